@@ -25,6 +25,8 @@ from hilstar.basics.attitudes import (
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import turn_text
 
+MAX_DEC_DEG = 90.0
+
 __all__ = [
     "angle_between_rad",
     "conjugate",
@@ -51,7 +53,6 @@ def __dir__() -> list[str]:
     return __all__
 
 
-MAX_DEC_DEG = 90.0
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 

@@ -50,12 +50,6 @@ def tradeoff_step(name: str) -> Trials:
     return Trials(name, table[0]["work"], error, second, "", trials)
 
 
-def colour_rows() -> list[tuple[str | float, ...]]:
-    """The rows of colour.csv: three names, then figures."""
-    with (HERE / "colour.csv").open(encoding="utf-8", newline="") as file:
-        return [(*row[:3], *map(float, row[3:])) for row in list(csv.reader(file))[1:]]
-
-
 def draw_scale(rows: list[dict[str, str]]) -> None:
     """Six panels of scale.csv: what grows with stars, pixels, workers, packets a second and
     hours, and where it bends.
@@ -121,7 +115,7 @@ def draw_scale(rows: list[dict[str, str]]) -> None:
         memory_mb = points("hours", "memory_mb")[1]
         hours.set(
             title=f"report, in {min(memory_mb):.0f} to {max(memory_mb):.0f} MB",
-            xlabel="hours of the run, 60 frames and packets a second",
+            xlabel="hours, at 60 frames and packets a second",
             ylabel="processor time [s]",
         )
         for axes in (stars, pixels, workers, hours):
@@ -175,7 +169,8 @@ def read_records(path: Path, record: type[Any]) -> list[Any]:
 if __name__ == "__main__":
     draw_scale(rows_of("scale.csv"))
     draw_tracker(rows_of("tracker.csv"))
-    colour.draw(DOCS / "colour.svg", colour_rows(), IDLE)
+    colour_choices = read_records(HERE / "colour.csv", colour.ColourChoice)
+    colour.draw(DOCS / "colour.svg", colour_choices, IDLE)
     timing.draw(DOCS / "timing.svg", read_records(HERE / "timing.csv", timing.TimingOutcome), IDLE)
     timing.draw_stripes(
         DOCS / "stripes.svg", read_records(HERE / "stripes.csv", timing.StripePoint)

@@ -449,13 +449,13 @@ def confronted_table() -> str:
         "mag rms",
         "background chi²",
         "unexplained",
-        "held out",
+        "held out, or why refused",
     ]
     body = []
     for row in rows_of("confronted.csv"):
         name = f"{row['camera']}, {row['image']}"
         if row["refused"]:
-            body.append([name, f"refused: {row['refused'].split(';')[0]}", *[""] * 5])
+            body.append([name, *[""] * 5, f"refused: {row['refused'].split(';')[0]}"])
             continue
         figures = [f"{float(row[key]):.3f}" for key in ("rms_px", "rms_mag")]
         held = [float(row[f"held_out_{key}"]) for key in ("px", "mag")]

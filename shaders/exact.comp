@@ -4,8 +4,8 @@
 // The pass runs after the linear image and its nearest levels are drawn, and changes those levels. A pixel belongs to the star that
 // gives more than half of its light, so no pixel is written by two stars.
 // With TEMPORAL a star begins with the errors that it left in the frame before (hilstar/display/temporal.py).
-// With TOGETHER it begins with what it left in the planes that were chosen before.
-// Defined before this text: LEVELS_FORMAT and LINEAR; LEVEL_BITS and TEXEL; PLANE; KEPT (8 or 4); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
+// With BEFORE panels (1 or 2) it begins with shares of what it left in each of them; with LEAVES another panel follows.
+// Defined before this text: LEVELS_FORMAT and LEVEL_BITS; KEPT (8 or 4); NEAR, the maximum number of pixels chosen; SIZE, a footprint's side in pixels;
 // FIRST, its first pixel relative to the star's own; and exact/inputs.glsl, exact/stars.glsl, exact/pixels.glsl, exact/choices.glsl.
 // On a CPU memory reads cost most: a pixel's place is one word, read once, and images are read faster than textures. A branch costs
 // both its sides there, because eight stars run in one vector: no decision depends on a pixel's number, and loops end with the star.
@@ -114,21 +114,16 @@ Sums choose(Star star, float of_light, Sums carried, float phase) {
     return Sums(plain + vec4(hidden, vec3(0.0)), best.b, best.c);
 }
 
-#ifdef TEMPORAL
-#define BEFORE before
-#else
-#define BEFORE left_sums
-#endif
-#if defined(TEMPORAL) || defined(TOGETHER)
-Sums sums_before(int i) {
-    if (i < 0) return Sums(vec4(0.0), vec4(0.0), vec2(0.0));
-    i *= 10;
-    return Sums(
-        vec4(BEFORE[i], BEFORE[i + 1], BEFORE[i + 2], BEFORE[i + 3]),
-        vec4(BEFORE[i + 4], BEFORE[i + 5], BEFORE[i + 6], BEFORE[i + 7]),
-        vec2(BEFORE[i + 8], BEFORE[i + 9]));
-}
+#define SUMS_AT(OF, i) Sums( \
+    vec4(OF[i], OF[i + 1], OF[i + 2], OF[i + 3]), vec4(OF[i + 4], OF[i + 5], OF[i + 6], OF[i + 7]), vec2(OF[i + 8], OF[i + 9]))
 
+#if BEFORE > 0
+Sums with_share(Sums sums, float share, Sums left) {
+    return Sums(sums.a + share * left.a, sums.b + share * left.b, sums.c + share * left.c);
+}
+#endif
+
+#if defined(TEMPORAL) || defined(LEAVES)
 void leave(int i, Sums sums) {
     for (int k = 0; k < 4; k++) {
         left_sums[10 * i + k] = sums.a[k];
@@ -144,21 +139,18 @@ void main() {
 #ifndef PATHS
     i = turn[i];
 #endif
-#ifdef TEMPORAL
-    Sums sums = sums_before(begins[i].before);
-    float phase = begins[i].phase;
-#else
     Sums sums = Sums(vec4(0.0), vec4(0.0), vec2(0.0));
     float phase = 0.0;
+#ifdef TEMPORAL
+    int star_before = begins[i].before;
+    if (star_before >= 0) sums = SUMS_AT(before, 10 * star_before);
+    phase = begins[i].phase;
 #endif
-#if defined(TOGETHER) && defined(MAKES_UP)
-    for (int k = 0; k < PLANES; k++) {
-        if (makes_up[k] == 0.0) continue;  // it is not chosen yet
-        Sums left = sums_before(PLANES * i + k);
-        sums.a += makes_up[k] * left.a;
-        sums.b += makes_up[k] * left.b;
-        sums.c += makes_up[k] * left.c;
-    }
+#if BEFORE > 0
+    if (makes_up.x != 0.0) sums = with_share(sums, makes_up.x, SUMS_AT(first_sums, 10 * i));
+#endif
+#if BEFORE > 1
+    if (makes_up.y != 0.0) sums = with_share(sums, makes_up.y, SUMS_AT(second_sums, 10 * i));
 #endif
 #ifdef PATHS
     ivec4 of = stretch[i];
@@ -175,9 +167,7 @@ void main() {
     Star star = star_of(i);
     sums = choose(star, star.e_per_s, sums, phase);
 #endif
-#ifdef TEMPORAL
+#if defined(TEMPORAL) || defined(LEAVES)
     leave(i, sums);
-#elif defined(TOGETHER) && defined(LEAVES)
-    leave(PLANES * i + PLANE, sums);
 #endif
 }

@@ -1,8 +1,12 @@
 #version 330 core
 // Levels to the screen: their codes, turned as the optics need them, and aids for aligning the bench.
-// Compiled for each orientation: on llvmpipe every branch costs at every pixel. QUARTER_TURNS, FLIP_X, FLIP_Y, STEALING, APART, AIDS.
+// Compiled for each orientation: on llvmpipe every branch costs at every pixel. QUARTER_TURNS, FLIP_X, FLIP_Y, STEALING, RGB, AIDS.
 
-uniform usampler2D levels;   // with APART those of red, green and blue, else one for all
+uniform usampler2D levels;   // with RGB those of red, else of all
+#ifdef RGB
+uniform usampler2D green_levels;
+uniform usampler2D blue_levels;
+#endif
 uniform usampler2D triples;  // with bit stealing the codes of each level, in rows of TABLE_WIDTH
 uniform float white;         // the largest code
 uniform ivec2 size_px;       // of the image
@@ -36,10 +40,9 @@ ivec2 image_pixel(ivec2 screen) {
 }
 
 uvec3 codes_of(ivec2 pixel) {
-    uvec4 shown = texelFetch(levels, pixel, 0);
-    uint level = shown.r;
-#ifdef APART
-    return shown.rgb;
+    uint level = texelFetch(levels, pixel, 0).r;
+#ifdef RGB
+    return uvec3(level, texelFetch(green_levels, pixel, 0).r, texelFetch(blue_levels, pixel, 0).r);
 #elif defined(STEALING)
     return texelFetch(triples, ivec2(int(level) % TABLE_WIDTH, int(level) / TABLE_WIDTH), 0).rgb;
 #else

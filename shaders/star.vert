@@ -4,11 +4,7 @@
 
 in ivec2 pixel;
 in vec2 fraction_px;
-in float electrons_per_s;  // of primaries that are driven apart, of the white that the one needs which needs most
-#ifdef APART
-in vec3 primaries_e_per_s;
-flat out vec3 star_primaries_e_per_s;
-#endif
+in float electrons_per_s;
 
 uniform ivec2 resolution_px;
 uniform int footprint_px;
@@ -22,7 +18,6 @@ uniform float sprites_per_star;
 uniform float reach_per_e;
 uniform vec2 reach_px2;
 uniform int largest_px;
-uniform vec2 margin_px;  // maximum distance of a primary's light from the star, 0 where there is one
 const float MARGIN_PX = 0.001;  // of rounding: a pixel too many is left dark by splat.frag
 
 flat out ivec2 star_pixel;
@@ -34,16 +29,12 @@ void main() {
     star_pixel = pixel;
     star_fraction_px = fraction_px;
     star_electrons_per_s = electrons_per_s;
-#ifdef APART
-    star_primaries_e_per_s = primaries_e_per_s;
-#endif
     // The viewport reaches footprint_px beyond every edge, because GL drops a point whose centre is outside it.
     vec2 centre_px = vec2(pixel) + (footprint_px % 2 == 1 ? 0.5 : 1.0);
     gl_Position = vec4(2.0 * (centre_px + float(footprint_px)) / vec2(resolution_px + 2 * footprint_px) - 1.0, 0.0, 1.0);
     star_reach_px = sqrt(max(log(reach_per_e * electrons_per_s), 0.0) * reach_px2);
     if (reach_per_e > 0.0) {
-        vec2 all_px = star_reach_px + margin_px;
-        float reach_px = min(max(all_px.x, all_px.y) + MARGIN_PX, float(largest_px));
+        float reach_px = min(max(star_reach_px.x, star_reach_px.y) + MARGIN_PX, float(largest_px));
         int around = footprint_px % 2 == 1 ? 2 * int(reach_px + 0.5) + 1 : 2 * int(reach_px) + 2;
         gl_PointSize = float(min(around, largest_px));
         return;

@@ -1,4 +1,4 @@
-// The light of pixels, row by row, the planes of a pixel beside each other, as whole numbers of a unit: their sum is the same in whatever order stars are added.
+// The light of pixels, row by row, as whole numbers of a unit: their sum is the same in whatever order stars are added.
 
 layout(std430, binding = 7) buffer PixelSums { int sums[]; };
-uniform float unit_e_per_s[PLANES];
+uniform float unit_e_per_s;

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin
 
 from typer import Typer
 from typer.models import ArgumentInfo, OptionInfo, ParameterInfo
@@ -30,6 +30,8 @@ generated from the commands themselves (`python tools/make_pages.py`).
 
 Every command that has `--json` then prints one JSON object on stdout and nothing else there. An output named `-`
 is stdout, for CSV and TOML alone; what the command says then goes to stderr.
+
+A switch may be repeated. An option that takes one value is given once: a second one is refused.
 
 An option of several commands has one meaning in all of them:
 
@@ -75,30 +77,31 @@ class Parameter:
     @property
     def usage(self) -> str:
         """How it stands on a command line: `BENCH.toml`, `[--seed N]`."""
-        words = " ".join(word for word in (*self.flags[:1], self.value) if word)
-        return words if self.required or words.startswith("[") else f"[{words}]"
+        words = " ".join(filter(None, (*self.flags[:1], self.value)))
+        if self.required or words.startswith("["):
+            return words
+        return f"[{words}]"
 
     @property
     def line(self) -> str:
         """Its line of the list."""
-        names = ", ".join(self.flags)
-        head = f"- `{' '.join(word for word in (names, self.value) if word)}`"
-        notes = (
-            ["required"] if self.required else [f"default `{self.default}`"] if self.default else []
-        )
-        return f"{head}{''.join(f' ({note})' for note in notes)}: {self.meaning}"
+        words = " ".join(filter(None, (", ".join(self.flags), self.value)))
+        note = ""
+        if self.required:
+            note = " (required)"
+        elif self.default:
+            note = f" (default `{self.default}`)"
+        return f"- `{words}`{note}: {self.meaning}"
 
 
 def page() -> str:
     """The page: the commands in the panels of `hilstar --help`."""
-    parts, panels = [HEAD], dict.fromkeys(panel for panel, _, _ in commands_of(application()))
-    for title in panels:
-        parts.append(f"## {title}\n")
-        parts += [
-            section(name, command)
-            for panel, name, command in commands_of(application())
-            if panel == title
-        ]
+    sections: dict[str, list[str]] = {}  # by their panels
+    for panel, name, command in commands_of(application()):
+        sections.setdefault(panel, []).append(section(name, command))
+    parts = [HEAD]
+    for panel, texts in sections.items():
+        parts += [f"## {panel}\n", *texts]
     return "\n".join(parts)
 
 
@@ -123,39 +126,37 @@ def commands_of(
 def section(name: str, command: Callable[..., Any]) -> str:
     """The command's part of the page."""
     parameters = sorted(parameters_of(command), key=lambda p: (bool(p.flags), not p.required))
-    usage = textwrap.wrap(
-        " ".join(["hilstar", name, *(p.usage.replace(" ", "\0") for p in parameters)]),
+    # an option and its value stay on one line
+    words = [parameter.usage.replace(" ", "\0") for parameter in parameters]
+    usage = textwrap.fill(
+        " ".join(["hilstar", name, *words]),
         width=92,
         subsequent_indent=" " * (len(name) + 9),
         break_long_words=False,
         break_on_hyphens=False,
-    )
+    ).replace("\0", " ")
     lines = "\n".join(parameter.line for parameter in parameters)
-    text = "\n".join(usage).replace("\0", " ")
-    return f"### hilstar {name}\n\n{inspect.getdoc(command)}\n\n```text\n{text}\n```\n\n{lines}\n"
+    return f"### hilstar {name}\n\n{inspect.getdoc(command)}\n\n```text\n{usage}\n```\n\n{lines}\n"
 
 
 def parameters_of(command: Callable[..., Any]) -> Iterator[Parameter]:
     """The arguments and options in the order of the function's signature."""
-    hints = get_type_hints(command, include_extras=True)
     for name, parameter in inspect.signature(command).parameters.items():
-        kind, *notes = get_args(hints[name])
-        info = next(note for note in notes if isinstance(note, ParameterInfo))
+        info = parameter.default
+        if not isinstance(info, ParameterInfo):
+            raise TypeError(f"{name}: is neither an option nor an argument of typer's")
         if info.hidden:
             continue
-        flags = flags_of(name, info) if isinstance(info, OptionInfo) else ()
-        value = "" if kind is bool else info.metavar or type_word(kind, name, info)
-        required = parameter.default is inspect.Parameter.empty
-        yield Parameter(flags, value, meaning_of(info), default_text(parameter.default), required)
-
-
-def flags_of(name: str, info: OptionInfo) -> tuple[str, ...]:
-    """`-o`, `--output`: what is written on the command line. Within Annotated typer has the
-    first of them as `default`.
-    """
-    words = (info.default, *(info.param_decls or ()))
-    written = tuple(word for word in words if isinstance(word, str) and word.startswith("-"))
-    return written or (f"--{name.replace('_', '-')}",)
+        kind = parameter.annotation
+        flags: tuple[str, ...] = ()
+        if isinstance(info, OptionInfo):
+            flags = tuple(info.param_decls or ())
+        value = ""
+        if kind is not bool:
+            value = info.metavar or type_word(kind, name, info)
+        is_required = info.default is ...
+        default = "" if is_required else default_text(info.default)
+        yield Parameter(flags, value, meaning_of(info), default, is_required)
 
 
 def type_word(kind: Any, name: str, info: ParameterInfo) -> str:
@@ -168,28 +169,31 @@ def type_word(kind: Any, name: str, info: ParameterInfo) -> str:
         return "|".join(map(str, get_args(kind)))
     if isinstance(kind, type) and issubclass(kind, Enum):
         return "|".join(str(choice.value) for choice in kind)
-    return name.upper() if isinstance(info, ArgumentInfo) else TYPE_WORDS[kind]
+    if isinstance(info, ArgumentInfo):
+        return name.upper()
+    return TYPE_WORDS[kind]
 
 
 def meaning_of(info: ParameterInfo) -> str:
     """Its help, with the limits of its value."""
-    low, high = info.min, info.max
-    high = None if high is not None and high >= MAX_BOUND else high
+    low = info.min
+    high = info.max
+    if high is not None and high >= MAX_BOUND:
+        high = None
+    limits = ""
     if low is not None and high is not None:
         limits = f" {low:g} to {high:g}."
     elif low is not None and low > 0:
         limits = f" {low:g} or more."
-    else:
-        limits = ""
     return f"{info.help}{limits}"
 
 
 def default_text(default: Any) -> str:
     """A default that says something: no flag's False, no None, no empty text."""
-    if default is inspect.Parameter.empty or default is None or default is False or default == "":
+    if default is None or default is False or default == "":
         return ""
-    return (
-        f"{default:g}"
-        if isinstance(default, float)
-        else str(default.value if isinstance(default, Enum) else default)
-    )
+    if isinstance(default, float):
+        return f"{default:g}"
+    if isinstance(default, Enum):
+        default = default.value
+    return str(default)

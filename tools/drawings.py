@@ -109,15 +109,15 @@ def chain() -> str:
         x += w + 24
     d.box((308, 8), (124, 56), "Catalogue\nspectra, bodies")
     d.arrow((370, 64), (370, 96))
-    for x0, words in (
-        (628, "Monitor\nphotons"),
-        (456, "Collimating lens\na star at infinity"),
-        (284, "Star tracker\nyours"),
+    for x0, width, words in (
+        (628, 124, "Monitor\nphotons"),
+        (444, 148, "Collimating lens\na star at infinity"),
+        (284, 124, "Star tracker\nyours"),
     ):
-        d.box((x0, 222), (124, 60), words, "light")
+        d.box((x0, 222), (width, 60), words, "light")
     d.arrow((690, 170), (690, 222))
-    d.arrow((628, 252), (580, 252), kind="ray", tip="raytip")
-    d.arrow((456, 252), (408, 252), kind="ray", tip="raytip")
+    d.arrow((628, 252), (592, 252), kind="ray", tip="raytip")
+    d.arrow((444, 252), (408, 252), kind="ray", tip="raytip")
     d.arrow((284, 252), (62, 252), (62, 170), kind="line dash")
     d.text(76, 244, "its answers, to your simulator", "note")
     d.text(8, 24, "blue: hilstar", "note")
@@ -211,12 +211,12 @@ def heads() -> str:
     )
     d.box((8, 92), (136, 66), "Body’s attitude\none sender,\none clock")
     d.box(
-        (172, 84), (152, 82), "hilstar serve\nheads.toml: one link,\ntime requests answered", "own"
+        (166, 84), (168, 82), "hilstar serve\nheads.toml: one link,\ntime requests answered", "own"
     )
-    d.arrow((144, 125), (172, 125))
+    d.arrow((144, 125), (166, 125))
     for k, name in enumerate(("plus-x", "minus-y", "zenith")):
         y = 14 + 78 * k
-        d.arrow((324, 125), (372, y + 31))
+        d.arrow((334, 125), (372, y + 31))
         d.box((372, y), (158, 62), f"{name}\nq_body_to_cam,\nits own moment of light", "own")
         d.arrow((530, y + 31), (566, y + 31), kind="ray", tip="raytip")
         d.box(
@@ -235,7 +235,7 @@ def separated() -> str:
         " error, noise",
         268,
     )
-    d.box((4, 92), (166, 74), "Answer less command\nat the same time,\nas a rotation vector")
+    d.box((4, 92), (166, 74), "Error of an answer\nanswer less command,\nas a rotation vector")
     rows = (
         ("clock", "offset and drift: what turns with the rate"),
         ("bias", "the same everywhere"),

@@ -3,8 +3,8 @@
     python tools/same_codes.py BEFORE/bin/hilstar AFTER/bin/hilstar
 
 Both replay a log of ten attitudes on each of BENCHES (round, exact, temporal, dither, bit stealing,
-a black level, 10 bits, a lens, bodies, satellites, faults, motion, effort), write one linear image
-with its truth table, and simulate one exposure of the virtual tracker; every picture, table and
+a black level, 10 bits, a lens, bodies, satellites, faults, motion, effort, primaries), write one
+linear image with its truth table, and simulate one exposure of the virtual tracker; every picture, table and
 exposure is compared by its pixels. Exit code 1 where one differs.
 """
 
@@ -84,6 +84,8 @@ for_s = 0.2
 turn_deg = [0.0, 0.1, 0.0]
 """
 
+SRGB = {"xy_r": [0.64, 0.33], "xy_g": [0.3, 0.6], "xy_b": [0.15, 0.06], "layout": "rgb-stripe"}
+
 Tables = dict[str, dict[str, Any]]
 BASE: Tables = {
     "tracker": {
@@ -120,12 +122,45 @@ BENCHES: dict[str, Tables] = {
     "faults": {},
     "motion": {"render": {"quantisation": "exact", "motion": "on"}, "monitor": {"scanout_ms": 15}},
     "effort": {"render": {"quantisation": "auto", "effort": "auto", "tolerance_px": 0.05}},
+    "primaries": {"monitor.primaries": SRGB, "render": {"colour": "star"}},
+    "primaries, round": {
+        "monitor.primaries": SRGB,
+        "render": {"colour": "star", "quantisation": "round"},
+    },
+    "primaries, temporal": {
+        "monitor.primaries": SRGB,
+        "render": {"colour": "star", "quantisation": "temporal", "cycle_frames": 6},
+    },
+    "primaries, dither": {
+        "monitor.primaries": SRGB | {"layout": "white"},
+        "render": {"colour": "star", "quantisation": "dither"},
+    },
+    "primaries, motion": {
+        "monitor": {"scanout_ms": 15},
+        "monitor.primaries": SRGB,
+        "render": {"colour": "star", "motion": "on"},
+    },
+    "primaries, bodies": {
+        "sky.bodies": {"planets": True, "moon": True, "sun": True, "earth": True},
+        "spacecraft": {"orbit": "station.tle"},
+        "monitor.primaries": SRGB,
+        "render": {"colour": "star"},
+    },
 }
-RATES_DEG_S = {"motion": (2.0, 1.0, 3.0), "bodies": (0.3, -0.2, 0.1), "satellites": (0.0, 0.5, 0.0)}
+RATES_DEG_S = {
+    "motion": (2.0, 1.0, 3.0),
+    "bodies": (0.3, -0.2, 0.1),
+    "satellites": (0.0, 0.5, 0.0),
+    "primaries, motion": (2.0, 1.0, 3.0),
+    "primaries, bodies": (0.3, -0.2, 0.1),
+}
 ORION_DEG = (84.057, -1.2)
 # at the epoch, from the station: the Moon, Jupiter, the Earth's limb, and the two other satellites
+BODIES_DEG = [(62.5, 26.0), (283.8, -23.15), (12.3, -25.6)]
 TARGETS_DEG = {
-    "bodies": [(62.5, 26.0), (283.8, -23.15), (12.3, -25.6)],
+    "bodies": BODIES_DEG,
+    "primaries, bodies": BODIES_DEG,
+    "primaries, motion": [ORION_DEG],
     "satellites": [(262.7, 18.56), (240.95, 32.7)],
     "motion": [ORION_DEG],
 }

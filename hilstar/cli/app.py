@@ -6,10 +6,11 @@ from typing import Annotated, Any
 
 import typer
 from typer import Option
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup, TyperOption
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.version import __version__
+from hilstar.cli.declare import for_typer
 
 # By their panels, each a file of this folder and its function.
 COMMANDS = {
@@ -37,12 +38,25 @@ GROUPS = {
     "calibrate": (
         "Calibrate",
         CALIBRATE,
-        ("dots", "geometric", "psf", "alignment", "reference", "plan", "photometric", "scale"),
+        (
+            "dots",
+            "geometric",
+            "psf",
+            "focus",
+            "alignment",
+            "reference",
+            "plan",
+            "photometric",
+            "scale",
+        ),
     ),
     "sensor": ("Calibrate", SENSOR, ("import_", "measure")),
     "optics": ("Calibrate", OPTICS, ("map_", "lens", "zernike")),
     "service": ("This machine", SERVICE, ("install", "uninstall")),
 }
+
+
+VERSION = "--version"
 
 
 class EarlyEnd(Exception):
@@ -73,6 +87,26 @@ class Commands(TyperGroup):
             raise EarlyEnd(error) from error
 
 
+class StatedOnce(TyperCommand):
+    """A command that refuses two values where an option takes one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse the words after the command's name. Raises InputError."""
+        if not ctx.resilient_parsing:  # Tab completes a wrong line, too
+            self._refuse_repeated(ctx, args)
+        return super().parse_args(ctx, args)
+
+    def _refuse_repeated(self, ctx: Any, args: list[str]) -> None:
+        """Refuse (InputError) a second value, of which typer would drop the first in silence."""
+        _, _, given = self.make_parser(ctx).parse_args(args=list(args))
+        for parameter in self.params:
+            if not isinstance(parameter, TyperOption) or parameter.is_flag or parameter.multiple:
+                continue
+            count = given.count(parameter)
+            if count > 1:
+                raise InputError(f"{parameter.opts[0]}: is given {count} times; write it once")
+
+
 def print_version(wanted: bool) -> None:
     """Print the version and exit, if `wanted`."""
     if wanted:
@@ -83,9 +117,7 @@ def print_version(wanted: bool) -> None:
 def hilstar(
     _: Annotated[
         bool,
-        Option(
-            "--version", callback=print_version, is_eager=True, help="Print the version and quit."
-        ),
+        Option(VERSION, callback=print_version, is_eager=True, help="Print the version and quit."),
     ] = False,
 ) -> None:
     """Show a star tracker on a bench the stars it would see: attitudes in, frames of code values
@@ -96,11 +128,11 @@ def hilstar(
 def add(to: typer.Typer, file: str, name: str, panel: str | None = None) -> None:
     """Add the command of a function `name` in a file of this folder."""
     function = getattr(import_module(f"hilstar.cli.{file}"), name)
-    to.command(public(name), rich_help_panel=panel)(function)
+    to.command(public(name), cls=StatedOnce, rich_help_panel=panel)(for_typer(function))
 
 
 def public(name: str) -> str:
-    """A function's name as a command's."""
+    """A command's name from its function's: first-light from first_light."""
     return name.strip("_").replace("_", "-")
 
 
@@ -110,10 +142,18 @@ def names() -> list[str]:
     return [*alone, *GROUPS]
 
 
+def members(group: str) -> list[str]:
+    """A group's own commands; none for the name of a command."""
+    if group not in GROUPS:
+        return []
+    _, _, functions = GROUPS[group]
+    return [public(name) for name in functions]
+
+
 @cache
 def application(only: str | None = None) -> typer.Typer:
-    """The commands of `hilstar`, or `only` the command or group of a name: each imports its
-    file, and all take 50 ms.
+    """The commands of `hilstar`; with `only`, that command or group alone, as importing all of them
+    takes 50 ms.
     """
     app = typer.Typer(
         cls=Commands,
@@ -137,7 +177,7 @@ def application(only: str | None = None) -> typer.Typer:
 
 @cache
 def built(only: str | None) -> Any:
-    """What typer makes of an application."""
+    """An application as typer runs it."""
     return typer.main.get_command(application(only))
 
 
@@ -150,4 +190,6 @@ def run(words: list[str]) -> Any:
     if not words or (len(words) == 1 and words[0] in GROUPS):
         run([*words, "--help"])
         return InputError.exit_code
-    return built(words[0] if words[0] in names() else None)(words, standalone_mode=False)
+    # the version needs no command, and an unknown word the names of all
+    only = words[0] if words[0] in (*names(), VERSION) else None
+    return built(only)(words, standalone_mode=False)

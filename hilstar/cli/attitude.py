@@ -1,13 +1,12 @@
 """hilstar attitude: where a log or a live stream points, in terms that a person can check."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
-
-from typer import Argument, Option
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.resources import resource_path
-from hilstar.cli import options
+from hilstar.cli.declare import argument, option, struct, switch
+from hilstar.cli.options import LOG_HELP, LogStatements, json_option
 from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
@@ -19,91 +18,89 @@ if TYPE_CHECKING:
 SHOWN_STARS = 3
 
 
-@options.log_statements
-def attitude(
-    source: Annotated[
-        Path,
-        Argument(
-            metavar="INPUT",
-            help=f"{options.LOG_HELP} Or a bench file (.toml): its live stream is awaited.",
-        ),
-    ],
-    time: Annotated[
-        str | None,
-        Option(
-            "--time",
-            metavar="T",
-            help=(
-                "Seconds after the log's first sample, or a date and time as the log has them; by"
-                " default its first sample."
-            ),
-        ),
-    ] = None,
-    bench: Annotated[
-        Path | None,
-        Option(
-            metavar="BENCH.toml",
-            help="Whose tracker, mounting and sky to use; by default the demo's tracker.",
-        ),
-    ] = None,
-    wait: Annotated[
-        float,
-        Option(metavar="SECONDS", help="How long to wait for a live stream.", min=0.1, max=1e6),
-    ] = 10.0,
-    statements: options.LogStatements = options.NOTHING_STATED,
-    explain: Annotated[
-        bool,
-        Option(
-            "--explain",
-            help="Explain what the source's numbers mean: frames, scalar order, time scale.",
-        ),
-    ] = False,
-    as_json: options.Json = False,
-) -> None:
+@struct
+class AttitudeOptions:
+    """The options of `hilstar attitude`."""
+
+    source: Path = argument(
+        "INPUT", f"{LOG_HELP} Or a bench file (.toml): its live stream is awaited."
+    )
+    time: str | None = option(
+        "T",
+        "Seconds after the log's first sample, or a date and time as the log has them; by default"
+        " its first sample.",
+    )
+    bench: Path | None = option(
+        "BENCH.toml", "Whose tracker, mounting and sky to use; by default the demo's tracker."
+    )
+    wait: float = option(
+        "SECONDS", "How long to wait for a live stream.", default=10.0, min=0.1, max=1e6
+    )
+    explain: bool = switch(
+        "Explain what the source's numbers mean: frames, scalar order, time scale."
+    )
+    as_json: bool = json_option()
+
+
+def attitude(options: AttitudeOptions, statements: LogStatements) -> None:
     """Say where a log or a live stream points: quaternion, RA, Dec, roll, and the brightest
     stars in view.
     """
     from hilstar.server.bench.bench_file import dated, read_bench_file
 
-    live = source.suffix.lower() == ".toml"
-    first = read_bench_file(source if live else bench or resource_path("configs", "demo.toml"))
-    if live and bench is not None:
-        file = read_bench_file(bench)
+    source = options.source
+    is_live = source.suffix.lower() == ".toml"
+    if is_live:
+        first = read_bench_file(source)
+        _refuse_of_stream(source, statements)
     else:
-        file = first
-    if live:
-        written = "write it into"
-        if statements.mounting is not None:
-            raise InputError(
-                f"--mounting {statements.mounting}: {written} {source} as [tracker] q_body_to_cam"
-            )
-        if statements.convention is not None:
-            raise InputError(
-                f"--convention {statements.convention}: {written} {source} as [attitude] convention"
-            )
-        statements.refuse(f"it is for a log, and {source} names a live stream; leave it out")
+        first = read_bench_file(options.bench or resource_path("configs", "demo.toml"))
+    file = first
+    if is_live and options.bench is not None:
+        file = read_bench_file(options.bench)
     stated = statements.stated(first.config)
-    if live:
-        sample, conventions, held = _live(first, time, wait)
-        for _, line in conventions.mounting_notices(stated.mounting):
+    if is_live:
+        pointing = _live(first, options.time, options.wait)
+        for _, line in pointing.conventions.mounting_notices(stated.mounting):
             say(line)
     else:
-        sample, conventions, held = _of_log(source, time, stated)
-    file = dated(file, conventions.scale, sample.t_ns)
-    fields = {"source": conventions.source, "held": held, **_pointing(sample, file)}
+        pointing = _of_log(source, options.time, stated)
+    conventions = pointing.conventions
+    file = dated(file, conventions.scale, pointing.sample.t_ns)
     meaning = conventions.lines(stated.mounting)
-    print_found(
-        as_json, fields | {"conventions": meaning}, [*(meaning if explain else ()), *_lines(fields)]
-    )
+    fields = {"source": conventions.source, "held": pointing.held}
+    fields |= _pointing(pointing.sample, file)
+    lines = _lines(fields)
+    if options.explain:
+        lines = [*meaning, *lines]
+    fields["conventions"] = meaning
+    print_found(options.as_json, fields, lines)
 
 
-class _Found(NamedTuple):
+def _refuse_of_stream(source: Path, statements: LogStatements) -> None:
+    """Refuse (InputError) what is stated of a log where there is a live stream, whose bench file
+    has keys for it.
+    """
+    keys = {
+        "--mounting": (statements.mounting, "[tracker] q_body_to_cam"),
+        "--convention": (statements.convention, "[attitude] convention"),
+    }
+    for flag, (value, key) in keys.items():
+        if value is not None:
+            raise InputError(f"{flag} {value}: write it into {source} as {key}")
+    statements.refuse(f"it is for a log, and {source} names a live stream; leave it out")
+
+
+class _Pointing(NamedTuple):
+    """An attitude, what its numbers mean, and whether it was held in a gap of a log."""
+
     sample: "AttitudeSample"
     conventions: "Conventions"
     held: bool = False
 
 
-def _live(file: "BenchFile", time: str | None, patience_s: float) -> _Found:
+def _live(file: "BenchFile", time: str | None, patience_s: float) -> _Pointing:
+    """The first attitude of a live stream. Raises InputError."""
     from hilstar.server.open_link import first_attitude, open_link
 
     if time is not None:
@@ -118,10 +115,11 @@ def _live(file: "BenchFile", time: str | None, patience_s: float) -> _Found:
             )
         with busy(f"waiting for an attitude, {patience_s:g} s at most"):
             sample = first_attitude(link, patience_s)
-        return _Found(sample, link.conventions)
+        return _Pointing(sample, link.conventions)
 
 
-def _of_log(path: Path, time: str | None, stated: "Stated") -> _Found:
+def _of_log(path: Path, time: str | None, stated: "Stated") -> _Pointing:
+    """The attitude of a log at a time; the first without one. Raises InputError."""
     from hilstar.attitude.clock.timeline import Policy
     from hilstar.attitude.logs.log_file import log_timeline, open_log, time_in_log
     from hilstar.attitude.wire.packet import AttitudeSample
@@ -137,10 +135,11 @@ def _of_log(path: Path, time: str | None, stated: "Stated") -> _Found:
         raise AssertionError("a log has samples")
     held = state.rate_cam_rad_s is None and state.age_ns > 0
     sample = AttitudeSample(t_ns, state.q_icrs_to_cam, state.rate_cam_rad_s, state.sequence)
-    return _Found(sample, log.conventions, held)
+    return _Pointing(sample, log.conventions, held)
 
 
 def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
+    """An attitude and the brightest stars of its sky, by the keys of --json."""
     import numpy as np
 
     from hilstar.basics.rotation import to_radec_roll_deg
@@ -149,50 +148,48 @@ def _pointing(sample: "AttitudeSample", file: "BenchFile") -> dict[str, Any]:
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(sample.q_icrs_to_cam)
     stars = brightest_seen(file, View(sample.q_icrs_to_cam, t_ns=sample.t_ns), SHOWN_STARS)
-    rate = sample.rate_cam_rad_s
+    rate_deg_s = None
+    if sample.rate_cam_rad_s is not None:
+        rate_deg_s = np.degrees(sample.rate_cam_rad_s).tolist()
+    tracker = {
+        "file": file.path.name,
+        "resolution_px": list(file.config.tracker.resolution_px),
+    }
     return {
         "t_ns": sample.t_ns,
         "q_icrs_to_cam": sample.q_icrs_to_cam.tolist(),
         "ra_deg": ra_deg,
         "dec_deg": dec_deg,
         "roll_deg": roll_deg,
-        "rate_deg_s": None if rate is None else np.degrees(rate).tolist(),
-        "tracker": {
-            "file": file.path.name,
-            "resolution_px": list(file.config.tracker.resolution_px),
-        },
+        "rate_deg_s": rate_deg_s,
+        "tracker": tracker,
         "stars": stars,
     }
 
 
-def _lines(told: dict[str, Any]) -> list[str]:
+def _lines(fields: dict[str, Any]) -> list[str]:
+    """The same as lines of text."""
     from hilstar.basics.rotation import turn_text
 
-    q = ", ".join(f"{c:.7f}" for c in told["q_icrs_to_cam"])
-    width, height = told["tracker"]["resolution_px"]
+    held = " (held: in a gap of the log)" if fields["held"] else ""
+    components = ", ".join(f"{component:.7f}" for component in fields["q_icrs_to_cam"])
+    ra = turn_text(fields["ra_deg"])
+    roll = turn_text(fields["roll_deg"])
     lines = [
-        f"q_icrs_to_cam {q}, t_ns {told['t_ns']}"
-        + (" (held: in a gap of the log)" if told["held"] else ""),
-        (
-            f"RA {turn_text(told['ra_deg'])}, Dec {told['dec_deg']:.4f}, roll"
-            f" {turn_text(told['roll_deg'])} deg"
-        ),
+        f"q_icrs_to_cam {components}, t_ns {fields['t_ns']}{held}",
+        f"RA {ra}, Dec {fields['dec_deg']:.4f}, roll {roll} deg",
     ]
-    if told["rate_deg_s"] is not None:
-        lines.append(
-            "rate "
-            + ", ".join(f"{c:z.6f}" for c in told["rate_deg_s"])
-            + " deg/s about x, y, z of the camera"
-        )
-    if not told["stars"]:
+    if fields["rate_deg_s"] is not None:
+        rates = ", ".join(f"{rate_deg_s:z.6f}" for rate_deg_s in fields["rate_deg_s"])
+        lines.append(f"rate {rates} deg/s about x, y, z of the camera")
+    if not fields["stars"]:
         lines.append("no star of the catalogue is in view")
-    for star in told["stars"]:
-        where = (
-            f"x {star.x_px:.0f}, y {star.y_px:.0f} of {width} x {height} px,"
-            f" {star.from_boresight_deg:.2f} deg from the middle"
-        )
+    width, height = fields["tracker"]["resolution_px"]
+    for star in fields["stars"]:
+        name = star.name or f"HIP {star.hip}"
         lines.append(
-            f"{star.name or f'HIP {star.hip}'}, V {star.v_mag:.2f}, in {star.constellation}:"
-            f" {where}"
+            f"{name}, V {star.v_mag:.2f}, in {star.constellation}: x {star.x_px:.0f},"
+            f" y {star.y_px:.0f} of {width} x {height} px, {star.from_boresight_deg:.2f} deg from"
+            " the middle"
         )
     return lines

@@ -3,11 +3,12 @@ by stars.
 """
 
 import json
+import threading
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
-from typer import Argument, Option
+from typing import TYPE_CHECKING, Any
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import (
@@ -19,53 +20,63 @@ from hilstar.basics.files import (
     check_ending,
     make_directory,
     refuse_stdout,
+    temporary_folder,
+    write_whole,
 )
-from hilstar.cli.image_source import Exposure, Grab, ShownTo, dot_images
+from hilstar.cli.declare import argument, option, struct, switch
+from hilstar.cli.image_source import (
+    DotOptions,
+    ImageOptions,
+    dot_images,
+    exposure_option,
+    handed_on,
+    image_source,
+)
 from hilstar.cli.options import (
-    BenchFile,
-    Json,
-    Overwrite,
+    bench_argument,
     check_files,
-    parse_numbers,
+    json_option,
+    output_option,
+    overwrite_option,
     parse_reading,
+    parse_resolution,
     seed_option,
+    windowed_option,
 )
-from hilstar.cli.running import Windowed
-from hilstar.server.console.terminal import busy, print_found, print_json, say
+from hilstar.server.console.terminal import busy, print_found, say
+
+if TYPE_CHECKING:
+    from hilstar.display.identity import MonitorIdentity
+    from hilstar.server.bench.bench_file import BenchFile
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
 NAMED = "in the bench file, under [collimator]: geometry = {!r}"
-RESOLUTION_FORM = "--resolution W,H in pixels, such as 1920,1080"
 
 
-def dots(
-    bench_file: BenchFile,
-    output: Annotated[
-        Path, Option("-o", "--output", metavar="DIR", help="Directory for plan.csv and the frames.")
-    ],
-    frames: Annotated[int, Option(metavar="N", help="Number of frames.", min=1, max=1000)] = 20,
-    dots_per_frame: Annotated[
-        int | None,
-        Option(
-            "--dots",
-            metavar="N",
-            help="About how many dots are lit in each. [as many as the field holds, 60 at most]",
-            min=1,
-            max=5000,
-        ),
-    ] = None,
-    show: Annotated[
-        bool,
-        Option("--show", help="Show the frames on the display: space for the next, q to quit."),
-    ] = False,
-    dwell: Annotated[
-        float | None,
-        Option(metavar="SECONDS", help="With --show: time for each frame, without keys.", min=0),
-    ] = None,
-    windowed: Windowed = False,
-    seed: Annotated[int, seed_option("Seed of the dots' codes.")] = 0,
-    as_json: Json = False,
-) -> None:
+@struct
+class DotsOptions:
+    """The options of `hilstar calibrate dots`."""
+
+    bench_file: Path = bench_argument()
+    output: Path = output_option("DIR", "Directory for plan.csv and the frames.")
+    frames: int = option("N", "Number of frames.", default=20, min=1, max=1000)
+    dots_per_frame: int | None = option(
+        "N",
+        "About how many dots are lit in each. [as many as the field holds, 60 at most]",
+        "--dots",
+        min=1,
+        max=5000,
+    )
+    show: bool = switch("Show the frames on the display: space for the next, q to quit.")
+    dwell: float | None = option(
+        "SECONDS", "With --show: time for each frame, without keys.", min=0
+    )
+    windowed: bool = windowed_option()
+    seed: int = seed_option("Seed of the dots' codes.")
+    as_json: bool = json_option()
+
+
+def dots(options: DotsOptions) -> None:
     """Make frames of dots for `calibrate geometric`: each dot blinks its own code.
 
     They stand where the tracker sees the screen, by the bench file's lens, or by its geometry file
@@ -84,74 +95,54 @@ def dots(
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.frame_files import write_codes_png
 
-    check_directory("-o", output)
-    file = read_bench_file(bench_file)
+    check_directory("-o", options.output)
+    file = read_bench_file(options.bench_file)
     monitor = file.config.monitor
     seen_screen = seen_screen_of(file)
-    if dots_per_frame is None:
-        lit = lit_for(seen_screen)
-    else:
-        lit = dots_per_frame
-    plan = plan_seen_dots(seen_screen, frames, lit, np.random.default_rng(seed))
-    check_files([], [output / "plan.csv"], file)
-    make_directory(output)
-    write_plan(output / "plan.csv", plan)
+    lit = options.dots_per_frame or lit_for(seen_screen)
+    rng = np.random.default_rng(options.seed)
+    plan = plan_seen_dots(seen_screen, options.frames, lit, rng)
+    check_files([], [options.output / "plan.csv"], file)
+    make_directory(options.output)
+    write_plan(options.output / "plan.csv", plan)
+    white = 2**monitor.bits - 1
     for frame in range(plan.frames):
-        image = dot_image(plan, frame, monitor.resolution_px, 2**monitor.bits - 1)
-        write_codes_png(output / f"frame_{frame:03}.png", image, monitor.bits)
-    shown = None
-    if show:
-        shown = show_dots(plan, monitor, dwell, windowed=windowed)
+        image = dot_image(plan, frame, monitor.resolution_px, white)
+        write_codes_png(options.output / f"frame_{frame:03}.png", image, monitor.bits)
+    if options.show:
+        shown = show_dots(plan, monitor, options.dwell, windowed=options.windowed)
         say(f"{shown} of {plan.frames} frames shown")
     summary = {
         "frames": plan.frames,
         "dots": len(plan),
         "lit": int(plan.lit.sum()),
-        "seed": seed,
-        "written": str(output),
+        "seed": options.seed,
+        "written": str(options.output),
     }
     lit_text = f"{plan.lit.sum() / plan.frames:.0f} lit in each"
-    print_found(
-        as_json, summary, [f"{len(plan)} dots in {plan.frames} frames, {lit_text}, in {output}"]
+    line = f"{len(plan)} dots in {plan.frames} frames, {lit_text}, in {options.output}"
+    print_found(options.as_json, summary, [line])
+
+
+@struct
+class GeometricOptions:
+    """The options of `hilstar calibrate geometric`."""
+
+    bench_file: Path = bench_argument()
+    plan: Path = option("DIR", "Directory that `calibrate dots` wrote.")
+    output: Path = output_option("geometry.toml", "The geometry file.")
+    observed: list[Path] | None = argument(
+        "OBSERVED...",
+        "A CSV of centroids (frame,x_px,y_px), or the tracker's images; none with --grab.",
     )
+    tracker_is_ideal: bool = switch(
+        "Take the tracker's lens as ideal; the file then holds both lenses."
+    )
+    plot: Path | None = option("OUT.png", "The error over the screen, and the residuals.")
+    as_json: bool = json_option()
 
 
-def geometric(
-    bench_file: BenchFile,
-    plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
-    output: Annotated[
-        Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")
-    ],
-    observed: Annotated[
-        list[Path] | None,
-        Argument(
-            metavar="OBSERVED...",
-            help="A CSV of centroids (frame,x_px,y_px), or the tracker's images; none with --grab.",
-        ),
-    ] = None,
-    grab: Grab = None,
-    exposure: Exposure = None,
-    feed: ShownTo = None,
-    overwrite: Overwrite = False,
-    tracker_is_ideal: Annotated[
-        bool,
-        Option(
-            "--tracker-is-ideal",
-            help="Take the tracker's lens as ideal; the file then holds both lenses.",
-        ),
-    ] = False,
-    dark: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help="A dark frame, taken from each image; with --grab one is taken, too.",
-        ),
-    ] = None,
-    plot: Annotated[
-        Path | None, Option(metavar="OUT.png", help="The error over the screen, and the residuals.")
-    ] = None,
-    as_json: Json = False,
-) -> None:
+def geometric(options: GeometricOptions, dots_from: DotOptions) -> None:
     """Fit the collimator's lens, the screen's tilt and the alignment to dots that the tracker
     saw.
     """
@@ -163,55 +154,46 @@ def geometric(
     )
     from hilstar.server.bench.bench_file import read_bench_file
 
-    check_ending("-o", output, TOML)
-    check_ending("--plot", plot, PNG)
-    file = read_bench_file(bench_file)
-    check_files([*(observed or []), dark, plan / "plan.csv"], [output, plot], file)
-    taken = dot_images(file, observed or [], plan, grab, exposure, feed, overwrite)
-    dark = dark or taken.dark
+    check_ending("-o", options.output, TOML)
+    check_ending("--plot", options.plot, PNG)
+    file = read_bench_file(options.bench_file)
+    observed = options.observed or []
+    plan_file = options.plan / "plan.csv"
+    check_files([*observed, dots_from.dark, plan_file], [options.output, options.plot], file)
+    taken = dot_images(file, observed, options.plan, dots_from)
     with busy("fitting the geometry"):
         calibration = calibrate_files(
-            file, taken.images, plan / "plan.csv", dark, tracker_is_ideal=tracker_is_ideal
+            file,
+            taken.images,
+            plan_file,
+            taken.dark,
+            tracker_is_ideal=options.tracker_is_ideal,
         )
-    monitor = file.config.monitor
-    written = write_calibrated(
-        output, calibration, plot, _monitor_of(monitor.display, monitor.resolution_px)
-    )
-    print_found(
-        as_json,
-        summary_of(calibration, written),
-        [*lines_of(calibration), NAMED.format(output.name)],
-    )
+    written = write_calibrated(options.output, calibration, options.plot, _monitor_of_bench(file))
+    summary = summary_of(calibration, written)
+    lines = lines_of(calibration)
+    lines.append(NAMED.format(options.output.name))
+    print_found(options.as_json, summary, lines)
 
 
-def psf(
-    bench_file: BenchFile,
-    plan: Annotated[Path, Option(metavar="DIR", help="Directory that `calibrate dots` wrote.")],
-    output: Annotated[
-        Path,
-        Option("-o", "--output", metavar="PSF.fits", help="The file for [tracker.optics] psf."),
-    ],
-    images: Annotated[
-        list[Path] | None,
-        Argument(metavar="IMAGES...", help="The tracker's images of the dots; none with --grab."),
-    ] = None,
-    grab: Grab = None,
-    exposure: Exposure = None,
-    feed: ShownTo = None,
-    overwrite: Overwrite = False,
-    dark: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help="A dark frame, taken from each image; with --grab one is taken, too.",
-        ),
-    ] = None,
-    oversampling: Annotated[
-        int, Option(metavar="N", help="Samples a tracker pixel along each axis.", min=2, max=16)
-    ] = 4,
-    plot: Annotated[Path | None, Option(metavar="OUT.png", help="The PSFs over the field.")] = None,
-    as_json: Json = False,
-) -> None:
+@struct
+class PsfOptions:
+    """The options of `hilstar calibrate psf`."""
+
+    bench_file: Path = bench_argument()
+    plan: Path = option("DIR", "Directory that `calibrate dots` wrote.")
+    output: Path = output_option("PSF.fits", "The file for [tracker.optics] psf.")
+    images: list[Path] | None = argument(
+        "IMAGES...", "The tracker's images of the dots; none with --grab."
+    )
+    oversampling: int = option(
+        "N", "Samples a tracker pixel along each axis.", default=4, min=2, max=16
+    )
+    plot: Path | None = option("OUT.png", "The PSFs over the field.")
+    as_json: bool = json_option()
+
+
+def psf(options: PsfOptions, dots_from: DotOptions) -> None:
     """Find the effective PSF of tracker and collimator over the field by the dots of `calibrate
     geometric`.
     """
@@ -224,83 +206,147 @@ def psf(
     from hilstar.optics.glass.psf_file import write_glass
     from hilstar.server.bench.bench_file import read_bench_file
 
-    check_ending("-o", output, FITS)
-    check_ending("--plot", plot, PNG)
-    file = read_bench_file(bench_file)
-    check_files([*(images or []), dark, plan / "plan.csv"], [output, plot], file)
-    taken = dot_images(file, images or [], plan, grab, exposure, feed, overwrite)
-    dark = dark or taken.dark
+    check_ending("-o", options.output, FITS)
+    check_ending("--plot", options.plot, PNG)
+    file = read_bench_file(options.bench_file)
+    images = options.images or []
+    plan_file = options.plan / "plan.csv"
+    check_files([*images, dots_from.dark, plan_file], [options.output, options.plot], file)
+    taken = dot_images(file, images, options.plan, dots_from)
     with busy("finding the PSFs"):
-        psf_result = effective_psf(file, taken.images, plan / "plan.csv", dark, oversampling)
-    write_glass(output, psf_result.glass)
-    if plot is not None:
-        draw_effective(plot, psf_result)
-    summary = summary_of(psf_result) | {
-        "written": [
-            str(written_path) for written_path in (output, plot) if written_path is not None
-        ]
-    }
-    print_found(
-        as_json,
-        summary,
-        [
-            *lines_of(psf_result),
-            f"in the bench file, under [tracker.optics]: psf = {str(output.name)!r}",
-        ],
+        psf_result = effective_psf(file, taken.images, plan_file, taken.dark, options.oversampling)
+    write_glass(options.output, psf_result.glass)
+    written = [str(options.output)]
+    if options.plot is not None:
+        draw_effective(options.plot, psf_result)
+        written.append(str(options.plot))
+    summary = summary_of(psf_result)
+    summary["written"] = written
+    lines = lines_of(psf_result)
+    lines.append(f"in the bench file, under [tracker.optics]: psf = {options.output.name!r}")
+    print_found(options.as_json, summary, lines)
+
+
+@struct
+class FocusOptions:
+    """The options of `hilstar calibrate focus`."""
+
+    bench_file: Path = bench_argument()
+    grab: str | None = option(
+        "CMD|genicam:NAME",
+        "Take the images here: a command as that of first-light ({output}, {pattern},"
+        " {exposure_s}), or a camera.",
     )
+    virtual: Path | None = option(
+        "TRUTH.toml", "Without hardware: a bench file that says how the bench really is."
+    )
+    images: int | None = option("N", "End after so many images. [at Ctrl-C]", min=1)
+    exposure: float | None = exposure_option()
+    feed: str | None = option(
+        "ENDPOINT", "Hand the dots on to who watches there (tcp://127.0.0.1:5570)."
+    )
+    as_json: bool = json_option()
 
 
-def _monitor_of(display: int | str, sides_px: tuple[int, int] | None = None) -> Any:
-    """The identity of the display that was measured, where this machine has it, of those sides;
-    None elsewhere.
+def focus(options: FocusOptions) -> None:
+    """Measure the PSF's sigma in image after image while somebody turns the tracker's ring.
+
+    A line for each image has the figure, the best so far and a curve of the last 40; it says where
+    stars are drawn out or saturate the tracker. Ctrl-C ends it with the best. With --json there is
+    an object for each image, and one of the best at the end.
+    """
+    from hilstar.basics.process.interrupts import stop_on_signal
+    from hilstar.instruments.calibrate.first_light.image_sources import NoImage, Stopped
+    from hilstar.instruments.calibrate.grabbed_dots import exposure_of
+    from hilstar.instruments.calibrate.live_focus import FocusCurve, focus_readings
+    from hilstar.server.bench.bench_file import read_bench_file
+
+    if (options.grab is None) == (options.virtual is None):
+        raise InputError("give --grab CMD or a camera, or --virtual TRUTH.toml: one of them")
+    file = read_bench_file(options.bench_file)
+    check_files([options.virtual], [], file)
+    source_options = ImageOptions(grab=options.grab, virtual=options.virtual, dark=None, diode=None)
+    stop = threading.Event()
+    curve = FocusCurve()
+    with (
+        temporary_folder("focus") as folder,
+        closing(image_source(file, source_options)) as source,
+        handed_on(options.feed, source),
+        stop_on_signal(stop),
+    ):
+        exposure_s = exposure_of(file, source, options.exposure)
+        try:
+            for reading in focus_readings(file, source, folder, exposure_s):
+                curve.add(reading)
+                print_found(options.as_json, reading, [curve.line()])
+                if stop.is_set() or reading.number == options.images:
+                    break
+        except Stopped:
+            pass
+        except NoImage:
+            # Ctrl-C at a terminal ends the command of --grab, too.
+            if not stop.is_set():
+                raise
+    best = curve.best
+    if best is None or best.figure is None:
+        raise InputError(curve.why_none())
+    summary = {"best": best, "images": len(curve.readings)}
+    sigma = f"{best.figure.psf_sigma_px:.3f} +- {best.figure.error_px:.3f} px"
+    place = f"image {best.number} of {len(curve.readings)}, after {best.t_s:.0f} s"
+    print_found(options.as_json, summary, [f"best: PSF sigma {sigma}: {place}"])
+
+
+def _monitor_of(display: int | str, modes: tuple[str, ...] = ("",)) -> "MonitorIdentity | None":
+    """The identity of the display that was measured, where this machine has it and its mode begins
+    like one of `modes`; None elsewhere.
     """
     from hilstar.display.window.this_monitor import identity_here
 
     identity = identity_here(display)
-    modes = () if sides_px is None else ("{}x{}@".format(*sides_px), "{1}x{0}@".format(*sides_px))
-    if identity is None or not identity.mode.startswith(modes or ""):
+    if identity is None or not identity.mode.startswith(modes):
         return None
     say(f"measured on {identity.name()}")
     return identity
 
 
-def alignment(
-    bench_file: BenchFile,
-    pairs: Annotated[
-        Path,
-        Argument(
-            metavar="PAIRS.csv",
-            help=(
-                "Commanded and reported q_icrs_to_cam, scalar first:"
-                " qw,qx,qy,qz,tw,tx,ty,tz[,valid]. With --ledger, the"
-                " tracker's telemetry: t_s,qw,qx,qy,qz[,valid]."
-            ),
-        ),
-    ],
-    output: Annotated[
-        Path, Option("-o", "--output", metavar="geometry.toml", help="The geometry file.")
-    ],
-    ledger: Annotated[
-        Path | None,
-        Option(
-            metavar="RUN.mcap",
-            help=(
-                "The ledger of the run that the telemetry is of: t_s is the middle of an exposure"
-                " in seconds of the ledger's"
-                " light_ns, the sender's clock."
-            ),
-        ),
-    ] = None,
-    offset_s: Annotated[
-        float | None,
-        Option(
-            "--offset-s",
-            metavar="SECONDS",
-            help="With --ledger: seconds to add to the telemetry's t_s; 0 by default.",
-        ),
-    ] = None,
-    as_json: Json = False,
-) -> None:
+def _monitor_of_bench(file: "BenchFile") -> "MonitorIdentity | None":
+    """The same of a bench's display, which may stand on its side."""
+    monitor = file.config.monitor
+    width_px, height_px = monitor.resolution_px
+    modes = (f"{width_px}x{height_px}@", f"{height_px}x{width_px}@")
+    return _monitor_of(monitor.display, modes)
+
+
+def _display_of(text: str) -> int | str:
+    """A display by its number or its name."""
+    if text.isdecimal():
+        return int(text)
+    return text
+
+
+@struct
+class AlignmentOptions:
+    """The options of `hilstar calibrate alignment`."""
+
+    bench_file: Path = bench_argument()
+    pairs: Path = argument(
+        "PAIRS.csv",
+        "Commanded and reported q_icrs_to_cam, scalar first: qw,qx,qy,qz,tw,tx,ty,tz[,valid]. With"
+        " --ledger, the tracker's telemetry: t_s,qw,qx,qy,qz[,valid].",
+    )
+    output: Path = output_option("geometry.toml", "The geometry file.")
+    ledger: Path | None = option(
+        "RUN.mcap",
+        "The ledger of the run that the telemetry is of: t_s is the middle of an exposure in"
+        " seconds of the ledger's light_ns, the sender's clock.",
+    )
+    offset_s: float | None = option(
+        "SECONDS", "With --ledger: seconds to add to the telemetry's t_s; 0 by default."
+    )
+    as_json: bool = json_option()
+
+
+def alignment(options: AlignmentOptions) -> None:
     """Find how the tracker stands before the screen from the attitudes that it reports, for one
     that gives nothing else.
     """
@@ -312,62 +358,54 @@ def alignment(
     )
     from hilstar.server.bench.bench_file import read_bench_file
 
-    check_ending("-o", output, TOML)
-    if offset_s is not None and ledger is None:
+    check_ending("-o", options.output, TOML)
+    if options.offset_s is not None and options.ledger is None:
         raise InputError(
             "--offset-s: pairs have no times; give it with --ledger RUN.mcap and the tracker's"
             " telemetry"
         )
-    if offset_s is not None and not abs(offset_s) < MAX_OFFSET_S:
+    if options.offset_s is not None and not abs(options.offset_s) < MAX_OFFSET_S:
         raise InputError(
-            f"--offset-s {offset_s}: write seconds, less than {MAX_OFFSET_S:g} either way"
+            f"--offset-s {options.offset_s}: write seconds, less than {MAX_OFFSET_S:g} either way"
         )
-    file = read_bench_file(bench_file)
-    check_files([pairs, ledger], [output], file)
+    file = read_bench_file(options.bench_file)
+    check_files([options.pairs, options.ledger], [options.output], file)
     with busy("fitting the alignment"):
-        aligned = align_files(file, pairs, ledger, offset_s or 0.0)
-    monitor = file.config.monitor
-    write_alignment(output, aligned, file, _monitor_of(monitor.display, monitor.resolution_px))
-    print_found(
-        as_json,
-        summary_of(aligned) | {"written": [str(output)]},
-        [*lines_of(aligned), NAMED.format(output.name)],
+        aligned = align_files(file, options.pairs, options.ledger, options.offset_s or 0.0)
+    write_alignment(options.output, aligned, file, _monitor_of_bench(file))
+    summary = summary_of(aligned)
+    summary["written"] = [str(options.output)]
+    lines = lines_of(aligned)
+    lines.append(NAMED.format(options.output.name))
+    print_found(options.as_json, summary, lines)
+
+
+@struct
+class PlanOptions:
+    """The options of `hilstar calibrate plan`."""
+
+    output: Path = output_option("PLAN.csv", "The plan, to be filled in.")
+    bits: int = option("N", "Bits per code.", default=8, min=1, max=16)
+    levels: int = option(
+        "N", "Levels from black to white; half of white is added.", default=32, min=2
     )
+    repeats: int = option(
+        "N", "Repeats of each level; 3 are enough for a plain power law.", default=6, min=1
+    )
+    channels: str = option("wrgb", "Channels to measure, of w, r, g, b.", default="w")
+    seed: int = seed_option("Seed of the order.")
+    headless: Path | None = option("DIR", "Write the patches to this directory as PNG.")
+    resolution: str = option("W,H", "Size of the pictures.", default="1920,1080")
+    show: bool = switch("Show the patches on a display: space for the next, q to quit.")
+    display: str = option("INDEX|NAME", "With --show: the display.", default="0")
+    dwell: float | None = option(
+        "SECONDS", "With --show: time for each patch, without keys.", min=0
+    )
+    overwrite: bool = overwrite_option()
+    as_json: bool = json_option()
 
 
-def plan(
-    output: Annotated[
-        Path, Option("-o", "--output", metavar="PLAN.csv", help="The plan, to be filled in.")
-    ],
-    bits: Annotated[int, Option(metavar="N", help="Bits per code.", min=1, max=16)] = 8,
-    levels: Annotated[
-        int, Option(metavar="N", help="Levels from black to white; half of white is added.", min=2)
-    ] = 32,
-    repeats: Annotated[
-        int,
-        Option(
-            metavar="N", help="Repeats of each level; 3 are enough for a plain power law.", min=1
-        ),
-    ] = 6,
-    channels: Annotated[
-        str, Option(metavar="wrgb", help="Channels to measure, of w, r, g, b.")
-    ] = "w",
-    seed: Annotated[int, seed_option("Seed of the order.")] = 0,
-    headless: Annotated[
-        Path | None, Option(metavar="DIR", help="Write the patches to this directory as PNG.")
-    ] = None,
-    resolution: Annotated[str, Option(metavar="W,H", help="Size of the pictures.")] = "1920,1080",
-    show: Annotated[
-        bool, Option("--show", help="Show the patches on a display: space for the next, q to quit.")
-    ] = False,
-    display: Annotated[str, Option(metavar="INDEX|NAME", help="With --show: the display.")] = "0",
-    dwell: Annotated[
-        float | None,
-        Option(metavar="SECONDS", help="With --show: time for each patch, without keys.", min=0),
-    ] = None,
-    overwrite: Overwrite = False,
-    as_json: Json = False,
-) -> None:
+def plan(options: PlanOptions) -> None:
     """Plan which codes to measure, in which order, and make their patches."""
     import numpy as np
 
@@ -380,75 +418,62 @@ def plan(
         write_plan,
     )
 
-    check_ending("-o", output, CSV)
-    check_directory("--headless", headless)
-    check_files([], [], None, output if is_filled_in(output) else None, overwrite)
-    width, height = (
-        round(value) for value in parse_numbers(resolution, 2, "--resolution", RESOLUTION_FORM)
-    )
-    if not (1 <= width <= 32768 and 1 <= height <= 32768):
-        raise InputError(f"--resolution {resolution}: write {RESOLUTION_FORM}")
-    settings = PlanSettings(bits, levels, repeats, channels)
-    planned = plan_patches(settings, np.random.default_rng(seed))
-    write_plan(output, planned)
-    written = [str(output)]
-    if headless is not None:
-        write_patches(headless, planned, (width, height), bits)
-        written.append(str(headless))
+    check_ending("-o", options.output, CSV)
+    check_directory("--headless", options.headless)
+    # only what a person filled in cannot be made again
+    if is_filled_in(options.output):
+        check_files([], [], None, options.output, options.overwrite)
+    size_px = parse_resolution(options.resolution)
+    settings = PlanSettings(options.bits, options.levels, options.repeats, options.channels)
+    planned = plan_patches(settings, np.random.default_rng(options.seed))
+    write_plan(options.output, planned)
+    written = [str(options.output)]
+    if options.headless is not None:
+        write_patches(options.headless, planned, size_px, options.bits)
+        written.append(str(options.headless))
     codes = len({patch.code for patch in planned})
     line = f"{len(planned)} patches of {codes} codes in {', '.join(written)}"
     advice = "fill in the column value, and give the file to hilstar calibrate photometric"
     summary = {
-        "bits": bits,
+        "bits": options.bits,
         "patches": len(planned),
         "codes": codes,
-        "seed": seed,
+        "seed": options.seed,
         "written": written,
     }
-    print_found(as_json, summary, [line, advice])
-    if show:
-        shown = show_patches(planned, bits, int(display) if display.isdecimal() else display, dwell)
+    print_found(options.as_json, summary, [line, advice])
+    if options.show:
+        display = _display_of(options.display)
+        shown = show_patches(planned, options.bits, display, options.dwell)
         say(f"{shown} of {len(planned)} patches shown")
-    elif headless is None:
+    elif options.headless is None:
         say(
             "add --show for the patches on a display (space for the next one), or --headless DIR"
             " for pictures of them"
         )
 
 
-def photometric(
-    measured: Annotated[
-        Path,
-        Argument(metavar="MEASURED.csv", help="code,channel,value; see configs/CALIBRATION.md."),
-    ],
-    output: Annotated[
-        Path, Option("-o", "--output", metavar="MONITOR.toml", help="The calibration file.")
-    ],
-    bits: Annotated[
-        int | None,
-        Option(
-            metavar="N", help="Bits per code; by default from the codes measured.", min=1, max=16
-        ),
-    ] = None,
-    who: Annotated[str, Option(metavar="NAME", help="Who made the measurements.")] = "",
-    when: Annotated[
-        str, Option(metavar="DATE", help="Date of the measurements; today by default.")
-    ] = "",
-    instrument: Annotated[str, Option(metavar="NAME", help="Instrument used.")] = "",
-    unit: Annotated[
-        str, Option(metavar="UNIT", help="Unit of the values, such as cd/m2 or DN.")
-    ] = "",
-    plot: Annotated[
-        Path | None, Option(metavar="OUT.png", help="The response and its residuals.")
-    ] = None,
-    display: Annotated[
-        str,
-        Option(
-            metavar="INDEX|NAME", help="The display that was measured, where this machine has one."
-        ),
-    ] = "0",
-    as_json: Json = False,
-) -> None:
+@struct
+class PhotometricOptions:
+    """The options of `hilstar calibrate photometric`."""
+
+    measured: Path = argument("MEASURED.csv", "code,channel,value; see configs/CALIBRATION.md.")
+    output: Path = output_option("MONITOR.toml", "The calibration file.")
+    bits: int | None = option(
+        "N", "Bits per code; by default from the codes measured.", min=1, max=16
+    )
+    who: str = option("NAME", "Who made the measurements.", default="")
+    when: str = option("DATE", "Date of the measurements; today by default.", default="")
+    instrument: str = option("NAME", "Instrument used.", default="")
+    unit: str = option("UNIT", "Unit of the values, such as cd/m2 or DN.", default="")
+    plot: Path | None = option("OUT.png", "The response and its residuals.")
+    display: str = option(
+        "INDEX|NAME", "The display that was measured, where this machine has one.", default="0"
+    )
+    as_json: bool = json_option()
+
+
+def photometric(options: PhotometricOptions) -> None:
     """Fit the monitor's response to measured patches."""
     from hilstar.instruments.calibrate.photometric import (
         Provenance,
@@ -456,76 +481,81 @@ def photometric(
         draw_calibration,
     )
 
-    check_ending("-o", output, TOML)
-    refuse_stdout("-o", output)
-    check_ending("--plot", plot, PNG)
-    check_files([measured], [output, output.with_suffix(".csv"), plot])
-    identity = _monitor_of(int(display) if display.isdecimal() else display)
-    provenance = Provenance(who, when, instrument, unit)
+    check_ending("-o", options.output, TOML)
+    refuse_stdout("-o", options.output)
+    check_ending("--plot", options.plot, PNG)
+    table = options.output.with_suffix(".csv")
+    check_files([options.measured], [options.output, table, options.plot])
+    identity = _monitor_of(_display_of(options.display))
+    provenance = Provenance(options.who, options.when, options.instrument, options.unit)
     with busy("fitting the response"):
-        found = calibrate_photometric(measured, output, provenance, bits, identity)
-    if plot is not None:
-        draw_calibration(measured, plot, bits)
-        found["written"].append(str(plot))
-    if as_json:
-        print_json(found)
-        return
-    black = found["black_level"]["relative"]
-    held = found["holdout"]
+        summary = calibrate_photometric(
+            options.measured, options.output, provenance, options.bits, identity
+        )
+    if options.plot is not None:
+        draw_calibration(options.measured, options.plot, options.bits)
+        summary["written"].append(str(options.plot))
+    lines = list(_response_lines(summary))
+    lines.append(f"{'written':20}{', '.join(summary['written'])}")
+    name = json.dumps(options.output.name)
+    lines.append(f"{'in the bench file':20}[monitor] calibration = {name}")
+    print_found(options.as_json, summary, lines)
+
+
+def _response_lines(summary: dict[str, Any]) -> Iterator[str]:
+    """The figures of a monitor's response as lines of text."""
+    black = summary["black_level"]["relative"]
+    contrast = "unknown: no light at code 0"
     if black > 0:
         contrast = f"1 : {1 / black:.0f}"
-    else:
-        contrast = "unknown: no light at code 0"
-    if found["drift_percent"] is None:
-        drift = "not known"
-    else:
-        drift = f"{found['drift_percent']:+.2f} %"
-    typer.echo(
-        f"{'measured':20}{found['codes']} codes above black, {found['bits']} bits; drift {drift}"
+    drift = "not known"
+    if summary["drift_percent"] is not None:
+        drift = f"{summary['drift_percent']:+.2f} %"
+    codes = f"{summary['codes']} codes above black, {summary['bits']} bits"
+    yield f"{'measured':20}{codes}; drift {drift}"
+    yield f"{'black level':20}{black:.3e} of white, contrast {contrast}"
+    yield f"{'noise':20}{100 * summary['noise_relative']:.2f} % of a reading"
+    holdout = summary["holdout"]
+    percents = [f"{holdout[name]:.2f}" for name in ("rms_percent", "p95_percent", "max_percent")]
+    yield (
+        f"{'held-out levels':20}{' / '.join(percents)} % (rms / 95 % / max),"
+        f" {holdout['max_mag']:.4f} mag maximum"
     )
-    typer.echo(f"{'black level':20}{black:.3e} of white, contrast {contrast}")
-    typer.echo(f"{'noise':20}{100 * found['noise_relative']:.2f} % of a reading")
-    typer.echo(
-        f"{'held-out levels':20}{held['rms_percent']:.2f} / {held['p95_percent']:.2f} /"
-        f" {held['max_percent']:.2f} % (rms / 95 % / max), {held['max_mag']:.4f} mag maximum"
-    )
-    for name, channel_fit in found["channels"].items() if len(found["channels"]) > 1 else ():
-        rms = channel_fit["holdout"]["rms_percent"]
-        under = channel_fit["black_level"]["relative"]
-        typer.echo(
-            f"{'channel ' + name:20}{channel_fit['shape']}, held-out levels {rms:.2f} % rms, black"
-            f" {under:.3e} of its white"
-        )
-    for decade, percent in (found["crosstalk_percent"] or {}).items():
-        unsure = found["crosstalk_error_percent"][decade]
-        typer.echo(
-            f"{'crosstalk at ' + decade:20}r + g + b is {percent:+.2f} +- {unsure:.2f} % from w"
-        )
-    typer.echo(f"{'written':20}{', '.join(found['written'])}")
-    typer.echo(f"{'in the bench file':20}[monitor] calibration = {json.dumps(output.name)}")
+    if len(summary["channels"]) > 1:
+        yield from _channel_lines(summary["channels"])
+    crosstalk = summary["crosstalk_percent"] or {}
+    for decade, percent in crosstalk.items():
+        error = summary["crosstalk_error_percent"][decade]
+        label = f"crosstalk at {decade}"
+        yield f"{label:20}r + g + b is {percent:+.2f} +- {error:.2f} % from w"
 
 
-def scale(
-    bench_file: BenchFile,
-    reading: Annotated[
-        list[str],
-        Option(
-            metavar="HIP,DN[,SIGMA]",
-            help="A star, the sum of its DN above the background, and the noise of that sum.",
-        ),
-    ],
-    exposure: Annotated[
-        float | None,
-        Option(metavar="SECONDS", help="The tracker's exposure; by default the bench file's."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        Option(
-            "-o", "--output", metavar="OUT.toml", help="A copy of the bench file with the key set."
-        ),
-    ] = None,
-    as_json: Json = False,
-) -> None:
+def _channel_lines(channels: dict[str, Any]) -> Iterator[str]:
+    """The response of each channel as a line of text."""
+    for name, channel in channels.items():
+        rms = channel["holdout"]["rms_percent"]
+        black = channel["black_level"]["relative"]
+        fit = f"{channel['shape']}, held-out levels {rms:.2f} % rms"
+        yield f"{f'channel {name}':20}{fit}, black {black:.3e} of its white"
+
+
+@struct
+class ScaleOptions:
+    """The options of `hilstar calibrate scale`."""
+
+    bench_file: Path = bench_argument()
+    reading: list[str] = option(
+        "HIP,DN[,SIGMA]",
+        "A star, the sum of its DN above the background, and the noise of that sum.",
+    )
+    exposure: float | None = option(
+        "SECONDS", "The tracker's exposure; by default the bench file's."
+    )
+    output: Path | None = output_option("OUT.toml", "A copy of the bench file with the key set.")
+    as_json: bool = json_option()
+
+
+def scale(options: ScaleOptions) -> None:
     """Scale the light by the tracker: what one pixel at white is worth, from its readings of
     stars shown.
     """
@@ -533,72 +563,66 @@ def scale(
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.build import open_bench
 
-    check_ending("-o", output, TOML)
-    file = read_bench_file(bench_file)
-    check_files([], [output], file)
+    check_ending("-o", options.output, TOML)
+    file = read_bench_file(options.bench_file)
+    check_files([], [options.output], file)
+    readings = [parse_reading(text) for text in options.reading]
+    exposure_s = options.exposure
+    if exposure_s is None:
+        exposure_s = file.config.tracker.exposure_s
     with open_bench(file) as bench:
-        if exposure is None:
-            exposure_s = bench.config.tracker.exposure_s
-        else:
-            exposure_s = exposure
-        found = scale_by_tracker(bench, [parse_reading(text) for text in reading], exposure_s)
-    if found.scatter_mag > UNSURE_MAG:
+        scaled = scale_by_tracker(bench, readings, exposure_s)
+    if scaled.scatter_mag > UNSURE_MAG:
         say(
-            f"the readings disagree by {found.scatter_mag:.3f} mag: look at background, saturation,"
-            " and the response"
+            f"the readings disagree by {scaled.scatter_mag:.3f} mag: look at background,"
+            " saturation, and the response"
         )
-    if output is not None:
-        with_flux_at_white(file, found, output)
-    keys = ("flux_at_white_e_per_s", "assumed_e_per_s", "scatter_mag", "relative_error")
-    summary: dict[str, Any] = {key: getattr(found, key) for key in keys}
-    summary |= {
-        "readings": len(reading),
+    written = None
+    if options.output is not None:
+        with_flux_at_white(file, scaled, options.output)
+        written = str(options.output)
+    summary = {
+        "flux_at_white_e_per_s": scaled.flux_at_white_e_per_s,
+        "assumed_e_per_s": scaled.assumed_e_per_s,
+        "scatter_mag": scaled.scatter_mag,
+        "relative_error": scaled.relative_error,
+        "readings": len(readings),
         "exposure_s": exposure_s,
-        "written": None if output is None else str(output),
+        "written": written,
     }
     lines = [
-        f"# by {len(reading)} readings of {exposure_s:g} s, scatter {found.scatter_mag:.4f} mag;"
-        " under [render]:"
+        f"# by {len(readings)} readings of {exposure_s:g} s, scatter {scaled.scatter_mag:.4f} mag;"
+        " under [render]:",
+        f"flux_at_white_e_per_s = {scaled.flux_at_white_e_per_s!r}",
     ]
-    lines.append(f"flux_at_white_e_per_s = {found.flux_at_white_e_per_s!r}")
-    if found.relative_error is not None:
+    if scaled.relative_error is not None:
         lines.append("# and how well it is known, under [certify]:")
-        lines += [
-            f"flux_at_white_relative = {found.relative_error:.3g}",
-            f"flux_at_white_dof = {len(found.ratios) - 1}",
-        ]
-    print_found(as_json, summary, lines)
+        lines.append(f"flux_at_white_relative = {scaled.relative_error:.3g}")
+        lines.append(f"flux_at_white_dof = {len(scaled.ratios) - 1}")
+    print_found(options.as_json, summary, lines)
 
 
-def reference(
-    readings: Annotated[
-        Path,
-        Argument(
-            metavar="READINGS.csv",
-            help=(
-                "target,azimuth_deg,elevation_deg[,station][,sigma_arcsec][,x_px,y_px]: faces of"
-                " the cube (+x, -y, ...), lit dots (dot), and links between stations (docs:"
-                " Calibration files)."
-            ),
-        ),
-    ],
-    bench_file: Annotated[
-        Path | None,
-        Option("--bench", metavar="BENCH.toml", help="The bench, for dots by their pixels."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        Option("-o", "--output", metavar="FILE.toml", help="Write the table [alignment] here."),
-    ] = None,
-    name: Annotated[str, Option(metavar="TEXT", help="What the reference is.")] = "",
-    as_json: Json = False,
-) -> None:
+@struct
+class ReferenceOptions:
+    """The options of `hilstar calibrate reference`."""
+
+    readings: Path = argument(
+        "READINGS.csv",
+        "target,azimuth_deg,elevation_deg[,station][,sigma_arcsec][,x_px,y_px]: faces of the cube"
+        " (+x, -y, ...), lit dots (dot), and links between stations (docs: Calibration files).",
+    )
+    bench_file: Path | None = option(
+        "BENCH.toml", "The bench, for dots by their pixels.", "--bench"
+    )
+    output: Path | None = output_option("FILE.toml", "Write the table [alignment] here.")
+    name: str = option("TEXT", "What the reference is.", default="")
+    as_json: bool = json_option()
+
+
+def reference(options: ReferenceOptions) -> None:
     """Find how the display stands to the tracker's cube from a theodolite's readings: the table
     [alignment] of the bench file.
     """
-    import datetime
-
-    from hilstar.basics.files import write_whole
     from hilstar.instruments.calibrate.reference import (
         fit_reference,
         lines_of,
@@ -609,21 +633,21 @@ def reference(
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.cameras import bench_camera
 
-    check_ending("-o", output, TOML)
+    check_ending("-o", options.output, TOML)
     camera = None
     file = None
-    if bench_file is not None:
-        file = read_bench_file(bench_file)
+    if options.bench_file is not None:
+        file = read_bench_file(options.bench_file)
         camera = bench_camera(file.config, file.folder)
-    check_files([readings, bench_file], [output], file)
-    found = fit_reference(readings, read_readings(readings, camera))
-    table = toml_of(found, name, datetime.datetime.now(datetime.UTC).date().isoformat())
+    check_files([options.readings, options.bench_file], [options.output], file)
+    fitted = fit_reference(options.readings, read_readings(options.readings, camera))
+    today = datetime.now(UTC).date().isoformat()
+    table = toml_of(fitted, options.name, today)
     written = []
-    if output is not None:
-        write_whole(output, table)
-        written.append(str(output))
-    print_found(
-        as_json,
-        summary_of(found) | {"written": written},
-        [*lines_of(found), "in the bench file:", *table.splitlines()],
-    )
+    if options.output is not None:
+        write_whole(options.output, table)
+        written.append(str(options.output))
+    summary = summary_of(fitted)
+    summary["written"] = written
+    lines = [*lines_of(fitted), "in the bench file:", *table.splitlines()]
+    print_found(options.as_json, summary, lines)

@@ -5,18 +5,18 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from functools import partial
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import typer
-from typer import Argument, Option
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory
 from hilstar.cli import running
-from hilstar.cli.options import Headless, Json, parse_memory
+from hilstar.cli.declare import argument, option, struct, switch
+from hilstar.cli.options import json_option, output_option, parse_memory
+from hilstar.cli.running import DisplayOptions, PageOptions
 from hilstar.server.console.terminal import print_found, progress, say
 
 if TYPE_CHECKING:
@@ -30,153 +30,144 @@ CENTROIDS = "centroids"  # the solver without another one
 LINE_S = 10.0  # between lines of progress where stderr is no terminal
 
 
+@struct
+class CaseOptions:
+    """Who is tested by the cases of a plan, and on how many cores."""
+
+    workers: int | None = option(
+        "N", "Processes on this machine; by default one a core.", min=1, max=1024
+    )
+    solver: str = option(
+        "SOLVER",
+        'What is tested: "centroids", "python:MODULE:FUNCTION", or a command with {image} that'
+        " prints a quaternion; not on a real bench.",
+        default=CENTROIDS,
+    )
+    solver_timeout: float = option(
+        "SECONDS", "Time limit of one image, s.", default=10.0, min=0.01, max=86400
+    )
+
+    def processes(self) -> int:
+        """The number of worker processes on this machine."""
+        return self.workers or len(os.sched_getaffinity(0))
+
+
+@struct
+class CampaignOptions:
+    """The options of `hilstar campaign`."""
+
+    plan: Path = argument("PLAN.toml", "What varies, and how (docs: Campaigns).")
+    output: Path = output_option("DIR", "Directory of the campaign; it goes on where it was.")
+    scheduler: str | None = option(
+        "tcp://HOST:PORT", "A Dask scheduler, whose workers run the cases; off loopback with TLS."
+    )
+    tls_ca_file: Path | None = option(
+        "FILE", "With --scheduler tls://HOST:PORT: the CA's certificates, PEM, as Dask's."
+    )
+    tls_cert: Path | None = option("FILE", "This side's certificate, PEM.")
+    tls_key: Path | None = option("FILE", "Its key, where the certificate's file has none.")
+    images: Literal["fits"] | None = option("", "Keep the images, with their truth.")
+    memory: str | None = option(
+        "SIZE", "For this process and its workers together, such as 4GB: as many run as fit."
+    )
+    strict: bool = switch("Exit with code 1 where one of the plan's requirements is not met.")
+    as_json: bool = json_option()
+
+
 def campaign(
-    plan: Annotated[
-        Path, Argument(metavar="PLAN.toml", help="What varies, and how (docs: Campaigns).")
-    ],
-    output: Annotated[
-        Path,
-        Option(
-            "-o",
-            "--output",
-            metavar="DIR",
-            help="Directory of the campaign; it goes on where it was.",
-        ),
-    ],
-    workers: Annotated[
-        int | None,
-        Option(
-            metavar="N", help="Processes on this machine; by default one a core.", min=1, max=1024
-        ),
-    ] = None,
-    scheduler: Annotated[
-        str | None,
-        Option(
-            metavar="tcp://HOST:PORT",
-            help="A Dask scheduler, whose workers run the cases; off loopback with TLS.",
-        ),
-    ] = None,
-    tls_ca_file: Annotated[
-        Path | None,
-        Option(
-            metavar="FILE",
-            help="With --scheduler tls://HOST:PORT: the CA's certificates, PEM, as Dask's.",
-        ),
-    ] = None,
-    tls_cert: Annotated[
-        Path | None, Option(metavar="FILE", help="This side's certificate, PEM.")
-    ] = None,
-    tls_key: Annotated[
-        Path | None, Option(metavar="FILE", help="Its key, where the certificate's file has none.")
-    ] = None,
-    solver: Annotated[
-        str,
-        Option(
-            metavar="SOLVER",
-            help=(
-                'What is tested: "centroids", "python:MODULE:FUNCTION", or a command with {image}'
-                " that prints a quaternion."
-            ),
-        ),
-    ] = CENTROIDS,
-    solver_timeout: Annotated[
-        float, Option(metavar="SECONDS", help="Time limit of one image, s.", min=0.01, max=86400)
-    ] = 10.0,
-    images: Annotated[
-        Literal["fits"] | None, Option(help="Keep the images, with their truth.")
-    ] = None,
-    memory: Annotated[
-        str | None,
-        Option(
-            metavar="SIZE",
-            help="For this process and its workers together, such as 4GB: as many run as fit.",
-        ),
-    ] = None,
-    headless: Headless = False,
-    windowed: running.Windowed = False,
-    force: running.Force = False,
-    feed: running.Feed = None,
-    console: running.Console = None,
-    token: running.Token = None,
-    console_name: running.ConsoleName = None,
-    strict: Annotated[
-        bool,
-        Option(
-            "--strict", help="Exit with code 1 where one of the plan's requirements is not met."
-        ),
-    ] = False,
-    as_json: Json = False,
+    options: CampaignOptions, cases: CaseOptions, display: DisplayOptions, page: PageOptions
 ) -> None:
     """Run a plan's cases over every core, or a cluster, into one Parquet table, a row a case."""
-    from hilstar.instruments.campaign.cluster import Scheduler
     from hilstar.instruments.campaign.run import Campaign
     from hilstar.instruments.campaign.store import Directory
 
-    check_directory("-o", output)
-    if scheduler is not None and (workers is not None or memory is not None):
+    check_directory("-o", options.output)
+    cluster = _scheduler(options, cases)
+    memory_bytes = None
+    if options.memory is not None:
+        memory_bytes = parse_memory(options.memory)
+    keeps_images = options.images is not None
+    this = Campaign(options.plan, options.output, cases.solver, cases.solver_timeout, keeps_images)
+    of_tracker = {
+        "--workers": cases.workers is not None,
+        "--scheduler": options.scheduler is not None,
+        "--memory": options.memory is not None,
+        "--images": keeps_images,
+        "--solver": cases.solver != CENTROIDS,
+    }
+    of_bench = display.given()
+    of_bench["--console"] = page.console is not None
+    check_through("campaign", "through =", this.on_bench, of_bench, of_tracker)
+    directory = Directory(options.output)
+    try:
+        directory.claim(this.about())
+        if not directory.table.exists() and this.on_bench:
+            with running.page_listener(page) as listener:
+                show_cases(this, directory, display, listener)
+        elif not directory.table.exists():
+            run_cases(this, directory, cluster, cases.processes(), memory_bytes)
+        results = _results(this, directory)
+    finally:
+        directory.close()
+    print_found(options.as_json, results.summary, results.lines)
+    if options.strict and results.not_met:
+        raise typer.Exit(1)
+
+
+def _scheduler(options: CampaignOptions, cases: CaseOptions) -> "Scheduler | None":
+    """The cluster of the command line, checked; None where this machine runs the cases. Raises
+    InputError.
+    """
+    from hilstar.instruments.campaign.cluster import Scheduler
+
+    keys = (options.tls_ca_file, options.tls_cert, options.tls_key)
+    if options.scheduler is None:
+        if any(keys):
+            raise InputError(
+                "campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it"
+            )
+        return None
+    if cases.workers is not None or options.memory is not None:
         raise InputError(
             "campaign --scheduler: the cluster's workers are its own; leave out --workers and"
             " --memory"
         )
-    pooled = {
-        "--workers": workers is not None,
-        "--scheduler": scheduler is not None,
-        "--memory": memory is not None,
-    }
-    pooled |= {"--images": images is not None, "--solver": solver != CENTROIDS}
-    cluster = None if scheduler is None else Scheduler(scheduler, tls_ca_file, tls_cert, tls_key)
-    if cluster is not None:
-        cluster.check()
-    elif tls_ca_file or tls_cert or tls_key:
-        raise InputError(
-            "campaign --tls-*: is for a cluster; write --scheduler tls://HOST:PORT beside it"
-        )
-    memory_bytes = None if memory is None else parse_memory(memory)
-    this = Campaign(plan, output, solver, solver_timeout, images is not None)
-    of_bench = {"--headless": headless, "--windowed": windowed, "--force": force}
-    of_bench |= {"--feed": feed is not None, "--console": console is not None}
-    check_through("campaign", "through =", this.on_bench, of_bench, pooled)
-    directory = Directory(output)
-    try:
-        directory.claim(this.about())
-        if not directory.table.exists() and this.on_bench:
-            shown_bench = partial(
-                running.shown_bench, headless=headless, windowed=windowed, force=force, timed=True
-            )
-            with running.page_listener(console, False, token, console_name) as listener:
-                show_cases(this, directory, shown_bench, feed, listener)
-        elif not directory.table.exists():
-            run_cases(
-                this, directory, cluster, workers or len(os.sched_getaffinity(0)), memory_bytes
-            )
-        # charts and statistics, once there is a table
-        from hilstar.instruments.campaign.page import PAGE_FILE
-        from hilstar.instruments.campaign.results import lines_of, write_results
+    scheduler = Scheduler(options.scheduler, *keys)
+    scheduler.check()
+    return scheduler
 
-        summary = write_results(directory.table, this.maker.file, this.plan.seed)
-        lines, not_met = lines_of(summary), False
-        if this.on_bench:
-            from hilstar.instruments.campaign.bench_results import bench_lines, bench_summary
 
-            summary |= bench_summary(directory.table)
-            lines += bench_lines(summary)
-        if this.plan.require:
-            from hilstar.instruments.campaign.requirements import NOT_MET
-            from hilstar.instruments.campaign.requirements_page import (
-                summary_of,
-                write_requirements,
-            )
+class _Results(NamedTuple):
+    """What --json has of a campaign, its lines, and whether a requirement is not met."""
 
-            verdicts = write_requirements(this.plan, this.path, directory.table, this.maker.file)
-            not_met = any(requirement.verdict == NOT_MET for requirement in verdicts)
-            summary["requirements"] = [summary_of(requirement) for requirement in verdicts]
-            lines += [requirement.words for requirement in verdicts]
-    finally:
-        directory.close()
+    summary: dict[str, Any]
+    lines: list[str]
+    not_met: bool
+
+
+def _results(this: "Campaign", directory: "Directory") -> _Results:
+    """Write charts, statistics and verdicts of a campaign that has its table."""
+    from hilstar.instruments.campaign.page import PAGE_FILE
+    from hilstar.instruments.campaign.results import lines_of, write_results
+
+    summary = write_results(directory.table, this.maker.file, this.plan.seed)
+    lines = lines_of(summary)
+    if this.on_bench:
+        from hilstar.instruments.campaign.bench_results import bench_lines, bench_summary
+
+        summary |= bench_summary(directory.table)
+        lines += bench_lines(summary)
+    not_met = False
+    if this.plan.require:
+        from hilstar.instruments.campaign.requirements import NOT_MET
+        from hilstar.instruments.campaign.requirements_page import summary_of, write_requirements
+
+        verdicts = write_requirements(this.plan, this.path, directory.table, this.maker.file)
+        not_met = any(requirement.verdict == NOT_MET for requirement in verdicts)
+        summary["requirements"] = [summary_of(requirement) for requirement in verdicts]
+        lines += [requirement.words for requirement in verdicts]
     lines.append(f"{'page':20}{directory.table.with_name(PAGE_FILE)}")
-    print_found(as_json, summary, lines)
-    if strict and not_met:
-        raise typer.Exit(1)
+    return _Results(summary, lines, not_met)
 
 
 def check_through(
@@ -186,20 +177,24 @@ def check_through(
     of_bench: dict[str, bool],
     of_tracker: dict[str, bool],
 ) -> None:
-    """Refuse (InputError) options that mean nothing for the plan's `through`, which is written as
-    `setting` in a plan or in a command.
+    """Refuse (InputError) options that mean nothing for a plan's `through`; `setting` is how the
+    plan or the command writes it.
     """
-    for name, given in (of_tracker if on_bench else of_bench).items():
+    if on_bench:
+        meaningless = of_tracker
+        through = "tracker or display"
+    else:
+        meaningless = of_bench
+        through = "bench"
+    for name, given in meaningless.items():
         if given:
-            through = "tracker or display" if on_bench else "bench"
             raise InputError(f"{command} {name}: is for {setting} {through}; leave it out")
 
 
 def show_cases(
     this: "Campaign",
     directory: "Directory",
-    shown_bench: Callable[["BenchFile"], AbstractContextManager[tuple[Any, Any]]],
-    endpoint: str | None,
+    display: running.DisplayOptions,
     listener: "PageListener | None",
 ) -> None:
     """Show the missing cases to the real tracker, with progress on the terminal and on the page."""
@@ -220,7 +215,8 @@ def show_cases(
 
         def on_done(done: int) -> None:
             nonlocal count, begun, said_s
-            begun = begun if count else done
+            if not count:
+                begun = done
             now_s = time.monotonic()
             count = min(done, this.cases)
             advance(count)
@@ -230,10 +226,10 @@ def show_cases(
                 notices.tell("campaign", f"{count} of {this.cases} cases, {left_s:.0f} s left")
 
         @contextmanager
-        def display(file: "BenchFile") -> Iterator[OpenDisplay]:
+        def opened(file: "BenchFile") -> Iterator[OpenDisplay]:
             with (
-                shown_bench(file) as (bench, screen),
-                running.optional_frames(endpoint, bench, screen) as feed,
+                running.shown_bench(file, display, timed=True) as (bench, screen),
+                running.optional_frames(display.feed, bench, screen) as feed,
             ):
                 ledger = LedgerSwitch()
                 renderer = bench.renderer.gl_renderer
@@ -249,7 +245,7 @@ def show_cases(
                 ):
                     yield OpenDisplay(bench, screen, sink, follower)
 
-        if not this.show(directory, display, notices, on_done):
+        if not this.show(directory, opened, notices, on_done):
             say(
                 f"hilstar: {count} of {this.cases} cases are done; the same command goes on from"
                 " there"

@@ -1,60 +1,47 @@
 """hilstar catalogue: the stars of a bench as its tracker sees them."""
 
 from pathlib import Path
-from typing import Annotated
-
-from typer import Option
 
 from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.files import STDOUT, check_outputs
-from hilstar.cli.options import BenchFile, Json
+from hilstar.cli.declare import option, struct
+from hilstar.cli.options import bench_argument, json_option, output_option
 from hilstar.server.console.terminal import busy, print_found
 
 
-def catalogue(
-    bench_file: BenchFile,
-    output: Annotated[
-        Path,
-        Option(
-            "-o",
-            "--output",
-            metavar="STARS.csv|fits|parquet|vot",
-            help="The table; its ending says what it is.",
-        ),
-    ],
-    faintest: Annotated[
-        float | None,
-        Option(
-            "--faintest", metavar="MAG", help="Faintest V; the bench's by default.", min=-30, max=40
-        ),
-    ] = None,
-    epoch: Annotated[
-        float | None,
-        Option(
-            "--epoch",
-            metavar="JYEAR",
-            help="Julian year of the places; the bench's by default.",
-            min=-10_000,
-            max=10_000,
-        ),
-    ] = None,
-    as_json: Json = False,
-) -> None:
+@struct
+class CatalogueOptions:
+    """The options of `hilstar catalogue`."""
+
+    bench_file: Path = bench_argument()
+    output: Path = output_option(
+        "STARS.csv|fits|parquet|vot", "The table; its ending says what it is."
+    )
+    faintest: float | None = option("MAG", "Faintest V; the bench's by default.", min=-30, max=40)
+    epoch: float | None = option(
+        "JYEAR", "Julian year of the places; the bench's by default.", min=-10_000, max=10_000
+    )
+    as_json: bool = json_option()
+
+
+def catalogue(options: CatalogueOptions) -> None:
     """Write the stars as the tracker sees them: places with errors, types, electrons per second,
     instrument magnitudes.
     """
     from hilstar.server.bench.bench_file import read_bench_file
     from hilstar.server.bench.catalogue import ENDINGS, bench_catalogue, write_catalogue
 
+    output = options.output
     if output != STDOUT and output.suffix.lower() not in ENDINGS:
+        endings = ", ".join(ENDINGS)
         raise InputError(
-            f"-o {shortened(str(output))}: give a name that ends in {', '.join(ENDINGS)}, or - for"
-            " CSV on stdout"
+            f"-o {shortened(str(output))}: give a name that ends in {endings}, or - for CSV on"
+            " stdout"
         )
-    check_outputs([bench_file], [output])
-    file = read_bench_file(bench_file)
+    check_outputs([options.bench_file], [output])
+    file = read_bench_file(options.bench_file)
     with busy("computing the catalogue"):
-        bench_stars = bench_catalogue(file, faintest, epoch)
+        bench_stars = bench_catalogue(file, options.faintest, options.epoch)
         write_catalogue(output, bench_stars)
     fields = {
         "file": str(output),
@@ -65,8 +52,5 @@ def catalogue(
     vega = bench_stars.zero_points["vega"]
     ab = bench_stars.zero_points["ab"]
     worth = f"an electron per second is {vega:.4f} mag (Vega), {ab:.4f} mag (AB)"
-    print_found(
-        as_json,
-        fields,
-        [f"{len(bench_stars)} stars at J{bench_stars.epoch_jyear:g}; {worth}; wrote {output}"],
-    )
+    count = f"{len(bench_stars)} stars at J{bench_stars.epoch_jyear:g}"
+    print_found(options.as_json, fields, [f"{count}; {worth}; wrote {output}"])

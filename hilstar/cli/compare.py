@@ -1,93 +1,90 @@
 """hilstar compare: two frames, star by star."""
 
-from itertools import product
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import Any
 
 import typer
-from typer import Argument, Option
 
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.options import Json
-from hilstar.server.console.terminal import busy, print_json
+from hilstar.cli.declare import argument, option, struct
+from hilstar.cli.options import json_option, output_option
+from hilstar.server.console.terminal import busy, print_found
 
 MAX_LINES = 10  # stars listed: if the whole sky differs, more of them say nothing
 
 
-def compare(
-    frame: Annotated[
-        Path, Argument(metavar="A.fits", help="The linear image from `hilstar frame -o`.")
-    ],
-    golden: Annotated[
-        Path, Argument(metavar="B.fits", help="The golden frame that it is compared with.")
-    ],
-    truth: Annotated[
-        Path | None, Option(metavar="TRUTH.csv", help="B's stars, from `hilstar frame --truth`.")
-    ] = None,
-    flux_mag: Annotated[
-        float | None, Option(metavar="MAG", help="Largest flux error of a star; 0.001 by default.")
-    ] = None,
-    centroid_px: Annotated[
-        float | None,
-        Option(metavar="PX", help="Largest centroid error of a star; 0.001 by default."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        Option("-o", "--output", metavar="DIR", help="Directory for a page, a chart and a table."),
-    ] = None,
-    as_json: Json = False,
-) -> None:
+@struct
+class CompareOptions:
+    """The options of `hilstar compare`."""
+
+    frame: Path = argument("A.fits", "The linear image from `hilstar frame -o`.")
+    golden: Path = argument("B.fits", "The golden frame that it is compared with.")
+    truth: Path | None = option("TRUTH.csv", "B's stars, from `hilstar frame --truth`.")
+    flux_mag: float | None = option("MAG", "Largest flux error of a star; 0.001 by default.")
+    centroid_px: float | None = option("PX", "Largest centroid error of a star; 0.001 by default.")
+    output: Path | None = output_option("DIR", "Directory for a page, a chart and a table.")
+    as_json: bool = json_option()
+
+
+def compare(options: CompareOptions) -> None:
     """Compare two frames star by star; exit code 0 if they show the same sky, 1 if not."""
     from hilstar.instruments.compare import compare as compare_files
     from hilstar.instruments.compare.report import write_report
     from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG, star_lines
 
-    check_directory("-o", output)
-    limits = (
-        FLUX_MAG if flux_mag is None else flux_mag,
-        CENTROID_PX if centroid_px is None else centroid_px,
-    )
+    check_directory("-o", options.output)
+    flux_mag = FLUX_MAG if options.flux_mag is None else options.flux_mag
+    centroid_px = CENTROID_PX if options.centroid_px is None else options.centroid_px
     with busy("comparing"):
         comparison = compare_files(
-            frame, golden, flux_mag=limits[0], centroid_px=limits[1], truth=truth
+            options.frame,
+            options.golden,
+            flux_mag=flux_mag,
+            centroid_px=centroid_px,
+            truth=options.truth,
         )
-        if output is not None:
-            write_report(make_directory(output), comparison)
+        if options.output is not None:
+            write_report(make_directory(options.output), comparison)
     summary = comparison.summary()
-    if as_json:
-        print_json(summary)
-    else:
-        if comparison.common is not None:
-            typer.echo(f"{'in common':20}{comparison.common.line()}")
-        rest = (
-            f"{summary['blends']} of them blends, {summary['unmeasured']} more with too little"
-            " light of their own in view"
-        )
-        typer.echo(f"{'stars compared':20}{summary['stars']}, {rest}")
-        by_channel = {"": summary} | {
-            f", {name}": channel_summary for name, channel_summary in summary["channels"].items()
-        }
-        for (name, unit), (channel, figures) in product(
-            (("flux", "mag"), ("centroid", "px")), by_channel.items()
-        ):
-            limit = summary["limits"][f"{name}_{unit}"]
-            three = " / ".join(
-                "-" if value is None else f"{value:.2g}"
-                for value in figures[f"{name}_error_{unit}"].values()
-            )
-            typer.echo(
-                f"{f'{name} error{channel}':20}{three} {unit} (rms / 95 % / max; limit {limit:g})"
-            )
-        if summary["widened"]:
-            why = "for rounding of the light around them or the image's edge"
-            typer.echo(f"{'wider limits':20}{summary['widened']} stars, {why}")
-        typer.echo(f"{'missing, extra':20}{summary['missing']}, {summary['extra']}")
-        if output is None:
-            where = " (-o DIR writes a table of all)"
-        else:
-            where = f" (in {output / 'compare.csv'})"
-        for line in star_lines(comparison, MAX_LINES, where):
-            typer.echo(f"{'':20}{line}")
-        typer.echo(f"{'verdict':20}{'the same sky' if comparison.same else 'NOT the same sky'}")
+    where = " (-o DIR writes a table of all)"
+    if options.output is not None:
+        where = f" (in {options.output / 'compare.csv'})"
+    lines = list(_figure_lines(summary))
+    if comparison.common is not None:
+        lines.insert(0, f"{'in common':20}{comparison.common.line()}")
+    lines += [f"{'':20}{line}" for line in star_lines(comparison, MAX_LINES, where)]
+    verdict = "the same sky" if comparison.same else "NOT the same sky"
+    lines.append(f"{'verdict':20}{verdict}")
+    print_found(options.as_json, summary, lines)
     if not comparison.same:
         raise typer.Exit(1)
+
+
+def _figure_lines(summary: dict[str, Any]) -> Iterator[str]:
+    """How many stars were compared, and their errors by channel."""
+    rest = (
+        f"{summary['blends']} of them blends, {summary['unmeasured']} more with too little light"
+        " of their own in view"
+    )
+    yield f"{'stars compared':20}{summary['stars']}, {rest}"
+    for name, unit in (("flux", "mag"), ("centroid", "px")):
+        key = f"{name}_error_{unit}"
+        limit = summary["limits"][f"{name}_{unit}"]
+        errors = {f"{name} error": summary[key]}
+        for channel, figures in summary["channels"].items():
+            errors[f"{name} error, {channel}"] = figures[key]
+        for label, error in errors.items():
+            figure = " / ".join(_figure(value) for value in error.values())
+            yield f"{label:20}{figure} {unit} (rms / 95 % / max; limit {limit:g})"
+    if summary["widened"]:
+        why = "for rounding of the light around them or the image's edge"
+        yield f"{'wider limits':20}{summary['widened']} stars, {why}"
+    yield f"{'missing, extra':20}{summary['missing']}, {summary['extra']}"
+
+
+def _figure(value: float | None) -> str:
+    """A figure, and a dash for none."""
+    if value is None:
+        return "-"
+    return f"{value:.2g}"

@@ -20,7 +20,7 @@ def offered(words: Iterable[str] | Callable[[], Iterable[str]]) -> Offer:
 
 
 def centroiders() -> Iterable[str]:
-    """Who finds the stars."""
+    """The centroiders that a budget takes."""
     from hilstar.tracker.centroiders import FAMILY
 
     return (*FAMILY, "all")

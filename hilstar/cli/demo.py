@@ -6,17 +6,18 @@ import sys
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, NamedTuple
 
 import typer
-from typer import Option
 
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.files import check_directory, make_directory, temporary_folder
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import caught
 from hilstar.cli import running
-from hilstar.cli.options import Json, seed_option
+from hilstar.cli.declare import option, struct, switch
+from hilstar.cli.options import json_option, output_option, seed_option
+from hilstar.cli.running import ActingPageOptions
 from hilstar.server.console.run_status import RunSource, RunStatus
 from hilstar.server.console.terminal import progress, report, say
 
@@ -24,13 +25,14 @@ if TYPE_CHECKING:
     from hilstar.server.bench.frame import Bench
     from hilstar.server.console.listener import PageListener
     from hilstar.server.frame_feed import FrameFeed
-    from hilstar.server.pacer import FrameSink
+    from hilstar.server.pacer import FrameSink, Shown
     from hilstar.server.serve import Outlet
+    from hilstar.server.summary import RunSummary
 
 HZ = 60  # the demo bench's refresh
-USUAL_S, LOOP_S = 10.0, 60.0
+USUAL_S, LOOP_S = 10.0, 60.0  # of a run, and of one with a tracker, whose noise takes answers
 MAX_MISSED = 0.01  # share of frames from which the budget is no longer the tracker's alone
-FREE_PORT = "tcp://127.0.0.1:*"
+FREE_PORT = "tcp://127.0.0.1:*"  # ZeroMQ chooses it
 # the tracker of --loop
 BIAS_ARCSEC, FOV_ARCSEC, PIXEL_ARCSEC, WRONG = (20.0, -10.0, 40.0), 2.0, 0.6, 0.01
 PLANTED = [
@@ -44,33 +46,22 @@ PLANTED = [
 PLANTED += ["--wrong", str(WRONG)]
 
 
-def demo(
-    output: Annotated[
-        Path, Option("-o", "--output", metavar="DIR", help="Directory for the pictures.")
-    ] = Path("hilstar-demo"),
-    duration: Annotated[
-        float | None,
-        Option(
-            metavar="SECONDS",
-            help="Seconds to run; by default 10, and 60 with --loop.",
-            min=0.5,
-            max=600,
-        ),
-    ] = None,
-    loop: Annotated[
-        bool,
-        Option(
-            "--loop",
-            help="A slow scan with a virtual tracker before the display, and its error budget.",
-        ),
-    ] = False,
-    seed: Annotated[int, seed_option("Seed of the jitter, and of the tracker's errors.")] = 1,
-    console: running.Console = None,
-    control: running.Control = False,
-    token: running.Token = None,
-    console_name: running.ConsoleName = None,
-    as_json: Json = False,
-) -> None:
+@struct
+class DemoOptions:
+    """The options of `hilstar demo`."""
+
+    output: Path = output_option("DIR", "Directory for the pictures.", default=Path("hilstar-demo"))
+    duration: float | None = option(
+        "SECONDS", "Seconds to run; by default 10, and 60 with --loop.", min=0.5, max=600
+    )
+    loop: bool = switch(
+        "A slow scan with a virtual tracker before the display, and its error budget."
+    )
+    seed: int = seed_option("Seed of the jitter, and of the tracker's errors.", default=1)
+    as_json: bool = json_option()
+
+
+def demo(options: DemoOptions, page: ActingPageOptions) -> None:
     """The main job in one command: real stars, an attitude streamed over a real ZeroMQ socket,
     frames out.
 
@@ -82,58 +73,72 @@ def demo(
     from hilstar.basics.resources import resource_path
     from hilstar.server.demo import Shows, run_demo, scan_samples, slew_samples, write_pictures
 
-    check_directory("-o", output)
-    seconds = duration or (LOOP_S if loop else USUAL_S)
-    samples = (scan_samples if loop else slew_samples)(seconds + 1.0, np.random.default_rng(seed))
+    check_directory("-o", options.output)
+    seconds = options.duration or (LOOP_S if options.loop else USUAL_S)
+    rng = np.random.default_rng(options.seed)
+    motion = scan_samples if options.loop else slew_samples
+    samples = motion(seconds + 1.0, rng)
     demo_file = resource_path("configs", "demo.toml")
+    beside: AbstractContextManager[TrackerBeside | None] = nullcontext()
+    if options.loop:
+        beside = tracker_beside(options.output, demo_file, seconds, options.seed)
     with (
-        running.page_listener(console, control, token, console_name) as listener,
-        tracker_beside(output, demo_file, seconds, seed) if loop else nullcontext() as tracker,
+        running.page_listener(page) as listener,
+        beside as tracker,
         progress("serving", seconds * HZ) as advance,
     ):
+
+        def counted(shown: "Shown") -> None:
+            advance(shown.number + 1)
 
         def watching(
             bench: "Bench", endpoint: str
         ) -> "AbstractContextManager[tuple[FrameSink, Outlet]]":
-            return _watching(
-                bench, endpoint, listener, control, lambda shown: advance(shown.number + 1), tracker
-            )
+            return _watching(bench, endpoint, listener, page.control, counted, tracker)
 
-        if tracker is None:
-            shows = Shows(demo_file, samples)
-        else:
+        shows = Shows(demo_file, samples)
+        if tracker is not None:
             shows = Shows(tracker.bench_file, samples, tracker.watches)
-        result = run_demo(output, seconds, shows, watching)
+        result = run_demo(options.output, seconds, shows, watching)
     if result.kept and caught() is None:  # no pictures after Ctrl-C
-        if not as_json:
-            say(f"writing {len(result.kept)} pictures and their previews to {output}")
+        if not options.as_json:
+            say(f"writing {len(result.kept)} pictures and their previews to {options.output}")
         with progress("writing pictures", 2 * len(result.kept)) as advance:
-            write_pictures(output, result, advance)
-    report(result.summary, as_json)
+            write_pictures(options.output, result, advance)
+    report(result.summary, options.as_json)
     if tracker is not None and caught() is None:
-        tracker.report(result.summary.answers, as_json)
-        missed = result.summary.missed_frames
-        if missed > MAX_MISSED * result.summary.frames:
-            line = (
-                f"the display missed {missed} frames, and answers that looked while it held a frame"
-                " are in no figure"
-            )
-            say(f"hilstar: {line}; the machine is busy: close other programs, and run it again")
-    if not as_json:
+        tracker.report(result.summary.answers, options.as_json)
+        _say_missed(result.summary)
+    if not options.as_json:
         typer.echo(
-            f"{'pictures':20}{output}/frame_*_codes.png (what the monitor gets), _preview.png"
-            " (stretched)"
+            f"{'pictures':20}{options.output}/frame_*_codes.png (what the monitor gets),"
+            " _preview.png (stretched)"
         )
     if result.summary.stale_frames and caught() is None:
-        line = (
-            f"{result.summary.stale_frames} of {result.summary.frames} frames show an old sky: no"
-            " attitude came in time; the machine is busy, so close other programs and run it again"
-        )
-        if as_json:
-            say(f"hilstar: {line}")
-        else:
-            typer.echo(f"{'stale sky':20}{line}")
+        _say_stale(result.summary, options.as_json)
         raise typer.Exit(1)
+
+
+def _say_missed(summary: "RunSummary") -> None:
+    """Say where the display missed frames that the tracker's budget takes for its own errors."""
+    missed = summary.missed_frames
+    if missed > MAX_MISSED * summary.frames:
+        say(
+            f"hilstar: the display missed {missed} frames, and answers that looked while it held a"
+            " frame are in no figure; the machine is busy: close other programs, and run it again"
+        )
+
+
+def _say_stale(summary: "RunSummary", as_json: bool) -> None:
+    """Say that frames showed an old sky; on stderr where stdout is the JSON object's."""
+    line = (
+        f"{summary.stale_frames} of {summary.frames} frames show an old sky: no attitude came in"
+        " time; the machine is busy, so close other programs and run it again"
+    )
+    if as_json:
+        say(f"hilstar: {line}")
+    else:
+        typer.echo(f"{'stale sky':20}{line}")
 
 
 @contextmanager
@@ -145,22 +150,26 @@ def _watching(
     advance: "FrameSink",
     tracker: "TrackerBeside | None",
 ) -> "Iterator[tuple[FrameSink, Outlet]]":
+    """The sink and the outlet of the demo's run, with its page and its tracker. Raises
+    MachineError where the GPU was lost.
+    """
     from hilstar.server.console.publisher import RunDescription
     from hilstar.server.record.ledger import NO_SPLIT
     from hilstar.server.serve import Outlet
 
     notices = Notices()
-    status = RunStatus(
-        RunSource(
-            f"bound to {endpoint}", bench.renderer.gl_renderer, bench.config.monitor.refresh_hz
-        )
-    )
+    refresh_hz = bench.config.monitor.refresh_hz
+    source = RunSource(f"bound to {endpoint}", bench.renderer.gl_renderer, refresh_hz)
+    status = RunStatus(source)
+    ledger_path = None
+    frames_endpoint = None
+    if tracker is not None:
+        ledger_path = tracker.ledger
+        frames_endpoint = FREE_PORT
     with (
-        running.optional_ledger(
-            None if tracker is None else tracker.ledger, bench, notices, True, NO_SPLIT
-        ) as ledger,
+        running.optional_ledger(ledger_path, bench, notices, True, NO_SPLIT) as ledger,
         running.optional_answers(bench, notices, ledger, None) as answers,
-        running.optional_frames(None if tracker is None else FREE_PORT, bench, None) as frames,
+        running.optional_frames(frames_endpoint, bench, None) as frames,
         nullcontext() if tracker is None or frames is None else tracker.before(frames),
     ):
         parts = running.page_parts(bench, notices, ledger, answers=answers)
@@ -170,12 +179,10 @@ def _watching(
             follower,
             requests,
         ):
-            yield (
-                sink,
-                Outlet(
-                    None, ledger, notices, follower=follower, requests=requests, answers=answers
-                ),
+            outlet = Outlet(
+                None, ledger, notices, follower=follower, requests=requests, answers=answers
             )
+            yield sink, outlet
     running.refuse_lost_gpu(notices)
 
 
@@ -248,9 +255,8 @@ class TrackerBeside:
         if self._process is None or self._feed is None:
             return False
         if self._process.poll() is not None:
-            error_lines = (
-                self._process.stderr.read().strip().splitlines() if self._process.stderr else []
-            ) or ["nothing"]
+            assert self._process.stderr is not None  # a pipe
+            error_lines = self._process.stderr.read().strip().splitlines() or ["nothing"]
             raise MachineError(
                 f"the demo's tracker ended before the run; it said: {error_lines[-1]}"
             )
@@ -272,32 +278,41 @@ class TrackerBeside:
             raise MachineError(f"the demo's run gives no budget: {refusal}") from refusal
         write_page(self._page, assessment)
         parts = assessment.found
-        rows: list[tuple[str, float, float | None, str]] = []
+        rows = []
         for k, axis in enumerate("xyz"):
-            rows.append(("bias " + axis, BIAS_ARCSEC[k], float(parts.bias_arcsec[k]), "arcsec"))
-        for name, planted, axes in (
+            bias_arcsec = float(parts.bias_arcsec[k])
+            rows.append(_LoopFigure(f"bias {axis}", BIAS_ARCSEC[k], bias_arcsec))
+        for name, planted_arcsec, axes in (
             ("field-of-view error", FOV_ARCSEC, parts.fov_arcsec),
             ("pixel error", PIXEL_ARCSEC, parts.pixel_arcsec),
         ):
-            rows += [
-                (f"{name} across", planted, axes.cross, "arcsec"),
-                (f"{name} about", ROLL * planted, axes.roll, "arcsec"),
-            ]
+            rows.append(_LoopFigure(f"{name} across", planted_arcsec, axes.cross))
+            rows.append(_LoopFigure(f"{name} about", ROLL * planted_arcsec, axes.roll))
         if isinstance(live, TrackerFigures) and live.answers:
-            rows.append(("wrong answers", 100 * WRONG, 100 * live.wrong / live.answers, "%"))
-        fields = {
-            "loop": [
-                {"quantity": name, "planted": a, "found": b, "unit": unit}
-                for name, a, b, unit in rows
-            ]
-        }
+            wrong_percent = 100 * live.wrong / live.answers
+            rows.append(_LoopFigure("wrong answers", 100 * WRONG, wrong_percent, "%"))
         if as_json:
-            say(json.dumps(fields))
+            say(json.dumps({"loop": [row._asdict() for row in rows]}))
             return
         for what, text in lines_of(assessment):
             typer.echo(f"{what:24}{text}")
         typer.echo(f"{'page':24}{self._page}")
         typer.echo(f"{'':28}{'planted':>10}{'found':>10}")
-        for name, planted_value, value, unit in rows:
-            figure = "unknown" if value is None else f"{value:.2f}"
-            typer.echo(f"{name:28}{planted_value:10.2f}{figure:>10} {unit}")
+        for row in rows:
+            typer.echo(row.line())
+
+
+class _LoopFigure(NamedTuple):
+    """A figure of the demo's tracker: as it was planted, and as its budget has it."""
+
+    quantity: str
+    planted: float
+    found: float | None
+    unit: str = "arcsec"
+
+    def line(self) -> str:
+        """The figure as a row of a table."""
+        text = "unknown"
+        if self.found is not None:
+            text = f"{self.found:.2f}"
+        return f"{self.quantity:28}{self.planted:10.2f}{text:>10} {self.unit}"

@@ -3,59 +3,56 @@
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
 
 import typer
-from typer import Argument, Option
 
-from hilstar.cli.options import Json
+from hilstar.cli.declare import argument, struct, switch
+from hilstar.cli.options import json_option
 from hilstar.cli.running import say_units
 from hilstar.server.console.terminal import busy, print_found, print_json, print_states
 
-OwnBench = Annotated[
-    Path | None,
-    Argument(
-        metavar="[BENCH.toml]",
-        help="A bench file, or one with heads, to be checked too.",
+
+@struct
+class DoctorOptions:
+    """The options of `hilstar doctor`."""
+
+    bench_file: Path | None = argument(
+        "[BENCH.toml]",
+        "A bench file, or one with heads, to be checked too.",
         show_default=False,
-    ),
-]
-Report = Annotated[
-    bool,
-    Option(
-        "--report",
-        help=(
-            "Print this machine as a row of the table of docs/where-it-fails.md, without names or"
-            " serial numbers."
-        ),
-    ),
-]
+    )
+    as_json: bool = json_option()
+    report: bool = switch(
+        "Print this machine as a row of the table of docs/where-it-fails.md, without names or"
+        " serial numbers."
+    )
 
 
-def doctor(bench_file: OwnBench = None, as_json: Json = False, report: Report = False) -> None:
+def doctor(options: DoctorOptions) -> None:
     """Check this machine's OpenGL, displays, links and files, and say what is missing; of a
     bench file, what it means.
     """
     from hilstar.server.doctor import examine, examine_bench, row, table
 
-    if report:
+    if options.report:
         cells = row()
-        print_found(as_json, cells, [table(cells)])
+        print_found(options.as_json, cells, [table(cells)])
         return
     with busy("examining this machine"):
-        benches = examine_bench(bench_file, datetime.now(UTC).date())
+        benches = examine_bench(options.bench_file, datetime.now(UTC).date())
         result = examine()
     for bench in benches.values():
         say_units(bench.fields)  # a star that is too wide is on the page, with its panels
-    if benches:
-        named = {"benches": {name: bench.keys() for name, bench in benches.items()}}
-    else:
-        named = {}
     lines = [check.line() for check in result.checks]
-    lines += [line for output in result.outputs for line in output.lines()]
-    lines += [line for name, bench in benches.items() for line in bench.lines(name)]
-    if as_json:
-        print_json(asdict(result) | named)
+    for output in result.outputs:
+        lines += output.lines()
+    fields = asdict(result)
+    if benches:
+        fields["benches"] = {name: bench.keys() for name, bench in benches.items()}
+    for name, bench in benches.items():
+        lines += bench.lines(name)
+    if options.as_json:
+        print_json(fields)
     else:
         print_states(lines)
     if not result.ok:

@@ -25,7 +25,7 @@ from hilstar.cli.old_names import with_present_names
 from hilstar.cli.options import with_values
 from hilstar.server.console.terminal import fail
 
-INTERRUPTED = 130
+INTERRUPTED = 130  # typer's exit code of Ctrl-C
 LOG_FORMAT = "hilstar: %(message)s"
 # longest wait for a slow reader of stderr, without and with a signal
 READER_WAITS_S, STOPPED_READER_WAITS_S = 1.0, 0.1
@@ -55,7 +55,8 @@ def main() -> NoReturn:
 
 
 def _kinds_of_logs() -> Mapping[bytes, str]:
-    # 0.1 s, where a file of another kind is refused
+    """How the kinds of logs begin, and their names: for the refusal of a file of another kind."""
+    # 0.1 s, which only a refusal needs
     from hilstar.attitude.logs.log_formats import kinds
 
     return kinds()
@@ -118,40 +119,52 @@ def _run(words: list[str]) -> int:
 
 def usage_line(error: Any, words: list[str]) -> str:
     """The line for a wrong command line: typer's `error`, and what to write instead."""
-    message = str(error.format_message()).replace("Value error, ", "").rstrip(".")
-    message = re.sub(
-        r"a valid (float|int)\w*( range)?",
-        lambda m: "a number" if m[1] == "float" else "a whole number",
-        message,
-    )
-    at = getattr(error, "ctx", None)
-    see = f"(see {'hilstar' if at is None else at.command_path} --help)"
-    if (spaced := _spaced_numbers(words) or _spaced_star(words)) is not None:
+    spaced = _spaced_numbers(words) or _spaced_star(words)
+    if spaced is not None:
         return spaced
-    if message.startswith("Missing option") and (missing := _missing_file(words)) is not None:
+    message = str(error.format_message()).replace("Value error, ", "").rstrip(".")
+    message = re.sub(r"a valid int\w*( range)?", "a whole number", message)
+    message = re.sub(r"a valid float\w*( range)?", "a number", message)
+    context = getattr(error, "ctx", None)
+    program = "hilstar"
+    if context is not None:
+        program = context.command_path
+    see = f"(see {program} --help)"
+    missing = _missing_file(words)
+    if missing is not None and message.startswith("Missing option"):
         return f"{missing}: no such file; give one that is there {see}"
-    if (other := re.match(r"No such command '(.*?)'", message)) and at is not None:
-        known = list(getattr(at.command, "commands", {}))
-        advice = (
-            ELSEWHERE.get(other[1])
-            or did_you_mean(other[1], known).strip()
-            or f"the commands are {', '.join(known)}"
-        )
-        return f"No such command '{shortened(other[1])}'; {advice} {see}"
-    if message.startswith("No such option") and at is not None:
-        known = []
-        for parameter in at.command.params:
-            for name in (*parameter.opts, *parameter.secondary_opts):
-                if name.startswith("-"):
-                    known.append(name)
-        # a group's own options are those of its commands
-        listed = f"its options are {', '.join(known)}" if known else "write it after a command"
-        advice = did_you_mean(error.option_name, known).strip() or listed
+    unknown = re.match(r"No such command '(.*?)'", message)
+    if unknown and context is not None:
+        advice = _advised_command(unknown[1], context.command)
+        return f"No such command '{shortened(unknown[1])}'; {advice} {see}"
+    if message.startswith("No such option") and context is not None:
+        advice = _advised_option(error.option_name, context.command)
         return f"No such option: {shortened(error.option_name)}; {advice} {see}"
-    if choice := re.search(r"'([^']*)' is not one of (.*)", message):
+    choice = re.search(r"'([^']*)' is not one of (.*)", message)
+    if choice:
         meant = did_you_mean(choice[1], re.findall(r"'(.*?)'", choice[2])).strip()
-        return f"{message}{meant and '; '}{meant} {see}"
+        if meant:
+            message = f"{message}; {meant}"
+        return f"{message} {see}"
     return f"{message} {see}"
+
+
+def _advised_command(name: str, group: Any) -> str:
+    """The command of a group that a wrong name means, else all of them."""
+    known = list(getattr(group, "commands", {}))
+    meant = did_you_mean(name, known).strip()
+    return ELSEWHERE.get(name) or meant or f"the commands are {', '.join(known)}"
+
+
+def _advised_option(name: str, command: Any) -> str:
+    """The option of a command that a wrong name means, else all of them."""
+    known = []
+    for parameter in command.params:
+        flags = (*parameter.opts, *parameter.secondary_opts)
+        known += [flag for flag in flags if flag.startswith("-")]
+    if not known:  # a group's own options are those of its commands
+        return "write it after a command"
+    return did_you_mean(name, known).strip() or f"its options are {', '.join(known)}"
 
 
 def _missing_file(words: list[str]) -> str | None:
@@ -173,20 +186,29 @@ def _spaced_numbers(words: list[str]) -> str | None:
     """The line for an option whose numbers have spaces between them, such as --radec 84.057 -1.2
     0; None if there is none.
     """
-    for k, word in enumerate(words):
-        option, is_joined, first = word.partition("=")
-        rest = ([first] if is_joined else []) + words[k + 1 :]
-        if option in NUMBER_OPTIONS:
-            parts = list(takewhile(NUMBERS.fullmatch, rest))
-        else:
-            parts = []
+    for k in range(len(words)):
+        option, values = _values_after(words, k)
+        if option not in NUMBER_OPTIONS:
+            continue
+        parts = list(takewhile(NUMBERS.fullmatch, values))
         if len(parts) > 1:
-            numbers = ",".join(",".join(parts).replace(",", " ").split())
+            # a shell makes words of "84.057, -1.2, 0" that keep their commas
+            joined = ",".join(parts).replace(",", " ")
+            numbers = ",".join(joined.split())
             return (
                 f"{option} {' '.join(parts)}: write {option} {numbers}, with commas and without"
                 " spaces"
             )
     return None
+
+
+def _values_after(words: list[str], k: int) -> tuple[str, list[str]]:
+    """The option that word k is, and the words from its value on, which may be joined to it."""
+    option, is_joined, value = words[k].partition("=")
+    values = words[k + 1 :]
+    if is_joined:
+        values = [value, *values]
+    return option, values
 
 
 def _spaced_star(words: list[str]) -> str | None:
@@ -195,11 +217,10 @@ def _spaced_star(words: list[str]) -> str | None:
     """
     from hilstar.sky.named_stars import is_star
 
-    for k, word in enumerate(words):
-        option, is_joined, first = word.partition("=")
-        rest = ([first] if is_joined else []) + words[k + 1 :]
-        name = " ".join(rest[:2])
-        if option == "--star" and len(rest) > 1 and is_star(name.partition(",")[0]):
+    for k in range(len(words)):
+        option, values = _values_after(words, k)
+        name = " ".join(values[:2])
+        if option == "--star" and len(values) > 1 and is_star(name.partition(",")[0]):
             return f"--star {name}: write --star {shlex.quote(name)}, with quotes around the name"
     return None
 

@@ -5,15 +5,13 @@ import json
 import shutil
 import sys
 from pathlib import Path
-from typing import Annotated
-
-from typer import Option
 
 from hilstar import server
 from hilstar.attitude.wire import protocol
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.files import check_ending, temporary_folder, written
-from hilstar.cli.options import BenchFile, Json, check_files
+from hilstar.cli.declare import struct
+from hilstar.cli.options import bench_argument, check_files, json_option, output_option
 from hilstar.server.console.terminal import busy, print_found, say
 
 FMU = (".fmu",)
@@ -22,27 +20,36 @@ MODEL, PROTOCOL = "star_display", "hilstar_protocol"
 EXTRA = "pythonfmu cannot be imported; install it: pip install 'hilstar[fmi]'"
 
 
-def fmu(
-    bench_file: BenchFile,
-    output: Annotated[Path, Option("-o", "--output", metavar="FILE.fmu", help="The FMU to write.")],
-    as_json: Json = False,
-) -> None:
+@struct
+class FmuOptions:
+    """The options of `hilstar fmu`."""
+
+    bench_file: Path = bench_argument()
+    output: Path = output_option("FILE.fmu", "The FMU to write.")
+    as_json: bool = json_option()
+
+
+def fmu(options: FmuOptions) -> None:
     """Make an FMU of a bench: a simulation tool's block with attitude in; frame, health and
     answered attitude out.
     """
     from hilstar.server.bench.bench_file import read_bench_file
 
-    check_ending("-o", output, FMU)
-    file = read_bench_file(bench_file)
-    check_files([], [output], file)
+    check_ending("-o", options.output, FMU)
+    file = read_bench_file(options.bench_file)
+    check_files([], [options.output], file)
     address = _address(file.path, file.config.attitude)
     with busy("building the FMU"), temporary_folder("fmu") as folder:
-        written(output, lambda out: out.write(build(folder, address).read_bytes()))
-    say(f"{output}: sends to {address}; start hilstar serve {bench_file} there")
-    print_found(as_json, {"address": address, "written": [str(output)]}, [str(output)])
+        written(options.output, lambda out: out.write(build(folder, address).read_bytes()))
+    say(f"{options.output}: sends to {address}; start hilstar serve {options.bench_file} there")
+    summary = {"address": address, "written": [str(options.output)]}
+    print_found(options.as_json, summary, [str(options.output)])
 
 
 def _address(path: Path, settings: object) -> str:
+    """Where the FMU sends to by `[attitude]`: this machine where the bench listens everywhere.
+    Raises InputError.
+    """
     from hilstar.server.bench.config.attitude import AttitudeSettings, udp_road
 
     assert isinstance(settings, AttitudeSettings)
@@ -61,15 +68,12 @@ def _address(path: Path, settings: object) -> str:
         raise InputError(
             f"{path}: [attitude] status_hz = 0, by which an FMU hears nothing; write 10 or more"
         )
-    if place.host.version == 6:
-        host = "[::1]"
-    else:
-        host = "127.0.0.1"
-    if place.host.version == 6:
-        named = f"[{place.host}]"
-    else:
-        named = str(place.host)
-    return f"{host if place.host.is_unspecified else named}:{place.port}"
+    host = str(place.host)
+    if place.host.is_unspecified:
+        host = "::1" if place.host.version == 6 else "127.0.0.1"
+    if ":" in host:
+        host = f"[{host}]"
+    return f"{host}:{place.port}"
 
 
 def build(folder: Path, address: str) -> Path:
@@ -97,5 +101,6 @@ def build(folder: Path, address: str) -> Path:
 
 
 def _forget_modules() -> None:
+    """Have the next import of the FMU's modules read their files: another FMU has others."""
     for name in (MODEL, PROTOCOL):
         sys.modules.pop(name, None)

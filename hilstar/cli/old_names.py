@@ -12,10 +12,12 @@ FRAMES, FEED, AVERAGE = "--frames", "--feed", "--average"
 
 
 def _frames_or_feed(value: str) -> str:
+    """`--frames` took an endpoint, and takes a number."""
     return FEED if "://" in value else FRAMES
 
 
 def _average_or_feed(value: str) -> str:
+    """`--frames` took an endpoint, or the number that is `--average` now."""
     return FEED if "://" in value else AVERAGE
 
 
@@ -37,9 +39,11 @@ OLD_NAMES: dict[str, dict[str, str | Callable[[str], str]]] = {
 
 def with_present_names(words: list[str]) -> list[str]:
     """The command line with the present names of its options; what follows `--` stays."""
-    old_names = OLD_NAMES.get(words[0] if words else "", {})
-    old_names = OLD_NAMES.get(" ".join(words[:2]), old_names)
-    end = words.index("--") if "--" in words else len(words)
+    of_command = OLD_NAMES.get(" ".join(words[:1]), {})
+    old_names = OLD_NAMES.get(" ".join(words[:2]), of_command)
+    end = len(words)
+    if "--" in words:
+        end = words.index("--")
     present: list[str] = []
     for k, word in enumerate(words[:end]):
         name, equals, joined = word.partition("=")

@@ -4,21 +4,19 @@ number.
 A parser takes a text and returns a value. Each refusal shows the form to write.
 """
 
-import inspect
 import math
 import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
-from functools import partial, wraps
+from collections.abc import Iterable
+from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
-
-from typer import Argument, Option
+from typing import TYPE_CHECKING, Any
 
 from hilstar.basics.errors import InputError, did_you_mean, shortened
 from hilstar.basics.files import check_outputs, files_named_in, refuse_existing, refuse_writer
 from hilstar.basics.units import NS_PER_S
 from hilstar.cli.completion import offered
+from hilstar.cli.declare import argument, option, struct, switch
 
 if TYPE_CHECKING:
     from hilstar.attitude.logs.entries import Stated
@@ -29,75 +27,7 @@ if TYPE_CHECKING:
     from hilstar.server.bench.config import BenchConfig
     from hilstar.server.record.ledger import SplitLimits
 
-BenchFile = Annotated[
-    Path, Argument(metavar="BENCH.toml", help="The bench file (docs: Bench file).")
-]
-Json = Annotated[
-    bool, Option("--json", help="Print one JSON object on stdout, and nothing else there.")
-]
-Headless = Annotated[bool, Option("--headless", help="Draw without a window.")]
-Overwrite = Annotated[
-    bool, Option("--overwrite", help="Replace an existing file that could not be made again.")
-]
-Explain = Annotated[
-    bool,
-    Option(
-        "--explain",
-        help="Explain on stderr what was chosen for this scene, with its error and its saving.",
-    ),
-]
-AtSeconds = Annotated[
-    float | None,
-    Option(
-        "--at",
-        metavar="SECONDS",
-        help="Seconds after sky.epoch_utc, or of a scenario; 0 by default.",
-    ),
-]
-RunFile = Annotated[Path, Argument(metavar="RUN.mcap", help="The ledger of serve or replay.")]
-ScenarioFile = Annotated[
-    Path | None,
-    Option(
-        "--scenario",
-        metavar="FILE.toml",
-        help="Faults on request: what is wrong in the sky, and when.",
-    ),
-]
-# What a user states of a log (see `LogStatements`).
-unsaid = partial(Option, rich_help_panel="What the log itself does not say")
-KernelFiles = Annotated[
-    list[Path] | None, unsaid("--kernel", metavar="FILE", help="A SPICE kernel; may be repeated.")
-]
-TopicName = Annotated[
-    str | None, unsaid("--topic", metavar="NAME", help="The topic, where a bag has several.")
-]
-BodyName = Annotated[
-    str | None, unsaid("--body", metavar="NAME", help="The body or frame, where a log has several.")
-]
-REFERENCE_HELP = "The frame that attitudes refer to, or what its axes are: icrs, enu, ned."
-ReferenceName = Annotated[
-    str | None,
-    unsaid(
-        "--reference",
-        metavar="FRAME",
-        help=REFERENCE_HELP,
-        autocompletion=offered(("icrs", "enu", "ned")),
-    ),
-]
-EpochUtc = Annotated[
-    str | None, unsaid("--epoch-utc", metavar="TIME", help="The UTC at the log's time zero.")
-]
-PLACE_HELP = "Where the vehicle is: degrees and metres, WGS84."
-PlaceText = Annotated[str | None, unsaid("--place", metavar="LAT,LON,HEIGHT", help=PLACE_HELP)]
-MOUNTING_HELP = "q_body_to_cam, for a log of the body's attitude."
-MountingText = Annotated[str | None, unsaid("--mounting", metavar="W,X,Y,Z", help=MOUNTING_HELP)]
-CONVENTION_METAVAR = "scalar=last,direction=cam_to_icrs,frame=body"
-CONVENTION_HELP = (
-    "What the quaternions of a CSV, JSON lines or an MCAP are, in place of [attitude] convention."
-)
-ConventionText = Annotated[
-    str | None, unsaid("--convention", metavar=CONVENTION_METAVAR, help=CONVENTION_HELP)
-]
+CONVENTION_FORM = "scalar=last,direction=cam_to_icrs,frame=body"
 MAX_SEED = 2**63 - 1  # largest number in a FITS header
 LOG_HELP = (
     "CSV (t_s,qw,qx,qy,qz), JSON lines, CCSDS or CIC AEM, STK .a, MCAP (a ledger), a SPICE CK or a"
@@ -136,9 +66,73 @@ def checked_seed(seed: int) -> int:
     return seed
 
 
-def seed_option(meaning: str) -> Any:
+def bench_argument() -> Any:
+    """The argument of a bench file."""
+    return argument("BENCH.toml", "The bench file (docs: Bench file).")
+
+
+def ledger_argument() -> Any:
+    """The argument of a run's ledger."""
+    return argument("RUN.mcap", "The ledger of serve or replay.")
+
+
+def output_option(value: str, meaning: str, **settings: Any) -> Any:
+    """The option of a command's output, -o."""
+    return option(value, meaning, "-o", "--output", **settings)
+
+
+def json_option() -> Any:
+    """The switch of a command's answer as JSON."""
+    return switch("Print one JSON object on stdout, and nothing else there.", "--json")
+
+
+def overwrite_option() -> Any:
+    """The switch that allows an output in place of a file."""
+    return switch("Replace an existing file that could not be made again.")
+
+
+def explain_option() -> Any:
+    """The switch that explains a scene's choices."""
+    return switch(
+        "Explain on stderr what was chosen for this scene, with its error and its saving."
+    )
+
+
+def at_option() -> Any:
+    """The option of a frame's moment."""
+    return option("SECONDS", "Seconds after sky.epoch_utc, or of a scenario; 0 by default.")
+
+
+def scenario_option() -> Any:
+    """The option of a scenario."""
+    return option("FILE.toml", "Faults on request: what is wrong in the sky, and when.")
+
+
+def windowed_option() -> Any:
+    """The switch of a window."""
+    return switch("A window on the desktop instead of the full display.")
+
+
+def force_option() -> Any:
+    """The switch that shows on a display that the checks refuse."""
+    return switch(
+        "Show on a display that the start-up checks refuse, or on a monitor that the bench's files"
+        " were not measured on; status, page and ledger go on saying so."
+    )
+
+
+def feed_option() -> Any:
+    """The option of an endpoint that gives the frames to others."""
+    return option(
+        "ENDPOINT",
+        "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570 (hilstar"
+        " tracker).",
+    )
+
+
+def seed_option(meaning: str, default: int = 0) -> Any:
     """The option of a seed, a whole number from 0 to MAX_SEED."""
-    return Option(metavar="SEED", help=meaning, min=0, callback=checked_seed)
+    return option("SEED", meaning, default=default, min=0, callback=checked_seed)
 
 
 def check_files(
@@ -165,8 +159,8 @@ def check_files(
 
 
 def with_values(words: list[str]) -> list[str]:
-    """The command line with a share after each fault option that stands alone, an address after
-    --console, --darks for each.
+    """The command line with the values that may be left out: a share after a fault option, and an
+    address after --console, --scpi and --camera. --darks stands before each of its files.
     """
     complete: list[str] = []
     several = False  # --darks takes files up to the next option
@@ -217,16 +211,26 @@ def parse_numbers(text: str, count: int, option: str, form: str) -> list[float]:
     return numbers
 
 
+def parse_resolution(text: str, example: str = "1920,1080") -> tuple[int, int]:
+    """Width and height in pixels from `--resolution`. Raises InputError."""
+    form = f"--resolution W,H in pixels, such as {example}"
+    width, height = parse_numbers(text, 2, "--resolution", form)
+    if not (1 <= width <= MAX_SIZE_PX and 1 <= height <= MAX_SIZE_PX):
+        raise InputError(f"--resolution {text}: write {form}")
+    return round(width), round(height)
+
+
 def parse_spin(text: str) -> "FloatArray":
-    """The rate in rad/s, cam components (3,), of "AXIS,DEG_PER_S"."""
+    """The rate in rad/s, cam components (3,), from "AXIS,DEG_PER_S". Raises InputError."""
     import numpy as np
 
     *axis, rate_text = [part.strip() for part in text.split(",")]
     try:
         rate = math.radians(float(rate_text))
-        vector = np.array(
-            SPIN_AXES[axis[0].lower()] if len(axis) == 1 else [float(part) for part in axis]
-        )
+        if len(axis) == 1:
+            vector = np.array(SPIN_AXES[axis[0].lower()])
+        else:
+            vector = np.array([float(part) for part in axis])
     except (ValueError, KeyError, IndexError) as error:
         raise InputError(f"--spin {text}: write {SPIN_FORM}") from error
     length = math.hypot(*vector)
@@ -277,31 +281,43 @@ def parse_convention(text: str) -> dict[str, str]:
         key, equals, value = (word.strip() for word in part.partition("="))
         if key not in choices or not equals or key in named:
             raise InputError(
-                f"--convention {text}: write {CONVENTION_METAVAR}, each key once, or some of them"
+                f"--convention {text}: write {CONVENTION_FORM}, each key once, or some of them"
             )
         if value not in choices[key]:
             raise InputError(
                 f"--convention {text}: {key} is {' or '.join(choices[key])}; write"
-                f" {CONVENTION_METAVAR}"
+                f" {CONVENTION_FORM}"
             )
         named[key] = value
     return named
 
 
-@dataclass(frozen=True, slots=True)
-class LogStatements:
-    """What the command line states of a log, as it was typed; `log_statements` gives a command an
-    option for each.
-    """
+unstated = partial(option, rich_help_panel="What the log itself does not say")
 
-    kernel: KernelFiles = None
-    topic: TopicName = None
-    body: BodyName = None
-    reference: ReferenceName = None
-    epoch_utc: EpochUtc = None
-    place: PlaceText = None
-    mounting: MountingText = None
-    convention: ConventionText = None
+
+@struct
+class LogStatements:
+    """What the command line states of a log, as it was typed."""
+
+    kernel: list[Path] | None = unstated("FILE", "A SPICE kernel; may be repeated.")
+    topic: str | None = unstated("NAME", "The topic, where a bag has several.")
+    body: str | None = unstated("NAME", "The body or frame, where a log has several.")
+    reference: str | None = unstated(
+        "FRAME",
+        "The frame that attitudes refer to, or what its axes are: icrs, enu, ned.",
+        autocompletion=offered(("icrs", "enu", "ned")),
+    )
+    epoch_utc: str | None = unstated("TIME", "The UTC at the log's time zero.")
+    place: str | None = unstated(
+        "LAT,LON,HEIGHT",
+        "Where the vehicle is: degrees and metres, WGS84.",
+    )
+    mounting: str | None = unstated("W,X,Y,Z", "q_body_to_cam, for a log of the body's attitude.")
+    convention: str | None = unstated(
+        CONVENTION_FORM,
+        "What the quaternions of a CSV, JSON lines or an MCAP are, in place of [attitude]"
+        " convention.",
+    )
 
     def stated(self, config: "BenchConfig | None" = None) -> "Stated":
         """The same for a log's reader, in place of what the bench file states. Raises InputError,
@@ -341,41 +357,6 @@ class LogStatements:
                 raise InputError(f"--{field.name.replace('_', '-')} {shown}: {why}")
 
 
-NOTHING_STATED = LogStatements()
-
-
-def log_statements(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of `LogStatements`, in the place of its argument `statements`."""
-
-    @wraps(command)
-    def with_statements(**arguments: Any) -> None:
-        stated = {field.name: arguments.pop(field.name) for field in fields(LogStatements)}
-        command(**arguments, statements=LogStatements(**stated))
-
-    kinds = get_type_hints(LogStatements, include_extras=True)
-    signature = inspect.signature(command)
-    parameters: list[inspect.Parameter] = []
-    for parameter in signature.parameters.values():
-        if parameter.name != "statements":
-            parameters.append(parameter)
-            continue
-        parameters += [
-            inspect.Parameter(
-                field.name,
-                inspect.Parameter.KEYWORD_ONLY,
-                default=None,
-                annotation=kinds[field.name],
-            )
-            for field in fields(LogStatements)
-        ]
-    parameters.sort(key=lambda parameter: parameter.kind)
-    with_statements.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
-    with_statements.__annotations__ = {
-        parameter.name: parameter.annotation for parameter in parameters
-    } | {"return": None}
-    return with_statements
-
-
 def parse_diode(text: str) -> tuple[str, int]:
     """The port and the baud rate of `--diode`. Raises InputError."""
     from hilstar.attitude.wire.serial_link import serial_target
@@ -389,7 +370,7 @@ def parse_diode(text: str) -> tuple[str, int]:
 
 
 def parse_share(text: str, option: str) -> float:
-    """A share from "5%" or "0.05". Raises InputError."""
+    """A fraction, 0 to 1, from "5%" or "0.05". Raises InputError."""
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?|\.\d+)\s*(%?)\s*", text)
     if match:
         share = float(match[1]) / (100.0 if match[2] else 1.0)
@@ -415,7 +396,7 @@ def parse_speed(text: str) -> float:
 
 
 def parse_split(text: str | None) -> "SplitLimits":
-    """The split of "1GB" or "1h". Raises InputError."""
+    """The size or time at which a ledger is split, from "1GB" or "1h". Raises InputError."""
     from hilstar.server.record.ledger import NO_SPLIT, SplitLimits
 
     if text is None:
@@ -433,7 +414,7 @@ def parse_split(text: str | None) -> "SplitLimits":
 
 
 def parse_memory(text: str) -> int:
-    """The bytes of "4GB" or "500 MB". Raises InputError."""
+    """Bytes, from "4GB" or "500 MB". Raises InputError."""
     match = re.fullmatch(r"(\d{1,9}(?:\.\d{1,9})?)\s*(MB|GB)", text.strip())
     if match is None or float(match[1]) <= 0:
         raise InputError(f"--memory {text}: write a size such as 4GB or 500MB")

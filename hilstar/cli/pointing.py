@@ -1,88 +1,88 @@
 """Where the command line points: `--radec`, `--star` or `--quaternion`."""
 
-from typing import TYPE_CHECKING, Annotated
-
-from typer import Option
+from typing import TYPE_CHECKING
 
 from hilstar.basics.errors import InputError, shortened
 from hilstar.cli.completion import offered, stars
+from hilstar.cli.declare import option, struct
 from hilstar.cli.options import parse_numbers
 
 if TYPE_CHECKING:
     from hilstar.basics.arrays import FloatArray
 
-RadecText = Annotated[
-    str | None,
-    Option(
-        "--radec",
-        metavar="RA,DEC,ROLL",
-        help="Boresight and roll, ICRS: degrees, or sexagesimal (5h36m14s,-1d12m,0).",
-    ),
-]
-StarText = Annotated[
-    str | None,
-    Option(
-        "--star",
-        metavar="NAME|HIP[,ROLL]",
-        autocompletion=offered(stars),
-        help="Boresight at a star: its name (Vega, alpha Lyr) or Hipparcos number; roll 0 if none.",
-    ),
-]
-QuaternionText = Annotated[
-    str | None, Option("--quaternion", metavar="W,X,Y,Z", help="q_icrs_to_cam, scalar first.")
-]
 RADEC_FORM = "RA,DEC,ROLL in degrees, such as 84.057,-1.2,0, or sexagesimal: 5h36m14s,-1d12m,0"
 USUAL_EPOCH_JYEAR = 2026.0  # that of a bench file which states none
 
 
+@struct
+class PlaceOptions:
+    """A boresight and a roll, by a place or a star."""
+
+    radec: str | None = option(
+        "RA,DEC,ROLL",
+        "Boresight and roll, ICRS: degrees, or sexagesimal (5h36m14s,-1d12m,0).",
+    )
+    star: str | None = option(
+        "NAME|HIP[,ROLL]",
+        "Boresight at a star: its name (Vega, alpha Lyr) or Hipparcos number; roll 0 if none.",
+        autocompletion=offered(stars),
+    )
+
+
+@struct
+class PointingOptions(PlaceOptions):
+    """An attitude, by a place, a star or a quaternion."""
+
+    quaternion: str | None = option("W,X,Y,Z", "q_icrs_to_cam, scalar first.")
+
+    @property
+    def given(self) -> list[str]:
+        """The attitudes that the command line states, as texts; `attitude_of` refuses more than
+        one.
+        """
+        texts = (self.radec, self.star, self.quaternion)
+        return [text for text in texts if text is not None]
+
+
 def attitude_of(
-    command: str,
-    radec: str | None,
-    star: str | None,
-    quaternion: str | None,
-    epoch_jyear: float = USUAL_EPOCH_JYEAR,
+    command: str, pointing: PointingOptions, epoch_jyear: float = USUAL_EPOCH_JYEAR
 ) -> "FloatArray":
     """The one attitude that the command line gives, q_icrs_to_cam (4,). Raises InputError."""
     from hilstar.basics.rotation import from_radec_roll_deg
     from hilstar.server.bench.frame import checked_quaternion
 
-    given = [text for text in (radec, star, quaternion) if text is not None]
-    if len(given) != 1:
+    if len(pointing.given) != 1:
         raise InputError(
             f"{command}: give the attitude with one of --radec RA,DEC,ROLL, --star NAME and"
             " --quaternion W,X,Y,Z"
         )
-    place = place_of(command, radec, star, epoch_jyear)
+    place = place_of(command, pointing, epoch_jyear)
     if place is not None:
         return from_radec_roll_deg(*place)
-    return checked_quaternion(parse_numbers(quaternion or "", 4, "--quaternion", "W,X,Y,Z"))
+    return checked_quaternion(parse_numbers(pointing.given[0], 4, "--quaternion", "W,X,Y,Z"))
 
 
 def optional_attitude(
-    command: str,
-    radec: str | None,
-    star: str | None,
-    quaternion: str | None,
-    epoch_jyear: float = USUAL_EPOCH_JYEAR,
+    command: str, pointing: PointingOptions, epoch_jyear: float = USUAL_EPOCH_JYEAR
 ) -> "FloatArray | None":
     """The same, and None where the command line gives none. Raises InputError."""
-    if radec is None and star is None and quaternion is None:
+    if not pointing.given:
         return None
-    return attitude_of(command, radec, star, quaternion, epoch_jyear)
+    return attitude_of(command, pointing, epoch_jyear)
 
 
 def place_of(
-    command: str, radec: str | None, star: str | None, epoch_jyear: float = USUAL_EPOCH_JYEAR
+    command: str, pointing: PlaceOptions, epoch_jyear: float = USUAL_EPOCH_JYEAR
 ) -> tuple[float, float, float] | None:
     """Right ascension, declination and roll, degrees, by --radec or --star; None without either.
     Raises InputError.
     """
-    if radec is not None and star is not None:
+    if pointing.radec is not None and pointing.star is not None:
         raise InputError(f"{command}: --radec and --star both say where; leave one out")
-    if radec is not None:
-        return parse_radec(radec)
-    if star is not None:
-        return parse_star(star, epoch_jyear)
+    if pointing.radec is not None:
+        return parse_radec(pointing.radec)
+    if pointing.star is not None:
+        return parse_star(pointing.star, epoch_jyear)
     return None
 
 
@@ -138,6 +138,7 @@ def _star_named(text: str) -> str:
 
 
 def _is_number(text: str) -> bool:
+    """Whether an angle is a number of degrees."""
     try:
         float(text)
     except ValueError:

@@ -1,68 +1,56 @@
 """hilstar replay: an attitude log on the monitor."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING
 
 from msgspec.structs import replace as replaced
-from typer import Argument, Option
 
 from hilstar.basics.files import MCAP, check_directory, check_ending
 from hilstar.basics.notices import Notices
-from hilstar.cli import options, running
+from hilstar.cli import running
 from hilstar.cli.completion import offered
+from hilstar.cli.declare import argument, option, struct
+from hilstar.cli.options import (
+    LOG_HELP,
+    LogStatements,
+    bench_argument,
+    check_files,
+    output_option,
+    parse_speed,
+    parse_split,
+)
+from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
 from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
 from hilstar.server.console.terminal import busy, say
 
+if TYPE_CHECKING:
+    from hilstar.server.console.messages import Pace
 
-@options.log_statements
+
+@struct
+class ReplayOptions:
+    """The options of `hilstar replay`."""
+
+    bench_file: Path = bench_argument()
+    log: Path = argument("LOG", LOG_HELP)
+    speed: str = option(
+        "realtime|max|N",
+        "Real time, as fast as possible, or N times real time.",
+        default="realtime",
+        autocompletion=offered(("realtime", "max")),
+    )
+    start: float | None = option("SECONDS", "Start this many seconds after the first sample.")
+    stop: float | None = option("SECONDS", "Stop this many seconds after the first sample.")
+    step: float | None = option("SECONDS", "Time step of the log between frames, in seconds.")
+    output: Path | None = output_option("DIR", "Directory for a PNG of each frame, and frames.csv.")
+
+
 def replay(
-    bench_file: options.BenchFile,
-    log: Annotated[Path, Argument(metavar="LOG", help=options.LOG_HELP)],
-    speed: Annotated[
-        str,
-        Option(
-            metavar="realtime|max|N",
-            help="Real time, as fast as possible, or N times real time.",
-            autocompletion=offered(("realtime", "max")),
-        ),
-    ] = "realtime",
-    start: Annotated[
-        float | None,
-        Option(metavar="SECONDS", help="Start this many seconds after the first sample."),
-    ] = None,
-    stop: Annotated[
-        float | None,
-        Option(metavar="SECONDS", help="Stop this many seconds after the first sample."),
-    ] = None,
-    step: Annotated[
-        float | None,
-        Option(metavar="SECONDS", help="Time step of the log between frames, in seconds."),
-    ] = None,
-    statements: options.LogStatements = options.NOTHING_STATED,
-    headless: options.Headless = False,
-    output: Annotated[
-        Path | None,
-        Option(
-            "-o",
-            "--output",
-            metavar="DIR",
-            help="Directory for a PNG of each frame, and frames.csv.",
-        ),
-    ] = None,
-    feed: running.Feed = None,
-    ledger: running.LedgerFile = None,
-    ledger_split: running.LedgerSplit = None,
-    scenario: options.ScenarioFile = None,
-    overwrite: options.Overwrite = False,
-    windowed: running.Windowed = False,
-    force: running.Force = False,
-    console: running.Console = None,
-    control: running.Control = False,
-    token: running.Token = None,
-    console_name: running.ConsoleName = None,
-    strict: running.Strict = False,
-    explain: options.Explain = False,
-    as_json: options.Json = False,
+    options: ReplayOptions,
+    statements: LogStatements,
+    display: DisplayOptions,
+    run: RunOptions,
+    page: ActingPageOptions,
 ) -> None:
     """Show an attitude log on the monitor."""
     from hilstar.server.bench.bench_file import dated, read_bench_file, with_codes_ms
@@ -71,57 +59,60 @@ def replay(
     from hilstar.server.replay import replay as replay_log
     from hilstar.server.serve import Outlet
 
-    check_directory("-o", output)
-    ledger = running.dated_ledger(ledger)
+    check_directory("-o", options.output)
+    ledger = running.dated_ledger(run.ledger)
     check_ending("--ledger", ledger, MCAP)
-    file = read_bench_file(bench_file)
-    faults = running.optional_scenario(scenario)
-    options.check_files(
-        [log, scenario],
-        [None if output is None else output / "frames.csv"],
-        file,
-        ledger,
-        overwrite,
-    )
-    split = options.parse_split(ledger_split)
+    file = read_bench_file(options.bench_file)
+    faults = running.optional_scenario(run.scenario)
+    table = None
+    if options.output is not None:
+        table = options.output / "frames.csv"
+    check_files([options.log, run.scenario], [table], file, ledger, run.overwrite)
+    split = parse_split(run.ledger_split)
     notices = Notices()
     stated = statements.stated(file.config)
-    wanted = Wanted(options.parse_speed(speed), start, stop, step)
+    wanted = Wanted(parse_speed(options.speed), options.start, options.stop, options.step)
     with busy("reading the log"):
-        play = plan_play(log, wanted, file.config, stated)
+        play = plan_play(options.log, wanted, file.config, stated)
     file = with_codes_ms(dated(file, play.conventions.scale, play.first_ns), play.codes_ms)
+    # The frames of an earlier run have the codes that it had.
+    is_timed = play.paced and not play.moving
     with (
-        running.page_listener(console, control, token, console_name) as listener,
+        running.page_listener(page) as listener,
         running.optional_pulse(file, notices) as pulse,
-        # The frames of an earlier run have the codes that it had.
-        running.shown_bench(
-            file, headless, windowed, force, timed=play.paced and not play.moving
-        ) as (bench, screen),
-        FrameImages(output, bench) as record,
-        running.optional_ledger(ledger, bench, notices, overwrite, split) as run_ledger,
+        running.shown_bench(file, display, timed=is_timed) as (bench, screen),
+        FrameImages(options.output, bench) as record,
+        running.optional_ledger(ledger, bench, notices, run.overwrite, split) as run_ledger,
         running.run_with_faults(bench, faults, notices, run_ledger, play.recording) as wrong,
         running.optional_answers(bench, notices, run_ledger, screen) as answers,
-        running.optional_frames(feed, bench, screen) as watched,
+        running.optional_frames(display.feed, bench, screen) as watched,
     ):
         if play.span:
             say(play.span)
         running.say_units_of(file)
         running.say_of_light(bench)
-        if explain:
+        if run.explain:
             running.explain_bench(bench, of_source=play.conventions.lines(stated.mounting))
         # Before the run: what would do takes seconds, and a run that is stopped ends at once.
-        effort = running.effort_of_run(bench, explain, as_json)
+        effort = running.effort_of_run(bench, run.explain, run.as_json)
         renderer = bench.renderer.gl_renderer
         refresh_hz = bench.config.monitor.refresh_hz
         source = RunSource(
-            f"replaying {log}", renderer, refresh_hz, play.frame_count, running.forced_on(screen)
+            f"replaying {options.log}",
+            renderer,
+            refresh_hz,
+            play.frame_count,
+            running.forced_on(screen),
         )
         status = RunStatus(source, run_ledger)
-        page = RunDescription("replay", "log", str(log), "clock" if play.paced else "asked")
+        pace: Pace = "clock" if play.paced else "asked"
+        description = RunDescription("replay", "log", str(options.log), pace)
         parts = running.page_parts(bench, notices, run_ledger, screen, wrong, answers, split=split)
         with (
             on_terminal(status),
-            running.followed(listener, control, page, parts, status, record, watched) as (
+            running.followed(
+                listener, page.control, description, parts, status, record, watched
+            ) as (
                 sink,
                 follower,
                 requests,
@@ -132,4 +123,4 @@ def replay(
             )
             summary = replay_log(bench, play, sink, outlet)
         summary = replaced(summary, **effort)
-    running.end_of_run(summary, screen, run_ledger, notices, as_json, strict)
+    running.end_of_run(summary, screen, run_ledger, notices, run.as_json, run.strict)

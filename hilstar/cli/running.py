@@ -6,16 +6,25 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 import typer
-from typer import Option
 
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.programs import Service
 from hilstar.basics.units import NS_PER_S
+from hilstar.cli.declare import option, struct, switch
+from hilstar.cli.options import (
+    explain_option,
+    feed_option,
+    force_option,
+    json_option,
+    overwrite_option,
+    scenario_option,
+    windowed_option,
+)
 from hilstar.server.console.run_status import RunStatus
 from hilstar.server.console.terminal import busy, report, say
 
@@ -39,106 +48,78 @@ if TYPE_CHECKING:
 
 POINTED = ("serve", "replay")  # commands whose attitudes come from elsewhere
 UTC_MARK = "{utc}"  # stands for the time in a ledger's name
-Strict = Annotated[
-    bool,
-    Option(
-        "--strict",
-        help=(
-            "Exit with 1 where over 1 % of the frames were missed or stale, or a wrong sky was"
-            " shown for any time."
-        ),
-    ),
-]
-Windowed = Annotated[
-    bool, Option("--windowed", help="A window on the desktop instead of the full display.")
-]
-Force = Annotated[
-    bool,
-    Option(
-        "--force",
-        help=(
-            "Show on a display that the start-up checks refuse, or on a monitor that the bench's"
-            " files were not measured on; status, page and ledger go on saying so."
-        ),
-    ),
-]
-LedgerFile = Annotated[
-    Path | None,
-    Option(
-        "--ledger",
-        metavar="RUN.mcap",
-        help="Record every packet and every frame in this file; {utc} in it is the start's time.",
-    ),
-]
 
-LedgerSplit = Annotated[
-    str | None,
-    Option(
-        "--ledger-split",
-        metavar="1GB|1h",
-        help="Continue in RUN.0001.mcap and so on after this size or time.",
-    ),
-]
-Console = Annotated[
-    str | None,
-    Option(
-        "--console",
-        metavar="[HOST:PORT]",
-        help=(
-            "Serve the operator's page there, by default on 127.0.0.1:8765; port 0 is any free one."
-        ),
+
+@struct
+class DisplayOptions:
+    """Where a run's frames are shown, and who else gets them."""
+
+    headless: bool = switch("Draw without a window.")
+    windowed: bool = windowed_option()
+    force: bool = force_option()
+    feed: str | None = feed_option()
+
+    def given(self) -> dict[str, bool]:
+        """Each flag, and whether the command line gives it."""
+        return {
+            "--headless": self.headless,
+            "--windowed": self.windowed,
+            "--force": self.force,
+            "--feed": self.feed is not None,
+        }
+
+
+@struct
+class RunOptions:
+    """What a run records, which faults it has, and what it prints."""
+
+    ledger: Path | None = option(
+        "RUN.mcap",
+        "Record every packet and every frame in this file; {utc} in it is the start's time.",
+    )
+    ledger_split: str | None = option(
+        "1GB|1h", "Continue in RUN.0001.mcap and so on after this size or time."
+    )
+    scenario: Path | None = scenario_option()
+    overwrite: bool = overwrite_option()
+    strict: bool = switch(
+        "Exit with 1 where over 1 % of the frames were missed or stale, or a wrong sky was shown"
+        " for any time."
+    )
+    explain: bool = explain_option()
+    as_json: bool = json_option()
+
+
+@struct
+class PageOptions:
+    """Where the operator's page of a run is, and who may see it."""
+
+    console: str | None = option(
+        "[HOST:PORT]",
+        "Serve the operator's page there, by default on 127.0.0.1:8765; port 0 is any free one.",
         show_default=False,
-    ),
-]
-Scpi = Annotated[
-    str | None,
-    Option(
-        "--scpi",
-        metavar="[HOST:PORT]",
-        help=(
-            "Answer a test stand's SCPI there, by default on 127.0.0.1:5025; port 0 is any free"
-            " one."
-        ),
-        show_default=False,
-    ),
-]
-Control = Annotated[bool, Option("--control", help="Let the page act: without it, it only shows.")]
-Token = Annotated[
-    str | None,
-    Option(
-        "--token",
-        metavar="TEXT",
+    )
+    token: str | None = option(
+        "TEXT",
+        "What a browser must give to see the page; beyond 127.0.0.1 one is made where none is"
+        " given.",
         envvar="HILSTAR_TOKEN",
-        help=(
-            "What a browser must give to see the page; beyond 127.0.0.1 one is made where none is"
-            " given."
-        ),
-    ),
-]
-ConsoleName = Annotated[
-    list[str] | None,
-    Option(
-        "--console-name",
-        metavar="NAME",
-        help="A further name of the page, as a proxy shows it; may be given often.",
-    ),
-]
-Feed = Annotated[
-    str | None,
-    Option(
-        "--feed",
-        metavar="ENDPOINT",
-        help=(
-            "Send each frame's codes to whoever watches there, such as tcp://127.0.0.1:5570"
-            " (hilstar tracker)."
-        ),
-    ),
-]
+    )
+    console_name: list[str] | None = option(
+        "NAME", "A further name of the page, as a proxy shows it; may be given often."
+    )
+
+
+@struct
+class ActingPageOptions(PageOptions):
+    """The same of a page that may act."""
+
+    control: bool = switch("Let the page act: without it, it only shows.")
 
 
 def explain_bench(bench: Any, t_ns: int | None = None, of_source: Sequence[str] = ()) -> None:
-    """Explain the attitudes' source, that of the stars, the choices within the tolerance, and
-    bodies that are discs then.
+    """Say what was chosen for this scene and why: the sources of attitudes and stars, the choices
+    within the tolerance, and the bodies that are discs at `t_ns`.
     """
     from hilstar.optics.layers.diffuse_layer import DiffuseLayer
     from hilstar.server.bench.effort_report import effort_lines
@@ -174,10 +155,10 @@ def explained_effort(bench: Any, wanted: bool) -> dict[str, dict[str, Any]]:
 
 @contextmanager
 def shown_bench(
-    file: "BenchFile", headless: bool, windowed: bool, force: bool, *, timed: bool
+    file: "BenchFile", display: DisplayOptions, *, timed: bool
 ) -> Iterator[tuple[Any, Any]]:
     """The bench and its screen; None when headless. `timed` as in `open_bench`."""
-    if headless:
+    if display.headless:
         from hilstar.display.render.context import create_context
         from hilstar.server.bench.build import open_bench
 
@@ -188,13 +169,17 @@ def shown_bench(
     from hilstar.server.screen.gate import open_screen
 
     with open_screen(
-        file, datetime.now(UTC).date(), windowed=windowed, force=force, timed=timed
+        file,
+        datetime.now(UTC).date(),
+        windowed=display.windowed,
+        force=display.force,
+        timed=timed,
     ) as screen:
         yield screen.bench, screen
 
 
 def forced_on(screen: Any) -> str:
-    """What is wrong with a screen that is shown by --force; "" for nothing, and headless."""
+    """The faults of a screen that --force ignores; "" for none, and headless."""
     return "" if screen is None else "; ".join(screen.forced)
 
 
@@ -208,8 +193,8 @@ def say_of_light(bench: Any) -> None:
 
 
 def say_optics(fields: "FieldsOfView", star: "StarSize") -> None:
-    """Warn of a length in the bench file that is probably in another unit than its key; else of
-    a star that is too wide.
+    """Warn where a length of the bench file is probably in another unit than its key, else where a
+    star is too wide.
     """
     fault = star.fault()
     if fields.warning is not None:
@@ -219,8 +204,8 @@ def say_optics(fields: "FieldsOfView", star: "StarSize") -> None:
 
 
 def say_seen(bench: Any) -> dict[str, Any]:
-    """Say what screen and tracker see and how wide a star is then, with what is wrong of it;
-    both for the run's summary.
+    """Say the fields of view of screen and tracker and the width of a star, with a warning where
+    one is implausible. Returns both for the run's summary.
     """
     from hilstar.server.bench.cameras import fields_of_view
     from hilstar.server.bench.star_size import star_size
@@ -234,8 +219,8 @@ def say_seen(bench: Any) -> dict[str, Any]:
 
 
 def say_units_of(file: "BenchFile") -> None:
-    """Warn of a length of a bench file that is probably another quantity, or in another unit
-    than its key.
+    """Warn where a length of a bench file is probably another quantity, or in another unit than its
+    key.
     """
     from hilstar.server.bench.cameras import fields_of_view
 
@@ -243,7 +228,7 @@ def say_units_of(file: "BenchFile") -> None:
 
 
 def say_units(fields: "FieldsOfView") -> None:
-    """The same, of fields of view that are at hand."""
+    """The same warning, from fields of view that were found already."""
     if fields.warning is not None:
         say(f"check the units: {fields.warning}")
 
@@ -425,19 +410,19 @@ def refuse_lost_gpu(notices: Notices) -> None:
 
 
 @contextmanager
-def page_listener(
-    console: str | None, control: bool, token: str | None, names: list[str] | None
-) -> "Iterator[PageListener | None]":
+def page_listener(page: PageOptions) -> "Iterator[PageListener | None]":
     """The page's listening socket; None without --console. Raises InputError."""
     from hilstar.server.console.listener import PageListener, parse_address
 
-    if console is None:
-        for option, given in (("--control", control), ("--console-name", bool(names))):
+    names = tuple(page.console_name or ())
+    if page.console is None:
+        may_act = isinstance(page, ActingPageOptions) and page.control
+        for flag, given in (("--control", may_act), ("--console-name", bool(names))):
             if given:
-                raise InputError(f"{option}: is the page's; add --console, or leave it out")
+                raise InputError(f"{flag}: is the page's; add --console, or leave it out")
         yield None
         return
-    with PageListener(parse_address(console), token, tuple(names or ())) as listener:
+    with PageListener(parse_address(page.console), page.token, names) as listener:
         say(f"the operator's page is at {listener.url}")
         yield listener
 
@@ -522,10 +507,13 @@ def followed(
     frames: "FrameFeed | None" = None,
     scpi: "PageListener | None" = None,
 ) -> "Iterator[tuple[FrameSink, Follower, SwitchRequests | None]]":
-    """Connect a run to the terminal, `record`, systemd, `frames`, page and SCPI: its sink, its
-    follower, their requests.
+    """Connect a run to all that follows it: terminal, `record`, systemd, `frames`, page and SCPI.
+
+    Yields the sink of its frames, its follower, and the requests of page and SCPI.
     """
-    sinks: list[FrameSink] = [status.see] if record is None else [record, status.see]
+    sinks: list[FrameSink] = [status.see]
+    if record is not None:
+        sinks.insert(0, record)
     if frames is not None:
         sinks.append(frames.see)
     with (
@@ -551,6 +539,7 @@ def followed(
 
 
 def _all_of(sinks: "list[FrameSink]") -> "FrameSink":
+    """A sink that hands each frame to all of `sinks`, in their order."""
     if len(sinks) == 1:
         return sinks[0]
 

@@ -1,73 +1,75 @@
 """hilstar sensor: a tracker's sensor from its EMVA 1288 data sheet, or from its own frames."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-from typer import Argument, Option
+from typing import TYPE_CHECKING, Any
 
 from hilstar.basics.files import TOML, check_ending, refuse_stdout
-from hilstar.cli.options import Json, check_files
+from hilstar.cli.declare import argument, option, struct
+from hilstar.cli.options import check_files, json_option, output_option
 from hilstar.server.console.terminal import busy, print_found
 
 if TYPE_CHECKING:
     from hilstar.instruments.calibrate.sensor import SensorFile
 
-Output = Annotated[
-    Path, Option("-o", "--output", metavar="SENSOR.toml", help="The tables for a bench file.")
-]
+
+def sensor_option() -> Any:
+    """The option of the file of a sensor."""
+    return output_option("SENSOR.toml", "The tables for a bench file.")
 
 
-def import_(
-    data: Annotated[
-        Path, Argument(metavar="EMVA.csv|json", help="Rows of quantity, value and unit.")
-    ],
-    output: Output,
-    as_json: Json = False,
-) -> None:
+@struct
+class ImportOptions:
+    """The options of `hilstar sensor import`."""
+
+    data: Path = argument("EMVA.csv|json", "Rows of quantity, value and unit.")
+    output: Path = sensor_option()
+    as_json: bool = json_option()
+
+
+def import_(options: ImportOptions) -> None:
     """Make a bench file's [tracker.detector] and quantum efficiency of an EMVA 1288 data sheet,
     and its curves.
     """
     from hilstar.instruments.calibrate.sensor import import_emva
 
-    _check(output)
-    check_files([data], [output])
-    _tell(output, import_emva(data), f"By hilstar sensor import from {data.name}", as_json)
+    _check(options.output)
+    check_files([options.data], [options.output])
+    source = f"By hilstar sensor import from {options.data.name}"
+    _tell(options.output, import_emva(options.data), source, options.as_json)
 
 
-def measure(
-    flats: Annotated[
-        list[Path],
-        Argument(metavar="FLATS...", help="FITS or PNG, two of each light after each other."),
-    ],
-    darks: Annotated[
-        list[Path],
-        Option(
-            "--darks",
-            metavar="DARKS...",
-            help="Frames without light, two of each exposure (EXPTIME).",
-        ),
-    ],
-    output: Output,
-    as_json: Json = False,
-) -> None:
+@struct
+class MeasureOptions:
+    """The options of `hilstar sensor measure`."""
+
+    flats: list[Path] = argument("FLATS...", "FITS or PNG, two of each light after each other.")
+    darks: list[Path] = option("DARKS...", "Frames without light, two of each exposure (EXPTIME).")
+    output: Path = sensor_option()
+    as_json: bool = json_option()
+
+
+def measure(options: MeasureOptions) -> None:
     """Measure gain, noise, full well and fixed pattern of a sensor by photon transfer, and write
     [tracker.detector].
     """
     from hilstar.instruments.calibrate.sensor import measure_sensor
 
-    _check(output)
-    check_files([*flats, *darks], [output])
+    _check(options.output)
+    check_files([*options.flats, *options.darks], [options.output])
     with busy("measuring"):
-        measured = measure_sensor(flats, darks)
-    _tell(output, measured, "By hilstar sensor measure; errors are one sigma", as_json)
+        measured = measure_sensor(options.flats, options.darks)
+    source = "By hilstar sensor measure; errors are one sigma"
+    _tell(options.output, measured, source, options.as_json)
 
 
 def _check(output: Path) -> None:
+    """Refuse (InputError) an output that is no TOML file: its curves stand beside it."""
     check_ending("-o", output, TOML)
     refuse_stdout("-o", output)
 
 
 def _tell(output: Path, sensor: "SensorFile", source: str, as_json: bool) -> None:
+    """Write a sensor's tables and curves, and print what they hold."""
     from hilstar.instruments.calibrate.sensor import write_sensor
 
     files = write_sensor(output, sensor, source)

@@ -6,28 +6,20 @@ import math
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
-from msgspec import UNSET
+from msgspec import UNSET, UnsetType
 from msgspec.structs import replace as replaced
-from typer import Option
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import MCAP, check_ending
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import end_with_parent
 from hilstar.cli import running
-from hilstar.cli.options import (
-    BenchFile,
-    Explain,
-    Headless,
-    Json,
-    Overwrite,
-    ScenarioFile,
-    check_files,
-    parse_split,
-)
+from hilstar.cli.declare import option, struct
+from hilstar.cli.options import bench_argument, check_files, parse_split
+from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
 from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
 from hilstar.server.console.terminal import print_found, say, without_attitude
 
@@ -35,15 +27,14 @@ if TYPE_CHECKING:
     from hilstar.attitude.wire.links import Pictures
     from hilstar.attitude.wire.zmq_links import ZmqReceiver
     from hilstar.server.bench.bench_file import BenchFile as ReadFile
+    from hilstar.server.bench.bench_file import HeadsFile
     from hilstar.server.bench.frame import Bench
     from hilstar.server.console.publisher import RunDescription
     from hilstar.server.heads import HeadsRun
     from hilstar.server.open_link import AnyLink
+    from hilstar.server.sync import BeatSummary
 
 NO_ATTITUDE = 4
-# Options of a head's process: the file with `heads`, and the endpoint of the source's attitudes.
-HeadOf = Annotated[Path | None, Option("--head-of", hidden=True)]
-FedBy = Annotated[str | None, Option("--fed-by", hidden=True)]
 
 
 def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json: bool) -> None:
@@ -57,11 +48,12 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
 
     heads = asked.heads
     if asked.ledger is not None and not overwrite:
-        taken = [file for name in heads.names if (file := head_ledger(asked.ledger, name)).exists()]
-        if taken:
-            raise InputError(
-                f"--ledger {asked.ledger}: {taken[0]} exists; give another name, or --overwrite"
-            )
+        for name in heads.names:
+            file = head_ledger(asked.ledger, name)
+            if file.exists():
+                raise InputError(
+                    f"--ledger {asked.ledger}: {file} exists; give another name, or --overwrite"
+                )
     notices = Notices()
     asked = replace(asked, consoles=_consoles(console, asked.token, len(heads.names)))
     with open_link(source_config(heads), heads.folder, notices, apart=True) as link:
@@ -69,35 +61,39 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
         say(f"{link.verb} {link.endpoint}, {len(heads.names)} heads: {', '.join(heads.names)}")
         assert not link.steps  # read_heads refuses lockstep
         head_summaries = run_heads(asked, link, say)
-    lines = []
-    verdicts = []
+    lines = [_head_line(name, head) for name, head in head_summaries.items()]
     for name, head in head_summaries.items():
         summary = head["summary"]
-        if isinstance(summary, dict):
-            frames = summary.get("frames")
-        else:
-            frames = None
-        if frames is None:
-            counted = "no summary"
-        else:
-            counted = f"{frames} frames"
-        if head["restarts"]:
-            again = f", started again {head['restarts']} times"
-        else:
-            again = ""
-        lines.append(f"{name:20s}{counted}, exit code {head['exit_code']}{again}")
         if isinstance(summary, dict) and "verdict" in summary:
-            verdicts.append(f"{'verdict':20s}{name}: {summary['verdict']['line']}")
-    print_found(as_json, {"heads": head_summaries}, [*lines, *verdicts])
+            lines.append(f"{'verdict':20s}{name}: {summary['verdict']['line']}")
+    print_found(as_json, {"heads": head_summaries}, lines)
     codes = [head["exit_code"] for head in head_summaries.values()]
     if all(code == NO_ATTITUDE for code in codes):
         raise typer.Exit(NO_ATTITUDE)
-    failed = [code for code in codes if code not in {0, NO_ATTITUDE}]
-    if failed:
-        raise typer.Exit(failed[0] if 0 < failed[0] <= NO_ATTITUDE else 1)
+    failures = [code for code in codes if code not in {0, NO_ATTITUDE}]
+    if failures:
+        # a head that a signal ended has a negative code, which is none of a command's
+        raise typer.Exit(failures[0] if 0 < failures[0] <= NO_ATTITUDE else 1)
+
+
+def _head_line(name: str, head: dict[str, Any]) -> str:
+    """How a head's process ended; its summary is a text where it printed no JSON object."""
+    frames = None
+    if isinstance(head["summary"], dict):
+        frames = head["summary"].get("frames")
+    count = "no summary"
+    if frames is not None:
+        count = f"{frames} frames"
+    restarts = ""
+    if head["restarts"]:
+        restarts = f", started again {head['restarts']} times"
+    return f"{name:20s}{count}, exit code {head['exit_code']}{restarts}"
 
 
 def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, ...]:
+    """The addresses of the heads' pages, one port after another; none without --console. Raises
+    InputError where one of them cannot be had.
+    """
     from hilstar.server.console.listener import MAX_PORT, ListenAddress, PageListener, parse_address
 
     if console is None:
@@ -107,16 +103,16 @@ def _consoles(console: str | None, token: str | None, count: int) -> tuple[str, 
         raise InputError(
             f"--console {console}: {count} pages need as many ports from there; choose a lower one"
         )
-    addresses = []
-    for k in range(count):
-        addresses.append(ListenAddress(first.host, first.port + k if first.port else 0))
-    with ExitStack() as doors:
+    ports = [0] * count  # of the system's choice
+    if first.port:
+        ports = [first.port + k for k in range(count)]
+    addresses = [ListenAddress(first.host, port) for port in ports]
+    with ExitStack() as stack:
         for address in addresses:
-            doors.enter_context(PageListener(address, token))
-    if ":" in first.host:
-        host = f"[{first.host}]"
-    else:
-        host = first.host
+            stack.enter_context(PageListener(address, token))
+    host = first.host
+    if ":" in host:
+        host = f"[{host}]"
     return tuple(f"{host}:{address.port}" for address in addresses)
 
 
@@ -143,115 +139,93 @@ def fed_link(file: "ReadFile", fed_by: str, notices: Notices) -> "ZmqReceiver":
     return ZmqReceiver(endpoint, notices=notices, decoder=decoder)
 
 
+@struct
+class ServeOptions:
+    """The options of `hilstar serve`."""
+
+    bench_file: Path = bench_argument()
+    duration: float | None = option(
+        "SECONDS", "Seconds to run; by default until Ctrl-C.", min=0, max=1e8
+    )
+    frames: int | None = option("N", "Number of frames to draw.", min=1)
+    scpi: str | None = option(
+        "[HOST:PORT]",
+        "Answer a test stand's SCPI there, by default on 127.0.0.1:5025; port 0 is any free one.",
+        show_default=False,
+    )
+
+
+@struct
+class HeadOptions:
+    """What `serve` of several heads gives the process of one head."""
+
+    head_of: Path | None = option("", "The file with `heads`.", hidden=True)
+    fed_by: str | None = option("", "The endpoint of the source's attitudes.", hidden=True)
+
+
 def serve(
-    bench_file: BenchFile,
-    headless: Headless = False,
-    duration: Annotated[
-        float | None,
-        Option(metavar="SECONDS", help="Seconds to run; by default until Ctrl-C.", min=0, max=1e8),
-    ] = None,
-    frames: Annotated[
-        int | None, Option(metavar="N", help="Number of frames to draw.", min=1)
-    ] = None,
-    feed: running.Feed = None,
-    ledger: running.LedgerFile = None,
-    ledger_split: running.LedgerSplit = None,
-    scenario: ScenarioFile = None,
-    overwrite: Overwrite = False,
-    windowed: running.Windowed = False,
-    force: running.Force = False,
-    console: running.Console = None,
-    control: running.Control = False,
-    token: running.Token = None,
-    console_name: running.ConsoleName = None,
-    scpi: running.Scpi = None,
-    strict: running.Strict = False,
-    explain: Explain = False,
-    as_json: Json = False,
-    head_of: HeadOf = None,
-    fed_by: FedBy = None,
+    options: ServeOptions,
+    display: DisplayOptions,
+    run: RunOptions,
+    page: ActingPageOptions,
+    head: HeadOptions,
 ) -> None:
     """Show the live attitude stream on the monitor; of a file with `heads`, on the monitor of
     each.
     """
     from hilstar.server.bench.bench_file import HeadsFile, as_head, read_bench_or_heads
 
-    file = read_bench_or_heads(bench_file) if head_of is None else as_head(bench_file, head_of)
+    file: ReadFile | HeadsFile
+    if head.head_of is None:
+        file = read_bench_or_heads(options.bench_file)
+    else:
+        file = as_head(options.bench_file, head.head_of)
     if isinstance(file, HeadsFile):
-        from hilstar.server.heads import HeadsRun
-
-        if feed is not None:
-            raise InputError(
-                f"--feed {feed}: one endpoint for several heads; serve one head's file, or leave it"
-                " out"
-            )
-        if scpi is not None:
-            raise InputError(
-                f"--scpi: {bench_file} has several heads, and SCPI is one bench's; give the bench"
-                " file of a head"
-            )
-        valued = {"--frames": frames, "--ledger-split": ledger_split, "--scenario": scenario}
-        switches = {
-            "--headless": headless,
-            "--windowed": windowed,
-            "--force": force,
-            "--control": control,
-        }
-        switches |= {"--overwrite": overwrite, "--explain": explain, "--strict": strict}
-        head_options = [
-            word
-            for name, value in valued.items()
-            if value is not None
-            for word in (name, str(value))
-        ]
-        head_options += [name for name, on in switches.items() if on]
-        asked = HeadsRun(
-            file, tuple(head_options), duration, running.dated_ledger(ledger), token=token
-        )
-        serve_heads(asked, console, overwrite, as_json)
+        asked = heads_run(file, options, display, run, page)
+        serve_heads(asked, page.console, run.overwrite, run.as_json)
         return
     from hilstar.attitude.wire.source import Mounting
     from hilstar.server.loop import Limit
     from hilstar.server.serve import Outlet
     from hilstar.server.serve import serve as serve_stream
 
-    ledger = running.dated_ledger(ledger)
+    ledger = running.dated_ledger(run.ledger)
     check_ending("--ledger", ledger, MCAP)
-    faults = running.optional_scenario(scenario)
-    check_files([scenario], [], file, ledger, overwrite)
-    split = parse_split(ledger_split)
+    faults = running.optional_scenario(run.scenario)
+    check_files([run.scenario], [], file, ledger, run.overwrite)
+    split = parse_split(run.ledger_split)
     notices = Notices()
+    # In lockstep the simulation waits for each frame: no frame is late, and a run's codes are those
+    # of any other machine.
+    is_timed = not file.config.attitude.lockstep
     with (
-        running.page_listener(console, control, token, console_name) as listener,
-        running.scpi_listener(file, scpi, listener, token) as instrument,
-        _source(file, fed_by, notices) as link,
+        running.page_listener(page) as listener,
+        running.scpi_listener(file, options.scpi, listener, page.token) as instrument,
+        _source(file, head.fed_by, notices) as link,
         running.optional_pulse(file, notices) as pulse,
-        # In lockstep the simulation waits for each frame: no frame is late, and a run's codes are
-        # those of any other machine.
-        running.shown_bench(
-            file, headless, windowed, force, timed=not file.config.attitude.lockstep
-        ) as (bench, screen),
-        running.optional_ledger(ledger, bench, notices, overwrite, split) as run_ledger,
+        running.shown_bench(file, display, timed=is_timed) as (bench, screen),
+        running.optional_ledger(ledger, bench, notices, run.overwrite, split) as run_ledger,
         running.run_with_faults(bench, faults, notices, run_ledger) as wrong,
         running.optional_answers(bench, notices, run_ledger, screen) as answers,
-        running.optional_frames(feed, bench, screen) as watched,
+        running.optional_frames(display.feed, bench, screen) as watched,
     ):
-        if explain:
-            running.explain_bench(
-                bench, of_source=link.conventions.lines(Mounting(file.config.tracker.q_body_to_cam))
-            )
+        if run.explain:
+            mounting = Mounting(file.config.tracker.q_body_to_cam)
+            running.explain_bench(bench, of_source=link.conventions.lines(mounting))
         refresh_hz = bench.config.monitor.refresh_hz
-        limit = Limit(
-            math.inf if duration is None else round(duration * refresh_hz),
-            math.inf if frames is None else frames,
-        )
+        slots: float = math.inf
+        if options.duration is not None:
+            slots = round(options.duration * refresh_hz)
+        limit = Limit(slots, options.frames or math.inf)
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
         # Before the run: what would do takes seconds, and a run that is stopped ends at once.
-        effort = running.effort_of_run(bench, explain, as_json)
+        effort = running.effort_of_run(bench, run.explain, run.as_json)
         optics = running.say_seen(bench) | effort
         running.say_of_light(bench)
-        beat = UNSET if file.config.attitude.lockstep else running.say_beat(bench, screen)
+        beat: BeatSummary | UnsetType = UNSET
+        if is_timed:
+            beat = running.say_beat(bench, screen)
         source = RunSource(
             link.endpoint,
             bench.renderer.gl_renderer,
@@ -265,7 +239,7 @@ def serve(
             on_terminal(status),
             running.followed(
                 listener,
-                control,
+                page.control,
                 _described(file, link),
                 parts,
                 status,
@@ -285,16 +259,59 @@ def serve(
             )
             summary = serve_stream(bench, link, limit, fed[0], outlet)
     whole_summary = replaced(summary, beat=beat, **optics)
-    running.end_of_run(whole_summary, screen, run_ledger, notices, as_json, strict)
+    running.end_of_run(whole_summary, screen, run_ledger, notices, run.as_json, run.strict)
     if not summary.packets.accepted:
         say(without_attitude(link.endpoint, summary.packets, link.trouble))
         raise typer.Exit(NO_ATTITUDE)
 
 
-def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
-    """The run as its page says it; where SCPI steers, with the port of the link to which it
-    sends.
+def heads_run(
+    file: "HeadsFile",
+    options: ServeOptions,
+    display: DisplayOptions,
+    run: RunOptions,
+    page: ActingPageOptions,
+) -> "HeadsRun":
+    """The run of several heads, with the options that go to each head's process. Raises InputError
+    for options of one bench.
     """
+    from hilstar.server.heads import HeadsRun
+
+    if display.feed is not None:
+        raise InputError(
+            f"--feed {display.feed}: one endpoint for several heads; serve one head's file, or"
+            " leave it out"
+        )
+    if options.scpi is not None:
+        raise InputError(
+            f"--scpi: {options.bench_file} has several heads, and SCPI is one bench's; give the"
+            " bench file of a head"
+        )
+    values = {
+        "--frames": options.frames,
+        "--ledger-split": run.ledger_split,
+        "--scenario": run.scenario,
+    }
+    switches = {
+        "--headless": display.headless,
+        "--windowed": display.windowed,
+        "--force": display.force,
+        "--control": page.control,
+        "--overwrite": run.overwrite,
+        "--explain": run.explain,
+        "--strict": run.strict,
+    }
+    words = []
+    for name, value in values.items():
+        if value is not None:
+            words += [name, str(value)]
+    words += [name for name, is_on in switches.items() if is_on]
+    ledger = running.dated_ledger(run.ledger)
+    return HeadsRun(file, tuple(words), options.duration, ledger, token=page.token)
+
+
+def _described(file: "ReadFile", link: "AnyLink") -> "RunDescription":
+    """What the page says of the run; where SCPI steers, also the port to which SCPI sends."""
     from hilstar.server.console.publisher import RunDescription
 
     source = file.config.attitude

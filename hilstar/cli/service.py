@@ -8,15 +8,15 @@ import subprocess
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
 import typer
-from typer import Argument, Option
 
 from hilstar.basics.errors import InputError, cannot_write, shortened
 from hilstar.basics.files import refuse_existing, write_whole
+from hilstar.cli.declare import argument, for_typer, option, struct, switch
 from hilstar.cli.old_names import with_present_names
-from hilstar.cli.options import BenchFile, Json, Overwrite, with_values
+from hilstar.cli.options import bench_argument, json_option, overwrite_option, with_values
 from hilstar.cli.running import UTC_MARK
 from hilstar.cli.serve import serve
 from hilstar.server.console.terminal import print_found, print_json, say
@@ -24,7 +24,7 @@ from hilstar.server.console.terminal import print_found, print_json, say
 if TYPE_CHECKING:
     from hilstar.server.console.listener import ListenAddress
 
-TOKEN_BYTES = 32
+TOKEN_BYTES = 32  # as many as `secrets` itself takes by default
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 DISPLAY_VARIABLES = ("DISPLAY", "XAUTHORITY", "WAYLAND_DISPLAY")
 
@@ -80,100 +80,110 @@ CLONE_NEWUSER, PR_CAPBSET_DROP = 0x10000000, 24
 SYSTEMD_S = 30.0  # more than TimeoutStopSec, in which a run ends
 
 
-def install(
-    bench_file: BenchFile,
-    options: Annotated[
-        list[str] | None,
-        Argument(
-            metavar="[-- OPTIONS]",
-            help="Options of `hilstar serve`, such as `-- --console --control`.",
-        ),
-    ] = None,
-    name: Annotated[
-        str | None, Option(metavar="NAME", help="The service's name; by default the bench file's.")
-    ] = None,
-    to_stdout: Annotated[
-        bool, Option("--print", help="Print the unit, and write nothing.")
-    ] = False,
-    overwrite: Overwrite = False,
-    as_json: Json = False,
-) -> None:
+@struct
+class InstallOptions:
+    """The options of `hilstar service install`."""
+
+    bench_file: Path = bench_argument()
+    serve_words: list[str] | None = argument(
+        "[-- OPTIONS]", "Options of `hilstar serve`, such as `-- --console --control`."
+    )
+    name: str | None = option("NAME", "The service's name; by default the bench file's.")
+    to_stdout: bool = switch("Print the unit, and write nothing.", "--print")
+    overwrite: bool = overwrite_option()
+    as_json: bool = json_option()
+
+
+def install(options: InstallOptions) -> None:
     """Write a systemd unit of this user that serves a bench: watched, and back within seconds
     whenever it ends.
     """
     from hilstar.server.bench.bench_file import read_bench_file
 
-    read_bench_file(bench_file)
-    command_words, console = _checked(bench_file, options or [])
-    service = unit_name(name or bench_file.stem)
+    read_bench_file(options.bench_file)
+    command_words, console = _checked(options.bench_file, options.serve_words or [])
+    service = unit_name(options.name or options.bench_file.stem)
     path = units_folder() / service
     confined = can_confine()
-    text = unit_text(path, bench_file.resolve(), command_words, confined)
+    text = unit_text(path, options.bench_file.resolve(), command_words, confined)
     if not confined:
         say(
             "this system gives users no namespace of their own: the unit keeps the capabilities"
             " that systemd gives it"
         )
-    fields = {"service": service, "unit": str(path), "confined": confined, "text": text}
-    if to_stdout:
-        if as_json:
+    fields: dict[str, Any] = {
+        "service": service,
+        "unit": str(path),
+        "confined": confined,
+        "text": text,
+    }
+    if options.to_stdout:
+        if options.as_json:
             print_json(fields | {"token_file": None, "written": []})
         else:
             typer.echo(text, nl=False)
         return
-    refuse_existing(path, overwrite)
+    refuse_existing(path, options.overwrite)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, text)
-        tokens = path.with_suffix(".env")
-        if console is None or console.is_loopback:
-            token_file = None
-        else:
-            token_file = str(tokens)
-        if token_file is not None and not tokens.exists():
-            import secrets  # hashes and random numbers, which no other command needs
-
-            with os.fdopen(
-                os.open(tokens, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "w"
-            ) as file:
-                file.write(f"HILSTAR_TOKEN={secrets.token_urlsafe(TOKEN_BYTES)}\n")
-            say(f"the token of the operator's page is in {tokens}")
+        token_file = None
+        if console is not None and not console.is_loopback:
+            token_file = path.with_suffix(".env")
+            _make_token(token_file)
     except OSError as error:
         raise cannot_write(path, error) from error
-    print_found(as_json, fields | {"token_file": token_file, "written": [str(path)]}, [str(path)])
+    fields["token_file"] = None if token_file is None else str(token_file)
+    fields["written"] = [str(path)]
+    print_found(options.as_json, fields, [str(path)])
     say(
         "start it now and whenever you log in: systemctl --user daemon-reload && systemctl --user"
         f" enable --now {service}"
     )
     say(f"at boot as well, with nobody logged in: loginctl enable-linger {getpass.getuser()}")
-    say(
-        "to be rid of it: hilstar service uninstall"
-        f" {service.removeprefix('hilstar-').removesuffix('.service')}"
+    say(f"to be rid of it: hilstar service uninstall {_bare_name(service)}")
+
+
+def _make_token(path: Path) -> None:
+    """Write a token of the operator's page, which this user alone can read; one that is there
+    stays.
+    """
+    import secrets  # hashes and random numbers, which no other command needs
+
+    if path.exists():
+        return
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+    with os.fdopen(descriptor, "w") as file:
+        file.write(f"HILSTAR_TOKEN={secrets.token_urlsafe(TOKEN_BYTES)}\n")
+    say(f"the token of the operator's page is in {path}")
+
+
+def _bare_name(name: str) -> str:
+    """A service's name without the ending and the prefix of its unit, or the ending of its bench
+    file.
+    """
+    return name.removesuffix(".toml").removesuffix(".service").removeprefix("hilstar-")
+
+
+@struct
+class UninstallOptions:
+    """The options of `hilstar service uninstall`."""
+
+    name: str = argument(
+        "NAME", "The service's name, as install printed it; by default the bench file's."
     )
+    as_json: bool = json_option()
 
 
-def uninstall(
-    name: Annotated[
-        str,
-        Argument(
-            metavar="NAME",
-            help="The service's name, as install printed it; by default the bench file's.",
-        ),
-    ],
-    as_json: Json = False,
-) -> None:
+def uninstall(options: UninstallOptions) -> None:
     """Stop a service, and delete its unit and its token."""
-    bare = name.removesuffix(".toml").removesuffix(".service").removeprefix("hilstar-")
-    path = units_folder() / unit_name(bare)
+    path = units_folder() / unit_name(_bare_name(options.name))
     if not os.path.lexists(path):
-        installed = sorted(
-            unit_path.stem.removeprefix("hilstar-")
-            for unit_path in path.parent.glob("hilstar-*.service")
-        )
+        units = path.parent.glob("hilstar-*.service")
+        installed = sorted(_bare_name(unit.name) for unit in units)
+        there = "there is none"
         if installed:
             there = f"there is {', '.join(installed)}"
-        else:
-            there = "there is none"
         raise InputError(f"{path}: no such service; {there}")
     stopped = _systemctl("disable", "--now", path.name)
     try:
@@ -182,7 +192,7 @@ def uninstall(
     except OSError as error:
         raise cannot_write(path, error) from error
     _systemctl("daemon-reload")
-    print_found(as_json, {"unit": str(path), "stopped": stopped}, [str(path)])
+    print_found(options.as_json, {"unit": str(path), "stopped": stopped}, [str(path)])
     if not stopped:
         say(
             "no systemd of this user was reached: if it still runs, systemctl --user stop"
@@ -191,43 +201,46 @@ def uninstall(
 
 
 def _systemctl(*words: str) -> bool:
+    """Run systemctl for this user. Returns whether it succeeded."""
+    command = ["systemctl", "--user", *words]
     try:
-        done = subprocess.run(
-            ["systemctl", "--user", *words], capture_output=True, timeout=SYSTEMD_S, check=False
-        )
+        done = subprocess.run(command, capture_output=True, timeout=SYSTEMD_S, check=False)
     except (OSError, subprocess.TimeoutExpired):
         return False
     return done.returncode == 0
 
 
-def _checked(bench_file: Path, options: list[str]) -> "tuple[list[str], ListenAddress | None]":
+def _checked(bench_file: Path, words: list[str]) -> "tuple[list[str], ListenAddress | None]":
+    """The options of serve by their present names, and the address of its page, if it has one.
+    Raises InputError for what serve refuses, and for what a unit cannot hold.
+    """
     from hilstar.server.console.listener import parse_address
 
-    option_words = with_values(with_present_names(["serve", *options])[1:])
+    serve_words = with_values(with_present_names(["serve", *words])[1:])
     alone = typer.Typer()
-    alone.command()(serve)
+    alone.command()(for_typer(serve))
+    command = typer.main.get_command(alone)
     try:
-        given = (
-            typer.main.get_command(alone)
-            .make_context("serve", [str(bench_file), *option_words])
-            .params
-        )
+        values = command.make_context("serve", [str(bench_file), *serve_words]).params
     except Exception as error:  # typer's usage errors have no public base class in all its versions
         message = getattr(error, "format_message", None)
         if message is None:
             raise
         raise InputError(f"the options after --: {message()} (see hilstar serve --help)") from error
-    if given["token"] is not None and "HILSTAR_TOKEN" not in os.environ:
+    if values["token"] is not None and "HILSTAR_TOKEN" not in os.environ:
         raise InputError(
             "--token: a unit is no place for it; write HILSTAR_TOKEN=... into the .env file beside"
             " the unit"
         )
-    if given["ledger"] is not None and UTC_MARK not in str(given["ledger"]):
+    ledger = values["ledger"]
+    if ledger is not None and UTC_MARK not in str(ledger):
         raise InputError(
-            f"--ledger {given['ledger']}: each start needs a ledger of its own; write"
-            f" run-{UTC_MARK}.mcap"
+            f"--ledger {ledger}: each start needs a ledger of its own; write run-{UTC_MARK}.mcap"
         )
-    return option_words, None if given["console"] is None else parse_address(given["console"])
+    console = None
+    if values["console"] is not None:
+        console = parse_address(values["console"])
+    return serve_words, console
 
 
 def can_confine() -> bool:
@@ -239,11 +252,12 @@ def can_confine() -> bool:
     libc = ctypes.CDLL(None)
     child = os.fork()
     if child == 0:
-        may = (os.geteuid() == 0 or libc.unshare(CLONE_NEWUSER) == 0) and libc.prctl(
-            PR_CAPBSET_DROP, 0, 0, 0, 0
-        ) == 0
-        os._exit(0 if may else 1)
-    return os.waitpid(child, 0)[1] == 0
+        may_drop = os.geteuid() == 0 or libc.unshare(CLONE_NEWUSER) == 0
+        if may_drop and libc.prctl(PR_CAPBSET_DROP, 0, 0, 0, 0) == 0:
+            os._exit(0)
+        os._exit(1)
+    _, status = os.waitpid(child, 0)
+    return status == 0
 
 
 def unit_name(name: str) -> str:
@@ -257,8 +271,11 @@ def unit_name(name: str) -> str:
 
 def units_folder(environment: Mapping[str, str] = os.environ) -> Path:
     """The folder of this user's systemd units."""
-    named = environment.get("XDG_CONFIG_HOME", "")
-    return (Path(named) if named.startswith("/") else Path.home() / ".config") / "systemd" / "user"
+    config = Path(environment.get("XDG_CONFIG_HOME", ""))
+    # the standard has a relative path ignored
+    if not config.is_absolute():
+        config = Path.home() / ".config"
+    return config / "systemd" / "user"
 
 
 def unit_text(
@@ -273,26 +290,22 @@ def unit_text(
 
     A `confined` one drops its capabilities, if `can_confine`.
     """
+    program = [sys.executable, "-m", "hilstar"]
     script = shutil.which("hilstar", path=str(Path(sys.executable).parent))
-    command = [
-        *([script] if script else [sys.executable, "-m", "hilstar"]),
-        "serve",
-        str(bench),
-        *options,
-    ]
-    folder = Path.cwd()
-    display_variables = {
-        name: environment[name] for name in DISPLAY_VARIABLES if environment.get(name)
-    }
+    if script:
+        program = [script]
+    command = [*program, "serve", str(bench), *options]
+    display = ""
+    for name in DISPLAY_VARIABLES:
+        if environment.get(name):
+            variable = f"{name}={environment[name]}"
+            display += f"Environment={_quoted(variable)}\n"
     return UNIT.format(
         path=path,
         bench=_literal(bench.name),
         command=" ".join(_quoted(word) for word in command),
-        folder=_literal(str(folder)),
-        display="".join(
-            f"Environment={_quoted(f'{name}={value}')}\n"
-            for name, value in display_variables.items()
-        ),
+        folder=_literal(str(Path.cwd())),
+        display=display,
         tokens=_literal(str(path.with_suffix(".env"))),
         confined=CONFINED if confined else "",
         calls=DENIED_CALLS,
@@ -307,6 +320,7 @@ def _literal(text: str) -> str:
 
 
 def _quoted(word: str) -> str:
+    """A word of a unit's command line. Raises InputError."""
     text = _literal(word).replace("\\", "\\\\").replace('"', '\\"').replace("$", "$$")
     if re.fullmatch(r"[A-Za-z0-9_@%+=:,./{}-]+", text):
         return text

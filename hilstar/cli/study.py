@@ -1,21 +1,21 @@
 """hilstar study: charts of what each choice costs, and of where methods fail."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
-
-from typer import Argument, Option
+from typing import TYPE_CHECKING, Literal
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import check_directory, make_directory
-from hilstar.cli.options import Json, check_files
-from hilstar.cli.pointing import StarText, place_of
+from hilstar.cli.declare import argument, option, struct, switch
+from hilstar.cli.options import check_files, json_option, output_option
+from hilstar.cli.pointing import PlaceOptions, place_of
 from hilstar.server.console.terminal import print_found, progress
 
 if TYPE_CHECKING:
     from hilstar.instruments.study.chain.run import ChainStudy
+    from hilstar.instruments.study.stability import FailureCase
 
 Study = Literal[
     "models",
@@ -53,90 +53,88 @@ TIMED = {
 CHAIN_SCENES = 5
 
 
-def study(
-    what: Annotated[Study, Argument(help="The study.")],
-    output: Annotated[
-        Path, Option("-o", "--output", metavar="DIR", help="Directory for charts and tables.")
-    ],
-    bench: Annotated[
-        Path | None,
-        Argument(
-            metavar="[BENCH.toml]",
-            help="The bench file of `chain`; of `models` and `outputs` one's own.",
-            show_default=False,
-        ),
-    ] = None,
-    radec: Annotated[
-        str | None,
-        Option(
-            metavar="RA,DEC,ROLL",
-            help="Of `models` and `outputs` of a bench: a field of one's own, beside the three.",
-        ),
-    ] = None,
-    star: StarText = None,
-    quick: Annotated[
-        bool, Option("--quick", help="Fewer rounds, where a full study takes minutes.")
-    ] = False,
-    images: Annotated[
-        Path | None,
-        Option(
-            metavar="DIR",
-            help="Photographs for `confront`: a folder for each camera, with its guess.toml.",
-        ),
-    ] = None,
-    as_json: Json = False,
-) -> None:
+@struct
+class FieldOptions(PlaceOptions):
+    """The place of a study's own field."""
+
+    radec: str | None = option(
+        "RA,DEC,ROLL",
+        "Of `models` and `outputs` of a bench: a field of one's own, beside the three.",
+    )
+
+
+@struct
+class StudyOptions:
+    """The options of `hilstar study`."""
+
+    what: Study = argument("", "The study.")
+    output: Path = output_option("DIR", "Directory for charts and tables.")
+    bench: Path | None = argument(
+        "[BENCH.toml]",
+        "The bench file of `chain`; of `models` and `outputs` one's own.",
+        show_default=False,
+    )
+    quick: bool = switch("Fewer rounds, where a full study takes minutes.")
+    images: Path | None = option(
+        "DIR", "Photographs for `confront`: a folder for each camera, with its guess.toml."
+    )
+    as_json: bool = json_option()
+
+
+def study(options: StudyOptions, pointing: FieldOptions) -> None:
     """Draw charts and tables of what each choice costs in accuracy and in time, and of where
     methods fail.
     """
-    check_directory("-o", output)
-    refuse_unused(what, bench, radec, star, images)
-    place = place_of("study", radec, star)
+    check_directory("-o", options.output)
+    refuse_unused(options, pointing)
+    place = place_of("study", pointing)
     answers: list[str] = []
-    steps = CHAIN_SCENES if what == "chain" else math.inf
-    with progress(f"study {what}", steps) as advance:
-        if images is not None:
+    steps = CHAIN_SCENES if options.what == "chain" else math.inf
+    with progress(f"study {options.what}", steps) as advance:
+        if options.images is not None:
             from hilstar.instruments.study.confront import run as confront_set
 
-            make_directory(output)
-            lines = confront_set(output, images, quick)
+            make_directory(options.output)
+            lines = confront_set(options.output, options.images, options.quick)
             right = None
-        elif bench is None:
-            lines, right = study_lines(what, output, quick)
-        elif what == "chain":
-            chain = chain_study(bench, output, quick, advance)
+        elif options.bench is None:
+            lines, right = study_lines(options.what, options.output, options.quick)
+        elif options.what == "chain":
+            chain = chain_study(options.bench, options.output, options.quick, advance)
             lines = chain.lines
             right = chain.right
             answers = chain.answers
         else:
-            lines = thesis_lines(what, bench, output, place)
+            lines = thesis_lines(options.what, options.bench, options.output, place)
             right = True
     fields = {
-        "study": what,
+        "study": options.what,
         "right": right,
         "findings": lines,
         "answers": answers,
-        "directory": str(output),
+        "directory": str(options.output),
     }
-    print_found(as_json, fields, [*lines, f"figures and tables in {output}", *answers])
+    lines = [*lines, f"figures and tables in {options.output}", *answers]
+    print_found(options.as_json, fields, lines)
 
 
-def refuse_unused(
-    what: str, bench: Path | None, radec: str | None, star: str | None, images: Path | None
-) -> None:
+def refuse_unused(options: StudyOptions, pointing: FieldOptions) -> None:
     """Refuse (InputError) what a study does not use, and what it lacks."""
+    what = options.what
+    bench = options.bench
+    images = options.images
     if what == "chain" and bench is None:
         raise InputError("study chain: is of a bench; write hilstar study chain BENCH.toml -o DIR")
     if bench is not None and what not in OF_A_BENCH:
         raise InputError(f"study {what}: has benches of its own; leave out {bench}")
-    for option, given in (("--radec", radec), ("--star", star)):
-        if given is None:
+    for flag, value in (("--radec", pointing.radec), ("--star", pointing.star)):
+        if value is None:
             continue
         if what not in OF_A_FIELD:
-            raise InputError(f"study {what}: has fields of its own; leave out {option}")
+            raise InputError(f"study {what}: has fields of its own; leave out {flag}")
         if bench is None:
-            example = f"hilstar study {what} BENCH.toml {option} {given}"
-            raise InputError(f"study {what} {option}: a field is seen by a bench; write {example}")
+            example = f"hilstar study {what} BENCH.toml {flag} {value}"
+            raise InputError(f"study {what} {flag}: a field is seen by a bench; write {example}")
     if what == "confront" and images is None:
         raise InputError("study confront: is of photographs; add --images DIR")
     if what != "confront" and images is not None:
@@ -158,30 +156,32 @@ def chain_study(
 def thesis_lines(
     what: str, bench: Path, output: Path, place: tuple[float, float, float] | None
 ) -> list[str]:
-    """Run the study of `models` or `outputs` with a bench, in the thesis's fields and at a
-    place; what it found.
-    """
+    """The findings of `models` or `outputs` for a bench, in the thesis's fields and at a place."""
     from hilstar.instruments.study import outputs, rapp
     from hilstar.instruments.study.fields import fields_of
     from hilstar.server.bench.bench_file import read_bench_file
 
     file = read_bench_file(bench)
-    names = rapp.BENCH_FILES if what == "models" else outputs.output_files(fields_of(place))
+    names: Iterable[str] = rapp.BENCH_FILES
+    if what != "models":
+        names = outputs.output_files(fields_of(place))
     check_files([bench], [output / name for name in names], file)
     make_directory(output)
-    if what == "models":
-        return [
-            f"{finding.figure}: {finding.text}" for finding in rapp.bench_rapp(output, file, place)
-        ]
-    return outputs.run(output, file, place)
+    if what != "models":
+        return outputs.run(output, file, place)
+    findings = rapp.bench_rapp(output, file, place)
+    return [f"{finding.figure}: {finding.text}" for finding in findings]
 
 
 def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str], bool | None]:
-    """Run a study; what it found, and whether everything was right (None: its times cannot be
-    judged).
+    """The findings of a study, and whether all was right; None where its times cannot be judged on
+    a busy machine.
     """
     make_directory(output)
-    study_of = import_module(f"hilstar.instruments.study.{what}{'.run' if what in ROOMS else ''}")
+    module = what
+    if what in ROOMS:
+        module = f"{what}.run"
+    study_of = import_module(f"hilstar.instruments.study.{module}")
     if what in TIMED:
         lines, right = study_of.run(output, quick)
         return lines, right
@@ -189,10 +189,14 @@ def study_lines(what: str, output: Path, quick: bool = False) -> tuple[list[str]
         return [f"{finding.figure}: {finding.text}" for finding in study_of.run(output)], True
     if what == "stability":
         cases = study_of.run(output)
-        lines = [
-            f"{'right' if c.right else 'WRONG'}  {c.case}: {c.happens} ({c.why}); not {c.method}:"
-            f" {c.fails}"
-            for c in cases
-        ]
-        return lines, all(case.right for case in cases)
-    return study_of.run(output) if what == "outputs" else study_of.run(output, quick), True
+        return [_case_line(case) for case in cases], all(case.right for case in cases)
+    if what == "outputs":
+        return study_of.run(output), True
+    return study_of.run(output, quick), True
+
+
+def _case_line(case: "FailureCase") -> str:
+    """A case in which another method fails, and whether this one was right."""
+    verdict = "right" if case.right else "WRONG"
+    answer = f"{verdict}  {case.case}: {case.happens} ({case.why})"
+    return f"{answer}; not {case.method}: {case.fails}"

@@ -1,6 +1,7 @@
 """hilstar tracker: the virtual tracker as a process of its own, before a display that runs."""
 
 import dataclasses
+import math
 import os
 import re
 import threading
@@ -8,15 +9,23 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
-from typer import Option
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.process.interrupts import is_command, stop_on_signal
-from hilstar.cli import options
+from hilstar.basics.units import NS_PER_S
 from hilstar.cli.completion import offered
+from hilstar.cli.declare import option, struct, switch
+from hilstar.cli.options import (
+    bench_argument,
+    check_files,
+    json_option,
+    parse_numbers,
+    parse_share,
+    seed_option,
+)
 from hilstar.server.console.terminal import print_json, say
 
 if TYPE_CHECKING:
@@ -25,139 +34,92 @@ if TYPE_CHECKING:
     from hilstar.attitude.wire.shown_frames import FrameWatch
     from hilstar.instruments.simulate.answer_link import AnswerLink
     from hilstar.instruments.simulate.live_exposure import LiveTracker, Solve
+    from hilstar.instruments.simulate.tracker_process import Planted
     from hilstar.server.answers.answer import Answer
     from hilstar.server.bench.bench_file import BenchFile
     from hilstar.server.gige.camera import GigECamera
 
 SOLVER_S = 10.0  # for a command
-NICE = 5
+NICE = 5  # behind a display on this machine, which has 0
 MAX_RATE_HZ, USUAL_RATE_HZ = 1000.0, 10.0
+# of planted errors: more than any tracker's, and arithmetic still holds them
 MAX_ARCSEC, MAX_S, MAX_PPM = 1e5, 1e5, 1e4
 SILENT = re.compile(r"(\d+(?:\.\d*)?)s?(?:@(\d+(?:\.\d*)?)s?)?")
-planted = partial(Option, rich_help_panel="Errors to plant")
+PLANTED = "Errors to plant"  # a panel of the help
+planted = partial(option, rich_help_panel=PLANTED)
 
 
-def tracker(
-    bench_file: options.BenchFile,
-    watch: Annotated[
-        str,
-        Option(metavar="ENDPOINT", help="Where serve or replay --feed sends its frames from."),
-    ],
-    answer: Annotated[
-        str | None,
-        Option(
-            metavar="TARGET",
-            help=(
-                "Where answers go: tcp://HOST:PORT (ZeroMQ), udp://HOST:PORT or"
-                " serial:/dev/ttyX@BAUD. Needed without --camera."
-            ),
-        ),
-    ] = None,
-    camera: Annotated[
-        str | None,
-        Option(
-            metavar="[ADDRESS]",
-            help=(
-                "Be a GigE Vision camera at an address of this machine, 127.0.0.2 by default: its"
-                " client gets the exposures."
-            ),
-        ),
-    ] = None,
-    allow: Annotated[
-        list[str] | None,
-        Option(
-            metavar="ADDRESS",
-            help="Who may use the camera; this machine alone by default. May be repeated.",
-        ),
-    ] = None,
-    rate: Annotated[
-        float | None,
-        Option(
-            metavar="HZ",
-            help="Answers per second; by default 10, or one an exposure where that is less.",
-        ),
-    ] = None,
-    solver: Annotated[
-        str | None,
-        Option(
-            metavar="truth|tetra3|CMD",
-            autocompletion=offered(("truth", "tetra3")),
-            help=(
-                "Who finds the attitude when none is expected: tetra3 (the extra hilstar[solve],"
-                " the default where it is"
-                ' installed), a command such as "solve {image}", python:MODULE:FUNCTION, or the'
-                " true one each time."
-            ),
-        ),
-    ] = None,
-    form: Annotated[
-        str,
-        Option(
-            "--format",
-            metavar="packet|json",
-            help="The format of the answers.",
-            autocompletion=offered(("packet", "json")),
-        ),
-    ] = "packet",
-    connect: Annotated[
-        bool,
-        Option(
-            "--connect",
-            help="Connect the ZeroMQ answers instead of binding: [answers] bind = true.",
-        ),
-    ] = False,
-    bias: Annotated[str, planted(metavar="X,Y,Z", help="Arcsec about cam x, y and z.")] = "0,0,0",
-    fov_error: Annotated[
-        float,
-        planted(
-            metavar="ARCSEC",
-            min=0,
-            max=MAX_ARCSEC,
-            help="One sigma about x and y of waves of 400 px, and 4 times that about z.",
-        ),
-    ] = 0.0,
-    pixel_error: Annotated[
-        float,
-        planted(metavar="ARCSEC", min=0, max=MAX_ARCSEC, help="The same, of waves of one pixel."),
-    ] = 0.0,
-    wrong: Annotated[
-        str, planted(metavar="SHARE", help="Of the answers that are any attitude, such as 1%.")
-    ] = "0",
-    silent: Annotated[
-        str | None,
-        planted(
-            metavar="S[@T]", help="Say nothing for S seconds, from T (5) after the first exposure."
-        ),
-    ] = None,
-    babble: Annotated[bool, planted("--babble", help="Send garbage between answers.")] = False,
-    latency: Annotated[
-        float,
-        planted(
-            metavar="SECONDS", help="From mid-exposure to the answer, at least.", min=0, max=MAX_S
-        ),
-    ] = 0.0,
-    clock_drift: Annotated[
-        float, planted(metavar="PPM", help="Of its own clock.", min=-MAX_PPM, max=MAX_PPM)
-    ] = 0.0,
-    clock_offset: Annotated[
-        float, planted(metavar="SECONDS", help="Of its own clock.", min=-MAX_S, max=MAX_S)
-    ] = 0.0,
-    seed: Annotated[int, options.seed_option("Seed of noise and errors.")] = 0,
-    duration: Annotated[
-        float | None,
-        Option(
-            metavar="SECONDS",
-            help="Seconds from the first frame; by default until Ctrl-C.",
-            min=0,
-            max=1e8,
-        ),
-    ] = None,
-    record: Annotated[
-        Path | None,
-        Option(metavar="FILE.csv", help="Write its answers as telemetry, too, as assess reads it."),
-    ] = None,
-    as_json: options.Json = False,
-) -> None:
+@struct
+class TrackerOptions:
+    """The options of `hilstar tracker`."""
+
+    bench_file: Path = bench_argument()
+    watch: str = option("ENDPOINT", "Where serve or replay --feed sends its frames from.")
+    answer: str | None = option(
+        "TARGET",
+        "Where answers go: tcp://HOST:PORT (ZeroMQ), udp://HOST:PORT or serial:/dev/ttyX@BAUD."
+        " Needed without --camera.",
+    )
+    camera: str | None = option(
+        "[ADDRESS]",
+        "Be a GigE Vision camera at an address of this machine, 127.0.0.2 by default: its client"
+        " gets the exposures.",
+    )
+    allow: list[str] | None = option(
+        "ADDRESS", "Who may use the camera; this machine alone by default. May be repeated."
+    )
+    rate: float | None = option(
+        "HZ", "Answers per second; by default 10, or one an exposure where that is less."
+    )
+    solver: str | None = option(
+        "truth|tetra3|CMD",
+        "Who finds the attitude when none is expected: tetra3 (the extra hilstar[solve], the"
+        ' default where it is installed), a command such as "solve {image}",'
+        " python:MODULE:FUNCTION, or the true one each time.",
+        autocompletion=offered(("truth", "tetra3")),
+    )
+    form: str = option(
+        "packet|json",
+        "The format of the answers.",
+        "--format",
+        default="packet",
+        autocompletion=offered(("packet", "json")),
+    )
+    connect: bool = switch("Connect the ZeroMQ answers instead of binding: [answers] bind = true.")
+    bias: str = planted("X,Y,Z", "Arcsec about cam x, y and z.", default="0,0,0")
+    fov_error: float = planted(
+        "ARCSEC",
+        "One sigma about x and y of waves of 400 px, and 4 times that about z.",
+        default=0.0,
+        min=0,
+        max=MAX_ARCSEC,
+    )
+    pixel_error: float = planted(
+        "ARCSEC", "The same, of waves of one pixel.", default=0.0, min=0, max=MAX_ARCSEC
+    )
+    wrong: str = planted("SHARE", "Of the answers that are any attitude, such as 1%.", default="0")
+    silent: str | None = planted(
+        "S[@T]", "Say nothing for S seconds, from T (5) after the first exposure."
+    )
+    babble: bool = switch("Send garbage between answers.", rich_help_panel=PLANTED)
+    latency: float = planted(
+        "SECONDS", "From mid-exposure to the answer, at least.", default=0.0, min=0, max=MAX_S
+    )
+    clock_drift: float = planted("PPM", "Of its own clock.", default=0.0, min=-MAX_PPM, max=MAX_PPM)
+    clock_offset: float = planted(
+        "SECONDS", "Of its own clock.", default=0.0, min=-MAX_S, max=MAX_S
+    )
+    seed: int = seed_option("Seed of noise and errors.")
+    duration: float | None = option(
+        "SECONDS", "Seconds from the first frame; by default until Ctrl-C.", min=0, max=1e8
+    )
+    record: Path | None = option(
+        "FILE.csv", "Write its answers as telemetry, too, as assess reads it."
+    )
+    as_json: bool = json_option()
+
+
+def tracker(options: TrackerOptions) -> None:
     """The bench's virtual tracker before the running display: it watches the frames, and answers
     in real time.
     """
@@ -168,42 +130,37 @@ def tracker(
     from hilstar.attitude.wire.shown_frames import FrameWatch
     from hilstar.instruments.simulate.answer_link import FORMATS
     from hilstar.instruments.simulate.live_exposure import LiveTracker
-    from hilstar.instruments.simulate.tracker_process import Planted, TrackerProcess
+    from hilstar.instruments.simulate.tracker_process import TrackerProcess
     from hilstar.server.bench.bench_file import read_bench_file
 
-    if form not in FORMATS:
-        raise InputError(f"--format {form}: write {' or '.join(FORMATS)}")
-    if answer is None and camera is None:
+    if options.form not in FORMATS:
+        raise InputError(f"--format {options.form}: write {' or '.join(FORMATS)}")
+    if options.answer is None and options.camera is None:
         raise InputError("nothing is to be given: write --answer TARGET, --camera, or both")
-    file = read_bench_file(bench_file)
-    options.check_files([], [record], file)
-    bias_arcsec = options.parse_numbers(bias, 3, "--bias", "X,Y,Z in arcsec")
-    if max(map(abs, bias_arcsec)) > MAX_ARCSEC:
-        raise InputError(f"--bias {bias}: write at most {MAX_ARCSEC:g} arcsec")
-    repeating = (fov_error, pixel_error)
-    silence = parse_silent(silent)
-    share = options.parse_share(wrong, "--wrong")
-    errors = Planted(
-        tuple(bias_arcsec), *repeating, share, *silence, latency, clock_drift, clock_offset
-    )
-    rate_hz = checked_rate(rate, file.config.tracker.exposure_s)
+    file = read_bench_file(options.bench_file)
+    check_files([], [options.record], file)
+    errors = planted_errors(options)
+    rate_hz = checked_rate(options.rate, file.config.tracker.exposure_s)
     stop = threading.Event()
-    noise, chance, garbage = map(np.random.default_rng, np.random.SeedSequence(seed).spawn(3))
+    seeds = np.random.SeedSequence(options.seed).spawn(3)
+    noise, chance, garbage = (np.random.default_rng(seed) for seed in seeds)
+    babbler = garbage if options.babble else None
+    seconds = math.inf if options.duration is None else options.duration
     with (
-        FrameWatch(watch) as frames,
+        FrameWatch(options.watch) as frames,
         LiveTracker(file, noise) as live,
-        answer_link(answer, form, connect, garbage if babble else None) as link,
-        open_camera(camera, allow or [], file, rate_hz) as gige,
-        recorded(record) as row,
+        answer_link(options, babbler) as link,
+        open_camera(options.camera, options.allow or [], file, rate_hz) as gige,
+        recorded(options.record) as row,
         stop_on_signal(stop),
     ):
         outlets = []
         if link is not None:
-            live.lost_in_space = solver_of(solver, live)
-            outlets.append(f"answers {rate_hz:g} Hz, {form}, to {link.endpoint}")
+            live.lost_in_space = solver_of(options.solver, live)
+            outlets.append(f"answers {rate_hz:g} Hz, {options.form}, to {link.endpoint}")
         if gige is not None:
-            outlets.append(f"a GigE Vision camera at {camera}")
-        watching = f"{frames.verb.replace('a sender', 'frames')} {watch}"
+            outlets.append(f"a GigE Vision camera at {options.camera}")
+        watching = f"{frames.verb.replace('a sender', 'frames')} {options.watch}"
         say("; ".join([watching, *outlets]))
         process = TrackerProcess(live, frames, errors, rate_hz, chance, gige)
 
@@ -212,10 +169,30 @@ def tracker(
                 link.send(answered)
             row(answered)
 
-        seconds = float("inf") if duration is None else duration
         process.run(None if link is None else send, stop, seconds)
         summary = process.tally.summary() | counts_of(live, frames, link, gige)
-    tell(summary, as_json)
+    tell(summary, options.as_json)
+
+
+def planted_errors(options: TrackerOptions) -> "Planted":
+    """The errors that the command line plants. Raises InputError."""
+    from hilstar.instruments.simulate.tracker_process import Planted
+
+    x_arcsec, y_arcsec, z_arcsec = parse_numbers(options.bias, 3, "--bias", "X,Y,Z in arcsec")
+    if max(abs(x_arcsec), abs(y_arcsec), abs(z_arcsec)) > MAX_ARCSEC:
+        raise InputError(f"--bias {options.bias}: write at most {MAX_ARCSEC:g} arcsec")
+    silent_s, silent_from_s = parse_silent(options.silent)
+    return Planted(
+        (x_arcsec, y_arcsec, z_arcsec),
+        options.fov_error,
+        options.pixel_error,
+        parse_share(options.wrong, "--wrong"),
+        silent_s,
+        silent_from_s,
+        options.latency,
+        options.clock_drift,
+        options.clock_offset,
+    )
 
 
 def counts_of(
@@ -247,15 +224,15 @@ def counts_of(
 
 @contextmanager
 def answer_link(
-    target: str | None, form: str, connect: bool, babbler: "np.random.Generator | None"
+    options: TrackerOptions, babbler: "np.random.Generator | None"
 ) -> Iterator["AnswerLink | None"]:
     """The link of answers, None without a target. Raises InputError."""
     from hilstar.instruments.simulate.answer_link import AnswerLink
 
-    if target is None:
+    if options.answer is None:
         yield None
         return
-    with AnswerLink(target, form, connect, babbler) as link:
+    with AnswerLink(options.answer, options.form, options.connect, babbler) as link:
         yield link
 
 
@@ -358,7 +335,9 @@ def checked_rate(rate_hz: float | None, exposure_s: float) -> float:
 
 
 def solver_of(text: str | None, live: "LiveTracker") -> "Solve | None":
-    """Who finds attitudes lost in space; None: the true one is taken. Raises InputError."""
+    """The solver of attitudes lost in space; None where the true attitude is taken. Raises
+    InputError.
+    """
     import numpy as np
 
     from hilstar.tracker.identify import LostInSpace
@@ -381,7 +360,12 @@ def solver_of(text: str | None, live: "LiveTracker") -> "Solve | None":
         database = LostInSpace(
             vectors, stars.v_mag[: len(vectors)], camera.focal_length_px, camera.resolution_px
         )
-        return lambda found, dn: database.solve(found.rays[:, :2] / found.rays[:, 2:], found.flux_e)
+
+        def solve(stars: Any, dn: Any) -> Any:
+            on_plane = stars.rays[:, :2] / stars.rays[:, 2:]
+            return database.solve(on_plane, stars.flux_e)
+
+        return solve
     return by_image(text or "", live)
 
 
@@ -401,17 +385,19 @@ def by_image(text: str, live: "LiveTracker") -> "Solve":
         )
     solver = choose_solver(text, Centroiding(), live.file.folder, SOLVER_S)
     nowhere = View(np.array([1.0, 0.0, 0.0, 0.0]))
-    told_kinds = set[str]()
+    no_light = np.zeros((0, 0))
+    no_stars = np.zeros(0, dtype=EXPOSURE_DTYPE)
+    faults = set[str]()
 
-    def solve(found: Any, dn: Any) -> Any:
+    def solve(stars: Any, dn: Any) -> Any:
+        exposure = Exposure(nowhere, dn, no_light, no_stars)  # an image without its truth
         try:
-            return solver.solve(
-                Exposure(nowhere, dn, np.zeros((0, 0)), np.zeros(0, dtype=EXPOSURE_DTYPE)), live
-            ).q_icrs_to_cam
+            return solver.solve(exposure, live).q_icrs_to_cam
         except SolverFault as fault:
-            if str(fault) not in told_kinds:
+            # a solver fails at ten images a second, for one reason
+            if str(fault) not in faults:
                 say(f"hilstar: {fault}")
-                told_kinds.add(str(fault))
+                faults.add(str(fault))
             return None
 
     return solve
@@ -421,17 +407,18 @@ def by_image(text: str, live: "LiveTracker") -> "Solve":
 def recorded(path: Path | None) -> Iterator[Any]:
     """A function that writes an answer as a row of telemetry; it does nothing without a file."""
     if path is None:
-        yield lambda said: None
+        yield lambda answer: None
         return
     with path.open("w", encoding="ascii") as file:
         file.write("t_s,qw,qx,qy,qz,valid\n")
 
-        def row(said: "Answer") -> None:
-            q = said.q_icrs_to_cam
+        def row(answer: "Answer") -> None:
+            t_s = (answer.t_ns or 0) / NS_PER_S
+            q = answer.q_icrs_to_cam
             if q is None:
-                numbers = ",,,"
+                file.write(f"{t_s:.9f},,,,,0\n")
             else:
                 numbers = ",".join(repr(float(value)) for value in q)
-            file.write(f"{(said.t_ns or 0) / 1e9:.9f},{numbers},{int(q is not None)}\n")
+                file.write(f"{t_s:.9f},{numbers},1\n")
 
         yield row

@@ -8,7 +8,7 @@ moments in boxes of 3 x 3 and 5 x 5 of the tracker's pixels (centres of mass).
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,24 +29,17 @@ class Weights:
     fit has 0 before the blur and 2 after it.
     """
 
-    light: float
-    moments: float
-    window_light: float
-    window_moments: float
-    box_3: float
-    box_5: float
-    few_steps: float
-    last_light: float
-    window_blurs: float
-
-
-# Found by search, for the centroider that gains least over rounding: stars of 46 to 95 steps, most
-# of all 66 at 32 x 32 phases.
-IN_A_FRAME = Weights(1.0, 0.587, 0.676, 3.262, 2.05, 0.484, 8.64, 1.891, 0.497)
-# Over frames no star weighs its light more, or faint stars' moments would drift; the larger box
-# leaves 0.0034 px in place of 0.0038 over six frames of a star of 66 steps, and the others stay
-# under 0.0031.
-OVER_FRAMES = Weights(1.0, 0.75, 0.8, 3.0, 2.2, 1.2, 0.0, 3.5, 0.6)
+    # Found by search, for the centroider that gains least over rounding in one frame: stars of 46
+    # to 95 steps, most of all 66 at 32 x 32 phases.
+    light: float = 1.0
+    moments: float = 0.587
+    window_light: float = 0.676
+    window_moments: float = 3.262
+    box_3: float = 2.05
+    box_5: float = 0.484
+    few_steps: float = 8.64
+    last_light: float = 1.891
+    window_blurs: float = 0.497
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,16 +63,14 @@ class Balance:
 
     psf: Psf
     seen: Seen = AS_USUAL
-    weights: Weights = IN_A_FRAME
+    weights: Weights = field(default_factory=Weights)
 
     @property
     def window_px(self) -> tuple[float, float]:
         """The Gaussian's sigma along x and y."""
-        x, y = (
-            math.sqrt(v + self.weights.window_blurs * self.seen.blur_px**2)
-            for v in self.psf.variance_px2
-        )
-        return x, y
+        x_px2, y_px2 = self.psf.variance_px2
+        more_px2 = self.weights.window_blurs * self.seen.blur_px**2
+        return math.sqrt(x_px2 + more_px2), math.sqrt(y_px2 + more_px2)
 
     def in_box(
         self, side: int, away_x: FloatArray | Float32Array, away_y: FloatArray | Float32Array
@@ -88,15 +79,18 @@ class Balance:
         star's nearest.
         """
         half = side * self.seen.pixel_px / 2
-        ends = range(BOX_REACH + 1)
         # A box without blur keeps an edge of half a pixel: where the tracker's pixels lie on the
         # monitor's is not known.
         blur = max(self.seen.blur_px, 0.25)
         scale = 1 / (blur * math.sqrt(2))  # scipy.special would take 0.12 s to import
-        along_axis = np.array(
-            [(math.erf((at + half) * scale) - math.erf((at - half) * scale)) / 2 for at in ends]
-        )
-        x, y = (np.minimum(np.abs(away), BOX_REACH).astype(np.intp) for away in (away_x, away_y))
+        in_side = []
+        for at in range(BOX_REACH + 1):
+            below = math.erf((at - half) * scale)
+            above = math.erf((at + half) * scale)
+            in_side.append((above - below) / 2)
+        along_axis = np.array(in_side)
+        x = np.minimum(np.abs(away_x), BOX_REACH).astype(np.intp)
+        y = np.minimum(np.abs(away_y), BOX_REACH).astype(np.intp)
         return np.asarray(along_axis[x] * along_axis[y])
 
     def follows(self, side: int) -> tuple[float, float]:
@@ -106,7 +100,8 @@ class Balance:
         slopes = []
         for variance in self.psf.variance_px2:
             # The slope of the mean of a unit Gaussian between -h and h, as both edges move
-            h = side * self.seen.pixel_px / 2 / math.sqrt(variance + self.seen.blur_px**2)
+            sigma_px = math.sqrt(variance + self.seen.blur_px**2)
+            h = side * self.seen.pixel_px / 2 / sigma_px
             density = math.exp(-(h**2) / 2) / math.sqrt(2 * math.pi)
             slopes.append(2 * h * density / math.erf(h / math.sqrt(2)))
         return slopes[0], slopes[1]
@@ -125,18 +120,17 @@ class Balance:
         d = (offset_px - fraction).astype(np.float32)
         off = fraction - nearest
         # An eighth power stands for exp(-u), within 0.03, to save the shader's time.
-        u = 0.5 * (
-            np.square(d[0] / np.float32(self.window_px[0]))
-            + np.square(d[1] / np.float32(self.window_px[1]))
-        )
+        sigma_x, sigma_y = self.window_px
+        along_x = np.square(d[0] / np.float32(sigma_x))
+        along_y = np.square(d[1] / np.float32(sigma_y))
+        u = 0.5 * (along_x + along_y)
         window = (1 + u / 8) ** -8
         arms = np.empty((SUMS, *window.shape), dtype=np.float32)
         weights = self.weights
-        arms[0], arms[1:3] = (
-            weights.light * (1 + weights.few_steps / np.maximum(steps, 1e-3)),
-            weights.moments * d,
-        )
-        arms[3], arms[4:6] = weights.window_light * window, weights.window_moments * window * d
+        arms[0] = weights.light * (1 + weights.few_steps / np.maximum(steps, 1e-3))
+        arms[1:3] = weights.moments * d
+        arms[3] = weights.window_light * window
+        arms[4:6] = weights.window_moments * window * d
         for first, side, weight in ((6, 3, weights.box_3), (8, 5, weights.box_5)):
             follows = np.array(self.follows(side), dtype=np.float32)[:, None, None]
             box = np.float32(weight) * self.in_box(side, *away).astype(np.float32)

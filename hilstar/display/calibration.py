@@ -90,8 +90,9 @@ class Calibration:
         if self.uniformity is None:
             return None
         width, height = resolution_px
-        rows = weights_of_grid(height, self.uniformity.shape[0])
-        columns = weights_of_grid(width, self.uniformity.shape[1])
+        grid_rows, grid_columns = self.uniformity.shape
+        rows = weights_of_grid(height, grid_rows)
+        columns = weights_of_grid(width, grid_columns)
         light = rows @ self.uniformity @ columns.T
         smallest = float(self.uniformity.min()) / 2  # an extrapolated slope must not go below zero
         np.maximum(light, smallest, out=light)
@@ -103,11 +104,13 @@ def weights_of_grid(pixels: int, fields: int) -> FloatArray:
     """The weight of each of a grid's fields in each pixel along one axis, (pixels, fields)."""
     if fields == 1:
         return np.ones((pixels, 1))
-    place = (np.arange(pixels) + 0.5) * fields / pixels - 0.5
+    pixel = np.arange(pixels)
+    place = (pixel + 0.5) * fields / pixels - 0.5
     lower_node = np.clip(np.floor(place).astype(np.intp), 0, fields - 2)
+    part = place - lower_node
     weights = np.zeros((pixels, fields))
-    weights[np.arange(pixels), lower_node] = 1 - (place - lower_node)
-    weights[np.arange(pixels), lower_node + 1] = place - lower_node
+    weights[pixel, lower_node] = 1 - part
+    weights[pixel, lower_node + 1] = part
     return weights
 
 
@@ -146,28 +149,30 @@ def load_calibration(source: str | Path, bits: int, *, bit_stealing: bool = Fals
             f"{path}: [calibration] bits = {head.bits}, but the monitor has {bits}; calibrate at"
             f" {bits} bits"
         )
-    columns = read_response(beside(path, head.response, "[calibration] response"), bits, read)
+    columns = read_response(_response_path(path, head), bits, read)
     uniformity = None
+    uniformity_relative = None
     if file.uniformity is not None:
-        uniformity = read_grid(beside(path, file.uniformity.file, "[uniformity] file"), read)
-    if file.weights:
-        weights = (file.weights.r, file.weights.g, file.weights.b)
-    else:
-        weights = None
+        grid_path = beside(path, file.uniformity.file, "[uniformity] file")
+        uniformity = read_grid(grid_path, read)
+        uniformity_relative = file.uniformity.relative
+    weights = None
+    if file.weights is not None:
+        weights = file.weights.r, file.weights.g, file.weights.b
     response, shares = _response(path, bits, columns, weights, bit_stealing)
     return Calibration(
         name=name if name == "lcd-example" else path.name,
         response=response,
         sha256=hashlib.sha256(b"".join(read)).hexdigest(),
         uniformity=uniformity,
-        uniformity_relative=file.uniformity.relative if file.uniformity else None,
+        uniformity_relative=uniformity_relative,
         noise=file.noise.relative if file.noise else 0.0,
         weights=shares,
         who=head.who,
         when=head.when,
         instrument=head.instrument,
         unit=head.unit,
-        notes={key: text for key, text in msgspec.structs.asdict(file.notes).items() if text},
+        notes=file.notes.stated(),
     )
 
 
@@ -193,22 +198,22 @@ def primary_lights(source: str | Path, bits: int) -> FloatArray:
         return np.outer(REC709_WEIGHTS, _formula(str(source), bits).light)
     path = _path_of(source)
     file = read_toml(path)
-    columns = read_response(beside(path, file.calibration.response, "[calibration] response"), bits)
-    above = {name: light - light[0] for name, light in columns.items()}
-    if "r" in above and file.weights is None:
-        light = np.stack([above[name] for name in ("r", "g", "b")])
-        return np.asarray(light / light[:, -1].sum())
-    if file.weights is None:
+    columns = read_response(_response_path(path, file.calibration), bits)
+    if "r" in columns:
+        measured = [columns[name] for name in PRIMARIES]
+    else:
+        measured = [columns["w"]] * 3
+    light = np.stack(measured)
+    above = light - light[:, :1]
+    whites = above[:, -1:]
+    if file.weights is not None:
+        shares = np.array([file.weights.r, file.weights.g, file.weights.b])
+        return np.asarray(above / whites * (shares / shares.sum())[:, None])
+    if "r" not in columns:
         raise InputError(
             f"{path}: the primaries as the tracker sees them are not known; add [weights] r, g, b"
         )
-    shares = np.array([file.weights.r, file.weights.g, file.weights.b])
-    if "r" in above:
-        names = ("r", "g", "b")
-    else:
-        names = ("w", "w", "w")
-    light = np.stack([above[name] / above[name][-1] for name in names])
-    return np.asarray(light * (shares / shares.sum())[:, None])
+    return np.asarray(above / whites.sum())
 
 
 def primary_responses(source: str | Path, bits: int) -> tuple[responses.Response, ...]:
@@ -220,14 +225,14 @@ def primary_responses(source: str | Path, bits: int) -> tuple[responses.Response
     if str(source) in FORMULAS:
         return (_formula(str(source), bits),) * 3
     path = _path_of(source)
-    columns = read_response(
-        beside(path, read_toml(path).calibration.response, "[calibration] response"), bits
-    )
-    tables = {
-        name: responses.table_response(bits, (light - light[0]) / (light[-1] - light[0]))
-        for name, light in columns.items()
-    }
-    return tuple(tables[name] for name in ("rgb" if "r" in tables else "www"))
+    columns = read_response(_response_path(path, read_toml(path).calibration), bits)
+    tables = []
+    for light in columns.values():
+        above = light - light[0]
+        tables.append(responses.table_response(bits, above / above[-1]))
+    if len(tables) == 1:
+        return (tables[0],) * 3
+    return tuple(tables)
 
 
 def with_uniformity(
@@ -260,9 +265,7 @@ def with_uniformity(
     else:
         origin = _path_of(source)
         file = read_toml(origin)
-        columns = read_response(
-            beside(origin, file.calibration.response, "[calibration] response"), bits
-        )
+        columns = read_response(_response_path(origin, file.calibration), bits)
         head = msgspec.structs.replace(file.calibration, response=response)
         weights = file.weights
         noise = file.noise.relative if file.noise else 0.0
@@ -284,21 +287,27 @@ def _response(
     weights: responses.Weights | None,
     bit_stealing: bool,
 ) -> tuple[responses.Response, responses.Weights | None]:
+    """A calibration's response and the primaries' shares of white, of sum 1; None where they are
+    not known. Raises InputError.
+    """
     whites = {name: float(light[-1] - light[0]) for name, light in columns.items()}
     if weights is None and "r" in columns:
         weights = whites["r"], whites["g"], whites["b"]
     if weights is not None:
-        if not sum(weights) > 0:
+        total = sum(weights)
+        if not total > 0:
             raise InputError(
                 f"{path}: [weights] r, g and b are all 0; write the primaries' shares of white"
             )
-        weights = weights[0] / sum(weights), weights[1] / sum(weights), weights[2] / sum(weights)
+        r, g, b = weights
+        weights = r / total, g / total, b / total
     elif bit_stealing:
         raise InputError(
             f"{path}: bit stealing needs the primaries as the tracker sees them; add [weights] r,"
             " g, b"
         )
-    black = float(np.mean([light[0] for light in columns.values()])) / sum(whites.values())
+    black_light = float(np.mean([light[0] for light in columns.values()]))
+    black = black_light / sum(whites.values())
     tables = {
         name: responses.table_response(bits, (light - light[0]) / whites[name])
         for name, light in columns.items()
@@ -375,6 +384,10 @@ class NotesTable(Table, frozen=True):
     drift: str = ""
     text: str = ""
 
+    def stated(self) -> dict[str, str]:
+        """Those that are not empty, by key."""
+        return {key: text for key, text in msgspec.structs.asdict(self).items() if text}
+
 
 class CalibrationFile(Table, frozen=True):
     """A whole calibration file."""
@@ -386,9 +399,6 @@ class CalibrationFile(Table, frozen=True):
     errors: ErrorsTable | None = None
     notes: NotesTable = msgspec.field(default_factory=NotesTable)
     monitor_identity: MonitorIdentity | None = None
-
-
-KIND = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
 
 
 def _read(path: Path, read: list[bytes] | None, limit_bytes: int = MAX_TABLE_BYTES) -> str:
@@ -413,6 +423,11 @@ def beside(path: Path, name: str, key: str) -> Path:
     return other
 
 
+def _response_path(path: Path, head: CalibrationHead) -> Path:
+    """The table of a calibration file. Raises InputError where it is not there."""
+    return beside(path, head.response, "[calibration] response")
+
+
 def read_toml(path: Path, read: list[bytes] | None = None) -> CalibrationFile:
     """Read and check a calibration file. Raises InputError: file, key, what is wrong and what to
     write.
@@ -425,10 +440,12 @@ def read_toml(path: Path, read: list[bytes] | None = None) -> CalibrationFile:
     try:
         return msgspec.convert(tables, CalibrationFile)
     except (msgspec.ValidationError, RecursionError) as error:
-        raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
+        kind = Kind(CalibrationFile, "configs/CALIBRATION.md", TYPE_WORDS)
+        raise InputError(f"{path}: {explained(str(error), tables, kind)}") from error
 
 
 def _table(path: Path, read: list[bytes] | None) -> TextTable:
+    """A table of a calibration, whose doubtful lines are told. Its bytes are appended to `read`."""
     lines = _read(path, read).splitlines(keepends=True)
     table = table_of(path, ADVICE, iter(lines))
     table.warn()
@@ -440,9 +457,10 @@ def _numbers(table: TextTable, columns: Sequence[Chosen]) -> FloatArray:
     none, or is negative.
     """
     rows = []
-    names = [
-        table.columns[column.place].header or f"column {column.place + 1}" for column in columns
-    ]
+    names = []
+    for column in columns:
+        header = table.columns[column.place].header
+        names.append(header or f"column {column.place + 1}")
     for line, cells in table.rows():
         texts = [table.cell(cells, column) for column in columns]
         row = finite_numbers(table.path, line, names, texts, "write numbers that are not negative")
@@ -482,15 +500,14 @@ def read_response(path: Path, bits: int, read: list[bytes] | None = None) -> dic
             f"{path}: its codes are {code[0]:g} to {code[-1]:g}; write 0 (black) to {white} (white"
             f" of {bits} bits)"
         )
-    columns = {
-        name: _every_code(path, name, code, rows[:, place + 1], white)
-        for place, name in enumerate(header[1:])
-    }
+    columns = {}
+    for name, light in zip(header[1:], rows.T[1:], strict=True):
+        columns[name] = _every_code(path, name, code, light, white)
     blacks = rows[0, 1:]
     if np.ptp(blacks) > BLACKS_AGREE * blacks.mean():
+        listed = ", ".join(f"{black:g}" for black in blacks)
         raise InputError(
-            f"{path}: code 0 has {', '.join(f'{b:g}' for b in blacks)}; all show one black screen,"
-            " so write one light"
+            f"{path}: code 0 has {listed}; all show one black screen, so write one light"
         )
     return columns
 
@@ -503,8 +520,9 @@ def _every_code(
     """
     fall = np.flatnonzero(np.diff(light) <= 0)
     if len(fall):
-        low = code[fall[0]]
-        high = code[fall[0] + 1]
+        first = fall[0]
+        low = code[first]
+        high = code[first + 1]
         raise InputError(
             f"{path}: light of channel {name} does not rise from code {low:g} to code {high:g};"
             " every code must be brighter"
@@ -513,20 +531,20 @@ def _every_code(
         return light
     if len(code) < 3:
         raise InputError(f"{path}: two codes make no response; give some between black and white")
+    black = light[0]
     log_code = np.log(code[1:])
-    log_light = np.log(light[1:] - light[0])
+    log_light = np.log(light[1:] - black)
     # a quarter of a second of every command that has no such file
     from scipy.interpolate import PchipInterpolator
 
     curve = PchipInterpolator(log_code, log_light)
     wanted = np.log(np.arange(1, white + 1))
-    slope = (log_light[1] - log_light[0]) / (log_code[1] - log_code[0])
-    below = log_light[0] + slope * (wanted - log_code[0])
-    return np.append(
-        light[0],
-        light[0]
-        + np.exp(np.where(wanted < log_code[0], below, curve(np.maximum(wanted, log_code[0])))),
-    )
+    first_code = log_code[0]
+    slope = (log_light[1] - log_light[0]) / (log_code[1] - first_code)
+    power_law = log_light[0] + slope * (wanted - first_code)
+    between = curve(np.maximum(wanted, first_code))
+    log_above = np.where(wanted < first_code, power_law, between)
+    return np.append(black, black + np.exp(log_above))
 
 
 def read_grid(path: Path, read: list[bytes]) -> FloatArray:
@@ -562,8 +580,9 @@ def write_calibration(
     """
     table = path.parent / head.response
     lines = [",".join(["code", *columns])]
-    for code, lights in enumerate(zip(*columns.values(), strict=True)):
-        lines.append(",".join([str(code), *(repr(float(light)) for light in lights)]))
+    lights = np.stack(list(columns.values()), axis=1).tolist()
+    for code, code_lights in enumerate(lights):
+        lines.append(",".join(map(repr, [code, *code_lights])))
     comment = f"# light in {head.unit or 'one linear unit'}, black level (code 0) included"
     lines.insert(0, comment.encode("ascii", "replace").decode())
     tables: dict[str, Any] = {

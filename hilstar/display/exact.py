@@ -22,7 +22,7 @@ import numpy.typing as npt
 from hilstar.basics.arrays import Float32Array, IntArray
 from hilstar.basics.units import COMPUTE_VERSION
 from hilstar.display import quantise
-from hilstar.display.balance import AS_USUAL, IN_A_FRAME, SUMS, Balance, Seen, Weights
+from hilstar.display.balance import AS_USUAL, SUMS, Balance, Seen, Weights
 from hilstar.display.footprints import FEWEST, FootprintMap, Footprints, PixelOrder, PlaceArray
 from hilstar.display.panel import Panel
 from hilstar.display.response import Levels
@@ -42,6 +42,23 @@ MAX_SIZE = 63  # largest footprint whose places fit into six bits
 # As MS_A_STAR. NumPy: 0.03 to 0.06 of 150 to 1800 stars, and more for sprites that are too wide for
 # the shader. A field of the Milky Way has twice the stars of an average one.
 EXACT_MS_A_STAR, NUMPY_EXACT_MS_A_STAR, WIDE_EXACT_MS_A_STAR = 0.003, 0.05, 0.23
+
+
+class Turn(NamedTuple):
+    """The turn of a panel among those of one monitor, which choose their levels one after another.
+
+    A star makes up in it for these shares `makes_up` of the errors that it left in the panels
+    before, in their order, in steps of both. Where it `is_followed`, the next panel makes up for
+    what it leaves itself.
+    """
+
+    makes_up: tuple[float, ...] = ()
+    is_followed: bool = False
+
+    @property
+    def kept(self) -> int:
+        """How many choices are kept side by side."""
+        return KEPT_BEFORE if self.is_followed else KEPT
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,13 +118,11 @@ class ExactQuantiser(quantise.Quantiser):
     )
     shader = "exact.comp"
     other_codes = 1e-2
-    weights: ClassVar[Weights] = IN_A_FRAME
+    weights: ClassVar[Weights] = Weights()
     remembers: ClassVar[bool] = False
     left: Left | None = None
-    # For so much of what these quantisers of other primaries left in the same frame each star makes
-    # up, in steps of both.
-    given: Sequence[tuple[float, quantise.Quantiser]] = ()
-    kept = KEPT
+    turn: Turn = Turn()
+    before: Sequence["ExactQuantiser"] = ()  # of the panels before, as in `turn`
     over: Float32Array | None = None  # what the last frame's sprites left, where each is a star
 
     def __init__(
@@ -133,10 +148,9 @@ class ExactQuantiser(quantise.Quantiser):
         """The levels of the next frame: its stars are added to its dithered extended light."""
         if light.sprites is None or not light.sprites.extended:
             return self.levels(light.sprites)
-        return self.levels(
-            light.sprites,
-            quantise.dither_levels(light.extended(), self._panel, self.floor_turn(light.number)),
-        )
+        turn = self.floor_turn(light.number)
+        floor = quantise.dither_levels(light.extended(), self._panel, turn)
+        return self.levels(light.sprites, floor)
 
     def begin_anew(self) -> None:
         """The next frame is the first of a sequence."""
@@ -199,12 +213,12 @@ class ExactQuantiser(quantise.Quantiser):
             levels = np.empty(footprint.place.shape, dtype=self._flat.dtype)
             carried = self._carried(sprites)
             remainder = np.empty_like(carried.error)
-            reach = self._reach(
-                footprint.rate_e_per_s * _sprites_in_path(sprites).astype(np.float32)
-            )
+            of_star_e_per_s = footprint.rate_e_per_s * _sprites_in_path(sprites).astype(np.float32)
+            reach = self._reach(of_star_e_per_s)
             for some in _turns(sprites):
+                stars = _part(footprint, some)
                 levels[:, some], remainder[:, some] = self._choose(
-                    _part(footprint, some), carried.of(some), reach[some]
+                    stars, carried.of(some), reach[some]
                 )
                 _hand_on(carried.error, remainder, some, sprites)
             self._keep(sprites, remainder)
@@ -216,18 +230,19 @@ class ExactQuantiser(quantise.Quantiser):
     def _reach(self, of_star_e_per_s: Float32Array) -> IntArray:
         """How many pixels of stars of so much light (n,) are chosen, (n,)."""
         order = self._map.order
-        return np.maximum(
-            order.reach(of_star_e_per_s / np.float32(self._step_e_per_s)), self.fewest(order)
-        )
+        steps = of_star_e_per_s / np.float32(self._step_e_per_s)
+        return np.maximum(order.reach(steps), self.fewest(order))
 
     def _carried(self, sprites: FrameLight) -> Carried:
         """The errors that each sprite begins with: what its light in other primaries left, or
         none.
         """
         carried = nothing_carried(len(sprites))
-        for part, other in self.given if sprites.per_star == 1 else ():
-            if part and isinstance(other, ExactQuantiser) and other.over is not None:
-                np.add(carried.error, np.float32(part) * other.over, out=carried.error)
+        if sprites.per_star > 1:
+            return carried
+        for share, panel in zip(self.turn.makes_up, self.before, strict=True):
+            if panel.over is not None:
+                np.add(carried.error, np.float32(share) * panel.over, out=carried.error)
         return carried
 
     def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
@@ -241,7 +256,7 @@ class ExactQuantiser(quantise.Quantiser):
         self.over = left
 
     def _choose(
-        self, found: Footprints, carried: Carried, reach: IntArray
+        self, stars: Footprints, carried: Carried, reach: IntArray
     ) -> tuple[IntArray, Float32Array]:
         """The levels of a chunk of stars, (pixels, n), and the errors that they and those `carried`
         leave, (SUMS, n).
@@ -249,21 +264,19 @@ class ExactQuantiser(quantise.Quantiser):
         Of each star the nearest `reach` (n,) pixels are chosen.
         """
         near = self._map.order.near
-        lower, upper, short, step = self._levels_about(found)
-        chosen = np.arange(near)[:, None] < reach
+        lower, upper, short, step = self._levels_about(stars)
+        is_chosen = np.arange(near)[:, None] < reach
         far = short.copy()
-        short = np.where(chosen, short[:near], np.float32(0))
-        step = np.where(chosen, step, np.float32(0))
-        far[:near][chosen] = 0.0
-        d = found.offset_px - found.fraction_px[:, None]
+        short = np.where(is_chosen, short[:near], np.float32(0))
+        step = np.where(is_chosen, step, np.float32(0))
+        far[:near][is_chosen] = 0.0
+        d = stars.offset_px - stars.fraction_px[:, None]
         weights = self._balance.weights
-        arm = self._balance.arms(
-            found.offset_px[:, :near],
-            found.fraction_px,
-            found.rate_e_per_s / np.float32(self._step_e_per_s),
-        )
+        steps_of_star = stars.rate_e_per_s / np.float32(self._step_e_per_s)
+        arm = self._balance.arms(stars.offset_px[:, :near], stars.fraction_px, steps_of_star)
         error = self._bounded(carried.error, step).copy()
-        error[:3] += np.stack([far.sum(axis=0), *np.einsum("kpn,pn->kn", d, far)])
+        moments_of_far = np.einsum("kpn,pn->kn", d, far)
+        error[:3] += np.stack([far.sum(axis=0), *moments_of_far])
         # Where all steps of a star are equal: the step; 0 elsewhere. What lies between two of them
         # no choice can show.
         largest = step.max(axis=0)
@@ -271,19 +284,22 @@ class ExactQuantiser(quantise.Quantiser):
         grid = np.where(largest <= smallest * (1 + SAME_STEP), largest, np.float32(0))
         error[0] += carried.phase * grid
         lowest = short.sum(axis=0) + error[0]
-        unit = np.where(grid > 0, grid, np.float32(1))
-        hidden = np.where(grid > 0, lowest - np.rint(lowest / unit) * unit, np.float32(0))
+        is_even = grid > 0
+        unit = np.where(is_even, grid, np.float32(1))
+        between = lowest - np.rint(lowest / unit) * unit
+        hidden = np.where(is_even, between, np.float32(0))
         error[0] -= hidden
-        weight = np.stack([arm[0, 0], *np.full((2, len(grid)), np.float32(weights.moments))])
+        of_moments = np.full((2, len(grid)), np.float32(weights.moments))
+        weight = np.stack([arm[0, 0], *of_moments])
         error[:3] *= weight
-        up, remainder = _decide(short, step, arm, error, weights.last_light, self.kept)
+        up, remainder = _decide(short, step, arm, error, weights.last_light, self.turn.kept)
         _turn_one_more(step, arm, up, remainder, grid)
         remainder[:3] /= weight
         remainder[0] += hidden
         return np.concatenate([lower + up, upper]), remainder
 
     def _levels_about(
-        self, found: Footprints
+        self, stars: Footprints
     ) -> tuple[IntArray, IntArray, Float32Array, Float32Array]:
         """The lower levels of the near pixels and the nearest ones of the others, what these are
         off the wanted light (pixels, n), and what the next level adds to the near ones' (near, n),
@@ -293,38 +309,40 @@ class ExactQuantiser(quantise.Quantiser):
         if self._output is None:
             output = None
         else:
-            output = self._output[found.place]
-        asked = found.light / np.float32(self._panel.flux_at_white_e_per_s)
+            output = self._output[stars.place]
+        asked = stars.light / np.float32(self._panel.flux_at_white_e_per_s)
         if output is not None:
             asked /= output
         if self._on_floor:
-            asked += self._light[self._flat[found.place]].astype(np.float32)
+            floor = self._flat[stars.place]
+            asked += self._light[floor].astype(np.float32)
         # light over white is lost; neighbours do not make up for it
         np.minimum(asked, np.float32(1), out=asked)
         # The nearest level this far out is 0 for all but the brightest stars.
         lower = self._lower.count(asked[:near])
-        upper = np.zeros(asked[near:].shape, dtype=np.intp)
-        bright = asked[near:] >= self._first_threshold
-        upper[bright] = self._nearest.count(asked[near:][bright])
+        beyond = asked[near:]
+        upper = np.zeros(beyond.shape, dtype=np.intp)
+        is_bright = beyond >= self._first_threshold
+        upper[is_bright] = self._nearest.count(beyond[is_bright])
         shown = self._light[np.concatenate([lower, upper])]
         step = self._light[lower + 1] - shown[:near]
         short = shown - asked
         if output is not None:
             short *= output
             step *= output[:near]
-        step[found.place[:near] == self._map.pixels] = 0.0
+        step[stars.place[:near] == self._map.pixels] = 0.0
         short /= self._light[1]
         step /= self._light[1]
         return lower, upper, short.astype(np.float32), step.astype(np.float32)
 
 
-def _part(found: Footprints, some: IntArray) -> Footprints:
+def _part(stars: Footprints, some: IntArray) -> Footprints:
     return Footprints(
-        found.light[:, some],
-        found.place[:, some],
-        found.offset_px[..., some],
-        found.fraction_px[:, some],
-        found.rate_e_per_s[some],
+        stars.light[:, some],
+        stars.place[:, some],
+        stars.offset_px[..., some],
+        stars.fraction_px[:, some],
+        stars.rate_e_per_s[some],
     )
 
 
@@ -332,24 +350,30 @@ def _turns(sprites: FrameLight) -> Iterator[IntArray]:
     """The sprites in chunks, each of a path after those before it; a long path is begun anew in
     places.
     """
-    place = np.arange(len(sprites))
+    order = np.arange(len(sprites))
+    turn = np.zeros_like(order)
     if sprites.per_star > 1:
-        begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
-        place = (place - np.repeat(begins, np.diff(begins, append=len(sprites)))) % CARRIED
-        order = np.argsort(place, kind="stable")
-    else:
-        order = place
-        place = np.zeros_like(place)
-    for turn in np.split(order, np.flatnonzero(np.diff(place[order])) + 1):
-        for start in range(0, len(turn), CHUNK):
-            yield turn[start : start + CHUNK]
+        begins, lengths = _paths(sprites)
+        place_in_path = order - np.repeat(begins, lengths)
+        turn = place_in_path % CARRIED
+        order = np.argsort(turn, kind="stable")
+    ends = np.flatnonzero(np.diff(turn[order])) + 1
+    for some in np.split(order, ends):
+        for start in range(0, len(some), CHUNK):
+            yield some[start : start + CHUNK]
+
+
+def _paths(sprites: FrameLight) -> tuple[IntArray, IntArray]:
+    """Where the path of each star begins among sprites, and how many it has."""
+    begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
+    return begins, np.diff(begins, append=len(sprites))
 
 
 def _sprites_in_path(sprites: FrameLight) -> IntArray:
+    """How many sprites the path of each has, (n,)."""
     if sprites.per_star == 1:
         return np.ones(len(sprites), dtype=np.intp)
-    begins = np.flatnonzero(np.diff(sprites.star, prepend=sprites.star[0] - 1))
-    lengths = np.diff(begins, append=len(sprites))
+    _, lengths = _paths(sprites)
     return np.asarray(np.repeat(lengths, lengths))
 
 
@@ -364,11 +388,13 @@ def _hand_on(
     if sprites.per_star == 1:
         return
     after = np.minimum(some + 1, len(sprites) - 1)
-    here = some[(sprites.star[after] == sprites.star[some]) & (after > some)]
+    goes_on = (sprites.star[after] == sprites.star[some]) & (after > some)
+    here = some[goes_on]
     there = here + 1
     carried[:, there] = left[:, here]
-    for row, place_px in ((1, sprites.x_px), (2, sprites.y_px)):
-        carried[row, there] -= left[0, here] * (place_px[there] - place_px[here])
+    light = left[0, here]
+    carried[1, there] -= light * (sprites.x_px[there] - sprites.x_px[here])
+    carried[2, there] -= light * (sprites.y_px[there] - sprites.y_px[here])
 
 
 def _decide(
@@ -397,11 +423,14 @@ def _decide(
         by = step[pixel]
         carried += weight * short[pixel]
         down = np.square(carried).sum(axis=0) + missing
-        rise = by * (2 * (weight * carried).sum(axis=0) + by * np.square(weight).sum(axis=0))
+        across = (weight * carried).sum(axis=0)
+        squares = np.square(weight).sum(axis=0)
+        rise = by * (2 * across + by * squares)
         rise[:, by == 0] = NONE
         # Of the four choices that two of those kept lead to keep two, in their places. Where both
         # of one lead to less than either of the other, the other's place takes the second.
-        other = np.arange(choices) ^ (1 << (pixel % (choices.bit_length() - 1)))
+        partners = pixel % (choices.bit_length() - 1)
+        other = np.arange(choices) ^ (1 << partners)
         better = down + np.minimum(rise, 0)
         worse = down + np.maximum(rise, 0)
         taken = worse[other] < better
@@ -412,10 +441,11 @@ def _decide(
         up[pixel] = np.where(taken, rise[other] >= 0, rise < 0)
         carried += weight * by * up[pixel]
     heavier = (last_light**2 - 1) * np.square(carried[0])
-    best = (np.square(carried).sum(axis=0) + heavier + missing).argmin(axis=0)[None, None]
-    return np.take_along_axis(up, best, axis=1)[:, 0], np.take_along_axis(carried, best, axis=1)[
-        :, 0
-    ]
+    cost = np.square(carried).sum(axis=0) + heavier + missing
+    best = cost.argmin(axis=0)[None, None]
+    best_up = np.take_along_axis(up, best, axis=1)
+    best_error = np.take_along_axis(carried, best, axis=1)
+    return best_up[:, 0], best_error[:, 0]
 
 
 def _turn_one_more(
@@ -430,27 +460,21 @@ def _turn_one_more(
 
     `step` and `arm` are as in `_decide`, whose results are changed.
     """
-    stars = np.flatnonzero(np.abs(error[0]) > OFF * arm[0, 0] * np.where(grid > 0, grid, np.inf))
+    even_step = np.where(grid > 0, grid, np.inf)
+    is_off = np.abs(error[0]) > OFF * arm[0, 0] * even_step
+    stars = np.flatnonzero(is_off)
     if not len(stars):
         return
     rise = error[0, stars] < 0
     by = np.where(rise, step[:, stars], -step[:, stars])
     arm = arm[:, :, stars]
-    more = by * (2 * (arm * error[:, None, stars]).sum(axis=0) + by * np.square(arm).sum(axis=0))
+    across = (arm * error[:, None, stars]).sum(axis=0)
+    squares = np.square(arm).sum(axis=0)
+    more = by * (2 * across + by * squares)
+    # a pixel without a step, or on the side already that the light has to go to
     more[(by == 0) | (up[:, stars] == rise)] = np.inf
     pixel = more.argmin(axis=0)
     can = np.flatnonzero(np.isfinite(more.min(axis=0)))
-    up[pixel[can], stars[can]] ^= True
-    error[:, stars[can]] += arm[:, pixel[can], can] * by[pixel[can], can]
-
-
-class Turn(NamedTuple):
-    """The turn of one panel of a target, whose panels are quantised one after the other.
-
-    Stars make up in it for the share `makes_up` [panel] of the errors that they left in each panel
-    before, in steps of both. `kept` is how many of the choices tried are kept.
-    """
-
-    plane: int
-    makes_up: list[float]
-    kept: int = KEPT
+    changed = pixel[can]
+    up[changed, stars[can]] ^= True
+    error[:, stars[can]] += arm[:, changed, can] * by[changed, can]

@@ -46,25 +46,27 @@ class PixelOrder:
         self.first = -((self.size - 1) // 2)
         self.bias = 0.5 if self.size % 2 else 0.0
         spread_px = np.sqrt(psf.variance_px2)
-        phase = self._middles
         steps = np.arange(self.size) + self.first
-        x, y = (((steps[:, None] - phase) / s) ** 2 for s in spread_px)
+        away_px = steps[:, None] - self._middles
+        x = (away_px / spread_px[0]) ** 2
+        y = (away_px / spread_px[1]) ** 2
         # The footprint's pixels from a star of each phase, in sigmas
-        distance = np.sqrt(y[:, None, :, None] + x[None, :, None, :]).reshape(
-            self.size**2, PHASES**2
-        )
+        by_axes = np.sqrt(y[:, None, :, None] + x[None, :, None, :])
+        distance = by_axes.reshape(self.size**2, PHASES**2)
         self._least_spread_px = float(spread_px.min())
         reach_sigmas = max(REACH_SIGMA, MIN_REACH_PX / self._least_spread_px)
-        self.near = int((distance <= reach_sigmas).sum(axis=0).max())
+        is_near = distance <= reach_sigmas
+        self.near = int(is_near.sum(axis=0).max())
         order = np.argsort(distance, axis=0, kind="stable")
-        self._farthest_sigmas = float(
-            np.take_along_axis(distance, order[self.near - 1 : self.near], axis=0).max()
-        )
+        last_near = order[self.near - 1 : self.near]
+        self._farthest_sigmas = float(np.take_along_axis(distance, last_near, axis=0).max())
         self.area_px2 = 2 * np.pi * float(spread_px.prod())
-        self.row, self.column = (part.astype(np.int32) for part in np.divmod(order, self.size))
+        self.row = (order // self.size).astype(np.int32)
+        self.column = (order % self.size).astype(np.int32)
 
     @property
     def _middles(self) -> FloatArray:
+        """The middle of each phase along one axis (PHASES,), px from the star's own pixel."""
         return (np.arange(PHASES) + 0.5) / PHASES - self.bias
 
     def near_sigmas(self, more_px: float = 0.0) -> float:
@@ -88,12 +90,15 @@ class PixelOrder:
         """The pixels of a footprint from the star's own, nearest first, by phase: x and y (2,
         PHASES^2, pixels).
         """
-        return np.stack([self.column.T, self.row.T]).astype(np.intp) + self.first
+        from_corner = np.stack([self.column.T, self.row.T])
+        return from_corner.astype(np.intp) + self.first
 
     @property
     def phases(self) -> FloatArray:
         """The middle of each phase, px from the star's own pixel: x and y (2, PHASES^2)."""
-        return np.stack([np.tile(self._middles, PHASES), np.repeat(self._middles, PHASES)])
+        x = np.tile(self._middles, PHASES)
+        y = np.repeat(self._middles, PHASES)
+        return np.stack([x, y])
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +141,11 @@ class FootprintMap:
         data = sprites.data
         count = len(sprites)
         fraction = data["fraction_px"].astype(np.float64).T
-        cell = np.clip((fraction + order.bias) * PHASES, 0, PHASES - 1).astype(np.intp)
-        row, column = (
-            table.take(cell[1] * PHASES + cell[0], axis=1) for table in (order.row, order.column)
-        )
+        in_phases = (fraction + order.bias) * PHASES
+        phase_x, phase_y = np.clip(in_phases, 0, PHASES - 1).astype(np.intp)
+        phase = phase_y * PHASES + phase_x
+        row = order.row.take(phase, axis=1)
+        column = order.column.take(phase, axis=1)
         if self._psf.by_colour and sprites.spectra is not None:
             x_px, y_px = data["pixel"].T + fraction
             stamps = self._psf.stamps_at(x_px, y_px, sprites.spectra, data["electrons_per_s"])
@@ -148,7 +154,9 @@ class FootprintMap:
             stamps = np.ascontiguousarray(np.moveaxis(stamps, 0, 2))
         else:
             stamps = self._psf.stamps(fraction, data["electrons_per_s"], order.size)
-        light = stamps.take((row * order.size + column) * count + np.arange(count, dtype=np.int32))
+        # the stamps are (rows, columns, n)
+        in_stamp = row * order.size + column
+        light = stamps.take(in_stamp * count + np.arange(count, dtype=np.int32))
         row += order.first
         column += order.first
         place = self._places(data["pixel"], row, column)
@@ -159,15 +167,17 @@ class FootprintMap:
         return Footprints(light, place, offset, data["fraction_px"].T, data["electrons_per_s"])
 
     def _places(self, pixel: PlaceArray, row: PlaceArray, column: PlaceArray) -> PlaceArray:
+        """The places (pixels, n) in the flat image of pixels so far from the stars' own (n, 2)."""
         width, height = self.resolution_px
         x = pixel[:, 0].astype(np.int32)
         y = pixel[:, 1].astype(np.int32)
         place = row * width + column
         place += y * width + x
         reach = self.order.size
-        cut = np.flatnonzero(
-            (x < reach) | (x >= width - reach) | (y < reach) | (y >= height - reach)
-        )
+        is_by_side = (x < reach) | (x >= width - reach)
+        is_by_end = (y < reach) | (y >= height - reach)
+        # the few stars whose footprints may reach over the edge
+        cut = np.flatnonzero(is_by_side | is_by_end)
         if len(cut):
             at_x = x[cut] + column[:, cut]
             at_y = y[cut] + row[:, cut]
@@ -183,20 +193,26 @@ class FootprintMap:
         flat_place = place.ravel()
         entry = np.arange(flat_place.size, dtype=np.int32)
         self._last_entry[flat_place] = entry  # the last of several stays
-        beaten = (self._last_entry[flat_place] != entry) & (flat_place != self.pixels)
-        if not beaten.any():
+        is_on_image = flat_place != self.pixels
+        is_beaten = (self._last_entry[flat_place] != entry) & is_on_image
+        if not is_beaten.any():
             return
-        contested = flat_place[beaten]
+        contested = flat_place[is_beaten]
         self._contested[contested] = True
         rivals = np.flatnonzero(self._contested[flat_place])
         self._contested[contested] = False
+        rival_light = flat_light[rivals]
         _, group = np.unique(flat_place[rivals], return_inverse=True)
-        total = np.bincount(group, flat_light[rivals])
-        by_light = np.lexsort((flat_light[rivals], group))
-        winner = rivals[by_light[np.flatnonzero(np.diff(group[by_light], append=-1))]]
-        flat_place_of_winner = flat_place[winner]
-        flat_light[rivals], flat_place[rivals] = 0.0, self.pixels
-        flat_light[winner], flat_place[winner] = total, flat_place_of_winner
+        total = np.bincount(group, rival_light)
+        # group by group, the brightest last
+        by_light = np.lexsort((rival_light, group))
+        last_of_group = np.flatnonzero(np.diff(group[by_light], append=-1))
+        winner = rivals[by_light[last_of_group]]
+        place_of_winner = flat_place[winner]
+        flat_light[rivals] = 0.0
+        flat_place[rivals] = self.pixels
+        flat_light[winner] = total
+        flat_place[winner] = place_of_winner
 
 
 def star_losses_mag(
@@ -219,30 +235,31 @@ def star_losses_mag(
             star_light.place.ravel(), star_light.light.ravel(), minlength=footprints.pixels + 1
         )
     for k in hidden.tolist():
-        if sprites.spectra is None or sprites.spectra.ndim == 1:
-            spectra = sprites.spectra
-        else:
-            spectra = sprites.spectra[k : k + 1]
+        spectra = sprites.spectra
+        if spectra is not None and spectra.ndim > 1:
+            spectra = spectra[k : k + 1]
         alone = footprints.find(replace(sprites, data=sprites.data[k : k + 1], spectra=spectra))
-        place = alone.place[:, 0]
         light = alone.light[:, 0].astype(np.float64)
         lit = light > 0
+        place = alone.place[lit, 0]
+        owners_light = _shown(place, panel, levels)
         wanted[k] = light.sum()
-        shown[k] = (light[lit] * _shown(place[lit], panel, levels) / whole[place[lit]]).sum()
+        shown[k] = (light[lit] * owners_light / whole[place]).sum()
     with np.errstate(invalid="ignore"):
         return np.asarray(magnitude(shown / wanted))
 
 
 def _shown(place: PlaceArray, panel: Panel, levels: Levels) -> FloatArray:
+    """The light, e-/s, that a panel shows at places of the flat image, 0 for those off it."""
     if levels.ndim == 3:
-        return np.asarray(
-            sum(
-                _shown(place, primary, Levels(levels[..., k]))
-                for k, primary in enumerate(panel.primaries)
-            )
-        )
-    level = np.append(levels.ravel(), levels.dtype.type(0))[place]
-    share = np.asarray(panel.response.light[level], dtype=np.float64)
+        light = np.zeros(place.shape)
+        for k, primary in enumerate(panel.primaries):
+            light += _shown(place, primary, Levels(levels[..., k]))
+        return light
+    # the place one past the end is that of pixels off the image
+    with_dark = np.append(levels.ravel(), levels.dtype.type(0))
+    share = np.asarray(panel.response.light[with_dark[place]], dtype=np.float64)
     if panel.uniformity is not None:
-        share = share * np.append(panel.uniformity.ravel(), 1.0)[place]
+        uniformity = np.append(panel.uniformity.ravel(), 1.0)
+        share = share * uniformity[place]
     return share * panel.flux_at_white_e_per_s

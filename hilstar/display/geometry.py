@@ -71,16 +71,17 @@ class ErrorTable(msgspec.Struct, frozen=True, kw_only=True):
     alignment_dof: float | None = None
 
     def __post_init__(self) -> None:
-        rows = self.map_arcsec
         modes = self.modes_arcsec
         turn = self.alignment_covariance_arcsec2
-        if rows is not None and (not rows or len({len(row) for row in rows}) != 1):
-            raise ValueError("map_arcsec has rows of different lengths")
-        if modes is not None and (
-            rows is None or {len(mode) for mode in modes} != {2 * len(rows) * len(rows[0])}
-        ):
+        places = 0
+        if self.map_arcsec is not None:
+            lengths = set(map(len, self.map_arcsec))
+            if len(lengths) != 1:
+                raise ValueError("map_arcsec has rows of different lengths")
+            places = len(self.map_arcsec) * lengths.pop()
+        if modes is not None and (not places or set(map(len, modes)) != {2 * places}):
             raise ValueError("modes_arcsec are not x and y of each place of map_arcsec")
-        if turn is not None and [len(row) for row in turn] != [3, 3, 3]:
+        if turn is not None and list(map(len, turn)) != [3, 3, 3]:
             raise ValueError("alignment_covariance_arcsec2 is not 3 by 3")
 
 
@@ -145,30 +146,27 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
             f"{path}: kind = {shortened(repr(geometry.kind))} and {KIND!r} is wanted; {ADVICE}"
         )
     if geometry.resolution_px != resolution_px:
-        sizes = "{} x {} px and the bench file's monitor has {} x {}".format(
-            *geometry.resolution_px, *resolution_px
+        width, height = geometry.resolution_px
+        bench_width, bench_height = resolution_px
+        raise InputError(
+            f"{path}: is of a monitor of {width} x {height} px and the bench file's monitor has"
+            f" {bench_width} x {bench_height}; calibrate this monitor"
         )
-        raise InputError(f"{path}: is of a monitor of {sizes}; calibrate this monitor")
     q = np.array(geometry.q_cam_to_mon)
-    if not abs(float(np.linalg.norm(q)) - 1.0) <= NORM_TOLERANCE:
-        raise InputError(f"{path}: q_cam_to_mon: its norm is {np.linalg.norm(q):.6g}; {ADVICE}")
-    field = geometry.field
+    norm = float(np.linalg.norm(q))
+    if not abs(norm - 1.0) <= NORM_TOLERANCE:
+        raise InputError(f"{path}: q_cam_to_mon: its norm is {norm:.6g}; {ADVICE}")
     residual = None
-    if field is not None:
-        sides = {len(field.x_px), len(field.y_px), *map(len, field.x_px), *map(len, field.y_px)}
-        if len(sides) != 1 or not 0 < len(field.x_px) <= MAX_TERMS:
-            raise InputError(
-                f"{path}: [field] has no two squares of one size, up to {MAX_TERMS}; {ADVICE}"
-            )
-        residual = ResidualField(np.array(field.x_px), np.array(field.y_px), resolution_px)
-    a, b = geometry.tilt_deg
+    if geometry.field is not None:
+        residual = _residual_field(path, geometry.field, resolution_px)
+    tilt_x, tilt_y = np.radians(geometry.tilt_deg).tolist()
     max_tangent = math.inf
     if geometry.max_field_deg is not None:
         max_tangent = math.tan(math.radians(geometry.max_field_deg))
     lens = Lens(
         radial=(geometry.k1, geometry.k2, geometry.k3),
         tangential=(geometry.p1, geometry.p2),
-        tilt_rad=(float(np.radians(a)), float(np.radians(b))),
+        tilt_rad=(tilt_x, tilt_y),
         field=residual,
         max_tangent=max_tangent,
     )
@@ -179,6 +177,18 @@ def load_geometry(path: Path, resolution_px: tuple[int, int]) -> Camera:
         to_matrix(normalise(q)),
         lens,
     )
+
+
+def _residual_field(path: Path, field: FieldTable, resolution_px: tuple[int, int]) -> ResidualField:
+    """What the lens leaves over the image, by a file's [field]. Raises InputError."""
+    x_px = field.x_px
+    y_px = field.y_px
+    sides = {len(x_px), len(y_px), *map(len, x_px), *map(len, y_px)}
+    if len(sides) != 1 or not 0 < len(x_px) <= MAX_TERMS:
+        raise InputError(
+            f"{path}: [field] has no two squares of one size, up to {MAX_TERMS}; {ADVICE}"
+        )
+    return ResidualField(np.array(x_px), np.array(y_px), resolution_px)
 
 
 def load_notes(path: Path) -> Notes:
@@ -193,6 +203,7 @@ def load_notes(path: Path) -> Notes:
 
 
 def _read(path: Path, form: type[LensTable], advice: str) -> Any:
+    """A file as a `form`. Raises InputError, which ends with `advice`."""
     table = parse_toml(path, named_text(path, advice, MAX_FILE_BYTES))
     try:
         return msgspec.convert(table, form)
@@ -210,10 +221,9 @@ def load_distortion(path: Path, camera: Camera) -> Camera:
     """The camera of a tracker with the lens of its flight model. Raises InputError."""
     advice = "write k1, k2, k3, p1 and p2, numbers, as far as they are not 0"
     distortion: DistortionFile = _read(path, DistortionFile, advice)
-    return replace(
-        camera,
-        lens=Lens((distortion.k1, distortion.k2, distortion.k3), (distortion.p1, distortion.p2)),
-    )
+    radial = distortion.k1, distortion.k2, distortion.k3
+    tangential = distortion.p1, distortion.p2
+    return replace(camera, lens=Lens(radial, tangential))
 
 
 def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: Notes) -> None:
@@ -225,9 +235,9 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
     if lens.field is not None:
         field = FieldTable(x_px=lens.field.x.tolist(), y_px=lens.field.y.tolist())
     w, x, y, z = q_cam_to_mon.tolist()
-    coefficients: dict[str, Any] = dict(
-        zip(LensTable.__struct_fields__, (*lens.radial, *lens.tangential), strict=True)
-    )
+    k1, k2, k3 = lens.radial
+    p1, p2 = lens.tangential
+    tilt_x, tilt_y = np.degrees(lens.tilt_rad).tolist()
     max_field_deg = None
     if math.isfinite(lens.max_tangent):
         max_field_deg = math.degrees(math.atan(lens.max_tangent))
@@ -237,17 +247,21 @@ def write_geometry(path: Path, camera: Camera, q_cam_to_mon: FloatArray, notes: 
         focal_length_px=camera.focal_length_px,
         principal_point_px=camera.principal_point_px,
         q_cam_to_mon=(w, x, y, z),
-        tilt_deg=(float(np.degrees(lens.tilt_rad[0])), float(np.degrees(lens.tilt_rad[1]))),
-        **coefficients,
+        tilt_deg=(tilt_x, tilt_y),
+        k1=k1,
+        k2=k2,
+        k3=k3,
+        p1=p1,
+        p2=p2,
         max_field_deg=max_field_deg,
         field=field,
         sigma=notes.sigma,
         error=notes.error,
         made=notes.made,
     )
-    table = msgspec.to_builtins(geometry) | {
-        TABLE: None if notes.identity is None else notes.identity.known()
-    }
+    table = msgspec.to_builtins(geometry)
+    if notes.identity is not None:
+        table[TABLE] = notes.identity.known()
     write_whole(path, toml_text(table))
 
 

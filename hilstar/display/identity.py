@@ -52,6 +52,9 @@ NO_SERIAL_WORDS = frozenset(
 )
 MAX_WEEK = 54  # 0: not stated; 255: the year is the model's (VESA E-EDID 1.4, 3.4.4)
 SHOWN_DIGITS = 20  # a SHA-256 in a line; names and modes are shorter
+NOT_KNOWN = ("", None, ())
+# settings of a MonitorIdentity that change light or time; hours only grow
+COMPARED = ("connector", "mode", "bits", "gamma_ramp", "brightness", "contrast", "colour_preset")
 
 
 class MonitorIdentity(Table, frozen=True):
@@ -82,15 +85,13 @@ class MonitorIdentity(Table, frozen=True):
 
     def name(self) -> str:
         """The monitor and its connection for a person."""
-        monitor_name = (
-            " ".join(part for part in (self.maker, self.model) if part)
-            or "a monitor that does not say what it is"
-        )
-        monitor_name += f", serial {self.serial}" if self.serial else ""
-        return (
-            f"{monitor_name}, on {self.connector or 'a connector not known'} at"
-            f" {self.mode or 'a mode not known'}"
-        )
+        monitor_name = f"{self.maker} {self.model}".strip()
+        monitor_name = monitor_name or "a monitor that does not say what it is"
+        if self.serial:
+            monitor_name += f", serial {self.serial}"
+        connector = self.connector or "a connector not known"
+        mode = self.mode or "a mode not known"
+        return f"{monitor_name}, on {connector} at {mode}"
 
     @property
     def doubt(self) -> str:
@@ -110,11 +111,8 @@ class MonitorIdentity(Table, frozen=True):
 
     def known(self) -> dict[str, Any]:
         """What is known, by its keys."""
-        return {
-            key: value
-            for key, value in msgspec.to_builtins(self).items()
-            if value not in ("", None, ())
-        }
+        fields = msgspec.to_builtins(self)
+        return {key: value for key, value in fields.items() if value not in NOT_KNOWN}
 
 
 def edid_identity(edid: bytes) -> MonitorIdentity:
@@ -131,17 +129,20 @@ def edid_identity(edid: bytes) -> MonitorIdentity:
     except (ValueError, struct.error):
         return known
     # pyedid 1.0.3 reads these two numbers the wrong way round.
-    product, number = (int.from_bytes(edid[a:b], "little") for a, b in ((10, 12), (12, 16)))
+    product = int.from_bytes(edid[10:12], "little")
+    number = int.from_bytes(edid[12:16], "little")
+    serial = ""
     if isinstance(edid_fields.serial, str):
-        text_serial = _plain(edid_fields.serial)
-    else:
-        text_serial = ""
+        serial = _stated_serial(_plain(edid_fields.serial))
+    week = None
+    if 0 < edid_fields.week <= MAX_WEEK:
+        week = edid_fields.week
     return msgspec.structs.replace(
         known,
         maker=edid_fields.manufacturer_pnp_id,
         model=_plain(edid_fields.name or "") or f"{product:04x}",
-        serial=_stated_serial(text_serial) or _stated_serial(str(number)),
-        week=edid_fields.week if 0 < edid_fields.week <= MAX_WEEK else None,
+        serial=serial or _stated_serial(str(number)),
+        week=week,
         year=edid_fields.year,
     )
 
@@ -211,32 +212,20 @@ def differences(was: MonitorIdentity, now: MonitorIdentity) -> Iterator[str]:
     and says nothing now, differs.
     """
     if was.edid_sha256 != now.edid_sha256:
-        same = was.serial and (was.maker, was.model, was.serial) == (
-            now.maker,
-            now.model,
-            now.serial,
-        )
-        yield (
-            "the same monitor with another EDID (another input, or a setting of its menu)"
-            if same
-            else "another monitor"
-        )
-    for key in (
-        "connector",
-        "mode",
-        "bits",
-        "gamma_ramp",
-        "brightness",
-        "contrast",
-        "colour_preset",
-    ):
+        monitor_before = was.maker, was.model, was.serial
+        monitor_now = now.maker, now.model, now.serial
+        if was.serial and monitor_before == monitor_now:
+            yield "the same monitor with another EDID (another input, or a setting of its menu)"
+        else:
+            yield "another monitor"
+    for key in COMPARED:
         before = getattr(was, key)
         after = getattr(now, key)
-        if before not in ("", None) and after not in ("", None) and before != after:
-            yield (
-                f"{key.replace('_', ' ')} {str(before)[:SHOWN_DIGITS]}, now"
-                f" {str(after)[:SHOWN_DIGITS]}"
-            )
+        if before in NOT_KNOWN or after in NOT_KNOWN or before == after:
+            continue
+        setting = key.replace("_", " ")
+        yield f"{setting} {str(before)[:SHOWN_DIGITS]}, now {str(after)[:SHOWN_DIGITS]}"
     if was.window_system != now.window_system:
-        before, after = (", ".join(identity.window_system) or "nothing" for identity in (was, now))
-        yield f"the window system added {before}, and adds {after} now"
+        added = ", ".join(was.window_system) or "nothing"
+        adds = ", ".join(now.window_system) or "nothing"
+        yield f"the window system added {added}, and adds {adds} now"

@@ -4,7 +4,6 @@ centroid.
 
 import math
 from dataclasses import dataclass, replace
-from itertools import islice
 
 import numpy as np
 
@@ -48,11 +47,18 @@ def phase_grid(
     """
     tile = psf.footprint_px + MARGIN_PX
     steps = np.arange(count)
-    places = ((steps + 0.5) * tile + (steps + start) / count - 0.5 for start in first)
-    x_px, y_px = (axis.ravel() for axis in np.meshgrid(*places))
+    middles = (steps + 0.5) * tile
+    first_x, first_y = first
+    columns_px = middles + (steps + first_x) / count - 0.5
+    rows_px = middles + (steps + first_y) / count - 0.5
+    grid_x_px, grid_y_px = np.meshgrid(columns_px, rows_px)
     flux = np.full(count**2, WHITE / psf.peak_share)
+    number = np.arange(count**2)
     size_px = count * tile, count * tile
-    return pack_sprites(x_px, y_px, flux, np.arange(count**2), size_px, psf.footprint_px), tile
+    sprites = pack_sprites(
+        grid_x_px.ravel(), grid_y_px.ravel(), flux, number, size_px, psf.footprint_px
+    )
+    return sprites, tile
 
 
 def line_places(sprites: FrameLight) -> tuple[FloatArray, FloatArray]:
@@ -68,20 +74,18 @@ def phase_image(sprites: FrameLight, psf: Psf, tile_px: int | None = None) -> Fl
     and rows of tiles of `tile_px`, by default those of `phase_grid`.
     """
     count = math.isqrt(len(sprites))
-    if tile_px is None:
-        tile = sprites.footprint_px + MARGIN_PX
-    else:
-        tile = tile_px
-    at = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
-    pixels = []
-    offsets = []
-    for axis, places in enumerate(line_places(sprites)):
-        line = sprites.data["pixel"][:, axis][:: count if axis else 1][:count, None] + at
-        pixels.append(line.ravel())
-        offsets.append((line - places[:, None]).ravel())
-    image = np.zeros((count * tile,) * 2)
-    shares = psf.shares(offsets[0][None], offsets[1][:, None])
-    image[np.ix_(pixels[1], pixels[0])] = float(sprites.data["electrons_per_s"][0]) * shares
+    tile = tile_px or sprites.footprint_px + MARGIN_PX
+    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
+    x_px, y_px = line_places(sprites)
+    pixel = sprites.data["pixel"]
+    columns = pixel[:count, 0, None] + steps
+    rows = pixel[::count, 1, None] + steps
+    away_x = (columns - x_px[:, None]).ravel()
+    away_y = (rows - y_px[:, None]).ravel()
+    shares = psf.shares(away_x[None], away_y[:, None])
+    e_per_s = float(sprites.data["electrons_per_s"][0])
+    image = np.zeros((count * tile, count * tile))
+    image[np.ix_(rows.ravel(), columns.ravel())] = e_per_s * shares
     return image
 
 
@@ -98,8 +102,11 @@ def measure(wanted: FloatArray, shown: FloatArray, tile: int) -> Errors:
     lit, lit_x_px, lit_y_px = _sums(shown, tile)
     flux = np.abs(magnitude(lit / light))
     off = np.where(lit > 0, np.hypot(lit_x_px - x_px, lit_y_px - y_px), np.inf)
-    rms = (float(np.sqrt(np.mean(np.square(error)))) for error in (flux, off))
-    return Errors(next(rms), float(flux.max()), next(rms), float(off.max()))
+    return Errors(_rms(flux), float(flux.max()), _rms(off), float(off.max()))
+
+
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(errors))))
 
 
 def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -107,9 +114,11 @@ def _sums(image: FloatArray, tile: int) -> tuple[FloatArray, FloatArray, FloatAr
     count = len(image) // tile
     tiles = image.reshape(count, tile, count, tile).transpose(0, 2, 1, 3)
     light = tiles.sum(axis=(2, 3))
-    at = np.arange(tile)
+    pixels = np.arange(tile)
     divisor = np.where(light > 0, light, 1.0)
-    return light, tiles.sum(axis=2) @ at / divisor, tiles.sum(axis=3) @ at / divisor
+    x_px = tiles.sum(axis=2) @ pixels / divisor
+    y_px = tiles.sum(axis=3) @ pixels / divisor
+    return light, x_px, y_px
 
 
 def shown_by(
@@ -127,11 +136,9 @@ def shown_by(
     """
     quantiser = kind(panel, linear.shape[::-1], balance.psf, balance.seen)
     exposed = quantiser.exposure(FRAMES_BEFORE, exposure_frames)
-    levels = (
-        quantiser.draw(UnquantisedFrame(sprites, lambda: linear, lambda: linear, number))
-        for number in range(exposed.stop)
-    )
-    shown = (
-        shown_light(frame_levels, panel) for frame_levels in islice(levels, exposed.start, None)
-    )
-    return np.asarray(sum(shown) / len(exposed))
+    total = np.zeros(linear.shape)
+    for number in range(exposed.stop):
+        levels = quantiser.draw(UnquantisedFrame(sprites, lambda: linear, lambda: linear, number))
+        if number in exposed:
+            total += shown_light(levels, panel)
+    return total / len(exposed)

@@ -6,10 +6,12 @@ chromaticities.
 """
 
 import itertools
+import math
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -77,27 +79,32 @@ def read_primaries(path: Path) -> tuple[Curve, ...]:
     """
     if path.suffix.lower() == ".ccss":
         return read_ccss(path)
-    rows = []
+    rows: list[list[float]] = []
+    last_nm = -np.inf
     for line, cells in read_rows(path, COLUMNS, ADVICE, MAX_CURVE_BYTES):
-        rows.append(finite_numbers(path, line, COLUMNS, cells[: len(COLUMNS)], ADVICE))
-        if min(rows[-1][1:]) < 0 or not RANGE_NM[0] < rows[-1][0] < RANGE_NM[1]:
+        row = finite_numbers(path, line, COLUMNS, cells[: len(COLUMNS)], ADVICE)
+        row_nm, *row_power = row
+        if min(row_power) < 0 or not RANGE_NM[0] < row_nm < RANGE_NM[1]:
             raise InputError(
                 f"{path}:{line}: power below 0, or a wavelength that is not in nm; {ADVICE}"
             )
-        if len(rows) > 1 and rows[-1][0] <= rows[-2][0]:
+        if row_nm <= last_nm:
             raise InputError(
                 f"{path}:{line}: wavelengths do not rise from row to row; sort them, each once"
             )
-    table = np.array(rows).reshape(-1, len(COLUMNS)).T
+        rows.append(row)
+        last_nm = row_nm
+    nm, *power = np.array(rows).reshape(-1, len(COLUMNS)).T
     if len(rows) > 1:
-        refuse_other_units(path, rows[0][0], rows[-1][0])
-    dark = [name for name, power in zip(PRIMARIES, table[1:], strict=True) if not power.any()]
+        refuse_other_units(path, float(nm[0]), float(nm[-1]))
+    dark = [name for name, light in zip(PRIMARIES, power, strict=True) if not light.any()]
     if dark:
         raise InputError(f"{path}: {len(rows)} rows, and no light of {', '.join(dark)}; {ADVICE}")
-    return _curves(table[0], table[1:])
+    return _curves(nm, np.array(power))
 
 
 def _curves(nm: FloatArray, power: FloatArray) -> tuple[Curve, ...]:
+    """A curve of each power (curves, n) at `nm` (n,), which falls to zero beside both ends."""
     first, last = np.nextafter(nm[[0, -1]], [0.0, np.inf])  # knots beside both ends and far off
     knots = np.concatenate([[RANGE_NM[0], first], nm, [last, RANGE_NM[1]]])
     return tuple(Curve(knots, np.pad(channel_power, 2)) for channel_power in power)
@@ -113,53 +120,71 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
     """
     nm, samples = _samples(path)
     power = samples.sum(axis=1)
-    lit = np.flatnonzero(power > DARK_SHARE * power.max())
+    lit = samples[power > DARK_SHARE * power.max()]
     if len(lit) < 3:
         raise InputError(
             f"{path}: {len(lit)} samples with light, where three primaries are wanted;"
             f" {CCSS_ADVICE}"
         )
-    shape = samples[lit] / np.linalg.norm(samples[lit], axis=1, keepdims=True)
-    together = shape @ shape.T
+    size = np.linalg.norm(lit, axis=1)
+    colours = lit / size[:, None]
+    together = colours @ colours.T
     fits = []
-    for three in map(list, itertools.combinations(range(len(lit)), 3)):
-        gram = together[np.ix_(three, three)]
-        if np.linalg.det(gram) > MIXED_WITHIN**4:
-            by = nearest_mixtures(gram, together[:, three])
-            off = (
-                1
-                - 2 * (by * together[:, three]).sum(axis=1)
-                + np.einsum("ni,ij,nj->n", by, gram, by)
-            )
-            fits.append(
-                (float(np.sqrt(max(off.max(), 0.0))), -float(power[lit[three]].sum()), three)
-            )
-    worst = min(fits, default=(1.0, 0.0, []))[0]
-    if worst > MIXED_WITHIN:
+    for candidates in itertools.combinations(range(len(lit)), 3):
+        fit = _fit(together, list(candidates))
+        if fit is not None:
+            fits.append(fit)
+    nearest = min([fit.worst for fit in fits], default=1.0)
+    if nearest > MIXED_WITHIN:
         raise InputError(
             f"{path}: no three of its {len(lit)} samples are primaries of which the others are"
-            f" mixtures (the nearest leave {100 * worst:.0f} % of one): a white subpixel, or"
+            f" mixtures (the nearest leave {100 * nearest:.0f} % of one): a white subpixel, or"
             f" samples of several displays; {CCSS_ADVICE}"
         )
-    near_best = [fit for fit in fits if fit[0] <= worst + MIXED_WITHIN**2]
-    _, _, three = min(near_best, key=lambda fit: fit[1])
-    size = np.linalg.norm(samples[lit], axis=1)
-    drive = (
-        nearest_mixtures(together[np.ix_(three, three)], together[:, three])
-        * size[:, None]
-        / size[three]
-    )
+    # among those that fit as well, within the square of what a sample may be off
+    near_best = [fit for fit in fits if fit.worst <= nearest + MIXED_WITHIN**2]
+    best = max(near_best, key=lambda fit: float(lit[fit.samples].sum()))
+    drive = best.mixtures * size[:, None] / size[best.samples]
     if drive.max() > 1 + MAX_EXCESS:
         raise InputError(
             f"{path}: a sample has {drive.max():.2f} times the light of its primaries: a white"
             f" subpixel, as of a panel that is no sum of red, green and blue; {CCSS_ADVICE}"
         )
-    primaries = samples[lit[three]]
-    order = np.argsort(-(primaries @ nm) / primaries.sum(axis=1))
-    return _curves(nm, primaries[order])
+    primaries = lit[best.samples]
+    mean_nm = (primaries @ nm) / primaries.sum(axis=1)
+    return _curves(nm, primaries[np.argsort(-mean_nm)])
+
+
+class _Fit(NamedTuple):
+    """Three `samples` as primaries: the `mixtures` (n, 3) of all that come nearest to samples of
+    norm 1, and how far the worst is off.
+    """
+
+    samples: list[int]
+    mixtures: FloatArray
+    worst: float
+
+
+def _fit(together: FloatArray, samples: list[int]) -> _Fit | None:
+    """Three samples as primaries, by the products (n, n) of all samples; None where one of them
+    is nearly a mixture of the others.
+    """
+    gram = together[np.ix_(samples, samples)]
+    # The determinant is the square of their volume. Colours within MIXED_WITHIN of each other, by
+    # which a mixture may be off, span its square at most.
+    if np.linalg.det(gram) <= MIXED_WITHIN**4:
+        return None
+    wanted = together[:, samples]
+    mixtures = nearest_mixtures(gram, wanted)
+    # |sample - mixture|^2, of samples of norm 1
+    across = (mixtures * wanted).sum(axis=1)
+    squares = np.einsum("ni,ij,nj->n", mixtures, gram, mixtures)
+    off = 1 - 2 * across + squares
+    return _Fit(samples, mixtures, math.sqrt(max(float(off.max()), 0.0)))
 
 
 def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
+    """Wavelengths (bands,), nm, and the spectra (samples, bands) of a .ccss. Raises InputError."""
     text = named_text(path, CCSS_ADVICE, MAX_CURVE_BYTES)
     if not text.lstrip().startswith("CCSS"):
         raise InputError(f"{path}: its first word is not CCSS; {CCSS_ADVICE}")
@@ -176,10 +201,10 @@ def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
         nm = np.linspace(first, last, int(keys["SPECTRAL_BANDS"]))
         fields = names.split()
         spectral = [k for k, name in enumerate(fields) if name.startswith("SPEC_")]
-        cells = np.array(rest.partition("BEGIN_DATA")[2].partition("END_DATA")[0].split()).reshape(
-            -1, len(fields)
-        )
-        samples = cells[:, spectral].astype(np.float64)
+        _, _, data = rest.partition("BEGIN_DATA")
+        cells = data.partition("END_DATA")[0].split()
+        table = np.array(cells).reshape(-1, len(fields))
+        samples = table[:, spectral].astype(np.float64)
         good = (
             len(spectral) == len(nm) > 1
             and RANGE_NM[0] < first < last < RANGE_NM[1]
@@ -199,21 +224,25 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
     Raises InputError where none is near.
     """
     matching = np.array([_matching_function(lobes) for lobes in MATCHING])
-    middles = np.arange(XY_NM[0], XY_NM[-1], 0.25)
-    spectra = np.exp(-((XY_NM - middles[:, None]) ** 2) / 2 * (FWHM_SIGMAS / fwhm_nm) ** 2)
+    middles_nm = np.arange(XY_NM[0], XY_NM[-1], 0.25)
+    away_nm = XY_NM - middles_nm[:, None]
+    spectra = np.exp(-(away_nm**2) / 2 * (FWHM_SIGMAS / fwhm_nm) ** 2)
     tristimulus = spectra @ matching.T
-    seen_xy = (tristimulus / tristimulus.sum(axis=1, keepdims=True))[:, :2]
+    total = tristimulus.sum(axis=1, keepdims=True)
+    spectra_xy = (tristimulus / total)[:, :2]
     chosen = []
     for name, wanted in zip(PRIMARIES, xy, strict=True):
-        off = np.hypot(*(seen_xy - wanted).T)
-        chosen.append(int(np.argmin(off)))
-        if off[chosen[-1]] > FAR_XY:
-            near = ", ".join(f"{value:.3f}" for value in seen_xy[chosen[-1]])
+        off = np.hypot(*(spectra_xy - wanted).T)
+        nearest = int(np.argmin(off))
+        chosen.append(nearest)
+        if off[nearest] > FAR_XY:
+            near = ", ".join(f"{value:.3f}" for value in spectra_xy[nearest])
             raise InputError(
                 f"[monitor.primaries] xy_{name} = {list(wanted)}: the nearest Gaussian of"
                 f" {fwhm_nm:g} nm has [{near}]; write another width_nm, or measured spectra as file"
             )
-    white = np.array([D65_XY[0], D65_XY[1], 1 - sum(D65_XY)]) / D65_XY[1]
+    white_x, white_y = D65_XY
+    white = np.array([white_x, white_y, 1 - (white_x + white_y)]) / white_y
     if len(set(chosen)) == len(chosen):
         amounts = np.linalg.solve(tristimulus[chosen].T, white)
     else:
@@ -223,7 +252,8 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
             "[monitor.primaries] xy_r, xy_g and xy_b: D65 is not within their triangle; write those"
             " of r, g and b"
         )
-    return _curves(XY_NM, spectra[chosen] * amounts[:, None])
+    primaries = spectra[chosen] * amounts[:, None]
+    return _curves(XY_NM, primaries)
 
 
 def _matching_function(lobes: Sequence[tuple[float, float, float, float]]) -> FloatArray:
@@ -237,16 +267,20 @@ def _matching_function(lobes: Sequence[tuple[float, float, float, float]]) -> Fl
 
 
 def _lobe(middle_nm: float, below: float, above: float) -> FloatArray:
-    away = XY_NM - middle_nm
-    return np.asarray(np.exp(-((away * np.where(away < 0, below, above)) ** 2) / 2))
+    """A Gaussian at XY_NM with an inverse sigma below its middle and another above it."""
+    away_nm = XY_NM - middle_nm
+    inverse_sigma = np.where(away_nm < 0, below, above)
+    sigmas = away_nm * inverse_sigma
+    return np.asarray(np.exp(-(sigmas**2) / 2))
 
 
 def reddest_nm(primaries: Sequence[Curve], least: float = 0.01) -> float:
     """The longest wavelength at which a primary has `least` of its largest power."""
-    lit = []
+    longest_nm = []
     for curve in primaries:
-        lit.append(curve.wavelength_nm[curve.value > least * curve.value.max()].max())
-    return float(max(lit))
+        is_lit = curve.value > least * curve.value.max()
+        longest_nm.append(float(curve.wavelength_nm[is_lit].max()))
+    return max(longest_nm)
 
 
 def channel_matrix(
@@ -267,18 +301,19 @@ def channel_matrix(
             "[monitor.primaries] file: the tracker detects none of this light; check that both are"
             " in nm"
         )
-    parted = np.linalg.matrix_rank(matrix) == min(matrix.shape)
-    if parted:
+    condition = None
+    if np.linalg.matrix_rank(matrix) == min(matrix.shape):
         condition = float(np.linalg.cond(matrix))
-    else:
-        condition = None
-    return ChannelMatrix(tuple(channels), matrix * (white_e_per_s / matrix.sum()), condition)
+    scale = white_e_per_s / matrix.sum()
+    return ChannelMatrix(tuple(channels), matrix * scale, condition)
 
 
 def _electrons(primary: Curve, optics: Optics) -> float:
+    """The integral of a primary's detected photons, in proportion to electrons."""
     curves = primary, optics.quantum_efficiency, optics.transmission
     nm, weight = integration_nodes(*curves)
-    return float(np.prod([curve(nm) for curve in curves], axis=0) * nm @ weight)
+    detected = np.prod([curve(nm) for curve in curves], axis=0)
+    return float(detected * nm @ weight)
 
 
 def nearest_mixtures(gram: FloatArray, wanted: FloatArray, *, whole: bool = False) -> FloatArray:
@@ -293,21 +328,33 @@ def nearest_mixtures(gram: FloatArray, wanted: FloatArray, *, whole: bool = Fals
     gram = gram / scale
     wanted = wanted / scale
     best = np.zeros_like(wanted)
+    # the cost of no light at all, which a mixture that has to be whole cannot be
     least = np.full(len(wanted), np.inf if whole else 0.0)
-    for size in range(1, len(gram) + 1):
-        for parts in map(list, itertools.combinations(range(len(gram)), size)):
-            system = gram[np.ix_(parts, parts)]
-            right = wanted[:, parts]
-            if whole:
-                system = np.block(
-                    [[system, np.ones((size, 1))], [np.ones((1, size)), np.zeros((1, 1))]]
-                )
-                right = np.column_stack([right, np.ones(len(right))])
-            mixtures = np.zeros_like(wanted)
-            mixtures[:, parts] = (right @ np.linalg.pinv(system, rcond=SINGULAR).T)[:, :size]
-            cost = np.einsum("ni,ij,nj->n", mixtures, gram, mixtures) - 2 * (mixtures * wanted).sum(
-                axis=1
-            )
-            better = (mixtures.min(axis=1) >= 0) & (cost < least)
-            best[better], least[better] = mixtures[better], cost[better]
+    for parts in _sets_of(len(gram)):
+        mixtures = np.zeros_like(wanted)
+        mixtures[:, parts] = _mixtures_of(gram[np.ix_(parts, parts)], wanted[:, parts], whole)
+        squares = np.einsum("ni,ij,nj->n", mixtures, gram, mixtures)
+        cost = squares - 2 * (mixtures * wanted).sum(axis=1)
+        better = (mixtures.min(axis=1) >= 0) & (cost < least)
+        best[better] = mixtures[better]
+        least[better] = cost[better]
     return best
+
+
+def _sets_of(count: int) -> Iterator[list[int]]:
+    """Every set of so many parts but the empty one, the smaller first."""
+    for size in range(1, count + 1):
+        yield from map(list, itertools.combinations(range(count), size))
+
+
+def _mixtures_of(gram: FloatArray, wanted: FloatArray, whole: bool) -> FloatArray:
+    """The mixtures (n, k) of k parts by linear least squares, of any sign; `whole` ones by a
+    Lagrange multiplier for their sum.
+    """
+    size = len(gram)
+    if whole:
+        ones = np.ones((size, 1))
+        gram = np.block([[gram, ones], [ones.T, np.zeros((1, 1))]])
+        wanted = np.column_stack([wanted, np.ones(len(wanted))])
+    inverse = np.linalg.pinv(gram, rcond=SINGULAR)
+    return np.asarray((wanted @ inverse.T)[:, :size])

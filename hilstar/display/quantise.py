@@ -36,7 +36,7 @@ MASK_FILE = Path(__file__).parent / "data" / "blue-noise.npy"  # made by tools/m
 EXPOSURE_FRAMES = 6
 MASK_TURNS = 4096  # the mask has no more distinct thresholds
 MANTISSA_BITS = 23
-MAX_FINER = 4
+MAX_FINER = 4  # times as many bins as thresholds to an octave, so that no bin holds two
 # a whole frame of 2500 to 5000 stars, for each: 1080p over 31 deg at 1 to 15 deg/s, two llvmpipe
 # cores
 MS_A_STAR = 0.002
@@ -230,6 +230,7 @@ def level_dtype(response: Response) -> type[np.uint8] | type[np.uint16]:
 
 
 def _wanted(linear_e_per_s: Float32Array, panel: Panel) -> Float32Array:
+    """The light to ask of a pixel, by its gain."""
     gain = panel.gain()
     if gain is None:
         return linear_e_per_s
@@ -403,21 +404,24 @@ def code_table(thresholds: Float32Array) -> CodeTable:
     one threshold; up to MAX_FINER times as many where then none does.
     """
     bits = min(12, len(thresholds).bit_length())
-    tables = (
-        _table(thresholds, MANTISSA_BITS - bits - finer) for finer in range(MAX_FINER.bit_length())
-    )
-    first = next(tables)
-    if first.steps() is not None:
-        return first
-    return next((table for table in tables if table.steps() is not None), first)
+    coarsest = _table(thresholds, MANTISSA_BITS - bits)
+    table = coarsest
+    for finer in range(1, MAX_FINER.bit_length()):
+        if table.steps() is not None:
+            return table
+        table = _table(thresholds, MANTISSA_BITS - bits - finer)
+    return coarsest if table.steps() is None else table
 
 
 def _table(thresholds: Float32Array, shift: int) -> CodeTable:
+    """The table whose bins are the lights of the same leading bits, all but `shift` of them."""
     bits = thresholds.view(np.int32)
-    first_bin, last_bin = (int(end) >> shift for end in (bits[0], bits[-1]))
+    first_bin = int(bits[0]) >> shift
+    last_bin = int(bits[-1]) >> shift
     # the first bin that begins at or above each threshold
     first_edge = ((bits + ((1 << shift) - 1)) >> shift) - first_bin
-    first_code = np.cumsum(np.bincount(first_edge)[: last_bin - first_bin + 1]).astype(np.uint32)
+    edges_of_bin = np.bincount(first_edge)[: last_bin - first_bin + 1]
+    first_code = np.cumsum(edges_of_bin).astype(np.uint32)
     first_code[0] = 0
     return CodeTable(thresholds, first_code, shift, first_bin)
 

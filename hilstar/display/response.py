@@ -66,18 +66,24 @@ def srgb_response(bits: int) -> Response:
     """The response of an sRGB monitor without black level; its thresholds are the light at the
     half codes.
     """
-    white = 2**bits - 1
-    codes = np.arange(2**bits, dtype=np.float64)
-    return Response(bits, srgb_light(codes / white), srgb_light((codes[:-1] + 0.5) / white))
+    codes, half_codes = _signals(bits)
+    return Response(bits, srgb_light(codes), srgb_light(half_codes))
 
 
 def gamma_response(bits: int, gamma: float = 2.2) -> Response:
     """The response of a monitor with a plain power law, without black level; its thresholds are
     the light at the half codes.
     """
+    codes, half_codes = _signals(bits)
+    return Response(bits, codes**gamma, half_codes**gamma)
+
+
+def _signals(bits: int) -> tuple[FloatArray, FloatArray]:
+    """The signals, 0 to 1, of all codes (2^bits,), and midway between them (2^bits - 1,)."""
     white = 2**bits - 1
     codes = np.arange(2**bits, dtype=np.float64)
-    return Response(bits, (codes / white) ** gamma, ((codes[:-1] + 0.5) / white) ** gamma)
+    half_codes = codes[:-1] + 0.5
+    return codes / white, half_codes / white
 
 
 def table_response(bits: int, light: FloatArray, black: float = 0.0) -> Response:
@@ -92,7 +98,8 @@ def mixed_response(
 ) -> Response:
     """The grey response of three channels, each weighted as the tracker sees its primary."""
     share = np.asarray(weights) / np.sum(weights)
-    light = share @ np.stack([channel.light for channel in channels])
+    lights = np.stack([channel.light for channel in channels])
+    light = share @ lights
     return table_response(channels[0].bits, light / light[-1], black)
 
 
@@ -114,30 +121,30 @@ def bit_stealing_response(
         )
     share = np.asarray(weights, dtype=np.float64) / np.sum(weights)
     # (0, 0, 0) first; (1, 1, 1) is the next grey
+    white = 2**bits - 1
     steps = np.array(list(product((0, 1), repeat=3)))[:TRIPLES]
-    rgb = (np.arange(2**bits - 1)[:, None, None] + steps).reshape(-1, 3)
-    rgb = np.concatenate([rgb, np.full((1, 3), 2**bits - 1)])
-    light = (
-        np.stack(
-            [channel.light[codes] for channel, codes in zip(channels, rgb.T, strict=True)], axis=1
-        )
-        @ share
-    )
+    greys = np.arange(white)[:, None, None]
+    triples = (greys + steps).reshape(-1, 3)
+    rgb = np.concatenate([triples, np.full((1, 3), white)])
+    lights = [channel.light[codes] for channel, codes in zip(channels, rgb.T, strict=True)]
+    light = np.stack(lights, axis=1) @ share
     order = np.argsort(light, kind="stable")
     rgb = rgb[order]
     light = light[order]
-    grey = (rgb == rgb[:, :1]).all(axis=1)
-    kept_places = [0]
+    is_grey = (rgb == rgb[:, :1]).all(axis=1)
+    places = [0]
     for place in range(1, len(light)):
-        if light[place] > light[kept_places[-1]] * (1 + SAME_LIGHT):
-            kept_places.append(place)
-        elif grey[place]:  # where lights are equal the grey one is kept
-            kept_places[-1] = place
-    light = light[kept_places] / light[kept_places][-1]
-    return Response(bits, light, _midway(light), black, rgb[kept_places].astype(np.uint16))
+        if light[place] > light[places[-1]] * (1 + SAME_LIGHT):
+            places.append(place)
+        elif is_grey[place]:  # of equal lights it is the level, whose primaries are alike
+            places[-1] = place
+    light = light[places]
+    light = light / light[-1]
+    return Response(bits, light, _midway(light), black, rgb[places].astype(np.uint16))
 
 
 def _midway(light: FloatArray) -> FloatArray:
+    """The middles (n - 1,) between lights (n,)."""
     return (light[:-1] + light[1:]) / 2
 
 

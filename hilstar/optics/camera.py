@@ -8,6 +8,7 @@ field over the pixels. All three are closed forms from direction to pixel, which
 shift on a coarse grid.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
@@ -34,6 +35,7 @@ NEWTON_ROUNDS, STEPS_A_ROUND = 10, 5  # slopes are found once a round: a mild le
 # In focal lengths, 1e-8 px on any screen; slopes by differences of SLOPE_STEP are right to 1e-10,
 # which is enough.
 NEWTON_DONE = 1e-13
+# tangents to either side of a direction, for its slopes; Newton's last step is under it
 SLOPE_STEP = 1e-6
 BEYOND_BORDER = 1 + 1e-9  # the farthest corner is within the lens
 WITHIN = 1 - 1e-12  # the lens, whatever rounding does
@@ -59,15 +61,16 @@ class ResidualField:
         """The field of coefficients (terms,) in the order of `field_terms`."""
         squares = np.zeros((2, degree + 1, degree + 1))
         i, j = _exponents(degree)
-        squares[0, i, j], squares[1, i, j] = x, y
+        squares[0, i, j] = x
+        squares[1, i, j] = y
         return cls(squares[0], squares[1], resolution_px)
 
     def at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The shift at pixels (k,), px."""
         columns, rows = _polynomials(x_px, y_px, self.resolution_px, len(self.x) - 1)
-        return np.einsum("ik,ik->k", self.x.T @ columns, rows), np.einsum(
-            "ik,ik->k", self.y.T @ columns, rows
-        )
+        dx_px = np.einsum("ik,ik->k", self.x.T @ columns, rows)
+        dy_px = np.einsum("ik,ik->k", self.y.T @ columns, rows)
+        return dx_px, dy_px
 
 
 def field_terms(
@@ -80,6 +83,7 @@ def field_terms(
 
 
 def _exponents(degree: int) -> tuple[IntArray, IntArray]:
+    """The degrees along columns and rows of the terms of a field, (terms,) each."""
     i, j = np.indices((degree + 1, degree + 1)).reshape(2, -1)
     is_within_degree = i + j <= degree
     return i[is_within_degree], j[is_within_degree]
@@ -88,6 +92,7 @@ def _exponents(degree: int) -> tuple[IntArray, IntArray]:
 def _polynomials(
     x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], degree: int
 ) -> tuple[FloatArray, FloatArray]:
+    """Chebyshev's polynomials T_0 to T_degree of columns and of rows, (degree + 1, k) each."""
     place = np.empty((2, len(x_px)))
     for row, at, size in zip(place, (x_px, y_px), resolution_px, strict=True):
         np.multiply(at, 2 / size, out=row)
@@ -152,12 +157,16 @@ def _onto_plane(tilt_rad: tuple[float, float]) -> FloatArray:
     turned about x and then about y.
     """
     a, b = tilt_rad
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(a), -np.sin(a)], [0.0, np.sin(a), np.cos(a)]])
-    about_y = np.array([[np.cos(b), 0.0, np.sin(b)], [0.0, 1.0, 0.0], [-np.sin(b), 0.0, np.cos(b)]])
+    cos_a, sin_a = np.cos(a), np.sin(a)
+    cos_b, sin_b = np.cos(b), np.sin(b)
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cos_a, -sin_a], [0.0, sin_a, cos_a]])
+    about_y = np.array([[cos_b, 0.0, sin_b], [0.0, 1.0, 0.0], [-sin_b, 0.0, cos_b]])
     axes = about_y @ about_x
     right, down, normal = axes.T
     foot = axes[2]
-    return np.array([foot[2] * right - foot[0] * normal, foot[2] * down - foot[1] * normal, normal])
+    to_right = foot[2] * right - foot[0] * normal
+    to_down = foot[2] * down - foot[1] * normal
+    return np.array([to_right, to_down, normal])
 
 
 def ray_shifts(camera: "Camera") -> Float32Array:
@@ -167,16 +176,15 @@ def ray_shifts(camera: "Camera") -> Float32Array:
     The first and the last node of a row lie on the image's edges, -0.5 and width - 0.5; a column's
     likewise. Where the lens has no direction the shift is 0.
     """
-    places = []
-    for size in camera.resolution_px:
-        places.append(np.linspace(-0.5, size - 0.5, -(-size // NODE_STEP_PX) + 1))
-    x_px, y_px = (part.ravel() for part in np.meshgrid(*places))
-    through_lens = camera.tangents(x_px, y_px)
-    plain = replace(camera, lens=None).tangents(x_px, y_px)
-    shifts = np.stack([a - b for a, b in zip(through_lens, plain, strict=True)], axis=-1).reshape(
-        len(places[1]), len(places[0]), 2
-    )
-    return np.nan_to_num(shifts).astype(np.float32)
+    width, height = camera.resolution_px
+    columns = math.ceil(width / NODE_STEP_PX) + 1
+    rows = math.ceil(height / NODE_STEP_PX) + 1
+    x_px, y_px = camera.grid_px((columns, rows))
+    u, v = camera.tangents(x_px, y_px)
+    plain_u, plain_v = replace(camera, lens=None).tangents(x_px, y_px)
+    shifts = np.stack([u - plain_u, v - plain_v], axis=-1)
+    by_node = shifts.reshape(rows, columns, 2)
+    return np.nan_to_num(by_node).astype(np.float32)
 
 
 class Slopes(NamedTuple):
@@ -186,6 +194,14 @@ class Slopes(NamedTuple):
     x_by_v: FloatArray
     y_by_u: FloatArray
     y_by_v: FloatArray
+
+    @property
+    def areas(self) -> FloatArray:
+        """How much of the image, px^2, an area of tangents covers, (n,); negative where it is
+        turned round.
+        """
+        a, b, c, d = self
+        return a * d - b * c
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -216,7 +232,9 @@ class Camera:
             y += self.principal_point_px[1]
             return x, y
         near = _over(1.0, z)
-        return self.places_px(image_vectors[:, 0] * near, image_vectors[:, 1] * near)
+        u = image_vectors[:, 0] * near
+        v = image_vectors[:, 1] * near
+        return self.places_px(u, v)
 
     def project_outward(self, image_vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `project`, but beyond the lens on straight lines away from the image: a path may
@@ -225,15 +243,17 @@ class Camera:
         if self.lens is None:
             return self.project(image_vectors)
         near = _over(1.0, image_vectors[:, 2])
-        return self.places_outward_px(image_vectors[:, 0] * near, image_vectors[:, 1] * near)
+        u = image_vectors[:, 0] * near
+        v = image_vectors[:, 1] * near
+        return self.places_outward_px(u, v)
 
     def places_outward_px(self, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         """As `places_px`, but beyond the lens on straight lines away from the image."""
-        if self.lens is None:
-            limit = np.inf
-        else:
+        limit = np.inf
+        if self.lens is not None:
             limit = self.lens.max_tangent * WITHIN
-        beyond = np.flatnonzero(u * u + v * v > limit**2)
+        radius2 = u * u + v * v
+        beyond = np.flatnonzero(radius2 > limit**2)
         if not len(beyond):
             return self.places_px(u, v)
         times = np.hypot(u[beyond], v[beyond]) / limit
@@ -242,11 +262,11 @@ class Camera:
         u[beyond] /= times
         v[beyond] /= times
         x_px, y_px = self.places_px(u, v)
-        for place, centre in (
-            (x_px, self.principal_point_px[0]),
-            (y_px, self.principal_point_px[1]),
-        ):
-            place[beyond] = centre + (place[beyond] - centre) * times
+        centre_x, centre_y = self.principal_point_px
+        from_centre_x = x_px[beyond] - centre_x
+        from_centre_y = y_px[beyond] - centre_y
+        x_px[beyond] = centre_x + from_centre_x * times
+        y_px[beyond] = centre_y + from_centre_y * times
         return x_px, y_px
 
     @property
@@ -289,8 +309,9 @@ class Camera:
         for _ in range(NEWTON_ROUNDS):
             if not (size > NEWTON_DONE).any():
                 break
-            a, b, c, d = free.slopes(u, v)
-            area = a * d - b * c
+            slopes = free.slopes(u, v)
+            a, b, c, d = slopes
+            area = slopes.areas
             for _ in range(STEPS_A_ROUND):
                 x, y = free.places_px(u, v)
                 off_x = x - x_px
@@ -304,39 +325,53 @@ class Camera:
                 v = np.where(wild, np.nan, v - step_v)
                 if not (size > NEWTON_DONE).any():
                     break
-        converged = (size < SLOPE_STEP) & (np.hypot(u, v) <= self.lens.max_tangent)
+        is_within = np.hypot(u, v) <= self.lens.max_tangent
+        converged = (size < SLOPE_STEP) & is_within
         return np.where(converged, u, np.nan), np.where(converged, v, np.nan)
 
     def slopes(self, u: FloatArray, v: FloatArray) -> Slopes:
         """How fast pixels change with the direction (u, v, 1), (n,) each."""
-        (x1, y1), (x0, y0) = self.places_px(u + SLOPE_STEP, v), self.places_px(u - SLOPE_STEP, v)
-        (x3, y3), (x2, y2) = self.places_px(u, v + SLOPE_STEP), self.places_px(u, v - SLOPE_STEP)
-        both = 2 * SLOPE_STEP
-        return Slopes((x1 - x0) / both, (x3 - x2) / both, (y1 - y0) / both, (y3 - y2) / both)
+        x_right, y_right = self.places_px(u + SLOPE_STEP, v)
+        x_left, y_left = self.places_px(u - SLOPE_STEP, v)
+        x_below, y_below = self.places_px(u, v + SLOPE_STEP)
+        x_above, y_above = self.places_px(u, v - SLOPE_STEP)
+        step = 2 * SLOPE_STEP
+        return Slopes(
+            x_by_u=(x_right - x_left) / step,
+            x_by_v=(x_below - x_above) / step,
+            y_by_u=(y_right - y_left) / step,
+            y_by_v=(y_below - y_above) / step,
+        )
 
     def rays(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Directions (n, 3) in cam, z in image axes 1, of pixels (n,)."""
         u, v = self.tangents(x_px, y_px)
-        return np.asarray(np.stack([u, v, np.ones_like(u)], axis=-1) @ self.cam_to_image)
+        image_rays = np.stack([u, v, np.ones_like(u)], axis=-1)
+        return np.asarray(image_rays @ self.cam_to_image)
 
     def pixel_sr(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """The solid angles (n,), sr, of pixels (n,)."""
         u, v = self.tangents(x_px, y_px)
-        a, b, c, d = self.slopes(u, v)
-        return np.asarray(1 / ((a * d - b * c) * (1 + u * u + v * v) ** 1.5))
+        px2_per_tangent2 = self.slopes(u, v).areas
+        length2 = 1 + u * u + v * v
+        return np.asarray(1 / (px2_per_tangent2 * length2**1.5))
 
     def fastest_px_s(self, rate_image_rad_s: FloatArray) -> float:
         """The fastest that a direction crosses the image at a rate (3,) of the camera in image
         axes, px/s; within 2 %.
         """
         u, v = self.tangents(*self.grid_px(SPEED_PLACES))
-        step = -np.cross(rate_image_rad_s, np.stack([u, v, np.ones_like(u)], axis=-1))
-        du = step[..., 0] - u * step[..., 2]
-        dv = step[..., 1] - v * step[..., 2]
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1)
+        step_x, step_y, step_z = -np.cross(rate_image_rad_s, rays).T
+        du = step_x - u * step_z
+        dv = step_y - v * step_z
         if self.lens is None:
             return float(self.focal_length_px * np.hypot(du, dv).max())
         a, b, c, d = self.slopes(u, v)
-        return float(np.nanmax(np.hypot(a * du + b * dv, c * du + d * dv)))
+        dx_px = a * du + b * dv
+        dy_px = c * du + d * dv
+        speed_px_s = np.hypot(dx_px, dy_px)
+        return float(np.nanmax(speed_px_s))
 
     def scales_px_rad(self) -> tuple[float, float]:
         """The smallest and the largest number of pixels to a radian anywhere on the image; a
@@ -351,29 +386,29 @@ class Camera:
         along_x = a * u + b * v
         along_y = c * u + d * v
         wide = 1 + u * u + v * v
-        xx = wide * (a * a + b * b + along_x**2)
-        yy = wide * (c * c + d * d + along_y**2)
-        xy = wide * (a * c + b * d + along_x * along_y)
+        plain_xx = a * a + b * b
+        plain_yy = c * c + d * d
+        plain_xy = a * c + b * d
+        xx = wide * (plain_xx + along_x**2)
+        yy = wide * (plain_yy + along_y**2)
+        xy = wide * (plain_xy + along_x * along_y)
         middle = (xx + yy) / 2
         spread = np.hypot((xx - yy) / 2, xy)
-        return float(np.sqrt(np.nanmin(middle - spread))), float(
-            np.sqrt(np.nanmax(middle + spread))
-        )
+        smallest = float(np.sqrt(np.nanmin(middle - spread)))
+        largest = float(np.sqrt(np.nanmax(middle + spread)))
+        return smallest, largest
 
     def grid_px(self, count: int | tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """Places over the whole image, its edges among them: `count` to a row and a column, or
         (columns, rows).
         """
         if isinstance(count, int):
-            counts = (count, count)
-        else:
-            counts = count
-        x, y = np.meshgrid(
-            *(
-                np.linspace(-0.5, size - 0.5, n)
-                for size, n in zip(self.resolution_px, counts, strict=True)
-            )
-        )
+            count = (count, count)
+        columns, rows = count
+        width, height = self.resolution_px
+        across = np.linspace(-0.5, width - 0.5, columns)
+        down = np.linspace(-0.5, height - 0.5, rows)
+        x, y = np.meshgrid(across, down)
         return x.ravel(), y.ravel()
 
     def pixels_from(
@@ -390,10 +425,11 @@ class Camera:
         """Whether places in pixels are on the image; not so at NaN."""
         width, height = self.resolution_px
         with np.errstate(invalid="ignore"):
-            return np.asarray(
-                (np.abs(x_px - (width - 1) / 2) <= width / 2)
-                & (np.abs(y_px - (height - 1) / 2) <= height / 2)
-            )
+            off_x = np.abs(x_px - (width - 1) / 2)
+            off_y = np.abs(y_px - (height - 1) / 2)
+            across = off_x <= width / 2
+            down = off_y <= height / 2
+        return np.asarray(across & down)
 
     def in_view(self, seen: FloatArray, margin_px: float, reach_rad: float) -> IntArray:
         """Positions of the directions (n, 3) in image axes that can come within `margin_px` of the
@@ -409,7 +445,8 @@ class Camera:
         reach = float(np.tan(angle_rad)) - radius  # tangents grow fastest at the rim, and outward
         x, y, z = seen.T
         inside = z > 0
-        for along, (low, high) in zip((x, y), self._box(margin_px), strict=True):
+        box = self._box(margin_px)
+        for along, (low, high) in zip((x, y), box, strict=True):
             inside &= along >= (low - reach) * z
             inside &= along <= (high + reach) * z
         return np.flatnonzero(inside)
@@ -420,15 +457,14 @@ class Camera:
         """
         if self.lens is not None:
             return self.lens.box
-        pairs = zip(self.principal_point_px, self.resolution_px, strict=True)
-        x, y = (
-            (
-                (-0.5 - margin_px - c) / self.focal_length_px,
-                (n - 0.5 + margin_px - c) / self.focal_length_px,
-            )
-            for c, n in pairs
-        )
-        return x, y
+        cx, cy = self.principal_point_px
+        width, height = self.resolution_px
+        focal_px = self.focal_length_px
+        left = (-0.5 - margin_px - cx) / focal_px
+        right = (width - 0.5 + margin_px - cx) / focal_px
+        top = (-0.5 - margin_px - cy) / focal_px
+        bottom = (height - 0.5 + margin_px - cy) / focal_px
+        return (left, right), (top, bottom)
 
     def edges(self, margin_px: float) -> FloatArray:
         """The planes of the image's sides, `margin_px` outside it: their inward unit normals (4, 3)
@@ -440,7 +476,8 @@ class Camera:
         normals = np.array(
             [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
         )
-        return np.asarray(normals / np.sqrt((normals * normals).sum(axis=1, keepdims=True)))
+        length2 = (normals * normals).sum(axis=1, keepdims=True)
+        return np.asarray(normals / np.sqrt(length2))
 
     def field(self, margin_px: float) -> tuple[float, FloatArray]:
         """`field_radius_rad` and `edges`, which are the same for every frame, of the last few
@@ -465,12 +502,15 @@ def linear_shares(size: int, count: int) -> FloatArray:
     """The share (size, count) of each place of `grid_px` in each pixel of a row: linear between
     neighbours.
     """
-    at = (np.arange(size) + 0.5) * (count - 1) / size
-    return np.asarray(np.maximum(0.0, 1 - np.abs(at[:, None] - np.arange(count))))
+    middles = np.arange(size) + 0.5
+    at = middles * (count - 1) / size
+    distance = np.abs(at[:, None] - np.arange(count))
+    return np.asarray(np.maximum(0.0, 1 - distance))
 
 
 @lru_cache(maxsize=16)
 def _field(camera: Camera, margin_px: float) -> tuple[float, FloatArray]:
+    """As `Camera.field`, by the camera itself: it is its own key, and its edges are read only."""
     edges = camera.edges(margin_px)
     edges.flags.writeable = False
     return camera.field_radius_rad(margin_px), edges
@@ -494,34 +534,36 @@ def bounded(camera: Camera, margin_px: float) -> Camera:
     if lens is None:
         return camera
     free = replace(camera, lens=replace(lens, max_tangent=np.inf))
-    (left, right), (top, bottom) = (
-        (-0.5 - margin_px, size - 0.5 + margin_px) for size in camera.resolution_px
-    )
-    across = np.linspace(left, right, BORDER_PLACES)
-    down = np.linspace(top, bottom, BORDER_PLACES)
-    border_x = np.concatenate(
-        [across, across, np.full(BORDER_PLACES, left), np.full(BORDER_PLACES, right)]
-    )
-    border_y = np.concatenate(
-        [np.full(BORDER_PLACES, top), np.full(BORDER_PLACES, bottom), down, down]
-    )
+    width, height = camera.resolution_px
+    first = -0.5 - margin_px
+    right = width - 0.5 + margin_px
+    bottom = height - 0.5 + margin_px
+    across = np.linspace(first, right, BORDER_PLACES)
+    down = np.linspace(first, bottom, BORDER_PLACES)
+    at_first = np.full(BORDER_PLACES, first)
+    at_right = np.full(BORDER_PLACES, right)
+    at_bottom = np.full(BORDER_PLACES, bottom)
+    border_x = np.concatenate([across, across, at_first, at_right])
+    border_y = np.concatenate([at_first, at_bottom, down, down])
     u, v = free.tangents(border_x, border_y)
-    reach = min(float(np.nan_to_num(np.hypot(u, v), nan=np.inf).max()), lens.max_tangent)
+    farthest = np.nan_to_num(np.hypot(u, v), nan=np.inf).max()
+    reach = min(float(farthest), lens.max_tangent)
     box = (_wide(u), _wide(v))
-    folds = True
-    if np.isfinite(reach):
-        side_u, side_v = (
-            part.ravel() for part in np.meshgrid(*[np.linspace(-reach, reach, FOLD_PLACES)] * 2)
-        )
-        inside = np.hypot(side_u, side_v) <= reach
-        a, b, c, d = free.slopes(side_u[inside], side_v[inside])
-        folds = not (a * d - b * c > 0).all()
-    if folds:
+    if not np.isfinite(reach) or _folds(free, reach):
         raise InputError(
             "its distortion folds within the screen: two directions share a pixel; fit it again,"
             " with fewer terms"
         )
     return replace(camera, lens=replace(lens, max_tangent=reach * BEYOND_BORDER, box=box))
+
+
+def _folds(camera: Camera, reach: float) -> bool:
+    """Whether a lens turns its image round anywhere within a radius of (u, v)."""
+    side = np.linspace(-reach, reach, FOLD_PLACES)
+    columns, rows = np.meshgrid(side, side)
+    inside = np.hypot(columns, rows) <= reach
+    slopes = camera.slopes(columns[inside], rows[inside])
+    return not (slopes.areas > 0).all()
 
 
 def _wide(tangents: FloatArray) -> tuple[float, float]:
@@ -533,5 +575,6 @@ def _wide(tangents: FloatArray) -> tuple[float, float]:
     low = float(tangents.min())
     high = float(tangents.max())
     if np.isfinite(low):
-        return (low - BOW * (high - low), high + BOW * (high - low))
+        bow = BOW * (high - low)
+        return low - bow, high + bow
     return ANY_TANGENT

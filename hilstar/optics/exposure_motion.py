@@ -40,12 +40,12 @@ MAX_PIECE_SIGMA = (MAX_NODES - NODES_AT_REST - 1) / NODES_PER_SIGMA
 # farther apart.
 MAX_PIECES = 20_000
 MAX_SPRITES = 2_000_000
-COARSER = 0.25
-MIN_COARSENESS = COARSER**3
+COARSER = 0.25  # of the nodes to a sigma, from one attempt to the next
+MIN_COARSENESS = COARSER**3  # after it a turn has too many sprites
 MIDDLE_S = np.zeros(1)
 AT_ONCE = Scan()
 MAX_ROWS_A_ROW = 0.5  # rows that a star may cross while one is read
-ROUNDS, SETTLED_S = 40, 1e-10
+ROUNDS, SETTLED_S = 40, 1e-10  # a round leaves up to MAX_ROWS_A_ROW of the error: 40 leave 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,10 +68,12 @@ class Motion:
         A constant rate turns about one axis: Rodrigues' formula on the attitude in the middle.
         """
         speed = float(np.linalg.norm(self.rate_cam_rad_s))
-        x, y, z = self.rate_cam_rad_s / speed if speed else np.zeros(3)
+        x, y, z = self.rate_cam_rad_s / (speed or 1.0)
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         angle = -speed * seconds[:, None, None]
-        turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+        # `cross` squared is what Rodrigues' formula has of the axis
+        squared = cross @ cross
+        turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * squared
         return np.asarray(camera.cam_to_image @ turn @ to_matrix(self.q_icrs_to_cam))
 
 
@@ -96,7 +98,8 @@ def own_row_s(
         row_s = seconds + late_s(row_s)
         if not len(row_s) or np.abs(row_s - before).max() < SETTLED_S:
             break
-    share = (late_s(row_s + step_s) - late_s(row_s - step_s)) / (2 * step_s)
+    late_change_s = late_s(row_s + step_s) - late_s(row_s - step_s)
+    share = late_change_s / (2 * step_s)
     return row_s, 1 / (1 - np.clip(share, -MAX_ROWS_A_ROW, MAX_ROWS_A_ROW))
 
 
@@ -110,10 +113,10 @@ def smeared_sprites(
     long to be drawn at all.
     """
     if not motion.rate_cam_rad_s.any() or not motion.exposure_s:
-        return make_sprites(
-            stars, motion.icrs_to_image(MIDDLE_S, camera)[0], camera, psf.footprint_px
-        )
-    degrees = np.degrees(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
+        icrs_to_image = motion.icrs_to_image(MIDDLE_S, camera)[0]
+        return make_sprites(stars, icrs_to_image, camera, psf.footprint_px)
+    speed_rad_s = np.linalg.norm(motion.rate_cam_rad_s)
+    degrees = np.degrees(speed_rad_s) * motion.exposure_s
     turn = f"an exposure in which the camera turns by {degrees:.4g} deg"
     fastest_px_s = camera.fastest_px_s(camera.cam_to_image @ motion.rate_cam_rad_s)
     row_s = scan.scanout_s / camera.resolution_px[1]
@@ -124,7 +127,7 @@ def smeared_sprites(
         )
     # Each piece of the turn is short compared with the field and, anywhere on the image, with its
     # nodes.
-    angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * motion.exposure_s
+    angle_rad = float(speed_rad_s) * motion.exposure_s
     path_sigma = fastest_px_s * motion.exposure_s / min(psf.width_px)
     needed = max(angle_rad / MAX_PIECE_RAD, path_sigma / MAX_PIECE_SIGMA)
     if needed > MAX_PIECES:
@@ -134,16 +137,16 @@ def smeared_sprites(
             " exposure_s or a slower rate"
         )
     pieces = int(np.ceil(needed))
+    edges_s = np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s
     fineness = 1.0
     while fineness >= MIN_COARSENESS:
         smear = _Smear(stars, camera, psf, NODES_PER_SIGMA * fineness, scan)
         chain: list[FrameLight] = []
         total = 0
-        for begin, end in itertools.pairwise(
-            np.linspace(-0.5, 0.5, pieces + 1) * motion.exposure_s
-        ):
-            chain.append(smear.piece(motion, float(begin), float(end), 1.0 / pieces))
-            total += len(chain[-1])
+        for begin_s, end_s in itertools.pairwise(edges_s.tolist()):
+            piece = smear.piece(motion, begin_s, end_s, 1.0 / pieces)
+            chain.append(piece)
+            total += len(piece)
             if total > MAX_SPRITES:
                 break
         else:
@@ -160,7 +163,9 @@ def smeared_sprites(
 
 @dataclass(frozen=True, slots=True)
 class _Smear:
-    """Stars smeared on one image."""
+    """How stars are smeared on an image: its camera and PSF, the nodes to a sigma of their paths,
+    and how its rows are exposed.
+    """
 
     stars: Stars
     camera: Camera
@@ -172,41 +177,41 @@ class _Smear:
         """The sprites of a piece of an exposure that is `part` of it."""
         camera = self.camera
         stars = self.stars
-        angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * (
-            end_s - begin_s + self.scan.scanout_s
-        )
+        footprint_px = self.psf.footprint_px
+        rate_image_rad_s = camera.cam_to_image @ motion.rate_cam_rad_s
+        whole_s = end_s - begin_s + self.scan.scanout_s
+        angle_rad = float(np.linalg.norm(motion.rate_cam_rad_s)) * whole_s
         middle = motion.icrs_to_image(np.array([(begin_s + end_s) / 2]), camera)[0]
-        radius_rad, edges = camera.field(self.psf.footprint_px / 2 + 1)
+        radius_rad, edges = camera.field(footprint_px / 2 + 1)
         near = stars.near(middle[2], radius_rad, edges @ middle, angle_rad)
-        paths = Paths(
-            stars.directions(near) @ middle.T, camera.cam_to_image @ motion.rate_cam_rad_s, camera
-        )
+        paths = Paths(stars.directions(near) @ middle.T, rate_image_rad_s, camera)
         half_s = (end_s - begin_s) / 2
         thrice_s = np.array([[-half_s], [0.0], [half_s]])
         if self.scan.scanout_s:
-            every = np.tile(np.arange(len(paths)), 3)
-            thrice_s = own_row_s(paths, every, np.repeat(thrice_s, len(paths)), self.scan)[
-                0
-            ].reshape(3, -1)
+            star = np.tile(np.arange(len(paths)), 3)
+            row_s, _ = own_row_s(paths, star, np.repeat(thrice_s, len(paths)), self.scan)
+            thrice_s = row_s.reshape(3, -1)
         x_px, y_px = paths.all_places_px(thrice_s)
         # The mean over a path in two chords: an arc's length to (angle / 4)^2 / 6 of it.
-        first_half, second_half = Chords(x_px[:2], y_px[:2]), Chords(x_px[1:], y_px[1:])
+        first_half = Chords(x_px[:2], y_px[:2])
+        second_half = Chords(x_px[1:], y_px[1:])
         length = first_half.length_sigma(self.psf.width_px)
         length = length + second_half.length_sigma(self.psf.width_px)
         whole = Chords(x_px[::2], y_px[::2])
         bulge_px = 2 * half_s * paths.speed_rad_s * np.nan_to_num(whole.length_sigma((1.0, 1.0)))
-        begin, end = whole.on_image(camera.resolution_px, self.psf.footprint_px / 2 + 1 + bulge_px)
-        counts = node_counts(
-            length * (end - begin), self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA
-        )
+        margin_px = footprint_px / 2 + 1 + bulge_px
+        begin, end = whole.on_image(camera.resolution_px, margin_px)
+        seen_sigma = length * (end - begin)
+        counts = node_counts(seen_sigma, self.nodes_per_sigma, NODES_AT_REST, MIN_PATH_SIGMA)
         counts[end <= begin] = 0  # the path misses the image
         nodes = nodes_of(np.minimum(counts, MAX_NODES))
-        share = begin[nodes.path] + (end - begin)[nodes.path] * (nodes.place + 1) / 2
+        seen_part = (end - begin)[nodes.path]
+        share = begin[nodes.path] + seen_part * (nodes.place + 1) / 2
         seconds = (2 * share - 1) * half_s
         star = near[nodes.path]
-        light = nodes.share * (end - begin)[nodes.path] * part * stars.electrons_per_s[star]
+        light = nodes.share * seen_part * part * stars.electrons_per_s[star]
         if self.scan.scanout_s:
             seconds, longer = own_row_s(paths, nodes.path, seconds, self.scan)
             light = light * longer
         x_px, y_px = paths.places_px(nodes.path, seconds)
-        return pack_sprites(x_px, y_px, light, star, camera.resolution_px, self.psf.footprint_px)
+        return pack_sprites(x_px, y_px, light, star, camera.resolution_px, footprint_px)

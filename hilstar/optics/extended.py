@@ -3,9 +3,8 @@ before levels are chosen.
 
 Its unit is that of the linear image, electrons per second of each pixel. It travels in a frame's
 `FrameLight.extended` and is drawn in order, before the sprites. Compared by identity: one object
-drawn
-twice is the same light. A small disc is a map of its spread places, a larger one is drawn ray by
-ray.
+drawn twice is the same light. A small disc is a map of its spread places, a larger one is drawn ray
+by ray.
 """
 
 from dataclasses import dataclass, replace
@@ -27,7 +26,10 @@ Rectangle = tuple[int, int, int, int]  # left, top, width, height, pixels
 # Below this radius (PSF and pixel combined) a disc's limb and centre cannot be told apart;
 # disc.frag is off by 1 % at 5.5.
 SMALL_SIGMAS = 8.0
-NODES_A_SIGMA = 4.0  # along a radius: places in the face's middle are then 0.8 sigma apart
+# Along a radius. In the face's middle places are then up to pi^3 / 4 / 5 = 1.55 sigma apart, and
+# the face is uneven by 2 exp(-2 pi^2 / 1.55^2) = 5e-4; with 4 it would be 1 %, also of the Sun
+# behind.
+NODES_A_SIGMA = 5.0
 # coverage that counts as a whole pixel: the rest is rounding, and the Sun behind may be 1e9 times
 # white
 WHOLE = 0.999
@@ -107,8 +109,7 @@ class DiscLight:
     """A body's disc through a camera, spread by a PSF; `icrs_to_image` (3, 3) as for sprites.
 
     Its light is multiplied by `times`. Where it `covers`, it hides what was drawn before it.
-    `disc_lights`
-    chooses between it and, for a small disc, a map.
+    `disc_lights` chooses between it and, for a small disc, a map.
     """
 
     disc: Disc
@@ -135,33 +136,42 @@ class DiscLight:
         x_px, y_px = self.camera.project_outward(limb_directions)
         if not (np.isfinite(x_px).all() and np.isfinite(y_px).all()):
             return (0, 0, *resolution_px)
-        sheared_px = 0.0  # how far the first and the last pixels' light is moved at most, about
-        if self.shear is not None:
-            late_s = (
-                sum(
-                    abs(s) * size
-                    for s, size in zip(self.shear.s_per_px, self.camera.resolution_px, strict=True)
-                )
-                / 2
-            )
-            turn = float(np.linalg.norm(self.shear.rate_image_rad_s)) * late_s
-            sheared_px = (
-                2
-                * turn
-                * float(np.hypot(self.camera.focal_length_px, max(self.camera.resolution_px)))
-            )
-        edges = []
-        for k, place in enumerate((x_px, y_px)):
-            low = float(place.min())
-            high = float(place.max())
-            half = (
-                (high - low) / 2 * BOW
-                + REACH_SIGMAS * float(np.sqrt(self.psf.variance_px2[k]))
-                + 1
-                + sheared_px
-            )
-            edges.append(((low + high) / 2 - half, (low + high) / 2 + half))
-        return clipped((edges[0][0], edges[1][0], edges[0][1], edges[1][1]), resolution_px)
+        middle_x, half_x = _middle_and_half(x_px)
+        middle_y, half_y = _middle_and_half(y_px)
+        variance_x, variance_y = self.psf.variance_px2
+        sheared_px = self._sheared_px()
+        spread_x = REACH_SIGMAS * float(np.sqrt(variance_x))
+        spread_y = REACH_SIGMAS * float(np.sqrt(variance_y))
+        half_x = half_x + spread_x + 1 + sheared_px
+        half_y = half_y + spread_y + 1 + sheared_px
+        left = middle_x - half_x
+        right = middle_x + half_x
+        top = middle_y - half_y
+        bottom = middle_y + half_y
+        return clipped((left, top, right, bottom), resolution_px)
+
+    def _sheared_px(self) -> float:
+        """How far the first and the last pixels' light is moved by the shear at most, about."""
+        if self.shear is None:
+            return 0.0
+        width, height = self.camera.resolution_px
+        by_column_s, by_row_s = self.shear.s_per_px
+        whole_s = abs(by_column_s) * width + abs(by_row_s) * height
+        late_s = whole_s / 2
+        turn_rad = float(np.linalg.norm(self.shear.rate_image_rad_s)) * late_s
+        lever_px = float(np.hypot(self.camera.focal_length_px, max(width, height)))
+        return 2 * turn_rad * lever_px
+
+
+def _middle_and_half(limb_px: FloatArray) -> tuple[float, float]:
+    """The middle of a limb's places along an axis, and how far from it they reach, as a limb may
+    bow between two of them.
+    """
+    low = float(limb_px.min())
+    high = float(limb_px.max())
+    middle = (low + high) / 2
+    half = (high - low) / 2 * BOW
+    return middle, half
 
 
 ExtendedLight = LightMap | GlowLight | DiscLight
@@ -201,8 +211,10 @@ def clipped(
     """The pixels of an image within left, top, right and bottom (the last two excluded); None
     where there is none.
     """
-    left, top = np.floor(edges_px[:2]).clip(0, resolution_px).astype(int).tolist()
-    right, bottom = np.ceil(edges_px[2:]).clip(0, resolution_px).astype(int).tolist()
+    first = np.floor(edges_px[:2]).clip(0, resolution_px)
+    end = np.ceil(edges_px[2:]).clip(0, resolution_px)
+    left, top = first.astype(int).tolist()
+    right, bottom = end.astype(int).tolist()
     if right > left and bottom > top:
         return (left, top, right - left, bottom - top)
     return None
@@ -257,12 +269,18 @@ def disc_lights(disc: Disc, view: DiscView, covers: bool) -> list[ExtendedLight]
 
 
 def _at_pose(light: DiscLight) -> list[ExtendedLight]:
+    """A disc at one pose: itself, a map where it is small, nothing where it is not on the image."""
     camera = light.camera
     radius_px = float(np.tan(min(light.disc.radius_rad, 1.0)) * camera.focal_length_px)
-    if radius_px < SMALL_SIGMAS * max(light.psf.variance_px2) ** 0.5:
-        nodes = int(np.ceil(NODES_A_SIGMA * radius_px / min(light.psf.variance_px2) ** 0.5))
-        drawn = _disc_map(light, min(max(MIN_NODES, nodes), MAX_NODES))
-        return [] if drawn is None else [drawn]
+    widest_px = max(light.psf.variance_px2) ** 0.5
+    narrowest_px = min(light.psf.variance_px2) ** 0.5
+    if radius_px < SMALL_SIGMAS * widest_px:
+        wanted = int(np.ceil(NODES_A_SIGMA * radius_px / narrowest_px))
+        nodes = min(max(MIN_NODES, wanted), MAX_NODES)
+        drawn = _disc_map(light, nodes)
+        if drawn is None:
+            return []
+        return [drawn]
     if light.region(camera.resolution_px) is None:
         return []
     return [light]
@@ -275,10 +293,8 @@ def _seen(light: DiscLight, directions: FloatArray) -> FloatArray:
         return np.asarray(image_directions)
     x_px, y_px = light.camera.project(image_directions)
     late_s = np.nan_to_num(light.shear.late_s(x_px, y_px))
-    return np.asarray(
-        image_directions
-        - late_s[:, None] * np.cross(light.shear.rate_image_rad_s, image_directions)
-    )
+    turned = np.cross(light.shear.rate_image_rad_s, image_directions)
+    return np.asarray(image_directions - late_s[:, None] * turned)
 
 
 def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
@@ -289,14 +305,16 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     camera = light.camera
     reach_px = light.psf.footprint_px / 2
     lit = _places(light, disc, nodes)
+    whole = lit
     if light.covers:
         whole = _places(light, replace(disc, law="uniform"), nodes)
-    else:
-        whole = lit
     if not len(whole.x_px):
         return None
-    (left, right), (top, bottom) = ((float(part.min()), float(part.max())) for part in whole[:2])
-    edges = (left - reach_px, top - reach_px, right + reach_px + 1, bottom + reach_px + 1)
+    left = float(whole.x_px.min()) - reach_px
+    top = float(whole.y_px.min()) - reach_px
+    right = float(whole.x_px.max()) + reach_px + 1
+    bottom = float(whole.y_px.max()) + reach_px + 1
+    edges = (left, top, right, bottom)
     region = clipped(edges, camera.resolution_px)
     if region is None:
         return None
@@ -304,13 +322,13 @@ def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     if light.covers:
         # Pixels to a steradian at the disc's middle: nearly the same over a small disc
         u, v, w = light.icrs_to_image @ disc.direction
-        a, b, c, d = camera.slopes(np.array([u / w]), np.array([v / w]))
-        px_per_sr = float(np.nan_to_num(a * d - b * c)[0] / abs(w) ** 3)
+        slopes = camera.slopes(np.array([u / w]), np.array([v / w]))
+        px2_per_tangent2 = np.nan_to_num(slopes.areas)[0]
+        px_per_sr = float(px2_per_tangent2 / abs(w) ** 3)
         share = light.psf.spread(whole.x_px, whole.y_px, whole.law_sr * px_per_sr, region)
         cover = np.where(share > WHOLE, np.float32(1), share)
-    image = light.psf.spread(
-        lit.x_px, lit.y_px, light.times * disc.normal_e_per_s_sr * lit.law_sr, region
-    )
+    rates = light.times * disc.normal_e_per_s_sr * lit.law_sr
+    image = light.psf.spread(lit.x_px, lit.y_px, rates, region)
     return LightMap(image, (region[0], region[1]), 1.0, cover, disc.name, lasting=False)
 
 
@@ -325,7 +343,7 @@ class FacePlaces(NamedTuple):
 
 
 def _places(light: DiscLight, disc: Disc, nodes: int) -> FacePlaces:
-    """Places of the face that have a pixel."""
+    """The places of a disc's face that have a pixel, and their light."""
     directions, law_sr = disc.points(nodes)
     x_px, y_px = light.camera.project(_seen(light, directions))
     known = np.isfinite(x_px)

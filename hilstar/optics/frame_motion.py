@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.optics.camera import Camera
 from hilstar.optics.paths import (
@@ -71,18 +71,15 @@ def swept_sprites(
     makes them.
     """
     turn, is_slower = slowed(turn, scan, camera)
-    middle = CameraTurn(
-        propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2), turn.rate_cam_rad_s
-    )
-    icrs_to_middle = camera.cam_to_image @ to_matrix(middle.q_icrs_to_cam)
+    middle_q = propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, scan.hold_s / 2)
+    icrs_to_middle = camera.cam_to_image @ to_matrix(middle_q)
     footprint_px = psf.footprint_px
     margin_px = footprint_px / 2 + 1
     radius_rad, edges = camera.field(margin_px)
     reach_rad = turn.speed_rad_s * scan.whole_s / 2
     near = stars.near(icrs_to_middle[2], radius_rad, edges @ icrs_to_middle, reach_rad)
-    image_directions = (
-        camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam) @ stars.directions(near).T
-    ).T
+    icrs_to_first = camera.cam_to_image @ to_matrix(turn.q_icrs_to_cam)
+    image_directions = (icrs_to_first @ stars.directions(near).T).T
     close = camera.in_view(image_directions, margin_px, turn.speed_rad_s * scan.longest_s)
     near = near[close]
     paths = _paths(image_directions[close], turn, scan, camera)
@@ -93,46 +90,58 @@ def swept_sprites(
         x_px, y_px = paths.places_px(EVERY, late_s)
         late_s = scan.late_s(x_px, y_px, camera.resolution_px)
     late_s = np.where(np.isfinite(late_s), late_s, 0.0)
-    ends = [paths.places_px(EVERY, seconds) for seconds in (late_s, late_s + scan.hold_s)]
-    chords = Chords(*(np.stack(places) for places in zip(*ends, strict=True)))
+    begin_x, begin_y = paths.places_px(EVERY, late_s)
+    end_x, end_y = paths.places_px(EVERY, late_s + scan.hold_s)
+    chords = Chords(np.stack([begin_x, end_x]), np.stack([begin_y, end_y]))
     # An arc bulges from its chord, and a star runs unevenly along it, by less than the angle of the
     # turn.
-    bulge_px = paths.speed_rad_s * scan.hold_s * np.nan_to_num(chords.length_sigma((1.0, 1.0)))
+    length_px = np.nan_to_num(chords.length_sigma((1.0, 1.0)))
+    bulge_px = paths.speed_rad_s * scan.hold_s * length_px
     # From the first light of the row where a path begins until the row where it ends is written
     # again: a star that falls by a share s of the rows that the panel lights meanwhile is overtaken
     # by the panel hold / (1 - s) after the first.
     span_s = np.zeros(len(late_s))
     if scan.hold_s:
-        share = (scan.late_s(*ends[1], camera.resolution_px) - late_s) / scan.hold_s
-        span_s = scan.hold_s / (
-            1 - np.clip(np.where(np.isfinite(share), share, 0.0), -MAX_TURN_FIELD, MAX_TURN_FIELD)
-        )
+        later_s = scan.late_s(end_x, end_y, camera.resolution_px) - late_s
+        share = later_s / scan.hold_s
+        share = np.where(np.isfinite(share), share, 0.0)
+        share = np.clip(share, -MAX_TURN_FIELD, MAX_TURN_FIELD)
+        span_s = scan.hold_s / (1 - share)
         chords = chords.to(span_s / scan.hold_s)
     # the part of each path, 0 to 1
     first, last = chords.on_image(camera.resolution_px, margin_px + bulge_px)
-    wanted = node_counts(
-        chords.length_sigma(psf.width_px) * (last - first), NODES_PER_SIGMA, 1, POINT_SIGMA
-    )
+    seen_sigma = chords.length_sigma(psf.width_px) * (last - first)
+    wanted = node_counts(seen_sigma, NODES_PER_SIGMA, 1, POINT_SIGMA)
     wanted[last <= first] = 0  # the path misses the image
-    chosen = wanted
-    wanting = np.flatnonzero(wanted)
-    brightest_stars = brightest(stars.electrons_per_s[near][wanting], max_stars(footprint_px))
-    if brightest_stars is not None:  # a frame has no room for the faintest
-        chosen = np.zeros_like(wanted)
-        chosen[wanting[brightest_stars]] = wanted[wanting[brightest_stars]]
+    chosen = _without_the_faintest(wanted, stars.electrons_per_s[near], footprint_px)
     counts = within_budget(chosen, min(EXTRA_SPRITES, EXTRA_PX // footprint_px**2))
     nodes = nodes_of(counts)
     begin = first[nodes.path]
     length = (last - first)[nodes.path]
-    seconds = late_s[nodes.path] + (begin + length * (nodes.place + 1) / 2) * span_s[nodes.path]
+    place = begin + length * (nodes.place + 1) / 2
+    seconds = late_s[nodes.path] + place * span_s[nodes.path]
     x_px, y_px = paths.places_px(nodes.path, seconds)
     star = near[nodes.path]
     light = nodes.share * length * stars.electrons_per_s[star]
     if scan.hold_s:
         light *= span_s[nodes.path] / scan.hold_s
     sprites = pack_sprites(x_px, y_px, light, star, camera.resolution_px, footprint_px)
-    capped = int(((wanted > 0) if is_slower else (counts < wanted)).sum())
-    return replace(sprites, per_star=int(counts.max(initial=1)), capped=capped)
+    coarser = (wanted > 0) if is_slower else (counts < wanted)
+    return replace(sprites, per_star=int(counts.max(initial=1)), capped=int(coarser.sum()))
+
+
+def _without_the_faintest(
+    wanted: IntArray, electrons_per_s: FloatArray, footprint_px: int
+) -> IntArray:
+    """The nodes (n,) that paths want, 0 for the faintest stars, for which a frame has no room."""
+    wanting = np.flatnonzero(wanted)
+    brightest_wanting = brightest(electrons_per_s[wanting], max_stars(footprint_px))
+    if brightest_wanting is None:
+        return wanted
+    star = wanting[brightest_wanting]
+    chosen = np.zeros_like(wanted)
+    chosen[star] = wanted[star]
+    return chosen
 
 
 def _paths(seen: FloatArray, turn: CameraTurn, scan: Scan, camera: Camera) -> Paths | ShortPaths:
@@ -141,14 +150,15 @@ def _paths(seen: FloatArray, turn: CameraTurn, scan: Scan, camera: Camera) -> Pa
     # Where a pinhole has the star when the middle row lights up says to `wrong_px` which row is the
     # star's.
     wrong_px = bend_px(camera) + turn.speed_rad_s * scan.longest_s * camera.focal_length_px
-    half_s = scan.hold_s / 2 + scan.scanout_s * min(1.0, wrong_px / min(camera.resolution_px))
+    wrong_rows = min(1.0, wrong_px / min(camera.resolution_px))
+    half_s = scan.hold_s / 2 + scan.scanout_s * wrong_rows
     points = points_within(camera, turn.speed_rad_s * half_s)
     if points is None:
         return exact
-    x_px, y_px = exact.through(replace(camera, lens=None)).all_places_px(np.zeros((1, 1)))
-    return ShortPaths(
-        exact, scan.late_s(x_px[0], y_px[0], camera.resolution_px) + scan.hold_s / 2, half_s, points
-    )
+    pinhole = replace(camera, lens=None)
+    x_px, y_px = exact.through(pinhole).all_places_px(np.zeros((1, 1)))
+    late_s = scan.late_s(x_px[0], y_px[0], camera.resolution_px)
+    return ShortPaths(exact, late_s + scan.hold_s / 2, half_s, points)
 
 
 def slowed(turn: CameraTurn, scan: Scan, camera: Camera) -> tuple[CameraTurn, bool]:
@@ -159,4 +169,5 @@ def slowed(turn: CameraTurn, scan: Scan, camera: Camera) -> tuple[CameraTurn, bo
     most_rad = MAX_TURN_FIELD * camera.field_radius_rad(0.0)
     if angle_rad <= most_rad:
         return turn, False
-    return CameraTurn(turn.q_icrs_to_cam, turn.rate_cam_rad_s * (most_rad / angle_rad)), True
+    slower_cam_rad_s = turn.rate_cam_rad_s * (most_rad / angle_rad)
+    return CameraTurn(turn.q_icrs_to_cam, slower_cam_rad_s), True

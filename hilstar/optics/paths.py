@@ -68,13 +68,15 @@ class NodeTable(NamedTuple):
 
 @lru_cache(maxsize=1)
 def _node_table() -> NodeTable:
-    rules = [np.polynomial.legendre.leggauss(count) for count in range(1, MAX_NODES + 1)]
+    """The table of all rules, made once."""
+    places = []
+    weights = []
+    for count in range(1, MAX_NODES + 1):
+        count_places, count_weights = np.polynomial.legendre.leggauss(count)
+        places.append(count_places)
+        weights.append(count_weights)
     first = np.cumsum([0, 0, *range(1, MAX_NODES)])
-    return NodeTable(
-        first,
-        np.concatenate([nodes for nodes, _ in rules]),
-        np.concatenate([weights for _, weights in rules]),
-    )
+    return NodeTable(first, np.concatenate(places), np.concatenate(weights))
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +95,8 @@ def nodes_of(counts: IntArray) -> Nodes:
     table = _node_table()
     path = np.repeat(np.arange(len(counts)), counts)
     begin = np.cumsum(counts) - counts
-    entry = np.arange(len(path)) + np.repeat(table.first[counts] - begin, counts)
+    to_entry = np.repeat(table.first[counts] - begin, counts)
+    entry = np.arange(len(path)) + to_entry
     return Nodes(path, table.places[entry], table.weights[entry] / 2)
 
 
@@ -108,7 +111,8 @@ def within_budget(wanted: IntArray, extra: int) -> IntArray:
     total = int(beyond.sum())
     if total <= extra:
         return np.asarray(counts)
-    return np.asarray(np.minimum(counts, 1) + (beyond * (extra / total)).astype(np.intp))
+    reduced = (beyond * (extra / total)).astype(np.intp)
+    return np.asarray(np.minimum(counts, 1) + reduced)
 
 
 class Paths:
@@ -125,7 +129,8 @@ class Paths:
         axis = np.array([x, y, z])
         # Component by component (3, n): several times faster than direction by direction.
         self._seen = np.ascontiguousarray(seen.T)
-        self._cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) @ self._seen
+        cross_with_axis = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+        self._cross = cross_with_axis @ self._seen
         self._along = axis[:, None] * (axis @ self._seen)
 
     def __len__(self) -> int:
@@ -143,18 +148,20 @@ class Paths:
         """Pixel x and y of the stars at places `star` (k,), each at its own of `seconds` (k,);
         NaN behind the camera.
         """
-        return self._places_px(
-            self._seen[:, star], self._cross[:, star], self._along[:, star], seconds
-        )
+        seen = self._seen[:, star]
+        cross = self._cross[:, star]
+        along = self._along[:, star]
+        return self._places_px(seen, cross, along, seconds)
 
     def all_places_px(self, seconds: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixel x and y (m, n) of all stars at `seconds` (m, 1), or (m, n) of their own; NaN
         behind the camera.
         """
-        shape = len(seconds), len(self)
-        x_px, y_px = self._places_px(
-            self._seen[:, None], self._cross[:, None], self._along[:, None], seconds
-        )
+        shape = (len(seconds), len(self))
+        seen = self._seen[:, None]
+        cross = self._cross[:, None]
+        along = self._along[:, None]
+        x_px, y_px = self._places_px(seen, cross, along, seconds)
         return x_px.reshape(shape), y_px.reshape(shape)
 
     def tangents_at(
@@ -178,11 +185,15 @@ class Paths:
         near = 1 / turned[2]
         at = turned[:2] * near
         first = (faster[:2] - at * faster[2]) * near
-        return at, first, (bend[:2] - at * bend[2] - first * faster[2]) * near
+        second = (bend[:2] - at * bend[2] - first * faster[2]) * near
+        return at, first, second
 
     def _places_px(
         self, seen: FloatArray, cross: FloatArray, along: FloatArray, seconds: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
+        """Pixel x and y of directions, by their parts across and along the axis (see
+        `__init__`).
+        """
         angle = self.speed_rad_s * seconds
         cosine = np.cos(angle)
         turned = seen * cosine
@@ -193,19 +204,19 @@ class Paths:
 
 @dataclass(frozen=True, slots=True)
 class Chords:
-    """The straight ways between the ends of n paths, px, (2, n) each: begin and end; NaN behind
-    the camera.
+    """Straight ways between the ends of n paths, px: x and y (2, n), begin and end; NaN behind the
+    camera.
     """
 
     x_px: FloatArray
     y_px: FloatArray
 
     def to(self, longer: FloatArray) -> "Chords":
-        """The same ways from their begins, so many times (n,) as long."""
-        x_px, y_px = (
-            np.stack([ends[0], ends[0] + (ends[1] - ends[0]) * longer])
-            for ends in (self.x_px, self.y_px)
-        )
+        """The chords with the same begins, each so many times (n,) as long."""
+        x_begin, x_end = self.x_px
+        y_begin, y_end = self.y_px
+        x_px = np.stack([x_begin, x_begin + (x_end - x_begin) * longer])
+        y_px = np.stack([y_begin, y_begin + (y_end - y_begin) * longer])
         return Chords(x_px, y_px)
 
     def length_sigma(self, width_px: tuple[float, float]) -> FloatArray:
@@ -227,28 +238,31 @@ class Chords:
         """
         begin = np.zeros(self.x_px.shape[1])
         end = np.ones(self.x_px.shape[1])
-        for ends, size in ((self.x_px, resolution_px[0]), (self.y_px, resolution_px[1])):
-            low = -0.5 - np.asarray(margin_px)
-            high = size - 0.5 + np.asarray(margin_px)
-            step = ends[1] - ends[0]
+        margin = np.asarray(margin_px)
+        width, height = resolution_px
+        for (first, last), size in ((self.x_px, width), (self.y_px, height)):
+            low = -0.5 - margin
+            high = size - 0.5 + margin
+            step = last - first
             still = np.abs(step) < 1e-9
             step = np.where(still, 1.0, step)
-            a = (low - ends[0]) / step
-            b = (high - ends[0]) / step
-            outside = still & ((ends[0] < low) | (ends[0] > high))
-            begin = np.maximum(
-                begin, np.where(still, np.where(outside, 1.0, 0.0), np.minimum(a, b))
-            )
-            end = np.minimum(end, np.where(still, np.where(outside, 0.0, 1.0), np.maximum(a, b)))
+            at_low = (low - first) / step
+            at_high = (high - first) / step
+            # a chord that stands still along an axis is within these limits or it is not
+            outside = still & ((first < low) | (first > high))
+            enters = np.where(still, np.where(outside, 1.0, 0.0), np.minimum(at_low, at_high))
+            leaves = np.where(still, np.where(outside, 0.0, 1.0), np.maximum(at_low, at_high))
+            begin = np.maximum(begin, enters)
+            end = np.minimum(end, leaves)
         is_crossed = end > begin
-        finite, (width, height) = np.isfinite(self.x_px), resolution_px
-        there = (np.abs(self.x_px - width / 2) <= width) & (
-            np.abs(self.y_px - height / 2) <= height
-        )
-        half_seen = (finite.sum(axis=0) == 1) & there.any(axis=0)
+        is_near = np.abs(self.x_px - width / 2) <= width
+        is_near &= np.abs(self.y_px - height / 2) <= height
+        ends_in_front = np.isfinite(self.x_px).sum(axis=0)
+        half_seen = (ends_in_front == 1) & is_near.any(axis=0)
         begin = np.where(is_crossed, begin, 1.0)
         end = np.where(is_crossed, end, 0.0)
-        begin[half_seen], end[half_seen] = 0.0, 1.0
+        begin[half_seen] = 0.0
+        end[half_seen] = 1.0
         return begin, end
 
 
@@ -259,20 +273,19 @@ def node_counts(
 
     A length that is not finite gets MAX_NODES.
     """
-    length = np.where(
-        np.isfinite(length_sigma), np.minimum(length_sigma, 1e9), MAX_NODES / per_sigma
-    )
+    finite = np.minimum(length_sigma, 1e9)
+    length = np.where(np.isfinite(length_sigma), finite, MAX_NODES / per_sigma)
     counts = np.ceil(per_sigma * length + at_rest)
     return np.asarray(np.where(length < shortest_sigma, 1, counts), dtype=np.intp)
 
 
 class ShortPaths:
-    """The paths of `exact` (n), each within `half_s` of its own `middle_s` (n,), through as many of
-    its places as `points`.
+    """Paths (n) that approximate those of `exact`, each within `half_s` of its own `middle_s` (n,):
+    polynomials through `points` of its places.
 
-    These are at the roots of a Chebyshev polynomial; of 1, by a lens's table, slope and curvature
-    are the path's too.
-    Off by at most LIMIT_PX or LIMIT_SHARE where `points_within` gave them.
+    The places are at the roots of a Chebyshev polynomial. With one point, slope and curvature of
+    the path come from a table of the lens. Paths are off by at most LIMIT_PX or LIMIT_SHARE where
+    `points_within` gave the number of points.
     """
 
     def __init__(self, exact: Paths, middle_s: FloatArray, half_s: float, points: int) -> None:
@@ -282,17 +295,17 @@ class ShortPaths:
         self._middle_s = middle_s
         self._half_s = half_s
         if points == 1:
-            self._terms = _lens_table(*_mapping(exact.camera)).along(
-                *exact.tangents_at(middle_s, half_s)
-            )
+            table = _lens_table(*_mapping(exact.camera))
+            self._terms = table.along(*exact.tangents_at(middle_s, half_s))
             return
-        at = np.cos((np.arange(points) + 0.5) * (np.pi / points))
-        places = np.stack(
-            exact.through(_beyond(exact.camera)).all_places_px(middle_s + half_s * at[:, None]),
-            axis=1,
-        )
+        half_steps = np.arange(points) + 0.5
+        at = np.cos(half_steps * (np.pi / points))
+        outward = exact.through(_beyond(exact.camera))
+        x_px, y_px = outward.all_places_px(middle_s + half_s * at[:, None])
+        places = np.stack([x_px, y_px], axis=1)
         powers = np.linalg.inv(np.vander(at, increasing=True))
-        self._terms = (powers @ places.reshape(points, -1)).reshape(places.shape)
+        terms = powers @ places.reshape(points, -1)
+        self._terms = terms.reshape(places.shape)
 
     def __len__(self) -> int:
         return self._count
@@ -316,11 +329,11 @@ class ShortPaths:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LensTable:
-    """A lens's places by tangents, of second degree about the nearest of the nodes of a grid over
-    its box.
+    """Where a lens images tangents: a polynomial of second degree about each node of a grid over
+    the lens's box.
 
-    `terms` (6, 2, nodes): place, its changes a step along u and v, and its bends by uu / 2, uv and
-    vv / 2. On the image places are off by up to `off_px`.
+    `terms` (6, 2, nodes) are x and y, px: the place, its changes by a step along u and v, and its
+    bends by uu / 2, uv and vv / 2. On the image places are off by up to `off_px`.
     """
 
     first: FloatArray
@@ -335,13 +348,15 @@ class LensTable:
         """
         off = (at - self.first) * self.steps
         node = np.rint(off)
-        for of_side, size in zip(node, self.shape, strict=True):
-            of_side.clip(0, size - 1, out=of_side)
+        along_u, along_v = self.shape
+        node[0].clip(0, along_u - 1, out=node[0])
+        node[1].clip(0, along_v - 1, out=node[1])
         off -= node
-        place, by_u, by_v, uu, uv, vv = self.terms.take(
-            (node[1] * self.shape[0] + node[0]).astype(np.intp), axis=2
-        )
-        (u, v), (first_u, first_v), (bend_u, bend_v) = off, by * self.steps, bend * self.steps
+        number = (node[1] * along_u + node[0]).astype(np.intp)
+        place, by_u, by_v, uu, uv, vv = self.terms.take(number, axis=2)
+        u, v = off
+        first_u, first_v = by * self.steps
+        bend_u, bend_v = bend * self.steps
         steep_u = uu * u
         steep_v = vv * v
         place += u * (by_u + steep_u)
@@ -350,12 +365,9 @@ class LensTable:
         by_u += uv * v + 2 * steep_u
         by_v += cross + 2 * steep_v
         first = by_u * first_u + by_v * first_v
-        second = (
-            by_u * bend_u
-            + by_v * bend_v
-            + (uu * first_u + uv * first_v) * first_u
-            + vv * (first_v * first_v)
-        )
+        second = by_u * bend_u + by_v * bend_v
+        second += (uu * first_u + uv * first_v) * first_u
+        second += vv * (first_v * first_v)
         return np.stack([place, first, second])
 
 
@@ -375,10 +387,14 @@ def _lens_table(
     """
     camera = _beyond(Camera(size_px, focal_px, principal_px, np.eye(3), lens))
     low, high = np.clip(np.array(lens.box).T, -lens.max_tangent, lens.max_tangent)
-    low, high = low - BESIDE_TABLE * (high - low), high + BESIDE_TABLE * (high - low)
-    step = float((high - low).max()) / TABLE_STEPS
+    beside = BESIDE_TABLE * (high - low)
+    low = low - beside
+    high = high + beside
+    width, height = high - low
+    step = float(max(width, height)) / TABLE_STEPS
     # one more node at each end
-    across, down = (np.arange(-1, round(side / step) + 2) for side in high - low)
+    across = np.arange(-1, round(width / step) + 2)
+    down = np.arange(-1, round(height / step) + 2)
     u, v = np.meshgrid(low[0] + step * across, low[1] + step * down)
     at = np.stack(camera.places_outward_px(u.ravel(), v.ravel())).reshape(2, *u.shape)
     middle = at[:, 1:-1, 1:-1]
@@ -388,24 +404,26 @@ def _lens_table(
     right = row[..., 2:]
     above = column[:, :-2]
     below = column[:, 2:]
-    cross = (at[:, 2:, 2:] - at[:, 2:, :-2] - at[:, :-2, 2:] + at[:, :-2, :-2]) / 4
-    bends = (left + right) / 2 - middle, cross, (above + below) / 2 - middle
-    terms = np.stack([middle, (right - left) / 2, (below - above) / 2, *bends]).reshape(6, 2, -1)
-    table = LensTable(low[:, None], 1 / step, (len(across) - 2, len(down) - 2), terms)
-    between = np.stack([u.ravel(), v.ravel()]) + step / 2  # where a table of second degree is worst
-    interpolated = table.along(between, *np.zeros((2, 2, 1)))[0]
+    by_u = (right - left) / 2
+    by_v = (below - above) / 2
+    half_uu = (left + right) / 2 - middle
+    half_vv = (above + below) / 2 - middle
+    corners = at[:, 2:, 2:] - at[:, 2:, :-2] - at[:, :-2, 2:] + at[:, :-2, :-2]
+    terms = np.stack([middle, by_u, by_v, half_uu, corners / 4, half_vv])
+    shape = (len(across) - 2, len(down) - 2)
+    table = LensTable(low[:, None], 1 / step, shape, terms.reshape(6, 2, -1))
+    nodes = np.stack([u.ravel(), v.ravel()])
+    between = nodes + step / 2  # where a table of second degree is worst
+    interpolated, _, _ = table.along(between, *np.zeros((2, 2, 1)))
     exact = np.stack(camera.places_outward_px(*between))
-    return replace(
-        table,
-        off_px=float(
-            np.hypot(*(interpolated - exact))[camera.contains_px(*exact)].max(initial=0.0)
-        ),
-    )
+    error_px = np.hypot(*(interpolated - exact))
+    on_image = camera.contains_px(*exact)
+    return replace(table, off_px=float(error_px[on_image].max(initial=0.0)))
 
 
 def points_within(camera: Camera, half_turn_rad: float) -> int | None:
-    """How many points keep paths within LIMIT_PX or LIMIT_SHARE, for a turn of twice that angle;
-    None where no few do.
+    """The fewest places through which a path is within LIMIT_PX or LIMIT_SHARE of the exact one,
+    for a camera that turns by twice that angle; None where none are enough.
     """
     for points, longest_rad in _longest_half_turns_rad(*_mapping(camera)):
         if 0 < half_turn_rad <= longest_rad:
@@ -415,14 +433,14 @@ def points_within(camera: Camera, half_turn_rad: float) -> int | None:
 
 @lru_cache(maxsize=16)
 def bend_px(camera: Camera) -> float:
-    """The farthest that a lens moves a direction from where a pinhole has it, on the image."""
+    """The largest distance on the image between where a lens and where a pinhole of its focal
+    length has a direction, px.
+    """
     if camera.lens is None:
         return 0.0
     u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
-    bent, ideal = (
-        np.stack(view_camera.places_px(u, v))
-        for view_camera in (camera, replace(camera, lens=None))
-    )
+    bent = np.stack(camera.places_px(u, v))
+    ideal = np.stack(replace(camera, lens=None).places_px(u, v))
     return float(np.nanmax(np.hypot(*(bent - ideal))))
 
 
@@ -437,44 +455,50 @@ def _longest_half_turns_rad(
     turns = [MAX_HALF_TURN_RAD * NARROWER**k for k in range(TRIES)]
     few = POINTS
     if lens is not None and lens.max_tangent < WIDEST_TABLE:
-        if _lens_table(size_px, focal_px, principal_px, lens).off_px <= TABLE_PX:
+        table = _lens_table(size_px, focal_px, principal_px, lens)
+        if table.off_px <= TABLE_PX:
             few = LENS_POINTS
-        else:
-            few = POINTS
-    firsts = [
-        bisect_left(turns, True, key=lambda turn: _excess(camera, turn, points) <= 1.0)
-        for points in few
-    ]
-    return tuple((points, [*turns, 0.0][first]) for points, first in zip(few, firsts, strict=True))
+    longest = []
+    for points in few:
+        # the first that is narrow enough; 0 after the last
+        first = bisect_left(turns, True, key=lambda turn: _excess(camera, turn, points) <= 1.0)
+        longest.append((points, [*turns, 0.0][first]))
+    return tuple(longest)
 
 
 def _excess(camera: Camera, half_turn_rad: float, points: int) -> float:
-    """The largest error on the image, about several axes, as a multiple of what it may be: of
-    paths that begin on the image.
+    """The largest error of short paths that begin on the image, as a multiple of what is allowed,
+    over turns about TRIED_AXES.
     """
     camera = _beyond(camera)
     u, v = camera.tangents(*camera.grid_px(TRIED_PLACES))
     directions = np.column_stack([u, v, np.ones_like(u)])[np.isfinite(u)]
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    middle_px, half_px = ((np.array(camera.resolution_px)[:, None, None] - k) / 2 for k in (1, 0))
+    size = np.array(camera.resolution_px)[:, None, None]
+    middle_px = (size - 1) / 2
+    half_px = size / 2
+    moment = np.ones(len(directions))
     worst = 0.0
     for axis in TRIED_AXES:
         exact = Paths(directions, np.array(axis), camera)
         half_s = half_turn_rad / exact.speed_rad_s
         moments = np.linspace(0.0, 2 * half_s, TRIED_MOMENTS)
-        short = ShortPaths(exact, np.full(len(directions), half_s), half_s, points)
-        places_px = [
-            short.places_px(slice(None), np.full(len(directions), moment)) for moment in moments
-        ]
-        places = np.stack(exact.all_places_px(moments[:, None]))
-        allowed = np.maximum(LIMIT_PX, LIMIT_SHARE * np.hypot(*(places[:, -1] - places[:, 0])))
-        on_image = (np.abs(places - middle_px) <= half_px).all(axis=0)
-        excess = np.hypot(*(np.stack(places_px, axis=1) - places)) / allowed
+        short = ShortPaths(exact, moment * half_s, half_s, points)
+        short_px = []
+        for at_s in moments:
+            short_px.append(short.places_px(slice(None), moment * at_s))
+        exact_px = np.stack(exact.all_places_px(moments[:, None]))
+        length_px = np.hypot(*(exact_px[:, -1] - exact_px[:, 0]))
+        allowed_px = np.maximum(LIMIT_PX, LIMIT_SHARE * length_px)
+        on_image = (np.abs(exact_px - middle_px) <= half_px).all(axis=0)
+        error_px = np.hypot(*(np.stack(short_px, axis=1) - exact_px))
+        excess = error_px / allowed_px
         worst = max(worst, float(excess[on_image].max(initial=0.0)))
     return worst
 
 
 def _beyond(camera: Camera) -> Camera:
+    """The camera with its lens used somewhat beyond what it is known for."""
     lens = camera.lens
     if lens is None:
         return camera

@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from bisect import bisect_left
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, reduce
+from functools import cached_property, lru_cache
 from itertools import count, zip_longest
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -25,10 +25,9 @@ from hilstar.basics.image_files import ImageSizeError, opened_fits
 from hilstar.basics.reading import named_bytes
 
 # The maximum share of a star's flux outside its footprint, at the worst sub-pixel phase. 1e-5 would
-# be enough for the
-# flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of that is cut, at the
-# cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the front; 8 px save a
-# tenth and cut 4e-5 mag.
+# be enough for the flux; but at sigma 3 px the centroid would then move by 1e-4 px, so a tenth of
+# that is cut, at the cost of one pixel. results/tradeoff.csv, psf: 10 px at sigma 0.85 are on the
+# front; 8 px save a tenth and cut 4e-5 mag.
 MAX_CUT = 1e-6
 MAX_GAUSSIAN_PX = 100_000  # the largest footprint that is tried
 PIXEL_VARIANCE = 1 / 12  # variance of a square pixel, px squared
@@ -37,6 +36,7 @@ SQRT2 = math.sqrt(2.0)
 # 4.4e-7 off.
 MAX_SHARE_ERROR = 1e-7
 MIN_DEGREE, MAX_DEGREE = 3, 8  # beyond it a polynomial costs as much as erf
+# distances that the polynomial is fitted to; rounds of Lawson's weights
 FIT_PLACES, FIT_ROUNDS = 120, 15
 BOUND_PLACES = 200  # along an axis, at which an upper bound is taken
 # The rational approximation of erf in shaders/shares.glsl, above and below the line, the highest
@@ -92,8 +92,8 @@ FILE_ADVICE = "give a FITS file with one image of odd sides, the chief ray in it
 
 
 class ShareShader(NamedTuple):
-    """A PSF for shares.glsl: lines to define before it, its uniforms by name, any table (h, w,
-    channels).
+    """What shares.glsl needs of a PSF: lines to define before it, its uniforms by name, and its
+    table (h, w, channels), if it has one.
     """
 
     defines: tuple[str, ...]
@@ -102,10 +102,11 @@ class ShareShader(NamedTuple):
 
 
 class Reach(NamedTuple):
-    """How far a share of light may lie from its star: an ellipse.
+    """The ellipse about a star within which a pixel of its footprint can get more than a share s of
+    its light.
 
-    Of the pixels of a footprint those with more than a share s have x^2 / `axes_px2[0]` + y^2 /
-    `axes_px2[1]` under log(`factor` / s).
+    It is x^2 / `axes_px2[0]` + y^2 / `axes_px2[1]` < log(`factor` / s), with x and y from the star,
+    px.
     """
 
     axes_px2: tuple[float, float]
@@ -118,9 +119,8 @@ class Psf(ABC):
 
     `by_place` and `by_colour` say whether it changes over the field and with a star's spectrum. One
     that does has an odd footprint and overrides `stamps_at`, `image` and `centroids_px`: those who
-    draw ask these.
-    A spectrum is the shares (L,) that light has at each of a PSF's L wavelengths, or (n, L) of n
-    stars; `mean_shares` (L,) are those of light without a spectrum of its own.
+    draw ask these. A spectrum is the shares (L,) that light has at each of a PSF's L wavelengths,
+    or (n, L) of n stars; `mean_shares` (L,) are those of light without a spectrum of its own.
     """
 
     by_place = False
@@ -199,8 +199,11 @@ class Psf(ABC):
         The side is odd: the footprint's, or one more.
         """
         rates = np.ones(len(x_px)) if electrons_per_s is None else electrons_per_s
-        fraction_px = np.stack([place - np.floor(place + 0.5) for place in (x_px, y_px)])
-        return np.moveaxis(self.stamps(fraction_px, rates, self.footprint_px | 1), 2, 0)
+        fraction_x = x_px - np.floor(x_px + 0.5)
+        fraction_y = y_px - np.floor(y_px + 0.5)
+        fraction_px = np.stack([fraction_x, fraction_y])
+        stamps = self.stamps(fraction_px, rates, self.footprint_px | 1)
+        return np.moveaxis(stamps, 2, 0)
 
     def image(
         self,
@@ -293,18 +296,21 @@ class GaussianPsf(Psf):
     @cached_property
     def peak_share(self) -> float:
         """The share of the pixel that a star is centred on."""
-        return pixel_share(0.0, self.sigma_px[0]) * pixel_share(0.0, self.sigma_px[1])
+        sigma_x, sigma_y = self.sigma_px
+        return pixel_share(0.0, sigma_x) * pixel_share(0.0, sigma_y)
 
     @cached_property
     def reach(self) -> Reach:
         """A Gaussian's ellipse with the factor that the integral over pixels needs."""
-        scale = [2 * (sigma**2 + 1 / 12) for sigma in self.sigma_px]
         places = np.linspace(0.0, self.footprint_px / 2 + 0.5, BOUND_PLACES)
-        shares = [np.maximum(pixel_shares(places, sigma), 1e-300) for sigma in self.sigma_px]
-        more = []
-        for share, along in zip(shares, scale, strict=True):
-            more.append(float((np.log(share) + places**2 / along).max()))
-        return Reach((scale[0], scale[1]), math.exp(sum(more)))
+        axes_px2 = []
+        log_factor = 0.0
+        for sigma in self.sigma_px:
+            axis_px2 = 2 * (sigma**2 + 1 / 12)
+            logs = np.log(np.maximum(pixel_shares(places, sigma), 1e-300))
+            axes_px2.append(axis_px2)
+            log_factor += float((logs + places**2 / axis_px2).max())
+        return Reach((axes_px2[0], axes_px2[1]), math.exp(log_factor))
 
     def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """The product of the shares along both axes."""
@@ -317,22 +323,26 @@ class GaussianPsf(Psf):
     def stamps(
         self, fraction_px: FloatArray, electrons_per_s: FloatArray | Float32Array, side_px: int
     ) -> Float32Array:
-        """Row by row the product of what each column and each row has."""
+        """See `Psf.stamps`: the share of each column times the share of each row."""
         from scipy.special import ndtr  # 0.1 s of every command that needs none of it
 
-        edges = np.arange(side_px + 1)[:, None] - ((side_px - 1) // 2 + 0.5)
-        across, down = (
-            np.diff(ndtr((edges - at) / s), axis=0)
-            for at, s in zip(fraction_px, self.sigma_px, strict=True)
-        )
+        first_edge = (side_px - 1) // 2 + 0.5
+        edges = np.arange(side_px + 1)[:, None] - first_edge
+        fraction_x, fraction_y = fraction_px
+        sigma_x, sigma_y = self.sigma_px
+        across = np.diff(ndtr((edges - fraction_x) / sigma_x), axis=0)
+        down = np.diff(ndtr((edges - fraction_y) / sigma_y), axis=0)
         down *= electrons_per_s
-        return np.asarray(across.astype(np.float32)[None] * down.astype(np.float32)[:, None])
+        across_32 = across.astype(np.float32)
+        down_32 = down.astype(np.float32)
+        return np.asarray(across_32[None] * down_32[:, None])
 
     def drawn_stamps(
         self, fraction_px: Float32Array, rates: Float32Array, side_px: int, footprint_px: int
     ) -> Float32Array:
         """In float32, along x and along y."""
-        offset_px = (np.arange(side_px, dtype=np.float32) - (side_px - 1) // 2)[:, None]
+        pixel = np.arange(side_px, dtype=np.float32) - (side_px - 1) // 2
+        offset_px = pixel[:, None]
         sigma_x, sigma_y = self.sigma_px
         across = shader_shares(offset_px - fraction_px[0], sigma_x, footprint_px)
         down = shader_shares(offset_px - fraction_px[1], sigma_y, footprint_px)
@@ -350,44 +360,47 @@ class GaussianPsf(Psf):
         from scipy.special import ndtr  # as in `stamps`
 
         left, top, width, height = region
-        across = np.diff(
-            ndtr((left - 0.5 + np.arange(width + 1) - x_px[:, None]) / self.sigma_px[0]), axis=1
-        )
-        down = np.diff(
-            ndtr((top - 0.5 + np.arange(height + 1) - y_px[:, None]) / self.sigma_px[1]), axis=1
-        )
+        sigma_x, sigma_y = self.sigma_px
+        edges_x = left - 0.5 + np.arange(width + 1)
+        edges_y = top - 0.5 + np.arange(height + 1)
+        across = np.diff(ndtr((edges_x - x_px[:, None]) / sigma_x), axis=1)
+        down = np.diff(ndtr((edges_y - y_px[:, None]) / sigma_y), axis=1)
         return np.asarray((down * electrons_per_s[:, None]).T @ across, dtype=np.float32)
 
     def cut_share(self, size_px: int) -> float:
-        """Axis by axis, from the complements of both edges."""
+        """See `Psf.cut_share`: axis by axis, from the complements of both edges."""
         inside = 1.0
         for sigma in self.sigma_px:
-            inside_axis = 1.0 - 0.5 * sum(
-                math.erfc((size_px / 2 + side) / (sigma * SQRT2)) for side in (-0.5, 0.5)
-            )
-            inside *= inside_axis
+            beyond_near = math.erfc((size_px / 2 - 0.5) / (sigma * SQRT2))
+            beyond_far = math.erfc((size_px / 2 + 0.5) / (sigma * SQRT2))
+            inside *= 1.0 - 0.5 * (beyond_near + beyond_far)
         return 1.0 - inside
 
     def outside_share(self, size_px: int) -> float:
-        """The share of a pixel beside the middle of an edge."""
-        (x, y), beyond = self.sigma_px, size_px / 2
-        return max(
-            pixel_share(beyond, x) * pixel_share(0.0, y),
-            pixel_share(beyond, y) * pixel_share(0.0, x),
-        )
+        """See `Psf.outside_share`: that of a pixel beside the middle of an edge."""
+        sigma_x, sigma_y = self.sigma_px
+        beyond_px = size_px / 2
+        beside_x = pixel_share(beyond_px, sigma_x) * pixel_share(0.0, sigma_y)
+        beside_y = pixel_share(beyond_px, sigma_y) * pixel_share(0.0, sigma_x)
+        return max(beside_x, beside_y)
 
     def shader(self, side_px: int) -> ShareShader:
         """A polynomial for each axis where one is exact enough (`share_polynomial`), else error
         functions.
         """
-        inverse_x, inverse_y = (1 / (sigma * SQRT2) for sigma in self.sigma_px)
-        uniforms = {"inverse_sigma_sqrt2": (inverse_x, inverse_y)}
-        axes = [share_polynomial(sigma, side_px / 2 + 0.5) for sigma in self.sigma_px]
-        if axes[0] is None or axes[1] is None:
+        sigma_x, sigma_y = self.sigma_px
+        uniforms = {"inverse_sigma_sqrt2": (1 / (sigma_x * SQRT2), 1 / (sigma_y * SQRT2))}
+        powers_x = share_polynomial(sigma_x, side_px / 2 + 0.5)
+        powers_y = share_polynomial(sigma_y, side_px / 2 + 0.5)
+        if powers_x is None or powers_y is None:
             return ShareShader((), uniforms)
-        terms = [f"vec2({x:.9e}, {y:.9e})" for x, y in zip_longest(axes[0], axes[1], fillvalue=0.0)]
+        terms = []
+        for x, y in zip_longest(powers_x, powers_y, fillvalue=0.0):
+            terms.append(f"vec2({x:.9e}, {y:.9e})")
         # Written out: from an array of uniforms llvmpipe takes twice as long.
-        polynomial = reduce(lambda sum, term: f"({sum} * square + {term})", reversed(terms))
+        polynomial = terms[-1]
+        for term in reversed(terms[:-1]):
+            polynomial = f"({polynomial} * square + {term})"
         return ShareShader((f"LOG2_SHARE(square) {polynomial}",), uniforms)
 
     def blurred(self, sigma_px: float) -> "GaussianPsf":
@@ -430,9 +443,13 @@ class SampledPsf(Psf):
             )
         # Of stars in a pixel's middle, edges and corner: the smallest sum of shares, and the
         # largest of those below zero
-        phases = [self._halves[y::2, x::2] for y in (0, 1) for x in (0, 1)]
-        least = min(float(part.sum()) for part in phases)
-        negative = max(float(-part.clip(max=0).sum()) for part in phases)
+        least = math.inf
+        negative = 0.0
+        for y in (0, 1):
+            for x in (0, 1):
+                shares = self._halves[y::2, x::2]
+                least = min(least, float(shares.sum()))
+                negative = max(negative, float(-shares.clip(max=0).sum()))
         if negative > self.max_negative:
             raise InputError(
                 f"{negative:.1%} of a PSF's light is negative; subtract its background, or sample"
@@ -458,48 +475,52 @@ class SampledPsf(Psf):
 
         density = self.samples / self.samples.sum() * self.per_px**2
         for axis, at_px in ((0, y_px), (1, x_px)):
-            black = [(BLACK_SAMPLES, BLACK_SAMPLES) if k == axis else (0, 0) for k in (0, 1)]
+            black = [(0, 0), (0, 0)]
+            black[axis] = (BLACK_SAMPLES, BLACK_SAMPLES)
             density = np.pad(density, black)
-            place_px = (np.arange(density.shape[axis]) - density.shape[axis] // 2) / self.per_px
+            size = density.shape[axis]
+            place_px = (np.arange(size) - size // 2) / self.per_px
             spline = make_interp_spline(place_px, density, SPLINE_DEGREE, axis=axis)
             last_px = place_px[-1]
             if self.pixel_integrated:
                 density = spline(np.clip(at_px, -last_px, last_px))
             else:
                 light = spline.antiderivative()
-                low, high = (
-                    light(np.clip(at_px + side, -last_px, last_px)) for side in (-0.5, 0.5)
-                )
+                low = light(np.clip(at_px - 0.5, -last_px, last_px))
+                high = light(np.clip(at_px + 0.5, -last_px, last_px))
                 density = high - low
         return np.asarray(density)
 
     @cached_property
     def _halves(self) -> FloatArray:
         """Shares at each half pixel, far enough that the last are black."""
-        last = 2 * math.ceil((max(self.samples.shape) // 2 + BLACK_SAMPLES) / self.per_px + 1)
+        reach_samples = max(self.samples.shape) // 2 + BLACK_SAMPLES
+        last = 2 * math.ceil(reach_samples / self.per_px + 1)
         at_px = np.arange(-last, last + 1) / 2
         return self._before_cut(at_px, at_px)
 
     @cached_property
     def width_px(self) -> tuple[float, float]:
         """Adaptive moments (Bernstein and Jarvis 2002), less a pixel's own variance."""
-        at_px = (np.arange(len(self._table)) - len(self._table) // 2) / self._steps
+        at_px = self._offsets_px
         middle = np.zeros(2)
         variance = np.ones(2)
         # a Gaussian weight as wide as the PSF halves its variance and its distance
         for _ in range(WIDTH_ROUNDS):
             powers = at_px ** np.arange(3)[:, None]
-            across, down = (
-                powers * np.exp(-((at_px - m) ** 2) / (2 * v))
-                for m, v in zip(middle, variance, strict=True)
-            )
+            from_middle_px = at_px - middle[:, None]
+            weight_x, weight_y = np.exp(-(from_middle_px**2) / (2 * variance[:, None]))
+            across = powers * weight_x
+            down = powers * weight_y
             sums = down @ self._table @ across.T  # powers of y, powers of x
-            mean = np.array([sums[0, 1], sums[1, 0]]) / sums[0, 0]
-            variance = np.maximum(
-                2 * (np.array([sums[0, 2], sums[2, 0]]) / sums[0, 0] - mean**2), PIXEL_VARIANCE
-            )
+            light = sums[0, 0]
+            mean = np.array([sums[0, 1], sums[1, 0]]) / light
+            mean_square = np.array([sums[0, 2], sums[2, 0]]) / light
+            weighted_variance = mean_square - mean**2
+            variance = np.maximum(2 * weighted_variance, PIXEL_VARIANCE)
             middle = 2 * mean - middle
-        x, y = np.sqrt(np.maximum(variance - PIXEL_VARIANCE, MIN_WIDTH_PX**2)).tolist()
+        width_px2 = np.maximum(variance - PIXEL_VARIANCE, MIN_WIDTH_PX**2)
+        x, y = np.sqrt(width_px2).tolist()
         return x, y
 
     @cached_property
@@ -510,8 +531,10 @@ class SampledPsf(Psf):
     @cached_property
     def _steps(self) -> int:
         """Places of the table to a pixel, an even number."""
-        fine = min(FINE_STEPS_A_PX, 2 * MAX_TABLE_SIDE // self.footprint_px)
-        return min(MAX_STEPS_A_PX, max(fine, MAX_TABLE_SIDE // self.footprint_px)) // 2 * 2
+        side_steps = MAX_TABLE_SIDE // self.footprint_px
+        fine_steps = min(FINE_STEPS_A_PX, 2 * MAX_TABLE_SIDE // self.footprint_px)
+        steps = min(MAX_STEPS_A_PX, max(fine_steps, side_steps))
+        return steps // 2 * 2
 
     @cached_property
     def _table(self) -> Float32Array:
@@ -525,10 +548,17 @@ class SampledPsf(Psf):
         steps = self._steps
         at_px = np.arange(side_px * steps) / steps - side_px / 2
         shares = np.maximum(self._before_cut(at_px, at_px), 0.0)
-        shares[0], shares[:, 0] = 0.0, 0.0
+        shares[0] = 0.0
+        shares[:, 0] = 0.0
         of_phases = shares.reshape(side_px, steps, side_px, steps)
         of_phases /= of_phases.sum(axis=(0, 2), keepdims=True)
         return np.pad(shares, (0, 1)).astype(np.float32)
+
+    @property
+    def _offsets_px(self) -> FloatArray:
+        """The offsets (n,) of the table's rows, and of its columns, px."""
+        count = len(self._table)
+        return np.asarray((np.arange(count) - count // 2) / self._steps)
 
     @cached_property
     def peak_share(self) -> float:
@@ -540,32 +570,37 @@ class SampledPsf(Psf):
         """The smallest ellipse with the PSF's axes that holds all shares over a ten-thousandth
         of the largest.
         """
-        squares = ((np.arange(len(self._table)) - len(self._table) // 2) / self._steps) ** 2
+        squares = self._offsets_px**2
         logs = np.log(np.maximum(self._table, 1e-30))
-
-        reaches = []
+        smallest_share_log = math.log(1e-4 * self.peak_share)
+        variance_x, variance_y = self.variance_px2
+        smallest_px2 = math.inf
         for scale in 2 * np.geomspace(1.0, 300.0, 20):
-            x, y = (float(scale) * variance for variance in self.variance_px2)
+            x = float(scale) * variance_x
+            y = float(scale) * variance_y
+            log_factors = logs + squares / x + squares[:, None] / y
             # the table is interpolated
-            log_factor = float((logs + squares / x + squares[:, None] / y).max()) + 0.01
-            reaches.append(
-                (scale * (log_factor - math.log(1e-4 * self.peak_share)), log_factor, (x, y))
-            )
-        _, log_factor, axes_px2 = min(reaches)
-        return Reach(axes_px2, math.exp(log_factor))
+            log_factor = float(log_factors.max()) + 0.01
+            reach_px2 = scale * (log_factor - smallest_share_log)
+            if reach_px2 < smallest_px2:
+                smallest_px2 = reach_px2
+                ellipse = Reach((x, y), math.exp(log_factor))
+        return ellipse
 
     def shares(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Linear between the four nearest of the table; 0 beyond it."""
         last = len(self._table) - 1
-        at_x, at_y = (np.clip(at * self._steps + last / 2, 0, last) for at in (x_px, y_px))
-        column, row = (np.minimum(at.astype(np.intp), last - 1) for at in (at_x, at_y))
+        at_x = np.clip(x_px * self._steps + last / 2, 0, last)
+        at_y = np.clip(y_px * self._steps + last / 2, 0, last)
+        column = np.minimum(at_x.astype(np.intp), last - 1)
+        row = np.minimum(at_y.astype(np.intp), last - 1)
         x = at_x - column
         y = at_y - row
-        first = row * (last + 1) + column
         table = self._table.ravel()
-        above, below = (
-            (1 - x) * table[first + down] + x * table[first + down + 1] for down in (0, last + 1)
-        )
+        first = row * (last + 1) + column
+        above = (1 - x) * table[first] + x * table[first + 1]
+        first = first + (last + 1)
+        below = (1 - x) * table[first] + x * table[first + 1]
         return np.asarray((1 - y) * above + y * below)
 
     def stamps(
@@ -573,8 +608,11 @@ class SampledPsf(Psf):
     ) -> Float32Array:
         """See `Psf.stamps`: all offsets at once."""
         pixel = np.arange(side_px) - (side_px - 1) // 2
-        x, y = (pixel[:, None] - at for at in fraction_px)
-        return np.asarray(self.shares(x[None], y[:, None]) * electrons_per_s, dtype=np.float32)
+        fraction_x, fraction_y = fraction_px
+        x = pixel[:, None] - fraction_x
+        y = pixel[:, None] - fraction_y
+        shares = self.shares(x[None], y[:, None])
+        return np.asarray(shares * electrons_per_s, dtype=np.float32)
 
     def spread(
         self,
@@ -588,47 +626,48 @@ class SampledPsf(Psf):
         image = np.zeros((height, width))
         columns = np.arange(left, left + width)
         rows = np.arange(top, top + height)
+        half_px = self.footprint_px / 2
         for x, y, light in zip(x_px, y_px, electrons_per_s, strict=True):
-            near_x, near_y = (
-                np.abs(at - middle) < self.footprint_px / 2
-                for at, middle in ((columns, x), (rows, y))
-            )
-            image[np.ix_(near_y, near_x)] += light * self.shares(
-                columns[near_x] - x, rows[near_y, None] - y
-            )
+            near_x = np.abs(columns - x) < half_px
+            near_y = np.abs(rows - y) < half_px
+            shares = self.shares(columns[near_x] - x, rows[near_y, None] - y)
+            image[np.ix_(near_y, near_x)] += light * shares
         return image.astype(np.float32)
 
     def cut_share(self, size_px: int) -> float:
-        """The largest of the four corners' of a pixel, by the shares at half pixels."""
+        """See `Psf.cut_share`: the largest for stars on the four corners of a pixel, by the shares
+        at half pixels.
+        """
         first = len(self._halves) // 2 - size_px
         if first < 0:
             return 0.0
-        insides = []
-        for y in (first, first + 2):
-            for x in (first, first + 2):
-                insides.append(self._halves[y : y + 2 * size_px : 2, x : x + 2 * size_px : 2])
-        return max(0.0, 1 - min(float(part.sum()) for part in insides))
+        end = first + 2 * size_px
+        least = 1.0
+        for y in (0, 2):
+            for x in (0, 2):
+                inside = self._halves[first + y : end + y : 2, first + x : end + x : 2]
+                least = min(least, float(inside.sum()))
+        return 1 - least
 
     def outside_share(self, size_px: int) -> float:
-        """The largest of the table beyond half of that side."""
-        far = (
-            np.abs(np.arange(len(self._table)) - len(self._table) // 2) >= size_px * self._steps / 2
-        )
-        return max(
-            float(self._table[far].max(initial=1e-30)),
-            float(self._table[:, far].max(initial=1e-30)),
-        )
+        """See `Psf.outside_share`: the largest share of the table beyond half of that side."""
+        far = np.abs(self._offsets_px) >= size_px / 2
+        in_rows = self._table[far].max(initial=1e-30)
+        in_columns = self._table[:, far].max(initial=1e-30)
+        return float(max(in_rows, in_columns))
 
     def shader(self, side_px: int) -> ShareShader:
-        """The same table: in each cell between four places what its bilinear interpolation is
-        made of.
+        """See `Psf.shader`: the table by cells of its grid, each with its four coefficients of
+        bilinear interpolation.
         """
         near = self._table[:-1, :-1]
         right = self._table[:-1, 1:]
         down = self._table[1:, :-1]
         both = self._table[1:, 1:]
-        cells = np.stack([near, right - near, down - near, both - right - down + near], axis=2)
-        return ShareShader((f"SHARE_STEPS {self._steps}.0",), {}, np.ascontiguousarray(cells))
+        twist = both - right - down + near
+        cells = np.stack([near, right - near, down - near, twist], axis=2)
+        defines = (f"SHARE_STEPS {self._steps}.0",)
+        return ShareShader(defines, {}, np.ascontiguousarray(cells))
 
     def blurred(self, sigma_px: float) -> "SampledPsf":
         """The samples convolved, with room for what spreads beyond them."""
@@ -636,7 +675,8 @@ class SampledPsf(Psf):
 
         sigma = sigma_px * self.per_px
         wide = np.pad(self.samples, math.ceil(6 * sigma))
-        spread = np.fft.ifft2(fourier_gaussian(np.fft.fft2(wide), sigma)).real
+        transformed = fourier_gaussian(np.fft.fft2(wide), sigma)
+        spread = np.fft.ifft2(transformed).real
         return SampledPsf(spread, self.per_px, self.pixel_integrated)
 
 
@@ -680,19 +720,23 @@ def _psf_in(path: Path, content: bytes) -> SampledPsf:
 
 
 def square_points(side_px: float, psf: Psf) -> tuple[FloatArray, Psf]:
-    """Where Gaussians stand along the side of an evenly lit square, in sides from its middle, and
-    the PSF of each.
+    """Gaussians that together stand for the light of an evenly lit square: their places along its
+    side, in sides from its middle, and the PSF of each.
 
-    The PSF is `psf` with what the points lack of the square's variance; `side_px` is in its pixels.
+    The PSF is `psf`, widened by the variance of the square that the places lack; `side_px` is in
+    its pixels.
     """
     narrow_px = min(psf.width_px)
     if isinstance(psf, GaussianPsf) and side_px <= TWO_UP_TO_SIGMAS * narrow_px:
         points = TWO
     else:
-        wanted = math.ceil(side_px / (FINE_SIGMAS * max(narrow_px, SHARPEST_PX)))
+        apart_px = FINE_SIGMAS * max(narrow_px, SHARPEST_PX)
+        wanted = math.ceil(side_px / apart_px)
         parts = min(max(wanted, MIN_PARTS), MAX_PARTS)
         points = (np.arange(parts) + 0.5) / parts - 0.5
-    return points, psf.blurred(side_px * math.sqrt(PIXEL_VARIANCE - float(np.mean(points**2))))
+    variance = float(np.mean(points**2))
+    spread_px = side_px * math.sqrt(PIXEL_VARIANCE - variance)
+    return points, psf.blurred(spread_px)
 
 
 def pixel_share(offset_px: float, sigma_px: float) -> float:
@@ -704,20 +748,21 @@ def pixel_share(offset_px: float, sigma_px: float) -> float:
     """
     near = abs(offset_px) - 0.5
     far = abs(offset_px) + 0.5
-    return 0.5 * (math.erfc(near / (sigma_px * SQRT2)) - math.erfc(far / (sigma_px * SQRT2)))
+    unit_px = sigma_px * SQRT2
+    return 0.5 * (math.erfc(near / unit_px) - math.erfc(far / unit_px))
 
 
 def pixel_shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
     """As `pixel_share`, of an array of offsets; same shape."""
     if np.size(offset_px) <= BOUND_PLACES:  # as a bench that opens asks for
-        return np.array([pixel_share(at, sigma_px) for at in np.ravel(offset_px).tolist()]).reshape(
-            np.shape(offset_px)
-        )
+        shares = [pixel_share(at, sigma_px) for at in np.ravel(offset_px).tolist()]
+        return np.array(shares).reshape(np.shape(offset_px))
     from scipy.special import erfc  # as in `stamps`
 
     near = np.abs(offset_px) - 0.5
     far = np.abs(offset_px) + 0.5
-    return np.asarray(0.5 * (erfc(near / (sigma_px * SQRT2)) - erfc(far / (sigma_px * SQRT2))))
+    unit_px = sigma_px * SQRT2
+    return np.asarray(0.5 * (erfc(near / unit_px) - erfc(far / unit_px)))
 
 
 def shader_shares(offset_px: Float32Array, sigma_px: float, footprint_px: int) -> Float32Array:
@@ -726,7 +771,8 @@ def shader_shares(offset_px: Float32Array, sigma_px: float, footprint_px: int) -
     """
     powers = share_polynomial(sigma_px, footprint_px / 2 + 0.5)
     if powers is None:
-        edges = np.concatenate([offset_px - np.float32(0.5), offset_px[-1:] + np.float32(0.5)])
+        half = np.float32(0.5)
+        edges = np.concatenate([offset_px - half, offset_px[-1:] + half])
         edges *= np.float32(1 / (sigma_px * SQRT2))
         share: Float32Array = np.diff(_shader_erf(edges), axis=0)
         return np.maximum(share, 0) * np.float32(0.5)
@@ -739,6 +785,7 @@ def shader_shares(offset_px: Float32Array, sigma_px: float, footprint_px: int) -
 
 
 def _shader_erf(value: Float32Array) -> Float32Array:
+    """The error function by the rational approximation of shaders/shares.glsl."""
     x = np.clip(value, np.float32(-ERF_REACH), np.float32(ERF_REACH))
     square = x * x
     above = np.full_like(x, ERF_ABOVE[0])
@@ -760,7 +807,8 @@ def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | No
     enough: under a sigma of 0.5 px.
     """
     # close together at the edge, as Chebyshev's
-    distance_px = reach_px * np.sin(np.linspace(0.0, np.pi / 2, FIT_PLACES))
+    angle = np.linspace(0.0, np.pi / 2, FIT_PLACES)
+    distance_px = reach_px * np.sin(angle)
     shares = np.array([pixel_share(float(place), sigma_px) for place in distance_px])
     wanted = np.log2(np.maximum(shares, shares[0] * 1e-12))
     scaled = (distance_px / reach_px) ** 2
@@ -768,12 +816,13 @@ def share_polynomial(sigma_px: float, reach_px: float) -> tuple[float, ...] | No
         terms = np.polynomial.chebyshev.chebvander(2 * scaled - 1, degree)
         weight = np.maximum(shares / shares[0], 1e-7)
         for _ in range(FIT_ROUNDS):
-            coefficients = np.linalg.lstsq(terms * weight[:, None], wanted * weight, rcond=None)[0]
-            error = np.abs(np.exp2(np.minimum(terms @ coefficients, 0.0)) - shares)
+            weighted_terms = terms * weight[:, None]
+            coefficients, *_ = np.linalg.lstsq(weighted_terms, wanted * weight, rcond=None)
+            fitted = np.exp2(np.minimum(terms @ coefficients, 0.0))
+            error = np.abs(fitted - shares)
             if error.max() <= MAX_SHARE_ERROR:
-                power = np.polynomial.Chebyshev(coefficients, domain=[0.0, reach_px**2]).convert(
-                    kind=np.polynomial.Polynomial
-                )
+                chebyshev = np.polynomial.Chebyshev(coefficients, domain=[0.0, reach_px**2])
+                power = chebyshev.convert(kind=np.polynomial.Polynomial)
                 return tuple(power.coef.tolist())
             # Lawson (1961): towards the smallest maximum
             weight = weight * np.sqrt(error / error.max() + 1e-3)

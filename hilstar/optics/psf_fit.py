@@ -20,14 +20,14 @@ NODES = 9  # of a quadrature over a pixel and a square, along each axis
 NODES_FROM = ((2.0, 3), (0.7, 5), (0.0, NODES))
 SIDE_STEPS = 600  # of the weight of a pixel convolved with a square's side
 MIN_VARIANCE_PX2 = 0.15**2
-MAX_CORRELATION = 0.95
+MAX_CORRELATION = 0.95  # a Gaussian of 1 is a line, whose density has no bound
 FIT_ROUNDS = 8
 MAX_STEP_PX, MAX_STEP_SHARE = 0.3, 0.6  # of a place, and of a variance, in one round
 RIDGE = 1e-9  # on unit columns: two that are alike share the light
 # residuals of more than so many medians count less, anew in each round
 FIELD_ROUNDS, OUTLIER_MEDIANS = 5, 2.0
-SMALLEST = 1e-300
-XX, YY, XY = 0, 1, 2
+SMALLEST = 1e-300  # in place of 0 where a column or a flux is divided by
+XY = 2  # the column of a covariance (n, 3) that follows xx and yy
 
 
 @lru_cache(maxsize=1024)
@@ -78,24 +78,31 @@ class PixelGaussians:
         nodes: int = NODES,
     ) -> None:
         xx, yy, xy = bounded(covariance).T
-        self._xx, self._yy, self._xy = (part[:, None, None] for part in (xx, yy, xy))
+        self._xx = xx[:, None, None]
+        self._yy = yy[:, None, None]
+        self._xy = xy[:, None, None]
         determinant = xx * yy - xy**2
         self._determinant = determinant[:, None, None]
-        rules = [cell_quadrature(float(side), nodes) for side in np.round(side_px, 3)]
-        at = np.stack([rule[0] for rule in rules])
-        self._weight = np.stack([rule[1] for rule in rules])
+        places = []
+        weights = []
+        for side in np.round(side_px, 3):
+            rule_places, rule_weights = cell_quadrature(float(side), nodes)
+            places.append(rule_places)
+            weights.append(rule_weights)
+        at = np.stack(places)
+        self._weight = np.stack(weights)
         self._nodes = nodes
         self._x = x_px[:, :, None] + at[:, None]
         self._y = y_px[:, :, None] + at[:, None]
-        self._size = len(at), y_px.shape[1], x_px.shape[1]
-        x = self._x.reshape(len(at), -1)
-        y = self._y.reshape(len(at), -1)
-        scale = -0.5 / determinant
-        light = (-2 * scale * xy)[:, None, None] * y[:, :, None] * x[:, None]
-        light += (scale * xx)[:, None, None] * (y * y)[:, :, None]
-        light += (scale * yy)[:, None, None] * (x * x)[:, None]
+        self._size = (len(at), y_px.shape[1], x_px.shape[1])
+        x = self._x.reshape(len(at), 1, -1)
+        y = self._y.reshape(len(at), -1)[:, :, None]
+        scale = (-0.5 / determinant)[:, None, None]
+        light = -2 * scale * self._xy * y * x
+        light += scale * self._xx * (y * y)
+        light += scale * self._yy * (x * x)
         np.exp(light, out=light)
-        self._light = light.reshape(*y.shape, self._size[2], nodes)
+        self._light = light.reshape(len(at), y.shape[1], self._size[2], nodes)
         self._peak = (2 * np.pi * np.sqrt(determinant))[:, None, None]
 
     @property
@@ -116,16 +123,21 @@ class PixelGaussians:
         yy = self._yy
         xy = self._xy
         determinant = self._determinant
-        first = [share, (yy * x - xy * y) / determinant, (xx * y - xy * x) / determinant]
+        by_x = (yy * x - xy * y) / determinant
+        by_y = (xx * y - xy * x) / determinant
+        first = [share, by_x, by_y]
         if not shape:
             return first
         x2 = self._moment(self._over_x(2), 0)
         x1y1 = self._moment(by_x1, 1)
         y2 = self._moment(by_x0, 2)
         square = determinant**2
-        u2 = (yy * yy * x2 - 2 * yy * xy * x1y1 + xy * xy * y2) / square
-        v2 = (xx * xx * y2 - 2 * xx * xy * x1y1 + xy * xy * x2) / square
-        uv = (-yy * xy * x2 + (xx * yy + xy * xy) * x1y1 - xx * xy * y2) / square
+        weighted_u2 = yy * yy * x2 - 2 * yy * xy * x1y1 + xy * xy * y2
+        weighted_v2 = xx * xx * y2 - 2 * xx * xy * x1y1 + xy * xy * x2
+        weighted_uv = -yy * xy * x2 + (xx * yy + xy * xy) * x1y1 - xx * xy * y2
+        u2 = weighted_u2 / square
+        v2 = weighted_v2 / square
+        uv = weighted_uv / square
         by_xx = (u2 - share * yy / determinant) / 2
         by_yy = (v2 - share * xx / determinant) / 2
         by_xy = uv + share * xy / determinant
@@ -134,7 +146,8 @@ class PixelGaussians:
     def _over_x(self, power: int) -> FloatArray:
         """The light times x to a power, mean over each pixel's width: (n, h nodes, w)."""
         if power == 0:
-            return np.asarray((self._light @ self._weight[:, None, :, None])[..., 0])
+            mean = self._light @ self._weight[:, None, :, None]
+            return np.asarray(mean[..., 0])
         weight = self._weight[:, None] * self._x**power
         return np.asarray(np.einsum("nrwk,nwk->nrw", self._light, weight))
 
@@ -143,14 +156,18 @@ class PixelGaussians:
         count, height, width = self._size
         rows = over_x.reshape(count, height, self._nodes, width)
         weight = self._weight[:, None] * self._y**power
-        return np.asarray((weight[:, :, None] @ rows)[:, :, 0] / self._peak)
+        mean = (weight[:, :, None] @ rows)[:, :, 0]
+        return np.asarray(mean / self._peak)
 
 
 def bounded(covariance: FloatArray) -> FloatArray:
-    """Covariances (n, 3) that are some: variances not under the smallest, and no line."""
+    """Covariances (n, 3), px^2, kept to those of a Gaussian: variances of MIN_VARIANCE_PX2 or more,
+    a correlation of up to MAX_CORRELATION.
+    """
     xx, yy = np.maximum(covariance[:, :XY], MIN_VARIANCE_PX2).T
     most = MAX_CORRELATION * np.sqrt(xx * yy)
-    return np.stack([xx, yy, np.clip(covariance[:, XY], -most, most)], axis=1)
+    xy = np.clip(covariance[:, XY], -most, most)
+    return np.stack([xx, yy, xy], axis=1)
 
 
 def normal_equations(
@@ -161,18 +178,26 @@ def normal_equations(
     """
     weighted = columns * weight[:, None]
     normal = weighted @ columns.transpose(0, 2, 1)
-    return normal, np.asarray((weighted @ values[:, :, None])[:, :, 0])
+    right = (weighted @ values[:, :, None])[:, :, 0]
+    return normal, np.asarray(right)
 
 
 def amplitudes(columns: Sequence[FloatArray], weight: FloatArray, images: FloatArray) -> FloatArray:
-    """How much (n, c) of each column (n, h, w) images (n, h, w) have, by weighted least squares."""
+    """The factors (n, c) by which columns (n, h, w) add up to images (n, h, w), by weighted least
+    squares.
+    """
     count = len(images)
     flat = np.stack(columns, axis=1).reshape(count, len(columns), -1)
-    normal, right = normal_equations(flat, weight.reshape(count, -1), images.reshape(count, -1))
-    size = np.sqrt(np.maximum(np.einsum("nkk->nk", normal), SMALLEST))
-    unit = normal / size[:, :, None] / size[:, None, :] + RIDGE * np.eye(len(columns))
-    solved = np.linalg.solve(unit, (right / size)[:, :, None])[:, :, 0]
-    return np.asarray(solved / size)
+    flat_weight = weight.reshape(count, -1)
+    flat_images = images.reshape(count, -1)
+    normal, right = normal_equations(flat, flat_weight, flat_images)
+    squares = np.einsum("nkk->nk", normal)
+    size = np.sqrt(np.maximum(squares, SMALLEST))
+    unit = normal / size[:, :, None] / size[:, None, :]
+    ridge = RIDGE * np.eye(len(columns))
+    unit_right = (right / size)[:, :, None]
+    solution = np.linalg.solve(unit + ridge, unit_right)
+    return np.asarray(solution[:, :, 0] / size)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,8 +217,11 @@ class PointImages:
 
     def offsets(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Pixels' places less the points' (n,), along x and y (n, s)."""
-        reach = np.arange(self.images.shape[1]) - self.images.shape[1] // 2
-        return (self.column - x_px)[:, None] + reach, (self.row - y_px)[:, None] + reach
+        side = self.images.shape[1]
+        reach = np.arange(side) - side // 2
+        across = (self.column - x_px)[:, None] + reach
+        down = (self.row - y_px)[:, None] + reach
+        return across, down
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,14 +251,16 @@ def fit_each(
         slopes = gaussians.slopes(shape=True)
         if points.has_level:
             slopes.append(np.ones_like(slopes[0]))
-        solved = amplitudes(slopes, points.weight, points.images)
-        steps = solved[:, 1:6] / np.maximum(np.abs(solved[:, :1]), SMALLEST)
+        solution = amplitudes(slopes, points.weight, points.images)
+        flux = np.maximum(np.abs(solution[:, :1]), SMALLEST)
+        steps = solution[:, 1:6] / flux
         moves = np.clip(steps[:, :2], -MAX_STEP_PX, MAX_STEP_PX)
         growth = steps[:, 2:]
         if alike:
             growth = np.median(growth, axis=0, keepdims=True)
-        variance = bounded(covariance)
-        most = MAX_STEP_SHARE * np.sqrt(variance[:, XX] * variance[:, YY])[:, None]
+        xx, yy, _ = bounded(covariance).T
+        mean_variance = np.sqrt(xx * yy)
+        most = MAX_STEP_SHARE * mean_variance[:, None]
         covariance = bounded(covariance + np.clip(growth, -most, most))
         x_px = x_px + moves[:, 0]
         y_px = y_px + moves[:, 1]
@@ -249,8 +279,8 @@ def over_field(terms: FloatArray, covariance: FloatArray) -> FloatArray:
     """
     weight = np.ones((len(terms), 1))
     for _ in range(FIELD_ROUNDS):
-        solved = np.linalg.lstsq(terms * weight, covariance * weight, rcond=None)[0]
-        off = np.abs(covariance - terms @ solved).max(axis=1, keepdims=True)
+        solution, *_ = np.linalg.lstsq(terms * weight, covariance * weight, rcond=None)
+        off = np.abs(covariance - terms @ solution).max(axis=1, keepdims=True)
         usual = max(OUTLIER_MEDIANS * float(np.median(off)), RIDGE)
         weight = 1 / np.maximum(1.0, off / usual)
-    return np.asarray(solved, dtype=np.float64)
+    return np.asarray(solution, dtype=np.float64)

@@ -17,22 +17,28 @@ class Orientation:
 
     def screen_px(self, resolution_px: tuple[int, int]) -> tuple[int, int]:
         """The screen that an image of `resolution_px` fills."""
+        width, height = resolution_px
         if self.quarter_turns % 2 == 0:
-            return resolution_px
-        return (resolution_px[1], resolution_px[0])
+            return width, height
+        return height, width
 
     @property
     def down(self) -> tuple[int, int]:
         """The direction of the screen's rows, from first to last, in image axes (x right, y
         down).
         """
-        x, y = ((0, 1), (1, 0), (0, -1), (-1, 0))[self.quarter_turns % 4]
-        return (-x, -y) if self.flip_y else (x, y)
+        by_turns = ((0, 1), (1, 0), (0, -1), (-1, 0))
+        x, y = by_turns[self.quarter_turns % 4]
+        if self.flip_y:
+            return -x, -y
+        return x, y
 
     def in_image(self, right: float, down: float) -> tuple[float, float]:
         """A step on the screen, right and down, in image axes."""
-        right = -right if self.flip_x else right
-        down = -down if self.flip_y else down
+        if self.flip_x:
+            right = -right
+        if self.flip_y:
+            down = -down
         for _ in range(self.quarter_turns % 4):
             right, down = down, -right
         return right, down
@@ -45,20 +51,28 @@ class Orientation:
         for _ in range(self.quarter_turns % 4):
             x_px, y_px = height - 1 - y_px, x_px
             width, height = height, width
-        x_px = width - 1 - x_px if self.flip_x else x_px
-        y_px = height - 1 - y_px if self.flip_y else y_px
-        return x_px, y_px
+        return self._flipped(x_px, y_px, (width, height))
 
     def to_image(
         self, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]
     ) -> tuple[FloatArray, FloatArray]:
         """The pixels (n,) of an image of `resolution_px` that the screen's pixels (n,) show."""
         width, height = self.screen_px(resolution_px)
-        x_px = width - 1 - x_px if self.flip_x else x_px
-        y_px = height - 1 - y_px if self.flip_y else y_px
+        x_px, y_px = self._flipped(x_px, y_px, (width, height))
         for _ in range(self.quarter_turns % 4):
             x_px, y_px = y_px, width - 1 - x_px
             width, height = height, width
+        return x_px, y_px
+
+    def _flipped(
+        self, x_px: FloatArray, y_px: FloatArray, screen_px: tuple[int, int]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Pixels (n,) of a screen whose columns or rows are reversed; the way back is the same."""
+        width, height = screen_px
+        if self.flip_x:
+            x_px = width - 1 - x_px
+        if self.flip_y:
+            y_px = height - 1 - y_px
         return x_px, y_px
 
 
@@ -92,10 +106,10 @@ class Scan:
         """How long after the middle row the row of a pixel lights up; off the image as at its
         edge.
         """
-        middle_x, middle_y = ((size - 1) / 2 for size in resolution_px)
-        if self.down[0]:
-            rows = resolution_px[0]
-        else:
-            rows = resolution_px[1]
-        place = (self.down[0] * (x_px - middle_x) + self.down[1] * (y_px - middle_y)) / rows
+        width, height = resolution_px
+        down_x, down_y = self.down
+        rows = width if down_x else height
+        from_middle_x = x_px - (width - 1) / 2
+        from_middle_y = y_px - (height - 1) / 2
+        place = (down_x * from_middle_x + down_y * from_middle_y) / rows
         return np.asarray(np.clip(place, -0.5, 0.5) * self.scanout_s)

@@ -76,24 +76,21 @@ class Candidates:
         keeps = not stars.bodies and stars.velocity_km_s is None and stars.air is None
         if keeps and self._kept is not None:
             last, last_camera, last_margin_px, last_icrs_to_image, near = self._kept
-            same = (
+            same_stars = (
                 stars.vectors is last.vectors
                 and stars.electrons_per_s is last.electrons_per_s
                 and stars.grid is last.grid
             )
+            same_image = camera is last_camera and margin_px == last_margin_px
             difference = (icrs_to_image - last_icrs_to_image).ravel()
             # |R - S| by its elements is sqrt(8) sin(angle / 2), whatever the axis of the turn from
             # R to S: roll counts as well.
             chord = math.sqrt(float(difference @ difference) / 8)
             turned_rad = 2 * math.asin(min(1.0, chord))
-            if (
-                same
-                and camera is last_camera
-                and margin_px == last_margin_px
-                and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD
-            ):
+            if same_stars and same_image and turned_rad <= KEPT_TURN_RAD - ROUNDING_RAD:
                 return near
-        star = stars_about(stars, icrs_to_image, camera, margin_px, KEPT_TURN_RAD if keeps else 0.0)
+        reach_rad = KEPT_TURN_RAD if keeps else 0.0
+        star = stars_about(stars, icrs_to_image, camera, margin_px, reach_rad)
         near = NearStars(star, stars.directions(star).T, stars.electrons_per_s.take(star))
         if keeps:
             self._kept = stars, camera, margin_px, icrs_to_image.copy(), near
@@ -131,15 +128,14 @@ class FrameLight:
 
     A sprite covers `footprint_px` squared pixels, the first of them at `pixel - (footprint_px - 1)
     // 2`. A star's light is divided among up to `per_star` sprites. `capped` stars are drawn
-    coarser than they should be, or not at all, because
-    the work of a frame is bounded. `rate_cam_rad_s` (3,) is the turn along which stars are drawn as
-    paths, None for points. `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that
-    changes over the field; None draws all by its mean. `extended` is the frame's light other than
-    stars, in the order in which it is drawn; `discs` names the bodies among it, and `over_white`
-    those of them that are brighter than white. Sprites of `added` light have -1, -2 and on for
-    `star`.
-    Where the monitor's primaries are driven apart, `primaries` float32 (n, 3) is the light of each,
-    and `lights` the extended light of each, moved to where that primary has to be drawn.
+    coarser than they should be, or not at all, because the work of a frame is bounded.
+    `rate_cam_rad_s` (3,) is the turn along which stars are drawn as paths, None for points.
+    `spectra` (n, L) or (L,) are shares of the wavelengths of a PSF that changes over the field;
+    None draws all by its mean. `extended` is the frame's light other than stars, in the order in
+    which it is drawn; `discs` names the bodies among it, and `over_white` those of them that are
+    brighter than white. Sprites of `added` light have -1, -2 and on for `star`. Where the monitor's
+    primaries are driven apart, `primaries` float32 (n, 3) is the light of each, and `lights` the
+    extended light of each, moved to where that primary has to be drawn.
     """
 
     data: npt.NDArray[np.void]
@@ -187,7 +183,8 @@ def make_sprites(
         directions = stars.directions(near).T
         electrons_per_s = stars.electrons_per_s.take(near)
     else:
-        near, directions, electrons_per_s = candidates.near(stars, icrs_to_image, camera, margin_px)
+        known = candidates.near(stars, icrs_to_image, camera, margin_px)
+        near, directions, electrons_per_s = known
     image_directions = (icrs_to_image @ directions).T  # component by component, as they are kept
     if camera.lens is not None:  # with a pinhole, projecting all costs less than selecting
         close = camera.in_view(image_directions, margin_px, 0.0)
@@ -243,30 +240,28 @@ def pack_sprites(
     x_px = x_px.take(inside_rows)
     y_px = y_px.take(inside_rows)
     data = np.empty(len(inside_rows), dtype=SPRITE_DTYPE)
-    whole, part = (data.view(kind).reshape(-1, 5) for kind in (np.int32, np.float32))
+    integers = data.view(np.int32).reshape(-1, 5)
+    floats = data.view(np.float32).reshape(-1, 5)
     for column, place_px in enumerate((x_px, y_px)):
         pixel = np.floor(place_px + bias)
-        whole[:, column] = pixel
-        part[:, 2 + column] = place_px - pixel
-    part[:, 4] = electrons_per_s.take(inside_rows)
+        integers[:, column] = pixel
+        floats[:, 2 + column] = place_px - pixel
+    floats[:, 4] = electrons_per_s.take(inside_rows)
     return FrameLight(data, footprint_px, star.take(inside_rows), x_px, y_px)
 
 
 def _between(place_px: FloatArray, first: float, end: float) -> npt.NDArray[np.bool_]:
+    """True for places from `first` to before `end`; not so at NaN."""
     return np.asarray((place_px >= first) & (place_px < end))
 
 
 def join_sprites(parts: Sequence[FrameLight], footprint_px: int) -> FrameLight:
     """All sprites of `parts`, which have one footprint."""
     if not parts:
-        nothing = np.empty(0)
-        return FrameLight(
-            np.empty(0, dtype=SPRITE_DTYPE),
-            footprint_px,
-            np.empty(0, dtype=np.intp),
-            nothing,
-            nothing,
-        )
+        no_sprites = np.empty(0, dtype=SPRITE_DTYPE)
+        no_stars = np.empty(0, dtype=np.intp)
+        no_places = np.empty(0)
+        return FrameLight(no_sprites, footprint_px, no_stars, no_places, no_places)
     return FrameLight(
         np.concatenate([part.data for part in parts]),
         footprint_px,
@@ -305,7 +300,8 @@ def mean_share(shares: FloatArray, stars: Stars) -> FloatArray:
     columns).
     """
     rates = stars.rates_e_per_s
-    return np.asarray(rates @ shares[: len(rates)] / (rates.sum() or 1.0))
+    total = rates.sum() or 1.0
+    return np.asarray(rates @ shares[: len(rates)] / total)
 
 
 def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
@@ -322,7 +318,8 @@ def shares_at(shares: FloatArray, stars: Stars, places: IntArray) -> FloatArray:
 
 def shares_by_bv(by_bv: FloatArray, bv_mag: FloatArray | float) -> FloatArray:
     """Shares (n, columns) of light of colours (n,), by those of BV_MAG."""
-    return np.stack([np.interp(bv_mag, BV_MAG, column) for column in by_bv.T], axis=-1)
+    shares = [np.interp(bv_mag, BV_MAG, column) for column in by_bv.T]
+    return np.stack(shares, axis=-1)
 
 
 def shares_of_sprites(
@@ -332,8 +329,9 @@ def shares_of_sprites(
     sprite_shares = shares_at(shares, stars, sprites.star)
     added = sprites.star < 0
     if by_bv is not None and added.any():
-        own_mag = np.array([light.bv_mag for light in sprites.added])
-        sprite_shares[added] = shares_by_bv(by_bv, own_mag[-1 - sprites.star[added]])
+        added_bv_mag = np.array([light.bv_mag for light in sprites.added])
+        of_sprites_mag = added_bv_mag[-1 - sprites.star[added]]
+        sprite_shares[added] = shares_by_bv(by_bv, of_sprites_mag)
     return sprite_shares
 
 
@@ -373,10 +371,9 @@ def by_share(
     one the mean of the stars.
     """
     of_sprites = shares_of_sprites(sprites, stars, shares, by_bv).astype(np.float32)
+    of_extended = extended_by_share(sprites, stars, shares, by_bv)
     parts = []
-    for share, lights in zip(
-        of_sprites.T, extended_by_share(sprites, stars, shares, by_bv), strict=True
-    ):
+    for share, lights in zip(of_sprites.T, of_extended, strict=True):
         data = sprites.data.copy()
         data["electrons_per_s"] *= share
         parts.append(replace(sprites, data=data, extended=lights))
@@ -387,13 +384,16 @@ def extended_by_share(
     sprites: FrameLight, stars: Stars, shares: FloatArray, by_bv: FloatArray | None = None
 ) -> list[tuple[ExtendedLight, ...]]:
     """The extended light of sprites once for each column of `shares`, as `by_share`."""
-    bodies = {name: len(stars.rates_e_per_s) + k for k, name in enumerate(stars.bodies)}
-    lights = [
-        -1 if isinstance(light, GlowLight) else bodies.get(light.name, -1)
-        for light in sprites.extended
-    ]
-    wide = shares_at(shares, stars, np.array(lights, dtype=np.intp))
-    for place, (light, body) in enumerate(zip(sprites.extended, lights, strict=True)):
+    first_body = len(stars.rates_e_per_s)
+    bodies = {name: first_body + k for k, name in enumerate(stars.bodies)}
+    light_bodies = []
+    for light in sprites.extended:
+        if isinstance(light, GlowLight):
+            light_bodies.append(-1)
+        else:
+            light_bodies.append(bodies.get(light.name, -1))
+    wide = shares_at(shares, stars, np.array(light_bodies, dtype=np.intp))
+    for place, (light, body) in enumerate(zip(sprites.extended, light_bodies, strict=True)):
         # light that is neither a star's nor a body's, as a fault's, has a colour of its own
         bv_mag = getattr(light, "bv_mag", None)
         if by_bv is not None and body < 0 and bv_mag is not None:
@@ -432,22 +432,26 @@ def clipped_sprites(
     bright = (rates > bright_e_per_s).nonzero()[0]
     x = np.rint(sprites.x_px[bright]).astype(int)
     y = np.rint(sprites.y_px[bright]).astype(int)
-    inside = (x >= 0) & (x < resolution_px[0]) & (y >= 0) & (y < resolution_px[1])
+    width, height = resolution_px
+    across = (x >= 0) & (x < width)
+    down = (y >= 0) & (y < height)
+    inside = across & down
     bright = bright[inside]
     x = x[inside]
     y = y[inside]
     limit = np.full(len(bright), flux_at_white_e_per_s * (1 + CLIP_TOLERANCE))
     if uniformity is not None:
         limit *= uniformity[y, x]
-    own_light = sprites.data["electrons_per_s"][bright] * psf.shares(
-        x - sprites.x_px[bright], y - sprites.y_px[bright]
-    )
+    shares = psf.shares(x - sprites.x_px[bright], y - sprites.y_px[bright])
+    own_light = sprites.data["electrons_per_s"][bright] * shares
     over = own_light > limit
     doubtful = (~over).nonzero()[0]
     if len(doubtful) > MAX_DOUBTFUL:
-        doubtful = doubtful[np.argpartition(-own_light[doubtful], MAX_DOUBTFUL)[:MAX_DOUBTFUL]]
+        brightest_first = np.argpartition(-own_light[doubtful], MAX_DOUBTFUL)
+        doubtful = doubtful[brightest_first[:MAX_DOUBTFUL]]
     if len(doubtful):
-        over[doubtful] = _light_at(sprites, x[doubtful], y[doubtful], psf) > limit[doubtful]
+        light = _light_at(sprites, x[doubtful], y[doubtful], psf)
+        over[doubtful] = light > limit[doubtful]
     return np.asarray(bright[over], dtype=np.intp)
 
 
@@ -456,38 +460,40 @@ def _light_at(sprites: FrameLight, x: IntArray, y: IntArray, psf: Psf) -> FloatA
     pixel = sprites.data["pixel"]
     reach = sprites.footprint_px / 2
     # Sprites whose footprints can reach one of the columns and rows, and some more
-    close = np.flatnonzero(
-        _reach(pixel[:, 0], x, sprites.footprint_px) & _reach(pixel[:, 1], y, sprites.footprint_px)
-    )
+    close_x = _reach(pixel[:, 0], x, sprites.footprint_px)
+    close_y = _reach(pixel[:, 1], y, sprites.footprint_px)
+    close = np.flatnonzero(close_x & close_y)
     if len(x) * len(close) <= FEW_PAIRS:
-        offset_x, offset_y = (
-            wanted[:, None] - places[close]
-            for places, wanted in ((sprites.x_px, x), (sprites.y_px, y))
-        )
+        offset_x = x[:, None] - sprites.x_px[close]
+        offset_y = y[:, None] - sprites.y_px[close]
         share = psf.shares(offset_x, offset_y)
-        share[np.maximum(np.abs(offset_x), np.abs(offset_y)) > reach] = 0.0
-        return np.asarray(share @ sprites.data["electrons_per_s"][close].astype(np.float64))
+        farther = np.maximum(np.abs(offset_x), np.abs(offset_y))
+        share[farther > reach] = 0.0
+        rates = sprites.data["electrons_per_s"][close].astype(np.float64)
+        return np.asarray(share @ rates)
     order = close[np.argsort(sprites.x_px[close])]
     rising_px = sprites.x_px[order]
     first = np.searchsorted(rising_px, x - reach)
     count = np.searchsorted(rising_px, x + reach, side="right") - first
     pixel = np.repeat(np.arange(len(x)), count)
-    other = order[np.arange(len(pixel)) + np.repeat(first - (np.cumsum(count) - count), count)]
+    # the pairs of a pixel are `count` sprites of `order` from its first on
+    first_pair = np.cumsum(count) - count
+    to_sprite = np.repeat(first - first_pair, count)
+    other = order[np.arange(len(pixel)) + to_sprite]
     offset_y = y[pixel] - sprites.y_px[other]
     near = np.abs(offset_y) <= reach
     pixel = pixel[near]
     other = other[near]
     offset_y = offset_y[near]
     share = psf.shares(x[pixel] - sprites.x_px[other], offset_y)
-    return np.asarray(
-        np.bincount(pixel, sprites.data["electrons_per_s"][other] * share, minlength=len(x)),
-        dtype=np.float64,
-    )
+    light = sprites.data["electrons_per_s"][other] * share
+    return np.asarray(np.bincount(pixel, light, minlength=len(x)), dtype=np.float64)
 
 
 def _reach(pixel: IntArray, wanted: IntArray, size_px: int) -> BoolArray:
     """Which pixels (n,) of an axis are within a footprint of one of the `wanted` (k,)."""
-    near = np.zeros(int(wanted.max(initial=0)) + 2 * size_px + 2, dtype=np.bool_)
+    last = int(wanted.max(initial=0)) + 2 * size_px + 1
+    near = np.zeros(last + 1, dtype=np.bool_)
     for place in set(wanted.tolist()):
         near[place : place + 2 * size_px + 1] = True
     return near.take(pixel + size_px, mode="clip")

@@ -70,12 +70,11 @@ class TrailView:
         """Places of the satellites that can come within a margin of the image within that time
         of the moment, and some more.
         """
-        turned = (
-            seen.directions(EVERY, np.zeros(len(seen)), self.velocity_km_s) @ self.icrs_to_image.T
-        )
-        reach_rad = (
-            float(seen.speeds_rad_s().max()) + float(np.linalg.norm(self.rate_image_rad_s))
-        ) * longest_s
+        directions = seen.directions(EVERY, np.zeros(len(seen)), self.velocity_km_s)
+        turned = directions @ self.icrs_to_image.T
+        fastest_rad_s = float(seen.speeds_rad_s().max())
+        turning_rad_s = float(np.linalg.norm(self.rate_image_rad_s))
+        reach_rad = (fastest_rad_s + turning_rad_s) * longest_s
         return self.camera.in_view(turned, margin_px, REACH * reach_rad)
 
 
@@ -130,11 +129,15 @@ def trails(
     counts = wanted
     total = int(wanted.sum())
     if total > brush.most:  # in proportion, one at least
-        counts = np.minimum(wanted, np.maximum(1, (wanted * (brush.most / total)).astype(np.intp)))
+        in_proportion = (wanted * (brush.most / total)).astype(np.intp)
+        counts = np.minimum(wanted, np.maximum(1, in_proportion))
     path = np.repeat(np.arange(len(seen)), counts)
-    order = np.arange(len(path)) - np.repeat(np.cumsum(counts) - counts, counts)
-    part = ((end - begin) / np.maximum(counts, 1))[path]
-    first_s = lit.begin_s[path] + (begin[path] + order * part) * lit.length_s
+    first_of_path = np.cumsum(counts) - counts
+    order = np.arange(len(path)) - np.repeat(first_of_path, counts)
+    part_of_path = (end - begin) / np.maximum(counts, 1)
+    part = part_of_path[path]
+    first_part = begin[path] + order * part
+    first_s = lit.begin_s[path] + first_part * lit.length_s
     last_s = first_s + part * lit.length_s
     x_px, y_px = view.places_px(seen, path, (first_s + last_s) / 2)
     light = seen.rates_e_per_s(path, first_s, last_s) * part
@@ -148,13 +151,10 @@ def trails(
     )
     trailed = np.flatnonzero(np.isin(seen.index, sprites.star))
     most = int(np.bincount(path[is_lit], minlength=1).max(initial=1))
-    sprites = replace(sprites, per_star=max(1, most), capped=int((counts < wanted)[trailed].sum()))
-    return Trails(
-        sprites,
-        seen.index[trailed],
-        rates[trailed],
-        seen.directions(trailed, lit.middle_s[trailed]),
-    )
+    coarser = (counts < wanted)[trailed]
+    sprites = replace(sprites, per_star=max(1, most), capped=int(coarser.sum()))
+    middle = seen.directions(trailed, lit.middle_s[trailed])
+    return Trails(sprites, seen.index[trailed], rates[trailed], middle)
 
 
 def sprite_counts(
@@ -165,23 +165,26 @@ def sprite_counts(
     """
     at = np.linspace(0.0, 1.0, SAMPLES)[:, None]
     which = np.tile(np.arange(len(seen)), SAMPLES)
-    x_px, y_px = view.places_px(seen, which, (lit.begin_s + at * lit.length_s).ravel())
+    seconds = lit.begin_s + at * lit.length_s
+    x_px, y_px = view.places_px(seen, which, seconds.ravel())
     x_px = x_px.reshape(SAMPLES, -1)
     y_px = y_px.reshape(SAMPLES, -1)
     ends = Chords(x_px[[0, -1]], y_px[[0, -1]])
-    off_x, off_y = ((1 - at) * place[0] + at * place[-1] - place for place in (x_px, y_px))
-    bulge_px = BULGE * np.sqrt((off_x * off_x + off_y * off_y).max(axis=0))
-    begin, end = ends.on_image(
-        view.camera.resolution_px, brush.psf.footprint_px / 2 + 1 + np.nan_to_num(bulge_px)
-    )
-    step_x, step_y = (
-        np.diff(place, axis=0) / s
-        for place, s in zip((x_px, y_px), brush.psf.width_px, strict=True)
-    )
-    length = np.sqrt(step_x * step_x + step_y * step_y).sum(axis=0) * (end - begin)
+    off_x = (1 - at) * x_px[0] + at * x_px[-1] - x_px
+    off_y = (1 - at) * y_px[0] + at * y_px[-1] - y_px
+    largest_px2 = (off_x * off_x + off_y * off_y).max(axis=0)
+    bulge_px = BULGE * np.sqrt(largest_px2)
+    margin_px = brush.psf.footprint_px / 2 + 1 + np.nan_to_num(bulge_px)
+    begin, end = ends.on_image(view.camera.resolution_px, margin_px)
+    sigma_x, sigma_y = brush.psf.width_px
+    step_x = np.diff(x_px, axis=0) / sigma_x
+    step_y = np.diff(y_px, axis=0) / sigma_y
+    steps = np.sqrt(step_x * step_x + step_y * step_y)
+    length = steps.sum(axis=0) * (end - begin)
     length = np.nan_to_num(length, nan=brush.most * SPACING_SIGMA)
-    wanted = 1 + np.floor(np.minimum(length / SPACING_SIGMA, brush.most)).astype(np.intp)
-    wanted = np.maximum(wanted, np.ceil((end - begin) * lit.length_s / LIGHT_S).astype(np.intp))
+    spaces = np.floor(np.minimum(length / SPACING_SIGMA, brush.most))
+    at_least = np.ceil((end - begin) * lit.length_s / LIGHT_S)
+    wanted = np.maximum(1 + spaces.astype(np.intp), at_least.astype(np.intp))
     wanted[end <= begin] = 0
     return wanted, (begin, end)
 
@@ -191,7 +194,8 @@ def with_trails(sprites: FrameLight, found: Trails, first: int) -> FrameLight:
     `first`.
     """
     trail_sprites = found.sprites
-    whole = with_sprites(sprites, [replace(trail_sprites, star=trail_sprites.star + first)])
+    numbered = replace(trail_sprites, star=trail_sprites.star + first)
+    whole = with_sprites(sprites, [numbered])
     return replace(
         whole,
         per_star=max(sprites.per_star, trail_sprites.per_star),
@@ -219,17 +223,19 @@ class DiscTrail:
 def wide(seen: "Pass", px_per_rad: float, wider_px: float) -> BoolArray:
     """Which satellites (n,) of a pass are wider than so many pixels."""
     size_km = seen.brightness.size_m[seen.index] / M_PER_KM
-    return np.asarray(size_km * px_per_rad > wider_px * np.linalg.norm(seen.seen_km[0], axis=1))
+    distance_km = np.linalg.norm(seen.seen_km[0], axis=1)
+    return np.asarray(size_km * px_per_rad > wider_px * distance_km)
 
 
 def disc_of(seen: "Pass", name: str, second: float, velocity_km_s: FloatArray | None) -> Disc:
     """The disc of the only satellite of a pass at a time after its moment, without light."""
     at = np.array([second])
     radius_km = float(seen.brightness.size_m[seen.index[0]]) / M_PER_KM / 2
+    distance_km = float(np.linalg.norm(seen.vectors_km(at)[0]))
     return Disc(
         name=name,
         direction=seen.directions(slice(None), at, velocity_km_s)[0],
-        distance_km=max(float(np.linalg.norm(seen.vectors_km(at)[0])), 1.001 * radius_km),
+        distance_km=max(distance_km, 1.001 * radius_km),
         equator_km=radius_km,
         polar_km=radius_km,
         pole=NORTH,
@@ -246,58 +252,64 @@ def disc_trail(
     light.
     """
     counts, (begin, end) = sprite_counts(seen, view, lit, brush)
-    radius_sigma = (
-        disc_of(seen, name, 0.0, None).radius_rad
-        * view.camera.focal_length_px
-        / min(brush.psf.width_px)
-    )
+    disc_now = disc_of(seen, name, 0.0, None)
+    radius_px = disc_now.radius_rad * view.camera.focal_length_px
+    radius_sigma = radius_px / min(brush.psf.width_px)
     coarser = max(1.0, radius_sigma / (STEPS_A_RADIUS * SPACING_SIGMA))
     count = min(math.ceil(int(counts[0]) / coarser), brush.poses)
     if not count:
         return None
-    edges_s = lit.begin_s[0] + np.linspace(begin[0], end[0], count + 1) * lit.length_s
-    middles_s = (edges_s[1:] + edges_s[:-1]) / 2
+    parts = np.linspace(begin[0], end[0], count + 1)
+    edges_s = lit.begin_s[0] + parts * lit.length_s
+    begins_s = edges_s[:-1]
+    ends_s = edges_s[1:]
+    middles_s = ((ends_s + begins_s) / 2).tolist()
     share = float(end[0] - begin[0]) / count
-    rates = seen.rates_e_per_s(np.zeros(count, dtype=np.intp), edges_s[:-1], edges_s[1:])
+    itself = np.zeros(count, dtype=np.intp)
+    rates = seen.rates_e_per_s(itself, begins_s, ends_s)
     if not rates.any():
         return None
-    bare = [disc_of(seen, name, second, view.velocity_km_s) for second in middles_s.tolist()]
+    bare = [disc_of(seen, name, second, view.velocity_km_s) for second in middles_s]
     lights: list[ExtendedLight] = []
     if count > 1:
         # Together they hide what the one in the middle hides: each after the other would hide the
         # light of those before.
-        lights += _lights(bare[count // 2], view, middles_s[count // 2], brush, 0.0, covers=True)
-    along = tuple(disc.of_rate(float(rate)) for disc, rate in zip(bare, rates, strict=True))
-    for disc, second in zip(along, middles_s.tolist(), strict=True):
-        lights += _lights(disc, view, second, brush, share, covers=count == 1)
+        k = count // 2
+        lights += _lights(bare[k], view, middles_s[k], brush, 0.0, covers=True)
+    along: list[Disc] = []
+    for disc, rate, second in zip(bare, rates.tolist(), middles_s, strict=True):
+        lit_disc = disc.of_rate(rate)
+        along.append(lit_disc)
+        lights += _lights(lit_disc, view, second, brush, share, covers=count == 1)
     if not lights:
         return None
     middle = seen.directions(slice(None), lit.middle_s)[0]
-    maps = sum(
-        float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap)
-    )
-    radiance = sum(
-        light.times * light.disc.normal_e_per_s_sr
-        for light in lights
-        if isinstance(light, DiscLight)
-    )
-    brightest = maps + radiance / view.camera.scales_px_rad()[0] ** 2
+    image_max = 0.0
+    radiance = 0.0
+    for light in lights:
+        if isinstance(light, LightMap):
+            image_max += float(light.image.max(initial=0.0))
+        elif isinstance(light, DiscLight):
+            radiance += light.times * light.disc.normal_e_per_s_sr
+    smallest_px_rad, _ = view.camera.scales_px_rad()
     return DiscTrail(
-        int(seen.index[0]),
-        float(rates.sum()) * share,
-        middle,
-        along,
-        np.full(count, share),
-        tuple(lights),
-        brightest,
+        index=int(seen.index[0]),
+        electrons_per_s=float(rates.sum()) * share,
+        middle=middle,
+        along=tuple(along),
+        shares=np.full(count, share),
+        lights=tuple(lights),
+        brightest_e_per_s=image_max + radiance / smallest_px_rad**2,
     )
 
 
 def _lights(
     disc: Disc, view: TrailView, second: float, brush: Brush, share: float, covers: bool
 ) -> list[ExtendedLight]:
-    turned = to_matrix(propagate(AT_REST, view.rate_image_rad_s, second)) @ view.icrs_to_image
-    return disc_lights(disc, DiscView(view.camera, brush.psf, (Pose(turned, share),)), covers)
+    """A disc as a turning camera has it at a time, with a share of its light."""
+    turn = to_matrix(propagate(AT_REST, view.rate_image_rad_s, second))
+    pose = Pose(turn @ view.icrs_to_image, share)
+    return disc_lights(disc, DiscView(view.camera, brush.psf, (pose,)), covers)
 
 
 def hidden(sprites: FrameLight, directions: FloatArray, found: DiscTrail) -> FrameLight:
@@ -306,7 +318,8 @@ def hidden(sprites: FrameLight, directions: FloatArray, found: DiscTrail) -> Fra
     """
     share_left = np.ones(len(sprites))
     for disc, share in zip(found.along, found.shares, strict=True):
-        share_left -= share * (directions @ disc.direction > np.cos(disc.radius_rad))
+        is_behind = directions @ disc.direction > np.cos(disc.radius_rad)
+        share_left -= share * is_behind
     is_visible = share_left > 0
     data = sprites.data[is_visible]
     data["electrons_per_s"] *= share_left[is_visible].astype(np.float32)

@@ -1,10 +1,10 @@
 """The air over a place on the Earth: it bends light, dims it, glows, and makes stars twinkle.
 
-Refraction is that of `stars.AirAbove`. The air mass
-is Kasten and Young's (1989, Appl. Opt. 28, 4735). Extinction is that of each star's own spectrum,
-tabulated at AIR_MASSES and straight between them. The glow of the sky goes with the zenith distance
-by van Rhijn's layer and with extinction (Krisciunas and Schaefer 1991, PASP 103, 1033, eq. 2 and
-3). Stars twinkle by Young's law (1967, AJ 72, 747).
+Refraction is that of `stars.AirAbove`. The air mass is Kasten and Young's (1989, Appl. Opt. 28,
+4735). Extinction is that of each star's own spectrum, tabulated at AIR_MASSES and straight between
+them. The glow of the sky goes with the zenith distance by van Rhijn's layer and with extinction
+(Krisciunas and Schaefer 1991, PASP 103, 1033, eq. 2 and 3). Stars twinkle by Young's law (1967, AJ
+72, 747).
 """
 
 from collections.abc import Callable
@@ -19,10 +19,12 @@ from hilstar.sky.electrons import Optics, Photometry, electron_response, referen
 from hilstar.sky.spectrum import DATA_DIR, Curve, integration_nodes, load_curve
 from hilstar.sky.stars import AirAbove, Stars, tell
 
+# at which rates are tabulated; magnitudes are linear between them
 AIR_MASSES = np.array([0.0, 1.0, 1.5, 2.0, 3.0, 5.0, 8.0, 15.0, 40.0])
 EXTINCTION, NIGHT_SKY = DATA_DIR / "extinction.csv", DATA_DIR / "night_sky.csv"
 VAN_RHIJN = 0.96  # an emitting layer at 130 km
 STEP_NS = NS_PER_S  # the zenith of a second: 15 arcsec, 0.4 mmag at an air mass of 5
+# of the Sun's altitude: above it the sky is brighter than a night's table says
 TWILIGHT_DEG = -12.0
 MAX_TWINKLE = 1.0  # beyond it, near the horizon, the law of weak scintillation ends
 
@@ -30,7 +32,9 @@ MAX_TWINKLE = 1.0  # beyond it, near the horizon, the law of weak scintillation 
 def air_mass(altitude_rad: FloatArray) -> FloatArray:
     """Air masses (n,) at apparent altitudes; that of the horizon below it."""
     h = np.maximum(altitude_rad, 0.0)
-    return np.asarray(1 / (np.sin(h) + 0.50572 * (np.degrees(h) + 6.07995) ** -1.6364))
+    # Kasten and Young 1989, of the altitude in degrees
+    beyond_sine = 0.50572 * (np.degrees(h) + 6.07995) ** -1.6364
+    return np.asarray(1 / (np.sin(h) + beyond_sine))
 
 
 def scintillation(
@@ -46,14 +50,14 @@ def scintillation(
         return np.full_like(masses, MAX_TWINKLE)
     across = (aperture_mm / 10) ** (-2 / 3)
     down = np.exp(-height_m / 8000)
-    return np.asarray(
-        np.minimum(0.09 * across * masses**1.75 * down / np.sqrt(2 * exposure_s), MAX_TWINKLE)
-    )
+    sigma = 0.09 * across * masses**1.75 * down / np.sqrt(2 * exposure_s)
+    return np.asarray(np.minimum(sigma, MAX_TWINKLE))
 
 
 def standard_pressure_hpa(height_m: float) -> float:
     """The pressure of the International Standard Atmosphere, hPa."""
-    return float(1013.25 * max(1 - 2.25577e-5 * height_m, 0.01) ** 5.25588)
+    temperature_ratio = max(1 - 2.25577e-5 * height_m, 0.01)
+    return float(1013.25 * temperature_ratio**5.25588)
 
 
 def extinction_curve(name: str) -> Curve | None:
@@ -69,12 +73,13 @@ def extinction_curve(name: str) -> Curve | None:
 
 def extinction_names() -> tuple[str, ...]:
     """The built-in places."""
-    return tuple(EXTINCTION.read_text().splitlines()[1].split(",")[1:])
+    header = EXTINCTION.read_text().splitlines()[1]
+    return tuple(header.split(",")[1:])
 
 
 def through_air(optics: Optics, extinction: Curve, masses: float) -> Optics:
-    """A tracker's optics behind so many air masses; the ends of a table of extinction hold
-    beyond it.
+    """A tracker's optics behind so many air masses. Beyond a table of extinction its end values
+    hold.
     """
     low, high = optics.range_nm
     knots = [c.wavelength_nm for c in (optics.transmission, extinction) if len(c.wavelength_nm)]
@@ -84,55 +89,59 @@ def through_air(optics: Optics, extinction: Curve, masses: float) -> Optics:
         mag = np.full(len(nm), extinction.value[0])
     else:
         mag = np.interp(nm, extinction.wavelength_nm, extinction.value)
-    return replace(
-        optics, transmission=Curve(nm, optics.transmission(nm) * 10 ** (-0.4 * mag * masses))
-    )
+    through = optics.transmission(nm) * 10 ** (-0.4 * mag * masses)
+    return replace(optics, transmission=Curve(nm, through))
 
 
 def dimmed_mag(
     rates: Callable[[Optics], FloatArray], optics: Optics, extinction: Curve
 ) -> FloatArray:
-    """How much fainter (masses, n) spectra are behind AIR_MASSES; `rates` gives their electrons
-    through optics.
+    """How much fainter spectra are behind AIR_MASSES, mag (masses, n); `rates` gives their
+    electrons (n,) through optics.
     """
-    every = np.stack([rates(through_air(optics, extinction, x)) for x in AIR_MASSES.tolist()])
-    return np.asarray(-2.5 * np.log10(np.maximum(every, 1e-300) / np.maximum(every[0], 1e-300)))
+    by_masses = []
+    for masses in AIR_MASSES.tolist():
+        by_masses.append(rates(through_air(optics, extinction, masses)))
+    detected = np.maximum(np.stack(by_masses), 1e-300)
+    return np.asarray(-2.5 * np.log10(detected / detected[0]))
 
 
 def glow_e_per_s_arcsec2(
     spectrum: Curve, v_mag_arcsec2: float, optics: Optics, photometry: Photometry
 ) -> float:
-    """Electrons per second and square arcsecond of a sky of this V and a spectrum's shape: as
-    zodiacal light's.
+    """Electrons per second and square arcsecond of a night sky of this V surface brightness, with
+    the shape of a spectrum.
     """
     passband = load_curve("johnson-v", "johnson-v")
     nm, weight_m = integration_nodes(passband, spectrum)
-    response = passband(nm) * weight_m * (nm if photometry.weighting == "photon" else 1.0)
+    response = passband(nm) * weight_m
+    if photometry.weighting == "photon":
+        response = response * nm
     mean = float(spectrum(nm) @ response / response.sum())
-    nm, response = electron_response(
-        replace(optics, transmission=with_knots(optics.transmission, spectrum, optics.range_nm))
-    )
+    transmission = with_knots(optics.transmission, spectrum, optics.range_nm)
+    nm, response = electron_response(replace(optics, transmission=transmission))
     share = float(spectrum(nm) @ response) / mean * reference_mean_w_m2_m(photometry)
     return float(flux_ratio(v_mag_arcsec2)) * optics.area_m2 * share
 
 
 def with_knots(curve: Curve, other: Curve, range_nm: tuple[float, float]) -> Curve:
-    """A curve with the knots of another within a range, so that a product of both is integrated
-    as it is.
+    """A curve with the knots of another within a range added, so that the product of both is
+    integrated exactly.
     """
+    low, high = range_nm
     nm = np.unique(np.concatenate([curve.wavelength_nm, other.wavelength_nm, range_nm]))
-    nm = nm[(nm >= range_nm[0]) & (nm <= range_nm[1])]
+    nm = nm[(nm >= low) & (nm <= high)]
     return Curve(nm, curve(nm))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SiteAir:
-    """The air of a place: `up_at` a UTC, ns, the constants of refraction, rad, and how it dims,
-    glows and twinkles.
+    """The air over a place: the zenith (`up_at` a UTC, ns), the constants of refraction, rad, and
+    how it dims stars, glows and makes them twinkle.
 
-    `dimming_mag` (channels, masses, n + 1) has each star of the catalogue by row, and last
-    sunlight. `glow_e_per_s_sr` (channels,) is that at the zenith, and `v_extinction_mag` that of V
-    by air mass.
+    `dimming_mag` (channels, masses, n + 1) is that of each star of the catalogue by row, and last
+    of sunlight. `glow_e_per_s_sr` (channels,) is the glow at the zenith, `v_extinction_mag` the
+    extinction of V for an air mass.
     """
 
     up_at: Callable[[int], FloatArray]
@@ -168,16 +177,20 @@ class SiteAir:
         apparent altitudes (n,).
         """
         masses = air_mass(np.nan_to_num(altitude_rad))
-        k = np.clip(np.searchsorted(AIR_MASSES, masses, side="right") - 1, 0, len(AIR_MASSES) - 2)
+        interval = np.searchsorted(AIR_MASSES, masses, side="right") - 1
+        k = np.clip(interval, 0, len(AIR_MASSES) - 2)
         part = (masses - AIR_MASSES[k]) / (AIR_MASSES[k + 1] - AIR_MASSES[k])
-        mag = self.dimming_mag[:, k, row] * (1 - part) + self.dimming_mag[:, k + 1, row] * part
+        below_mag = self.dimming_mag[:, k, row]
+        above_mag = self.dimming_mag[:, k + 1, row]
+        mag = below_mag * (1 - part) + above_mag * part
         return np.asarray(flux_ratio(mag))
 
     def twinkling(
         self, stars: Stars, utc_ns: int, exposure_s: float, rng: "np.random.Generator"
     ) -> Stars:
         """Stars as they twinkle in an exposure, each by itself about its mean; bodies do not."""
-        masses = air_mass(self.above(utc_ns).altitude_rad(stars.vectors))
+        altitude_rad = self.above(utc_ns).altitude_rad(stars.vectors)
+        masses = air_mass(altitude_rad)
         sigma = scintillation(self.aperture_mm, masses, self.height_m, exposure_s)
         width = np.sqrt(np.log1p(sigma**2))
         factor = np.exp(width * rng.standard_normal(len(stars)) - width**2 / 2)
@@ -189,15 +202,17 @@ class SiteAir:
         steradian; none below ground.
         """
         sine = directions @ self.above(utc_ns).up
-        masses = 1 / np.sqrt(1 - VAN_RHIJN * (1 - np.maximum(sine, 0.0) ** 2))
-        relative = masses * flux_ratio(self.v_extinction_mag * (masses - 1)) * (sine > 0)
+        level = np.maximum(sine, 0.0)
+        masses = 1 / np.sqrt(1 - VAN_RHIJN * (1 - level**2))
+        # relative to the zenith, whose light is dimmed by one air mass
+        dimming = flux_ratio(self.v_extinction_mag * (masses - 1))
+        relative = masses * dimming * (sine > 0)
         return np.asarray(self.glow_e_per_s_sr[:, None] * relative)
 
     def check_sun(self, sun: FloatArray, utc_ns: int) -> None:
         """Warn, once, of a Sun above -12 degrees in a direction (3,)."""
-        altitude_deg = float(
-            np.degrees(np.arcsin(self.above(utc_ns).up @ sun / np.linalg.norm(sun)))
-        )
+        sine = self.above(utc_ns).up @ sun / np.linalg.norm(sun)
+        altitude_deg = float(np.degrees(np.arcsin(sine)))
         if altitude_deg > TWILIGHT_DEG:
             tell(
                 self.told,
@@ -210,4 +225,5 @@ class SiteAir:
 
 @lru_cache(maxsize=16)
 def _above(air: SiteAir, second: int) -> AirAbove:
+    """The air of a second, kept: a frame asks for the same several times."""
     return AirAbove(air.up_at(second * STEP_NS), air.refraction_rad, air.told)

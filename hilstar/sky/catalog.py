@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError, cannot_read, shortened
 from hilstar.basics.reading import open_lines
 
@@ -83,9 +83,8 @@ class Catalog:
     `range_mag` in Hp with `period_d`, NaN where none is given; `maximum_jd` is a time of its
     largest light, which a user's table may have. `multiple` is its flag H59 of doubles (C resolved,
     G accelerated, O orbit, V variability-induced, X unexplained scatter), with `separation_arcsec`
-    where it resolved the pair:
-    V and the colours are then those of both, except for 472 of 11 101 entries. `rows_read` counts
-    all rows of the source, and `notes` say what became of them.
+    where it resolved the pair: V and the colours are then those of both, except for 472 of 11 101
+    entries. `rows_read` counts all rows of the source, and `notes` say what became of them.
     """
 
     hip: npt.NDArray[np.int32]
@@ -114,7 +113,8 @@ class Catalog:
 
     def taken(self, rows: IntArray | npt.NDArray[np.bool_]) -> "Catalog":
         """The stars at `rows`: places, or a mask (n,)."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in column_names()})
+        columns = {name: getattr(self, name)[rows] for name in column_names()}
+        return replace(self, **columns)
 
     def at_phase(self, jd: float) -> "Catalog":
         """The stars with their V at a Julian date: a sinusoid of magnitudes about V, of those
@@ -123,10 +123,10 @@ class Catalog:
         known = np.flatnonzero(np.isfinite(self.maximum_jd))
         turns = (jd - self.maximum_jd[known]) / self.period_d[known]
         v_mag = self.v_mag.copy()
-        v_mag[known] -= self.range_mag[known] / 2 * np.cos(2 * np.pi * turns)
-        count = int(
-            np.isin(self.variable, [bytes([letter]) for letter in VARIABLE_TYPES]).sum()
-        ) - len(known)
+        half_mag = self.range_mag[known] / 2
+        v_mag[known] -= half_mag * np.cos(2 * np.pi * turns)
+        is_variable = _vary(self.variable)
+        count = int(is_variable.sum()) - len(known)
         note = (
             f"{len(known)} variable stars have their light of JD {jd:.4f}; {count} without an epoch"
             " of phase have their mean"
@@ -147,33 +147,37 @@ class Catalog:
             return f"HIP {self.hip[row]}"
         identifier = int(self.identifier[row])
         if self.designation == TYCHO:
-            region, number = divmod(identifier, TYC_REGION)
-            return f"{TYCHO} {region}-{number // 10}-{number % 10}"
+            region, rest = divmod(identifier, TYC_REGION)
+            number, component = divmod(rest, 10)
+            return f"{TYCHO} {region}-{number}-{component}"
         return f"{self.designation} {identifier}"
 
     def identifier_of(self, name: str) -> int | None:
         """The identifier in a name that `name` gives to a star without a HIP number; None for
         any other text.
         """
-        if not self.designation or not name.startswith(f"{self.designation} "):
+        prefix = f"{self.designation} "
+        if not self.designation or not name.startswith(prefix):
             return None
-        numbers = name.removeprefix(f"{self.designation} ").split("-")
-        if not all(n.isascii() and n.isdigit() and len(n) <= MAX_DIGITS for n in numbers):
-            return None
+        numbers: list[int] = []
+        for digits in name.removeprefix(prefix).split("-"):
+            if not (digits.isascii() and digits.isdigit()) or len(digits) > MAX_DIGITS:
+                return None
+            numbers.append(int(digits))
         if self.designation == TYCHO:
-            if len(numbers) == 3:
-                return int(numbers[0]) * TYC_REGION + int(numbers[1]) * 10 + int(numbers[2])
+            if len(numbers) != 3:
+                return None
+            region, number, component = numbers
+            return region * TYC_REGION + number * 10 + component
+        if len(numbers) != 1:
             return None
-        return int(numbers[0]) if len(numbers) == 1 else None
+        return numbers[0]
 
 
 def column_names() -> list[str]:
     """The names of a catalogue's arrays."""
-    return [
-        field.name
-        for field in fields(Catalog)
-        if field.name not in ("designation", "rows_read", "notes")
-    ]
+    facts_of_all = ("designation", "rows_read", "notes")
+    return [field.name for field in fields(Catalog) if field.name not in facts_of_all]
 
 
 def plain_catalog(
@@ -221,10 +225,10 @@ def _packaged(faintest_v_mag: float) -> Catalog:
     open several benches.
     """
     with np.load(PACKAGED_CATALOG) as packed:
-        bright = np.flatnonzero(packed["v_mag"] / FIELDS["v_mag"][1] <= faintest_v_mag)
-        catalog = unpack(
-            {name: packed[name][bright] for name in (*FIELDS, *LETTERS)}, int(packed["rows_read"])
-        )
+        v_mag = packed["v_mag"] / FIELDS["v_mag"][1]
+        bright = np.flatnonzero(v_mag <= faintest_v_mag)
+        columns = {name: packed[name][bright] for name in (*FIELDS, *LETTERS)}
+        catalog = unpack(columns, int(packed["rows_read"]))
     for name in column_names():
         getattr(catalog, name).setflags(write=False)
     return catalog
@@ -239,9 +243,8 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
     rows_read = 0
     try:
         with open_lines(path, "give the CDS I/239 hip_main.dat", MAX_CATALOGUE_BYTES) as lines:
-            for line_number, row in enumerate(
-                csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE), start=1
-            ):
+            rows_of_fields = csv.reader(lines, delimiter="|", quoting=csv.QUOTE_NONE)
+            for line_number, row in enumerate(rows_of_fields, start=1):
                 if not row:
                     continue
                 rows_read += 1
@@ -255,10 +258,14 @@ def read_hip_main(path: Path) -> tuple[dict[str, npt.NDArray[np.int64]], int]:
             f"{path}: holds no star with position, V and B-V; give the CDS I/239 hip_main.dat"
         )
     table = np.array(rows, dtype=np.int64)
-    return {name: table[:, i] for i, name in enumerate((*FIELDS, *LETTERS))}, rows_read
+    names = (*FIELDS, *LETTERS)
+    return dict(zip(names, table.T, strict=True)), rows_read
 
 
 def _parse_row(row: list[str], where: str) -> list[int] | None:
+    """The steps of a row's fields and its letters; None for a star without what is REQUIRED.
+    Raises InputError.
+    """
     if len(row) != COLUMN_COUNT or row[0] != "H":
         raise InputError(
             f"{where}: not a row of hip_main.dat ({COLUMN_COUNT} fields after 'H|'); give the CDS"
@@ -300,26 +307,31 @@ def unpack(columns: dict[str, npt.NDArray[np.int64]], rows_read: int) -> Catalog
     values: dict[str, FloatArray] = {}
     for name, (_, per_unit) in FIELDS.items():
         steps = columns[name]
-        values[name] = steps / per_unit
-        values[name][steps == np.iinfo(steps.dtype).min] = np.nan
+        blank = np.iinfo(steps.dtype).min
+        values[name] = np.where(steps == blank, np.nan, steps / per_unit)
     letters = {name: columns[name].astype(np.uint8).view("S1") for name in LETTERS}
-    varies = np.isin(letters["variable"], [bytes([letter]) for letter in VARIABLE_TYPES])
+    variable = letters["variable"]
+    varies = _vary(variable)
     hip = columns["hip"].astype(np.int32)
     range_mag = values.pop("hp_faintest_mag") - values.pop("hp_brightest_mag")
-    return plain_catalog(
-        "HIP",
-        rows_read,
-        values
-        | {
-            "hip": hip,
-            "identifier": hip.astype(np.int64),
-            "variable": np.where(varies, letters["variable"], b""),
-            "range_mag": np.where(varies, range_mag, np.nan).astype(np.float32),
-            "period_d": np.where(varies, values["period_d"], np.nan).astype(np.float32),
-            "multiple": letters["multiple"],
-            "separation_arcsec": values["separation_arcsec"].astype(np.float32),
-        },
-    )
+    range_mag = np.where(varies, range_mag, np.nan)
+    period_d = np.where(varies, values["period_d"], np.nan)
+    plain: dict[str, npt.NDArray[Any]] = {
+        "hip": hip,
+        "identifier": hip.astype(np.int64),
+        "variable": np.where(varies, variable, b""),
+        "range_mag": range_mag.astype(np.float32),
+        "period_d": period_d.astype(np.float32),
+        "multiple": letters["multiple"],
+        "separation_arcsec": values["separation_arcsec"].astype(np.float32),
+    }
+    return plain_catalog("HIP", rows_read, values | plain)
+
+
+def _vary(variable: Letters) -> BoolArray:
+    """Which stars (n,) vary by themselves, by their types."""
+    types = [bytes([letter]) for letter in VARIABLE_TYPES]
+    return np.isin(variable, types)
 
 
 class StarName(NamedTuple):
@@ -334,9 +346,12 @@ class StarName(NamedTuple):
 @cache
 def star_names() -> dict[int, StarName]:
     """The designations and names of 3300 stars by HIP number (see `tools/make_star_names.py`)."""
+    star_of_hip: dict[int, StarName] = {}
     with STAR_NAMES.open(encoding="utf-8", newline="") as file:
-        rows = csv.DictReader(line for line in file if not line.startswith("#"))
-        return {int(row["hip"]): StarName(row["designation"], row["name"]) for row in rows}
+        for row in csv.DictReader(line for line in file if not line.startswith("#")):
+            hip = int(row["hip"])
+            star_of_hip[hip] = StarName(row["designation"], row["name"])
+    return star_of_hip
 
 
 def label_of(hip: int) -> str:
@@ -344,4 +359,6 @@ def label_of(hip: int) -> str:
     any.
     """
     designation, name = star_names().get(hip, ("", ""))
-    return designation or name or (f"HIP {hip}" if hip else "")
+    if designation or name or not hip:
+        return designation or name
+    return f"HIP {hip}"

@@ -32,6 +32,7 @@ class _Zone(NamedTuple):
 
 @cache
 def _zones() -> tuple[_Zone, ...]:
+    """The zones of Roman's table."""
     with ZONES.open(encoding="utf-8", newline="") as file:
         rows = csv.DictReader(line for line in file if not line.startswith("#"))
         zones = []

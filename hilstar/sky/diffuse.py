@@ -60,8 +60,8 @@ class TangentImage:
         return x * scale + middle, y * scale + middle
 
     def seen_by(self, px_rad: float, sigma_px: float) -> "TangentImage":
-        """The same for a camera whose finest pixels have `px_rad`: with pixels nearly as large,
-        and spread by a Gaussian.
+        """The image for a camera whose finest pixels have `px_rad`: with pixels nearly as large,
+        and spread by a Gaussian of `sigma_px` of these.
         """
         from scipy.ndimage import gaussian_filter
 
@@ -80,24 +80,23 @@ class TangentImage:
         return replace(whole, image=image)
 
     def _binned(self, count: int) -> "TangentImage":
+        """The image in blocks of `count` by `count` pixels, with more dark around it for whole
+        ones.
+        """
         if count < 2:
             return self
         half = -self.image.shape[0] % (2 * count) // 2  # sides are even: the middle stays
-        return TangentImage(
-            block_means(np.pad(self.image, half), count),
-            self.axes,
-            self.px_per_tangent / count,
-            self.max_tangent,
-        )
+        image = block_means(np.pad(self.image, half), count)
+        return TangentImage(image, self.axes, self.px_per_tangent / count, self.max_tangent)
 
 
 def block_means(image: Any, count: int) -> Any:
     """The means of blocks of `count` by `count` pixels, dark beyond the last row and column."""
-    rows, columns = (-(-size // count) for size in image.shape)
-    padded = np.pad(
-        image, [(0, n * count - size) for n, size in zip((rows, columns), image.shape, strict=True)]
-    )
-    return padded.reshape(rows, count, columns, count).mean(axis=(1, 3))
+    height, width = image.shape
+    rows, columns = -(-height // count), -(-width // count)
+    padded = np.pad(image, [(0, rows * count - height), (0, columns * count - width)])
+    blocks = padded.reshape(rows, count, columns, count)
+    return blocks.mean(axis=(1, 3))
 
 
 def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
@@ -112,7 +111,10 @@ def read_diffuse_map(path: Path) -> tuple[TangentImage, ...]:
             if table is not None:
                 return _of_healpix(path, table)
             if images:
-                return tuple(face for image in images for face in _of_image(path, image))
+                faces: list[TangentImage] = []
+                for image in images:
+                    faces.extend(_of_image(path, image))
+                return tuple(faces)
     except (InputError, MachineError):
         raise
     except ImageSizeError as error:
@@ -145,10 +147,12 @@ def brightness(path: Path, values: Any, unit_name: str | None) -> FloatArray:
         else:
             unit_text = f"unit {unit_name!r}, which is no surface brightness"
         raise InputError(f"{path}: {unit_text}; {UNIT_ADVICE}") from error
-    return np.asarray(np.maximum(np.nan_to_num(w_m2_m_sr, nan=0.0, posinf=0.0), 0.0))
+    finite = np.nan_to_num(w_m2_m_sr, nan=0.0, posinf=0.0)
+    return np.asarray(np.maximum(finite, 0.0))
 
 
 def _of_image(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
+    """The tangent image about a picture's middle, or a cube's faces where it is too wide."""
     from astropy.wcs import WCS
     from astropy.wcs.utils import proj_plane_pixel_scales, wcs_to_celestial_frame
     from scipy.ndimage import map_coordinates
@@ -171,23 +175,23 @@ def _of_image(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
 
     def sampled(directions: FloatArray) -> FloatArray:
         x, y, z = (directions @ to_frame.T).T
-        place = wcs.world_to_pixel_values(
-            np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(np.clip(z, -1.0, 1.0)))
-        )[::-1]
-        return np.asarray(
-            map_coordinates(light, np.nan_to_num(place, nan=-9.0), order=1, mode="grid-constant")
-        )
+        lon_deg = np.degrees(np.arctan2(y, x))
+        lat_deg = np.degrees(np.arcsin(np.clip(z, -1.0, 1.0)))
+        column, row = wcs.world_to_pixel_values(lon_deg, lat_deg)
+        place = np.nan_to_num((row, column), nan=-9.0)
+        return np.asarray(map_coordinates(light, place, order=1, mode="grid-constant"))
 
     x, y = np.meshgrid(np.linspace(-0.5, columns - 0.5, 33), np.linspace(-0.5, rows - 0.5, 33))
     world = np.radians(wcs.pixel_to_world_values(x.ravel(), y.ravel()))
     lon, lat = world[:, np.isfinite(world).all(axis=0)]
-    frame_directions = to_frame.T @ np.stack(
-        [np.cos(lon) * np.cos(lat), np.sin(lon) * np.cos(lat), np.sin(lat)]
-    )
+    celestial = np.stack([np.cos(lon) * np.cos(lat), np.sin(lon) * np.cos(lat), np.sin(lat)])
+    frame_directions = to_frame.T @ celestial
     middle = frame_directions.mean(axis=1)
     middle /= np.linalg.norm(middle) or 1.0
-    reach = math.acos(np.clip(float((middle @ frame_directions).min()), -1.0, 1.0))
-    if reach > math.radians(MAX_HALF_DEG) or world.shape[1] != frame_directions.shape[1]:
+    smallest_cosine = float((middle @ frame_directions).min())
+    reach = math.acos(np.clip(smallest_cosine, -1.0, 1.0))
+    is_partly_nowhere = world.shape[1] != frame_directions.shape[1]
+    if reach > math.radians(MAX_HALF_DEG) or is_partly_nowhere:
         return _cube(sampled, math.ceil(2 / px_rad))
     axes = _axes_about(middle)
     half = math.tan(reach + px_rad)
@@ -196,6 +200,7 @@ def _of_image(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
 
 
 def _of_healpix(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
+    """A cube's faces of a HEALPix table."""
     try:
         from astropy_healpix import HEALPix
     except ImportError as error:
@@ -216,9 +221,8 @@ def _of_healpix(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
     if header.get("INDXSCHM", "IMPLICIT").strip() != "IMPLICIT" or len(light) != grid.npix:
         raise InputError(f"{path}: {len(light)} pixels of {grid.npix}; give a map of the whole sky")
     if grid.nside > MAX_NSIDE:
-        if grid.order == "nested":
-            nested = light
-        else:
+        nested = light
+        if grid.order != "nested":
             nested = light[grid.nested_to_ring(np.arange(grid.npix))]
         grid = HEALPix(MAX_NSIDE, "nested")
         light = nested.reshape(grid.npix, -1).mean(axis=1)
@@ -232,7 +236,8 @@ def _of_healpix(path: Path, hdu: Any) -> tuple[TangentImage, ...]:
         lat = np.arcsin(np.clip(z, -1.0, 1.0)) * u.rad
         return np.asarray(grid.interpolate_bilinear_lonlat(lon, lat, light))
 
-    return _cube(sampled, math.ceil(2 / grid.pixel_resolution.to_value("rad")))
+    px_rad = grid.pixel_resolution.to_value("rad")
+    return _cube(sampled, math.ceil(2 / px_rad))
 
 
 def _turned(frame: Any) -> FloatArray:
@@ -245,7 +250,9 @@ def _turned(frame: Any) -> FloatArray:
 
 def _axes_about(normal: FloatArray) -> FloatArray:
     """Axes (3, 3) of a tangent plane: any x and y across its normal."""
-    x = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    # the axis that the normal is farthest from
+    farthest = np.eye(3)[np.argmin(np.abs(normal))]
+    x = np.cross(normal, farthest)
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(normal, x), normal])
 
@@ -255,8 +262,12 @@ def _cube(sampled: Sampled, side: int) -> tuple[TangentImage, ...]:
     px_per_tangent = min(side, MAX_CUBE_PX) / 2
     normals = np.concatenate([np.eye(3), -np.eye(3)])
     full = 2 * (math.ceil(px_per_tangent) + EDGE_PX)
-    faces = [_face(sampled, _axes_about(normal), full, px_per_tangent, 1.0) for normal in normals]
-    return tuple(face for face in faces if face.image.any())
+    faces = []
+    for normal in normals:
+        face = _face(sampled, _axes_about(normal), full, px_per_tangent, 1.0)
+        if face.image.any():
+            faces.append(face)
+    return tuple(faces)
 
 
 def _face(
@@ -270,8 +281,9 @@ def _face(
     at = (np.arange(side) - (side - 1) / 2) / px_per_tangent
     image = np.empty((side, side), dtype=np.float32)
     for first in range(0, side, 256):
-        v, u = np.meshgrid(at[first : first + 256], at, indexing="ij")
+        block = slice(first, first + 256)
+        v, u = np.meshgrid(at[block], at, indexing="ij")
         rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ axes
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        image[first : first + 256] = sampled(rays).reshape(u.shape)
+        image[block] = sampled(rays).reshape(u.shape)
     return TangentImage(image, axes, px_per_tangent, max_tangent)

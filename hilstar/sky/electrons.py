@@ -7,11 +7,9 @@ alone, so it is tabulated once per bench; for AGS it is one number.
 Electron rates from real spectra by colour: the Pickles library (Pickles 1998, PASP 110, 863).
 
 Black bodies fail where molecules take over: B-V saturates near 1.5 and turns back, V-I does not. So
-the
-logarithm of a V = 0 star's electron rate is a smooth curve over V-I, with a term in B-V for the
-hottest:
-fitted to the library once per bench. tests/authority/test_pickles.py holds the errors of held-out
-stars.
+the logarithm of a V = 0 star's electron rate is a smooth curve over V-I, with a term in B-V for the
+hottest: fitted to the library once per bench. tests/authority/test_pickles.py holds the errors of
+held-out stars.
 """
 
 from collections.abc import Sequence
@@ -56,14 +54,12 @@ Weighting = Literal["energy", "photon"]
 PACKAGED_LIBRARY = Path(__file__).resolve().parent / "data" / "pickles.npz"
 
 # Natural cubic splines with knots at equal shares of the library. 7 to 14 knots were tried, without
-# B-V and with
-# it up to 0.1, 0.2 and 0.3 mag: from 10 knots on, with B-V, held-out stars are within 1 % (median)
-# and 3 % (95 %)
-# for V-I < 2.5 on the built-in sensors and a flat one; beyond 12 knots nothing improves.
+# B-V and with it up to 0.1, 0.2 and 0.3 mag: from 10 knots on, with B-V, held-out stars are within
+# 1 % (median) and 3 % (95 %) for V-I < 2.5 on the built-in sensors and a flat one; beyond 12 knots
+# nothing improves.
 VI_KNOT_COUNT = 12
 # Up to here (about F0) B-V tells supergiants and reddened stars from dwarfs of the same V-I; past
-# it, B-V
-# follows the metal lines in the blue and makes the rates of cool supergiants worse.
+# it, B-V follows the metal lines in the blue and makes the rates of cool supergiants worse.
 MAX_BV_TERM_MAG = 0.3
 # For stars without V-I. Late M giants have the B-V of K giants and ten times their electrons. The
 # fit excludes them: their rates are wrong, and those of the K giants, fifty times as many to V =
@@ -84,9 +80,8 @@ class Optics:
     transmission: Curve
 
     def __post_init__(self) -> None:
-        if not len(self.quantum_efficiency.wavelength_nm) and not len(
-            self.transmission.wavelength_nm
-        ):
+        efficiency_nm = self.quantum_efficiency.wavelength_nm
+        if not len(efficiency_nm) and not len(self.transmission.wavelength_nm):
             flat = Curve(np.array(SILICON_RANGE_NM), np.full(2, self.quantum_efficiency.value[0]))
             object.__setattr__(self, "quantum_efficiency", flat)
 
@@ -98,11 +93,13 @@ class Optics:
     @property
     def range_nm(self) -> tuple[float, float]:
         """The wavelengths that the tracker detects: where both curves have values."""
-        ranged = []
-        for c in (self.quantum_efficiency, self.transmission):
-            if len(c.wavelength_nm):
-                ranged.append(c.wavelength_nm)
-        return max(w[0] for w in ranged), min(w[-1] for w in ranged)
+        low_nm = []
+        high_nm = []
+        for curve in (self.quantum_efficiency, self.transmission):
+            if len(curve.wavelength_nm):
+                low_nm.append(curve.wavelength_nm[0])
+                high_nm.append(curve.wavelength_nm[-1])
+        return max(low_nm), min(high_nm)
 
 
 def all_channels(channels: Sequence[Optics]) -> Optics:
@@ -149,9 +146,8 @@ def v_band_mean_w_m2_m(temperature_k: float | FloatArray, weighting: Weighting) 
     response = passband(wavelength_nm) * weight_m
     if weighting == "photon":
         response = response * wavelength_nm
-    spectrum = blackbody_exitance_w_m2_m(
-        wavelength_nm, np.asarray(temperature_k, dtype=np.float64)[..., None]
-    )
+    temperature_k = np.asarray(temperature_k, dtype=np.float64)
+    spectrum = blackbody_exitance_w_m2_m(wavelength_nm, temperature_k[..., None])
     return np.asarray(spectrum @ response / response.sum())
 
 
@@ -159,8 +155,7 @@ def reference_mean_w_m2_m(photometry: Photometry) -> float:
     """<F_ref> of a V = 0 star through Johnson V, W/m2/m.
 
     "vega" is the published band average itself, whatever the weighting. "iau-bolometric" is the
-    thesis's:
-    a 9602 K black body with the IAU's bolometric zero point (eq. 3.14, 3.15).
+    thesis's: a 9602 K black body with the IAU's bolometric zero point (eq. 3.14, 3.15).
     """
     if photometry.zero_point == "vega":
         return VEGA_V0_W_M2_M
@@ -174,13 +169,8 @@ def electron_response(optics: Optics) -> tuple[FloatArray, FloatArray]:
     """
     wavelength_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
     electrons_per_j = wavelength_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
-    return (
-        wavelength_nm,
-        optics.quantum_efficiency(wavelength_nm)
-        * optics.transmission(wavelength_nm)
-        * electrons_per_j
-        * weight_m,
-    )
+    efficiency = optics.quantum_efficiency(wavelength_nm) * optics.transmission(wavelength_nm)
+    return wavelength_nm, efficiency * electrons_per_j * weight_m
 
 
 def dgs_electrons_per_s(
@@ -192,9 +182,8 @@ def dgs_electrons_per_s(
     wavelength_nm, response = electron_response(optics)
     temperature_k = np.asarray(temperature_k, dtype=np.float64)
     exitance = blackbody_exitance_w_m2_m(wavelength_nm, temperature_k[..., None])
-    dilution = reference_mean_w_m2_m(photometry) / v_band_mean_w_m2_m(
-        temperature_k, photometry.weighting
-    )
+    mean_w_m2_m = v_band_mean_w_m2_m(temperature_k, photometry.weighting)
+    dilution = reference_mean_w_m2_m(photometry) / mean_w_m2_m
     return np.asarray(optics.area_m2 * dilution * (exitance @ response))
 
 
@@ -207,9 +196,8 @@ def zodiacal_electrons_per_s_arcsec2(
     Zodiacal light is a little redder than the Sun: the WFC3 handbook's spectrum gives 5 % more
     photons from 330 to 1100 nm.
     """
-    return float(
-        flux_ratio(v_mag_arcsec2) * dgs_electrons_per_s(SUN_TEMPERATURE_K, optics, photometry)
-    )
+    sunlight_e_per_s = dgs_electrons_per_s(SUN_TEMPERATURE_K, optics, photometry)
+    return float(flux_ratio(v_mag_arcsec2) * sunlight_e_per_s)
 
 
 def ags_electrons_per_s(optics: Optics, photometry: Photometry) -> float:
@@ -223,12 +211,10 @@ def ags_electrons_per_s(optics: Optics, photometry: Photometry) -> float:
     width_m = (high_nm - low_nm) * 1e-9
     mean_qe = optics.quantum_efficiency(wavelength_nm) @ weight_m / width_m
     mean_transmission = optics.transmission(wavelength_nm) @ weight_m / width_m
-    dilution = reference_mean_w_m2_m(photometry) / v_band_mean_w_m2_m(
-        REFERENCE_TEMPERATURE_K, photometry.weighting
-    )
-    irradiance_w_m2 = dilution * (
-        blackbody_exitance_w_m2_m(wavelength_nm, REFERENCE_TEMPERATURE_K) @ weight_m
-    )
+    mean_w_m2_m = v_band_mean_w_m2_m(REFERENCE_TEMPERATURE_K, photometry.weighting)
+    dilution = reference_mean_w_m2_m(photometry) / mean_w_m2_m
+    exitance = blackbody_exitance_w_m2_m(wavelength_nm, REFERENCE_TEMPERATURE_K)
+    irradiance_w_m2 = dilution * (exitance @ weight_m)
     mean_wavelength_m = (low_nm + high_nm) / 2 * 1e-9
     photons_per_j = mean_wavelength_m / (PLANCK_J_S * LIGHT_M_S)
     return float(optics.area_m2 * irradiance_w_m2 * photons_per_j * mean_qe * mean_transmission)
@@ -265,9 +251,8 @@ def tabulate(model: BrightnessModel, optics: Optics, photometry: Photometry) -> 
             " electron"
         )
     if model == "ags":
-        return RateTable(
-            Chebyshev([np.log(ags_electrons_per_s(optics, photometry))], domain=domain)
-        )
+        log_rate_of_all = np.log(ags_electrons_per_s(optics, photometry))
+        return RateTable(Chebyshev([log_rate_of_all], domain=domain))
 
     def log_rate(inverse_k: FloatArray) -> FloatArray:
         with np.errstate(divide="ignore"):
@@ -337,9 +322,8 @@ class PicklesTable:
             bv = bv_mag[part]
             known = np.isfinite(vi)
             block = log_rate[part]
-            block[known] = self.over_vi(vi[known]) + self.per_bv * np.clip(
-                bv[known], *self.bv_range_mag
-            )
+            bv_term = self.per_bv * np.clip(bv[known], *self.bv_range_mag)
+            block[known] = self.over_vi(vi[known]) + bv_term
             block[~known] = self.over_bv(bv[~known])
         return np.asarray(flux_ratio(v_mag) * np.exp(log_rate))
 
@@ -366,9 +350,8 @@ def tabulate_pickles(optics: Optics, photometry: Photometry) -> PicklesTable:
     library star.
     """
     library = load_library()
-    return fit_table(
-        library.bv_mag, library.vi_mag, library_electrons_per_s(library, optics, photometry)
-    )
+    rate = library_electrons_per_s(library, optics, photometry)
+    return fit_table(library.bv_mag, library.vi_mag, rate)
 
 
 def library_electrons_per_s(library: Library, optics: Optics, photometry: Photometry) -> FloatArray:
@@ -377,19 +360,16 @@ def library_electrons_per_s(library: Library, optics: Optics, photometry: Photom
 
     Raises InputError as `tabulate_pickles` does.
     """
-    curves = optics.quantum_efficiency, optics.transmission
+    efficiency, transmission = optics.quantum_efficiency, optics.transmission
     _check_range(library, optics)
-    nodes_nm, weight_m = integration_nodes(*curves, _knots(library))
+    nodes_nm, weight_m = integration_nodes(efficiency, transmission, _knots(library))
     electrons_per_j = nodes_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
-    response = curves[0](nodes_nm) * curves[1](nodes_nm) * electrons_per_j * weight_m
-    dilution = reference_mean_w_m2_m(photometry) / band_mean(
-        library, load_curve("johnson-v", "johnson-v"), photometry.weighting
-    )
-    rate = (
-        optics.area_m2
-        * dilution
-        * (library.flux @ _onto_grid(library.wavelength_nm, nodes_nm, response))
-    )
+    response = efficiency(nodes_nm) * transmission(nodes_nm) * electrons_per_j * weight_m
+    johnson_v = load_curve("johnson-v", "johnson-v")
+    v_mean = band_mean(library, johnson_v, photometry.weighting)
+    dilution = reference_mean_w_m2_m(photometry) / v_mean
+    detected = library.flux @ _onto_grid(library.wavelength_nm, nodes_nm, response)
+    rate = optics.area_m2 * dilution * detected
     if not (rate > 0).all():
         raise InputError(
             'tracker: a star of the Pickles library gives no electron; write spectrum = "blackbody"'
@@ -405,9 +385,8 @@ def band_mean(library: Library, passband: Curve, weighting: Weighting = "energy"
     response = passband(nodes_nm) * weight_m
     if weighting == "photon":
         response = response * nodes_nm
-    return np.asarray(
-        library.flux @ _onto_grid(library.wavelength_nm, nodes_nm, response) / response.sum()
-    )
+    weights = _onto_grid(library.wavelength_nm, nodes_nm, response)
+    return np.asarray(library.flux @ weights / response.sum())
 
 
 def fit_table(bv_mag: FloatArray, vi_mag: FloatArray, electrons_per_s: FloatArray) -> PicklesTable:
@@ -415,19 +394,18 @@ def fit_table(bv_mag: FloatArray, vi_mag: FloatArray, electrons_per_s: FloatArra
     log_rate = np.log(electrons_per_s)
     vi_knots_mag = _knots_at_equal_shares(vi_mag, VI_KNOT_COUNT)
     bv_range_mag = float(bv_mag.min()), MAX_BV_TERM_MAG
-    design = np.column_stack([natural_basis(vi_mag, vi_knots_mag), np.clip(bv_mag, *bv_range_mag)])
+    bv_term_mag = np.clip(bv_mag, *bv_range_mag)
+    design = np.column_stack([natural_basis(vi_mag, vi_knots_mag), bv_term_mag])
     *over_vi, per_bv = np.linalg.lstsq(design, log_rate)[0]
     plain = vi_mag < MAX_BV_FIT_VI_MAG
     bv_knots_mag = _knots_at_equal_shares(bv_mag[plain], BV_KNOT_COUNT)
-    over_bv = np.array(
-        np.linalg.lstsq(natural_basis(bv_mag[plain], bv_knots_mag), log_rate[plain])[0],
-        dtype=np.float64,
-    )
+    bv_design = natural_basis(bv_mag[plain], bv_knots_mag)
+    over_bv = np.array(np.linalg.lstsq(bv_design, log_rate[plain])[0], dtype=np.float64)
     return PicklesTable(
-        Spline(vi_knots_mag, np.array(over_vi)),
-        float(per_bv),
-        bv_range_mag,
-        Spline(bv_knots_mag, over_bv),
+        over_vi=Spline(vi_knots_mag, np.array(over_vi)),
+        per_bv=float(per_bv),
+        bv_range_mag=bv_range_mag,
+        over_bv=Spline(bv_knots_mag, over_bv),
     )
 
 
@@ -437,17 +415,22 @@ def natural_basis(colour_mag: FloatArray, knots_mag: FloatArray) -> FloatArray:
     """
     x = np.clip(colour_mag, knots_mag[0], knots_mag[-1])[:, None]
     last = np.maximum(x - knots_mag[-1], 0) ** 3
-    d = (np.maximum(x - knots_mag[:-1], 0) ** 3 - last) / (knots_mag[-1] - knots_mag[:-1])
+    cubic = np.maximum(x - knots_mag[:-1], 0) ** 3
+    d = (cubic - last) / (knots_mag[-1] - knots_mag[:-1])
     return np.hstack([np.ones_like(x), x, d[:, :-1] - d[:, -1:]])
 
 
 def _knots_at_equal_shares(colour_mag: FloatArray, count: int) -> FloatArray:
     """Quantiles, bit for bit NumPy's, whose own import `numpy.ma`: that takes 10 ms."""
-    whole, part = np.divmod(np.linspace(0, 1, count) * (len(colour_mag) - 1), 1)
-    low, high = np.sort(colour_mag)[[whole.astype(np.intp), np.ceil(whole + part).astype(np.intp)]]
-    return np.asarray(
-        np.where(part < 0.5, low + (high - low) * part, high - (high - low) * (1 - part))
-    )
+    places = np.linspace(0, 1, count) * (len(colour_mag) - 1)
+    whole, part = np.divmod(places, 1)
+    lower = whole.astype(np.intp)
+    upper = np.ceil(whole + part).astype(np.intp)
+    rising_mag = np.sort(colour_mag)
+    low, high = rising_mag[lower], rising_mag[upper]
+    from_low = low + (high - low) * part
+    from_high = high - (high - low) * (1 - part)
+    return np.asarray(np.where(part < 0.5, from_low, from_high))
 
 
 def _knots(library: Library) -> Curve:
@@ -459,7 +442,8 @@ def _onto_grid(grid_nm: FloatArray, nodes_nm: FloatArray, response: FloatArray) 
     """Weights on the samples that integrate the straight lines between them as `response` does
     at the nodes.
     """
-    lower_node = np.clip(np.searchsorted(grid_nm, nodes_nm, side="right") - 1, 0, len(grid_nm) - 2)
+    interval = np.searchsorted(grid_nm, nodes_nm, side="right") - 1
+    lower_node = np.clip(interval, 0, len(grid_nm) - 2)
     share = (nodes_nm - grid_nm[lower_node]) / (grid_nm[lower_node + 1] - grid_nm[lower_node])
     weights = np.bincount(lower_node, response * (1 - share), len(grid_nm))
     return np.asarray(weights + np.bincount(lower_node + 1, response * share, len(grid_nm)))

@@ -18,6 +18,7 @@ from hilstar.sky.stars import RAD_PER_MAS
 PACKAGED_FACTS = Path(__file__).resolve().parent / "data" / "hipparcos_facts.npz"
 
 MOTION = ("ra", "dec", "pm_ra", "pm_dec")  # the parameters whose errors are carried to an epoch
+SIGMAS = ("sigma_ra_mas", "sigma_dec_mas", "sigma_pm_ra_mas_yr", "sigma_pm_dec_mas_yr")  # theirs
 # Columns of hip_main.dat (CDS I/239 ReadMe): name -> (column counted from 0, steps per unit, stored
 # as).
 STEP_FACTS: dict[str, tuple[int, int, str]] = {
@@ -69,7 +70,8 @@ def facts_of(hip: npt.NDArray[np.int32]) -> dict[str, npt.NDArray[Any]]:
     """
     facts = _packaged()
     order = np.argsort(facts["hip"])
-    place = np.minimum(np.searchsorted(facts["hip"], hip, sorter=order), len(order) - 1)
+    place = np.searchsorted(facts["hip"], hip, sorter=order)
+    place = np.minimum(place, len(order) - 1)
     row = order[place]
     has_row = facts["hip"][row] == hip
     facts_by_name: dict[str, npt.NDArray[Any]] = {}
@@ -86,11 +88,12 @@ def errors_of(catalog: Catalog) -> dict[str, npt.NDArray[Any]]:
     own figures: NaN for the stars of a table, whose figures are not Hipparcos'.
     """
     facts = facts_of(catalog.hip)
-    is_hipparcos = (catalog.identifier == catalog.hip) & (
-        catalog.epoch_jyear == HIPPARCOS_EPOCH_JYEAR
-    )
-    errors = [name for name in STEP_FACTS if name.startswith("sigma_")]
-    return facts | {name: np.where(is_hipparcos, facts[name], np.nan) for name in errors}
+    has_epoch = catalog.epoch_jyear == HIPPARCOS_EPOCH_JYEAR
+    is_hipparcos = (catalog.identifier == catalog.hip) & has_epoch
+    for name in STEP_FACTS:
+        if name.startswith("sigma_"):
+            facts[name] = np.where(is_hipparcos, facts[name], np.nan)
+    return facts
 
 
 class PropagatedPlaces(NamedTuple):
@@ -124,26 +127,30 @@ def motion_at(
             catalog.pm_ra_cosdec_mas_yr * RAD_PER_MAS,
             catalog.pm_dec_mas_yr * RAD_PER_MAS,
         )
-    )
-    u, pm_ra, pm_dec = _moved(start.astype(np.complex128), years)
+    ).astype(np.complex128)
+    cos_dec = np.cos(start[1].real)
+    u, pm_ra, pm_dec = _moved(start, years)
     x, y, z = u.real
     flat = np.hypot(x, y)
     jacobian = np.empty((len(catalog), 4, 4))
     for k in range(4):
-        varied = start.astype(np.complex128)
+        varied = start.copy()
         if k == 0:
-            varied[k] += 1j * STEP / np.cos(start[1])  # RA: its error is given times cos Dec
+            varied[k] += 1j * STEP / cos_dec  # RA: its error is given times cos Dec
         else:
             varied[k] += 1j * STEP
-        du, d_ra, d_dec = (part.imag / STEP for part in _moved(varied, years))
-        jacobian[:, 0, k] = (x * du[1] - y * du[0]) / flat
-        jacobian[:, 1, k] = flat * du[2] - z * (x * du[0] + y * du[1]) / flat
-        jacobian[:, 2, k], jacobian[:, 3, k] = d_ra, d_dec
-    covariance = jacobian @ _covariance(facts) @ jacobian.transpose(0, 2, 1)
-    ra_deg = np.degrees(np.arctan2(y, x)) % 360.0
-    dec_deg = np.degrees(np.arctan2(z, flat))
+        varied_u, varied_pm_ra, varied_pm_dec = _moved(varied, years)
+        dx, dy, dz = varied_u.imag / STEP
+        jacobian[:, 0, k] = (x * dy - y * dx) / flat
+        jacobian[:, 1, k] = flat * dz - z * (x * dx + y * dy) / flat
+        jacobian[:, 2, k] = varied_pm_ra.imag / STEP
+        jacobian[:, 3, k] = varied_pm_dec.imag / STEP
     return PropagatedPlaces(
-        ra_deg, dec_deg, pm_ra.real / RAD_PER_MAS, pm_dec.real / RAD_PER_MAS, covariance
+        ra_deg=np.degrees(np.arctan2(y, x)) % 360.0,
+        dec_deg=np.degrees(np.arctan2(z, flat)),
+        pm_ra_mas_yr=pm_ra.real / RAD_PER_MAS,
+        pm_dec_mas_yr=pm_dec.real / RAD_PER_MAS,
+        covariance=jacobian @ _covariance(facts) @ jacobian.transpose(0, 2, 1),
     )
 
 
@@ -159,41 +166,30 @@ def _moved(
     sin_dec = np.sin(dec)
     cos_dec = np.cos(dec)
     u0 = np.stack((cos_dec * cos_ra, cos_dec * sin_ra, sin_dec))
-    motion = np.stack(
-        (
-            -east * sin_ra - north * sin_dec * cos_ra,
-            east * cos_ra - north * sin_dec * sin_ra,
-            north * cos_dec,
-        )
-    )
+    motion_x = -east * sin_ra - north * sin_dec * cos_ra
+    motion_y = east * cos_ra - north * sin_dec * sin_ra
+    motion = np.stack((motion_x, motion_y, north * cos_dec))
     squared = east**2 + north**2
     shrink = 1 / np.sqrt(1 + squared * years**2)
     u = (u0 + motion * years) * shrink
     motion = (motion - u0 * squared * years) * shrink**3
-    flat = np.sqrt(u[0] ** 2 + u[1] ** 2)
-    return u, (u[0] * motion[1] - u[1] * motion[0]) / flat, motion[2] / flat
+    x, y, _ = u
+    along_x, along_y, along_z = motion
+    flat = np.sqrt(x**2 + y**2)
+    return u, (x * along_y - y * along_x) / flat, along_z / flat
 
 
 def _covariance(facts: dict[str, npt.NDArray[Any]]) -> FloatArray:
     """The covariance (n, 4, 4) of the catalogue's own epoch."""
-    sigma = np.stack(
-        [
-            facts[name]
-            for name in (
-                "sigma_ra_mas",
-                "sigma_dec_mas",
-                "sigma_pm_ra_mas_yr",
-                "sigma_pm_dec_mas_yr",
-            )
-        ]
-    )
+    sigma = np.stack([facts[name] for name in SIGMAS])
     covariance = np.empty((sigma.shape[1], 4, 4))
     for i, quantity in enumerate(MOTION):
         covariance[:, i, i] = sigma[i] ** 2
         for j in range(i + 1, 4):
-            covariance[:, i, j] = covariance[:, j, i] = (
-                sigma[i] * sigma[j] * facts[f"{quantity}_{MOTION[j]}_correlation"]
-            )
+            correlation = facts[f"{quantity}_{MOTION[j]}_correlation"]
+            both = sigma[i] * sigma[j] * correlation
+            covariance[:, i, j] = both
+            covariance[:, j, i] = both
     return covariance
 
 
@@ -205,4 +201,5 @@ def sigma_v_mag(facts: dict[str, npt.NDArray[Any]], bv_mag: FloatArray) -> Float
     for source, (blue, red) in V_SCATTER_MAG.items():
         chosen = facts["v_source"] == source
         scatter[chosen] = np.where(bv_mag[chosen] < RED_BV_MAG, blue, red)
-    return np.asarray(np.hypot(facts["sigma_measured_mag"], scatter), dtype=np.float64)
+    measured_mag = facts["sigma_measured_mag"]
+    return np.asarray(np.hypot(measured_mag, scatter), dtype=np.float64)

@@ -52,7 +52,7 @@ NOISE = 0.13
 LATE_SUBCLASS = (55.0, 65.0)
 LATE_EXTRA = 1.5
 TREND_DEGREE = 3  # of the polynomial in V-I that the rates' logarithms depart from
-BLOCK_STARS = 4000
+BLOCK_STARS = 4000  # evaluated at once, which bounds the memory
 
 
 def luminosity_class(spectral_type: npt.NDArray[np.bytes_]) -> npt.NDArray[np.str_]:
@@ -74,20 +74,30 @@ def read_types(spectral_type: npt.NDArray[np.bytes_]) -> FloatArray:
     middle of its ten.
     """
     texts, which = np.unique(spectral_type, return_inverse=True)
-    return np.array([_read(text.decode()) for text in texts.tolist()]).reshape(-1, 2)[which]
+    types = [_read(text.decode()) for text in texts.tolist()]
+    return np.array(types).reshape(-1, 2)[which]
 
 
 def _read(text: str) -> tuple[float, float]:
+    """Subclass and luminosity class of a type; NaN for what is not there."""
     type_match = TYPE.match(text)
     if type_match is None:
         return np.nan, np.nan
     letter, first, other, second = type_match.groups()
-    subclass = [10.0 * LETTERS.index(letter) + float(first or 5)]
+    subclasses = [_subclass(letter, first or "5")]
     if first and second:
-        subclass.append(10.0 * LETTERS.index(other or letter) + float(second))
-    classes = [CLASSES.get(name, 1.0) for name in CLASS.findall(text.partition("+")[0])]
-    mean_class = float(np.mean(classes)) if classes else np.nan
-    return float(np.mean(subclass)), mean_class
+        subclasses.append(_subclass(other or letter, second))
+    subclass = float(np.mean(subclasses))
+    without_companion = text.partition("+")[0]
+    classes = [CLASSES.get(name, 1.0) for name in CLASS.findall(without_companion)]
+    if not classes:
+        return subclass, np.nan
+    return subclass, float(np.mean(classes))
+
+
+def _subclass(letter: str, digits: str) -> float:
+    """A type's place in the row of all, ten to a letter: A0 is 20."""
+    return 10.0 * LETTERS.index(letter) + float(digits)
 
 
 def star_types(catalog: Catalog) -> FloatArray:
@@ -99,16 +109,13 @@ def star_types(catalog: Catalog) -> FloatArray:
     """
     facts = facts_of(catalog.hip)
     kind = read_types(facts["spectral_type"])
-    parallax_mas = np.maximum(
-        catalog.parallax_mas, MIN_PARALLAX_SIGMAS * facts["sigma_parallax_mas"]
-    )
-    absolute_mag = (
-        catalog.v_mag - 10 + 5 * np.log10(np.where(parallax_mas > 0, parallax_mas, np.nan))
-    )
+    least_mas = MIN_PARALLAX_SIGMAS * facts["sigma_parallax_mas"]
+    parallax_mas = np.maximum(catalog.parallax_mas, least_mas)
+    parallax_mas = np.where(parallax_mas > 0, parallax_mas, np.nan)
+    absolute_mag = catalog.v_mag - 10 + 5 * np.log10(parallax_mas)
     dwarf = absolute_mag > np.interp(kind[:, 0], GIANT_SUBCLASS, GIANT_MAG)
-    by_mag = np.where(
-        dwarf, CLASSES["V"], np.where(absolute_mag < SUPERGIANT_MAG, 1.0, CLASSES["III"])
-    )
+    evolved = np.where(absolute_mag < SUPERGIANT_MAG, 1.0, CLASSES["III"])
+    by_mag = np.where(dwarf, CLASSES["V"], evolved)
     by_mag[np.isnan(absolute_mag)] = np.nan
     kind[:, 1] = np.where(np.isnan(kind[:, 1]), by_mag, kind[:, 1])
     return kind
@@ -124,19 +131,21 @@ def bare_and_dusty() -> electrons.Library:
     bare = electrons.load_library()
     wavelength_nm = bare.wavelength_nm
     curve = CubicSpline(DUST_PER_UM, DUST_MAG, bc_type="natural")
-    flux = bare.flux * flux_ratio(DUST_EBV_MAG * curve(1000.0 / wavelength_nm))
+    extinction_mag = DUST_EBV_MAG * curve(1000.0 / wavelength_nm)
+    flux = bare.flux * flux_ratio(extinction_mag)
     behind = replace(bare, flux=flux)
-    v, i = (read_curve_csv(DATA_DIR / f"{name}.csv") for name in ("johnson-v", "bessell-i"))
+    v = read_curve_csv(DATA_DIR / "johnson-v.csv")
+    i = read_curve_csv(DATA_DIR / "bessell-i.csv")
     light = electrons.band_mean(behind, v)
-    redder = magnitude(light / electrons.band_mean(behind, i)) - magnitude(
-        electrons.band_mean(bare, v) / electrons.band_mean(bare, i)
-    )
+    dusty_vi_mag = magnitude(light / electrons.band_mean(behind, i))
+    bare_vi_mag = magnitude(electrons.band_mean(bare, v) / electrons.band_mean(bare, i))
+    reddening_mag = dusty_vi_mag - bare_vi_mag
     return electrons.Library(
-        wavelength_nm,
-        np.concatenate([bare.flux, flux / light[:, None]]),
-        bare.spectral_type * 2,
-        np.tile(bare.bv_mag, 2),
-        np.concatenate([bare.vi_mag, bare.vi_mag + redder]),
+        wavelength_nm=wavelength_nm,
+        flux=np.concatenate([bare.flux, flux / light[:, None]]),
+        spectral_type=bare.spectral_type * 2,
+        bv_mag=np.tile(bare.bv_mag, 2),
+        vi_mag=np.concatenate([bare.vi_mag, bare.vi_mag + reddening_mag]),
     )
 
 
@@ -168,18 +177,19 @@ class TypeTable:
         rate = self.by_colour.electrons_per_s(v_mag, bv_mag, vi_mag)
         if kind is None:
             return rate
-        known = np.flatnonzero(np.isfinite(kind).all(axis=1) & np.isfinite(vi_mag))
+        has_type = np.isfinite(kind).all(axis=1)
+        known = np.flatnonzero(has_type & np.isfinite(vi_mag))
         kinds, which = np.unique(kind[known], axis=0, return_inverse=True)
         weight = self.weight * _alike_types(kinds, self.spectra)
-        vi_mag = np.clip(vi_mag[known], self.spectra[:, 2].min(), self.spectra[:, 2].max())
+        library_vi_mag = self.spectra[:, 2]
+        vi_mag = np.clip(vi_mag[known], library_vi_mag.min(), library_vi_mag.max())
         for begin in range(0, len(known), BLOCK_STARS):
             part = slice(begin, begin + BLOCK_STARS)
-            departure = np.einsum(
-                "nk,nk->n", weight[which[part]], _alike_colours(vi_mag[part], self.spectra[:, 2])
-            )
-            rate[known[part]] = flux_ratio(v_mag[known[part]]) * np.exp(
-                departure + _trend(vi_mag[part]) @ self.trend
-            )
+            star = known[part]
+            alike = _alike_colours(vi_mag[part], library_vi_mag)
+            departure = np.einsum("nk,nk->n", weight[which[part]], alike)
+            log_rate = departure + _trend(vi_mag[part]) @ self.trend
+            rate[star] = flux_ratio(v_mag[star]) * np.exp(log_rate)
         return rate
 
 
@@ -187,23 +197,25 @@ def _alike_types(kind: FloatArray, other: FloatArray) -> FloatArray:
     """The part of the covariance of ln(rate) that types have, between (n, 2 or more) and (k, 2
     or more), shape (n, k).
     """
-    late = []
-    for part in (kind, other):
-        late.append(1 + LATE_EXTRA * np.interp(part[:, 0], LATE_SUBCLASS, (0.0, 1.0)))
-    apart = []
-    for column, length in enumerate(TYPE_LENGTHS):
-        apart.append((kind[:, column, None] - other[:, column]) / length)
-    return np.asarray(late[0][:, None] * late[1] * np.exp(-(apart[0] ** 2 + apart[1] ** 2) / 2))
+    subclass_length, class_length = TYPE_LENGTHS
+    subclass = kind[:, 0]
+    other_subclass = other[:, 0]
+    late = 1 + LATE_EXTRA * np.interp(subclass, LATE_SUBCLASS, (0.0, 1.0))
+    other_late = 1 + LATE_EXTRA * np.interp(other_subclass, LATE_SUBCLASS, (0.0, 1.0))
+    subclass_apart = (subclass[:, None] - other_subclass) / subclass_length
+    class_apart = (kind[:, 1, None] - other[:, 1]) / class_length
+    apart = subclass_apart**2 + class_apart**2
+    return np.asarray(late[:, None] * other_late * np.exp(-apart / 2))
 
 
 def _alike_colours(vi_mag: FloatArray, other_mag: FloatArray) -> FloatArray:
     """The part that V-I (n,) and (k,) have, shape (n, k)."""
-    return np.asarray(
-        np.exp(-(((vi_mag[:, None] - other_mag) / COLOUR_LENGTH_MAG) ** 2) / 2) + ANY_COLOUR
-    )
+    apart = (vi_mag[:, None] - other_mag) / COLOUR_LENGTH_MAG
+    return np.asarray(np.exp(-(apart**2) / 2) + ANY_COLOUR)
 
 
 def _trend(vi_mag: FloatArray) -> FloatArray:
+    """The powers (n, TREND_DEGREE + 1) of V-I, the highest first."""
     return np.vander(vi_mag, TREND_DEGREE + 1)
 
 
@@ -212,7 +224,8 @@ def fit_types(rate: FloatArray) -> TypeTable:
     above zero, shape (m,).
     """
     library = bare_and_dusty()
-    return fit_spectra(read_types(np.array(library.spectral_type, dtype=np.bytes_)), library, rate)
+    kind = read_types(np.array(library.spectral_type, dtype=np.bytes_))
+    return fit_spectra(kind, library, rate)
 
 
 def fit_spectra(kind: FloatArray, library: electrons.Library, rate: FloatArray) -> TypeTable:
@@ -224,19 +237,22 @@ def fit_spectra(kind: FloatArray, library: electrons.Library, rate: FloatArray) 
     covariance[np.diag_indices(len(rate))] += NOISE**2
     trend = _trend(library.vi_mag)
     # The departures' weights are at right angles to the trend.
-    system = np.block(
-        [[covariance, trend], [trend.T, np.zeros((TREND_DEGREE + 1, TREND_DEGREE + 1))]]
-    )
-    solution = np.linalg.solve(system, np.concatenate([np.log(rate), np.zeros(TREND_DEGREE + 1)]))
+    terms = TREND_DEGREE + 1
+    none = np.zeros((terms, terms))
+    system = np.block([[covariance, trend], [trend.T, none]])
+    right_side = np.concatenate([np.log(rate), np.zeros(terms)])
+    solution = np.linalg.solve(system, right_side)
     weight = solution[: len(rate)]
     coefficients = solution[len(rate) :]
     by_colour = electrons.fit_table(library.bv_mag[bare], library.vi_mag[bare], rate[bare])
-    return TypeTable(by_colour, coefficients, np.column_stack([kind, library.vi_mag]), weight)
+    spectra = np.column_stack([kind, library.vi_mag])
+    return TypeTable(by_colour, coefficients, spectra, weight)
 
 
 def tabulate_types(optics: electrons.Optics, photometry: electrons.Photometry) -> TypeTable:
     """The rate table of a bench. Raises InputError as `tabulate_pickles` does."""
-    return fit_types(electrons.library_electrons_per_s(bare_and_dusty(), optics, photometry))
+    rate = electrons.library_electrons_per_s(bare_and_dusty(), optics, photometry)
+    return fit_types(rate)
 
 
 def class_shares(optics: electrons.Optics, from_nm: float) -> dict[str, float]:
@@ -247,9 +263,13 @@ def class_shares(optics: electrons.Optics, from_nm: float) -> dict[str, float]:
     """
     library = electrons.load_library()
     nm = library.wavelength_nm
-    detected = library.flux * nm * optics.quantum_efficiency(nm) * optics.transmission(nm)
-    shares = detected[:, nm >= from_nm].sum(axis=1) / np.maximum(
-        detected.sum(axis=1), np.finfo(np.float64).tiny
-    )
+    photons = library.flux * nm
+    detected = photons * optics.quantum_efficiency(nm) * optics.transmission(nm)
+    total = np.maximum(detected.sum(axis=1), np.finfo(np.float64).tiny)
+    beyond = detected[:, nm >= from_nm].sum(axis=1)
+    shares = beyond / total
     classes = np.array([kind[0] for kind in library.spectral_type])
-    return {letter: float(shares[classes == letter].mean()) for letter in LETTERS}
+    by_class = {}
+    for letter in LETTERS:
+        by_class[letter] = float(shares[classes == letter].mean())
+    return by_class

@@ -256,6 +256,9 @@ def _unit_by_range(low: float, high: float) -> str | None:
 
 
 def _check_curve(curve: Curve, path: Path, highest: float) -> None:
+    """Raise InputError for a curve of too few or too many rows, that do not rise, or beyond what
+    their kind can have.
+    """
     wavelength_nm = curve.wavelength_nm
     value = curve.value
     if len(wavelength_nm) < 2:
@@ -278,9 +281,8 @@ def _check_curve(curve: Curve, path: Path, highest: float) -> None:
             f"{path}: wavelengths from {ends}; write {RANGE_NM[0]:g} to {RANGE_NM[1]:g} nm"
         )
     if value.min() < 0 or value.max() > highest:
-        if highest == 1:
-            what = "fractions from 0 to 1"
-        else:
+        what = "fractions from 0 to 1"
+        if highest != 1:
             what = f"numbers from 0 to {highest:g}"
         raise InputError(f"{path}: values from {value.min():g} to {value.max():g}; write {what}")
 
@@ -300,7 +302,9 @@ def blackbody_exitance_w_m2_m(
 
 def temperature_ballesteros2012_k(bv_mag: FloatArray) -> FloatArray:
     """Colour temperature from B-V (Ballesteros 2012, EPL 97, 34008, eq. 14): smooth everywhere."""
-    return np.asarray(4600.0 * (1.0 / (0.92 * bv_mag + 1.7) + 1.0 / (0.92 * bv_mag + 0.62)))
+    hotter = 1.0 / (0.92 * bv_mag + 1.7)
+    cooler = 1.0 / (0.92 * bv_mag + 0.62)
+    return np.asarray(4600.0 * (hotter + cooler))
 
 
 def temperature_wang2021_k(bv_mag: FloatArray) -> FloatArray:
@@ -333,19 +337,20 @@ def integration_nodes(*curves: Curve) -> tuple[FloatArray, FloatArray]:
     low = max(w[0] for w in ranged)
     high = min(w[-1] for w in ranged)
     knots = np.sort(np.concatenate(ranged))
-    knots = knots[(knots >= low) & (knots <= high) & (np.diff(knots, prepend=-np.inf) > 0)]
+    is_new = np.diff(knots, prepend=-np.inf) > 0
+    knots = knots[(knots >= low) & (knots <= high) & is_new]
     if len(knots) < 2:
         raise InputError(
             "the quantum efficiency and the transmission share no wavelength; check that both are"
             " in nm"
         )
-    pieces = np.maximum(1, np.ceil(np.diff(knots) / MAX_INTERVAL_NM)).astype(int)
+    widths = np.diff(knots)
+    pieces = np.maximum(1, np.ceil(widths / MAX_INTERVAL_NM)).astype(int)
     # number within its interval, from 0
-    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    edges = np.append(
-        np.repeat(knots[:-1], pieces) + piece * np.repeat(np.diff(knots) / pieces, pieces),
-        knots[-1],
-    )
+    first_piece = np.cumsum(pieces) - pieces
+    piece = np.arange(pieces.sum()) - np.repeat(first_piece, pieces)
+    begins = np.repeat(knots[:-1], pieces) + piece * np.repeat(widths / pieces, pieces)
+    edges = np.append(begins, knots[-1])
     half = np.diff(edges)[:, None] / 2
     wavelength_nm = (edges[:-1, None] + half * (1 + NODES)).ravel()
     return wavelength_nm, (half * WEIGHTS).ravel() * 1e-9

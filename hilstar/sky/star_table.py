@@ -90,7 +90,8 @@ MAX_STORED_BYTES = 3_000_000_000
 DTYPES = {"hip": "i4", "identifier": "i8", "variable": "S1", "multiple": "S1"} | dict.fromkeys(
     ("range_mag", "period_d", "separation_arcsec"), "f4"
 )
-ALWAYS_KNOWN = ("ra_deg", "dec_deg", "v_mag", "bv_mag", "pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+MOTIONS = ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")
+ALWAYS_KNOWN = ("ra_deg", "dec_deg", "v_mag", "bv_mag", *MOTIONS)
 log = logging.getLogger(__name__)
 MAY_BE_UNKNOWN = ("vi_mag", "parallax_mas")
 _STATE_EPOCH = "write [sky] catalogue_epoch_jyear, such as 2000.0"
@@ -130,7 +131,7 @@ def assemble(
     columns.check_turn()
     ra_deg, dec_deg = columns.places()
     v_mag, bv_mag, vi_mag, notes = columns.magnitudes()
-    pm = {role: columns.role(role, 0.0) for role in ("pm_ra_cosdec_mas_yr", "pm_dec_mas_yr")}
+    pm = {role: columns.role(role, 0.0) for role in MOTIONS}
     figures: dict[str, npt.NDArray[Any]] = {
         "ra_deg": ra_deg,
         "dec_deg": dec_deg,
@@ -149,17 +150,17 @@ def assemble(
             f"{path}: none of its {len(reason)} rows is a star ({_reasons(reason)});"
             f" {table_reader.COLUMNS_WANTED}"
         )
-    dated = compared or any((motion[is_usable] != 0).any() for motion in pm.values())
+    is_moving = any(motion[is_usable].any() for motion in pm.values())
+    dated = compared or is_moving
     epoch, epoch_words = columns.epoch(stated_epoch_jyear, dated, designation)
     for doubt in (columns.places_doubt(), columns.motions_doubt(pm)):
         if doubt and not columns.is_gaia:
             raise InputError(f"{path}: {doubt}")
         if doubt:
             columns.notices.append(f"{doubt}; taken as Gaia's archive has it")
-    if _repeats(identifier[is_usable]):
-        columns.notices.append(
-            f"{_repeats(identifier[is_usable])} of its stars have {NO_IDENTIFIER}"
-        )
+    repeats = _repeats(identifier[is_usable])
+    if repeats:
+        columns.notices.append(f"{repeats} of its stars have {NO_IDENTIFIER}")
         designation, identifier = columns.row_numbers()
     hip = columns.hip()
     repeated = _repeated_hip(hip, is_usable)
@@ -170,9 +171,8 @@ def assemble(
         "identifier": identifier,
         "hip": _once(hip, is_usable, v_mag),
     }
-    catalog = plain_catalog(
-        designation, len(is_usable), {name: values[is_usable] for name, values in figures.items()}
-    )
+    usable = {name: values[is_usable] for name, values in figures.items()}
+    catalog = plain_catalog(designation, len(is_usable), usable)
     if is_usable.all():
         rest = ""
     else:
@@ -181,7 +181,8 @@ def assemble(
         f"{path.name}: {len(catalog)} stars of {len(is_usable)} rows, {notes}; {epoch_words}{rest}"
     )
     doubts = tuple(f"{path.name}: {notice}" for notice in columns.notices)
-    return Assembled(catalog, line, int((~is_usable).sum()), doubts)
+    dropped = len(is_usable) - len(catalog)
+    return Assembled(catalog, line, dropped, doubts)
 
 
 class TableMagnitudes(NamedTuple):
@@ -206,23 +207,23 @@ class _Columns:
     @property
     def is_gaia(self) -> bool:
         """Whether the table has the names of Gaia's archive, which say the units."""
-        return (
-            all(name in self.layout.role for name in ("gaia", "g_mag"))
-            and self.pair[0].lower() == "ra"
-        )
+        role = self.layout.role
+        if "gaia" not in role or "g_mag" not in role:
+            return False
+        return self.pair[0].lower() == "ra"
 
     def has_unit(self, column: str) -> bool:
+        """Whether the table states a column's unit."""
         return bool((self.table.unit.get(column) or "").strip())
 
     def _in_unit(self, role: str, column: str) -> FloatArray:
-        factor = table_reader.factor_to(role, column, self.table.unit.get(column), self.path)
+        """A column (n,) in the unit that a role has; another one is told."""
+        unit = self.table.unit.get(column)
+        factor = table_reader.factor_to(role, column, unit, self.path)
         values = np.asarray(self.table.columns[column], dtype=np.float64)
         if factor == 1.0:
             return values
-        notice = (
-            f"column {column} is in {self.table.unit.get(column)}, and is multiplied by"
-            f" {factor:.9g}"
-        )
+        notice = f"column {column} is in {unit}, and is multiplied by {factor:.9g}"
         if notice not in self.notices:
             self.notices.append(notice)
         return values * factor
@@ -243,8 +244,9 @@ class _Columns:
         """Why places without a unit may be hours or radians, and what to write; "" where they are
         degrees.
         """
-        name = self.pair[0]
-        ra, dec = (np.asarray(self.table.columns[column], dtype=np.float64) for column in self.pair)
+        name, dec_name = self.pair
+        ra = np.asarray(self.table.columns[name], dtype=np.float64)
+        dec = np.asarray(self.table.columns[dec_name], dtype=np.float64)
         placed = np.isfinite(ra) & np.isfinite(dec)
         if self.has_unit(name) or not placed.any():
             return ""
@@ -253,7 +255,8 @@ class _Columns:
         steepest = np.abs(dec[placed]).max()
         base = f"column {name} has no unit and runs from {low:.6g} to {high:.6g}"
         names = "ra_deg, ra_hours or ra_rad"
-        if low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN and steepest <= RAD_A_TURN / 4:
+        is_a_turn = low >= -RAD_A_TURN / 2 and high <= RAD_A_TURN
+        if is_a_turn and steepest <= RAD_A_TURN / 4:
             return (
                 f"{base}: radians, hours or degrees? {UNIT_ADVICE}: {names}, with dec_deg or"
                 " dec_rad"
@@ -266,17 +269,23 @@ class _Columns:
         """Why proper motions without a unit are too small to be mas a year; "" where they are
         not.
         """
-        given = [self.layout.role[role] for role in motions if role in self.layout.role]
+        given = []
+        for role in motions:
+            if role in self.layout.role:
+                given.append(self.layout.role[role])
         if not given or any(map(self.has_unit, given)):
             return ""
         total = np.hypot(*motions.values())
         moving = total[total > 0]
-        if len(moving) < MOTION_STARS or np.median(moving) >= MIN_MEDIAN_MAS_YR:
+        if len(moving) < MOTION_STARS:
             return ""
-        median = f"half of its stars move by less than {np.median(moving):.3g}"
-        advice = f"{UNIT_ADVICE}: {given[0]}_arcsec_yr or {given[0]}_mas_yr"
+        median = np.median(moving)
+        if median >= MIN_MEDIAN_MAS_YR:
+            return ""
+        name = given[0]
         return (
-            f"column {given[0]} has no unit, and {median}, so they are in arcsec a year; {advice}"
+            f"column {name} has no unit, and half of its stars move by less than {median:.3g}, so"
+            f" they are in arcsec a year; {UNIT_ADVICE}: {name}_arcsec_yr or {name}_mas_yr"
         )
 
     def role(self, role: str, blank: float) -> FloatArray:
@@ -289,7 +298,8 @@ class _Columns:
         """Right ascension, 0 to 360, and declination, degrees; NaN where no pair of columns has
         both.
         """
-        ra_deg, dec_deg = (np.full(self.table.row_count, np.nan) for _ in range(2))
+        ra_deg = np.full(self.table.row_count, np.nan)
+        dec_deg = np.full(self.table.row_count, np.nan)
         for ra, dec in self.layout.places:
             blank = ~(np.isfinite(ra_deg) & np.isfinite(dec_deg))
             if not blank.any():
@@ -301,20 +311,23 @@ class _Columns:
 
     def magnitudes(self) -> TableMagnitudes:
         """The magnitudes of each row by the first conversion that its columns allow."""
-        v, bv, vi = (np.full(self.table.row_count, np.nan) for _ in range(3))
+        v = np.full(self.table.row_count, np.nan)
+        bv = np.full(self.table.row_count, np.nan)
+        vi = np.full(self.table.row_count, np.nan)
         notes: list[str] = []
-        for route in (
-            route for route in table_reader.ROUTES if route.roles in self.layout.magnitudes
-        ):
+        for route in table_reader.ROUTES:
+            if route.roles not in self.layout.magnitudes:
+                continue
             blank = ~(np.isfinite(v) & np.isfinite(bv))
             if not blank.any():
                 break
-            new_v, new_bv, new_vi = route.convert(
-                *(self.role(role, np.nan)[blank] for role in route.roles)
-            )
-            if np.isfinite(new_v).any() and route.words not in notes:
+            magnitudes = [self.role(role, np.nan)[blank] for role in route.roles]
+            route_v, route_bv, route_vi = route.convert(*magnitudes)
+            v[blank] = route_v
+            bv[blank] = route_bv
+            vi[blank] = route_vi
+            if np.isfinite(route_v).any() and route.words not in notes:
                 notes.append(route.words)
-            v[blank], bv[blank], vi[blank] = new_v, new_bv, new_vi
         if "vi_mag" in self.layout.role:
             given = self.role("vi_mag", np.nan)
             vi = np.where(np.isfinite(given), given, vi)
@@ -324,16 +337,18 @@ class _Columns:
         """Type, range, period and a time of largest light, where a row has all of its three
         figures; nothing without them.
         """
-        roles = ("maximum_jd", "period_d", "amplitude_mag")
-        if not all(role in self.layout.role for role in roles):
+        if not self.layout.role.keys() >= {"maximum_jd", "period_d", "amplitude_mag"}:
             return {}
-        maximum, period, amplitude = (self.role(role, np.nan) for role in roles)
-        known = (
-            np.isfinite(maximum) & (period > 0) & (amplitude > 0) & (amplitude < MAX_AMPLITUDE_MAG)
-        )
+        maximum = self.role("maximum_jd", np.nan)
+        period = self.role("period_d", np.nan)
+        amplitude = self.role("amplitude_mag", np.nan)
+        has_range = (amplitude > 0) & (amplitude < MAX_AMPLITUDE_MAG)
+        known = np.isfinite(maximum) & (period > 0) & has_range
+        kind = np.where(known, b"P", b"")
+        range_mag = np.where(known, 2 * amplitude, np.nan)
         return {
-            "variable": np.where(known, b"P", b"").astype("S1"),
-            "range_mag": np.where(known, 2 * amplitude, np.nan).astype(np.float32),
+            "variable": kind.astype("S1"),
+            "range_mag": range_mag.astype(np.float32),
             "period_d": np.where(known, period, np.nan),
             "maximum_jd": np.where(known, maximum, np.nan),
         }
@@ -348,23 +363,24 @@ class _Columns:
             epoch = self.role("epoch_jyear", GAIA_DR3_JYEAR)
             release = "Gaia DR2" if (epoch == GAIA_DR2_JYEAR).all() else "Gaia DR3"
             return release, np.asarray(columns[role["gaia"]], dtype=np.int64)
-        if all(name in role for name in ("tyc1", "tyc2", "tyc3")):
-            region, number, part = (
-                np.asarray(columns[role[name]], dtype=np.int64) for name in ("tyc1", "tyc2", "tyc3")
-            )
-            return TYCHO, region * TYC_REGION + number * 10 + part
+        if role.keys() >= {"tyc1", "tyc2", "tyc3"}:
+            region = np.asarray(columns[role["tyc1"]], dtype=np.int64)
+            number = np.asarray(columns[role["tyc2"]], dtype=np.int64)
+            component = np.asarray(columns[role["tyc3"]], dtype=np.int64)
+            return TYCHO, region * TYC_REGION + number * 10 + component
         return self.row_numbers()
 
     def row_numbers(self) -> tuple[str, npt.NDArray[np.int64]]:
         """The designation and the number of each row, from 1."""
-        return f"{self.path.stem[:MAX_STEM]} row", np.arange(
-            1, self.table.row_count + 1, dtype=np.int64
-        )
+        numbers = np.arange(1, self.table.row_count + 1, dtype=np.int64)
+        return f"{self.path.stem[:MAX_STEM]} row", numbers
 
     def hip(self) -> npt.NDArray[np.int64]:
-        if "hip" not in self.layout.role:
+        """The HIP number of each row, 0 for none."""
+        name = self.layout.role.get("hip")
+        if name is None:
             return np.zeros(self.table.row_count, dtype=np.int64)
-        return np.asarray(self.table.columns[self.layout.role["hip"]], dtype=np.int64)
+        return np.asarray(self.table.columns[name], dtype=np.int64)
 
     def epoch(
         self, stated_jyear: float | None, dated: bool, designation: str
@@ -376,23 +392,21 @@ class _Columns:
         if known is None and designation == "Gaia DR3":
             known = GAIA_DR3_JYEAR
         if stated_jyear is not None:
-            return (
-                np.full(self.table.row_count, stated_jyear),
-                f"places of J{stated_jyear:g} as stated",
-            )
+            words = f"places of J{stated_jyear:g} as stated"
+            return np.full(self.table.row_count, stated_jyear), words
         if "epoch_jyear" in self.layout.role:
             values = self.role("epoch_jyear", np.nan)
-            if not ((values > EPOCHS_JYEAR[0]) & (values < EPOCHS_JYEAR[1])).all():
+            first, last = EPOCHS_JYEAR
+            is_epoch = (values > first) & (values < last)
+            if not is_epoch.all():
                 raise InputError(
                     f"{self.path}: column {self.layout.role['epoch_jyear']} is no Julian year;"
                     f" {_STATE_EPOCH}"
                 )
             return values, f"places of J{float(np.median(values)):g} by its column"
         if known is not None:
-            return (
-                np.full(self.table.row_count, known),
-                f"places of J{known:g} by its columns' names",
-            )
+            words = f"places of J{known:g} by its columns' names"
+            return np.full(self.table.row_count, known), words
         if dated:
             raise InputError(
                 f"{self.path}: has no epoch of its places, and stars move; {_STATE_EPOCH}"
@@ -411,27 +425,36 @@ def _dropped(figures: dict[str, npt.NDArray[Any]]) -> npt.NDArray[np.int8]:
             figures[name][beyond] = np.nan
         else:
             reason[beyond] = 3
-    reason[~(np.isfinite(figures["v_mag"]) & np.isfinite(figures["bv_mag"]))] = 2
-    reason[~(np.isfinite(figures["ra_deg"]) & np.isfinite(figures["dec_deg"]))] = 1
+    has_light = np.isfinite(figures["v_mag"]) & np.isfinite(figures["bv_mag"])
+    has_place = np.isfinite(figures["ra_deg"]) & np.isfinite(figures["dec_deg"])
+    reason[~has_light] = 2
+    reason[~has_place] = 1
     stars = np.flatnonzero(reason == 0)
     # Rows that stand in the table before, with the same place and magnitude.
     alike = [figures[name][stars] for name in ("v_mag", "dec_deg", "ra_deg")]
     order = np.lexsort(alike)
     repeated = np.all([np.diff(values[order]) == 0 for values in alike], axis=0)
-    reason[stars[order[1:][repeated]]] = 4
+    later = order[1:][repeated]
+    reason[stars[later]] = 4
     return reason
 
 
 def _reasons(reason: npt.NDArray[np.int8]) -> str:
-    counts = np.bincount(reason, minlength=len(_REASONS))
-    return ", ".join(f"{counts[k]} {_REASONS[k]}" for k in range(1, len(_REASONS)) if counts[k])
+    """How many rows are not used, by reason."""
+    counts = np.bincount(reason, minlength=len(_REASONS)).tolist()
+    parts = []
+    for count, text in zip(counts, _REASONS, strict=True):
+        if count and text:
+            parts.append(f"{count} {text}")
+    return ", ".join(parts)
 
 
 def _repeated_hip(hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_]) -> str:
     """What to tell of HIP numbers that several stars have: which, and who keeps them; "" of
     none.
     """
-    numbers, counts = np.unique(hip[kept & (hip > 0)], return_counts=True)
+    given = hip[kept & (hip > 0)]
+    numbers, counts = np.unique(given, return_counts=True)
     several = counts > 1
     if not several.any():
         return ""
@@ -449,19 +472,22 @@ def _once(
     hip: npt.NDArray[np.int64], kept: npt.NDArray[np.bool_], v_mag: FloatArray
 ) -> npt.NDArray[np.int32]:
     """HIP numbers of which each stands once, at the brightest star that has it."""
-    usable = np.where(kept & (hip > 0) & (hip < 2**31), hip, 0)
+    is_hip = (hip > 0) & (hip < 2**31)
+    usable = np.where(kept & is_hip, hip, 0)
     rows = np.flatnonzero(usable)
-    rows = rows[np.argsort(v_mag[rows], kind="stable")]
-    _, first = np.unique(usable[rows], return_index=True)
+    brightest_first = rows[np.argsort(v_mag[rows], kind="stable")]
+    _, first = np.unique(usable[brightest_first], return_index=True)
+    keepers = brightest_first[first]
     result = np.zeros(len(hip), dtype=np.int32)
-    result[rows[first]] = usable[rows[first]]
+    result[keepers] = usable[keepers]
     return result
 
 
 def _repeats(identifier: npt.NDArray[np.int64]) -> int:
     """How many stars have no identifier, or that of another star."""
     _, place, count = np.unique(identifier, return_inverse=True, return_counts=True)
-    return int(((count[place] > 1) | (identifier == 0)).sum())
+    is_repeated = count[place] > 1
+    return int((is_repeated | (identifier == 0)).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -479,8 +505,8 @@ def join(hipparcos: Catalog, table: Catalog) -> Joined:
     """Add the table's stars that Hipparcos does not have.
 
     Stars are compared at the median epoch of the table's places. Hipparcos' own row stays for each
-    star of both, with
-    its place, magnitude and number; so do pairs that it has as one star of the sum.
+    star of both, with its place, magnitude and number; so do pairs that it has as one star of the
+    sum.
     """
     epoch_jyear = float(np.median(table.epoch_jyear))
     owner, arcsec = _nearest_owner(hipparcos, table, epoch_jyear)
@@ -508,17 +534,14 @@ def _nearest_owner(
     """
     from scipy.spatial import cKDTree
 
-    reach = max(
-        FAR_ARCSEC, float(np.nanmax(hipparcos.separation_arcsec, initial=0.0)) + PAIR_ARCSEC
-    )
+    widest_arcsec = float(np.nanmax(hipparcos.separation_arcsec, initial=0.0))
+    reach = max(FAR_ARCSEC, widest_arcsec + PAIR_ARCSEC)
     tree = cKDTree(unit_vectors_icrs(hipparcos, epoch_jyear))
-    chord, owner = tree.query(
-        unit_vectors_icrs(table, epoch_jyear), distance_upper_bound=reach * RAD_PER_ARCSEC
-    )
-    return (
-        np.minimum(np.asarray(owner, dtype=np.intp), len(hipparcos) - 1),
-        np.asarray(chord) / RAD_PER_ARCSEC,
-    )
+    table_vectors = unit_vectors_icrs(table, epoch_jyear)
+    chord, owner = tree.query(table_vectors, distance_upper_bound=reach * RAD_PER_ARCSEC)
+    # beyond the reach the tree gives a place after the last
+    near = np.minimum(np.asarray(owner, dtype=np.intp), len(hipparcos) - 1)
+    return near, np.asarray(chord) / RAD_PER_ARCSEC
 
 
 def _held(
@@ -526,19 +549,22 @@ def _held(
 ) -> npt.NDArray[np.bool_]:
     """The stars of the table (n,) whose light is in their owner's magnitude."""
     fainter_mag = table.v_mag - hipparcos.v_mag[owner]
-    separation = np.nan_to_num(hipparcos.separation_arcsec[owner].astype(np.float64), nan=-np.inf)
-    held = (arcsec <= SAME_ARCSEC) | (
-        (arcsec <= separation + PAIR_ARCSEC) & (fainter_mag > -PAIR_MAG)
-    )
+    known_arcsec = hipparcos.separation_arcsec[owner].astype(np.float64)
+    separation = np.nan_to_num(known_arcsec, nan=-np.inf)
+    is_same = arcsec <= SAME_ARCSEC
+    is_of_pair = (arcsec <= separation + PAIR_ARCSEC) & (fainter_mag > -PAIR_MAG)
+    held = is_same | is_of_pair
     alone = np.ones(len(hipparcos), dtype=np.bool_)
     alone[owner[held]] = False
-    return np.asarray(
-        held | (alone[owner] & (arcsec <= FAR_ARCSEC) & (np.abs(fainter_mag) <= FAR_MAG))
-    )
+    # one that is farther off is the owner where no other is and it is as bright
+    is_alike = (arcsec <= FAR_ARCSEC) & (np.abs(fainter_mag) <= FAR_MAG)
+    return np.asarray(held | (alone[owner] & is_alike))
 
 
 @dataclass(frozen=True, slots=True)
 class _Differences:
+    """How a table differs from Hipparcos: by how many stars, in the median of V, and in words."""
+
     count: int
     median_mag: float
     words: str
@@ -570,11 +596,13 @@ def _differences(
 
 
 def _doubt(table: Catalog, held: npt.NDArray[np.bool_], difference: _Differences) -> str | None:
-    bright = table.v_mag < BRIGHT_V_MAG
-    if bright.sum() >= BRIGHT_STARS and held[bright].mean() < FEW_MATCHES:
+    """Why a table's places or magnitudes may be others than it says; None where they fit."""
+    held_bright = held[table.v_mag < BRIGHT_V_MAG]
+    count = len(held_bright)
+    if count >= BRIGHT_STARS and held_bright.mean() < FEW_MATCHES:
         return (
-            f"of its {int(bright.sum())} stars to V = {BRIGHT_V_MAG:g} Hipparcos has"
-            f" {held[bright].mean():.0%} at their place; are its places ICRS degrees, and of the"
+            f"of its {count} stars to V = {BRIGHT_V_MAG:g} Hipparcos has"
+            f" {held_bright.mean():.0%} at their place; are its places ICRS degrees, and of the"
             " epoch that it gives?"
         )
     if difference.count and abs(difference.median_mag) > OVERLAP_LIMIT_MAG:
@@ -620,7 +648,8 @@ def store_path(made_of: Sequence[str]) -> Path | None:
             root = Path.home() / ".cache"
     except RuntimeError:  # no home
         return None
-    key = hashlib.sha256(json.dumps([VERSION, *made_of]).encode()).hexdigest()
+    words = json.dumps([VERSION, *made_of])
+    key = hashlib.sha256(words.encode()).hexdigest()
     return root / "hilstar" / f"catalogue-{key[:40]}.npz"
 
 
@@ -630,11 +659,9 @@ def kept(path: Path) -> Kept | None:
         with open_regular(path, "", MAX_STORED_BYTES) as file:
             status = os.fstat(file.fileno())
             # Nothing in it is packed, so that it cannot unfold into more than the file is long.
-            plain = all(
-                entry.compress_type == zipfile.ZIP_STORED
-                for entry in zipfile.ZipFile(file).infolist()
-            )
-            if status.st_uid != os.getuid() or not plain:
+            entries = zipfile.ZipFile(file).infolist()
+            is_plain = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
+            if status.st_uid != os.getuid() or not is_plain:
                 return None
             file.seek(0)
             with np.load(file, allow_pickle=False) as packed:
@@ -650,26 +677,24 @@ def kept(path: Path) -> Kept | None:
         stored = Kept(catalog, tuple(map(str, about["doubts"])))
     except Exception:  # whatever a damaged file raises in the layers of zipfile, NumPy and json
         return None
-    return stored if _is_sound(catalog) else None
+    if not _is_sound(catalog):
+        return None
+    return stored
 
 
 def _is_sound(catalog: Catalog) -> bool:
     """Whether each column has its type, one length, and figures that a star can have."""
     for name in column_names():
         values = getattr(catalog, name)
-        if (
-            values.shape != catalog.v_mag.shape
-            or values.ndim != 1
-            or values.dtype != np.dtype(DTYPES.get(name, "f8"))
-        ):
+        dtype = np.dtype(DTYPES.get(name, "f8"))
+        is_column = values.ndim == 1 and values.shape == catalog.v_mag.shape
+        if not is_column or values.dtype != dtype:
             return False
-        if name in RANGES:
+        if name in ALWAYS_KNOWN:
             low, high = RANGES[name]
-            if name in ALWAYS_KNOWN:
-                bounds = (values.min(initial=high), values.max(initial=low))
-            else:
-                bounds = (low, high)
-            if not (low <= bounds[0] and bounds[1] <= high):  # NaN too
+            lowest = values.min(initial=high)
+            highest = values.max(initial=low)
+            if not (low <= lowest and highest <= high):  # NaN too
                 return False
     return bool(np.isfinite(catalog.epoch_jyear).all())
 
@@ -685,11 +710,8 @@ def keep(path: Path, made: Kept) -> None:
         make_directory(path.parent)
         with whole_file(path) as file:
             np.savez(file, allow_pickle=False, about=np.array(json.dumps(about)), **columns)
-        by_age = sorted(
-            path.parent.glob("catalogue-*.npz"),
-            key=lambda file: file.stat().st_mtime_ns,
-            reverse=True,
-        )
+        others = path.parent.glob("catalogue-*.npz")
+        by_age = sorted(others, key=lambda file: file.stat().st_mtime_ns, reverse=True)
         for old in by_age[KEPT_FILES:]:
             old.unlink(missing_ok=True)
 
@@ -748,9 +770,9 @@ def choose_catalog(choice: TableChoice) -> Catalog:
 
 
 def _made(path: Path, choice: TableChoice) -> Kept:
-    assembled = assemble(
-        path, table_reader.read_table(path), choice.epoch_jyear, choice.with_hipparcos
-    )
+    """The stars of a table, joined with Hipparcos' where the choice says so. Raises InputError."""
+    table = table_reader.read_table(path)
+    assembled = assemble(path, table, choice.epoch_jyear, choice.with_hipparcos)
     doubts = list(assembled.doubts)
     if assembled.dropped:
         doubts.append(assembled.line)
@@ -766,9 +788,8 @@ def _by_cell(catalog: Catalog, *notes: str) -> Catalog:
     """The same stars, neighbours together: a bench that sorts them by cell then reads each array
     from its start to its end.
     """
-    return replace(
-        catalog.taken(cell_grid(unit_vectors_icrs(catalog, GAIA_DR3_JYEAR)).order), notes=notes
-    )
+    grid = cell_grid(unit_vectors_icrs(catalog, GAIA_DR3_JYEAR))
+    return replace(catalog.taken(grid.order), notes=notes)
 
 
 def table_facts(
@@ -779,41 +800,40 @@ def table_facts(
 
     Reads the table once more, for the columns that no bench needs. Raises InputError.
     """
-    if str(choice.source) == "hipparcos" or _is_hip_main(Path(choice.source)):
+    path = Path(choice.source)
+    if str(choice.source) == "hipparcos" or _is_hip_main(path):
         return facts
-    columns = _Columns(
-        Path(choice.source),
-        table_reader.read_table(Path(choice.source), table_reader.NAMES | table_reader.ERROR_NAMES),
-    )
+    table = table_reader.read_table(path, table_reader.NAMES | table_reader.ERROR_NAMES)
+    columns = _Columns(path, table)
     if not any(role in columns.layout.role for role in table_reader.ERROR_NAMES):
         return facts
-    by_row = columns.row_numbers()
-    if stars.designation == by_row[0]:
-        identifier = by_row[1]
-    else:
-        identifier = columns.identifiers()[1]
+    designation, identifier = columns.row_numbers()
+    if stars.designation != designation:
+        _, identifier = columns.identifiers()
     order = np.argsort(identifier, kind="stable")
-    row = order[
-        np.minimum(np.searchsorted(identifier, stars.identifier, sorter=order), len(order) - 1)
-    ]
-    is_own_row = (identifier[row] == stars.identifier) & ~(
-        choice.with_hipparcos & (stars.hip == stars.identifier)
-    )
+    place = np.searchsorted(identifier, stars.identifier, sorter=order)
+    row = order[np.minimum(place, len(order) - 1)]
+    is_own_row = identifier[row] == stars.identifier
+    if choice.with_hipparcos:
+        is_own_row &= stars.hip != stars.identifier
     row_facts = dict(facts)
     for role in table_reader.ERROR_NAMES:
         name = columns.layout.role.get(role)
-        if name is not None and role == table_reader.SPECTRAL_TYPE:
-            row_facts[role] = np.where(is_own_row, columns.table.columns[name][row], facts[role])
-            row_facts["spectral_type_source"] = np.where(
-                is_own_row, b"U", facts["spectral_type_source"]
-            )
-        elif name is not None:
-            row_facts[role] = np.where(is_own_row, columns.role(role, np.nan)[row], facts[role])
+        if name is None:
+            continue
+        if role == table_reader.SPECTRAL_TYPE:
+            own = columns.table.columns[name]
+            source = np.where(is_own_row, b"U", facts["spectral_type_source"])
+            row_facts["spectral_type_source"] = source
+        else:
+            own = columns.role(role, np.nan)
+        row_facts[role] = np.where(is_own_row, own[row], facts[role])
     if "sigma_measured_mag" in columns.layout.role:
         row_facts["v_source"] = np.where(is_own_row, b"U", facts["v_source"])
     return row_facts
 
 
 def _is_hip_main(path: Path) -> bool:
+    """Whether a file begins as Hipparcos' main catalogue does."""
     with open_regular(path, table_reader.FILE_WANTED, table_reader.MAX_TABLE_BYTES) as file:
         return file.read(2) == b"H|"

@@ -23,13 +23,11 @@ MAX_SHIFT = 1.1  # largest aberration in units of v/c, for speeds up to 0.1 c
 
 BODY_CELL_RAD = 1e-6  # radius of a cell with one body: rounding
 # Measured over 116 812 stars and an 18 by 10 degree monitor: cells of 2 to 10 degrees take 23 to 11
-# us
-# and pass on 1200 to 2700 stars; 4 degrees (13 us, 1500 stars) minimises the time of both steps.
+# us and pass on 1200 to 2700 stars; 4 degrees (13 us, 1500 stars) minimises the time of both steps.
 # results/tradeoff.csv, culling: 1 to 6 degrees take the same time, a scan twenty times as long.
 CELL_DEG = 4.0
 # Within a cell stars are sorted by PARTS^2 parts of it: neighbours on the image follow each other,
-# which
-# saves a twelfth of drawing them.
+# which saves a twelfth of drawing them.
 PARTS = 4
 # arccos near 1 is accurate to 1e-8 rad only; a cell is enlarged by this.
 RADIUS_MARGIN_RAD = 1e-6
@@ -77,13 +75,14 @@ class AirAbove:
         w = b * tangent**2
         by = (a + w) * tangent / (1 + (a + 3 * w) / up**2)
         cosine = 1 - by**2 / 2
-        return np.asarray(
-            (cosine - by * z / r)[:, None] * level + (cosine * z + by * r)[:, None] * self.up
-        )
+        along_level = cosine - by * z / r
+        along_up = cosine * z + by * r
+        return np.asarray(along_level[:, None] * level + along_up[:, None] * self.up)
 
     def lowest_rad(self, axis: FloatArray, radius_rad: float) -> float:
         """The lowest altitude within an angle of a direction (3,)."""
-        return float(np.arcsin(np.clip(axis @ self.up, -1.0, 1.0))) - radius_rad
+        altitude_rad = float(np.arcsin(np.clip(axis @ self.up, -1.0, 1.0)))
+        return altitude_rad - radius_rad
 
     def most_rad(self, axis: FloatArray, radius_rad: float) -> float:
         """By how much light within an angle of a direction (3,) is bent at most."""
@@ -108,7 +107,8 @@ class AirAbove:
 
     def altitude_rad(self, vectors: FloatArray) -> FloatArray:
         """Apparent altitudes (n,) of directions outside the air (n, 3)."""
-        return np.asarray(np.arcsin(np.clip(self.bent(vectors) @ self.up, -1.0, 1.0)))
+        sine = np.clip(self.bent(vectors) @ self.up, -1.0, 1.0)
+        return np.asarray(np.arcsin(sine))
 
 
 def tell(told: set[str], key: str, text: str, *values: object) -> None:
@@ -178,15 +178,14 @@ class Stars:
         one's plane.
         """
         if self.velocity_km_s is not None:
-            reach_rad += MAX_SHIFT * float(np.linalg.norm(self.velocity_km_s)) / LIGHT_KM_S
+            speed_km_s = float(np.linalg.norm(self.velocity_km_s))
+            reach_rad += MAX_SHIFT * speed_km_s / LIGHT_KM_S
         if self.air is None:
             return self.grid.near(axis, radius_rad, edges, reach_rad)
-        near_stars = self.grid.near(
-            axis, radius_rad, edges, reach_rad + self.air.most_rad(axis, radius_rad + reach_rad)
-        )
-        return self.air.risen(
-            near_stars, self.vectors, self.air.lowest_rad(axis, radius_rad + reach_rad)
-        )
+        field_rad = radius_rad + reach_rad
+        bent_rad = self.air.most_rad(axis, field_rad)
+        near_stars = self.grid.near(axis, radius_rad, edges, reach_rad + bent_rad)
+        return self.air.risen(near_stars, self.vectors, self.air.lowest_rad(axis, field_rad))
 
     def directions(self, which: IntArray) -> FloatArray:
         """Where stars are seen: ICRS unit vectors (n, 3)."""
@@ -195,11 +194,11 @@ class Stars:
             vectors = vectors.T.take(which, axis=1).T
         else:
             vectors = vectors[which]
-        if self.velocity_km_s is None:
-            apparent = vectors
-        else:
-            apparent = aberrate(vectors, self.velocity_km_s)
-        return apparent if self.air is None else self.air.bent(apparent)
+        if self.velocity_km_s is not None:
+            vectors = aberrate(vectors, self.velocity_km_s)
+        if self.air is not None:
+            vectors = self.air.bent(vectors)
+        return vectors
 
     def seen_at(self, velocity_km_s: FloatArray | None) -> "Stars":
         """The same stars for such an observer; None: for the one who sees `vectors`."""
@@ -218,6 +217,7 @@ class Stars:
         return names
 
     def _name(self, star: int, first_body: int) -> str:
+        """The name of a body, or of a catalogue's star; empty for what has none."""
         if star >= first_body:
             return self.bodies[star - first_body]
         if self.row[star] < 0:
@@ -226,10 +226,8 @@ class Stars:
 
     def designations(self, which: IntArray) -> list[int | str]:
         """The HIP numbers of stars (n,), and the names of those that have none."""
-        return [
-            name or hip
-            for name, hip in zip(self.names(which), self.hip[which].tolist(), strict=True)
-        ]
+        hips = self.hip[which].tolist()
+        return [name or hip for name, hip in zip(self.names(which), hips, strict=True)]
 
 
 def split_by_rate(
@@ -248,6 +246,7 @@ def split_by_rate(
 
 
 def _selected(stars: Stars, is_selected: npt.NDArray[np.bool_]) -> Stars:
+    """Stars (k,) of those given, in cells of their own."""
     grid = cell_grid(stars.vectors[is_selected])
     order = np.flatnonzero(is_selected)[grid.order]
     columns = {}
@@ -268,6 +267,8 @@ def make_stars(
     electrons_per_s, colours = total_and_colours(electrons_per_s)
     grid = cell_grid(vectors)
     order = grid.order
+    if colours is not None:
+        colours = colours[order]
     return Stars(
         hip=catalog.hip[order],
         vectors=np.asfortranarray(vectors[order]),
@@ -278,7 +279,7 @@ def make_stars(
         grid=grid,
         catalog=catalog,
         row=order,
-        colours=None if colours is None else colours[order],
+        colours=colours,
     )
 
 
@@ -313,39 +314,42 @@ def with_bodies(
     to an image. Their `colours` (k, channels) or (channels,) are wanted where stars have theirs.
     """
     count = len(bodies)
-    order = len(stars) + np.arange(len(bodies))
-    cells = order[: count if found else 0]
+    places = len(stars) + np.arange(count)
     nowhere = np.full(count, np.nan)
-    grid = stars.grid
+    vectors = np.concatenate([stars.vectors, np.full((count, 3), np.nan)])
+    all_colours = None
+    if stars.colours is not None and colours is not None:
+        body_colours = np.broadcast_to(colours, (count, colours.shape[-1]))
+        all_colours = np.vstack([stars.colours, body_colours])
     return Stars(
         hip=np.concatenate([stars.hip, np.zeros(count, dtype=np.int32)]),
-        vectors=np.asfortranarray(np.concatenate([stars.vectors, np.full((count, 3), np.nan)])),
+        vectors=np.asfortranarray(vectors),
         v_mag=np.concatenate([stars.v_mag, nowhere]),
         bv_mag=np.concatenate([stars.bv_mag, bv_mag]),
         temperature_k=np.concatenate([stars.temperature_k, nowhere]),
         electrons_per_s=np.concatenate([stars.electrons_per_s, nowhere]),
-        grid=replace(
-            grid,
-            order=np.concatenate([grid.order, order]),
-            start=np.concatenate([grid.start, cells]),
-            count=np.concatenate([grid.count, np.ones(len(cells), dtype=grid.count.dtype)]),
-            centre=np.concatenate([grid.centre, np.full((len(cells), 3), np.nan)]),
-            cos_radius=np.concatenate(
-                [grid.cos_radius, np.full(len(cells), np.cos(BODY_CELL_RAD))]
-            ),
-            sin_radius=np.concatenate(
-                [grid.sin_radius, np.full(len(cells), np.sin(BODY_CELL_RAD))]
-            ),
-        ),
+        grid=_with_cells(stars.grid, places, count if found else 0),
         catalog=stars.catalog,
         row=np.concatenate([stars.row, np.full(count, -1)]),
         bodies=(*stars.bodies, *bodies),
-        colours=(
-            None
-            if stars.colours is None or colours is None
-            else np.vstack([stars.colours, np.broadcast_to(colours, (count, colours.shape[-1]))])
-        ),
+        colours=all_colours,
         colours_by_bv=stars.colours_by_bv,
+    )
+
+
+def _with_cells(grid: "CellGrid", places: IntArray, cell_count: int) -> "CellGrid":
+    """A grid and after it stars at `places` (n,), the first of them each in a cell of its own,
+    which has no centre yet.
+    """
+    ones = np.ones(cell_count)
+    return replace(
+        grid,
+        order=np.concatenate([grid.order, places]),
+        start=np.concatenate([grid.start, places[:cell_count]]),
+        count=np.concatenate([grid.count, ones.astype(grid.count.dtype)]),
+        centre=np.concatenate([grid.centre, np.full((cell_count, 3), np.nan)]),
+        cos_radius=np.concatenate([grid.cos_radius, ones * np.cos(BODY_CELL_RAD)]),
+        sin_radius=np.concatenate([grid.sin_radius, ones * np.sin(BODY_CELL_RAD)]),
     )
 
 
@@ -408,9 +412,10 @@ class CellGrid:
         gaps = (start[1:] != end[:-1]).nonzero()[0]
         firsts = [int(start[0]), *start[gaps + 1].tolist()]
         lasts = [*end[gaps].tolist(), int(end[-1])]
-        return np.concatenate(
-            [np.arange(first, last) for first, last in zip(firsts, lasts, strict=True)]
-        )
+        ranges = []
+        for first, last in zip(firsts, lasts, strict=True):
+            ranges.append(np.arange(first, last))
+        return np.concatenate(ranges)
 
 
 def cell_grid(vectors: FloatArray, cell_deg: float = CELL_DEG) -> CellGrid:
@@ -420,18 +425,20 @@ def cell_grid(vectors: FloatArray, cell_deg: float = CELL_DEG) -> CellGrid:
     bands = max(1, round(180.0 / cell_deg))
     down = np.arccos(np.clip(vectors[:, 2], -1, 1)) / np.pi * bands
     band = np.minimum(down.astype(np.intp), bands - 1)
-    per_band = np.maximum(
-        1, np.round(360.0 / cell_deg * np.sin((np.arange(bands) + 0.5) * np.pi / bands))
-    ).astype(np.intp)
-    along = np.arctan2(vectors[:, 1], vectors[:, 0]) / (2 * np.pi) % 1.0 * per_band[band]
+    middles_rad = (np.arange(bands) + 0.5) * np.pi / bands
+    per_band = np.maximum(1, np.round(360.0 / cell_deg * np.sin(middles_rad))).astype(np.intp)
+    turn = np.arctan2(vectors[:, 1], vectors[:, 0]) / (2 * np.pi) % 1.0
+    along = turn * per_band[band]
     sector = np.minimum(along.astype(np.intp), per_band[band] - 1)
-    cell = (np.cumsum(per_band) - per_band)[band] + sector
+    first_of_band = np.cumsum(per_band) - per_band
+    cell = first_of_band[band] + sector
     # Few bits make NumPy's stable sort a radix sort, in a fifth of the time.
-    part = ((down - band) * PARTS).astype(np.uint8) * np.uint8(PARTS + 1) + (
-        (along - sector) * PARTS
-    ).astype(np.uint8)
+    part_down = ((down - band) * PARTS).astype(np.uint8)
+    part_along = ((along - sector) * PARTS).astype(np.uint8)
+    part = part_down * np.uint8(PARTS + 1) + part_along
     order = np.argsort(part, kind="stable")
-    order = order[np.argsort(cell.astype(np.min_scalar_type(per_band.sum()))[order], kind="stable")]
+    small_cell = cell.astype(np.min_scalar_type(per_band.sum()))
+    order = order[np.argsort(small_cell[order], kind="stable")]
     # Not `np.unique`, here and wherever a bench opens: its first call imports `numpy.ma`, which
     # takes 10 ms.
     start = np.flatnonzero(np.diff(cell[order], prepend=-1))
@@ -439,10 +446,12 @@ def cell_grid(vectors: FloatArray, cell_deg: float = CELL_DEG) -> CellGrid:
     if not len(start):
         nothing = np.empty(0)
         return CellGrid(order, start, count, np.empty((0, 3)), nothing, nothing)
-    centre = np.add.reduceat(vectors[order], start)
+    sorted_vectors = vectors[order]
+    centre = np.add.reduceat(sorted_vectors, start)
     centre /= np.linalg.norm(centre, axis=1, keepdims=True)
-    cosine = np.einsum("ij,ij->i", vectors[order], np.repeat(centre, count, axis=0))
-    radius = np.arccos(np.clip(np.minimum.reduceat(cosine, start), -1, 1)) + RADIUS_MARGIN_RAD
+    cosine = np.einsum("ij,ij->i", sorted_vectors, np.repeat(centre, count, axis=0))
+    smallest_cosine = np.clip(np.minimum.reduceat(cosine, start), -1, 1)
+    radius = np.arccos(smallest_cosine) + RADIUS_MARGIN_RAD
     return CellGrid(order, start, count, centre, np.cos(radius), np.sin(radius))
 
 
@@ -480,12 +489,12 @@ def aberrate(
     """Directions (n, 3) as a moving observer sees them; the velocity is ICRS, barycentric, in km/s.
 
     The exact special-relativistic formula (Klioner 2003, AJ 125, 1580, eq. 10). The caller keeps
-    the
-    speed under that of light.
+    the speed under that of light.
     """
     beta = np.asarray(observer_velocity_km_s, dtype=np.float64) / LIGHT_KM_S
     gamma_inverse = np.sqrt(1.0 - beta @ beta)
     along = vectors @ beta
-    apparent = gamma_inverse * vectors + (1.0 + along / (1.0 + gamma_inverse))[:, None] * beta
+    apparent = gamma_inverse * vectors
+    apparent = apparent + (1.0 + along / (1.0 + gamma_inverse))[:, None] * beta
     apparent /= (1.0 + along)[:, None]
     return np.asarray(apparent / np.linalg.norm(apparent, axis=1, keepdims=True))

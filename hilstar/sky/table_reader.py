@@ -11,6 +11,7 @@ import io
 import itertools
 import re
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -130,6 +131,8 @@ COLUMNS_WANTED = (
     "name V with B-V or V-I (vmag, b-v, v-i), Tycho's vtmag and btmag, or Gaia's phot_g_mean_mag"
     " with bp_rp or with phot_bp_mean_mag and phot_rp_mean_mag"
 )
+# The roles whose figures are identifiers.
+WHOLE = ("gaia", "tyc1", "tyc2", "tyc3", "hip")
 MAX_NAMED = 12
 HOURS = ("h", "hr", "hrs", "hour", "hours", "hourangle")
 IN_RADIANS = ("rarad", "derad")
@@ -184,15 +187,21 @@ def bv_from_vi(vi_mag: FloatArray) -> FloatArray:
 
 @cache
 def _bv_along_vi() -> tuple[FloatArray, FloatArray]:
+    """V-I of the bins that are full enough, and the median B-V in each."""
     stars = load_catalog()
     known = np.isfinite(stars.vi_mag)
     bv_mag = stars.bv_mag[known]
     vi_mag = stars.vi_mag[known]
     order = np.argsort(vi_mag, kind="stable")
     bins, start = np.unique(np.round(vi_mag[order] / BIN_MAG), return_index=True)
-    parts = zip(bins * BIN_MAG, np.split(bv_mag[order], start[1:]), strict=True)
-    full = [(vi, float(np.median(part))) for vi, part in parts if len(part) >= MIN_STARS]
-    return np.array([vi for vi, _ in full]), np.array([bv for _, bv in full])
+    parts = np.split(bv_mag[order], start[1:])
+    full_vi_mag = []
+    median_bv_mag = []
+    for middle, part in zip(bins * BIN_MAG, parts, strict=True):
+        if len(part) >= MIN_STARS:
+            full_vi_mag.append(middle)
+            median_bv_mag.append(np.median(part))
+    return np.array(full_vi_mag), np.array(median_bv_mag)
 
 
 Converted = tuple[FloatArray, FloatArray, FloatArray]
@@ -210,6 +219,7 @@ class Route:
 
 
 def _given(v: FloatArray, bv: FloatArray) -> Converted:
+    """Johnson's own, without V-I."""
     return v, bv, np.full(len(v), np.nan)
 
 
@@ -257,7 +267,7 @@ class Layout:
 
     def needed(self) -> list[str]:
         """The columns to read."""
-        return sorted({*self.role.values(), *(name for pair in self.places for name in pair)})
+        return sorted({*self.role.values(), *itertools.chain(*self.places)})
 
 
 def layout_of(
@@ -269,41 +279,55 @@ def layout_of(
     Raises InputError where there is no place or no magnitude with a colour, and for a column that
     is there twice.
     """
-    known = _plain_names(names, roles)
-    places = tuple((known[ra], known[dec]) for ra, dec in PLACES if ra in known and dec in known)
-    column_of: dict[str, str] = {}
-    for role, synonyms in roles.items():
-        synonym = next((name for name in synonyms if name in known), None)
-        if synonym is not None:
-            column_of[role] = known[synonym]
-    magnitudes = tuple(route.roles for route in ROUTES if column_of.keys() >= set(route.roles))
-    columns = ", ".join(shortened(name, 40) for name in names[:MAX_NAMED])
+    layout = _layout_by(_plain_names(names, roles), roles)
+    shown = [shortened(name, 40) for name in names[:MAX_NAMED]]
     if len(names) > MAX_NAMED:
-        columns += ", ..."
-    if not places:
+        shown.append("...")
+    columns = ", ".join(shown)
+    if not layout.places:
         pairs = ", ".join(f"{ra} and {dec}" for ra, dec in PLACES[:4])
         raise InputError(
             f"{path}: has no right ascension and declination among its columns ({columns}); name"
             f" them {pairs}"
         )
-    if not magnitudes:
+    if not layout.magnitudes:
         raise InputError(
             f"{path}: has no magnitude with a colour among its columns ({columns});"
             f" {COLUMNS_WANTED}"
         )
-    layout = Layout(column_of, places, magnitudes)
-    small = [name.strip().lower() for name in names]
+    columns_of_name = Counter(name.strip().lower() for name in names)
     for name in layout.needed():
-        if small.count(name.strip().lower()) > 1:
+        if columns_of_name[name.strip().lower()] > 1:
             raise InputError(f"{path}: column {name} is there twice; leave one of them")
     return layout
+
+
+def _layout_by(known: Mapping[str, str], roles: Mapping[str, tuple[str, ...]]) -> Layout:
+    """The layout of a table's names by the names that are known (`_plain_names`)."""
+    places = []
+    for ra, dec in PLACES:
+        if ra in known and dec in known:
+            places.append((known[ra], known[dec]))
+    column_of: dict[str, str] = {}
+    for role, synonyms in roles.items():
+        for synonym in synonyms:
+            if synonym in known:
+                column_of[role] = known[synonym]
+                break
+    magnitudes = []
+    for route in ROUTES:
+        if column_of.keys() >= set(route.roles):
+            magnitudes.append(route.roles)
+    return Layout(column_of, tuple(places), tuple(magnitudes))
 
 
 def _plain_names(names: Sequence[str], roles: Mapping[str, tuple[str, ...]]) -> dict[str, str]:
     """A table's names by the names that are known: in small letters, without a unit at the end
     where that one is not known.
     """
-    known = {name.strip().lower(): name for name in reversed(names)}
+    known: dict[str, str] = {}
+    for name in names:
+        known.setdefault(name.strip().lower(), name)
     bases = set(itertools.chain(*PLACES, *roles.values()))
     for name in names:
         base, unit = _name_and_unit(name)
@@ -315,10 +339,11 @@ def _plain_names(names: Sequence[str], roles: Mapping[str, tuple[str, ...]]) -> 
 def _name_and_unit(name: str) -> tuple[str, str]:
     """A name in small letters and the unit at its end: "pmRA_arcsec_yr" is pmra and arcsec/yr."""
     plain = name.strip().lower()
-    for place in (place for place, character in enumerate(plain) if character in "_ " and place):
-        unit = suffix_unit(plain[place + 1 :])
-        if is_unit(unit):
-            return plain[:place], unit
+    for place in range(1, len(plain)):
+        if plain[place] in "_ ":
+            unit = suffix_unit(plain[place + 1 :])
+            if is_unit(unit):
+                return plain[:place], unit
     return plain, ""
 
 
@@ -347,11 +372,9 @@ def factor_to(role: str, column: str, unit: str | None, path: Path) -> float:
     if by_spelling is not None and (plain_unit(unit) not in HOURS or role == "ra_deg"):
         return float(by_spelling)
     try:
-        return float(
-            u.Unit(unit, parse_strict="raise").to(
-                u.Unit(wanted), equivalencies=u.dimensionless_angles()
-            )
-        )
+        stated = u.Unit(unit, parse_strict="raise")
+        angles = u.dimensionless_angles()
+        return float(stated.to(u.Unit(wanted), equivalencies=angles))
     except (ValueError, TypeError, u.UnitConversionError) as error:
         raise InputError(
             f"{path}: column {column} is in {shortened(unit)!r}; give it in"
@@ -373,9 +396,6 @@ class RawTable:
     unit: Mapping[str, str | None]
     row_count: int
     notices: tuple[str, ...] = ()
-
-
-Whole = ("gaia", "tyc1", "tyc2", "tyc3", "hip")
 
 
 def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawTable:
@@ -418,9 +438,8 @@ def _quiet(path: Path) -> Iterator[None]:
             path, "it needs more memory than there is", "cut it to the stars that are used"
         ) from error
     except Exception as error:
-        raise cannot_read(
-            path, f"{type(error).__name__}: {error}".rstrip(": "), FILE_WANTED
-        ) from error
+        reason = f"{type(error).__name__}: {error}".rstrip(": ")
+        raise cannot_read(path, reason, FILE_WANTED) from error
 
 
 def _read_packed_fits(path: Path, packed: bytes, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
@@ -437,38 +456,33 @@ def _read_fits(
     from astropy.io import fits
 
     with _quiet(path), fits.open(source, memmap=isinstance(source, Path)) as hdus:
-        table = next(
-            (hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)), None
-        )
-        if table is None:
+        tables = [hdu for hdu in hdus if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)]
+        if not tables:
             raise InputError(f"{path}: holds no table; {FILE_WANTED}")
+        table = tables[0]
         layout = layout_of(path, table.columns.names, roles)
         _check_rows(path, int(table.header["NAXIS2"]))
         by_name = {column.name: column for column in table.columns}
         columns = {}
         unit = {}
         for name in layout.needed():
-            null = by_name[name].null
+            column = by_name[name]
             values = np.asarray(table.data[name])
-            if null is not None and values.dtype.kind in "iu":
-                mask = values == null
-            else:
-                mask = None
-            columns[name], unit[name] = (
-                _numbers(path, layout, name, values, mask),
-                by_name[name].unit or unit_by_name(name),
-            )
+            mask = None
+            if column.null is not None and values.dtype.kind in "iu":
+                mask = values == column.null
+            columns[name] = _numbers(path, layout, name, values, mask)
+            unit[name] = column.unit or unit_by_name(name)
         return RawTable(layout, columns, unit, len(table.data))
 
 
 def _read_votable(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
     from astropy.io import votable
 
-    if path.stat().st_size > MAX_XML_BYTES:
-        size = size_text(path.stat().st_size)
-        raise cannot_read(
-            path, f"a VOTable of {size}, {size_text(MAX_XML_BYTES)} at most", "give it as FITS"
-        )
+    size_bytes = path.stat().st_size
+    if size_bytes > MAX_XML_BYTES:
+        reason = f"a VOTable of {size_text(size_bytes)}, {size_text(MAX_XML_BYTES)} at most"
+        raise cannot_read(path, reason, "give it as FITS")
     if ELSEWHERE.search(path.read_bytes()):
         raise cannot_read(
             path,
@@ -481,15 +495,19 @@ def _read_votable(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
         layout = layout_of(path, list(fields), roles)
         _check_rows(path, len(table.array))
         columns = {}
-        unit = {}
+        unit: dict[str, str | None] = {}
+        array_names = table.array.dtype.names or ()
         for name in layout.needed():
-            column = table.array[
-                fields[name].ID if fields[name].ID in (table.array.dtype.names or ()) else name
-            ]
-            columns[name] = _numbers(
-                path, layout, name, np.asarray(column.data), np.ma.getmaskarray(column)
-            )
-            unit[name] = unit_by_name(name) if fields[name].unit is None else str(fields[name].unit)
+            field = fields[name]
+            array_name = field.ID if field.ID in array_names else name
+            column = table.array[array_name]
+            values = np.asarray(column.data)
+            mask = np.ma.getmaskarray(column)
+            columns[name] = _numbers(path, layout, name, values, mask)
+            if field.unit is None:
+                unit[name] = unit_by_name(name)
+            else:
+                unit[name] = str(field.unit)
         return RawTable(layout, columns, unit, len(table.array))
 
 
@@ -504,19 +522,23 @@ def _read_text(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
         for column in table.columns:
             unit[column.name] = column.unit or by_yaml.get(column.name) or unit_by_name(column.name)
         parts: dict[str, list[Any]] = {name: [] for name in layout.needed()}
+        place = {name: names.index(name) for name in parts}
         count = 0
         with _quiet(path):
-            for chunk in _chunks(table, [names.index(name) for name in parts]):
+            for chunk in _chunks(table, list(place.values())):
                 count += len(chunk)
                 _check_rows(path, count)
                 for name, pieces in parts.items():
-                    values, mask = _cells(chunk[_numbered(names.index(name))], unit[name])
+                    column = chunk[_numbered(place[name])]
+                    values, mask = _cells(column, unit[name])
                     pieces.append(_numbers(path, layout, name, values, mask))
     if not count:
         raise InputError(f"{path}: has no rows; {FILE_WANTED}")
     columns = {name: np.concatenate(pieces) for name, pieces in parts.items()}
-    plain = {name: "deg" if _turn_of(stated) else stated for name, stated in unit.items()}
-    return RawTable(layout, columns, plain, count, tuple(table.notices))
+    for name, stated in unit.items():
+        if _turn_of(stated) is not None:
+            unit[name] = "deg"  # which `_cells` made of them
+    return RawTable(layout, columns, unit, count, tuple(table.notices))
 
 
 def _turn_of(unit: str | None) -> str | None:
@@ -538,22 +560,25 @@ def _degrees(values: npt.NDArray[Any], mask: npt.NDArray[np.bool_], unit: str) -
     """Sexagesimal texts as degrees, 0 where masked."""
     from astropy.coordinates import Angle
 
-    return np.asarray(Angle(np.where(mask, "0", values), unit=unit).deg)
+    texts = np.where(mask, "0", values)
+    return np.asarray(Angle(texts, unit=unit).deg)
 
 
 def _ecsv_units(path: Path) -> dict[str, str | None]:
     """The units of an ECSV's columns by its YAML head; nothing for other texts."""
     with open_regular(path, FILE_WANTED) as file:
         head = file.read(MAX_HEAD_BYTES).decode("utf-8-sig", errors="replace")
-    comments = [line[1:].strip() for line in head.splitlines() if line.startswith("#")]
+    comments = []
+    for line in head.splitlines():
+        if line.startswith("#"):
+            comments.append(line[1:].strip())
     if not comments or not comments[0].startswith("%ECSV"):
         return {}
     from astropy.table import meta
 
     with _quiet(path):
-        header = meta.get_header_from_yaml(
-            [line for line in comments if not line.startswith("%ECSV")]
-        )
+        yaml_lines = [line for line in comments if not line.startswith("%ECSV")]
+        header = meta.get_header_from_yaml(yaml_lines)
     return {column["name"]: column.get("unit") for column in header["datatype"]}
 
 
@@ -592,9 +617,8 @@ def _chunks(table: TextTable, places: list[int]) -> Iterator[Any]:
         try:
             yield text.read(block, **options)
         except text.InconsistentTableError:
-            yield text.read(
-                _even_block(table, number, lines), **(options | {"delimiter": UNIT_SEPARATOR})
-            )
+            options["delimiter"] = UNIT_SEPARATOR
+            yield text.read(_even_block(table, number, lines), **options)
 
 
 def _plain_block(table: TextTable, block: str) -> str:
@@ -629,21 +653,22 @@ def _numbers(path: Path, layout: Layout, name: str, values: npt.NDArray[Any], ma
     InputError for other text.
     """
     if name == layout.role.get(SPECTRAL_TYPE):
-        texts = np.array(
-            [str(text).strip().encode("ascii", "replace") for text in values.tolist()],
-            dtype=np.bytes_,
-        )
+        types = []
+        for text in values.tolist():
+            types.append(str(text).strip().encode("ascii", "replace"))
+        texts = np.array(types, dtype=np.bytes_)
         if mask is None:
             return texts
         return np.where(mask, b"", texts)
-    whole = name in {layout.role.get(role) for role in Whole}
+    whole = name in {layout.role.get(role) for role in WHOLE}
     is_number = values.dtype.kind in "iufb"
     if not is_number and values.size == 0:
         raise InputError(f"{path}: has no rows; {FILE_WANTED}")
     if not is_number:
+        first = str(values.flat[0])[:40]
         raise InputError(
-            f"{path}: column {name} is no column of numbers (its first is"
-            f" {str(values.flat[0])[:40]!r}); write decimal figures, places in degrees"
+            f"{path}: column {name} is no column of numbers (its first is {first!r}); write decimal"
+            " figures, places in degrees"
         )
     if whole:
         plain = _whole_numbers(values)
@@ -661,11 +686,13 @@ def _whole_numbers(values: npt.NDArray[Any]) -> npt.NDArray[np.int64]:
     if values.dtype.kind != "f":
         return values.astype(np.int64)
     numbers = np.nan_to_num(values, nan=0.0)
-    lost = np.abs(numbers) > MAX_WHOLE_FLOAT.get(values.dtype.itemsize, 2.0**53)
+    largest = MAX_WHOLE_FLOAT.get(values.dtype.itemsize, 2.0**53)
+    lost = np.abs(numbers) > largest
     return np.where(lost, 0.0, numbers).astype(np.int64)
 
 
 def _check_rows(path: Path, count: int) -> None:
+    """Raise InputError for more than MAX_ROWS."""
     if count > MAX_ROWS:
         raise InputError(
             f"{path}: has more than {MAX_ROWS} rows; cut it to the magnitudes that the tracker sees"

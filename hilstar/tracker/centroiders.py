@@ -21,16 +21,16 @@ Centroider = Literal[Kind, "psf"]  # which is `fit` where a star is a Gaussian
 FAMILY: tuple[Kind, ...] = get_args(Kind)
 WIDE = 1.5  # in units of the star's sigma
 MIN_WINDOW_PX = 1.0  # a narrower one sees the one pixel that it stands on
-FIT_STEPS, WINDOW_STEPS = 8, 20
+FIT_STEPS, WINDOW_STEPS = 8, 20  # at most: stars that have settled end them before
 FIRST_STEPS = 3  # steps with a window before a fit
 # A window as wide as the star moves the mean half of the way, one on a single pixel all of it: both
 # come to rest by this.
 PACE = 1.5
-SETTLED_PX = 1e-6
+SETTLED_PX = 1e-6  # a step under it moves no star any more
 MAX_STEP_PX = 0.3  # largest step of a fit: its model is nearly linear within that
 BOX_SHARE = 0.02  # of its brightest pixel: darker ones do not count in a box
 BOX_HALVES: dict[str, int] = {"box3": 1, "box5": 2}
-MIN_LIGHT = 1e-30
+MIN_LIGHT = 1e-30  # a square with less is dark
 SLOPE_PX = 0.02  # to either side of a place, for a told PSF's slope
 
 
@@ -55,17 +55,24 @@ def star_places(
     default the brightest: two images of a star between two pixels are to be compared in one box.
     The others begin there. Of a box those pixels count that have over `box_share` of its brightest.
     """
-    lit = np.flatnonzero(stamps.sum(axis=(1, 2)) > MIN_LIGHT)
     x = np.zeros(len(stamps))
     y = np.zeros(len(stamps))
-    kind = "fit" if kind == "psf" else kind
-    if len(lit):
-        rows, columns = brightest(stamps) if pixels is None else pixels
-        near = rows[lit], columns[lit]
-        if kind in BOX_HALVES:
-            x[lit], y[lit] = _box(stamps[lit], BOX_HALVES[kind], near, box_share)
-        else:
-            x[lit], y[lit] = _KINDS[kind](stamps[lit], sigma_px, near)
+    lit = np.flatnonzero(stamps.sum(axis=(1, 2)) > MIN_LIGHT)
+    if not len(lit):
+        return x, y
+    if pixels is None:
+        pixels = brightest(stamps)
+    rows, columns = pixels
+    near = (rows[lit], columns[lit])
+    if kind == "psf":
+        kind = "fit"
+    if kind in BOX_HALVES:
+        lit_x, lit_y = _box(stamps[lit], BOX_HALVES[kind], near, box_share)
+    else:
+        places_of = _KINDS[kind]
+        lit_x, lit_y = places_of(stamps[lit], sigma_px, near)
+    x[lit] = lit_x
+    y[lit] = lit_y
     return x, y
 
 
@@ -76,49 +83,71 @@ def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
     The place is that of the PSF's middle, the chief ray: with coma the star's light lies beside it.
     """
     half = stamps.shape[1] // 2
-    x, y = (np.clip(place, -half, half) for place in first)
+    first_x, first_y = first
+    x = np.clip(first_x, -half, half)
+    y = np.clip(first_y, -half, half)
+    pixels = stamps.reshape(len(stamps), -1, 1)
     for _ in range(FIT_STEPS):
-        shares = told(x, y)
-        by_x = (told(x + SLOPE_PX, y) - told(x - SLOPE_PX, y)) / (2 * SLOPE_PX)
-        by_y = (told(x, y + SLOPE_PX) - told(x, y - SLOPE_PX)) / (2 * SLOPE_PX)
-        parts = np.stack([shares, by_x, by_y], axis=1).reshape(len(stamps), 3, -1)
+        parts = _told_parts(told, x, y).reshape(len(stamps), 3, -1)
         normal = parts @ parts.transpose(0, 2, 1)
-        right_side = parts @ stamps.reshape(len(stamps), -1, 1)
-        normal += (
-            np.eye(3)
-            * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
-        )
-        solution = np.linalg.solve(normal, right_side)[..., 0]  # flux, and flux times each step
+        right_side = parts @ pixels
+        solution = np.linalg.solve(normal + _ridge(normal), right_side)
+        flux, flux_dx, flux_dy = solution[..., 0].T
         # where there is no light, no step
-        flux = np.where(solution[:, 0] > MIN_LIGHT, solution[:, 0], np.inf)
-        dx, dy = (np.clip(solution[:, k] / flux, -MAX_STEP_PX, MAX_STEP_PX) for k in (1, 2))
-        x, y = (np.clip(place, -half, half) for place in (x + dx, y + dy))
-        if not len(dx) or max(np.abs(dx).max(), np.abs(dy).max()) < SETTLED_PX:
+        divisor = np.where(flux > MIN_LIGHT, flux, np.inf)
+        dx = np.clip(flux_dx / divisor, -MAX_STEP_PX, MAX_STEP_PX)
+        dy = np.clip(flux_dy / divisor, -MAX_STEP_PX, MAX_STEP_PX)
+        x = np.clip(x + dx, -half, half)
+        y = np.clip(y + dy, -half, half)
+        if not len(dx) or _are_settled(dx, dy):
             break
     return x, y
+
+
+def _told_parts(told: ToldPsf, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Shares of a told PSF at places (n,), and their slopes along x and y: (n, 3, side, side)."""
+    shares = told(x, y)
+    by_x = (told(x + SLOPE_PX, y) - told(x - SLOPE_PX, y)) / (2 * SLOPE_PX)
+    by_y = (told(x, y + SLOPE_PX) - told(x, y - SLOPE_PX)) / (2 * SLOPE_PX)
+    return np.stack([shares, by_x, by_y], axis=1)
+
+
+def _ridge(normal: FloatArray) -> FloatArray:
+    """What is added to normal matrices (n, 3, 3), so that a star without light has a solution."""
+    trace = np.trace(normal, axis1=1, axis2=2)
+    weight = np.maximum(1e-12 * trace, MIN_LIGHT)
+    return np.asarray(np.eye(3) * weight[:, None, None])
+
+
+def _are_settled(dx_px: FloatArray, dy_px: FloatArray) -> bool:
+    """Whether no star takes a step that matters any more."""
+    largest_px = max(np.abs(dx_px).max(), np.abs(dy_px).max())
+    return bool(largest_px < SETTLED_PX)
 
 
 def brightest(stamps: FloatArray) -> Pixels:
     """The brightest pixel of each square, two or more from its edge."""
     side = stamps.shape[1]
-    rows, columns = np.divmod(
-        stamps[:, 2 : side - 2, 2 : side - 2].reshape(len(stamps), -1).argmax(axis=1), side - 4
-    )
+    inner = stamps[:, 2 : side - 2, 2 : side - 2]
+    place = inner.reshape(len(stamps), -1).argmax(axis=1)
+    rows, columns = np.divmod(place, side - 4)
     return rows + 2, columns + 2
 
 
 def _axis(stamps: FloatArray) -> FloatArray:
+    """The places (side,), px from the middle, of the pixels of squares along a side."""
     side = stamps.shape[1]
     return np.asarray(np.arange(side) - side // 2, dtype=np.float64)
 
 
 def _moment(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
+    """See the module: places (n,) by the plain first moment."""
     at = _axis(stamps)
     light = stamps.sum(axis=(1, 2))
-    x, y = (
-        np.clip(stamps.sum(axis=axis) @ at / light, at[0], at[-1]) for axis in (1, 2)
-    )  # noise below 0 may leave little light
-    return x, y
+    x = stamps.sum(axis=1) @ at / light
+    y = stamps.sum(axis=2) @ at / light
+    # noise below 0 may leave little light
+    return np.clip(x, at[0], at[-1]), np.clip(y, at[0], at[-1])
 
 
 def _window(
@@ -128,21 +157,27 @@ def _window(
     wide: float = 1.0,
     steps: int = WINDOW_STEPS,
 ) -> Places:
-    at, (x, y) = _axis(stamps), _box(stamps, 2, pixels)
-    sigmas = [wide * max(sigma, MIN_WINDOW_PX) for sigma in sigma_px]
+    """See the module: places (n,) by a Gaussian window, `wide` times as wide as the star, that
+    follows it.
+    """
+    at = _axis(stamps)
+    x, y = _box(stamps, 2, pixels)
+    sigma_x = wide * max(sigma_px[0], MIN_WINDOW_PX)
+    sigma_y = wide * max(sigma_px[1], MIN_WINDOW_PX)
     for _ in range(steps):
-        across, down = (
-            np.exp(-np.square(at - place[:, None]) / (2 * sigma**2))
-            for place, sigma in zip((x, y), sigmas, strict=True)
-        )
-        sums = _sums(
-            stamps, np.stack([down, at * down], axis=1), np.stack([across, at * across], axis=2)
-        )
+        across = np.exp(-np.square(at - x[:, None]) / (2 * sigma_x**2))
+        down = np.exp(-np.square(at - y[:, None]) / (2 * sigma_y**2))
+        rows = np.stack([down, at * down], axis=1)
+        columns = np.stack([across, at * across], axis=2)
+        sums = _sums(stamps, rows, columns)
         light = np.maximum(sums[:, 0, 0], MIN_LIGHT)
-        dx = PACE * (sums[:, 0, 1] / light - x)
-        dy = PACE * (sums[:, 1, 0] / light - y)
-        x, y = (np.clip(place, at[0], at[-1]) for place in (x + dx, y + dy))
-        if max(np.abs(dx).max(), np.abs(dy).max()) < SETTLED_PX:
+        mean_x = sums[:, 0, 1] / light
+        mean_y = sums[:, 1, 0] / light
+        dx = PACE * (mean_x - x)
+        dy = PACE * (mean_y - y)
+        x = np.clip(x + dx, at[0], at[-1])
+        y = np.clip(y + dy, at[0], at[-1])
+        if _are_settled(dx, dy):
             break
     return x, y
 
@@ -155,18 +190,22 @@ def _sums(stamps: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArr
 
 
 def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
-    at, (x, y) = _axis(stamps), _window(stamps, sigma_px, pixels, steps=FIRST_STEPS)
+    """See the module: places (n,) by least squares of a Gaussian, after some steps of a window."""
+    at = _axis(stamps)
+    x, y = _window(stamps, sigma_px, pixels, steps=FIRST_STEPS)
+    sigma_x, sigma_y = sigma_px
     flux = stamps.sum(axis=(1, 2))
     for _ in range(FIT_STEPS):
-        across, down = (
-            np.stack(_profile(at, place, sigma), axis=1)
-            for place, sigma in zip((x, y), sigma_px, strict=True)
-        )
-        step = _fit_step(_sums(stamps, down, across.transpose(0, 2, 1)), across, down, flux)
+        across = _profile(at, x, sigma_x)
+        down = _profile(at, y, sigma_y)
+        sums = _sums(stamps, down, across.transpose(0, 2, 1))
+        step = _fit_step(sums, across, down, flux)
         flux = np.maximum(flux + step[:, 0], MIN_LIGHT)
-        dx, dy = (np.clip(step[:, k], -MAX_STEP_PX, MAX_STEP_PX) for k in (1, 2))
-        x, y = (np.clip(place, at[0], at[-1]) for place in (x + dx, y + dy))
-        if max(np.abs(dx).max(), np.abs(dy).max()) < SETTLED_PX:
+        dx = np.clip(step[:, 1], -MAX_STEP_PX, MAX_STEP_PX)
+        dy = np.clip(step[:, 2], -MAX_STEP_PX, MAX_STEP_PX)
+        x = np.clip(x + dx, at[0], at[-1])
+        y = np.clip(y + dy, at[0], at[-1])
+        if _are_settled(dx, dy):
             break
     return x, y
 
@@ -175,68 +214,73 @@ def _products(profile: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Sums along a side of shares and their slopes (n, 2, side): shares squared, shares times
     slopes, and slopes squared.
     """
-    share, slope = profile[:, 0], profile[:, 1]
-    return (
-        np.einsum("ns,ns->n", share, share),
-        np.einsum("ns,ns->n", share, slope),
-        np.einsum("ns,ns->n", slope, slope),
-    )
+    share = profile[:, 0]
+    slope = profile[:, 1]
+    share_share = np.einsum("ns,ns->n", share, share)
+    share_slope = np.einsum("ns,ns->n", share, slope)
+    slope_slope = np.einsum("ns,ns->n", slope, slope)
+    return share_share, share_slope, slope_slope
 
 
 def _fit_step(
-    seen: FloatArray, across: FloatArray, down: FloatArray, flux: FloatArray
+    sums: FloatArray, across: FloatArray, down: FloatArray, flux: FloatArray
 ) -> FloatArray:
     """What least squares adds to flux, x and y, (n, 3).
 
     `across` and `down` (n, 2, side) are a star's shares and their slopes in columns and rows,
-    `seen` (n, 2, 2) the square's sums under their products.
+    `sums` (n, 2, 2) those of the square under their products.
     """
     xx, xd, dd = _products(across)
     yy, yd, ee = _products(down)
-    star_and_slopes = flux * yy * xd, flux * yd * xx  # the star with its slopes
-    normal = np.stack(
-        [
-            xx * yy,
-            *star_and_slopes,
-            star_and_slopes[0],
-            flux**2 * yy * dd,
-            flux**2 * yd * xd,
-            star_and_slopes[1],
-            flux**2 * yd * xd,
-            flux**2 * ee * xx,
-        ],
-        axis=-1,
-    ).reshape(-1, 3, 3)
-    unexplained = (
-        np.stack([seen[:, 0, 0], flux * seen[:, 0, 1], flux * seen[:, 1, 0]], axis=-1)
-        - flux[:, None] * normal[:, 0]
-    )
-    normal += (
-        np.eye(3) * np.maximum(1e-12 * np.trace(normal, axis1=1, axis2=2), MIN_LIGHT)[:, None, None]
-    )
-    return np.asarray(np.linalg.solve(normal, unexplained[..., None])[..., 0])
+    star_star = xx * yy
+    star_by_x = flux * yy * xd
+    star_by_y = flux * yd * xx
+    squared = flux**2
+    by_x_by_x = squared * yy * dd
+    by_x_by_y = squared * yd * xd
+    by_y_by_y = squared * ee * xx
+    by_star = np.stack([star_star, star_by_x, star_by_y], axis=-1)
+    by_x = np.stack([star_by_x, by_x_by_x, by_x_by_y], axis=-1)
+    by_y = np.stack([star_by_y, by_x_by_y, by_y_by_y], axis=-1)
+    normal = np.stack([by_star, by_x, by_y], axis=1)
+    light_by_x = flux * sums[:, 0, 1]
+    light_by_y = flux * sums[:, 1, 0]
+    light = np.stack([sums[:, 0, 0], light_by_x, light_by_y], axis=-1)
+    unexplained = light - flux[:, None] * by_star
+    solution = np.linalg.solve(normal + _ridge(normal), unexplained[..., None])
+    return np.asarray(solution[..., 0])
 
 
-def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> Places:
-    """A star's shares in a row of pixels, and how they change with its place, (n, side)."""
+def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> FloatArray:
+    """A star's shares in a row of pixels, and how they change with its place, (n, 2, side)."""
     from scipy.special import ndtr  # 0.1 s of every command that needs none of it
 
-    edges = (np.append(at - 0.5, at[-1] + 0.5) - place[:, None]) / sigma_px
-    return np.diff(ndtr(edges)), -np.diff(np.exp(-(edges**2) / 2)) / (np.sqrt(2 * np.pi) * sigma_px)
+    edges_px = np.append(at - 0.5, at[-1] + 0.5)
+    edges = (edges_px - place[:, None]) / sigma_px
+    shares = np.diff(ndtr(edges))
+    density = np.exp(-(edges**2) / 2)
+    slopes = -np.diff(density) / (np.sqrt(2 * np.pi) * sigma_px)
+    return np.stack([shares, slopes], axis=1)
 
 
 def _box(stamps: FloatArray, half: int, pixels: Pixels, share: float = BOX_SHARE) -> Places:
+    """See the module: places (n,) by the centre of mass of boxes that reach `half` pixels from
+    `pixels`.
+    """
     rows, columns = pixels
     side = stamps.shape[1]
     near = np.arange(-half, half + 1)
     y = rows[:, None, None] + near[:, None]
     x = columns[:, None, None] + near
-    box = stamps[np.arange(len(stamps))[:, None, None], y, x]
-    box = np.where(box > share * box.max(axis=(1, 2), keepdims=True), box, 0.0)
+    star = np.arange(len(stamps))
+    box = stamps[star[:, None, None], y, x]
+    is_bright = box > share * box.max(axis=(1, 2), keepdims=True)
+    box = np.where(is_bright, box, 0.0)
     light = np.maximum(box.sum(axis=(1, 2)), MIN_LIGHT)
-    return (box * (x - side // 2)).sum(axis=(1, 2)) / light, (box * (y - side // 2)).sum(
-        axis=(1, 2)
-    ) / light
+    middle = side // 2
+    moment_x = (box * (x - middle)).sum(axis=(1, 2))
+    moment_y = (box * (y - middle)).sum(axis=(1, 2))
+    return moment_x / light, moment_y / light
 
 
 _KINDS: dict[Kind, Callable[[FloatArray, Sigma, Pixels], Places]] = {

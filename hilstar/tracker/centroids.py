@@ -38,8 +38,7 @@ CLIPPED_SIGMA = 0.986578
 MIN_STEP_PX = 1e-7
 WITH_DIAGONALS = np.ones((3, 3), dtype=np.bool_)
 # Share of s^2 by which the window can narrow the star's second moment: Newton's step is at most 10
-# times the
-# plain one, so that noise in the moment cannot throw the centre out of the window.
+# times the plain one, so that noise in the moment cannot throw the centre out of the window.
 MIN_SLOPE = 0.1
 COUNTED_TYPES, COUNTED_AT_ONCE = (np.uint8, np.uint16), 1 << 16
 # where the bias is steepest, 2 pi 0.05 px a pixel, interpolation between two of them is right to
@@ -64,8 +63,7 @@ class CentroidSettings:
 
     `window_radius_px` (default: 4 window sigmas, rounded up) is half the window's side: it is 2
     radius + 1 pixels wide. `psf_sigma_px` (x, y), where known, removes the S-curve of that Gaussian
-    star from the places.
-    Raises InputError for a value out of range.
+    star from the places. Raises InputError for a value out of range.
     """
 
     threshold_sigma: float = 5.0
@@ -93,9 +91,8 @@ class CentroidSettings:
             raise InputError(
                 f"centroids: window_radius_px = {self.window_radius_px}; write 1 to 1000 pixels"
             )
-        if self.psf_sigma_px is not None and not all(
-            0.05 <= sigma <= 100 for sigma in self.psf_sigma_px
-        ):
+        psf_px = self.psf_sigma_px
+        if psf_px is not None and not all(0.05 <= sigma <= 100 for sigma in psf_px):
             raise InputError(
                 f"centroids: psf_sigma_px = {self.psf_sigma_px}; write two numbers from 0.05 to 100"
             )
@@ -112,9 +109,8 @@ class Centroids:
     right, y down.
 
     `flux` is the sum in the window, `peak` the highest pixel of the blob, both above the background
-    and in the image's
-    unit; `pixels` counts the blob; `at_edge` says that the window leaves the image, which biases
-    the place inwards.
+    and in the image's unit; `pixels` counts the blob; `at_edge` says that the window leaves the
+    image, which biases the place inwards.
     """
 
     x_px: FloatArray
@@ -145,31 +141,33 @@ def estimate_background(image: npt.NDArray[Any], step: float | None = None) -> L
     sigma of the median.
 
     The second step resolves a fraction of a DN where the median, and the MAD, are whole ones. One
-    level for the image:
-    a gradient counts as noise. `step` is what the image was rounded to (default: 1 for whole
-    numbers, else 0), and the noise at least rounding's, step / sqrt 12. That of a noiseless float
-    image is 0, and then every pixel over the level belongs to a star: give a `LocalBackground` for
-    such an image.
+    level for the image: a gradient counts as noise. `step` is what the image was rounded to
+    (default: 1 for whole numbers, else 0), and the noise at least rounding's, step / sqrt 12. That
+    of a noiseless float image is 0, and then every pixel over the level belongs to a star: give a
+    `LocalBackground` for such an image.
     """
     if step is None:
         step = 1.0 if image.dtype.kind in "iu" else 0.0
     _check(image)
-    values, counts = (
-        _counted(image)
-        if image.dtype in COUNTED_TYPES
-        else (image.astype(np.float64).ravel(), None)
-    )
+    counts: IntArray | None = None
+    if image.dtype in COUNTED_TYPES:
+        values, counts = _counted(image)
+    else:
+        values = image.astype(np.float64).ravel()
     median = _median(values, counts)
-    sigma = MAD_TO_SIGMA * _median(np.abs(values - median), counts)
+    deviation = np.abs(values - median)
+    sigma = MAD_TO_SIGMA * _median(deviation, counts)
     # Where the noise is under a step, a cut at 3 sigma would keep a code on one side and drop its
     # counterpart on the other.
-    is_background = np.abs(values - median) <= CLIP_SIGMAS * max(sigma, step)
-    shares = None if counts is None else counts[is_background]
-    level = float(np.average(values[is_background], weights=shares))
-    noise = (
-        math.sqrt(float(np.average((values[is_background] - level) ** 2, weights=shares)))
-        / CLIPPED_SIGMA
-    )
+    is_background = deviation <= CLIP_SIGMAS * max(sigma, step)
+    background = values[is_background]
+    weights = None
+    if counts is not None:
+        weights = counts[is_background]
+    level = float(np.average(background, weights=weights))
+    squared = (background - level) ** 2
+    variance = float(np.average(squared, weights=weights))
+    noise = math.sqrt(variance) / CLIPPED_SIGMA
     return LocalBackground(level, max(noise, step / math.sqrt(12)))
 
 
@@ -181,7 +179,8 @@ def _counted(image: npt.NDArray[Any]) -> tuple[FloatArray, IntArray]:
     counts = np.zeros(int(image.max()) + 1, dtype=np.intp)
     # whose whole numbers of 64 bits stay in a core's cache
     for begin in range(0, len(flat), COUNTED_AT_ONCE):
-        counts += np.bincount(flat[begin : begin + COUNTED_AT_ONCE], minlength=len(counts))
+        part = flat[begin : begin + COUNTED_AT_ONCE]
+        counts += np.bincount(part, minlength=len(counts))
     values = np.flatnonzero(counts)
     return values.astype(np.float64), counts[values]
 
@@ -192,7 +191,9 @@ def _median(values: FloatArray, counts: IntArray | None) -> float:
         return float(np.median(values))
     order = np.argsort(values, kind="stable")
     below = np.cumsum(counts[order])
-    middle = np.searchsorted(below, [(below[-1] - 1) // 2, below[-1] // 2], side="right")
+    pixels = below[-1]
+    middle_pixels = [(pixels - 1) // 2, pixels // 2]
+    middle = np.searchsorted(below, middle_pixels, side="right")
     return float(values[order][middle].mean())
 
 
@@ -208,34 +209,36 @@ def noisiest_background(image: FloatArray, step: float = 1.0) -> LocalBackground
         level = _median(*_counted(image))
     else:
         level = float(np.median(image))
-    rows, columns = (max(size // BLOCK_PX, 1) for size in image.shape)
-    height = image.shape[0] // rows
-    width = image.shape[1] // columns
-    blocks = (
-        image[: rows * height, : columns * width]
-        .reshape(rows, height, columns, width)
-        .swapaxes(1, 2)
-    )
+    image_height, image_width = image.shape
+    rows = max(image_height // BLOCK_PX, 1)
+    columns = max(image_width // BLOCK_PX, 1)
+    height = image_height // rows
+    width = image_width // columns
+    whole = image[: rows * height, : columns * width]
+    blocks = whole.reshape(rows, height, columns, width).swapaxes(1, 2)
     # Sorted in two thirds of the time of float64, and exact for whole steps up to 2^24.
     values: npt.NDArray[Any] = blocks.reshape(rows * columns, -1).astype(np.float32)
     values -= _row_medians(values)
-    off = np.abs(values)
+    deviation = np.abs(values)
     # The median deviation of whole steps is a whole one: half a step more, so that nothing of the
     # noise is cut off.
-    is_background = off <= CLIP_SIGMAS * (MAD_TO_SIGMA * (_row_medians(off) + step / 2))
+    sigma = MAD_TO_SIGMA * (_row_medians(deviation) + step / 2)
+    is_background = deviation <= CLIP_SIGMAS * sigma
     values *= is_background
     squares = np.einsum("ij,ij->i", values, values, dtype=np.float64)
-    noise = np.sqrt(squares / is_background.sum(axis=1)) / CLIPPED_SIGMA
-    return LocalBackground(
-        level, max(float(np.percentile(noise, NOISIER_PERCENT)), step / math.sqrt(12))
-    )
+    variance = squares / is_background.sum(axis=1)
+    noise = np.sqrt(variance) / CLIPPED_SIGMA
+    noisier = float(np.percentile(noise, NOISIER_PERCENT))
+    return LocalBackground(level, max(noisier, step / math.sqrt(12)))
 
 
 def _row_medians(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
     """The median of each row of values (n, k), (n, 1) of their type: whole rows are sorted in a
     tenth of `np.median`'s time.
     """
-    middle = np.sort(values, axis=1)[:, (values.shape[1] - 1) // 2 : values.shape[1] // 2 + 1]
+    size = values.shape[1]
+    in_order = np.sort(values, axis=1)
+    middle = in_order[:, (size - 1) // 2 : size // 2 + 1]
     return np.asarray(middle.mean(axis=1, keepdims=True))
 
 
@@ -248,28 +251,26 @@ def find_stars(
     or another shape.
 
     Without `background` it is estimated from the image. Stars whose blobs touch are one; a
-    neighbour inside the window
-    pulls the centre towards itself.
+    neighbour inside the window pulls the centre towards itself.
     """
     settings = settings or CentroidSettings()
     _check(image)
     under = background or estimate_background(image)
-    blobs = _find_blobs(
-        image, under.level, settings.threshold_sigma * under.noise, settings.minimum_pixels
-    )
+    threshold = settings.threshold_sigma * under.noise
+    blobs = _find_blobs(image, under.level, threshold, settings.minimum_pixels)
     x_px, y_px = _refine(image, under.level, blobs, settings)
     stamps, _, _ = squares(image, under.level, x_px, y_px, settings.radius_px)
     flux = stamps.sum(axis=(1, 2))
     height, width = image.shape
     reach = settings.radius_px
-    inside = (np.rint(x_px) >= reach) & (np.rint(x_px) < width - reach)
-    inside &= (np.rint(y_px) >= reach) & (np.rint(y_px) < height - reach)
+    column = np.rint(x_px)
+    row = np.rint(y_px)
+    inside = (column >= reach) & (column < width - reach)
+    inside &= (row >= reach) & (row < height - reach)
     if settings.psf_sigma_px is not None:
-        curves = s_curves(settings)
-        x_px, y_px = (
-            place - np.interp(place, curve.measured_px, curve.bias_px, period=1.0)
-            for place, curve in zip((x_px, y_px), curves, strict=True)
-        )
+        curve_x, curve_y = s_curves(settings)
+        x_px = x_px - np.interp(x_px, curve_x.measured_px, curve_x.bias_px, period=1.0)
+        y_px = y_px - np.interp(y_px, curve_y.measured_px, curve_y.bias_px, period=1.0)
     order = np.argsort(-flux, kind="stable")
     return Centroids(
         x_px[order],
@@ -282,6 +283,7 @@ def find_stars(
 
 
 def _check(image: npt.NDArray[Any]) -> None:
+    """Raise InputError for an image that has no stars to look for."""
     if image.ndim != 2 or 0 in image.shape or image.dtype.kind not in "fiu":
         raise InputError(
             f"centroids: an image of type {image.dtype}, shape {image.shape}; give numbers (height,"
@@ -316,7 +318,8 @@ def _find_blobs(
     peak = np.zeros(blob_count)
     np.maximum.at(peak, blob, value)
     # Everything above a threshold of 0 or more is positive, so no blob's flux is 0.
-    x_px, y_px = (np.bincount(blob, value * place, minlength=blob_count) / flux for place in (x, y))
+    x_px = np.bincount(blob, value * x, minlength=blob_count) / flux
+    y_px = np.bincount(blob, value * y, minlength=blob_count) / flux
     is_large = pixels >= minimum_pixels
     return _Blobs(x_px[is_large], y_px[is_large], peak[is_large], pixels[is_large])
 
@@ -334,24 +337,29 @@ def squares(
     Beyond the image values are 0.
     """
     reach = np.arange(-radius_px, radius_px + 1)
-    column, row = (np.rint(place).astype(np.intp)[:, None] + reach for place in (x_px, y_px))
+    middle_column = np.rint(x_px).astype(np.intp)
+    middle_row = np.rint(y_px).astype(np.intp)
+    column = middle_column[:, None] + reach
+    row = middle_row[:, None] + reach
     height, width = image.shape
-    values = (
-        image[row.clip(0, height - 1)[:, :, None], column.clip(0, width - 1)[:, None, :]].astype(
-            np.float64
-        )
-        - level
-    )
-    for place, size, axes in ((row, height, np.s_[:, :, None]), (column, width, np.s_[:, None, :])):
-        beyond = (place < 0) | (place >= size)
-        if beyond.any():
-            values *= ~beyond[axes]
-    return values, (column - x_px[:, None])[:, None, :], (row - y_px[:, None])[:, :, None]
+    nearest_row = row.clip(0, height - 1)[:, :, None]
+    nearest_column = column.clip(0, width - 1)[:, None, :]
+    values = image[nearest_row, nearest_column].astype(np.float64) - level
+    row_beyond = (row < 0) | (row >= height)
+    if row_beyond.any():
+        values *= ~row_beyond[:, :, None]
+    column_beyond = (column < 0) | (column >= width)
+    if column_beyond.any():
+        values *= ~column_beyond[:, None, :]
+    dx = column - x_px[:, None]
+    dy = row - y_px[:, None]
+    return values, dx[:, None, :], dy[:, :, None]
 
 
 def _refine(
     image: npt.NDArray[Any], level: float, blobs: _Blobs, settings: CentroidSettings
 ) -> tuple[FloatArray, FloatArray]:
+    """Places (n,), px, by the settings' window, from those of blobs on."""
     if settings.window == "gaussian":
         return _gaussian_centres(image, level, blobs, settings)
     return _plain_centres(image, level, blobs, settings)
@@ -370,19 +378,24 @@ def _gaussian_centres(
     sigma2 = settings.window_sigma_px**2
     lost = np.zeros(place.shape[1], dtype=np.bool_)
     for _ in range(settings.iterations):
-        values, dx, dy = squares(image, level, place[0], place[1], settings.radius_px)
-        weighted = values * np.exp(-0.5 * (dx**2 + dy**2) / sigma2)
+        x_px, y_px = place
+        values, dx, dy = squares(image, level, x_px, y_px, settings.radius_px)
+        distance2 = dx**2 + dy**2
+        weighted = values * np.exp(-0.5 * distance2 / sigma2)
         total = weighted.sum(axis=(1, 2))
         lost |= total <= 0
         total = np.where(lost, 1.0, total)
-        first_px = np.stack([(weighted * dx).sum(axis=(1, 2)), (weighted * dy).sum(axis=(1, 2))])
-        second_px2 = np.stack(
-            [(weighted * dx**2).sum(axis=(1, 2)), (weighted * dy**2).sum(axis=(1, 2))]
-        )
+        first_x = (weighted * dx).sum(axis=(1, 2))
+        first_y = (weighted * dy).sum(axis=(1, 2))
+        first_px = np.stack([first_x, first_y])
+        second_x = (weighted * dx**2).sum(axis=(1, 2))
+        second_y = (weighted * dy**2).sum(axis=(1, 2))
+        second_px2 = np.stack([second_x, second_y])
         slope = 1 - second_px2 / total / sigma2
         step = first_px / total / np.maximum(slope, MIN_SLOPE)
         moved = np.where(lost, start, place + step)
-        lost |= (np.abs(moved - start) > settings.radius_px).any(axis=0)
+        from_start_px = np.abs(moved - start)
+        lost |= (from_start_px > settings.radius_px).any(axis=0)
         moved = np.where(lost, start, moved)
         arrived = np.abs(moved - place).max(initial=0.0) < MIN_STEP_PX
         place = moved
@@ -403,12 +416,18 @@ def _plain_centres(
     place = start
     middle = np.rint(start)
     for _ in range(settings.iterations):
-        values, dx, dy = squares(image, level, middle[0], middle[1], settings.radius_px)
+        x_px, y_px = middle
+        values, dx, dy = squares(image, level, x_px, y_px, settings.radius_px)
         total = values.sum(axis=(1, 2))
-        sums = np.stack([(values * dx).sum(axis=(1, 2)), (values * dy).sum(axis=(1, 2))])
+        sum_x = (values * dx).sum(axis=(1, 2))
+        sum_y = (values * dy).sum(axis=(1, 2))
+        sums = np.stack([sum_x, sum_y])
         step = np.divide(sums, total, out=np.zeros_like(sums), where=total > 0)
-        lost = (total <= 0) | (np.abs(middle + step - start) > settings.radius_px).any(axis=0)
-        place = np.where(lost, start, middle + step)
+        moved = middle + step
+        from_start_px = np.abs(moved - start)
+        has_left = (from_start_px > settings.radius_px).any(axis=0)
+        lost = (total <= 0) | has_left
+        place = np.where(lost, start, moved)
         still = np.array_equal(np.rint(place), middle)
         middle = np.rint(place)
         if still:
@@ -432,9 +451,8 @@ def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
     itself.
 
     Window and star are products of an x and a y part, so the curve of one axis does not depend on
-    the other's place.
-    Raises InputError where two places within a pixel are measured as one: the window is too narrow
-    for that star.
+    the other's place. Raises InputError where two places within a pixel are measured as one: the
+    window is too narrow for that star.
     """
     if settings.psf_sigma_px is None:
         raise InputError(
@@ -444,19 +462,18 @@ def s_curves(settings: CentroidSettings) -> tuple[SCurve, SCurve]:
     middle_px = tile_px // 2
     true_px = np.linspace(-0.5, 0.5, S_CURVE_PHASES, endpoint=False)
     pixel = np.arange(tile_px) - middle_px - true_px[:, None]
-    share_x, share_y = (
-        ndtr((pixel + 0.5) / sigma) - ndtr((pixel - 0.5) / sigma) for sigma in settings.psf_sigma_px
-    )
+    sigma_x, sigma_y = settings.psf_sigma_px
+    share_x = ndtr((pixel + 0.5) / sigma_x) - ndtr((pixel - 0.5) / sigma_x)
+    share_y = ndtr((pixel + 0.5) / sigma_y) - ndtr((pixel - 0.5) / sigma_y)
     tiles = share_y[:, :, None] * share_x[:, None, :]
     strip = tiles.transpose(1, 0, 2).reshape(tile_px, -1)
     offset_px = tile_px * np.arange(S_CURVE_PHASES) + middle_px
     ones = np.ones(S_CURVE_PHASES)
     stars = _Blobs(offset_px + true_px, middle_px + true_px, ones, ones.astype(np.intp))
     x_px, y_px = _refine(strip, 0.0, stars, settings)
-    curves = (
-        SCurve(x_px - offset_px, x_px - offset_px - true_px),
-        SCurve(y_px - middle_px, y_px - middle_px - true_px),
-    )
+    measured_x = x_px - offset_px
+    measured_y = y_px - middle_px
+    curves = SCurve(measured_x, measured_x - true_px), SCurve(measured_y, measured_y - true_px)
     if any((np.diff(curve.measured_px) <= 0).any() for curve in curves):
         raise InputError(
             f"centroids: window_sigma_px = {settings.window_sigma_px:g} is too narrow for"

@@ -36,13 +36,12 @@ DEFAULT_PITCH_UM = 13.0  # the CCD47-20's
 MAX_HITS = 1e6  # cosmic rays in one frame; each is a track of pixels
 
 # A particle at minimum ionisation in silicon (Particle Data Group): 388 eV/um on average, 3.66 eV a
-# pair. The mean
-# alone, without Landau's tail.
+# pair. The mean alone, without Landau's tail.
 RAY_E_PER_UM = 388.0 / 3.66
 RAY_DEPTH_UM = 20.0  # sensitive silicon of a back-illuminated CCD, of the order of its pixel
 RAY_STEP_PX = 0.25  # along a track, so that no pixel that it crosses is passed over
 
-FALSE_STAR_REACH_SIGMAS = 5.0
+FALSE_STAR_REACH_SIGMAS = 5.0  # beyond it lie 6e-7 of a Gaussian's light along an axis
 CodeArray = npt.NDArray[np.uint16]
 ChargeArray = npt.NDArray[Any]  # float64 in `noise_version = 1`, else float32
 
@@ -58,8 +57,8 @@ def cosmic_rays_e(
     silicon.
 
     The rate is that of hits on the sensor's face. Rays come isotropically, so a face sees cos^2 of
-    the angle to its
-    normal spread evenly from 0 to 1. Raises InputError where more than MAX_HITS are expected.
+    the angle to its normal spread evenly from 0 to 1. Raises InputError where more than MAX_HITS
+    are expected.
     """
     height, width = shape
     area_cm2 = width * height * (pixel_pitch_um * 1e-4) ** 2
@@ -80,16 +79,18 @@ def cosmic_rays_e(
     charge_e *= np.divide(seen_px, length_px, out=np.ones(hits), where=length_px > 0)
     steps = np.ceil(seen_px / RAY_STEP_PX).astype(np.intp) + 1
     ray = np.repeat(np.arange(hits), steps)
-    along_px = (
-        (np.arange(len(ray)) - np.repeat(np.cumsum(steps) - steps, steps) + 0.5)
-        / steps[ray]
-        * seen_px[ray]
-    )
-    column = np.floor(start_px[ray, 0] + along_px * np.cos(azimuth_rad[ray])).astype(np.intp)
-    row = np.floor(start_px[ray, 1] + along_px * np.sin(azimuth_rad[ray])).astype(np.intp)
+    # each track's steps, evenly from its begin to its end
+    first = np.cumsum(steps) - steps
+    step = np.arange(len(ray)) - np.repeat(first, steps)
+    along_px = (step + 0.5) / steps[ray] * seen_px[ray]
+    x_px = start_px[ray, 0] + along_px * np.cos(azimuth_rad[ray])
+    y_px = start_px[ray, 1] + along_px * np.sin(azimuth_rad[ray])
+    column = np.floor(x_px).astype(np.intp)
+    row = np.floor(y_px).astype(np.intp)
     inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+    charge_a_step_e = (charge_e / steps)[ray[inside]]
     image_e = np.zeros(shape)
-    np.add.at(image_e, (row[inside], column[inside]), rng.poisson((charge_e / steps)[ray[inside]]))
+    np.add.at(image_e, (row[inside], column[inside]), rng.poisson(charge_a_step_e))
     return image_e
 
 
@@ -105,23 +106,19 @@ def false_stars_e(
     x_px, y_px = (rng.random((settings.false_stars, 2)) * (width, height) - 0.5).T
     sigma_px = settings.false_star_sigma_px
     reach = math.ceil(FALSE_STAR_REACH_SIGMAS * sigma_px) + 1
-    column = np.rint(x_px).astype(np.intp)[:, None] + np.arange(-reach, reach + 1)
-    row = np.rint(y_px).astype(np.intp)[:, None] + np.arange(-reach, reach + 1)
-    share_x = ndtr((column - x_px[:, None] + 0.5) / sigma_px) - ndtr(
-        (column - x_px[:, None] - 0.5) / sigma_px
-    )
-    share_y = ndtr((row - y_px[:, None] + 0.5) / sigma_px) - ndtr(
-        (row - y_px[:, None] - 0.5) / sigma_px
-    )
+    steps = np.arange(-reach, reach + 1)
+    column = np.rint(x_px).astype(np.intp)[:, None] + steps
+    row = np.rint(y_px).astype(np.intp)[:, None] + steps
+    across_px = column - x_px[:, None]
+    down_px = row - y_px[:, None]
+    share_x = ndtr((across_px + 0.5) / sigma_px) - ndtr((across_px - 0.5) / sigma_px)
+    share_y = ndtr((down_px + 0.5) / sigma_px) - ndtr((down_px - 0.5) / sigma_px)
     share_x *= (column >= 0) & (column < width)
     share_y *= (row >= 0) & (row < height)
     light_e = settings.false_star_e_per_s * exposure_s * share_y[:, :, None] * share_x[:, None, :]
     image_e = np.zeros(shape)
-    np.add.at(
-        image_e,
-        (row.clip(0, height - 1)[:, :, None], column.clip(0, width - 1)[:, None, :]),
-        light_e,
-    )
+    pixels = row.clip(0, height - 1)[:, :, None], column.clip(0, width - 1)[:, None, :]
+    np.add.at(image_e, pixels, light_e)
     return image_e
 
 
@@ -159,13 +156,11 @@ class Detector:
         kind = np.float64 if settings.noise_version == 1 else np.float32
         self.gain_map: ChargeArray = gain_map.astype(kind, copy=False)
         self.dark_map_e_per_s: ChargeArray = dark_map_e_per_s.astype(kind, copy=False)
-        self.column_e: ChargeArray = (
-            settings.column_noise_e * column.standard_normal(width)
-        ).astype(kind)
+        column_e = settings.column_noise_e * column.standard_normal(width)
+        self.column_e: ChargeArray = column_e.astype(kind)
         offset_shape = self.shape if settings.dsnu_e else 0
-        self.offset_map_e: ChargeArray = (
-            settings.dsnu_e * offset.standard_normal(offset_shape)
-        ).astype(kind)
+        offset_map_e = settings.dsnu_e * offset.standard_normal(offset_shape)
+        self.offset_map_e: ChargeArray = offset_map_e.astype(kind)
 
     def expose(
         self, mean_e: npt.ArrayLike, exposure_s: float, rng: np.random.Generator
@@ -174,8 +169,7 @@ class Detector:
         in the exposure.
 
         Raises InputError for a wrong shape, and for electrons or an exposure that are negative, not
-        finite or beyond
-        MAX_E.
+        finite or beyond MAX_E.
         """
         settings = self.settings
         light_e = self.collected_e(mean_e, exposure_s)
@@ -205,17 +199,16 @@ class Detector:
             else:  # without read noise a dark pixel needs no number
                 charge_e = read = np.zeros_like(expected_e)
                 lit = np.flatnonzero(bright)
-                charge_e.ravel()[lit] = poisson(
-                    expected_e.ravel()[lit], normal_pairs(words, lit)[0], 0.0
-                )
+                shot, _ = normal_pairs(words, lit)
+                charge_e.ravel()[lit] = poisson(expected_e.ravel()[lit], shot, 0.0)
             if rays_e is not None:
                 charge_e += rays_e[part]
             if settings.blooming:
-                spilt_e[part], normal[part] = charge_e, read
+                spilt_e[part] = charge_e
+                normal[part] = read
             else:
-                codes[part] = self._read_out(
-                    np.minimum(charge_e, np.float32(settings.full_well_e)), read, part
-                )
+                well_e = np.minimum(charge_e, np.float32(settings.full_well_e))
+                codes[part] = self._read_out(well_e, read, part)
 
         draw_blocks(self.shape, rng, draw)
         if settings.blooming:
@@ -264,9 +257,8 @@ class Detector:
         settings = self.settings
         light_e = self.collected_e(mean_e, exposure_s)
         self._check_light(light_e)
-        expected_e = (
-            light_e.astype(np.float64) + settings.dark_e_per_s * settings.dark_factor * exposure_s
-        )
+        dark_e_per_s = settings.dark_e_per_s * settings.dark_factor
+        expected_e = light_e.astype(np.float64) + dark_e_per_s * exposure_s
         self._check_largest(expected_e)
         return self._convert(self._fill_wells(expected_e))
 
@@ -289,6 +281,7 @@ class Detector:
         return light_e
 
     def _check_light(self, light_e: npt.NDArray[Any]) -> None:
+        """Raise InputError for electrons that are negative, not a number, or too many."""
         if not light_e.min() >= 0:  # NaN propagates through min
             raise InputError(
                 "a pixel's electrons are negative or NaN; give expected electrons, 0 or more"
@@ -296,6 +289,7 @@ class Detector:
         self._check_largest(light_e)
 
     def _check_largest(self, expected_e: npt.NDArray[Any]) -> None:
+        """Raise InputError for more electrons in a pixel than can be drawn."""
         largest_e = expected_e.max()
         if not largest_e <= MAX_E:
             raise InputError(
@@ -304,6 +298,7 @@ class Detector:
             )
 
     def _fill_wells(self, collected_e: FloatArray) -> ChargeArray:
+        """The charge that the wells hold, what exceeds them cut off or spilt along columns."""
         full_e = self.settings.full_well_e
         if self.settings.blooming:
             return bloom(collected_e, full_e)
@@ -361,18 +356,16 @@ def bloom(charge_e: ChargeArray, full_well_e: float) -> ChargeArray:
 
     Only the charge that leaves a column at its ends is lost.
     """
-    kept_e = np.minimum(charge_e, full_well_e)
+    wells_e = np.minimum(charge_e, full_well_e)
     columns = np.flatnonzero((charge_e > full_well_e).any(axis=0))
-    excess_e = charge_e[:, columns] - kept_e[:, columns]
-    wells_e = kept_e[:, columns]
-    for spilt_e, rows in (
-        (excess_e / 2, range(len(wells_e))),
-        (excess_e / 2, reversed(range(len(wells_e)))),
-    ):
+    column_wells_e = wells_e[:, columns]
+    half_excess_e = (charge_e[:, columns] - column_wells_e) / 2
+    downwards = range(len(wells_e))
+    for rows in (downwards, reversed(downwards)):
         carried_e = np.zeros(len(columns))
         for row in rows:
-            offered_e = wells_e[row] + carried_e + spilt_e[row]
-            wells_e[row] = np.minimum(offered_e, full_well_e)
-            carried_e = offered_e - wells_e[row]
-    kept_e[:, columns] = wells_e
-    return kept_e
+            offered_e = column_wells_e[row] + carried_e + half_excess_e[row]
+            column_wells_e[row] = np.minimum(offered_e, full_well_e)
+            carried_e = offered_e - column_wells_e[row]
+    wells_e[:, columns] = column_wells_e
+    return wells_e

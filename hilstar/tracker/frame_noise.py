@@ -7,11 +7,10 @@ bits. It becomes two independent normal numbers (Box and Muller 1958): the first
 electrons, the second the read noise.
 
 Electrons are the smallest count whose cumulative probability reaches that of the normal number.
-Below EXACT_BELOW_E
-that is exact (to float32's rounding of the number): a table or an expansion gives the count, and
-where either leaves a doubt, scipy's distribution decides. From there on the expansion alone decides
-(Giles, ACM TOMS 42 (2016) 5, eq. 8: of Cornish and Fisher's kind, with the 1/3 of a discrete law):
-its errors are in `tests/unit/tracker/test_frame_noise.py`.
+Below EXACT_BELOW_E that is exact (to float32's rounding of the number): a table or an expansion
+gives the count, and where either leaves a doubt, scipy's distribution decides. From there on the
+expansion alone decides (Giles, ACM TOMS 42 (2016) 5, eq. 8: of Cornish and Fisher's kind, with the
+1/3 of a discrete law): its errors are in `tests/unit/tracker/test_frame_noise.py`.
 """
 
 import os
@@ -38,8 +37,7 @@ ONE_STEP_SIGMAS = 3.0  # within it, a doubt is between two counts
 # Above this mean, the number of a step is straight between rows to 1.7e-3 sigmas.
 STRAIGHT_ABOVE_E, STEP_NUMBER_ERROR = 0.1, 2e-3
 # The expansion's error, e-, is at most ERROR_PER_BEND2 times the square of its last term ("bend"),
-# plus
-# ERROR_E_TIMES_MEAN / mean; with the next term, FINER_ERROR_PER_BEND3 times its cube, plus
+# plus ERROR_E_TIMES_MEAN / mean; with the next term, FINER_ERROR_PER_BEND3 times its cube, plus
 # FINER_ERROR_E / mean^1.5.
 ERROR_PER_BEND2, ERROR_E_TIMES_MEAN = 3.0, 0.03
 FINER_ERROR_PER_BEND3, FINER_ERROR_E = 7.5, 0.03
@@ -52,8 +50,7 @@ def normal_pairs(
     6.77 sigmas.
 
     Of words (n,), or of each part of words (parts, rows, width), the first half makes radii and the
-    second angles.
-    `which` (k,) asks for some alone, by their places in the flat array: arrays (k,).
+    second angles. `which` (k,) asks for some alone, by their places in the flat array: arrays (k,).
     """
     parts = words.shape[0] if words.ndim == 3 else 1
     halves = words.view(np.uint32).reshape(parts, 2, -1)
@@ -101,12 +98,10 @@ def poisson(
     # The many all at once, and the few again by themselves.
     if large_count < mean_e.size / 2:
         large = np.flatnonzero(is_large)
-        counts = _by_table(
-            np.minimum(mean_e, np.nextafter(np.float32(TABLE_BELOW_E), np.float32(0))), normal
-        )
-        counts.ravel()[large] = _by_expansion(
-            mean_e.ravel()[large], normal.ravel()[large], TABLE_BELOW_E
-        )
+        below = np.nextafter(np.float32(TABLE_BELOW_E), np.float32(0))
+        counts = _by_table(np.minimum(mean_e, below), normal)
+        large_e = mean_e.ravel()[large]
+        counts.ravel()[large] = _by_expansion(large_e, normal.ravel()[large], TABLE_BELOW_E)
         return counts
     counts = _by_expansion(np.maximum(mean_e, np.float32(TABLE_BELOW_E)), normal, TABLE_BELOW_E)
     small = np.flatnonzero(~is_large)
@@ -115,6 +110,9 @@ def poisson(
 
 
 def _by_table(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
+    """Counts of means under TABLE_BELOW_E, by cells of mean and normal number; where a cell has
+    several, by the step between two, or exactly.
+    """
     table = _count_table()
     place = mean_e * np.float32(ROWS_PER_E)
     np.floor(place, out=place)
@@ -129,18 +127,20 @@ def _by_table(mean_e: Float32Array, normal: Float32Array) -> Float32Array:
     step = rows.astype(np.intp) * UNSURE + counts.ravel()[doubts].astype(np.intp)
     low = table.step_number.take(step)
     high = table.step_number.take(step + UNSURE)
-    above = numbers - (low + (rows - np.floor(rows)) * (high - low))
-    sure = (
-        (np.abs(above) > STEP_NUMBER_ERROR)
-        & (rows > STRAIGHT_ABOVE_E * ROWS_PER_E)
-        & (np.abs(numbers) < ONE_STEP_SIGMAS)
-    )
+    step_number = low + (rows - np.floor(rows)) * (high - low)
+    above = numbers - step_number
+    is_straight = rows > STRAIGHT_ABOVE_E * ROWS_PER_E
+    is_one_step = np.abs(numbers) < ONE_STEP_SIGMAS
+    sure = (np.abs(above) > STEP_NUMBER_ERROR) & is_straight & is_one_step
     counts.ravel()[doubts] += (above > 0) & sure
     _decide(counts, mean_e, normal, doubts[~sure])
     return counts
 
 
 def _by_expansion(mean_e: Float32Array, normal: Float32Array, smallest_e: float) -> Float32Array:
+    """Counts of means from `smallest_e` up, by Cornish and Fisher's expansion of the quantile in
+    the root of the mean; where that may be off by one, by its next term, or exactly.
+    """
     root = np.sqrt(mean_e)
     square = normal * normal
     bend = square + np.float32(2.0)
@@ -178,10 +178,9 @@ def _by_expansion(mean_e: Float32Array, normal: Float32Array, smallest_e: float)
         + (square * (7 / 810 + square / 270) - 8 / 405) / means
     )
     counts.ravel()[doubts] = np.floor(finer)
-    near = (
-        np.abs(finer - np.rint(finer))
-        < FINER_ERROR_PER_BEND3 * np.abs(bends) ** 3 + FINER_ERROR_E / root**3
-    )
+    off = np.abs(finer - np.rint(finer))
+    error = FINER_ERROR_PER_BEND3 * np.abs(bends) ** 3 + FINER_ERROR_E / root**3
+    near = off < error
     counts.ravel()[doubts[near]] = np.rint(finer[near]) - 1
     _decide(counts, mean_e, normal, doubts[near])
     return counts
@@ -202,9 +201,8 @@ def _decide(
     counted += low
     climbing = np.flatnonzero(low & (np.abs(numbers) > ONE_STEP_SIGMAS))
     while len(climbing):
-        short = pdtr(counted[climbing], means[climbing]) < ndtr(
-            numbers[climbing].astype(np.float64)
-        )
+        reached = ndtr(numbers[climbing].astype(np.float64))
+        short = pdtr(counted[climbing], means[climbing]) < reached
         climbing = climbing[short]
         counted[climbing] += 1
     counts.ravel()[doubts] = counted
@@ -214,9 +212,8 @@ class CountTable(NamedTuple):
     """Counts by mean and normal number.
 
     `cells` (rows * COLUMNS,) holds the smallest count of a cell, with UNSURE where there are more;
-    `step_number`
-    ((rows + 1) * UNSURE,) the number above which a count gives way to the next, at the means
-    between rows.
+    `step_number` ((rows + 1) * UNSURE,) the number above which a count gives way to the next, at
+    the means between rows.
     """
 
     cells: npt.NDArray[np.uint8]
@@ -225,19 +222,19 @@ class CountTable(NamedTuple):
 
 @cache
 def _count_table() -> CountTable:
+    """The table for means under TABLE_BELOW_E, made once."""
     from scipy.special import ndtri, pdtr
 
     mean_e = np.arange(int(TABLE_BELOW_E) * ROWS_PER_E + 1) / ROWS_PER_E
     number = ndtri(pdtr(np.arange(UNSURE), mean_e[:, None])).clip(-6.8, 6.8)
     edge = number * COLUMNS_PER_SIGMA + COLUMNS / 2
 
+    row = np.arange(len(mean_e))[:, None]
+
     def counts(margin: float) -> npt.NDArray[np.intp]:
         steps = np.zeros((len(mean_e), COLUMNS), dtype=np.intp)
-        np.add.at(
-            steps,
-            (np.arange(len(mean_e))[:, None], np.ceil(edge + margin).astype(np.intp)),
-            number < 6.8,
-        )
+        column = np.ceil(edge + margin).astype(np.intp)
+        np.add.at(steps, (row, column), number < 6.8)
         return steps.cumsum(axis=1)
 
     smallest = counts(MARGIN_COLUMNS)[:-1]
@@ -260,7 +257,8 @@ def draw_blocks(
     key = int(rng.integers(2**63))
 
     def draw_block(first: int) -> None:
-        stream = np.random.Generator(np.random.SFC64(np.random.SeedSequence((key, first))))
+        seed = np.random.SeedSequence((key, first))
+        stream = np.random.Generator(np.random.SFC64(seed))
         # A whole block is drawn at once, as two parts; the image's end part by part.
         end = min(first + 2 * rows, height)
         if end == first + 2 * rows:
@@ -269,15 +267,15 @@ def draw_blocks(
             parts, step = 1, rows
         for top in range(first, end, step):
             part = slice(top, min(top + step, height))
-            words = stream.integers(-(2**63), 2**63, size=(part.stop - top) * width, dtype=np.int64)
+            size = (part.stop - top) * width
+            words = stream.integers(-(2**63), 2**63, size=size, dtype=np.int64)
             draw(part, words.reshape(parts, -1, width))
 
     blocks = range(0, height, 2 * rows)
     max_threads = os.environ.get("OMP_NUM_THREADS", "").split(",")[0]
+    threads = len(os.sched_getaffinity(0))
     if max_threads.isdecimal() and int(max_threads):
         threads = int(max_threads)
-    else:
-        threads = len(os.sched_getaffinity(0))
     threads = min(len(blocks), threads)
     if threads == 1:
         for first in blocks:

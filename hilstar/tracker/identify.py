@@ -39,8 +39,13 @@ def wahba(seen: FloatArray, known: FloatArray, weight: FloatArray) -> FloatArray
 
     Wahba's problem by SVD (Markley 1988).
     """
-    u, _, vt = np.linalg.svd(np.einsum("n,ni,nj->ij", weight / weight.sum(), seen, known))
-    return from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
+    share = weight / weight.sum()
+    profile = np.einsum("n,ni,nj->ij", share, seen, known)
+    u, _, vt = np.linalg.svd(profile)
+    # +1, or -1 where the product would be a reflection
+    handedness = np.linalg.det(u) * np.linalg.det(vt)
+    proper = np.diag([1.0, 1.0, handedness])
+    return from_matrix(u @ proper @ vt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,38 +89,55 @@ def identify(
     """
     if len(found) < MIN_STARS:
         return None
-    seen_px = KDTree(np.stack([found.x_px, found.y_px], axis=1))
+    found_px = np.stack([found.x_px, found.y_px], axis=1)
+    tree = KDTree(found_px)
     star, directions = stars_near(q_expected)
-    weight = 1 / (CENTROID_E_PX2 / np.maximum(found.flux_e, 1.0) + CENTROID_FLOOR_PX**2)
+    variance_px2 = CENTROID_E_PX2 / np.maximum(found.flux_e, 1.0) + CENTROID_FLOOR_PX**2
+    weight = 1 / variance_px2
     q = q_expected
     for step, radius_px in enumerate(RADII_PX):
-        expected = np.stack(place(directions @ to_matrix(q).T), axis=1)
-        inside = np.flatnonzero(np.isfinite(expected).all(axis=1))
-        distance, found_at = seen_px.query(expected[inside], distance_upper_bound=radius_px)
-        nearest = np.asarray(found_at)
+        turned = directions @ to_matrix(q).T
+        expected_x, expected_y = place(turned)
+        expected_px = np.column_stack([expected_x, expected_y])
+        inside = np.flatnonzero(np.isfinite(expected_px).all(axis=1))
+        distance_px, neighbour = tree.query(expected_px[inside], distance_upper_bound=radius_px)
+        is_near = np.isfinite(distance_px)
         # Of several catalogue stars near one find the brightest has it.
-        near = inside[np.isfinite(distance)]
-        pairs, first = np.unique(nearest[np.isfinite(distance)], return_index=True)
-        known = near[first]
+        pairs, first = np.unique(np.asarray(neighbour)[is_near], return_index=True)
+        known = inside[is_near][first]
         # they all moved alike: those that did not are others
         if step == 0 and len(pairs) >= MIN_STARS:
-            moved = np.stack([found.x_px[pairs], found.y_px[pairs]], axis=1) - expected[known]
-            alike = np.linalg.norm(moved - np.median(moved, axis=0), axis=1) < RADII_PX[1]
+            moved_px = found_px[pairs] - expected_px[known]
+            rest_px = moved_px - np.median(moved_px, axis=0)
+            apart_px = np.linalg.norm(rest_px, axis=1)
+            alike = apart_px < RADII_PX[1]
             pairs = pairs[alike]
             known = known[alike]
-        if len(pairs) < max(MIN_STARS, MIN_SHARE * min(len(found), len(directions)) * (step > 0)):
+        enough: float = MIN_STARS
+        if step > 0:
+            enough = max(MIN_STARS, MIN_SHARE * min(len(found), len(directions)))
+        if len(pairs) < enough:
             return None
         q = wahba(found.rays[pairs], directions[known], weight[pairs])
     for _ in range(REFITS):  # a neighbour in a star's window pulls it away from where it is
-        off = np.linalg.norm(found.rays[pairs] - directions[known] @ to_matrix(q).T, axis=1)
-        is_close = off**2 * weight[pairs] <= REJECTED**2 * np.median(off**2 * weight[pairs])
+        off_rad = _off_rad(found.rays[pairs], directions[known], q)
+        misfit = off_rad**2 * weight[pairs]
+        is_close = misfit <= REJECTED**2 * np.median(misfit)
         if is_close.all() or is_close.sum() < MIN_STARS:
             break
         pairs = pairs[is_close]
         known = known[is_close]
         q = wahba(found.rays[pairs], directions[known], weight[pairs])
-    off = np.linalg.norm(found.rays[pairs] - directions[known] @ to_matrix(q).T, axis=1)
-    return Identified(q, pairs, star[known], float(np.sqrt(np.mean(off**2) / 2)))
+    off_rad = _off_rad(found.rays[pairs], directions[known], q)
+    mean_square = np.mean(off_rad**2) / 2
+    rms_rad = float(np.sqrt(mean_square))
+    return Identified(q, pairs, star[known], rms_rad)
+
+
+def _off_rad(rays: FloatArray, directions: FloatArray, q_icrs_to_cam: FloatArray) -> FloatArray:
+    """The angles (n,) of rays (n, 3), cam, from directions (n, 3), ICRS, at an attitude."""
+    expected = directions @ to_matrix(q_icrs_to_cam).T
+    return np.asarray(np.linalg.norm(rays - expected, axis=1))
 
 
 class LostInSpace:
@@ -145,23 +167,22 @@ class LostInSpace:
         self._camera = tetra3rs.CameraModel(
             focal_length_px=focal_length_px, image_width=width, image_height=height
         )
-        field_deg = float(np.degrees(2 * np.arctan(width / 2 / focal_length_px)))
+        half_tangent = width / 2 / focal_length_px
+        field_deg = float(np.degrees(2 * np.arctan(half_tangent)))
         order = np.argsort(v_mag, kind="stable")
         rows = np.zeros(len(order), dtype=GAIA_RECORD)
         x, y, z = directions[order].T
-        rows["id"], rows["mag"] = order + 1, v_mag[order]
-        rows["ra"], rows["dec"] = (
-            np.degrees(np.arctan2(y, x)) % 360,
-            np.degrees(np.arcsin(np.clip(z, -1, 1))),
-        )
+        rows["id"] = order + 1
+        rows["mag"] = v_mag[order]
+        rows["ra"] = np.degrees(np.arctan2(y, x)) % 360
+        rows["dec"] = np.degrees(np.arcsin(np.clip(z, -1, 1)))
+        # tetra3rs's Gaia file: its mark, its version, the number of stars, and their rows
+        version = np.array([1], "<u4")
+        count = np.array([len(rows)], "<u8")
+        header = b"GDR3" + version.tobytes() + count.tobytes()
         with tempfile.TemporaryDirectory(prefix="hilstar-") as folder:
             path = Path(folder) / "stars.bin"
-            path.write_bytes(
-                b"GDR3"
-                + np.array([1], "<u4").tobytes()
-                + np.array([len(rows)], "<u8").tobytes()
-                + rows.tobytes()
-            )
+            path.write_bytes(header + rows.tobytes())
             self._database = tetra3rs.SolverDatabase.generate_from_gaia(
                 str(path),
                 max_fov_deg=field_deg * (1 + FIELD_ERROR),

@@ -20,8 +20,8 @@ EVEN_DARK_DN = 1.0  # a step of the ADC, from the darkest pixel of a black scree
 
 
 def in_pixels(images: Iterable[npt.NDArray[Any]], bayer: str | None) -> FloatArray:
-    """What a sensor's pixels (height, width) have of images by channel: each its own colour's; the
-    one image of a mono sensor.
+    """The light of a sensor's pixels (height, width), by images of each channel: a pixel has that
+    of its own colour. A mono sensor has one image.
 
     Images may share their memory, where they come one after the other.
     """
@@ -71,7 +71,7 @@ def software_image(dn: npt.NDArray[Any], detector: DetectorSettings) -> npt.NDAr
 
 
 def software_psf_px(psf_px: tuple[float, float], detector: DetectorSettings) -> tuple[float, float]:
-    """The sigma (x, y) of a star there, of those of the optics."""
+    """The sigma (x, y), px, of a star in the software's image, by that of the optics."""
     if not detector.takes_superpixels:
         return psf_px
     x, y = (float(np.sqrt(sigma**2 + SUPERPIXEL_VARIANCE_PX2)) for sigma in psf_px)
@@ -79,8 +79,8 @@ def software_psf_px(psf_px: tuple[float, float], detector: DetectorSettings) -> 
 
 
 def uneven_dark_dn(under_e: FloatArray, detector: DetectorSettings) -> FloatArray | None:
-    """What electrons under the stars (h, w) are in the software's image, DN; None where that is
-    even.
+    """The level (h, w), DN, that electrons under the stars have in the software's image; None where
+    it is even.
 
     A screen that is seen whole glows over a part of the field, which is one large spot to software
     that takes one level for the whole image.

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import ndtr
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray, IntArray
 
 # of the reading of a level that noise spreads over the steps, beside that noise
 VARIANCE_DN2 = 1 / 12
@@ -52,15 +52,22 @@ def rounding_error(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
     """
     total = np.zeros(np.broadcast_shapes(level_dn.shape, noise_dn.shape))
     for order in HARMONICS:
-        damped = np.exp(-2 * (math.pi * order * noise_dn) ** 2)
-        total += (-1) ** order / (math.pi * order) * np.sin(2 * math.pi * order * level_dn) * damped
+        amplitude = (-1) ** order / (math.pi * order)
+        wave = amplitude * np.sin(2 * math.pi * order * level_dn)
+        total += wave * _damping(order, noise_dn)
     return total
+
+
+def _damping(order: IntArray | np.intp, noise_dn: FloatArray | float) -> FloatArray:
+    """What noise leaves of harmonics of rounding's sawtooth."""
+    return np.asarray(np.exp(-2 * (math.pi * order * noise_dn) ** 2))
 
 
 def rounding_rms(noise_dn: float) -> float:
     """The rms of `rounding_error` over all levels, DN: 1 / sqrt 12 without noise."""
-    damped = np.exp(-2 * (math.pi * HARMONICS * noise_dn) ** 2) / (math.pi * HARMONICS)
-    return math.sqrt(float((damped**2).sum()) / 2)
+    damped = _damping(HARMONICS, noise_dn) / (math.pi * HARMONICS)
+    mean_square = float((damped**2).sum()) / 2
+    return math.sqrt(mean_square)
 
 
 def rounded_light(light_dn: FloatArray, dark_noise_dn: float, dn_per_e: float) -> FloatArray:
@@ -74,7 +81,8 @@ def rounded_light(light_dn: FloatArray, dark_noise_dn: float, dn_per_e: float) -
         return np.zeros(STEP_PHASES)
     noise_dn = np.sqrt(dark_noise_dn**2 + dn_per_e * light_dn)
     lit = rounding_error(PLACES_DN + light_dn, noise_dn)
-    return np.asarray((lit - rounding_error(PLACES_DN, np.array(dark_noise_dn))).mean(axis=1))
+    dark = rounding_error(PLACES_DN, np.array(dark_noise_dn))
+    return np.asarray((lit - dark).mean(axis=1))
 
 
 def cut_mean_dn(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
@@ -84,7 +92,8 @@ def cut_mean_dn(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
     """
     ratio = level_dn / noise_dn
     density = np.exp(-(ratio**2) / 2) / math.sqrt(2 * math.pi)
-    return np.asarray(level_dn * ndtr(ratio) + noise_dn * density - density / noise_dn / 24)
+    above_zero_dn = level_dn * ndtr(ratio) + noise_dn * density
+    return np.asarray(above_zero_dn - density / noise_dn / 24)
 
 
 def uncut_level_dn(mean_dn: float, noise_dn: float) -> float:
@@ -93,7 +102,8 @@ def uncut_level_dn(mean_dn: float, noise_dn: float) -> float:
     highest_dn = mean_dn + noise_dn
 
     def excess_dn(level_dn: float) -> float:
-        return float(cut_mean_dn(np.array(level_dn), np.array(noise_dn))) - mean_dn
+        mean = cut_mean_dn(np.array(level_dn), np.array(noise_dn))
+        return float(mean) - mean_dn
 
     if excess_dn(lowest_dn) >= 0:  # darker than any level that is told apart
         return lowest_dn
@@ -111,5 +121,7 @@ def cut_light(light_dn: FloatArray, dark_mean_dn: float, noise_dn: float, dn_per
         return 0.0
     dark_dn = uncut_level_dn(dark_mean_dn, noise_dn)
     spread_dn = np.sqrt(noise_dn**2 + dn_per_e * light_dn)
-    lit_dn = cut_mean_dn(dark_dn + light_dn, spread_dn) - (dark_dn + light_dn)
-    return float((lit_dn - (dark_mean_dn - dark_dn)).mean())
+    level_dn = dark_dn + light_dn
+    added_to_light_dn = cut_mean_dn(level_dn, spread_dn) - level_dn
+    added_to_dark_dn = dark_mean_dn - dark_dn
+    return float((added_to_light_dn - added_to_dark_dn).mean())

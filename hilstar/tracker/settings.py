@@ -25,8 +25,8 @@ E2V_DARK = {"ccd47-20": (1.14e6, 9080.0), "e2v-nimo": (122.0, 6400.0)}
 DATASHEET_RANGE_K = (230.0, 300.0)
 
 # More is refused. numpy's Poisson sampler compares logarithms of the size of mean * ln(mean): their
-# rounding is 0.004
-# at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails (9.2e18).
+# rounding is 0.004 at 1e12 and of order 1 at 1e15, where the sampler is wrong long before it fails
+# (9.2e18).
 MAX_E = 1e12
 
 Amount = Annotated[float, Meta(ge=0, le=MAX_E)]
@@ -55,10 +55,9 @@ class PixelNoise:
     @property
     def total_e2(self) -> FloatArray:
         """The sum: the square of n_TOT (thesis table 4.1, eq. 4.14)."""
-        thermal_e2 = (
-            self.dark_e2 + self.read_e2 + self.reset_e2 + self.quantisation_e2 + self.dsnu_e2
-        )
-        return np.asarray(self.shot_e2 + self.prnu_e2 + thermal_e2)
+        even_e2 = self.dark_e2 + self.read_e2 + self.reset_e2 + self.quantisation_e2
+        even_e2 = even_e2 + self.dsnu_e2
+        return np.asarray(self.shot_e2 + self.prnu_e2 + even_e2)
 
 
 class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -160,18 +159,17 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         for name, kind in _KINDS.items():
             check_value(name, getattr(self, name), kind)
         if self.dark_quantiles:
-            mean, sigma = fitted_dark(
-                self.dark_distribution, np.array(self.dark_quantiles, dtype=np.float64)
-            )
+            points = np.array(self.dark_quantiles, dtype=np.float64)
+            mean, sigma = fitted_dark(self.dark_distribution, points)
             msgspec.structs.force_setattr(self, "dark_e_per_s", mean)
             msgspec.structs.force_setattr(self, "dsnu_e_per_s", sigma)
         low_k, high_k = DATASHEET_RANGE_K
         for name in ("temperature_k", "dark_reference_temperature_k"):
-            if self.dark_law in E2V_DARK and not low_k <= getattr(self, name) <= high_k:
+            kelvin = getattr(self, name)
+            if self.dark_law in E2V_DARK and not low_k <= kelvin <= high_k:
                 raise InputError(
-                    f'{name} = {getattr(self, name):g}; dark_law "{self.dark_law}" holds from'
-                    f" {low_k:g} to {high_k:g} K: write such a temperature, or dark_law ="
-                    ' "arrhenius"'
+                    f'{name} = {kelvin:g}; dark_law "{self.dark_law}" holds from {low_k:g} to'
+                    f' {high_k:g} K: write such a temperature, or dark_law = "arrhenius"'
                 )
         _check_shutter(self)
         for name in ("column_noise_e", "column_dark_e_per_s"):
@@ -186,15 +184,13 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
                 " dark_e_per_s above 0"
             )
         hz = [point[0] for point in self.read_noise_table]
-        if (
-            hz
-            and self.readout_hz
-            and not (sorted(set(hz)) == hz and hz[0] <= self.readout_hz <= hz[-1])
-        ):
-            raise InputError(
-                f"readout_hz = {self.readout_hz:g}; write a frequency within read_noise_table,"
-                f" whose frequencies rise: {hz[0]:g} to {hz[-1]:g}"
-            )
+        if hz and self.readout_hz:
+            is_rising = sorted(set(hz)) == hz
+            if not (is_rising and hz[0] <= self.readout_hz <= hz[-1]):
+                raise InputError(
+                    f"readout_hz = {self.readout_hz:g}; write a frequency within read_noise_table,"
+                    f" whose frequencies rise: {hz[0]:g} to {hz[-1]:g}"
+                )
 
     @property
     def takes_superpixels(self) -> bool:
@@ -218,24 +214,21 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             return _arrhenius(self.dark_activation_ev, cold_k, warm_k)
         if self.dark_law in E2V_DARK:
             return e2v_dark(self.dark_law, warm_k) / e2v_dark(self.dark_law, cold_k)
-        cold_ev, warm_ev = (
-            self.dark_gap_ev or silicon_gap_ev(kelvin) for kelvin in (cold_k, warm_k)
-        )
-        depletion = math.pow(warm_k / cold_k, 1.5) * math.exp(
-            (cold_ev / cold_k - warm_ev / warm_k) / (2 * BOLTZMANN_EV_PER_K)
-        )
-        return (
-            1 - self.dark_depletion_share
-        ) * depletion**2 + self.dark_depletion_share * depletion
+        # depletion goes with the intrinsic carriers, diffusion with their square
+        cold_ev = self.dark_gap_ev or silicon_gap_ev(cold_k)
+        warm_ev = self.dark_gap_ev or silicon_gap_ev(warm_k)
+        exponent = (cold_ev / cold_k - warm_ev / warm_k) / (2 * BOLTZMANN_EV_PER_K)
+        depletion = math.pow(warm_k / cold_k, 1.5) * math.exp(exponent)
+        depletion_share = self.dark_depletion_share
+        return (1 - depletion_share) * depletion**2 + depletion_share * depletion
 
     @property
     def hot_factor(self) -> float:
         """What the temperature does to the extra dark current of hot pixels."""
         if not self.hot_pixel_activation_ev:
             return self.dark_factor
-        return _arrhenius(
-            self.hot_pixel_activation_ev, self.dark_reference_temperature_k, self.temperature_k
-        )
+        reference_k = self.dark_reference_temperature_k
+        return _arrhenius(self.hot_pixel_activation_ev, reference_k, self.temperature_k)
 
     @property
     def read_noise_now_e(self) -> float:
@@ -248,16 +241,15 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             hz, table_e = np.log(np.maximum(self.read_noise_table, 1e-12)).T
             return math.exp(float(np.interp(math.log(self.readout_hz), hz, table_e)))
         corner_hz = self.read_noise_corner_hz
-        return self.read_noise_e * math.sqrt(
-            (self.readout_hz + corner_hz) / (self.read_noise_reference_hz + corner_hz)
-        )
+        band = (self.readout_hz + corner_hz) / (self.read_noise_reference_hz + corner_hz)
+        return self.read_noise_e * math.sqrt(band)
 
     @property
     def reset_noise_e(self) -> float:
         """kTC noise: sqrt(k T C) / q, e-."""
-        return math.sqrt(
-            BOLTZMANN_EV_PER_K * self.temperature_k * self.sense_capacitance_ff * 1e-15 / ELECTRON_C
-        )
+        thermal_v = BOLTZMANN_EV_PER_K * self.temperature_k
+        squared_c = thermal_v * self.sense_capacitance_ff * 1e-15
+        return math.sqrt(squared_c / ELECTRON_C)
 
     def noise(self, light_e: npt.ArrayLike, exposure_s: float) -> PixelNoise:
         """The noise of pixels that light gives `light_e` electrons on average, background among
@@ -271,6 +263,8 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         quantisation_e2 = self.gain_e_per_dn**2 / 12
         if self.quantisation_noise:
             quantisation_e2 += self.adc_noise_e**2
+        dark_pattern_e_per_s = math.hypot(self.dsnu_e_per_s, self.column_dark_e_per_s)
+        dark_pattern_e2 = dark_pattern_e_per_s**2 * seconds**2
         return PixelNoise(
             shot_e2=light,
             dark_e2=self.dark_e_per_s * seconds,
@@ -278,9 +272,7 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
             reset_e2=self.reset_noise_e**2,
             quantisation_e2=quantisation_e2,
             prnu_e2=(self.prnu * light) ** 2,
-            dsnu_e2=math.hypot(self.dsnu_e_per_s, self.column_dark_e_per_s) ** 2 * seconds**2
-            + self.column_noise_e**2
-            + self.dsnu_e**2,
+            dsnu_e2=dark_pattern_e2 + self.column_noise_e**2 + self.dsnu_e**2,
         )
 
     @property
@@ -303,15 +295,14 @@ _KINDS = get_type_hints(DetectorSettings, include_extras=True)
 
 
 def _check_shutter(detector: DetectorSettings) -> None:
+    """Raise InputError where a shutter lacks its time, or has another's."""
     for name, shutter in (("row_time_us", "rolling"), ("row_shift_us", "frame-transfer")):
-        if (getattr(detector, name) > 0) != (detector.shutter == shutter):
-            if detector.shutter == shutter:
-                way = "above 0"
-            else:
-                way = f'= 0, or shutter = "{shutter}"'
+        time_us = getattr(detector, name)
+        is_that_shutter = detector.shutter == shutter
+        if (time_us > 0) != is_that_shutter:
+            way = "above 0" if is_that_shutter else f'= 0, or shutter = "{shutter}"'
             raise InputError(
-                f'{name} = {getattr(detector, name):g} with shutter = "{detector.shutter}"; write'
-                f" {name} {way}"
+                f'{name} = {time_us:g} with shutter = "{detector.shutter}"; write {name} {way}'
             )
 
 
@@ -326,9 +317,12 @@ def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
 
     share, rate = points.reshape(-1, 2).T
     low = 0.0 if law == "normal" else 1e-9
-    if len(share) < 2 or not (
-        share[0] > 0 and share[-1] < 1 and (np.diff(share) > 0).all() and (np.diff(rate) > 0).all()
-    ):
+    if len(share) < 2:
+        is_distribution = False
+    else:
+        is_rising = (np.diff(share) > 0).all() and (np.diff(rate) > 0).all()
+        is_distribution = bool(is_rising and share[0] > 0 and share[-1] < 1)
+    if not is_distribution:
         raise InputError(
             "dark_quantiles: write two points or more, shares between 0 and 1, both columns rising"
         )
@@ -339,14 +333,13 @@ def fitted_dark(law: str, points: FloatArray) -> tuple[float, float]:
     if law == "gamma":
 
         def misfit(log_shape: float) -> float:
-            return float(
-                np.var(np.log(rate / np.maximum(gammaincinv(math.exp(log_shape), share), 1e-300)))
-            )
+            quantiles = gammaincinv(math.exp(log_shape), share)
+            return float(np.var(np.log(rate / np.maximum(quantiles, 1e-300))))
 
-        shape = math.exp(
-            minimize_scalar(misfit, bounds=(math.log(0.02), math.log(1e6)), method="bounded").x
-        )
-        mean = shape * math.exp(float(np.log(rate / gammaincinv(shape, share)).mean()))
+        bounds = (math.log(0.02), math.log(1e6))
+        shape = math.exp(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
+        scales = rate / gammaincinv(shape, share)
+        mean = shape * math.exp(float(np.log(scales).mean()))
         return mean, mean / math.sqrt(shape)
     normal_rate = rate if law == "normal" else np.log(rate)
     slope, middle = np.polyfit(ndtri(share), normal_rate, 1).tolist()
@@ -375,7 +368,9 @@ def silicon_gap_ev(temperature_k: float) -> float:
 
 
 def _arrhenius(activation_ev: float, cold_k: float, warm_k: float) -> float:
-    return math.exp(activation_ev / BOLTZMANN_EV_PER_K * (1 / cold_k - 1 / warm_k))
+    """The factor by which a process of an activation energy is faster at the warm temperature."""
+    inverse_k = 1 / cold_k - 1 / warm_k
+    return math.exp(activation_ev / BOLTZMANN_EV_PER_K * inverse_k)
 
 
 def check_value(name: str, value: Any, kind: Any) -> None:
@@ -389,5 +384,7 @@ def check_value(name: str, value: Any, kind: Any) -> None:
             raise InputError(f"{name} = {value!r}; write {wanted}")
         return
     for note in notes:
-        if isinstance(note, Meta) and note.ge is not None and not note.ge <= value <= note.le:
+        if not isinstance(note, Meta) or note.ge is None:
+            continue
+        if not note.ge <= value <= note.le:
             raise InputError(f"{name} = {value:g}; write a number from {note.ge:g} to {note.le:g}")

@@ -31,7 +31,7 @@ BOX_SIDE = 9  # tracker pixels: a box of 5, and two on either side for its centr
 FINEST_PX = 0.5
 BOXES = ("box3", "box5")
 GOLDEN = 0.6180339887498949  # its multiples fill a pixel most evenly
-MIN_BLUR_PX = 1e-3
+MIN_BLUR_PX = 1e-3  # in place of none, by which places would be divided
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +48,7 @@ class StarErrors:
     @property
     def flux_rms_mag(self) -> float:
         """The rms of the flux errors."""
-        return float(np.sqrt(np.mean(np.square(self.flux_mag))))
+        return _rms(self.flux_mag)
 
     @property
     def flux_max_mag(self) -> float:
@@ -57,26 +57,30 @@ class StarErrors:
 
     def axis_rms_px(self, kind: Centroider) -> float:
         """The rms along an axis."""
-        return float(np.sqrt(np.mean(np.square(self.off_px[kind]))))
+        return _rms(self.off_px[kind])
 
     def max_px(self, kind: Centroider) -> float:
         """The largest distance."""
         return float(np.hypot(*self.off_px[kind]).max())
 
     def worst(self) -> Centroider:
-        """Who is furthest off."""
+        """The centroider with the largest distance."""
         return max(self.off_px, key=self.max_px)
 
 
-class Judge:
-    """A tracker that looks at stars of a sigma (x, y) in the tiles of an image, and knows where
-    they should be.
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.square(errors))))
 
-    `wanted` (count * tile, count * tile) has a star in each tile, near its middle: those of a
-    column of tiles at an
-    x of `places_px`, those of a row at a y (count,). `blur_px` and `pixel_px` are the tracker's, in
-    monitor pixels, and `box_share` the threshold of its boxes. `phases` (count,) along x and y say
-    where in a tracker's pixel the stars of a column and of a row are, by default anywhere.
+
+class Judge:
+    """A tracker that measures the stars in the tiles of an image against the same stars in the
+    image that is wanted.
+
+    `wanted` (count * tile, count * tile) has one star near the middle of each tile: those of a
+    column of tiles at one x of `places_px`, those of a row at one y (count,). `sigma_px` (x, y) is
+    a star's; `blur_px` and `pixel_px` are the tracker's; all in monitor pixels. `box_share` is the
+    threshold of its boxes. `phases` (count,) along x and y say where in a tracker's pixel the stars
+    of a column and of a row are; by default they are spread evenly.
     """
 
     def __init__(
@@ -92,13 +96,16 @@ class Judge:
     ) -> None:
         self._box_share = box_share
         self._count = len(places_px[0])
-        self._phases = phases or (spread_phases(self._count),) * 2
+        if phases is None:
+            evenly = spread_phases(self._count)
+            phases = (evenly, evenly)
+        self._phases = phases
         self._tile = len(wanted) // self._count
         self._pixel_px = pixel_px
-        self._in_tile_px = [place - self._tile * np.arange(self._count) for place in places_px]
+        tile_first_px = self._tile * np.arange(self._count)
+        self._in_tile_px = [place_px - tile_first_px for place_px in places_px]
         self._sampled_px = max(pixel_px, FINEST_PX)
-        x, y = (math.sqrt(sigma**2 + SQUARES_VARIANCE + blur_px**2) for sigma in sigma_px)
-        self._sigma_px = x / self._sampled_px, y / self._sampled_px
+        self._sigma_px = _shown_sigma(sigma_px, blur_px, self._sampled_px)
         half = max(BOX_SIDE // 2, math.ceil(REACH_SIGMAS * max(self._sigma_px)))
         blur_px = max(blur_px, MIN_BLUR_PX)
         self._views = {self._sampled_px: self._views_of(self._sampled_px, blur_px, half)}
@@ -121,65 +128,73 @@ class Judge:
         off_px = {}
         for kind in kinds:
             if kind not in self._places:
-                self._places[kind] = self._found(self._wanted, kind)
-            off_px[kind] = np.where(
-                light > 0, self._found(shown, kind) - self._places[kind], np.inf
-            )
-        return StarErrors(np.asarray(magnitude(light / (share * self._light))), off_px)
+                self._places[kind] = self._places_of(self._wanted, kind)
+            error_px = self._places_of(shown, kind) - self._places[kind]
+            off_px[kind] = np.where(light > 0, error_px, np.inf)
+        flux_ratio = light / (share * self._light)
+        return StarErrors(np.asarray(magnitude(flux_ratio)), off_px)
 
-    def _found(self, image: FloatArray, kind: Centroider) -> FloatArray:
-        """The stars' places (2, n), px, from where the tracker's pixel in the middle is."""
+    def _places_of(self, image: FloatArray, kind: Centroider) -> FloatArray:
+        """The places (2, n), px, at which a centroider finds the stars, from the tracker's pixel in
+        the middle.
+        """
         if kind == "moment":  # no blur and no pixel changes it
             tiles = self._tiles(image, self._tile)
             at = np.arange(self._tile)
             light = np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny)
-            return np.stack([tiles.sum(axis=1) @ at / light, tiles.sum(axis=2) @ at / light])
+            x = tiles.sum(axis=1) @ at / light
+            y = tiles.sum(axis=2) @ at / light
+            return np.stack([x, y])
         boxed = kind in BOXES
         pixel_px = self._pixel_px if boxed else self._sampled_px
         stamps = self._seen(image, pixel_px)
-        places = star_places(
-            stamps, kind, self._sigma_px, self._middles(stamps, boxed), self._box_share
-        )
+        middles = self._middles(stamps, boxed)
+        places = star_places(stamps, kind, self._sigma_px, middles, self._box_share)
         return np.stack(places) * pixel_px
 
     def _middles(self, stamps: FloatArray, boxed: bool) -> Pixels:
+        """The pixels that centroiders begin at: a box's is the brightest of the stars wanted."""
         if boxed:
             return self._pixels
         middle = np.full(len(stamps), stamps.shape[1] // 2)
         return middle, middle
 
     def _light_of(self, image: FloatArray) -> FloatArray:
+        """The light (n,) of each tile."""
         return np.asarray(self._tiles(image, self._tile).sum(axis=(1, 2)))
 
     def _tiles(self, image: FloatArray, side: int) -> FloatArray:
+        """An image of tiles with so many pixels along a side as (n, side, side), row by row."""
         count = self._count
-        return image.reshape(count, side, count, side).transpose(0, 2, 1, 3).reshape(-1, side, side)
+        by_tile = image.reshape(count, side, count, side).transpose(0, 2, 1, 3)
+        return by_tile.reshape(-1, side, side)
 
     def _views_of(self, pixel_px: float, blur_px: float, half: int) -> list[FloatArray]:
-        return [
-            _collected(place_px, self._tile, pixel_px, blur_px, half, phase)
-            for place_px, phase in zip(self._in_tile_px, self._phases, strict=True)
-        ]
+        """What tracker pixels collect of a tile's columns and of its rows (see `_collected`)."""
+        views = []
+        for place_px, phase in zip(self._in_tile_px, self._phases, strict=True):
+            views.append(_collected(place_px, self._tile, pixel_px, blur_px, half, phase))
+        return views
 
     def _seen(self, image: FloatArray, pixel_px: float) -> FloatArray:
         """The tracker's pixels about each star, (n, side, side)."""
-        (columns, rows), count, tile = self._views[pixel_px], self._count, self._tile
+        columns, rows = self._views[pixel_px]
+        count = self._count
+        tile = self._tile
         side = rows.shape[1]
-        # (column, y, side)
-        wide = image.reshape(count * tile, count, tile).transpose(1, 0, 2) @ columns.transpose(
-            0, 2, 1
-        )
-        lines = (
-            wide.reshape(count, count, tile, side)
-            .transpose(1, 2, 0, 3)
-            .reshape(count, tile, count * side)
-        )
-        return np.asarray(
-            (rows @ lines)
-            .reshape(count, side, count, side)
-            .transpose(0, 2, 1, 3)
-            .reshape(-1, side, side)
-        )
+        by_column = image.reshape(count * tile, count, tile).transpose(1, 0, 2)
+        across = by_column @ columns.transpose(0, 2, 1)  # (column of tiles, y, side)
+        by_row = across.reshape(count, count, tile, side).transpose(1, 2, 0, 3)
+        pixels = rows @ by_row.reshape(count, tile, count * side)
+        return self._tiles(np.asarray(pixels), side)
+
+
+def _shown_sigma(sigma_px: Sigma, blur_px: float, sampled_px: float) -> Sigma:
+    """A star's sigma (x, y) as a tracker sees it, in its sampled pixels."""
+    sigma_x, sigma_y = sigma_px
+    x_px = math.sqrt(sigma_x**2 + SQUARES_VARIANCE + blur_px**2)
+    y_px = math.sqrt(sigma_y**2 + SQUARES_VARIANCE + blur_px**2)
+    return x_px / sampled_px, y_px / sampled_px
 
 
 def stamp_errors(
@@ -201,41 +216,46 @@ def stamp_errors(
     phases = spread_phases(count)
     at = np.arange(side)
     light = wanted.sum(axis=(1, 2))
-    middles = wanted.sum(axis=1) @ at / light, wanted.sum(axis=2) @ at / light
+    middle_x = wanted.sum(axis=1) @ at / light
+    middle_y = wanted.sum(axis=2) @ at / light
     sampled_px = max(pixel_px, FINEST_PX)
     blur_px = max(blur_px, MIN_BLUR_PX)
-    x, y = (math.sqrt(sigma**2 + SQUARES_VARIANCE + blur_px**2) / sampled_px for sigma in sigma_px)
+    shown_sigma = _shown_sigma(sigma_px, blur_px, sampled_px)
 
     def seen(images: FloatArray, width_px: float, half: int) -> FloatArray:
-        columns, rows = (
-            _collected(middle, side, width_px, blur_px, half, phases) for middle in middles
-        )
+        columns = _collected(middle_x, side, width_px, blur_px, half, phases)
+        rows = _collected(middle_y, side, width_px, blur_px, half, phases)
         return rows @ images @ columns.transpose(0, 2, 1)
 
     # Centroiders of a box see the tracker's pixels in it; all others the whole star.
     box_half = BOX_SIDE // 2
-    boxed = seen(wanted, pixel_px, box_half), seen(shown, pixel_px, box_half)
+    boxed_wanted = seen(wanted, pixel_px, box_half)
+    boxed_shown = seen(shown, pixel_px, box_half)
     half = max(box_half, math.ceil(side / 2 / sampled_px))
-    whole = seen(wanted, sampled_px, half), seen(shown, sampled_px, half)
+    whole_wanted = seen(wanted, sampled_px, half)
+    whole_shown = seen(shown, sampled_px, half)
     middle = np.full(count, half)
+    box_pixels = brightest(boxed_wanted)
     is_lit = shown.sum(axis=(1, 2)) > 0
     off_px: dict[Centroider, FloatArray] = {}
     for kind in FAMILY:
         if kind in BOXES:
-            views, width_px, pixels = boxed, pixel_px, brightest(boxed[0])
+            wanted_at = star_places(boxed_wanted, kind, shown_sigma, box_pixels, box_share)
+            shown_at = star_places(boxed_shown, kind, shown_sigma, box_pixels, box_share)
+            width_px = pixel_px
         else:
-            views, width_px, pixels = whole, sampled_px, (middle, middle)
-        there, here = (
-            np.stack(star_places(view, kind, (x, y), pixels, box_share)) * width_px
-            for view in views
-        )
-        off_px[kind] = np.where(is_lit, here - there, np.inf)
+            wanted_at = star_places(whole_wanted, kind, shown_sigma, (middle, middle))
+            shown_at = star_places(whole_shown, kind, shown_sigma, (middle, middle))
+            width_px = sampled_px
+        error_px = np.stack(shown_at) * width_px - np.stack(wanted_at) * width_px
+        off_px[kind] = np.where(is_lit, error_px, np.inf)
     return off_px
 
 
 def spread_phases(count: int) -> FloatArray:
     """Places (count,) within a pixel, -0.5 to 0.5, spread evenly by the golden ratio."""
-    return np.asarray((np.arange(count) * GOLDEN) % 1.0 - 0.5)
+    turned = np.arange(count) * GOLDEN
+    return np.asarray(turned % 1.0 - 0.5)
 
 
 def _collected(
@@ -252,13 +272,15 @@ def _collected(
     (n, 2 half + 1, side), for stars at places (n,) from the first monitor pixel; each meets the
     tracker's pixels at its `phase` (n,).
     """
-    middles = star_px[:, None] + pixel_px * (np.arange(-half, half + 1) + phase[:, None])
+    steps = np.arange(-half, half + 1) + phase[:, None]
+    middles = (star_px[:, None] + pixel_px * steps)[:, :, None]
     edges = np.arange(side + 1) - 0.5
-    to_left, to_right = (middles[:, :, None] + way * pixel_px / 2 - edges for way in (-1, 1))
+    to_left = middles - pixel_px / 2 - edges
+    to_right = middles + pixel_px / 2 - edges
     # Cumulative light of a blurred point up to a place, and the integral of that over a monitor
     # pixel.
-    within = [_ramp(to, blur_px) for to in (to_left, to_right)]
-    return -np.diff(within[1] - within[0], axis=-1)
+    within = _ramp(to_right, blur_px) - _ramp(to_left, blur_px)
+    return -np.diff(within, axis=-1)
 
 
 def _ramp(to_px: FloatArray, blur_px: float) -> FloatArray:
@@ -266,6 +288,5 @@ def _ramp(to_px: FloatArray, blur_px: float) -> FloatArray:
     from scipy.special import ndtr  # 0.1 s of every command that needs none of it
 
     sigmas = to_px / blur_px
-    return np.asarray(
-        blur_px * (sigmas * ndtr(sigmas) + np.exp(-np.square(sigmas) / 2) / math.sqrt(2 * math.pi))
-    )
+    density = np.exp(-np.square(sigmas) / 2) / math.sqrt(2 * math.pi)
+    return np.asarray(blur_px * (sigmas * ndtr(sigmas) + density))

@@ -1,4 +1,4 @@
-// What exact.comp reads and writes, of one PLANE of the image. It comes after planes.glsl.
+// What exact.comp reads and writes.
 
 #if NEAR <= 32
 #define BITS uint
@@ -8,7 +8,7 @@
 #define BITS uvec4
 #endif
 
-layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // WORDS each, as SPRITE_DTYPE, and each plane's light
+layout(std430, binding = 0) readonly buffer Sprites { int sprite[]; };        // WORDS each, as SPRITE_DTYPE
 // A footprint's pixels by distance, for each phase: in a block where there is room, as the light of levels in floor.glsl.
 #ifdef ORDER_ROWS
 layout(std140, binding = 1) uniform Order { uvec4 order_rows[ORDER_ROWS]; };
@@ -30,15 +30,23 @@ struct Begin {
 layout(std430, binding = 4) readonly buffer Begins { Begin begins[]; };
 layout(std430, binding = 5) readonly buffer Before { float before[]; };       // ten sums for each star, or stretch
 layout(std430, binding = 6) writeonly buffer Left { float left_sums[]; };
-#elif defined(TOGETHER)
-layout(std430, binding = 6) buffer Left { float left_sums[]; };               // ten for each plane of a star
-uniform float makes_up[PLANES];  // for how much of what each plane left the star makes up here, in steps of both
+#else
+#if BEFORE > 0
+layout(std430, binding = 4) readonly buffer First { float first_sums[]; };    // ten for each star, left in the panel before
+uniform vec2 makes_up;  // for how much of what it left in each panel before a star makes up here, in steps of both
+#endif
+#if BEFORE > 1
+layout(std430, binding = 5) readonly buffer Second { float second_sums[]; };
+#endif
+#ifdef LEAVES
+layout(std430, binding = 6) writeonly buffer Left { float left_sums[]; };
+#endif
 #endif
 #ifdef SUMS
-layout(std430, binding = 8) buffer Levels { uint level_words[]; };            // TEXEL of LEVEL_BITS for a pixel
+layout(std430, binding = 8) buffer Levels { uint level_words[]; };            // LEVEL_BITS for a pixel
 #else
 layout(LEVELS_FORMAT, binding = 0) uniform uimage2D levels;
-layout(LINEAR, binding = 1) readonly uniform image2D linear_e_per_s;
+layout(r32f, binding = 1) readonly uniform image2D linear_e_per_s;
 #endif
 #ifdef UNIFORMITY
 uniform sampler2D gain;
@@ -64,6 +72,7 @@ uniform vec4 weights;   // light and moments, of all and under the window
 uniform float few_steps;
 uniform float last_light;
 
+const int WORDS = 5;
 const int PHASES = 8;
 const float NONE = 1e30;
 const float SAME_STEP = 1e-4;

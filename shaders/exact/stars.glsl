@@ -11,13 +11,7 @@ Star star_of(int i) {
     i *= WORDS;
     ivec2 pixel = ivec2(sprite[i], sprite[i + 1]);
     vec2 fraction = vec2(intBitsToFloat(sprite[i + 2]), intBitsToFloat(sprite[i + 3]));
-#ifdef OFFSETS
-    fraction -= places_px[PLANE];
-    vec2 whole = floor(fraction + odd);
-    pixel += ivec2(whole);
-    fraction -= whole;
-#endif
-    return Star(pixel, fraction, intBitsToFloat(sprite[i + WORDS - PLANES + PLANE]));
+    return Star(pixel, fraction, intBitsToFloat(sprite[i + 4]));
 }
 
 ivec2 pixel_of(int i) {
@@ -57,7 +51,7 @@ vec3 whole_of(Star star) {
 const uint BITS_OF_LEVEL = uint(LEVEL_BITS), IN_WORD = 32u / BITS_OF_LEVEL;
 
 uint level_place(ivec2 at) {
-    return uint(TEXEL * (at.y * resolution_px.x + at.x) + PLANE);
+    return uint(at.y * resolution_px.x + at.x);
 }
 
 int level_at(ivec2 at) {
@@ -72,13 +66,11 @@ void show_level(ivec2 at, int level) {
 }
 #else
 int level_at(ivec2 at) {
-    return int(imageLoad(levels, at)[PLANE]);
+    return int(imageLoad(levels, at).r);
 }
 
 void show_level(ivec2 at, int level) {
-    uvec4 shown = PLANES == 1 ? uvec4(0u) : imageLoad(levels, at);
-    shown[PLANE] = uint(level);
-    imageStore(levels, at, shown);
+    imageStore(levels, at, uvec4(level, 0u, 0u, 0u));
 }
 #endif
 
@@ -152,10 +144,9 @@ float path_light_at(vec2 offset) {
 float asked_of(ivec2 at, float own) {
     if (!on_image(at)) return -1.0;
 #ifdef SUMS
-    int units = sums[PLANES * (at.y * resolution_px.x + at.x) + PLANE];
-    float drawn = float(units) * unit_e_per_s[PLANE];
+    float drawn = float(sums[at.y * resolution_px.x + at.x]) * unit_e_per_s;
 #else
-    float drawn = imageLoad(linear_e_per_s, at)[PLANE];
+    float drawn = imageLoad(linear_e_per_s, at).r;
 #endif
     // Two stars never own one pixel: `overrated` is the largest ratio of `own` to the star's true light in a pixel.
     // A faint star's sprite may end before its near pixels do.

@@ -71,13 +71,13 @@ BLACK_BODY_LIMIT_MAG = 0.005
 GLOW_LIMIT = 1e-4
 
 
-def bench(folder: Path, site: str = "", sky: str = ""):
+def site_bench(folder: Path, site: str = "", sky: str = ""):
     return bench_file_of(folder / "site.toml", BENCH.format(site=site, sky=sky))
 
 
 @cache
 def stars_and_sky():
-    file = bench(Path())
+    file = site_bench(Path())
     sources = bench_sources(file.config, file.folder)
     stars = bench_stars(file.config, file.folder, sources.moving)
     return file, stars, sources.moving
@@ -172,7 +172,7 @@ def test_extinction_of_a_black_body_is_its_integral(tmp_path):
     (tmp_path / "k.csv").write_text(
         "wavelength_nm,value\n" + "".join(f"{a},{b}\n" for a, b in zip(knots, mag, strict=True))
     )
-    file = bench(tmp_path, 'extinction = "k.csv"', 'spectrum = "blackbody"')
+    file = site_bench(tmp_path, 'extinction = "k.csv"', 'spectrum = "blackbody"')
     nm, qe = read("ccd47-20")
     temperature_k = 7000.0
     bv = brentq(
@@ -204,7 +204,7 @@ def read_columns(name: str, column: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_the_skys_glow_is_the_integral_of_its_spectrum():
-    file = bench(Path(), "sky_v_mag_arcsec2 = 20.5")
+    file = site_bench(Path(), "sky_v_mag_arcsec2 = 20.5")
     glow = site_glow_e_per_s_sr(
         file.config, file.folder, bench_channels(file.config.tracker, file.folder)[0]
     )
@@ -247,7 +247,7 @@ def plain(function, knots_nm: np.ndarray) -> float:
 
 def test_stars_twinkle_by_youngs_law(tmp_path):
     """Measured over 60 exposures of one field: the scatter of each star's light, by altitude."""
-    file = bench(tmp_path)
+    file = site_bench(tmp_path)
     with Simulator(file) as simulator:
         moving = simulator.moving
         air = moving.air.above(moving.utc_ns(None))
@@ -304,7 +304,7 @@ def facing(up: np.ndarray, altitude_deg: float) -> np.ndarray:
 
 
 def test_below_the_horizon_there_is_neither_star_nor_sky(tmp_path, caplog):
-    file = bench(tmp_path, "sky_v_mag_arcsec2 = 20.5")
+    file = site_bench(tmp_path, "sky_v_mag_arcsec2 = 20.5")
     with Simulator(file) as simulator:
         up = simulator.moving.air.above(simulator.moving.utc_ns(None)).up
         found = [
@@ -358,14 +358,14 @@ def test_the_benchs_hash_covers_the_sites_curves(tmp_path):
     curve = tmp_path / "air.csv"
     curve.write_text("wavelength_nm,value\n400,0.4\n900,0.1\n")
     keys = 'extinction = "air.csv"\nsky_v_mag_arcsec2 = 21\nsky_spectrum = "air.csv"'
-    before = bench(tmp_path, keys).sha256
+    before = site_bench(tmp_path, keys).sha256
     curve.write_text("wavelength_nm,value\n400,0.5\n900,0.1\n")
-    assert bench(tmp_path, keys).sha256 != before
+    assert site_bench(tmp_path, keys).sha256 != before
 
 
 def test_a_place_on_the_ground_moves_east_as_the_earth_turns():
     """Its velocity is the slope of its place, 0.326 km/s at 45.5 degrees."""
-    ground = Ground(bench(Path()).config.site)
+    ground = Ground(site_bench(Path()).config.site)
     utc_ns = 1_790_000_000 * 10**9
     velocity = ground.state(utc_ns)[1]
     after, before = (ground.state(utc_ns + s * 10**9)[0] for s in (5, -5))
@@ -375,7 +375,7 @@ def test_a_place_on_the_ground_moves_east_as_the_earth_turns():
 
 def test_without_a_stated_pressure_it_is_the_standard_one_of_the_height():
     """At 1200 m 877 hPa: refraction goes with it."""
-    file = bench(Path())
+    file = site_bench(Path())
     optics = bench_channels(file.config.tracker, file.folder)[0]
     site = file.config.site
     stated, standard = (

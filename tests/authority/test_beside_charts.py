@@ -14,7 +14,7 @@ from tests.support.figures import assert_legible
 RECORDED = sorted((ROOT / "results").glob("beside_*.csv"))
 
 
-def recorded(path) -> tuple[Beside, str]:
+def recorded_rows(path) -> tuple[Beside, str]:
     with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     steps = tuple(
@@ -28,7 +28,7 @@ def recorded(path) -> tuple[Beside, str]:
 def test_a_recorded_run_is_written_as_it_was_and_its_chart_is_legible(path, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(charts, "save", lambda figure, path: drawn.append(figure))
-    beside, date = recorded(path)
+    beside, date = recorded_rows(path)
     name = path.stem.removeprefix("beside_")
     write_beside(tmp_path, name, beside, date)
     assert (tmp_path / path.name).read_text() == path.read_text()
@@ -37,7 +37,7 @@ def test_a_recorded_run_is_written_as_it_was_and_its_chart_is_legible(path, tmp_
 
 
 def test_each_program_of_the_issue_has_a_recorded_run():
-    programs = {recorded(path)[0].program for path in RECORDED}
+    programs = {recorded_rows(path)[0].program for path in RECORDED}
     assert {"GalSim", "astrometry.net", "LOST", "Basilisk", "Pyxel", "Stellarium"} <= programs
 
 

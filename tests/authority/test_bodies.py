@@ -22,8 +22,10 @@ from skyfield.api import EarthSatellite
 from skyfield.jpllib import SpiceKernel
 from skyfield.timelib import Timescale
 
+from hilstar.basics.units import KM_PER_AU
 from hilstar.sky.bodies.kernel import tdb_of_utc
 from hilstar.sky.bodies.orbit import TleOrbit
+from hilstar.sky.bodies.shapes import POLAR_RADII_KM, RADII_KM
 from tests.support.claims import holds
 from tests.support.skies import (
     ALL_BODIES,
@@ -270,3 +272,26 @@ def test_from_a_low_orbit_bodies_are_where_skyfield_has_them_and_the_moon_by_a_d
     ]
     # 6720 km at right angles to the way to the Moon, 369 000 km that day, is 1.04 deg
     assert 1.0 < max(parallax_deg) < 1.05
+
+
+# Semidiameters at 1 au, arcsec (Astronomical Almanac, section E; the Sun's section C), and
+# flattenings (NASA's planetary fact sheets).
+SEMIDIAMETERS_ARCSEC = {
+    "Sun": 959.23,
+    "Mercury": 3.36,
+    "Venus": 8.34,
+    "Mars": 4.68,
+    "Jupiter": 98.57,
+    "Saturn": 83.10,
+    "Uranus": 35.24,
+    "Neptune": 34.14,
+}
+FLATTENINGS = {"Jupiter": 0.06487, "Saturn": 0.09796, "Uranus": 0.02293, "Neptune": 0.01708}
+
+
+@pytest.mark.parametrize("name", SEMIDIAMETERS_ARCSEC)
+def test_bodies_have_the_almanac_s_sizes_and_the_fact_sheets_flattening(name):
+    radius_km = RADII_KM[name]
+    assert radius_km / KM_PER_AU / ARCSEC == pytest.approx(SEMIDIAMETERS_ARCSEC[name], abs=0.006)
+    polar_km = POLAR_RADII_KM.get(name, radius_km)
+    assert 1 - polar_km / radius_km == pytest.approx(FLATTENINGS.get(name, 0.0), abs=1e-5)

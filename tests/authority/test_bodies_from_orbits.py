@@ -52,7 +52,7 @@ def elements(kind: str, utc_ns: int, rng: np.random.Generator) -> list[str]:
     return list(export_tle(satellite))
 
 
-def message(satellite: EarthSatellite, scale, utc_ns: int) -> str:
+def oem_message(satellite: EarthSatellite, scale, utc_ns: int) -> str:
     """The orbit about a date as an OEM, by Skyfield's own states."""
     stamps = utc_ns + MINUTE_NS * np.arange(-5, 6)
     days, rest_ns = np.divmod(stamps, DAY_NS)
@@ -131,7 +131,7 @@ def observer_of(kind: str, utc_ns: int, scale, rng) -> tuple[Orbit | None, Earth
     lines = elements(kind, utc_ns, rng)
     satellite = EarthSatellite(*lines, kind, scale)
     if kind == "Molniya":
-        return OemOrbit(message(satellite, scale, utc_ns), kind, utc_ns), satellite
+        return OemOrbit(oem_message(satellite, scale, utc_ns), kind, utc_ns), satellite
     return TleOrbit("\n".join(lines), kind), satellite
 
 

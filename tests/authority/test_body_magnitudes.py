@@ -33,7 +33,9 @@ SKYFIELD_FAR_MAG = 0.025
 MAX_ALLEN_DEG = 150
 
 
-def at(sun_au: float, distance_au: float, phase_deg: float) -> tuple[np.ndarray, np.ndarray]:
+def seen_at_phase(
+    sun_au: float, distance_au: float, phase_deg: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Vectors from the Sun and from the observer to a body with these distances and this phase,
     km.
     """
@@ -56,9 +58,9 @@ def at(sun_au: float, distance_au: float, phase_deg: float) -> tuple[np.ndarray,
     ],
 )
 def test_the_figures_of_the_paper_s_own_program(name, sun_au, distance_au, phase_deg, v_mag):
-    assert body_v_mag(name, *at(sun_au, distance_au, phase_deg), 2020.0) == pytest.approx(
-        v_mag, abs=PRINTED_MAG
-    )
+    assert body_v_mag(
+        name, *seen_at_phase(sun_au, distance_au, phase_deg), 2020.0
+    ) == pytest.approx(v_mag, abs=PRINTED_MAG)
 
 
 def test_planets_on_200_dates_are_as_bright_as_in_skyfield(rng):
@@ -99,9 +101,13 @@ def test_planets_on_200_dates_are_as_bright_as_in_skyfield(rng):
 
 def test_the_moon_dims_by_the_squares_of_both_distances():
     """By 0.07 mag from perihelion to aphelion."""
-    near, far = (body_v_mag("Moon", *at(sun, 0.00257, 40.0), 2020.0) for sun in (0.983, 1.017))
+    near, far = (
+        body_v_mag("Moon", *seen_at_phase(sun, 0.00257, 40.0), 2020.0) for sun in (0.983, 1.017)
+    )
     assert far - near == pytest.approx(5 * np.log10(1.017 / 0.983), abs=1e-9)
-    close, wide = (body_v_mag("Moon", *at(1.0, au, 40.0), 2020.0) for au in (0.0024, 0.0027))
+    close, wide = (
+        body_v_mag("Moon", *seen_at_phase(1.0, au, 40.0), 2020.0) for au in (0.0024, 0.0027)
+    )
     assert wide - close == pytest.approx(5 * np.log10(0.0027 / 0.0024), abs=1e-9)
 
 
@@ -185,9 +191,9 @@ def test_the_moon_is_as_bright_as_in_allen_s_table_and_its_crescent_goes_as_the_
 def test_the_earth_is_as_bright_as_in_skyfield():
     for phase_deg in (0.0, 45.0, 90.0, 150.0, 170.0):
         theirs = magnitudelib._earth_magnitude(0.99, 0.0026, phase_deg)
-        assert body_v_mag("Earth", *at(0.99, 0.0026, phase_deg), 2020.0) == pytest.approx(
-            float(theirs), abs=SKYFIELD_MAG
-        )
+        assert body_v_mag(
+            "Earth", *seen_at_phase(0.99, 0.0026, phase_deg), 2020.0
+        ) == pytest.approx(float(theirs), abs=SKYFIELD_MAG)
 
 
 def test_colours_are_those_of_the_paper():

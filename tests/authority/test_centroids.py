@@ -58,7 +58,7 @@ def profile(place_px: FloatArray, sigma_px: float, size_px: int) -> FloatArray:
     return ndtr((pixel + 0.5) / sigma_px) - ndtr((pixel - 0.5) / sigma_px)
 
 
-def star(x_px: float, y_px: float, sigma_px: float, size_px: int = 61) -> FloatArray:
+def star_image(x_px: float, y_px: float, sigma_px: float, size_px: int = 61) -> FloatArray:
     return np.outer(
         profile(np.array(y_px), sigma_px, size_px), profile(np.array(x_px), sigma_px, size_px)
     )
@@ -117,7 +117,7 @@ class Errors:
         return float(2 * np.mean(self.error_px * np.sin(2 * np.pi * self.phase_px)))
 
 
-def measure(sigma_px: float, snr: float, settings: CentroidSettings, seed: int) -> Errors:
+def centroid_errors(sigma_px: float, snr: float, settings: CentroidSettings, seed: int) -> Errors:
     """Errors, x and y together, of the centroids of STARS stars with photon and read noise."""
     rng = np.random.default_rng(seed)
     field = star_field(sigma_px, flux_for(snr, sigma_px), rng, 2 * settings.radius_px + 5)
@@ -139,7 +139,7 @@ def predicted_scatter_px(sigma_px: float, snr: float, settings: CentroidSettings
     d = np.arange(2 * radius + 1) - radius
     variances = []
     for phase in PHASES_PX:
-        image = flux_e * star(radius + phase, radius, sigma_px, 2 * radius + 1)
+        image = flux_e * star_image(radius + phase, radius, sigma_px, 2 * radius + 1)
         dx, dy = (d - phase)[None, :], d[:, None]
         weight = np.exp(-0.5 * (dx**2 + dy**2) / settings.window_sigma_px**2)
         slope = (image * weight * (dx**2 / settings.window_sigma_px**2 - 1)).sum()
@@ -152,7 +152,7 @@ def bias_px(sigma_px: float, settings: CentroidSettings) -> FloatArray:
     biases = []
     for phase in PHASES_PX:
         found = find_stars(
-            1e6 * star(30 + phase, 30.3, sigma_px), settings, LocalBackground(0.0, 20.0)
+            1e6 * star_image(30 + phase, 30.3, sigma_px), settings, LocalBackground(0.0, 20.0)
         )
         assert len(found) == 1
         biases.append(found.x_px[0] - 30 - phase)
@@ -235,7 +235,7 @@ def test_an_elliptical_stars_axes_have_an_s_curve_each():
 @pytest.mark.parametrize("sigma_px", SIGMAS_PX)
 def test_the_scatter_is_the_pixels_noise_propagated(sigma_px, snr):
     settings = replace(window_for(sigma_px), psf_sigma_px=(sigma_px, sigma_px))
-    errors = measure(sigma_px, snr, settings, seed=11)
+    errors = centroid_errors(sigma_px, snr, settings, seed=11)
     assert errors.found == 1.0
     assert errors.scatter_px == pytest.approx(
         predicted_scatter_px(sigma_px, snr, settings), rel=SCATTER_TOLERANCE
@@ -251,7 +251,7 @@ def test_the_first_column_is_x_and_the_first_pixels_centre_is_nought():
     assert (found.x_px[0], found.y_px[0]) == (7.0, 3.0)
     # A whole pixel to the right and half a pixel down.
     found = find_stars(
-        100 * star(12.0, 8.5, 1.0, 21), CentroidSettings(), LocalBackground(0.0, 1.0)
+        100 * star_image(12.0, 8.5, 1.0, 21), CentroidSettings(), LocalBackground(0.0, 1.0)
     )
     assert found.x_px[0] == pytest.approx(12.0, abs=NUMERICAL_PX)
     assert found.y_px[0] == pytest.approx(8.5, abs=NUMERICAL_PX)
@@ -259,7 +259,7 @@ def test_the_first_column_is_x_and_the_first_pixels_centre_is_nought():
 
 @pytest.mark.parametrize("window", ["gaussian", "plain"])
 def test_a_mirrored_image_has_mirrored_stars(window):
-    image = 1e5 * (star(20.3, 25.1, 0.8) + 0.5 * star(40.7, 33.2, 0.8))
+    image = 1e5 * (star_image(20.3, 25.1, 0.8) + 0.5 * star_image(40.7, 33.2, 0.8))
     settings = CentroidSettings(window=window)
     found = find_stars(image, settings, LocalBackground(0.0, 10.0))
     mirrored = find_stars(
@@ -272,19 +272,19 @@ def test_a_mirrored_image_has_mirrored_stars(window):
 def test_stars_come_brightest_first_with_their_flux_peak_and_pixels():
     fluxes = (2e4, 9e4, 5e4)
     places = ((15.2, 15.4), (45.1, 15.3), (30.2, 44.9))
-    image = sum(flux * star(*place, 0.8) for flux, place in zip(fluxes, places, strict=True))
+    image = sum(flux * star_image(*place, 0.8) for flux, place in zip(fluxes, places, strict=True))
     found = find_stars(image + 300.0, CentroidSettings(), LocalBackground(300.0, 10.0))
     # The window is 4 px on each side: at 0.8 px of sigma and 0.45 px off its middle it cuts 4
     # sigmas off, under 1e-5.
     np.testing.assert_allclose(found.flux, sorted(fluxes, reverse=True), rtol=1e-5)
     np.testing.assert_allclose(found.x_px, [45.1, 30.2, 15.2], atol=0.0025)  # the S-curve at 0.8 px
     assert found.peak[0] == pytest.approx(image.max())
-    assert found.pixels[0] == (9e4 * star(*places[1], 0.8) > 50.0).sum()
+    assert found.pixels[0] == (9e4 * star_image(*places[1], 0.8) > 50.0).sum()
     assert not found.at_edge.any()
 
 
 def test_small_blobs_can_be_left_out():
-    image = 1e5 * star(30.3, 30.3, 1.0)
+    image = 1e5 * star_image(30.3, 30.3, 1.0)
     image[10, 10] = 5000.0
     background = LocalBackground(0.0, 10.0)
     assert len(find_stars(image, CentroidSettings(minimum_pixels=1), background)) == 2
@@ -305,7 +305,9 @@ def test_pixels_that_touch_by_a_corner_are_one_star():
 
 
 def test_stars_whose_windows_leave_the_image_say_so():
-    image = 1e5 * (star(1.0, 30.0, 0.8) + star(30.0, 30.0, 0.8) + 0.5 * star(30.0, 58.0, 0.8))
+    image = 1e5 * (
+        star_image(1.0, 30.0, 0.8) + star_image(30.0, 30.0, 0.8) + 0.5 * star_image(30.0, 58.0, 0.8)
+    )
     found = find_stars(image, CentroidSettings(), LocalBackground(0.0, 10.0))
     assert found.at_edge[np.argsort(found.x_px)].tolist().count(True) == 2
     assert not found.at_edge[(np.abs(found.x_px - 30) < 1) & (np.abs(found.y_px - 30) < 1)].any()
@@ -333,7 +335,7 @@ def test_the_background_is_found_under_stars_and_to_a_fraction_of_a_dn(gain_e_pe
     places = rng.uniform(20, 280, (30, 2))
     for x, y in places:
         column, row = int(x) - 10, int(y) - 10
-        sky[row : row + 21, column : column + 21] += 1e5 * star(x - column, y - row, 0.8, 21)
+        sky[row : row + 21, column : column + 21] += 1e5 * star_image(x - column, y - row, 0.8, 21)
     image = np.rint(sky / gain_e_per_dn).astype(np.uint16)
     found = estimate_background(image)
     noise_dn = math.hypot(noise_e / gain_e_per_dn, math.sqrt(1 / 12))
@@ -433,7 +435,7 @@ if __name__ == "__main__":
                 f" {np.abs(bias_px(sigma, known)).max():.1e} "
             ]
             for signal_to_noise in (10.0, *FIRST_ORDER_SNR):
-                got = measure(sigma, signal_to_noise, known, seed=11)
+                got = centroid_errors(sigma, signal_to_noise, known, seed=11)
                 cells.append(f"{got.scatter_px:.4f} ({100 * got.found:5.1f} %)")
             if window == "gaussian":
                 cells += [

@@ -38,7 +38,7 @@ SEEN_SIGMA_PX = float(np.sqrt(SIGMA_PX**2 + 1 / 6 + BLUR_PX**2))
 SLOPE_STEP_PX, FIT_ROUNDS = 1e-3, 3
 
 
-def fitted(seen, x, y, phases):
+def fit_errors(seen, x, y, phases):
     """How far from the star itself a least-squares fit of light, x and y finds it (2, n), px."""
 
     def view(x_px, y_px):
@@ -97,7 +97,7 @@ def places_off(shown, field, rng):
     here, _ = centroids(shown, at, TRACKER_PIXEL_PX, BLUR_PX, SEEN_SIGMA_PX, boxes)
     seen, _ = seen_by_tracker(shown, at, TRACKER_PIXEL_PX, BLUR_PX)
     off_px = {kind: place - there[kind] for kind, place in here.items()}
-    return off_px | {"fit": fitted(seen, x, y, at)}
+    return off_px | {"fit": fit_errors(seen, x, y, at)}
 
 
 def rms(values):

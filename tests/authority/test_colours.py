@@ -55,7 +55,7 @@ def saved(path, values):
     return np.interp(GRID_NM, SENSOR_NM, values.round(9), left=0, right=0)
 
 
-def bench(folder, panel, sensor, **render):
+def panel_bench(folder, panel, sensor, **render):
     """A bench of a panel and a sensor, and the sensor's curves (channels, n) on the grid."""
     written(folder / "panel.csv", PANELS[panel])
     names = (
@@ -125,7 +125,7 @@ def drives(frame, opened):
 @pytest.mark.parametrize("panel", PANELS)
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_each_channel_has_its_electrons_where_the_gamut_allows(tmp_path, panel, sensor):
-    opened, curves = bench(tmp_path, panel, SENSORS[sensor])
+    opened, curves = panel_bench(tmp_path, panel, SENSORS[sensor])
     with opened:
         matrix, _ = photons_of_panel(panel, curves)
         matrix /= matrix.sum()
@@ -173,7 +173,7 @@ def test_each_channel_has_its_electrons_where_the_gamut_allows(tmp_path, panel, 
 @pytest.mark.parametrize("panel", PANELS)
 @pytest.mark.parametrize("sensor", MONO)
 def test_a_mono_tracker_has_a_stars_electrons_and_its_mean_wavelength(tmp_path, panel, sensor):
-    opened, curves = bench(tmp_path, panel, MONO[sensor])
+    opened, curves = panel_bench(tmp_path, panel, MONO[sensor])
     with opened:
         stars = opened.stars
         _, of_primaries = photons_of_panel(panel, curves)
@@ -204,7 +204,7 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
         (x, y, one, 0.0) for x in (0, side / 2, side) for y in (0, side / 2, side) for one in nm
     ]
     lateral = [
-        (1.0, 0.0, *(0.2 * moved(one) * (2 * place / side - 1) for place in (x, y)))
+        (1.0, 0.0, *(0.2 * moved_share(one) * (2 * place / side - 1) for place in (x, y)))
         for x, y, one, _ in places
     ]
     dot = np.exp(-(at**2 + at[:, None] ** 2) / 0.5)
@@ -213,7 +213,7 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
         glass_of(Stack(np.array([dot] * len(places)), np.array(places), np.array(lateral), 2)),
     )
     sensor = np.where((SENSOR_NM > 420) & (SENSOR_NM < 700), MONO["visible"], 0.0)
-    without, curves = bench(tmp_path, "lcd", sensor)
+    without, curves = panel_bench(tmp_path, "lcd", sensor)
     path = tmp_path / "bench.toml"
     path.write_text(path.read_text() + '\n[tracker.optics]\npsf = "glass.fits"\n')
     with without, load(path) as opened:
@@ -224,7 +224,9 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
         )
     _, of_primaries = photons_of_panel("lcd", curves)
     _, of_stars = photons_of_stars(stars.temperature_k, curves)
-    primaries, sky = (one @ moved(GRID_NM) / one.sum(axis=1) for one in (of_primaries, of_stars))
+    primaries, sky = (
+        one @ moved_share(GRID_NM) / one.sum(axis=1) for one in (of_primaries, of_stars)
+    )
     spread, off, plain = (
         np.std(one)
         for one in (sky, shares @ primaries - sky, without.stars.primaries @ primaries - sky)
@@ -238,6 +240,6 @@ def test_a_lens_whose_lateral_colour_turns_back_parts_stars_by_colour_as_in_the_
     assert np.abs(shares @ means[0] - means[1]).max() < 60
 
 
-def moved(nm):
+def moved_share(nm):
     """By how much light of a wavelength is moved at the edge of the field."""
     return ((nm - 560) / 100) ** 2 - 0.3 * (nm - 560) / 100

@@ -59,7 +59,7 @@ def _the_same_table():
         yield
 
 
-def at(text: str) -> np.ndarray:
+def utc_array(text: str) -> np.ndarray:
     return np.array([utc_ns_of(text, "--epoch-utc")])
 
 
@@ -76,7 +76,7 @@ def angle_mas(matrix: np.ndarray) -> float:
 
 @pytest.mark.parametrize("date", DATES)
 def test_the_earths_axes_are_astropys(date):
-    ours = to_matrix(q_icrs_to_itrs(at(date))[0])
+    ours = to_matrix(q_icrs_to_itrs(utc_array(date))[0])
     time = Time(date, scale="utc")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -101,7 +101,7 @@ def test_the_earths_axes_are_those_that_the_iers_published():
             [0.000756253967, 0.000970134847, 0.999999243459],
         ]
     )
-    ours = to_matrix(q_icrs_to_itrs(at("2012-05-20T16:33:13"))[0])
+    ours = to_matrix(q_icrs_to_itrs(utc_array("2012-05-20T16:33:13"))[0])
     # The IERS's own parameters of that day were rapid ones: UT1 to 0.13 ms, the pole to 0.4 mas.
     holds("itrs-iers", angle_mas(ours @ itrf_to_icrf))
 
@@ -122,10 +122,10 @@ def test_a_star_stands_where_astropys_horizon_has_it(date, place):
         )
     north, east, up = seen.xyz.value
     ned = Rotation.from_quat(
-        q_icrs_to_ned(at(date), latitude_deg, longitude_deg)[0], scalar_first=True
+        q_icrs_to_ned(utc_array(date), latitude_deg, longitude_deg)[0], scalar_first=True
     )
     enu = Rotation.from_quat(
-        q_icrs_to_enu(at(date), latitude_deg, longitude_deg)[0], scalar_first=True
+        q_icrs_to_enu(utc_array(date), latitude_deg, longitude_deg)[0], scalar_first=True
     )
     direction = star.cartesian.xyz.value
     for ours, theirs in (
@@ -138,7 +138,9 @@ def test_a_star_stands_where_astropys_horizon_has_it(date, place):
 @pytest.mark.parametrize("latitude_deg", [-89.0, -30.0, 0.0, 45.0, 90.0])
 def test_a_level_frame_turns_by_the_earths_rate(latitude_deg):
     """v' = -omega x v."""
-    begin, end = q_icrs_to_ned(at("2026-11-22T10:00:00") + np.array([0, 10**9]), latitude_deg, 11.0)
+    begin, end = q_icrs_to_ned(
+        utc_array("2026-11-22T10:00:00") + np.array([0, 10**9]), latitude_deg, 11.0
+    )
     turned = -to_rotation_vector(multiply(end, conjugate(begin)))
     assert turned == pytest.approx(
         earth_rate_ned_rad_s(latitude_deg), abs=EARTH_RATE_RAD_S * POLE_RAD
@@ -149,7 +151,11 @@ def test_a_leap_second_does_not_turn_the_earth_back():
     """UTC repeats no second here: 2017 begins two seconds of the Earth after 23:59:59 of 2016."""
     q = q_icrs_to_itrs(
         np.concatenate(
-            [at("2016-12-31T23:59:58"), at("2016-12-31T23:59:59"), at("2017-01-01T00:00:00")]
+            [
+                utc_array("2016-12-31T23:59:58"),
+                utc_array("2016-12-31T23:59:59"),
+                utc_array("2017-01-01T00:00:00"),
+            ]
         )
     )
     first, over = (
@@ -161,12 +167,17 @@ def test_a_leap_second_does_not_turn_the_earth_back():
 
 def test_beyond_the_table_the_user_is_told_by_how_much():
     assert (
-        beyond_table(int(at("1980-01-01T00:00:00")[0]), int(at("2026-01-01T00:00:00")[0])) is None
+        beyond_table(
+            int(utc_array("1980-01-01T00:00:00")[0]), int(utc_array("2026-01-01T00:00:00")[0])
+        )
+        is None
     )
-    line = beyond_table(int(at("2026-01-01T00:00:00")[0]), int(at("2060-01-01T00:00:00")[0]))
+    line = beyond_table(
+        int(utc_array("2026-01-01T00:00:00")[0]), int(utc_array("2060-01-01T00:00:00")[0])
+    )
     assert line is not None
     assert "beyond it UT1 is guessed" in line
-    assert np.isfinite(q_icrs_to_itrs(at("2060-01-01T00:00:00"))).all()
+    assert np.isfinite(q_icrs_to_itrs(utc_array("2060-01-01T00:00:00"))).all()
 
 
 @pytest.mark.parametrize(

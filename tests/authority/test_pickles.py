@@ -25,17 +25,17 @@ from tests.support.claims import holds
 GLASS = load_curve("n-bk7-10mm", "transmission")
 
 
-def flat(low_nm, high_nm):
+def half_curve(low_nm, high_nm):
     return Curve(np.array([low_nm, high_nm]), np.array([0.5, 0.5]))
 
 
 SENSORS = {
     "ccd47-20": Optics(30.0, load_curve("ccd47-20", "qe"), GLASS),
     "kai-4021": Optics(30.0, load_curve("kai-4021", "qe"), GLASS),
-    "flat": Optics(30.0, flat(400.0, 1000.0), GLASS),
+    "flat": Optics(30.0, half_curve(400.0, 1000.0), GLASS),
 }
 # What a tracker without glass or filter sees, ultraviolet to 1100 nm.
-BARE = Optics(30.0, flat(300.0, 1100.0), constant_curve(1.0))
+BARE = Optics(30.0, half_curve(300.0, 1100.0), constant_curve(1.0))
 
 REDDEST_VI_MAG = 2.5  # the range that the aims are for: 98.4 % of Hipparcos to V = 7.5
 
@@ -251,7 +251,7 @@ def test_five_magnitudes_are_a_hundredfold():
 
 def test_a_sensor_past_the_spectra_is_refused():
     with pytest.raises(InputError, match="250 to 1600 nm"):
-        tabulate_pickles(Optics(30.0, flat(400.0, 1700.0), constant_curve(1.0)), Photometry())
+        tabulate_pickles(Optics(30.0, half_curve(400.0, 1700.0), constant_curve(1.0)), Photometry())
 
 
 def test_a_blind_sensor_is_refused():

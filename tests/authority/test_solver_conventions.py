@@ -45,7 +45,7 @@ def field(sky):
     return slopes[order], v_mag[order]
 
 
-def same(q, other):
+def is_same_attitude(q, other):
     return min(np.abs(q - other).max(), np.abs(q + other).max()) < 1e-5
 
 
@@ -54,7 +54,7 @@ def test_tetra3rs_answers_in_hilstars_convention(sky, field):
     slopes, v_mag = field
     solver = LostInSpace(*sky, FOCAL_PX, (SIDE_PX, SIDE_PX))
     q = solver.solve(slopes, 10 ** (-0.4 * v_mag))
-    assert same(q, from_radec_roll_deg(*RADEC_ROLL_DEG))
+    assert is_same_attitude(q, from_radec_roll_deg(*RADEC_ROLL_DEG))
 
 
 def test_ruststartracker_has_the_scalar_last_and_the_conjugate(sky, field):
@@ -73,7 +73,7 @@ def test_ruststartracker_has_the_scalar_last_and_the_conjugate(sky, field):
     rays = np.column_stack([field[0], np.ones(len(field[0]))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     x, y, z, w = tracker.process_observation_vectors(rays.astype(np.float32)).quat
-    assert same(np.array([w, -x, -y, -z]), from_radec_roll_deg(*RADEC_ROLL_DEG))
+    assert is_same_attitude(np.array([w, -x, -y, -z]), from_radec_roll_deg(*RADEC_ROLL_DEG))
 
 
 def test_cedar_answers_hilstars_roll(field):

@@ -60,7 +60,7 @@ def sensor(request, tmp_path_factory):
     ]
 
 
-def written(folder, mono, *changes):
+def channel_bench(folder, mono, *changes):
     keys = (
         {"quantum_efficiency": "mono.csv"}
         if mono
@@ -94,7 +94,7 @@ def electrons(temperature_k, efficiency):
 @pytest.mark.parametrize("mono", [True, False], ids=["mono", "bayer"])
 def test_each_channels_electrons_of_every_star(sensor, mono):
     folder, channels = sensor
-    stars = bench_stars(read_bench_file(written(folder, mono)).config, folder)
+    stars = bench_stars(read_bench_file(channel_bench(folder, mono)).config, folder)
     some = np.linspace(0, len(stars) - 1, 60).astype(int)
     found = stars.electrons_per_s[some, None] * (1 if mono else stars.colours[some])
     efficiencies = [sum(channels) / 3] if mono else channels
@@ -113,7 +113,7 @@ def test_the_mosaics_mean_image_has_a_quarter_of_red_and_blue_and_half_of_green(
     """A star of sigma 1.6 px: every second pixel has its quarter of the light to 3e-6."""
     folder, channels = sensor
     with Simulator(
-        read_bench_file(written(folder, False, {"tracker": {"psf_sigma_px": [1.6, 1.6]}}))
+        read_bench_file(channel_bench(folder, False, {"tracker": {"psf_sigma_px": [1.6, 1.6]}}))
     ) as simulator:
         exposure = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     star = exposure.truth[0]
@@ -163,7 +163,7 @@ def test_the_budgets_near_infrared_is_the_librarys_own(sensor):
     folder, channels = sensor
     power = np.exp(-(((NM - 600) / 40) ** 2))  # 1 % of it at 686 nm
     primaries = [Curve(NM, power), Curve(NM, np.where(NM < 560, power, 0.0))]
-    tracker = read_bench_file(written(folder, False)).config.tracker
+    tracker = read_bench_file(channel_bench(folder, False)).config.tracker
     optics = dict(zip(tracker.quantum_efficiencies, bench_channels(tracker, folder), strict=True))
     rows = red_shares(optics, [700.0, reddest_nm(primaries)])
     found = {(row["channel"], row["from_nm"]): row["by_class"] for row in rows}

@@ -74,7 +74,7 @@ def vectors_of(dlon_deg, lat_deg) -> np.ndarray:
         return np.atleast_2d(seen.transform_to(GCRS(obstime=time)).cartesian.xyz.value.T)
 
 
-def table() -> np.ndarray:
+def table_17() -> np.ndarray:
     """Table 17 as the package keeps it, NaN where it is blank."""
     return tabled_light(
         Sunward(*(grid.ravel() for grid in np.meshgrid(LON_DEG, LAT_DEG, indexing="ij")))
@@ -82,7 +82,7 @@ def table() -> np.ndarray:
 
 
 def test_fifty_directions_by_astropy_have_the_tables_brightness(rng):
-    radiance, tabled = (values.reshape(len(LON_DEG), len(LAT_DEG)) for values in table())
+    radiance, tabled = (values.reshape(len(LON_DEG), len(LAT_DEG)) for values in table_17())
     for dlon, lat, value in PAPER:
         assert radiance[LON_DEG.tolist().index(dlon), LAT_DEG.tolist().index(lat)] == pytest.approx(
             value
@@ -98,7 +98,7 @@ def test_between_directions_it_is_within_the_error_that_is_stated():
     """Every second longitude, or latitude, is found from its neighbours; at half the step the
     error is about a quarter.
     """
-    radiance, tabled = (values.reshape(len(LON_DEG), len(LAT_DEG)) for values in table())
+    radiance, tabled = (values.reshape(len(LON_DEG), len(LAT_DEG)) for values in table_17())
     values = np.where(tabled, np.log(radiance), np.nan)
     errors = []
     for of, axis in ((values, LON_DEG), (values.T, LAT_DEG)):
@@ -123,7 +123,9 @@ def test_its_v_magnitude_is_that_of_the_papers_other_unit():
         if s10 == 60:
             holds("zodiacal-pole", v_mag)
             # of the brightest direction of table 17, 15 degrees from the Sun
-            holds("zodiacal-brightest", v_mag - 2.5 * np.log10(table().radiance.max() / radiance))
+            holds(
+                "zodiacal-brightest", v_mag - 2.5 * np.log10(table_17().radiance.max() / radiance)
+            )
 
 
 def test_its_spectrum_is_table_19s_and_redder_near_the_sun():

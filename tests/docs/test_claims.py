@@ -34,6 +34,8 @@ from tests.support.claims import faults, holds, rows
 from tools import claims as tool
 
 ROW = "star-places"
+# pages, tests, and the files that have what is given
+COPIED = ("docs/*.md", "tests/**/*.py", "hilstar/**/*.py", "tools/*.py", "configs/*.toml")
 
 
 def test_each_figure_its_row_and_its_test_belong_together():
@@ -93,10 +95,10 @@ def test_settings_are_those_of_the_code():
 
 @pytest.fixture(scope="module")
 def whole_copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """README, docs, rows and tests."""
+    """README, docs, rows, tests, and the files that have what is given."""
     folder = tmp_path_factory.mktemp("copy")
     names = ["README.md", "claims.toml"]
-    for pattern in ("docs/*.md", "tests/**/*.py"):
+    for pattern in COPIED:
         names += [path.relative_to(ROOT).as_posix() for path in ROOT.glob(pattern)]
     for name in names:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -138,6 +140,9 @@ CALL = 'holds("star-places", error_mas.max())'
         ("README.md", "claim: star-places", "claim: star-place", "no row of claims.toml is"),
         ("README.md", "0.2 mas<!-- claim: body-places -->", "0.2 mas", "0.2 mas has no mark"),
         ("docs/accuracy-speed.md", "\n## ", "\nIt is 0.3 px off.\n\n## ", "0.3 px has no mark"),
+        ("docs/certify.md", "\n## ", "\nIt is 0.3 px off.\n\n## ", "0.3 px has no mark"),
+        ("docs/certify.md", "0.2 %<!-- given", "0.3 %<!-- given", "has no 0.3 %"),
+        ("docs/first-day.md", "0.05 mag<!-- given: ", "0.05 mag<!-- given: x/", "has no 0.05 mag"),
         ("claims.toml", TEST, "tests/authority/test_nothing.py", "does not exist"),
         ("claims.toml", "test_every_star_is", "test_every_star_was", "does not exist"),
         ("claims.toml", '["apply_space_motion"]', '["starpm"]', "does not use starpm"),

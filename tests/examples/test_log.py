@@ -25,7 +25,7 @@ STEP_ERROR_RAD = STEP_S**3 / 12 * np.radians(20) / 20 * (2 * np.pi / 20) ** 2
 DIGITS_RAD = 1e-11  # of the file, in a difference of two attitudes
 
 
-def rows() -> np.ndarray:
+def sample_rows() -> np.ndarray:
     """t_s, q_icrs_to_cam, rate_cam_rad_s of each sample."""
     return np.loadtxt(EXAMPLES / "slew.csv", delimiter=",", skiprows=2)
 
@@ -42,7 +42,7 @@ def test_the_log_is_what_its_script_makes():
 
 
 def test_its_attitudes_turn_as_its_rates_say_from_rest_to_rest():
-    log = rows()
+    log = sample_rows()
     attitudes = Rotation.from_quat(log[:, 1:5], scalar_first=True)
     assert np.allclose(np.linalg.norm(log[:, 1:5], axis=1), 1, rtol=0, atol=1e-11)
     turns = (attitudes[1:] * attitudes[:-1].inv()).as_rotvec()
@@ -64,7 +64,7 @@ def test_replay_and_the_virtual_tracker_follow_it(tmp_path, monkeypatch):
     (shown,) = re.findall(r"(?s)```text\n(.*?)```", section("An attitude log"))
     assert shape(replayed.stdout + exposed.stdout) == shape(shown)
 
-    log = rows()
+    log = sample_rows()
     with Path("slew-frames/frames.csv").open() as file:
         frames = list(csv.DictReader(file))
     assert [float(frame["t_s"]) for frame in frames] == [2.0 * k for k in range(12)]

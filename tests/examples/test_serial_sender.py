@@ -53,7 +53,7 @@ def sender(tmp_path_factory) -> Path:
     return target
 
 
-def told(output: str) -> dict[str, int]:
+def sender_counts(output: str) -> dict[str, int]:
     match = re.fullmatch(r"sent (\d+), requests (\d+), statuses (\d+)\n", output)
     assert match is not None, output
     return dict(zip(("sent", "requests", "statuses"), map(int, match.groups()), strict=True))
@@ -74,7 +74,7 @@ def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(
         assert result.returncode == 0, result.stderr
         time.sleep(READ_S)
         summary = interrupted(process)
-    counted = told(result.stdout)
+    counted = sender_counts(result.stdout)
     packets = summary["packets"]
     assert counted["sent"] == 150 == packets["received"] == packets["accepted"]
     assert packets["refused"] == 0
@@ -111,7 +111,7 @@ def test_the_sender_turns_as_its_rate_says_and_answers_on_its_own_clock(cable, s
         link.send(Status(0, 0, 0, 0, 0, 0, 0))
         heard = [(arrival.host_ns, arrival.event) for arrival in first] + listened(link, program)
         assert program.stdout is not None
-        counted = told(program.stdout.read())
+        counted = sender_counts(program.stdout.read())
     samples = [event for _, event in heard if isinstance(event, AttitudeSample)]
     assert counted == {"sent": 100, "requests": 1, "statuses": 1}
     assert [sample.sequence for sample in samples] == list(range(100))

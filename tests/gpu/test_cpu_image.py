@@ -16,9 +16,10 @@ from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf
-from tests.support.stars import sprites_at
+from tests.support.stars import random_sprites, sprites_at
 
 SIZE, SIGMA = (256, 192), (0.85, 0.85)
+DECADES = (1, 7)  # of light, electrons per second
 # float32 shares of both ways are at most 1e-7 of a star's light off (scene/psf.py), and the sum of
 # a few stars rounds.
 WAYS_LIMIT = 1e-6
@@ -40,13 +41,6 @@ def gl():
         assert renderer.gl_error() == "GL_NO_ERROR"
 
 
-def stars(gl: Renderer, count: int, rng: np.random.Generator, size=SIZE):
-    flux = 10.0 ** rng.uniform(1, 7, count)
-    return sprites_at(
-        rng.uniform([-5, -5], np.add(size, 5), size=(count, 2)), flux, gl.footprint_px
-    )
-
-
 @pytest.mark.parametrize("size", [SIZE, (255, 33), (7, 5), (640, 2)])
 def test_frames_of_any_number_of_stars_follow_each_other(size, rng):
     """Few are made black one by one, more by a clear; few are one chunk, more several."""
@@ -56,7 +50,7 @@ def test_frames_of_any_number_of_stars_follow_each_other(size, rng):
     ):
         assert raster._cpu_image is None
         for count in (3, 40, 2, 9000, 1, 300, 128, 129, 0, 40, 300, 131, 2, 0, 3):
-            sprites = stars(gl, count, rng, size)
+            sprites = random_sprites(count, rng, size, gl.footprint_px, DECADES)
             gl.draw(sprites)
             raster.draw(sprites)
             meeting = count * gl.footprint_px**2 / (size[0] * size[1])
@@ -75,7 +69,7 @@ def test_few_stars_on_a_large_image_are_made_black_without_a_clear(rng, monkeypa
     ):
         monkeypatch.setattr(cpu_stars, "MAX_LISTED", 100.0)
         for count in (200, 150, 3, 2000, 100, 1, 400, 0):
-            sprites = stars(gl, count, rng, (1024, 768))
+            sprites = random_sprites(count, rng, (1024, 768), gl.footprint_px, DECADES)
             gl.draw(sprites)
             fresh.draw(None)
             fresh.draw(sprites)
@@ -106,7 +100,7 @@ def test_no_star_is_lost_where_many_stand_in_few_rows(sigma, rng):
 
 def test_extended_light_and_stars_alone_take_turns(gl, rng):
     light = LightMap(np.full((8, 9), 5.0, dtype=np.float32), (20, 30))
-    some, other = stars(gl, 50, rng), stars(gl, 60, rng)
+    some, other = (random_sprites(count, rng, SIZE, gl.footprint_px, DECADES) for count in (50, 60))
     with Rasterised(Target(SIZE, GaussianPsf(SIGMA))) as raster:
         for sprites in (
             some,
@@ -126,7 +120,7 @@ def test_the_image_outlives_its_renderer_and_cannot_be_written_to(rng):
         image = gl.linear()
     del gl
     with Renderer(Target((1024, 768), GaussianPsf(SIGMA))) as other:
-        other.draw(stars(other, 100, rng, (1024, 768)))
+        other.draw(random_sprites(100, rng, (1024, 768), other.footprint_px, DECADES))
     assert image.sum(dtype=np.float64) == pytest.approx(1e6, rel=1e-5)
     with pytest.raises(ValueError, match="read-only"):
         image[0, 0] = 1.0
@@ -137,7 +131,7 @@ def test_renderers_that_come_and_go_leave_no_memory_behind(rng):
     resident_mb = []
     for _ in range(16):
         with Renderer(Target((1920, 1080), GaussianPsf(SIGMA))) as gl:
-            gl.draw(stars(gl, 5000, rng, (1920, 1080)))
+            gl.draw(random_sprites(5000, rng, (1920, 1080), gl.footprint_px, DECADES))
             gl.draw(None)
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         resident_mb.append(pages * 4096 / 1e6)

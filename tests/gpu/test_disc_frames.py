@@ -71,7 +71,7 @@ def aim(bench: Bench, name: str, off_deg: float = 0.0) -> np.ndarray:
     return from_radec_roll_deg(ra, dec - off_deg, 0.0)
 
 
-def disc(radius_px: float, phase_deg: float, at_px=(45.0, 41.0), name="Moon") -> Disc:
+def disc_on_image(radius_px: float, phase_deg: float, at_px=(45.0, 41.0), name="Moon") -> Disc:
     direction = CAMERA.rays(np.array([at_px[0]]), np.array([at_px[1]]))[0]
     direction /= np.linalg.norm(direction)
     side = np.cross(direction, [0.3, 1.0, 0.2])
@@ -151,7 +151,10 @@ def test_the_sun_in_the_field_is_white_finite_and_told_and_stars_keep_their_ligh
 
 
 def test_a_nearer_disc_hides_a_farther_one_and_covers_all_of_it():
-    near, far = disc(9.0, 20.0, name="near"), disc(20.0, 30.0, (47.0, 40.0), "far")
+    near, far = (
+        disc_on_image(9.0, 20.0, name="near"),
+        disc_on_image(20.0, 30.0, (47.0, 40.0), "far"),
+    )
     view = DiscView(CAMERA, GaussianPsf(SIGMA), (Pose(np.eye(3)),))
     with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as gl:
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
@@ -171,10 +174,10 @@ def test_a_disc_that_others_hide_as_a_whole_is_none():
     """The Sun in a total eclipse is neither drawn nor listed, and comes back at its last
     contact.
     """
-    moon = disc(20.0, 170.0, (45.0, 41.0))
+    moon = disc_on_image(20.0, 170.0, (45.0, 41.0))
     for sun, seen in (
-        (disc(19.0, 0.0, (45.5, 41.0), "Sun"), 1),
-        (disc(19.0, 0.0, (47.0, 41.0), "Sun"), 2),
+        (disc_on_image(19.0, 0.0, (45.5, 41.0), "Sun"), 1),
+        (disc_on_image(19.0, 0.0, (47.0, 41.0), "Sun"), 2),
     ):
         layer = BodyLayer(
             SimpleNamespace(discs=lambda *_, sun=sun: [moon, sun]),
@@ -204,7 +207,7 @@ def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(bench):
 @pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("late_s", [0.0, 1 / 60], ids=["at once", "row by row"])
 def test_the_reference_has_the_same_disc(radius_px, lens, late_s):
-    one = disc(radius_px, 60.0)
+    one = disc_on_image(radius_px, 60.0)
     shear = (
         Shear(np.array([0.02, 0.05, 0.01]), (0.0, late_s / SIZE[1]), (47.5, 39.5))
         if late_s
@@ -236,7 +239,7 @@ def test_a_large_disc_in_tiles_is_that_of_the_reference(face, law):
     size = (226, 222)
     cam = Camera(size, 900.0, (112.5, 110.5), np.eye(3), LENS)
     one = replace(
-        disc(face[0], 50.0, face[1]),
+        disc_on_image(face[0], 50.0, face[1]),
         law=law,
         polar_km=0.93,
         pole=np.array([0.6, 0.8, 0.0]),
@@ -271,7 +274,8 @@ def test_every_quantisation_encodes_discs_and_erases_them(method, radius_px):
         for _ in range(2):
             gl.draw(
                 replace(
-                    star, extended=tuple(disc_lights(disc(radius_px, 40.0), view, covers=True))
+                    star,
+                    extended=tuple(disc_lights(disc_on_image(radius_px, 40.0), view, covers=True)),
                 ),
                 3,
             )
@@ -299,7 +303,9 @@ def test_maps_of_discs_do_not_push_out_those_that_last(monkeypatch):
             discs = [
                 light
                 for x in range(5)
-                for light in disc_lights(disc(2.0, 40.0, (10.0 + 15 * x, 40.0)), view, covers=True)
+                for light in disc_lights(
+                    disc_on_image(2.0, 40.0, (10.0 + 15 * x, 40.0)), view, covers=True
+                )
             ]
             gl.draw(replace(none, extended=(lasting, *discs)))
             assert gl.linear().sum() > 4e8

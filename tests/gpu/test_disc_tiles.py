@@ -57,7 +57,7 @@ def looking(
     )
 
 
-def moon(light: DiscLight, radius_px: float) -> DiscLight:
+def moon_tiles(light: DiscLight, radius_px: float) -> DiscLight:
     """A Moon of that radius off the middle, three quarters of it lit."""
     ahead, sun = np.array([0.02, -0.01, 1.0]), np.array([0.8, 0.3, -0.5])
     far = 1 / np.sin(radius_px / light.camera.focal_length_px)
@@ -85,8 +85,8 @@ SCENES = {
     "geostationary": looking(42_164.0, 800.0, -8.0, 50.0),
     "through a lens": looking(EQUATOR_KM + 400, 300.0, -5.0, 60.0, LENS),
     "turning": replace(looking(EQUATOR_KM + 400, 1500.0, -1.0, 60.0), shear=TURN),
-    "a Moon of 110 px": moon(looking(42_164.0, 3000.0, -8.0, 50.0), 110.0),
-    "a Moon of 3000 px": moon(looking(42_164.0, 60_000.0, -8.0, 50.0), 3000.0),
+    "a Moon of 110 px": moon_tiles(looking(42_164.0, 3000.0, -8.0, 50.0), 110.0),
+    "a Moon of 3000 px": moon_tiles(looking(42_164.0, 60_000.0, -8.0, 50.0), 3000.0),
 }
 
 

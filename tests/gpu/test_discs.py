@@ -39,7 +39,7 @@ def gl():
         assert renderer.gl_error() == "GL_NO_ERROR"
 
 
-def drawn(gl, *lights) -> np.ndarray:
+def drawn_discs(gl, *lights) -> np.ndarray:
     none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
     gl.draw(replace(none, extended=tuple(lights)))
     return gl.linear().astype(float)
@@ -49,7 +49,7 @@ def lights(disc: Disc, cam: Camera, covers: bool = False):
     return disc_lights(disc, DiscView(cam, GaussianPsf(SIGMA), (Pose(np.eye(3)),)), covers)
 
 
-def camera(focal_px: float = FOCAL_PX, lens: Lens | None = None) -> Camera:
+def long_camera(focal_px: float = FOCAL_PX, lens: Lens | None = None) -> Camera:
     return Camera(SIZE, focal_px, (31.5, 29.5), np.eye(3), lens)
 
 
@@ -64,7 +64,7 @@ def sun_from(direction: np.ndarray, phase_deg: float) -> np.ndarray:
     return -np.cos(np.radians(phase_deg)) * direction + np.sin(np.radians(phase_deg)) * side
 
 
-def moon(radius_px: float, phase_deg: float, cam: Camera, polar: float = 1.0) -> Disc:
+def moon_disc(radius_px: float, phase_deg: float, cam: Camera, polar: float = 1.0) -> Disc:
     direction = towards(30.3, 31.9, cam)
     pole, sun = np.array([0.6, 0.8, 0.0]), sun_from(direction, phase_deg)
     distance = 1 / np.sin(radius_px / cam.focal_length_px)
@@ -118,9 +118,9 @@ def centroid_px(picture: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("radius_px", [14.0, 4.0])
 @pytest.mark.parametrize("phase_deg", [0.0, 30.0, 60.0, 90.0, 120.0, 150.0])
 def test_the_moon_s_light_and_limb_at_six_phases_are_those_of_rays(gl, rng, radius_px, phase_deg):
-    cam = camera()
-    disc = moon(radius_px, phase_deg, cam)
-    got = drawn(gl, *lights(disc, cam))
+    cam = long_camera()
+    disc = moon_disc(radius_px, phase_deg, cam)
+    got = drawn_discs(gl, *lights(disc, cam))
     truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng, finer=5)
     holds("disc-light", 100 * abs(got.sum() / truth.sum() - 1))
     assert got.sum() == pytest.approx(disc.law_integral_sr() * 1e9, rel=SUM_LIMIT)
@@ -133,14 +133,14 @@ def test_the_moon_s_light_and_limb_at_six_phases_are_those_of_rays(gl, rng, radi
 
 @pytest.mark.parametrize("polar", [1.0, 0.9], ids=["sphere", "Saturn's flattening"])
 def test_a_disc_through_a_lens_is_where_the_lens_has_it(gl, rng, polar):
-    cam = camera(100.0, LENS)  # the corner is 0.4 of tangent off: the lens moves it by 1 px
-    disc = moon(14.0, 50.0, cam, polar)
-    got = drawn(gl, *lights(disc, cam))
+    cam = long_camera(100.0, LENS)  # the corner is 0.4 of tangent off: the lens moves it by 1 px
+    disc = moon_disc(14.0, 50.0, cam, polar)
+    got = drawn_discs(gl, *lights(disc, cam))
     truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng)
     assert got.sum() == pytest.approx(truth.sum(), rel=FLUX_LIMIT)
     off_px = limb_off_px(disc, cam, got, truth)
     assert len(off_px) > 15 and np.abs(off_px).max() < PLACE_LIMIT_PX
-    plain = spread_image(body_of(disc), camera(100.0).rays, SIZE, SIGMA, rng)
+    plain = spread_image(body_of(disc), long_camera(100.0).rays, SIZE, SIGMA, rng)
     assert np.abs(limb_off_px(disc, cam, plain, truth)).max() > PLACE_LIMIT_PX  # the lens is seen
 
 
@@ -155,7 +155,7 @@ def test_a_disc_through_a_lens_is_where_the_lens_has_it(gl, rng, polar):
     ids=["low orbit's limb", "through a lens", "fills the screen", "geostationary"],
 )
 def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px, aim_deg, lens):
-    cam = camera(focal_px, lens)
+    cam = long_camera(focal_px, lens)
     distance_km = EARTH_KM + altitude_km
     # of the centre below the boresight
     angle = np.arcsin(EARTH_KM / distance_km) + np.radians(aim_deg)
@@ -177,13 +177,13 @@ def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px,
         Air(*AIR),
     )
     (light,) = lights(disc, cam, covers=True)
-    got = drawn(gl, light)
+    got = drawn_discs(gl, light)
     truth = spread_image(body_of(disc), cam.rays, SIZE, SIGMA, rng, finer=2)
     assert got.sum() == pytest.approx(truth.sum(), rel=FLUX_LIMIT)
     assert np.abs(got - truth).max() < FLUX_LIMIT * truth.max()
     # What the sky behind lets through: a map of 1 drawn before the disc.
     behind = LightMap(np.full(SIZE[::-1], 1e6 * truth.max(), dtype=np.float32))
-    through = (drawn(gl, behind, light) - got) / behind.image
+    through = (drawn_discs(gl, behind, light) - got) / behind.image
     y, x = (part.ravel().astype(float) for part in np.mgrid[: SIZE[1], : SIZE[0]])
     wanted = disc.transmission(cam.rays(x, y)).reshape(SIZE[::-1])
     smooth = maximum_filter(wanted, 9) - minimum_filter(wanted, 9) < FLUX_LIMIT
@@ -192,14 +192,24 @@ def test_the_earth_and_its_air_are_those_of_rays(gl, rng, altitude_km, focal_px,
 
 @pytest.mark.parametrize("sigma_px", [(0.3, 3.5), (0.2, 0.2), (3.0, 3.0)])
 def test_any_gaussian_keeps_a_disc_s_light_and_its_place(sigma_px):
-    cam = camera()
-    disc = moon(4.8, 40.0, cam)
+    cam = long_camera()
+    disc = moon_disc(4.8, 40.0, cam)
     view = DiscView(cam, GaussianPsf(sigma_px), (Pose(np.eye(3)),))
     with Renderer(Target(SIZE, GaussianPsf(sigma_px))) as gl:
-        got = drawn(gl, *disc_lights(disc, view, covers=True))
+        got = drawn_discs(gl, *disc_lights(disc, view, covers=True))
     # of the same middle
     truth = spread_image(
         body_of(disc), cam.rays, SIZE, (1.0, 1.0), np.random.default_rng(1), finer=5
     )
     assert got.sum() == pytest.approx(disc.law_integral_sr() * 1e9, rel=SUM_LIMIT)
     assert np.abs(centroid_px(got) - centroid_px(truth)).max() < PLACE_LIMIT_PX
+
+
+def test_the_middle_of_a_small_disc_hides_all_that_is_behind_it():
+    """The Sun behind a Moon is 1e9 times white: what is left of it would be bright."""
+    (light,) = lights(moon_disc(6.0, 60.0, long_camera()), long_camera(), covers=True)
+    y, x = np.indices(light.cover.shape)
+    off_px = np.hypot(x + light.corner_px[0] - 30.3, y + light.corner_px[1] - 31.9)
+    assert (light.cover[off_px < 2.5] == 1).all() and (off_px < 2.5).sum() > 15
+    assert (light.cover[off_px > 10] < 1e-3).all()
+    assert light.cover.sum() == pytest.approx(np.pi * 6.0**2, rel=0.01)

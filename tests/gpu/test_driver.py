@@ -11,7 +11,7 @@ from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import gamma_response
 from hilstar.optics.psf import GaussianPsf
-from tests.support.stars import sprites_at
+from tests.support.stars import random_sprites
 
 NO_SUCH_CAPABILITY = 0x1234
 TRIANGLE = (
@@ -52,17 +52,10 @@ def test_the_reset_status_is_asked_for(context):
 SIZE, SIGMA, WHITE = (96, 64), (0.85, 0.85), 1e6
 
 
-def stars(count, rng):
-    return sprites_at(
-        rng.uniform([0, 0], SIZE, size=(count, 2)),
-        10.0 ** rng.uniform(4, 6, count),
-        GaussianPsf(SIGMA).footprint_px,
-    )
-
-
 @pytest.mark.parametrize("quantisation", ["round", "dither", "exact", "temporal"])
 def test_a_frame_after_the_images_were_lost_is_as_if_nothing_had_been_drawn(quantisation, rng):
-    few, many = stars(3, rng), stars(40, rng)
+    footprint = GaussianPsf(SIGMA).footprint_px
+    few, many = (random_sprites(count, rng, SIZE, footprint, (4, 6)) for count in (3, 40))
     with Renderer(
         Target(SIZE, GaussianPsf(SIGMA), gamma_response(8), WHITE, quantisation)
     ) as renderer:

@@ -35,7 +35,7 @@ def gl():
         assert renderer.gl_error() == "GL_NO_ERROR"
 
 
-def drawn(gl, disc: Disc, cam: Camera) -> np.ndarray:
+def drawn_earth(gl, disc: Disc, cam: Camera) -> np.ndarray:
     none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
     gl.draw(
         replace(
@@ -97,7 +97,7 @@ def test_the_limb_and_the_light_are_those_of_rays(gl, rng, name):
         else np.arcsin(EQUATOR_KM / distance_km) + np.radians(from_limb_deg)
     )
     disc, body, cam = scene(distance_km, focal_px, aim, phase_deg)
-    got, truth = drawn(gl, disc, cam), spread_image(body, cam.rays, SIZE, SIGMA, rng, finer=2)
+    got, truth = drawn_earth(gl, disc, cam), spread_image(body, cam.rays, SIZE, SIGMA, rng, finer=2)
     holds("earth-light", 100 * abs(got.sum() / truth.sum() - 1))
     assert np.abs(got - truth).max() < PIXEL_LIMIT * truth.max()
     on = limb(body, 7200)
@@ -121,14 +121,14 @@ def test_the_limb_and_the_light_are_those_of_rays(gl, rng, name):
 
 def test_from_within_its_shadow_the_night_side_fills_the_field_and_gives_no_light(gl):
     disc, _, cam = scene(EQUATOR_KM + 400, 100.0, 0.0, 175.0)
-    assert not drawn(gl, disc, cam).any()
+    assert not drawn_earth(gl, disc, cam).any()
 
 
 @pytest.mark.parametrize("distance_km", [6000.0, EQUATOR_KM + 1.0, EQUATOR_KM + 400])
 @pytest.mark.parametrize("focal_px", [20.0, 5000.0])
 def test_an_earth_that_fills_the_field_is_smooth_and_finite(gl, distance_km, focal_px):
     disc, _, cam = scene(distance_km, focal_px, 0.0, 20.0)
-    got = drawn(gl, disc, cam)
+    got = drawn_earth(gl, disc, cam)
     inner = got[8:-8, 8:-8]
     assert np.isfinite(got).all() and (inner > 0).all()
     assert np.abs(np.diff(inner)).max() < 0.1 * inner.max()

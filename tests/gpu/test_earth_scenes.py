@@ -65,7 +65,7 @@ def body_direction(bench: Bench, name: str, place_km: np.ndarray) -> np.ndarray:
     return next(disc.direction for disc in found if disc.name == name)
 
 
-def light(bench: Bench, direction: np.ndarray, place_km: np.ndarray) -> np.ndarray:
+def light_from(bench: Bench, direction: np.ndarray, place_km: np.ndarray) -> np.ndarray:
     """The linear image about a direction from a place."""
     sprites = bench.light(bench.view(towards(direction), None, T_NS, np.zeros(3), place_km))
     levels = bench.draw_sprites(sprites).levels
@@ -113,7 +113,7 @@ def test_the_moon_sets_behind_the_earth(bench):
         moon = body_direction(bench, "Moon", place)  # parallax, up to a degree
         place = above(moon, np.radians(height_deg), side)
         moon = body_direction(bench, "Moon", place)
-        picture = light(bench, moon, place)
+        picture = light_from(bench, moon, place)
         listed = [
             disc.name
             for disc in bench.discs(bench.view(towards(moon), None, T_NS, np.zeros(3), place))
@@ -134,7 +134,7 @@ def test_the_moon_sets_behind_the_earth(bench):
 def test_the_sun_at_the_limb_is_cut_by_it_and_all_stays_finite(bench):
     sun = body_direction(bench, "Sun", np.array([0.0, 0.0, 7000.0]))
     sums = [
-        light(bench, sun, above(sun, np.radians(h), np.array([0.3, 0.2, 1.0]))).sum()
+        light_from(bench, sun, above(sun, np.radians(h), np.array([0.3, 0.2, 1.0]))).sum()
         for h in (-3.0, -0.1, 0.1, 3.0)
     ]
     assert (np.diff(sums) > 0).all()
@@ -145,7 +145,7 @@ def test_the_sun_at_the_limb_is_cut_by_it_and_all_stays_finite(bench):
 def test_from_low_above_the_day_side_the_earth_fills_the_field(bench):
     sun = body_direction(bench, "Sun", np.array([0.0, 0.0, 7000.0]))
     place = (EQUATOR_KM + ALTITUDE_KM) * sun
-    picture = light(bench, -sun, place)
+    picture = light_from(bench, -sun, place)
     assert (picture > bench.flux_at_white_e_per_s).all()
     drawn = bench.draw_sprites(
         bench.light(bench.view(towards(-sun), None, T_NS, np.zeros(3), place))

@@ -39,7 +39,7 @@ from tests.support.exact_scenes import (
 OTHER, OTHER_AMONG_NEIGHBOURS = 0.08, 0.35
 
 
-def target_of(scene, quantisation="exact"):
+def scene_target(scene, quantisation="exact"):
     return Target(
         (SIDE, SIDE),
         GaussianPsf(scene.sigma_px),
@@ -53,7 +53,7 @@ def target_of(scene, quantisation="exact"):
 @pytest.mark.parametrize("name", SCENES)
 def test_no_scene_is_worse_than_rounded_nor_other_than_the_oracle_s(name):
     scene = SCENES[name]()
-    with Renderer(target_of(scene)) as gl:
+    with Renderer(scene_target(scene)) as gl:
         gl.draw(scene.sprites)
         levels = gl.levels().copy()
         assert gl.gl_error() == "GL_NO_ERROR"
@@ -72,7 +72,7 @@ def test_no_scene_is_worse_than_rounded_nor_other_than_the_oracle_s(name):
 @pytest.mark.parametrize("name", STREAKS)
 def test_streaks_are_as_right_where_they_might_fail(name):
     scene = STREAKS[name]()
-    with Renderer(target_of(scene)) as gl:
+    with Renderer(scene_target(scene)) as gl:
         gl.draw(scene.sprites)
         levels = gl.levels().copy()
         assert gl.gl_error() == "GL_NO_ERROR"
@@ -98,7 +98,7 @@ HARDEST = (
 @pytest.mark.parametrize("name", HARDEST)
 def test_over_frames_no_scene_is_near_rounded_and_a_part_of_a_refresh_costs_nothing(name):
     scene, frames = SCENES[name](), []
-    with Renderer(target_of(scene, "temporal")) as gl:
+    with Renderer(scene_target(scene, "temporal")) as gl:
         for number in range(FRAMES):
             gl.draw(scene.sprites, number)
             frames.append(shown_light(gl.levels(), scene.panel))
@@ -109,7 +109,7 @@ def test_over_frames_no_scene_is_near_rounded_and_a_part_of_a_refresh_costs_noth
 @pytest.mark.parametrize("uniformity", [None, uneven()], ids=["even", "uneven"])
 def test_no_stars_are_black_also_after_some(uniformity):
     scene = single(3, srgb_response(8), USUAL, uniformity)
-    with Renderer(target_of(scene)) as gl:
+    with Renderer(scene_target(scene)) as gl:
         for sprites, lit in ((None, False), (scene.sprites, True), (None, False)):
             gl.draw(sprites)
             assert (gl.levels().max() > 0) == lit

@@ -17,7 +17,7 @@ from hilstar.display.response import srgb_response
 from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.extended import GlowLight, LightMap
 from hilstar.optics.psf import GaussianPsf
-from tests.support.stars import sprites_at
+from tests.support.stars import random_sprites, sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
 CORNER, SHAPE = (70, 40), (60, 90)
@@ -34,20 +34,12 @@ GLOW_LENS_LIMIT = 0.01 * 3 / 40
 OTHER = 0.08
 
 
-def camera(lens: Lens | None = None) -> Camera:
+def short_camera(lens: Lens | None = None) -> Camera:
     return Camera(SIZE, 400.0, (127.5, 95.5), np.eye(3), lens)
 
 
-def target_of(method, uniformity=None) -> Target:
+def srgb_target(method, uniformity=None) -> Target:
     return Target(SIZE, GaussianPsf(SIGMA), srgb_response(10), WHITE, method, uniformity)
-
-
-def stars(gl, rng, count=40):
-    return sprites_at(
-        rng.uniform([5, 5], [250, 187], size=(count, 2)),
-        10.0 ** rng.uniform(4, 6, count),
-        gl.footprint_px,
-    )
 
 
 def map_of(rng, low=0.0, high=3e-3) -> LightMap:
@@ -56,11 +48,11 @@ def map_of(rng, low=0.0, high=3e-3) -> LightMap:
 
 @pytest.mark.parametrize("method", ["round", "dither"])
 def test_a_map_is_added_to_the_stars_encoded_whole_and_gone_in_the_next_frame(method, rng):
-    target = target_of(method, rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32))
+    target = srgb_target(method, rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32))
     panel = target.panel()
     oracle = {"round": round_levels, "dither": dither_levels}[method]
     with Renderer(target) as gl:
-        plain, light = stars(gl, rng), map_of(rng)
+        plain, light = random_sprites(40, rng, SIZE, gl.footprint_px, (4, 6), -5), map_of(rng)
         gl.draw(plain, 3)
         alone, alone_levels = gl.linear().copy(), gl.levels().copy()
         gl.draw(replace(plain, extended=(light,)), 3)
@@ -82,7 +74,7 @@ def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng, uneven):
     of `dither`.
     """
     step_e = srgb_response(10).light[1] * WHITE
-    target = target_of(
+    target = srgb_target(
         "exact", rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if uneven else None
     )
     panel = target.panel()
@@ -116,11 +108,24 @@ def test_exact_adds_each_star_in_light_to_the_dithered_floor(rng, uneven):
         assert (gl.levels() == plain).all()
 
 
+def test_a_floor_is_that_of_its_own_light(rng):
+    """Of two lights in turn, `exact` shows each as if it were the first."""
+    target = srgb_target("exact")
+    panel = target.panel()
+    with Renderer(target) as gl:
+        none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
+        elsewhere = replace(map_of(rng, 3e-3, 6e-3), corner_px=(10, 110))
+        for light in (map_of(rng), elsewhere):
+            gl.draw(replace(none, extended=(light,)))
+            # ties alone
+            assert np.mean(gl.levels() != dither_levels(gl.linear(), panel)) < 1e-4
+
+
 def test_temporal_s_floor_is_dithered_with_a_mask_that_turns(rng):
-    target = target_of("temporal")
+    target = srgb_target("temporal")
     panel, light = target.panel(), map_of(rng)
     with Renderer(target) as gl:
-        few = stars(gl, rng)
+        few = random_sprites(40, rng, SIZE, gl.footprint_px, (4, 6), -5)
         none = replace(few, data=few.data[:0], star=few.star[:0], extended=(light,))
         shown = []
         for frame in range(4):
@@ -142,7 +147,7 @@ def test_temporal_s_floor_is_dithered_with_a_mask_that_turns(rng):
 
 @pytest.mark.parametrize("lens", [None, LENS], ids=["pinhole", "lens"])
 def test_a_glow_has_its_profile_about_a_direction_on_and_off_the_image(lens):
-    cam = camera(lens)
+    cam = short_camera(lens)
     x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
     seen = cam.rays(x.ravel().astype(float), y.ravel().astype(float))
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)

@@ -32,7 +32,7 @@ PERIOD_NS = 16_666_667
 SAME = 1e-6  # of the brightest pixel: both add the same float32 shares, in another order
 
 
-def frame_of(bench, number: int) -> ShownFrame:
+def watched_frame(bench, number: int) -> ShownFrame:
     """A frame of the bench at Orion's belt, as a watcher gets it."""
     levels = bench.draw(ORION, number).levels
     lit, rgb = lit_pixels(levels), bench.calibration.response.rgb
@@ -77,7 +77,7 @@ def test_both_trackers_see_the_same_electrons(tmp_path: Path, rng, monkeypatch, 
     campaigns.close()
     with open_bench(file) as bench, LiveTracker(file, rng) as live:
         for number in range(FRAMES + 1):
-            live.take(frame_of(bench, number))
+            live.take(watched_frame(bench, number))
         exposed = live.frames.exposed(0, FRAMES * PERIOD_NS)
         assert exposed is not None
         seen = []
@@ -106,7 +106,7 @@ def test_stars_are_found_on_a_screen_that_glows_over_a_part_of_the_field(tmp_pat
     file = glowing_file(tmp_path)
     with open_bench(file) as bench, LiveTracker(file, rng) as live:
         for number in range(FRAMES + 1):
-            live.take(frame_of(bench, number))
+            live.take(watched_frame(bench, number))
         exposed = live.frames.exposed(0, FRAMES * PERIOD_NS)
         assert exposed is not None
         solved = live.solve(exposed, live.expose(exposed))

@@ -21,7 +21,7 @@ from hilstar.optics.psf import GaussianPsf
 from hilstar.server.bench.config import RenderSettings
 from hilstar.server.bench.effort import Light, plan_effort
 from hilstar.server.replay import OTHER_CODES_BY_NUMPY
-from tests.support.stars import sprites_at
+from tests.support.stars import random_sprites, sprites_at
 
 SIZE = (256, 192)
 PSF = GaussianPsf((0.85, 0.85))
@@ -92,14 +92,6 @@ def rows(tmp_path, monkeypatch):
     monkeypatch.setitem(QUANTISERS, "careless", CarelessQuantiser)
 
 
-def stars(count, rng, footprint_px):
-    return sprites_at(
-        rng.uniform([-5, -5], [260, 197], size=(count, 2)),
-        10.0 ** rng.uniform(0, 7, count),
-        footprint_px,
-    )
-
-
 @pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
 @pytest.mark.parametrize("count", [150, 8000], ids=["under sprites", "whole image"])
 def test_a_new_pixel_quantiser_draws_its_oracle_s_levels_in_each_frame(count, mapped, rng):
@@ -110,7 +102,7 @@ def test_a_new_pixel_quantiser_draws_its_oracle_s_levels_in_each_frame(count, ma
     target = Target(SIZE, PSF, srgb_response(8), WHITE, "ordered", uniformity)
     oracle, sprites, drawn = (
         OrderedQuantiser(target.panel(), SIZE, PSF),
-        stars(count, rng, PSF.footprint_px),
+        random_sprites(count, rng, SIZE, PSF.footprint_px),
         [],
     )
     with Renderer(target) as gl:
@@ -142,7 +134,7 @@ def test_a_new_star_quantiser_draws_its_oracle_s_levels(rng):
 @pytest.mark.parametrize("method", ["ordered", "careless"])
 def test_numpy_draws_and_effort_judges_a_new_quantisation(method, rng):
     target = Target(SIZE, PSF, srgb_response(8), WHITE, method)
-    backend, sprites = NumpyBackend(target), stars(40, rng, PSF.footprint_px)
+    backend, sprites = NumpyBackend(target), random_sprites(40, rng, SIZE, PSF.footprint_px)
     backend.draw(sprites, 1)
     with Renderer(target) as gl:
         gl.draw(sprites, 1)

@@ -18,7 +18,7 @@ from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import bit_stealing_response, gamma_response, srgb_response
 from hilstar.optics.psf import GaussianPsf
-from tests.support.stars import sprites_at
+from tests.support.stars import random_sprites, sprites_at
 
 SIZE = (256, 192)
 SIGMA = (0.85, 0.85)
@@ -40,18 +40,12 @@ RESPONSES = {
 TIE = 4 * np.finfo(np.float32).eps
 
 
-def uneven(rng) -> np.ndarray:
+def uneven_map(rng) -> np.ndarray:
     return rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32)
 
 
 def target_of(response, method, uniformity=None) -> Target:
     return Target(SIZE, GaussianPsf(SIGMA), response, WHITE, method, uniformity)
-
-
-def stars(count, rng, footprint):
-    """`count` stars of eight decades in and about the image."""
-    pixels = rng.uniform([-5, -5], [260, 197], size=(count, 2))
-    return sprites_at(pixels, 10.0 ** rng.uniform(0, 7, count), footprint)
 
 
 def assert_same_but_for_ties(found, expected, linear, panel):
@@ -77,10 +71,10 @@ def test_levels_are_those_of_the_oracle_pixel_for_pixel(response, count, mapped,
     """150 stars take the footprint pass, 8000 the full-screen pass: the levels of one linear
     image are one thing.
     """
-    target = target_of(response, method, uneven(rng) if mapped else None)
+    target = target_of(response, method, uneven_map(rng) if mapped else None)
     panel = target.panel()
     with Renderer(target) as gl:
-        sprites = stars(count, rng, gl.footprint_px)
+        sprites = random_sprites(count, rng, SIZE, gl.footprint_px)
         gl.draw(sprites)
         linear, levels = gl.linear(), gl.levels().copy()
         oracle = {"round": round_levels, "dither": dither_levels}[method](linear, panel)
@@ -151,7 +145,7 @@ def apart(count, rng, footprint):
 @pytest.mark.parametrize("response", RESPONSES.values(), ids=RESPONSES)
 @pytest.mark.parametrize("mapped", [False, True], ids=["even", "uneven"])
 def test_exact_levels_are_those_of_its_quantiser(response, mapped, rng):
-    target = target_of(response, "exact", uneven(rng) if mapped else None)
+    target = target_of(response, "exact", uneven_map(rng) if mapped else None)
     panel = target.panel()
     with Renderer(target) as gl:
         for count in (130, 20):
@@ -241,7 +235,7 @@ def test_temporal_goes_on_while_the_frames_numbers_rise(rng):
     drawings do not.
     """
     with Renderer(target_of(GREY, "temporal")) as gl:
-        sprites = stars(60, rng, gl.footprint_px)
+        sprites = random_sprites(60, rng, SIZE, gl.footprint_px)
 
         def seen(frame):
             gl.draw(sprites, frame)
@@ -273,7 +267,7 @@ def test_without_compute_shaders_exact_is_numpy_s(monkeypatch, rng):
     target = target_of(RESPONSES["srgb8"], "exact")
     with Renderer(target) as gl:
         for count in (300, 20):
-            sprites = stars(count, rng, gl.footprint_px)
+            sprites = random_sprites(count, rng, SIZE, gl.footprint_px)
             gl.draw(sprites)
             assert np.array_equal(
                 gl.levels(),
@@ -287,7 +281,7 @@ def test_exact_and_round_draw_one_sky(rng):
     """
     response = RESPONSES["srgb10"]
     with Renderer(target_of(response, "exact")) as gl:
-        sprites = stars(60, rng, gl.footprint_px)
+        sprites = random_sprites(60, rng, SIZE, gl.footprint_px)
         gl.draw(sprites)
         rounded = round_levels(gl.linear(), Panel(response, WHITE))
         assert np.abs(gl.levels().astype(int) - rounded).max() <= 1
@@ -304,7 +298,7 @@ def on_the_gpu(gl, dtype):
 def test_the_texture_on_the_gpu_holds_the_codes(method, name, rng):
     with Renderer(target_of(RESPONSES[name], method)) as gl:
         for count in (200, 3):
-            gl.draw(stars(count, rng, gl.footprint_px), 5)
+            gl.draw(random_sprites(count, rng, SIZE, gl.footprint_px), 5)
             codes = gl.levels().copy()
             texture = on_the_gpu(gl, codes.dtype).reshape(codes.shape)
             assert np.array_equal(texture, codes)

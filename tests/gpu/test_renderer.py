@@ -46,7 +46,7 @@ def draw(
     return linear, codes, sprites
 
 
-def target_of(resolution=(256, 192), sigma=(0.85, 0.85), bits=8, white=1e6) -> Target:
+def plain_target(resolution=(256, 192), sigma=(0.85, 0.85), bits=8, white=1e6) -> Target:
     return Target(
         resolution, GaussianPsf(sigma), None if bits is None else srgb_response(bits), white
     )
@@ -68,7 +68,7 @@ def test_an_isolated_star_has_its_flux_and_its_centroid_at_every_phase(sigma, bi
     pixels[:, 1] += phases[rows.ravel()]
     flux = 10.0 ** np.linspace(1, 9, 144)
     side = 14 * step
-    linear, _, _ = draw(target_of((side, side), sigma, bits), pixels, flux)
+    linear, _, _ = draw(plain_target((side, side), sigma, bits), pixels, flux)
     off_flux, off_px = [], []
     for (x, y), f in zip(pixels, flux, strict=True):
         left, top = round(x) - step // 2, round(y) - step // 2
@@ -99,7 +99,7 @@ def exact_centroid(x: float, sigma: float) -> float:
 def test_every_pixel_is_that_of_the_oracle(sigma, bits, rng):
     pixels = rng.uniform([-5, -5], [260, 197], size=(60, 2))
     flux = 10.0 ** rng.uniform(2, 6, 60)
-    linear, _, sprites = draw(target_of(sigma=sigma, bits=bits), pixels, flux)
+    linear, _, sprites = draw(plain_target(sigma=sigma, bits=bits), pixels, flux)
     oracle = linear_image(sprites, (256, 192), GaussianPsf(sigma))
     # Where stars overlap, each brings its own error.
     scale = (
@@ -128,7 +128,7 @@ def test_stars_partly_off_the_edge_are_drawn_partly(bits):
         ]
     )
     flux = np.full(len(pixels), 1e6)
-    linear, _, sprites = draw(target_of(bits=bits), pixels, flux)
+    linear, _, sprites = draw(plain_target(bits=bits), pixels, flux)
     oracle = linear_image(sprites, (256, 192), GaussianPsf((0.85, 0.85)))
     assert np.abs(linear - oracle).max() < PIXEL_LIMIT * 1e6
     # A star on the very edge gives half its light, one on the corner a quarter.
@@ -158,7 +158,7 @@ def test_codes_are_those_of_the_oracle_pixel_for_pixel(bits, count, rng):
     """
     pixels = rng.uniform([-5, -5], [260, 197], size=(count, 2))
     flux = 10.0 ** rng.uniform(1, 7, count)
-    target = target_of(bits=bits)
+    target = plain_target(bits=bits)
     linear, codes, _ = draw(target, pixels, flux)
     assert codes.dtype == (np.uint8 if bits <= 8 else np.uint16)
     assert np.array_equal(codes, encode(linear, target.response, target.flux_at_white_e_per_s))
@@ -168,7 +168,7 @@ def test_codes_are_those_of_the_oracle_pixel_for_pixel(bits, count, rng):
 @BOTH_WAYS
 def test_overlapping_stars_add_up(bits, rng):
     pixels = np.full((1000, 2), 100.25) + rng.normal(scale=0.01, size=(1000, 2))
-    linear, _, sprites = draw(target_of(bits=bits), pixels, np.ones(1000))
+    linear, _, sprites = draw(plain_target(bits=bits), pixels, np.ones(1000))
     oracle = linear_image(sprites, (256, 192), GaussianPsf((0.85, 0.85)))
     # 1000 additions round by up to half a step of the running sum each: 1000 x 6e-8 at the very
     # worst.
@@ -180,20 +180,20 @@ def test_overlapping_stars_add_up(bits, rng):
 def test_a_hundred_thousand_stars_are_drawn(bits, rng):
     count = 100_000
     pixels = rng.uniform([20, 20], [1004, 748], size=(count, 2))
-    linear, _, _ = draw(target_of((1024, 768), bits=bits), pixels, np.ones(count))
+    linear, _, _ = draw(plain_target((1024, 768), bits=bits), pixels, np.ones(count))
     assert linear.sum(dtype=np.float64) == pytest.approx(count, rel=BLEND_LIMIT + MAX_CUT)
 
 
 @BOTH_WAYS
 def test_twelve_decades_of_flux_stand_side_by_side(bits):
     pixels = np.array([[50.0, 50.0], [150.0, 100.0]])
-    linear, _, _ = draw(target_of(bits=bits), pixels, np.array([1e12, 1.0]))
+    linear, _, _ = draw(plain_target(bits=bits), pixels, np.array([1e12, 1.0]))
     assert linear[30:70, 30:70].sum(dtype=np.float64) == pytest.approx(1e12, rel=FLUX_LIMIT)
     assert linear[80:120, 130:170].sum(dtype=np.float64) == pytest.approx(1.0, rel=FLUX_LIMIT)
 
 
 def test_nothing_remains_of_the_frame_before(rng):
-    target = target_of()
+    target = plain_target()
     with Renderer(target) as gl:
         many = sprites_at(rng.uniform(0, 190, size=(6000, 2)), np.full(6000, 1e6), gl.footprint_px)
         few = sprites_at(np.array([[30.3, 40.4]]), np.array([1e6]), gl.footprint_px)
@@ -218,7 +218,7 @@ def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
     itself.
     """
     size = (640, 480)
-    with Renderer(target_of(size)) as gl, Renderer(target_of(size)) as fresh:
+    with Renderer(plain_target(size)) as gl, Renderer(plain_target(size)) as fresh:
         for count in (3, 40, 2, 9000, 1, 300, 9000, 0, 40, 300, 2, 0, 3):
             sprites = sprites_at(
                 rng.uniform([0, 0], size, size=(count, 2)), np.full(count, 1e6), gl.footprint_px
@@ -238,7 +238,7 @@ def test_frames_of_any_number_of_stars_follow_each_other(read, rng):
 
 def test_two_renderers_live_side_by_side():
     pixels = np.array([[30.3, 40.4]])
-    with Renderer(target_of()) as a, Renderer(target_of((64, 64), bits=12)) as b:
+    with Renderer(plain_target()) as a, Renderer(plain_target((64, 64), bits=12)) as b:
         for _ in range(3):
             a.draw(sprites_at(pixels, np.array([1e6]), a.footprint_px))
             b.draw(sprites_at(pixels, np.array([2e6]), b.footprint_px))
@@ -250,15 +250,15 @@ def test_two_renderers_live_side_by_side():
 
 def test_a_sprite_larger_than_the_driver_s_points_is_refused():
     with pytest.raises(InputError, match="sprite_sigma_px"):
-        Renderer(target_of(sigma=(400.0, 400.0)))
+        Renderer(plain_target(sigma=(400.0, 400.0)))
 
 
 def test_a_monitor_larger_than_the_driver_s_textures_is_refused():
     with pytest.raises(InputError, match="resolution_px"):
-        Renderer(target_of((32768, 64)))
+        Renderer(plain_target((32768, 64)))
 
 
 def test_a_machine_without_egl_is_told_what_to_install(monkeypatch):
     monkeypatch.setattr(context_module, "EGL_LIBRARY", "libEGL.so.none")
     with pytest.raises(MachineError, match="apt-get install libegl1 libgl1-mesa-dri"):
-        Renderer(target_of())
+        Renderer(plain_target())

@@ -13,8 +13,9 @@ from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
 from hilstar.optics.psf import SampledPsf
+from hilstar.optics.sprites import FrameLight
 from tests.support.psfs import airy, coma, sampled
-from tests.support.stars import sprites_at
+from tests.support.stars import random_sprites
 
 SIZE = (160, 120)
 # float32 of a table's interpolation, in a pixel where a few stars meet, over the brightest star's
@@ -23,20 +24,16 @@ PIXEL_LIMIT = 6e-7
 COMA, AIRY = SampledPsf(sampled(coma(), 5, 7), 5), SampledPsf(sampled(airy(1.5), 4, 12), 4)
 
 
-def stars(psf: SampledPsf, seed: int = 3, count: int = 60):
-    rng = np.random.default_rng(seed)
-    return sprites_at(
-        rng.uniform([-8, -8], np.add(SIZE, 8), (count, 2)),
-        10 ** rng.uniform(3, 6.5, count),
-        psf.footprint_px,
-    )
+def sixty_stars(psf: SampledPsf) -> FrameLight:
+    rng = np.random.default_rng(3)
+    return random_sprites(60, rng, SIZE, psf.footprint_px, (3, 6.5), 8)
 
 
 @pytest.mark.parametrize("psf", [COMA, AIRY], ids=["coma", "airy"])
 @pytest.mark.parametrize("method", [None, "round", "dither", "exact", "temporal"])
 def test_both_backends_draw_the_same_light_and_the_same_levels(psf, method):
     target = Target(SIZE, psf, None if method is None else srgb_response(8), 1e6, method or "round")
-    oracle, sprites = NumpyBackend(target), stars(psf)
+    oracle, sprites = NumpyBackend(target), sixty_stars(psf)
     with Renderer(target) as gl:
         for frame in range(2):
             gl.draw(sprites, frame)
@@ -59,10 +56,10 @@ def test_renderers_of_one_context_keep_their_own_tables(bits):
     response = None if bits is None else srgb_response(bits)
     with Renderer(Target(SIZE, COMA, response, 1e6)) as first:
         other = Renderer(Target(SIZE, AIRY, response, 1e6), first.context)
-        first.draw(stars(COMA))
+        first.draw(sixty_stars(COMA))
         alone = first.linear().copy()
         first.draw(None)
-        other.draw(stars(AIRY))
+        other.draw(sixty_stars(AIRY))
         other.linear()
-        first.draw(stars(COMA))
+        first.draw(sixty_stars(COMA))
         assert np.array_equal(first.linear(), alone)

@@ -16,9 +16,10 @@ from hilstar.display.render.target import SpriteSide, Target
 from hilstar.display.response import gamma_response, srgb_response
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf, pixel_shares
-from tests.support.stars import sprites_at
+from tests.support.stars import random_sprites, sprites_at
 
 SIZE, SIGMA, WHITE = (256, 192), (0.85, 0.85), 1e6
+FOOTPRINT = GaussianPsf(SIGMA).footprint_px
 PANELS = {
     "srgb6": srgb_response(6),
     "srgb8": srgb_response(8),
@@ -29,11 +30,6 @@ PANELS = {
 # at most.
 FLOAT32 = 1e-6
 CUT = 1e-4  # of a star: what lies past a sprite two pixels smaller
-
-
-def stars(count, rng, size=SIZE, decades=(1, 6)):
-    pixels = rng.uniform([-5, -5], [size[0] + 5, size[1] + 5], size=(count, 2))
-    return sprites_at(pixels, 10.0 ** rng.uniform(*decades, count), GaussianPsf(SIGMA).footprint_px)
 
 
 def covering(sprites, size):
@@ -51,7 +47,7 @@ def test_levels_are_those_of_the_light_but_for_what_lies_beyond_reach(name, unev
     response = PANELS[name]
     map_ = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if uneven else None
     with Renderer(Target(SIZE, GaussianPsf(SIGMA), response, WHITE, uniformity=map_)) as gl:
-        sprites = stars(count, rng)
+        sprites = random_sprites(count, rng, SIZE, FOOTPRINT, (1, 6))
         gl.draw(sprites)
         found, whole, panel = gl.levels().copy(), gl.linear().astype(np.float64), gl.target.panel()
         assert gl.gl_error() == "GL_NO_ERROR"
@@ -69,7 +65,7 @@ def test_levels_are_those_of_the_light_but_for_what_lies_beyond_reach(name, unev
 
 def test_the_order_of_stars_changes_nothing(rng):
     with Renderer(Target(SIZE, GaussianPsf(SIGMA), PANELS["srgb10"], WHITE)) as gl:
-        sprites = stars(3000, rng)
+        sprites = random_sprites(3000, rng, SIZE, FOOTPRINT, (1, 6))
         gl.draw(sprites)
         first = gl.levels().copy()
         for _ in range(3):
@@ -92,9 +88,9 @@ def test_where_units_are_too_coarse_the_light_is_as_fine(rng):
     """A panel of 16 bits, and on 8 bits so many stars of white that a unit would be much of a
     step: points are blended as they are, and on the CPU sums are of finer units.
     """
-    bright = stars(20_000, rng, decades=(6, 7))
+    bright = random_sprites(20_000, rng, SIZE, FOOTPRINT, (6, 7))
     for response, sprites in (
-        (srgb_response(16), stars(300, rng, decades=(5, 7))),
+        (srgb_response(16), random_sprites(300, rng, SIZE, FOOTPRINT, (5, 7))),
         (gamma_response(8, 3.0), bright),
     ):
         target = Target(SIZE, GaussianPsf(SIGMA), response, WHITE)
@@ -118,7 +114,11 @@ def test_frames_of_all_kinds_follow_each_other(quantisation, rng):
     """
     target = Target(SIZE, GaussianPsf(SIGMA), gamma_response(8), WHITE, quantisation)
     glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
-    few, many, bright = stars(9, rng), stars(600, rng), stars(20_000, rng, decades=(6, 7))
+    few, many, bright = (
+        random_sprites(9, rng, SIZE, FOOTPRINT, (1, 6)),
+        random_sprites(600, rng, SIZE, FOOTPRINT, (1, 6)),
+        random_sprites(20_000, rng, SIZE, FOOTPRINT, (6, 7)),
+    )
     lit = replace(few, extended=(glow,))
     frames = [
         few,
@@ -183,7 +183,7 @@ def test_smaller_sprites_leave_out_no_more_than_they_say(rng):
         Renderer(Target(SIZE, GaussianPsf(SIGMA), response, WHITE, sides=sides)) as gl,
         Renderer(Target(SIZE, GaussianPsf(SIGMA), response, WHITE)) as all_,
     ):
-        sprites = stars(400, rng)
+        sprites = random_sprites(400, rng, SIZE, FOOTPRINT, (1, 6))
         gl.draw(sprites)
         all_.draw(sprites)
         found, whole, panel = (
@@ -220,7 +220,7 @@ def test_the_texture_that_a_window_shows_has_the_levels_in_memory(quantisation, 
         Target(size, GaussianPsf(SIGMA), PANELS["srgb8"], WHITE, quantisation=quantisation)
     ) as gl:
         for count in (40, 400, 30):
-            gl.draw(stars(count, rng, size, (4, 6)))
+            gl.draw(random_sprites(count, rng, size, FOOTPRINT, (4, 6)))
             levels, texture = gl.levels().copy(), gl.codes_texture
             with gl.context:
                 shown = np.frombuffer(texture.read(alignment=1), dtype=np.uint8).reshape(size[::-1])

@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,9 @@ from hilstar.basics.notices import Notices
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import Quantisation
 from hilstar.display.quantisers import QUANTISERS
-from hilstar.display.render.renderer import Renderer
+from hilstar.display.render.backend import Backend
+from hilstar.display.render.context import create_context
+from hilstar.display.render.numpy_backend import open_backend
 from hilstar.display.render.target import SpriteSide, Target
 from hilstar.display.render.way import WAY_VARIABLE
 from hilstar.display.response import gamma_response, srgb_response
@@ -34,7 +37,7 @@ USUAL = (0.85, 0.85)
 SRGB8 = srgb_response(8)
 
 
-def stars(count: int, sigma_px, rng, per_star: int = 1) -> FrameLight:
+def stars_or_paths(count: int, sigma_px, rng, per_star: int = 1) -> FrameLight:
     """Stars all over the image and its edges, many faint ones and few that clip, or paths of
     `per_star` sprites.
     """
@@ -49,13 +52,17 @@ def stars(count: int, sigma_px, rng, per_star: int = 1) -> FrameLight:
     return replace(packed, per_star=per_star)
 
 
-def drawn(target: Target, frames: list[FrameLight]) -> list[np.ndarray]:
-    with Renderer(target) as gl:
+def opened(target: Target) -> closing[Backend]:
+    return closing(open_backend(target, create_context()))
+
+
+def drawn_frames(target: Target, frames: list[FrameLight]) -> list[np.ndarray]:
+    with opened(target) as gl:
         found = []
         for number, sprites in enumerate(frames):
             gl.draw(sprites, number)
             found.append(gl.levels().copy())
-        assert gl.gl_error() == "GL_NO_ERROR"
+        assert gl.fault() == ""
     return found
 
 
@@ -64,17 +71,17 @@ def both_ways(
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The codes of frames on the CPU, and by points."""
     monkeypatch.setenv(WAY_VARIABLE, "cpu")
-    with Renderer(target) as gl:
+    with opened(target) as gl:
         if not gl.path.startswith("CPU"):
             pytest.skip(f"{gl.gl_renderer}, OpenGL {gl.gl_version}, shares no memory for `exact`")
-    on_cpu = drawn(target, frames)
+    on_cpu = drawn_frames(target, frames)
     monkeypatch.setenv(WAY_VARIABLE, "gl")
-    with Renderer(target) as gl:
+    with opened(target) as gl:
         assert gl.path.startswith("points")
-    return on_cpu, drawn(target, frames)
+    return on_cpu, drawn_frames(target, frames)
 
 
-def assert_same(
+def assert_same_codes(
     quantisation: Quantisation, on_cpu: list[np.ndarray], by_points: list[np.ndarray]
 ) -> None:
     """Both add the same whole units, whose last bits a driver's exp2 decides: of few pixels is the
@@ -115,8 +122,8 @@ def shrunk(sigma_px) -> tuple[SpriteSide, ...]:
 def test_both_ways_choose_the_same_codes(
     quantisation, response, sigma_px, count, per_star, rng, monkeypatch
 ):
-    frames = [stars(count, sigma_px, rng, per_star) for _ in range(FRAMES)]
-    assert_same(
+    frames = [stars_or_paths(count, sigma_px, rng, per_star) for _ in range(FRAMES)]
+    assert_same_codes(
         quantisation,
         *both_ways(
             Target(SIZE, GaussianPsf(sigma_px), response, WHITE, quantisation), frames, monkeypatch
@@ -131,11 +138,11 @@ def test_so_they_do_of_three_primaries_beside_each_other(quantisation, rng, monk
     places_px = np.array([(-0.3, 0), (0, 0.2), (0.3, 0)])
     target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE, quantisation, primaries=panels)
     target = replace(target, places_px=places_px, together=0.4 + 0.6 * np.eye(3))
-    frames = [stars(count, USUAL, rng) for count in (30, 300)]
+    frames = [stars_or_paths(count, USUAL, rng) for count in (30, 300)]
     for k, one in enumerate(frames):
         light = one.data["electrons_per_s"][:, None] * rng.dirichlet([1, 1, 1], len(one))
         frames[k] = replace(one, primaries=light.astype(np.float32))
-    assert_same(quantisation, *both_ways(target, frames, monkeypatch))
+    assert_same_codes(quantisation, *both_ways(target, frames, monkeypatch))
 
 
 @pytest.mark.parametrize("quantisation", ["round", "exact"])
@@ -146,9 +153,9 @@ def test_so_they_do_on_an_uneven_panel_and_with_smaller_sprites(
     uneven = rng.uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32) if changed == "uneven" else None
     sides = shrunk(USUAL) if changed == "smaller sprites" else ()
     target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE, quantisation, uneven, sides)
-    assert_same(
+    assert_same_codes(
         quantisation,
-        *both_ways(target, [stars(300, USUAL, rng) for _ in range(FRAMES)], monkeypatch),
+        *both_ways(target, [stars_or_paths(300, USUAL, rng) for _ in range(FRAMES)], monkeypatch),
     )
 
 
@@ -157,10 +164,10 @@ def test_so_they_do_where_light_beside_stars_comes_and_goes(rng, monkeypatch):
     one's own.
     """
     glow = LightMap(np.full((40, 50), 3e4, dtype=np.float32), (30, 20))
-    frames = [stars(count, USUAL, rng) for count in (200, 300, 20, 0, 200)]
+    frames = [stars_or_paths(count, USUAL, rng) for count in (200, 300, 20, 0, 200)]
     frames[1] = replace(frames[1], extended=(glow,))
     target = Target(SIZE, GaussianPsf(USUAL), SRGB8, WHITE)
-    assert_same("round", *both_ways(target, frames, monkeypatch))
+    assert_same_codes("round", *both_ways(target, frames, monkeypatch))
 
 
 @pytest.mark.parametrize("smaller", [False, True], ids=["whole", "smaller sprites"])
@@ -169,18 +176,18 @@ def test_no_frame_of_temporal_leaves_a_pixel_behind(sigma_px, smaller, rng):
     """`temporal` chooses among all near pixels, some of which lie a little beyond its reach:
     they are erased too.
     """
-    frames = [stars(600, sigma_px, rng) for _ in range(12)]
+    frames = [stars_or_paths(600, sigma_px, rng) for _ in range(12)]
     side = GaussianPsf(sigma_px).footprint_px
     sides = (SpriteSide(3e38, 2 + side % 2),) if smaller else ()
     target = Target(SIZE, GaussianPsf(sigma_px), SRGB8, WHITE, "temporal", sides=sides)
-    for codes, sprites in zip(drawn(target, frames), frames, strict=True):
+    for codes, sprites in zip(drawn_frames(target, frames), frames, strict=True):
         under = np.zeros(SIZE[::-1], dtype=bool)
         for x, y in sprites.data["pixel"] - (side - 1) // 2:
             under[max(y, 0) : max(y + side, 0), max(x, 0) : max(x + side, 0)] = True
         assert not codes[~under].any()
 
 
-def replayed(path, log, ledger=None) -> tuple[dict[int, np.ndarray], list[str], DrawnBy]:
+def replayed_codes(path, log, ledger=None) -> tuple[dict[int, np.ndarray], list[str], DrawnBy]:
     """The codes of each frame of a replay, what was told of another renderer, and who drew it."""
     codes, told = {}, []
 
@@ -213,15 +220,15 @@ def test_a_run_of_another_path_is_said_to_be_one_and_its_codes_are_within_what_i
     path.write_text(bench_text({"render": {"quantisation": quantisation}}))
     turn = [(k / 10, math.cos(0.01 * k), math.sin(0.01 * k)) for k in range(6)]
     log.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{t},{w},{x},0,0\n" for t, w, x in turn))
-    first, told, before = replayed(path, log, ledger)
+    first, told, before = replayed_codes(path, log, ledger)
     assert not told
-    again, told, _ = replayed(path, ledger)
+    again, told, _ = replayed_codes(path, ledger)
     assert not told
     assert all(np.array_equal(first[number], again[number]) for number in first)
     if not before.path.startswith("CPU"):
         pytest.skip(f"{before} draws one way only")
     monkeypatch.setenv(WAY_VARIABLE, "gl")
-    by_points, told, now = replayed(path, ledger)
+    by_points, told, now = replayed_codes(path, ledger)
     assert len(told) == 1 and str(before) in told[0] and str(now) in told[0]
     assert before.other_codes(now, quantisation) == QUANTISERS[quantisation].other_codes
     for number, codes in first.items():

@@ -71,7 +71,7 @@ from dataclasses import replace
 from hilstar.display.quantise import Panel
 from hilstar.display.response import srgb_response
 from hilstar.display.render.backend import Target
-from hilstar.display.render.numpy_backend import NumpyBackend, headless_context, open_backend
+from hilstar.display.render.numpy_backend import headless_context, open_backend
 from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import sprites_at
 rng, psf, grey = np.random.default_rng(36), GaussianPsf((0.85, 0.85)), srgb_response(8)
@@ -85,7 +85,7 @@ stripes, together = np.array([(-1 / 3, 0), (0, 0), (1 / 3, 0)]), 0.4 + 0.6 * np.
 found, context = {}, headless_context()
 for codes in ("round", "dither", "exact"):
     target = Target((320, 240), psf, grey, 1e4, codes, primaries=panels, places_px=stripes, together=together)
-    each = [open_backend(target, context), NumpyBackend(target)]
+    each = [open_backend(target, context), open_backend(target, None)]
     for one in each:
         one.draw(sprites)
     drawn, oracle = (one.levels().astype(int) for one in each)

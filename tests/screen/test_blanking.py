@@ -37,7 +37,7 @@ def server(tmp_path_factory) -> Iterator[Xorg]:
 def blanking(server):
     for words in (("s", "600", "300"), ("s", "blank")):
         xset(server, *words)
-    assert seen(server) == BEFORE
+    assert blanking_of(server) == BEFORE
 
 
 def xset(server: Xorg, *words: str) -> str:
@@ -52,7 +52,7 @@ def xset(server: Xorg, *words: str) -> str:
     return done.stdout
 
 
-def seen(server: Xorg) -> tuple[str, ...]:
+def blanking_of(server: Xorg) -> tuple[str, ...]:
     """Timeout, cycle, and whether blanking is preferred, as xset tells them."""
     text = xset(server, "q")
     patterns = (r"timeout:\s+(\d+)", r"cycle:\s+(\d+)", r"blanking:\s+(\w+)")
@@ -61,12 +61,12 @@ def seen(server: Xorg) -> tuple[str, ...]:
 
 
 def awake(server: Xorg) -> bool:
-    timeout, _, prefers = seen(server)
+    timeout, _, prefers = blanking_of(server)
     return (timeout, prefers) == AWAKE
 
 
 @contextmanager
-def shown(
+def shown_frames_of(
     server: Xorg, folder: Path, name: str = "bench", *options: str
 ) -> Iterator[subprocess.Popen[bytes]]:
     folder.mkdir(exist_ok=True)
@@ -97,44 +97,44 @@ def shown(
     [(signal.SIGINT, ()), (signal.SIGTERM, ("--windowed",)), (signal.SIGKILL, ("--windowed",))],
 )
 def test_nothing_blanks_during_a_run_and_all_is_as_before_after_it(server, tmp_path, sign, options):
-    with shown(server, tmp_path, "bench", *options) as process:
+    with shown_frames_of(server, tmp_path, "bench", *options) as process:
         wait_for(lambda: awake(server) or process.poll() is not None)
         assert process.poll() is None, (tmp_path / "bench.txt").read_text()
         process.send_signal(sign)
         process.wait(PATIENCE_S)
         if sign != signal.SIGKILL:
-            assert seen(server) == BEFORE  # before the command has ended
-    wait_for(lambda: seen(server) == BEFORE, "after a kill, within moments")
+            assert blanking_of(server) == BEFORE  # before the command has ended
+    wait_for(lambda: blanking_of(server) == BEFORE, "after a kill, within moments")
 
 
 def test_a_kill_of_all_its_processes_restores_too(server, tmp_path):
-    with shown(server, tmp_path) as process:
+    with shown_frames_of(server, tmp_path) as process:
         wait_for(lambda: awake(server) or process.poll() is not None)
         os.killpg(process.pid, signal.SIGKILL)
         process.wait(PATIENCE_S)
-    wait_for(lambda: seen(server) == BEFORE)
+    wait_for(lambda: blanking_of(server) == BEFORE)
 
 
 def test_two_runs_on_one_server_keep_it_awake_until_the_last_ends(server, tmp_path):
-    with shown(server, tmp_path / "one", "one", "--windowed") as one:
+    with shown_frames_of(server, tmp_path / "one", "one", "--windowed") as one:
         wait_for(lambda: awake(server))
-        with shown(server, tmp_path / "two", "two", "--windowed") as two:
+        with shown_frames_of(server, tmp_path / "two", "two", "--windowed") as two:
             wait_for(lambda: "Hz" in (tmp_path / "two" / "two.txt").read_text())
             one.send_signal(signal.SIGINT)
             one.wait(PATIENCE_S)
             wait_for(lambda: awake(server))
             two.send_signal(signal.SIGKILL)
-    wait_for(lambda: seen(server) == BEFORE)
+    wait_for(lambda: blanking_of(server) == BEFORE)
 
 
 def test_what_somebody_sets_meanwhile_is_prevented_and_comes_after(server, tmp_path):
-    with shown(server, tmp_path) as process:
+    with shown_frames_of(server, tmp_path) as process:
         wait_for(lambda: awake(server) or process.poll() is not None)
         xset(server, "s", "120", "300")
         wait_for(lambda: awake(server) or process.poll() is not None)
         process.send_signal(signal.SIGINT)
         process.wait(PATIENCE_S)
-    assert seen(server)[0] == "120"
+    assert blanking_of(server)[0] == "120"
 
 
 class StandIn:
@@ -191,8 +191,8 @@ def test_standby_is_ended_prevented_and_restored(monkeypatch):
 def test_a_virtual_server_is_kept_awake_too(tmp_path):
     with xvfb(tmp_path, "640x480x24") as screen:
         xset(screen, "s", "600", "300")
-        with shown(screen, tmp_path) as process:
-            wait_for(lambda: seen(screen)[0] == "0")
+        with shown_frames_of(screen, tmp_path) as process:
+            wait_for(lambda: blanking_of(screen)[0] == "0")
             process.send_signal(signal.SIGINT)
             process.wait(PATIENCE_S)
-        assert seen(screen)[0] == "600"
+        assert blanking_of(screen)[0] == "600"

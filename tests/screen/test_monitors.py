@@ -60,7 +60,7 @@ def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Pope
         env=server.env,
     ) as process:
         try:
-            wait_for(lambda: frames(path) > 10 or process.poll() is not None)
+            wait_for(lambda: frame_count(path) > 10 or process.poll() is not None)
             yield process
         finally:
             if process.poll() is None:
@@ -71,7 +71,7 @@ def showing(server: Xorg, path: Path, *options: str) -> Iterator[subprocess.Pope
                     process.kill()
 
 
-def frames(path: Path) -> int:
+def frame_count(path: Path) -> int:
     return len(recorded(path.parent / "run.mcap"))
 
 
@@ -117,7 +117,7 @@ def test_the_monitor_that_is_named_is_the_one_that_is_filled(server, tmp_path):
         )
         with showing(server, path):
             pass
-        assert frames(path) > 10
+        assert frame_count(path) > 10
         warned = run_hilstar(
             "replay", path, tmp_path / "still.csv", "--force", "--stop", "0.2", env=server.env
         )
@@ -175,11 +175,11 @@ def test_a_display_that_is_unplugged_and_returns_is_filled_again(server, tmp_pat
         server.xrandr("--output", "DUMMY1", "--gamma", OTHER_GAMMA)
         with showing(server, path) as process:
             server.xrandr("--output", "DUMMY1", "--off")
-            gone = frames(path)
-            wait_for(lambda: frames(path) > gone + 30)
+            gone = frame_count(path)
+            wait_for(lambda: frame_count(path) > gone + 30)
             server.xrandr("--output", "DUMMY1", "--mode", "640x480", "--right-of", "DUMMY0")
-            back = frames(path)
-            wait_for(lambda: frames(path) > back + 30)
+            back = frame_count(path)
+            wait_for(lambda: frame_count(path) > back + 30)
             wait_for(lambda: server.gamma("DUMMY1") == (1.0, 1.0, 1.0))
             assert process.poll() is None
             process.terminate()

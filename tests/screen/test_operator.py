@@ -11,31 +11,26 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import zmq
 
-from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.attitude.wire.protocol import (
     HEALTH_BLANK,
     HEALTH_HIDDEN,
     HEALTH_NO_ATTITUDE,
     HEALTH_OPERATOR_OVERRIDE,
 )
-from hilstar.server.record.ledger_records import EventRecord, FrameRecord, frame_records
+from hilstar.server.record.ledger_records import FrameRecord, frame_records
 from tests.support.benches import ORION_Q, SCREEN_BENCH
 from tests.support.forks import HILSTAR, Started
+from tests.support.ledgers import read_events
 from tests.support.senders import connected, free_port, packet
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.events import Client, client
 from tests.support.x11.screens import Screen, Shown, codes_of, lines_over, recorded
 
 MS = 1_000_000
-
-
-def events(ledger: Path) -> list[EventRecord]:
-    return [msgspec.json.decode(data, type=EventRecord) for data in read_messages(ledger, "/event")]
 
 
 def last_frame(ledger: Path) -> FrameRecord | None:
@@ -76,7 +71,7 @@ def test_each_key_is_in_the_frames_and_the_events_and_a_hidden_sky_is_none(scree
             )
             assert (frame.stars_drawn > 0) == has_sky
         summary = shown.stop()
-    told = [event.detail for event in events(ledger) if event.kind == "operator"]
+    told = [event.detail for event in read_events(ledger) if event.kind == "operator"]
     assert len(told) == len(steps) == summary["events"]["operator"]
     for detail, (_, operator, _) in zip(told, steps, strict=True):
         assert (operator or "the sky of the attitude again") in detail

@@ -134,7 +134,7 @@ def test_the_window_s_close_button_ends_the_run_in_order(screen, bench_file):
     assert len(list(frame_records(ledger))) == summary["frames"]
 
 
-def refused(
+def refused_run(
     screen: Screen, bench_file: Path, *options: str, display: str | None = None
 ) -> tuple[int, str]:
     env = screen.env if display is None else screen.env | {"DISPLAY": display}
@@ -145,17 +145,17 @@ def refused(
 
 def test_the_gate_refuses_a_display_of_another_size_and_force_is_logged(screen, bench_file):
     bench_file.write_text(SCREEN_BENCH.replace("[640, 480]", "[800, 600]"))
-    code, said = refused(screen, bench_file)
+    code, said = refused_run(screen, bench_file)
     assert code == 3
     assert "640 x 480" in said and "800 x 600" in said and "--force" in said
-    code, said = refused(screen, bench_file, "--force", "--stop", "0.2")
+    code, said = refused_run(screen, bench_file, "--force", "--stop", "0.2")
     assert code == 0
     assert "--force" in said
 
 
 def test_the_gate_refuses_8_bits_where_10_are_asked_for(screen, bench_file):
     bench_file.write_text(SCREEN_BENCH.replace("[collimator]", "bits = 10\n[collimator]"))
-    code, said = refused(screen, bench_file)
+    code, said = refused_run(screen, bench_file)
     assert code == 3
     assert "8 bits" in said and "10" in said
 
@@ -163,18 +163,18 @@ def test_the_gate_refuses_8_bits_where_10_are_asked_for(screen, bench_file):
 def test_without_a_refresh_of_its_own_the_display_is_paced_by_software_and_that_is_said(
     screen, bench_file
 ):
-    code, said = refused(screen, bench_file, "--stop", "0.3")
+    code, said = refused_run(screen, bench_file, "--stop", "0.3")
     assert code == 0
     assert "paced by software" in said
 
 
 def test_a_display_that_is_not_there_gets_one_line(screen, bench_file):
     bench_file.write_text(SCREEN_BENCH.replace("[collimator]", 'display = "DELL"\n[collimator]'))
-    code, said = refused(screen, bench_file)
+    code, said = refused_run(screen, bench_file)
     assert code == 3
     assert "DELL" in said and "640 x 480" in said
     bench_file.write_text(SCREEN_BENCH)
-    code, said = refused(screen, bench_file, display=":99999")
+    code, said = refused_run(screen, bench_file, display=":99999")
     assert code == 3
     assert "--headless" in said
 
@@ -270,9 +270,9 @@ def test_the_gate_reads_the_depth_and_every_code_of_what_is_drawn_on(tmp_path, d
     bench_file.write_text(SCREEN_BENCH.replace("[collimator]", f"bits = {bits}\n[collimator]"))
     still_log(tmp_path / "still.csv")
     with xvfb(tmp_path, f"640x480x{depth}") as screen:
-        code, said = refused(screen, bench_file, "--stop", "0.2")
+        code, said = refused_run(screen, bench_file, "--stop", "0.2")
         assert code == 3, said
-        _, forced = refused(screen, bench_file, "--force", "--stop", "0.2")
+        _, forced = refused_run(screen, bench_file, "--force", "--stop", "0.2")
     for word in words:
         assert word in forced
     assert ("codes are not drawn" in forced) == ((depth, bits) == (24, 10)), forced

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics import charts
-from hilstar.instruments.study.row_charts import (
+from hilstar.instruments.study.engine import (
     HIDDEN,
     ChartSpec,
     CurvePanel,

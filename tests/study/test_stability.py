@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
-from hilstar.instruments.study.stability import FailureCase, Figures, image, recorded
+from hilstar.instruments.study.stability import CaseFigures, FailureCase, image, recorded
 from hilstar.instruments.study.stability import run as stability
 from tests.support.commands import run_hilstar_here
 from tests.support.pictures import assert_drawn, table
@@ -83,7 +83,7 @@ def test_the_table_has_every_case_and_the_curves_have_charts(study):
 
 
 def test_what_is_no_number_is_not_right():
-    assert not FailureCase("c", "m", "f", "h", "w", Figures(math.nan, math.nan, 1.0)).right
+    assert not FailureCase("c", "m", "f", "h", "w", CaseFigures(math.nan, math.nan, 1.0)).right
 
 
 def rendered_by(method):

@@ -20,8 +20,8 @@ from hilstar.instruments.study import predictors
 from hilstar.instruments.study.chain import answers, choices, measuring, run
 from hilstar.instruments.study.chain import glass as chain_glass
 from hilstar.instruments.study.chain.choices import (
+    ChainCombination,
     ChainScene,
-    Combination,
     Parts,
     five_scenes,
     lead_ns,
@@ -249,7 +249,7 @@ def test_a_held_attitude_is_late_by_its_age_its_row_and_half_a_frame(parts, monk
     expected = np.sqrt(
         np.mean((3600 * late_s * np.linalg.norm(np.cross(true, predictors.AXIS), axis=1)) ** 2)
     )
-    held = Combination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
+    held = ChainCombination("exact", False, parts[0].faintest_v_mag, "full", "point", "held")
     assert scene.error(held).error_arcsec == pytest.approx(expected, rel=LATE_SHARE)
 
 
@@ -269,7 +269,7 @@ def test_a_star_that_runs_with_the_scan_loses_no_light(parts, monkeypatch):
 def test_a_star_that_is_lost_is_no_nearer_than_one_that_is_found_late(parts):
     scene, bench = scene_of(parts, 4), parts[0]
     (judge,) = scene.judges
-    held = Combination("exact", False, bench.faintest_v_mag, "full", "point", "held")
+    held = ChainCombination("exact", False, bench.faintest_v_mag, "full", "point", "held")
     image_e = scene.tracker.image_e(scene.chain(held).exposed(judge.seen), judge.seen)
     late = off(judge, judge.measure(image_e), judge.sky)
     dark = off(judge, judge.measure(np.zeros_like(image_e)), judge.sky)
@@ -292,7 +292,7 @@ def test_a_long_exposure_is_said_to_be_measured_in_part(study, tmp_path):
     assert {row["exposure_s"] for row in table(out / "chain.csv")} == {"0.1"}
 
 
-def planted(**figures) -> CombinationRow:
+def combination_row(**figures) -> CombinationRow:
     known = {field.name: 1.0 for field in fields(CombinationRow)}
     words = {
         "scene": "s",
@@ -314,9 +314,13 @@ def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, pla
     beside it auto.
     """
     time_ms, error = sorted((1.0, 9.0))[place[0]], sorted((0.1, 900.0))[place[1]]
-    rows = [planted(time_ms=t, error_arcsec=e) for t in (1.0, 3.0, 9.0) for e in (0.1, 10.0, 900.0)]
+    rows = [
+        combination_row(time_ms=t, error_arcsec=e)
+        for t in (1.0, 3.0, 9.0)
+        for e in (0.1, 10.0, 900.0)
+    ]
     rows += [
-        planted(time_ms=time_ms * k, error_arcsec=error, chosen=name)
+        combination_row(time_ms=time_ms * k, error_arcsec=error, chosen=name)
         for name, k in (("default", 1), ("auto", 1.01))
     ]
     kept = []
@@ -335,7 +339,7 @@ def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, pla
 
 def test_a_busy_machine_has_no_front(monkeypatch, tmp_path):
     rows = [
-        run.without_fronts(planted(time_ms=t, error_arcsec=10 / t, chosen=name))
+        run.without_fronts(combination_row(time_ms=t, error_arcsec=10 / t, chosen=name))
         for t, name in ((1.0, "auto"), (3.0, ""))
     ]
     assert {(row.on_front, row.on_front_mag, row.on_front_as_filed) for row in rows} == {
@@ -357,7 +361,7 @@ def test_scenes_that_are_alike_are_drawn_once():
         "1 deg/s": (1.0, 0.25),
     }
     rows = [
-        planted(scene=name, rate_deg_s=rate, error_arcsec=error, chosen="auto")
+        combination_row(scene=name, rate_deg_s=rate, error_arcsec=error, chosen="auto")
         for name, (rate, error) in rates.items()
     ]
     assert run.differing(rows) == {
@@ -369,7 +373,7 @@ def test_scenes_that_are_alike_are_drawn_once():
 
 def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():
     spots = [(1.0, 3.0), (2.0, 2.0), (2.0, 2.0), (2.0, 2.5), (3.0, 1.0), (3.5, 1.0)]
-    assert front([planted(time_ms=t, error_mag=e) for t, e in spots], "error_mag") == [
+    assert front([combination_row(time_ms=t, error_mag=e) for t, e in spots], "error_mag") == [
         True,
         True,
         True,
@@ -379,7 +383,7 @@ def test_a_point_is_beaten_by_one_that_is_no_worse_and_no_slower():
     ]
 
     def beaters(which, *points):
-        rows = [planted(time_ms=t, error_arcsec=e, noise_ms=n) for t, e, n in points]
+        rows = [combination_row(time_ms=t, error_arcsec=e, noise_ms=n) for t, e, n in points]
         rows[which] = replace(rows[which], chosen="auto")
         return tuple([rows.index(row) for row in found] for found in beating(rows))
 
@@ -467,7 +471,7 @@ def answered(given: answers.Given, rate_deg_s: float = 0.0, **errors: float) -> 
     for name, arcsec in errors.items():
         codes, _, flags = name.partition("_")
         rows.append(
-            planted(
+            combination_row(
                 error_arcsec=arcsec,
                 error_mag=0.001,
                 quantisation=codes,
@@ -494,8 +498,12 @@ def test_an_answer_is_the_simplest_that_is_near_the_best_of_what_is_given():
 
 def test_a_cheaper_choice_whose_light_is_far_worse_is_no_answer():
     rows = [
-        planted(quantisation="round", bit_stealing="false", error_arcsec=1.0, error_mag=0.02),
-        planted(quantisation="exact", bit_stealing="false", error_arcsec=1.0, error_mag=0.002),
+        combination_row(
+            quantisation="round", bit_stealing="false", error_arcsec=1.0, error_mag=0.02
+        ),
+        combination_row(
+            quantisation="exact", bit_stealing="false", error_arcsec=1.0, error_mag=0.002
+        ),
     ]
     assert answers.simplest(rows).quantisation == "exact"
 
@@ -510,7 +518,9 @@ def test_each_turn_is_named_from_which_another_step_is_most_of_the_error():
     ):
         for prediction, arcsec in (("rate", 1.0), ("two samples", 2.0)):
             errors = {"error_arcsec": arcsec, "bit_stealing": "false"}
-            rows.append(planted(scene=scene, rate_deg_s=rate, prediction=prediction, **errors))
+            rows.append(
+                combination_row(scene=scene, rate_deg_s=rate, prediction=prediction, **errors)
+            )
         steps = {
             step: 2.0 if step == largest else 0.5 for step in ("codes", "prediction", "refresh")
         }

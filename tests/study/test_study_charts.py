@@ -18,7 +18,7 @@ from hilstar.instruments.simulate.budget import (
 )
 from hilstar.instruments.study.economy import EffortComparison, EffortOutcome, economy_finding
 from hilstar.instruments.study.speed import report as benchmark_report
-from hilstar.instruments.study.speed.report import Machine, MethodTiming, Result, Spread
+from hilstar.instruments.study.speed.report import Machine, MethodTiming, Result, TimeSpread
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.figures import assert_legible, assert_title_is_drawn
 from tests.support.pictures import assert_drawn
@@ -217,7 +217,7 @@ def test_the_legend_of_the_benchmark_is_whole(figures, tmp_path, sizes, methods)
     ours = [("hilstar", kind) for kind in ("whole_frame", "turning", "linear_only")]
     kinds = [*ours, *((method, "linear_only") for method in methods)]
     rows = [
-        MethodTiming(w, h, stars, method, kind, Spread(median=1.0, min=0.9, max=1.2))
+        MethodTiming(w, h, stars, method, kind, TimeSpread(median=1.0, min=0.9, max=1.2))
         for w, h in sizes
         for stars in (100, 1000)
         for method, kind in kinds

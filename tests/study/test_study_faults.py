@@ -23,7 +23,7 @@ def study(tmp_path_factory):
     return folder, lines
 
 
-def rows(path):
+def table_rows(path):
     with path.open() as file:
         return list(csv.DictReader(file))
 
@@ -32,7 +32,7 @@ def test_every_kind_but_a_dropped_frame_has_its_cost(study):
     folder, findings = study
     kinds = {table["kind"] for tables in CASES.values() for table in tables}
     assert kinds == set(KINDS) - {"drop"}  # which draws nothing
-    costs = rows(folder / "faults-cost.csv")
+    costs = table_rows(folder / "faults-cost.csv")
     assert [(row["quantisation"], row["case"]) for row in costs] == [
         (q, case) for q in QUANTISATIONS for case in CASES
     ]
@@ -42,7 +42,7 @@ def test_every_kind_but_a_dropped_frame_has_its_cost(study):
 
 def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(study):
     folder, _ = study
-    strays = rows(folder / "faults-stray.csv")
+    strays = table_rows(folder / "faults-stray.csv")
     for quantisation in QUANTISATIONS:
         mine = {
             float(row["share_of_white"]): row

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.study import limits
-from hilstar.instruments.study.limits import Limit, limits_finding, run
+from hilstar.instruments.study.limits import StressLimit, limits_finding, run
 from tests.support.pictures import assert_drawn, table
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
@@ -27,7 +27,7 @@ def study(tmp_path_factory):
     return folder, lines, table(folder / "limits.csv")
 
 
-def rows_of(rows, stress):
+def limit_rows(rows, stress):
     """The stress, the error, and where they meet, of one limit."""
     own = [row for row in rows if row["stress"] == stress]
     at, error = (np.array([float(row[name]) for row in own]) for name in ("at", "error"))
@@ -40,7 +40,7 @@ def test_the_place_where_a_method_leaves_its_tolerance_is_between_its_own_rows(s
     stresses = list(dict.fromkeys(row["stress"] for row in rows))
     assert len(lines) == 1 + len(stresses) == 13
     for stress in stresses:
-        at, error, meets, tolerance = rows_of(rows, stress)
+        at, error, meets, tolerance = limit_rows(rows, stress)
         assert error[0] <= tolerance, f"{stress}: over the tolerance where it is easy"
         over = np.flatnonzero(error > tolerance)
         if not len(over):
@@ -52,18 +52,18 @@ def test_the_place_where_a_method_leaves_its_tolerance_is_between_its_own_rows(s
 
 def test_the_limits_are_those_that_hilstar_tells_elsewhere(study):
     _, _, rows = study
-    stars, lost_mag, _, _ = rows_of(rows, "stars in view")
+    stars, lost_mag, _, _ = limit_rows(rows, "stars in view")
     assert not lost_mag[stars < ROOM_STARS].any()
     assert (lost_mag[stars > 1.5 * ROOM_STARS] > 0).all()
-    vi_mag, off_mag, _, _ = rows_of(rows, "V-I [mag]")
+    vi_mag, off_mag, _, _ = limit_rows(rows, "V-I [mag]")
     assert (off_mag[vi_mag < RED_VI_MAG - 0.5] < RED_LIMIT_MAG).all()
     assert off_mag[vi_mag > RED_VI_MAG + 1.0].max() > 2 * RED_LIMIT_MAG
     for stress in ("distance from the pole [deg]", "angle short of 90 deg [deg]"):
-        _, error, meets, tolerance = rows_of(rows, stress)
+        _, error, meets, tolerance = limit_rows(rows, stress)
         assert math.isnan(meets) and (error < 1e-3 * tolerance).all()
     # A turn's error over parted refreshes is f (1 - f) / 2 of a refresh over n + f refreshes
-    # (run/sync.py), to first order.
-    at, error, _, _ = rows_of(rows, limits.TURN)
+    # (server/sync.py), to first order.
+    at, error, _, _ = limit_rows(rows, limits.TURN)
     per_deg_s = 3600 / 60 * 0.3 * 0.7 / 2 / 6.3
     assert error == pytest.approx(per_deg_s * at, rel=0.02)
 
@@ -73,27 +73,27 @@ def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field(study):
     takes.
     """
     _, _, rows = study
-    at, error, _, _ = rows_of(rows, limits.TILT)
+    at, error, _, _ = limit_rows(rows, limits.TILT)
     assert error[5] / at[5] == pytest.approx(error[0] / at[0], rel=0.01)
     widest_px = (959.5**2) * math.radians(at[0]) / (350e3 / 57.65)
     assert 0.1 * widest_px < error[0] < 0.6 * widest_px
 
 
-def planted(errors, at=(1.0, 2.0, 4.0)) -> Limit:
-    return Limit(
+def limit_of(errors, at=(1.0, 2.0, 4.0)) -> StressLimit:
+    return StressLimit(
         "A method", limits.AGE, "packets over {} ms old", "px", np.array(at), np.array(errors)
     )
 
 
 def test_a_crossing_is_found_between_points_and_none_is_said_as_such():
     tolerance = limits.TOLERANCE_PX
-    crossing = planted([tolerance / 10, tolerance / 10, tolerance * 10])
+    crossing = limit_of([tolerance / 10, tolerance / 10, tolerance * 10])
     assert crossing.meets == pytest.approx(2.0 + HALF_SAMPLE * 2.0)
     assert crossing.words == "packets over 3 ms old"
-    assert planted([0.0, 0.0, 0.0]).words == "nowhere to 4 ms"
-    assert planted([1.0, 1.0, 1.0]).words == "everywhere"
-    falling = planted([0.0, tolerance * 10, 0.0])
+    assert limit_of([0.0, 0.0, 0.0]).words == "nowhere to 4 ms"
+    assert limit_of([1.0, 1.0, 1.0]).words == "everywhere"
+    falling = limit_of([0.0, tolerance * 10, 0.0])
     assert 1.0 < falling.meets < 2.0
-    assert limits_finding([crossing, planted([0.0, 0.0, 0.0])]).startswith(
+    assert limits_finding([crossing, limit_of([0.0, 0.0, 0.0])]).startswith(
         "1 of 2 methods of hilstar leave their tolerance"
     )

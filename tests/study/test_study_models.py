@@ -72,7 +72,7 @@ def study(tmp_path_factory):
     return folder, dict(line.split(": ", 1) for line in result.stdout.splitlines()[:-1])
 
 
-def columns(path):
+def table_columns(path):
     """A table's columns by name: numbers where they are numbers."""
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -136,7 +136,7 @@ def rapp_by_quadrature(kelvin, sensor, power):
 @pytest.mark.parametrize("sensor", ["ccd47-20", "kai-4021"])
 @pytest.mark.parametrize(("weighting", "power"), [("energy", 0), ("photon", 1)])
 def test_rapp_is_what_equations_5_1_to_5_3_say(study, sensor, weighting, power):
-    table = columns(study[0] / f"rapp_{sensor}.csv")
+    table = table_columns(study[0] / f"rapp_{sensor}.csv")
     assert (np.diff(table["temperature_k"]) > 0).all()
     for kelvin in (3000.0, 5000.0, 50_000.0):
         row = np.flatnonzero(table["temperature_k"] == kelvin)[0]
@@ -152,7 +152,7 @@ def test_rapp_is_one_where_both_models_are_the_same(study):
     """
     ratios = rapp_ratios(np.array([9602.0]), study_optics("ccd47-20"), "energy")
     assert ratios[0, 0] == pytest.approx(1.0, rel=1e-9)
-    rows = columns(study[0] / "rapp_ccd47-20.csv")
+    rows = table_columns(study[0] / "rapp_ccd47-20.csv")
     kelvin, rapp3 = rows["temperature_k"], rows["rapp3_photon"]
     assert kelvin[0] == pytest.approx(3000) and kelvin[-1] == pytest.approx(50_000)
     assert np.interp(9000, kelvin, rapp3) == pytest.approx(0.85, abs=0.01)
@@ -166,7 +166,7 @@ def test_torres_gives_the_sun_its_temperature():
 
 
 def test_the_zero_points_differ_by_a_third_of_a_magnitude(study):
-    table = columns(study[0] / "zero_points.csv")
+    table = table_columns(study[0] / "zero_points.csv")
     bolometric = [
         setting == ("iau-bolometric", "energy")
         for setting in zip(table["zero_point"], table["weighting"], strict=True)
@@ -175,7 +175,7 @@ def test_the_zero_points_differ_by_a_third_of_a_magnitude(study):
 
 
 def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(study):
-    table, text = columns(study[0] / "spectra.csv"), study[1]["spectra"]
+    table, text = table_columns(study[0] / "spectra.csv"), study[1]["spectra"]
     assert table["spectral_type"] == list(load_library().spectral_type)
     median = {}
     for name in ("pickles, leave-one-out", "black body, ballesteros2012"):
@@ -203,7 +203,7 @@ def test_a_held_out_star_is_not_in_its_own_table():
 
 
 def test_the_zero_point_costs_the_same_at_every_colour(study):
-    cost = columns(study[0] / "choices.csv")["zero_point_iau-bolometric_mag"]
+    cost = table_columns(study[0] / "choices.csv")["zero_point_iau-bolometric_mag"]
     assert cost.min() == pytest.approx(0.31, abs=0.01)
     assert cost.max() == pytest.approx(0.31, abs=0.01)
 
@@ -212,7 +212,7 @@ def test_hot_stars_differ_as_the_thesis_says(study):
     """Section 5.4, CCD47-20: 'higher than 9000 K ... results that differ from 15 % up to 5 %'; 5
     % is passed at 25 000 K.
     """
-    table = columns(study[0] / "rapp_ccd47-20.csv")
+    table = table_columns(study[0] / "rapp_ccd47-20.csv")
     hot = table["temperature_k"] >= 9000
     off = 1 - table["rapp3_photon"][hot]
     assert off[0] == pytest.approx(0.15, abs=0.005)
@@ -226,7 +226,7 @@ def test_torres_agrees_with_pecaut_and_mamajek():
 
 
 def test_the_source_s_step_is_in_the_table(study):
-    table = columns(study[0] / "temperature_scales.csv")
+    table = table_columns(study[0] / "temperature_scales.csv")
     assert (table["bv_mag"][0], table["bv_mag"][-1]) == (-0.35, 1.8)
     zero = np.flatnonzero(table["bv_mag"] == 0)[0]
     step_k = table["wang2021_k"][zero] - table["wang2021_k"][zero - 1]
@@ -257,7 +257,7 @@ def test_the_bolometric_zero_point_is_as_faint_as_its_own_arithmetic(study):
     mean = integral(lambda nm: exitance(nm) * np.interp(nm, *johnson), johnson[0])
     mean /= integral(lambda nm: np.interp(nm, *johnson), johnson[0])
     faint_mag = -2.5 * np.log10(2.518021002e-8 / (sigma * REFERENCE_K**4) * mean / 3.631e-2)
-    table = columns(study[0] / "zero_points.csv")
+    table = table_columns(study[0] / "zero_points.csv")
     cost = table["mag_against_default"]
     for k, (zero, weighting) in enumerate(
         zip(table["zero_point"], table["weighting"], strict=True)
@@ -271,7 +271,7 @@ def test_the_bolometric_zero_point_is_as_faint_as_its_own_arithmetic(study):
 
 def test_choices_cost_what_a_bench_would_see(study):
     """The same stars through the tables that `hilstar frame` uses."""
-    table = columns(study[0] / "choices.csv")
+    table = table_columns(study[0] / "choices.csv")
     stars, optics = load_catalog().brighter_than(7.5), study_optics("ccd47-20")
     ones = np.zeros(len(stars))
     kelvin = electrons.star_temperatures_k(stars.bv_mag, "ballesteros2012")
@@ -283,7 +283,7 @@ def test_choices_cost_what_a_bench_would_see(study):
     found = [table[f"pickles_{name}_mag"][row] for name in ("p5", "median", "p95")]
     assert found == pytest.approx(np.percentile(mags, (5, 50, 95)), abs=TABLE_MAG_LIMIT)
     assert table["stars_in_window"][row] == near.sum()
-    rapp = columns(study[0] / "rapp_ccd47-20.csv")
+    rapp = table_columns(study[0] / "rapp_ccd47-20.csv")
     at = electrons.star_temperatures_k(np.array([1.0]), "ballesteros2012")
     ags_mag = 2.5 * np.log10(np.interp(at, rapp["temperature_k"], rapp["rapp3_energy"]))
     # straight lines between 400 points
@@ -303,7 +303,7 @@ def test_there_are_no_percentiles_where_stars_are_few():
 
 @pytest.mark.parametrize("sensor", HELD_OUT)
 def test_real_spectra_are_as_wrong_as_measured(study, sensor):
-    table = columns(study[0] / "spectra.csv")
+    table = table_columns(study[0] / "spectra.csv")
     assert len(table["spectral_type"]) == 106
     errors = np.abs(table[f"{sensor}: pickles, leave-one-out [%]"][table["vi_mag"] < 2.5])
     assert np.percentile(errors, (50, 95)) == pytest.approx(
@@ -314,7 +314,7 @@ def test_real_spectra_are_as_wrong_as_measured(study, sensor):
 def test_titles_say_what_the_tables_hold(study):
     folder, texts = study
     for sensor in ("ccd47-20", "kai-4021"):
-        table = columns(folder / f"rapp_{sensor}.csv")
+        table = table_columns(folder / f"rapp_{sensor}.csv")
         at = dict(zip(table["temperature_k"], table["rapp3_energy"], strict=True))
         for words in (
             f"{at[3000]:.2f} times",
@@ -322,10 +322,10 @@ def test_titles_say_what_the_tables_hold(study):
             f"{100 * at[9000] - 100:+.1f} %",
         ):
             assert words in texts[f"rapp_{sensor}"]
-    zero = columns(folder / "zero_points.csv")
+    zero = table_columns(folder / "zero_points.csv")
     assert f"{zero['electrons_per_s'][0] / 1e6:.1f} million" in texts["zero_points"]
     assert f"({zero['mag_against_default'][2]:.2f} mag)" in texts["zero_points"]
-    flat = columns(folder / "choices.csv")["zero_point_iau-bolometric_mag"]
+    flat = table_columns(folder / "choices.csv")["zero_point_iau-bolometric_mag"]
     assert f"iau-bolometric {np.median(flat):.2f}" in texts["choices"]
     assert choices_finding(
         {"zero": np.array([0.31, 0.31]), "b ags": np.array([0.16, 0.32])}
@@ -333,7 +333,7 @@ def test_titles_say_what_the_tables_hold(study):
         "zero changes most: half of Hipparcos to V = 7.5 by 0.31 mag and more; a twentieth are"
         " changed most by ags, by 0.32 mag"
     )
-    table = columns(folder / "spectra.csv")
+    table = table_columns(folder / "spectra.csv")
     for name in ("pickles, leave-one-out", "black body, ballesteros2012"):
         errors = np.abs(table[f"kai-4021: {name} [%]"][table["vi_mag"] < 2.5])
         assert "{:.1f} % ({:.1f} %)".format(*np.percentile(errors, (50, 95))) in texts["spectra"]
@@ -351,7 +351,7 @@ def test_a_title_follows_its_data(tmp_path, monkeypatch):
 
 def test_the_thesis_s_tables_stand_beside_what_is_here(study):
     folder, texts = study
-    rows = columns(folder / "catalogue_errors.csv")
+    rows = table_columns(folder / "catalogue_errors.csv")
     here, thesis = (dict(zip(rows["what"], rows[name], strict=True)) for name in ("here", "thesis"))
     assert thesis["V from T"] == here["V from T"] == 409  # table 2.2
     for name in (
@@ -362,12 +362,12 @@ def test_the_thesis_s_tables_stand_beside_what_is_here(study):
         "sigma_pm_ra_mas_yr",
     ):
         assert here[name] == pytest.approx(thesis[name], abs=0.025)  # table 2.3
-    bands = columns(folder / "passbands.csv")
+    bands = table_columns(folder / "passbands.csv")
     assert list(bands["band"]) == ["U", "B", "V", "R", "I"]
     # table 2.5; Vega's own colours are not all 0
     assert bands["vega_v0"] == pytest.approx(bands["thesis_bessell"], rel=0.02)
     assert bands["effective_nm"] == pytest.approx(bands["thesis_effective_nm"], rel=0.02)
-    dark = columns(folder / "detector_laws.csv")
+    dark = table_columns(folder / "detector_laws.csv")
     at = np.flatnonzero(dark["temperature_k"] == 293)[0]
     assert [dark[law][at] for law in list(dark)[1:]] == pytest.approx([203] * 5)
     assert "97.2 photons" in texts["zodiacal"] and "96.9 as sunlight" in texts["zodiacal"]
@@ -379,7 +379,7 @@ def test_the_thesis_s_tables_stand_beside_what_is_here(study):
 
 def test_every_figure_is_drawn_and_found(study):
     folder, texts = study
-    table = columns(folder / "findings.csv")
+    table = table_columns(folder / "findings.csv")
     assert tuple(table["figure"]) == tuple(texts) == STEMS
     assert table["finding"] == list(texts.values())
     for stem in STEMS:
@@ -415,7 +415,7 @@ def test_the_stars_of_the_map_are_those_of_the_catalogue(study):
     """Figure 2.2: each cell has its stars, counted here one by one; the whole sky has 41 253
     square degrees.
     """
-    table, catalog = columns(study[0] / "star_density.csv"), load_catalog()
+    table, catalog = table_columns(study[0] / "star_density.csv"), load_catalog()
     cell_deg2 = 41_252.96 / len(table["ra_deg"])
     assert table["stars_deg2"].sum() * cell_deg2 == pytest.approx(len(catalog), rel=1e-5)
     k = int(table["stars_deg2"].argmax())
@@ -431,7 +431,7 @@ def test_the_camera_s_frame_is_astropy_s_tangent_plane(study):
     """Figure 2.11: x and y over z are Astropy's tangent plane at the boresight, west and south
     of it.
     """
-    table = columns(study[0] / "frames.csv")
+    table = table_columns(study[0] / "frames.csv")
     plane = WCS(naxis=2)
     plane.wcs.ctype, plane.wcs.crval, plane.wcs.cdelt = (
         ["RA---TAN", "DEC--TAN"],
@@ -450,7 +450,7 @@ def test_zodiacal_light_near_the_earth_has_its_magnitude(study):
     """Figure 4.11: table 6.4's high zodiacal light is V = 22.1 through Johnson V, as the
     handbook says.
     """
-    table, (nm, response) = columns(study[0] / "backgrounds.csv"), curve("johnson-v")
+    table, (nm, response) = table_columns(study[0] / "backgrounds.csv"), curve("johnson-v")
     # W/m2/arcsec2/nm
     per_nm = table["zodiacal"] * 6.62607015e-34 * 299_792_458 / (table["wavelength_nm"] * 1e-9)
     weight = np.interp(table["wavelength_nm"], nm, response, left=0, right=0)
@@ -466,7 +466,7 @@ def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(study):
     """
     nm, response = curve("johnson-v")
     for stem, star, kelvin in (("sun", "g2v", 5772.0), ("vega_logarithmic", "vega", 9602.0)):
-        table = columns(study[0] / f"{stem}.csv")
+        table = table_columns(study[0] / f"{stem}.csv")
         weight = np.interp(table["wavelength_nm"], nm, response, left=0, right=0)
         means = [
             np.trapezoid(table[name] * weight, table["wavelength_nm"])

@@ -29,7 +29,7 @@ def study(tmp_path_factory):
     return folder, lines
 
 
-def rows_of(path, record):
+def typed_rows(path, record):
     """A table as records of texts and numbers."""
     kinds = get_type_hints(record)
     with path.open(newline="") as file:
@@ -43,7 +43,7 @@ def rows_of(path, record):
 def outcomes(study):
     return {
         (o.method, o.rate_hz, o.latency_ms): o
-        for o in rows_of(study[0] / "prediction.csv", PredictionOutcome)
+        for o in typed_rows(study[0] / "prediction.csv", PredictionOutcome)
     }
 
 
@@ -72,7 +72,7 @@ def test_a_rate_predicts_better_than_holding_and_worse_the_longer_it_has_to(outc
 def shaken(study):
     return {
         (s.way, s.packets, s.jitter_hz): s
-        for s in rows_of(study[0] / "prediction_jitter.csv", Shaken)
+        for s in typed_rows(study[0] / "prediction_jitter.csv", Shaken)
     }
 
 

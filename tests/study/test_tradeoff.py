@@ -72,7 +72,7 @@ def study(tmp_path_factory):
     )
 
 
-def error_of(step, method):
+def method_error(step, method):
     return float(step[method]["error"])
 
 
@@ -149,7 +149,7 @@ def test_less_is_worse(study):
     steps = study[2]
 
     def falls(step, *methods):
-        errors = [error_of(steps[step], method) for method in methods]
+        errors = [method_error(steps[step], method) for method in methods]
         assert all(worse > better for worse, better in itertools.pairwise(errors)), (
             methods,
             errors,
@@ -216,7 +216,7 @@ def clock(monkeypatch):
     return work
 
 
-def planted(clock, own_ms, floor=0.0):
+def three_methods(clock, own_ms, floor=0.0):
     """Three methods, of which the slowest is as wrong as the fastest."""
     trials = [
         Trial("fast and rough", 0.1, 0.0, clock(1.0)),
@@ -229,11 +229,11 @@ def planted(clock, own_ms, floor=0.0):
 
 
 def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(clock):
-    step = measured(planted(clock, 4.0), 0.02)
+    step = measured(three_methods(clock, 4.0), 0.02)
     assert [row.method for row in step.trials if not row.on_front] == ["slow and rough"]
     assert step.default.beaten == "" and step.default.time_ms == pytest.approx(4.0)
     # all errors count as none: the fastest is best
-    beaten = measured(planted(clock, 4.0, floor=1.0), 0.02)
+    beaten = measured(three_methods(clock, 4.0, floor=1.0), 0.02)
     assert not beaten.default.on_front
     assert (
         beaten.default.beaten == "'fast and rough' is no worse and takes 75 % less time; it is tidy"
@@ -290,7 +290,9 @@ def test_a_trapezoid_integrates_a_straight_line(rng):
 def test_every_step_is_known_and_a_chart_that_cannot_be_written_is_refused(tmp_path, clock):
     assert len(STEPS) == len(NAMES)
     with pytest.raises(InputError, match="cannot be written"):
-        draw_trials(tmp_path / "no" / "chart.png", measured(planted(clock, 4.0), 0.01), "here")
+        draw_trials(
+            tmp_path / "no" / "chart.png", measured(three_methods(clock, 4.0), 0.01), "here"
+        )
 
 
 def test_a_title_says_a_time_as_it_is_drawn():

@@ -57,3 +57,9 @@ def read_columns(path: Path) -> dict[str, Any]:
     """A campaign's table as columns of Python values."""
     table = pq.read_table(path)
     return {name: table.column(name).to_pylist() for name in table.column_names}
+
+
+def rows_so_far(folder: Path) -> int:
+    """The rows in the journal of a campaign that writes to `folder`/out."""
+    journal = folder / "out" / "journal"
+    return sum(path.read_bytes().count(b"\n") for path in journal.glob("*.jsonl"))

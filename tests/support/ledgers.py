@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
+
+from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.server.record.ledger_records import (
+    EventRecord,
     FrameRecord,
     PacketTally,
     ProcessRecord,
@@ -38,3 +42,8 @@ def read_run(path: Path) -> Run:
     assert run.frames
     run.packets = tally.counts
     return run
+
+
+def read_events(path: Path) -> list[EventRecord]:
+    """The events of a ledger, which may be growing."""
+    return [msgspec.json.decode(data, type=EventRecord) for data in read_messages(path, "/event")]

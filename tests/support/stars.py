@@ -32,3 +32,17 @@ def sprites_at(pixels: np.ndarray, electrons_per_s: np.ndarray, footprint: int) 
     return FrameLight(
         data, footprint, np.arange(len(pixels)), pixels[:, 0].copy(), pixels[:, 1].copy()
     )
+
+
+def random_sprites(
+    count: int,
+    rng: np.random.Generator,
+    size_px: tuple[int, int],
+    footprint: int,
+    decades: tuple[float, float] = (0, 7),
+    margin_px: float = 5.0,
+) -> FrameLight:
+    """Sprites all over an image and a margin about it, of many magnitudes."""
+    low_px = np.full(2, -margin_px)
+    pixels = rng.uniform(low_px, size_px - low_px, size=(count, 2))
+    return sprites_at(pixels, 10.0 ** rng.uniform(*decades, count), footprint)

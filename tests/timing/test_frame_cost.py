@@ -24,7 +24,7 @@ MAX_FRAME_MS = 400.0
 MOVING = '[render]\nmotion = "on"\nquantisation = "round"\n'  # of exact codes a turn costs more
 
 
-def stream(sender, attitudes, hz: float) -> None:
+def send_attitudes(sender, attitudes, hz: float) -> None:
     start_ns = time.monotonic_ns()
     for k, (q, rate) in enumerate(attitudes):
         due_ns = start_ns + round(k * 1e9 / hz)
@@ -38,7 +38,7 @@ def attitude_packet(k, t_ns, q, rate) -> bytes:
     return json.dumps({"t_ns": t_ns, "q": q, "sequence": k}).encode()
 
 
-def turned(degrees: float) -> tuple[float, ...]:
+def turned_q(degrees: float) -> tuple[float, ...]:
     half = math.radians(degrees) / 2
     return (math.cos(half), 0.0, math.sin(half), 0.0)
 
@@ -56,7 +56,7 @@ def test_turns_of_any_rate_are_drawn_in_bounded_time_and_counted(tmp_path):
         CoreWaits(process.pid) as waited,
     ):
         process.shows()
-        stream(sender, turns, 100)
+        send_attitudes(sender, turns, 100)
         process.has_received(len(turns))
         process.send_signal(signal.SIGINT)
         summary = summary_of(process)
@@ -69,7 +69,9 @@ def test_turns_of_any_rate_are_drawn_in_bounded_time_and_counted(tmp_path):
 def test_a_rate_in_deg_s_is_refused_by_name_once_said_and_the_stream_goes_on(tmp_path):
     with publisher() as (sender, port), serving(tmp_path, port, attitude=MOVING) as process:
         still = (0.5, 0.5, -0.5, 0.5)
-        stream(sender, [(still, (0.0, 0.0, 57.0 if k % 2 else 1.0)) for k in range(100)], 100)
+        send_attitudes(
+            sender, [(still, (0.0, 0.0, 57.0 if k % 2 else 1.0)) for k in range(100)], 100
+        )
         process.has_received(100)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE_S)
@@ -90,7 +92,7 @@ def test_a_sender_without_rates_that_retargets_stops_no_frame(tmp_path, degrees)
         serving(tmp_path, port, attitude=MOVING) as process,
         CoreWaits(process.pid) as waited,
     ):
-        stream(sender, [(turned(degrees * (k // 20 % 2)), None) for k in range(200)], 200)
+        send_attitudes(sender, [(turned_q(degrees * (k // 20 % 2)), None) for k in range(200)], 200)
         process.send_signal(signal.SIGTERM)
         asked_s = time.monotonic()
         summary = summary_of(process)
@@ -118,7 +120,9 @@ def test_a_run_with_such_turns_is_replayed_from_its_ledger_in_bounded_time(tmp_p
         serving(tmp_path, port, "--ledger", str(ledger), attitude=attitude) as process,
     ):
         process.shows()
-        stream(sender, [((0.5, 0.5, -0.5, 0.5), (900.0, 0.0, -900.0)) for _ in range(100)], 100)
+        send_attitudes(
+            sender, [((0.5, 0.5, -0.5, 0.5), (900.0, 0.0, -900.0)) for _ in range(100)], 100
+        )
         process.has_received(100)
         process.shows(60)
         process.send_signal(signal.SIGINT)

@@ -47,7 +47,7 @@ def screen(tmp_path_factory) -> Iterator[Screen]:
 
 
 @contextmanager
-def shown(screen: Screen, folder: Path, kind: str):
+def still_sky(screen: Screen, folder: Path, kind: str):
     """A still sky with the photodiode square, kept in a ledger, while this is open."""
     bench = folder / "bench.toml"
     keys = f'photodiode_px = 40\nphotodiode = "{kind}"\nscanout_ms = 0'
@@ -82,12 +82,12 @@ def shown(screen: Screen, folder: Path, kind: str):
             process.kill()
 
 
-def measured(
+def measured_latency(
     screen: Screen, folder: Path, kind: str, added_ms: float, device_clock: bool, *options: str
 ) -> tuple[dict, Path]:
     with (
         Cable(folder) as cable,
-        shown(screen, folder, kind) as bench,
+        still_sky(screen, folder, kind) as bench,
         Diode(screen, cable.sender, added_ms, device_clock),
     ):
         diode = ["--diode", f"serial:{cable.host}@921600", "--duration", str(WATCHED_S)]
@@ -104,7 +104,7 @@ def measured_undisturbed(*wanted, edges: int = MIN_EDGES) -> tuple[dict, Path]:
     """
     deadline_s = time.monotonic() + PATIENCE_S
     while True:
-        found, bench = measured(*wanted)
+        found, bench = measured_latency(*wanted)
         if found["edges"] > edges and found["unmatched"] <= MAX_UNMATCHED * found["edges"]:
             return found, bench
         assert time.monotonic() < deadline_s, (
@@ -122,7 +122,7 @@ def test_a_delay_that_was_added_is_found_and_written_into_the_bench_file(screen,
     assert not plain["ambiguous"]
     # Its line keeps this diode from looking for so long: not every edge is seen, and those that
     # are, are as late as this.
-    late, bench = measured(
+    late, bench = measured_latency(
         screen, tmp_path, "code", ADDED_MS, False, "--write", tmp_path / "bench.toml"
     )
     added_ms = late["latency_ms"]["p50"] - plain["latency_ms"]["p50"]

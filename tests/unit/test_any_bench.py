@@ -107,7 +107,7 @@ def result(found=None, code=0, stderr="", memory_mb=500.0):
     return CommandResult(code, 1.0, 1.0, memory_mb, json.dumps(found or {}), stderr)
 
 
-def session(**verdicts):
+def session_of(**verdicts):
     return {
         "steps": [
             {"name": name, "verdict": verdict, "line": f"{name} said so"}
@@ -116,9 +116,9 @@ def session(**verdicts):
     }
 
 
-DARK = session(orientation="failed")
+DARK = session_of(orientation="failed")
 DARK["steps"][0]["line"] = "a black screen fills the tracker to 100% of its range"
-DONE = session(geometry="done", verify="done")
+DONE = session_of(geometry="done", verify="done")
 CLAMPED = Comparison(0.15, 0.55, -40.0)
 GONE = result(code=3, stderr="gone")
 PASSED = {"passed": True, "reasons": []}
@@ -150,16 +150,19 @@ PASSED = {"passed": True, "reasons": []}
             judge.TRACEBACK,
             "x",
         ),
-        ({FIRST_LIGHT: result(session(focus="failed"), 1)}, {}, judge.FAILED, "focus said so"),
+        ({FIRST_LIGHT: result(session_of(focus="failed"), 1)}, {}, judge.FAILED, "focus said so"),
         (
-            {FIRST_LIGHT: result(session(verify="failed"), 1), VERIFY: result({"reasons": [WIDE]})},
+            {
+                FIRST_LIGHT: result(session_of(verify="failed"), 1),
+                VERIFY: result({"reasons": [WIDE]}),
+            },
             {},
             judge.TOO_WIDE,
             "star_sigma_ratio",
         ),
         (
             {
-                FIRST_LIGHT: result(session(verify="failed"), 1),
+                FIRST_LIGHT: result(session_of(verify="failed"), 1),
                 VERIFY: result({"reasons": [WIDE, "flux is off"]}),
             },
             {},

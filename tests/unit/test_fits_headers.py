@@ -40,15 +40,15 @@ def file_of(*hdus) -> bytes:
     return buffer.getvalue()
 
 
-def image(cards: dict | list, pattern: str = "RGGB", kind=fits.PrimaryHDU) -> fits.PrimaryHDU:
+def mosaic_hdu(cards: dict | list, pattern: str = "RGGB", kind=fits.PrimaryHDU) -> fits.PrimaryHDU:
     made = kind(mosaic(pattern))
     for key, value in dict(cards).items():
         made.header[key] = value
     return made
 
 
-def read(cards: dict, pattern: str = "RGGB"):
-    return read_fits_image(file_of(image(cards, pattern)))
+def read_image(cards: dict, pattern: str = "RGGB"):
+    return read_fits_image(file_of(mosaic_hdu(cards, pattern)))
 
 
 @pytest.mark.parametrize(
@@ -85,29 +85,29 @@ def read(cards: dict, pattern: str = "RGGB"):
     ],
 )
 def test_an_exposure_is_in_seconds(cards, seconds):
-    found = read(cards)
+    found = read_image(cards)
     assert found.exposure_s == (None if seconds is None else pytest.approx(seconds))
     assert not found.notes
 
 
 @pytest.mark.parametrize("value", ["long", "1/200 s", -1.0, True, "10 parsec"])
 def test_an_exposure_that_is_none_is_said(value):
-    found = read({"EXPTIME": value})
+    found = read_image({"EXPTIME": value})
     assert found.exposure_s is None
     assert "EXPTIME" in found.notes[0] and "no exposure in seconds" in found.notes[0]
 
 
 @pytest.mark.parametrize("key", ["SHUTTER", "EXPDUR", "TELAPSE", "FRAMETIM", "HIERARCH ESO EXPT"])
 def test_a_keyword_that_may_be_an_exposure_is_named(key):
-    found = read({key: 10.0})
+    found = read_image({key: 10.0})
     assert found.exposure_s is None
     name = key.removeprefix("HIERARCH ")
     assert f"{name} is no keyword of an exposure that is known" in found.notes[0]
-    assert not read({key: "open"}).notes
+    assert not read_image({key: "open"}).notes
 
 
 def test_two_exposures_that_differ_are_said():
-    found = read({"EXPTIME": 10.0, "EXPOSURE": 20.0})
+    found = read_image({"EXPTIME": 10.0, "EXPOSURE": 20.0})
     assert found.exposure_s == 10.0
     assert found.notes == ("EXPTIME says 10 s and EXPOSURE 20 s: EXPTIME is taken",)
 
@@ -151,7 +151,7 @@ def astropy_ns(text: str, scale: str) -> int:
     ],
 )
 def test_a_time_is_the_middle_of_the_exposure(cards, expected):
-    found = read({**cards, "EXPTIME": 10.0})
+    found = read_image({**cards, "EXPTIME": 10.0})
     assert found.t_ns == pytest.approx(utc_ns(expected), abs=UTC_TOLERANCE_NS)
     assert not found.notes
 
@@ -160,14 +160,14 @@ def test_a_time_is_the_middle_of_the_exposure(cards, expected):
     ("name", "scale"), [("TAI", "tai"), ("TT", "tt"), ("TDB", "tdb"), ("tai", "tai")]
 )
 def test_scales_are_turned_into_utc(name, scale):
-    found = read({"DATE-OBS": EIGHT_PM, "TIMESYS": name, "EXPTIME": 0.0})
+    found = read_image({"DATE-OBS": EIGHT_PM, "TIMESYS": name, "EXPTIME": 0.0})
     assert found.t_ns == pytest.approx(astropy_ns(EIGHT_PM, scale), abs=UTC_TOLERANCE_NS)
 
 
 def test_gps_is_18_s_ahead_of_utc():
-    found = read({"DATE-OBS": EIGHT_PM, "TIMESYS": "GPS", "EXPTIME": 0.0})
+    found = read_image({"DATE-OBS": EIGHT_PM, "TIMESYS": "GPS", "EXPTIME": 0.0})
     assert found.t_ns == pytest.approx(utc_ns("2024-03-01T19:59:42"), abs=UTC_TOLERANCE_NS)
-    by_days = read({"MJD-OBS": 60370.5, "TIMESYS": "TAI", "EXPTIME": 0.0})
+    by_days = read_image({"MJD-OBS": 60370.5, "TIMESYS": "TAI", "EXPTIME": 0.0})
     assert by_days.t_ns == pytest.approx(utc_ns("2024-03-01T11:59:23"), abs=UTC_TOLERANCE_NS)
 
 
@@ -187,29 +187,29 @@ def test_gps_is_18_s_ahead_of_utc():
     ],
 )
 def test_an_image_without_a_time_is_undated_and_said(cards, words):
-    found = read({**cards, "EXPTIME": 10.0})
+    found = read_image({**cards, "EXPTIME": 10.0})
     assert found.t_ns is None
     assert any(words in note for note in found.notes), found.notes
 
 
 def test_an_undated_image_is_said_beside_what_else_is():
-    found = read({"DATE-OBS": "2024-03-01", "EXPTIME": "long"})
+    found = read_image({"DATE-OBS": "2024-03-01", "EXPTIME": "long"})
     assert len(found.notes) == 2 and "tells no time of day" in found.notes[1]
 
 
 def test_local_time_gives_way_to_days_of_utc():
-    found = read({"DATE-OBS": (EIGHT_PM, "local time"), "MJD-OBS": 60370.5, "EXPTIME": 10.0})
+    found = read_image({"DATE-OBS": (EIGHT_PM, "local time"), "MJD-OBS": 60370.5, "EXPTIME": 10.0})
     assert found.t_ns == pytest.approx(utc_ns("2024-03-01T12:00:05"), abs=UTC_TOLERANCE_NS)
 
 
 def test_what_contradicts_or_is_assumed_is_said():
-    apart = read({"DATE-OBS": EIGHT_PM, "MJD-OBS": 60370.5, "EXPTIME": 1.0})
+    apart = read_image({"DATE-OBS": EIGHT_PM, "MJD-OBS": 60370.5, "EXPTIME": 1.0})
     assert apart.t_ns == utc_ns("2024-03-01T20:00:00.5")
     assert apart.notes == ("MJD-OBS is -28800 s off DATE-OBS, which is taken",)
-    unknown = read({"DATE-OBS": EIGHT_PM})
+    unknown = read_image({"DATE-OBS": EIGHT_PM})
     assert unknown.t_ns == utc_ns(EIGHT_PM)
     assert unknown.notes == ("no exposure is known: DATE-OBS, its start, is taken for its middle",)
-    both = read({"DATE-BEG": EIGHT_PM, "DATE-END": "2024-03-01T20:00:08"})
+    both = read_image({"DATE-BEG": EIGHT_PM, "DATE-END": "2024-03-01T20:00:08"})
     assert both.t_ns == utc_ns("2024-03-01T20:00:04") and not both.notes
 
 
@@ -224,30 +224,30 @@ def test_what_contradicts_or_is_assumed_is_said():
     ],
 )
 def test_a_keyword_that_may_be_a_time_is_named(key, value):
-    found = read({key: value, "EXPTIME": 10.0})
+    found = read_image({key: value, "EXPTIME": 10.0})
     assert found.t_ns is None
     assert found.notes == (f"{key} is no keyword of a time that is known: undated; write DATE-OBS",)
 
 
 @pytest.mark.parametrize("key", ["DATE", "DATE-LOC"])
 def test_the_date_of_the_file_or_of_another_clock_is_no_time(key):
-    found = read({key: EIGHT_PM, "EXPTIME": 10.0})
+    found = read_image({key: EIGHT_PM, "EXPTIME": 10.0})
     assert found.t_ns is None and not found.notes
 
 
 @pytest.mark.parametrize("key", ["CFA_PATT", "BAYERIND", "MOSAIC", "COLORMOD"])
 def test_a_pattern_in_a_keyword_that_is_not_known_is_taken_and_said(key):
-    found = read({key: "gbrg"})
+    found = read_image({key: "gbrg"})
     assert found.bayer == "GBRG"
     assert found.notes == (f"{key} = GBRG is taken for the mosaic's pattern",)
-    assert read({key: "gbrg", "BAYERPAT": "NONE"}).bayer == ""
+    assert read_image({key: "gbrg", "BAYERPAT": "NONE"}).bayer == ""
 
 
 def test_a_binned_mosaic_is_said():
-    binned = read({"BAYERPAT": "RGGB", "XBINNING": 2, "YBINNING": 2})
+    binned = read_image({"BAYERPAT": "RGGB", "XBINNING": 2, "YBINNING": 2})
     assert binned.notes[0].startswith("XBINNING = 2: a binned mosaic may mix colours")
-    assert not read({"BAYERPAT": "RGGB", "XBINNING": 1}).notes
-    assert not read({"XBINNING": 2}).notes
+    assert not read_image({"BAYERPAT": "RGGB", "XBINNING": 1}).notes
+    assert not read_image({"XBINNING": 2}).notes
 
 
 @pytest.mark.parametrize(
@@ -274,14 +274,14 @@ def test_a_binned_mosaic_is_said():
 )
 def test_planes_have_the_names_of_their_colours(tmp_path: Path, pixels, cards):
     path = tmp_path / "mosaic.fits"
-    path.write_bytes(file_of(image(cards, pixels)))
+    path.write_bytes(file_of(mosaic_hdu(cards, pixels)))
     planes = {photo.plane: int(photo.dn.mean()) // 1000 for photo in read_photographs(path, None)}
     assert planes == {"r": 1, "g1": 2, "g2": 2, "b": 3}
 
 
 @pytest.mark.parametrize("value", [None, "NONE", "mono", False, "", "N/A"])
 def test_a_grey_image_is_one_plane(value):
-    assert read({} if value is None else {"BAYERPAT": value}).bayer == ""
+    assert read_image({} if value is None else {"BAYERPAT": value}).bayer == ""
 
 
 @pytest.mark.parametrize(
@@ -289,7 +289,7 @@ def test_a_grey_image_is_one_plane(value):
 )
 def test_a_mosaic_of_another_kind_is_refused(tmp_path: Path, value):
     path = tmp_path / "mosaic.fits"
-    path.write_bytes(file_of(image({"BAYERPAT": value})))
+    path.write_bytes(file_of(mosaic_hdu({"BAYERPAT": value})))
     with pytest.raises(
         InputError,
         match=r"mosaic\.fits: BAYERPAT is .*a mosaic of a kind that is not read; write RGGB",
@@ -302,11 +302,11 @@ def test_a_mosaic_of_another_kind_is_refused(tmp_path: Path, value):
 )
 def test_a_layout_that_is_none_is_refused(cards):
     with pytest.raises(InputError, match=next(iter(cards))):
-        read({"BAYERPAT": "RGGB", **cards})
+        read_image({"BAYERPAT": "RGGB", **cards})
 
 
 def test_rows_from_the_bottom_are_turned_over():
-    given = image({"ROWORDER": "BOTTOM-UP"})
+    given = mosaic_hdu({"ROWORDER": "BOTTOM-UP"})
     assert (read_fits_image(file_of(given)).pixels == given.data[::-1]).all()
 
 
@@ -339,7 +339,9 @@ def test_an_extension_s_own_keywords_count_first(own):
 
 
 def test_the_first_of_several_images_is_taken_and_said():
-    found = read_fits_image(file_of(image({}), fits.ImageHDU(np.zeros((8, 8), dtype=np.uint8))))
+    found = read_fits_image(
+        file_of(mosaic_hdu({}), fits.ImageHDU(np.zeros((8, 8), dtype=np.uint8)))
+    )
     assert found.pixels.shape == (SIDE_PX, SIDE_PX)
     assert found.notes == ("holds 2 images, of which the first is taken",)
 
@@ -349,7 +351,7 @@ def test_the_first_of_several_images_is_taken_and_said():
 )
 def test_a_packed_file_is_the_same_image(tmp_path: Path, reader):
     plain, packed = tmp_path / "a.fits", tmp_path / "a.fits.gz"
-    plain.write_bytes(file_of(image({})))
+    plain.write_bytes(file_of(mosaic_hdu({})))
     packed.write_bytes(gzip.compress(plain.read_bytes()))
     assert (reader(plain) == reader(packed)).all()
     packed.write_bytes(gzip.compress(plain.read_bytes())[:-40])

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilstar.basics.arrays import IntArray
 from hilstar.display.response import Codes, Levels, Response
 
 CROSSHAIR, GRID, BLANK, PATCH = 1, 2, 4, 8
@@ -36,16 +37,25 @@ def lay_over(
     dark = on_patch and patch_level >= line_level  # on a patch as bright as a line
     height, width = levels.shape[:2]
     x, y = cross_px
-    columns = [k for k in range(width) if _on_line(k - x, overlay)]
-    rows = [k for k in range(height) if _on_line(k - y, overlay)]
+    columns = _lines(np.arange(width) - x, overlay)
+    rows = _lines(np.arange(height) - y, overlay)
     for lines in (np.s_[:, columns], np.s_[rows, :]):
-        levels[lines] = 0 if dark else np.maximum(levels[lines], line_level)
+        if dark:
+            levels[lines] = 0
+        else:
+            levels[lines] = np.maximum(levels[lines], line_level)
 
 
-def _on_line(offset_px: int, overlay: int) -> bool:
-    return bool(
-        (overlay & GRID and offset_px % GRID_PX == 0) or (overlay & CROSSHAIR and offset_px == 0)
-    )
+def _lines(offset_px: IntArray, overlay: int) -> IntArray:
+    """Which columns or rows, by their offsets (n,) from the crosshair's, have a line of its or of
+    the grid.
+    """
+    is_line = np.zeros(len(offset_px), dtype=np.bool_)
+    if overlay & GRID:
+        is_line |= offset_px % GRID_PX == 0
+    if overlay & CROSSHAIR:
+        is_line |= offset_px == 0
+    return np.flatnonzero(is_line)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,9 +76,7 @@ class AidLevels:
             return levels
         levels = levels.copy()
         white = 2**self.bits - 1
-        patch, line = (
-            level_of_code(self.response, code)
-            for code in (round(patch_share * white), int(LINE_SHARE * white))
-        )
+        patch = level_of_code(self.response, round(patch_share * white))
+        line = level_of_code(self.response, int(LINE_SHARE * white))
         lay_over(levels, overlay, patch, line, self.cross_px)
         return levels

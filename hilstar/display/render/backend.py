@@ -6,6 +6,7 @@ OpenGL.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
@@ -20,7 +21,7 @@ from hilstar.display.response import Levels
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import Psf
 from hilstar.optics.scan import Orientation
-from hilstar.optics.sprites import FrameLight, by_channel, by_primary, without_stars
+from hilstar.optics.sprites import FrameLight, by_channel, without_stars
 from hilstar.sky.stars import Stars
 
 if TYPE_CHECKING:
@@ -64,6 +65,12 @@ class Backend(ABC):
     path: Path
     context: "Context | None"
 
+    def __init__(self, target: Target) -> None:
+        """Raises ValueError for primaries that are driven apart: `open_backend` draws those."""
+        if target.primaries:
+            raise ValueError("a backend draws one panel; open those of primaries by open_backend")
+        self.target = target
+
     @abstractmethod
     def draw(self, sprites: FrameLight | None, frame: int = 0) -> None:
         """Draw the linear image and the levels of `sprites` (None: blank); read them with `linear`
@@ -101,9 +108,12 @@ class Backend(ABC):
         """
 
     @abstractmethod
-    def show_on(self, view: ScreenView) -> None:
+    def show_on(self, view: ScreenView, beside: "Sequence[Backend]" = ()) -> None:
         """Present frames on this screen from now on: by OpenGL that of the window whose context
         it draws in.
+
+        With two others `beside` it, of the same kind, its levels are red's, and theirs are green's
+        and blue's.
         """
 
     @abstractmethod
@@ -168,13 +178,6 @@ def as_maps(sprites: FrameLight | None, target: Target) -> FrameLight | None:
     psf = target.psf
     if sprites is None or sprites.spectra is None or not psf.by_colour:
         return sprites
-    if sprites.primaries is not None:
-        parts = (
-            as_maps(by_primary(sprites, target.places_px, k), target)
-            for k in range(len(target.primaries))
-        )
-        lights = tuple(() if part is None else part.extended for part in parts)
-        return replace(without_stars(sprites), extended=lights[0], lights=lights)
     rates = sprites.data["electrons_per_s"]
     at_px = sprites.x_px, sprites.y_px
     light = psf.image(*at_px, sprites.spectra, rates, target.resolution_px)

@@ -30,6 +30,7 @@ WORTH_A_GROUP_PX = 4096
 MAX_LISTED = 1 / 16
 LEAST_PX = 1e-6  # as in splat.frag
 MARGIN_PX = 0.001  # as in star.vert
+ROUNDED_DOWN = 1 - 1e-6  # float32 light times gain may be rounded up to the first threshold
 NOWHERE: IntArray = np.empty(0, dtype=np.intp)
 
 
@@ -100,10 +101,12 @@ def _places(
     """
     width, height = resolution_px
     step = np.arange(side) - (side - 1) // 2
-    place = np.add.outer(width * step, step).reshape(-1, 1) + (y * width + x)
+    in_square = np.add.outer(width * step, step).reshape(-1, 1)
+    place = in_square + (y * width + x)
     low = step[0]
     high = step[-1]
-    is_cut = (x + low < 0) | (x + high >= width) | (y + low < 0) | (y + high >= height)
+    is_cut = (x + low < 0) | (x + high >= width)
+    is_cut |= (y + low < 0) | (y + high >= height)
     if not is_cut.any():
         return place, None
     cut = np.flatnonzero(is_cut)
@@ -120,10 +123,10 @@ def _places(
 class CpuStars:
     """Draws stars into pixels' sums and levels, in memory that is given or its own.
 
-    `levels` (height, width, components) are black at first; the sums of the planes of a pixel lie
-    beside each other. They stay for `exact` to look at: `unit_e_per_s` are their units. Where a
-    frame has a floor, its stars are added to those levels in light. `least_side_px` is the smallest
-    square that a star has, for what else may be lit about it.
+    `levels` (height, width) are black at first. The sums stay for `exact` to look at:
+    `unit_e_per_s` is their unit. Where a frame has a floor, its stars are added to those levels in
+    light. `least_side_px` is the smallest square that a star has, for what else may be lit about
+    it.
     """
 
     def __init__(
@@ -136,28 +139,23 @@ class CpuStars:
         self._units = units
         self._size_px = units.size_px
         self._psf = units.psf
-        planes = self._planes = units.planes
+        panel = units.panel
         self._least_side_px = least_side_px
-        self._count = len(planes.panels)
-        self._levels = levels.reshape(-1, levels.shape[-1])
-        pixels = math.prod(self._size_px)
+        self._levels = levels.reshape(-1)
         if sums is None:
-            whole = np.zeros(pixels * self._count, dtype=np.int32)
+            self._whole_sums = np.zeros(math.prod(self._size_px), dtype=np.int32)
         else:
-            whole = sums
-        self._whole_sums = whole.reshape(pixels, self._count)
+            self._whole_sums = sums
         self._fine_sums: npt.NDArray[np.float64] | None = None  # where an int32 is too small
         self._sums: npt.NDArray[Any] = self._whole_sums  # the last frame's
         self.unit_e_per_s = units.most_e_per_s
-        gain = planes.panels[0].gain()
+        gain = panel.gain()
         self._gain = None if gain is None else gain.ravel()
         self._most_gain = 1.0 if gain is None else float(gain.max())
-        edges = [RoundQuantiser.edges_e_per_s(panel) for panel in planes.panels]
-        self._counters = [ThresholdCounter(thresholds) for thresholds in edges]
-        lowest = [float(thresholds[0]) for thresholds in edges]
-        self._dark_e_per_s = [light / self._most_gain * (1 - 1e-6) for light in lowest]
-        self._level_light = planes.panels[0].light_e_per_s()
-        self._margin_px = np.array(planes.margin_px, dtype=np.float32)
+        thresholds = RoundQuantiser.edges_e_per_s(panel)
+        self._counter = ThresholdCounter(thresholds)
+        self._dark_e_per_s = float(thresholds[0]) / self._most_gain * ROUNDED_DOWN
+        self._level_light = panel.light_e_per_s()
         self._axes_px2 = np.array(units.axes_px2, dtype=np.float32)
         self._drawn: IntArray | None = None  # places of the last frame's squares; None: anywhere
         self._on_floor = False
@@ -178,19 +176,20 @@ class CpuStars:
             _blacken(image, drawn)
         self._on_floor = floor is not None
         if floor is not None:
-            self._levels[:, 0] = floor.ravel()
+            self._levels[:] = floor.ravel()
         self._drawn = NOWHERE
 
     def _images(self) -> list[npt.NDArray[Any]]:
+        """The levels and the sums, which a frame changes in the same places."""
         if self._fine_sums is None:
             fine = []
         else:
             fine = [self._fine_sums]
         return [self._levels, self._whole_sums, *fine]
 
-    def add(self, sprites: FrameLight, unit_e_per_s: list[float] | None) -> None:
-        """Add the light of `sprites` to the sums, after `lay`: in these units of each plane (see
-        `LightUnits`), or where an int32 is too small for them (None) in finer ones.
+    def add(self, sprites: FrameLight, unit_e_per_s: float | None) -> None:
+        """Add the light of `sprites` to the sums, after `lay`: in this unit (see `LightUnits`), or
+        where an int32 is too small for it (None) in a finer one.
         """
         if unit_e_per_s is None:
             self.unit_e_per_s, self._sums = self._units.fine_unit_for(sprites), self._fine()
@@ -198,7 +197,7 @@ class CpuStars:
             self.unit_e_per_s, self._sums = unit_e_per_s, self._whole_sums
         reach_px = self._reach_px(sprites)
         side_px = self._sides_px(reach_px)
-        rates = self._rates(sprites)
+        rates = sprites.data["electrons_per_s"] * np.float32(1 / self.unit_e_per_s)
         is_listed = int((side_px**2).sum()) <= MAX_LISTED * len(self._levels)
         places = []
         for squares in squares_of(sprites, side_px, self._size_px):
@@ -206,11 +205,6 @@ class CpuStars:
             if is_listed:
                 places.append(squares.place.ravel())
         self._drawn = np.concatenate([NOWHERE, *places]) if is_listed else None
-
-    def encode(self) -> None:
-        """Make levels of the sums, the nearest."""
-        for plane in range(self._count):
-            self._encode(plane)
 
     def _fine(self) -> npt.NDArray[np.float64]:
         """The sums in finer units; a frame that needs them is rare."""
@@ -220,8 +214,8 @@ class CpuStars:
 
     def _sides_px(self, reach_px: Float32Array) -> IntArray:
         """The sides (n,) of the squares about ellipses of half axes (2, n), as in star.vert."""
-        away_px = (reach_px + self._margin_px[:, None]).max(axis=0) + np.float32(MARGIN_PX)
-        if self._planes.footprint_px % 2:
+        away_px = reach_px.max(axis=0) + np.float32(MARGIN_PX)
+        if self._psf.footprint_px % 2:
             around = 2 * (away_px + np.float32(0.5)).astype(np.intp) + 1
         else:
             around = 2 * away_px.astype(np.intp) + 2
@@ -234,51 +228,34 @@ class CpuStars:
         squares = np.log(np.maximum(lit, np.float32(1)))
         return np.sqrt(squares * self._axes_px2[:, None])
 
-    def _rates(self, sprites: FrameLight) -> list[Float32Array]:
-        """The rates (n,) of sprites in the units of each plane."""
-        if self._planes.apart:
-            light = list(sprites.data["primaries_e_per_s"].T)
-        else:
-            light = [sprites.data["electrons_per_s"]]
-        units = zip(light, self.unit_e_per_s, strict=True)
-        return [rate * np.float32(1 / unit_e_per_s) for rate, unit_e_per_s in units]
-
-    def _add(self, squares: Squares, rates: list[Float32Array], reach_px: Float32Array) -> None:
-        """Add the light of the stars of squares, which reaches so far, to their pixels' sums."""
+    def _add(self, squares: Squares, rates: Float32Array, reach_px: Float32Array) -> None:
+        """Add the light of the stars of squares, which reaches so far, to their pixels' sums;
+        `rates` (n,) are all sprites', in units.
+        """
         is_lit = self._within_reach(squares, reach_px)
         if squares.on_image is not None:
             is_lit &= squares.on_image
-        flat = self._sums.reshape(-1)
-        place = squares.place.ravel()
-        for plane, rate in enumerate(rates):
-            fraction_px = squares.fraction_px
-            if self._planes.apart:
-                fraction_px = fraction_px - np.array([self._planes.places_px[plane]], np.float32).T
-            units = self._psf.drawn_stamps(
-                fraction_px, rate[squares.some], squares.side_px, self._planes.footprint_px
-            )
-            most = self._units.most_e_per_s[plane] / self.unit_e_per_s[plane]
-            np.minimum(units, np.float32(most), out=units)
-            units *= is_lit
-            units += np.float32(0.5)
-            added = units.astype(flat.dtype)
-            if self._count == 1:
-                where = place
-            else:
-                where = place * self._count + plane
-            np.add.at(flat, where, added.ravel())
+        units = self._psf.drawn_stamps(
+            squares.fraction_px, rates[squares.some], squares.side_px, self._psf.footprint_px
+        )
+        most = self._units.most_e_per_s / self.unit_e_per_s
+        np.minimum(units, np.float32(most), out=units)
+        units *= is_lit
+        units += np.float32(0.5)
+        added = units.astype(self._sums.dtype)
+        np.add.at(self._sums, squares.place.ravel(), added.ravel())
 
     def _within_reach(self, squares: Squares, reach_px: Float32Array) -> BoolArray:
         """Which pixels (side, side, n) of squares lie within their stars' ellipses, as in
         splat.frag.
         """
-        away = squares.offset_px[:, None]
-        away_x, away_y = (np.abs(away - at) for at in squares.fraction_px)
-        margin_x, margin_y = self._margin_px
-        up = np.maximum(away_y - margin_y, np.float32(0))
-        up /= np.maximum(reach_px[1], np.float32(LEAST_PX))
-        wide = reach_px[0] * np.sqrt(np.maximum(1 - up * up, np.float32(0))) + margin_x
-        wide[away_y > reach_px[1] + margin_y] = -1.0
+        offset_px = squares.offset_px[:, None]
+        x_px, y_px = squares.fraction_px
+        away_x = np.abs(offset_px - x_px)
+        away_y = np.abs(offset_px - y_px)
+        up = away_y / np.maximum(reach_px[1], np.float32(LEAST_PX))
+        wide = reach_px[0] * np.sqrt(np.maximum(1 - up * up, np.float32(0)))
+        wide[away_y > reach_px[1]] = -1.0
         is_lit = np.asarray(away_x <= wide[:, None])
         beyond = (squares.side_px - self._units.side_px) // 2
         if beyond > 0:  # the square is wider than the sprite, for what `exact` may light
@@ -287,14 +264,13 @@ class CpuStars:
             is_lit &= inside[:, None, None] & inside[:, None]
         return is_lit
 
-    def _encode(self, plane: int) -> None:
-        """Make levels of a plane's sums where they light a pixel."""
-        sums = self._sums[:, plane]
-        unit_e_per_s = self.unit_e_per_s[plane]
+    def encode(self) -> None:
+        """Make levels of the sums, the nearest, where they light a pixel."""
+        sums = self._sums
         if self._on_floor:
             least = 1
         else:
-            least = max(1, int(self._dark_e_per_s[plane] / unit_e_per_s))
+            least = max(1, int(self._dark_e_per_s / self.unit_e_per_s))
         if self._drawn is None:
             place = np.flatnonzero(sums >= least)
             lit = sums[place]
@@ -303,22 +279,20 @@ class CpuStars:
             is_lit = np.flatnonzero(every >= least)
             place = self._drawn[is_lit]
             lit = every[is_lit]
-        light = lit.astype(np.float32) * np.float32(unit_e_per_s)
+        light = lit.astype(np.float32) * np.float32(self.unit_e_per_s)
         if self._gain is not None:
             light *= self._gain[place]
-        levels = self._levels[:, plane]
         if self._on_floor:
-            light += self._level_light[levels[place]]
-        levels[place] = self._counters[plane].count(light)
+            light += self._level_light[self._levels[place]]
+        self._levels[place] = self._counter.count(light)
 
 
 def _blacken(image: npt.NDArray[Any], place: IntArray | None) -> None:
-    """Make an image (pixels, planes) black at these places; None for everywhere."""
+    """Make an image (pixels,) black at these places; None for everywhere."""
     if place is None:
         image.fill(0)
-        return
-    for plane in range(image.shape[1]):  # both indices at once take twice as long
-        image[:, plane][place] = 0
+    else:
+        image[place] = 0
 
 
 class CpuImage:
@@ -340,7 +314,7 @@ class CpuImage:
         """Draw the light of sprites (None: none) in place of the last ones', within squares of
         these sides (n,), by default all of their footprints.
         """
-        _blacken(self._light[:, None], self._drawn)
+        _blacken(self._light, self._drawn)
         self._drawn = NOWHERE
         if sprites is None or not len(sprites):
             return

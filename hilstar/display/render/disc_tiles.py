@@ -10,7 +10,9 @@ sprites and edges: other tiles are drawn as levels, tiles over white as one leve
 the first level not at all (`Sure`).
 """
 
+import math
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 
@@ -62,16 +64,19 @@ class Sure:
         darkest = np.minimum.reduce(corners)
         return darkest > times * self.white_e_per_s, brightest * times < self.dark_e_per_s
 
-    def apart(self, left: int, top: int, rows: int, columns: int) -> BoolArray:
+    def apart(self, corner_px: tuple[int, int], shape: tuple[int, ...]) -> BoolArray:
         """Which tiles (rows, columns) from a corner of the image on have no sprite's light."""
+        rows, columns = shape
+        # one row and column more, for sprites off the tiles
         apart = np.ones((rows + 1, columns + 1), dtype=np.bool_)
         reach = self.reach_px
-        for across in range(-reach, reach + TILE_PX, TILE_PX):
-            for down in range(-reach, reach + TILE_PX, TILE_PX):
-                away = min(across, reach) - left, min(down, reach) - top
-                column, row = np.clip((self.sprites_px + away) // TILE_PX, -1, (columns, rows)).T
-                # those off the tiles in a row or column that is not used
-                apart[row, column] = False
+        # a tile's side is the largest step that passes over no tile
+        steps_px = range(-reach, reach + TILE_PX, TILE_PX)
+        for across, down in product(steps_px, steps_px):
+            away = min(across, reach) - corner_px[0], min(down, reach) - corner_px[1]
+            tile = (self.sprites_px + away) // TILE_PX
+            column, row = np.clip(tile, -1, (columns, rows)).T
+            apart[row, column] = False
         return apart[:-1, :-1]
 
 
@@ -117,69 +122,95 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
     """The tiles of a disc in a rectangle of its image; None where the rectangle has fewer than
     MIN_TILED_PX pixels.
     """
-    left, top, width, height = region
+    first_x, first_y, width, height = region
     if width * height < MIN_TILED_PX:
         return None
-    x, y = (
-        begin + TILE_PX * np.arange(-1, -(-size // TILE_PX) + 2)
-        for begin, size in ((left, width), (top, height))
-    )
-    whole = _lattice(light, np.stack(np.meshgrid(x, y), axis=-1).astype(np.float64), TILE_PX)
+    x = first_x + _nodes_px(width)
+    y = first_y + _nodes_px(height)
+    places = np.stack(np.meshgrid(x, y), axis=-1)
+    whole = _lattice(light, places.astype(np.float64), TILE_PX)
     drawn = ~whole.is_beside
     white = np.zeros_like(whole.is_face)
     apart = white
     if sure is not None:
         smooth = whole.is_inside | whole.is_air
         white, dark = sure.levels(whole.e_per_s, smooth)
-        apart = sure.apart(left, top, *white.shape)
+        apart = sure.apart((first_x, first_y), white.shape)
         # A limb may bulge into a tile between its corners, but not without a corner of a tile
         # beside it.
-        around = _all(_all(np.pad(dark, 1, constant_values=True)))
-        drawn &= ~(apart & dark & (smooth | around))
-    some = np.argwhere(drawn)
-    of_air = (light.disc.distance_radii, light.disc.air_radii, light.disc.slant_depth, whole.spread)
-    if not len(some):
+        is_dark_around = _all(_all(np.pad(dark, 1, constant_values=True)))
+        is_black = dark & (smooth | is_dark_around)
+        drawn &= ~(apart & is_black)
+    disc = light.disc
+    of_air = disc.distance_radii, disc.air_radii, disc.slant_depth, whole.spread
+    inner = _inner(region, drawn)
+    if inner is None:
         return Tiles(
-            (left, top, 0, 0), NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, NOTHING, of_air
+            (first_x, first_y, 0, 0),
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            NOTHING,
+            of_air,
         )
-    (first_y, first_x), (last_y, last_x) = (
-        some.min(axis=0) * TILE_PX,
-        (some.max(axis=0) + 1) * TILE_PX,
-    )
-    inner = (
-        left + first_x,
-        top + first_y,
-        min(width, last_x) - first_x,
-        min(height, last_y) - first_y,
-    )
     drawn &= ~white
     # Tiles at the edges in parts: in the linear image, for their sprites and rays are encoded tile
     # by tile.
     steps = np.arange(-FINE_PX, TILE_PX + FINE_PX + 1, FINE_PX)
-    edges = whole.face[:-1, :-1, :2][drawn & ~whole.is_inside & ~whole.is_air]
-    fine = _lattice(
-        light, edges[:, None, None] + np.stack(np.meshgrid(steps, steps), axis=-1), FINE_PX
-    )
-    if sure is None:
-        fine_white = np.zeros_like(fine.is_face)
-    else:
-        fine_white = sure.levels(fine.e_per_s, fine.is_inside | fine.is_air)[0]
+    parts = np.stack(np.meshgrid(steps, steps), axis=-1)
+    is_edge = drawn & ~whole.is_inside & ~whole.is_air
+    corners = whole.face[:-1, :-1, :2][is_edge]
+    fine = _lattice(light, corners[:, None, None] + parts, FINE_PX)
+    fine_white = np.zeros_like(fine.is_face)
+    if sure is not None:
+        fine_white, _ = sure.levels(fine.e_per_s, fine.is_inside | fine.is_air)
+    fine_edges = ~fine.is_inside & ~fine.is_air & ~fine.is_beside & ~fine_white
     fine_inside = fine.is_inside & ~fine_white
     fine_air = fine.is_air & ~fine_white
     face = whole.is_face & drawn
     inside = whole.is_inside & drawn & ~whole.is_face
     air = whole.is_air & drawn
+    of_large = {
+        "air": _corners(whole.air, air & ~apart),
+        "inside": _corners(whole.face, inside),
+        "white": _runs(x[1:-1], y[1:-1], white),
+    }
+    of_fine = {
+        "air": _corners(fine.air, fine_air),
+        "inside": _corners(fine.face, fine_inside),
+        "white": _corners(fine.face, fine_white),
+    }
     return Tiles(
-        (int(inner[0]), int(inner[1]), int(inner[2]), int(inner[3])),
-        _corners(whole.face, face & ~apart),
-        np.concatenate([_corners(whole.air, air & ~apart), _corners(fine.air, fine_air)]),
-        np.concatenate([_corners(whole.face, inside), _corners(fine.face, fine_inside)]),
-        _corners(fine.face, ~fine.is_inside & ~fine.is_air & ~fine.is_beside & ~fine_white),
-        np.concatenate([_runs(x[1:-1], y[1:-1], white), _corners(fine.face, fine_white)]),
-        _corners(whole.face, face & apart),
-        _corners(whole.air, air & apart),
-        of_air,
+        region=inner,
+        face=_corners(whole.face, face & ~apart),
+        edges=_corners(fine.face, fine_edges),
+        face_levels=_corners(whole.face, face & apart),
+        air_levels=_corners(whole.air, air & apart),
+        of_air=of_air,
+        **{kind: np.concatenate([of_large[kind], of_fine[kind]]) for kind in of_large},
     )
+
+
+def _nodes_px(size_px: int) -> IntArray:
+    """Nodes of tiles along an axis from a rectangle's first pixel, with a tile beyond both ends."""
+    count = math.ceil(size_px / TILE_PX)
+    return TILE_PX * np.arange(-1, count + 2)
+
+
+def _inner(region: Rectangle, drawn: BoolArray) -> Rectangle | None:
+    """The part of a rectangle within which its tiles (rows, columns) are `drawn`; None for none."""
+    places = np.argwhere(drawn)
+    if not len(places):
+        return None
+    x, y, width, height = region
+    first_y, first_x = (places.min(axis=0) * TILE_PX).tolist()
+    end_y, end_x = ((places.max(axis=0) + 1) * TILE_PX).tolist()
+    inner_width = min(width, end_x) - first_x
+    inner_height = min(height, end_y) - first_y
+    return x + first_x, y + first_y, inner_width, inner_height
 
 
 def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
@@ -187,62 +218,81 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     them, but for the outer ones.
     """
     disc = light.disc
-    px_per_rad = light.camera.scales_px_rad()[0]
-    sigma_px = max(light.psf.variance_px2) ** 0.5
+    px_per_rad, *_ = light.camera.scales_px_rad()
+    reach_px = REACH_SIGMAS * max(light.psf.variance_px2) ** 0.5
     shape = places.shape[:-1]
     distance = disc.distance_radii
     rays, sr = _rays(light, places.reshape(-1, 2))
     directions = rays @ light.icrs_to_image
     on_sphere = directions @ disc.to_sphere.T
     impact = disc.impact(directions).reshape(shape)
-    face = (disc.radiance(directions) * sr * light.times).reshape(shape)
+    radiance = disc.radiance(directions)
+    face = (radiance * sr * light.times).reshape(shape)
     # Corners so far away that neither the disc, its air nor the Gaussian reaches their tiles
-    angle = np.arctan2(np.hypot(on_sphere[:, 0], on_sphere[:, 1]), on_sphere[:, 2]).reshape(shape)
-    rim = np.arcsin(min(1.0, (1 + AIR_TOP * disc.air_radii) / distance))
-    beside = _all(
-        angle > rim + WIDER * (size_px * np.sqrt(2) + REACH_SIGMAS * sigma_px) / px_per_rad
-    )
+    x, y, z = on_sphere.T
+    angle_rad = np.arctan2(np.hypot(x, y), z).reshape(shape)
+    rim_radii = 1 + AIR_TOP * disc.air_radii
+    rim_rad = np.arcsin(min(1.0, rim_radii / distance))
+    diagonal_px = size_px * np.sqrt(2)
+    beside = _all(angle_rad > rim_rad + WIDER * (diagonal_px + reach_px) / px_per_rad)
     # Tiles far enough within the limb, and off the terminator where that would be seen. A face's
     # height over the plane of its limb goes as the root of 1 - impact^2, whose second derivative is
     # its power -3/2.
-    inside, lit = np.minimum(impact, 1.0), face > 0  # NaN stays
-    radii_per_px = np.sqrt(np.maximum(distance**2 - inside**2, 0.0)) / px_per_rad
+    inside = np.minimum(impact, 1.0)  # NaN stays
+    lit = face > 0
+    away_radii = np.sqrt(np.maximum(distance**2 - inside**2, 0.0))
+    radii_per_px = away_radii / px_per_rad
     # the Gaussian's reach, radii
-    margin = REACH_SIGMAS * sigma_px * np.minimum(WIDER * radii_per_px, distance / px_per_rad)
-    most = (
-        (size_px * radii_per_px) ** 2
-        / 8
-        * (disc.normal_e_per_s_sr * light.times * sr).reshape(shape)
-    )
-    is_inside = _all((impact < 1 - margin) & (radii_per_px * LARGE_PX < 1)) & ~beside
+    margin = reach_px * np.minimum(WIDER * radii_per_px, distance / px_per_rad)
+    largest = (disc.normal_e_per_s_sr * light.times * sr).reshape(shape)
+    bulge = (size_px * radii_per_px) ** 2 / 8 * largest
+    is_far_within = (impact < 1 - margin) & (radii_per_px * LARGE_PX < 1)
+    is_inside = _all(is_far_within) & ~beside
     is_inside[..., 1:-1, 1:-1] &= _even(lit)
-    is_face = _all(SMOOTH * face * (1 - inside**2) ** 1.5 >= most * lit) & is_inside
+    is_smooth = SMOOTH * face * (1 - inside**2) ** 1.5 >= bulge * lit
+    is_face = _all(is_smooth) & is_inside
     is_air = np.zeros_like(is_face)
     touched = np.zeros_like(face)
     hidden = np.zeros_like(face)
     spread = 0.0
     if disc.air is not None and distance > 1:
-        touched = (disc.touched_light(directions) * sr * light.times).reshape(shape)
-        hidden = -np.expm1(
-            -disc.slant_depth * np.exp(-np.maximum(impact - 1, 0.0) / disc.air_radii)
-        )
-        # The variances of the Gaussian in scale heights: half of their mean by tile.glsl, and what
-        # it leaves out.
-        along_x, along_y = (
-            np.array(light.psf.variance_px2)
-            * (distance**2 - 1)
-            / (disc.air_radii * px_per_rad) ** 2
-        )
-        spread = (along_x + along_y) / 4
-        if abs(along_x - along_y) / 4 + max(along_x, along_y) ** 2 / 8 < SPREAD:
+        touched_light = disc.touched_light(directions)
+        touched = (touched_light * sr * light.times).reshape(shape)
+        height = np.maximum(impact - 1, 0.0) / disc.air_radii
+        hidden = -np.expm1(-disc.slant_depth * np.exp(-height))
+        spread, omitted = _spread_of_air(light, px_per_rad)
+        if omitted < SPREAD:
             is_air = _all(impact > 1 + margin) & ~beside
             is_air[..., 1:-1, 1:-1] &= _even(touched > 0)
-    of_face = np.concatenate([places, face[..., None], np.ones((*shape, 3))], axis=-1)
-    of_air = np.concatenate([places, touched[..., None], on_sphere.reshape(*shape, 3)], axis=-1)
+    cover = np.ones((*shape, 3))
+    of_face = np.concatenate([places, face[..., None], cover], axis=-1)
+    rays_on_sphere = on_sphere.reshape(*shape, 3)
+    of_air = np.concatenate([places, touched[..., None], rays_on_sphere], axis=-1)
     e_per_s = np.where(impact < 1, face, touched * hidden)
     inner = (..., slice(1, -1), slice(1, -1))
-    masks = is_face[inner], is_inside[inner], is_air[inner], beside[inner]
-    return _Lattice(of_face[*inner, :], of_air[*inner, :], e_per_s[inner], *masks, spread)
+    return _Lattice(
+        face=of_face[*inner, :],
+        air=of_air[*inner, :],
+        e_per_s=e_per_s[inner],
+        is_face=is_face[inner],
+        is_inside=is_inside[inner],
+        is_air=is_air[inner],
+        is_beside=beside[inner],
+        spread=spread,
+    )
+
+
+def _spread_of_air(light: DiscLight, px_per_rad: float) -> tuple[float, float]:
+    """By what share the Gaussian raises air's light by tile.glsl, and what share that omits.
+
+    The one is half of the mean of the Gaussian's variances along x and y in scale heights.
+    """
+    disc = light.disc
+    scale_px = disc.air_radii * px_per_rad
+    variance_px2 = np.array(light.psf.variance_px2)
+    along_x, along_y = variance_px2 * (disc.distance_radii**2 - 1) / scale_px**2
+    omitted = abs(along_x - along_y) / 4 + max(along_x, along_y) ** 2 / 8
+    return float(along_x + along_y) / 4, float(omitted)
 
 
 def _rays(light: DiscLight, places: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -253,11 +303,12 @@ def _rays(light: DiscLight, places: FloatArray) -> tuple[FloatArray, FloatArray]
     u, v = light.camera.tangents(x_px, y_px)
     rays = np.stack([u, v, np.ones_like(u)], axis=1)
     if light.shear is not None:
-        rays += light.shear.late_s(x_px, y_px)[:, None] * np.cross(
-            light.shear.rate_image_rad_s, rays
-        )
+        late_s = light.shear.late_s(x_px, y_px)
+        rays += late_s[:, None] * np.cross(light.shear.rate_image_rad_s, rays)
     a, b, c, d = light.camera.slopes(u, v)
-    return rays, 1 / ((a * d - b * c) * np.linalg.norm(rays, axis=1) ** 3)
+    px_per_tangents = a * d - b * c
+    distance = np.linalg.norm(rays, axis=1)
+    return rays, 1 / (px_per_tangents * distance**3)
 
 
 def _all(nodes: BoolArray) -> BoolArray:
@@ -269,7 +320,9 @@ def _even(nodes: BoolArray) -> BoolArray:
     """Which tiles but the outer ones are alike, true or not, at all corners and those of the
     tiles beside them.
     """
-    return np.logical_or(*(_all(_all(_all(alike))) for alike in (nodes, ~nodes)))
+    is_lit = _all(_all(_all(nodes)))
+    is_dark = _all(_all(_all(~nodes)))
+    return np.asarray(is_lit | is_dark)
 
 
 def _corners(nodes: FloatArray, tiles: BoolArray) -> Float32Array:
@@ -278,10 +331,12 @@ def _corners(nodes: FloatArray, tiles: BoolArray) -> Float32Array:
     """
     if not tiles.any():
         return NOTHING
-    size = nodes.shape[-3] - 1, nodes.shape[-2] - 1
+    rows = nodes.shape[-3] - 1
+    columns = nodes.shape[-2] - 1
     parts = []
     for row, column in CORNERS:
-        parts.append(nodes[..., row : row + size[0], column : column + size[1], :][tiles])
+        corners = nodes[..., row : row + rows, column : column + columns, :]
+        parts.append(corners[tiles])
     return np.stack(parts, axis=-2).reshape(-1, 6).astype(np.float32)
 
 
@@ -289,8 +344,10 @@ def _runs(x: IntArray, y: IntArray, tiles: BoolArray) -> Float32Array:
     """The corners of tiles (rows, columns) between `x` and `y`, as one that follow each other in
     a row, or equal rows.
     """
-    row, begin = np.nonzero(np.diff(tiles, axis=1, prepend=False) & tiles)
-    end = np.nonzero(np.diff(tiles, axis=1, append=False) & tiles)[1] + 1
+    is_begin = np.diff(tiles, axis=1, prepend=False) & tiles
+    is_end = np.diff(tiles, axis=1, append=False) & tiles
+    row, begin = np.nonzero(is_begin)
+    end = np.nonzero(is_end)[1] + 1
     order = np.lexsort((row, end, begin))
     row = row[order]
     begin = begin[order]
@@ -298,8 +355,10 @@ def _runs(x: IntArray, y: IntArray, tiles: BoolArray) -> Float32Array:
     goes_on = (np.diff(begin) == 0) & (np.diff(end) == 0) & (np.diff(row) == 1)
     first = np.append(True, ~goes_on)[: len(row)]
     last = np.append(~goes_on, True)[: len(row)]
-    sides = (y[row[first]], y[row[last] + 1]), (x[begin[first]], x[end[first]])
+    rows_px = y[row[first]], y[row[last] + 1]
+    columns_px = x[begin[first]], x[end[first]]
+    unused = [np.zeros(first.sum())] * 4
     places = []
     for j, k in CORNERS:
-        places.append(np.stack([sides[1][k], sides[0][j], *[np.zeros(first.sum())] * 4], axis=-1))
+        places.append(np.stack([columns_px[k], rows_px[j], *unused], axis=-1))
     return np.stack(places, axis=-2).reshape(-1, 6).astype(np.float32)

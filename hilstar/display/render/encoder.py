@@ -1,8 +1,5 @@
 """Programs of shaders/, a PSF for them, and the pass that makes levels of a linear image by
 counting thresholds.
-
-Primaries that are driven apart are planes of one image, whose pixels and sprites have the light of
-each (`Planes`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,11 +17,11 @@ from hilstar.basics.resources import resource_path
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import PixelQuantiser, code_table, level_dtype
 from hilstar.display.render.context import is_software, pinned, shares_memory
-from hilstar.display.render.target import MAX_SIDES, Planes, SpriteSide, SpriteSides
-from hilstar.display.response import Levels
+from hilstar.display.render.target import MAX_SIDES, SpriteSide, SpriteSides
+from hilstar.display.response import Levels, Response
 from hilstar.optics.extended import Rectangle
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import FrameLight
+from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
 
 if TYPE_CHECKING:
     from hilstar.display.render.disc_tiles import Tiles
@@ -33,8 +30,8 @@ TABLE_WIDTH = 1024  # that of encode.frag
 _shader = cache(lambda name: resource_path("shaders", name).read_text())
 TABLE_UNIT = 15  # the last texture unit that every OpenGL has: nothing else takes it
 MAX_RATE = 3e38  # in float32
-# star.vert's
-INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f", "primaries_e_per_s": "3f"}
+# star.vert's, in the order of SPRITE_DTYPE
+INPUTS = {"pixel": "2i", "fraction_px": "2f", "electrons_per_s": "1f"}
 # cost of a pixel under a sprite, in pixels of a pass over the whole image (llvmpipe, sprites of 6
 # px)
 SPRITE_PIXEL_COST = 4
@@ -46,6 +43,7 @@ MAX_ERASED_REGION = 0.25  # as much of rectangles, which sprites' overheads do n
 # ms.
 MAX_ERASED_BY_CARD = 1.0
 IMAGES_VERSION = 420  # the OpenGL that has images in shaders
+STEPS_BLOCK, EDGES_BLOCK = 0, 1  # uniform blocks of encode.frag
 # A level is missed only where the wings of more stars than this meet outside all of their own
 # squares (see `lit_sides`).
 MEETING_WINGS = 16
@@ -105,19 +103,6 @@ def set_uniforms(
             program[name] = value
 
 
-def set_planes(
-    planes: Planes, program: moderngl.Program | moderngl.ComputeShader, **values: Sequence[Any]
-) -> None:
-    """Set the uniforms of a program: `values` by plane, and where planes lie; compilers drop what
-    it does not need.
-    """
-    for name, uniform in (values | {"places_px": planes.places_px}).items():
-        if name in program:  # an array ends with its last element that is used
-            length = getattr(program[name], "array_length", 1)
-            program[name] = list(uniform[:length]) if length > 1 else uniform[0]
-    set_uniforms(program, {"margin_px": planes.margin_px})
-
-
 class Shares:
     """The defines, uniforms and table of a PSF for programs with shares.glsl. It lives in its
     renderer's context.
@@ -147,28 +132,24 @@ def splat_program(
     ctx: moderngl.Context,
     resolution_px: tuple[int, int],
     shares: Shares,
-    planes: Planes,
     in_units: bool = False,
 ) -> moderngl.Program:
     """The program of star.vert and splat.frag; `in_units` draws light in the whole units of a
     LightUnits.
     """
-    defines = (*planes.defines, *shares.defines, *["UNITS"] * in_units)
-    program = build_program(ctx, "star.vert", "splat.frag", defines, ("planes.glsl", "shares.glsl"))
+    defines = (*shares.defines, *["UNITS"] * in_units)
+    program = build_program(ctx, "star.vert", "splat.frag", defines, ("shares.glsl",))
     shares.set(program)
-    set_planes(planes, program)
     program["resolution_px"] = resolution_px
     program["footprint_px"] = shares.footprint_px
     return program
 
 
-def sprites_array(
-    program: moderngl.Program, buffer: moderngl.Buffer, planes: Planes
-) -> moderngl.VertexArray:
+def sprites_array(program: moderngl.Program, buffer: moderngl.Buffer) -> moderngl.VertexArray:
     """A vertex array of what a program of star.vert asks of sprites in a buffer."""
     layout = []
     names = []
-    for name in planes.dtype.names or ():
+    for name in SPRITE_DTYPE.names or ():
         form = INPUTS[name]
         if name in program:
             layout.append(form)
@@ -176,6 +157,14 @@ def sprites_array(
         else:
             layout.append(f"{4 * int(form[0])}x")  # bytes that this program does not read
     return program.ctx.vertex_array(program, [(buffer, " ".join(layout), *names)])
+
+
+def viewport_of_sprites(size_px: tuple[int, int], footprint_px: int) -> Rectangle:
+    """The viewport of star.vert: a footprint beyond every edge, for GL drops a point whose centre
+    is outside it.
+    """
+    width, height = size_px
+    return -footprint_px, -footprint_px, width + 2 * footprint_px, height + 2 * footprint_px
 
 
 def set_sides(program: moderngl.Program, sides: SpriteSides) -> None:
@@ -205,8 +194,11 @@ def lit_sides(
         light = lit_e_per_s / float(gain.max())
     sizes = range(psf.footprint_px - 2, 0, -2)
     every = -(-len(sizes) // MAX_SIDES) or 1
-    rates = {size: light / wings / psf.outside_share(size) for size in sizes[::every]}
-    return tuple(SpriteSide(min(rate, MAX_RATE), size) for size, rate in rates.items())
+    sides = []
+    for size in sizes[::every]:
+        below_e_per_s = light / wings / psf.outside_share(size)
+        sides.append(SpriteSide(min(below_e_per_s, MAX_RATE), size))
+    return tuple(sides)
 
 
 def most_covered_px(sprites: FrameLight, footprint_px: int, sides: SpriteSides, few_px: int) -> int:
@@ -233,11 +225,8 @@ class Eraser:
     its renderer's context.
     """
 
-    def __init__(
-        self, ctx: moderngl.Context, size_px: tuple[int, int], planes: Planes, of_levels: bool
-    ) -> None:
+    def __init__(self, ctx: moderngl.Context, size_px: tuple[int, int], of_levels: bool) -> None:
         self._ctx = ctx
-        self._planes = planes
         self._size_px = size_px
         max_share = MAX_ERASED_BY_CARD
         self._most_share = MAX_ERASED_BY_CARD
@@ -262,7 +251,8 @@ class Eraser:
             return
         fbo.use()
         width, height = self._size_px
-        if sum(wide * high for _, _, wide, high in regions) >= self._most_share * width * height:
+        erased_px = sum(wide * high for _, _, wide, high in regions)
+        if erased_px >= self._most_share * width * height:
             fbo.clear()
             return
         for region in regions:
@@ -273,7 +263,7 @@ class Eraser:
         """Read the places of sprites from a buffer."""
         if self._vao is not None:
             self._vao.release()
-        self._vao = sprites_array(self._program, buffer, self._planes)
+        self._vao = sprites_array(self._program, buffer)
         self._program["footprint_px"] = self._footprint_px = footprint_px
 
     def clears(self, count: int | None) -> bool:
@@ -286,13 +276,11 @@ class Eraser:
         """Make `fbo` black where the first `count` sprites of the buffer are; all of it where
         that is not known.
         """
-        width, height = self._size_px
         fbo.use()
         if self.clears(count):
             fbo.clear()
         elif count and self._vao is not None:
-            margin = self._footprint_px
-            fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
+            fbo.viewport = viewport_of_sprites(self._size_px, self._footprint_px)
             self._vao.render(moderngl.POINTS, vertices=count)
 
 
@@ -322,33 +310,21 @@ class LevelTexture:
     """The levels of the last frame on the GPU, R8UI up to 256 levels and R16UI beyond; `texture` is
     what a window shows.
 
-    Those of primaries have RGBA. It lives in its renderer's context, which is current in every
-    call.
+    It lives in its renderer's context, which is current in every call.
     """
 
     def __init__(
-        self, ctx: moderngl.Context, resolution_px: tuple[int, int], planes: Planes
+        self, ctx: moderngl.Context, resolution_px: tuple[int, int], response: Response
     ) -> None:
-        width, height = resolution_px
-        kind = level_dtype(planes.panels[0].response)
-        self._components = planes.texel
-        shape = height, width, planes.texel
+        kind = level_dtype(response)
+        shape = resolution_px[::-1]
         made: tuple[npt.NDArray[Any], moderngl.Buffer | None] = np.zeros(shape, dtype=kind), None
         self.image, self.memory = pinned(ctx, shape, kind) if shares_memory(ctx) else made
         self._dtype = f"u{self.image.itemsize}"
         bits = 8 * self.image.itemsize
-        if planes.apart:
-            self._levels = Levels(self.image[..., : len(planes.panels)])
-            levels_format = f"rgba{bits}ui"
-        else:
-            self._levels = Levels(self.image[..., 0])
-            levels_format = f"r{bits}ui"
-        self.defines = (
-            f"LEVELS_FORMAT {levels_format}",
-            f"LEVEL_BITS {bits}",
-            f"TEXEL {planes.texel}",
-        )
-        self.texture = ctx.texture(resolution_px, planes.texel, dtype=self._dtype)
+        self._levels = Levels(self.image)
+        self.defines = f"LEVELS_FORMAT r{bits}ui", f"LEVEL_BITS {bits}"
+        self.texture = ctx.texture(resolution_px, 1, dtype=self._dtype)
         self.fbo = ctx.framebuffer([self.texture])
         self.fbo.clear()
         self.in_memory = False  # whether the last levels are in the array alone
@@ -366,13 +342,9 @@ class LevelTexture:
         return self.texture
 
     def read(self) -> Levels:
-        """The levels (height, width), or of primaries (height, width, 3); the next frame
-        overwrites the same array.
-        """
+        """The levels (height, width); the next frame overwrites the same array."""
         if not self.in_memory:
-            self.fbo.read_into(
-                self.image, components=self._components, dtype=self._dtype, alignment=1
-            )
+            self.fbo.read_into(self.image, components=1, dtype=self._dtype, alignment=1)
         return self._levels
 
 
@@ -407,40 +379,6 @@ class LookupTable:
             self.buffer.bind_to_storage_buffer(self._binding)
 
 
-def joined(tables: Sequence[npt.NDArray[Any]]) -> tuple[npt.NDArray[Any], list[int]]:
-    """The tables of all planes end to end, and where each begins."""
-    return np.concatenate(tables), [0, *np.cumsum([len(table) for table in tables])[:-1].tolist()]
-
-
-def level_steps(
-    edges: Sequence[Float32Array],
-) -> tuple[npt.NDArray[Any], list[tuple[int, int, int, int]]] | None:
-    """The table of levels.glsl for planes that count these edges, and its `bins`; None where a
-    bin has several thresholds.
-    """
-    tables = [code_table(table_edges) for table_edges in edges]
-    steps = []
-    for table in tables:
-        table_steps = table.steps()
-        if table_steps is None:
-            return None
-        steps.append(table_steps)
-    joined_steps, begins = joined(steps)
-    bins = []
-    for table_edges, begin in zip(tables, begins, strict=True):
-        first = table_edges.first_bin - 1
-        end = table_edges.first_bin + len(table_edges.first_code)
-        bins.append(
-            (
-                first << table_edges.bin_shift,
-                (end << table_edges.bin_shift) - 1,
-                table_edges.bin_shift,
-                begin,
-            )
-        )
-    return joined_steps, bins
-
-
 class Encoder:
     """Draws the levels of a linear image: only the sprites' footprints where that is less work than
     the whole image.
@@ -454,68 +392,52 @@ class Encoder:
         ctx: moderngl.Context,
         linear: moderngl.Texture,
         levels: LevelTexture,
-        planes: Planes,
+        panel: Panel,
         quantiser: type[PixelQuantiser],
     ) -> None:
         self._ctx = ctx
-        self._planes = planes
         self._fbo = levels.fbo
         self._size_px = linear.size
         self._footprint_px = 0
-        gain = planes.panels[0].gain()
+        gain = panel.gain()
         rises = quantiser.shader
-        defines = [*planes.defines, *["RISES"] * bool(rises), *["UNIFORMITY"] * (gain is not None)]
-        edges = [quantiser.edges_e_per_s(panel) for panel in planes.panels]
-        table = level_steps(edges)
-        steps = None
-        if table is not None:
-            steps = table_rows(table[0], ctx)
-            row_count = 0 if steps is None else len(steps)
-            defines.append(f"STEPS {row_count}")
+        defines = [*["RISES"] * bool(rises), *["UNIFORMITY"] * (gain is not None)]
         self._linear_image = linear if ctx.version_code >= IMAGES_VERSION else None
-        of_image = [f"IMAGES {linear_format(planes)}"] * (self._linear_image is not None)
-        last = ["levels.glsl"] * (table is not None) + [rises] * bool(rises)
-        self._built = partial(build_program, ctx, fragment="encode.frag", last=last)
-        self._defines = tuple(defines)
-        self._of_image = tuple(of_image)
+        self._of_image = ("IMAGES",) if self._linear_image is not None else ()
         self._sprite_vao: moderngl.VertexArray | None = None
-        self._white = planes.panels[0].response.white
+        self._white = panel.response.white
         self._textures = {"linear_e_per_s": linear}
-        thresholds, first = joined(edges)
-        counts = [
-            (begin, len(buffer_data)) for begin, buffer_data in zip(first, edges, strict=True)
-        ]
-        rows = table_rows(thresholds, ctx) if rises else None
-        self._blocks = {
-            place: ctx.buffer(buffer_data.tobytes())
-            for place, buffer_data in enumerate((steps, rows))
-            if buffer_data is not None
-        }
-        if rows is not None:
-            self._defines = (*self._defines, f"EDGES {len(rows)}")
-        elif table is None or rises:
-            self._textures["threshold_e_per_s"] = self._texture(_rows(thresholds))
-        if table is None:
-            tables = [code_table(buffer_data) for buffer_data in edges]
-            codes, begins = joined([buffer_data.first_code for buffer_data in tables])
-            self._textures["first_code"] = self._texture(_rows(codes))
-            tables_and_begins = zip(tables, begins, strict=True)
-            bins = [
-                (
-                    buffer_data.first_bin,
-                    len(buffer_data.first_code) - 1,
-                    buffer_data.bin_shift,
-                    begin,
-                )
-                for buffer_data, begin in tables_and_begins
-            ]
+        self._blocks: dict[int, moderngl.Buffer] = {}
+        edges = quantiser.edges_e_per_s(panel)
+        table = code_table(edges)
+        last, first, shift = len(table.first_code) - 1, table.first_bin, table.bin_shift
+        steps = table.steps()
+        edge_rows = table_rows(edges, ctx) if rises else None
+        if edge_rows is not None:
+            defines.append(f"EDGES {len(edge_rows)}")
+            self._blocks[EDGES_BLOCK] = ctx.buffer(edge_rows.tobytes())
+        elif steps is None or rises:
+            self._textures["threshold_e_per_s"] = self._texture(_rows(edges))
+        # `bins` of levels.glsl and of encode.frag
+        if steps is None:
+            self._textures["first_code"] = self._texture(_rows(table.first_code))
+            bins = first, last, shift
         else:
-            bins = table[1]
-            self._textures |= {} if steps is not None else {"steps": self._texture(_rows(table[0]))}
+            bins = (first - 1) << shift, ((first + last + 1) << shift) - 1, shift
+            step_rows = table_rows(steps, ctx)
+            if step_rows is None:
+                self._textures["steps"] = self._texture(_rows(steps))
+                defines.append("STEPS 0")
+            else:
+                self._blocks[STEPS_BLOCK] = ctx.buffer(step_rows.tobytes())
+                defines.append(f"STEPS {len(step_rows)}")
         if gain is not None:
             self._textures["gain"] = self._texture(gain)
         self._textures |= {name: self._texture(mask) for name, mask in quantiser.masks().items()}
-        self._bins = bins, counts
+        after = ["levels.glsl"] * (steps is not None) + [rises] * bool(rises)
+        self._built = partial(build_program, ctx, fragment="encode.frag", last=after)
+        self._defines = tuple(defines)
+        self._counts = {"bins": bins, "white": len(edges)}
         self._programs: dict[tuple[str, ...], moderngl.Program] = {}
         self.sprite_program, self._whole = (
             self._program(vertex) for vertex in ("star.vert", "full.vert")
@@ -529,16 +451,15 @@ class Encoder:
         """
         key = (vertex, *of_tiles)
         if key not in self._programs:
-            include = ("planes.glsl", *["tile.glsl"] * bool(of_tiles))
             program = self._built(
                 vertex=vertex,
                 defines=(*self._defines, *(of_tiles or self._of_image)),
-                include=include,
+                include=["tile.glsl"] * bool(of_tiles),
             )
-            set_planes(self._planes, program, bins=self._bins[0], thresholds=self._bins[1])
             if "Edges" in program:
-                cast(moderngl.UniformBlock, program["Edges"]).binding = 1
-            set_uniforms(program, {name: unit for unit, name in enumerate(self._textures)})
+                cast(moderngl.UniformBlock, program["Edges"]).binding = EDGES_BLOCK
+            units = {name: unit for unit, name in enumerate(self._textures)}
+            set_uniforms(program, self._counts | units)
             self._programs[key] = program
         return self._programs[key]
 
@@ -561,7 +482,7 @@ class Encoder:
         """Read the places and rates of sprites from a buffer."""
         if self._sprite_vao is not None:
             self._sprite_vao.release()
-        self._sprite_vao = sprites_array(self.sprite_program, buffer, self._planes)
+        self._sprite_vao = sprites_array(self.sprite_program, buffer)
         self.sprite_program["footprint_px"] = self._footprint_px = footprint_px
 
     def draw(
@@ -601,13 +522,13 @@ class Encoder:
             self._whole_vao.render(moderngl.TRIANGLES, vertices=3)
         if count and self._sprite_vao is not None:
             self.sprite_program["sprites_per_star"] = float(per_star)
-            margin = self._footprint_px
-            self._fbo.viewport = (-margin, -margin, width + 2 * margin, height + 2 * margin)
+            self._fbo.viewport = viewport_of_sprites(self._size_px, self._footprint_px)
             self._sprite_vao.render(moderngl.POINTS, vertices=count)
         if tiles is not None:
             self._draw_tiles(tiles, uniforms)
 
     def _bind(self) -> None:
+        """Bind the linear image and the tables for the next pass."""
         for unit, texture in enumerate(self._textures.values()):
             texture.use(unit)
         if self._linear_image is not None:
@@ -616,6 +537,7 @@ class Encoder:
             block.bind_to_uniform_block(place)
 
     def _draw_tiles(self, tiles: "Tiles", uniforms: Mapping[str, float]) -> None:
+        """Encode tiles: of the linear image where it has them, of their own light, or white."""
         self._fbo.viewport, self._fbo.scissor = (0, 0, *self._size_px), tiles.region
         of_image = np.concatenate([tiles.face, tiles.air, tiles.inside, tiles.edges])
         given = (
@@ -637,12 +559,8 @@ class Encoder:
         self._fbo.scissor = None  # type: ignore[assignment]  # as its documentation has it: no test
 
 
-def linear_format(planes: Planes) -> str:
-    """GL's name of a linear image's texels."""
-    return "rgba32f" if planes.apart else "r32f"
-
-
 def _rows(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Values (n,) in rows of TABLE_WIDTH, with 0 after the last."""
     rows = -(-len(values) // TABLE_WIDTH)
     padded = np.zeros((rows, TABLE_WIDTH), dtype=values.dtype)
     padded.ravel()[: len(values)] = values

@@ -79,6 +79,7 @@ class ExtendedLayer:
         return tuple(regions), sure_tiles
 
     def _draw_one(self, light: ExtendedLight) -> None:
+        """Add one light to all pixels of the viewport."""
         if isinstance(light, LightMap):
             self._draw_map(light)
             return
@@ -94,6 +95,7 @@ class ExtendedLayer:
         triangle.render(moderngl.TRIANGLES, vertices=3)
 
     def _draw_map(self, light: LightMap) -> None:
+        """Add a map; what lasts is uploaded once."""
         defines = () if light.cover is None else ("COVER",)
         program, triangle = self._program("light_map.frag", (), *defines)
         textures = []
@@ -114,6 +116,7 @@ class ExtendedLayer:
             texture.release()
 
     def _draw_tiles(self, light: DiscLight, tiles: Tiles) -> None:
+        """Add a disc tile by tile, but for those that are drawn as levels."""
         for corners, defines in ((tiles.face, ()), (tiles.air, ("AIR",))):
             if len(corners):
                 program, _ = self._program(

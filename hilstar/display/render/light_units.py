@@ -1,4 +1,4 @@
-"""The planes of an image, and the whole units in which each plane's pixels add up stars.
+"""The whole units in which pixels add up stars, and how far a star lights them.
 
 Each pixel's light is a sum of whole units, which is the same in whatever order stars are added, and
 the same for both ways of drawing them. Nothing here needs OpenGL.
@@ -8,9 +8,8 @@ import math
 
 import numpy as np
 
-from hilstar.basics.arrays import Float32Array
-from hilstar.display.quantise import RoundQuantiser
-from hilstar.display.render.target import Planes, SpriteSides
+from hilstar.display.panel import Panel
+from hilstar.display.render.target import SpriteSides
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight
 
@@ -30,76 +29,70 @@ WINGS, DENSER_WINGS = 128, 8
 # 0.004 mag, by squares 0.6 and 0.001.
 SQUARE_WINGS = 16
 ANY_RATE = 1e-6  # the largest side of all, for stars of any rate, has fewer wings
-
-
-def edges_of(planes: Planes) -> list[Float32Array]:
-    """The thresholds of each plane, by which the nearest levels are counted."""
-    return [RoundQuantiser.edges_e_per_s(panel) for panel in planes.panels]
+# float32 light may be rounded up by 1e-7 of it, star by star: the bound of a sum must not be passed
+ROUNDED_UP = 1.000001
 
 
 class LightUnits:
-    """The whole units in which each plane's pixels add up stars, and the ellipse within which a
-    star lights them.
+    """The whole units in which pixels add up stars, and the ellipse within which a star lights
+    them.
 
     Both ways of drawing take them, and so choose the same levels. `sides` (see `Target.sides`) say
     how large sprites are at most, and what light of a star alone they may leave out.
     """
 
     def __init__(
-        self, planes: Planes, size_px: tuple[int, int], psf: Psf, sides: SpriteSides = ()
+        self, panel: Panel, size_px: tuple[int, int], psf: Psf, sides: SpriteSides = ()
     ) -> None:
-        self.planes = planes
+        self.panel = panel
         self.size_px = size_px
         self.psf = psf
-        panel = planes.lit
-        self._share = planes.share
-        self._footprint_px = planes.footprint_px
+        self._footprint_px = psf.footprint_px
         gain = panel.gain()
         low, high = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
         thresholds = panel.response.thresholds_e_per_s(panel.flux_at_white_e_per_s)
         self.lit_e_per_s = float(thresholds[0]) / high
-        self._white_e_per_s = panel.flux_at_white_e_per_s / low
-        self.most_e_per_s = [self._white_e_per_s * share for share in planes.share]
+        self.most_e_per_s = panel.flux_at_white_e_per_s / low
         self._peak_share = psf.peak_share
         self.axes_px2, self._share_bound = psf.reach
         self.wings = float(WINGS)
         # what part of the light that lights a pixel the squares leave out beside them at most: one
         # in so many
         if sides:
-            outside = [
-                self.lit_e_per_s / (side.below_e_per_s * psf.outside_share(side.side_px))
-                for side in sides
-            ]
-            fewest = min(
-                [wings for wings in outside if wings > ANY_RATE], default=WINGS / SQUARE_WINGS
-            )
-            self.wings = SQUARE_WINGS * max(1.0, fewest)
-        more_px = planes.footprint_px - psf.footprint_px
-        self.side_px = max((side.side_px + more_px for side in sides), default=self._footprint_px)
+            fewest = []
+            for side in sides:
+                outside_e_per_s = side.below_e_per_s * psf.outside_share(side.side_px)
+                wings = self.lit_e_per_s / outside_e_per_s
+                if wings > ANY_RATE:
+                    fewest.append(wings)
+            self.wings = SQUARE_WINGS * max(1.0, min(fewest, default=WINGS / SQUARE_WINGS))
+        self.side_px = max((side.side_px for side in sides), default=self._footprint_px)
 
-    def unit_for(self, sprites: FrameLight | None) -> list[float] | None:
-        """The unit of each plane (e-/s) in which no pixel's sum is too large for an int32; None
-        where one is too coarse for its panel.
+    def unit_for(self, sprites: FrameLight | None) -> float | None:
+        """The unit (e-/s) in which no pixel's sum is too large for an int32; None where it is too
+        coarse for the panel.
         """
-        units = self._units_in(sprites, MAX_SUM)
-        coarsest = [self.lit_e_per_s * share * MAX_UNIT for share in self._share]
-        is_fine = all(unit <= most for unit, most in zip(units, coarsest, strict=True))
-        return units if is_fine else None
+        unit_e_per_s = self._unit_in(sprites, MAX_SUM)
+        if unit_e_per_s > self.lit_e_per_s * MAX_UNIT:
+            return None
+        return unit_e_per_s
 
-    def fine_unit_for(self, sprites: FrameLight) -> list[float]:
-        """The unit of each plane (e-/s) in which a float64 holds every sum exactly."""
-        return self._units_in(sprites, MAX_FINE_SUM)
+    def fine_unit_for(self, sprites: FrameLight) -> float:
+        """The unit (e-/s) in which a float64 holds every sum exactly."""
+        return self._unit_in(sprites, MAX_FINE_SUM)
 
-    def _units_in(self, sprites: FrameLight | None, max_sum: int) -> list[float]:
-        """Powers of two, from the sum of all stars' brightest pixels, of white at most each."""
+    def _unit_in(self, sprites: FrameLight | None, max_sum: int) -> float:
+        """A power of two, from the sum of all stars' brightest pixels, of white at most each."""
         if sprites is None or not len(sprites):
             return self.most_e_per_s
-        white_e_per_s = np.float32(self._white_e_per_s / self._peak_share)
+        white_e_per_s = np.float32(self.most_e_per_s / self._peak_share)
         rates = np.minimum(sprites.data["electrons_per_s"], white_e_per_s)
-        most_e_per_s = float(rates.sum(dtype=np.float64)) * self._peak_share * 1.000001
-        most_e_per_s = max(most_e_per_s, self._white_e_per_s)
+        total_e_per_s = float(rates.sum(dtype=np.float64))
+        most_e_per_s = total_e_per_s * self._peak_share * ROUNDED_UP
+        most_e_per_s = max(most_e_per_s, self.most_e_per_s)
         room = max_sum - len(sprites)
-        return [2.0 ** math.ceil(math.log2(most_e_per_s * share / room)) for share in self._share]
+        exponent = math.ceil(math.log2(most_e_per_s / room))
+        return float(2.0**exponent)
 
     def reach_per_e(self, sprites: FrameLight, alone: bool = False) -> float:
         """The factor of a star's rate whose logarithm, times `axes_px2`, gives the squared half

@@ -6,6 +6,7 @@ OpenGL's. The quantisers are those that the shaders follow.
 
 import ctypes
 import logging
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from typing import TYPE_CHECKING
 
@@ -14,14 +15,17 @@ import numpy.typing as npt
 
 from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import MachineError, NotThereError
-from hilstar.display.quantise import UnquantisedFrame, level_dtype
+from hilstar.display.exact import ExactQuantiser
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import Quantiser, UnquantisedFrame, level_dtype
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.aids import LINE_SHARE, lay_over
+from hilstar.display.render.apart import ApartBackend
 from hilstar.display.render.backend import NO_FRAME, Backend, ScreenView, as_maps
 from hilstar.display.render.cpu_stars import CpuImage, CpuStars
 from hilstar.display.render.light_units import LightUnits
 from hilstar.display.render.reference import extended_image
-from hilstar.display.render.target import Planes, Target
-from hilstar.display.render.turns import levels_by_plane, quantisers_of
+from hilstar.display.render.target import Target
 from hilstar.display.render.way import EGL_LIBRARY, wanted_way
 from hilstar.display.response import Levels
 from hilstar.optics.extended import ExtendedLight
@@ -37,12 +41,20 @@ log = logging.getLogger(__name__)
 
 def open_backend(target: Target, context: "Context | None") -> Backend:
     """The backend of a target: OpenGL in a context, NumPy without one (see `headless_context`)."""
+    open_panel = partial(_open_panel, context)
+    if target.primaries:
+        return ApartBackend(target, open_panel)
+    return open_panel(target, ())
+
+
+def _open_panel(context: "Context | None", target: Target, before: Sequence[Backend]) -> Backend:
+    """The backend of a grey target, or of one primary and those `before` it (see `Target.turn`)."""
     if context is None:
-        return NumpyBackend(target)
+        return NumpyBackend(target, before)
     # moderngl, which nothing needs where NumPy draws
     from hilstar.display.render.renderer import Renderer
 
-    return Renderer(target, context)
+    return Renderer(target, context, before)
 
 
 def headless_context(gpu: int | str | None = None) -> "Context | None":
@@ -82,9 +94,20 @@ def _say_once(why: str) -> None:
     )
 
 
+def _exact_quantisers(backends: Sequence[Backend]) -> list[ExactQuantiser]:
+    """The quantisers of backends that choose a star's levels together."""
+    quantisers = []
+    for backend in backends:
+        if isinstance(backend, NumpyBackend) and isinstance(backend._quantiser, ExactQuantiser):
+            quantisers.append(backend._quantiser)
+    return quantisers
+
+
 class NumpyBackend(Backend):
-    """Draws sprites of one Target in NumPy; `back_buffer` has the codes (height, width, 3) that
-    were presented.
+    """Draws sprites of one grey Target in NumPy; `back_buffer` has the codes (height, width, 3)
+    that were presented.
+
+    `before` are the backends of the target's `turn`, for whose stars' errors those here make up.
     """
 
     back_buffer: npt.NDArray[np.uint16]
@@ -93,23 +116,29 @@ class NumpyBackend(Backend):
     gl_renderer = NUMPY
     gl_version = np.__version__
 
-    def __init__(self, target: Target) -> None:
-        self.target = target
-        self._quantisers = quantisers_of(target)
+    def __init__(self, target: Target, before: Sequence[Backend] = ()) -> None:
+        super().__init__(target)
+        panel = target.panel()
+        self._quantiser: Quantiser | None = None
+        if panel is not None:
+            kind = QUANTISERS[target.quantisation]
+            self._quantiser = kind(panel, target.resolution_px, target.psf, target.seen)
+        if isinstance(self._quantiser, ExactQuantiser):
+            self._quantiser.turn = target.turn
+            self._quantiser.before = _exact_quantisers(before)
         self.path = "NumPy"
         self._stars: CpuStars | None = None
-        self._level_image = np.empty((0, 0, 0), dtype=np.uint8)
-        self._planes = Planes.of(target)
-        if self._planes.panels and target.quantisation == "round":
+        self._level_image = np.empty((0, 0), dtype=np.uint8)
+        if panel is not None and target.quantisation == "round":
             self.path = "CPU"
-            self._build_stars()
+            self._build_stars(panel)
         self._image_of_stars = CpuImage(target.resolution_px, target.psf)
         self._last_frame = NO_FRAME
         self._linear: Float32Array | None = None  # that of `_sprites`, once somebody asks
         self._sprites: FrameLight | None = None
         self._levels: Levels | None = None
-        # the last of each primary, and its image
-        self._lights: dict[int, tuple[tuple[ExtendedLight, ...], FloatArray]] = {}
+        # the last ones, and their image
+        self._lights: tuple[tuple[ExtendedLight, ...], FloatArray] | None = None
 
     def draw(self, sprites: FrameLight | None, frame: int = 0) -> None:
         """Draw `sprites` (None: blank); see `Backend.draw`."""
@@ -120,16 +149,18 @@ class NumpyBackend(Backend):
         self._linear = None
         if self._stars is not None and self._draws_stars_alone(self._stars, sprites):
             return
-        if self._quantisers:
-            self._levels = levels_by_plane(self.target, sprites, partial(self._plane, frame))
+        if self._quantiser is not None:
+            image = partial(self._image, sprites, True)
+            alone = partial(self._image, sprites, False, stars=False)
+            light = UnquantisedFrame(sprites, image, alone, frame)
+            self._levels = self._quantiser.draw(light)
 
-    def _build_stars(self) -> None:
+    def _build_stars(self, panel: Panel) -> None:
         """Make what draws the nearest levels of frames of stars alone."""
         target = self.target
-        planes = self._planes
-        units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
-        shape = *target.resolution_px[::-1], len(planes.panels)
-        self._level_image = np.zeros(shape, dtype=level_dtype(planes.panels[0].response))
+        units = LightUnits(panel, target.resolution_px, target.psf, target.sides)
+        shape = target.resolution_px[::-1]
+        self._level_image = np.zeros(shape, dtype=level_dtype(panel.response))
         self._stars = CpuStars(units, self._level_image)
         self._units = units
 
@@ -140,19 +171,10 @@ class NumpyBackend(Backend):
             return False
         stars.lay(None)
         if light is not None and len(light):
-            packed = self._planes.packed(light)
-            stars.add(packed, self._units.unit_for(packed))
+            stars.add(light, self._units.unit_for(light))
             stars.encode()
-        image = self._level_image
-        if not self.target.primaries:
-            image = image[..., 0]
-        self._levels = Levels(image)
+        self._levels = Levels(self._level_image)
         return True
-
-    def _plane(self, frame: int, k: int, light: FrameLight | None) -> Levels:
-        image = partial(self._image, light, True, k)
-        alone = partial(self._image, light, False, k, stars=False)
-        return self._quantisers[k].draw(UnquantisedFrame(light, image, alone, frame))
 
     def draw_linear(self, sprites: FrameLight) -> None:
         """Draw the linear image of `sprites` alone; see `Backend.draw_linear`."""
@@ -173,9 +195,10 @@ class NumpyBackend(Backend):
             raise TypeError("this target has no monitor response, so no levels")
         return self._levels
 
-    def show_on(self, view: ScreenView) -> None:
+    def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
         """See `Backend.show_on`."""
         self._screen = view
+        self._shown = (self, *beside)
 
     def present(
         self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)
@@ -183,11 +206,11 @@ class NumpyBackend(Backend):
         """See `Backend.present`."""
         view = self._screen
         turn, (width, height) = view.orientation, view.orientation.screen_px(view.screen_px)
-        shown = self.levels()[:height, :width]
+        shown = np.stack([backend.levels()[:height, :width] for backend in self._shown], -1)
         if view.triples is not None:
-            shown = view.triples[shown]
+            shown = view.triples[shown[..., 0]]
         codes = np.zeros((height, width, 3), dtype=np.uint16)
-        codes[: shown.shape[0], : shown.shape[1]] = shown if shown.ndim == 3 else shown[..., None]
+        codes[: shown.shape[0], : shown.shape[1]] = shown
         cross_x, cross_y = map(round, view.cross_px)
         lay_over(
             codes, overlay, patch_code, int(LINE_SHARE * (2**view.bits - 1)), (cross_x, cross_y)
@@ -207,8 +230,8 @@ class NumpyBackend(Backend):
     def begin_anew(self) -> None:
         """The next frame is the first of a sequence."""
         self._last_frame = NO_FRAME
-        for quantiser in self._quantisers.values():
-            quantiser.begin_anew()
+        if self._quantiser is not None:
+            self._quantiser.begin_anew()
 
     def finish(self) -> None:
         """Return at once: `draw` has drawn."""
@@ -216,11 +239,9 @@ class NumpyBackend(Backend):
     def close(self) -> None:
         """Do nothing."""
 
-    def _image(
-        self, sprites: FrameLight | None, shrunk: bool, plane: int = 0, stars: bool = True
-    ) -> Float32Array:
-        """The linear image of a plane, or its extended light; `shrunk` draws fainter stars
-        within the target's `sides`.
+    def _image(self, sprites: FrameLight | None, shrunk: bool, stars: bool = True) -> Float32Array:
+        """The linear image, or its extended light; `shrunk` draws fainter stars within the
+        target's `sides`.
         """
         width, height = self.target.resolution_px
         if stars:
@@ -229,34 +250,31 @@ class NumpyBackend(Backend):
         if sprites is None:
             return zeros
         if sprites.extended:
-            extended = self._extended(sprites.extended, plane)
+            extended = self._extended(sprites.extended)
         else:
             extended = None
         if not stars:
             if extended is None:
                 return zeros
             return extended.astype(np.float32)
-        self._image_of_stars.draw(sprites, self._sides_px(sprites, shrunk, plane))
+        self._image_of_stars.draw(sprites, self._sides_px(sprites, shrunk))
         image = self._image_of_stars.image
         if extended is None:
             return image
         return (image + extended).astype(np.float32)
 
-    def _sides_px(self, sprites: FrameLight, shrunk: bool, plane: int) -> IntArray:
+    def _sides_px(self, sprites: FrameLight, shrunk: bool) -> IntArray:
         """The sides (n,) of the squares of sprites."""
         sides_px = np.full(len(sprites), self.target.psf.footprint_px)
         rate = sprites.data["electrons_per_s"] * sprites.per_star
-        if self.target.primaries:
-            white_e_per_s = self.target.primaries[plane].flux_at_white_e_per_s
-            rate = rate * (self.target.flux_at_white_e_per_s / white_e_per_s)
         for side in self.target.sides if shrunk else ():
             sides_px[rate < side.below_e_per_s] = side.side_px
         return sides_px
 
-    def _extended(self, lights: tuple[ExtendedLight, ...], plane: int) -> FloatArray:
+    def _extended(self, lights: tuple[ExtendedLight, ...]) -> FloatArray:
         """The light of discs and stray light alone (height, width); the same lights again are
         not drawn again.
         """
-        if plane not in self._lights or self._lights[plane][0] != lights:
-            self._lights[plane] = lights, extended_image(lights, self.target.resolution_px)
-        return self._lights[plane][1]
+        if self._lights is None or self._lights[0] != lights:
+            self._lights = lights, extended_image(lights, self.target.resolution_px)
+        return self._lights[1]

@@ -1,5 +1,7 @@
 """The last pass: the levels of a renderer onto the window that its context belongs to."""
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import moderngl
@@ -15,6 +17,7 @@ from hilstar.display.window.x11 import GL_LIBRARY, X11_LIBRARY
 
 GL_DITHER = 0x0BD0
 MAX_LEVELS = 2**16
+TRIPLES_UNIT = 3  # after the textures of three primaries' levels
 PRIMARIES = {"grey": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
 
 
@@ -54,18 +57,15 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
     All are drawn side by side and read back. It overwrites the back buffer, and swaps nothing.
     """
     codes = np.arange(2**bits, dtype=np.uint16)
-    triples = np.concatenate(
-        [np.outer(codes, primaries).astype(np.uint16) for primaries in PRIMARIES.values()]
-    )
+    parts = [np.outer(codes, primaries) for primaries in PRIMARIES.values()]
+    triples = np.concatenate(parts).astype(np.uint16)
     width, height = screen_px
+    pixels = np.arange(width * height, dtype=np.uint32)
+    at_once = min(MAX_LEVELS, width * height)
     wrong = 0
     first = ""
-    for part in np.array_split(triples, -(-len(triples) // min(MAX_LEVELS, width * height))):
-        levels = (
-            (np.arange(width * height, dtype=np.uint32) % len(part))
-            .astype(np.uint16)
-            .reshape(height, width)
-        )
+    for part in np.array_split(triples, math.ceil(len(triples) / at_once)):
+        levels = (pixels % len(part)).astype(np.uint16).reshape(height, width)
         with context:
             texture = level_texture(context, levels)
             Presenter(texture, ScreenView(screen_px, screen_px, bits, triples=part)).present()
@@ -73,14 +73,15 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
             # moderngl asks for an attachment, which a window's back buffer has not, and reads on
             _ = context.error
             texture.release()
-        drawn = np.rint(
-            np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1] * codes[-1]
-        )
+        # GL counts rows from the bottom
+        shares = np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1]
+        drawn = np.rint(shares * codes[-1])
         differ = (drawn != part[levels]).any(axis=-1)
         changed = np.unique(levels[differ])
         if len(changed) and not wrong:
             became = drawn[(levels == changed[0]) & differ][0].astype(int)
-            first = f"{tuple(map(int, part[changed[0]]))} as {tuple(map(int, became))}"
+            wanted = part[changed[0]]
+            first = f"{tuple(wanted.tolist())} as {tuple(became.tolist())}"
         wrong += len(changed)
     if wrong:
         return f"{wrong} of {len(triples)} codes are not drawn as they are, {first}"
@@ -90,12 +91,17 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
 class Presenter:
     """Draws a texture of levels on the screen of its context; `table` has the codes of each level.
 
-    Of primaries that are driven `apart` the levels of red, green and blue are their codes.
+    With two others `beside` them the levels are the codes of red, and theirs those of green and
+    blue.
     """
 
-    def __init__(self, levels: moderngl.Texture, view: ScreenView, apart: bool = False) -> None:
-        self._texture = levels
-        self._apart = apart
+    def __init__(
+        self,
+        levels: moderngl.Texture,
+        view: ScreenView,
+        beside: Sequence[moderngl.Texture] = (),
+    ) -> None:
+        self._textures = [levels, *beside]
         self._ctx = levels.ctx
         self._view = view
         with self._ctx:
@@ -112,7 +118,8 @@ class Presenter:
         view = self._view
         orientation = self._view.orientation
         flips = {"FLIP_X": orientation.flip_x, "FLIP_Y": orientation.flip_y}
-        wanted = flips | {"STEALING": view.triples is not None, "APART": self._apart, "AIDS": aids}
+        is_rgb = len(self._textures) > 1
+        wanted = flips | {"STEALING": view.triples is not None, "RGB": is_rgb, "AIDS": aids}
         defines = (
             f"QUARTER_TURNS {orientation.quarter_turns % 4}",
             *(name for name, is_set in wanted.items() if is_set),
@@ -120,7 +127,9 @@ class Presenter:
         program = build_program(self._ctx, "full.vert", "present.frag", defines)
         values: dict[str, Any] = {
             "levels": 0,
-            "triples": 1,
+            "triples": TRIPLES_UNIT,
+            "green_levels": 1,
+            "blue_levels": 2,
             "white": float(2**view.bits - 1),
             "size_px": view.resolution_px,
             "screen_px": view.screen_px,
@@ -168,8 +177,9 @@ class Presenter:
             else:
                 self._driver.take_back_buffer()
             self._ctx.viewport = (0, 0, *self._view.screen_px)
-            self._texture.use(0)
-            self.table.use(1)
+            for unit, texture in enumerate(self._textures):
+                texture.use(unit)
+            self.table.use(TRIPLES_UNIT)
             program, vao = self._aided if overlay else self._plain
             if overlay:
                 program["overlay"], program["patch_code"] = overlay, patch_code

@@ -4,7 +4,7 @@ many rays a pixel.
 
 import numpy as np
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.optics.extended import DiscLight, ExtendedLight, GlowLight, LightMap, Rectangle
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight
@@ -24,7 +24,8 @@ def linear_image(
     `footprint_px` larger than the sprites' own shows what their footprints cut.
     """
     image = extended_image(sprites.extended, resolution_px)
-    add_stars(image, sprites, psf, sprites.footprint_px if footprint_px is None else footprint_px)
+    side_px = footprint_px or sprites.footprint_px
+    add_stars(image, sprites, psf, side_px)
     return image
 
 
@@ -37,20 +38,35 @@ def extended_image(lights: tuple[ExtendedLight, ...], resolution_px: tuple[int, 
         region = light.region(resolution_px)
         if region is None:
             continue
-        left, top, width, height = region
         if isinstance(light, LightMap):
-            x, y = light.corner_px
-            part = slice(top - y, top - y + height), slice(left - x, left - x + width)
-            own = light.times * light.image[part].astype(np.float64)
-            cover = np.zeros(1) if light.cover is None else light.cover[part]
+            e_per_s, cover = _map(light, region)
         elif isinstance(light, GlowLight):
-            own, cover = _glow(light, region), np.zeros(1)
+            e_per_s = _glow(light, region)
+            cover = np.zeros(1)
         else:
-            own, cover = _disc(light, region)
-        where = slice(top, top + height), slice(left, left + width)
+            e_per_s, cover = _disc(light, region)
+        where = _part(region)
         # it hides what was there where it covers that
-        image[where] = image[where] * (1 - cover) + own
+        behind = image[where] * (1 - cover)
+        image[where] = behind + e_per_s
     return image
+
+
+def _part(region: Rectangle, corner_px: tuple[int, int] = (0, 0)) -> tuple[slice, slice]:
+    """Rows and columns of a region in an image whose first pixel is at `corner_px`."""
+    x, y, width, height = region
+    row = y - corner_px[1]
+    column = x - corner_px[0]
+    return slice(row, row + height), slice(column, column + width)
+
+
+def _map(light: LightMap, region: Rectangle) -> tuple[FloatArray, FloatArray | Float32Array]:
+    """A map's light and cover (height, width) in a region; a cover of 0 where it has none."""
+    part = _part(region, light.corner_px)
+    e_per_s = light.times * light.image[part].astype(np.float64)
+    if light.cover is None:
+        return e_per_s, np.zeros(1)
+    return e_per_s, light.cover[part]
 
 
 def add_stars(
@@ -66,33 +82,41 @@ def add_stars(
     """
     height, width = image.shape
     steps = np.arange(side_px) - (side_px - 1) // 2
+    flat = image.reshape(-1)
     data = sprites.data[some]
     x_px = sprites.x_px[some]
     y_px = sprites.y_px[some]
+    rates = share * data["electrons_per_s"].astype(np.float64)
     at_once = max(1, MAX_AT_ONCE_PX // side_px**2)
     for begin in range(0, len(data), at_once):
         part = slice(begin, begin + at_once)
-        columns, rows = (data["pixel"][part, axis, None] + steps for axis in (0, 1))
-        of_pixels = psf.shares(
-            (columns - x_px[part, None])[:, None, :], (rows - y_px[part, None])[:, :, None]
-        )
-        light = share * data["electrons_per_s"][part, None, None].astype(np.float64) * of_pixels
+        pixel_x, pixel_y = data["pixel"][part].T
+        columns = pixel_x[:, None] + steps
+        rows = pixel_y[:, None] + steps
+        away_x = columns - x_px[part, None]
+        away_y = rows - y_px[part, None]
+        shares = psf.shares(away_x[:, None, :], away_y[:, :, None])
+        light = rates[part, None, None] * shares
         on_x = (columns >= 0) & (columns < width)
         on_y = (rows >= 0) & (rows < height)
         inside = on_y[:, :, None] & on_x[:, None, :]
-        places = rows[:, :, None].astype(np.intp) * width + columns[:, None, :]
-        np.add.at(image.reshape(-1), places[inside], light[inside])
+        line_begins = rows.astype(np.intp) * width
+        places = line_begins[:, :, None] + columns[:, None, :]
+        np.add.at(flat, places[inside], light[inside])
 
 
 def _glow(light: GlowLight, region: Rectangle) -> FloatArray:
-    left, top, width, height = region
-    y, x = np.mgrid[top : top + height, left : left + width].astype(np.float64)
+    """The light (height, width) of a glow in a region, by its angle from the middle."""
+    height, width = region[3], region[2]
+    rows, columns = _part(region)
+    y, x = np.mgrid[rows, columns].astype(np.float64)
     u, v = light.camera.tangents(x.ravel(), y.ravel())
     rays = np.stack([u, v, np.ones_like(u)], axis=1)
-    angle = np.arctan2(
-        np.linalg.norm(np.cross(light.direction_image, rays), axis=1), rays @ light.direction_image
-    )
-    profile = (1 + (angle / light.scale_rad) ** 2) ** (-light.exponent / 2)
+    across = np.linalg.norm(np.cross(light.direction_image, rays), axis=1)
+    along = rays @ light.direction_image
+    angle_rad = np.arctan2(across, along)
+    scales = angle_rad / light.scale_rad
+    profile = (1 + scales**2) ** (-light.exponent / 2)
     return np.asarray(light.peak_e_per_s * profile.reshape(height, width))
 
 
@@ -100,8 +124,9 @@ def _ray_places(first_px: int, size_px: int, margin_px: int) -> FloatArray:
     """Places along an axis of rays through pixels and a margin on either side, RAYS_ACROSS in
     each pixel.
     """
-    rays = np.arange((size_px + 2 * margin_px) * RAYS_ACROSS)
-    return (rays + 0.5) / RAYS_ACROSS - 0.5 - margin_px + first_px
+    count = (size_px + 2 * margin_px) * RAYS_ACROSS
+    from_edge_px = (np.arange(count) + 0.5) / RAYS_ACROSS
+    return from_edge_px - 0.5 - margin_px + first_px
 
 
 def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
@@ -110,23 +135,26 @@ def _disc(light: DiscLight, region: Rectangle) -> tuple[FloatArray, FloatArray]:
     """
     from scipy.ndimage import gaussian_filter
 
-    left, top, width, height = region
-    margin = int(np.ceil(REACH_SIGMAS * max(light.psf.width_px)))
-    columns = _ray_places(left, width, margin)
-    rows = _ray_places(top, height, margin)
+    x, y, width, height = region
+    wide_x_px, wide_y_px = light.psf.width_px
+    margin = int(np.ceil(REACH_SIGMAS * max(wide_x_px, wide_y_px)))
+    columns = _ray_places(x, width, margin)
+    rows = _ray_places(y, height, margin)
     at_once = max(1, RAYS_AT_ONCE // len(columns))
-    sharp = np.concatenate(
-        [_rays(light, columns, rows[k : k + at_once]) for k in range(0, len(rows), at_once)], axis=1
-    )
-    sigma = [RAYS_ACROSS * width_px for width_px in reversed(light.psf.width_px)]
     parts = []
-    for part in sharp:
-        fine = gaussian_filter(part, sigma, mode="nearest", truncate=REACH_SIGMAS)
-        whole = fine.reshape(
-            height + 2 * margin, RAYS_ACROSS, width + 2 * margin, RAYS_ACROSS
-        ).mean(axis=(1, 3))
-        parts.append(whole[margin : margin + height, margin : margin + width])
-    return light.times * parts[0], light.covers * parts[1]
+    for begin in range(0, len(rows), at_once):
+        some = rows[begin : begin + at_once]
+        parts.append(_rays(light, columns, some))
+    sharp_light, sharp_cover = np.concatenate(parts, axis=1)
+    sigma_rays = RAYS_ACROSS * wide_y_px, RAYS_ACROSS * wide_x_px
+    inner = slice(margin, margin + height), slice(margin, margin + width)
+
+    def in_pixels(sharp: FloatArray) -> FloatArray:
+        fine = gaussian_filter(sharp, sigma_rays, mode="nearest", truncate=REACH_SIGMAS)
+        by_pixel = fine.reshape(height + 2 * margin, RAYS_ACROSS, width + 2 * margin, RAYS_ACROSS)
+        return np.asarray(by_pixel.mean(axis=(1, 3))[inner])
+
+    return light.times * in_pixels(sharp_light), light.covers * in_pixels(sharp_cover)
 
 
 def _rays(light: DiscLight, columns_px: FloatArray, rows_px: FloatArray) -> FloatArray:
@@ -134,13 +162,18 @@ def _rays(light: DiscLight, columns_px: FloatArray, rows_px: FloatArray) -> Floa
     rows (rows,).
     """
     camera = light.camera
-    x_px, y_px = (part.ravel() for part in np.meshgrid(columns_px, rows_px))
+    grid_x_px, grid_y_px = np.meshgrid(columns_px, rows_px)
+    x_px = grid_x_px.ravel()
+    y_px = grid_y_px.ravel()
     u, v = camera.tangents(x_px, y_px)
     rays = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
     if light.shear is not None:
         late_s = light.shear.late_s(x_px, y_px)
         rays = rays + late_s[:, None] * np.cross(light.shear.rate_image_rad_s, rays)
     a, b, c, d = camera.slopes(rays[:, 0], rays[:, 1])
-    sr = np.nan_to_num(1 / (a * d - b * c)) / np.linalg.norm(rays, axis=1) ** 3
+    px_per_tangents = a * d - b * c
+    distance = np.linalg.norm(rays, axis=1)
+    sr = np.nan_to_num(1 / px_per_tangents) / distance**3
     radiance, cover = light.disc.with_air(rays @ light.icrs_to_image)
-    return np.stack([radiance * sr, cover]).reshape(2, len(rows_px), len(columns_px))
+    flat = np.stack([radiance * sr, cover])
+    return flat.reshape(2, len(rows_px), len(columns_px))

@@ -5,8 +5,9 @@ This room is the only user of moderngl.
 
 import math
 import zlib
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Self
 
 import moderngl
@@ -14,6 +15,7 @@ import numpy as np
 
 from hilstar.basics.arrays import Float32Array
 from hilstar.display.exact import ExactQuantiser
+from hilstar.display.panel import Panel
 from hilstar.display.quantise import MASK_TURNS, DitherQuantiser, PixelQuantiser
 from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.backend import NO_FRAME, Backend, Path, ScreenView, as_maps
@@ -36,18 +38,18 @@ from hilstar.display.render.encoder import (
     Shares,
     lit_sides,
     most_covered_px,
-    set_planes,
     set_sides,
+    set_uniforms,
     splat_program,
     sprites_array,
+    viewport_of_sprites,
 )
 from hilstar.display.render.exact_pass import ExactPass, PixelSums
 from hilstar.display.render.light_units import LightUnits
-from hilstar.display.render.target import Planes, SpriteSide, SpriteSides, Target
-from hilstar.display.render.turns import levels_by_plane, quantisers_of, turns_of
+from hilstar.display.render.target import Target
 from hilstar.display.response import Levels
 from hilstar.optics.extended import Rectangle
-from hilstar.optics.sprites import FrameLight
+from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
 
 if TYPE_CHECKING:
     from hilstar.display.render.disc_tiles import Sure, Tiles
@@ -55,34 +57,37 @@ if TYPE_CHECKING:
 
 FIRST_CAPACITY = 4096  # sprites; the buffer grows by doubling
 UNTIMED = nullcontext()
+NO_LEVELS = "this target has no monitor response, so no levels"
 
 
 class Renderer(Backend):
-    """Draws sprites of one Target, in a context of its own or in a window's. Free it with
+    """Draws sprites of one grey Target, in a context of its own or in a window's. Free it with
     `close`.
+
+    `before` are the renderers of the target's `turn`, for whose stars' errors those here make up.
     """
 
     context: Context
     MAY_USE_CPU = True  # else points draw, whatever HILSTAR_DRAW says
 
-    def __init__(self, target: Target, context: Context | None = None) -> None:
-        self.target = target
-        self._planes = Planes.of(target)
-        self.footprint_px = self._planes.footprint_px
+    def __init__(
+        self, target: Target, context: Context | None = None, before: Sequence[Backend] = ()
+    ) -> None:
+        super().__init__(target)
+        self._before = [renderer for renderer in before if isinstance(renderer, Renderer)]
+        self._panel = target.panel()
+        self.footprint_px = target.psf.footprint_px
         self._undrawn: tuple[FrameLight | None, bool] | None = None
         self._by_numpy = False
         quantiser = QUANTISERS[target.quantisation]
         self._by_pixel = quantiser.by_pixel()
-        self._by_star = (
-            quantiser
-            if target.response is not None and issubclass(quantiser, ExactQuantiser)
-            else None
-        )
+        self._by_star: type[ExactQuantiser] | None = None
+        if target.response is not None and issubclass(quantiser, ExactQuantiser):
+            self._by_star = quantiser
         self._last_frame = NO_FRAME
         self.context = self._ctx = context or create_context()
-        self.gl_renderer, self.gl_version = (
-            str(self._ctx.info[f"GL_{what}"]) for what in ("RENDERER", "VERSION")
-        )
+        self.gl_renderer = str(self._ctx.info["GL_RENDERER"])
+        self.gl_version = str(self._ctx.info["GL_VERSION"])
         try:
             with self._ctx:
                 self._driver = Driver(self._ctx)
@@ -103,21 +108,21 @@ class Renderer(Backend):
             raise
 
     def _build(self) -> None:
+        """Make images and programs; those of levels only where there is a response."""
         ctx = self._ctx
         target = self.target
-        planes = self._planes
         ctx.enable(moderngl.PROGRAM_POINT_SIZE)
         ctx.blend_func = (moderngl.ONE, moderngl.ONE)
-        self._linear = ctx.texture(target.resolution_px, planes.texel, dtype="f4")
+        self._linear = ctx.texture(target.resolution_px, 1, dtype="f4")
         self._linear.filter = (moderngl.NEAREST, moderngl.NEAREST)
         self._linear_fbo = ctx.framebuffer([self._linear])
         self._shares = Shares(ctx, target.psf, self.footprint_px)
-        self._splat = splat_program(ctx, target.resolution_px, self._shares, planes)
-        self._eraser = Eraser(ctx, target.resolution_px, planes, of_levels=False)
-        self._level_eraser = Eraser(ctx, target.resolution_px, planes, of_levels=True)
+        self._splat = splat_program(ctx, target.resolution_px, self._shares)
+        self._eraser = Eraser(ctx, target.resolution_px, of_levels=False)
+        self._level_eraser = Eraser(ctx, target.resolution_px, of_levels=True)
         self._regions: tuple[Rectangle, ...] = ()  # where extended light is on the images
         self._tiles: Tiles | None = None  # a disc whose levels need no linear image everywhere
-        self._cut_sides = self._wider(target.sides)
+        self._cut_sides = target.sides
         self._build_levels()
         set_sides(self._splat, self._cut_sides)
         self._reserve(FIRST_CAPACITY)
@@ -128,13 +133,10 @@ class Renderer(Backend):
             self._cpu_image = CpuImage(target.resolution_px, target.psf)
         self._is_cpu_image = False  # where the last draw is
 
-    def _wider(self, sides: SpriteSides) -> SpriteSides:
-        """The sides of sprites that have the light of all planes."""
-        more_px = self.footprint_px - self.target.psf.footprint_px
-        return tuple(SpriteSide(side.below_e_per_s, side.side_px + more_px) for side in sides)
-
     def _build_levels(self) -> None:
-        target, planes = self.target, self._planes
+        """Make what turns light into levels, and choose the path of frames of stars alone."""
+        target = self.target
+        panel = self._panel
         # What turns light into codes; a window adds its own.
         self.tables: list[moderngl.Texture | moderngl.Buffer] = []
         self._checksums: list[tuple[moderngl.Texture | moderngl.Buffer, int]] = []
@@ -142,86 +144,76 @@ class Renderer(Backend):
         self._levels: LevelTexture | None = None
         self._levels_black = True  # but for the last frame
         self._encoder: Encoder | None = None
-        self._exact_passes: list[ExactPass] = []  # by plane, as those are chosen in turn
+        self._exact_pass: ExactPass | None = None
         self._units: LightUnits | None = None
         self._cpu_stars: CpuStars | None = None
         self._pixel_sums: PixelSums | None = None  # those of `_cpu_stars`, for `exact`
         self._unit_splat: moderngl.Program | None = None  # where points are in units
-        # `exact` in NumPy is made by the first frame that needs it: its arrays are as large as the
-        # image.
-        self._exact: dict[int, ExactQuantiser] = {}
+        self._exact: ExactQuantiser | None = None
         self._floor_encoder: Encoder | None = None
         self._floor_levels: LevelTexture | None = None
         self._floor_key: tuple[object, float] = ((), 0.0)
-        if not planes.panels:
+        if panel is None:
             return
-        panel, gain = planes.lit, planes.panels[0].gain()
+        gain = panel.gain()
         self._gains = (1.0, 1.0) if gain is None else (float(gain.min()), float(gain.max()))
-        self._levels = LevelTexture(self._ctx, target.resolution_px, planes)
+        self._levels = LevelTexture(self._ctx, target.resolution_px, panel.response)
         by_star, ctx = self._by_star, self._ctx
         if by_star is not None and by_star.takes(target.psf, ctx.version_code):
-            left = (
-                ctx.buffer(reserve=4, dynamic=True)
-                if planes.apart and not by_star.remembers
-                else None
-            )
-            chosen = partial(
-                ExactPass,
+            passes = [renderer._exact_pass for renderer in self._before]
+            self._exact_pass = ExactPass(
                 by_star,
                 target,
-                planes,
+                panel,
+                [exact_pass for exact_pass in passes if exact_pass is not None],
                 linear=self._linear,
                 levels=self._levels,
                 shares=self._shares,
             )
-            self._exact_passes = [chosen(turn, left=left) for turn in turns_of(target)]
-        if by_star is None or self._exact_passes:
-            self._encoder = Encoder(ctx, self._linear, self._levels, planes, self._by_pixel)
+            self.tables += self._exact_pass.tables
+        if by_star is None or self._exact_pass is not None:
+            self._encoder = Encoder(ctx, self._linear, self._levels, panel, self._by_pixel)
+            self.tables += self._encoder.tables
             lit_e_per_s = self._by_pixel.lit_from_e_per_s(panel)
-            sides = (
+            self._lit_sides = (
                 () if not lit_e_per_s else target.sides or lit_sides(panel, lit_e_per_s, target.psf)
             )
-            self._lit_sides = self._wider(sides)
             set_sides(self._encoder.sprite_program, self._lit_sides)
             if lit_e_per_s and not target.sides:
-                self._cut_sides = self._wider(lit_sides(panel, lit_e_per_s, target.psf, CUT_WINGS))
+                self._cut_sides = lit_sides(panel, lit_e_per_s, target.psf, CUT_WINGS)
             if not self._by_pixel.shader:  # light in units is compared with thresholds alone
-                self._build_units(self._levels, self._encoder)
-        for made in (self._encoder, *self._exact_passes):
-            self.tables += [] if made is None else made.tables
+                self._build_units(panel, self._levels, self._encoder)
         self.path = self._path_of_levels()
 
     def _path_of_levels(self) -> Path:
         if self._by_star is None:
             return "points" if self._cpu_stars is None else "CPU"
-        if not self._exact_passes:
+        if self._exact_pass is None:
             return "NumPy"
         if self._cpu_stars is None:
             return "points, then compute shaders"
         return "CPU, then compute shaders"
 
-    def _build_units(self, levels: LevelTexture, encoder: Encoder) -> None:
+    def _build_units(self, panel: Panel, levels: LevelTexture, encoder: Encoder) -> None:
         """Build what draws light in whole units: on the CPU, else points.
 
         `exact` takes the sums of both from memory that the GL shares; where it shares none, points.
         """
         target = self.target
-        planes = self._planes
-        units = self._units = LightUnits(planes, target.resolution_px, target.psf, target.sides)
-        if self._uses_cpu and not self._exact_passes:
+        units = self._units = LightUnits(panel, target.resolution_px, target.psf, target.sides)
+        if self._uses_cpu and self._exact_pass is None:
             self._cpu_stars = CpuStars(units, levels.image)
             return
-        size = 4 * math.prod(target.resolution_px) * len(planes.panels)
+        size = 4 * math.prod(target.resolution_px)
         if self._uses_cpu and shares_memory(self._ctx) and size <= MAX_WRITTEN_BYTES:
-            sums = self._pixel_sums = PixelSums(planes, levels)
+            sums = self._pixel_sums = PixelSums(levels)
             side_px = least_side_px(target.psf)
             self._cpu_stars = CpuStars(units, levels.image, sums.values, side_px)
             return
         self._unit_splat = splat_program(
-            self._ctx, target.resolution_px, self._shares, planes, in_units=True
+            self._ctx, target.resolution_px, self._shares, in_units=True
         )
-        set_planes(planes, self._unit_splat, most_e_per_s=units.most_e_per_s)
-        set_planes(planes, encoder.sprite_program)
+        set_uniforms(self._unit_splat, {"most_e_per_s": units.most_e_per_s})
         for program in (self._unit_splat, encoder.sprite_program):
             program["reach_px2"], program["largest_px"] = units.axes_px2, units.side_px
 
@@ -229,12 +221,12 @@ class Renderer(Backend):
         """The sprites in the buffer as a program takes them."""
         if program is None:
             return None
-        return sprites_array(program, self._buffer, self._planes)
+        return sprites_array(program, self._buffer)
 
     def _reserve(self, sprites: int) -> None:
         """Make room for `sprites` sprites on the GPU; it grows by doubling and never shrinks."""
         self._capacity = sprites
-        self._buffer = self._ctx.buffer(reserve=sprites * self._planes.dtype.itemsize, dynamic=True)
+        self._buffer = self._ctx.buffer(reserve=sprites * SPRITE_DTYPE.itemsize, dynamic=True)
         self._splat_vao = self._array_of(self._splat)
         self._unit_vao = self._array_of(self._unit_splat)
         self._last_count: int | None = None  # sprites in the buffer and on the images
@@ -251,22 +243,25 @@ class Renderer(Backend):
             self._last_frame = frame
             stars = self._cpu_stars
             by_star = self._by_star
-            if by_star is None or self._exact_passes:
+            exact_pass = self._exact_pass
+            if by_star is None or exact_pass is not None:
                 sprites = as_maps(sprites, self.target)
+            if exact_pass is not None:
+                exact_pass.forget_over()
+            if self._exact is not None:
+                self._exact.over = None
             extended = sprites is not None and bool(sprites.extended)
             # Stars are added to levels of extended light, on the CPU or by NumPy.
             on_floor = extended and by_star is not None
-            in_units = not extended or (on_floor and stars is not None and not self._planes.apart)
+            in_units = not extended or (on_floor and stars is not None)
             units = self._units if in_units else None
             if units is None:
                 unit_e_per_s = None
             else:
                 unit_e_per_s = units.unit_for(sprites)
             self._by_numpy = by_star is not None and (
-                not self._exact_passes or (on_floor and unit_e_per_s is None)
+                exact_pass is None or (on_floor and unit_e_per_s is None)
             )
-            if sprites is not None and not self._by_numpy:
-                sprites = self._planes.packed(sprites)
             # `exact` takes no finer units
             if stars is not None and in_units and (unit_e_per_s or by_star is None):
                 floor = None
@@ -288,7 +283,7 @@ class Renderer(Backend):
         self,
         stars: CpuStars,
         sprites: FrameLight | None,
-        unit_e_per_s: list[float] | None,
+        unit_e_per_s: float | None,
         floor: LevelTexture | None,
     ) -> None:
         """Levels star by star; the linear image is drawn only when it is read."""
@@ -319,16 +314,8 @@ class Renderer(Backend):
 
     def draw_linear(self, sprites: FrameLight) -> None:
         """See `Backend.draw_linear`."""
-        if self._planes.apart:
-            self._white.draw_linear(sprites)
-            return
         with self._ctx:
             self._draw_linear(sprites, whole=True)
-
-    @cached_property
-    def _white(self) -> "Renderer":
-        """A renderer of linear images, for a target of primaries, which has none of its own."""
-        return Renderer(Target(self.target.resolution_px, self.target.psf), self._ctx)
 
     @cached_property
     def _extended(self) -> "ExtendedLayer":
@@ -340,18 +327,15 @@ class Renderer(Backend):
     def begin_anew(self) -> None:
         """See `Backend.begin_anew`."""
         self._last_frame = NO_FRAME
-        for quantiser in self._exact.values():
-            quantiser.left = None
-        for exact_pass in self._exact_passes:
-            exact_pass.left = None
+        if self._exact is not None:
+            self._exact.left = None
+        if self._exact_pass is not None:
+            self._exact_pass.left = None
 
-    def _draw_by_points(self, sprites: FrameLight | None, unit_e_per_s: list[float] | None) -> None:
+    def _draw_by_points(self, sprites: FrameLight | None, unit_e_per_s: float | None) -> None:
         """The linear image and its levels by rasterised sprites, in units where one is given."""
-        few_px = self.target.resolution_px[0] * self.target.resolution_px[1] // SPRITE_PIXEL_COST
-        if self._encoder is not None:
-            sides = self._lit_sides
-        else:
-            sides = ()
+        few_px = math.prod(self.target.resolution_px) // SPRITE_PIXEL_COST
+        sides = () if self._encoder is None else self._lit_sides
         if sprites is None:
             covered_px = 0
         else:
@@ -368,7 +352,7 @@ class Renderer(Backend):
             encoder.sprite_program["reach_per_e"] = reach_per_e
             if in_units and unit_e_per_s is not None:
                 splat["reach_per_e"] = reach_per_e
-                set_planes(self._planes, splat, unit_e_per_s=unit_e_per_s)
+                splat["unit_e_per_s"] = unit_e_per_s
         cut = in_units or (bool(self._cut_sides) and sprites is not None and covered_px < few_px)
         if sprites is None or not sprites.extended or covered_px >= few_px:
             sure = None
@@ -398,40 +382,47 @@ class Renderer(Backend):
         """Choose the levels of the sprites that are drawn, star by star, with what NumPy's last
         frame left.
         """
-        for exact_pass in self._exact_passes:
-            # what NumPy's quantiser carries goes on here
-            if self._exact and self._exact[exact_pass.plane].left is not None:
-                exact_pass.left = self._exact[exact_pass.plane].left
-                self._exact[exact_pass.plane].left = None
-            if sprites is None or not len(sprites):
-                exact_pass.left = None
-                continue
-            with self._stage("choose"):
-                exact_pass.draw(self._buffer if sums is None else sums.sprites, sprites, sums)
+        exact_pass = self._exact_pass
+        if exact_pass is None:
+            return
+        # what NumPy's quantiser carries goes on here
+        if self._exact is not None and self._exact.left is not None:
+            exact_pass.left = self._exact.left
+            self._exact.left = None
+        if sprites is None or not len(sprites):
+            exact_pass.left = None
+            return
+        with self._stage("choose"):
+            exact_pass.draw(self._buffer if sums is None else sums.sprites, sprites, sums)
 
     def _draw_by_numpy(self, sprites: FrameLight | None, frame: int) -> None:
         """Levels by the sprites themselves: the linear image is drawn only when it is read."""
-        target, levels, by_star = self.target, self._levels, self._by_star
-        if levels is None or by_star is None:
+        levels = self._levels
+        quantiser = self._numpy_exact()
+        if levels is None or quantiser is None:
             return
-        if not self._exact:
-            for plane, quantiser in quantisers_of(target).items():
-                if isinstance(quantiser, ExactQuantiser):
-                    self._exact[plane] = quantiser
         # what the shader carries goes on here
-        for exact_pass in self._exact_passes:
-            carried = exact_pass.left
-            if carried is not None:
-                self._exact[exact_pass.plane].left = carried
-                exact_pass.left = None
+        exact_pass = self._exact_pass
+        if exact_pass is not None and exact_pass.left is not None:
+            quantiser.left = exact_pass.left
+            exact_pass.left = None
         floor = None
         if sprites is not None and sprites.extended:
-            floor = self._floor(sprites, by_star.floor_turn(frame)).read()
-        on = [None] * len(self._exact) if floor is None else np.atleast_3d(floor).transpose(2, 0, 1)
-        self._exact_levels = levels_by_plane(
-            target, sprites, lambda k, light: self._exact[k].levels(light, on[k])
-        )
+            floor = self._floor(sprites, quantiser.floor_turn(frame)).read()
+        self._exact_levels = quantiser.levels(sprites, floor)
         levels.write(self._exact_levels)
+
+    def _numpy_exact(self) -> ExactQuantiser | None:
+        """`exact` in NumPy, made by the first frame that needs it: its arrays are as large as the
+        image.
+        """
+        target = self.target
+        if self._exact is None and self._by_star is not None and self._panel is not None:
+            before = [renderer._numpy_exact() for renderer in self._before]
+            self._exact = self._by_star(self._panel, target.resolution_px, target.psf, target.seen)
+            self._exact.turn = target.turn
+            self._exact.before = [quantiser for quantiser in before if quantiser is not None]
+        return self._exact
 
     def _floor(self, sprites: FrameLight, turn: float) -> LevelTexture:
         """The levels of extended light alone, dithered by a turned mask: stars are added to them in
@@ -439,14 +430,15 @@ class Renderer(Backend):
 
         The same lights and turn again give the same levels, which are kept.
         """
-        key = sprites.lights or sprites.extended, turn
+        key = sprites.extended, turn
+        panel = self._panel
+        if panel is None:
+            raise TypeError(NO_LEVELS)
         if self._floor_encoder is None or self._floor_levels is None:
-            self._floor_key, self._floor_levels = (
-                ((), 0.0),
-                LevelTexture(self._ctx, self.target.resolution_px, self._planes),
-            )
+            self._floor_key = (), 0.0
+            self._floor_levels = LevelTexture(self._ctx, self.target.resolution_px, panel.response)
             self._floor_encoder = Encoder(
-                self._ctx, self._linear, self._floor_levels, self._planes, DitherQuantiser
+                self._ctx, self._linear, self._floor_levels, panel, DitherQuantiser
             )
         if key != self._floor_key:
             self._erase(levels=False)
@@ -462,13 +454,14 @@ class Renderer(Backend):
 
     def _sure(self, quantiser: type[PixelQuantiser], sprites: FrameLight | None) -> "Sure | None":
         """The bounds beyond which a disc's levels are sure without its exact light: black below the
-        first and white above the second. None with several planes.
+        first and white above the second. None without a response.
         """
-        if self._planes.apart or not self._planes.panels:
+        panel = self._panel
+        if panel is None:
             return None
         from hilstar.display.render.disc_tiles import Sure
 
-        panel, (least, most) = self._planes.panels[0], self._gains
+        least, most = self._gains
         white_e_per_s = panel.flux_at_white_e_per_s
         # The first step by the smallest threshold of a mask, at all of its turns
         dark_e_per_s = quantiser.lit_from_e_per_s(panel) or float(
@@ -481,17 +474,8 @@ class Renderer(Backend):
         return Sure(dark_e_per_s / most, white_e_per_s / least, places_px, self.footprint_px)
 
     def _draw_extended(self, sprites: FrameLight, sure: "Sure | None" = None) -> None:
-        """Add extended light to the linear image, that of each primary to its plane alone."""
-        fbo = self._linear_fbo
-        self._regions = ()
-        for plane, lights in enumerate(sprites.lights or (sprites.extended,)):
-            if self._planes.apart:
-                fbo.color_mask = plane == 0, plane == 1, plane == 2, plane == 3
-            else:
-                fbo.color_mask = True, True, True, True
-            regions, self._tiles = self._extended.draw(fbo, lights, sure)
-            self._regions += regions
-        fbo.color_mask = True, True, True, True
+        """Add extended light to the linear image."""
+        self._regions, self._tiles = self._extended.draw(self._linear_fbo, sprites.extended, sure)
 
     def _draw_linear(
         self,
@@ -523,19 +507,14 @@ class Renderer(Backend):
                 self._buffer.orphan()
                 self._buffer.write(sprites.data)
             self._last_count = len(sprites)
-            width, height = self.target.resolution_px
-            margin = self.footprint_px
             with self._stage("splat"):
                 if not in_units:
                     self._splat["sides"] = 0 if whole else len(self._cut_sides)
                     self._splat["sprites_per_star"] = float(sprites.per_star)
                 self._linear_fbo.use()
                 self._shares.bind()
-                self._linear_fbo.viewport = (
-                    -margin,
-                    -margin,
-                    width + 2 * margin,
-                    height + 2 * margin,
+                self._linear_fbo.viewport = viewport_of_sprites(
+                    self.target.resolution_px, self.footprint_px
                 )
                 self._ctx.enable(moderngl.BLEND)
                 vao = self._unit_vao if in_units and self._unit_vao is not None else self._splat_vao
@@ -564,7 +543,7 @@ class Renderer(Backend):
         if self._by_numpy:
             return self._exact_levels
         if self._levels is None:
-            raise TypeError("this target has no monitor response, so no levels")
+            raise TypeError(NO_LEVELS)
         if self._levels.in_memory:  # nothing of them is left to draw
             return self._levels.read()
         with self._ctx:
@@ -577,7 +556,7 @@ class Renderer(Backend):
         without a response.
         """
         if self._levels is None:
-            raise TypeError("this target has no monitor response, so no levels")
+            raise TypeError(NO_LEVELS)
         with self._ctx:
             return self._levels.upload()
 
@@ -585,8 +564,6 @@ class Renderer(Backend):
         """See `Backend.linear`."""
         if self._cpu_image is not None and self._is_cpu_image:
             return self._cpu_image.image
-        if self._planes.apart:
-            return self._white.linear()
         with self._ctx:
             if self._undrawn is not None:
                 self._draw_linear(*self._undrawn, levels=self._by_numpy)
@@ -594,21 +571,22 @@ class Renderer(Backend):
             self._linear_fbo.read_into(self._linear_image, components=1, dtype="f4", alignment=1)
         return self._linear_image
 
-    def show_on(self, view: ScreenView) -> None:
+    def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
         """See `Backend.show_on`."""
         from hilstar.display.render.presenter import Presenter
 
-        self._screen, self._presenter = (
-            view,
-            Presenter(self.codes_texture, view, apart=self._planes.apart),
-        )
+        self._screen = view
+        self._shown = [self, *(other for other in beside if isinstance(other, Renderer))]
+        textures = [renderer.codes_texture for renderer in self._shown]
+        self._presenter = Presenter(textures[0], view, textures[1:])
         self.tables.append(self._presenter.table)
 
     def present(
         self, overlay: int = 0, patch_code: int = 0, marker: tuple[int, int] = (0, 0)
     ) -> None:
         """See `Backend.present`."""
-        _ = self.codes_texture  # with the last levels
+        for renderer in self._shown:
+            _ = renderer.codes_texture  # with the last levels
         self._presenter.present(overlay, patch_code, marker)
 
     def take_back_buffer(self) -> None:

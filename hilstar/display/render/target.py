@@ -1,21 +1,17 @@
 """What a backend draws: an image, its sprites, and the monitor that shows it."""
 
-import math
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.display.balance import AS_USUAL, Seen
+from hilstar.display.exact import Turn
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import Quantisation
 from hilstar.display.response import Response
 from hilstar.optics.psf import Psf
-from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight
-
-APART_DTYPE = np.dtype([*SPRITE_DTYPE.descr, ("primaries_e_per_s", "<f4", 3)])
 
 MAX_SIDES = 8  # as in star.vert
 
@@ -41,7 +37,7 @@ class Target:
     as the footprint. `seen` is how the tracker sees the monitor, for `exact` and `temporal`. Where
     the `primaries` are driven apart, each has its panel, and its light lies at its place of
     `places_px` (3, 2) within a pixel; `together` (3, 3) are products of two primaries' electrons
-    over the channels.
+    over the channels. The target `of_primary` has one of them alone, and its `turn` among them.
     """
 
     resolution_px: tuple[int, int]
@@ -55,6 +51,7 @@ class Target:
     primaries: tuple[Panel, ...] = ()
     places_px: FloatArray = field(default_factory=lambda: np.zeros((1, 2)))
     together: FloatArray = field(default_factory=lambda: np.eye(1))
+    turn: Turn = field(default_factory=Turn)
 
     def panel(self) -> Panel | None:
         """The monitor, None without a response. Raises InputError for a map that does not fit."""
@@ -69,80 +66,20 @@ class Target:
             )
         return Panel(self.response, self.flux_at_white_e_per_s, self.uniformity)
 
-
-@dataclass(frozen=True, slots=True)
-class Planes:
-    """The planes of an image: one, or one for each of the primaries that a target drives apart.
-
-    `panels` are theirs, `share` (planes,) what of white's light each has, and `footprint_px` the
-    side of sprites that hold the light of all: it lies up to `margin_px` from the star.
-    """
-
-    panels: tuple[Panel, ...]
-    share: tuple[float, ...]
-    footprint_px: int
-    margin_px: tuple[float, float]
-    defines: tuple[str, ...]
-    places_px: list[tuple[float, float]]
-
-    @classmethod
-    def of(cls, target: Target) -> "Planes":
-        """Those of a target."""
-        white_e_per_s = target.flux_at_white_e_per_s
-        panel = target.panel()
-        panels = target.primaries or (() if panel is None else (panel,))
-        if target.primaries:
-            away = np.abs(np.array(target.places_px)).max(axis=0)
-        else:
-            away = np.zeros(2)
-        defines = ["APART"] * bool(target.primaries) + ["OFFSETS"] * bool(away.any())
-        share = tuple(one.flux_at_white_e_per_s / white_e_per_s for one in panels)
-        margin_px = float(away[0]), float(away[1])
-        side_px = target.psf.footprint_px + 2 * math.ceil(max(margin_px))
-        return cls(
-            panels,
-            share,
-            side_px,
-            margin_px,
-            tuple(defines),
-            [(float(x), float(y)) for x, y in target.places_px],
+    def of_primary(self, k: int, turn: Turn) -> "Target":
+        """The target of primary `k` alone: a grey monitor with that primary's light."""
+        panel = self.primaries[k]
+        # the sides are by stars' rates of white
+        share = panel.flux_at_white_e_per_s / self.flux_at_white_e_per_s
+        sides = [SpriteSide(share * side.below_e_per_s, side.side_px) for side in self.sides]
+        return Target(
+            resolution_px=self.resolution_px,
+            psf=self.psf,
+            response=panel.response,
+            flux_at_white_e_per_s=panel.flux_at_white_e_per_s,
+            quantisation=self.quantisation,
+            uniformity=panel.uniformity,
+            sides=tuple(sides),
+            seen=self.seen,
+            turn=turn,
         )
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        """A sprite's: SPRITE_DTYPE, with the light of each primary after it."""
-        return APART_DTYPE if self.apart else SPRITE_DTYPE
-
-    @property
-    def apart(self) -> bool:
-        """Whether there is a plane for each primary."""
-        return len(self.panels) > 1
-
-    @property
-    def texel(self) -> int:
-        """Components of a texel."""
-        return 4 if self.apart else 1
-
-    @property
-    def lit(self) -> Panel:
-        """A grey panel whose first level takes as little light as that of any plane."""
-        first, share = min(
-            zip(self.panels, self.share, strict=True),
-            key=lambda one: float(one[0].response.threshold[0]),
-        )
-        return replace(first, flux_at_white_e_per_s=first.flux_at_white_e_per_s / share)
-
-    def packed(self, sprites: FrameLight) -> FrameLight:
-        """Sprites with `dtype`; their rate is then that of the white that they need for the
-        primary that needs most.
-        """
-        if not self.apart or sprites.primaries is None:
-            return sprites
-        data = np.empty(len(sprites), dtype=APART_DTYPE)
-        fields = data.view(np.int32).reshape(len(sprites), APART_DTYPE.itemsize // 4)
-        fields[:, :5] = sprites.data.view(np.int32).reshape(-1, 5)
-        data["primaries_e_per_s"] = sprites.primaries
-        data["electrons_per_s"] = (sprites.primaries / np.array(self.share, dtype=np.float32)).max(
-            axis=1
-        )
-        return replace(sprites, data=data)

@@ -60,9 +60,7 @@ class VariantRenderer(Renderer):
             self._shares = Shares(self._ctx, self.target.psf, self.footprint_px)
             if variant.profile == "erf":  # where a polynomial would do
                 self._shares.defines = ()
-            self._splat = splat_program(
-                self._ctx, self.target.resolution_px, self._shares, self._planes
-            )
+            self._splat = splat_program(self._ctx, self.target.resolution_px, self._shares)
         else:
             define = variant.profile.upper().replace(" ", "_")
             self._splat = build_program(self._ctx, "star.vert", "study/splat.frag", (define,))

@@ -50,6 +50,7 @@ class Awake:
             self._process.stdout.close()
 
     def _wait(self) -> None:
+        """Wait for the process's word, or its end."""
         if (
             self._process.stdout is not None
             and select.select([self._process.stdout], [], [], MAX_WAIT_S)[0]
@@ -75,6 +76,8 @@ class _Blanking(NamedTuple):
 
 
 class _Server:
+    """A connection to the X server of DISPLAY. Raises OSError without one."""
+
     def __init__(self) -> None:
         self._x11, self._xext = (ctypes.CDLL(name) for name in ("libX11.so.6", "libXext.so.6"))
         self._x11.XOpenDisplay.restype = ctypes.c_void_p
@@ -136,6 +139,7 @@ def _keep() -> None:
 
 
 def _main() -> None:
+    """Leave the run, whose signals are not meant for this process, and keep the screen awake."""
     if os.fork():
         os._exit(0)
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):

@@ -13,7 +13,20 @@ from typing import NamedTuple
 
 import numpy as np
 
-Value = str | int | tuple[int, ...]
+from hilstar.display.window.property_rules import (
+    NVIDIA,
+    RIGHT,
+    WRONG,
+    PropertyRule,
+    Value,
+    at_least_the_bits,
+    by_nvidia,
+    doubtful_unless,
+    identity_matrix,
+    one_of,
+    set_by_xrandr,
+)
+
 Pair = tuple[int, int]
 IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 TRANSFORM_TOLERANCE = 1e-4  # X has 16 bits after the point
@@ -21,11 +34,97 @@ PITCH_TOLERANCE = 0.03
 CM_ROUNDING_MM = 5.0
 # numbers of a property; a longer one (a table of the colour hardware) is not listed
 MAX_LISTED = 18
-NVIDIA = "nvidia-settings: "
-WRONG, DOUBTFUL, RIGHT = "wrong", "doubtful", "right"
 DITHERS = "the driver adds a pattern to every code"
-ONE = (0, 1)  # as a drm_color_ctm has it
-IDENTITY_HALVES = [*ONE, *[0] * 6, *ONE, *[0] * 6, *ONE]
+SCALES = "frames are scaled to leave a margin"
+FOLLOWS = "the refresh follows the frames"
+RULES = (
+    PropertyRule(
+        "Broadcast RGB",
+        one_of("full", "automatic"),
+        "codes go to 16 to 235, always or at television modes",
+        set_by_xrandr("Full"),
+    ),
+    PropertyRule(
+        "output_csc", one_of("bypass"), "codes are converted on their way", set_by_xrandr("bypass")
+    ),
+    PropertyRule(
+        "max bpc",
+        at_least_the_bits,
+        "the cable carries fewer bits than the bench's codes have",
+        set_by_xrandr("{bits}"),
+    ),
+    PropertyRule("dithering mode", one_of("off"), DITHERS, set_by_xrandr("off")),
+    PropertyRule("dither", one_of("off"), DITHERS, set_by_xrandr("off")),
+    PropertyRule(
+        "CTM",
+        identity_matrix,
+        "a colour matrix mixes the primaries",
+        set_by_xrandr("0,1,0,0,0,0,0,0,0,1,0,0,0,0,0,0,0,1"),
+    ),
+    PropertyRule(
+        "Colorspace", one_of("default"), "the panel converts colours", set_by_xrandr("Default")
+    ),
+    PropertyRule(
+        "HDR_OUTPUT_METADATA", one_of("0"), "the panel maps tones (HDR)", set_by_xrandr("0")
+    ),
+    PropertyRule(
+        "underscan",
+        one_of("off", "auto"),
+        "frames are scaled down, always or on a television",
+        set_by_xrandr("off"),
+    ),
+    PropertyRule("left margin", one_of("0"), SCALES, set_by_xrandr("0")),
+    PropertyRule("right margin", one_of("0"), SCALES, set_by_xrandr("0")),
+    PropertyRule("top margin", one_of("0"), SCALES, set_by_xrandr("0")),
+    PropertyRule("bottom margin", one_of("0"), SCALES, set_by_xrandr("0")),
+    PropertyRule(
+        "abm level",
+        one_of("0"),
+        "the driver dims the backlight and lifts codes by the picture",
+        set_by_xrandr("0"),
+    ),
+    PropertyRule("vibrant hue", one_of("90"), "the driver turns hues", set_by_xrandr("90")),
+    PropertyRule(
+        "color vibrance", one_of("150"), "the driver saturates colours", set_by_xrandr("150")
+    ),
+    PropertyRule("VRR_ENABLED", one_of("0,off"), FOLLOWS, set_by_xrandr("0")),
+    PropertyRule("adaptive-sync", one_of("0,off"), FOLLOWS, set_by_xrandr("0")),
+    PropertyRule("freesync", one_of("0,off"), FOLLOWS, set_by_xrandr("0")),
+    PropertyRule(
+        "TearFree",
+        doubtful_unless("off,auto"),
+        "frames are copied once more, and may come a refresh late",
+        set_by_xrandr("off"),
+    ),
+    PropertyRule(
+        "content type",
+        doubtful_unless("no data,graphics"),
+        "the monitor may process pictures by it",
+        set_by_xrandr("Graphics"),
+    ),
+    PropertyRule(f"{NVIDIA}CurrentDithering", one_of("0"), DITHERS, by_nvidia("Dithering=2")),
+    PropertyRule(
+        f"{NVIDIA}CurrentColorRange",
+        one_of("0"),
+        "codes go to 16 to 235",
+        by_nvidia("ColorRange=0"),
+    ),
+    PropertyRule(
+        f"{NVIDIA}CurrentColorSpace",
+        one_of("0"),
+        "codes are converted to YCbCr",
+        by_nvidia("ColorSpace=0"),
+    ),
+    PropertyRule(
+        f"{NVIDIA}DigitalVibrance",
+        one_of("0"),
+        "the driver saturates colours",
+        by_nvidia("DigitalVibrance=0"),
+    ),
+)
+NVIDIA_ATTRIBUTES = tuple(
+    rule.name.removeprefix(NVIDIA) for rule in RULES if rule.name.startswith(NVIDIA)
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,35 +200,38 @@ def findings(
     """The faults of an output that shows codes of `bits` bits on pixels of that pitch (None: not
     known).
     """
+    properties = state.properties or {}
     for rule in RULES:
-        value = (state.properties or {}).get(rule.name)
+        value = properties.get(rule.name)
         if value is None:
-            verdict = RIGHT
-        else:
-            verdict = rule.judge(value, bits)
-        if value is not None and verdict != RIGHT:
+            continue
+        verdict = rule.judge(value, bits)
+        if verdict != RIGHT:
             mend = rule.mend.format(output=state.name, name=rule.name, bits=bits)
-            yield Finding(
-                f"{rule.name} of {state.name} is {_words(value)}: {rule.why}; {mend}",
-                verdict == WRONG,
-            )
+            fault = f"{rule.name} of {state.name} is {_words(value)}: {rule.why}"
+            yield Finding(f"{fault}; {mend}", verdict == WRONG)
     yield from _geometry_findings(state)
-    edid_pitch_um = _own_pitch_um(state.edid)
-    if (
-        pixel_pitch_um is not None
-        and edid_pitch_um is not None
-        and abs(edid_pitch_um[0] - pixel_pitch_um)
-        > PITCH_TOLERANCE * edid_pitch_um[0] + edid_pitch_um[1]
-    ):
+    if pixel_pitch_um is not None:
+        yield from _pitch_findings(state, pixel_pitch_um)
+
+
+def _pitch_findings(state: OutputState, pixel_pitch_um: float) -> Iterator[Finding]:
+    """Whether the bench file's pitch is another than the EDID's."""
+    edid_pitch_um = _edid_pitch_um(state.edid)
+    if edid_pitch_um is None:
+        return
+    pitch_um, rounding_um = edid_pitch_um
+    if abs(pitch_um - pixel_pitch_um) > PITCH_TOLERANCE * pitch_um + rounding_um:
         text = (
-            f"{state.name} says by its EDID that its pixels are {edid_pitch_um[0]:.1f} um apart and"
+            f"{state.name} says by its EDID that its pixels are {pitch_um:.1f} um apart and"
             f" the bench file says {pixel_pitch_um:g}; measure it, and set [monitor] pixel_pitch_um"
         )
         yield Finding(text, False)
 
 
 def _geometry_findings(state: OutputState) -> Iterator[Finding]:
-    off = max(abs(a - b) for a, b in zip(state.transform, IDENTITY, strict=True))
+    """What scales, turns or copies frames on their way to an output."""
+    off = np.abs(np.subtract(state.transform, IDENTITY)).max()
     if off > TRANSFORM_TOLERANCE:
         mend = f"xrandr --output {state.name} --transform none"
         yield Finding(
@@ -179,161 +281,30 @@ def size_mm_of(edid: bytes) -> Pair | None:
     return None
 
 
-def _own_pitch_um(edid: bytes) -> tuple[float, float] | None:
-    """The pitch of an EDID's own pixels, um, and its uncertainty by rounding of the size."""
+def _edid_pitch_um(edid: bytes) -> tuple[float, float] | None:
+    """The pitch of a monitor's own pixels by its EDID, um, and its uncertainty by rounding of the
+    size.
+    """
     timing = edid[54:72]
     if len(edid) < 128 or not timing[0] | timing[1]:
         return None
     wide_px = timing[2] | (timing[4] & 0xF0) << 4
-    fine = size_mm_of(edid)
-    coarse_mm = 10 * edid[21]
-    if not wide_px or not (fine or (coarse_mm and edid[22])):
+    size_mm = size_mm_of(edid)
+    width_cm = edid[21]
+    height_cm = edid[22]
+    if size_mm is not None:
+        wide_mm, rounding_mm = size_mm[0], 0.5
+    elif width_cm and height_cm:
+        wide_mm, rounding_mm = 10 * width_cm, CM_ROUNDING_MM
+    else:
         return None
-    wide_mm, rounding_mm = (fine[0], 0.5) if fine else (coarse_mm, CM_ROUNDING_MM)
-    return wide_mm / wide_px * 1e3, rounding_mm / wide_px * 1e3
+    if not wide_px:
+        return None
+    um_per_mm = 1e3 / wide_px
+    return wide_mm * um_per_mm, rounding_mm * um_per_mm
 
 
 def _words(value: Value) -> str:
     if isinstance(value, tuple):
         return " ".join(str(part) for part in value)
     return str(value)
-
-
-Judge = Callable[[Value, int], str]
-
-
-@dataclass(frozen=True, slots=True)
-class _Rule:
-    """A property: whether a value is right for codes of some bits, why not, and the command that
-    mends it.
-    """
-
-    name: str
-    judge: Judge
-    why: str
-    mend: str
-
-
-def _one_of(right: str, doubtful: str = "") -> Judge:
-    """Right are these values, separated by commas, in any case; some are doubtful; all others
-    are wrong.
-    """
-    good = right.lower().split(",")
-    unsure = doubtful.lower().split(",") if doubtful else []
-
-    def judge(value: Value, bits: int) -> str:
-        word = str(value).lower()
-        if word in good:
-            return RIGHT
-        if word in unsure:
-            return DOUBTFUL
-        return WRONG
-
-    return judge
-
-
-def _doubtful_unless(right: str) -> Judge:
-    good = right.lower().split(",")
-    return lambda value, bits: RIGHT if str(value).lower() in good else DOUBTFUL
-
-
-def _identity_matrix(value: Value, bits: int) -> str:
-    """A matrix of drm_color_ctm: nine numbers of sign, 31 and 32 bits, the low half first; all 0
-    where none is set.
-    """
-    if not value:
-        return RIGHT
-    halves = (np.atleast_1d(value).astype(np.int64) & 0xFFFFFFFF).tolist()
-    if not any(halves) or halves == IDENTITY_HALVES:
-        return RIGHT
-    return WRONG
-
-
-def _set(value: str) -> str:
-    return f'xrandr --output {{output}} --set "{{name}}" "{value}"'
-
-
-def _by_nvidia(attribute: str) -> str:
-    return f'nvidia-settings -a "[DPY:{{output}}]/{attribute}"'
-
-
-RULES = (
-    _Rule(
-        "Broadcast RGB",
-        _one_of("full", "automatic"),
-        "codes go to 16 to 235, always or at television modes",
-        _set("Full"),
-    ),
-    _Rule("output_csc", _one_of("bypass"), "codes are converted on their way", _set("bypass")),
-    _Rule(
-        "max bpc",
-        lambda value, bits: WRONG if isinstance(value, int) and value < bits else RIGHT,
-        "the cable carries fewer bits than the bench's codes have",
-        _set("{bits}"),
-    ),
-    _Rule("dithering mode", _one_of("off"), DITHERS, _set("off")),
-    _Rule("dither", _one_of("off"), DITHERS, _set("off")),
-    _Rule(
-        "CTM",
-        _identity_matrix,
-        "a colour matrix mixes the primaries",
-        _set("0,1,0,0,0,0,0,0,0,1,0,0,0,0,0,0,0,1"),
-    ),
-    _Rule("Colorspace", _one_of("default"), "the panel converts colours", _set("Default")),
-    _Rule("HDR_OUTPUT_METADATA", _one_of("0"), "the panel maps tones (HDR)", _set("0")),
-    _Rule(
-        "underscan",
-        _one_of("off", "auto"),
-        "frames are scaled down, always or on a television",
-        _set("off"),
-    ),
-    *(
-        _Rule(f"{side} margin", _one_of("0"), "frames are scaled to leave a margin", _set("0"))
-        for side in ("left", "right", "top", "bottom")
-    ),
-    _Rule(
-        "abm level",
-        _one_of("0"),
-        "the driver dims the backlight and lifts codes by the picture",
-        _set("0"),
-    ),
-    _Rule("vibrant hue", _one_of("90"), "the driver turns hues", _set("90")),
-    _Rule("color vibrance", _one_of("150"), "the driver saturates colours", _set("150")),
-    _Rule("VRR_ENABLED", _one_of("0,off"), "the refresh follows the frames", _set("0")),
-    _Rule("adaptive-sync", _one_of("0,off"), "the refresh follows the frames", _set("0")),
-    _Rule("freesync", _one_of("0,off"), "the refresh follows the frames", _set("0")),
-    _Rule(
-        "TearFree",
-        _doubtful_unless("off,auto"),
-        "frames are copied once more, and may come a refresh late",
-        _set("off"),
-    ),
-    _Rule(
-        "content type",
-        _doubtful_unless("no data,graphics"),
-        "the monitor may process pictures by it",
-        _set("Graphics"),
-    ),
-    _Rule(f"{NVIDIA}CurrentDithering", _one_of("0"), DITHERS, _by_nvidia("Dithering=2")),
-    _Rule(
-        f"{NVIDIA}CurrentColorRange",
-        _one_of("0"),
-        "codes go to 16 to 235",
-        _by_nvidia("ColorRange=0"),
-    ),
-    _Rule(
-        f"{NVIDIA}CurrentColorSpace",
-        _one_of("0"),
-        "codes are converted to YCbCr",
-        _by_nvidia("ColorSpace=0"),
-    ),
-    _Rule(
-        f"{NVIDIA}DigitalVibrance",
-        _one_of("0"),
-        "the driver saturates colours",
-        _by_nvidia("DigitalVibrance=0"),
-    ),
-)
-NVIDIA_ATTRIBUTES = tuple(
-    rule.name.removeprefix(NVIDIA) for rule in RULES if rule.name.startswith(NVIDIA)
-)

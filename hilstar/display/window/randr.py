@@ -15,13 +15,12 @@ from typing import Any
 from hilstar.basics.process.closing import Closing
 from hilstar.display.window.output_settings import (
     IDENTITY,
-    NVIDIA,
     NVIDIA_ATTRIBUTES,
     OutputState,
     Pair,
-    Value,
     property_value,
 )
+from hilstar.display.window.property_rules import NVIDIA, Value
 from hilstar.display.window.x11 import (
     INT,
     NUMBER,
@@ -239,6 +238,7 @@ class Randr(Closing):
     def _state(
         self, resources: Any, number: int, output: Any, modes: dict[int, _Mode]
     ) -> OutputState | None:
+        """An output that is lit; None where its CRTC shows no known mode."""
         crtc = self._xrandr.XRRGetCrtcInfo(self._display, ctypes.byref(resources), output.crtc)
         with self._got(_Crtc, self._xrandr.XRRFreeCrtcInfo, crtc) as now:
             if now is None or now.mode not in modes:
@@ -264,6 +264,7 @@ class Randr(Closing):
         )
 
     def _transform(self, crtc: int) -> tuple[float, ...]:
+        """The rows of a CRTC's 3 x 3 transform; IDENTITY where it has none."""
         pointer = ctypes.POINTER(_Transform)()
         if (
             not self._xrandr.XRRGetCrtcTransform(self._display, crtc, ctypes.byref(pointer))
@@ -275,6 +276,7 @@ class Randr(Closing):
         return current if any(current) else IDENTITY
 
     def _properties(self, output: int) -> Iterator[tuple[str, Value | bytes]]:
+        """Name and value of each property of an output; the EDID as bytes."""
         count = ctypes.c_int()
         atoms = self._xrandr.XRRListOutputProperties(self._display, output, ctypes.byref(count))
         for atom in atoms[: count.value] if atoms else ():
@@ -286,6 +288,7 @@ class Randr(Closing):
             self._x11.XFree(ctypes.cast(atoms, POINTER))
 
     def _property(self, output: int, atom: int, raw: bool) -> Value | bytes | None:
+        """The value of a property, None for none or a table; `raw` bytes as they are."""
         kind = ctypes.c_ulong()
         form = ctypes.c_int()
         count = ctypes.c_ulong()
@@ -307,6 +310,7 @@ class Randr(Closing):
         return property_value(kind_name, form.value, items, self._atom)
 
     def _atom(self, atom: int) -> str:
+        """The name of an atom, "" for none."""
         name = self._x11.XGetAtomName(self._display, atom)
         if not name:
             return ""
@@ -315,6 +319,7 @@ class Randr(Closing):
         return text
 
     def _providers(self) -> tuple[str, ...]:
+        """The names of the screen's GPUs."""
         pointer = self._xrandr.XRRGetProviderResources(self._display, self._root)
         with self._got(_Providers, self._xrandr.XRRFreeProviderResources, pointer) as providers:
             if providers is None:

@@ -45,12 +45,15 @@ def identity_here(wanted: int | str) -> MonitorIdentity | None:
                 adds["a transform"] = state.transform != IDENTITY
     edid = edid or edid_of_drm(display.name)
     width, height = display.resolution_px
+    gamma_ramp = sha256_of(ramp)
+    if ramp and is_straight(ramp):
+        gamma_ramp = STRAIGHT
     return msgspec.structs.replace(
         edid_identity(edid),
         connector=display.name,
         mode=f"{width}x{height}@{refresh_hz:.2f}",
         bits=display.bits,
-        gamma_ramp=STRAIGHT if ramp and is_straight(ramp) else sha256_of(ramp),
+        gamma_ramp=gamma_ramp,
         window_system=tuple(what for what, there in adds.items() if there),
         **_by_ddc(edid),
     )
@@ -92,7 +95,9 @@ def _by_ddc(edid: bytes) -> dict[str, int]:
     ):
         values = value_text.split()
         with contextlib.suppress(ValueError):
-            settings[VCP[code]] = (
-                int(values[0]) if kind == "C" else int("".join(values[-2:]).replace("x", ""), 16)
-            )
+            if kind == "C":
+                settings[VCP[code]] = int(values[0])
+            else:
+                low_bytes = "".join(values[-2:])
+                settings[VCP[code]] = int(low_bytes.replace("x", ""), 16)
     return settings

@@ -75,6 +75,9 @@ class Visibility:
         return cls(x11, connection, window, place)
 
     def _run(self) -> None:
+        """The thread: look at events, and at times at what sends none, until `close` or the end of
+        the window or its server.
+        """
         descriptor = self._x11.XConnectionNumber(self._connection)
         while self._there:
             off_place = self._off_place() if self._mapped else ""
@@ -129,6 +132,7 @@ class Visibility:
         return "off the screen, in part or wholly"
 
     def _geometry(self, drawable: int) -> tuple[int, int] | None:
+        """The size of a window, px; None where it is gone."""
         root = ctypes.c_ulong()
         x = ctypes.c_int()
         y = ctypes.c_int()
@@ -147,6 +151,7 @@ class Visibility:
 
 
 def _ended(descriptor: int) -> bool:
+    """Whether the far end of a connection is closed."""
     poll = select.poll()
     poll.register(descriptor, 0)
     return bool(poll.poll(0))  # without requested events, it still reports a hang-up

@@ -102,14 +102,11 @@ class PresentEvents:
             # response_type, extension, sequence (2), length (4), event_type (2), kind, mode
             head = ctypes.string_at(event, 12)
             self._free(event)
-            generic = head[0] & 0x7F == GENERIC_EVENT and head[1] == self._opcode
-            if (
-                generic
-                and head[8] == COMPLETE_NOTIFY
-                and head[10] == KIND_PIXMAP
-                and head[11] < len(MODES)
-            ):
-                modes_shown.append(MODES[head[11]])
+            response, extension, kind, mode = head[0], head[1], head[10], head[11]
+            is_present = response & 0x7F == GENERIC_EVENT and extension == self._opcode
+            is_complete = head[8] == COMPLETE_NOTIFY and kind == KIND_PIXMAP
+            if is_present and is_complete and mode < len(MODES):
+                modes_shown.append(MODES[mode])
         return modes_shown
 
     def close(self) -> None:

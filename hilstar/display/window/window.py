@@ -129,6 +129,7 @@ def _glfw() -> Any:
 
 
 def _start() -> None:
+    """Begin GLFW, on X11 alone. Raises MachineError without a display."""
     glfw.ERROR_REPORTING = "ignore"
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
     display = os.environ.get("DISPLAY")
@@ -139,6 +140,7 @@ def _start() -> None:
 
 
 def _describe(index: int, monitor: Any) -> Display:
+    """A monitor of GLFW's as it is now."""
     mode = glfw.get_video_mode(monitor)
     name = glfw.get_monitor_name(monitor)
     return Display(
@@ -211,9 +213,9 @@ class Window(Closing):
             (glfw.BLUE_BITS, settings.bits),
         ):
             glfw.window_hint(hint, value)
-        width, height = (
-            settings.resolution_px if self.display is None else self.display.resolution_px
-        )
+        width, height = settings.resolution_px
+        if self.display is not None:
+            width, height = self.display.resolution_px
         self._window = _newest_window(width, height, monitor)
         if not self._window:
             raise MachineError(
@@ -239,13 +241,9 @@ class Window(Closing):
             self._visibility = Visibility.of(window, area, self._survival)
         glx_window = glfw.get_glx_window(self._window) if self._x_display else None
         sync = sync_control(self._x_display, glx_window)
-        if self.display is not None:
-            refresh_hz = self.display.refresh_hz
-        else:
-            refresh_hz = 0
-        self._stamps = SwapStamps(
-            sync, NS_PER_S / (refresh_hz or settings.refresh_hz or USUAL_REFRESH_HZ)
-        )
+        display_hz = 0 if self.display is None else self.display.refresh_hz
+        period_ns = NS_PER_S / (display_hz or settings.refresh_hz or USUAL_REFRESH_HZ)
+        self._stamps = SwapStamps(sync, period_ns)
         if monitor is not None:
             self._set_identity_ramp(monitor)
         if self._survival is not None:
@@ -286,6 +284,7 @@ class Window(Closing):
         return self._visibility.hidden
 
     def _on_end(self, why: str) -> None:
+        """Xlib's word that the server or the window is gone; the first reason counts."""
         if self.gone is None:
             self.gone = why
         if self._watch is not None:
@@ -295,14 +294,13 @@ class Window(Closing):
         self._changed = True
 
     def _follow_display(self) -> None:
+        """Say that the window's display is unplugged, or return to it once it is back."""
         self._changed = False
         display = self.display
         if display is None:
             return
         on_it = bool(glfw.get_window_monitor(self._window))
-        monitor = next(
-            (m for m in glfw.get_monitors() if _describe(0, m).name == display.name), None
-        )
+        monitor = _monitor_named(display.name)
         if monitor is None and not self.lost:
             self.lost = True
             self._ramp = None
@@ -323,6 +321,7 @@ class Window(Closing):
             log.warning("the display %s is back", display.name)
 
     def _on_key(self, window: Any, key: int, scancode: int, action: int, mods: int) -> None:
+        """Queue the name of a key that is pressed, not of one that repeats or is released."""
         if action != glfw.PRESS:
             return
         name = {glfw.KEY_ESCAPE: "escape", glfw.KEY_SPACE: "space", glfw.KEY_F1: "f1"}.get(key)
@@ -393,12 +392,11 @@ class Window(Closing):
         """
         if self.display is None:
             return None
-        same = (
-            d.name
-            for d in _displays()
-            if d.name != self.display.name and d.position_px == self.display.position_px
-        )
-        return next(same, None)
+        for display in _displays():
+            is_other = display.name != self.display.name
+            if is_other and display.position_px == self.display.position_px:
+                return display.name
+        return None
 
     @property
     def modes_hz(self) -> tuple[int, ...]:
@@ -480,11 +478,11 @@ class Window(Closing):
 
 
 def _modes_hz(display: Display, monitor: Any) -> tuple[int, ...]:
-    modes = glfw.get_video_modes(monitor)
-    same = {
-        int(m.refresh_rate) for m in modes if (m.size.width, m.size.height) == display.resolution_px
-    }
-    return tuple(sorted(same - {0}))
+    rates_hz = set()
+    for mode in glfw.get_video_modes(monitor):
+        if (mode.size.width, mode.size.height) == display.resolution_px:
+            rates_hz.add(int(mode.refresh_rate))
+    return tuple(sorted(rates_hz - {0}))
 
 
 def _refresh_hint(refresh_hz: float | None, modes_hz: tuple[int, ...], display: Display) -> int:
@@ -513,12 +511,21 @@ def _newest_window(width: int, height: int, monitor: Any) -> Any:
     return None
 
 
+def _monitor_named(name: str) -> Any:
+    """GLFW's monitor of a name, None where it is not plugged in."""
+    for monitor in glfw.get_monitors():
+        if _describe(0, monitor).name == name:
+            return monitor
+    return None
+
+
 def _area_of(monitor: Any) -> ScreenArea:
     display = _describe(0, monitor)
     return ScreenArea(display.position_px, display.resolution_px)
 
 
 def _find(wanted: int | str) -> tuple[Display, Any]:
+    """The display of an index or a name, and GLFW's monitor. Raises NotThereError."""
     described = _displays()
     for display, monitor in zip(described, glfw.get_monitors(), strict=True):
         if display.is_named(wanted):

@@ -144,10 +144,9 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
     ones.
     """
     if len(pairs) < MIN_PAIRS:
+        skipped = ""
         if pairs.skipped:
             skipped = f" ({pairs.skipped} more are not valid)"
-        else:
-            skipped = ""
         raise InputError(
             f"{pairs.source}: {len(pairs)} pairs{skipped} and {MIN_PAIRS} are needed; measure more"
             " attitudes"
@@ -160,37 +159,45 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
             f"{pairs.source}: half or more of the reported attitudes are wild: {used.sum()} of"
             f" {len(pairs)} agree; look for lost stars, and rows of other times"
         )
-    if pairs.rate_rad_s is None:
-        rate_rad_s = None
-    else:
+    rate_rad_s = None
+    if pairs.rate_rad_s is not None:
         rate_rad_s = pairs.rate_rad_s[used]
     covariance, dof = fit.covariance_rad2(groups_of(pairs.commanded))
+    commanded = pairs.commanded[used]
+    residual = residual_of(commanded, rate_rad_s, fit.residual_rad[used], fit.q)
+    q_nominal = from_matrix(camera.cam_to_image)
+    wild = tuple(pairs.line[~used].tolist())
     return Aligned(
         pairs=pairs,
         fit=fit,
-        residual=residual_of(pairs.commanded[used], rate_rad_s, fit.residual_rad[used], fit.q),
+        residual=residual,
         camera=camera,
-        q_cam_to_mon=corrected(from_matrix(camera.cam_to_image), fit.q),
+        q_cam_to_mon=corrected(q_nominal, fit.q),
         covariance_arcsec2=ARCSEC_PER_RAD**2 * covariance,
         dof=dof,
-        wild=tuple(pairs.line[~used].tolist()),
+        wild=wild,
     )
 
 
 def corrected(q_cam_to_mon: FloatArray, q_commanded_to_reported: FloatArray) -> FloatArray:
     """The alignment (4,), w >= 0, with which the tracker reports what is commanded: Q' = Q M*."""
     q = normalise(multiply(q_cam_to_mon, conjugate(q_commanded_to_reported)))
-    return np.asarray(-q if q[0] < 0 else q)
+    # q and -q are one rotation
+    if q[0] < 0:
+        q = -q
+    return np.asarray(q)
 
 
 def groups_of(commanded: FloatArray) -> IntArray:
     """The group (n,) of each commanded attitude (n, 4); attitudes within SAME_ATTITUDE have one
     group.
     """
+    # q and -q are one attitude: the largest component is made positive
     largest = np.argmax(np.abs(commanded), axis=1)
     sign = np.sign(np.take_along_axis(commanded, largest[:, None], axis=1))
     rounded = np.round(commanded * sign / SAME_ATTITUDE).astype(np.int64)
-    return np.asarray(np.unique(rounded, axis=0, return_inverse=True)[1]).reshape(-1)
+    _, group = np.unique(rounded, axis=0, return_inverse=True)
+    return np.asarray(group).reshape(-1)
 
 
 def residual_of(
@@ -198,23 +205,29 @@ def residual_of(
 ) -> Residual:
     """Judge the residuals (n, 3), rad, of pairs without wild ones; `q` is the fitted rotation."""
     group = groups_of(commanded)
+    attitudes = int(group.max()) + 1
     cross = residual_rad[:, :2]
     roll = residual_rad[:, 2:]
+    # the mean rotation is taken from the residuals themselves
     dof = max(1.0 - 1.0 / len(group), 0.5)
-    rms = AxesArcsec(
-        *(ARCSEC_PER_RAD * float(np.sqrt((part**2).mean() / dof)) for part in (cross, roll))
-    )
     repeat = unexplained = None
-    if len(group) - group.max() - 1 >= MIN_REPEATS:
-        judged = (_against_repeats(part, group) for part in (cross, roll))
-        repeat, unexplained = (AxesArcsec(*of_axes) for of_axes in zip(*judged, strict=True))
+    if len(group) - attitudes >= MIN_REPEATS:
+        cross_repeat, cross_excess = _against_repeats(cross, group)
+        roll_repeat, roll_excess = _against_repeats(roll, group)
+        repeat = AxesArcsec(cross_repeat, roll_repeat)
+        unexplained = AxesArcsec(cross_excess, roll_excess)
     return Residual(
-        rms,
-        repeat,
-        unexplained,
-        int(group.max()) + 1,
-        _causes(commanded, rate_rad_s, residual_rad, q, group),
+        rms=AxesArcsec(_rms_arcsec(cross, dof), _rms_arcsec(roll, dof)),
+        repeat=repeat,
+        unexplained=unexplained,
+        attitudes=attitudes,
+        causes=_causes(commanded, rate_rad_s, residual_rad, q, group),
     )
+
+
+def _rms_arcsec(residual_rad: FloatArray, dof: float) -> float:
+    """The rms of residuals (n, axes) along an axis, where a share `dof` of them is free."""
+    return ARCSEC_PER_RAD * float(np.sqrt((residual_rad**2).mean() / dof))
 
 
 def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
@@ -224,16 +237,19 @@ def _against_repeats(part: FloatArray, group: IntArray) -> tuple[float, float]:
     groups = len(count)
     axes = part.shape[1]
     means = _means(part, group)
-    within = float(((part - means[group]) ** 2).sum()) / (axes * (pairs - groups))
+    free_within = axes * (pairs - groups)
+    within = float(((part - means[group]) ** 2).sum()) / free_within
     repeat = ARCSEC_PER_RAD * float(np.sqrt(within))
-    within = max(within, FLOOR_RAD**2)
     if groups < 2:
         return repeat, 0.0
-    between = float((count[:, None] * (means - part.mean(axis=0)) ** 2).sum()) / (
-        axes * (groups - 1)
-    )
-    if between / within <= _f_limit(axes * (groups - 1), axes * (pairs - groups)):
+    within = max(within, FLOOR_RAD**2)
+    free_between = axes * (groups - 1)
+    off = means - part.mean(axis=0)
+    squares = count[:, None] * off**2
+    between = float(squares.sum()) / free_between
+    if between / within <= _f_limit(free_between, free_within):
         return repeat, 0.0
+    # the usual count of a group's pairs, of groups of several sizes
     usual = (pairs - float((count**2).sum()) / pairs) / (groups - 1)
     return repeat, ARCSEC_PER_RAD * float(np.sqrt((between - within) / usual))
 
@@ -259,12 +275,8 @@ def _causes(
     means = _means(residual_rad, group)
     causes = []
     # A turn n of the reference frame: C R(n) C* is a turn by C n in cam.
-    frames = np.stack(
-        [
-            to_matrix(q_commanded)
-            for q_commanded in commanded[np.unique(group, return_index=True)[1]]
-        ]
-    )
+    _, first_pair = np.unique(group, return_index=True)
+    frames = np.stack([to_matrix(attitude) for attitude in commanded[first_pair]])
     turn = _explained(means, frames)
     if turn is not None:
         size = ARCSEC_PER_RAD * float(np.linalg.norm(turn))
@@ -273,12 +285,14 @@ def _causes(
             " report in ICRS, not of date?"
         )
     if rate_rad_s is not None:
-        late = _explained(means, -_means(rate_rad_s @ to_matrix(q).T, group)[:, :, None])
+        rates = _means(rate_rad_s @ to_matrix(q).T, group)
+        late = _explained(means, -rates[:, :, None])
         if late is not None:
             causes.append(
                 f"times that are {late[0]:+.4f} s off explain most of it: add that to --offset-s"
             )
-    drift = _explained(means, _means(row, group)[:, :, None] * np.eye(3))
+    along = _means(row, group)
+    drift = _explained(means, along[:, :, None] * np.eye(3))
     if drift is not None:
         size = ARCSEC_PER_RAD * float(np.linalg.norm(drift))
         causes.append(
@@ -289,10 +303,9 @@ def _causes(
 
 
 def _means(values: FloatArray, group: IntArray) -> FloatArray:
-    return (
-        np.stack([np.bincount(group, column) for column in values.T], axis=1)
-        / np.bincount(group)[:, None]
-    )
+    """The mean (groups, k) of values (n, k) by group."""
+    sums = np.stack([np.bincount(group, column) for column in values.T], axis=1)
+    return np.asarray(sums / np.bincount(group)[:, None])
 
 
 def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | None:
@@ -300,21 +313,23 @@ def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | No
     residuals (n, 3); else None.
     """
     pairs, _, amounts = columns.shape
-    scale = np.sqrt((residual_rad**2).mean(axis=0))
-    cross = max(float(np.sqrt((scale[0] ** 2 + scale[1] ** 2) / 2)), FLOOR_RAD)
-    weight = 1 / np.array([cross, cross, max(float(scale[2]), FLOOR_RAD)])
-    wanted = (residual_rad - residual_rad.mean(axis=0)) * weight
-    design = ((columns - columns.mean(axis=0)) * weight[:, None]).reshape(3 * pairs, amounts)
-    solution, _, rank, _ = np.linalg.lstsq(design, wanted.ravel(), rcond=1e-6)
+    scale_x, scale_y, scale_z = np.sqrt((residual_rad**2).mean(axis=0))
+    cross = max(float(np.sqrt((scale_x**2 + scale_y**2) / 2)), FLOOR_RAD)
+    roll = max(float(scale_z), FLOOR_RAD)
+    weight = 1 / np.array([cross, cross, roll])
+    wanted = ((residual_rad - residual_rad.mean(axis=0)) * weight).ravel()
+    varying = (columns - columns.mean(axis=0)) * weight[:, None]
+    design = varying.reshape(3 * pairs, amounts)
+    solution, _, rank, _ = np.linalg.lstsq(design, wanted, rcond=1e-6)
     free = 3 * pairs - 3 - rank
+    if rank < amounts or free < 3:
+        return None
     whole = float((wanted**2).sum())
-    unexplained = float(((wanted.ravel() - design @ solution) ** 2).sum())
-    if (
-        rank < amounts
-        or free < 3
-        or unexplained > (1 - MIN_EXPLAINED) * whole
-        or whole < pairs * (FLOOR_RAD / cross) ** 2
-    ):
+    unexplained = float(((wanted - design @ solution) ** 2).sum())
+    # what rounding alone makes needs no cause
+    if whole < pairs * (FLOOR_RAD / cross) ** 2:
+        return None
+    if unexplained > (1 - MIN_EXPLAINED) * whole:
         return None
     ratio = (whole - unexplained) / amounts / max(unexplained / free, 1e-30)
     if ratio > _f_limit(amounts, free):
@@ -323,6 +338,9 @@ def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | No
 
 
 def _f_limit(above: float, below: float) -> float:
+    """The ratio of two variances that chance exceeds once in 1 / FALSE_ALARM, by their degrees of
+    freedom.
+    """
     # F's quantile; scipy.stats has the same one and takes half a second to import
     from scipy.special import fdtri
 
@@ -365,9 +383,8 @@ def write_alignment(
         alignment_dof=float(found.dof),
     )
     sigma = notes.sigma | dict(zip(axes, found.sigma_arcsec, strict=True))
-    write_geometry(
-        path, camera, found.q_cam_to_mon, Notes(sigma, error, made, identity or notes.identity)
-    )
+    new_notes = Notes(sigma, error, made, identity or notes.identity)
+    write_geometry(path, camera, found.q_cam_to_mon, new_notes)
 
 
 def summary_of(found: Aligned) -> dict[str, Any]:
@@ -378,6 +395,10 @@ def summary_of(found: Aligned) -> dict[str, Any]:
     `unexplained_arcsec` are None where too few attitudes repeat.
     """
     residual = found.residual
+    repeat = unexplained = None
+    if residual.repeat is not None and residual.unexplained is not None:
+        repeat = asdict(residual.repeat)
+        unexplained = asdict(residual.unexplained)
     return {
         "pairs": len(found.pairs),
         "used": int(found.fit.used.sum()),
@@ -388,10 +409,8 @@ def summary_of(found: Aligned) -> dict[str, Any]:
         "rotation_arcsec": found.rotation_arcsec,
         "sigma_arcsec": found.sigma_arcsec,
         "residual_arcsec": asdict(residual.rms),
-        "repeat_arcsec": None if residual.repeat is None else asdict(residual.repeat),
-        "unexplained_arcsec": (
-            None if residual.unexplained is None else asdict(residual.unexplained)
-        ),
+        "repeat_arcsec": repeat,
+        "unexplained_arcsec": unexplained,
         "q_cam_to_mon": found.q_cam_to_mon.tolist(),
         "notes": remarks_of(found),
     }
@@ -407,13 +426,13 @@ def remarks_of(found: Aligned) -> tuple[str, ...]:
     elif unexplained is None:
         remarks.append(NO_REPEATS)
     elif unexplained.cross > 0 or unexplained.roll > 0:
-        parts = (("across", unexplained.cross), ("about", unexplained.roll))
-        excess = " and ".join(
-            f"{value:.3g} arcsec rms {where} the boresight" for where, value in parts if value > 0
-        )
+        parts = []
+        for value, where in ((unexplained.cross, "across"), (unexplained.roll, "about")):
+            if value > 0:
+                parts.append(f"{value:.3g} arcsec rms {where} the boresight")
         remarks.append(
-            f"a rotation does not explain {excess}: calibrate the geometry with dots (hilstar"
-            " calibrate geometric)"
+            f"a rotation does not explain {' and '.join(parts)}: calibrate the geometry with dots"
+            " (hilstar calibrate geometric)"
         )
     return (*remarks, *residual.causes)
 
@@ -421,22 +440,27 @@ def remarks_of(found: Aligned) -> tuple[str, ...]:
 def lines_of(found: Aligned) -> list[str]:
     """The alignment for a person."""
     residual = found.residual
-    wild = found.wild
     pairs = found.pairs
-    parts = zip(found.rotation_arcsec, found.sigma_arcsec, strict=True)
-    x, y, z = (f"{value:.2f} +- {sigma:.2f}" for value, sigma in parts)
-    named = ", ".join(map(str, wild[:MAX_NAMED])) + (", ..." if len(wild) > MAX_NAMED else "")
-    if pairs.skipped:
-        skipped = f", {pairs.skipped} skipped"
-    else:
-        skipped = ""
+    axes = []
+    for value, sigma in zip(found.rotation_arcsec, found.sigma_arcsec, strict=True):
+        axes.append(f"{value:.2f} +- {sigma:.2f}")
+    x, y, z = axes
+    wild = "none"
+    if found.wild:
+        named = ", ".join(map(str, found.wild[:MAX_NAMED]))
+        if len(found.wild) > MAX_NAMED:
+            named += ", ..."
+        wild = f"{len(found.wild)}, on lines {named}"
+    used = f"{int(found.fit.used.sum())} of {len(pairs)} used"
     if residual.attitudes == 1:
-        of = "all of one attitude"
+        used += ", all of one attitude"
     else:
-        of = f"of {residual.attitudes} attitudes"
+        used += f", of {residual.attitudes} attitudes"
+    if pairs.skipped:
+        used += f", {pairs.skipped} skipped"
     rows = [
-        ("pairs", f"{int(found.fit.used.sum())} of {len(pairs)} used, {of}{skipped}"),
-        ("wild", f"{len(wild)}, on lines {named}" if wild else "none"),
+        ("pairs", used),
+        ("wild", wild),
         ("reported - commanded", f"x {x}, y {y}, about the boresight {z} arcsec"),
         ("residual", _both(residual.rms)),
     ]
@@ -446,7 +470,8 @@ def lines_of(found: Aligned) -> list[str]:
             ("not a rotation", _both(residual.unexplained)),
         ]
     width = max(len(name) for name, _ in rows) + 2
-    return [f"{name:{width}}{text}" for name, text in rows] + list(remarks_of(found))
+    lines = [f"{name:{width}}{text}" for name, text in rows]
+    return [*lines, *remarks_of(found)]
 
 
 def _both(axes: AxesArcsec) -> str:

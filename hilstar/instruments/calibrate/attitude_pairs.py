@@ -103,7 +103,8 @@ def read_pairs(path: Path) -> Pairs:
     line_of = np.array(lines, dtype=np.intp)
     both = np.array(numbers).reshape(len(lines), len(columns))
     commanded = _unit(path, line_of, both[:, :4], COMMANDED)
-    return Pairs(path, line_of, commanded, _unit(path, line_of, both[:, 4:], REPORTED), skipped)
+    reported = _unit(path, line_of, both[:, 4:], REPORTED)
+    return Pairs(path, line_of, commanded, reported, skipped)
 
 
 def _unit(path: Path, lines: IntArray, q: FloatArray, names: tuple[str, ...]) -> FloatArray:
@@ -118,7 +119,9 @@ def _unit(path: Path, lines: IntArray, q: FloatArray, names: tuple[str, ...]) ->
             f"{path}:{lines[first]}: the norm of {','.join(names)} is {norm[first]:.6g}; write unit"
             f" quaternions, within {NORM_TOLERANCE:g}"
         )
-    return normalise(q) if len(q) else q
+    if len(q):
+        return normalise(q)
+    return q
 
 
 def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
@@ -132,25 +135,35 @@ def pair_with_ledger(path: Path, ledger: Path, offset_s: float) -> Pairs:
     telemetry = read_telemetry(path, rising=False)
     run = read_commanded(ledger)
     valid = telemetry.valid
-    t_s = run.seconds(telemetry.t_ns[valid] + round(offset_s * NS_PER_S))
+    row_ns = telemetry.t_ns[valid] + round(offset_s * NS_PER_S)
+    t_s = run.seconds(row_ns)
     moments = run.commanded.at(t_s)
     known = moments.known
     if not known.any():
-        spans = (times + run.zero_ns / NS_PER_S for times in (t_s, run.commanded.t_s))
-        said, lit = (f"{span.min():.3f} to {span.max():.3f} s" for span in spans)
+        zero_s = run.zero_ns / NS_PER_S
+        times = _span(t_s + zero_s)
+        lit = _span(run.commanded.t_s + zero_s)
         raise InputError(
-            f"{path}: its times, {said}, meet no frame of {ledger}, lit from {lit} on the sender's"
+            f"{path}: its times, {times}, meet no frame of {ledger}, lit from {lit} on the sender's"
             " clock; write t_s on that clock, or add --offset-s"
         )
+    line = telemetry.line[valid]
+    reported = telemetry.q[valid]
+    skipped = len(valid) - int(known.sum())
     return Pairs(
         source=path,
-        line=telemetry.line[valid][known],
+        line=line[known],
         commanded=moments.q[known],
-        reported=telemetry.q[valid][known],
-        skipped=len(valid) - int(known.sum()),
+        reported=reported[known],
+        skipped=skipped,
         rate_rad_s=moments.rate_rad_s[known],
         names=COMMANDED,
     )
+
+
+def _span(t_s: FloatArray) -> str:
+    """The first and the last of times, in words."""
+    return f"{t_s.min():.3f} to {t_s.max():.3f} s"
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,11 +188,13 @@ class RotationFit:
         The pairs of a single group count as independent, so that an error of that attitude itself
         is not included.
         """
-        weighted = self.weight[:, None] * self.residual_rad
-        if len(np.unique(group[self.used])) == 1:
+        used_groups = np.unique(group[self.used])
+        if len(used_groups) == 1:
             group = np.arange(len(group))
+            used_groups = group[self.used]
+        weighted = self.weight[:, None] * self.residual_rad
         sums = np.stack([np.bincount(group, weighted[:, k]) for k in range(3)], axis=1)
-        groups = max(len(np.unique(group[self.used])), 2)
+        groups = max(len(used_groups), 2)
         total = float(self.weight.sum())
         return np.asarray(sums.T @ sums * groups / (groups - 1) / total**2), groups - 1
 
@@ -193,17 +208,7 @@ def start_of(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     angles = np.zeros(len(rotations))
     reach = np.inf
     for candidate in rotations[chosen]:
-        cosine = np.abs(rotations @ candidate)
-        # The chord is exact for tiny angles, where the cosine is not.
-        chord = np.linalg.norm(
-            rotations - np.where((rotations @ candidate)[:, None] < 0, -1.0, 1.0) * candidate,
-            axis=1,
-        )
-        angle = np.where(
-            cosine > 0.5,
-            4 * np.arcsin(np.minimum(chord / 2, 1.0)),
-            2 * np.arccos(np.minimum(cosine, 1.0)),
-        )
+        angle = _angles_to(rotations, candidate)
         half = float(np.quantile(angle, 0.5, method="higher"))
         if half < reach:
             best = candidate
@@ -212,12 +217,26 @@ def start_of(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
     return best, angles
 
 
+def _angles_to(rotations: FloatArray, q: FloatArray) -> FloatArray:
+    """Angles (n,) between rotations (n, 4) and the rotation q, rad."""
+    product = rotations @ q
+    # q and -q are one rotation
+    sign = np.where(product[:, None] < 0, -1.0, 1.0)
+    cosine = np.abs(product)
+    chord = np.linalg.norm(rotations - sign * q, axis=1)
+    # The chord is exact for tiny angles, where the cosine is not.
+    by_chord = 4 * np.arcsin(np.minimum(chord / 2, 1.0))
+    by_cosine = 2 * np.arccos(np.minimum(cosine, 1.0))
+    return np.where(cosine > 0.5, by_chord, by_cosine)
+
+
 def fit_rotation(rotations: FloatArray) -> RotationFit:
     """The robust mean of rotations (n, 4), of which more than half agree within AGREE_RAD."""
     q, angle = start_of(rotations)
     near = angle <= AGREE_RAD
     q = _moved(q, np.median(_residuals(rotations[near], q), axis=0))
-    cut = CUT_SIGMAS * (1 + (FEW / max(int(near.sum()), 1)) ** 2)
+    pairs = max(int(near.sum()), 1)
+    cut = CUT_SIGMAS * (1 + (FEW / pairs) ** 2)
     for _ in range(ROUNDS):
         residual = _residuals(rotations, q)
         weight = _weights(residual, near, cut)
@@ -230,19 +249,27 @@ def fit_rotation(rotations: FloatArray) -> RotationFit:
 
 
 def _residuals(rotations: FloatArray, q: FloatArray) -> FloatArray:
+    """Rotation vectors (n, 3), rad, from the rotation q to others (n, 4)."""
     return to_rotation_vector(multiply(rotations, conjugate(q)))
 
 
 def _moved(q: FloatArray, step_rad: FloatArray) -> FloatArray:
+    """The rotation after a step, rad."""
     return normalise(multiply(from_rotation_vector(step_rad), q))
 
 
 def _weights(residual: FloatArray, near: npt.NDArray[np.bool_], cut: float) -> FloatArray:
+    """Tukey's weights (n,) of residuals (n, 3); all those that are near where none is within the
+    cut.
+    """
     off = np.abs(residual[near])
     cross = max(MAD_TO_SIGMA * float(np.median(off[:, :2])), FLOOR_RAD)
     roll = max(MAD_TO_SIGMA * float(np.median(off[:, 2])), FLOOR_RAD)
-    squared = (residual[:, 0] ** 2 + residual[:, 1] ** 2) / cross**2 + residual[:, 2] ** 2 / roll**2
-    weight = np.where(near & (squared < cut**2), (1 - squared / cut**2) ** 2, 0.0)
+    x, y, z = residual.T
+    cross_squared = (x**2 + y**2) / cross**2
+    squared = cross_squared + z**2 / roll**2
+    is_within = near & (squared < cut**2)
+    weight = np.where(is_within, (1 - squared / cut**2) ** 2, 0.0)
     if weight.any():
         return weight
     return near.astype(np.float64)
@@ -268,11 +295,12 @@ def _conventions(names: tuple[str, ...]) -> Iterator[tuple[Change, Change, str]]
     yield _as_is, _scalar_last, f"{tracker} {last}"
     yield _as_is, lambda q: conjugate(_scalar_last(q)), f"{tracker} {last}; and they {inverse}"
     for axis, signs in (("x", (1, 1, -1, -1)), ("y", (1, -1, 1, -1)), ("z", (1, -1, -1, 1))):
+        mirror = partial(np.multiply, np.array(signs, dtype=np.float64))
         cure = (
             f"are mirrored in {axis}: write them for right-handed axes, x right and y down in the"
             " image"
         )
-        yield _as_is, partial(np.multiply, np.array(signs, dtype=np.float64)), f"{tracker} {cure}"
+        yield _as_is, mirror, f"{tracker} {cure}"
     both = (
         "either both quaternions are the inverse (cam to ICRS) or have the scalar last, or the"
         " tracker's reference frame is not"
@@ -296,6 +324,7 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
     commanded = pairs.commanded[few]
     reported = pairs.reported[few]
     rotation, spread = _spread(commanded, reported)
+    agrees = spread <= AGREE_RAD
     out_of_view = _boresight_rad(rotation) > field_radius_rad
     cures = []
     for change_commanded, change_reported, cure in _conventions(pairs.names):
@@ -304,8 +333,8 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
             cures.append((reach, cure))
     best = min((reach for reach, _ in cures), default=np.inf)
     cure = next((cure for reach, cure in cures if reach <= SIMPLER * best), "")
-    agrees = spread <= AGREE_RAD
-    if cure and (not agrees or out_of_view or (spread > CLEARLY_RAD and CLEARLY * best < spread)):
+    is_clearly_better = spread > CLEARLY_RAD and CLEARLY * best < spread
+    if cure and (not agrees or out_of_view or is_clearly_better):
         raise InputError(
             f"{pairs.source}: no one rotation leads from the commanded to the reported attitudes;"
             f" {cure}"
@@ -317,10 +346,11 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
             " lost stars, rows of other times, or another sky"
         )
     if out_of_view:
+        off_deg = np.degrees(_boresight_rad(rotation))
         raise InputError(
-            f"{pairs.source}: the z axis of the reported attitudes is"
-            f" {np.degrees(_boresight_rad(rotation)):.3g} degrees off the boresight, and the screen"
-            " would be out of view; write them for cam axes (z boresight, x right, y down)"
+            f"{pairs.source}: the z axis of the reported attitudes is {off_deg:.3g} degrees off the"
+            " boresight, and the screen would be out of view; write them for cam axes (z boresight,"
+            " x right, y down)"
         )
 
 
@@ -334,5 +364,6 @@ def _spread(commanded: FloatArray, reported: FloatArray) -> tuple[FloatArray, fl
 
 
 def _boresight_rad(rotation: FloatArray) -> float:
-    turned = to_matrix(rotation)[:, 2]
-    return float(np.arctan2(np.hypot(turned[0], turned[1]), turned[2]))
+    """How far a rotation turns the boresight, rad."""
+    x, y, z = to_matrix(rotation)[:, 2]
+    return float(np.arctan2(np.hypot(x, y), z))

@@ -45,40 +45,48 @@ def film_edges(
     The camera's own delay, from the end of an exposure to its first byte here, stays in the times.
     Raises InputError where nothing blinks or the camera is too slow, MachineError.
     """
-    formats = [name for name in camera.about["formats"] if _is_plain(name)]
+    names = camera.about["formats"]
+    formats = [name for name in names if _is_plain(name)]
     if not formats:
         raise InputError(
-            "the camera has no format of whole bytes of grey or Bayer:"
-            f" {', '.join(camera.about['formats'])}"
+            f"the camera has no format of whole bytes of grey or Bayer: {', '.join(names)}"
         )
     camera.set({"PixelFormat": min(formats, key=_bits_of)})
     if exposure_s is None:
         exposure_s = EXPOSURE_REFRESHES / refresh_hz
     square = find_square(camera.film(exposure_s, LOOK_S))
-    edges: list[Edges] = []
+    host_ns = []
+    levels = []
     end_s = time.monotonic() + seconds
-    while (left_s := end_s - time.monotonic()) > 0:
+    while True:
+        rest_s = end_s - time.monotonic()
+        if rest_s <= 0:
+            break
         to_host_ns = time.monotonic_ns() - time.time_ns()
-        film = camera.film(exposure_s, min(left_s, CHUNK_S), square.rows)
+        film = camera.film(exposure_s, min(rest_s, CHUNK_S), square.rows)
         begin_ns = begin_on_host(film, to_host_ns)
         check_rate(begin_ns, film.exposure_s, refresh_hz)
-        levels = film.dn[:, square.pixels].mean(axis=1)
-        edges.append(edges_in(begin_ns, film.exposure_s, levels))
-    host_ns = np.concatenate([part.host_ns for part in edges])
-    if len(host_ns) < MIN_EDGES:
+        signal_dn = film.dn[:, square.pixels].mean(axis=1)
+        edges = edges_in(begin_ns, film.exposure_s, signal_dn)
+        host_ns.append(edges.host_ns)
+        levels.append(edges.level)
+    edges_ns = np.concatenate(host_ns)
+    if len(edges_ns) < MIN_EDGES:
         raise InputError(
-            f"{len(host_ns)} changes of the square came, and at least {MIN_EDGES} are needed; write"
-            " a longer --duration"
+            f"{len(edges_ns)} changes of the square came, and at least {MIN_EDGES} are needed;"
+            " write a longer --duration"
         )
-    return Edges(host_ns, np.concatenate([part.level for part in edges]))
+    return Edges(edges_ns, np.concatenate(levels))
 
 
 def _is_plain(name: str) -> bool:
+    """Whether a pixel format is of whole bytes."""
     match = FORMAT.fullmatch(name)
     return match is not None and match[3] is None
 
 
 def _bits_of(name: str) -> int:
+    """The bits of a pixel of a format."""
     match = FORMAT.fullmatch(name)
     assert match is not None
     return int(match[2])
@@ -92,7 +100,9 @@ def find_square(film: Film) -> Square:
         np.minimum(low, image, out=low)
         np.maximum(high, image, out=high)
     change = high - low
-    largest = float(np.quantile(change, 1 - 20 / max(change.size, 21)))
+    # some 20 pixels of a square are seen even where it is small
+    quantile = 1 - 20 / max(change.size, 21)
+    largest = float(np.quantile(change, quantile))
     if largest < max(MIN_CHANGE_DN, NOISE_TIMES * float(np.median(change))):
         raise InputError(
             f"nothing blinks in the camera's images: pixels change by {largest:.0f} DN at most;"
@@ -126,11 +136,13 @@ def begin_on_host(film: Film, to_host_ns: int) -> IntArray:
 
 def check_rate(begin_ns: IntArray, exposure_s: float, refresh_hz: float) -> None:
     """Refuse (InputError) exposures of which none lies within one refresh for sure."""
-    period_s = float(np.median(np.diff(begin_ns))) / NS_PER_S if len(begin_ns) > 1 else np.inf
+    period_s = np.inf
+    if len(begin_ns) > 1:
+        period_s = float(np.median(np.diff(begin_ns))) / NS_PER_S
     if period_s + exposure_s > 1 / refresh_hz:
-        exposure_ms, period_ms, refresh_ms = (
-            seconds * NS_PER_S / NS_PER_MS for seconds in (exposure_s, period_s, 1 / refresh_hz)
-        )
+        exposure_ms = exposure_s * NS_PER_S / NS_PER_MS
+        period_ms = period_s * NS_PER_S / NS_PER_MS
+        refresh_ms = 1 / refresh_hz * NS_PER_S / NS_PER_MS
         raise InputError(
             f"the camera exposes for {exposure_ms:.3g} ms every {period_ms:.3g} ms, and the square"
             f" may change every {refresh_ms:.3g} ms; write a shorter --exposure, or a higher"
@@ -143,23 +155,29 @@ def edges_in(begin_ns: IntArray, exposure_s: float, levels: FloatArray) -> Edges
     their signals (n,).
     """
     middle = (levels.min() + levels.max()) / 2
-    dark, lit = (float(np.median(levels[part])) for part in (levels <= middle, levels >= middle))
+    dark = float(np.median(levels[levels <= middle]))
+    lit = float(np.median(levels[levels >= middle]))
     share = np.clip((levels - dark) / max(lit - dark, 1e-9), 0.0, 1.0)
     exposure_ns = exposure_s * NS_PER_S
     sure = np.flatnonzero((share < DARK) | (share > LIT))
     is_lit = share[sure] > HALF
-    edges: list[tuple[float, int]] = []
+    host_ns = []
+    edge_levels = []
     for k in np.flatnonzero(np.diff(is_lit)):
-        before, after = int(sure[k]), int(sure[k + 1])
+        before = int(sure[k])
+        after = int(sure[k + 1])
         level = int(is_lit[k + 1])
         if after == before + 1:
-            edge_ns = (float(begin_ns[before]) + exposure_ns + float(begin_ns[after])) / 2
+            ended_ns = float(begin_ns[before]) + exposure_ns
+            edge_ns = (ended_ns + float(begin_ns[after])) / 2
         elif after == before + 2:
             # the light had its old level until then
-            old = share[before + 1] if level == 0 else 1 - share[before + 1]
-            edge_ns = float(begin_ns[before + 1]) + old * exposure_ns
+            old_share = share[before + 1]
+            if level:
+                old_share = 1 - old_share
+            edge_ns = float(begin_ns[before + 1]) + old_share * exposure_ns
         else:
             continue  # the light changed more than once, or images are missing
-        edges.append((edge_ns, level))
-    host_ns = np.array([round(edge_ns) for edge_ns, _ in edges], dtype=np.int64)
-    return Edges(host_ns, np.array([level for _, level in edges], dtype=np.int64))
+        host_ns.append(round(edge_ns))
+        edge_levels.append(level)
+    return Edges(np.array(host_ns, dtype=np.int64), np.array(edge_levels, dtype=np.int64))

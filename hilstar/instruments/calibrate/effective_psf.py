@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.charts import chart
 from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX, MIN_DOTS, read_plan
@@ -58,12 +58,18 @@ STEP_PX = 1e-3  # for numerical derivatives
 QUANTISED_DN2 = 1 / 12
 ASKS_SIGMAS = 3.0  # by which held-out dots have to prefer the spline
 POINTS = 5  # field points along each side of the file
+MODEL_NAMES = {  # by the number of the spline's terms over the field
+    0: "Gaussian",
+    1: "spline, constant over the field",
+    3: "spline, linear over the field",
+    6: "spline, quadratic over the field",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Dots:
-    """Mean images of n dots (n, side, side), DN, and their variance; the middle pixels, the
-    dots' places and sides, px.
+    """Mean images of n dots (n, side, side), DN, and their variance, DN^2; the middle pixels, the
+    dots' places and sides, px, (n,) each.
     """
 
     images: FloatArray
@@ -79,19 +85,27 @@ class Dots:
         return Dots(*(getattr(self, name)[chosen] for name in self.__slots__))
 
     @property
+    def places_px(self) -> FloatArray:
+        """Places (n, 2), x and y."""
+        return np.stack([self.x_px, self.y_px], axis=1)
+
+    @property
     def offsets(self) -> tuple[FloatArray, FloatArray]:
         """Pixels' places less their dot's, along x and y (n, side)."""
-        reach = np.arange(self.images.shape[1]) - self.images.shape[1] // 2
-        return (self.column - self.x_px)[:, None] + reach, (self.row - self.y_px)[:, None] + reach
+        side = self.images.shape[1]
+        reach = np.arange(side) - side // 2
+        across = (self.column - self.x_px)[:, None] + reach
+        down = (self.row - self.y_px)[:, None] + reach
+        return across, down
 
 
 @dataclass(frozen=True, slots=True)
 class Effective:
-    """What pixels get of a point over the field: polynomials of a Gaussian's covariance (T, 3), and
-    of a spline (T', m, m).
+    """An effective PSF over the field: a Gaussian's covariance (T, 3) and a spline (T', m, m), both
+    by coefficients of polynomials of the place.
 
-    `middle_px` and `scale_px` make places a polynomial's; `knots_px` (m,) are the middles of the
-    spline's functions.
+    A place counts from `middle_px` in units of `scale_px`. `knots_px` (m,) are the middles of the
+    spline's functions, along each axis.
     """
 
     middle_px: FloatArray
@@ -113,12 +127,19 @@ class Effective:
         covariance = self._of(x_px, y_px, self.covariance)
         shares = PixelGaussians(*offsets, covariance, side_px).shares
         if len(self.spline):
-            across, down = (_functions(self.knots_px, off, side_px) for off in offsets)
-            shares += down @ self._of(x_px, y_px, self.spline) @ across.transpose(0, 2, 1)
+            coefficients = self._of(x_px, y_px, self.spline)
+            across = _functions(self.knots_px, offsets[0], side_px)
+            down = _functions(self.knots_px, offsets[1], side_px)
+            shares += down @ coefficients @ across.transpose(0, 2, 1)
         return shares
 
+    def place(self, places_px: FloatArray) -> FloatArray:
+        """Places (n, 2), px, as those of the polynomials: from -1 to 1 over the dots' field."""
+        return np.asarray((places_px - self.middle_px) / self.scale_px)
+
     def _of(self, x_px: FloatArray, y_px: FloatArray, coefficients: FloatArray) -> FloatArray:
-        place = (np.stack([x_px, y_px], axis=1) - self.middle_px) / self.scale_px
+        """Polynomials with coefficients (T, ...) at places (n,): (n, ...)."""
+        place = self.place(np.stack([x_px, y_px], axis=1))
         return np.tensordot(terms_of(place, len(coefficients)), coefficients, axes=1)
 
 
@@ -134,11 +155,12 @@ def _functions(knots_px: FloatArray, offset_px: FloatArray, side_px: FloatArray)
     from scipy.interpolate import BSpline
 
     basis_spline = BSpline.basis_element(np.arange(-2, 3) * KNOT_PX, extrapolate=False)
-    whole = basis_spline.antiderivative()
+    integral = basis_spline.antiderivative()
     end_px = 2 * KNOT_PX
     half = np.maximum(side_px, 1e-3)[:, None, None] / 2
     off = offset_px[:, :, None] - knots_px
-    high, low = (whole(np.clip(off + step, -end_px, end_px)) for step in (half, -half))
+    high = integral(np.clip(off + half, -end_px, end_px))
+    low = integral(np.clip(off - half, -end_px, end_px))
     return np.asarray((high - low) / (2 * half))
 
 
@@ -146,23 +168,22 @@ def effective_psf(
     file: BenchFile, images: Sequence[Path], plan: Path, dark: Path | None, per_px: int
 ) -> "Found":
     """The effective PSF from a tracker's images of planned dots. Raises InputError."""
-    config = file.config
+    resolution_px = file.config.tracker.resolution_px
     nominal = nominal_of(file)
     dots = read_plan(plan)
-    observed = measure_images(images, dark, config.tracker.resolution_px, dot_sigma_px(file))
+    observed = measure_images(images, dark, resolution_px, dot_sigma_px(file))
     look = first_look(dots, nominal, observed, np.random.default_rng(SEED))
     _, data = matched(dots, nominal, observed, look)
-    if len(np.unique(data.dot)) < MIN_DOTS:
+    count = len(np.unique(data.dot))
+    if count < MIN_DOTS:
         raise InputError(
-            f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed; show more"
-            " dots or frames"
+            f"{count} dots were recognised and {MIN_DOTS} are needed; show more dots or frames"
         )
-    if dark is None:
-        under = None
-    else:
-        under = read_image(dark, config.tracker.resolution_px)
-    sides = _dot_sides(data, dots.x_px, dots.y_px)
-    cut = cut_out(numbered(images), config.tracker.resolution_px, under, data, sides)
+    dark_image = None
+    if dark is not None:
+        dark_image = read_image(dark, resolution_px)
+    sides_px = _dot_sides(data, dots.x_px, dots.y_px)
+    cut = cut_out(numbered(images), resolution_px, dark_image, data, sides_px)
     return fit_effective(cut, per_px)
 
 
@@ -170,19 +191,90 @@ def _dot_sides(data: MatchedDots, x_px: FloatArray, y_px: FloatArray) -> FloatAr
     """The side of a dot where each centroid is, tracker px (n,), by a cubic map from the tracker
     to the monitor.
     """
-    place = np.stack([data.seen.x_px, data.seen.y_px], axis=1)
-    middle = place.mean(axis=0)
-    scale = float(np.abs(place - place.mean(axis=0)).max())
+    tracker_px = np.stack([data.centroids.x_px, data.centroids.y_px], axis=1)
+    monitor_px = np.stack([x_px[data.dot], y_px[data.dot]], axis=1)
+    middle = tracker_px.mean(axis=0)
+    scale = float(np.abs(tracker_px - middle).max())
+    u, v = ((tracker_px - middle) / scale).T
     # a cubic map has ten terms; few dots determine a linear one
     degree = 3 if len(data) > 40 else 1
-    powers = [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
-    u, v = ((place - middle) / scale).T
-    terms = np.stack([u**i * v**j for i, j in powers], axis=1)
-    by_u = np.stack([i * u ** max(i - 1, 0) * v**j for i, j in powers], axis=1) / scale
-    by_v = np.stack([j * u**i * v ** max(j - 1, 0) for i, j in powers], axis=1) / scale
-    maps = np.linalg.lstsq(terms, np.stack([x_px[data.dot], y_px[data.dot]], axis=1), rcond=None)[0]
-    (xu, yu), (xv, yv) = (by_u @ maps).T, (by_v @ maps).T
-    return np.asarray(DOT_PX / np.sqrt(np.abs(xu * yv - xv * yu)))
+    terms = []
+    by_u = []
+    by_v = []
+    for i in range(degree + 1):
+        slope_u = i * u ** max(i - 1, 0)
+        for j in range(degree + 1 - i):
+            slope_v = v ** max(j - 1, 0)
+            terms.append(u**i * v**j)
+            by_u.append(slope_u * v**j / scale)
+            by_v.append(j * u**i * slope_v / scale)
+    maps = np.linalg.lstsq(np.stack(terms, axis=1), monitor_px, rcond=None)[0]
+    x_by_u, y_by_u = (np.stack(by_u, axis=1) @ maps).T
+    x_by_v, y_by_v = (np.stack(by_v, axis=1) @ maps).T
+    # monitor pixels in one of the tracker's
+    area = np.abs(x_by_u * y_by_v - x_by_v * y_by_u)
+    return np.asarray(DOT_PX / np.sqrt(area))
+
+
+@dataclass(frozen=True, slots=True)
+class _Sums:
+    """Sums of n dots' images over frames, and of their squares (n, s, s), and how many frames
+    there were (n,).
+    """
+
+    total: FloatArray
+    squares: FloatArray
+    frames: FloatArray
+
+    @classmethod
+    def none(cls, count: int) -> "_Sums":
+        """Sums before the first frame."""
+        side = 2 * MAX_HALF_PX + 1
+        shape = (count, side, side)
+        return cls(np.zeros(shape), np.zeros(shape), np.zeros(count))
+
+    def add(self, dot: IntArray, cutouts: FloatArray) -> None:
+        """Add images of some dots (k, s, s)."""
+        self.total[dot] += cutouts
+        self.squares[dot] += cutouts**2
+        self.frames[dot] += 1
+
+
+@dataclass(frozen=True, slots=True)
+class _Places:
+    """Middle pixels of n dots, their places, px, and the sides of their squares, px, (n,) each."""
+
+    column: IntArray
+    row: IntArray
+    x_px: FloatArray
+    y_px: FloatArray
+    side_px: FloatArray
+
+    @classmethod
+    def of(cls, x_px: FloatArray, y_px: FloatArray, side_px: FloatArray) -> "_Places":
+        """Those of dots at places (n,)."""
+        column = np.rint(x_px).astype(np.intp)
+        row = np.rint(y_px).astype(np.intp)
+        return cls(column, row, x_px, y_px, side_px)
+
+    def cutouts(self, image: FloatArray, dot: IntArray) -> FloatArray:
+        """Squares (k, s, s) of an image (h, w) about some dots; NaN beyond its edges."""
+        padded = np.pad(image, MAX_HALF_PX, constant_values=np.nan)
+        # the margin is as wide as the reach: a dot's first pixel is at its own middle's index
+        steps = np.arange(2 * MAX_HALF_PX + 1)
+        rows = self.row[dot, None] + steps
+        columns = self.column[dot, None] + steps
+        return np.asarray(padded[rows[:, :, None], columns[:, None, :]])
+
+
+def _is_alone(x_px: FloatArray, y_px: FloatArray) -> BoolArray:
+    """Which places (n,) of one frame have no other within their square."""
+    across = np.abs(x_px[:, None] - x_px)
+    down = np.abs(y_px[:, None] - y_px)
+    itself = np.where(np.eye(len(x_px)), np.inf, 0)
+    apart = np.maximum(across, down) + itself
+    nearest = apart.min(axis=1, initial=np.inf)
+    return np.asarray(nearest > 2 * MAX_HALF_PX)
 
 
 def cut_out(
@@ -195,122 +287,115 @@ def cut_out(
     """The mean image of each dot in each pose over the frames in which none lies near it. Raises
     InputError.
     """
-    _, which = np.unique(np.stack([data.seen.pose, data.dot]), axis=1, return_inverse=True)
-    which = which.ravel()
-    count = np.bincount(which)
-    x_px, y_px, side_px = (
-        np.bincount(which, part) / count for part in (data.seen.x_px, data.seen.y_px, sides_px)
-    )
-    reach = MAX_HALF_PX
-    column = np.rint(x_px).astype(np.intp)
-    row = np.rint(y_px).astype(np.intp)
-    total, squares, lit = (
-        np.zeros((len(count), *size)) for size in ((2 * reach + 1,) * 2, (2 * reach + 1,) * 2, ())
-    )
-    steps = np.arange(-reach, reach + 1)
+    _, dot = np.unique(np.stack([data.centroids.pose, data.dot]), axis=1, return_inverse=True)
+    dot = dot.ravel()
+    count = np.bincount(dot)
+    x_px = np.bincount(dot, data.centroids.x_px) / count
+    y_px = np.bincount(dot, data.centroids.y_px) / count
+    side_px = np.bincount(dot, sides_px) / count
+    places = _Places.of(x_px, y_px, side_px)
+    sums = _Sums.none(len(count))
     for (frame, pose), path in paths.items():
-        here = np.flatnonzero((data.seen.frame == frame) & (data.seen.pose == pose))
-        if not len(here):
+        in_frame = np.flatnonzero((data.centroids.frame == frame) & (data.centroids.pose == pose))
+        if not len(in_frame):
             continue
         image = read_image(path, resolution_px)
-        image = np.pad(image if dark is None else image - dark, reach, constant_values=np.nan)
-        x = data.seen.x_px[here]
-        y = data.seen.y_px[here]
-        apart = np.maximum(np.abs(x[:, None] - x), np.abs(y[:, None] - y)) + np.where(
-            np.eye(len(here)), np.inf, 0
-        )
-        alone = which[here[apart.min(axis=1, initial=np.inf) > 2 * MAX_HALF_PX]]
-        cutouts = image[
-            (row[alone, None] + reach + steps)[:, :, None],
-            (column[alone, None] + reach + steps)[:, None, :],
-        ]
-        total[alone] += cutouts
-        squares[alone] += cutouts**2
-        lit[alone] += 1
-    return _of_frames((total, squares, lit), (column, row, x_px, y_px, side_px))
+        if dark is not None:
+            image = image - dark
+        is_alone = _is_alone(data.centroids.x_px[in_frame], data.centroids.y_px[in_frame])
+        alone = dot[in_frame[is_alone]]
+        sums.add(alone, places.cutouts(image, alone))
+    return _of_frames(sums, places)
 
 
 def dots_of_image(image: FloatArray, x_px: FloatArray, y_px: FloatArray, side_px: float) -> Dots:
     """Dots of `side_px` at places (n,) of one image (h, w) that stand alone. Raises InputError
     where they are too few.
     """
-    padded = np.pad(image, MAX_HALF_PX, constant_values=np.nan)
-    apart = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px)) + np.where(
-        np.eye(len(x_px)), np.inf, 0
-    )
-    column = np.rint(x_px).astype(np.intp)
-    row = np.rint(y_px).astype(np.intp)
-    steps = np.arange(2 * MAX_HALF_PX + 1)
-    cutouts = padded[(row[:, None] + steps)[:, :, None], (column[:, None] + steps)[:, None, :]]
-    lit = np.where(apart.min(axis=1, initial=np.inf) > 2 * MAX_HALF_PX, 1.0, 0.0)
-    return _of_frames(
-        (cutouts, cutouts**2, lit), (column, row, x_px, y_px, np.full(len(x_px), side_px))
-    )
+    places = _Places.of(x_px, y_px, np.full(len(x_px), side_px))
+    alone = np.flatnonzero(_is_alone(x_px, y_px))
+    sums = _Sums.none(len(x_px))
+    sums.add(alone, places.cutouts(image, alone))
+    return _of_frames(sums, places)
 
 
-def _of_frames(sums: tuple[FloatArray, FloatArray, FloatArray], places: tuple[Any, ...]) -> Dots:
-    """Dots by the sums of their images, of the squares of these, and how many there were. Raises
+def _of_frames(sums: _Sums, places: _Places) -> Dots:
+    """Dots by the sums of their images, without those that the image's edge cuts. Raises
     InputError for too few.
     """
-    total, squares, lit = sums
-    usable = np.flatnonzero((lit > 0) & np.isfinite(total).all(axis=(1, 2)))
+    is_whole = np.isfinite(sums.total).all(axis=(1, 2))
+    usable = np.flatnonzero((sums.frames > 0) & is_whole)
     if len(usable) < MIN_DOTS:
         raise InputError(
             f"{len(usable)} dots stand alone by {2 * MAX_HALF_PX} px in some frame, and {MIN_DOTS}"
             " are needed; plan fewer --dots in a frame"
         )
-    mean = total[usable] / lit[usable, None, None]
-    spread = squares[usable] / lit[usable, None, None] - mean**2
-    variance = _variance(mean, spread, lit[usable]) / lit[usable, None, None]
-    dots = Dots(mean, variance, *(part[usable] for part in places))
+    frames = sums.frames[usable]
+    pixel_frames = frames[:, None, None]
+    mean = sums.total[usable] / pixel_frames
+    spread = sums.squares[usable] / pixel_frames - mean**2
+    dots = Dots(
+        images=mean,
+        variance=_variance(mean, spread, frames) / pixel_frames,
+        column=places.column[usable],
+        row=places.row[usable],
+        x_px=places.x_px[usable],
+        y_px=places.y_px[usable],
+        side_px=places.side_px[usable],
+    )
     half = _half_px(dots)
     inner = slice(MAX_HALF_PX - half, MAX_HALF_PX + half + 1)
-    return replace(dots, images=mean[:, inner, inner], variance=variance[:, inner, inner])
+    inner_images = dots.images[:, inner, inner]
+    return replace(dots, images=inner_images, variance=dots.variance[:, inner, inner])
 
 
 def _variance(mean: FloatArray, spread: FloatArray, lit: FloatArray) -> FloatArray:
-    """The variance of one frame's pixels (n, s, s), linear in their light, by what repeats of a
-    dot differ by.
+    """The variance of one frame's pixels (n, s, s), DN^2: linear in their light, fitted to how
+    frames of one dot differ.
+
+    `mean` and `spread` (n, s, s) are the mean and the variance of `lit` (n,) frames.
     """
-    again = np.flatnonzero(lit > 1)
+    repeated = np.flatnonzero(lit > 1)
     light = mean - np.median(mean)
-    if not len(again):
-        edge = np.concatenate([mean[:, 0].ravel(), mean[:, -1].ravel()])
+    if not len(repeated):
+        # without repeats the edges of the squares, where light is least
+        first_row = mean[:, 0].ravel()
+        last_row = mean[:, -1].ravel()
+        edge = np.concatenate([first_row, last_row])
         return np.full(mean.shape, float(np.var(edge)) + QUANTISED_DN2)
-    unbiased = (spread[again] * (lit[again] / (lit[again] - 1))[:, None, None]).ravel()
-    lone_light = light[again].ravel()
-    dim = lone_light < np.median(lone_light) + 0.1 * np.ptp(lone_light)
-    flat = max(float(unbiased[dim].mean()), QUANTISED_DN2)
-    slope = max(
-        float(
-            ((unbiased - flat) * lone_light)[~dim].sum()
-            / max((lone_light[~dim] ** 2).sum(), 1e-300)
-        ),
-        0.0,
-    )
+    bessel = lit[repeated] / (lit[repeated] - 1)
+    variance = (spread[repeated] * bessel[:, None, None]).ravel()
+    repeated_light = light[repeated].ravel()
+    dim_limit = np.median(repeated_light) + 0.1 * np.ptp(repeated_light)
+    is_dim = repeated_light < dim_limit
+    flat = max(float(variance[is_dim].mean()), QUANTISED_DN2)
+    bright_light = repeated_light[~is_dim]
+    products = ((variance - flat) * repeated_light)[~is_dim]
+    light_square = max((bright_light**2).sum(), 1e-300)
+    slope = max(float(products.sum() / light_square), 0.0)
     return flat + slope * light.clip(min=0)
 
 
 def _half_px(dots: Dots) -> int:
     """Half the side of the square beyond which the dots have no light."""
-    side = dots.images.shape[1]
-    ring = np.abs(np.indices((side, side)) - side // 2).max(axis=0).ravel()
-    flux = (dots.images - dots.images[:, :1].mean(axis=(1, 2), keepdims=True)).reshape(
-        len(dots.images), -1
-    )
-    flux = flux.sum(axis=0)
-    variance = dots.variance.reshape(len(dots.images), -1).sum(axis=0)
+    count, side, _ = dots.images.shape
+    from_middle = np.abs(np.indices((side, side)) - side // 2)
+    ring = from_middle.max(axis=0).ravel()
+    first_row = dots.images[:, :1].mean(axis=(1, 2), keepdims=True)
+    flux = (dots.images - first_row).reshape(count, -1).sum(axis=0)
+    variance = dots.variance.reshape(count, -1).sum(axis=0)
     size = np.bincount(ring)
     mean = np.bincount(ring, flux) / size
     sigma = np.sqrt(np.bincount(ring, variance)) / size
-    visible = np.flatnonzero((mean > SEEN_SIGMAS * sigma) & (mean > SEEN_SHARE * mean[0]))
-    return int(np.clip(visible.max(initial=0) + 2, MIN_HALF_PX, MAX_HALF_PX))
+    is_lit = (mean > SEEN_SIGMAS * sigma) & (mean > SEEN_SHARE * mean[0])
+    last_lit = np.flatnonzero(is_lit).max(initial=0)
+    return int(np.clip(last_lit + 2, MIN_HALF_PX, MAX_HALF_PX))
 
 
 @dataclass(frozen=True, slots=True)
 class HeldOut:
-    """Of dots held out of a fit: rms of pixels relative to a dot's brightest one, what noise
-    makes, and chi square by dot.
+    """Errors of a model on dots held out of its fit: rms of their pixels relative to the dot's
+    brightest one, that which noise alone makes, and the reduced chi square of each dot.
     """
 
     name: str
@@ -321,8 +406,8 @@ class HeldOut:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """An effective PSF as a tracker's glass, the models that were held to dots that they had not
-    seen, and the one chosen.
+    """An effective PSF as a tracker's glass, the models tried on dots held out of their fits, and
+    the one chosen; `sigma_px` is the Gaussian's, along x and y in the middle of the field.
     """
 
     glass: Glass
@@ -338,43 +423,53 @@ def fit_effective(dots: Dots, per_px: int) -> Found:
     """Fit dots, choose the model by those held out, and make the file's glass. Raises InputError
     for dots that are none.
     """
-    place = np.stack([dots.x_px, dots.y_px], axis=1)
-    middle = (place.max(axis=0) + place.min(axis=0)) / 2
-    scale = max(float(np.ptp(place, axis=0).max()) / 2, 1.0)
+    places_px = dots.places_px
+    middle = (places_px.max(axis=0) + places_px.min(axis=0)) / 2
+    scale = max(float(np.ptp(places_px, axis=0).max()) / 2, 1.0)
     dots, covariance = _each_gaussian(dots)
-    degrees = [
-        d for d in range(MAX_DEGREE + 1) if (d + 1) * (d + 2) // 2 * DOTS_A_TERM <= len(place)
-    ]
-    counts = [(d + 1) * (d + 2) // 2 for d in degrees]
-    start = Effective(middle, scale, np.zeros((counts[-1], 3)), _knots(dots), np.zeros((0, 0, 0)))
-    fold = np.random.default_rng(SEED).permutation(len(place)) % FOLDS
-    models = [
-        _held_out(start, dots, covariance, fold, 0),
-        *(_held_out(start, dots, covariance, fold, n) for n in counts),
-    ]
-    gaussian = models[0]
-    best = min(models[1:], key=lambda model: float(model.chi2.mean()))
+    counts = []
+    for degree in range(MAX_DEGREE + 1):
+        terms = (degree + 1) * (degree + 2) // 2
+        if terms * DOTS_A_TERM <= len(places_px):
+            counts.append(terms)
+    start = Effective(
+        middle_px=middle,
+        scale_px=scale,
+        covariance=np.zeros((counts[-1], 3)),
+        knots_px=_knots(dots),
+        spline=np.zeros((0, 0, 0)),
+    )
+    fold = np.random.default_rng(SEED).permutation(len(places_px)) % FOLDS
+    models = [_held_out(start, dots, covariance, fold, count) for count in (0, *counts)]
+    gaussian, *splines = models
+    best = min(splines, key=lambda model: float(model.chi2.mean()))
     gain = gaussian.chi2 - best.chi2
-    asks = bool(gain.mean() > ASKS_SIGMAS * gain.std(ddof=1) / np.sqrt(len(gain)))
-    chosen = best if asks else gaussian
-    final, _ = _fitted(start, dots, covariance, counts[models.index(best) - 1] if asks else 0)
+    gain_error = gain.std(ddof=1) / np.sqrt(len(gain))
+    asks = bool(gain.mean() > ASKS_SIGMAS * gain_error)
+    chosen = gaussian
+    count = 0
+    if asks:
+        chosen = best
+        count = counts[splines.index(best)]
+    final, _ = _fitted(start, dots, covariance, count)
     half = dots.images.shape[1] // 2
-    glass = _glass(final, place, half, per_px)
-    variance = final.covariance[0, :XY].clip(min=MIN_VARIANCE_PX2)
+    x_variance, y_variance = final.covariance[0, :XY].clip(min=MIN_VARIANCE_PX2)
     return Found(
-        glass,
-        models,
-        chosen,
-        asks,
-        (float(variance[0] ** 0.5), float(variance[1] ** 0.5)),
-        len(place),
-        half,
+        glass=_glass(final, places_px, half, per_px),
+        models=models,
+        chosen=chosen,
+        asks_for_more=asks,
+        sigma_px=(float(x_variance**0.5), float(y_variance**0.5)),
+        dots=len(places_px),
+        half_px=half,
     )
 
 
 def _knots(dots: Dots) -> FloatArray:
-    reach = max(1.5, dots.images.shape[1] / 2 - float(np.median(dots.side_px)) / 2 - 2 * KNOT_PX)
-    count = int(reach / KNOT_PX)
+    """The middles (m,) of the spline's functions, px, as far as the dots' images reach."""
+    half_side_px = float(np.median(dots.side_px)) / 2
+    reach_px = dots.images.shape[1] / 2 - half_side_px - 2 * KNOT_PX
+    count = int(max(1.5, reach_px) / KNOT_PX)
     return np.asarray(KNOT_PX * np.arange(-count, count + 1), dtype=np.float64)
 
 
@@ -405,9 +500,10 @@ def _placed(model: Effective, dots: Dots) -> tuple[Dots, FloatArray, FloatArray]
         for moved in _moved(dots):
             columns.append((model.of(x_px, y_px, moved, dots.side_px) - shares) / STEP_PX)
         solved = amplitudes(columns, weight, dots.images)
-        steps = solved[:, 2:] / np.maximum(np.abs(solved[:, :1]), SMALLEST)
-        steps = np.clip(steps, -MAX_STEP_PX, MAX_STEP_PX)
-        dots = replace(dots, x_px=dots.x_px + steps[:, 0], y_px=dots.y_px + steps[:, 1])
+        light = np.maximum(np.abs(solved[:, :1]), SMALLEST)
+        steps = np.clip(solved[:, 2:] / light, -MAX_STEP_PX, MAX_STEP_PX)
+        step_x, step_y = steps.T
+        dots = replace(dots, x_px=dots.x_px + step_x, y_px=dots.y_px + step_y)
     shares = model.of(x_px, y_px, dots.offsets, dots.side_px)
     return dots, shares, amplitudes((shares, np.ones_like(shares)), weight, dots.images)
 
@@ -418,17 +514,15 @@ def _fitted(
     """A model of dots: the Gaussian's covariance over the field, and a spline with `count` terms
     over the field.
     """
-    place = (np.stack([dots.x_px, dots.y_px], axis=1) - start.middle_px) / start.scale_px
-    terms = terms_of(place, len(start.covariance))
+    terms = terms_of(start.place(dots.places_px), len(start.covariance))
     coefficients = over_field(terms, covariance)
-    model = replace(start, covariance=coefficients)
+    gaussian = replace(start, covariance=coefficients)
     if not count:
-        return model, dots
+        return gaussian, dots
+    model = gaussian
     for _ in range(SPLINE_ROUNDS):
         dots, _, amplitudes = _placed(model, dots)
-        model = replace(
-            model, spline=_spline(replace(model, spline=start.spline), dots, amplitudes, count)
-        )
+        model = replace(gaussian, spline=_spline(gaussian, dots, amplitudes, count))
     return model, dots
 
 
@@ -441,25 +535,26 @@ def _spline(gaussian: Effective, dots: Dots, amplitudes: FloatArray, count: int)
     flux, background = amplitudes.T[:, :, None, None]
     flux = np.maximum(flux, 1e-9)
     sigma = np.sqrt(dots.variance) / flux
-    rest = (dots.images - background) / flux - gaussian.of(
-        dots.x_px, dots.y_px, dots.offsets, dots.side_px
-    )
-    across, down = (_functions(gaussian.knots_px, off, dots.side_px) for off in dots.offsets)
-    place = (np.stack([dots.x_px, dots.y_px], axis=1) - gaussian.middle_px) / gaussian.scale_px
-    terms = terms_of(place, count)
+    shares = (dots.images - background) / flux
+    rest = shares - gaussian.of(dots.x_px, dots.y_px, dots.offsets, dots.side_px)
+    across_px, down_px = dots.offsets
+    across = _functions(gaussian.knots_px, across_px, dots.side_px)
+    down = _functions(gaussian.knots_px, down_px, dots.side_px)
+    terms = terms_of(gaussian.place(dots.places_px), count)
     size = len(gaussian.knots_px)
 
     def forward(coefficients: FloatArray) -> FloatArray:
         of_dot = np.tensordot(terms, coefficients.reshape(count, size, size), axes=1)
-        return np.asarray((down @ of_dot @ across.transpose(0, 2, 1) / sigma).ravel())
+        model = down @ of_dot @ across.transpose(0, 2, 1)
+        return np.asarray((model / sigma).ravel())
 
     def backward(values: FloatArray) -> FloatArray:
-        of_dot = down.transpose(0, 2, 1) @ (values.reshape(sigma.shape) / sigma) @ across
+        weighted = values.reshape(sigma.shape) / sigma
+        of_dot = down.transpose(0, 2, 1) @ weighted @ across
         return np.asarray(np.tensordot(terms.T, of_dot, axes=1).ravel())
 
-    operator = LinearOperator(
-        (sigma.size, count * size * size), matvec=forward, rmatvec=backward, dtype=np.float64
-    )
+    shape = (sigma.size, count * size * size)
+    operator = LinearOperator(shape, matvec=forward, rmatvec=backward, dtype=np.float64)
     solution = lsqr(
         operator,
         (rest / sigma).ravel(),
@@ -467,8 +562,8 @@ def _spline(gaussian: Effective, dots: Dots, amplitudes: FloatArray, count: int)
         iter_lim=SPLINE_STEPS,
         atol=1e-5,
         btol=1e-5,
-    )[0]
-    return np.asarray(solution.reshape(count, size, size))
+    )
+    return np.asarray(solution[0].reshape(count, size, size))
 
 
 def _held_out(
@@ -477,49 +572,59 @@ def _held_out(
     """How far a model is off dots that it was not fitted to; only their places, light and
     background are.
     """
-    chi2, rms, noise = (np.zeros(len(fold)) for _ in range(3))
+    chi2 = np.zeros(len(fold))
+    rms = np.zeros(len(fold))
+    noise = np.zeros(len(fold))
     for number in range(FOLDS):
         known = np.flatnonzero(fold != number)
         held = np.flatnonzero(fold == number)
         model, _ = _fitted(start, dots.at(known), covariance[known], count)
-        own_stamps, shares, amplitudes = _placed(model, dots.at(held))
+        placed, shares, amplitudes = _placed(model, dots.at(held))
         flux, background = amplitudes.T[:, :, None, None]
-        off = own_stamps.images - background - flux * shares
+        squares = (placed.images - background - flux * shares) ** 2
         peak = np.abs(flux[:, 0, 0]) * shares.max(axis=(1, 2))
-        chi2[held] = (off**2 / own_stamps.variance).mean(axis=(1, 2))
-        rms[held] = np.sqrt((off**2).mean(axis=(1, 2))) / peak
-        noise[held] = np.sqrt(own_stamps.variance.mean(axis=(1, 2))) / peak
-    if count:
-        name = (
-            f"spline, {('constant', 'linear', 'quadratic')[(1, 3, 6).index(count)]} over the field"
-        )
-    else:
-        name = "Gaussian"
-    return HeldOut(name, float(np.sqrt(np.mean(rms**2))), float(np.sqrt(np.mean(noise**2))), chi2)
+        square = squares.mean(axis=(1, 2))
+        variance = placed.variance.mean(axis=(1, 2))
+        chi2[held] = (squares / placed.variance).mean(axis=(1, 2))
+        rms[held] = np.sqrt(square) / peak
+        noise[held] = np.sqrt(variance) / peak
+    return HeldOut(MODEL_NAMES[count], _rms(rms), _rms(noise), chi2)
+
+
+def _rms(values: FloatArray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _glass(model: Effective, place: FloatArray, half_px: int, per_px: int) -> Glass:
     """The model at points over the dots' field, each with its centroid in the middle."""
     low = place.min(axis=0)
     high = place.max(axis=0)
-    x_px, y_px = (part.ravel() for part in np.meshgrid(*np.linspace(low, high, POINTS).T))
-    steps = np.arange(-half_px * per_px, half_px * per_px + 1) / per_px
-    none = np.zeros(len(x_px))
-    off = [np.tile(steps, (len(x_px), 1)) for _ in (0, 1)]
+    columns, rows = np.linspace(low, high, POINTS).T
+    grid_x, grid_y = np.meshgrid(columns, rows)
+    x_px = grid_x.ravel()
+    y_px = grid_y.ravel()
+    count = len(x_px)
+    reach = half_px * per_px
+    steps = np.arange(-reach, reach + 1) / per_px
+    no_side = np.zeros(count)
+    across = np.tile(steps, (count, 1))
+    down = np.tile(steps, (count, 1))
     for _ in range(3):
-        images = model.of(x_px, y_px, (off[0], off[1]), none)
+        images = model.of(x_px, y_px, (across, down), no_side)
         total = images.sum(axis=(1, 2))
-        off[0] = off[0] + (images.sum(axis=1) @ steps / total)[:, None]
-        off[1] = off[1] + (images.sum(axis=2) @ steps / total)[:, None]
-    images = model.of(x_px, y_px, (off[0], off[1]), none)
-    at = np.column_stack([x_px, y_px, np.full(len(x_px), np.nan), none])
+        x_centroid = images.sum(axis=1) @ steps / total
+        y_centroid = images.sum(axis=2) @ steps / total
+        across = across + x_centroid[:, None]
+        down = down + y_centroid[:, None]
+    images = model.of(x_px, y_px, (across, down), no_side)
+    in_focus = np.zeros(count)
+    at = np.column_stack([x_px, y_px, np.full(count, np.nan), in_focus])
     history = (
         f"hilstar calibrate psf: {len(place)} dots",
         "collimator and tracker together, without the dots' squares; centroids in the middle",
     )
-    return glass_of(
-        Stack(images, at, facts_of(len(at)), per_px, pixel_integrated=True), history=history
-    )
+    stack = Stack(images, at, facts_of(count), per_px, pixel_integrated=True)
+    return glass_of(stack, history=history)
 
 
 def draw_effective(path: Path, found: Found) -> None:
@@ -530,7 +635,8 @@ def draw_effective(path: Path, found: Found) -> None:
         f" {found.chosen.noise:.2%}"
     )
     with chart(path, finding, height_inch=6.6) as (axes,):
-        picked = images.reshape(POINTS, POINTS, *images.shape[1:])[:: POINTS // 2, :: POINTS // 2]
+        grid = images.reshape(POINTS, POINTS, *images.shape[1:])
+        picked = grid[:: POINTS // 2, :: POINTS // 2]
         # points are sorted by x, then y
         picture = picked.transpose(1, 2, 0, 3).reshape(3 * images.shape[1], -1)
         axes.imshow(np.sqrt(picture.clip(min=0)), cmap="viridis", interpolation="nearest")
@@ -546,24 +652,23 @@ def draw_effective(path: Path, found: Found) -> None:
 def summary_of(found: Found) -> dict[str, Any]:
     """The figures of an effective PSF, by the keys of --json."""
     models = []
-    for m in found.models:
-        models.append(
-            {"name": m.name, "rms": m.rms, "noise": m.noise, "reduced_chi2": float(m.chi2.mean())}
-        )
+    for model in found.models:
+        models.append({"name": model.name, **_errors(model)})
     return {
         "dots": found.dots,
         "half_px": found.half_px,
         "sigma_px": list(found.sigma_px),
         "model": found.chosen.name,
         "more_than_gaussian": found.asks_for_more,
-        "held_out": {
-            "rms": found.chosen.rms,
-            "noise": found.chosen.noise,
-            "reduced_chi2": float(found.chosen.chi2.mean()),
-        },
+        "held_out": _errors(found.chosen),
         "models": models,
         "components": len(found.glass.basis),
     }
+
+
+def _errors(model: HeldOut) -> dict[str, float]:
+    """Errors on held-out dots, by the keys of --json."""
+    return {"rms": model.rms, "noise": model.noise, "reduced_chi2": float(model.chi2.mean())}
 
 
 def lines_of(found: Found) -> list[str]:

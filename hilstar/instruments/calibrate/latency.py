@@ -34,8 +34,11 @@ from hilstar.server.sync import beat, exposures_of
 INT64 = range(-(2**63), 2**63)
 MAX_EDGE_BYTES = 20_000_000  # a day of toggles
 MIN_EDGES = 20
+EDGE_COLUMNS = ("host_ns", "level")
 EDGE_FORM = "write lines of host_ns,level"
+EDGE_ADVICE = f"{EDGE_FORM} under that header"
 DEVICE_FORM = "send a line 0 or 1 at each edge, or 0,MICROSECONDS by the device's own clock"
+DEVICE_LINE = re.compile(rb"([01])(?:,(\d{1,18}))?")
 MAX_LATENCY_NS = 500 * NS_PER_MS
 # a clock that is read after the swap may give a time later than that of the light
 MAX_EARLY_NS = 5 * NS_PER_MS
@@ -62,44 +65,54 @@ def capture_edges(port: str, baud: int, seconds: float) -> Edges:
     Device times are converted to the host's clock by the lower hull of their delays, so the minimum
     delay stays in the latency. Raises InputError where there are too few.
     """
-    lines = read_lines(port, baud, seconds)
-    edges = [
-        (host_ns, match)
-        for host_ns, line in lines
-        if (match := re.fullmatch(rb"([01])(?:,(\d{1,18}))?", line))
-    ]
-    if len(edges) < MIN_EDGES:
+    host: list[int] = []
+    levels: list[int] = []
+    device_us: list[int] = []
+    for line_ns, line in read_lines(port, baud, seconds):
+        match = DEVICE_LINE.fullmatch(line)
+        if match is None:
+            continue
+        host.append(line_ns)
+        levels.append(int(match[1]))
+        if match[2] is not None:
+            device_us.append(int(match[2]))
+    if len(host) < MIN_EDGES:
         raise InputError(
-            f"serial:{port}@{baud}: {len(edges)} edges came, and at least {MIN_EDGES} are needed;"
+            f"serial:{port}@{baud}: {len(host)} edges came, and at least {MIN_EDGES} are needed;"
             f" {DEVICE_FORM}"
         )
-    host_ns = np.array([host for host, _ in edges], dtype=np.int64)
-    level = np.array([int(match[1]) for _, match in edges], dtype=np.int64)
-    if all(match[2] is not None for _, match in edges):
-        device_ns = [int(match[2]) * NS_PER_US for _, match in edges]
-        clock = OneWayFilter()
-        for host, device in zip(host_ns.tolist(), device_ns, strict=True):
-            clock.observe(host, host - device)
-        if clock.line is not None:
-            offset_ns = [round(clock.line.at(host)) for host in host_ns.tolist()]
-            host_ns = np.array(device_ns, dtype=np.int64) + offset_ns
-    return Edges(host_ns, level)
+    host_ns = np.array(host, dtype=np.int64)
+    if len(device_us) == len(host):
+        host_ns = _on_host(host_ns, NS_PER_US * np.array(device_us, dtype=np.int64))
+    return Edges(host_ns, np.array(levels, dtype=np.int64))
+
+
+def _on_host(host_ns: IntArray, device_ns: IntArray) -> IntArray:
+    """Device times (n,) on the host's clock, by when they came (n,)."""
+    clock = OneWayFilter()
+    for arrival_ns, stamp_ns in zip(host_ns.tolist(), device_ns.tolist(), strict=True):
+        clock.observe(arrival_ns, arrival_ns - stamp_ns)
+    if clock.line is None:
+        return host_ns
+    offset_ns = [round(clock.line.at(arrival_ns)) for arrival_ns in host_ns.tolist()]
+    return np.asarray(device_ns + offset_ns)
 
 
 def read_edges(path: Path) -> Edges:
     """Read edges from a CSV file with the columns host_ns and level. Raises InputError."""
     rows = []
-    for line, cells in read_rows(
-        path, ("host_ns", "level"), f"{EDGE_FORM} under that header", MAX_EDGE_BYTES, ()
-    ):
+    for line, cells in read_rows(path, EDGE_COLUMNS, EDGE_ADVICE, MAX_EDGE_BYTES, ()):
         try:
-            rows.append((int(cells[0]), int(cells[1])))
-            if rows[-1][0] not in INT64:
+            host_ns = int(cells[0])
+            level = int(cells[1])
+            if host_ns not in INT64:
                 raise ValueError("host_ns does not fit 64 bits")
         except ValueError as error:
-            wrong = f"not a file of edges ({shortened(repr(error))}); {EDGE_FORM} under that header"
-            raise InputError(f"{path}:{line}: {wrong}") from error
-    if len(rows) < MIN_EDGES or any(level not in {0, 1} for _, level in rows):
+            fault = f"not a file of edges ({shortened(repr(error))}); {EDGE_ADVICE}"
+            raise InputError(f"{path}:{line}: {fault}") from error
+        rows.append((host_ns, level))
+    are_levels_known = all(level in {0, 1} for _, level in rows)
+    if len(rows) < MIN_EDGES or not are_levels_known:
         raise InputError(
             f"{path}: at least {MIN_EDGES} edges are needed, each of level 0 or 1; {EDGE_FORM}"
         )
@@ -109,9 +122,8 @@ def read_edges(path: Path) -> Edges:
 
 def save_edges(path: Path, edges: Edges) -> None:
     """Write edges as `read_edges` reads them. Raises InputError where that cannot be done."""
-    write_csv(
-        path, ("host_ns", "level"), zip(edges.host_ns.tolist(), edges.level.tolist(), strict=True)
-    )
+    columns = (edges.host_ns.tolist(), edges.level.tolist())
+    write_csv(path, EDGE_COLUMNS, zip(*columns, strict=True))
 
 
 def edges_of(swap_ns: IntArray, level: IntArray) -> Edges:
@@ -138,38 +150,40 @@ def pair(seen: Edges, shown: Edges, period_ns: float) -> Paired:
     """Match each edge to its frame by the most frequent latency, within half a period. Raises
     InputError if too few agree.
     """
-    inside = (seen.host_ns >= shown.host_ns[0] - MAX_EARLY_NS) & (
-        seen.host_ns <= shown.host_ns[-1] + MAX_LATENCY_NS
-    )
-    host_ns = seen.host_ns[inside]
-    level = seen.level[inside]
+    first_ns = shown.host_ns[0] - MAX_EARLY_NS
+    last_ns = shown.host_ns[-1] + MAX_LATENCY_NS
+    in_run = (seen.host_ns >= first_ns) & (seen.host_ns <= last_ns)
+    host_ns = seen.host_ns[in_run]
+    level = seen.level[in_run]
     guess_ns, ambiguous = _likely_latency_ns(Edges(host_ns, level), shown)
-    latency = []
-    agreeing = []
+    latencies = [np.zeros(0)]
+    levels = [np.zeros(0, dtype=np.int64)]
     for value in (0, 1):
         causes = shown.host_ns[shown.level == value]
-        mine = host_ns[level == value]
-        if len(causes) and len(mine):
-            delay = mine - nearest_of(causes, mine - guess_ns)
-            good = np.abs(delay - guess_ns) < period_ns / 2
-            latency.append(delay[good].astype(np.float64))
-            agreeing.append(np.full(int(good.sum()), value))
-    if latency:
-        latencies = np.concatenate(latency)
-    else:
-        latencies = np.zeros(0)
-    if len(latencies) < max(MIN_EDGES, AGREEING_SHARE * len(host_ns)):
-        fit = f"{len(latencies)} of {len(host_ns)} edges fit the run's frames"
-        raise InputError(f"{fit}; record the edges during the run, on the same machine")
-    return Paired(latencies, np.concatenate(agreeing), len(host_ns) - len(latencies), ambiguous)
+        edges_ns = host_ns[level == value]
+        if len(causes) and len(edges_ns):
+            delay_ns = edges_ns - nearest_of(causes, edges_ns - guess_ns)
+            agrees = np.abs(delay_ns - guess_ns) < period_ns / 2
+            latencies.append(delay_ns[agrees].astype(np.float64))
+            levels.append(np.full(int(agrees.sum()), value))
+    latency_ns = np.concatenate(latencies)
+    if len(latency_ns) < max(MIN_EDGES, AGREEING_SHARE * len(host_ns)):
+        raise InputError(
+            f"{len(latency_ns)} of {len(host_ns)} edges fit the run's frames; record the edges"
+            " during the run, on the same machine"
+        )
+    unmatched = len(host_ns) - len(latency_ns)
+    return Paired(latency_ns, np.concatenate(levels), unmatched, ambiguous)
 
 
 def nearest_of(moments: IntArray, wanted: FloatArray) -> IntArray:
     """The member of sorted `moments` (m,) nearest to each of `wanted` (n,)."""
     after = np.minimum(np.searchsorted(moments, wanted), len(moments) - 1)
     before = np.maximum(after - 1, 0)
-    closer = np.abs(moments[after] - wanted) < np.abs(moments[before] - wanted)
-    return np.asarray(moments[np.where(closer, after, before)])
+    to_after = np.abs(moments[after] - wanted)
+    to_before = np.abs(moments[before] - wanted)
+    nearest = np.where(to_after < to_before, after, before)
+    return np.asarray(moments[nearest])
 
 
 def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
@@ -180,18 +194,20 @@ def _likely_latency_ns(seen: Edges, shown: Edges) -> tuple[float, bool]:
     counts = np.zeros(bins, dtype=np.int64)
     for value in (0, 1):
         causes = shown.host_ns[shown.level == value]
-        mine = seen.host_ns[seen.level == value]
-        begin = np.searchsorted(causes, mine - MAX_LATENCY_NS)
-        end = np.searchsorted(causes, mine + MAX_EARLY_NS, side="right")
-        for edge_ns, a, b in zip(mine, begin, end, strict=True):
-            np.add.at(
-                counts, np.minimum((edge_ns - causes[a:b] + MAX_EARLY_NS) // BIN_NS, bins - 1), 1
-            )
+        edges_ns = seen.host_ns[seen.level == value]
+        first = np.searchsorted(causes, edges_ns - MAX_LATENCY_NS)
+        end = np.searchsorted(causes, edges_ns + MAX_EARLY_NS, side="right")
+        for k, edge_ns in enumerate(edges_ns):
+            delay_ns = edge_ns - causes[first[k] : end[k]]
+            place = (delay_ns + MAX_EARLY_NS) // BIN_NS
+            np.add.at(counts, np.minimum(place, bins - 1), 1)
     smooth = np.convolve(counts, np.ones(3, dtype=np.int64), mode="same")
     likely = np.flatnonzero(smooth >= LIKELY_SHARE * smooth.max())
-    first = likely[likely <= likely[0] + 2]
-    best = int(first[np.argmax(smooth[first])])
-    return (best + 0.5) * BIN_NS - MAX_EARLY_NS, bool((likely > likely[0] + 4).any())
+    # bins of one peak are next to each other
+    first_peak = likely[likely <= likely[0] + 2]
+    best = int(first_peak[np.argmax(smooth[first_peak])])
+    has_others = bool((likely > likely[0] + 4).any())
+    return (best + 0.5) * BIN_NS - MAX_EARLY_NS, has_others
 
 
 def summarise(paired: Paired, config: BenchConfig) -> dict[str, Any]:
@@ -203,29 +219,42 @@ def summarise(paired: Paired, config: BenchConfig) -> dict[str, Any]:
     """
     ms = paired.latency_ns / NS_PER_MS
     to_square_ms = swap_to_square_ms(config.monitor)
-    p1, p50, p99 = (float(value) for value in np.percentile(ms, [1, 50, 99]))
-    rise, fall = (ms[paired.level == level] for level in (1, 0))
+    p1, p50, p99 = np.percentile(ms, [1, 50, 99]).tolist()
+    jitter_ms = float(ms.std())
+    latency_ms = {"p1": p1, "p50": p50, "p99": p99, "max": float(ms.max())}
+    median_error_ms = ERROR_OF_MEDIAN * jitter_ms / math.sqrt(len(ms))
     return {
         "edges": len(ms),
         "unmatched": paired.unmatched,
         "ambiguous": paired.ambiguous,
-        "latency_ms": {"p1": p1, "p50": p50, "p99": p99, "max": float(ms.max())},
-        "jitter_ms": float(ms.std()),
-        "rise_ms": float(np.median(rise)) if len(rise) else None,
-        "fall_ms": float(np.median(fall)) if len(fall) else None,
+        "latency_ms": latency_ms,
+        "jitter_ms": jitter_ms,
+        "rise_ms": _median(ms[paired.level == 1]),
+        "fall_ms": _median(ms[paired.level == 0]),
         "swap_to_square_ms": to_square_ms,
         "panel_delay_ms": p50 - to_square_ms,
-        "panel_delay_u_ms": ERROR_OF_MEDIAN * float(ms.std()) / math.sqrt(len(ms)),
+        "panel_delay_u_ms": median_error_ms,
         "beat": asdict(beat(exposures_of(config))),
     }
+
+
+def _median(values: FloatArray) -> float | None:
+    if len(values):
+        return float(np.median(values))
+    return None
 
 
 def swap_to_square_ms(monitor: Monitor) -> float:
     """Time from the first row's light to that of the square's middle, at the foot of the screen,
     by the scan-out.
     """
-    rows = monitor.resolution_px[0 if monitor.rotate_deg % 180 else 1]
-    return monitor.panel_scanout_ms * (1 - monitor.photodiode_px / 2 / rows)
+    width, height = monitor.resolution_px
+    # a screen that stands on its side is scanned along the image's width
+    rows = height
+    if monitor.rotate_deg % 180:
+        rows = width
+    middle_row_share = 1 - monitor.photodiode_px / 2 / rows
+    return monitor.panel_scanout_ms * middle_row_share
 
 
 def checked_delay_ms(panel_delay_ms: float) -> float:
@@ -248,14 +277,11 @@ def write_panel_delay(path: Path, panel_delay_ms: float, error_ms: float) -> Non
     that cannot be changed.
     """
     value = checked_delay_ms(panel_delay_ms)
-    text = with_key(
-        read_text(path, "give the path of a bench file", MAX_TOML_BYTES),
-        "monitor",
-        "panel_delay_ms",
-        value,
-    )
+    text = read_text(path, "give the path of a bench file", MAX_TOML_BYTES)
+    text = with_key(text, "monitor", "panel_delay_ms", value)
     text = with_key(text, "certify", "panel_delay_u_ms", float(f"{error_ms:.3g}"))
-    if parse_toml(path, text).get("monitor", {}).get("panel_delay_ms") != value:
+    written = parse_toml(path, text).get("monitor", {})
+    if written.get("panel_delay_ms") != value:
         raise InputError(
             f"{path}: write panel_delay_ms = {value} into its [monitor] yourself: the table is not"
             " in plain form"
@@ -302,19 +328,15 @@ def latency_lines(summary: dict[str, Any]) -> list[str]:
     """The figures as lines of text."""
     latency = summary["latency_ms"]
     turn = summary["beat"]
-    if turn["period_s"] is None:
-        every = "none"
-    else:
-        every = f"every {turn['period_s']:.3g} s"
+    period = "none"
+    if turn["period_s"] is not None:
+        period = f"every {turn['period_s']:.3g} s"
+    cost = "-"
     worst = turn["worst_arcsec_per_deg_s"]
-    if worst is None:
-        cost = "-"
-    else:
+    if worst is not None:
         cost = f"at most {worst:.2g} arcsec at 1 deg/s"
-    rise, fall = (
-        "-" if value is None else f"{value:.2f}"
-        for value in (summary["rise_ms"], summary["fall_ms"])
-    )
+    rise = _milliseconds(summary["rise_ms"])
+    fall = _milliseconds(summary["fall_ms"])
     figures = {
         "edges": f"{summary['edges']} paired, {summary['unmatched']} without a frame",
         "swap to light": (
@@ -323,7 +345,7 @@ def latency_lines(summary: dict[str, Any]) -> list[str]:
         "rise, fall": f"{rise}, {fall} ms (medians)",
         "jitter": f"{summary['jitter_ms']:.3f} ms (standard deviation)",
         "beat with the exposure": (
-            f"{turn['refreshes_per_exposure']:.3f} refreshes in one; {every}; {cost}"
+            f"{turn['refreshes_per_exposure']:.3f} refreshes in one; {period}; {cost}"
         ),
         "of this, scan-out": f"{summary['swap_to_square_ms']:.2f} ms to the square",
         "panel_delay_ms": f"{summary['panel_delay_ms']:.3f} +- {summary['panel_delay_u_ms']:.3f}",
@@ -333,18 +355,26 @@ def latency_lines(summary: dict[str, Any]) -> list[str]:
             'a latency longer by whole pairs of frames fits too; [monitor] photodiode = "code"'
             " tells which"
         )
-    return [f"{what:24}{how_much}" for what, how_much in figures.items()]
+    return [f"{name:24}{text}" for name, text in figures.items()]
+
+
+def _milliseconds(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.2f}"
 
 
 def draw_latency(path: Path, paired: Paired, summary: dict[str, Any]) -> None:
     """Draw a histogram of the latencies by level."""
     middle = summary["latency_ms"]["p50"]
     jitter = summary["jitter_ms"]
+    ms = paired.latency_ns / NS_PER_MS
+    widest_ms = max(ms.max(), ms.min() + 1e-3)
+    bins = np.linspace(ms.min(), widest_ms, BINS).tolist()
     with chart(path, f"From swap to light: {middle:.2f} ms, jitter {jitter:.3f} ms") as (axes,):
-        ms = paired.latency_ns / NS_PER_MS
-        bins = np.linspace(ms.min(), max(ms.max(), ms.min() + 1e-3), BINS).tolist()
         for (level, name), colour in zip(LEVEL_NAMES.items(), (BLUE, ORANGE), strict=True):
-            axes.hist(ms[paired.level == level], bins=bins, color=colour, alpha=0.6, label=name)
+            of_level = ms[paired.level == level]
+            axes.hist(of_level, bins=bins, color=colour, alpha=0.6, label=name)
         axes.set_xlabel("swap to the photodiode's edge [ms]")
         axes.set_ylabel("edges [number]")
         axes.margins(y=0.25)

@@ -96,18 +96,21 @@ class MeasuredLevels:
         """The noise of one reading of white, relative to it, for a given relative noise beyond
         stated errors.
         """
-        stated = float(self.stated[-1] * math.sqrt(self.count[-1]) / self.mean[-1])
-        return math.hypot(relative_noise, stated)
+        reading_sigma = self.stated[-1] * math.sqrt(self.count[-1])
+        return math.hypot(relative_noise, float(reading_sigma / self.mean[-1]))
 
     def standard_error(self, relative_noise: float) -> FloatArray:
         """Standard error of the mean (n,), in its unit, for a given relative noise of one
         reading.
         """
-        variance = (relative_noise * self.mean) ** 2 + self.additive_noise**2
-        return np.asarray(np.sqrt(variance / self.count + self.stated**2), dtype=np.float64)
+        reading_variance = (relative_noise * self.mean) ** 2 + self.additive_noise**2
+        variance = reading_variance / self.count + self.stated**2
+        return np.asarray(np.sqrt(variance), dtype=np.float64)
 
 
 class _Row(NamedTuple):
+    """A measurement as its line has it."""
+
     code: int
     channel: str
     value: float
@@ -132,48 +135,61 @@ def read_measurements(path: Path, bits: int | None = None) -> Measurements:
             f"{path}: it has no measurement; write code,channel,value rows below the header"
         )
     codes = np.array([row.code for row in rows], dtype=np.intp)
-    bits = bits or next(usual for usual in USUAL_BITS if codes.max() < 2**usual)
-    if codes.max() >= 2**bits:
+    largest_code = int(codes.max())
+    if bits is None or bits == 0:
+        bits = next(usual for usual in USUAL_BITS if largest_code < 2**usual)
+    if largest_code >= 2**bits:
         raise InputError(
-            f"{path}: code {codes.max()} is outside {bits} bits (0 to {2**bits - 1}); say --bits"
+            f"{path}: code {largest_code} is outside {bits} bits (0 to {2**bits - 1}); say --bits"
         )
     channel = np.array([row.channel for row in rows])
     reading = np.array([row.value for row in rows])
     exposure_s = np.array([row.exposure_s for row in rows])
-    sigma = np.array([row.sigma for row in rows]) / exposure_s
-    common = np.array([row.common for row in rows]).reshape(len(rows), -1) / exposure_s[:, None]
-    given = [row.t_s for row in rows if row.t_s is not None]
-    if given and len(given) < len(rows):
-        raise InputError(
-            f"{path}: t_s is empty in some rows; give it in every row or leave the column out"
-        )
-    time = np.array(given if given else np.arange(len(rows)), dtype=np.float64)
+    sigma = np.array([row.sigma for row in rows])
+    common = np.array([row.common for row in rows]).reshape(len(rows), -1)
     clipped = {}
     for name in set(channel.tolist()):
-        clipped[name] = _clipped(codes[channel == name], reading[channel == name])
-    digest = hashlib.sha256(raw).hexdigest()
+        of_channel = channel == name
+        clipped[name] = _clipped(codes[of_channel], reading[of_channel])
     return Measurements(
         source=str(path),
         bits=bits,
         code=codes,
         channel=channel,
         value=reading / exposure_s,
-        time=time,
+        time=_times(path, rows),
         clipped=clipped,
-        sha256=digest,
-        sigma=sigma,
-        common=common,
+        sha256=hashlib.sha256(raw).hexdigest(),
+        sigma=sigma / exposure_s,
+        common=common / exposure_s[:, None],
     )
 
 
+def _times(path: Path, rows: list[_Row]) -> FloatArray:
+    """The time of each row (n,), s; its number where no row has one. Raises InputError where some
+    do not.
+    """
+    times = [row.t_s for row in rows if row.t_s is not None]
+    if not times:
+        return np.arange(len(rows), dtype=np.float64)
+    if len(times) < len(rows):
+        raise InputError(
+            f"{path}: t_s is empty in some rows; give it in every row or leave the column out"
+        )
+    return np.array(times, dtype=np.float64)
+
+
 def _rows(path: Path) -> Iterator[_Row]:
+    """The rows of a table. Raises InputError with the line."""
     with open_table(path, f"write {','.join(NEEDED)}", MAX_BYTES) as table:
         if not table.columns:
             return
         columns = _columns(table)
         table.warn()
         for number, cells in table.rows():
-            texts = {name: table.cell(cells, column) for name, column in columns.items()}
+            texts = {}
+            for name, column in columns.items():
+                texts[name] = table.cell(cells, column)
             yield _row(f"{path}: line {number}", texts)
 
 
@@ -201,6 +217,7 @@ def _columns(table: TextTable) -> dict[str, Chosen]:
 
 
 def _row(place: str, cells: dict[str, str]) -> _Row:
+    """A row by its cells. Raises InputError."""
     if not cells["value"]:
         raise InputError(
             f"{place}: value is empty; measure the patch and fill it in, or delete the row"
@@ -225,19 +242,30 @@ def _row(place: str, cells: dict[str, str]) -> _Row:
     if exposure_s <= 0:
         raise InputError(f"{place}: exposure_s = {exposure_s:g}; write more than 0")
     time = cells.get("t_s")
+    sigma = _sigma(place, cells)
+    common = []
+    for name, cell in cells.items():
+        if name.startswith(COMMON):
+            common.append(_number(place, name, cell or "0"))
+    t_s = None
+    if time:
+        t_s = _number(place, "t_s", time)
+    return _Row(code, cells["channel"], value, exposure_s, t_s, sigma, tuple(common))
+
+
+def _sigma(place: str, cells: dict[str, str]) -> float:
+    """The standard error of a row's value, 0 without that column. Raises InputError."""
     if cells.get("sigma") == "":
         advice = "write the value's standard error, or leave the column out"
         raise InputError(f"{place}: sigma is empty; {advice}")
     sigma = _number(place, "sigma", cells.get("sigma", "0"))
     if sigma < 0:
         raise InputError(f"{place}: sigma = {sigma:g}; write a standard error, 0 or more")
-    causes = [name for name in cells if name.startswith(COMMON)]
-    common = tuple(_number(place, name, cells[name] or "0") for name in causes)
-    t_s = _number(place, "t_s", time) if time else None
-    return _Row(code, cells["channel"], value, exposure_s, t_s, sigma, common)
+    return sigma
 
 
 def _number(place: str, name: str, text: str) -> float:
+    """A finite number of a cell. Raises InputError."""
     try:
         number = float(text)
     except ValueError:
@@ -254,7 +282,7 @@ def _clipped(code: IntArray, reading: FloatArray) -> list[int]:
     at_limit = reading == reading.max()
     codes = np.unique(code[at_limit])
     if len(codes) > 1 and at_limit.sum() >= CLIPPED_VALUES:
-        return [int(c) for c in codes]
+        return [int(code) for code in codes]
     return []
 
 
@@ -266,11 +294,13 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
     value = measured.value[chosen]
     code, place, count = np.unique(measured.code[chosen], return_inverse=True, return_counts=True)
     mean = np.asarray(np.bincount(place, value) / count, dtype=np.float64)
-    squares = np.asarray(np.bincount(place, (value - mean[place]) ** 2), dtype=np.float64)
-    variance = np.bincount(place, measured.sigma[chosen] ** 2) / count
+    off = value - mean[place]
+    squares = np.asarray(np.bincount(place, off**2), dtype=np.float64)
+    stated_variance = np.bincount(place, measured.sigma[chosen] ** 2) / count
+    is_stated = bool(stated_variance.any())
     # What repeats scatter beyond the readings' own errors.
-    squares -= (count - 1) * variance
-    floor = 0.0 if variance.any() else NOISE_FLOOR
+    squares -= (count - 1) * stated_variance
+    floor = 0.0 if is_stated else NOISE_FLOOR
     # The relative noise of the bright half, where the instrument's floor is negligible; of all but
     # black if too few repeat.
     relative = math.nan
@@ -279,19 +309,18 @@ def group_levels(measured: Measurements, channel: str) -> MeasuredLevels:
         if dof >= BRIGHT_DOF:
             square = max(float((squares[part] / mean[part] ** 2).sum()), 0.0)
             relative = max(math.sqrt(square / dof), floor)
-    if variance.any():
-        additive = 0.0
-    else:
+    additive = 0.0
+    if not is_stated:
         additive = _additive(squares, mean, count, relative)
     common = np.zeros((len(code), measured.common.shape[1]))
     np.add.at(common, place, measured.common[chosen])
     return MeasuredLevels(
-        code.astype(np.intp),
-        mean,
-        count.astype(np.intp),
-        relative,
-        additive,
-        stated=np.sqrt(variance / count),
+        code=code.astype(np.intp),
+        mean=mean,
+        count=count.astype(np.intp),
+        relative_noise=relative,
+        additive_noise=additive,
+        stated=np.sqrt(stated_variance / count),
         common=common / count[:, None],
     )
 
@@ -303,14 +332,17 @@ def _additive(squares: FloatArray, mean: FloatArray, count: IntArray, relative: 
     # F's quantile; scipy.stats has the same one and takes half a second to import
     from scipy.special import fdtri
 
-    faint = (np.arange(len(mean)) <= len(mean) // 3) & (count > 1)
-    dof = int((count[faint] - 1).sum())
+    levels = len(mean)
+    faint = (np.arange(levels) <= levels // 3) & (count > 1)
+    freedom = count[faint] - 1
+    dof = int(freedom.sum())
     if not dof or math.isnan(relative):
         return 0.0
-    expected = float(((relative * mean[faint]) ** 2 * (count[faint] - 1)).sum())
-    if float(squares[faint].sum()) <= expected * fdtri(dof, BRIGHT_DOF * 2, FAINT_ALARM):
+    expected = float(((relative * mean[faint]) ** 2 * freedom).sum())
+    square = float(squares[faint].sum())
+    if square <= expected * fdtri(dof, BRIGHT_DOF * 2, FAINT_ALARM):
         return 0.0
-    return math.sqrt((float(squares[faint].sum()) - expected) / dof)
+    return math.sqrt((square - expected) / dof)
 
 
 def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -> None:
@@ -344,8 +376,11 @@ def check_levels(measured: Measurements, channel: str, levels: MeasuredLevels) -
     error = levels.standard_error(relative)
     _check_saturation(measured, channel, levels, error)
     highest = np.maximum.accumulate(levels.mean)
-    peak = np.maximum.accumulate(np.where(levels.mean == highest, np.arange(len(highest)), 0))
-    fall = (highest - levels.mean) / np.maximum(np.hypot(error, error[peak]), 1e-30)
+    # the level before each one that is the highest so far
+    numbers = np.where(levels.mean == highest, np.arange(len(highest)), 0)
+    peak = np.maximum.accumulate(numbers)
+    fall_error = np.maximum(np.hypot(error, error[peak]), 1e-30)
+    fall = (highest - levels.mean) / fall_error
     worst = int(np.argmax(fall))
     if fall[worst] > FALSE_ALARM_SIGMA:
         percent = 100 * (1 - levels.mean[worst] / highest[worst])
@@ -366,7 +401,8 @@ def _check_saturation(
     white = levels.mean[-1]
     noise = float(np.hypot(error, error[-1])[-1] / white)
     margin = max(0.03, math.sqrt(FALSE_ALARM_SIGMA * noise / 3))
-    flat = (levels.code <= (1 - margin) * measured.white) & (levels.mean >= white * (1 - noise))
+    is_darker_code = levels.code <= (1 - margin) * measured.white
+    flat = is_darker_code & (levels.mean >= white * (1 - noise))
     if not clipped and flat.any():
         clipped = levels.code[int(np.argmax(flat)) :].tolist()
     if clipped:
@@ -384,21 +420,27 @@ def drift_over_run(measured: Measurements) -> tuple[float, float]:
     Both are nan where nothing was repeated. Code 0 is left out: its noise is not that of light.
     """
     lit = (measured.code > 0) & (measured.value > 0)
-    key = measured.code[lit] * len(CHANNELS) + np.array(
-        [CHANNELS.index(str(name)) for name in measured.channel[lit]]
-    )
-    _, place, count = np.unique(key, return_inverse=True, return_counts=True)
-    log_light = np.log(measured.value[lit])
-    time = measured.time[lit]
-    within = [values - (np.bincount(place, values) / count)[place] for values in (log_light, time)]
-    leverage = float((within[1] ** 2).sum())
+    channels = [CHANNELS.index(str(name)) for name in measured.channel[lit]]
+    patch = measured.code[lit] * len(CHANNELS) + np.array(channels)
+    _, place, count = np.unique(patch, return_inverse=True, return_counts=True)
+    # each reading against its patch's mean
+    log_light = _within(np.log(measured.value[lit]), place, count)
+    time = _within(measured.time[lit], place, count)
+    leverage = float((time**2).sum())
     span = float(np.ptp(measured.time))
     dof = len(place) - len(count) - 1
     if dof < 3 or leverage <= 1e-12 * max(span, 1e-300) ** 2:
         return math.nan, math.nan
-    slope = float(within[0] @ within[1]) / leverage
-    scatter = float(((within[0] - slope * within[1]) ** 2).sum()) / dof
+    slope = float(log_light @ time) / leverage
+    residual = log_light - slope * time
+    scatter = float((residual**2).sum()) / dof
     return slope * span, math.sqrt(scatter / leverage) * span
+
+
+def _within(values: FloatArray, place: IntArray, count: IntArray) -> FloatArray:
+    """Values (n,) less the mean of their group."""
+    means = np.bincount(place, values) / count
+    return np.asarray(values - means[place])
 
 
 def check_drift(measured: Measurements) -> float:

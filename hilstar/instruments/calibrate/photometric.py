@@ -6,11 +6,11 @@ relative to the noise of each level's mean, so a faint level counts as much as a
 a cubic spline, in one of three shapes:
 
     power   base s^2.2    g over log s, penalty on g''            a power law is left alone by the
-    penalty
+                                                                  penalty
     srgb    base sRGB     g over log s, penalty on g''            so is sRGB with its linear toe, to
-    a power
+                                                                  a power
     smooth  base s^2.2    g over s plus a log s, penalty on g'''  S-curves of liquid crystals:
-    analytic in s
+                                                                  analytic in s
 
 The stiffness of the penalty and the shape are those of the maximum marginal likelihood (with weak
 normal priors on the coefficients). The noise is that stated with the readings, and what the repeats
@@ -97,6 +97,7 @@ class ChannelFit:
     `light` (2^bits,) is above black, 0 to 1 at white, strictly rising; `white` (above black) and
     `black` are in the unit of measurement, `black_error` the standard error of `black` beside
     white. `error` (2^bits,) is the relative standard error of `light`.
+
     Of each level but code 0 (levels - 1,): `residual` is its relative error in a fit without it,
     `residual_error` that residual's standard error; `level_off` is its light, corrected for common
     causes, over the fit's, less 1, and `level_error` its relative standard error. `lack_of_fit` is
@@ -187,41 +188,60 @@ def fit_levels(levels: measurements.MeasuredLevels, white: int) -> ChannelFit:
     """The response to levels that have passed `check_levels`, for codes 0 to `white`."""
     noise = levels.relative_noise
     if math.isnan(noise):
-        if levels.has_errors:
-            noise = 0.0
-        else:
+        noise = 0.0
+        if not levels.has_errors:
             noise = _residual_noise(levels, white)
     best = _best_solution(levels, white, noise)
     problem = best.problem
     scale = float(levels.mean[-1] - levels.mean[0])
-    above = np.exp(problem.log_base_codes + problem.at_codes @ best.theta)
-    from_white = problem.at_codes - problem.at_codes[-1]
-    shape_covariance = best.covariance[: len(best.theta), : len(best.theta)]
-    error = np.sqrt(np.maximum(_variances(from_white, shape_covariance), 0.0))
-    held_out_share = np.maximum(1 - _variances(best.design, best.covariance), 1e-6)
-    lack = best.lack_of_fit
+    count = len(best.theta)
+    shape_covariance = best.covariance[:count, :count]
+    log_above = problem.log_base_codes + problem.at_codes @ best.theta
+    above = np.exp(log_above)
+    white_light = float(above[-1])
     light = strictly_rising(np.append(0.0, above / above[-1]))
-    off, level_error = _levels_about(best, float(above[-1]) * light[levels.code[1:]])
-    black_own = scale * problem.black_sigma * math.sqrt(float(best.covariance[-1, -1]))
-    black_common = float(np.linalg.norm(levels.common[0]))
-    # The black level is stated relative to white, which has an error of its own.
-    white_error = math.sqrt(max(_variances(problem.at_codes[-1:], shape_covariance)[0], 0.0))
+    # relative to white, which is 1 whatever the parameters are
+    from_white = problem.at_codes - problem.at_codes[-1]
+    variance = _variances(from_white, shape_covariance)
+    error = np.sqrt(np.maximum(variance, 0.0))
+    lack = best.lack_of_fit
+    level_off, level_error = _levels_about(best, white_light * light[levels.code[1:]])
+    # a residual without its own level is larger by the share that the level has in the fit
+    leverage = _variances(best.design, best.covariance)
+    held_out_share = np.maximum(1 - leverage, 1e-6)
+    level_sigma = problem.sigma / best.above
+    held_out_residual = best.misfit / held_out_share * problem.sigma / best.above
     return ChannelFit(
         light=light,
-        white=float(above[-1]) * scale,
+        white=white_light * scale,
         black=best.black * scale,
         error=np.append(0.0, lack * error),
         levels=levels,
-        residual=best.misfit / held_out_share * problem.sigma / best.above,
+        residual=held_out_residual,
         noise_relative=noise,
         shape=best.shape.name,
         parameters=best.parameters,
-        black_error=math.hypot(black_own, black_common, best.black * scale * white_error),
-        residual_error=problem.sigma / best.above / np.sqrt(held_out_share),
-        level_off=off,
+        black_error=_black_error(best, levels, scale),
+        residual_error=level_sigma / np.sqrt(held_out_share),
+        level_off=level_off,
         level_error=lack * level_error,
         lack_of_fit=lack,
     )
+
+
+def _black_error(best: "_Solution", levels: measurements.MeasuredLevels, scale: float) -> float:
+    """The standard error of the black level, in the unit of measurement: its own, that of common
+    causes, and that of white, relative to which it is stated.
+    """
+    problem = best.problem
+    black_variance = float(best.covariance[-1, -1])
+    own_error = scale * problem.black_sigma * math.sqrt(black_variance)
+    common_error = float(np.linalg.norm(levels.common[0]))
+    count = len(best.theta)
+    shape_covariance = best.covariance[:count, :count]
+    white_variance = _variances(problem.at_codes[-1:], shape_covariance)[0]
+    white_error = math.sqrt(max(white_variance, 0.0))
+    return math.hypot(own_error, common_error, best.black * scale * white_error)
 
 
 def _residual_noise(levels: measurements.MeasuredLevels, white: int) -> float:
@@ -264,33 +284,38 @@ def strictly_rising(light: FloatArray) -> FloatArray:
     """
     rising = light.copy()
     for code in range(1, len(rising)):
-        rising[code] = max(rising[code], rising[code - 1] * (1 + MIN_RISE) + MIN_STEP, MIN_LIGHT)
+        minimum = rising[code - 1] * (1 + MIN_RISE) + MIN_STEP
+        rising[code] = max(rising[code], minimum, MIN_LIGHT)
     return np.asarray(rising / rising[-1])
 
 
 def _best_solution(levels: measurements.MeasuredLevels, white: int, noise: float) -> _Solution:
+    """The shape and the stiffness with the largest evidence."""
     solutions: list[_Solution] = []
     for shape in SHAPES:
         problem = _problem(shape, levels, white, noise)
         solutions.append(_solve(shape, problem, is_whole=False))
         # Far from its place a stiff curve misfits and a soft one leads: from there on the whole
-        # range
-        # of stiffness is looked at again. Where that has not settled it is no solution.
+        # range of stiffness is looked at again. Where that has not settled it is no solution.
         again = _solve(shape, problem, is_whole=True)
-        solutions += [again] * again.has_settled
+        if again.has_settled:
+            solutions.append(again)
     return min(solutions, key=lambda solution: solution.minus_log_evidence)
 
 
 def _problem(
     shape: Shape, levels: measurements.MeasuredLevels, white: int, noise: float
 ) -> _Problem:
+    """The matrices of a shape, of `noise` relative to a level."""
     codes = np.arange(1, white + 1) / white
     at = levels.code[1:] / white
     low, high = shape.coordinate(codes[[0, -1]])
-    knots = np.linspace(0, 1, int(np.clip(len(at) // 2, MIN_KNOTS, MAX_KNOTS)))
+    count = int(np.clip(len(at) // 2, MIN_KNOTS, MAX_KNOTS))
+    knots = np.linspace(0, 1, count)
 
     def columns(signal: FloatArray) -> FloatArray:
-        spline = _spline((shape.coordinate(signal) - low) / (high - low), knots)
+        place = (shape.coordinate(signal) - low) / (high - low)
+        spline = _spline(place, knots)
         if shape.log_term:
             return np.hstack([spline, np.log(signal)[:, None]])
         return spline
@@ -304,11 +329,13 @@ def _problem(
         prior = np.pad(prior, (0, 1))
         prior[-1, -1] = 1 / PRIOR_SLOPE_SIGMA**2
     scale = levels.mean[-1] - levels.mean[0]
+    floor = BLACK_FLOOR
     if levels.has_errors:
         floor = STATED_FLOOR
-    else:
-        floor = BLACK_FLOOR
-    sigma = np.hypot(levels.standard_error(noise) / scale, floor)
+    level_error = levels.standard_error(noise) / scale
+    sigma = np.hypot(level_error, floor)
+    black = float(levels.mean[0] / scale)
+    common = (levels.common[1:] - levels.common[0]) / scale
     return _Problem(
         at_levels=columns(at),
         at_codes=columns(codes),
@@ -318,18 +345,17 @@ def _problem(
         prior=prior,
         light=levels.mean[1:] / scale,
         sigma=sigma[1:],
-        black=float(levels.mean[0] / scale),
+        black=black,
         black_sigma=float(sigma[0]),
-        common=(levels.common[1:] - levels.common[0]) / scale,
+        common=common,
     )
 
 
 def _spline(place: FloatArray, knots: FloatArray, derivative: int = 0) -> FloatArray:
     """Cubic B-splines (places, knots + 2) over 0 to 1, or a derivative of them."""
     padded = np.concatenate([np.zeros(3), knots, np.ones(3)])
-    return np.asarray(
-        BSpline(padded, np.eye(len(knots) + 2), 3)(np.clip(place, 0, 1), nu=derivative)
-    )
+    basis = BSpline(padded, np.eye(len(knots) + 2), 3)
+    return np.asarray(basis(np.clip(place, 0, 1), nu=derivative))
 
 
 def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
@@ -340,15 +366,18 @@ def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
     black = problem.black
     stiffness = math.nan
     moved = math.inf
-    start = np.maximum(problem.light - problem.black, 0.05 * np.maximum(problem.light, BLACK_FLOOR))
-    normal = problem.at_levels.T @ problem.at_levels + 1e-6 * (problem.prior + problem.penalty)
-    theta = np.asarray(
-        np.linalg.solve(normal, problem.at_levels.T @ (np.log(start) - problem.log_base_levels))
-    )
+    lowest = 0.05 * np.maximum(problem.light, BLACK_FLOOR)
+    start = np.maximum(problem.light - problem.black, lowest)
+    # what the levels leave open is smooth
+    weak_prior = 1e-6 * (problem.prior + problem.penalty)
+    normal = problem.at_levels.T @ problem.at_levels + weak_prior
+    target = np.log(start) - problem.log_base_levels
+    theta = np.asarray(np.linalg.solve(normal, problem.at_levels.T @ target))
     causes = np.zeros(problem.common.shape[1])
     first = len(theta)
     for step in range(MAX_STEPS):
-        above = np.exp(np.clip(problem.log_base_levels + problem.at_levels @ theta, -60, 10))
+        log_light = problem.log_base_levels + problem.at_levels @ theta
+        above = np.exp(np.clip(log_light, -60, 10))
         misfit = (problem.light - black - above - problem.common @ causes) / problem.sigma
         slope = problem.at_levels * above[:, None]
         dark = np.full((len(above), 1), problem.black_sigma)
@@ -356,28 +385,30 @@ def _solve(shape: Shape, problem: _Problem, *, is_whole: bool) -> _Solution:
         shift = (black - problem.black) / problem.black_sigma
         target = misfit + design @ np.concatenate([theta, causes, [shift]])
         if step < STIFFNESS_STEPS:
-            stiffness = _stiffest(problem, design, target, math.nan if is_whole else stiffness)
+            before = math.nan if is_whole else stiffness
+            stiffness = _stiffest(problem, design, target, before)
         evidence, precision = _evidence(problem, design, target, stiffness)
         covariance = np.linalg.inv(precision)
         new = covariance @ (design.T @ target)
-        moved = float(np.abs(problem.at_levels @ (new[:first] - theta)).max())
+        log_change = problem.at_levels @ (new[:first] - theta)
+        moved = float(np.abs(log_change).max())
         theta = new[:first]
         causes = new[first:-1]
         black = max(problem.black + new[-1] * problem.black_sigma, 0.0)
         if moved < SETTLED and step >= 2:
             break
     return _Solution(
-        problem,
-        shape,
-        theta,
-        causes,
-        black,
-        evidence,
-        np.asarray(covariance),
-        design,
-        misfit,
-        above,
-        moved < SETTLED,
+        problem=problem,
+        shape=shape,
+        theta=theta,
+        causes=causes,
+        black=black,
+        minus_log_evidence=evidence,
+        covariance=np.asarray(covariance),
+        design=design,
+        misfit=misfit,
+        above=above,
+        has_settled=moved < SETTLED,
     )
 
 
@@ -394,21 +425,28 @@ def _evidence(
     precision[count:, count:] += np.eye(len(precision) - count)
     root = np.linalg.cholesky(precision)
     explained = np.linalg.solve(root, design.T @ target)
-    determinants = 2 * np.log(np.diag(root)).sum() - np.linalg.slogdet(prior)[1]
+    _, log_prior_determinant = np.linalg.slogdet(prior)
+    determinants = 2 * np.log(np.diag(root)).sum() - log_prior_determinant
     return float(target @ target - explained @ explained + determinants), precision
 
 
 def _stiffest(problem: _Problem, design: FloatArray, target: FloatArray, before: float) -> float:
+    """The logarithm of the stiffness with the largest evidence: over the whole range, or beside
+    that of the step `before`, which is NaN before the first one.
+    """
+
     def evidence(stiffness: float) -> float:
         return _evidence(problem, design, target, stiffness)[0]
 
-    if math.isnan(before):
-        grid = LOG_STIFFNESS
-    else:
+    grid = LOG_STIFFNESS
+    if not math.isnan(before):
         grid = before + np.array([-1.0, 0.0, 1.0])
     best = int(np.argmin([evidence(value) for value in grid]))
-    bounds = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    optimum = minimize_scalar(evidence, bounds=bounds, method="bounded", options={"xatol": 0.02})
+    low = grid[max(best - 1, 0)]
+    high = grid[min(best + 1, len(grid) - 1)]
+    optimum = minimize_scalar(
+        evidence, bounds=(low, high), method="bounded", options={"xatol": 0.02}
+    )
     return float(np.clip(optimum.x, LOG_STIFFNESS[0], LOG_STIFFNESS[-1]))
 
 
@@ -443,22 +481,26 @@ def calibrate_photometric(
     # For the calibration file: r, g and b where known, else w, all with the mean black.
     names = measurements.PRIMARIES if "r" in fits else ("w",)
     black = float(np.mean([fits[name].black for name in names]))
-    columns = {name: black + fits[name].white * fits[name].light for name in names}
-    noise = max(fits[name].levels.reading_noise(fits[name].noise_relative) for name in columns)
-    if math.isnan(drift):
-        drift_note = "not known: nothing was repeated"
-    else:
+    columns = {}
+    noises = []
+    for name in names:
+        fit = fits[name]
+        columns[name] = black + fit.white * fit.light
+        noises.append(fit.levels.reading_noise(fit.noise_relative))
+    noise = max(noises)
+    drift_note = "not known: nothing was repeated"
+    drift_percent = None
+    if not math.isnan(drift):
         drift_note = f"{100 * drift:+.2f} % over the run"
+        drift_percent = 100 * drift
     text = f"fitted to {measured.name}, sha256 {data.sha256}"
-    if output.with_suffix(".csv").resolve() == measured.resolve():
+    response = output.with_suffix(".csv")
+    if response.resolve() == measured.resolve():
         raise InputError(
             f"{output}: its response would be written over {measured}; choose another name"
         )
-    stated = {name: text or NOT_STATED for name, text in asdict(provenance or Provenance()).items()}
-    if stated["when"] == NOT_STATED:
-        stated["when"] = datetime.date.today().isoformat()
     head = CalibrationHead(
-        kind="photometric", bits=data.bits, response=output.with_suffix(".csv").name, **stated
+        kind="photometric", bits=data.bits, response=response.name, **_stated(provenance)
     )
     table = write_calibration(
         output,
@@ -470,45 +512,65 @@ def calibrate_photometric(
         errors=errors_of(fits),
     )
     channels = {name: _channel_figures(fit) for name, fit in fits.items()}
-    # r + g + b against w, above black: at white and codes decades below it
-    additivity = None
-    crosstalk = None
-    unsure = None
-    if len(fits) == len(measurements.CHANNELS):
-        together = np.sum(
-            [fits[name].white * fits[name].light for name in measurements.PRIMARIES], axis=0
-        )
-        more = 100 * (together / np.maximum(fits["w"].white * fits["w"].light, 1e-300) - 1)
-        additivity = float(more[-1])
-        decades = {f"1e-{decade}": place for decade, place in _decades(fits["w"]).items()}
-        crosstalk = {decade: float(more[place]) for decade, place in decades.items()}
-        at = [*decades.values()]
-        # A channel's errors are relative to its white, which is as well known as its readings are
-        # many.
-        off: dict[str, FloatArray] = {}
-        for name, channel_fit in fits.items():
-            white_error = (
-                channel_fit.levels.standard_error(channel_fit.noise_relative)[-1]
-                / channel_fit.levels.mean[-1]
-            )
-            off[name] = np.hypot(channel_fit.error[at], white_error)
-        errors = [
-            fits[name].white * fits[name].light[at] / together[at] * off[name]
-            for name in measurements.PRIMARIES
-        ]
-        error = np.sqrt(np.square([*errors, off["w"]]).sum(axis=0))
-        unsure = dict(zip(decades, (100 * error).tolist(), strict=True))
-    return channels[next(iter(columns))] | {
+    return channels[names[0]] | {
         "bits": data.bits,
         "channels": channels,
         "noise_relative": noise,
-        "additivity_percent": additivity,
-        "crosstalk_percent": crosstalk,
-        "crosstalk_error_percent": unsure,
-        "drift_percent": None if math.isnan(drift) else 100 * drift,
+        **_additivity(fits),
+        "drift_percent": drift_percent,
         "written": [str(output), str(table)],
         "sha256": load_calibration(output, data.bits).sha256,
     }
+
+
+def _stated(provenance: Provenance | None) -> dict[str, str]:
+    """Who measured, when and with what, for the calibration file."""
+    stated = asdict(provenance or Provenance())
+    if not stated["when"]:
+        stated["when"] = datetime.date.today().isoformat()
+    for name, text in stated.items():
+        stated[name] = text or NOT_STATED
+    return stated
+
+
+def _additivity(fits: dict[str, ChannelFit]) -> dict[str, Any]:
+    """How far r, g and b together are from w, above black, percent: at white, and at codes decades
+    below it with their errors; null where not all four were measured.
+    """
+    if len(fits) < len(measurements.CHANNELS):
+        return {
+            "additivity_percent": None,
+            "crosstalk_percent": None,
+            "crosstalk_error_percent": None,
+        }
+    primaries = [fits[name] for name in measurements.PRIMARIES]
+    white = fits["w"]
+    together = np.sum([fit.white * fit.light for fit in primaries], axis=0)
+    white_light = np.maximum(white.white * white.light, 1e-300)
+    excess = 100 * (together / white_light - 1)
+    places = list(_decades(white).values())
+    errors = []
+    for fit in primaries:
+        share = fit.white * fit.light[places] / together[places]
+        errors.append(share * _white_and_own_error(fit, places))
+    errors.append(_white_and_own_error(white, places))
+    error_percent = 100 * np.sqrt(np.square(errors).sum(axis=0))
+    names = [f"1e-{decade}" for decade in _decades(white)]
+    return {
+        "additivity_percent": float(excess[-1]),
+        "crosstalk_percent": dict(zip(names, excess[places].tolist(), strict=True)),
+        "crosstalk_error_percent": dict(zip(names, error_percent.tolist(), strict=True)),
+    }
+
+
+def _white_and_own_error(fit: ChannelFit, places: list[int]) -> FloatArray:
+    """Relative errors (n,) of a channel's light at codes.
+
+    A channel's errors are relative to its white, which is as well known as its readings are many.
+    """
+    levels = fit.levels
+    white_error = levels.standard_error(fit.noise_relative)[-1] / levels.mean[-1]
+    return np.asarray(np.hypot(fit.error[places], white_error))
 
 
 def errors_of(fits: dict[str, ChannelFit]) -> ErrorsTable | None:
@@ -521,17 +583,22 @@ def errors_of(fits: dict[str, ChannelFit]) -> ErrorsTable | None:
     levels = fit.levels
     if math.isnan(levels.relative_noise) and not levels.has_errors:
         return None
+    level_light = fit.light[levels.code[1:]]
+    black = fit.black_error / fit.white
+    common = levels.standard_error(fit.noise_relative)[0] / fit.white
+    dof = float((levels.count - 1).sum())
     return ErrorsTable(
-        light=_rounded(fit.light[levels.code[1:]]),
+        light=_rounded(level_light),
         off=_rounded(fit.level_off),
         relative=_rounded(fit.level_error),
-        dof=float((levels.count - 1).sum()),
-        black=_rounded(fit.black_error / fit.white)[0],
-        common=_rounded(levels.standard_error(fit.noise_relative)[0] / fit.white)[0],
+        dof=dof,
+        black=_rounded(black)[0],
+        common=_rounded(common)[0],
     )
 
 
 def _rounded(values: FloatArray | float) -> list[float]:
+    """Numbers of six digits, as the calibration file has them."""
     return [float(f"{value:.6g}") for value in np.atleast_1d(values).tolist()]
 
 
@@ -552,8 +619,13 @@ def fit_all(data: measurements.Measurements) -> dict[str, ChannelFit]:
 
 
 def _decades(fit: ChannelFit) -> dict[int, int]:
+    """The code whose light is nearest to each decade below white."""
     log_light = np.log(np.maximum(fit.light, 1e-12))
-    return {decade: int(np.argmin(np.abs(log_light + decade * math.log(10)))) for decade in DECADES}
+    codes = {}
+    for decade in DECADES:
+        distance = np.abs(log_light + decade * math.log(10))
+        codes[decade] = int(np.argmin(distance))
+    return codes
 
 
 def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
@@ -561,21 +633,24 @@ def _channel_figures(fit: ChannelFit) -> dict[str, Any]:
     errors at decades below white.
     """
     count = fit.levels.count
+    error_percent = {}
+    for decade, code in _decades(fit).items():
+        error_percent[f"1e-{decade}"] = 100 * float(fit.error[code])
+    repeats = {"min": int(count.min()), "max": int(count.max())}
+    black_level = {
+        "relative": fit.black / fit.white,
+        "unit": fit.black,
+        "error": fit.black_error / fit.white,
+    }
     return {
         "codes": len(count),
-        "repeats": {"min": int(count.min()), "max": int(count.max())},
-        "black_level": {
-            "relative": fit.black / fit.white,
-            "unit": fit.black,
-            "error": fit.black_error / fit.white,
-        },
+        "repeats": repeats,
+        "black_level": black_level,
         "noise_relative": fit.levels.reading_noise(fit.noise_relative),
         "lack_of_fit": fit.lack_of_fit,
         "shape": fit.shape,
         "parameters": fit.parameters,
-        "error_percent": {
-            f"1e-{decade}": 100 * float(fit.error[place]) for decade, place in _decades(fit).items()
-        },
+        "error_percent": error_percent,
         "holdout": held_out(fit),
     }
 
@@ -584,17 +659,22 @@ def held_out(fit: ChannelFit) -> dict[str, float]:
     """The errors of a fit's levels, each held out of the fit, from white to three decades below;
     light is above black.
     """
-    shown = fit.light[fit.levels.code[1:]] >= 10.0 ** -DECADES[-1]
+    level_light = fit.light[fit.levels.code[1:]]
+    shown = level_light >= 10.0 ** -DECADES[-1]
     residual = np.abs(fit.residual[shown])
-    sigmas = float(np.percentile(residual / fit.residual_error[shown], 95))
-    figures = {
-        "rms": np.sqrt((residual**2).mean()),
-        "p95": np.percentile(residual, 95),
-        "max": residual.max(),
+    sigmas = residual / fit.residual_error[shown]
+    rms = float(np.sqrt((residual**2).mean()))
+    p95 = float(np.percentile(residual, 95))
+    p95_sigmas = float(np.percentile(sigmas, 95))
+    largest = float(residual.max())
+    return {
+        "rms_percent": 100 * rms,
+        "p95_percent": 100 * p95,
+        "max_percent": 100 * largest,
+        "rms_mag": MAG_PER_RELATIVE * rms,
+        "max_mag": MAG_PER_RELATIVE * largest,
+        "p95_sigmas": p95_sigmas,
     }
-    percent = {f"{name}_percent": 100 * float(value) for name, value in figures.items()}
-    mag = {f"{name}_mag": MAG_PER_RELATIVE * float(figures[name]) for name in ("rms", "max")}
-    return percent | mag | {"p95_sigmas": sigmas}
 
 
 def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str:
@@ -605,12 +685,12 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
     """
     fits = fit_all(measurements.read_measurements(measured, bits))
     worst = max(fits.values(), key=lambda fit: held_out(fit)["rms_percent"])
-    left = held_out(worst)
-    repeats = worst.levels.reading_noise(worst.noise_relative)
+    errors = held_out(worst)
+    repeats_percent = 100 * worst.levels.reading_noise(worst.noise_relative)
     finding = (
-        f"Levels held out of the fit are {left['rms_percent']:.2g} % ({left['rms_mag']:.2g} mag)"
-        f" rms off, {left['max_percent']:.2g} % at the maximum; a patch repeats to"
-        f" {100 * repeats:.2g} %"
+        f"Levels held out of the fit are {errors['rms_percent']:.2g} % ({errors['rms_mag']:.2g}"
+        f" mag) rms off, {errors['max_percent']:.2g} % at the maximum; a patch repeats to"
+        f" {repeats_percent:.2g} %"
     )
     note = (
         "Lines: the fit. Dots: measured above, held out of the fit below. Dotted: black. Bands: the"
@@ -618,30 +698,35 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
     )
     with chart(path, finding, panels=2, note=note) as (response, residual):
         for name, fit in fits.items():
-            colour = COLOURS[name]
-            code = fit.levels.code[1:]
-            white = fit.white
-            level = (fit.levels.mean[1:] - fit.black) / white
-            black = max(fit.black / white, MIN_DRAWN_LIGHT)
-            codes = np.arange(len(fit.light))
-            response.plot(
-                codes[1:],
-                np.maximum(fit.light[1:], MIN_DRAWN_LIGHT),
-                color=colour,
-                label=NAMES[name],
-            )
-            is_drawn = level > MIN_DRAWN_LIGHT
-            response.plot(
-                code[is_drawn], level[is_drawn], "o", color=colour, markersize=4, label="_measured"
-            )
-            response.axhline(black, color=colour, linewidth=0.8, linestyle=":", label="_black")
-            shown = fit.light >= 1e-3
-            held = fit.light[code] >= 1e-3
-            error = 100 * fit.error[shown]
-            residual.fill_between(codes[shown], -error, error, color=colour, alpha=0.15, lw=0)
-            residual.plot(code[held], 100 * fit.residual[held], "o", color=colour, markersize=4)
+            _draw_response(response, fit, name)
+            _draw_residuals(residual, fit, COLOURS[name])
         response.set(yscale="log", ylim=(1e-5, 2), ylabel="light over white [share]")
         residual.axhline(0, color=MUTED, linewidth=0.8)
         residual.set(ylabel="held-out residual [%]", xlabel="code")
         label_ends(response)
     return finding
+
+
+def _draw_response(axes: Any, fit: ChannelFit, channel: str) -> None:
+    """Draw a channel's light over its code: the fit, the levels, and black."""
+    colour = COLOURS[channel]
+    codes = np.arange(1, len(fit.light))
+    light = np.maximum(fit.light[1:], MIN_DRAWN_LIGHT)
+    axes.plot(codes, light, color=colour, label=NAMES[channel])
+    level = (fit.levels.mean[1:] - fit.black) / fit.white
+    is_drawn = level > MIN_DRAWN_LIGHT
+    drawn_codes = fit.levels.code[1:][is_drawn]
+    axes.plot(drawn_codes, level[is_drawn], "o", color=colour, markersize=4, label="_measured")
+    black = max(fit.black / fit.white, MIN_DRAWN_LIGHT)
+    axes.axhline(black, color=colour, linewidth=0.8, linestyle=":", label="_black")
+
+
+def _draw_residuals(axes: Any, fit: ChannelFit, colour: str) -> None:
+    """Draw the levels' held-out residuals, and a band of the fit's error, from 1e-3 of white on."""
+    is_shown = fit.light >= 1e-3
+    codes = np.flatnonzero(is_shown)
+    error_percent = 100 * fit.error[is_shown]
+    axes.fill_between(codes, -error_percent, error_percent, color=colour, alpha=0.15, lw=0)
+    code = fit.levels.code[1:]
+    is_held = is_shown[code]
+    axes.plot(code[is_held], 100 * fit.residual[is_held], "o", color=colour, markersize=4)

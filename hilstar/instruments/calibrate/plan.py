@@ -50,11 +50,8 @@ class PlanSettings:
     channels: str = "w"
 
     def __post_init__(self) -> None:
-        if (
-            not 1 <= self.bits <= 16
-            or not 2 <= self.levels <= 2**self.bits
-            or not 1 <= self.repeats <= 1000
-        ):
+        is_possible = 1 <= self.bits <= 16 and 2 <= self.levels <= 2**self.bits
+        if not is_possible or not 1 <= self.repeats <= 1000:
             raise InputError(
                 f"plan of {self.levels} levels, {self.repeats} repeats, {self.bits} bits; write 1"
                 " to 16 bits, 2 to 2^bits levels and 1 to 1000 repeats"
@@ -75,15 +72,15 @@ def plan_patches(settings: PlanSettings, rng: np.random.Generator) -> list[Patch
     """
     codes = planned_codes(settings.bits, settings.levels)
     white = 2**settings.bits - 1
-    light = (np.array(codes) / white) ** 2.2
-    faint = [code for code, is_faint in zip(codes, light < FAINT_LIGHT, strict=True) if is_faint]
-    drawn: list[Patch] = []
+    faint = [code for code in codes if (code / white) ** 2.2 < FAINT_LIGHT]
+    ordered: list[Patch] = []
     references: list[Patch] = []
     for name in settings.channels:
-        for code in [*codes, *faint]:
-            drawn += [Patch(code, name)] * settings.repeats
-        references += [Patch(code, name) for code in (0, white // 2, white)]
-    shuffled = [drawn[place] for place in rng.permutation(len(drawn))]
+        for code in (*codes, *faint):
+            ordered += [Patch(code, name)] * settings.repeats
+        for code in (0, white // 2, white):
+            references.append(Patch(code, name))
+    shuffled = [ordered[place] for place in rng.permutation(len(ordered))]
     at_once = PATCHES_PER_REFERENCE * len(settings.channels)
     patches: list[Patch] = []
     for start in range(0, len(shuffled), at_once):
@@ -98,7 +95,8 @@ def planned_codes(bits: int, levels: int) -> list[int]:
     white = 2**bits - 1
     light = np.geomspace(MIN_PLANNED_LIGHT, 1, levels - 1)
     # IEC 61966-2-1
-    signal = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    power = 1.055 * light ** (1 / 2.4) - 0.055
+    signal = np.where(light <= 0.0031308, 12.92 * light, power)
     codes = [0]
     for place, code in enumerate(np.rint(signal * white).astype(int)):
         largest = white - (levels - 2 - place)  # leaves a code for each level that follows
@@ -123,7 +121,11 @@ def is_filled_in(path: Path) -> bool:
         lines = read_text(path, "", MAX_PLAN_BYTES).splitlines()
     except InputError:
         return path.is_file()
-    return any(line.strip() and not line.rstrip().endswith(",") for line in lines[1:])
+    for line in lines[1:]:
+        row = line.strip()
+        if row and not row.endswith(","):
+            return True
+    return False
 
 
 Level = TypeVar("Level", bound=np.unsignedinteger)
@@ -139,9 +141,11 @@ def patch_image(
     width, height = resolution_px
     side = max(1, round(min(width, height) * PATCH_SHARE))
     top = (height - side) // 2
-    left = (width - side) // 2
+    first_column = (width - side) // 2
     grey = np.zeros((height, width), dtype=code_dtype(bits))
-    grey[top : top + side, left : left + side] = patch.code
+    rows = slice(top, top + side)
+    columns = slice(first_column, first_column + side)
+    grey[rows, columns] = patch.code
     return in_channel(grey, patch.channel)
 
 
@@ -190,10 +194,11 @@ def show_patches(
         view = ScreenView(size_px, size_px, bits, triples=nothing)
         presenter = Presenter(level_texture(window_context(), square), view)
         for shown, patch in enumerate(planned):
+            lit = [0, 1, 2]
+            if patch.channel in PRIMARIES:
+                lit = [PRIMARIES.index(patch.channel)]
             triples = nothing.copy()
-            triples[
-                1, [PRIMARIES.index(patch.channel)] if patch.channel in PRIMARIES else [0, 1, 2]
-            ] = patch.code
+            triples[1, lit] = patch.code
             presenter.set_triples(triples)
             log.warning(
                 "patch %d of %d: code %d, channel %s",

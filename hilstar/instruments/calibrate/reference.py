@@ -39,10 +39,15 @@ MORE = ("station", "sigma_arcsec", "x_px", "y_px", "mon_x", "mon_y", "mon_z")
 ADVICE = f"write a CSV with the columns {','.join(NEEDED)} (docs: calibration files)"
 DOT = "dot"
 FACES = {
-    f"{sign}{axis}": np.eye(3)["xyz".index(axis)] * (1.0 if sign == "+" else -1.0)
-    for sign in "+-"
-    for axis in "xyz"
+    "+x": np.array([1.0, 0.0, 0.0]),
+    "+y": np.array([0.0, 1.0, 0.0]),
+    "+z": np.array([0.0, 0.0, 1.0]),
+    "-x": np.array([-1.0, 0.0, 0.0]),
+    "-y": np.array([0.0, -1.0, 0.0]),
+    "-z": np.array([0.0, 0.0, -1.0]),
 }
+VECTOR = ("mon_x", "mon_y", "mon_z")
+PIXEL = ("x_px", "y_px")
 MIN_APART_DEG = 1.0  # two directions nearer to each other tell no rotation
 SURE = 0.01  # below this probability the scatter contradicts the stated sigmas
 MAX_ELEVATION_DEG = 89.9
@@ -92,48 +97,60 @@ def read_readings(path: Path, camera: Camera | None) -> list[Reading]:
     """
     readings = []
     for line, cells in read_rows(path, NEEDED, ADVICE, MAX_TABLE_BYTES, MORE):
-        target = cells[0].strip().lower()
-        azimuth, elevation = finite_numbers(path, line, NEEDED[1:], cells[1:3], ADVICE)
-        if abs(elevation) > MAX_ELEVATION_DEG:
-            raise InputError(
-                f"{path}:{line}: elevation_deg = {elevation:g}; write degrees above the horizon,"
-                f" less than {MAX_ELEVATION_DEG:g}"
-            )
-        more = dict(zip(MORE, cells[3:], strict=True))
-        sigma = None
-        if more["sigma_arcsec"].strip():
-            (sigma,) = finite_numbers(path, line, ["sigma_arcsec"], [more["sigma_arcsec"]], ADVICE)
-            if not sigma > 0:
-                raise InputError(f"{path}:{line}: sigma_arcsec = {sigma:g}; write arcsec above 0")
-        direction = None
-        if target == DOT:
-            direction = _dot(path, line, more, camera)
-        elif target in FACES:
-            direction = -FACES[target]
-        elif not target or target[0] in "+-":
-            raise InputError(
-                f"{path}:{line}: target = {shortened(target)!r}; write a face (+x, -y, ...), dot,"
-                " or the name of a link"
-            )
-        station = more["station"].strip()
-        angles = math.radians(azimuth), math.radians(elevation)
-        readings.append(Reading(line, target, station, *angles, sigma, direction))
+        readings.append(_reading(path, line, cells, camera))
         if len(readings) > MAX_READINGS:
             raise InputError(f"{path}: more than {MAX_READINGS} readings; write fewer")
     return readings
 
 
+def _reading(path: Path, line: int, cells: list[str], camera: Camera | None) -> Reading:
+    """The reading of a line. Raises InputError."""
+    target = cells[0].strip().lower()
+    azimuth, elevation = finite_numbers(path, line, NEEDED[1:], cells[1:3], ADVICE)
+    if abs(elevation) > MAX_ELEVATION_DEG:
+        raise InputError(
+            f"{path}:{line}: elevation_deg = {elevation:g}; write degrees above the horizon,"
+            f" less than {MAX_ELEVATION_DEG:g}"
+        )
+    more = dict(zip(MORE, cells[3:], strict=True))
+    sigma = None
+    if more["sigma_arcsec"].strip():
+        (sigma,) = finite_numbers(path, line, ["sigma_arcsec"], [more["sigma_arcsec"]], ADVICE)
+        if not sigma > 0:
+            raise InputError(f"{path}:{line}: sigma_arcsec = {sigma:g}; write arcsec above 0")
+    direction = None
+    if target == DOT:
+        direction = _dot(path, line, more, camera)
+    elif target in FACES:
+        # the telescope looks against the face's normal
+        direction = -FACES[target]
+    elif not target or target[0] in "+-":
+        raise InputError(
+            f"{path}:{line}: target = {shortened(target)!r}; write a face (+x, -y, ...), dot,"
+            " or the name of a link"
+        )
+    return Reading(
+        line=line,
+        target=target,
+        station=more["station"].strip(),
+        azimuth_rad=math.radians(azimuth),
+        elevation_rad=math.radians(elevation),
+        sigma_arcsec=sigma,
+        direction=direction,
+    )
+
+
 def _dot(path: Path, line: int, more: dict[str, str], camera: Camera | None) -> FloatArray:
     """A dot's direction in mon: as it is given, or by its pixel."""
-    given = [more[name] for name in ("mon_x", "mon_y", "mon_z")]
-    if all(cell.strip() for cell in given):
-        vector = np.array(finite_numbers(path, line, ("mon_x", "mon_y", "mon_z"), given, ADVICE))
+    vector_cells = [more[name] for name in VECTOR]
+    if all(cell.strip() for cell in vector_cells):
+        vector = np.array(finite_numbers(path, line, VECTOR, vector_cells, ADVICE))
         size = float(np.linalg.norm(vector))
         if not size > 0:
             raise InputError(f"{path}:{line}: mon_x, mon_y, mon_z are all 0; write a direction")
         return np.asarray(vector / size)
-    pixel = [more[name] for name in ("x_px", "y_px")]
-    if not all(cell.strip() for cell in pixel):
+    pixel_cells = [more[name] for name in PIXEL]
+    if not all(cell.strip() for cell in pixel_cells):
         raise InputError(
             f"{path}:{line}: a dot without a place; write x_px and y_px, or mon_x, mon_y and mon_z"
         )
@@ -141,65 +158,71 @@ def _dot(path: Path, line: int, more: dict[str, str], camera: Camera | None) -> 
         raise InputError(
             f"{path}:{line}: a dot by its pixel needs the bench file; add --bench BENCH.toml"
         )
-    x_px, y_px = finite_numbers(path, line, ("x_px", "y_px"), pixel, ADVICE)
+    x_px, y_px = finite_numbers(path, line, PIXEL, pixel_cells, ADVICE)
     ray = camera.rays(np.array([x_px]), np.array([y_px]))[0]
     return np.asarray(ray / np.linalg.norm(ray))
 
 
 def fit_reference(path: Path, readings: list[Reading]) -> ReferenceFit:
     """The rotation from mon to the cube. Raises InputError where the readings do not tell it."""
-    for what, some in (
-        ("dots", [reading for reading in readings if reading.target == DOT]),
-        ("faces of the cube", [reading for reading in readings if reading.target in FACES]),
-    ):
-        if not _apart([reading.direction for reading in some if reading.direction is not None]):
-            raise InputError(
-                f"{path}: {len(some)} readings of {what}; two {what} or more, in directions over"
-                f" {MIN_APART_DEG:g} deg apart, tell a rotation: read another one"
-            )
-    zeros = _station_zeros(path, readings)
-    unknowns = _Unknowns.of(readings, zeros)
-    weights = np.array([1.0 / (reading.sigma_arcsec or 1.0) for reading in readings])
-    weights = np.repeat(weights, 2)
+    dots = [reading for reading in readings if reading.target == DOT]
+    faces = [reading for reading in readings if reading.target in FACES]
+    _check_apart(path, "dots", dots)
+    _check_apart(path, "faces of the cube", faces)
+    unknowns = _Unknowns.of(readings, _station_zeros(path, readings))
+    weights = np.repeat([1.0 / (reading.sigma_arcsec or 1.0) for reading in readings], 2)
 
     def residuals(parameters: FloatArray) -> FloatArray:
         return np.asarray(weights * unknowns.residuals(parameters) * ARCSEC_PER_RAD)
 
-    found = optimize.least_squares(residuals, np.zeros(unknowns.count), method="trf", x_scale=1e-5)
+    solution = optimize.least_squares(
+        residuals, np.zeros(unknowns.count), method="trf", x_scale=1e-5
+    )
     # two dots, two faces and a link of each station leave some
     free = 2 * len(readings) - unknowns.count
-    squares = float((found.fun**2).sum())
-    stated = all(reading.sigma_arcsec is not None for reading in readings)
+    squares = float((solution.fun**2).sum())
     dof: float | None = float(free)
     scale = squares / free
-    if stated and float(stats.chi2.sf(squares, free)) > SURE:
-        dof, scale = None, 1.0
-    jacobian = np.asarray(found.jac, dtype=np.float64)
+    is_stated = all(reading.sigma_arcsec is not None for reading in readings)
+    if is_stated and float(stats.chi2.sf(squares, free)) > SURE:
+        dof = None
+        scale = 1.0
+    jacobian = np.asarray(solution.jac, dtype=np.float64)
     normal = jacobian.T @ jacobian
     covariance = np.asarray(np.linalg.pinv(normal, hermitian=True) * scale, dtype=np.float64)
-    q, turned = unknowns.rotation(found.x, covariance)
-    residual = unknowns.residuals(found.x).reshape(-1, 2) * ARCSEC_PER_RAD
-    return ReferenceFit(tuple(readings), q, turned * ARCSEC_PER_RAD**2, dof, residual)
+    q_mon_to_reference, covariance_rad2 = unknowns.rotation(solution.x, covariance)
+    residual_rad = unknowns.residuals(solution.x).reshape(-1, 2)
+    return ReferenceFit(
+        readings=tuple(readings),
+        q_mon_to_reference=q_mon_to_reference,
+        covariance_arcsec2=covariance_rad2 * ARCSEC_PER_RAD**2,
+        dof=dof,
+        residual_arcsec=residual_rad * ARCSEC_PER_RAD,
+    )
 
 
-def _apart(directions: list[FloatArray]) -> bool:
-    """Whether some two directions span a rotation: neither parallel nor opposite."""
-    least = math.sin(math.radians(MIN_APART_DEG))
-    return any(
-        float(np.linalg.norm(np.cross(directions[0], other))) > least for other in directions[1:]
+def _check_apart(path: Path, what: str, readings: list[Reading]) -> None:
+    """Refuse (InputError) readings of which no two directions span a rotation: parallel or
+    opposite ones.
+    """
+    directions = [reading.direction for reading in readings if reading.direction is not None]
+    minimum = math.sin(math.radians(MIN_APART_DEG))
+    for other in directions[1:]:
+        sine = float(np.linalg.norm(np.cross(directions[0], other)))
+        if sine > minimum:
+            return
+    raise InputError(
+        f"{path}: {len(readings)} readings of {what}; two {what} or more, in directions over"
+        f" {MIN_APART_DEG:g} deg apart, tell a rotation: read another one"
     )
 
 
 def pointing(azimuth_rad: float, elevation_rad: float) -> FloatArray:
     """Where a telescope points (3,): north, east, down."""
     level = math.cos(elevation_rad)
-    return np.array(
-        [
-            level * math.cos(azimuth_rad),
-            level * math.sin(azimuth_rad),
-            -math.sin(elevation_rad),
-        ]
-    )
+    north = level * math.cos(azimuth_rad)
+    east = level * math.sin(azimuth_rad)
+    return np.array([north, east, -math.sin(elevation_rad)])
 
 
 def _station_zeros(path: Path, readings: list[Reading]) -> dict[str, float]:
@@ -207,32 +230,33 @@ def _station_zeros(path: Path, readings: list[Reading]) -> dict[str, float]:
     InputError for a station without one.
     """
     stations = list(dict.fromkeys(reading.station for reading in readings))
-    seen: dict[str, dict[str, float]] = {station: {} for station in stations}
+    azimuths: dict[str, dict[str, float]] = {station: {} for station in stations}
     for reading in readings:
         if reading.direction is None:
-            seen[reading.station].setdefault(reading.target, reading.azimuth_rad)
+            azimuths[reading.station].setdefault(reading.target, reading.azimuth_rad)
     zeros = {stations[0]: 0.0}
     waiting = stations[1:]
     while waiting:
-        found = next(_linked(waiting, seen, zeros), None)
-        if found is None:
+        linked = next(_linked(waiting, azimuths, zeros), None)
+        if linked is None:
             raise InputError(
                 f"{path}: station {shortened(waiting[0])!r} shares no link with"
                 f" {shortened(stations[0])!r}; read one target at infinity from both"
             )
-        station, zero = found
+        station, zero = linked
         zeros[station] = zero
         waiting.remove(station)
     return zeros
 
 
 def _linked(
-    waiting: list[str], seen: dict[str, dict[str, float]], zeros: dict[str, float]
+    waiting: list[str], azimuths: dict[str, dict[str, float]], zeros: dict[str, float]
 ) -> Iterator[tuple[str, float]]:
+    """Waiting stations that see a link of a station whose zero is known, and their zeros, rad."""
     for station in waiting:
         for other, zero in zeros.items():
-            for target in seen[station].keys() & seen[other].keys():
-                yield station, zero + seen[other][target] - seen[station][target]
+            for target in azimuths[station].keys() & azimuths[other].keys():
+                yield station, zero + azimuths[other][target] - azimuths[station][target]
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,24 +274,19 @@ class _Unknowns:
     @classmethod
     def of(cls, readings: list[Reading], zeros: dict[str, float]) -> "_Unknowns":
         """The first guess."""
-        pointed = [
-            pointing(reading.azimuth_rad + zeros[reading.station], reading.elevation_rad)
-            for reading in readings
-        ]
-        guesses = []
-        for is_dot in (True, False):
-            pairs = [
-                (reading.direction, seen)
-                for reading, seen in zip(readings, pointed, strict=True)
-                if reading.direction is not None and (reading.target == DOT) == is_dot
-            ]
-            guesses.append(_wahba(pairs))
-        links = {
-            reading.target: seen
-            for reading, seen in zip(readings, pointed, strict=True)
-            if reading.direction is None
-        }
-        return cls(readings, guesses[0], guesses[1], zeros, links)
+        dots = []
+        faces = []
+        links = {}
+        for reading in readings:
+            azimuth_rad = reading.azimuth_rad + zeros[reading.station]
+            pointed = pointing(azimuth_rad, reading.elevation_rad)
+            if reading.direction is None:
+                links[reading.target] = pointed
+            elif reading.target == DOT:
+                dots.append((reading.direction, pointed))
+            else:
+                faces.append((reading.direction, pointed))
+        return cls(readings, _wahba(dots), _wahba(faces), zeros, links)
 
     @property
     def count(self) -> int:
@@ -276,15 +295,17 @@ class _Unknowns:
 
     def residuals(self, parameters: FloatArray) -> FloatArray:
         """Readings less the fit (2 n,), rad: along azimuth, then elevation, of each."""
-        from_mon = to_matrix(from_rotation_vector(parameters[:3])) @ self.from_mon
-        from_cube = to_matrix(from_rotation_vector(parameters[3:6])) @ self.from_cube
+        from_mon, from_cube = self._rotations(parameters)
         stations = list(self.zeros)
         links = list(self.links)
         first_link = 6 + len(stations) - 1
         residual = np.zeros(2 * len(self.readings))
         for k, reading in enumerate(self.readings):
             place = stations.index(reading.station)
-            zero = self.zeros[reading.station] + (parameters[5 + place] if place else 0.0)
+            zero = self.zeros[reading.station]
+            # the first station's zero is every azimuth's
+            if place:
+                zero = zero + parameters[5 + place]
             if reading.direction is None:
                 at = first_link + 2 * links.index(reading.target)
                 model = _moved(self.links[reading.target], *parameters[at : at + 2])
@@ -292,12 +313,18 @@ class _Unknowns:
                 model = from_mon @ reading.direction
             else:
                 model = from_cube @ reading.direction
-            azimuth = math.atan2(model[1], model[0]) - zero
-            elevation = math.asin(max(-1.0, min(1.0, -model[2])))
-            turn = math.remainder(reading.azimuth_rad - azimuth, 2 * math.pi)
+            azimuth, elevation = _angles(model)
+            turn = math.remainder(reading.azimuth_rad - (azimuth - zero), 2 * math.pi)
+            # along azimuth: a circle is smaller the higher it is
             residual[2 * k] = turn * math.cos(reading.elevation_rad)
             residual[2 * k + 1] = reading.elevation_rad - elevation
         return residual
+
+    def _rotations(self, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """The matrices (3, 3) from mon and from the cube to the theodolite's axes."""
+        mon_turn = to_matrix(from_rotation_vector(parameters[:3]))
+        cube_turn = to_matrix(from_rotation_vector(parameters[3:6]))
+        return mon_turn @ self.from_mon, cube_turn @ self.from_cube
 
     def rotation(
         self, parameters: FloatArray, covariance: FloatArray
@@ -305,36 +332,51 @@ class _Unknowns:
         """The quaternion (4,) from mon to the cube, and its covariance (3, 3) about mon's axes,
         rad squared.
         """
-        from_mon = to_matrix(from_rotation_vector(parameters[:3])) @ self.from_mon
-        from_cube = to_matrix(from_rotation_vector(parameters[3:6])) @ self.from_cube
+        from_mon, from_cube = self._rotations(parameters)
         q = normalise(from_matrix(from_cube.T @ from_mon))
+        # q and -q are one rotation: that with a positive scalar is written
+        if q[0] < 0:
+            q = -q
         # an error a of mon and b of the cube, in the theodolite's axes, turns mon by a - b
         difference = np.zeros((3, len(covariance)))
         difference[:, :3] = from_mon.T
         difference[:, 3:6] = -from_mon.T
         turned = difference @ covariance @ difference.T
-        return np.asarray(-q if q[0] < 0 else q), (turned + turned.T) / 2
+        # rounding leaves a product like this not quite symmetric
+        return np.asarray(q), (turned + turned.T) / 2
+
+
+def _angles(direction: FloatArray) -> tuple[float, float]:
+    """Azimuth and elevation, rad, of a direction (3,)."""
+    azimuth = math.atan2(direction[1], direction[0])
+    elevation = math.asin(max(-1.0, min(1.0, -direction[2])))
+    return azimuth, elevation
 
 
 def _moved(direction: FloatArray, right_rad: float, up_rad: float) -> FloatArray:
     """A direction (3,) that is moved by small angles along azimuth and elevation."""
-    azimuth = math.atan2(direction[1], direction[0])
-    elevation = math.asin(max(-1.0, min(1.0, -direction[2])))
-    return pointing(azimuth + right_rad / max(math.cos(elevation), 1e-6), elevation + up_rad)
+    azimuth, elevation = _angles(direction)
+    level = max(math.cos(elevation), 1e-6)
+    return pointing(azimuth + right_rad / level, elevation + up_rad)
 
 
 def _wahba(pairs: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
     """The rotation matrix (3, 3) from first to second directions."""
-    product = sum((np.outer(seen, of) for of, seen in pairs), np.zeros((3, 3)))
+    product = np.zeros((3, 3))
+    for before, after in pairs:
+        product = product + np.outer(after, before)
     u, _, v = np.linalg.svd(product)
-    return np.asarray(u @ np.diag([1.0, 1.0, float(np.linalg.det(u) * np.linalg.det(v))]) @ v)
+    handedness = float(np.linalg.det(u) * np.linalg.det(v))
+    return np.asarray(u @ np.diag([1.0, 1.0, handedness]) @ v)
 
 
 def alignment_table(found: ReferenceFit, name: str, date: str) -> dict[str, Any]:
     """The table [alignment] of a bench file."""
     q = [round(value, DIGITS + 3) for value in found.q_mon_to_reference.tolist()]
     table: dict[str, Any] = {"q_mon_to_reference": q}
-    rows = [[float(f"{value:.{DIGITS}g}") for value in row] for row in found.covariance_arcsec2]
+    rows = []
+    for row in found.covariance_arcsec2:
+        rows.append([float(f"{value:.{DIGITS}g}") for value in row])
     table["covariance_arcsec2"] = rows
     if found.dof is not None:
         table["dof"] = found.dof
@@ -351,8 +393,9 @@ def toml_of(found: ReferenceFit, name: str, date: str) -> str:
 
 def summary_of(found: ReferenceFit) -> dict[str, Any]:
     """The fit in figures, by the keys of --json."""
-    rms = float(np.sqrt((found.residual_arcsec**2).mean()))
-    worst = int(np.argmax(np.abs(found.residual_arcsec).max(axis=1)))
+    residual = np.abs(found.residual_arcsec)
+    rms = float(np.sqrt((residual**2).mean()))
+    worst = int(np.argmax(residual.max(axis=1)))
     return {
         "readings": len(found.readings),
         "q_mon_to_reference": found.q_mon_to_reference.tolist(),
@@ -361,7 +404,7 @@ def summary_of(found: ReferenceFit) -> dict[str, Any]:
         "dof": found.dof,
         "residual_rms_arcsec": rms,
         "worst_line": found.readings[worst].line,
-        "worst_arcsec": float(np.abs(found.residual_arcsec[worst]).max()),
+        "worst_arcsec": float(residual[worst].max()),
     }
 
 

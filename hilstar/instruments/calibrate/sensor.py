@@ -30,6 +30,7 @@ from hilstar.tracker.settings import BOLTZMANN_EV_PER_K, DetectorSettings
 MAX_EMVA_BYTES = 1_000_000
 FRAME_ADVICE = "give raw frames as FITS or PNG, 8 to 16 bits of grey"
 EMVA_ADVICE = "write rows quantity,value,unit, such as K,0.25,DN/e- and eta@530nm,62,%"
+EMVA_COLUMNS = ("quantity", "value", "unit")
 ICE_K = 273.15
 EXPOSURE_KEY = "EXPTIME"
 # of the temporal noise: means of one level drift by less, and 128 x 128 px tell them to 0.01
@@ -37,12 +38,12 @@ DARK_SPREAD = 0.5
 ROUNDING_DN2 = 1 / 12
 # share of saturation: the standard's range for the slope of variance over signal
 LINEAR_SHARE = 0.7
-
-
 GREEK = {"σ": "sigma", "μ": "mu", "µ": "mu", "η": "eta", "τ": "tau"}
 # Of one quantity in DN and in electrons, both rounded.
 ROUNDED_ALIKE = 0.05
 WAVELENGTH = re.compile(r"(?:lambda=)?(\d+(?:\.\d+)?)nm")
+# spellings of a unit that no rule of `sheet_unit` turns into its own
+UNIT_SPELLINGS = {"c": "degc", "": "1", "e-s-1": "e-/s", "e-.s-1": "e-/s"}
 GAIN_UNITS: dict[str, Callable[[float], float]] = {"dn/e-": lambda value: 1 / value}
 ELECTRONS: dict[str, Callable[[float], float]] = {"e-": float, "ke-": lambda value: 1000 * value}
 SHARES: dict[str, Callable[[float], float]] = {"%": lambda value: value / 100, "1": float}
@@ -135,11 +136,12 @@ def sheet_unit(text: str) -> str:
     pixel.
     """
     plain = plain_unit(text).replace("lambda", "")
-    plain = re.sub(r"[/.*(]?(?:pixel|pix|px)\)?", "", plain).removesuffix("rms").removesuffix("/")
+    plain = re.sub(r"[/.*(]?(?:pixel|pix|px)\)?", "", plain)
+    plain = plain.removesuffix("rms").removesuffix("/")
     plain = re.sub(r"[()]", "", plain)
     plain = re.sub(r"\b(?:adu|lsb|counts?|digit)\b", "dn", plain)
     plain = re.sub(r"(?<![a-z])(k?)(?:electrons?|el|e)(?![a-z-])-?", r"\1e-", plain)
-    return {"c": "degc", "": "1", "e-s-1": "e-/s", "e-.s-1": "e-/s"}.get(plain, plain)
+    return UNIT_SPELLINGS.get(plain, plain)
 
 
 class Reading(NamedTuple):
@@ -168,25 +170,28 @@ def import_emva(path: Path) -> SensorFile:
         plain, _, wavelength = symbol(name).replace("(", "@").rstrip(")").partition("@")
         quantity = next((known for known in QUANTITIES if plain in known.names), None)
         if quantity is None:
-            unused.append(name)
+            unused.append(shortened(name))
             continue
         reading = _reading(place, name, quantity, value, unit)
-        match = WAVELENGTH.fullmatch(wavelength)
         if quantity.key != "eta":
             readings.append(reading)
-        elif match is None:
+            continue
+        match = WAVELENGTH.fullmatch(wavelength)
+        if match is None:
             raise InputError(f"{place}: {name}; write its wavelength, such as eta@530nm")
-        else:
-            efficiency.append((float(match[1]), reading.value))
+        efficiency.append((float(match[1]), reading.value))
     keys = _keys(path, readings)
     if "temperature_k" in keys:
         keys["dark_reference_temperature_k"] = keys["temperature_k"]
-    if (doubling_k := keys.pop("doubling_k", 0.0)) > 0:
+    doubling_k = keys.pop("doubling_k", 0.0)
+    if doubling_k > 0:
+        # exp(-E / k T) doubles from T to T + doubling
         kelvin = keys.get("temperature_k", DetectorSettings().temperature_k)
-        keys["dark_activation_ev"] = (
-            math.log(2) * BOLTZMANN_EV_PER_K * kelvin * (kelvin + doubling_k) / doubling_k
-        )
-    notes = (f"not used: {', '.join(map(shortened, unused))}",) if unused else ()
+        inverse_k = kelvin * (kelvin + doubling_k) / doubling_k
+        keys["dark_activation_ev"] = math.log(2) * BOLTZMANN_EV_PER_K * inverse_k
+    notes: tuple[str, ...] = ()
+    if unused:
+        notes = (f"not used: {', '.join(unused)}",)
     return _checked(path, SensorFile(keys, {}, tuple(sorted(efficiency)), notes))
 
 
@@ -217,29 +222,30 @@ def _keys(path: Path, readings: Sequence[Reading]) -> dict[str, Any]:
     # What is in electrons comes first: in DN it is rounded more coarsely.
     for reading in sorted(readings, key=lambda reading: reading.in_dn):
         key = reading.quantity.key
+        value = reading.value
         if reading.in_dn:
             value = reading.value * gains[0].value
-        else:
-            value = reading.value
         if key not in keys:
-            keys[key], first[key] = value, reading
+            keys[key] = value
+            first[key] = reading
             continue
+        rounded = 0.0
         if reading.in_dn or reading.quantity is not first[key].quantity:
             rounded = ROUNDED_ALIKE
-        else:
-            rounded = 0.0
         if abs(value - keys[key]) > rounded * abs(keys[key]):
-            other = f"{first[key].place.rpartition(':')[2]} has {first[key].name} for {keys[key]:g}"
+            _, _, other_line = first[key].place.rpartition(":")
             raise InputError(
-                f"{reading.place}: {reading.name} makes {key} {value:g}, and line {other}; leave"
-                " one of them"
+                f"{reading.place}: {reading.name} makes {key} {value:g}, and line {other_line} has"
+                f" {first[key].name} for {keys[key]:g}; leave one of them"
             )
     # in the order of the sheet again
     return {reading.quantity.key: keys[reading.quantity.key] for reading in readings}
 
 
 def _checked(path: Path, sensor: SensorFile) -> SensorFile:
-    if len({nm for nm, _ in sensor.efficiency}) < len(sensor.efficiency):
+    """The sensor, whose values some sensor may have. Raises InputError."""
+    wavelengths = {nm for nm, _ in sensor.efficiency}
+    if len(wavelengths) < len(sensor.efficiency):
         raise InputError(f"{path}: eta has a wavelength twice; write each once")
     for nm, share in sensor.efficiency:
         if not 0 <= share <= 1:
@@ -253,32 +259,27 @@ def _checked(path: Path, sensor: SensorFile) -> SensorFile:
 
 def _emva_rows(path: Path) -> Iterator[tuple[str, str, float, str]]:
     """Place, quantity, value and unit of each row."""
-    columns = ("quantity", "value", "unit")
     if path.suffix.lower() == ".json":
-        try:
-            table = msgspec.json.decode(
-                read_text(path, EMVA_ADVICE, MAX_EMVA_BYTES), type=list[dict[str, str | float]]
-            )
-        except msgspec.MsgspecError as error:
-            raise InputError(
-                f"{path}: {shortened(str(error))}; write a list of objects with quantity, value,"
-                " unit"
-            ) from error
-        rows = []
-        for number, row in enumerate(table, start=1):
-            rows.append((number, [str(row.get(name, "")) for name in columns]))
+        rows = _json_rows(path)
     else:
-        rows = [
-            (line, cells[:3])
-            for line, cells in read_rows(path, columns, EMVA_ADVICE, MAX_EMVA_BYTES)
-        ]
-    for line, (name, value, unit) in rows:
-        yield (
-            f"{path}:{line}",
-            name,
-            finite_numbers(path, line, ("value",), [value], EMVA_ADVICE)[0],
-            unit,
-        )
+        rows = read_rows(path, EMVA_COLUMNS, EMVA_ADVICE, MAX_EMVA_BYTES)
+    for line, cells in rows:
+        name, value_text, unit = cells[:3]
+        (value,) = finite_numbers(path, line, ("value",), [value_text], EMVA_ADVICE)
+        yield f"{path}:{line}", name, value, unit
+
+
+def _json_rows(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Numbers and cells of the objects in a JSON list. Raises InputError."""
+    text = read_text(path, EMVA_ADVICE, MAX_EMVA_BYTES)
+    try:
+        table = msgspec.json.decode(text, type=list[dict[str, str | float]])
+    except msgspec.MsgspecError as error:
+        raise InputError(
+            f"{path}: {shortened(str(error))}; write a list of objects with quantity, value, unit"
+        ) from error
+    for number, row in enumerate(table, start=1):
+        yield number, [str(row.get(name, "")) for name in EMVA_COLUMNS]
 
 
 @dataclass(frozen=True, slots=True)
@@ -300,9 +301,9 @@ class Levels:
         """
         weight = math.sqrt(math.prod(self.shape)) / np.maximum(error, 1e-9)
         place = np.nan_to_num(self.exposure_s) ** power
-        values, covariance = np.polyfit(
-            place, getattr(self, name), int(self.timed), w=weight, cov="unscaled"
-        )
+        degree = int(self.timed)
+        column = getattr(self, name)
+        values, covariance = np.polyfit(place, column, degree, w=weight, cov="unscaled")
         return values, np.sqrt(np.diag(covariance))
 
     @property
@@ -327,23 +328,28 @@ def read_levels(paths: Sequence[Path], what: str) -> Levels:
     rows = []
     largest_dn = 0.0
     shape = read_image(paths[0], advice=FRAME_ADVICE).shape
-    for first, second in zip(paths[::2], paths[1::2], strict=True):
-        (a, seconds), (b, again) = _exposed(first), _exposed(second)
-        if not (
-            a.shape == b.shape == shape
-            and (seconds == again or (math.isnan(seconds) and math.isnan(again)))
-        ):
+    for first_path, second_path in zip(paths[::2], paths[1::2], strict=True):
+        first, first_s = _exposed(first_path)
+        second, second_s = _exposed(second_path)
+        is_alike = first_s == second_s or (math.isnan(first_s) and math.isnan(second_s))
+        if not (first.shape == second.shape == shape and is_alike):
             raise InputError(
-                f"{second}: its size or EXPTIME is not that of {first}; give two frames of each"
-                " exposure"
+                f"{second_path}: its size or EXPTIME is not that of {first_path}; give two frames"
+                " of each exposure"
             )
-        pattern = float(np.mean((a - a.mean()) * (b - b.mean())))
-        if not math.isfinite(pattern):
+        # what both have in common is no noise
+        first_off = first - first.mean()
+        second_off = second - second.mean()
+        spatial_dn2 = float(np.mean(first_off * second_off))
+        if not math.isfinite(spatial_dn2):
             raise InputError(
-                f"{second}: it or {first} has pixels that are no finite number; give raw frames"
+                f"{second_path}: it or {first_path} has pixels that are no finite number; give raw"
+                " frames"
             )
-        rows.append(((a.mean() + b.mean()) / 2, float((a - b).var()) / 2, pattern, seconds))
-        largest_dn = max(largest_dn, float(a.max()), float(b.max()))
+        mean_dn = (first.mean() + second.mean()) / 2
+        temporal_dn2 = float((first - second).var()) / 2
+        rows.append((mean_dn, temporal_dn2, spatial_dn2, first_s))
+        largest_dn = max(largest_dn, float(first.max()), float(second.max()))
     mean, temporal, spatial, exposure_s = np.array(sorted(rows)).T
     if 0 < np.isnan(exposure_s).sum() < len(exposure_s):
         raise InputError(
@@ -356,7 +362,9 @@ def read_levels(paths: Sequence[Path], what: str) -> Levels:
 def _exposed(path: Path) -> tuple[FloatArray, float]:
     """A frame, and its exposure, s; NaN where it says none."""
     image, exposure_s = read_exposed(path, advice=FRAME_ADVICE)
-    return image, math.nan if exposure_s is None else exposure_s
+    if exposure_s is None:
+        return image, math.nan
+    return image, exposure_s
 
 
 def _refuse_unlike_darks(dark: Levels) -> None:
@@ -389,62 +397,92 @@ def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
     spatial, spatial_error = dark.line("spatial_dn2", 2, dark.pattern_error_dn2)
     signal = light.mean_dn - np.polyval(mean, flat_s)
     variance = light.temporal_dn2 - np.polyval(temporal, flat_s)
+    # beyond saturation the noise falls
     top = int(light.temporal_dn2.argmax())
-    usable = np.flatnonzero(
-        (signal > 0) & (light.temporal_dn2 > 0) & (signal <= LINEAR_SHARE * signal[top])
-    )
-    weight = pixels / 2 * (signal[usable] / light.temporal_dn2[usable]) ** 2
-    if len(usable):
-        k_dn_per_e = float((variance[usable] / signal[usable]) @ weight / weight.sum())
-    else:
-        k_dn_per_e = 0.0
-    if not k_dn_per_e > 0:
-        raise InputError(
-            "FLATS: no noise that grows with light; give raw frames of one sensor from dark to"
-            " saturation"
-        )
-    k_error = float(weight.sum()) ** -0.5 / k_dn_per_e
-    half = int(usable[np.abs(signal[usable] - signal[top] / 2).argmin()])
-    keys: dict[str, Any] = {"gain_e_per_dn": 1 / k_dn_per_e, "offset_dn": float(mean[-1])}
-    sigmas = {"gain_e_per_dn": k_error / k_dn_per_e, "offset_dn": float(mean_error[-1])}
-
-    def add(
-        key: str, value: float, error: float, unit: float = k_dn_per_e, unit_error: float = k_error
-    ) -> None:
-        keys[key], sigmas[key] = (
-            max(float(value), 0.0) / unit,
-            math.hypot(error, max(value, 0.0) * unit_error) / unit,
-        )
-
-    def add_root(
-        key: str, square: float, error: float, unit: float = k_dn_per_e, unit_error: float = k_error
-    ) -> None:
-        root = math.sqrt(max(square, 0.0))
-        add(key, root, error / (2 * root) if square > error else math.sqrt(error), unit, unit_error)
-
-    add_root("read_noise_e", temporal[-1] - ROUNDING_DN2, temporal_error[-1])
-    add_root("dsnu_e", spatial[-1], spatial_error[-1])
+    is_lit = (signal > 0) & (light.temporal_dn2 > 0)
+    usable = np.flatnonzero(is_lit & (signal <= LINEAR_SHARE * signal[top]))
+    gain = _system_gain(signal[usable], variance[usable], light.temporal_dn2[usable], pixels)
+    figures = _Figures(gain)
+    figures.keys["offset_dn"] = float(mean[-1])
+    figures.sigmas["offset_dn"] = float(mean_error[-1])
+    figures.add_root("read_noise_e", temporal[-1] - ROUNDING_DN2, temporal_error[-1], gain)
+    figures.add_root("dsnu_e", spatial[-1], spatial_error[-1], gain)
+    from_half = np.abs(signal[usable] - signal[top] / 2)
+    half = int(usable[from_half.argmin()])
     pattern_dn2 = light.spatial_dn2[half] - np.polyval(spatial, flat_s[half] ** 2)
-    add_root(
-        "prnu", pattern_dn2, light.pattern_error_dn2[half] / math.sqrt(pixels), signal[half], 0.0
-    )
+    pattern_error_dn2 = light.pattern_error_dn2[half] / math.sqrt(pixels)
+    figures.add_root("prnu", pattern_dn2, pattern_error_dn2, _Unit(signal[half], 0.0))
     notes = [
         f"{len(signal)} levels of light, {len(dark.mean_dn)} of dark, {pixels} px; light that is"
         " not even counts as PRNU"
     ]
     if dark.timed:
-        add("dark_e_per_s", mean[0], mean_error[0])
-        add_root("dsnu_e_per_s", spatial[0], spatial_error[0])
+        figures.add("dark_e_per_s", mean[0], mean_error[0], gain)
+        figures.add_root("dsnu_e_per_s", spatial[0], spatial_error[0], gain)
     else:
         notes.append("no dark current: the darks have no two exposures (EXPTIME)")
     if top < len(signal) - 1:
-        add("full_well_e", signal[top], np.ptp(signal[top - 1 : top + 2]) / 2)
+        full_error_dn = np.ptp(signal[top - 1 : top + 2]) / 2
+        figures.add("full_well_e", signal[top], full_error_dn, gain)
     else:
         notes.append("full_well_e is not known: the brightest flats do not saturate")
+    keys: dict[str, Any] = dict(figures.keys)
     keys["bits"] = max(1, math.ceil(math.log2(light.largest_dn + 1)))
     notes.append(f"bits holds the largest DN seen, {light.largest_dn:g}")
-    points = np.array([signal, variance]), np.array([np.nan_to_num(dark.exposure_s), dark.mean_dn])
-    return SensorFile(keys, sigmas, (), tuple(notes), *points)
+    transfer = np.array([signal, variance])
+    dark_points = np.array([np.nan_to_num(dark.exposure_s), dark.mean_dn])
+    return SensorFile(keys, figures.sigmas, (), tuple(notes), transfer, dark_points)
+
+
+@dataclass(frozen=True, slots=True)
+class _Unit:
+    """What a figure in DN is divided by, with its one-sigma error."""
+
+    value: float
+    error: float
+
+
+def _system_gain(
+    signal_dn: FloatArray, variance_dn2: FloatArray, temporal_dn2: FloatArray, pixels: int
+) -> _Unit:
+    """K, DN/e-: the slope of the variance over the signal (n,). Raises InputError where noise does
+    not grow with light.
+    """
+    weight = pixels / 2 * (signal_dn / temporal_dn2) ** 2
+    k_dn_per_e = 0.0
+    if len(signal_dn):
+        k_dn_per_e = float((variance_dn2 / signal_dn) @ weight / weight.sum())
+    if not k_dn_per_e > 0:
+        raise InputError(
+            "FLATS: no noise that grows with light; give raw frames of one sensor from dark to"
+            " saturation"
+        )
+    return _Unit(k_dn_per_e, float(weight.sum()) ** -0.5 / k_dn_per_e)
+
+
+class _Figures:
+    """The keys that were measured, with their one-sigma errors; the gain first."""
+
+    def __init__(self, gain: _Unit) -> None:
+        self.keys = {"gain_e_per_dn": 1 / gain.value}
+        self.sigmas = {"gain_e_per_dn": gain.error / gain.value}
+
+    def add(self, key: str, value: float, error: float, unit: _Unit) -> None:
+        """Add a figure of 0 or more, by its value in DN and that one's error."""
+        positive = max(float(value), 0.0)
+        self.keys[key] = positive / unit.value
+        self.sigmas[key] = math.hypot(error, positive * unit.error) / unit.value
+
+    def add_root(self, key: str, square: float, error: float, unit: _Unit) -> None:
+        """Add the root of a square, DN^2, by that one's error; where it is within that, the
+        error's own root is the figure's.
+        """
+        root = math.sqrt(max(square, 0.0))
+        if square > error:
+            root_error = error / (2 * root)
+        else:
+            root_error = math.sqrt(error)
+        self.add(key, root, root_error, unit)
 
 
 def write_sensor(output: Path, sensor: SensorFile, source: str) -> list[Path]:
@@ -454,25 +492,23 @@ def write_sensor(output: Path, sensor: SensorFile, source: str) -> list[Path]:
     settings = sensor.settings
     curve = output.with_name(f"{output.stem}_qe.csv")
     chart = output.with_name(f"{output.stem}_curves")
-    lines = [f"# {source}", *(f"# {note}" for note in sensor.notes)]
-    many = len(sensor.efficiency) > 1
-    if sensor.efficiency:
-        lines += [
-            "[tracker]",
-            (
-                "quantum_efficiency ="
-                f" {json.dumps(curve.name) if many else f'{sensor.efficiency[0][1]:.6g}'}"
-            ),
-        ]
-    if many:
+    files = [output]
+    lines = [f"# {source}"]
+    for note in sensor.notes:
+        lines.append(f"# {note}")
+    if len(sensor.efficiency) > 1:
         charts.write_csv(curve, ("wavelength_nm", "value"), sensor.efficiency)
-    lines += [
-        "[tracker.detector]",
-        *(f"{line.replace(' +- ', '  # +- ')}" for line in sensor.lines),
-    ]
+        files.append(curve)
+        lines += ["[tracker]", f"quantum_efficiency = {json.dumps(curve.name)}"]
+    elif sensor.efficiency:
+        _, share = sensor.efficiency[0]
+        lines += ["[tracker]", f"quantum_efficiency = {share:.6g}"]
+    lines.append("[tracker.detector]")
+    for line in sensor.lines:
+        lines.append(line.replace(" +- ", "  # +- "))
     write_whole(output, "\n".join(lines) + "\n")
     draw_curves(chart, settings, sensor)
-    return [output, *([curve] if many else []), *(chart.with_suffix(end) for end in charts.ENDINGS)]
+    return [*files, *(chart.with_suffix(ending) for ending in charts.ENDINGS)]
 
 
 def draw_curves(path: Path, settings: DetectorSettings, sensor: SensorFile) -> None:
@@ -485,17 +521,18 @@ def draw_curves(path: Path, settings: DetectorSettings, sensor: SensorFile) -> N
         f"{gain:.3g} e- a DN, {settings.read_noise_e:.3g} e- of read noise, full at"
         f" {settings.full_well_e:.0f} e-"
     )
-    signal_dn = np.array(
-        [0.0, settings.full_well_e / gain if sensor.transfer is None else sensor.transfer[0].max()]
-    )
-    seconds = np.array(
-        [0.0, 1.0 if sensor.dark is None else max(float(sensor.dark[0].max()), 1e-3)]
-    )
+    largest_dn = settings.full_well_e / gain
+    if sensor.transfer is not None:
+        largest_dn = sensor.transfer[0].max()
+    longest_s = 1.0
+    if sensor.dark is not None:
+        longest_s = max(float(sensor.dark[0].max()), 1e-3)
+    signal_dn = np.array([0.0, largest_dn])
+    seconds = np.array([0.0, longest_s])
+    dark_dn = settings.offset_dn + settings.dark_e_per_s * seconds / gain
     with charts.chart(path, finding, 1, 2, share_x=False) as (transfer, dark):
         transfer.plot(signal_dn, signal_dn / gain, label="shot noise")
-        dark.plot(
-            seconds, settings.offset_dn + settings.dark_e_per_s * seconds / gain, label="mean dark"
-        )
+        dark.plot(seconds, dark_dn, label="mean dark")
         for axes, points in ((transfer, sensor.transfer), (dark, sensor.dark)):
             if measured and points is not None:
                 axes.plot(*points, "o", color=charts.ORANGE, label="measured")

@@ -45,10 +45,9 @@ class WarmUp:
     are standard errors.
 
     `stable_after_s` is on the clock of the readings: infinite where the law never is stable, after
-    the last reading where
-    it will be. `ahead` is the relative change in the next ten minutes; `is_stable` says that it is
-    within `limit` at 95 %. `law` explains the readings from `from_s` on; it is "none" where no law
-    does, and then the figures are not known (nan).
+    the last reading where it will be. `ahead` is the relative change in the next ten minutes;
+    `is_stable` says that it is within `limit` at 95 %. `law` explains the readings from `from_s`
+    on; it is "none" where no law does, and then the figures are not known (nan).
     """
 
     law: str
@@ -70,7 +69,8 @@ class WarmUp:
         """The relative change in the next ten minutes that is not exceeded at 95 %; nan where no
         law is found.
         """
-        return abs(self.ahead) + float(stdtrit(self.dof, CONFIDENCE)) * self.ahead_error
+        student = float(stdtrit(self.dof, CONFIDENCE))
+        return abs(self.ahead) + student * self.ahead_error
 
     @property
     def line(self) -> str:
@@ -87,11 +87,10 @@ class WarmUp:
         )
         after = f"{self.stable_after_s:.0f} +- {self.stable_after_error_s:.0f} s"
         if self.is_stable:
-            first = f"from the first reading, at {self.from_s:.0f} s, on"
-            return (
-                f"white is stable to {limit}"
-                f" {first if self.stable_after_s <= self.from_s else f'after {after}'}; {drift}"
-            )
+            since = f"after {after}"
+            if self.stable_after_s <= self.from_s:
+                since = f"from the first reading, at {self.from_s:.0f} s, on"
+            return f"white is stable to {limit} {since}; {drift}"
         if self.law == "exponential":
             return (
                 f"white is not yet stable to {limit}: by its exponential it is after {after};"
@@ -126,35 +125,37 @@ class _Law:
 
     @property
     def criterion(self) -> float:
-        return len(self.residual) * math.log(float(np.mean(self.residual**2)) + FLOOR**2) + 2 * len(
-            self.parameters
-        )
+        """Akaike's, up to a constant: the smaller the likelier."""
+        mean_square = float(np.mean(self.residual**2)) + FLOOR**2
+        return len(self.residual) * math.log(mean_square) + 2 * len(self.parameters)
 
     @property
     def is_refused(self) -> bool:
+        """Whether the readings contradict it: successive residuals are alike, or one jumps."""
         if self.at_end:
             return True
         steps = np.diff(self.residual)
-        n = len(self.residual)
+        by_steps = float(np.mean(steps**2)) / 2 + FLOOR**2
+        by_residuals = float(self.residual @ self.residual) / self.dof + FLOOR**2
+        # von Neumann's ratio is 1 for independent residuals
+        lowest_ratio = 1 - ALIKE_SIGMAS / math.sqrt(len(self.residual))
+        if by_steps / by_residuals < lowest_ratio:
+            return True
+        largest_step = float(np.abs(steps).max())
         scatter = MAD_TO_SIGMA * float(np.median(np.abs(steps)))
-        ratio = (float(np.mean(steps**2)) / 2 + FLOOR**2) / (
-            float(self.residual @ self.residual) / self.dof + FLOOR**2
-        )
-        return (
-            ratio < 1 - ALIKE_SIGMAS / math.sqrt(n)
-            or float(np.abs(steps).max()) > JUMP_SIGMAS * scatter + 10 * FLOOR
-        )
+        return largest_step > JUMP_SIGMAS * scatter + 10 * FLOOR
 
     @property
     def noise(self) -> float:
+        """The noise of one reading, relative."""
         return math.sqrt(float(self.residual @ self.residual) / self.dof)
 
     def died_away(self, at_s: float) -> bool:
         """Whether an exponential is far below a reading's noise by a time."""
-        return (
-            len(self.parameters) == 3
-            and abs(self.parameters[1]) * math.exp(-at_s / self.parameters[2]) < self.noise / 3
-        )
+        if len(self.parameters) < 3:
+            return False
+        _, change, tau_s = self.parameters
+        return bool(abs(change) * math.exp(-at_s / tau_s) < self.noise / 3)
 
     def foretold(self, span_s: float, limit: float) -> tuple[list[float], list[float]]:
         """At `span_s`: slope, 1/s, and change in the next ten minutes, relative; when white is
@@ -172,15 +173,21 @@ class _Law:
 
     @staticmethod
     def _figures(parameters: FloatArray, span_s: float, limit: float) -> FloatArray:
-        w, a, *rest = (float(value) for value in parameters)
-        if not rest:
+        """Slope, change in the next ten minutes, and when it is within the limit, as in
+        `foretold`.
+        """
+        w, a, *tau = parameters.tolist()
+        if not tau:
             slope = a / (w + a * span_s)
             return np.array([slope, slope * AHEAD_S, 0.0])
-        falls = -math.expm1(-AHEAD_S / rest[0])
-        ends = a * math.exp(-span_s / rest[0])
-        white = w + ends
-        stable_s = rest[0] * math.log(max(abs(a) * falls / white, 1e-300) / limit)
-        return np.array([-ends / white / rest[0], -ends / white * falls, stable_s])
+        (tau_s,) = tau
+        falls = -math.expm1(-AHEAD_S / tau_s)
+        rest = a * math.exp(-span_s / tau_s)
+        white = w + rest
+        change = abs(a) * falls / white
+        stable_s = tau_s * math.log(max(change, 1e-300) / limit)
+        fall_share = -rest / white
+        return np.array([fall_share / tau_s, fall_share * falls, stable_s])
 
 
 def watch_white(
@@ -209,10 +216,11 @@ def watch_white(
             )
         light.append(value)
         over = (ended_ns - first_ns) / NS_PER_S + EVERY_S > longest_s
-        if len(light) >= MIN_READINGS and (
-            over or judge_warm_up(np.array(t_s), np.array(light)).is_stable
-        ):
-            return np.array(t_s), np.array(light)
+        if len(light) >= MIN_READINGS:
+            times = np.array(t_s)
+            readings = np.array(light)
+            if over or judge_warm_up(times, readings).is_stable:
+                return times, readings
         wait(max(EVERY_S - (ended_ns - begun_ns) / NS_PER_S, 1e-3))
 
 
@@ -220,26 +228,35 @@ def judge_warm_up(t_s: FloatArray, light: FloatArray, limit: float = STABLE) -> 
     """When white is stable to `limit`, by readings (n,) at times (n,). Raises InputError for
     fewer than 12, or no readings.
     """
-    if len(light) < MIN_READINGS or not (
-        np.isfinite(light).all() and (light > 0).all() and (np.diff(t_s) > 0).all()
-    ):
+    is_usable = len(light) >= MIN_READINGS
+    is_usable = is_usable and bool(np.isfinite(light).all() and (light > 0).all())
+    if not is_usable or not (np.diff(t_s) > 0).all():
         raise InputError(
             f"{len(light)} readings of white: a warm-up takes {MIN_READINGS} or more, above 0, at"
             " rising times"
         )
-    for first in (part * len(light) // PARTS for part in range(PARTS)):
+    for part in range(PARTS):
+        first = part * len(light) // PARTS
         if len(light) - first < MIN_READINGS:
             break
-        laws = [law for law in _laws(t_s[first:], light[first:]) if not law.is_refused]
-        laws.sort(key=lambda law: law.criterion)
-        judgements = []
-        for law in laws:
-            if law.criterion < laws[0].criterion + LIKELY:
-                judgements.append(_judged(law, t_s[first:], light[first:], limit))
+        judgements = _likely(t_s[first:], light[first:], limit)
         if judgements:  # white is stable only if it is by each law that is likely
             is_stable = all(judgement.is_stable for judgement in judgements)
             return replace(judgements[0], is_stable=is_stable)
     return WarmUp("none", False, limit)
+
+
+def _likely(t_s: FloatArray, light: FloatArray, limit: float) -> list[WarmUp]:
+    """The figures of each law that readings (n,) do not contradict and that is about as likely as
+    the likeliest, which is the first.
+    """
+    laws = [law for law in _laws(t_s, light) if not law.is_refused]
+    laws.sort(key=lambda law: law.criterion)
+    judgements = []
+    for law in laws:
+        if law.criterion < laws[0].criterion + LIKELY:
+            judgements.append(_judged(law, t_s, light, limit))
+    return judgements
 
 
 def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> WarmUp:
@@ -248,33 +265,41 @@ def _judged(law: _Law, t_s: FloatArray, light: FloatArray, limit: float) -> Warm
     half = len(t_s) // 2
     # An exponential that has died away says nothing of the drift: a line through the last half of
     # the readings does.
+    end = law
+    end_span_s = span_s
     if law.died_away(float(t_s[half] - t_s[0])):
         end = _line(t_s[half:], light[half:])
-    else:
-        end = law
+        end_span_s = 0.0
     (_, _, stable_s), (_, _, stable_error_s) = law.foretold(span_s, limit)
-    (slope, ahead, _), (slope_error, ahead_error, _) = end.foretold(
-        span_s if end is law else 0.0, limit
-    )
-    linear = len(law.parameters) == 2
-    if linear:
-        stable_s = 0.0 if abs(ahead) < limit else math.inf
+    (slope, ahead, _), (slope_error, ahead_error, _) = end.foretold(end_span_s, limit)
+    if len(law.parameters) == 2:
+        name = "line"
+        tau_s = math.nan
+        stable_s = 0.0
+        if abs(ahead) >= limit:
+            stable_s = math.inf
     else:
+        name = "exponential"
+        tau_s = float(law.parameters[2])
         stable_s = max(stable_s, 0.0)
+    bound = abs(ahead) + stdtrit(end.dof, CONFIDENCE) * ahead_error
+    if not stable_s:
+        stable_error_s = 0.0
+    start_s = float(t_s[0])
     return WarmUp(
-        law="line" if linear else "exponential",
-        is_stable=bool(abs(ahead) + stdtrit(end.dof, CONFIDENCE) * ahead_error < limit),
+        law=name,
+        is_stable=bool(bound < limit),
         limit=limit,
-        stable_after_s=float(t_s[0]) + stable_s,
-        stable_after_error_s=stable_error_s if stable_s else 0.0,
+        stable_after_s=start_s + stable_s,
+        stable_after_error_s=stable_error_s,
         drift_percent_per_h=100 * S_PER_H * slope,
         drift_error_percent_per_h=100 * S_PER_H * slope_error,
         ahead=ahead,
         ahead_error=ahead_error,
-        tau_s=math.nan if linear else float(law.parameters[2]),
+        tau_s=tau_s,
         noise=law.noise,
         dof=end.dof,
-        from_s=float(t_s[0]),
+        from_s=start_s,
     )
 
 
@@ -286,7 +311,8 @@ def fitted_white(found: WarmUp, t_s: FloatArray, light: FloatArray) -> FloatArra
     used = t_s >= found.from_s
     if found.law != "none":
         law = _laws(t_s[used], light[used])[found.law == "exponential"]
-        drawn[used] = light[used] - float(np.median(light[used])) * law.residual
+        white = float(np.median(light[used]))
+        drawn[used] = light[used] - white * law.residual
     return drawn
 
 
@@ -299,15 +325,17 @@ def _laws(t_s: FloatArray, light: FloatArray) -> tuple[_Law, _Law]:
         residual = _law(time, value, math.exp(log_tau)).residual
         return float(residual @ residual)
 
-    tried = np.linspace(
-        math.log(float(np.median(np.diff(time)))), math.log(MAX_TAU * float(time[-1])), TAUS
-    )
-    best = int(np.argmin([misfit(tau_s) for tau_s in tried]))
-    bounds = tried[max(best - 1, 0)], tried[min(best + 1, TAUS - 1)]
-    log_tau = float(minimize_scalar(misfit, bounds=bounds, method="bounded").x)
+    shortest_s = float(np.median(np.diff(time)))
+    longest_s = MAX_TAU * float(time[-1])
+    tried = np.linspace(math.log(shortest_s), math.log(longest_s), TAUS)
+    best = int(np.argmin([misfit(log_tau) for log_tau in tried]))
+    lowest = tried[max(best - 1, 0)]
+    highest = tried[min(best + 1, TAUS - 1)]
+    log_tau = float(minimize_scalar(misfit, bounds=(lowest, highest), method="bounded").x)
     margin = END_SHARE * (tried[1] - tried[0])
     at_end = not tried[0] + margin < log_tau < tried[-1] - margin
-    return _line(t_s, light), replace(_law(time, value, math.exp(log_tau)), at_end=at_end)
+    exponential = _law(time, value, math.exp(log_tau))
+    return _line(t_s, light), replace(exponential, at_end=at_end)
 
 
 def _line(t_s: FloatArray, light: FloatArray) -> _Law:
@@ -316,20 +344,20 @@ def _line(t_s: FloatArray, light: FloatArray) -> _Law:
 
 def _law(time: FloatArray, value: FloatArray, tau: float | None = None) -> _Law:
     """Least squares at times (n,) from 0 on: a line, or an exponential of a time constant."""
-    shape = time if tau is None else np.exp(-time / tau)
+    shape = time
+    if tau is not None:
+        shape = np.exp(-time / tau)
     columns = np.stack([np.ones_like(time), shape], axis=1)
     coefficients = np.linalg.lstsq(columns, value, rcond=None)[0]
     residual = value - columns @ coefficients
     if tau is not None:
-        columns = np.column_stack([columns, coefficients[1] * shape * time / tau**2])
+        by_tau = coefficients[1] * shape * time / tau**2
+        columns = np.column_stack([columns, by_tau])
         coefficients = np.append(coefficients, tau)
     dof = len(value) - columns.shape[1]
     size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
     scaled = columns / size
+    inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-13)
     noise2 = float(residual @ residual) / dof + FLOOR**2
-    return _Law(
-        coefficients,
-        noise2 * np.linalg.pinv(scaled.T @ scaled, rcond=1e-13) / np.outer(size, size),
-        residual,
-        dof,
-    )
+    covariance = np.asarray(noise2 * inverse / np.outer(size, size), dtype=np.float64)
+    return _Law(np.asarray(coefficients, dtype=np.float64), covariance, residual, dof)

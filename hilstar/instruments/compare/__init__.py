@@ -56,9 +56,8 @@ def assert_same_sky(
     """
     comparison = compare(frame, golden, flux_mag=flux_mag, centroid_px=centroid_px, truth=truth)
     if not comparison.same:
-        raise AssertionError(
-            "\n".join([finding(comparison), *star_lines(comparison, MAX_LINES, "")])
-        )
+        lines = [finding(comparison), *star_lines(comparison, MAX_LINES, "")]
+        raise AssertionError("\n".join(lines))
     return comparison
 
 
@@ -91,29 +90,31 @@ def compare(
             f"compare: truth {shortened(repr(truth))}; give a Frame's truth, or the CSV that"
             " `hilstar frame --truth OUT.csv` writes"
         )
-    images = _image(frame), _image(golden)
-    same = images[0].ndim == images[1].ndim
-    light, golden_light = (image if same else _together(image) for image in images)
+    light, golden_light = _image(frame), _image(golden)
+    if light.ndim != golden_light.ndim:
+        light, golden_light = _together(light), _together(golden_light)
     check_skies(light, golden_light)
-    truth_table = frame.truth if isinstance(frame, Frame) else None
+    frame_truth = frame.truth if isinstance(frame, Frame) else None
     if isinstance(truth, str | Path):
         truth = read_truth_csv(Path(truth))
     elif truth is None and isinstance(golden, Frame):
         truth = golden.truth
     elif (
         truth is None
-        and truth_table is not None
-        and describes(truth_table, _together(golden_light))
+        and frame_truth is not None
+        and describes(frame_truth, _together(golden_light))
     ):
-        truth = truth_table
-    return compare_skies(light, golden_light, limits, truth, truth_table)
+        truth = frame_truth
+    return compare_skies(light, golden_light, limits, truth, frame_truth)
 
 
 def _together(image: FloatArray) -> FloatArray:
+    """The sum of an image's channels."""
     return image.sum(axis=0) if image.ndim == 3 else image
 
 
 def _image(sky: Sky) -> FloatArray:
+    """A sky as a linear image (height, width), or (3, height, width). Raises InputError."""
     if isinstance(sky, str | Path):
         return read_frame_fits(Path(sky))
     if isinstance(sky, Frame):

@@ -63,17 +63,14 @@ def compare_skies(
     check_skies(frame, golden)
     if frame.ndim == 3:
         tables = truth, frame_truth
-        pairs = zip(CHANNELS, frame, golden, strict=True)
-        by_channel = {
-            name: compare_skies(golden_channel, other, limits, *tables)
-            for name, golden_channel, other in pairs
-        }
-        return replace(
-            compare_skies(frame.sum(axis=0), golden.sum(axis=0), limits, *tables),
-            channels=by_channel,
-        )
+        by_channel = {}
+        for name, channel, golden_channel in zip(CHANNELS, frame, golden, strict=True):
+            by_channel[name] = compare_skies(channel, golden_channel, limits, *tables)
+        whole = compare_skies(frame.sum(axis=0), golden.sum(axis=0), limits, *tables)
+        return replace(whole, channels=by_channel)
     psf = star_fit.star_psf(golden)
-    seeds, unmeasured = _measurable(golden, star_fit.find_seeds(golden, truth, psf), psf)
+    listed = star_fit.find_seeds(golden, truth, psf)
+    seeds, unmeasured = _measurable(golden, listed, psf)
     if not seeds.hip:
         raise InputError(
             "compare: no star of the golden image has enough light in view; give one that has"
@@ -92,15 +89,15 @@ def compare_skies(
         names = star_fit.names_at(places, table, blend_px)
         for hip, (x, y), star_flux in zip(names, places.tolist(), flux.tolist(), strict=True):
             stars.append(StarDifference(hip, x, y, star_flux, error, 0.0, 0.0, limits))
-    return SkyComparison(
-        stars, limits, unmeasured, common_change(stars, (golden.shape[1], golden.shape[0]))
-    )
+    height, width = golden.shape
+    return SkyComparison(stars, limits, unmeasured, common_change(stars, (width, height)))
 
 
 def check_skies(frame: FloatArray, golden: FloatArray) -> None:
     """Raise InputError where two images cannot be compared, as `compare_skies` does."""
     for name, image in (("frame", frame), ("golden", golden)):
-        if not (image.ndim == 2 or image.shape[:-2] == (len(CHANNELS),)) or min(image.shape) < 2:
+        is_linear = image.ndim == 2 or image.shape[:-2] == (len(CHANNELS),)
+        if not is_linear or min(image.shape) < 2:
             raise InputError(
                 f"compare: the {name} image has the shape {image.shape}; give a linear image"
                 " (height, width)"
@@ -111,7 +108,8 @@ def check_skies(frame: FloatArray, golden: FloatArray) -> None:
                 " numbers"
             )
     if frame.shape != golden.shape:
-        (height, width), (golden_height, golden_width) = frame.shape[-2:], golden.shape[-2:]
+        height, width = frame.shape[-2:]
+        golden_height, golden_width = golden.shape[-2:]
         raise InputError(
             f"compare: {width} x {height} px against {golden_width} x {golden_height} px; give"
             " images of one monitor"
@@ -126,13 +124,20 @@ def _measurable(golden: FloatArray, seeds: star_fit.Seeds, psf: Psf) -> tuple[st
     """
     count = seeds.stars
     shape = (golden.shape[0], golden.shape[1])
-    seeds = seeds.only(star_fit.StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
+    seeds = _in_view(seeds, psf, shape)
     seeds = star_fit.Seeds(star_fit.refined(golden, seeds.places_px, psf), seeds.hip)
-    seeds = seeds.only(star_fit.StarTemplates(seeds.places_px, psf, shape).in_view >= MIN_IN_VIEW)
+    seeds = _in_view(seeds, psf, shape)
     templates = star_fit.StarTemplates(seeds.places_px, psf, shape)
     flux = templates.fit(golden)[:, 0]
-    seeds = seeds.only(flux > templates.errors(flux, PIXEL_ERROR)[0] / MAX_ERROR)
+    flux_error, _ = templates.errors(flux, PIXEL_ERROR)
+    seeds = seeds.only(flux > flux_error / MAX_ERROR)
     return seeds, count - seeds.stars
+
+
+def _in_view(seeds: star_fit.Seeds, psf: Psf, shape: tuple[int, int]) -> star_fit.Seeds:
+    """The seeds with enough light on an image of a shape (height, width)."""
+    templates = star_fit.StarTemplates(seeds.places_px, psf, shape)
+    return seeds.only(templates.in_view >= MIN_IN_VIEW)
 
 
 class _SkyFit:
@@ -143,7 +148,8 @@ class _SkyFit:
     def __init__(self, image: FloatArray, places_px: FloatArray, psf: Psf) -> None:
         self.light = image
         self.psf = psf
-        self.templates = star_fit.StarTemplates(places_px, psf, (image.shape[0], image.shape[1]))
+        height, width = image.shape
+        self.templates = star_fit.StarTemplates(places_px, psf, (height, width))
         fitted = self.templates.fit(image)
         self.flux = fitted[:, 0]
         self.places_px = places_px + star_fit.shifts_px(fitted)
@@ -154,38 +160,40 @@ class _SkyFit:
         """The same stars in another image: the same templates, except for those that moved."""
         start = self.templates.places_px
         fit = _SkyFit(frame, start, self.psf)
+        max_move_px = MAX_MOVE_SIGMAS * max(self.psf.width_px)
         for _ in range(MOVE_STEPS):
             move = fit.places_px - self.places_px
-            shift = np.hypot(*move.T)
-            moved = (fit.flux > MISSING_SHARE * self.flux) & (shift > SMALL_MOVE_PX)
-            moved &= shift <= MAX_MOVE_SIGMAS * max(self.psf.width_px)
+            shift_px = np.hypot(*move.T)
+            is_there = fit.flux > MISSING_SHARE * self.flux
+            is_move = (shift_px > SMALL_MOVE_PX) & (shift_px <= max_move_px)
+            moved = is_there & is_move
             if not moved.any():
                 break
-            fit = _SkyFit(frame, start + np.where(moved[:, None], move, 0.0), self.psf)
+            places_px = start + np.where(moved[:, None], move, 0.0)
+            fit = _SkyFit(frame, places_px, self.psf)
         return fit
 
 
 def _differences(
     seeds: star_fit.Seeds, fit: _SkyFit, moved: _SkyFit, limits: Limits
 ) -> list[StarDifference]:
+    """Each star of an image against itself in another, a missing one where it is too faint or too
+    far.
+    """
     flux_error, place_error_px = fit.templates.errors(fit.flux, PIXEL_ERROR)
     limit_mag = np.maximum(MAG_PER_RELATIVE * flux_error / fit.flux, limits.flux_mag)
     limit_px = np.maximum(place_error_px, limits.centroid_px)
     shift = moved.places_px - fit.places_px
-    gone = (moved.flux <= MISSING_SHARE * fit.flux) | (
-        np.hypot(*shift.T) > MAX_MOVE_SIGMAS * max(fit.psf.width_px)
-    )
-    error_mag = np.where(gone, np.inf, magnitude(np.where(gone, 1.0, moved.flux / fit.flux)))
-    columns = (
-        *fit.places_px.T,
-        fit.flux,
-        error_mag,
-        *np.where(gone, 0.0, shift.T),
-        limit_mag,
-        limit_px,
-    )
+    max_move_px = MAX_MOVE_SIGMAS * max(fit.psf.width_px)
+    gone = moved.flux <= MISSING_SHARE * fit.flux
+    gone |= np.hypot(*shift.T) > max_move_px
+    ratio = np.where(gone, 1.0, moved.flux / fit.flux)
+    error_mag = np.where(gone, np.inf, magnitude(ratio))
+    shift_px = np.where(gone, 0.0, shift.T)
+    columns = (*fit.places_px.T, fit.flux, error_mag, *shift_px, limit_mag, limit_px)
+    rows = np.column_stack(columns).tolist()
     differences: list[StarDifference] = []
-    for hip, row in zip(seeds.hip, np.column_stack(columns).tolist(), strict=True):
+    for hip, row in zip(seeds.hip, rows, strict=True):
         x_px, y_px, flux, mag, dx_px, dy_px, star_limit_mag, star_limit_px = row
         star_limits = Limits(star_limit_mag, star_limit_px)
         differences.append(StarDifference(hip, x_px, y_px, flux, mag, dx_px, dy_px, star_limits))
@@ -199,15 +207,17 @@ def _unexplained(light: FloatArray, fit: _SkyFit, moved: _SkyFit) -> tuple[Float
     the image may be as bright as any on it, and its wing wrong by that star's rounding.
     """
     change = np.maximum(np.abs(moved.model - fit.model), np.abs(light))
-    floor = star_fit.RIPPLE_SHARE * np.maximum(fit.light, moved.light) + 0.5 * change
-    rounding = PIXEL_ERROR * max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
-    seeds = star_fit.nameless_seeds(
-        star_fit.bright_pixels(light, star_fit.around(floor, fit.psf) + rounding), fit.psf
-    ).places_px
+    brighter = np.maximum(fit.light, moved.light)
+    floor = star_fit.RIPPLE_SHARE * brighter + 0.5 * change
+    largest_flux = max(fit.flux.max(initial=0.0), moved.flux.max(initial=0.0))
+    rounding = PIXEL_ERROR * largest_flux
+    limit = star_fit.around(floor, fit.psf) + rounding
+    bright = star_fit.bright_pixels(light, limit)
+    seeds = star_fit.nameless_seeds(bright, fit.psf).places_px
     places = star_fit.refined(light, seeds, fit.psf)
-    flux = star_fit.StarTemplates(places, fit.psf, (light.shape[0], light.shape[1])).fit(light)[
-        :, 0
-    ]
+    height, width = light.shape
+    templates = star_fit.StarTemplates(places, fit.psf, (height, width))
+    flux = templates.fit(light)[:, 0]
     column, row = seeds.astype(np.intp).T
     # Two stars at one place: the fit may give one too much and the other less than 0.
     return places, np.maximum(flux, light[row, column])
@@ -234,7 +244,8 @@ def read_frame_fits(path: Path) -> FloatArray:
             f"{path}: not a linear image in {UNIT} (BUNIT is {header.get('BUNIT')!r}); {wanted}"
         )
     light = np.asarray(image, dtype=np.float64)
-    if (np.abs(light[np.isfinite(light)]) > MAX_E_PER_S).any():
+    finite = light[np.isfinite(light)]
+    if (np.abs(finite) > MAX_E_PER_S).any():
         raise InputError(f"{path}: a pixel has more than {MAX_E_PER_S:g} {UNIT}; {wanted}")
     return light
 
@@ -252,8 +263,7 @@ def read_truth_csv(path: Path) -> star_fit.Truth:
         names.append(name)
     truth = np.zeros(len(rows), dtype=TRUTH_DTYPE)
     truth["name"] = names
-    for name, column in zip(
-        TRUTH_COLUMNS, np.array(rows).reshape(-1, len(TRUTH_COLUMNS)).T, strict=True
-    ):
+    columns = np.array(rows).reshape(-1, len(TRUTH_COLUMNS)).T
+    for name, column in zip(TRUTH_COLUMNS, columns, strict=True):
         truth[name] = column
     return truth

@@ -91,19 +91,23 @@ def draw(path: Path, comparison: SkyComparison) -> Any:
             axis.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
         axes[1].set_xlabel("magnitudes below the brightest star [mag]")
         # Remove the names that overlap those of worse stars, and those that are too many.
-        if (figure := axes[0].get_figure(root=True)) is not None:
+        figure = axes[0].get_figure(root=True)
+        if figure is not None:
             figure.draw_without_rendering()
-        for texts in names:  # worst first, of each panel
-            drawn_boxes: list[Bbox] = []
-            for text in texts:
-                box = text.get_window_extent().padded(ROOM_PX)
-                if len(drawn_boxes) == MAX_NAMES or any(
-                    box.overlaps(other) for other in drawn_boxes
-                ):
-                    text.remove()
-                else:
-                    drawn_boxes.append(box)
+        for texts in names:
+            _keep_apart(texts)
     return axes[0].figure
+
+
+def _keep_apart(texts: "list[Annotation]") -> None:
+    """Remove names (worst star first) that overlap one before, or are more than MAX_NAMES."""
+    boxes: list[Bbox] = []
+    for text in texts:
+        box = text.get_window_extent().padded(ROOM_PX)
+        if len(boxes) == MAX_NAMES or any(box.overlaps(other) for other in boxes):
+            text.remove()
+        else:
+            boxes.append(box)
 
 
 class ChartPanel:
@@ -116,17 +120,20 @@ class ChartPanel:
         self.stars = comparison.stars if common is None else common.beyond + common.alone
         self.worst = comparison.differing
         self.brightest = max(star.flux_e_per_s for star in comparison.stars)
-        self.limit = comparison.limits.flux_mag if unit == "mag" else comparison.limits.centroid_px
         self.common = 0.0
-        if common is not None:
-            self.common = abs(common.flux_mag) if unit == "mag" else math.hypot(*common.shift_px)
-        self.row = 4 * max(
-            [
-                self.limit,
-                self.common,
-                *(max(self.point(star)[1:]) for star in self.of("same", "changed")),
-            ]
-        )
+        if unit == "mag":
+            self.limit = comparison.limits.flux_mag
+            if common is not None:
+                self.common = abs(common.flux_mag)
+        else:
+            self.limit = comparison.limits.centroid_px
+            if common is not None:
+                self.common = math.hypot(*common.shift_px)
+        highest = max(self.limit, self.common)
+        for star in self.of("same", "changed"):
+            _, error, star_limit = self.point(star)
+            highest = max(highest, error, star_limit)
+        self.row = 4 * highest
         self.rows = {"missing": self.row, "extra": 8 * self.row}
 
     def of(self, *kinds: str) -> list[StarDifference]:
@@ -144,12 +151,11 @@ class ChartPanel:
         """How many stars are of a kind. Missing and extra ones are all counted, as on the
         terminal and in the table.
         """
-        if kind in self.rows:
-            count = len(self.comparison.of(kind))
-        else:
-            count = drawn
-        common = count - drawn
-        return f"{kind}: {count}" + (f"\n({common} by what is common)" if common else "")
+        count = len(self.comparison.of(kind)) if kind in self.rows else drawn
+        label = f"{kind}: {count}"
+        if count != drawn:
+            label += f"\n({count - drawn} by what is common)"
+        return label
 
     def draw(self, axis: "Axes") -> None:
         """Draw the stars, the limits and the legend."""
@@ -160,29 +166,24 @@ class ChartPanel:
                 heights = [self.rows[kind]] * len(mags)
             else:
                 heights = [error for _, error, _ in points]
-            axis.plot(
-                mags,
-                heights,
-                marker,
-                color=colour,
-                ms=5 if kind == "same" else 7,
-                label=self.label(kind, len(mags)),
-            )
-        axis.axhline(
-            self.limit, color=INK, ls="--", lw=1.2, label=f"limit: {self.limit:g} {self.unit}"
-        )
+            size = 5 if kind == "same" else 7
+            label = self.label(kind, len(mags))
+            axis.plot(mags, heights, marker, color=colour, ms=size, label=label)
+        limit_label = f"limit: {self.limit:g} {self.unit}"
+        axis.axhline(self.limit, color=INK, ls="--", lw=1.2, label=limit_label)
         if self.common:
-            axis.axhline(
-                self.common, color=GREEN, lw=1.2, label=f"in common: {self.common:.3g} {self.unit}"
-            )
-        wider = [
-            point
-            for star in self.of("same", "changed")
-            if (point := self.point(star))[2] > self.limit
-        ]
-        if wider:
-            at, _, limits = zip(*wider, strict=True)
-            axis.plot(at, limits, "_", color=INK, ms=8, label=f"a star's own limit: {len(wider)}")
+            common_label = f"in common: {self.common:.3g} {self.unit}"
+            axis.axhline(self.common, color=GREEN, lw=1.2, label=common_label)
+        wide_mags = []
+        wide_limits = []
+        for star in self.of("same", "changed"):
+            mag, _, star_limit = self.point(star)
+            if star_limit > self.limit:
+                wide_mags.append(mag)
+                wide_limits.append(star_limit)
+        if wide_mags:
+            wide_label = f"a star's own limit: {len(wide_mags)}"
+            axis.plot(wide_mags, wide_limits, "_", color=INK, ms=8, label=wide_label)
         axis.set_ylim(MIN_ERROR / 2, 300 * self.row)
         axis.set_xlim(right=axis.get_xlim()[1] + 0.5)
 
@@ -190,18 +191,17 @@ class ChartPanel:
         """Names of the worst stars. Missing and extra ones are named in the panel of flux alone."""
         names = []
         for star in self.worst:
-            mag, error, own_limit = self.point(star)
-            if self.unit == "mag" if star.kind in self.rows else error > own_limit:
-                if star.hip:
-                    name = star.name
-                else:
-                    name = f"({star.x_px:.0f}, {star.y_px:.0f})"
+            mag, error, star_limit = self.point(star)
+            is_named = error > star_limit
+            if star.kind in self.rows:
+                is_named = self.unit == "mag"
+            if is_named:
+                name = star.name if star.hip else f"({star.x_px:.0f}, {star.y_px:.0f})"
                 place = mag, self.rows.get(star.kind, error)
-                names.append(
-                    axis.annotate(
-                        name, place, xytext=(6, 5), textcoords="offset points", fontsize=SMALL_PT
-                    )
+                text = axis.annotate(
+                    name, place, xytext=(6, 5), textcoords="offset points", fontsize=SMALL_PT
                 )
+                names.append(text)
         return names[:MAX_TRIED]
 
 

@@ -12,12 +12,14 @@ from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.error_spread import ErrorSpread, error_spread
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import magnitude
+from hilstar.instruments.compare.star_fit import nearest_places
 
 MORE_STARS = 0.1  # share of all stars that a motion with more parameters has to explain in addition
 # rounds of reweighted least squares, which converge to the minimum sum of absolute residuals
@@ -45,21 +47,25 @@ def common_motion(places: FloatArray, moves: FloatArray, limits_px: FloatArray) 
     """The simplest motion that explains the moves (n, 2) of stars at `places` (n, 2) from the
     middle; None for none.
     """
-    before = np.hypot(*moves.T)
-    limit = np.median(limits_px)
-    if np.median(before) <= limit:
+    before_px = np.hypot(*moves.T)
+    limit_px = np.median(limits_px)
+    if np.median(before_px) <= limit_px:
         return None
     best: Motion | None = None
-    remaining = before
+    rest_px = before_px
     for rank in range(1, rank_for(len(places)) + 1):
         motion = fitted_motion(places, moves, rank)
-        then = np.hypot(*(moves - motion(places)).T)
-        more = (then <= limits_px).mean() > (remaining <= limits_px).mean() + MORE_STARS
-        nearer = np.median(remaining) > limit and np.median(then) < MIN_SHARE * np.median(remaining)
+        then_px = np.hypot(*(moves - motion(places)).T)
+        explained = (then_px <= limits_px).mean()
+        explained_before = (rest_px <= limits_px).mean()
+        more = explained > explained_before + MORE_STARS
+        median_px = np.median(rest_px)
+        is_off = median_px > limit_px
+        nearer = is_off and np.median(then_px) < MIN_SHARE * median_px
         if rank == 1 or more or nearer:
             best = motion
-            remaining = then
-    if np.median(remaining) <= MIN_SHARE * np.median(before):
+            rest_px = then_px
+    if np.median(rest_px) <= MIN_SHARE * np.median(before_px):
         return best
     return None
 
@@ -78,36 +84,40 @@ def rank_for(stars: int) -> int:
 def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
     """The motion of a rank that has the minimum sum of absolute residuals."""
     scale = float(np.abs(places).max()) or 1.0
-    (x, y), (u, v) = (places / scale).T, ((places + moves) / scale).T
+    x, y = (places / scale).T
+    u, v = ((places + moves) / scale).T
     ones = np.ones_like(x)
     zeros = np.zeros_like(x)
-    if rank == 1:
-        columns = [(ones, zeros), (zeros, ones)]
-    elif rank == 2:
-        columns = [(ones, zeros), (zeros, ones), (x, y), (-y, x)]
-    else:
+    columns = [(ones, zeros), (zeros, ones)]
+    if rank == 2:
+        columns += [(x, y), (-y, x)]
+    elif rank == 3:
         # a homography, as of a camera that turns: u (1 + g x + h y) = a x + b y + c is linear in
         # its eight numbers
-        columns = [(ones, zeros), (zeros, ones), (x, zeros), (y, zeros), (zeros, x), (zeros, y)]
+        columns += [(x, zeros), (y, zeros), (zeros, x), (zeros, y)]
         columns += [(-u * x, -v * x), (-u * y, -v * y)]
-    design = np.stack([np.stack(column, axis=-1) for column in columns], axis=-1)
-    coefficients = _least_absolute(design, np.stack([u - x, v - y], axis=-1), FINEST_PX / scale)
+    terms = [np.stack(column, axis=-1) for column in columns]
+    design = np.stack(terms, axis=-1)
+    wanted = np.stack([u - x, v - y], axis=-1)
+    coefficients = _least_absolute(design, wanted, FINEST_PX / scale)
 
     def motion(at: FloatArray) -> FloatArray:
+        """The moves (n, 2) of places (n, 2)."""
         x, y = at.T / scale
         right, down, *more = coefficients
         if rank == 1:
             moved = np.broadcast_to(coefficients, at.shape)
         elif rank == 2:
             grow, turn = more
-            moved = np.stack([right + grow * x - turn * y, down + grow * y + turn * x], axis=-1)
+            moved_x = right + grow * x - turn * y
+            moved_y = down + grow * y + turn * x
+            moved = np.stack([moved_x, moved_y], axis=-1)
         else:
             a, b, d, e, g, h = more
             wide = 1 + g * x + h * y
-            moved = np.stack(
-                [(a * x + b * y + right + x) / wide - x, (d * x + e * y + down + y) / wide - y],
-                axis=-1,
-            )
+            moved_x = (a * x + b * y + right + x) / wide - x
+            moved_y = (d * x + e * y + down + y) / wide - y
+            moved = np.stack([moved_x, moved_y], axis=-1)
         return np.asarray(moved * scale)
 
     return motion
@@ -115,16 +125,16 @@ def fitted_motion(places: FloatArray, moves: FloatArray, rank: int) -> Motion:
 
 def _least_absolute(design: FloatArray, wanted: FloatArray, finest: float) -> FloatArray:
     """Coefficients (k,) of design (n, 2, k) to wanted (n, 2) with the minimum sum of distances."""
-    weight = np.ones(len(wanted))
-    solution = np.zeros(design.shape[2])
+    weight: npt.NDArray[np.floating[Any]] = np.ones(len(wanted))
+    solution: FloatArray = np.zeros(design.shape[2])
     for _ in range(ROUNDS):
         root = np.sqrt(weight)[:, None]
-        weighted = (design * root[..., None]).reshape(-1, design.shape[2])
-        solution = np.asarray(
-            np.linalg.lstsq(weighted, (wanted * root).ravel(), rcond=None)[0], dtype=np.float64
-        )
-        weight = 1 / np.maximum(np.hypot(*(wanted - design @ solution).T), finest)
-    return np.asarray(solution)
+        weighted_design = (design * root[..., None]).reshape(-1, design.shape[2])
+        weighted = (wanted * root).ravel()
+        solution, *_ = np.linalg.lstsq(weighted_design, weighted, rcond=None)
+        residual = wanted - design @ solution
+        weight = 1 / np.maximum(np.hypot(*residual.T), finest)
+    return np.asarray(solution, dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,29 +188,25 @@ class StarDifference:
     @property
     def error_over_limit(self) -> float:
         """The larger of its two errors, each divided by its limit."""
-        return max(
-            abs(self.flux_error_mag) / self.limits.flux_mag,
-            self.centroid_error_px / self.limits.centroid_px,
-        )
+        flux_error = abs(self.flux_error_mag) / self.limits.flux_mag
+        return max(flux_error, self.centroid_error_px / self.limits.centroid_px)
 
     @property
     def name(self) -> str:
         """Its HIP number, those of its blend, or its place."""
-        if self.hip:
-            hips = [designation for designation in self.hip if isinstance(designation, int)]
-            bodies = [designation for designation in self.hip if isinstance(designation, str)]
-            parts = [*map(str, hips), *bodies]
-            if hips:
-                parts[0] = f"HIP {parts[0]}"
-            return " + ".join(parts)
-        return f"star at ({self.x_px:.1f}, {self.y_px:.1f})"
+        if not self.hip:
+            return f"star at ({self.x_px:.1f}, {self.y_px:.1f})"
+        hips = [str(number) for number in self.hip if isinstance(number, int)]
+        bodies = [body for body in self.hip if isinstance(body, str)]
+        if hips:
+            hips[0] = f"HIP {hips[0]}"
+        return " + ".join([*hips, *bodies])
 
     def line(self) -> str:
         """What is wrong with the star, for a person."""
+        place = ""
         if self.hip:
             place = f" at ({self.x_px:.2f}, {self.y_px:.2f}) px"
-        else:
-            place = ""
         if self.kind in ("missing", "extra"):
             return f"{self.name}{place}: {self.kind}, {self.flux_e_per_s:.4g} electrons/s"
         return (
@@ -214,9 +220,9 @@ class CommonChange:
     """What is common: shift in the middle of the image, px, turn and scale there, and magnitudes
     (positive: too faint).
 
-    A figure is 0 where the stars do not have it in common.
-    `beyond` are the stars of both images once that is subtracted, `alone` those that only one image
-    has. Stars that the shift brought into view or took out of it are in neither.
+    A figure is 0 where the stars do not have it in common. `beyond` are the stars of both images
+    once that is subtracted, `alone` those that only one image has. Stars that the shift brought
+    into view or took out of it are in neither.
     """
 
     shift_px: tuple[float, float]
@@ -235,21 +241,22 @@ class CommonChange:
         """What is common, for a person."""
         right, down = self.shift_px
         digits = 2 if math.hypot(right, down) >= 0.1 else 4
+        parts = []
         if any(self.shift_px):
-            parts = [f"shifted by ({right:z.{digits}f}, {down:z.{digits}f}) px"]
-        else:
-            parts = []
-        parts += [f"turned by {self.rotation_deg:+.4f} deg"] if self.rotation_deg else []
-        parts += [f"scaled by {self.scale_error:+.4%}"] if self.scale_error else []
-        dimmer = "dimmer" if self.flux_mag > 0 else "brighter"
-        digits = 2 if abs(self.flux_mag) >= 0.1 else 4
-        parts += [f"{dimmer} by {abs(self.flux_mag):.{digits}f} mag"] if self.flux_mag else []
+            parts.append(f"shifted by ({right:z.{digits}f}, {down:z.{digits}f}) px")
+        if self.rotation_deg:
+            parts.append(f"turned by {self.rotation_deg:+.4f} deg")
+        if self.scale_error:
+            parts.append(f"scaled by {self.scale_error:+.4%}")
+        if self.flux_mag:
+            dimmer = "dimmer" if self.flux_mag > 0 else "brighter"
+            digits = 2 if abs(self.flux_mag) >= 0.1 else 4
+            parts.append(f"{dimmer} by {abs(self.flux_mag):.{digits}f} mag")
         odd = len(self.differing)
-        if not odd:
-            rest = ""
-        elif odd == 1:
+        rest = ""
+        if odd == 1:
             rest = "; 1 star differs from that"
-        else:
+        elif odd:
             rest = f"; {odd} stars differ from that"
         return f"all {', '.join(parts) or 'moved alike'}{rest}"
 
@@ -273,66 +280,85 @@ def common_change(stars: list[StarDifference], size_px: tuple[int, int]) -> Comm
     missing = [star for star in stars if star.kind == "missing"]
     extra = [star for star in stars if star.kind == "extra"]
     pairs = dict(_pairs(missing, extra))
-    for here, there in pairs.items():  # stars that moved far are in both images
-        old = missing[here]
-        new = extra[there]
-        error_mag = magnitude(new.flux_e_per_s / old.flux_e_per_s)
-        both.append(
-            replace(
-                old, flux_error_mag=error_mag, dx_px=new.x_px - old.x_px, dy_px=new.y_px - old.y_px
-            )
-        )
-    if len(both) < max(MIN_STARS, MIN_STAR_SHARE * (len(both) + len(missing) - len(pairs))):
+    for before, after in pairs.items():  # stars that moved far are in both images
+        both.append(_moved(missing[before], extra[after]))
+    in_golden = len(both) + len(missing) - len(pairs)
+    if len(both) < max(MIN_STARS, MIN_STAR_SHARE * in_golden):
         return None
     middle = (np.array(size_px) - 1) / 2
     places = _places(both) - middle
     moves = np.array([(star.dx_px, star.dy_px) for star in both])
-    limit_px = np.array([star.limits.centroid_px for star in both])
-    motion = common_motion(places, moves, limit_px)
-    # The median flux error, where it exceeds the limit and makes up more than half of the median
-    # star's error.
-    errors_mag = np.array([star.flux_error_mag for star in both])
-    flux_mag = float(np.median(errors_mag))
-    limit_mag = np.median([star.limits.flux_mag for star in both])
-    if abs(flux_mag) <= limit_mag or np.median(np.abs(errors_mag - flux_mag)) > MIN_SHARE * abs(
-        flux_mag
-    ):
-        flux_mag = 0.0
+    limits_px = np.array([star.limits.centroid_px for star in both])
+    motion = common_motion(places, moves, limits_px)
+    flux_mag = _common_flux_mag(both)
     if motion is None and not flux_mag:
         return None
     model = motion or np.zeros_like
-    beyond = [
-        replace(star, flux_error_mag=star.flux_error_mag - flux_mag, dx_px=dx, dy_px=dy)
-        for star, (dx, dy) in zip(both, (moves - model(places)).tolist(), strict=True)
-    ]
+    beyond = []
+    rest_px = moves - model(places)
+    for star, (dx_px, dy_px) in zip(both, rest_px.tolist(), strict=True):
+        error_mag = star.flux_error_mag - flux_mag
+        beyond.append(replace(star, flux_error_mag=error_mag, dx_px=dx_px, dy_px=dy_px))
+    matched_extra = set(pairs.values())
     alone = [star for k, star in enumerate(missing) if k not in pairs]
-    taken = set(pairs.values())
-    alone += [star for k, star in enumerate(extra) if k not in taken]
-    unmoved = []
+    alone += [star for k, star in enumerate(extra) if k not in matched_extra]
+    in_view = []
     for star in alone:  # but those that the motion brought into view or took out of it
         place = _places([star]) - middle
-        if star.kind == "missing":
-            move = model(place)
-        else:
-            move = -model(place)
-        if not move.any() or (np.abs(place + move) <= middle - EDGE_PX).all():
-            unmoved.append(star)
-    # The motion in the middle, and its turn and scale there: 0 for what moves no star by more than
-    # its limit.
-    limit = float(np.median(limit_px))
-    reach = float(np.hypot(*middle))
-    shift, right, down = model(np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
-    (xx, yx), (xy, yy) = right - shift, down - shift
-    turn = math.atan2(yx - xy, 2 + xx + yy)
-    grow = math.sqrt((1 + xx) * (1 + yy) - xy * yx) - 1
-    return CommonChange(
-        (float(shift[0]), float(shift[1])) if np.hypot(*shift) > limit else (0.0, 0.0),
-        math.degrees(turn) if abs(turn) * reach > limit else 0.0,
-        grow if abs(grow) * reach > limit else 0.0,
-        flux_mag,
-        beyond,
-        unmoved,
-    )
+        move = model(place)
+        if star.kind == "extra":
+            move = -move
+        is_shown = np.abs(place + move) <= middle - EDGE_PX
+        if not move.any() or is_shown.all():
+            in_view.append(star)
+    limit_px = float(np.median(limits_px))
+    shift_px, rotation_deg, scale_error = _in_the_middle(model, middle, limit_px)
+    return CommonChange(shift_px, rotation_deg, scale_error, flux_mag, beyond, in_view)
+
+
+def _moved(before: StarDifference, after: StarDifference) -> StarDifference:
+    """A missing star and an extra one as one star that moved."""
+    error_mag = magnitude(after.flux_e_per_s / before.flux_e_per_s)
+    dx_px = after.x_px - before.x_px
+    dy_px = after.y_px - before.y_px
+    return replace(before, flux_error_mag=error_mag, dx_px=dx_px, dy_px=dy_px)
+
+
+def _common_flux_mag(stars: list[StarDifference]) -> float:
+    """The median flux error, where it exceeds the limit and makes up more than half of the median
+    star's error; else 0.
+    """
+    errors_mag = np.array([star.flux_error_mag for star in stars])
+    limit_mag = np.median([star.limits.flux_mag for star in stars])
+    flux_mag = float(np.median(errors_mag))
+    rest_mag = np.median(np.abs(errors_mag - flux_mag))
+    if abs(flux_mag) <= limit_mag or rest_mag > MIN_SHARE * abs(flux_mag):
+        return 0.0
+    return flux_mag
+
+
+def _in_the_middle(
+    motion: Motion, middle: FloatArray, limit_px: float
+) -> tuple[tuple[float, float], float, float]:
+    """A motion's shift, px, turn, deg, and scale error in the middle of the image: 0 for what moves
+    no star by more than its limit.
+    """
+    reach_px = float(np.hypot(*middle))
+    steps_px = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+    shift, right, down = motion(steps_px)
+    xx, yx = right - shift
+    xy, yy = down - shift
+    turn_rad = math.atan2(yx - xy, 2 + xx + yy)
+    area = (1 + xx) * (1 + yy) - xy * yx
+    scale_error = math.sqrt(area) - 1
+    shift_px = (float(shift[0]), float(shift[1]))
+    if np.hypot(*shift) <= limit_px:
+        shift_px = (0.0, 0.0)
+    if abs(turn_rad) * reach_px <= limit_px:
+        turn_rad = 0.0
+    if abs(scale_error) * reach_px <= limit_px:
+        scale_error = 0.0
+    return shift_px, math.degrees(turn_rad), scale_error
 
 
 def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[tuple[int, int]]:
@@ -342,38 +368,49 @@ def _pairs(missing: list[StarDifference], extra: list[StarDifference]) -> list[t
     voters = min(MAX_VOTERS, len(old), len(new))
     if voters < MIN_STARS:
         return []
-    brightest = []
-    for kind in (missing, extra):
-        brightest.append(
-            np.argsort([-star.flux_e_per_s for star in kind], kind="stable")[:MAX_VOTERS]
-        )
-    votes = (new[brightest[1]][None, :] - old[brightest[0]][:, None]).reshape(-1, 2)
-    near = cKDTree(votes).query_ball_point(votes, VOTE_PX)
+    votes = _displacements(_brightest(missing), _brightest(extra))
+    near: Any = cKDTree(votes).query_ball_point(votes, VOTE_PX)
     winner = max(near, key=len)
     if len(winner) < max(MIN_STARS, MIN_STAR_SHARE * voters):
         return []
     predicted = old + np.median(votes[winner], axis=0)
+    middle = old.mean(axis=0)
     pairs: list[tuple[int, int]] = []
     for _ in range(PAIR_ROUNDS):
         # Those that are each other's nearest, within PAIR_PX.
-        distance, nearest = (np.asarray(neighbours) for neighbours in cKDTree(new).query(predicted))
-        back = np.asarray(cKDTree(predicted).query(new)[1])
-        pairs = [
-            (k, int(n)) for k, n in enumerate(nearest) if distance[k] <= PAIR_PX and back[n] == k
-        ]
-        here = np.array([before for before, _ in pairs], dtype=np.intp)
-        there = np.array([after for _, after in pairs], dtype=np.intp)
-        middle = old.mean(axis=0)
-        motion = fitted_motion(old[here] - middle, new[there] - old[here], rank_for(len(pairs)))
+        distances_px, nearest = nearest_places(new, predicted)
+        _, back = nearest_places(predicted, new)
+        is_mutual = back[nearest] == np.arange(len(old))
+        mutual = is_mutual & (distances_px <= PAIR_PX)
+        before = np.flatnonzero(mutual)
+        after = nearest[before]
+        pairs = list(zip(before.tolist(), after.tolist(), strict=True))
+        moves = new[after] - old[before]
+        motion = fitted_motion(old[before] - middle, moves, rank_for(len(pairs)))
         predicted = old + motion(old - middle)
     return pairs
 
 
+def _brightest(stars: list[StarDifference]) -> FloatArray:
+    """Places (n, 2) of the brightest MAX_VOTERS stars, brightest first."""
+    order = np.argsort([-star.flux_e_per_s for star in stars], kind="stable")
+    return _places(stars)[order[:MAX_VOTERS]]
+
+
+def _displacements(before: FloatArray, after: FloatArray) -> FloatArray:
+    """The displacements (n m, 2) from each of n places to each of m others."""
+    displacements = after[None, :] - before[:, None]
+    return displacements.reshape(-1, 2)
+
+
 def _places(stars: list[StarDifference]) -> FloatArray:
-    return np.array([(star.x_px, star.y_px) for star in stars]).reshape(-1, 2)
+    """The places (n, 2) of stars, px."""
+    places = [(star.x_px, star.y_px) for star in stars]
+    return np.array(places).reshape(-1, 2)
 
 
 def _worst_first(stars: list[StarDifference]) -> list[StarDifference]:
+    """By the error over its limit, the largest first, and of equal ones the brightest."""
     return sorted(stars, key=lambda star: (-star.error_over_limit, -star.flux_e_per_s))
 
 
@@ -440,16 +477,14 @@ class SkyComparison:
     @property
     def flux_error_mag(self) -> ErrorSpread:
         """The spread of the flux errors of stars that both images have."""
-        return error_spread(
-            np.array([abs(star.flux_error_mag) for star in self.of("same", "changed")])
-        )
+        errors_mag = [abs(star.flux_error_mag) for star in self.of("same", "changed")]
+        return error_spread(np.array(errors_mag))
 
     @property
     def centroid_error_px(self) -> ErrorSpread:
         """The spread of the centroid errors of stars that both images have."""
-        return error_spread(
-            np.array([star.centroid_error_px for star in self.of("same", "changed")])
-        )
+        errors_px = [star.centroid_error_px for star in self.of("same", "changed")]
+        return error_spread(np.array(errors_px))
 
     def summary(self) -> dict[str, Any]:
         """The JSON object of `hilstar compare`; infinite errors are null there."""
@@ -492,7 +527,8 @@ def star_lines(comparison: SkyComparison, max_lines: int, rest: str) -> list[str
     """A line for each star that differs beyond the common difference, `max_lines` of them;
     `rest` says where more are.
     """
-    if not comparison.bad and (other := _other_channel(comparison)):
+    other = _other_channel(comparison)
+    if not comparison.bad and other is not None:
         return star_lines(comparison.channels[other], max_lines, rest)
     stars = comparison.differing
     lines = [star.line() for star in stars[:max_lines]]
@@ -503,27 +539,35 @@ def star_lines(comparison: SkyComparison, max_lines: int, rest: str) -> list[str
 
 def _other_channel(comparison: SkyComparison) -> str | None:
     """The first channel that is not the same; None where all are."""
-    return next((name for name, channel in comparison.channels.items() if not channel.same), None)
+    for name, channel in comparison.channels.items():
+        if not channel.same:
+            return name
+    return None
 
 
 def finding(comparison: SkyComparison) -> str:
     """The verdict in one sentence."""
-    if not comparison.bad and (other := _other_channel(comparison)):
+    other = _other_channel(comparison)
+    if not comparison.bad and other is not None:
         return f"In channel {other}: {finding(comparison.channels[other])}"
     if comparison.same:
-        largest = comparison.flux_error_mag.max, comparison.centroid_error_px.max
+        flux_mag = comparison.flux_error_mag.max
+        place_px = comparison.centroid_error_px.max
         return (
-            f"The same sky: {comparison.star_count} stars, at most {largest[0]:.2g} mag and"
-            f" {largest[1]:.2g} px off"
+            f"The same sky: {comparison.star_count} stars, at most {flux_mag:.2g} mag and"
+            f" {place_px:.2g} px off"
         )
     if comparison.common is not None:
-        odd = comparison.differing[:1]
-        return f"Not the same sky: {comparison.common.line()}" + "".join(
-            f"; the worst is {star.line()}" for star in odd
-        )
-    counts = {name: len(comparison.of(name)) for name in ("changed", "missing", "extra")}
-    rest = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
+        sentence = f"Not the same sky: {comparison.common.line()}"
+        if comparison.differing:
+            sentence += f"; the worst is {comparison.differing[0].line()}"
+        return sentence
+    counts = []
+    for kind in ("changed", "missing", "extra"):
+        count = len(comparison.of(kind))
+        if count:
+            counts.append(f"{count} {kind}")
     return (
-        f"Not the same sky: of {comparison.star_count} stars {rest}; the worst is"
+        f"Not the same sky: of {comparison.star_count} stars {', '.join(counts)}; the worst is"
         f" {comparison.bad[0].line()}"
     )

@@ -61,21 +61,29 @@ class StarTemplates:
         self.places_px = places_px
         self.shape = shape
         reach_px = psf.footprint_px // 2 + 1
-        self._x, self._y = (
-            _Profiles(places_px[:, k], psf.width_px[k], reach_px, shape[1 - k]) for k in (0, 1)
-        )
+        height, width = shape
+        sigma_x, sigma_y = psf.width_px
+        self._x = _Profiles(places_px[:, 0], sigma_x, reach_px, width)
+        self._y = _Profiles(places_px[:, 1], sigma_y, reach_px, height)
         self.in_view = self._x.share.sum(axis=1) * self._y.share.sum(axis=1)
 
     @cached_property
     def _columns(self) -> csc_array:
         """The light of each star and its derivatives (pixels, 3 n)."""
         size = len(self.places_px)
-        pairs = [(getattr(self._y, y), getattr(self._x, x)) for y, x in COLUMNS]
-        data = np.stack([y[:, :, None] * x[:, None, :] for y, x in pairs], axis=1)
-        pixel = self._y.clipped[:, :, None] * self.shape[1] + self._x.clipped[:, None, :]
-        index = np.broadcast_to(pixel[:, None], data.shape).ravel()
-        ends = np.arange(3 * size + 1) * math.prod(data.shape[2:])
-        return csc_array((data.ravel(), index, ends), shape=(math.prod(self.shape), 3 * size))
+        columns = []
+        for y_name, x_name in COLUMNS:
+            down = getattr(self._y, y_name)
+            across = getattr(self._x, x_name)
+            columns.append(down[:, :, None] * across[:, None, :])
+        data = np.stack(columns, axis=1)
+        height, width = self.shape
+        pixel = self._y.clipped[:, :, None] * width + self._x.clipped[:, None, :]
+        index = np.broadcast_to(pixel[:, None], data.shape)
+        pixels_of_star = math.prod(data.shape[2:])
+        ends = np.arange(3 * size + 1) * pixels_of_star
+        content = (data.ravel(), index.ravel(), ends)
+        return csc_array(content, shape=(height * width, 3 * size))
 
     @cached_property
     def normal(self) -> csc_array:
@@ -85,13 +93,14 @@ class StarTemplates:
         size = len(self.places_px)
         width = self._x.share.shape[1]
         middles = np.column_stack([self._x.middle, self._y.middle])
-        near = (
-            cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray").astype(np.intp)
-        )
-        star, other = (
-            np.concatenate([np.arange(size), near[:, k], near[:, 1 - k]]) for k in (0, 1)
-        )
-        along_x, along_y = (profiles.overlaps(star, other) for profiles in (self._x, self._y))
+        pairs = cKDTree(middles).query_pairs(width - 1, p=np.inf, output_type="ndarray")
+        first, second = pairs.astype(np.intp).T
+        # each star with itself, and each pair both ways round
+        itself = np.arange(size)
+        star = np.concatenate([itself, first, second])
+        other = np.concatenate([itself, second, first])
+        along_x = self._x.overlaps(star, other)
+        along_y = self._y.overlaps(star, other)
         number_of = {"share": 0, "slope": 1}
         entries = [(number_of[y], number_of[x]) for y, x in COLUMNS]
         products = []
@@ -100,17 +109,24 @@ class StarTemplates:
         blocks = np.stack(products, axis=1)
         row = 3 * star[:, None] + np.arange(9) // 3
         col = 3 * other[:, None] + np.arange(9) % 3
-        return csc_array((blocks.ravel(), (row.ravel(), col.ravel())), shape=(3 * size, 3 * size))
+        places = (row.ravel(), col.ravel())
+        return csc_array((blocks.ravel(), places), shape=(3 * size, 3 * size))
 
     @cached_property
     def _scale(self) -> FloatArray:
-        return np.asarray(1 / np.sqrt(np.maximum(self.normal.diagonal(), np.finfo(float).tiny)))
+        """Factors (3 n,) that bring the columns to unit length."""
+        squares = np.maximum(self.normal.diagonal(), np.finfo(float).tiny)
+        return np.asarray(1 / np.sqrt(squares))
 
     @cached_property
     def _solver(self) -> SuperLU:
+        """The factors of the normal equations of unit columns."""
         unit = self.normal.copy()
-        unit.data *= self._scale[unit.indices] * np.repeat(self._scale, np.diff(unit.indptr))
-        return splu(csc_array(unit + RIDGE * eye_array(len(self._scale), format="csc")))
+        row_scale = self._scale[unit.indices]
+        column_scale = np.repeat(self._scale, np.diff(unit.indptr))
+        unit.data *= row_scale * column_scale
+        ridge = RIDGE * eye_array(len(self._scale), format="csc")
+        return splu(csc_array(unit + ridge))
 
     def fit(self, image: FloatArray) -> FloatArray:
         """Flux, and flux times the shift along x and y, of each star (n, 3): least squares over
@@ -119,7 +135,8 @@ class StarTemplates:
         if not len(self.places_px):
             return np.zeros((0, 3))
         wanted = np.asarray(self._columns.T @ image.ravel())
-        return (self._scale * self._solver.solve(self._scale * wanted)).reshape(-1, 3)
+        of_unit_columns = self._solver.solve(self._scale * wanted)
+        return (self._scale * of_unit_columns).reshape(-1, 3)
 
     def image(self, fitted: FloatArray) -> FloatArray:
         """The light (height, width) of a fit."""
@@ -130,22 +147,24 @@ class StarTemplates:
         all stars that reach it.
         """
         size = len(flux)
-        blocks = np.zeros((size, 3, 3))
         entries = self.normal.tocoo()
-        is_own = entries.row // 3 == entries.col // 3
-        row = entries.row[is_own]
-        col = entries.col[is_own]
-        blocks[row // 3, row % 3, col % 3] = entries.data[is_own]
-        variance = np.diagonal(np.linalg.pinv(blocks, hermitian=True), axis1=1, axis2=2)
-        fluxes = entries.row % 3 + entries.col % 3 == 0
-        near = np.bincount(
-            entries.row[fluxes] // 3, np.abs(flux)[entries.col[fluxes] // 3], minlength=size
-        )
+        row_star, row_term = np.divmod(entries.row, 3)
+        col_star, col_term = np.divmod(entries.col, 3)
+        itself = np.flatnonzero(row_star == col_star)
+        place = (row_star[itself], row_term[itself], col_term[itself])
+        blocks = np.zeros((size, 3, 3))
+        blocks[place] = entries.data[itself]
+        covariance = np.linalg.pinv(blocks, hermitian=True)
+        variance = np.diagonal(covariance, axis1=1, axis2=2)
+        fluxes = row_term + col_term == 0
+        reaching = np.abs(flux)[col_star[fluxes]]
+        near = np.bincount(row_star[fluxes], reaching, minlength=size)
         around = pixel_error * near
         with np.errstate(divide="ignore", invalid="ignore"):
-            return np.sqrt(variance[:, 0]) * around, np.sqrt(
-                variance[:, 1:].sum(axis=1)
-            ) * around / np.abs(flux)
+            flux_error = np.sqrt(variance[:, 0]) * around
+            shift_error = np.sqrt(variance[:, 1:].sum(axis=1)) * around
+            place_error_px = shift_error / np.abs(flux)
+        return flux_error, place_error_px
 
 
 class _Profiles:
@@ -159,7 +178,9 @@ class _Profiles:
     def __init__(self, place_px: FloatArray, sigma_px: float, reach_px: int, size_px: int) -> None:
         self.middle = np.rint(place_px).astype(np.intp)
         pixel = self.middle[:, None] + np.arange(-reach_px, reach_px + 1)
-        near, far = ((pixel - place_px[:, None] + side) / sigma_px for side in (-0.5, 0.5))
+        from_star_px = pixel - place_px[:, None]
+        near = (from_star_px - 0.5) / sigma_px
+        far = (from_star_px + 0.5) / sigma_px
         inside = (pixel >= 0) & (pixel < size_px)
         self.share = (ndtr(far) - ndtr(near)) * inside
         self.slope = (_bell(near) - _bell(far)) / sigma_px * inside
@@ -172,21 +193,25 @@ class _Profiles:
         width = self.share.shape[1]
         both = np.stack([self.share, self.slope], axis=1)
         # The pixel of the other star that is each pixel of this one; beyond its profile are zeros.
-        place = width + np.arange(width) + (self.middle[star] - self.middle[other])[:, None]
+        apart = self.middle[star] - self.middle[other]
+        place = width + np.arange(width) + apart[:, None]
         padded = np.pad(both, ((0, 0), (0, 0), (width, width)))
         return np.asarray(both[star] @ padded[other[:, None], :, place])
 
 
 def _bell(u: FloatArray) -> FloatArray:
+    """The standard normal density."""
     return np.asarray(np.exp(-0.5 * np.square(u)) / math.sqrt(2 * math.pi))
 
 
 def bright_pixels(image: FloatArray, floor: FloatArray) -> FloatArray:
     """Places (n, 2), px, of pixels above `floor` that no neighbour outshines, brightest first."""
-    top = (image > floor) & (image == ndimage.maximum_filter(image, 3, mode="constant"))
+    is_peak = image == ndimage.maximum_filter(image, 3, mode="constant")
+    top = (image > floor) & is_peak
     row, column = np.nonzero(top)
     order = np.argsort(-image[row, column], kind="stable")
-    return np.column_stack([column, row])[order].astype(np.float64)
+    places = np.column_stack([column[order], row[order]])
+    return places.astype(np.float64)
 
 
 def around(image: FloatArray, psf: Psf) -> FloatArray:
@@ -201,23 +226,28 @@ def star_psf(image: FloatArray) -> GaussianPsf:
     # A Gaussian of sigma s and its copy one pixel on correlate by exp(-1 / 4 s^2); the pixel's own
     # 1/12 px^2 is subtracted.
     power = np.vdot(image, image)
-    correlations = (
-        np.vdot(image[:, 1:], image[:, :-1]) / power,
-        np.vdot(image[1:], image[:-1]) / power,
-    )
-    x, y = (
-        math.sqrt(max(-0.25 / math.log(np.clip(part, 0.05, 0.999)) - 1 / 12, 0.04))
-        for part in correlations
-    )
+    along_x = np.vdot(image[:, 1:], image[:, :-1]) / power
+    along_y = np.vdot(image[1:], image[:-1]) / power
+    x = _sigma_px(float(along_x))
+    y = _sigma_px(float(along_y))
     first = GaussianPsf((x, y))
     bright = bright_pixels(image, RIPPLE_SHARE * around(image, first))
-    places = _apart(bright, first.footprint_px, (image.shape[1], image.shape[0]))
+    height, width = image.shape
+    places = _apart(bright, first.footprint_px, (width, height))
     points = star_points(image, places, first.footprint_px // 2 + 1)
     covariance = np.tile([x * x, y * y, 0.0], (len(places), 1))
     start = PointGaussians(places[:, 0], places[:, 1], covariance)
     fitted = fit_each(points, start, SIGMA_ROUNDS, alike=True)
     sigma_x, sigma_y = np.sqrt(fitted.covariance[0, :XY])
     return GaussianPsf((float(sigma_x), float(sigma_y)))
+
+
+def _sigma_px(correlation: float) -> float:
+    """The sigma of stars by the correlation of an image with itself one pixel on, kept to what a
+    star can have.
+    """
+    of_pixels_px2 = -0.25 / math.log(np.clip(correlation, 0.05, 0.999))
+    return math.sqrt(max(of_pixels_px2 - 1 / 12, 0.04))
 
 
 def star_points(image: FloatArray, places_px: FloatArray, reach_px: int) -> PointImages:
@@ -229,9 +259,8 @@ def star_points(image: FloatArray, places_px: FloatArray, reach_px: int) -> Poin
     columns = middle[:, 0, None] + steps
     images = padded[rows[:, :, None], columns[:, None, :]]
     none_px = np.zeros(len(middle))
-    return PointImages(
-        images, np.ones_like(images), middle[:, 0], middle[:, 1], none_px, has_level=False
-    )
+    weights = np.ones_like(images)
+    return PointImages(images, weights, middle[:, 0], middle[:, 1], none_px, has_level=False)
 
 
 def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) -> FloatArray:
@@ -240,9 +269,13 @@ def _apart(places_px: FloatArray, distance_px: float, size_px: tuple[int, int]) 
     """
     bright = places_px[: 4 * SIGMA_STARS]
     distance = np.abs(bright[:, None] - places_px[None]).max(axis=2)
-    edge = np.minimum(bright, np.array(size_px) - 1 - bright).min(axis=1)
-    alone = ((distance < distance_px).sum(axis=1) == 1) & (edge >= distance_px / 2)
-    return bright[alone if alone.any() else slice(None)][:SIGMA_STARS].copy()
+    last = np.array(size_px) - 1
+    edge = np.minimum(bright, last - bright).min(axis=1)
+    near_stars = (distance < distance_px).sum(axis=1)  # each is its own neighbour
+    alone = (near_stars == 1) & (edge >= distance_px / 2)
+    if alone.any():
+        bright = bright[alone]
+    return bright[:SIGMA_STARS].copy()
 
 
 def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
@@ -250,15 +283,16 @@ def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
     well: all stars at once.
     """
     start = places_px
-    shape = (image.shape[0], image.shape[1])
-    last = np.array([shape[1] - 1, shape[0] - 1])
+    height, width = image.shape
+    last = np.array([width - 1, height - 1])
     outwards = BEYOND_SIGMAS * np.array(psf.width_px)
-    low = np.where(start < 0.5, np.minimum(start, 0) - outwards, start - MAX_OFFSET_PX)
-    high = np.where(start > last - 0.5, np.maximum(start, last) + outwards, start + MAX_OFFSET_PX)
+    first_outside = np.minimum(start, 0) - outwards
+    last_outside = np.maximum(start, last) + outwards
+    low = np.where(start < 0.5, first_outside, start - MAX_OFFSET_PX)
+    high = np.where(start > last - 0.5, last_outside, start + MAX_OFFSET_PX)
     for _ in range(MAX_PLACE_STEPS):
-        step = np.clip(
-            shifts_px(StarTemplates(places_px, psf, shape).fit(image)), -MAX_STEP_PX, MAX_STEP_PX
-        )
+        fitted = StarTemplates(places_px, psf, (height, width)).fit(image)
+        step = np.clip(shifts_px(fitted), -MAX_STEP_PX, MAX_STEP_PX)
         before = places_px
         places_px = np.clip(places_px + step, low, high)
         if np.abs(places_px - before).max(initial=0.0) < MIN_STEP_PX:
@@ -269,7 +303,8 @@ def refined(image: FloatArray, places_px: FloatArray, psf: Psf) -> FloatArray:
 def shifts_px(fitted: FloatArray) -> FloatArray:
     """The shifts (n, 2) in a fit, px; 0 for a star without light."""
     flux = fitted[:, :1]
-    return np.divide(fitted[:, 1:], flux, out=np.zeros_like(fitted[:, 1:]), where=flux > 0)
+    moments = fitted[:, 1:]
+    return np.divide(moments, flux, out=np.zeros_like(moments), where=flux > 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -286,11 +321,10 @@ class Seeds:
         """How many stars there are, each of a blend counted."""
         return sum(max(len(hip), 1) for hip in self.hip)
 
-    def only(self, kept: npt.NDArray[np.bool_]) -> "Seeds":
-        """The seeds (n,) that are `kept`."""
-        return Seeds(
-            self.places_px[kept], [hip for hip, keep in zip(self.hip, kept, strict=True) if keep]
-        )
+    def only(self, chosen: npt.NDArray[np.bool_]) -> "Seeds":
+        """The seeds (n,) that are chosen."""
+        hip = list(itertools.compress(self.hip, chosen))
+        return Seeds(self.places_px[chosen], hip)
 
 
 def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
@@ -308,22 +342,28 @@ def find_seeds(golden: FloatArray, truth: Truth | None, psf: Psf) -> Seeds:
         )
     table = truth[np.argsort(-truth["electrons_per_s"], kind="stable")]
     places = _places_px(table)
-    listed = _blended(Seeds(places, [_name_of(row) for row in table]), blend_px)
+    names = list(map(_name_of, table))
+    listed = _blended(Seeds(places, names), blend_px)
     # The light of a star off the image is brightest at the image's edge.
-    shown = np.clip(places, 0, np.array([golden.shape[1], golden.shape[0]]) - 1)
-    away = _nearest(shown, bright)[0] > blend_px
-    unlisted = nameless_seeds(bright[away], psf)
-    return Seeds(np.concatenate([listed.places_px, unlisted.places_px]), listed.hip + unlisted.hip)
+    height, width = golden.shape
+    last = np.array([width - 1, height - 1])
+    shown = np.clip(places, 0, last)
+    distance_px, _ = nearest_places(shown, bright)
+    unlisted = nameless_seeds(bright[distance_px > blend_px], psf)
+    every_place = np.concatenate([listed.places_px, unlisted.places_px])
+    return Seeds(every_place, listed.hip + unlisted.hip)
 
 
 def nameless_seeds(places_px: FloatArray, psf: Psf) -> Seeds:
     """Seeds at places (n, 2), px, brightest first; those closer than a blend are one."""
-    return _blended(Seeds(places_px, [()] * len(places_px)), blend_distance_px(psf))
+    nameless = Seeds(places_px, [()] * len(places_px))
+    return _blended(nameless, blend_distance_px(psf))
 
 
 def blend_distance_px(psf: Psf) -> float:
     """The distance within which two stars are one blend."""
-    return max(BLEND_SIGMAS * max(psf.width_px), BLEND_PX)
+    widest_px = max(psf.width_px)
+    return max(BLEND_SIGMAS * widest_px, BLEND_PX)
 
 
 def describes(truth: Truth, image: FloatArray) -> bool:
@@ -331,9 +371,8 @@ def describes(truth: Truth, image: FloatArray) -> bool:
     (height, width).
     """
     psf = star_psf(image)
-    return _has(
-        truth, bright_pixels(image, RIPPLE_SHARE * around(image, psf)), blend_distance_px(psf)
-    )
+    bright = bright_pixels(image, RIPPLE_SHARE * around(image, psf))
+    return _has(truth, bright, blend_distance_px(psf))
 
 
 def names_at(
@@ -342,27 +381,33 @@ def names_at(
     """The HIP number of the table's star at each place (n, 2), px, where it has one."""
     if truth is None or not len(truth) or not len(places_px):
         return [()] * len(places_px)
-    distance, nearest = _nearest(_places_px(truth), places_px)
-    return [
-        _name_of(truth[k]) if d <= blend_px else () for d, k in zip(distance, nearest, strict=True)
-    ]
+    distances_px, nearest = nearest_places(_places_px(truth), places_px)
+    names: list[tuple[int | str, ...]] = []
+    for distance_px, row in zip(distances_px, truth[nearest], strict=True):
+        names.append(_name_of(row) if distance_px <= blend_px else ())
+    return names
 
 
 def _name_of(row: np.void) -> tuple[int | str, ...]:
+    """A star's HIP number, or a body's name."""
     return (str(row["name"]) or int(row["hip"]),)
 
 
 def _has(truth: Truth, found_px: FloatArray, blend_px: float) -> bool:
+    """Whether a table has at least half of the brightest of places (n, 2), px."""
     if not len(truth) or not len(found_px):
         return False
-    return bool(np.median(_nearest(_places_px(truth), found_px[:KNOWN_STARS])[0]) <= blend_px)
+    distances_px, _ = nearest_places(_places_px(truth), found_px[:KNOWN_STARS])
+    return bool(np.median(distances_px) <= blend_px)
 
 
 def _places_px(truth: Truth) -> FloatArray:
+    """The places (n, 2), px, of a table's stars."""
     return np.column_stack([truth["x_px"], truth["y_px"]])
 
 
-def _nearest(known_px: FloatArray, places_px: FloatArray) -> tuple[FloatArray, IntArray]:
+def nearest_places(known_px: FloatArray, places_px: FloatArray) -> tuple[FloatArray, IntArray]:
+    """The distance, px, and the row of the known place nearest to each place (n,)."""
     distance_px, nearest = cKDTree(known_px).query(places_px)
     return np.asarray(distance_px), np.asarray(nearest, dtype=np.intp)
 
@@ -371,13 +416,15 @@ def _blended(seeds: Seeds, blend_px: float) -> Seeds:
     """One seed for each chain of near ones, at the place of its first, which is its brightest."""
     size = len(seeds.places_px)
     pairs = cKDTree(seeds.places_px).query_pairs(blend_px, output_type="ndarray")
-    links = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(size, size))
+    ends = (pairs[:, 0], pairs[:, 1])
+    links = coo_array((np.ones(len(pairs)), ends), shape=(size, size))
+    group = np.zeros(size, dtype=np.intp)
     if size:
-        group = np.asarray(connected_components(links, directed=False)[1], dtype=np.intp)
-    else:
-        group = np.zeros(0, dtype=np.intp)
+        _, labels = connected_components(links, directed=False)
+        group = np.asarray(labels, dtype=np.intp)
     _, first = np.unique(group, return_index=True)
     hips: dict[int, tuple[int | str, ...]] = {}
     for label, hip in zip(group.tolist(), seeds.hip, strict=True):
         hips[label] = hips.get(label, ()) + hip
-    return Seeds(seeds.places_px[first], [hips[label] for label in group[first].tolist()])
+    first_hips = [hips[label] for label in group[first].tolist()]
+    return Seeds(seeds.places_px[first], first_hips)

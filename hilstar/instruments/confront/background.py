@@ -17,8 +17,6 @@ from hilstar.basics.units import MAD_TO_SIGMA
 
 PATTERN_CLIP = 4.0  # sigmas beyond which a pixel of one photograph does not count
 FOUND_SIGMAS = 4.0
-
-
 KINDS = ("response", "offsets_dn", "columns_dn", "rows_dn")
 NAMES = ("response of pixels", "offsets of pixels", "of columns", "of rows")
 EIGHT_NEIGHBOURS = np.ones((3, 3), dtype=np.int8)
@@ -29,6 +27,9 @@ CLIP = 2.5  # sigmas beyond which a pixel of a block is a star's
 CLIPPED = 0.9543  # sigma of a normal distribution cut at 2.5 sigma
 ROUNDS = 4
 BRIGHT_BLOCK, NOISY_BLOCK = 0.5, 1.2  # sigmas over its neighbours' median, and times their noise
+# radii of rings, in half of the shorter side: three of sky, and two in the corners of the image
+RINGS = (0.2, 0.5, 0.8, 1.15, 1.25)
+RING_WIDTH = 0.1
 MIN_RING_PX = 100
 KERNEL_PX = 1.0  # sigma of the Gaussian by which sources are looked for
 THRESHOLD = 5.0
@@ -51,37 +52,47 @@ class FixedPattern:
     @property
     def rms(self) -> tuple[float, ...]:
         """Response, pixels, columns, rows; 0 where it is within FOUND_SIGMAS of its error."""
-        return tuple(
-            math.sqrt(s) if s > FOUND_SIGMAS * e else 0.0
-            for s, e in zip(self.squares, self.errors, strict=True)
-        )
+        rms = []
+        for square, error in zip(self.squares, self.errors, strict=True):
+            is_known = square > FOUND_SIGMAS * error
+            rms.append(math.sqrt(square) if is_known else 0.0)
+        return tuple(rms)
 
     def variance_dn2(self, light_dn: FloatArray) -> FloatArray:
         """Variance of a pixel about its neighbours at a level of light."""
         response, *offsets = self.rms
-        return np.asarray((response * light_dn) ** 2 + math.fsum(offset**2 for offset in offsets))
+        offset_variance = math.fsum(offset**2 for offset in offsets)
+        return np.asarray((response * light_dn) ** 2 + offset_variance)
 
     def words(self) -> str:
         """What was found, or under what it is (two sigmas)."""
         parts = []
-        for name, square, error, rms in zip(
-            NAMES, self.squares, self.errors, self.rms, strict=True
-        ):
-            if not math.isfinite(error):
+        for k, name in enumerate(NAMES):
+            if not math.isfinite(self.errors[k]):
                 continue
-            times, unit = (100, "%") if name == NAMES[0] else (1, "DN")
-            if rms:
-                found = f"{times * rms:.3g} +- {times * error / (2 * rms):.2g}"
+            if name == NAMES[0]:
+                text = f"{self._figure(k, 100)} %"
             else:
-                found = ""
-            parts.append(
-                f"{name} {found or f'under {times * math.sqrt(max(square, 0.0) + 2 * error):.2g}'}"
-                f" {unit}"
-            )
+                text = f"{self._figure(k, 1)} DN"
+            parts.append(f"{name} {text}")
         return ", ".join(parts)
 
+    def _figure(self, k: int, factor: float) -> str:
+        """Component `k` times a factor, with its error, or its upper limit."""
+        error = self.errors[k]
+        rms = self.rms[k]
+        if rms:
+            return f"{factor * rms:.3g} +- {factor * error / (2 * rms):.2g}"
+        limit = math.sqrt(max(self.squares[k], 0.0) + 2 * error)
+        return f"under {factor * limit:.2g}"
 
-NO_PATTERN = FixedPattern()
+
+@dataclass(frozen=True, slots=True)
+class _Square:
+    """The square of a component, and one sigma of it."""
+
+    value: float
+    error: float
 
 
 def fixed_pattern(
@@ -95,71 +106,70 @@ def fixed_pattern(
     response where they do not.
     """
     pixels, shares, columns, rows, light, inverse = (_Pairs() for _ in range(6))
-    for off, level, use in photographs:
-        use = (
-            use
-            & (np.abs(off) < PATTERN_CLIP * math.sqrt(float((off[use] ** 2).mean())))
-            & (level > 0)
-        )
+    for off, level, mask in photographs:
+        rms = math.sqrt(float((off[mask] ** 2).mean()))
+        is_quiet = np.abs(off) < PATTERN_CLIP * rms
+        use = mask & is_quiet & (level > 0)
         off = np.where(use, off - off[use].mean(), 0.0)
         level = np.where(use, level, 1.0)
         for axis, sums in ((0, columns), (1, rows)):
             count = use.sum(axis=axis)
-            sums.add(off.sum(axis=axis) / np.maximum(count, 1), count > use.shape[axis] / 4)
+            mean = off.sum(axis=axis) / np.maximum(count, 1)
+            sums.add(mean, count > use.shape[axis] / 4)
         # neighbours' differences: what is smooth is the sky's or the lens's
         off = (off[:, 1:] - off[:, :-1]) / math.sqrt(2)
         use = use[:, 1:] & use[:, :-1]
         level = (level[:, 1:] + level[:, :-1]) / 2
-        for sums, values in (
-            (pixels, off),
-            (shares, off / level),
-            (light, level),
-            (inverse, 1 / level),
-        ):
-            sums.add(values, use)
+        pixels.add(off, use)
+        shares.add(off / level, use)
+        light.add(level, use)
+        inverse.add(1 / level, use)
     if pixels.photographs < 2 or not pixels.pairs:
         return None
-    (column, column_error), (row, row_error), (both, both_error), (share, share_error) = (
-        component.mean() for component in (columns, rows, pixels, shares)
-    )
     height = use.shape[0]
     width = use.shape[1] + 1
-    (column, column_error), (row, row_error) = _lines_alone(
-        (column, column_error), (row, row_error), both, (height, width)
-    )
-    lit = light.mean()[0]
-    dim = inverse.mean()[0]
-    both = both - max(column, 0.0)
-    share = share - max(column, 0.0) * dim
+    both = pixels.mean()
+    share = shares.mean()
+    column, row = _lines_alone(columns.mean(), rows.mean(), both.value, (height, width))
+    lit = light.mean().value
+    dim = inverse.mean().value
+    # columns' offsets are in the differences of neighbours, too
+    column_square = max(column.value, 0.0)
+    both_square = both.value - column_square
+    share_square = share.value - column_square * dim
     # both = response^2 lit + offsets^2, share = response^2 + offsets^2 dim
-    apart = lit * dim - 1
-    response = (both * dim - share) / apart
-    offset = (share * lit - both) / apart
-    response_error = math.hypot(both_error * dim, share_error) / apart
-    offset_error = math.hypot(share_error * lit, both_error) / apart
-    if offset < FOUND_SIGMAS * offset_error:
-        response = both / lit
-        response_error = both_error / lit
-    return FixedPattern(
-        (response, offset, column, row), (response_error, offset_error, column_error, row_error)
+    determinant = lit * dim - 1
+    response = _Square(
+        (both_square * dim - share_square) / determinant,
+        math.hypot(both.error * dim, share.error) / determinant,
     )
+    offset = _Square(
+        (share_square * lit - both_square) / determinant,
+        math.hypot(share.error * lit, both.error) / determinant,
+    )
+    if offset.value < FOUND_SIGMAS * offset.error:
+        response = _Square(both_square / lit, both.error / lit)
+    components = (response, offset, column, row)
+    values = tuple(square.value for square in components)
+    errors = tuple(square.error for square in components)
+    return FixedPattern(values, errors)
 
 
 def _lines_alone(
-    column: tuple[float, float], row: tuple[float, float], both: float, size: tuple[int, int]
-) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Squares of columns and rows, with their errors, without the share that pixels' own patterns
-    leave in their means.
+    columns: _Square, rows: _Square, both: float, size: tuple[int, int]
+) -> tuple[_Square, _Square]:
+    """Squares of columns and rows without the share that pixels' own patterns leave in their
+    means.
 
     `both` is the square of pixels and columns together, `size` (height, width).
     """
     height, width = size
-    of_columns = (column[0] - both / height) / (1 - 1 / height)
-    pixel = max(both - of_columns, 0.0)
-    of_rows = row[0] - pixel / width
-    column_error = math.hypot(column[1], math.sqrt(2 / width) * pixel / height)
-    row_error = math.hypot(row[1], math.sqrt(2 / height) * pixel / width)
-    return (of_columns, column_error), (of_rows, row_error)
+    column = (columns.value - both / height) / (1 - 1 / height)
+    pixel = max(both - column, 0.0)
+    row = rows.value - pixel / width
+    column_error = math.hypot(columns.error, math.sqrt(2 / width) * pixel / height)
+    row_error = math.hypot(rows.error, math.sqrt(2 / height) * pixel / width)
+    return _Square(column, column_error), _Square(row, row_error)
 
 
 class _Pairs:
@@ -171,21 +181,22 @@ class _Pairs:
 
     def add(self, values: FloatArray, use: BoolArray) -> None:
         self.photographs += 1
-        values = np.where(use, values, 0.0)
-        self._sum, self._squares, self._count = (
-            self._sum + values,
-            self._squares + values**2,
-            self._count + use,
-        )
+        used = np.where(use, values, 0.0)
+        self._sum = self._sum + used
+        self._squares = self._squares + used**2
+        self._count = self._count + use
 
     @property
     def pairs(self) -> float:
         return float((self._count * (self._count - 1) / 2).sum())
 
-    def mean(self) -> tuple[float, float]:
-        product = float((self._sum**2 - self._squares).sum()) / 2 / max(self.pairs, 1.0)
-        variance = float(self._squares.sum()) / max(float(self._count.sum()), 1.0)
-        return product, variance / math.sqrt(max(self.pairs, 1.0))
+    def mean(self) -> _Square:
+        """The mean product, with its error."""
+        pairs = max(self.pairs, 1.0)
+        product = float((self._sum**2 - self._squares).sum()) / 2 / pairs
+        values = max(float(self._count.sum()), 1.0)
+        variance = float(self._squares.sum()) / values
+        return _Square(product, variance / math.sqrt(pairs))
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,35 +224,32 @@ def sky_level(dn: FloatArray, step: float) -> SkyLevel:
     columns = max(width // side, 1)
     high = height // rows
     wide = width // columns
-    blocks = (
-        dn[: rows * high, : columns * wide]
-        .reshape(rows, high, columns, wide)
-        .swapaxes(1, 2)
-        .reshape(rows, columns, -1)
-    )
+    whole_blocks = dn[: rows * high, : columns * wide].reshape(rows, high, columns, wide)
+    blocks = whole_blocks.swapaxes(1, 2).reshape(rows, columns, -1)
+    rounding = step / 12**0.5
     middle = np.median(blocks, axis=2, keepdims=True)
-    sigma = MAD_TO_SIGMA * np.median(np.abs(blocks - middle), axis=2, keepdims=True) + step / 2
+    deviation = np.median(np.abs(blocks - middle), axis=2, keepdims=True)
+    # half a step more: the deviation of most pixels is 0 where the noise is under a step
+    sigma = MAD_TO_SIGMA * deviation + step / 2
     for _ in range(ROUNDS):
         is_sky = np.abs(blocks - middle) <= CLIP * sigma
         count = np.maximum(is_sky.sum(axis=2, keepdims=True), 1)
         middle = (blocks * is_sky).sum(axis=2, keepdims=True) / count
-        sigma = (
-            np.sqrt(((blocks - middle) ** 2 * is_sky).sum(axis=2, keepdims=True) / count) / CLIPPED
-        )
-        sigma = np.maximum(sigma, step / 12**0.5)
+        squares = ((blocks - middle) ** 2 * is_sky).sum(axis=2, keepdims=True)
+        sigma = np.maximum(np.sqrt(squares / count) / CLIPPED, rounding)
     level = middle[..., 0]
     noise = sigma[..., 0]
     if min(level.shape) > 2:  # a block full of a bright star's light is as its neighbours
-        others, quiet = (ndimage.median_filter(part, 3, mode="nearest") for part in (level, noise))
-        bright = level > others + BRIGHT_BLOCK * quiet
-        level = np.where(bright, others, level)
+        others = ndimage.median_filter(level, 3, mode="nearest")
+        quiet = ndimage.median_filter(noise, 3, mode="nearest")
+        is_bright = level > others + BRIGHT_BLOCK * quiet
+        level = np.where(is_bright, others, level)
         noise = np.minimum(noise, NOISY_BLOCK * quiet)
-    places = []
-    for size, size_px in ((height, high), (width, wide)):
-        places.append((np.arange(size) - (size_px - 1) / 2) / size_px)
-    return SkyLevel(
-        _between(level, *places), np.maximum(_between(noise, *places), step / 12**0.5), side
-    )
+    row_places = (np.arange(height) - (high - 1) / 2) / high
+    column_places = (np.arange(width) - (wide - 1) / 2) / wide
+    smooth_level = _between(level, row_places, column_places)
+    smooth_noise = _between(noise, row_places, column_places)
+    return SkyLevel(smooth_level, np.maximum(smooth_noise, rounding), side)
 
 
 def is_round(dn: FloatArray) -> bool:
@@ -250,30 +258,33 @@ def is_round(dn: FloatArray) -> bool:
     """
     height, width = dn.shape
     y, x = np.mgrid[:height, :width]
-    radius = np.hypot(x - (width - 1) / 2, y - (height - 1) / 2) / (min(height, width) / 2)
-    rings = [dn[(radius >= low) & (radius < low + 0.1)] for low in (0.2, 0.5, 0.8, 1.15, 1.25)]
+    distance_px = np.hypot(x - (width - 1) / 2, y - (height - 1) / 2)
+    radius = distance_px / (min(height, width) / 2)
+    rings = [dn[(radius >= low) & (radius < low + RING_WIDTH)] for low in RINGS]
     if min(map(len, rings)) < MIN_RING_PX:
         return False
     *sky, near, far = map(np.median, rings)
     noise = MAD_TO_SIGMA * float(np.median(np.abs(rings[-1] - far)))
     lit = min(sky[:2]) - far
     unsure = 4 * noise / len(rings[-1]) ** 0.5
-    return bool(lit > max(0.3 * noise, 10 * unsure) and abs(near - far) < 0.05 * lit + unsure)
+    is_lit = lit > max(0.3 * noise, 10 * unsure)
+    are_corners_level = abs(near - far) < 0.05 * lit + unsure
+    return bool(is_lit and are_corners_level)
 
 
 def _between(blocks: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
     """Values of blocks at places, cubic between their middles and straight on beyond."""
     from scipy.interpolate import make_interp_spline
 
-    for axis, at in ((0, rows), (1, columns)):
+    for axis, places in ((0, rows), (1, columns)):
         count = blocks.shape[axis]
         if count == 1:
-            blocks = np.repeat(blocks, len(at), axis=axis)
+            blocks = np.repeat(blocks, len(places), axis=axis)
             continue
         spline = make_interp_spline(np.arange(count), blocks, k=min(3, count - 1), axis=axis)
-        inner = np.clip(at, 0, count - 1)
+        inner = np.clip(places, 0, count - 1)
         slope = spline.derivative()(inner)
-        beyond = (at - inner).reshape((-1, 1) if axis == 0 else (1, -1))
+        beyond = np.expand_dims(places - inner, 1 - axis)
         blocks = spline(inner) + slope * beyond
     return np.asarray(blocks)
 
@@ -300,40 +311,55 @@ class FoundSources:
         return len(self.x_px)
 
     @property
+    def places_px(self) -> FloatArray:
+        """Places (n, 2), x and y."""
+        return np.column_stack([self.x_px, self.y_px])
+
+    @property
     def trail(self) -> BoolArray:
         """Which are long and thin."""
-        return (self.length_px > MIN_TRAIL_PX) & (self.length_px > MIN_TRAIL_RATIO * self.width_px)
+        is_thin = self.length_px > MIN_TRAIL_RATIO * self.width_px
+        return is_thin & (self.length_px > MIN_TRAIL_PX)
 
 
 def find_sources(sigmas: FloatArray) -> FoundSources:
     """Sources of an image in sigmas: connected pixels of it, smoothed, above THRESHOLD."""
-    norm = float(np.sqrt((_kernel(sigmas.shape) ** 2).sum()))
+    # noise of one sigma a pixel is one sigma in the smoothed image, too
+    norm = float(np.sqrt((_kernel() ** 2).sum()))
     smooth = ndimage.gaussian_filter(sigmas, KERNEL_PX, mode="nearest", truncate=4.0) / norm
-    above = smooth > THRESHOLD
-    labels, count = ndimage.label(above, structure=EIGHT_NEIGHBOURS)
-    y, x = np.nonzero(above)
-    blob = labels[y, x] - 1
+    is_above = smooth > THRESHOLD
+    labels, count = ndimage.label(is_above, structure=EIGHT_NEIGHBOURS)
+    y, x = np.nonzero(is_above)
+    source = labels[y, x] - 1
     value = smooth[y, x]
-    total = np.maximum(np.bincount(blob, value, minlength=count), 1e-9)
-    mx, my = (np.bincount(blob, value * part, minlength=count) / total for part in (x, y))
-    area = np.maximum(np.bincount(blob, minlength=count), 1)
-    dx = x - mx[blob]
-    dy = y - my[blob]
-    xx, yy, xy = (
-        np.bincount(blob, part, minlength=count) / area + 1 / 12 * same
-        for part, same in ((dx * dx, 1), (dy * dy, 1), (dx * dy, 0))
-    )
+    area = np.maximum(np.bincount(source, minlength=count), 1)
+    total = np.maximum(np.bincount(source, value, minlength=count), 1e-9)
+    x_px = np.bincount(source, value * x, minlength=count) / total
+    y_px = np.bincount(source, value * y, minlength=count) / total
+    dx = x - x_px[source]
+    dy = y - y_px[source]
+    # second moments of the pixels' area, each of them a square: 1/12 of its own along an axis
+    xx = np.bincount(source, dx * dx, minlength=count) / area + 1 / 12
+    yy = np.bincount(source, dy * dy, minlength=count) / area + 1 / 12
+    xy = np.bincount(source, dx * dy, minlength=count) / area
     middle = (xx + yy) / 2
     spread = np.hypot((xx - yy) / 2, xy)
-    length = np.sqrt(12 * (middle + spread))
-    width = np.sqrt(12 * np.maximum(middle - spread, 1 / 12))
+    # sides of the rectangle that has these moments
+    length_px = np.sqrt(12 * (middle + spread))
+    width_px = np.sqrt(12 * np.maximum(middle - spread, 1 / 12))
     peak = np.zeros(count)
-    np.maximum.at(peak, blob, value)
-    fwhm = 2 * np.sqrt(np.bincount(blob, value > peak[blob] / 2, minlength=count) / np.pi)
+    np.maximum.at(peak, source, value)
+    half_area = np.bincount(source, value > peak[source] / 2, minlength=count)
+    fwhm_px = 2 * np.sqrt(half_area / np.pi)
     order = np.argsort(-peak * np.sqrt(area), kind="stable")[:MAX_SOURCES]
-    single = _single(sigmas, mx[order], my[order])
     return FoundSources(
-        mx[order], my[order], peak[order], length[order], width[order], fwhm[order], single
+        x_px=x_px[order],
+        y_px=y_px[order],
+        snr=peak[order],
+        length_px=length_px[order],
+        width_px=width_px[order],
+        fwhm_px=fwhm_px[order],
+        single=_single(sigmas, x_px[order], y_px[order]),
     )
 
 
@@ -348,15 +374,16 @@ def source_mask(sources: FoundSources, sigmas: FloatArray, grow_px: int) -> Bool
     spots[rows, columns] = True
     lit = np.asarray(ndimage.binary_dilation(spots, iterations=grow_px))
     for k in np.flatnonzero(sources.length_px > 2 * grow_px):
-        half = min(round(float(sources.length_px[k]) / 2), MAX_MASK_PX) + grow_px
-        lit[
-            max(rows[k] - half, 0) : rows[k] + half + 1,
-            max(columns[k] - half, 0) : columns[k] + half + 1,
-        ] = True
+        half_length_px = round(float(sources.length_px[k]) / 2)
+        half_px = min(half_length_px, MAX_MASK_PX) + grow_px
+        first_row = max(rows[k] - half_px, 0)
+        first_column = max(columns[k] - half_px, 0)
+        lit[first_row : rows[k] + half_px + 1, first_column : columns[k] + half_px + 1] = True
     return lit
 
 
-def _kernel(shape: tuple[int, ...]) -> FloatArray:
+def _kernel() -> FloatArray:
+    """The Gaussian (17, 17) by which sources are looked for; sums to 1."""
     spot = np.zeros((17, 17))
     spot[8, 8] = 1
     return np.asarray(ndimage.gaussian_filter(spot, KERNEL_PX, truncate=4.0))
@@ -366,12 +393,20 @@ def _single(sigmas: FloatArray, x_px: FloatArray, y_px: FloatArray) -> BoolArray
     """Whether the highest pixel about a place has no light beside it: less than a star of 0.35
     px of sigma leaves there.
     """
-    padded = np.pad(sigmas, 3)
-    reach = np.arange(-1, 2)
-    rows, columns = (np.rint(place).astype(np.intp)[:, None] + reach + 3 for place in (y_px, x_px))
+    margin = 3
+    padded = np.pad(sigmas, margin)
+    reach = np.arange(-1, 2) + margin
+    middle_row = np.rint(y_px).astype(np.intp)
+    middle_column = np.rint(x_px).astype(np.intp)
+    rows = middle_row[:, None] + reach
+    columns = middle_column[:, None] + reach
     patch = padded[rows[:, :, None], columns[:, None, :]].reshape(len(x_px), 9)
-    best = patch.argmax(axis=1)
-    row = np.rint(y_px).astype(np.intp) + best // 3 + 2
-    column = np.rint(x_px).astype(np.intp) + best % 3 + 2
-    around = [padded[row + dy, column + dx] for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0))]
-    return np.asarray(np.mean(around, axis=0) + 0.75 < 0.04 * padded[row, column])
+    highest = patch.argmax(axis=1)
+    row = middle_row + highest // 3 + margin - 1
+    column = middle_column + highest % 3 + margin - 1
+    beside = []
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        beside.append(padded[row + dy, column + dx])
+    # 0.75 is 1.5 sigmas of the noise of a mean of four
+    highest_beside = np.mean(beside, axis=0) + 0.75
+    return np.asarray(highest_beside < 0.04 * padded[row, column])

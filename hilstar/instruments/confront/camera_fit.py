@@ -76,7 +76,7 @@ class Places:
     vectors: FloatArray
 
     def at(self, chosen: BoolArray | IntArray) -> "Places":
-        """Some of them."""
+        """The places that are `chosen`, by a mask or by their numbers."""
         return Places(
             self.x_px[chosen], self.y_px[chosen], self.sigma_px[chosen], self.vectors[chosen]
         )
@@ -103,7 +103,8 @@ class Pointing:
     def altitude_deg(self) -> float | None:
         """Height of the boresight over the horizon, where the air or refraction told it."""
         if self.air is not None:
-            return math.degrees(math.asin(float(np.clip(self.boresight @ self.air.up, -1, 1))))
+            sine = float(np.clip(self.boresight @ self.air.up, -1, 1))
+            return math.degrees(math.asin(sine))
         if self.zenith is None:
             return None
         return 90 - math.degrees(math.atan(math.hypot(*self.zenith)))
@@ -114,12 +115,14 @@ class Pointing:
             return self.air.bent(vectors)
         if self.zenith is None:
             return vectors
-        matrix = to_matrix(self.q_icrs_to_cam)
-        return np.asarray(refracted(vectors @ matrix.T, np.array([self.zenith])) @ matrix)
+        icrs_to_cam = to_matrix(self.q_icrs_to_cam)
+        bent = refracted(vectors @ icrs_to_cam.T, np.array([self.zenith]))
+        return np.asarray(bent @ icrs_to_cam)
 
     def places_px(self, camera: Camera, vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Pixels of directions (n, 3), ICRS."""
-        return camera.project(self.seen(vectors) @ to_matrix(self.q_icrs_to_cam).T)
+        """Pixels of directions (n, 3), ICRS; NaN for those that the camera has no place for."""
+        icrs_to_cam = to_matrix(self.q_icrs_to_cam)
+        return camera.project(self.seen(vectors) @ icrs_to_cam.T)
 
 
 def refracted(cam: FloatArray, zenith: FloatArray) -> FloatArray:
@@ -153,9 +156,9 @@ class CameraFit:
         residuals = []
         for photograph, pointing in zip(photographs, self.pointings, strict=True):
             x, y = pointing.places_px(self.camera, photograph.vectors)
-            residuals.append(
-                np.nan_to_num(np.column_stack([photograph.x_px - x, photograph.y_px - y]), nan=1e3)
-            )
+            off_px = np.column_stack([photograph.x_px - x, photograph.y_px - y])
+            # a star that the lens has no place for is far off
+            residuals.append(np.nan_to_num(off_px, nan=1e3))
         return residuals
 
 
@@ -168,22 +171,24 @@ def with_values(camera: Camera, values: dict[str, float]) -> Camera:
         old = camera.lens or Lens()
         k1, k2, k3 = old.radial
         p1, p2 = old.tangential
-        lens = Lens(
-            (values.get("k1", k1), values.get("k2", k2), k3),
-            (values.get("p1", p1), values.get("p2", p2)),
-        )
+        radial = (values.get("k1", k1), values.get("k2", k2), k3)
+        tangential = (values.get("p1", p1), values.get("p2", p2))
+        lens = Lens(radial, tangential)
     cx, cy = camera.principal_point_px
+    scale = math.exp(values.get("log_focal", 0.0))
     return replace(
         camera,
-        focal_length_px=camera.focal_length_px * math.exp(values.get("log_focal", 0.0)),
+        focal_length_px=camera.focal_length_px * scale,
         principal_point_px=(cx + values.get("centre_x", 0.0), cy + values.get("centre_y", 0.0)),
         lens=lens,
     )
 
 
 class _CameraLoss:
-    """The residuals of places in sigmas by a camera's numbers, each photograph's turn, and its
-    zenith where that is fitted.
+    """The residuals of places, in sigmas, as a function of numbers: those of the camera by `names`,
+    three of each photograph's turn, and two of its zenith where that is fitted.
+
+    `owner` (n,) is the photograph of each star.
     """
 
     def __init__(
@@ -197,70 +202,65 @@ class _CameraLoss:
         self.base = base
         self.pointings = pointings
         self.names = names
-        self.owner = np.repeat(
-            np.arange(len(photographs)), [len(photograph.x_px) for photograph in photographs]
-        )
-        self.x_px, self.y_px, sigma_px = (
-            np.concatenate([getattr(photograph, name) for photograph in photographs])
-            for name in ("x_px", "y_px", "sigma_px")
-        )
+        counts = [len(photograph.x_px) for photograph in photographs]
+        self.owner = np.repeat(np.arange(len(photographs)), counts)
+        self.x_px = np.concatenate([photograph.x_px for photograph in photographs])
+        self.y_px = np.concatenate([photograph.y_px for photograph in photographs])
+        sigma_px = np.concatenate([photograph.sigma_px for photograph in photographs])
         self.sigma_px = np.hypot(sigma_px, floor_px)
-        star_vectors = [  # in cam as it is, behind an air that is known
-            (photograph.air.bent(places.vectors) if photograph.air is not None else places.vectors)
-            @ to_matrix(photograph.q_icrs_to_cam).T
-            for photograph, places in zip(pointings, photographs, strict=True)
-        ]
-        self.cam = np.concatenate(star_vectors)
-        self.bent = np.array(
-            [photograph.zenith is not None and photograph.air is None for photograph in pointings],
-            dtype=bool,
-        )
+        cam = []
+        bent = []
+        for pointing, photograph in zip(pointings, photographs, strict=True):
+            vectors = photograph.vectors
+            if pointing.air is not None:
+                # an air that is known does not change with the numbers
+                vectors = pointing.air.bent(vectors)
+            cam.append(vectors @ to_matrix(pointing.q_icrs_to_cam).T)
+            bent.append(pointing.zenith is not None and pointing.air is None)
+        self.cam = np.concatenate(cam)
+        self.bent = np.array(bent, dtype=bool)
         self.zenith_of = np.cumsum(self.bent) - 1  # the row of a photograph's zenith
 
     def start(self) -> FloatArray:
         """The numbers of the base and the pointings as they are."""
         lens = self.base.lens or Lens()
         lens_values = dict(zip(LENS_NAMES, (*lens.radial[:2], *lens.tangential), strict=True))
+        camera_numbers = [lens_values.get(name, 0.0) / STEPS[name] for name in self.names]
+        turns = np.zeros(3 * len(self.pointings))
         zeniths = []
         for pointing, bent in zip(self.pointings, self.bent, strict=True):
             if bent and pointing.zenith:
                 zeniths.append(pointing.zenith)
-        turns = np.zeros(3 * len(self.pointings))
-        return np.concatenate(
-            [
-                [lens_values.get(name, 0.0) / STEPS[name] for name in self.names],
-                turns,
-                np.ravel(zeniths),
-            ]
-        )
+        return np.concatenate([camera_numbers, turns, np.ravel(zeniths)])
 
     def parts(self, numbers: FloatArray) -> tuple[Camera, FloatArray, FloatArray]:
         """The camera, each photograph's turn (m, 4), and the fitted zeniths (z, 2) of numbers."""
-        camera_count = len(self.names)
-        last = len(self.names) + 3 * len(self.pointings)
-        camera = with_values(
-            self.base,
-            {name: STEPS[name] * float(n) for name, n in zip(self.names, numbers, strict=False)},
-        )
+        first_turn = len(self.names)
+        first_zenith = first_turn + 3 * len(self.pointings)
+        values = {}
+        for name, number in zip(self.names, numbers, strict=False):
+            values[name] = STEPS[name] * float(number)
+        camera = with_values(self.base, values)
         # the image's middle stays where it is when the principal point moves: else the loss is one
         # long valley
-        dx, dy = (
-            a - b
-            for a, b in zip(camera.principal_point_px, self.base.principal_point_px, strict=True)
-        )
-        follow = np.array([dy, -dx, 0.0]) / camera.focal_length_px
-        turns = from_rotation_vectors(
-            ATTITUDE_STEP_RAD * numbers[camera_count:last].reshape(-1, 3) + follow
-        )
-        return camera, turns, numbers[last:].reshape(-1, 2)
+        cx, cy = camera.principal_point_px
+        base_cx, base_cy = self.base.principal_point_px
+        follow = np.array([cy - base_cy, -(cx - base_cx), 0.0]) / camera.focal_length_px
+        turn_numbers = numbers[first_turn:first_zenith].reshape(-1, 3)
+        turns = from_rotation_vectors(ATTITUDE_STEP_RAD * turn_numbers + follow)
+        return camera, turns, numbers[first_zenith:].reshape(-1, 2)
 
     def unpacked(self, numbers: FloatArray) -> tuple[Camera, tuple[Pointing, ...]]:
+        """The camera and the pointings of numbers."""
         camera, turns, zeniths = self.parts(numbers)
         pointings = []
-        for p, q in zip(self.pointings, turns, strict=True):
-            pointings.append(replace(p, q_icrs_to_cam=multiply(q, p.q_icrs_to_cam)))
-        for i in np.flatnonzero(self.bent):
-            pointings[i] = replace(pointings[i], zenith=tuple(zeniths[self.zenith_of[i]].tolist()))
+        for k, pointing in enumerate(self.pointings):
+            zenith = pointing.zenith
+            if self.bent[k]:
+                x, y = zeniths[self.zenith_of[k]].tolist()
+                zenith = (x, y)
+            q_icrs_to_cam = multiply(turns[k], pointing.q_icrs_to_cam)
+            pointings.append(replace(pointing, q_icrs_to_cam=q_icrs_to_cam, zenith=zenith))
         return camera, tuple(pointings)
 
     def residuals(self, numbers: FloatArray) -> FloatArray:
@@ -268,54 +268,53 @@ class _CameraLoss:
         camera, turns, zeniths = self.parts(numbers)
         cam = np.einsum("nij,nj->ni", to_matrix(turns)[self.owner], self.cam)
         if len(zeniths):
-            some = self.bent[self.owner]
-            cam[some] = refracted(cam[some], zeniths[self.zenith_of[self.owner[some]]])
+            is_bent = self.bent[self.owner]
+            star_zeniths = zeniths[self.zenith_of[self.owner[is_bent]]]
+            cam[is_bent] = refracted(cam[is_bent], star_zeniths)
         x, y = camera.project(cam)
-        parts = [(self.x_px - x) / self.sigma_px, (self.y_px - y) / self.sigma_px]
-        parts += [
-            numbers[: len(self.names)] / [PRIOR[name] for name in self.names],
-            zeniths.ravel() / ZENITH_PRIOR,
-        ]
-        return np.asarray(np.clip(np.nan_to_num(np.concatenate(parts), nan=1e4), -1e4, 1e4))
+        x_off = (self.x_px - x) / self.sigma_px
+        y_off = (self.y_px - y) / self.sigma_px
+        camera_prior = numbers[: len(self.names)] / [PRIOR[name] for name in self.names]
+        zenith_prior = zeniths.ravel() / ZENITH_PRIOR
+        off = np.concatenate([x_off, y_off, camera_prior, zenith_prior])
+        return np.asarray(np.clip(np.nan_to_num(off, nan=1e4), -1e4, 1e4))
 
     def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
         """Derivatives by differences: a photograph's own numbers move its own places alone, all
         photographs' at once.
         """
-        camera_count = len(self.names)
+        first_turn = len(self.names)
+        first_zenith = first_turn + 3 * len(self.pointings)
         stars = len(self.owner)
-        photographs = len(self.pointings)
-        found = np.zeros((len(off), len(numbers)))
+        jacobian = np.zeros((len(off), len(numbers)))
 
         def changed(columns: IntArray) -> FloatArray:
             moved = numbers.copy()
             moved[columns] += DIFFERENCE
             return (self.residuals(moved) - off) / DIFFERENCE
 
-        for k in range(camera_count):
-            found[:, k] = changed(np.array([k]))
-        axis_places = [
-            (
-                np.arange(camera_count + k, camera_count + 3 * photographs, 3),
-                self.owner,
-                np.arange(stars),
-            )
-            for k in range(3)
-        ]
-        if self.bent.any():
-            lit = np.flatnonzero(self.bent[self.owner])
-            zenith = self.zenith_of[self.owner[lit]]
-            axis_places += [
-                (np.arange(camera_count + 3 * photographs + k, len(numbers), 2), zenith, lit)
-                for k in range(2)
-            ]
-        for columns, which, rows in axis_places:
+        def change_each(columns: IntArray, column: IntArray, rows: IntArray) -> None:
+            """Change one number of every photograph; stars `rows` depend on columns[column]."""
             change = changed(columns)
-            for first in (0, stars):
-                found[first + rows, columns[which]] = change[first + rows]
-        priors = np.arange(camera_count + 3 * photographs, len(numbers))
-        found[2 * stars + camera_count + np.arange(len(priors)), priors] = 1 / ZENITH_PRIOR
-        return found
+            for axis_rows in (rows, stars + rows):
+                jacobian[axis_rows, columns[column]] = change[axis_rows]
+
+        for k in range(first_turn):
+            jacobian[:, k] = changed(np.array([k]))
+        for k in range(3):
+            columns = np.arange(first_turn + k, first_zenith, 3)
+            change_each(columns, self.owner, np.arange(stars))
+        if self.bent.any():
+            bent_stars = np.flatnonzero(self.bent[self.owner])
+            zenith = self.zenith_of[self.owner[bent_stars]]
+            for k in range(2):
+                columns = np.arange(first_zenith + k, len(numbers), 2)
+                change_each(columns, zenith, bent_stars)
+        zenith_numbers = np.arange(first_zenith, len(numbers))
+        first_prior = 2 * stars + first_turn
+        prior_rows = first_prior + np.arange(len(zenith_numbers))
+        jacobian[prior_rows, zenith_numbers] = 1 / ZENITH_PRIOR
+        return jacobian
 
 
 def fit_model(
@@ -332,8 +331,10 @@ def fit_model(
     """
     loss = _CameraLoss(base, pointings, photographs, names, floor_px)
     numbers, hessian = minimised(loss.residuals, loss.slopes, loss.start())
+    camera, fitted_pointings = loss.unpacked(numbers)
     covariance = np.asarray(np.linalg.pinv(hessian), dtype=np.float64)
-    return *loss.unpacked(numbers), covariance[: len(names), : len(names)]
+    count = len(names)
+    return camera, fitted_pointings, covariance[:count, :count]
 
 
 def minimised(
@@ -348,32 +349,35 @@ def minimised(
     `slopes` are the derivatives of residuals, which it is given too.
     """
 
-    def value(off: FloatArray) -> float:
+    def loss_of(off: FloatArray) -> float:
         size = np.abs(off)
-        return float(np.where(size <= HUBER, size**2 / 2, HUBER * (size - HUBER / 2)).sum())
+        huber = np.where(size <= HUBER, size**2 / 2, HUBER * (size - HUBER / 2))
+        return float(huber.sum())
 
     off = residuals(numbers)
     damping = FIRST_DAMPING
-    best = value(off)
+    best = loss_of(off)
     normal = np.eye(len(numbers))
     for _ in range(MAX_STEPS):
         design = slopes(numbers, off)
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), HUBER))
         normal = design.T @ (weight[:, None] * design)
         downhill = design.T @ (weight * off)
+        diagonal = np.diag(normal) + 1e-12
         for _ in range(MAX_DAMPINGS):
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal) + 1e-12), -downhill)
-            trial = residuals(numbers + step)
-            new = value(trial)
-            if new <= best:
+            damped = normal + damping * np.diag(diagonal)
+            step = np.linalg.solve(damped, -downhill)
+            trial_off = residuals(numbers + step)
+            trial = loss_of(trial_off)
+            if trial <= best:
                 break
             damping *= 10
         else:
             break
-        gain = best - new
+        gain = best - trial
         numbers = numbers + step
-        off = trial
-        best = new
+        off = trial_off
+        best = trial
         damping = damping / 10
         if gain < least_gain:
             break
@@ -387,17 +391,22 @@ def own_floor_px(
     without their tails.
     """
     off = np.concatenate(residuals).ravel()
-    sigma = np.repeat(np.concatenate([photograph.sigma_px for photograph in photographs]), 2)
+    if not len(off):
+        return 0.0
+    sigma_px = np.concatenate([photograph.sigma_px for photograph in photographs])
+    axis_sigma_px = np.repeat(sigma_px, 2)
     scale = math.sqrt(len(off) / max(len(off) - numbers, 1))
     low = 0.0
     high = 10.0
+    # the floor at which residuals spread by one sigma, by halving: the spread falls with it
     for _ in range(40):
         middle = (low + high) / 2
-        if len(off):
-            spread = scale * MAD_TO_SIGMA * float(np.median(np.abs(off / np.hypot(sigma, middle))))
+        sigmas = off / np.hypot(axis_sigma_px, middle)
+        spread = scale * MAD_TO_SIGMA * float(np.median(np.abs(sigmas)))
+        if spread > 1:
+            low = middle
         else:
-            spread = 0.0
-        low, high = (middle, high) if spread > 1 else (low, middle)
+            high = middle
     return high
 
 
@@ -416,48 +425,64 @@ def fit_camera(
     model serves without it.
     """
     bare = tuple(pointings)
-    count = sum(len(photograph.x_px) for photograph in photographs)
-    numbers = 3 * len(bare)
-    enough = {
-        name: names
-        for name, names in MODELS.items()
-        if 2 * count > STARS_A_NUMBER * (len(names) + numbers)
-    }
-    models: dict[str, tuple[str, ...]] = {"fixed": ()} if fixed else enough
-    if not models:
-        models = {"pinhole": MODELS["pinhole"]}
-    largest, camera, bare, floor = _largest(base, bare, photographs, models)
+    models: dict[str, tuple[str, ...]] = {"fixed": ()}
+    if not fixed:
+        models = _affordable(photographs)
+    largest, camera, bare, floor_px = _largest(base, bare, photographs, models)
     if not last:
-        return CameraFit(_bounded(camera) or camera, bare, largest, floor_px=floor)
-    models = {name: models[name] for name in [*models][: [*models].index(largest) + 1]}
-    chosen = largest
-    best = math.inf
-    held = {}
+        return CameraFit(_bounded(camera) or camera, bare, largest, floor_px=floor_px)
+    held_out_px = {}
     for name, names in models.items():
-        held[name] = _held_out(base, bare, photographs, names, floor)
-        if held[name] < GAIN * best:
-            best = held[name]
-            chosen = name
+        held_out_px[name] = _held_out(base, bare, photographs, names, floor_px)
+        if name == largest:
+            break  # larger ones fold
+    chosen = _asked_for(held_out_px)
     names = models[chosen]
     if chosen != largest:
-        camera, bare, floor = _settled(base, bare, photographs, names)
-    if any(photograph.air is None for photograph in bare):
-        bent = tuple(
-            photograph if photograph.air else _with_zenith(camera, photograph, places, floor)
-            for photograph, places in zip(bare, photographs, strict=True)
-        )
-        if chosen == largest:
-            plain_px = best
-        else:
-            plain_px = _held_out(camera, bare, photographs, names, floor)
-        bent_px = _held_out(camera, bent, photographs, names, floor)
-        held[f"{chosen}, refraction"] = bent_px
+        camera, bare, floor_px = _settled(base, bare, photographs, names)
+    if any(pointing.air is None for pointing in bare):
+        bent = _with_zeniths(camera, bare, photographs, floor_px)
+        plain_px = held_out_px[chosen]
+        if chosen != largest:
+            plain_px = _held_out(camera, bare, photographs, names, floor_px)
+        bent_px = _held_out(camera, bent, photographs, names, floor_px)
+        held_out_px[f"{chosen}, refraction"] = bent_px
         if bent_px < GAIN * plain_px:
-            camera, bare, floor = _settled(camera, bent, photographs, names)
+            camera, bare, floor_px = _settled(camera, bent, photographs, names)
             chosen += ", refraction"
-    camera, bare, covariance = fit_model(camera, bare, photographs, names, floor)
-    sigma = {name: STEPS[name] * math.sqrt(covariance[k, k]) for k, name in enumerate(names)}
-    return CameraFit(_bounded(camera) or camera, bare, chosen, sigma, held, floor)
+    camera, bare, covariance = fit_model(camera, bare, photographs, names, floor_px)
+    sigma = {}
+    for k, name in enumerate(names):
+        sigma[name] = STEPS[name] * math.sqrt(covariance[k, k])
+    return CameraFit(_bounded(camera) or camera, bare, chosen, sigma, held_out_px, floor_px)
+
+
+def _asked_for(held_out_px: dict[str, float]) -> str:
+    """The smallest model, of those in order of size, that no larger one improves upon by GAIN; the
+    largest where errors are not known.
+    """
+    *_, chosen = held_out_px
+    best_px = math.inf
+    for name, error_px in held_out_px.items():
+        if error_px < GAIN * best_px:
+            best_px = error_px
+            chosen = name
+    return chosen
+
+
+def _affordable(photographs: Sequence[Places]) -> dict[str, tuple[str, ...]]:
+    """The models for which there are STARS_A_NUMBER residuals for each number; the smallest
+    always.
+    """
+    residuals = 2 * sum(len(photograph.x_px) for photograph in photographs)
+    attitude_numbers = 3 * len(photographs)
+    models: dict[str, tuple[str, ...]] = {}
+    for name, names in MODELS.items():
+        if residuals > STARS_A_NUMBER * (len(names) + attitude_numbers):
+            models[name] = names
+    if not models:
+        models["pinhole"] = MODELS["pinhole"]
+    return models
 
 
 def _largest(
@@ -512,16 +537,14 @@ def _settled(
     names: tuple[str, ...],
 ) -> tuple[Camera, tuple[Pointing, ...], float]:
     """A fit whose floor is that of its own residuals."""
-    floor = 0.05
+    floor_px = 0.05
     for _ in range(3):
-        camera, pointings, _ = fit_model(camera, pointings, photographs, names, floor)
-        fit = CameraFit(camera, pointings, "")
-        floor = own_floor_px(
-            fit.residuals_px(photographs),
-            photographs,
-            len(names) + sum(3 + 2 * (p.zenith is not None) for p in pointings),
-        )
-    return camera, pointings, floor
+        camera, pointings, _ = fit_model(camera, pointings, photographs, names, floor_px)
+        numbers = len(names) + 3 * len(pointings)
+        numbers += 2 * sum(pointing.zenith is not None for pointing in pointings)
+        residuals_px = CameraFit(camera, pointings, "").residuals_px(photographs)
+        floor_px = own_floor_px(residuals_px, photographs, numbers)
+    return camera, pointings, floor_px
 
 
 def _held_out(
@@ -538,46 +561,65 @@ def _held_out(
     # from which folds are near
     camera, pointings, _ = fit_model(camera, pointings, photographs, names, floor_px)
     for fold in range(FOLDS):
-        out = [np.arange(len(photograph.x_px)) % FOLDS == fold for photograph in photographs]
-        fitted_stars = [
-            photograph.at(~mask) for photograph, mask in zip(photographs, out, strict=True)
-        ]
-        held_camera, turned, _ = fit_model(camera, pointings, fitted_stars, names, floor_px)
-        tested = [photograph.at(mask) for photograph, mask in zip(photographs, out, strict=True)]
-        for photograph, off in zip(
-            tested, CameraFit(held_camera, turned, "").residuals_px(tested), strict=True
-        ):
-            sigma = np.hypot(photograph.sigma_px, floor_px)[:, None]
-            squares += float((np.clip(off / sigma, -HUBER - 1, HUBER + 1) ** 2).sum())
-            weights += 2 * float((1 / sigma**2).sum())
+        fitted = []
+        tested = []
+        for photograph in photographs:
+            is_held_out = np.arange(len(photograph.x_px)) % FOLDS == fold
+            fitted.append(photograph.at(~is_held_out))
+            tested.append(photograph.at(is_held_out))
+        fold_camera, turned, _ = fit_model(camera, pointings, fitted, names, floor_px)
+        residuals_px = CameraFit(fold_camera, turned, "").residuals_px(tested)
+        for photograph, off_px in zip(tested, residuals_px, strict=True):
+            sigma_px = np.hypot(photograph.sigma_px, floor_px)[:, None]
+            clipped = np.clip(off_px / sigma_px, -HUBER - 1, HUBER + 1)
+            squares += float((clipped**2).sum())
+            weights += 2 * float((1 / sigma_px**2).sum())
     return math.sqrt(squares / max(weights, 1e-12))
 
 
+def _with_zeniths(
+    camera: Camera, pointings: Sequence[Pointing], photographs: Sequence[Places], floor_px: float
+) -> tuple[Pointing, ...]:
+    """The pointings, each with a zenith where its air is not known."""
+    bent = []
+    for pointing, places in zip(pointings, photographs, strict=True):
+        if pointing.air is None:
+            bent.append(_with_zenith(camera, pointing, places, floor_px))
+        else:
+            bent.append(pointing)
+    return tuple(bent)
+
+
 def _with_zenith(camera: Camera, pointing: Pointing, places: Places, floor_px: float) -> Pointing:
+    """The pointing with the zenith by which refraction explains the places best."""
+    sigma_px = np.hypot(places.sigma_px, floor_px)
+
     def off(trial: Pointing) -> FloatArray:
-        return (
-            CameraFit(camera, (trial,), "").residuals_px([places])[0]
-            / np.hypot(places.sigma_px, floor_px)[:, None]
-        )
+        residuals_px = CameraFit(camera, (trial,), "").residuals_px([places])
+        return residuals_px[0] / sigma_px[:, None]
 
     # a zenith (a, b) squeezes a field by 1 + a^2 along x, 1 + b^2 along y and a b across both: it
     # is known but for its sign
-    (cx, cy), zero = camera.principal_point_px, np.zeros(len(places.x_px))
+    cx, cy = camera.principal_point_px
     u = places.x_px - cx
     v = places.y_px - cy
+    zero = np.zeros(len(u))
     ones = zero + 1
-    columns = [(ones, zero), (zero, ones), (v, -u), (u, v), (u, -v), (v, u)]
-    weight = 1 / np.hypot(places.sigma_px, floor_px)
-    design = np.stack([np.concatenate([x * weight, y * weight]) for x, y in columns], axis=1)
-    plain = np.clip(off(replace(pointing, zenith=None)).T.ravel(), -5, 5)
-    *_, p, q = np.linalg.lstsq(design, plain, rcond=None)[0].tolist()
-    tangent = math.sqrt(2 * math.hypot(p, q) / REFRACTION_RAD)
-    angle = math.atan2(-q, -p) / 2
+    weight = 1 / sigma_px
+    columns = []
+    # shifts, a turn, a scale, and the two squeezes
+    for x, y in ((ones, zero), (zero, ones), (v, -u), (u, v), (u, -v), (v, u)):
+        columns.append(np.concatenate([x * weight, y * weight]))
+    without = np.clip(off(replace(pointing, zenith=None)).T.ravel(), -5, 5)
+    coefficients = np.linalg.lstsq(np.stack(columns, axis=1), without, rcond=None)[0]
+    *_, along, across = coefficients.tolist()
+    tangent = math.sqrt(2 * math.hypot(along, across) / REFRACTION_RAD)
+    angle_rad = math.atan2(-across, -along) / 2
     tangent = min(max(tangent, 0.3), 3.0)
-    starts = []
-    for s in (1, -1):
-        starts.append(
-            replace(pointing, zenith=(s * tangent * math.cos(angle), s * tangent * math.sin(angle)))
-        )
-    fits = [fit_model(camera, [start], [places], (), floor_px)[1][0] for start in starts]
+    fits = []
+    for sign in (1, -1):
+        zenith = (sign * tangent * math.cos(angle_rad), sign * tangent * math.sin(angle_rad))
+        start = replace(pointing, zenith=zenith)
+        _, fitted, _ = fit_model(camera, [start], [places], (), floor_px)
+        fits.append(fitted[0])
     return min(fits, key=lambda trial: float(np.minimum(off(trial) ** 2, 9).sum()))

@@ -77,26 +77,30 @@ def read_photographs(
     InputError: what and what to do.
     """
     data = read_bytes(path, ADVICE, MAX_BYTES)
-    read = _fits if is_fits(data) else _picture
-    pixels, facts = read(path, data, resolution_px)
+    if is_fits(data):
+        pixels, facts = _fits(path, data, resolution_px)
+    else:
+        pixels, facts = _picture(path, data, resolution_px)
     dn = _grey(path, pixels, facts)
-    size = dn.shape[1], dn.shape[0]
-    if min(size) < MIN_SIDE_PX:
+    height, width = dn.shape
+    if min(width, height) < MIN_SIDE_PX:
         raise InputError(
-            f"{path}: {size[0]} x {size[1]} px is too small to hold a field of stars; give a whole"
+            f"{path}: {width} x {height} px is too small to hold a field of stars; give a whole"
             " frame"
         )
-    if resolution_px is not None and size != resolution_px:
+    if resolution_px is not None and (width, height) != resolution_px:
         raise InputError(
-            f"{path}: is {size[0]} x {size[1]} px, and [tracker] resolution_px is"
+            f"{path}: is {width} x {height} px, and [tracker] resolution_px is"
             f" {list(resolution_px)}; give whole frames as they were taken, or write resolution_px"
-            f" = [{size[0]}, {size[1]}]"
+            f" = [{width}, {height}]"
         )
     step, full = _levels(path, dn)
-    t_ns = at_ns if at_ns is not None else facts.t_ns
+    t_ns = at_ns
+    if t_ns is None:
+        t_ns = facts.t_ns
     notes = facts.notes
-    if t_ns is None and (named := NAMED_TIME.search(path.name)):
-        t_ns = utc_ns(f"{named[1]}T{named[2]}:{named[3]}:{named[4]}")
+    if t_ns is None:
+        t_ns = _named_ns(path)
         if t_ns is not None:
             notes = (*notes, "its time is read from its name, as UTC")
     photograph = Photograph(path, dn, step, full, t_ns, facts.exposure_s, "", notes)
@@ -105,8 +109,19 @@ def read_photographs(
     return [photograph]
 
 
+def _named_ns(path: Path) -> int | None:
+    """The UTC in a file's name; None without one."""
+    match = NAMED_TIME.search(path.name)
+    if match is None:
+        return None
+    date, hours, minutes, seconds = match.groups()
+    return utc_ns(f"{date}T{hours}:{minutes}:{seconds}")
+
+
 @dataclass(frozen=True, slots=True)
 class _Facts:
+    """What an image's file says of it."""
+
     t_ns: int | None = None
     exposure_s: float | None = None
     bayer: str = ""
@@ -135,9 +150,10 @@ def _grey(path: Path, pixels: npt.NDArray[Any], facts: _Facts) -> FloatArray:
             f" {ADVICE}"
         )
     dn = pixels.astype(np.float64)
-    if not np.isfinite(dn).all():
+    is_finite = np.isfinite(dn)
+    if not is_finite.all():
         raise InputError(
-            f"{path}: {int((~np.isfinite(dn)).sum())} pixels are no finite numbers; {ADVICE}"
+            f"{path}: {int((~is_finite).sum())} pixels are no finite numbers; {ADVICE}"
         )
     return dn
 
@@ -165,21 +181,31 @@ def _levels(path: Path, dn: FloatArray) -> tuple[float, float]:
     step = float(np.diff(inner).min())
     bits = math.ceil(math.log2(max(top, 1) + 1))
     ceiling = float(2**bits - 1)
-    clipped = int(at_top.sum()) >= SATURATED_PIXELS or top >= ceiling - step
-    return step, top if clipped else ceiling
+    is_clipped = int(at_top.sum()) >= SATURATED_PIXELS or top >= ceiling - step
+    if is_clipped:
+        return step, top
+    return step, ceiling
 
 
-def _planes(found: Photograph, pattern: str) -> Iterator[Photograph]:
+def _planes(mosaic: Photograph, pattern: str) -> Iterator[Photograph]:
+    """The planes of a mosaic, of half its size: r, g1, g2 and b by a pattern of rows such as
+    RGGB.
+    """
     greens = 0
     for number, colour in enumerate(pattern.lower()):
-        greens += colour == "g"
-        name = f"g{greens}" if colour == "g" else colour
-        yield replace(found, dn=found.dn[number // 2 :: 2, number % 2 :: 2].copy(), plane=name)
+        name = colour
+        if colour == "g":
+            greens += 1
+            name = f"g{greens}"
+        row, column = divmod(number, 2)
+        plane_dn = mosaic.dn[row::2, column::2].copy()
+        yield replace(mosaic, dn=plane_dn, plane=name)
 
 
 def _fits(
     path: Path, data: bytes, resolution_px: tuple[int, int] | None
 ) -> tuple[npt.NDArray[Any], _Facts]:
+    """The pixels of a FITS image, and what its header says. Raises InputError."""
     try:
         fits_image = read_fits_image(data, resolution_px)
     except (InputError, ImageSizeError) as error:
@@ -202,6 +228,7 @@ def _fits(
 def _picture(
     path: Path, data: bytes, resolution_px: tuple[int, int] | None
 ) -> tuple[npt.NDArray[Any], _Facts]:
+    """The pixels of a picture, and what its EXIF says. Raises InputError."""
     from PIL import UnidentifiedImageError
 
     try:
@@ -219,9 +246,9 @@ def _picture(
                     f"{path}: holds colours of a palette or of print ({picture.mode}); {ADVICE}"
                 )
             begin_ns, exposure_s = _exif(picture.getexif())
-            if begin_ns is None:
-                t_ns = None
-            else:
+            t_ns = None
+            if begin_ns is not None:
+                # the middle of the exposure
                 t_ns = begin_ns + round((exposure_s or 0.0) / 2 * NS_PER_S)
             return np.asarray(picture), _Facts(t_ns, exposure_s, "", notes)
     except InputError:
@@ -239,18 +266,24 @@ def _picture(
 def _exif(exif: Any) -> tuple[int | None, float | None]:
     """UTC of the start, where EXIF has the offset from it, and the exposure."""
     exif_table = exif.get_ifd(EXIF_IFD) if exif else {}
-    exposure = exif_table.get(EXIF_EXPOSURE)
+    exposure_s = None
+    if exif_table.get(EXIF_EXPOSURE):
+        exposure_s = float(exif_table[EXIF_EXPOSURE])
     date = str(exif_table.get(EXIF_DATE, ""))
     offset = str(exif_table.get(EXIF_OFFSET, ""))
     match = re.fullmatch(r"([+-])(\d\d):(\d\d)", offset)
-    if match:
-        begin_ns = utc_ns(date[:10].replace(":", "-") + "T" + date[11:19])
-    else:
-        begin_ns = None
-    if begin_ns is not None and match is not None:
-        ahead_s = (int(match[2]) * 60 + int(match[3])) * 60
-        begin_ns -= (-1 if match[1] == "-" else 1) * ahead_s * NS_PER_S
-    return begin_ns, float(exposure) if exposure else None
+    if match is None:
+        return None, exposure_s
+    # EXIF writes colons in the date, too
+    day = date[:10].replace(":", "-")
+    begin_ns = utc_ns(f"{day}T{date[11:19]}")
+    if begin_ns is None:
+        return None, exposure_s
+    sign, hours, minutes = match.groups()
+    ahead_s = (int(hours) * 60 + int(minutes)) * 60
+    if sign == "-":
+        ahead_s = -ahead_s
+    return begin_ns - ahead_s * NS_PER_S, exposure_s
 
 
 def parse_utc(text: str) -> int:

@@ -2,8 +2,9 @@
 stars that are missing.
 """
 
+import itertools
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from hilstar.basics.units import flux_ratio
 from hilstar.instruments.confront.background import EIGHT_NEIGHBOURS, source_mask
 from hilstar.instruments.confront.light import BRIGHT_V_MAG
 from hilstar.instruments.confront.photographed_sky import planets_seen
-from hilstar.instruments.confront.session import MATCH_PX, Session, Shot
+from hilstar.instruments.confront.session import MATCH_PX, Session, Shot, within_image
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.optics.layers.view import STILL
 from hilstar.server.bench.bench_file import read_bench_file
@@ -48,6 +49,7 @@ MOVED_PX = 5.0  # by which stars move between photographs that tell them from ho
 # under 0.2, 0.2 to 0.5 and 0.5 to 1.
 GALACTIC_POLE = np.array([-0.867666, -0.198076, 0.455984])
 COMPLETE_V_MAG, COUNTS_SLOPE = (7.3, 1.1), (0.484, -0.067)
+Cell = tuple[int, int]
 NOT_COUNTED = frozenset({"saturated", "blended", "missing", "dim region"})
 
 
@@ -84,18 +86,29 @@ class StarRow:
     @property
     def counted(self) -> bool:
         """Whether it counts in rms errors: to V = 6.5, alone, not saturated."""
-        return self.v_mag <= BRIGHT_V_MAG and not NOT_COUNTED & set(self.flags) and self.dn > 0
+        return self.v_mag <= BRIGHT_V_MAG and self.stands_alone and self.dn > 0
+
+    @property
+    def stands_alone(self) -> bool:
+        """Whether nothing spoils its figures: saturation, a neighbour, a cloud."""
+        return not NOT_COUNTED & set(self.flags)
 
     @property
     def figures(self) -> tuple[float, ...]:
         """Those of a row of stars.csv, in its order."""
-        seen_px = (self.x_px, self.y_px)
-        predicted = (self.x_predicted_px, self.y_predicted_px)
-        return *seen_px, *predicted, self.dn, self.dn_predicted, self.v_mag, self.b_v_mag
+        measured_px = (self.x_px, self.y_px)
+        predicted_px = (self.x_predicted_px, self.y_predicted_px)
+        light = (self.dn, self.dn_predicted)
+        return *measured_px, *predicted_px, *light, self.v_mag, self.b_v_mag
+
+    @property
+    def off_px(self) -> tuple[float, float]:
+        """Place seen less predicted, x and y, px."""
+        return self.x_px - self.x_predicted_px, self.y_px - self.y_predicted_px
 
     @property
     def off_mag(self) -> float:
-        """Seen less predicted, mag."""
+        """Magnitude seen less predicted; NaN without light."""
         if self.dn > 0 and self.dn_predicted > 0:
             return -2.5 * math.log10(self.dn / self.dn_predicted)
         return math.nan
@@ -175,9 +188,8 @@ class Judge:
         file = read_bench_file(tracker)
         config = file.config
         dated = session.shots[0].sky  # each photograph's air is put before its stars below
-        if dated.velocity_km_s is None:
-            velocity = (0.0, 0.0, 0.0)
-        else:
+        velocity = (0.0, 0.0, 0.0)
+        if dated.velocity_km_s is not None:
             velocity = tuple(dated.velocity_km_s.tolist())
         sky = msgspec.structs.replace(
             config.sky,
@@ -187,15 +199,14 @@ class Judge:
             observer_velocity_km_s=velocity,
             bodies=type(config.sky.bodies)(),
         )
-        config = msgspec.structs.replace(
+        stars_alone = msgspec.structs.replace(
             config, sky=sky, background=type(config.background)(), site=None
         )
-        self._simulator = Simulator(replace(file, config=config), refuse=False)
+        self._simulator = Simulator(replace(file, config=stars_alone), refuse=False)
         self._stars = self._simulator.stars
-        tracker_keys = config.tracker
-        self._own_mag = -2.5 * math.log10(
-            max(tracker_keys.exposure_s, 1e-12) / tracker_keys.detector.gain_e_per_dn
-        )
+        exposure_s = max(config.tracker.exposure_s, 1e-12)
+        gain_e_per_dn = config.tracker.detector.gain_e_per_dn
+        self._own_mag = -2.5 * math.log10(exposure_s / gain_e_per_dn)
         self.hot, self.dead = self._defects()
 
     def close(self) -> None:
@@ -207,67 +218,75 @@ class Judge:
         whose stars moved.
         """
         session = self.session
-        shape = session.shots[0].photo.dn.shape
-        counts = np.zeros((2, *shape), dtype=np.int16)
+        height, width = session.shots[0].photo.dn.shape
+        bright_counts = np.zeros((height, width), dtype=np.int16)
+        dark_counts = np.zeros((height, width), dtype=np.int16)
         for shot in session.shots:
-            off = (shot.photo.dn - shot.level.level) / np.sqrt(
-                session.pixels.variance_dn2(shot.level.level)
-            )
-            # what the eight about it have: a star's light is there too
-            around = ndimage.uniform_filter(off, 3) * 9 - off
-            alone = around < HOT_LIGHT * np.abs(off) + 3 * math.sqrt(8)
-            counts[0] += (off > HOT_SIGMAS) & alone
-            counts[1] += off < -HOT_SIGMAS
-        least = max(1, math.ceil(HOT_SHARE * len(session.shots)))
-        axes = np.array(
-            [to_matrix(pointing.q_icrs_to_cam)[2] for pointing in session.camera.pointings]
-        )
-        moved_px = np.ptp(axes, axis=0).max() * session.camera.camera.focal_length_px
-        # stars too may have one pixel, in each photograph: what no neighbour shares at all
-        if moved_px < MOVED_PX:
-            counts[0] *= around < 0.1 * np.abs(off) + 2 * math.sqrt(8)
-        return counts[0] >= least, counts[1] >= least
+            noise_dn = np.sqrt(session.pixels.variance_dn2(shot.level.level))
+            sigmas = shot.above_dn / noise_dn
+            # the sum of the eight neighbours: a star's light is there too
+            around = ndimage.uniform_filter(sigmas, 3) * 9 - sigmas
+            is_alone = around < HOT_LIGHT * np.abs(sigmas) + 3 * math.sqrt(8)
+            bright_counts += (sigmas > HOT_SIGMAS) & is_alone
+            dark_counts += sigmas < -HOT_SIGMAS
+        # stars that did not move may have one pixel in each photograph, too: of these, pixels
+        # that share nothing at all with their neighbours
+        if self._moved_px() < MOVED_PX:
+            bright_counts *= around < 0.1 * np.abs(sigmas) + 2 * math.sqrt(8)
+        minimum = max(1, math.ceil(HOT_SHARE * len(session.shots)))
+        return bright_counts >= minimum, dark_counts >= minimum
+
+    def _moved_px(self) -> float:
+        """How far apart boresights of the photographs are along an axis of the sky, px."""
+        camera = self.session.camera
+        boresights = []
+        for pointing in camera.pointings:
+            icrs_to_cam = to_matrix(pointing.q_icrs_to_cam)
+            boresights.append(icrs_to_cam[2])
+        spread = np.ptp(np.array(boresights), axis=0)
+        return float(spread.max() * camera.camera.focal_length_px)
 
     def of(self, number: int) -> Verdict:
         """The verdict on a photograph."""
         session = self.session
-        shot = self.session.shots[number]
+        shot = session.shots[number]
         light_dn = self._light_dn(number)
         level = shot.level.level
         variance = session.pixels.variance_dn2(level)
-        noise = np.sqrt(variance + np.maximum(light_dn, 0) / session.pixels.gain_e_per_dn)
-        residual = (shot.photo.dn - level - light_dn) / noise
+        star_variance = np.maximum(light_dn, 0) / session.pixels.gain_e_per_dn
+        noise = np.sqrt(variance + star_variance)
+        residual = (shot.above_dn - light_dn) / noise
         expected = self._expected(number)
         rows = self._rows(number, expected)
-        dim, cells = _dim_regions(rows, shot.photo.size_px)
-        rows = [
-            (
-                replace(row, flags=(*row.flags, "dim region"))
-                if cells(row) and "missing" not in row.flags
-                else row
-            )
-            for row in rows
-        ]
+        dim, is_dim = _dim_regions(rows, shot.photo.size_px)
+        for k, row in enumerate(rows):
+            if is_dim(row) and "missing" not in row.flags:
+                rows[k] = replace(row, flags=(*row.flags, "dim region"))
         light_sigma = light_dn / np.sqrt(variance)
-        chi = residual[self._background(shot, light_sigma)]
-        chi = chi[np.abs(chi) < MAX_CHI]
+        sources = self._sources(number, light_sigma, expected)
+        background = residual[self._background(shot, light_sigma)]
+        background = background[np.abs(background) < MAX_CHI]
+        background_chi2 = math.nan
+        if len(background):
+            background_chi2 = float((background**2).mean())
+        star_chi2 = math.nan
+        if shot.clean.any():
+            star_chi2 = float(np.median(shot.found.chi2[shot.clean]))
         counted = [row for row in rows if row.counted]
-        off = np.array(
-            [(row.x_px - row.x_predicted_px, row.y_px - row.y_predicted_px) for row in counted]
-        ).reshape(-1, 2)
-        mag = np.array([row.off_mag for row in counted])
+        off_px = np.array([row.off_px for row in counted])
+        off_mag = np.array([row.off_mag for row in counted])
+        # a star of no positive light has a place and no magnitude
+        has_light = np.isfinite(off_mag)
         return Verdict(
             shot=shot,
             number=number,
             stars=rows,
-            sources=self._sources(number, light_sigma, expected),
-            rms_px=_rms(off.ravel()),
-            rms_mag=_rms(mag[np.isfinite(mag)]),
+            sources=sources,
+            rms_px=_rms(off_px.ravel()),
+            rms_mag=_rms(off_mag[has_light]),
             counted=len(counted),
-            background_chi2=float((chi**2).mean()) if len(chi) else math.nan,
-            star_chi2=(
-                float(np.median(shot.found.chi2[shot.clean])) if shot.clean.any() else math.nan
-            ),
+            background_chi2=background_chi2,
+            star_chi2=star_chi2,
             dim=dim,
             dated=self._dated(number),
             fainter=self._fainter(number, expected),
@@ -283,219 +302,162 @@ class Judge:
         session = self.session
         stars = self._stars
         simulator = self._simulator
-        shot = self.session.shots[number]
+        shot = session.shots[number]
         pointing = session.camera.pointings[number]
         air = shot.sky.air
         rate = stars.electrons_per_s
         if air is not None and session.air is not None:
-            rate = rate * session.air.shares(stars.row, air.altitude_rad(stars.vectors))[0]
+            altitude_rad = air.altitude_rad(stars.vectors)
+            rate = rate * session.air.shares(stars.row, altitude_rad)[0]
         if session.light.colours.any() or shot.photo.plane:
-            rate = rate * flux_ratio(session.plane_mag(number, shot.sky.columns(stars.row)))
-        columns = (pointing.seen(stars.vectors), stars.temperature_k, rate)
-        by_row = [np.empty_like(column) for column in columns]
-        for ordered, column in zip(by_row, columns, strict=True):
+            plane_mag = session.plane_mag(number, shot.sky.columns(stars.row))
+            rate = rate * flux_ratio(plane_mag)
+        # the simulator's stars are sorted by cell of the sky, a catalogue's are by row
+        by_row = []
+        for column in (pointing.seen(stars.vectors), stars.temperature_k, rate):
+            ordered = np.empty_like(column)
             ordered[stars.row] = column
+            by_row.append(ordered)
         simulator.stars = make_stars(stars.catalog, *by_row)
-        exposure = simulator.expose(simulator.view(pointing.q_icrs_to_cam, STILL), None)
+        view = simulator.view(pointing.q_icrs_to_cam, STILL)
+        exposure = simulator.expose(view, None)
         # the file's quantum efficiency and exposure stand for one zero point, this photograph's air
         # for another
-        offsets = session.light.offsets_mag
-        air_mag = offsets[number] - (self._own_mag if session.fixed else offsets.mean())
-        return np.asarray(exposure.mean_e / session.pixels.gain_e_per_dn * 10 ** (-0.4 * air_mag))
+        offsets_mag = session.light.offsets_mag
+        if session.fixed:
+            file_mag = self._own_mag
+        else:
+            file_mag = offsets_mag.mean()
+        air_share = 10 ** (-0.4 * (offsets_mag[number] - file_mag))
+        return np.asarray(exposure.mean_e / session.pixels.gain_e_per_dn * air_share)
 
     def _expected(self, number: int) -> Expected:
+        """Stars of the catalogue whose light is on the photograph."""
         session = self.session
-        shot = self.session.shots[number]
-        width, height = shot.photo.size_px
-        x, y = session.camera.pointings[number].places_px(session.camera.camera, shot.sky.vectors)
-        with np.errstate(invalid="ignore"):
-            star = np.flatnonzero(
-                (x > -EDGE_PX)
-                & (x < width - 1 + EDGE_PX)
-                & (y > -EDGE_PX)
-                & (y < height - 1 + EDGE_PX)
-            )
-        return Expected(
-            star, x[star], y[star], session.predicted_dn(number, star, x[star], y[star])
-        )
+        shot = session.shots[number]
+        pointing = session.camera.pointings[number]
+        x, y = pointing.places_px(session.camera.camera, shot.sky.vectors)
+        star = np.flatnonzero(within_image(x, y, shot.photo.size_px, -EDGE_PX))
+        x_px = x[star]
+        y_px = y[star]
+        return Expected(star, x_px, y_px, session.predicted_dn(number, star, x_px, y_px))
 
     def _rows(self, number: int, expected: Expected) -> list[StarRow]:
         """Rows of the stars that are seen, and of those that should be."""
         shot = self.session.shots[number]
-        sky = shot.sky
-        found = shot.found
-        _, double, variable = sky.within(shot.star)
-        place = {star: k for k, star in enumerate(expected.star.tolist())}
-        v_mag = sky.v_mag
-        bv_mag = sky.bv_mag
-        hip = sky.hip
-        kinds = {
-            "saturated": shot.saturated,
-            "blended": shot.blended,
-            "double": double,
-            "variable": variable,
-        }
-
-        def row(star: int, seen: Iterable[float], flags: tuple[str, ...]) -> StarRow:
-            x, y, dn, sigma = (float(value) for value in seen)
-            k = place[star]
-            predicted = float(expected.x_px[k]), float(expected.y_px[k])
-            light = float(expected.dn[k])
-            v = float(v_mag[star])
-            bv = float(bv_mag[star])
-            return StarRow(
-                star,
-                int(hip[star]),
-                sky.name(star),
-                x,
-                y,
-                *predicted,
-                dn,
-                sigma,
-                light,
-                v,
-                bv,
-                flags,
-            )
-
+        stars = shot.found
+        place = _places_by_star(expected)
+        flags = _flags(shot)
         rows = []
         for k, star in enumerate(shot.star.tolist()):
-            flags = tuple(name for name, which in kinds.items() if which is not None and which[k])
             if star in place:
-                rows.append(
-                    row(star, (found.x_px[k], found.y_px[k], found.dn[k], found.sigma_dn[k]), flags)
-                )
-        noise = math.sqrt(
-            float(np.median(self.session.pixels.variance_dn2(shot.level.level))) * NEFF_PX
-        )
-        width, height = shot.photo.size_px
-        near = _saturated(shot)
-        sources = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px]))
-        seen = set(shot.star.tolist())
-        for star in expected.star[expected.dn > EXPECTED_SNR * noise].tolist():
-            x = expected.x_px[place[star]]
-            y = expected.y_px[place[star]]
-            inside = (
-                2 * MATCH_PX < x < width - 1 - 2 * MATCH_PX
-                and 2 * MATCH_PX < y < height - 1 - 2 * MATCH_PX
-            )
-            if star in seen or not inside or near(x, y) or sources.query([x, y])[0] <= 2 * MATCH_PX:
+                figures = (stars.x_px[k], stars.y_px[k], stars.dn[k], stars.sigma_dn[k])
+                rows.append(_star_row(shot, expected, place[star], figures, flags[k]))
+        for star in self._missing(shot, expected):
+            figures = (math.nan,) * 4
+            rows.append(_star_row(shot, expected, place[star], figures, ("missing",)))
+        return rows
+
+    def _missing(self, shot: Shot, expected: Expected) -> Iterator[int]:
+        """Stars, rows of the sky, that should stand out of the noise, and where no light is."""
+        place = _places_by_star(expected)
+        identified = set(shot.star.tolist())
+        near_saturated = _saturated(shot)
+        source_tree = cKDTree(shot.sources.places_px)
+        in_middle = within_image(expected.x_px, expected.y_px, shot.photo.size_px, 2 * MATCH_PX)
+        noise_dn = math.sqrt(self._pixel_variance(shot) * NEFF_PX)
+        for star in expected.star[expected.dn > EXPECTED_SNR * noise_dn].tolist():
+            k = place[star]
+            x = expected.x_px[k]
+            y = expected.y_px[k]
+            if star in identified or not in_middle[k] or near_saturated(x, y):
+                continue
+            if source_tree.query([x, y])[0] <= 2 * MATCH_PX:
                 continue
             # its light may be part of a larger source
-            box = np.s_[round(y) - 2 : round(y) + 3, round(x) - 2 : round(x) + 3]
-            if (shot.photo.dn[box] - shot.level.level[box]).sum() < expected.dn[place[star]] / 2:
-                rows.append(row(star, (math.nan,) * 4, ("missing",)))
-        return rows
+            column = round(x)
+            row = round(y)
+            box = np.s_[row - 2 : row + 3, column - 2 : column + 3]
+            light_dn = (shot.photo.dn[box] - shot.level.level[box]).sum()
+            if light_dn < expected.dn[k] / 2:
+                yield star
+
+    def _pixel_variance(self, shot: Shot) -> float:
+        """The variance of a background pixel, DN^2."""
+        variance = self.session.pixels.variance_dn2(shot.level.level)
+        return float(np.median(variance))
 
     def _sources(self, number: int, light_sigma: FloatArray, expected: Expected) -> list[SourceRow]:
         """Every source with its explanation: a planet, a trail, a star, the detector, or a
         bright star's light.
         """
-        session = self.session
         shot = self.session.shots[number]
         sources = shot.sources
-        sky = shot.sky
-        if len(expected.star):
-            tree = cKDTree(np.column_stack([expected.x_px, expected.y_px]))
-        else:
-            tree = None
-        planets = self._planets(number)
-        satellites = self._satellites(number) if sources.trail.any() else {}
-        pixel_dn = math.sqrt(float(np.median(session.pixels.variance_dn2(shot.level.level))))
-        near = _saturated(shot)
+        satellites = {}
+        if sources.trail.any():
+            satellites = self._satellites(number)
         hot = ndimage.binary_dilation(self.hot, EIGHT_NEIGHBOURS)
-        height, width = light_sigma.shape
-        trails = [
-            (sources.x_px[k], sources.y_px[k], sources.length_px[k] / 2 + MASK_PX)
-            for k in np.flatnonzero(sources.trail)
-        ]
-        reach = max(3.0, PLANET_RAD * session.camera.camera.focal_length_px)
-
-        def why(k: int) -> str:
-            at = float(sources.x_px[k]), float(sources.y_px[k])
-            planet = next(
-                (name for name, place in planets.items() if math.dist(place, at) < reach), ""
-            )
-            if planet or sources.trail[k]:
-                reach_px = (
-                    sources.length_px[k] / 2 + SATELLITE_RAD * session.camera.camera.focal_length_px
-                )
-                name = next(
-                    (name for name, place in satellites.items() if math.dist(place, at) < reach_px),
-                    "a trail",
-                )
-                return planet or f"{name}, {sources.length_px[k]:.0f} px long"
-            light_dn = SAME_LIGHT * sources.snr[k] * pixel_dn * math.sqrt(NEFF_PX)
-            beside = (
-                []
-                if tree is None
-                else tree.query_ball_point(at, max(MATCH_PX + 0.5, sources.length_px[k] / 2))
-            )
-            if beside and expected.dn[beside].sum() > light_dn:
-                return sky.name(int(expected.star[max(beside, key=lambda j: expected.dn[j])]))
-            column, row = (
-                min(max(round(at[0]), 0), width - 1),
-                min(max(round(at[1]), 0), height - 1),
-            )
-            if hot[row, column] or sources.single[k]:
-                return "a hot pixel" if hot[row, column] else "one pixel: hot, or a cosmic ray"
-            if any(math.dist(at, (x, y)) < half for x, y, half in trails):
-                return "beside a trail"
-            return (
-                "light of a bright star"
-                if near(*at) or light_sigma[row, column] > sources.snr[k] / 4
-                else ""
-            )
-
-        return [
-            SourceRow(float(sources.x_px[k]), float(sources.y_px[k]), float(sources.snr[k]), why(k))
-            for k in range(len(sources))
-        ]
+        explanation = _Explanation(
+            shot=shot,
+            expected=expected,
+            tree=_tree_of(expected),
+            planets=self._planets(number),
+            satellites=satellites,
+            near_saturated=_saturated(shot),
+            hot=hot,
+            light_sigma=light_sigma,
+            pixel_dn=math.sqrt(self._pixel_variance(shot)),
+            focal_length_px=self.session.camera.camera.focal_length_px,
+        )
+        rows = []
+        for k in range(len(sources)):
+            x_px, y_px = sources.places_px[k].tolist()
+            rows.append(SourceRow(x_px, y_px, float(sources.snr[k]), explanation.of(k)))
+        return rows
 
     def _planets(self, number: int) -> dict[str, tuple[float, float]]:
+        """Places of planets by name, px, those beyond the image, too; none without a date."""
         shot = self.session.shots[number]
         if shot.photo.t_ns is None:
             return {}
         planets = planets_seen(shot.photo.t_ns)
         camera = self.session.camera
-        x, y = camera.pointings[number].places_px(camera.camera, np.array(list(planets.values())))
-        return {
-            n: (float(a), float(b))
-            for n, a, b in zip(planets, x, y, strict=True)
-            if math.isfinite(a) and math.isfinite(b)
-        }
+        vectors = np.array(list(planets.values()))
+        x, y = camera.pointings[number].places_px(camera.camera, vectors)
+        places = {}
+        for name, x_px, y_px in zip(planets, x.tolist(), y.tolist(), strict=True):
+            if math.isfinite(x_px) and math.isfinite(y_px):
+                places[name] = (x_px, y_px)
+        return places
 
     def _satellites(self, number: int) -> dict[str, tuple[float, float]]:
         """Places of satellites in the middle of the exposure, by the bench's list; none without
         a list, a site and a date.
         """
         file = self.session.file
-        photo = self.session.shots[number].photo
+        shot = self.session.shots[number]
         config = file.config
-        camera = self.session.camera
-        if config.sky.bodies.satellites is None or config.site is None or photo.t_ns is None:
+        camera = self.session.camera.camera
+        if config.sky.bodies.satellites is None or config.site is None or shot.photo.t_ns is None:
             return {}
-        utc = f"{np.datetime64(photo.t_ns, 'ns').astype('datetime64[ms]')}Z"
-        sky = msgspec.structs.replace(
-            config.sky, epoch_utc=utc, epoch_jyear=self.session.shots[number].sky.epoch_jyear
-        )
+        utc = f"{np.datetime64(shot.photo.t_ns, 'ns').astype('datetime64[ms]')}Z"
+        sky = msgspec.structs.replace(config.sky, epoch_utc=utc, epoch_jyear=shot.sky.epoch_jyear)
         moving = bench_moving(msgspec.structs.replace(config, sky=sky), file.folder)
-        pointing = camera.pointings[number]
         if moving is None or moving.satellites is None:
             return {}
         moving.air = self.session.air
-        passing = moving.passing(
-            Cone(pointing.boresight, camera.camera.field_radius_rad(0.0), photo.exposure_s or 0.0),
-            0,
-        )
+        pointing = self.session.camera.pointings[number]
+        exposure_s = shot.photo.exposure_s or 0.0
+        field = Cone(pointing.boresight, camera.field_radius_rad(0.0), exposure_s)
+        passing = moving.passing(field, 0)
         if passing is None:
             return {}
         directions = passing.directions(slice(None), np.zeros(len(passing)))
-        x, y = camera.camera.project(directions @ to_matrix(pointing.q_icrs_to_cam).T)
-        return {
-            moving.satellites.names[k]: (float(a), float(b))
-            for k, a, b in zip(passing.index, x, y, strict=True)
-        }
+        x, y = camera.project(directions @ to_matrix(pointing.q_icrs_to_cam).T)
+        places = {}
+        for k, x_px, y_px in zip(passing.index, x.tolist(), y.tolist(), strict=True):
+            places[moving.satellites.names[k]] = (x_px, y_px)
+        return places
 
     def _background(self, shot: Shot, light_sigma: FloatArray) -> BoolArray:
         """Pixels without light of stars and sources."""
@@ -508,52 +470,193 @@ class Judge:
         slope of star counts.
         """
         shot = self.session.shots[number]
-        sine = abs(float(self.session.camera.pointings[number].boresight @ GALACTIC_POLE))
-        complete = COMPLETE_V_MAG[0] + COMPLETE_V_MAG[1] * sine
+        pointing = self.session.camera.pointings[number]
+        galactic_sine = abs(float(pointing.boresight @ GALACTIC_POLE))
+        complete_mag = COMPLETE_V_MAG[0] + COMPLETE_V_MAG[1] * galactic_sine
         if not shot.clean.any():
-            return Fainter(complete, math.nan, 0.0)
-        places = np.column_stack([shot.found.x_px, shot.found.y_px])[shot.clean]
-        near = cKDTree(np.column_stack([shot.sources.x_px, shot.sources.y_px])).query(places)[1]
-        depth = shot.sky.v_mag[shot.star[shot.clean]] + 2.5 * np.log10(shot.sources.snr[near])
-        reached = float(np.median(depth)) - 2.5 * math.log10(LISTED_SNR)
+            return Fainter(complete_mag, math.nan, 0.0)
+        clean_places_px = shot.found.places_px[shot.clean]
+        source = cKDTree(shot.sources.places_px).query(clean_places_px)[1]
+        clean_v_mag = shot.sky.v_mag[shot.star[shot.clean]]
+        depth_mag = clean_v_mag + 2.5 * np.log10(shot.sources.snr[source])
+        reached_mag = float(np.median(depth_mag)) - 2.5 * math.log10(LISTED_SNR)
+        if reached_mag <= complete_mag:
+            return Fainter(complete_mag, reached_mag, 0.0)
         v_mag = shot.sky.v_mag[expected.star]
-        every = float((v_mag <= complete).sum()) * 10 ** (
-            (COUNTS_SLOPE[0] + COUNTS_SLOPE[1] * sine) * (reached - complete)
-        )
-        return Fainter(
-            complete,
-            reached,
-            max(every - float((v_mag <= reached).sum()), 0.0) if reached > complete else 0.0,
-        )
+        slope = COUNTS_SLOPE[0] + COUNTS_SLOPE[1] * galactic_sine
+        growth = 10 ** (slope * (reached_mag - complete_mag))
+        all_stars = float((v_mag <= complete_mag).sum()) * growth
+        catalogued = float((v_mag <= reached_mag).sum())
+        return Fainter(complete_mag, reached_mag, max(all_stars - catalogued, 0.0))
 
     def _dated(self, number: int) -> DatedBy | None:
         """How far off the date is by the stars that move fastest over the image; None without
         stars.
         """
-        shot = self.session.shots[number]
         session = self.session
-        use = np.flatnonzero(shot.clean)
-        if not len(use):
+        shot = session.shots[number]
+        clean = np.flatnonzero(shot.clean)
+        if not len(clean):
             return None
-        star = shot.star[use]
-        some = shot.sky.catalog.taken(shot.sky.order[star])
-        later = unit_vectors_icrs(some, shot.sky.epoch_jyear + 1) - unit_vectors_icrs(
-            some, shot.sky.epoch_jyear
-        )
+        star = shot.star[clean]
+        catalog = shot.sky.catalog.taken(shot.sky.order[star])
+        epoch_jyear = shot.sky.epoch_jyear
+        now = unit_vectors_icrs(catalog, epoch_jyear)
+        next_year = unit_vectors_icrs(catalog, epoch_jyear + 1)
+        vectors = shot.sky.vectors[star]
+        moved = vectors + (next_year - now)
         pointing = session.camera.pointings[number]
         camera = session.camera.camera
-        vectors = shot.sky.vectors[star]
-        here, there = (
-            np.column_stack(pointing.places_px(camera, part)) for part in (vectors, vectors + later)
-        )
-        off = np.column_stack([shot.found.x_px[use], shot.found.y_px[use]]) - here
-        sigma = np.hypot(shot.found.sigma_px[use], max(session.camera.floor_px, 0.02))[:, None]
-        motion = (there - here) / sigma
-        information = float((motion**2).sum())
-        return DatedBy(
-            float((motion * off / sigma).sum()) / max(information, 1e-12),
-            max(information, 1e-12) ** -0.5,
-        )
+        now_px = np.column_stack(pointing.places_px(camera, vectors))
+        next_year_px = np.column_stack(pointing.places_px(camera, moved))
+        off_px = shot.found.places_px[clean] - now_px
+        floor_px = max(session.camera.floor_px, 0.02)
+        sigma_px = np.hypot(shot.found.sigma_px[clean], floor_px)[:, None]
+        motion = (next_year_px - now_px) / sigma_px
+        information = max(float((motion**2).sum()), 1e-12)
+        years = float((motion * off_px / sigma_px).sum()) / information
+        return DatedBy(years, information**-0.5)
+
+
+def _places_by_star(expected: Expected) -> dict[int, int]:
+    """Numbers of expected stars by their rows of the sky."""
+    return {star: k for k, star in enumerate(expected.star.tolist())}
+
+
+def _flags(shot: Shot) -> list[tuple[str, ...]]:
+    """What may spoil the figures of each star of a shot."""
+    _, double, variable = shot.sky.within(shot.star)
+    masks = {
+        "saturated": shot.saturated,
+        "blended": shot.blended,
+        "double": double,
+        "variable": variable,
+    }
+    flags = []
+    for k in range(len(shot.star)):
+        star_flags = [name for name, mask in masks.items() if mask is not None and mask[k]]
+        flags.append(tuple(star_flags))
+    return flags
+
+
+def _star_row(
+    shot: Shot, expected: Expected, k: int, figures: Iterable[float], flags: tuple[str, ...]
+) -> StarRow:
+    """The row of expected star `k`, with the `figures` that were measured: x and y, px, DN and its
+    sigma.
+    """
+    star = int(expected.star[k])
+    catalog = shot.sky.catalog
+    row = int(shot.sky.order[star])
+    x_px, y_px, dn, sigma_dn = (float(value) for value in figures)
+    return StarRow(
+        star=star,
+        hip=int(catalog.hip[row]),
+        name=shot.sky.name(star),
+        x_px=x_px,
+        y_px=y_px,
+        x_predicted_px=float(expected.x_px[k]),
+        y_predicted_px=float(expected.y_px[k]),
+        dn=dn,
+        sigma_dn=sigma_dn,
+        dn_predicted=float(expected.dn[k]),
+        v_mag=float(catalog.v_mag[row]),
+        b_v_mag=float(catalog.bv_mag[row]),
+        flags=flags,
+    )
+
+
+def _tree_of(expected: Expected) -> cKDTree | None:
+    if len(expected.star):
+        return cKDTree(np.column_stack([expected.x_px, expected.y_px]))
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class _Explanation:
+    """What a photograph's sources may be: `planets` and `satellites` by name, px, the expected
+    stars and their `tree`, and hot pixels (height, width).
+    """
+
+    shot: Shot
+    expected: Expected
+    tree: cKDTree | None
+    planets: dict[str, tuple[float, float]]
+    satellites: dict[str, tuple[float, float]]
+    near_saturated: Callable[[float, float], bool]
+    hot: BoolArray
+    light_sigma: FloatArray
+    pixel_dn: float
+    focal_length_px: float
+
+    def of(self, k: int) -> str:
+        """What source `k` is; empty where nothing explains it."""
+        sources = self.shot.sources
+        place = (float(sources.x_px[k]), float(sources.y_px[k]))
+        planet = _named_near(self.planets, place, max(3.0, PLANET_RAD * self.focal_length_px))
+        if planet:
+            return planet
+        length_px = sources.length_px[k]
+        if sources.trail[k]:
+            reach_px = length_px / 2 + SATELLITE_RAD * self.focal_length_px
+            satellite = _named_near(self.satellites, place, reach_px) or "a trail"
+            return f"{satellite}, {length_px:.0f} px long"
+        star = self._brightest_star(k, place)
+        if star is not None:
+            return self.shot.sky.name(star)
+        return self._artefact(k, place)
+
+    def _artefact(self, k: int, place: tuple[float, float]) -> str:
+        """What of the detector, or of a bright light beside it, source `k` is; empty if none."""
+        x_px, y_px = place
+        sources = self.shot.sources
+        height, width = self.light_sigma.shape
+        column = min(max(round(x_px), 0), width - 1)
+        row = min(max(round(y_px), 0), height - 1)
+        if self.hot[row, column]:
+            return "a hot pixel"
+        if sources.single[k]:
+            return "one pixel: hot, or a cosmic ray"
+        if self._beside_trail(place):
+            return "beside a trail"
+        if self.near_saturated(x_px, y_px) or self.light_sigma[row, column] > sources.snr[k] / 4:
+            return "light of a bright star"
+        return ""
+
+    def _brightest_star(self, k: int, place: tuple[float, float]) -> int | None:
+        """The brightest star at a source, a row of the sky; None where all stars there are too
+        faint for its light.
+        """
+        if self.tree is None:
+            return None
+        sources = self.shot.sources
+        radius_px = max(MATCH_PX + 0.5, sources.length_px[k] / 2)
+        beside = self.tree.query_ball_point(place, radius_px)
+        if not beside:
+            return None
+        minimum_dn = SAME_LIGHT * sources.snr[k] * self.pixel_dn * math.sqrt(NEFF_PX)
+        stars_dn = self.expected.dn[beside]
+        if stars_dn.sum() <= minimum_dn:
+            return None
+        return int(self.expected.star[beside[int(stars_dn.argmax())]])
+
+    def _beside_trail(self, place: tuple[float, float]) -> bool:
+        sources = self.shot.sources
+        for k in np.flatnonzero(sources.trail):
+            reach_px = sources.length_px[k] / 2 + MASK_PX
+            if math.dist(place, sources.places_px[k]) < reach_px:
+                return True
+        return False
+
+
+def _named_near(
+    places: dict[str, tuple[float, float]], place: tuple[float, float], reach_px: float
+) -> str:
+    """The first name whose place is within a reach; empty without any."""
+    for name, named_place in places.items():
+        if math.dist(named_place, place) < reach_px:
+            return name
+    return ""
 
 
 def _rms(values: FloatArray) -> float:
@@ -564,13 +667,28 @@ def _rms(values: FloatArray) -> float:
 
 def _saturated(shot: Shot) -> Callable[[float, float], bool]:
     """Whether a place is near a saturated star."""
-    if shot.saturated is None:
-        mask = np.zeros(0, dtype=bool)
-    else:
-        mask = shot.saturated
-    x = shot.found.x_px[mask]
-    y = shot.found.y_px[mask]
-    return lambda a, b: bool((np.hypot(x - a, y - b) < HALO_PX).any())
+    mask = shot.saturated
+    if mask is None:
+        mask = np.zeros(len(shot.star), dtype=bool)
+    star_x_px = shot.found.x_px[mask]
+    star_y_px = shot.found.y_px[mask]
+
+    def near(x_px: float, y_px: float) -> bool:
+        distances_px = np.hypot(star_x_px - x_px, star_y_px - y_px)
+        return bool((distances_px < HALO_PX).any())
+
+    return near
+
+
+@dataclass(frozen=True, slots=True)
+class _CellStars:
+    """Stars of a part of the image, how many of them are missing, and by how much the others are
+    too faint, mag.
+    """
+
+    count: int
+    missing: int
+    off_mag: float
 
 
 def _dim_regions(
@@ -579,59 +697,74 @@ def _dim_regions(
     """Parts of the image whose stars are missing or dim, in words, and whether a star is in one
     of them.
     """
-    width, height = size_px
-    cells: dict[tuple[int, int], list[StarRow]] = {}
-
-    def cell(row: StarRow) -> tuple[int, int]:
-        across = row.x_predicted_px / width
-        down = row.y_predicted_px / height
-        return min(int(CELLS * max(down, 0)), CELLS - 1), min(
-            int(CELLS * max(across, 0)), CELLS - 1
-        )
-
-    trusted = [
-        r
-        for r in rows
-        if "missing" in r.flags
-        or (not NOT_COUNTED & set(r.flags) and r.dn > EXPECTED_SNR * r.sigma_dn)
-    ]
+    trusted = [row for row in rows if _is_trusted(row)]
+    off_mag = np.array([row.off_mag for row in trusted if row.dn > 0])
+    spread_mag = 0.1
+    if len(off_mag):
+        spread_mag = MAD * float(np.median(np.abs(off_mag)))
+    cells: dict[Cell, list[StarRow]] = {}
     for row in trusted:
-        cells.setdefault(cell(row), []).append(row)
-    dim: dict[tuple[int, int], tuple[int, int, float]] = {}
-    if len(every := np.array([r.off_mag for r in trusted if r.dn > 0])):
-        spread = MAD * float(np.median(np.abs(every)))
-    else:
-        spread = 0.1
-    for place, some in cells.items():
-        lost = sum("missing" in r.flags for r in some)
-        off = np.array([r.off_mag for r in some if r.dn > 0])
-        middle = float(np.median(off)) if len(off) else math.nan
-        if len(some) >= DIM_STARS and (
-            2 * lost >= len(some)
-            or middle > max(DIM_MAG, DIM_SIGMAS * spread / math.sqrt(len(off)))
-        ):
-            dim[place] = lost, len(some), middle
-    parts: dict[str, list[tuple[int, int, float]]] = {}
-    for (down, across), found in dim.items():
-        name = f"{('upper', 'lower')[2 * down >= CELLS]} {('left', 'right')[2 * across >= CELLS]}"
-        parts.setdefault(name, []).append(found)
-    region_texts = []
-    for name, every_cell in parts.items():
-        lost = sum(cell_counts[0] for cell_counts in every_cell)
-        count = sum(cell_counts[1] for cell_counts in every_cell)
-        depth = [cell_counts[2] for cell_counts in every_cell if math.isfinite(cell_counts[2])]
-        if depth:
-            deep = f", those seen {np.median(depth):.2f} mag too faint"
-        else:
-            deep = ""
-        region_texts.append(
-            f"{name}: {lost} of {count} stars are missing{deep}: cloud, an obstacle, or vignetting"
-        )
-    faint = max(DIM_MAG, DIM_SIGMAS * spread)
+        cells.setdefault(_cell(row, size_px), []).append(row)
+    dim: dict[Cell, _CellStars] = {}
+    for place, cell_rows in cells.items():
+        stars, is_dim = _judged_cell(cell_rows, spread_mag)
+        if is_dim:
+            dim[place] = stars
+    quarters: dict[str, list[_CellStars]] = {}
+    for (down, across), stars in dim.items():
+        vertical = ("upper", "lower")[2 * down >= CELLS]
+        horizontal = ("left", "right")[2 * across >= CELLS]
+        quarters.setdefault(f"{vertical} {horizontal}", []).append(stars)
+    region_texts = [_region_text(name, stars) for name, stars in quarters.items()]
+    faint_mag = max(DIM_MAG, DIM_SIGMAS * spread_mag)
 
     def in_dim(row: StarRow) -> bool:
-        down, across = cell(row)
-        beside = any((down + a, across + b) in dim for a in (-1, 0, 1) for b in (-1, 0, 1))
-        return beside and row.off_mag > faint
+        down, across = _cell(row, size_px)
+        around = itertools.product((down - 1, down, down + 1), (across - 1, across, across + 1))
+        return row.off_mag > faint_mag and not dim.keys().isdisjoint(around)
 
     return region_texts, in_dim
+
+
+def _is_trusted(row: StarRow) -> bool:
+    """Whether a star tells of its part of the image: missing, or bright and alone."""
+    if "missing" in row.flags:
+        return True
+    return row.stands_alone and row.dn > EXPECTED_SNR * row.sigma_dn
+
+
+def _cell(row: StarRow, size_px: tuple[int, int]) -> Cell:
+    """Row and column of the cell of the image, of CELLS by CELLS, that has a star."""
+    width, height = size_px
+    down = int(CELLS * max(row.y_predicted_px / height, 0))
+    across = int(CELLS * max(row.x_predicted_px / width, 0))
+    return min(down, CELLS - 1), min(across, CELLS - 1)
+
+
+def _judged_cell(rows: Sequence[StarRow], spread_mag: float) -> tuple[_CellStars, bool]:
+    """The stars of a cell, and whether they are dim: half of them missing, or the rest fainter
+    than their spread allows.
+    """
+    missing = sum("missing" in row.flags for row in rows)
+    off_mag = np.array([row.off_mag for row in rows if row.dn > 0])
+    middle_mag = math.nan
+    is_faint = False
+    if len(off_mag):
+        middle_mag = float(np.median(off_mag))
+        error_mag = spread_mag / math.sqrt(len(off_mag))
+        is_faint = middle_mag > max(DIM_MAG, DIM_SIGMAS * error_mag)
+    is_dim = len(rows) >= DIM_STARS and (2 * missing >= len(rows) or is_faint)
+    return _CellStars(len(rows), missing, middle_mag), is_dim
+
+
+def _region_text(name: str, cells: Sequence[_CellStars]) -> str:
+    """A quarter of the image whose stars are missing or dim, in words."""
+    missing = sum(stars.missing for stars in cells)
+    count = sum(stars.count for stars in cells)
+    depth_mag = [stars.off_mag for stars in cells if math.isfinite(stars.off_mag)]
+    depth = ""
+    if depth_mag:
+        depth = f", those seen {np.median(depth_mag):.2f} mag too faint"
+    return (
+        f"{name}: {missing} of {count} stars are missing{depth}: cloud, an obstacle, or vignetting"
+    )

@@ -8,7 +8,7 @@ photograph has less light.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -102,6 +102,14 @@ class LightFit:
         return np.asarray(10 ** (-0.4 * (a * radius2 + b * radius2**2)))
 
 
+def join_light(parts: Sequence[StarLight]) -> StarLight:
+    """The stars of several photographs in one row of each quantity."""
+    columns = []
+    for quantity in fields(StarLight):
+        columns.append(np.concatenate([getattr(part, quantity.name) for part in parts]))
+    return StarLight(*columns)
+
+
 def fit_light(
     stars: StarLight, images: int, magnitudes: Magnitudes, held: LightFit | None = None
 ) -> LightFit:
@@ -113,56 +121,71 @@ def fit_light(
     if held is not None:
         return _offsets_alone(stars, images, magnitudes(NO_CORRECTION), held)
     ones = np.eye(images)[stars.image]
-    r2 = stars.radius2
     use = _trusted(stars, ones)
-    vignetting: dict[str, list[FloatArray]] = {"even": []}
-    if use.sum() >= MIN_STARS + images:
-        vignetting |= {"r^2": [r2], "r^2, r^4": [r2, r2**2]}
-    correction = _correction(stars, magnitudes, np.column_stack([ones, r2]), use)
+    correction = _correction(stars, magnitudes, np.column_stack([ones, stars.radius2]), use)
     base = magnitudes(correction)
-    off = stars.instrument_mag - base
-    chosen = "even"
-    best = math.inf
-    for name, columns in vignetting.items():
-        held_out = _held_out(np.column_stack([ones, *columns]), off, stars.sigma_mag, use)
-        if held_out < GAIN * best:
-            best = held_out
-            chosen = name
+    off_mag = stars.instrument_mag - base
+    vignetting = _vignetting(stars, ones, off_mag, use)
     # a mosaic's planes have a colour each beside the one quantum efficiency
-    bv = np.nan_to_num(stars.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG
+    bv_mag = np.nan_to_num(stars.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG
     planes = np.unique(stars.plane)
-    own_columns = [bv * (stars.plane == plane) for plane in planes if len(planes) > 1]
-    solution = _robust(
-        np.column_stack([ones, *vignetting[chosen], *own_columns]), off, stars.sigma_mag, use
-    )
-    terms = (*solution.values[images : len(solution.values) - len(own_columns)].tolist(), 0.0, 0.0)[
-        :2
-    ]
+    colour_columns = []
+    if len(planes) > 1:
+        colour_columns = [bv_mag * (stars.plane == plane) for plane in planes]
+    design = np.column_stack([ones, *vignetting, *colour_columns])
+    solution = _robust(design, off_mag, stars.sigma_mag, use)
+    offsets_mag = solution.values[:images]
+    first_colour = images + len(vignetting)
+    r2_mag, r4_mag = (*solution.values[images:first_colour].tolist(), 0.0, 0.0)[:2]
     colours = np.zeros(images)
     colour_terms = {}
-    for k, plane in enumerate(planes if own_columns else ()):
-        colours[np.unique(stars.image[stars.plane == plane])] = solution.values[
-            len(solution.values) - len(own_columns) + k
-        ]
-        here = use & (stars.plane == plane)
-        colour_terms[" rgb"[plane]] = float(
-            _about_v(stars, base, here, ones[:, ones[here].any(axis=0)], ()).values[1]
-        )
-    about_v = _about_v(stars, base, use, ones, vignetting[chosen])
-    sigma = {name: about_v.sigma[k] for k, name in enumerate(("linearity", "colour_term"))}
-    sigma |= {"zero_point_mag": float(about_v.sigma[2 : 2 + images].mean())}
+    for k in range(len(colour_columns)):
+        plane = planes[k]
+        in_plane = stars.plane == plane
+        colours[np.unique(stars.image[in_plane])] = solution.values[first_colour + k]
+        plane_use = use & in_plane
+        plane_ones = ones[:, ones[plane_use].any(axis=0)]
+        about_v = _about_v(stars, base, plane_use, plane_ones, ())
+        colour_terms[" rgb"[plane]] = float(about_v.values[1])
+    about_v = _about_v(stars, base, use, ones, vignetting)
+    zero_points = slice(2, 2 + images)
+    sigma = {
+        "linearity": about_v.sigma[0],
+        "colour_term": about_v.sigma[1],
+        "zero_point_mag": float(about_v.sigma[zero_points].mean()),
+    }
+    mag = base + solution.model - ones @ offsets_mag
     return LightFit(
-        offsets_mag=solution.values[:images],
-        vignetting_mag=(terms[0], terms[1]),
+        offsets_mag=offsets_mag,
+        vignetting_mag=(r2_mag, r4_mag),
         correction=correction,
-        zero_point_mag=-float(about_v.values[2 : 2 + images].mean()),
+        zero_point_mag=-float(about_v.values[zero_points].mean()),
         colour_term=float(about_v.values[1]),
         linearity=float(about_v.values[0]),
         sigma=sigma,
-        mag=base + solution.model - ones @ solution.values[:images],
+        mag=mag,
         colours=colours,
         colour_terms=colour_terms,
     )
+
+
+def _vignetting(
+    stars: StarLight, ones: FloatArray, off_mag: FloatArray, use: BoolArray
+) -> list[FloatArray]:
+    """Columns (n,) of the vignetting that held-out stars ask for: none, r^2, or r^2 and r^4."""
+    choices: list[list[FloatArray]] = [[]]
+    if use.sum() >= MIN_STARS + ones.shape[1]:
+        r2 = stars.radius2
+        choices += [[r2], [r2, r2**2]]
+    chosen = choices[0]
+    best = math.inf
+    for columns in choices:
+        design = np.column_stack([ones, *columns])
+        held_out_mag = _held_out(design, off_mag, stars.sigma_mag, use)
+        if held_out_mag < GAIN * best:
+            best = held_out_mag
+            chosen = columns
+    return chosen
 
 
 def with_extinction(
@@ -174,26 +197,25 @@ def with_extinction(
     A photograph's offset counts by its stars' scatter and by CLOUD_MAG, by which skies differ. With
     a `known` extinction the slope is what is left of it.
     """
-    light_found = replace(light, masses=tuple(masses))
-    x = np.array([np.nan if air_mass is None else air_mass for air_mass in masses])
+    known_masses = replace(light, masses=tuple(masses))
+    x = np.array([math.nan if mass is None else mass for mass in masses])
     if not np.isfinite(x).all() or len(x) < 3 or np.ptp(x) < MIN_MASSES:
-        return light_found
-    off = light.offsets_mag[stars.image] + light.mag - stars.instrument_mag
+        return known_masses
+    off_mag = light.offsets_mag[stars.image] + light.mag - stars.instrument_mag
     count = np.bincount(stars.image[stars.clean], minlength=len(x))
-    spread = MAD_TO_SIGMA * float(np.median(np.abs(off[stars.clean])))
-    sigma = np.hypot(spread / np.sqrt(np.maximum(count, 1)), CLOUD_MAG)
-    design = np.column_stack([x, np.ones(len(x))]) / sigma[:, None]
-    slope, _ = np.linalg.lstsq(design, light.offsets_mag / sigma, rcond=None)[0]
-    error = math.sqrt(float(np.linalg.inv(design.T @ design)[0, 0]))
+    spread_mag = MAD_TO_SIGMA * float(np.median(np.abs(off_mag[stars.clean])))
+    error_mag = spread_mag / np.sqrt(np.maximum(count, 1))
+    sigma_mag = np.hypot(error_mag, CLOUD_MAG)
+    design = np.column_stack([x, np.ones(len(x))]) / sigma_mag[:, None]
+    slope, _ = np.linalg.lstsq(design, light.offsets_mag / sigma_mag, rcond=None)[0]
+    covariance = np.linalg.inv(design.T @ design)
     if known:
-        name = "extinction_beyond_table"
+        name = "extinction_beyond_table_mag_per_air_mass"
     else:
-        name = "extinction"
-    return replace(
-        light_found,
-        extinction_mag=float(slope),
-        sigma=light.sigma | {f"{name}_mag_per_air_mass": error},
-    )
+        name = "extinction_mag_per_air_mass"
+    slope_sigma = math.sqrt(float(covariance[0, 0]))
+    sigma = light.sigma | {name: slope_sigma}
+    return replace(known_masses, extinction_mag=float(slope), sigma=sigma)
 
 
 def _trusted(stars: StarLight, ones: FloatArray) -> BoolArray:
@@ -204,74 +226,87 @@ def _trusted(stars: StarLight, ones: FloatArray) -> BoolArray:
     bright = clean & (stars.dn > TRUSTED_SNR * stars.sigma_dn)
     if not bright.any():
         return clean
-    plain = _robust(ones, stars.instrument_mag - stars.v_mag, stars.sigma_mag, bright)
-    expected_dn = 10 ** (-0.4 * (stars.v_mag + ones @ plain.values))
-    is_trusted = clean & (expected_dn > TRUSTED_SNR * np.median(stars.sigma_dn[bright]))
-    return is_trusted if is_trusted.sum() >= MIN_STARS else clean
+    zero_points = _robust(ones, stars.instrument_mag - stars.v_mag, stars.sigma_mag, bright)
+    expected_dn = 10 ** (-0.4 * (stars.v_mag + ones @ zero_points.values))
+    minimum_dn = TRUSTED_SNR * np.median(stars.sigma_dn[bright])
+    is_trusted = clean & (expected_dn > minimum_dn)
+    if is_trusted.sum() >= MIN_STARS:
+        return is_trusted
+    return clean
+
+
+@dataclass(frozen=True, slots=True)
+class _CorrectionLoss:
+    """The loss of a correction: its value, residuals (n,) in sigmas, and their weights."""
+
+    value: float
+    off: FloatArray
+    weight: FloatArray
 
 
 def _correction(
     stars: StarLight, magnitudes: Magnitudes, plain: FloatArray, use: BoolArray
 ) -> Correction:
-    """Tilt and bow of the quantum efficiency by which stars of all colours fit best."""
-    count = sum(int(use.sum()) >= least + plain.shape[1] for least in STARS_FOR_CORRECTION)
+    """Tilt and bow of the quantum efficiency by which stars of all colours fit best; beside them
+    the `plain` columns are fitted.
+    """
+    columns = plain.shape[1]
+    count = sum(int(use.sum()) >= stars_for + columns for stars_for in STARS_FOR_CORRECTION)
     if not count or np.std(np.nan_to_num(stars.bv_mag[use])) < MIN_COLOURS_MAG:
         return NO_CORRECTION
-    weight = np.hypot(stars.sigma_mag, CORRECTION_FLOOR_MAG)[use]
+    sigma = np.hypot(stars.sigma_mag, CORRECTION_FLOOR_MAG)[use]
     target = stars.instrument_mag[use]
     plain = plain[use]
 
-    def loss(values: FloatArray) -> tuple[float, FloatArray, FloatArray]:
-        """Huber's loss and a weak prior; the residuals in sigmas, and the other columns'
-        coefficients.
-        """
+    def loss_of(values: FloatArray) -> _CorrectionLoss:
+        """Huber's loss and a weak prior, with the plain columns' coefficients following."""
         off = target - magnitudes(_pair(values))[use]
         weights = np.ones(len(target))
         for _ in range(CORRECTION_ROUNDS):
-            rows = plain * (np.sqrt(weights) / weight)[:, None]
-            residual = (
-                off - plain @ np.linalg.lstsq(rows, off * np.sqrt(weights) / weight, rcond=None)[0]
-            ) / weight
-            weights = np.minimum(
-                1.0, CORRECTION_HUBER / np.maximum(np.abs(residual), CORRECTION_HUBER)
-            )
+            root = np.sqrt(weights)
+            design = plain * (root / sigma)[:, None]
+            coefficients = np.linalg.lstsq(design, off * root / sigma, rcond=None)[0]
+            residual = (off - plain @ coefficients) / sigma
+            size = np.maximum(np.abs(residual), CORRECTION_HUBER)
+            weights = np.minimum(1.0, CORRECTION_HUBER / size)
         size = np.abs(residual)
-        huber = np.where(
-            size < CORRECTION_HUBER, size**2 / 2, CORRECTION_HUBER * (size - CORRECTION_HUBER / 2)
-        )
-        return float(huber.sum() + ((values / CORRECTION_PRIOR) ** 2).sum() / 2), residual, weights
+        linear = CORRECTION_HUBER * (size - CORRECTION_HUBER / 2)
+        huber = np.where(size < CORRECTION_HUBER, size**2 / 2, linear)
+        prior = ((values / CORRECTION_PRIOR) ** 2).sum() / 2
+        return _CorrectionLoss(float(huber.sum() + prior), residual, weights)
+
+    def step_from(values: FloatArray, loss: _CorrectionLoss) -> FloatArray:
+        """A Gauss-Newton step of tilt and bow (2,), by differences."""
+        base = magnitudes(_pair(values))[use]
+        slopes = [*plain.T]
+        for difference in CORRECTION_STEP * np.eye(2)[:count]:
+            moved = magnitudes(_pair(values + difference))[use]
+            slopes.append((moved - base) / CORRECTION_STEP)
+        design = np.column_stack(slopes) / sigma[:, None]
+        prior = np.zeros(design.shape[1])
+        prior[columns:] = 1 / CORRECTION_PRIOR[:count] ** 2
+        downhill = design.T @ (loss.weight * loss.off)
+        downhill[columns:] -= values[:count] * prior[columns:]
+        normal = design.T @ (loss.weight[:, None] * design)
+        step = np.zeros(2)
+        step[:count] = np.linalg.solve(normal + np.diag(prior + 1e-9), downhill)[columns:]
+        return step
 
     values: FloatArray = np.zeros(2)
-    best, off, kept = loss(values)
+    best = loss_of(values)
     for _ in range(CORRECTION_ROUNDS):
-        base = magnitudes(_pair(values))[use]
-        moved = [
-            magnitudes(_pair(values + step))[use] for step in CORRECTION_STEP * np.eye(2)[:count]
-        ]
-        slopes = (
-            np.column_stack(
-                [*plain.T, *((moved_loss - base) / CORRECTION_STEP for moved_loss in moved)]
-            )
-            / weight[:, None]
-        )
-        prior = np.zeros(slopes.shape[1])
-        prior[plain.shape[1] :] = 1 / CORRECTION_PRIOR[:count] ** 2
-        downhill = slopes.T @ (kept * off)
-        downhill[plain.shape[1] :] -= values[:count] * prior[plain.shape[1] :]
-        step = np.zeros(2)
-        step[:count] = np.linalg.solve(
-            slopes.T @ (kept[:, None] * slopes) + np.diag(prior + 1e-9), downhill
-        )[plain.shape[1] :]
+        step = step_from(values, best)
         for share in (1.0, 0.4, 0.15, 0.05):
             trial = np.clip(values + share * step, -MAX_CORRECTION, MAX_CORRECTION)
-            new = loss(trial)
-            if new[0] < best:
+            trial_loss = loss_of(trial)
+            if trial_loss.value < best.value:
                 break
         else:
             break
-        done = best - new[0] < 0.01
-        values, (best, off, kept) = trial, new
-        if done:
+        gain = best.value - trial_loss.value
+        values = trial
+        best = trial_loss
+        if gain < 0.01:
             break
     return _pair(values)
 
@@ -287,36 +322,39 @@ def _about_v(
     ones: FloatArray,
     vignetting: Sequence[FloatArray],
 ) -> "_Robust":
-    """The power of the light that DN follow, and about V the colour term and zero points."""
-    bv = np.nan_to_num(stars.bv_mag)
-    both = _robust(
-        np.column_stack([base, ones, *vignetting]), stars.instrument_mag, stars.sigma_mag, use
-    )
+    """The power of the light that DN follow, and about V the colour term and zero points: values
+    and sigmas in this order.
+    """
+    bv_mag = np.nan_to_num(stars.bv_mag)
+    by_magnitude = np.column_stack([base, ones, *vignetting])
+    power = _robust(by_magnitude, stars.instrument_mag, stars.sigma_mag, use)
     # a zero point at V = 0 of a line with a free slope lies far from the stars: that of slope 1 is
     # stated
-    plain = _robust(
-        np.column_stack([bv, ones, *vignetting]),
-        stars.instrument_mag - stars.v_mag,
-        stars.sigma_mag,
-        use,
-    )
-    return replace(
-        both,
-        values=np.concatenate([both.values[:1], plain.values]),
-        sigma=np.concatenate([both.sigma[:1], plain.sigma]),
-    )
+    by_colour = np.column_stack([bv_mag, ones, *vignetting])
+    about_v_mag = stars.instrument_mag - stars.v_mag
+    about_v = _robust(by_colour, about_v_mag, stars.sigma_mag, use)
+    values = np.concatenate([power.values[:1], about_v.values])
+    sigma = np.concatenate([power.sigma[:1], about_v.sigma])
+    return replace(power, values=values, sigma=sigma)
 
 
 def _offsets_alone(stars: StarLight, images: int, base: FloatArray, held: LightFit) -> LightFit:
-    shape = held.vignetting_mag[0] * stars.radius2 + held.vignetting_mag[1] * stars.radius2**2
-    off = stars.instrument_mag - base - shape
+    """The light of a camera that is held: each photograph's offset is fitted alone."""
+    r2_mag, r4_mag = held.vignetting_mag
+    shade_mag = r2_mag * stars.radius2 + r4_mag * stars.radius2**2
     ones = np.eye(images)[stars.image]
-    solution = _robust(ones, off, stars.sigma_mag, _trusted(stars, ones))
-    return replace(held, offsets_mag=solution.values, mag=base + shape, colours=np.zeros(images))
+    off_mag = stars.instrument_mag - base - shade_mag
+    solution = _robust(ones, off_mag, stars.sigma_mag, _trusted(stars, ones))
+    colours = np.zeros(images)
+    return replace(held, offsets_mag=solution.values, mag=base + shade_mag, colours=colours)
 
 
 @dataclass(frozen=True, slots=True)
 class _Robust:
+    """A robust fit: values (k,) of the columns and their sigmas, the model (n,), and target less
+    model (n,).
+    """
+
     values: FloatArray
     sigma: FloatArray
     model: FloatArray
@@ -325,29 +363,31 @@ class _Robust:
 
 def _robust(design: FloatArray, target: FloatArray, sigma: FloatArray, use: BoolArray) -> _Robust:
     """Least squares without what lies far off; its errors by the scatter that is left."""
-    is_kept = use & np.isfinite(target)
+    columns = design.shape[1]
+    is_near = use & np.isfinite(target)
     floor = 0.05
-    values: FloatArray = np.zeros(design.shape[1])
-    covariance = np.full((design.shape[1],) * 2, np.nan)
+    values: FloatArray = np.zeros(columns)
+    covariance = np.full((columns, columns), np.nan)
     for _ in range(ROUNDS):
-        if is_kept.sum() <= design.shape[1]:
+        count = is_near.sum()
+        if count <= columns:
             break
-        weight = 1 / np.hypot(sigma, floor)[is_kept]
-        rows = design[is_kept] * weight[:, None]
-        values = np.asarray(
-            np.linalg.lstsq(rows, target[is_kept] * weight, rcond=None)[0], dtype=np.float64
-        )
+        weight = 1 / np.hypot(sigma, floor)[is_near]
+        rows = design[is_near] * weight[:, None]
+        weighted_target = target[is_near] * weight
+        values = np.linalg.lstsq(rows, weighted_target, rcond=None)[0].astype(np.float64)
         off = target - design @ values
-        spread = (
-            MAD_TO_SIGMA
-            * float(np.median(np.abs(off[is_kept])))
-            * math.sqrt(is_kept.sum() / (is_kept.sum() - design.shape[1]))
-        )
-        floor = math.sqrt(max(spread**2 - float(np.median(sigma[is_kept])) ** 2, 1e-6))
+        median_off = float(np.median(np.abs(off[is_near])))
+        spread = MAD_TO_SIGMA * median_off * math.sqrt(count / (count - columns))
+        noise = float(np.median(sigma[is_near]))
+        # what the scatter has beyond noise is each star's own: catalogue, blends, flat field
+        floor = math.sqrt(max(spread**2 - noise**2, 1e-6))
         covariance = np.linalg.pinv(rows.T @ rows)
-        is_kept = use & (np.abs(off) < PATTERN_CLIP * np.hypot(sigma, max(spread, 0.01)))
+        limit = PATTERN_CLIP * np.hypot(sigma, max(spread, 0.01))
+        is_near = use & (np.abs(off) < limit)
     model = design @ values
-    return _Robust(values, np.sqrt(np.maximum(np.diag(covariance), 0)), model, target - model)
+    value_sigma = np.sqrt(np.maximum(np.diag(covariance), 0))
+    return _Robust(values, value_sigma, model, target - model)
 
 
 def _held_out(design: FloatArray, target: FloatArray, sigma: FloatArray, use: BoolArray) -> float:
@@ -355,8 +395,9 @@ def _held_out(design: FloatArray, target: FloatArray, sigma: FloatArray, use: Bo
     off = np.full(len(target), np.nan)
     number = np.cumsum(use)
     for fold in range(FOLDS):
-        out = use & (number % FOLDS == fold)
-        off[out] = _robust(design, target, sigma, use & ~out).off[out]
+        is_held_out = use & (number % FOLDS == fold)
+        fit = _robust(design, target, sigma, use & ~is_held_out)
+        off[is_held_out] = fit.off[is_held_out]
     clipped_mag = np.clip(off[use], -0.5, 0.5)
     if len(clipped_mag):
         return math.sqrt(float((clipped_mag**2).mean()))

@@ -8,8 +8,9 @@ allows. The camera is a pinhole here; a lens of some per cent is within the tole
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -38,8 +39,20 @@ MIN_MATCHED = 5
 KEPT_STARS, KEPT_RAD = 1000, 3e-4
 # scales the triangles' keys, so that one distance is every tolerance
 STRETCH = np.array([MAX_RATIO_OFF / STEP, 1.0, 1.0])
-# triples (t, 3), which way round they go (t,), and their stretched keys
-Triangles = tuple[IntArray, FloatArray, cKDTree]
+
+
+@dataclass(frozen=True, slots=True)
+class Triangles:
+    """Triangles of stars: triples (t, 3), corners by the side opposite, longest first; which way
+    round they go (t,); and a tree of their stretched keys.
+    """
+
+    triples: IntArray
+    turns: FloatArray
+    tree: cKDTree
+
+
+# the triangles of the sky last solved, by the field's size, with its stars' directions
 _KEPT: dict[float, tuple[FloatArray, Triangles]] = {}
 
 
@@ -68,8 +81,9 @@ class SourceField:
 
     def rays(self, focal_length_px: float) -> FloatArray:
         """Unit vectors (n, 3) in cam by a pinhole."""
-        rays = np.column_stack([self.places_px / focal_length_px, np.ones(len(self.places_px))])
-        return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+        in_focal_lengths = self.places_px / focal_length_px
+        rays = np.column_stack([in_focal_lengths, np.ones(len(self.places_px))])
+        return _unit(rays)
 
 
 def solve_lost(
@@ -83,73 +97,98 @@ def solve_lost(
     """
     if len(field.places_px) < MIN_MATCHED:
         return None
-    smaller_rad = 2 * math.atan(min(field.width_px, field.height_px) / 2 / focal_length_px)
-    reach = math.pi
-    if near is not None:
-        reach = 2.5 * math.atan(field.diagonal_px / 2 / focal_length_px)
-        rows = np.flatnonzero(vectors @ near > math.cos(min(reach, math.pi)))
-        solution = _solved(
-            field,
-            focal_length_px,
-            vectors[rows],
-            _triangles_of_sky(vectors[rows], smaller_rad, near, reach),
-        )
-        if solution is None:
-            return None
-        return replace(solution, star=rows[solution.star])
-    table = _KEPT.get(smaller_rad)
-    if (
-        table is None
-        or table[0].shape != vectors.shape
-        or np.abs(table[0][:KEPT_STARS] - vectors[:KEPT_STARS]).max() > KEPT_RAD
-    ):
-        table = vectors, _triangles_of_sky(vectors, smaller_rad)
-        _KEPT.clear()
-        _KEPT[smaller_rad] = table
-    return _solved(field, focal_length_px, vectors, table[1])
+    smaller_px = min(field.width_px, field.height_px)
+    smaller_rad = 2 * math.atan(smaller_px / 2 / focal_length_px)
+    if near is None:
+        return _solved(field, focal_length_px, vectors, _triangles_kept(vectors, smaller_rad))
+    reach = 2.5 * math.atan(field.diagonal_px / 2 / focal_length_px)
+    rows = np.flatnonzero(vectors @ near > math.cos(min(reach, math.pi)))
+    sky = _triangles_of_sky(vectors[rows], smaller_rad, near, reach)
+    solution = _solved(field, focal_length_px, vectors[rows], sky)
+    if solution is None:
+        return None
+    return replace(solution, star=rows[solution.star])
+
+
+def _triangles_kept(vectors: FloatArray, smaller_rad: float) -> Triangles:
+    """The triangles of the whole sky: those of the last one, where that is the same but for its
+    date.
+    """
+    cached = _KEPT.get(smaller_rad)
+    if cached is not None and cached[0].shape == vectors.shape:
+        moved = np.abs(cached[0][:KEPT_STARS] - vectors[:KEPT_STARS])
+        if moved.max() <= KEPT_RAD:
+            return cached[1]
+    sky = _triangles_of_sky(vectors, smaller_rad)
+    _KEPT.clear()
+    _KEPT[smaller_rad] = vectors, sky
+    return sky
 
 
 def _solved(
     field: SourceField, focal_length_px: float, vectors: FloatArray, sky: Triangles
 ) -> SolvedField | None:
-    tries = (_by_hypothesis(field, focal_length_px * times, vectors, sky) for times in HYPOTHESES)
-    return next((solution for solution in tries if solution is not None), None)
+    """The attitude by the first hypothesis of the focal length that is proved."""
+    for factor in HYPOTHESES:
+        solution = _by_hypothesis(field, focal_length_px * factor, vectors, sky)
+        if solution is not None:
+            return solution
+    return None
 
 
 def _triangles_of_sky(
     vectors: FloatArray, smaller_rad: float, near: FloatArray | None = None, reach: float = math.pi
 ) -> Triangles:
-    """Triangles of stars."""
+    """Triangles of the brightest stars in circles all over the sky, or within a reach of a
+    direction.
+    """
     radius_rad = smaller_rad * CIRCLE
-    spacing_rad = radius_rad * 0.8
-    circles = math.ceil(4 * math.pi / spacing_rad**2)
     # enough stars for the circles, and for the proof
     area_sr = 2 * math.pi * (1 - math.cos(radius_rad))
-    bright = vectors[: min(len(vectors), math.ceil(2.5 * STARS_A_CIRCLE * 4 * math.pi / area_sr))]
-    number = np.arange(circles) + 0.5
-    z = 1 - 2 * number / circles
-    azimuth = number * math.pi * (3 - math.sqrt(5))
-    level = np.sqrt(1 - z * z)
-    centres = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), z], axis=1)
+    count = math.ceil(2.5 * STARS_A_CIRCLE * 4 * math.pi / area_sr)
+    bright = vectors[: min(len(vectors), count)]
+    centres = _spread(radius_rad * 0.8)
     if near is not None:
         centres = centres[centres @ near > math.cos(min(reach, math.pi))]
-    within = cKDTree(bright).query_ball_point(
-        centres, 2 * math.sin(radius_rad / 2), return_sorted=True
-    )
-    sets = [row[:STARS_A_CIRCLE] for row in within if len(row) >= 3]
-    every = []
-    for size in range(3, STARS_A_CIRCLE + 1):
-        rows = np.array([row for row in sets if len(row) == size], dtype=np.intp)
-        if len(rows):
-            every.append(rows[:, list(itertools.combinations(range(size), 3))].reshape(-1, 3))
-    if not every:
-        return np.empty((0, 3), dtype=np.intp), np.empty(0), cKDTree(np.empty((0, 3)))
-    count = len(vectors)  # one number a triple, in order: three times as quick to sort as rows
-    code = np.unique(np.concatenate(every) @ np.array([count**2, count, 1]))
-    triples = np.column_stack([code // count**2, code // count % count, code % count])
+    chord = 2 * math.sin(radius_rad / 2)
+    circles = cKDTree(bright).query_ball_point(centres, chord, return_sorted=True)
+    triples = _triples(circles, len(vectors))
+    if not len(triples):
+        return Triangles(triples, np.empty(0), cKDTree(np.empty((0, 3))))
     ordered, keys, turns = _keys(triples, vectors)
-    wide = keys[:, 0] > math.log(MIN_SIDE * 2 * radius_rad * 0.8)
-    return ordered[wide], turns[wide], cKDTree(keys[wide] * STRETCH)
+    shortest_rad = MIN_SIDE * 2 * radius_rad * 0.8
+    is_wide = keys[:, 0] > math.log(shortest_rad)
+    tree = cKDTree(keys[is_wide] * STRETCH)
+    return Triangles(ordered[is_wide], turns[is_wide], tree)
+
+
+def _spread(spacing_rad: float) -> FloatArray:
+    """Directions (n, 3) spread evenly over the sky, on a spiral of golden angles."""
+    count = math.ceil(4 * math.pi / spacing_rad**2)
+    number = np.arange(count) + 0.5
+    z = 1 - 2 * number / count
+    azimuth = number * math.pi * (3 - math.sqrt(5))
+    level = np.sqrt(1 - z * z)
+    return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), z], axis=1)
+
+
+def _triples(circles: Iterable[Any], stars: int) -> IntArray:
+    """All triples (t, 3), each once, of the brightest of `stars` stars in each circle."""
+    by_size: dict[int, list[list[int]]] = {}
+    for rows in circles:
+        brightest = rows[:STARS_A_CIRCLE]
+        by_size.setdefault(len(brightest), []).append(brightest)
+    parts = []
+    for size in range(3, STARS_A_CIRCLE + 1):
+        if size in by_size:
+            rows_of_size = np.array(by_size[size], dtype=np.intp)
+            corners = list(itertools.combinations(range(size), 3))
+            parts.append(rows_of_size[:, corners].reshape(-1, 3))
+    if not parts:
+        return np.empty((0, 3), dtype=np.intp)
+    # one number a triple, in order: three times as quick to sort as rows
+    code = np.unique(np.concatenate(parts) @ np.array([stars**2, stars, 1]))
+    return np.column_stack([code // stars**2, code // stars % stars, code % stars])
 
 
 def _keys(triples: IntArray, vectors: FloatArray) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -157,14 +196,16 @@ def _keys(triples: IntArray, vectors: FloatArray) -> tuple[IntArray, FloatArray,
     and two ratios; handedness.
     """
     corners = vectors[triples]
-    sides = 2 * np.arcsin(np.linalg.norm(corners[:, [1, 2, 0]] - corners[:, [2, 0, 1]], axis=2) / 2)
+    opposite = corners[:, [1, 2, 0]] - corners[:, [2, 0, 1]]
+    sides = 2 * np.arcsin(np.linalg.norm(opposite, axis=2) / 2)
     order = np.argsort(-sides, axis=1)
     sides = np.take_along_axis(sides, order, axis=1)
     triples = np.take_along_axis(triples, order, axis=1)
-    corners = vectors[triples]
-    turn = np.sign(np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])))
+    first, second, third = np.moveaxis(vectors[triples], 1, 0)
+    turn = np.sign(np.einsum("ij,ij->i", first, np.cross(second, third)))
     # a ratio's tolerance is the tree's unit; the scale's is STEP
-    keys = np.column_stack([np.log(sides[:, 0]), sides[:, 1:] / sides[:, :1]])
+    ratios = sides[:, 1:] / sides[:, :1]
+    keys = np.column_stack([np.log(sides[:, 0]), ratios])
     return triples, keys, turn
 
 
@@ -173,43 +214,47 @@ def _image_triples(field: SourceField) -> Iterator[tuple[int, int, int]]:
     first.
     """
     radius = CIRCLE * min(field.width_px, field.height_px)
-    ways = []
-    for size in (field.width_px, field.height_px):
-        ways.append(np.arange(-(size / 2 - radius), size / 2 - radius + 1, max(radius / 2, 1.0)))
-    known_triples: set[tuple[int, int, int]] = set()
-    triples: list[tuple[int, int, int]] = []
-    for x, y in itertools.product(*ways):
-        near = np.flatnonzero(
-            np.hypot(field.places_px[:, 0] - x, field.places_px[:, 1] - y) < radius
-        )[:SOURCES_A_CIRCLE]
+    step = max(radius / 2, 1.0)
+    x_reach = field.width_px / 2 - radius
+    y_reach = field.height_px / 2 - radius
+    columns = np.arange(-x_reach, x_reach + 1, step)
+    rows = np.arange(-y_reach, y_reach + 1, step)
+    source_x, source_y = field.places_px.T
+    # an order that does not change, without repeats
+    triples: dict[tuple[int, int, int], None] = {}
+    for x, y in itertools.product(columns, rows):
+        distance = np.hypot(source_x - x, source_y - y)
+        near = np.flatnonzero(distance < radius)[:SOURCES_A_CIRCLE]
         for triple in itertools.combinations(near.tolist(), 3):
-            if triple not in known_triples:
-                known_triples.add(triple)
-                triples.append(triple)
+            triples[triple] = None
     yield from sorted(triples, key=sum)
 
 
 def _by_hypothesis(
     field: SourceField, focal_px: float, vectors: FloatArray, sky: Triangles
 ) -> SolvedField | None:
-    triples, turns, tree = sky
+    """The attitude by triangles of sources that are alike to those of stars, at about a focal
+    length.
+    """
     rays = field.rays(focal_px)
-    mine = np.array(list(_image_triples(field)), dtype=np.intp).reshape(-1, 3)
-    if not len(mine) or not len(triples):
+    image_triples = np.array(list(_image_triples(field)), dtype=np.intp).reshape(-1, 3)
+    if not len(image_triples) or not len(sky.triples):
         return None
-    mine, keys, turn = _keys(mine, rays)
+    image_triples, keys, turn = _keys(image_triples, rays)
     proof = _Proof(field, vectors)
     tried = 0
-    near = tree.query_ball_point(keys * STRETCH, MAX_RATIO_OFF * 1.2)
+    near = sky.tree.query_ball_point(keys * STRETCH, MAX_RATIO_OFF * 1.2)
     for row, candidates in enumerate(near):
         for candidate in candidates:
-            if turns[candidate] != turn[row]:
+            if sky.turns[candidate] != turn[row]:
                 continue
             tried += 1
             if tried > MAX_CANDIDATES:
                 return None
-            scale = math.exp(keys[row, 0] - tree.data[candidate, 0] / STRETCH[0])
-            solution = proof.of(mine[row], triples[candidate], focal_px * scale)
+            log_side = sky.tree.data[candidate, 0] / STRETCH[0]
+            scale = math.exp(keys[row, 0] - log_side)
+            stars = sky.triples[candidate]
+            solution = proof.of(image_triples[row], stars, focal_px * scale)
             if solution is not None:
                 return solution
     return None
@@ -224,9 +269,10 @@ class _Proof:
         self.places = field.places_px[:MAX_SOURCES]
         self.tree = cKDTree(self.places)
         self.radius_px = NEAR * field.diagonal_px
-        self.chance = min(
-            0.5, len(self.places) * math.pi * self.radius_px**2 / (field.width_px * field.height_px)
-        )
+        # that a random place is within the radius of some source
+        area_px = field.width_px * field.height_px
+        circles_px = len(self.places) * math.pi * self.radius_px**2
+        self.chance = min(0.5, circles_px / area_px)
         self.sky = cKDTree(vectors)
 
     def of(self, sources: IntArray, stars: IntArray, focal_px: float) -> SolvedField | None:
@@ -236,28 +282,33 @@ class _Proof:
         if len(in_image) < MIN_MATCHED:
             return None
         star, source = self._pairs(in_image, matrix, focal_px)
+        if len(star) < MIN_MATCHED:
+            return None
+        # the three pairs match by themselves
         more = len(star) - 3
-        of = len(in_image) - 3
-        if len(star) < MIN_MATCHED or betainc(more, of - more + 1, self.chance) > MAX_CHANCE:
+        others = len(in_image) - 3
+        if betainc(more, others - more + 1, self.chance) > MAX_CHANCE:
             return None
         for _ in range(3):
             matrix, focal_px = _refined(self.places[source], self.vectors[star], matrix, focal_px)
-            star, source = self._pairs(self._seen(matrix, focal_px), matrix, focal_px)
+            in_image = self._seen(matrix, focal_px)
+            star, source = self._pairs(in_image, matrix, focal_px)
             if len(star) < MIN_MATCHED:
                 return None
         return SolvedField(from_matrix(matrix), focal_px, source, star)
 
     def _seen(self, matrix: FloatArray, focal_px: float) -> IntArray:
         """The brightest stars on the image, as many as there are sources."""
-        radius = math.atan(self.field.diagonal_px / 2 / focal_px)
-        near = np.sort(self.sky.query_ball_point(matrix[2], 2 * math.sin(radius / 2)))
-        at = self._places(self.vectors[near], matrix, focal_px)
-        inside = (np.abs(at[:, 0]) < self.field.width_px / 2) & (
-            np.abs(at[:, 1]) < self.field.height_px / 2
-        )
-        return np.asarray(near[inside][: len(self.places)], dtype=np.intp)
+        radius_rad = math.atan(self.field.diagonal_px / 2 / focal_px)
+        boresight = matrix[2]
+        near = np.sort(self.sky.query_ball_point(boresight, 2 * math.sin(radius_rad / 2)))
+        x, y = self._places(self.vectors[near], matrix, focal_px).T
+        across = np.abs(x) < self.field.width_px / 2
+        down = np.abs(y) < self.field.height_px / 2
+        return np.asarray(near[across & down][: len(self.places)], dtype=np.intp)
 
     def _places(self, vectors: FloatArray, matrix: FloatArray, focal_px: float) -> FloatArray:
+        """Places (n, 2) of stars from the image's middle, px."""
         cam = vectors @ matrix.T
         return np.asarray(focal_px * cam[:, :2] / cam[:, 2:])
 
@@ -276,10 +327,13 @@ def nearest_once(
     """Which places (n, 2), brightest first, have a source of a tree within a radius, each source
     once, and that source.
     """
-    off, source = map(np.asarray, tree.query(places_px, distance_upper_bound=radius_px))
-    here = np.flatnonzero(np.isfinite(off))
-    here = here[np.sort(np.unique(source[here], return_index=True)[1])]
-    return here, source[here]
+    distances, sources = tree.query(places_px, distance_upper_bound=radius_px)
+    near = np.flatnonzero(np.isfinite(np.asarray(distances)))
+    source = np.asarray(sources)
+    # the first, which is the brightest, of the places at a source
+    _, first = np.unique(source[near], return_index=True)
+    near = near[np.sort(first)]
+    return near, source[near]
 
 
 def turned(cam: FloatArray, icrs: FloatArray) -> FloatArray:
@@ -287,7 +341,8 @@ def turned(cam: FloatArray, icrs: FloatArray) -> FloatArray:
     1988).
     """
     u, _, vt = np.linalg.svd(cam.T @ icrs)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
+    handedness = np.linalg.det(u) * np.linalg.det(vt)
+    return np.asarray(u @ np.diag([1.0, 1.0, handedness]) @ vt)
 
 
 def _refined(
@@ -300,4 +355,9 @@ def _refined(
     centred_px = places - places.mean(axis=0)
     focal_px = float(np.sqrt((centred_px**2).sum() / (plane**2).sum()))
     rays = np.column_stack([places / focal_px, np.ones(len(places))])
-    return turned(rays / np.linalg.norm(rays, axis=1, keepdims=True), vectors), focal_px
+    return turned(_unit(rays), vectors), focal_px
+
+
+def _unit(rays: FloatArray) -> FloatArray:
+    """Directions (n, 3) of norm 1."""
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

@@ -4,8 +4,8 @@ file read back.
 
 import json
 import math
-from collections.abc import Iterable
-from dataclasses import replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,14 @@ from hilstar.instruments.confront.background import FixedPattern
 from hilstar.instruments.confront.light import NO_CORRECTION, LightFit
 from hilstar.instruments.confront.photon_transfer import PixelFit
 from hilstar.instruments.confront.session import FixedCamera, Session, corrected, radius2_of
-from hilstar.instruments.confront.star_psf import HALF, STAMP_PX, Stamps, StarPsf, fit_psf
+from hilstar.instruments.confront.star_psf import (
+    HALF,
+    MEAN_BV_MAG,
+    STAMP_PX,
+    Stamps,
+    StarPsf,
+    fit_psf,
+)
 from hilstar.optics.camera import Lens
 from hilstar.optics.glass.psf_file import Stack, facts_of, glass_of, write_glass
 from hilstar.optics.psf import GaussianPsf, read_psf
@@ -32,6 +39,7 @@ from hilstar.sky.spectrum import Curve
 GRID = 4  # field points along each side of the PSF file
 PER_PX, HALF_PX = 4, 6  # samples a pixel, and half of a PSF image's side
 MODEL = "confront: "  # before the PSF's own numbers in the file's history
+CARD_CHARACTERS = 60  # of them in a line of that history
 # a 24 inch screen, for a bench whose file has no monitor
 SCREEN_PX, SCREEN_PITCH_UM, FILLED = (1920, 1080), 265.5, 0.95
 PLACEHOLDER = (
@@ -40,6 +48,7 @@ PLACEHOLDER = (
 )
 UNDATED = '[sky]\nepoch_utc = "2000-01-01T00:00:00Z"\n'
 NAMES = ("tracker.toml", "tracker_distortion.toml", "tracker_qe.csv", "tracker_psf.fits")
+COPIED_TABLES = ("render", "attitude", "verify", "sync")  # of the given file, as they are
 PATH_KEYS = {
     "calibration",
     "geometry",
@@ -51,8 +60,9 @@ PATH_KEYS = {
     "satellites",
     "satellite_magnitudes",
     "extinction",
+    "true_calibration",
+    "true_geometry",
 }
-PATH_KEYS |= {"true_calibration", "true_geometry"}
 
 
 def read_tracker_file(path: Path) -> tuple[BenchFile, bool]:
@@ -66,39 +76,82 @@ def read_tracker_file(path: Path) -> tuple[BenchFile, bool]:
     has_screen = "monitor" in tables or "collimator" in tables
     if "site" in tables and "sky" not in tables:
         text = f"{text.rstrip()}\n{UNDATED}"  # photographs have dates of their own
-    return (
-        bench_file_of(path, text if has_screen else f"{text.rstrip()}\n{PLACEHOLDER}"),
-        has_screen,
-    )
+    if not has_screen:
+        text = f"{text.rstrip()}\n{PLACEHOLDER}"
+    return bench_file_of(path, text), has_screen
 
 
 def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     """Write the camera of a session as a bench file and the files it names. Raises InputError
     where they cannot be written.
     """
-    camera = session.camera.camera
-    pixels = session.pixels
-    tracker = session.file.config.tracker
-    lens = camera.lens or Lens()
-    sigma = session.camera.sigma
-    lines = [f"# fitted to {len(session.shots)} photographs: {session.camera.model}"]
-    for name, value in zip(
-        ("k1", "k2", "p1", "p2"), (*lens.radial[:2], *lens.tangential), strict=True
-    ):
-        lines.append(
-            f"{name} = {value:.9g}" + (f"  # +- {sigma[name]:.2g}" if name in sigma else "")
-        )
-    write_whole(folder / NAMES[1], "\n".join(lines) + "\n")
-    times, exposure_s = _write_efficiency(folder / NAMES[2], session)
+    _write_distortion(folder / NAMES[1], session)
+    exposure = _write_efficiency(folder / NAMES[2], session)
     _write_psf(folder / NAMES[3], session)
+    tables = _tables(session, exposure.exposure_s, has_screen)
+    absolute = _absolute(tables, session.file.folder)
+    comments = [f"# {note}\n" for note in _notes(session, exposure.factor, has_screen)]
+    lines = "\n".join(_toml(absolute))
+    path = folder / NAMES[0]
+    write_whole(path, f"{''.join(comments)}{lines}\n")
+    return path
+
+
+def _write_distortion(path: Path, session: Session) -> None:
+    lens = session.camera.camera.lens or Lens()
+    k1, k2, _ = lens.radial
+    p1, p2 = lens.tangential
+    lines = [f"# fitted to {len(session.shots)} photographs: {session.camera.model}"]
+    for name, value in (("k1", k1), ("k2", k2), ("p1", p1), ("p2", p2)):
+        line = f"{name} = {value:.9g}"
+        sigma = session.camera.sigma.get(name)
+        if sigma is not None:
+            line += f"  # +- {sigma:.2g}"
+        lines.append(line)
+    write_whole(path, "\n".join(lines) + "\n")
+
+
+def _tables(session: Session, exposure_s: float, has_screen: bool) -> dict[str, Any]:
+    """The tables of the bench file: the fitted tracker, its sky and background, and the others as
+    they were given.
+    """
+    pixels = session.pixels
+    given = parse_toml(session.file.path, session.file.text)
+    tables: dict[str, Any] = {"tracker": _tracker(session, given["tracker"], exposure_s)}
+    if session.air is not None and session.shots[0].photo.t_ns is not None:
+        # the sky's own light is in [background], as it was measured
+        site = given.get("site", {})
+        tables["site"] = {key: site[key] for key in site if not key.startswith("sky_")}
+    tables["sky"] = _dated_sky(session, given)
+    levels_dn = [np.median(shot.level.level) for shot in session.shots]
+    light_dn = float(np.median(levels_dn)) - pixels.pedestal_dn
+    light_e = max(light_dn * pixels.gain_e_per_dn, 0.0)
+    tables["background"] = {"electrons_per_px": light_e}
+    if has_screen:
+        tables["monitor"] = dict(given.get("monitor", {}))
+        tables["collimator"] = dict(given.get("collimator", {}))
+    else:
+        tables["monitor"] = {"resolution_px": list(SCREEN_PX), "pixel_pitch_um": SCREEN_PITCH_UM}
+        tables["collimator"] = {"focal_length_mm": round(_collimator_mm(session), 1)}
+    for name, table in given.items():
+        if name in COPIED_TABLES:
+            tables[name] = table
+    return tables
+
+
+def _tracker(session: Session, given: dict[str, Any], exposure_s: float) -> dict[str, Any]:
+    """The keys of [tracker]."""
+    camera = session.camera.camera
+    tracker = session.file.config.tracker
     # twice that of a mosaic's plane
     pitch_um = tracker.pixel_pitch_um * tracker.resolution_px[0] / camera.resolution_px[0]
+    principal_point_px = [round(place_px, 4) for place_px in camera.principal_point_px]
     table: dict[str, Any] = {
         "aperture_mm": tracker.aperture_mm,
         "focal_length_mm": camera.focal_length_px * pitch_um * 1e-3,
         "pixel_pitch_um": pitch_um,
         "resolution_px": list(camera.resolution_px),
-        "principal_point_px": [round(v, 4) for v in camera.principal_point_px],
+        "principal_point_px": principal_point_px,
         "quantum_efficiency": NAMES[2],
         "transmission": tracker.transmission,
         "exposure_s": exposure_s,
@@ -106,64 +159,40 @@ def write_tracker(folder: Path, session: Session, has_screen: bool) -> Path:
     }
     if tracker.frame_hz is not None:
         table["frame_hz"] = tracker.frame_hz
-    given_tables = parse_toml(session.file.path, session.file.text)
-    detector = _detector(session, given_tables["tracker"].get("detector", {}))
-    tables: dict[str, Any] = {
-        "tracker": table | {"optics": {"psf": NAMES[3]}, "detector": detector}
-    }
-    sky = _dated_sky(session, given_tables)
-    if session.air is not None and session.shots[0].photo.t_ns is not None:
-        tables["site"] = {
-            k: v for k, v in given_tables.get("site", {}).items() if not k.startswith("sky_")
-        }
-    tables["sky"] = sky
-    level = float(np.median([np.median(shot.level.level) for shot in session.shots]))
-    tables["background"] = {
-        "electrons_per_px": max((level - pixels.pedestal_dn) * pixels.gain_e_per_dn, 0.0)
-    }
-    for name in ("monitor", "collimator"):
-        tables[name] = dict(given_tables.get(name, {}))
-    if not has_screen:
-        half = [size / 2 / camera.focal_length_px for size in camera.resolution_px]
-        screen = [size * SCREEN_PITCH_UM * 1e-3 for size in SCREEN_PX]
-        focal_mm = FILLED * min(
-            side / 2 / tangent for side, tangent in zip(screen, half, strict=True)
+    table["optics"] = {"psf": NAMES[3]}
+    table["detector"] = _detector(session, given.get("detector", {}))
+    return table
+
+
+def _collimator_mm(session: Session) -> float:
+    """The focal length at which the tracker's field fills the example's screen, mm."""
+    camera = session.camera.camera
+    lengths_mm = []
+    for screen_px, tracker_px in zip(SCREEN_PX, camera.resolution_px, strict=True):
+        half_screen_mm = screen_px * SCREEN_PITCH_UM * 1e-3 / 2
+        tangent = tracker_px / 2 / camera.focal_length_px
+        lengths_mm.append(half_screen_mm / tangent)
+    return FILLED * min(lengths_mm)
+
+
+def _notes(session: Session, factor: float, has_screen: bool) -> Iterator[str]:
+    """Comments at the head of the bench file; `factor` is how much longer its exposure is than the
+    one that was given.
+    """
+    names = ", ".join(shot.photo.name for shot in session.shots)
+    yield f"By hilstar confront from {names}."
+    if factor > 1:
+        yield (
+            "Aperture and exposure are those that were given, but more light came than they give:"
+            f" exposure_s is {factor:.3g} times it."
         )
-        tables["monitor"] = {"resolution_px": list(SCREEN_PX), "pixel_pitch_um": SCREEN_PITCH_UM}
-        tables["collimator"] = {"focal_length_mm": round(focal_mm, 1)}
-    tables |= {
-        k: v
-        for k, v in given_tables.items()
-        if k not in tables and k in {"render", "attitude", "verify", "sync"}
-    }
-    notes = [
-        f"By hilstar confront from {', '.join(shot.photo.name for shot in session.shots)}.",
-        "Aperture and exposure are those that were given"
-        + (
-            f", but more light came than they give: exposure_s is {times:.3g} times it."
-            if times > 1
-            else "."
-        ),
-        f"The gain: {pixels.gain_words}.",
-        *(
-            []
-            if has_screen
-            else [
-                "The monitor and the collimator are examples that fill the field: write your own."
-            ]
-        ),
-        *(
-            [f"DN are those of the file, made linear: to the power {1 / session.power:.4f}."]
-            if session.power != 1
-            else []
-        ),
-    ]
-    path = folder / NAMES[0]
-    text = "".join(f"# {note}\n" for note in notes) + "\n".join(
-        _toml(_absolute(tables, session.file.folder))
-    )
-    write_whole(path, text + "\n")
-    return path
+    else:
+        yield "Aperture and exposure are those that were given."
+    yield f"The gain: {session.pixels.gain_words}."
+    if not has_screen:
+        yield "The monitor and the collimator are examples that fill the field: write your own."
+    if session.power != 1:
+        yield f"DN are those of the file, made linear: to the power {1 / session.power:.4f}."
 
 
 def _dated_sky(session: Session, given: dict[str, Any]) -> dict[str, Any]:
@@ -220,6 +249,7 @@ def _detector(session: Session, given: dict[str, Any]) -> dict[str, Any]:
 
 
 def _absolute(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Tables whose paths of files that exist are absolute: the new file may lie elsewhere."""
     absolute: dict[str, Any] = {}
     for key, value in tables.items():
         if isinstance(value, dict):
@@ -231,25 +261,32 @@ def _absolute(tables: dict[str, Any], folder: Path) -> dict[str, Any]:
     return absolute
 
 
-def _toml(table: dict[str, Any], name: str = "") -> Iterable[str]:
+def _toml(table: dict[str, Any], name: str = "") -> Iterator[str]:
     """Lines of a table and those in it; JSON and TOML write numbers, truth values, lists and
     plain text alike.
     """
     if name:
         yield f"\n[{name}]"
-    yield from (
-        f"{key} = {json.dumps(value)}"
-        for key, value in table.items()
-        if not isinstance(value, dict)
-    )
+    for key, value in table.items():
+        if not isinstance(value, dict):
+            yield f"{key} = {json.dumps(value)}"
+    # a key after a table's head would be that table's: tables last
     for key, value in table.items():
         if isinstance(value, dict):
             yield from _toml(value, f"{name}.{key}" if name else key)
 
 
-def _write_efficiency(path: Path, session: Session) -> tuple[float, float]:
-    """Write the quantum efficiency that gives the light that was seen; how much longer the
-    exposure has to be, and it, s.
+@dataclass(frozen=True, slots=True)
+class _Exposure:
+    """The exposure of the bench file, and how many times it is that of the photographs."""
+
+    exposure_s: float
+    factor: float
+
+
+def _write_efficiency(path: Path, session: Session) -> _Exposure:
+    """Write the quantum efficiency that gives the light that was seen, and say with which
+    exposure: a longer one where the efficiency would be over 1.
     """
     tracker = session.file.config.tracker
     optics = bench_optics(tracker, session.file.folder)
@@ -257,30 +294,35 @@ def _write_efficiency(path: Path, session: Session) -> tuple[float, float]:
     if not len(curve.wavelength_nm):
         curve = Curve(np.array([300.0, 1100.0]), np.full(2, curve.value[0]))
     exposure_s = session.shots[0].photo.exposure_s or tracker.exposure_s or 1.0
-    wanted = (
-        session.pixels.gain_e_per_dn
-        * 10 ** (-0.4 * float(session.light.offsets_mag.mean()))
-        / exposure_s
-    )
-    share = min(wanted, 1.0 / max(float(curve.value.max()), 1e-9))
-    rows = "\n".join(
-        f"{nm:.2f},{value * share:.7g}"
-        for nm, value in zip(curve.wavelength_nm, curve.value, strict=True)
-    )
-    write_whole(path, f"wavelength_nm,value\n{rows}\n")
-    return wanted / share, exposure_s * wanted / share
+    offset_mag = float(session.light.offsets_mag.mean())
+    ratio = session.pixels.gain_e_per_dn * 10 ** (-0.4 * offset_mag) / exposure_s
+    largest = max(float(curve.value.max()), 1e-9)
+    share = min(ratio, 1.0 / largest)
+    lines = ["wavelength_nm,value\n"]
+    for nm, value in zip(curve.wavelength_nm, curve.value, strict=True):
+        lines.append(f"{nm:.2f},{value * share:.7g}\n")
+    write_whole(path, "".join(lines))
+    return _Exposure(exposure_s * ratio / share, ratio / share)
 
 
 def _write_psf(path: Path, session: Session) -> None:
+    """Write images of the PSF on a grid of the field, and in the history the model's numbers."""
     psf = session.psf
     light = session.light
     width, height = psf.size_px
-    across, down = (np.linspace(0, size - 1, GRID) for size in (width, height))
-    places = np.array([(x, y) for x in across for y in down])
-    images = np.stack([psf.samples(x, y, PER_PX, HALF_PX) for x, y in places])
-    facts = facts_of(len(places))
-    facts[:, 0] = np.clip(light.illumination(radius2_of(session.camera.camera, *places.T)), 0, 2)
-    at = np.column_stack([places, np.full(len(places), np.nan), np.zeros(len(places))])
+    places = []
+    images = []
+    for x_px in np.linspace(0, width - 1, GRID):
+        for y_px in np.linspace(0, height - 1, GRID):
+            places.append((x_px, y_px))
+            images.append(psf.samples(x_px, y_px, PER_PX, HALF_PX))
+    places_px = np.array(places)
+    facts = facts_of(len(places_px))
+    illumination = light.illumination(radius2_of(session.camera.camera, *places_px.T))
+    facts[:, 0] = np.clip(illumination, 0, 2)
+    no_wavelength = np.full(len(places_px), np.nan)
+    in_focus = np.zeros(len(places_px))
+    at = np.column_stack([places_px, no_wavelength, in_focus])
     numbers = {
         "covariance": psf.covariance.tolist(),
         "colour": float(psf.colour),
@@ -288,14 +330,11 @@ def _write_psf(path: Path, session: Session) -> None:
         "vignetting": list(light.vignetting_mag),
     }
     text = json.dumps(numbers, separators=(",", ":"))  # a FITS card loses spaces at its end
-    parts = [f"{MODEL}{text[k : k + 60]}" for k in range(0, len(text), 60)]
-    write_glass(
-        path,
-        glass_of(
-            Stack(images, at, facts, PER_PX, False),
-            history=("PSF of photographs, by hilstar confront", *parts),
-        ),
-    )
+    history = ["PSF of photographs, by hilstar confront"]
+    for first in range(0, len(text), CARD_CHARACTERS):
+        history.append(f"{MODEL}{text[first : first + CARD_CHARACTERS]}")
+    stack = Stack(np.stack(images), at, facts, PER_PX, False)
+    write_glass(path, glass_of(stack, history=tuple(history)))
 
 
 def fixed_camera(file: BenchFile, step_dn: float) -> FixedCamera:
@@ -305,18 +344,19 @@ def fixed_camera(file: BenchFile, step_dn: float) -> FixedCamera:
     psf, vignetting = _psf_of(file)
     light = LightFit(np.zeros(1), vignetting, NO_CORRECTION, math.nan, math.nan, 1.0)
     detector = tracker.detector
-    read_e = math.sqrt(
-        max(detector.electronics_e**2 - (step_dn**2 - 1) / 12 * detector.gain_e_per_dn**2, 0.0)
-    )
+    # the file's noise has the rounding of a detector of steps of one DN; the photographs' steps
+    # may be of several
+    rounding2_e2 = (step_dn**2 - 1) / 12 * detector.gain_e_per_dn**2
+    read_e = math.sqrt(max(detector.electronics_e**2 - rounding2_e2, 0.0))
+    pattern = FixedPattern((detector.prnu**2, 0.0, 0.0, 0.0), (0.0,) * 4)
     pixels = PixelFit(
-        detector.gain_e_per_dn,
-        detector.offset_dn,
-        read_e,
-        step_dn,
-        {},
-        np.empty((0, 2)),
-        (),
-        FixedPattern((detector.prnu**2, 0.0, 0.0, 0.0), (0.0,) * 4),
+        gain_e_per_dn=detector.gain_e_per_dn,
+        pedestal_dn=detector.offset_dn,
+        read_noise_e=read_e,
+        step_dn=step_dn,
+        sigma={},
+        points=np.empty((0, 2)),
+        pattern=pattern,
     )
     return FixedCamera(camera, psf, light, pixels)
 
@@ -326,44 +366,54 @@ def _psf_of(file: BenchFile) -> tuple[StarPsf, tuple[float, float]]:
     to the file's images.
     """
     tracker = file.config.tracker
-    size = tracker.resolution_px
+    size_px = tracker.resolution_px
     psf = tracker_psf(tracker, file.folder)
     if isinstance(psf, GaussianPsf):
-        x, y = psf.width_px
-        return StarPsf(np.array([[x * x], [y * y], [0.0]]), 0.0, 0.0, 2.0, size), (0.0, 0.0)
+        x_px, y_px = psf.width_px
+        covariance = np.array([[x_px * x_px], [y_px * y_px], [0.0]])
+        return StarPsf(covariance, 0.0, 0.0, 2.0, size_px), (0.0, 0.0)
     glass = glass_in(tracker, file.folder)
     if glass is None:
         stated_psf = read_psf(file.folder / tracker.optics.psf)
-        return _fitted(
-            np.asarray(stated_psf.samples)[None],
-            stated_psf.per_px,
-            np.array([[size[0] / 2, size[1] / 2]]),
-            size,
-        ), (0.0, 0.0)
-    model_text = "".join(
-        str(line).removeprefix(MODEL) for line in glass.history if str(line).startswith(MODEL)
-    )
-    if model_text:
-        try:
-            numbers = msgspec.json.decode(model_text)
-            wing_share, wing_sigma = numbers["wing"]
-            a, b = numbers["vignetting"]
-            return StarPsf(
-                np.array(numbers["covariance"]), numbers["colour"], wing_share, wing_sigma, size
-            ), (a, b)
-        except (msgspec.MsgspecError, LookupError, TypeError, ValueError):
-            # somebody changed it: the images count
-            pass
+        images = np.asarray(stated_psf.samples)[None]
+        middle_px = np.array([[size_px[0] / 2, size_px[1] / 2]])
+        return _fitted(images, stated_psf.per_px, middle_px, size_px), (0.0, 0.0)
+    written = _written_model(glass.history, size_px)
+    if written is not None:
+        return written
     focus = int(np.abs(glass.focuses_um - tracker.optics.focus_um).argmin())
     images = glass.images[:, :, focus].mean(axis=1)
-    light = np.log10(np.maximum(glass.illumination[:, :, focus].mean(axis=1), 1e-3)) * -2.5
+    illumination = glass.illumination[:, :, focus].mean(axis=1)
+    shade_mag = np.log10(np.maximum(illumination, 1e-3)) * -2.5
     r2 = radius2_of(tracker_camera(tracker, file.folder), *glass.places_px.T)
-    a, b = (
-        np.linalg.lstsq(np.column_stack([r2, r2**2]), light, rcond=None)[0].tolist()
-        if len(r2) > 2
-        else (0.0, 0.0)
-    )
-    return _fitted(images, glass.per_px, glass.places_px, size), (a, b)
+    vignetting_mag = (0.0, 0.0)
+    if len(r2) > 2:
+        design = np.column_stack([r2, r2**2])
+        a, b = np.linalg.lstsq(design, shade_mag, rcond=None)[0].tolist()
+        vignetting_mag = (a, b)
+    return _fitted(images, glass.per_px, glass.places_px, size_px), vignetting_mag
+
+
+def _written_model(
+    history: Iterable[object], size_px: tuple[int, int]
+) -> tuple[StarPsf, tuple[float, float]] | None:
+    """The PSF and the vignetting by the numbers that confront wrote into a PSF file's history;
+    None without them.
+    """
+    lines = [str(line) for line in history]
+    text = "".join(line.removeprefix(MODEL) for line in lines if line.startswith(MODEL))
+    if not text:
+        return None
+    try:
+        numbers = msgspec.json.decode(text)
+        wing_share, wing_sigma_px = numbers["wing"]
+        a, b = numbers["vignetting"]
+        covariance = np.array(numbers["covariance"])
+        psf = StarPsf(covariance, numbers["colour"], wing_share, wing_sigma_px, size_px)
+    except (msgspec.MsgspecError, LookupError, TypeError, ValueError):
+        # somebody changed it: the images count
+        return None
+    return psf, (a, b)
 
 
 def _fitted(
@@ -372,15 +422,16 @@ def _fitted(
     """The PSF that fits images (n, side, side) of `per_px` samples a pixel, each at its place:
     as stars of 1e6 DN.
     """
-    stamps = np.zeros((len(images), STAMP_PX, STAMP_PX))
-    middle = images.shape[-1] // 2
-    offsets = np.rint((np.arange(images.shape[-1]) - middle) / per_px).astype(np.intp)
+    count, side, _ = images.shape
+    values = np.zeros((count, STAMP_PX, STAMP_PX))
+    offsets = np.rint((np.arange(side) - side // 2) / per_px).astype(np.intp)
     is_near = np.abs(offsets) <= HALF
-    at = offsets[is_near] + HALF
-    for stamp, image in zip(stamps, images, strict=True):
-        np.add.at(stamp, (at[:, None], at[None, :]), image[np.ix_(is_near, is_near)])
+    pixel = offsets[is_near] + HALF
+    for stamp, image in zip(values, images, strict=True):
+        near_samples = image[np.ix_(is_near, is_near)]
+        np.add.at(stamp, (pixel[:, None], pixel[None, :]), near_samples)
     columns, rows = np.rint(places_px).T
-    level = Stamps(
-        1e6 * stamps, np.full_like(stamps, 1.0), columns, rows, np.full(len(stamps), 0.65)
-    )
-    return replace(fit_psf(level, columns.copy(), rows.copy(), size_px, 1.0), colour=0.0)
+    bv_mag = np.full(count, MEAN_BV_MAG)
+    stamps = Stamps(1e6 * values, np.full_like(values, 1.0), columns, rows, bv_mag)
+    psf = fit_psf(stamps, columns.copy(), rows.copy(), size_px, 1.0)
+    return replace(psf, colour=0.0)

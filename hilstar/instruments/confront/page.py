@@ -5,14 +5,14 @@ and charts; one file.
 import base64
 import io
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.charts import BLUE, INK, MUTED, ORANGE, panels_of
 from hilstar.basics.files import write_whole
 from hilstar.basics.pages import (
@@ -34,7 +34,7 @@ from hilstar.basics.pages import (
 from hilstar.instruments.confront.excess import Excess
 from hilstar.instruments.confront.judge import (
     LISTED_SNR,
-    NOT_COUNTED,
+    SourceRow,
     StarRow,
 )
 from hilstar.instruments.confront.judge import Verdict as PhotoVerdict
@@ -47,13 +47,15 @@ MAX_SIDE_PX = 1200
 # Sigmas of the background between which a picture's greys lie: the sky's noise is nearly black.
 BLACK, WHITE = 2.0, 30.0
 RESIDUAL = 5.0
+MAP_ROWS, MAP_COLUMNS = 12, 16
 JPEG_QUALITY = 82
 MAX_ROWS = 40
 MAX_NAMED = 12  # of the brightest stars, by which a reader finds his way
 NAME_SIZE = 55  # a picture's width over the height of its names
 GRID, TILE_PER_PX, TILE_HALF_PX = 5, 8, 3
 VIEWS = ("photograph", "prediction", "residual")
-STYLE, SCRIPT = (Path(__file__).with_suffix(ending) for ending in (".css", ".js"))
+STYLE = Path(__file__).with_suffix(".css")
+SCRIPT = Path(__file__).with_suffix(".js")
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,22 +71,36 @@ class Pictures:
 def page_pictures(session: Session, verdict: PhotoVerdict) -> Pictures:
     """The pictures of a verdict, before its arrays are dropped."""
     shot = verdict.shot
-    noise = np.sqrt(session.pixels.variance_dn2(shot.level.level))
-    in_sigmas = [(part - shot.level.level) / noise for part in (shot.photo.dn, verdict.predicted)]
-    top = math.asinh(WHITE)
-    greys = []
-    for part in in_sigmas:
-        above = np.clip(brightest(part, MAX_SIDE_PX) - BLACK, 0, None)
-        greys.append(255 * np.clip(np.arcsinh(above) / top, 0, 1))
-    greys.append(255 * np.clip(verdict.residual / (2 * RESIDUAL) + 0.5, 0, 1))
-    height, width = verdict.residual.shape
-    rows = np.linspace(0, height, 13).astype(int)
-    columns = np.linspace(0, width, 17).astype(int)
-    clipped = np.minimum(verdict.residual**2, 25.0)
-    sums = np.add.reduceat(np.add.reduceat(clipped, rows[:-1], axis=0), columns[:-1], axis=1)
-    return Pictures(
-        tuple(_jpeg(grey) for grey in greys), sums / np.outer(np.diff(rows), np.diff(columns))
+    noise_dn = np.sqrt(session.pixels.variance_dn2(shot.level.level))
+    predicted_dn = verdict.predicted - shot.level.level
+    residual_grey = 255 * np.clip(verdict.residual / (2 * RESIDUAL) + 0.5, 0, 1)
+    views = (
+        _jpeg(_grey(shot.above_dn / noise_dn)),
+        _jpeg(_grey(predicted_dn / noise_dn)),
+        _jpeg(residual_grey),
     )
+    return Pictures(views, _chi2_map(verdict.residual))
+
+
+def _grey(sigmas: FloatArray) -> FloatArray:
+    """Greys of 0 to 255 of an image in sigmas, no larger than the page shows; faint stars are
+    raised by an inverse hyperbolic sine.
+    """
+    above = np.clip(brightest(sigmas, MAX_SIDE_PX) - BLACK, 0, None)
+    share = np.arcsinh(above) / math.asinh(WHITE)
+    return np.asarray(255 * np.clip(share, 0, 1))
+
+
+def _chi2_map(residual: FloatArray) -> FloatArray:
+    """Mean squares (MAP_ROWS, MAP_COLUMNS) of an image's residuals in sigmas."""
+    height, width = residual.shape
+    rows = np.linspace(0, height, MAP_ROWS + 1).astype(int)
+    columns = np.linspace(0, width, MAP_COLUMNS + 1).astype(int)
+    clipped = np.minimum(residual**2, RESIDUAL**2)
+    by_row = np.add.reduceat(clipped, rows[:-1], axis=0)
+    sums = np.add.reduceat(by_row, columns[:-1], axis=1)
+    areas = np.outer(np.diff(rows), np.diff(columns))
+    return np.asarray(sums / areas)
 
 
 def brightest(image: FloatArray, max_side_px: int) -> FloatArray:
@@ -94,9 +110,9 @@ def brightest(image: FloatArray, max_side_px: int) -> FloatArray:
     factor = math.ceil(max(image.shape) / max_side_px)
     if factor == 1:
         return image
-    edges = [np.arange(0, size, factor) for size in image.shape]
-    rows = np.maximum.reduceat(image, edges[0], axis=0)
-    return np.asarray(np.maximum.reduceat(rows, edges[1], axis=1))
+    height, width = image.shape
+    rows = np.maximum.reduceat(image, np.arange(0, height, factor), axis=0)
+    return np.asarray(np.maximum.reduceat(rows, np.arange(0, width, factor), axis=1))
 
 
 def _jpeg(grey: FloatArray) -> bytes:
@@ -113,7 +129,8 @@ def _jpeg(grey: FloatArray) -> bytes:
 def write_page(path: Path, found: Confronted, pictures: Sequence[Pictures]) -> None:
     """Write the page, which needs no other file. Raises InputError where it cannot be written."""
     parts = [f"<style>{STYLE.read_text()}</style>", figures_of(_figures(found.verdicts))]
-    parts += [card.html() for card in _cards(found, pictures)]
+    for card in _cards(found, pictures):
+        parts.append(card.html())
     title = "Photographs against the simulator"
     write_whole(path, page_of(title, _verdict(found), parts, SCRIPT.read_text()))
 
@@ -130,16 +147,19 @@ def _verdict(found: Confronted) -> Verdict:
 def _figures(verdicts: Sequence[PhotoVerdict]) -> Iterator[KeyFigure]:
     """Stars, how far they are off, and what is missing on either side; of all photographs."""
     counted = sum(verdict.counted for verdict in verdicts)
+    unexplained = sum(len(verdict.unexplained) for verdict in verdicts)
+    missing = sum(len(verdict.missing) for verdict in verdicts)
+    worst_px = _worst([verdict.rms_px for verdict in verdicts])
+    worst_mag = _worst([verdict.rms_mag for verdict in verdicts])
     yield KeyFigure(str(counted), f"stars to V = {BRIGHT_V_MAG:g}")
-    yield KeyFigure(f"{_worst(verdict.rms_px for verdict in verdicts)} px", "rms off their places")
-    yield KeyFigure(f"{_worst(verdict.rms_mag for verdict in verdicts)} mag", "rms off their light")
-    yield _count(
-        sum(len(verdict.unexplained) for verdict in verdicts), "sources that nothing explains"
-    )
-    yield _count(sum(len(verdict.missing) for verdict in verdicts), "stars that are missing")
+    yield KeyFigure(f"{worst_px} px", "rms off their places")
+    yield KeyFigure(f"{worst_mag} mag", "rms off their light")
+    yield _count(unexplained, "sources that nothing explains")
+    yield _count(missing, "stars that are missing")
 
 
-def _worst(values: Iterable[float]) -> str:
+def _worst(values: Sequence[float]) -> str:
+    """The largest of the values that are known, in words."""
     known = [value for value in values if math.isfinite(value)]
     if not known:
         return DASH
@@ -206,7 +226,8 @@ def _summary(verdicts: Sequence[PhotoVerdict]) -> str:
 
 def _frame(verdict: PhotoVerdict, pictures: Pictures) -> str:
     """A photograph, its prediction and residual, with marks and names."""
-    height, width = verdict.shot.photo.dn.shape
+    photo = verdict.shot.photo
+    height, width = photo.dn.shape
     marks = [_name(row, width) for row in _brightest(verdict)]
     for source in verdict.unexplained:
         corner = f'x="{source.x_px - 9:.0f}" y="{source.y_px - 9:.0f}"'
@@ -216,13 +237,14 @@ def _frame(verdict: PhotoVerdict, pictures: Pictures) -> str:
         marks.append(f'<circle {middle} r="10" stroke="#6cb6ff"/>')
     view = f'viewBox="-0.5 -0.5 {width} {height}" fill="none" stroke-width="1.5"'
     over = f'<svg {view} aria-hidden="true">{"".join(marks)}</svg>'
-    images = "".join(
-        f'<img alt="{name} of {escaped(verdict.shot.photo.name)}"'
-        f' src="data:image/jpeg;base64,{base64.b64encode(data).decode()}">'
-        for name, data in zip(VIEWS, pictures.views, strict=True)
-    )
-    names = (*VIEWS, "blink", "side by side")
-    buttons = "".join(f'<button type="button">{name}</button> ' for name in names)
+    images = ""
+    for name, data in zip(VIEWS, pictures.views, strict=True):
+        encoded = base64.b64encode(data).decode()
+        source_url = f"data:image/jpeg;base64,{encoded}"
+        images += f'<img alt="{name} of {escaped(photo.name)}" src="{source_url}">'
+    buttons = ""
+    for name in (*VIEWS, "blink", "side by side"):
+        buttons += f'<button type="button">{name}</button> '
     note = paragraph(
         f"Names: the {MAX_NAMED} brightest stars. Squares: sources over {LISTED_SNR:g} sigmas that"
         f" nothing explains. Circles: stars that are missing. Black is {BLACK:g} sigmas"
@@ -253,86 +275,77 @@ def _name(row: StarRow, width: int) -> str:
     return f'<text {place} text-anchor="{anchor}" fill="#ffd24a">{escaped(name)}</text>'
 
 
-def _charts(found: Confronted, pictures: Sequence[Pictures]) -> list[tuple[str, str]]:
-    rows = [
-        row
-        for verdict in found.verdicts
-        for row in verdict.stars
-        if row.dn > 0 and row.dn_predicted > 0
-    ]
-    good = [row for row in rows if not NOT_COUNTED & set(row.flags)]
-    if good:
-        charts = [("Flux and colour", _flux(found, good))]
-    else:
-        charts = []
-    if good:
-        charts.append(("Places", _places(good)))
-    charts.append(("Point spread function", _psf_grid(found.session)))
+def _charts(found: Confronted, pictures: Sequence[Pictures]) -> Iterator[tuple[str, str]]:
+    """Titles and charts."""
+    rows = []
+    for verdict in found.verdicts:
+        for row in verdict.stars:
+            if row.dn > 0 and row.dn_predicted > 0 and row.stands_alone:
+                rows.append(row)
+    if rows:
+        yield "Flux and colour", _flux(found, rows)
+        yield "Places", _places(rows)
+    yield "Point spread function", _psf_grid(found.session)
     if len(found.session.pixels.points):
-        charts.append(("Photon transfer", _transfer(found.session)))
-    charts.append(("Squared residuals over the field", _chi2_maps(found.verdicts, pictures)))
-    return charts
+        yield "Photon transfer", _transfer(found.session)
+    yield "Squared residuals over the field", _chi2_maps(found.verdicts, pictures)
 
 
-def _flux(found: Confronted, rows: Sequence[Any]) -> str:
-    v, bv, dn, off = (
-        np.array([getattr(row, name) for row in rows])
-        for name in ("v_mag", "b_v_mag", "dn", "off_mag")
-    )
+def _flux(found: Confronted, rows: Sequence[StarRow]) -> str:
+    """Flux against V, and how far off it is against V and colour."""
+    v_mag = np.array([row.v_mag for row in rows])
+    bv_mag = np.array([row.b_v_mag for row in rows])
+    instrument_mag = -2.5 * np.log10(np.array([row.dn for row in rows]))
+    off_mag = np.array([row.off_mag for row in rows])
     light = found.session.light
     counted = np.array([row.counted for row in rows])
+    rms_mag = math.nan
     if counted.any():
-        rms = math.sqrt(float((off[counted] ** 2).mean()))
-    else:
-        rms = math.nan
-    finding = f"Stars to V = 6.5 are {rms:.3f} mag rms off their prediction"
+        rms_mag = math.sqrt(float((off_mag[counted] ** 2).mean()))
+    finding = f"Stars to V = 6.5 are {rms_mag:.3f} mag rms off their prediction"
     note = (
         "Stars that stand alone and are not saturated. Filled: to V = 6.5. Off: seen less"
         " predicted, up where too faint."
     )
     with panels_of(finding, 1, 3, share_x=False, note=note, height_inch=3.9) as panels:
-        for axes, x, y, names in (
-            (panels[0], v, -2.5 * np.log10(dn), ("V [mag]", "-2.5 log10 DN")),
-            (panels[1], v, off, ("V [mag]", "off [mag]")),
-            (panels[2], bv, off, ("B-V [mag]", "off [mag]")),
-        ):
-            axes.plot(
-                x[~counted], y[~counted], "o", ms=2.5, mfc="none", color=MUTED, rasterized=True
-            )
-            axes.plot(x[counted], y[counted], "o", ms=3.5, color=BLUE)
-            axes.set(xlabel=names[0], ylabel=names[1])
-        for axes in panels[1:]:
+        by_flux, by_v, by_colour = panels
+        _draw_stars(by_flux, v_mag, instrument_mag, counted)
+        by_flux.set(xlabel="V [mag]", ylabel="-2.5 log10 DN")
+        _draw_stars(by_v, v_mag, off_mag, counted)
+        by_v.set(xlabel="V [mag]", ylabel="off [mag]", ylim=(-1, 1))
+        _draw_stars(by_colour, bv_mag, off_mag, counted)
+        by_colour.set(xlabel="B-V [mag]", ylabel="off [mag]", ylim=(-1, 1))
+        for axes in (by_v, by_colour):
             axes.axhline(0, color=INK, lw=1)
-            axes.set_ylim(-1, 1)
         if math.isfinite(light.zero_point_mag):
-            line = np.array([v.min(), v.max()])
-            panels[0].plot(
-                line,
-                line - light.zero_point_mag + light.colour_term * float(np.nanmedian(bv)),
-                color=ORANGE,
-                lw=1.2,
-            )
+            ends_mag = np.array([v_mag.min(), v_mag.max()])
+            colour_mag = light.colour_term * float(np.nanmedian(bv_mag))
+            fitted_mag = ends_mag - light.zero_point_mag + colour_mag
+            by_flux.plot(ends_mag, fitted_mag, color=ORANGE, lw=1.2)
     return drawing_of(
         panels[0].figure, "flux against V, and what is left of it against V and colour"
     )
 
 
-def _places(rows: Sequence[Any]) -> str:
-    some = [row for row in rows if row.dn > 20 * row.sigma_dn]
-    x, y = (
-        np.array([getattr(row, name) for row in some])
-        for name in ("x_predicted_px", "y_predicted_px")
-    )
-    dx = np.array([row.x_px - row.x_predicted_px for row in some])
-    dy = np.array([row.y_px - row.y_predicted_px for row in some])
-    if some:
-        rms = math.sqrt(float((dx**2 + dy**2).mean() / 2))
-    else:
-        rms = math.nan
-    with panels_of(
-        f"Stars of 20 sigmas and more are {rms:.3f} px rms an axis off their places",
-        height_inch=4.6,
-    ) as panels:
+def _draw_stars(axes: Any, x: FloatArray, y: FloatArray, counted: BoolArray) -> None:
+    """Stars that count are filled, the others open."""
+    others = {"ms": 2.5, "mfc": "none", "color": MUTED, "rasterized": True}
+    axes.plot(x[~counted], y[~counted], "o", **others)
+    axes.plot(x[counted], y[counted], "o", ms=3.5, color=BLUE)
+
+
+def _places(rows: Sequence[StarRow]) -> str:
+    """Arrows from predicted places to those seen."""
+    bright = [row for row in rows if row.dn > 20 * row.sigma_dn]
+    x = np.array([row.x_predicted_px for row in bright])
+    y = np.array([row.y_predicted_px for row in bright])
+    off_px = np.array([row.off_px for row in bright]).reshape(-1, 2)
+    dx, dy = off_px.T
+    rms_px = math.nan
+    if bright:
+        rms_px = math.sqrt(float((dx**2 + dy**2).mean() / 2))
+    finding = f"Stars of 20 sigmas and more are {rms_px:.3f} px rms an axis off their places"
+    with panels_of(finding, height_inch=4.6) as panels:
         axes = panels[0]
         arrows = axes.quiver(
             x, y, dx, dy, angles="xy", color=BLUE, width=0.003, scale=2.0, scale_units="width"
@@ -344,31 +357,33 @@ def _places(rows: Sequence[Any]) -> str:
 
 
 def _psf_grid(session: Session) -> str:
+    """The PSF at GRID by GRID places of the field, in one picture: 25 panels of their own take a
+    second.
+    """
     psf = session.psf
     width, height = psf.size_px
-    places = [
-        (x, y) for y in np.linspace(0, height - 1, GRID) for x in np.linspace(0, width - 1, GRID)
-    ]
-    fwhm = psf.fwhm_px(*np.array(places).T)
-    finding = f"Full width at half maximum {fwhm.min():.2f} to {fwhm.max():.2f} px, pixel included"
-    tiles = np.array([np.sqrt(psf.samples(x, y, TILE_PER_PX, TILE_HALF_PX)) for x, y in places])
-    side = tiles.shape[-1]
-    mosaic = tiles.reshape(GRID, GRID, side, side).swapaxes(1, 2).reshape(GRID * side, GRID * side)
-    with panels_of(
-        finding,
-        note="Width and height of each tile: 6 px. Numbers: place and width, px.",
-        height_inch=6.6,
-    ) as panels:
-        axes = panels[0]  # one picture: 25 panels of their own take a second
+    columns, rows = np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))
+    x_px = columns.ravel()
+    y_px = rows.ravel()
+    fwhm_px = psf.fwhm_px(x_px, y_px)
+    tiles = []
+    for x, y in zip(x_px, y_px, strict=True):
+        # a root: the wings show beside the core
+        tiles.append(np.sqrt(psf.samples(x, y, TILE_PER_PX, TILE_HALF_PX)))
+    side = tiles[0].shape[-1]
+    grid = np.array(tiles).reshape(GRID, GRID, side, side)
+    mosaic = grid.swapaxes(1, 2).reshape(GRID * side, GRID * side)
+    finding = (
+        f"Full width at half maximum {fwhm_px.min():.2f} to {fwhm_px.max():.2f} px, pixel included"
+    )
+    note = "Width and height of each tile: 6 px. Numbers: place and width, px."
+    with panels_of(finding, note=note, height_inch=6.6) as panels:
+        axes = panels[0]
         axes.imshow(mosaic, cmap="gray_r", extent=(0, GRID, GRID, 0))
-        for number, ((x, y), wide) in enumerate(zip(places, fwhm, strict=True)):
-            axes.text(
-                number % GRID + 0.03,
-                number // GRID + 0.97,
-                f"{x:.0f}, {y:.0f}: {wide:.2f}",
-                fontsize=7,
-                color=MUTED,
-            )
+        for number, (x, y, wide) in enumerate(zip(x_px, y_px, fwhm_px, strict=True)):
+            row, column = divmod(number, GRID)
+            text = f"{x:.0f}, {y:.0f}: {wide:.2f}"
+            axes.text(column + 0.03, row + 0.97, text, fontsize=7, color=MUTED)
         axes.set_xticks(range(GRID + 1), [""] * (GRID + 1))
         axes.set_yticks(range(GRID + 1), [""] * (GRID + 1))
     return drawing_of(panels[0].figure, "point spread functions over the field")
@@ -420,31 +435,42 @@ def _chi2_maps(verdicts: Sequence[PhotoVerdict], pictures: Sequence[Pictures]) -
 
 def _lists(verdicts: Sequence[PhotoVerdict]) -> Iterator[Card]:
     """What was seen and is no star, and what is missing."""
-    sources: list[tuple[object, ...]] = [
-        (v.shot.photo.name, round(s.x_px, 1), round(s.y_px, 1), s.snr)
-        for v in verdicts
-        for s in v.unexplained
-    ]
-    sources.sort(key=lambda row: -float(str(row[3])))
-    named: list[tuple[object, ...]] = [
-        (v.shot.photo.name, round(s.x_px, 1), round(s.y_px, 1), s.snr, s.explained_by)
-        for v in verdicts
-        for s in v.sources
-        if s.explained_by and not s.explained_by.startswith("HIP ") and s.snr >= LISTED_SNR
-    ]
-    missing: list[tuple[object, ...]] = [
-        (v.shot.photo.name, r.name, r.v_mag, round(r.x_predicted_px, 1), round(r.y_predicted_px, 1))
-        for v in verdicts
-        for r in v.missing
-    ]
-    for title, rows, header in (
-        ("Sources that nothing explains", sources, ("photograph", "x, px", "y, px", "sigmas")),
-        ("Sources that are no stars", named, ("photograph", "x, px", "y, px", "sigmas", "what")),
-        ("Stars that are missing", missing, ("photograph", "star", "V, mag", "x, px", "y, px")),
-    ):
-        if not rows:
-            continue
-        texts = [table_of(rows[:MAX_ROWS], header)]
-        if len(rows) > MAX_ROWS:
-            texts.append(paragraph(f"{len(rows) - MAX_ROWS} more in the tables."))
-        yield Card(title, words=texts)
+    unexplained = []
+    named: list[tuple[object, ...]] = []
+    missing: list[tuple[object, ...]] = []
+    for verdict in verdicts:
+        photograph = verdict.shot.photo.name
+        for source in verdict.unexplained:
+            x, y = round(source.x_px, 1), round(source.y_px, 1)
+            unexplained.append((photograph, x, y, source.snr))
+        for source in verdict.sources:
+            if _is_named(source):
+                x, y = round(source.x_px, 1), round(source.y_px, 1)
+                named.append((photograph, x, y, source.snr, source.explained_by))
+        for star in verdict.missing:
+            x, y = round(star.x_predicted_px, 1), round(star.y_predicted_px, 1)
+            missing.append((photograph, star.name, star.v_mag, x, y))
+    unexplained.sort(key=lambda row: -row[3])
+    place = ("x, px", "y, px")
+    yield from _list("Sources that nothing explains", unexplained, ("photograph", *place, "sigmas"))
+    header = ("photograph", *place, "sigmas", "what")
+    yield from _list("Sources that are no stars", named, header)
+    yield from _list("Stars that are missing", missing, ("photograph", "star", "V, mag", *place))
+
+
+def _is_named(source: SourceRow) -> bool:
+    """Whether a source is something that is no star, and stands out."""
+    is_star = source.explained_by.startswith("HIP ")
+    return bool(source.explained_by) and not is_star and source.snr >= LISTED_SNR
+
+
+def _list(
+    title: str, rows: Sequence[tuple[object, ...]], header: tuple[str, ...]
+) -> Iterator[Card]:
+    """A card with the first MAX_ROWS rows; none without rows."""
+    if not rows:
+        return
+    texts = [table_of(rows[:MAX_ROWS], header)]
+    if len(rows) > MAX_ROWS:
+        texts.append(paragraph(f"{len(rows) - MAX_ROWS} more in the tables."))
+    yield Card(title, words=texts)

@@ -78,9 +78,11 @@ class DatedSky:
         """Of some stars (k,): the error of V, mag, and whether they are known doubles or
         variables.
         """
-        some = self.catalog.taken(self.order[star])
-        sigma = np.nan_to_num(sigma_v_mag(errors_of(some), some.bv_mag), nan=0.05)
-        return sigma, np.isin(some.multiple, DOUBLES), np.isin(some.variable, VARIABLES)
+        stars = self.catalog.taken(self.order[star])
+        sigma_mag = np.nan_to_num(sigma_v_mag(errors_of(stars), stars.bv_mag), nan=0.05)
+        is_double = np.isin(stars.multiple, DOUBLES)
+        is_variable = np.isin(stars.variable, VARIABLES)
+        return sigma_mag, is_double, is_variable
 
     def name(self, star: int) -> str:
         """What a star is called in the catalogue."""
@@ -96,29 +98,23 @@ def dated_sky(file: BenchFile, t_ns: int | None) -> DatedSky:
     """
     sky = file.config.sky
     catalog = choose_catalog(catalogue_choice(file.config, file.folder))
-    epoch = sky.epoch_jyear if t_ns is None else jyear(t_ns)
-    if t_ns is None:
-        velocity = None
-    else:
-        velocity = earth_velocity_km_s(t_ns)
-    air = None
-    if file.config.site is not None and t_ns is not None:
-        ground = Ground(file.config.site)
-        velocity = earth_velocity_km_s(t_ns) + ground.state(t_ns)[1]
-        air = AirAbove(
-            ground.up(t_ns),
-            site_refraction(file.config.site, bench_optics(file.config.tracker, file.folder)),
-        )
     order = np.argsort(catalog.v_mag, kind="stable")
-    vectors = unit_vectors_icrs(catalog, epoch)[order]
-    return DatedSky(
-        catalog,
-        epoch,
-        velocity,
-        vectors if velocity is None else aberrate(vectors, velocity),
-        order,
-        air,
-    )
+    if t_ns is None:
+        vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)[order]
+        return DatedSky(catalog, sky.epoch_jyear, None, vectors, order)
+    epoch_jyear = jyear(t_ns)
+    velocity_km_s = earth_velocity_km_s(t_ns)
+    air = None
+    site = file.config.site
+    if site is not None:
+        ground = Ground(site)
+        _, ground_km_s = ground.state(t_ns)
+        velocity_km_s = velocity_km_s + ground_km_s
+        optics = bench_optics(file.config.tracker, file.folder)
+        air = AirAbove(ground.up(t_ns), site_refraction(site, optics))
+    vectors = unit_vectors_icrs(catalog, epoch_jyear)[order]
+    seen_vectors = aberrate(vectors, velocity_km_s)
+    return DatedSky(catalog, epoch_jyear, velocity_km_s, seen_vectors, order, air)
 
 
 @lru_cache(maxsize=64)
@@ -152,7 +148,9 @@ def planets_seen(t_ns: int) -> dict[str, FloatArray]:
             if name:
                 planets[name] = erfa.plan94(UNIX_JD, t_ns / DAY_NS, number)["p"] - earth
         planets["the Moon"] = erfa.moon98(UNIX_JD, t_ns / DAY_NS)["p"]
-    return {
-        name: np.asarray(aberrate((v / np.linalg.norm(v))[None], earth_velocity_km_s(t_ns))[0])
-        for name, v in planets.items()
-    }
+    velocity_km_s = earth_velocity_km_s(t_ns)
+    directions = {}
+    for name, place_au in planets.items():
+        unit = place_au / np.linalg.norm(place_au)
+        directions[name] = np.asarray(aberrate(unit[None], velocity_km_s)[0])
+    return directions

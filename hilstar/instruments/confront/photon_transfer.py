@@ -8,15 +8,15 @@ or levels that differ widely. A gain that they leave open is the bench file's.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.units import MAD_TO_SIGMA
-from hilstar.instruments.confront.background import NO_PATTERN, FixedPattern
+from hilstar.instruments.confront.background import FixedPattern
 from hilstar.tracker.settings import DetectorSettings
 
 BLOCK_PX = 32
@@ -47,18 +47,19 @@ class PixelFit:
     sigma: dict[str, float]
     points: FloatArray
     notes: tuple[str, ...] = ()
-    pattern: FixedPattern = NO_PATTERN
+    pattern: FixedPattern = field(default_factory=FixedPattern)
     gain_told: bool = False
 
     def variance_dn2(self, level_dn: FloatArray) -> FloatArray:
-        """Variance of a pixel at a level."""
-        light = np.maximum(level_dn - self.pedestal_dn, 0)
-        noise = (
-            light / self.gain_e_per_dn
-            + (self.read_noise_e / self.gain_e_per_dn) ** 2
-            + self.step_dn**2 / 12
-        )
-        return np.asarray(noise + self.pattern.variance_dn2(light))
+        """Variance of a pixel at a level, DN^2: of its light, its read noise, and the rounding to
+        steps.
+        """
+        light_dn = np.maximum(level_dn - self.pedestal_dn, 0)
+        shot_dn2 = light_dn / self.gain_e_per_dn
+        read_dn2 = (self.read_noise_e / self.gain_e_per_dn) ** 2
+        rounding_dn2 = self.step_dn**2 / 12
+        noise_dn2 = shot_dn2 + read_dn2 + rounding_dn2
+        return np.asarray(noise_dn2 + self.pattern.variance_dn2(light_dn))
 
     @property
     def gain_words(self) -> str:
@@ -75,30 +76,36 @@ def transfer_points(dn: FloatArray, level: FloatArray, star: BoolArray) -> Float
     A shading within a block counts for nothing: the smooth level is taken off first.
     """
     off = dn - level
-    free = ~star
-    parts = []
-    for first, second, both in (
-        (off[:, 1:], off[:, :-1], free[:, 1:] & free[:, :-1]),
-        (off[1:], off[:-1], free[1:] & free[:-1]),
-    ):
-        height, width = (size // BLOCK_PX * BLOCK_PX for size in first.shape)
-        shape = height // BLOCK_PX, BLOCK_PX, width // BLOCK_PX, BLOCK_PX
-        difference = _in_blocks((first - second)[:height, :width], shape)
-        use = _in_blocks(both[:height, :width], shape)
-        middle = _in_blocks(level[:height, :width], shape).mean(axis=1)
-        squares = (difference**2 * use).sum(axis=1) / np.maximum(use.sum(axis=1), 1)
-        spread = np.sqrt(np.maximum(squares, 1e-12))
-        use &= np.abs(difference) < 4 * spread[:, None]
-        count = use.sum(axis=1)
-        variance = (difference**2 * use).sum(axis=1) / np.maximum(count, 1) / 2
-        full = count > BLOCK_PX**2 / 2
-        parts.append(np.column_stack([middle, variance])[full])
-    return np.concatenate(parts)
+    is_free = ~star
+    across = _block_points(np.diff(off, axis=1), is_free[:, 1:] & is_free[:, :-1], level)
+    down = _block_points(np.diff(off, axis=0), is_free[1:] & is_free[:-1], level)
+    return np.concatenate([across, down])
 
 
-def _in_blocks(values: npt.NDArray[Any], shape: tuple[int, int, int, int]) -> npt.NDArray[Any]:
-    """Values (height, width) by block: (blocks, BLOCK_PX^2)."""
-    return values.reshape(shape).swapaxes(1, 2).reshape(-1, BLOCK_PX**2)
+def _block_points(difference: FloatArray, use: BoolArray, level: FloatArray) -> FloatArray:
+    """Levels and variances (n, 2) of blocks by differences (height, width) of two pixels each,
+    where more than half of them count.
+    """
+    differences = _in_blocks(difference)
+    uses = _in_blocks(use)
+    levels = _in_blocks(level[: difference.shape[0], : difference.shape[1]])
+    squares = (differences**2 * uses).sum(axis=1) / np.maximum(uses.sum(axis=1), 1)
+    spread = np.sqrt(np.maximum(squares, 1e-12))
+    uses &= np.abs(differences) < 4 * spread[:, None]
+    count = uses.sum(axis=1)
+    squares = (differences**2 * uses).sum(axis=1) / np.maximum(count, 1)
+    # a difference has the noise of two pixels
+    points = np.column_stack([levels.mean(axis=1), squares / 2])
+    return np.asarray(points[count > BLOCK_PX**2 / 2])
+
+
+def _in_blocks(values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Values (height, width) by whole block: (blocks, BLOCK_PX^2)."""
+    rows = values.shape[0] // BLOCK_PX
+    columns = values.shape[1] // BLOCK_PX
+    whole = values[: rows * BLOCK_PX, : columns * BLOCK_PX]
+    blocks = whole.reshape(rows, BLOCK_PX, columns, BLOCK_PX).swapaxes(1, 2)
+    return blocks.reshape(-1, BLOCK_PX**2)
 
 
 def fit_pixels(
@@ -114,27 +121,35 @@ def fit_pixels(
     """
     if not len(points):
         note = "no part of the background is free of sources: the detector is the bench file's"
-        if pedestal is None:
-            offset = assumed.offset_dn
-        else:
-            offset = pedestal[0]
+        offset_dn = assumed.offset_dn
+        if pedestal is not None:
+            offset_dn = pedestal[0]
         bench = _of_bench(assumed, step_dn, points, pattern)
-        return replace(bench, pedestal_dn=offset, notes=(note,))
-    level, variance = points.T
-    offset, offset_sigma, note = _pedestal(level, pedestal, assumed)
-    light = level - offset
-    *_, column, row = pattern.rms  # of which a difference along a row, or down a column, has one
-    variance = variance - pattern.variance_dn2(np.maximum(light, 0)) + (column**2 + row**2) / 2
+        return replace(bench, pedestal_dn=offset_dn, notes=(note,))
+    level_dn, all_variance = points.T
+    offset_dn, offset_sigma_dn, note = _pedestal(level_dn, pedestal, assumed)
+    light_dn = level_dn - offset_dn
+    # a difference along a row, or down a column, has one of both patterns
+    *_, column_dn, row_dn = pattern.rms
+    line_variance = (column_dn**2 + row_dn**2) / 2
+    pattern_variance = pattern.variance_dn2(np.maximum(light_dn, 0))
+    variance = all_variance - pattern_variance + line_variance
+    notes: tuple[str, ...] = ()
+    if note:
+        notes = (note,)
     bench = replace(
         _of_bench(assumed, step_dn, points, pattern),
-        pedestal_dn=offset,
-        sigma={"pedestal_dn": offset_sigma},
-        notes=(note,) if note else (),
+        pedestal_dn=offset_dn,
+        sigma={"pedestal_dn": offset_sigma_dn},
+        notes=notes,
     )
     several = math.isfinite(pattern.errors[0])
-    own_gain = _by_levels(bench, light, variance, several=several)
-    own_gain = own_gain or _by_one_level(bench, light, variance, several=several)
-    return own_gain or _by_response(bench, light, variance, assumed.dsnu_e / bench.gain_e_per_dn)
+    fit = _by_levels(bench, light_dn, variance, several=several)
+    if fit is None:
+        fit = _by_one_level(bench, light_dn, variance, several=several)
+    if fit is None:
+        fit = _by_response(bench, light_dn, variance, assumed.dsnu_e / bench.gain_e_per_dn)
+    return fit
 
 
 def _of_bench(
@@ -143,9 +158,16 @@ def _of_bench(
     points: FloatArray,
     pattern: FixedPattern,
 ) -> PixelFit:
-    gain = assumed.gain_e_per_dn
-    read_e = assumed.read_noise_e
-    return PixelFit(gain, assumed.offset_dn, read_e, step_dn, {}, points, (), pattern)
+    """The detector as the bench file has it."""
+    return PixelFit(
+        gain_e_per_dn=assumed.gain_e_per_dn,
+        pedestal_dn=assumed.offset_dn,
+        read_noise_e=assumed.read_noise_e,
+        step_dn=step_dn,
+        sigma={},
+        points=points,
+        pattern=pattern,
+    )
 
 
 def _pedestal(
@@ -184,12 +206,13 @@ def _by_levels(
     if not line.slope > TOLD_SIGMAS * line.slope_sigma:
         return None
     gain = 1 / line.slope
-    read_dn = math.sqrt(max(line.at_zero - bench.step_dn**2 / 12, 0.0))
-    read_sigma_dn = min(line.at_zero_sigma / max(2 * read_dn, 1e-9), math.sqrt(line.at_zero_sigma))
-    sigma = bench.sigma | {
-        "gain_e_per_dn": gain * line.slope_sigma / line.slope,
-        "read_noise_e": gain * read_sigma_dn,
-    }
+    rounding_dn2 = bench.step_dn**2 / 12
+    read_dn = math.sqrt(max(line.at_zero - rounding_dn2, 0.0))
+    # of a root: its own error where it is far from 0, else the root of the square's
+    far_sigma_dn = line.at_zero_sigma / max(2 * read_dn, 1e-9)
+    read_sigma_dn = min(far_sigma_dn, math.sqrt(line.at_zero_sigma))
+    gain_sigma = gain * line.slope_sigma / line.slope
+    sigma = {"gain_e_per_dn": gain_sigma, "read_noise_e": gain * read_sigma_dn}
     pattern = bench.pattern
     if not several and line.square > 0:
         pattern = _response_alone(line.square, line.square_sigma)
@@ -197,7 +220,7 @@ def _by_levels(
         bench,
         gain_e_per_dn=gain,
         read_noise_e=read_dn * gain,
-        sigma=sigma,
+        sigma=bench.sigma | sigma,
         pattern=pattern,
         gain_told=True,
     )
@@ -211,16 +234,19 @@ def _by_one_level(
     several: bool,
 ) -> PixelFit | None:
     """The gain by the shot noise of one level; None where its fixed pattern is not known."""
-    signal = float(np.median(light))
-    noise2 = float(np.median(variance)) - bench.step_dn**2 / 12
-    if not several or signal <= 0 or noise2 <= 0:
+    signal_dn = float(np.median(light))
+    noise_dn2 = float(np.median(variance)) - bench.step_dn**2 / 12
+    if not several or signal_dn <= 0 or noise_dn2 <= 0:
         return None
     read_e = bench.read_noise_e
-    gain = (signal + math.sqrt(signal**2 + 4 * noise2 * read_e**2)) / (2 * noise2)
-    sigma2 = math.hypot(_median_error(variance), signal**2 * bench.pattern.errors[0])
-    read2 = (read_e / gain) ** 2
-    shot2 = max(noise2 - read2, MIN_VARIANCE_DN2)
-    error = math.hypot(sigma2, 2 * READ_NOISE_SHARE * read2) / shot2
+    # noise^2 = signal / gain + (read noise / gain)^2
+    root = math.sqrt(signal_dn**2 + 4 * noise_dn2 * read_e**2)
+    gain = (signal_dn + root) / (2 * noise_dn2)
+    response_error_dn2 = signal_dn**2 * bench.pattern.errors[0]
+    noise_error_dn2 = math.hypot(_median_error(variance), response_error_dn2)
+    read_dn2 = (read_e / gain) ** 2
+    shot_dn2 = max(noise_dn2 - read_dn2, MIN_VARIANCE_DN2)
+    error = math.hypot(noise_error_dn2, 2 * READ_NOISE_SHARE * read_dn2) / shot_dn2
     if error > MAX_GAIN_ERROR:
         return None
     note = (
@@ -228,9 +254,12 @@ def _by_one_level(
         f" {bench.pedestal_dn:g} DN, and"
         f" read noise, {read_e:g} e-"
     )
-    sigma = bench.sigma | {"gain_e_per_dn": gain * error}
     return replace(
-        bench, gain_e_per_dn=gain, sigma=sigma, notes=(*bench.notes, note), gain_told=True
+        bench,
+        gain_e_per_dn=gain,
+        sigma=bench.sigma | {"gain_e_per_dn": gain * error},
+        notes=(*bench.notes, note),
+        gain_told=True,
     )
 
 
@@ -241,32 +270,35 @@ def _by_response(
     offsets_dn: float,
 ) -> PixelFit:
     """The bench file's gain; the noise left over is read noise, or the pixels' response."""
-    signal = float(np.median(light))
-    noise2 = float(np.median(variance)) - bench.step_dn**2 / 12
+    signal_dn = float(np.median(light))
+    noise_dn2 = float(np.median(variance)) - bench.step_dn**2 / 12
     gain = bench.gain_e_per_dn
-    if signal <= 0:
+    if signal_dn <= 0:
         note = "the background is at the pedestal: the gain is the bench file's"
-        read_e = math.sqrt(max(noise2, 0.0)) * gain
+        read_e = math.sqrt(max(noise_dn2, 0.0)) * gain
         return replace(bench, read_noise_e=read_e, notes=(*bench.notes, note))
-    shot2 = signal / gain + (bench.read_noise_e / gain) ** 2
-    left2 = noise2 - shot2 - offsets_dn**2
-    error2 = _median_error(variance)
+    shot_dn2 = signal_dn / gain + (bench.read_noise_e / gain) ** 2
+    rest_dn2 = noise_dn2 - shot_dn2 - offsets_dn**2
+    error_dn2 = _median_error(variance)
     note = (
         "these photographs do not tell the gain, which is the bench file's: one level of"
         " background has shot noise and the"
         " pixels' response in one"
     )
-    if left2 < -TOLD_SIGMAS * error2:
-        least = signal / max(noise2, MIN_VARIANCE_DN2)
+    if rest_dn2 < -TOLD_SIGMAS * error_dn2:
+        minimum_gain = signal_dn / max(noise_dn2, MIN_VARIANCE_DN2)
+        noise_dn = math.sqrt(max(noise_dn2, 0.0))
         note += (
-            f"; but the noise, {math.sqrt(max(noise2, 0.0)):.3g} DN, is less than its shot noise,"
-            f" {math.sqrt(shot2):.3g} DN: write [tracker.detector] gain_e_per_dn = {least:.3g} or"
-            " more"
+            f"; but the noise, {noise_dn:.3g} DN, is less than its shot noise,"
+            f" {math.sqrt(shot_dn2):.3g} DN: write [tracker.detector] gain_e_per_dn ="
+            f" {minimum_gain:.3g} or more"
         )
         return replace(bench, notes=(*bench.notes, note))
     if math.isfinite(bench.pattern.errors[0]):
         return replace(bench, notes=(*bench.notes, note))
-    pattern = _response_alone(left2 / signal**2, error2 / signal**2, offsets_dn)
+    square = rest_dn2 / signal_dn**2
+    square_sigma = error_dn2 / signal_dn**2
+    pattern = _response_alone(square, square_sigma, offsets_dn)
     if pattern.rms[0]:
         percent = 100 * pattern.rms[0]
         note += f"; the rest of the noise is a response of {percent:.2g} %, if no more are offsets"
@@ -275,10 +307,11 @@ def _by_response(
 
 def _response_alone(square: float, sigma: float, offsets_dn: float = 0.0) -> FixedPattern:
     """The response of one photograph's pixels, beside offsets that the bench file gives."""
-    offsets_sigma = math.inf if offsets_dn == 0 else 0.0
-    return FixedPattern(
-        (max(square, 0.0), offsets_dn**2, 0.0, 0.0), (sigma, offsets_sigma, math.inf, math.inf)
-    )
+    offsets_sigma = 0.0
+    if offsets_dn == 0:
+        offsets_sigma = math.inf
+    squares = (max(square, 0.0), offsets_dn**2, 0.0, 0.0)
+    return FixedPattern(squares, (sigma, offsets_sigma, math.inf, math.inf))
 
 
 def _median_error(values: FloatArray) -> float:
@@ -297,16 +330,16 @@ def _free(design: FloatArray, target: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.lstsq(design, target, rcond=None)[0], dtype=np.float64)
 
 
-class _Curve(NamedTuple):
-    slope: float
-    at_zero: float
-    square: float
-    slope_sigma: float
-    at_zero_sigma: float
-    square_sigma: float
+@dataclass(frozen=True, slots=True)
+class _Curve:
+    """A curve of variances over levels: slope, value at 0 and share of the square, with sigmas."""
 
-
-NO_CURVE = _Curve(*[math.nan] * 6)
+    slope: float = math.nan
+    at_zero: float = math.nan
+    square: float = math.nan
+    slope_sigma: float = math.nan
+    at_zero_sigma: float = math.nan
+    square_sigma: float = math.nan
 
 
 def _curve(x: FloatArray, y: FloatArray, *, square: bool) -> _Curve:
@@ -314,31 +347,39 @@ def _curve(x: FloatArray, y: FloatArray, *, square: bool) -> _Curve:
     columns = [x, np.ones_like(x)]
     if square:
         columns.append(x**2)
-    whole = np.column_stack(columns)
+    all_rows = np.column_stack(columns)
     near = np.ones(len(x), dtype=bool)
     scale = np.maximum(np.maximum(np.median(y) * 0.5, y), MIN_VARIANCE_DN2)
     values: FloatArray = np.zeros(3)
     sigma = np.full(3, math.nan)
     for _ in range(ROUNDS):
         if near.sum() < MIN_POINTS:  # levels without noise
-            return NO_CURVE
+            return _Curve()
         weight = 1 / scale[near]
-        design = whole[near] * weight[:, None]
-        size = np.linalg.norm(design, axis=0)
-        least_squares = _not_below_zero if square else _free
-        values = least_squares(design / size, y[near] * weight) / size
-        off = y - whole @ values
+        rows = all_rows[near] * weight[:, None]
+        size = np.linalg.norm(rows, axis=0)
+        design = rows / size
+        target = y[near] * weight
+        if square:
+            values = _not_below_zero(design, target) / size
+        else:
+            values = _free(design, target) / size
+        off = y - all_rows @ values
         spread = MAD_TO_SIGMA * float(np.median(np.abs(off[near] * weight)))
-        normal = np.linalg.pinv((design / size).T @ (design / size))
-        sigma = spread * np.sqrt(np.diag(normal)) / size
+        covariance = np.linalg.pinv(design.T @ design)
+        sigma = spread * np.sqrt(np.diag(covariance)) / size
         near = np.abs(off) < CLIP * spread * scale
-    if square:
-        squares = (float(values[2]), float(sigma[2]))
-    else:
-        squares = (0.0, 0.0)
-    return _Curve(
-        float(values[0]), float(values[1]), squares[0], float(sigma[0]), float(sigma[1]), squares[1]
+    curve = _Curve(
+        slope=float(values[0]),
+        at_zero=float(values[1]),
+        square=0.0,
+        slope_sigma=float(sigma[0]),
+        at_zero_sigma=float(sigma[1]),
+        square_sigma=0.0,
     )
+    if square:
+        curve = replace(curve, square=float(values[2]), square_sigma=float(sigma[2]))
+    return curve
 
 
 def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[float, float] | None:
@@ -352,36 +393,33 @@ def fit_pedestal(levels: Sequence[FloatArray], places: FloatArray) -> tuple[floa
     medians = [float(np.median(level)) for level in levels]
     if len(levels) < 2 or max(medians) < MIN_LEVEL_RANGE * max(min(medians), 1e-9):
         return None
+    plane = np.column_stack([np.ones(len(places)), places])
+    whole = _common_zero(levels, plane)
+    sigma = abs(whole) / 2
+    if len(levels) == 2:
+        return whole, sigma
+    usable = []
+    for k in range(len(levels)):
+        other_medians = medians[:k] + medians[k + 1 :]
+        if max(other_medians) > MIN_LEVEL_RANGE * min(other_medians):
+            usable.append(_common_zero([*levels[:k], *levels[k + 1 :]], plane))
+    if len(usable) > 1:
+        # of the jackknife
+        sigma = float(np.std(usable)) * math.sqrt(max(len(usable) - 1, 1))
+    return whole, max(sigma, 0.01 * min(medians))
+
+
+def _common_zero(levels: Sequence[FloatArray], plane: FloatArray) -> float:
+    """The level above which skies are most nearly one shade: their logarithms differ by a plane."""
     from scipy.optimize import minimize_scalar
 
-    plane = np.column_stack([np.ones(len(places)), places])
+    lowest = min(float(level.min()) for level in levels)
 
-    def best(some: Sequence[FloatArray]) -> float:
-        lowest = min(float(level.min()) for level in some)
+    def loss(pedestal: float) -> float:
+        logs = np.log(np.array(levels) - pedestal)
+        off = (logs - logs.mean(axis=0)).T
+        slopes = np.linalg.lstsq(plane, off, rcond=None)[0]
+        return float(((off - plane @ slopes) ** 2).sum())
 
-        def loss(pedestal: float) -> float:
-            logs = np.log(np.array(some) - pedestal)
-            off = (logs - logs.mean(axis=0)).T
-            off = off - plane @ np.linalg.lstsq(plane, off, rcond=None)[0]
-            return float((off**2).sum())
-
-        return float(
-            minimize_scalar(
-                loss, bounds=(lowest - 2 * abs(lowest), 0.98 * lowest), method="bounded"
-            ).x
-        )
-
-    whole = best(levels)
-    if len(levels) == 2:
-        return whole, abs(whole) / 2
-    parts = [best([*levels[:k], *levels[k + 1 :]]) for k in range(len(levels))]
-    usable = [
-        p
-        for k, p in enumerate(parts)
-        if max(m := medians[:k] + medians[k + 1 :]) > MIN_LEVEL_RANGE * min(m)
-    ]
-    if len(usable) > 1:
-        sigma = float(np.std(usable)) * math.sqrt(max(len(usable) - 1, 1))
-    else:
-        sigma = abs(whole) / 2
-    return whole, max(sigma, 0.01 * min(medians))
+    bounds = (lowest - 2 * abs(lowest), 0.98 * lowest)
+    return float(minimize_scalar(loss, bounds=bounds, method="bounded").x)

@@ -2,13 +2,12 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.charts import write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import make_directory
@@ -21,14 +20,15 @@ from hilstar.instruments.confront.measured_bench import (
     read_tracker_file,
     write_tracker,
 )
-from hilstar.instruments.confront.page import page_pictures, write_page
+from hilstar.instruments.confront.page import Pictures, page_pictures, write_page
 from hilstar.instruments.confront.report import Confronted, failures_of, lines_of, words_of
-from hilstar.instruments.confront.session import run_session
+from hilstar.instruments.confront.session import Advance, Session, run_session
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.cameras import tracker_camera
 
-OUTPUTS = ("index.html", "stars.csv", "sources.csv", *NAMES)
+RESULTS = ("index.html", "stars.csv", "sources.csv")
+OUTPUTS = (*RESULTS, *NAMES)
 # photographs in memory, with their backgrounds 0.5 GB; those beyond lie in files
 MEMORY_PX = 20_000_000
 STAR_COLUMNS = (
@@ -44,6 +44,22 @@ STAR_COLUMNS = (
     "b_v_mag",
     "flags",
 )
+SOURCE_COLUMNS = ("image", "x_px", "y_px", "snr", "explained_by")
+MAX_HOT_ROWS = 1000
+# done by time, once the simulator is ready, and the photographs are judged
+SIMULATOR_PERCENT, JUDGED_PERCENT = 88, 94
+
+
+@dataclass(frozen=True, slots=True)
+class _Judgement:
+    """The verdicts on all photographs, their pictures, and the detector's defects: rows and columns
+    of hot pixels (n, 2), and the counts of hot and dead ones.
+    """
+
+    verdicts: tuple[Verdict, ...]
+    pictures: tuple[Pictures, ...]
+    hot: IntArray
+    defects: tuple[int, int]
 
 
 def confront(
@@ -55,76 +71,108 @@ def confront(
     at_ns: int | None = None,
     fixed: bool = False,
     tell: Callable[[str], None] = lambda line: None,
+    advance: Advance = lambda percent: None,
 ) -> Confronted:
     """Confront photographs with a bench's tracker and write DIR's files. Raises InputError: what
     is wrong, and what to do.
+
+    `tell` is given a line for each photograph, and `advance` what is done, percent.
     """
     file, has_screen = read_tracker_file(bench)
-    photos: list[Photograph] = []
-    for path in images:
-        read = read_photographs(path, file.config.tracker.resolution_px, at_ns)
-        if sum(photograph.dn.size for photograph in (*photos, *read)) > MEMORY_PX:
-            read = [replace(photograph, dn=paged(photograph.dn)) for photograph in read]
-        photos += read
-    full = max(photo.full_dn for photo in photos)
-    photos = [replace(photo, full_dn=full) for photo in photos]
-    names = [photo.name for photo in photos]
-    twice = next((name for k, name in enumerate(names) if name in names[:k]), None)
-    if twice is not None:
-        raise InputError(f"{twice}: two images have this name; give each a name of its own")
+    photos = _read(file, images, at_ns)
+    fixed_optics = None
     if fixed:
-        held = fixed_camera(file, max(photo.step_dn for photo in photos))
-    else:
-        held = None
+        fixed_optics = fixed_camera(file, max(photo.step_dn for photo in photos))
     try:
-        session = run_session(file, photos, _base(file, photos), start, fixed=held)
+        session = run_session(
+            file, photos, _base(file, photos), start, fixed=fixed_optics, advance=advance
+        )
     except np.linalg.LinAlgError as error:
         raise InputError(
             f"{photos[0].path}: its levels allow no fit ({error}); give raw frames, 8 to 16 bits of"
             " grey"
         ) from error
     make_directory(output)
+    names: tuple[str, ...] = OUTPUTS
     if fixed and has_screen:
         tracker = bench
+        names = RESULTS
     else:
         tracker = write_tracker(output, session, has_screen)
+    judgement = _judge(session, tracker, tell, advance)
+    excess = split_excess(session, judgement.verdicts)
+    lines = lines_of(session, judgement.verdicts, excess, judgement.defects)
+    result = Confronted(
+        session=session,
+        verdicts=judgement.verdicts,
+        excess=excess,
+        lines=tuple(lines),
+        failures=tuple(failures_of(judgement.verdicts)),
+        notes=_notes(photos, session),
+        written=tuple(str(output / name) for name in names),
+        defects=judgement.defects,
+    )
+    _write_stars(output / "stars.csv", judgement.verdicts)
+    _write_sources(output / "sources.csv", judgement)
+    write_page(output / "index.html", result, judgement.pictures)
+    advance(100)
+    return result
+
+
+def _read(file: BenchFile, images: Sequence[Path], at_ns: int | None) -> list[Photograph]:
+    """The photographs, all with the full scale of the largest; a mosaic's planes are one each.
+
+    Raises InputError where two have one name, by which tables and pages know them.
+    """
+    photos: list[Photograph] = []
+    pixels = 0
+    for path in images:
+        read = read_photographs(path, file.config.tracker.resolution_px, at_ns)
+        pixels += sum(photo.dn.size for photo in read)
+        if pixels > MEMORY_PX:
+            read = [replace(photo, dn=paged(photo.dn)) for photo in read]
+        photos += read
+    names: set[str] = set()
+    for photo in photos:
+        if photo.name in names:
+            raise InputError(
+                f"{photo.name}: two images have this name; give each a name of its own"
+            )
+        names.add(photo.name)
+    full_dn = max(photo.full_dn for photo in photos)
+    return [replace(photo, full_dn=full_dn) for photo in photos]
+
+
+def _judge(
+    session: Session, tracker: Path, tell: Callable[[str], None], advance: Advance
+) -> _Judgement:
+    """Judge each photograph by what `simulate` predicts of it with a tracker file."""
     judge = Judge(session, tracker)
     verdicts = []
     pictures = []
+    nothing = np.empty((0, 0))
+    count = len(session.shots)
     try:
-        for number in range(len(photos)):
+        for number in range(count):
+            judged_percent = (JUDGED_PERCENT - SIMULATOR_PERCENT) * number // count
+            advance(SIMULATOR_PERCENT + judged_percent)
             verdict = judge.of(number)
             pictures.append(page_pictures(session, verdict))
-            nothing = np.empty((0, 0))
+            # its images take as much memory as all that stays of it
             verdicts.append(replace(verdict, predicted=nothing, residual=nothing))
             tell(f"{verdict.shot.photo.name}: {words_of(verdict)}")
-        defects = int(judge.hot.sum()), int(judge.dead.sum())
-        hot = np.argwhere(judge.hot)
     finally:
         judge.close()
-    excess = split_excess(session, verdicts)
-    notes = list(
-        dict.fromkeys(
-            [*(f"{p.name}: {note}" for p in photos for note in p.notes), *session.pixels.notes]
-        )
-    )
-    result = Confronted(
-        session,
-        tuple(verdicts),
-        excess,
-        tuple(lines_of(session, verdicts, excess, defects)),
-        tuple(failures_of(verdicts)),
-        tuple(notes),
-        tuple(
-            str(output / name)
-            for name in OUTPUTS
-            if name not in NAMES or not (fixed and has_screen)
-        ),
-        defects,
-    )
-    _write_tables(output, verdicts, hot)
-    write_page(output / "index.html", result, pictures)
-    return result
+    defects = int(judge.hot.sum()), int(judge.dead.sum())
+    return _Judgement(tuple(verdicts), tuple(pictures), np.argwhere(judge.hot), defects)
+
+
+def _notes(photos: Sequence[Photograph], session: Session) -> tuple[str, ...]:
+    """What was assumed of photographs and of the detector, once each."""
+    notes = []
+    for photo in photos:
+        notes += [f"{photo.name}: {note}" for note in photo.notes]
+    return tuple(dict.fromkeys([*notes, *session.pixels.notes]))
 
 
 def _base(file: BenchFile, photos: Sequence[Photograph]) -> Camera:
@@ -132,36 +180,43 @@ def _base(file: BenchFile, photos: Sequence[Photograph]) -> Camera:
     have half of the pixels.
     """
     camera = tracker_camera(file.config.tracker, file.folder)
-    size = photos[0].size_px
-    if any(photo.size_px != size for photo in photos):
+    size_px = photos[0].size_px
+    if any(photo.size_px != size_px for photo in photos):
         raise InputError("the images have different sizes; give frames of one camera")
-    if size == camera.resolution_px:
+    if size_px == camera.resolution_px:
         return replace(camera, lens=None)
-    times = size[0] / camera.resolution_px[0]
-    middle = (size[0] - 1) / 2, (size[1] - 1) / 2
-    return Camera(size, camera.focal_length_px * times, middle, camera.cam_to_image)
+    width, height = size_px
+    focal_length_px = camera.focal_length_px * (width / camera.resolution_px[0])
+    middle_px = (width - 1) / 2, (height - 1) / 2
+    return Camera(size_px, focal_length_px, middle_px, camera.cam_to_image)
 
 
-def _write_tables(output: Path, verdicts: Sequence[Verdict], hot: Any) -> None:
-    def text(value: float) -> str:
-        return f"{value:.4f}" if math.isfinite(value) else ""
+def _write_stars(path: Path, verdicts: Sequence[Verdict]) -> None:
+    rows: list[tuple[object, ...]] = []
+    for verdict in verdicts:
+        for star in verdict.stars:
+            figures = [_text(value) for value in star.figures]
+            flags = [flag.replace(" ", "-") for flag in star.flags]
+            rows.append((verdict.shot.photo.name, star.hip, *figures, " ".join(flags)))
+    write_csv(path, STAR_COLUMNS, rows)
 
-    stars = [
-        (
-            v.shot.photo.name,
-            r.hip,
-            *map(text, r.figures),
-            " ".join(flag.replace(" ", "-") for flag in r.flags),
-        )
-        for v in verdicts
-        for r in v.stars
-    ]
-    write_csv(output / "stars.csv", STAR_COLUMNS, stars)
-    sources = [
-        (v.shot.photo.name, f"{s.x_px:.3f}", f"{s.y_px:.3f}", f"{s.snr:.2f}", s.explained_by)
-        for v in verdicts
-        for s in v.sources
-    ]
+
+def _text(value: float) -> str:
+    """A number for a table, empty where it is not known."""
+    if math.isfinite(value):
+        return f"{value:.4f}"
+    return ""
+
+
+def _write_sources(path: Path, judgement: _Judgement) -> None:
+    rows: list[tuple[object, ...]] = []
+    for verdict in judgement.verdicts:
+        name = verdict.shot.photo.name
+        for source in verdict.sources:
+            x = f"{source.x_px:.3f}"
+            y = f"{source.y_px:.3f}"
+            rows.append((name, x, y, f"{source.snr:.2f}", source.explained_by))
     # defects under the threshold of sources are listed once, of no image
-    sources += [("", f"{x}", f"{y}", "", "a hot pixel") for y, x in hot[:1000].tolist()]
-    write_csv(output / "sources.csv", ("image", "x_px", "y_px", "snr", "explained_by"), sources)
+    for y_px, x_px in judgement.hot[:MAX_HOT_ROWS].tolist():
+        rows.append(("", f"{x_px}", f"{y_px}", "", "a hot pixel"))
+    write_csv(path, SOURCE_COLUMNS, rows)

@@ -41,11 +41,12 @@ STARS_FOR = ((40, 6), (12, 2), (0, 1))  # stars that a number of terms of the fi
 
 @dataclass(frozen=True, slots=True)
 class StarPsf:
-    """`covariance` (3, terms) of xx, yy and xy, px^2, `colour` its relative change per magnitude of
-    B-V, and the wings.
+    """A point spread function over an image of `size_px`.
 
-    Terms are 1, r^2, u, v, u^2 - v^2, u v of the place (u, v) from the image's middle in half
-    diagonals.
+    `covariance` (3, terms) are coefficients of the core's xx, yy and xy, px^2. Terms are 1, r^2, u,
+    v, u^2 - v^2, u v of the place (u, v) from the image's middle in half diagonals. `colour` is the
+    relative change of the covariance per magnitude of B-V. `wing_share` is the wings' share of the
+    light.
     """
 
     covariance: FloatArray
@@ -55,31 +56,33 @@ class StarPsf:
     size_px: tuple[int, int]
 
     def core(self, x_px: FloatArray, y_px: FloatArray, bv_mag: FloatArray) -> FloatArray:
-        """Covariances (n, 3) at places."""
-        terms = field_terms(x_px, y_px, self.size_px)[:, : self.covariance.shape[1]]
-        core_light = terms @ self.covariance.T
-        core_light *= np.clip(
-            1 + self.colour * (np.nan_to_num(bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG), 0.3, 3.0
-        )[:, None]
-        core_light[:, :2] = np.clip(core_light[:, :2], MIN_SIGMA_PX**2, MAX_SIGMA_PX**2)
-        limit = 0.9 * np.sqrt(core_light[:, 0] * core_light[:, 1])
-        core_light[:, 2] = np.clip(core_light[:, 2], -limit, limit)
-        return core_light
+        """Covariances xx, yy and xy (n, 3) of the core at places, px^2, before pixels widen it."""
+        count = self.covariance.shape[1]
+        terms = field_terms(x_px, y_px, self.size_px)[:, :count]
+        covariance = terms @ self.covariance.T
+        redness_mag = np.nan_to_num(bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG
+        factor = np.clip(1 + self.colour * redness_mag, 0.3, 3.0)
+        covariance *= factor[:, None]
+        covariance[:, :2] = np.clip(covariance[:, :2], MIN_SIGMA_PX**2, MAX_SIGMA_PX**2)
+        # a covariance is positive definite: |xy| < sqrt(xx yy)
+        limit = 0.9 * np.sqrt(covariance[:, 0] * covariance[:, 1])
+        covariance[:, 2] = np.clip(covariance[:, 2], -limit, limit)
+        return covariance
 
     def fwhm_px(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Full width at half maximum of what pixels get, (n,): of core, wings and a pixel, all
         made round.
         """
         core = self.core(x_px, y_px, np.full(len(x_px), MEAN_BV_MAG))
-        narrow = (core[:, 0] + core[:, 1]) / 2 + 1 / 12
-        wide = np.full(len(x_px), self.wing_sigma_px**2 + 1 / 12)
+        # a square pixel's variance along an axis is 1/12
+        core_variance = (core[:, 0] + core[:, 1]) / 2 + 1 / 12
+        wing_variance = np.full(len(x_px), self.wing_sigma_px**2 + 1 / 12)
         radius = np.linspace(0, 12, 1201)
-        parts = ((1 - self.wing_share, narrow), (self.wing_share, wide))
-        light = np.sum(
-            [share / v[:, None] * np.exp(-(radius**2) / (2 * v[:, None])) for share, v in parts],
-            axis=0,
-        )
-        return np.asarray(2 * radius[(light > light[:, :1] / 2).sum(axis=1) - 1])
+        core_light = _round_light(1 - self.wing_share, core_variance, radius)
+        wing_light = _round_light(self.wing_share, wing_variance, radius)
+        light = core_light + wing_light
+        is_over_half = light > light[:, :1] / 2
+        return np.asarray(2 * radius[is_over_half.sum(axis=1) - 1])
 
     def on_pixels(
         self, dx: FloatArray, dy: FloatArray, core: FloatArray
@@ -91,10 +94,11 @@ class StarPsf:
         """
         narrow = _gaussians(dx, dy, core).slopes()
         wide = _gaussians(dx, dy, self._wing(len(core))).slopes()
-        share, by_x, by_y = (
-            (1 - self.wing_share) * of_core + self.wing_share * of_wing
-            for of_core, of_wing in zip(narrow, wide, strict=True)
-        )
+        core_share = 1 - self.wing_share
+        parts = []
+        for of_core, of_wing in zip(narrow, wide, strict=True):
+            parts.append(core_share * of_core + self.wing_share * of_wing)
+        share, by_x, by_y = parts
         return share, by_x, by_y
 
     def by_shape(
@@ -103,33 +107,50 @@ class StarPsf:
         """Shares as `on_pixels`, and their derivatives (5, n, rows, columns) by xx, yy, xy, the
         wings' share and sigma.
         """
-        share = self.wing_share
+        wing_share = self.wing_share
+        core_share = 1 - wing_share
         narrow = _gaussians(dx, dy, core).slopes(shape=True)
         wide = _gaussians(dx, dy, self._wing(len(core))).slopes(shape=True)
-        by_wing = share * 2 * self.wing_sigma_px * (wide[3] + wide[4])
-        by_core = [(1 - share) * slope for slope in narrow[3:]]
-        slopes = np.stack([*by_core, wide[0] - narrow[0], by_wing])
-        return (1 - share) * narrow[0] + share * wide[0], slopes
+        by_core = [core_share * slope for slope in narrow[3:]]
+        by_wing_share = wide[0] - narrow[0]
+        by_wing_sigma = wing_share * 2 * self.wing_sigma_px * (wide[3] + wide[4])
+        slopes = np.stack([*by_core, by_wing_share, by_wing_sigma])
+        share = core_share * narrow[0] + wing_share * wide[0]
+        return share, slopes
 
     def _wing(self, count: int) -> FloatArray:
-        return np.broadcast_to([self.wing_sigma_px**2, self.wing_sigma_px**2, 0.0], (count, 3))
+        """Covariances (count, 3) of the wings, px^2."""
+        variance = self.wing_sigma_px**2
+        return np.broadcast_to([variance, variance, 0.0], (count, 3))
 
     def samples(self, x_px: float, y_px: float, per_px: int, half_px: int) -> FloatArray:
         """The light itself on a grid of `per_px` samples a pixel, (side, side), without the
         pixel; sums to 1.
         """
-        at = np.arange(-half_px * per_px, half_px * per_px + 1) / per_px
-        xx, yy, xy = self.core(np.array([x_px]), np.array([y_px]), np.array([MEAN_BV_MAG]))[0]
-        x, y = np.meshgrid(at, at)
-        square = (yy * x * x - 2 * xy * x * y + xx * y * y) / (xx * yy - xy * xy)
+        half = half_px * per_px
+        offsets_px = np.arange(-half, half + 1) / per_px
+        x, y = np.meshgrid(offsets_px, offsets_px)
+        cores = self.core(np.array([x_px]), np.array([y_px]), np.array([MEAN_BV_MAG]))
+        xx, yy, xy = cores[0]
+        determinant = xx * yy - xy * xy
+        square = (yy * x * x - 2 * xy * x * y + xx * y * y) / determinant
         core = np.exp(-square / 2)
         wing = np.exp(-(x * x + y * y) / (2 * self.wing_sigma_px**2))
-        found = (1 - self.wing_share) * core / core.sum() + self.wing_share * wing / wing.sum()
-        return np.asarray(found / found.sum())
+        core_light = (1 - self.wing_share) * core / core.sum()
+        wing_light = self.wing_share * wing / wing.sum()
+        light = core_light + wing_light
+        return np.asarray(light / light.sum())
+
+
+def _round_light(share: float, variance_px2: FloatArray, radius_px: FloatArray) -> FloatArray:
+    """Light (n, radii) of round Gaussians with a share of all light, but for a factor."""
+    variance = variance_px2[:, None]
+    profile = np.exp(-(radius_px**2) / (2 * variance))
+    return np.asarray(share / variance * profile)
 
 
 def field_terms(x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int]) -> FloatArray:
-    """Terms (n, 6) of the field."""
+    """Terms (n, 6) of the field: 1, r^2, u, v, u^2 - v^2, u v."""
     half = math.hypot(*size_px) / 2
     u = (x_px - (size_px[0] - 1) / 2) / half
     v = (y_px - (size_px[1] - 1) / 2) / half
@@ -160,7 +181,7 @@ class Stamps:
         return len(self.column)
 
     def at(self, chosen: BoolArray) -> "Stamps":
-        """Some of them."""
+        """The stamps that are `chosen` (n,)."""
         return Stamps(
             self.values[chosen],
             self.variance[chosen],
@@ -169,15 +190,31 @@ class Stamps:
             self.bv_mag[chosen],
         )
 
+    def middle(self, reach: int) -> FloatArray:
+        """Values (n, side, side) of the pixels up to `reach` from the middle one."""
+        near = slice(HALF - reach, HALF + reach + 1)
+        return self.values[:, near, near]
+
+    def offsets(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Offsets of the pixels' columns and rows from places (n,): dx (n, k) and dy (n, k), px."""
+        reach = np.arange(-HALF, HALF + 1)
+        dx = self.column[:, None] + reach - x_px[:, None]
+        dy = self.row[:, None] + reach - y_px[:, None]
+        return dx, dy
+
+    def weight(self, light_dn: FloatArray, gain_e_per_dn: float) -> FloatArray:
+        """One over the variance of pixels (n, k, k) that have this light of their stars, DN."""
+        photon_variance = light_dn / gain_e_per_dn
+        model_variance = (MODEL_ERROR * light_dn) ** 2
+        return np.asarray(1 / (self.variance + photon_variance + model_variance))
+
 
 def join(parts: Sequence[Stamps]) -> Stamps:
     """All stamps of several photographs."""
-    return Stamps(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("values", "variance", "column", "row", "bv_mag")
-        )
-    )
+    columns = []
+    for name in ("values", "variance", "column", "row", "bv_mag"):
+        columns.append(np.concatenate([getattr(part, name) for part in parts]))
+    return Stamps(*columns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +230,11 @@ class Measured:
     sigma_dn: FloatArray
     chi2: FloatArray
 
+    @property
+    def places_px(self) -> FloatArray:
+        """Places (n, 2), x and y."""
+        return np.column_stack([self.x_px, self.y_px])
+
 
 def cut_stamps(
     above: FloatArray, variance: FloatArray, x_px: FloatArray, y_px: FloatArray, bv_mag: FloatArray
@@ -206,20 +248,15 @@ def cut_stamps(
     row = np.rint(y_px)
     columns = column[:, None] + reach
     rows = row[:, None] + reach
-    inside = ((rows >= 0) & (rows < height))[:, :, None] & ((columns >= 0) & (columns < width))[
-        :, None, :
-    ]
-    at = (
-        np.clip(rows, 0, height - 1).astype(np.intp)[:, :, None],
-        np.clip(columns, 0, width - 1).astype(np.intp)[:, None, :],
-    )
-    return Stamps(
-        np.where(inside, above[at], 0.0),
-        np.where(inside, variance[at], np.inf),
-        column,
-        row,
-        bv_mag,
-    )
+    in_columns = (columns >= 0) & (columns < width)
+    in_rows = (rows >= 0) & (rows < height)
+    inside = in_rows[:, :, None] & in_columns[:, None, :]
+    pixel_rows = np.clip(rows, 0, height - 1).astype(np.intp)
+    pixel_columns = np.clip(columns, 0, width - 1).astype(np.intp)
+    pixels = (pixel_rows[:, :, None], pixel_columns[:, None, :])
+    values = np.where(inside, above[pixels], 0.0)
+    stamp_variance = np.where(inside, variance[pixels], np.inf)
+    return Stamps(values, stamp_variance, column, row, bv_mag)
 
 
 def measure(
@@ -228,62 +265,63 @@ def measure(
     """Stars by least squares of place, flux and a level, from starting places; photon noise by
     `gain_e_per_dn`.
     """
+    count = len(x_px)
     x = x_px.copy()
     y = y_px.copy()
-    reach = np.arange(-HALF, HALF + 1)
     core = psf.core(x, y, stamps.bv_mag)
-    weight = 1 / stamps.variance
-    flux = np.zeros(len(x))
-    level = np.zeros(len(x))
+    flux = np.zeros(count)
+    level = np.zeros(count)
     for number in range(PLACE_STEPS):
-        dx = stamps.column[:, None] + reach - x[:, None]
-        dy = stamps.row[:, None] + reach - y[:, None]
+        dx, dy = stamps.offsets(x, y)
         shape, by_x, by_y = psf.on_pixels(dx, dy, core)
-        # photon noise of the model, not of what was seen: else faint stars come out too faint
         if number:
-            star = np.maximum(flux, 0)[:, None, None] * shape
-            weight = 1 / (stamps.variance + star / gain_e_per_dn + (MODEL_ERROR * star) ** 2)
-        if number:
+            # photon noise of the model, not of what was seen: else faint stars come out too faint
+            star_dn = np.maximum(flux, 0)[:, None, None] * shape
+            weight = stamps.weight(star_dn, gain_e_per_dn)
             flux = np.maximum(flux, 1e-3)
         else:
+            weight = 1 / stamps.variance
             flux = _linear(shape, stamps.values, weight)[0].clip(min=1e-3)
-        columns = np.stack(
-            [flux[:, None, None] * by_x, flux[:, None, None] * by_y, shape, np.ones_like(shape)],
-            axis=1,
-        )
-        flat = columns.reshape(len(x), 4, -1)
-        off = (stamps.values - flux[:, None, None] * shape - level[:, None, None]).reshape(
-            len(x), -1
-        )
-        w = weight.reshape(len(x), -1)
-        normal, right = normal_equations(flat, w, off)
+        flux_dn = flux[:, None, None]
+        slopes = np.stack([flux_dn * by_x, flux_dn * by_y, shape, np.ones_like(shape)], axis=1)
+        model = flux_dn * shape
+        off = (stamps.values - model - level[:, None, None]).reshape(count, -1)
+        pixel_weight = weight.reshape(count, -1)
+        normal, right = normal_equations(slopes.reshape(count, 4, -1), pixel_weight, off)
         normal += 1e-12 * np.eye(4)
         move = np.linalg.solve(normal, right[..., None])[..., 0]
         x += np.clip(move[:, 0], -0.5, 0.5)
         y += np.clip(move[:, 1], -0.5, 0.5)
         flux = flux + move[:, 2]
         level = level + move[:, 3]
+        # the few that never settle (blends, cosmic rays) do not hold up the others
         if np.quantile(np.abs(move[:, :2]), 0.98) < PLACE_DONE_PX:
             break
     covariance = np.linalg.inv(normal)
     counted = np.isfinite(stamps.variance).sum(axis=(1, 2))
-    chi2 = (off**2 * w).sum(axis=1) / np.maximum(counted - 4, 1)
-    place = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
-    return Measured(x, y, flux, place, np.sqrt(covariance[:, 2, 2]), chi2)
+    chi2 = (off**2 * pixel_weight).sum(axis=1) / np.maximum(counted - 4, 1)
+    sigma_px = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)
+    sigma_dn = np.sqrt(covariance[:, 2, 2])
+    return Measured(x, y, flux, sigma_px, sigma_dn, chi2)
 
 
 def _linear(
     shape: FloatArray, values: FloatArray, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Flux and level (n,) by least squares."""
-    s, v, w = (part.reshape(len(shape), -1) for part in (shape, values, weight))
+    """Flux and level (n,) of stars of a `shape` by weighted least squares."""
+    count = len(shape)
+    s = shape.reshape(count, -1)
+    v = values.reshape(count, -1)
+    w = weight.reshape(count, -1)
     sw = w.sum(axis=1)
     s1 = (w * s).sum(axis=1)
     ss = (w * s * s).sum(axis=1)
     v1 = (w * v).sum(axis=1)
     vs = (w * v * s).sum(axis=1)
-    det = np.maximum(ss * sw - s1 * s1, 1e-300)
-    return (vs * sw - v1 * s1) / det, (ss * v1 - s1 * vs) / det
+    determinant = np.maximum(ss * sw - s1 * s1, 1e-300)
+    flux = (vs * sw - v1 * s1) / determinant
+    level = (ss * v1 - s1 * vs) / determinant
+    return flux, level
 
 
 def fit_psf(
@@ -294,23 +332,19 @@ def fit_psf(
     gain_e_per_dn: float,
 ) -> StarPsf:
     """The PSF of stars that stand alone and are not saturated, from starting places."""
-    terms = next(count for least, count in STARS_FOR if len(stamps) >= least)
+    terms = next(count for minimum, count in STARS_FOR if len(stamps) >= minimum)
     start = np.zeros((3, terms))
     start[:, 0] = _first_covariance(stamps, x_px, y_px)
     psf = StarPsf(start, 0.0, 0.05, 2.0, size_px)
-    x = x_px
-    y = y_px
-    measured = measure(stamps, psf, x, y, gain_e_per_dn)
+    measured = measure(stamps, psf, x_px, y_px, gain_e_per_dn)
     for number in range(SHAPE_ROUNDS):
+        # colour and wings once the core is near
         psf = _shape(stamps, measured, psf, gain_e_per_dn, wide=number > 0)
-        near = np.hypot(measured.x_px - x_px, measured.y_px - y_px) < 2
-        measured = measure(
-            stamps,
-            psf,
-            np.where(near, measured.x_px, x_px),
-            np.where(near, measured.y_px, y_px),
-            gain_e_per_dn,
-        )
+        moved_px = np.hypot(measured.x_px - x_px, measured.y_px - y_px)
+        is_near = moved_px < 2
+        x = np.where(is_near, measured.x_px, x_px)
+        y = np.where(is_near, measured.y_px, y_px)
+        measured = measure(stamps, psf, x, y, gain_e_per_dn)
     return psf
 
 
@@ -329,82 +363,123 @@ def _first_width(stamps: Stamps) -> float:
     """A variance, px^2, from how much of a star's light its highest pixel and the eight about it
     have.
     """
-    middle = stamps.values[:, HALF - 3 : HALF + 4, HALF - 3 : HALF + 4]
-    peak = np.median(middle.max(axis=(1, 2)) / np.maximum(middle.sum(axis=(1, 2)), 1e-9))
-    return float(np.clip(1 / (2 * math.pi * np.clip(peak, 0.02, 0.6)), 0.15, 9.0))
+    middle = stamps.middle(3)
+    total = np.maximum(middle.sum(axis=(1, 2)), 1e-9)
+    peak_share = np.median(middle.max(axis=(1, 2)) / total)
+    # a Gaussian's middle pixel has 1 / (2 pi sigma^2) of its light
+    variance = 1 / (2 * math.pi * np.clip(peak_share, 0.02, 0.6))
+    return float(np.clip(variance, 0.15, 9.0))
 
 
 def _shape(
     stamps: Stamps, at: Measured, psf: StarPsf, gain_e_per_dn: float, *, wide: bool
 ) -> StarPsf:
-    """The PSF's numbers with the stars where they are; flux and level of each follow."""
-    reach = np.arange(-HALF, HALF + 1)
-    dx = stamps.column[:, None] + reach - at.x_px[:, None]
-    dy = stamps.row[:, None] + reach - at.y_px[:, None]
-    count = psf.covariance.shape[1]
-    terms = field_terms(at.x_px, at.y_px, psf.size_px)[:, :count]
-    light = (
-        np.maximum(at.dn, 0)[:, None, None]
-        * psf.on_pixels(dx, dy, psf.core(at.x_px, at.y_px, stamps.bv_mag))[0]
-    )
-    weight = 1 / (stamps.variance + light / gain_e_per_dn + (MODEL_ERROR * light) ** 2)
-    root = np.sqrt(weight)
-    redder = np.nan_to_num(stamps.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG
-    ratio = np.clip(psf.wing_share, 0.01, 0.49) / 0.5
-    if wide:
-        tail = [psf.colour, math.log(ratio / (1 - ratio)), math.log(psf.wing_sigma_px)]
-    else:
-        tail = []
-    start = np.concatenate([psf.covariance.ravel(), tail])
-    # weak: terms of the field are 0 +- 1 px^2, and the wings stay within factors of those before
-    prior = np.eye(len(start))
-    about = np.where(np.arange(len(start)) < 3 * count, 0.0, start)
-    prior = prior[[*(np.arange(3 * count) % count > 0), *(False, True, True)[: len(tail)]]]
+    """The PSF's numbers with the stars where they are; flux and level of each follow.
 
-    def of(numbers: FloatArray) -> StarPsf:
-        covariance = numbers[: 3 * count].reshape(3, count)
-        if not wide:
-            return replace(psf, covariance=covariance)
-        share = 0.5 * float(expit(numbers[-2]))
-        sigma = math.exp(np.clip(numbers[-1], *np.log(WING_SIGMA_PX)))
+    With `wide` also colour and wings, else the core's covariance alone.
+    """
+    loss = _ShapeLoss(stamps, at, psf, gain_e_per_dn, wide=wide)
+    numbers, _ = minimised(loss.residuals, loss.slopes, loss.start, SHAPE_GAIN)
+    return loss.psf_of(numbers)
+
+
+class _ShapeLoss:
+    """The residuals of stamps, in sigmas, as a function of the PSF's numbers: coefficients of the
+    covariance, and where it is `wide` colour, logistic of the wings' share, and logarithm of their
+    sigma.
+    """
+
+    def __init__(
+        self, stamps: Stamps, at: Measured, psf: StarPsf, gain_e_per_dn: float, *, wide: bool
+    ) -> None:
+        self.stamps = stamps
+        self.at = at
+        self.psf = psf
+        self.wide = wide
+        self.dx, self.dy = stamps.offsets(at.x_px, at.y_px)
+        self.count = psf.covariance.shape[1]
+        self.terms = field_terms(at.x_px, at.y_px, psf.size_px)[:, : self.count]
+        self.redness_mag = np.nan_to_num(stamps.bv_mag, nan=MEAN_BV_MAG) - MEAN_BV_MAG
+        share = psf.on_pixels(self.dx, self.dy, self._core(psf))[0]
+        light_dn = np.maximum(at.dn, 0)[:, None, None] * share
+        self.weight = stamps.weight(light_dn, gain_e_per_dn)
+        self.root = np.sqrt(self.weight)
+        tail = []
+        if wide:
+            # the share by its logistic, of at most one half: no step leads out of its range
+            ratio = np.clip(psf.wing_share, 0.01, 0.49) / 0.5
+            tail = [psf.colour, math.log(ratio / (1 - ratio)), math.log(psf.wing_sigma_px)]
+        self.start = np.concatenate([psf.covariance.ravel(), tail])
+        is_field_term = np.arange(3 * self.count) % self.count > 0
+        is_held = [*is_field_term, *(False, True, True)[: len(tail)]]
+        # weak: terms of the field are 0 +- 1 px^2, and the wings stay within factors of those
+        # before
+        self.prior = np.eye(len(self.start))[is_held]
+        is_covariance = np.arange(len(self.start)) < 3 * self.count
+        self.prior_mean = np.where(is_covariance, 0.0, self.start)
+
+    def _core(self, psf: StarPsf) -> FloatArray:
+        return psf.core(self.at.x_px, self.at.y_px, self.stamps.bv_mag)
+
+    def psf_of(self, numbers: FloatArray) -> StarPsf:
+        """The PSF of numbers."""
+        covariance = numbers[: 3 * self.count].reshape(3, self.count)
+        if not self.wide:
+            return replace(self.psf, covariance=covariance)
+        log_sigma = np.clip(numbers[-1], *np.log(WING_SIGMA_PX))
         return replace(
-            psf,
+            self.psf,
             covariance=covariance,
             colour=float(numbers[-3]),
-            wing_share=share,
-            wing_sigma_px=sigma,
+            wing_share=0.5 * float(expit(numbers[-2])),
+            wing_sigma_px=math.exp(log_sigma),
         )
 
-    def residuals(numbers: FloatArray) -> FloatArray:
-        trial = of(numbers)
-        shape = trial.on_pixels(dx, dy, trial.core(at.x_px, at.y_px, stamps.bv_mag))[0]
-        flux, level = _linear(shape, stamps.values, weight)
-        off = (stamps.values - flux[:, None, None] * shape - level[:, None, None]) * root
-        return np.concatenate([np.clip(off.ravel(), -30, 30), prior @ (numbers - about)])
+    def residuals(self, numbers: FloatArray) -> FloatArray:
+        """Those of all pixels, with the stars' flux and level that fit best, then the priors."""
+        values = self.stamps.values
+        trial = self.psf_of(numbers)
+        shape = trial.on_pixels(self.dx, self.dy, self._core(trial))[0]
+        flux, level = _linear(shape, values, self.weight)
+        model = flux[:, None, None] * shape
+        off = (values - model - level[:, None, None]) * self.root
+        # a pixel of a neighbour that no catalogue has pulls no further than 30 sigmas
+        clipped = np.clip(off.ravel(), -30, 30)
+        return np.concatenate([clipped, self.prior @ (numbers - self.prior_mean)])
 
-    def slopes(numbers: FloatArray, off: FloatArray) -> FloatArray:
+    def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
         """Derivatives with each star's flux and level following (Kaufman 1975)."""
-        trial = of(numbers)
-        shape, by = trial.by_shape(dx, dy, trial.core(at.x_px, at.y_px, stamps.bv_mag))
-        redness = 1 + trial.colour * redder
-        columns = [
-            by[k] * (redness * terms[:, t])[:, None, None] for k in range(3) for t in range(count)
-        ]
-        if wide:
-            plain = terms @ trial.covariance.T
-            columns.append(sum(by[k] * (plain[:, k] * redder)[:, None, None] for k in range(3)))
-            columns += [
-                by[3] * trial.wing_share * (1 - 2 * trial.wing_share),
-                by[4] * trial.wing_sigma_px,
-            ]
-        flux = _linear(shape, stamps.values, weight)[0][:, None, None]
-        differences = []
-        for column in columns:
-            of_shape, of_level = _linear(shape, flux * column, weight)
-            change = flux * column - of_shape[:, None, None] * shape - of_level[:, None, None]
-            differences.append(np.concatenate([-(change * root).ravel(), np.zeros(len(prior))]))
-        found = np.stack(differences, axis=1)
-        found[len(off) - len(prior) :] = prior
-        return found
+        trial = self.psf_of(numbers)
+        shape, by_shape = trial.by_shape(self.dx, self.dy, self._core(trial))
+        flux = _linear(shape, self.stamps.values, self.weight)[0][:, None, None]
+        no_prior = np.zeros(len(self.prior))
+        columns = []
+        for light_slope in self._light_slopes(trial, by_shape):
+            slope_dn = flux * light_slope
+            of_shape, of_level = _linear(shape, slope_dn, self.weight)
+            followed_dn = of_shape[:, None, None] * shape
+            change_dn = slope_dn - followed_dn - of_level[:, None, None]
+            column = -(change_dn * self.root).ravel()
+            columns.append(np.concatenate([column, no_prior]))
+        jacobian = np.stack(columns, axis=1)
+        jacobian[len(off) - len(self.prior) :] = self.prior
+        return jacobian
 
-    return of(minimised(residuals, slopes, start, SHAPE_GAIN)[0])
+    def _light_slopes(self, trial: StarPsf, by_shape: FloatArray) -> list[FloatArray]:
+        """Derivatives of the light (n, rows, columns) by each number."""
+        redness = 1 + trial.colour * self.redness_mag
+        slopes = []
+        for k in range(3):
+            for term in range(self.count):
+                factor = redness * self.terms[:, term]
+                slopes.append(by_shape[k] * factor[:, None, None])
+        if not self.wide:
+            return slopes
+        colourless = self.terms @ trial.covariance.T
+        by_colour = np.zeros_like(by_shape[0])
+        for k in range(3):
+            factor = colourless[:, k] * self.redness_mag
+            by_colour += by_shape[k] * factor[:, None, None]
+        by_logit = by_shape[3] * trial.wing_share * (1 - 2 * trial.wing_share)
+        by_log_sigma = by_shape[4] * trial.wing_sigma_px
+        return [*slopes, by_colour, by_logit, by_log_sigma]

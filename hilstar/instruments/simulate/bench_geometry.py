@@ -50,7 +50,9 @@ class BenchGeometry:
         return seen_px[0], seen_px[1]
 
     def _to_monitor(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        return self.monitor.project(self.tracker.rays(x_px, y_px) @ self.monitor.cam_to_image.T)
+        """As `to_monitor`, of all pixels at once."""
+        rays = self.tracker.rays(x_px, y_px)
+        return self.monitor.project(rays @ self.monitor.cam_to_image.T)
 
     def shown_at(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
         """The places at which the mirrored display shows pixels (n,) of the image."""

@@ -30,12 +30,12 @@ from hilstar.tracker.star_errors import Judge, StarErrors
 
 PHASES = 16  # along a side of a pixel
 STEP_MAG = 0.5
-MAX_BELOW_WHITE_MAG = 15.0
-SOLAR_BV, LIKE_SOLAR_BV = 0.65, 0.1
+MAX_BELOW_WHITE_MAG = 15.0  # darker than the last code of 16 bits, 12 mag
+SOLAR_BV, LIKE_SOLAR_BV = 0.65, 0.1  # the Sun's; stars as near to it count as of its colour
 FLUX_LIMITS_MAG = (0.02, 0.05)
 CENTROID_LIMIT_PX = 0.01
 USUAL: Centroider = "fit"  # what most trackers do
-COMPARED_MAG = 6.0
+COMPARED_MAG = 6.0  # below full scale, where kinds of centroiders are compared
 By = Centroider | Literal["all"]
 MAX_NAMED = 20
 RED_NM = 700.0  # beyond it a monitor has next to no light
@@ -115,42 +115,33 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     """
     by = centroider or bench.config.verify.judge or USUAL
     errors_by_mag = _errors(bench)
-    render = bench.config.render
     white = bench.flux_at_white_e_per_s
+    response = bench.calibration.response
     # A star of rate r has V = zero_mag + magnitude(r).
     zero_mag = zero_point_mag(bench)
     white /= solar_drive(bench)
     clips = zero_mag + magnitude(white * bench.darkest / bench.psf.peak_share)
     # Below this a star lights no pixel, wherever it is; for dithers, it lights one in half of the
     # frames.
-    dark = (
-        bench.faintest_shown_e_per_s / solar_drive(bench)
-        or bench.calibration.response.half_step * white
-    )
-    nothing = zero_mag + magnitude(dark)
+    faintest_e_per_s = bench.faintest_shown_e_per_s / solar_drive(bench)
+    nothing = zero_mag + magnitude(faintest_e_per_s or response.half_step * white)
     half = np.array([-0.5, 0.5])
     # a star on the corner of four pixels
     corner_share = float(bench.psf.shares(half, half[:, None]).max())
     channels = named_channels(bench.config.tracker, bench.file.folder)
     spectra = bench_primaries(bench.config.monitor, bench.file.folder)
-    if spectra is None:
-        primaries = None
-    else:
+    primaries = None
+    ends_nm = [RED_NM]
+    if spectra is not None:
         primaries = channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
-    if spectra is None:
-        ends_nm = [RED_NM]
-    else:
-        ends_nm = [RED_NM, reddest_nm(spectra)]
+        ends_nm.append(reddest_nm(spectra))
     rows = [_row(bench, mag, errors, by, clips) for mag, errors in errors_by_mag]
+    axis_rms_px: dict[str, float | None] = dict.fromkeys(FAMILY)
+    for row in rows:
+        if row.below_white_mag == COMPARED_MAG:
+            axis_rms_px = row.axis_rms_px
     return LightBudget(
-        method=render.quantisation
-        + (
-            " with bit stealing"
-            if render.bit_stealing
-            else ", each primary"
-            if bench.colours
-            else ""
-        ),
+        method=_method(bench),
         bits=bench.config.monitor.bits,
         clips_v_mag=clips,
         clips_v_mag_at_best=zero_mag + magnitude(white / corner_share),
@@ -159,13 +150,10 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         within=_within(rows),
         clipped_hip=clipping_hip(bench),
         left_out=not_drawn(bench),
-        black_e_per_s_px=bench.calibration.response.black * bench.flux_at_white_e_per_s,
+        black_e_per_s_px=response.black * bench.flux_at_white_e_per_s,
         rows=rows,
         centroider=by,
-        centroid_rms_px=next(
-            (row.axis_rms_px for row in rows if row.below_white_mag == COMPARED_MAG),
-            dict.fromkeys(FAMILY),
-        ),
+        centroid_rms_px=axis_rms_px,
         primaries=primaries,
         near_infrared=red_shares(channels, ends_nm),
         out_of_gamut=out_of_gamut(bench),
@@ -173,16 +161,26 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     )
 
 
+def _method(bench: Bench) -> str:
+    """A bench's quantisation, and what drives its subpixels."""
+    quantisation = bench.config.render.quantisation
+    if bench.config.render.bit_stealing:
+        return f"{quantisation} with bit stealing"
+    if bench.colours:
+        return f"{quantisation}, each primary"
+    return quantisation
+
+
 def out_of_gamut(bench: Bench) -> float | None:
     """The share of a bench's stars whose colour its primaries cannot show; None where they are
     not driven apart.
     """
     colours = bench.colours
-    count = len(bench.stars.rates_e_per_s)
     if colours is None:
         return None
-    alone = np.arange(count)
-    off = colours.off(colours.wanted(bench.stars, alone), colours.shares_of(bench.stars, alone))
+    stars = np.arange(len(bench.stars.rates_e_per_s))
+    wanted = colours.wanted(bench.stars, stars)
+    off = colours.off(wanted, colours.shares_of(bench.stars, stars))
     return float(1 - colours.in_gamut(off).mean())
 
 
@@ -190,15 +188,15 @@ def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[dict[s
     """The shares of light `from_nm` on `by_class` of spectra, in "all" channels together, and in
     each `channel` of several.
     """
-    every = {
-        "all": all_channels(list(channels.values())),
-        **(channels if len(channels) > 1 else {}),
-    }
-    return [
-        {"channel": name, "from_nm": nm, "by_class": class_shares(channel_shares, nm)}
-        for nm in ends_nm
-        for name, channel_shares in every.items()
-    ]
+    every = {"all": all_channels(list(channels.values()))}
+    if len(channels) > 1:
+        every |= channels
+    rows = []
+    for from_nm in ends_nm:
+        for name, optics in every.items():
+            by_class = class_shares(optics, from_nm)
+            rows.append({"channel": name, "from_nm": from_nm, "by_class": by_class})
+    return rows
 
 
 def zero_point_mag(bench: Bench) -> float:
@@ -209,18 +207,21 @@ def zero_point_mag(bench: Bench) -> float:
     """
     rates_e_per_s = bench.stars.rates_e_per_s
     alike = _like_the_sun(bench)
-    return float(np.median(bench.stars.v_mag[alike] - magnitude(rates_e_per_s[alike])))
+    zero_mags = bench.stars.v_mag[alike] - magnitude(rates_e_per_s[alike])
+    return float(np.median(zero_mags))
 
 
 def _like_the_sun(bench: Bench) -> IntArray:
     """The stars within LIKE_SOLAR_BV of the Sun's B-V, or else those nearest to it."""
-    distance = np.abs(bench.stars.bv_mag[: len(bench.stars.rates_e_per_s)] - SOLAR_BV)
+    bv_mag = bench.stars.bv_mag[: len(bench.stars.rates_e_per_s)]
+    distance = np.abs(bv_mag - SOLAR_BV)
     return np.flatnonzero(distance <= max(LIKE_SOLAR_BV, float(distance.min())))
 
 
 def solar_drive(bench: Bench) -> float:
     """How much of white a star of the Sun's colour asks for, relative to a white star as bright."""
-    return float(np.median(np.broadcast_to(bench.drive, len(bench.stars))[_like_the_sun(bench)]))
+    drive = np.broadcast_to(bench.drive, len(bench.stars))
+    return float(np.median(drive[_like_the_sun(bench)]))
 
 
 def not_drawn(bench: Bench) -> NotDrawn:
@@ -228,10 +229,10 @@ def not_drawn(bench: Bench) -> NotDrawn:
     over, do not count.
     """
     rates = bench.stars.rates_e_per_s
-    missing = rates[
-        (bench.stars.electrons_per_s * bench.drive)[: len(rates)] < bench.faintest_shown_e_per_s
-    ]
-    return NotDrawn(len(missing), float(missing.sum() / rates.sum()))
+    driven_e_per_s = (bench.stars.electrons_per_s * bench.drive)[: len(rates)]
+    missing = rates[driven_e_per_s < bench.faintest_shown_e_per_s]
+    flux_share = missing.sum() / rates.sum()
+    return NotDrawn(len(missing), float(flux_share))
 
 
 def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
@@ -243,19 +244,20 @@ def _errors(bench: Bench) -> list[tuple[float, StarErrors]]:
     psf = bench.psf
     sprites, _ = phase_grid(PHASES, psf)
     bright = phase_image(sprites, psf)
-    judge = Judge(
-        bright, line_places(sprites), psf.width_px, target.seen.blur_px, target.seen.pixel_px
-    )
+    pixels = target.seen
+    judge = Judge(bright, line_places(sprites), psf.width_px, pixels.blur_px, pixels.pixel_px)
     panel = Panel(bench.calibration.response, WHITE)
-    balance = Balance(psf, target.seen)
+    balance = Balance(psf, pixels)
+    kind = QUANTISERS[target.quantisation]
     error_rows = []
     for mag in np.arange(0.0, MAX_BELOW_WHITE_MAG + STEP_MAG / 2, STEP_MAG).tolist():
-        wanted = (bright * flux_ratio(mag)).astype(np.float32)
+        ratio = flux_ratio(mag)
+        wanted = (bright * ratio).astype(np.float32)
         stars = fainter(sprites, mag)
-        kind = QUANTISERS[target.quantisation]
         shown = shown_by(kind, frames, panel, wanted, stars, balance)
-        error_rows.append((mag, judge.errors(shown, flux_ratio(mag))))
-        if not np.isfinite(error_rows[-1][1].flux_mag).all():
+        errors = judge.errors(shown, ratio)
+        error_rows.append((mag, errors))
+        if not np.isfinite(errors.flux_mag).all():
             break
     return error_rows
 
@@ -268,6 +270,9 @@ def _row(bench: Bench, mag: float, errors: StarErrors, by: By, clips_v_mag: floa
     arcsec_per_px = ARCSEC_PER_RAD / bench.camera.scales_px_rad()[0]  # where a pixel is widest
     kind = errors.worst() if by == "all" else by
     max_px = errors.max_px(kind)
+    axis_rms_px: dict[str, float | None] = {}
+    for family_kind in FAMILY:
+        axis_rms_px[family_kind] = _finite(errors.axis_rms_px(family_kind))
     return MagnitudeRow(
         v_mag=clips_v_mag + mag,
         below_white_mag=mag,
@@ -276,167 +281,185 @@ def _row(bench: Bench, mag: float, errors: StarErrors, by: By, clips_v_mag: floa
         centroid_rms_px=_finite(math.sqrt(2) * errors.axis_rms_px(kind)),
         centroid_max_px=_finite(max_px),
         centroid_max_arcsec=_finite(max_px * arcsec_per_px),
-        axis_rms_px={each: _finite(errors.axis_rms_px(each)) for each in FAMILY},
+        axis_rms_px=axis_rms_px,
     )
 
 
 def _within(rows: list[MagnitudeRow]) -> dict[str, float | None]:
     """The magnitudes below full scale over which the worst star stays within each limit."""
-
-    def reach(values: list[float | None], limit: float) -> float | None:
-        good = 0
-        while good < len(rows) and (value := values[good]) is not None and value <= limit:
-            good += 1
-        return rows[good - 1].below_white_mag if good else None
-
     flux = [row.flux_max_mag for row in rows]
     centroid = [row.centroid_max_px for row in rows]
-    limits = {f"{limit:g}_mag": reach(flux, limit) for limit in FLUX_LIMITS_MAG}
-    return limits | {f"{CENTROID_LIMIT_PX:g}_px": reach(centroid, CENTROID_LIMIT_PX)}
+    limits = {}
+    for limit_mag in FLUX_LIMITS_MAG:
+        limits[f"{limit_mag:g}_mag"] = _last_within(rows, flux, limit_mag)
+    limits[f"{CENTROID_LIMIT_PX:g}_px"] = _last_within(rows, centroid, CENTROID_LIMIT_PX)
+    return limits
 
 
-def write_report(directory: Path, found: LightBudget) -> None:
+def _last_within(
+    rows: list[MagnitudeRow], errors: list[float | None], limit: float
+) -> float | None:
+    """The magnitude below full scale up to which the errors of rows are within a limit; None where
+    the first is not.
+    """
+    within_mag = None
+    for row, error in zip(rows, errors, strict=True):
+        if error is None or error > limit:
+            break
+        within_mag = row.below_white_mag
+    return within_mag
+
+
+def write_report(directory: Path, budget: LightBudget) -> None:
     """budget.csv, and its chart as budget.png and budget.svg. Raises InputError where one cannot
     be written.
     """
     rows = []
-    for row in found.rows:
+    for row in budget.rows:
         columns = asdict(row)
         # each kind of centroider has a column of its own
         for kind, value in columns.pop("axis_rms_px").items():
             columns[f"axis_rms_px_{kind}"] = value
         rows.append(columns)
     write_csv(directory / "budget.csv", list(rows[0]), [list(row.values()) for row in rows])
-    reach = found.within[f"{FLUX_LIMITS_MAG[1]:g}_mag"]
+    reach = budget.within[f"{FLUX_LIMITS_MAG[1]:g}_mag"]
+    reach_text = "no" if reach is None else f"{reach:g}"
     finding = (
-        f"{found.bits} bits, {found.method}: from V = {found.clips_v_mag:.1f}, where stars clip,"
-        " within "
+        f"{budget.bits} bits, {budget.method}: from V = {budget.clips_v_mag:.1f}, where stars clip,"
+        f" within {FLUX_LIMITS_MAG[1]:g} mag over {reach_text} magnitudes"
     )
-    finding += (
-        f"{FLUX_LIMITS_MAG[1]:g} mag over {'no' if reach is None else f'{reach:g}'} magnitudes"
-    )
-    shown = [row for row in found.rows if row.flux_max_mag is not None]
-    v_mag = np.array([row.v_mag for row in shown])
     note = (
-        f"Left of the first grey line stars clip (V = {found.clips_v_mag:.2f}), right of the second"
-        " they show nothing (V ="
-    )
-    note += (
-        f" {found.nothing_v_mag:.2f}). Over sub-pixel phases; places by {found.centroider} but in"
-        " the last panel."
+        f"Left of the first grey line stars clip (V = {budget.clips_v_mag:.2f}), right of the"
+        f" second they show nothing (V = {budget.nothing_v_mag:.2f}). Over sub-pixel phases; places"
+        f" by {budget.centroider} but in the last panel."
     )
     with chart(directory / "budget", finding, 3, note=note) as axes:
-        for axis, kind, limits, label in (
-            (axes[0], "flux", FLUX_LIMITS_MAG, "flux error [mag]"),
-            (axes[1], "centroid", (CENTROID_LIMIT_PX,), "place error [monitor px]"),
-        ):
-            unit = "mag" if kind == "flux" else "px"
-            for name, word, colour in (("max", "largest to V", ORANGE), ("rms", "rms", BLUE)):
-                values = np.array([getattr(row, f"{kind}_{name}_{unit}") for row in shown])
-                if name == "max":
-                    values = np.maximum.accumulate(values.astype(float))
-                axis.semilogy(v_mag, np.maximum(values, MIN_ERROR), color=colour, label=word)
-            for limit in limits:
-                axis.axhline(
-                    limit, color=RED, linestyle=":", linewidth=1.4, label=f"limit {limit:g} {unit}"
-                )
-            axis.set_ylabel(label)
-        for kind, colour in zip(FAMILY, SERIES, strict=True):
-            values = np.array([row.axis_rms_px[kind] for row in shown])
-            axes[2].semilogy(
-                v_mag,
-                np.maximum(values, MIN_ERROR),
-                "--" if kind == "fit" else "-",
-                color=colour,
-                label=kind,
-            )
-        axes[2].set_ylabel("rms along an axis [monitor px]")
-        axes[2].set_xlabel("V of a star of the Sun's colour [mag]")
+        _draw_errors(axes, budget)
         for axis in axes:
-            for edge in (found.clips_v_mag, found.nothing_v_mag):
+            for edge in (budget.clips_v_mag, budget.nothing_v_mag):
                 axis.axvline(edge, color=MUTED, linewidth=1)
             label_ends(axis)
 
 
-def budget_lines(found: LightBudget) -> list[str]:
+def _draw_errors(axes: Any, budget: LightBudget) -> None:
+    """The errors of flux and place, rms and up to each magnitude, and of each kind of centroider,
+    on three axes.
+    """
+    shown = [row for row in budget.rows if row.flux_max_mag is not None]
+    v_mag = np.array([row.v_mag for row in shown])
+    flux_axis, place_axis, kind_axis = axes
+    for axis, name, unit, limits in (
+        (flux_axis, "flux", "mag", FLUX_LIMITS_MAG),
+        (place_axis, "centroid", "px", (CENTROID_LIMIT_PX,)),
+    ):
+        largest = np.array([getattr(row, f"{name}_max_{unit}") for row in shown])
+        largest = np.maximum.accumulate(largest.astype(float))
+        rms = np.array([getattr(row, f"{name}_rms_{unit}") for row in shown])
+        for errors, label, colour in ((largest, "largest to V", ORANGE), (rms, "rms", BLUE)):
+            axis.semilogy(v_mag, np.maximum(errors, MIN_ERROR), color=colour, label=label)
+        for limit in limits:
+            label = f"limit {limit:g} {unit}"
+            axis.axhline(limit, color=RED, linestyle=":", linewidth=1.4, label=label)
+    for kind, colour in zip(FAMILY, SERIES, strict=True):
+        errors = np.array([row.axis_rms_px[kind] for row in shown])
+        style = "--" if kind == "fit" else "-"
+        drawn = np.maximum(errors, MIN_ERROR)
+        kind_axis.semilogy(v_mag, drawn, style, color=colour, label=kind)
+    flux_axis.set_ylabel("flux error [mag]")
+    place_axis.set_ylabel("place error [monitor px]")
+    kind_axis.set_ylabel("rms along an axis [monitor px]")
+    kind_axis.set_xlabel("V of a star of the Sun's colour [mag]")
+
+
+def budget_lines(budget: LightBudget) -> list[str]:
     """The budget for a person."""
-    within = ", ".join(
-        f"{_number(value, 'g')} mag within {limit.replace('_', ' ')}"
-        for limit, value in found.within.items()
-    )
-    centroid_text = ", ".join(
-        f"{kind} {_number(value, '.4f')}" for kind, value in found.centroid_rms_px.items()
-    )
+    within = []
+    for limit, reach in budget.within.items():
+        within.append(f"{_number(reach, 'g')} mag within {limit.replace('_', ' ')}")
+    centroids = []
+    for kind, rms_px in budget.centroid_rms_px.items():
+        centroids.append(f"{kind} {_number(rms_px, '.4f')}")
     lines = [
-        f"{'method':22}{found.method}, {found.bits} bits",
+        f"{'method':22}{budget.method}, {budget.bits} bits",
         (
-            f"{'clips at':22}V = {found.clips_v_mag:.2f} in the middle of a pixel,"
-            f" {found.clips_v_mag_at_best:.2f} on a corner"
+            f"{'clips at':22}V = {budget.clips_v_mag:.2f} in the middle of a pixel,"
+            f" {budget.clips_v_mag_at_best:.2f} on a corner"
         ),
         (
-            f"{'shows nothing':22}from V = {found.nothing_v_mag:.2f}, a range of"
-            f" {found.range_mag:.1f} mag"
+            f"{'shows nothing':22}from V = {budget.nothing_v_mag:.2f}, a range of"
+            f" {budget.range_mag:.1f} mag"
         ),
-        f"{'below full scale':22}{within}",
-        f"{'centroider':22}{found.centroider}, in the tracker's pixels after its blur",
-        f"{f'{COMPARED_MAG:g} mag below it':22}{centroid_text} px rms along an axis",
-        f"{'clipped stars':22}{named(found.clipped_hip, MAX_NAMED)}",
+        f"{'below full scale':22}{', '.join(within)}",
+        f"{'centroider':22}{budget.centroider}, in the tracker's pixels after its blur",
+        f"{f'{COMPARED_MAG:g} mag below it':22}{', '.join(centroids)} px rms along an axis",
+        f"{'clipped stars':22}{named(budget.clipped_hip, MAX_NAMED)}",
         (
-            f"{'not drawn':22}{found.left_out.stars} stars, too faint:"
-            f" {found.left_out.flux_share:.2e} of all light"
+            f"{'not drawn':22}{budget.left_out.stars} stars, too faint:"
+            f" {budget.left_out.flux_share:.2e} of all light"
         ),
-        f"{'black':22}{found.black_e_per_s_px:.4g} e-/s in a monitor pixel",
-        f"{'in the tracker':22}{found.star.line()}",
+        f"{'black':22}{budget.black_e_per_s_px:.4g} e-/s in a monitor pixel",
+        f"{'in the tracker':22}{budget.star.line()}",
     ]
-    if found.primaries is not None:
-        primaries = found.primaries
-        figure = _number(primaries.condition, ".2f")
-        lines.append(
-            f"{'condition number':22}{figure}, electrons of each channel by each primary at full"
-            " light:"
-        )
-        if found.out_of_gamut is not None:
-            if len(primaries.channels) > 1:
-                what = "electrons by channel"
-            else:
-                what = "mean wavelength"
-            lines.insert(
-                -1,
-                f"{'out of gamut':22}{found.out_of_gamut:.2%} of stars, whose {what} the primaries"
-                " cannot show",
-            )
-        for channel, rates in zip(primaries.channels, primaries.e_per_s.tolist(), strict=True):
-            shares = (
-                f"{name} {rate:.4g} e-/s" for name, rate in zip(PRIMARIES, rates, strict=True)
-            )
-            lines.append(f"{channel:22}{', '.join(shares)}")
-    for red in found.near_infrared:
+    if budget.primaries is not None:
+        lines += _primaries_lines(budget.primaries, budget.out_of_gamut)
+    for red in budget.near_infrared:
         by_class = " ".join(f"{kind} {100 * share:.1f}" for kind, share in red["by_class"].items())
         name = f"from {red['from_nm']:.0f} nm, % of e-"
+        line = f"{name:22}{by_class}"
+        if red["channel"] != "all":
+            line += f"  {red['channel']}"
+        lines.append(line)
+    return [*lines, "", *_magnitude_lines(budget)]
+
+
+def _primaries_lines(primaries: ChannelMatrix, out_of_gamut_share: float | None) -> list[str]:
+    """What each channel of the tracker has of each primary, and how many stars' colours these
+    cannot show.
+    """
+    lines = []
+    if out_of_gamut_share is not None:
+        what = "electrons by channel" if len(primaries.channels) > 1 else "mean wavelength"
         lines.append(
-            f"{name:22}{by_class}" + ("" if red["channel"] == "all" else f"  {red['channel']}")
+            f"{'out of gamut':22}{out_of_gamut_share:.2%} of stars, whose {what} the primaries"
+            " cannot show"
         )
-    every = found.centroider == "all"
-    if every:
-        kinds = f"{'':4}{''.join(f'{kind:>9}' for kind in FAMILY)}"
+    condition = _number(primaries.condition, ".2f")
+    lines.append(
+        f"{'condition number':22}{condition}, electrons of each channel by each primary at full"
+        " light:"
+    )
+    for channel, rates in zip(primaries.channels, primaries.e_per_s.tolist(), strict=True):
+        shares = []
+        for name, rate in zip(PRIMARIES, rates, strict=True):
+            shares.append(f"{name} {rate:.4g} e-/s")
+        lines.append(f"{channel:22}{', '.join(shares)}")
+    return lines
+
+
+def _magnitude_lines(budget: LightBudget) -> list[str]:
+    """The table of errors by magnitude, with all kinds of centroiders or the budget's."""
+    by_kind = budget.centroider == "all"
+    titles = f"{'V':>6}{'flux rms':>12}{'max mag':>10}"
+    if by_kind:
+        names = "".join(f"{kind:>9}" for kind in FAMILY)
+        titles += f"{'':4}{names}{'max px':>9}"
     else:
-        kinds = f"{'centroid rms':>14}"
-    lines += [
-        "",
-        f"{'V':>6}{'flux rms':>12}{'max mag':>10}{kinds}{'max px':>9}"
-        + ("" if every else f"{'max arcsec':>12}"),
-    ]
-    for row in found.rows:
-        rms_mag, max_mag = (_number(mag, ".4f") for mag in (row.flux_rms_mag, row.flux_max_mag))
+        titles += f"{'centroid rms':>14}{'max px':>9}{'max arcsec':>12}"
+    lines = [titles]
+    for row in budget.rows:
+        rms_mag = _number(row.flux_rms_mag, ".4f")
+        max_mag = _number(row.flux_max_mag, ".4f")
+        max_px = _number(row.centroid_max_px, ".4f")
         line = f"{row.v_mag:6.2f}{rms_mag:>12}{max_mag:>10}"
-        if every:
-            line += " " * 4 + "".join(
-                f"{_number(row.axis_rms_px[kind], '.4f'):>9}" for kind in FAMILY
-            )
+        if by_kind:
+            line += " " * 4
+            for kind in FAMILY:
+                line += f"{_number(row.axis_rms_px[kind], '.4f'):>9}"
+            line += f"{max_px:>9}"
         else:
-            line += f"{_number(row.centroid_rms_px, '.4f'):>14}"
-        line += f"{_number(row.centroid_max_px, '.4f'):>9}"
-        lines.append(line if every else f"{line}{_number(row.centroid_max_arcsec, '.2f'):>12}")
+            line += f"{_number(row.centroid_rms_px, '.4f'):>14}{max_px:>9}"
+            line += f"{_number(row.centroid_max_arcsec, '.2f'):>12}"
+        lines.append(line)
     return lines
 
 

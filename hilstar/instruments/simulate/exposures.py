@@ -32,8 +32,7 @@ def log_views(
     exposure.
 
     One at each sample, or `frame_count` of them evenly from the first to the last. Within half an
-    exposure of the log's
-    ends the rate is that of the part inside.
+    exposure of the log's ends the rate is that of the part inside.
     """
     timeline = log_timeline(samples, Policy(0, NS_PER_S, max_rate_rad_s))
     first_ns = samples[0].t_ns
@@ -41,22 +40,28 @@ def log_views(
     if frame_count is None:
         times_ns = [sample.t_ns for sample in samples]
     else:
-        times_ns = [round(t) for t in np.linspace(first_ns, last_ns, frame_count)]
-    return [view_at(timeline, (first_ns, last_ns), t_ns, exposure_s) for t_ns in times_ns]
+        times_ns = np.rint(np.linspace(first_ns, last_ns, frame_count)).astype(int).tolist()
+    views = []
+    for t_ns in times_ns:
+        views.append(view_at(timeline, (first_ns, last_ns), t_ns, exposure_s))
+    return views
 
 
 def view_at(timeline: Timeline, span_ns: tuple[int, int], t_ns: int, exposure_s: float) -> View:
     """The exposure around `t_ns` of a log that lasts over `span_ns` (see `log_views`)."""
     half_ns = round(exposure_s * NS_PER_S / 2)
-    ends_ns = max(span_ns[0], t_ns - half_ns), min(span_ns[1], t_ns + half_ns)
-    begin, middle, end = (timeline.at(t) for t in (ends_ns[0], t_ns, ends_ns[1]))
+    first_ns, last_ns = span_ns
+    begin_ns = max(first_ns, t_ns - half_ns)
+    end_ns = min(last_ns, t_ns + half_ns)
+    begin = timeline.at(begin_ns)
+    middle = timeline.at(t_ns)
+    end = timeline.at(end_ns)
     if begin is None or middle is None or end is None:
         raise AssertionError("a log has a sample")
     rate = np.zeros(3)
-    if ends_ns[1] > ends_ns[0]:
-        rate = rate_between_rad_s(
-            begin.q_icrs_to_cam, end.q_icrs_to_cam, (ends_ns[1] - ends_ns[0]) / NS_PER_S
-        )
+    if end_ns > begin_ns:
+        seconds = (end_ns - begin_ns) / NS_PER_S
+        rate = rate_between_rad_s(begin.q_icrs_to_cam, end.q_icrs_to_cam, seconds)
     return View.exposure(middle.q_icrs_to_cam, rate, exposure_s, t_ns)
 
 
@@ -72,11 +77,9 @@ class LogFaults:
         """Each exposure, cut where a fault begins or ends. Raises InputError for a fault that
         cannot be drawn.
         """
-        timetable = Timetable(
-            self.scenario,
-            simulator_view(simulator, self.scenario).prepare,
-            simulator.config.tracker.exposure_s,
-        )
+        faults = simulator_view(simulator, self.scenario)
+        exposure_s = simulator.config.tracker.exposure_s
+        timetable = Timetable(self.scenario, faults.prepare, exposure_s)
         timeline = log_timeline(self.samples, Policy(0, NS_PER_S, self.max_rate_rad_s))
         zero_ns = self.samples[0].t_ns
 
@@ -86,9 +89,11 @@ class LogFaults:
                 raise AssertionError("a log has a sample")
             return state.q_icrs_to_cam
 
-        return [
-            pieces_of(view, (view.t_ns or 0) - zero_ns, timetable, attitude_at) for view in views
-        ]
+        pieces = []
+        for view in views:
+            run_ns = (view.t_ns or 0) - zero_ns
+            pieces.append(pieces_of(view, run_ns, timetable, attitude_at))
+        return pieces
 
 
 def faulty_exposure(
@@ -97,6 +102,6 @@ def faulty_exposure(
     """One exposure with a scenario's faults, its middle at `run_ns` of that. Raises InputError
     (see `FaultView.prepare`).
     """
-    seen_by = simulator_view(simulator, scenario)
-    timetable = Timetable(scenario, seen_by.prepare, simulator.config.tracker.exposure_s)
-    return FaultyExposure(seen_by, pieces_of(view, run_ns, timetable))
+    faults = simulator_view(simulator, scenario)
+    timetable = Timetable(scenario, faults.prepare, simulator.config.tracker.exposure_s)
+    return FaultyExposure(faults, pieces_of(view, run_ns, timetable))

@@ -105,6 +105,7 @@ def sky_under(dn: DigitalNumbers) -> Sky:
 
 
 def _blocks(dn: DigitalNumbers) -> _Blocks:
+    """The medians and the noise of square blocks of a frame."""
     height, width = dn.shape
     side = int(np.clip(min(height, width) // BLOCKS_A_SIDE, MIN_BLOCK_PX, MAX_BLOCK_PX))
     rows = max(height // side, 1)
@@ -112,19 +113,19 @@ def _blocks(dn: DigitalNumbers) -> _Blocks:
     high = height // rows
     wide = width // columns
     whole = dn[: rows * high, : columns * wide].astype(np.float64)
-    pixels = whole.reshape(rows, high, columns, wide).swapaxes(1, 2).reshape(rows * columns, -1)
+    by_block = whole.reshape(rows, high, columns, wide).swapaxes(1, 2)
+    pixels = by_block.reshape(rows * columns, -1)
     level = np.median(pixels, axis=1)
-    noise = MAD_TO_SIGMA * np.median(np.abs(pixels - level[:, None]), axis=1)
-    down, across = np.indices((rows, columns)).reshape(2, -1)
-    return _Blocks(
-        level,
-        noise,
-        (2 * across + 1) * wide / width - 1,
-        (2 * down + 1) * high / height - 1,
-    )
+    deviation = np.abs(pixels - level[:, None])
+    noise = MAD_TO_SIGMA * np.median(deviation, axis=1)
+    row, column = np.indices((rows, columns)).reshape(2, -1)
+    across = (2 * column + 1) * wide / width - 1
+    down = (2 * row + 1) * high / height - 1
+    return _Blocks(level, noise, across, down)
 
 
 def _terms(across: FloatArray, down: FloatArray) -> FloatArray:
+    """The terms (n, 6) of a surface of second degree."""
     ones = np.ones_like(across)
     return np.column_stack([ones, across, down, across**2, across * down, down**2])
 
@@ -136,8 +137,10 @@ def _fitted(terms: FloatArray, level: FloatArray, chosen: BoolArray) -> FloatArr
 
 
 def _stretched(light: FloatArray, noise: float) -> FloatArray:
+    """Greys, 1 for the brightest, of light: an asinh of it in units of its noise."""
     top = max(float(light.max()) / noise, MIN_TOP_SIGMA)
-    return np.asarray(np.arcsinh(np.maximum(light, 0) / noise) / np.arcsinh(top))
+    in_noise = np.maximum(light, 0) / noise
+    return np.asarray(np.arcsinh(in_noise) / np.arcsinh(top))
 
 
 def _star_places(box_sum: FloatArray, box_noise: float) -> tuple[IntArray, IntArray]:
@@ -159,7 +162,8 @@ def _is_wide(patch: FloatArray) -> bool:
     middle = RING_PX // 2
     inner = slice(middle - MAX_RADIUS_PX, middle + MAX_RADIUS_PX + 1)
     near = patch[inner, inner]
-    bright, _ = ndimage.label(near > WIDE_SHARE * near[MAX_RADIUS_PX, MAX_RADIUS_PX])
+    peak = near[MAX_RADIUS_PX, MAX_RADIUS_PX]
+    bright, _ = ndimage.label(near > WIDE_SHARE * peak)
     star = bright == bright[MAX_RADIUS_PX, MAX_RADIUS_PX]
     edge = star[0].any() or star[-1].any() or star[:, 0].any() or star[:, -1].any()
     return bool(edge)
@@ -174,12 +178,13 @@ def _discs(
     """Discs about places (rows, columns) on black (height, width); of two the brighter shows."""
     picture = np.zeros(shape)
     height, width = shape
+    rows, columns = place
     reach = np.arange(-MAX_RADIUS_PX, MAX_RADIUS_PX + 1)
     for down in reach:
         for across in reach:
             inside = radius_px >= np.hypot(down, across)
-            row = place[0][inside] + down
-            column = place[1][inside] + across
+            row = rows[inside] + down
+            column = columns[inside] + across
             on = (row >= 0) & (row < height) & (column >= 0) & (column < width)
             np.maximum.at(picture, (row[on], column[on]), grey[inside][on])
     return picture

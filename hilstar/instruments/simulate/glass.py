@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.optics.psf import Psf
 from hilstar.tracker.centroiders import Pixels, ToldPsf
 
@@ -23,36 +23,38 @@ def told_psf(psf: Psf, pixels: Pixels, side_px: int, shares: FloatArray | None =
     rows, columns = pixels
     near = np.arange(side_px) - side_px // 2
 
-    def of(x: FloatArray, y: FloatArray) -> FloatArray:
+    def of(x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         if not psf.by_colour:
             stamps = []
-            for across, down in zip(near - x[:, None], near - y[:, None], strict=True):
+            for x, y in zip(x_px, y_px, strict=True):
+                across = near - x
+                down = near - y
                 stamps.append(psf.shares(across[None, :], down[:, None]))
             return np.stack(stamps)
-        places = columns + x, rows + y
-        light = psf.stamps_at(*places, psf.mean_shares if shares is None else shares)
-        own_size = light.shape[1]
+        at_x_px = columns + x_px
+        at_y_px = rows + y_px
+        spectra = psf.mean_shares if shares is None else shares
+        light = psf.stamps_at(at_x_px, at_y_px, spectra)
+        glass_side = light.shape[1]
         light = np.pad(light, ((0, 0), (1, 1), (1, 1)))
-        # The glass's square is about the pixel nearest to the star, this one about its own.
-        to = []
-        for place, middle in zip(places, (columns, rows), strict=True):
-            to.append(
-                np.clip(
-                    middle[:, None]
-                    + near
-                    - np.floor(place + 0.5).astype(np.intp)[:, None]
-                    + own_size // 2
-                    + 1,
-                    0,
-                    own_size + 1,
-                )
-            )
-        return np.asarray(
-            light[np.arange(len(x))[:, None, None], to[1][:, :, None], to[0][:, None, :]],
-            dtype=np.float64,
-        )
+        stars = np.arange(len(x_px))[:, None, None]
+        column = _in_glass_square(columns[:, None] + near, at_x_px, glass_side)
+        row = _in_glass_square(rows[:, None] + near, at_y_px, glass_side)
+        squares = light[stars, row[:, :, None], column[:, None, :]]
+        return np.asarray(squares, dtype=np.float64)
 
     return of
+
+
+def _in_glass_square(pixels: IntArray, stars_px: FloatArray, side_px: int) -> IntArray:
+    """Where pixels (n, m) along an axis lie in the glass's squares about stars (n,), padded by one
+    dark pixel, which all beyond them have.
+
+    The glass's square is about the pixel nearest to the star, and not about the centroider's.
+    """
+    nearest = np.floor(stars_px + 0.5).astype(np.intp)
+    from_first = pixels - nearest[:, None] + side_px // 2
+    return np.asarray(np.clip(from_first + 1, 0, side_px + 1))
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +82,11 @@ class ErrorSplit:
             "colour": self.colour,
             "psf": self.psf,
         }
-        return {name: float(np.sqrt((part**2).sum(axis=1).mean())) for name, part in parts.items()}
+        rms = {}
+        for name, part in parts.items():
+            distance2 = (part**2).sum(axis=1)
+            rms[name] = float(np.sqrt(distance2.mean()))
+        return rms
 
 
 def split_errors(
@@ -94,12 +100,17 @@ def split_errors(
     """
     if len(places_px) < MIN_STARS:
         raise ValueError(f"{len(places_px)} stars; a split takes {MIN_STARS}")
-    u, v = (
-        (place - (size - 1) / 2) / (size / 2)
-        for place, size in zip(places_px.T, size_px, strict=True)
-    )
-    by_place = np.stack([u**j * v**k for j in range(4) for k in range(4 - j)], axis=1)
-    by_colour = (bv_mag - bv_mag.mean())[:, None] * np.stack([np.ones_like(u), u, v], axis=1)
-    solution = np.linalg.lstsq(np.hstack([by_place, by_colour]), errors_px, rcond=None)[0]
+    width, height = size_px
+    u = (places_px[:, 0] - (width - 1) / 2) / (width / 2)
+    v = (places_px[:, 1] - (height - 1) / 2) / (height / 2)
+    cubic = []
+    for j in range(4):
+        for k in range(4 - j):
+            cubic.append(u**j * v**k)
+    by_place = np.stack(cubic, axis=1)
+    line = np.stack([np.ones_like(u), u, v], axis=1)
+    by_colour = (bv_mag - bv_mag.mean())[:, None] * line
+    terms = np.hstack([by_place, by_colour])
+    solution = np.linalg.lstsq(terms, errors_px, rcond=None)[0]
     count = by_place.shape[1]
     return ErrorSplit(errors_px, by_place @ solution[:count], by_colour @ solution[count:])

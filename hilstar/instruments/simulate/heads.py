@@ -47,9 +47,11 @@ class HeadsErrors:
 
 
 def _figures(errors: list[float]) -> dict[str, float] | None:
+    """The rms and the maximum of errors, None without any."""
     if not errors:
         return None
-    return {"rms": float(np.sqrt(np.mean(np.square(errors)))), "max": max(errors)}
+    rms = np.sqrt(np.mean(np.square(errors)))
+    return {"rms": float(rms), "max": max(errors)}
 
 
 class _Head:
@@ -61,7 +63,8 @@ class _Head:
         # The window's bias repeats with the place within a pixel: a wider one has 0.0004 px of it
         # in place of 0.0009.
         width_px = WIDER * finder.settings.window_sigma_px
-        self.finder = replace(finder, settings=replace(finder.settings, window_sigma_px=width_px))
+        settings = replace(finder.settings, window_sigma_px=width_px)
+        self.finder = replace(finder, settings=settings)
         self.mounting = Mounting(twin.config.tracker.q_body_to_cam)
 
     def solved(
@@ -70,73 +73,89 @@ class _Head:
         """The body's attitude as this head's stars have it, from linear light and from codes;
         None with too few stars.
         """
-        head_field = self.twin.field(
-            multiply(self.mounting.q_body_to_cam, q_icrs_to_body), first_frame
-        )
-        sky, shown = (
-            self.finder.match(image_e, head_field.x_px, head_field.y_px)
-            for image_e in (head_field.sky_e, head_field.shown_e)
-        )
+        q_icrs_to_cam = multiply(self.mounting.q_body_to_cam, q_icrs_to_body)
+        head_field = self.twin.field(q_icrs_to_cam, first_frame)
+        x_px, y_px = head_field.x_px, head_field.y_px
+        sky = self.finder.match(head_field.sky_e, x_px, y_px)
+        shown = self.finder.match(head_field.shown_e, x_px, y_px)
         stars = np.flatnonzero(self._usable(head_field, sky, shown))
         if len(stars) < MIN_STARS:
             return None
-        wanted = self._directions(head_field.x_px[stars], head_field.y_px[stars])
+        wanted = self._directions(x_px[stars], y_px[stars])
         # Linear light places all stars alike; codes place bright stars better.
         alike = np.ones(len(stars))
         light = head_field.truth["electrons_per_s"][stars].astype(np.float64)
-        linear, codes = (
-            self._body(q_icrs_to_body, self._found(vectors, stars), wanted, weights)
-            for vectors, weights in ((sky, alike), (shown, light))
-        )
+        linear = self._body(q_icrs_to_body, self._solved_from(sky, stars), wanted, alike)
+        codes = self._body(q_icrs_to_body, self._solved_from(shown, stars), wanted, light)
         return linear, codes
 
-    def _usable(self, seen: TwinField, sky: Matched, shown: Matched) -> npt.NDArray[np.bool_]:
-        truth, (width, height) = seen.truth, self.twin.camera.resolution_px
+    def _usable(self, head_field: TwinField, sky: Matched, shown: Matched) -> npt.NDArray[np.bool_]:
+        """True for stars (n,) whose centroids in both images are of nothing else: whole in both,
+        alone in their windows, drawn and not clipped.
+        """
+        truth = head_field.truth
+        x_px, y_px = head_field.x_px, head_field.y_px
         radius_px = self.finder.settings.radius_px
-        margin = radius_px + EDGE_PX
-        inside = (
-            (seen.x_px > margin)
-            & (seen.x_px < width - 1 - margin)
-            & (seen.y_px > margin)
-            & (seen.y_px < height - 1 - margin)
-        )
+        margin_px = radius_px + EDGE_PX
+        inside = _inside(x_px, y_px, self.twin.camera.resolution_px, margin_px)
         bench = self.twin.bench
-        reach = bench.psf.footprint_px / 2 + margin * self.twin.monitor_px_per_px
-        screen_w, screen_h = bench.camera.resolution_px
-        x = truth["x_px"]
-        y = truth["y_px"]
-        inside &= (
-            (x > reach) & (x < screen_w - 1 - reach) & (y > reach) & (y < screen_h - 1 - reach)
-        )
-        near = crowded(seen.x_px, seen.y_px, truth["electrons_per_s"], radius_px, self.finder.psf)
-        is_matched = (sky.index >= 0) & (shown.index >= 0) & ~shared(sky.index)
-        return np.asarray(inside & is_matched & truth["drawn"] & ~truth["clipped"] & ~near)
+        reach_px = bench.psf.footprint_px / 2 + margin_px * self.twin.monitor_px_per_px
+        inside &= _inside(truth["x_px"], truth["y_px"], bench.camera.resolution_px, reach_px)
+        rates = truth["electrons_per_s"]
+        is_crowded = crowded(x_px, y_px, rates, radius_px, self.finder.psf)
+        has_both = (sky.index >= 0) & (shown.index >= 0)
+        is_matched = has_both & ~shared(sky.index)
+        is_whole = truth["drawn"] & ~truth["clipped"]
+        return np.asarray(inside & is_matched & is_whole & ~is_crowded)
 
     def _directions(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+        """Unit vectors (n, 3) of places on the detector, cam."""
         rays = self.twin.camera.rays(x_px, y_px)
         return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
-    def _found(self, matched: Matched, stars: npt.NDArray[np.intp]) -> FloatArray:
-        place = matched.index[stars]
-        return self._directions(matched.found.x_px[place], matched.found.y_px[place])
+    def _solved_from(self, matched: Matched, stars: npt.NDArray[np.intp]) -> FloatArray:
+        """Unit vectors (n, 3), cam, to the centroids of stars (n,)."""
+        source = matched.index[stars]
+        return self._directions(matched.found.x_px[source], matched.found.y_px[source])
 
     def _body(
-        self, q_icrs_to_body: FloatArray, found: FloatArray, wanted: FloatArray, weights: FloatArray
+        self,
+        q_icrs_to_body: FloatArray,
+        measured: FloatArray,
+        wanted: FloatArray,
+        weights: FloatArray,
     ) -> FloatArray:
+        """The body's attitude (4,) by directions measured, where stars of the true attitude have
+        those wanted, (n, 3) each.
+        """
         q_body_to_cam = self.mounting.q_body_to_cam
         # turns the camera's true axes into those solved
-        off = from_matrix(rotation_between(wanted, found, weights))
-        return multiply(
-            conjugate(q_body_to_cam), multiply(off, multiply(q_body_to_cam, q_icrs_to_body))
-        )
+        q_cam_to_solved = from_matrix(rotation_between(wanted, measured, weights))
+        q_icrs_to_cam = multiply(q_body_to_cam, q_icrs_to_body)
+        q_icrs_to_solved = multiply(q_cam_to_solved, q_icrs_to_cam)
+        return multiply(conjugate(q_body_to_cam), q_icrs_to_solved)
+
+
+def _inside(
+    x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], margin_px: float
+) -> npt.NDArray[np.bool_]:
+    """True for places (n,) farther than a margin from an image's edges."""
+    width, height = resolution_px
+    across = (x_px > margin_px) & (x_px < width - 1 - margin_px)
+    down = (y_px > margin_px) & (y_px < height - 1 - margin_px)
+    return np.asarray(across & down)
 
 
 def rotation_between(before: FloatArray, after: FloatArray, weights: FloatArray) -> FloatArray:
     """The rotation (3, 3) that takes unit vectors (n, 3) nearest to others: Wahba's problem by
     Markley's SVD (1988).
     """
-    u, _, vt = np.linalg.svd((weights[:, None] * after).T @ before)
-    return np.asarray(u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt)
+    weighted = weights[:, None] * after
+    u, _, vt = np.linalg.svd(weighted.T @ before)
+    # +1, or -1 where the product would be a reflection
+    handedness = np.linalg.det(u) * np.linalg.det(vt)
+    proper = np.diag([1.0, 1.0, handedness])
+    return np.asarray(u @ proper @ vt)
 
 
 def verify_heads(
@@ -152,22 +171,24 @@ def verify_heads(
     """
     pairs = [HeadsErrors(*two) for two in combinations(heads.names, 2)]
     with ExitStack() as stack:
-        seen_by = [_Head(stack.enter_context(Twin(file))) for file in heads.files]
+        twins = [_Head(stack.enter_context(Twin(file))) for file in heads.files]
         for number in range(fields):
-            q = rng.normal(size=4)
-            q_icrs_to_body = q / np.linalg.norm(q)
+            components = rng.normal(size=4)
+            q_icrs_to_body = components / np.linalg.norm(components)
             first_frame = int(rng.integers(0, MASK_TURNS))
-            solved = [head.solved(q_icrs_to_body, first_frame) for head in seen_by]
-            for pair, (first_head, other) in zip(pairs, combinations(solved, 2), strict=True):
-                if first_head is not None and other is not None:
-                    pair.linear_arcsec.append(_apart_arcsec(first_head[0], other[0]))
-                    pair.codes_arcsec.append(_apart_arcsec(first_head[1], other[1]))
+            solved = [head.solved(q_icrs_to_body, first_frame) for head in twins]
+            for pair, (first, second) in zip(pairs, combinations(solved, 2), strict=True):
+                if first is None or second is None:
+                    continue
+                first_linear, first_codes = first
+                second_linear, second_codes = second
+                pair.linear_arcsec.append(_apart_arcsec(first_linear, second_linear))
+                pair.codes_arcsec.append(_apart_arcsec(first_codes, second_codes))
             on_field(number + 1)
     return pairs
 
 
-def _apart_arcsec(one: FloatArray, other: FloatArray) -> float:
+def _apart_arcsec(first: FloatArray, second: FloatArray) -> float:
     """The angle between two solutions of one body's attitude."""
-    return (
-        float(np.linalg.norm(to_rotation_vector(multiply(one, conjugate(other))))) * ARCSEC_PER_RAD
-    )
+    turn_rad = to_rotation_vector(multiply(first, conjugate(second)))
+    return float(np.linalg.norm(turn_rad)) * ARCSEC_PER_RAD

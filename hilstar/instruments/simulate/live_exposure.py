@@ -93,15 +93,16 @@ class WatchedFrames:
     def add(self, frame: ShownFrame) -> None:
         """Take a frame. One that is older than the last begins a new run."""
         last = self._frames[-1].head if self._frames else None
-        if last is not None and (
-            frame.head.lit_ns <= last.lit_ns or frame.head.frame <= last.frame
-        ):
+        head = frame.head
+        if last is not None and (head.lit_ns <= last.lit_ns or head.frame <= last.frame):
             self._frames.clear()
         elif last is not None:
-            self.missing += frame.head.frame - last.frame - 1
+            self.missing += head.frame - last.frame - 1
         self.received += 1
         self._frames.append(frame)
-        while len(self._frames) > 1 and self._frames[1].head.lit_ns < frame.head.lit_ns - KEPT_NS:
+        # the frame that the oldest exposure still to be asked for begins in stays
+        oldest_ns = head.lit_ns - KEPT_NS
+        while len(self._frames) > 1 and self._frames[1].head.lit_ns < oldest_ns:
             self._frames.popleft()
 
     @property
@@ -121,7 +122,8 @@ class WatchedFrames:
         lights: list[FloatArray] = []
         turns: list[tuple[FloatArray, float]] = []
         for frame, until_ns in zip(frames, ends_ns, strict=True):
-            share = (min(until_ns, end_ns) - max(frame.head.lit_ns, begin_ns)) / (end_ns - begin_ns)
+            lit_ns = min(until_ns, end_ns) - max(frame.head.lit_ns, begin_ns)
+            share = lit_ns / (end_ns - begin_ns)
             if share <= 0:
                 continue
             places.append(frame.lit)
@@ -129,13 +131,16 @@ class WatchedFrames:
             if (q := frame.q_icrs_to_cam) is not None:
                 turns.append((q, share))
         lit, first = np.unique(np.concatenate(places), return_inverse=True)
-        columns = np.concatenate(lights).T
-        light = np.array(
-            [np.bincount(first, column, minlength=len(lit)) for column in columns], dtype=np.float64
-        ).T
-        shown = sum((share for _, share in turns), 0.0)
+        sums = []
+        for primary_light in np.concatenate(lights).T:
+            sums.append(np.bincount(first, primary_light, minlength=len(lit)))
         return Exposed(
-            (begin_ns, end_ns), lit.astype(np.intp), light, _mean(turns), len(places), shown
+            span_ns=(begin_ns, end_ns),
+            lit=lit.astype(np.intp),
+            light_e_per_s=np.array(sums, dtype=np.float64).T,
+            q_icrs_to_cam=_mean(turns),
+            frames=len(places),
+            shown_share=sum((share for _, share in turns), 0.0),
         )
 
 
@@ -143,13 +148,14 @@ def _mean(turns: list[tuple[FloatArray, float]]) -> FloatArray | None:
     """The mean rotation of attitudes with weights: of small turns from the first."""
     if not turns:
         return None
-    first = turns[0][0]
+    first, _ = turns[0]
     total = sum(share for _, share in turns)
-    about = np.sum(
-        [share / total * to_rotation_vector(multiply(q, conjugate(first))) for q, share in turns],
-        axis=0,
-    )
-    return normalise(multiply(from_rotation_vector(about), first))
+    weighted = []
+    for q, share in turns:
+        turn_rad = to_rotation_vector(multiply(q, conjugate(first)))
+        weighted.append(share / total * turn_rad)
+    mean_rad = np.sum(weighted, axis=0)
+    return normalise(multiply(from_rotation_vector(mean_rad), first))
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,29 +195,26 @@ class LiveTracker(Closing):
         self._detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         with open_bench(file) as bench:
             self._bench = bench  # its light; its renderer is closed
-            self._size_px, self._bits = bench.camera.resolution_px, self.config.monitor.bits
+            self._size_px = bench.camera.resolution_px
+            self._bits = self.config.monitor.bits
             self._panel = true_panel(bench)
             self._rgb = bench.calibration.response.rgb
             self._primaries = seen_primaries(bench)
             self._colours = DisplayColours.of(bench)
             self._optics = TwinOptics(true_geometry(bench, self.camera), bench.tracker_psf)
             glow_e_per_s = self._optics.glow_e_per_s(self._panel)
-            noise_e2 = tracker.detector.noise(
-                np.median(glow_e_per_s) * self.exposure_s, self.exposure_s
-            ).total_e2
-            faintest = (
-                SEEN_SIGMAS
-                * float(np.sqrt(noise_e2))
-                / self.canvas.psf.peak_share
-                / self.exposure_s
-            )
-            self.stars, _ = split_by_rate(bench.stars, max(faintest, bench.faintest_shown_e_per_s))
+            glow_e = np.median(glow_e_per_s) * self.exposure_s
+            noise_e = float(np.sqrt(tracker.detector.noise(glow_e, self.exposure_s).total_e2))
+            detected_e = SEEN_SIGMAS * noise_e / self.canvas.psf.peak_share
+            faintest_e_per_s = max(detected_e / self.exposure_s, bench.faintest_shown_e_per_s)
+            self.stars, _ = split_by_rate(bench.stars, faintest_e_per_s)
         background = TrackerBackground(self.config, file.folder, self.camera, refuse=False)
-        glow_e = self._colours.grey(glow_e_per_s) * self.exposure_s
-        self._under_e = glow_e + background.of_view_e(View(np.array([1.0, 0, 0, 0])))
+        pixels_glow_e = self._colours.grey(glow_e_per_s) * self.exposure_s
+        self._under_e = pixels_glow_e + background.of_view_e(View(np.array([1.0, 0, 0, 0])))
         self._gain_db = 0.0
         # As the bench file has them: what a client sets is worked out from these.
-        self._bench_exposure_s, self._bench_under_e = self.exposure_s, self._under_e
+        self._bench_exposure_s = self.exposure_s
+        self._bench_under_e = self._under_e
         self._dark_dn = uneven_dark_dn(self._under_e, tracker.detector)
         self._radius_rad = self.camera.field_radius_rad(0.0)
         self._before: tuple[int, FloatArray] | None = None
@@ -220,15 +223,14 @@ class LiveTracker(Closing):
         self.frames = WatchedFrames(self._light)
 
     def _light(self, frame: ShownFrame) -> FloatArray:
+        """The light (n, primaries) of a frame's lit pixels, e-/s."""
         levels = frame.codes if self._rgb is None else _levels_of(frame.codes, self._rgb)
-        panels, columns = (
-            self._panel.primaries or (self._panel,),
-            levels.reshape(len(levels), math.prod(levels.shape[1:])).T,
-        )
-        lights = [
-            panel.response.light[k] * panel.flux_at_white_e_per_s
-            for panel, k in zip(panels, columns, strict=True)
-        ]
+        panels = self._panel.primaries or (self._panel,)
+        by_channel = levels.reshape(len(levels), math.prod(levels.shape[1:])).T
+        lights = []
+        for panel, channel_levels in zip(panels, by_channel, strict=True):
+            relative = panel.response.light[channel_levels]
+            lights.append(relative * panel.flux_at_white_e_per_s)
         light = np.stack(lights, axis=1)
         if self._panel.uniformity is not None:
             light = light * self._panel.uniformity.ravel()[frame.lit, None]
@@ -238,16 +240,11 @@ class LiveTracker(Closing):
         """Take a frame. Raises InputError for one of another display."""
         head = frame.head
         kind = head.width, head.height, head.bits, head.channels
-        mine = (
-            *self._size_px,
-            self._bits,
-            1 if self._rgb is None and not self._panel.primaries else 3,
-        )
-        if kind != mine:
-            shown, wanted = (
-                "{} x {} pixels of {} bits in {} channels".format(*frame_kind)
-                for frame_kind in (kind, mine)
-            )
+        channels = 1 if self._rgb is None and not self._panel.primaries else 3
+        bench_kind = *self._size_px, self._bits, channels
+        if kind != bench_kind:
+            form = "{} x {} pixels of {} bits in {} channels"
+            shown, wanted = form.format(*kind), form.format(*bench_kind)
             raise InputError(
                 f"frames of {shown}, the bench file has {wanted}; give the bench file of serve"
             )
@@ -279,25 +276,24 @@ class LiveTracker(Closing):
         expected = self._expected(exposed)
         stars = self._found(dn, exposed, expected)
         settings = self.config.tracker.detector
-        if np.count_nonzero(dn == 2**settings.bits - 1) > BLINDED_SHARE * dn.size:
+        last_code = 2**settings.bits - 1
+        if np.count_nonzero(dn == last_code) > BLINDED_SHARE * dn.size:
             return self._answered(Solved(exposed, BLINDED, stars))
-        if expected is None:
-            identified = None
-        else:
+        identified = None
+        if expected is not None:
             identified = identify(stars, expected, self._near, self._place)
         mode = TRACKING
         if identified is None and self.lost_in_space is not None and len(stars):
             mode = LOST
             guess = self.lost_in_space(stars, dn)
-            if guess is None:
-                identified = None
-            else:
+            if guess is not None:
                 identified = identify(stars, guess, self._near, self._place)
         if identified is None:
             mode = TOO_FEW if len(stars) < MIN_STARS else LOST
         return self._answered(Solved(exposed, mode, stars, identified))
 
     def _answered(self, solved: Solved) -> Solved:
+        """The same answer, noted as the last one where it has an attitude."""
         if solved.identified is not None:
             at_ns = solved.exposed.middle_ns
             self._before = self._last
@@ -308,45 +304,47 @@ class LiveTracker(Closing):
         """The attitude that the last two lead to, or the true one; None where none is known."""
         if self.lost_in_space is None:
             return exposed.q_icrs_to_cam
-        if self._last is None or exposed.middle_ns - self._last[0] > STALE_S * NS_PER_S:
+        if self._last is None:
             return None
-        return propagate(
-            self._last[1], self.rate_cam_rad_s(), (exposed.middle_ns - self._last[0]) / NS_PER_S
-        )
+        last_ns, last_q = self._last
+        since_ns = exposed.middle_ns - last_ns
+        if since_ns > STALE_S * NS_PER_S:
+            return None
+        return propagate(last_q, self.rate_cam_rad_s(), since_ns / NS_PER_S)
 
     def rate_cam_rad_s(self) -> FloatArray:
         """The turn between the last two attitudes (3,), cam; 0 where there are none of the last
         second.
         """
-        before = self._before
-        last = self._last
-        if before is None or last is None or last[0] - before[0] > TURN_S * NS_PER_S:
+        if self._before is None or self._last is None:
             return np.zeros(3)
-        return rate_between_rad_s(before[1], last[1], (last[0] - before[0]) / NS_PER_S)
+        before_ns, before_q = self._before
+        last_ns, last_q = self._last
+        if last_ns - before_ns > TURN_S * NS_PER_S:
+            return np.zeros(3)
+        return rate_between_rad_s(before_q, last_q, (last_ns - before_ns) / NS_PER_S)
 
     def _found(
         self, dn: npt.NDArray[np.uint16], exposed: Exposed, expected: FloatArray | None
     ) -> FoundStars:
+        """The stars that the tracker's software finds in an image, by a window as wide as they are
+        smeared.
+        """
         psf_px = software_psf_px(self.canvas.psf.width_px, self.config.tracker.detector)
-        streak_px = (
-            float(np.linalg.norm(self.rate_cam_rad_s()[:2]))
-            * self.exposure_s
-            * self.camera.focal_length_px
-        )
-        window_px = max(
-            1.0,
-            *psf_px,
-            min(streak_px / np.sqrt(12), MAX_WINDOW_PX) if streak_px > STREAK_PX else 0.0,
-        )
+        across_rad_s = float(np.linalg.norm(self.rate_cam_rad_s()[:2]))
+        streak_px = across_rad_s * self.exposure_s * self.camera.focal_length_px
         still = streak_px <= STREAK_PX
+        window_px = max(1.0, *psf_px)
+        if not still:
+            # the standard deviation of an even streak along itself
+            window_px = max(window_px, min(streak_px / np.sqrt(12), MAX_WINDOW_PX))
         image = software_image(dn, self.config.tracker.detector)
         background: LocalBackground | None = None
         if self._dark_dn is not None:
             image = image - self._dark_dn
             background = noisiest_background(image)
-        settings = CentroidSettings(
-            window_sigma_px=window_px, psf_sigma_px=psf_px if still else None
-        )
+        psf_sigma_px = psf_px if still else None
+        settings = CentroidSettings(window_sigma_px=window_px, psf_sigma_px=psf_sigma_px)
         stars = find_stars(image, settings, background)
         good = ~stars.at_edge
         x_px = stars.x_px[good]
@@ -359,25 +357,26 @@ class LiveTracker(Closing):
         stars = solved.found
         pairs = solved.identified
         gain = self._detector.settings.gain_e_per_dn
-        if pairs is None:
-            hip = {}
-        else:
+        hip = {}
+        if pairs is not None:
             hip = dict(zip(pairs.found.tolist(), self.stars.hip[pairs.star].tolist(), strict=True))
         reported: list[ReportedStar] = []
         for k in range(min(len(stars), MAX_REPORTED)):
-            dn = float(stars.flux_e[k]) / gain
-            star = ReportedStar(
-                float(stars.x_px[k]), float(stars.y_px[k]), dn, hip=hip.get(k) or None
-            )
-            reported.append(star)
+            x_px, y_px = float(stars.x_px[k]), float(stars.y_px[k])
+            flux_dn = float(stars.flux_e[k]) / gain
+            reported.append(ReportedStar(x_px, y_px, flux_dn, hip=hip.get(k) or None))
         return tuple(reported)
 
     def _near(self, q_icrs_to_cam: FloatArray) -> tuple[IntArray, FloatArray]:
-        near = self.stars.near(to_matrix(q_icrs_to_cam)[2], self._radius_rad)
-        near = near[np.argsort(-self.stars.electrons_per_s[near], kind="stable")[:MAX_EXPECTED]]
+        """The brightest stars (n,) of a field, and their unit vectors (n, 3), ICRS."""
+        boresight = to_matrix(q_icrs_to_cam)[2]
+        near = self.stars.near(boresight, self._radius_rad)
+        brightest_first = np.argsort(-self.stars.electrons_per_s[near], kind="stable")
+        near = near[brightest_first[:MAX_EXPECTED]]
         return near, self.stars.directions(near)
 
     def _place(self, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Tracker pixels (n,) of rays (n, 3), cam."""
         return self.camera.project(rays @ self.camera.cam_to_image.T)
 
     def close(self) -> None:
@@ -389,8 +388,10 @@ def _levels_of(codes: npt.NDArray[np.unsignedinteger], rgb: npt.NDArray[np.uint1
     """The levels (n,) of triples of codes (n, 3); the darkest where a triple is none of the
     response's.
     """
-    numbers = rgb.astype(np.int64) @ [1 << 32, 1 << 16, 1]
+    weights = [1 << 32, 1 << 16, 1]
+    numbers = rgb.astype(np.int64) @ weights
+    asked = codes.astype(np.int64) @ weights
     order = np.argsort(numbers)
-    asked = codes.astype(np.int64) @ [1 << 32, 1 << 16, 1]
-    place = order[np.minimum(np.searchsorted(numbers[order], asked), len(order) - 1)]
+    at_or_after = np.searchsorted(numbers[order], asked)
+    place = order[np.minimum(at_or_after, len(order) - 1)]
     return np.where(numbers[place] == asked, place, 0)

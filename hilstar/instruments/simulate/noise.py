@@ -13,7 +13,7 @@ over places on the detector.
 import contextlib
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,16 +52,17 @@ from hilstar.tracker.mosaic import (
 from hilstar.tracker.settings import DetectorSettings, PixelNoise
 
 PHASES = 6  # along a side of a pixel
-SLOPE_STEP_PX = 1e-3
+SLOPE_STEP_PX = 1e-3  # to either side of a place, for slopes
 CHUNK = 64  # stars at once
 UNSEEN = 0.01  # the probability of detection at which the table of magnitudes ends
 MAX_ROWS, BETWEEN = 80, 5  # rows, and steps from one to the next by which stars are interpolated
-NO_INFORMATION = NO_NOISE_E2 = 1e-12  # a star whose pixels all clip; a pixel without light
+# a star whose pixels all clip; a pixel without light
+NO_INFORMATION = NO_NOISE_E2 = 1e-12
 # simulated stars of a magnitude along a side of an image; found ones that give an error
 TRIALS, MIN_FOUND = 20, 40
-SKY_FIELDS = 100
+SKY_FIELDS = 100  # at random, of which medians are told
 LIMIT_STEP_MAG = 0.25
-TURN_RAD = 1e-6
+TURN_RAD = 1e-6  # about each axis, for its slopes: 0.2 arcsec
 NO_PLACE_PX = 1e3  # a star whose light never leaves one pixel, or is all clipped
 MIN_STARS = 2  # for an attitude
 # A pattern of four stars is what lost-in-space solvers look up (tetra3's and astrometry.net's).
@@ -71,23 +72,24 @@ ENOUGH_SHARE = 0.95  # of fields
 SOURCES = ("shot", "background", "dark", "read", "reset", "quantisation", "prnu", "dsnu")
 WHO = ("limit", *FAMILY)
 NEA_COLUMNS = [f"{kind}_{way}_arcsec" for kind in WHO for way in ("across", "about")]
+# V, B-V and V-I of one star of the Sun's colour, as `StarRates` takes them
+SOLAR_STAR = np.array([[0.0], [SOLAR_BV], [np.nan]])
+LISTED = ("hip", "name", "x_px", "y_px", "v_mag")  # columns of stars.csv before the noise
 
 # Stars in noise, electrons of a whole star, rms over the places within a pixel. `detection` is the
 # probability that the threshold finds it. `bound_px` is the Cramer-Rao bound of place along an axis
 # (rms of x and y), flux unknown; `bound_flux_e` that of flux, place unknown, `bound_flux_sky_e`
 # background unknown too. `effective_px` is how many pixels' read noise a star has, `clipped_px` how
 # many pixels are left out because they clip.
-NOISE_DTYPE = np.dtype(
-    [(f"{source}_e", "f8") for source in SOURCES]
-    + [
-        (name, "f8")
-        for name in ("total_e", "snr", "detection", "bound_px", "bound_x_px", "bound_y_px")
-    ]
-    + [
-        (name, "f8")
-        for name in ("bound_flux_e", "bound_flux_sky_e", "star_e", "effective_px", "clipped_px")
-    ]
+BOUNDS_OF_PLACE = ("bound_x_px", "bound_y_px", "detection")
+BOUND_COLUMNS = ("bound_px", "bound_x_px", "bound_y_px", "bound_flux_e", "bound_flux_sky_e")
+NOISE_COLUMNS = (
+    *(f"{source}_e" for source in SOURCES),
+    *("total_e", "snr", "detection"),
+    *BOUND_COLUMNS,
+    *("star_e", "effective_px", "clipped_px"),
 )
+NOISE_DTYPE = np.dtype([(name, "f8") for name in NOISE_COLUMNS])
 Table = npt.NDArray[np.void]
 
 
@@ -122,21 +124,28 @@ class NoisyStar:
         self.mosaic = mosaic
         self.side_px = max(psf.footprint_px | 1, 7)
         phase = (np.arange(phases) + 0.5) / phases - 0.5
-        y_px, x_px = (grid.ravel() for grid in np.meshgrid(phase, phase))
+        columns, rows = np.meshgrid(phase, phase)
+        y_px = columns.ravel()
+        x_px = rows.ravel()
         step = SLOPE_STEP_PX
-        star_pattern, sky = self._patterns()
+        star_pattern, sky_pattern = self._patterns()
         stamps = self.stamps(x_px, y_px)
-        slope_x = (self.stamps(x_px + step, y_px) - self.stamps(x_px - step, y_px)) / (2 * step)
-        slope_y = (self.stamps(x_px, y_px + step) - self.stamps(x_px, y_px - step)) / (2 * step)
+        change_x = self.stamps(x_px + step, y_px) - self.stamps(x_px - step, y_px)
+        change_y = self.stamps(x_px, y_px + step) - self.stamps(x_px, y_px - step)
+        slope_x = change_x / (2 * step)
+        slope_y = change_y / (2 * step)
         count = phases**2 * len(star_pattern)
-        self.shares = (star_pattern[:, None] * stamps).reshape(count, -1)
-        by_x = (star_pattern[:, None] * slope_x).reshape(count, -1)
-        by_y = (star_pattern[:, None] * slope_y).reshape(count, -1)
-        by_sky = (sky[:, None] * np.ones_like(stamps)).reshape(count, -1)
+        star_pattern = star_pattern[:, None]
+        self.shares = (star_pattern * stamps).reshape(count, -1)
+        by_x = (star_pattern * slope_x).reshape(count, -1)
+        by_y = (star_pattern * slope_y).reshape(count, -1)
+        by_sky = sky_pattern[:, None] * np.ones_like(stamps)
+        by_sky = by_sky.reshape(count, -1)
         self._sky = by_sky if mosaic is not None else np.ones((1, 1))
         # by x, y, flux, background; of one electron
-        by = np.stack([by_x, by_y, self.shares, by_sky])
-        self._pairs = np.einsum("ifp,jfp->fpij", by, by).reshape(count, -1, 16)
+        slopes = np.stack([by_x, by_y, self.shares, by_sky])
+        pairs = np.einsum("ifp,jfp->fpij", slopes, slopes)
+        self._pairs = pairs.reshape(count, -1, 16)
 
     def _patterns(self) -> FloatArray:
         """The shares of star and background of the pixels in a window, (2, n, side, side), for a
@@ -146,9 +155,11 @@ class NoisyStar:
             return np.ones((2, 1, 1, 1))
         side = self.side_px
         whole = in_mosaic(self.mosaic, self.detector.bayer, (side + 1, side + 1))
-        return np.stack(
-            [whole[:, y : y + side, x : x + side] for y in (0, 1) for x in (0, 1)], axis=1
-        )
+        windows = []
+        for y in (0, 1):
+            for x in (0, 1):
+                windows.append(whole[:, y : y + side, x : x + side])
+        return np.stack(windows, axis=1)
 
     def _windows(self, values: FloatArray, shape: tuple[int, ...]) -> FloatArray:
         """Values of pixels, broadcast to (n, phases, pixels), as windows (m, side, side)."""
@@ -156,10 +167,10 @@ class NoisyStar:
 
     def stamps(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """Shares (n, side, side) of stars so far (n,) from the middle of their square."""
-        at = np.arange(self.side_px) - self.side_px // 2
-        return np.asarray(
-            self.psf.shares((at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None])
-        )
+        pixel = np.arange(self.side_px) - self.side_px // 2
+        across_px = (pixel - x_px[:, None])[:, None, :]
+        down_px = (pixel - y_px[:, None])[:, :, None]
+        return np.asarray(self.psf.shares(across_px, down_px))
 
     def noise(
         self, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings
@@ -168,86 +179,75 @@ class NoisyStar:
         a pixel, in one exposure.
         """
         noise_rows = np.empty(len(star_e), NOISE_DTYPE)
-        for at in range(0, len(star_e), CHUNK):
-            part = slice(at, at + CHUNK)
-            self._fill(
-                noise_rows[part], star_e[part, None, None], background_e[part, None, None], finder
-            )
+        for begin in range(0, len(star_e), CHUNK):
+            chunk = slice(begin, begin + CHUNK)
+            star_chunk_e = star_e[chunk, None, None]
+            background_chunk_e = background_e[chunk, None, None]
+            self._fill(noise_rows[chunk], star_chunk_e, background_chunk_e, finder)
         return noise_rows
 
     def fisher(self, weight: FloatArray, star_e: FloatArray) -> FloatArray:
         """Information (n, phases, 4, 4) of x, y [px], flux and background [e-], of stars (n,
         1, 1) by 1 / pixels' variance.
         """
-        unit = (
-            (weight.transpose(1, 0, 2) @ self._pairs)
-            .transpose(1, 0, 2)
-            .reshape(*weight.shape[:2], 4, 4)
-        )
-        scale = np.concatenate(
-            [star_e, star_e, np.ones_like(star_e), np.ones_like(star_e)], axis=-1
-        )
+        by_phase = weight.transpose(1, 0, 2) @ self._pairs
+        unit = by_phase.transpose(1, 0, 2).reshape(*weight.shape[:2], 4, 4)
+        # slopes by place and not those by flux and background grow with the star
+        per_e = np.ones_like(star_e)
+        scale = np.concatenate([star_e, star_e, per_e, per_e], axis=-1)
         return np.asarray(unit * scale.transpose(0, 2, 1)[:, None] * scale[:, None])
 
     def _fill(
-        self, found: Table, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings
+        self, rows: Table, star_e: FloatArray, background_e: FloatArray, finder: CentroidSettings
     ) -> None:
+        """Fill rows (n,) of NOISE_DTYPE, of stars and backgrounds (n, 1, 1)."""
         shares = self.shares
         under_e = background_e * self._sky
-        light_e = star_e * shares + under_e
-        noise, sky = (self.detector.noise(light, self.exposure_s) for light in (light_e, under_e))
+        pixel_star_e = star_e * shares
+        light_e = pixel_star_e + under_e
+        noise = self.detector.noise(light_e, self.exposure_s)
+        sky = self.detector.noise(under_e, self.exposure_s)
         unclipped = light_e + noise.dark_e2 <= full_e(self.detector)
         weight = unclipped / noise.total_e2
         by_flux = weight * shares
         by_flux /= np.maximum((by_flux * shares).sum(axis=-1, keepdims=True), NO_INFORMATION)
         squared = by_flux**2
         effective_px = squared.sum(axis=-1, keepdims=True)
-        even = (sky.dark_e2, sky.read_e2, sky.reset_e2, sky.quantisation_e2)
-        shot, background, prnu = (
-            (squared * e2).sum(axis=-1, keepdims=True)
-            for e2 in (star_e * shares, under_e, noise.prnu_e2)
-        )
-        variances = (
-            shot,
-            background,
-            *(effective_px * e2 for e2 in even),
-            prnu,
-            effective_px * sky.dsnu_e2,
-        )
-        for source, e2 in zip(SOURCES, variances, strict=True):
-            found[f"{source}_e"] = np.sqrt(e2.mean(axis=(1, 2)))
-        found["total_e"] = np.sqrt(
-            np.sum([found[f"{source}_e"] ** 2 for source in SOURCES], axis=0)
-        )
+        variances_e2 = {
+            "shot": (squared * pixel_star_e).sum(axis=-1, keepdims=True),
+            "background": (squared * under_e).sum(axis=-1, keepdims=True),
+            "dark": effective_px * sky.dark_e2,
+            "read": effective_px * sky.read_e2,
+            "reset": effective_px * sky.reset_e2,
+            "quantisation": effective_px * sky.quantisation_e2,
+            "prnu": (squared * noise.prnu_e2).sum(axis=-1, keepdims=True),
+            "dsnu": effective_px * sky.dsnu_e2,
+        }
+        for source, variance_e2 in variances_e2.items():
+            rows[f"{source}_e"] = np.sqrt(variance_e2.mean(axis=(1, 2)))
+        squares_e2 = [rows[f"{source}_e"] ** 2 for source in SOURCES]
+        rows["total_e"] = np.sqrt(np.sum(squares_e2, axis=0))
         # Where one pixel is left, it cannot tell place from flux: a bound is then large, and not an
         # error.
-        information = self.fisher(weight, star_e) * (
-            1 + NO_INFORMATION * np.eye(4)
-        ) + NO_INFORMATION * np.eye(4)
-        known, free = (
-            np.sqrt(
-                np.linalg.inv(information[..., :size, :size])
-                .diagonal(axis1=-2, axis2=-1)
-                .mean(axis=1)
-            )
-            for size in (3, 4)
-        )
-        for name, light in zip(
-            ("x_px", "y_px", "flux_e", "flux_sky_e"), (*known.T, free[:, 2]), strict=True
-        ):
-            found[f"bound_{name}"] = light
-        found["bound_px"] = np.sqrt((found["bound_x_px"] ** 2 + found["bound_y_px"] ** 2) / 2)
-        found["effective_px"] = effective_px.mean(axis=(1, 2))
-        # somewhere within a pixel nothing is left of them
-        found[~unclipped.any(axis=-1).all(axis=-1)] = np.nan
-        found["star_e"], found["clipped_px"] = (
-            star_e[:, 0, 0],
-            (~unclipped).sum(axis=-1).mean(axis=-1),
-        )
-        found["snr"] = found["star_e"] / found["total_e"]
-        found["detection"] = found_share(
-            self._above(star_e, under_e, (noise, sky), finder), finder.minimum_pixels
-        )
+        regular = NO_INFORMATION * np.eye(4)
+        information = self.fisher(weight, star_e) * (1 + regular) + regular
+        background_known = _bounds(information[..., :3, :3])
+        background_free = _bounds(information)
+        rows["bound_x_px"] = background_known[:, 0]
+        rows["bound_y_px"] = background_known[:, 1]
+        rows["bound_flux_e"] = background_known[:, 2]
+        rows["bound_flux_sky_e"] = background_free[:, 2]
+        both_px2 = rows["bound_x_px"] ** 2 + rows["bound_y_px"] ** 2
+        rows["bound_px"] = np.sqrt(both_px2 / 2)
+        rows["effective_px"] = effective_px.mean(axis=(1, 2))
+        # somewhere within a pixel all pixels of them clip
+        has_place = unclipped.any(axis=-1).all(axis=-1)
+        rows[~has_place] = np.nan
+        rows["star_e"] = star_e[:, 0, 0]
+        rows["clipped_px"] = (~unclipped).sum(axis=-1).mean(axis=-1)
+        rows["snr"] = rows["star_e"] / rows["total_e"]
+        above = self._above(star_e, under_e, (noise, sky), finder)
+        rows["detection"] = found_share(above, finder.minimum_pixels)
 
     def _above(
         self,
@@ -264,27 +264,50 @@ class NoisyStar:
         """
         noise, sky = noises
         if self.detector.takes_superpixels:
-            shape = noise.total_e2.shape
-            light = superpixels(self._windows(star_e * self.shares, shape))
-            variance = superpixels(self._windows(noise.total_e2, shape), squared=True)
-            dark = superpixels(self._windows(sky.total_e2, shape), squared=True)
-            limit_e = finder.threshold_sigma * np.sqrt(dark.mean(axis=(1, 2), keepdims=True))
-            above = np.pad(ndtr((light - limit_e) / np.sqrt(variance)), ((0, 0), (0, 1), (0, 1)))
-            by_place = np.stack(
-                [above[:, y::2, x::2].reshape(len(above), -1) for y in (0, 1) for x in (0, 1)],
-                axis=1,
-            )
-            best = by_place[np.arange(len(by_place)), np.prod(1 - by_place, axis=2).argmin(axis=1)]
-            return np.asarray(best.reshape(*noise.total_e2.shape[:2], -1))
+            return self._superpixels_above(star_e, noises, finder.threshold_sigma)
         # The first code over the threshold begins half a step below it, and rounding is no noise of
         # its own.
         step_e = self.detector.gain_e_per_dn
         level_dn = (under_e + sky.dark_e2) / step_e + self.detector.offset_dn
-        first_dn = (
-            np.floor(level_dn + finder.threshold_sigma * np.sqrt(sky.total_e2) / step_e) + 0.5
-        )
+        threshold_dn = finder.threshold_sigma * np.sqrt(sky.total_e2) / step_e
+        first_dn = np.floor(level_dn + threshold_dn) + 0.5
         sigma_e = np.sqrt(np.maximum(noise.total_e2 - step_e**2 / 12, NO_NOISE_E2))
-        return np.asarray(ndtr((star_e * self.shares - (first_dn - level_dn) * step_e) / sigma_e))
+        limit_e = (first_dn - level_dn) * step_e
+        return np.asarray(ndtr((star_e * self.shares - limit_e) / sigma_e))
+
+    def _superpixels_above(
+        self,
+        star_e: FloatArray,
+        noises: "tuple[PixelNoise, PixelNoise]",
+        threshold_sigma: float,
+    ) -> FloatArray:
+        """As `_above`, of superpixels: every second one along both axes, at whichever of the four
+        places most probably finds the star.
+        """
+        noise, sky = noises
+        shape = noise.total_e2.shape
+        light_e = superpixels(self._windows(star_e * self.shares, shape))
+        variance_e2 = superpixels(self._windows(noise.total_e2, shape), squared=True)
+        dark_e2 = superpixels(self._windows(sky.total_e2, shape), squared=True)
+        limit_e = threshold_sigma * np.sqrt(dark_e2.mean(axis=(1, 2), keepdims=True))
+        above = ndtr((light_e - limit_e) / np.sqrt(variance_e2))
+        above = np.pad(above, ((0, 0), (0, 1), (0, 1)))
+        places = []
+        for y in (0, 1):
+            for x in (0, 1):
+                places.append(above[:, y::2, x::2].reshape(len(above), -1))
+        by_place = np.stack(places, axis=1)
+        nothing_above = np.prod(1 - by_place, axis=2)
+        best = by_place[np.arange(len(by_place)), nothing_above.argmin(axis=1)]
+        return np.asarray(best.reshape(*shape[:2], -1))
+
+
+def _bounds(information: FloatArray) -> FloatArray:
+    """Cramer-Rao bounds (n, k) of k parameters, rms over phases, by information (n, phases, k,
+    k).
+    """
+    variances = np.linalg.inv(information).diagonal(axis1=-2, axis2=-1)
+    return np.asarray(np.sqrt(variances.mean(axis=1)))
 
 
 def superpixels(images: npt.NDArray[np.floating[Any]], *, squared: bool = False) -> FloatArray:
@@ -292,7 +315,8 @@ def superpixels(images: npt.NDArray[np.floating[Any]], *, squared: bool = False)
     from scipy.ndimage import correlate1d
 
     weights = SUPERPIXEL**2 if squared else SUPERPIXEL
-    return np.asarray(correlate1d(correlate1d(images, weights, axis=1), weights, axis=2))
+    smooth = correlate1d(images, weights, axis=1)
+    return np.asarray(correlate1d(smooth, weights, axis=2))
 
 
 def found_share(above: FloatArray, minimum_pixels: int) -> FloatArray:
@@ -321,49 +345,47 @@ def measured_px(
     """
     side = star.side_px
     shape = (TRIALS * star.side_px,) * 2
-    plain = {
-        "hot_pixel_fraction": 0.0,
-        "dead_pixel_fraction": 0.0,
-        "false_stars": 0,
-        "cosmic_rays_per_cm2_s": 0.0,
-    }
-    device = Detector(structs.replace(star.detector, blooming=False, **plain), shape)
-    place_px = rng.uniform(-0.5, 0.5, (2, TRIALS**2))
-    light_e = (
-        (star_e * star.stamps(*place_px))
-        .reshape(TRIALS, TRIALS, side, side)
-        .swapaxes(1, 2)
-        .reshape(shape)
+    plain = structs.replace(
+        star.detector,
+        blooming=False,
+        hot_pixel_fraction=0.0,
+        dead_pixel_fraction=0.0,
+        false_stars=0,
+        cosmic_rays_per_cm2_s=0.0,
     )
+    device = Detector(plain, shape)
+    place_px = rng.uniform(-0.5, 0.5, (2, TRIALS**2))
+    stamps_e = star_e * star.stamps(*place_px)
+    tiles_e = stamps_e.reshape(TRIALS, TRIALS, side, side)
+    light_e = tiles_e.swapaxes(1, 2).reshape(shape)
     under_e = sky_e
     bayer = star.detector.bayer
-    superpixel = star.detector.takes_superpixels
     if star.mosaic is not None and bayer is not None:
-        star_pattern, sky = in_mosaic(star.mosaic, bayer, shape)
+        star_pattern, sky_pattern = in_mosaic(star.mosaic, bayer, shape)
         light_e = light_e * star_pattern
-        under_e = sky_e * sky
+        under_e = sky_e * sky_pattern
     dn = device.expose(light_e + under_e, star.exposure_s, rng)
     noise = star.detector.noise(sky_e, star.exposure_s)
-    seen_e = (dn - star.detector.offset_dn) * star.detector.gain_e_per_dn - under_e - noise.dark_e2
-    stamps = seen_e.reshape(TRIALS, side, TRIALS, side).swapaxes(1, 2).reshape(-1, side, side)
-    stamps = superpixels(stamps) if superpixel else stamps
-    threshold_e = (
-        finder.threshold_sigma
-        * math.sqrt(noise.total_e2)
-        * (float(np.sum(SUPERPIXEL**2)) if superpixel else 1.0)
-    )
+    exposed_e = (dn - star.detector.offset_dn) * star.detector.gain_e_per_dn
+    measured_e = exposed_e - under_e - noise.dark_e2
+    measured_tiles_e = measured_e.reshape(TRIALS, side, TRIALS, side).swapaxes(1, 2)
+    stamps = measured_tiles_e.reshape(-1, side, side)
+    threshold_e = finder.threshold_sigma * math.sqrt(noise.total_e2)
+    if star.detector.takes_superpixels:
+        stamps = superpixels(stamps)
+        threshold_e *= float(np.sum(SUPERPIXEL**2))
     above = stamps > threshold_e
     is_detected = above.sum(axis=(1, 2)) >= finder.minimum_pixels
     if is_detected.sum() < MIN_FOUND:
         return np.full(len(FAMILY), np.nan)
     width_px = software_psf_px(star.psf.width_px, star.detector)
-    off = []
+    errors_px = []
     for kind in FAMILY:
-        off.append(
-            np.stack(star_places(stamps[is_detected], kind, width_px)) - place_px[:, is_detected]
-        )
+        centroids_px = np.stack(star_places(stamps[is_detected], kind, width_px))
+        errors_px.append(centroids_px - place_px[:, is_detected])
     # an offset of all, as by coma, is the calibration's
-    return np.asarray(np.sqrt(np.var(off, axis=2).mean(axis=1)))
+    variance_px2 = np.var(errors_px, axis=2)
+    return np.asarray(np.sqrt(variance_px2.mean(axis=1)))
 
 
 def field_stars(stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray) -> Table:
@@ -382,11 +404,9 @@ def turns_of(camera: Camera, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
     turns = np.empty((len(x_px), 2, 3))
     for k, axis in enumerate(np.eye(3)):
         moved = TURN_RAD * np.cross(axis, rays)
-        there, back = (
-            np.stack(camera.project((rays + way * moved) @ camera.cam_to_image.T))
-            for way in (1, -1)
-        )
-        turns[:, :, k] = ((there - back) / (2 * TURN_RAD)).T
+        there_px = np.stack(camera.project((rays + moved) @ camera.cam_to_image.T))
+        back_px = np.stack(camera.project((rays - moved) @ camera.cam_to_image.T))
+        turns[:, :, k] = ((there_px - back_px) / (2 * TURN_RAD)).T
     return turns
 
 
@@ -398,16 +418,18 @@ def nea_arcsec(turns: FloatArray, sigma_px: FloatArray, detection: FloatArray) -
     `detection` (n,) the share of exposures that has them.
     """
     weight = np.where(sigma_px < NO_PLACE_PX, detection / np.square(sigma_px), 0.0).T
-    information = np.einsum("na,nai,naj->nij", weight, turns, turns).cumsum(axis=0)
+    by_star = np.einsum("na,nai,naj->nij", weight, turns, turns)
+    information = by_star.cumsum(axis=0)
     usable = weight.all(axis=1).cumsum() >= MIN_STARS
     # Two stars in one place leave the turn about them open: it comes out as large, and not as an
     # error.
-    information += (
-        NO_INFORMATION * np.trace(information, axis1=1, axis2=2)[:, None, None] * np.eye(3)
-    )
+    trace = np.trace(information, axis1=1, axis2=2)[:, None, None]
+    information += NO_INFORMATION * trace * np.eye(3)
     nea = np.full((2, len(usable)), np.inf)
-    x, y, z = np.linalg.inv(information[usable]).diagonal(axis1=1, axis2=2).T
-    nea[:, usable] = ARCSEC_PER_RAD * np.sqrt([(x + y) / 2, z])
+    covariance = np.linalg.inv(information[usable])
+    x, y, z = covariance.diagonal(axis1=1, axis2=2).T
+    across_and_about = np.sqrt([(x + y) / 2, z])
+    nea[:, usable] = ARCSEC_PER_RAD * across_and_about
     return nea
 
 
@@ -443,18 +465,59 @@ def noisy_star(file: BenchFile, sky_e: FloatArray, channel: int | None = None) -
     whole or as a channel sees it.
     """
     tracker = file.config.tracker
-    mosaic = None
-    bayer = file.config.tracker.detector.bayer
-    if bayer is not None:
-        of_star = star_flux(file.config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0]
-        levels = []
-        for one in CHANNELS:
-            levels.append(np.mean([sky_e[part].mean() for part in of_colour(bayer, one)]))
-        mosaic = np.array([of_star / of_star.sum(), np.array(levels) / (sky_e.mean() or 1.0)])
-        mosaic[0, [k for k in range(len(CHANNELS)) if channel not in (None, k)]] = 0.0
-    return NoisyStar(
-        tracker_psf(tracker, file.folder), tracker.detector, tracker.exposure_s, mosaic=mosaic
-    )
+    bayer = tracker.detector.bayer
+    psf = tracker_psf(tracker, file.folder)
+    if bayer is None:
+        return NoisyStar(psf, tracker.detector, tracker.exposure_s)
+    flux_e_per_s = star_flux(file.config, file.folder)(*SOLAR_STAR)[0]
+    star_shares = flux_e_per_s / flux_e_per_s.sum()
+    levels_e = []
+    for name in CHANNELS:
+        means_e = [sky_e[pixels].mean() for pixels in of_colour(bayer, name)]
+        levels_e.append(np.mean(means_e))
+    mosaic = np.array([star_shares, np.array(levels_e) / (sky_e.mean() or 1.0)])
+    if channel is not None:
+        others = np.arange(len(CHANNELS)) != channel
+        mosaic[0, others] = 0.0
+    return NoisyStar(psf, tracker.detector, tracker.exposure_s, mosaic=mosaic)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fields:
+    """Fields of the sky as a tracker at rest sees them: the `stars` of each, rows of TRUTH_DTYPE;
+    its mean background, e- in a pixel; and the last one's background (h, w).
+    """
+
+    stars: list[Table]
+    background_e: list[float]
+    last_background_e: FloatArray
+
+
+def _all_over_the_sky(
+    file: BenchFile, stars: Stars, camera: Camera, rng: np.random.Generator
+) -> _Fields:
+    """SKY_FIELDS fields at random, less those that are too near the Sun: nobody looks there."""
+    background = TrackerBackground(file.config, file.folder, camera)
+    exposure_s = file.config.tracker.exposure_s
+    sky_e = np.zeros((1, 1))
+    fields = _Fields([], [], sky_e)
+    for components in rng.standard_normal((SKY_FIELDS, 4)):
+        q = normalise(components)
+        try:
+            sky_e = background.of_view_e(View.exposure(q, STILL, exposure_s))
+        except InputError:
+            continue
+        fields.background_e.append(float(sky_e.mean()))
+        fields.stars.append(field_stars(stars, camera, q))
+    return replace(fields, last_background_e=sky_e)
+
+
+def _one_field(file: BenchFile, stars: Stars, camera: Camera, q_icrs_to_cam: FloatArray) -> _Fields:
+    """The field at one attitude. Raises InputError near the Sun."""
+    background = TrackerBackground(file.config, file.folder, camera)
+    q = normalise(q_icrs_to_cam)
+    sky_e = background.of_view_e(View.exposure(q, STILL, file.config.tracker.exposure_s))
+    return _Fields([field_stars(stars, camera, q)], [float(sky_e.mean())], sky_e)
 
 
 def _check_light(file: BenchFile, stars: Stars) -> None:
@@ -485,38 +548,26 @@ def noise_budget(
     camera = tracker_camera(tracker, file.folder)
     stars = bench_stars(config, file.folder)
     _check_light(file, stars)
-    background = TrackerBackground(config, file.folder, camera)
-    sights = []
-    levels_e = []
-    for q in rng.standard_normal((SKY_FIELDS, 4)) if q_icrs_to_cam is None else q_icrs_to_cam[None]:
-        try:
-            sky_e = background.of_view_e(View.exposure(normalise(q), STILL, tracker.exposure_s))
-        except InputError:  # too near the Sun: nobody looks there
-            if q_icrs_to_cam is not None:
-                raise
-            continue
-        levels_e.append(float(sky_e.mean()))
-        sights.append(field_stars(stars, camera, normalise(q)))
-    middle_e = float(np.median(levels_e))
+    brightest = float(stars.v_mag.min())
+    if q_icrs_to_cam is None:
+        fields = _all_over_the_sky(file, stars, camera, rng)
+    else:
+        fields = _one_field(file, stars, camera, q_icrs_to_cam)
+        if len(fields.stars[0]):
+            brightest = float(fields.stars[0]["v_mag"].min())
+    sky_e = fields.last_background_e
+    middle_e = float(np.median(fields.background_e))
     star = noisy_star(file, sky_e)
-    brightest = float(
-        (stars.v_mag if q_icrs_to_cam is None or not len(sights[0]) else sights[0]["v_mag"]).min()
-    )
-    zero_e = (
-        float(star_rates(config, file.folder)(*np.array([[0.0], [SOLAR_BV], [np.nan]]))[0])
-        * tracker.exposure_s
-    )
-    v_mag: FloatArray = math.floor(
-        brightest / STEP_MAG
-    ) * STEP_MAG + STEP_MAG / BETWEEN * np.arange(MAX_ROWS * BETWEEN + 1.0)
-    all_e = zero_e * flux_ratio(v_mag)
+    first_mag = math.floor(brightest / STEP_MAG) * STEP_MAG
+    v_mag: FloatArray = first_mag + STEP_MAG / BETWEEN * np.arange(MAX_ROWS * BETWEEN + 1.0)
+    zero_e_per_s = float(star_rates(config, file.folder)(*SOLAR_STAR)[0])
+    all_e = zero_e_per_s * tracker.exposure_s * flux_ratio(v_mag)
     under_e = np.full(len(v_mag), middle_e)
     noise = star.noise(all_e, under_e, finder)
-    shown = slice(0, int((noise["detection"][::BETWEEN] >= UNSEEN).sum()) * BETWEEN + 1, BETWEEN)
-    measured = np.array(
-        [measured_px(star, one, middle_e, finder, rng) for one in noise["star_e"][shown].tolist()]
-    ).T
-    reached = {f"{kind}_px": one for kind, one in zip(FAMILY, measured, strict=True)}
+    detectable = noise["detection"][::BETWEEN] >= UNSEEN
+    shown = slice(0, int(detectable.sum()) * BETWEEN + 1, BETWEEN)
+    measured = _measured_by_rate(star, noise["star_e"][shown], middle_e, finder, rng)
+    reached = {f"{kind}_px": sigma_px for kind, sigma_px in zip(FAMILY, measured, strict=True)}
     channels = {}
     if star.mosaic is not None:
         for number, (name, share, sky) in enumerate(zip(CHANNELS, *star.mosaic, strict=True)):
@@ -529,38 +580,31 @@ def noise_budget(
     listed = None
     counts: list[float] = []  # stars that are found in a field, on average
     curves: list[FloatArray] = []  # NEA of each field by who finds its stars: (WHO, 2, n)
-    for field in sights:
+    for field in fields.stars:
         star_e = field["electrons_per_s"] * tracker.exposure_s
         bounds = between(noise, star_e)
         if q_icrs_to_cam is not None:
-            pixels = np.ceil(np.stack([field["y_px"], field["x_px"]]) - 0.5).astype(np.intp)
-            own_noise = star.noise(
-                star_e, software_image(sky_e, tracker.detector)[tuple(pixels)], finder
-            )
-            bounds = np.stack(
-                [own_noise["bound_x_px"], own_noise["bound_y_px"], own_noise["detection"]]
-            )
-            listed = _rows(
-                {name: field[name] for name in ("hip", "name", "x_px", "y_px", "v_mag")},
-                own_noise,
-                {},
-            )
-        counts.append(float(bounds[2].sum()))
+            image_e = software_image(sky_e, tracker.detector)
+            field_noise = star.noise(star_e, _at_stars(image_e, field), finder)
+            bounds = np.stack([field_noise[name] for name in BOUNDS_OF_PLACE])
+            listed = _rows({name: field[name] for name in LISTED}, field_noise, {})
+        detection = bounds[2]
+        counts.append(float(detection.sum()))
         turns = turns_of(camera, field["x_px"], field["y_px"])
-        # by who finds the stars: the bounds, then what centroiders reach, the same on both axes
-        reached_px = [_at_rates(star_e, noise[shown], sigma_px) for sigma_px in measured]
-        sigmas_px = [bounds[:2], *(np.stack([sigma, sigma]) for sigma in reached_px)]
-        curves.append(np.stack([nea_arcsec(turns, sigma, bounds[2]) for sigma in sigmas_px]))
-    faintest = min(
-        config.sky.faintest_v_mag, math.ceil(stars.v_mag.max() / LIMIT_STEP_MAG) * LIMIT_STEP_MAG
-    )
-    nea = _nea_rows(sights, curves, faintest)
+        nea_by_finder = [nea_arcsec(turns, bounds[:2], detection)]
+        for kind_px in measured:
+            # what a centroider reaches is the same on both axes
+            sigma_px = _at_rates(star_e, noise[shown], kind_px)
+            nea_by_finder.append(nea_arcsec(turns, np.stack([sigma_px, sigma_px]), detection))
+        curves.append(np.stack(nea_by_finder))
+    faintest_star_mag = math.ceil(stars.v_mag.max() / LIMIT_STEP_MAG) * LIMIT_STEP_MAG
+    nea = _nea_rows(fields.stars, curves, min(config.sky.faintest_v_mag, faintest_star_mag))
     return NoiseBudget(
         threshold_sigma=finder.threshold_sigma,
         minimum_pixels=finder.minimum_pixels,
         background_e_per_px=middle_e,
         centroider=config.verify.judge or USUAL,
-        fields=len(sights),
+        fields=len(fields.stars),
         rows=_rows({"v_mag": v_mag[shown]}, noise[shown], reached),
         stars=listed,
         nea=nea,
@@ -572,9 +616,31 @@ def noise_budget(
     )
 
 
+def _measured_by_rate(
+    star: NoisyStar,
+    stars_e: FloatArray,
+    sky_e: float,
+    finder: CentroidSettings,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """The errors of `measured_px` (FAMILY, n), px, of stars of `stars_e` (n,) electrons."""
+    trials_px = []
+    for star_e in stars_e.tolist():
+        trials_px.append(measured_px(star, star_e, sky_e, finder, rng))
+    return np.array(trials_px).T
+
+
+def _at_stars(image: FloatArray, field: Table) -> FloatArray:
+    """The pixels (n,) of an image that stars of a field lie in."""
+    places_px = np.stack([field["y_px"], field["x_px"]])
+    rows, columns = np.ceil(places_px - 0.5).astype(np.intp)
+    return np.asarray(image[rows, columns])
+
+
 def _at_rates(star_e: FloatArray, noise: Table, values: FloatArray) -> FloatArray:
     """A figure of the rows of a table at other stars' electrons (n,)."""
-    return np.interp(-np.log(star_e), -np.log(noise["star_e"]), values)
+    at = -np.log(star_e)
+    return np.interp(at, -np.log(noise["star_e"]), values)
 
 
 def _by_way(nea_row: Mapping[str, Any]) -> dict[str, dict[str, float]]:
@@ -604,15 +670,14 @@ def attitude_limits_arcsec(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatA
         with contextlib.suppress(InputError):
             sky_e = background.of_view_e(View.exposure(q, STILL, tracker.exposure_s))
             star = star or noisy_star(file, sky_e)
+            star_e = field["electrons_per_s"] * tracker.exposure_s
             under_e = np.full(len(field), float(sky_e.mean()))
-            own_noise = star.noise(
-                field["electrons_per_s"] * tracker.exposure_s, under_e, CentroidSettings()
-            )
-            bounds = np.stack([own_noise["bound_x_px"], own_noise["bound_y_px"]])
-            nea = nea_arcsec(
-                turns_of(camera, field["x_px"], field["y_px"]), bounds, own_noise["detection"]
-            )
-            limits_arcsec[k] = nea[:, -1:].ravel() if nea.size else np.inf
+            noise = star.noise(star_e, under_e, CentroidSettings())
+            bounds_px = np.stack([noise["bound_x_px"], noise["bound_y_px"]])
+            turns = turns_of(camera, field["x_px"], field["y_px"])
+            nea = nea_arcsec(turns, bounds_px, noise["detection"])
+            if nea.size:
+                limits_arcsec[k] = nea[:, -1]
     return limits_arcsec
 
 
@@ -629,45 +694,55 @@ def between(noise: Table, star_e: FloatArray) -> FloatArray:
 
 
 def _rows(before: dict[str, Any], noise: Table, after: dict[str, Any]) -> list[dict[str, Any]]:
-    columns = before | {name: noise[name] for name in NOISE_DTYPE.names or ()} | after
+    """Rows of a table: columns `before`, those of the noise, and columns `after`."""
+    columns = dict(before)
+    for name in NOISE_COLUMNS:
+        columns[name] = noise[name]
+    columns |= after
     lists = [column.tolist() for column in columns.values()]
-    return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)]
+    rows = []
+    for values in zip(*lists, strict=True):
+        rows.append(dict(zip(columns, values, strict=True)))
+    return rows
 
 
 def _nea_rows(
-    sights: list[Table], curves: list[FloatArray], faintest_v_mag: float
+    fields: list[Table], curves: list[FloatArray], faintest_v_mag: float
 ) -> list[dict[str, Any]]:
     """Medians over fields by the faintest star used, from the first limit at which half of the
     fields have an attitude.
     """
-    first = min(sight["v_mag"].min(initial=faintest_v_mag) for sight in sights)
-    limits = np.arange(
-        math.ceil(first / LIMIT_STEP_MAG) * LIMIT_STEP_MAG, faintest_v_mag, LIMIT_STEP_MAG
-    )
+    brightest = min(field["v_mag"].min(initial=faintest_v_mag) for field in fields)
+    first = math.ceil(brightest / LIMIT_STEP_MAG) * LIMIT_STEP_MAG
+    limits = np.arange(first, faintest_v_mag, LIMIT_STEP_MAG)
     none = np.full((len(WHO), 2), np.inf)
     rows = []
     for limit in [*limits.tolist(), faintest_v_mag]:
-        counts = [int(np.searchsorted(field["v_mag"], limit, side="right")) for field in sights]
+        counts = []
         at_limit = []
-        for curve, count in zip(curves, counts, strict=True):
+        for field, curve in zip(fields, curves, strict=True):
+            count = int(np.searchsorted(field["v_mag"], limit, side="right"))
+            counts.append(count)
             at_limit.append(curve[..., count - 1] if count else none)
-        median = np.median(at_limit, axis=0)
+        median = np.median(at_limit, axis=0).ravel().tolist()
         row = {"v_mag": limit, "stars": float(np.median(counts))}
-        rows.append(row | dict(zip(NEA_COLUMNS, median.ravel().tolist(), strict=True)))
-    is_limited = [math.isfinite(row["limit_about_arcsec"]) for row in rows]
-    return rows[is_limited.index(True) if any(is_limited) else -1 :]
+        rows.append(row | dict(zip(NEA_COLUMNS, median, strict=True)))
+    for first_row, row in enumerate(rows):
+        if math.isfinite(row["limit_about_arcsec"]):
+            return rows[first_row:]
+    return rows[-1:]
 
 
-def write_noise(directory: Path, found: NoiseBudget) -> None:
+def write_noise(directory: Path, budget: NoiseBudget) -> None:
     """noise.csv, nea.csv and their charts, and stars.csv of a field. Raises InputError where one
     cannot be written.
     """
-    for name, rows in (("noise", found.rows), ("nea", found.nea), ("stars", found.stars)):
+    for name, rows in (("noise", budget.rows), ("nea", budget.nea), ("stars", budget.stars)):
         if rows:
             cells = [list(map(_cell, row.values())) for row in rows]
             write_csv(directory / f"{name}.csv", list(rows[0]), cells)
-    if math.isfinite(found.nea_arcsec["limit"]["about"]):
-        _draw(directory / "nea", found)
+    if math.isfinite(budget.nea_arcsec["limit"]["about"]):
+        _draw(directory / "nea", budget)
 
 
 def _cell(value: object) -> object:
@@ -677,82 +752,78 @@ def _cell(value: object) -> object:
     return value
 
 
-def _draw(path: Path, found: NoiseBudget) -> None:
-    last = found.nea_arcsec
-    centroider = found.centroider
-    limit, reached = (
-        " and ".join(map(two_digits, last[kind].values())) for kind in ("limit", centroider)
-    )
+def _draw(path: Path, budget: NoiseBudget) -> None:
+    centroider = budget.centroider
+    limit = " and ".join(map(two_digits, budget.nea_arcsec["limit"].values()))
+    reached = " and ".join(map(two_digits, budget.nea_arcsec[centroider].values()))
     finding = (
-        f"Stars to V = {found.nea[-1]['v_mag']:g} allow {limit} arcsec across and about the"
-        " boresight;"
+        f"Stars to V = {budget.nea[-1]['v_mag']:g} allow {limit} arcsec across and about the"
+        f" boresight; {centroider} reaches {reached}"
     )
-    finding += f" {centroider} reaches {reached}"
-    if found.fields == 1:
+    if budget.fields == 1:
         where = "the field"
     else:
-        where = f"{found.fields} fields all over the sky, median"
+        where = f"{budget.fields} fields all over the sky, median"
     note = (
         f"One exposure at rest, with all noise; {where}. Lines: Cramer-Rao bound; dashes: simulated"
         f" {centroider}."
     )
     with chart(path, finding, 1, 2, note=note, share_x=False, share_y=True) as panels:
-        for axes, key, label in zip(
-            panels, ("v_mag", "stars"), ("faintest V [mag]", "stars"), strict=True
-        ):
+        by_magnitude, by_stars = panels
+        for axes, key in ((by_magnitude, "v_mag"), (by_stars, "stars")):
             # the last one of a number of stars
-            rows = list({row[key]: row for row in found.nea}.values())
+            rows = list({row[key]: row for row in budget.nea}.values())
+            places = [row[key] for row in rows]
             for way, colour in (("about", ORANGE), ("across", BLUE)):
                 for kind, style in ((centroider, "--"), ("limit", "-")):
                     values = [row[f"{kind}_{way}_arcsec"] for row in rows]
                     name = f"{way}, {kind}" if key == "stars" else "_"
-                    axes.semilogy(
-                        [row[key] for row in rows], values, style, color=colour, label=name
-                    )
-            axes.set_xlabel(label)
-        panels[0].set_ylabel("NEA [arcsec]")
-        panels[1].set_xscale("log")
-        label_ends(panels[1])
+                    axes.semilogy(places, values, style, color=colour, label=name)
+        by_magnitude.set_xlabel("faintest V [mag]")
+        by_magnitude.set_ylabel("NEA [arcsec]")
+        by_stars.set_xlabel("stars")
+        by_stars.set_xscale("log")
+        label_ends(by_stars)
 
 
-def sensitivity_line(found: NoiseBudget) -> str:
+def sensitivity_line(budget: NoiseBudget) -> str:
     """Whether the tracker is sensitive enough: what it finds, and how often it can identify it."""
-    enough = "sensitive enough" if found.identified_share >= ENOUGH_SHARE else "not enough"
-    field = "the field" if found.fields == 1 else f"a field (median of {found.fields})"
-    fields = f"{IDENTIFIED} or more in {found.identified_share:.0%} of fields"
+    enough = "sensitive enough" if budget.identified_share >= ENOUGH_SHARE else "not enough"
+    field = "the field" if budget.fields == 1 else f"a field (median of {budget.fields})"
+    fields = f"{IDENTIFIED} or more in {budget.identified_share:.0%} of fields"
     return (
-        f"{enough}: half of the stars of V = {found.found_v_mag:.1f} are found,"
-        f" {found.found_stars:.3g} stars in {field}, {fields}"
+        f"{enough}: half of the stars of V = {budget.found_v_mag:.1f} are found,"
+        f" {budget.found_stars:.3g} stars in {field}, {fields}"
     )
 
 
-def noise_lines(found: NoiseBudget) -> Iterator[str]:
+def noise_lines(budget: NoiseBudget) -> Iterator[str]:
     """The budget for a person."""
-    centroider = found.centroider
-    threshold = f"{found.minimum_pixels} px above {found.threshold_sigma:g} sigma"
+    centroider = budget.centroider
+    threshold = f"{budget.minimum_pixels} px above {budget.threshold_sigma:g} sigma"
     yield (
-        f"{'found':22}{threshold} of a background of {found.background_e_per_px:.4g} e- in a pixel"
+        f"{'found':22}{threshold} of a background of {budget.background_e_per_px:.4g} e- in a pixel"
     )
-    for name, channel_noise in found.channels.items():
+    for name, channel_noise in budget.channels.items():
         figures = (
             f"{channel_noise['star_share']:.1%} of a star of the Sun's colour, background"
             f" {channel_noise['background_e_per_px']:.4g} e-"
         )
         yield f"{'pixels of ' + name:22}{figures}"
-    for kind, nea in found.nea_arcsec.items():
+    for kind, nea in budget.nea_arcsec.items():
         nea_text = f"{nea['across']:.3g} arcsec across, {nea['about']:.3g} about the boresight"
         if not math.isfinite(nea["about"]):
             nea_text = f"none: fewer than {MIN_STARS} stars with a place"
         yield f"{'NEA, ' + kind:22}{nea_text}"
     yield ""
-    snr = [f"snr_{name}" for name in found.channels]
-    titles = "".join(f"{'SNR ' + name:>8}" for name in found.channels)
+    channel_titles = "".join(f"{'SNR ' + name:>8}" for name in budget.channels)
     sums = f"{'V':>6}{'star e-':>12}{'noise e-':>11}{'SNR':>8}"
-    yield f"{sums}{titles}{'detection':>11}{'bound px':>10}{centroider + ' px':>12}"
-    for row in found.rows:
-        reached = row[f"{centroider}_px"]
-        yield (
-            f"{row['v_mag']:6.1f}{row['star_e']:12.4g}{row['total_e']:11.4g}"
-            f"{''.join(f'{row[name]:8.1f}' for name in ('snr', *snr))}{row['detection']:11.4f}"
-            f"{row['bound_px']:10.4g}{'-' if math.isnan(reached) else f'{reached:.4f}':>12}"
-        )
+    yield f"{sums}{channel_titles}{'detection':>11}{'bound px':>10}{centroider + ' px':>12}"
+    for row in budget.rows:
+        line = f"{row['v_mag']:6.1f}{row['star_e']:12.4g}{row['total_e']:11.4g}{row['snr']:8.1f}"
+        for name in budget.channels:
+            line += f"{row[f'snr_{name}']:8.1f}"
+        line += f"{row['detection']:11.4f}{row['bound_px']:10.4g}"
+        reached_px = row[f"{centroider}_px"]
+        reached_text = "-" if math.isnan(reached_px) else f"{reached_px:.4f}"
+        yield f"{line}{reached_text:>12}"

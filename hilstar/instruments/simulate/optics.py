@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.process.closing import Closing
 from hilstar.display.panel import Panel
 from hilstar.display.primaries import channel_matrix
@@ -55,14 +55,13 @@ def seen_primaries(bench: Bench) -> tuple[Primary, ...]:
     psf = bench.tracker_psf
     if colours is None:
         return ALL_ALIKE
+    spectra: Sequence[FloatArray | None] = [None] * len(colours.places_px)
     if psf.by_colour:
-        spectra = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm)
-    else:
-        spectra = None
-    places = [(float(x), float(y)) for x, y in colours.places_px]
-    return tuple(
-        Primary(place, None if spectra is None else spectra[k]) for k, place in enumerate(places)
-    )
+        spectra = list(colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm))
+    primaries = []
+    for (x_px, y_px), shares in zip(colours.places_px, spectra, strict=True):
+        primaries.append(Primary((float(x_px), float(y_px)), shares))
+    return tuple(primaries)
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,16 +94,17 @@ class DisplayColours:
             return cls(bayer, colours.by_primary, colours.by_primary @ colours.of_white)
         white = mean_share(stars.colours, stars)
         if primaries is not None:
-            white = channel_matrix(
-                primaries, named_channels(config.tracker, folder), 1.0
-            ).e_per_s.sum(axis=1)
+            channels = named_channels(config.tracker, folder)
+            white = channel_matrix(primaries, channels, 1.0).e_per_s.sum(axis=1)
         return cls(bayer, white[:, None], white)
 
     def shown(self, images: FloatArray) -> FloatArray:
         """Light of each primary (primaries, h, w) in the detector's pixels (h, w)."""
-        if self.bayer is None:
-            return np.asarray(images.sum(axis=0)) if len(images) > 1 else images[0]
-        return in_pixels(np.tensordot(self.by_primary, images, 1), self.bayer)
+        if self.bayer is not None:
+            return in_pixels(np.tensordot(self.by_primary, images, 1), self.bayer)
+        if len(images) > 1:
+            return np.asarray(images.sum(axis=0))
+        return np.asarray(images[0])
 
     def grey(self, image: FloatArray) -> FloatArray:
         """The black level's light (h, w) in the detector's pixels."""
@@ -125,9 +125,8 @@ class TwinOptics(Closing):
         # A pixel farther than this from the detector lights none of it, though it be twice as large
         # there as on the axis.
         self._reach_px = 2 * side_px + self._psf.footprint_px / 2 + 1
-        self._renderer = open_backend(
-            Target(geometry.tracker.resolution_px, self._psf), headless_context()
-        )
+        target = Target(geometry.tracker.resolution_px, self._psf)
+        self._renderer = open_backend(target, headless_context())
 
     def images_e_per_s(
         self, lights_e_per_s: Iterable[FloatArray | LitLight], primaries: Sequence[Primary]
@@ -176,20 +175,18 @@ class TwinOptics(Closing):
         return LitLight(lit.place[near], lit.e_per_s[near])
 
     def _points(self, lit: LitLight, primary: Primary) -> FloatArray:
-        dx, dy = (step.ravel() for step in np.meshgrid(self._steps, self._steps))
-        rows, columns = np.divmod(lit.place[:, None], self.geometry.monitor.resolution_px[0])
-        x_px, y_px = self.geometry.to_tracker(
-            (columns + dx).ravel(), (rows + dy).ravel(), primary.place_px
-        )
+        """The light of lit pixels on the detector (h, w), each as the points of its square."""
+        columns, rows = np.meshgrid(self._steps, self._steps)
+        dx, dy = columns.ravel(), rows.ravel()
+        row, column = np.divmod(lit.place[:, None], self.geometry.monitor.resolution_px[0])
+        point_x, point_y = (column + dx).ravel(), (row + dy).ravel()
+        x_px, y_px = self.geometry.to_tracker(point_x, point_y, primary.place_px)
         light = np.repeat(lit.e_per_s / len(dx), len(dx))
         star = np.zeros(len(light), dtype=np.intp)
         size_px = self.geometry.tracker.resolution_px
         sprites = pack_sprites(x_px, y_px, light, star, size_px, self._psf.footprint_px)
         if self._psf.by_colour:  # grey light has no spectrum here
-            if primary.shares is None:
-                shares = self._psf.mean_shares
-            else:
-                shares = primary.shares
+            shares = self._psf.mean_shares if primary.shares is None else primary.shares
             at_px = (sprites.x_px, sprites.y_px)
             rates = sprites.data["electrons_per_s"]
             return self._psf.image(*at_px, shares, rates, size_px).astype(np.float64)
@@ -221,25 +218,29 @@ class TwinOptics(Closing):
         """The glow of the detector's rows from `first` to before `last`."""
         width, _ = self.geometry.tracker.resolution_px
         y, x = np.mgrid[first:last, 0:width].astype(np.float64)
-        seen_x, seen_y = (
-            part.reshape(y.shape) for part in self.geometry.to_monitor(x.ravel(), y.ravel())
-        )
-        (x_down, x_right), (y_down, y_right) = np.gradient(seen_x), np.gradient(seen_y)
+        monitor_x, monitor_y = self.geometry.to_monitor(x.ravel(), y.ravel())
+        seen_x, seen_y = monitor_x.reshape(y.shape), monitor_y.reshape(y.shape)
+        x_down, x_right = np.gradient(seen_x)
+        y_down, y_right = np.gradient(seen_y)
         # Beyond a lens there is no place: a pixel whose neighbour looks there has no density
         # either.
         density = np.nan_to_num(np.abs(x_right * y_down - x_down * y_right))
         screen_w, screen_h = self.geometry.monitor.resolution_px
         on_screen = np.abs(seen_x - (screen_w - 1) / 2) <= screen_w / 2
         on_screen &= np.abs(seen_y - (screen_h - 1) / 2) <= screen_h / 2
-        light = np.full(on_screen.shape, panel.response.black * panel.flux_at_white_e_per_s)
+        black_e_per_s = panel.response.black * panel.flux_at_white_e_per_s
+        light = np.full(on_screen.shape, black_e_per_s)
         if panel.uniformity is not None:
-            column = np.clip(np.rint(np.where(on_screen, seen_x, 0)), 0, screen_w - 1).astype(
-                np.intp
-            )
-            row = np.clip(np.rint(np.where(on_screen, seen_y, 0)), 0, screen_h - 1).astype(np.intp)
+            column = _nearest_pixel(np.where(on_screen, seen_x, 0), screen_w)
+            row = _nearest_pixel(np.where(on_screen, seen_y, 0), screen_h)
             light = light * panel.uniformity[row, column]
         return np.asarray(np.where(on_screen, light * density, 0.0))
 
     def close(self) -> None:
         """Free the GL context."""
         self._renderer.close()
+
+
+def _nearest_pixel(places_px: FloatArray, size_px: int) -> IntArray:
+    """The pixels along an axis of `size_px` that places are nearest to."""
+    return np.clip(np.rint(places_px), 0, size_px - 1).astype(np.intp)

@@ -32,10 +32,8 @@ def rolled(view: View, tracker: Tracker) -> View:
     if detector.shutter != "rolling":
         return view
     readout_s = tracker.resolution_px[1] * detector.row_time_us * S_PER_US
-    return replace(
-        view,
-        scan=Scan((0, 1 if detector.row_direction == "down" else -1), readout_s, view.scan.hold_s),
-    )
+    down = 1 if detector.row_direction == "down" else -1
+    return replace(view, scan=Scan((0, down), readout_s, view.scan.hold_s))
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +60,8 @@ class RowBeat:
         """The frames that any row may see."""
         reach_s = (self.rows.whole_s + self.screen.scanout_s) / 2
         first = math.floor((-reach_s - self.hold_s - self.phase_s) / self.period_s)
-        return range(first, math.ceil((reach_s - self.phase_s) / self.period_s) + 1)
+        last = math.ceil((reach_s - self.phase_s) / self.period_s)
+        return range(first, last + 1)
 
     def begin_s(self, frame: int) -> float:
         """When a frame lights the screen's middle row."""
@@ -75,12 +74,12 @@ class RowBeat:
         `screen_late_s` (n,) is how long after its middle row the screen lights a place,
         `row_late_s` (n,) how long after its middle row the tracker exposes it.
         """
-        begin = self.begin_s(frame) + screen_late_s
-        exposed = row_late_s - self.rows.hold_s / 2
-        lit = np.minimum(begin + self.hold_s, exposed + self.rows.hold_s) - np.maximum(
-            begin, exposed
-        )
-        return np.asarray(np.maximum(lit, 0.0) * (self.period_s / (self.hold_s * self.rows.hold_s)))
+        lit_begin_s = self.begin_s(frame) + screen_late_s
+        exposed_begin_s = row_late_s - self.rows.hold_s / 2
+        both_begin_s = np.maximum(lit_begin_s, exposed_begin_s)
+        both_end_s = np.minimum(lit_begin_s + self.hold_s, exposed_begin_s + self.rows.hold_s)
+        both_s = np.maximum(both_end_s - both_begin_s, 0.0)
+        return np.asarray(both_s * (self.period_s / (self.hold_s * self.rows.hold_s)))
 
 
 def rolling_light(
@@ -94,38 +93,39 @@ def rolling_light(
     config = bench.config
     screen = bench.scan
     moving = bench.moving
-    turn = view.turn
+    rate_cam_rad_s = view.turn.rate_cam_rad_s
     beat = RowBeat(view.scan, screen, 1 / config.monitor.refresh_hz, phase_s)
-    sizes = config.monitor.resolution_px, config.tracker.resolution_px
-    changes = (
-        bool(turn.rate_cam_rad_s.any()) or len(bench.quantiser.exposure(0, len(beat.frames))) > 1
-    )
+    screen_px, tracker_px = config.monitor.resolution_px, config.tracker.resolution_px
+    # a frame is drawn anew only where it differs from the one before
+    drawn_frames = bench.quantiser.exposure(0, len(beat.frames))
+    changes = bool(rate_cam_rad_s.any()) or len(drawn_frames) > 1
     changes |= moving is not None and moving.satellites is not None
     compensated = config.render.motion == "on"
-    total = np.zeros((len(panel.primaries) or 1, *sizes[0][::-1]))
+    total = np.zeros((len(panel.primaries) or 1, *screen_px[::-1]))
     shown = None
-    y, x = (part.ravel().astype(np.float64) for part in np.indices(sizes[1][::-1]))
-    glow_late_s = np.nan_to_num(
-        screen.late_s(*geometry.shown_at(*geometry.to_monitor(x, y)), sizes[0])
-    )
-    glow_rows_s = view.scan.late_s(x, y, sizes[1])
-    glow = np.zeros(x.shape)
+    y_px, x_px = np.indices(tracker_px[::-1]).reshape(2, -1).astype(np.float64)
+    glow_places = geometry.shown_at(*geometry.to_monitor(x_px, y_px))
+    glow_late_s = np.nan_to_num(screen.late_s(*glow_places, screen_px))
+    glow_rows_s = view.scan.late_s(x_px, y_px, tracker_px)
+    glow = np.zeros(x_px.shape)
     for number, frame in enumerate(beat.frames):
         if changes or shown is None:
-            seconds = beat.begin_s(frame) + (0.0 if compensated else beat.hold_s / 2)
-            q = propagate(view.q_icrs_to_cam, turn.rate_cam_rad_s, seconds)
-            if view.t_ns is None:
-                t_ns = None
-            else:
+            seconds = beat.begin_s(frame)
+            if not compensated:
+                seconds += beat.hold_s / 2
+            q = propagate(view.q_icrs_to_cam, rate_cam_rad_s, seconds)
+            t_ns = None
+            if view.t_ns is not None:
                 t_ns = view.t_ns + round(seconds * NS_PER_S)
-            rate = turn.rate_cam_rad_s if compensated else None
-            shown = np.array(primary_lights(bench.draw(q, number, rate, t_ns=t_ns).levels, panel))
+            rate = rate_cam_rad_s if compensated else None
+            levels = bench.draw(q, number, rate, t_ns=t_ns).levels
+            shown = np.array(primary_lights(levels, panel))
             rows, columns = np.nonzero(shown.any(axis=0))
             places = columns.astype(np.float64), rows.astype(np.float64)
-            screen_late_s = screen.late_s(*places, sizes[0])
-            row_late_s = np.nan_to_num(view.scan.late_s(*geometry.to_tracker(*places), sizes[1]))
-        total[:, rows, columns] += shown[:, rows, columns] * beat.shares(
-            frame, screen_late_s, row_late_s
-        )
+            screen_late_s = screen.late_s(*places, screen_px)
+            tracker_places = geometry.to_tracker(*places)
+            row_late_s = np.nan_to_num(view.scan.late_s(*tracker_places, tracker_px))
+        shares = beat.shares(frame, screen_late_s, row_late_s)
+        total[:, rows, columns] += shown[:, rows, columns] * shares
         glow += beat.shares(frame, glow_late_s, glow_rows_s)
-    return total, glow.reshape(sizes[1][::-1])
+    return total, glow.reshape(tracker_px[::-1])

@@ -6,7 +6,7 @@ faults.
 
 import itertools
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -141,9 +141,8 @@ class Simulator(Closing):
     renderer's.
 
     Free it with `close`, or use it as a context manager; one in another's context ends with that.
-    One that
-    does not `refuse` views goes on near the Sun (see `TrackerBackground`). `psf` stands for the
-    bench's own.
+    One that does not `refuse` views goes on near the Sun (see `TrackerBackground`). `psf` stands
+    for the bench's own.
     """
 
     def __init__(
@@ -259,15 +258,16 @@ class Simulator(Closing):
             mean_e = self._exposed_e(light, stars, exposure_s)
             mean_e += self._background.of_view_e(view)
         else:
-            mean_e, open_s = faults.light_e(
-                lambda part, layer: light_of(
-                    canvas, (*layers, layer), stars, rolled(part, self.config.tracker)
-                ),
-                lambda light, seconds: self._exposed_e(light, stars, seconds),
-            )
-            mean_e += self._background.of_view_e(faults.pieces[len(faults.pieces) // 2].view) * (
-                open_s / exposure_s
-            )
+
+            def light_with_faults(part: View, layer: FaultLayer) -> FrameLight:
+                return light_of(canvas, (*layers, layer), stars, rolled(part, self.config.tracker))
+
+            def exposed_e(light: FrameLight, seconds: float) -> FloatArray:
+                return self._exposed_e(light, stars, seconds)
+
+            mean_e, open_s = faults.light_e(light_with_faults, exposed_e)
+            middle = faults.pieces[len(faults.pieces) // 2]
+            mean_e += self._background.of_view_e(middle.view) * (open_s / exposure_s)
             light = faults.sprites()
         # the Sun has more than a detector can be asked for; its wells are full long before
         if self.moving is not None:
@@ -281,13 +281,15 @@ class Simulator(Closing):
             return Exposure(view, dn, mean_e, truth, light.capped)
         added = _exposed(faults.added_truth())
         by_bv = stars.colours_by_bv
-        added = with_channels(added, None if by_bv is None else shares_by_bv(by_bv, added["bv"]))
+        added_shares = None if by_bv is None else shares_by_bv(by_bv, added["bv"])
+        added = with_channels(added, added_shares)
         truth = np.concatenate([truth, added])
         return Exposure(view, dn, mean_e, truth, light.capped, faults.names)
 
     def _digitised(
         self, mean_e: FloatArray, rng: np.random.Generator | None
     ) -> npt.NDArray[np.uint16]:
+        """The DN of mean electrons (h, w), with noise by a generator or without."""
         exposure_s = self.config.tracker.exposure_s
         if rng is None:
             return self.detector.expose_noiseless(mean_e, exposure_s)
@@ -312,13 +314,10 @@ class Simulator(Closing):
         if glass is None:
             self.renderer.draw(sprites)
             return self.renderer.linear()
-        image = glass.psf.image(
-            sprites.x_px,
-            sprites.y_px,
-            glass.shares(stars, sprites.star),
-            sprites.data["electrons_per_s"],
-            self.config.tracker.resolution_px,
-        )
+        shares = glass.shares(stars, sprites.star)
+        rates = sprites.data["electrons_per_s"]
+        size_px = self.config.tracker.resolution_px
+        image = glass.psf.image(sprites.x_px, sprites.y_px, shares, rates, size_px)
         if sprites.extended:
             self.renderer.draw(without_stars(sprites))
             image += self.renderer.linear()
@@ -360,13 +359,21 @@ def pieces_of(
     pieces = []
     for begin_ns, end_ns in itertools.pairwise(edges):
         middle_ns = (begin_ns + end_ns) // 2
-        since_ns = timetable.stands_since_ns(middle_ns)
         now = timetable.on(middle_ns, begin_ns)
+        q_icrs_to_cam = at_constant_rate(middle_ns)
+        piece_rate = rate
+        stopped_ns = timetable.stands_since_ns(middle_ns)
+        if stopped_ns is not None:
+            q_icrs_to_cam = where(stopped_ns)
+            piece_rate = STILL
+        t_ns = None
+        if view.t_ns is not None:
+            t_ns = view.t_ns + middle_ns - run_ns
         part = replace(
             view,
-            q_icrs_to_cam=at_constant_rate(middle_ns) if since_ns is None else where(since_ns),
-            rate_cam_rad_s=rate if since_ns is None else STILL,
-            t_ns=None if view.t_ns is None else view.t_ns + middle_ns - run_ns,
+            q_icrs_to_cam=q_icrs_to_cam,
+            rate_cam_rad_s=piece_rate,
+            t_ns=t_ns,
             scan=Scan(hold_s=(end_ns - begin_ns) / NS_PER_S),
         )
         pieces.append(ExposurePiece(part, now))
@@ -402,7 +409,8 @@ class FaultyExposure:
             sprites = light_of(layer.turned(piece.view), layer)
             light = exposed_e(sprites, piece_s)
             total = light if total is None else total + light
-            open_s += 0.0 if layer.blank else piece_s
+            if not layer.blank:
+                open_s += piece_s
             self._note(sprites, piece_s / exposure_s)
         if total is None:
             raise AssertionError("an exposure has a piece")
@@ -411,32 +419,37 @@ class FaultyExposure:
     def _note(self, sprites: FrameLight, share: float) -> None:
         self._seen.append(sprites)
         if sprites.added:
-            self._rows.append((added_truth(sprites, np.zeros(len(sprites), dtype=bool)), share))
+            unclipped = np.zeros(len(sprites), dtype=bool)
+            self._rows.append((added_truth(sprites, unclipped), share))
 
     @property
     def names(self) -> tuple[str, ...]:
         """The faults that are on in it."""
-        return tuple(
-            dict.fromkeys(active.fault.name for piece in self.pieces for active in piece.now)
-        )
+        return tuple(dict.fromkeys(active.fault.name for active in self._active()))
+
+    def _active(self) -> Iterator[Now]:
+        """The faults that are on in each piece, piece after piece."""
+        for piece in self.pieces:
+            yield from piece.now
 
     def sprites(self) -> FrameLight:
         """The sprites of the bench's own stars and discs in any of its pieces, end to end."""
         parts = [_own(sprites) for sprites in self._seen]
         whole = join_sprites(parts, parts[0].footprint_px)
-        discs = tuple(dict.fromkeys(name for part in parts for name in part.discs))
-        return replace(whole, capped=sum(part.capped for part in parts), discs=discs)
+        discs: dict[str, None] = {}
+        for part in parts:
+            discs |= dict.fromkeys(part.discs)
+        capped = sum(part.capped for part in parts)
+        return replace(whole, capped=capped, discs=tuple(discs))
 
     def added_truth(self) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE for what faults added: in electrons per second of the whole
         exposure, at the mean place.
         """
-        tracks = {
-            active.fault.name
-            for piece in self.pieces
-            for active in piece.now
-            if isinstance(active.fault, CosmicRays)
-        }
+        tracks = set()
+        for active in self._active():
+            if isinstance(active.fault, CosmicRays):
+                tracks.add(active.fault.name)
         points: dict[str, npt.NDArray[np.void]] = {}
         tables: list[npt.NDArray[np.void]] = []
         for rows, share in self._rows:
@@ -515,17 +528,16 @@ def exposure_truth(
     image_directions = stars.directions(star) @ icrs_to_image.T
     x_px, y_px = canvas.camera.project(image_directions)
     if view.scan.scanout_s and view.turns:
-        paths = Paths(
-            image_directions, canvas.camera.cam_to_image @ view.turn.rate_cam_rad_s, canvas.camera
-        )
-        x_px, y_px = paths.places_px(
-            EVERY, own_row_s(paths, EVERY, np.zeros(len(star)), view.scan)[0]
-        )
+        rate_image_rad_s = canvas.camera.cam_to_image @ view.turn.rate_cam_rad_s
+        paths = Paths(image_directions, rate_image_rad_s, canvas.camera)
+        row_s, _ = own_row_s(paths, EVERY, np.zeros(len(star)), view.scan)
+        x_px, y_px = paths.places_px(EVERY, row_s)
     truth = _exposed(truth_table(stars, star, x_px, y_px))
     height, width = mean_e.shape
-    inside = np.isfinite(x_px) & (np.rint(x_px) >= 0) & (np.rint(x_px) < width)
-    inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < height)
-    place = np.rint(y_px[inside]).astype(np.intp), np.rint(x_px[inside]).astype(np.intp)
+    column, row = np.rint(x_px), np.rint(y_px)
+    inside = np.isfinite(x_px) & (column >= 0) & (column < width)
+    inside &= (row >= 0) & (row < height)
+    place = row[inside].astype(np.intp), column[inside].astype(np.intp)
     # of other colours, the brightest pixel may be a neighbour of the star's own
     if stars.colours is not None:
         from scipy.ndimage import maximum_filter
@@ -533,15 +545,14 @@ def exposure_truth(
         mean_e = maximum_filter(mean_e, CLIPPED_PX)
     truth["clipped"][inside] = mean_e[place] > canvas.full_e
     if glass is not None:
-        centroids = glass.psf.centroids_px(
-            x_px[inside], y_px[inside], glass.shares(stars, star[inside])
-        )
-        for name, value in zip(
-            ("x_centroid_px", "y_centroid_px", "relative_illumination"), centroids, strict=True
-        ):
-            truth[name][inside] = value
+        shares = glass.shares(stars, star[inside])
+        x, y, illumination = glass.psf.centroids_px(x_px[inside], y_px[inside], shares)
+        truth["x_centroid_px"][inside] = x
+        truth["y_centroid_px"][inside] = y
+        truth["relative_illumination"][inside] = illumination
     truth["clipped"] |= np.isin(truth["name"], light.over_white)
-    truth = with_channels(truth, None if stars.colours is None else stars.colours[star])
+    colours = None if stars.colours is None else stars.colours[star]
+    truth = with_channels(truth, colours)
     return truth[np.argsort(truth["v_mag"], kind="stable")]
 
 
@@ -550,11 +561,9 @@ def _exposed(truth: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
     exposed = np.zeros(len(truth), dtype=EXPOSURE_DTYPE)
     for name in TRUTH_DTYPE.names or ():
         exposed[name] = truth[name]
-    exposed["x_centroid_px"], exposed["y_centroid_px"], exposed["relative_illumination"] = (
-        truth["x_px"],
-        truth["y_px"],
-        1.0,
-    )
+    exposed["x_centroid_px"] = truth["x_px"]
+    exposed["y_centroid_px"] = truth["y_px"]
+    exposed["relative_illumination"] = 1.0
     return exposed
 
 
@@ -586,11 +595,10 @@ class TrackerBackground:
     by direction, sky glow.
 
     Pixels of a `mosaic`, where the tracker has one, have their own channel's, else that of all
-    channels. Zodiacal light
-    and glow are computed at LATTICE places along each side of the detector, each with its pixel's
-    solid angle. Where the table of zodiacal light is blank, near the Sun, a field is refused
-    (InputError); without `refuse` the nearest tabled light is drawn, and a warning says so once
-    until the field has left that part of the sky.
+    channels. Zodiacal light and glow are computed at LATTICE places along each side of the
+    detector, each with its pixel's solid angle. Where the table of zodiacal light is blank, near
+    the Sun, a field is refused (InputError); without `refuse` the nearest tabled light is drawn,
+    and a warning says so once until the field has left that part of the sky.
     """
 
     def __init__(
@@ -603,25 +611,26 @@ class TrackerBackground:
         mosaic: bool = True,
         moving: "MovingSky | None" = None,
     ) -> None:
-        self._bayer, tracker = config.tracker.detector.bayer if mosaic else None, config.tracker
-        channels = (
-            (bench_optics(tracker, folder),)
-            if self._bayer is None
-            else bench_channels(tracker, folder)
-        )
+        tracker = config.tracker
+        self._bayer = tracker.detector.bayer if mosaic else None
+        if self._bayer is None:
+            channels: tuple[Optics, ...] = (bench_optics(tracker, folder),)
+        else:
+            channels = bench_channels(tracker, folder)
         places = camera.grid_px(LATTICE)
         self._sr = camera.pixel_sr(*places)
-        self._across, self._down = (linear_shares(size, LATTICE) for size in camera.resolution_px)
+        width, height = camera.resolution_px
+        self._across = linear_shares(width, LATTICE)
+        self._down = linear_shares(height, LATTICE)
         pixel_sr = self._over_pixels(self._sr)
-        self.steady_e = in_pixels(
-            (background_e(config, optics, pixel_sr) for optics in channels), self._bayer
-        )
-        self._config, self._refuse, self._beyond = config, refuse, False
-        self._moving = (
-            None
-            if moving is None or moving.air is None or not moving.air.glow_e_per_s_sr.any()
-            else moving
-        )
+        steady = (background_e(config, optics, pixel_sr) for optics in channels)
+        self.steady_e = in_pixels(steady, self._bayer)
+        self._config = config
+        self._refuse = refuse
+        self._beyond = False
+        self._moving = None
+        if moving is not None and moving.air is not None and moving.air.glow_e_per_s_sr.any():
+            self._moving = moving
         self._lights: list[ZodiacalLight] = []
         if config.background.zodiacal is not None:
             self._lights = [ZodiacalLight.through(optics) for optics in channels]
@@ -645,17 +654,18 @@ class TrackerBackground:
             glow = self._moving.air.glow_at(directions, self._moving.utc_ns(view.t_ns))
             if self._bayer is None:
                 glow = glow.sum(axis=0, keepdims=True)
-            if not rates:
-                rates = list(glow)
+            if rates:
+                rates = [rate + more for rate, more in zip(rates, glow, strict=True)]
             else:
-                rates = [a + b for a, b in zip(rates, glow, strict=True)]
+                rates = list(glow)
         by_place = self._sr * self._config.tracker.exposure_s
         images = (self._over_pixels(rate * by_place) for rate in rates)
         return np.asarray(self.steady_e + in_pixels(images, self._bayer))
 
     def _over_pixels(self, values: FloatArray) -> FloatArray:
         """Values at the lattice's places (n,) as an image (height, width)."""
-        return np.asarray(self._down @ values.reshape(LATTICE, LATTICE) @ self._across.T)
+        lattice = values.reshape(LATTICE, LATTICE)
+        return np.asarray(self._down @ lattice @ self._across.T)
 
     def _say(self, nearest_deg: float, *, beyond: bool) -> None:
         """Refuse a field beyond the table, or warn of it where it follows one that was not."""
@@ -683,15 +693,13 @@ def background_e(config: BenchConfig, optics: Optics, pixel_sr: FloatArray) -> F
     level_e = np.full((height, width), background.electrons_per_px or 0.0)
     if background.zodiacal_v_mag_arcsec2 is not None:
         photometry = Photometry(config.sky.zero_point, config.sky.passband_weighting)
-        rate = zodiacal_electrons_per_s_arcsec2(
-            background.zodiacal_v_mag_arcsec2, optics, photometry
-        )
+        v_mag_arcsec2 = background.zodiacal_v_mag_arcsec2
+        rate = zodiacal_electrons_per_s_arcsec2(v_mag_arcsec2, optics, photometry)
         level_e = rate * ARCSEC_PER_RAD**2 * tracker.exposure_s * pixel_sr
     across_e, down_e = background.gradient_electrons_across
-    ramp_e = (
-        across_e * np.linspace(-0.5, 0.5, width)
-        + (down_e * np.linspace(-0.5, 0.5, height))[:, None]
-    )
+    ramp_across_e = across_e * np.linspace(-0.5, 0.5, width)
+    ramp_down_e = down_e * np.linspace(-0.5, 0.5, height)
+    ramp_e = ramp_across_e + ramp_down_e[:, None]
     total_e: FloatArray = level_e + ramp_e
     if total_e.min() < 0:
         raise InputError(

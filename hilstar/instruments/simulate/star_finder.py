@@ -26,7 +26,7 @@ from hilstar.tracker.centroids import (
 from hilstar.tracker.mosaic import software_psf_px
 
 USUAL: Centroider = "window"
-MATCH_PX = 3.0
+MATCH_PX = 3.0  # a find farther from a star's place is not that star
 # Others' light in a star's window, as a share of its own. Both images have it, so its effect is of
 # second order: at
 # 0.02, a neighbour 0.1 mag off adds 0.002 mag.
@@ -63,8 +63,10 @@ class Matched:
         both = np.flatnonzero((self.index[k] >= 0) & (other.index[k] >= 0))
         i = self.index[k[both]]
         j = other.index[k[both]]
-        difference.flux_mag[both] = magnitude(np.maximum(a.flux[i] / b.flux[j], 0.0))
-        difference.x_px[both], difference.y_px[both] = a.x_px[i] - b.x_px[j], a.y_px[i] - b.y_px[j]
+        ratio = a.flux[i] / b.flux[j]
+        difference.flux_mag[both] = magnitude(np.maximum(ratio, 0.0))
+        difference.x_px[both] = a.x_px[i] - b.x_px[j]
+        difference.y_px[both] = a.y_px[i] - b.y_px[j]
         return difference
 
 
@@ -85,7 +87,8 @@ class StarFinder:
         """The stars of a noiseless image (h, w) at their places (n,), where the bench's own
         centroider finds them.
         """
-        return self.placed(self.find(image_e, x_px, y_px), image_e, (x_px, y_px), self.centroider)
+        matched = self.find(image_e, x_px, y_px)
+        return self.placed(matched, image_e, (x_px, y_px), self.centroider)
 
     def find(self, image_e: FloatArray, x_px: FloatArray, y_px: FloatArray) -> Matched:
         """The stars of a noiseless image (h, w) at their places (n,), where a window finds them.
@@ -115,26 +118,24 @@ class StarFinder:
         if kind == "window" or not len(stars):
             return matched
         index = matched.index[stars]
+        true_x_px, true_y_px = true_px[0][stars], true_px[1][stars]
+        aside_x = np.rint(stars_found.x_px[index] - true_x_px)
+        aside_y = np.rint(stars_found.y_px[index] - true_y_px)
+        column = np.rint(true_x_px + aside_x).astype(np.intp)
+        row = np.rint(true_y_px + aside_y).astype(np.intp)
         reach = self.settings.radius_px
-        aside = (
-            np.rint(seen_px[index] - true[stars])
-            for seen_px, true in zip((stars_found.x_px, stars_found.y_px), true_px, strict=True)
-        )
-        column, row = (
-            np.rint(true[stars] + by).astype(np.intp)
-            for true, by in zip(true_px, aside, strict=True)
-        )
         stamps = squares(image, level, column, row, reach)[0]
         middle = np.full(len(stars), reach)
         dx_px, dy_px = star_places(stamps, kind, self.psf.width_px, (middle, middle))
         if kind == "psf" and self.told is not None:
-            dx_px, dy_px = psf_places(
-                stamps, told_psf(self.told, (row, column), 2 * reach + 1), (dx_px, dy_px)
-            )
+            stated_psf = told_psf(self.told, (row, column), 2 * reach + 1)
+            dx_px, dy_px = psf_places(stamps, stated_psf, (dx_px, dy_px))
         x_px = stars_found.x_px.copy()
         y_px = stars_found.y_px.copy()
-        x_px[index], y_px[index] = column + dx_px, row + dy_px
-        return Matched(replace(stars_found, x_px=x_px, y_px=y_px), matched.index)
+        x_px[index] = column + dx_px
+        y_px[index] = row + dy_px
+        centroids = replace(stars_found, x_px=x_px, y_px=y_px)
+        return Matched(centroids, matched.index)
 
 
 def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
@@ -144,26 +145,26 @@ def star_finder(bench: Bench, monitor_px_per_px: float) -> StarFinder:
     psf = seen_psf(bench, monitor_px_per_px)
     settings = CentroidSettings(window_sigma_px=max(1.0, *psf.width_px))
     peak_e = faintest_e_per_s(bench) * bench.config.tracker.exposure_s * psf.peak_share
-    peak_e *= 1.0 if bench.config.tracker.detector.bayer is None else MOSAIC_SHARE
+    if bench.config.tracker.detector.bayer is not None:
+        peak_e *= MOSAIC_SHARE
     under = LocalBackground(0.0, MIN_PEAK * peak_e / settings.threshold_sigma)
+    centroider = bench.config.verify.centroider
     stated_psf = None
-    if bench.config.verify.centroider == "psf" and not isinstance(bench.tracker_psf, GaussianPsf):
-        stated_psf = bench.tracker_psf.blurred(
-            float(np.sqrt(np.mean(_shown_px2(bench, monitor_px_per_px))))
-        )
-    return StarFinder(settings, psf, under, bench.config.verify.centroider or USUAL, stated_psf)
+    if centroider == "psf" and not isinstance(bench.tracker_psf, GaussianPsf):
+        variance_px2 = np.mean(_shown_px2(bench, monitor_px_per_px))
+        stated_psf = bench.tracker_psf.blurred(float(np.sqrt(variance_px2)))
+    return StarFinder(settings, psf, under, centroider or USUAL, stated_psf)
 
 
 def seen_psf(bench: Bench, monitor_px_per_px: float) -> Psf:
     """The Gaussian nearest to a star on the tracker, in its pixels: sprite, monitor pixel and
     the tracker's own PSF.
     """
-    spread = _shown_px2(bench, monitor_px_per_px)
-    x, y = (
-        math.sqrt(a + width_px**2)
-        for a, width_px in zip(spread, bench.tracker_psf.width_px, strict=True)
-    )
-    return GaussianPsf(software_psf_px((x, y), bench.config.tracker.detector))
+    shown_x_px2, shown_y_px2 = _shown_px2(bench, monitor_px_per_px)
+    tracker_x_px, tracker_y_px = bench.tracker_psf.width_px
+    x_px = math.sqrt(shown_x_px2 + tracker_x_px**2)
+    y_px = math.sqrt(shown_y_px2 + tracker_y_px**2)
+    return GaussianPsf(software_psf_px((x_px, y_px), bench.config.tracker.detector))
 
 
 def _shown_px2(bench: Bench, monitor_px_per_px: float) -> list[float]:
@@ -177,17 +178,19 @@ def faintest_e_per_s(bench: Bench) -> float:
     """The rate of the faintest star or body that the bench draws."""
     rates = bench.shown_stars.electrons_per_s
     drawn = rates[rates >= bench.faintest_shown_e_per_s]
-    return float(drawn.min()) if len(drawn) else 1.0
+    if not len(drawn):
+        return 1.0
+    return float(drawn.min())
 
 
 def nearest(found: Centroids, x_px: FloatArray, y_px: FloatArray) -> IntArray:
     """For each place (n,) the star found nearest within MATCH_PX, -1 for none."""
-    place, seen_row, distance = neighbours(
-        np.stack([x_px, y_px], axis=1), np.stack([found.x_px, found.y_px], axis=1), MATCH_PX
-    )
+    places = np.stack([x_px, y_px], axis=1)
+    centroids = np.stack([found.x_px, found.y_px], axis=1)
+    place, centroid, distance = neighbours(places, centroids, MATCH_PX)
     index = np.full(len(x_px), -1, dtype=np.intp)
     order = np.argsort(-distance, kind="stable")
-    index[place[order]] = seen_row[order]  # the nearest is written last
+    index[place[order]] = centroid[order]  # the nearest is written last
     return index
 
 
@@ -207,8 +210,11 @@ def neighbours(
     end = np.searchsorted(x, at + within, side="right")
     count = end - first
     place_row = np.repeat(np.arange(len(places)), count)
-    other = order[np.arange(len(place_row)) + np.repeat(first - np.cumsum(count) + count, count)]
-    distance = np.hypot(*(places[place_row] - others[other]).T)
+    # the pairs of a place are `count` rows of `order` from its first on
+    to_first = first - np.cumsum(count) + count
+    other = order[np.arange(len(place_row)) + np.repeat(to_first, count)]
+    offset = places[place_row] - others[other]
+    distance = np.hypot(*offset.T)
     near = distance <= within
     return place_row[near], other[near], distance[near]
 
@@ -216,7 +222,8 @@ def neighbours(
 def shared(match: IntArray) -> npt.NDArray[np.bool_]:
     """True for places whose match is another one's too."""
     used, counts = np.unique(match, return_counts=True)
-    return np.asarray((match >= 0) & (counts[np.searchsorted(used, match)] > 1))
+    counts_of_match = counts[np.searchsorted(used, match)]
+    return np.asarray((match >= 0) & (counts_of_match > 1))
 
 
 def crowded(
@@ -228,11 +235,13 @@ def crowded(
     places = np.stack([x_px, y_px], axis=1)
     half = radius_px + 0.5
     result = np.zeros(len(flux), dtype=np.bool_)
-    a, b, _ = neighbours(places, places, math.sqrt(2) * half + WING_SIGMAS * max(psf.width_px))
-    a, b = a[a != b], b[a != b]
-    offset = places[b] - np.rint(places[a])
-    share = (ndtr((offset + half) / psf.width_px) - ndtr((offset - half) / psf.width_px)).prod(
-        axis=1
-    )
-    result[a[flux[b] * share > CROWDED_SHARE * flux[a]]] = True
+    reach_px = math.sqrt(2) * half + WING_SIGMAS * max(psf.width_px)
+    star, other, _ = neighbours(places, places, reach_px)
+    star, other = star[star != other], other[star != other]
+    offset_px = places[other] - np.rint(places[star])
+    upper = ndtr((offset_px + half) / psf.width_px)
+    lower = ndtr((offset_px - half) / psf.width_px)
+    share = (upper - lower).prod(axis=1)
+    is_crowded = flux[other] * share > CROWDED_SHARE * flux[star]
+    result[star[is_crowded]] = True
     return result

@@ -260,6 +260,9 @@ class TrackerProcess:
             self._tracker.take(frame)
 
     def _report(self, solved: Solved) -> None:
+        """Count an exposure's answer and, unless the tracker is silent then, queue it for when it
+        is due.
+        """
         tally = self.tally
         q = None
         wrong = False
@@ -307,6 +310,7 @@ class TrackerProcess:
         )
 
     def _put(self, send: Send | None) -> None:
+        """Send the answers that are due."""
         if send is None:
             return
         while self._waiting and self._waiting[0][0] <= self._host.now_ns():

@@ -4,7 +4,6 @@ The twin of a bench: from an attitude to what falls on the tracker's detector, a
 out.
 """
 
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -60,14 +59,16 @@ def exposure_lights(
     With `temporal` that is one of the first PHASES frames of a sequence, which `frame` is the first
     of.
     """
-    count = max(1, round(bench.config.tracker.exposure_s * bench.config.monitor.refresh_hz))
+    config = bench.config
+    count = max(1, round(config.tracker.exposure_s * config.monitor.refresh_hz))
     exposed = bench.quantiser.exposure(first_frame % PHASES, count)
     size = frame.levels.shape[:2]
     total: list[list[FloatArray]] = []  # by panel and primary, over the frames
     for number in range(exposed.stop):
         levels = frame.levels
         if number:
-            sprites = bench.light(bench.view(frame.q_icrs_to_cam, None, frame.t_ns), faults)
+            view = bench.view(frame.q_icrs_to_cam, None, frame.t_ns)
+            sprites = bench.light(view, faults)
             levels = bench.draw_sprites(sprites, first_frame + number).levels
         if number not in exposed:
             continue
@@ -76,8 +77,9 @@ def exposure_lights(
             return lit
         if not total:
             total = [_dark_images(len(primaries), size) for primaries in lit]
-        for whole, part in zip(itertools.chain(*total), itertools.chain(*lit), strict=True):
-            whole.ravel()[part.place] += part.e_per_s
+        for primaries, lights in zip(total, lit, strict=True):
+            for whole, light in zip(primaries, lights, strict=True):
+                whole.ravel()[light.place] += light.e_per_s
     return [_mean_lights(primaries, len(exposed)) for primaries in total]
 
 
@@ -106,20 +108,18 @@ def true_panel(bench: Bench) -> Panel:
     white = verify.true_flux_at_white_e_per_s or bench.flux_at_white_e_per_s
     if verify.true_calibration is None:
         scale = white / bench.flux_at_white_e_per_s
-        parts = tuple(
-            replace(primary, flux_at_white_e_per_s=scale * primary.flux_at_white_e_per_s)
-            for primary in bench.panel.primaries
-        )
-        return Panel(bench.calibration.response, white, bench.uniformity, parts)
-    true = true_calibration(
-        bench, verify.true_calibration, bit_stealing=bench.config.render.bit_stealing
-    )
+        primaries = []
+        for primary in bench.panel.primaries:
+            primary_white = scale * primary.flux_at_white_e_per_s
+            primaries.append(replace(primary, flux_at_white_e_per_s=primary_white))
+        return Panel(bench.calibration.response, white, bench.uniformity, tuple(primaries))
+    bit_stealing = bench.config.render.bit_stealing
+    true = true_calibration(bench, verify.true_calibration, bit_stealing=bit_stealing)
     response = levels_of(bench.calibration.response, true.response)
     uniformity = true.uniformity_map(bench.config.monitor.resolution_px)
     colours = bench.colours
-    if colours is None:
-        parts = ()
-    else:
+    parts: tuple[Panel, ...] = ()
+    if colours is not None:
         parts = primary_panels(bench.file, colours, white, uniformity, verify.true_calibration)
     return Panel(response, white, uniformity, parts)
 
@@ -136,16 +136,16 @@ def levels_of(assumed: Response, true: Response) -> Response:
     """
     if assumed.rgb is None or true.rgb is None:
         return true
-    light = {
-        tuple(triple): value for triple, value in zip(true.rgb.tolist(), true.light, strict=True)
-    }
-    known = np.array([light.get(tuple(triple), np.nan) for triple in assumed.rgb.tolist()])
+    light = {}
+    for triple, value in zip(true.rgb.tolist(), true.light, strict=True):
+        light[tuple(triple)] = value
+    levels = np.array([light.get(tuple(triple), np.nan) for triple in assumed.rgb.tolist()])
     # A triple that the true monitor cannot tell from its neighbour has that one's light.
-    places = np.arange(len(known))
-    known = np.interp(places, places[np.isfinite(known)], known[np.isfinite(known)])
-    return Response(
-        assumed.bits, known, table_response(assumed.bits, known).threshold, true.black, assumed.rgb
-    )
+    places = np.arange(len(levels))
+    known = np.isfinite(levels)
+    levels = np.interp(places, places[known], levels[known])
+    threshold = table_response(assumed.bits, levels).threshold
+    return Response(assumed.bits, levels, threshold, true.black, assumed.rgb)
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,10 +157,9 @@ class TwinField:
     itself, and stars have the electrons of an average pixel of it. `pixels_e` are the detector's
     own of what is shown. `shown_e` is what the monitor as it is makes, `assumed_e` what it would
     make if everything were as assumed (the same array where nothing differs), and `sky_e` what the
-    stars themselves make. `by_channel` has shown and sky of each channel,
-    where primaries are driven apart for several. `under_e` lies under them all. `truth` has the
-    rows of TRUTH_DTYPE of stars and points, and `discs` those bodies' directions (3,), cam, and
-    radii, rad, which are more
+    stars themselves make. `by_channel` has shown and sky of each channel, where primaries are
+    driven apart for several. `under_e` lies under them all. `truth` has the rows of TRUTH_DTYPE of
+    stars and points, and `discs` those bodies' directions (3,), cam, and radii, rad, which are more
     than points.
     """
 
@@ -180,10 +179,10 @@ class TwinField:
         near = np.zeros(len(self.truth), dtype=bool)
         rays = camera.rays(self.x_px, self.y_px)
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        margin_rad = margin_px / camera.focal_length_px
         for direction, radius_rad in self.discs:
-            near |= rays @ direction > math.cos(
-                min(radius_rad + margin_px / camera.focal_length_px, math.pi)
-            )
+            within_rad = min(radius_rad + margin_rad, math.pi)
+            near |= rays @ direction > math.cos(within_rad)
         return near
 
 
@@ -205,14 +204,14 @@ class Twin(Closing):
         self.true_camera = true.monitor
         self.detector = Detector(tracker.detector, tracker.resolution_px, tracker.pixel_pitch_um)
         self.true_optics = TwinOptics(true, self.bench.tracker_psf)
-        self.glow_e_per_s = self.assumed_glow_e_per_s = self.true_optics.glow_e_per_s(
-            self.true_panel
-        )
+        self.glow_e_per_s = self.true_optics.glow_e_per_s(self.true_panel)
+        self.assumed_glow_e_per_s = self.glow_e_per_s
         self.sky_optics = self.true_optics
         if self.differs:
             self.sky_optics = TwinOptics(self.assumed_geometry, self.bench.tracker_psf)
             self.assumed_glow_e_per_s = self.sky_optics.glow_e_per_s(self.bench.panel)
-        self.primaries, self._mosaic = seen_primaries(self.bench), DisplayColours.of(self.bench)
+        self.primaries = seen_primaries(self.bench)
+        self._mosaic = DisplayColours.of(self.bench)
         self._background = TrackerBackground(
             self.config, file.folder, self.camera, refuse=False, moving=self.bench.moving
         )
@@ -224,58 +223,68 @@ class Twin(Closing):
         frame = self.bench.frame(q_icrs_to_cam, first_frame)
         exposure_s = self.config.tracker.exposure_s
         skies = [self.sky_optics.image_e_per_s(light) * exposure_s for light in frame.light]
+        panels = [self.true_panel]
         if self.differs:
-            panels = [self.true_panel, self.bench.panel]
-        else:
-            panels = [self.true_panel]
+            panels.append(self.bench.panel)
         view = rolled(self._exposure_at(frame), self.config.tracker)
         glow_e = self._mosaic.grey(self.glow_e_per_s) * exposure_s
         lights: Sequence[Iterable[FloatArray | LitLight]]
         if view.scan.scanout_s and exposure_s:
             phase_s = self._phase_s(first_frame)
-            optics_and_panels = zip((self.true_optics, self.sky_optics), panels, strict=False)
             parts = []
-            for optics, panel in optics_and_panels:
+            for optics, panel in zip((self.true_optics, self.sky_optics), panels, strict=False):
                 parts.append(rolling_light(self.bench, optics.geometry, panel, view, phase_s))
             lights = [light for light, _ in parts]
-            glow_e = glow_e * parts[0][1]
+            _, glow_share = parts[0]
+            glow_e = glow_e * glow_share
         else:
             lights = exposure_lights(self.bench, frame, first_frame, panels)
         by_primary = self.true_optics.images_e_per_s(lights[0], self.primaries) * exposure_s
         pixels_e = self._mosaic.shown(by_primary)
         bayer = self._mosaic.bayer
-        sky = self._found_in(
-            sum(skies[1:], start=skies[0]) if bayer is None else in_pixels(skies, bayer)
-        )
+        if bayer is None:
+            sky_e = sum(skies[1:], start=skies[0])
+        else:
+            sky_e = in_pixels(skies, bayer)
+        sky = self._found_in(sky_e)
         shown = assumed = self._found_in(pixels_e)
         if self.differs:
             as_assumed = self.sky_optics.images_e_per_s(lights[1], self.primaries) * exposure_s
             assumed = self._found_in(self._mosaic.shown(as_assumed))
         by_channel: tuple[tuple[FloatArray, FloatArray], ...] = ()
         if (colours := self.bench.colours) is not None and not colours.mono:
-            by_channel = tuple(
-                zip(np.tensordot(colours.by_primary, by_primary, 1), skies, strict=True)
-            )
+            shown_by_channel = np.tensordot(colours.by_primary, by_primary, 1)
+            by_channel = tuple(zip(shown_by_channel, skies, strict=True))
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
         view = self.bench.view(frame.q_icrs_to_cam)
         discs = self.bench.discs(view)
         under_e = glow_e + self._background.of_view_e(view)
         points = ~np.isin(frame.rows["name"], [disc.name for disc in discs])
-        x_px, y_px = self.camera.project(
-            self.bench.stars.directions(frame.star[points]) @ icrs_to_cam.T
-        )
-        hidden_cones = tuple((icrs_to_cam @ disc.direction, disc.radius_rad) for disc in discs)
+        point_stars = frame.star[points]
+        stars = self.bench.stars
+        x_px, y_px = self.camera.project(stars.directions(point_stars) @ icrs_to_cam.T)
+        hidden_cones = []
+        for disc in discs:
+            hidden_cones.append((icrs_to_cam @ disc.direction, disc.radius_rad))
         truth = frame.rows[points]
-        if bayer is not None and self.bench.stars.colours is not None:
-            of_channels = shares_at(self.bench.stars.colours, self.bench.stars, frame.star[points])
-            truth["electrons_per_s"] *= of_channels @ [
-                bayer.count(channel) / len(bayer) for channel in CHANNELS
-            ]
+        if bayer is not None and stars.colours is not None:
+            pattern = [bayer.count(channel) / len(bayer) for channel in CHANNELS]
+            truth["electrons_per_s"] *= shares_at(stars.colours, stars, point_stars) @ pattern
         return TwinField(
-            shown, assumed, sky, truth, x_px, y_px, pixels_e, hidden_cones, under_e, by_channel
+            shown_e=shown,
+            assumed_e=assumed,
+            sky_e=sky,
+            truth=truth,
+            x_px=x_px,
+            y_px=y_px,
+            pixels_e=pixels_e,
+            discs=tuple(hidden_cones),
+            under_e=under_e,
+            by_channel=by_channel,
         )
 
     def _found_in(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """The image in which the tracker's software finds stars, of the detector's pixels."""
         return software_image(pixels, self.config.tracker.detector)
 
     def _exposure_at(self, frame: Frame) -> View:
@@ -323,9 +332,11 @@ class Twin(Closing):
 def changed_keys(verify: Verify) -> list[str]:
     """The names of the keys of [verify] that are not at their defaults."""
     default = Verify()
-    return [
-        name for name in verify.__struct_fields__ if getattr(verify, name) != getattr(default, name)
-    ]
+    changed = []
+    for name in verify.__struct_fields__:
+        if getattr(verify, name) != getattr(default, name):
+            changed.append(name)
+    return changed
 
 
 def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
@@ -342,13 +353,11 @@ def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
     if verify.true_geometry is not None:
         camera = real_monitor(config, bench.file.folder, verify.true_geometry)
         return BenchGeometry(camera, tracker, verify.true_mirror)
-    if (verify.true_q_cam_to_mon, verify.true_pixel_pitch_um, verify.true_focal_length_mm) == (
-        None,
-        None,
-        None,
-    ):
+    lens = (verify.true_q_cam_to_mon, verify.true_pixel_pitch_um, verify.true_focal_length_mm)
+    if lens == (None, None, None):
         return BenchGeometry(bench.camera, tracker, verify.true_mirror)
-    norm = math.hypot(*(verify.true_q_cam_to_mon or collimator.q_cam_to_mon))
+    q_cam_to_mon = verify.true_q_cam_to_mon or collimator.q_cam_to_mon
+    norm = math.hypot(*q_cam_to_mon)
     if abs(norm - 1) > NORM_TOLERANCE:
         raise InputError(
             f"{bench.file.path}: [verify] true_q_cam_to_mon: its norm is {norm:.6g}; write a unit"
@@ -358,7 +367,7 @@ def true_geometry(bench: Bench, tracker: Camera) -> BenchGeometry:
         monitor.resolution_px,
         verify.true_pixel_pitch_um or monitor.pixel_pitch_um,
         verify.true_focal_length_mm or collimator.focal_length_mm,
-        np.array(verify.true_q_cam_to_mon or collimator.q_cam_to_mon),
+        np.array(q_cam_to_mon),
         ideal_monitor(config).principal_point_px,
     )
     return BenchGeometry(camera, tracker, verify.true_mirror)

@@ -10,8 +10,10 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
@@ -22,13 +24,13 @@ from hilstar.basics.charts import (
     capital,
     chart,
     value_bars,
-    write_records,
 )
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_S
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
-from hilstar.instruments.study.row_charts import (
+from hilstar.display.response import Levels
+from hilstar.instruments.study.engine import (
     HIDDEN,
     ChartSpec,
     LevelLine,
@@ -37,7 +39,7 @@ from hilstar.instruments.study.row_charts import (
     at_least,
     draw_rows,
     looks_of,
-    row_panels,
+    write_rows,
 )
 from hilstar.instruments.study.study_benches import FULL_HD, Table, study_bench
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, Spent, in_turn
@@ -71,71 +73,40 @@ BODIES: dict[str, tuple[Table, Table]] = {
     "all": ({"planets": True, "moon": True, "sun": True, "earth": True}, LOW_ORBIT),
 }
 FRAME_NS = round(NS_PER_S / REFRESH_HZ)
-SIGMA_PX = (0.85, 0.85)
+SIGMA_PX = (0.85, 0.85)  # of sprites by default
 MIDDLE_PX = (0.2, -0.3)  # disc centre from the middle pixel's centre: off any symmetry
-FOCAL_PX = 6000.0
+FOCAL_PX = 6000.0  # a pixel is 34 arcsec, as on the demo's monitor
 RADII_PX = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0, 6.0, 8.0, 12.0, 20.0, 40.0, 80.0)
 QUICK_RADII_PX = (0.1, 2.0, 12.0)
 PHASES_DEG = (0.0, 60.0, 120.0, 150.0)
 # along each side: at most 0.07 px apart, under a tenth of sigma
 MIN_RAYS, RAYS_A_PX, MAX_RAYS = 600, 16, 2400
 LIMB_PX = 4.0  # a smaller disc has no edge that falls from a middle
-PLACES = 60
-MARGIN_PX = 8
+PLACES = 60  # along a limb, where its edge is found
+MARGIN_PX = 8  # around a disc: nine sigmas of its light
 # Degrees from the boresight to the body's middle, of the Earth beyond its limb (negative: on it)
 NEAR_DEG: dict[str, tuple[float, ...]] = {
     "Moon": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.5, 0.25, 0.0),
     "Sun": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.5, 0.25, 0.0),
     "Earth": (40.0, 20.0, 12.0, 8.0, 5.0, 3.0, 1.0, 0.0, -1.0, -3.0, -8.0, -20.0, -40.0, -70.0),
 }
-QUICK_DEG = {"Moon": (40.0, 0.5), "Sun": (40.0, 0.5), "Earth": (40.0, 0.0, -70.0)}
-ROUNDS, QUICK_ROUNDS = 40, 3
+QUICK_DEG: dict[str, tuple[float, ...]] = {
+    "Moon": (40.0, 0.5),
+    "Sun": (40.0, 0.5),
+    "Earth": (40.0, 0.0, -70.0),
+}
+ROUNDS, QUICK_ROUNDS = 40, 3  # of which the fastest frame counts
 QUICK_BENCHES = ("nothing", "Moon", "Sun", "Earth", "all")
-FLUX_LIMIT, LIMB_LIMIT_PX, DISC_PX = 0.01, 0.1, 0.2
+FLUX_LIMIT, LIMB_LIMIT_PX = 0.01, 0.1
+DISC_PX = 0.2  # a body of a smaller diameter is drawn as a point
 FLOOR = 1e-6  # lower end of the chart's axis
 SMALL = {"ms": 4}
+BESIDE_AXIS = (0.3, 1.0, 0.0)  # the Sun stands beside a disc, across this axis
 SIZE_NOTE = (
     f"A Moon at {len(PHASES_DEG)} phases, against rays in float64. Left of the dashed line it is"
     " drawn as a point."
 )
-SIZE_PANELS = (
-    PanelSpec(
-        (LineSpec("radius_px", at_least("flux_off", FLOOR), marker="o", look=SMALL),),
-        "error [share]",
-        title="Light of the whole disc",
-        levels=(LevelLine(FLUX_LIMIT, "limit"),),
-        scales=("log", "log"),
-    ),
-    PanelSpec(
-        (
-            LineSpec(
-                "radius_px", at_least("limb_off_px", FLOOR), marker="s", named=False, look=SMALL
-            ),
-            LineSpec("radius_px", at_least("middle_off_px", FLOOR), ":", marker="o", look=SMALL),
-        ),
-        "error [px]",
-        title="Place of its limb (squares, solid) and of its middle (dotted)",
-        levels=(LevelLine(LIMB_LIMIT_PX, "limit"),),
-        scales=("log", "log"),
-    ),
-    PanelSpec(
-        (
-            LineSpec("radius_px", at_least("pixel_off", FLOOR), marker="o", look=SMALL),
-            LineSpec(
-                "radius_px",
-                at_least("point_pixel_off", FLOOR),
-                ":",
-                marker="x",
-                named=False,
-                look=SMALL,
-            ),
-        ),
-        "error [of the brightest]",
-        "radius of the Moon's disc [px]",
-        title="Its worst pixel, drawn as a disc (solid) and as a point (crosses, dotted)",
-        scales=("log", "log"),
-    ),
-)
+LOG_LOG: Any = {"scales": ("log", "log")}
 LIMIT_NOTE = (
     "Earth by its limb, negative on the Earth; Moon and Sun by their middles. 1920 x 1080, drawn in"
     " software."
@@ -158,11 +129,17 @@ LIMIT_PANELS = (
         xticks=LIMIT_TICKS_DEG,
     ),
 )
+COST_NOTE = (
+    "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x"
+    " 1080, drawn in software."
+)
 
 
 @contextmanager
 def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
-    """The benches of these names, which end with the context. Raises InputError or MachineError."""
+    """Open the benches of these names; they close with the context. Raises InputError or
+    MachineError.
+    """
     common: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
         "monitor": {**FULL_HD, "refresh_hz": REFRESH_HZ, "bits": 12},
@@ -174,44 +151,48 @@ def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
         (Path(folder) / "low.tle").write_text(TLE)
         benches = {}
         for name in names:
-            own_tables = {}
-            for key, table in zip(("sky.bodies", "spacecraft"), BODIES[name], strict=True):
-                if table:
-                    own_tables[key] = table
+            tables = dict(common)
+            bodies, spacecraft = BODIES[name]
+            if bodies:
+                tables["sky.bodies"] = bodies
+            if spacecraft:
+                tables["spacecraft"] = spacecraft
             path = Path(folder) / f"{name.replace(' ', '_')}.toml"
-            benches[name] = stack.enter_context(study_bench(path, {**common, **own_tables}))
+            benches[name] = stack.enter_context(study_bench(path, tables))
         yield benches
 
 
 def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
-    """The attitude (unit quaternion) so far from a body's middle, or beyond the Earth's limb
-    (negative: on it).
+    """The attitude (unit quaternion) that points `off_deg` away from a body's centre.
+
+    Of the Earth the angle counts from its limb, and is negative on its disc.
     """
     if bench.moving is None:
         raise AssertionError("a bench with bodies moves")
-    whole_sky = np.array([0.0, 0.0, 1.0]), np.pi
-    discs = bench.moving.discs(*whole_sky, 0.0, t_ns)
+    north = np.array([0.0, 0.0, 1.0])
+    discs = bench.moving.discs(north, np.pi, 0.0, t_ns)
     disc = next(disc for disc in discs if disc.name == body)
     off_rad = np.radians(off_deg)
     if body == "Earth":
         off_rad += disc.radius_rad
-    # Along declination, away from the near pole; the Earth towards the Sun, where its limb is lit
-    if body == "Earth":
+        # towards the Sun, where the limb is lit
         beside = disc.sun
     else:
-        beside = np.array([0.0, 0.0, -np.sign(disc.direction[2]) or 1.0])
-    beside = beside - (beside @ disc.direction) * disc.direction
-    beside /= np.linalg.norm(beside)
-    x, y, z = np.cos(off_rad) * disc.direction + np.sin(off_rad) * beside
-    return from_radec_roll_deg(
-        float(np.degrees(np.arctan2(y, x))), float(np.degrees(np.arcsin(z))), 0.0
-    )
+        # along declination, away from the near pole
+        beside = north * (-np.sign(disc.direction[2]) or 1.0)
+    across = beside - (beside @ disc.direction) * disc.direction
+    across /= np.linalg.norm(across)
+    x, y, z = np.cos(off_rad) * disc.direction + np.sin(off_rad) * across
+    ra_deg = float(np.degrees(np.arctan2(y, x)))
+    dec_deg = float(np.degrees(np.arcsin(z)))
+    return from_radec_roll_deg(ra_deg, dec_deg, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class BodyScene:
-    """A bench by its name, its aim (see `attitude`) from `t_ns` on, and the step of its clock
-    from frame to frame.
+    """What a frame shows: a bench by its name, and its aim `off_deg` from a body (see `attitude`).
+
+    The bench's clock starts at `t_ns` and advances by `step_ns` a frame.
     """
 
     name: str
@@ -223,19 +204,18 @@ class BodyScene:
 
 
 def at_a_step(scene: str) -> bool:
-    """Whether each frame of a scene, by its name, is the first of a step of the orbit."""
+    """Whether every frame of a scene begins a new step of the orbit."""
     by_name = {known.name: known for known in SCENES}
     return by_name[scene].step_ns != FRAME_NS
 
 
 @dataclass(frozen=True, slots=True)
 class BodyCost:
-    """One scene: the fastest frame of the rounds, ms, with the body and without any, and the
-    difference.
+    """The cost of the bodies in one scene: the fastest frame, ms, with and without them.
 
     `cpu_ms` is the difference in processor time of all cores, the driver's threads included. A busy
-    machine changes it least, and in software rendering it is the whole cost. `discs` are the bodies
-    drawn as discs, `stars` counts the stars drawn.
+    machine changes it least, and in software rendering it is the whole cost. `discs` names the
+    bodies that are drawn as discs, `stars` counts the stars drawn.
     """
 
     scene: str
@@ -247,7 +227,7 @@ class BodyCost:
     stars: int
 
 
-SCENES = (
+SCENES: tuple[BodyScene, ...] = (
     BodyScene("from the Earth's centre, no body", "observer", "Moon", 60.0),
     BodyScene("planets, none in view", "planets", "Jupiter", 60.0),
     BodyScene("Uranus in view, a point", "planets", "Uranus", 0.3),
@@ -266,18 +246,26 @@ SCENES = (
 
 
 def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) -> BodyCost:
-    """A scene and the same frame without bodies, timed in turn. `benches` has "nothing", "all"
-    and the scene's.
+    """Time a scene and the same frame without bodies in turn.
+
+    `benches` holds "nothing", "all" and the scene's own.
     """
     bench = benches[scene.bench]
-    nothing = benches["nothing"]
-    knows = bench.moving is not None and scene.body in bench.moving.names
-    q = attitude(bench if knows else benches["all"], scene.body, scene.off_deg, scene.t_ns)
-    without, shown = fastest((nothing, bench), q, scene.t_ns, scene.step_ns, rounds)
-    stars = bench.draw(q, t_ns=scene.t_ns).star_count
-    discs = " ".join(disc.name for disc in bench.discs(bench.view(q, None, scene.t_ns)))
-    cost = shown.wall_ms - without.wall_ms, shown.cpu_ms - without.cpu_ms
-    return BodyCost(scene.name, shown.wall_ms, without.wall_ms, *cost, discs, stars)
+    aimed = bench
+    if bench.moving is None or scene.body not in bench.moving.names:
+        aimed = benches["all"]
+    q = attitude(aimed, scene.body, scene.off_deg, scene.t_ns)
+    without, shown = fastest((benches["nothing"], bench), q, scene.t_ns, scene.step_ns, rounds)
+    view = bench.view(q, None, scene.t_ns)
+    return BodyCost(
+        scene=scene.name,
+        frame_ms=shown.wall_ms,
+        without_ms=without.wall_ms,
+        cost_ms=shown.wall_ms - without.wall_ms,
+        cpu_ms=shown.cpu_ms - without.cpu_ms,
+        discs=" ".join(disc.name for disc in bench.discs(view)),
+        stars=bench.draw(q, t_ns=scene.t_ns).star_count,
+    )
 
 
 def fastest(
@@ -289,23 +277,30 @@ def fastest(
     The second bench's clock begins at `t_ns` and goes on by `step_ns` from frame to frame.
     """
     nothing, bench = benches
-    works = {
-        "nothing": lambda _: nothing.draw(q).levels,
-        "bodies": lambda k: bench.draw(q, t_ns=t_ns + k * step_ns).levels,
-    }
-    without, shown = (
-        Spent(*np.min(took, axis=0).tolist()) for took in in_turn(works, rounds).values()
-    )
-    return without, shown
+
+    def without(_: int) -> Levels:
+        return nothing.draw(q).levels
+
+    def with_bodies(number: int) -> Levels:
+        return bench.draw(q, t_ns=t_ns + number * step_ns).levels
+
+    times = in_turn({"nothing": without, "bodies": with_bodies}, rounds)
+    return shortest(times["nothing"]), shortest(times["bodies"])
+
+
+def shortest(times: Sequence[Spent]) -> Spent:
+    """The smallest wall time and the smallest processor time of some frames."""
+    wall_ms, cpu_ms = np.min(times, axis=0).tolist()
+    return Spent(wall_ms, cpu_ms)
 
 
 @dataclass(frozen=True, slots=True)
 class Exactness:
-    """A body of one radius at one phase: its light, the place of its limb (NaN: none) or of its
-    middle, single pixels.
+    """How exact a disc of one radius at one phase is.
 
-    `flux_off` and `pixel_off` are relative to all its light and to its brightest pixel;
-    `point_pixel_off` is that of a point.
+    `flux_off` is relative to its light, `pixel_off` to its brightest pixel; `point_pixel_off` is
+    the error of a point drawn in its place. `limb_off_px` is NaN where the disc is too small or too
+    thin to have a limb.
     """
 
     body: str
@@ -319,111 +314,121 @@ class Exactness:
 
 
 def moon(radius_px: float, phase_deg: float) -> Disc:
-    """A Moon of that radius off the middle of an image."""
-    ahead = np.array([MIDDLE_PX[0] / FOCAL_PX, MIDDLE_PX[1] / FOCAL_PX, 1.0])
-    ahead /= np.linalg.norm(ahead)
-    side = np.cross(ahead, [0.3, 1.0, 0.0])
+    """A Moon of a radius and phase, off the centre of an image."""
+    ahead = middle_direction()
+    side = np.cross(ahead, BESIDE_AXIS)
     side /= np.linalg.norm(side)
     phase = np.radians(phase_deg)
-    sun = -np.cos(phase) * ahead + np.sin(phase) * side
-    far = 1 / np.sin(radius_px / FOCAL_PX)
     disc = Disc(
-        "Moon",
-        ahead,
-        far,
-        1.0,
-        1.0,
-        np.array([0.0, 1.0, 0.0]),
-        sun,
-        "lunar-lambert",
-        1.0,
-        lunar_share(phase_deg),
+        name="Moon",
+        direction=ahead,
+        distance_km=1 / np.sin(radius_px / FOCAL_PX),
+        equator_km=1.0,
+        polar_km=1.0,
+        pole=np.array([0.0, 1.0, 0.0]),
+        sun=-np.cos(phase) * ahead + np.sin(phase) * side,
+        law="lunar-lambert",
+        normal_e_per_s_sr=1.0,
+        lunar_share=lunar_share(phase_deg),
     )
     return disc.of_rate(1e6)
 
 
+def middle_direction() -> FloatArray:
+    """The unit vector to the disc's centre."""
+    ahead = np.array([MIDDLE_PX[0] / FOCAL_PX, MIDDLE_PX[1] / FOCAL_PX, 1.0])
+    return np.asarray(ahead / np.linalg.norm(ahead))
+
+
+def drawn_discs(disc: Disc, camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """The images (h, w) of a disc as it is drawn, and of a point in its place."""
+    psf = GaussianPsf(SIGMA_PX)
+    size_px = camera.resolution_px
+    with Renderer(Target(size_px, psf)) as renderer:
+        x_px, y_px = camera.project(disc.direction[None])
+        star = np.zeros(1, dtype=np.intp)
+        side_px = renderer.footprint_px
+        point = pack_sprites(x_px, y_px, np.array([1e6]), star, size_px, side_px)
+        view = DiscView(camera, psf, (Pose(np.eye(3)),))
+        lights = tuple(disc_lights(disc, view, covers=True))
+        renderer.draw(replace(join_sprites([], side_px), extended=lights))
+        as_disc = renderer.linear().astype(np.float64)
+        renderer.draw(point)
+        as_point = renderer.linear().astype(np.float64)
+    return as_disc, as_point
+
+
 def exactness(radius_px: float, phase_deg: float) -> Exactness:
-    """A Moon as it is drawn, against rays."""
+    """The errors of a Moon as it is drawn, against traced rays."""
     from scipy.ndimage import center_of_mass
 
     disc = moon(radius_px, phase_deg)
     half = int(np.ceil(radius_px)) + MARGIN_PX
-    size = (2 * half + 1, 2 * half + 1)
-    psf = GaussianPsf(SIGMA_PX)
-    camera = Camera(size, FOCAL_PX, (half, half), np.eye(3))
-    with Renderer(Target(size, psf)) as renderer:
-        place = camera.project(disc.direction[None])
-        point = pack_sprites(
-            *place, np.array([1e6]), np.zeros(1, dtype=np.intp), size, renderer.footprint_px
-        )
-        lights = disc_lights(disc, DiscView(camera, psf, (Pose(np.eye(3)),)), covers=True)
-        renderer.draw(replace(join_sprites([], renderer.footprint_px), extended=tuple(lights)))
-        drawn = renderer.linear().astype(np.float64)
-        renderer.draw(point)
-        as_point = renderer.linear().astype(np.float64)
+    side_px = 2 * half + 1
+    camera = Camera((side_px, side_px), FOCAL_PX, (half, half), np.eye(3))
+    drawn, as_point = drawn_discs(disc, camera)
     truth = traced(disc, camera)
-    limb = np.nan
+    brightest = truth.max()
+    limb_px = np.nan
     if radius_px >= LIMB_PX and phase_deg <= 90:
-        limb = float(
-            np.nanmax(
-                np.abs(_edges(drawn, radius_px, phase_deg) - _edges(truth, radius_px, phase_deg))
-            )
-        )
+        off_px = edges_px(drawn, radius_px, phase_deg) - edges_px(truth, radius_px, phase_deg)
+        limb_px = float(np.nanmax(np.abs(off_px)))
+    middle_px = np.subtract(center_of_mass(drawn), center_of_mass(truth))
     return Exactness(
         body=disc.name,
         phase_deg=phase_deg,
         radius_px=radius_px,
         flux_off=float(drawn.sum() / truth.sum() - 1),
-        middle_off_px=float(
-            np.abs(np.subtract(center_of_mass(drawn), center_of_mass(truth))).max()
-        ),
-        limb_off_px=limb,
-        pixel_off=float(np.abs(drawn - truth).max() / truth.max()),
-        point_pixel_off=float(np.abs(as_point - truth).max() / truth.max()),
+        middle_off_px=float(np.abs(middle_px).max()),
+        limb_off_px=limb_px,
+        pixel_off=float(np.abs(drawn - truth).max() / brightest),
+        point_pixel_off=float(np.abs(as_point - truth).max() / brightest),
     )
 
 
 def traced(disc: Disc, camera: Camera) -> FloatArray:
-    """The image of a disc by rays on a lattice about it, float64, each ray's light spread by the
-    Gaussian over the pixels.
+    """The image (h, w) of a disc by float64 rays on a lattice, each spread over pixels by the
+    Gaussian.
     """
     from scipy.special import ndtr
 
     radius_px = np.tan(disc.radius_rad) * camera.focal_length_px * 1.001
     count = int(np.clip(RAYS_A_PX * 2 * radius_px, MIN_RAYS, MAX_RAYS))
     step_px = 2 * radius_px / count
-    (x_mid,), (y_mid,) = camera.project(disc.direction[None])
     along = (np.arange(count) + 0.5) * step_px - radius_px
+    (x_mid,), (y_mid,) = camera.project(disc.direction[None])
     x_px, y_px = np.meshgrid(x_mid + along, y_mid + along)
     rays = camera.rays(x_px.ravel(), y_px.ravel())
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     # The solid angle of a square of the image plane: the cube of the ray's cosine to the axis
     light = disc.radiance(rays) * (step_px / camera.focal_length_px) ** 2 * rays[:, 2] ** 3
     width, height = camera.resolution_px
-    across = np.diff(
-        ndtr((np.arange(width + 1) - 0.5 - (x_mid + along)[:, None]) / SIGMA_PX[0]), axis=1
-    )
-    down = np.diff(
-        ndtr((np.arange(height + 1) - 0.5 - (y_mid + along)[:, None]) / SIGMA_PX[1]), axis=1
-    )
+    across = np.diff(ndtr(edges_in_sigmas(width, x_mid + along, SIGMA_PX[0])), axis=1)
+    down = np.diff(ndtr(edges_in_sigmas(height, y_mid + along, SIGMA_PX[1])), axis=1)
     return np.asarray(down.T @ light.reshape(count, count) @ across)
 
 
-def _edges(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
-    """Where an image falls to half its light 3 px inside the limb, on the lit side, px outward
-    of the limb.
+def edges_in_sigmas(pixels: int, places_px: FloatArray, sigma_px: float) -> FloatArray:
+    """The edges of a row of pixels relative to places (n,), in sigmas: (n, pixels + 1)."""
+    edges_px = np.arange(pixels + 1) - 0.5
+    return np.asarray((edges_px - places_px[:, None]) / sigma_px)
+
+
+def edges_px(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
+    """Where the lit limb of a disc is in an image, px outward of its true place.
+
+    The limb is where light falls to half of its value 3 px inside.
     """
     from scipy.ndimage import map_coordinates
 
     half = image.shape[0] // 2
     lit = 1.0 if phase_deg else np.pi  # radians to either side of the Sun's
-    ahead = np.array([MIDDLE_PX[0] / FOCAL_PX, MIDDLE_PX[1] / FOCAL_PX, 1.0])
-    sun = np.cross(ahead, [0.3, 1.0, 0.0])
+    sun = np.cross(middle_direction(), BESIDE_AXIS)
     angle = np.arctan2(sun[1], sun[0]) + np.linspace(-lit, lit, PLACES)
     steps = np.linspace(-3.0, 3.0, 241)
-    way = radius_px + steps[None, :]
-    x_px = half + MIDDLE_PX[0] + way * np.cos(angle)[:, None]
-    y_px = half + MIDDLE_PX[1] + way * np.sin(angle)[:, None]
+    from_middle = radius_px + steps[None, :]
+    x_px = half + MIDDLE_PX[0] + from_middle * np.cos(angle)[:, None]
+    y_px = half + MIDDLE_PX[1] + from_middle * np.sin(angle)[:, None]
     profile = map_coordinates(image, [y_px, x_px], order=3, mode="nearest")
     level = profile[:, :1] / 2
     below = profile < level
@@ -431,18 +436,18 @@ def _edges(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArray:
     rows = np.arange(PLACES)
     high = profile[rows, first - 1]
     low = profile[rows, first]
-    place = steps[first - 1] + (steps[1] - steps[0]) * (high - level[:, 0]) / (high - low)
+    share = (high - level[:, 0]) / (high - low)
+    place = steps[first - 1] + (steps[1] - steps[0]) * share
     return np.asarray(np.where(below.any(axis=1), place, np.nan))
 
 
 @dataclass(frozen=True, slots=True)
 class Near:
-    """A frame with a body so near its middle: the fastest of some, ms, and in processor time, and
-    without any body.
+    """A frame with a body near its middle: the fastest of some, ms.
 
-    `over_white_mag` is how many magnitudes brighter than white the brightest pixel is (below 0:
-    fainter), `finite` says that every pixel's light is a number, `white_is_white` that each with
-    more than white has white's code; `stars` those drawn.
+    `over_white_mag` is how much brighter than white the brightest pixel is (negative: fainter).
+    `finite` says that every pixel's light is a number, `white_is_white` that each pixel over white
+    has white's code.
     """
 
     body: str
@@ -457,26 +462,29 @@ class Near:
 
 
 def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: int) -> Near:
-    """A body at one place. `benches` has "nothing" and the body's own."""
+    """Time a body at one angle from the boresight, and look at its light.
+
+    `benches` holds "nothing" and the body's own.
+    """
     bench = benches[body]
-    nothing = benches["nothing"]
     start_ns = DAY_SIDE_NS if body == "Earth" else 0
     q = attitude(bench, body, off_deg, start_ns)
-    without, shown = fastest((nothing, bench), q, start_ns, FRAME_NS, rounds)
+    without, shown = fastest((benches["nothing"], bench), q, start_ns, FRAME_NS, rounds)
     drawn = bench.draw(q, t_ns=start_ns)
     levels = drawn.levels.copy()
     light = bench.renderer.linear()
-    brightest = float(light.max())
     white = bench.flux_at_white_e_per_s
+    brightest = max(float(light.max()), 1e-9)
+    over_white = levels[light > white]
     return Near(
         body=body,
         off_deg=off_deg,
         frame_ms=shown.wall_ms,
         cpu_ms=shown.cpu_ms,
         without_ms=without.wall_ms,
-        over_white_mag=2.5 * math.log10(max(brightest, 1e-9) / white),
+        over_white_mag=2.5 * math.log10(brightest / white),
         finite=bool(np.isfinite(light).all()),
-        white_is_white=bool((levels[light > white] == bench.calibration.response.white).all()),
+        white_is_white=bool((over_white == bench.calibration.response.white).all()),
         stars=drawn.star_count,
     )
 
@@ -485,45 +493,75 @@ def run(directory: Path, quick: bool = False) -> Judged:
     """Write `bodies_cost`, `bodies_size` and `bodies_limits` (PNG and CSV); a line for each
     finding. Raises InputError.
     """
+    names: tuple[str, ...] = tuple(BODIES)
+    rounds = ROUNDS
+    near_deg = NEAR_DEG
+    radii_px: tuple[float, ...] = RADII_PX
+    if quick:
+        names = QUICK_BENCHES
+        rounds = QUICK_ROUNDS
+        near_deg = QUICK_DEG
+        radii_px = QUICK_RADII_PX
+    near_rounds = max(QUICK_ROUNDS, rounds // 4)
     others = OtherWork()
-    names: tuple[str, ...] = QUICK_BENCHES if quick else tuple(BODIES)
-    rounds = QUICK_ROUNDS if quick else ROUNDS
-    near_deg = QUICK_DEG if quick else NEAR_DEG
-    radii_px: tuple[float, ...] = QUICK_RADII_PX if quick else RADII_PX
+    costs = []
+    nears = []
     with opened(names) as benches:
-        costs = [measure_cost(benches, scene, rounds) for scene in SCENES if scene.bench in names]
-        nears = []
+        for scene in SCENES:
+            if scene.bench in names:
+                costs.append(measure_cost(benches, scene, rounds))
         for body, angles_deg in near_deg.items():
             for off_deg in angles_deg:
-                nears.append(approach(benches, body, off_deg, max(QUICK_ROUNDS, rounds // 4)))
+                nears.append(approach(benches, body, off_deg, near_rounds))
     load = others.load()
-    sizes = []
-    for phase_deg in PHASES_DEG:
-        sizes += [exactness(radius_px, phase_deg) for radius_px in radii_px]
-    for name, records in (("bodies_cost", costs), ("bodies_size", sizes), ("bodies_limits", nears)):
-        write_records(directory / f"{name}.csv", records)
-    cost_line = draw_costs(directory / "bodies_cost", costs, load)
+    sizes = [exactness(radius, phase) for phase, radius in product(PHASES_DEG, radii_px)]
+    write_rows(directory / "bodies_cost.csv", costs)
+    write_rows(directory / "bodies_size.csv", sizes)
+    write_rows(directory / "bodies_limits.csv", nears)
+    draw_costs(directory / "bodies_cost", costs, load)
     draw_sizes(directory / "bodies_size", sizes)
     draw_limits(directory / "bodies_limits", nears, load)
-    return load.judged([cost_line, _size_line(sizes), _limits_line(nears)])
+    return load.judged([cost_line(costs), size_line(sizes), limits_line(nears)])
 
 
-def _size_line(sizes: Sequence[Exactness]) -> str:
-    limb_px = float(np.nanmax([size.limb_off_px for size in sizes]))
-    worst = max(sizes, key=lambda size: abs(size.flux_off))
+def unseen_ms(costs: Sequence[BodyCost]) -> float:
+    """The largest cost of bodies that are not drawn as discs, between steps of the orbit, ms."""
+    largest_ms = 0.0
+    for cost in costs:
+        if not cost.discs and not at_a_step(cost.scene):
+            largest_ms = max(largest_ms, cost.cpu_ms)
+    return largest_ms
+
+
+def cost_line(costs: Sequence[BodyCost]) -> str:
+    """What bodies cost, in words."""
+    dearest = max(costs, key=lambda cost: cost.cpu_ms)
+    all_ms = max(costs[-1].cpu_ms, 0.0)
     return (
-        f"discs of {sizes[0].radius_px:g} to {max(s.radius_px for s in sizes):g} px in radius have"
-        f" their light within {100 * abs(worst.flux_off):.2g} % and their limb within {limb_px:.3f}"
-        " px of rays in float64"
+        f"bodies that are not in view, or points, take at most {unseen_ms(costs):.1f} ms of"
+        f" processor time a frame, and all of them {all_ms:.1f} ms once in 2 s; the dearest:"
+        f" {dearest.scene}, {dearest.cpu_ms:.0f} ms"
     )
 
 
-def _limits_line(nears: Sequence[Near]) -> str:
+def size_line(sizes: Sequence[Exactness]) -> str:
+    """How exact discs are, in words."""
+    limb_px = float(np.nanmax([size.limb_off_px for size in sizes]))
+    flux_percent = 100 * max(abs(size.flux_off) for size in sizes)
+    largest_px = max(size.radius_px for size in sizes)
+    return (
+        f"discs of {sizes[0].radius_px:g} to {largest_px:g} px in radius have their light within"
+        f" {flux_percent:.2g} % and their limb within {limb_px:.3f} px of rays in float64"
+    )
+
+
+def limits_line(nears: Sequence[Near]) -> str:
+    """The slowest frame with a body in view, and what its light does, in words."""
     slowest = max(nears, key=lambda near: near.cpu_ms)
+    place = f"{slowest.body} at {slowest.off_deg:g} degrees"
     return (
         f"a body in view takes at most {slowest.cpu_ms:.0f} ms of processor time a frame"
-        f" ({slowest.body} at {slowest.off_deg:g} degrees); every pixel's light is"
-        f" {light_words(nears)}"
+        f" ({place}); every pixel's light is {light_words(nears)}"
     )
 
 
@@ -534,55 +572,61 @@ def light_words(nears: Sequence[Near]) -> str:
     return "NOT finite, or over white and not white"
 
 
-def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> str:
-    """What each scene costs; the finding."""
+def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> None:
+    """What each scene costs."""
     dearest = max(costs, key=lambda cost: cost.cpu_ms)
-    unseen = [cost.cpu_ms for cost in costs if not cost.discs and not at_a_step(cost.scene)]
-    unseen_ms = max(0.0, *unseen)
-    note = (
-        "Processor time of a frame, less that of the same frame on a bench without bodies; 1920 x"
-        " 1080, drawn in software."
-    )
     finding = (
-        f"Between steps of an orbit bodies that are no discs cost at most {unseen_ms:.1f} ms; the"
-        f" dearest body, {dearest.scene}, {dearest.cpu_ms:.0f} ms"
+        f"Between steps of an orbit bodies that are no discs cost at most {unseen_ms(costs):.1f}"
+        f" ms; the dearest body, {dearest.scene}, {dearest.cpu_ms:.0f} ms"
     )
     title = load.title(finding, "Bodies of each kind on top of a frame")
-    with chart(path, title, note=load.note(note), height_inch=4.4) as (axes,):
-        value_bars(
-            axes,
-            [capital(cost.scene) for cost in costs],
-            [round(max(cost.cpu_ms, 0.0), 2) for cost in costs],
-            BLUE,
-        )
+    names = [capital(cost.scene) for cost in costs]
+    times_ms = [round(max(cost.cpu_ms, 0.0), 2) for cost in costs]
+    with chart(path, title, note=load.note(COST_NOTE), height_inch=4.4) as (axes,):
+        value_bars(axes, names, times_ms, BLUE)
         axes.set_xlabel("processor time on top [ms]")
-    return (
-        f"bodies that are not in view, or points, take at most {unseen_ms:.1f} ms of processor time"
-        f" a frame, and all of them {max(costs[-1].cpu_ms, 0.0):.1f} ms once in 2 s; the dearest:"
-        f" {dearest.scene}, {dearest.cpu_ms:.0f} ms"
-    )
+
+
+def size_line_of(error: str, style: str = "-", marker: str = "o", named: bool = True) -> LineSpec:
+    """An error of discs against their radius."""
+    return LineSpec("radius_px", at_least(error, FLOOR), style, marker, named, look=SMALL)
 
 
 def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
     """The errors of discs against their radius."""
+    light = PanelSpec(
+        (size_line_of("flux_off"),),
+        "error [share]",
+        title="Light of the whole disc",
+        levels=(LevelLine(FLUX_LIMIT, "limit"),),
+        **LOG_LOG,
+    )
+    place = PanelSpec(
+        (size_line_of("limb_off_px", marker="s", named=False), size_line_of("middle_off_px", ":")),
+        "error [px]",
+        title="Place of its limb (squares, solid) and of its middle (dotted)",
+        levels=(LevelLine(LIMB_LIMIT_PX, "limit"),),
+        **LOG_LOG,
+    )
+    pixel = PanelSpec(
+        (size_line_of("pixel_off"), size_line_of("point_pixel_off", ":", "x", False)),
+        "error [of the brightest]",
+        "radius of the Moon's disc [px]",
+        title="Its worst pixel, drawn as a disc (solid) and as a point (crosses, dotted)",
+        places=(LevelLine(DISC_PX / 2, HIDDEN, MUTED),),
+        xticks=sorted({size.radius_px for size in sizes}),
+        **LOG_LOG,
+    )
     looks = looks_of({phase_deg: f"{phase_deg:g} deg" for phase_deg in PHASES_DEG})
     layout = {"height_inch": 8.4}
-    light, place, pixel = SIZE_PANELS
-    with_ticks = replace(pixel, xticks=sorted({size.radius_px for size in sizes}))
-    spec = ChartSpec(
-        (light, place, with_ticks),
-        lambda size: size.phase_deg,
-        looks,
-        SIZE_NOTE,
-        layout=layout,
-    )
-    with row_panels(path, _size_line(sizes), spec, sizes) as panels:
-        panels[2].axvline(DISC_PX / 2, color=MUTED, linestyle="--", lw=1.2, label=HIDDEN)
+    panels = (light, place, pixel)
+    spec = ChartSpec(panels, lambda size: size.phase_deg, looks, SIZE_NOTE, layout=layout)
+    draw_rows(path, size_line(sizes), spec, sizes)
 
 
 def draw_limits(path: Path, nears: Sequence[Near], load: Load) -> None:
     """Processor time and light as bodies come near."""
-    title = load.title(_limits_line(nears), f"Every pixel's light is {light_words(nears)}")
+    title = load.title(limits_line(nears), f"Every pixel's light is {light_words(nears)}")
     bodies = dict.fromkeys(near.body for near in nears)
     looks = looks_of({body: body for body in bodies})
     spec = ChartSpec(LIMIT_PANELS, lambda near: near.body, looks, LIMIT_NOTE)

@@ -10,7 +10,7 @@ wavelength of detected photons.
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -20,16 +20,27 @@ import numpy as np
 from msgspec.structs import replace as replace_keys
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, chart, write_csv
+from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import magnitude
+from hilstar.display.quantise import Quantisation
 from hilstar.display.response import Levels, srgb_response
 from hilstar.instruments.simulate.budget import RED_NM, SOLAR_BV
+from hilstar.instruments.study.engine import (
+    ChartSpec,
+    LevelLine,
+    LineSpec,
+    PanelSpec,
+    SeriesLook,
+    draw_rows,
+    write_rows,
+)
 from hilstar.instruments.study.study_benches import (
     GLASS,
     Isolation,
+    Value,
     bench_text,
     centroid_px,
     lone_windows,
@@ -41,7 +52,7 @@ from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import tracker_psf
 from hilstar.server.bench.colours import Colours, warmth
-from hilstar.server.bench.config.hardware import TrackerOptics
+from hilstar.server.bench.config.hardware import Tracker, TrackerOptics
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.primary_panels import bench_colours
 from hilstar.server.bench.star_glass import StarGlass
@@ -87,6 +98,7 @@ TRACKERS = {
     "Bayer": "Bayer, wide dyes",
     "mono to 700 nm": f"{MONO_SENSOR} to {CUT_NM:g} nm",
 }
+QUICK_TRACKERS = ("mono", "Bayer")
 MARKERS = {"mono": "o", "Bayer": "s", "mono to 700 nm": "^"}
 INKS = {"white": MUTED, "star": BLUE, "depth": ORANGE}
 FRAME_PX = (800, 600)
@@ -97,89 +109,175 @@ PUBLISHED_SUBTYPES = 6.55  # a rig with an OLED of 2025
 # Sigmas of a mosaic's stars, px, their black bodies, and the places along two pixels at which they
 # stand.
 SIGMAS_PX, STARS_K, PHASES, TILE_PX = (0.55, 0.8, 1.0, 1.5), (3500.0, 6000.0, 12_000.0), 16, 24
-Row = tuple[str | float, ...]
-# Stars to V = 7 without codes: share of electrons in a wrong channel, of one channel nm of the mean
-# wavelength, and subtypes.
-GAMUT = (
-    "panel",
-    "sensor",
-    "condition",
-    "out_share",
-    "off_median",
-    "off_95",
-    "off_percent_k",
-    "subtypes",
-    "subtypes_white",
+LENS, LENS_PSF = "planar-1897.toml", "planar-1897.fits"
+METHODS: tuple[Quantisation, ...] = ("round", "exact")
+QUOTED_SIGMA_PX = 1.0  # of the mosaic's stars that the findings name
+NOTE = (
+    "Full: exact; open: round. Circles: mono; triangles: mono to 700 nm; squares: Bayer. Lone"
+    " stars of V = 1 to 5.5 on an sRGB LCD of 8 bits."
 )
-# The same of a mono sensor by spectral class: stars to V = 7, their mean wavelength and how far it
-# is off, and subtypes.
-BY_CLASS = ("panel", "sensor", "class", "stars", "mean_nm", "off_nm", "subtypes", "subtypes_white")
-# Lone stars of V = 1 to 5.5 as codes show them: mean errors of colour, 95 % of light, a channel's
-# light [%] and place; time.
-CHOICE = (
-    "tracker",
-    "colour",
-    "method",
-    "stars",
-    "wall_ms",
-    "cpu_ms",
-    "subtypes",
-    "off_percent_k",
-    "mag",
-    "channel",
-    "px",
-)
-# Places through a lens against a star's like the Sun: of the sky, and shown minus sky. "linear": 1
-# px for 100 nm of the mean.
-LATERAL = ("lens", "panel", "colour", "sky_px", "off_px", "off_share")
-# Errors of a noiseless star's place along an axis, over places in four pixels.
-PLACES = ("sigma_px", "temperature_k", "image", "rms_px", "max_px")
+LEGEND = {"loc": "upper center", "bbox_to_anchor": (0.5, 1.25), "ncols": 4, "frameon": False}
+POINT = {"ms": 7}
+PUBLISHED_WIDTH = 1.8
+
+
+@dataclass(frozen=True, slots=True)
+class GamutRow:
+    """Stars to V = 7 of a panel before a sensor, as its primaries can show them; no codes.
+
+    `out_share` is the share of stars outside the gamut. `off_...` is the error of colour: the share
+    of electrons in a wrong channel, or for one channel nm of the mean wavelength. `subtypes` is the
+    error with each star's own mixture, `subtypes_white` with white.
+    """
+
+    panel: str
+    sensor: str
+    condition: float
+    out_share: float
+    off_median: float
+    off_95: float
+    off_percent_k: float
+    subtypes: float
+    subtypes_white: float
+
+
+@dataclass(frozen=True, slots=True)
+class GamutClass:
+    """The stars of one spectral class before a mono sensor: their mean wavelength and its error,
+    nm.
+    """
+
+    panel: str
+    sensor: str
+    class_: str
+    stars: int
+    mean_nm: float
+    off_nm: float
+    subtypes: float
+    subtypes_white: float
+
+
+@dataclass(frozen=True, slots=True)
+class ColourChoice:
+    """Lone stars of V = 1 to 5.5 with the codes of one choice.
+
+    `subtypes` and `off_percent_k` are mean errors of colour; `mag`, `channel` (%) and `px` are what
+    95 % of the stars are within. The times are of the fastest frame.
+    """
+
+    tracker: str
+    colour: str
+    method: str
+    stars: int
+    wall_ms: float
+    cpu_ms: float
+    subtypes: float
+    off_percent_k: float
+    mag: float
+    channel: float
+    px: float
+
+
+@dataclass(frozen=True, slots=True)
+class LateralColour:
+    """The shift of stars' places by a lens's lateral colour, against a star like the Sun, rms.
+
+    `sky_px` is the sky's own, `off_px` the error of the shown one. The lens "linear" moves a star
+    by 1 px for 100 nm of its mean wavelength.
+    """
+
+    lens: str
+    panel: str
+    colour: str
+    sky_px: float
+    off_px: float
+    off_share: float
+
+
+@dataclass(frozen=True, slots=True)
+class MosaicPlaces:
+    """Errors of a noiseless star's place along an axis, over places within two by two pixels."""
+
+    sigma_px: float
+    temperature_k: float
+    image: str
+    rms_px: float
+    max_px: float
+
+
+@dataclass(frozen=True, slots=True)
+class GamutStars:
+    """The stars (n,) of a panel before a sensor: the wanted colour of each, and its errors."""
+
+    kinds: FloatArray
+    wanted: FloatArray
+    off: FloatArray
+    subtypes: FloatArray
+    subtypes_white: FloatArray
+    condition: float
+    out_share: float
+    off_percent_k: float
+
+
+@dataclass(frozen=True, slots=True)
+class ShownStars:
+    """Lone stars (n,): wanted colours (n, c), shown shares of primaries (n, 3), light relative to
+    the wanted one (n,), and errors of place (n, 2), px.
+    """
+
+    wanted: FloatArray
+    shares: FloatArray
+    light: FloatArray
+    off_px: FloatArray
 
 
 def curve_of(lobes: Lobes) -> FloatArray:
     """A sum of Gaussians at NM."""
-    return np.asarray(
-        sum(height * np.exp(-(((NM - peak) / wide) ** 2)) for peak, wide, height in lobes)
-    )
+    curve = np.zeros_like(NM)
+    for peak_nm, half_width_nm, height in lobes:
+        curve += height * np.exp(-(((NM - peak_nm) / half_width_nm) ** 2))
+    return curve
+
+
+def write_spectrum(path: Path, header: str, *columns: FloatArray) -> None:
+    """Write columns (n,) as a file of a spectrum."""
+    lines = [header]
+    for row in zip(*columns, strict=True):
+        lines.append(",".join(f"{value:.6g}" for value in row))
+    path.write_text("\n".join(lines) + "\n")
 
 
 def write_spectra(folder: Path) -> None:
     """Primaries and quantum efficiencies as the files that benches name."""
-    for name, three in PANELS.items():
-        rows = []
-        for row in zip(NM, *map(curve_of, three), strict=True):
-            rows.append(",".join(f"{x:.6g}" for x in row))
-        (folder / f"{name}.csv").write_text("\n".join(["wavelength_nm,r,g,b", *rows]))
-    for name, three in SENSORS.items():
-        for channel, lobes in zip(CHANNELS, three, strict=True):
-            lines = [
-                "wavelength_nm,value",
-                *(f"{nm:g},{value:.6g}" for nm, value in zip(NM, curve_of(lobes), strict=True)),
-            ]
-            (folder / f"{name} {channel}.csv").write_text("\n".join(lines))
+    for name, primaries in PANELS.items():
+        curves = map(curve_of, primaries)
+        write_spectrum(folder / f"{name}.csv", "wavelength_nm,r,g,b", NM, *curves)
+    header = "wavelength_nm,value"
+    for name, dyes in SENSORS.items():
+        for channel, lobes in zip(CHANNELS, dyes, strict=True):
+            write_spectrum(folder / f"{name} {channel}.csv", header, NM, curve_of(lobes))
     whole = load_curve(MONO_SENSOR, "quantum_efficiency")
-    cut = (
-        f"{nm:g},{value:.6g}"
-        for nm, value in zip(NM[CUT_NM > NM], whole(NM[CUT_NM > NM]), strict=True)
-    )
-    (folder / MONO[f"{MONO_SENSOR} to {CUT_NM:g} nm"]).write_text(
-        "\n".join(["wavelength_nm,value", *cut])
-    )
+    before_cut = NM[CUT_NM > NM]
+    cut_name = MONO[f"{MONO_SENSOR} to {CUT_NM:g} nm"]
+    write_spectrum(folder / cut_name, header, before_cut, whole(before_cut))
 
 
 def file_of(
     folder: Path, panel: str, sensor: str, faintest_v_mag: float = 7.0, **render: str | float
 ) -> BenchFile:
     """The bench of a panel with vertical stripes and a sensor, in the folder of the spectra."""
-    three = {f"quantum_efficiency_{letter}": f"{sensor} {letter}.csv" for letter in CHANNELS}
+    tracker: dict[str, Value] = {"transmission": GLASS, "resolution_px": (1024, 1024)}
+    detector: dict[str, Value] = {}
     if sensor in MONO:
-        efficiency_keys = {"quantum_efficiency": MONO[sensor]}
+        tracker["quantum_efficiency"] = MONO[sensor]
     else:
-        efficiency_keys = three
+        detector["bayer"] = "rggb"
+        for letter in CHANNELS:
+            tracker[f"quantum_efficiency_{letter}"] = f"{sensor} {letter}.csv"
     text = bench_text(
         {
-            "tracker": {**efficiency_keys, "transmission": GLASS, "resolution_px": (1024, 1024)},
-            "tracker.detector": {} if sensor in MONO else {"bayer": "rggb"},
+            "tracker": tracker,
+            "tracker.detector": detector,
             "sky": {"faintest_v_mag": faintest_v_mag},
             "monitor": {"resolution_px": FRAME_PX, "pixel_pitch_um": 57.65},
             "monitor.primaries": {"file": f"{panel}.csv", "layout": "rgb-stripe"},
@@ -187,10 +285,11 @@ def file_of(
             "render": {"brightest_v_mag": BRIGHTEST_V_MAG, "colour": "star", **render},
         }
     )
+    if sensor not in MONO:
+        # The usual tracker's sensor is mono.
+        text = text.replace(f'quantum_efficiency = "{MONO_SENSOR}"\n', "")
     path = folder / "bench.toml"
-    path.write_text(
-        text if sensor in MONO else text.replace('quantum_efficiency = "ccd47-20"\n', "")
-    )
+    path.write_text(text)
     return read_bench_file(path)
 
 
@@ -198,109 +297,142 @@ def subtypes_by(channels: Mapping[str, Optics]) -> Callable[[FloatArray], FloatA
     """Spectral subtypes (0 is O0, 60 is M0) by a tracker's colour: shares of channels (n, 3), or a
     mean wavelength (n, 1).
 
-    Those of colours beyond the dwarfs' are their ends'.
+    A colour beyond the dwarfs' has the subtype of the nearest dwarf.
     """
     library = load_library()
     kinds = read_types(np.array(library.spectral_type, dtype=np.bytes_))
-    order = np.flatnonzero(kinds[:, 1] == CLASSES["V"])
+    dwarfs = np.flatnonzero(kinds[:, 1] == CLASSES["V"])
+    dwarfs = dwarfs[np.argsort(kinds[dwarfs, 0])]
+    subtype = kinds[dwarfs, 0]
     nm = library.wavelength_nm
-    order = order[np.argsort(kinds[order, 0])]
-    response_nm = np.array(
-        [
-            channel.quantum_efficiency(nm) * channel.transmission(nm) * nm
-            for channel in channels.values()
-        ]
-    )
-    light = library.flux[order] @ response_nm.T
-    if len(response_nm) > 1:
-        colour = light
-    else:
-        colour = library.flux[order] @ (response_nm * nm).T / light
+    responses = []
+    for channel in channels.values():
+        efficiency = channel.quantum_efficiency(nm) * channel.transmission(nm)
+        responses.append(efficiency * nm)
+    response = np.array(responses)
+    colour = library.flux[dwarfs] @ response.T
+    if len(response) == 1:
+        colour = library.flux[dwarfs] @ (response * nm).T / colour
     index = np.maximum.accumulate(-warmth(colour))
-    return lambda wanted: np.asarray(np.interp(-warmth(wanted), index, kinds[order, 0]))
+    return lambda wanted: np.asarray(np.interp(-warmth(wanted), index, subtype))
 
 
 def colours_of(file: BenchFile, stars: Stars) -> Colours:
-    """The mixtures of a bench that drives its primaries apart. Raises InputError."""
+    """The mixtures of a bench that drives its primaries separately. Raises InputError."""
     colours = bench_colours(file.config, file.folder, stars.catalog)
     if colours is None:
         raise AssertionError('colour = "star"')
     return colours
 
 
-def study_gamut(folder: Path, by_class: list[Row]) -> Iterator[Row]:
-    """Every panel before every sensor: rows of GAMUT; those of BY_CLASS are appended."""
+def gamut_stars(panel: str, sensor: str, folder: Path) -> GamutStars:
+    """The catalogue's stars of a panel before a sensor."""
+    file = file_of(folder, panel, sensor)
+    stars = bench_stars(file.config, folder)
+    colours = colours_of(file, stars)
+    subtypes = subtypes_by(named_channels(file.config.tracker, folder))
+    wanted = colours.wanted(stars)
+    shares = colours.shares(wanted)
+    channels = 1 if colours.mono else 3
+    true_subtypes = subtypes(wanted[:, :channels])
+    off = colours.off(wanted, shares)
+    warmer = np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
+    by_star = subtypes(colours.shown(shares))
+    by_white = subtypes(colours.shown(colours.of_white[None]))
+    kinds = np.floor(star_types(stars.catalog)[:, 0] / 10)
+    return GamutStars(
+        kinds=kinds[stars.row],
+        wanted=wanted,
+        off=off,
+        subtypes=np.abs(by_star - true_subtypes),
+        subtypes_white=np.abs(by_white - true_subtypes),
+        condition=float(colours.matrix.condition or math.nan),
+        out_share=float((~colours.in_gamut(off)).mean()),
+        off_percent_k=float(100 * warmer),
+    )
+
+
+def study_gamut(folder: Path) -> tuple[list[GamutRow], list[GamutClass]]:
+    """Every panel before every sensor, and mono sensors by spectral class."""
+    rows = []
+    by_class: list[GamutClass] = []
     for panel, sensor in product(PANELS, (*MONO, *SENSORS)):
-        file = file_of(folder, panel, sensor)
-        stars = bench_stars(file.config, folder)
-        colours = colours_of(file, stars)
-        subtypes = subtypes_by(named_channels(file.config.tracker, folder))
-        wanted = colours.wanted(stars)
-        shares = colours.shares(wanted)
-        own_subtypes = subtypes(wanted[:, : 1 if colours.mono else 3])
-        off = colours.off(wanted, shares)
-        warmer = np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
-        by_star, by_white = (
-            np.abs(subtypes(colours.shown(mixture)) - own_subtypes)
-            for mixture in (shares, colours.of_white[None])
-        )
-        out = (~colours.in_gamut(off)).mean()
-        condition = colours.matrix.condition or math.nan
-        at_off = np.percentile(off, (50, 95))
-        kinds = np.floor(star_types(stars.catalog)[:, 0] / 10)
-        for number, letter in enumerate(LETTERS if colours.mono else ""):
-            some = np.flatnonzero(kinds[stars.row] == number)
-            figures = (
-                float(mixture[some].mean()) for mixture in (wanted[:, 0], off, by_star, by_white)
+        stars = gamut_stars(panel, sensor, folder)
+        median, at_95 = np.percentile(stars.off, (50, 95)).tolist()
+        rows.append(
+            GamutRow(
+                panel=panel,
+                sensor=sensor,
+                condition=stars.condition,
+                out_share=stars.out_share,
+                off_median=median,
+                off_95=at_95,
+                off_percent_k=stars.off_percent_k,
+                subtypes=float(stars.subtypes.mean()),
+                subtypes_white=float(stars.subtypes_white.mean()),
             )
-            by_class.append((panel, sensor, letter, len(some), *figures))
-        yield (
-            panel,
-            sensor,
-            *map(float, (condition, out, *at_off, 100 * warmer, by_star.mean(), by_white.mean())),
         )
+        if sensor in MONO:
+            by_class += class_rows(panel, sensor, stars)
+    return rows, by_class
 
 
-def shown_stars(bench: Bench, colours: Colours, fields: int) -> Iterator[tuple[FloatArray, ...]]:
-    """Lone stars of frames: what is wanted, the shares of primaries shown (3,), light over
-    wanted (1,), and place off (2,).
-    """
+def class_rows(panel: str, sensor: str, stars: GamutStars) -> list[GamutClass]:
+    """The stars before a mono sensor by spectral class."""
+    rows = []
+    for number, letter in enumerate(LETTERS):
+        of_class = np.flatnonzero(stars.kinds == number)
+        mean_nm = float(stars.wanted[of_class, 0].mean())
+        off_nm = float(stars.off[of_class].mean())
+        subtypes = float(stars.subtypes[of_class].mean())
+        by_white = float(stars.subtypes_white[of_class].mean())
+        count = len(of_class)
+        rows.append(GamutClass(panel, sensor, letter, count, mean_nm, off_nm, subtypes, by_white))
+    return rows
+
+
+def light_by_primary(bench: Bench, levels: Levels) -> FloatArray:
+    """A frame's light by primary (h, w, 3), relative to each one's white."""
     light = srgb_response(bench.config.monitor.bits).light
     rgb = bench.calibration.response.rgb
+    if levels.ndim == 3:
+        return light[levels]
+    if rgb is None:
+        return np.repeat(light[levels][..., None], 3, axis=2)
+    return light[rgb[levels]]
+
+
+def shown_stars(bench: Bench, colours: Colours, fields: int) -> ShownStars:
+    """The lone stars of `fields` frames, anywhere on the sky."""
     white = colours.of_white * bench.flux_at_white_e_per_s
     stars = bench.shown_stars
     rng = np.random.default_rng(1)
+    wanted = []
+    shares = []
+    light = []
+    off_px = []
     for _ in range(fields):
-        q = from_radec_roll_deg(
-            rng.uniform(0, 360), math.degrees(math.asin(rng.uniform(-1, 1))), 0.0
-        )
-        levels, sprites = bench.draw(q).levels, bench.sprites(q, stars)
-        if levels.ndim == 3:
-            relative = light[levels]
-        elif rgb is None:
-            relative = np.repeat(light[levels][..., None], 3, axis=2)
-        else:
-            relative = light[rgb[levels]]
-        images = relative * white
+        ra_deg = rng.uniform(0, 360)
+        dec_deg = math.degrees(math.asin(rng.uniform(-1, 1)))
+        q = from_radec_roll_deg(ra_deg, dec_deg, 0.0)
+        images = light_by_primary(bench, bench.draw(q).levels) * white
+        sprites = bench.sprites(q, stars)
         for number, window in lone_windows(sprites, sprites.x_px, sprites.y_px, FRAME_PX, LONE):
             by_primary = images[window].sum(axis=(0, 1))
-            if not (BRIGHTEST_V_MAG < stars.v_mag[number] < FAINTEST_V_MAG and by_primary.any()):
+            is_judged = BRIGHTEST_V_MAG < stars.v_mag[number] < FAINTEST_V_MAG
+            if not (is_judged and by_primary.any()):
                 continue
-            row = int(np.flatnonzero(sprites.star == number)[0])
+            total = by_primary.sum()
             rate = float(stars.electrons_per_s[number])
-            middles = (
-                np.nan_to_num([centroid_px(images[..., k], window) for k in range(3)])
-                + colours.places_px
-            )
-            place = by_primary @ middles / by_primary.sum()
-            share = by_primary / (by_primary.sum() if colours.mono else rate)
-            place -= sprites.x_px[row], sprites.y_px[row]
-            yield (
-                colours.wanted(stars, np.array([number]))[0],
-                share,
-                by_primary.sum(keepdims=True) / rate,
-                place,
-            )
+            centroids = [centroid_px(images[..., k], window) for k in range(3)]
+            middles = np.nan_to_num(centroids) + colours.places_px
+            row = int(np.flatnonzero(sprites.star == number)[0])
+            true_px = sprites.x_px[row], sprites.y_px[row]
+            wanted.append(colours.wanted(stars, np.array([number]))[0])
+            shares.append(by_primary / (total if colours.mono else rate))
+            light.append(total / rate)
+            off_px.append(by_primary @ middles / total - true_px)
+    return ShownStars(*map(np.array, (wanted, shares, light, off_px)))
 
 
 def frame_of(bench: Bench, number: int) -> Levels:
@@ -310,56 +442,64 @@ def frame_of(bench: Bench, number: int) -> Levels:
 
 def study_choices(
     folder: Path, trackers: Mapping[str, str], fields: int, rounds: int
-) -> Iterator[Row]:
-    """Each choice before trackers by their sensors, on the LCD; frames of all are timed in turn:
-    rows of CHOICE.
-    """
+) -> Iterator[ColourChoice]:
+    """Each choice on the LCD before each tracker; the frames of all choices are timed in turn."""
     for tracker, sensor in trackers.items():
         with ExitStack() as stack:
-            benches = {
-                key: stack.enter_context(
-                    open_bench(
-                        file_of(folder, "sRGB LCD", sensor, colour=key[0], quantisation=key[1])
-                    )
-                )
-                for key in product(INKS, ("round", "exact"))
-            }
-            chosen_bench = benches["star", "exact"]
-            colours = colours_of(chosen_bench.file, chosen_bench.stars)
-            subtypes = subtypes_by(named_channels(chosen_bench.config.tracker, folder))
-            times = in_turn(
-                {" ".join(key): partial(frame_of, bench) for key, bench in benches.items()}, rounds
-            )
-            for key, bench in benches.items():
-                stars = zip(*shown_stars(bench, colours, fields), strict=True)
-                wanted, shares, flux, off = (np.array(part) for part in stars)
-                shown = colours.shown(shares)
-                # what all are off by is the alignment's
-                off = np.hypot(*(off - np.median(off, axis=0)).T)
-                flux_mag = np.abs([magnitude(float(star_flux)) for star_flux in flux[:, 0]])
-                if colours.mono:
-                    channels = np.abs(flux - 1)
-                else:
-                    channels = np.abs(shown / wanted - 1)
-                off_kind = np.abs(subtypes(shown) - subtypes(wanted[:, : shown.shape[1]])).mean()
-                off_k = 100 * np.abs(colours.temperature_factor(wanted, shares) - 1).mean()
-                at_95 = (
-                    np.percentile(star_flux, 95) for star_flux in (flux_mag, 100 * channels, off)
-                )
-                figures = (*np.min(times[" ".join(key)], axis=0), off_kind, off_k, *at_95)
-                yield (tracker, *key, len(flux), *map(float, figures))
+            benches = {}
+            works = {}
+            for colour, method in product(INKS, METHODS):
+                file = file_of(folder, "sRGB LCD", sensor, colour=colour, quantisation=method)
+                bench = stack.enter_context(open_bench(file))
+                benches[colour, method] = bench
+                works[f"{colour} {method}"] = partial(frame_of, bench)
+            known = benches["star", "exact"]
+            colours = colours_of(known.file, known.stars)
+            subtypes = subtypes_by(named_channels(known.config.tracker, folder))
+            times = in_turn(works, rounds)
+            for (colour, method), bench in benches.items():
+                stars = shown_stars(bench, colours, fields)
+                fastest = np.min(times[f"{colour} {method}"], axis=0).tolist()
+                figures = colour_figures(stars, colours, subtypes)
+                yield ColourChoice(tracker, colour, method, len(stars.light), *fastest, *figures)
 
 
-def study_lateral(folder: Path) -> Iterator[Row]:
-    """Stars of all colours over the field of a lens of 1897, and of a linear one: rows of LATERAL.
+def colour_figures(
+    stars: ShownStars, colours: Colours, subtypes: Callable[[FloatArray], FloatArray]
+) -> tuple[float, ...]:
+    """The errors of a choice: subtypes, % of temperature; mag, % of a channel, px, of 95 %."""
+    shown = colours.shown(stars.shares)
+    true_subtypes = subtypes(stars.wanted[:, : shown.shape[1]])
+    off_subtypes = np.abs(subtypes(shown) - true_subtypes).mean()
+    warmth_factor = colours.temperature_factor(stars.wanted, stars.shares)
+    off_percent_k = 100 * np.abs(warmth_factor - 1).mean()
+    light_mag = np.abs([magnitude(float(light)) for light in stars.light])
+    if colours.mono:
+        channels = np.abs(stars.light - 1)
+    else:
+        channels = np.abs(shown / stars.wanted - 1)
+    # what all are off by is the alignment's
+    off_x, off_y = (stars.off_px - np.median(stars.off_px, axis=0)).T
+    distance_px = np.hypot(off_x, off_y)
+    at_95 = [np.percentile(errors, 95) for errors in (light_mag, 100 * channels, distance_px)]
+    return tuple(map(float, (off_subtypes, off_percent_k, *at_95)))
 
-    A panel whose primaries its filter does not all pass has no row.
+
+def lens_tracker() -> Tracker:
+    """The tracker with the lens of 1897."""
+    tracker = read_bench_file(resource_path("configs", LENS)).config.tracker
+    optics = TrackerOptics(psf=str(resource_path("configs", LENS_PSF)))
+    return replace_keys(tracker, optics=optics)
+
+
+def study_lateral(folder: Path) -> Iterator[LateralColour]:
+    """Stars of all colours over the field of a lens of 1897, and of a linear one.
+
+    A panel has no row where the lens's filter blocks one of its primaries.
     """
-    planar = read_bench_file(resource_path("configs", "planar-1897.toml")).config.tracker
-    tracker = replace_keys(
-        planar, optics=TrackerOptics(psf=str(resource_path("configs", "planar-1897.fits")))
-    )
-    psf, (width, height) = tracker_psf(tracker, folder), tracker.resolution_px
+    tracker = lens_tracker()
+    psf = tracker_psf(tracker, folder)
+    width, height = tracker.resolution_px
     if not psf.by_colour:
         raise AssertionError("the file has a glass")
     for panel in PANELS:
@@ -371,172 +511,182 @@ def study_lateral(folder: Path) -> Iterator[Row]:
         except InputError:
             continue
         by_primary = colours.density @ NodeSpline(psf.wavelengths_nm)(colours.nm)
-        own_shares = StarGlass(file, psf).shares(stars, np.arange(len(stars)))
+        true_shares = StarGlass(file, psf).shares(stars, np.arange(len(stars)))
         wanted = colours.wanted(stars)
         solar = int(np.abs(stars.bv_mag - SOLAR_BV).argmin())
-        places = (
-            np.random.default_rng(1).uniform(-0.5, (width - 0.5, height - 0.5), (len(stars), 2)).T
-        )
+        corner_px = width - 0.5, height - 0.5
+        places = np.random.default_rng(1).uniform(-0.5, corner_px, (len(stars), 2)).T
         # as for a lens that is not known
-        white = colours.of_white + 0 * wanted[:, :1]
         plain = replace(colours, lateral=None)
-        for colour, known, unknown in (
-            ("white", white, white),
-            ("star", colours.shares(wanted), plain.shares(wanted)),
-        ):
-            glass = [
-                moved_px(psf, places, spectrum_shares, solar)
-                for spectrum_shares in (own_shares, known @ by_primary)
-            ]
-            means = [
-                (spectrum_shares - spectrum_shares[solar]).T / 100
-                for spectrum_shares in (wanted[:, :1], plain.shown(unknown))
-            ]
-            for lens, (sky, shown) in (("planar-1897", glass), ("linear", means)):
-                sky_px, off_px = (
-                    float(np.sqrt((spectrum_shares**2).sum(axis=0).mean()))
-                    for spectrum_shares in (sky, shown - sky)
-                )
-                yield lens, panel, colour, sky_px, off_px, off_px / sky_px
+        white = colours.of_white + 0 * wanted[:, :1]
+        shares = {"white": white, "star": colours.shares(wanted)}
+        plain_shares = {"white": white, "star": plain.shares(wanted)}
+        sky_px = moved_px(psf, places, true_shares, solar)
+        linear_sky_px = linear_px(wanted[:, :1], solar)
+        for colour, mixture in shares.items():
+            shown_px = moved_px(psf, places, mixture @ by_primary, solar)
+            yield lateral_colour("planar-1897", panel, colour, sky_px, shown_px)
+            linear_shown_px = linear_px(plain.shown(plain_shares[colour]), solar)
+            yield lateral_colour("linear", panel, colour, linear_sky_px, linear_shown_px)
+
+
+def lateral_colour(
+    lens: str, panel: str, colour: str, sky_px: FloatArray, shown_px: FloatArray
+) -> LateralColour:
+    """A row by the places (axes, n) of stars in the sky and as they are shown."""
+    size_px = distance_rms_px(sky_px)
+    off_px = distance_rms_px(shown_px - sky_px)
+    return LateralColour(lens, panel, colour, size_px, off_px, off_px / size_px)
+
+
+def distance_rms_px(places_px: FloatArray) -> float:
+    """The rms distance of places (axes, n)."""
+    return float(np.sqrt((places_px**2).sum(axis=0).mean()))
+
+
+def linear_px(mean_nm: FloatArray, against: int) -> FloatArray:
+    """The shift by a linear lens of stars of mean wavelengths (n, 1), px, against one of them."""
+    return np.asarray((mean_nm - mean_nm[against]).T / 100)
 
 
 def moved_px(psf: Psf, places_px: FloatArray, spectra: FloatArray, against: int) -> FloatArray:
-    """By how much spectra (n, L) move stars at places (2, n), px, against one of them there."""
-    centroids = []
-    for spectrum_shares in (spectra, spectra[against]):
-        centroids.append(psf.centroids_px(places_px[0], places_px[1], spectrum_shares)[:2])
-    return np.asarray(np.stack(centroids[0]) - np.stack(centroids[1]))
+    """The shift of spectra (n, L) at places (2, n), px, against one of them at the same places."""
+    x_px, y_px = places_px
+    moved = np.stack(psf.centroids_px(x_px, y_px, spectra)[:2])
+    reference = np.stack(psf.centroids_px(x_px, y_px, spectra[against])[:2])
+    return np.asarray(moved - reference)
 
 
-def study_mosaic(channels: Sequence[Optics]) -> Iterator[Row]:
-    """Noiseless stars in a mosaic, found as `hilstar tracker` does: rows of PLACES."""
-    steps = np.arange(PHASES) / PHASES * 2
-    y_px, x_px = (TILE_PX // 2 + grid.ravel() for grid in np.meshgrid(steps, steps, indexing="ij"))
+def mosaic_image(sigma_px: float, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """Stars at places (PHASES^2,) within tiles of their own, row by row, as one image."""
     at = np.arange(TILE_PX)
+    across = (at - x_px[:, None])[:, None, :]
+    down = (at - y_px[:, None])[:, :, None]
+    tiles = GaussianPsf((sigma_px, sigma_px)).shares(across, down)
+    in_rows = tiles.reshape(PHASES, PHASES, TILE_PX, TILE_PX).swapaxes(1, 2)
+    return in_rows.reshape(PHASES * TILE_PX, PHASES * TILE_PX)
+
+
+def study_mosaic(channels: Sequence[Optics]) -> Iterator[MosaicPlaces]:
+    """Noiseless stars in a mosaic, found as `hilstar tracker` does."""
+    steps = np.arange(PHASES) / PHASES * 2
+    down, across = np.meshgrid(steps, steps, indexing="ij")
+    x_px = TILE_PX // 2 + across.ravel()
+    y_px = TILE_PX // 2 + down.ravel()
     for sigma_px, kelvin in product(SIGMAS_PX, STARS_K):
         rates = [float(dgs_electrons_per_s(kelvin, channel, Photometry())) for channel in channels]
-        shares = GaussianPsf((sigma_px, sigma_px)).shares(
-            (at - x_px[:, None])[:, None, :], (at - y_px[:, None])[:, :, None]
-        )
-        stars = (
-            shares.reshape(PHASES, PHASES, TILE_PX, TILE_PX)
-            .swapaxes(1, 2)
-            .reshape((PHASES * TILE_PX,) * 2)
-        )
+        stars = mosaic_image(sigma_px, x_px, y_px)
         raw = in_pixels([stars * rate / max(rates) for rate in rates], "rggb")
-        for name, image, spread_px in (
-            ("mosaic", raw, 0.0),
-            ("superpixel", luminance(raw), SUPERPIXEL_VARIANCE_PX2),
-        ):
+        images = {"mosaic": (raw, 0.0), "superpixel": (luminance(raw), SUPERPIXEL_VARIANCE_PX2)}
+        for name, (image, spread_px) in images.items():
             width_px = math.sqrt(sigma_px**2 + spread_px)
-            settings = CentroidSettings(
-                window_sigma_px=max(1.0, width_px),
-                psf_sigma_px=(width_px, width_px),
-                minimum_pixels=2,
-            )
-            centroids = find_stars(image, settings, LocalBackground(0.0, 1e-3))
-            tiles = np.stack([centroids.x_px // TILE_PX, centroids.y_px // TILE_PX]).astype(np.intp)
-            # the brightest of a tile
-            first = np.unique(tiles[1] * PHASES + tiles[0], return_index=True)[1]
-            column, row = tiles[:, first]
-            true_x, true_y = (TILE_PX * tile + TILE_PX // 2 + steps[tile] for tile in (column, row))
-            off = np.concatenate([centroids.x_px[first] - true_x, centroids.y_px[first] - true_y])
-            yield sigma_px, kelvin, name, float(np.sqrt((off**2).mean())), float(np.abs(off).max())
+            off_px = mosaic_off_px(image, width_px, steps)
+            rms_px = float(np.sqrt((off_px**2).mean()))
+            yield MosaicPlaces(sigma_px, kelvin, name, rms_px, float(np.abs(off_px).max()))
 
 
-def draw(path: Path, rows: Sequence[Row], load: Load) -> str:
+def mosaic_off_px(image: FloatArray, width_px: float, steps: FloatArray) -> FloatArray:
+    """The errors of the places of stars in an image of tiles, px: along x, then along y."""
+    settings = CentroidSettings(
+        window_sigma_px=max(1.0, width_px), psf_sigma_px=(width_px, width_px), minimum_pixels=2
+    )
+    centroids = find_stars(image, settings, LocalBackground(0.0, 1e-3))
+    columns = (centroids.x_px // TILE_PX).astype(np.intp)
+    rows = (centroids.y_px // TILE_PX).astype(np.intp)
+    # the brightest of a tile
+    first = np.unique(rows * PHASES + columns, return_index=True)[1]
+    true_x = TILE_PX * columns[first] + TILE_PX // 2 + steps[columns[first]]
+    true_y = TILE_PX * rows[first] + TILE_PX // 2 + steps[rows[first]]
+    return np.concatenate([centroids.x_px[first] - true_x, centroids.y_px[first] - true_y])
+
+
+def draw(path: Path, rows: Sequence[ColourChoice], load: Load) -> str:
     """The chart of the choices; its finding."""
-    choices = [dict(zip(CHOICE, row, strict=True)) for row in rows]
-    exact = {
-        choice["colour"]: choice
-        for choice in choices
-        if (choice["tracker"], choice["method"]) == ("Bayer", "exact")
-    }
-    star = exact["star"]
-    white = exact["white"]
+    subtypes = {}
+    for row in rows:
+        if row.tracker == "Bayer" and row.method == "exact":
+            subtypes[row.colour] = row.subtypes
     finding = (
-        f"Each star's own mixture is {star['subtypes']:.2g} subtypes off before a Bayer tracker,"
-        f" white {white['subtypes']:.0f}"
+        f"Each star's own mixture is {subtypes['star']:.2g} subtypes off before a Bayer tracker,"
+        f" white {subtypes['white']:.0f}"
     )
-    note = (
-        "Full: exact; open: round. Circles: mono; triangles: mono to 700 nm; squares: Bayer. Lone"
-        " stars of"
+    looks = {}
+    for tracker, colour, method in product(MARKERS, INKS, METHODS):
+        is_open = method != "exact"
+        look = SeriesLook(colour, INKS[colour], MARKERS[tracker], is_open)
+        looks[tracker, colour, method] = look
+    published = LevelLine(
+        PUBLISHED_SUBTYPES, f"published, {PUBLISHED_SUBTYPES:g}", GREEN, ":", PUBLISHED_WIDTH
     )
-    note += " V = 1 to 5.5 on an sRGB LCD of 8 bits."
-    labels = {
-        "subtypes": "colour, mean\n[subtypes]",
-        "mag": "flux, 95 %\n[mag]",
-        "px": "place, 95 %\n[px]",
-    }
-    with chart(path, finding, 3, note=load.note(note)) as axes:
-        for axis, (name, label) in zip(axes, labels.items(), strict=True):
-            for choice in choices:
-                ink = INKS[str(choice["colour"])]
-                marker = MARKERS[str(choice["tracker"])]
-                face = ink if choice["method"] == "exact" else "none"
-                axis.loglog(
-                    choice["cpu_ms"], choice[name], marker, ms=7, color=ink, markerfacecolor=face
-                )
-            axis.set_ylabel(label)
-        for name, ink in INKS.items():
-            axes[0].plot([], [], "o", color=ink, label=name)
-        axes[0].axhline(
-            PUBLISHED_SUBTYPES,
-            color=GREEN,
-            linestyle=":",
-            label=f"published, {PUBLISHED_SUBTYPES:g}",
-        )
-        axes[0].legend(loc="upper center", bbox_to_anchor=(0.5, 1.25), ncols=4, frameon=False)
-        axes[2].set_xlabel("frame, CPU time [ms]")
+    first = replace(
+        choice_panel("subtypes", "colour, mean\n[subtypes]"),
+        levels=(published,),
+        keys=tuple(SeriesLook(name, ink) for name, ink in INKS.items()),
+        legend=LEGEND,
+    )
+    light = choice_panel("mag", "flux, 95 %\n[mag]")
+    place = replace(choice_panel("px", "place, 95 %\n[px]"), xlabel="frame, CPU time [ms]")
+    spec = ChartSpec((first, light, place), choice_of, looks, NOTE)
+    draw_rows(path, finding, spec, rows, load)
     return finding
+
+
+def choice_of(row: ColourChoice) -> tuple[str, str, str]:
+    """The series of a row: a tracker and a choice."""
+    return row.tracker, row.colour, row.method
+
+
+def choice_panel(error: str, ylabel: str) -> PanelSpec:
+    """An error of the choices against their time, a point each."""
+    points = LineSpec("cpu_ms", error, "", named=False, look=POINT)
+    return PanelSpec((points,), ylabel, scales=("log", "log"), names=False)
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write colour.csv and its chart, and the tables colour_gamut, _class, _lateral, _red and
     _mosaic; findings.
     """
+    fields = FIELDS
+    rounds = ROUNDS
+    before = dict(TRACKERS)
+    if quick:
+        fields = QUICK_FIELDS
+        rounds = QUICK_ROUNDS
+        before = {name: TRACKERS[name] for name in QUICK_TRACKERS}
     others = OtherWork()
     with TemporaryDirectory() as name:
         folder = Path(name)
         write_spectra(folder)
-        by_class: list[Row] = []
-        gamut = list(study_gamut(folder, by_class))
+        gamut, by_class = study_gamut(folder)
         lateral = list(study_lateral(folder))
-        before = dict([*TRACKERS.items()][: 2 if quick else None])
-        choices = list(
-            study_choices(
-                folder, before, *((QUICK_FIELDS, QUICK_ROUNDS) if quick else (FIELDS, ROUNDS))
-            )
-        )
-        trackers = {}
+        choices = list(study_choices(folder, before, fields, rounds))
+        red = []
         for sensor in (*MONO, *SENSORS):
-            trackers[sensor] = file_of(folder, "OLED", sensor).config.tracker
-        red = [
-            (name, *class_shares(bench_optics(tracker_name, folder), RED_NM).values())
-            for name, tracker_name in trackers.items()
-        ]
-        mosaic = list(study_mosaic(bench_channels(trackers["Bayer, wide dyes"], folder)))
-    three = (
-        ("", CHOICE, choices),
-        ("_gamut", GAMUT, gamut),
-        ("_class", BY_CLASS, by_class),
-        ("_lateral", LATERAL, lateral),
-    )
-    for table, columns, rows in (
-        *three,
-        ("_red", ("sensor", *LETTERS), red),
-        ("_mosaic", PLACES, mosaic),
-    ):
-        write_csv(directory / f"colour{table}.csv", columns, rows)
+            tracker = file_of(folder, "OLED", sensor).config.tracker
+            shares = class_shares(bench_optics(tracker, folder), RED_NM)
+            red.append((sensor, *shares.values()))
+        wide = file_of(folder, "OLED", TRACKERS["Bayer"]).config.tracker
+        mosaic = list(study_mosaic(bench_channels(wide, folder)))
+    write_rows(directory / "colour.csv", choices)
+    write_rows(directory / "colour_gamut.csv", gamut)
+    write_rows(directory / "colour_class.csv", by_class)
+    write_rows(directory / "colour_lateral.csv", lateral)
+    write_csv(directory / "colour_red.csv", ("sensor", *LETTERS), red)
+    write_rows(directory / "colour_mosaic.csv", mosaic)
     load = others.load()
     lines = [draw(directory / "colour", choices, load)]
-    lines += [
-        f"lateral colour of {lens} by {by} on {on}: off by {off:.0%} of the sky's"
-        for lens, on, by, *_, off in lateral
-    ]
-    lines += [
-        f"a star of {px:g} px, {k:g} K, is {rms:.3f} px off rms in a {name}"
-        for px, k, name, rms, _ in mosaic
-        if px == 1
-    ]
+    lines += [lateral_line(row) for row in lateral]
+    lines += [mosaic_line(row) for row in mosaic if row.sigma_px == QUOTED_SIGMA_PX]
     return load.judged(lines)
+
+
+def lateral_line(row: LateralColour) -> str:
+    """A row in words."""
+    of = f"lateral colour of {row.lens} by {row.colour} on {row.panel}"
+    return f"{of}: off by {row.off_share:.0%} of the sky's"
+
+
+def mosaic_line(row: MosaicPlaces) -> str:
+    """A row in words."""
+    star = f"a star of {row.sigma_px:g} px, {row.temperature_k:g} K"
+    return f"{star}, is {row.rms_px:.3f} px off rms in a {row.image}"

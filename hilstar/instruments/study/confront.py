@@ -7,24 +7,29 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from hilstar.basics.charts import BLUE, MUTED, ORANGE, SMALL_PT, chart, write_records
+from hilstar.basics.charts import BLUE, MUTED, ORANGE, SMALL_PT, chart
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import make_directory
 from hilstar.instruments.confront.report import Confronted
 from hilstar.instruments.confront.run import confront
+from hilstar.instruments.study.engine import values, write_rows
 
 ENDINGS = frozenset({".fits", ".fit", ".fz", ".tif", ".tiff", ".png", ".jpg", ".jpeg"})
 MIN_HELD_OUT = 3  # images of a camera: two fit it, one tests it
+ERRORS = {"px": "px per axis", "mag": "mag"}  # of a row, by the end of its fields, and their units
+NOTE = "Bars: with a camera that all images of it fitted. Points: with the camera of the others."
 FORM = "a folder for each camera: guess.toml, which holds its [tracker], and its images"
 
 
 @dataclass(frozen=True, slots=True)
-class PhotographFound:
-    """One image: how far stars to V = 6.5 are off, alone and by a camera that other images
-    fitted; NaN where not measured.
+class PhotographRow:
+    """One image: errors of its stars to V = 6.5 in a fit of all images, and when it is held out.
+
+    NaN where not measured.
     """
 
     camera: str
@@ -48,21 +53,20 @@ def run(directory: Path, images: Path, quick: bool = False) -> list[str]:
 
     With `quick` no image is held out. Raises InputError where `images` has no cameras.
     """
-    cameras = sorted(
-        folder.parent for folder in {*images.glob("guess.toml"), *images.glob("*/guess.toml")}
-    )
-    if not cameras:
+    guesses = {*images.glob("guess.toml"), *images.glob("*/guess.toml")}
+    if not guesses:
         raise InputError(f"{images}: has no guess.toml; give {FORM}")
-    camera_rows = [
-        row for folder in cameras for row in confront_camera(folder, directory / folder.name, quick)
-    ]
-    write_records(directory / "confront.csv", camera_rows)
-    draw(directory / "confront", camera_rows)
-    return [line_of(row) for row in camera_rows]
+    rows = []
+    for guess in sorted(guesses, key=lambda path: path.parent):
+        camera = guess.parent
+        rows += confront_camera(camera, directory / camera.name, quick)
+    write_rows(directory / "confront.csv", rows)
+    draw(directory / "confront", rows)
+    return [line_of(row) for row in rows]
 
 
-def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographFound]:
-    """The images of one camera, together and each by the others."""
+def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographRow]:
+    """The images of one camera: fitted together, and each held out."""
     paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in ENDINGS)
     if not paths:
         raise InputError(f"{folder}: has no image; give {FORM}")
@@ -73,28 +77,33 @@ def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographF
         try:
             fitted = confront(folder / "guess.toml", paths, output)
         except InputError as error:
-            # the image that the message names, or all of them
-            text = str(error)
-            named = [path for path in paths if str(path) in text or text.startswith(path.name)]
-            wrong = named[:1] or paths
-            why = re.sub(r"\S*/", "", text).split(": ", 1)[-1]
+            wrong = wrong_images(str(error), paths)
+            why = re.sub(r"\S*/", "", str(error)).split(": ", 1)[-1]
             for path in wrong:
-                refused.append(PhotographFound(folder.name, path.name, refused=why))
+                refused.append(PhotographRow(folder.name, path.name, refused=why))
             paths = [path for path in paths if path not in wrong]
     if fitted is None:
         return refused
-    rows = [row_of(folder.name, fitted, number) for number in range(len(fitted.verdicts))]
-    names = [path.name for path in paths]
-    if not quick and len(rows) == len(paths) >= MIN_HELD_OUT:
-        rows = [held_out(row, folder, output, paths) if row.image in names else row for row in rows]
+    count = len(fitted.verdicts)
+    rows = [row_of(folder.name, fitted, number) for number in range(count)]
+    if not quick and count == len(paths) >= MIN_HELD_OUT:
+        rows = [held_out(row, folder, output, paths) for row in rows]
     return rows + refused
 
 
-def row_of(camera: str, found: Confronted, number: int) -> PhotographFound:
+def wrong_images(refusal: str, paths: Sequence[Path]) -> Sequence[Path]:
+    """The image that a refusal names, or all of them."""
+    for path in paths:
+        if str(path) in refusal or refusal.startswith(path.name):
+            return [path]
+    return paths
+
+
+def row_of(camera: str, confronted: Confronted, number: int) -> PhotographRow:
     """The figures of one image of a confrontation."""
-    verdict = found.verdicts[number]
-    session = found.session
-    return PhotographFound(
+    verdict = confronted.verdicts[number]
+    session = confronted.session
+    return PhotographRow(
         camera=camera,
         image=verdict.shot.photo.name,
         stars=verdict.counted,
@@ -109,39 +118,45 @@ def row_of(camera: str, found: Confronted, number: int) -> PhotographFound:
 
 
 def held_out(
-    row: PhotographFound, folder: Path, output: Path, paths: Sequence[Path]
-) -> PhotographFound:
-    """The row with what a camera of the other images leaves of this one."""
-    own_path = next(path for path in paths if path.name == row.image)
-    others = output / "held_out" / own_path.stem / "fit"
-    test = output / "held_out" / own_path.stem / "test"
-    for place in (output / "held_out", others.parent, others, test):
+    row: PhotographRow, folder: Path, output: Path, paths: Sequence[Path]
+) -> PhotographRow:
+    """The row with its errors by a camera that the other images fit."""
+    own_path = next((path for path in paths if path.name == row.image), None)
+    if own_path is None:
+        return row
+    folders = output / "held_out" / own_path.stem
+    others = folders / "fit"
+    test = folders / "test"
+    for place in (folders.parent, folders, others, test):
         make_directory(place)
+    other_paths = [path for path in paths if path != own_path]
     try:
-        confront(folder / "guess.toml", [path for path in paths if path != own_path], others)
-        verdict = confront(others / "tracker.toml", [own_path], test, fixed=True).verdicts[0]
+        confront(folder / "guess.toml", other_paths, others)
+        confronted = confront(others / "tracker.toml", [own_path], test, fixed=True)
     except InputError:  # too few stars without it: nothing is held out
         return row
+    verdict = confronted.verdicts[0]
     return replace(row, held_out_px=verdict.rms_px, held_out_mag=verdict.rms_mag)
 
 
-def line_of(row: PhotographFound) -> str:
+def line_of(row: PhotographRow) -> str:
     """One image in words."""
     name = f"{row.camera}/{row.image}"
     if row.refused:
         return f"{name}: refused: {row.refused}"
+    errors = f"{row.rms_px:.3f} px and {row.rms_mag:.3f} mag"
+    sources = f"{row.unexplained} of {row.sources} sources unexplained"
     line = (
-        f"{name}: {row.stars} stars to V = 6.5 within {row.rms_px:.3f} px and {row.rms_mag:.3f}"
-        f" mag, background chi2 {row.background_chi2:.2f}, {row.unexplained} of {row.sources}"
-        f" sources unexplained, DN go as light to the power {row.linearity:.2f}"
+        f"{name}: {row.stars} stars to V = 6.5 within {errors}, background chi2"
+        f" {row.background_chi2:.2f}, {sources}, DN go as light to the power {row.linearity:.2f}"
     )
     if math.isnan(row.held_out_px):
         return line
     return f"{line}; held out {row.held_out_px:.3f} px, {row.held_out_mag:.3f} mag"
 
 
-def short_name(row: PhotographFound, rows: Sequence[PhotographFound]) -> str:
-    """The words of an image's name that not all images of its camera share, whole."""
+def short_name(row: PhotographRow, rows: Sequence[PhotographRow]) -> str:
+    """An image's name without the words that all images of its camera share."""
     parts = Path(row.image).stem.split("_")
     others = []
     for other in rows:
@@ -153,31 +168,25 @@ def short_name(row: PhotographFound, rows: Sequence[PhotographFound]) -> str:
     return " ".join(word for word in parts if word not in shared)
 
 
-def draw(path: Path, found: Sequence[PhotographFound]) -> None:
-    """Bars of what is left of places and light in each image, and points of what is left when it
-    is held out.
+def draw(path: Path, rows: Sequence[PhotographRow]) -> None:
+    """Bars of the errors of places and light in each image, and points of those when it is held
+    out.
     """
-    rows = [row for row in found if not row.refused]
-    if not rows:
+    measured = [row for row in rows if not row.refused]
+    if not measured:
         return
-    best = min(row.rms_px for row in rows)
-    worst = max(row.rms_px for row in rows)
-    of = f"{len(rows)} photograph{'s' * (len(rows) > 1)}"
+    best = min(row.rms_px for row in measured)
+    worst = max(row.rms_px for row in measured)
+    of = f"{len(measured)} photograph{'s' * (len(measured) > 1)}"
     finding = f"{of}: stars to V = 6.5 are {best:.2f} to {worst:.2f} px off their places"
-    note = (
-        "Bars: with a camera that all images of it fitted. Points: with the camera of the others."
-    )
-    places = np.arange(len(rows))
-    with chart(
-        path, finding, 1, 2, note=note, share_x=False, height_inch=1.6 + 0.3 * len(rows)
-    ) as panels:
-        for axes, kind, unit in zip(panels, ("px", "mag"), ("px per axis", "mag"), strict=True):
-            axes.barh(places, [getattr(row, f"rms_{kind}") for row in rows], color=BLUE, height=0.6)
-            axes.plot(
-                [getattr(row, f"held_out_{kind}") for row in rows], places, "o", color=ORANGE, ms=5
-            )
+    places = np.arange(len(measured))
+    layout: dict[str, Any] = {"share_x": False, "height_inch": 1.6 + 0.3 * len(measured)}
+    with chart(path, finding, 1, 2, note=NOTE, **layout) as panels:
+        for axes, (kind, unit) in zip(panels, ERRORS.items(), strict=True):
+            axes.barh(places, values(measured, f"rms_{kind}"), color=BLUE, height=0.6)
+            axes.plot(values(measured, f"held_out_{kind}"), places, "o", color=ORANGE, ms=5)
             axes.set(xlabel=f"rms [{unit}]", xlim=(0, None))
             axes.set_yticks(places, [])
             axes.invert_yaxis()
-        labels = [f"{row.camera}, {short_name(row, rows)}" for row in rows]
+        labels = [f"{row.camera}, {short_name(row, measured)}" for row in measured]
         panels[0].set_yticks(places, labels, fontsize=SMALL_PT, color=MUTED)

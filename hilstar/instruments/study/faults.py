@@ -2,6 +2,7 @@
 light.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -9,21 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.basics.charts import BLUE, GREEN, chart, write_records
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import BLUE, GREEN
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from hilstar.basics.units import NS_PER_S, magnitude
 from hilstar.display.quantise import shown_light
-from hilstar.instruments.study.row_charts import (
+from hilstar.display.response import Levels
+from hilstar.instruments.study.engine import (
     ChartSpec,
+    DotsSpec,
     LevelLine,
     LineSpec,
-    PairSpec,
     PanelSpec,
     SeriesLook,
-    draw_pairs,
     draw_rows,
     finite,
-    name_places,
+    row_panels,
+    write_rows,
 )
 from hilstar.instruments.study.study_benches import (
     FULL_HD,
@@ -36,7 +39,7 @@ from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.optics.extended import GlowLight
 from hilstar.optics.layers.fault_kinds import Freeze, Now, fault_of
 from hilstar.optics.layers.faults import FaultLayer
-from hilstar.optics.sprites import join_sprites
+from hilstar.optics.sprites import FrameLight, join_sprites
 from hilstar.server.bench.fault_views import display_view
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.scenario import FaultSchedule, Scenario
@@ -76,6 +79,12 @@ STRAY_PANEL = PanelSpec(
     scales=("log", "log"),
 )
 LOST_MAG = 1.0  # a star this much too faint is not the star that was asked for
+NOTHING_MAG = 99.0  # of a star that shows nothing
+EVEN_RAD = 100.0  # the width of a glow that is even over any field
+COSTS_NOTE = (
+    "Filled: a frame with the fault. Open: the same frame without it, in turn in the same run."
+    " Medians; 1920 x 1080."
+)
 
 NOWHERE = "a scenario, nothing on"
 CASES: dict[str, list[dict[str, Any]]] = {
@@ -112,9 +121,7 @@ CASES: dict[str, list[dict[str, Any]]] = {
 
 @dataclass(frozen=True, slots=True)
 class FaultCost:
-    """One case: median times of a frame, ms, with the fault and without any, in turn in the same
-    run.
-    """
+    """One case: the median time of a frame with and without the fault, ms, in turn in one run."""
 
     quantisation: str
     case: str
@@ -125,8 +132,9 @@ class FaultCost:
 
 @dataclass(frozen=True, slots=True)
 class Stray:
-    """Stars over even stray light of a share of white: the error of their light in the codes,
-    and the share that is lost.
+    """Stars over even stray light: the errors of their light in the codes, mag, and the share lost.
+
+    The stray light is a share of white.
     """
 
     quantisation: str
@@ -139,7 +147,8 @@ class Stray:
 
 def bench_of(folder: Path, quantisation: str) -> Bench:
     """The bench of a study: an 8-bit monitor of 1920 x 1080 before a tracker of 11 degrees."""
-    np.save(folder / "stray.npy", np.hypot(*np.indices((256, 256))) * 3.0)
+    from_corner = np.hypot(*np.indices((256, 256)))
+    np.save(folder / "stray.npy", from_corner * 3.0)
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
         "monitor": {**FULL_HD, "refresh_hz": REFRESH_HZ},
@@ -149,74 +158,85 @@ def bench_of(folder: Path, quantisation: str) -> Bench:
     return study_bench(folder / f"{quantisation}.toml", tables)
 
 
+def attitude_of(frame: int) -> FloatArray:
+    """The attitude (unit quaternion) of a frame of the slew."""
+    return propagate(FIELD, SLEW_RAD_S, frame / REFRESH_HZ)
+
+
+class CaseFrames:
+    """The frames of a bench under the faults of a case, and the same frames without any."""
+
+    def __init__(self, bench: Bench, folder: Path, case: str) -> None:
+        self.bench = bench
+        faults = []
+        for number, table in enumerate(CASES[case]):
+            faults.append(fault_of({"name": f"fault {number}", **table}))
+        scenario = Scenario(folder / "faults.toml", "", 1, tuple(faults), folder)
+        self.view = display_view(bench, scenario)
+        # A run asks its schedule in every frame, whatever it has on.
+        later = fault_of({"kind": "blank", "name": "later", "at_s": 1e6})
+        self.schedule = FaultSchedule(replace(scenario, faults=(later,)), 1 / REFRESH_HZ)
+        self.prepared = [self.view.prepare(fault) for fault in faults]
+        self.is_frozen = any(isinstance(fault, Freeze) for fault in self.prepared)
+
+    def without(self, frame: int) -> Levels:
+        """A frame without faults."""
+        return self.bench.draw(attitude_of(frame)).levels
+
+    def with_faults(self, frame: int) -> Levels:
+        """The same frame with the faults."""
+        t_ns = round(frame / REFRESH_HZ * NS_PER_S)
+        self.schedule.at(t_ns)
+        faults = enumerate(self.prepared, start=1)
+        now = tuple(Now(number, fault, t_ns) for number, fault in faults)
+        effects = FaultLayer(self.view, now)
+        if self.is_frozen:
+            return self.bench.renderer.levels()
+        if effects.blank:
+            return self.bench.draw_sprites(None).levels
+        turned_view = effects.turned(self.bench.view(attitude_of(frame)))
+        layer = effects if effects.now else None
+        return self.bench.draw_sprites(self.bench.light(turned_view, layer)).levels
+
+
 def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
     """The time of a frame with the faults of a case and without any, in turn."""
-    faults = tuple(fault_of({"name": f"fault {k}", **table}) for k, table in enumerate(CASES[case]))
-    scenario = Scenario(folder / "faults.toml", "", 1, faults, folder)
-    view = display_view(bench, scenario)
-    waiting = fault_of({"kind": "blank", "name": "later", "at_s": 1e6})
-    schedule = FaultSchedule(replace(scenario, faults=(waiting,)), 1 / REFRESH_HZ)
-    ready = [view.prepare(fault) for fault in faults]
-
-    def plain(k: int) -> object:
-        return bench.draw(propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)).levels
-
-    def faulty(k: int) -> object:
-        t_ns = round(k / REFRESH_HZ * NS_PER_S)
-        schedule.at(t_ns)
-        effects = FaultLayer(
-            view, tuple(Now(n, fault, t_ns) for n, fault in enumerate(ready, start=1))
-        )
-        if any(isinstance(fault, Freeze) for fault in ready):
-            return bench.renderer.levels()
-        if effects.blank:
-            return bench.draw_sprites(None).levels
-        turned_view = effects.turned(bench.view(propagate(FIELD, SLEW_RAD_S, k / REFRESH_HZ)))
-        return bench.draw_sprites(bench.light(turned_view, effects if effects.now else None)).levels
-
-    ms = medians_ms({"without": plain, "with": faulty}, rounds)
-    return FaultCost(
-        bench.config.render.quantisation,
-        case,
-        ms["with"],
-        ms["without"],
-        ms["with"] - ms["without"],
-    )
+    frames = CaseFrames(bench, folder, case)
+    ms = medians_ms({"without": frames.without, "with": frames.with_faults}, rounds)
+    quantisation = bench.config.render.quantisation
+    cost_ms = ms["with"] - ms["without"]
+    return FaultCost(quantisation, case, ms["with"], ms["without"], cost_ms)
 
 
 def stray_light(bench: Bench, share: float) -> Stray:
-    """Each star's light in the codes over even stray light: the frame with the stars, less the
-    same without them.
-    """
-    white = bench.flux_at_white_e_per_s
+    """The errors of stars over even stray light, by frames with them and without them."""
     sprites = bench.light(bench.view(FIELD))
-    # 100 rad wide: even
-    glow = GlowLight(np.array([0.0, 0.0, 1.0]), share * white, 100.0, 1.0, bench.camera)
-    lights = (glow,) if share else ()
-    both, alone = (
-        shown_light(
-            bench.draw_sprites(replace(sprite_set, extended=lights)).levels, bench.panel
-        ).copy()
-        for sprite_set in (sprites, join_sprites([], sprites.footprint_px))
-    )
-    off_mag = []
-    for star, window in lone_windows(
-        sprites, sprites.x_px, sprites.y_px, bench.camera.resolution_px, ISOLATION
-    ):
-        wanted = float(sprites.data["electrons_per_s"][sprites.star == star].sum())
-        got = float((both[window] - alone[window]).sum())
-        off_mag.append(magnitude(got / wanted) if got > 0 else np.inf)
-    errors = np.abs(np.array(off_mag))
-    finite_errors = np.where(np.isfinite(errors), errors, 99.0)
-    median, p95 = np.percentile(finite_errors, (50, 95)).tolist()
-    return Stray(
-        bench.config.render.quantisation,
-        share,
-        len(finite_errors),
-        median,
-        p95,
-        float((finite_errors > LOST_MAG).mean()),
-    )
+    lights: tuple[GlowLight, ...] = ()
+    if share:
+        boresight = np.array([0.0, 0.0, 1.0])
+        light_e_per_s = share * bench.flux_at_white_e_per_s
+        lights = (GlowLight(boresight, light_e_per_s, EVEN_RAD, 1.0, bench.camera),)
+    both = light_of(bench, replace(sprites, extended=lights))
+    no_sprites = join_sprites([], sprites.footprint_px)
+    alone = light_of(bench, replace(no_sprites, extended=lights))
+    rates = sprites.data["electrons_per_s"]
+    size_px = bench.camera.resolution_px
+    errors_mag = []
+    for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, size_px, ISOLATION):
+        true = float(rates[sprites.star == star].sum())
+        shown = float((both[window] - alone[window]).sum())
+        error_mag = NOTHING_MAG
+        if shown > 0:
+            error_mag = abs(magnitude(shown / true))
+        errors_mag.append(error_mag)
+    median, p95 = np.percentile(errors_mag, (50, 95)).tolist()
+    lost = float((np.array(errors_mag) > LOST_MAG).mean())
+    return Stray(bench.config.render.quantisation, share, len(errors_mag), median, p95, lost)
+
+
+def light_of(bench: Bench, sprites: FrameLight) -> FloatArray:
+    """The light (h, w) of the panel when it shows a frame of sprites."""
+    return shown_light(bench.draw_sprites(sprites).levels, bench.panel).copy()
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
@@ -225,7 +245,8 @@ def run(directory: Path, quick: bool = False) -> Judged:
     """
     costs: list[FaultCost] = []
     strays: list[Stray] = []
-    rounds, shares = (QUICK_ROUNDS, QUICK_SHARES) if quick else (ROUNDS, SHARES)
+    rounds = QUICK_ROUNDS if quick else ROUNDS
+    shares = QUICK_SHARES if quick else SHARES
     others = OtherWork()
     with TemporaryDirectory() as name:
         for quantisation in QUANTISATIONS:
@@ -234,86 +255,100 @@ def run(directory: Path, quick: bool = False) -> Judged:
                 costs += [cost_of(bench, Path(name), case, rounds) for case in CASES]
                 strays += [stray_light(bench, share) for share in shares]
     load = others.load()
-    write_records(directory / "faults-cost.csv", costs)
-    write_records(directory / "faults-stray.csv", strays)
+    write_rows(directory / "faults-cost.csv", costs)
+    write_rows(directory / "faults-stray.csv", strays)
     draw_stray(directory / "faults", strays)
     draw_costs(directory / "faults_cost", costs, load)
-    findings = []
-    for quantisation in QUANTISATIONS:
-        mine = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
-        off = mine[NOWHERE]
-        star = mine["false star, on the sky"]
-        dearest = max(mine.values(), key=lambda cost: cost.cost_ms)
-        findings.append(
-            f"{quantisation}: of a frame of {off.without_ms:.1f} ms a scenario with nothing on"
-            f" takes {off.cost_ms:+.2f} ms, a false star {star.cost_ms:+.2f} ms; the dearest,"
-            f" {dearest.case}, {dearest.cost_ms:+.1f} ms"
-        )
-    for quantisation in QUANTISATIONS:
-        share = spoilt_from(strays, quantisation)
-        if share is None:
-            limit = "no stray light here"
-        else:
-            limit = f"stray light of {share:g} of white"
-        findings.append(
-            f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from"
-            f" {limit} on"
-        )
-    return load.judged(findings)
+    lines = [cost_line(costs, quantisation) for quantisation in QUANTISATIONS]
+    lines += [stray_line(strays, quantisation) for quantisation in QUANTISATIONS]
+    return load.judged(lines)
 
 
-def spoilt_from(strays: list[Stray], quantisation: str) -> float | None:
-    """The stray light, share of white, above which stars are off by more than SPOILT_MAG; None
-    where none spoils them.
+def cost_line(costs: Sequence[FaultCost], quantisation: str) -> str:
+    """The cost of a scenario without faults, of a false star and of the dearest fault, in words."""
+    by_case = {cost.case: cost for cost in costs if cost.quantisation == quantisation}
+    nothing = by_case[NOWHERE]
+    star = by_case["false star, on the sky"]
+    dearest = max(by_case.values(), key=lambda cost: cost.cost_ms)
+    return (
+        f"{quantisation}: of a frame of {nothing.without_ms:.1f} ms a scenario with nothing on"
+        f" takes {nothing.cost_ms:+.2f} ms, a false star {star.cost_ms:+.2f} ms; the dearest,"
+        f" {dearest.case}, {dearest.cost_ms:+.1f} ms"
+    )
+
+
+def stray_line(strays: Sequence[Stray], quantisation: str) -> str:
+    """The stray light that spoils stars, in words."""
+    share = spoilt_from(strays, quantisation)
+    limit = "no stray light here"
+    if share is not None:
+        limit = f"stray light of {share:g} of white"
+    return (
+        f"{quantisation}: the stars' light is off by more than {SPOILT_MAG:g} mag (95 %) from"
+        f" {limit} on"
+    )
+
+
+def spoilt_from(strays: Sequence[Stray], quantisation: str) -> float | None:
+    """The smallest stray light, share of white, at which 95 % of the stars are not within
+    SPOILT_MAG; None where none is that large.
     """
-    worst = [
-        stray
-        for stray in strays
-        if stray.quantisation == quantisation and stray.p95_mag > SPOILT_MAG
-    ]
-    return min((stray.share_of_white for stray in worst if stray.share_of_white), default=None)
+    shares = []
+    for stray in strays:
+        is_spoilt = stray.quantisation == quantisation and stray.p95_mag > SPOILT_MAG
+        if is_spoilt and stray.share_of_white:
+            shares.append(stray.share_of_white)
+    return min(shares, default=None)
 
 
-def draw_stray(path: Path, strays: list[Stray]) -> None:
+def draw_stray(path: Path, strays: Sequence[Stray]) -> None:
     """The error of stars under even stray light."""
-    shares = {name: spoilt_from(strays, name) for name in QUANTISATIONS}
-    share_texts = [
-        f"from {share:g} of white on with {name}"
-        for name, share in shares.items()
-        if share is not None
-    ]
-    if share_texts:
+    limits = []
+    for name in QUANTISATIONS:
+        share = spoilt_from(strays, name)
+        if share is not None:
+            limits.append(f"from {share:g} of white on with {name}")
+    finding = "No stray light spoils stars"
+    if limits:
         finding = (
-            f"Stray light spoils stars by more than {SPOILT_MAG:g} mag {', and '.join(share_texts)}"
+            f"Stray light spoils stars by more than {SPOILT_MAG:g} mag {', and '.join(limits)}"
         )
-    else:
-        finding = "No stray light spoils stars"
     looks = {name: SeriesLook(name, colour, "o") for name, colour in COLOURS.items()}
-    spec = ChartSpec((STRAY_PANEL,), lambda row: row.quantisation, looks, STRAY_NOTE)
+    spec = ChartSpec((STRAY_PANEL,), quantisation_of, looks, STRAY_NOTE)
     draw_rows(path, finding, spec, [row for row in strays if row.share_of_white])
 
 
-def draw_costs(path: Path, costs: list[FaultCost], load: Load) -> None:
+def quantisation_of(row: Stray | FaultCost) -> str:
+    """The series of a row: its quantisation."""
+    return row.quantisation
+
+
+def draw_costs(path: Path, costs: Sequence[FaultCost], load: Load) -> None:
     """The time of a frame with each fault and without it."""
     dearest = max(costs, key=lambda cost: cost.frame_ms)
-    star = max(
-        (cost for cost in costs if "false star" in cost.case), key=lambda cost: cost.frame_ms
-    )
-    points = f"With false stars a frame takes at most {star.frame_ms:.1f} ms"
-    finding = f"{points}, with the dearest fault, {dearest.case}, {dearest.frame_ms:.0f} ms"
-    note = (
-        "Filled: a frame with the fault. Open: the same frame without it, in turn in the same run."
-        " Medians; 1920 x 1080."
+    star_ms = max(cost.frame_ms for cost in costs if "false star" in cost.case)
+    finding = (
+        f"With false stars a frame takes at most {star_ms:.1f} ms, with the dearest fault,"
+        f" {dearest.case}, {dearest.frame_ms:.0f} ms"
     )
     title = load.title(finding, "Times of frames with each fault")
-    note = load.note(note)
-    with chart(
-        path, title, 1, len(QUANTISATIONS), note=note, share_y=True, height_inch=5.2
-    ) as panels:
-        for (name, colour), axes in zip(COLOURS.items(), panels, strict=True):
-            mine = [cost for cost in costs if cost.quantisation == name]
-            looks = SeriesLook("without", colour), SeriesLook("with the fault", colour)
-            draw_pairs(axes, PairSpec("without_ms", "frame_ms", looks, open_first=True), mine)
-            axes.set_xlabel("time of a frame [ms]")
-            axes.set_title(name, color=colour)
-        name_places(panels[0], list(CASES))
+    panels = tuple(costs_panel(quantisation) for quantisation in QUANTISATIONS)
+    layout = {"share_y": True, "height_inch": 5.2}
+    spec = ChartSpec(panels, quantisation_of, {}, COSTS_NOTE, len(panels), layout)
+    with row_panels(path, title, spec, costs, load) as grid:
+        for axes, quantisation in zip(grid, QUANTISATIONS, strict=True):
+            axes.set_title(quantisation, color=COLOURS[quantisation])
+
+
+def costs_panel(quantisation: str) -> PanelSpec:
+    """The times of frames of one quantisation; the first panel has the names for all."""
+    colour = COLOURS[quantisation]
+    dots = DotsSpec(
+        (
+            ("without_ms", SeriesLook("without", colour, is_open=True)),
+            ("frame_ms", SeriesLook("with the fault", colour)),
+        ),
+        where=lambda row: row.quantisation == quantisation,
+        name=(lambda row: row.case) if quantisation == QUANTISATIONS[0] else None,
+    )
+    return PanelSpec(xlabel="time of a frame [ms]", dots=dots, names=False)

@@ -9,13 +9,12 @@ whole screen; 5 % of the dots are lost and as many are false.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import write_records
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.geometric.dots import DotPlan, plan_dots
@@ -32,7 +31,7 @@ from hilstar.instruments.calibrate.geometric.fit import (
 from hilstar.instruments.calibrate.geometric.geometry_fit import matched
 from hilstar.instruments.calibrate.geometric.match import first_look
 from hilstar.instruments.calibrate.geometric.observed import Observed
-from hilstar.instruments.study.row_charts import (
+from hilstar.instruments.study.engine import (
     ChartSpec,
     LevelLine,
     LineSpec,
@@ -40,6 +39,7 @@ from hilstar.instruments.study.row_charts import (
     Where,
     draw_rows,
     looks_of,
+    write_rows,
 )
 from hilstar.optics.camera import Camera
 
@@ -51,7 +51,7 @@ DESIGN_FOCAL_MM = 100.0
 SIZES = ((8, 10), (10, 25), (14, 40), (20, 60), (30, 100))
 NOISES_PX = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2)
 USUAL_SIZE, USUAL_NOISE_PX = (20, 60), 0.02
-STARS = 4000
+STARS = 4000  # chance moves an rms over so many by about 1 %
 FAIL_ARCSEC = 1.0
 SEED = 7
 MARKERS = "osd^"
@@ -69,8 +69,8 @@ TRACKER = Camera((2048, 2048), ARCSEC_PER_RAD / 38.0, (1023.5, 1023.5), np.eye(3
 
 @dataclass(frozen=True, slots=True)
 class DotFaults:
-    """The noise of a centroid (one sigma, one axis), and the shares of lit dots that are lost
-    and false.
+    """The noise of a centroid, px (one sigma, one axis), and the shares of lit dots that are lost
+    and that are false.
     """
 
     noise_px: float = 0.02
@@ -90,7 +90,8 @@ def observed_dots(
     frame by frame.
     """
     width, height = resolution_px
-    inside = (x_px > 0) & (x_px < width - 1) & (y_px > 0) & (y_px < height - 1)
+    inside = (x_px > 0) & (x_px < width - 1)
+    inside &= (y_px > 0) & (y_px < height - 1)
 
     def noisy_px(places: FloatArray, false_count: int, size: int) -> FloatArray:
         """Places along an axis with their noise, and false ones anywhere."""
@@ -104,7 +105,8 @@ def observed_dots(
         false_count = int(rng.poisson(faults.false * len(dots)))
         x = noisy_px(x_px[dots], false_count, width)
         y = noisy_px(y_px[dots], false_count, height)
-        centroids.append(np.stack([np.full(len(x), float(frame)), x, y]))
+        number = np.full(len(x), float(frame))
+        centroids.append(np.stack([number, x, y]))
     frames, x, y = np.concatenate(centroids, axis=1)
     frame_of = frames.astype(np.intp)
     return Observed(frame_of, np.zeros_like(frame_of), x, y, np.ones(len(frame_of)))
@@ -112,16 +114,18 @@ def observed_dots(
 
 def turned(a_deg: float, b_deg: float, c_deg: float = 0.0) -> FloatArray:
     """Rotation about x, then y, then z: columns are the turned axes."""
-    a, b, c = np.radians([a_deg, b_deg, c_deg])
-    x = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
-    y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])
-    z = np.array([[np.cos(c), -np.sin(c), 0], [np.sin(c), np.cos(c), 0], [0, 0, 1]])
+    angles = np.radians([a_deg, b_deg, c_deg])
+    cos_a, cos_b, cos_c = np.cos(angles)
+    sin_a, sin_b, sin_c = np.sin(angles)
+    x = np.array([[1, 0, 0], [0, cos_a, -sin_a], [0, sin_a, cos_a]])
+    y = np.array([[cos_b, 0, sin_b], [0, 1, 0], [-sin_b, 0, cos_b]])
+    z = np.array([[cos_c, -sin_c, 0], [sin_c, cos_c, 0], [0, 0, 1]])
     return np.asarray(z @ y @ x)
 
 
 @dataclass(frozen=True, slots=True)
 class TracedBench:
-    """A doublet, tilted and decentred, before a tilted screen: angles in degrees, lengths in mm."""
+    """A tilted, decentred doublet before a tilted screen; angles in degrees, lengths in mm."""
 
     resolution_px: tuple[int, int] = (1920, 1080)
     pitch_mm: float = 0.05765
@@ -133,34 +137,40 @@ class TracedBench:
     screen_shift_mm: tuple[float, float] = (0.5, 0.3)
 
     def places_px(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Where on the screen, px, the rays of directions (n, 3) in cam end, (n,) each."""
+        """Where the rays of directions (n, 3) in cam meet the screen, px: x and y (n,)."""
+        at, ray = self.behind_lens(directions)
+        screen = turned(*self.screen_tilt_deg)
+        scale = self.focal_mm / DESIGN_FOCAL_MM
+        to_screen_mm = self.to_lens_mm + (BACK_FOCUS_MM + sum(THICKNESS_MM)) * scale
+        middle = np.array([*self.screen_shift_mm, to_screen_mm])
+        normal = screen[:, 2]
+        length = ((middle - at) @ normal) / (ray @ normal)
+        from_middle = at + ray * length[:, None] - middle
+        x, y = (from_middle @ screen[:, :2] / self.pitch_mm).T
+        width, height = self.resolution_px
+        return x + (width - 1) / 2, y + (height - 1) / 2
+
+    def behind_lens(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Points on the last surface, mm, and directions behind it, (n, 3) in cam, of the rays of
+        directions (n, 3) through the pupil.
+        """
         scale = self.focal_mm / DESIGN_FOCAL_MM
         axes = turned(*self.lens_tilt_deg)
         vertex = np.array([*self.lens_shift_mm, self.to_lens_mm])
         ray = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ axes
         at = np.broadcast_to((-vertex) @ axes, ray.shape)
-        for radius, before, after, step in zip(
-            RADII_MM, INDEX[:-1], INDEX[1:], (*THICKNESS_MM, 0.0), strict=True
-        ):
+        surfaces = zip(RADII_MM, INDEX[:-1], INDEX[1:], (*THICKNESS_MM, 0.0), strict=True)
+        for radius, before, after, step in surfaces:
             at, ray = _refracted(at, ray, radius * scale, before / after)
-            at = at - np.array([0.0, 0.0, step * scale])
-        at = (at + np.array([0.0, 0.0, sum(THICKNESS_MM) * scale])) @ axes.T + vertex
-        ray = ray @ axes.T
-        screen = turned(*self.screen_tilt_deg)
-        middle = np.array(
-            [*self.screen_shift_mm, self.to_lens_mm + (BACK_FOCUS_MM + sum(THICKNESS_MM)) * scale]
-        )
-        normal = screen[:, 2]
-        hit = at + ray * (((middle - at) @ normal) / (ray @ normal))[:, None]
-        x, y = ((hit - middle) @ screen[:, :2] / self.pitch_mm).T
-        return x + (self.resolution_px[0] - 1) / 2, y + (self.resolution_px[1] - 1) / 2
+            at = at - along_axis(step * scale)
+        from_vertex = at + along_axis(sum(THICKNESS_MM) * scale)
+        return from_vertex @ axes.T + vertex, ray @ axes.T
 
     def directions(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        """The directions (n, 3) in cam of pixels (n,): the inverse, by Newton's method with
-        differences.
-        """
-        u = (np.asarray(x_px) - (self.resolution_px[0] - 1) / 2) * self.pitch_mm / self.focal_mm
-        v = (np.asarray(y_px) - (self.resolution_px[1] - 1) / 2) * self.pitch_mm / self.focal_mm
+        """The directions (n, 3) in cam of pixels (n,), by Newton's method with differences."""
+        width, height = self.resolution_px
+        u = (np.asarray(x_px) - (width - 1) / 2) * self.pitch_mm / self.focal_mm
+        v = (np.asarray(y_px) - (height - 1) / 2) * self.pitch_mm / self.focal_mm
         ones = np.ones_like(u)
         step = 1e-6
         for _ in range(12):
@@ -176,23 +186,32 @@ class TracedBench:
             off_y = y - y_px
             u = u - (d * off_x - b * off_y) / area
             v = v - (a * off_y - c * off_x) / area
-        return np.column_stack([u, v, ones]) / np.sqrt(u**2 + v**2 + 1)[:, None]
+        length = np.sqrt(u**2 + v**2 + 1)
+        return np.column_stack([u, v, ones]) / length[:, None]
+
+
+def along_axis(mm: float) -> FloatArray:
+    """A vector along the lens's axis, mm."""
+    return np.array([0.0, 0.0, mm])
 
 
 def _refracted(
     at: FloatArray, ray: FloatArray, radius: float, ratio: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Points on, and directions behind, a sphere whose vertex is at the origin; `ratio` is n
-    before over n after.
+    """Points on a sphere whose vertex is the origin, and directions behind it. `ratio` is n before
+    over n after.
     """
-    to_centre = at - [0.0, 0.0, radius]
+    centre = along_axis(radius)
+    to_centre = at - centre
     half = (ray * to_centre).sum(axis=1)
     root = np.sqrt(half**2 - (to_centre**2).sum(axis=1) + radius**2)
-    at = at + ray * (-half - np.sign(radius) * root)[:, None]
-    normal = (at - [0.0, 0.0, radius]) / radius
+    length = -half - np.sign(radius) * root
+    hit = at + ray * length[:, None]
+    normal = (hit - centre) / radius
     cosine = -(ray * normal).sum(axis=1)
-    turned_back = np.sqrt(1 - ratio**2 * (1 - cosine**2))
-    return at, ratio * ray + (ratio * cosine - turned_back)[:, None] * normal
+    cosine_behind = np.sqrt(1 - ratio**2 * (1 - cosine**2))
+    bend = ratio * cosine - cosine_behind
+    return hit, ratio * ray + bend[:, None] * normal
 
 
 BENCH = TracedBench(lens_shift_mm=(8.0, -5.0), lens_tilt_deg=(4.0, 2.5))
@@ -218,7 +237,7 @@ class Frames:
     noise_px: float
 
 
-MODELS = (
+MODELS: tuple[LensModel, ...] = (
     LensModel("a pinhole", PINHOLE),
     LensModel("a pinhole with k1", RADIAL),
     LensModel("Brown-Conrady with tilt", BROWN_CONRADY),
@@ -228,7 +247,7 @@ MODELS = (
 
 @dataclass(frozen=True, slots=True)
 class CalibrationOutcome:
-    """One model on one set of frames: the error of held-out dots, and that of stars all over the
+    """One lens model fitted to one set of frames: its errors at held-out dots and at stars over the
     screen.
     """
 
@@ -247,10 +266,11 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     outcomes: list[CalibrationOutcome] = []
     for frames in frames_of(quick):
         outcomes += _outcomes(frames)
-    write_records(directory / "geometry.csv", outcomes)
-    usual = [
-        outcome for outcome in outcomes if has_usual_noise(outcome) and has_usual_size(outcome)
-    ]
+    write_rows(directory / "geometry.csv", outcomes)
+    usual = []
+    for outcome in outcomes:
+        if has_usual_noise(outcome) and has_usual_size(outcome):
+            usual.append(outcome)
     best = min(usual, key=lambda outcome: outcome.held_out_arcsec)
     uncalibrated = ideal_arcsec()
     finding = (
@@ -276,17 +296,17 @@ def frames_of(quick: bool) -> list[Frames]:
 
 def line_of(outcome: CalibrationOutcome) -> str:
     """A model's errors in words."""
-    stars_rms = outcome.stars_rms_arcsec
-    held_out_rms = outcome.held_out_arcsec
-    stars = f"stars {stars_rms:.3g} arcsec rms, {outcome.stars_max_arcsec:.3g} maximum"
-    line = f"{outcome.model}: {stars}; held-out dots {held_out_rms:.3g} rms"
+    stars = f"stars {outcome.stars_rms_arcsec:.3g} arcsec rms"
+    largest = f"{outcome.stars_max_arcsec:.3g} maximum"
+    dots = f"held-out dots {outcome.held_out_arcsec:.3g} rms"
+    line = f"{outcome.model}: {stars}, {largest}; {dots}"
     if outcome.stars_max_arcsec < FAIL_ARCSEC:
         return line
     return f"{line}; FAILS: over {FAIL_ARCSEC:g} arcsec"
 
 
 def ideal_arcsec() -> float:
-    """How far stars are off with no calibration at all, rms over the screen."""
+    """The error of stars without any calibration, arcsec rms over the screen."""
     nominal = _nominal()
     still = Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, np.eye(4)[:1])
     return float(np.sqrt(np.square(_star_errors(still)).mean()))
@@ -294,11 +314,9 @@ def ideal_arcsec() -> float:
 
 def _nominal() -> Nominal:
     aligned = np.array([1.0, 0.0, 0.0, 0.0])
-    return Nominal(
-        monitor_camera(BENCH.resolution_px, BENCH.pitch_mm * 1e3, BENCH.focal_mm, aligned),
-        aligned,
-        TRACKER,
-    )
+    pitch_um = BENCH.pitch_mm * 1e3
+    monitor = monitor_camera(BENCH.resolution_px, pitch_um, BENCH.focal_mm, aligned)
+    return Nominal(monitor, aligned, TRACKER)
 
 
 def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
@@ -310,29 +328,32 @@ def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
     problem, data = matched(plan, nominal, dots, first_look(plan, nominal, dots, rng))
     for model in MODELS:
         free = Model(model.parameters)
-        held_out_arcsec = held_out(problem, model.name, free, model.field_degree, data).rms_arcsec
-        errors = _star_errors(fit(problem, free, model.field_degree, data).geometry)
-        stars = float(np.sqrt((errors**2).mean())), float(errors.max())
+        of_dots = held_out(problem, model.name, free, model.field_degree, data)
+        fitted = fit(problem, free, model.field_degree, data)
+        errors = _star_errors(fitted.geometry)
         yield CalibrationOutcome(
-            frames.count,
-            frames.dots,
-            frames.noise_px,
-            model.name,
-            len(data),
-            held_out_arcsec,
-            *stars,
+            frames=frames.count,
+            dots_per_frame=frames.dots,
+            noise_px=frames.noise_px,
+            model=model.name,
+            centroids=len(data),
+            held_out_arcsec=of_dots.rms_arcsec,
+            stars_rms_arcsec=float(np.sqrt((errors**2).mean())),
+            stars_max_arcsec=float(errors.max()),
         )
 
 
 def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """How far stars all over the screen are shown from where the traced rays put them, arcsec."""
+    """The distances between shown stars and their traced places, arcsec (STARS,)."""
     rng = np.random.default_rng(SEED)
     width, height = BENCH.resolution_px
     x = rng.uniform(-0.5, width - 0.5, STARS)
     y = rng.uniform(-0.5, height - 0.5, STARS)
     monitor = geometry.monitor
-    shown_x, shown_y = monitor.project(BENCH.directions(x, y) @ monitor.cam_to_image.T)
-    return np.asarray(np.hypot(shown_x - x, shown_y - y) * ARCSEC_PER_RAD / monitor.focal_length_px)
+    in_image = BENCH.directions(x, y) @ monitor.cam_to_image.T
+    shown_x, shown_y = monitor.project(in_image)
+    off_px = np.hypot(shown_x - x, shown_y - y)
+    return np.asarray(off_px * ARCSEC_PER_RAD / monitor.focal_length_px)
 
 
 def draw(
@@ -345,30 +366,32 @@ def draw(
         LevelLine(uncalibrated_arcsec, "uncalibrated", style=":"),
         LevelLine(FAIL_ARCSEC, "fails above"),
     )
-    by_dots = PanelSpec(
-        lines_of("centroids", has_usual_noise),
-        "error, rms [arcsec]",
-        "centroids [number]",
-        levels=levels,
-        scales=("log", "log"),
+    by_dots = replace(
+        error_panel("centroids", has_usual_noise), xlabel="centroids [number]", levels=levels
     )
-    by_noise = PanelSpec(
-        lines_of("noise_px", has_usual_size),
-        "error, rms [arcsec]",
-        "noise of a centroid [px]",
+    by_noise = replace(
+        error_panel("noise_px", has_usual_size),
+        xlabel="noise of a centroid [px]",
         levels=levels,
-        scales=("log", "log"),
         xticks=sorted({outcome.noise_px for outcome in outcomes}),
     )
-    looks = looks_of(labels, MARKERS)
     spec = ChartSpec(
-        (by_dots, by_noise), lambda row: row.model, looks, NOTE, layout={"share_x": False}
+        (by_dots, by_noise),
+        lambda row: row.model,
+        looks_of(labels, MARKERS),
+        NOTE,
+        layout={"share_x": False},
     )
     draw_rows(path, finding, spec, outcomes)
 
 
+def error_panel(x: str, where: Where) -> PanelSpec:
+    """The errors of every model against one varied quantity."""
+    return PanelSpec(lines_of(x, where), "error, rms [arcsec]", scales=("log", "log"))
+
+
 def lines_of(x: str, where: Where) -> tuple[LineSpec, ...]:
-    """The errors of stars, and dotted those of dots that were held out, against `x`."""
+    """The errors of stars against `x`, and dotted those of held-out dots."""
     stars = LineSpec(x, "stars_rms_arcsec", where=where)
     dotted = {"lw": HELD_OUT_WIDTH}
     held_out_dots = LineSpec(
@@ -378,10 +401,10 @@ def lines_of(x: str, where: Where) -> tuple[LineSpec, ...]:
 
 
 def has_usual_noise(outcome: CalibrationOutcome) -> bool:
-    """Whether only the dots of an outcome's frames are varied."""
+    """Whether an outcome varies only the dots of its frames."""
     return outcome.noise_px == USUAL_NOISE_PX
 
 
 def has_usual_size(outcome: CalibrationOutcome) -> bool:
-    """Whether only the noise of an outcome's centroids is varied."""
+    """Whether an outcome varies only the noise of its centroids."""
     return (outcome.frames, outcome.dots_per_frame) == USUAL_SIZE

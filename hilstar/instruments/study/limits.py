@@ -16,7 +16,7 @@ import numpy as np
 
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import BLUE, RED, SMALL_PT, capital, chart, two_digits, write_csv
+from hilstar.basics.charts import BLUE, RED, SMALL_PT, capital, chart, two_digits
 from hilstar.basics.rotation import (
     angle_between_rad,
     from_radec_roll_deg,
@@ -28,6 +28,7 @@ from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S, flux_ratio
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.assess.bench_effects import turn_between
 from hilstar.instruments.study import codes
+from hilstar.instruments.study.engine import write_rows
 from hilstar.instruments.study.predictors import ORION, predictors, rate_of, slew_attitude
 from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.optics.psf import GaussianPsf, pixel_shares
@@ -40,12 +41,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # The demo's monitor and collimator (configs/demo.toml).
-FOCAL_LENGTH_MM, PITCH_UM, SIZE_PX, ALIGNED = (
-    350.0,
-    57.65,
-    (1920, 1080),
-    np.array([1.0, 0.0, 0.0, 0.0]),
-)
+FOCAL_LENGTH_MM, PITCH_UM, SIZE_PX = 350.0, 57.65, (1920, 1080)
+ALIGNED = np.array([1.0, 0.0, 0.0, 0.0])
 SIGMA_PX, REFRESH_HZ, PARTED_REFRESHES = 0.85, 60.0, 6.3
 FAINT_MAG, COARSE_BITS = 6.0, 8
 TOLERANCE_PX, TOLERANCE_MAG = RenderSettings().tolerance_px, RenderSettings().tolerance_mag
@@ -99,10 +96,24 @@ TOLERANCES: dict[Unit, float] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Limit:
+class LimitRow:
+    """A method's error under one stress, its tolerance, and the stress at which they meet."""
+
+    method: str
+    stress: str
+    at: float
+    error: float
+    unit: Unit
+    tolerance: float
+    meets: float
+
+
+@dataclass(frozen=True, slots=True)
+class StressLimit:
     """A method's error (n,) against a stress (n,), from easy to hard; `unit` is the error's.
 
-    `says` names the place where the method leaves its tolerance, whose figure stands in its braces.
+    `says` describes the stress at which the method leaves its tolerance; its braces take the
+    figure.
     """
 
     method: str
@@ -114,7 +125,7 @@ class Limit:
 
     @property
     def at_unit(self) -> str:
-        """The stress's unit, in brackets at its end, or what it counts."""
+        """The stress's unit: in brackets at its end, or what it counts."""
         bracketed = self.stress.partition("[")[2].partition("]")[0]
         return bracketed or self.stress.split()[0].rstrip(",")
 
@@ -152,9 +163,17 @@ class Limit:
             return "everywhere"
         return f"nowhere to {two_digits(float(self.at[-1]))} {self.at_unit}"
 
+    def rows(self) -> list[LimitRow]:
+        """Its rows of the table, from easy to hard."""
+        ends = self.unit, self.tolerance, self.meets
+        rows = []
+        for at, error in zip(self.at.tolist(), self.error.tolist(), strict=True):
+            rows.append(LimitRow(self.method, self.stress, at, error, *ends))
+        return rows
 
-def narrow_sprites() -> Limit:
-    """The place of a star that is integrated over pixels, against its sigma."""
+
+def narrow_sprites() -> StressLimit:
+    """The place of a star whose light is integrated over pixels, against its sigma."""
     sigmas_px = np.geomspace(0.9, 0.1, 33)
     phases = np.linspace(-0.5, 0.5, 21)
     pixels = np.arange(-8.0, 9.0)
@@ -164,17 +183,17 @@ def narrow_sprites() -> Limit:
         places = shares @ pixels / shares.sum(axis=1)
         errors.append(float(np.abs(places - phases).max()))
     says = "stars under {} px wide"
-    return Limit("Integral over pixels", SIGMA, says, "px", sigmas_px, np.array(errors))
+    return StressLimit("Integral over pixels", SIGMA, says, "px", sigmas_px, np.array(errors))
 
 
-def coarse_codes(quick: bool) -> Limit:
-    """The light of a star of exact codes, against the monitor's bits."""
+def coarse_codes(quick: bool) -> StressLimit:
+    """The light of a star with exact codes, against the monitor's bits."""
     bits = (10, 8, 6, 4) if quick else (12, 10, 9, 8, 7, 6, 5, 4)
     errors: list[float] = []
     for count in bits:
         (star,) = codes.code_errors(count, EXACT, 8, [FAINT_MAG])
         errors.append(star.flux_max_mag)
-    return Limit(
+    return StressLimit(
         "Exact codes, light",
         BITS,
         "codes under {} bits",
@@ -184,17 +203,19 @@ def coarse_codes(quick: bool) -> Limit:
     )
 
 
-def faint_stars(quick: bool) -> Limit:
-    """The place of a star of exact codes by the plain moment, against how faint it is."""
+def faint_stars(quick: bool) -> StressLimit:
+    """The place of a star with exact codes by the plain moment, against its magnitude."""
     mags = np.linspace(0, 9, 5 if quick else 13)
     stars = codes.code_errors(COARSE_BITS, EXACT, 8, mags)
     errors = [star.max_px("moment") for star in stars]
     stress = FAINT
-    return Limit("Exact codes, place", stress, "{} mag under white", "px", mags, np.array(errors))
+    return StressLimit(
+        "Exact codes, place", stress, "{} mag under white", "px", mags, np.array(errors)
+    )
 
 
-def red_stars() -> Limit:
-    """The light of spectra that are found by V-I, the median of those held out, against V-I."""
+def red_stars() -> StressLimit:
+    """The light of held-out spectra by their V-I, median, against V-I."""
     library = load_library()
     rates = library_electrons_per_s(library, study_optics("ccd47-20"), Photometry())
     errors = held_out_errors(rates)
@@ -204,11 +225,11 @@ def red_stars() -> Limit:
         near = np.abs(library.vi_mag - centre) <= WINDOW_VI_MAG
         medians.append(float(np.median(np.abs(magnitude(1 + errors[near])))))
     says = "spectra over V-I {}"
-    return Limit("Spectra by colour, median", RED_STARS, says, "mag", at, np.array(medians))
+    return StressLimit("Spectra by colour, median", RED_STARS, says, "mag", at, np.array(medians))
 
 
-def crowds() -> Limit:
-    """The light of stars that have no room in a frame, against the stars in view."""
+def crowds() -> StressLimit:
+    """The light of stars that do not fit into a frame, against the stars in view."""
     counts = np.geomspace(3e3, 3e6, 19)
     room = max_stars(GaussianPsf((SIGMA_PX, SIGMA_PX)).footprint_px)
     rng = np.random.default_rng(SEED)
@@ -218,11 +239,13 @@ def crowds() -> Limit:
         drawn = brightest(light, room)
         shown = light if drawn is None else light[drawn]
         errors.append(abs(magnitude(float(shown.sum() / light.sum()))))
-    return Limit("A frame's room for stars", CROWD, "{} stars", "mag", counts, np.array(errors))
+    return StressLimit(
+        "A frame's room for stars", CROWD, "{} stars", "mag", counts, np.array(errors)
+    )
 
 
-def tilted_screen() -> Limit:
-    """The places of a pinhole on a tilted screen, rms after alignment, against the tilt."""
+def tilted_screen() -> StressLimit:
+    """The places of a pinhole model on a tilted screen, rms after alignment, against the tilt."""
     camera = monitor_camera(SIZE_PX, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
     x_px, y_px = camera.grid_px((13, 9))
     shown = normalise(camera.rays(x_px, y_px))
@@ -238,10 +261,10 @@ def tilted_screen() -> Limit:
         rms_rad = float(np.sqrt((residual**2).sum(axis=1).mean()))
         errors.append(rms_rad * camera.focal_length_px)
     says = "a tilt over {} deg"
-    return Limit("Pinhole, no geometry file", TILT, says, "px", tilts_deg, np.array(errors))
+    return StressLimit("Pinhole, no geometry file", TILT, says, "px", tilts_deg, np.array(errors))
 
 
-def wide_fields() -> Limit:
+def wide_fields() -> StressLimit:
     """A direction onto the monitor's plane and back, against the angle from the axis."""
     camera = monitor_camera(SIZE_PX, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
     from_90_deg = np.geomspace(60.0, 1e-7, 15)
@@ -249,7 +272,7 @@ def wide_fields() -> Limit:
     true = np.stack([np.sin(angle), np.zeros(len(angle)), np.cos(angle)], axis=1)
     rays = normalise(camera.rays(*camera.project(true)))
     errors = np.linalg.norm(np.cross(rays, true), axis=1) * ARCSEC_PER_RAD
-    return Limit(
+    return StressLimit(
         "Perspective",
         "angle short of 90 deg [deg]",
         "{} deg short of 90",
@@ -259,7 +282,7 @@ def wide_fields() -> Limit:
     )
 
 
-def poles() -> Limit:
+def poles() -> StressLimit:
     """An attitude to RA, Dec and roll and back, against its distance from the pole."""
     from_pole_deg = np.geomspace(10.0, 1e-7, 15)
     errors = []
@@ -267,7 +290,7 @@ def poles() -> Limit:
         q = from_radec_roll_deg(123.4, 90.0 - distance, 56.7)
         back = from_radec_roll_deg(*to_radec_roll_deg(q))
         errors.append(angle_between_rad(q, back) * ARCSEC_PER_RAD)
-    return Limit(
+    return StressLimit(
         "RA, Dec and roll",
         "distance from the pole [deg]",
         "{} deg from the pole",
@@ -277,15 +300,15 @@ def poles() -> Limit:
     )
 
 
-def parted_refreshes() -> Limit:
-    """A star's place over an exposure that is no whole number of refreshes, against the turn.
+def parted_refreshes() -> StressLimit:
+    """A star's place over an exposure of 6.3 refreshes, against the turn.
 
-    `study timing` holds this law to the virtual tracker.
+    `study timing` checks this law with the virtual tracker.
     """
     rates_deg_s = np.geomspace(0.03, 30.0, 13)
     worst = beat(Exposures(REFRESH_HZ, PARTED_REFRESHES / REFRESH_HZ)).worst_arcsec_per_deg_s or 0.0
     stress = TURN
-    return Limit(
+    return StressLimit(
         "Refreshes in an exposure",
         stress,
         "turns over {} deg/s",
@@ -300,7 +323,9 @@ def predicted_rms_arcsec(
     packet_hz: float,
     age_ms: float,
 ) -> float:
-    """The error of prediction of a movement, rms over its frames; packets arrive `age_ms` old."""
+    """The rms error of the predicted attitude over the frames of a movement; packets arrive
+    `age_ms` old.
+    """
     way = next(predictor for predictor in predictors() if predictor.is_default)
     errors = []
     for frame in range(int(SPAN_S * REFRESH_HZ)):
@@ -315,23 +340,19 @@ def predicted_rms_arcsec(
     return float(np.sqrt(np.mean(np.square(errors))))
 
 
-def old_packets(quick: bool) -> Limit:
-    """Error of a predicted attitude, on a slew with jitter, against the age of the newest
-    packet.
-    """
+def old_packets(quick: bool) -> StressLimit:
+    """The predicted attitude of a shaken slew, against the age of the newest packet."""
     ages_ms = np.geomspace(0.5, 100.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, 1000.0, age) for age in ages_ms.tolist()]
     says = "packets over {} ms old"
-    return Limit("Prediction by rates", AGE, says, "arcsec", ages_ms, np.array(errors))
+    return StressLimit("Prediction by rates", AGE, says, "arcsec", ages_ms, np.array(errors))
 
 
-def few_packets(quick: bool) -> Limit:
-    """Error of a predicted attitude, on the same slew and without delay, against the rate of
-    packets.
-    """
+def few_packets(quick: bool) -> StressLimit:
+    """The predicted attitude of the same slew without delay, against the packet rate."""
     rates_hz = np.geomspace(1000.0, 5.0, 6 if quick else 12)
     errors = [predicted_rms_arcsec(slew_attitude, rate, 0.0) for rate in rates_hz.tolist()]
-    return Limit(
+    return StressLimit(
         "Prediction by rates",
         PACKETS,
         "under {} packets a second",
@@ -341,8 +362,8 @@ def few_packets(quick: bool) -> Limit:
     )
 
 
-def vibrations(quick: bool) -> Limit:
-    """Prediction over 20 ms of a vibration, against its frequency."""
+def vibrations(quick: bool) -> StressLimit:
+    """The predicted attitude of a vibration, 20 ms ahead, against its frequency."""
     frequencies_hz = np.geomspace(0.5, 45.0, 6 if quick else 12)
     errors = []
     for hz in frequencies_hz.tolist():
@@ -352,7 +373,7 @@ def vibrations(quick: bool) -> Limit:
             return propagate(ORION, Z, angle)
 
         errors.append(predicted_rms_arcsec(attitude, 100.0, 20.0))
-    return Limit(
+    return StressLimit(
         "Prediction over 20 ms",
         VIBRATION,
         "vibrations over {} Hz",
@@ -362,7 +383,7 @@ def vibrations(quick: bool) -> Limit:
     )
 
 
-def every_limit(quick: bool) -> list[Limit]:
+def every_limit(quick: bool) -> list[StressLimit]:
     """Every limit, in the order of the chain: light, places, time."""
     return [
         *(narrow_sprites(), coarse_codes(quick), faint_stars(quick)),
@@ -375,22 +396,18 @@ def every_limit(quick: bool) -> list[Limit]:
 def run(directory: Path, quick: bool = False) -> list[str]:
     """Measure, and write `limits.csv` and its chart; a line for each limit. Raises InputError."""
     limits = every_limit(quick)
-    rows = []
+    rows: list[LimitRow] = []
     for limit in limits:
-        ends = limit.unit, limit.tolerance, limit.meets
-        for at, error in zip(limit.at.tolist(), limit.error.tolist(), strict=True):
-            rows.append((limit.method, limit.stress, at, error, *ends))
-    write_csv(
-        directory / "limits.csv",
-        ("method", "stress", "at", "error", "unit", "tolerance", "meets"),
-        rows,
-    )
+        rows += limit.rows()
+    write_rows(directory / "limits.csv", rows)
     draw(directory / "limits", limits)
-    finding = limits_finding(limits)
-    return [finding, *(f"{limit.method} ({limit.stress}): {limit.words}" for limit in limits)]
+    lines = [limits_finding(limits)]
+    for limit in limits:
+        lines.append(f"{limit.method} ({limit.stress}): {limit.words}")
+    return lines
 
 
-def limits_finding(limits: Sequence[Limit]) -> str:
+def limits_finding(limits: Sequence[StressLimit]) -> str:
     """How many methods leave their tolerance, and where those do that a bench meets first."""
     failing = [limit for limit in limits if limit.fails]
     met = [limit.words for limit in failing if limit.stress in MET_FIRST]
@@ -398,7 +415,7 @@ def limits_finding(limits: Sequence[Limit]) -> str:
     return f"{count}: {', '.join(met)}"
 
 
-def draw(path: Path, limits: Sequence[Limit]) -> None:
+def draw(path: Path, limits: Sequence[StressLimit]) -> None:
     """A panel for each method: its error, the tolerance, and where they meet."""
     rows = math.ceil(len(limits) / COLUMNS)
     note = (
@@ -407,23 +424,15 @@ def draw(path: Path, limits: Sequence[Limit]) -> None:
         " px of the demo's monitor; the dot is where they meet. Each axis runs from easy to hard."
         " Places by the plain moment."
     )
-    height_inch = EDGE_INCH + PANEL_INCH * rows
-    with chart(
-        path,
-        limits_finding(limits),
-        rows,
-        COLUMNS,
-        note=note,
-        share_x=False,
-        height_inch=height_inch,
-    ) as grid:
+    layout: dict[str, Any] = {"share_x": False, "height_inch": EDGE_INCH + PANEL_INCH * rows}
+    with chart(path, limits_finding(limits), rows, COLUMNS, note=note, **layout) as grid:
         for axes, limit in zip(grid, limits, strict=False):
             draw_limit(axes, limit)
         for axes in grid[len(limits) :]:
             axes.set_axis_off()
 
 
-def draw_limit(axes: "Axes", limit: Limit) -> None:
+def draw_limit(axes: "Axes", limit: StressLimit) -> None:
     """One method: error against stress, from easy to hard, and where it meets its tolerance."""
     axes.plot(limit.at, np.maximum(limit.error, SMALLEST), color=BLUE, label="_error")
     axes.axhline(limit.tolerance, color=RED, ls="--", lw=1.2, label="_tolerance")

@@ -10,15 +10,16 @@ beside the one here.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from msgspec import structs
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.charts import (
     BLUE,
     GREEN,
@@ -27,7 +28,6 @@ from hilstar.basics.charts import (
     ORANGE,
     PURPLE,
     SERIES,
-    SMALL_PT,
     chart,
     label_ends,
     plain_ticks,
@@ -35,14 +35,23 @@ from hilstar.basics.charts import (
     write_csv,
 )
 from hilstar.basics.units import LIGHT_M_S, flux_ratio, magnitude
-from hilstar.instruments.study.rapp import SENSORS, WEIGHTINGS, ChartFinding, rapp
-from hilstar.instruments.study.row_charts import (
+from hilstar.instruments.study.engine import (
+    HIDDEN,
+    BarSpec,
+    ChartFinding,
+    ChartSpec,
     CurvePanel,
+    LevelLine,
     PanelSpec,
     draw_curve_panel,
     draw_curves,
+    draw_rows,
+    looks_of,
     write_columns,
+    write_findings,
+    write_rows,
 )
+from hilstar.instruments.study.rapp import SENSORS, WEIGHTINGS, rapp
 from hilstar.instruments.study.sky_figures import FIGURES as SKY_FIGURES
 from hilstar.instruments.study.study_benches import (
     APERTURE_MM,
@@ -57,6 +66,7 @@ from hilstar.sky.electrons import (
     SUN_TEMPERATURE_K,
     Optics,
     Photometry,
+    ZeroPoint,
     ags_electrons_per_s,
     dgs_electrons_per_s,
     library_electrons_per_s,
@@ -125,19 +135,47 @@ DARK_LAWS: dict[str, dict[str, Any]] = {
     "e2v NIMO": {"dark_law": "e2v-nimo"},
 }
 COLD_K = 273.0
-CORNERS_HZ = (0.0, 1e4, 1e5)
+BODIES_K = (3000.0, 5000.0, 9000.0, 30_000.0)
+BAND_COLOURS = (PURPLE, BLUE, GREEN, ORANGE, INK)
+CORNERS_HZ = (0.0, 1e4, 1e5)  # of 1/f noise
 ZODIACAL_V_MAG, ZODIACAL_NM = 22.1, (330.0, 1100.0)
-BRIGHT_V_MAG = 7.5
+BRIGHT_V_MAG = 7.5  # to which Hipparcos is complete
 HELD_OUT = "pickles, leave-one-out"
 BY_TYPE = "mk, leave-one-out"
-SETTINGS = [
-    Photometry(zero, weighting) for zero in ("vega", "iau-bolometric") for weighting in WEIGHTINGS
-]
+BODY = "black body, ballesteros2012"
+ZERO_POINTS: tuple[ZeroPoint, ...] = ("vega", "iau-bolometric")
+SETTINGS = [Photometry(*setting) for setting in product(ZERO_POINTS, WEIGHTINGS)]
 # where Torres 2010 holds; exact at 0, where wang2021 steps
 SCALE_BV_MAG = np.arange(-35, 181) / 100
 BV_MAG = np.arange(-30, 201) / 100
+PERCENTILE_COLUMNS = ("pickles_p5_mag", "pickles_median_mag", "pickles_p95_mag", "stars_in_window")
+# By the order in which methods are drawn, the last first.
+SPECTRUM_MARKS = (("+", GREEN), ("x", ORANGE), ("^", INK), ("o", BLUE))
+SUPERGIANTS = "torres2010_supergiant"
+SCALE_STYLES, SCALE_COLOURS = (":", "-", "-"), (MUTED, BLUE, ORANGE)
+ZERO_LINE = LevelLine(0, HIDDEN, style="-", width=1)
+BAR = {"width": 0.38}
 WINDOW_MAG = 0.05  # half the width of the running percentiles in B-V
-MIN_STARS = 20
+MIN_STARS = 20  # 5 % of fewer is no star
+
+
+@dataclass(frozen=True, slots=True)
+class CatalogueFigure:
+    """A figure of Hipparcos, here and as the thesis prints it."""
+
+    what: str
+    unit: str
+    here: float
+    thesis: float
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredValue:
+    """A figure of the catalogue's stars (n,), its axis's label, and the drawn limits."""
+
+    of_star: FloatArray
+    label: str
+    limits: tuple[float, float]
 
 
 def catalogue_errors(directory: Path) -> ChartFinding:
@@ -145,41 +183,53 @@ def catalogue_errors(directory: Path) -> ChartFinding:
     and B-V are from.
     """
     catalog = load_catalog()
+    errors = catalogue_medians(catalog)
+    write_rows(directory / "catalogue_errors.csv", [*source_counts(catalog), *errors])
+    medians = {row.what: row.here for row in errors}
+    largest = max(abs(row.here - row.thesis) for row in errors)
+    places = f"{medians['sigma_ra_mas']:.2f} and {medians['sigma_dec_mas']:.2f} mas"
+    text = (
+        f"Hipparcos's errors: B-V {medians['sigma_bv_mag']:.4f} mag (thesis: 0.0281), places"
+        f" {places} (0.77, 0.64); all of table 2.3 within {largest:.3f}"
+    )
+    draw_catalogue_errors(directory / "catalogue_errors", text, catalog, errors)
+    return ChartFinding("catalogue_errors", text)
+
+
+def source_counts(catalog: Catalog) -> list[CatalogueFigure]:
+    """Table 2.2: how many stars have V and B-V from each source."""
+    facts = facts_of(catalog.hip)
+    v_sources = Counter(facts["v_source"].tolist())
+    bv_sources = Counter(facts["bv_source"].tolist())
+    rows = []
+    for source, (v_stars, bv_stars) in TABLE_2_2.items():
+        key = source.encode()
+        rows.append(CatalogueFigure(f"V from {source}", "stars", v_sources[key], v_stars))
+        rows.append(CatalogueFigure(f"B-V from {source}", "stars", bv_sources[key], bv_stars))
+    return rows
+
+
+def catalogue_medians(catalog: Catalog) -> list[CatalogueFigure]:
+    """Table 2.3: the median errors of bright stars; of B-V the mean of all."""
     facts = facts_of(catalog.hip)
     bright = catalog.v_mag < TABLE_2_3_V_MAG
-    origins = [Counter(facts[name].tolist()) for name in ("v_source", "bv_source")]
-    rows: list[tuple[str, str, float, float]] = []
-    for source, both in TABLE_2_2.items():
-        for what, count, stars in zip(("V", "B-V"), origins, both, strict=True):
-            rows.append((f"{what} from {source}", "stars", count[source.encode()], stars))
+    rows = []
     for name, (unit, printed) in TABLE_2_3.items():
         if name == "sigma_bv_mag":
             here = facts[name].mean()
         else:
             here = np.median(facts[name][bright])
-        rows.append((name, unit, float(here), printed))
-    write_csv(directory / "catalogue_errors.csv", ("what", "unit", "here", "thesis"), rows)
-    medians = {name: here for name, _, here, _ in rows if name in TABLE_2_3}
-    largest = max(abs(medians[name] - printed) for name, (_, printed) in TABLE_2_3.items())
-    text = (
-        f"Hipparcos's errors: B-V {medians['sigma_bv_mag']:.4f} mag (thesis: 0.0281), places"
-        f" {medians['sigma_ra_mas']:.2f} and {medians['sigma_dec_mas']:.2f} mas (0.77, 0.64); all"
-        f" of table 2.3 within {largest:.3f}"
-    )
-    draw_catalogue_errors(directory / "catalogue_errors", text, catalog, medians)
-    return ChartFinding("catalogue_errors", text)
+        rows.append(CatalogueFigure(name, unit, float(here), printed))
+    return rows
 
 
 def draw_catalogue_errors(
-    path: Path,
-    text: str,
-    catalog: Catalog,
-    medians: Mapping[str, float],
+    path: Path, text: str, catalog: Catalog, errors: Sequence[CatalogueFigure]
 ) -> None:
     """Each error against the figure that it is of, with its median and the thesis's, and maps."""
     facts = facts_of(catalog.hip)
     against = measured_values(catalog)
-    largest = max(abs(medians[name] - printed) for name, (_, printed) in TABLE_2_3.items())
+    largest = max(abs(row.here - row.thesis) for row in errors)
     note = (
         f"Density of all {len(catalog)} stars; errors over {CLIPPED_TIMES} times the thesis's stand"
         " at the top edge. Solid: the figures above them, medians of stars to V ="
@@ -187,34 +237,22 @@ def draw_catalogue_errors(
     )
     layout: dict[str, Any] = {"note": note, "share_x": False, "height_inch": 11.0}
     with chart(path, text, 4, 2, **layout) as panels:
-        titles = dict(zip(TABLE_2_3, NAMES_2_3, strict=True))
-        for axes, (name, (unit, printed)) in zip(panels, TABLE_2_3.items(), strict=False):
-            value = against[name]
-            high = CLIPPED_TIMES * printed
+        for axes, row, title in zip(panels[:6], errors, NAMES_2_3, strict=True):
+            value = against[row.what]
+            high = CLIPPED_TIMES * row.thesis
             style: dict[str, Any] = {"cmap": density(), "norm": "log", "rasterized": True}
             style |= {"bins": (120, 60), "range": (value.limits, (0.0, high))}
-            axes.hist2d(value.of_star, np.minimum(facts[name], high), **style)
-            axes.set(ylabel=f"error [{unit}]", xlabel=value.label)
-            axes.set_title(f"{titles[name]}: {two_digits(medians[name])} {unit}")
-            axes.axhline(medians[name], color=INK, label="_here")
-            axes.axhline(printed, color=MUTED, ls="--", label="_thesis")
+            axes.hist2d(value.of_star, np.minimum(facts[row.what], high), **style)
+            axes.set(ylabel=f"error [{row.unit}]", xlabel=value.label)
+            axes.set_title(f"{title}: {two_digits(row.here)} {row.unit}")
+            axes.axhline(row.here, color=INK, label="_here")
+            axes.axhline(row.thesis, color=MUTED, ls="--", label="_thesis")
         for axes, name in zip(panels[6:], ("sigma_ra_mas", "sigma_dec_mas"), strict=True):
             sky_map(axes, catalog, name, facts[name])
 
 
-@dataclass(frozen=True, slots=True)
-class MeasuredValue:
-    """A figure of the catalogue's stars (n,), the label of its axis, and the limits that are
-    drawn.
-    """
-
-    of_star: FloatArray
-    label: str
-    limits: tuple[float, float]
-
-
 def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
-    """The figure that each error of table 2.3 belongs to, by the error's name."""
+    """The catalogue's figure behind each error of table 2.3, by the error's name."""
     pm_ra = catalog.pm_ra_cosdec_mas_yr
     pm_dec = catalog.pm_dec_mas_yr
     return {
@@ -228,22 +266,23 @@ def measured_values(catalog: Catalog) -> dict[str, MeasuredValue]:
 
 
 def density() -> "Colormap":
-    """From clear to blue, on light pages and on dark ones."""
+    """A colour map from clear to blue, for light and dark pages."""
     from matplotlib.colors import LinearSegmentedColormap, to_rgba
 
     return LinearSegmentedColormap.from_list("density", [to_rgba(BLUE, 0.06), to_rgba(BLUE, 1.0)])
 
 
 def sky_map(axes: "Axes", catalog: Catalog, name: str, error_mas: FloatArray) -> None:
-    """The median of an error over the sky, which Hipparcos scanned about the ecliptic's poles."""
+    """A map of the median of an error; Hipparcos scanned the sky about the ecliptic's poles."""
     ra_edges = np.linspace(0, 360, 73)
     dec_edges = np.degrees(np.arcsin(np.linspace(-1, 1, 37)))
     column = np.digitize(catalog.ra_deg, ra_edges) - 1
     row = np.digitize(catalog.dec_deg, dec_edges) - 1
     medians = np.full((len(dec_edges) - 1, len(ra_edges) - 1), np.nan)
     for at in np.unique(row * medians.shape[1] + column):
-        cell = divmod(int(at), medians.shape[1])
-        medians[cell] = np.median(error_mas[(row == cell[0]) & (column == cell[1])])
+        cell_row, cell_column = divmod(int(at), medians.shape[1])
+        in_cell = (row == cell_row) & (column == cell_column)
+        medians[cell_row, cell_column] = np.median(error_mas[in_cell])
     style: dict[str, Any] = {"cmap": density(), "vmin": 0.5, "vmax": 1.3, "rasterized": True}
     image = axes.pcolormesh(ra_edges, dec_edges, medians, **style)
     title = f"Sky map: {NAMES_2_3[list(TABLE_2_3).index(name)]}, medians"
@@ -251,51 +290,57 @@ def sky_map(axes: "Axes", catalog: Catalog, name: str, error_mas: FloatArray) ->
     axes.figure.colorbar(image, ax=axes, label="Error [mas]", fraction=0.06, pad=0.02)
 
 
+@dataclass(frozen=True, slots=True)
+class PassbandRow:
+    """A band: its effective wavelength, nm, and Vega's flux through it, erg/s/cm2/A, here and as
+    the thesis prints them.
+    """
+
+    band: str
+    effective_nm: float
+    thesis_effective_nm: float
+    vega_v0: float
+    thesis_bessell: float
+    thesis_johnson: float
+
+
+def passband_curves() -> dict[str, Curve]:
+    """The responses of UBVRI by band."""
+    responses = {}
+    for band in TABLE_2_5:
+        author = "johnson" if band == "v" else "bessell"
+        responses[band] = read_curve_csv(DATA_DIR / f"{author}-{band}.csv")
+    return responses
+
+
+def passband_rows(responses: Mapping[str, Curve]) -> list[PassbandRow]:
+    """Table 2.5 by Vega's spectrum, scaled to V = 0."""
+    light = vega()
+    scale = ZERO_W_M2_M["v"] / curve_mean(light, responses["v"])
+    longest_nm = light.wavelength_nm.max()
+    by_wavelength = Curve(light.wavelength_nm, light.value * light.wavelength_nm / longest_nm)
+    rows = []
+    for band, (johnson, bessell, printed_nm) in TABLE_2_5.items():
+        mean = curve_mean(light, responses[band])
+        effective_nm = curve_mean(by_wavelength, responses[band]) / mean * longest_nm
+        flux = scale * mean / ERG_S_CM2_A
+        rows.append(PassbandRow(band.upper(), effective_nm, printed_nm, flux, bessell, johnson))
+    return rows
+
+
 def passbands(directory: Path) -> ChartFinding:
     """Figures 2.12, 2.13 and 3.7, and table 2.5: UBVRI, Vega, and the black body that the thesis
     takes for it.
     """
-    light = vega()
-    curves = {}
-    for b in TABLE_2_5:
-        curves[b] = read_curve_csv(DATA_DIR / f"{'johnson' if b == 'v' else 'bessell'}-{b}.csv")
-    in_v = curve_mean(light, curves["v"])
-    scale = ZERO_W_M2_M["v"] / in_v  # a star with Vega's spectrum and V = 0
-    rows = []
-    for band, (johnson, bessell, printed_nm) in TABLE_2_5.items():
-        weighted = Curve(
-            light.wavelength_nm, light.value * light.wavelength_nm / light.wavelength_nm.max()
-        )
-        effective = (
-            curve_mean(weighted, curves[band])
-            / curve_mean(light, curves[band])
-            * light.wavelength_nm.max()
-        )
-        rows.append(
-            (
-                band.upper(),
-                effective,
-                printed_nm,
-                scale * curve_mean(light, curves[band]) / ERG_S_CM2_A,
-                bessell,
-                johnson,
-            )
-        )
-    columns = (
-        "band",
-        "effective_nm",
-        "thesis_effective_nm",
-        "vega_v0",
-        "thesis_bessell",
-        "thesis_johnson",
-    )
-    write_csv(directory / "passbands.csv", columns, rows)
-    off = max(abs(row[3] / row[4] - 1) for row in rows)
+    responses = passband_curves()
+    rows = passband_rows(responses)
+    write_rows(directory / "passbands.csv", rows)
+    off = max(abs(row.vega_v0 / row.thesis_bessell - 1) for row in rows)
     nm = np.arange(300.0, 1101.0)
-    body = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K) / v_band_mean_w_m2_m(
-        REFERENCE_TEMPERATURE_K, "energy"
-    )
-    shown = {"Vega": light(nm) / in_v, "black body, 9602 K": body}
+    light = vega()
+    exitance = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K)
+    body = exitance / v_band_mean_w_m2_m(REFERENCE_TEMPERATURE_K, "energy")
+    shown = {"Vega": light(nm) / curve_mean(light, responses["v"]), "black body, 9602 K": body}
     blue = float(shown["Vega"][50] / body[50])
     text = (
         f"Vega's spectrum at V = 0 has table 2.5's second fluxes within {100 * off:.1f} %;"
@@ -306,19 +351,7 @@ def passbands(directory: Path) -> ChartFinding:
         " 1990."
     )
     with chart(directory / "passbands", text, panels=2, note=note) as (upper, lower):
-        for (band, curve), colour in zip(
-            curves.items(), (PURPLE, BLUE, GREEN, ORANGE, INK), strict=True
-        ):
-            upper.plot(curve.wavelength_nm, curve.value, color=colour, label="_")
-            peak = curve.value.argmax()
-            upper.annotate(
-                band.upper(),
-                (curve.wavelength_nm[peak], curve.value[peak]),
-                va="bottom",
-                ha="center",
-                color=colour,
-            )
-        upper.set(ylabel="response [1]", ylim=(0, 1.15))
+        draw_passbands(upper, responses)
         spec = PanelSpec((), "relative F_lambda [1]", "wavelength [nm]", legend={})
         draw_curve_panel(lower, CurvePanel(nm, shown, spec, (INK, ORANGE)))
     columns_nm = {"wavelength_nm": nm, "vega": shown["Vega"], "blackbody_9602_k": body}
@@ -326,42 +359,78 @@ def passbands(directory: Path) -> ChartFinding:
     return ChartFinding("passbands", text)
 
 
+def draw_passbands(axes: "Axes", responses: Mapping[str, Curve]) -> None:
+    """The responses of UBVRI, each named at its peak."""
+    for (band, curve), colour in zip(responses.items(), BAND_COLOURS, strict=True):
+        axes.plot(curve.wavelength_nm, curve.value, color=colour, label="_")
+        peak = curve.value.argmax()
+        place = curve.wavelength_nm[peak], curve.value[peak]
+        axes.annotate(band.upper(), place, va="bottom", ha="center", color=colour)
+    axes.set(ylabel="response [1]", ylim=(0, 1.15))
+
+
+def sensor_words(curve: Curve) -> str:
+    """The range of a sensor and its peak, in words."""
+    first_nm, last_nm = curve.wavelength_nm[[0, -1]]
+    peak_nm = curve.wavelength_nm[curve.value.argmax()]
+    return f"{first_nm:.0f} to {last_nm:.0f} nm, most at {peak_nm:.0f}"
+
+
 def curves(directory: Path) -> ChartFinding:
     """Figures 5.1, 5.2, 5.20 and 5.21: sensors, glass, and the black bodies that they see."""
     names = ("ccd47-20", "kai-4021", "n-bk7-10mm")
-    loaded = {name: load_curve(name, name) for name in names}
-    labels = {}
-    for name, curve in loaded.items():
-        first_nm, last_nm = curve.wavelength_nm[[0, -1]]
-        peak_nm = curve.wavelength_nm[curve.value.argmax()]
-        labels[name] = f"{first_nm:.0f} to {last_nm:.0f} nm, most at {peak_nm:.0f}"
-    text = f"The CCD47-20 sees {labels['ccd47-20']}; the approximate KAI-4021 {labels['kai-4021']}"
+    responses = {name: load_curve(name, name) for name in names}
+    ccd = sensor_words(responses["ccd47-20"])
+    kai = sensor_words(responses["kai-4021"])
+    text = f"The CCD47-20 sees {ccd}; the approximate KAI-4021 {kai}"
     note = (
         "CCD47-20: ULTRACAM's red arm, not the thesis's midband coating. KAI-4021: recalled, not"
         " digitised. Lines: V."
     )
     nm = np.arange(300.0, 1101.0, 2.0)
-    kelvin = (3000.0, 5000.0, 9000.0, 30_000.0)
-    bodies = [blackbody_exitance_w_m2_m(nm, temperature_k) for temperature_k in kelvin]
-    bodies = [temperature_k / temperature_k.max() for temperature_k in bodies]
-    v = load_curve("johnson-v", "johnson-v").wavelength_nm
-    of_sensors = {name: curve(nm) for name, curve in loaded.items()}
-    of_bodies = {
-        f"{temperature_k:.0f} K": body for temperature_k, body in zip(kelvin, bodies, strict=True)
-    }
-    edges = PanelSpec((), "exitance over its largest [1]", "wavelength [nm]")
-    with chart(directory / "curves", text, panels=2, note=note) as (upper, lower):
-        spec = PanelSpec((), "electrons a photon, transmission [1]")
-        draw_curve_panel(upper, CurvePanel(nm, of_sensors, spec))
-        draw_curve_panel(lower, CurvePanel(nm, of_bodies, edges))
-        for edge in (v[0], v[-1]):
-            lower.axvline(edge, color=MUTED, lw=1)
-    columns = {
-        f"blackbody_{temperature_k:.0f}_k": body
-        for temperature_k, body in zip(kelvin, bodies, strict=True)
-    }
-    write_columns(directory / "curves.csv", {"wavelength_nm": nm, **of_sensors, **columns})
+    columns = {"wavelength_nm": nm}
+    of_sensors = {name: curve(nm) for name, curve in responses.items()}
+    columns |= of_sensors
+    of_bodies = {}
+    for kelvin in BODIES_K:
+        exitance = blackbody_exitance_w_m2_m(nm, kelvin)
+        relative = exitance / exitance.max()
+        of_bodies[f"{kelvin:.0f} K"] = relative
+        columns[f"blackbody_{kelvin:.0f}_k"] = relative
+    v_nm = load_curve("johnson-v", "johnson-v").wavelength_nm
+    edges = tuple(LevelLine(float(edge), HIDDEN, MUTED, "-", 1) for edge in v_nm[[0, -1]])
+    sensors_spec = PanelSpec((), "electrons a photon, transmission [1]")
+    bodies_spec = PanelSpec((), "exitance over its largest [1]", "wavelength [nm]", places=edges)
+    panels = CurvePanel(nm, of_sensors, sensors_spec), CurvePanel(nm, of_bodies, bodies_spec)
+    draw_curves(directory / "curves", text, panels, note)
+    write_columns(directory / "curves.csv", columns)
     return ChartFinding("curves", text)
+
+
+def dark_currents(kelvin: FloatArray) -> dict[str, FloatArray]:
+    """The dark current, e-/s, of table 4.2's detector at temperatures (n,) by each law."""
+    dark = {}
+    for name, law in DARK_LAWS.items():
+        currents = []
+        for temperature_k in kelvin.tolist():
+            detector = structs.replace(TABLE_4_2_DARK, temperature_k=temperature_k, **law)
+            currents.append(TABLE_4_2_DARK.dark_e_per_s * detector.dark_factor)
+        dark[name] = np.array(currents)
+    return dark
+
+
+def read_noises(hz: FloatArray) -> dict[str, FloatArray]:
+    """The read noise, e-, at readout frequencies (n,) by the corner of 1/f noise."""
+    noises = {}
+    for corner_hz in CORNERS_HZ:
+        noise_e = []
+        for readout_hz in hz.tolist():
+            detector = structs.replace(
+                TABLE_4_2_DARK, read_noise_corner_hz=corner_hz, readout_hz=readout_hz
+            )
+            noise_e.append(detector.read_noise_now_e)
+        noises[f"1/f corner {corner_hz / 1e3:g} kHz"] = np.array(noise_e)
+    return noises
 
 
 def detector_laws(directory: Path) -> ChartFinding:
@@ -370,22 +439,12 @@ def detector_laws(directory: Path) -> ChartFinding:
     """
     kelvin = np.arange(230.0, 300.5, 1.0)
     hz = np.geomspace(1e4, 1e7, 61)
-    dark = {}
-    for name, law in DARK_LAWS.items():
-        detectors = [
-            structs.replace(TABLE_4_2_DARK, temperature_k=t, **law) for t in kelvin.tolist()
-        ]
-        dark[name] = np.array([203 * detector.dark_factor for detector in detectors])
-    read = {}
-    for corner_hz in CORNERS_HZ:
-        detector = structs.replace(TABLE_4_2_DARK, read_noise_corner_hz=corner_hz)
-        detectors = [structs.replace(detector, readout_hz=f) for f in hz.tolist()]
-        read[corner_hz] = np.array([detector.read_noise_now_e for detector in detectors])
-    at = {name: float(values[kelvin == COLD_K][0]) for name, values in dark.items()}
+    dark = dark_currents(kelvin)
+    cold = {name: float(values[kelvin == COLD_K][0]) for name, values in dark.items()}
     text = (
-        f"Of 203 e-/s at 293 K (table 4.2) {COLD_K:.0f} K leaves {at['e2v AIMO']:.0f} by e2v's AIMO"
-        f" law, {at['e2v NIMO']:.0f} by its NIMO law, {at['Arrhenius, 0.56 eV']:.0f} by Arrhenius"
-        " with half of silicon's gap"
+        f"Of 203 e-/s at 293 K (table 4.2) {COLD_K:.0f} K leaves {cold['e2v AIMO']:.0f} by e2v's"
+        f" AIMO law, {cold['e2v NIMO']:.0f} by its NIMO law, {cold['Arrhenius, 0.56 eV']:.0f} by"
+        " Arrhenius with half of silicon's gap"
     )
     note = (
         "e2v's constants were seen in public code, not on a data sheet. Read noise: 2 e- at 1 MHz,"
@@ -393,31 +452,48 @@ def detector_laws(directory: Path) -> ChartFinding:
     )
     upper = PanelSpec((), "dark current [e-/s]", "temperature [K]", scales=("linear", "log"))
     lower = PanelSpec((), "read noise [e-]", "readout frequency [Hz]", scales=("log", "log"))
-    by_corner = {f"1/f corner {corner / 1e3:g} kHz": noise for corner, noise in read.items()}
-    panels = CurvePanel(kelvin, dark, upper), CurvePanel(hz, by_corner, lower)
+    panels = CurvePanel(kelvin, dark, upper), CurvePanel(hz, read_noises(hz), lower)
     draw_curves(directory / "detector_laws", text, panels, note)
     write_columns(directory / "detector_laws.csv", {"temperature_k": kelvin, **dark})
     return ChartFinding("detector_laws", text)
 
 
+def sunlight(nm: FloatArray) -> FloatArray:
+    """The spectrum of sunlight, a black body's."""
+    return blackbody_exitance_w_m2_m(nm, SUN_TEMPERATURE_K)
+
+
+def near_the_sun(nm: FloatArray) -> FloatArray:
+    """The spectrum of zodiacal light 30 degrees from the Sun."""
+    return relative_spectrum(nm, NEAR_SLOPES)
+
+
+ZODIACAL_LIGHTS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "sunlight": sunlight,
+    "90 deg from the Sun": relative_spectrum,
+    "30 deg from the Sun": near_the_sun,
+}
+
+
+def zodiacal_photons(nm: FloatArray) -> dict[str, FloatArray]:
+    """Zodiacal light of V = 22.1, photons/s/m2/arcsec2/nm at nm (n,), by each spectrum."""
+    photons_per_j = nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
+    v = load_curve("johnson-v", "johnson-v")
+    v_nm = np.arange(v.wavelength_nm[0], v.wavelength_nm[-1] + 1)
+    level = flux_ratio(ZODIACAL_V_MAG) * ZERO_W_M2_M["v"]
+    spectra = {}
+    for name, light in ZODIACAL_LIGHTS.items():
+        mean = float(light(v_nm) @ v(v_nm) / v(v_nm).sum())
+        spectra[name] = level * light(nm) / mean * 1e-9 * photons_per_j
+    return spectra
+
+
 def zodiacal_spectrum(directory: Path) -> ChartFinding:
     """Equation 4.9 and figure 4.11: zodiacal light of V = 22.1 by table 19 and as sunlight."""
     nm = np.arange(ZODIACAL_NM[0], ZODIACAL_NM[1] + 1)
-    photons_per_j = nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
-    v = load_curve("johnson-v", "johnson-v")
-    level = flux_ratio(ZODIACAL_V_MAG) * ZERO_W_M2_M["v"]
-    v_nm = np.arange(v.wavelength_nm[0], v.wavelength_nm[-1] + 1)
-    lights: dict[str, Callable[[FloatArray], FloatArray]] = {
-        "sunlight": lambda x: blackbody_exitance_w_m2_m(x, SUN_TEMPERATURE_K),
-        "90 deg from the Sun": relative_spectrum,
-        "30 deg from the Sun": lambda x: relative_spectrum(x, NEAR_SLOPES),
-    }
-    spectra: dict[str, FloatArray] = {}
-    for name, light in lights.items():
-        mean = float(light(v_nm) @ v(v_nm) / v(v_nm).sum())
-        spectra[name] = level * light(nm) / mean * 1e-9 * photons_per_j  # photons/s/m2/arcsec2/nm
-    total = {name: float(np.trapezoid(values, nm)) for name, values in spectra.items()}
-    sun, far, near = total.values()
+    spectra = zodiacal_photons(nm)
+    totals = {name: float(np.trapezoid(values, nm)) for name, values in spectra.items()}
+    sun, far, near = totals.values()
     text = (
         f"Zodiacal light of V = {ZODIACAL_V_MAG:g} has {far:.1f} photons/s/m2/arcsec2 90 degrees"
         f" from the Sun (330 to 1100 nm), {near:.1f} at 30 degrees, {sun:.1f} as sunlight"
@@ -426,14 +502,44 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
         f"V = {ZODIACAL_V_MAG:g}. Leinert 1998, table 19 and equation 22, through Johnson V. The"
         " WFC3 handbook's spectrum, V = 22.15, gives 101.6."
     )
-    with_totals = {f"{name}: {total[name]:.1f} in all": light for name, light in spectra.items()}
+    with_totals = {f"{name}: {totals[name]:.1f} in all": light for name, light in spectra.items()}
     spec = PanelSpec((), "photons/s/m2/arcsec2/nm", "wavelength [nm]", legend={})
     draw_curves(directory / "zodiacal", text, (CurvePanel(nm, with_totals, spec),), note)
     write_columns(directory / "zodiacal.csv", {"wavelength_nm": nm, **spectra})
     return ChartFinding("zodiacal", text)
 
 
-FIGURES = (catalogue_errors, passbands, curves, detector_laws, zodiacal_spectrum)
+@dataclass(frozen=True, slots=True)
+class SpectrumErrors:
+    """The errors (n,) of the electron rates of library stars by one method and sensor, %."""
+
+    sensor: str
+    method: str
+    percent: FloatArray
+
+    def within(self, stars: BoolArray) -> tuple[float, float]:
+        """The errors that half and 95 % of some stars are within, %."""
+        half, at_95 = np.percentile(np.abs(self.percent[stars]), (50, 95)).tolist()
+        return half, at_95
+
+
+def spectrum_errors() -> list[SpectrumErrors]:
+    """Every sensor by every method: held-out spectra, and black bodies."""
+    library = load_library()
+    photometry = Photometry()
+    rows = []
+    for sensor in SENSORS:
+        optics = study_optics(sensor)
+        rates = library_electrons_per_s(library, optics, photometry)
+        dusty_rates = library_electrons_per_s(bare_and_dusty(), optics, photometry)
+        by_type = held_out_by_type(dusty_rates)[: len(rates)]
+        rows.append(SpectrumErrors(sensor, HELD_OUT, 100 * held_out_errors(rates)))
+        rows.append(SpectrumErrors(sensor, BY_TYPE, 100 * by_type))
+        for scale in TEMPERATURE_SCALES:
+            kelvin = star_temperatures_k(library.bv_mag, scale)
+            off = dgs_electrons_per_s(kelvin, optics, photometry) / rates - 1
+            rows.append(SpectrumErrors(sensor, f"black body, {scale}", 100 * off))
+    return rows
 
 
 def spectra(directory: Path) -> ChartFinding:
@@ -441,41 +547,23 @@ def spectra(directory: Path) -> ChartFinding:
     spectra over V-I.
     """
     library = load_library()
-    photometry = Photometry()
-    errors: dict[tuple[str, str], FloatArray] = {}  # relative, of each star, by sensor and method
-    for sensor in SENSORS:
-        optics = study_optics(sensor)
-        rates = library_electrons_per_s(library, optics, photometry)
-        errors[sensor, HELD_OUT] = held_out_errors(rates)
-        errors[sensor, BY_TYPE] = held_out_by_type(
-            library_electrons_per_s(bare_and_dusty(), optics, photometry)
-        )[: len(rates)]
-        for scale in TEMPERATURE_SCALES:
-            body = dgs_electrons_per_s(
-                star_temperatures_k(library.bv_mag, scale), optics, photometry
-            )
-            errors[sensor, f"black body, {scale}"] = body / rates - 1
+    rows = spectrum_errors()
+    by_method = {(row.sensor, row.method): row for row in rows}
     sure = library.vi_mag < MAX_RELIABLE_VI_MAG
-    figures = {
-        key: np.percentile(100 * np.abs(error[sure]), (50, 95)) for key, error in errors.items()
-    }
-    by_sensor = []
-    for sensor in SENSORS:
-        real, real_95 = figures[sensor, HELD_OUT]
-        body, body_95 = figures[sensor, "black body, ballesteros2012"]
-        by_sensor.append(
-            f"{SENSORS[sensor].split()[0]} {real:.1f} % ({real_95:.1f} %) by real spectra and V-I,"
-            f" {body:.1f} % ({body_95:.1f} %) by black bodies and B-V"
-        )
-    text = f"Median error of the electron rate (95 %), V-I < 2.5: {'; '.join(by_sensor)}"
-    worst_real = max(figures[sensor, HELD_OUT][1] for sensor in SENSORS)
-    worst_body = max(figures[sensor, "black body, ballesteros2012"][1] for sensor in SENSORS)
     late = ~sure & np.array([name.endswith("III") for name in library.spectral_type])
-    of_late = {key: np.percentile(100 * np.abs(error[late]), 95) for key, error in errors.items()}
-    text += "; late M giants (95 %), " + "; ".join(
-        f"{SENSORS[sensor].split()[0]} {of_late[sensor, HELD_OUT]:.0f} % by V-I,"
-        f" {of_late[sensor, BY_TYPE]:.1f} % by MK type (others {figures[sensor, BY_TYPE][1]:.1f} %)"
-        for sensor in SENSORS
+    usual = []
+    late_giants = []
+    for sensor, title in SENSORS.items():
+        name = title.split()[0]
+        real = by_method[sensor, HELD_OUT]
+        by_type = by_method[sensor, BY_TYPE]
+        usual.append(f"{name} {spectra_words(real, by_method[sensor, BODY], sure)}")
+        late_giants.append(f"{name} {late_words(real, by_type, late, sure)}")
+    worst_real = max(by_method[sensor, HELD_OUT].within(sure)[1] for sensor in SENSORS)
+    worst_body = max(by_method[sensor, BODY].within(sure)[1] for sensor in SENSORS)
+    text = (
+        f"Median error of the electron rate (95 %), V-I < 2.5: {'; '.join(usual)}; late M giants"
+        f" (95 %), {'; '.join(late_giants)}"
     )
     finding = (
         f"Real spectra by V-I give the electron rate within {worst_real:.1f} % for 95 % of stars to"
@@ -487,148 +575,207 @@ def spectra(directory: Path) -> ChartFinding:
     )
     with chart(directory / "spectra", finding, panels=2, note=note) as panels:
         for axes, sensor in zip(panels, SENSORS, strict=True):
-            named = [(name, error) for (owner, name), error in errors.items() if owner == sensor]
-            for (name, error), mark, colour in zip(
-                reversed(named), "+x^o", (GREEN, ORANGE, INK, BLUE), strict=True
-            ):
-                axes.plot(library.vi_mag, 100 * error, mark, color=colour, ms=4, label=name)
-            axes.axvline(MAX_RELIABLE_VI_MAG, color=MUTED, lw=1, ls="--")
-            axes.axhline(0, color=INK, lw=1)
-            axes.set_yscale("symlog", linthresh=5)
-            axes.set(ylabel="error of the electron rate [%]", title=SENSORS[sensor])
-            axes.set_ylim(-130, 50_000)
-            plain_ticks(axes.yaxis, (-50, -10, 0, 10, 50, 200))
+            draw_spectra(axes, sensor, [row for row in rows if row.sensor == sensor])
         panels[-1].set(xlabel="V-I [mag]")
         panels[0].legend(loc="upper right")
-    columns = ("spectral_type", "bv_mag", "vi_mag", *(f"{s}: {n} [%]" for s, n in errors))
-    table = zip(
-        library.spectral_type,
-        library.bv_mag,
-        library.vi_mag,
-        *(100 * e for e in errors.values()),
-        strict=True,
-    )
+    columns = ["spectral_type", "bv_mag", "vi_mag"]
+    columns += [f"{row.sensor}: {row.method} [%]" for row in rows]
+    errors = [row.percent for row in rows]
+    table = zip(library.spectral_type, library.bv_mag, library.vi_mag, *errors, strict=True)
     write_csv(directory / "spectra.csv", columns, table)
     return ChartFinding("spectra", text)
 
 
-def zero_points(directory: Path) -> ChartFinding:
-    """Electrons of a V = 0 star of 9602 K by zero point and weighting."""
-    rates = {}
-    for sensor in SENSORS:
-        optics = study_optics(sensor)
-        of_settings = [dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, optics, p) for p in SETTINGS]
-        rates[sensor] = np.array(of_settings)
-    mag = {sensor: magnitude(rate / rate[0]) for sensor, rate in rates.items()}
-    base = rates["ccd47-20"]
-    cost = mag["ccd47-20"]
-    text = (
-        f"A V = 0 star of 9602 K gives {base[0] / 1e6:.1f} million electrons/s by Vega's flux"
-        f" (CCD47-20, 30 mm), {100 * (1 - base[2] / base[0]):.0f} % ({cost[2]:.2f} mag) fewer by"
-        " the IAU's bolometric zero point"
+def spectra_words(real: SpectrumErrors, body: SpectrumErrors, sure: BoolArray) -> str:
+    """The errors of real spectra and of black bodies, in words."""
+    real_half, real_95 = real.within(sure)
+    body_half, body_95 = body.within(sure)
+    return (
+        f"{real_half:.1f} % ({real_95:.1f} %) by real spectra and V-I, {body_half:.1f} %"
+        f" ({body_95:.1f} %) by black bodies and B-V"
     )
-    note = f"A black body of {REFERENCE_TEMPERATURE_K:.0f} K, V = 0, behind {APERTURE_MM:g} mm."
-    with chart(directory / "zero_points", text, panels=2, note=note) as (upper, lower):
-        place = np.arange(len(SETTINGS))
-        for k, ((sensor, name), colour) in enumerate(
-            zip(SENSORS.items(), (BLUE, ORANGE), strict=True)
-        ):
-            for axes, height, figure in (
-                (upper, rates[sensor] / 1e6, "%.2f"),
-                (lower, mag[sensor], "%+.3f"),
-            ):
-                bars = axes.bar(place + 0.4 * k - 0.2, height, 0.38, color=colour, label=name)
-                axes.bar_label(bars, fmt=figure, padding=2, fontsize=SMALL_PT)
-        upper.set(ylabel="electrons a second [millions]", ylim=(0, 1.3 * base.max() / 1e6))
-        low = min(0.0, *(m.min() for m in mag.values()))
-        high = max(m.max() for m in mag.values())
-        # with room for figures and names
-        limits = (low - 0.15 * (high - low), high + 0.4 * (high - low))
-        lower.set_xticks(place, [f"{p.zero_point},\n{p.weighting} weighting" for p in SETTINGS])
-        lower.set(
-            ylabel="fainter than vega, energy [mag]",
-            xlabel="zero point, weighting of the passband",
-            ylim=limits,
-        )
-        for axes in (upper, lower):
-            axes.grid(visible=False, axis="x")
-            axes.legend(loc="upper left", ncols=2)
+
+
+def late_words(
+    real: SpectrumErrors, by_type: SpectrumErrors, late: BoolArray, sure: BoolArray
+) -> str:
+    """The errors of late M giants by colour and by type, and of the others by type, in words."""
+    by_colour_95 = real.within(late)[1]
+    by_type_95 = by_type.within(late)[1]
+    others_95 = by_type.within(sure)[1]
+    return f"{by_colour_95:.0f} % by V-I, {by_type_95:.1f} % by MK type (others {others_95:.1f} %)"
+
+
+def draw_spectra(axes: "Axes", sensor: str, rows: Sequence[SpectrumErrors]) -> None:
+    """The errors of one sensor over V-I, a mark a star."""
+    vi_mag = load_library().vi_mag
+    for row, (mark, colour) in zip(reversed(rows), SPECTRUM_MARKS, strict=True):
+        axes.plot(vi_mag, row.percent, mark, color=colour, ms=4, label=row.method)
+    axes.axvline(MAX_RELIABLE_VI_MAG, color=MUTED, lw=1, ls="--")
+    axes.axhline(0, color=INK, lw=1)
+    axes.set_yscale("symlog", linthresh=5)
+    axes.set(ylabel="error of the electron rate [%]", title=SENSORS[sensor])
+    axes.set_ylim(-130, 50_000)
+    plain_ticks(axes.yaxis, (-50, -10, 0, 10, 50, 200))
+
+
+@dataclass(frozen=True, slots=True)
+class ZeroPointRow:
+    """The electrons of a star of V = 0 by one zero point and weighting, and how much fainter it is
+    than by the default.
+    """
+
+    sensor: str
+    zero_point: str
+    weighting: str
+    electrons_per_s: float
+    mag_against_default: float
+
+    @property
+    def millions(self) -> float:
+        """The electrons a second, millions."""
+        return self.electrons_per_s / 1e6
+
+    @property
+    def words(self) -> str:
+        """The setting, in two lines."""
+        return f"{self.zero_point},\n{self.weighting} weighting"
+
+
+def zero_point_rows() -> list[ZeroPointRow]:
+    """Every sensor by every setting; the default is the first setting."""
     rows = []
     for sensor in SENSORS:
-        for p, rate, cost_mag in zip(SETTINGS, rates[sensor], mag[sensor], strict=True):
-            rows.append((sensor, p.zero_point, p.weighting, float(rate), float(cost_mag)))
-    columns = ("sensor", "zero_point", "weighting", "electrons_per_s", "mag_against_default")
-    write_csv(directory / "zero_points.csv", columns, rows)
+        optics = study_optics(sensor)
+        default_rate = None
+        for setting in SETTINGS:
+            rate = dgs_electrons_per_s(REFERENCE_TEMPERATURE_K, optics, setting)
+            default_rate = default_rate or rate
+            cost_mag = float(magnitude(rate / default_rate))
+            figures = float(rate), cost_mag
+            rows.append(ZeroPointRow(sensor, setting.zero_point, setting.weighting, *figures))
+    return rows
+
+
+def zero_points(directory: Path) -> ChartFinding:
+    """Electrons of a V = 0 star of 9602 K by zero point and weighting."""
+    rows = zero_point_rows()
+    write_rows(directory / "zero_points.csv", rows)
+    default, bolometric = rows[0], rows[2]
+    fewer = 100 * (1 - bolometric.electrons_per_s / default.electrons_per_s)
+    text = (
+        f"A V = 0 star of 9602 K gives {default.millions:.1f} million electrons/s by Vega's flux"
+        f" (CCD47-20, 30 mm), {fewer:.0f} % ({bolometric.mag_against_default:.2f} mag) fewer by the"
+        " IAU's bolometric zero point"
+    )
+    note = f"A black body of {REFERENCE_TEMPERATURE_K:.0f} K, V = 0, behind {APERTURE_MM:g} mm."
+    largest = max(row.millions for row in rows if row.sensor == default.sensor)
+    costs_mag = [row.mag_against_default for row in rows]
+    low = min(0.0, *costs_mag)
+    high = max(costs_mag)
+    extent = high - low
+    legend = {"loc": "upper left", "ncols": 2}
+    upper = PanelSpec(
+        ylabel="electrons a second [millions]",
+        bars=BarSpec(setting_words, "millions", 0.8, "%.2f", look=BAR),
+        ylim=(0, 1.3 * largest),
+        legend=legend,
+    )
+    lower = PanelSpec(
+        ylabel="fainter than vega, energy [mag]",
+        xlabel="zero point, weighting of the passband",
+        bars=BarSpec(setting_words, "mag_against_default", 0.8, "%+.3f", look=BAR),
+        # with room for figures and names
+        ylim=(low - 0.15 * extent, high + 0.4 * extent),
+        legend=legend,
+    )
+    looks = looks_of(SENSORS)
+    spec = ChartSpec((upper, lower), lambda row: row.sensor, looks, note)
+    draw_rows(directory / "zero_points", text, spec, rows)
     return ChartFinding("zero_points", text)
+
+
+def setting_words(row: ZeroPointRow) -> str:
+    """The group of a row: its setting."""
+    return row.words
+
+
+def names_with(figures: Mapping[str, tuple[float, float]], form: str) -> str:
+    """Names with their two figures, as `form` writes them, in one line."""
+    named = []
+    for name, (half, most) in figures.items():
+        named.append(form.format(name=name.split()[-1], half=half, most=most))
+    return ", ".join(named)
+
+
+def within_mag(bv: FloatArray, mag: FloatArray) -> tuple[float, float]:
+    """What half and 95 % of Hipparcos to V = 7.5 are within, mag, by errors (n,) over B-V (n,)."""
+    stars_bv = load_catalog().brighter_than(BRIGHT_V_MAG).bv_mag
+    stars_bv = stars_bv[(stars_bv >= bv[0]) & (stars_bv <= bv[-1])]
+    off_mag = np.abs(np.interp(stars_bv, bv, mag))
+    half, most = np.percentile(off_mag, (50, 95)).tolist()
+    return half, most
 
 
 def temperature_scales(directory: Path) -> ChartFinding:
     """The scales that a bench file can choose, beside Torres 2010, and their error in electrons."""
     bv = np.union1d(SCALE_BV_MAG, -1e-9)  # both sides of wang2021's step
     torres = torres2010_k(bv)
+    kelvin = {SUPERGIANTS: torres2010_k(bv, supergiant=True)}
+    for name, scale in TEMPERATURE_SCALES.items():
+        kelvin[name] = scale(bv)
     optics = study_optics("ccd47-20")
-    photometry = Photometry()
-    base = dgs_electrons_per_s(torres, optics, photometry)
-    kelvin = {"torres2010_supergiant": torres2010_k(bv, supergiant=True)}
-    kelvin |= {name: scale(bv) for name, scale in TEMPERATURE_SCALES.items()}
-    percent = {name: 100 * (t / torres - 1) for name, t in kelvin.items()}
-    mag = {
-        name: magnitude(dgs_electrons_per_s(t, optics, photometry) / base)
-        for name, t in kelvin.items()
-    }
-    stars_bv = load_catalog().brighter_than(BRIGHT_V_MAG).bv_mag
-    stars_bv = stars_bv[(stars_bv >= bv[0]) & (stars_bv <= bv[-1])]
-    within = {}
-    for n in TEMPERATURE_SCALES:
-        within[n] = np.percentile(np.abs(np.interp(stars_bv, bv, mag[n])), (50, 95))
+    base = dgs_electrons_per_s(torres, optics, Photometry())
+    percent = {}
+    mag = {}
+    for name, scale_k in kelvin.items():
+        percent[name] = 100 * (scale_k / torres - 1)
+        mag[name] = magnitude(dgs_electrons_per_s(scale_k, optics, Photometry()) / base)
+    within = {name: within_mag(bv, mag[name]) for name in TEMPERATURE_SCALES}
     zero = int(np.searchsorted(bv, 0.0))
-    wang = kelvin["wang2021"]
-    step_k = wang[zero - 1] - wang[zero]
+    before_step_k = kelvin["wang2021"][zero - 1]
+    step_k = before_step_k - kelvin["wang2021"][zero]
+    with_most = names_with(within, "{half:.3f} ({most:.2f}) mag by {name}")
     text = (
-        f"wang2021 steps down by {step_k:.0f} K ({100 * step_k / wang[zero - 1]:.1f} %) at B-V = 0;"
-        " half of Hipparcos to V = 7.5 (95 %) is within "
-        + ", ".join(
-            f"{half:.3f} ({most:.2f}) mag by {name}" for name, (half, most) in within.items()
-        )
-        + " of Torres 2010"
+        f"wang2021 steps down by {step_k:.0f} K ({100 * step_k / before_step_k:.1f} %) at B-V = 0;"
+        f" half of Hipparcos to V = 7.5 (95 %) is within {with_most} of Torres 2010"
     )
     finding = (
-        f"The scale wang2021 steps down by {step_k:.0f} K at B-V = 0; half of Hipparcos is within "
-        + ", ".join(f"{half:.3f} mag by {name}" for name, (half, _) in within.items())
+        f"The scale wang2021 steps down by {step_k:.0f} K at B-V = 0; half of Hipparcos is within"
+        f" {names_with(within, '{half:.3f} mag by {name}')} of Torres 2010"
     )
     note = (
         "Torres 2010 (Flower 1996) for dwarfs and giants is the reference. Electrons: CCD47-20, +"
         " is fainter."
     )
-    groups = {"k": kelvin, "percent": percent, "mag": mag}
-    with chart(
-        directory / "temperature_scales", f"{finding} of Torres 2010", panels=3, note=note
-    ) as panels:
-        panels[0].plot(bv, torres, color=INK, label="Torres 2010")
-        for axes, values in zip(panels, groups.values(), strict=True):
-            for (name, value), style, colour in zip(
-                values.items(), (":", "-", "-"), (MUTED, BLUE, ORANGE), strict=True
-            ):
-                label = name.replace("torres2010_supergiant", "Torres, supergiants")
-                if axes is panels[2] and name in within:
-                    label = f"{name}: half within {within[name][0]:.3f}"
-                axes.plot(bv, value, style, color=colour, label=label)
-        for axes in panels[1:]:
-            axes.axhline(0, color=INK, lw=1)
-        panels[0].set(yscale="log", ylabel="temperature [K]")
-        panels[1].set(ylabel="difference [%]")
-        panels[2].set(xlabel="B-V [mag]", ylabel="difference in electrons [mag]")
-        label_ends(*panels)
-    columns = (
-        "bv_mag",
-        "torres2010_k",
-        *(f"{name}_{unit}" for unit, values in groups.items() for name in values),
+    above = PanelSpec(ylabel="temperature [K]", scales=("linear", "log"))
+    middle = PanelSpec(ylabel="difference [%]", levels=(ZERO_LINE,))
+    below = PanelSpec(
+        ylabel="difference in electrons [mag]", xlabel="B-V [mag]", levels=(ZERO_LINE,)
     )
-    table = np.column_stack(
-        (bv, torres, *(value for values in groups.values() for value in values.values()))
+    labels = {name: name.replace(SUPERGIANTS, "Torres, supergiants") for name in kelvin}
+    mag_labels = dict(labels)
+    for name, (half, _) in within.items():
+        mag_labels[name] = f"{name}: half within {half:.3f}"
+    scales = {"Torres 2010": torres, **relabelled(kelvin, labels)}
+    panels = (
+        CurvePanel(bv, scales, above, (INK, *SCALE_COLOURS), styles=("-", *SCALE_STYLES)),
+        CurvePanel(bv, relabelled(percent, labels), middle, SCALE_COLOURS, styles=SCALE_STYLES),
+        CurvePanel(bv, relabelled(mag, mag_labels), below, SCALE_COLOURS, styles=SCALE_STYLES),
     )
-    write_csv(directory / "temperature_scales.csv", columns, table.tolist())
+    draw_curves(directory / "temperature_scales", finding, panels, note)
+    columns = {"bv_mag": bv, "torres2010_k": torres}
+    for unit, values in (("k", kelvin), ("percent", percent), ("mag", mag)):
+        columns |= relabelled(values, {name: f"{name}_{unit}" for name in values})
+    write_columns(directory / "temperature_scales.csv", columns)
     return ChartFinding("temperature_scales", text)
+
+
+def relabelled(
+    curves: Mapping[str, FloatArray], labels: Mapping[str, str]
+) -> dict[str, FloatArray]:
+    """Curves by their labels."""
+    return {labels[name]: values for name, values in curves.items()}
 
 
 def choices(directory: Path) -> ChartFinding:
@@ -636,61 +783,67 @@ def choices(directory: Path) -> ChartFinding:
     optics = study_optics("ccd47-20")
     stars = load_catalog().brighter_than(BRIGHT_V_MAG)
     cost = choice_costs_mag(BV_MAG, optics)
-    real = tabulate_pickles(optics, Photometry()).electrons_per_s(
-        np.zeros(len(stars)), stars.bv_mag, stars.vi_mag
-    )
-    # a spectrum for each colour, of which there are few
-    bv_mag, star = np.unique(stars.bv_mag, return_inverse=True)
-    body = dgs_electrons_per_s(
-        star_temperatures_k(bv_mag, "ballesteros2012"), optics, Photometry()
-    )[star]
-    on_stars = {name: mag[star] for name, mag in choice_costs_mag(bv_mag, optics).items()}
-    on_stars["spectrum pickles"] = magnitude(real / body)
-    low, middle, high, _ = percentiles = running_percentiles(
-        stars.bv_mag, on_stars["spectrum pickles"], BV_MAG
-    )
-    paid = {name: np.percentile(np.abs(mag), (50, 95)) for name, mag in on_stars.items()}
+    on_stars = star_costs_mag(stars, optics)
+    percentiles = running_percentiles(stars.bv_mag, on_stars["spectrum pickles"], BV_MAG)
+    low, middle, high, _ = percentiles
+    paid = {}
+    for name, mag in on_stars.items():
+        half, most = np.percentile(np.abs(mag), (50, 95)).tolist()
+        paid[name] = half, most
     text = (
         "What each choice costs half of Hipparcos to V = 7.5 (95 %), CCD47-20, mag: "
-        + ", ".join(
-            f"{name.split()[-1]} {half:.2f} ({most:.2f})" for name, (half, most) in paid.items()
-        )
+        + names_with(paid, "{name} {half:.2f} ({most:.2f})")
     )
-    finding = choices_finding(paid)
     note = (
         f"At a name: half of {len(stars)} Hipparcos stars change by as much (a twentieth). Band: 5"
         f" to 95 % of them. M giants share the B-V of K giants, and are up to {-np.nanmin(low):.1f}"
         " mag brighter than the black body. + is fainter; CCD47-20."
     )
-    with chart(directory / "choices", finding, panels=2, note=note) as (upper, lower):
+    with chart(directory / "choices", choices_finding(paid), panels=2, note=note) as panels:
+        upper, lower = panels
         for (name, mag), colour in zip(cost.items(), SERIES, strict=False):
-            half, most = paid[name]
-            upper.plot(
-                BV_MAG, mag, color=colour, label=f"{name.split()[-1]}: {half:.2f} ({most:.2f})"
-            )
-        half, most = paid["spectrum pickles"]
-        names = {upper: f"pickles: {half:.2f} ({most:.2f})", lower: "pickles, median"}
-        for axes, name in names.items():
-            axes.plot(BV_MAG, middle, color=INK, label=name)
+            upper.plot(BV_MAG, mag, color=colour, label=cost_label(name, paid))
+        upper.plot(BV_MAG, middle, color=INK, label=cost_label("spectrum pickles", paid))
+        lower.plot(BV_MAG, middle, color=INK, label="pickles, median")
+        for axes in panels:
             axes.axhline(0, color=MUTED, lw=1)
             axes.set(ylabel="cost against a black body [mag]")
         lower.fill_between(BV_MAG, low, high, color=MUTED, alpha=0.35, lw=0)
         lower.set(xlabel="B-V [mag]")
         label_ends(upper, lower)
-    columns = ("bv_mag", *(f"{n.replace(' ', '_')}_mag" for n in cost))
-    columns += ("pickles_p5_mag", "pickles_median_mag", "pickles_p95_mag", "stars_in_window")
-    write_csv(
-        directory / "choices.csv",
-        columns,
-        np.column_stack((BV_MAG, *cost.values(), *percentiles)).tolist(),
-    )
+    columns = {"bv_mag": BV_MAG}
+    for name, mag in cost.items():
+        columns[f"{name.replace(' ', '_')}_mag"] = mag
+    columns |= dict(zip(PERCENTILE_COLUMNS, percentiles, strict=True))
+    write_columns(directory / "choices.csv", columns)
     return ChartFinding("choices", text)
 
 
-def choices_finding(paid: Mapping[str, FloatArray]) -> str:
-    """Which choice changes half of the stars most, and which a twentieth; mag (2,) by choice."""
-    dearest = max(paid, key=lambda name: float(paid[name][0]))
-    for_few = max(paid, key=lambda name: float(paid[name][1]))
+def cost_label(name: str, paid: Mapping[str, tuple[float, float]]) -> str:
+    """A choice, what half of the stars pay for it, and what a twentieth pays."""
+    half, most = paid[name]
+    return f"{name.rsplit(maxsplit=1)[-1]}: {half:.2f} ({most:.2f})"
+
+
+def star_costs_mag(stars: Catalog, optics: Optics) -> dict[str, FloatArray]:
+    """The cost of each choice for stars (n,), mag, that of real spectra included."""
+    table = tabulate_pickles(optics, Photometry())
+    real = table.electrons_per_s(np.zeros(len(stars)), stars.bv_mag, stars.vi_mag)
+    # a spectrum for each colour, of which there are few
+    bv_mag, star = np.unique(stars.bv_mag, return_inverse=True)
+    kelvin = star_temperatures_k(bv_mag, "ballesteros2012")
+    body = dgs_electrons_per_s(kelvin, optics, Photometry())[star]
+    costs = {}
+    for name, mag in choice_costs_mag(bv_mag, optics).items():
+        costs[name] = mag[star]
+    costs["spectrum pickles"] = magnitude(real / body)
+    return costs
+
+
+def choices_finding(paid: Mapping[str, tuple[float, float]]) -> str:
+    """The choice that changes half of the stars most, and the one that changes a twentieth most."""
+    dearest = max(paid, key=lambda name: paid[name][0])
+    for_few = max(paid, key=lambda name: paid[name][1])
     half, most = paid[dearest]
     text = (
         f"Of the choices of brightness {dearest.split()[-1]} changes most: half of Hipparcos to"
@@ -708,15 +861,15 @@ def choice_costs_mag(bv_mag: FloatArray, optics: Optics) -> dict[str, FloatArray
     """
     default = Photometry()
     kelvin = star_temperatures_k(bv_mag, "ballesteros2012")
+    wang_k = star_temperatures_k(bv_mag, "wang2021")
+    photon = Photometry("vega", "photon")
+    bolometric = Photometry("iau-bolometric")
+    average = ags_electrons_per_s(optics, default)
     rates = {
-        "temperature wang2021": dgs_electrons_per_s(
-            star_temperatures_k(bv_mag, "wang2021"), optics, default
-        ),
-        "weighting photon": dgs_electrons_per_s(kelvin, optics, Photometry("vega", "photon")),
-        "zero point iau-bolometric": dgs_electrons_per_s(
-            kelvin, optics, Photometry("iau-bolometric")
-        ),
-        "brightness ags": np.full_like(bv_mag, ags_electrons_per_s(optics, default)),
+        "temperature wang2021": dgs_electrons_per_s(wang_k, optics, default),
+        "weighting photon": dgs_electrons_per_s(kelvin, optics, photon),
+        "zero point iau-bolometric": dgs_electrons_per_s(kelvin, optics, bolometric),
+        "brightness ags": np.full_like(bv_mag, average),
     }
     base = dgs_electrons_per_s(kelvin, optics, default)
     return {name: magnitude(rate / base) for name, rate in rates.items()}
@@ -736,16 +889,18 @@ def running_percentiles(bv_mag: FloatArray, value: FloatArray, at_bv_mag: FloatA
     return rows
 
 
+FIGURES: tuple[Callable[[Path], ChartFinding], ...] = (
+    *(temperature_scales, zero_points, choices, spectra),
+    *(catalogue_errors, passbands, curves, detector_laws, zodiacal_spectrum),
+    *SKY_FIGURES,
+)
+
+
 def run(directory: Path) -> list[ChartFinding]:
     """Write every chart and its table (CSV) into `directory`, and `findings.csv`. Raises
     InputError.
     """
     findings = [rapp(directory, sensor) for sensor in SENSORS]
-    findings += [
-        chart_of(directory)
-        for chart_of in (temperature_scales, zero_points, choices, spectra, *FIGURES, *SKY_FIGURES)
-    ]
-    write_csv(
-        directory / "findings.csv", ("figure", "finding"), [(f.figure, f.text) for f in findings]
-    )
+    findings += [figure(directory) for figure in FIGURES]
+    write_findings(directory, findings)
     return findings

@@ -18,7 +18,7 @@ from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.simulate.pictures import write_exposure_fits
 from hilstar.instruments.simulate.simulator import Exposure, FrameNoise, Simulator
-from hilstar.instruments.study.fields import FIELDS, Field, fields_of
+from hilstar.instruments.study.fields import FIELDS, SkyField, fields_of
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.tracker.settings import DetectorSettings
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 SEED = 1
-ZOOM_PX = 160
-STRETCH_PERCENT = (1, 99.8)
+ZOOM_PX = 160  # side of the part that is shown
+STRETCH_PERCENT = (1, 99.8)  # of the pixels below black, and below white
 # From black to white, in sigmas of the sky's noise: at least, and at most where a body fills
 # pixels.
 MIN_SIGMAS, MAX_SIGMAS = 10.0, 300.0
@@ -41,20 +41,20 @@ FIGURES = {"orion": "5.3 to 5.7", "lyra": "5.8 to 5.12", "rosetta": "5.14 to 5.1
 
 
 @dataclass(frozen=True, slots=True)
-class Scene:
-    """A field before a camera: stem of its files, title, and star of its zoom (None: the
-    brightest).
+class OutputScene:
+    """A field before a camera: the stem of its files, its title, and the star of its zoom (None:
+    the brightest).
     """
 
     stem: str
     title: str
-    field: Field
+    field: SkyField
     zoom_hip: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Outputs:
-    """A scene's exposures without and with noise, and what its sky has."""
+    """A scene's exposures without and with noise, and its sky."""
 
     clean: Exposure
     noisy: Exposure
@@ -78,49 +78,50 @@ def run(
     """Write each scene's figure, images (FITS) and truth (CSV); a line for each. Raises
     InputError.
     """
-    if file is not None:
-        chosen = fields_of(radec_roll_deg)
-        return [
-            _output(directory, file, Scene(field.stem, f"{field.name}, {file.path.name}", field))
-            for field in chosen
-        ]
     lines = []
+    if file is not None:
+        for field in fields_of(radec_roll_deg):
+            scene = OutputScene(field.stem, f"{field.name}, {file.path.name}", field)
+            lines.append(_output(directory, file, scene))
+        return lines
     for field in FIELDS:
-        published = Scene(
-            field.stem + PUBLISHED,
-            f"{field.name} as published (thesis figures {FIGURES[field.stem]})",
-            field,
-            field.zoom_hip,
+        figures = FIGURES[field.stem]
+        published = f"{field.name} as published (thesis figures {figures})"
+        mended = f"{field.name} with the thesis's errors mended"
+        stem = field.stem + PUBLISHED
+        bench = thesis_bench(f"thesis-{field.stem}-as-published.toml")
+        lines.append(_output(directory, bench, OutputScene(stem, published, field, field.zoom_hip)))
+        bench = thesis_bench(f"thesis-{field.stem}.toml")
+        lines.append(
+            _output(directory, bench, OutputScene(field.stem, mended, field, field.zoom_hip))
         )
-        mended = Scene(
-            field.stem, f"{field.name} with the thesis's errors mended", field, field.zoom_hip
-        )
-        for scene, suffix in ((published, "-as-published"), (mended, "")):
-            bench = read_bench_file(resource_path("configs", f"thesis-{field.stem}{suffix}.toml"))
-            lines.append(_output(directory, bench, scene))
     return lines
 
 
-def output_files(fields: tuple[Field, ...]) -> list[str]:
+def thesis_bench(name: str) -> BenchFile:
+    """A bench file of the thesis's simulations."""
+    return read_bench_file(resource_path("configs", name))
+
+
+def output_files(fields: tuple[SkyField, ...]) -> list[str]:
     """The names of all files that `run` writes of a bench."""
     endings = (".png", ".svg", ".csv", ".fits", f"{WITHOUT_NOISE}.fits")
-    return [field.stem + ending for field in fields for ending in endings]
+    names = []
+    for field in fields:
+        names += [field.stem + ending for ending in endings]
+    return names
 
 
 def thesis_total_e(detector: DetectorSettings, light_e: float, exposure_s: float) -> float:
     """The n_TOT of table 4.1 and eq. 4.14 as printed, whose PRNU and DSNU have no dimension."""
     fixed_e2 = light_e * detector.prnu + detector.dsnu_e_per_s * exposure_s
-    return math.sqrt(
-        light_e
-        + detector.dark_e_per_s * exposure_s
-        + fixed_e2
-        + detector.adc_noise_e**2
-        + detector.read_noise_e**2
-    )
+    dark_e = detector.dark_e_per_s * exposure_s
+    readout_e2 = detector.adc_noise_e**2 + detector.read_noise_e**2
+    return math.sqrt(light_e + dark_e + fixed_e2 + readout_e2)
 
 
-def _output(directory: Path, file: BenchFile, scene: Scene) -> str:
-    """Expose a scene and write its files; what it has, in a line."""
+def _output(directory: Path, file: BenchFile, scene: OutputScene) -> str:
+    """Expose a scene and write its files; a line about it."""
     noise = FrameNoise(seed=SEED)
     with Simulator(file) as simulator:
         view = simulator.view(from_radec_roll_deg(*scene.field.radec_roll_deg), np.zeros(3))
@@ -128,23 +129,22 @@ def _output(directory: Path, file: BenchFile, scene: Scene) -> str:
         noisy = simulator.expose(view, noise.rng())
         exposure_s = simulator.config.tracker.exposure_s
         sky_e = float(np.median(clean.mean_e))
-        noise_e = math.sqrt(simulator.detector.settings.noise(sky_e, exposure_s).total_e2)
+        sky_noise = simulator.detector.settings.noise(sky_e, exposure_s)
+        noise_e = math.sqrt(sky_noise.total_e2)
         inside = simulator.camera.contains_px(noisy.truth["x_px"], noisy.truth["y_px"])
         camera_text = _camera_words(file, simulator.camera, sky_e, noise_e)
         gain = simulator.detector.settings.gain_e_per_dn
         outputs = Outputs(clean, noisy, inside, sky_e, noise_e, gain, camera_text)
         write_exposure_fits(directory / f"{scene.stem}.fits", simulator, noisy, noise)
-        without = FrameNoise("none", SEED)
-        write_exposure_fits(
-            directory / f"{scene.stem}{WITHOUT_NOISE}.fits", simulator, clean, without
-        )
+        clean_path = directory / f"{scene.stem}{WITHOUT_NOISE}.fits"
+        write_exposure_fits(clean_path, simulator, clean, FrameNoise("none", SEED))
     truth = outputs.truth
     write_csv(directory / f"{scene.stem}.csv", truth.dtype.names or (), truth.tolist())
     _figure(directory / scene.stem, scene, outputs)
-    return f"{scene.stem}: {_found(outputs)}"
+    return f"{scene.stem}: {_scene_words(outputs)}"
 
 
-def _found(outputs: Outputs) -> str:
+def _scene_words(outputs: Outputs) -> str:
     """Stars, temperatures and sky of a scene in words."""
     level_dn = np.median(outputs.noisy.dn)
     sky = f"sky {level_dn:.0f} DN; n_TOT of a pixel of sky {outputs.noise_e:.0f} e-"
@@ -154,57 +154,61 @@ def _found(outputs: Outputs) -> str:
     v_mag = truth["v_mag"]
     kelvin = truth["temperature_k"]
     beyond = int((~outputs.inside).sum())
+    edge = ""
     if beyond:
         edge = f", {beyond} more whose light reaches the image"
-    else:
-        edge = ""
-    heat = ""
-    if np.isfinite(kelvin).any():
-        heat = f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"
-        heat += f" ({np.nanmean(kelvin[outputs.inside]):.0f} K on the image)" if beyond else ""
-    return (
-        f"{int(outputs.inside.sum())} stars{edge}, V {v_mag.min():.2f} to {v_mag.max():.2f}, mean"
-        f" {v_mag.mean():.2f}{heat};"
-        f" {int(truth['clipped'].sum())} stars saturated; {sky}"
-    )
+    heat = heat_words(kelvin)
+    if heat and beyond:
+        heat += f" ({np.nanmean(kelvin[outputs.inside]):.0f} K on the image)"
+    stars = f"{int(outputs.inside.sum())} stars{edge}"
+    extent = f"V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f}"
+    saturated = int(truth["clipped"].sum())
+    return f"{stars}, {extent}{heat}; {saturated} stars saturated; {sky}"
+
+
+def heat_words(kelvin: FloatArray) -> str:
+    """The hottest and the mean of temperatures (n,), in words; empty where none is known."""
+    if not np.isfinite(kelvin).any():
+        return ""
+    return f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"
 
 
 def _camera_words(file: BenchFile, camera: Camera, sky_e: float, noise_e: float) -> str:
     tracker = file.config.tracker
-    width, height = (math.degrees(angle) for angle in _field_rad(camera))
-    return "\n".join(
-        (
-            f"Aperture {tracker.aperture_mm:g} mm",
-            f"Focal length {tracker.focal_length_mm:g} mm",
-            f"Field {width:.3g} x {height:.3g}°",
-            f"Exposure {tracker.exposure_s:g} s",
-            f"Gain {tracker.detector.gain_e_per_dn:g} e-/DN",
-            f"Sky {sky_e:.0f} e-/px",
-            f"Its noise {noise_e:.0f} e-",
-        )
-    )
+    width_deg, height_deg = _field_deg(camera)
+    lines = [
+        f"Aperture {tracker.aperture_mm:g} mm",
+        f"Focal length {tracker.focal_length_mm:g} mm",
+        f"Field {width_deg:.3g} x {height_deg:.3g}°",
+        f"Exposure {tracker.exposure_s:g} s",
+        f"Gain {tracker.detector.gain_e_per_dn:g} e-/DN",
+        f"Sky {sky_e:.0f} e-/px",
+        f"Its noise {noise_e:.0f} e-",
+    ]
+    return "\n".join(lines)
 
 
-def _field_rad(camera: Camera) -> tuple[float, float]:
+def _field_deg(camera: Camera) -> tuple[float, float]:
     """The angles across the middle of the image, and down it."""
     width, height = camera.resolution_px
-    across = camera.rays(np.array([-0.5, width - 0.5]), np.full(2, height / 2 - 0.5))
-    down = camera.rays(np.full(2, width / 2 - 0.5), np.array([-0.5, height - 0.5]))
-    return _angle_rad(across), _angle_rad(down)
+    middle_x = np.full(2, width / 2 - 0.5)
+    middle_y = np.full(2, height / 2 - 0.5)
+    across = camera.rays(np.array([-0.5, width - 0.5]), middle_y)
+    down = camera.rays(middle_x, np.array([-0.5, height - 0.5]))
+    return _angle_deg(across), _angle_deg(down)
 
 
-def _angle_rad(rays: FloatArray) -> float:
+def _angle_deg(rays: FloatArray) -> float:
     first, last = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    return math.acos(float(np.clip(first @ last, -1, 1)))
+    return math.degrees(math.acos(float(np.clip(first @ last, -1, 1))))
 
 
-def _figure(path: Path, scene: Scene, outputs: Outputs) -> None:
+def _figure(path: Path, scene: OutputScene, outputs: Outputs) -> None:
     """The seven outputs of a scene."""
-    saturated = int(outputs.truth["clipped"].sum())
-    kelvin = outputs.truth["temperature_k"]
-    finding = f"{scene.title}: {int(outputs.inside.sum())} stars, {saturated or 'none'} saturated"
-    if np.isfinite(kelvin).any():
-        finding += f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"
+    saturated = int(outputs.truth["clipped"].sum()) or "none"
+    stars = int(outputs.inside.sum())
+    heat = heat_words(outputs.truth["temperature_k"])
+    finding = f"{scene.title}: {stars} stars, {saturated} saturated{heat}"
     note = (
         "Stars count from the brightest; lines: means of all whose light reaches the image. One"
         " stretch for all images."
@@ -238,7 +242,7 @@ def _draw_property(axes: "Axes", values: FloatArray, name: str, unit: str) -> No
     axes.set(xlabel="star", title=title, ylabel=f"{name} [{unit}]")
 
 
-def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
+def _draw_images(panels: "list[Axes]", scene: OutputScene, outputs: Outputs) -> None:
     """The images without and with noise, each with its zoom, and beside them scale and camera."""
     star, (x_px, y_px) = _zoom(scene, outputs)
     low, high = np.percentile(outputs.noisy.dn, STRETCH_PERCENT)
@@ -251,11 +255,9 @@ def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
         image = axes.imshow(exposure.dn, cmap="gray", vmin=low, vmax=high, interpolation="nearest")
         axes.grid(False)
         axes.set(xlabel="x [px]", ylabel="y [px]", title=title)
+    half = ZOOM_PX / 2
     for zoomed in (drawn[1], drawn[3]):
-        zoomed.set(
-            xlim=(x_px - ZOOM_PX / 2, x_px + ZOOM_PX / 2),
-            ylim=(y_px + ZOOM_PX / 2, y_px - ZOOM_PX / 2),
-        )
+        zoomed.set(xlim=(x_px - half, x_px + half), ylim=(y_px + half, y_px - half))
     facts = panels[2]
     scale = panels[5]
     facts.text(0, 1, outputs.camera_words, va="top", transform=facts.transAxes, fontsize=SMALL_PT)
@@ -266,7 +268,7 @@ def _draw_images(panels: "list[Axes]", scene: Scene, outputs: Outputs) -> None:
     )
 
 
-def _zoom(scene: Scene, outputs: Outputs) -> tuple[str, tuple[float, float]]:
+def _zoom(scene: OutputScene, outputs: Outputs) -> tuple[str, tuple[float, float]]:
     """The name and place of the star in a zoom's middle; without one the image's middle."""
     stars = outputs.truth[outputs.inside]
     if scene.zoom_hip is not None:

@@ -2,8 +2,7 @@
 predictor, and their times.
 
 The slew is a swing of degrees, shaken on each axis (`predictors.py`). A frame at time t has the
-samples taken before
-t minus the latency, which covers link, drawing and scan-out.
+samples taken before t minus the latency, which covers link, drawing and scan-out.
 
 Then the prediction of a vibration beside a steady turn, against its frequency: by the rate, with
 `prediction = "auto"`, and for the newest attitude alone.
@@ -12,6 +11,7 @@ Then the prediction of a vibration beside a steady turn, against its frequency: 
 import math
 import time
 from bisect import bisect_right
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
@@ -21,7 +21,8 @@ import numpy as np
 
 from hilstar.attitude.clock.timeline import Policy, Prediction, Timeline
 from hilstar.attitude.wire.packet import AttitudeSample
-from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, write_records
+from hilstar.basics.arrays import FloatArray
+from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE
 from hilstar.basics.rotation import (
     angle_between_rad,
     conjugate,
@@ -30,6 +31,17 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_MS, NS_PER_S
+from hilstar.instruments.study.engine import (
+    HIDDEN,
+    ChartSpec,
+    LevelLine,
+    LineSpec,
+    PanelSpec,
+    SeriesLook,
+    draw_rows,
+    looks_of,
+    write_rows,
+)
 from hilstar.instruments.study.predictors import (
     JITTER,
     NEAR,
@@ -42,24 +54,14 @@ from hilstar.instruments.study.predictors import (
     slew_attitude,
     slew_sample,
 )
-from hilstar.instruments.study.row_charts import (
-    HIDDEN,
-    ChartSpec,
-    LevelLine,
-    LineSpec,
-    PanelSpec,
-    SeriesLook,
-    draw_rows,
-    looks_of,
-)
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork
 
 RATES_HZ = (5, 10, 20, 50, 100, 200)
 LATENCIES_MS = (2, 5, 10, 20, 50, 100)
 USUAL_HZ, USUAL_MS = 100, 20
 FRAME_HZ = 60
-SPAN_S, QUICK_SPAN_S = 40.0, 4.0
-TIMED = 200
+SPAN_S, QUICK_SPAN_S = 40.0, 4.0  # of the slew: two of its swings, or part of one
+TIMED = 200  # attitudes, whose median time counts
 MARKERS = "osd^vx"
 
 Way = Literal["rate", "auto", "newest"]
@@ -83,8 +85,8 @@ Z = np.array([0.0, 0.0, 1.0])
 
 @dataclass(frozen=True, slots=True)
 class PredictionOutcome:
-    """One predictor at one rate and latency: errors over all frames, arcsec, and the time of one
-    attitude, us.
+    """One predictor at one packet rate and latency: errors over all frames, arcsec, and the time of
+    one attitude, us.
     """
 
     method: str
@@ -95,65 +97,10 @@ class PredictionOutcome:
     attitude_us: float
 
 
-def run(directory: Path, quick: bool = False) -> Judged:
-    """Measure, and write `prediction.csv` and its chart; a line for each method. Raises
-    InputError.
-    """
-    span_s = QUICK_SPAN_S if quick else SPAN_S
-    outcomes = []
-    others = OtherWork()
-    # Over latency at the usual rate, and over rate at the usual latency.
-    for hz, ms in sorted(
-        {(USUAL_HZ, ms) for ms in LATENCIES_MS} | {(hz, USUAL_MS) for hz in RATES_HZ}
-    ):
-        samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(math.ceil(span_s * hz) + 1)]
-        outcomes += [
-            _outcome(predictor, samples, hz, ms)
-            for predictor in predictors()
-            if not predictor.waits
-        ]
-    load = others.load()
-    write_records(directory / "prediction.csv", outcomes)
-    usual = [o for o in outcomes if (o.rate_hz, o.latency_ms) == (USUAL_HZ, USUAL_MS)]
-    default_name = next(predictor.name for predictor in predictors() if predictor.is_default)
-    default = next(o for o in usual if o.method == default_name)
-    hold = next(o for o in usual if o.method == "hold")
-    finding = (
-        f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is"
-        f" off by {default.rms_arcsec:.2g} arcsec rms, holding the sample by {hold.rms_arcsec:.3g}"
-    )
-    draw(directory / "prediction", finding, outcomes, load)
-    cells, frequencies = (
-        (QUICK_SHAKEN_CELLS, QUICK_SHAKEN_HZ) if quick else (SHAKEN_CELLS, SHAKEN_HZ)
-    )
-    shaken_by = []
-    for rates, (packet_hz, age_ms), way, jitter_hz in product(
-        (True, False), cells, WAYS, frequencies
-    ):
-        if jitter_hz < packet_hz / 2:  # a faster one looks like a slow one
-            residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, rates)
-            packets = "with rates" if rates else "without rates"
-            shaken_by.append(Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual))
-    write_records(directory / "prediction_jitter.csv", shaken_by)
-    given, derived = (crossing_hz(shaken_by, packets, USUAL_HZ, USUAL_MS) for packets in SENDERS)
-    note = (
-        f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is"
-        " nearer than one predicted by"
-        f' {USUAL_MS} ms; "auto" is within {auto_times(shaken_by):.1f} times the better of both'
-    )
-    draw_shaken(directory / "prediction_jitter", note, shaken_by)
-    lines = (
-        f"{o.method}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum,"
-        f" {o.attitude_us:.0f} us per attitude"
-        for o in usual
-    )
-    return load.judged([finding, *lines, note])
-
-
 @dataclass(frozen=True, slots=True)
 class Shaken:
-    """A vibration by one way of prediction: the amplitude shown and the error (rms), as shares
-    of the true ones.
+    """A vibration with one way of prediction: the shown amplitude and the rms error, relative to
+    the true ones.
     """
 
     way: str
@@ -165,75 +112,158 @@ class Shaken:
     residual: float
 
 
+def run(directory: Path, quick: bool = False) -> Judged:
+    """Measure, and write `prediction.csv` and its chart; a line for each method. Raises
+    InputError.
+    """
+    others = OtherWork()
+    outcomes = slew_outcomes(QUICK_SPAN_S if quick else SPAN_S)
+    load = others.load()
+    write_rows(directory / "prediction.csv", outcomes)
+    usual = [row for row in outcomes if is_usual(row.rate_hz, row.latency_ms)]
+    finding = slew_finding(usual)
+    draw(directory / "prediction", finding, outcomes, load)
+    shaken = shaken_rows(quick)
+    write_rows(directory / "prediction_jitter.csv", shaken)
+    note = shaken_finding(shaken)
+    draw_shaken(directory / "prediction_jitter", note, shaken)
+    return load.judged([finding, *map(line_of, usual), note])
+
+
+def is_usual(packet_hz: int, age_ms: int) -> bool:
+    """Whether packet rate and age are those of most benches."""
+    return (packet_hz, age_ms) == (USUAL_HZ, USUAL_MS)
+
+
+def slew_outcomes(span_s: float) -> list[PredictionOutcome]:
+    """Every predictor over latency at the usual rate, and over rate at the usual latency."""
+    by_latency = {(USUAL_HZ, ms) for ms in LATENCIES_MS}
+    by_rate = {(hz, USUAL_MS) for hz in RATES_HZ}
+    outcomes = []
+    for hz, ms in sorted(by_latency | by_rate):
+        count = math.ceil(span_s * hz) + 1
+        samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(count)]
+        for predictor in predictors():
+            if not predictor.waits:
+                outcomes.append(_outcome(predictor, samples, hz, ms))
+    return outcomes
+
+
+def slew_finding(usual: Sequence[PredictionOutcome]) -> str:
+    """The error of the default predictor, beside that of none."""
+    rms_arcsec = {row.method: row.rms_arcsec for row in usual}
+    default = next(predictor.name for predictor in predictors() if predictor.is_default)
+    return (
+        f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is"
+        f" off by {rms_arcsec[default]:.2g} arcsec rms, holding the sample by"
+        f" {rms_arcsec['hold']:.3g}"
+    )
+
+
+def line_of(row: PredictionOutcome) -> str:
+    """A predictor in words."""
+    errors = f"{row.rms_arcsec:.3g} arcsec rms, {row.worst_arcsec:.3g} maximum"
+    return f"{row.method}: {errors}, {row.attitude_us:.0f} us per attitude"
+
+
+def shaken_rows(quick: bool) -> list[Shaken]:
+    """A vibration by every way of prediction, with and without rates."""
+    cells: tuple[tuple[int, int], ...] = SHAKEN_CELLS
+    frequencies: tuple[int, ...] = SHAKEN_HZ
+    if quick:
+        cells = QUICK_SHAKEN_CELLS
+        frequencies = QUICK_SHAKEN_HZ
+    rows = []
+    for packets, cell, way, jitter_hz in product(SENDERS, cells, WAYS, frequencies):
+        packet_hz, age_ms = cell
+        if jitter_hz >= packet_hz / 2:
+            continue  # it looks like a slow one
+        has_rates = packets == SENDERS[0]
+        residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, has_rates)
+        rows.append(Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual))
+    return rows
+
+
+def shaken_finding(rows: Sequence[Shaken]) -> str:
+    """The frequency above which no prediction is better, and the error of "auto"."""
+    given, derived = (crossing_hz(rows, packets, USUAL_HZ, USUAL_MS) for packets in SENDERS)
+    return (
+        f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is"
+        f' nearer than one predicted by {USUAL_MS} ms; "auto" is within {auto_times(rows):.1f}'
+        " times the better of both"
+    )
+
+
 def shaken_error(
     way: Way, jitter_hz: float, packet_hz: int, age_ms: float, rates: bool
 ) -> tuple[float, float]:
-    """Error (rms) and amplitude of a vibration about z, beside a steady turn, as shown: shares of
-    the vibration's own.
+    """The rms error and the shown amplitude of a vibration about z beside a steady turn, relative
+    to the true ones.
 
-    "newest" stands still between packets; the steady turn is known to it.
+    "newest" holds the attitude between packets; it knows the steady turn.
     """
-    turn = 0.0 if way == "newest" else SHAKEN_TURN_RAD_S
+    turn = SHAKEN_TURN_RAD_S
+    ahead_ns = NS_PER_S
+    if way == "newest":
+        turn = 0.0
+        ahead_ns = 0
     prediction: Prediction = "auto" if way == "auto" else "rate"
-    timeline = Timeline(Policy(0 if way == "newest" else NS_PER_S, NS_PER_S, prediction=prediction))
+    timeline = Timeline(Policy(ahead_ns, NS_PER_S, prediction=prediction))
     latency_s = max(age_ms / 1e3 - 0.5 / packet_hz, 0.0)
     amplitude = SHAKEN_ARCSEC / ARCSEC_PER_RAD
     turning = math.tau * jitter_hz
 
-    def angle(t_s: float) -> float:
-        return turn * t_s + amplitude * math.sin(turning * t_s + 0.3)
+    def attitude(t_s: float) -> FloatArray:
+        angle = turn * t_s + amplitude * math.sin(turning * t_s + 0.3)
+        return propagate(ORION, Z, angle)
 
-    taken = 0
+    def sample(t_s: float) -> AttitudeSample:
+        rate = None
+        if rates:
+            rate = Z * (turn + amplitude * turning * math.cos(turning * t_s + 0.3))
+        return AttitudeSample(round(t_s * NS_PER_S), attitude(t_s), rate)
+
+    received = 0
     errors = []
     times_s = np.arange(0, SETTLED_S + SHAKEN_S, 1 / SHAKEN_FRAME_HZ) + latency_s
     for t_s in times_s:
-        while taken / packet_hz <= t_s - latency_s:
-            at_s = taken / packet_hz
-            if rates:
-                rate = Z * (turn + amplitude * turning * math.cos(turning * at_s + 0.3))
-            else:
-                rate = None
-            timeline.add(
-                AttitudeSample(round(at_s * NS_PER_S), propagate(ORION, Z, angle(at_s)), rate)
-            )
-            taken += 1
+        while received / packet_hz <= t_s - latency_s:
+            timeline.add(sample(received / packet_hz))
+            received += 1
         shown = attitude_at(timeline, round(t_s * NS_PER_S))
-        errors.append(
-            -to_rotation_vector(
-                multiply(shown.q_icrs_to_cam, conjugate(propagate(ORION, Z, angle(t_s))))
-            )[2]
-        )
+        off = multiply(shown.q_icrs_to_cam, conjugate(attitude(t_s)))
+        errors.append(-to_rotation_vector(off)[2])
     late = times_s >= SETTLED_S
     phase = turning * times_s[late] + 0.3
     error = np.array(errors)[late]
     waves = np.column_stack((np.sin(phase), np.cos(phase), np.ones(len(phase))))
-    fitted = np.linalg.lstsq(waves, error + amplitude * np.sin(phase), rcond=None)[0]
-    return float(np.sqrt(2 * np.mean(error**2)) / amplitude), float(
-        np.hypot(fitted[0], fitted[1]) / amplitude
-    )
+    shown_wave = error + amplitude * np.sin(phase)
+    sine, cosine, _ = np.linalg.lstsq(waves, shown_wave, rcond=None)[0]
+    residual = float(np.sqrt(2 * np.mean(error**2)) / amplitude)
+    return residual, float(np.hypot(sine, cosine) / amplitude)
 
 
-def auto_times(found: list[Shaken]) -> float:
+def auto_times(rows: Sequence[Shaken]) -> float:
     """The largest error of "auto" as a multiple of the better of the other two."""
     residuals: dict[tuple[str, float], dict[str, float]] = {}
-    for shaken in found:
-        if (shaken.packet_hz, shaken.age_ms) == (USUAL_HZ, USUAL_MS):
-            by_way = residuals.setdefault((shaken.packets, shaken.jitter_hz), {})
-            by_way[shaken.way] = shaken.residual
-    times = [way["auto"] / min(way["rate"], way["newest"]) for way in residuals.values()]
-    return max(times)
+    for row in rows:
+        if is_usual(row.packet_hz, row.age_ms):
+            by_way = residuals.setdefault((row.packets, row.jitter_hz), {})
+            by_way[row.way] = row.residual
+    return max(way["auto"] / min(way["rate"], way["newest"]) for way in residuals.values())
 
 
-def crossing_hz(found: list[Shaken], packets: str, packet_hz: int, age_ms: int) -> float:
+def crossing_hz(rows: Sequence[Shaken], packets: str, packet_hz: int, age_ms: int) -> float:
     """The frequency above which the newest attitude is nearer than one predicted by its rate;
-    infinite for none.
+    infinite where there is none.
     """
-    alike = [s for s in found if (s.packets, s.packet_hz, s.age_ms) == (packets, packet_hz, age_ms)]
-    by_rate = [s for s in alike if s.way == "rate"]
-    by_newest = [s for s in alike if s.way == "newest"]
-    worse_by = np.array([s.residual for s in by_rate]) - np.array([s.residual for s in by_newest])
-    hz = [s.jitter_hz for s in by_rate]
-    for (low, under), (high, over) in pairwise(zip(hz, worse_by, strict=True)):
+    residuals: dict[str, dict[float, float]] = {"rate": {}, "newest": {}, "auto": {}}
+    for row in rows:
+        if (row.packets, row.packet_hz, row.age_ms) == (packets, packet_hz, age_ms):
+            residuals[row.way][row.jitter_hz] = row.residual
+    by_rate = residuals["rate"]
+    worse_by = {hz: by_rate[hz] - residuals["newest"][hz] for hz in by_rate}
+    for (low, under), (high, over) in pairwise(worse_by.items()):
         if under <= 0 < over:
             return float(low * (high / low) ** (under / (under - over)))
     return math.inf
@@ -244,10 +274,9 @@ def _outcome(
 ) -> PredictionOutcome:
     taken_ns = [sample.t_ns for sample in samples]
     latency_ns = latency_ms * NS_PER_MS
+    first = (taken_ns[NEAR] + latency_ns) * FRAME_HZ / NS_PER_S
+    last = taken_ns[-1] * FRAME_HZ / NS_PER_S
     errors = []
-    first, last = (
-        t_ns * FRAME_HZ / NS_PER_S for t_ns in (taken_ns[NEAR] + latency_ns, taken_ns[-1])
-    )
     for frame in range(math.ceil(first), math.floor(last)):
         t_ns = round(frame * NS_PER_S / FRAME_HZ)
         count = bisect_right(taken_ns, t_ns - latency_ns)
@@ -260,9 +289,8 @@ def _outcome(
         predict(taken_ns[-1] + latency_ns)
         times_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
     rms = float(np.sqrt(np.mean(np.square(errors))))
-    return PredictionOutcome(
-        predictor.name, rate_hz, latency_ms, rms, max(errors), float(np.median(times_us))
-    )
+    median_us = float(np.median(times_us))
+    return PredictionOutcome(predictor.name, rate_hz, latency_ms, rms, max(errors), median_us)
 
 
 def draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load) -> None:
@@ -272,41 +300,43 @@ def draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load
         f"A swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken by {shaken}. In brackets: the"
         " time of one attitude."
     )
-    labels = {outcome.method: outcome.method for outcome in outcomes}
-    with_times = {}
-    for name in labels:
-        took_us = [outcome.attitude_us for outcome in outcomes if outcome.method == name]
-        with_times[name] = f"{name} ({np.median(took_us):.0f} us)"
-    error = "pointing error, rms [arcsec]"
+    times_us: dict[str, list[float]] = {}
+    for row in outcomes:
+        times_us.setdefault(row.method, []).append(row.attitude_us)
+
+    def with_time(row: PredictionOutcome) -> str:
+        return f"{row.method} ({np.median(times_us[row.method]):.0f} us)"
+
+    latency = LineSpec("latency_ms", "rms_arcsec", label=with_time, where=has_usual_rate)
     by_latency = PanelSpec(
-        (
-            LineSpec(
-                "latency_ms",
-                "rms_arcsec",
-                label=lambda outcome: with_times[outcome.method],
-                where=lambda outcome: outcome.rate_hz == USUAL_HZ,
-            ),
-        ),
-        error,
+        (latency,),
+        "pointing error, rms [arcsec]",
         f"latency [ms], packets at {USUAL_HZ} Hz",
         scales=("log", "log"),
         xticks=LATENCIES_MS,
     )
     by_rate = PanelSpec(
-        (LineSpec("rate_hz", "rms_arcsec", where=lambda outcome: outcome.latency_ms == USUAL_MS),),
-        error,
+        (LineSpec("rate_hz", "rms_arcsec", where=has_usual_latency),),
+        "pointing error, rms [arcsec]",
         f"rate of packets [Hz], latency {USUAL_MS} ms",
         scales=("log", "log"),
         xticks=RATES_HZ,
     )
-    spec = ChartSpec(
-        (by_latency, by_rate),
-        lambda outcome: outcome.method,
-        looks_of(labels, MARKERS),
-        note,
-        layout={"share_x": False},
-    )
+    looks = looks_of({method: method for method in times_us}, MARKERS)
+    layout = {"share_x": False}
+    panels = (by_latency, by_rate)
+    spec = ChartSpec(panels, lambda row: row.method, looks, note, layout=layout)
     draw_rows(path, finding, spec, outcomes, load)
+
+
+def has_usual_rate(row: PredictionOutcome) -> bool:
+    """Whether a row varies latency only."""
+    return row.rate_hz == USUAL_HZ
+
+
+def has_usual_latency(row: PredictionOutcome) -> bool:
+    """Whether a row varies the packet rate only."""
+    return row.latency_ms == USUAL_MS
 
 
 def draw_shaken(path: Path, finding: str, shaken: list[Shaken]) -> None:
@@ -316,12 +346,9 @@ def draw_shaken(path: Path, finding: str, shaken: list[Shaken]) -> None:
         f" of {SHAKEN_ARCSEC:g} arcsec beside a turn of {math.degrees(SHAKEN_TURN_RAD_S):g} deg/s."
         " Error and amplitude as shares of the vibration's own."
     )
-    usual = [row for row in shaken if (row.packet_hz, row.age_ms) == (USUAL_HZ, USUAL_MS)]
+    usual = [row for row in shaken if is_usual(row.packet_hz, row.age_ms)]
     looks = {way: SeriesLook(way, colour, "o") for way, colour in WAYS.items()}
-    panels = (
-        *(error_panel(packets) for packets in SENDERS),
-        *(gain_panel(packets) for packets in SENDERS),
-    )
+    panels = (*map(error_panel, SENDERS), *map(gain_panel, SENDERS))
     layout = {"share_y": "row"}
     draw_rows(path, finding, ChartSpec(panels, way_of, looks, note, 2, layout), usual)
 

@@ -32,8 +32,9 @@ AttitudeAt = Callable[[int], FloatArray]
 
 @dataclass(frozen=True, slots=True)
 class Predictor:
-    """A way to the attitude at a time: `load` takes the last samples, which for one that `waits`
-    end after that time.
+    """A way to the attitude at a time: `load` takes the last samples.
+
+    Those of one that `waits` end after that time.
     """
 
     name: str
@@ -43,13 +44,10 @@ class Predictor:
 
 
 def predictors() -> tuple[Predictor, ...]:
-    """Every way; the default is hilstar's timeline as a bench file that says nothing sets it,
-    fed with rates.
-    """
+    """Every way. The default is hilstar's timeline with a bench file's defaults, fed with rates."""
     settings = AttitudeSettings()
-    bench_policy = Policy(
-        round(settings.max_extrapolation_ms * NS_PER_MS), round(settings.stale_after_ms * NS_PER_MS)
-    )
+    ahead_ns = round(settings.max_extrapolation_ms * NS_PER_MS)
+    bench_policy = Policy(ahead_ns, round(settings.stale_after_ms * NS_PER_MS))
     hold = Policy(0, bench_policy.stale_after_ns)
     return (
         Predictor("hold", partial(_timeline, hold)),
@@ -72,11 +70,11 @@ def slew_attitude(t_ns: int) -> FloatArray:
     and a fast jitter.
     """
     t_s = t_ns / NS_PER_S
-    return shaken(
-        ORION,
-        t_s,
-        [math.radians(SLEW_DEG) * math.sin(2 * math.pi * t_s / SLEW_S + axis) for axis in range(3)],
-    )
+    angles_rad = []
+    for axis in range(3):
+        swing = math.sin(2 * math.pi * t_s / SLEW_S + axis)
+        angles_rad.append(math.radians(SLEW_DEG) * swing)
+    return shaken(ORION, t_s, angles_rad)
 
 
 def shaken(
@@ -86,18 +84,19 @@ def shaken(
     q = q_icrs_to_cam
     for axis, angle in enumerate(angles_rad):
         for size_arcsec, hz in JITTER:
-            angle += math.radians(size_arcsec / 3600) * math.sin(
-                2 * math.pi * hz * t_s + 2 * axis * hz
-            )
+            phase = 2 * math.pi * hz * t_s + 2 * axis * hz
+            angle += math.radians(size_arcsec / 3600) * math.sin(phase)
         turn = np.zeros(4)
-        turn[0], turn[1 + axis] = math.cos(angle / 2), math.sin(angle / 2)
+        turn[0] = math.cos(angle / 2)
+        turn[1 + axis] = math.sin(angle / 2)
         q = multiply(turn, q)
     return q
 
 
 def rate_of(attitude: Callable[[int], FloatArray], t_ns: int) -> FloatArray:
-    """The rate (3,) of a movement, from RATE_STEP_NS on both sides: 0.006 arcsec/s off at 37 Hz,
-    0.0003 arcsec predicted.
+    """The rate (3,) of a movement by differences over RATE_STEP_NS on both sides.
+
+    It is 0.006 arcsec/s off at 37 Hz, which is 0.0003 arcsec of a predicted attitude.
     """
     before = attitude(t_ns - RATE_STEP_NS)
     after = attitude(t_ns + RATE_STEP_NS)
@@ -106,8 +105,8 @@ def rate_of(attitude: Callable[[int], FloatArray], t_ns: int) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Movement:
-    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a constant turn about AXIS, and, where it
-    is `shaken`, JITTER on it.
+    """A camera's true attitude: `q_icrs_to_cam` at t = 0, a steady turn about AXIS, and JITTER
+    where it is `shaken`.
 
     A camera at rest is not shaken.
     """
@@ -171,22 +170,22 @@ def _timeline(
 
 
 def _accelerated(near: Sequence[AttitudeSample]) -> AttitudeAt:
-    """The newest sample's rate, and the change since the one before it carried on."""
-    (before_ns, before), (newest_ns, newest) = (
-        (s.t_ns, np.asarray(s.rate_cam_rad_s)) for s in near[-2:]
-    )
+    """Extrapolation by the newest rate and its change since the sample before."""
+    before, newest = near[-2:]
+    rate_before = np.asarray(before.rate_cam_rad_s)
+    rate = np.asarray(newest.rate_cam_rad_s)
 
     def predicted(t_ns: int) -> FloatArray:
-        ahead_s = (t_ns - newest_ns) / NS_PER_S
-        gap_s = (newest_ns - before_ns) / NS_PER_S
-        bend = (newest - before) / gap_s
-        return propagate(near[-1].q_icrs_to_cam, newest + 0.5 * ahead_s * bend, ahead_s)
+        ahead_s = (t_ns - newest.t_ns) / NS_PER_S
+        gap_s = (newest.t_ns - before.t_ns) / NS_PER_S
+        bend = (rate - rate_before) / gap_s
+        return propagate(newest.q_icrs_to_cam, rate + 0.5 * ahead_s * bend, ahead_s)
 
     return predicted
 
 
 def _spline(near: Sequence[AttitudeSample]) -> AttitudeAt:
-    """The samples' turns from the newest one, as a cubic carried on past it."""
+    """Extrapolation of a cubic through the samples' turns from the newest one."""
     newest = near[-1]
 
     def predicted(t_ns: int) -> FloatArray:

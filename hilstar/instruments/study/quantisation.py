@@ -2,6 +2,8 @@
 time.
 """
 
+import math
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -11,17 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import (
-    BLUE,
-    INK,
-    ORANGE,
-    SMALL_PT,
-    chart,
-    label_ends,
-    name_at_side,
-    write_csv,
-)
+from hilstar.basics.charts import BLUE, INK, ORANGE, SMALL_PT
 from hilstar.basics.units import flux_ratio
 from hilstar.display.phases import USUAL_PSF, WHITE
 from hilstar.display.quantise import EXPOSURE_FRAMES
@@ -29,166 +21,59 @@ from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
 from hilstar.instruments.study import codes
-from hilstar.instruments.study.row_charts import PairSpec, SeriesLook, draw_pairs, name_places
+from hilstar.instruments.study.engine import (
+    ChartSpec,
+    DotsSpec,
+    LineSpec,
+    PanelSpec,
+    SeriesLook,
+    draw_rows,
+    row_panels,
+    write_rows,
+)
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
+from hilstar.optics.sprites import FrameLight
 from hilstar.tracker.centroiders import FAMILY
-from hilstar.tracker.star_errors import StarErrors
 
-Found = dict[tuple[int, str], list[StarErrors]]
+ROUNDS, QUICK_ROUNDS = 31, 3
 MIN_ERROR = 1e-5  # as drawn
+MIDDLE_BITS = codes.BITS[1]  # those that titles and lines state
+MARKERS = dict(zip(codes.BITS, "os^", strict=True))
+AIM_LABEL: Any = {"textcoords": "offset points", "fontsize": SMALL_PT}
+STEALING_STYLE = {True: ":", False: "-"}
+MAGNITUDES_NOTE = (
+    "Largest errors over sub-pixel phases, sRGB; places by a PSF fit. Dotted: with bit stealing."
+)
+TIMES_NOTE = (
+    f"{codes.STARS} stars, {codes.FRAME_PX[0]} x {codes.FRAME_PX[1]}. Circles, squares, triangles:"
+    " 8, 10 and 12 bits, at the faint end."
+)
 EACH_NOTE = (
     "Errors are rms along an axis, over sub-pixel phases. At the right: what exact leaves of the"
     " error of round."
 )
-EACH_PAIRS = PairSpec(
-    "round_px", "exact_px", (SeriesLook("round", ORANGE), SeriesLook("exact", BLUE))
-)
-BESIDE: Any = {"textcoords": "offset points", "va": "center", "fontsize": SMALL_PT}
-MARKERS = dict(zip(codes.BITS, "os^", strict=True))
+EACH_LOOKS = SeriesLook("round", ORANGE), SeriesLook("exact", BLUE)
 
 
-def run(directory: Path, quick: bool = False) -> Judged:
-    """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
-    phases, mags = (8, np.linspace(0, 8, 5)) if quick else (32, np.linspace(0, 10, 41))
-    errors_by_way: Found = {}
-    rows = []
-    for bits in codes.BITS:
-        for way in codes.WAYS:
-            errors = codes.code_errors(bits, way, phases, mags)
-            errors_by_way[bits, way.name] = errors
-            for mag, of_mag in zip(mags.tolist(), errors, strict=True):
-                rows.append((bits, way.name, mag, *codes.error_cells(of_mag)))
-    write_csv(
-        directory / "quantisation.csv",
-        ("bits", "method", "mag_under_white", *codes.ERROR_COLUMNS),
-        rows,
-    )
-    faintest = {
-        key: errors[int(np.searchsorted(mags, codes.AIMS[key[0]][1]))]
-        for key, errors in errors_by_way.items()
-    }
-    others = OtherWork()
-    times = _frame_times_ms(3 if quick else 31)
-    load = others.load()
-    _draw_magnitudes(directory / "quantisation", errors_by_way, mags)
-    draw_each(directory / "quantisation_centroiders", centroider_errors(faintest))
-    _draw_times(directory / "quantisation_time", faintest, times, load)
-    time_rows = []
-    for key, of_faintest in faintest.items():
-        mag_under_white = codes.AIMS[key[0]][1]
-        time_rows.append((*key, times[key], mag_under_white, *codes.error_cells(of_faintest)))
-    write_csv(
-        directory / "quantisation_time.csv",
-        ("bits", "method", "frame_ms", "mag_under_white", *codes.ERROR_COLUMNS),
-        time_rows,
-    )
-    coarsest = codes.BITS[0]
-    ratios = []
-    for kind in FAMILY:
-        rounded_px = faintest[coarsest, "round"].axis_rms_px(kind)
-        exact_px = faintest[coarsest, "exact"].axis_rms_px(kind)
-        ratios.append(f"{kind} {exact_px / rounded_px:.2f} ({exact_px:.4f} px)")
-    ratios_text = ", ".join(ratios)
-    ms = ", ".join(f"{way.method} {times[10, way.name]:.1f} ms" for way in codes.WAYS[:4])
-    lines = [
-        *(_summary(bits, errors_by_way, mags) for bits in codes.BITS),
-        (
-            f"{coarsest} bits, {codes.AIMS[coarsest][1]:g} magnitudes under white: of the error of"
-            f" round (rms along an axis) exact leaves, by each centroider, {ratios_text}"
-        ),
-        (
-            f"{codes.STARS} stars, {codes.FRAME_PX[0]} x {codes.FRAME_PX[1]}, 10 bits, from light"
-            f" to levels in memory: {ms}"
-        ),
-        codes.study_frames(directory, quick),
-    ]
-    return load.judged(lines)
+@dataclass(frozen=True, slots=True)
+class WayErrors:
+    """The errors of one way at one magnitude under white."""
+
+    bits: int
+    method: str
+    mag_under_white: float
+    figures: codes.ErrorFigures
 
 
-def _frame_times_ms(rounds: int) -> dict[tuple[int, str], float]:
-    """The median time of drawing STARS stars and reading their levels back, ms, by bits and way;
-    the ways in turn.
-    """
-    sprites = codes.star_field(codes.FRAME_PX, USUAL_PSF.footprint_px)
-    times: dict[tuple[int, str], float] = {}
+@dataclass(frozen=True, slots=True)
+class TimedWay:
+    """The median time of a frame of one way, and its errors at the faint end of its aim."""
 
-    def draw(renderer: Renderer, frame: int) -> object:
-        renderer.draw(sprites, frame)
-        return renderer.levels()
-
-    for bits in codes.BITS:
-        with ExitStack() as stack:
-            targets = {}
-            for way in codes.WAYS:
-                targets[way.name] = Target(
-                    codes.FRAME_PX, USUAL_PSF, codes.response_of(bits, way), WHITE, way.method
-                )
-            works = {
-                name: partial(draw, stack.enter_context(Renderer(on)))
-                for name, on in targets.items()
-            }
-            times |= {(bits, name): ms for name, ms in medians_ms(works, rounds).items()}
-    return times
-
-
-def _summary(bits: int, found: Found, mags: FloatArray) -> str:
-    aim_mag, limit = codes.AIMS[bits]
-    worst = {way: _worst(found[bits, way.name], mags, limit) for way in codes.WAYS}
-    others = ", ".join(f"{way.method} {worst[way]}" for way in codes.WAYS[:3])
-    half_step_px = srgb_response(bits).half_step * USUAL_PSF.peak_share / flux_ratio(limit)
-    return (
-        f"{bits} bits, sRGB, {limit:g} magnitudes (aim {aim_mag:g} mag, {codes.AIM_PX:g} px):"
-        f" largest errors, places by a PSF fit, of exact {worst[codes.WAYS[3]]}, with bit stealing"
-        f" {worst[codes.WAYS[5]]}; {others} (over {EXPOSURE_FRAMES} frames). Half the smallest step"
-        f" of light moves a centroid by {half_step_px:.3f} px along each axis"
-    )
-
-
-def _worst(errors: list[StarErrors], mags: FloatArray, limit_mag: float) -> str:
-    within = [e for e, mag in zip(errors, mags, strict=True) if mag <= limit_mag]
-    return (
-        f"{max(e.flux_max_mag for e in within):.3f} mag and"
-        f" {max(e.max_px(codes.JUDGE) for e in within):.3f} px"
-    )
-
-
-def _draw_magnitudes(path: Path, found: Found, mags: FloatArray) -> None:
-    bits = codes.BITS[1]
-    limit = codes.AIMS[codes.BITS[1]][1]
-    exact, rounded = (_worst(found[bits, name], mags, limit) for name in ("exact", "round"))
-    finding = (
-        f"On {bits} bits every star to {limit:g} magnitudes under white is within {exact} with"
-        f" exact, {rounded} with round"
-    )
-    note = (
-        "Largest errors over sub-pixel phases, sRGB; places by a PSF fit. Dotted: with bit"
-        " stealing."
-    )
-    with chart(path, finding, len(codes.BITS), 2, note=note, share_y="col") as grid:
-        for bits, flux, place in zip(codes.BITS, grid[::2], grid[1::2], strict=True):
-            aim_mag, limit = codes.AIMS[bits]
-            for way in codes.WAYS:
-                errors = found[bits, way.name]
-                for axes, values in (
-                    (flux, [e.flux_max_mag for e in errors]),
-                    (place, [e.max_px(codes.JUDGE) for e in errors]),
-                ):
-                    shown = np.where(np.isfinite(values), np.maximum(values, MIN_ERROR), np.nan)
-                    label = way.name.replace("mean of ", "")
-                    style = ":" if way.stealing else "-"
-                    axes.semilogy(mags, shown, style, color=way.colour, lw=1.5, label=label)
-            for axes, aim in ((flux, aim_mag), (place, codes.AIM_PX)):
-                axes.plot(
-                    [0, limit, limit], [aim, aim, MIN_ERROR], "--", color=INK, lw=1.1, label="_aim"
-                )
-                axes.annotate(
-                    "aim", (0, aim), (2, 3), textcoords="offset points", fontsize=SMALL_PT
-                )
-            flux.set(title=f"{bits} bits", ylabel="flux error [mag]")
-            place.set_ylabel("place error [monitor px]")
-            label_ends(place)
-        for axes in grid[-2:]:
-            axes.set_xlabel("magnitudes under a white peak")
+    bits: int
+    method: str
+    frame_ms: float
+    mag_under_white: float
+    figures: codes.ErrorFigures
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,74 +93,273 @@ class CentroiderErrors:
         return self.exact_px / self.round_px
 
 
-def centroider_errors(faintest: dict[tuple[int, str], StarErrors]) -> list[CentroiderErrors]:
-    """The errors at the faint end by bits and centroider."""
+def run(directory: Path, quick: bool = False) -> Judged:
+    """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
+    rows = way_errors(quick)
+    write_rows(directory / "quantisation.csv", rows)
+    others = OtherWork()
+    timed = timed_ways(rows, QUICK_ROUNDS if quick else ROUNDS)
+    load = others.load()
+    by_centroider = centroider_errors(rows)
+    draw_magnitudes(directory / "quantisation", rows)
+    draw_each(directory / "quantisation_centroiders", by_centroider)
+    draw_times(directory / "quantisation_time", timed, load)
+    write_rows(directory / "quantisation_time.csv", timed)
+    lines = [summary(bits, rows) for bits in codes.BITS]
+    lines += [centroiders_line(by_centroider), times_line(timed)]
+    lines.append(codes.study_frames(directory, quick))
+    return load.judged(lines)
+
+
+def way_errors(quick: bool) -> list[WayErrors]:
+    """The errors of every way over magnitudes."""
+    phases = 32
+    mags = np.linspace(0, 10, 41)
+    if quick:
+        phases = 8
+        mags = np.linspace(0, 8, 5)
     rows = []
-    for bits, kind in product(codes.BITS, FAMILY):
-        rounded = faintest[bits, "round"]
-        exact = faintest[bits, "exact"]
-        errors_px = rounded.axis_rms_px(kind), exact.axis_rms_px(kind)
-        rows.append(CentroiderErrors(bits, kind, *errors_px))
+    for bits, way in product(codes.BITS, codes.WAYS):
+        errors = codes.code_errors(bits, way, phases, mags)
+        for mag, of_mag in zip(mags.tolist(), errors, strict=True):
+            rows.append(WayErrors(bits, way.name, mag, codes.error_figures(of_mag)))
     return rows
 
 
-def draw_each(path: Path, rows: list[CentroiderErrors]) -> None:
+def faintest(rows: Sequence[WayErrors], bits: int, method: str) -> WayErrors:
+    """The errors of a way at the faint end of its aim."""
+    limit_mag = codes.AIMS[bits][1]
+    for row in rows:
+        if (row.bits, row.method) == (bits, method) and row.mag_under_white >= limit_mag:
+            return row
+    raise AssertionError("magnitudes reach the faint end of every aim")
+
+
+def draw_levels(renderer: Renderer, sprites: FrameLight, frame: int) -> object:
+    """Draw a frame and read its levels back."""
+    renderer.draw(sprites, frame)
+    return renderer.levels()
+
+
+def timed_ways(rows: Sequence[WayErrors], rounds: int) -> list[TimedWay]:
+    """The time of drawing STARS stars and reading their levels back, the ways of a number of bits
+    in turn.
+    """
+    sprites = codes.star_field(codes.FRAME_PX, USUAL_PSF.footprint_px)
+    timed = []
+    for bits in codes.BITS:
+        works: dict[str, Callable[[int], object]] = {}
+        with ExitStack() as stack:
+            for way in codes.WAYS:
+                response = codes.response_of(bits, way)
+                target = Target(codes.FRAME_PX, USUAL_PSF, response, WHITE, way.method)
+                renderer = stack.enter_context(Renderer(target))
+                works[way.name] = partial(draw_levels, renderer, sprites)
+            times_ms = medians_ms(works, rounds)
+        for name, frame_ms in times_ms.items():
+            row = faintest(rows, bits, name)
+            limit_mag = codes.AIMS[bits][1]
+            timed.append(TimedWay(bits, name, frame_ms, limit_mag, row.figures))
+    return timed
+
+
+def centroider_errors(rows: Sequence[WayErrors]) -> list[CentroiderErrors]:
+    """The errors at the faint end by bits and centroider."""
+    table = []
+    for bits, kind in product(codes.BITS, FAMILY):
+        round_px = faintest(rows, bits, "round").figures.axis_rms_px(kind)
+        exact_px = faintest(rows, bits, "exact").figures.axis_rms_px(kind)
+        table.append(CentroiderErrors(bits, kind, round_px, exact_px))
+    return table
+
+
+def summary(bits: int, rows: Sequence[WayErrors]) -> str:
+    """The largest errors of every way on a panel of these bits, beside its aim."""
+    aim_mag, limit = codes.AIMS[bits]
+    largest = {way.name: largest_words(rows, bits, way.name) for way in codes.WAYS}
+    others = ", ".join(f"{way.method} {largest[way.name]}" for way in codes.WAYS[:3])
+    exact = largest["exact"]
+    stealing = largest["exact" + codes.STEALING]
+    half_step_px = srgb_response(bits).half_step * USUAL_PSF.peak_share / flux_ratio(limit)
+    aim = f"aim {aim_mag:g} mag, {codes.AIM_PX:g} px"
+    return (
+        f"{bits} bits, sRGB, {limit:g} magnitudes ({aim}): largest errors, places by a PSF fit, of"
+        f" exact {exact}, with bit stealing {stealing}; {others} (over {EXPOSURE_FRAMES}"
+        " frames). Half the smallest step of light moves a centroid by"
+        f" {half_step_px:.3f} px along each axis"
+    )
+
+
+def largest_words(rows: Sequence[WayErrors], bits: int, method: str) -> str:
+    """The largest errors of a way down to the faint end of its aim, in words."""
+    limit_mag = codes.AIMS[bits][1]
+    flux_mag = 0.0
+    place_px = 0.0
+    for row in rows:
+        if (row.bits, row.method) == (bits, method) and row.mag_under_white <= limit_mag:
+            flux_mag = max(flux_mag, row.figures.flux_max_mag)
+            place_px = max(place_px, row.figures.max_px_fit)
+    return f"{flux_mag:.3f} mag and {place_px:.3f} px"
+
+
+def centroiders_line(rows: Sequence[CentroiderErrors]) -> str:
+    """The error of `exact` relative to `round` on the coarsest panel, by centroider."""
+    coarsest = codes.BITS[0]
+    ratios = []
+    for row in rows:
+        if row.bits == coarsest:
+            ratios.append(f"{row.centroider} {row.share:.2f} ({row.exact_px:.4f} px)")
+    return (
+        f"{coarsest} bits, {codes.AIMS[coarsest][1]:g} magnitudes under white: of the error of"
+        f" round (rms along an axis) exact leaves, by each centroider, {', '.join(ratios)}"
+    )
+
+
+def times_line(timed: Sequence[TimedWay]) -> str:
+    """The times of the ways without bit stealing."""
+    ms = {row.method: row.frame_ms for row in timed if row.bits == MIDDLE_BITS}
+    times = ", ".join(f"{way.method} {ms[way.name]:.1f} ms" for way in codes.WAYS[:4])
+    width, height = codes.FRAME_PX
+    return (
+        f"{codes.STARS} stars, {width} x {height}, {MIDDLE_BITS} bits, from light to levels in"
+        f" memory: {times}"
+    )
+
+
+def way_of(row: WayErrors | TimedWay) -> str:
+    """The series of a row: its way."""
+    return row.method
+
+
+def draw_magnitudes(path: Path, rows: Sequence[WayErrors]) -> None:
+    """The largest errors against magnitude, a row of panels for each number of bits."""
+    limit = codes.AIMS[MIDDLE_BITS][1]
+    exact = largest_words(rows, MIDDLE_BITS, "exact")
+    rounded = largest_words(rows, MIDDLE_BITS, "round")
+    finding = (
+        f"On {MIDDLE_BITS} bits every star to {limit:g} magnitudes under white is within {exact}"
+        f" with exact, {rounded} with round"
+    )
+    panels = []
+    for bits in codes.BITS:
+        xlabel = "magnitudes under a white peak" if bits == codes.BITS[-1] else ""
+        flux = magnitude_lines(bits, "flux_max_mag")
+        place = magnitude_lines(bits, "max_px_fit")
+        log_y: dict[str, Any] = {"xlabel": xlabel, "scales": ("linear", "log")}
+        title = f"{bits} bits"
+        panels.append(PanelSpec(flux, "flux error [mag]", title=title, names=False, **log_y))
+        panels.append(PanelSpec(place, "place error [monitor px]", **log_y))
+    looks = {}
+    for way in codes.WAYS:
+        looks[way.name] = SeriesLook(way.name.replace("mean of ", ""), way.colour)
+    spec = ChartSpec(tuple(panels), way_of, looks, MAGNITUDES_NOTE, 2, {"share_y": "col"})
+    with row_panels(path, finding, spec, rows) as grid:
+        for bits, flux_axes, place_axes in zip(codes.BITS, grid[::2], grid[1::2], strict=True):
+            aim_mag, limit = codes.AIMS[bits]
+            for axes, aim in ((flux_axes, aim_mag), (place_axes, codes.AIM_PX)):
+                down_at_limit = [0, limit, limit], [aim, aim, MIN_ERROR]
+                axes.plot(*down_at_limit, "--", color=INK, lw=1.1, label="_aim")
+                axes.annotate("aim", (0, aim), (2, 3), **AIM_LABEL)
+
+
+def magnitude_lines(bits: int, error: str) -> tuple[LineSpec, ...]:
+    """An error on a panel against magnitude: solid, and dotted with bit stealing."""
+    stealing_ways = {way.name: way.stealing for way in codes.WAYS}
+    lines = []
+    for is_stealing, style in STEALING_STYLE.items():
+
+        def is_drawn(row: WayErrors, is_stealing: bool = is_stealing) -> bool:
+            return row.bits == bits and stealing_ways[row.method] == is_stealing
+
+        line = LineSpec("mag_under_white", as_drawn(error), style, where=is_drawn, look={"lw": 1.5})
+        lines.append(line)
+    return tuple(lines)
+
+
+def as_drawn(error: str) -> Callable[[WayErrors], float]:
+    """An error for a logarithmic axis: at least MIN_ERROR, NaN where a star shows nothing."""
+
+    def value(row: WayErrors) -> float:
+        size = float(getattr(row.figures, error))
+        if math.isfinite(size):
+            return max(size, MIN_ERROR)
+        return math.nan
+
+    return value
+
+
+def draw_each(path: Path, rows: Sequence[CentroiderErrors]) -> None:
     """The errors of round and exact by each centroider, a panel for each number of bits."""
     shares = [row.share for row in rows]
     finding = (
         f"Whichever centroider the tracker has, exact leaves {min(shares):.2f} to"
         f" {max(shares):.2f} of the error that round makes at the faint end"
     )
-    count = len(codes.BITS)
-    with chart(path, finding, 1, count, note=EACH_NOTE, share_y=True, height_inch=3.6) as grid:
-        for bits, axes in zip(codes.BITS, grid, strict=True):
-            of_bits = [row for row in rows if row.bits == bits]
-            draw_pairs(axes, EACH_PAIRS, of_bits)
-            for place, row in enumerate(of_bits):
-                axes.annotate(f"{row.share:.2f}", (row.round_px, place), (6, 0), **BESIDE)
-            title = f"{bits} bits, {codes.AIMS[bits][1]:g} mag under white"
-            axes.set(title=title, xlabel="error [monitor px]")
-            axes.margins(x=0.2, y=0.12)
-        name_places(grid[0], FAMILY)
+    panels = tuple(centroiders_panel(bits) for bits in codes.BITS)
+    layout = {"share_y": True, "height_inch": 3.6}
+    spec = ChartSpec(panels, lambda row: row.bits, {}, EACH_NOTE, len(panels), layout)
+    with row_panels(path, finding, spec, rows) as grid:
         names = grid[0].get_legend_handles_labels()
         grid[0].figure.legend(*names, loc="outside upper right", ncols=2)
 
 
-def _draw_times(
-    path: Path,
-    faintest: dict[tuple[int, str], StarErrors],
-    times: dict[tuple[int, str], float],
-    load: Load,
-) -> None:
-    width, height = codes.FRAME_PX
-    note = (
-        f"{codes.STARS} stars, {width} x {height}. Circles, squares, triangles: 8, 10 and 12 bits,"
-        " at the faint end."
+def centroiders_panel(bits: int) -> PanelSpec:
+    """The errors on a panel of these bits; the first panel has the names for all."""
+    first, second = EACH_LOOKS
+    dots = DotsSpec(
+        (("round_px", first), ("exact_px", second)),
+        where=lambda row: row.bits == bits,
+        name=(lambda row: row.centroider) if bits == codes.BITS[0] else None,
+        note=lambda row: f"{row.share:.2f}",
     )
-    ms = {way.name: times[codes.BITS[1], way.name] for way in codes.WAYS}
+    return PanelSpec(
+        xlabel="error [monitor px]",
+        title=f"{bits} bits, {codes.AIMS[bits][1]:g} mag under white",
+        dots=dots,
+        names=False,
+        margins=(0.2, 0.12),
+    )
+
+
+def draw_times(path: Path, timed: Sequence[TimedWay], load: Load) -> None:
+    """The errors at the faint end against the time of a frame."""
+    ms = {row.method: row.frame_ms for row in timed if row.bits == MIDDLE_BITS}
     took = f"exact takes {ms['exact']:.1f} ms and round {ms['round']:.1f} ms"
-    finding = load.title(f"From light to codes in memory {took}, on {codes.BITS[1]} bits")
-    with chart(path, finding, 2, note=load.note(note)) as panels:
-        for way in codes.WAYS:
-            for bits, marker in MARKERS.items():
-                for axes, error in zip(panels, _rms(faintest[bits, way.name]), strict=True):
-                    face = "none" if way.stealing else way.colour
-                    axes.loglog(
-                        times[bits, way.name], error, marker, color=way.colour, mfc=face, ms=8
-                    )
-        for axes, number, what in zip(
-            panels, (0, 1), ("flux error, rms [mag]", "place error, rms [monitor px]"), strict=True
-        ):
-            axes.set_ylabel(what)
-            axes.margins(0.1)
-            names = []
-            for way in codes.WAYS:
-                key = codes.BITS[0], way.name
-                place = times[key], _rms(faintest[key])[number]
-                names.append((way.name, place, way.colour))
-            name_at_side(axes, names)
-        panels[-1].set_xlabel("time of a frame [ms]")
+    finding = load.title(f"From light to codes in memory {took}, on {MIDDLE_BITS} bits")
+    looks = {}
+    for way in codes.WAYS:
+        looks[way.name] = SeriesLook(way.name, way.colour, is_open=way.stealing)
+    log: dict[str, Any] = {"scales": ("log", "log"), "margins": (0.1, 0.1)}
+    light = PanelSpec(time_points(flux_rms_mag), "flux error, rms [mag]", **log)
+    place = PanelSpec(
+        time_points(distance_rms_px),
+        "place error, rms [monitor px]",
+        "time of a frame [ms]",
+        **log,
+    )
+    draw_rows(path, finding, ChartSpec((light, place), way_of, looks, TIMES_NOTE), timed, load)
 
 
-def _rms(errors: StarErrors) -> tuple[float, float]:
-    return errors.flux_rms_mag, float(np.sqrt(2)) * errors.axis_rms_px(codes.JUDGE)
+def time_points(error: Callable[[TimedWay], float]) -> tuple[LineSpec, ...]:
+    """An error against time: a marker for each number of bits, of which the first is named."""
+    points = []
+    for bits, marker in MARKERS.items():
+
+        def is_drawn(row: TimedWay, bits: int = bits) -> bool:
+            return row.bits == bits
+
+        named = bits == codes.BITS[0]
+        large = {"ms": 8}
+        point = LineSpec("frame_ms", error, "", marker, named, where=is_drawn, look=large)
+        points.append(point)
+    return tuple(points)
+
+
+def flux_rms_mag(row: TimedWay) -> float:
+    """The error of light, rms."""
+    return row.figures.flux_rms_mag
+
+
+def distance_rms_px(row: TimedWay) -> float:
+    """The distance by which a PSF fit is off, rms."""
+    return math.sqrt(2) * row.figures.axis_rms_px_fit

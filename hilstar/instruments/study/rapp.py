@@ -4,8 +4,10 @@ They depend on the sensor: of the two that the thesis has (figures 5.19 and 5.22
 own, with the stars that it sees in the thesis's three fields and in any other.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -16,7 +18,8 @@ from hilstar.basics.charts import MUTED, SERIES, chart, label_ends, plain_ticks,
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import LIGHT_M_S
-from hilstar.instruments.study.fields import Field, fields_of
+from hilstar.instruments.study.engine import ChartFinding, write_columns, write_findings
+from hilstar.instruments.study.fields import SkyField, fields_of
 from hilstar.instruments.study.study_benches import study_optics
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
@@ -35,6 +38,9 @@ from hilstar.sky.electrons import (
 )
 from hilstar.sky.spectrum import PLANCK_J_S, blackbody_exitance_w_m2_m, integration_nodes
 from hilstar.sky.stars import Stars
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SENSORS = {"ccd47-20": "CCD47-20", "kai-4021": "KAI-4021 (approximate QE)"}
 WEIGHTINGS: tuple[Weighting, ...] = ("energy", "photon")
@@ -56,15 +62,17 @@ BENCH_FILES = (
     "rapp_stars.csv",
     "findings.csv",
 )
-STAR_COLUMNS = ("field", "hip", "v_mag", "bv_mag", "temperature_k", "rapp3")
 
 
-@dataclass(frozen=True, slots=True)
-class ChartFinding:
-    """A chart, by the stem of its files, and what it says."""
+class StarRatio(NamedTuple):
+    """A star of a field, and its electrons by its spectrum over those of the average model."""
 
-    figure: str
-    text: str
+    field: str
+    hip: int
+    v_mag: float
+    bv_mag: float
+    temperature_k: float
+    rapp3: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +81,7 @@ class FieldRatios:
     model's.
     """
 
-    field: Field
+    field: SkyField
     star: npt.NDArray[np.intp]
     ratio: FloatArray
 
@@ -90,25 +98,23 @@ class FieldRatios:
 def rapp_ratios(temperature_k: FloatArray, optics: Optics, weighting: Weighting) -> FloatArray:
     """RAPP1, RAPP2 and RAPP3, shape (3, n): DGS over AGS in irradiance, photons and electrons."""
     photometry = Photometry(weighting=weighting)
-    wavelength_nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
-    low_nm, high_nm = optics.range_nm
-    photons_per_j = wavelength_nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
-    mean_photons_per_j = (low_nm + high_nm) / 2 * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
+    nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
+    joule_m = PLANCK_J_S * LIGHT_M_S
     reference = reference_mean_w_m2_m(photometry)
 
     def in_range(kelvin: FloatArray, response: FloatArray) -> FloatArray:
-        spectrum = blackbody_exitance_w_m2_m(wavelength_nm, kelvin[:, None])
-        return np.asarray(
-            reference / v_band_mean_w_m2_m(kelvin, weighting) * (spectrum @ (response * weight_m))
-        )
+        spectrum = blackbody_exitance_w_m2_m(nm, kelvin[:, None])
+        scale = reference / v_band_mean_w_m2_m(kelvin, weighting)
+        return np.asarray(scale * (spectrum @ (response * weight_m)))
 
-    ones = np.ones_like(wavelength_nm)
+    ones = np.ones_like(nm)
     average = in_range(np.array([REFERENCE_TEMPERATURE_K]), ones)[0]
+    mean_nm = sum(optics.range_nm) / 2
+    mean_photons_per_j = mean_nm * 1e-9 / joule_m
     irradiance = in_range(temperature_k, ones) / average
-    photons = in_range(temperature_k, photons_per_j) / (average * mean_photons_per_j)
-    electrons = dgs_electrons_per_s(temperature_k, optics, photometry) / ags_electrons_per_s(
-        optics, photometry
-    )
+    photons = in_range(temperature_k, nm * 1e-9 / joule_m) / (average * mean_photons_per_j)
+    spectral = dgs_electrons_per_s(temperature_k, optics, photometry)
+    electrons = spectral / ags_electrons_per_s(optics, photometry)
     return np.stack((irradiance, photons, electrons))
 
 
@@ -120,19 +126,19 @@ def rapp(directory: Path, sensor: str) -> ChartFinding:
     # which the range of wavelengths alone makes
     in_full_range = rapp_ratios(kelvin[-1:], study_optics("ccd47-20"), "energy")
     coolest, cool, hot, hottest = _quoted(kelvin, ratios["energy"])
+    thesis = SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
     text = (
         f"{SENSORS[sensor]}: the spectral model gives {coolest:.2f} times the electrons of the"
-        " average one at 3000 K,"
-        f" {cool:.2f} at 5000 K; at 9000 K they differ by {100 * (hot - 1):+.1f} %, at 50000 K by"
-        f" {100 * (hottest - 1):+.1f} %"
-        + SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
+        f" average one at 3000 K, {cool:.2f} at 5000 K; at 9000 K they differ by"
+        f" {100 * (hot - 1):+.1f} %, at 50000 K by {100 * (hottest - 1):+.1f} %{thesis}"
     )
     title = (
         f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the"
-        " average model,"
-        f" one of 5000 K {cool:.2f} times"
+        f" average model, one of 5000 K {cool:.2f} times"
     )
-    _draw(directory / f"rapp_{sensor}", title, optics, ratios, "energy")
+    with chart(directory / f"rapp_{sensor}", title, note=_note(optics, "energy")) as (axes,):
+        _draw_ratios(axes, ratios, "energy")
+        _finish([axes])
     _write(directory / f"rapp_{sensor}.csv", kelvin, ratios)
     return ChartFinding(f"rapp_{sensor}", text)
 
@@ -140,9 +146,9 @@ def rapp(directory: Path, sensor: str) -> ChartFinding:
 def bench_rapp(
     directory: Path, file: BenchFile, radec_roll_deg: tuple[float, float, float] | None = None
 ) -> list[ChartFinding]:
-    """The three ratios of a bench's tracker, and RAPP3 of the stars that it sees.
+    """The three ratios of a bench's tracker, and RAPP3 of the stars in its fields.
 
-    The stars are those of the thesis's fields, and of one of one's own. The curves are of black
+    The fields are the thesis's, and the user's own where one is given. The curves are of black
     bodies; the stars have the spectra that the bench gives them. Raises InputError.
     """
     optics = bench_optics(file.config.tracker, file.folder)
@@ -152,22 +158,24 @@ def bench_rapp(
     coolest, cool, hot, hottest = _quoted(kelvin, ratios[weighting])
     text = (
         f"By {file.path.name} a black body of 3000 K gives {coolest:.2f} times the electrons of"
-        " the average model, one of"
-        f" 5000 K {cool:.2f}, 9000 K {hot:.2f}, 50000 K {hottest:.2f}"
+        f" the average model, one of 5000 K {cool:.2f}, 9000 K {hot:.2f}, 50000 K {hottest:.2f}"
     )
     stars, ratio = _star_ratios(file)
     camera = tracker_camera(file.config.tracker, file.folder)
     fields = [_in_field(field, stars, ratio, camera) for field in fields_of(radec_roll_deg)]
-    _draw(directory / "rapp_bench", text, optics, ratios, weighting, (stars, fields))
+    with chart(directory / "rapp_bench", text, 2, note=_note(optics, weighting)) as panels:
+        _draw_ratios(panels[0], ratios, weighting)
+        _draw_stars(panels[1], stars, fields)
+        _finish(panels)
     _write(directory / "rapp_bench.csv", kelvin, ratios)
-    rows = [row for field in fields for row in _star_rows(field, stars)]
-    write_csv(directory / "rapp_stars.csv", STAR_COLUMNS, rows)
+    rows: list[StarRatio] = []
+    for field in fields:
+        rows += _star_rows(field, stars)
+    write_csv(directory / "rapp_stars.csv", StarRatio._fields, rows)
     findings = [ChartFinding("rapp_bench", text)]
-    findings += [
-        ChartFinding("rapp_stars", f"RAPP3 of the stars of {field.text}") for field in fields
-    ]
-    table = [(finding.figure, finding.text) for finding in findings]
-    write_csv(directory / "findings.csv", ("figure", "finding"), table)
+    for field in fields:
+        findings.append(ChartFinding("rapp_stars", f"RAPP3 of the stars of {field.text}"))
+    write_findings(directory, findings)
     return findings
 
 
@@ -183,22 +191,23 @@ def _quoted(kelvin: FloatArray, ratios: FloatArray) -> FloatArray:
 
 def _star_ratios(file: BenchFile) -> tuple[Stars, FloatArray]:
     """The stars of a bench, and the electrons of each (n,) over those by the average model."""
-    config = file.config
-    spectral, average = (
-        bench_stars(
-            structs.replace(config, sky=structs.replace(config.sky, brightness=model)), file.folder
-        )
-        for model in ("dgs", "ags")
-    )
+    spectral = _stars_by(file, "dgs")
     if not len(spectral):
         raise InputError(
-            f"[sky] faintest_v_mag = {config.sky.faintest_v_mag:g} leaves no star; write a larger"
-            " magnitude"
+            f"[sky] faintest_v_mag = {file.config.sky.faintest_v_mag:g} leaves no star; write a"
+            " larger magnitude"
         )
+    average = _stars_by(file, "ags")
     return spectral, spectral.electrons_per_s / average.electrons_per_s
 
 
-def _in_field(field: Field, stars: Stars, ratio: FloatArray, camera: Camera) -> FieldRatios:
+def _stars_by(file: BenchFile, brightness: Literal["dgs", "ags"]) -> Stars:
+    """The stars of a bench by one model of brightness."""
+    sky = structs.replace(file.config.sky, brightness=brightness)
+    return bench_stars(structs.replace(file.config, sky=sky), file.folder)
+
+
+def _in_field(field: SkyField, stars: Stars, ratio: FloatArray, camera: Camera) -> FieldRatios:
     """The stars whose centre is on the image."""
     to_image = camera.cam_to_image @ to_matrix(from_radec_roll_deg(*field.radec_roll_deg))
     near = stars.near(to_image[2], camera.field_radius_rad(0.0))
@@ -207,53 +216,65 @@ def _in_field(field: Field, stars: Stars, ratio: FloatArray, camera: Camera) -> 
     return FieldRatios(field, star, ratio[star])
 
 
-def _star_rows(in_field: FieldRatios, stars: Stars) -> list[tuple[object, ...]]:
-    properties = (stars.hip, stars.v_mag, stars.bv_mag, stars.temperature_k)
-    columns = [values[in_field.star].tolist() for values in properties]
-    stems = [in_field.field.stem] * len(in_field.star)
-    return list(zip(stems, *columns, in_field.ratio.tolist(), strict=True))
+def _star_rows(in_field: FieldRatios, stars: Stars) -> list[StarRatio]:
+    """A row for each star of a field."""
+    rows = []
+    for star, ratio in zip(in_field.star.tolist(), in_field.ratio.tolist(), strict=True):
+        rows.append(
+            StarRatio(
+                field=in_field.field.stem,
+                hip=stars.hip[star].item(),
+                v_mag=stars.v_mag[star].item(),
+                bv_mag=stars.bv_mag[star].item(),
+                temperature_k=stars.temperature_k[star].item(),
+                rapp3=ratio,
+            )
+        )
+    return rows
 
 
-def _draw(
-    path: Path,
-    title: str,
-    optics: Optics,
-    ratios: dict[Weighting, FloatArray],
-    solid: Weighting,
-    stars: tuple[Stars, list[FieldRatios]] | None = None,
-) -> None:
-    """The ratios over temperature, solid by the weighting `solid`; below, the stars of fields."""
-    kelvin = _temperatures_k()
+def _note(optics: Optics, solid: Weighting) -> str:
+    """What the ratios compare, and how each weighting is drawn."""
     (dotted,) = set(WEIGHTINGS) - {solid}
     low_nm, high_nm = optics.range_nm
-    note = (
+    return (
         f"DGS over AGS at one V, {low_nm:.0f} to {high_nm:.0f} nm. Solid: {solid} weighting;"
         f" dotted: {dotted}."
     )
-    panels = 1 if stars is None else 2
-    with chart(path, title, panels, note=note) as axes:
-        for k, (name, colour) in enumerate(zip(RATIOS, SERIES, strict=False)):
-            axes[0].loglog(kelvin, ratios[solid][k], color=colour, label=name)
-            axes[0].loglog(kelvin, ratios[dotted][k], ":", color=colour, label="_dotted")
-        axes[0].set(ylabel="ratio of the models [1]")
-        if stars is not None:
-            catalogue, fields = stars
-            for field, colour in zip(fields, SERIES, strict=False):
-                kelvin_of_stars = catalogue.temperature_k[field.star]
-                name = field.field.name
-                axes[1].loglog(kelvin_of_stars, field.ratio, ".", ms=4, color=colour, label=name)
-            axes[1].set(ylabel="electrons of stars [1]")
-            axes[1].legend(loc="upper right")
-        for panel in axes:
-            panel.axhline(1, color=MUTED, lw=1)
-            panel.set_xlim(kelvin[0], kelvin[-1])
-        axes[-1].set(xlabel="black-body temperature [K]")
-        plain_ticks(axes[-1].xaxis, TICKS_K)
-        label_ends(axes[0])
+
+
+def _draw_ratios(axes: "Axes", ratios: dict[Weighting, FloatArray], solid: Weighting) -> None:
+    """The ratios over temperature, solid by the weighting `solid`."""
+    kelvin = _temperatures_k()
+    (dotted,) = set(WEIGHTINGS) - {solid}
+    for number, (name, colour) in enumerate(zip(RATIOS, SERIES, strict=False)):
+        axes.loglog(kelvin, ratios[solid][number], color=colour, label=name)
+        axes.loglog(kelvin, ratios[dotted][number], ":", color=colour, label="_dotted")
+    axes.set(ylabel="ratio of the models [1]")
+
+
+def _draw_stars(axes: "Axes", stars: Stars, fields: Sequence[FieldRatios]) -> None:
+    """RAPP3 of the stars of each field."""
+    for field, colour in zip(fields, SERIES, strict=False):
+        kelvin = stars.temperature_k[field.star]
+        axes.loglog(kelvin, field.ratio, ".", ms=4, color=colour, label=field.field.name)
+    axes.set(ylabel="electrons of stars [1]")
+    axes.legend(loc="upper right")
+
+
+def _finish(panels: "Sequence[Axes]") -> None:
+    """Draw where both models agree, and label the panels' temperatures."""
+    for axes in panels:
+        axes.axhline(1, color=MUTED, lw=1)
+        axes.set_xlim(QUOTED_K[0], QUOTED_K[-1])
+    panels[-1].set(xlabel="black-body temperature [K]")
+    plain_ticks(panels[-1].xaxis, TICKS_K)
+    label_ends(panels[0])
 
 
 def _write(path: Path, kelvin: FloatArray, ratios: dict[Weighting, FloatArray]) -> None:
-    numbers = range(len(RATIOS))
-    names = [f"rapp{k + 1}_{weighting}" for weighting in WEIGHTINGS for k in numbers]
-    values = [ratios[weighting][k] for weighting in WEIGHTINGS for k in numbers]
-    write_csv(path, ("temperature_k", *names), np.column_stack((kelvin, *values)).tolist())
+    columns = {"temperature_k": kelvin}
+    for weighting in WEIGHTINGS:
+        for number, ratio in enumerate(ratios[weighting], start=1):
+            columns[f"rapp{number}_{weighting}"] = ratio
+    write_columns(path, columns)

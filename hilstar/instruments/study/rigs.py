@@ -19,33 +19,33 @@ import numpy as np
 from scipy import ndimage
 
 from hilstar.basics.arrays import FloatArray, IntArray
-from hilstar.basics.charts import BLUE, GREEN, MUTED, ORANGE, chart, two_digits, write_records
+from hilstar.basics.charts import BLUE, GREEN, ORANGE, two_digits
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
-from hilstar.display.quantise import shown_light
-from hilstar.display.render.reference import linear_image
-from hilstar.instruments.study.row_charts import name_places
+from hilstar.instruments.study.engine import (
+    ChartSpec,
+    DotsSpec,
+    PanelSpec,
+    SeriesLook,
+    draw_rows,
+    write_rows,
+)
 from hilstar.instruments.study.study_benches import (
     FULL_HD,
     GLASS,
-    Isolation,
     Table,
-    lone_windows,
-    squares,
-    star_error,
+    lone_errors,
     study_bench,
+    turning_sprites,
 )
-from hilstar.optics.frame_motion import CameraTurn, swept_sprites
+from hilstar.optics.frame_motion import CameraTurn
 from hilstar.optics.psf import GaussianPsf
-from hilstar.optics.scan import Scan
-from hilstar.server.bench.code_errors import NO_THRESHOLD
 from hilstar.server.bench.frame import Bench
 from hilstar.sky.catalog import load_catalog
 from hilstar.tracker.centroiders import star_places
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.identify import wahba
 from hilstar.tracker.settings import DetectorSettings
-from hilstar.tracker.star_errors import stamp_errors
 
 LASSI, NAPLES, P13 = "LASSI, Illinois 2024", "Naples 2013", "P13XM015"
 REPOSITORY = "HongruiZhao/CNNStarDetectCentroid, commit 89de519"
@@ -71,7 +71,7 @@ READ_NOISE_E = FULL_WELL_E / 30 / math.sqrt(12)
 # star_detection_centroiding.py: a dark frame's mean; main_detection_centroiding.py: 3 DN over the
 # background, areas over 3 px, and 7 x 7 px for the centre of mass.
 DARK_DN, THRESHOLD_DN, MIN_PIXELS, MASS_HALF_PX = 10.0, 3.0, 4, 3
-GRID_HALF_PX, FIT_HALF_PX = 2, 4
+GRID_HALF_PX, FIT_HALF_PX = 2, 4  # half sides of the squares of pixels that they use
 EDGE_PX, MATCHED_PX = 5, 3.0
 # Sigma over five minutes about the boresight and two axes across it, arcsec, STATIC.
 SCATTER_ARCSEC = {
@@ -81,15 +81,24 @@ SCATTER_ARCSEC = {
 }
 FITTED, LIGHT_UNIT = "Gaussian grid", "DN"
 LIGHTS_DN = (34.0, 40.0, 48.0, 60.0, 80.0)
-EXPOSURES, QUICK_EXPOSURES = 300, 40
+EXPOSURES, QUICK_EXPOSURES = 300, 40  # chance moves a sigma of so many by 4 and 11 %
 # Naples: a panel of 0.641 m of 2560 pixels before 1.3 m (REPOSITORY, old_error_analysis.py); 16
 # stars a solution, 22.48 x 17.02 degrees, 5 and 30 arcsec (NAPLES_SOURCE).
 NAPLES_PIXEL_ARCSEC = 641.0 / 2560 / 1300.0 * ARCSEC_PER_RAD
 NAPLES_STARS, NAPLES_FIELD_DEG, NAPLES_ARCSEC = 16, (22.48, 17.02), (30.0, 5.0)
-TRIALS = 2000
+TRIALS = 2000  # chance moves an rms of so many by 1.6 %
 P13_RESOLUTION_ARCSEC, P13_ARCSEC = 3.43, 2.0
 OUTSIDE_PIXEL_ARCSEC, OUTSIDE_CODES_ARCSEC, OUTSIDE_CODES_MAG = 10.30, 0.082, 0.0054
-ISOLATION = Isolation(margin_px=7, max_share=2e-4)
+PLACE_UNIT = "arcsec rms an axis"
+NOTE = (
+    "Static scatter: the same light of a star in all rows. The network is predicted by a PSF"
+    " fit. Light is in mag, all else in arcsec."
+)
+DOTS = (
+    ("published", SeriesLook("published", ORANGE, "o", is_open=True)),
+    ("predicted", SeriesLook("predicted", BLUE, "o", more={"ms": 4})),
+    ("with_hilstar", SeriesLook("with hilstar's codes", GREEN, "D", more={"ms": 4})),
+)
 Places = tuple[FloatArray, FloatArray]
 # Places (x, y) of stars whose coarse columns and rows (n,) were found in an image.
 Finder = Callable[[FloatArray, IntArray, IntArray], Places]
@@ -111,20 +120,21 @@ class RigFigure:
     with_hilstar: float
     source: str
 
-
-def rig_figure(
-    rig: str,
-    figure: str,
-    unit: str,
-    published: float,
-    predicted: float,
-    source: str,
-    *,
-    with_hilstar: float = math.nan,
-) -> RigFigure:
-    """A figure with its difference, published less predicted."""
-    difference = published - predicted
-    return RigFigure(rig, figure, unit, published, predicted, difference, with_hilstar, source)
+    @classmethod
+    def of(
+        cls,
+        rig: str,
+        figure: str,
+        unit: str,
+        published: float,
+        predicted: float,
+        source: str,
+        *,
+        with_hilstar: float = math.nan,
+    ) -> "RigFigure":
+        """A figure with its difference, published less predicted."""
+        difference = published - predicted
+        return cls(rig, figure, unit, published, predicted, difference, with_hilstar, source)
 
 
 def run(directory: Path, quick: bool = False) -> list[str]:
@@ -135,22 +145,23 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     codes_share = places[0].with_hilstar / places[0].predicted
     rows = [*places, *scatter_rows(quick), *constant_rows(codes_share)]
     rows += [*naples_rows(), *p13_rows()]
-    write_records(directory / "rigs.csv", rows)
+    write_rows(directory / "rigs.csv", rows)
     draw(directory / "rigs", rows)
     return [finding_of(rows), *map(line_of, rows)]
 
 
 def attitudes(count: int) -> list[FloatArray]:
-    """Attitudes by chance, evenly over the sky: `count` quaternions q_icrs_to_cam."""
+    """Random attitudes, evenly over the sky: `count` quaternions q_icrs_to_cam."""
     rng = np.random.default_rng(SEED)
-    ra = rng.uniform(0.0, 360.0, count)
-    dec = np.degrees(np.arcsin(rng.uniform(-1.0, 1.0, count)))
-    roll = rng.uniform(0.0, 360.0, count)
-    return [from_radec_roll_deg(*each) for each in zip(ra, dec, roll, strict=True)]
+    ra_deg = rng.uniform(0.0, 360.0, count)
+    dec_deg = np.degrees(np.arcsin(rng.uniform(-1.0, 1.0, count)))
+    roll_deg = rng.uniform(0.0, 360.0, count)
+    angles = zip(ra_deg, dec_deg, roll_deg, strict=True)
+    return [from_radec_roll_deg(*radec_roll_deg) for radec_roll_deg in angles]
 
 
 def place_rows(count: int) -> list[RigFigure]:
-    """What each way leaves of places and light on the panel, over attitudes."""
+    """The errors of places and light on the panel, by one pixel a star and by hilstar's codes."""
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024), "transmission": GLASS},
         "sky": {"faintest_v_mag": FAINTEST_V_MAG},
@@ -163,64 +174,50 @@ def place_rows(count: int) -> list[RigFigure]:
     light = list[float]()
     with TemporaryDirectory() as folder, study_bench(Path(folder) / "lassi.toml", tables) as bench:
         for q_icrs_to_cam in attitudes(count):
-            own_pixel, codes, magnitudes = field_errors(bench, q_icrs_to_cam)
-            rounded.append(own_pixel)
-            placed.append(codes)
-            light += magnitudes
+            turn = CameraTurn(q_icrs_to_cam, np.zeros(3))
+            rounded.append(pixel_errors(bench, turn))
+            errors = lone_errors(bench, turn, bench.draw(q_icrs_to_cam).levels)
+            placed.append(errors.off_px["fit"])
+            light += [star.flux_mag for star in errors.stars]
     pixel_arcsec = rms(np.concatenate(rounded, axis=1)) * PIXEL_ARCSEC
     codes_arcsec = rms(np.concatenate(placed, axis=1)) * PIXEL_ARCSEC
-    mag = rms(np.array(light))
-    unit = "arcsec rms an axis"
     return [
-        rig_figure(
+        RigFigure.of(
             LASSI,
             "places, one pixel a star",
-            unit,
+            PLACE_UNIT,
             OUTSIDE_PIXEL_ARCSEC,
             pixel_arcsec,
             f"{SIMULATOR}; {OUTSIDE}",
             with_hilstar=codes_arcsec,
         ),
-        rig_figure(
-            LASSI, "places, hilstar's codes", unit, OUTSIDE_CODES_ARCSEC, codes_arcsec, OUTSIDE
+        RigFigure.of(
+            LASSI,
+            "places, hilstar's codes",
+            PLACE_UNIT,
+            OUTSIDE_CODES_ARCSEC,
+            codes_arcsec,
+            OUTSIDE,
         ),
-        rig_figure(LASSI, "light, hilstar's codes", "mag rms", OUTSIDE_CODES_MAG, mag, OUTSIDE),
+        RigFigure.of(
+            LASSI,
+            "light, hilstar's codes",
+            "mag rms",
+            OUTSIDE_CODES_MAG,
+            rms(np.array(light)),
+            OUTSIDE,
+        ),
     ]
 
 
-def field_errors(
-    bench: Bench, q_icrs_to_cam: FloatArray
-) -> tuple[FloatArray, FloatArray, list[float]]:
-    """Of a field's stars: how far the middle of a star's pixel is off (2, n), and of those that
-    stand alone hilstar's codes by a PSF fit (2, m), px; and errors of their light, mag.
-    """
-    turn = CameraTurn(q_icrs_to_cam, np.zeros(3))
-    scan = Scan(bench.scan.down, bench.scan.scanout_s, bench.scan.hold_s)
-    sprites = swept_sprites(bench.stars, turn, scan, bench.camera, bench.psf)
+def pixel_errors(bench: Bench, turn: CameraTurn) -> FloatArray:
+    """The distances (2, n), px, from a field's stars to the middles of their pixels."""
+    sprites = turning_sprites(bench, turn)
     places = np.stack([sprites.x_px, sprites.y_px])
-    width, height = bench.camera.resolution_px
-    inside = (np.abs(places[0] - (width - 1) / 2) < width / 2) & (
-        np.abs(places[1] - (height - 1) / 2) < height / 2
-    )
-    own_pixel = np.rint(places[:, inside]) - places[:, inside]
-    shown = shown_light(bench.draw(q_icrs_to_cam).levels, bench.panel)
-    true = linear_image(sprites, bench.camera.resolution_px, bench.psf)
-    light = []
-    windows = []
-    rates = sprites.data["electrons_per_s"]
-    for star, window in lone_windows(
-        sprites, sprites.x_px, sprites.y_px, bench.camera.resolution_px, ISOLATION
-    ):
-        if rates[sprites.star == star].sum() > 2 * bench.flux_at_white_e_per_s:
-            continue  # clips at some places within a pixel
-        light.append(star_error(shown, true, window).flux_mag)
-        windows.append(window)
-    seen = bench.renderer.target.seen
-    lit, wanted = (squares(image, windows) for image in (shown, true))
-    off_px = stamp_errors(
-        lit, wanted, bench.psf.width_px, seen.blur_px, seen.pixel_px, box_share=NO_THRESHOLD
-    )
-    return own_pixel, off_px["fit"], light
+    size_px = np.array(bench.camera.resolution_px)[:, None]
+    from_middle = np.abs(places - (size_px - 1) / 2)
+    inside = (from_middle < size_px / 2).all(axis=0)
+    return np.asarray(np.rint(places[:, inside]) - places[:, inside])
 
 
 def rms(values: FloatArray) -> float:
@@ -242,33 +239,38 @@ class RigField:
 def rig_field() -> RigField:
     """The field of the rig's static run, q = (0, 0, 0, 1): the celestial pole."""
     stars = load_catalog().brighter_than(FAINTEST_V_MAG)
-    ra, dec = np.radians(stars.ra_deg), np.radians(stars.dec_deg)
+    ra = np.radians(stars.ra_deg)
+    dec = np.radians(stars.dec_deg)
     directions = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
     directions = directions[:, directions[2] > 0.9]
     slopes = directions[:2] / directions[2]
-    panel_px = slopes * LENS_MM / PIXEL_MM + np.array(PANEL_PX)[:, None] / 2
+    panel_size = np.array(PANEL_PX)[:, None]
+    panel_px = slopes * LENS_MM / PIXEL_MM + panel_size / 2
     on_panel = (np.floor(panel_px) >= 0).all(axis=0)
-    on_panel &= (panel_px < np.array(PANEL_PX)[:, None]).all(axis=0)
+    on_panel &= (panel_px < panel_size).all(axis=0)
     own_pixel = np.floor(panel_px) + 0.5
-    shown = (own_pixel - np.array(PANEL_PX)[:, None] / 2) * PIXEL_MM / LENS_MM
+    shown_slopes = (own_pixel - panel_size / 2) * PIXEL_MM / LENS_MM
     principal = np.array(PRINCIPAL_PX)[:, None]
-    pixel_px = FOCAL_PX * shown + principal
+    pixel_px = FOCAL_PX * shown_slopes + principal
     true_px = FOCAL_PX * slopes + principal
     limit = np.array(CAMERA_PX)[:, None] - EDGE_PX
-    seen = on_panel & (pixel_px > EDGE_PX).all(axis=0) & (pixel_px < limit).all(axis=0)
-    return RigField(directions[:, seen].T, pixel_px[:, seen], true_px[:, seen])
+    in_view = on_panel & (pixel_px > EDGE_PX).all(axis=0)
+    in_view &= (pixel_px < limit).all(axis=0)
+    return RigField(directions[:, in_view].T, pixel_px[:, in_view], true_px[:, in_view])
 
 
 def centre_of_mass(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
-    """The first moment of the pixels about a star, its background in it, as the rig's."""
+    """The first moment of the pixels around a star, background included, as the rig's."""
     at = np.arange(-MASS_HALF_PX, MASS_HALF_PX + 1)
     stamps = stamps_at(image, columns, rows, MASS_HALF_PX)
     light = stamps.sum(axis=(1, 2))
-    return columns + stamps.sum(axis=1) @ at / light, rows + stamps.sum(axis=2) @ at / light
+    x_px = stamps.sum(axis=1) @ at / light
+    y_px = stamps.sum(axis=2) @ at / light
+    return columns + x_px, rows + y_px
 
 
 def gaussian_grid(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
-    """Parabolas through logarithms of the pixels of each line, weighted by the pixels, whose
+    """Parabolas through the logarithms of each line's pixels, weighted by the pixels; their
     coefficients are summed over the lines (Delabie et al. 2014, J. Astronaut. Sci. 61, 60).
     """
     stamps = np.maximum(stamps_at(image, columns, rows, GRID_HALF_PX), 1.0)
@@ -276,9 +278,9 @@ def gaussian_grid(image: FloatArray, columns: IntArray, rows: IntArray) -> Place
 
 
 def _vertex(lines: FloatArray) -> FloatArray:
-    """Where the parabolas (n, lines, pixels) together have their top, px from the middle.
+    """The common top of the parabolas (n, lines, pixels), px from the middle.
 
-    Each line's coefficients are multiplied by its normal equations' determinant.
+    Each line's coefficients are multiplied by the determinant of its normal equations.
     """
     half = lines.shape[2] // 2
     powers = np.arange(-half, half + 1) ** np.arange(3)[:, None]
@@ -286,13 +288,15 @@ def _vertex(lines: FloatArray) -> FloatArray:
     right_side = np.einsum("jp,nlp,nlp->nlj", powers, lines, np.log(lines))
     weight = np.linalg.det(normal)
     solution = np.linalg.solve(normal, right_side[..., None])[..., 0] * weight[..., None]
-    linear, square = solution[..., 1].sum(axis=1), solution[..., 2].sum(axis=1)
+    linear = solution[..., 1].sum(axis=1)
+    square = solution[..., 2].sum(axis=1)
+    # Without a top the star stays in the middle.
     top = np.divide(-linear, 2 * square, out=np.zeros_like(linear), where=square < 0)
     return np.asarray(np.clip(top, -half, half))
 
 
 def psf_fit(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
-    """Least squares of the PSF, the level known: no centroider scatters less by much."""
+    """A least-squares fit of the PSF with a known background: no centroider scatters much less."""
     stamps = stamps_at(image, columns, rows, FIT_HALF_PX) - DARK_DN
     x_px, y_px = star_places(stamps, "fit", (PSF_SIGMA_PX, PSF_SIGMA_PX))
     return columns + x_px, rows + y_px
@@ -308,11 +312,13 @@ FINDERS: dict[str, Finder] = {
 def stamps_at(image: FloatArray, columns: IntArray, rows: IntArray, half: int) -> FloatArray:
     """Squares of pixels (n, side, side) about columns and rows (n,)."""
     at = np.arange(-half, half + 1)
-    return np.asarray(image[rows[:, None, None] + at[:, None], columns[:, None, None] + at])
+    pixel_rows = rows[:, None, None] + at[:, None]
+    pixel_columns = columns[:, None, None] + at
+    return np.asarray(image[pixel_rows, pixel_columns])
 
 
 def found_stars(image: FloatArray) -> tuple[IntArray, IntArray]:
-    """Columns and rows (n,) of the rig's detection: middles of lit areas, rounded down."""
+    """Columns and rows (n,) by the rig's detection: the middles of lit areas, rounded down."""
     labels, count = ndimage.label(image > DARK_DN + THRESHOLD_DN)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     wide = np.flatnonzero(sizes >= MIN_PIXELS)
@@ -328,8 +334,9 @@ def found_stars(image: FloatArray) -> tuple[IntArray, IntArray]:
 def scatter_arcsec(
     field: RigField, places_px: FloatArray, star_dn: float, exposures: int
 ) -> dict[str, FloatArray]:
-    """Sigma of attitudes about the boresight and across it (3,), by centroider, of stars of a
-    light at places on the detector (2, n).
+    """Sigma of attitudes about the boresight and across it (3,), arcsec, by centroider.
+
+    The stars have one light, and stand at places on the detector (2, n), px.
     """
     settings = DetectorSettings(
         gain_e_per_dn=GAIN_E_PER_DN,
@@ -343,7 +350,7 @@ def scatter_arcsec(
     rates = np.full(places_px.shape[1], star_dn * GAIN_E_PER_DN)
     mean_e = psf.spread(places_px[0], places_px[1], rates, (0, 0, *CAMERA_PX)).astype(np.float64)
     rng = np.random.default_rng(SEED)
-    turns: dict[str, list[FloatArray]] = {name: [] for name in FINDERS}
+    turns = {name: list[FloatArray]() for name in FINDERS}
     for _ in range(exposures):
         image = detector.expose(mean_e, 0.0, rng).astype(np.float64)
         columns, rows = found_stars(image)
@@ -351,26 +358,32 @@ def scatter_arcsec(
             turn = attitude_error(field, *finder(image, columns, rows))
             if turn is not None:
                 turns[name].append(turn)
-    return {name: np.std(found, axis=0) for name, found in turns.items()}
+    return {name: np.std(errors, axis=0) for name, errors in turns.items()}
 
 
 def attitude_error(field: RigField, x_px: FloatArray, y_px: FloatArray) -> FloatArray | None:
-    """The error of an attitude by centroids: turns about z, x and y (3,), arcsec; None of under
-    three stars.
+    """The error of an attitude by centroids: turns about z, x and y (3,), arcsec; None with fewer
+    than three stars.
 
-    Each centroid is the star's that is nearest, within MATCHED_PX of its own pixel.
+    A centroid belongs to the nearest star within MATCHED_PX.
     """
-    apart = np.hypot(x_px[:, None] - field.pixel_px[0], y_px[:, None] - field.pixel_px[1])
-    matched = apart.min(axis=1, initial=np.inf) < MATCHED_PX
+    off_x = x_px[:, None] - field.pixel_px[0]
+    off_y = y_px[:, None] - field.pixel_px[1]
+    distance_px = np.hypot(off_x, off_y)
+    matched = distance_px.min(axis=1, initial=np.inf) < MATCHED_PX
     if matched.sum() < 3:
         return None
-    star = apart[matched].argmin(axis=1)
-    rays = np.stack([x_px[matched], y_px[matched]]) - np.array(PRINCIPAL_PX)[:, None]
-    seen = np.concatenate([rays / FOCAL_PX, np.ones((1, rays.shape[1]))]).T
-    seen /= np.linalg.norm(seen, axis=1, keepdims=True)
-    turn = to_matrix(wahba(seen, field.directions[star], np.ones(len(seen))))
-    axis = np.array([turn[1, 0] - turn[0, 1], turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0]])
-    return axis / 2 * ARCSEC_PER_RAD
+    star = distance_px[matched].argmin(axis=1)
+    from_axis = np.column_stack([x_px[matched], y_px[matched]]) - PRINCIPAL_PX
+    rays = unit_rays(from_axis / FOCAL_PX)
+    turn = to_matrix(wahba(rays, field.directions[star], np.ones(len(rays))))
+    twice = turn - turn.T
+    return np.array([twice[1, 0], twice[2, 1], twice[0, 2]]) / 2 * ARCSEC_PER_RAD
+
+
+def about(scatter: Sequence[float] | FloatArray) -> float:
+    """The scatter about the boresight."""
+    return float(scatter[0])
 
 
 def across_rms(scatter: Sequence[float] | FloatArray) -> float:
@@ -378,84 +391,90 @@ def across_rms(scatter: Sequence[float] | FloatArray) -> float:
     return rms(np.asarray(scatter[1:]))
 
 
-def scatter_rows(quick: bool) -> list[RigFigure]:
-    """The rig's static scatters, by one light of a star that is taken from one of them."""
-    exposures = QUICK_EXPOSURES if quick else EXPOSURES
-    field = rig_field()
+SCATTER_AXES: dict[str, Callable[[Sequence[float] | FloatArray], float]] = {
+    "about": about,
+    "across": across_rms,
+}
+
+
+def fitted_light_dn(field: RigField, exposures: int) -> float:
+    """The light of a star, DN, at which FITTED scatters across the boresight as published."""
     by_light = []
     for star_dn in LIGHTS_DN:
-        found = scatter_arcsec(field, field.pixel_px, star_dn, exposures)
-        by_light.append(across_rms(found[FITTED]))
-    wanted = across_rms(SCATTER_ARCSEC[FITTED])
-    falling = np.log(by_light)[::-1]
-    light_dn = float(np.exp(np.interp(np.log(wanted), falling, np.log(LIGHTS_DN)[::-1])))
+        scatter = scatter_arcsec(field, field.pixel_px, star_dn, exposures)
+        by_light.append(across_rms(scatter[FITTED]))
+    published = across_rms(SCATTER_ARCSEC[FITTED])
+    # np.interp wants what it looks up in to rise; scatter falls with light.
+    rising = np.log(by_light)[::-1]
+    light = np.interp(np.log(published), rising, np.log(LIGHTS_DN)[::-1])
+    return float(np.exp(light))
+
+
+def scatter_rows(quick: bool) -> list[RigFigure]:
+    """The rig's static scatters, by the light of a star that is taken from one of them."""
+    exposures = QUICK_EXPOSURES if quick else EXPOSURES
+    field = rig_field()
+    light_dn = fitted_light_dn(field, exposures)
     before = scatter_arcsec(field, field.pixel_px, light_dn, exposures)
     after = scatter_arcsec(field, field.true_px, light_dn, exposures)
-    rows = [rig_figure(LASSI, "light of a star (fitted)", LIGHT_UNIT, math.nan, light_dn, "none")]
+    rows = [RigFigure.of(LASSI, "light of a star (fitted)", LIGHT_UNIT, math.nan, light_dn, "none")]
     for name, published in SCATTER_ARCSEC.items():
-        for what, size in (("about", lambda scatter: scatter[0]), ("across", across_rms)):
-            figure = f"static scatter {what}, {name}"
-            if (name, what) == (FITTED, "across"):
+        for axis, size_of in SCATTER_AXES.items():
+            figure = f"static scatter {axis}, {name}"
+            if (name, axis) == (FITTED, "across"):
                 figure += " (fitted)"
             rows.append(
-                rig_figure(
+                RigFigure.of(
                     LASSI,
                     figure,
                     "arcsec, sigma",
-                    float(size(published)),
-                    float(size(before[name])),
+                    size_of(published),
+                    size_of(before[name]),
                     STATIC,
-                    with_hilstar=float(size(after[name])),
+                    with_hilstar=size_of(after[name]),
                 )
             )
     return rows
 
 
 def constant_rows(codes_share: float) -> list[RigFigure]:
-    """What the panel alone does to an attitude, however often it is measured: nobody states it.
+    """The error that the panel's pixels give an attitude and no average removes; no source states
+    it.
 
     `codes_share` is the error of hilstar's codes over that of one pixel a star.
     """
     count = rig_field().pixel_px.shape[1]
-    sides = np.degrees(2 * np.arctan(np.array(CAMERA_PX) / 2 / FOCAL_PX))
-    turns = pixel_attitudes_arcsec(count, (float(sides[0]), float(sides[1])), PIXEL_ARCSEC)
-    return [
-        rig_figure(
-            LASSI,
-            f"constant error of an attitude, {what}",
-            "arcsec rms",
-            math.nan,
-            predicted,
-            "none",
-            with_hilstar=predicted * codes_share,
+    half_sides = np.arctan(np.array(CAMERA_PX) / 2 / FOCAL_PX)
+    width_deg, height_deg = np.degrees(2 * half_sides).tolist()
+    turns = pixel_attitudes_arcsec(count, (width_deg, height_deg), PIXEL_ARCSEC)
+    rows = []
+    for axis, predicted in zip(SCATTER_AXES, turns, strict=True):
+        figure = f"constant error of an attitude, {axis}"
+        after = predicted * codes_share
+        rows.append(
+            RigFigure.of(
+                LASSI, figure, "arcsec rms", math.nan, predicted, "none", with_hilstar=after
+            )
         )
-        for what, predicted in zip(("about", "across"), turns, strict=True)
-    ]
+    return rows
 
 
 def naples_rows() -> list[RigFigure]:
-    """What pixels alone do to attitudes of the tracker's stars."""
+    """The errors that pixels alone give the tracker's attitudes."""
     turns = pixel_attitudes_arcsec(NAPLES_STARS, NAPLES_FIELD_DEG, NAPLES_PIXEL_ARCSEC)
-    return [
-        rig_figure(
-            NAPLES,
-            f"precision of tracking {what}",
-            "arcsec",
-            published,
-            predicted,
-            NAPLES_SOURCE,
-        )
-        for what, published, predicted in zip(
-            ("about", "across"), NAPLES_ARCSEC, turns, strict=True
-        )
-    ]
+    rows = []
+    for axis, published, predicted in zip(SCATTER_AXES, NAPLES_ARCSEC, turns, strict=True):
+        figure = f"precision of tracking {axis}"
+        rows.append(RigFigure.of(NAPLES, figure, "arcsec", published, predicted, NAPLES_SOURCE))
+    return rows
 
 
 def pixel_attitudes_arcsec(
     stars: int, field_deg: tuple[float, float], pixel_arcsec: float
 ) -> tuple[float, float]:
-    """Errors of attitudes by so many stars anywhere in a field, each in the middle of its panel's
-    pixel: rms about the boresight, and of an axis across it.
+    """Errors of attitudes by stars that stand in the middles of their panel's pixels, rms.
+
+    Returns the error about the boresight, and that of an axis across it.
     """
     rng = np.random.default_rng(SEED)
     half = np.tan(np.radians(field_deg) / 2)
@@ -463,11 +482,11 @@ def pixel_attitudes_arcsec(
     for _ in range(TRIALS):
         slopes = rng.uniform(-1.0, 1.0, (stars, 2)) * half
         off = rng.uniform(-0.5, 0.5, (stars, 2)) * pixel_arcsec / ARCSEC_PER_RAD
-        known, seen = (unit_rays(part) for part in (slopes, slopes + off))
-        turn = to_matrix(wahba(seen, known, np.ones(stars)))
+        shown = unit_rays(slopes + off)
+        turn = to_matrix(wahba(shown, unit_rays(slopes), np.ones(stars)))
         turns.append((turn[1, 0], turn[2, 1], turn[0, 2]))
-    about, *across = np.sqrt(np.mean(np.square(turns), axis=0)) * ARCSEC_PER_RAD
-    return float(about), rms(np.array(across))
+    scatter = np.sqrt(np.mean(np.square(turns), axis=0)) * ARCSEC_PER_RAD
+    return about(scatter), across_rms(scatter)
 
 
 def unit_rays(slopes: FloatArray) -> FloatArray:
@@ -477,15 +496,14 @@ def unit_rays(slopes: FloatArray) -> FloatArray:
 
 
 def p13_rows() -> list[RigFigure]:
-    """The largest error along an axis of a star on the pixel that it falls into."""
+    """The largest error along an axis of a star on the pixel it falls into."""
     predicted = P13_RESOLUTION_ARCSEC / 2
-    return [
-        rig_figure(P13, "largest error of a place", "arcsec", P13_ARCSEC, predicted, P13_SOURCE)
-    ]
+    figure = "largest error of a place"
+    return [RigFigure.of(P13, figure, "arcsec", P13_ARCSEC, predicted, P13_SOURCE)]
 
 
 def finding_of(rows: Sequence[RigFigure]) -> str:
-    """What each way leaves on one panel."""
+    """The error of places by each way on one panel."""
     first = rows[0]
     return (
         f"one pixel a star leaves {first.predicted:.1f} arcsec rms an axis on LASSI's"
@@ -507,28 +525,12 @@ def line_of(row: RigFigure) -> str:
 
 def draw(path: Path, rows: Sequence[RigFigure]) -> None:
     """Each figure published, predicted, and with hilstar's codes."""
-    note = (
-        "Static scatter: the same light of a star in all rows. The network is predicted by a PSF"
-        " fit. Light is in mag, all else in arcsec."
+    drawn = [row for row in rows if row.unit != LIGHT_UNIT]
+    panel = PanelSpec(
+        xlabel="arcsec, or mag",
+        dots=DotsSpec(DOTS, name=lambda row: f"{row.rig.partition(',')[0]}: {row.figure}"),
+        legend={"loc": "center left", "bbox_to_anchor": (0.0, 0.62)},
     )
-    finding = finding_of(rows)
-    rows = [row for row in rows if row.unit != LIGHT_UNIT]
-    height_inch = 1.6 + 0.3 * len(rows)
-    places = range(len(rows))
-    with chart(path, finding, note=note, height_inch=height_inch) as (axes,):
-        for place, row in zip(places, rows, strict=True):
-            axes.plot([row.published, row.predicted], [place, place], color=MUTED, lw=1)
-        axes.plot([row.with_hilstar for row in rows], places, "D", color=GREEN, ms=4)
-        axes.plot([row.published for row in rows], places, "o", color=ORANGE, mfc="none")
-        axes.plot([row.predicted for row in rows], places, "o", color=BLUE, ms=4)
-        for label, colour, marker in (
-            ("published", ORANGE, "o"),
-            ("predicted", BLUE, "o"),
-            ("with hilstar's codes", GREEN, "D"),
-        ):
-            axes.plot([], [], marker, color=colour, label=label)
-        axes.set_xscale("log")
-        axes.set_xlabel("arcsec, or mag")
-        name_places(axes, [f"{row.rig.partition(',')[0]}: {row.figure}" for row in rows])
-        axes.grid(visible=False, axis="y")
-        axes.legend(loc="center left", bbox_to_anchor=(0.0, 0.62))
+    layout = {"height_inch": 1.6 + 0.3 * len(drawn)}
+    spec = ChartSpec((panel,), lambda row: row.rig, {}, NOTE, layout=layout)
+    draw_rows(path, finding_of(rows), spec, drawn)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,9 +20,14 @@ from hilstar.basics.charts import (
 )
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import LIGHT_M_S, flux_ratio
+from hilstar.instruments.study.engine import (
+    ChartFinding,
+    CurvePanel,
+    PanelSpec,
+    draw_curves,
+    write_columns,
+)
 from hilstar.instruments.study.fields import FIELDS
-from hilstar.instruments.study.rapp import ChartFinding
-from hilstar.instruments.study.row_charts import CurvePanel, PanelSpec, draw_curves, write_columns
 from hilstar.sky.air import NIGHT_SKY
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import REFERENCE_TEMPERATURE_K, SUN_TEMPERATURE_K, load_library
@@ -35,6 +41,9 @@ from hilstar.sky.spectrum import (
 )
 from hilstar.sky.stars import unit_vectors_icrs
 from hilstar.sky.synthetic import ZERO_W_M2_M, curve_mean, vega
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 SKY_DEG2 = 4 * np.pi * np.degrees(1) ** 2
 CELLS = (36, 18)  # of the map, across and down: 10 degrees of right ascension, equal areas
@@ -52,6 +61,7 @@ EARTHSHINES = {
     "earthshine, 38°": 1.0,
     "earthshine, 50°": 0.5,
 }  # by degrees from the Earth's limb
+ZODIACAL = "zodiacal, V = 22.1"
 LIGHT_COLOURS = (BLUE, MUTED, GREEN, PURPLE, ORANGE)
 LIGHT_COLUMNS = (
     "zodiacal",
@@ -70,41 +80,48 @@ def star_density(directory: Path) -> ChartFinding:
     down = np.linspace(-1, 1, CELLS[1] + 1)
     height = np.sin(np.radians(catalog.dec_deg))
     stars, _, _ = np.histogram2d(catalog.ra_deg % 360, height, (across, down))
-    density = stars.T / (SKY_DEG2 / stars.size)
+    cell_deg2 = SKY_DEG2 / stars.size
+    density = stars.T / cell_deg2
     low, high = np.percentile(density, (5, 95))
+    mean = len(catalog) / SKY_DEG2
     text = (
-        f"Hipparcos has {len(catalog) / SKY_DEG2:.2f} stars a square degree, {low:.1f} to"
-        f" {high:.1f} in 90 % of the sky:"
-        " most along the Milky Way"
+        f"Hipparcos has {mean:.2f} stars a square degree, {low:.1f} to {high:.1f} in 90 % of the"
+        " sky: most along the Milky Way"
     )
     note = (
-        f"{len(catalog)} stars with V and B-V. Cells of equal area, {SKY_DEG2 / stars.size:.0f}"
-        " square degrees each."
+        f"{len(catalog)} stars with V and B-V. Cells of equal area, {cell_deg2:.0f} square degrees"
+        " each."
     )
     with chart(directory / "star_density", text, note=note, height_inch=4.2) as (axes,):
-        image = axes.imshow(
-            density,
-            extent=(0, 360, -1, 1),
-            origin="lower",
-            aspect="auto",
-            cmap="viridis",
-            interpolation="nearest",
-        )
-        declinations = np.array([-90, -60, -30, 0, 30, 60, 90])
-        axes.set_yticks(np.sin(np.radians(declinations)), [str(degree) for degree in declinations])
-        axes.set_xticks(np.arange(0, 361, 60))
-        axes.set(xlim=(360, 0), xlabel="right ascension [deg]", ylabel="declination [deg]")
-        axes.grid(False)
-        axes.figure.colorbar(image, ax=axes, label="Stars a square degree")
-    middles = (across[:-1] + across[1:]) / 2, np.degrees(np.arcsin((down[:-1] + down[1:]) / 2))
-    ra_deg, dec_deg = np.meshgrid(*middles)
+        draw_density(axes, density)
+    ra_deg = (across[:-1] + across[1:]) / 2
+    dec_deg = np.degrees(np.arcsin((down[:-1] + down[1:]) / 2))
+    ra_grid, dec_grid = np.meshgrid(ra_deg, dec_deg)
     columns = {
-        "ra_deg": ra_deg.ravel(),
-        "dec_deg": dec_deg.ravel(),
+        "ra_deg": ra_grid.ravel(),
+        "dec_deg": dec_grid.ravel(),
         "stars_deg2": density.ravel(),
     }
     write_columns(directory / "star_density.csv", columns)
     return ChartFinding("star_density", text)
+
+
+def draw_density(axes: "Axes", density: FloatArray) -> None:
+    """A map of the sky in cells of equal area."""
+    image = axes.imshow(
+        density,
+        extent=(0, 360, -1, 1),
+        origin="lower",
+        aspect="auto",
+        cmap="viridis",
+        interpolation="nearest",
+    )
+    declinations = np.array([-90, -60, -30, 0, 30, 60, 90])
+    axes.set_yticks(np.sin(np.radians(declinations)), [str(degree) for degree in declinations])
+    axes.set_xticks(np.arange(0, 361, 60))
+    axes.set(xlim=(360, 0), xlabel="right ascension [deg]", ylabel="declination [deg]")
+    axes.grid(False)
+    axes.figure.colorbar(image, ax=axes, label="Stars a square degree")
 
 
 def frames(directory: Path) -> ChartFinding:
@@ -114,45 +131,51 @@ def frames(directory: Path) -> ChartFinding:
     angles = FIELDS[0].radec_roll_deg
     matrix = to_matrix(from_radec_roll_deg(*angles))
     cam = vectors @ matrix.T
-    half = np.tan(np.radians(FRAME_DEG / 2))
-    inside = (cam[:, 2] > 0) & (np.abs(cam[:, :2]) < half * cam[:, 2:]).all(axis=1)
-    error = float(np.abs(vectors[inside] @ equation_2_3(*angles) - cam[inside]).max())
+    limit = np.tan(np.radians(FRAME_DEG / 2)) * cam[:, 2:]
+    inside = (cam[:, 2] > 0) & (np.abs(cam[:, :2]) < limit).all(axis=1)
+    icrs = vectors[inside]
+    cam = cam[inside]
+    count = len(cam)
+    error = float(np.abs(icrs @ equation_2_3(*angles) - cam).max())
+    agreement = f"{error:.0e}".replace("e-", " x 10^-")
     text = (
-        f"{int(inside.sum())} stars of Orion, in the celestial frame about +y, stand about +z in"
-        " the camera's;"
-        f" equation 2.3 and hilstar's quaternion agree to {error:.0e}"
-    ).replace("e-", " x 10^-")
-    count = int(inside.sum())
+        f"{count} stars of Orion, in the celestial frame about +y, stand about +z in the camera's;"
+        f" equation 2.3 and hilstar's quaternion agree to {agreement}"
+    )
     finding = (
         f"{count} stars of Orion stand about +y in the celestial frame, and about +z in the"
         " camera's"
     )
-    note = "Unit vectors. North is up in both, as roll is 0; the camera's y points down."
-    with chart(directory / "frames", finding, 1, 2, note=note, share_x=False, height_inch=4.4) as (
-        sky,
-        image,
-    ):
-        boresight = matrix[2]
-        sky.plot(vectors[inside, 0], vectors[inside, 2], ".", ms=3, color=BLUE)
-        sky.plot(boresight[0], boresight[2], "+", ms=14, mew=2, color=ORANGE)
-        sky.set(xlabel="x [1]", ylabel="z [1]", title="Celestial frame (ICRS)", aspect="equal")
-        image.plot(cam[inside, 0], cam[inside, 1], ".", ms=3, color=BLUE)
-        image.plot(0, 0, "+", ms=14, mew=2, color=ORANGE)
-        for axes, name, colour in ((sky, "stars", BLUE), (image, "boresight", ORANGE)):
-            axes.text(
-                1, 1.03, name, color=colour, ha="right", transform=axes.transAxes, fontsize=SMALL_PT
-            )
-        image.invert_yaxis()
-        image.set(xlabel="x [1]", ylabel="y [1]", title="Camera frame (cam)", aspect="equal")
-    _write_frames(directory / "frames.csv", catalog.hip[inside], vectors[inside], cam[inside])
+    draw_frames(directory / "frames", finding, icrs, cam, matrix[2])
+    _write_frames(directory / "frames.csv", catalog.hip[inside], icrs, cam)
     return ChartFinding("frames", text)
 
 
+def draw_frames(
+    path: Path, finding: str, icrs: FloatArray, cam: FloatArray, boresight: FloatArray
+) -> None:
+    """Directions (n, 3) of stars in both frames, and the boresight (3,), ICRS."""
+    note = "Unit vectors. North is up in both, as roll is 0; the camera's y points down."
+    with chart(path, finding, 1, 2, note=note, share_x=False, height_inch=4.4) as (sky, image):
+        sky.plot(icrs[:, 0], icrs[:, 2], ".", ms=3, color=BLUE)
+        sky.plot(boresight[0], boresight[2], "+", ms=14, mew=2, color=ORANGE)
+        sky.set(xlabel="x [1]", ylabel="z [1]", title="Celestial frame (ICRS)", aspect="equal")
+        image.plot(cam[:, 0], cam[:, 1], ".", ms=3, color=BLUE)
+        image.plot(0, 0, "+", ms=14, mew=2, color=ORANGE)
+        for axes, name, colour in ((sky, "stars", BLUE), (image, "boresight", ORANGE)):
+            style: Any = {"color": colour, "ha": "right", "fontsize": SMALL_PT}
+            axes.text(1, 1.03, name, transform=axes.transAxes, **style)
+        image.invert_yaxis()
+        image.set(xlabel="x [1]", ylabel="y [1]", title="Camera frame (cam)", aspect="equal")
+
+
 def _write_frames(path: Path, hip: IntArray, icrs: FloatArray, cam: FloatArray) -> None:
-    axes = [f"{axis}_{frame}" for frame in ("icrs", "cam") for axis in "xyz"]
+    columns = ["hip"]
+    for frame in ("icrs", "cam"):
+        columns += [f"{axis}_{frame}" for axis in "xyz"]
     table = np.column_stack((icrs, cam)).tolist()
     rows = [(number, *row) for number, row in zip(hip.tolist(), table, strict=True)]
-    write_csv(path, ("hip", *axes), rows)
+    write_csv(path, columns, rows)
 
 
 def equation_2_3(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:
@@ -173,26 +196,26 @@ def _about_x(angle: float) -> FloatArray:
     return np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
 
 
+def scaled_in_v(nm: FloatArray, flux: FloatArray) -> Curve:
+    """A spectrum over its mean through Johnson V."""
+    mean = curve_mean(Curve(nm, flux), load_curve("johnson-v", "johnson-v"))
+    return Curve(nm, flux / mean)
+
+
 def sun(directory: Path) -> ChartFinding:
     """Figure 3.1: a star of the Sun's type and the black body of the Sun's temperature."""
     library = load_library()
+    nm = library.wavelength_nm
     star = library.flux[library.spectral_type.index(SUN_TYPE)]
-    johnson_v = load_curve("johnson-v", "johnson-v")
-    mean = curve_mean(Curve(library.wavelength_nm, star), johnson_v)
-    spectrum = Curve(library.wavelength_nm, star / mean)
-    everywhere = blackbody_exitance_w_m2_m(library.wavelength_nm, SUN_TEMPERATURE_K)
-    body = Curve(
-        library.wavelength_nm,
-        everywhere / curve_mean(Curve(library.wavelength_nm, everywhere), johnson_v),
-    )
-    at_nm = np.array(QUOTED_NM)
-    share = spectrum(at_nm) / body(at_nm)
-    quoted = ", ".join(
-        f"{ratio:.2f} at {nm:.0f} nm" for ratio, nm in zip(share.tolist(), QUOTED_NM, strict=True)
-    )
+    spectrum = scaled_in_v(nm, star)
+    body = scaled_in_v(nm, blackbody_exitance_w_m2_m(nm, SUN_TEMPERATURE_K))
+    quoted = []
+    for at_nm in QUOTED_NM:
+        share = float(spectrum(np.array([at_nm]))[0] / body(np.array([at_nm]))[0])
+        quoted.append(f"{share:.2f} at {at_nm:.0f} nm")
     text = (
         f"A star of the Sun's type ({SUN_TYPE}) over the black body of {SUN_TEMPERATURE_K:.0f} K,"
-        f" scaled in V: {quoted}"
+        f" scaled in V: {', '.join(quoted)}"
     )
     note = (
         "Pickles 1998, mean of stars of that type; no spectrum of the Sun itself is in the package."
@@ -203,7 +226,7 @@ def sun(directory: Path) -> ChartFinding:
         f"{SUN_TYPE}, observed": observed,
         f"black body, {SUN_TEMPERATURE_K:.0f} K": shown_body,
     }
-    spec = PanelSpec((), "F_lambda over its mean in V [1]", "wavelength [nm]", legend={})
+    spec = PanelSpec(ylabel="F_lambda over its mean in V [1]", xlabel="wavelength [nm]", legend={})
     panel = CurvePanel(SHOWN_NM, curves, spec, (INK, ORANGE))
     draw_curves(directory / "sun", text, (panel,), note)
     columns = {"wavelength_nm": SHOWN_NM, "g2v": observed, "blackbody": shown_body}
@@ -214,11 +237,11 @@ def sun(directory: Path) -> ChartFinding:
 def vega_logarithmic(directory: Path) -> ChartFinding:
     """Figure 2.13, right: Vega on logarithmic scales, beside the thesis's black body."""
     light = vega()
-    shown = (light.wavelength_nm >= VEGA_NM[0]) & (light.wavelength_nm <= VEGA_NM[1])
+    first_nm, last_nm = VEGA_NM
+    shown = (light.wavelength_nm >= first_nm) & (light.wavelength_nm <= last_nm)
     nm = light.wavelength_nm[shown]
-    value = light.value[shown]
     johnson_v = load_curve("johnson-v", "johnson-v")
-    flux = value / curve_mean(light, johnson_v) * ZERO_W_M2_M["v"]
+    flux = light.value[shown] / curve_mean(light, johnson_v) * ZERO_W_M2_M["v"]
     body = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K)
     body *= ZERO_W_M2_M["v"] / curve_mean(Curve(nm, body), johnson_v)
     falls = float(np.interp(1000, nm, flux) / np.interp(5000, nm, flux))
@@ -249,18 +272,16 @@ def backgrounds(directory: Path) -> ChartFinding:
     """Figure 4.11: zodiacal light and the other lights between the stars near the Earth."""
     zodiacal = read_curve_csv(HST_ZODIACAL)
     earthshine = read_curve_csv(EARTHSHINE)
-    lights: dict[str, FloatArray] = {"zodiacal, V = 22.1": _photons(zodiacal)}
-    lights |= {name: times * _photons(earthshine) for name, times in EARTHSHINES.items()}
+    high = _photons(earthshine)
+    lights = {ZODIACAL: _photons(zodiacal)}
+    for name, times in EARTHSHINES.items():
+        lights[name] = times * high
     lights["from the ground"] = _glow_photons()
     total = {name: float(np.nansum(values)) for name, values in lights.items()}
-    high, twice, low = (
-        total[name] for name in ("earthshine, 38°", "earthshine, 24°", "earthshine, 50°")
-    )
-    sky = total["zodiacal, V = 22.1"]
     text = (
-        f"Zodiacal light of V = 22.1 has {sky:.0f} photons/s/m2/arcsec2 (300 to 1100 nm);"
-        f" earthshine adds {high:.0f} at 38"
-        f" degrees from the Earth's limb, {twice:.0f} at 24, {low:.0f} at 50"
+        f"Zodiacal light of V = 22.1 has {total[ZODIACAL]:.0f} photons/s/m2/arcsec2 (300 to 1100"
+        f" nm); earthshine adds {total['earthshine, 38°']:.0f} at 38 degrees from the Earth's limb,"
+        f" {total['earthshine, 24°']:.0f} at 24, {total['earthshine, 50°']:.0f} at 50"
     )
     note = (
         "STIS Instrument Handbook, table 6.4. Ground: Paranal's glow (Hanuschik 2003) at V ="
@@ -290,7 +311,8 @@ def _glow_photons() -> FloatArray:
     spectrum = read_curve_csv(NIGHT_SKY, highest=np.inf)
     mean = curve_mean(spectrum, load_curve("johnson-v", "johnson-v"))
     level = flux_ratio(GLOW_V_MAG) * ZERO_W_M2_M["v"]
-    known = (spectrum.wavelength_nm[0] <= SHOWN_NM) & (spectrum.wavelength_nm[-1] >= SHOWN_NM)
+    first_nm, last_nm = spectrum.wavelength_nm[[0, -1]]
+    known = (first_nm <= SHOWN_NM) & (last_nm >= SHOWN_NM)
     return np.where(known, _photons_of(spectrum(SHOWN_NM) / mean * level), np.nan)
 
 

@@ -23,7 +23,7 @@ from hilstar.basics.charts import capital
 
 MIN_ROUNDS = 3  # every work runs this often, whatever its share of a budget
 MAX_ROUNDS = 500  # more do not move a median
-SEED = 1
+SEED = 1  # of the orders of rounds
 # share of the cores taken by others above which times are 5 % and more off: a third of one of two
 # cores
 BUSY_SHARE = 0.15
@@ -37,7 +37,7 @@ Judged = tuple[list[str], bool | None]
 
 @dataclass(frozen=True, slots=True)
 class Load:
-    """The cores that others took while times were taken, and what to say of such times."""
+    """The cores that other processes used while times were taken, and what to say of the times."""
 
     cores: float = 0.0
 
@@ -48,7 +48,7 @@ class Load:
 
     @property
     def caution(self) -> str:
-        """The line about times that were taken beside other work."""
+        """The line about times taken beside other work."""
         return (
             f"a busy machine: other processes took {self.cores:.1f} of its {os.cpu_count()} cores"
             " meanwhile, so these times name no winner; run it again when the machine is idle"
@@ -104,10 +104,14 @@ def in_turn(
     names = list(works)
     rng = np.random.default_rng(SEED)
     for number in range(rounds + 1):
-        for name in (names[k] for k in rng.permutation(len(names))):
-            if number <= MIN_ROUNDS or sum(taken.wall_ms for taken in times[name]) <= 1e3 * share_s:
-                took = spent(partial(works[name], number))
-                times[name] += [took] if number else []
+        for place in rng.permutation(len(names)):
+            name = names[place]
+            so_far_ms = sum(taken.wall_ms for taken in times[name])
+            if number > MIN_ROUNDS and so_far_ms > 1e3 * share_s:
+                continue
+            taken = spent(partial(works[name], number))
+            if number > 0:
+                times[name].append(taken)
     return times
 
 
@@ -122,12 +126,13 @@ def medians_ms(works: Mapping[str, Callable[[int], object]], rounds: int) -> dic
 def beaten_by(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
     """Whether the method of a row is beaten by that of a column, (n, n).
 
-    A method beats another whose error and time are both no smaller, and one of them larger.
+    A method is beaten by another whose error and time are both no larger, and one of them smaller.
     """
     error = np.asarray(errors, dtype=np.float64)
     taken = np.asarray(times_ms, dtype=np.float64)
     as_good = (error <= error[:, None]) & (taken <= taken[:, None])
-    return np.asarray(as_good & ((error < error[:, None]) | (taken < taken[:, None])))
+    better = (error < error[:, None]) | (taken < taken[:, None])
+    return np.asarray(as_good & better)
 
 
 def pareto_front(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
@@ -138,8 +143,8 @@ def pareto_front(errors: npt.ArrayLike, times_ms: npt.ArrayLike) -> BoolArray:
 
 
 class OtherWork:
-    """Counts the cores that other processes take from its creation on; children of this process
-    are its own.
+    """Counts the cores that other processes use from now on; this process's children are not
+    others.
     """
 
     def __init__(self) -> None:
@@ -149,15 +154,16 @@ class OtherWork:
         """How many cores the others took on average since creation; 0 where the system does not
         say.
         """
-        all_s, others_s = (
-            now - before for now, before in zip(self._times_s(), self._before, strict=True)
-        )
+        all_before_s, others_before_s = self._before
+        all_now_s, others_now_s = self._times_s()
+        all_s = all_now_s - all_before_s
+        others_s = max(others_now_s - others_before_s, 0.0)
         if all_s > 0:
-            return max(others_s, 0.0) / all_s * (os.cpu_count() or 1)
+            return others_s / all_s * (os.cpu_count() or 1)
         return 0.0
 
     def load(self) -> Load:
-        """What the others took since creation."""
+        """The use by others since creation."""
         return Load(self.cores())
 
     @staticmethod
@@ -166,17 +172,15 @@ class OtherWork:
         other processes.
         """
         try:
-            ticks = []
-            for word in STAT.read_text(encoding="ascii").split("\n", 1)[0].split()[1:9]:
-                ticks.append(int(word))
+            first_line = STAT.read_text(encoding="ascii").split("\n", 1)[0]
+            ticks = [int(word) for word in first_line.split()[1:9]]
         except (OSError, ValueError):
             return 0.0, 0.0
-        each_s = 1 / os.sysconf("SC_CLK_TCK")
+        tick_s = 1 / os.sysconf("SC_CLK_TCK")
         user, nice, system, idle, waiting, *interrupts = ticks
         busy = user + nice + system + sum(interrupts)
-        own_usage = [
-            resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-        ]
-        return (busy + idle + waiting) * each_s, busy * each_s - sum(
-            used.ru_utime + used.ru_stime for used in own_usage
-        )
+        own_s = 0.0
+        for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN):
+            usage = resource.getrusage(who)
+            own_s += usage.ru_utime + usage.ru_stime
+        return (busy + idle + waiting) * tick_s, busy * tick_s - own_s

@@ -4,15 +4,15 @@ of each compensation.
 The virtual tracker integrates over several frames of a simulated panel, which lights row by row and
 holds each row until it is written again. Its image is compared with that of the sky in the same
 exposure, star by star. Each row is at its own phase, so the stars of one exposure see the whole
-beat. The beat is compared with the prediction of `run.sync`.
+beat. The beat is compared with the prediction of `server.sync`.
 
 Before a tracker with a rolling shutter such a display shows stripes: the tracker is at rest and
-without noise, the glow of the black level shows each row's light, and lines are `run.sync`'s at
+without noise, the glow of the black level shows each row's light, and lines are `server.sync`'s at
 each row's own phase.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 
 from hilstar.attitude.clock.timeline import Attitude, Policy, Timeline
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.charts import plain_ticks, write_records
+from hilstar.basics.charts import plain_ticks
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S, magnitude
@@ -35,21 +35,22 @@ from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.shutter import S_PER_US
 from hilstar.instruments.study import study_benches
-from hilstar.instruments.study.predictors import Movement, attitude_at
-from hilstar.instruments.study.row_charts import (
+from hilstar.instruments.study.engine import (
     ChartSpec,
     LineSpec,
     PanelSpec,
     draw_rows,
     looks_of,
     row_panels,
+    write_rows,
 )
+from hilstar.instruments.study.predictors import Movement, attitude_at
 from hilstar.instruments.study.sweep import Judged, Load, OtherWork, medians_ms
 from hilstar.optics.exposure_motion import Motion, smeared_sprites
 from hilstar.optics.layers.view import STILL, View
 from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import FrameLight
-from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.monitor import scan_of
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, beat, seen_at
@@ -58,26 +59,12 @@ STRIPES_RADEC_ROLL_DEG = (84.0, 0.0, 0.0)
 STRIPE_ROWS, ROW_TIME_US, REFRESH_HZ = 1024, 60.0, 60.0
 STRIPE_SIZE_PX = (128, STRIPE_ROWS)
 EVERY_ROWS = 16  # between dots
-ROUNDING = 1e-9
+ROUNDING = 1e-9  # a smaller departure is the arithmetic's
 STRIPE_NOTE = (
     f"{REFRESH_HZ:g} Hz, scan-out of a whole refresh; {STRIPE_ROWS} rows, {ROW_TIME_US:g} us each,"
     " the top row first. Dots: glow on the virtual tracker's rows. Lines: foretold."
 )
-STRIPE_PANEL = PanelSpec(
-    (
-        LineSpec("row", "foretold"),
-        LineSpec("row", "light", "", marker="o", named=False, look={"ms": 3}),
-    ),
-    "light / mean light",
-    "row of the tracker",
-    from_zero=True,
-    legend={
-        "loc": "upper center",
-        "bbox_to_anchor": (0.5, -0.16),
-        "ncols": 2,
-        "frameon": False,
-    },
-)
+WHOLE_PT = 5.0  # width of the lines of whole refreshes: another line lies on them
 RADEC_ROLL_DEG = (84.0, 0.0, 15.0)  # Orion: enough bright stars
 PACKET_HZ = 200
 RATE_DEG_S = 1.0
@@ -94,15 +81,39 @@ PLACE_TICKS = (-100, -30, -10, -3, -1, 0, 1, 3, 10, 30, 100)
 STARTS = 3  # exposure starts within a refresh, for phases between the rows of stars
 MARKERS = "osd^"
 STEP_S = 0.5e-3  # to either side, for a star's speed on the detector
+# A window reaches the largest error here and the PSF beyond a star's path.
 ISOLATION = study_benches.Isolation(margin_px=8.0, max_share=1e-3)
 RATES_DEG_S = (0.01, 0.03, 0.1, 0.3, 1.0, 2.0, 4.0)
 QUICK_RATES_DEG_S = (2.0,)
-DRAW_TO_SWAP_S = 0.010
+DRAW_TO_SWAP_S = 0.010  # from the newest packet that a frame has to its swap
 EXPOSURE_S = 0.1
 START_S = 0.0037  # exposure start within a refresh period
 REFRESH_MS = 1e3 / 60  # the default of a bench file
 FRAME_BEFORE = 1  # the first rows of an exposure still show the frame before
-COST_ROUNDS = 9
+COST_ROUNDS = 9  # of which the median counts
+
+
+def is_whole(point: "StripePoint") -> bool:
+    """Whether a row's exposure is of whole refreshes."""
+    return float(point.refreshes).is_integer()
+
+
+STRIPE_PANEL = PanelSpec(
+    (
+        LineSpec("row", "foretold", where=is_whole, look={"lw": WHOLE_PT}),
+        LineSpec("row", "foretold", where=lambda point: not is_whole(point)),
+        LineSpec("row", "light", "", marker="o", named=False, look={"ms": 3}),
+    ),
+    "light / mean light",
+    "row of the tracker",
+    from_zero=True,
+    legend={
+        "loc": "upper center",
+        "bbox_to_anchor": (0.5, -0.16),
+        "ncols": 2,
+        "frameon": False,
+    },
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +129,7 @@ class StripeCase:
         return f"{self.refreshes:g} refreshes, rows lit {self.lit_ms:.3g} ms"
 
 
-STRIPE_CASES = (
+STRIPE_CASES: tuple[StripeCase, ...] = (
     StripeCase(0.6, 4.0),
     StripeCase(2.4, 4.0),
     StripeCase(2.0, 4.0),
@@ -128,7 +139,7 @@ STRIPE_CASES = (
 
 @dataclass(frozen=True, slots=True)
 class StripePoint:
-    """A row of one case: its light relative to the mean, seen and foretold."""
+    """A row of one case: its light relative to the mean, measured and foretold."""
 
     refreshes: float
     lit_ms: float
@@ -138,7 +149,7 @@ class StripePoint:
 
 
 def stripe_points(case: StripeCase) -> list[StripePoint]:
-    """The rows of one case, every so many."""
+    """The rows of one case, every EVERY_ROWS."""
     exposure_s = case.refreshes / REFRESH_HZ
     tables: dict[str, study_benches.Table] = {
         "tracker": {
@@ -152,45 +163,56 @@ def stripe_points(case: StripeCase) -> list[StripePoint]:
     }
     rolling: study_benches.Table = {"shutter": "rolling", "row_time_us": ROW_TIME_US}
     view = View.exposure(from_radec_roll_deg(*STRIPES_RADEC_ROLL_DEG), STILL, exposure_s)
-    light = []
-    for extra in ({"tracker.detector": rolling}, {}):
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "bench.toml"
-            path.write_text(study_benches.bench_text({**tables, **extra}), encoding="utf-8")
-            file = read_bench_file(path)
-            tracker = DisplayTracker(file)
-            light.append(
-                tracker.expose(view, None).mean_e[::EVERY_ROWS, 0]
-            )  # the left edge: the boresight's stars are elsewhere
-            tracker.close()
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "bench.toml"
+        striped = left_edge_e(path, {**tables, "tracker.detector": rolling}, view)
+        even = left_edge_e(path, tables, view)
+        late = row_lateness(read_bench_file(path))
+    exposures = Exposures(REFRESH_HZ, exposure_s, lit_s=case.lit_ms * 1e-3)
+    foretold = seen_at(exposures, late).light
+    points = []
+    for row in np.flatnonzero(even).tolist():  # the first and last see past the screen
+        light = float(striped[row] / even[row])
+        number = row * EVERY_ROWS
+        points.append(StripePoint(case.refreshes, case.lit_ms, number, light, float(foretold[row])))
+    return points
+
+
+def left_edge_e(path: Path, tables: Mapping[str, study_benches.Table], view: View) -> FloatArray:
+    """The electrons of an exposure at the left edge, every EVERY_ROWS rows; the bright stars are
+    elsewhere.
+
+    The bench file is written to `path`.
+    """
+    path.write_text(study_benches.bench_text(tables), encoding="utf-8")
+    tracker = DisplayTracker(read_bench_file(path))
+    edge = tracker.expose(view, None).mean_e[::EVERY_ROWS, 0]
+    tracker.close()
+    return edge
+
+
+def row_lateness(file: BenchFile) -> FloatArray:
+    """How many refreshes after its part of the screen lights a row's exposure begins, every
+    EVERY_ROWS rows.
+
+    The middle rows begin together.
+    """
     config = file.config
-    x = np.zeros(STRIPE_ROWS)[::EVERY_ROWS]
-    y = np.arange(float(STRIPE_ROWS))[::EVERY_ROWS]
-    geometry = BenchGeometry(
-        bench_camera(config, path.parent), tracker_camera(config.tracker, path.parent)
-    )
-    screen_late_s = scan_of(config.monitor).late_s(
-        *geometry.to_monitor(x, y), config.monitor.resolution_px
-    )
-    # middle rows begin together
-    late = REFRESH_HZ * ((y - (STRIPE_ROWS - 1) / 2) * ROW_TIME_US * S_PER_US - screen_late_s)
-    foretold = seen_at(Exposures(REFRESH_HZ, exposure_s, lit_s=case.lit_ms * 1e-3), late).light
-    return [
-        StripePoint(
-            case.refreshes,
-            case.lit_ms,
-            int(y[row]),
-            float(light[0][row] / light[1][row]),
-            float(foretold[row]),
-        )
-        for row in np.flatnonzero(light[1])  # the first and last see past the screen
-    ]
+    monitor = bench_camera(config, file.folder)
+    geometry = BenchGeometry(monitor, tracker_camera(config.tracker, file.folder))
+    rows = np.arange(float(STRIPE_ROWS))[::EVERY_ROWS]
+    x_px, y_px = geometry.to_monitor(np.zeros(len(rows)), rows)
+    screen_late_s = scan_of(config.monitor).late_s(x_px, y_px, config.monitor.resolution_px)
+    begin_s = (rows - (STRIPE_ROWS - 1) / 2) * ROW_TIME_US * S_PER_US
+    return np.asarray(REFRESH_HZ * (begin_s - screen_late_s))
 
 
 def stripe_findings(directory: Path) -> list[str]:
     """Write `stripes.csv` and its chart; its finding. Raises InputError."""
-    points = [point for case in STRIPE_CASES for point in stripe_points(case)]
-    write_records(directory / "stripes.csv", points)
+    points: list[StripePoint] = []
+    for case in STRIPE_CASES:
+        points += stripe_points(case)
+    write_rows(directory / "stripes.csv", points)
     return [draw_stripes(directory / "stripes", points)]
 
 
@@ -200,7 +222,7 @@ def stripe_depth(points: list[StripePoint], whole: bool) -> float:
     """
     depth = 0.0
     for point in points:
-        if float(point.refreshes).is_integer() == whole:
+        if is_whole(point) == whole:
             depth = max(depth, abs(point.light - 1))
     return depth
 
@@ -225,11 +247,8 @@ def stripe_case(point: StripePoint) -> StripeCase:
     return StripeCase(point.refreshes, point.lit_ms)
 
 
-# A window reaches the largest error here and the PSF beyond a star's path.
-
-
 def slew(rate_deg_s: float) -> Movement:
-    """A turn at a constant rate from t = 0 on, with the packets that report it."""
+    """A turn at a constant rate, and the packets that report it."""
     return Movement(from_radec_roll_deg(*RADEC_ROLL_DEG), rate_deg_s, PACKET_HZ, shaken=False)
 
 
@@ -241,7 +260,7 @@ class Compensation:
     motion: str
 
 
-WAYS = {
+WAYS: dict[str, Compensation] = {
     "no prediction": Compensation({}, "off"),
     "prediction": Compensation({}, "off"),
     "+ scan-out": Compensation({"hold_ms": 0}, "on"),
@@ -252,11 +271,10 @@ WAYS = {
 def frame_weights(
     rows: FloatArray, swaps_s: Sequence[float], scan: Scan, span_s: tuple[float, float]
 ) -> FloatArray:
-    """The share of an exposure (begin, end) for which each row (r,) shows each frame (k,), (k, r);
-    `rows` from 0 to 1.
+    """The share of an exposure (begin, end) for which each row (r,) shows each frame (k,): (k, r).
 
-    A row lights `rows` of the scan-out after the swap, and shows the frame until the next one
-    reaches it.
+    `rows` run from 0 to 1. A row lights `rows` of the scan-out after the swap, and shows the frame
+    until the next one reaches it.
     """
     begins = np.asarray(swaps_s)[:, None] + rows * scan.scanout_s
     ends = begins + scan.hold_s
@@ -265,8 +283,8 @@ def frame_weights(
 
 
 class ScanningPanel(Closing):
-    """A bench that shows on a panel that scans, with one compensation, and a tracker in front of
-    it. Free it with `close`.
+    """A bench with one compensation, shown on a panel that scans, and a tracker in front of it.
+    Free it with `close`.
 
     Rows stay lit for `lit` of a refresh, which the bench knows where it compensates smear.
     """
@@ -291,16 +309,18 @@ class ScanningPanel(Closing):
         self.bench = study_benches.study_bench(path, tables)
         config = self.bench.config
         self.period_s = 1 / config.monitor.refresh_hz
-        self.panel_scan = replace(
-            self.bench.scan, scanout_s=self.period_s, hold_s=lit * self.period_s
-        )
-        tracker = config.tracker
-        self.exposure_s = tracker.exposure_s
-        self.camera = tracker_camera(tracker, self.bench.file.folder)
-        self.optics = TwinOptics(
-            BenchGeometry(self.bench.camera, self.camera), self.bench.tracker_psf
-        )
+        hold_s = lit * self.period_s
+        self.panel_scan = replace(self.bench.scan, scanout_s=self.period_s, hold_s=hold_s)
+        self.exposure_s = config.tracker.exposure_s
+        self.camera = tracker_camera(config.tracker, self.bench.file.folder)
+        geometry = BenchGeometry(self.bench.camera, self.camera)
+        self.optics = TwinOptics(geometry, self.bench.tracker_psf)
         self.panel = self.bench.panel
+
+    def motion(self, movement: Movement) -> Motion:
+        """The camera's true motion over the exposure, from its middle."""
+        middle_ns = round((self.start_s + self.exposure_s / 2) * NS_PER_S)
+        return Motion(movement.at(middle_ns), movement.turn_rad_s, self.exposure_s)
 
     def attitude(self, movement: Movement, swap_s: float) -> Attitude:
         """The attitude that the display derives from the packets received when it starts the
@@ -324,28 +344,29 @@ class ScanningPanel(Closing):
 
     def exposed_e_per_s(self, movement: Movement) -> FloatArray:
         """The tracker's image (h, w) of the screen, mean over an exposure."""
-        height = self.bench.config.monitor.resolution_px[1]
-        span_s = (self.start_s, self.start_s + self.exposure_s)
-        first = math.floor((span_s[0] - 2 * self.period_s) / self.period_s) - FRAME_BEFORE
-        numbers = range(first, math.ceil(span_s[1] / self.period_s) + 1)
+        width, height = self.bench.config.monitor.resolution_px
+        begin_s = self.start_s
+        end_s = begin_s + self.exposure_s
+        first = math.floor((begin_s - 2 * self.period_s) / self.period_s) - FRAME_BEFORE
+        numbers = range(first, math.ceil(end_s / self.period_s) + 1)
         swaps_s = [number * self.period_s for number in numbers]
-        weights = frame_weights(
-            (np.arange(height) + 0.5) / height, swaps_s, self.panel_scan, span_s
-        )
-        light = np.zeros((height, self.bench.config.monitor.resolution_px[0]))
+        rows = (np.arange(height) + 0.5) / height
+        weights = frame_weights(rows, swaps_s, self.panel_scan, (begin_s, end_s))
+        light = np.zeros((height, width))
         for number, swap_s, weight in zip(numbers, swaps_s, weights, strict=True):
             if weight.any():
-                light += weight[:, None] * shown_light(
-                    self.levels(self.attitude(movement, swap_s), number), self.panel
-                )
+                levels = self.levels(self.attitude(movement, swap_s), number)
+                light += weight[:, None] * shown_light(levels, self.panel)
         return self.optics.image_e_per_s(light)
 
     def cost_ms(self, movement: Movement) -> float:
         """Median time of drawing a frame, from its attitude to its codes, ms."""
         attitude = self.attitude(movement, 0.0)
-        return medians_ms({self.way: lambda number: self.levels(attitude, number)}, COST_ROUNDS)[
-            self.way
-        ]
+
+        def work(number: int) -> Levels:
+            return self.levels(attitude, number)
+
+        return medians_ms({self.way: work}, COST_ROUNDS)[self.way]
 
     def close(self) -> None:
         """Free the GL contexts."""
@@ -364,11 +385,8 @@ class TimingSky(Closing):
 
     def paths(self, movement: Movement) -> FrameLight:
         """Each star's path over the exposure, in monitor pixels."""
-        middle_s = self._shown.start_s + self._shown.exposure_s / 2
-        motion = Motion(
-            movement.at(round(middle_s * NS_PER_S)), movement.turn_rad_s, self._shown.exposure_s
-        )
         bench = self._shown.bench
+        motion = self._shown.motion(movement)
         return smeared_sprites(bench.stars, motion, bench.camera, bench.psf)
 
     def exposed_e_per_s(self, movement: Movement) -> FloatArray:
@@ -383,7 +401,7 @@ class TimingSky(Closing):
 
 @dataclass(frozen=True, slots=True)
 class TimingCase:
-    """Refreshes in an exposure, and for how much of a refresh a row stays lit."""
+    """Refreshes in an exposure, and the share of a refresh for which a row stays lit."""
 
     refreshes: float
     lit: float = 1.0
@@ -396,27 +414,28 @@ class TimingCase:
     @property
     def words(self) -> str:
         """For a legend."""
-        return f"{self.refreshes:g} refreshes" + (
-            "" if self.lit == 1 else f", lit {self.lit:g} of each"
-        )
+        refreshes = f"{self.refreshes:g} refreshes"
+        if self.lit == 1:
+            return refreshes
+        return f"{refreshes}, lit {self.lit:g} of each"
 
 
-CASES = (
+CASES: tuple[TimingCase, ...] = (
     TimingCase(6.0),
     TimingCase(6.3),
     TimingCase(2.4),
     TimingCase(6.0, 0.25),
     TimingCase(2.4, 0.25),
 )
-QUICK_CASES = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4, 0.25))
+QUICK_CASES: tuple[TimingCase, ...] = (TimingCase(6.0), TimingCase(6.3), TimingCase(2.4, 0.25))
 
 
 @dataclass(frozen=True, slots=True)
 class BeatPoint:
-    """One star of one exposure, measured and foretold; the exposure begins `phase` refreshes after
-    its row lights.
+    """One star of one exposure, measured and foretold.
 
-    `off_arcsec` is along the star's motion, `light_mag` against the mean light of the panel.
+    The exposure begins `phase` refreshes after the star's row lights. `off_arcsec` is along the
+    star's motion, `light_mag` relative to the panel's mean light.
     """
 
     refreshes: float
@@ -435,9 +454,8 @@ def measure_beat(quick: bool = False) -> list[BeatPoint]:
     for case in QUICK_CASES if quick else CASES:
         with TemporaryDirectory() as folder, ExitStack() as stack:
             path = Path(folder) / "beat.toml"
-            panel = stack.enter_context(
-                ScanningPanel("+ smear", path, case.refreshes / 60.0, case.lit)
-            )
+            exposure_s = case.refreshes / 60.0
+            panel = stack.enter_context(ScanningPanel("+ smear", path, exposure_s, case.lit))
             sky = stack.enter_context(TimingSky(panel))
             for number in range(STARTS):
                 panel.start_s = (number + 0.2) / STARTS * panel.period_s
@@ -450,47 +468,51 @@ def _exposure_points(
 ) -> Iterator[BeatPoint]:
     shown = panel.exposed_e_per_s(movement)
     true = sky.exposed_e_per_s(movement)
-    paths = sky.paths(movement)
-    to_tracker = panel.optics.geometry.to_tracker
-    camera = panel.bench.camera
-    windows = list(
-        study_benches.lone_windows(
-            paths, *to_tracker(paths.x_px, paths.y_px), panel.camera.resolution_px, ISOLATION
-        )
-    )
+    windows = lone_paths(panel, sky, movement)
     # Where each star is on the monitor in the middle of the exposure, and just before and after:
     # its row, and its speed.
-    middle_ns = round((panel.start_s + panel.exposure_s / 2) * NS_PER_S)
-    middle = Motion(movement.at(middle_ns), movement.turn_rad_s, panel.exposure_s)
-    vectors = panel.bench.stars.vectors[[star for star, _ in windows]]
-    images = vectors @ middle.icrs_to_image(np.array([-STEP_S, 0.0, STEP_S]), camera).transpose(
-        0, 2, 1
-    )
+    to_tracker = panel.optics.geometry.to_tracker
+    camera = panel.bench.camera
+    stars = [star for star, _ in windows]
+    turns = panel.motion(movement).icrs_to_image(np.array([-STEP_S, 0.0, STEP_S]), camera)
+    images = panel.bench.stars.vectors[stars] @ turns.transpose(0, 2, 1)
     before, now, after = (camera.project(image) for image in images)
     speed_px_s = np.subtract(to_tracker(*after), to_tracker(*before)) / (2 * STEP_S)
-    phase = (panel.start_s / panel.period_s - (now[1] + 0.5) / camera.resolution_px[1]) % 1.0
-    foretold = seen_at(
-        Exposures(1 / panel.period_s, panel.exposure_s, lit_s=case.lit * panel.period_s), phase
-    )
+    row_share = (now[1] + 0.5) / camera.resolution_px[1]
+    phase = (panel.start_s / panel.period_s - row_share) % 1.0
+    lit_s = case.lit * panel.period_s
+    foretold = seen_at(Exposures(1 / panel.period_s, panel.exposure_s, lit_s=lit_s), phase)
+    arcsec_per_s = RATE_DEG_S * ARCSEC_PER_DEG
     for index, (_, window) in enumerate(windows):
-        off_px = np.subtract(
-            study_benches.centroid_px(shown, window), study_benches.centroid_px(true, window)
-        )
+        shown_px = study_benches.centroid_px(shown, window)
+        true_px = study_benches.centroid_px(true, window)
         speed = speed_px_s[:, index]
+        off_s = float(np.subtract(shown_px, true_px) @ speed / (speed @ speed))
+        light = float(shown[window].sum() / true[window].sum())
         yield BeatPoint(
-            case.refreshes,
-            case.lit,
-            float(phase[index]),
-            float(off_px @ speed / (speed @ speed)) * RATE_DEG_S * ARCSEC_PER_DEG,
-            float(foretold.off_s[index]) * RATE_DEG_S * ARCSEC_PER_DEG,
-            magnitude(float(shown[window].sum() / true[window].sum()) / case.lit),
-            magnitude(float(foretold.light[index])),
+            refreshes=case.refreshes,
+            lit=case.lit,
+            phase=float(phase[index]),
+            off_arcsec=off_s * arcsec_per_s,
+            foretold_arcsec=float(foretold.off_s[index]) * arcsec_per_s,
+            light_mag=magnitude(light / case.lit),
+            foretold_mag=magnitude(float(foretold.light[index])),
         )
+
+
+def lone_paths(
+    panel: ScanningPanel, sky: TimingSky, movement: Movement
+) -> list[tuple[int, study_benches.Window]]:
+    """The isolated stars of an exposure, with their windows on the tracker."""
+    paths = sky.paths(movement)
+    x_px, y_px = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
+    size_px = panel.camera.resolution_px
+    return list(study_benches.lone_windows(paths, x_px, y_px, size_px, ISOLATION))
 
 
 def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
     """Write `beat.csv` and its chart; a line for each case. Raises InputError."""
-    write_records(directory / "beat.csv", points)
+    write_rows(directory / "beat.csv", points)
     cases: dict[TimingCase, list[BeatPoint]] = {}
     for point in points:
         cases.setdefault(TimingCase(point.refreshes, point.lit), []).append(point)
@@ -499,21 +521,26 @@ def beat_findings(points: list[BeatPoint], directory: Path) -> list[str]:
         f" their phase, within {_off_arcsec(points):.2g} arcsec rms"
     )
     draw_beat(directory / "beat", finding, cases)
-    lines = []
-    for case, mine in cases.items():
-        found = beat(case.exposures)
-        lines.append(
-            f"{case.words}: up to {max(abs(p.off_arcsec) for p in mine):.3g} arcsec"
-            f" ({(found.worst_arcsec_per_deg_s or 0.0) * RATE_DEG_S:.3g} foretold over all phases)"
-            f" and {max(abs(p.light_mag) for p in mine):.2g} mag ({found.worst_mag:.2g});"
-            f" {_off_arcsec(mine):.2g} arcsec rms off that ({len(mine)} stars)"
-        )
-    return [finding, *lines]
+    return [finding, *(case_line(case, points) for case, points in cases.items())]
 
 
-def _off_arcsec(points: list[BeatPoint]) -> float:
-    """How far stars are from where they were foretold, rms."""
-    return float(np.sqrt(np.mean([(p.off_arcsec - p.foretold_arcsec) ** 2 for p in points])))
+def case_line(case: TimingCase, points: Sequence[BeatPoint]) -> str:
+    """The largest errors of a case, beside those that are foretold over all phases."""
+    foretold = beat(case.exposures)
+    worst_arcsec = (foretold.worst_arcsec_per_deg_s or 0.0) * RATE_DEG_S
+    off_arcsec = max(abs(point.off_arcsec) for point in points)
+    light_mag = max(abs(point.light_mag) for point in points)
+    return (
+        f"{case.words}: up to {off_arcsec:.3g} arcsec ({worst_arcsec:.3g} foretold over all phases)"
+        f" and {light_mag:.2g} mag ({foretold.worst_mag:.2g});"
+        f" {_off_arcsec(points):.2g} arcsec rms off that ({len(points)} stars)"
+    )
+
+
+def _off_arcsec(points: Sequence[BeatPoint]) -> float:
+    """The rms distance of stars from their foretold places, arcsec."""
+    off = np.array([point.off_arcsec - point.foretold_arcsec for point in points])
+    return float(np.sqrt(np.mean(off**2)))
 
 
 def draw_beat(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]) -> None:
@@ -539,9 +566,7 @@ def draw_beat(path: Path, finding: str, cases: dict[TimingCase, list[BeatPoint]]
 
 @dataclass(frozen=True, slots=True)
 class ForetoldBeat:
-    """The error of a star that `run.sync` foretells for a phase of the exposure; its columns are
-    those of BeatPoint.
-    """
+    """The error that `server.sync` foretells for one phase; its columns are those of BeatPoint."""
 
     refreshes: float
     lit: float
@@ -551,7 +576,7 @@ class ForetoldBeat:
 
 
 def foretold_beat(case: TimingCase) -> list[ForetoldBeat]:
-    """A case at every phase."""
+    """The foretold errors of a case at every phase."""
     phases = np.linspace(0, 1, BEAT_PHASES)
     foretold = seen_at(case.exposures, phases)
     off_arcsec = foretold.off_s * RATE_DEG_S * ARCSEC_PER_DEG
@@ -576,7 +601,7 @@ def beat_case(row: BeatPoint | ForetoldBeat) -> TimingCase:
 @dataclass(frozen=True, slots=True)
 class TimingOutcome:
     """One compensation at one rate: rms and largest error of centroids, arcsec, rms flux error,
-    mag, and drawing time, ms.
+    mag, and the time of a frame, ms.
     """
 
     way: str
@@ -592,25 +617,20 @@ def compare(panel: ScanningPanel, sky: TimingSky, movement: Movement) -> TimingO
     """One compensation on one slew, against the sky."""
     shown = panel.exposed_e_per_s(movement)
     true = sky.exposed_e_per_s(movement)
-    paths = sky.paths(movement)
-    places = panel.optics.geometry.to_tracker(paths.x_px, paths.y_px)
-    windows = study_benches.lone_windows(paths, *places, panel.camera.resolution_px, ISOLATION)
-    errors = [study_benches.star_error(shown, true, window) for _, window in windows]
+    errors = []
+    for _, window in lone_paths(panel, sky, movement):
+        errors.append(study_benches.star_error(shown, true, window))
     flux_mag = np.array([error.flux_mag for error in errors])
-    off_arcsec = (
-        np.array([error.centroid_px for error in errors])
-        * ARCSEC_PER_RAD
-        / panel.camera.focal_length_px
-    )
-    rms_arcsec, rms_mag = (float(np.sqrt(np.mean(np.square(v)))) for v in (off_arcsec, flux_mag))
+    off_px = np.array([error.centroid_px for error in errors])
+    off_arcsec = off_px * ARCSEC_PER_RAD / panel.camera.focal_length_px
     return TimingOutcome(
-        panel.way,
-        movement.rate_deg_s,
-        len(errors),
-        rms_arcsec,
-        float(off_arcsec.max()),
-        rms_mag,
-        panel.cost_ms(movement),
+        way=panel.way,
+        rate_deg_s=movement.rate_deg_s,
+        stars=len(errors),
+        rms_arcsec=float(np.sqrt(np.mean(off_arcsec**2))),
+        worst_arcsec=float(off_arcsec.max()),
+        flux_rms_mag=float(np.sqrt(np.mean(flux_mag**2))),
+        draw_ms=panel.cost_ms(movement),
     )
 
 
@@ -634,32 +654,33 @@ def run(directory: Path, quick: bool = False) -> Judged:
     others = OtherWork()
     outcomes = measure(quick)
     load = others.load()
-    write_records(directory / "timing.csv", outcomes)
+    write_rows(directory / "timing.csv", outcomes)
     finding = draw(directory / "timing", outcomes, load)
-    lines = []
-    for o in outcomes:
-        if o.rate_deg_s == QUICK_RATES_DEG_S[0]:
-            lines.append(
-                f"{o.way}: {o.rms_arcsec:.3g} arcsec rms, {o.worst_arcsec:.3g} maximum,"
-                f" {o.flux_rms_mag:.2g} mag rms, {o.draw_ms:.1f} ms a frame ({o.stars} stars)"
-            )
-    return load.judged(
-        [
-            finding,
-            *lines,
-            *beat_findings(measure_beat(quick), directory),
-            *stripe_findings(directory),
-        ]
-    )
+    lines = [finding]
+    for outcome in outcomes:
+        if outcome.rate_deg_s == QUICK_RATES_DEG_S[0]:
+            lines.append(line_of(outcome))
+    lines += beat_findings(measure_beat(quick), directory)
+    lines += stripe_findings(directory)
+    return load.judged(lines)
+
+
+def line_of(outcome: TimingOutcome) -> str:
+    """An outcome in words."""
+    errors = f"{outcome.rms_arcsec:.3g} arcsec rms, {outcome.worst_arcsec:.3g} maximum"
+    cost = f"{outcome.draw_ms:.1f} ms a frame ({outcome.stars} stars)"
+    return f"{outcome.way}: {errors}, {outcome.flux_rms_mag:.2g} mag rms, {cost}"
 
 
 def draw(path: Path, outcomes: list[TimingOutcome], load: Load) -> str:
     """The chart of the outcomes; its finding."""
-    at = {(o.way, o.rate_deg_s): o for o in outcomes}
-    plain, best = (at[way, QUICK_RATES_DEG_S[0]] for way in ("prediction", "+ smear"))
+    rms_arcsec = {}
+    for outcome in outcomes:
+        if outcome.rate_deg_s == QUICK_RATES_DEG_S[0]:
+            rms_arcsec[outcome.way] = outcome.rms_arcsec
     finding = (
-        f"At 2 deg/s star positions are off by {plain.rms_arcsec:.0f} arcsec rms with prediction"
-        f" alone, and by {best.rms_arcsec:.2g} with scan-out and smear compensated"
+        f"At 2 deg/s star positions are off by {rms_arcsec['prediction']:.0f} arcsec rms with"
+        f" prediction alone, and by {rms_arcsec['+ smear']:.2g} with scan-out and smear compensated"
     )
     rates = sorted({outcome.rate_deg_s for outcome in outcomes})
     error = PanelSpec(

@@ -3,8 +3,9 @@
 A study of trials makes `Trials` of a step, has them `measured`, and draws and writes them here.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -45,7 +46,7 @@ MIN_HEIGHT_INCH, HEAD_INCH, NAME_INCH = 4.2, 1.9, 0.17
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """A measure of methods: its name and unit; figures under `floor` count as 0."""
+    """A measure of methods: its name and unit; values below `floor` count as 0."""
 
     name: str
     unit: str
@@ -78,10 +79,10 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Trials:
-    """All methods of a step. `work` names the timed work, `why_default` is the reason for the
-    default where another beats it.
+    """All methods of a step. `work` names the timed work, `why_default` is the reason to keep the
+    default where another method beats it.
 
-    `remark` is a caution that the figures alone would hide. `load` is what others took while it was
+    `remark` is a caution that the figures do not show. `load` is the work of others while it was
     timed.
     """
 
@@ -106,7 +107,7 @@ def measured(step: Trials, budget_s: float) -> Trials:
     On a busy machine no method is on the front, and none is said to beat the default.
     """
     others = OtherWork()
-    works = {trial.method: lambda _, work=trial.work: work() for trial in step.trials}
+    works = {trial.method: partial(called, trial.work) for trial in step.trials}
     times = in_turn(works, MAX_ROUNDS, budget_s / len(works))
     load = others.load()
     quartiles = [quartiles_ms(taken) for taken in times.values()]
@@ -125,6 +126,11 @@ def measured(step: Trials, budget_s: float) -> Trials:
         why = f"{beaten_words(timed[default], best)}; {step.why_default}"
         timed[default] = replace(timed[default], beaten=why)
     return replace(step, trials=sorted(timed, key=lambda trial: trial.time_ms), load=load)
+
+
+def called(work: Callable[[], object], _: int) -> object:
+    """Call a work that does not ask for the number of its round."""
+    return work()
 
 
 def quartiles_ms(times: Sequence[Spent]) -> tuple[float, float, float]:
@@ -194,31 +200,102 @@ def said(value: float, figure: Figure) -> str:
     return f"{two_digits(value)} {figure.unit}"
 
 
+@dataclass(frozen=True, slots=True)
+class FrontPoint:
+    """A choice on a chart of error against time: its place and colour, the ends of its bar, and the
+    colours of its rings.
+    """
+
+    time_ms: float
+    error: float
+    ends_ms: tuple[float, float]
+    colour: str
+    on_front: bool
+    rings: tuple[str, ...] = ()
+
+    @property
+    def place(self) -> tuple[float, float]:
+        """Time and error."""
+        return self.time_ms, self.error
+
+
+@dataclass(frozen=True, slots=True)
+class FrontLook:
+    """How a chart draws its front, the bars of times, and points that are not on the front.
+
+    `line` is None where the front has no line; `ring_pt` are the diameters of rings by their
+    colours.
+    """
+
+    line: Mapping[str, Any] | None
+    bar: Mapping[str, Any]
+    beaten: Mapping[str, Any]
+    ring_pt: Mapping[str, float]
+    ring_width: float
+
+
+TRIALS_LOOK: FrontLook = FrontLook(
+    line={"color": BLUE, "lw": 1.4},
+    bar={"lw": 3.5, "alpha": 0.4, "solid_capstyle": "butt"},
+    beaten={},
+    ring_pt={RED: 14},
+    ring_width=2.0,
+)
+
+
+def draw_front(axes: "Axes", points: Sequence[FrontPoint], look: FrontLook) -> None:
+    """Draw error against time on logarithmic axes: the front as a line, and every point with its
+    bar and its rings. The points come fastest first.
+    """
+    front = [point.place for point in points if point.on_front]
+    if look.line is not None and len(front) > 1:
+        times_ms, errors = zip(*front, strict=True)
+        axes.step(times_ms, errors, where="post", **look.line)
+    for point in points:
+        axes.plot(point.ends_ms, [point.error] * 2, color=point.colour, **look.bar)
+        style: dict[str, Any] = {"color": point.colour, "ms": 6, "zorder": 3}
+        if not point.on_front:
+            style |= look.beaten
+        axes.plot(*point.place, "o", **style)
+    for point in points:
+        for colour in point.rings:
+            ring: dict[str, Any] = {"color": colour, "mfc": "none", "mew": look.ring_width}
+            axes.plot(*point.place, "o", ms=look.ring_pt[colour], zorder=4, **ring)
+    axes.set(xscale="log", yscale="log")
+
+
 def draw_trials(path: Path, step: Trials, machine: str) -> None:
     """Draw error against time on logarithmic axes: the front as a line, the default ringed,
     every method named at the side.
     """
     height = max(MIN_HEIGHT_INCH, HEAD_INCH + NAME_INCH * len(step.trials))
     note = step.load.note(trials_note(step, machine))
+    unit = step.error.unit.replace(SHARE, "share")
+    ylabel = title_lines(f"{step.error.name} [{unit}]", LABEL_COLUMNS)
     with chart(path, finding(step), note=note, height_inch=height) as (axes,):
-        front = [place_of(trial, step) for trial in step.trials if trial.on_front]
-        if len(front) > 1:
-            axes.step(*np.array(front).T, where="post", color=BLUE, lw=1.4)
-        for trial in step.trials:
-            # A default that is alone on the front has the colour of its name.
-            colour = front_colour(trial)
-            if trial.is_default and len(front) == 1:
-                colour = RED
-            draw_trial(axes, trial, step, colour)
-        ring: dict[str, Any] = {"color": RED, "ms": 14, "mfc": "none", "mew": 2.0, "zorder": 4}
-        axes.plot(*place_of(step.default, step), "o", **ring)
-        unit = step.error.unit.replace(SHARE, "share")
-        ylabel = title_lines(f"{step.error.name} [{unit}]", LABEL_COLUMNS)
-        axes.set(xscale="log", yscale="log", xlabel="median time [ms]", ylabel=ylabel)
+        draw_front(axes, front_points(step), TRIALS_LOOK)
+        axes.set(xlabel="median time [ms]", ylabel=ylabel)
         axes.margins(0.06, 0.08)
         if any(trial.error < step.error.floor for trial in step.trials):
             axes.axhline(step.error.floor, color=MUTED, ls=":", lw=1.2)
         name_at_side(axes, side_names(step))
+
+
+def front_points(step: Trials) -> list[FrontPoint]:
+    """The methods of a step as they are drawn, the default ringed."""
+    front_count = sum(trial.on_front for trial in step.trials)
+    points = []
+    for trial in step.trials:
+        rings: tuple[str, ...] = ()
+        colour = front_colour(trial)
+        if trial.is_default:
+            rings = (RED,)
+            # A default that is alone on the front has the colour of its name.
+            if front_count == 1:
+                colour = RED
+        time_ms, error = place_of(trial, step)
+        points.append(FrontPoint(time_ms, error, trial.quartiles_ms, colour, trial.on_front, rings))
+    return points
 
 
 def trials_note(step: Trials, machine: str) -> str:
@@ -244,14 +321,6 @@ def front_colour(trial: Trial) -> str:
     if trial.on_front:
         return BLUE
     return MUTED
-
-
-def draw_trial(axes: "Axes", trial: Trial, step: Trials, colour: str) -> None:
-    """A method's point, and the quartiles of its times."""
-    place = place_of(trial, step)
-    bar: dict[str, Any] = {"lw": 3.5, "alpha": 0.4, "solid_capstyle": "butt"}
-    axes.plot(trial.quartiles_ms, [place[1]] * 2, color=colour, **bar)
-    axes.plot(*place, "o", color=colour, ms=6, zorder=3)
 
 
 def side_names(step: Trials) -> SideNames:

@@ -154,16 +154,15 @@ class FaultyFields:
         q = from_radec_roll_deg(float(ra_deg), float(dec_deg), float(rng.uniform(0, 360)))
         angle = rng.uniform(0, 2 * np.pi)
         off = OFF_FIELD if isinstance(fault, Glow) else OFF_AXIS * math.sqrt(rng.random())
-        return propagate(
-            q, off * self._view_rad * np.array([math.cos(angle), math.sin(angle), 0.0]), 1.0
-        )
+        axis_cam = np.array([math.cos(angle), math.sin(angle), 0.0])
+        return propagate(q, off * self._view_rad * axis_cam, 1.0)
 
     def _direction(self, fault: Fault) -> FloatArray | None:
         """A fault's place on the sky; None where it has none of its own."""
-        if isinstance(fault, PlacedFault) and (
-            fault.radec_deg is not None or fault.icrs is not None
-        ):
-            return icrs_direction(fault)
+        if isinstance(fault, PlacedFault):
+            has_place = fault.radec_deg is not None or fault.icrs is not None
+            if has_place:
+                return icrs_direction(fault)
         if isinstance(fault, Flash | StarGone):
             return self._view.star_direction(fault)
         return None
@@ -173,30 +172,32 @@ class FaultyFields:
         frame.
         """
         if isinstance(fault, StarGone):
+            vectors = self._twin.bench.stars.vectors[frame.star.clip(0)]
             toward = self._view.star_direction(fault)
-            rows = np.flatnonzero(
-                (self._twin.bench.stars.vectors[frame.star.clip(0)] @ toward) > 1 - 1e-14
-            )
+            rows = np.flatnonzero(vectors @ toward > 1 - 1e-14)
         else:
             rows = np.flatnonzero(frame.rows["name"] == fault.name)
         if not len(rows):
             return None
-        row = frame.rows[rows[0]]
-        x, y = self._twin.assumed_geometry.to_tracker(
-            np.array([row["x_px"]]), np.array([row["y_px"]])
-        )
-        return np.array([x[0], y[0]])
+        row = frame.rows[rows[:1]]
+        x_px, y_px = self._twin.assumed_geometry.to_tracker(row["x_px"], row["y_px"])
+        return np.array([x_px[0], y_px[0]])
 
-    def _whole(self, place: FloatArray) -> bool:
+    def _whole(self, place_px: FloatArray) -> bool:
+        """Whether the window about a place is whole on the detector."""
+        x, y = place_px
         width, height = self._twin.camera.resolution_px
         reach = self._reach_px()
-        return bool(reach <= place[0] < width - reach and reach <= place[1] < height - reach)
+        return bool(reach <= x < width - reach and reach <= y < height - reach)
 
     def _reach_px(self) -> int:
+        """How far a window reaches from its middle pixel."""
         return math.ceil(WINDOW_SIGMAS * max(self._finder.psf.width_px)) + 1
 
-    def _window(self, place: FloatArray) -> tuple[slice, slice]:
-        reach, (x, y) = self._reach_px(), np.rint(place).astype(int).tolist()
+    def _window(self, place_px: FloatArray) -> tuple[slice, slice]:
+        """The rows and columns of the window about a place."""
+        reach = self._reach_px()
+        x, y = np.rint(place_px).astype(int).tolist()
         return slice(y - reach, y + reach + 1), slice(x - reach, x + reach + 1)
 
     def _stars_off_px(self, shot: _Shot) -> float | None:
@@ -209,39 +210,36 @@ class FaultyFields:
         is_matched = match.index >= 0
         if not is_matched.any():
             return None
-        its = match.index[is_matched]
-        return float(
-            np.median(
-                np.hypot(
-                    match.found.x_px[its] - x_px[is_matched],
-                    match.found.y_px[its] - y_px[is_matched],
-                )
-            )
-        )
+        source = match.index[is_matched]
+        right_px = match.found.x_px[source] - x_px[is_matched]
+        down_px = match.found.y_px[source] - y_px[is_matched]
+        return float(np.median(np.hypot(right_px, down_px)))
 
 
 def _middle(light: FloatArray) -> FloatArray:
     """The centroid of light (h, w), x and y."""
     y, x = np.indices(light.shape)
-    return np.asarray(np.array([(x * light).sum(), (y * light).sum()]) / light.sum())
+    moments = np.array([(x * light).sum(), (y * light).sum()])
+    return np.asarray(moments / light.sum())
 
 
 def fault_lines(seen: list[FaultSeen]) -> list[str]:
     """The figures for a person, a line for each fault."""
-    return [
-        f"{'fault':20}{fault_seen.name} ({fault_seen.kind}): {_words(fault_seen)}"
-        for fault_seen in seen
-    ]
+    lines = []
+    for fault in seen:
+        lines.append(f"{'fault':20}{fault.name} ({fault.kind}): {_figures(fault)}")
+    return lines
 
 
-def _words(one: FaultSeen) -> str:
-    if one.note:
-        return one.note
+def _figures(fault: FaultSeen) -> str:
+    """What was measured of a fault, or its note."""
+    if fault.note:
+        return fault.note
     parts = []
-    if one.asked_e is not None and one.seen_e is not None:
-        parts.append(f"{one.asked_e:.6g} e- asked for, {one.seen_e:.6g} seen")
-    if one.flux_mag is not None:
-        parts.append(f"{one.flux_mag:+.4f} mag")
-    if one.off_px is not None:
-        parts.append(f"{one.off_px:.4f} px off")
+    if fault.asked_e is not None and fault.seen_e is not None:
+        parts.append(f"{fault.asked_e:.6g} e- asked for, {fault.seen_e:.6g} seen")
+    if fault.flux_mag is not None:
+        parts.append(f"{fault.flux_mag:+.4f} mag")
+    if fault.off_px is not None:
+        parts.append(f"{fault.off_px:.4f} px off")
     return ", ".join(parts) or "nothing was found"

@@ -75,13 +75,14 @@ MIRRORS: tuple[Mirror, ...] = ("x", "y", "swap")
 
 @dataclass(frozen=True, slots=True)
 class GeometryFit:
-    """The smallest sufficient model of the displacements, as true minus assumed.
+    """How the display's geometry is off, true minus assumed, by the smallest model that explains
+    the stars' displacements.
 
-    Scale, rotation about the detector's middle and shift, and where the displacements ask for them
-    the screen's tilt about its x and y axes and the lens, k1 of its tangents; `tilt_px` and
-    `distortion_px` are the largest displacements by these. `left` is the share of the mean square
-    that is not explained, corrected for the number of unknowns, `left_px` what 95 % of the stars
-    are within of the model.
+    Scale, rotation about the detector's middle and shift; where the displacements ask for them also
+    the screen's tilt about its x and y axes, and the lens, k1 of its tangents. `tilt_px` and
+    `distortion_px` are the largest displacements by these two. `left` is the share of the mean
+    square that the model does not explain, corrected for the number of unknowns; 95 % of the stars
+    are within `left_px` of the model.
     """
 
     scale_error: float
@@ -105,19 +106,22 @@ def fit_geometry(rows: FloatArray, tracker: Camera, limit_px: float) -> Geometry
     if len(rows) < MIN_STARS:
         return None
     focal_px = tracker.focal_length_px
-    seen_tangents = (rows[:, :2] + rows[:, 2:] - tracker.principal_point_px) / focal_px
+    shown_px = rows[:, :2] + rows[:, 2:]
+    seen_tangents = (shown_px - tracker.principal_point_px) / focal_px
     back = -rows[:, 2:] / focal_px
     for _ in range(TRIMS):
         # Another star that was found near a star's place is none of these.
-        off = _lengths(_fits(seen_tangents, back)[-1].rest)
+        largest_model = _fits(seen_tangents, back)[-1]
+        off = _lengths(largest_model.rest)
         is_kept = off <= max(WILD * float(np.median(off)), limit_px / focal_px)
         if is_kept.sum() < MIN_STARS:
             break
         seen_tangents = seen_tangents[is_kept]
         back = back[is_kept]
     fits = _fits(seen_tangents, back)
-    good = ENOUGH * min(fit.noise for fit in fits) + ENOUGH_OF_LIMIT * limit_px / focal_px
-    return _summed_up(next(fit for fit in fits if fit.noise <= good), back.T.ravel(), focal_px)
+    enough = ENOUGH * min(fit.noise for fit in fits) + ENOUGH_OF_LIMIT * limit_px / focal_px
+    smallest = next(fit for fit in fits if fit.noise <= enough)
+    return _summed_up(smallest, back.T.ravel(), focal_px)
 
 
 def _fits(seen: FloatArray, back: FloatArray) -> "list[_MotionFit]":
@@ -126,7 +130,8 @@ def _fits(seen: FloatArray, back: FloatArray) -> "list[_MotionFit]":
     wanted = back.T.ravel()
     fits = []
     for model in MODELS:
-        fit = _MotionFit.of({name: parts[name] for name in model}, wanted)
+        model_parts = {name: parts[name] for name in model}
+        fit = _MotionFit.of(model_parts, wanted)
         if MIN_RESIDUALS * fit.unknowns <= len(wanted):
             fits.append(fit)
     return fits
@@ -144,13 +149,16 @@ def _parts(x: FloatArray, y: FloatArray) -> dict[str, FloatArray]:
         HIGHER: [(x * r2**2, y * r2**2)],
         DECENTRED: [(2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y)],
     }
-    return {name: np.column_stack(list(map(np.concatenate, columns[name]))) for name in columns}
+    parts = {}
+    for name, displacements in columns.items():
+        parts[name] = np.column_stack([np.concatenate(x_then_y) for x_then_y in displacements])
+    return parts
 
 
 @dataclass(frozen=True, slots=True)
 class _MotionFit:
-    """A model's unknowns by its parts, the displacements (2 n,) by each, and what all of them
-    leave.
+    """A least-squares fit of displacements: the values of its unknowns by part, the displacements
+    (2 n,) that each part makes, and the rest (2 n,).
     """
 
     found: dict[str, FloatArray]
@@ -160,63 +168,70 @@ class _MotionFit:
 
     @classmethod
     def of(cls, parts: dict[str, FloatArray], wanted: FloatArray) -> "_MotionFit":
+        """The least-squares fit of parts (2 n, unknowns) to displacements (2 n,)."""
         design = np.hstack(list(parts.values()))
-        values = np.linalg.lstsq(design, wanted, rcond=None)[0]
+        values, *_ = np.linalg.lstsq(design, wanted, rcond=None)
         ends = np.cumsum([part.shape[1] for part in parts.values()])
         values_by_part = dict(zip(parts, np.split(values, ends[:-1]), strict=True))
         moved = {name: part @ values_by_part[name] for name, part in parts.items()}
-        return cls(values_by_part, moved, wanted - design @ values, design.shape[1])
+        rest = wanted - design @ values
+        return cls(values_by_part, moved, rest, design.shape[1])
 
     @property
     def noise(self) -> float:
         """One sigma of what is left, of a residual."""
-        return math.sqrt(float(self.rest @ self.rest) / (len(self.rest) - self.unknowns))
+        degrees_of_freedom = len(self.rest) - self.unknowns
+        return math.sqrt(float(self.rest @ self.rest) / degrees_of_freedom)
 
     def largest(self, *names: str) -> float:
         """The largest displacement by some parts together."""
-        return float(
-            _lengths(
-                sum(
-                    (self.moved[name] for name in names if name in self.moved),
-                    np.zeros_like(self.rest),
-                )
-            ).max()
-        )
+        together = np.zeros_like(self.rest)
+        for name in names:
+            if name in self.moved:
+                together = together + self.moved[name]
+        return float(_lengths(together).max())
 
 
 def _lengths(residuals: FloatArray) -> FloatArray:
-    return np.asarray(np.hypot(*np.split(residuals, 2)))
+    """The distances (n,) of residuals (2 n,), those along x before those along y."""
+    along_x, along_y = np.split(residuals, 2)
+    return np.asarray(np.hypot(along_x, along_y))
 
 
 def _summed_up(fit: _MotionFit, wanted: FloatArray, focal_px: float) -> GeometryFit:
+    """The figures of a fit. A fit leads from the display back to the sky, and its figures the other
+    way.
+    """
     scale, rotation, right, down = fit.found[ALIGNED].tolist()
     backwards = complex(1.0 + scale, rotation)
     forwards = 1.0 / backwards
     shift = -complex(right, down) / backwards
     a, b = fit.found.get(TILT, np.zeros(2)).tolist()
+    k1 = float(fit.found.get(LENS, np.zeros(1))[0]) / abs(backwards)
     total = float(wanted @ wanted)
+    left_share = fit.noise**2 * len(wanted) / total if total else 0.0
+    left_95 = float(np.percentile(_lengths(fit.rest), 95))
     return GeometryFit(
         scale_error=forwards.real - 1.0,
         rotation_rad=forwards.imag,
         offset_px=(shift.real * focal_px, shift.imag * focal_px),
         tilt_rad=(a, b),
         tilt_px=focal_px * fit.largest(TILT),
-        k1=float(fit.found.get(LENS, np.zeros(1))[0]) / abs(backwards),
+        k1=k1,
         distortion_px=focal_px * fit.largest(LENS, HIGHER, DECENTRED),
-        left=fit.noise**2 * len(wanted) / total if total else 0.0,
-        left_px=focal_px * float(np.percentile(_lengths(fit.rest), 95)),
+        left=left_share,
+        left_px=focal_px * left_95,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Star:
-    """One star at its place on the tracker, px: errors of the display, + too faint, right and down,
-    magnitudes and px.
+    """One star at its place on the tracker, px, and the errors of the display there.
 
-    `codes_mag`, `codes_px` are what the codes would cost on the monitor that the bench assumes, NaN
-    where that star would
-    be lost; `floor_mag`, `floor_px` are the estimator's own, of the linear image against catalogue
-    and sky. A body has a `name`, and 0 for `hip`.
+    `flux_mag` is positive where the star is too faint, `dx_px` and `dy_px` are right and down.
+    `codes_mag`, `codes_px` are what the codes alone would cost on the monitor that the bench
+    assumes, NaN where that star would be lost. `floor_mag`, `floor_px` are the estimator's own
+    errors: of the linear image against catalogue and sky. A body has a `name`, and 0 for `hip`.
     """
 
     hip: int
@@ -235,15 +250,15 @@ class Star:
 
 @dataclass(slots=True)
 class MatchTally:
-    """Stars by what became of them, added up over the fields.
+    """Stars by what became of them, over all fields.
 
-    `summed` stars are part of a brighter one that the tracker cannot part from them. `displaced`
-    has the rows (`fit_geometry`) of the stars that the display really shows, however far off.
-    `vanished` counts how many fewer are found than the sky has, `mirrored` those found where a
-    screen so mirrored would show them; `noisy_mag`, `noisy_px` are the errors with all of the
-    detector's noise. `off_px` has how far off each kind of centroider finds each of `stars`,
-    `channels_mag` how much too faint each channel is of those whose colour the primaries have;
-    there are `out_of_gamut` others.
+    `summed` stars are part of a brighter one from which the tracker cannot tell them. `displaced`
+    has the rows (`fit_geometry`) of all stars that the display shows, however far off. `vanished`
+    is how many fewer are found than the sky has; `mirrored` counts, by mirror, those found where a
+    screen so mirrored would show them. `noisy_mag`, `noisy_px` are the errors with all of the
+    detector's noise. `off_px` has how far off each kind of centroider finds each of `stars`.
+    `channels_mag` has how much too faint each channel is, of stars whose colour the primaries have;
+    `out_of_gamut` counts the others.
     """
 
     stars: list[Star] = field(default_factory=list)
@@ -317,9 +332,9 @@ def glass_effect(psf: Psf, stars: list[Star]) -> GlassEffect | None:
         return None
     x, y = np.array([(star.x_px, star.y_px) for star in stars]).T
     to_x, to_y, light = psf.centroids_px(x, y, psf.mean_shares)
-    fainter = [abs(magnitude(float(star_light))) for star_light in light if star_light > 0]
+    fainter_mag = np.abs(magnitude(light[light > 0]))
     px = float(np.percentile(np.hypot(to_x - x, to_y - y), 95))
-    mag = float(np.percentile(fainter or [0.0], 95))
+    mag = float(np.percentile(fainter_mag, 95)) if len(fainter_mag) else 0.0
     return GlassEffect(px, mag)
 
 
@@ -329,25 +344,26 @@ def with_blends_as_one(seen: TwinField, psf: Psf) -> TwinField:
 
     The brighter one keeps its name; its light, magnitude and places become those of the sum.
     """
-    owner = _owners(
-        np.column_stack([seen.x_px, seen.y_px]) / psf.width_px, seen.truth["electrons_per_s"]
-    )
-    own_index = np.arange(len(owner))
-    if np.array_equal(owner, own_index):
-        return seen
     light = seen.truth["electrons_per_s"]
+    places_px = np.column_stack([seen.x_px, seen.y_px])
+    owner = _owners(places_px / psf.width_px, light)
+    itself = np.arange(len(owner))
+    if np.array_equal(owner, itself):
+        return seen
     total = np.bincount(owner, light, len(owner))
-    stars = np.flatnonzero(owner == own_index)
+    stars = np.flatnonzero(owner == itself)
 
     def centre(places_px: FloatArray) -> FloatArray:
-        moment = np.bincount(owner, light * (places_px - places_px[owner]), len(owner))[stars]
-        return np.asarray(places_px[stars] + moment / total[stars])
+        moment = np.bincount(owner, light * (places_px - places_px[owner]), len(owner))
+        return np.asarray(places_px[stars] + moment[stars] / total[stars])
 
     truth = seen.truth[stars].copy()
-    truth["x_px"], truth["y_px"] = centre(seen.truth["x_px"]), centre(seen.truth["y_px"])
+    truth["x_px"] = centre(seen.truth["x_px"])
+    truth["y_px"] = centre(seen.truth["y_px"])
     truth["electrons_per_s"] = total[stars]
     truth["v_mag"] += magnitude(np.asarray(total[stars] / light[stars]))
-    truth["clipped"] = np.bincount(owner, seen.truth["clipped"], len(owner))[stars] > 0
+    clipped_count = np.bincount(owner, seen.truth["clipped"], len(owner))
+    truth["clipped"] = clipped_count[stars] > 0
     return replace(seen, truth=truth, x_px=centre(seen.x_px), y_px=centre(seen.y_px))
 
 
@@ -358,13 +374,17 @@ def _owners(places: FloatArray, light: FloatArray) -> IntArray:
     owner = np.arange(len(light))
     near = defaultdict[int, list[int]](list)
     a, b, _ = neighbours(places, places, BLEND_SIGMAS)
-    for star, other in np.stack([a, b], axis=1)[a != b].tolist():
+    pairs = np.stack([a, b], axis=1)[a != b]
+    for star, other in pairs.tolist():
         near[star].append(other)
-    for star in sorted(near, key=lambda star: (-light[star], star)):
-        if owner[star] == star:
-            for other in near[star]:
-                if owner[other] == other and (light[other], -other) < (light[star], -star):
-                    owner[other] = star
+    brightest_first = sorted(near, key=lambda star: (-light[star], star))
+    for star in brightest_first:
+        if owner[star] != star:
+            continue
+        for other in near[star]:
+            is_fainter = (light[other], -other) < (light[star], -star)
+            if owner[other] == other and is_fainter:
+                owner[other] = star
     return owner
 
 
@@ -387,15 +407,14 @@ class Comparison:
         windowed_sky = self.finder.find(seen.sky_e, seen.x_px, seen.y_px)
         windowed_shown = self.finder.find(seen.shown_e, seen.x_px, seen.y_px)
         true_px = (seen.x_px, seen.y_px)
-        errors_by_kind = {}
+        images_by_kind = {}
         for kind in dict.fromkeys([*FAMILY, self.finder.centroider]):
             in_sky = self.finder.placed(windowed_sky, seen.sky_e, true_px, kind)
             in_shown = self.finder.placed(windowed_shown, seen.shown_e, true_px, kind)
-            errors_by_kind[kind] = in_sky, in_shown
-        sky, shown = errors_by_kind[self.finder.centroider]
-        if seen.assumed_e is seen.shown_e:
-            assumed = shown
-        else:
+            images_by_kind[kind] = in_sky, in_shown
+        sky, shown = images_by_kind[self.finder.centroider]
+        assumed = shown
+        if seen.assumed_e is not seen.shown_e:
             assumed = self.finder.match(seen.assumed_e, seen.x_px, seen.y_px)
         inside = self._inside(seen)
         drawn = seen.truth["drawn"]
@@ -410,12 +429,13 @@ class Comparison:
         is_matched = wanted & (sky.index >= 0) & (shown.index >= 0)
         listed = np.flatnonzero(wanted)
         both = np.flatnonzero(is_matched)
-        for k, star in zip(listed, self._stars(seen, listed, (sky, shown, assumed)), strict=True):
+        rows = self._stars(seen, listed, (sky, shown, assumed))
+        for k, star in zip(listed, rows, strict=True):
             (tally.stars if is_matched[k] else tally.lost).append(star)
-        for kind, (there, here) in errors_by_kind.items():
-            tally.off_px.setdefault(kind, []).extend(
-                np.hypot(*here.against(there, both)[1:]).tolist()
-            )
+        for kind, (in_sky, in_shown) in images_by_kind.items():
+            difference = in_shown.against(in_sky, both)
+            off_px = np.hypot(difference.x_px, difference.y_px)
+            tally.off_px.setdefault(kind, []).extend(off_px.tolist())
         if seen.by_channel:
             tally.out_of_gamut += int((is_matched & ~seen.truth["in_gamut"]).sum())
             self._compare_channels(seen, np.flatnonzero(is_matched & seen.truth["in_gamut"]))
@@ -426,12 +446,16 @@ class Comparison:
 
     def _compare_channels(self, seen: TwinField, stars: IntArray) -> None:
         """The light of each channel in squares about stars, shown against sky."""
-        self.tally.channels_mag = self.tally.channels_mag or [[] for _ in seen.by_channel]
+        tally = self.tally
+        tally.channels_mag = tally.channels_mag or [[] for _ in seen.by_channel]
         reach = math.ceil(self.finder.settings.radius_px)
         for x, y in np.rint([seen.x_px[stars], seen.y_px[stars]]).T.astype(int).tolist():
-            part = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
-            for off, (there, sky) in zip(self.tally.channels_mag, seen.by_channel, strict=True):
-                off.append(abs(magnitude(float(there[part].sum() / sky[part].sum()))))
+            square = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
+            for errors_mag, (shown_e, sky_e) in zip(
+                tally.channels_mag, seen.by_channel, strict=True
+            ):
+                ratio = float(shown_e[square].sum() / sky_e[square].sum())
+                errors_mag.append(abs(magnitude(ratio)))
 
     def measured(self) -> Measured:
         """All that was measured so far, with what a verdict has to know of the bench. Raises
@@ -457,22 +481,23 @@ class Comparison:
     def _stars_a_field(self) -> float:
         """The bench's stars over the whole sky by the solid angle of the tracker's field."""
         camera = self.twin.camera
-        right, down = (size / 2 / camera.focal_length_px for size in camera.resolution_px)
+        width, height = camera.resolution_px
+        right = width / 2 / camera.focal_length_px
+        down = height / 2 / camera.focal_length_px
         field_sr = 4 * math.atan(right * down / math.sqrt(1 + right**2 + down**2))
         return len(self.twin.bench.stars) * field_sr / (4 * math.pi)
 
     def _glow(self) -> GlowFit:
-        given = self.twin.config.verify.black_e_per_s_px
-        sigma_x, sigma_y = self.finder.psf.width_px
-        disc_px = 4 * math.pi * sigma_x * sigma_y
+        """The glow of the screen's black as assumed and as seen, and what it may be off."""
+        limit_e_per_s_px = self.twin.config.verify.black_e_per_s_px
+        if limit_e_per_s_px is None:
+            sigma_x, sigma_y = self.finder.psf.width_px
+            disc_px = 4 * math.pi * sigma_x * sigma_y
+            limit_e_per_s_px = BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px
         return GlowFit(
             assumed_e_per_s_px=on_screen_median(self.twin.assumed_glow_e_per_s),
             seen_e_per_s_px=on_screen_median(self.twin.glow_e_per_s),
-            limit_e_per_s_px=(
-                BLACK_SHARE * faintest_e_per_s(self.twin.bench) / disc_px
-                if given is None
-                else given
-            ),
+            limit_e_per_s_px=limit_e_per_s_px,
         )
 
     def _stars(
@@ -482,58 +507,63 @@ class Comparison:
         that is as assumed.
         """
         sky, shown, assumed = images
+        display = shown.against(sky, k)
+        codes = assumed.against(sky, k)
+        floor = sky.against(self._catalogue(seen), k)
         rows = seen.truth[k]
-        places = (seen.x_px[k], seen.y_px[k])
-        codes_mag, *codes_px = assumed.against(sky, k)
-        floor_mag, *floor_px = sky.against(self._catalogue(seen), k)
-        off = *shown.against(sky, k), codes_mag, np.hypot(*codes_px), floor_mag, np.hypot(*floor_px)
-        columns = rows["hip"], rows["v_mag"], *places, *off, rows["name"]
-        return list(
-            itertools.starmap(Star, zip(*(column.tolist() for column in columns), strict=True))
+        columns = (
+            *(rows["hip"], rows["v_mag"], seen.x_px[k], seen.y_px[k]),
+            *(display.flux_mag, display.x_px, display.y_px),
+            *(codes.flux_mag, np.hypot(codes.x_px, codes.y_px)),
+            *(floor.flux_mag, np.hypot(floor.x_px, floor.y_px)),
+            rows["name"],
         )
+        values = [column.tolist() for column in columns]
+        return list(itertools.starmap(Star, zip(*values, strict=True)))
 
     def _catalogue(self, seen: TwinField) -> Matched:
         """The catalogue as if it had been found in an image."""
         flux_e = seen.truth["electrons_per_s"] * self.twin.config.tracker.exposure_s
         count = len(seen.truth)
-        ones = np.ones(count, dtype=np.intp)
-        return Matched(
-            Centroids(seen.x_px, seen.y_px, flux_e, flux_e, ones, ones < 1),
-            np.arange(count, dtype=np.intp),
-        )
+        pixels = np.ones(count, dtype=np.intp)
+        at_edge = np.zeros(count, dtype=bool)
+        catalogue = Centroids(seen.x_px, seen.y_px, flux_e, flux_e, pixels, at_edge)
+        return Matched(catalogue, np.arange(count, dtype=np.intp))
 
     def _blended(self, seen: TwinField, sky: Matched) -> npt.NDArray[np.bool_]:
+        """True for stars (n,) with another's light in their window, or a disc's."""
         flux = seen.truth["electrons_per_s"]
+        psf = self.finder.psf
         radius_px = self.finder.settings.radius_px
-        by_disc = seen.near_disc(
-            self.twin.camera, radius_px + WING_SIGMAS * max(self.finder.psf.width_px)
-        )
-        return np.asarray(
-            shared(sky.index)
-            | crowded(seen.x_px, seen.y_px, flux, radius_px, self.finder.psf)
-            | by_disc
-        )
+        is_crowded = crowded(seen.x_px, seen.y_px, flux, radius_px, psf)
+        by_disc = seen.near_disc(self.twin.camera, radius_px + WING_SIGMAS * max(psf.width_px))
+        return np.asarray(shared(sky.index) | is_crowded | by_disc)
 
     def _follow(self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]) -> None:
         """Find each star where the true lens shows it, and note how far that is from where the
         sky has it.
         """
         geometry = BenchGeometry(self.twin.true_camera, self.twin.camera)
-        match = nearest(shown, *geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"]))
+        places_px = geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"])
+        match = nearest(shown, *places_px)
         k = np.flatnonzero(wanted & (match >= 0) & ~shared(match))
         x_px = seen.x_px[k]
         y_px = seen.y_px[k]
-        off_px = shown.x_px[match[k]] - x_px, shown.y_px[match[k]] - y_px
-        self.tally.displaced.append(np.column_stack([x_px, y_px, *off_px]))
+        right_px = shown.x_px[match[k]] - x_px
+        down_px = shown.y_px[match[k]] - y_px
+        self.tally.displaced.append(np.column_stack([x_px, y_px, right_px, down_px]))
 
     def _count_mirrored(
         self, seen: TwinField, shown: Centroids, wanted: npt.NDArray[np.bool_]
     ) -> None:
         """Count the stars that are where a mirrored screen would have them."""
-        for mirror in MIRRORS if self.twin.differs else ():
+        if not self.twin.differs:
+            return
+        for mirror in MIRRORS:
             geometry = BenchGeometry(self.twin.true_camera, self.twin.camera, mirror)
-            places = geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"])
-            self.tally.mirrored[mirror] += int((wanted & (nearest(shown, *places) >= 0)).sum())
+            places_px = geometry.to_tracker(seen.truth["x_px"], seen.truth["y_px"])
+            is_there = wanted & (nearest(shown, *places_px) >= 0)
+            self.tally.mirrored[mirror] += int(is_there.sum())
 
     def _measure_noisy(
         self, seen: TwinField, dn: npt.NDArray[Any], wanted: npt.NDArray[np.bool_]
@@ -551,16 +581,15 @@ class Comparison:
         matched = Matched(windowed, match)
         placed = self.finder.placed(matched, dn, true_px, self.finder.centroider, under.level).found
         tracker = self.twin.config.tracker
-        expected_dn = seen.truth["electrons_per_s"] * (
-            tracker.exposure_s / tracker.detector.gain_e_per_dn
-        )
+        dn_s_per_e = tracker.exposure_s / tracker.detector.gain_e_per_dn
+        expected_dn = seen.truth["electrons_per_s"] * dn_s_per_e
         k = np.flatnonzero(wanted & (match >= 0))
         k = k[placed.flux[match[k]] > 0]
-        its = match[k]
-        self.tally.noisy_mag += magnitude(placed.flux[its] / expected_dn[k]).tolist()
-        self.tally.noisy_px += np.hypot(
-            placed.x_px[its] - seen.x_px[k], placed.y_px[its] - seen.y_px[k]
-        ).tolist()
+        source = match[k]
+        self.tally.noisy_mag += magnitude(placed.flux[source] / expected_dn[k]).tolist()
+        right_px = placed.x_px[source] - seen.x_px[k]
+        down_px = placed.y_px[source] - seen.y_px[k]
+        self.tally.noisy_px += np.hypot(right_px, down_px).tolist()
 
     def _inside(self, seen: TwinField) -> npt.NDArray[np.bool_]:
         """Stars whose window is whole on the detector and whose sprite is whole on the monitor."""
@@ -576,10 +605,10 @@ class Comparison:
     def _on_detector(self, seen: TwinField, margin_px: float) -> npt.NDArray[np.bool_]:
         """Stars on the detector, `margin_px` or farther from its edge; one at NaN is not on it."""
         width, height = self.twin.camera.resolution_px
-        inside = (seen.x_px >= margin_px - 0.5) & (seen.x_px < width - 0.5 - margin_px)
-        return np.asarray(
-            inside & (seen.y_px >= margin_px - 0.5) & (seen.y_px < height - 0.5 - margin_px)
-        )
+        first_px = margin_px - 0.5
+        across = (seen.x_px >= first_px) & (seen.x_px < width - 0.5 - margin_px)
+        down = (seen.y_px >= first_px) & (seen.y_px < height - 0.5 - margin_px)
+        return np.asarray(across & down)
 
 
 def on_screen_median(glow_e_per_s: FloatArray) -> float:
@@ -587,4 +616,6 @@ def on_screen_median(glow_e_per_s: FloatArray) -> float:
     no light.
     """
     lit = glow_e_per_s[glow_e_per_s > 0]
-    return float(np.median(lit)) if len(lit) else 0.0
+    if not len(lit):
+        return 0.0
+    return float(np.median(lit))

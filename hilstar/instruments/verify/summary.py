@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, MUTED, RED, SMALL_PT, chart, label_ends, write_csv
 from hilstar.basics.error_spread import ErrorSpread, error_spread
 from hilstar.basics.units import ARCSEC_PER_RAD
@@ -17,7 +18,7 @@ from hilstar.display.quantise import MASK_TURNS
 from hilstar.instruments.simulate.star_finder import USUAL
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.instruments.verify.faulty_fields import FaultyFields, fault_lines
-from hilstar.instruments.verify.measure import Comparison, Star
+from hilstar.instruments.verify.measure import Comparison, GeometryFit, Star
 from hilstar.instruments.verify.verdict import DisplayErrors, Verdict, judge, p95
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.scenario import Scenario
@@ -25,6 +26,10 @@ from hilstar.server.bench.star_size import StarSize
 
 MIN_SHARE = 1e-4  # share of the limit at which smaller errors are drawn
 ARROW_SHARE = 0.06  # share of the chart's width, for the residual that 95 % of stars are within
+GEOMETRY_KEYS = (
+    *("scale_error", "rotation_arcsec", "offset_px"),
+    *("tilt_deg", "k1", "distortion_px"),
+)
 
 
 def verify(
@@ -44,14 +49,14 @@ def verify(
     attitudes, noise, of_faults = rng.spawn(3)
     with Twin(file) as twin:
         comparison = Comparison(twin)
-        if scenario is None:
-            faulty = None
-        else:
+        faulty = None
+        if scenario is not None:
             faulty = FaultyFields(twin, scenario, of_faults)
         for number in range(fields):
-            q = attitudes.normal(size=4)
+            components = attitudes.normal(size=4)
+            q_icrs_to_cam = components / np.linalg.norm(components)
             first_frame = int(attitudes.integers(0, MASK_TURNS))
-            comparison.add(twin.field(q / np.linalg.norm(q), first_frame), noise)
+            comparison.add(twin.field(q_icrs_to_cam, first_frame), noise)
             on_field(number + 1)
         verdict = judge(comparison.measured())
         if faulty is None:
@@ -72,12 +77,19 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
     measured = verdict.measured
     errors = verdict.errors
     tally = measured.tally
-    fit = errors.geometry
     centroid_px = errors.centroid_px()
+    arcsec_per_px = ARCSEC_PER_RAD / measured.camera.focal_length_px
     noisy_mag = np.abs(np.array(tally.noisy_mag) - errors.zero_point_mag)
     noisy_px = np.array(tally.noisy_px)
     glow = measured.glow
     calibration = measured.calibration
+    by_centroider = {}
+    for kind, off_px in tally.off_px.items():
+        by_centroider[kind] = error_spread(np.array(off_px))
+    channels_mag = {}
+    channels = measured.config.tracker.quantum_efficiencies
+    for key, errors_mag in zip(channels, tally.channels_mag, strict=False):
+        channels_mag[key] = error_spread(np.array(errors_mag))
 
     def spread(name: str) -> ErrorSpread:
         return error_spread(np.abs(errors.of(name)))
@@ -87,34 +99,21 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
         "stars": len(errors.stars),
         "flux_error_mag": spread("flux_mag"),
         "centroid_error_px": error_spread(centroid_px),
-        "centroid_error_arcsec": error_spread(
-            centroid_px * ARCSEC_PER_RAD / measured.camera.focal_length_px
-        ),
+        "centroid_error_arcsec": error_spread(centroid_px * arcsec_per_px),
         "centroider": measured.config.verify.centroider or USUAL,
-        "centroid_error_px_by": {
-            kind: error_spread(np.array(off_px)) for kind, off_px in tally.off_px.items()
-        },
+        "centroid_error_px_by": by_centroider,
         "lost": len(errors.lost),
         "passed": verdict.passed,
         "reasons": verdict.reasons,
-        **{
-            name: getattr(tally, name)
-            for name in ("blended", "clipped", "not_shown", "at_edge", "summed")
-        },
-        "channels_mag": {
-            key: error_spread(np.array(off))
-            for key, off in zip(
-                measured.config.tracker.quantum_efficiencies, tally.channels_mag, strict=False
-            )
-        },
+        "blended": tally.blended,
+        "clipped": tally.clipped,
+        "not_shown": tally.not_shown,
+        "at_edge": tally.at_edge,
+        "summed": tally.summed,
+        "channels_mag": channels_mag,
         "out_of_gamut": tally.out_of_gamut,
         "zero_point_mag": _finite(errors.zero_point_mag),
-        "scale_error": None if fit is None else fit.scale_error,
-        "rotation_arcsec": None if fit is None else fit.rotation_rad * ARCSEC_PER_RAD,
-        "offset_px": None if fit is None else fit.offset_px,
-        "tilt_deg": None if fit is None else tuple(map(math.degrees, fit.tilt_rad)),
-        "k1": None if fit is None else fit.k1,
-        "distortion_px": None if fit is None else fit.distortion_px,
+        **_geometry_keys(errors.geometry),
         "black_e_per_s_px": {"assumed": glow.assumed_e_per_s_px, "seen": glow.seen_e_per_s_px},
         "estimator_floor": {"flux_mag": spread("floor_mag"), "centroid_px": spread("floor_px")},
         "codes_alone": {
@@ -136,6 +135,20 @@ def summarise(verdict: Verdict) -> dict[str, Any]:
     }
 
 
+def _geometry_keys(fit: GeometryFit | None) -> dict[str, Any]:
+    """The keys of how monitor and lens stand, None for each with too few stars."""
+    if fit is None:
+        return dict.fromkeys(GEOMETRY_KEYS)
+    return {
+        "scale_error": fit.scale_error,
+        "rotation_arcsec": fit.rotation_rad * ARCSEC_PER_RAD,
+        "offset_px": fit.offset_px,
+        "tilt_deg": tuple(map(math.degrees, fit.tilt_rad)),
+        "k1": fit.k1,
+        "distortion_px": fit.distortion_px,
+    }
+
+
 def _finite(value: float) -> float | None:
     """The value, or None for what JSON cannot hold."""
     return value if math.isfinite(value) else None
@@ -147,14 +160,16 @@ def _by_magnitude(errors: DisplayErrors) -> list[dict[str, Any]]:
     v_mag = errors.of("v_mag")
     flux = np.abs(errors.of("flux_mag"))
     centroid = errors.centroid_px()
-    for low in range(math.floor(v_mag.min(initial=0.0)), math.ceil(v_mag.max(initial=0.0)) + 1):
+    first = math.floor(v_mag.min(initial=0.0))
+    last = math.ceil(v_mag.max(initial=0.0))
+    for low in range(first, last + 1):
         there = (v_mag >= low) & (v_mag < low + 1)
-        if there.any():
-            spreads = {
-                "flux_error_mag": error_spread(flux[there]),
-                "centroid_error_px": error_spread(centroid[there]),
-            }
-            rows.append({"v_from": low, "v_to": low + 1, "stars": int(there.sum()), **spreads})
+        if not there.any():
+            continue
+        row: dict[str, Any] = {"v_from": low, "v_to": low + 1, "stars": int(there.sum())}
+        row["flux_error_mag"] = error_spread(flux[there])
+        row["centroid_error_px"] = error_spread(centroid[there])
+        rows.append(row)
     return rows
 
 
@@ -167,19 +182,21 @@ def summary_lines(summary: dict[str, Any]) -> list[str]:
     noisy = summary["noisy"]
     rest = f"{summary['lost']} lost, {summary['blended']} blended, {summary['clipped']} clipped"
     rest += f", {summary['not_shown']} not shown, {summary['at_edge']} at edge"
-    rest += f", {summary['summed']} part of a blend" if summary["summed"] else ""
-    centroid = (
-        f"{three(summary['centroid_error_px'])} px, {three(summary['centroid_error_arcsec'])}"
-        " arcsec"
-    )
-    error_text = ", ".join(
-        f"{kind} {_number(errors.rms)}" for kind, errors in summary["centroid_error_px_by"].items()
-    )
+    if summary["summed"]:
+        rest += f", {summary['summed']} part of a blend"
+    centroid_px = three(summary["centroid_error_px"])
+    centroid_arcsec = three(summary["centroid_error_arcsec"])
+    by_kind = []
+    for kind, errors in summary["centroid_error_px_by"].items():
+        by_kind.append(f"{kind} {_number(errors.rms)}")
     lines = [
         f"{'stars':20}{summary['stars']} in {summary['fields']} fields; {rest}",
         f"{'flux error':20}{three(summary['flux_error_mag'])} mag (rms / 95 % / max)",
-        f"{'centroid error':20}{centroid}, by {summary['centroider']}",
-        f"{'by each centroider':20}{error_text} px rms",
+        (
+            f"{'centroid error':20}{centroid_px} px, {centroid_arcsec} arcsec, by"
+            f" {summary['centroider']}"
+        ),
+        f"{'by each centroider':20}{', '.join(by_kind)} px rms",
     ]
     for key, errors in summary["channels_mag"].items():
         lines.append(f"{key:21}{three(errors)} mag")
@@ -215,11 +232,8 @@ def write_report(directory: Path, verdict: Verdict) -> None:
     one cannot be written.
     """
     errors = verdict.errors
-    write_csv(
-        directory / "stars.csv",
-        [entry.name for entry in fields(Star)],
-        map(astuple, errors.stars + errors.lost),
-    )
+    columns = [column.name for column in fields(Star)]
+    write_csv(directory / "stars.csv", columns, map(astuple, errors.stars + errors.lost))
     _draw_field(directory / "field", errors, verdict.measured.camera.resolution_px)
     if errors.stars:
         _draw_errors(directory / "errors", verdict)
@@ -238,58 +252,49 @@ def _draw_errors(path: Path, verdict: Verdict) -> None:
     )
     note = f"Each point is one of {len(v_mag)} stars. The limit is for 95 % of them."
     with chart(path, finding, 2, note=note) as axes:
-        for axis, values, limit, label in (
-            (axes[0], np.abs(flux), limits.flux_mag, "flux error [mag]"),
-            (axes[1], centroid, limits.centroid_px, "place error [tracker px]"),
-        ):
-            axis.semilogy(
-                v_mag,
-                np.maximum(values, MIN_SHARE * limit),
-                ".",
-                color=MUTED,
-                ms=5,
-                alpha=0.7,
-                label="_star",
-            )
-            axis.axhline(limit, color=RED, linestyle="--", linewidth=1.4, label="limit")
-            axis.axhline(
-                max(p95(values), MIN_SHARE * limit),
-                color=BLUE,
-                linewidth=1.4,
-                label="95 % of stars",
-            )
-            axis.set_ylabel(label)
+        flux_axis, place_axis = axes
+        _draw_stars(flux_axis, v_mag, np.abs(flux), limits.flux_mag)
+        _draw_stars(place_axis, v_mag, centroid, limits.centroid_px)
+        flux_axis.set_ylabel("flux error [mag]")
+        place_axis.set_ylabel("place error [tracker px]")
+        place_axis.set_xlabel("V [mag]")
+        for axis in axes:
             label_ends(axis)
-        axes[1].set_xlabel("V [mag]")
+
+
+def _draw_stars(axis: Any, v_mag: FloatArray, errors: FloatArray, limit: float) -> None:
+    """Stars' errors by magnitude, at least MIN_SHARE of the limit; the limit, and what 95 % of
+    stars are within.
+    """
+    smallest = MIN_SHARE * limit
+    drawn = np.maximum(errors, smallest)
+    axis.semilogy(v_mag, drawn, ".", color=MUTED, ms=5, alpha=0.7, label="_star")
+    axis.axhline(limit, color=RED, linestyle="--", linewidth=1.4, label="limit")
+    within = max(p95(errors), smallest)
+    axis.axhline(within, color=BLUE, linewidth=1.4, label="95 % of stars")
 
 
 def _draw_field(path: Path, errors: DisplayErrors, resolution_px: tuple[int, int]) -> None:
-    x, y, dx, dy = (errors.of(name) for name in ("x_px", "y_px", "dx_px", "dy_px"))
+    x, y = errors.of("x_px"), errors.of("y_px")
+    dx, dy = errors.of("dx_px"), errors.of("dy_px")
     longest = max(p95(np.hypot(dx, dy)), 1e-9)
     arrow_px = ARROW_SHARE * resolution_px[0]
     finding = (
         f"Centroid errors of {len(x)} stars over the tracker's field; {len(errors.lost)} stars are"
         " lost"
     )
-    note = f"Arrows are enlarged {arrow_px / longest:.0f} times." + (
-        " Red crosses: lost stars." if errors.lost else ""
-    )
+    note = f"Arrows are enlarged {arrow_px / longest:.0f} times."
+    if errors.lost:
+        note += " Red crosses: lost stars."
     with chart(path, finding, note=note, height_inch=7.4) as (axis,):
         axis.plot(x, y, ".", color=MUTED, markersize=3)
-        arrows = axis.quiver(
-            x,
-            y,
-            dx,
-            dy,
-            angles="xy",
-            scale_units="xy",
-            scale=longest / arrow_px,
-            width=0.002,
-            color=BLUE,
-        )
+        axes_units = {"angles": "xy", "scale_units": "xy", "scale": longest / arrow_px}
+        arrows = axis.quiver(x, y, dx, dy, **axes_units, width=0.002, color=BLUE)
         key = {"labelpos": "E", "coordinates": "axes", "fontproperties": {"size": SMALL_PT}}
         axis.quiverkey(arrows, 0.86, 1.03, longest, f"{longest:.2g} px", **key)
-        axis.plot([s.x_px for s in errors.lost], [s.y_px for s in errors.lost], "x", color=RED)
+        lost_x = [star.x_px for star in errors.lost]
+        lost_y = [star.y_px for star in errors.lost]
+        axis.plot(lost_x, lost_y, "x", color=RED)
         axis.set_xlim(0, resolution_px[0])
         axis.set_ylim(resolution_px[1], 0)
         axis.set_aspect("equal")

@@ -44,8 +44,8 @@ class DisplayErrors:
         return len(self.stars) + len(self.lost)
 
     def of(self, name: str) -> FloatArray:
-        """One of the stars' errors (n,), by the name of `Star`'s field; NaN of codes that lose
-        the star.
+        """One of the stars' figures (n,), by the name of `Star`'s field; NaN where the codes alone
+        lose the star.
         """
         return np.array([getattr(star, name) for star in self.stars])
 
@@ -57,15 +57,17 @@ class DisplayErrors:
 def display_errors(measured: Measured) -> DisplayErrors:
     """The errors of all fields' stars."""
     stars = measured.tally.stars
-    zero_point = median([s.flux_mag for s in stars])
-    codes_zero_point = median([s.codes_mag for s in stars])
-    stars = [
-        replace(s, flux_mag=s.flux_mag - zero_point, codes_mag=s.codes_mag - codes_zero_point)
-        for s in stars
-    ]
+    zero_point = median([star.flux_mag for star in stars])
+    codes_zero_point = median([star.codes_mag for star in stars])
+    relative = []
+    for star in stars:
+        flux_mag = star.flux_mag - zero_point
+        codes_mag = star.codes_mag - codes_zero_point
+        relative.append(replace(star, flux_mag=flux_mag, codes_mag=codes_mag))
     displaced = np.concatenate([np.empty((0, 4)), *measured.tally.displaced])
     geometry = fit_geometry(displaced, measured.camera, measured.config.verify.centroid_px)
-    return DisplayErrors(stars, measured.tally.lost, zero_point, codes_zero_point, geometry)
+    lost = measured.tally.lost
+    return DisplayErrors(relative, lost, zero_point, codes_zero_point, geometry)
 
 
 def median(values: list[float]) -> float:
@@ -82,31 +84,21 @@ def p95(errors: FloatArray) -> float:
 
 
 def reasons(measured: Measured, errors: DisplayErrors) -> list[str]:
-    """The reasons against a bench; none where it passes."""
+    """Every reason against a bench, in words; none where it passes."""
     too_wide = _too_wide(measured)
     if not errors.looked_for:
         return [_none(measured), *too_wide]
     lost = _lost(measured, errors)
     centroid = _centroids(measured, errors)
-    if lost or centroid:
-        geometry = _geometry(measured, errors)
-    else:
-        geometry = []
+    against = [*lost, *centroid]
+    if against:
+        against += _geometry(measured, errors)
     # A few stars found by chance, or far from the middle of their windows, say nothing about light.
     mostly_lost = len(errors.lost) > MIN_SHARE * errors.looked_for
-    if mostly_lost:
-        light = []
-    else:
-        light = [*_light(measured, errors), *_codes(measured, errors)]
-    return [
-        *lost,
-        *centroid,
-        *geometry,
-        *light,
-        *_black(measured),
-        *_floor(measured, errors),
-        *too_wide,
-    ]
+    if not mostly_lost:
+        against += _light(measured, errors)
+        against += _codes(measured, errors)
+    return [*against, *_black(measured), *_floor(measured, errors), *too_wide]
 
 
 def _none(measured: Measured) -> str:
@@ -195,10 +187,8 @@ def _geometry(measured: Measured, errors: DisplayErrors) -> list[str]:
         else:
             cure = "look at q_cam_to_mon and principal_point_px"
         geometry_fit.append(f"the field is shifted by ({right:+.2f}, {down:+.2f}) px: {cure}")
-    return [
-        *geometry_fit,
-        *_lens(fit, limit, again if measured_lens else "hilstar calibrate geometric measures it"),
-    ]
+    cure = again if measured_lens else "hilstar calibrate geometric measures it"
+    return [*geometry_fit, *_lens(fit, limit, cure)]
 
 
 def _lens(fit: GeometryFit, limit_px: float, cure: str) -> list[str]:
@@ -232,14 +222,14 @@ def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
     p95_mag = p95(np.abs(errors.of("flux_mag")))
     alone = p95(np.abs(errors.of("codes_mag")))
     if p95_mag > limit:
-        response = math.sqrt(max(p95_mag**2 - alone**2, 0.0)) > limit
-        cause = (
-            ": light does not follow the codes as assumed, look at the monitor's response and"
-            " uniformity"
-        )
-        reasons.append(
-            f"flux is {p95_mag:.3f} mag off at 95 % (limit {limit:g}){cause if response else ''}"
-        )
+        text = f"flux is {p95_mag:.3f} mag off at 95 % (limit {limit:g})"
+        beside_codes_mag = math.sqrt(max(p95_mag**2 - alone**2, 0.0))
+        if beside_codes_mag > limit:
+            text += (
+                ": light does not follow the codes as assumed, look at the monitor's response and"
+                " uniformity"
+            )
+        reasons.append(text)
     offset = errors.zero_point_mag
     of_codes = errors.codes_zero_point_mag
     if abs(offset) > limit:
@@ -254,6 +244,7 @@ def _light(measured: Measured, errors: DisplayErrors) -> list[str]:
 
 
 def _black(measured: Measured) -> list[str]:
+    """What the screen's black gives more or less than is assumed."""
     glow = measured.glow
     if abs(glow.seen_e_per_s_px - glow.assumed_e_per_s_px) <= glow.limit_e_per_s_px:
         return []
@@ -274,18 +265,22 @@ def _floor(measured: Measured, errors: DisplayErrors) -> list[str]:
     if mag <= limits.flux_mag and px <= limits.centroid_px:
         return []
     glass = measured.glass
-    beside = glass is not None and px > limits.centroid_px and glass.px > MIN_SHARE * px
-    if glass is not None and (beside or (mag > limits.flux_mag and glass.mag > MIN_SHARE * mag)):
-        return [
-            f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue"
-            f" at 95 %: the glass of [tracker.optics] psf has centroids {glass.px:.3f} px beside"
-            f" their chief rays and light {glass.mag:.3f} mag under the axis's at 95"
-            f" %{CURE if limits.centroider != 'psf' else ''}"
-        ]
-    return [
+    text = (
         f"the linear image itself is measured {mag:.3f} mag and {px:.3f} px off the catalogue at 95"
-        " %: the tracker's PSF is too narrow or too wide for its pixels, or lies beside its chief"
-        " ray, so that nothing can be said about the display"
+        " %: "
+    )
+    if glass is not None:
+        by_place = px > limits.centroid_px and glass.px > MIN_SHARE * px
+        by_light = mag > limits.flux_mag and glass.mag > MIN_SHARE * mag
+        if by_place or by_light:
+            cure = CURE if limits.centroider != "psf" else ""
+            return [
+                f"{text}the glass of [tracker.optics] psf has centroids {glass.px:.3f} px beside"
+                f" their chief rays and light {glass.mag:.3f} mag under the axis's at 95 %{cure}"
+            ]
+    return [
+        f"{text}the tracker's PSF is too narrow or too wide for its pixels, or lies beside its"
+        " chief ray, so that nothing can be said about the display"
     ]
 
 
@@ -300,26 +295,18 @@ def _codes(measured: Measured, errors: DisplayErrors) -> list[str]:
     if mag <= limits.flux_mag and px <= limits.centroid_px:
         return []
     # What is proposed has to suit the monitor as it is, too.
-    calibrations = []
-    for calibration in (measured.calibration, measured.true_calibration):
-        if calibration is not None:
-            calibrations.append(calibration)
+    calibrations = [measured.calibration]
+    if measured.true_calibration is not None:
+        calibrations.append(measured.true_calibration)
+    ways = []
     if render.quantisation != BY_COST[-1]:
-        ways = [f'quantisation = "{BY_COST[-1]}"']
+        ways.append(f'quantisation = "{BY_COST[-1]}"')
+    if not render.bit_stealing and all(c.can_steal_bits for c in calibrations):
+        ways.append("bit_stealing = true")
+    if all(c.is_formula for c in calibrations):
+        ways.append("more bits")
     else:
-        ways = []
-    ways += (
-        ["bit_stealing = true"]
-        if not render.bit_stealing and all(c.can_steal_bits for c in calibrations)
-        else []
-    )
-    ways += [
-        (
-            "more bits"
-            if all(c.is_formula for c in calibrations)
-            else "a monitor calibrated on more bits"
-        )
-    ]
+        ways.append("a monitor calibrated on more bits")
     ways += ["a larger brightest_v_mag", "a smaller faintest_v_mag"]
     return [
         f"the codes alone cost {mag:.3f} mag and {px:.3f} px at 95 %; try {', '.join(ways[:-1])} or"

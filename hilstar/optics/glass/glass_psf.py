@@ -19,7 +19,14 @@ from numpy.polynomial.polynomial import polyvander
 
 from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import InputError
-from hilstar.optics.glass.psf_file import MAX_NEGATIVE, TOLERANCE, Glass, moment_carriers, principal
+from hilstar.optics.glass.psf_file import (
+    MAX_NEGATIVE,
+    TOLERANCE,
+    Glass,
+    moment_carriers,
+    offsets,
+    principal,
+)
 from hilstar.optics.psf import (
     BLACK_SAMPLES,
     MAX_FOOTPRINT_PX,
@@ -42,12 +49,13 @@ MAX_STEPS, MIN_STEPS, TABLE_SIDE, PLACES_A_PX = 4, 2, 1024, 32
 # What the reduced stamps leave out of all tabulated ones, rms, relative to them. Flux, centroids
 # and second moments are kept.
 STAMP_TOLERANCE = 3e-4
-FIRST_STAMPS, MAX_STAMPS = 48, 400
+FIRST_STAMPS, MAX_STAMPS = 48, 400  # the first number that is tried, doubled up to the last
 MAX_DEGREE = 3  # splines over wavelength and focus, polynomials over a scattered field
-MAX_GRID_DEGREE = 4
-ON_EDGE_PX = 1e-6
+MAX_GRID_DEGREE = 4  # of splines over a full grid
+ON_EDGE_PX = 1e-6  # of the field's scale: rounding, by which a point on the hull is outside it
 SMALLEST, DARK = 1e-15, 1e-12  # numbers, and illuminations, that count as none
-SPRITES_AT_ONCE_PX = 2_000_000
+SPRITES_AT_ONCE_PX = 2_000_000  # bounds the memory: their stamps take 8 MB
+# samples to a pixel; rounds in which a weight becomes as wide as a PSF
 MIN_REGRIDDED, WIDTH_ROUNDS = 4, 20
 # basis images of the simpler glasses that may stand for one
 COMPONENTS = (3, 6, 12)
@@ -57,9 +65,10 @@ Kernel = Literal["linear", "thin_plate_spline", "quintic"]
 
 
 class NodeSpline:
-    """Functions of one variable, one of each of `nodes` (k,), rising: 1 there, 0 at the others.
+    """Interpolation in one variable: for each of its `nodes` (k,), which rise, a function that is 1
+    at that node and 0 at the others.
 
-    Beyond the nodes the values at their ends count.
+    Beyond the first and the last node the functions keep their values there.
     """
 
     def __init__(self, nodes: FloatArray, max_degree: int = MAX_DEGREE) -> None:
@@ -67,47 +76,62 @@ class NodeSpline:
         from scipy.interpolate import make_interp_spline
 
         self._nodes = nodes
-        self._of = None
-        self._middle = (nodes[-1] + nodes[0]) / 2
-        self._half = (nodes[-1] - nodes[0]) / 2 or 1.0
+        self._spline = None
+        first = nodes[0]
+        last = nodes[-1]
+        self._middle = (last + first) / 2
+        self._half = (last - first) / 2 or 1.0
         if len(nodes) > max_degree + 1:
-            self._of = make_interp_spline(nodes, np.eye(len(nodes)), max_degree)
+            self._spline = make_interp_spline(nodes, np.eye(len(nodes)), max_degree)
         else:  # one polynomial, which is quicker
-            self._terms = np.linalg.inv(
-                polyvander((nodes - self._middle) / self._half, len(nodes) - 1)
-            ).T
+            self._coefficients = np.linalg.inv(self._powers(nodes)).T
+
+    def _powers(self, places: FloatArray) -> FloatArray:
+        """The powers (n, k) of places (n,), which are scaled to -1 to 1 between the ends."""
+        scaled = (places - self._middle) / self._half
+        return polyvander(scaled, len(self._nodes) - 1)
 
     def __call__(self, at: FloatArray) -> FloatArray:
         """The functions (n, k) at places (n,)."""
         at = np.clip(at, self._nodes[0], self._nodes[-1])
-        if self._of is not None:
-            return np.asarray(self._of(at))
-        return np.asarray(
-            (self._terms @ polyvander((at - self._middle) / self._half, len(self._nodes) - 1).T).T
-        )
+        if self._spline is not None:
+            return np.asarray(self._spline(at))
+        return np.asarray((self._coefficients @ self._powers(at).T).T)
 
 
 class Field:
-    """Functions over the field, one of each of its points (F, 2): 1 there, 0 at the others, smooth
-    between.
+    """Interpolation over the field: for each of its points (F, 2), px, a smooth function that is 1
+    at that point and 0 at the others.
 
-    On a full grid they are products of splines, elsewhere radial basis functions with polynomials.
-    Beyond the points' convex hull they have the values of its nearest place.
+    On a full grid the functions are products of splines, elsewhere radial basis functions with
+    polynomials. Beyond the points' convex hull they keep the values at the nearest place of its
+    edge.
     """
 
     def __init__(self, places_px: FloatArray) -> None:
         self.places_px = places_px
-        self._scale = max(1.0, float(np.abs(places_px - places_px.mean(axis=0)).max()))
-        self._degree = max((d for d in range(MAX_DEGREE + 1) if self._holds(d)), default=0)
+        self._middle_px = places_px.mean(axis=0)
+        farthest_px = float(np.abs(places_px - self._middle_px).max())
+        self._scale = max(1.0, farthest_px)
+        self._degree = 0
+        for degree in range(MAX_DEGREE + 1):
+            if self._holds(degree):
+                self._degree = degree
         self.hull_px = places_px[self._corners()]
-        columns, rows = (np.unique(axis) for axis in places_px.T)
-        grid = np.stack([part.T.ravel() for part in np.meshgrid(columns, rows)], axis=1)
-        self._grid = None  # `places_px` is sorted by x, then y
+        columns = np.unique(places_px[:, 0])
+        rows = np.unique(places_px[:, 1])
+        # `places_px` is sorted by x, then y
+        grid_x, grid_y = np.meshgrid(columns, rows, indexing="ij")
+        grid = np.stack([grid_x.ravel(), grid_y.ravel()], axis=1)
+        self._grid = None
         if grid.shape == places_px.shape and (grid == places_px).all():
-            self._grid = NodeSpline(columns, MAX_GRID_DEGREE), NodeSpline(rows, MAX_GRID_DEGREE)
+            across = NodeSpline(columns, MAX_GRID_DEGREE)
+            down = NodeSpline(rows, MAX_GRID_DEGREE)
+            self._grid = (across, down)
 
     def _scaled(self, places_px: FloatArray) -> FloatArray:
-        return np.asarray((places_px - self.places_px.mean(axis=0)) / self._scale)
+        """Places from the points' mean, in units of the farthest point's distance."""
+        return np.asarray((places_px - self._middle_px) / self._scale)
 
     def _holds(self, degree: int) -> bool:
         """Whether the points determine a polynomial of that degree with some to spare."""
@@ -117,18 +141,18 @@ class Field:
             for j in range(degree + 1 - i):
                 products.append(x**i * y**j)
         terms = np.stack(products, axis=1)
-        if degree > 1:
-            enough = terms.shape[1] * 1.4 <= len(x)
-        else:
-            enough = terms.shape[1] <= len(x)
-        return bool(enough and np.linalg.matrix_rank(terms, tol=1e-6 * len(x)) == terms.shape[1])
+        count = terms.shape[1]
+        needed = count * 1.4 if degree > 1 else count
+        rank = np.linalg.matrix_rank(terms, tol=1e-6 * len(x))
+        return bool(needed <= len(x) and rank == count)
 
     def _corners(self) -> list[int]:
         """The points at the corners of the hull, in order; the two ends of a line."""
         if self._holds(1):
             from scipy.spatial import ConvexHull
 
-            return [int(k) for k in ConvexHull(self.places_px).vertices]
+            hull = ConvexHull(self.places_px)
+            return [int(k) for k in hull.vertices]
         along = self.places_px @ np.ptp(self.places_px, axis=0)
         return sorted({int(along.argmin()), int(along.argmax())})
 
@@ -139,25 +163,29 @@ class Field:
         places = np.stack([x_px, y_px], axis=1)
         beyond_px = np.zeros(len(places))
         begin = self.hull_px
-        along = np.roll(self.hull_px, -1, axis=0) - self.hull_px
+        along = np.roll(begin, -1, axis=0) - begin
         off = places[:, None] - begin
         cross_px = along[:, 0] * off[..., 1] - along[:, 1] * off[..., 0]
         if len(begin) > 2:
-            outside = np.flatnonzero((cross_px < -ON_EDGE_PX * self._scale).any(axis=1))
+            is_outside = (cross_px < -ON_EDGE_PX * self._scale).any(axis=1)
+            outside = np.flatnonzero(is_outside)
         else:
             outside = np.arange(len(places))  # a line or a point has no inside
         if len(outside):
             length2 = np.maximum((along * along).sum(axis=1), 1e-300)
-            part = np.clip((off[outside] * along).sum(axis=2) / length2, 0, 1)
-            nearest = begin + part[..., None] * along
-            far = np.linalg.norm(nearest - places[outside, None], axis=2)
-            which = far.argmin(axis=1)
-            beyond_px[outside] = far[np.arange(len(outside)), which]
-            places[outside] = nearest[np.arange(len(outside)), which]
+            advance = (off[outside] * along).sum(axis=2)
+            part = np.clip(advance / length2, 0, 1)
+            on_edges = begin + part[..., None] * along
+            far_px = np.linalg.norm(on_edges - places[outside, None], axis=2)
+            star = np.arange(len(outside))
+            nearest_edge = far_px.argmin(axis=1)
+            beyond_px[outside] = far_px[star, nearest_edge]
+            places[outside] = on_edges[star, nearest_edge]
         return places, beyond_px
 
     @cached_property
     def _scattered(self) -> Callable[[FloatArray], FloatArray]:
+        """The functions (n, F) at scaled places (n, 2), of points that are no grid."""
         from scipy.interpolate import RBFInterpolator
 
         kernels: tuple[Kernel, ...] = "linear", "thin_plate_spline", "quintic", "quintic"
@@ -176,21 +204,23 @@ class Field:
         if len(self.places_px) == 1 or not len(places):
             return np.ones((len(places), len(self.places_px)))
         if self._grid is not None:
-            across, down = (
-                spline(place) for spline, place in zip(self._grid, places.T, strict=True)
-            )
-            return np.asarray((across.T[:, None] * down.T).reshape(-1, len(places)).T)
+            spline_x, spline_y = self._grid
+            across = spline_x(places[:, 0])
+            down = spline_y(places[:, 1])
+            products = across.T[:, None] * down.T
+            return np.asarray(products.reshape(-1, len(places)).T)
         return np.asarray(self._scattered(self._scaled(places)))
 
 
 @dataclass(frozen=True, slots=True)
 class _Stamps:
-    """Stamps, images of the light of pixels, from which PSFs are mixed: `stamps` (R, side^2).
+    """Images of the light of pixels, `stamps` (R, side^2), of which every star's image is a
+    weighted sum.
 
-    The coefficient of a stamp is a polynomial of a star's place within its pixel. `parts` (squares,
-    6 K, R) are the polynomials' coefficients for each basis image and each square of a pixel, in
-    the order of `_terms`. `sums` (R,) are the stamps' sums; `light` (K, n) is the light of pixels
-    by basis image at all tabulated places.
+    The weight of a stamp is a quadratic function of the star's place within its pixel, by squares
+    of the pixel. `parts` (squares, 6 K, R) are its coefficients for each basis image, in the order
+    of `_terms`. `sums` (R,) are the stamps' sums; `light` (K, n) is the light that pixels get of
+    each basis image at all tabulated places.
     """
 
     stamps: Float32Array
@@ -215,15 +245,17 @@ class Focused:
 
 
 class _Measured(SampledPsf):
-    """An image whose width is wanted, and which no star is drawn by."""
+    """An image of which only the width is asked for. No star is drawn by it, so negative light is
+    no fault.
+    """
 
     max_negative = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class GlassPsf(SampledPsf):
-    """A glass at one focus: stars are drawn each by place and spectrum, all else by the mean PSF in
-    the field's middle.
+    """A glass at one focus. Each star is drawn by its place and its spectrum, all other light by
+    the mean PSF in the middle of the field.
 
     `mean_shares` (L,) are the shares that each wavelength has of light without a spectrum of its
     own. Make it with `glass_psf`.
@@ -240,9 +272,7 @@ class GlassPsf(SampledPsf):
     def __post_init__(self) -> None:
         """Refuse what is no PSF, the mean and each of the others."""
         super().__post_init__()
-        stamps = self._stamps
-        weights = self.optics.weights.reshape(-1, len(self.optics.basis))
-        least = float((weights @ stamps.light).min())
+        least = float((self._psf_weights @ self._stamps.light).min())
         if least < 1 - MAX_UNEVEN:
             raise InputError(
                 f"a star's pixels get {least:.1%} of a PSF's light at one place in a pixel, and"
@@ -251,14 +281,21 @@ class GlassPsf(SampledPsf):
             )
 
     @cached_property
+    def _psf_weights(self) -> FloatArray:
+        """The weights (F L, K) of the basis images by PSF."""
+        return self.optics.weights.reshape(-1, len(self.optics.basis))
+
+    @cached_property
     def width_px(self) -> tuple[float, float]:
         """The smaller of the mean's and the sharpest PSF's: paths are sampled for all."""
-        flat = self.optics.weights.reshape(-1, len(self.optics.basis))
-        peak = (flat @ self.optics.basis.reshape(len(self.optics.basis), -1)).max(axis=1)
-        sharpest = np.tensordot(flat[peak.argmax()], self.optics.basis, axes=1).clip(min=0)
+        basis = self.optics.basis
+        psfs = self._psf_weights @ basis.reshape(len(basis), -1)
+        highest = psfs.max(axis=1).argmax()
+        sharpest = np.tensordot(self._psf_weights[highest], basis, axes=1)
         widths = []
-        for samples in (self.samples, sharpest):
-            widths.append(_Measured(samples, self.per_px, self.pixel_integrated).width_px)
+        for samples in (self.samples, sharpest.clip(min=0)):
+            image = _Measured(samples, self.per_px, self.pixel_integrated)
+            widths.append(image.width_px)
         x, y = np.min(widths, axis=0).tolist()
         return x, y
 
@@ -267,17 +304,24 @@ class GlassPsf(SampledPsf):
         """The side of the smallest odd square outside which no PSF has more than MAX_CUT of its
         light.
         """
-        count, height, width = self.optics.basis.shape
-        y, x = np.indices((height, width))
-        ring = np.maximum(np.abs(y - height // 2), np.abs(x - width // 2)).ravel()
-        light = np.stack([np.bincount(ring, image.ravel()) for image in self.optics.basis])
-        light_within = np.cumsum(self.optics.weights.reshape(-1, count) @ light, axis=1)
+        _, height, width = self.optics.basis.shape
+        down = np.abs(offsets(height))
+        across = np.abs(offsets(width))
+        ring = np.maximum(down[:, None], across).ravel()
+        rings = []
+        for image in self.optics.basis:
+            rings.append(np.bincount(ring, image.ravel()))
+        light = self._psf_weights @ np.stack(rings)
+        light_within = np.cumsum(light, axis=1)
         cut = np.abs(1 - light_within).max(axis=0)
         too_much = np.flatnonzero(cut > MAX_CUT)
-        last_ring = min(int(too_much[-1]) + 1, len(cut) - 1) if len(too_much) else 0
+        last_ring = 0
+        if len(too_much):
+            last_ring = min(int(too_much[-1]) + 1, len(cut) - 1)
         # samples of which pixels are integrated have light from half a pixel around them
         pixel_half_px = 0.5 if self.pixel_integrated else 0.0
-        side = 2 * math.ceil((last_ring + 0.5) / self.per_px + pixel_half_px) + 1
+        reach_px = (last_ring + 0.5) / self.per_px + pixel_half_px
+        side = 2 * math.ceil(reach_px) + 1
         if side > MAX_FOOTPRINT_PX:
             raise InputError(
                 f"a PSF's light reaches over {side} px, more than {MAX_FOOTPRINT_PX}; cut off what"
@@ -287,42 +331,50 @@ class GlassPsf(SampledPsf):
 
     @cached_property
     def peak_share(self) -> float:
-        """The largest of the sharpest PSF, where a star is in a pixel's middle, and of the mean."""
-        return max(float(self._table.max()), float(self._centred().max()))
+        """The largest share that one pixel gets: of the sharpest PSF, for a star in the middle of a
+        pixel, or of the mean PSF at any place.
+        """
+        of_mean = float(self._table.max())
+        of_any = float(self._centred().max())
+        return max(of_mean, of_any)
 
     def _centred(self) -> Float32Array:
         """The light (F L, side^2) of the pixels about a star in the middle of a pixel, by each of
         the PSFs.
         """
-        weights = self.optics.weights.reshape(-1, len(self.optics.basis)).astype(np.float32)
-        return self._parts(weights, *np.zeros((2, len(weights)))) @ self._stamps.stamps
+        weights = self._psf_weights.astype(np.float32)
+        middle_px = np.zeros(len(weights))
+        return self._parts(weights, middle_px, middle_px) @ self._stamps.stamps
 
     def _tabulated(self, steps: int) -> list[FloatArray]:
         """The light that pixels of the footprint collect from the rows and the columns of basis
         images, (steps + 1, side, samples) each, by the star's place within its pixel.
         """
         side = self.footprint_px
-        at_px = np.arange(side) - side // 2 - (np.arange(steps + 1)[:, None] / steps - 0.5)
-        shape = self.optics.basis.shape[1:]
-        basis_pixels = (
-            _pixels_of(size, self.per_px, at_px.ravel(), self.pixel_integrated) for size in shape
-        )
-        return [part.reshape(steps + 1, side, -1) for part in basis_pixels]
+        star_px = np.arange(steps + 1)[:, None] / steps - 0.5
+        at_px = (offsets(side) - star_px).ravel()
+        tables = []
+        for size in self.optics.basis.shape[1:]:
+            pixels = _pixels_of(size, self.per_px, at_px, self.pixel_integrated)
+            tables.append(pixels.reshape(steps + 1, side, -1))
+        return tables
 
     @cached_property
     def _squares(self) -> int:
         """How many squares a pixel has along each side."""
         basis = self.optics.basis
-        weights = self.optics.weights.reshape(-1, len(self.optics.basis))
-        lines = (weights @ basis.sum(axis=axis) for axis in (2, 1))
-        curvatures = []
-        for line, table in zip(lines, self._tabulated(PLACES_A_PX), strict=True):
-            curvatures.append(line @ np.diff(table, 3, axis=0).swapaxes(1, 2))
+        rows = self._psf_weights @ basis.sum(axis=2)
+        columns = self._psf_weights @ basis.sum(axis=1)
+        row_table, column_table = self._tabulated(PLACES_A_PX)
+        largest = 0.0
+        for line, table in ((rows, row_table), (columns, column_table)):
+            differences = np.diff(table, 3, axis=0)
+            of_lines = line @ differences.swapaxes(1, 2)
+            largest = max(largest, float(np.abs(of_lines).max()))
         # over a square of 1 px, by Chebyshev's
-        cubic = (
-            max(float(np.abs(curvature).max()) for curvature in curvatures) * PLACES_A_PX**3 / 192
-        )
-        return int(np.clip(math.ceil(np.cbrt(cubic / CUBIC_TOLERANCE)), MIN_SQUARES, MAX_SQUARES))
+        cubic = largest * PLACES_A_PX**3 / 192
+        squares = math.ceil(np.cbrt(cubic / CUBIC_TOLERANCE))
+        return int(np.clip(squares, MIN_SQUARES, MAX_SQUARES))
 
     @cached_property
     def _stamps(self) -> _Stamps:
@@ -331,70 +383,75 @@ class GlassPsf(SampledPsf):
         """
         side = self.footprint_px
         squares = self._squares
-        steps_a_square = min(
-            MAX_STEPS, max(MIN_STEPS, min(TABLE_SIDE // side, MAX_STEPS * 6) // squares)
-        )
+        steps_a_pixel = min(TABLE_SIDE // side, MAX_STEPS * 6)
+        steps_a_square = min(MAX_STEPS, max(MIN_STEPS, steps_a_pixel // squares))
         steps = steps_a_square * squares
+        places_a_side = steps + 1
         count = len(self.optics.basis)
-        down, across = (
-            _normal_floats(part.reshape(-1, part.shape[2])) for part in self._tabulated(steps)
-        )
-        used = np.maximum(np.sqrt((self.optics.weights**2).mean(axis=(0, 1))), 1e-30).astype(
-            np.float32
-        )
-        table = np.empty((count, (steps + 1) ** 2, side * side), dtype=np.float32)
-        for image, scale, table_part in zip(
-            _normal_floats(self.optics.basis), used, table, strict=True
-        ):
-            pixels = (down @ (scale * image) @ across.T).reshape(steps + 1, side, steps + 1, side)
-            table_part[:] = pixels.transpose(0, 2, 1, 3).reshape(table_part.shape)
+        row_table, column_table = self._tabulated(steps)
+        down = _normal_floats(row_table.reshape(-1, row_table.shape[2]))
+        across = _normal_floats(column_table.reshape(-1, column_table.shape[2]))
+        # images are tabulated as strong as they are used: small ones need less care
+        mean_squares = (self.optics.weights**2).mean(axis=(0, 1))
+        used = np.maximum(np.sqrt(mean_squares), 1e-30).astype(np.float32)
+        basis = _normal_floats(self.optics.basis)
+        table = np.empty((count, places_a_side**2, side * side), dtype=np.float32)
+        for image, scale, image_table in zip(basis, used, table, strict=True):
+            pixels = down @ (scale * image) @ across.T
+            by_axis = pixels.reshape(places_a_side, side, places_a_side, side)
+            image_table[:] = by_axis.transpose(0, 2, 1, 3).reshape(image_table.shape)
         stamps, coefficients = _few(table.reshape(-1, side * side), side)
-        by_place = (coefficients.reshape(count, -1) / used[:, None]).reshape(
-            count, steps + 1, steps + 1, -1
-        )
+        by_place = coefficients.reshape(count, -1) / used[:, None]
+        by_place = by_place.reshape(count, places_a_side, places_a_side, -1)
         places = np.linspace(-1, 1, steps_a_square + 1)
-        y, x = (part.ravel() for part in np.meshgrid(places, places, indexing="ij"))
-        fit = np.linalg.pinv(_terms(x, y)).astype(np.float32)
+        y, x = np.meshgrid(places, places, indexing="ij")
+        terms = _terms(x.ravel(), y.ravel())
+        fit = np.linalg.pinv(terms).astype(np.float32)
         parts = np.empty((squares**2, fit.shape[0], count, len(stamps)), dtype=np.float32)
-        for number, table_part in enumerate(parts):
-            row, column = (steps_a_square * place for place in divmod(number, squares))
-            square = by_place[
-                :, row : row + steps_a_square + 1, column : column + steps_a_square + 1
-            ]
-            table_part[:] = np.tensordot(fit, square.reshape(count, -1, len(stamps)), axes=(1, 1))
+        for number, square_parts in enumerate(parts):
+            row, column = divmod(number, squares)
+            first_row = steps_a_square * row
+            first_column = steps_a_square * column
+            rows = slice(first_row, first_row + steps_a_square + 1)
+            columns = slice(first_column, first_column + steps_a_square + 1)
+            square = by_place[:, rows, columns].reshape(count, -1, len(stamps))
+            square_parts[:] = np.tensordot(fit, square, axes=(1, 1))
         light = table.sum(axis=2) / used[:, None]
-        return _Stamps(
-            stamps, parts.reshape(squares**2, -1, len(stamps)), stamps.sum(axis=1), light
-        )
+        by_square = parts.reshape(squares**2, -1, len(stamps))
+        return _Stamps(stamps, by_square, stamps.sum(axis=1), light)
 
     def _mixed(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> Float32Array:
-        """How much stars at places (n,) have of each basis image (n, K); `shares` as
-        spectra of `Psf`.
+        """The weights (n, K) of the basis images in the light of stars at places (n,); `shares` are
+        spectra as in `Psf`.
         """
         by_field = self.field(x_px, y_px).T.astype(np.float32)
         shares = shares.T.astype(np.float32, order="C")
         by_point = by_field[:, None] * shares.reshape(shares.shape[0], -1)
-        return np.asarray(by_point.reshape(len(self._light), -1).T @ self._light)
+        light = by_point.reshape(len(self._light), -1)
+        return np.asarray(light.T @ self._light)
 
     @cached_property
     def _sums(self) -> Float32Array:
+        """The light (K,) of each basis image."""
         return np.asarray(self.optics.basis.sum(axis=(1, 2)), dtype=np.float32)
 
     @cached_property
     def _light(self) -> Float32Array:
-        """The weights of each point's and wavelength's light (F L, K): a PSF's, times its
-        illumination inside the image.
+        """The weights (F L, K) of the basis images in the light of each field point and wavelength:
+        those of its PSF, times its illumination inside the image.
         """
         optics = self.optics
-        light = optics.weights * (optics.illumination * optics.inside)[..., None]
-        return np.asarray(light.reshape(-1, len(optics.basis)), dtype=np.float32)
+        inside = optics.illumination * optics.inside
+        light = optics.weights * inside[..., None]
+        by_psf = light.reshape(-1, len(optics.basis))
+        return np.asarray(by_psf, dtype=np.float32)
 
     def _parts(self, weights: Float32Array, x_px: FloatArray, y_px: FloatArray) -> Float32Array:
         """The coefficients (n, R) of the stamps for stars at places (n,), sorted by `_square`, with
         `weights` (n, K) of the basis images.
         """
-        square, *within = _square(x_px, y_px, self._squares)
-        terms = _terms(*within).astype(np.float32)[:, :, None]
+        square, within_x, within_y = _square(x_px, y_px, self._squares)
+        terms = _terms(within_x, within_y).astype(np.float32)[:, :, None]
         stamp_parts = self._stamps.parts
         counts = np.bincount(square, minlength=self._squares**2)
         parts = np.empty((len(terms), stamp_parts.shape[2]), dtype=np.float32)
@@ -404,20 +461,20 @@ class GlassPsf(SampledPsf):
             if count:
                 begin = end
                 end = end + count
-                products = np.multiply(terms[begin:end], weights[begin:end, None], out=room[:count])
-                np.matmul(products.reshape(count, -1), stamp_part, out=parts[begin:end])
+                stars = slice(begin, end)
+                products = np.multiply(terms[stars], weights[stars, None], out=room[:count])
+                np.matmul(products.reshape(count, -1), stamp_part, out=parts[stars])
         return parts
 
     @cached_property
     def moved_px(self) -> FloatArray:
         """The centroid of each PSF from its chief ray (F, L, 2), px."""
         _, height, width = self.optics.basis.shape
-        x = np.arange(width) - width // 2
-        y = np.arange(height) - height // 2
-        firsts = np.stack(
-            [self.optics.basis.sum(axis=1) @ x, self.optics.basis.sum(axis=2) @ y], axis=1
-        )
-        return np.asarray(self.optics.weights @ firsts / self.per_px)
+        basis = self.optics.basis
+        moment_x = basis.sum(axis=1) @ offsets(width)
+        moment_y = basis.sum(axis=2) @ offsets(height)
+        moments = np.stack([moment_x, moment_y], axis=1)
+        return np.asarray(self.optics.weights @ moments / self.per_px)
 
     def centroids_px(
         self, x_px: FloatArray, y_px: FloatArray, spectra: FloatArray
@@ -429,18 +486,18 @@ class GlassPsf(SampledPsf):
         """
         optics = self.optics
         by_field = self.field(x_px, y_px)
-        falls = optics.illumination * optics.inside
-        total = ((by_field @ falls) * spectra).sum(axis=1)
+        light = optics.illumination * optics.inside
+        total = ((by_field @ light) * spectra).sum(axis=1)
         lit = total > DARK
-        off = [
-            ((by_field @ (falls * off)) * spectra).sum(axis=1)
-            for off in np.moveaxis(self.moved_px, 2, 0)
-        ]
-        x, y = (
-            place + np.where(lit, first / np.where(lit, total, 1), 0)
-            for place, first in zip((x_px, y_px), off, strict=True)
-        )
-        return x, y, ((by_field @ optics.illumination) * spectra).sum(axis=1)
+        divisor = np.where(lit, total, 1)
+        centroids = []
+        moved_by_axis = np.moveaxis(self.moved_px, 2, 0)
+        for place_px, moved_px in zip((x_px, y_px), moved_by_axis, strict=True):
+            moment = ((by_field @ (light * moved_px)) * spectra).sum(axis=1)
+            centroids.append(place_px + np.where(lit, moment / divisor, 0))
+        x, y = centroids
+        illumination = ((by_field @ optics.illumination) * spectra).sum(axis=1)
+        return x, y, illumination
 
     def stamps_at(
         self,
@@ -451,13 +508,19 @@ class GlassPsf(SampledPsf):
     ) -> Float32Array:
         """See `Psf.stamps_at`: each by its place and spectrum."""
         rates = np.ones(len(x_px)) if electrons_per_s is None else electrons_per_s
-        order = np.argsort(_square(x_px, y_px, self._squares)[0])
-        stamps, scale = self._drawn(
-            x_px[order], y_px[order], spectra[order] if spectra.ndim == 2 else spectra
-        )
+        order = self._by_square(x_px, y_px)
+        star_spectra = spectra[order] if spectra.ndim == 2 else spectra
+        stamps, scale = self._drawn(x_px[order], y_px[order], star_spectra)
+        factors = rates[order] * scale
         squares = np.empty_like(stamps)
-        squares[order] = stamps * (rates[order] * scale)[:, None]
-        return squares.reshape(-1, self.footprint_px, self.footprint_px)
+        squares[order] = stamps * factors[:, None]
+        side = self.footprint_px
+        return squares.reshape(-1, side, side)
+
+    def _by_square(self, x_px: FloatArray, y_px: FloatArray) -> IntArray:
+        """The stars at places (n,) in the order of their squares, as `_drawn` wants them."""
+        square, _, _ = _square(x_px, y_px, self._squares)
+        return np.argsort(square)
 
     def _drawn(
         self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray
@@ -470,24 +533,22 @@ class GlassPsf(SampledPsf):
         # Polynomials and reduced stamps keep all light but some 1e-5 of it; this restores the rest.
         light = weights @ self._sums
         whole = parts @ self._stamps.sums
-        return parts @ self._stamps.stamps, np.asarray(
-            light / np.where(whole > 0, whole, np.inf), dtype=np.float32
-        )
+        scale = light / np.where(whole > 0, whole, np.inf)
+        return parts @ self._stamps.stamps, np.asarray(scale, dtype=np.float32)
 
     def unreduced(self, x_px: FloatArray, y_px: FloatArray, shares: FloatArray) -> FloatArray:
-        """The same of stars of 1 electron per second, by the whole basis: exact, and some
-        hundred times as slow.
+        """The light (n, side, side) about stars of 1 electron per second by the whole basis: what
+        `_drawn` approximates, exact and some hundred times as slow.
         """
         side = self.footprint_px
-        at_px = np.arange(side) - side // 2
+        at_px = offsets(side)
         stamps = np.empty((len(x_px), side, side))
-        for stamp, weights, x, y in zip(
-            stamps, self._mixed(x_px, y_px, shares), x_px, y_px, strict=True
-        ):
+        mixed = self._mixed(x_px, y_px, shares)
+        for stamp, weights, x, y in zip(stamps, mixed, x_px, y_px, strict=True):
             image = np.tensordot(weights.astype(np.float64), self.optics.basis, axes=1)
             height, width = image.shape
-            down_px = at_px - (y - np.floor(y + 0.5))
-            across_px = at_px - (x - np.floor(x + 0.5))
+            down_px = at_px - _in_pixel(y)
+            across_px = at_px - _in_pixel(x)
             down = _pixels_of(height, self.per_px, down_px, self.pixel_integrated)
             across = _pixels_of(width, self.per_px, across_px, self.pixel_integrated)
             stamp[:] = down @ image @ across.T
@@ -505,27 +566,32 @@ class GlassPsf(SampledPsf):
         # as `NodeSpline`; its product takes half the time of `np.add.at`
         from scipy.sparse import csc_array
 
-        side, (width, height) = self.footprint_px, resolution_px
+        side = self.footprint_px
+        width, height = resolution_px
+        # with room for what falls beyond the edges
         across = width + 2 * side
         size = (height + 2 * side) * across
-        near = np.arange(side, dtype=np.int32)
-        near = (near[:, None] * across + near).ravel()
+        pixel = np.arange(side, dtype=np.int32)
+        stamp_pixels = (pixel[:, None] * across + pixel).ravel()
         at_once = max(1, SPRITES_AT_ONCE_PX // side**2)
-        order = np.argsort(_square(x_px, y_px, self._squares)[0])
-        room = np.empty(0, np.float32)
+        order = self._by_square(x_px, y_px)
+        image = np.empty(0, np.float32)
         for begin in range(0, max(len(order), 1), at_once):
-            part = order[begin : begin + at_once]
-            at_px = x_px[part], y_px[part]
-            stamps, scale = self._drawn(*at_px, spectra[part] if spectra.ndim == 2 else spectra)
-            columns, rows = (
-                np.floor(place + 0.5).astype(np.int32) + side - side // 2 for place in at_px
-            )
-            places = (rows * across + columns)[:, None] + near
-            ends = np.arange(len(part) + 1, dtype=np.int32) * side**2
-            sparse = csc_array((stamps.ravel(), places.ravel(), ends), (size, len(part)))
-            light = np.asarray(sparse @ (electrons_per_s[part] * scale))
-            room = room + light if begin else light
-        return room.reshape(-1, across)[side:-side, side:-side]
+            star = order[begin : begin + at_once]
+            star_spectra = spectra[star] if spectra.ndim == 2 else spectra
+            stamps, scale = self._drawn(x_px[star], y_px[star], star_spectra)
+            middle_column = np.floor(x_px[star] + 0.5).astype(np.int32)
+            middle_row = np.floor(y_px[star] + 0.5).astype(np.int32)
+            column = middle_column + side - side // 2
+            row = middle_row + side - side // 2
+            places = (row * across + column)[:, None] + stamp_pixels
+            ends = np.arange(len(star) + 1, dtype=np.int32) * side**2
+            content = (stamps.ravel(), places.ravel(), ends)
+            sparse = csc_array(content, (size, len(star)))
+            light = np.asarray(sparse @ (electrons_per_s[star] * scale))
+            image = image + light if begin else light
+        with_room = image.reshape(-1, across)
+        return with_room[side:-side, side:-side]
 
     @property
     def in_the_middle(self) -> SampledPsf:
@@ -554,22 +620,22 @@ class GlassPsf(SampledPsf):
         sigma = sigma_px * self.per_px
         more = math.ceil(6 * sigma)
         wide = np.pad(self.optics.basis, ((0, 0), (more, more), (more, more)))
-        spread = np.stack(
-            [np.fft.ifft2(fourier_gaussian(np.fft.fft2(image), sigma)).real for image in wide]
-        )
-        optics = replace(self.optics, basis=spread)
-        return replace(self, samples=_middle(optics, self.field, self.mean_shares), optics=optics)
+        spread = []
+        for image in wide:
+            transformed = fourier_gaussian(np.fft.fft2(image), sigma)
+            spread.append(np.fft.ifft2(transformed).real)
+        return _of_optics(self, replace(self.optics, basis=np.stack(spread)))
 
 
 def glass_psf(glass: Glass, focus_um: float, mean_shares: FloatArray) -> GlassPsf:
     """A glass at one of its focus positions, or between them. Raises InputError for PSFs that
     cannot be drawn.
     """
-    at_focus = NodeSpline(glass.focuses_um)(np.array([focus_um]))[0]
-    weights, illumination, inside = (
-        np.tensordot(part, at_focus, axes=(2, 0))
-        for part in (glass.weights, glass.illumination, 1 - glass.outside)
-    )
+    over_focus = NodeSpline(glass.focuses_um)
+    at_focus = over_focus(np.array([focus_um]))[0]
+    weights = np.tensordot(glass.weights, at_focus, axes=(2, 0))
+    illumination = np.tensordot(glass.illumination, at_focus, axes=(2, 0))
+    inside = np.tensordot(1 - glass.outside, at_focus, axes=(2, 0))
     lateral_px = np.tensordot(glass.lateral_px, at_focus, axes=(2, 0))
     basis = glass.basis.astype(np.float64)
     optics = Focused(basis, weights, illumination, inside)
@@ -600,25 +666,30 @@ def regridded(images: FloatArray, per_px: int, matrix: FloatArray) -> tuple[Floa
     area = abs(float(np.linalg.det(matrix)))
     new_per_px = max(MIN_REGRIDDED, math.ceil(per_px / math.sqrt(area)))
     to_samples = np.linalg.inv(matrix) * per_px / new_per_px
-    half_x, half_y = (
-        np.ceil(np.abs(np.linalg.inv(to_samples)) @ (np.array([width, height]) // 2))
-        .astype(int)
-        .tolist()
-    )
-    y, x = np.indices((2 * half_y + 1, 2 * half_x + 1)) - np.array([half_y, half_x])[:, None, None]
+    old_half = np.array([width, height]) // 2
+    new_half = np.ceil(np.abs(np.linalg.inv(to_samples)) @ old_half)
+    half_x, half_y = new_half.astype(int).tolist()
+    x, y = np.meshgrid(offsets(2 * half_x + 1), offsets(2 * half_y + 1))
     columns, rows = np.tensordot(to_samples, np.stack([x, y]), axes=1)
     at = np.stack([rows + height // 2, columns + width // 2])
-    drawn: FloatArray = np.stack(
-        [map_coordinates(image, at, np.float64, SPLINE_DEGREE) for image in images]
-    )
-    return drawn * abs(float(np.linalg.det(to_samples))), new_per_px
+    drawn = []
+    for image in images:
+        drawn.append(map_coordinates(image, at, np.float64, SPLINE_DEGREE))
+    area_ratio = abs(float(np.linalg.det(to_samples)))
+    return np.stack(drawn) * area_ratio, new_per_px
 
 
 def _middle(optics: Focused, field: Field, shares: FloatArray) -> FloatArray:
-    middle = field(*field.places_px.mean(axis=0)[:, None])[0]
-    return np.asarray(
-        np.tensordot(np.einsum("f,l,flk->k", middle, shares, optics.weights), optics.basis, axes=1)
-    )
+    """The PSF (height, width) of the field's middle and of light with such shares (L,)."""
+    middle_x, middle_y = field.places_px.mean(axis=0)[:, None]
+    middle = field(middle_x, middle_y)[0]
+    weights = np.einsum("f,l,flk->k", middle, shares, optics.weights)
+    return np.asarray(np.tensordot(weights, optics.basis, axes=1))
+
+
+def _of_optics(psf: GlassPsf, optics: Focused) -> GlassPsf:
+    """A glass by other images or weights."""
+    return replace(psf, samples=_middle(optics, psf.field, psf.mean_shares), optics=optics)
 
 
 def with_components(psf: GlassPsf, count: int) -> GlassPsf:
@@ -630,14 +701,17 @@ def with_components(psf: GlassPsf, count: int) -> GlassPsf:
     basis = optics.basis.reshape(len(optics.basis), -1)
     mean = flat.mean(axis=0)
     values, vectors = np.linalg.eigh(basis @ basis.T)
+    positive = np.maximum(values, 1e-12 * values[-1])
     # its square is the metric of weights
-    scale = vectors * np.sqrt(np.maximum(values, 1e-12 * values[-1]))
-    turned, sizes, components = np.linalg.svd((flat - mean) @ scale, full_matrices=False)
-    component_count = min(count - 1, int((sizes > 1e-9 * sizes[0]).sum()))
-    images = np.vstack([mean, components[:component_count] @ np.linalg.pinv(scale)]) @ basis
-    weights = np.hstack(
-        [np.ones((len(flat), 1)), turned[:, :component_count] * sizes[:component_count]]
-    )
+    scale = vectors * np.sqrt(positive)
+    departures = (flat - mean) @ scale
+    turned, sizes, components = np.linalg.svd(departures, full_matrices=False)
+    independent = int((sizes > 1e-9 * sizes[0]).sum())
+    component_count = min(count - 1, independent)
+    component_weights = components[:component_count] @ np.linalg.pinv(scale)
+    images = np.vstack([mean, component_weights]) @ basis
+    of_components = turned[:, :component_count] * sizes[:component_count]
+    weights = np.hstack([np.ones((len(flat), 1)), of_components])
     return _of_images(psf, images, weights)
 
 
@@ -647,26 +721,17 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
     """
     optics = psf.optics
     side = psf.footprint_px
-    pixel = np.stack([part.ravel() for part in np.indices((side, side))[::-1]], axis=1) - side // 2
     _, height, width = optics.basis.shape
-    y, x = np.indices((height, width))
-    place = np.stack([x.ravel() - width // 2, y.ravel() - height // 2], axis=1) / psf.per_px
+    pixel = _grid_offsets(side, side)
+    place = _grid_offsets(height, width) / psf.per_px
+    stamps = psf._centred().astype(np.float64)
+    centroids = psf.moved_px.reshape(-1, 2)
     images = []
-    for stamp, centroid in zip(
-        psf._centred().astype(np.float64), psf.moved_px.reshape(-1, 2), strict=True
-    ):
-        off = pixel - centroid
-        spread = np.eye(2)
-        for _ in range(WIDTH_ROUNDS):  # as `SampledPsf.width_px`
-            light = stamp * np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off))
-            spread = 2 * (off.T * light) @ off / light.sum()
-            spread += np.eye(2) * max(
-                0.0, PIXEL_VARIANCE + MIN_WIDTH_PX**2 - float(np.linalg.eigvalsh(spread)[0])
-            )
+    for stamp, centroid in zip(stamps, centroids, strict=True):
+        spread = _adaptive_spread(stamp, pixel - centroid)
         if not psf.pixel_integrated:
             spread = spread - np.eye(2) * PIXEL_VARIANCE
-        off = place - centroid
-        images.append(np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off)))
+        images.append(_gaussian(place - centroid, spread))
     gaussians = np.stack(images)
     gaussians /= gaussians.sum(axis=1, keepdims=True)
     pixel_samples = 1 if psf.pixel_integrated else psf.per_px
@@ -674,21 +739,41 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
     return _of_images(psf, basis.astype(np.float64), weights)
 
 
+def _adaptive_spread(light: FloatArray, off: FloatArray) -> FloatArray:
+    """The second moments (2, 2), px^2, of light (n,) at offsets (n, 2) from its centroid, as
+    `SampledPsf.width_px` finds them; at least a pixel's and MIN_WIDTH_PX's.
+    """
+    least = PIXEL_VARIANCE + MIN_WIDTH_PX**2
+    spread = np.eye(2)
+    for _ in range(WIDTH_ROUNDS):
+        weighted = light * _gaussian(off, spread)
+        moments = 2 * (off.T * weighted) @ off
+        spread = moments / weighted.sum()
+        smallest = float(np.linalg.eigvalsh(spread)[0])
+        spread += np.eye(2) * max(0.0, least - smallest)
+    return spread
+
+
+def _gaussian(off: FloatArray, spread: FloatArray) -> FloatArray:
+    """A Gaussian of a covariance (2, 2) at offsets (n, 2) from its middle, where it is 1."""
+    distance2 = np.einsum("ni,ij,nj->n", off, np.linalg.inv(spread), off)
+    return np.asarray(np.exp(-0.5 * distance2))
+
+
 def _of_images(psf: GlassPsf, images: FloatArray, weights: FloatArray) -> GlassPsf:
     """A glass by other images (K, m) and weights (n, K) of its PSFs."""
     basis = images.reshape(-1, *psf.optics.basis.shape[1:])
-    weights = (weights / (weights @ images.sum(axis=1))[:, None]).reshape(
-        *psf.optics.weights.shape[:2], -1
-    )
-    optics = replace(psf.optics, basis=basis, weights=weights)
-    return replace(psf, samples=_middle(optics, psf.field, psf.mean_shares), optics=optics)
+    light = weights @ images.sum(axis=1)
+    fields, wavelengths, _ = psf.optics.weights.shape
+    of_light = (weights / light[:, None]).reshape(fields, wavelengths, -1)
+    return _of_optics(psf, replace(psf.optics, basis=basis, weights=of_light))
 
 
 def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
-    """PSFs moved by `lateral` (F, L, 2) samples, right and down, on a basis of their own: one focus
-    needs fewer components.
+    """A glass whose PSFs are moved by `lateral` (F, L, 2) samples, right and down, on a basis made
+    for its one focus, which needs fewer components.
 
-    Pixels have `width` samples, 1 where they are integrated.
+    A pixel has `width` samples; 1 where pixels are integrated.
     """
     from scipy.ndimage import shift
 
@@ -704,15 +789,13 @@ def _rebased(optics: Focused, lateral: FloatArray, width: int) -> Focused:
         moved.append(image)
     images = np.stack(moved)
     images /= images.sum(axis=(1, 2), keepdims=True)
-    basis, weights, _ = principal(
-        images.reshape(len(images), -1), images.shape[1:], TOLERANCE, width
-    )
-    weights /= (weights @ basis.sum(axis=1, dtype=np.float64))[:, None]
-    return replace(
-        optics,
-        basis=basis.reshape(-1, *images.shape[1:]).astype(np.float64),
-        weights=weights.reshape(*optics.weights.shape[:2], -1),
-    )
+    flat_images = images.reshape(len(images), -1)
+    basis, weights, _ = principal(flat_images, images.shape[1:], TOLERANCE, width)
+    light = weights @ basis.sum(axis=1, dtype=np.float64)
+    weights /= light[:, None]
+    new_basis = basis.reshape(-1, *images.shape[1:]).astype(np.float64)
+    new_weights = weights.reshape(*optics.weights.shape[:2], -1)
+    return replace(optics, basis=new_basis, weights=new_weights)
 
 
 def _square(
@@ -721,9 +804,26 @@ def _square(
     """In which square of its pixel each star (n,) is, and its place in it, -1 to 1 right and
     down.
     """
-    at = [(place - np.floor(place + 0.5) + 0.5) * squares for place in (x_px, y_px)]
-    column, row = (np.minimum(place.astype(np.intp), squares - 1) for place in at)
-    return row * squares + column, 2 * (at[0] - column) - 1, 2 * (at[1] - row) - 1
+    at_x = (_in_pixel(x_px) + 0.5) * squares
+    at_y = (_in_pixel(y_px) + 0.5) * squares
+    column = np.minimum(at_x.astype(np.intp), squares - 1)
+    row = np.minimum(at_y.astype(np.intp), squares - 1)
+    within_x = 2 * (at_x - column) - 1
+    within_y = 2 * (at_y - row) - 1
+    return row * squares + column, within_x, within_y
+
+
+def _in_pixel(place_px: FloatArray) -> FloatArray:
+    """Places from the middles of the pixels that they are in, px."""
+    return np.asarray(place_px - np.floor(place_px + 0.5))
+
+
+def _grid_offsets(rows: int, columns: int) -> IntArray:
+    """How far each sample of an image is right of the middle one and below it, (n, 2), row by
+    row.
+    """
+    x, y = np.meshgrid(offsets(columns), offsets(rows))
+    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def _terms(x: FloatArray, y: FloatArray) -> FloatArray:
@@ -738,13 +838,15 @@ def _pixels_of(size: int, per_px: int, at_px: FloatArray, integrated: bool) -> F
     from scipy.interpolate import make_interp_spline
 
     unit_images = np.pad(np.eye(size), ((BLACK_SAMPLES, BLACK_SAMPLES), (0, 0)))
-    place_px = (np.arange(len(unit_images)) - len(unit_images) // 2) / per_px
+    place_px = offsets(len(unit_images)) / per_px
     spline = make_interp_spline(place_px, unit_images, SPLINE_DEGREE)
     last_px = place_px[-1]
     if integrated:
-        return np.asarray(spline(np.clip(at_px, -last_px, last_px)) * per_px)
+        density = spline(np.clip(at_px, -last_px, last_px))
+        return np.asarray(density * per_px)
     light = spline.antiderivative()
-    low, high = (light(np.clip(at_px + side, -last_px, last_px)) for side in (-0.5, 0.5))
+    low = light(np.clip(at_px - 0.5, -last_px, last_px))
+    high = light(np.clip(at_px + 0.5, -last_px, last_px))
     return np.asarray((high - low) * per_px)
 
 
@@ -756,13 +858,15 @@ def _normal_floats(values: FloatArray) -> Float32Array:
 
 
 def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
-    """Rows (R, side^2), and the coefficients (n, R) by which they make those of a table to
+    """Few rows (R, side^2) and coefficients (n, R), whose product is the table (n, side^2) to
     STAMP_TOLERANCE.
 
     Flux, centroids and second moments are kept exactly. Random projections find the principal
-    components of the rest (Halko, Martinsson and Tropp 2011, algorithm 4.4), always the same.
+    components of the rest (Halko, Martinsson and Tropp 2011, algorithm 4.4), always the same ones.
     """
-    carriers, terms = (part.astype(np.float32) for part in moment_carriers((side, side), 1.0))
+    exact_carriers, exact_terms = moment_carriers((side, side), 1.0)
+    carriers = exact_carriers.astype(np.float32)
+    terms = exact_terms.astype(np.float32)
     moments = table @ terms
     rest = table - moments @ carriers
     rng = np.random.default_rng(0)
@@ -775,23 +879,25 @@ def _few(table: Float32Array, side: int) -> tuple[Float32Array, Float32Array]:
         span = _orthonormal(rest.T @ _orthonormal(rest @ random))
         held = (rest @ span).astype(np.float64)
         eigenvalues, turn = np.linalg.eigh(held.T @ held)
-        enough = np.flatnonzero(
-            rest_energy - np.cumsum(eigenvalues[::-1]) <= STAMP_TOLERANCE**2 * total
-        )
+        unexplained = rest_energy - np.cumsum(eigenvalues[::-1])
+        enough = np.flatnonzero(unexplained <= STAMP_TOLERANCE**2 * total)
         if len(enough) or wanted in (MAX_STAMPS, *rest.shape):
-            turn = turn[:, ::-1][:, : int(enough[0]) + 1 if len(enough) else wanted].astype(
-                np.float32
-            )
+            count = int(enough[0]) + 1 if len(enough) else wanted
+            strongest_first = turn[:, ::-1]
+            turn = strongest_first[:, :count].astype(np.float32)
             break
         wanted = min(2 * wanted, MAX_STAMPS)
     stamps = (span @ turn).T
-    return np.concatenate([carriers, stamps]), np.concatenate([moments, rest @ stamps.T], axis=1)
+    coefficients = np.concatenate([moments, rest @ stamps.T], axis=1)
+    return np.concatenate([carriers, stamps]), coefficients
 
 
 def _orthonormal(columns: Float32Array | FloatArray) -> Float32Array:
     """Orthonormal columns that span those given, by their products with each other: QR takes far
     longer on long ones.
     """
-    values, vectors = np.linalg.eigh((columns.T @ columns).astype(np.float64))
+    products = columns.T @ columns
+    values, vectors = np.linalg.eigh(products.astype(np.float64))
     good = values > 1e-9 * values[-1]
-    return np.asarray(columns @ (vectors[:, good] / np.sqrt(values[good])), dtype=np.float32)
+    to_orthonormal = vectors[:, good] / np.sqrt(values[good])
+    return np.asarray(columns @ to_orthonormal, dtype=np.float32)

@@ -1,11 +1,11 @@
 """A glass from a lens's prescription: optiland traces it, and its rays become PSFs with
 diffraction.
 
-Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k
-(path + L (x - x_ray) +
-M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid angle of each (the
-angular spectrum, Goodman, Fourier Optics, section 3.10). Where the pupil would need too many rays,
-because what diffraction spreads is far finer than the aberrations, rays are counted as they fall.
+Each ray is a plane wave behind the lens: the light's field in the image is the sum of exp(i k (path
++ L (x - x_ray) + M (y - y_ray))) over rays evenly in the pupil, by the square root of the solid
+angle of each (the angular spectrum, Goodman, Fourier Optics, section 3.10). Where the pupil would
+need too many rays, because what diffraction spreads is far finer than the aberrations, rays are
+counted as they fall.
 
 Surfaces may be tilted and decentred. The detector lies in the prescription's image surface, its
 middle on the chief ray of the field's middle, its axes the surface's own.
@@ -30,7 +30,7 @@ from hilstar.optics.camera import Lens
 from hilstar.optics.glass.codev_file import read_codev
 from hilstar.optics.glass.lens_data import FieldPoint, LensPrescription, LensSurface
 from hilstar.optics.glass.optiland_lens import optic_of
-from hilstar.optics.glass.psf_file import Glass, Stack, glass_of
+from hilstar.optics.glass.psf_file import Glass, Stack, glass_of, pupil_places
 from hilstar.optics.glass.zemax_file import read_zemax
 
 CAN_INSTALL = "pip install 'hilstar[lens]'"
@@ -50,6 +50,7 @@ MIN_SAMPLES, MAX_SAMPLES = 4, 16  # a tracker pixel, where --oversampling does n
 # the sum of plane waves repeats after so many stamps; at 1.5 second moments were 1.3 % off
 PERIOD_MARGIN = 2.0
 FINER = 8  # parts of a ray's share of the pupil along each axis, at its edge
+# Newton's rounds from a place to its field; distortion is fitted to rays along spokes of the field
 CHIEF_ROUNDS, DISTORTION_RAYS, DISTORTION_SPOKES = 12, 24, 12
 EDGE = 0.05  # share of the field from whose chief ray to the axis's the scale is taken
 MIN_LIT = 1e-3  # share of a pupil below which a field point is dark
@@ -236,16 +237,16 @@ class _LensRays:
             field.vx = field.vy = 0.0
         self.wavelengths_um = sorted({float(w.value) for w in optic.wavelengths.wavelengths})
         self.primary_um = float(optic.primary_wavelength)
-        self.focal_length_mm = abs(float(np.asarray(optic.paraxial.f2()).ravel()[0]))
-        self.f_number = abs(float(np.asarray(optic.paraxial.FNO()).ravel()[0]))
+        self.focal_length_mm = _size_of(optic.paraxial.f2())
+        self.f_number = _size_of(optic.paraxial.FNO())
         if not math.isfinite(self.focal_length_mm) or not self.wavelengths_um:
             raise InputError(
                 "it has no focal length or no wavelength; write a lens that forms an image"
             )
         frame = optic.image_surface.geometry.cs
-        self._image_mm, self._to_image = (
-            np.asarray(part, dtype=np.float64) for part in frame.get_effective_transform()
-        )
+        image_mm, to_image = frame.get_effective_transform()
+        self._image_mm = np.asarray(image_mm, dtype=np.float64)
+        self._to_image = np.asarray(to_image, dtype=np.float64)
         self.centre_mm = np.zeros(2)
         self.sign = 1.0
         edge = np.array([[0.0, 0.0], [0.0, EDGE]])
@@ -257,7 +258,9 @@ class _LensRays:
             )
         # A lens with one field, on the axis, has no direction in which its image could be turned
         # round.
-        self.sign = float(np.sign((tangents[1] - tangents[0]) @ (places[1] - places[0]))) or 1.0
+        tangent_step = tangents[1] - tangents[0]
+        place_step = places[1] - places[0]
+        self.sign = float(np.sign(tangent_step @ place_step)) or 1.0
         self.centre_mm = places[0]
 
     def at_image(self, rays: Any) -> tuple[FloatArray, FloatArray]:
@@ -267,19 +270,23 @@ class _LensRays:
         from_plane = np.stack([rays.x, rays.y, rays.z - self._image_mm[2]])
         places = self._to_image.T @ from_plane
         cosines = self._to_image.T @ np.stack([rays.L, rays.M, rays.N])
-        moved = self._to_image.T @ np.array([*self._image_mm[:2], 0.0])
-        return places[:2] - moved[:2, None] - self.centre_mm[:, None], cosines
+        across_mm, down_mm, _ = self._image_mm
+        moved = self._to_image.T @ np.array([across_mm, down_mm, 0.0])
+        from_middle = places[:2] - moved[:2, None] - self.centre_mm[:, None]
+        return from_middle, cosines
 
     def chiefs(self, fields: FloatArray, um: float) -> tuple[FloatArray, FloatArray]:
         """Tangents of field angles (n, 2), and the chief rays' places (n, 2), mm, at fields
         (n, 2) relative to the largest.
         """
-        none = np.zeros(len(fields))
-        starts = self.optic.ray_tracer.ray_generator.generate_rays(
-            fields[:, 0], fields[:, 1], none, none, um
-        )
-        tangents = self.sign * np.stack([starts.L / starts.N, starts.M / starts.N], axis=1)
-        rays = self.optic.trace_generic(fields[:, 0], fields[:, 1], none, none, um)
+        x, y = fields.T
+        pupil_middle = np.zeros(len(fields))
+        generate = self.optic.ray_tracer.ray_generator.generate_rays
+        starts = generate(x, y, pupil_middle, pupil_middle, um)
+        tangent_x = starts.L / starts.N
+        tangent_y = starts.M / starts.N
+        tangents = self.sign * np.stack([tangent_x, tangent_y], axis=1)
+        rays = self.optic.trace_generic(x, y, pupil_middle, pupil_middle, um)
         places, _ = self.at_image(rays)
         return tangents, places.T
 
@@ -289,52 +296,69 @@ class _LensRays:
         """
         if self.max_field == 0:
             return np.zeros_like(places_mm)
-        tangents = self.chiefs(np.array([[0.0, 0.0], [0.0, EDGE]]), self.primary_um)[0]
-        slope_mm = camera.focal_length_mm * float(tangents[1, 1] - tangents[0, 1]) / EDGE
+        near_axis = np.array([[0.0, 0.0], [0.0, EDGE]])
+        tangents, _ = self.chiefs(near_axis, self.primary_um)
+        tangent_step = float(tangents[1, 1] - tangents[0, 1])
+        slope_mm = camera.focal_length_mm * tangent_step / EDGE
         fields = places_mm / slope_mm
         for _ in range(CHIEF_ROUNDS):
             fields = np.clip(fields, -1.5, 1.5)
             tangents, _ = self.chiefs(fields, self.primary_um)
-            fields = fields + (places_mm - camera.places_mm(tangents)) / slope_mm
+            off_mm = places_mm - camera.places_mm(tangents)
+            fields = fields + off_mm / slope_mm
         return np.asarray(fields)
 
     def bundle(self, field: FloatArray, um: float, rays: int) -> _Bundle:
-        at = (np.arange(rays) + 0.5) / rays * 2 - 1
+        """Rays of a pupil's grid (n, n) from a field (2,), relative to the largest, at a
+        wavelength.
+        """
+        at = pupil_places(rays)
         across, down = np.meshgrid(at, at)
         filled = _filled(rays)
         radius = float(np.hypot(*field))
-        at_field = radius * self.max_field
-        beside_cut, along_cut, shift = (
-            np.interp(at_field, self._vignetting[0], part) for part in self._vignetting[1:]
-        )
+        radii, *factors = self._vignetting
+        at_radius = radius * self.max_field
+        beside_cut, along_cut, shift = (np.interp(at_radius, radii, part) for part in factors)
         # the field's direction is the factors' y
-        turn = field / radius if radius else np.array([0.0, 1.0])
-        along = across * turn[0] + down * turn[1]
-        beside = across * turn[1] - down * turn[0]
+        turn_x, turn_y = field / radius if radius else np.array([0.0, 1.0])
+        along = across * turn_x + down * turn_y
+        beside = across * turn_y - down * turn_x
         moved_along = shift - along_cut * along
         moved_beside = beside_cut * beside
         # beyond it only where no light is
-        px = np.clip(across + moved_along * turn[0] - moved_beside * turn[1], -1, 1)
-        py = np.clip(down + moved_along * turn[1] + moved_beside * turn[0], -1, 1)
+        vignetted_x = across + moved_along * turn_x - moved_beside * turn_y
+        vignetted_y = down + moved_along * turn_y + moved_beside * turn_x
+        px = np.clip(vignetted_x, -1, 1)
+        py = np.clip(vignetted_y, -1, 1)
         hx = np.full(px.size, field[0])
         hy = np.full(px.size, field[1])
+
+        def on_grid(values: Any) -> FloatArray:
+            return np.array(values).reshape(px.shape)
+
         generate = self.optic.ray_tracer.ray_generator.generate_rays
-        first = generate(hx, hy, px.ravel(), py.ravel(), um)
-        x0, y0, z0, l0, m0, n0 = (
-            np.array(getattr(first, name)).reshape(px.shape)
-            for name in ("x", "y", "z", "L", "M", "N")
-        )
-        found = self.optic.trace_generic(hx, hy, px.ravel(), py.ravel(), um)
-        (x, y), cosines = (np.array(part).reshape(-1, *px.shape) for part in self.at_image(found))
-        path, light = (np.array(getattr(found, name)).reshape(px.shape) for name in ("opd", "i"))
-        good = (filled > 0) & np.isfinite(x + y + path) & (light > 0)
+        start = generate(hx, hy, px.ravel(), py.ravel(), um)
+        x0 = on_grid(start.x)
+        y0 = on_grid(start.y)
+        z0 = on_grid(start.z)
+        l0 = on_grid(start.L)
+        m0 = on_grid(start.M)
+        n0 = on_grid(start.N)
+        end = self.optic.trace_generic(hx, hy, px.ravel(), py.ravel(), um)
+        places, cosines = self.at_image(end)
+        x = on_grid(places[0])
+        y = on_grid(places[1])
+        path = on_grid(end.opd)
+        light = on_grid(end.i)
+        arrives = np.isfinite(x + y + path) & (light > 0)
+        good = (filled > 0) & arrives
         # A plane wave's path up to where its rays start, and the area of the beam that each ray
         # stands for.
         path = path + l0 * x0 + m0 * y0 + n0 * z0
         area = np.abs(_determinant(x0, y0)) * np.abs(n0)
-        return _Bundle(
-            x, y, cosines, path, np.where(good, np.nan_to_num(light) * area * filled, 0.0)
-        )
+        weighted = np.nan_to_num(light) * area * filled
+        cosines = np.array(cosines).reshape(3, *px.shape)
+        return _Bundle(x, y, cosines, path, np.where(good, weighted, 0.0))
 
 
 def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
@@ -368,64 +392,76 @@ def _vignetting(points: tuple[FieldPoint, ...]) -> FloatArray:
 @lru_cache(maxsize=4)
 def _filled(rays: int) -> FloatArray:
     """How much of each cell of a pupil's grid (n, n) lies within the pupil."""
-    fine = (np.arange(rays * FINER) + 0.5) / (rays * FINER) * 2 - 1
-    return np.asarray(
-        (fine**2 + fine[:, None] ** 2 <= 1).reshape(rays, FINER, rays, FINER).mean(axis=(1, 3))
-    )
+    fine = pupil_places(rays * FINER)
+    radius2 = fine**2 + fine[:, None] ** 2
+    inside = radius2 <= 1
+    cells = inside.reshape(rays, FINER, rays, FINER)
+    return np.asarray(cells.mean(axis=(1, 3)))
+
+
+def _size_of(value: Any) -> float:
+    """The absolute value of a figure that Optiland gives as a number or as an array of one."""
+    return abs(float(np.asarray(value).ravel()[0]))
 
 
 def _determinant(a: FloatArray, b: FloatArray) -> FloatArray:
     """The determinant of the map from a grid's cells to (a, b): the area of each cell there."""
-    (a_down, a_right), (b_down, b_right) = np.gradient(a), np.gradient(b)
+    a_down, a_right = np.gradient(a)
+    b_down, b_right = np.gradient(b)
     return np.asarray(a_right * b_down - a_down * b_right)
 
 
 def _glass(
     lens: _LensRays, plate: Plate, per_px: int | None, tolerance: float, made_by: str
 ) -> Traced:
-    pitch_mm, (width, height) = plate.pitch_um * 1e-3, plate.resolution_px
-    middle = (np.array([width, height]) - 1) / 2
+    """The glass of rays' PSFs, at each place of a grid over the plate, wavelength and focus."""
+    pitch_mm = plate.pitch_um * 1e-3
+    middle = (np.array(plate.resolution_px) - 1) / 2
     camera = _Chiefs.of(lens)
     places = _field_points(lens, plate)
     fields = lens.fields_at(places * pitch_mm, camera)
-    finest_um = lens.wavelengths_um[0] * lens.f_number / 2
-    samples = per_px or min(MAX_SAMPLES, max(MIN_SAMPLES, math.ceil(plate.pitch_um / finest_um)))
-    grid = 2 * plate.half_px * samples + 1, pitch_mm / samples
+    samples = per_px or _samples_a_px(lens, plate)
+    side = 2 * plate.half_px * samples + 1
+    grid = (side, pitch_mm / samples)
     images = []
     at = []
     facts = []
-    axis_light: dict[float, float] = {}
     for um in lens.wavelengths_um:
-        axis_light[um] = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
-        if axis_light[um] <= 0:
+        axis_light = float(lens.bundle(np.zeros(2), um, MIN_RAYS).light.sum())
+        if axis_light <= 0:
             raise InputError(
                 "no ray of its field's middle reaches the image; do apertures lie beside the beam?"
             )
-        for place, field, chief in zip(places, fields, lens.chiefs(fields, um)[1], strict=True):
+        _, chiefs_mm = lens.chiefs(fields, um)
+        for place, field, chief_mm in zip(places, fields, chiefs_mm, strict=True):
             slopes = _slopes(lens, field, um)
-            light = float(lens.bundle(field, um, MIN_RAYS).light.sum()) / axis_light[um]
+            light = float(lens.bundle(field, um, MIN_RAYS).light.sum()) / axis_light
             for focus_um in sorted(set(plate.focuses_um)):
+                focused_mm = chief_mm + slopes * focus_um * 1e-3
                 if light > MIN_LIT:
-                    image, outside = _psf(
-                        lens, (field, um, focus_um * 1e-3), chief + slopes * focus_um * 1e-3, grid
-                    )
+                    ray_of_light = (field, um, focus_um * 1e-3)
+                    image, outside = _psf(lens, ray_of_light, focused_mm, grid)
+                    illumination = min(light, 2.0)
                 else:
-                    image = _dark(grid[0])
+                    image = _dark(side)
                     outside = 0.0
+                    illumination = 0.0
+                moved = focused_mm / pitch_mm - place
                 images.append(image)
                 at.append((*(middle + place), um * 1e3, focus_um))
-                moved = (chief + slopes * focus_um * 1e-3) / pitch_mm - place
-                facts.append((min(light, 2.0) if light > MIN_LIT else 0.0, outside, *moved))
+                facts.append((illumination, outside, *moved))
     stack = Stack(np.array(images), np.array(at), np.array(facts), samples)
-    history = (
-        made_by,
-        f"focal length {camera.focal_length_mm:.6g} mm, F-number {lens.f_number:.4g}",
-    )
-    return Traced(
-        glass_of(stack, tolerance, camera.lens, history=history),
-        camera.focal_length_mm,
-        lens.f_number,
-    )
+    focal_mm = camera.focal_length_mm
+    history = (made_by, f"focal length {focal_mm:.6g} mm, F-number {lens.f_number:.4g}")
+    glass = glass_of(stack, tolerance, camera.lens, history=history)
+    return Traced(glass, focal_mm, lens.f_number)
+
+
+def _samples_a_px(lens: _LensRays, plate: Plate) -> int:
+    """Samples to a pixel, two to the finest detail of the shortest wave."""
+    finest_um = lens.wavelengths_um[0] * lens.f_number / 2
+    wanted = math.ceil(plate.pitch_um / finest_um)
+    return min(MAX_SAMPLES, max(MIN_SAMPLES, wanted))
 
 
 def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
@@ -435,23 +471,28 @@ def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:
     half = (np.array(plate.resolution_px) - 1) / 2
     if lens.max_field == 0:
         return np.zeros((1, 2))
-    edge_px = float(np.linalg.norm(lens.chiefs(np.array([[0.0, 1.0]]), lens.primary_um)[1])) / (
-        plate.pitch_um * 1e-3
-    )
-    scale = min(1.0, edge_px / float(np.hypot(*half)))
-    columns, rows = (np.unique(np.linspace(-size * scale, size * scale, POINTS)) for size in half)
-    return np.stack([part.ravel() for part in np.meshgrid(columns, rows)], axis=1)
+    _, edge_mm = lens.chiefs(np.array([[0.0, 1.0]]), lens.primary_um)
+    edge_px = float(np.linalg.norm(edge_mm)) / (plate.pitch_um * 1e-3)
+    corner_px = float(np.hypot(*half))
+    scale = min(1.0, edge_px / corner_px)
+    half_x, half_y = half * scale
+    columns = np.unique(np.linspace(-half_x, half_x, POINTS))
+    rows = np.unique(np.linspace(-half_y, half_y, POINTS))
+    x, y = np.meshgrid(columns, rows)
+    return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
 def _slopes(lens: _LensRays, field: FloatArray, um: float) -> FloatArray:
-    rays = lens.optic.trace_generic(
-        np.array([field[0]]), np.array([field[1]]), np.zeros(1), np.zeros(1), um
-    )
-    cosines = lens.at_image(rays)[1][:, 0]
-    return np.asarray(cosines[:2] / cosines[2])
+    """How far (2,) a field's chief ray moves right and down for a step away from the lens."""
+    pupil_middle = np.zeros(1)
+    rays = lens.optic.trace_generic(field[:1], field[1:], pupil_middle, pupil_middle, um)
+    _, cosines = lens.at_image(rays)
+    across, down, along = cosines[:, 0]
+    return np.array([across / along, down / along])
 
 
 def _dark(side: int) -> FloatArray:
+    """What stands for the PSF of a place without light: all light in its middle sample."""
     image = np.zeros((side, side))
     image[side // 2, side // 2] = 1.0
     return image
@@ -468,50 +509,66 @@ def _psf(
 
     `light` is its field, wavelength (um) and defocus (mm), `grid` the stamp's side and step (mm).
     """
-    (field, um, defocus_mm), (side, step_mm) = light, grid
-    needed = math.ceil(PERIOD_MARGIN * side * step_mm / (um * 1e-3 * lens.f_number))
+    field, um, defocus_mm = light
+    side, step_mm = grid
+    wave_mm = um * 1e-3
+    needed = math.ceil(PERIOD_MARGIN * side * step_mm / (wave_mm * lens.f_number))
     if needed > MAX_RAYS:
-        return _counted(lens.bundle(field, um, GEOMETRIC_RAYS), defocus_mm, centre, side, step_mm)
-    return _waves(
-        lens.bundle(field, um, max(MIN_RAYS, needed)), um, defocus_mm, centre, (side, step_mm)
-    )
+        rays = lens.bundle(field, um, GEOMETRIC_RAYS)
+        return _counted(rays, defocus_mm, centre, side, step_mm)
+    rays = lens.bundle(field, um, max(MIN_RAYS, needed))
+    return _waves(rays, um, defocus_mm, centre, grid)
 
 
 def _waves(
     rays: _Bundle, um: float, defocus_mm: float, centre: FloatArray, grid: tuple[int, float]
 ) -> tuple[FloatArray, float]:
+    """The PSF of the waves that rays stand for: their sum's square on the stamp's samples, by
+    finer ones where these are wider than half a fringe.
+    """
     side, step_mm = grid
-    finer = max(1, math.ceil(step_mm / (um * 1e-3 * 0.5 * _fastest(rays))) // 2 * 2 + 1)
-    at_mm = (np.arange(side * finer) - (side * finer) // 2) * step_mm / finer
+    fringe_mm = um * 1e-3 * 0.5 * _fastest(rays)
+    finer = max(1, math.ceil(step_mm / fringe_mm) // 2 * 2 + 1)
+    samples = side * finer
+    at_mm = (np.arange(samples) - samples // 2) * step_mm / finer
     wave = 2 * np.pi / (um * 1e-3)
     cos_x, cos_y, cos_z = rays.cosines
     # Solid angle times its cosine; of a cell at the pupil's edge both light and angle are a part.
-    angle = np.nan_to_num(np.abs(_determinant(cos_x, cos_y))) * _filled(len(rays.x))
+    whole_angle = np.abs(_determinant(cos_x, cos_y))
+    angle = np.nan_to_num(whole_angle) * _filled(len(rays.x))
     lit = rays.light > 0
-    path = (
-        rays.path + cos_z * defocus_mm - cos_x * (rays.x - centre[0]) - cos_y * (rays.y - centre[1])
-    )
+    moved_x = rays.x - centre[0]
+    moved_y = rays.y - centre[1]
+    path = rays.path + cos_z * defocus_mm - cos_x * moved_x - cos_y * moved_y
     path = path[lit] - np.median(path[lit])
     light = rays.light[lit]
     angle = angle[lit]
     cos_x = cos_x[lit]
     cos_y = cos_y[lit]
-    part = np.sqrt(light * angle) * np.exp(1j * wave * path)
+    phase = np.exp(1j * wave * path)
+    amplitude = np.sqrt(light * angle) * phase
     # a phase that no light shows
-    middle_x, middle_y = (np.average(cosine, weights=light) for cosine in (cos_x, cos_y))
+    middle_x = np.average(cos_x, weights=light)
+    middle_y = np.average(cos_y, weights=light)
     across = np.exp(1j * wave * np.outer(cos_x - middle_x, at_mm))
     down = np.exp(1j * wave * np.outer(cos_y - middle_y, at_mm))
-    image = np.abs((down * part[:, None]).T @ across) ** 2
+    waves = (down * amplitude[:, None]).T @ across
+    intensity = np.abs(waves) ** 2
     # Parseval: the integral over the image is the wavelength squared times that of the squared
     # amplitude over solid angles.
     total = float(light.sum()) * (um * 1e-3 / (step_mm / finer)) ** 2
-    image = image.reshape(side, finer, side, finer).sum(axis=(1, 3))
+    image = intensity.reshape(side, finer, side, finer).sum(axis=(1, 3))
     return image, float(np.clip(1 - image.sum() / total, 0, 0.999))
 
 
 def _fastest(rays: _Bundle) -> float:
+    """The F-number of the fastest beam, across or down, that has light."""
     lit = rays.light > 0
-    return 1 / max(1e-6, float(max(np.ptp(cosine[lit]) for cosine in rays.cosines[:2])))
+    cos_x, cos_y, _ = rays.cosines
+    across = np.ptp(cos_x[lit])
+    down = np.ptp(cos_y[lit])
+    widest = float(max(across, down))
+    return 1 / max(1e-6, widest)
 
 
 def _counted(
@@ -519,22 +576,23 @@ def _counted(
 ) -> tuple[FloatArray, float]:
     """Rays shared out among the four samples nearest to each."""
     lit = rays.light > 0
-    light, (cos_x, cos_y, cos_z) = rays.light[lit], rays.cosines[:, lit]
+    light = rays.light[lit]
+    cos_x, cos_y, cos_z = rays.cosines[:, lit]
     x_mm = rays.x[lit] + cos_x / cos_z * defocus_mm - centre[0]
     y_mm = rays.y[lit] + cos_y / cos_z * defocus_mm - centre[1]
-    x, y = x_mm / step_mm + side // 2, y_mm / step_mm + side // 2
-    column = np.floor(x).astype(np.intp)
-    row = np.floor(y).astype(np.intp)
+    x = x_mm / step_mm + side // 2
+    y = y_mm / step_mm + side // 2
+    first_column = np.floor(x).astype(np.intp)
+    first_row = np.floor(y).astype(np.intp)
     image = np.zeros((side, side))
     for down, right in ((0, 0), (0, 1), (1, 0), (1, 1)):
-        share = light * np.abs(1 - down - (y - row)) * np.abs(1 - right - (x - column))
-        inside = (
-            (column + right >= 0)
-            & (column + right < side)
-            & (row + down >= 0)
-            & (row + down < side)
-        )
-        np.add.at(image, (row[inside] + down, column[inside] + right), share[inside])
+        share_y = np.abs(1 - down - (y - first_row))
+        share_x = np.abs(1 - right - (x - first_column))
+        share = light * share_y * share_x
+        column = first_column + right
+        row = first_row + down
+        inside = (column >= 0) & (column < side) & (row >= 0) & (row < side)
+        np.add.at(image, (row[inside], column[inside]), share[inside])
     return image, float(np.clip(1 - image.sum() / light.sum(), 0, 0.999))
 
 
@@ -548,37 +606,44 @@ class _Chiefs:
     lens: Lens | None
 
     def places_mm(self, tangents: FloatArray) -> FloatArray:
-        """Where it has directions (n, 2)."""
+        """Places (n, 2), mm from the detector's middle, of directions (n, 2) by their tangents."""
         if self.lens is None:
-            bent = tangents
-        else:
-            bent = np.stack(self.lens.bent(*tangents.T), axis=1)
-        return np.asarray(self.focal_length_mm * bent)
+            return np.asarray(self.focal_length_mm * tangents)
+        u, v = self.lens.bent(*tangents.T)
+        return np.asarray(self.focal_length_mm * np.stack([u, v], axis=1))
 
     @classmethod
     def of(cls, lens: _LensRays) -> "_Chiefs":
+        """By least squares of places on the field's spokes."""
         if lens.max_field == 0:
             return cls(lens.focal_length_mm, None)
         turn = np.linspace(0, 2 * np.pi, DISTORTION_SPOKES, endpoint=False)
         radius = np.linspace(0, 1, DISTORTION_RAYS + 1)[1:]
-        fields = (radius[:, None, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)).reshape(
-            -1, 2
-        )
+        spokes = np.stack([np.sin(turn), np.cos(turn)], axis=1)
+        fields = radius[:, None, None] * spokes
+        fields = fields.reshape(-1, 2)
         tangents, places = lens.chiefs(fields, lens.primary_um)
         known = np.isfinite(places).all(axis=1)
         largest = float(np.hypot(*tangents.T).max())
-        (u, v), places = tangents[known].T / largest, places[known] / largest
+        u, v = tangents[known].T / largest
+        places = places[known] / largest
         r2 = u * u + v * v
         # A column of equations for each coefficient: all places' x, then all places' y.
-        radial = [np.concatenate([u * r2**power, v * r2**power]) for power in range(4)]
-        p1_column = np.concatenate([2 * u * v, r2 + 2 * v * v])
-        p2_column = np.concatenate([r2 + 2 * u * u, 2 * u * v])
-        columns = np.stack([*radial, p1_column, p2_column], axis=1)
-        coefficients = np.linalg.lstsq(columns, places.T.ravel(), rcond=None)[0].tolist()
+        columns = []
+        for power in range(4):
+            columns.append(np.concatenate([u * r2**power, v * r2**power]))
+        p1_x = 2 * u * v
+        p1_y = r2 + 2 * v * v
+        p2_x = r2 + 2 * u * u
+        p2_y = 2 * u * v
+        columns.append(np.concatenate([p1_x, p1_y]))
+        columns.append(np.concatenate([p2_x, p2_y]))
+        equations = np.stack(columns, axis=1)
+        solution, *_ = np.linalg.lstsq(equations, places.T.ravel(), rcond=None)
+        focal, *distortion = solution.tolist()
         # of tangents relative to the largest: turned back to tangents
-        focal, *distortion = coefficients
-        k1, k2, k3, p1, p2 = (
-            part / focal / largest**power
-            for part, power in zip(distortion, (2, 4, 6, 1, 1), strict=True)
-        )
+        coefficients = []
+        for relative, power in zip(distortion, (2, 4, 6, 1, 1), strict=True):
+            coefficients.append(relative / focal / largest**power)
+        k1, k2, k3, p1, p2 = coefficients
         return cls(focal, Lens((k1, k2, k3), (p1, p2)))

@@ -15,7 +15,7 @@ keep it:
   they are known.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -144,9 +144,8 @@ def glass_of(
     if per_px < 1:
         raise InputError(f"PSFs of {per_px} samples a pixel; write 1 or more")
     width = 1 if stack.pixel_integrated else per_px
-    basis, weights, residual = principal(
-        images.reshape(count, -1), images.shape[1:], tolerance, width
-    )
+    flat_images = images.reshape(count, -1)
+    basis, weights, residual = principal(flat_images, images.shape[1:], tolerance, width)
     sums = basis.sum(axis=1, dtype=np.float64)
     weights /= (weights @ sums)[:, None]
     axes, place = _product(stack.at)
@@ -169,6 +168,16 @@ def glass_of(
     return made
 
 
+def pupil_places(count: int) -> FloatArray:
+    """The middles (count,) of equal parts of a pupil's axis, -1 to 1."""
+    return np.asarray((np.arange(count) + 0.5) / count * 2 - 1)
+
+
+def offsets(count: int) -> IntArray:
+    """How far each of so many samples of a row is from the middle one, samples."""
+    return np.arange(count) - count // 2
+
+
 def moment_carriers(shape: tuple[int, int], sigma: float) -> tuple[FloatArray, FloatArray]:
     """Six images (6, m) that carry one moment each, and the moments' own terms (m, 6), of images of
     a shape (height, width).
@@ -176,10 +185,14 @@ def moment_carriers(shape: tuple[int, int], sigma: float) -> tuple[FloatArray, F
     The moments are flux, x, y, x^2, xy and y^2 about the middle sample. An image less what its
     moments' carriers have of it has none of these moments, and neither has any sum of such images.
     """
-    y, x = ((np.indices(shape) - np.array(shape)[:, None, None] // 2) / sigma).reshape(2, -1)
+    middle = np.array(shape)[:, None, None] // 2
+    from_middle = (np.indices(shape) - middle) / sigma
+    y, x = from_middle.reshape(2, -1)
     terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
-    weighed = np.exp(-(x * x + y * y) / 2)[:, None] * terms
-    return np.linalg.pinv(terms.T @ weighed) @ weighed.T, terms
+    weight = np.exp(-(x * x + y * y) / 2)
+    weighted = weight[:, None] * terms
+    to_moments = np.linalg.pinv(terms.T @ weighted)
+    return to_moments @ weighted.T, terms
 
 
 def principal(
@@ -196,7 +209,10 @@ def principal(
     if len(images) <= FEW_IMAGES:
         return images.astype(np.float32), np.eye(len(images)), 0.0
     mean = images.mean(axis=0)
-    carriers, terms = moment_carriers(shape, float(1 / np.sqrt(4 * np.pi * (mean @ mean))))
+    # a Gaussian of this sigma has the mean image's sum of squares
+    squares = mean @ mean
+    sigma = float(1 / np.sqrt(4 * np.pi * squares))
+    carriers, terms = moment_carriers(shape, sigma)
     moments = images @ terms
     rest = images - moments @ carriers
     in_pixels = _by_pixels(rest.reshape(-1, *shape), width)
@@ -205,22 +221,20 @@ def principal(
     count = 0
     for count in range(len(images) + 1):
         residual = _elsewhere(in_pixels)
-        if (
-            residual <= tolerance
-            or count == len(images)
-            or values[-1 - count] <= 1e-14 * values[-1]
-        ):
+        if residual <= tolerance or count == len(images):
+            break
+        # what is left is rounding
+        if values[-1 - count] <= 1e-14 * values[-1]:
             break
         vector = vectors[:, -1 - count]
         in_pixels -= np.outer(vector, vector @ in_pixels)
-    leading = vectors[:, ::-1][:, :count]
-    basis = leading.T @ rest
-    size = np.maximum(np.linalg.norm(basis, axis=1), 1e-300)
-    return (
-        np.concatenate([carriers, basis / size[:, None]]).astype(np.float32),
-        np.hstack([moments, leading * size]),
-        residual,
-    )
+    strongest_first = vectors[:, ::-1]
+    leading = strongest_first[:, :count]
+    components = leading.T @ rest
+    size = np.maximum(np.linalg.norm(components, axis=1), 1e-300)
+    basis = np.concatenate([carriers, components / size[:, None]])
+    weights = np.hstack([moments, leading * size])
+    return basis.astype(np.float32), weights, residual
 
 
 def _by_pixels(images: FloatArray, width: int) -> FloatArray:
@@ -238,12 +252,14 @@ def _by_pixels(images: FloatArray, width: int) -> FloatArray:
         summed = np.cumsum(np.pad(pixel_sums, margins), axis=axis)
         last = np.arange(width, summed.shape[axis], apart)
         pixel_sums = summed.take(last, axis) - summed.take(last - width, axis)
-    return np.asarray(pixel_sums.reshape(len(images), -1) * (apart / width) ** 2)
+    mean_of_places = (apart / width) ** 2
+    return np.asarray(pixel_sums.reshape(len(images), -1) * mean_of_places)
 
 
 def _elsewhere(residuals: FloatArray) -> float:
     """The largest share of light that lies elsewhere, of residuals (n, m) by `_by_pixels`."""
-    return 0.5 * float(np.abs(residuals).sum(axis=1).max())
+    absolute = np.abs(residuals).sum(axis=1)
+    return 0.5 * float(absolute.max())
 
 
 def _product(
@@ -279,6 +295,7 @@ def _product(
 
 
 def _ordered(values: FloatArray, place: tuple[IntArray, ...], shape: tuple[int, ...]) -> FloatArray:
+    """Values of rows (n, ...) by field point, wavelength and focus (F, L, Z, ...)."""
     grid = np.empty((*shape, *values.shape[1:]))
     grid[place] = values
     return grid
@@ -291,20 +308,22 @@ def _check(glass: Glass) -> None:
 
 
 def _check_numbers(glass: Glass) -> None:
+    """Raise InputError for figures that are not finite, or beyond what their kind can have."""
     if glass.per_px < 1:
         raise InputError(f"PSFs of {glass.per_px} samples a pixel; write 1 or more")
     numbers = (
         *(glass.places_px, glass.focuses_um, glass.weights, glass.basis),
-        glass.outside,
-        glass.lateral_px,
+        *(glass.outside, glass.lateral_px),
     )
     if not all(np.isfinite(part).all() for part in numbers):
         raise InputError("a place, a focus, a weight or a sample is not finite; write numbers")
-    if not (np.isnan(glass.wavelengths_nm).all() or (glass.wavelengths_nm > 0).all()):
+    has_none = np.isnan(glass.wavelengths_nm).all()
+    if not (has_none or (glass.wavelengths_nm > 0).all()):
         raise InputError(
             f"wavelength_nm from {glass.wavelengths_nm.min():g}; write wavelengths over 0 nm"
         )
-    if not ((glass.illumination >= 0) & (glass.illumination <= 2)).all():
+    illumination = glass.illumination
+    if not ((illumination >= 0) & (illumination <= 2)).all():
         raise InputError(
             "relative_illumination is not within 0 to 2; write each point's light relative to the"
             " axis"
@@ -316,20 +335,21 @@ def _check_numbers(glass: Glass) -> None:
 
 
 def _check_psfs(glass: Glass) -> None:
+    """Raise InputError for a PSF that does not sum to 1, lies beside its chief ray, or is too
+    negative.
+    """
     binned = [_binned(image, glass.per_px) for image in glass.basis]
     _, height, width = glass.basis.shape
-    x = np.arange(width) - width // 2
-    y = np.arange(height) - height // 2
-    firsts = np.stack(
-        [glass.basis.sum(axis=(1, 2)), (glass.basis.sum(axis=1) @ x), glass.basis.sum(axis=2) @ y],
-        axis=1,
-    )
+    light = glass.basis.sum(axis=(1, 2))
+    moment_x = glass.basis.sum(axis=1) @ offsets(width)
+    moment_y = glass.basis.sum(axis=2) @ offsets(height)
+    moments = np.stack([light, moment_x, moment_y], axis=1)
     for f, wavelength, focus in np.ndindex(*glass.weights.shape[:3]):
         weights = glass.weights[f, wavelength, focus]
         where = f"the PSF at ({glass.places_px[f, 0]:g}, {glass.places_px[f, 1]:g}) px"
         if not np.isnan(glass.wavelengths_nm[wavelength]):
             where += f", {glass.wavelengths_nm[wavelength]:g} nm"
-        total, off_x, off_y = weights @ firsts
+        total, off_x, off_y = weights @ moments
         if abs(total - 1) > SUM_TOLERANCE:
             raise InputError(f"{where} sums to {total:.4g}; write weights whose PSF sums to 1")
         if abs(off_x) > MAX_OFF * width or abs(off_y) > MAX_OFF * height:
@@ -345,9 +365,12 @@ def _check_psfs(glass: Glass) -> None:
 
 
 def _binned(image: Float32Array, per_px: int) -> FloatArray:
-    """Sums over about a pixel each."""
-    rows = np.add.reduceat(image.astype(np.float64), np.arange(0, image.shape[0], per_px), axis=0)
-    return np.asarray(np.add.reduceat(rows, np.arange(0, image.shape[1], per_px), axis=1))
+    """An image's sums over squares of about a pixel."""
+    height, width = image.shape
+    first_rows = np.arange(0, height, per_px)
+    first_columns = np.arange(0, width, per_px)
+    rows = np.add.reduceat(image.astype(np.float64), first_rows, axis=0)
+    return np.asarray(np.add.reduceat(rows, first_columns, axis=1))
 
 
 def write_glass(path: Path, glass: Glass) -> None:
@@ -366,32 +389,29 @@ def write_glass(path: Path, glass: Glass) -> None:
     header["CREATOR"] = f"hilstar {__version__}"
     for line in glass.history:
         header["HISTORY"] = line
-    f, wavelength, focus = (part.ravel() for part in np.indices(glass.illumination.shape))
-    columns = dict(zip(AXES[:2], glass.places_px[f].T, strict=True))
-    columns |= {
-        "wavelength_nm": glass.wavelengths_nm[wavelength],
-        "focus_um": glass.focuses_um[focus],
-    }
-    lateral = glass.lateral_px.reshape(-1, 2).T
-    columns |= dict(
-        zip(FACTS, (glass.illumination.ravel(), glass.outside.ravel(), *lateral), strict=True)
-    )
-    table = [fits.Column(name, "D", array=value) for name, value in columns.items()]
     count = glass.weights.shape[-1]
-    table.append(fits.Column("weights", f"{count}D", array=glass.weights.reshape(-1, count)))
-    hdus = [fits.PrimaryHDU(glass.basis, header), fits.BinTableHDU.from_columns(table, name=POINTS)]
-    if glass.transmission is not None:
-        curve = zip(
-            ("wavelength_nm", "transmission"),
-            (glass.transmission.wavelength_nm, glass.transmission.value),
-            strict=True,
-        )
-        hdus.append(
-            fits.BinTableHDU.from_columns(
-                [fits.Column(n, "D", array=v) for n, v in curve], name=TRANSMISSION
-            )
-        )
+    columns = [fits.Column(name, "D", array=value) for name, value in _point_columns(glass)]
+    columns.append(fits.Column("weights", f"{count}D", array=glass.weights.reshape(-1, count)))
+    points = fits.BinTableHDU.from_columns(columns, name=POINTS)
+    hdus = [fits.PrimaryHDU(glass.basis, header), points]
+    curve = glass.transmission
+    if curve is not None:
+        curve_columns = [
+            fits.Column("wavelength_nm", "D", array=curve.wavelength_nm),
+            fits.Column("transmission", "D", array=curve.value),
+        ]
+        hdus.append(fits.BinTableHDU.from_columns(curve_columns, name=TRANSMISSION))
     written(path, fits.HDUList(hdus).writeto)
+
+
+def _point_columns(glass: Glass) -> Iterator[tuple[str, FloatArray]]:
+    """The columns of AXES and FACTS of a glass's points, and their names."""
+    point, wavelength, focus = np.indices(glass.illumination.shape).reshape(3, -1)
+    x_px, y_px = glass.places_px[point].T
+    lateral_x_px, lateral_y_px = glass.lateral_px.reshape(-1, 2).T
+    axes = (x_px, y_px, glass.wavelengths_nm[wavelength], glass.focuses_um[focus])
+    facts = (glass.illumination.ravel(), glass.outside.ravel(), lateral_x_px, lateral_y_px)
+    yield from zip((*AXES, *FACTS), (*axes, *facts), strict=True)
 
 
 def read_glass(path: Path) -> SampledPsf | Glass:

@@ -20,7 +20,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, MachineError, shortened
 from hilstar.basics.reading import parse_toml, read_text
 from hilstar.basics.toml_tables import Table
-from hilstar.optics.glass.psf_file import Glass, Stack, glass_of
+from hilstar.optics.glass.psf_file import Glass, Stack, glass_of, pupil_places
 
 MAX_BYTES = 1_000_000
 ADVICE = "give a TOML file as docs/optics.md has it"
@@ -80,10 +80,7 @@ def glass_of_pupil(path: Path, per_px: int | None, tolerance: float) -> Glass:
         pupil = msgspec.convert(parse_toml(path, read_text(path, ADVICE, MAX_BYTES)), Pupil)
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {shortened(str(error))}; {ADVICE}") from error
-    finest_um = min(pupil.wavelengths_nm) * 1e-3 * pupil.focal_length_mm / pupil.aperture_mm / 2
-    samples = per_px or min(
-        MAX_SAMPLES, max(MIN_SAMPLES, math.ceil(pupil.pixel_pitch_um / finest_um))
-    )
+    samples = per_px or _samples_a_px(pupil)
     try:
         stack = diffracted(pupil, samples)
         return glass_of(stack, tolerance, history=(f"hilstar optics zernike of {path.name}",))
@@ -91,31 +88,48 @@ def glass_of_pupil(path: Path, per_px: int | None, tolerance: float) -> Glass:
         raise InputError(f"{path}: {error}") from error
 
 
+def _samples_a_px(pupil: Pupil) -> int:
+    """Samples to a pixel, two to the finest detail of the shortest wave."""
+    f_number = pupil.focal_length_mm / pupil.aperture_mm
+    finest_um = min(pupil.wavelengths_nm) * 1e-3 * f_number / 2
+    wanted = math.ceil(pupil.pixel_pitch_um / finest_um)
+    return min(MAX_SAMPLES, max(MIN_SAMPLES, wanted))
+
+
 def diffracted(pupil: Pupil, per_px: int) -> Stack:
     """The PSFs of a pupil at its field points, wavelengths and focus positions. Raises
     InputError and MachineError.
     """
     pupil_field = PupilField(pupil)
-    (width, height), middle = pupil.resolution_px, (np.array(pupil.resolution_px) - 1) / 2
-    columns, rows = (
-        np.linspace(0, size - 1, pupil.points) if pupil.points > 1 else [(size - 1) / 2]
-        for size in (width, height)
-    )
+    width, height = pupil.resolution_px
+    middle = (np.array(pupil.resolution_px) - 1) / 2
+    columns = _grid_places(width, pupil.points)
+    rows = _grid_places(height, pupil.points)
+    wavelengths_nm = sorted(set(pupil.wavelengths_nm))
+    focuses_um = sorted(set(pupil.focuses_um))
     images = []
     places = []
     facts = []
-    for x_px, y_px, nm, focus_um in product(
-        columns, rows, sorted(set(pupil.wavelengths_nm)), sorted(set(pupil.focuses_um))
-    ):
+    for x_px, y_px, nm, focus_um in product(columns, rows, wavelengths_nm, focuses_um):
         off_px = np.array([x_px, y_px]) - middle
-        image, outside = psf_of(pupil, pupil_field(off_px, nm, focus_um), nm, per_px)
+        field = pupil_field(off_px, nm, focus_um)
+        image, outside = psf_of(pupil, field, nm, per_px)
         images.append(image)
         places.append((x_px, y_px, nm, focus_um))
-        slope2 = (pupil.pixel_pitch_um * 1e-3 / pupil.focal_length_mm) ** 2 * (off_px @ off_px)
-        lateral_px = pupil.lateral_per_nm * (nm - pupil.reference_nm) * off_px
+        px_tangent = pupil.pixel_pitch_um * 1e-3 / pupil.focal_length_mm
+        slope2 = px_tangent**2 * (off_px @ off_px)
+        growth = pupil.lateral_per_nm * (nm - pupil.reference_nm)
+        lateral_px = growth * off_px
         illumination = (1 + slope2) ** -2 if pupil.cos4 else 1.0
         facts.append((illumination, outside, *lateral_px))
     return Stack(np.array(images), np.array(places), np.array(facts), per_px)
+
+
+def _grid_places(size: int, points: int) -> FloatArray:
+    """Places (points,), px, along an axis: from edge to edge, or the middle alone."""
+    if points == 1:
+        return np.array([(size - 1) / 2])
+    return np.linspace(0, size - 1, points)
 
 
 class PupilField:
@@ -127,33 +141,35 @@ class PupilField:
         zernike = _poppy().zernike
         self._pupil = pupil
         self._amplitude = aperture(pupil)
-        at = (np.arange(PUPIL) + 0.5) / PUPIL * 2 - 1
+        at = pupil_places(PUPIL)
         self._x, self._y = np.meshgrid(at, at)
         self._r2 = self._x**2 + self._y**2
-        polar = {
-            "rho": np.minimum(np.sqrt(self._r2), 1.0),
-            "theta": np.arctan2(self._y, self._x),
-            "outside": 0.0,
-        }
-        nolls = {term.noll for term in pupil.terms if term.kind == "zernike"}
-        self._zernikes: dict[int, FloatArray] = {j: zernike.zernike1(j, **polar) for j in nolls}
+        radius = np.minimum(np.sqrt(self._r2), 1.0)
+        polar = {"rho": radius, "theta": np.arctan2(self._y, self._x), "outside": 0.0}
+        self._zernikes: dict[int, FloatArray] = {}
+        for term in pupil.terms:
+            if term.kind == "zernike" and term.noll not in self._zernikes:
+                self._zernikes[term.noll] = zernike.zernike1(term.noll, **polar)
 
     def __call__(self, off_px: FloatArray, nm: float, focus_um: float) -> FloatArray:
         """The field at a place, px from the image's middle. Raises InputError where its samples
         are too coarse.
         """
         pupil = self._pupil
-        radius = float(np.hypot(*off_px)) / (float(np.hypot(*pupil.resolution_px)) / 2)
-        direction = off_px / max(float(np.hypot(*off_px)), 1e-12)
-        along = self._x * direction[0] + self._y * direction[1]
-        wave_nm = 1e3 * focus_um / 8 * (pupil.aperture_mm / pupil.focal_length_mm) ** 2 * self._r2
+        distance_px = float(np.hypot(*off_px))
+        diagonal_px = float(np.hypot(*pupil.resolution_px))
+        radius = distance_px / (diagonal_px / 2)
+        direction_x, direction_y = off_px / max(distance_px, 1e-12)
+        along = self._x * direction_x + self._y * direction_y
+        # a defocus of a lens by its sagitta: the wave's at the pupil's edge is focus / (8 N^2)
+        inverse_f_number = pupil.aperture_mm / pupil.focal_length_mm
+        wave_nm = 1e3 * focus_um / 8 * inverse_f_number**2 * self._r2
         for term in pupil.terms:
             size_nm = term.nm + term.per_nm * (nm - pupil.reference_nm)
             match term.kind:
                 case "zernike":
-                    wave_nm = (
-                        wave_nm + size_nm * radius**term.field_power * self._zernikes[term.noll]
-                    )
+                    growth = radius**term.field_power
+                    wave_nm = wave_nm + size_nm * growth * self._zernikes[term.noll]
                 case "W020":
                     wave_nm = wave_nm + size_nm * self._r2
                 case "W040":
@@ -165,36 +181,37 @@ class PupilField:
                 case "W220":
                     wave_nm = wave_nm + size_nm * radius**2 * self._r2
         lit = self._amplitude > 0
-        steps = []
-        for k in (0, 1):
-            steps.append(
-                np.abs(np.diff(wave_nm, axis=k))[lit[1:, :] if k == 0 else lit[:, 1:]].max(
-                    initial=0.0
-                )
-                / nm
-            )
-        if max(steps) > MAX_STEP_WAVES:
+        steps_down = np.abs(np.diff(wave_nm, axis=0))
+        steps_right = np.abs(np.diff(wave_nm, axis=1))
+        largest_down_nm = steps_down[lit[1:, :]].max(initial=0.0)
+        largest_right_nm = steps_right[lit[:, 1:]].max(initial=0.0)
+        waves = max(largest_down_nm, largest_right_nm) / nm
+        if waves > MAX_STEP_WAVES:
             raise InputError(
-                f"the wavefront at {nm:g} nm and focus {focus_um:g} um changes by {max(steps):.2g}"
-                f" waves from one of {PUPIL} pupil samples to the next; write smaller coefficients"
-                " or focus positions"
+                f"the wavefront at {nm:g} nm and focus {focus_um:g} um changes by {waves:.2g} waves"
+                f" from one of {PUPIL} pupil samples to the next; write smaller coefficients or"
+                " focus positions"
             )
-        return np.asarray(self._amplitude * np.exp(2j * np.pi / nm * wave_nm))
+        phase = np.exp(2j * np.pi / nm * wave_nm)
+        return np.asarray(self._amplitude * phase)
 
 
 def aperture(pupil: Pupil) -> FloatArray:
     """How much of each of the pupil's samples (PUPIL, PUPIL) is open, 0 to 1."""
-    at = (np.arange(PUPIL * FINER) + 0.5) / (PUPIL * FINER) * 2 - 1
+    at = pupil_places(PUPIL * FINER)
     x, y = np.meshgrid(at, at)
     r2 = x * x + y * y
     is_open = (r2 <= 1) & (r2 >= pupil.obstruction**2)
     half = pupil.spider_width_mm / pupil.aperture_mm
     for k in range(pupil.spiders):
         angle = math.radians(pupil.spider_angle_deg + 360 * k / pupil.spiders)
-        along = x * math.cos(angle) + y * math.sin(angle)
-        across = y * math.cos(angle) - x * math.sin(angle)
+        cosine = math.cos(angle)
+        sine = math.sin(angle)
+        along = x * cosine + y * sine
+        across = y * cosine - x * sine
         is_open &= (np.abs(across) > half) | (along < 0)
-    return np.asarray(is_open.reshape(PUPIL, FINER, PUPIL, FINER).mean(axis=(1, 3)))
+    by_sample = is_open.reshape(PUPIL, FINER, PUPIL, FINER)
+    return np.asarray(by_sample.mean(axis=(1, 3)))
 
 
 def psf_of(pupil: Pupil, field: FloatArray, nm: float, per_px: int) -> tuple[FloatArray, float]:
@@ -215,11 +232,15 @@ def psf_of(pupil: Pupil, field: FloatArray, nm: float, per_px: int) -> tuple[Flo
             f" {finest}"
         )
     transform = _poppy().matrixDFT.MatrixFourierTransform(centering="SYMMETRIC")
-    image = np.abs(transform.perform(field, side * step, side)) ** 2
-    return image, max(0.0, 1 - float(image.sum() / np.abs(field).sum()))
+    waves = transform.perform(field, side * step, side)
+    image = np.abs(waves) ** 2
+    inside = float(image.sum() / np.abs(field).sum())
+    outside = 1 - inside
+    return image, max(0.0, outside)
 
 
 def _poppy() -> Any:
+    """poppy, which only pupils need. Raises MachineError without it."""
     try:
         import poppy.matrixDFT
         import poppy.zernike

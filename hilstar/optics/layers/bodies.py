@@ -37,7 +37,7 @@ MAX_POSED_PX = 120
 # Poses in an exposure for each sigma that the camera moves: a limb is then a chain of edges at most
 # 1.6 sigma apart.
 EXPOSED_PER_SIGMA = 1.0
-MAX_EXPOSED = 63
+MAX_EXPOSED = 63  # poses, which bounds an exposure's work; odd, so that one is in the middle
 # places of a limb that are asked whether they are hidden: a body hides another's outline as a whole
 LIMB_PLACES = 24
 LATTICE = 9  # places along each side of a disc's rectangle at which clipping is tested
@@ -49,9 +49,9 @@ class BodyLayer:
     def __init__(self, moving: "MovingSky", canvas: Canvas) -> None:
         self.canvas = canvas
         self._moving = moving
-        px_rad = canvas.camera.scales_px_rad()
-        self._px_sr = px_rad[0] ** -2
-        self._px_per_rad = px_rad[1]
+        smallest_px_rad, largest_px_rad = canvas.camera.scales_px_rad()
+        self._px_sr = smallest_px_rad**-2
+        self._px_per_rad = largest_px_rad
         self._reach_rad = canvas.camera.field_radius_rad(canvas.psf.footprint_px / 2 + 1)
 
     def add(self, light: FrameLight, stars: Stars, view: View) -> FrameLight:
@@ -72,7 +72,8 @@ class BodyLayer:
         extended = list(light.extended)
         names = []
         over_white = []
-        for disc, lights in zip(reversed(discs), self._lights(discs, posed), strict=True):
+        drawn_lights = self._lights(discs, posed)
+        for disc, lights in zip(reversed(discs), drawn_lights, strict=True):
             extended.extend(lights)
             if lights:
                 names.append(disc.name)
@@ -88,30 +89,32 @@ class BodyLayer:
     def on_image(self, view: View) -> list[Disc]:
         """Discs that touch the image of a camera at rest, nearest first."""
         camera = self.canvas.camera
-        icrs_to_image = view.icrs_to_image(self.canvas.camera)
-        lights = (
-            DiscLight(disc, icrs_to_image, camera, self.canvas.psf) for disc in self._near(view)
-        )
-        return [light.disc for light in lights if light.region(camera.resolution_px) is not None]
+        icrs_to_image = view.icrs_to_image(camera)
+        discs = []
+        for disc in self._near(view):
+            light = DiscLight(disc, icrs_to_image, camera, self.canvas.psf)
+            if light.region(camera.resolution_px) is not None:
+                discs.append(disc)
+        return discs
 
     def alone(self, disc: Disc, view: View) -> tuple[ExtendedLight, ...]:
         """The light of a disc that nothing covers, at rest."""
-        return tuple(self._lights([disc], self._still(view.icrs_to_image(self.canvas.camera)))[0])
+        posed = self._still(view.icrs_to_image(self.canvas.camera))
+        (lights,) = self._lights([disc], posed)
+        return tuple(lights)
 
     def any_lights(self) -> tuple[ExtendedLight, ...]:
         """Discs of several sizes in the middle of the image: for a driver that compiles a shader
         for each kind.
         """
         ahead = np.array([0.0, 0.0, 1.0])
-        radii_rad = (
-            np.array([2.0, 20.0, 100.0, 400.0]) * max(self.canvas.psf.width_px) / self._px_per_rad
-        )
+        sigma_rad = max(self.canvas.psf.width_px) / self._px_per_rad
         discs = []
-        for r in radii_rad.tolist():
-            discs.append(
-                Disc("", ahead, 1 / math.sin(min(r, 1.0)), 1.0, 1.0, ahead, -ahead, "lambert")
-            )
-        return tuple(itertools.chain.from_iterable(self._lights(discs, self._still(np.eye(3)))))
+        for radius_sigma in (2.0, 20.0, 100.0, 400.0):
+            distance_km = 1 / math.sin(min(radius_sigma * sigma_rad, 1.0))
+            discs.append(Disc("", ahead, distance_km, 1.0, 1.0, ahead, -ahead, "lambert"))
+        lights = self._lights(discs, self._still(np.eye(3)))
+        return tuple(itertools.chain.from_iterable(lights))
 
     def unhidden(
         self, light: FrameLight, stars: Stars, discs: list[Disc], view: View
@@ -127,10 +130,10 @@ class BodyLayer:
         # those that nothing hides.
         satellite = np.flatnonzero((which >= len(stars) - len(stars.bodies)) & (which < first))
         point = np.flatnonzero(which >= first)
+        far_km = np.empty(0)
         if len(point):
-            far_km = self._moving.distances_km(*view.observer)[which[point] - first]
-        else:
-            far_km = np.empty(0)
+            distances_km = self._moving.distances_km(*view.observer)
+            far_km = distances_km[which[point] - first]
         for disc in discs:
             # more than a cosine rounds
             reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7
@@ -140,7 +143,8 @@ class BodyLayer:
             behind = np.flatnonzero(near)
             if len(behind):
                 through[behind] *= disc.transmission(directions[behind])
-        through[np.isin(light.star, disc_stars(stars, (disc.name for disc in discs)))] = 0.0
+        itself = disc_stars(stars, (disc.name for disc in discs))
+        through[np.isin(light.star, itself)] = 0.0
         is_shown = through >= HIDDEN
         if is_shown.all() and (through == 1).all():
             return light
@@ -167,10 +171,9 @@ class BodyLayer:
         discs = self._moving.discs(axis, reach_rad, wide_rad, *view.observer)
         wide_discs = []
         for k, disc in enumerate(discs):
+            places = disc.direction[None]
             if k:
                 places = np.vstack([disc.direction, disc.limb(LIMB_PLACES)])
-            else:
-                places = disc.direction[None]
             through = np.ones(len(places))
             for nearer in discs[:k]:
                 through *= nearer.transmission(places)
@@ -179,6 +182,7 @@ class BodyLayer:
         return wide_discs
 
     def _still(self, icrs_to_image: FloatArray) -> DiscView:
+        """The camera at rest."""
         return DiscView(self.canvas.camera, self.canvas.psf, (Pose(icrs_to_image),))
 
     def _exposed(self, view: View) -> DiscView:
@@ -187,46 +191,46 @@ class BodyLayer:
         """
         camera = self.canvas.camera
         exposure_s = view.scan.hold_s
-        length_sigma = (
-            view.turn.speed_rad_s * exposure_s * self._px_per_rad / min(self.canvas.psf.width_px)
-        )
+        length_px = view.turn.speed_rad_s * exposure_s * self._px_per_rad
+        length_sigma = length_px / min(self.canvas.psf.width_px)
         count = min(math.ceil(EXPOSED_PER_SIGMA * length_sigma) | 1, MAX_EXPOSED)
         place, weight = gauss_legendre(count)
         maps = view.motion.icrs_to_image(place / 2 * exposure_s, camera)
-        poses = tuple(
-            Pose(pose_map, float(share / 2)) for pose_map, share in zip(maps, weight, strict=True)
-        )
-        return DiscView(
-            camera, self.canvas.psf, poses, _shear(view.scan, view.turn.rate_cam_rad_s, camera)
-        )
+        poses = []
+        for icrs_to_image, share in zip(maps, weight, strict=True):
+            poses.append(Pose(icrs_to_image, float(share / 2)))
+        shear = _shear(view.scan, view.turn.rate_cam_rad_s, camera)
+        return DiscView(camera, self.canvas.psf, tuple(poses), shear)
 
     def _turning(self, view: View, max_poses: int) -> DiscView:
         """The camera while a screen's rows light up one after the other, each held for a time."""
         camera = self.canvas.camera
         scan = view.scan
         turn, _ = slowed(view.turn, scan, camera)
-        length_sigma = (
-            turn.speed_rad_s * scan.hold_s * self._px_per_rad / min(self.canvas.psf.width_px)
-        )
+        length_px = turn.speed_rad_s * scan.hold_s * self._px_per_rad
+        length_sigma = length_px / min(self.canvas.psf.width_px)
         count = 1
         if length_sigma > POINT_SIGMA:
             # odd: one is in the middle
             count = min(math.ceil(NODES_PER_SIGMA * length_sigma + 1) | 1, max_poses)
         place, weight = gauss_legendre(count)
-        times = zip(((place + 1) / 2 * scan.hold_s).tolist(), (weight / 2).tolist(), strict=True)
-        attitudes = (
-            (propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, seconds), share)
-            for seconds, share in times
-        )
-        poses = tuple(Pose(camera.cam_to_image @ to_matrix(q), share) for q, share in attitudes)
-        return DiscView(camera, self.canvas.psf, poses, _shear(scan, turn.rate_cam_rad_s, camera))
+        seconds = (place + 1) / 2 * scan.hold_s
+        poses = []
+        for second, share in zip(seconds.tolist(), (weight / 2).tolist(), strict=True):
+            q_icrs_to_cam = propagate(turn.q_icrs_to_cam, turn.rate_cam_rad_s, second)
+            poses.append(Pose(camera.cam_to_image @ to_matrix(q_icrs_to_cam), share))
+        shear = _shear(scan, turn.rate_cam_rad_s, camera)
+        return DiscView(camera, self.canvas.psf, tuple(poses), shear)
 
     def _lights(self, discs: list[Disc], posed: DiscView) -> list[list[ExtendedLight]]:
         """The light of each of some discs, which are nearest first, in the order in which they
         are drawn.
         """
-        ordered = reversed([*enumerate(discs, 1)])
-        return [disc_lights(disc, posed, covers=k < len(discs)) for k, disc in ordered]
+        lights = []
+        for number, disc in reversed([*enumerate(discs, 1)]):
+            # the last of the list is drawn first, and there is nothing to cover
+            lights.append(disc_lights(disc, posed, covers=number < len(discs)))
+        return lights
 
     def _clips(self, lights: list[ExtendedLight], white_e_per_s: float) -> bool:
         """Whether a disc's lights have more than white in a pixel; a large disc is tested at a
@@ -234,10 +238,13 @@ class BodyLayer:
         """
         if not math.isfinite(white_e_per_s):
             return False
-        brightest = sum(
-            float(light.image.max(initial=0.0)) for light in lights if isinstance(light, LightMap)
-        )
-        large = [light for light in lights if isinstance(light, DiscLight)]
+        large = []
+        brightest = 0.0
+        for light in lights:
+            if isinstance(light, LightMap):
+                brightest += float(light.image.max(initial=0.0))
+            elif isinstance(light, DiscLight):
+                large.append(light)
         if large:
             brightest = self._px_sr * self._brightest(large[len(large) // 2])
         return brightest > white_e_per_s
@@ -249,10 +256,9 @@ class BodyLayer:
         if region is None:
             return 0.0
         left, top, width, height = region
-        x, y = np.meshgrid(
-            np.linspace(left, left + width - 1, LATTICE),
-            np.linspace(top, top + height - 1, LATTICE),
-        )
+        across = np.linspace(left, left + width - 1, LATTICE)
+        down = np.linspace(top, top + height - 1, LATTICE)
+        x, y = np.meshgrid(across, down)
         u, v = camera.tangents(x.ravel(), y.ravel())
         rays = np.nan_to_num(np.stack([u, v, np.ones_like(u)], axis=1))
         # And of its lit face: a crescent may lie between those of the lattice
@@ -268,17 +274,14 @@ def _shear(scan: Scan, rate_cam_rad_s: FloatArray, camera: Camera) -> Shear | No
     """
     if not scan.scanout_s:
         return None
-    late_s = tuple(
-        down * scan.scanout_s / size
-        for down, size in zip(scan.down, camera.resolution_px, strict=True)
-    )
-    middle = tuple((size - 1) / 2 for size in camera.resolution_px)
-    return Shear(
-        camera.cam_to_image @ rate_cam_rad_s, (late_s[0], late_s[1]), (middle[0], middle[1])
-    )
+    width, height = camera.resolution_px
+    right, down = scan.down
+    late_s = right * scan.scanout_s / width, down * scan.scanout_s / height
+    middle_px = (width - 1) / 2, (height - 1) / 2
+    return Shear(camera.cam_to_image @ rate_cam_rad_s, late_s, middle_px)
 
 
 def disc_stars(stars: Stars, names: Iterable[str]) -> IntArray:
-    """The places of discs among `stars`, whose last are the bodies."""
+    """The rows of bodies among `stars`, by name: bodies are the last rows."""
     last_first = stars.bodies[::-1]  # a satellite may have a body's name; satellites come before
     return np.array([len(stars) - 1 - last_first.index(name) for name in names], dtype=np.intp)

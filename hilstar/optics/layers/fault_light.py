@@ -200,24 +200,26 @@ class FaultView:
         lights = []
         for active in now:
             fault = active.fault
-            if (
-                not isinstance(fault, FalseStar | Flash)
-                or fault.tracker_px is not None
-                or fault.screen_px is not None
-            ):
+            if not isinstance(fault, FalseStar | Flash) or _moves_with_camera(fault):
                 continue
-            if isinstance(fault, Flash) and (fault.hip is not None or fault.star is not None):
-                # A star too faint to show is among all of the bench's stars.
-                at = []
-                for known in (stars, self.by.stars):
-                    for place in self._places(known, fault)[:1]:
-                        at.append(known.vectors[place])
-            else:
-                at = [self.by.apparent(icrs_direction(fault)[None])[0]]
-            if at:
-                vectors.append(at[0])
+            vector = self._sky_vector(fault, stars)
+            if vector is not None:
+                vectors.append(vector)
                 lights.append(self._added(fault, active.share))
         return np.reshape(vectors, (-1, 3)), lights
+
+    def _sky_vector(self, fault: FalseStar | Flash, stars: Stars) -> FloatArray | None:
+        """The direction (3,), ICRS, of a point that is fixed on the sky; None for a star that the
+        bench does not have.
+        """
+        if not isinstance(fault, Flash) or (fault.hip is None and fault.star is None):
+            return np.asarray(self.by.apparent(icrs_direction(fault)[None])[0])
+        # A star too faint to show is among all of the bench's stars.
+        for known in (stars, self.by.stars):
+            places = self._places(known, fault)
+            if len(places):
+                return np.asarray(known.vectors[places[0]])
+        return None
 
     def star_direction(self, fault: Fault) -> FloatArray | None:
         """The direction (3,), ICRS, of the star that a fault is about; None if it is about none."""
@@ -227,13 +229,10 @@ class FaultView:
         return None
 
     def _added(self, fault: PointLight, share: float = 1.0) -> AddedLight:
+        """A point's name and light, of which a share is shown."""
         rate = self.light_e_per_s(fault) * share
-        return AddedLight(
-            fault.name,
-            float(magnitude(rate / self.by.v0_e_per_s(fault.bv_mag))),
-            fault.bv_mag,
-            rate,
-        )
+        v_mag = float(magnitude(rate / self.by.v0_e_per_s(fault.bv_mag)))
+        return AddedLight(fault.name, v_mag, fault.bv_mag, rate)
 
     def camera_points(
         self, now: Sequence[Now], scan: Scan | None
@@ -245,9 +244,7 @@ class FaultView:
         lights = []
         for active in now:
             fault = active.fault
-            if isinstance(fault, FalseStar | Flash) and (
-                fault.tracker_px is not None or fault.screen_px is not None
-            ):
+            if isinstance(fault, FalseStar | Flash) and _moves_with_camera(fault):
                 chains.append(self._moving(fault, active, scan))
                 lights.append(self._added(fault, active.share))
             elif isinstance(fault, CosmicRays):
@@ -258,23 +255,25 @@ class FaultView:
                 lights += [AddedLight(fault.name, v_mag, TRACK_BV_MAG, rate)] * fault.number
         return chains, lights
 
-    def _moving(self, fault: FalseStar | Flash, one: Now, scan: Scan | None) -> "PointChain":
+    def _moving(self, fault: FalseStar | Flash, active: Now, scan: Scan | None) -> "PointChain":
         """A point's path over the pixels while they are lit."""
-        by, (source, place) = self.by, self._source(fault)
-        rate = np.array(fault.rate_px_s)
-        since_s = one.since_ns / NS_PER_S
-        begin_s = since_s
+        canvas = self.by.canvas
+        camera = canvas.camera
+        source, place = self._source(fault)
+        begin_px = np.array([place])
+        rate_px_s = np.array(fault.rate_px_s)
+        begin_s = active.since_ns / NS_PER_S
         hold_s = 0.0
-        if scan is not None and rate.any():
-            x_px, y_px = by.canvas.camera.pixels_from(
-                source, *(np.array([place]) + rate * since_s).T
-            )
-            late_s = scan.late_s(x_px, y_px, by.canvas.camera.resolution_px)[0]
-            begin_s = since_s + (float(late_s) if math.isfinite(late_s) else 0.0)
+        if scan is not None and rate_px_s.any():
+            x_px, y_px = camera.pixels_from(source, *(begin_px + rate_px_s * begin_s).T)
+            late_s = float(scan.late_s(x_px, y_px, camera.resolution_px)[0])
+            if math.isfinite(late_s):
+                begin_s += late_s
             hold_s = scan.hold_s
-        ends = [(np.array(place) + rate * seconds)[None] for seconds in (begin_s, begin_s + hold_s)]
-        light = np.array([self.light_e_per_s(fault) * one.share])
-        return Lines(ends[0], ends[1], light).seen_by(by.canvas.camera, source, by.canvas.psf)
+        first_px = begin_px + rate_px_s * begin_s
+        last_px = begin_px + rate_px_s * (begin_s + hold_s)
+        light = np.array([self.light_e_per_s(fault) * active.share])
+        return Lines(first_px, last_px, light).seen_by(camera, source, canvas.psf)
 
     def _burst(self, fault: CosmicRays, since_ns: int) -> "PointChain":
         """The tracks of the exposure that a moment is in, counted from the burst's beginning."""
@@ -284,23 +283,19 @@ class FaultView:
         if key not in self._tracks:
             if len(self._tracks) >= KEPT_BURSTS:
                 self._tracks.clear()
-            made = tracks(
-                fault,
-                by.tracker.resolution_px,
-                by.exposure_s,
-                self.rng(fault.name, TRACK_SEED, number),
-            )
-            self._tracks[key] = made.seen_by(by.canvas.camera, by.tracker, by.canvas.psf)
+            rng = self.rng(fault.name, TRACK_SEED, number)
+            lines = tracks(fault, by.tracker.resolution_px, by.exposure_s, rng)
+            self._tracks[key] = lines.seen_by(by.canvas.camera, by.tracker, by.canvas.psf)
         return self._tracks[key]
 
     def gone(self, now: Sequence[Now], stars: Stars) -> list[tuple[int, float]]:
         """Stars that a fault removes, and the share of their light that is left in this frame."""
-        taken = [active for active in now if isinstance(active.fault, StarGone)]
-        return [
-            (int(star), 1 - active.share)
-            for active in taken
-            for star in self._places(stars, active.fault)
-        ]
+        removed = []
+        for active in now:
+            if isinstance(active.fault, StarGone):
+                for star in self._places(stars, active.fault):
+                    removed.append((int(star), 1 - active.share))
+        return removed
 
     def _places(self, stars: Stars, fault: Fault) -> IntArray:
         """The places of a fault's star in `stars`; empty if it is not among them, or the fault is
@@ -410,9 +405,8 @@ def _places(stars: Stars, wanted: int | str) -> IntArray:
     if identifier is None:
         return np.empty(0, dtype=np.intp)
     nameless = np.flatnonzero(stars.hip[:first] == 0)
-    return np.asarray(
-        nameless[stars.catalog.identifier[stars.row[nameless]] == identifier], dtype=np.intp
-    )
+    identifiers = stars.catalog.identifier[stars.row[nameless]]
+    return np.asarray(nameless[identifiers == identifier], dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True)
@@ -442,22 +436,28 @@ class Lines:
         """The lines in pixels of `source` as `camera` sees them; lines behind it or beyond its
         lens have no points.
         """
-        ends = []
-        for place in (self.begin_px, self.end_px):
-            ends.append(np.stack(camera.pixels_from(source, *place.T)))
-        length_sigma = np.hypot(*((ends[1] - ends[0]) / np.array(psf.width_px)[:, None]))
+        begin_x, begin_y = camera.pixels_from(source, *self.begin_px.T)
+        end_x, end_y = camera.pixels_from(source, *self.end_px.T)
+        sigma_x, sigma_y = psf.width_px
+        across_sigma = (end_x - begin_x) / sigma_x
+        down_sigma = (end_y - begin_y) / sigma_y
+        length_sigma = np.hypot(across_sigma, down_sigma)
         known = np.nan_to_num(length_sigma, nan=-1.0, posinf=-1.0)
-        counts = np.where(
-            known < 0, 0, np.minimum(np.ceil(known / STEP_SIGMA), MAX_STEPS - 1).astype(np.intp) + 1
-        )
+        wanted = np.ceil(known / STEP_SIGMA)
+        steps = np.minimum(wanted, MAX_STEPS - 1).astype(np.intp)
+        counts = np.where(known < 0, 0, steps + 1)
         line = np.repeat(np.arange(len(counts)), counts)
         first = np.repeat(np.cumsum(counts) - counts, counts)
         # One point of a line that is none lies at its place; those of a longer one in the middles
         # of its equal parts.
-        share = ((np.arange(len(line)) - first + 0.5) / counts[line])[:, None]
-        places = self.begin_px[line] * (1 - share) + self.end_px[line] * share
+        order = np.arange(len(line)) - first
+        share = ((order + 0.5) / counts[line])[:, None]
+        begin = self.begin_px[line]
+        end = self.end_px[line]
+        places = begin * (1 - share) + end * share
         x_px, y_px = camera.pixels_from(source, *places.T)
-        return PointChain(x_px, y_px, self.electrons_per_s[line] / counts[line], line, len(counts))
+        light = self.electrons_per_s[line] / counts[line]
+        return PointChain(x_px, y_px, light, line, len(counts))
 
 
 def tracks(
@@ -469,5 +469,12 @@ def tracks(
     width, height = resolution_px
     middle = rng.random((burst.number, 2)) * (width, height) - 0.5
     angle = rng.uniform(0.0, 2 * np.pi, burst.number)
-    half = burst.length_px / 2 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return Lines(middle - half, middle + half, np.full(burst.number, burst.electrons / exposure_s))
+    direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    half = burst.length_px / 2 * direction
+    light = np.full(burst.number, burst.electrons / exposure_s)
+    return Lines(middle - half, middle + half, light)
+
+
+def _moves_with_camera(fault: FalseStar | Flash) -> bool:
+    """Whether a point has a place in the tracker's or the screen's pixels."""
+    return fault.tracker_px is not None or fault.screen_px is not None

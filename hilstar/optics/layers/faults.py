@@ -100,15 +100,15 @@ class FaultLayer:
         surfaces = by.surfaces(now, view.q_icrs_to_cam)
         parts = by.footprints(chains)
         if named:
-            drawn = by.by.points.add(
-                no_light(light.footprint_px), few_stars(directions, named, stars), view
-            )
+            stars_of_faults = few_stars(directions, named, stars)
+            drawn = by.by.points.add(no_light(light.footprint_px), stars_of_faults, view)
+            # lines have -1, -2 and on for `star`, what is fixed on the sky the numbers after
             parts = [replace(drawn, star=-1 - len(lines) - drawn.star), *parts]
         if parts:
-            longest = (
-                int(np.unique(part.star, return_counts=True)[1].max(initial=1)) for part in parts
-            )
-            per_star = max(light.per_star, *(part.per_star for part in parts), *longest)
+            per_star = light.per_star
+            for part in parts:
+                _, counts = np.unique(part.star, return_counts=True)
+                per_star = max(per_star, part.per_star, int(counts.max(initial=1)))
             light = replace(with_sprites(light, parts), per_star=per_star, added=(*lines, *named))
         if surfaces:
             return replace(light, extended=(*light.extended, *surfaces))
@@ -120,12 +120,12 @@ def _dimmed(sprites: FrameLight, gone: list[tuple[int, float]]) -> FrameLight:
     data = sprites.data
     is_shown = np.ones(len(sprites), dtype=bool)
     for star, remaining_share in gone:
-        its = sprites.star == star
+        is_star = sprites.star == star
         if remaining_share <= 0:
-            is_shown &= ~its
-        elif its.any():
+            is_shown &= ~is_star
+        elif is_star.any():
             data = data.copy()
-            data["electrons_per_s"][its] *= np.float32(remaining_share)
+            data["electrons_per_s"][is_star] *= np.float32(remaining_share)
     whole = replace(sprites, data=data)
     if is_shown.all():
         return whole
@@ -150,12 +150,8 @@ def _without_discs(sprites: FrameLight, gone: dict[str, float]) -> FrameLight:
             light = replace(light, times=light.times * gone[light.name])
         lights.append(light)
     discs = tuple(name for name in sprites.discs if gone.get(name, 1.0) > 0)
-    return replace(
-        sprites,
-        extended=tuple(lights),
-        discs=discs,
-        over_white=tuple(n for n in sprites.over_white if n in discs),
-    )
+    over_white = tuple(name for name in sprites.over_white if name in discs)
+    return replace(sprites, extended=tuple(lights), discs=discs, over_white=over_white)
 
 
 def few_stars(vectors: FloatArray, lights: Sequence[AddedLight], like: Stars) -> Stars:

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 # Limits of the work: sprites of all satellites together in a frame (the cost of 60 stars' paths of
 # 16 px) and in an exposure, and poses of one disc.
 FRAME_SPRITES, EXPOSURE_SPRITES = 1000, 200_000
+# discs along a satellite's path: they bound the work of an image
 FRAME_POSES, EXPOSURE_POSES = 33, 500
 ROW_ROUNDS = 2  # as for stars: see `scene.frame_motion`
 
@@ -94,17 +95,18 @@ class SatelliteLayer:
         satellites = self.moving.satellites
         if satellites is None or not satellites.sized:
             return []
-        passing = self._passing(
-            view, self.canvas.camera.field_radius_rad(0.0), 0.0, faintest_e_per_s=0.0
-        )
+        camera = self.canvas.camera
+        reach_rad = camera.field_radius_rad(0.0)
+        passing = self._passing(view, reach_rad, 0.0, faintest_e_per_s=0.0)
         if passing is None:
             return []
-        broad = np.flatnonzero(wide(passing, self.canvas.camera.scales_px_rad()[1], POINT_PX))
-        names = satellites.names
-        return [
-            disc_of(passing.only(np.array([k])), names[passing.index[k]], 0.0, stars.velocity_km_s)
-            for k in broad.tolist()
-        ]
+        _, largest_px_rad = camera.scales_px_rad()
+        discs = []
+        for k in np.flatnonzero(wide(passing, largest_px_rad, POINT_PX)).tolist():
+            name = satellites.names[passing.index[k]]
+            satellite = passing.only(np.array([k]))
+            discs.append(disc_of(satellite, name, 0.0, stars.velocity_km_s))
+        return discs
 
     def _passing(
         self, view: View, reach_rad: float, longest_s: float, faintest_e_per_s: float | None = None
@@ -113,17 +115,14 @@ class SatelliteLayer:
         from hilstar.sky.bodies.passes import Cone  # imports SGP4, which only satellites need
 
         axis = view.icrs_to_image(self.canvas.camera)[2]
-        if faintest_e_per_s is None:
-            faintest = self.faintest_e_per_s
-        else:
-            faintest = faintest_e_per_s
+        faintest = self.faintest_e_per_s if faintest_e_per_s is None else faintest_e_per_s
         return self.moving.passing(Cone(axis, reach_rad, longest_s, faintest), *view.observer)
 
     def _brush(self, view: View) -> Brush:
-        most, poses = (
-            (EXPOSURE_SPRITES, EXPOSURE_POSES) if view.exposed else (FRAME_SPRITES, FRAME_POSES)
-        )
-        return Brush(self.canvas.psf, most, poses)
+        """The bounds of an exposure's work, or of a frame's."""
+        if view.exposed:
+            return Brush(self.canvas.psf, EXPOSURE_SPRITES, EXPOSURE_POSES)
+        return Brush(self.canvas.psf, FRAME_SPRITES, FRAME_POSES)
 
     def _lit(self, seen: "Pass", path: TrailView, view: View) -> Lit:
         """When each satellite's row is lit."""
@@ -145,30 +144,27 @@ class SatelliteLayer:
             return light
         lit = self._lit(seen, path, view)
         drawn = []
-        for k in np.argsort(-np.linalg.norm(seen.seen_km[0], axis=1)):
+        farthest_first = np.argsort(-np.linalg.norm(seen.seen_km[0], axis=1))
+        for k in farthest_first:
             lit_span = Lit(lit.begin_s[[k]], lit.length_s)
             name = satellites.names[seen.index[k]]
             trail = disc_trail(seen.only(np.array([k])), name, path, lit_span, self._brush(view))
             if trail is not None:
                 drawn.append(trail)
                 light = hidden(light, stars.directions(light.star), trail)
-        index = np.array([trail_light.index for trail_light in drawn], dtype=np.intp)
-        rates = np.array([trail_light.electrons_per_s for trail_light in drawn])
-        satellites.write(
-            stars,
-            index,
-            np.array([trail_light.middle for trail_light in drawn]).reshape(-1, 3),
-            rates,
-        )
+        index = np.array([trail.index for trail in drawn], dtype=np.intp)
+        rates = np.array([trail.electrons_per_s for trail in drawn])
+        middles = np.array([trail.middle for trail in drawn]).reshape(-1, 3)
+        satellites.write(stars, index, middles, rates)
         white_e_per_s = self.canvas.white_in(view)
         lights = list(light.extended)
         discs = list(light.discs)
         over_white = list(light.over_white)
-        for trail_light in drawn:
-            name = trail_light.along[0].name
-            lights.extend(trail_light.lights)
+        for trail in drawn:
+            name = trail.along[0].name
+            lights.extend(trail.lights)
             discs.append(name)
-            if trail_light.brightest_e_per_s > white_e_per_s:
+            if trail.brightest_e_per_s > white_e_per_s:
                 over_white.append(name)
         return replace(
             light, extended=tuple(lights), discs=tuple(discs), over_white=tuple(over_white)

@@ -23,7 +23,7 @@ from hilstar.optics.layers.fault_kinds import Gradient, MeasuredMap
 # a camera's pixels lie smoothly in another's: splines between every eighth are right to 1e-4 px
 GRID_PX = 8
 MAX_FILE_BYTES = 200_000_000
-MAX_SIDE_PX = 16_384
+MAX_SIDE_PX = 16_384  # a map of this side takes 2 GB as float64
 MAP_ADVICE = "give a FITS image, a greyscale PNG or an npy array of the whole detector"
 
 
@@ -36,7 +36,8 @@ def gradient_image(fault: Gradient, camera: Camera, tracker: Camera) -> Float32A
     right = math.cos(math.radians(fault.towards_deg))
     down = math.sin(math.radians(fault.towards_deg))
     extent_px = abs(right) * width + abs(down) * height
-    rise = 0.5 + ((x_px - (width - 1) / 2) * right + (y_px - (height - 1) / 2) * down) / extent_px
+    along_px = (x_px - (width - 1) / 2) * right + (y_px - (height - 1) / 2) * down
+    rise = 0.5 + along_px / extent_px
     return as_light(np.maximum(rise, 0.0) * area)
 
 
@@ -52,7 +53,9 @@ def map_image(
     width, height = source.resolution_px
     rows, columns = values.shape
     inside = source.contains_px(x_px, y_px)
-    place = np.stack([(y_px + 0.5) * rows / height - 0.5, (x_px + 0.5) * columns / width - 0.5])
+    row = (y_px + 0.5) * rows / height - 0.5
+    column = (x_px + 0.5) * columns / width - 0.5
+    place = np.stack([row, column])
     sampled = map_coordinates(values, np.where(inside, place, 0.0), order=1, mode="nearest")
     return as_light(np.where(inside, sampled * area, 0.0))
 
@@ -80,26 +83,40 @@ def pixels_in(camera: Camera, other: Camera) -> PixelsIn:
         return PixelsIn(x, y, np.ones((height, width)))
     from scipy.interpolate import RectBivariateSpline
 
-    across, down = (
-        np.linspace(0, size - 1, max(5, size // GRID_PX)) for size in camera.resolution_px
-    )
-    x, y = np.meshgrid(across, down)
-    places = [part.reshape(x.shape) for part in other.pixels_from(camera, x.ravel(), y.ravel())]
-    if not all(np.isfinite(place).all() for place in places):
-        rows, columns = np.mgrid[0:height, 0:width].astype(np.float64)
-        other_px = other.pixels_from(camera, columns.ravel(), rows.ravel())
-        seen_x, seen_y = (part.reshape(height, width) for part in other_px)
-        (a, b), (c, d) = np.gradient(seen_x), np.gradient(seen_y)
-        return PixelsIn(seen_x, seen_y, np.abs(b * c - a * d))
-    along_x, along_y = (RectBivariateSpline(down, across, place) for place in places)
+    across = np.linspace(0, width - 1, max(5, width // GRID_PX))
+    down = np.linspace(0, height - 1, max(5, height // GRID_PX))
+    x_px, y_px = _places_in(other, camera, across, down)
+    if not np.isfinite(x_px).all() or not np.isfinite(y_px).all():
+        return _every_pixel_in(camera, other)
+    along_x = RectBivariateSpline(down, across, x_px)
+    along_y = RectBivariateSpline(down, across, y_px)
     x_right = along_x(down, across, dy=1)
     y_right = along_y(down, across, dy=1)
     x_down = along_x(down, across, dx=1)
     y_down = along_y(down, across, dx=1)
-    covered = RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))
-    return PixelsIn(
-        *(spline(np.arange(height), np.arange(width)) for spline in (along_x, along_y, covered))
-    )
+    area = RectBivariateSpline(down, across, np.abs(x_right * y_down - x_down * y_right))
+    rows, columns = np.arange(height), np.arange(width)
+    return PixelsIn(along_x(rows, columns), along_y(rows, columns), area(rows, columns))
+
+
+def _every_pixel_in(camera: Camera, other: Camera) -> PixelsIn:
+    """As `pixels_in`, each pixel by itself: where a part of the image is nowhere in the other's."""
+    width, height = camera.resolution_px
+    columns = np.arange(width, dtype=np.float64)
+    rows = np.arange(height, dtype=np.float64)
+    x_px, y_px = _places_in(other, camera, columns, rows)
+    x_down, x_right = np.gradient(x_px)
+    y_down, y_right = np.gradient(y_px)
+    return PixelsIn(x_px, y_px, np.abs(x_right * y_down - x_down * y_right))
+
+
+def _places_in(
+    other: Camera, camera: Camera, columns: FloatArray, rows: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Pixel x and y (rows, columns), in another camera's image, of a grid of a camera's pixels."""
+    x, y = np.meshgrid(columns, rows)
+    x_px, y_px = other.pixels_from(camera, x.ravel(), y.ravel())
+    return x_px.reshape(x.shape), y_px.reshape(x.shape)
 
 
 def map_sha256(path: Path) -> str:

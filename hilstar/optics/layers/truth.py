@@ -42,6 +42,11 @@ TRUTH_DTYPE = np.dtype(
         ("dec_deg", "f8"),
     ]
 )
+# what light that a fault adds has not, as it is no catalogue's
+UNKNOWN_OF_ADDED = (
+    *("temperature_k", "range_mag", "period_d", "separation_arcsec"),
+    *("sigma_pos_mas", "sigma_mag", "ra_deg", "dec_deg"),
+)
 
 
 def clipped_in(truth: npt.NDArray[np.void]) -> list[int | str]:
@@ -62,25 +67,30 @@ def truth_table(
     they are drawn.
     """
     truth = np.zeros(len(star), dtype=TRUTH_DTYPE)
-    truth["hip"], truth["name"] = stars.hip[star], stars.names(star)
-    truth["x_px"], truth["y_px"] = x_px, y_px
-    truth["v_mag"], truth["bv"] = stars.v_mag[star], stars.bv_mag[star]
+    truth["hip"] = stars.hip[star]
+    truth["name"] = stars.names(star)
+    truth["x_px"] = x_px
+    truth["y_px"] = y_px
+    truth["v_mag"] = stars.v_mag[star]
+    truth["bv"] = stars.bv_mag[star]
     truth["temperature_k"] = stars.temperature_k[star]
     truth["electrons_per_s"] = stars.electrons_per_s[star]
     truth["drawn"] = True
-    truth["sigma_pos_mas"] = truth["sigma_mag"] = np.nan
-    truth["ra_deg"], truth["dec_deg"] = to_radec_deg(stars.directions(star))
+    truth["sigma_pos_mas"] = np.nan
+    truth["sigma_mag"] = np.nan
+    ra_deg, dec_deg = to_radec_deg(stars.directions(star))
+    truth["ra_deg"] = ra_deg
+    truth["dec_deg"] = dec_deg
     listed = stars.row[star] >= 0
     row = stars.row[star[listed]]
     catalog = stars.catalog
-    truth["variable"][listed], truth["double"][listed] = (
-        catalog.variable[row],
-        catalog.multiple[row],
-    )
+    truth["variable"][listed] = catalog.variable[row]
+    truth["double"][listed] = catalog.multiple[row]
     for name in ("range_mag", "period_d", "separation_arcsec"):
         truth[name] = np.nan
+        values = getattr(catalog, name)[row]
         # Back to the catalogue's decimals from float32.
-        truth[name][listed] = np.round(getattr(catalog, name)[row].astype(np.float64), 3)
+        truth[name][listed] = np.round(values.astype(np.float64), 3)
     return truth
 
 
@@ -91,17 +101,10 @@ def with_channels(truth: npt.NDArray[np.void], colours: FloatArray | None) -> np
     `colours` None, of a tracker with one channel: the rows themselves.
     """
     if colours is None:
-        light = None
-    else:
-        light = dict(
-            zip(
-                CHANNEL_COLUMNS,
-                (truth["electrons_per_s"] * part for part in colours.T),
-                strict=True,
-            )
-        )
-    if light is None:
         return truth
+    light = {}
+    for name, share in zip(CHANNEL_COLUMNS, colours.T, strict=True):
+        light[name] = truth["electrons_per_s"] * share
     return with_columns(truth, light)
 
 
@@ -115,17 +118,19 @@ def with_errors(
     read here.
     """
     listed = np.flatnonzero(truth["hip"] > 0)
+    hips = truth["hip"][listed]
     # a tenth of the time that sorting a catalogue takes
-    near = np.flatnonzero(np.isin(catalog.hip, truth["hip"][listed]))
+    near = np.flatnonzero(np.isin(catalog.hip, hips))
     order = near[np.argsort(catalog.hip[near])]
-    stars = catalog.taken(order[np.searchsorted(catalog.hip[order], truth["hip"][listed])])
+    place = np.searchsorted(catalog.hip[order], hips)
+    stars = catalog.taken(order[place])
     facts = errors_of(stars)
     covariance = motion_at(stars, facts, epoch_jyear).covariance
+    variance_mas2 = (covariance[:, 0, 0] + covariance[:, 1, 1]) / 2
+    sigma_mag = sigma_v_mag(facts, stars.bv_mag)
     table = truth.copy()
-    table["sigma_pos_mas"][listed] = np.round(
-        np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2), ERROR_DECIMALS
-    )
-    table["sigma_mag"][listed] = np.round(sigma_v_mag(facts, stars.bv_mag), ERROR_DECIMALS)
+    table["sigma_pos_mas"][listed] = np.round(np.sqrt(variance_mas2), ERROR_DECIMALS)
+    table["sigma_mag"][listed] = np.round(sigma_mag, ERROR_DECIMALS)
     return table
 
 
@@ -134,7 +139,9 @@ def designations(stars: Stars, sprites: FrameLight, which: IntArray) -> tuple[in
     without one.
     """
     star = np.unique(sprites.star[which])
-    added = dict.fromkeys(sprites.added[-1 - k].name for k in star[star < 0])
+    added: dict[str, None] = {}
+    for k in star[star < 0].tolist():
+        added[sprites.added[-1 - k].name] = None
     return (*stars.designations(star[star >= 0]), *added)
 
 
@@ -168,16 +175,19 @@ def sprite_truth(
     if len(once) < len(star):  # each star once, a satellite in the middle of its streak's light
         light = sprites.data["electrons_per_s"][is_star].astype(np.float64)
         total = np.bincount(which, light)
-        x_px, y_px = (np.bincount(which, light * places) / total for places in (x_px, y_px))
+        x_px = np.bincount(which, light * x_px) / total
+        y_px = np.bincount(which, light * y_px) / total
         star = once
     truth = truth_table(stars, star, x_px, y_px)
-    truth["clipped"] = (
-        over[is_star] if len(star) == is_star.sum() else np.isin(star, sprites.star[over])
-    )
+    if len(star) == is_star.sum():
+        truth["clipped"] = over[is_star]
+    else:
+        truth["clipped"] = np.isin(star, sprites.star[over])
     if not sprites.added:
         return truth, star
     added = added_truth(sprites, over)
-    return np.concatenate([truth, added]), np.concatenate([star, np.unique(sprites.star[~is_star])])
+    added_index = np.unique(sprites.star[~is_star])
+    return np.concatenate([truth, added]), np.concatenate([star, added_index])
 
 
 def added_truth(sprites: FrameLight, over: npt.NDArray[np.bool_]) -> npt.NDArray[np.void]:
@@ -185,28 +195,24 @@ def added_truth(sprites: FrameLight, over: npt.NDArray[np.bool_]) -> npt.NDArray
     which sprites clip.
     """
     of_added = np.flatnonzero(sprites.star < 0)
-    star, line = np.unique(sprites.star[of_added], return_inverse=True)
+    index, line = np.unique(sprites.star[of_added], return_inverse=True)
     light = sprites.data["electrons_per_s"][of_added].astype(np.float64)
-    rows = np.zeros(len(star), dtype=TRUTH_DTYPE)
-    total = np.bincount(line, light, minlength=len(star))
-    for name, places in (("x_px", sprites.x_px), ("y_px", sprites.y_px)):
-        rows[name] = np.bincount(line, light * places[of_added], minlength=len(star)) / total
-    for k, added in enumerate(sprites.added[-1 - index] for index in star.tolist()):
-        rows[k]["name"], rows[k]["v_mag"], rows[k]["bv"] = added.name, added.v_mag, added.bv_mag
-        rows[k]["electrons_per_s"] = added.electrons_per_s
-    for name in (
-        "temperature_k",
-        "range_mag",
-        "period_d",
-        "separation_arcsec",
-        "sigma_pos_mas",
-        "sigma_mag",
-        "ra_deg",
-        "dec_deg",
-    ):
+    total = np.bincount(line, light, minlength=len(index))
+    moment_x = np.bincount(line, light * sprites.x_px[of_added], minlength=len(index))
+    moment_y = np.bincount(line, light * sprites.y_px[of_added], minlength=len(index))
+    rows = np.zeros(len(index), dtype=TRUTH_DTYPE)
+    for name in UNKNOWN_OF_ADDED:
         rows[name] = np.nan
+    rows["x_px"] = moment_x / total
+    rows["y_px"] = moment_y / total
+    for row, number in zip(rows, index.tolist(), strict=True):
+        added = sprites.added[-1 - number]
+        row["name"] = added.name
+        row["v_mag"] = added.v_mag
+        row["bv"] = added.bv_mag
+        row["electrons_per_s"] = added.electrons_per_s
     rows["drawn"] = True
-    rows["clipped"] = np.bincount(line, over[of_added], minlength=len(star)) > 0
+    rows["clipped"] = np.bincount(line, over[of_added], minlength=len(index)) > 0
     return rows
 
 
@@ -242,23 +248,24 @@ def brightest_in_view(
     cam = vectors @ to_matrix(q_icrs_to_cam).T
     x_px, y_px = camera.project(cam @ camera.cam_to_image.T)
     inside = np.flatnonzero(camera.contains_px(x_px, y_px))
-    brightest = inside[np.argsort(stars.v_mag[star_rows[inside]], kind="stable")][:count]
+    brightest_first = np.argsort(stars.v_mag[star_rows[inside]], kind="stable")
+    brightest = inside[brightest_first][:count]
     star_rows = star_rows[brightest]
     cam = cam[brightest]
     vectors = vectors[brightest]
     x_px = x_px[brightest]
     y_px = y_px[brightest]
-    off_rad = np.arctan2(np.hypot(cam[:, 0], cam[:, 1]), cam[:, 2])
+    right, down, forward = cam.T
+    off_rad = np.arctan2(np.hypot(right, down), forward)
     ra_deg, dec_deg = to_radec_deg(vectors)
     constellations: list[str] = []
     if len(star_rows):
         # takes half a second, which only this needs
         from astropy.coordinates import SkyCoord, get_constellation
 
+        places = SkyCoord(ra_deg, dec_deg, unit="deg")
         # IAU boundaries of 1930
-        constellations = []
-        for name in get_constellation(SkyCoord(ra_deg, dec_deg, unit="deg")):
-            constellations.append(str(name))
+        constellations = [str(name) for name in get_constellation(places)]
     columns = (
         stars.hip[star_rows].tolist(),
         stars.v_mag[star_rows].tolist(),

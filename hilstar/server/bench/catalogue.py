@@ -1,7 +1,11 @@
 """A bench's catalogue as its tracker sees it: a row a star, with errors, origins and synthetic
 magnitudes; and its files.
+
+`catalogue_columns.csv` beside this file has the columns in their order, with units, UCDs and
+descriptions; the functions here have their values.
 """
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,21 +39,13 @@ MIN_PARALLAX_SIGMAS = 5.0  # beyond which a distance is within 20 %
 FAINTER_MAG = 3.0  # by this a neighbour may be fainter
 COLOUR_STEP_MAG = 0.01  # step of the derivative of a rate by a colour
 DECIMALS = 9  # places in degrees: 4 microarcseconds
-PASSBANDS = {
-    "u": "Bessell's U",
-    "b": "Bessell's B",
-    "r": "Bessell's R",
-    "i": "Bessell's I",
-    "g": "Gaia's G",
-}
-# A star's spectrum is chosen by its V-I, or its type: what it has in B is then not what was
-# measured.
-NOT_MEASURED = {
-    "b": "; not V + (B-V), which is b_measured_mag: the spectrum is chosen by V-I or by type",
-    "i": "; V - (V-I) is i_measured_mag",
-}
 ENDINGS = (".csv", ".fits", ".parquet", ".vot")
+COLUMNS = Path(__file__).with_name("catalogue_columns.csv")
 PARQUET = "parquet needs pyarrow: pip install 'hilstar[campaign]', or write .csv, .fits or .vot"
+
+
+# Figures or text of each star (n,), by the column's name.
+Values = dict[str, npt.NDArray[Any]]
 
 
 class Column(NamedTuple):
@@ -58,7 +54,7 @@ class Column(NamedTuple):
     values: npt.NDArray[Any]
     unit: str
     ucd: str
-    words: str
+    description: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,112 +97,79 @@ def bench_catalogue(
         epoch = epoch_jyear
     chosen = every.taken(rows)
     facts = table_facts(choice, chosen, errors_of(chosen))
-    light, zero_points = _light(file, chosen, facts)
-    columns = (
-        _places(chosen, facts, epoch)
-        | _photometry(chosen, facts)
-        | light
-        | _distances(chosen, facts, light)
-    )
-    return InstrumentCatalogue(columns | _company(every, rows, facts, epoch), epoch, zero_points)
+    zero_points = _zero_points(file)
+    values = _places(chosen, facts, epoch)
+    values |= _photometry(chosen, facts)
+    values |= _light(file, chosen, facts, zero_points)
+    values |= _distances(chosen, facts, values["bolometric_mag"])
+    values |= _company(every, rows, facts, epoch)
+    columns = _described(values, sky.temperature, zero_points)
+    return InstrumentCatalogue(columns, epoch, zero_points)
 
 
-def _places(stars: Catalog, facts: dict[str, Any], epoch_jyear: float) -> dict[str, Column]:
+def _described(
+    values: Values, temperature: str, zero_points: dict[str, float]
+) -> dict[str, Column]:
+    """The columns in the order of COLUMNS. A description may name the bench's choices in braces."""
+    columns = {}
+    with COLUMNS.open(newline="", encoding="utf-8") as file:
+        for row in csv.DictReader(file):
+            description = row["description"].format(
+                temperature=temperature,
+                fainter_mag=FAINTER_MAG,
+                vega_mag=zero_points["vega"],
+                ab_mag=zero_points["ab"],
+            )
+            name = row["name"]
+            columns[name] = Column(values[name], row["unit"], row["ucd"], description)
+    return columns
+
+
+def _places(stars: Catalog, facts: dict[str, Any], epoch_jyear: float) -> Values:
     motion = motion_at(stars, facts, epoch_jyear)
     sigma = np.sqrt(np.einsum("nii->in", motion.covariance))
     product = sigma[0] * sigma[1]
-    correlation = np.divide(
-        motion.covariance[:, 0, 1], product, out=np.full(len(product), np.nan), where=product > 0
-    )
-    place = "pos.eq.ra;meta.main"
-    speed = "pos.pm;pos.eq.ra"
+    unknown = np.full(len(product), np.nan)
+    covariance = motion.covariance[:, 0, 1]
+    correlation = np.divide(covariance, product, out=unknown, where=product > 0)
     names = ["" if hip else stars.name(k) for k, hip in enumerate(stars.hip.tolist())]
-    return {
-        "hip": Column(stars.hip, "", "meta.id;meta.main", "Hipparcos number, 0 for a star without"),
-        "name": Column(
-            np.array(names, dtype=np.str_),
-            *("", "meta.id", "designation of a star without a HIP number"),
-        ),
-        "ra_deg": Column(
-            np.round(motion.ra_deg, DECIMALS) % 360.0,
-            "deg",
-            place,
-            "right ascension, ICRS, at the epoch",
-        ),
-        "dec_deg": Column(
-            np.round(motion.dec_deg, DECIMALS),
-            "deg",
-            place.replace(".ra", ".dec"),
-            "declination, ICRS",
-        ),
-        "sigma_ra_mas": Column(
-            sigma[0], "mas", "stat.error;pos.eq.ra", "error at the epoch, times cos(dec)"
-        ),
-        "sigma_dec_mas": Column(
-            sigma[1], "mas", "stat.error;pos.eq.dec", "error of declination at the epoch"
-        ),
-        "ra_dec_correlation": Column(
-            correlation, "", "stat.correlation", "correlation of both errors at the epoch"
-        ),
-        "pm_ra_mas_yr": Column(
-            motion.pm_ra_mas_yr, "mas/yr", speed, "proper motion in right ascension, times cos(dec)"
-        ),
-        "pm_dec_mas_yr": Column(
-            motion.pm_dec_mas_yr,
-            "mas/yr",
-            speed.replace(".ra", ".dec"),
-            "proper motion in declination",
-        ),
-        "sigma_pm_ra_mas_yr": Column(sigma[2], "mas/yr", f"stat.error;{speed}", "its error"),
-        "sigma_pm_dec_mas_yr": Column(
-            sigma[3], "mas/yr", "stat.error;pos.pm;pos.eq.dec", "its error"
-        ),
-        "parallax_mas": Column(stars.parallax_mas, "mas", "pos.parallax.trig", "parallax"),
-        "sigma_parallax_mas": Column(
-            facts["sigma_parallax_mas"], "mas", "stat.error;pos.parallax.trig", "its error"
-        ),
-    }
+    values: Values = {}
+    values["hip"] = stars.hip
+    values["name"] = np.array(names, dtype=np.str_)
+    # A place may round up to 360 degrees.
+    values["ra_deg"] = np.round(motion.ra_deg, DECIMALS) % 360.0
+    values["dec_deg"] = np.round(motion.dec_deg, DECIMALS)
+    values["sigma_ra_mas"] = sigma[0]
+    values["sigma_dec_mas"] = sigma[1]
+    values["ra_dec_correlation"] = correlation
+    values["pm_ra_mas_yr"] = motion.pm_ra_mas_yr
+    values["pm_dec_mas_yr"] = motion.pm_dec_mas_yr
+    values["sigma_pm_ra_mas_yr"] = sigma[2]
+    values["sigma_pm_dec_mas_yr"] = sigma[3]
+    values["parallax_mas"] = stars.parallax_mas
+    values["sigma_parallax_mas"] = facts["sigma_parallax_mas"]
+    return values
 
 
-def _photometry(stars: Catalog, facts: dict[str, Any]) -> dict[str, Column]:
-    def origin(name: str, words: str) -> Column:
-        return Column(facts[name].astype(np.str_), "", "meta.ref", words)
-
-    return {
-        "v_mag": Column(stars.v_mag, "mag", "phot.mag;em.opt.V", "Johnson V"),
-        "sigma_v_mag": Column(
-            sigma_v_mag(facts, stars.bv_mag), "mag", "stat.error;phot.mag;em.opt.V", "its error"
-        ),
-        "v_source": origin("v_source", "origin of V: G ground, H Hipparcos, T Tycho, U the table"),
-        "b_v_mag": Column(stars.bv_mag, "mag", "phot.color;em.opt.B;em.opt.V", "Johnson B-V"),
-        "sigma_b_v_mag": Column(facts["sigma_bv_mag"], "mag", "stat.error;phot.color", "its error"),
-        "b_v_source": origin("bv_source", "origin of B-V: G ground, T Tycho"),
-        "v_i_mag": Column(stars.vi_mag, "mag", "phot.color;em.opt.V;em.opt.I", "Cousins V-I"),
-        "sigma_v_i_mag": Column(facts["sigma_vi_mag"], "mag", "stat.error;phot.color", "its error"),
-        "v_i_source": origin("vi_source", "origin of V-I: field H42 of CDS I/239"),
-        "spectral_type": Column(
-            facts["spectral_type"].astype(np.str_), "", "src.spType", "MK type"
-        ),
-        "luminosity_class": Column(
-            luminosity_class(facts["spectral_type"]),
-            "",
-            "src.class.luminosity",
-            "class in that type",
-        ),
-        "spectral_type_source": origin(
-            "spectral_type_source", "origin of the type: field H77 of CDS I/239, or U: the table"
-        ),
-        "variable": Column(
-            stars.variable.astype(np.str_),
-            "",
-            "src.var",
-            "P periodic, U unsolved, M within 0.03 mag",
-        ),
-        "range_mag": Column(
-            _decimals(stars.range_mag), "mag", "src.var.amplitude", "range of its light in Hp"
-        ),
-        "period_d": Column(_decimals(stars.period_d), "d", "time.period", "period"),
-    }
+def _photometry(stars: Catalog, facts: dict[str, Any]) -> Values:
+    spectral_type = facts["spectral_type"]
+    values: Values = {}
+    values["v_mag"] = stars.v_mag
+    values["sigma_v_mag"] = sigma_v_mag(facts, stars.bv_mag)
+    values["v_source"] = facts["v_source"].astype(np.str_)
+    values["b_v_mag"] = stars.bv_mag
+    values["sigma_b_v_mag"] = facts["sigma_bv_mag"]
+    values["b_v_source"] = facts["bv_source"].astype(np.str_)
+    values["v_i_mag"] = stars.vi_mag
+    values["sigma_v_i_mag"] = facts["sigma_vi_mag"]
+    values["v_i_source"] = facts["vi_source"].astype(np.str_)
+    values["spectral_type"] = spectral_type.astype(np.str_)
+    values["luminosity_class"] = luminosity_class(spectral_type)
+    values["spectral_type_source"] = facts["spectral_type_source"].astype(np.str_)
+    values["variable"] = stars.variable.astype(np.str_)
+    values["range_mag"] = _decimals(stars.range_mag)
+    values["period_d"] = _decimals(stars.period_d)
+    return values
 
 
 def _decimals(values: npt.NDArray[np.float32]) -> FloatArray:
@@ -214,61 +177,39 @@ def _decimals(values: npt.NDArray[np.float32]) -> FloatArray:
     return np.asarray(np.round(values.astype(np.float64), 3), dtype=np.float64)
 
 
-def _light(
-    file: BenchFile, stars: Catalog, facts: dict[str, Any]
-) -> tuple[dict[str, Column], dict[str, float]]:
+def _zero_points(file: BenchFile) -> dict[str, float]:
+    """The magnitude of one electron per second, by the system."""
     sky = file.config.sky
     optics = bench_optics(file.config.tracker, file.folder)
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
-    rates = star_rates(file.config, file.folder)
+    vega = magnitude(1 / vega_electrons_per_s(optics, photometry))
+    ab = magnitude(1 / ab_electrons_per_s(optics))
+    return {"vega": VEGA_V_MAG + vega, "ab": ab}
+
+
+def _light(
+    file: BenchFile, stars: Catalog, facts: dict[str, Any], zero_points: dict[str, float]
+) -> Values:
+    sky = file.config.sky
+    v, bv, vi = stars.v_mag, stars.bv_mag, stars.vi_mag
     kind = star_kinds(file.config, stars)
-    rate = rates(stars.v_mag, stars.bv_mag, stars.vi_mag, kind)
-    zero_points = {
-        "vega": VEGA_V_MAG + magnitude(1 / vega_electrons_per_s(optics, photometry)),
-        "ab": magnitude(1 / ab_electrons_per_s(optics)),
-    }
+    photometry = Photometry(sky.zero_point, sky.passband_weighting)
     colour = colours(sky.spectrum, sky.temperature, photometry)
-    columns = {
-        "temperature_k": Column(
-            star_temperatures_k(stars.bv_mag, sky.temperature),
-            "K",
-            "phys.temperature",
-            f"temperature by B-V ({sky.temperature})",
-        )
-    }
+    rates = star_rates(file.config, file.folder)
+    rate = rates(v, bv, vi, kind)
+    values: Values = {}
+    values["temperature_k"] = star_temperatures_k(bv, sky.temperature)
+    # A star's spectrum is chosen by its V-I, or its type: its synthetic B is then not V + (B-V).
     for band in BANDS:
-        values = stars.v_mag + colour[band](stars.bv_mag, stars.vi_mag, kind)
-        light_note = (
-            f"synthetic, its spectrum through {PASSBANDS[band]}{NOT_MEASURED.get(band, '')}"
-        )
-        columns[f"{band}_mag"] = Column(
-            values, "mag", f"phot.mag;em.opt.{band.upper()}", light_note
-        )
-    columns["b_measured_mag"] = Column(
-        stars.v_mag + stars.bv_mag, "mag", "phot.mag;em.opt.B", "V + (B-V), as measured"
-    )
-    columns["i_measured_mag"] = Column(
-        stars.v_mag - stars.vi_mag, "mag", "phot.mag;em.opt.I", "V - (V-I), as measured"
-    )
-    bolometric = stars.v_mag + colour["bolometric"](stars.bv_mag, stars.vi_mag, kind)
-    columns["bolometric_mag"] = Column(
-        bolometric, "mag", "phot.mag.bc", "apparent bolometric magnitude (IAU 2015)"
-    )
-    columns["electrons_per_s"] = Column(
-        rate, "1/s", "phot.count", "electrons per second in this tracker"
-    )
-    for system, zero in zero_points.items():
-        light_note = f"magnitude in this tracker, {zero:.4f} - 2.5 log10(electrons_per_s)"
-        columns[f"instrument_mag_{system}"] = Column(
-            zero + magnitude(rate), "mag", "phot.mag;instr", light_note
-        )
-    columns["sigma_instrument_mag"] = Column(
-        sigma_instrument_mag(stars, facts, rates, kind),
-        "mag",
-        "stat.error;phot.mag;instr",
-        "its error, by those of V and of the colours",
-    )
-    return columns, zero_points
+        values[f"{band}_mag"] = v + colour[band](bv, vi, kind)
+    values["b_measured_mag"] = v + bv
+    values["i_measured_mag"] = v - vi
+    values["bolometric_mag"] = v + colour["bolometric"](bv, vi, kind)
+    values["electrons_per_s"] = rate
+    for system, zero_mag in zero_points.items():
+        values[f"instrument_mag_{system}"] = zero_mag + magnitude(rate)
+    values["sigma_instrument_mag"] = sigma_instrument_mag(stars, facts, rates, kind)
+    return values
 
 
 def sigma_instrument_mag(
@@ -283,75 +224,48 @@ def sigma_instrument_mag(
     bv = stars.bv_mag
     vi = stars.vi_mag
     half = COLOUR_STEP_MAG / 2
-    by_bv = (
-        magnitude(rates(v, bv + half, vi, kind) / rates(v, bv - half, vi, kind)) / COLOUR_STEP_MAG
-    )
-    by_vi = (
-        magnitude(rates(v, bv, vi + half, kind) / rates(v, bv, vi - half, kind)) / COLOUR_STEP_MAG
-    )
+    redder = rates(v, bv + half, vi, kind)
+    bluer = rates(v, bv - half, vi, kind)
+    by_bv = magnitude(redder / bluer) / COLOUR_STEP_MAG
+    redder = rates(v, bv, vi + half, kind)
+    bluer = rates(v, bv, vi - half, kind)
+    by_vi = magnitude(redder / bluer) / COLOUR_STEP_MAG
+    # An error of a colour that does not count may be unknown (NaN), and then it does not count.
     of_bv = by_bv * np.where(by_bv == 0, 0, facts["sigma_bv_mag"])
     of_vi = by_vi * np.where(by_vi == 0, 0, facts["sigma_vi_mag"])
     return np.sqrt(sigma_v_mag(facts, bv) ** 2 + of_bv**2 + of_vi**2)
 
 
-def _distances(
-    stars: Catalog, facts: dict[str, Any], light: dict[str, Column]
-) -> dict[str, Column]:
+def _distances(stars: Catalog, facts: dict[str, Any], bolometric_mag: FloatArray) -> Values:
     parallax = stars.parallax_mas
-    sigma = facts["sigma_parallax_mas"]
-    sure = (parallax > 0) & ~(parallax < MIN_PARALLAX_SIGMAS * sigma)
-    modulus = 10 - 5 * np.log10(np.where(sure, parallax, np.nan))
-    return {
-        "absolute_mag": Column(
-            stars.v_mag - modulus, "mag", "phys.magAbs;em.opt.V", "absolute V, without extinction"
-        ),
-        "absolute_bolometric_mag": Column(
-            light["bolometric_mag"].values - modulus,
-            "mag",
-            "phys.magAbs.bol",
-            "absolute bolometric magnitude",
-        ),
-    }
+    min_parallax = MIN_PARALLAX_SIGMAS * facts["sigma_parallax_mas"]
+    # A parallax of unknown error (NaN) is taken as it is.
+    is_sure = (parallax > 0) & ~(parallax < min_parallax)
+    modulus = 10 - 5 * np.log10(np.where(is_sure, parallax, np.nan))
+    values: Values = {}
+    values["absolute_mag"] = stars.v_mag - modulus
+    values["absolute_bolometric_mag"] = bolometric_mag - modulus
+    return values
 
 
 def _company(
     every: Catalog, rows: npt.NDArray[np.intp], facts: dict[str, Any], epoch_jyear: float
-) -> dict[str, Column]:
+) -> Values:
     stars = every.taken(rows)
     difference = facts["difference_hp_mag"]
-    brighter = stars.v_mag + 2.5 * np.log10(1 + 10 ** (-0.4 * difference))
+    ratio = 10 ** (-0.4 * difference)  # the fainter component's light to the brighter's
+    brighter = stars.v_mag + 2.5 * np.log10(1 + ratio)
     neighbour, arcsec = nearest_neighbours(every, rows, epoch_jyear)
-    return {
-        "double": Column(
-            stars.multiple.astype(np.str_),
-            "",
-            "meta.code.multip",
-            "flag H59 of CDS I/239: C G O V X",
-        ),
-        "separation_arcsec": Column(
-            _decimals(stars.separation_arcsec),
-            "arcsec",
-            "pos.angDistance",
-            "of a pair in one entry",
-        ),
-        "component_a_mag": Column(
-            brighter,
-            "mag",
-            "phot.mag",
-            "brighter component, of V of both and their difference in Hp",
-        ),
-        "component_b_mag": Column(brighter + difference, "mag", "phot.mag", "fainter component"),
-        "neighbour": Column(
-            np.array([every.name(k) for k in neighbour.tolist()], dtype=np.str_),
-            *(
-                "",
-                "meta.id",
-                f"nearest entry less than {FAINTER_MAG:g} mag fainter, of the whole catalogue",
-            ),
-        ),
-        "neighbour_arcsec": Column(arcsec, "arcsec", "pos.angDistance", "its distance"),
-        "neighbour_v_mag": Column(every.v_mag[neighbour], "mag", "phot.mag;em.opt.V", "its V"),
-    }
+    names = [every.name(k) for k in neighbour.tolist()]
+    values: Values = {}
+    values["double"] = stars.multiple.astype(np.str_)
+    values["separation_arcsec"] = _decimals(stars.separation_arcsec)
+    values["component_a_mag"] = brighter
+    values["component_b_mag"] = brighter + difference
+    values["neighbour"] = np.array(names, dtype=np.str_)
+    values["neighbour_arcsec"] = arcsec
+    values["neighbour_v_mag"] = every.v_mag[neighbour]
+    return values
 
 
 def nearest_neighbours(
@@ -368,19 +282,21 @@ def nearest_neighbours(
     tree = cKDTree(vectors)
     neighbours = rows.copy()
     chord = np.full(len(rows), np.nan)
+    limit_mag = every.v_mag[rows] + FAINTER_MAG
+    # The nearest few do for most stars; the rest are asked again for four times as many.
     rest = np.arange(len(rows))
     count = 8
     while len(rest):
         count = min(count, len(every))
-        far, near = (
-            np.atleast_2d(part)
-            for part in tree.query(vectors[rows[rest]], k=np.arange(1, count + 1))
-        )
-        fits = (every.v_mag[near] < every.v_mag[rows[rest], None] + FAINTER_MAG) & (
-            near != rows[rest, None]
-        )
+        star = rows[rest]
+        ranks = np.arange(1, count + 1)
+        distances, places = tree.query(vectors[star], k=ranks)
+        far = np.atleast_2d(distances)
+        near = np.atleast_2d(places)
+        is_bright = every.v_mag[near] < limit_mag[rest, None]
+        fits = is_bright & (near != star[:, None])
         first = fits.argmax(axis=1)
-        has = fits[np.arange(len(rest)), first]
+        has = fits.any(axis=1)
         neighbours[rest[has]] = near[has, first[has]]
         chord[rest[has]] = far[has, first[has]]
         if count == len(every):
@@ -394,38 +310,47 @@ def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
     """Write a CSV, a FITS table, a VOTable or a Parquet file by the name's ending. Raises
     InputError or MachineError.
     """
-    from astropy.table import Table
 
-    if path == STDOUT:
-        ending = ".csv"
-    else:
-        ending = path.suffix.lower()
-    table = Table({name: column.values for name, column in catalogue.columns.items()})
-    for name, column in catalogue.columns.items():
-        table[name].unit, table[name].description = column.unit or None, column.words
-        table[name].meta["ucd"] = column.ucd
-    if ending == ".parquet":
+    ending = path.suffix.lower()
+    if path == STDOUT or ending == ".csv":
+        _write_csv(path, catalogue)
+    elif ending == ".parquet":
         _write_parquet(path, catalogue)
-    elif ending == ".csv":
-        texts = []
-        for name, column in catalogue.columns.items():
-            if name in ("ra_deg", "dec_deg"):
-                form = f".{DECIMALS}f"
-            elif column.values.dtype.kind == "f":
-                form = ".6g"
-            else:
-                form = ""
-            texts.append([format(value, form) for value in column.values.tolist()])
-        # MK types such as "S5,1" have commas
-        write_csv(path, list(catalogue.columns), zip(*texts, strict=True))
     elif ending == ".vot":
         from astropy.io.votable import from_table
 
         with whole_file(path) as file:
-            from_table(table).to_xml(file)
+            from_table(_table(catalogue)).to_xml(file)
     else:
         with whole_file(path) as file:
-            _fits(table, catalogue).writeto(file)
+            _fits(_table(catalogue), catalogue).writeto(file)
+
+
+def _table(catalogue: InstrumentCatalogue) -> Any:
+    """Astropy's table of it."""
+    from astropy.table import Table
+
+    table = Table()
+    for name, column in catalogue.columns.items():
+        table[name] = column.values
+        table[name].unit = column.unit or None
+        table[name].description = column.description
+        table[name].meta["ucd"] = column.ucd
+    return table
+
+
+def _write_csv(path: Path, catalogue: InstrumentCatalogue) -> None:
+    texts = []
+    for name, column in catalogue.columns.items():
+        if name in ("ra_deg", "dec_deg"):
+            form = f".{DECIMALS}f"
+        elif column.values.dtype.kind == "f":
+            form = ".6g"
+        else:
+            form = ""
+        texts.append([format(value, form) for value in column.values.tolist()])
+    # MK types such as "S5,1" have commas
+    write_csv(path, list(catalogue.columns), zip(*texts, strict=True))
 
 
 def _fits(table: Any, catalogue: InstrumentCatalogue) -> Any:
@@ -437,7 +362,7 @@ def _fits(table: Any, catalogue: InstrumentCatalogue) -> Any:
         hdu.header[f"ZP{system.upper()}"] = (zero, "mag of one electron per second")
     for number, column in enumerate(catalogue.columns.values(), start=1):
         hdu.header[f"TUCD{number}"] = column.ucd
-        hdu.header.comments[f"TTYPE{number}"] = column.words[:45]
+        hdu.header.comments[f"TTYPE{number}"] = column.description[:45]
     return fits.HDUList([fits.PrimaryHDU(), hdu])
 
 
@@ -451,7 +376,7 @@ def _write_parquet(path: Path, catalogue: InstrumentCatalogue) -> None:
     arrays = []
     for name, column in catalogue.columns.items():
         array = pa.array(column.values.tolist())
-        metadata = {"unit": column.unit, "ucd": column.ucd, "description": column.words}
+        metadata = {"unit": column.unit, "ucd": column.ucd, "description": column.description}
         fields.append(pa.field(name, array.type, metadata=metadata))
         arrays.append(array)
     table = pa.table(arrays, schema=pa.schema(fields))

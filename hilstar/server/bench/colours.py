@@ -73,21 +73,17 @@ class Lateral:
     def of(cls, psf: GlassPsf, nm: FloatArray, density: FloatArray) -> "Lateral | None":
         """That of a glass to the primaries' light; None where it moves none of it by LEAST_PX."""
         moved = psf.moved_px - psf.moved_px.mean(axis=1, keepdims=True)
-        _, size, parts = np.linalg.svd(
-            moved.transpose(0, 2, 1).reshape(-1, moved.shape[1]) / np.sqrt(len(moved)),
-            full_matrices=False,
-        )
-        px = (parts.T * size)[:, size > max(LEAST_PX, LEAST_PART * size[0])]
-        by_primary = density @ NodeSpline(psf.wavelengths_nm)(nm) @ px
-        spread = float(np.square(by_primary - by_primary.mean(axis=0)).sum())
+        by_wavelength = moved.transpose(0, 2, 1).reshape(-1, moved.shape[1])
+        rms = by_wavelength / np.sqrt(len(moved))  # over the field's places
+        _, size, parts = np.linalg.svd(rms, full_matrices=False)
+        min_size = max(LEAST_PX, LEAST_PART * size[0])
+        px = (parts.T * size)[:, size > min_size]
+        splines = NodeSpline(psf.wavelengths_nm)
+        by_primary = density @ splines(nm) @ px
+        spread = _square_spread(by_primary)
         if spread < LEAST_PX**2:
             return None
-        weight = (
-            LATERAL_WEIGHT
-            * MEAN_WEIGHT
-            * float(np.square(density @ nm - (density @ nm).mean()).sum())
-            / spread
-        )
+        weight = LATERAL_WEIGHT * MEAN_WEIGHT * _square_spread(density @ nm) / spread
         return cls(psf.wavelengths_nm, px, by_primary, np.zeros(px.shape[1]), weight)
 
     @property
@@ -96,6 +92,12 @@ class Lateral:
         them, so that none is below 0.
         """
         return np.asarray(2 * np.abs(self.px).max(axis=0))  # a spline passes its nodes by less
+
+
+def _square_spread(by_primary: FloatArray) -> float:
+    """The sum of the squares of primaries' (3,) or (3, k) departures from their mean."""
+    departure = by_primary - by_primary.mean(axis=0)
+    return float(np.square(departure).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,24 +150,25 @@ class Colours:
         k): wavelength, products of the cumulative spectrum with the primaries', and displacements
         by the lens. Bodies are taken by their B-V.
         """
-        which = np.arange(len(stars)) if which is None else which
+        if which is None:
+            which = np.arange(len(stars))
         if stars.colours is not None:
             return np.asarray(stars.colours[which])
         row = stars.row[which]
         listed = row >= 0
-        none = np.full(len(which), np.nan)
+        catalogue_row = np.maximum(row, 0)
+        vi = np.full(len(which), np.nan)
         if len(stars.catalog):
-            vi = np.where(listed, stars.catalog.vi_mag[np.maximum(row, 0)], none)
-        else:
-            vi = none
+            vi = np.where(listed, stars.catalog.vi_mag[catalogue_row], np.nan)
         kind = None
         if self._kinds is not None:
-            kind = np.where(listed[:, None], self._kinds[np.maximum(row, 0)], np.nan)
+            kind = np.where(listed[:, None], self._kinds[catalogue_row], np.nan)
         return self._means(stars.bv_mag[which], vi, kind)
 
     def _means(self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None) -> FloatArray:
-        flux = [curve(np.zeros(len(bv_mag)), bv_mag, vi_mag, kind) for curve in self._curves]
-        means = np.stack(flux[1:], axis=1) / flux[0][:, None]
+        v_mag = np.zeros(len(bv_mag))
+        photons, *weighted = [curve(v_mag, bv_mag, vi_mag, kind) for curve in self._curves]
+        means = np.stack(weighted, axis=1) / photons[:, None]
         if self.lateral is not None:
             means[:, MOVED:] -= self.lateral.lifted
         return np.asarray(means)
@@ -179,32 +182,29 @@ class Colours:
         """
         if self.lateral is None or not len(catalog):
             return self
-        some = np.argsort(catalog.bv_mag)[:: math.ceil(len(catalog) / ASIDE_STARS)]
-        wanted = self._means(
-            catalog.bv_mag[some],
-            catalog.vi_mag[some],
-            None if self._kinds is None else self._kinds[some],
-        )
         from scipy.optimize import minimize  # 0.2 s of every command that needs none of it
 
+        every = math.ceil(len(catalog) / ASIDE_STARS)
+        some = np.argsort(catalog.bv_mag)[::every]
+        kind = None
+        if self._kinds is not None:
+            kind = self._kinds[some]
+        wanted = self._means(catalog.bv_mag[some], catalog.vi_mag[some], kind)
         lens = self.lateral
-        size_px = float(np.abs(self.lateral.px).max())
+        size_px = float(np.abs(lens.px).max())
 
         # the mean square of what is out of reach, and its gradient
-        def left(aside: FloatArray) -> tuple[float, FloatArray]:
-            tried = replace(lens, aside=aside * size_px)
-            rest = (
-                replace(self, lateral=tried).shares(wanted) @ lens.by_primary
-                - wanted[:, MOVED:]
-                - tried.aside
-            )
-            square = np.square(rest / size_px).sum(axis=1).mean() + ASIDE_COST * aside @ aside
-            return float(square), 2 * (ASIDE_COST * aside - rest.mean(axis=0) / size_px)
+        def cost(aside: FloatArray) -> tuple[float, FloatArray]:
+            moved = replace(lens, aside=aside * size_px)
+            shares = replace(self, lateral=moved).shares(wanted)
+            rest_px = shares @ lens.by_primary - wanted[:, MOVED:] - moved.aside
+            rest = rest_px / size_px
+            square = np.square(rest).sum(axis=1).mean() + ASIDE_COST * aside @ aside
+            gradient = 2 * (ASIDE_COST * aside - rest_px.mean(axis=0) / size_px)
+            return float(square), gradient
 
-        mixtures = (
-            minimize(left, lens.aside, jac=True, method="BFGS", options={"gtol": 1e-6}).x * size_px
-        )
-        return replace(self, lateral=replace(lens, aside=mixtures))
+        nearest = minimize(cost, lens.aside, jac=True, method="BFGS", options={"gtol": 1e-6})
+        return replace(self, lateral=replace(lens, aside=nearest.x * size_px))
 
     def shares(self, wanted: FloatArray) -> FloatArray:
         """The light of each primary (n, 3) for what is `wanted`, as shares of a star's
@@ -212,13 +212,17 @@ class Colours:
         """
         if not self.mono:
             return nearest_mixtures(self._gram, wanted @ self.by_primary)
-        away = self.mean_nm - self.mean_nm.mean()
+        # The normal equations of the cumulative spectrum, of the mean wavelength and of the place.
+        middle_nm = self.mean_nm.mean()
+        away = self.mean_nm - middle_nm
+        wanted_away = wanted[:, :1] - middle_nm
         gram = self._gram + MEAN_WEIGHT * np.outer(away, away)
-        near = wanted[:, 1:MOVED] + MEAN_WEIGHT * (wanted[:, :1] - self.mean_nm.mean()) * away
+        near = wanted[:, 1:MOVED] + MEAN_WEIGHT * wanted_away * away
         lens = self.lateral
         if lens is not None:
+            place_px = wanted[:, MOVED:] + lens.aside
             gram = gram + lens.weight * lens.by_primary @ lens.by_primary.T
-            near = near + lens.weight * (wanted[:, MOVED:] + lens.aside) @ lens.by_primary.T
+            near = near + lens.weight * place_px @ lens.by_primary.T
         mixtures = nearest_mixtures(gram, near, whole=True)
         return np.asarray(mixtures / mixtures.sum(axis=1, keepdims=True))  # to 1e-11
 
@@ -232,11 +236,12 @@ class Colours:
         if stars.primaries is not None and stars.primaries_by_bv is not None:
             return stars.primaries, stars.primaries_by_bv
         by_bv = stars.colours_by_bv
-        unknown = np.full_like(BV_MAG, np.nan)
         if by_bv is None:
-            by_bv = self._means(
-                BV_MAG, unknown, None if self._kinds is None else np.full((len(BV_MAG), 2), np.nan)
-            )
+            unknown = np.full_like(BV_MAG, np.nan)
+            kind = None
+            if self._kinds is not None:
+                kind = np.full((len(BV_MAG), 2), np.nan)
+            by_bv = self._means(BV_MAG, unknown, kind)
         return self.shares(self.wanted(stars)), self.shares(by_bv)
 
     def drive(self, shares: FloatArray) -> FloatArray:
@@ -249,7 +254,9 @@ class Colours:
         """What mixtures of primaries (n, 3) have of what is `wanted`: shares of channels (n,
         channels), or the mean wavelength (n, 1), nm.
         """
-        return np.asarray(shares @ (self.mean_nm[:, None] if self.mono else self.by_primary.T))
+        if self.mono:
+            return np.asarray(shares @ self.mean_nm[:, None])
+        return np.asarray(shares @ self.by_primary.T)
 
     def off(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
         """How far off mixtures are (n,): the share of a star's electrons in the wrong channel, or
@@ -259,17 +266,21 @@ class Colours:
         """
         lens = self.lateral
         if lens is not None:
-            return np.asarray(
-                np.linalg.norm(shares @ lens.by_primary - wanted[:, MOVED:] - lens.aside, axis=1)
-            )
+            off_px = shares @ lens.by_primary - wanted[:, MOVED:] - lens.aside
+            return np.asarray(np.linalg.norm(off_px, axis=1))
         shown = self.shown(shares)
-        return np.asarray(np.abs(shown - wanted[:, : shown.shape[1]]).sum(axis=1))
+        difference = shown - wanted[:, : shown.shape[1]]
+        return np.asarray(np.abs(difference).sum(axis=1))
 
     def in_gamut(self, off: FloatArray) -> BoolArray:
         """Whether stars that are so far `off` have their colour."""
-        return np.asarray(
-            off < (WITHIN if not self.mono else WITHIN_NM if self.lateral is None else WITHIN_PX)
-        )
+        if not self.mono:
+            tolerance = WITHIN
+        elif self.lateral is None:
+            tolerance = WITHIN_NM
+        else:
+            tolerance = WITHIN_PX
+        return np.asarray(off < tolerance)
 
     def temperature_factor(self, wanted: FloatArray, shares: FloatArray) -> FloatArray:
         """The colour temperatures of mixtures (n,) over those of their stars, by black bodies of
@@ -277,10 +288,9 @@ class Colours:
 
         The colour is blue's electrons over red's, or the mean wavelength.
         """
-        temperatures_k = []
-        for primary_shares in (self.shown(shares), wanted):
-            temperatures_k.append(np.interp(warmth(primary_shares), self._scale, SCALE_K))
-        return np.asarray(temperatures_k[0] / temperatures_k[1])
+        shown_k = np.interp(warmth(self.shown(shares)), self._scale, SCALE_K)
+        wanted_k = np.interp(warmth(wanted), self._scale, SCALE_K)
+        return np.asarray(shown_k / wanted_k)
 
     def shares_of(self, stars: Stars, star: IntArray) -> FloatArray:
         """The light of each primary (n, 3) of stars at places (n,) of a bench's; below 0, where
@@ -302,31 +312,27 @@ class Colours:
         shares = self.shares_of(stars, star[star_rows])
         shown = self.shown(shares)
         off = self.off(wanted, shares)
+        in_gamut = self.in_gamut(off)
         rate = truth["electrons_per_s"][star_rows]
-        added = {
-            "temperature_shown_k": (
-                truth["temperature_k"][star_rows] * self.temperature_factor(wanted, shares)
-            )
-        }
+        factor = self.temperature_factor(wanted, shares)
+        added = {"temperature_shown_k": truth["temperature_k"][star_rows] * factor}
         if self.mono:
-            added |= {"wavelength_nm": wanted[:, 0], "wavelength_shown_nm": shown[:, 0]}
+            added["wavelength_nm"] = wanted[:, 0]
+            added["wavelength_shown_nm"] = shown[:, 0]
             added["electrons_shown_per_s"] = rate * shares.sum(axis=1)
         else:
-            for name, kind in (("electrons", wanted), ("electrons_shown", shown)):
-                added |= {
-                    f"{name}_{primary}_per_s": rate * kind[:, k]
-                    for k, primary in enumerate(PRIMARIES)
-                }
-            added["off_gamut"] = np.where(self.in_gamut(off), 0.0, off)
-        return with_columns(truth, added | {"in_gamut": self.in_gamut(off)}, star_rows)
+            for name, by_channel in (("electrons", wanted), ("electrons_shown", shown)):
+                for k, channel in enumerate(PRIMARIES):
+                    added[f"{name}_{channel}_per_s"] = rate * by_channel[:, k]
+            added["off_gamut"] = np.where(in_gamut, 0.0, off)
+        return with_columns(truth, added | {"in_gamut": in_gamut}, star_rows)
 
     def driven(self, sprites: FrameLight, stars: Stars) -> FrameLight:
         """Sprites with the light of each primary; `sprites.star` has places among `stars`."""
         primaries, by_bv = self._shares_of_all(stars)
         shares = shares_of_sprites(sprites, stars, primaries, by_bv)
-        light = np.maximum(sprites.data["electrons_per_s"][:, None] * shares, TINY).astype(
-            np.float32
-        )
+        rate = sprites.data["electrons_per_s"][:, None]
+        light = np.maximum(rate * shares, TINY).astype(np.float32)
         if not sprites.extended:
             return replace(sprites, primaries=light)
         # the same objects are the same light: it is moved once
@@ -346,9 +352,9 @@ def warmth(colour: FloatArray) -> FloatArray:
     if colour.shape[1] != len(PRIMARIES):
         return -colour[:, 0]
     tiny = np.finfo(np.float64).tiny
-    return np.asarray(
-        np.log(np.maximum(colour[:, -1], tiny)) - np.log(np.maximum(colour[:, 0], tiny))
-    )
+    red = np.maximum(colour[:, 0], tiny)
+    blue = np.maximum(colour[:, -1], tiny)
+    return np.asarray(np.log(blue) - np.log(red))
 
 
 def mixed_for(
@@ -375,67 +381,74 @@ def mixed_for(
         )
     optics = all_channels(list(channels.values()))
     nm = np.arange(optics.range_nm[0], optics.range_nm[1] + STEP_NM, STEP_NM)
-    response_nm = optics.quantum_efficiency(nm) * optics.transmission(nm) * nm
-    density = np.array([curve(nm) for curve in primaries]) * response_nm
+    response = optics.quantum_efficiency(nm) * optics.transmission(nm)
+    density = np.array([curve(nm) for curve in primaries]) * (response * nm)
     density /= density.sum(axis=1, keepdims=True)
     places = np.asarray(places_px)
+    scale = _scale(channels)
     if len(channels) > 1:
         by_primary = matrix.e_per_s / of_white
-        return Colours(
-            matrix,
-            places,
-            nm,
-            density,
-            by_primary.T @ by_primary,
-            (),
-            kinds,
-            _scale(channels, True),
-        )
+        gram = by_primary.T @ by_primary
+        return Colours(matrix, places, nm, density, gram, (), kinds, scale)
     up_to = np.cumsum(density, axis=1)
     gram = up_to @ up_to.T * STEP_NM
+    lateral = None
+    if isinstance(psf, GlassPsf):
+        lateral = Lateral.of(psf, nm, density)
+    efficiency = optics.quantum_efficiency
+    knots = _knots(optics, nm)
+    curves = []
+    for weight in _weights(knots, nm, up_to, lateral):
+        weighted = Curve(knots, efficiency(knots) * weight)
+        curves.append(rates_by(replace(optics, quantum_efficiency=weighted)))
+    return Colours(matrix, places, nm, density, gram, tuple(curves), kinds, scale, lateral)
+
+
+def _knots(optics: Optics, nm: FloatArray) -> FloatArray:
+    """Wavelengths (k,), nm, at which a weighted quantum efficiency is given: some of `nm`, and the
+    curve's own.
+    """
+    own_nm = optics.quantum_efficiency.wavelength_nm
+    if not len(own_nm):  # the same at each wavelength
+        own_nm = np.array(optics.range_nm)
+    knots = nm[::KNOT_STEPS]
+    inside = (knots > own_nm[0]) & (knots < own_nm[-1])
+    return np.unique(np.concatenate([knots[inside], own_nm]))
+
+
+def _weights(
+    knots: FloatArray, nm: FloatArray, up_to: FloatArray, lateral: Lateral | None
+) -> list[FloatArray]:
+    """The weights (k,) at `knots` whose means over a star's photons `Colours.wanted` has, after
+    that of the photons themselves.
+
+    `up_to` (3, n) are the primaries' cumulative spectra at `nm` (n,).
+    """
     # The part of a cumulative spectrum above a wavelength: a photon there adds as much to a star's
     # product with it.
     above = np.cumsum(up_to[:, ::-1], axis=1)[:, ::-1] * STEP_NM
-    knots = nm[::KNOT_STEPS]
-    plain = optics.quantum_efficiency
-    if len(plain.wavelength_nm):
-        edge_nm = plain.wavelength_nm
-    else:
-        edge_nm = np.array(optics.range_nm)
-    knots = np.unique(
-        np.concatenate([knots[(knots > edge_nm[0]) & (knots < edge_nm[-1])], edge_nm])
-    )
-    if isinstance(psf, GlassPsf):
-        lateral = Lateral.of(psf, nm, density)
-    else:
-        lateral = None
-    weights = [np.ones_like(knots), knots, *(np.interp(knots, nm, curve) for curve in above)]
-    weights += (
-        []
-        if lateral is None
-        else [*(NodeSpline(lateral.nm)(knots) @ lateral.px + lateral.lifted).T]
-    )
-    curves = tuple(
-        rates_by(replace(optics, quantum_efficiency=Curve(knots, plain(knots) * curve)))
-        for curve in weights
-    )
-    return Colours(
-        matrix, places, nm, density, gram, curves, kinds, _scale(channels, False), lateral
-    )
+    weights = [np.ones_like(knots), knots]
+    for curve in above:
+        weights.append(np.interp(knots, nm, curve))
+    if lateral is not None:
+        splines = NodeSpline(lateral.nm)
+        moved_px = splines(knots) @ lateral.px + lateral.lifted
+        weights.extend(moved_px.T)
+    return weights
 
 
-def _scale(channels: dict[str, Optics], by_channel: bool) -> FloatArray:
+def _scale(channels: dict[str, Optics]) -> FloatArray:
     """The rising index of black bodies of SCALE_K."""
+    by_channel = len(channels) > 1
     scales = []
     for optics in channels.values():
-        curves = optics.quantum_efficiency, optics.transmission
-        nm, weight = integration_nodes(*curves)
-        photons = (
-            blackbody_exitance_w_m2_m(nm, SCALE_K[:, None])
-            * nm
-            * curves[0](nm)
-            * curves[1](nm)
-            * weight
-        )
-        scales.append(photons.sum(axis=1) if by_channel else photons @ nm / photons.sum(axis=1))
+        efficiency = optics.quantum_efficiency
+        transmission = optics.transmission
+        nm, weight = integration_nodes(efficiency, transmission)
+        exitance = blackbody_exitance_w_m2_m(nm, SCALE_K[:, None])
+        photons = exitance * nm * efficiency(nm) * transmission(nm) * weight
+        if by_channel:
+            scales.append(photons.sum(axis=1))
+        else:
+            scales.append(photons @ nm / photons.sum(axis=1))
     return np.maximum.accumulate(warmth(np.stack(scales, axis=1)))

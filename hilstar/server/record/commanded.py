@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.rotation import (
     conjugate,
     from_rotation_vectors,
@@ -37,7 +36,7 @@ class Moments:
 
     q: FloatArray
     rate_rad_s: FloatArray
-    known: npt.NDArray[np.bool_]
+    known: BoolArray
     held_s: FloatArray
 
 
@@ -60,27 +59,36 @@ class Commanded:
         self.t_s = t_s
         self.q = q
         self.held_s = held_s
-        self.hold_s = np.diff(held_s, axis=1)[:, 0] if hold_s is None else hold_s
-        gap_s = np.diff(t_s)
-        self.interval_s = float(np.median(gap_s)) if len(gap_s) else 0.0
-        self._step = to_rotation_vector(multiply(q[1:], conjugate(q[:-1])))  # frame k to k + 1
+        if hold_s is None:
+            hold_s = held_s[:, 1] - held_s[:, 0]
+        self.hold_s = hold_s
+        self._gap_s = np.diff(t_s)
+        self.interval_s = 0.0
+        if len(self._gap_s):
+            self.interval_s = float(np.median(self._gap_s))
+        q_step = multiply(q[1:], conjugate(q[:-1]))  # frame k to k + 1
+        self._step = to_rotation_vector(q_step)
+        self.joined = self._joined()
+
+    def _joined(self) -> BoolArray:
+        """Whether each frame (m - 1,) and the next say what was shown between them."""
         turned = np.linalg.norm(self._step, axis=1)
-        near = gap_s <= max(MAX_GAP_S, USUAL_INTERVALS * self.interval_s)
+        is_shown = np.isfinite(turned)
+        turned = np.nan_to_num(turned)
+        max_gap_s = max(MAX_GAP_S, USUAL_INTERVALS * self.interval_s)
+        is_near = (self._gap_s <= max_gap_s) & (turned <= MAX_STEP_RAD)
+        is_same = turned <= SAME_RAD
         # A step is a jump where it is much faster than the one before and the one after it.
-        rate = np.nan_to_num(turned) / gap_s
+        rate = turned / self._gap_s
         before = np.append(0.0, rate[:-1])
         after = np.append(rate[1:], 0.0)
-        jumps = (np.nan_to_num(turned) > JUMP_RAD) & (rate > JUMP_RATIO * np.maximum(before, after))
-        with np.errstate(invalid="ignore"):
-            self.joined = (
-                np.isfinite(turned)
-                & ((near & (turned <= MAX_STEP_RAD)) | (turned <= SAME_RAD))
-                & ~jumps
-            )
-        self._gap_s = gap_s
+        usual_rate = np.maximum(before, after)
+        is_jump = (turned > JUMP_RAD) & (rate > JUMP_RATIO * usual_rate)
+        joined = is_shown & (is_near | is_same) & ~is_jump
+        return np.asarray(joined)
 
     @property
-    def shown(self) -> npt.NDArray[np.bool_]:
+    def shown(self) -> BoolArray:
         """Which frames (m,) have an attitude."""
         return np.asarray(np.isfinite(self.q[:, 0]))
 
@@ -91,49 +99,52 @@ class Commanded:
         Of a trajectory of angular acceleration change j (rad/s^3) the cubic is off by less than j
         dt^3 / 15.
         """
-        before = np.clip(np.searchsorted(self.t_s, t_s, side="right") - 1, 0, len(self.t_s) - 2)
-        known = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1]) & self.joined[before]
-        gap_s = self._gap_s[before, None]
+        last_interval = len(self.t_s) - 2
+        frames_before = np.searchsorted(self.t_s, t_s, side="right")
+        before = np.clip(frames_before - 1, 0, last_interval)
+        in_run = (t_s >= self.t_s[0]) & (t_s <= self.t_s[-1])
+        known = in_run & self.joined[before]
+        is_known = known[:, None]
+        gap_s = self._gap_s[before]
         step = self._step[before]
-        share = np.clip((t_s - self.t_s[before]) / gap_s[:, 0], 0, 1)[:, None]
+        since_s = t_s - self.t_s[before]
+        share = np.clip(since_s / gap_s, 0, 1)[:, None]
         # Hermite's cubic of the rotation vector from the frame before; at its ends it turns by
         # (step + bend) per interval.
         start = step + self._bend(before, -1)
         end = step + self._bend(before, 1)
         squared = share**2
         cubed = share**3
-        moved = (
-            (cubed - 2 * squared + share) * start
-            + (3 * squared - 2 * cubed) * step
-            + (cubed - squared) * end
-        )
-        speed = (
-            (3 * squared - 4 * share + 1) * start
-            + (6 * share - 6 * squared) * step
-            + (3 * squared - 2 * share) * end
-        )
-        rate = -speed / gap_s  # v_cam' = -omega x v_cam
-        q = normalise(
-            multiply(from_rotation_vectors(np.where(known[:, None], moved, 0.0)), self.q[before])
-        )
-        held_s = self._held_about(t_s)
-        return Moments(
-            np.where(known[:, None], q, np.nan),
-            np.where(known[:, None], rate, np.nan),
-            known,
-            held_s,
-        )
+        of_start = cubed - 2 * squared + share
+        of_step = 3 * squared - 2 * cubed
+        of_end = cubed - squared
+        moved = of_start * start + of_step * step + of_end * end
+        # The derivative of each weight by the share.
+        of_start = 3 * squared - 4 * share + 1
+        of_step = 6 * share - 6 * squared
+        of_end = 3 * squared - 2 * share
+        speed = of_start * start + of_step * step + of_end * end
+        rate = -speed / gap_s[:, None]  # v_cam' = -omega x v_cam
+        turn = from_rotation_vectors(np.where(is_known, moved, 0.0))
+        q = normalise(multiply(turn, self.q[before]))
+        q = np.where(is_known, q, np.nan)
+        rate = np.where(is_known, rate, np.nan)
+        return Moments(q, rate, known, self._held_about(t_s))
 
     def over_exposures(self, reach_s: float) -> "Commanded":
         """The same, where a moment stands for what was lit up to `reach_s` before and after it."""
-        widened = self.held_s + np.array([-reach_s, reach_s])
-        if not len(widened):
+        if not len(self.held_s):
             return self
+        start_s = self.held_s[:, 0] - reach_s
+        end_s = self.held_s[:, 1] + reach_s
         # Spans that meet become one.
-        apart = np.append(True, widened[1:, 0] > np.maximum.accumulate(widened[:, 1])[:-1])
-        first = np.flatnonzero(apart)
-        spans_s = np.stack([widened[first, 0], np.maximum.reduceat(widened[:, 1], first)], axis=1)
-        return Commanded(self.t_s, self.q, spans_s, np.maximum.reduceat(self.hold_s, first))
+        latest_end_s = np.maximum.accumulate(end_s)
+        is_apart = start_s[1:] > latest_end_s[:-1]
+        first = np.flatnonzero(np.append(True, is_apart))
+        joint_end_s = np.maximum.reduceat(end_s, first)
+        spans_s = np.stack([start_s[first], joint_end_s], axis=1)
+        hold_s = np.maximum.reduceat(self.hold_s, first)
+        return Commanded(self.t_s, self.q, spans_s, hold_s)
 
     def _held_about(self, t_s: FloatArray) -> FloatArray:
         """How long a frame stood in the held span in which each time (n,) lies, s; 0 where it
@@ -157,13 +168,11 @@ class Commanded:
         last = len(self._step) - 1
         other = interval + side
         near = np.clip(other, 0, last)
+        is_there = (other >= 0) & (other <= last)
         ratio = self._gap_s[near] / self._gap_s[interval]
-        even = (
-            (ratio < UNEVEN)
-            & (ratio > 1 / UNEVEN)
-            & (other >= 0)
-            & (other <= last)
-            & self.joined[near]
-        )
-        change = (self._step[near] / ratio[:, None] - self._step[interval]) / (1 + ratio[:, None])
-        return np.where(even[:, None], change, 0.0)
+        is_even = (ratio < UNEVEN) & (ratio > 1 / UNEVEN)
+        is_usable = is_even & is_there & self.joined[near]
+        ratio = ratio[:, None]
+        neighbour_turn = self._step[near] / ratio  # in the interval's own time
+        change = (neighbour_turn - self._step[interval]) / (1 + ratio)
+        return np.where(is_usable[:, None], change, 0.0)

@@ -53,21 +53,26 @@ def read_commanded(ledger: Path) -> CommandedRun:
     changed = 0
     missed = array("q")
     for record in frame_records(ledger):
-        plain = record.q is not None and not record.operator and not record.hidden
-        changed += record.q is not None and not plain
         light.append(record.light_ns)
         missed.append(record.missed_before)
-        shown.extend(record.q if plain and record.q is not None else NOT_SHOWN)
+        if record.q is None:
+            shown.extend(NOT_SHOWN)
+        elif record.operator or record.hidden:
+            changed += 1
+            shown.extend(NOT_SHOWN)
+        else:
+            shown.extend(record.q)
     # Of frames of one moment the last counts.
-    light_ns, last = np.unique(np.array(light, dtype=np.int64)[::-1], return_index=True)
+    newest_first_ns = np.array(light, dtype=np.int64)[::-1]
+    light_ns, last = np.unique(newest_first_ns, return_index=True)
+    if not len(light_ns):
+        raise InputError(f"{ledger}: {NO_FRAMES}")
     if len(light_ns) < 2:
-        raise InputError(
-            f"{ledger}:"
-            f" {'has one frame; give the ledger of a longer run' if len(light_ns) else NO_FRAMES}"
-        )
+        raise InputError(f"{ledger}: has one frame; give the ledger of a longer run")
+    zero_ns = int(light_ns[0])
+    t_s = (light_ns - zero_ns) / NS_PER_S
     q = np.array(shown).reshape(-1, 4)[::-1][last]
-    t_s = (light_ns - light_ns[0]) / NS_PER_S
     missed_before = np.array(missed, dtype=np.int64)[::-1][last]
     late = np.flatnonzero(missed_before[1:] > 0) + 1
     held_s = np.stack([t_s[late - 1], t_s[late]], axis=1)
-    return CommandedRun(Commanded(t_s, q, held_s), int(light_ns[0]), changed, int(sum(missed)))
+    return CommandedRun(Commanded(t_s, q, held_s), zero_ns, changed, sum(missed))

@@ -53,13 +53,12 @@ SMALL_RAD = 1e-8
 RECOUNTED = 8192
 # Times of a frame, ms, and the keys that a report has them under.
 METRICS = {
-    **{
-        "interval": "interval_ms",
-        "late": "swap_late_ms",
-        "draw": "draw_to_swap_ms",
-        "age": "attitude_age_ms",
-    },
-    **{"prediction": "prediction_ms", "packet": "packet_to_swap_ms"},
+    "interval": "interval_ms",
+    "late": "swap_late_ms",
+    "draw": "draw_to_swap_ms",
+    "age": "attitude_age_ms",
+    "prediction": "prediction_ms",
+    "packet": "packet_to_swap_ms",
 }
 HEAD = (
     "bench_sha256",
@@ -75,10 +74,11 @@ COUNTED = ("frames", "right_frames", "capped_frames", *FAULTS)
 # The columns of the spans: METRICS, then these.
 COUNTS = ("missed", "stars", "clipped", "below_step", "stale", "blank")
 ACCEPTED, REFUSED = range(2)
-NUMBERS, WORDS = (
-    ("stale", "capped", "missed_before", "stars_drawn", "clipped", "below_step"),
-    ("operator", "hidden"),
-)
+# The whole numbers and the texts of a frame's record that are counted.
+NUMBERS = ("stale", "capped", "missed_before", "stars_drawn", "clipped", "below_step")
+WORDS = ("operator", "hidden")
+# The figures of a RunFigures that a report has under the same name.
+SAME_NAME = ("duration_s", "events", "pulses", "memory_growth_mb")
 
 
 class ThinnedRows:
@@ -94,16 +94,19 @@ class ThinnedRows:
         """Add rows (n, columns), or skip them."""
         while len(rows):
             first = -self._seen % self.stride
-            fitting = rows[first :: self.stride][: len(self._rows) - self._kept]
-            self._rows[self._kept : self._kept + len(fitting)] = fitting
-            self._kept += len(fitting)
+            free = len(self._rows) - self._kept
+            fitting = rows[first :: self.stride][:free]
+            end = self._kept + len(fitting)
+            self._rows[self._kept : end] = fitting
+            self._kept = end
             taken = min(len(rows), first + len(fitting) * self.stride)
             self._seen = self._seen + taken
             rows = rows[taken:]
             if len(rows) and self._kept == len(self._rows):
                 half = len(self._rows) // 2
                 self._rows[:half] = self._rows[::2]
-                self._kept, self.stride = half, 2 * self.stride
+                self._kept = half
+                self.stride = 2 * self.stride
 
     @property
     def rows(self) -> npt.NDArray[Any]:
@@ -143,22 +146,31 @@ class SpanTable:
                 self._begin[self._used] = rows[0, 0]
                 self._used = self._used + 1
                 self._in_last = 0
-            if self._in_last:
-                whole = 0
-            else:
-                whole = min(len(rows) // self.length, len(self._begin) - self._used + 1)
-            count = max(whole, 1) * self.length - self._in_last
-            self._add(rows[:count], max(whole, 1))
+            # Whole spans are added at once; one that has begun is filled first.
+            spans = 1
+            if not self._in_last:
+                free = len(self._begin) - self._used + 1
+                whole = min(len(rows) // self.length, free)
+                spans = max(whole, 1)
+            count = spans * self.length - self._in_last
+            self._add(rows[:count], spans)
             rows = rows[count:]
 
     def _add(self, rows: FloatArray, spans: int) -> None:
-        values = rows[:, 1:].reshape(spans, -1, rows.shape[1] - 1)
-        place = slice(self._used - 1, self._used - 1 + spans)
-        self._begin[self._used : place.stop] = rows[:: max(len(rows) // spans, 1), 0][1:spans]
-        self._low[place] = np.fmin(self._low[place], np.fmin.reduce(values, axis=1))
-        self._high[place] = np.fmax(self._high[place], np.fmax.reduce(values, axis=1))
-        self._sum[place] += np.nansum(values, axis=1)
-        self._used, self._in_last = place.stop, self._in_last + values.shape[1]
+        columns = rows.shape[1] - 1
+        values = rows[:, 1:].reshape(spans, -1, columns)
+        first = self._used - 1
+        end = first + spans
+        span_frames = max(len(rows) // spans, 1)
+        begin = rows[::span_frames, 0]
+        self._begin[self._used : end] = begin[1:spans]
+        low = np.fmin.reduce(values, axis=1)
+        high = np.fmax.reduce(values, axis=1)
+        self._low[first:end] = np.fmin(self._low[first:end], low)
+        self._high[first:end] = np.fmax(self._high[first:end], high)
+        self._sum[first:end] += np.nansum(values, axis=1)
+        self._used = end
+        self._in_last += values.shape[1]
 
     def _halve(self) -> None:
         half = self._used // 2
@@ -166,8 +178,12 @@ class SpanTable:
         self._high[:half] = np.maximum(self._high[::2], self._high[1::2])
         self._sum[:half] = self._sum[::2] + self._sum[1::2]
         self._begin[:half] = self._begin[::2]
-        self._low[half:], self._high[half:], self._sum[half:] = np.inf, -np.inf, 0.0
-        self._used, self._in_last, self.length = half, 2 * self.length, 2 * self.length
+        self._low[half:] = np.inf
+        self._high[half:] = -np.inf
+        self._sum[half:] = 0.0
+        self._used = half
+        self.length = 2 * self.length
+        self._in_last = self.length
 
     @property
     def begin(self) -> FloatArray:
@@ -176,11 +192,13 @@ class SpanTable:
 
     def column(self, number: int) -> SpanColumn:
         """One column over all spans."""
-        low, high, total = (
-            table[: self._used, number] for table in (self._low, self._high, self._sum)
-        )
-        some = np.isfinite(low)
-        return SpanColumn(np.where(some, low, np.nan), np.where(some, high, np.nan), total)
+        low = self._low[: self._used, number]
+        high = self._high[: self._used, number]
+        total = self._sum[: self._used, number]
+        has_value = np.isfinite(low)
+        low = np.where(has_value, low, np.nan)
+        high = np.where(has_value, high, np.nan)
+        return SpanColumn(low, high, total)
 
 
 class TimeBins:
@@ -201,13 +219,18 @@ class TimeBins:
         if self._first_ns is None:
             self._first_ns = int(at_ns[0])
         since_ns = np.maximum(at_ns - self._first_ns, 0)
-        while (last := int(since_ns.max()) // self.width_ns) >= len(self._counts):
-            half = len(self._counts) // 2
-            self._counts[:half] = self._counts[::2] + self._counts[1::2]
-            self._counts[half:] = 0
-            self._used, self.width_ns = (self._used + 1) // 2, 2 * self.width_ns
+        latest_ns = int(since_ns.max())
+        while latest_ns >= len(self._counts) * self.width_ns:
+            self._halve()
         np.add.at(self._counts, (since_ns // self.width_ns, kinds), number)
-        self._used = max(self._used, last + 1)
+        self._used = max(self._used, latest_ns // self.width_ns + 1)
+
+    def _halve(self) -> None:
+        half = len(self._counts) // 2
+        self._counts[:half] = self._counts[::2] + self._counts[1::2]
+        self._counts[half:] = 0
+        self._used = (self._used + 1) // 2
+        self.width_ns = 2 * self.width_ns
 
     def rates_hz(self, zero_ns: int) -> tuple[FloatArray, FloatArray]:
         """The start of each bin, s after a host time, (n,), and the rate of each kind in it,
@@ -215,10 +238,10 @@ class TimeBins:
         """
         if self._first_ns is None:
             return np.zeros(0), np.zeros((0, self._counts.shape[1]))
-        begin_s = (self._first_ns - zero_ns) / NS_PER_S + np.arange(
-            self._used, dtype=np.float64
-        ) * (self.width_ns / NS_PER_S)
-        return begin_s, self._counts[: self._used].astype(np.float64) * (NS_PER_S / self.width_ns)
+        bins = np.arange(self._used, dtype=np.float64)
+        begin_s = (self._first_ns - zero_ns) / NS_PER_S + bins * (self.width_ns / NS_PER_S)
+        counts = self._counts[: self._used].astype(np.float64)
+        return begin_s, counts * (NS_PER_S / self.width_ns)
 
 
 class Keyframes:
@@ -232,21 +255,27 @@ class Keyframes:
 
     def add(self, frames: list[FrameRecord], worths: dict[str, IntArray]) -> None:
         """Look at frames (n), whose `worths` (n,) say how special each is."""
-        self._even.add(np.array([*frames, None], dtype=object)[:-1, None])
+        rows = np.empty((len(frames), 1), dtype=object)
+        rows[:, 0] = frames
+        self._even.add(rows)
         for why, worth in worths.items():
             place = int(worth.argmax())
-            if worth[place] > self._best.get(why, (0, None))[0]:
+            highest, _ = self._best.get(why, (0, None))
+            if worth[place] > highest:
                 self._best[why] = int(worth[place]), frames[place]
 
     def chosen(self, last: FrameRecord | None) -> list[tuple[FrameRecord, str]]:
         """The frames in order, each with what is special about it, or ""."""
-        found = {id(frame): (frame, "") for frame in self._even.rows[:, 0]}
+        frames = list(self._even.rows[:, 0])
+        reasons: dict[int, list[str]] = {}  # by the frame's identity
         for why, (_, frame) in self._best.items():
-            before = found.get(id(frame), (frame, ""))[1]
-            found[id(frame)] = (frame, ", ".join(part for part in (before, why) if part))
+            frames.append(frame)
+            reasons.setdefault(id(frame), []).append(why)
         if last is not None:
-            found.setdefault(id(last), (last, ""))
-        return sorted(found.values(), key=lambda each: each[0].swap_ns)
+            frames.append(last)
+        by_identity = {id(frame): frame for frame in frames}
+        in_order = sorted(by_identity.values(), key=attrgetter("swap_ns"))
+        return [(frame, ", ".join(reasons.get(id(frame), []))) for frame in in_order]
 
 
 @dataclass(slots=True)
@@ -376,11 +405,9 @@ class RunFigures:
             if self.warm is None and (record.host_ns - first.host_ns) / NS_PER_S >= WARM_UP_S:
                 self.warm = record
             self.last_process = record
-            self.process.add(
-                np.array(
-                    [(record.host_ns / NS_PER_S, record.resident_bytes / MEGABYTE, record.cpu_s)]
-                )
-            )
+            resident_mb = record.resident_bytes / MEGABYTE
+            row = (record.host_ns / NS_PER_S, resident_mb, record.cpu_s)
+            self.process.add(np.array([row]))
         elif isinstance(record, EventRecord):
             self._add_event(record)
         elif isinstance(record, FaultRecord):
@@ -389,17 +416,16 @@ class RunFigures:
         elif isinstance(record, AnswerRecord):
             self.answers.answer(record)
             if record.verdict == "right" and record.residual_arcsec is not None:
-                self.residuals.add(
-                    np.array([(record.middle_ns / NS_PER_S, *record.residual_arcsec)])
-                )
+                middle_s = record.middle_ns / NS_PER_S
+                self.residuals.add(np.array([(middle_s, *record.residual_arcsec)]))
         elif record.kind == "pulse" and record.reason in PULSES:
             self.pulses = dict.fromkeys(PULSES, 0) | self.pulses
             self.pulses[record.reason] += record.count
         elif record.kind == "lost":
             self.lost += record.count
         elif record.kind == "packet":
-            place = ACCEPTED if record.reason == "accepted" else REFUSED
-            self.packet_times.add(np.array([record.host_ns]), np.array([place]), record.count)
+            kind = ACCEPTED if record.reason == "accepted" else REFUSED
+            self.packet_times.add(np.array([record.host_ns]), np.array([kind]), record.count)
 
     def _add_event(self, record: EventRecord) -> None:
         kind = record.kind[:MAX_REASON_CHARACTERS]
@@ -420,16 +446,17 @@ class RunFigures:
         self.counted["frames"] += len(frames)
         stale, capped, missed, stars, clipped, below = (_whole(frames, name)[0] for name in NUMBERS)
         blank = np.array([frame.q is None for frame in frames])
-        text_flags = [_has_text(frames, name) for name in WORDS]
+        operator, hidden = (_has_text(frames, name) for name in WORDS)
         swap_ns, _ = _whole(frames, "swap_ns")
         wrong = _covered(self.wrong_sky, swap_ns)
-        masks = dict(zip(FAULTS, (stale > 0, blank, *text_flags, wrong), strict=True))
-        self._newest.add(swap_ns, ~np.any([*masks.values()][:-1], axis=0), wrong)
-        masks |= {
-            "right_frames": ~np.any([*masks.values()], axis=0),
-            "late": (stale > 0) & ~blank,
-            "capped_frames": capped > 0,
-        }
+        is_stale = stale > 0
+        late = is_stale & ~blank
+        plain = ~(is_stale | blank | operator | hidden)
+        self._newest.add(swap_ns, plain, wrong)
+        masks = dict(zip(FAULTS, (is_stale, blank, operator, hidden, wrong), strict=True))
+        masks["right_frames"] = plain & ~wrong
+        masks["late"] = late
+        masks["capped_frames"] = capped > 0
         for name, mask in masks.items():
             self.counted[name] += int(mask.sum())
         for name, number in (("clipped", clipped), ("below_step", below), ("stars_drawn", stars)):
@@ -440,27 +467,27 @@ class RunFigures:
         self.samples.add(times)
         run_s = (swap_ns - self.first_swap_ns) / NS_PER_S
         self.spans.add(np.column_stack([run_s, times, missed, stars, clipped, below, stale, blank]))
-        self.keyframes.add(
-            frames,
-            {"first stale": masks["late"], "most clipped stars": clipped, "most stars": stars},
-        )
-        shown_rows = np.flatnonzero(~blank)
-        if not len(shown_rows):
-            return
+        worths = {"first stale": late, "most clipped stars": clipped, "most stars": stars}
+        self.keyframes.add(frames, worths)
+        if not blank.all():
+            self._add_path(frames, np.flatnonzero(~blank), run_s)
+
+    def _add_path(
+        self, frames: list[FrameRecord], shown_rows: npt.NDArray[np.intp], run_s: FloatArray
+    ) -> None:
         q = attitudes_of(frames)
-        t_ns = _whole(frames, "t_ns")[0][shown_rows]
-        self._first_t_ns = int(t_ns[0]) if self._first_t_ns is None else self._first_t_ns
+        all_t_ns, _ = _whole(frames, "t_ns")
+        t_ns = all_t_ns[shown_rows]
+        if self._first_t_ns is None:
+            self._first_t_ns = int(t_ns[0])
         last_q = q[0] if self._q is None else self._q
-        turned = np.cumsum(
-            np.vstack([self._turned, _turns_rad(np.vstack([last_q, q[:-1]]), q)]), axis=0
-        )
+        q_before = np.vstack([last_q, q[:-1]])
+        steps_rad = _turns_rad(q_before, q)
+        turned = np.cumsum(np.vstack([self._turned, steps_rad]), axis=0)
         self._q = q[-1]
         self._turned = turned[-1]
-        self.path.add(
-            np.column_stack(
-                [run_s[shown_rows], (t_ns - self._first_t_ns) / NS_PER_S, q, turned[1:]]
-            )
-        )
+        t_s = (t_ns - self._first_t_ns) / NS_PER_S
+        self.path.add(np.column_stack([run_s[shown_rows], t_s, q, turned[1:]]))
 
 
 def _times_ms(
@@ -494,13 +521,13 @@ def _has_text(frames: Sequence[FrameRecord], name: str) -> BoolArray:
 def _whole(records: Sequence[RunRecord], name: str) -> tuple[npt.NDArray[np.int64], BoolArray]:
     """A whole number of each record, 0 for None, and whether it is known, (n,) each."""
     count = len(records)
-    known = np.ones(len(records), dtype=bool)
     try:
-        return np.fromiter(map(attrgetter(name), records), np.int64, count), known
-    except TypeError:
-        values = list(map(attrgetter(name), records))
-        known[[number for number, value in enumerate(values) if value is None]] = False
+        numbers = np.fromiter(map(attrgetter(name), records), np.int64, count)
+    except TypeError:  # the number of some record is None
+        values = [getattr(record, name) for record in records]
+        known = np.array([value is not None for value in values])
         return np.array([value or 0 for value in values], dtype=np.int64), known
+    return numbers, np.ones(count, dtype=bool)
 
 
 def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -512,11 +539,11 @@ def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
     z = -bw * az - bx * ay + by * ax + bz * aw
     sine = np.sqrt(x * x + y * y + z * z)
     small = sine <= SMALL_RAD
-    scale = (
-        -2.0
-        * np.copysign(1.0, w)
-        * np.where(small, 1.0, np.arctan2(sine, np.abs(w)) / np.where(small, 1.0, sine))
-    )
+    half_rad = np.arctan2(sine, np.abs(w))
+    # Of a small angle the angle over its sine is 1 to the last bit.
+    angle_over_sine = np.where(small, 1.0, half_rad / np.where(small, 1.0, sine))
+    sign = np.copysign(1.0, w)
+    scale = -2.0 * sign * angle_over_sine
     return np.asarray(scale[:, None] * np.stack([x, y, z], axis=1))
 
 
@@ -585,116 +612,122 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
 
 def summarise(run: RunFigures) -> RunReport:
     """The figures of a run, from those of its frames."""
+    figures: dict[str, Any] = dict(run.most)
+    for name, key in METRICS.items():
+        figures[key] = run.spreads[name].percentiles()
+    for name in COUNTED:
+        figures[name] = run.counted[name]
+    for name in HEAD:
+        figures[name] = run.head.get(name)
+    for name in SAME_NAME:
+        figures[name] = getattr(run, name)
     config = config_of(run.head)
-    last = run.last
-    if config is None:
-        refresh_hz = None
-    else:
+    refresh_hz = None
+    age_frames = None
+    if config is not None:
         refresh_hz = config.monitor.refresh_hz
-    times = {key: run.spreads[name].percentiles() for name, key in METRICS.items()}
-    figures: dict[str, Any] = {name: run.counted[name] for name in COUNTED} | {
-        name: run.head.get(name) for name in HEAD
-    }
-    figures |= {
-        name: getattr(run, name) for name in ("duration_s", "events", "pulses", "memory_growth_mb")
-    }
+        age_frames = figures["attitude_age_ms"].times(refresh_hz / 1e3)
+    missed = 0
+    source = ""
+    last_swap_ns = run.first_swap_ns
+    if run.last is not None:
+        missed = run.last.missed
+        source = run.last.timestamp_source
+        last_swap_ns = run.last.swap_ns
     return RunReport(
-        **(figures | times | run.most),
-        missed_frames=0 if last is None else last.missed,
-        timestamp_source="" if last is None else last.timestamp_source,
+        **figures,
+        missed_frames=missed,
+        timestamp_source=source,
         refresh_hz=refresh_hz,
         pacing_jitter_ms=run.spreads["interval"].deviation,
-        attitude_age_frames=(
-            None if refresh_hz is None else times["attitude_age_ms"].times(refresh_hz / 1e3)
-        ),
+        attitude_age_frames=age_frames,
         packets=run.packets.counts,
         lost_packets=run.lost,
-        wrong_sky=run.wrong_sky.total(
-            run.first_swap_ns, run.first_swap_ns if last is None else last.swap_ns
-        ),
+        wrong_sky=run.wrong_sky.total(run.first_swap_ns, last_swap_ns),
         answers=run.answers.report(run.first_swap_ns) or UNSET,
     )
 
 
-def table_rows(found: RunReport) -> list[tuple[str, str]]:
+def table_rows(report: RunReport) -> list[tuple[str, str]]:
     """The figures as rows of text: name and value."""
-    refused = sum(count for reason, count in found.packets.items() if reason != "accepted")
+    rows = [*_frame_rows(report).items(), *_time_rows(report).items()]
+    for condition in report.wrong_sky.conditions:
+        rows.append((condition.kind, f"{condition.seconds:.1f} s: {condition.text}"))
+    rows.extend(_event_rows(report).items())
+    rows.extend(answer_rows(report.answers or None))
+    rows.extend(_origin_rows(report).items())
+    return rows
 
-    def three(figure: Percentiles | None, unit: str = "ms") -> str:
-        values = (None, None, None) if figure is None else (figure.p50, figure.p99, figure.max)
-        return (
-            " / ".join("-" if v is None else f"{v:.2f}" for v in values)
-            + f" {unit} (p50 / p99 / max)"
-        )
 
-    def number(value: float | None, unit: str) -> str:
-        return "-" if value is None else f"{value:.2f} {unit}"
+def _frame_rows(report: RunReport) -> dict[str, str]:
+    frames = f"{report.frames} in {report.duration_s:.1f} s, {report.missed_frames} missed"
+    operator = f"{report.operator_frames} by an operator's keys"
+    rows = {}
+    rows["frames"] = f"{frames}, {report.stale_frames} stale, {report.blank_frames} blank"
+    rows["not the plain sky"] = f"{operator}, {report.hidden_frames} hidden"
+    rows["coarser paths"] = f"{report.capped_frames} frames, because the turn was too fast"
+    return rows
 
+
+def _time_rows(report: RunReport) -> dict[str, str]:
+    refresh = _number(report.refresh_hz, "Hz")
+    jitter = _number(report.pacing_jitter_ms, "ms")
+    age = _percentiles(report.attitude_age_ms)
+    age_frames = _percentiles(report.attitude_age_frames, "frames")
+    rows = {}
+    rows["time stamps"] = f"{report.timestamp_source}; the bench file's refresh rate is {refresh}"
+    rows["pacing jitter"] = f"{jitter} (standard deviation of the interval between swaps)"
+    rows["interval"] = _percentiles(report.interval_ms)
+    rows["swap later than predicted"] = _percentiles(report.swap_late_ms)
+    rows["start of drawing to swap"] = _percentiles(report.draw_to_swap_ms)
+    rows["age of the attitude at light"] = f"{age} = {age_frames}"
+    rows["predicted past the last packet"] = _percentiles(report.prediction_ms)
+    rows["packet to swap"] = _percentiles(report.packet_to_swap_ms)
+    return rows
+
+
+def _event_rows(report: RunReport) -> dict[str, str]:
+    accepted = report.packets.get("accepted", 0)
+    refused = sum(report.packets.values()) - accepted
+    events = [f"{kind} {count}" for kind, count in report.events.items()]
     pulses = "none"
-    if found.pulses:
-        lost = f", the line lost {found.pulses['lost']} times" if found.pulses["lost"] else ""
-        pulses = f"{found.pulses['sent']} at their frames, {found.pulses['skipped']} skipped{lost}"
-    frames = f"{found.frames} in {found.duration_s:.1f} s, {found.missed_frames} missed"
-    return [
-        ("frames", f"{frames}, {found.stale_frames} stale, {found.blank_frames} blank"),
-        (
-            "not the plain sky",
-            f"{found.operator_frames} by an operator's keys, {found.hidden_frames} hidden",
-        ),
-        ("coarser paths", f"{found.capped_frames} frames, because the turn was too fast"),
-        (
-            "time stamps",
-            (
-                f"{found.timestamp_source}; the bench file's refresh rate is"
-                f" {number(found.refresh_hz, 'Hz')}"
-            ),
-        ),
-        (
-            "pacing jitter",
-            (
-                f"{number(found.pacing_jitter_ms, 'ms')} (standard deviation of the interval"
-                " between swaps)"
-            ),
-        ),
-        ("interval", three(found.interval_ms)),
-        ("swap later than predicted", three(found.swap_late_ms)),
-        ("start of drawing to swap", three(found.draw_to_swap_ms)),
-        (
-            "age of the attitude at light",
-            f"{three(found.attitude_age_ms)} = {three(found.attitude_age_frames, 'frames')}",
-        ),
-        ("predicted past the last packet", three(found.prediction_ms)),
-        ("packet to swap", three(found.packet_to_swap_ms)),
-        *[
-            (condition.kind, f"{condition.seconds:.1f} s: {condition.text}")
-            for condition in found.wrong_sky.conditions
-        ],
-        (
-            "packets",
-            (
-                f"{found.packets.get('accepted', 0)} accepted, {refused} refused,"
-                f" {found.lost_packets} lost"
-            ),
-        ),
-        ("events", ", ".join(f"{kind} {count}" for kind, count in found.events.items()) or "none"),
-        ("pulses", pulses),
-        (
-            "stars",
-            (
-                f"at most {found.stars_drawn} drawn, {found.clipped} clipped, {found.below_step}"
-                " too faint"
-            ),
-        ),
-        *answer_rows(found.answers or None),
-        ("memory after the first minute", number(found.memory_growth_mb, "MB more at the end")),
-        ("bench file", f"SHA-256 {found.bench_sha256}"),
-        ("calibration", f"{found.calibration}, SHA-256 {found.calibration_sha256}"),
-        *([("certificate", found.certificate)] if found.certificate else []),
-        (
-            "renderer",
-            (
-                f"{found.gl_renderer}, OpenGL {found.gl_version or '-'}; levels by"
-                f" {found.render_path or '-'}"
-            ),
-        ),
-    ]
+    if report.pulses:
+        pulses = f"{report.pulses['sent']} at their frames, {report.pulses['skipped']} skipped"
+        lost = report.pulses["lost"]
+        if lost:
+            pulses += f", the line lost {lost} times"
+    stars = f"at most {report.stars_drawn} drawn, {report.clipped} clipped"
+    rows = {}
+    rows["packets"] = f"{accepted} accepted, {refused} refused, {report.lost_packets} lost"
+    rows["events"] = ", ".join(events) or "none"
+    rows["pulses"] = pulses
+    rows["stars"] = f"{stars}, {report.below_step} too faint"
+    return rows
+
+
+def _origin_rows(report: RunReport) -> dict[str, str]:
+    growth = _number(report.memory_growth_mb, "MB more at the end")
+    opengl = report.gl_version or "-"
+    levels = report.render_path or "-"
+    rows = {}
+    rows["memory after the first minute"] = growth
+    rows["bench file"] = f"SHA-256 {report.bench_sha256}"
+    rows["calibration"] = f"{report.calibration}, SHA-256 {report.calibration_sha256}"
+    if report.certificate:
+        rows["certificate"] = report.certificate
+    rows["renderer"] = f"{report.gl_renderer}, OpenGL {opengl}; levels by {levels}"
+    return rows
+
+
+def _percentiles(figure: Percentiles | None, unit: str = "ms") -> str:
+    values: tuple[float | None, ...] = (None, None, None)
+    if figure is not None:
+        values = (figure.p50, figure.p99, figure.max)
+    numbers = ["-" if value is None else f"{value:.2f}" for value in values]
+    return f"{' / '.join(numbers)} {unit} (p50 / p99 / max)"
+
+
+def _number(value: float | None, unit: str) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.2f} {unit}"

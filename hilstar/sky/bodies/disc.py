@@ -69,7 +69,8 @@ class Disc:
         """The map (3, 3) of ICRS vectors to axes in which the body is a unit sphere on +z, in
         equatorial radii.
         """
-        squash = np.eye(3) + (self.equator_km / self.polar_km - 1) * np.outer(self.pole, self.pole)
+        stretch = self.equator_km / self.polar_km - 1
+        squash = np.eye(3) + stretch * np.outer(self.pole, self.pole)
         towards = squash @ self.direction
         z = towards / np.linalg.norm(towards)
         sun = squash @ self.sun
@@ -83,23 +84,21 @@ class Disc:
     @cached_property
     def distance_radii(self) -> float:
         """The distance of the centre in the axes of `to_sphere`."""
-        return (
-            float(np.linalg.norm(self.to_sphere @ self.direction))
-            * self.distance_km
-            / self.equator_km
-        )
+        direction_length = float(np.linalg.norm(self.to_sphere @ self.direction))
+        return direction_length * self.distance_km / self.equator_km
 
     @cached_property
     def sun_sphere(self) -> FloatArray:
-        """A place's product with this vector (3,) is the cosine of the Sun's angle times the
-        length of the normal.
+        """The vector (3,) whose product with a place of the sphere is the cosine of the Sun's angle
+        there, times the length of the normal.
         """
         return np.asarray(self.to_sphere @ self.sun)
 
     @property
     def radius_rad(self) -> float:
         """The largest angle from the centre to the limb."""
-        return float(np.arcsin(min(1.0, max(self.equator_km, self.polar_km) / self.distance_km)))
+        sine = max(self.equator_km, self.polar_km) / self.distance_km
+        return float(np.arcsin(min(1.0, sine)))
 
     @property
     def air_radii(self) -> float:
@@ -123,9 +122,8 @@ class Disc:
         """
         sine = min(1.0, radii / self.distance_radii)
         turn = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
-        ring = np.stack(
-            [sine * np.cos(turn), sine * np.sin(turn), np.full(count, np.sqrt(1 - sine**2))], axis=1
-        )
+        forward = np.full(count, np.sqrt(1 - sine**2))
+        ring = np.stack([sine * np.cos(turn), sine * np.sin(turn), forward], axis=1)
         on_sphere = ring @ np.linalg.inv(self.to_sphere).T
         return np.asarray(on_sphere / np.linalg.norm(on_sphere, axis=1, keepdims=True))
 
@@ -145,7 +143,8 @@ class Disc:
         """The share of light from behind the body in ICRS directions (n, 3): 0 on its disc, less
         than 1 through its air.
         """
-        height = (self._impact(directions @ self.to_sphere.T) - 1) / (self.air_radii or 1.0)
+        impact = self._impact(directions @ self.to_sphere.T)
+        height = (impact - 1) / (self.air_radii or 1.0)
         through = np.exp(-self.slant_depth * np.exp(-np.maximum(height, 0.0)))
         return np.where(height < 0, 0.0, through)
 
@@ -154,9 +153,8 @@ class Disc:
         that lead away.
         """
         across = np.hypot(seen[:, 0], seen[:, 1])
-        return np.where(
-            seen[:, 2] > 0, self.distance_radii * across / np.linalg.norm(seen, axis=1), np.inf
-        )
+        impact = self.distance_radii * across / np.linalg.norm(seen, axis=1)
+        return np.where(seen[:, 2] > 0, impact, np.inf)
 
     def radiance(self, directions: FloatArray) -> FloatArray:
         """Electrons per second and steradian of the solid disc in ICRS directions (n, 3); 0
@@ -167,10 +165,10 @@ class Disc:
         on = np.flatnonzero(self._impact(sphere_rays) < 1)
         ray = sphere_rays[on] / np.linalg.norm(sphere_rays[on], axis=1, keepdims=True)
         squared = ray[:, 0] ** 2 + ray[:, 1] ** 2
-        closest = self.distance_radii * np.column_stack((ray[:, :2] * ray[:, 2:], -squared))
-        place = (
-            closest - np.sqrt(np.maximum(0.0, 1 - self.distance_radii**2 * squared))[:, None] * ray
-        )
+        towards_centre = np.column_stack((ray[:, :2] * ray[:, 2:], -squared))
+        closest = self.distance_radii * towards_centre
+        half_chord = np.sqrt(np.maximum(0.0, 1 - self.distance_radii**2 * squared))
+        place = closest - half_chord[:, None] * ray
         light = np.zeros(len(directions))
         light[on] = self.normal_e_per_s_sr * self._shaded(place, sphere_rays[on])
         return light
@@ -199,20 +197,20 @@ class Disc:
         return self.touched_light(directions) * hidden, hidden
 
     def touched_light(self, directions: FloatArray) -> FloatArray:
-        """Electrons per second and steradian (n,) of ground that rays just touch, by the share of
-        light that air stops there.
+        """The radiance (n,), electrons per second and steradian, of ground that a ray just touches,
+        over the share of light that air stops there.
 
-        The rays have the sides of ICRS directions (n, 3).
+        Of ICRS directions (n, 3) only the side of the disc on which they lie counts.
         """
         sphere_directions = directions @ self.to_sphere.T
+        sideways = sphere_directions[:, :2]
+        length = np.hypot(sphere_directions[:, 0], sphere_directions[:, 1])
         # any at the middle
-        side = (
-            sphere_directions[:, :2]
-            / np.maximum(np.hypot(sphere_directions[:, 0], sphere_directions[:, 1]), 1e-30)[:, None]
-        )
+        side = sideways / np.maximum(length, 1e-30)[:, None]
         sine = 1 / self.distance_radii
         up = np.column_stack((side * np.sqrt(1 - sine**2), np.full(len(side), -sine)))
-        mu0 = np.maximum(0.0, up @ self.sun_sphere / np.linalg.norm(up @ self.to_sphere, axis=1))
+        normal_length = np.linalg.norm(up @ self.to_sphere, axis=1)
+        mu0 = np.maximum(0.0, up @ self.sun_sphere / normal_length)
         return np.asarray(self.normal_e_per_s_sr * mu0 / -np.expm1(-self.slant_depth))
 
     def _shaded(self, place: FloatArray, seen: FloatArray) -> FloatArray:
@@ -234,7 +232,8 @@ class Disc:
 
     def law_integral_sr(self) -> float:
         """The law's function over the seen disc, steradian."""
-        return float(self.points(QUADRATURE)[1].sum())
+        _, shares_sr = self.points(QUADRATURE)
+        return float(shares_sr.sum())
 
     def points(self, nodes: int) -> tuple[FloatArray, FloatArray]:
         """Directions (n, 3), ICRS axes, of places on the lit face, and the law's function times the
@@ -264,7 +263,8 @@ class Disc:
         # The limb ends latitudes as a square root does: evenly in an angle it is smooth.
         latitude = top * np.sin(node * np.pi / 2)
         stretch = top * np.cos(node * np.pi / 2) * np.pi / 2
-        reach = np.arccos(np.minimum(1.0, 1 / (self.distance_radii * np.cos(latitude))))
+        cos_reach = 1 / (self.distance_radii * np.cos(latitude))
+        reach = np.arccos(np.minimum(1.0, cos_reach))
         first = -reach
         if self.law in ("lambert", "lunar-lambert"):
             # Sun's longitude; +x is its side, -z the observer's
@@ -274,8 +274,10 @@ class Disc:
         longitude = first[:, None] + half[:, None] * (node + 1)
         area = (weight * stretch * np.cos(latitude) * half)[:, None] * weight
         cosine = np.cos(latitude)[:, None]
-        sine = np.broadcast_to(np.sin(latitude)[:, None], longitude.shape)
-        place = np.stack([cosine * np.sin(longitude), sine, -cosine * np.cos(longitude)], axis=-1)
+        right = cosine * np.sin(longitude)
+        up = np.broadcast_to(np.sin(latitude)[:, None], longitude.shape)
+        forward = -cosine * np.cos(longitude)
+        place = np.stack([right, up, forward], axis=-1)
         return place.reshape(-1, 3), area.ravel()
 
 

@@ -45,9 +45,9 @@ def apparent_cone(seen_km: FloatArray, velocity_km_s: FloatArray) -> tuple[Float
     beta = velocity_km_s / LIGHT_KM_S
     along = float(beta @ towards)
     middle = towards + math.cos(radius_rad) * (beta - along * towards)
-    return middle / np.linalg.norm(middle), EQUATOR_KM / math.sin(
-        radius_rad - along * math.sin(radius_rad)
-    )
+    direction = middle / np.linalg.norm(middle)
+    apparent_radius_rad = radius_rad - along * math.sin(radius_rad)
+    return direction, EQUATOR_KM / math.sin(apparent_radius_rad)
 
 
 def earth_disc(
@@ -60,6 +60,7 @@ def earth_disc(
     """
     direction, distance_km = apparent_cone(seen_km, velocity_km_s)
     sun_km = float(np.linalg.norm(from_sun_km))
+    phase_deg = phase_angle_deg(from_sun_km, seen_km)
     return Disc(
         name=EARTH,
         direction=direction,
@@ -69,7 +70,7 @@ def earth_disc(
         pole=np.array([0.0, 0.0, 1.0]),  # 0.15 degrees from the pole of 2026: 0.1 km of the limb
         sun=-from_sun_km / sun_km,
         law="lambert",
-        normal_e_per_s_sr=_normal(sun_km, phase_angle_deg(from_sun_km, seen_km), v0_e_per_s),
+        normal_e_per_s_sr=_normal(sun_km, phase_deg, v0_e_per_s),
         air=AIR,
     )
 
@@ -78,7 +79,8 @@ def earth_light(disc: Disc, v0_e_per_s: float) -> tuple[float, float]:
     """V and electrons per second of all that is seen of the Earth's ground."""
     rate = disc.normal_e_per_s_sr * disc.law_integral_sr()
     dark = v0_e_per_s * flux_ratio(DARK_V_MAG)
-    return -2.5 * math.log10(max(rate, dark) / v0_e_per_s), rate
+    v_mag = -2.5 * math.log10(max(rate, dark) / v0_e_per_s)
+    return v_mag, rate
 
 
 def _normal(sun_km: float, phase_deg: float, v0_e_per_s: float) -> float:
@@ -87,7 +89,8 @@ def _normal(sun_km: float, phase_deg: float, v0_e_per_s: float) -> float:
     phase = math.radians(phase_deg)
     # From 1 au, where a Lambert sphere's integral over its disc is a closed form
     far_km = KM_PER_AU * np.array([math.cos(phase), math.sin(phase), 0.0])
-    rate = v0_e_per_s * flux_ratio(body_v_mag(EARTH, np.array([sun_km, 0.0, 0.0]), far_km, 2000.0))
-    return rate / (
-        2 / 3 * (MEAN_KM / KM_PER_AU) ** 2 * (math.sin(phase) + (math.pi - phase) * math.cos(phase))
-    )
+    from_sun_km = np.array([sun_km, 0.0, 0.0])
+    v_mag = body_v_mag(EARTH, from_sun_km, far_km, 2000.0)
+    rate = v0_e_per_s * flux_ratio(v_mag)
+    lambert = math.sin(phase) + (math.pi - phase) * math.cos(phase)
+    return rate / (2 / 3 * (MEAN_KM / KM_PER_AU) ** 2 * lambert)

@@ -74,8 +74,11 @@ def tdb_of_utc(utc_ns: int) -> Tdb:
         # before 1960, and years after the last known leap second
         warnings.simplefilter("ignore", erfa.ErfaWarning)
         # Not `utctai`, whose day that ends with a leap second is stretched over 86401 s.
-        tt_part = part + (float(erfa.dat(*erfa.jd2cal(whole, part))) + TT_FROM_TAI_S) / DAY_S
-    return Tdb(whole, tt_part + float(erfa.dtdb(whole, tt_part, part, 0.0, 0.0, 0.0)) / DAY_S)
+        year, month, day, day_part = erfa.jd2cal(whole, part)
+        tai_less_utc_s = float(erfa.dat(year, month, day, day_part))
+        tt_part = part + (tai_less_utc_s + TT_FROM_TAI_S) / DAY_S
+    tdb_less_tt_s = float(erfa.dtdb(whole, tt_part, part, 0.0, 0.0, 0.0))
+    return Tdb(whole, tt_part + tdb_less_tt_s / DAY_S)
 
 
 class Kernel:
@@ -85,23 +88,22 @@ class Kernel:
 
     def __init__(self) -> None:
         package_spec = importlib.util.find_spec("skyfield_data")
-        if (
-            package_spec is None
-            or package_spec.origin is None
-            or importlib.util.find_spec("jplephem") is None
-        ):
+        reader_spec = importlib.util.find_spec("jplephem")
+        if package_spec is None or package_spec.origin is None or reader_spec is None:
             raise MachineError(
                 f"[sky.bodies] and [spacecraft] need an ephemeris of the Solar System; {INSTALL}"
             )
         from jplephem.spk import SPK
 
-        spk = SPK.open(str(Path(package_spec.origin).parent / "data" / "de421.bsp"))
-        self._segments: dict[tuple[int, int], Any] = {
-            link: spk[link] for chain in (EARTH, *CHAINS.values()) for link in chain
-        }
-        for segment in self._segments.values():
-            # maps its numbers into memory, where they stay when the file is closed
-            segment.compute(segment.start_jd)
+        kernel_file = Path(package_spec.origin).parent / "data" / "de421.bsp"
+        spk = SPK.open(str(kernel_file))
+        self._segments: dict[tuple[int, int], Any] = {}
+        for chain in CHAINS.values():
+            for link in chain:
+                segment = spk[link]
+                # maps its numbers into memory, where they stay when the file is closed
+                segment.compute(segment.start_jd)
+                self._segments[link] = segment
         spk.daf.file.close()
         sun = self._segments[CHAINS["Sun"][0]]
         self.first_jd = float(sun.start_jd)
@@ -111,12 +113,18 @@ class Kernel:
         self, chain: tuple[tuple[int, int], ...], whole: float, part: FloatArray
     ) -> FloatArray:
         """Barycentric places (k, 3), ICRS axes, at the Julian dates (TDB) `whole` + `part` (k,)."""
-        return np.asarray(sum(self._segments[link].compute(whole, part) for link in chain).T)
+        steps_km = [self._segments[link].compute(whole, part) for link in chain]
+        return np.asarray(sum(steps_km).T)
 
     def earth(self, whole: float, part: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Barycentric places, km, and velocities, km/s, of the Earth's centre, (k, 3) each."""
-        both = [self._segments[link].compute_and_differentiate(whole, part) for link in EARTH]
-        return np.asarray(sum(p for p, _ in both).T), np.asarray(sum(v for _, v in both).T / DAY_S)
+        place_km = np.zeros((3, len(part)))
+        velocity_km_day = np.zeros((3, len(part)))
+        for link in EARTH:
+            step_km, step_km_day = self._segments[link].compute_and_differentiate(whole, part)
+            place_km += step_km
+            velocity_km_day += step_km_day
+        return place_km.T, velocity_km_day.T / DAY_S
 
     def seen_km(
         self, name: str, whole: float, part: FloatArray, earth_km: FloatArray
@@ -124,10 +132,13 @@ class Kernel:
         """Vectors (k, 3) from the Earth's centre to where a body was when the light that arrives
         now left it.
         """
+        chain = CHAINS[name]
         light_days = np.zeros_like(part)
         for _ in range(LIGHT_TIME_ROUNDS):
-            from_earth_km = self.places_km(CHAINS[name], whole, part - light_days) - earth_km
-            light_days = np.linalg.norm(from_earth_km, axis=1) / LIGHT_KM_S / DAY_S
+            place_km = self.places_km(chain, whole, part - light_days)
+            from_earth_km = place_km - earth_km
+            distance_km = np.linalg.norm(from_earth_km, axis=1)
+            light_days = distance_km / LIGHT_KM_S / DAY_S
         return from_earth_km
 
 
@@ -152,10 +163,10 @@ def apparent_bodies(seen_km: FloatArray, view: Viewpoint) -> FloatArray:
     directions = _unit(seen_km)
     distance_km = float(np.linalg.norm(view.from_sun_km))
     outward = view.from_sun_km / distance_km
+    distance_au = distance_km / KM_PER_AU
+    others = directions[1:]
     from_sun = _unit(seen_km[1:] + view.from_sun_km)
-    directions[1:] = erfa.ld(
-        SUN_MASSES, directions[1:], from_sun, outward, distance_km / KM_PER_AU, DEFLECTION_LIMIT
-    )
+    directions[1:] = erfa.ld(SUN_MASSES, others, from_sun, outward, distance_au, DEFLECTION_LIMIT)
     return aberrate(directions, view.velocity_km_s)
 
 
@@ -163,12 +174,17 @@ def apparent_stars(directions: FloatArray, parallax_mas: FloatArray, view: Viewp
     """Unit vectors (n, 3) of stars in directions (n, 3) from the barycentre; a parallax of NaN
     or below 0 counts as 0.
     """
-    shift_rad = np.radians(np.fmax(parallax_mas, 0.0) / MAS_PER_DEG)
-    directions = _unit(directions - shift_rad[:, None] * (view.place_km / KM_PER_AU))
+    known_mas = np.fmax(parallax_mas, 0.0)
+    shift_rad = np.radians(known_mas / MAS_PER_DEG)
+    place_au = view.place_km / KM_PER_AU
+    directions = _unit(directions - shift_rad[:, None] * place_au)
     distance_km = float(np.linalg.norm(view.from_sun_km))
-    bent = erfa.ldsun(directions, view.from_sun_km / distance_km, distance_km / KM_PER_AU)
+    outward = view.from_sun_km / distance_km
+    bent = erfa.ldsun(directions, outward, distance_km / KM_PER_AU)
     return aberrate(_unit(bent), view.velocity_km_s)
 
 
 def _unit(vectors: FloatArray) -> FloatArray:
-    return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+    """The unit vectors (..., 3) along vectors (..., 3)."""
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / lengths)

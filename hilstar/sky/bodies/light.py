@@ -102,20 +102,17 @@ def body_v_mag(
     if name == "Moon":
         return moon_v_mag(sun_au, distance_au * KM_PER_AU, phase_deg)
     if name in _POLES:
-        sun_deg, observer_deg = (
-            latitude_deg(_POLES[name], v) for v in (sun_to_body_km, observer_to_body_km)
-        )
+        sun_deg = latitude_deg(_POLES[name], sun_to_body_km)
+        observer_deg = latitude_deg(_POLES[name], observer_to_body_km)
     # globe and rings (eq. 10); rings that are lit from the other side do not count
     if name == "Saturn":
-        sine = float(np.sin(np.radians(np.sqrt(max(0.0, sun_deg * observer_deg)))))
-        mag = (
-            -8.914
-            - 1.825 * sine
-            + 0.026 * phase_deg
-            - 0.378 * sine * float(np.exp(-2.25 * phase_deg))
-        )
+        ring_deg = np.sqrt(max(0.0, sun_deg * observer_deg))
+        sine = float(np.sin(np.radians(ring_deg)))
+        opposition_mag = 0.378 * sine * float(np.exp(-2.25 * phase_deg))
+        mag = -8.914 - 1.825 * sine + 0.026 * phase_deg - opposition_mag
     elif name == "Uranus":
-        mag = URANUS_MAG + URANUS_PER_DEG * (abs(sun_deg) + abs(observer_deg)) / 2
+        mean_deg = (abs(sun_deg) + abs(observer_deg)) / 2
+        mag = URANUS_MAG + URANUS_PER_DEG * mean_deg
     elif name == "Neptune":  # eq. 16: it brightened from 1980 to 2000
         mag = float(np.clip(-6.89 - 0.0054 * (jyear - 1980.0), -7.00, -6.89))
     elif name == "Earth":
@@ -139,16 +136,17 @@ def moon_v_mag(sun_au: float, distance_km: float, phase_deg: float) -> float:
     """V of the Moon."""
     plain_deg = min(phase_deg, MOON_CRESCENT_DEG)
     curve = MOON_PER_DEG * plain_deg + MOON_PER_DEG4 * plain_deg**4
-    left_deg = max(180.0 - phase_deg, THINNEST_DEG)
-    curve += 7.5 * max(0.0, float(np.log10((180.0 - MOON_CRESCENT_DEG) / left_deg)))
-    return FULL_MOON_V_MAG + curve + 5 * float(np.log10(sun_au * distance_km / MOON_DISTANCE_KM))
+    crescent_deg = max(180.0 - phase_deg, THINNEST_DEG)
+    thinner_mag = float(np.log10((180.0 - MOON_CRESCENT_DEG) / crescent_deg))
+    curve += 7.5 * max(0.0, thinner_mag)
+    by_distance_mag = 5 * float(np.log10(sun_au * distance_km / MOON_DISTANCE_KM))
+    return FULL_MOON_V_MAG + curve + by_distance_mag
 
 
 def latitude_deg(pole: FloatArray, towards_body: FloatArray) -> float:
     """The planetocentric latitude below the far end of a vector to the body, degrees."""
-    return float(
-        np.degrees(np.arcsin(np.clip(-pole @ towards_body / np.linalg.norm(towards_body), -1, 1)))
-    )
+    sine = -pole @ towards_body / np.linalg.norm(towards_body)
+    return float(np.degrees(np.arcsin(np.clip(sine, -1, 1))))
 
 
 def bodies_electrons_per_s(
@@ -172,13 +170,11 @@ def reflected(names: tuple[str, ...]) -> electrons.Library:
     lit = [sunlight * albedo(name, stars.wavelength_nm) for name in names]
     flux = np.array(lit).reshape(len(names), len(stars.wavelength_nm))  # also without bodies
     colour = bodies_bv_mag(names)
-    unscaled = electrons.Library(
-        stars.wavelength_nm, flux, names, colour, np.full(len(names), np.nan)
-    )
+    nm = stars.wavelength_nm
+    unknown_mag = np.full(len(names), np.nan)
+    unscaled = electrons.Library(nm, flux, names, colour, unknown_mag)
     mean = electrons.band_mean(unscaled, load_curve("johnson-v", "johnson-v"))
-    return electrons.Library(
-        stars.wavelength_nm, flux / mean[:, None], names, colour, unscaled.vi_mag
-    )
+    return electrons.Library(nm, flux / mean[:, None], names, colour, unknown_mag)
 
 
 def bodies_bv_mag(names: tuple[str, ...]) -> FloatArray:

@@ -219,12 +219,15 @@ class MovingSky:
                 vectors[[self._earth]] = aberrate(vectors[[self._earth]], -velocity)
             stars.vectors[-count:] = vectors
             stars.grid.centre[-count:] = vectors
-            stars.v_mag[-count:], stars.electrons_per_s[-count:] = self._light(self._step(moment))
+            v_mag, rates = self._light(self._step(moment))
+            stars.v_mag[-count:] = v_mag
+            stars.electrons_per_s[-count:] = rates
         apparent = stars.seen_at(velocity)
         if self.air is None:
             return apparent
         utc_ns = self._utc_ns + moment.since_ns
-        self.air.check_sun(self._circumstances(moment.since_ns // MINUTE_NS).sun_km, utc_ns)
+        circumstances = self._circumstances(moment.since_ns // MINUTE_NS)
+        self.air.check_sun(circumstances.sun_km, utc_ns)
         return self.air.over(apparent, utc_ns)
 
     def utc_ns(self, t_ns: int | None) -> int:
@@ -242,9 +245,8 @@ class MovingSky:
         since_ns = self._within(t_ns)
         now = partial(self._circumstances, since_ns // MINUTE_NS)
         utc_ns = self._utc_ns + since_ns
-        satellite_pass = self.satellites.near(
-            cone, SkyAt(utc_ns, now, self._fixed_km_s, *velocity_and_place)
-        )
+        sky = SkyAt(utc_ns, now, self._fixed_km_s, *velocity_and_place)
+        satellite_pass = self.satellites.near(cone, sky)
         if satellite_pass is None or self.air is None:
             return satellite_pass
         return satellite_pass.through(self.air, utc_ns)
@@ -261,7 +263,8 @@ class MovingSky:
         cubics = self._span(since_ns // SPAN_NS)
         share = since_ns % SPAN_NS / SPAN_NS
         powers = share**EXPONENTS
-        return Circumstances(np.tensordot(powers, cubics.seen_km, 1)[0], powers @ cubics.earth_km_s)
+        seen_km = np.tensordot(powers, cubics.seen_km, 1)
+        return Circumstances(seen_km[0], powers @ cubics.earth_km_s)
 
     def discs(
         self,
@@ -283,7 +286,8 @@ class MovingSky:
         moment = self._moment(t_ns, velocity_km_s, place_km)
         now = self._at(moment)
         radius_rad = now[:-1, 4]
-        near = now[:-1, :3] @ axis > np.cos(np.minimum(reach_rad + radius_rad, np.pi))
+        farthest_rad = np.minimum(reach_rad + radius_rad, np.pi)
+        near = now[:-1, :3] @ axis > np.cos(farthest_rad)
         near &= 2 * radius_rad > wider_than_rad
         if not near.any():
             return []
@@ -299,7 +303,9 @@ class MovingSky:
         step = self._step(moment)
         discs = []
         for i in np.flatnonzero(near).tolist():
-            discs.append(_moved(self._face(step, i), directions[i], float(now[i, 3])))
+            face = self._face(step, i)
+            distance_km = float(now[i, 3])
+            discs.append(_moved(face, directions[i], distance_km))
         if self.air is not None:
             discs = _through(self.air, discs, self._utc_ns + moment.since_ns)
         return sorted(discs, key=lambda disc: disc.distance_km)
@@ -311,7 +317,8 @@ class MovingSky:
         place_km: FloatArray | None = None,
     ) -> FloatArray:
         """How far the bodies (n,) are, in the order of `names`; else as `seen`."""
-        return self._at(self._moment(t_ns, velocity_km_s, place_km))[:-1, 3]
+        now = self._at(self._moment(t_ns, velocity_km_s, place_km))
+        return now[:-1, 3]
 
     def _moment(
         self, t_ns: int | None, velocity_km_s: FloatArray | None, place_km: FloatArray | None
@@ -322,8 +329,10 @@ class MovingSky:
         since_ns = self._within(t_ns)
         if place_km is None:
             return SkyMoment(since_ns)
+        if velocity_km_s is None:
+            velocity_km_s = np.zeros(3)
         x, y, z = place_km.tolist()
-        u, v, w = (0.0, 0.0, 0.0) if velocity_km_s is None else velocity_km_s.tolist()
+        u, v, w = velocity_km_s.tolist()
         return SkyMoment(since_ns, (x, y, z, u, v, w))
 
     def _step(self, moment: SkyMoment) -> SkyMoment:
@@ -339,9 +348,11 @@ class MovingSky:
         if moment.state is not None:
             return self._node(moment)
         first = self._step(moment)
+        last = SkyMoment(first.since_ns + self._step_ns)
         node = self._node(first)
+        change = self._node(last) - node
         share = (moment.since_ns - first.since_ns) / self._step_ns
-        return node + (self._node(SkyMoment(first.since_ns + self._step_ns)) - node) * share
+        return node + change * share
 
     def sight(self, since_ns: int) -> Sight:
         """The bodies at a moment, aberrated by the observer's velocity at the start; the Sun
@@ -350,13 +361,10 @@ class MovingSky:
         return self._sight(SkyMoment(since_ns))
 
     def _sight(self, moment: SkyMoment) -> Sight:
+        """As `sight`, of an observer whose state may come with the moment."""
         sight = self._seen_from(moment)
-        return replace(
-            sight,
-            directions=apparent_bodies(
-                sight.seen_km, replace(sight.view, velocity_km_s=self._fixed_km_s)
-            ),
-        )
+        start_view = replace(sight.view, velocity_km_s=self._fixed_km_s)
+        return replace(sight, directions=apparent_bodies(sight.seen_km, start_view))
 
     def _seen_from(self, moment: SkyMoment) -> Sight:
         """The bodies at a moment, without their directions."""
@@ -364,7 +372,8 @@ class MovingSky:
         cubics = self._span(span)
         share = rest_ns / SPAN_NS
         powers = share**EXPONENTS
-        slopes = EXPONENTS * share ** np.maximum(EXPONENTS - 1, 0) / SPAN_S
+        lowered = np.maximum(EXPONENTS - 1, 0)
+        slopes = EXPONENTS * share**lowered / SPAN_S
         place_km, about_km_s = self._orbit.state(self._utc_ns + moment.since_ns)
         from_earth_km = np.tensordot(powers, cubics.seen_km, 1)
         earth_km_s = powers @ cubics.earth_km_s
@@ -375,13 +384,14 @@ class MovingSky:
         seen_km = from_earth_km - place_km
         # Light takes another time to the observer than to the Earth's centre: 22 ms at most in a
         # low orbit, 700 m of the Moon
-        later_s = (
-            np.linalg.norm(seen_km, axis=1) - np.linalg.norm(from_earth_km, axis=1)
-        ) / LIGHT_KM_S
-        seen_km -= (np.tensordot(slopes, cubics.seen_km, 1) + earth_km_s) * later_s[:, None]
+        farther_km = np.linalg.norm(seen_km, axis=1) - np.linalg.norm(from_earth_km, axis=1)
+        later_s = farther_km / LIGHT_KM_S
+        own_km_s = np.tensordot(slopes, cubics.seen_km, 1) + earth_km_s
+        seen_km -= own_km_s * later_s[:, None]
         if EARTH in self._tracked and at_centre(place_km):
             seen_km[self._tracked.index(EARTH)] = NORTH
-        view = Viewpoint(powers @ cubics.earth_km + place_km, velocity_km_s, -seen_km[0])
+        observer_km = powers @ cubics.earth_km + place_km
+        view = Viewpoint(observer_km, velocity_km_s, -seen_km[0])
         return Sight(seen_km, view, np.empty((0, 3)), place_km, about_km_s)
 
     def diameters_arcsec(self, t_ns: int | None = None) -> dict[str, float]:
@@ -398,16 +408,18 @@ class MovingSky:
         return diameters
 
     def _compute_span(self, span: int) -> Span:
+        """The cubics of a span, through four places of each body and of the Earth."""
         if self._unix:
             date = tdb_of_utc(self._utc_ns + span * SPAN_NS)
         else:
             date = self._epoch.after(span * SPAN_S)
         part = date.part + CUBIC_AT * SPAN_S / DAY_S
         earth_km, earth_km_s = self._kernel.earth(date.whole, part)
-        seen_km = [self._kernel.seen_km(name, date.whole, part, earth_km) for name in self._tracked]
-        return Span(
-            np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1), CUBIC @ earth_km, CUBIC @ earth_km_s
-        )
+        seen_km = []
+        for name in self._tracked:
+            seen_km.append(self._kernel.seen_km(name, date.whole, part, earth_km))
+        seen_cubics = np.tensordot(CUBIC, np.stack(seen_km, axis=1), 1)
+        return Span(seen_cubics, CUBIC @ earth_km, CUBIC @ earth_km_s)
 
     def _compute_node(self, moment: SkyMoment) -> FloatArray:
         """Rows of the bodies' unit vectors, distances, km, and radii, rad; last the change of the
@@ -422,10 +434,11 @@ class MovingSky:
         if self._earth is not None and at_centre(sight.place_km):
             node[self._earth] = np.nan  # nowhere in view
         elif self._earth is not None:
-            node[self._earth, :3], node[self._earth, 3] = apparent_cone(
-                -sight.place_km, sight.about_earth_km_s
-            )
-        node[:-1, 4] = np.arcsin(np.minimum(1.0, self._radii_km / node[:-1, 3]))
+            middle, distance_km = apparent_cone(-sight.place_km, sight.about_earth_km_s)
+            node[self._earth, :3] = middle
+            node[self._earth, 3] = distance_km
+        sine = np.minimum(1.0, self._radii_km / node[:-1, 3])
+        node[:-1, 4] = np.arcsin(sine)
         node[-1, :3] = sight.view.velocity_km_s - self._fixed_km_s
         return node
 
@@ -433,15 +446,16 @@ class MovingSky:
         """The disc of a drawn body, with its light."""
         sight = self._sight(moment)
         name = self.names[i]
-        rate = float(self._light(moment)[1][i])
         if name == EARTH:
             return self._earth_disc(sight)
         row = self._drawn[i]
         seen_km = sight.seen_km[row]
-        sun_km = sight.seen_km[0] - sight.seen_km[row]
         if name == "Sun":
+            sun = NORTH  # its light comes from itself
             phase_deg = 0.0
         else:
+            sun_km = sight.seen_km[0] - seen_km
+            sun = sun_km / np.linalg.norm(sun_km)
             phase_deg = phase_angle_deg(-sun_km, seen_km)
         disc = Disc(
             name=name,
@@ -450,18 +464,22 @@ class MovingSky:
             equator_km=RADII_KM[name],
             polar_km=POLAR_RADII_KM.get(name, RADII_KM[name]),
             pole=pole(name),
-            sun=NORTH if name == "Sun" else sun_km / np.linalg.norm(sun_km),
+            sun=sun,
             law=LAWS.get(name, "lambert"),
             lunar_share=lunar_share(phase_deg) if name == "Moon" else 1.0,
         )
-        return disc.of_rate(rate)
+        _, rates = self._light(moment)
+        return disc.of_rate(float(rates[i]))
 
     def _earth_disc(self, sight: Sight) -> Disc:
-        v0_e_per_s = float(self._bodies.v0_e_per_s[self.names.index(EARTH)])
+        """The Earth's disc as seen, with its light."""
+        earth = self.names.index(EARTH)
+        v0_e_per_s = float(self._bodies.v0_e_per_s[earth])
         from_sun_km = sight.view.from_sun_km - sight.place_km
         return earth_disc(-sight.place_km, from_sun_km, sight.about_earth_km_s, v0_e_per_s)
 
     def _compute_light(self, moment: SkyMoment) -> tuple[FloatArray, FloatArray]:
+        """V and electrons per second (n,) of the bodies at a moment."""
         sight = self._sight(moment)
         jyear = self._jyear(moment.since_ns / NS_PER_S)
         from_sun_km = sight.seen_km + sight.view.from_sun_km
@@ -473,12 +491,14 @@ class MovingSky:
         rates = self._bodies.v0_e_per_s * flux_ratio(v_mag)
         if self._earth is not None and not at_centre(sight.place_km):
             disc = self._earth_disc(sight)
-            v_mag[self._earth], rates[self._earth] = earth_light(
-                disc, float(self._bodies.v0_e_per_s[self._earth])
-            )
+            v0_e_per_s = float(self._bodies.v0_e_per_s[self._earth])
+            earth_v_mag, earth_rate = earth_light(disc, v0_e_per_s)
+            v_mag[self._earth] = earth_v_mag
+            rates[self._earth] = earth_rate
         return v_mag, rates
 
     def _jyear(self, seconds: float) -> float:
+        """The Julian year, TDB, at seconds since the start."""
         date = self._epoch.after(seconds)
         return 2000.0 + (date.whole - J2000_JD + date.part) / YEAR_DAYS
 
@@ -488,7 +508,8 @@ class MovingSky:
         """
         first = self._kernel.first_jd + EDGE_DAYS
         last = self._kernel.last_jd - EDGE_DAYS
-        first_ns, last_ns = self._since_ns(first), self._since_ns(last)
+        first_ns = self._since_ns(first)
+        last_ns = self._since_ns(last)
         if not first_ns <= 0 <= last_ns:
             raise InputError(
                 f"[sky] epoch_utc: the ephemeris covers {_date(first)} to {_date(last)}; write a"
@@ -498,7 +519,8 @@ class MovingSky:
 
     def _since_ns(self, jd: float) -> int:
         """The time from the start to a Julian date, ns."""
-        return round((jd - self._epoch.whole - self._epoch.part) * DAY_S * NS_PER_S)
+        days = jd - self._epoch.whole - self._epoch.part
+        return round(days * DAY_S * NS_PER_S)
 
     def _within(self, t_ns: int | None) -> int:
         """A time since the start, held within the ephemeris; a far one is told once, as it is
@@ -514,12 +536,14 @@ class MovingSky:
                 t_ns,
                 since_ns / YEAR_NS,
             )
-        return min(max(since_ns, self._limits_ns[0]), self._limits_ns[1])
+        first_ns, last_ns = self._limits_ns
+        return min(max(since_ns, first_ns), last_ns)
 
 
 def _date(jd: float) -> str:
     """The day of a Julian date."""
-    return str(np.datetime64(round((jd - UNIX_JD) * DAY_S), "s").astype("datetime64[D]"))
+    unix_s = round((jd - UNIX_JD) * DAY_S)
+    return str(np.datetime64(unix_s, "s").astype("datetime64[D]"))
 
 
 def _against_start(now: FloatArray, velocity_km_s: FloatArray | None) -> FloatArray | None:
@@ -539,16 +563,16 @@ def _through(air: SiteAir, discs: list[Disc], utc_ns: int) -> list[Disc]:
     left out too.
     """
     above = air.above(utc_ns)
+    sunlight = np.array([-1])
     above_horizon = []
     for disc in discs:
-        altitude_rad = above.altitude_rad(disc.direction[None])
+        direction = disc.direction[None]
+        altitude_rad = above.altitude_rad(direction)
         if altitude_rad[0] > -disc.radius_rad:
-            light = disc.normal_e_per_s_sr * float(air.shares(np.array([-1]), altitude_rad).mean())
-            above_horizon.append(
-                replace(
-                    disc, direction=above.bent(disc.direction[None])[0], normal_e_per_s_sr=light
-                )
-            )
+            share = float(air.shares(sunlight, altitude_rad).mean())
+            light = disc.normal_e_per_s_sr * share
+            bent = above.bent(direction)[0]
+            above_horizon.append(replace(disc, direction=bent, normal_e_per_s_sr=light))
     return above_horizon
 
 

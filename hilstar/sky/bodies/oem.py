@@ -25,7 +25,7 @@ NODES = 4  # 1e-6 km of a low orbit at four minutes
 # to beyond the Lagrange points; a state in metres is outside one of them
 MIN_KM, MAX_KM, MAX_KM_S = 6000.0, 1e7, 1e3
 FAR_KM = 1.0  # half an arcsecond of the Moon
-TRIED = 50
+TRIED = 50  # epochs that are held out in turn: they bound the time that a long file takes
 DAY_NS = 86_400 * NS_PER_S
 # magnitudes are those of a minute's beginning, places those of two steps
 UNSEEN_NS = 120 * NS_PER_S
@@ -49,6 +49,10 @@ class Segment:
     t_ns: npt.NDArray[np.int64]
     states: FloatArray
 
+    def ends_ns(self) -> tuple[int, int]:
+        """The first and the last epoch."""
+        return int(self.t_ns[0]), int(self.t_ns[-1])
+
 
 class OemOrbit:
     """The orbit in the text of a file `name`.
@@ -68,8 +72,9 @@ class OemOrbit:
         self._unseen_ns = UNSEEN_NS if day else -1
         if not self._segments:
             raise InputError(f"{name}: contains no segment of an orbit; {OEM_ADVICE}")
-        if min(_away_ns(s, utc_ns) for s in self._segments) > DAY_NS:
-            spans = ", ".join(_span(s) for s in self._segments[:5])
+        nearest_ns = min(_away_ns(segment, utc_ns) for segment in self._segments)
+        if nearest_ns > DAY_NS:
+            spans = ", ".join(map(_span, self._segments[:5]))
             raise InputError(
                 f"{name}: has no orbit within a day of {_date(utc_ns)} UTC; it has {spans}"
             )
@@ -85,41 +90,41 @@ class OemOrbit:
         epoch, which is told once.
         """
         segment = min(reversed(self._segments), key=lambda s: _away_ns(s, utc_ns))
-        if (
-            not self._told
-            and _away_ns(segment, utc_ns) > 0
-            and abs(utc_ns - self._stars_ns) > self._unseen_ns
-        ):
+        is_away = _away_ns(segment, utc_ns) > 0
+        since_ns = abs(utc_ns - self._stars_ns)
+        if is_away and not self._told and since_ns > self._unseen_ns:
             log.warning(
                 "%s: has no orbit at %s UTC; that of its nearest epoch is held",
                 self._name,
                 _date(utc_ns),
             )
             self._told = True
-        t_ns = int(np.clip(_time(segment.scale, utc_ns), segment.t_ns[0], segment.t_ns[-1]))
+        first_ns, last_ns = segment.ends_ns()
+        t_ns = min(max(_time(segment.scale, utc_ns), first_ns), last_ns)
         return _at(segment.t_ns, segment.states, t_ns)
 
 
 def _away_ns(segment: Segment, utc_ns: int) -> int:
     """How far a UTC is from what a segment covers; 0 within."""
     t_ns = _time(segment.scale, utc_ns)
-    return max(int(segment.t_ns[0]) - t_ns, t_ns - int(segment.t_ns[-1]), 0)
+    first_ns, last_ns = segment.ends_ns()
+    return max(first_ns - t_ns, t_ns - last_ns, 0)
 
 
 def _at(
     times_ns: npt.NDArray[np.int64], states: FloatArray, t_ns: int
 ) -> tuple[FloatArray, FloatArray]:
     """Place and velocity at a time by the NODES states (n, 6) about it."""
-    first = int(
-        np.clip(np.searchsorted(times_ns, t_ns) - NODES // 2, 0, max(0, len(times_ns) - NODES))
-    )
+    centred = np.searchsorted(times_ns, t_ns) - NODES // 2
+    first = int(np.clip(centred, 0, max(0, len(times_ns) - NODES)))
     near = slice(first, first + NODES)
     from scipy.interpolate import KroghInterpolator
 
     # An epoch that stands twice gives its place first and then its velocity.
-    twice_s = np.repeat((times_ns[near] - t_ns) / NS_PER_S, 2)
+    since_s = (times_ns[near] - t_ns) / NS_PER_S
     place_and_velocity = states[near].reshape(-1, 3)
-    place, velocity = KroghInterpolator(twice_s, place_and_velocity).derivatives(0.0, der=2)
+    polynomial = KroghInterpolator(np.repeat(since_s, 2), place_and_velocity)
+    place, velocity = polynomial.derivatives(0.0, der=2)
     return place, velocity
 
 
@@ -127,20 +132,26 @@ def _off_km(segment: Segment) -> float:
     """How far the polynomial is off between epochs, km, by what it is at epochs that are held
     out, where steps are longer.
     """
-    inner = (
-        np.unique(np.linspace(1, len(segment.t_ns) - 2, TRIED).astype(int))
-        if len(segment.t_ns) > 2
-        else ()
-    )
-    worst_km, order = 0.0, 2 * min(NODES, len(segment.t_ns) - 1)
-    for k in inner:
-        near = [i for i in range(k - NODES, k + NODES + 1) if i != k and 0 <= i < len(segment.t_ns)]
-        place, _ = _at(segment.t_ns[near], segment.states[near], int(segment.t_ns[k]))
-        worst_km = max(worst_km, float(np.linalg.norm(place - segment.states[k, :3])))
+    count = len(segment.t_ns)
+    if count <= 2:
+        return 0.0
+    held_out = np.unique(np.linspace(1, count - 2, TRIED).astype(int))
+    order = 2 * min(NODES, count - 1)
+    worst_km = 0.0
+    for k in held_out.tolist():
+        first = max(0, k - NODES)
+        around = slice(first, k + NODES + 1)
+        near_ns = np.delete(segment.t_ns[around], k - first)
+        near_states = np.delete(segment.states[around], k - first, axis=0)
+        place, _ = _at(near_ns, near_states, int(segment.t_ns[k]))
+        off_km = float(np.linalg.norm(place - segment.states[k, :3]))
+        worst_km = max(worst_km, off_km)
+    # the polynomial's error falls with the step to its order
     return worst_km / float(2**order)
 
 
 def _segments(text: str, name: str) -> Iterator[Segment]:
+    """The segments of a text, one after the other. Raises InputError with the line."""
     meta: dict[str, str] = {}
     rows: list[list[str]] = []
     section = "header"
@@ -174,11 +185,12 @@ def _segments(text: str, name: str) -> Iterator[Segment]:
 
 
 def _segment(meta: dict[str, str], rows: list[list[str]], name: str) -> Iterator[Segment]:
+    """The segment of some rows; none for the header, which has no frame. Raises InputError."""
     if "REF_FRAME" not in meta and not rows:
         return  # the header
-    frame, centre, scale = (
-        meta.get(key, "missing") for key in ("REF_FRAME", "CENTER_NAME", "TIME_SYSTEM")
-    )
+    frame = meta.get("REF_FRAME", "missing")
+    centre = meta.get("CENTER_NAME", "missing")
+    scale = meta.get("TIME_SYSTEM", "missing")
     if frame not in FRAMES or centre != "EARTH":
         raise InputError(
             f"{name}: REF_FRAME is {frame[:40]} and CENTER_NAME {centre[:40]}; {OEM_ADVICE}"
@@ -189,25 +201,32 @@ def _segment(meta: dict[str, str], rows: list[list[str]], name: str) -> Iterator
         )
     if len(rows) < 2:
         raise InputError(f"{name}: a segment has {len(rows)} states; it needs two or more")
-    t_ns = np.array([_epoch_ns(row[1], f"{name}:{row[0]}") for row in rows], dtype=np.int64)
-    states = np.array([_numbers(row[2:], f"{name}:{row[0]}") for row in rows])
+    epochs_ns = []
+    states = []
+    for line, epoch, *numbers in rows:
+        where = f"{name}:{line}"
+        epochs_ns.append(_epoch_ns(epoch, where))
+        states.append(_numbers(numbers, where))
+    t_ns = np.array(epochs_ns, dtype=np.int64)
     back = np.flatnonzero(np.diff(t_ns) <= 0)
     if len(back):
         raise InputError(
             f"{name}:{rows[back[0] + 1][0]}: the epoch is not after the one before it; sort the"
             " lines by time"
         )
-    yield Segment(scale, t_ns, states)
+    yield Segment(scale, t_ns, np.array(states))
 
 
 def _numbers(words: list[str], where: str) -> list[float]:
+    """A state's six figures. Raises InputError."""
     try:
         numbers = [float(word) for word in words]
     except ValueError:
         numbers = [np.nan] * 6
     place = np.abs(numbers[:3])
     speed = np.abs(numbers[3:])
-    if not ((place < MAX_KM).all() and (speed < MAX_KM_S).all() and np.linalg.norm(place) > MIN_KM):
+    is_orbit = (place < MAX_KM).all() and (speed < MAX_KM_S).all()
+    if not is_orbit or not np.linalg.norm(place) > MIN_KM:
         raise InputError(
             f"{where}: {' '.join(words)[:60]!r}; write km from the Earth's centre, and km/s"
         )
@@ -225,16 +244,13 @@ def _epoch_ns(text: str, where: str) -> int:
         day_of_year = int(of_year or 1)
         start = f"{year}-{month}-{day}" if month else year
         date = np.datetime64(start, "D") + (day_of_year - 1)
-        inside = (
-            int(year) in YEARS
-            and day_of_year in DAYS_OF_YEAR
-            and int(hour) < 24
-            and int(minute) < 60
-        )
-        if not inside or float(second) >= 60:
+        is_date = int(year) in YEARS and day_of_year in DAYS_OF_YEAR
+        is_time = int(hour) < 24 and int(minute) < 60 and float(second) < 60
+        if not is_date or not is_time:
             raise ValueError
-        seconds = int(date.astype(np.int64)) * 86_400 + 3600 * int(hour) + 60 * int(minute)
-        return seconds * NS_PER_S + round(float(second) * NS_PER_S)
+        days = int(date.astype(np.int64))
+        minutes = 60 * int(hour) + int(minute)
+        return days * DAY_NS + minutes * 60 * NS_PER_S + round(float(second) * NS_PER_S)
     except ValueError:
         raise InputError(
             f"{where}: the epoch is {text[:40]!r}; write YYYY-MM-DDThh:mm:ss.f or"
@@ -243,9 +259,11 @@ def _epoch_ns(text: str, where: str) -> int:
 
 
 def _time(scale: str, utc_ns: int) -> int:
+    """A UTC, ns since 1970, in another time scale."""
     if scale == "UTC":
         return utc_ns
-    year, month, day = (int(part) for part in _date(utc_ns)[:10].split("-"))
+    date = _date(utc_ns)[:10]
+    year, month, day = map(int, date.split("-"))
     with warnings.catch_warnings():
         # before 1960, and years after the last known leap second
         warnings.simplefilter("ignore", erfa.ErfaWarning)
@@ -254,10 +272,11 @@ def _time(scale: str, utc_ns: int) -> int:
 
 
 def _date(t_ns: int) -> str:
+    """A time, ns since 1970, to the second."""
     return str(np.datetime64(t_ns, "ns").astype("datetime64[s]"))
 
 
 def _span(segment: Segment) -> str:
     """The first and the last date of a segment, and their time scale."""
-    first, last = _date(int(segment.t_ns[0])), _date(int(segment.t_ns[-1]))
-    return f"{first} to {last} {segment.scale}"
+    first_ns, last_ns = segment.ends_ns()
+    return f"{_date(first_ns)} to {_date(last_ns)} {segment.scale}"

@@ -16,7 +16,9 @@ from hilstar.basics.errors import InputError, MachineError
 from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD, Tdb, tdb_of_utc
 from hilstar.sky.bodies.omm import is_omm, read_omm
 
-LINE_LENGTH = 69
+LINE_LENGTH = 69  # with its checksum
+# What an ASCII character adds to its line's checksum: lists have tens of thousands of lines.
+DIGIT_VALUE = dict.fromkeys(range(128), 0) | {ord("-"): 1} | {ord(str(n)): n for n in range(10)}
 TLE_ADVICE = "give a file with one two-line element set, or one OMM in JSON, XML or CSV"
 TURN_NS = 3600 * 10**9  # the equator's axes move by 0.006 arcsec an hour: 0.2 m of a low orbit
 log = logging.getLogger(__name__)
@@ -67,25 +69,26 @@ class TleOrbit:
                 raise InputError(
                     f"{name}: has {len(sets)} element sets, and an orbit is one; {TLE_ADVICE}"
                 )
-            self._satellite = sets[0].satrec
-            self.number = sets[0].number
+            element_set = sets[0]
+            self._satellite = element_set.satrec
+            self.number = element_set.number
         else:
-            self._satellite = Satrec.twoline2rv(*_checked(name, text))
+            first, second = _checked(name, text)
+            self._satellite = Satrec.twoline2rv(first, second)
             self.number = int(self._satellite.satnum)
 
     def age_days(self, utc_ns: int) -> float:
         """How many days a UTC is after the elements' own date."""
-        return (
-            utc_ns / NS_PER_DAY
-            + UNIX_JD
-            - float(self._satellite.jdsatepoch)
-            - float(self._satellite.jdsatepochF)
-        )
+        epoch_jd = float(self._satellite.jdsatepoch)
+        epoch_part = float(self._satellite.jdsatepochF)
+        return utc_ns / NS_PER_DAY + UNIX_JD - epoch_jd - epoch_part
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
         """Place and velocity by SGP4, from the true equator and mean equinox to the ICRS."""
         days, rest_ns = divmod(utc_ns, NS_PER_DAY)
-        error, place_km, velocity_km_s = self._satellite.sgp4(UNIX_JD + days, rest_ns / NS_PER_DAY)
+        jd = UNIX_JD + days
+        jd_part = rest_ns / NS_PER_DAY
+        error, place_km, velocity_km_s = self._satellite.sgp4(jd, jd_part)
         if error:
             date = np.datetime64(utc_ns, "ns").astype("datetime64[s]")
             raise InputError(
@@ -96,24 +99,39 @@ class TleOrbit:
 
 
 def _checked(name: str, text: str) -> tuple[str, str]:
-    tle_lines = [
-        line
-        for line in map(str.rstrip, text.splitlines())
-        if line[:2] in {"1 ", "2 "} and len(line) == LINE_LENGTH
-    ]
-    if [line[0] for line in tle_lines] != ["1", "2"]:
+    """The two element lines of a text, other lines left out. Raises InputError where they are not
+    two, or with a wrong checksum.
+    """
+    tle_lines = []
+    numbers = ""
+    for line in text.splitlines():
+        line = line.rstrip()
+        if line.startswith(("1 ", "2 ")) and len(line) == LINE_LENGTH and line.isascii():
+            tle_lines.append(line)
+            numbers += line[0]
+    if numbers != "12":
         raise InputError(
             f"{name}: not one set of two lines of {LINE_LENGTH} characters that begin with 1 and 2;"
             f" {TLE_ADVICE}"
         )
     for number, line in enumerate(tle_lines, start=1):
-        total = sum(int(c) if c.isdigit() else c == "-" for c in line[:-1]) % 10
-        if str(total) != line[-1]:
+        total = digit_sum(line)
+        stated = line[-1]
+        if str(total) != stated:
             raise InputError(
-                f"{name}: element line {number}: its digits add up to {total}, not {line[-1]};"
+                f"{name}: element line {number}: its digits add up to {total}, not {stated};"
                 f" {TLE_ADVICE}"
             )
-    return tle_lines[0], tle_lines[1]
+    first, second = tle_lines
+    return first, second
+
+
+def digit_sum(line: str) -> int:
+    """The checksum of an element line (ASCII) by all its characters but the last, which states it:
+    the sum of its digits, a minus sign as 1, modulo 10.
+    """
+    values = map(DIGIT_VALUE.__getitem__, line[:-1].encode())
+    return sum(values) % 10
 
 
 @lru_cache(maxsize=8)
@@ -122,6 +140,9 @@ def icrs_from_teme(hour: int) -> FloatArray:
     and precession (IAU 2006).
     """
     date: Tdb = tdb_of_utc(hour * TURN_NS)
-    cosine, sine = (f(erfa.ee06a(date.whole, date.part)) for f in (np.cos, np.sin))
+    equinoxes_rad = erfa.ee06a(date.whole, date.part)
+    cosine = np.cos(equinoxes_rad)
+    sine = np.sin(equinoxes_rad)
     teme_to_true = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(erfa.pnm06a(date.whole, date.part).T @ teme_to_true)
+    true_from_icrs = erfa.pnm06a(date.whole, date.part)
+    return np.asarray(true_from_icrs.T @ teme_to_true)

@@ -123,13 +123,12 @@ class Pass:
         seen_km = self.seen_km.copy()
         seen_km[0] = above.bent(towards) * range_km
         altitude_rad = above.altitude_rad(towards)
+        sunlight = np.full(len(self), -1)
+        share = air.shares(sunlight, altitude_rad).mean(axis=0)
         standard = self.brightness.standard_e_per_s.copy()
-        standard[self.index] *= air.shares(np.full(len(self), -1), altitude_rad).mean(axis=0) * (
-            altitude_rad > 0
-        )
-        return replace(
-            self, seen_km=seen_km, brightness=replace(self.brightness, standard_e_per_s=standard)
-        )
+        standard[self.index] *= share * (altitude_rad > 0)
+        brightness = replace(self.brightness, standard_e_per_s=standard)
+        return replace(self, seen_km=seen_km, brightness=brightness)
 
     def directions(
         self, which: IntArray | slice, seconds: FloatArray, velocity_km_s: FloatArray | None = None
@@ -144,11 +143,8 @@ class Pass:
         else:
             velocity = self.fixed_km_s + velocity_km_s
         from_observer_km = _at(self.seen_km[:, which], seconds[:, None])
-        return aberrate(
-            from_observer_km
-            / np.sqrt(np.einsum("ij,ij->i", from_observer_km, from_observer_km))[:, None],
-            velocity,
-        )
+        range_km = _lengths(from_observer_km)
+        return aberrate(from_observer_km / range_km[:, None], velocity)
 
     def vectors_km(self, seconds: FloatArray) -> FloatArray:
         """Vectors (n, 3), km, from the observer to the satellites, each at its own of `seconds`
@@ -158,9 +154,9 @@ class Pass:
 
     def speeds_rad_s(self) -> FloatArray:
         """How fast each is at its nearest in view (n,): its speed over its distance."""
-        squares = (np.einsum("ij,ij->i", part, part) for part in self.seen_km[:2])
-        distance, speed = (np.sqrt(square) for square in squares)
-        return np.asarray(speed / distance)
+        distance_km = _lengths(self.seen_km[0])
+        speed_km_s = _lengths(self.seen_km[1])
+        return np.asarray(speed_km_s / distance_km)
 
     def rates_e_per_s(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
         """Mean electron rates (k,) between two times.
@@ -171,14 +167,23 @@ class Pass:
         middle_s = ((begin_s + end_s) / 2)[:, None]
         listed = self.index[which]
         place = _at(self.place_km[:, which], middle_s)
-        share = reflected_share(_at(self.seen_km[:, which], middle_s), place, self.now.sun_km)
-        share = share * in_front(_at(self.observer_km[:, None], middle_s), place)
+        seen_km = _at(self.seen_km[:, which], middle_s)
+        observer_km = _at(self.observer_km[:, None], middle_s)
+        share = reflected_share(seen_km, place, self.now.sun_km)
+        share = share * in_front(observer_km, place)
         varied = self.brightness.variation(listed, self.since_s + begin_s, self.since_s + end_s)
         return np.asarray(self.brightness.standard_e_per_s[listed] * share * varied)
 
 
 def _at(cubic: FloatArray, s: FloatArray | np.float64) -> FloatArray:
-    return np.asarray(cubic[0] + s * (cubic[1] + s * (cubic[2] + s * cubic[3])))
+    """A cubic, coefficients first, at a time in seconds."""
+    a, b, c, d = cubic
+    return np.asarray(a + s * (b + s * (c + s * d)))
+
+
+def _lengths(vectors: FloatArray) -> FloatArray:
+    """The lengths (n,) of vectors (n, 3)."""
+    return np.asarray(np.sqrt(np.einsum("ij,ij->i", vectors, vectors)))
 
 
 class Satellites:
@@ -209,13 +214,13 @@ class Satellites:
         self._zero_ns = zero_ns
         self._swarm = Swarm([satellite.satrec for satellite in satellites])
         self._numbers = np.array([satellite.number for satellite in satellites])
-        self._other = (
-            np.ones(len(satellites), dtype=np.bool_)
-            if own_number is None
-            else self._numbers != own_number
-        )
+        self._other = np.ones(len(satellites), dtype=np.bool_)
+        if own_number is not None:
+            self._other = self._numbers != own_number
         self._watch: _Watch | None = None
-        self._lost_told = self._own_told = self._age_told = False
+        self._lost_told = False
+        self._own_told = False
+        self._age_told = False
         self._epoch_age_days = np.array([satellite.age_days(0) for satellite in satellites])
         self.file = "satellites"  # what they are called in a line about their age
         self._lost = 0
@@ -233,22 +238,19 @@ class Satellites:
         if not len(in_cone):
             return None
         from_observer_km = self._swarm.places_km(in_cone, sky.utc_ns) - observer[0]
-        range_km = np.sqrt(np.einsum("ij,ij->i", from_observer_km, from_observer_km))
+        range_km = _lengths(from_observer_km)
         reach_km = _reach_km(observer, cone.half_s)
         now = sky.now()
-        near = _within(
-            from_observer_km @ cone.axis, range_km, cone.radius_rad + SHIFT_RAD, reach_km
-        ) & (range_km > OWN_KM)
-        near &= (
-            self._brightest(in_cone, from_observer_km, range_km, reach_km, now)
-            >= cone.faintest_e_per_s
-        )
+        along_km = from_observer_km @ cone.axis
+        near = _within(along_km, range_km, cone.radius_rad + SHIFT_RAD, reach_km)
+        near &= range_km > OWN_KM
+        brightest = self._brightest(in_cone, from_observer_km, range_km, reach_km, now)
+        near &= brightest >= cone.faintest_e_per_s
         which = in_cone[near]
         if not len(which):
             return None
-        place, from_observer_km = _light_cubics(
-            self._swarm.motion_km(which, sky.utc_ns), observer, now.earth_km_s
-        )
+        motion_km = self._swarm.motion_km(which, sky.utc_ns)
+        place, from_observer_km = _light_cubics(motion_km, observer, now.earth_km_s)
         since_s = (sky.utc_ns - self._zero_ns) / NS_PER_S
         return Pass(
             which, self.brightness, from_observer_km, place, observer, since_s, now, sky.fixed_km_s
@@ -273,27 +275,24 @@ class Satellites:
         """The satellites that can be in a cone, from the list that is kept for some time."""
         watch = self._watch
         if watch is None or not watch.covers(cone, sky.utc_ns, observer[0]):
-            self._watch = watch = _Watch(
-                cone, sky.utc_ns, observer, self._search(cone, sky, observer)
-            )
+            found = self._search(cone, sky, observer)
+            watch = _Watch(cone, sky.utc_ns, observer, found)
+            self._watch = watch
         return watch.found
 
     def _search(self, cone: Cone, sky: SkyAt, observer: FloatArray) -> IntArray:
-        from_observer_km = self._swarm.places_km(slice(None), sky.utc_ns) - observer[0]
-        range_km = np.sqrt(np.einsum("ij,ij->i", from_observer_km, from_observer_km))
+        """The satellites of the whole list that can be in a cone, or in one near it, within WATCH_S
+        of a moment, but the observer's own.
+        """
+        every = slice(None)
+        from_observer_km = self._swarm.places_km(every, sky.utc_ns) - observer[0]
+        range_km = _lengths(from_observer_km)
         self._tell_own(range_km)
         half_s = WATCH_S + cone.half_s
         reach_km = _reach_km(observer, half_s) + JUMP_KM
-        near = (
-            _within(
-                from_observer_km @ cone.axis,
-                range_km,
-                cone.radius_rad + WATCH_RAD + SHIFT_RAD,
-                reach_km,
-            )
-            & self._other
-        )
-        candidates = np.flatnonzero(near)
+        radius_rad = cone.radius_rad + WATCH_RAD + SHIFT_RAD
+        near = _within(from_observer_km @ cone.axis, range_km, radius_rad, reach_km)
+        candidates = np.flatnonzero(near & self._other)
         brightest = self._brightest(
             candidates, from_observer_km[candidates], range_km[candidates], reach_km, sky.now()
         )
@@ -304,9 +303,9 @@ class Satellites:
         sun_km = sky.now().sun_km
         for seconds in np.array([-half_s, half_s]):
             place = self._swarm.places_km(candidates, sky.utc_ns, seconds)
-            lit += sunlit_share(place, sun_km) * in_front(
-                _at(observer, seconds)[None], place, HIDDEN_KM
-            )
+            observer_then = _at(observer, seconds)[None]
+            is_seen = in_front(observer_then, place, HIDDEN_KM)
+            lit += sunlit_share(place, sun_km) * is_seen
         return np.asarray(candidates[lit > 0])
 
     def _brightest(
@@ -323,14 +322,12 @@ class Satellites:
         range_km = np.maximum(range_km, OWN_KM)
         closest_km = np.maximum(range_km - reach_km, OWN_KM)
         to_sun = now.sun_km / np.linalg.norm(now.sun_km)
-        diffuse = (
-            phase_factor(np.clip(-(seen_km @ to_sun) / range_km, -1.0, 1.0))
-            + STEEPEST_PHASE * reach_km / closest_km
-        )
-        share = MOST_SUN * np.minimum(diffuse, MAX_PHASE_FACTOR) * (STANDARD_KM / closest_km) ** 2
-        return np.asarray(
-            self.brightness.standard_e_per_s[which] * self.brightness.most(which) * share
-        )
+        cos_phase = np.clip(-(seen_km @ to_sun) / range_km, -1.0, 1.0)
+        steepest = STEEPEST_PHASE * reach_km / closest_km
+        diffuse = np.minimum(phase_factor(cos_phase) + steepest, MAX_PHASE_FACTOR)
+        share = MOST_SUN * diffuse * (STANDARD_KM / closest_km) ** 2
+        standard_e_per_s = self.brightness.standard_e_per_s[which]
+        return np.asarray(standard_e_per_s * self.brightness.most(which) * share)
 
     def write(
         self, stars: Stars, index: IntArray, vectors: FloatArray, electrons_per_s: FloatArray
@@ -339,7 +336,8 @@ class Satellites:
         vectors (k, 3) and rates (k,).
         """
         place = len(stars) - len(stars.bodies) + index
-        stars.vectors[place], stars.electrons_per_s[place] = vectors, electrons_per_s
+        stars.vectors[place] = vectors
+        stars.electrons_per_s[place] = electrons_per_s
         stars.v_mag[place] = magnitude(electrons_per_s / self._v0_e_per_s)
 
     def place(self, utc_ns: int) -> int:
@@ -371,6 +369,7 @@ class Satellites:
             )
 
     def _tell_lost(self) -> None:
+        """One line, once, of the satellites that have no place."""
         if self._lost_told or not self._lost:
             return
         from sgp4.api import SGP4_ERRORS
@@ -389,6 +388,7 @@ class Satellites:
         )
 
     def _tell_own(self, range_km: FloatArray) -> None:
+        """One line, once, of a satellite that is the observer itself."""
         if self._own_told:
             return
         own_indices = np.flatnonzero(~self._other | (range_km < OWN_KM))
@@ -417,8 +417,9 @@ class _Watch:
         seconds = (utc_ns - self.utc_ns) / NS_PER_S
         if abs(seconds) > WATCH_S or float(cone.axis @ self.cone.axis) < COS_WATCH:
             return False
-        wider = cone.radius_rad > self.cone.radius_rad or cone.half_s > self.cone.half_s
-        if wider or cone.faintest_e_per_s < self.cone.faintest_e_per_s:
+        kept = self.cone
+        is_wider = cone.radius_rad > kept.radius_rad or cone.half_s > kept.half_s
+        if is_wider or cone.faintest_e_per_s < kept.faintest_e_per_s:
             return False
         jump = observer_km - _at(self.observer_km, np.float64(seconds))
         return float(jump @ jump) < JUMP_KM**2
@@ -435,7 +436,8 @@ def _within(
     """Whether vectors (n,), of lengths `range_km` and with parts `along_km` along an axis, can come
     within `radius_rad` of the axis when their ends move by up to `reach_km`.
     """
-    moved = np.arcsin(np.minimum(1.0, reach_km / np.maximum(range_km, reach_km + OWN_KM)))
+    held_km = np.maximum(range_km, reach_km + OWN_KM)
+    moved = np.arcsin(np.minimum(1.0, reach_km / held_km))
     limit = np.cos(np.minimum(np.pi, radius_rad + moved))
     return np.asarray((along_km >= limit * range_km) | (range_km <= reach_km))
 
@@ -447,14 +449,15 @@ def _light_cubics(
     observer, by their places.
     """
     from_observer_km = place_km - observer_km[:, None]
-    distance = np.sqrt(np.einsum("ij,ij->i", from_observer_km[0], from_observer_km[0]))
-    late_s = (distance / LIGHT_KM_S)[:, None]
-    receding = (
-        np.einsum("ij,ij->i", from_observer_km[0], from_observer_km[1]) / distance / LIGHT_KM_S
-    )[:, None]
+    towards_km = from_observer_km[0]
+    distance_km = _lengths(towards_km)
+    late_s = (distance_km / LIGHT_KM_S)[:, None]
+    outward_km2_s = np.einsum("ij,ij->i", towards_km, from_observer_km[1])
+    receding = (outward_km2_s / distance_km / LIGHT_KM_S)[:, None]
+    _, velocity, bend, _ = place_km
     sent = place_km.copy()
-    sent[0] -= late_s * (place_km[1] - late_s * place_km[2])
-    sent[1] -= receding * place_km[1] + 2 * late_s * place_km[2]
+    sent[0] -= late_s * (velocity - late_s * bend)
+    sent[1] -= receding * velocity + 2 * late_s * bend
     from_observer_km = sent - observer_km[:, None]
     # Meanwhile the Earth, and what is about it, has moved on: that undoes the aberration by its
     # velocity.

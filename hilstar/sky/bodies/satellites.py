@@ -35,15 +35,15 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError, MachineError, printable, shortened
 from hilstar.basics.text_tables import Chosen, TextTable, table_of
-from hilstar.basics.units import NS_PER_S, flux_ratio
+from hilstar.basics.units import KM_PER_AU, NS_PER_S, flux_ratio
 from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD
 from hilstar.sky.bodies.omm import is_omm, read_omm
-from hilstar.sky.bodies.orbit import TURN_NS, icrs_from_teme
+from hilstar.sky.bodies.orbit import LINE_LENGTH, TURN_NS, digit_sum, icrs_from_teme
 
 if TYPE_CHECKING:
     from sgp4.api import Satrec
 
-LINE_LENGTH = 69  # with its checksum
+
 MAX_NAME = 24  # characters, as CelesTrak has them
 LIST_FORM = (
     "give a list of two-line element sets, with name lines or without, or OMM in JSON, XML or CSV"
@@ -64,9 +64,9 @@ NUMBERS = {
         "mean motion": (52, 63),
     },
 }
-DIGIT_SUM = {ord(c): int(c) if c.isdigit() else int(c == "-") for c in map(chr, range(128))}
-STANDARD_KM = 1000.0
-SUN_KM, KM_PER_AU = 695_700.0, 149_597_870.7
+
+STANDARD_KM = 1000.0  # the range that a standard magnitude is for, at 90 degrees of phase
+SUN_KM = 695_700.0
 EARTH_KM, EARTH_FLATTENING = 6378.137, 1 / 298.257  # IERS Conventions 2010
 MAX_PHASE_FACTOR = np.pi  # at full phase
 FWHM_SIGMAS = 2 * float(np.sqrt(2 * np.log(2)))
@@ -111,9 +111,8 @@ class Satellite:
 
     def age_days(self, utc_ns: int) -> float:
         """How many days a UTC is after the elements' own date."""
-        return float(
-            utc_ns / NS_PER_DAY + UNIX_JD - self.satrec.jdsatepoch - self.satrec.jdsatepochF
-        )
+        epoch_jd = self.satrec.jdsatepoch
+        return float(utc_ns / NS_PER_DAY + UNIX_JD - epoch_jd - self.satrec.jdsatepochF)
 
 
 def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
@@ -131,7 +130,8 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
     for satellite in _satellites(text, file):
         number = satellite.number
         other = by_number.get(number)
-        if other is None or abs(satellite.age_days(utc_ns)) < abs(other.age_days(utc_ns)):
+        days_off = abs(satellite.age_days(utc_ns))
+        if other is None or days_off < abs(other.age_days(utc_ns)):
             by_number[number] = satellite
     if not by_number:
         raise InputError(f"{file}: no element set in it; {LIST_FORM}")
@@ -178,11 +178,12 @@ def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
                     f"{where}: element line 2 is missing after line {first_at}; {LIST_FORM}"
                 )
             _check(line, where)
-            if line[2:7] != first[2:7]:
-                other = first[2:7].strip()
+            number = line[2:7]
+            other = first[2:7]
+            if number != other:
                 raise InputError(
-                    f"{where}: it is of satellite {line[2:7].strip()}, line {first_at} of {other};"
-                    f" {LIST_FORM}"
+                    f"{where}: it is of satellite {number.strip()}, line {first_at} of"
+                    f" {other.strip()}; {LIST_FORM}"
                 )
             yield name, first, line
             name = ""
@@ -204,7 +205,8 @@ def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
 def _name(line: str) -> str:
     """A name line's name in ASCII, as tables have it; Space-Track writes "0 " before it."""
     text = line[2:] if line.startswith("0 ") else line
-    return printable(text.strip()).encode("ascii", "replace").decode()[:MAX_NAME].strip()
+    ascii_text = printable(text.strip()).encode("ascii", "replace").decode()
+    return ascii_text[:MAX_NAME].strip()
 
 
 def _check(line: str, where: str) -> None:
@@ -218,15 +220,17 @@ def _check(line: str, where: str) -> None:
     # SGP4's parser is C, where a NUL ends a text.
     if not line.isprintable():
         raise InputError(f"{where}: it has a control character: a damaged line; take the list anew")
-    total = sum(map(DIGIT_SUM.__getitem__, line[:-1].encode())) % 10
-    if str(total) != line[-1]:
+    total = digit_sum(line)
+    stated = line[-1]
+    if str(total) != stated:
         raise InputError(
-            f"{where}: its digits add up to {total}, not {line[-1]}: a damaged line; take the list"
+            f"{where}: its digits add up to {total}, not {stated}: a damaged line; take the list"
             " anew"
         )
     for what, (begin, end) in NUMBERS[line[0]].items():
         part = line[begin:end].strip()
-        if not part.lstrip("+-").replace(".", "", 1).isdigit():
+        digits = part.lstrip("+-").replace(".", "", 1)
+        if not digits.isdigit():
             raise InputError(
                 f"{where}: columns {begin + 1} to {end}, its {what}, read {part!r}; write a number"
             )
@@ -249,12 +253,15 @@ class Brightness:
     size_m: FloatArray
 
     def most(self, which: IntArray) -> FloatArray:
-        """The largest factor by which each of these is ever brighter than its mean (in a flash:
-        than without).
+        """The largest factor (n,) by which these are ever brighter than their mean; of those that
+        flash, than without a flash.
         """
         ratio = flux_ratio(-self.amplitude_mag[which])
-        varied = np.where(np.isnan(self.flash_s[which]), 2 * ratio / (ratio + 1), ratio)
-        return np.where(np.isnan(self.period_s[which]), 1.0, varied)
+        waved = 2 * ratio / (ratio + 1)
+        is_flashing = ~np.isnan(self.flash_s[which])
+        varied = np.where(is_flashing, ratio, waved)
+        is_steady = np.isnan(self.period_s[which])
+        return np.where(is_steady, 1.0, varied)
 
     def variation(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
         """The mean factor of each of these (n,) between two times, seconds after `epoch_utc`, in
@@ -269,39 +276,45 @@ class Brightness:
         if steady.all():
             return factor
         end_s = np.maximum(end_s, begin_s + SHORTEST_S)
-        flashing = ~np.isnan(self.flash_s[which]) & ~steady
-        for chosen, mean in ((~flashing & ~steady, self._waved), (flashing, self._flashed)):
-            factor[chosen] = mean(which[chosen], begin_s[chosen], end_s[chosen])
+        has_flash = ~np.isnan(self.flash_s[which])
+        flashing = has_flash & ~steady
+        waving = ~has_flash & ~steady
+        factor[waving] = self._waved(which[waving], begin_s[waving], end_s[waving])
+        factor[flashing] = self._flashed(which[flashing], begin_s[flashing], end_s[flashing])
         return factor
 
     def _waved(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        """As `variation`, of those that go up and down: the cosine's mean is a sinc."""
         ratio = flux_ratio(-self.amplitude_mag[which])
         per_s = 1 / self.period_s[which]
-        middle = ((begin_s + end_s) / 2 - self.flash_at_s[which]) * per_s
+        middle_s = (begin_s + end_s) / 2 - self.flash_at_s[which]
+        middle = middle_s * per_s
         depth = (ratio - 1) / (ratio + 1)
-        return np.asarray(
-            1 + depth * np.cos(2 * np.pi * middle) * np.sinc((end_s - begin_s) * per_s)
-        )
+        damping = np.sinc((end_s - begin_s) * per_s)
+        wave = depth * np.cos(2 * np.pi * middle)
+        return np.asarray(1 + wave * damping)
 
     def _flashed(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
+        """As `variation`, of those that flash."""
         from scipy.special import ndtr  # 0.1 s, which only flashes need
 
         period_s = self.period_s[which]
         sigma_s = self.flash_s[which] / FWHM_SIGMAS
+        flash_at_s = self.flash_at_s[which]
         # The light of all flashes up to each end, in flashes: whole periods, and those near that
         # have not ended
-        until = []
+        ends = []
         for seconds in (begin_s, end_s):
-            turn = np.floor((seconds - self.flash_at_s[which]) / period_s)
-            rest_s = seconds - self.flash_at_s[which] - turn * period_s
-            near = ndtr((rest_s[:, None] - NEIGHBOURS * period_s[:, None]) / sigma_s[:, None]).sum(
-                axis=1
-            )
-            until.append((turn, near))
-        (turn, near), (last_turn, last_near) = until
-        flashes = (last_turn - turn) + (last_near - near)
+            turn = np.floor((seconds - flash_at_s) / period_s)
+            rest_s = seconds - flash_at_s - turn * period_s
+            since_s = rest_s[:, None] - NEIGHBOURS * period_s[:, None]
+            ended = ndtr(since_s / sigma_s[:, None])
+            ends.append((turn, ended.sum(axis=1)))
+        (first_turn, first_near), (last_turn, last_near) = ends
+        flashes = (last_turn - first_turn) + (last_near - first_near)
         extra = flux_ratio(-self.amplitude_mag[which]) - 1
-        return np.asarray(1 + extra * flashes * sigma_s * np.sqrt(2 * np.pi) / (end_s - begin_s))
+        light_s = extra * flashes * sigma_s * np.sqrt(2 * np.pi)
+        return np.asarray(1 + light_s / (end_s - begin_s))
 
 
 def reflected_share(
@@ -315,17 +328,18 @@ def reflected_share(
     distance_au = float(np.linalg.norm(sun_km)) / KM_PER_AU
     to_sun = sun_km / np.linalg.norm(sun_km)  # from any satellite of the Earth within 1 arcmin
     range_km = np.linalg.norm(from_observer_km, axis=1)
-    diffuse = phase_factor(np.clip(-(from_observer_km @ to_sun) / range_km, -1.0, 1.0))
-    return np.asarray(
-        (STANDARD_KM / range_km) ** 2 / distance_au**2 * diffuse * sunlit_share(place_km, sun_km)
-    )
+    cos_phase = np.clip(-(from_observer_km @ to_sun) / range_km, -1.0, 1.0)
+    by_distance = (STANDARD_KM / range_km) ** 2 / distance_au**2
+    sunlit = sunlit_share(place_km, sun_km)
+    return np.asarray(by_distance * phase_factor(cos_phase) * sunlit)
 
 
 def phase_factor(cos_phase: FloatArray) -> FloatArray:
     """The light of a diffuse sphere over that at 90 degrees of phase (n,), by the cosines of its
     phase angles.
     """
-    return np.asarray(np.sqrt(1 - cos_phase**2) + (np.pi - np.arccos(cos_phase)) * cos_phase)
+    phase_rad = np.arccos(cos_phase)
+    return np.asarray(np.sqrt(1 - cos_phase**2) + (np.pi - phase_rad) * cos_phase)
 
 
 def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
@@ -342,24 +356,29 @@ def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
     far = np.linalg.norm(to_sun, axis=1)
     earth = np.arcsin(np.minimum(1.0, EARTH_KM / distance))
     disc = np.arcsin(SUN_KM / far)
-    apart = np.arccos(np.clip(-np.einsum("ij,ij->i", place, to_sun) / (distance * far), -1.0, 1.0))
+    cosine = -np.einsum("ij,ij->i", place, to_sun) / (distance * far)
+    apart = np.arccos(np.clip(cosine, -1.0, 1.0))
     within = np.abs(earth - disc)
-    share = np.where(apart <= within, np.maximum(0.0, 1 - (earth / disc) ** 2), 1.0)
+    # one circle inside the other: the Earth hides all, or as much as its own area
+    ring = np.maximum(0.0, 1 - (earth / disc) ** 2)
+    share = np.where(apart <= within, ring, 1.0)
     partly = np.flatnonzero((apart > within) & (apart < earth + disc))
     if len(partly):
-        share[partly] = 1 - _overlap(earth[partly], disc[partly], apart[partly]) / (
-            np.pi * disc[partly] ** 2
-        )
+        part_disc = disc[partly]
+        hidden = _overlap(earth[partly], part_disc, apart[partly])
+        share[partly] = 1 - hidden / (np.pi * part_disc**2)
     return share
 
 
 def _overlap(a: FloatArray, b: FloatArray, apart: FloatArray) -> FloatArray:
     """The area that circles of radii a and b share, on a plane."""
     from_a = (apart**2 + a**2 - b**2) / (2 * apart)
-    in_a, in_b = (
-        np.arccos(np.clip(x / r, -1.0, 1.0)) for x, r in ((from_a, a), (apart - from_a, b))
-    )
-    return np.asarray(a**2 * (in_a - np.sin(2 * in_a) / 2) + b**2 * (in_b - np.sin(2 * in_b) / 2))
+    from_b = apart - from_a
+    in_a = np.arccos(np.clip(from_a / a, -1.0, 1.0))
+    in_b = np.arccos(np.clip(from_b / b, -1.0, 1.0))
+    segment_a = a**2 * (in_a - np.sin(2 * in_a) / 2)
+    segment_b = b**2 * (in_b - np.sin(2 * in_b) / 2)
+    return np.asarray(segment_a + segment_b)
 
 
 def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.0) -> FloatArray:
@@ -371,19 +390,20 @@ def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.
     observer = _stretched(observer_km)
     place = _stretched(place_km)
     way = place - observer
-    share = np.clip(
-        -np.einsum("ij,ij->i", observer, way) / np.einsum("ij,ij->i", way, way), 0.0, 1.0
-    )
-    closest = np.linalg.norm(observer + share[:, None] * way, axis=1)
-    inside = np.linalg.norm(observer, axis=1) < EARTH_KM
-    return np.where((closest < EARTH_KM - depth_km) & ~inside, 0.0, 1.0)
+    along_way = -np.einsum("ij,ij->i", observer, way)
+    share = np.clip(along_way / np.einsum("ij,ij->i", way, way), 0.0, 1.0)
+    closest = observer + share[:, None] * way
+    is_hidden = np.linalg.norm(closest, axis=1) < EARTH_KM - depth_km
+    is_inside = np.linalg.norm(observer, axis=1) < EARTH_KM
+    return np.where(is_hidden & ~is_inside, 0.0, 1.0)
 
 
 def _stretched(vectors_km: FloatArray) -> FloatArray:
     """Vectors in axes in which the Earth is a sphere of its equatorial radius; its axis is ICRS
     z within 0.2 degrees.
     """
-    return np.asarray(vectors_km * np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)]))
+    to_sphere = np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)])
+    return np.asarray(vectors_km * to_sphere)
 
 
 def read_table(text: str, file: str) -> dict[int, Row]:
@@ -392,33 +412,41 @@ def read_table(text: str, file: str) -> dict[int, Row]:
     """
     rows: dict[int, Row] = {}
     table = table_of(Path(file), TABLE_FORM, iter(text.splitlines(keepends=True)))
-    (_, key), *columns = _columns(table)
+    key, columns = _columns(table)
     table.warn()
     for line, cells in table.rows():
         where = f"{file}:{line}"
         number = _number(table.cell(cells, key), where)
         if number in rows:
             raise InputError(f"{where}: satellite {number} is there twice; leave one row")
-        rows[number] = _values({name: table.cell(cells, column) for name, column in columns}, where)
+        texts = {name: table.cell(cells, column) for name, column in columns.items()}
+        rows[number] = _values(texts, where)
     return rows
 
 
-def _columns(table: TextTable) -> list[tuple[str, Chosen]]:
-    """The columns by name, the catalogue number's first. Raises InputError for one that is unknown
-    or there twice.
+def _columns(table: TextTable) -> tuple[Chosen, dict[str, Chosen]]:
+    """The catalogue number's column, and the others by name. Raises InputError for one that is
+    unknown or there twice.
     """
-    chosen = [(name, table.chosen(name)) for name in (KEY, *COLUMNS)]
-    known = [(name, column) for name, column in chosen if column is not None]
-    if not table.columns or chosen[0][1] is None:
+    key = table.chosen(KEY)
+    columns: dict[str, Chosen] = {}
+    for name in COLUMNS:
+        column = table.chosen(name)
+        if column is not None:
+            columns[name] = column
+    if not table.columns or key is None:
         raise table.refusal(table.header_line, f"no header with {KEY} and each column once")
-    places = {column.place for _, column in known}
-    unknown = [column.header for place, column in enumerate(table.columns) if place not in places]
-    if unknown:
-        raise table.refusal(table.header_line, f"no column {shortened(unknown[0])!r} is known")
-    return known
+    places = {key.place}
+    places.update(column.place for column in columns.values())
+    for place, written in enumerate(table.columns):
+        if place not in places:
+            name = shortened(written.header)
+            raise table.refusal(table.header_line, f"no column {name!r} is known")
+    return key, columns
 
 
 def _number(text: str, where: str) -> int:
+    """A catalogue number, as digits or in Alpha-5. Raises InputError."""
     from sgp4.alpha5 import from_alpha5
 
     try:
@@ -430,6 +458,7 @@ def _number(text: str, where: str) -> int:
 
 
 def _values(row: dict[str, str], where: str) -> Row:
+    """The columns that a row fills, as numbers. Raises InputError."""
     values: Row = {}
     for name, text in row.items():
         if not text:
@@ -449,7 +478,8 @@ def _values(row: dict[str, str], where: str) -> Row:
             raise InputError(
                 f"{where}: light that varies has a period_s and an amplitude_mag; write both"
             )
-        if values.get("flash_s", 0.0) > values["period_s"] / 2:
+        flash_s = values.get("flash_s", 0.0)
+        if flash_s > values["period_s"] / 2:
             raise InputError(
                 f"{where}: flash_s is over half of period_s; leave it out: the light then goes up"
                 " and down"
@@ -466,11 +496,12 @@ def brightness_of(
     `v0_e_per_s` is the electron rate of sunlight of V = 0.
     """
 
-    def column(name: str, default: float) -> np.ndarray:
-        return np.array(
-            [rows.get(satellite.number, {}).get(name, default) for satellite in satellites],
-            dtype=np.float64,
-        )
+    def column(name: str, default: float) -> FloatArray:
+        values = []
+        for satellite in satellites:
+            row = rows.get(satellite.number, {})
+            values.append(row.get(name, default))
+        return np.array(values, dtype=np.float64)
 
     return Brightness(
         standard_e_per_s=v0_e_per_s * flux_ratio(column("standard_mag", default_mag)),
@@ -483,7 +514,9 @@ def brightness_of(
 
 
 class Swarm:
-    """Satellites by their elements; a moment's places depend on that moment alone."""
+    """Satellites moved by their elements (SGP4) in steps of STEP_S, with cubics between; a place
+    depends on its moment alone.
+    """
 
     def __init__(self, satrecs: "Sequence[Satrec]") -> None:
         from sgp4.api import SatrecArray
@@ -510,22 +543,26 @@ class Swarm:
         if not len(due):
             return False
         for k in due.tolist():
-            part = slice(k * SHARE, min(len(self), (k + 1) * SHARE))
+            end = min(len(self), (k + 1) * SHARE)
+            part = slice(k * SHARE, end)
             begin_ns = int(step[k]) * STEP_NS + int(self._late_ns[k])
-            self._load(k, part, begin_ns, follows=step[k] == self._step[k] + 1)
+            follows = bool(step[k] == self._step[k] + 1)
+            self._load(k, part, begin_ns, follows)
             self._begin_ns[part] = begin_ns
         self._step = step
         return True
 
     def _load(self, k: int, part: slice, begin_ns: int, follows: bool) -> None:
+        """Make the cubics of a share's step; one that follows the last begins where that ended."""
         last = self._ends[k]
-        error = np.zeros(part.stop - part.start, dtype=np.uint8)
         if last is None or not follows:
             last, error = self._states(k, begin_ns)
         else:
-            error = np.where(np.isnan(last[:, 0, 0]), self.error[part], 0).astype(np.uint8)
+            has_none = np.isnan(last[:, 0, 0])
+            error = np.where(has_none, self.error[part], 0).astype(np.uint8)
         end, end_error = self._states(k, begin_ns + STEP_NS)
-        self._terms[part] = HERMITE @ np.concatenate([last, end], axis=1)
+        both = np.concatenate([last, end], axis=1)
+        self._terms[part] = HERMITE @ both
         self.error[part] = np.where(error, error, end_error)
         self._ends[k] = end
 
@@ -534,16 +571,16 @@ class Swarm:
         where there is one.
         """
         days, rest_ns = divmod(utc_ns, NS_PER_DAY)
-        error, place_km, velocity_km_s = self._shares[k].sgp4(
-            np.array([UNIX_JD + days]), np.array([rest_ns / NS_PER_DAY])
-        )
-        states = (
-            np.stack([place_km[:, 0], velocity_km_s[:, 0] * STEP_S], axis=1)
-            @ icrs_from_teme(utc_ns // TURN_NS).T
-        )
-        error = np.where(
-            np.isfinite(states).all(axis=(1, 2)), error[:, 0], np.maximum(error[:, 0], 1)
-        )
+        utc_days = np.array([UNIX_JD + days])
+        utc_rest_days = np.array([rest_ns / NS_PER_DAY])
+        codes, place_km, velocity_km_s = self._shares[k].sgp4(utc_days, utc_rest_days)
+        velocity_km_step = velocity_km_s[:, 0] * STEP_S
+        teme = np.stack([place_km[:, 0], velocity_km_step], axis=1)
+        turn = icrs_from_teme(utc_ns // TURN_NS)
+        states = teme @ turn.T
+        is_finite = np.isfinite(states).all(axis=(1, 2))
+        error = codes[:, 0]
+        error = np.where(is_finite, error, np.maximum(error, 1))
         states[error != 0] = np.nan
         return states, error
 
@@ -553,15 +590,21 @@ class Swarm:
         """Places (n, 3), km from the Earth's centre, ICRS axes, `seconds` (n,) after the UTC it
         was moved to; NaN for none.
         """
-        s = ((utc_ns - self._begin_ns[which]) / NS_PER_S + seconds)[:, None] / STEP_S
-        terms = self._terms[which]
-        return np.asarray(terms[:, 0] + s * (terms[:, 1] + s * (terms[:, 2] + s * terms[:, 3])))
+        after_s = (utc_ns - self._begin_ns[which]) / NS_PER_S + seconds
+        s = after_s[:, None] / STEP_S
+        a, b, c, d = np.moveaxis(self._terms[which], 1, 0)
+        return np.asarray(a + s * (b + s * (c + s * d)))
 
     def motion_km(self, which: IntArray, utc_ns: int) -> FloatArray:
         """Coefficients (4, n, 3) of 1, s, s^2 and s^3 of the same places, s in seconds after
         that UTC.
         """
-        s = ((utc_ns - self._begin_ns[which]) / NS_PER_S)[:, None] / STEP_S
+        after_s = (utc_ns - self._begin_ns[which]) / NS_PER_S
+        s = after_s[:, None] / STEP_S
         a, b, c, d = np.moveaxis(self._terms[which], 1, 0)
-        cubic = a + s * (b + s * (c + s * d)), b + s * (2 * c + s * 3 * d), c + s * 3 * d, d
-        return np.stack([term / STEP_S**power for power, term in enumerate(cubic)])
+        # the cubic about s in place of 0
+        place = a + s * (b + s * (c + s * d))
+        velocity = b + s * (2 * c + s * 3 * d)
+        bend = c + s * 3 * d
+        steps = [term / STEP_S**power for power, term in enumerate((place, velocity, bend, d))]
+        return np.stack(steps)

@@ -29,7 +29,7 @@ from hilstar.basics.rotation import (
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.display.geometry import monitor_camera
-from hilstar.instruments.study.stability import FailureCase, Figures
+from hilstar.instruments.study.stability import CaseFigures, FailureCase
 from hilstar.optics.camera import Camera
 from hilstar.optics.sprites import pack_sprites
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
@@ -88,7 +88,7 @@ def motion_at_pole() -> FailureCase:
         f"{faults[0]:.0f} mas off after {years:g} years; {faults[1]:.2g} mas",
         f"{error:.1e} mas off a great circle",
         "space motion on unit vectors: nothing divides by cos(dec)",
-        Figures(error, min(faults), DIRECTION_MAS),
+        CaseFigures(error, min(faults), DIRECTION_MAS),
     )
 
 
@@ -129,7 +129,7 @@ def fields_over_wrap_and_pole() -> FailureCase:
         f"{box_lost} of {seen} stars within {radius:.0f} degrees lost",
         f"{lost} lost",
         "cells of the sphere are chosen by the angle between unit vectors",
-        Figures(float(lost), float(box_lost), NONE_LOST),
+        CaseFigures(float(lost), float(box_lost), NONE_LOST),
     )
 
 
@@ -150,7 +150,7 @@ def stars_behind() -> FailureCase:
         f"{ghosts} of {len(behind)} stars behind are drawn, mirrored",
         f"{ours} drawn",
         "only stars with Z > 0 are projected",
-        Figures(float(ours), float(ghosts), NONE_LOST),
+        CaseFigures(float(ours), float(ghosts), NONE_LOST),
     )
 
 
@@ -190,7 +190,7 @@ def field_of_180_deg() -> FailureCase:
         f"{error:.1e} px off; but a degree at the edge is {spread:.2g} times as long as one in the"
         " middle",
         "float64; the perspective itself diverges at 180 degrees, as a flat monitor does",
-        Figures(error, fault, EDGE_PX),
+        CaseFigures(error, fault, EDGE_PX),
     )
 
 
@@ -207,7 +207,7 @@ def boresight_at_pole() -> FailureCase:
         f"{fault:.2g} mas off",
         f"{error:.1g} mas off; RA {ra_deg:.6f} of 123 and roll {roll_deg:.6f} of 10 degrees",
         "arctan2 of all three components",
-        Figures(error, fault, DIRECTION_MAS),
+        CaseFigures(error, fault, DIRECTION_MAS),
     )
 
 
@@ -247,7 +247,7 @@ def weak_perspective() -> FailureCase:
         fails,
         f"{error:.1e} px off at most",
         "each star's own Z; eq. 4.3 and 4.4 divide by it too, and so are not a weak perspective",
-        Figures(error, float(np.abs(off_px).max()), CENTROID_PX),
+        CaseFigures(error, float(np.abs(off_px).max()), CENTROID_PX),
     )
 
 
@@ -291,7 +291,7 @@ def two_signs() -> FailureCase:
         f"goes round the long way: {fault / 3600:.0f} degrees off",
         f"{error:.0e} arcsec off",
         "q and -q are one attitude: the nearer of them is taken",
-        Figures(error, fault, ANGLE_ARCSEC),
+        CaseFigures(error, fault, ANGLE_ARCSEC),
     )
 
 
@@ -307,7 +307,7 @@ def antipodal() -> FailureCase:
         f"{fault:.0f}: sin(angle) is 0",
         f"{error:.0e} arcsec off",
         "the angle comes from both chords, and a small one is a straight line",
-        Figures(error, fault, ANGLE_ARCSEC),
+        CaseFigures(error, fault, ANGLE_ARCSEC),
     )
 
 
@@ -321,7 +321,7 @@ def half_turn() -> FailureCase:
         f"{error:.0e} arcsec off",
         "SLERP turns at a constant rate, right up to the half turn where two ways are equally"
         " short",
-        Figures(error, fault, ANGLE_ARCSEC),
+        CaseFigures(error, fault, ANGLE_ARCSEC),
     )
 
 
@@ -359,7 +359,7 @@ def fast_turns() -> FailureCase:
         " the other way is shorter",
         f"with rates: {error:.0e} arcsec off",
         "the rates say which way, and how often round; send them, or more than two samples a turn",
-        Figures(error, fault, ANGLE_ARCSEC),
+        CaseFigures(error, fault, ANGLE_ARCSEC),
     )
 
 
@@ -390,7 +390,7 @@ def not_a_number() -> FailureCase:
         f"{passed} of {sent} pass: NaN is not larger, and a rate has no norm to check",
         f"{taken} taken",
         "every number has to be finite before anything is computed from it",
-        Figures(float(taken), float(passed), NONE_TAKEN),
+        CaseFigures(float(taken), float(passed), NONE_TAKEN),
     )
 
 

@@ -15,7 +15,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import LIGHT_M_S, magnitude
 from hilstar.instruments.simulate.simulator import Simulator
-from hilstar.instruments.study.stability import FailureCase, Figures
+from hilstar.instruments.study.stability import CaseFigures, FailureCase
 from hilstar.instruments.study.study_benches import Table, bench_text, held_out_errors, study_optics
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.sky.electrons import (
@@ -105,7 +105,7 @@ def _colour(bv_mag: float, star: int, tolerance: float, why: str) -> FailureCase
         f"{fails} against the spectrum of the library's {library.spectral_type[star].strip()}",
         f"{100 * pickles:+.1f} %",
         why,
-        Figures(abs(float(pickles)), float(max(map(abs, bodies.values()))), tolerance),
+        CaseFigures(abs(float(pickles)), float(max(map(abs, bodies.values()))), tolerance),
     )
 
 
@@ -123,7 +123,7 @@ def temperature_range() -> FailureCase:
         f"off by up to {100 * fault:.0f} %",
         f"off by at most {error:.1e}",
         f"ln(rate) is smooth in 1/T: a Chebyshev series of degree {TABLE_DEGREE} holds it",
-        Figures(error, fault, TABLE_ERROR),
+        CaseFigures(error, fault, TABLE_ERROR),
     )
 
 
@@ -149,7 +149,7 @@ def planck_overflow() -> FailureCase:
         f"{overflows} overflows in {len(x)}; {fault:.0e} off at x = 1e-12",
         f"no overflow, 0 at x = 1000; {error:.0e} off at most",
         "written with exp(-x) and expm1",
-        Figures(error, fault, TABLE_ERROR),
+        CaseFigures(error, fault, TABLE_ERROR),
     )
 
 
@@ -175,7 +175,7 @@ def source_step() -> FailureCase:
         f"jumps by {kelvin_step:.0f} K, {fault:+.4f} mag",
         ", ".join(f"{name} {mag:+.1e} mag" for name, (_, mag) in jumps.items()),
         "its two branches do not meet there; the other scales have one branch",
-        Figures(max(abs(mag) for _, mag in jumps.values()), abs(fault), STEP_MAG),
+        CaseFigures(max(abs(mag) for _, mag in jumps.values()), abs(fault), STEP_MAG),
     )
 
 
@@ -199,7 +199,7 @@ def cool_stars() -> FailureCase:
         f"pickles, each star held out: median error {100 * error:.1f} %, maximum"
         f" {100 * ours.max():.0f} %",
         "most of a cool star's light is redder than V, where AGS assumes a body of 9602 K",
-        Figures(error, fault, COOL_MEDIAN),
+        CaseFigures(error, fault, COOL_MEDIAN),
     )
 
 
@@ -220,7 +220,7 @@ def blind_tracker() -> FailureCase:
         f"ln(rate) = {logarithm[0]:.0f}, no finite curve through it",
         happens,
         "no electrons to scale",
-        Figures(taken, float((~np.isfinite(logarithm)).sum()), NOTHING),
+        CaseFigures(taken, float((~np.isfinite(logarithm)).sum()), NOTHING),
     )
 
 
@@ -259,7 +259,7 @@ def billion_electrons() -> FailureCase:
         f"exp(-1e9) is 0: mean {product_e.mean():.0f} electrons",
         f"mean {drawn_e.mean():.7g} and sigma {drawn_e.std():.0f}, {error:.1f} standard errors off",
         "drawn by transformed rejection; more than 1e12 are refused",
-        Figures(error, fault, STANDARD_ERRORS),
+        CaseFigures(error, fault, STANDARD_ERRORS),
     )
 
 
@@ -282,7 +282,7 @@ def full_well() -> FailureCase:
         f"wraps round to {wrapped[0, 0]} DN",
         f"{dn.max()} DN = {settings.full_well_e:g} e- / {settings.gain_e_per_dn:g}",
         "charge is clipped at the full well, then codes at the largest one",
-        Figures(error, fault, HALF_DN),
+        CaseFigures(error, fault, HALF_DN),
     )
 
 
@@ -324,7 +324,7 @@ def empty_field() -> FailureCase:
         f"{stars} stars, mean {dn.mean():.2f} DN for 2400 e- and an offset of 100, {error:.1f}"
         " standard errors off",
         "nothing is scaled to a frame's own light",
-        Figures(error, standard_errors(scaled, 200.0, sigma_dn), STANDARD_ERRORS),
+        CaseFigures(error, standard_errors(scaled, 200.0, sigma_dn), STANDARD_ERRORS),
     )
 
 
@@ -342,7 +342,7 @@ def no_exposure() -> FailureCase:
         f"{stars} stars in view, no electrons: mean {dn.mean():.2f} DN, sigma {dn.std():.2f},"
         f" {error:.1f} standard errors off",
         "rates are multiplied by the exposure; bias and read noise remain",
-        Figures(error, standard_errors(rate, 100.0, sigma_dn), STANDARD_ERRORS),
+        CaseFigures(error, standard_errors(rate, 100.0, sigma_dn), STANDARD_ERRORS),
     )
 
 
@@ -370,5 +370,5 @@ def nan_pixel() -> FailureCase:
         f"{centre:g} for one pixel of {image.size}",
         "refused: " + " | ".join(lines),
         "one NaN makes every sum NaN",
-        Figures(float(taken), float(np.isnan(centre)), NOTHING),
+        CaseFigures(float(taken), float(np.isnan(centre)), NOTHING),
     )

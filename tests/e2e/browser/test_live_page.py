@@ -13,16 +13,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 
 import hilstar
-from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.server.record.ledger_records import EventRecord
 from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
+from tests.support.ledgers import read_events
 from tests.support.senders import ORION, connected, packet
 from tests.support.servers import Served, bound
 from tests.support.waiting import CHANCES, CoreWaits, repeating, wait_for
@@ -58,7 +57,7 @@ ALL_DISABLED = (
 
 
 @dataclass
-class Sky:
+class RunBeforeSky:
     """A run with its page, and the sender before it, which may fall silent and may turn."""
 
     served: Served
@@ -81,11 +80,11 @@ class Sky:
 
 
 @contextmanager
-def sky(folder: Path, *options: str) -> Iterator[Sky]:
+def sky(folder: Path, *options: str) -> Iterator[RunBeforeSky]:
     with bound(folder, "--console", "127.0.0.1:0", *options) as served:
         wait_for(lambda: any(ADDRESS.search(line) for line in list(served.lines)), served.lines)
         url = next(found[1] for line in served.lines if (found := ADDRESS.search(line)))
-        shown, numbers = Sky(served, url, folder), itertools.count()
+        shown, numbers = RunBeforeSky(served, url, folder), itertools.count()
         shown.sending.set()
         shown.turning.set()
 
@@ -101,7 +100,7 @@ def sky(folder: Path, *options: str) -> Iterator[Sky]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Iterator[Sky]:
+def run(tmp_path_factory) -> Iterator[RunBeforeSky]:
     folder = tmp_path_factory.mktemp("page")
     (folder / "faults.toml").write_text(SCENARIO)
     options = (
@@ -128,7 +127,7 @@ def live(page, run) -> Browser:
     return page
 
 
-def frame_of(page: Browser) -> int:
+def frame_on_page(page: Browser) -> int:
     return int(page.run("return document.getElementById('picture').dataset.frame"))
 
 
@@ -141,17 +140,14 @@ def pictures_in_a_second(page: Browser) -> int:
     return page.run_async(COUNT_PICTURES)
 
 
-def events(run: Sky) -> list[EventRecord]:
-    return [
-        msgspec.json.decode(data, type=EventRecord)
-        for data in read_messages(run.folder / "run.mcap", "/event")
-    ]
+def run_events(run: RunBeforeSky) -> list[EventRecord]:
+    return read_events(run.folder / "run.mcap")
 
 
 def test_pictures_move_and_the_numbers_are_those_that_are_sent(live, run):
-    first, shown = frame_of(live), pixels(live, "picture")
+    first, shown = frame_on_page(live), pixels(live, "picture")
     assert any(pictures_in_a_second(live) >= MIN_PICTURES_HZ for _ in range(CHANCES))
-    assert frame_of(live) > first and pixels(live, "picture") != shown
+    assert frame_on_page(live) > first and pixels(live, "picture") != shown
     run.stand_still()
     wanted = hilstar.basics.rotation.to_radec_roll_deg(np.array(run.q()))
     # Four decimals are shown.
@@ -173,7 +169,7 @@ def test_single_pixels_have_the_codes_of_that_attitude(live, run):
     live.until(
         f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {shown_deg}) < 1e-4"
     )
-    first = frame_of(live)
+    first = frame_on_page(live)
     live.until(f"document.getElementById('picture').dataset.frame > {first}")
     time.sleep(1)  # until the pictures that were on their way have come
     ActionChains(live).send_keys("0", "h", "9").perform()
@@ -201,9 +197,9 @@ def test_single_pixels_follow_their_star_until_a_person_moves_them(live, run):
     live.until("document.getElementById('picture-text').textContent.includes('follows')")
     followed = live.text("#picture-text").partition("follows ")[2]
     run.turned_rad = TURNED_RAD
-    first = frame_of(live)
+    first = frame_on_page(live)
     time.sleep(1)
-    assert frame_of(live) > first and live.run(MIDDLE_LIT)
+    assert frame_on_page(live) > first and live.run(MIDDLE_LIT)
     assert live.text("#picture-text").endswith(f"follows {followed}")
     live.find("#picture").click()
     ActionChains(live).send_keys(Keys.ARROW_RIGHT).perform()
@@ -358,7 +354,7 @@ new MutationObserver(() => {
 """
 
 
-def red_after_stale_ms(page: Browser, run: Sky) -> float:
+def red_after_stale_ms(page: Browser, run: RunBeforeSky) -> float:
     """How long after the run has found its attitude stale the page is red."""
     page.run(RED_AFTER)
     silent_ns = time.monotonic_ns()
@@ -385,10 +381,10 @@ def test_stale_turns_red_within_half_a_second_and_says_why(live, run):
     live.until("document.body.dataset.ok === 'true'")
 
 
-def events_of(run: Sky, kind: str, count: int = 1) -> list[EventRecord]:
+def events_of(run: RunBeforeSky, kind: str, count: int = 1) -> list[EventRecord]:
     """The events of a kind, once the ledger's writer has put so many of them into the file."""
-    wait_for(lambda: sum(record.kind == kind for record in events(run)) >= count, kind)
-    return [record for record in events(run) if record.kind == kind]
+    wait_for(lambda: sum(record.kind == kind for record in run_events(run)) >= count, kind)
+    return [record for record in run_events(run) if record.kind == kind]
 
 
 def test_controls_act_and_the_ledger_says_who(live, run):
@@ -420,9 +416,10 @@ def test_controls_act_and_the_ledger_says_who(live, run):
     live.until("document.getElementById('control-fault').textContent === 'Inject'")
     live.until("document.body.dataset.ok === 'true'")
     wait_for(
-        lambda: any("shutter" in record.detail for record in events(run)), "the mark in the ledger"
+        lambda: any("shutter" in record.detail for record in run_events(run)),
+        "the mark in the ledger",
     )
-    mark = next(record for record in events(run) if "shutter" in record.detail)
+    mark = next(record for record in run_events(run) if "shutter" in record.detail)
     assert "Ada Løve" in mark.detail
     assert [(record.detail.split()[-4], record.who) for record in events_of(run, "fault", 2)] == [
         ("begins,", "Ada Løve"),
@@ -493,7 +490,7 @@ def test_without_control_the_page_only_shows(page, tmp_path):
         page.get("about:blank")
 
 
-def red_after_death_ms(page: Browser, shown: Sky) -> float:
+def red_after_death_ms(page: Browser, shown: RunBeforeSky) -> float:
     """How long after the run's process has been killed the page is red."""
     page.get(shown.url)
     page.until("document.body.dataset.ok === 'true'")

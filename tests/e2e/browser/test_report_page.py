@@ -148,7 +148,7 @@ def test_what_comes_once_a_second_is_a_line_in_a_short_run_too(report):
     assert inked > 0.5
 
 
-def shown(page: Browser, selector: str) -> int:
+def elements_shown(page: Browser, selector: str) -> int:
     """How many elements of a selector can be seen."""
     return page.run(
         "return [...document.querySelectorAll(arguments[0])].filter((one) =>"
@@ -165,7 +165,7 @@ def test_on_paper_it_is_light_without_buttons_and_with_all_events(report):
     )
     report.run(many)
     pressed = "button:not(.pick), select, input"
-    assert shown(report, pressed) > 10
+    assert elements_shown(report, pressed) > 10
     chart_before = report.run("return document.querySelector('#chart-age canvas').toDataURL()")
     report.paper()
     ground, panel = report.run(
@@ -175,10 +175,10 @@ def test_on_paper_it_is_light_without_buttons_and_with_all_events(report):
     assert (ground, panel) == (colours_of("light")["ground"], colours_of("light")["panel"])
     chart_now = report.run("return document.querySelector('#chart-age canvas').toDataURL()")
     assert chart_now != chart_before  # drawn again in the light colours
-    assert shown(report, pressed) == 0
+    assert elements_shown(report, pressed) == 0
     cut = "const list = document.getElementById('events'); return list.scrollHeight - list.clientHeight"
     assert report.run(cut) <= 1
-    assert shown(report, "#events li") >= 102
+    assert elements_shown(report, "#events li") >= 102
     report.screen()
     report.prefer(color_scheme="dark")
     report.until("document.documentElement.dataset.theme === 'dark'")

@@ -61,7 +61,7 @@ def bench_file(folder, name, true_q=TRUE_Q, **collimator):
     return path
 
 
-def planted(folder, lens):
+def bench_and_truth(folder, lens):
     """A bench file that is wrong about its alignment, and how the bench truly stands."""
     if lens is None:
         path = bench_file(
@@ -90,7 +90,7 @@ def planted(folder, lens):
     "lens", [None, Lens((0.4, 0.0, 0.0), (0.002, -0.001), (0.02, -0.01))], ids=["ideal", "lens"]
 )
 def test_with_the_file_that_is_written_the_tracker_reports_what_is_commanded(tmp_path, lens):
-    path, true = planted(tmp_path, lens)
+    path, true = bench_and_truth(tmp_path, lens)
     with hilstar.load(path) as bench:
         before = [reported(bench, true, q) for q in ATTITUDES]
     assert (

@@ -49,7 +49,7 @@ def coma_lens(x, y):
     return [(0.7, -0.3 * u, -0.3 * v, 0.55, 0.55), (0.3, 0.7 * u, 0.7 * v, 0.9, 0.9)]
 
 
-def light(parts, x, y, columns, rows):
+def mean_light(parts, x, y, columns, rows):
     """What pixels get of points (n,) through the parts, mean over the points."""
     total = np.zeros((len(rows), len(columns)))
     for weight, off_x, off_y, sx, sy in parts:
@@ -63,7 +63,7 @@ def light(parts, x, y, columns, rows):
     return total
 
 
-def session(folder, lens):
+def psf_session(folder, lens):
     (folder / "bench.toml").write_text(FILE)
     wanted = "--frames", "16", "--dots", "14", "-o", folder / "plan"
     assert run_hilstar_here("calibrate", "dots", folder / "bench.toml", *wanted).returncode == 0
@@ -75,7 +75,7 @@ def session(folder, lens):
         at = np.meshgrid(x + POINTS, y + POINTS)
         px, py = tracker.project(monitor.rays(*(part.ravel() for part in at)))
         columns, rows = round(px.mean()) + reach, round(py.mean()) + reach
-        dots.append((columns, rows, light(lens(px.mean(), py.mean()), px, py, columns, rows)))
+        dots.append((columns, rows, mean_light(lens(px.mean(), py.mean()), px, py, columns, rows)))
     for frame in range(plan.frames):
         image = np.zeros((SIZE[1] + 24, SIZE[0] + 24))
         for k in np.flatnonzero(plan.lit[:, frame]):
@@ -103,7 +103,7 @@ def calibrated(folder, *options):
 
 @pytest.mark.parametrize(("lens", "more"), [(round_lens, False), (coma_lens, True)])
 def test_the_psf_over_the_field_is_found_without_the_dot(tmp_path, lens, more):
-    session(tmp_path, lens)
+    psf_session(tmp_path, lens)
     result = calibrated(tmp_path, "--json", "--plot", tmp_path / "psf.png")
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
@@ -116,10 +116,12 @@ def test_the_psf_over_the_field_is_found_without_the_dot(tmp_path, lens, more):
     side = glass.basis.shape[1]
     at = (np.arange(side) - side // 2) / glass.per_px
     for (x, y), found in zip(glass.places_px, glass.images[:, 0, 0], strict=True):
-        wanted = light(lens(x, y), np.zeros(1), np.zeros(1), at, at) / glass.per_px**2
+        wanted = mean_light(lens(x, y), np.zeros(1), np.zeros(1), at, at) / glass.per_px**2
         # centroids in the middle
         off = [float(axis @ at / axis.sum()) for axis in (wanted.sum(axis=0), wanted.sum(axis=1))]
-        wanted = light(lens(x, y), -np.array(off[:1]), -np.array(off[1:]), at, at) / glass.per_px**2
+        wanted = (
+            mean_light(lens(x, y), -np.array(off[:1]), -np.array(off[1:]), at, at) / glass.per_px**2
+        )
         assert 0.5 * np.abs(found - wanted).sum() < ELSEWHERE
         for axis in (0, 1):
             variance, true = (float(image.sum(axis=axis) @ at**2) for image in (found, wanted))
@@ -130,7 +132,7 @@ ELSEWHERE, VARIANCE = 0.035, 0.06  # measured: 0.025 and 0.04, at corners that f
 
 
 def test_images_without_the_plan_s_dots_are_one_line(tmp_path):
-    session(tmp_path, round_lens)
+    psf_session(tmp_path, round_lens)
     for path in tmp_path.glob("frame_*.png"):
         Image.fromarray(np.asarray(Image.open(path))[::-1].copy()).save(path)
     assert_refused(calibrated(tmp_path), 2, "flip_y")

@@ -22,7 +22,7 @@ import pytest
 from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import ROOT, bench_text
 from tests.support.campaign_tracker import FOCAL_PX, WAVE_PX, Planted, wave
-from tests.support.campaigns import plan_text, read_columns
+from tests.support.campaigns import plan_text, read_columns, rows_so_far
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.forks import HILSTAR, Started
 from tests.support.senders import free_port
@@ -57,12 +57,6 @@ def answering(planted: Planted) -> Iterator[subprocess.Popen[str]]:
             yield process
         finally:
             process.kill()
-
-
-def rows_so_far(folder: Path) -> int:
-    return sum(
-        path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl")
-    )
 
 
 def test_the_planted_budget_of_500_cases_is_found_and_wild_answers_are_named(

@@ -20,7 +20,7 @@ import pytest
 import hilstar
 from hilstar.instruments.campaign import cluster
 from tests.support.benches import ROOT
-from tests.support.campaigns import read_columns, write_campaign
+from tests.support.campaigns import read_columns, rows_so_far, write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here, run_started
 from tests.support.forks import Started
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -52,7 +52,9 @@ OPTIONS = ("--solver", "python:sleepy:solve", "--json")
 
 
 @contextlib.contextmanager
-def running(folder: Path, log: str, *words: str, **env: str) -> Iterator[subprocess.Popen[bytes]]:
+def dask_program(
+    folder: Path, log: str, *words: str, **env: str
+) -> Iterator[subprocess.Popen[bytes]]:
     """A program of Dask's, whose log goes to a file, until the end of this."""
     with (folder / log).open("wb") as out:
         process = Started(
@@ -109,12 +111,6 @@ def pool_table(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return (folder / "pool/cases.parquet").read_bytes()
 
 
-def rows_so_far(folder: Path) -> int:
-    return sum(
-        path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl")
-    )
-
-
 @contextlib.contextmanager
 def scheduler(
     folder: Path, port: str = "0", *more: str
@@ -124,7 +120,7 @@ def scheduler(
     file.unlink(missing_ok=True)
     where = more or ("--host", "127.0.0.1")
     start = ("scheduler", "--port", port, "--no-dashboard", "--scheduler-file", file.name, *where)
-    with running(folder, "scheduler.log", *start) as process:
+    with dask_program(folder, "scheduler.log", *start) as process:
         wait_for(lambda: file.exists() and file.stat().st_size, "no scheduler")
         yield process, json.loads(file.read_text())["address"]
 
@@ -142,7 +138,7 @@ def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_kill
         _, address = stack.enter_context(scheduler(folder))
         other = str(other_version(folder))
         stack.enter_context(
-            running(
+            dask_program(
                 folder, "c.log", "worker", address, *WORKER, "--name", "other", PYTHONPATH=other
             )
         )
@@ -152,8 +148,8 @@ def test_a_cluster_gives_the_pools_table_though_a_worker_and_the_driver_are_kill
             "the other version is not refused",
         )
 
-        victim = stack.enter_context(running(folder, "a.log", "worker", address, *WORKER))
-        stack.enter_context(running(folder, "b.log", "worker", address, *WORKER))
+        victim = stack.enter_context(dask_program(folder, "a.log", "worker", address, *WORKER))
+        stack.enter_context(dask_program(folder, "b.log", "worker", address, *WORKER))
         wait_for(lambda: rows_so_far(folder) >= 3, "nothing comes")
         os.kill(victim.pid, signal.SIGKILL)
         after_kill = rows_so_far(folder)
@@ -185,14 +181,14 @@ def test_a_campaign_goes_on_when_its_scheduler_was_killed_and_is_started_again(
 ) -> None:
     with contextlib.ExitStack() as stack:
         process, address = stack.enter_context(scheduler(folder))
-        stack.enter_context(running(folder, "a.log", "worker", address, *WORKER))
+        stack.enter_context(dask_program(folder, "a.log", "worker", address, *WORKER))
         driver = driver_of(folder, address)
         wait_for(lambda: rows_so_far(folder) >= 3, "nothing comes")
         process.kill()
         process.wait()
         (folder / "slow").unlink()
         stack.enter_context(scheduler(folder, address.rpartition(":")[2]))
-        stack.enter_context(running(folder, "b.log", "worker", address, *WORKER))
+        stack.enter_context(dask_program(folder, "b.log", "worker", address, *WORKER))
         assert driver.wait(PATIENCE_S) == 0, (folder / "driver.log").read_text()
     assert read_columns(folder / "out/cases.parquet")["case"] == list(range(24))
 
@@ -201,7 +197,7 @@ def test_an_answer_that_died_with_its_worker_is_not_waited_for(folder: Path) -> 
     """The scheduler would hand the task to that worker again, as soon as it is back."""
     with contextlib.ExitStack() as stack:
         _, address = stack.enter_context(scheduler(folder))
-        worker = stack.enter_context(running(folder, "a.log", "worker", address, *WORKER))
+        worker = stack.enter_context(dask_program(folder, "a.log", "worker", address, *WORKER))
         command = [sys.executable, "-c", FETCH, address, str(worker.pid)]
         fetched = run_started(command)
     assert fetched.stdout == "finished None\n", fetched.stderr
@@ -246,7 +242,7 @@ def test_a_cluster_with_dasks_tls_runs_a_campaign_and_takes_nobody_elses_certifi
         )
         assert address.startswith("tls://127.0.0.1:")
         stack.enter_context(
-            running(folder, "a.log", "worker", address, *WORKER, "--host", "127.0.0.1", *ours)
+            dask_program(folder, "a.log", "worker", address, *WORKER, "--host", "127.0.0.1", *ours)
         )
         words = ("campaign", "plan.toml", "-o", "out", "--scheduler", address, *OPTIONS)
         monkeypatch.setattr(cluster, "CONNECT_S", 5.0)
@@ -311,7 +307,7 @@ def test_a_scheduler_on_loopback_that_listens_to_the_network_too_is_said(folder:
             pytest.skip("this machine has no other address than loopback's")
         here = f"tcp://127.0.0.1:{address.rpartition(':')[2]}"
         stack.enter_context(
-            running(folder, "a.log", "worker", here, *WORKER, "--host", "127.0.0.1")
+            dask_program(folder, "a.log", "worker", here, *WORKER, "--host", "127.0.0.1")
         )
         result = run_hilstar_here(
             "campaign", "plan.toml", "-o", "out", "--scheduler", here, *OPTIONS, cwd=folder

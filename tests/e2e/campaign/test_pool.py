@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.campaigns import read_columns, write_campaign
+from tests.support.campaigns import read_columns, rows_so_far, write_campaign
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.forks import Started
 from tests.support.servers import workers_of
@@ -41,12 +41,6 @@ def start(folder: Path, workers: int) -> subprocess.Popen[str]:
     command = [*HILSTAR, "campaign", "plan.toml", "-o", "out", "--workers", str(workers), *OPTIONS]
     pipe = subprocess.PIPE
     return Started(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
-
-
-def rows_so_far(folder: Path) -> int:
-    return sum(
-        path.read_bytes().count(b"\n") for path in (folder / "out" / "journal").glob("*.jsonl")
-    )
 
 
 def runs(pid: int) -> bool:

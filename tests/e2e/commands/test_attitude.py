@@ -30,7 +30,7 @@ def log_of(tmp_path: Path, rows: list[tuple[float, list[float]]]) -> Path:
     return path
 
 
-def told(*arguments: object) -> dict:
+def told_attitude(*arguments: object) -> dict:
     result = run_hilstar_here("attitude", *arguments, "--json")
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
@@ -39,7 +39,9 @@ def told(*arguments: object) -> dict:
 def test_an_attitude_of_a_log_s_gap_is_said_to_be_held(tmp_path, small_bench_file):
     q = [0.5, 0.5, -0.5, 0.5]
     log = log_of(tmp_path, [(t_s, q) for t_s in (0.0, 1.0, 2.0, 3.0, 60.0, 61.0)])
-    between, in_gap = (told(log, "--time", t_s, "--bench", small_bench_file) for t_s in (1.5, 30))
+    between, in_gap = (
+        told_attitude(log, "--time", t_s, "--bench", small_bench_file) for t_s in (1.5, 30)
+    )
     assert (between["held"], in_gap["held"]) == (False, True)
 
 
@@ -49,7 +51,7 @@ def test_boresight_and_stars_are_those_that_an_independent_rotation_finds(
 ):
     turn = Rotation.random(rng=np.random.default_rng(seed))
     q = turn.as_quat(scalar_first=True).tolist()
-    found = told(log_of(tmp_path, [(0.0, q), (1.0, q)]), "--bench", small_bench_file)
+    found = told_attitude(log_of(tmp_path, [(0.0, q), (1.0, q)]), "--bench", small_bench_file)
     boresight = SkyCoord(*turn.inv().apply([0.0, 0.0, 1.0]), representation_type="cartesian")
     boresight.representation_type = "unitspherical"
     looked = SkyCoord(found["ra_deg"], found["dec_deg"], unit="deg")
@@ -81,7 +83,10 @@ def test_a_time_within_a_log_may_be_seconds_or_a_date(tmp_path):
     ]
     rows = [(1_700_000_000.0 + 10 * k, q) for k, q in enumerate(turns)]
     log = log_of(tmp_path, rows)
-    by_seconds, by_date = told(log, "--time", "15"), told(log, "--time", "2023-11-14T22:13:35")
+    by_seconds, by_date = (
+        told_attitude(log, "--time", "15"),
+        told_attitude(log, "--time", "2023-11-14T22:13:35"),
+    )
     assert by_seconds == by_date
     assert by_seconds["t_ns"] == 1_700_000_015 * 10**9
     expected = Rotation.from_euler("z", 3, degrees=True)
@@ -105,7 +110,7 @@ def test_a_live_stream_is_awaited(tmp_path):
         bench.write_text(SMALL_BENCH + attitude_table(port))
         other = tmp_path / "other.toml"
         other.write_text(SMALL_BENCH)
-        found = told(bench, "--bench", other)
+        found = told_attitude(bench, "--bench", other)
     assert (found["ra_deg"], found["dec_deg"]) == pytest.approx((0, 0), abs=ROUNDING_DEG)
     # whose stars are told
     assert found["tracker"]["file"] == "other.toml"
@@ -116,8 +121,8 @@ def test_a_mounting_may_be_given_without_a_bench_file(tmp_path):
     looks along its x.
     """
     (tmp_path / "log.aem").write_text(kvn(rows_of([0, 0, 0, 1])))
-    assert told(tmp_path / "log.aem")["dec_deg"] == pytest.approx(90, abs=ROUNDING_DEG)
-    found = told(tmp_path / "log.aem", "--mounting", "0.5,-0.5,-0.5,-0.5")
+    assert told_attitude(tmp_path / "log.aem")["dec_deg"] == pytest.approx(90, abs=ROUNDING_DEG)
+    found = told_attitude(tmp_path / "log.aem", "--mounting", "0.5,-0.5,-0.5,-0.5")
     turn = Rotation.from_quat([-0.5, -0.5, -0.5, 0.5])
     ra_deg = np.degrees(np.arctan2(*turn.inv().apply([0.0, 0.0, 1.0])[1::-1]))
     assert (found["ra_deg"], found["dec_deg"]) == pytest.approx((ra_deg, 0), abs=ROUNDING_DEG)

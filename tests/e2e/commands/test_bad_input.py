@@ -43,7 +43,7 @@ def bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         yield
 
 
-def refusal(*words: str) -> str:
+def command_refusal(*words: str) -> str:
     """The line with which a command refuses, in this process."""
     with pytest.raises(HilstarError) as error:
         run([*map(str, words)])
@@ -132,7 +132,7 @@ def test_what_is_no_file_or_too_large_is_refused_wherever_a_file_is_named(tmp_pa
         names | {"large": "" if kind == "ledger" else f"{size_gb} GB or more"}
     ).items():
         absolute = str(tmp_path / name)
-        line = refusal(
+        line = command_refusal(
             *place(kind, name if kind in {"response", "grid"} and name[0] != "/" else absolute)
         )
         assert reason in line, (name, line)
@@ -154,7 +154,7 @@ def test_what_is_no_file_or_too_large_is_refused_wherever_a_file_is_named(tmp_pa
 )
 def test_a_log_of_another_format_is_named_with_those_that_are_read(head, words):
     Path("log").write_bytes(head)
-    line = refusal("convert", "log", "out.csv")
+    line = command_refusal("convert", "log", "out.csv")
     assert words in line
     assert readable() in line or "header must have" in line
 
@@ -163,9 +163,11 @@ def test_a_log_of_another_format_is_named_with_those_that_are_read(head, words):
 def test_whole_numbers_of_any_length_are_refused_by_name(digits):
     number = "9" * digits
     Path("bench.toml").write_text(BENCH + f"[tracker.detector]\ndevice_seed = {number}\n")
-    assert "device_seed" in refusal(*FRAME) or "thousands of digits" in refusal(*FRAME)
+    assert "device_seed" in command_refusal(*FRAME) or "thousands of digits" in command_refusal(
+        *FRAME
+    )
     Path("bench.toml").write_text(BENCH + f"[tracker.detector]\ndevice_seed = 0x{'f' * digits}\n")
-    assert "device_seed" in refusal(*FRAME)
+    assert "device_seed" in command_refusal(*FRAME)
     Path("bench.toml").write_text(BENCH)
     for text in (
         f"t_s,qw,qx,qy,qz,sequence\n1,1,0,0,0,{number}\n",
@@ -174,9 +176,9 @@ def test_whole_numbers_of_any_length_are_refused_by_name(digits):
         f'{{"t_ns":1,"q":[1,0,0,0],"sequence":-{number}}}\n{{"t_ns":0,"q":[1,0,0,0]}}\n',
     ):
         Path("log").write_text(text)
-        assert "log:" in refusal("convert", "log", "out.csv")
+        assert "log:" in command_refusal("convert", "log", "out.csv")
     Path("edges").write_text(f"host_ns,level\n{number},1\n")
-    assert "edges:2: " in refusal("latency", "none.mcap", "--edges", "edges")
+    assert "edges:2: " in command_refusal("latency", "none.mcap", "--edges", "edges")
 
 
 @pytest.mark.parametrize(
@@ -195,12 +197,12 @@ def test_whole_numbers_of_any_length_are_refused_by_name(digits):
 def test_a_curve_that_no_sensor_has_is_refused(rows):
     Path("qe.csv").write_text(rows)
     Path("bench.toml").write_text(BENCH.replace('"ccd47-20"', '"qe.csv"'))
-    assert "qe.csv:" in refusal(*FRAME)
+    assert "qe.csv:" in command_refusal(*FRAME)
 
 
 def test_a_key_of_thousands_of_parts_takes_no_minutes():
     Path("bench.toml").write_text(".".join(["a"] * 90_000) + " = 1\n")
-    assert "a key has 32 parts or more" in refusal(*FRAME)
+    assert "a key has 32 parts or more" in command_refusal(*FRAME)
 
 
 @pytest.mark.parametrize(
@@ -217,7 +219,7 @@ def test_a_key_of_thousands_of_parts_takes_no_minutes():
 )
 def test_a_refusal_repeats_little_of_a_bench_file(text):
     Path("bench.toml").write_text(text if text.startswith(("k", "[tracker]")) else BENCH + text)
-    assert len(refusal(*FRAME)) < 700
+    assert len(command_refusal(*FRAME)) < 700
 
 
 SIMULATE = ("simulate", "bench.toml", "--radec", "84,-1,0", "-o", "o.fits")
@@ -235,13 +237,13 @@ def test_a_curve_of_next_to_nothing_is_refused(words, key, value):
     Path("bench.toml").write_text(
         "\n".join(lines).replace("[tracker]", f"[tracker]\n{key} = {value}")
     )
-    assert f"[tracker] {key} = {value}: write a number from 1e-06 to 1" in refusal(*words)
+    assert f"[tracker] {key} = {value}: write a number from 1e-06 to 1" in command_refusal(*words)
 
 
 def test_a_curve_of_next_to_nothing_in_a_file_is_refused():
     Path("qe.csv").write_text("wavelength_nm,value\n400,5e-324\n900,5e-324\n")
     Path("bench.toml").write_text(BENCH.replace('"ccd47-20"', '"qe.csv"'))
-    refused = refusal(*FRAME)
+    refused = command_refusal(*FRAME)
     assert "quantum_efficiency" in refused or "no electron" in refused
 
 
@@ -263,7 +265,7 @@ def test_a_number_that_no_bench_has_is_refused_before_it_takes_memory(table, lin
     lines.insert(lines.index(f"[{table}]") + 1, line)
     Path("bench.toml").write_text("\n".join(lines) + "\n")
     for words in (FRAME, SIMULATE):
-        assert f"[{table}] {key} = " in refusal(*words)
+        assert f"[{table}] {key} = " in command_refusal(*words)
 
 
 BURST = '[[fault]]\nname = "protons"\nkind = "cosmic-rays"\nat_s = 0\nnumber = 4\nelectrons = 800\n'
@@ -289,12 +291,12 @@ BURST = '[[fault]]\nname = "protons"\nkind = "cosmic-rays"\nat_s = 0\nnumber = 4
 def test_an_exposure_of_no_length_is_refused_where_light_is_divided_by_it(words):
     Path("bench.toml").write_text(BENCH.replace("[tracker]", "[tracker]\nexposure_s = 0"))
     Path("burst.toml").write_text(BURST)
-    assert "exposure_s" in refusal(*words)
+    assert "exposure_s" in command_refusal(*words)
 
 
 def test_a_noise_budget_of_no_star_is_refused():
     Path("bench.toml").write_text(BENCH + "\n[sky]\nfaintest_v_mag = -3\n")
-    assert "[sky] faintest_v_mag = -3 leaves no star" in refusal(
+    assert "[sky] faintest_v_mag = -3 leaves no star" in command_refusal(
         "budget", "bench.toml", "--noise", "-o", "budget"
     )
 
@@ -305,7 +307,7 @@ def test_an_image_of_a_thousand_million_pixels_is_refused(table, size):
     Path("bench.toml").write_text(BENCH.replace(size, "[32768, 32768]"))
     assert (
         f"[{table}] resolution_px = [32768, 32768]: 1074 million pixels; write 67 million at most"
-        in refusal(*FRAME)
+        in command_refusal(*FRAME)
     )
 
 
@@ -434,5 +436,5 @@ def refusal_of_process(*words: str) -> str:
 def test_a_refusal_repeats_little_of_the_command_line(words):
     Path("bench.toml").write_text(BENCH)
     line = refusal_of_process(*words)
-    assert len(line) < 450  # the names of all commands among them
+    assert len(line) < 500  # the names of all commands among them
     assert "write" in line or "--help" in line

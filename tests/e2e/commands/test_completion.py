@@ -92,6 +92,7 @@ def test_tab_in_a_real_bash_completes_an_option_and_the_line_runs(env):
         ("hilstar attitude log.csv --reference en", "enu"),
         ("hilstar frame bench.toml --star Betel", "Betelgeuse"),
         ("hilstar help first", "first-light"),
+        ("hilstar help calibrate geo", "geometric"),
     ],
 )
 def test_bash_is_given_the_word(env, line, word):

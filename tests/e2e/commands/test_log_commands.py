@@ -35,7 +35,7 @@ def log(tmp_path) -> Path:
     return path
 
 
-def replayed(bench: Path, log: Path, output: Path, *options: str) -> list[dict[str, str]]:
+def replayed_log(bench: Path, log: Path, output: Path, *options: str) -> list[dict[str, str]]:
     result = run_hilstar_here(
         "replay", bench, log, "--headless", "--speed", "max", "-o", output, *options
     )
@@ -55,7 +55,7 @@ def test_every_form_of_a_log_replays_to_the_same_frames(tmp_path, small_bench_fi
     assert converted.returncode == 0, converted.stderr
     assert "21 attitudes" in converted.stdout
     ours, theirs = (
-        replayed(small_bench_file, path, tmp_path / path.suffix, "--step", "0.25")
+        replayed_log(small_bench_file, path, tmp_path / path.suffix, "--step", "0.25")
         for path in (log, other)
     )
     assert len(ours) == len(theirs) == 9
@@ -70,7 +70,7 @@ def test_every_form_of_a_log_replays_to_the_same_frames(tmp_path, small_bench_fi
 
 
 def test_a_replay_s_span_and_step_are_those_asked_for(tmp_path, small_bench_file, log):
-    rows = replayed(
+    rows = replayed_log(
         small_bench_file, log, tmp_path / "out", "--start", "0.5", "--stop", "1.5", "--step", "0.1"
     )
     assert [float(row["t_s"]) for row in rows] == pytest.approx([1.5 + 0.1 * k for k in range(11)])

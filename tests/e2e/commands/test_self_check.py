@@ -55,7 +55,7 @@ def json_lines(folder: Path, q: Numbers) -> Path:
     return path
 
 
-def aem(version: str = "1.0", **keywords: str) -> Callable[[Path, Numbers], Path]:
+def aem_writer(version: str = "1.0", **keywords: str) -> Callable[[Path, Numbers], Path]:
     def write(folder: Path, q: Numbers) -> Path:
         (folder / "a.aem").write_text(kvn(rows_of(q, q), version, **keywords))
         return folder / "a.aem"
@@ -96,7 +96,7 @@ def cic(folder: Path, q: Numbers) -> Path:
     return folder / "a.cic"
 
 
-def bag(
+def bag_writer(
     kind: str, frame: str, release: str, write: Callable[..., Path], name: str
 ) -> Callable[[Path, Numbers], Path]:
     def written(folder: Path, q: Numbers) -> Path:
@@ -117,29 +117,33 @@ B2A = {"ATTITUDE_DIR": "B2A", "QUATERNION_TYPE": "FIRST"}
 LOGS = {
     "csv": (csv, "q", ()),
     "json": (json_lines, "q", ()),
-    "aem-1": (aem(), "Q1 Q2 Q3 QC", ()),
-    "aem-1-back": (aem(**B2A), "QC Q1 Q2 Q3", ()),
+    "aem-1": (aem_writer(), "Q1 Q2 Q3 QC", ()),
+    "aem-1-back": (aem_writer(**B2A), "QC Q1 Q2 Q3", ()),
     "aem-1-from-body": (
-        aem(REF_FRAME_A="SC_BODY_1", REF_FRAME_B="EME2000", QUATERNION_TYPE="FIRST"),
+        aem_writer(REF_FRAME_A="SC_BODY_1", REF_FRAME_B="EME2000", QUATERNION_TYPE="FIRST"),
         "QC Q1 Q2 Q3",
         (),
     ),
-    "aem-2": (aem("2.0"), "Q1 Q2 Q3 QC", ()),
-    "aem-2-teme": (aem("2.0", REF_FRAME_A="TEME"), "Q1 Q2 Q3 QC", ()),
-    "aem-1-itrf": (aem("1.0", REF_FRAME_A="ITRF-97", ATTITUDE_DIR="B2A"), "Q1 Q2 Q3 QC", ()),
+    "aem-2": (aem_writer("2.0"), "Q1 Q2 Q3 QC", ()),
+    "aem-2-teme": (aem_writer("2.0", REF_FRAME_A="TEME"), "Q1 Q2 Q3 QC", ()),
+    "aem-1-itrf": (aem_writer("1.0", REF_FRAME_A="ITRF-97", ATTITUDE_DIR="B2A"), "Q1 Q2 Q3 QC", ()),
     "aem-2-tracker": (
-        aem("2.0", REF_FRAME_A="STARTRACKER_1", REF_FRAME_B="ICRF"),
+        aem_writer("2.0", REF_FRAME_A="STARTRACKER_1", REF_FRAME_B="ICRF"),
         "Q1 Q2 Q3 QC",
         (),
     ),
     "ck": (kernel, "m2q(C), C from J2000", ()),
     "ros1": (
-        bag(ros_bags.POSE_STAMPED, "map", "noetic", write_bag1, ".bag"),
+        bag_writer(ros_bags.POSE_STAMPED, "map", "noetic", write_bag1, ".bag"),
         "x y z w",
         ("--reference", "enu", STATED[2]),
     ),
-    "ros2": (bag(ros_bags.IMU, "", "humble", write_bag2, ""), "x y z w", ("--reference", "icrs")),
-    "ros2-mcap": (bag(ros_bags.TF, "gcrf", "jazzy", write_mcap, ".mcap"), "x y z w", ()),
+    "ros2": (
+        bag_writer(ros_bags.IMU, "", "humble", write_bag2, ""),
+        "x y z w",
+        ("--reference", "icrs"),
+    ),
+    "ros2-mcap": (bag_writer(ros_bags.TF, "gcrf", "jazzy", write_mcap, ".mcap"), "x y z w", ()),
     "stk": (stk, "Q1 Q2 Q3 QC", ()),
     "cic": (cic, "QC Q1 Q2 Q3", ()),
 }

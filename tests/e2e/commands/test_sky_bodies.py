@@ -42,7 +42,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def frame(bench_file: Path, radec: str, *more: str) -> tuple[dict, list[dict[str, str]]]:
+def frame_of_radec(bench_file: Path, radec: str, *more: str) -> tuple[dict, list[dict[str, str]]]:
     folder = bench_file.parent
     done = run_hilstar_here(
         "frame",
@@ -62,7 +62,7 @@ def frame(bench_file: Path, radec: str, *more: str) -> tuple[dict, list[dict[str
 
 @pytest.mark.parametrize("at_s", [0, 86_400])
 def test_planets_in_the_truth_table_are_where_skyfield_has_them(bodies_file, at_s):
-    summary, rows = frame(bodies_file, JUPITER, "--at", str(at_s))
+    summary, rows = frame_of_radec(bodies_file, JUPITER, "--at", str(at_s))
     named = {row["name"]: row for row in rows if row["name"]}
     assert {"Jupiter", "Mars"} <= set(named)
     assert {row["hip"] for row in named.values()} == {"0"}
@@ -319,7 +319,7 @@ def test_without_the_extra_the_machine_lacks_something(bodies_file, monkeypatch)
 
 
 def test_a_bench_without_bodies_has_no_name_in_its_table(small_bench_file):
-    _, rows = frame(small_bench_file, MOON)
+    _, rows = frame_of_radec(small_bench_file, MOON)
     assert {row["name"] for row in rows} == {""}
 
 

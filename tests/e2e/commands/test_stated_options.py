@@ -74,7 +74,7 @@ def words(command: str, files, tmp_path, port: int = 9) -> tuple[object, ...]:
     }[command]
 
 
-def off_rad(q) -> float:
+def off_camera_rad(q) -> float:
     return (Rotation.from_quat([float(c) for c in q], scalar_first=True) * CAMERA.inv()).magnitude()
 
 
@@ -94,7 +94,7 @@ def test_each_command_uses_a_convention_and_a_mounting(tmp_path, files, command)
         if command == "send":
             datagrams = iter(lambda: receiver.recv(100), b"")  # its time requests are among them
             packet = next(datagram for datagram in datagrams if len(datagram) == ATTITUDE_BYTES)
-            assert off_rad(struct.unpack_from("<4d", packet, 16)) < SAME_RAD
+            assert off_camera_rad(struct.unpack_from("<4d", packet, 16)) < SAME_RAD
     if command == "attitude":
         assert "RA 84.0000, Dec -1.2000, roll 10.0000 deg" in result.stdout
     if command in {"replay", "convert"}:
@@ -102,13 +102,13 @@ def test_each_command_uses_a_convention_and_a_mounting(tmp_path, files, command)
         with path.open() as file:
             rows = list(csv.DictReader(file))
         assert (
-            max(off_rad([row[name] for name in ("qw", "qx", "qy", "qz")]) for row in rows)
+            max(off_camera_rad([row[name] for name in ("qw", "qx", "qy", "qz")]) for row in rows)
             < SAME_RAD
         )
     if command == "simulate":
         (path,) = (tmp_path / "exposures").glob("*.fits")
         header = fits.getheader(path)
-        assert off_rad([header[name] for name in ("QW", "QX", "QY", "QZ")]) < SHOWN_RAD
+        assert off_camera_rad([header[name] for name in ("QW", "QX", "QY", "QZ")]) < SHOWN_RAD
 
 
 @pytest.mark.parametrize("command", COMMANDS)

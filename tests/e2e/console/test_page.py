@@ -9,13 +9,12 @@ import signal
 import time
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 
-from hilstar.attitude.logs.mcap_log import read_messages
-from hilstar.server.record.ledger_records import EventRecord, frame_records
+from hilstar.server.record.ledger_records import frame_records
 from tests.support.commands import run_hilstar_here
+from tests.support.ledgers import read_events
 from tests.support.pages import PageAddress, children, gone, live, page_of, picture_of
 from tests.support.run_page import run_data_of
 from tests.support.senders import LYRA, ORION, connected, talking
@@ -41,10 +40,6 @@ def run(tmp_path_factory):
 @pytest.fixture
 def page(run) -> PageAddress:
     return run[1]
-
-
-def events(ledger: Path) -> list[EventRecord]:
-    return [msgspec.json.decode(data, type=EventRecord) for data in read_messages(ledger, "/event")]
 
 
 def test_health_says_what_is_wrong_and_turns_within_half_a_second(run):
@@ -128,8 +123,8 @@ def test_each_control_acts_on_the_next_frames_and_is_in_the_ledger_with_who(run)
             {"line": "mark written"},
         )
         wait_for(lambda: page.health_is(True))
-    wait_for(lambda: any(event.kind == "mark" for event in events(folder / "run.mcap")))
-    told = [(event.detail, event.who) for event in events(folder / "run.mcap") if event.who]
+    wait_for(lambda: any(event.kind == "mark" for event in read_events(folder / "run.mcap")))
+    told = [(event.detail, event.who) for event in read_events(folder / "run.mcap") if event.who]
     assert told[:2] == [
         ("blank on, by Ada: blank", "Ada"),
         ("blank off, by Ada: the sky of the attitude again", "Ada"),

@@ -94,7 +94,7 @@ def systemd(tmp_path):
     found.close()
 
 
-def cpu_s(pid: int) -> float:
+def process_cpu_s(pid: int) -> float:
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
@@ -124,5 +124,5 @@ def test_killed_and_started_again_it_shows_frames_within_three_seconds(systemd):
     time.sleep(RESTART_S)
     with systemd.started() as process:
         systemd.told("READY=1")
-        back_s = cpu_s(process.pid) + RESTART_S
+        back_s = process_cpu_s(process.pid) + RESTART_S
     assert back_s < BACK_S

@@ -26,7 +26,7 @@ def map_files(tmp_path):
     return tmp_path
 
 
-def made(folder, *options):
+def mapped_psf(folder, *options):
     return run_hilstar_here(
         "optics",
         "map",
@@ -39,7 +39,7 @@ def made(folder, *options):
 
 
 def test_a_map_becomes_the_tracker_s_glass(map_files):
-    result = made(map_files, "--oversampling", "4", "--json")
+    result = mapped_psf(map_files, "--oversampling", "4", "--json")
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
     assert (told["points"], told["wavelengths_nm"], told["focuses_um"]) == (
@@ -68,7 +68,7 @@ def test_a_map_becomes_the_tracker_s_glass(map_files):
 
 
 def test_a_plain_map_says_what_it_made(map_files):
-    result = made(map_files, "--oversampling", "4", "--tolerance", "0.01")
+    result = mapped_psf(map_files, "--oversampling", "4", "--tolerance", "0.01")
     assert result.returncode == 0, result.stderr
     assert "25 field points, 4 wavelengths, 1 focus positions:" in result.stdout
 
@@ -83,10 +83,10 @@ def test_a_plain_map_says_what_it_made(map_files):
 )
 def test_a_table_that_does_not_fit_is_one_line(map_files, points, advice):
     (map_files / "points.csv").write_text(points)
-    assert_refused(made(map_files, "--oversampling", "4"), 2, "points.csv", advice)
+    assert_refused(mapped_psf(map_files, "--oversampling", "4"), 2, "points.csv", advice)
 
 
 def test_a_stack_that_is_none_is_one_line(map_files):
     (map_files / "stack.fits").write_bytes(b"no image")
-    assert_refused(made(map_files), 2, "stack.fits", "not a FITS image")
+    assert_refused(mapped_psf(map_files), 2, "stack.fits", "not a FITS image")
     assert not (map_files / "psf.fits").exists()

@@ -67,7 +67,7 @@ def solver_python(tmp_path_factory) -> Path:
     return python
 
 
-def centroids(image: np.ndarray, width_tolerance: float) -> np.ndarray:
+def lone_centroids(image: np.ndarray, width_tolerance: float) -> np.ndarray:
     """Centres of gravity (y, x) of lone stars away from the edge, brightest first; NumPy and
     SciPy alone.
     """
@@ -146,7 +146,7 @@ def solved_fields(solver_python: Path, fields: list[np.ndarray]) -> list[dict[st
 @pytest.mark.parametrize("kind", ["linear", "codes"])
 def test_the_solved_attitude_is_the_commanded_one(solver_python, fields, kind):
     limit_arcsec = LIMITS_ARCSEC[kind]
-    found = [centroids(image, WIDTH_TOLERANCE[kind])[: STARS[kind]] for image in fields[kind]]
+    found = [lone_centroids(image, WIDTH_TOLERANCE[kind])[: STARS[kind]] for image in fields[kind]]
     for (ra, dec, roll), solution in zip(
         ATTITUDES, solved_fields(solver_python, found), strict=True
     ):
@@ -203,7 +203,7 @@ def test_pictures_for_basilisk_s_camera_solve_to_basilisk_s_attitude(solver_pyth
     # 12 bits, the leading ones
     assert all(picture.dtype == np.uint16 and not (picture & 15).any() for picture in pictures)
     truth = Truth(tmp_path)
-    found = [centroids(lit_pixels(picture >> 4), 0.3)[:40] for picture in pictures]
+    found = [lone_centroids(lit_pixels(picture >> 4), 0.3)[:40] for picture in pictures]
     for t_ns, solution in zip(times_ns, solved_fields(solver_python, found), strict=True):
         row = truth.row(t_ns)
         boresight = (pose * truth.body_from_n[row]).inv().apply([0, 0, 1])

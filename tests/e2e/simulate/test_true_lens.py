@@ -69,7 +69,7 @@ def calibrated(path, case, rng):
     write_calibrated(path, calibrate_geometry(plan, nominal, seen, rng, tracker_known=True), None)
 
 
-def verdict(path):
+def verify_verdict(path):
     result = run_hilstar_here("verify", path, "--fields", "6", "--json")
     assert result.returncode == 0, result.stderr
     return json.loads(result.stdout)
@@ -81,7 +81,7 @@ def test_a_traced_bench_fails_as_assumed_and_passes_once_its_dots_are_measured(t
     (tmp_path / "flight.toml").write_text("k1 = 0.0\n")
     path = tmp_path / "bench.toml"
     path.write_text(BENCH + '[verify]\ntrue_geometry = "truth.toml"\n')
-    before = verdict(path)
+    before = verify_verdict(path)
     assert not before["passed"]
     assert any(
         "tilted by" in reason and "calibrate geometric" in reason for reason in before["reasons"]
@@ -89,7 +89,7 @@ def test_a_traced_bench_fails_as_assumed_and_passes_once_its_dots_are_measured(t
     path.write_text(
         path.read_text().replace("[collimator]", '[collimator]\ngeometry = "geometry.toml"')
     )
-    after = verdict(path)
+    after = verify_verdict(path)
     assert after["centroid_error_px"]["p95"] < 0.1, after["reasons"]
     assert not any(
         "calibrate geometric" in r or "centroids" in r or "not where" in r for r in after["reasons"]

@@ -25,7 +25,7 @@ nm = 200
 """
 
 
-def made(folder, text=PUPIL, *options):
+def zernike_psf(folder, text=PUPIL, *options):
     (folder / "lens.toml").write_text(text)
     return run_hilstar_here(
         "optics", "zernike", folder / "lens.toml", "-o", folder / "psf.fits", *options
@@ -34,7 +34,7 @@ def made(folder, text=PUPIL, *options):
 
 def test_aberrations_become_the_tracker_s_glass(tmp_path):
     pytest.importorskip("poppy")
-    result = made(tmp_path, PUPIL, "--json")
+    result = zernike_psf(tmp_path, PUPIL, "--json")
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
     assert (told["points"], told["wavelengths_nm"]) == (4, [500, 650])
@@ -56,10 +56,10 @@ def test_aberrations_become_the_tracker_s_glass(tmp_path):
 )
 def test_a_file_that_is_none_is_one_line(tmp_path, text, advice):
     pytest.importorskip("poppy")
-    assert_refused(made(tmp_path, text), 2, "lens.toml", advice)
+    assert_refused(zernike_psf(tmp_path, text), 2, "lens.toml", advice)
 
 
 def test_without_poppy_it_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "poppy", None)
     monkeypatch.setitem(sys.modules, "poppy.matrixDFT", None)
-    assert_refused(made(tmp_path), 3, "pip install 'hilstar[optics]'")
+    assert_refused(zernike_psf(tmp_path), 3, "pip install 'hilstar[optics]'")

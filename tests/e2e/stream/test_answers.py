@@ -204,19 +204,19 @@ def test_a_file_that_never_ends_takes_no_core_and_is_told(tmp_path, kind):
                 lambda: source.take(20) == [] and source.refusals().get("flood", 0) > 100,
                 "what is dropped",
             )
-        before_s, begun_ns = cpu_s(source), time.monotonic_ns()
+        before_s, begun_ns = reader_cpu_s(source), time.monotonic_ns()
         wait_for(
             lambda: source.take(20) == [] and time.monotonic_ns() - begun_ns > 10**9, "a second"
         )
         # Without a rest the reader takes the whole of a core.
-        assert cpu_s(source) - before_s < 0.3 * (time.monotonic_ns() - begun_ns) / 1e9
+        assert reader_cpu_s(source) - before_s < 0.3 * (time.monotonic_ns() - begun_ns) / 1e9
         path.unlink()
         path.write_bytes(STREAM)
         assert_answers(gathered(source, 3))
         assert source.trouble() == ""
 
 
-def cpu_s(source: AnswersApart) -> float:
+def reader_cpu_s(source: AnswersApart) -> float:
     """The CPU time of the process that reads."""
     fields = (
         Path(f"/proc/{source._process._process.pid}/stat").read_text().rpartition(")")[2].split()

@@ -41,7 +41,7 @@ MAX_CLOCK_MS = 2.0
 HELD_S = 0.2
 
 
-def log(path, seconds):
+def swing_log(path, seconds):
     """A slow swing about Orion's belt: a turn at one rate would not tell a clock from a bias."""
     q, lines = from_radec_roll_deg(84.057, -1.2, 0.0), ["t_s,qw,qx,qy,qz"]
     for k in range(round(seconds * 50) + 1):
@@ -78,7 +78,7 @@ def test_flight_software_before_the_camera_is_assessed(tmp_path):
     )
     flight = FlightSoftware(bench)
     ledger, address = tmp_path / "run.mcap", own_address()
-    replay = [*HILSTAR, "replay", bench, log(tmp_path / "log.csv", 120.0), "--headless"]
+    replay = [*HILSTAR, "replay", bench, swing_log(tmp_path / "log.csv", 120.0), "--headless"]
     replay += ["--feed", endpoint, "--ledger", ledger]
     watcher = [*HILSTAR, "tracker", bench, "--watch", endpoint, "--camera", address, "--json"]
     quiet = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
@@ -123,7 +123,7 @@ def simulated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("simulated")
     detector = {"read_noise_e": 8.0, "offset_dn": 100.0, "dark_e_per_s": 20.0, "prnu": 0.01}
     (folder / "bench.toml").write_text(bench_text(TWIN, {"tracker.detector": detector}))
-    words = ("--log", log(folder / "log.csv", 4.0), "--frames", str(FRAMES), "--seed", "7")
+    words = ("--log", swing_log(folder / "log.csv", 4.0), "--frames", str(FRAMES), "--seed", "7")
     drawn = run_hilstar_here("simulate", folder / "bench.toml", *words, "-o", folder / "frames")
     assert drawn.returncode == 0, drawn.stderr
     frames = [fits.getdata(path) for path in sorted((folder / "frames").glob("*.fits"))]

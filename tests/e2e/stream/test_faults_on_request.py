@@ -48,7 +48,7 @@ MESSAGES = (
 STEP_S = 0.01
 
 
-def told(ledger: Path) -> list[str]:
+def told_faults(ledger: Path) -> list[str]:
     """What the ledger of a run says so far of faults: those that began and ended, and the
     messages that were refused.
     """
@@ -80,7 +80,9 @@ def test_a_live_run_takes_faults_from_file_and_stream_and_is_replayed(tmp_path):
             for message, effects in [*MESSAGES, (None, ["end rays"])]:
                 if message is not None:
                     faults.send(message)
-                wait_for(lambda wanted=Counter(effects): wanted <= Counter(told(ledger)), effects)
+                wait_for(
+                    lambda wanted=Counter(effects): wanted <= Counter(told_faults(ledger)), effects
+                )
             summary = interrupted(process)
             sending.join()
     faulty = summary["faults"]

@@ -49,7 +49,7 @@ def tables(port: int, answers: int) -> str:
 
 
 @contextmanager
-def tracker(port: int) -> Iterator[np.ndarray]:
+def resting_tracker(port: int) -> Iterator[np.ndarray]:
     """A tracker at rest that answers 20 times a second, off by its bias; what it answers."""
     q = multiply(
         from_rotation_vector(BIAS_ARCSEC / ARCSEC_PER_RAD),
@@ -80,7 +80,7 @@ def tracker(port: int) -> Iterator[np.ndarray]:
         thread.join()
 
 
-def off_arcsec(q: np.ndarray, other: np.ndarray) -> float:
+def attitudes_apart_arcsec(q: np.ndarray, other: np.ndarray) -> float:
     return 2 * float(np.arccos(min(1.0, abs(q @ other)))) * ARCSEC_PER_RAD
 
 
@@ -94,7 +94,10 @@ def test_as_json_it_is_where_it_sends_and_what_was_written(tmp_path):
 
 def test_an_fmu_drives_a_bench_and_hears_what_the_tracker_answers(tmp_path):
     port, answers = free_port(), free_port()
-    with scpi_run(tmp_path, tables(port, answers)) as (served, found), tracker(answers) as answered:
+    with (
+        scpi_run(tmp_path, tables(port, answers)) as (served, found),
+        resting_tracker(answers) as answered,
+    ):
         done = run_hilstar_here("fmu", tmp_path / "bench.toml", "-o", tmp_path / "display.fmu")
         assert done.returncode == 0 and done.stdout == f"{tmp_path / 'display.fmu'}\n"
         assert validate_fmu(str(tmp_path / "display.fmu")) == []
@@ -112,7 +115,9 @@ def test_an_fmu_drives_a_bench_and_hears_what_the_tracker_answers(tmp_path):
         assert int(last["health"]) & (protocol.HEALTH_BLANK | protocol.HEALTH_STALE) == 0
         assert int(last["health"]) & protocol.HEALTH_CLOCK_SYNCHRONISED
         assert (
-            off_arcsec(np.array([last[f"answered_q_{axis}"] for axis in "wxyz"]), answered)
+            attitudes_apart_arcsec(
+                np.array([last[f"answered_q_{axis}"] for axis in "wxyz"]), answered
+            )
             < NEAR_ARCSEC
         )
         assert SECONDS - 1.0 < last["answered_t_s"] < SECONDS
@@ -127,7 +132,10 @@ def test_an_fmu_drives_a_bench_and_hears_what_the_tracker_answers(tmp_path):
                 return sender.answer is not None
 
             wait_for(passed_on, served.lines)
-            assert off_arcsec(np.array(sender.answer.q_icrs_to_cam), answered) < NEAR_ARCSEC
+            assert (
+                attitudes_apart_arcsec(np.array(sender.answer.q_icrs_to_cam), answered)
+                < NEAR_ARCSEC
+            )
 
 
 def test_its_packets_are_those_of_the_wire(tmp_path, monkeypatch):

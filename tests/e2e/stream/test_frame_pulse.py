@@ -21,7 +21,7 @@ EVERY, REFRESH_HZ, SECONDS = 24, 60, 1.7
 APART_MS = 400.0
 
 
-def bench(tmp_path, port, **sync):
+def pulse_bench(tmp_path, port, **sync):
     path = tmp_path / "bench.toml"
     tables = {
         "render": {"quantisation": "round"},
@@ -37,7 +37,7 @@ def server():
         yield server
 
 
-def replayed(tmp_path, bench_file):
+def replayed_pulses(tmp_path, bench_file):
     log = still_log(tmp_path / "still.csv")
     kept = ("--ledger", tmp_path / "run.mcap")
     done = run_hilstar_here(
@@ -50,7 +50,7 @@ def replayed(tmp_path, bench_file):
 @pytest.mark.timing
 def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_path, server):
     with CoreWaits(os.getpid()) as waited:
-        summary, _ = replayed(tmp_path, bench(tmp_path, server.url, pulse_ms=20))
+        summary, _ = replayed_pulses(tmp_path, pulse_bench(tmp_path, server.url, pulse_ms=20))
     told, pulses = summary["sync"], server.pulses()
     assert told["port"] == server.url
     assert (
@@ -78,7 +78,7 @@ def test_a_port_that_is_cut_stops_no_frame(tmp_path, server):
 
     thread = threading.Thread(target=cut, daemon=True)
     thread.start()
-    summary, said = replayed(tmp_path, bench(tmp_path, f"{server.url}?timeout=0.3"))
+    summary, said = replayed_pulses(tmp_path, pulse_bench(tmp_path, f"{server.url}?timeout=0.3"))
     thread.join()
     assert summary["sync"]["lost"] == 1 and summary["sync"]["pulses"] >= 1
     assert summary["frames"] + summary["missed_frames"] >= int(SECONDS * REFRESH_HZ)
@@ -102,12 +102,12 @@ def test_a_port_that_is_cut_stops_no_frame(tmp_path, server):
 
 
 def test_a_port_that_is_not_there_is_the_machine_s(tmp_path):
-    path = bench(tmp_path, "/dev/nothing-there")
+    path = pulse_bench(tmp_path, "/dev/nothing-there")
     result = run_hilstar_here("serve", path, "--headless", "--frames", "1")
     assert_refused(result, 3, "[sync] port = /dev/nothing-there", "plug it in")
 
 
-def served(tmp_path, *changes):
+def served_pulses(tmp_path, *changes):
     path = tmp_path / "beat.toml"
     tables = {
         "render": {"quantisation": "round", "tolerance_px": 0.02},
@@ -123,7 +123,7 @@ def served(tmp_path, *changes):
 
 
 def test_serve_says_a_beat_that_matters_and_nothing_of_one_that_does_not(tmp_path):
-    beat, lines = served(tmp_path, {"tracker": {"exposure_s": 0.105}})
+    beat, lines = served_pulses(tmp_path, {"tracker": {"exposure_s": 0.105}})
     assert (
         len(lines) == 1
         and "[tracker] exposure_s = 0.1" in lines[0]
@@ -138,7 +138,7 @@ def test_serve_says_a_beat_that_matters_and_nothing_of_one_that_does_not(tmp_pat
     assert beat["worst_arcsec"] == pytest.approx(1.0, rel=1e-6) and beat[
         "period_s"
     ] == pytest.approx(0.35)
-    beat, lines = served(tmp_path)
+    beat, lines = served_pulses(tmp_path)
     assert (
         lines == []
         and beat["worst_arcsec"] == 0.0

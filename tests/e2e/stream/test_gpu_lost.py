@@ -62,7 +62,7 @@ sys.exit(run_command(sys.argv[4:]))
 LOG_S = 4
 
 
-def planted(
+def harmed_replay(
     folder: Path, harm: str, slept_s: float, table: int = 0, quantisation: str = "round", **more
 ):
     """`replay --headless` (or with a window) of a log of LOG_S, with harm done in it; its
@@ -108,24 +108,24 @@ def assert_ended_early(ran, ledger: Path, folder: Path, *words: str) -> None:
 
 @pytest.mark.parametrize("quantisation", ["round", "dither", "exact"])
 def test_a_table_that_changed_in_sleep_ends_the_run(tmp_path, quantisation):
-    ran, ledger = planted(tmp_path, "table", 60.0, quantisation=quantisation)
+    ran, ledger = harmed_replay(tmp_path, "table", 60.0, quantisation=quantisation)
     assert_ended_early(ran, ledger, tmp_path, "memory was lost in sleep, 1 of the tables")
     assert "the machine slept for 60.0 s" in ran.stderr
 
 
 def test_a_gl_error_ends_the_run(tmp_path):
-    ran, ledger = planted(tmp_path, "error", 0.0)
+    ran, ledger = harmed_replay(tmp_path, "error", 0.0)
     assert_ended_early(ran, ledger, tmp_path, "GL_INVALID_ENUM")
 
 
 def test_a_gpu_that_was_reset_ends_the_run(tmp_path):
     """The status is planted behind the driver's own, which is asked first."""
-    ran, ledger = planted(tmp_path, "reset", 0.0)
+    ran, ledger = harmed_replay(tmp_path, "reset", 0.0)
     assert_ended_early(ran, ledger, tmp_path, "the GPU is lost", "reset for an unknown reason")
 
 
 def test_after_a_sleep_that_harmed_nothing_the_run_goes_on(tmp_path):
-    ran, ledger = planted(tmp_path, "nothing", 60.0)
+    ran, ledger = harmed_replay(tmp_path, "nothing", 60.0)
     assert ran.returncode == 0, ran.stderr
     summary = json.loads(ran.stdout)
     assert summary["events"] == {"resumed": 1} | {
@@ -137,7 +137,9 @@ def test_after_a_sleep_that_harmed_nothing_the_run_goes_on(tmp_path):
 
 def test_a_window_s_own_table_that_changed_in_sleep_ends_the_run(tmp_path):
     with xvfb(tmp_path) as screen:
-        ran, ledger = planted(tmp_path, "table", 60.0, table=-1, how="--windowed", env=screen.env)
+        ran, ledger = harmed_replay(
+            tmp_path, "table", 60.0, table=-1, how="--windowed", env=screen.env
+        )
     assert_ended_early(ran, ledger, tmp_path, "memory was lost in sleep, 1 of the tables")
     # the window's own check of its codes leaves no error
     assert "before the first frame" not in ran.stderr

@@ -35,7 +35,7 @@ RATE = (0.0, 0.0, 0.1)
 LIMIT_BYTES = 20_000
 
 
-def stream(sender, count: int) -> None:
+def send_turn(sender, count: int) -> None:
     """A turn at 100 Hz, on a bench clock that stood at 50 s when it began; a wrong packet after
     each tenth.
     """
@@ -58,21 +58,21 @@ def messages(path: Path) -> dict[str, list[dict]]:
     return found
 
 
-def served(tmp_path, *options: str) -> tuple[Path, dict]:
+def served_ledger(tmp_path, *options: str) -> tuple[Path, dict]:
     ledger = tmp_path / "run.mcap"
     with (
         publisher() as (sender, port),
         serving(tmp_path, port, "--ledger", str(ledger), *options) as process,
     ):
         process.shows()
-        stream(sender, 100)
+        send_turn(sender, 100)
         process.has_received(110)
         process.send_signal(signal.SIGINT)
         return ledger, summary_of(process)
 
 
 def test_every_packet_and_every_frame_is_there(tmp_path):
-    ledger, summary = served(tmp_path)
+    ledger, summary = served_ledger(tmp_path)
     assert summary["ledger"] == {"path": str(ledger), "failure": None, "unrecorded": 0}
     found = messages(ledger)
     assert len(found["/attitude"]) == summary["packets"]["received"] == 110
@@ -130,7 +130,7 @@ def test_what_was_drawn_is_drawn_again_bit_for_bit(tmp_path):
 
 
 def test_a_live_run_s_ledger_is_an_attitude_log_too(tmp_path):
-    ledger, _ = served(tmp_path)
+    ledger, _ = served_ledger(tmp_path)
     samples = read_log(ledger)
     assert len(samples) == 100
     converted = run_hilstar_here("convert", ledger, tmp_path / "run.csv")
@@ -151,7 +151,7 @@ def test_after_a_kill_all_but_the_last_half_second_can_be_read(tmp_path):
     with publisher() as (sender, port), serving(tmp_path, port, "--ledger", str(ledger)) as process:
         process.shows()
         with CoreWaits(process.pid) as waited:
-            stream(sender, 150)
+            send_turn(sender, 150)
             process.kill()
             process.wait()
     found, frames = read_log(ledger), list(drawable_frames(ledger))
@@ -194,7 +194,7 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
             assert process.stderr is not None
             process.stderr.readline()
             await_subscriber(sender)
-            stream(sender, 200)
+            send_turn(sender, 200)
             out, err = process.communicate(timeout=PATIENCE_S)
     assert process.returncode == 1, err
     summary = json.loads(out)
@@ -309,7 +309,7 @@ def test_a_flood_of_wrong_packets_is_counted_and_the_ledger_stays_small(tmp_path
 
 
 def test_no_flipped_bit_changes_an_attitude_unsaid(tmp_path, rng):
-    ledger, _ = served(tmp_path)
+    ledger, _ = served_ledger(tmp_path)
     data = ledger.read_bytes()
     truth = [(s.t_ns, *s.q_icrs_to_cam) for s in read_log(ledger)]
     damaged = tmp_path / "damaged.mcap"

@@ -42,7 +42,7 @@ NUTATED_RAD = 0.25 * 2.5e-3
 MESSAGES = MessageSplitter().feed(STREAM_2025.read_bytes())
 
 
-def bench_of(folder: Path, *lines: str, mounting: tuple[float, ...] = MOUNTING) -> Path:
+def nasa42_bench(folder: Path, *lines: str, mounting: tuple[float, ...] = MOUNTING) -> Path:
     path = folder / "bench.toml"
     mounted = SMALL_BENCH.replace("[tracker]", f"[tracker]\nq_body_to_cam = {list(mounting)}")
     path.write_text("\n".join([mounted, "[attitude]", 'source = "42"', *lines, ""]))
@@ -79,7 +79,7 @@ def server() -> Iterator[socket.socket]:
 def test_a_recorded_run_of_42_is_shown_and_every_message_acknowledged(tmp_path):
     ledger = tmp_path / "run.mcap"
     with server() as listener:
-        bench = bench_of(
+        bench = nasa42_bench(
             tmp_path,
             f'endpoint = "tcp://127.0.0.1:{listener.getsockname()[1]}"',
             'spacecraft = "SC[0]"',
@@ -104,7 +104,7 @@ def test_a_recorded_run_of_42_is_shown_and_every_message_acknowledged(tmp_path):
         assert angle_between_rad(np.array(frame.q), expected) < NUTATED_RAD
 
 
-def turning(seconds: float) -> Rotation:
+def body_turn(seconds: float) -> Rotation:
     """The body after so long: v_B of v_N."""
     return Rotation.from_rotvec(-RATE_RAD_S * seconds) * Rotation.from_euler(
         "zyx", [84, 20, 30], degrees=True
@@ -116,11 +116,12 @@ def test_every_frame_is_the_body_s_attitude_of_its_time_through_the_mounting(tmp
         port = listener.getsockname()[1]
         reader = MessageReader(0, Mounting(MOUNTING))
         with (
-            load(bench_of(tmp_path)) as bench,
+            load(nasa42_bench(tmp_path)) as bench,
             Nasa42Link(f"tcp://127.0.0.1:{port}", reader) as link,
         ):
             steps = (
-                message(k * STEP_S, turning(k * STEP_S), RATE_RAD_S).encode() for k in range(10**6)
+                message(k * STEP_S, body_turn(k * STEP_S), RATE_RAD_S).encode()
+                for k in range(10**6)
             )
 
             def simulate() -> None:
@@ -138,7 +139,7 @@ def test_every_frame_is_the_body_s_attitude_of_its_time_through_the_mounting(tmp
     assert len(shown) > 60
     assert summary.packets.refused == 0
     for t_ns, attitude in shown:
-        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * turning(
+        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * body_turn(
             (t_ns - BEGIN_NS) / 1e9
         )
         assert (
@@ -151,10 +152,10 @@ def test_in_lockstep_42_runs_as_fast_as_frames_come_and_each_message_is_a_frame(
     twice.
     """
     drawn = []
-    steps = [message(36.0 * k, turning(float(k)), RATE_RAD_S).encode() for k in range(200)]
+    steps = [message(36.0 * k, body_turn(float(k)), RATE_RAD_S).encode() for k in range(200)]
     with (
         server() as listener,
-        load(bench_of(tmp_path, "lockstep = true")) as bench,
+        load(nasa42_bench(tmp_path, "lockstep = true")) as bench,
         Nasa42Lockstep(
             f"tcp://127.0.0.1:{listener.getsockname()[1]}", MessageReader(0, Mounting(MOUNTING))
         ) as link,
@@ -174,7 +175,7 @@ def test_in_lockstep_42_runs_as_fast_as_frames_come_and_each_message_is_a_frame(
     assert [(t_ns - BEGIN_NS) // 36_000_000_000 for t_ns, _ in drawn] == list(range(200))
     assert summary.packets.refused == 1
     for k, (_, attitude) in enumerate(drawn):
-        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * turning(float(k))
+        expected = Rotation.from_quat(MOUNTING, scalar_first=True) * body_turn(float(k))
         assert (
             Rotation.from_quat(attitude.q_icrs_to_cam, scalar_first=True) * expected.inv()
         ).magnitude() < FOLLOWED_RAD
@@ -182,7 +183,7 @@ def test_in_lockstep_42_runs_as_fast_as_frames_come_and_each_message_is_a_frame(
 
 def test_42_may_be_the_client_and_come_back_and_nobody_else_gets_in(tmp_path):
     port = free_port()
-    bench = bench_of(tmp_path, f'endpoint = "tcp://127.0.0.1:{port}"', "bind = true")
+    bench = nasa42_bench(tmp_path, f'endpoint = "tcp://127.0.0.1:{port}"', "bind = true")
     with listening(bench, f"bound to tcp://127.0.0.1:{port}") as process:
         for first in (0, 10):
             with socket.create_connection(("127.0.0.1", port)) as connection:
@@ -205,7 +206,7 @@ def test_what_is_wrong_is_refused_by_reason_and_the_display_goes_on(tmp_path):
         b"A" * 200_000 + b"\n[ENDMSG]\n",
     ]
     with server() as listener:
-        bench = bench_of(tmp_path, f'endpoint = "tcp://127.0.0.1:{listener.getsockname()[1]}"')
+        bench = nasa42_bench(tmp_path, f'endpoint = "tcp://127.0.0.1:{listener.getsockname()[1]}"')
         with listening(bench, "connecting to") as process:
             connection, _ = listener.accept()
             with connection:
@@ -235,7 +236,7 @@ def test_what_is_wrong_is_refused_by_reason_and_the_display_goes_on(tmp_path):
 )
 def test_keys_that_are_wrong_get_one_line(tmp_path, lines, said):
     result = run_hilstar_here(
-        "serve", bench_of(tmp_path, *lines), "--headless", "--duration", "0.1"
+        "serve", nasa42_bench(tmp_path, *lines), "--headless", "--duration", "0.1"
     )
     assert_refused(result, 2, said)
 
@@ -248,7 +249,7 @@ def test_a_port_in_use_gets_one_line():
 
 
 def test_explain_says_42_s_conventions_with_an_attitude_in_its_words(tmp_path):
-    bench = bench_of(
+    bench = nasa42_bench(
         tmp_path, f'endpoint = "tcp://127.0.0.1:{free_port()}"', mounting=(1.0, 0.0, 0.0, 0.0)
     )
     result = run_hilstar_here("serve", bench, "--headless", "--frames", "1", "--explain")

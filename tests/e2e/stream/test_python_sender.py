@@ -21,7 +21,7 @@ from tests.support.wire.ptys import Cable
 CLOCK_AHEAD_NS = 10**15
 
 
-def stream(sender: hilstar.Sender, until=lambda: True, count: int = 60) -> int:
+def send_until(sender: hilstar.Sender, until=lambda: True, count: int = 60) -> int:
     """Send until something holds, `count` times at least; how many were sent."""
     sent = 0
 
@@ -62,7 +62,7 @@ def test_both_ways_the_status_comes_back_and_the_simulation_s_own_clock_is_known
                     sender.status.health & HEALTH_CLOCK_SYNCHRONISED
                 )
 
-            sent = stream(sender, synchronised)
+            sent = send_until(sender, synchronised)
             time.sleep(0.2)
             summary = interrupted(process)
     assert summary["packets"]["accepted"] == summary["packets"]["received"] == sent
@@ -103,7 +103,7 @@ def test_with_keys_it_is_let_in_on_either_side_of_the_connection(tmp_path, conne
     ):
         assert sender.wait()
         assert sender.status is None
-        sent = stream(sender)
+        sent = send_until(sender)
         time.sleep(0.2)
         packets = interrupted(process)["packets"]
     assert packets["accepted"] == packets["received"] == sent

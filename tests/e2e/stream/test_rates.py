@@ -41,7 +41,7 @@ MIN_BELIEVED_ARCSEC = 100.0  # of some 500 to 900, by how the packets fall betwe
 FRAMES_AFTER = 90
 
 
-def attitude(t_ns: int, from_ns: int) -> tuple[float, ...]:
+def turned_by_time(t_ns: int, from_ns: int) -> tuple[float, ...]:
     return tuple(propagate(np.array(ORION), TURN_RAD_S, (t_ns - from_ns) / 1e9))
 
 
@@ -49,7 +49,7 @@ def as_packet(k: int, t_ns: int, q: tuple[float, ...], rate: tuple[float, ...]) 
     return packet(k, t_ns, q, rate)
 
 
-def as_json(k: int, t_ns: int, q: tuple[float, ...], rate: tuple[float, ...]) -> bytes:
+def json_with_rate(k: int, t_ns: int, q: tuple[float, ...], rate: tuple[float, ...]) -> bytes:
     return json.dumps({"t_ns": t_ns, "q": q, "rate": rate, "sequence": k}).encode()
 
 
@@ -58,7 +58,7 @@ def as_json_uncounted(k: int, t_ns: int, q: tuple[float, ...], rate: tuple[float
 
 
 @contextmanager
-def turning(
+def turning_sender(
     sender: zmq.Socket, rate: Callable[[], tuple[float, ...]], form=as_packet, hz: float = 100.0
 ) -> Iterator[int]:
     """A sender that turns by TURN_RAD_S and says `rate`; when it began, ns."""
@@ -66,7 +66,7 @@ def turning(
 
     def say() -> None:
         t_ns = time.monotonic_ns()
-        sender.send(form(next(sequences), t_ns, attitude(t_ns, from_ns), rate()))
+        sender.send(form(next(sequences), t_ns, turned_by_time(t_ns, from_ns), rate()))
 
     with repeating(say, 1 / hz):
         yield from_ns
@@ -80,7 +80,7 @@ def run_of(small_bench_file, tmp_path, check: str, form=as_packet) -> tuple[list
         publisher() as (sender, port),
         ZmqReceiver(f"tcp://127.0.0.1:{port}") as link,
         load(bench_file) as bench,
-        turning(sender, lambda: AS_DEG_S, form) as from_ns,
+        turning_sender(sender, lambda: AS_DEG_S, form) as from_ns,
     ):
         told_at: list[int] = []
 
@@ -94,13 +94,14 @@ def run_of(small_bench_file, tmp_path, check: str, form=as_packet) -> tuple[list
         summary, shown = serve_until(bench, link, enough)
     after = [frame for frame in shown[told_at[0] :] if frame.attitude is not None]
     errors = [
-        angle_between_rad(attitude(f.t_ns, from_ns), f.attitude.q_icrs_to_cam) * ARCSEC_PER_RAD
+        angle_between_rad(turned_by_time(f.t_ns, from_ns), f.attitude.q_icrs_to_cam)
+        * ARCSEC_PER_RAD
         for f in after
     ]
     return errors, msgspec.to_builtins(summary)
 
 
-@pytest.mark.parametrize("form", [as_packet, as_json, as_json_uncounted])
+@pytest.mark.parametrize("form", [as_packet, json_with_rate, as_json_uncounted])
 def test_a_rate_in_deg_s_is_told_and_the_quaternions_turn_is_drawn(
     small_bench_file, tmp_path, form, caplog
 ):
@@ -127,7 +128,7 @@ def test_terminal_health_and_ledger_say_it_and_its_end(tmp_path):
     rates = [AS_DEG_S]
     with bound(tmp_path, "--console", "127.0.0.1:0", "--ledger", str(ledger)) as served:
         page = page_of(served)
-        with connected(served.port) as sender, turning(sender, lambda: rates[0]):
+        with connected(served.port) as sender, turning_sender(sender, lambda: rates[0]):
             served.await_line("probably because they are in deg/s; send rad/s")
             wait_for(
                 lambda: any(
@@ -175,7 +176,7 @@ def test_in_lockstep_it_is_told_though_no_rate_is_drawn_by(tmp_path):
     ):
         for k in range(100):
             t_ns = k * 10_000_000
-            asker.send(packet(k, t_ns, attitude(t_ns, 0), AS_DEG_S))
+            asker.send(packet(k, t_ns, turned_by_time(t_ns, 0), AS_DEG_S))
             asker.recv()
         until_said(
             process,

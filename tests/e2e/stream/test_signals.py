@@ -54,7 +54,7 @@ def program(*words: str | Path, before: str = "") -> list[str]:
 
 
 @contextmanager
-def running(
+def started_command(
     command: list[str], begin: type[subprocess.Popen] = Started, **more
 ) -> Iterator[subprocess.Popen]:
     with begin(
@@ -74,7 +74,7 @@ def test_a_hang_up_ends_nothing_under_nohup(tmp_path):
         command = program(
             "serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger
         )
-        with running(command, ignored=(signal.SIGHUP,)) as process:
+        with started_command(command, ignored=(signal.SIGHUP,)) as process:
             assert process.stderr is not None and process.stderr.readline()
             process.send_signal(signal.SIGHUP)
             wait_for(
@@ -131,7 +131,7 @@ def test_a_signal_ends_a_run_in_order(tmp_path, number):
         command = program(
             "serve", serve_file(tmp_path, port), "--headless", "--json", "--ledger", ledger
         )
-        with running(command, ignored=(signal.SIGINT,)) as process:
+        with started_command(command, ignored=(signal.SIGINT,)) as process:
             assert process.stderr is not None and process.stderr.readline()
             wait_for(
                 lambda: (
@@ -153,7 +153,9 @@ def test_a_draw_without_end_is_ended(tmp_path, small_bench_file, number, before)
     """Once in a call that lets other threads run, and once in one that does not."""
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n60,1,0,0,0\n")
-    with running(program("replay", small_bench_file, log, "--headless", before=before)) as process:
+    with started_command(
+        program("replay", small_bench_file, log, "--headless", before=before)
+    ) as process:
         assert process.stdout is not None and process.stdout.readline() == b"drawing\n"
         with CoreWaits(process.pid) as waited:
             code, _, err = ends(process, number)
@@ -174,7 +176,7 @@ def test_a_signal_while_a_shader_is_built_ends_it_in_order(tmp_path, small_bench
         " os.kill(os.getpid(), signal.SIGINT)\n    return make(*arguments)\n_moderngl.make_uniform"
         " = told"
     )
-    with running(
+    with started_command(
         program(
             "frame",
             small_bench_file,
@@ -201,7 +203,7 @@ def test_a_signal_while_a_peer_s_library_calls_python_ends_it_without_a_word_of_
         " ctypes.CDLL(None).qsort((ctypes.c_int * 2)(2, 1), 2, 4, kind(told))\n    print('drawn',"
         " flush=True)\nbenchmark.METHODS = (('callback', 'calls Python', lambda: draw),)"
     )
-    with running(
+    with started_command(
         program("benchmark", "-o", tmp_path / "times", before=before), text=True
     ) as process:
         out, err = process.communicate(timeout=2 * PATIENCE_S)
@@ -220,7 +222,7 @@ def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
         " os.kill(os.getpid(), signal.SIGINT)\n    return wait(clock, due_ns,"
         " stop)\nHostClock.wait_until = told"
     )
-    with running(
+    with started_command(
         program("serve", serve_file(tmp_path, free_port()), "--headless", "--json", before=before),
         text=True,
     ) as process:
@@ -232,7 +234,7 @@ def test_a_signal_in_the_middle_of_a_wait_ends_a_run_in_order(tmp_path):
 def test_a_second_signal_ends_it_at_once(tmp_path, small_bench_file):
     log = tmp_path / "log.csv"
     log.write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n60,1,0,0,0\n")
-    with running(
+    with started_command(
         program("replay", small_bench_file, log, "--headless", before=WITHOUT_LOCK)
     ) as process:
         assert process.stdout is not None and process.stdout.readline() == b"drawing\n"
@@ -260,7 +262,7 @@ def test_a_disk_that_stands_still_holds_up_neither_the_frames_nor_the_end(tmp_pa
         "--ledger",
         str(tmp_path / "run.mcap"),
     ]
-    with running(program(*command, before=still)) as process:
+    with started_command(program(*command, before=still)) as process:
         assert process.stderr is not None
         # said after two seconds of frames
         while b"no attitude yet" not in (line := process.stderr.readline()):
@@ -345,7 +347,7 @@ def test_a_lockstep_message_that_is_no_request_holds_up_nothing(tmp_path):
     port = free_port()
     context = zmq.Context()
     wrong, right = context.socket(zmq.DEALER), context.socket(zmq.REQ)
-    with running(
+    with started_command(
         program("serve", serve_file(tmp_path, port, "lockstep = true"), "--headless", "--json")
     ) as process:
         try:
@@ -387,7 +389,7 @@ def test_a_sender_whose_listener_takes_nothing_ends_in_order(tmp_path):
             (f"tcp://127.0.0.1:{port}", "10000"),
             (f"serial:{os.ttyname(near)}@115200", "1000"),
         ):
-            with running(
+            with started_command(
                 program("send", "--spin", "z,1", "--rate", rate, "--to", to, "--json")
             ) as process:
                 wait_for(lambda process=process: has_handlers(process))
@@ -421,7 +423,7 @@ def test_a_pool_of_workers_ends_with_its_command(tmp_path, small_bench_file):
     log.write_text("t_s,qw,qx,qy,qz\n" + "".join(f"{t},1,0,0,0\n" for t in range(5000)))
     out = tmp_path / "out"
     for number in (signal.SIGTERM, signal.SIGKILL):
-        with running(
+        with started_command(
             program("simulate", small_bench_file, "--log", log, "-o", out / str(number))
         ) as process:
             wait_for(lambda number=number: list((out / str(number)).glob("*.fits")))
@@ -455,7 +457,9 @@ def test_every_command_that_takes_its_time_ends_within_a_second(tmp_path, small_
         (signal.SIGTERM, 0.0, subprocess.Popen),
         (signal.SIGINT, 1.5, Started),
     ):
-        with running(program(*other_commands(tmp_path, small_bench_file)[name]), begin) as process:
+        with started_command(
+            program(*other_commands(tmp_path, small_bench_file)[name]), begin
+        ) as process:
             wait_for(lambda process=process: has_handlers(process))
             time.sleep(later_s)
             code, _, err = ends(process, number)

@@ -69,7 +69,7 @@ def display(tmp_path_factory):
         process.wait(PATIENCE_S)
 
 
-def tracker(display, *options):
+def tracker_with_camera(display, *options):
     bench, endpoint = display
     command = [*HILSTAR, "tracker", bench, "--watch", endpoint, *options, "--json"]
     return Started(
@@ -85,7 +85,10 @@ def ended(process):
 
 def test_a_triggered_exposure_is_one_image_of_the_stars_that_are_lit(display):
     address = own_address()
-    with tracker(display, "--camera", address) as process, GigEClient(address) as client:
+    with (
+        tracker_with_camera(display, "--camera", address) as process,
+        GigEClient(address) as client,
+    ):
         opened(client)
         assert client.control() == 0
         client.set("TriggerMode", 1)
@@ -111,7 +114,7 @@ def test_a_trigger_before_the_display_shows_anything_is_an_image_of_its_first_fr
     address, endpoint = own_address(), f"tcp://127.0.0.1:{free_port()}"
     replay = [*map(str, [*HILSTAR, "replay", bench, log, "--headless"]), "--feed", endpoint]
     with (
-        tracker((bench, endpoint), "--camera", address) as process,
+        tracker_with_camera((bench, endpoint), "--camera", address) as process,
         GigEClient(address) as client,
     ):
         opened(client)
@@ -136,7 +139,7 @@ def test_it_answers_while_its_images_are_taken(display):
     address, port = own_address(), free_port()
     answering = ("--answer", f"udp://127.0.0.1:{port}", "--solver", "truth")
     with (
-        tracker(display, "--camera", address, *answering) as process,
+        tracker_with_camera(display, "--camera", address, *answering) as process,
         GigEClient(address) as client,
     ):
         opened(client)
@@ -157,7 +160,7 @@ def test_aravis_finds_it_sets_it_and_loses_no_image(display):
     ):
         pytest.skip("Aravis is not installed (gir1.2-aravis-0.8, python3-gi)")
     address, count = own_address(), 20
-    with tracker(display, "--camera", address) as process:
+    with tracker_with_camera(display, "--camera", address) as process:
         with GigEClient(address) as client:
             opened(client)
         grabbed = subprocess.run(
@@ -185,7 +188,7 @@ def test_aravis_s_own_test_of_cameras_finds_no_fault(display):
     if program is None:
         pytest.skip("arv-camera-test-0.8 is not installed (aravis-tools)")
     address = own_address()
-    with tracker(display, "--camera", address) as process:
+    with tracker_with_camera(display, "--camera", address) as process:
         with GigEClient(address) as client:
             opened(client)
         tested = subprocess.run(
@@ -198,8 +201,9 @@ def test_aravis_s_own_test_of_cameras_finds_no_fault(display):
         ended(process)
     counts = dict(re.findall(r"^(n_\w+) += (\d+)", tested.stdout, re.MULTILINE))
     assert int(counts["n_completed_buffers"]) > 0, tested.stdout + tested.stderr
-    # Late packets (n_failures) are a busy machine's; these are a camera's that breaks the standard.
-    for fault in ("n_size_mismatch_errors", "n_error_packets", "n_ignored_bytes"):
+    # Late packets (n_failures) and images for which it had no room (n_ignored_bytes) are a busy
+    # machine's; these are a camera's that breaks the standard.
+    for fault in ("n_size_mismatch_errors", "n_error_packets"):
         assert int(counts[fault]) == 0, tested.stdout
 
 

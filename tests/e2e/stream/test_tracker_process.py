@@ -12,6 +12,7 @@ import socket
 import subprocess
 import sys
 import tty
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ OWN_ARCSEC = (5.0, 5.0, 40.0)
 BIAS = (100.0, -50.0, 300.0)
 
 
-def log(path, seconds=30.0):
+def turn_log(path, seconds=30.0):
     """A slow turn about the boresight and across it from Orion's belt."""
     q, lines = from_radec_roll_deg(84.057, -1.2, 0.0), ["t_s,qw,qx,qy,qz"]
     for k in range(round(seconds * 20) + 1):
@@ -61,7 +62,7 @@ def display(tmp_path_factory):
         *HILSTAR,
         "replay",
         str(folder / "bench.toml"),
-        str(log(folder / "log.csv", 300.0)),
+        str(turn_log(folder / "log.csv", 300.0)),
         "--headless",
     ]
     with Started(
@@ -72,7 +73,7 @@ def display(tmp_path_factory):
         process.wait(PATIENCE_S)
 
 
-def tracker(display, *options):
+def tracker_of_display(display, *options):
     bench, endpoint = display
     command = [*HILSTAR, "tracker", str(bench), "--watch", endpoint, *options]
     return Started(
@@ -108,7 +109,7 @@ def test_lost_in_space_then_tracking_its_answers_are_the_attitude_that_was_lit_a
             "--record",
             tmp_path / "answers.csv",
         )
-        with tracker(display, *told, *planted) as process:
+        with tracker_of_display(display, *told, *planted) as process:
             found = summary(process)
         answers = [json.loads(ear.recv(65536)) for _ in range(found["answers"])]
     assert len(answers) >= 5
@@ -147,7 +148,7 @@ def test_planted_silence_garbage_latency_and_wrong_answers_over_a_serial_line(di
         2,
     )
     line = f"serial:{os.ttyname(theirs)}@921600"
-    with tracker(
+    with tracker_of_display(
         display, "--answer", line, "--format", "json", "--duration", 3, *planted
     ) as process:
         heard = b""
@@ -169,7 +170,7 @@ def test_an_outside_command_finds_the_attitude_and_prediction_follows_it(display
     exposure after that one follows.
     """
     solver = f"{sys.executable} {ROOT / 'examples' / 'star_solver.py'} {{image}} {25e3 / 13}"
-    with tracker(
+    with tracker_of_display(
         display, "--answer", f"udp://127.0.0.1:{free_port()}", "--duration", 4, "--solver", solver
     ) as process:
         found = summary(process)
@@ -219,15 +220,9 @@ def test_a_watcher_that_never_reads_loses_frames_and_holds_up_none():
 )
 def test_what_is_wrong_gets_one_line(tmp_path, options, said):
     (tmp_path / "bench.toml").write_text(bench_text(TWIN))
-    words = [
-        "tracker",
-        tmp_path / "bench.toml",
-        "--watch",
-        "tcp://127.0.0.1:1",
-        "--answer",
-        "udp://127.0.0.1:9",
-        *options,
-    ]
+    right = {"--watch": "tcp://127.0.0.1:1", "--answer": "udp://127.0.0.1:9"}
+    given = right | {options[0]: options[1]}
+    words = ["tracker", tmp_path / "bench.toml", *chain.from_iterable(given.items())]
     assert_refused(run_hilstar_here(*words), 2, said)
 
 

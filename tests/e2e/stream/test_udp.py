@@ -42,7 +42,7 @@ ANSWERED_S = 0.3
 A_BUSY_MACHINE_S = ("frame-late", "frame-given-up", "stale", "fresh")  # and no fault of a sender's
 
 
-def bench_of(folder: Path, *lines: str) -> Path:
+def udp_bench(folder: Path, *lines: str) -> Path:
     path = folder / "udp.toml"
     path.write_text("\n".join([LIVE_BENCH, "[attitude]", 'source = "udp"', *lines, ""]))
     return path
@@ -73,7 +73,7 @@ def test_a_sender_over_ipv6_that_starts_first_waits_none_is_lost_and_both_sides_
         assert sender.stderr is not None
         assert "waiting for a listener" in sender.stderr.readline()
         with listening(
-            bench_of(tmp_path, f'bind = "[::1]:{port}"'), f"bound to udp://[::1]:{port}"
+            udp_bench(tmp_path, f'bind = "[::1]:{port}"'), f"bound to udp://[::1]:{port}"
         ) as process:
             told = json.loads(sender.communicate(timeout=PATIENCE_S)[0])
             process.has_received(300)
@@ -89,7 +89,7 @@ def test_a_sender_over_ipv6_that_starts_first_waits_none_is_lost_and_both_sides_
 def test_lost_corrupted_and_reordered_datagrams_add_up(tmp_path):
     port = free_port()
     with listening(
-        bench_of(tmp_path, f'endpoint = "udp://127.0.0.1:{port}"'), "bound to"
+        udp_bench(tmp_path, f'endpoint = "udp://127.0.0.1:{port}"'), "bound to"
     ) as process:
         faults = ["--lose", "10%", "--corrupt", "5%", "--reorder", "--jitter", "1", "--seed", "3"]
         told = sent(
@@ -105,7 +105,7 @@ def test_lost_corrupted_and_reordered_datagrams_add_up(tmp_path):
     assert packets["accepted"] == packets["received"] - told["corrupted"] - told["reordered"]
 
 
-def as_json(data: bytes) -> bytes:
+def json_of_packet(data: bytes) -> bytes:
     """The same attitude as JSON that counts nothing; what is no attitude stays as it is."""
     event = decode(data)
     if not isinstance(event, AttitudeSample) or event.rate_cam_rad_s is None:
@@ -115,7 +115,7 @@ def as_json(data: bytes) -> bytes:
     ).encode()
 
 
-@pytest.mark.parametrize("form", [bytes, as_json], ids=["packets", "JSON"])
+@pytest.mark.parametrize("form", [bytes, json_of_packet], ids=["packets", "JSON"])
 def test_nothing_wrong_is_drawn_over_a_bad_network(tmp_path, form: Callable[[bytes], bytes]):
     """A turn of 20 deg/s; datagrams lost, corrupted, reordered, every fifth twice: each attitude
     drawn is that of its time.
@@ -124,7 +124,7 @@ def test_nothing_wrong_is_drawn_over_a_bad_network(tmp_path, form: Callable[[byt
     port = free_port()
     allowed, notices = AllowedSenders(), Notices()
     with (
-        load(bench_of(tmp_path, f"port = {port}")) as bench,
+        load(udp_bench(tmp_path, f"port = {port}")) as bench,
         UdpLink(bound_place(None, port, None), allowed, notices) as link,
         UdpSender(link.endpoint) as road,
     ):
@@ -188,7 +188,7 @@ def test_an_address_that_is_not_listed_is_counted_and_never_answered_and_malform
     tmp_path,
 ):
     port = free_port()
-    bench = bench_of(tmp_path, f'bind = "127.0.0.1:{port}"', 'allow = ["127.0.0.1", "10.0.0.0/8"]')
+    bench = udp_bench(tmp_path, f'bind = "127.0.0.1:{port}"', 'allow = ["127.0.0.1", "10.0.0.0/8"]')
     command = [*HILSTAR, "serve", str(bench), "--headless", "--json"]
     with (
         Run(command) as process,
@@ -244,7 +244,7 @@ def test_a_look_at_where_a_live_stream_points_answers_a_sender_that_waits(tmp_pa
     ]
     with Started(command, stderr=subprocess.PIPE, text=True) as sender:
         try:
-            result = run_hilstar_here("attitude", bench_of(tmp_path, f"port = {port}"), "--json")
+            result = run_hilstar_here("attitude", udp_bench(tmp_path, f"port = {port}"), "--json")
         finally:
             sender.kill()
     assert result.returncode == 0, result.stderr
@@ -255,7 +255,7 @@ def test_a_look_at_where_a_live_stream_points_answers_a_sender_that_waits(tmp_pa
 def test_a_sender_that_comes_back_on_another_port_is_answered_there(tmp_path):
     """Without a number it is another sender, until the first was silent for `stale_after_ms`."""
     port = free_port()
-    with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
+    with listening(udp_bench(tmp_path, f"port = {port}"), "bound to") as process:
         for _ in range(2):
             with UdpSender(f"udp://127.0.0.1:{port}") as road:
                 k = iter(range(10**9))
@@ -292,7 +292,7 @@ def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
         "while time.time() < end or not select.select([0], [], [], 0)[0]: [s.send(b'?' * 64) for _"
         " in range(500)]"
     )
-    with listening(bench_of(tmp_path, f"port = {port}"), "bound to") as process:
+    with listening(udp_bench(tmp_path, f"port = {port}"), "bound to") as process:
         process.shows()
         with subprocess.Popen(
             [sys.executable, "-c", flood, str(port)], stdin=subprocess.PIPE
@@ -339,19 +339,19 @@ def test_a_flood_costs_little_and_its_newest_attitude_is_shown(tmp_path):
 )
 def test_keys_that_are_wrong_or_disagree_get_one_line(tmp_path, lines, said):
     result = run_hilstar_here(
-        "serve", bench_of(tmp_path, *lines), "--headless", "--duration", "0.1"
+        "serve", udp_bench(tmp_path, *lines), "--headless", "--duration", "0.1"
     )
     assert_refused(result, 2, "udp.toml: [attitude]", said)
 
 
 def test_keys_of_udp_are_refused_on_another_road(tmp_path):
     for line in ('bind = "127.0.0.1:5560"', 'allow = ["127.0.0.1"]'):
-        bench = bench_of(tmp_path, line)
+        bench = udp_bench(tmp_path, line)
         bench.write_text(bench.read_text().replace('"udp"', '"zmq"'))
         assert_refused(
             run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "udp"
         )
-    bench = bench_of(tmp_path, "port = 5560")
+    bench = udp_bench(tmp_path, "port = 5560")
     bench.write_text(bench.read_text().replace('"udp"', '"serial"'))
     assert_refused(
         run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "/dev/ttyUSB0"
@@ -361,11 +361,11 @@ def test_keys_of_udp_are_refused_on_another_road(tmp_path):
 def test_a_port_in_use_an_address_of_another_machine_and_a_wrong_target_get_one_line(tmp_path):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
-        bench = bench_of(tmp_path, f"port = {other.getsockname()[1]}")
+        bench = udp_bench(tmp_path, f"port = {other.getsockname()[1]}")
         assert_refused(
             run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"), 2, "in use"
         )
-    bench = bench_of(tmp_path, 'bind = "192.0.2.1:5560"', 'allow = ["192.0.2.2"]')
+    bench = udp_bench(tmp_path, 'bind = "192.0.2.1:5560"', 'allow = ["192.0.2.2"]')
     assert_refused(
         run_hilstar_here("serve", bench, "--headless", "--duration", "0.1"),
         2,

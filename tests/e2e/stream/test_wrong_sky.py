@@ -33,7 +33,7 @@ Sent = Callable[[int, np.ndarray, tuple[float, ...]], dict[str, object]]
 
 
 @contextmanager
-def turning(sender: zmq.Socket, sent: Sent) -> Iterator[None]:
+def wrong_sender(sender: zmq.Socket, sent: Sent) -> Iterator[None]:
     """A sender that turns by TURN_RAD_S at 100 Hz, and says what `sent` makes of time, attitude
     and rate.
     """
@@ -77,7 +77,7 @@ def test_a_clock_ahead_is_said_while_it_lasts_and_counts_as_wrong_after_it(tmp_p
         page = page_of(served)
         with (
             connected(served.port) as sender,
-            turning(
+            wrong_sender(
                 sender,
                 lambda t_ns, q, rate: {"t_ns": t_ns + ahead_ns[0], "q": q.tolist(), "rate": rate},
             ),
@@ -127,7 +127,7 @@ def test_a_conjugate_is_said_with_the_line_to_write(tmp_path):
         page = page_of(served)
         with (
             connected(served.port) as sender,
-            turning(
+            wrong_sender(
                 sender,
                 lambda t_ns, q, rate: {"t_ns": t_ns, "q": conjugate(q).tolist(), "rate": rate},
             ),
@@ -145,7 +145,7 @@ def test_what_only_a_person_can_judge_is_said_at_the_first_attitude(tmp_path):
         page = page_of(served)
         with (
             connected(served.port) as sender,
-            turning(sender, lambda t_ns, q, rate: {"t_ns": t_ns, "q": list(ORION)}),
+            wrong_sender(sender, lambda t_ns, q, rate: {"t_ns": t_ns, "q": list(ORION)}),
         ):
             served.await_line(
                 "the first attitude points at RA 84.000, Dec -1.000, roll 0.000 deg; the brightest"

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from hilstar.attitude.logs.log_file import read_log
-from hilstar.basics.errors import InputError
+from tests.support.refusals import refusal
 
 EPOCHS = ("2024-02-29T23:59:59.25", "2024-03-01T00:00:01")
 
@@ -43,8 +42,5 @@ def read(tmp_path, text):
     return read_log(tmp_path / "log")
 
 
-def refusal(tmp_path, text):
-    with pytest.raises(InputError) as caught:
-        read(tmp_path, text)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+def aem_refusal(tmp_path, text):
+    return refusal(read, tmp_path, text)

@@ -113,7 +113,7 @@ def seconds(begin_s: float, end_s: float, period_ns: int = PERIOD_NS) -> range:
     return range(round(begin_s * NS_PER_S), round(end_s * NS_PER_S), period_ns)
 
 
-class Run:
+class ReceiverRun:
     """A whole script through a receiver; `ages_ms` and `shown` are of the attitude shown just
     after each message.
     """
@@ -174,7 +174,7 @@ class Run:
 
 
 def test_a_plain_stream_is_no_event():
-    run = Run(lambda t0: Sender().packets(t0, seconds(0, 6)))
+    run = ReceiverRun(lambda t0: Sender().packets(t0, seconds(0, 6)))
     assert (run.accepted, run.counts.refused, run.events) == (1200, 0, {})
     assert run.receiver.clock_summary().uncertainty_ms < 0.2
 
@@ -201,7 +201,7 @@ def test_a_sender_that_hangs_is_stale_and_taken_up_again_at_once(repeat_hz, same
             good[400:] = Sender(first=400 + len(hung_s)).packets(t0, seconds(4, 5))
         return good + repeats
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert run.accepted == 600
     assert run.counts.refused_by["time"] == run.counts.refused == len(hung_s)
     assert run.receiver.jumps.jumps == 0
@@ -223,7 +223,7 @@ def test_a_clock_that_goes_on_from_where_it_stood_is_taken_up_and_is_no_jump():
             stopped + stood + Sender(first=600, offset_ns=-2 * NS_PER_S).packets(t0, seconds(5, 7))
         )
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert run.receiver.jumps.jumps == 0
     assert run.events == {"source-frozen": 1, "source-resumed": 1}
     assert run.accepted == 1000
@@ -239,7 +239,7 @@ def test_bursts_of_one_old_packet_change_nothing(old_s):
             Arrival(t0 + 4_502_000_000 + k * 20_000, old.event, old.raw) for k in range(50)
         ]
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert run.accepted == 1200
     assert run.counts.refused_by["time"] == 50
     assert run.receiver.jumps.jumps == 0
@@ -256,7 +256,7 @@ def late_sender(first: int, counts: bool = True, offset_ns: int = 0) -> Sender:
 )
 def test_of_two_senders_the_first_is_shown_and_the_other_refused(counts, first):
     """The second begins after two seconds, on the same clock, and ends after six."""
-    run = Run(
+    run = ReceiverRun(
         lambda t0: (
             Sender(counts=counts).packets(t0, seconds(0, 8))
             + late_sender(first, counts).packets(t0 + 2_300_000, seconds(2, 6))
@@ -280,7 +280,7 @@ def test_a_second_sender_with_a_clock_of_its_own_and_four_times_the_rate_is_kept
             t0 + 2_300_000, seconds(3, 6)
         )
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert run.events["second-sender"] == 1
     assert run.counts.refused_by["source"] > 500
     assert abs(run.shown[-1] @ ORION) > 0.999
@@ -288,7 +288,7 @@ def test_a_second_sender_with_a_clock_of_its_own_and_four_times_the_rate_is_kept
 
 
 def test_two_senders_that_do_not_count_on_one_clock_are_not_told():
-    run = Run(
+    run = ReceiverRun(
         lambda t0: (
             Sender(counts=False).packets(t0, seconds(0, 4))
             + late_sender(0, counts=False).packets(t0 + 2_300_000, seconds(2, 4))
@@ -299,7 +299,7 @@ def test_two_senders_that_do_not_count_on_one_clock_are_not_told():
 
 def test_a_second_sender_that_begins_at_the_first_one_s_next_count_takes_its_place():
     """It is told that there are two."""
-    run = Run(
+    run = ReceiverRun(
         lambda t0: (
             Sender().packets(t0, seconds(0, 4))
             + late_sender(401).packets(t0 + 2_300_000, seconds(2, 4))
@@ -331,7 +331,7 @@ def test_two_senders_of_one_sky_and_one_clock_are_told_by_number_or_address(stat
         second = Sender(counts=counts, **other).packets(t0 + 2_300_000, seconds(0, 3))
         return Sender(counts=counts, **one).packets(t0, seconds(0, 4)) + second
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert run.events == {"second-sender": 1}
     assert (run.accepted, run.counts.refused_by["source"]) == (800, 600)
     told = next(notice for notice in run.told if notice.kind == "second-sender")
@@ -347,7 +347,7 @@ def test_another_number_or_address_takes_over_once_the_first_was_silent(stated, 
         second = Sender(LYRA, **other).packets(t0, seconds(3 + pause_s, 6))
         return Sender(**one).packets(t0, seconds(0, 3)) + second
 
-    run = Run(make)
+    run = ReceiverRun(make)
     refused_s = max(STALE_AFTER_NS / NS_PER_S - pause_s, 0)
     assert run.counts.refused == run.counts.refused_by["source"]
     assert run.counts.refused == pytest.approx(refused_s * NS_PER_S / PERIOD_NS, abs=1)
@@ -360,7 +360,7 @@ def test_one_number_from_another_address_is_the_same_sender():
         moved = Sender(first=400, number=3, address=THERE).packets(t0, seconds(2, 4))
         return Sender(number=3, address=HERE).packets(t0, seconds(0, 2)) + moved
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert (run.accepted, run.events) == (800, {})
 
 
@@ -396,7 +396,7 @@ def test_two_senders_of_one_design_are_told_apart_however_they_alternate(burst, 
     """Equal counters, two skies, clocks that are nanoseconds or days apart: the second one is
     never shown.
     """
-    run = Run(beside(Sender(), Sender(LYRA, offset_ns=offset_ns), burst))
+    run = ReceiverRun(beside(Sender(), Sender(LYRA, offset_ns=offset_ns), burst))
     assert run.events == {"second-sender": 1}
     assert (run.accepted, run.counts.refused_by["source"] + run.counts.refused_by["time"]) == (
         600,
@@ -410,7 +410,7 @@ def test_two_senders_of_one_design_are_told_apart_however_they_alternate(burst, 
 @pytest.mark.parametrize("burst", [1, 4])
 @pytest.mark.parametrize("offset_ns", [3600 * NS_PER_S, -3 * A_DAY_NS])
 def test_two_senders_of_one_sky_and_two_clocks_are_two(burst, offset_ns):
-    run = Run(beside(Sender(), Sender(offset_ns=offset_ns), burst))
+    run = ReceiverRun(beside(Sender(), Sender(offset_ns=offset_ns), burst))
     assert run.events == {"second-sender": 1}
     assert (run.accepted, run.counts.refused_by["source"], run.receiver.jumps.jumps) == (
         600,
@@ -436,7 +436,7 @@ def test_one_sender_that_mixes_packets_and_json_is_one(burst, counts):
             found.append(Arrival(t0 + after_ns + 50_000, sample, encode(sample)))
         return found
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert (run.accepted, run.events) == (800, {})
 
 
@@ -445,7 +445,7 @@ def test_one_sender_that_mixes_packets_and_json_is_one(burst, counts):
 @pytest.mark.parametrize("q", [ORION, LYRA], ids=["same sky", "another sky"])
 def test_a_sender_that_restarts_takes_over(pause_s, offset_s, q):
     """Its count begins anew, and its clock and sky may be others."""
-    run = Run(
+    run = ReceiverRun(
         lambda t0: (
             Sender(first=5000).packets(t0, seconds(0, 3))
             + Sender(q, offset_ns=offset_s * NS_PER_S).packets(t0, seconds(3 + pause_s, 6))
@@ -465,7 +465,7 @@ def test_the_first_sender_that_pauses_gives_way_and_is_the_second_when_it_resume
             Sender(LYRA, offset_ns=offset_ns).packets(t0 + 8_000_000, seconds(0, 6)), 3
         )
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert run.events["second-sender"] == 2
     assert run.events["second-sender-gone"] == 1
     assert abs(run.shown[-1] @ LYRA) > 0.999
@@ -474,7 +474,7 @@ def test_the_first_sender_that_pauses_gives_way_and_is_the_second_when_it_resume
 
 
 def test_the_other_sender_is_taken_up_when_the_first_falls_silent():
-    run = Run(
+    run = ReceiverRun(
         lambda t0: (
             Sender().packets(t0, seconds(0, 4))
             + late_sender(9).packets(t0 + 2_300_000, seconds(2, 6))
@@ -493,7 +493,7 @@ def test_a_sender_that_hangs_gives_way_to_another():
         hung = [Arrival(t0 + ns, good[-1].event, good[-1].raw) for ns in seconds(2, 6, 10_000_000)]
         return good + hung + late_sender(70).packets(t0 + 2_300_000, seconds(3, 6))
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert run.counts.refused == run.counts.refused_by["time"] == 400
     assert abs(run.shown[-1] @ LYRA) > 0.999
     assert max(run.ages_ms[-800:]) < 15
@@ -517,7 +517,7 @@ def test_a_receiver_that_was_stopped_does_not_think_that_the_first_sender_was_si
             for arrival in both
         ]
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert run.events == {"second-sender": 1}
     assert abs(run.shown[-1] @ ORION) > 0.999
     assert run.receiver.jumps.jumps == 0
@@ -542,7 +542,9 @@ def test_one_sender_that_retargets_to_and_fro_is_one(every, how):
     """By its count, or, where it does not count, because it says so."""
     qs = [LYRA if (k // every) % 2 else ORION for k in range(1000)]
     sequences = list(range(1000)) if how == "counted" else [0] * 1000
-    run = Run(lambda t0: many(t0, qs, sequences, lambda k: how == "said" and k % every == 0))
+    run = ReceiverRun(
+        lambda t0: many(t0, qs, sequences, lambda k: how == "said" and k % every == 0)
+    )
     assert (run.accepted, run.events) == (1000, {})
 
 
@@ -566,7 +568,7 @@ def test_one_sender_however_it_counts_is_one(sequences):
     rng = np.random.default_rng(4)
     # noise of 200 arcsec
     qs = [propagate(ORION, rng.normal(size=3) * 1e-3, 1.0) for _ in range(1000)]
-    run = Run(lambda t0: many(t0, qs, sequences))
+    run = ReceiverRun(lambda t0: many(t0, qs, sequences))
     assert (run.accepted, run.events) == (1000, {})
 
 
@@ -581,13 +583,13 @@ def test_packets_out_of_order_are_one_sender_s():
             )
         return found
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert run.events == {}
     assert run.counts.refused == run.counts.refused_by["time"] == 98
 
 
 def test_a_receiver_that_breaks_is_started_again_and_said():
-    run = Run(
+    run = ReceiverRun(
         lambda t0: Sender().packets(t0, seconds(0, 1)),
         fails=[MemoryError(), OSError("no such\nsocket")],
     )
@@ -611,7 +613,7 @@ def test_the_summary_s_offset_is_that_of_the_clock_after_its_jumps(jump_s):
             first=600, offset_ns=round(jump_s * NS_PER_S)
         ).packets(t0, seconds(3, 6))
 
-    run = Run(make)
+    run = ReceiverRun(make)
     told = run.receiver.clock_summary()
     assert (told.jumps, run.events, run.accepted) == (1, {"jump": 1}, 1200)
     assert told.offset_ms == pytest.approx(-1000 * jump_s + 0.05, abs=0.02)
@@ -622,7 +624,7 @@ SHARED = Traffic(clock="shared")
 
 
 def test_a_shared_clock_is_taken_as_it_is():
-    run = Run(lambda t0: Sender().packets(t0, seconds(0, 1), delay_ns=3_000_000), SHARED)
+    run = ReceiverRun(lambda t0: Sender().packets(t0, seconds(0, 1), delay_ns=3_000_000), SHARED)
     told = run.receiver.clock_summary()
     assert (told.mode, told.offset_ms, told.uncertainty_ms, told.jumps) == ("shared", 0.0, 0.0, 0)
     assert run.receiver.latency_ms.percentile(50) == pytest.approx(3.0, rel=0.05)
@@ -632,7 +634,7 @@ def test_a_shared_clock_is_taken_as_it_is():
 
 @pytest.mark.parametrize(("offset_s", "refused"), [(-50, False), (50, True), (0.3, False)])
 def test_a_clock_that_is_not_shared_is_said_once(offset_s, refused):
-    run = Run(
+    run = ReceiverRun(
         lambda t0: Sender(offset_ns=round(offset_s * NS_PER_S)).packets(t0, seconds(0, 4)), SHARED
     )
     assert run.events == {"clock-not-shared": 1}
@@ -665,7 +667,7 @@ def test_unix_time_has_the_offset_of_this_machine_s_clock_and_the_error_that_its
     packets = partial(
         Sender(offset_ns=UNIX_NOW_NS).packets, times=seconds(0, 1), delay_ns=3_000_000
     )
-    run = Run(packets, UNIX, unix_offset=SteppingUnixTime(error_ns))
+    run = ReceiverRun(packets, UNIX, unix_offset=SteppingUnixTime(error_ns))
     told = run.receiver.clock_summary()
     assert (told.mode, told.uncertainty_ms, told.jumps, told.drift_ppm) == (
         "unix",
@@ -686,7 +688,7 @@ def test_a_step_of_unix_time_is_followed_without_a_jump():
         )
         return Sender(offset_ns=UNIX_NOW_NS).packets(t0, seconds(0, 1)) + stepped
 
-    run = Run(make, UNIX, unix_offset=SteppingUnixTime(1000, NS_PER_S // 2, steps_after=5))
+    run = ReceiverRun(make, UNIX, unix_offset=SteppingUnixTime(1000, NS_PER_S // 2, steps_after=5))
     assert run.receiver.clock_summary().jumps == 0 and run.counts.refused_by["time"] == 0
     assert np.abs(run.ages_ms[-100:]).max() < 1.0
 
@@ -694,14 +696,16 @@ def test_a_step_of_unix_time_is_followed_without_a_jump():
 def test_what_is_no_unix_time_is_said_once():
     """TAI, as PTP has it on the wire, is 37 s ahead."""
     ahead = Sender(offset_ns=UNIX_NOW_NS + 37 * NS_PER_S)
-    run = Run(lambda t0: ahead.packets(t0, seconds(0, 3)), UNIX, unix_offset=SteppingUnixTime(1000))
+    run = ReceiverRun(
+        lambda t0: ahead.packets(t0, seconds(0, 3)), UNIX, unix_offset=SteppingUnixTime(1000)
+    )
     assert run.events == {"clock-not-shared": 1}
     assert run.counts.refused_by["time"] == 600
 
 
 def test_a_clock_too_far_ahead_is_said_of_refused_packets_and_not_of_a_sky(caplog):
     ahead = Sender(offset_ns=3600 * NS_PER_S)
-    run = Run(lambda t0: ahead.packets(t0, seconds(0, 2)), SHARED)
+    run = ReceiverRun(lambda t0: ahead.packets(t0, seconds(0, 2)), SHARED)
     (line,) = [
         line for line in caplog.messages if "[attitude] clock" in line and "refused (" not in line
     ]
@@ -721,7 +725,9 @@ def test_a_clock_too_far_ahead_is_said_of_refused_packets_and_not_of_a_sky(caplo
 )
 def test_another_clock_is_named_by_its_difference_from_unix_time(ahead_s, name, caplog):
     ahead = Sender(offset_ns=UNIX_NOW_NS + round(ahead_s * NS_PER_S))
-    Run(lambda t0: ahead.packets(t0, seconds(0, 1)), UNIX, unix_offset=SteppingUnixTime(1000))
+    ReceiverRun(
+        lambda t0: ahead.packets(t0, seconds(0, 1)), UNIX, unix_offset=SteppingUnixTime(1000)
+    )
     (line,) = [line for line in caplog.messages if 'clock = "unix"' in line]
     assert f"{ahead_s:.3f} s ahead of CLOCK_REALTIME" in line
     assert (", as " not in line) if name is None else (name in line)
@@ -737,7 +743,7 @@ def test_how_far_a_clock_is_ahead_is_not_what_a_late_packet_says(caplog):
             replace(each, host_ns=each.host_ns + late_ns) for each in packets[20:]
         ]
 
-    run = Run(make, UNIX, unix_offset=SteppingUnixTime(1000))
+    run = ReceiverRun(make, UNIX, unix_offset=SteppingUnixTime(1000))
     assert run.events == {"clock-not-shared": 1}
     (line,) = [line for line in caplog.messages if 'clock = "unix"' in line]
     assert "0.100 s ahead of CLOCK_REALTIME" in line
@@ -749,16 +755,18 @@ def test_a_clock_ahead_is_a_wrong_sky_until_it_is_right_again(ahead_s):
         ahead = Sender(offset_ns=round(ahead_s * NS_PER_S)).packets(t0, seconds(0, 2))
         return ahead + Sender(first=2000).packets(t0, seconds(3, 6))
 
-    run = Run(make, SHARED)
+    run = ReceiverRun(make, SHARED)
     assert run.events == {"clock-not-shared": 1, "clock-shared": 1}
     assert run.receiver.latency_ms.percentile(1) < 0
 
 
 def test_packets_that_are_always_late_by_a_known_clock_are_a_notice():
-    late = Run(lambda t0: Sender().packets(t0, seconds(0, 6), delay_ns=120_000_000), SHARED)
+    late = ReceiverRun(lambda t0: Sender().packets(t0, seconds(0, 6), delay_ns=120_000_000), SHARED)
     assert late.events == {"clock-behind": 1}
     assert (
-        Run(lambda t0: Sender().packets(t0, seconds(0, 6), delay_ns=30_000_000), SHARED).events
+        ReceiverRun(
+            lambda t0: Sender().packets(t0, seconds(0, 6), delay_ns=30_000_000), SHARED
+        ).events
         == {}
     )
 
@@ -779,7 +787,7 @@ def test_what_was_queued_before_the_frames_teaches_nothing():
         read = [Arrival(t0 - LEAD_NS, arrival.event, arrival.raw) for arrival in queued]
         return read + Sender(first=600).packets(t0, seconds(0, 3))
 
-    run = Run(make)
+    run = ReceiverRun(make)
     assert (run.accepted, run.counts.refused, run.events) == (1000, 0, {})
     assert run.receiver.latency_ms.max < 0.01
     assert run.receiver.latency_ms.count == 600

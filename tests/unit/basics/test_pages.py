@@ -31,7 +31,7 @@ from hilstar.basics.palette import colours_of
 PLUS_MINUS = "\N{PLUS-MINUS SIGN}"
 
 
-def rows_of(table: str) -> list[list[str]]:
+def cell_texts(table: str) -> list[list[str]]:
     """The texts of a table's cells."""
     rows = re.findall("<tr>(.*?)</tr>", table)
     return [re.findall("<t[hd][^>]*>(.*?)</t[hd]>", row) for row in rows]
@@ -92,11 +92,11 @@ def test_an_interval_has_two_digits_of_its_half_width() -> None:
 def test_a_table_leaves_out_columns_without_a_value_and_writes_no_dashes() -> None:
     rows = [("flux", 1.23456, None, ""), ("place", 7, None, "")]
     table = table_of(rows, ("quantity", "value", "limit", "verdict"))
-    assert rows_of(table) == [["quantity", "value"], ["flux", "1.235"], ["place", "7"]]
+    assert cell_texts(table) == [["quantity", "value"], ["flux", "1.235"], ["place", "7"]]
     assert '<th scope="col">' in table
     some = table_of([("flux", None), ("place", 0.1)], ("quantity", "limit"))
-    assert rows_of(some)[1:] == [["flux", ""], ["place", "0.1"]]
-    assert rows_of(table_of([("a", None)])) == [["a", ""]]  # without a header, all of it
+    assert cell_texts(some)[1:] == [["flux", ""], ["place", "0.1"]]
+    assert cell_texts(table_of([("a", None)])) == [["a", ""]]  # without a header, all of it
 
 
 def test_a_cell_with_an_uncertainty_stands_with_the_numbers_and_a_sentence_does_not() -> None:

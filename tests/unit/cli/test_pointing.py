@@ -12,15 +12,17 @@ from astropy.coordinates import SkyCoord
 from hilstar.basics.errors import InputError
 from hilstar.basics.resources import resource_path
 from hilstar.cli.app import built
-from hilstar.cli.options import NOTHING_STATED
+from hilstar.cli.options import LogStatements
 from hilstar.cli.pointing import (
     USUAL_EPOCH_JYEAR,
+    PlaceOptions,
+    PointingOptions,
     attitude_of,
     parse_radec,
     parse_star,
     place_of,
 )
-from hilstar.cli.send import wanted_samples
+from hilstar.cli.send import SendOptions, wanted_samples
 from hilstar.server.bench.config.sky import SkySettings
 from tests.support.benches import ROOT
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -91,15 +93,17 @@ def test_a_star_is_in_the_middle_of_its_frame(tmp_path):
 def test_star_and_radec_of_its_place_are_one_attitude():
     ra_deg, dec_deg, roll_deg = parse_star("Vega,30", 2026.0)
     assert roll_deg == 30
-    by_star = attitude_of("frame", None, "Vega,30", None, 2026.0)
-    by_place = attitude_of("frame", f"{ra_deg!r},{dec_deg!r},30", None, None)
+    by_star = attitude_of("frame", PointingOptions(star="Vega,30"), 2026.0)
+    place = PointingOptions(radec=f"{ra_deg!r},{dec_deg!r},30")
+    by_place = attitude_of("frame", place)
     assert np.array_equal(by_star, by_place)
 
 
 def test_a_spin_begins_at_the_star():
-    samples, _ = wanted_samples(None, "z,1", None, place_of("send", None, "Vega"), NOTHING_STATED)
-    begun = next(iter(samples)).q_icrs_to_cam
-    assert np.array_equal(begun, attitude_of("send", None, "Vega", None))
+    place = place_of("send", PlaceOptions(star="Vega"))
+    sent = wanted_samples(SendOptions(spin="z,1"), place, LogStatements())
+    begun = next(iter(sent.samples)).q_icrs_to_cam
+    assert np.array_equal(begun, attitude_of("send", PointingOptions(star="Vega")))
 
 
 def test_a_log_has_attitudes_of_its_own(tmp_path):

@@ -194,12 +194,12 @@ def test_certify_finds_the_example_of_the_truth(
         "certify", "gone.toml", "--virtual", "truth-example.toml", "-o", "certificate"
     )
     assert "gone.toml" in done.stderr
-    from hilstar.cli.image_source import virtual_truth
+    from hilstar.cli.image_source import ImageOptions
 
-    found = virtual_truth(Path("truth-example.toml"))
-    assert found is not None
-    assert found.is_file()
-    assert virtual_truth(Path("other.toml")) == Path("other.toml")
+    example = ImageOptions(virtual=Path("truth-example.toml")).truth()
+    assert example is not None
+    assert example.is_file()
+    assert ImageOptions(virtual=Path("other.toml")).truth() == Path("other.toml")
 
 
 def test_doctor_keeps_a_long_name_apart_from_its_text() -> None:

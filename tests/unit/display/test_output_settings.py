@@ -8,12 +8,12 @@ from dataclasses import replace
 import pytest
 
 from hilstar.display.window.output_settings import (
-    NVIDIA,
     OutputState,
     findings,
     property_value,
     size_mm_of,
 )
+from hilstar.display.window.property_rules import NVIDIA
 
 PLAIN = OutputState("DP-1", (1920, 1080), preferred_px=((1920, 1080),))
 HALF = (0, 1, 0, 0, 0, 0, 0, 0, 0x80000000 - 2**32, 0, 0, 0, 0, 0, 0, 0, 0, 1)

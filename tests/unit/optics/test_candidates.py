@@ -36,7 +36,7 @@ def camera_of(focal_mm: float, lens: Lens | None = None):
     )
 
 
-def assert_same(kept: FrameLight, fresh: FrameLight) -> None:
+def assert_same_light(kept: FrameLight, fresh: FrameLight) -> None:
     for name in ("data", "star", "x_px", "y_px"):
         assert getattr(kept, name).tobytes() == getattr(fresh, name).tobytes()
 
@@ -51,7 +51,7 @@ def test_sprites_are_those_of_a_fresh_look(sky, start, focal_mm, step_of_limit, 
         axis = np.array([0.0, 0.0, 1.0]) if k % 3 == 0 else rng.normal(size=3)
         q = propagate(q, axis / np.linalg.norm(axis), step_of_limit * KEPT_TURN_RAD)
         kept = make_sprites(sky, to_matrix(q), camera, FOOTPRINT, candidates)
-        assert_same(kept, make_sprites(sky, to_matrix(q), camera, FOOTPRINT))
+        assert_same_light(kept, make_sprites(sky, to_matrix(q), camera, FOOTPRINT))
 
 
 def test_a_lens_has_them_too(sky, rng):
@@ -63,7 +63,7 @@ def test_a_lens_has_them_too(sky, rng):
     for _ in range(STEPS):
         q = propagate(q, rng.normal(size=3), 0.2 * KEPT_TURN_RAD)
         kept = make_sprites(sky, to_matrix(q), camera, FOOTPRINT, candidates)
-        assert_same(kept, make_sprites(sky, to_matrix(q), camera, FOOTPRINT))
+        assert_same_light(kept, make_sprites(sky, to_matrix(q), camera, FOOTPRINT))
 
 
 def test_stars_are_looked_for_again_beyond_the_turn_alone(sky):
@@ -92,7 +92,7 @@ def test_other_stars_lights_observers_and_cameras_are_not_mistaken(sky, rng):
     for stars in (sky, others, fainter, moving, moving.seen_at(np.array([0.0, 9_000.0, 0.0])), sky):
         for seen_by in (camera, camera_of(60.0)):
             kept = make_sprites(stars, turn, seen_by, FOOTPRINT, candidates)
-            assert_same(kept, make_sprites(stars, turn, seen_by, FOOTPRINT))
+            assert_same_light(kept, make_sprites(stars, turn, seen_by, FOOTPRINT))
 
 
 def test_bodies_that_move_in_the_arrays_are_looked_for_in_every_frame(sky):
@@ -103,5 +103,5 @@ def test_bodies_that_move_in_the_arrays_are_looked_for_in_every_frame(sky):
         bodies.vectors[-1] = bodies.grid.centre[-1] = direction
         bodies.electrons_per_s[-1] = 1 + x
         kept = make_sprites(bodies, turn, camera, FOOTPRINT, candidates)
-        assert_same(kept, make_sprites(bodies, turn, camera, FOOTPRINT))
+        assert_same_light(kept, make_sprites(bodies, turn, camera, FOOTPRINT))
         assert (len(sky) in kept.star) == (x < 0.1)

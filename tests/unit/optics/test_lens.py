@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.basics.errors import InputError
 from hilstar.display.geometry import monitor_camera
 from hilstar.optics.camera import Lens, ResidualField, bounded, field_terms, ray_shifts
+from tests.support.refusals import refusal
 
 SIZE = (1920, 1080)
 PINHOLE = monitor_camera(SIZE, 57.65, 350.0, np.array([1.0, 0.0, 0.0, 0.0]))
@@ -86,8 +86,7 @@ def test_the_fields_terms_are_its_values(rng):
 
 
 def test_a_lens_that_folds_on_the_screen_is_refused():
-    with pytest.raises(InputError, match="folds"):
-        bounded(replace(PINHOLE, lens=Lens((-20.0, 0.0, 0.0))), MARGIN_PX)
+    assert "folds" in refusal(bounded, replace(PINHOLE, lens=Lens((-20.0, 0.0, 0.0))), MARGIN_PX)
 
 
 def test_the_fastest_star_is_as_fast_as_finite_differences_say(rng):

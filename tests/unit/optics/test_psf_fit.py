@@ -96,7 +96,7 @@ def test_the_slopes_are_those_of_differences():
         assert np.abs(slope - (after - before) / (2 * STEP)).max() < SLOPE_LIMIT
 
 
-def planted(rng, covariance, side_px=0.0, level=7.0, noise_e=0.0):
+def gaussian_points(rng, covariance, side_px=0.0, level=7.0, noise_e=0.0):
     """STARS images of one covariance at chance places within a pixel, and those places."""
     x_px, y_px = rng.uniform(-0.5, 0.5, (2, STARS))
     sides = np.full(STARS, side_px)
@@ -114,7 +114,7 @@ def planted(rng, covariance, side_px=0.0, level=7.0, noise_e=0.0):
 @pytest.mark.parametrize("side_px", [0.0, 1.4])
 def test_a_planted_gaussian_is_found_to_the_ridge(rng, side_px):
     covariance = np.tile(TILTED, (STARS, 1))
-    points, start, x_px, y_px = planted(rng, covariance, side_px)
+    points, start, x_px, y_px = gaussian_points(rng, covariance, side_px)
     fitted = fit_each(points, start, rounds=15)
     assert fitted.covariance == pytest.approx(covariance, abs=10 * FIT_LIMIT)
     assert fitted.x_px == pytest.approx(x_px, abs=FIT_LIMIT)
@@ -123,7 +123,7 @@ def test_a_planted_gaussian_is_found_to_the_ridge(rng, side_px):
 
 def test_one_covariance_of_all_is_that_of_all(rng):
     covariance = np.tile([9.0, 1.0, 0.0], (STARS, 1))
-    points, start, *_ = planted(rng, covariance, level=0.0)
+    points, start, *_ = gaussian_points(rng, covariance, level=0.0)
     fitted = fit_each(points, start, rounds=15, alike=True)
     assert np.ptp(fitted.covariance, axis=0) == pytest.approx(0.0, abs=1e-12)
     # 19 pixels are 3.2 sigmas to either side: the rest is cut, and not missed
@@ -132,7 +132,7 @@ def test_one_covariance_of_all_is_that_of_all(rng):
 
 def test_noise_moves_a_fit_by_no_more_than_its_own_sigma(rng):
     covariance = np.tile(TILTED, (STARS, 1))
-    points, start, x_px, _ = planted(rng, covariance, noise_e=NOISE_E)
+    points, start, x_px, _ = gaussian_points(rng, covariance, noise_e=NOISE_E)
     fitted = fit_each(points, start)
     for off in (fitted.x_px - x_px, *(fitted.covariance - covariance).T):
         assert abs(off.mean()) < SIGMAS * off.std() / np.sqrt(STARS)

@@ -33,7 +33,7 @@ def centroid_px(share: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     return np.array([(part.sum(axis=0) * at).sum(), (part.sum(axis=1) * at).sum()]) / part.sum()
 
 
-def errors(psf: SampledPsf, profile) -> tuple[float, float, float]:
+def profile_errors(psf: SampledPsf, profile) -> tuple[float, float, float]:
     """The largest errors of a star's flux (relative), centroid (px) and pixel (relative to its
     flux) over all phases.
     """
@@ -74,7 +74,9 @@ def errors(psf: SampledPsf, profile) -> tuple[float, float, float]:
 def test_a_sampled_psf_has_its_light_in_the_right_pixels_at_every_phase(
     profile, per_px, half_px, limit
 ):
-    flux, centroid, pixel = errors(SampledPsf(sampled(profile, per_px, half_px), per_px), profile)
+    flux, centroid, pixel = profile_errors(
+        SampledPsf(sampled(profile, per_px, half_px), per_px), profile
+    )
     holds("psf-sum", flux)
     # of an Airy pattern, whose rings go on, also the light beyond its samples
     holds("psf-pixel" if limit < AIRY_LIMIT else "psf-airy", pixel)
@@ -98,7 +100,7 @@ def test_an_image_that_reaches_far_keeps_its_core():
 def test_an_image_that_is_pixel_integrated_is_interpolated_alone():
     at = np.arange(-28, 29) / 4
     psf = SampledPsf(in_pixels(coma(), at, at), 4, pixel_integrated=True)
-    flux, centroid, pixel = errors(psf, coma())
+    flux, centroid, pixel = profile_errors(psf, coma())
     assert (flux < FLUX_LIMIT, centroid < CENTROID_LIMIT_PX, pixel < 1.5e-4) == (True, True, True)
 
 
@@ -175,7 +177,7 @@ def test_fewer_samples_than_two_a_sigma_are_off_by_percents():
     """Where it fails: the spline cannot know what lies between its samples."""
     for samples, (sigma_px, per_px) in SAMPLES_A_SIGMA.items():
         light = gaussian(sigma_px, sigma_px)
-        flux, centroid, pixel = errors(SampledPsf(sampled(light, per_px, 5), per_px), light)
+        flux, centroid, pixel = profile_errors(SampledPsf(sampled(light, per_px, 5), per_px), light)
         holds("psf-sum", flux)
         holds(f"psf-{samples}-pixel", pixel)
         holds(f"psf-{samples}-centroid", centroid)
@@ -191,7 +193,7 @@ def test_negative_lobes_become_black_and_many_are_refused():
     noisy = samples + rng.normal(0, 1e-4, samples.shape) * samples.max()
     assert noisy.min() < 0
     psf = SampledPsf(noisy, 4)
-    flux, _, pixel = errors(psf, gaussian(0.6, 0.6))
+    flux, _, pixel = profile_errors(psf, gaussian(0.6, 0.6))
     assert flux < FLUX_LIMIT
     assert pixel < 2e-3  # the noise in a pixel's 16 samples, and what its sum does to all
     assert psf.shares(PHASES * 10, PHASES[:, None] * 10).min() >= 0

@@ -67,7 +67,7 @@ class FakeScreen:
         return self._closes_at is not None and self.presented[-1] >= self._closes_at
 
 
-class Run:
+class PacedRun:
     """A run on a fake screen; a frame's sprites take `cost(number)` ns."""
 
     def __init__(self, tmp_path, limit: Limit, cost=lambda number: DRAW_NS, **screen) -> None:
@@ -104,7 +104,7 @@ class Run:
 
 
 def test_each_refresh_has_a_frame_that_is_swapped_when_predicted(tmp_path):
-    run = Run(tmp_path, Limit(slots=200))
+    run = PacedRun(tmp_path, Limit(slots=200))
     assert [frame.number for frame in run.shown] == list(range(200))
     assert run.loop.tally.missed_frames == 0
     for frame in run.shown:
@@ -115,20 +115,20 @@ def test_each_refresh_has_a_frame_that_is_swapped_when_predicted(tmp_path):
 
 
 def test_the_moment_of_light_is_the_middle_row_s_after_the_predicted_swap(tmp_path):
-    run = Run(tmp_path, Limit(slots=50))
+    run = PacedRun(tmp_path, Limit(slots=50))
     for moment in run.moments:
         assert moment.swap_ns is not None
         assert moment.light_ns == moment.light_if_begun_at(123) == moment.swap_ns + TO_LIGHT_NS
 
 
 def test_a_frame_is_begun_as_late_as_the_last_ones_allow(tmp_path):
-    run = Run(tmp_path, Limit(slots=100))
+    run = PacedRun(tmp_path, Limit(slots=100))
     early = [frame.predicted_swap_ns - frame.draw_ns for frame in run.shown]
     assert all(ahead == pytest.approx(DRAW_NS + GUARD_NS, abs=1) for ahead in early[SETTLED:])
 
 
 def test_a_slow_frame_is_swapped_late_and_what_it_missed_is_counted(tmp_path):
-    run = Run(
+    run = PacedRun(
         tmp_path, Limit(slots=100), lambda number: 1.5 * PERIOD_NS if number == 60 else DRAW_NS
     )
     (late,) = [
@@ -141,7 +141,9 @@ def test_a_slow_frame_is_swapped_late_and_what_it_missed_is_counted(tmp_path):
 
 
 def test_a_frame_far_past_its_swap_is_given_up_and_counted_with_those_it_missed(tmp_path):
-    run = Run(tmp_path, Limit(slots=100), lambda number: 5 * PERIOD_NS if number == 60 else DRAW_NS)
+    run = PacedRun(
+        tmp_path, Limit(slots=100), lambda number: 5 * PERIOD_NS if number == 60 else DRAW_NS
+    )
     assert 60 not in [frame.number for frame in run.shown]
     assert run.loop.tally.given_up_frames == run.notices.counts()["frame-given-up"] == 1
     after = next(frame for frame in run.shown if frame.number > 60)
@@ -149,25 +151,25 @@ def test_a_frame_far_past_its_swap_is_given_up_and_counted_with_those_it_missed(
 
 
 def test_a_display_without_a_refresh_of_its_own_is_paced_by_the_clock(tmp_path):
-    run = Run(tmp_path, Limit(slots=100), by_screen=False)
+    run = PacedRun(tmp_path, Limit(slots=100), by_screen=False)
     assert {frame.swap_ns - frame.predicted_swap_ns for frame in run.shown} == {0}
     assert np.diff([frame.swap_ns for frame in run.shown]) == pytest.approx(PERIOD_NS, abs=1)
 
 
 def test_the_run_ends_with_its_window(tmp_path):
-    run = Run(tmp_path, Limit(), closes_at=7)
+    run = PacedRun(tmp_path, Limit(), closes_at=7)
     assert [frame.number for frame in run.shown] == list(range(8))
     assert run.loop.stop.is_set()
     assert "window-gone" not in run.notices.counts()
 
 
 def test_a_run_of_so_many_frames_presents_so_many(tmp_path):
-    run = Run(tmp_path, Limit(frames=12))
+    run = PacedRun(tmp_path, Limit(frames=12))
     assert run.screen.presented == list(range(12))
 
 
 def test_frames_say_how_they_were_timed_and_what_the_photodiode_saw(tmp_path):
-    run = Run(tmp_path, Limit(slots=4))
+    run = PacedRun(tmp_path, Limit(slots=4))
     assert [frame.marker for frame in run.shown] == [0, 1, 0, 1]
     assert {frame.timestamp_source for frame in run.shown} == {"a fake"}
     said = run.loop.screen_summary()
@@ -178,12 +180,12 @@ def test_frames_say_how_they_were_timed_and_what_the_photodiode_saw(tmp_path):
 
 
 def test_stars_move_within_the_frames_of_a_display(tmp_path):
-    run = Run(tmp_path, Limit(slots=1))
+    run = PacedRun(tmp_path, Limit(slots=1))
     assert run.rates == [TURNING.rate_cam_rad_s]
 
 
 def test_an_idle_screen_is_kept_alive_and_ends_the_run_when_its_window_goes(tmp_path):
-    run = Run(tmp_path, Limit(slots=0))
+    run = PacedRun(tmp_path, Limit(slots=0))
     run.loop.idle()
     assert run.screen.presented == [0] and not run.loop.stop.is_set()
     run.screen.window.gone = "its display was unplugged"

@@ -54,7 +54,7 @@ class SlowBench:
         )
 
 
-class Run:
+class LoopRun:
     """A paced run of `limit` on a fake clock."""
 
     def __init__(
@@ -79,7 +79,7 @@ class Run:
 
 
 def test_frames_stand_on_a_grid_of_the_clock(tmp_path):
-    run = Run(tmp_path, Limit(slots=100))
+    run = LoopRun(tmp_path, Limit(slots=100))
     assert run.numbers == list(range(100))
     assert run.lights_ns == [1_000_000_000 + k * PERIOD_NS for k in range(100)]
     assert run.loop.tally.missed_frames == 0
@@ -100,7 +100,7 @@ def test_a_wait_that_wakes_late_shifts_no_later_frame(tmp_path):
 @pytest.mark.parametrize(("cost_periods", "missed"), [(0.5, 0), (1.5, 1), (1.96, 2)])
 def test_a_slow_frame_misses_the_slots_that_pass_meanwhile(tmp_path, cost_periods, missed):
     """With the millisecond of drawing, 1.96 periods are more than two."""
-    run = Run(
+    run = LoopRun(
         tmp_path, Limit(slots=20), lambda number: cost_periods * PERIOD_NS if number == 5 else 0
     )
     assert run.numbers == [*range(6), *range(6 + missed, 20)]
@@ -111,7 +111,7 @@ def test_a_slow_frame_misses_the_slots_that_pass_meanwhile(tmp_path, cost_period
 
 
 def test_a_frame_whose_sprites_took_too_long_is_given_up_and_the_next_is_shown(tmp_path):
-    run = Run(tmp_path, Limit(slots=20), lambda number: 3.5 * PERIOD_NS if number == 3 else 0)
+    run = LoopRun(tmp_path, Limit(slots=20), lambda number: 3.5 * PERIOD_NS if number == 3 else 0)
     assert run.numbers == [0, 1, 2, *range(7, 20)]
     tally = run.loop.tally
     assert (tally.given_up_frames, tally.missed_frames, tally.frames) == (1, 4, 16)
@@ -124,25 +124,27 @@ def test_a_turn_beyond_what_effort_claims_is_told_once(tmp_path, turn_deg_s, tol
     turning = replace(STILL, rate_cam_rad_s=(0.0, math.radians(turn_deg_s), 0.0))
     for motion, count in (("on", told), ("off", 0)):
         more = f'[render]\nmotion = "{motion}"\n'
-        run = Run(tmp_path, Limit(slots=20), more=more, attitude=turning)
+        run = LoopRun(tmp_path, Limit(slots=20), more=more, attitude=turning)
         assert run.loop.notices.counts().get("beyond-claim", 0) == count
 
 
 def test_no_two_frames_in_a_row_are_given_up(tmp_path):
-    run = Run(tmp_path, Limit(slots=60), lambda number: 3.5 * PERIOD_NS)
+    run = LoopRun(tmp_path, Limit(slots=60), lambda number: 3.5 * PERIOD_NS)
     begun = len(run.shown) + run.loop.tally.given_up_frames
     assert len(run.shown) == begun // 2 > 5
     assert run.loop.tally.frames + run.loop.tally.missed_frames == 60
 
 
 def test_a_run_ends_after_so_many_frames_whatever_was_missed(tmp_path):
-    run = Run(tmp_path, Limit(frames=10), lambda number: 1.5 * PERIOD_NS if number % 4 == 0 else 0)
+    run = LoopRun(
+        tmp_path, Limit(frames=10), lambda number: 1.5 * PERIOD_NS if number % 4 == 0 else 0
+    )
     assert len(run.shown) == 10
     assert run.loop.tally.missed_frames == sum(frame.missed_before for frame in run.shown)
 
 
 def test_slots_after_the_end_of_a_run_are_not_missed(tmp_path):
-    run = Run(tmp_path, Limit(slots=6), lambda number: 10.5 * PERIOD_NS if number == 4 else 0)
+    run = LoopRun(tmp_path, Limit(slots=6), lambda number: 10.5 * PERIOD_NS if number == 4 else 0)
     assert run.numbers == [0, 1, 2, 3]
     assert run.loop.tally.frames + run.loop.tally.missed_frames == 6
 
@@ -185,13 +187,15 @@ def test_a_stopped_lead_in_ends(tmp_path):
 
 @pytest.mark.parametrize(("on_stale", "blank"), [("hold", False), ("blank", True)])
 def test_a_stale_attitude_is_held_or_blank_as_the_bench_file_says(tmp_path, on_stale, blank):
-    run = Run(tmp_path, Limit(slots=3), more=f'[attitude]\non_stale = "{on_stale}"\n', attitude=OLD)
+    run = LoopRun(
+        tmp_path, Limit(slots=3), more=f'[attitude]\non_stale = "{on_stale}"\n', attitude=OLD
+    )
     assert [frame.attitude is None for frame in run.shown] == [blank] * 3
     assert run.loop.tally.stale_frames == 3
 
 
 def test_without_an_attitude_a_frame_is_blank_and_says_so(tmp_path):
-    run = Run(tmp_path, Limit(slots=2), attitude=None)
+    run = LoopRun(tmp_path, Limit(slots=2), attitude=None)
     assert all(
         frame.missing and frame.attitude is None and frame.drawn.star_count == 0
         for frame in run.shown

@@ -57,11 +57,11 @@ def kept(monkeypatch):
     return made
 
 
-def settings(**keys):
+def pulse_settings(**keys):
     return SyncSettings(port="loop://", **keys)
 
 
-def frames(pulse, count, first=0):
+def pulsed_frames(pulse, count, first=0):
     for number in range(first, first + count):
         pulse.frame(number, time.monotonic_ns())
         time.sleep(FRAME_S)
@@ -72,9 +72,9 @@ def test_each_frame_has_a_pulse_of_the_width_and_level_asked_for_and_the_line_en
     kept, active
 ):
     high = active == "high"
-    with FramePulse(Line(high), settings(active=active, pulse_ms=3.0), Notices()) as pulse:
+    with FramePulse(Line(high), pulse_settings(active=active, pulse_ms=3.0), Notices()) as pulse:
         for number in range(12):
-            frames(pulse, 1, number)
+            pulsed_frames(pulse, 1, number)
             wait_for(
                 lambda number=number: pulse.summary().pulses == number + 1,
                 "its pulse has ended",
@@ -99,7 +99,7 @@ def test_each_frame_has_a_pulse_of_the_width_and_level_asked_for_and_the_line_en
 
 def test_the_delay_is_the_one_from_the_frame_s_stamp_to_the_line(kept):
     stamps = []
-    with FramePulse(Line(), settings(), Notices()) as pulse:
+    with FramePulse(Line(), pulse_settings(), Notices()) as pulse:
         for number in range(12):
             # swapped 2 ms ago, as far as the driver knows
             stamps.append(time.monotonic_ns() - 2_000_000)
@@ -115,8 +115,8 @@ def test_the_delay_is_the_one_from_the_frame_s_stamp_to_the_line(kept):
 
 
 def test_of_every_third_frame(kept):
-    with FramePulse(Line(), settings(every_frames=3), Notices()) as pulse:
-        frames(pulse, 9, first=1)
+    with FramePulse(Line(), pulse_settings(every_frames=3), Notices()) as pulse:
+        pulsed_frames(pulse, 9, first=1)
     summary = pulse.summary()
     assert summary.pulses + summary.skipped == 3
 
@@ -124,7 +124,7 @@ def test_of_every_third_frame(kept):
 @pytest.mark.timing
 def test_a_slow_line_keeps_no_frame_waiting_and_what_it_misses_is_counted(kept):
     line = Line()
-    with FramePulse(line, settings(), Notices()) as pulse:
+    with FramePulse(line, pulse_settings(), Notices()) as pulse:
         line.slow_s = 0.1
         begin_s, asked_s = time.thread_time(), time.monotonic()
         costs_s = []
@@ -146,17 +146,17 @@ def test_a_slow_line_keeps_no_frame_waiting_and_what_it_misses_is_counted(kept):
 
 def test_a_line_that_is_lost_is_told_once_and_tried_until_it_is_back(kept):
     notices, line = Notices(), Line()
-    with FramePulse(line, settings(), notices) as pulse:
-        frames(pulse, 2)
+    with FramePulse(line, pulse_settings(), notices) as pulse:
+        pulsed_frames(pulse, 2)
         line.gone = True
-        frames(pulse, 10)
+        pulsed_frames(pulse, 10)
         wait_for(notices.counts, "the line is told to be lost")
         assert notices.counts() == {"sync-lost": 1}
         line.gone = False
         deadline_s, number = time.monotonic() + PATIENCE_S, 12
         before = pulse.summary().pulses
         while pulse.summary().pulses == before and time.monotonic() < deadline_s:
-            frames(pulse, 1, number)
+            pulsed_frames(pulse, 1, number)
             number += 1
     assert notices.counts() == {"sync-lost": 1, "sync-back": 1}
     summary = pulse.summary()

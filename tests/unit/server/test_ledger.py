@@ -41,6 +41,7 @@ from hilstar.server.record.ledger_records import (
 )
 from hilstar.server.record.run_figures import RunFigures, figures_of, summarise
 from tests.support.full_disk import files_of_at_most
+from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
 
 UNCERTIFIED = SimpleNamespace(certify=SimpleNamespace(certificate=None))
@@ -110,8 +111,7 @@ def test_a_split_is_a_size_or_a_time():
         parse_split("1.5h").seconds,
     ) == (1e9, 1800, 5400)
     for wrong in ("1", "GB", "1kB", "5s", "-1h", "1e3GB", "1 fortnight"):
-        with pytest.raises(InputError, match="--ledger-split"):
-            parse_split(wrong)
+        assert "--ledger-split" in refusal(parse_split, wrong)
 
 
 def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(tmp_path, bench):
@@ -140,7 +140,7 @@ def replace_by_another(path, folder):
     (folder / "other").replace(path)
 
 
-def cut(path, _):
+def cut_file(path, _):
     os.truncate(path, 300)
 
 
@@ -183,7 +183,7 @@ def harm_until_said(path, harm, notices):
 
 @pytest.mark.parametrize("split", [SplitLimits(), SplitLimits(bytes=1)])
 @pytest.mark.parametrize(
-    "harm", [delete, replace_by_another, cut, write_anew, write_longer, write_over]
+    "harm", [delete, replace_by_another, cut_file, write_anew, write_longer, write_over]
 )
 def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, bench, harm, split):
     notices, path = Notices(), tmp_path / "run.mcap"
@@ -324,8 +324,7 @@ def test_an_mcap_without_attitudes_lists_its_topics(tmp_path):
         writer.add_message(writer.register_channel(topic, "json", 0), 1, b"{}", 1)
     writer.finish()
     (tmp_path / "other.mcap").write_bytes(file.getvalue())
-    with pytest.raises(InputError, match="its topics are /gps, /imu"):
-        read_log(tmp_path / "other.mcap")
+    assert "its topics are /gps, /imu" in refusal(read_log, tmp_path / "other.mcap")
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ MS = 1_000_000
 RATE = np.array([0.0, 0.1, 0.0])
 
 
-def attitude(angle: float, age_ns: int = 5 * MS) -> Attitude:
+def aged_attitude(angle: float, age_ns: int = 5 * MS) -> Attitude:
     return Attitude(
         np.array([np.cos(angle), 0.0, 0.0, np.sin(angle)]), age_ns, False, rate_cam_rad_s=RATE
     )
@@ -27,16 +27,16 @@ def aids():
 
 
 def test_without_keys_the_attitude_is_the_one_that_came(aids):
-    wanted = attitude(0.1)
+    wanted = aged_attitude(0.1)
     assert Operator(aids, Notices()).attitude(0, wanted) is wanted
 
 
 def test_a_pause_keeps_the_attitude_which_grows_old_and_does_not_move(aids):
     operator = Operator(aids, Notices())
-    before = attitude(0.1)
+    before = aged_attitude(0.1)
     operator.attitude(100 * MS, before)
     aids.set("pause", True)
-    held = operator.attitude(350 * MS, attitude(0.2))
+    held = operator.attitude(350 * MS, aged_attitude(0.2))
     assert held is not None and held.q_icrs_to_cam is before.q_icrs_to_cam
     assert held.age_ns == 255 * MS
     assert held.rate_cam_rad_s is None
@@ -47,16 +47,16 @@ def test_a_pause_keeps_the_attitude_which_grows_old_and_does_not_move(aids):
 def test_a_pause_before_any_attitude_shows_none(aids):
     operator = Operator(aids, Notices())
     aids.set("pause", True)
-    assert operator.attitude(0, attitude(0.1)) is None
+    assert operator.attitude(0, aged_attitude(0.1)) is None
 
 
 def test_under_a_blank_or_a_patch_there_is_no_sky(aids):
     operator = Operator(aids, Notices())
     for name in ("blank", "patch"):
         aids.set(name, True)
-        assert operator.attitude(0, attitude(0.1)) is None
+        assert operator.attitude(0, aged_attitude(0.1)) is None
         aids.set(name, False)
-    wanted = attitude(0.1)
+    wanted = aged_attitude(0.1)
     assert operator.attitude(0, wanted) is wanted
 
 

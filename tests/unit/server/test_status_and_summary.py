@@ -44,7 +44,7 @@ def loop():
 RENDERER = SimpleNamespace(gl_renderer="llvmpipe", gl_version="4.5", path="points")
 
 
-def shown(
+def shown_frame(
     attitude: Attitude | None = FRESH, number: int = 9, clipped: tuple[int, ...] = (), **more
 ) -> Shown:
     return Shown(number, 0, attitude, SimpleNamespace(clipped_hip=clipped), **more)
@@ -53,7 +53,7 @@ def shown(
 def test_a_status_names_the_frame_its_light_and_the_attitude_behind_it(loop):
     counts = PacketCounts(received=10)
     counts.refused_by["crc"] = 3
-    status = StatusMaker().status(shown(), 123, loop, counts, True)
+    status = StatusMaker().status(shown_frame(), 123, loop, counts, True)
     assert (status.frame, status.light_t_ns, status.attitude_sequence, status.attitude_age_ns) == (
         9,
         123,
@@ -65,7 +65,7 @@ def test_a_status_names_the_frame_its_light_and_the_attitude_behind_it(loop):
 
 
 def test_without_an_attitude_its_age_is_minus_one(loop):
-    status = StatusMaker().status(shown(None, missing=True), 0, loop, PacketCounts(), False)
+    status = StatusMaker().status(shown_frame(None, missing=True), 0, loop, PacketCounts(), False)
     assert (status.attitude_age_ns, status.attitude_sequence) == (-1, 0)
     assert status.health == protocol.HEALTH_NO_ATTITUDE | protocol.HEALTH_BLANK
 
@@ -74,9 +74,12 @@ def test_missed_frames_and_refused_packets_are_told_once_each_time(loop):
     maker, counts = StatusMaker(), PacketCounts()
     loop.tally.missed_frames, counts.refused_by["norm"] = 2, 1
     bits = protocol.HEALTH_MISSED | protocol.HEALTH_REFUSED
-    assert [maker.status(shown(), 0, loop, counts, False).health for _ in range(2)] == [bits, 0]
+    assert [maker.status(shown_frame(), 0, loop, counts, False).health for _ in range(2)] == [
+        bits,
+        0,
+    ]
     loop.tally.missed_frames += 1
-    assert maker.status(shown(), 0, loop, counts, False).health == protocol.HEALTH_MISSED
+    assert maker.status(shown_frame(), 0, loop, counts, False).health == protocol.HEALTH_MISSED
 
 
 @pytest.mark.parametrize(
@@ -89,7 +92,9 @@ def test_missed_frames_and_refused_packets_are_told_once_each_time(loop):
 def test_an_operator_s_keys_and_a_hidden_window_are_told_while_they_last(loop, on_screen, bit):
     maker = StatusMaker()
     loop.pacer.operator.now = on_screen
-    assert [maker.status(shown(), 0, loop, PacketCounts(), False).health for _ in range(2)] == [
+    assert [
+        maker.status(shown_frame(), 0, loop, PacketCounts(), False).health for _ in range(2)
+    ] == [
         bit,
         bit,
     ]
@@ -98,17 +103,19 @@ def test_an_operator_s_keys_and_a_hidden_window_are_told_while_they_last(loop, o
 def test_a_failed_ledger_a_clipped_star_and_a_stale_attitude_are_told_while_they_last(loop):
     ledger = SimpleNamespace(failure=None)
     maker = StatusMaker(ledger)
-    assert maker.status(shown(), 0, loop, PacketCounts(), False).health == 0
+    assert maker.status(shown_frame(), 0, loop, PacketCounts(), False).health == 0
     ledger.failure, loop.gate.stale = "No space left on device", True
     bits = protocol.HEALTH_LEDGER_FAILED | protocol.HEALTH_CLIPPED | protocol.HEALTH_STALE
-    assert maker.status(shown(clipped=(32349,)), 0, loop, PacketCounts(), False).health == bits
+    assert (
+        maker.status(shown_frame(clipped=(32349,)), 0, loop, PacketCounts(), False).health == bits
+    )
 
 
 def test_a_second_sender_is_told_while_it_lasts_and_once_if_it_has_gone_since(loop):
     maker, notices = StatusMaker(), loop.notices
 
     def health() -> int:
-        return maker.status(shown(), 0, loop, PacketCounts(), False).health
+        return maker.status(shown_frame(), 0, loop, PacketCounts(), False).health
 
     notices.begin("second-sender", "two senders")
     assert [health(), health()] == [protocol.HEALTH_SECOND_SENDER] * 2

@@ -29,7 +29,7 @@ TURNING = Attitude(
 )
 
 
-class Run:
+class ModelRun:
     """A bench on a model display: past the gate, then `frames` frames."""
 
     def __init__(self, tmp_path, hz: float = 60, force: bool = False, **display) -> None:
@@ -66,7 +66,7 @@ def test_a_stamp_ahead_of_now_is_the_driver_s_time_of_the_swap(tmp_path, hz, sta
     """Linux stamps the end of a blank at its beginning: with stamps refused, light was a refresh
     late behind three buffers.
     """
-    run = Run(tmp_path, hz, buffers=3, stamp_ns=round(stamp_ms * MS))
+    run = ModelRun(tmp_path, hz, buffers=3, stamp_ns=round(stamp_ms * MS))
     late_ns = run.frames(100)
     assert run.display.timestamp_source == "GLX_OML_sync_control"
     assert run.timing.queued == 0 and run.loop.tally.missed_frames == 0
@@ -76,7 +76,7 @@ def test_a_stamp_ahead_of_now_is_the_driver_s_time_of_the_swap(tmp_path, hz, sta
 @pytest.mark.parametrize("wrong_ms", [25.0, -1500.0])
 def test_stamps_of_another_clock_are_given_up(tmp_path, caplog, wrong_ms):
     with caplog.at_level(logging.WARNING):
-        run = Run(tmp_path, stamp_ns=round(wrong_ms * MS))
+        run = ModelRun(tmp_path, stamp_ns=round(wrong_ms * MS))
         late_ns = run.frames(100)
     assert run.display.timestamp_source == "after-swap clock"
     assert "gives no time of swaps" in caplog.text
@@ -84,7 +84,7 @@ def test_stamps_of_another_clock_are_given_up(tmp_path, caplog, wrong_ms):
 
 
 def test_single_gaps_between_stamps_cost_nothing(tmp_path, caplog):
-    run = Run(tmp_path, stamp_ns=0, stampless=lambda number: number % 10 == 3)
+    run = ModelRun(tmp_path, stamp_ns=0, stampless=lambda number: number % 10 == 3)
     assert np.abs(run.frames(200)).max() < ON_TIME_NS
     assert {frame.timestamp_source for frame in run.shown} == {
         "GLX_OML_sync_control",
@@ -103,8 +103,8 @@ def test_frames_that_a_driver_holds_back_are_found_and_refused_or_reckoned_with(
         with pytest.raises(
             MachineError, match=f"holds {held} finished frame.* back.*after the swap.*--force"
         ):
-            Run(tmp_path, hz, buffers=buffers)
-    run = Run(tmp_path, hz, force=True, buffers=buffers)
+            ModelRun(tmp_path, hz, buffers=buffers)
+    run = ModelRun(tmp_path, hz, force=True, buffers=buffers)
     assert run.timing.queued == held
     assert np.abs(run.frames(100)[4:]).max() < (QUEUED_NS if held else ON_TIME_NS)
     assert run.loop.screen_summary()["queued_frames"] == held
@@ -117,7 +117,7 @@ def test_a_driver_that_needs_longer_is_found_by_the_gate(tmp_path, deadline_ms, 
     """With a guard of 1 ms and a driver that needs 1.3, every frame was a refresh late, at half
     the rate, for good.
     """
-    run = Run(tmp_path, hz, deadline_ns=round(deadline_ms * MS))
+    run = ModelRun(tmp_path, hz, deadline_ns=round(deadline_ms * MS))
     assert run.timing.guard_ms == pytest.approx(
         min(next(guard_ms for guard_ms in GUARDS_MS if guard_ms > deadline_ms), 500 / hz)
     )
@@ -128,7 +128,7 @@ def test_a_driver_that_needs_longer_is_found_by_the_gate(tmp_path, deadline_ms, 
 
 
 def test_a_driver_that_comes_to_need_longer_is_followed_within_a_second(tmp_path):
-    run = Run(tmp_path)
+    run = ModelRun(tmp_path)
     run.frames(100)
     run.display.deadline_ns = round(1.9 * MS)
     late = np.abs(run.frames(120)) > ON_TIME_NS
@@ -138,7 +138,7 @@ def test_a_driver_that_comes_to_need_longer_is_followed_within_a_second(tmp_path
 
 
 def test_frames_that_were_late_themselves_do_not_raise_the_guard(tmp_path):
-    run = Run(tmp_path)
+    run = ModelRun(tmp_path)
     for _ in range(20):
         assert not run.screen.budget.add_flip(lead_ns=-2 * MS, late_ns=16.7 * MS)
         assert not run.screen.budget.add_flip(lead_ns=1 * MS, late_ns=0.01 * MS)

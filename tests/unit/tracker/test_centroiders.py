@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.tracker.centroiders import Centroider, brightest, star_places
+from hilstar.tracker.centroiders import Centroider, _profile, brightest, star_places
 
 SIGMA = (1.05, 0.95)
 # Of Gaussians integrated over pixels: sampling's own errors; a box of 5 x 5 cuts wings, one of 3 x
@@ -24,7 +24,7 @@ BIAS_PX = {
 }
 
 
-def stars(places, side=21):
+def gaussian_images(places, side=21):
     at = np.arange(side) - side // 2
     share = [
         np.diff(ndtr((np.append(at - 0.5, at[-1] + 0.5) - place[:, None]) / sigma))
@@ -36,16 +36,16 @@ def stars(places, side=21):
 @pytest.mark.parametrize("kind", get_args(Centroider))
 def test_each_finds_a_star_within_its_own_bias(kind, rng):
     places = rng.uniform(-0.5, 0.5, (2, 50))
-    x, y = star_places(1e4 * stars(places), kind, SIGMA)
+    x, y = star_places(1e4 * gaussian_images(places), kind, SIGMA)
     assert np.abs([x - places[0], y - places[1]]).max() < BIAS_PX[kind]
 
 
 @pytest.mark.parametrize("kind", get_args(Centroider))
 def test_each_follows_a_small_shift_and_finds_nothing_in_the_dark(kind):
     places = np.array([[0.2, 0.21, 0.0], [-0.3, -0.3, 0.0]])
-    images = stars(places)
+    images = gaussian_images(places)
     images[2] = 0
-    x, y = star_places(images, kind, SIGMA, brightest(stars(np.zeros((2, 3)))))
+    x, y = star_places(images, kind, SIGMA, brightest(gaussian_images(np.zeros((2, 3)))))
     assert 0.003 < x[1] - x[0] < 0.011
     assert abs(y[1] - y[0]) < 1e-3
     assert x[2] == y[2] == 0
@@ -55,7 +55,7 @@ def test_noise_alone_and_clipped_stars_keep_every_place_finite(rng):
     for images in (
         rng.normal(0, 1, (40, 15, 15)) + 0.1,
         np.ones((3, 15, 15)),
-        np.minimum(stars(np.zeros((2, 3))), 0.01),
+        np.minimum(gaussian_images(np.zeros((2, 3))), 0.01),
     ):
         for kind in get_args(Centroider):
             assert np.isfinite(star_places(np.maximum(images, 0), kind, SIGMA)).all()
@@ -66,13 +66,16 @@ HOSTILE = {
     "two pixels, apart": lambda rng: np.eye(15)[7][:, None] * (np.eye(15)[2] + np.eye(15)[12]),
     "a row": lambda rng: np.eye(15)[7][:, None] * np.ones(15),
     "a corner": lambda rng: np.eye(15)[0][:, None] * np.eye(15)[0],
-    "half of a star, at an edge": lambda rng: stars(np.zeros((2, 1)), 15)[0] * (np.arange(15) < 7),
-    "two stars, one of them brighter": lambda rng: (
-        stars(np.array([[1.5], [0.0]]), 15)[0] + 9 * stars(np.array([[-1.5], [0.5]]), 15)[0]
+    "half of a star, at an edge": lambda rng: (
+        gaussian_images(np.zeros((2, 1)), 15)[0] * (np.arange(15) < 7)
     ),
-    "clipped flat": lambda rng: np.minimum(1e6 * stars(np.zeros((2, 1)), 15)[0], 1.0),
-    "hardly any light": lambda rng: 1e-29 * stars(np.zeros((2, 1)), 15)[0],
-    "more than a sun": lambda rng: 1e30 * stars(np.zeros((2, 1)), 15)[0],
+    "two stars, one of them brighter": lambda rng: (
+        gaussian_images(np.array([[1.5], [0.0]]), 15)[0]
+        + 9 * gaussian_images(np.array([[-1.5], [0.5]]), 15)[0]
+    ),
+    "clipped flat": lambda rng: np.minimum(1e6 * gaussian_images(np.zeros((2, 1)), 15)[0], 1.0),
+    "hardly any light": lambda rng: 1e-29 * gaussian_images(np.zeros((2, 1)), 15)[0],
+    "more than a sun": lambda rng: 1e30 * gaussian_images(np.zeros((2, 1)), 15)[0],
     "noise": lambda rng: np.maximum(rng.normal(size=(15, 15)), 0),
 }
 
@@ -84,3 +87,11 @@ def test_a_star_that_is_none_has_a_place_on_its_square(kind, sigma, rng):
     images = np.array([make(rng) for make in HOSTILE.values()])
     for x in star_places(images, kind, (sigma, sigma)):
         assert np.isfinite(x).all() and np.abs(x).max() <= 7
+
+
+def test_a_star_s_shares_change_with_its_place_as_their_slopes_say():
+    at, sigma_px, step_px = np.arange(-6.0, 7.0), 0.8, 1e-5
+    places = np.array([-0.4, 0.0, 0.3])
+    before, slopes = _profile(at, places, sigma_px)
+    after, _ = _profile(at, places + step_px, sigma_px)
+    assert slopes == pytest.approx((after - before) / step_px, abs=step_px)

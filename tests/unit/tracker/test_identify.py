@@ -40,7 +40,7 @@ def lost_in_space(sky):
     return LostInSpace(*sky, FOCAL_PX, (SIDE_PX, SIDE_PX))
 
 
-class Sky:
+class SeenSky:
     """Stars that a camera of 10.9 degrees sees at an attitude, with noise, false ones and one
     that a neighbour pulled away.
     """
@@ -71,7 +71,7 @@ def test_lost_in_space_and_then_by_all_stars_is_the_true_attitude_wherever_the_c
     sky, lost_in_space, rng
 ):
     for q in normalise(rng.normal(size=(25, 4))):
-        seen = Sky(sky, q, rng)
+        seen = SeenSky(sky, q, rng)
         rays = seen.found.rays
         guess = lost_in_space.solve(rays[:, :2] / rays[:, 2:], seen.found.flux_e)
         assert guess is not None
@@ -84,7 +84,7 @@ def test_noise_alone_is_no_attitude(sky, lost_in_space, rng):
     x, y = rng.uniform(0, SIDE_PX, (2, 30))
     rays = normalise(np.stack([x - 511.5, y - 511.5, np.full(30, FOCAL_PX)], axis=1))
     assert lost_in_space.solve(rays[:, :2] / rays[:, 2:], np.ones(30)) is None
-    seen = Sky(sky, normalise(rng.normal(size=4)), rng)
+    seen = SeenSky(sky, normalise(rng.normal(size=4)), rng)
     assert (
         identify(
             FoundStars(x, y, np.ones(30), rays),
@@ -100,7 +100,7 @@ def test_noise_alone_is_no_attitude(sky, lost_in_space, rng):
 def test_an_expected_attitude_may_be_off_by_the_first_radius(sky, rng, off_px):
     q = normalise(rng.normal(size=4))
     expected = multiply(from_rotation_vector(np.array([0.6, 0.8, 0.0]) * off_px / FOCAL_PX), q)
-    seen = Sky(sky, q, rng)
+    seen = SeenSky(sky, q, rng)
     known = identify(seen.found, expected, seen.near, seen.place)
     assert known is not None
     assert angle_between_rad(known.q_icrs_to_cam, q) < LIMIT_RAD
@@ -111,7 +111,7 @@ def test_the_residual_s_rms_is_that_of_one_axis(sky, rng):
     """Of 12 fields of some 20 stars: known to a twentieth; three of their numbers go to the fit."""
     rms_px = []
     for q in normalise(rng.normal(size=(12, 4))):
-        seen = Sky(sky, q, rng)
+        seen = SeenSky(sky, q, rng)
         known = identify(seen.found, q, seen.near, seen.place)
         freedom = 1 - 3 / (2 * len(known.star))
         rms_px.append(known.rms_rad * FOCAL_PX / np.sqrt(freedom))

@@ -42,10 +42,11 @@ from hilstar.server.bench.cameras import (
     ideal_monitor,
     tracker_camera,
 )
-from hilstar.server.bench.config import parse_config
+from hilstar.server.bench.config import Monitor, parse_config
 from hilstar.server.bench.monitor import calibration_source
 from hilstar.server.sync import BeatSummary
 from hilstar.tracker.mosaic import software_image
+from hilstar.tracker.settings import DetectorSettings
 
 Verdict = Literal["done", "skipped", "failed"]
 Figure = float | int | str
@@ -257,7 +258,7 @@ class DarkSubtracted:
 class StepContext:
     """Everything that a step works with.
 
-    Images go to `folder`, results to `session`. `kept` has the images of an interrupted attempt,
+    Images go to `folder`, results to `session`. `images` has those of an interrupted attempt,
     which are not taken again. `known` has the figures of earlier steps; `patches` is the maximum
     number of readings of the response. `watch` is called with each pattern before it is shown.
     White is watched for `watched_s` at most, 0 for not at all.
@@ -270,7 +271,7 @@ class StepContext:
     folder: Path
     source: ImageSource
     known: dict[str, Figure]
-    kept: Mapping[str, Path]
+    images: Mapping[str, Path]
     patches: int
     watch: Callable[[Pattern], object] = lambda pattern: None
     watched_s: float = 0.0
@@ -278,14 +279,24 @@ class StepContext:
     stage: Callable[[str], object] = lambda words: None
 
     @property
+    def monitor(self) -> Monitor:
+        """The bench file's [monitor]."""
+        return self.file.config.monitor
+
+    @property
+    def detector(self) -> DetectorSettings:
+        """The bench file's [tracker.detector]."""
+        return self.file.config.tracker.detector
+
+    @property
     def resolution_px(self) -> tuple[int, int]:
         """Size of the monitor's image."""
-        return self.file.config.monitor.resolution_px
+        return self.monitor.resolution_px
 
     @property
     def white(self) -> int:
         """The largest code."""
-        return int(2**self.file.config.monitor.bits - 1)
+        return int(2**self.monitor.bits - 1)
 
     @property
     def truth(self) -> BenchFile | None:
@@ -359,20 +370,20 @@ class StepContext:
 
     def take(self, pattern: Pattern, exposure_s: float | None = None) -> Path:
         """Take the tracker's image of a pattern, by default at the bench file's exposure."""
-        if pattern.name in self.kept:
-            return self.kept[pattern.name]
+        if pattern.name in self.images:
+            return self.images[pattern.name]
         make_directory(self.folder)
+        if exposure_s is None:
+            exposure_s = self.exposure_s
         stem = self.folder / pattern.name
         self.watch(pattern)
-        return self.source.look(
-            self.file, pattern, stem, self.exposure_s if exposure_s is None else exposure_s
-        )
+        return self.source.look(self.file, pattern, stem, exposure_s)
 
     def take_or_key(self, pattern: Pattern, keys: Mapping[str, str]) -> Path | str:
         """Take the tracker's image of a pattern, or by hand the key that says how it looks;
         `keys` has their meanings.
         """
-        if isinstance(self.source, ByHand) and pattern.name not in self.kept:
+        if isinstance(self.source, ByHand) and pattern.name not in self.images:
             stem = make_directory(self.folder) / pattern.name
             self.watch(pattern)
             return self.source.look_or_key(self.file, pattern, stem, keys)
@@ -381,8 +392,8 @@ class StepContext:
     def unlit(self) -> Path | None:
         """The tracker's image with the monitor switched off, None where there is none."""
         name = "unlit_000"
-        if name in self.kept:
-            return self.kept[name]
+        if name in self.images:
+            return self.images[name]
         return self.source.unlit(make_directory(self.folder) / name)
 
     def dark(self, number: int = 0) -> Path:
@@ -448,5 +459,5 @@ def darker_code(code: int) -> int:
 
 def calibration_of(context: StepContext) -> Calibration:
     """The calibration that the bench file names."""
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     return load_calibration(calibration_source(monitor, context.file.folder), monitor.bits)

@@ -19,6 +19,7 @@ from scipy.special import ndtr
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import chart
 from hilstar.basics.errors import InputError
+from hilstar.basics.units import MAD_TO_SIGMA
 from hilstar.instruments.calibrate.effective_psf import (
     Found,
     dots_of_image,
@@ -112,8 +113,9 @@ class Sharpness:
 
 
 class _Dots(NamedTuple):
-    """Squares of pixels (n, k, k) about dots, and the offsets of their middles from the dots'
-    first places (n,).
+    """Squares of pixels (n, k, k), DN, about dots, and the dots' first places (n,), px.
+
+    A square reaches `half_px` from its middle pixel to each side.
     """
 
     values: FloatArray
@@ -163,14 +165,13 @@ def sharpness(
             " look at the focus"
         )
     turn = math.radians(turn_deg)
-    half_side = dot_side_px / 2 * (abs(math.cos(turn)) + abs(math.sin(turn)))
+    # of the upright square that holds a turned one
+    widening = abs(math.cos(turn)) + abs(math.sin(turn))
+    half_side = dot_side_px / 2 * widening
     # The wings of a first look at the dots: the blob's pixels are those above the threshold.
     blob_px = math.sqrt(float(np.median(centroids.pixels)) / math.pi)
-    half = int(
-        np.clip(
-            math.ceil(max(half_side + START_SIGMAS, 1.5 * blob_px + 2)), MIN_HALF_PX, MAX_HALF_PX
-        )
-    )
+    reach_px = max(half_side + START_SIGMAS, 1.5 * blob_px + 2)
+    half = int(np.clip(math.ceil(reach_px), MIN_HALF_PX, MAX_HALF_PX))
     # Where dots stand closer together, smaller squares hold less of the wings and the fit's error
     # says so.
     smallest = math.ceil(half_side + MIN_WINGS_PX)
@@ -197,9 +198,12 @@ def sharpness(
     by_scatter = float(np.std(dot_sigmas)) / math.sqrt(len(dot_sigmas))
     by_model = math.hypot(MODEL_SHARE * sigma_px, EDGE_SHARE * fit.shape.side_px)
     error_px = math.hypot(max(fit.sigma_error_px, by_scatter), by_model)
+    # a place of the fit is from the middle of its dot's pixel
+    x_px = np.rint(dots.x_px) + fit.places[:, 0]
+    y_px = np.rint(dots.y_px) + fit.places[:, 1]
     return Sharpness(
-        x_px=np.rint(dots.x_px) + fit.places[:, 0],
-        y_px=np.rint(dots.y_px) + fit.places[:, 1],
+        x_px=x_px,
+        y_px=y_px,
         each_psf_sigma_px=dot_sigmas,
         psf_sigma_px=sigma_px,
         psf_sigma_error_px=error_px,
@@ -214,81 +218,93 @@ def _alone(image: FloatArray, level: float, x_px: FloatArray, y_px: FloatArray, 
     image.
     """
     height, width = image.shape
-    apart = np.maximum(np.abs(x_px[:, None] - x_px), np.abs(y_px[:, None] - y_px))
-    apart += np.where(np.eye(len(x_px), dtype=bool), np.inf, 0.0)
+    across = np.abs(x_px[:, None] - x_px)
+    down = np.abs(y_px[:, None] - y_px)
+    itself = np.where(np.eye(len(x_px), dtype=bool), np.inf, 0.0)
+    apart = np.maximum(across, down) + itself
+    is_alone = apart.min(axis=1, initial=np.inf) > 2 * half
     column = np.rint(x_px).astype(np.intp)
     row = np.rint(y_px).astype(np.intp)
-    whole = (column >= half) & (column < width - half) & (row >= half) & (row < height - half)
-    lone = np.flatnonzero(whole & (apart.min(axis=1, initial=np.inf) > 2 * half))[:MAX_DOTS]
+    is_whole = (column >= half) & (column < width - half)
+    is_whole &= (row >= half) & (row < height - half)
+    chosen = np.flatnonzero(is_whole & is_alone)[:MAX_DOTS]
     steps = np.arange(-half, half + 1)
-    values = (
-        image[(row[lone, None] + steps)[:, :, None], (column[lone, None] + steps)[:, None, :]]
-        - level
-    )
-    return _Dots(np.asarray(values, dtype=np.float64), x_px[lone], y_px[lone], half)
+    rows = row[chosen, None] + steps
+    columns = column[chosen, None] + steps
+    values = image[rows[:, :, None], columns[:, None, :]] - level
+    return _Dots(np.asarray(values, dtype=np.float64), x_px[chosen], y_px[chosen], half)
 
 
 def _points(sigma_px: float, side_px: float, turn: float) -> FloatArray:
     """Points (p, 2) spread evenly over a square of side 1 that is turned by `turn` rad."""
     count = int(np.clip(math.ceil(POINTS_A_SIGMA * side_px / sigma_px), MIN_POINTS, MAX_POINTS))
     along = (np.arange(count) + 0.5) / count - 0.5
-    x, y = (part.ravel() for part in np.meshgrid(along, along))
+    grid_x, grid_y = np.meshgrid(along, along)
+    x = grid_x.ravel()
+    y = grid_y.ravel()
     cos = math.cos(turn)
     sin = math.sin(turn)
-    return np.column_stack([cos * x - sin * y, sin * x + cos * y])
+    turned_x = cos * x - sin * y
+    turned_y = sin * x + cos * y
+    return np.column_stack([turned_x, turned_y])
 
 
 def _started(dots: _Dots, side_px: float, turn: float) -> _Shape:
-    """The PSF's sigma, of some, that leaves the smallest squares."""
+    """The shape with the PSF's sigma, of STARTS_PX, that leaves the smallest squares."""
     few = _first(dots, MIN_DOTS)
     misfits = []
-    for sigma_px in STARTS_PX:
-        shape = _Shape(_points(float(sigma_px), side_px, turn), float(sigma_px), side_px)
+    for sigma_px in STARTS_PX.tolist():
+        shape = _Shape(_points(sigma_px, side_px, turn), sigma_px, side_px)
         model = _slopes(shape, _first_places(few), few.half_px)[0]
         flux, level = _amplitudes(model, few.values)
-        misfits.append(float(((few.values - flux * model - level) ** 2).sum()))
+        off = few.values - flux * model - level
+        misfits.append(float((off**2).sum()))
     best = float(STARTS_PX[int(np.argmin(misfits))])
+    # points for half of it, as the fit may become narrower
     return _Shape(_points(best / 2, side_px, turn), best, side_px)
 
 
 def _first(dots: _Dots, count: int) -> _Dots:
+    """The first, which are the brightest, of the dots."""
     return _Dots(dots.values[:count], dots.x_px[:count], dots.y_px[:count], dots.half_px)
 
 
 def _first_places(dots: _Dots) -> FloatArray:
-    return np.column_stack([dots.x_px - np.rint(dots.x_px), dots.y_px - np.rint(dots.y_px)])
+    """Places (n, 2) of dots from the middles of their middle pixels, px."""
+    x_px = dots.x_px - np.rint(dots.x_px)
+    y_px = dots.y_px - np.rint(dots.y_px)
+    return np.column_stack([x_px, y_px])
 
 
-def _amplitudes(own: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _amplitudes(model: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Light and background (n, 1, 1) of dots with a model (n, k, k), by least squares."""
-    flat = own - own.mean(axis=(1, 2), keepdims=True)
-    flux = (flat * values).sum(axis=(1, 2), keepdims=True) / np.maximum(
-        (flat**2).sum(axis=(1, 2), keepdims=True), 1e-300
-    )
-    flux = np.maximum(flux, FLUX_FLOOR)
-    return flux, values.mean(axis=(1, 2), keepdims=True) - flux * own.mean(
-        axis=(1, 2), keepdims=True
-    )
+    model_mean = model.mean(axis=(1, 2), keepdims=True)
+    flat = model - model_mean
+    product = (flat * values).sum(axis=(1, 2), keepdims=True)
+    square = (flat**2).sum(axis=(1, 2), keepdims=True)
+    flux = np.maximum(product / np.maximum(square, 1e-300), FLUX_FLOOR)
+    level = values.mean(axis=(1, 2), keepdims=True) - flux * model_mean
+    return flux, level
 
 
 def _slopes(shape: _Shape, places: FloatArray, half: int) -> tuple[FloatArray, ...]:
     """Shares of dots' light in pixels (n, k, k), and their derivatives by x, y, the PSF's sigma
     and the side's logarithm.
     """
-    across, down = (_along(shape, places[:, k], shape.points[:, k], half) for k in (0, 1))
+    share_x, by_x, sigma_x, side_x = _along(shape, places[:, 0], shape.points[:, 0], half)
+    share_y, by_y, sigma_y, side_y = _along(shape, places[:, 1], shape.points[:, 1], half)
     weight = 1 / len(shape.points)
-    (share_x, by_x, sigma_x, side_x), (share_y, by_y, sigma_y, side_y) = across, down
 
     def together(of_y: FloatArray, of_x: FloatArray) -> FloatArray:
+        """The mean over the points (n, rows, columns) of a product of both axes."""
         return np.asarray(of_y.transpose(0, 2, 1) @ of_x * weight)
 
-    return (
-        together(share_y, share_x),
-        together(share_y, by_x),
-        together(by_y, share_x),
-        together(sigma_y, share_x) + together(share_y, sigma_x),
-        together(side_y, share_x) + together(share_y, side_x),
-    )
+    share = together(share_y, share_x)
+    by_place_x = together(share_y, by_x)
+    by_place_y = together(by_y, share_x)
+    by_sigma = together(sigma_y, share_x) + together(share_y, sigma_x)
+    by_side = together(side_y, share_x) + together(share_y, side_x)
+    return share, by_place_x, by_place_y, by_sigma, by_side
 
 
 def _along(
@@ -300,19 +316,63 @@ def _along(
     edges = np.arange(2 * half + 2) - half - 0.5
     middle = place[:, None] + shape.side_px * points
     reach = (edges - middle[:, :, None]) / shape.sigma_px
-    density = np.exp(-0.5 * reach**2) / (math.sqrt(2 * math.pi) * shape.sigma_px)
+    norm = math.sqrt(2 * math.pi) * shape.sigma_px
+    density = np.exp(-0.5 * reach**2) / norm
     share = np.diff(ndtr(reach), axis=2)
     by_place = -np.diff(density, axis=2)
     by_sigma = -np.diff(density * reach, axis=2)
-    return share, by_place, by_sigma, by_place * (shape.side_px * points)[:, None]
+    by_side = by_place * (shape.side_px * points)[:, None]
+    return share, by_place, by_sigma, by_side
 
 
-def _weights(own: FloatArray, flux: FloatArray, noise_dn: float, noise: DotNoise) -> FloatArray:
+def _weights(model: FloatArray, flux: FloatArray, noise_dn: float, noise: DotNoise) -> FloatArray:
     """One over the sigma of each pixel (n, k, k), by the model's light."""
-    light = np.maximum(flux * own, 0.0)
-    return np.asarray(
-        1 / np.sqrt(noise_dn**2 + light / noise.gain_e_per_dn + (noise.prnu * light) ** 2)
-    )
+    light = np.maximum(flux * model, 0.0)
+    photon_dn2 = light / noise.gain_e_per_dn
+    response_dn2 = (noise.prnu * light) ** 2
+    return np.asarray(1 / np.sqrt(noise_dn**2 + photon_dn2 + response_dn2))
+
+
+class _NormalEquations(NamedTuple):
+    """Normal equations of each dot: matrices (n, m, m) and right sides (n, m, 1); the sum of the
+    squares of all residuals, in sigmas, and their number.
+    """
+
+    normal: FloatArray
+    right: FloatArray
+    square: float
+    pixels: int
+
+    @classmethod
+    def of(
+        cls,
+        dots: _Dots,
+        shape: _Shape,
+        places: FloatArray,
+        noise_dn: float,
+        noise: DotNoise,
+        *,
+        with_side: bool,
+    ) -> "_NormalEquations":
+        """Those of light, background, x, y, the PSF's sigma, and the side's logarithm where it is
+        wanted.
+        """
+        model, *slopes = _slopes(shape, places, dots.half_px)
+        if not with_side:
+            slopes = slopes[:-1]
+        flux, level = _amplitudes(model, dots.values)
+        weight = _weights(model, flux, noise_dn, noise)
+        off = (dots.values - flux * model - level) * weight
+        derivatives = [model, np.ones_like(model)]
+        for slope in slopes:
+            derivatives.append(flux * slope)
+        columns = np.stack(derivatives, axis=1) * weight[:, None]
+        columns = columns.reshape(len(model), len(derivatives), -1)
+        right = columns @ off.reshape(len(model), -1, 1)
+        normal = columns @ columns.transpose(0, 2, 1)
+        diagonal = np.einsum("nkk->nk", normal)[:, :, None]
+        normal += 1e-12 * diagonal * np.eye(len(derivatives))
+        return cls(normal, right, float((off**2).sum()), off.size)
 
 
 def _fitted(
@@ -329,50 +389,57 @@ def _fitted(
     value = math.inf
     settled = False
     for _ in range(ROUNDS):
-        model, *slopes = _slopes(shape, places, dots.half_px)
-        flux, level = _amplitudes(model, dots.values)
-        weight = _weights(model, flux, noise_dn, noise)
-        off = (dots.values - flux * model - level) * weight
-        columns = (
-            np.stack([model, np.ones_like(model), *(flux * slope for slope in slopes)], axis=1)
-            * weight[:, None]
-        )
-        columns = columns.reshape(len(model), 6, -1)
-        right = columns @ off.reshape(len(model), -1, 1)
-        normal = columns @ columns.transpose(0, 2, 1)
-        normal += 1e-12 * np.einsum("nkk->nk", normal)[:, :, None] * np.eye(6)
-        by_own = np.linalg.solve(
-            normal[:, :4, :4], np.concatenate([normal[:, :4, 4:], right[:, :4]], axis=2)
-        )
-        common = (normal[:, 4:, 4:] - normal[:, 4:, :4] @ by_own[:, :, :2]).sum(axis=0)
-        aim = (right[:, 4:] - normal[:, 4:, :4] @ by_own[:, :, 2:]).sum(axis=0)[:, 0]
-        chi2 = max(float((off**2).sum()) / max(off.size - 4 * len(model), 1), 1.0)
+        equations = _NormalEquations.of(dots, shape, places, noise_dn, noise, with_side=True)
+        normal, right, square, pixels = equations
+        # a dot's light, background and place, and what is common to all dots
+        dot_part = slice(0, 4)
+        common_part = slice(4, 6)
+        couplings = normal[:, common_part, dot_part]
+        own_right = np.concatenate([normal[:, dot_part, common_part], right[:, dot_part]], axis=2)
+        by_own = np.linalg.solve(normal[:, dot_part, dot_part], own_right)
+        own_by_common = by_own[:, :, :2]
+        own_alone = by_own[:, :, 2:]
+        dot_normals = normal[:, common_part, common_part] - couplings @ own_by_common
+        dot_aims = right[:, common_part] - couplings @ own_alone
+        common = dot_normals.sum(axis=0)
+        aim = dot_aims.sum(axis=0)[:, 0]
+        freedom = max(pixels - 4 * len(normal), 1)
+        chi2 = max(square / freedom, 1.0)
         # The side is known beforehand to SIDE_SHARE; its weight grows with the misfit as the
         # pixels' own does.
         known = chi2 / SIDE_SHARE**2
         common[1, 1] += known
         aim[1] += known * math.log(side_px / shape.side_px)
         step = np.linalg.solve(common + damping * np.diag(np.diag(common)), aim)
-        grown = float(np.clip(shape.sigma_px + step[0], 0.5 * shape.sigma_px, 2 * shape.sigma_px))
-        sigma_px = float(np.clip(grown, *SIGMAS_PX))
-        moved = by_own[:, 2:4, 2] - by_own[:, 2:4, :2] @ step
+        moved = own_alone[:, 2:4, 0] - own_by_common[:, 2:4] @ step
         places = places + np.clip(moved, -0.5, 0.5)
-        settled = bool(
-            abs(sigma_px - shape.sigma_px) < SETTLED * sigma_px and abs(step[1]) < SETTLED
-        )
-        side = shape.side_px * math.exp(float(np.clip(step[1], -0.05, 0.05)))
-        turn = math.atan2(*(shape.points[-1] - shape.points[0])[::-1]) - math.pi / 4
-        shape = _Shape(_points(sigma_px, side, turn), sigma_px, side)
-        if float((off**2).sum()) <= value:
+        before_px = shape.sigma_px
+        shape = _stepped(shape, step)
+        is_sigma_settled = abs(shape.sigma_px - before_px) < SETTLED * shape.sigma_px
+        settled = bool(is_sigma_settled and abs(step[1]) < SETTLED)
+        if square <= value:
             damping = damping / 3
         else:
             damping = damping * 5
-        value = float((off**2).sum())
+        value = square
         if settled:
             break
     covariance = np.linalg.inv(common) * chi2
+    sigma_error_px = math.sqrt(covariance[0, 0])
     side_error_px = shape.side_px * math.sqrt(covariance[1, 1])
-    return _Fitted(shape, places, math.sqrt(covariance[0, 0]), side_error_px, settled)
+    return _Fitted(shape, places, sigma_error_px, side_error_px, settled)
+
+
+def _stepped(shape: _Shape, step: FloatArray) -> _Shape:
+    """The shape after a step of the PSF's sigma and of the side's logarithm, both limited."""
+    before_px = shape.sigma_px
+    limited_px = float(np.clip(before_px + step[0], 0.5 * before_px, 2 * before_px))
+    sigma_px = float(np.clip(limited_px, *SIGMAS_PX))
+    side_px = shape.side_px * math.exp(float(np.clip(step[1], -0.05, 0.05)))
+    # by the diagonal of the points, which is turned by 45 degrees more
+    x, y = shape.points[-1] - shape.points[0]
+    turn = math.atan2(y, x) - math.pi / 4
+    return _Shape(_points(sigma_px, side_px, turn), sigma_px, side_px)
 
 
 def _each_sigma(
@@ -381,24 +448,12 @@ def _each_sigma(
     """The PSF's sigma by each dot (n,), with the side of all, and which dots agree with the
     others (n,).
     """
-    model, by_x, by_y, by_sigma, _ = _slopes(shape, places, dots.half_px)
-    flux, level = _amplitudes(model, dots.values)
-    weight = _weights(model, flux, noise_dn, noise)
-    off = ((dots.values - flux * model - level) * weight).reshape(len(model), -1, 1)
-    columns = (
-        np.stack([model, np.ones_like(model), flux * by_x, flux * by_y, flux * by_sigma], axis=1)
-        * weight[:, None]
-    )
-    columns = columns.reshape(len(model), 5, -1)
-    normal = columns @ columns.transpose(0, 2, 1)
-    steps = np.linalg.solve(
-        normal + 1e-12 * np.einsum("nkk->nk", normal)[:, :, None] * np.eye(5), columns @ off
-    )[:, 4, 0]
+    equations = _NormalEquations.of(dots, shape, places, noise_dn, noise, with_side=False)
+    steps = np.linalg.solve(equations.normal, equations.right)[:, 4, 0]
     dot_sigmas = np.clip(shape.sigma_px + steps, *SIGMAS_PX)
     far = np.abs(dot_sigmas - np.median(dot_sigmas))
-    return dot_sigmas, far <= WILD_SIGMAS * 1.4826 * max(
-        float(np.median(far)), 1e-3 * shape.sigma_px
-    )
+    spread_px = max(float(np.median(far)), 1e-3 * shape.sigma_px)
+    return dot_sigmas, far <= WILD_SIGMAS * MAD_TO_SIGMA * spread_px
 
 
 class SharpDots(NamedTuple):
@@ -416,22 +471,15 @@ def focus(context: StepContext) -> StepOutcome:
     InputError.
     """
     code, sharp, looked = sharp_dots(context)
-    wanted = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
-    sigma = sharp.psf_sigma_px
-    error = sharp.psf_sigma_error_px
-    picture = context.session / "focus.svg"
-    finding = (
-        f"PSF sigma {sigma:.3f} px (by {len(sharp.x_px)} dots), the bench file has {wanted:.4g}"
-    )
-    with chart(picture, finding, height_inch=6.0) as (axes,):
-        dots = axes.scatter(sharp.x_px, sharp.y_px, c=sharp.each_psf_sigma_px, cmap="viridis", s=60)
-        axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
-        axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
-        axes.invert_yaxis()
+    stated_px = float(np.hypot(*context.tracker_psf.width_px) / np.sqrt(2))
+    sigma_px = sharp.psf_sigma_px
+    error_px = sharp.psf_sigma_error_px
     pixel_px = sharp.dot_side_px / DOT_PX
+    picture = context.session / "focus.svg"
+    _draw_dots(picture, sharp, stated_px)
     figures: dict[str, Figure] = {
-        "psf_sigma_px": sigma,
-        "psf_sigma_error_px": error,
+        "psf_sigma_px": sigma_px,
+        "psf_sigma_error_px": error_px,
         "monitor_pixel_px": pixel_px,
         "monitor_pixel_error_px": sharp.dot_side_error_px / DOT_PX,
         "dots": len(sharp.x_px),
@@ -440,10 +488,9 @@ def focus(context: StepContext) -> StepOutcome:
     files: tuple[Path, ...] = looked.path, picture
     pictures: tuple[Path, ...] = (picture,)
     line = (
-        f"PSF sigma {sigma:.3f} +- {error:.3f} px, the bench file says {wanted:.4g}; dots at code"
-        f" {code}"
+        f"PSF sigma {sigma_px:.3f} +- {error_px:.3f} px, the bench file says {stated_px:.4g}; dots"
+        f" at code {code}, a monitor pixel is {pixel_px:.3f} px"
     )
-    line += f", a monitor pixel is {pixel_px:.3f} px"
     effective = _effective(looked, sharp)
     if effective is not None:
         drawn = context.session / "psf.svg"
@@ -451,35 +498,51 @@ def focus(context: StepContext) -> StepOutcome:
         files = (*files, drawn)
         pictures = (picture, drawn)
         figures["effective_psf_rms"] = effective.chosen.rms
-        line += (
-            f"; {'more than' if effective.asks_for_more else 'no more than'} a Gaussian over the"
-            " field"
-        )
-    number = StepNumber(sigma, error, "px", f"PSF sigma; the bench file says {wanted:.4g}")
+        if effective.asks_for_more:
+            line += "; more than a Gaussian over the field"
+        else:
+            line += "; no more than a Gaussian over the field"
+    number = StepNumber(sigma_px, error_px, "px", f"PSF sigma; the bench file says {stated_px:.4g}")
     verdict: Verdict = "done"
+    failure = _why_blurred(sharp, stated_px)
+    if failure:
+        line = f"{line}: {failure}"
+        verdict = "failed"
+    fitted = (FittedFigure("PSF sigma", sigma_px, *SIGMAS_PX),)
+    return StepOutcome(verdict, line, figures, files, pictures, number=number, fitted=fitted)
+
+
+def _why_blurred(sharp: Sharpness, stated_px: float) -> str:
+    """What is wrong with the focus, or with its figure, and what to do; empty if nothing is."""
     if not sharp.has_settled:
-        why = (
+        return (
             f"the fit of the dots has not settled in {ROUNDS} rounds: look at the dots' image, and"
             " at the focal lengths"
         )
-        line = f"{line}: {why}"
-        verdict = "failed"
-    elif error > MAX_ERROR_SHARE * sigma:
-        why = (
-            f"the PSF cannot be told from a monitor pixel of {pixel_px:.2f} px: take a longer"
-            " [tracker] exposure_s"
+    if sharp.psf_sigma_error_px > MAX_ERROR_SHARE * sharp.psf_sigma_px:
+        return (
+            f"the PSF cannot be told from a monitor pixel of {sharp.dot_side_px / DOT_PX:.2f} px:"
+            " take a longer [tracker] exposure_s"
         )
-        line = f"{line}: {why}"
-        verdict = "failed"
-    elif sigma > BLURRED * wanted + BLURRED_BY_PX:
-        cure = (
+    if sharp.psf_sigma_px > BLURRED * stated_px + BLURRED_BY_PX:
+        return (
             "turn the focus until this figure is smallest (--again focus), or write [tracker]"
             " psf_sigma_px as it is"
         )
-        line = f"{line}: {cure}"
-        verdict = "failed"
-    fitted = (FittedFigure("PSF sigma", sigma, *SIGMAS_PX),)
-    return StepOutcome(verdict, line, figures, files, pictures, number=number, fitted=fitted)
+    return ""
+
+
+def _draw_dots(picture: Path, sharp: Sharpness, stated_px: float) -> None:
+    """Draw the PSF's sigma by each dot over the tracker's image."""
+    finding = (
+        f"PSF sigma {sharp.psf_sigma_px:.3f} px (by {len(sharp.x_px)} dots), the bench file has"
+        f" {stated_px:.4g}"
+    )
+    with chart(picture, finding, height_inch=6.0) as (axes,):
+        dots = axes.scatter(sharp.x_px, sharp.y_px, c=sharp.each_psf_sigma_px, cmap="viridis", s=60)
+        axes.figure.colorbar(dots, ax=axes, label="PSF sigma [tracker px]")
+        axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")
+        axes.invert_yaxis()
 
 
 def _effective(looked: DarkSubtracted, found: Sharpness) -> Found | None:
@@ -487,9 +550,8 @@ def _effective(looked: DarkSubtracted, found: Sharpness) -> Found | None:
     alone is known.
     """
     try:
-        return fit_effective(
-            dots_of_image(looked.image, found.x_px, found.y_px, found.dot_side_px), OVERSAMPLING
-        )
+        dots = dots_of_image(looked.image, found.x_px, found.y_px, found.dot_side_px)
+        return fit_effective(dots, OVERSAMPLING)
     except InputError:
         return None
 
@@ -502,18 +564,15 @@ def sharp_dots(context: StepContext) -> SharpDots:
     code = context.white
     plan = first_dots(seen_screen)
     dark = context.read(context.dark())
-    for number in range(context.file.config.monitor.bits * 2):
+    for number in range(context.monitor.bits * 2):
         codes = dot_image(plan, 0, context.resolution_px, code)
         looked = context.look(Pattern(f"dots_{number:03}", codes), dark)
         # a dot that saturates the detector looks wider than it is
         if looked.raw_peak < DOT_FILL * context.full_dn:
             break
         code = context.darker(code)
-    return SharpDots(
-        code,
-        seen_sharpness(looked.image, seen_screen, context.file.config.tracker.detector),
-        looked,
-    )
+    detector = context.detector
+    return SharpDots(code, seen_sharpness(looked.image, seen_screen, detector), looked)
 
 
 def seen_sharpness(

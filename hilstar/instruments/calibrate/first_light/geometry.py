@@ -5,6 +5,7 @@ import math
 from dataclasses import astuple, dataclass, replace
 from operator import ne
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -50,6 +51,8 @@ from hilstar.instruments.calibrate.geometric.observed import Observed, measure_i
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background, squares
 
+# an orientation: a matrix (2, 2), row by row
+Way = tuple[int, int, int, int]
 # half the figure's side, relative to the smaller side of what both screen and tracker have
 FIGURE_REACH = 0.25
 SQUARE_TRACKER_PX = 2.5  # side of its smallest square as the tracker sees it
@@ -110,7 +113,9 @@ class OrientationFigure:
         codes = black(resolution_px)
         for x, y, sides in zip(self.x_px, self.y_px, SQUARES, strict=True):
             half = self.side_px * sides / 2
-            codes[round(y - half) : round(y + half), round(x - half) : round(x + half)] = code
+            rows = slice(round(y - half), round(y + half))
+            columns = slice(round(x - half), round(x + half))
+            codes[rows, columns] = code
         return Pattern(name, codes)
 
 
@@ -121,21 +126,23 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
     monitor = geometry.monitor
     tracker = geometry.tracker
     ratio = monitor.focal_length_px / tracker.focal_length_px
-    reach = FIGURE_REACH * min(
-        *monitor.resolution_px, *(ratio * size for size in tracker.resolution_px)
-    )
+    tracker_width, tracker_height = tracker.resolution_px
+    smaller_side = min(*monitor.resolution_px, ratio * tracker_width, ratio * tracker_height)
+    reach = FIGURE_REACH * smaller_side
     side = max(3, math.ceil(SQUARE_TRACKER_PX * ratio))
     if reach < SQUARES[0] * side:
         raise InputError(
             "the tracker sees too little of the monitor for a figure; look at the focal lengths and"
             " pixel pitches"
         )
-    (middle_x,), (middle_y,) = geometry.to_monitor(
-        *(np.array([(size - 1) / 2]) for size in tracker.resolution_px)
-    )
+    tracker_x = np.array([(tracker_width - 1) / 2])
+    tracker_y = np.array([(tracker_height - 1) / 2])
+    (middle_x,), (middle_y,) = geometry.to_monitor(tracker_x, tracker_y)
     width, height = monitor.resolution_px
     # Where the bench file has the tracker look far beside the middle, it may well be wrong.
-    if not (abs(middle_x - width / 2) < width / 4 and abs(middle_y - height / 2) < height / 4):
+    is_near_middle = abs(middle_x - width / 2) < width / 4
+    is_near_middle = is_near_middle and abs(middle_y - height / 2) < height / 4
+    if not is_near_middle:
         middle_x = (width - 1) / 2
         middle_y = (height - 1) / 2
     x_px = middle_x + reach * np.array([-1.0, 1.0, -1.0])
@@ -153,7 +160,7 @@ class SeenFigure:
     is seen.
     """
 
-    way: tuple[int, int, int, int]
+    way: Way
     scale: float
     turn_deg: float
     turn_error_deg: float
@@ -168,6 +175,9 @@ class SeenFigure:
         orientation and the remaining angle.
         """
         return self.turn_deg + QUARTER_TURNS_DEG.get(self.way, 0.0)
+
+
+Measurement = tuple[SeenFigure, DarkSubtracted]
 
 
 class SquaresAlike(InputError):
@@ -188,22 +198,23 @@ def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     largest = np.argsort(-stars.pixels, kind="stable")[:MAX_SPOTS]
     # By light, for a wide PSF makes spots of nearly one size of squares of three.
     radius_px = math.ceil(WINDOW_SIDES * math.sqrt(stars.pixels.max()))
-    values, dx, dy = squares(
-        image, background.level, stars.x_px[largest], stars.y_px[largest], radius_px
-    )
+    x_px = stars.x_px[largest]
+    y_px = stars.y_px[largest]
+    values, dx, dy = squares(image, background.level, x_px, y_px, radius_px)
     light = values.sum(axis=(1, 2))
     brightest = np.argsort(-light, kind="stable")[: len(SQUARES)]
-    step = light[brightest[:-1]] / np.maximum(light[brightest[1:]], 1e-9)
+    square_light = light[brightest]
+    step = square_light[:-1] / np.maximum(square_light[1:], 1e-9)
     if (step < MIN_LIGHT_STEP).any():
-        light_text = ", ".join(f"{square_light:.3g}" for square_light in light[brightest])
+        light_text = ", ".join(f"{light_dn:.3g}" for light_dn in square_light)
         raise SquaresAlike(
             f"the three brightest spots have {light_text} DN in all and cannot be told apart, where"
             " squares of three sizes have 9, 4 and 1 parts; look at stray light and reflections,"
             " or expose shorter"
         )
-    right, down = ((values * offset).sum(axis=(1, 2)) / light for offset in (dx, dy))
-    which = largest[brightest]
-    return stars.x_px[which] + right[brightest], stars.y_px[which] + down[brightest]
+    right_px = (values * dx).sum(axis=(1, 2)) / light
+    down_px = (values * dy).sum(axis=(1, 2)) / light
+    return (x_px + right_px)[brightest], (y_px + down_px)[brightest]
 
 
 def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
@@ -216,61 +227,71 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     monitor_px = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
     shown_x, shown_y = geometry.to_monitor(x_px, y_px)
     corner, right, below = np.stack([shown_x, shown_y], axis=1)
-    figure_px = np.column_stack([right - corner, below - corner]) / (2 * figure.reach_px)
+    side_px = 2 * figure.reach_px
+    figure_px = np.column_stack([right - corner, below - corner]) / side_px
     scale = float(np.sqrt(abs(np.linalg.det(figure_px))))
     if not 1 / MAX_SCALE < scale < MAX_SCALE:
         raise InputError(
             f"the figure is {scale:.2f} times as large as the bench file says; look at focal"
             " lengths and pitches"
         )
-    ways = {way: np.array(way, dtype=np.float64).reshape(2, 2) for way in WAYS}
-    way = max(ways, key=lambda each: float((ways[each] * figure_px).sum()))
-    remaining_map = np.linalg.inv(ways[way]) @ figure_px / scale
-    longest, shortest = np.linalg.svd(remaining_map, compute_uv=False)
+    way = max(WAYS, key=lambda each_way: float((_matrix_of(each_way) * figure_px).sum()))
+    remaining = np.linalg.inv(_matrix_of(way)) @ figure_px / scale
+    longest, shortest = np.linalg.svd(remaining, compute_uv=False)
     if longest > MAX_STRETCH * shortest:
         raise InputError(
             f"the figure is no square: {longest / shortest:.2f} times as long one way as the other;"
             " look at stray light, and at how far the screen is tilted"
         )
-    turn = float(
-        np.degrees(
-            np.arctan2(
-                remaining_map[1, 0] - remaining_map[0, 1], remaining_map[0, 0] + remaining_map[1, 1]
-            )
-        )
-    )
-    sides = np.degrees(
-        [
-            np.arctan2(remaining_map[1, 0], remaining_map[0, 0]),
-            np.arctan2(-remaining_map[0, 1], remaining_map[1, 1]),
-        ]
-    )
-    by_spots = math.degrees(SPOT_ERROR_PX * monitor_px / (2 * figure.reach_px))
-    turn_error = math.hypot(float(sides[0] - sides[1]) / 2, by_spots)
+    (right_x, below_x), (right_y, below_y) = remaining
+    turn = float(np.degrees(np.arctan2(right_y - below_x, right_x + below_y)))
+    turn_of_right = np.degrees(np.arctan2(right_y, right_x))
+    turn_of_below = np.degrees(np.arctan2(-below_x, below_y))
+    by_spots = math.degrees(SPOT_ERROR_PX * monitor_px / side_px)
+    turn_error = math.hypot(float(turn_of_right - turn_of_below) / 2, by_spots)
     # The rotation that takes the spots' directions to the figure's, on a monitor as far away as the
     # figure is large.
     focal_length_px = geometry.monitor.focal_length_px / scale
     camera = replace(geometry.monitor, focal_length_px=focal_length_px)
-    shown_rays = np.column_stack([*camera.tangents(figure.x_px, figure.y_px), np.ones(3)])
-    aligned, _ = Rotation.align_vectors(_unit(shown_rays), _unit(geometry.tracker.rays(x_px, y_px)))
-    q_cam_to_mon = from_matrix(aligned.as_matrix())
-    return SeenFigure(way, scale, turn, turn_error, x_px, y_px, focal_length_px, q_cam_to_mon)
+    u, v = camera.tangents(figure.x_px, figure.y_px)
+    figure_rays = _unit(np.column_stack([u, v, np.ones(3)]))
+    spot_rays = _unit(geometry.tracker.rays(x_px, y_px))
+    aligned, _ = Rotation.align_vectors(figure_rays, spot_rays)
+    return SeenFigure(
+        way=way,
+        scale=scale,
+        turn_deg=turn,
+        turn_error_deg=turn_error,
+        x_px=x_px,
+        y_px=y_px,
+        focal_length_px=focal_length_px,
+        q_cam_to_mon=from_matrix(aligned.as_matrix()),
+    )
+
+
+def _matrix_of(way: Way) -> FloatArray:
+    """The matrix (2, 2) of an orientation: its columns are where right and below appear."""
+    return np.array(way, dtype=np.float64).reshape(2, 2)
 
 
 def _unit(rays: FloatArray) -> FloatArray:
+    """Directions (n, 3) of norm 1."""
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
-def keys_of_ways() -> dict[str, tuple[int, int, int, int]]:
+def keys_of_ways() -> dict[str, Way]:
     """The key to press for each orientation; the first is upright."""
     return {str(number): way for number, way in enumerate(WAYS, start=1)}
 
 
-def look_of(way: tuple[int, int, int, int]) -> str:
+def look_of(way: Way) -> str:
     """Where the figure's squares appear in this orientation, in words."""
     right = (way[0], way[2])
     below = (way[1], way[3])
-    corner = CORNERS[-right[0] - below[0], -right[1] - below[1]]
+    # opposite to both
+    corner_x = -right[0] - below[0]
+    corner_y = -right[1] - below[1]
+    corner = CORNERS[corner_x, corner_y]
     return (
         f"the largest square {corner}, the next one {SIDES[right]}, the smallest {SIDES[below]}"
         f" ({WAYS[way]})"
@@ -289,36 +310,35 @@ class ScreenMounting:
     def matrix(self) -> FloatArray:
         """The matrix (2, 2) from the image's axes to the screen's, x right and y down."""
         turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), self.rotate_deg // 90)
-        return np.asarray(
-            np.diag([-1.0 if self.flip_x else 1.0, -1.0 if self.flip_y else 1.0]) @ turn
-        )
+        x_sign = -1.0 if self.flip_x else 1.0
+        y_sign = -1.0 if self.flip_y else 1.0
+        return np.asarray(np.diag([x_sign, y_sign]) @ turn)
 
 
-def corrected(mounting: ScreenMounting, way: tuple[int, int, int, int]) -> ScreenMounting:
+def corrected(mounting: ScreenMounting, way: Way) -> ScreenMounting:
     """The mounting that turns an image seen in orientation `way` upright, with the fewest keys
     changed.
     """
-    wanted = mounting.matrix @ np.linalg.inv(np.array(way, dtype=np.float64).reshape(2, 2))
+    wanted = mounting.matrix @ np.linalg.inv(_matrix_of(way))
     flips = (False, True)
-    all_ways = []
-    for x, y, turn in itertools.product(flips, flips, (0, 90, 180, 270)):
-        all_ways.append(ScreenMounting(x, y, turn))
-    right = [each for each in all_ways if np.allclose(each.matrix, wanted)]
-    return min(
-        right,
-        key=lambda each: (
-            sum(map(ne, astuple(each), astuple(mounting))),
-            each.flip_y,
-            each.rotate_deg,
-        ),
-    )
+    upright = []
+    for flip_x, flip_y, rotate_deg in itertools.product(flips, flips, (0, 90, 180, 270)):
+        candidate = ScreenMounting(flip_x, flip_y, rotate_deg)
+        if np.allclose(candidate.matrix, wanted):
+            upright.append(candidate)
+
+    def cost(candidate: ScreenMounting) -> tuple[int, bool, int]:
+        changed_keys = sum(map(ne, astuple(candidate), astuple(mounting)))
+        return changed_keys, candidate.flip_y, candidate.rotate_deg
+
+    return min(upright, key=cost)
 
 
 def orientation(context: StepContext) -> StepOutcome:
     """Find how the screen is mounted, set the bench file's keys, and check that the figure is
     upright. Raises InputError.
     """
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
     first, measured = _way(context, "figure_000")
     after = corrected(before, first)
@@ -327,46 +347,34 @@ def orientation(context: StepContext) -> StepOutcome:
         changes += tuple(context.change("monitor", key, getattr(after, key)))
     if (before.rotate_deg - after.rotate_deg) % 180:
         width, height = monitor.resolution_px
-        changes += (
-            KeyChange(
-                table="monitor", key="resolution_px", before=[width, height], after=[height, width]
-            ),
+        turned_size = KeyChange(
+            table="monitor", key="resolution_px", before=[width, height], after=[height, width]
         )
-    if changes:
-        now, measured = _way(
-            replace(context, file=with_changes(context.file, changes)), "figure_001"
-        )
-        # A screen that is turned by nearly 45 degrees may now be nearest to 90: the geometry's fit
-        # takes either.
-        if now not in (UPRIGHT, *QUARTER_TURNS_DEG) or (
-            now != UPRIGHT and not _is_oblique(measured)
-        ):
-            made = "; ".join(change.line for change in changes)
-            raise InputError(f"after {made} the figure is {WAYS[now]}; is it the same screen?")
+        changes += (turned_size,)
+    way = "upright"
     if changes:
         way = f"first {WAYS[first]}, now upright"
-    else:
-        way = "upright"
+        mounted = replace(context, file=with_changes(context.file, changes))
+        now, measured = _way(mounted, "figure_001")
+        # A screen that is turned by nearly 45 degrees may now be nearest to 90: the geometry's fit
+        # takes either.
+        is_quarter_off = now in QUARTER_TURNS_DEG and _is_oblique(measured)
+        if now != UPRIGHT and not is_quarter_off:
+            made = "; ".join(change.line for change in changes)
+            raise InputError(f"after {made} the figure is {WAYS[now]}; is it the same screen?")
     if measured is None:
         figures: dict[str, Figure] = {"seen": WAYS[first], "told_by": "a key"}
         return StepOutcome("done", f"{way}, as a person saw it", figures, changes=changes)
     seen_figure, looked = measured
     turn_deg = seen_figure.whole_turn_deg
     picture = context.session / "orientation.svg"
-    draw_spots(
-        picture,
-        looked.image,
-        seen_figure.x_px,
-        seen_figure.y_px,
-        f"the figure as the tracker sees it: {way}",
-    )
+    finding = f"the figure as the tracker sees it: {way}"
+    draw_spots(picture, looked.image, seen_figure.x_px, seen_figure.y_px, finding)
     figures = {
         "seen": WAYS[first],
         "scale": seen_figure.scale,
         "turn_deg": turn_deg,
         "turn_error_deg": seen_figure.turn_error_deg,
-    }
-    figures |= {
         SEEN_FOCAL: seen_figure.focal_length_px,
         **dict(zip(SEEN_Q, seen_figure.q_cam_to_mon.tolist(), strict=True)),
     }
@@ -374,26 +382,32 @@ def orientation(context: StepContext) -> StepOutcome:
     number = StepNumber(
         turn_deg, seen_figure.turn_error_deg, "deg", "turn of the figure that is left"
     )
-    return StepOutcome("done", line, figures, (looked.path, picture), (picture,), changes, number)
+    files = (looked.path, picture)
+    return StepOutcome("done", line, figures, files, (picture,), changes, number)
 
 
-def _is_oblique(measured: tuple[SeenFigure, DarkSubtracted] | None) -> bool:
-    return measured is not None and abs(measured[0].turn_deg) > OBLIQUE_DEG
+def _is_oblique(measured: Measurement | None) -> bool:
+    """Whether the figure is nearly half-way between two right angles."""
+    if measured is None:
+        return False
+    seen_figure, _ = measured
+    return abs(seen_figure.turn_deg) > OBLIQUE_DEG
 
 
-def _way(
-    context: StepContext, name: str
-) -> tuple[tuple[int, int, int, int], tuple[SeenFigure, DarkSubtracted] | None]:
+def _way(context: StepContext, name: str) -> tuple[Way, Measurement | None]:
     """The figure's orientation, and its measurement; None where a person pressed a key instead."""
     geometry = context.geometry()
     figure = figure_for(geometry)
     keys = keys_of_ways()
     code = context.white
     tries = 0
+    looks = {key: look_of(way) for key, way in keys.items()}
     while True:
-        shown = name if not tries else f"{name}_dim{tries}"
+        shown = name
+        if tries:
+            shown = f"{name}_dim{tries}"
         pattern = figure.pattern(shown, context.resolution_px, code)
-        answer = context.take_or_key(pattern, {key: look_of(way) for key, way in keys.items()})
+        answer = context.take_or_key(pattern, looks)
         if isinstance(answer, str):
             return keys[answer], None
         looked = context.looked(answer, context.read(context.dark()))
@@ -416,33 +430,26 @@ def draw_spots(
     height, width = image.shape
     # Of 16 million pixels Matplotlib makes 1 GB of colours. A spot of one pixel stays bright.
     step = max(math.ceil(max(height, width) / DRAWN_PX), 1)
-    whole = image[: height // step * step, : width // step * step]
-    drawn = whole.reshape(height // step, step, width // step, step).max(axis=(1, 3))
-    edges = (-0.5, whole.shape[1] - 0.5, whole.shape[0] - 0.5, -0.5)
+    rows = height // step
+    columns = width // step
+    whole = image[: rows * step, : columns * step]
+    drawn = whole.reshape(rows, step, columns, step).max(axis=(1, 3))
+    edges = (-0.5, columns * step - 0.5, rows * step - 0.5, -0.5)
+    low, high = np.percentile(drawn, (5, 99.9)).tolist()
+    grey = np.sqrt(np.clip(drawn - low, 0, None))
     with chart(path, finding, height_inch=6.4) as (axes,):
-        low, high = (float(value) for value in np.percentile(drawn, (5, 99.9)))
-        axes.imshow(
-            np.sqrt(np.clip(drawn - low, 0, None)),
-            cmap="gray",
-            vmax=np.sqrt(max(high - low, 1.0)),
-            extent=edges,
-        )
+        axes.imshow(grey, cmap="gray", vmax=np.sqrt(max(high - low, 1.0)), extent=edges)
         axes.scatter(x_px, y_px, s=260, facecolors="none", edgecolors=DARK[ORANGE], linewidths=1.8)
         # readable over stars and on black
         plate = {"facecolor": "black", "edgecolor": "none", "boxstyle": "round,pad=0.25"}
+        look: dict[str, Any] = {"color": DARK[ORANGE], "size": TEXT_PT + 1, "bbox": plate}
         for name, x, y in zip(SQUARE_NAMES, x_px[:3], y_px[:3], strict=False):
-            side = "right" if x > image.shape[1] / 2 else "left"
-            away = -14 if side == "right" else 14
-            axes.annotate(
-                name,
-                (x, y),
-                (away, 16),
-                textcoords="offset points",
-                ha=side,
-                color=DARK[ORANGE],
-                size=TEXT_PT + 1,
-                bbox=plate,
-            )
+            side = "left"
+            away = (14, 16)
+            if x > width / 2:
+                side = "right"
+                away = (-14, 16)
+            axes.annotate(name, (x, y), away, textcoords="offset points", ha=side, **look)
         axes.grid(visible=False)
         axes.set(xlabel="tracker x [px]", ylabel="tracker y [px]")
 
@@ -463,50 +470,60 @@ def geometry(context: StepContext) -> StepOutcome:
     paths = [*paths, *more_paths]
     write_plan(context.folder / "plan.csv", plan)
     ideal = context.file.config.tracker.distortion is None
-    context.stage(f"fits lenses to {len(observed) + len(more_seen)} centroids")
-    calibrated = calibrate_seen(
-        context.file, plan, observed.joined(more_seen), tracker_is_ideal=ideal
-    )
+    centroids = observed.joined(more_seen)
+    context.stage(f"fits lenses to {len(centroids)} centroids")
+    calibrated = calibrate_seen(context.file, plan, centroids, tracker_is_ideal=ideal)
     output = context.session / "geometry.toml"
     picture = context.session / "geometry.svg"
     write_calibrated(output, calibrated, picture, context.source.monitor)
     chosen = calibrated.chosen
     error = calibrated.uncertainty
+    line = (
+        f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f}"
+        f" max; a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
+    )
+    # from an rms over two axes
+    rms_error_arcsec = chosen.rms_arcsec / math.sqrt(4 * len(calibrated.data))
+    number = StepNumber(
+        chosen.rms_arcsec,
+        rms_error_arcsec,
+        "arcsec",
+        "rms distance of held-out dots from where the fit has them",
+    )
+    return StepOutcome(
+        "done",
+        line,
+        _geometry_figures(calibrated),
+        files=(output, picture, context.folder / "plan.csv", dark, *paths),
+        pictures=(picture,),
+        changes=context.names("collimator", "geometry", output),
+        number=number,
+        fitted=_ends_of(calibrated),
+    )
+
+
+def _geometry_figures(found: Calibrated) -> dict[str, Figure]:
+    """The figures of a geometry: its model and errors, dots and centroids, and the lens."""
+    chosen = found.chosen
+    error = found.uncertainty
     figures: dict[str, Figure] = {
         "model": chosen.name,
         "held_out_rms_arcsec": chosen.rms_arcsec,
         "held_out_max_arcsec": chosen.max_arcsec,
         "error_rms_arcsec": error.rms_arcsec,
         "error_max_arcsec": error.max_arcsec,
-        "noise_px": calibrated.problem.noise_px,
-        "dots_recognised": calibrated.recognised,
-        "dots_planned": len(calibrated.plan),
-        "centroids_lost": int(calibrated.lost),
-        "centroids_false": int(calibrated.false),
-        **{
-            name: parameter.value
-            for name, parameter in parameters_of(calibrated).items()
-            if "rotation" not in name
-        },
-        "notes": "; ".join(notes_for_a_person(calibrated)) or "none",
+        "noise_px": found.problem.noise_px,
+        "dots_recognised": found.recognised,
+        "dots_planned": len(found.plan),
+        "centroids_lost": int(found.lost),
+        "centroids_false": int(found.false),
     }
-    line = (
-        f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f}"
-        f" max; a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
-    )
-    files = (output, picture, context.folder / "plan.csv", dark, *paths)
-    rms = chosen.rms_arcsec
-    points = len(calibrated.data)
-    number = StepNumber(
-        rms,
-        rms / math.sqrt(4 * points),
-        "arcsec",
-        "rms distance of held-out dots from where the fit has them",
-    )
-    changes = context.names("collimator", "geometry", output)
-    return StepOutcome(
-        "done", line, figures, files, (picture,), changes, number, _ends_of(calibrated)
-    )
+    # a rotation is counted from the bench file's, which the geometry file replaces
+    for name, parameter in parameters_of(found).items():
+        if "rotation" not in name:
+            figures[name] = parameter.value
+    figures["notes"] = "; ".join(notes_for_a_person(found)) or "none"
+    return figures
 
 
 def _frames_of(
@@ -517,13 +534,8 @@ def _frames_of(
     """
     paths = []
     for frame in range(plan.frames):
-        paths.append(
-            context.take(
-                Pattern(
-                    f"frame_{first + frame:03}", dot_image(plan, frame, context.resolution_px, code)
-                )
-            )
-        )
+        codes = dot_image(plan, frame, context.resolution_px, code)
+        paths.append(context.take(Pattern(f"frame_{first + frame:03}", codes)))
     size_px = context.file.config.tracker.resolution_px
     context.stage(f"measures the dots of {len(paths)} images")
     return paths, measure_images(paths, dark, size_px, dot_sigma_px(context.file))
@@ -533,18 +545,11 @@ def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:
     """The tilts, and where dots are farther off than their noise the degree of the field: a
     larger one was not tried.
     """
-    tilts = []
+    parameters = parameters_of(found)
+    figures = []
     for name in ("tilt_x_deg", "tilt_y_deg"):
-        tilts.append(
-            FittedFigure(name, parameters_of(found)[name].value, -MAX_TILT_DEG, MAX_TILT_DEG)
-        )
+        figures.append(FittedFigure(name, parameters[name].value, -MAX_TILT_DEG, MAX_TILT_DEG))
     if found.chosen.rms_arcsec > FAR * found.held_out_noise_arcsec:
-        tilts.append(
-            FittedFigure(
-                "the degree of the lens's field",
-                found.chosen.field_degree,
-                -1.0,
-                max(FIELD_DEGREES),
-            )
-        )
-    return tuple(tilts)
+        name = "the degree of the lens's field"
+        figures.append(FittedFigure(name, found.chosen.field_degree, -1.0, max(FIELD_DEGREES)))
+    return tuple(figures)

@@ -24,7 +24,7 @@ import numpy.typing as npt
 from msgspec.structs import replace
 
 from hilstar.attitude.wire.shown_frames import FrameHead, FrameSender, ShownFrame
-from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from hilstar.basics.errors import HilstarError, InputError, MachineError, shortened
 from hilstar.basics.files import written
 from hilstar.basics.process.closing import Closing
@@ -206,9 +206,10 @@ def complete_images(folder: Path) -> dict[str, Path]:
     """The images in a directory by name without ending, except the newest, which may be
     incomplete.
     """
-    images = [
-        path for path in folder.glob("*") if path.suffix in ENDINGS and path.name != PATTERN_FILE
-    ]
+    images = []
+    for path in folder.glob("*"):
+        if path.suffix in ENDINGS and path.name != PATTERN_FILE:
+            images.append(path)
     images.sort(key=lambda path: path.stat().st_mtime_ns)
     return {path.stem: path for path in images[:-1]}
 
@@ -271,11 +272,13 @@ def _presenter(
     monitor = file.config.monitor
     triples = None
     if codes.ndim == 3:
+        # a colour as one number, of which the distinct ones are found at once
         packed = codes.astype(np.int64) @ np.array([1 << 32, 1 << 16, 1])
         colours, levels = np.unique(packed, return_inverse=True)
-        triples = np.stack(
-            [colours >> 32, colours >> 16 & 0xFFFF, colours & 0xFFFF], axis=1
-        ).astype(np.uint16)
+        red = colours >> 32
+        green = colours >> 16 & 0xFFFF
+        blue = colours & 0xFFFF
+        triples = np.stack([red, green, blue], axis=1).astype(np.uint16)
         codes = levels.reshape(codes.shape[:2]).astype(np.uint16)
     view = ScreenView(
         monitor.resolution_px,
@@ -302,13 +305,16 @@ class PatternFrames:
         height, width = codes.shape[:2]
         lit, values = lit_codes(codes)
         self._number += 1
+        channels = 1
+        if codes.ndim == 3:
+            channels = 3
         head = FrameHead(
             frame=self._number,
             lit_ns=lit_ns,
             width=width,
             height=height,
             bits=file.config.monitor.bits,
-            channels=3 if codes.ndim == 3 else 1,
+            channels=channels,
             bench_sha256=file.sha256,
         )
         self._sender.put_frame(ShownFrame(head, lit, values))
@@ -873,11 +879,11 @@ class VirtualBench(ImageSource):
         )
 
     def _exposed(self, light_e_per_s: Float32Array, exposure_s: float, stem: Path) -> Path:
+        """Expose the virtual tracker, and write its image: taken again it has the same noise."""
         mean_e = light_e_per_s + self._sky_e_per_s
         mean_e *= np.float32(exposure_s)
-        rng = np.random.default_rng(
-            (self._seed, zlib.crc32(str(Path(stem.parent.name) / stem.name).encode()))
-        )
+        name = Path(stem.parent.name) / stem.name
+        rng = np.random.default_rng((self._seed, zlib.crc32(str(name).encode())))
         pixels = self._detector.expose(mean_e, exposure_s, rng)
         image = png_of(pixels)
         path = stem.with_name(stem.name + ".png")
@@ -991,18 +997,17 @@ class MaskImages:
 
     def keep(self, key: bytes, image: FloatArray) -> None:
         """Keep an image (h, w), in place of older ones."""
-        rows, columns = (np.flatnonzero(image.any(axis=axis)) for axis in (1, 0))
-        part = slice(0, 0), slice(0, 0)
-        if len(rows):
-            part = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        self._parts[key] = *part, image[part].astype(np.float32)
-        while len(self._parts) > 1 and (
-            len(self._parts) > self._count or self._bytes() > MASKS_KEPT_BYTES
-        ):
-            del self._parts[next(iter(self._parts))]
+        rows = _extent(np.asarray(image.any(axis=1)))
+        columns = _extent(np.asarray(image.any(axis=0)))
+        self._parts[key] = rows, columns, image[rows, columns].astype(np.float32)
+        while len(self._parts) > 1 and self._is_full():
+            oldest = next(iter(self._parts))
+            del self._parts[oldest]
 
-    def _bytes(self) -> int:
-        return sum(part.nbytes for _, _, part in self._parts.values())
+    def _is_full(self) -> bool:
+        """Whether there are more images than are kept, or too large ones."""
+        size_bytes = sum(part.nbytes for _, _, part in self._parts.values())
+        return len(self._parts) > self._count or size_bytes > MASKS_KEPT_BYTES
 
     def image(self, key: bytes, level: float) -> Float32Array:
         """A pattern's image at a level relative to that of the image that is kept."""
@@ -1010,6 +1015,14 @@ class MaskImages:
         image = np.zeros(self._shape, dtype=np.float32)
         np.multiply(part, np.float32(level), out=image[rows, columns])
         return image
+
+
+def _extent(is_lit: BoolArray) -> slice:
+    """From the first to the last that is lit (n,)."""
+    lit = np.flatnonzero(is_lit)
+    if not len(lit):
+        return slice(0, 0)
+    return slice(lit[0], lit[-1] + 1)
 
 
 def mean_light(frames: list[list[LitLight]]) -> list[LitLight]:
@@ -1033,18 +1046,15 @@ def virtual_diode(
     """
     frames = int(seconds * file.config.monitor.refresh_hz)
     period_ns = NS_PER_S / file.config.monitor.refresh_hz
-    swap_ns = np.rint(np.arange(frames) * period_ns + rng.normal(0, SWAP_JITTER_NS, frames)).astype(
-        np.int64
-    )
-    shown = edges_of(swap_ns, np.array([marker_light(number, KIND) for number in range(frames)]))
+    jitter_ns = rng.normal(0, SWAP_JITTER_NS, frames)
+    swap_ns = np.rint(np.arange(frames) * period_ns + jitter_ns).astype(np.int64)
+    levels = np.array([marker_light(number, KIND) for number in range(frames)])
+    shown = edges_of(swap_ns, levels)
     monitor = replace(truth.config.monitor, photodiode_px=file.config.monitor.photodiode_px)
     delay_ms = monitor.panel_delay_ms + swap_to_square_ms(monitor)
-    late_ms = delay_ms + rng.normal(
-        0, truth.config.certify.virtual.delay_noise_ms, len(shown.host_ns)
-    )
-    return DiodeRecording(
-        shown, Edges(shown.host_ns + np.rint(late_ms * NS_PER_MS).astype(np.int64), shown.level)
-    )
+    noise_ms = rng.normal(0, truth.config.certify.virtual.delay_noise_ms, len(shown.host_ns))
+    late_ns = np.rint((delay_ms + noise_ms) * NS_PER_MS).astype(np.int64)
+    return DiodeRecording(shown, Edges(shown.host_ns + late_ns, shown.level))
 
 
 def refuse_other_bench(bench: BenchFile, truth: BenchFile) -> None:

@@ -86,8 +86,9 @@ class DotField:
         """Every `period`-th pixel of the square, across and down, in a patch's code and channel."""
         codes = black(resolution_px)
         first = period // 2
-        inside = codes[self.top : self.top + self.side, self.left : self.left + self.side]
-        inside[first::period, first::period] = patch.code
+        rows = slice(self.top, self.top + self.side)
+        columns = slice(self.left, self.left + self.side)
+        codes[rows, columns][first::period, first::period] = patch.code
         return in_channel(codes, patch.channel)
 
     def lit(self, period: int) -> int:
@@ -103,12 +104,10 @@ def field_for(
 
     Raises InputError where too little of the monitor is seen.
     """
+    width, height = geometry.monitor.resolution_px
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    sides = (
-        *(ratio * size for size in geometry.monitor.resolution_px),
-        *geometry.tracker.resolution_px,
-    )
-    side = min(SHARE * min(sides), MAX_SIDE_TRACKER_PX) / ratio
+    smaller_side_px = min(ratio * width, ratio * height, *geometry.tracker.resolution_px)
+    side = min(SHARE * smaller_side_px, MAX_SIDE_TRACKER_PX) / ratio
     sparsest = 2 ** math.ceil(math.log2(max(APART_TRACKER_PX / ratio, 1.0)))
     cells = int(side // sparsest)
     if cells < MIN_DOTS:
@@ -116,27 +115,42 @@ def field_for(
             "the tracker sees too little of the monitor for the response; look at focal lengths and"
             " pixel pitches"
         )
-    (x,), (y,) = geometry.to_monitor(
-        *(np.array([(size - 1) / 2]) for size in geometry.tracker.resolution_px)
-    )
-    corner = []  # the top left of a square about the middle of what is seen, kept on the screen
-    for middle, size in zip((x, y), geometry.monitor.resolution_px, strict=True):
-        if math.isfinite(middle):
-            wanted = middle
-        else:
-            wanted = (size - 1) / 2
-        corner.append(
-            int(np.clip(round(wanted - (cells * sparsest - 1) / 2), 0, size - cells * sparsest))
-        )
-    left, top = corner
-    margin = MARGIN_PX + MARGIN_SIGMAS * math.hypot(sigma_px, ratio / math.sqrt(12))
-    rows, columns = _seen(geometry, (left, top), cells * sparsest, margin)
-    periods = tuple(2**power for power in range(int(math.log2(sparsest)) + 1))
     square_px = cells * sparsest
+    first_column, first_row = _corner(geometry, square_px)
+    margin = MARGIN_PX + MARGIN_SIGMAS * math.hypot(sigma_px, ratio / math.sqrt(12))
+    rows, columns = _seen(geometry, (first_column, first_row), square_px, margin)
+    powers = range(int(math.log2(sparsest)) + 1)
+    periods = tuple(2**power for power in powers)
     area_px = monitor_area(geometry, rows, columns, even)
     if even is not None:
-        area_px /= float(even[top : top + square_px, left : left + square_px].mean())
-    return DotField(left, top, square_px, rows, columns, area_px), periods
+        square_rows = slice(first_row, first_row + square_px)
+        square_columns = slice(first_column, first_column + square_px)
+        square_light = even[square_rows, square_columns]
+        area_px /= float(square_light.mean())
+    field = DotField(first_column, first_row, square_px, rows, columns, area_px)
+    return field, periods
+
+
+def _corner(geometry: BenchGeometry, square_px: int) -> tuple[int, int]:
+    """The left top of a square about the middle of what is seen, kept on the screen, monitor px."""
+    width, height = geometry.tracker.resolution_px
+    middle_x = np.array([(width - 1) / 2])
+    middle_y = np.array([(height - 1) / 2])
+    (x,), (y,) = geometry.to_monitor(middle_x, middle_y)
+    monitor_width, monitor_height = geometry.monitor.resolution_px
+    first_column = _first_px(x, monitor_width, square_px)
+    first_row = _first_px(y, monitor_height, square_px)
+    return first_column, first_row
+
+
+def _first_px(middle: float, size: int, square_px: int) -> int:
+    """The first pixel of a square about a place on an axis of `size` pixels; about the middle of
+    these where the place is NaN.
+    """
+    if not math.isfinite(middle):
+        middle = (size - 1) / 2
+    first = round(middle - (square_px - 1) / 2)
+    return int(np.clip(first, 0, size - square_px))
 
 
 def _seen(
@@ -174,20 +188,19 @@ def monitor_area(
     differ by several percent.
     """
     y, x = np.mgrid[rows.start : rows.stop + 1, columns.start : columns.stop + 1] - 0.5
-    corner_x, corner_y = (
-        part.reshape(y.shape) for part in geometry.to_monitor(x.ravel(), y.ravel())
-    )
+    seen_x, seen_y = geometry.to_monitor(x.ravel(), y.ravel())
+    corner_x = seen_x.reshape(y.shape)
+    corner_y = seen_y.reshape(y.shape)
+    down_x, up_x = _diagonals(corner_x)
+    down_y, up_y = _diagonals(corner_y)
     # Half the cross product of a quadrangle's diagonals.
-    down_x = corner_x[1:, 1:] - corner_x[:-1, :-1]
-    down_y = corner_y[1:, 1:] - corner_y[:-1, :-1]
-    up_x = corner_x[:-1, 1:] - corner_x[1:, :-1]
-    up_y = corner_y[:-1, 1:] - corner_y[1:, :-1]
     area = np.nan_to_num(np.abs(down_x * up_y - down_y * up_x)) / 2
     width, height = geometry.monitor.resolution_px
-    middle_x = (corner_x[1:, 1:] + corner_x[:-1, :-1]) / 2
-    middle_y = (corner_y[1:, 1:] + corner_y[:-1, :-1]) / 2
-    on_screen = np.abs(middle_x - (width - 1) / 2) <= width / 2
-    on_screen &= np.abs(middle_y - (height - 1) / 2) <= height / 2
+    middle_x = _middles(corner_x)
+    middle_y = _middles(corner_y)
+    from_middle_x = np.abs(middle_x - (width - 1) / 2)
+    from_middle_y = np.abs(middle_y - (height - 1) / 2)
+    on_screen = (from_middle_x <= width / 2) & (from_middle_y <= height / 2)
     area = area[on_screen]
     if even is not None:
         # A black screen glows over the whole part, whose edges are darker than the dots' square.
@@ -195,6 +208,20 @@ def monitor_area(
         column = np.clip(np.rint(middle_x[on_screen]), 0, width - 1).astype(np.intp)
         area = area * even[row, column]
     return float(area.sum())
+
+
+def _diagonals(corner: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Diagonals (h, w) of quadrangles along one axis, down to the right and up to the right, by
+    that axis of their corners (h + 1, w + 1).
+    """
+    down = corner[1:, 1:] - corner[:-1, :-1]
+    up = corner[:-1, 1:] - corner[1:, :-1]
+    return down, up
+
+
+def _middles(corner: FloatArray) -> FloatArray:
+    """Middles (h, w) of quadrangles along one axis, by their corners (h + 1, w + 1)."""
+    return np.asarray((corner[1:, 1:] + corner[:-1, :-1]) / 2)
 
 
 def lattice_profile(period: int, ratio: float, sigma_px: float) -> FloatArray:
@@ -208,16 +235,21 @@ def lattice_profile(period: int, ratio: float, sigma_px: float) -> FloatArray:
     neighbours = math.ceil(MARGIN_SIGMAS * sigma / step) + 1
     reach = np.arange(-neighbours, neighbours + 1) * step
     place = np.linspace(-0.5, 0.5, PHASES)[:, None] * step + reach
-    return np.asarray((ndtr((place + 0.5) / sigma) - ndtr((place - 0.5) / sigma)).sum(axis=1))
+    beyond = ndtr((place + 0.5) / sigma)
+    before = ndtr((place - 0.5) / sigma)
+    return np.asarray((beyond - before).sum(axis=1))
 
 
 def peak_shares(periods: tuple[int, ...], ratio: float, sigma_px: float) -> FloatArray:
     """The share of a lit pixel's light in the brightest tracker pixel, per lattice; `ratio` is
     tracker px per monitor px.
     """
-    return np.array(
-        [float(lattice_profile(period, ratio, sigma_px).max()) ** 2 for period in periods]
-    )
+    shares = []
+    for period in periods:
+        profile = lattice_profile(period, ratio, sigma_px)
+        # the profile is the same along both axes
+        shares.append(float(profile.max()) ** 2)
+    return np.array(shares)
 
 
 class Range(NamedTuple):
@@ -257,12 +289,12 @@ class LatticeRatio:
     @property
     def words(self) -> str:
         """The ratio for a person."""
-        more, less = (_exposed(times) for times in self.times)
+        dense, sparse = self.times
         ratio = f"{self.ratio:.5f} +- {self.error:.5f} times"
         code = f"code {self.patch.code} of {self.patch.channel}"
         return (
-            f"{code}: a pixel of every {self.dense}{more} is {ratio} one of every"
-            f" {self.sparse}{less}"
+            f"{code}: a pixel of every {self.dense}{_exposed(dense)} is {ratio} one of every"
+            f" {self.sparse}{_exposed(sparse)}"
         )
 
 
@@ -298,17 +330,20 @@ class Readings:
     def write(self, path: Path) -> None:
         """MEASURED.csv, as `calibrate photometric` reads it. Raises InputError."""
         light = "light of one monitor pixel in the tracker, DN/s, by dots on lattices"
-        head = [f"# {light}; exposed for {self.exposure_s:.6g} s"]
-        head += [f"# {link.words}" for link in self.links]
+        lines = [f"# {light}; exposed for {self.exposure_s:.6g} s"]
+        for link in self.links:
+            lines.append(f"# {link.words}")
         columns = ["order", "code", "channel", "value", "sigma"]
-        columns += [f"{COMMON}{cause}" for cause in range(1, self.common.shape[1] + 1)]
-        rows = []
+        for cause in range(self.common.shape[1]):
+            columns.append(f"{COMMON}{cause + 1}")
+        lines.append(",".join(columns))
         for order, patch in enumerate(self.patches):
             value = float(self.light[order])
             cells = [str(order + 1), str(patch.code), patch.channel, repr(value)]
-            cells += [f"{error:.5g}" for error in (self.sigma[order], *self.common[order])]
-            rows.append(",".join(cells))
-        write_whole(path, "\n".join([*head, ",".join(columns), *rows]) + "\n")
+            for error in (self.sigma[order], *self.common[order]):
+                cells.append(f"{error:.5g}")
+            lines.append(",".join(cells))
+        write_whole(path, "\n".join(lines) + "\n")
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,8 +367,8 @@ class Look(NamedTuple):
 class PixelScatter:
     """The noise of sums over the field, from images of one pattern that were taken again.
 
-    By exposure: the variance of a black image's sum, DN^2. `dn_per_e` is that of a lit one over it,
-    for each DN of light.
+    The variance of a black image's sum, DN^2, is known for each exposure; light adds `dn_per_e` to
+    it for each DN of its sum. `default_dn_per_e` stands in where no lit pattern was repeated.
     """
 
     default_dn_per_e: float
@@ -360,19 +395,26 @@ class PixelScatter:
         """The variance of the sum of a black image, exposed so many times longer."""
         squares = self._squares.get((BLACK, Range(1, times)), [])
         if not squares:
-            for (patch, _), more in self._squares.items():
-                squares = squares + more * (not patch.code)
-        return float(np.mean(squares)) if squares else 0.0
+            # of any exposure
+            for (patch, _), others in self._squares.items():
+                if not patch.code:
+                    squares = squares + others
+        if squares:
+            return float(np.mean(squares))
+        return 0.0
 
     def dark_sum_dn(self, times: int) -> float:
         """The sum of the last black image, DN, exposed so many times longer, else of another."""
-        sums = {at.times: total for (patch, at), total in self._sums.items() if not patch.code}
+        sums = {}
+        for (patch, at), total in self._sums.items():
+            if not patch.code:
+                sums[at.times] = total
         return sums.get(times, max(sums.values(), default=0.0))
 
     @property
     def dn_per_e(self) -> float:
-        """The variance of light over light, DN: by the images of lit patterns; as the detector is
-        stated without repeats.
+        """DN an electron, as the variance of light over the light: by repeated images of lit
+        patterns, and as the detector is stated where none was repeated.
         """
         variance = 0.0
         light = 0.0
@@ -407,8 +449,8 @@ class _Reading(NamedTuple):
 
 
 class _Values(NamedTuple):
-    """Of each patch (n,): light above black and its own standard error, DN/s; light for a DN of a
-    lit patch's sum.
+    """Light of each patch above black (n,) and its own standard error (n,), DN/s, and what one DN
+    of a lit patch's sum is in DN/s (n,).
     """
 
     light: FloatArray
@@ -458,7 +500,7 @@ class Photometer:
         for period in self.periods:
             self.profiles[period] = lattice_profile(period, self.ratio, sigma_px)
         self.exposure_s = context.exposure_s
-        self.scatter = PixelScatter(1 / context.file.config.tracker.detector.gain_e_per_dn)
+        self.scatter = PixelScatter(1 / context.detector.gain_e_per_dn)
         self._dark_screen = context.take(self._black_screen(0))
         self.images = [self._dark_screen]
         self._cold = self._part(self._dark_screen) < HOT_FILL * context.full_dn
@@ -476,10 +518,10 @@ class Photometer:
         links = [self._link(pair) for pair in pairs]
         lit = _lit(planned, chosen, blacks, sums)
         values = self._values(planned, lit, blacks[1], self._factors(links))
-        causes = [
-            self._of_ratios(values.light, lit, links),
-            self._of_rounding(values, lit, pairs, links),
-        ]
+        values = self._values(planned, lit, blacks[1], self._factors(links))
+        of_ratios = self._of_ratios(values.light, lit, links)
+        of_rounding = self._of_rounding(values, lit, pairs, links)
+        causes = [of_ratios, of_rounding]
         cut = self._of_cut(values, lit, pairs, links)
         if (np.abs(cut) > SMALL_MODE * values.sigma).any():
             values = values._replace(light=values.light - cut)
@@ -491,28 +533,30 @@ class Photometer:
         for order, reading in lit.items():
             period[order] = reading.at.period
         return Readings(
-            planned,
-            np.maximum(with_black, 0.0),
-            self.exposure_s,
-            links,
-            black_error is not None,
-            tuple(self.images),
-            values.light,
-            period,
-            values.sigma,
-            np.hstack(causes),
+            patches=planned,
+            light=np.maximum(with_black, 0.0),
+            exposure_s=self.exposure_s,
+            links=links,
+            black_known=black_error is not None,
+            images=tuple(self.images),
+            above_black=values.light,
+            period=period,
+            sigma=values.sigma,
+            common=np.hstack(causes),
         )
 
     def _expose(self) -> float:
         """Choose an exposure in which white does not saturate, first the bench file's; returns a
         white dot's peak, DN.
         """
-        brightest = max(self.assumed.light, key=lambda name: float(self.assumed.light[name][-1]))
+        assumed = self.assumed.light
+        brightest = max(assumed, key=lambda name: float(assumed[name][-1]))
         white = Patch(self.context.white, brightest)
         sparsest = Range(self.periods[-1])
         for probe in range(MAX_PROBES):
             # Another exposure is no repeat: it tells nothing of the scatter.
-            fill = self._filled(self._part(self._take(f"white_{probe:02}", sparsest, white)))
+            part = self._part(self._take(f"white_{probe:02}", sparsest, white))
+            fill = self._filled(part)
             if fill <= MAX_FILL:
                 break
             if not self.context.source.sets_exposure:
@@ -531,8 +575,9 @@ class Photometer:
             self.exposure_s *= FILL / fill
         dark = self._part(self._take("black", Range(1), BLACK))
         bright = self._part(self._take("white", sparsest, white))
-        share = float(self.assumed.light[white.channel][white.code])
-        return float((bright - dark)[self._cold].max(initial=1.0)) / share
+        share = float(assumed[white.channel][white.code])
+        above_dn = (bright - dark)[self._cold]
+        return float(above_dn.max(initial=1.0)) / share
 
     def _peaks(self, planned: list[Patch], white_dn: float) -> dict[Patch, FloatArray]:
         """The brightest pixel (periods,), DN, of each lit patch on each lattice, by the bench
@@ -551,12 +596,13 @@ class Photometer:
         """
         highest_dn = FILL * self.context.full_dn
         fits = np.flatnonzero(peaks <= highest_dn)
-        place = int(fits[0]) if len(fits) else len(peaks) - 1
-        times = 1
+        place = len(peaks) - 1
+        if len(fits):
+            place = int(fits[0])
+        longest_s = 0.0
         if self.context.source.sets_exposure:
             longest_s = self.longest_s
-        else:
-            longest_s = 0.0
+        times = 1
         while peaks[place] * times < FAINT_DN and self.exposure_s * times * LONGER <= longest_s:
             times *= LONGER
         return Range(self.periods[place], times)
@@ -566,8 +612,8 @@ class Photometer:
         planned: list[Patch],
         chosen: dict[Patch, Range],
     ) -> tuple[dict[int, FloatArray], dict[int, float]]:
-        """The sums of black images, in turn, by how many times longer they are exposed; those of
-        lit ones by their order.
+        """Sums over the field, DN: of the black images, in turn (images,), by how many times longer
+        they are exposed, and of each lit patch by its place in the plan.
         """
         longer = sorted({at.times for at in chosen.values()} | {1})
         blacks: dict[int, list[float]] = {times: [] for times in longer}
@@ -585,10 +631,14 @@ class Photometer:
                 if patch in fixed or fill <= MAX_FILL or at == Range(self.periods[-1]):
                     break
                 # Brighter than the bench file says.
-                chosen[patch] = Range(at.period) if at.times > 1 else Range(2 * at.period)
+                if at.times > 1:
+                    chosen[patch] = Range(at.period)
+                else:
+                    chosen[patch] = Range(2 * at.period)
             fixed.add(patch)
             sums[order] = total
-        return {times: np.array(black_sums) for times, black_sums in blacks.items()}, sums
+        black_sums = {times: np.array(of_times) for times, of_times in blacks.items()}
+        return black_sums, sums
 
     def _pairs(
         self,
@@ -599,17 +649,19 @@ class Photometer:
         """Compare each two neighbouring ranges of a channel by one code shown in both."""
         ranges = {patch: at for patch, at in chosen.items() if patch.channel == channel}
         used = {*ranges.values(), Range(self.periods[-1])}
-        ladder = sorted(used, key=lambda at: (-at.times, at.period))
+        ladder = sorted(used, key=_ladder_place)
         for step, (more, less) in enumerate(itertools.pairwise(ladder)):
             patch = self._brightest(f"link_{channel}_{step}", ranges, peaks, more)
+            scale = self._dots(less) / self._dots(more)
             lights: list[tuple[float, float]] = []
+            ratios = []
             for pair in range(self.pairs):
                 name = f"link_{channel}_{step}_{pair}"
-                lights.append(self._both(name, patch, more, less))
-            scale = self._dots(less) / self._dots(more)
-            means = [float(mean) for mean in np.mean(lights, axis=0)]
-            ratios = tuple(patch_light / other * scale for patch_light, other in lights)
-            yield _Pair(patch, more, less, (means[0], means[1]), ratios)
+                more_dn, less_dn = self._both(name, patch, more, less)
+                lights.append((more_dn, less_dn))
+                ratios.append(more_dn / less_dn * scale)
+            mean_more_dn, mean_less_dn = np.mean(lights, axis=0).tolist()
+            yield _Pair(patch, more, less, (mean_more_dn, mean_less_dn), tuple(ratios))
 
     def _both(self, name: str, patch: Patch, more: Range, less: Range) -> tuple[float, float]:
         """A patch's light in two ranges, DN, as in `_Reading`."""
@@ -656,7 +708,7 @@ class Photometer:
         blacks: FloatArray,
         factors: dict[tuple[str, Range], float],
     ) -> _Values:
-        """Light above black of each patch, and the standard error of its own images."""
+        """Light of each patch above black, DN/s, and the standard error by its own images."""
         count = len(planned)
         light = np.zeros(count)
         per_dn = np.zeros(count)
@@ -670,37 +722,40 @@ class Photometer:
             per_dn[order] = 1 / (dots * self.exposure_s)
             light[order] = reading.light_dn * per_dn[order]
             # Light that rounding hides has shot noise, too.
-            hidden_dn = float(np.sqrt((self._rounded(reading.at, reading.light_dn) ** 2).mean()))
+            rounded_dn = self._rounded(reading.at, reading.light_dn)
+            hidden_dn = float(np.sqrt((rounded_dn**2).mean()))
             known_dn = max(reading.light_dn, 0.0) + hidden_dn
             variance = self.scatter.sum_dn2(known_dn, reading.at.times, reading.blacks)
             sigma[order] = math.sqrt(variance) * per_dn[order]
         return _Values(light, sigma, per_dn)
 
     def _dots(self, at: Range) -> int:
-        """By how many lit pixels and exposures a sum in a range has to be divided."""
+        """Lit pixels times exposures of a range: what a sum is divided by for a pixel's light."""
         return self.field.lit(at.period) * at.times
 
     def _link(self, pair: _Pair) -> LatticeRatio:
         """A ratio of ranges with its standard error."""
         more, less = pair.light_dn
-        dark_more, dark_less = (self.scatter.dark_dn2(at.times) for at in (pair.more, pair.less))
-        variance = (self.scatter.dn_per_e * more + dark_more) / more**2
-        variance += (self.scatter.dn_per_e * less + dark_less) / less**2
+        dark_more = self.scatter.dark_dn2(pair.more.times)
+        dark_less = self.scatter.dark_dn2(pair.less.times)
+        # relative variances of both sums, and of the black ones under them
+        dn_per_e = self.scatter.dn_per_e
+        variance = (dn_per_e * more + dark_more) / more**2
+        variance += (dn_per_e * less + dark_less) / less**2
         if pair.more.times == pair.less.times:  # one black image is under both
             variance += dark_more * (1 / more - 1 / less) ** 2
         else:
             variance += dark_more / more**2 + dark_less / less**2
         ratio = float(np.mean(pair.ratios))
         error = ratio * math.sqrt(variance / len(pair.ratios))
-        times = (pair.more.times, pair.less.times)
         return LatticeRatio(
-            pair.patch,
-            pair.more.period,
-            pair.less.period,
-            ratio,
-            pair.ratios,
-            error,
-            times,
+            patch=pair.patch,
+            dense=pair.more.period,
+            sparse=pair.less.period,
+            ratio=ratio,
+            pairs=pair.ratios,
+            error=error,
+            times=(pair.more.times, pair.less.times),
         )
 
     def _factors(self, links: list[LatticeRatio]) -> dict[tuple[str, Range], float]:
@@ -748,13 +803,12 @@ class Photometer:
         effects = np.zeros((len(values.light), len(longer), STEP_PHASES))
         for order, reading in lit.items():
             place = longer.index(reading.at.times)
-            effects[order, place] = (
-                self._rounded(reading.at, reading.light_dn) * values.per_dn[order]
-            )
+            rounded_dn = self._rounded(reading.at, reading.light_dn)
+            effects[order, place] = rounded_dn * values.per_dn[order]
         for pair, link in zip(pairs, links, strict=True):
             off = np.zeros((len(longer), STEP_PHASES))
-            ranges = zip((pair.more, pair.less), pair.light_dn, (1, -1), strict=True)
-            for at, light_dn, sign in ranges:
+            more_dn, less_dn = pair.light_dn
+            for at, light_dn, sign in ((pair.more, more_dn, 1), (pair.less, less_dn, -1)):
                 if at.times in longer:
                     rounded = self._rounded(at, light_dn) / light_dn
                     off[longer.index(at.times)] += sign * rounded
@@ -762,10 +816,10 @@ class Photometer:
                 if _passes(reading.patch, reading.at, link):
                     effects[order] -= values.light[order] * off
         flat = effects.reshape(len(values.light), -1) / math.sqrt(STEP_PHASES)
-        modes, sizes, _ = np.linalg.svd(flat, full_matrices=False)
-        modes = modes * sizes
-        used = (np.abs(modes) > SMALL_MODE * values.sigma[:, None]).any(axis=0)
-        return np.asarray(modes[:, used])
+        vectors, sizes, _ = np.linalg.svd(flat, full_matrices=False)
+        modes = vectors * sizes
+        is_large = np.abs(modes) > SMALL_MODE * values.sigma[:, None]
+        return np.asarray(modes[:, is_large.any(axis=0)])
 
     def _of_cut(
         self,
@@ -779,34 +833,46 @@ class Photometer:
         """
         effect = np.zeros(len(values.light))
         for order, reading in lit.items():
-            effect[order] = self._cut_dn(reading.at, reading.light_dn) * values.per_dn[order]
+            cut_dn = self._cut_dn(reading.at, reading.light_dn)
+            effect[order] = cut_dn * values.per_dn[order]
         for pair, link in zip(pairs, links, strict=True):
             more, less = pair.light_dn
-            off = self._cut_dn(pair.more, more) / more - self._cut_dn(pair.less, less) / less
+            more_off = self._cut_dn(pair.more, more) / more
+            less_off = self._cut_dn(pair.less, less) / less
             for order, reading in lit.items():
                 if _passes(reading.patch, reading.at, link):
-                    effect[order] -= values.light[order] * off
+                    effect[order] -= values.light[order] * (more_off - less_off)
         return effect
 
     def _cut_dn(self, at: Range, light_dn: float) -> float:
         """The DN that the cut at code 0 adds to the sum of a lattice's image above black."""
-        detector = self.context.file.config.tracker.detector
+        detector = self.context.detector
+        pixels = self.field.tracker_px
         stated_dn = detector.electronics_e / detector.gain_e_per_dn
-        read_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / self.field.tracker_px, math.inf)
+        read_dn = before_adc_dn(self.scatter.dark_dn2(at.times) / pixels, math.inf)
         # What is cut off scatters less than it would: the stated noise counts where it is larger.
         noise_dn = max(stated_dn, read_dn)
-        dark_dn = self.scatter.dark_sum_dn(at.times) / self.field.tracker_px
+        dark_dn = self.scatter.dark_sum_dn(at.times) / pixels
         dots = self.field.lit(at.period)
-        along = self.profiles[at.period]
-        level_dn = max(light_dn, 0.0) / dots * np.outer(along, along).ravel()
-        cell_px = (at.period * self.ratio) ** 2
-        return dots * cell_px * cut_light(level_dn, dark_dn, noise_dn, self.scatter.dn_per_e)
+        level_dn = max(light_dn, 0.0) / dots * self._pixel_shares(at)
+        cut_dn = cut_light(level_dn, dark_dn, noise_dn, self.scatter.dn_per_e)
+        return dots * self._cell_px(at) * cut_dn
+
+    def _pixel_shares(self, at: Range) -> FloatArray:
+        """Shares (PHASES^2,) of a dot's light in pixels at places within a lattice's cell."""
+        profile = self.profiles[at.period]
+        return np.outer(profile, profile).ravel()
+
+    def _cell_px(self, at: Range) -> float:
+        """The tracker's pixels in a cell of a lattice."""
+        return float((at.period * self.ratio) ** 2)
 
     def _noise_dn(self, variance_dn2: float, sum_dn: float) -> float:
         """The noise of a pixel before the ADC, DN, by the variance of the field's sum and that
         sum.
         """
-        detector = self.context.file.config.tracker.detector
+        detector = self.context.detector
+        detector = self.context.detector
         pixels = self.field.tracker_px
         # How far a level is above the offset, rounding tells to half a step.
         light_dn = max(sum_dn / pixels - detector.offset_dn - HALF_STEP_DN, 0.0)
@@ -818,17 +884,15 @@ class Photometer:
         """The DN (STEP_PHASES,) that the ADC's rounding adds to the sum of a lattice's image above
         black, by where the dark level lies between two codes.
         """
-        dark_dn = self._noise_dn(
-            self.scatter.dark_dn2(at.times), self.scatter.dark_sum_dn(at.times)
-        )
+        black_dn2 = self.scatter.dark_dn2(at.times)
+        noise_dn = self._noise_dn(black_dn2, self.scatter.dark_sum_dn(at.times))
         dots = self.field.lit(at.period)
-        along = self.profiles[at.period]
-        shares = np.outer(along, along).ravel()
+        shares = self._pixel_shares(at)
         # Dots that are rounded away may have a peak of half a step.
-        dot_dn = max(light_dn / dots, HALF_STEP_DN / float(shares.max()))
-        level_dn = dot_dn * shares
-        cell_px = (at.period * self.ratio) ** 2
-        return dots * cell_px * rounded_light(level_dn, dark_dn, self.scatter.dn_per_e)
+        hidden_dn = HALF_STEP_DN / float(shares.max())
+        level_dn = max(light_dn / dots, hidden_dn) * shares
+        rounding_dn = rounded_light(level_dn, noise_dn, self.scatter.dn_per_e)
+        return dots * self._cell_px(at) * rounding_dn
 
     def _with_black(
         self, planned: list[Patch], light: FloatArray
@@ -841,22 +905,23 @@ class Photometer:
             whites = []
             for name in self.assumed.light:
                 white = Patch(self.context.white, name)
-                whites.append(light[[patch == white for patch in planned]].mean())
+                is_white = [patch == white for patch in planned]
+                whites.append(light[is_white].mean())
             return light + self.assumed.black * float(np.sum(whites)), None
         # A black screen minus one that is switched off. Both are in the bench file's exposure. Its
         # noise is not that of the lattices' exposure: the black screen is taken again.
-        screens = [self._dark_screen, self.context.take(self._black_screen(1))]
-        self.images += [screens[1], unlit]
-        parts = [self._part(path) for path in screens]
-        under = self._part(unlit)
-        glowing_dn = float(np.mean([part.sum() for part in parts]))
-        dark_dn = float(under.sum())
+        again = self.context.take(self._black_screen(1))
+        self.images += [again, unlit]
+        first = self._part(self._dark_screen)
+        second = self._part(again)
+        glowing_dn = float(np.mean([first.sum(), second.sum()]))
+        dark_dn = float(self._part(unlit).sum())
         more_dn = glowing_dn - dark_dn
         seconds = self.field.monitor_px * self.context.exposure_s
         # The screen that is switched off has the noise of the other, less that of the glow.
-        glowing_dn2 = float(((parts[0] - parts[1]) ** 2).sum()) / 2
+        glowing_dn2 = float(((first - second) ** 2).sum()) / 2
         dark_dn2 = max(glowing_dn2 - self.scatter.dn_per_e * max(more_dn, 0.0), 0.0)
-        variance = glowing_dn2 / len(parts) + dark_dn2
+        variance = glowing_dn2 / 2 + dark_dn2
         # Each of the two levels is rounded, and the one without glow has less noise to spread it.
         for image_dn2, sum_dn in ((glowing_dn2, glowing_dn), (dark_dn2, dark_dn)):
             rounding_dn = rounding_rms(self._noise_dn(image_dn2, sum_dn))
@@ -879,15 +944,23 @@ class Photometer:
         return float(part[self._cold].max(initial=0.0)) / self.context.full_dn
 
     def _take(self, name: str, at: Range, patch: Patch) -> Path:
-        longer = f"_{at.times}" if at.times > 1 else ""
+        """Take an image of a lattice in a patch's code; its file."""
+        if at.times > 1:
+            name = f"{name}_{at.times}"
         codes = self.field.lattice(self.context.resolution_px, at.period, patch)
-        pattern = Pattern(name + longer, codes)
-        self.images.append(self.context.take(pattern, self.exposure_s * at.times))
-        return self.images[-1]
+        path = self.context.take(Pattern(name, codes), self.exposure_s * at.times)
+        self.images.append(path)
+        return path
 
     def _part(self, path: Path) -> FloatArray:
+        """The field's part (h, w) of an image, DN."""
         # A copy: a slice would keep its whole image, and the scatter keeps parts of a hundred.
         return self.context.pixels(path)[self.field.rows, self.field.columns].copy()
+
+
+def _ladder_place(at: Range) -> tuple[int, int]:
+    """The order of ranges, from those that show the most of faint light."""
+    return -at.times, at.period
 
 
 def _passes(patch: Patch, at: Range, link: LatticeRatio) -> bool:
@@ -896,7 +969,7 @@ def _passes(patch: Patch, at: Range, link: LatticeRatio) -> bool:
     """
     if patch.channel != link.patch.channel:
         return False
-    return (-at.times, at.period) <= (-link.times[0], link.dense)
+    return _ladder_place(at) <= _ladder_place(Range(link.dense, link.times[0]))
 
 
 def _lit(
@@ -906,13 +979,13 @@ def _lit(
     sums: dict[int, float],
 ) -> dict[int, _Reading]:
     """The lit patches by their order, above the black images before and after them."""
-    orders = np.flatnonzero([patch.code == 0 for patch in planned])
+    black_orders = np.flatnonzero([patch.code == 0 for patch in planned])
     lit: dict[int, _Reading] = {}
     for order, total in sums.items():
         patch = planned[order]
         at = chosen[patch]
-        under, variance = _between(order, orders, blacks[at.times])
-        lit[order] = _Reading(patch, at, total - under, variance)
+        black_dn, variance = _between(order, black_orders, blacks[at.times])
+        lit[order] = _Reading(patch, at, total - black_dn, variance)
     return lit
 
 
@@ -921,6 +994,9 @@ def _between(order: int, orders: IntArray, values: FloatArray) -> tuple[float, f
     if len(orders) == 1:
         return float(values[0]), 1.0
     after = int(np.clip(np.searchsorted(orders, order), 1, len(orders) - 1))
-    share = float(np.clip((order - orders[after - 1]) / (orders[after] - orders[after - 1]), 0, 1))
-    value = (1 - share) * values[after - 1] + share * values[after]
-    return float(value), (1 - share) ** 2 + share**2
+    before = after - 1
+    elapsed = (order - orders[before]) / (orders[after] - orders[before])
+    share = float(np.clip(elapsed, 0, 1))
+    value = (1 - share) * values[before] + share * values[after]
+    variance = (1 - share) ** 2 + share**2
+    return float(value), variance

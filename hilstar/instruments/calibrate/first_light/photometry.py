@@ -58,7 +58,7 @@ DIM_LIGHT = 1e-3  # relative to white: how far down responses are compared
 
 def photometry(context: StepContext) -> StepOutcome:
     """Measure the response and name its file in the bench file. Raises InputError."""
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     if not context.patches:
         how = (
             "give --patches N, or use a photometer (`hilstar calibrate plan --show`, then `hilstar"
@@ -68,32 +68,12 @@ def photometry(context: StepContext) -> StepOutcome:
             "skipped", f"not measured, the bench file's {monitor.calibration} stays: {how}"
         )
     assumed = calibration_of(context)
-    apart = drives_apart(context.file.config)
-    if context.file.config.render.bit_stealing or apart:
-        channels = "".join(PRIMARIES)
-    else:
-        channels = "w"
+    by_channel = _assumed_light(context.file, assumed.response)
+    channels = "".join(by_channel)
     planned = plan_for(monitor.bits, context.patches, channels)
-    by_channel = {"w": assumed.response.light}
-    if apart:
-        responses = primary_responses(
-            calibration_source(monitor, context.file.folder), monitor.bits
-        )
-        shares = shares_of_white(context.file)
-        by_channel = {
-            name: share * response.light
-            for name, share, response in zip(channels, shares, responses, strict=True)
-        }
-    elif channels != "w":
-        by_channel = dict(
-            zip(
-                channels,
-                primary_lights(calibration_source(monitor, context.file.folder), monitor.bits),
-                strict=True,
-            )
-        )
     light = Assumed(by_channel, assumed.response.black)
-    readings = Photometer(context, context.psf_sigma_px, light, PAIRS, LONGEST_S).read(planned)
+    photometer = Photometer(context, context.psf_sigma_px, light, PAIRS, LONGEST_S)
+    readings = photometer.read(planned)
     measured, output, picture, before = (context.session / name for name in PHOTOMETRY_FILES)
     readings.write(measured)
     instrument = f"the tracker, exposed for {readings.exposure_s:.4g} s, hilstar first-light"
@@ -111,20 +91,46 @@ def photometry(context: StepContext) -> StepOutcome:
     written = load_calibration(output, monitor.bits)
     now = written.response
     errors = read_toml(output).errors
-    black_error = 0.0 if errors is None else errors.black
-    figures = _response_figures(
-        context, readings, calibration, (assumed.response, now), black_error
-    )
+    black_error = 0.0
+    if errors is not None:
+        black_error = errors.black
+    responses = (assumed.response, now)
+    figures = _response_figures(context, readings, calibration, responses, black_error)
     if written.weights is not None:
-        figures["shares_of_white"] = ", ".join(
-            f"{n} {share:.4f}" for n, share in zip(channels, written.weights, strict=True)
-        )
-    off = (
-        f"{figures['bench_file_off_rms_mag']:.3f} mag rms,"
-        f" {figures['bench_file_off_max_mag']:.3f} max"
-    )
-    off_mag = response_error_mag(assumed.response, now)
-    with chart(before, f"The bench file's response is off by {off}") as (axes,):
+        shares = []
+        for name, share in zip(channels, written.weights, strict=True):
+            shares.append(f"{name} {share:.4f}")
+        figures["shares_of_white"] = ", ".join(shares)
+    _draw_before(before, figures, responses)
+    return _judged(context, figures, tuple(dict.fromkeys(files)), (picture, before))
+
+
+def _assumed_light(file: BenchFile, response: Response) -> dict[str, FloatArray]:
+    """Light above black by channel and code, relative to white, as the bench file has it: of the
+    primaries where the bench drives them apart, or one by one; else of white.
+    """
+    monitor = file.config.monitor
+    source = calibration_source(monitor, file.folder)
+    if drives_apart(file.config):
+        light = {}
+        responses = primary_responses(source, monitor.bits)
+        for name, share, primary in zip(PRIMARIES, shares_of_white(file), responses, strict=True):
+            light[name] = share * primary.light
+        return light
+    if file.config.render.bit_stealing:
+        return dict(zip(PRIMARIES, primary_lights(source, monitor.bits), strict=True))
+    return {"w": response.light}
+
+
+def _draw_before(
+    picture: Path, figures: dict[str, Figure], responses: tuple[Response, Response]
+) -> None:
+    """Draw how far the bench file's response is off the measured one."""
+    before, now = responses
+    off_mag = response_error_mag(before, now)
+    rms = f"{figures['bench_file_off_rms_mag']:.3f} mag rms"
+    largest = f"{figures['bench_file_off_max_mag']:.3f} max"
+    with chart(picture, f"The bench file's response is off by {rms}, {largest}") as (axes,):
         axes.plot(now.light[-len(off_mag) :], off_mag, color=INK)
         axes.axhline(0, color=MUTED, linewidth=0.8)
         axes.set_xscale("log")
@@ -133,7 +139,6 @@ def photometry(context: StepContext) -> StepOutcome:
             ylabel="fainter than in the bench file [mag]",
         )
         axes.invert_yaxis()
-    return _judged(context, figures, tuple(dict.fromkeys(files)), (picture, before))
 
 
 def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
@@ -141,14 +146,14 @@ def plan_for(bits: int, patches: int, channels: str = "w") -> list[Patch]:
     they are too few.
     """
     plans = []
-    for levels in range(MIN_LEVELS, max(MIN_LEVELS, min(patches, 2**bits)) + 1):
-        plans.append(
-            plan_patches(PlanSettings(bits, levels, 1, channels), np.random.default_rng(SEED))
-        )
-    if len(plans[0]) > patches:
+    most_levels = max(MIN_LEVELS, min(patches, 2**bits))
+    for levels in range(MIN_LEVELS, most_levels + 1):
+        settings = PlanSettings(bits, levels, 1, channels)
+        plans.append(plan_patches(settings, np.random.default_rng(SEED)))
+    fewest = len(plans[0])
+    if fewest > patches:
         raise InputError(
-            f"--patches {patches}: a response needs {len(plans[0])} or more; write that, or 0 for"
-            " none"
+            f"--patches {patches}: a response needs {fewest} or more; write that, or 0 for none"
         )
     return [planned for planned in plans if len(planned) <= patches][-1]
 
@@ -163,7 +168,8 @@ def shares_of_white(file: BenchFile) -> FloatArray:
             "[monitor.primaries] file: first-light measures each primary's light; write it, or xy_r"
             " to xy_b"
         )
-    matrix = channel_matrix(primaries, named_channels(file.config.tracker, file.folder), 1.0)
+    channels = named_channels(file.config.tracker, file.folder)
+    matrix = channel_matrix(primaries, channels, 1.0)
     return np.asarray(matrix.e_per_s.sum(axis=0))
 
 
@@ -174,40 +180,51 @@ def _response_figures(
     responses: tuple[Response, Response],
     black_error: float,
 ) -> dict[str, Figure]:
+    """The figures of a response: against the bench file's, its black level, held-out levels, and
+    how ranges compare.
+    """
     before, now = responses
-    off = response_error_mag(before, now)
-    held = [channel["holdout"] for channel in found["channels"].values()]
+    off_mag = response_error_mag(before, now)
+    black_measured = "no: give --dark, an image with the monitor switched off"
+    if readings.black_known:
+        black_measured = "yes"
+    drift_percent = math.nan
+    if found["drift_percent"] is not None:
+        drift_percent = found["drift_percent"]
+    holdouts = [channel["holdout"] for channel in found["channels"].values()]
+    p95_percent = max(holdout["p95_percent"] for holdout in holdouts)
+    ratios = [f"{link.ratio:.4f}" for link in readings.links]
+    links_mag = [abs(float(magnitude(link.ratio))) for link in readings.links]
+    links_sigmas = [link.sigmas for link in readings.links]
+    off_rms_mag = float(np.sqrt((off_mag**2).mean()))
+    off_max_mag = float(np.abs(off_mag).max())
+    held_out_rms_mag = max(holdout["rms_mag"] for holdout in holdouts)
+    held_out_max_mag = max(holdout["max_mag"] for holdout in holdouts)
+    held_out_sigmas = max(holdout["p95_sigmas"] for holdout in holdouts)
     figures: dict[str, Figure] = {
         "gamma": exponent(now),
         "gamma_in_bench_file": exponent(before),
-        "bench_file_off_rms_mag": float(np.sqrt((off**2).mean())),
-        "bench_file_off_max_mag": float(np.abs(off).max()),
+        "bench_file_off_rms_mag": off_rms_mag,
+        "bench_file_off_max_mag": off_max_mag,
         "black_level": now.black,
         "black_level_error": black_error,
         "black_level_in_bench_file": before.black,
-        "black_level_measured": (
-            "yes"
-            if readings.black_known
-            else "no: give --dark, an image with the monitor switched off"
-        ),
-        "held_out_rms_mag": max(channel_figures["rms_mag"] for channel_figures in held),
-        "held_out_p95_mag": max(
-            MAG_PER_RELATIVE * channel_figures["p95_percent"] / 100 for channel_figures in held
-        ),
-        "held_out_p95_sigmas": max(channel_figures["p95_sigmas"] for channel_figures in held),
-        "held_out_max_mag": max(channel_figures["max_mag"] for channel_figures in held),
+        "black_level_measured": black_measured,
+        "held_out_rms_mag": held_out_rms_mag,
+        "held_out_p95_mag": MAG_PER_RELATIVE * p95_percent / 100,
+        "held_out_p95_sigmas": held_out_sigmas,
+        "held_out_max_mag": held_out_max_mag,
         "noise_percent": 100 * found["noise_relative"],
-        "drift_percent": float("nan") if found["drift_percent"] is None else found["drift_percent"],
+        "drift_percent": drift_percent,
         "patches": len(readings.patches),
         "codes": found["codes"],
         "exposure_s": readings.exposure_s,
-        "links": ", ".join(f"{link.ratio:.4f}" for link in readings.links) or "none",
-        "links_max_mag": max(
-            (abs(float(magnitude(link.ratio))) for link in readings.links), default=0.0
-        ),
-        "links_max_sigmas": max((link.sigmas for link in readings.links), default=0.0),
-        **{f"error_at_{decade}_percent": value for decade, value in found["error_percent"].items()},
+        "links": ", ".join(ratios) or "none",
+        "links_max_mag": max(links_mag, default=0.0),
+        "links_max_sigmas": max(links_sigmas, default=0.0),
     }
+    for decade, value in found["error_percent"].items():
+        figures[f"error_at_{decade}_percent"] = value
     if context.truth is not None:
         true = bench_calibration(context.truth.config, context.truth.folder).response
         figures["truth_max_mag"] = float(np.abs(response_error_mag(now, true)).max())
@@ -232,7 +249,7 @@ def _judged(
     limits of [verify].
     """
     limit_mag = context.file.config.verify.flux_mag
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     is_black_measured = figures["black_level_measured"] == "yes"
     black = f"black {figures['black_level']:.2e} of white as the bench file has it, not measured"
     if is_black_measured:
@@ -280,8 +297,10 @@ def response_error_mag(assumed: Response, true: Response) -> FloatArray:
     """How much fainter each code is than assumed (n,), magnitudes, from three decades below
     white to white.
     """
-    is_bright = true.light[1:] >= DIM_LIGHT
-    return np.asarray(magnitude(true.light[1:][is_bright] / assumed.light[1:][is_bright]))
+    true_light = true.light[1:]
+    is_bright = true_light >= DIM_LIGHT
+    ratio = true_light[is_bright] / assumed.light[1:][is_bright]
+    return np.asarray(magnitude(ratio))
 
 
 def exponent(response: Response) -> float:

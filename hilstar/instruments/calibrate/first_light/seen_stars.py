@@ -26,8 +26,9 @@ from hilstar.display.panel import Panel
 from hilstar.display.quantise import shown_light
 from hilstar.display.response import Levels
 from hilstar.instruments.calibrate.first_light.context import MAX_FILL, StepContext
-from hilstar.instruments.calibrate.first_light.image_sources import Pattern
+from hilstar.instruments.calibrate.first_light.image_sources import CodeImage, Pattern
 from hilstar.instruments.calibrate.scale import STAR_MAG
+from hilstar.optics.camera import Camera
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import display_psf, tracker_camera
 from hilstar.server.bench.frame import Bench, Frame
@@ -80,15 +81,17 @@ class StarSpot:
         sprite = display_psf(context.file.config, context.file.folder, geometry.monitor).width_px
         # A sprite's shares are those of whole pixels, and each pixel is a square of light: a
         # twelfth of its area each.
-        drawn = [ratio * math.sqrt(width**2 + 2 / 12) for width in sprite]
-        psf_scale = context.psf_sigma_px / float(np.mean(context.tracker_psf.width_px))
-        x, y = (
-            math.hypot(psf_scale * a, b)
-            for a, b in zip(context.tracker_psf.width_px, drawn, strict=True)
-        )
-        detector = context.file.config.tracker.detector
-        gain_e_per_dn = detector.gain_e_per_dn
-        return cls((x, y), gain_e_per_dn, detector.prnu, detector.electronics_e / gain_e_per_dn)
+        squares_px2 = 2 / 12
+        psf_px = context.tracker_psf.width_px
+        psf_scale = context.psf_sigma_px / float(np.mean(psf_px))
+        sigmas_px = []
+        for psf_width_px, sprite_px in zip(psf_px, sprite, strict=True):
+            drawn_px = ratio * math.sqrt(sprite_px**2 + squares_px2)
+            sigmas_px.append(math.hypot(psf_scale * psf_width_px, drawn_px))
+        x_px, y_px = sigmas_px
+        detector = context.detector
+        electronics_dn = detector.electronics_e / detector.gain_e_per_dn
+        return cls((x_px, y_px), detector.gain_e_per_dn, detector.prnu, electronics_dn)
 
     @property
     def mean_sigma_px(self) -> float:
@@ -114,34 +117,46 @@ class StarSpot:
     @property
     def window_share(self) -> float:
         """The share of a star's light that is in the window."""
-        half = self.radius_px + 0.5
-        return math.prod(float(ndtr(half / sigma) - ndtr(-half / sigma)) for sigma in self.sigma_px)
+        return self._share_within(self.radius_px + 0.5)
 
     @property
     def peak_share(self) -> float:
         """The share of a star's light in the pixel that it is in the middle of."""
-        return math.prod(float(ndtr(0.5 / sigma) - ndtr(-0.5 / sigma)) for sigma in self.sigma_px)
+        return self._share_within(0.5)
+
+    def _share_within(self, half_px: float) -> float:
+        """The share of a star's light in a square about it."""
+        shares = []
+        for sigma in self.sigma_px:
+            shares.append(float(ndtr(half_px / sigma) - ndtr(-half_px / sigma)))
+        return math.prod(shares)
 
     @cached_property
     def _shares(self) -> tuple[FloatArray, FloatArray]:
         """Shares of a star's light in its window (k, k), and pixels' offsets along x (k,)."""
         offset = np.arange(-self.radius_px, self.radius_px + 1.0)
-        x, y = (
-            ndtr((offset + 0.5) / sigma) - ndtr((offset - 0.5) / sigma) for sigma in self.sigma_px
-        )
-        return np.outer(y, x), offset
+        axes = []
+        for sigma in self.sigma_px:
+            beyond = ndtr((offset + 0.5) / sigma)
+            before = ndtr((offset - 0.5) / sigma)
+            axes.append(beyond - before)
+        across, down = axes
+        return np.outer(down, across), offset
 
     def light_noise_mag(self, dn: FloatArray, noise_dn: float) -> FloatArray:
         """The noise (n,) of stars of `dn` (n,) in all, magnitudes, over a background of
         `noise_dn` in a pixel.
         """
         shares, _ = self._shares
+        shares, _ = self._shares
         light = np.maximum(dn, 1e-9)
-        photons = light * self.window_share / (self.gain_e_per_dn * self.frames)
-        variance = photons + shares.size * noise_dn**2
-        variance += (self.prnu * light) ** 2 * float((shares**2).sum())
-        variance += (self.rounded_dn(light, noise_dn) ** 2).mean(axis=1)
-        return np.asarray(MAG_PER_RELATIVE * np.sqrt(variance) / (light * self.window_share))
+        window_dn = light * self.window_share
+        photon_dn2 = window_dn / (self.gain_e_per_dn * self.frames)
+        background_dn2 = shares.size * noise_dn**2
+        response_dn2 = (self.prnu * light) ** 2 * float((shares**2).sum())
+        rounding_dn2 = (self.rounded_dn(light, noise_dn) ** 2).mean(axis=1)
+        variance = photon_dn2 + background_dn2 + response_dn2 + rounding_dn2
+        return np.asarray(MAG_PER_RELATIVE * np.sqrt(variance) / window_dn)
 
     def tabled_noise_mag(self, dn: FloatArray, noise_dn: float, largest_dn: float) -> FloatArray:
         """`light_noise_mag` (n,) from a table: the rounding of each of 100 000 stars takes minutes.
@@ -153,18 +168,18 @@ class StarSpot:
         return np.interp(dn, points_dn, noise_mag, left=np.inf)
 
     def rounded_dn(self, dn: FloatArray, noise_dn: float) -> FloatArray:
-        """What the ADC's rounding adds to windows of stars of `dn` (n,) in all, DN.
+        """What the ADC's rounding adds to the windows of stars of `dn` (n,) in all, DN: (n,
+        STEP_PHASES), by where the dark level lies between two codes (see `rounded_light`).
 
-        (n, STEP_PHASES), see `rounded_light`. `noise_dn` is that of a pixel less its dark frame's,
-        in the mean of the frames.
+        `noise_dn` is that of a pixel above its dark frame, in the mean of the frames.
         """
         shares, _ = self._shares
+        pixel_shares = shares.ravel()
         dark_dn = before_adc_dn(noise_dn**2 * self.frames / 2, self.electronics_dn)
         rounded = np.zeros((len(dn), STEP_PHASES))
         for star, light_dn in enumerate(dn.tolist()):
-            rounded[star] = rounded_light(
-                light_dn * shares.ravel(), dark_dn, 1 / self.gain_e_per_dn
-            )
+            pixels_dn = light_dn * pixel_shares
+            rounded[star] = rounded_light(pixels_dn, dark_dn, 1 / self.gain_e_per_dn)
         return shares.size * rounded
 
     def place_noise_px(self, dn: FloatArray, noise_dn: float) -> FloatArray:
@@ -173,13 +188,15 @@ class StarSpot:
         """
         shares, offset = self._shares
         sigma2 = self.settings.window_sigma_px**2
-        window = np.exp(-0.5 * (offset**2 + offset[:, None] ** 2) / sigma2)
+        distance2 = offset**2 + offset[:, None] ** 2
+        window = np.exp(-0.5 * distance2 / sigma2)
         pull2 = (window * offset) ** 2
         slope = float((shares * window * (1 - offset**2 / sigma2)).sum())
         light = np.maximum(dn, 1e-9)
         photons = light / (self.gain_e_per_dn * self.frames)
-        variance = noise_dn**2 * float(pull2.sum()) + photons * float((pull2 * shares).sum())
-        variance += (self.prnu * light) ** 2 * float((pull2 * shares**2).sum())
+        background = noise_dn**2 * float(pull2.sum())
+        response = (self.prnu * light) ** 2 * float((pull2 * shares**2).sum())
+        variance = background + photons * float((pull2 * shares).sum()) + response
         return np.asarray(np.sqrt(variance) / (light * slope))
 
 
@@ -197,15 +214,21 @@ class Beyond(NamedTuple):
         """The scatter of residuals (n,) beyond their noise (n,): the square root of the weighted
         mean of residual^2 - noise^2.
         """
-        weight = 1 / (noise**2 + float(np.median(noise)) ** 2) ** 2
-        more = float((weight * (residual**2 - noise**2)).sum() / weight.sum())
-        at_least = max(more, 0.0)
-        error = math.sqrt(2 * float((weight**2 * (noise**2 + at_least) ** 2).sum())) / float(
-            weight.sum()
-        )
-        bounds = (more, more - ONE_SIDED * error, more + ONE_SIDED * error)
-        sigma, low, high = (math.sqrt(max(variance, 0.0)) for variance in bounds)
-        return cls(sigma, low, high)
+        noise2 = noise**2
+        weight = 1 / (noise2 + float(np.median(noise)) ** 2) ** 2
+        total = weight.sum()
+        squares = residual**2 - noise2
+        excess = float((weight * squares).sum() / total)
+        variance = noise2 + max(excess, 0.0)
+        error2 = 2 * float((weight**2 * variance**2).sum())
+        error = math.sqrt(error2) / float(total)
+        reach = ONE_SIDED * error
+        return cls(_root(excess), _root(excess - reach), _root(excess + reach))
+
+
+def _root(variance: float) -> float:
+    """The root of a variance that noise may have made negative."""
+    return math.sqrt(max(variance, 0.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,11 +293,14 @@ class StarsSeen:
         centred_mag = centred_mag - np.median(centred_mag)
         error = np.sqrt(self.noise_mag[used] ** 2 + STAR_MAG**2)
         x, y = self.screen[used].T
+        log_light = np.log(self.e_per_s[used])
+        rms_mag = float(np.sqrt((centred_mag**2).mean()))
+        error_mag = float(np.sqrt((error**2).mean()))
         return Scatter(
-            rms_mag=float(np.sqrt((centred_mag**2).mean())),
-            error_mag=float(np.sqrt((error**2).mean())),
+            rms_mag=rms_mag,
+            error_mag=error_mag,
             by_place=_explained(centred_mag, x, y, x**2 + y**2),
-            by_light=_explained(centred_mag, np.log(self.e_per_s[used])),
+            by_light=_explained(centred_mag, log_light),
         )
 
 
@@ -327,8 +353,17 @@ def _explained(off: FloatArray, *shapes: FloatArray) -> float:
     total = float(((off - off.mean()) ** 2).sum())
     if free < 1 or not total:
         return 0.0
-    residual = off - design @ np.linalg.lstsq(design, off, rcond=None)[0]
-    return float(1 - (residual**2).sum() / free / (total / (len(off) - 1)))
+    coefficients = np.linalg.lstsq(design, off, rcond=None)[0]
+    residual = off - design @ coefficients
+    residual_variance = (residual**2).sum() / free
+    return float(1 - residual_variance / (total / (len(off) - 1)))
+
+
+class _ShownField(NamedTuple):
+    """A field of stars: codes of each frame of an exposure, and the stars that should be seen."""
+
+    codes: tuple[CodeImage, ...]
+    expected: ExpectedStars
 
 
 def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
@@ -338,32 +373,16 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
     """
     spot = StarSpot.of(context)
     dark, dark_paths = _mean_dark(context, frames)
-    with open_bench(context.file) as bench:
-        shown = []
-        for q_icrs_to_cam in _fields(
-            bench, context, spot, math.sqrt(2) * noisiest_background(dark).noise
-        ):
-            frame = bench.frame(q_icrs_to_cam)
-            levels: tuple[Levels, ...] = (frame.levels,)
-            # with `temporal` the frames of an exposure
-            exposed = bench.quantiser.exposure(0, bench.config.exposure_frames)
-            if len(exposed) > 1:
-                levels = tuple(
-                    Levels(bench.draw(frame.q_icrs_to_cam, number).levels.copy())
-                    for number in exposed
-                )
-            codes = tuple(
-                bench.code_values(field_stars).astype(np.uint16) for field_stars in levels
-            )
-            shown.append((codes, _alone(bench, context, frame, levels, spot)))
+    shown = _shown_fields(context, spot, math.sqrt(2) * noisiest_background(dark).noise)
     fields = []
-    for number, (codes, wanted) in enumerate(shown):
-        names = [
-            f"stars_{number:03}",
-            *(f"stars_{number:03}_{again:02}" for again in range(1, frames)),
-        ]
-        patterns = [Pattern(name, codes[0], codes[1:]) for name in names]
-        fields.append(_compared(context, patterns, dark, wanted, spot))
+    for number, field in enumerate(shown):
+        patterns = []
+        for again in range(frames):
+            name = f"stars_{number:03}"
+            if again:
+                name += f"_{again:02}"
+            patterns.append(Pattern(name, field.codes[0], field.codes[1:]))
+        fields.append(_compared(context, patterns, dark, field.expected, spot))
     columns: dict[str, Any] = {}
     for column in dataclasses.fields(StarsSeen):
         if column.name not in {"lost", "frames", "images"}:
@@ -379,14 +398,35 @@ def see_stars(context: StepContext, frames: int = 1) -> StarsSeen:
     return stars_seen
 
 
+def _shown_fields(context: StepContext, spot: StarSpot, noise_dn: float) -> list[_ShownField]:
+    """The fields with the most readable stars, over a background of `noise_dn` in a pixel."""
+    shown = []
+    with open_bench(context.file) as bench:
+        # with `temporal` the frames of an exposure
+        exposed = bench.quantiser.exposure(0, bench.config.exposure_frames)
+        for q_icrs_to_cam in _fields(bench, context, spot, noise_dn):
+            frame = bench.frame(q_icrs_to_cam)
+            levels = [frame.levels]
+            if len(exposed) > 1:
+                levels.clear()
+                for number in exposed:
+                    drawn = bench.draw(frame.q_icrs_to_cam, number)
+                    levels.append(Levels(drawn.levels.copy()))
+            codes = [bench.code_values(of_frame).astype(np.uint16) for of_frame in levels]
+            expected = _alone(bench, context, frame, tuple(levels), spot)
+            shown.append(_ShownField(tuple(codes), expected))
+    return shown
+
+
 def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
-    told = (
+    """What is wrong where too few stars can be compared, and what to do."""
+    few = (
         f"{len(seen.dn)} stars can be seen where the sky has them, in {fields} fields, and"
         f" {MIN_STARS} are needed"
     )
     if seen.lost:
         return (
-            f"{told}; {seen.lost} that should be bright enough are not there: measure the response"
+            f"{few}; {seen.lost} that should be bright enough are not there: measure the response"
             " (--again photometry), look at [render] flux_at_white_e_per_s, or run the geometry"
             " again (--again geometry)"
         )
@@ -395,7 +435,7 @@ def _why_few(seen: StarsSeen, spot: StarSpot, fields: int) -> str:
     else:
         wide = "the field has few bright stars"
     return (
-        f"{told}; {wide}: write a longer [tracker] exposure_s, a larger [render] brightest_v_mag,"
+        f"{few}; {wide}: write a longer [tracker] exposure_s, a larger [render] brightest_v_mag,"
         " so that faint stars are shown brighter, or a larger [sky] faintest_v_mag"
     )
 
@@ -424,35 +464,47 @@ def _fields(
     readable = (stars.row >= 0) & (dn < largest_dn)
     readable &= stars.electrons_per_s * bench.psf.peak_share <= bench.flux_at_white_e_per_s
     readable &= spot.tabled_noise_mag(dn, noise_dn, largest_dn) < READ_MAG
-    attitudes = [np.asarray(q / np.linalg.norm(q)) for q in rng.normal(size=(RANDOM_ATTITUDES, 4))]
-    which = np.flatnonzero(readable)
-    brightest = which[np.argsort(-dn[which], kind="stable")][:POINTED_ATTITUDES]
-    for boresight, other in zip(
-        stars.directions(brightest), rng.normal(size=(len(brightest), 3)), strict=True
-    ):
+    readable_stars = np.flatnonzero(readable)
+    attitudes = []
+    for q in rng.normal(size=(RANDOM_ATTITUDES, 4)):
+        attitudes.append(np.asarray(q / np.linalg.norm(q)))
+    by_brightness = np.argsort(-dn[readable_stars], kind="stable")
+    brightest = readable_stars[by_brightness][:POINTED_ATTITUDES]
+    others = rng.normal(size=(len(brightest), 3))
+    for boresight, other in zip(stars.directions(brightest), others, strict=True):
         right = np.cross(other, boresight)
         right /= np.linalg.norm(right)
-        attitudes.append(from_matrix(np.stack([right, np.cross(boresight, right), boresight])))
+        down = np.cross(boresight, right)
+        attitudes.append(from_matrix(np.stack([right, down, boresight])))
     camera = tracker_camera(context.file.config.tracker, context.file.folder)
     margin = spot.radius_px + MIN_EDGE_PX
+    vectors = stars.directions(readable_stars)
     counts = []
-    vectors = stars.directions(which)
     for q in attitudes:
         in_cam = vectors @ to_matrix(q).T
-        with np.errstate(invalid="ignore", over="ignore"):
-            inside = in_cam[:, 2] > 0
-            for side_camera, edge in ((camera, margin), (bench.camera, MIN_EDGE_PX)):
-                x, y = side_camera.project(in_cam @ side_camera.cam_to_image.T)
-                width, height = side_camera.resolution_px
-                inside &= (x > edge) & (x < width - edge) & (y > edge) & (y < height - edge)
+        inside = in_cam[:, 2] > 0
+        inside &= _is_in_image(camera, in_cam, margin)
+        inside &= _is_in_image(bench.camera, in_cam, MIN_EDGE_PX)
         counts.append(int(inside.sum()))
-    order = np.argsort(-np.array(counts), kind="stable")[:MAX_FIELDS]
-    before = np.concatenate([[0], np.cumsum(np.array(counts)[order])[:-1]])
-    return [
-        attitudes[k]
-        for place, k in enumerate(order)
-        if place < FIELDS or before[place] < ENOUGH_STARS
-    ]
+    fields: list[FloatArray] = []
+    stars_shown = 0
+    for k in np.argsort(-np.array(counts), kind="stable")[:MAX_FIELDS].tolist():
+        if len(fields) < FIELDS or stars_shown < ENOUGH_STARS:
+            fields.append(attitudes[k])
+        stars_shown += counts[k]
+    return fields
+
+
+def _is_in_image(camera: Camera, in_cam: FloatArray, margin_px: float) -> npt.NDArray[np.bool_]:
+    """Which directions (n, 3) in cam are in a camera's image, farther than a margin from its
+    edge.
+    """
+    width, height = camera.resolution_px
+    with np.errstate(invalid="ignore", over="ignore"):
+        x, y = camera.project(in_cam @ camera.cam_to_image.T)
+        across = (x > margin_px) & (x < width - margin_px)
+        down = (y > margin_px) & (y < height - margin_px)
+    return np.asarray(across & down)
 
 
 def _alone(
@@ -464,25 +516,21 @@ def _alone(
     camera = tracker_camera(context.file.config.tracker, context.file.folder)
     truth = frame.rows
     vectors = bench.stars.directions(frame.star)
-    place = np.stack(camera.project(vectors @ to_matrix(frame.q_icrs_to_cam).T), axis=1)
-    width, height = camera.resolution_px
+    in_cam = vectors @ to_matrix(frame.q_icrs_to_cam).T
+    place = np.stack(camera.project(in_cam), axis=1)
     screen = np.stack([truth["x_px"], truth["y_px"]], axis=1)
-    limits = np.array(context.resolution_px) - 1 - MIN_EDGE_PX
-    edge_px = max(MIN_EDGE_PX, spot.radius_px + 2.0)
-    # No planets: their light is known to 0.05 mag only, and a disc may be wide.
-    is_usable = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
-    is_usable &= bench.stars.row[frame.star] >= 0
-    is_usable &= (place > edge_px).all(axis=1) & (
-        place < np.array([width, height]) - 1 - edge_px
-    ).all(axis=1)
-    is_usable &= (screen > MIN_EDGE_PX).all(axis=1) & (screen < limits).all(axis=1)
-    finite = np.where(np.isfinite(place), place, -1e6)
     light = np.asarray(truth["electrons_per_s"], dtype=np.float64)
+    edge_px = max(MIN_EDGE_PX, spot.radius_px + 2.0)
+    is_usable = truth["drawn"] & ~truth["clipped"] & np.isfinite(place).all(axis=1)
+    # No planets: their light is known to 0.05 mag only, and a disc may be wide.
+    is_usable &= bench.stars.row[frame.star] >= 0
+    is_usable &= _is_inside(place, camera.resolution_px, edge_px)
+    is_usable &= _is_inside(screen, context.resolution_px, MIN_EDGE_PX)
+    finite = np.where(np.isfinite(place), place, -1e6)
     near = cKDTree(finite).query_ball_point(finite, ALONE_RADII * spot.radius_px + 2)
-    if len(light):
-        beside = np.array([light[neighbours].sum() for neighbours in near]) - light
-    else:
-        beside = light
+    beside = light.copy()
+    for k in range(len(light)):
+        beside[k] = light[near[k]].sum() - light[k]
     is_usable &= beside < BESIDE_SHARE * light
     middle = (np.array(context.resolution_px) - 1) / 2
     return ExpectedStars(
@@ -492,6 +540,15 @@ def _alone(
         screen=(screen[is_usable] - middle) / middle,
         codes_mag=_codes_mag(bench, context, frame, levels, screen[is_usable], spot),
     )
+
+
+def _is_inside(
+    places_px: FloatArray, resolution_px: tuple[int, int], margin_px: float
+) -> npt.NDArray[np.bool_]:
+    """Which places (n, 2) are over a margin within an image's outermost pixels."""
+    last_px = np.array(resolution_px) - 1 - margin_px
+    is_inside = (places_px > margin_px) & (places_px < last_px)
+    return np.asarray(is_inside.all(axis=1))
 
 
 def _codes_mag(
@@ -506,18 +563,22 @@ def _codes_mag(
     tracker's window.
     """
     geometry = context.geometry()
-    reach = math.ceil(
-        (spot.radius_px + 0.5) * geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
-    )
-    off = []
+    ratio = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
+    reach = math.ceil((spot.radius_px + 0.5) * ratio)
+    off_mag = []
     for x, y in np.rint(screen_px).astype(np.intp):
-        part = slice(max(y - reach, 0), y + reach + 1), slice(max(x - reach, 0), x + reach + 1)
+        rows = slice(max(y - reach, 0), y + reach + 1)
+        columns = slice(max(x - reach, 0), x + reach + 1)
+        part = (rows, columns)
         wanted = float(frame.linear[part].sum(dtype=np.float64))
         # In the window alone: light of a whole 8K screen is 0.3 GB, and here were three of them.
-        shown = np.mean([_light_in(channel_levels, bench.panel, part) for channel_levels in levels])
-        off.append(magnitude(float(shown) / wanted) if wanted > 0 else 0.0)
+        shown = np.mean([_light_in(of_frame, bench.panel, part) for of_frame in levels])
+        if wanted > 0:
+            off_mag.append(magnitude(float(shown) / wanted))
+        else:
+            off_mag.append(0.0)
     # such a star is not shown, and will not be found
-    return np.asarray(np.nan_to_num(np.array(off), posinf=0.0))
+    return np.asarray(np.nan_to_num(np.array(off_mag), posinf=0.0))
 
 
 def _light_in(levels: Levels, panel: Panel, part: tuple[slice, slice]) -> float:
@@ -547,40 +608,43 @@ def _compared(
     noise_dn = background.noise
     places_px = np.stack([stars.x_px, stars.y_px], axis=1)
     count = len(wanted.e_per_s)
-    far = np.full(count, np.inf)
+    distance_px = np.full(count, np.inf)
     nearest = np.zeros(count, dtype=np.intp)
     if len(places_px) and count:
-        far, nearest = (np.asarray(part) for part in cKDTree(places_px).query(wanted.place_px))
-    near = far < max(MIN_REACH_PX, spot.mean_sigma_px)
+        distances, rows = cKDTree(places_px).query(wanted.place_px)
+        distance_px = np.asarray(distances)
+        nearest = np.asarray(rows)
+    near = distance_px < max(MIN_REACH_PX, spot.mean_sigma_px)
+    near_dn = stars.flux[nearest[near]] / spot.window_share
     expected_dn = wanted.e_per_s * context.exposure_s / spot.gain_e_per_dn
     brighter = 1.0
     if near.sum() >= MIN_STARS:  # the screen may give more or less light than the bench file says
-        brighter = float(
-            np.median(stars.flux[nearest[near]] / spot.window_share / expected_dn[near])
-        )
+        brighter = float(np.median(near_dn / expected_dn[near]))
     matched = near.copy()
-    dn = stars.flux[nearest[near]] / spot.window_share
-    matched[near] = spot.light_noise_mag(dn, noise_dn) < READ_MAG
+    matched[near] = spot.light_noise_mag(near_dn, noise_dn) < READ_MAG
     peak_sigmas = brighter * expected_dn * spot.peak_share / noise_dn
+    is_lost = ~near & (peak_sigmas > LOST_MARGIN * THRESHOLD_SIGMA)
     chosen = nearest[matched]
     dn = stars.flux[chosen] / spot.window_share
     shared = dataclasses.replace(spot, frames=images)
     noise_mag = shared.light_noise_mag(dn, noise_dn)
-    whole_dn = np.maximum(dn * spot.window_share, 1e-9)
-    rounded = shared.rounded_dn(dn, noise_dn) / whole_dn[:, None]
+    window_dn = np.maximum(dn * spot.window_share, 1e-9)
+    rounded = shared.rounded_dn(dn, noise_dn) / window_dn[:, None]
+    residual_px = places_px[chosen] - wanted.place_px[matched]
     saturated = stars.peak[chosen] > MAX_FILL * context.full_dn - first.floor_dn
+    noise_mag = np.where(saturated, np.inf, noise_mag)
     return StarsSeen(
         hip=wanted.hip[matched],
         place_px=wanted.place_px[matched],
-        residual_px=places_px[chosen] - wanted.place_px[matched],
+        residual_px=residual_px,
         place_noise_px=shared.place_noise_px(dn, noise_dn),
         dn=dn,
         e_per_s=wanted.e_per_s[matched],
-        noise_mag=np.where(saturated, np.inf, noise_mag),
+        noise_mag=noise_mag,
         rounding_mag=MAG_PER_RELATIVE * rounded,
         screen=wanted.screen[matched],
         codes_mag=wanted.codes_mag[matched],
-        lost=int((~near & (peak_sigmas > LOST_MARGIN * THRESHOLD_SIGMA)).sum()),
+        lost=int(is_lost.sum()),
         frames=images,
         images=tuple(paths),
     )

@@ -23,6 +23,7 @@ from hilstar.basics.version import __version__
 from hilstar.instruments.calibrate.first_light.context import (
     KIND,
     Figure,
+    KeyChange,
     SessionFile,
     StepContext,
     StepNumber,
@@ -61,7 +62,7 @@ STEPS_FILE = Path(__file__).with_name("steps.toml")
 
 def latency(context: StepContext) -> StepOutcome:
     """Measure the panel's delay and set it in the bench file. Raises InputError, MachineError."""
-    monitor = context.file.config.monitor
+    monitor = context.monitor
     if not monitor.photodiode_px:
         return StepOutcome(
             "skipped",
@@ -78,52 +79,58 @@ def latency(context: StepContext) -> StepOutcome:
             f"not measured, the bench file's {monitor.panel_delay_ms:g} ms stays: give {how}",
         )
     paired = pair(watched.seen, watched.shown, NS_PER_S / monitor.refresh_hz)
-    found = summarise(paired, context.file.config)
+    summary = summarise(paired, context.file.config)
     picture = context.session / "latency.svg"
-    draw_latency(picture, paired, found)
-    delay_ms = checked_delay_ms(
-        0.0 if -AGREE_MS < found["panel_delay_ms"] < 0 else found["panel_delay_ms"]
-    )
-    error_ms = found["panel_delay_u_ms"]
+    draw_latency(picture, paired, summary)
+    panel_ms = summary["panel_delay_ms"]
+    # light of a panel without delay may come this much early, by noise
+    if -AGREE_MS < panel_ms < 0:
+        panel_ms = 0.0
+    delay_ms = checked_delay_ms(panel_ms)
+    error_ms = summary["panel_delay_u_ms"]
+    latency_ms = summary["latency_ms"]
     figures: dict[str, Figure] = {
         "panel_delay_ms": delay_ms,
         "error_ms": error_ms,
         "in_bench_file_ms": monitor.panel_delay_ms,
-        "swap_to_light_p50_ms": found["latency_ms"]["p50"],
-        "swap_to_light_p99_ms": found["latency_ms"]["p99"],
-        "swap_to_square_ms": found["swap_to_square_ms"],
-        "jitter_ms": found["jitter_ms"],
-        "edges": found["edges"],
-        "edges_without_a_frame": found["unmatched"],
+        "swap_to_light_p50_ms": latency_ms["p50"],
+        "swap_to_light_p99_ms": latency_ms["p99"],
+        "swap_to_square_ms": summary["swap_to_square_ms"],
+        "jitter_ms": summary["jitter_ms"],
+        "edges": summary["edges"],
+        "edges_without_a_frame": summary["unmatched"],
     }
-    figures |= {name: found[name] for name in ("rise_ms", "fall_ms") if found[name] is not None}
+    for name in ("rise_ms", "fall_ms"):
+        if summary[name] is not None:
+            figures[name] = summary[name]
     if context.truth is not None:
         figures["truth_panel_delay_ms"] = context.truth.config.monitor.panel_delay_ms
     line = (
         f"the panel's delay is {delay_ms:g} +- {error_ms:.3f} ms, the bench file has"
         f" {monitor.panel_delay_ms:g}; a swap is light at the square after"
-        f" {found['latency_ms']['p50']:.2f} ms, jitter {found['jitter_ms']:.3f}, {found['edges']}"
-        " edges"
+        f" {latency_ms['p50']:.2f} ms, jitter {summary['jitter_ms']:.3f}, {summary['edges']} edges"
     )
-    agrees = abs(delay_ms - monitor.panel_delay_ms) < max(AGREE_MS, 3 * error_ms)
-    changes = (
-        *context.change("monitor", "panel_delay_ms", delay_ms),
-        *context.change("certify", "panel_delay_u_ms", float(f"{error_ms:.3g}")),
-    )
+    changes: tuple[KeyChange, ...] = ()
+    if abs(delay_ms - monitor.panel_delay_ms) >= max(AGREE_MS, 3 * error_ms):
+        changes = (
+            *context.change("monitor", "panel_delay_ms", delay_ms),
+            *context.change("certify", "panel_delay_u_ms", float(f"{error_ms:.3g}")),
+        )
     number = StepNumber(
         delay_ms, error_ms, "ms", "from the buffer swap to the light of the first row"
     )
-    return StepOutcome(
-        "done", line, figures, (picture,), (picture,), () if agrees else changes, number
-    )
+    return StepOutcome("done", line, figures, (picture,), (picture,), changes, number)
 
 
 def machine(context: StepContext) -> StepOutcome:
     """Check the machine. Raises MachineError for what it lacks."""
     examined = examine()
-    missing = [check for check in examined.checks if check.required and not check.ok]
+    missing = []
+    for check in examined.checks:
+        if check.required and not check.ok:
+            missing.append(f"{check.name}: {check.detail}")
     if missing:
-        raise MachineError("; ".join(f"{check.name}: {check.detail}" for check in missing))
+        raise MachineError("; ".join(missing))
     figures = {check.name: check.detail for check in examined.checks}
     passed = sum(check.required for check in examined.checks)  # all of them
     number = StepNumber(passed, None, f"of {passed}", "checks passed of what hilstar needs")
@@ -134,21 +141,18 @@ def display(context: StepContext) -> StepOutcome:
     """Measure the display. Raises MachineError for one that is not as the bench file has it."""
     timing = context.source.gate(context.file)
     if timing is None:
-        return StepOutcome(
-            "skipped",
-            f"no display of this program's own ({context.source.identity.partition(':')[0]})",
-        )
+        source, _, _ = context.source.identity.partition(":")
+        return StepOutcome("skipped", f"no display of this program's own ({source})")
     figures: dict[str, Figure] = {"period_ms": timing.period_ms, "dropped": timing.dropped}
+    line = f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped"
     if timing.paced_by_screen:
         figures["refresh_hz"] = MS_PER_S / timing.period_ms
+    else:
+        line += "; the display has no refresh of its own, frames are paced by software"
     if timing.modes_hz:
         figures["modes_hz"] = " ".join(map(str, timing.modes_hz))
-    if timing.paced_by_screen:
-        paced = ""
-    else:
-        paced = "; the display has no refresh of its own, frames are paced by software"
-    forced = "".join(f"; forced: {forced_check}" for forced_check in context.source.forced)
-    line = f"a frame every {timing.period_ms:.3f} ms, {timing.dropped} dropped{paced}{forced}"
+    for forced_check in context.source.forced:
+        line += f"; forced: {forced_check}"
     number = StepNumber(
         timing.period_ms, timing.period_error_ms, "ms", "from one frame to the next"
     )
@@ -277,12 +281,14 @@ class FirstLightSession:
                 f"{folder}: is the session of {earlier.bench}; write another directory for"
                 f" {file.path}"
             )
-        self.records = (
-            {}
-            if earlier is None
-            else {record.name: record for record in earlier.steps if record.name in NAMES}
-        )
-        self.unfinished = {} if earlier is None else dict(earlier.unfinished)
+        self.records: dict[str, StepRecord] = {}
+        self.unfinished: dict[str, str] = {}
+        if earlier is not None:
+            self.unfinished |= earlier.unfinished
+            for record in earlier.steps:
+                # a step of another version of hilstar is none of this session's
+                if record.name in NAMES:
+                    self.records[record.name] = record
 
     def run(self, again: frozenset[str], say: Callable[[str], None]) -> int:
         """Run what is not done; exit code 0, 1 where a step failed, or a MachineError's. Raises
@@ -294,10 +300,8 @@ class FirstLightSession:
             write_whole(before, self.file.path.read_bytes())
         for number, step in enumerate(STEPS):
             if step.name not in again and self._is_done(number):
-                say(
-                    f"{step.name:12} {self.records[step.name].verdict} before:"
-                    f" {self.records[step.name].line}"
-                )
+                record = self.records[step.name]
+                say(f"{step.name:12} {record.verdict} before: {record.line}")
                 continue
             record = self._run(number, step.name in again, say)
             self.records[step.name] = record
@@ -311,36 +315,37 @@ class FirstLightSession:
         """
         step = STEPS[number]
         record = self.records.get(step.name)
-        if (
-            record is None
-            or record.verdict == "failed"
-            or step.name in self.unfinished
-            or self._unmet(step) is not None
-        ):
+        if record is None or record.verdict == "failed" or step.name in self.unfinished:
+            return False
+        if self._unmet(step) is not None:
             return False
         if record.verdict == "skipped" and step.needs:
             return False  # it lacked a step that has been done by now
         if record.state_sha256 != self._state(number):
             return False
-        paths = ((self.folder / name, digest) for name, digest in record.files.items())
-        return all(_is_file(path) and sha256_of(path) == digest for path, digest in paths)
+        for name, digest in record.files.items():
+            path = self.folder / name
+            if not _is_file(path) or sha256_of(path) != digest:
+                return False
+        return True
 
     def _unmet(self, step: SessionStep) -> str | None:
+        """The step that has to be done before this one can run; None where it can."""
         for name in step.unless_failed:
             record = self.records.get(name)
             if record is not None and record.verdict == "failed":
                 return name
         for name in step.needs:
             record = self.records.get(name)
-            if (
-                record is None
-                or record.verdict == "failed"
-                or (record.verdict == "skipped" and name != "display")
-            ):
+            if record is None or record.verdict == "failed":
+                return name
+            # without a display of this program's own there is nothing to measure of it
+            if record.verdict == "skipped" and name != "display":
                 return name
         return None
 
     def _run(self, number: int, afresh: bool, say: Callable[[str], None]) -> StepRecord:
+        """Run a step, or skip it for want of another; its record."""
         step = STEPS[number]
         start_s = time.monotonic()
         exit_code = 0
@@ -355,22 +360,29 @@ class FirstLightSession:
             self.unfinished[step.name] = self._attempt(number)
             write_session(self.folder, self.as_file(step.name))
             outcome, exit_code = self._tried(step, context)
+        figures = {name: _finite(value) for name, value in outcome.figures.items()}
+        files = {}
+        for path in outcome.files:
+            files[os.path.relpath(path, self.folder)] = sha256_of(path)
+        pictures = [os.path.relpath(path, self.folder) for path in outcome.pictures]
+        ended = datetime.datetime.now(datetime.UTC)
         return StepRecord(
             name=step.name,
             verdict=outcome.verdict,
             line=outcome.line,
             exit_code=exit_code,
             state_sha256=self._state(number),
-            figures={name: _finite(value) for name, value in outcome.figures.items()},
-            files={os.path.relpath(path, self.folder): sha256_of(path) for path in outcome.files},
-            pictures=[os.path.relpath(path, self.folder) for path in outcome.pictures],
+            figures=figures,
+            files=files,
+            pictures=pictures,
             changes=list(outcome.changes),
-            ended=datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+            ended=ended.isoformat(timespec="seconds"),
             seconds=round(time.monotonic() - start_s, 3),
             number=outcome.number,
         )
 
     def _tried(self, step: SessionStep, context: StepContext) -> tuple[StepOutcome, int]:
+        """A step's outcome, and its exit code; a failure where it raises. Raises Stopped."""
         try:
             with self._progress.of(step.name):
                 outcome = RUNS[step.name](context).checked()
@@ -380,37 +392,40 @@ class FirstLightSession:
         except HilstarError as error:
             # Bad data for one step is not a wrong command: the session continues and ends with exit
             # code 1.
+            code = error.exit_code
             if isinstance(error, InputError):
                 code = 1
-            else:
-                code = error.exit_code
             if not isinstance(error, NoImage | MachineError):
                 del self.unfinished[step.name]
             return StepOutcome("failed", one_line(str(error))), code
         del self.unfinished[step.name]
-        return outcome, 1 if outcome.verdict == "failed" else 0
+        return outcome, int(outcome.verdict == "failed")
 
     def _attempt(self, number: int) -> str:
+        """What an attempt's images depend on."""
         # Every pattern depends on the collimator, even where the step's result does not.
-        return f"{self._state(number, (*STEPS[number].tables, 'collimator'))} {self.patches}"
+        tables = (*STEPS[number].tables, "collimator")
+        return f"{self._state(number, tables)} {self.patches}"
 
     def _context(self, step: SessionStep, goes_on: bool) -> StepContext:
+        """What a step is given; its images go into the last attempt's folder, or into a new one."""
         attempts = self.folder / "images"
         number = sum(1 for path in attempts.glob(f"{step.name}-*") if path.is_dir())
-        folder = attempts / f"{step.name}-{number if goes_on and number else number + 1}"
+        if not goes_on or not number:
+            number += 1
+        folder = attempts / f"{step.name}-{number}"
         known: dict[str, Figure] = {}
         for name, record in self.records.items():
             if record.verdict == "done":
                 for key, value in record.figures.items():
                     known[f"{name}.{key}"] = value
-        images = complete_images(folder)
         return StepContext(
             self.file,
             self.folder,
             folder,
             self.source,
             known,
-            images,
+            complete_images(folder),
             self.patches,
             watch=self._shows,
             stage=self._progress.stage,
@@ -474,11 +489,9 @@ class FirstLightSession:
         figures = {} if record is None else record.figures
         refresh_hz = figures.get("refresh_hz")
         modes = str(figures.get("modes_hz", "")).split()
-        return beat_of(
-            self.file.config,
-            None if refresh_hz is None else float(refresh_hz),
-            [float(hz) for hz in modes],
-        )
+        if refresh_hz is not None:
+            refresh_hz = float(refresh_hz)
+        return beat_of(self.file.config, refresh_hz, [float(hz) for hz in modes])
 
 
 def _finite(value: Figure) -> Figure:

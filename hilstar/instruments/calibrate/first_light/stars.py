@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from msgspec.structs import replace
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.charts import BLUE, INK, MUTED, SMALL_PT, chart, write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
@@ -28,7 +28,7 @@ from hilstar.instruments.calibrate.first_light.seen_stars import (
     StarsSeen,
     see_stars,
 )
-from hilstar.instruments.calibrate.scale import UNSURE_MAG, scale_of
+from hilstar.instruments.calibrate.scale import UNSURE_MAG, MeasuredScale, scale_of
 from hilstar.instruments.verify.summary import summarise
 from hilstar.instruments.verify.summary import verify as run_twin
 from hilstar.instruments.verify.verdict import Verdict as TwinVerdict
@@ -62,39 +62,28 @@ def verify(context: StepContext) -> StepOutcome:
     InputError.
     """
     stars_seen = _enough_frames(context)
-    off_px = np.hypot(*stars_seen.residual_px.T)
-    rms_px = float(np.sqrt((off_px**2).mean()))
-    figures: dict[str, Figure] = {
-        "stars": len(off_px),
-        "lost": stars_seen.lost,
-        "star_rms_px": rms_px,
-        "star_p95_px": float(np.percentile(off_px, 95)),
-        "star_max_px": float(off_px.max()),
-        "star_rms_arcsec": rms_px * ARCSEC_PER_RAD / context.geometry().tracker.focal_length_px,
-        "star_noise_px": math.sqrt(2) * float(np.sqrt((stars_seen.place_noise_px**2).mean())),
-        "star_beyond_noise_p95_px": P95_OF_TWO * stars_seen.beyond_px.sigma,
-        "star_beyond_noise_max_px": P95_OF_TWO * stars_seen.beyond_px.high,
-        "frames": stars_seen.frames,
-    }
-    reasons: list[str] = []
+    count = len(stars_seen.place_px)
+    figures = _place_figures(context, stars_seen)
+    rms_arcsec = float(figures["star_rms_arcsec"])
+    rms = f"{figures['star_rms_px']:.3f} px ({rms_arcsec:.2f} arcsec) rms"
     picture = context.session / "verify.svg"
-    light = context.session / "verify-light.svg"
-    rms = f"{figures['star_rms_px']:.3f} px ({figures['star_rms_arcsec']:.2f} arcsec) rms"
-    width_px = context.file.config.tracker.resolution_px[0]
     draw_residuals(
         picture,
         stars_seen.place_px,
         stars_seen.residual_px,
-        width_px,
-        f"{len(stars_seen.place_px)} stars are {rms} from the sky",
+        context.file.config.tracker.resolution_px[0],
+        f"{count} stars are {rms} from the sky",
     )
     line = (
-        f"{len(stars_seen.place_px)} stars on the screen are {rms} from where the sky has them,"
-        f" {noise_words(stars_seen)}"
+        f"{count} stars on the screen are {rms} from where the sky has them,"
+        f" {noise_words(stars_seen)}; beyond it {figures['star_beyond_noise_p95_px']:.3f} px at"
+        " 95 %"
     )
-    line += f"; beyond it {figures['star_beyond_noise_p95_px']:.3f} px at 95 %"
+    reasons: list[str] = []
     pictures = [picture]
-    if stars_seen.sure.sum() >= MIN_STARS:
+    sure_stars = int(stars_seen.sure.sum())
+    if sure_stars >= MIN_STARS:
+        light = context.session / "verify-light.svg"
         light_figures, finding = _light_figures(context, stars_seen, light)
         figures |= light_figures
         pictures.append(light)
@@ -102,43 +91,73 @@ def verify(context: StepContext) -> StepOutcome:
             f", and {figures['flux_p95_mag']:.3f} mag from its light (95 % of"
             f" {figures['flux_stars']})"
         )
-        reasons += [finding] if finding else []
+        if finding:
+            reasons.append(finding)
     else:
-        line += f"; the light of {int(stars_seen.sure.sum())} can be read, too few to judge it"
+        line += f"; the light of {sure_stars} can be read, too few to judge it"
     is_scattered = bool(reasons)
     reasons += place_reasons(stars_seen, context.file.config.verify.centroid_px)
     reasons += _star_reasons(context, figures, is_scattered=is_scattered)
-    context.stage(f"the twin looks at {VERIFY_FIELDS} fields")
-    twin = summarise(_twin(context))
-    reasons += [f"the twin: {reason}" for reason in twin["reasons"]]
-    figures |= {
-        "twin_passed": str(twin["passed"]).lower(),
-        "twin_stars": twin["stars"],
-        "twin_zero_point_mag": (
-            "not known" if twin["zero_point_mag"] is None else twin["zero_point_mag"]
-        ),
-        "twin_flux_p95_mag": twin["flux_error_mag"].p95 or 0.0,
-        "twin_centroid_p95_px": twin["centroid_error_px"].p95 or 0.0,
-    }
+    twin_figures, twin_reasons = _twin_figures(context)
+    figures |= twin_figures
+    reasons += twin_reasons
     if context.truth is not None:
         figures |= _against_truth(context)
         line += (
             f"; against the truth, places are {figures['truth_rms_arcsec']:.2f} arcsec rms off, and"
             f" stars of the twin {figures['twin_flux_p95_mag']:.3f} mag at 95 %"
         )
-    line += f": {'; '.join(reasons)}" if reasons else ""
-    verdict: Verdict = "failed" if reasons else "done"
-    rms_arcsec = float(figures["star_rms_arcsec"])
-    error = rms_arcsec / math.sqrt(4 * len(off_px))  # from an rms over two axes
+    verdict: Verdict = "done"
+    if reasons:
+        verdict = "failed"
+        line += f": {'; '.join(reasons)}"
     number = StepNumber(
         rms_arcsec,
-        error,
+        rms_arcsec / math.sqrt(4 * count),  # from an rms over two axes
         "arcsec",
-        f"rms distance of {len(off_px)} stars from where the sky has them",
+        f"rms distance of {count} stars from where the sky has them",
     )
-    return StepOutcome(
-        verdict, line, figures, (*pictures, *stars_seen.images), tuple(pictures), number=number
-    )
+    files = (*pictures, *stars_seen.images)
+    return StepOutcome(verdict, line, figures, files, tuple(pictures), number=number)
+
+
+def _place_figures(context: StepContext, seen: StarsSeen) -> dict[str, Figure]:
+    """How far stars are from where the sky has them, and how much of that is beyond noise."""
+    off_px = np.hypot(*seen.residual_px.T)
+    rms_px = float(np.sqrt((off_px**2).mean()))
+    noise_px = float(np.sqrt((seen.place_noise_px**2).mean()))
+    beyond = seen.beyond_px
+    focal_length_px = context.geometry().tracker.focal_length_px
+    p95_px = float(np.percentile(off_px, 95))
+    return {
+        "stars": len(off_px),
+        "lost": seen.lost,
+        "star_rms_px": rms_px,
+        "star_p95_px": p95_px,
+        "star_max_px": float(off_px.max()),
+        "star_rms_arcsec": rms_px * ARCSEC_PER_RAD / focal_length_px,
+        "star_noise_px": math.sqrt(2) * noise_px,
+        "star_beyond_noise_p95_px": P95_OF_TWO * beyond.sigma,
+        "star_beyond_noise_max_px": P95_OF_TWO * beyond.high,
+        "frames": seen.frames,
+    }
+
+
+def _twin_figures(context: StepContext) -> tuple[dict[str, Figure], list[str]]:
+    """The figures of the twin's own comparison, and what speaks against it."""
+    context.stage(f"the twin looks at {VERIFY_FIELDS} fields")
+    twin = summarise(_twin(context))
+    zero_point_mag: Figure = "not known"
+    if twin["zero_point_mag"] is not None:
+        zero_point_mag = twin["zero_point_mag"]
+    figures: dict[str, Figure] = {
+        "twin_passed": str(twin["passed"]).lower(),
+        "twin_stars": twin["stars"],
+        "twin_zero_point_mag": zero_point_mag,
+        "twin_flux_p95_mag": twin["flux_error_mag"].p95 or 0.0,
+        "twin_centroid_p95_px": twin["centroid_error_px"].p95 or 0.0,
+    }
+    return figures, [f"the twin: {reason}" for reason in twin["reasons"]]
 
 
 def noise_words(seen: StarsSeen) -> str:
@@ -173,7 +192,9 @@ def frames_for(seen: StarsSeen, limit_px: float) -> int:
         return seen.frames
     room = limit**2 - beyond.sigma**2
     doubt = beyond.high**2 - beyond.sigma**2
-    return max(math.ceil(seen.frames * doubt / max(room, limit**2 / 4)), seen.frames + 1)
+    # the doubt shrinks with the frames; a scatter near the limit itself takes four times as many
+    frames = math.ceil(seen.frames * doubt / max(room, limit**2 / 4))
+    return max(frames, seen.frames + 1)
 
 
 def place_reasons(seen: StarsSeen, limit_px: float) -> list[str]:
@@ -216,11 +237,8 @@ def _twin(context: StepContext) -> TwinVerdict:
     if black > 0:
         known = math.hypot(known, float(figures.get(BLACK_ERROR, 0.0)) / black)
     limit = max(glow.limit_e_per_s_px, AGREE_SIGMAS * known * glow.assumed_e_per_s_px)
-    return judge(
-        dataclasses.replace(
-            twin_run.measured, glow=dataclasses.replace(glow, limit_e_per_s_px=limit)
-        )
-    )
+    known_glow = dataclasses.replace(glow, limit_e_per_s_px=limit)
+    return judge(dataclasses.replace(twin_run.measured, glow=known_glow))
 
 
 def _twin_file(context: StepContext) -> BenchFile:
@@ -258,30 +276,30 @@ def _light_figures(
     """The errors of the stars' light without their common zero point, and what is wrong where
     they scatter too far.
     """
-    gain = context.file.config.tracker.detector.gain_e_per_dn
-    exposure_s = context.exposure_s
-    off = np.asarray(magnitude(seen.dn * gain / (seen.e_per_s * exposure_s)))[seen.sure]
-    zero_point = float(np.median(off))
-    spread = np.abs(off - zero_point)
-    p95 = float(np.percentile(spread, 95))
+    sure = seen.sure
+    asked_e = seen.e_per_s[sure] * context.exposure_s
+    seen_e = seen.dn[sure] * context.detector.gain_e_per_dn
+    off_mag = np.asarray(magnitude(seen_e / asked_e))
+    noise_mag = seen.noise_mag[sure]
+    zero_point_mag = float(np.median(off_mag))
+    spread_mag = np.abs(off_mag - zero_point_mag)
+    p95_mag = float(np.percentile(spread_mag, 95))
     finding = (
-        f"the light of {len(off)} stars is {p95:.3f} mag from the sky's at 95 %, {zero_point:+.3f}"
-        " mag in common"
+        f"the light of {len(off_mag)} stars is {p95_mag:.3f} mag from the sky's at 95 %,"
+        f" {zero_point_mag:+.3f} mag in common"
     )
-    from_middle = np.hypot(*seen.screen[seen.sure].T)
-    draw_light(
-        picture, seen.e_per_s[seen.sure], off, seen.noise_mag[seen.sure], finding, from_middle
-    )
-    scatter = seen.scatter(off, seen.sure)
+    from_middle = np.hypot(*seen.screen[sure].T)
+    draw_light(picture, seen.e_per_s[sure], off_mag, noise_mag, finding, from_middle)
+    scatter = seen.scatter(off_mag, sure)
+    beyond = Beyond.of(off_mag - zero_point_mag, noise_mag)
+    rms_mag = float(np.sqrt((spread_mag**2).mean()))
     figures: dict[str, Figure] = {
-        "flux_stars": len(off),
-        "flux_rms_mag": float(np.sqrt((spread**2).mean())),
-        "flux_p95_mag": p95,
-        "flux_max_mag": float(spread.max()),
-        "flux_beyond_noise_p95_mag": (
-            P95_OF_ONE * Beyond.of(off - zero_point, seen.noise_mag[seen.sure]).sigma
-        ),
-        "flux_zero_point_mag": zero_point,
+        "flux_stars": len(off_mag),
+        "flux_rms_mag": rms_mag,
+        "flux_p95_mag": p95_mag,
+        "flux_max_mag": float(spread_mag.max()),
+        "flux_beyond_noise_p95_mag": P95_OF_ONE * beyond.sigma,
+        "flux_zero_point_mag": zero_point_mag,
         "flux_scatter_mag": scatter.rms_mag,
         "flux_error_mag": scatter.error_mag,
         "flux_by_place": scatter.by_place,
@@ -295,24 +313,23 @@ def _star_reasons(
     """The limits of [verify] that the stars miss, with advice; not their light again where its
     scatter has been told.
     """
-    limits = context.file.config.verify
+    limit_mag = context.file.config.verify.flux_mag
+    lost = float(figures["lost"])
     reasons = []
-    if float(figures["lost"]) > LOST_SHARE * (float(figures["lost"]) + float(figures["stars"])):
+    if lost > LOST_SHARE * (lost + float(figures["stars"])):
         reasons.append(f"{figures['lost']} bright stars are not there")
-    is_off = float(figures.get("flux_beyond_noise_p95_mag", 0.0)) > limits.flux_mag
-    if is_off and not is_scattered:
-        off = (
-            f"beyond noise the light of stars is {figures['flux_beyond_noise_p95_mag']:.3f} mag off"
-            " at 95 %"
+    beyond_mag = float(figures.get("flux_beyond_noise_p95_mag", 0.0))
+    if beyond_mag > limit_mag and not is_scattered:
+        reasons.append(
+            f"beyond noise the light of stars is {beyond_mag:.3f} mag off at 95 % (limit"
+            f" {limit_mag:g}): measure the response (photometry)"
         )
-        off += f" (limit {limits.flux_mag:g})"
-        reasons.append(f"{off}: measure the response (photometry)")
-    if abs(float(figures.get("flux_zero_point_mag", 0.0))) > limits.flux_mag:
-        off = (
-            f"all stars are {figures['flux_zero_point_mag']:+.3f} mag off (limit"
-            f" {limits.flux_mag:g})"
+    zero_point_mag = float(figures.get("flux_zero_point_mag", 0.0))
+    if abs(zero_point_mag) > limit_mag:
+        reasons.append(
+            f"all stars are {zero_point_mag:+.3f} mag off (limit {limit_mag:g}): measure what white"
+            " is worth (scale)"
         )
-        reasons.append(f"{off}: measure what white is worth (scale)")
     return reasons
 
 
@@ -324,15 +341,14 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
     truth = context.truth
     assert truth is not None
     width, height = context.resolution_px
-    x, y = (
-        part.ravel()
-        for part in np.meshgrid(np.linspace(0, width - 1, GRID), np.linspace(0, height - 1, GRID))
-    )
-    mine, its = (
-        bench_camera(file.config, file.folder).rays(x, y) for file in (context.file, truth)
-    )
-    mine, its = (rays / np.linalg.norm(rays, axis=1, keepdims=True) for rays in (mine, its))
-    off = np.linalg.norm(np.cross(mine, its), axis=1) * ARCSEC_PER_RAD
+    columns = np.linspace(0, width - 1, GRID)
+    rows = np.linspace(0, height - 1, GRID)
+    grid_x, grid_y = np.meshgrid(columns, rows)
+    x = grid_x.ravel()
+    y = grid_y.ravel()
+    fitted = _directions(context.file, x, y)
+    true = _directions(truth, x, y)
+    off = np.linalg.norm(np.cross(fitted, true), axis=1) * ARCSEC_PER_RAD
     known = np.isfinite(off)
     if not known.any():
         raise InputError(
@@ -346,6 +362,12 @@ def _against_truth(context: StepContext) -> dict[str, Figure]:
         "truth_max_arcsec": largest,
         "truth_share_of_screen": float(known.mean()),
     }
+
+
+def _directions(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """Unit directions (n, 3) in cam of places on a bench's screen."""
+    rays = bench_camera(file.config, file.folder).rays(x_px, y_px)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def scale(context: StepContext) -> StepOutcome:
@@ -362,29 +384,21 @@ def scale(context: StepContext) -> StepOutcome:
             f" {len(used)}, {saturated} saturate the tracker (a shorter [tracker] exposure_s) and"
             f" {int(clips.sum())} clip on the monitor (a smaller [render] brightest_v_mag)"
         )
-    wanted, noise_mag = stars_seen.e_per_s[used], stars_seen.noise_mag[used]
-    ratios = (
-        stars_seen.dn[used]
-        * context.file.config.tracker.detector.gain_e_per_dn
-        / (wanted * context.exposure_s)
-    )
+    asked = stars_seen.e_per_s[used]
+    noise_mag = stars_seen.noise_mag[used]
+    seen_e = stars_seen.dn[used] * context.detector.gain_e_per_dn
+    ratios = seen_e / (asked * context.exposure_s)
+    ratios_mag = np.asarray(magnitude(ratios))
     star_scale = scale_of(white, ratios, noise_mag)
-    scatter = stars_seen.scatter(np.asarray(magnitude(ratios)), used)
-    by_mag = float(magnitude(star_scale.flux_at_white_e_per_s / white))
-    # The ADC rounds all stars by where its one dark level is.
-    rounding_mag = star_scale.weights @ stars_seen.rounding_mag[used] / star_scale.weights.sum()
-    rounding_rms_mag = float(np.sqrt((rounding_mag**2).mean()))
-    by_readings_mag = MAG_PER_RELATIVE * (star_scale.relative_error or 0.0)
-    error_mag = math.hypot(by_readings_mag, SYSTEMATIC_MAG, rounding_rms_mag)
-    weight = np.sqrt(star_scale.weights)
-    trend_mag, trend_error_mag = trend(wanted, np.asarray(magnitude(ratios)), weight)
-    rounding_trends_mag = [trend(wanted, one, weight)[0] for one in stars_seen.rounding_mag[used].T]
-    rounding_trend_mag = float(np.sqrt(np.mean(np.square(rounding_trends_mag))))
-    trend_error_mag = math.hypot(trend_error_mag, rounding_trend_mag)
+    found_white = star_scale.flux_at_white_e_per_s
+    scatter = stars_seen.scatter(ratios_mag, used)
+    off_mag = float(magnitude(found_white / white))
+    error_mag = _scale_error_mag(star_scale, stars_seen.rounding_mag[used])
+    trend_mag, trend_error_mag = _scale_trend(stars_seen, used, ratios_mag, star_scale.weights)
     figures: dict[str, Figure] = {
-        "flux_at_white_e_per_s": star_scale.flux_at_white_e_per_s,
+        "flux_at_white_e_per_s": found_white,
         "in_bench_file_e_per_s": white,
-        "off_mag": by_mag,
+        "off_mag": off_mag,
         "error_mag": error_mag,
         "scatter_mag": star_scale.scatter_mag,
         "trend_mag": trend_mag,
@@ -392,80 +406,90 @@ def scale(context: StepContext) -> StepOutcome:
         "stars": len(ratios),
     }
     if context.truth is not None:
-        figures["truth_off_mag"] = magnitude(
-            star_scale.flux_at_white_e_per_s / _white_e_per_s(context.truth)
-        )
+        figures["truth_off_mag"] = magnitude(found_white / _white_e_per_s(context.truth))
     figures["scatter_error_mag"] = scatter.error_mag
-    brighter = (
-        f"{abs(by_mag):.3f} +- {error_mag:.3f} mag {'fainter' if by_mag > 0 else 'brighter'} than"
-        " the bench file has it"
+    direction = "fainter" if off_mag > 0 else "brighter"
+    line = (
+        f"white is worth {found_white:.4g} e-/s, {abs(off_mag):.3f} +- {error_mag:.3f} mag"
+        f" {direction} than the bench file has it, by {len(ratios)} stars"
     )
-    white_text = f"{star_scale.flux_at_white_e_per_s:.4g} e-/s"
-    line = f"white is worth {white_text}, {brighter}, by {len(ratios)} stars"
     picture = context.session / "scale.svg"
-    draw_light(
-        picture,
-        wanted,
-        magnitude(ratios),
-        noise_mag,
-        f"{line}; they agree to {star_scale.scatter_mag:.3f} mag",
-    )
+    agreement = f"they agree to {star_scale.scatter_mag:.3f} mag"
+    draw_light(picture, asked, ratios_mag, noise_mag, f"{line}; {agreement}")
     readings = context.session / READINGS_FILE
     sigma_dn = noise_mag / MAG_PER_RELATIVE * stars_seen.dn[used]
-    write_csv(
-        readings,
-        ("hip", "dn", "sigma_dn"),
-        zip(
-            *(column.tolist() for column in (stars_seen.hip[used], stars_seen.dn[used], sigma_dn)),
-            strict=True,
-        ),
-    )
-    files = (picture, readings, *stars_seen.images)
-    error_e_per_s = star_scale.flux_at_white_e_per_s * error_mag / MAG_PER_RELATIVE
+    columns = (stars_seen.hip[used].tolist(), stars_seen.dn[used].tolist(), sigma_dn.tolist())
+    write_csv(readings, ("hip", "dn", "sigma_dn"), zip(*columns, strict=True))
     number = StepNumber(
-        star_scale.flux_at_white_e_per_s,
-        error_e_per_s,
+        found_white,
+        found_white * error_mag / MAG_PER_RELATIVE,
         "e-/s",
         "light of one pixel at white, in the tracker",
     )
-    unsure_mag = max(UNSURE_MAG, FAR * scatter.error_mag)
-    wrong = (
-        [f"they disagree by {star_scale.scatter_mag:.3f} mag"]
-        if star_scale.scatter_mag > unsure_mag
-        else []
+    outcome = StepOutcome(
+        "done", line, figures, (picture, readings, *stars_seen.images), (picture,), number=number
     )
-    if error_mag > UNSURE_MAG:
-        wrong.append("they are too noisy: write a longer [tracker] exposure_s")
+    contradictions = _contradictions(star_scale.scatter_mag, scatter.error_mag, error_mag)
     if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * trend_error_mag):
-        wrong.append(
+        contradictions.append(
             f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +-"
             f" {trend_error_mag:.3f} mag"
         )
-    if wrong:
+    if contradictions:
         why = (
             "the response is not as the bench file has it (photometry), or the background is not"
             " dark; nothing was changed"
         )
-        return StepOutcome(
-            "failed",
-            f"{line}, but {' and '.join(wrong)}: {why}",
-            figures,
-            files,
-            (picture,),
-            number=number,
-        )
-    verdict: Verdict = "failed" if scatter.finding else "done"
-    line += f", but {scatter.finding}" if scatter.finding else ""
+        line += f", but {' and '.join(contradictions)}: {why}"
+        return dataclasses.replace(outcome, verdict="failed", line=line)
+    if scatter.finding:
+        line += f", but {scatter.finding}"
+        outcome = dataclasses.replace(outcome, verdict="failed", line=line)
+    if abs(off_mag) < AGREE_SIGMAS * error_mag:
+        return outcome
+    new_white = float(f"{found_white:.6g}")
+    relative = float(f"{error_mag / MAG_PER_RELATIVE:.3g}")
     changes = (
-        *context.change(
-            "render", "flux_at_white_e_per_s", float(f"{star_scale.flux_at_white_e_per_s:.6g}")
-        ),
-        *context.change(
-            "certify", "flux_at_white_relative", float(f"{error_mag / MAG_PER_RELATIVE:.3g}")
-        ),
+        *context.change("render", "flux_at_white_e_per_s", new_white),
+        *context.change("certify", "flux_at_white_relative", relative),
     )
-    agrees = abs(by_mag) < AGREE_SIGMAS * error_mag
-    return StepOutcome(verdict, line, figures, files, (picture,), () if agrees else changes, number)
+    return dataclasses.replace(outcome, changes=changes)
+
+
+def _scale_error_mag(star_scale: MeasuredScale, rounding_mag: FloatArray) -> float:
+    """The error of full scale: by the readings, by what sessions were off, and by the ADC, which
+    rounds all stars (n, phases) by where its one dark level is.
+    """
+    common_mag = star_scale.weights @ rounding_mag / star_scale.weights.sum()
+    rounding_rms_mag = float(np.sqrt((common_mag**2).mean()))
+    by_readings_mag = MAG_PER_RELATIVE * (star_scale.relative_error or 0.0)
+    return math.hypot(by_readings_mag, SYSTEMATIC_MAG, rounding_rms_mag)
+
+
+def _scale_trend(
+    seen: StarsSeen, used: BoolArray, ratios_mag: FloatArray, weights: FloatArray
+) -> tuple[float, float]:
+    """The change of full scale from the faintest to the brightest star, mag, and its error, that by
+    the ADC's rounding in it.
+    """
+    asked = seen.e_per_s[used]
+    root = np.sqrt(weights)
+    trend_mag, error_mag = trend(asked, ratios_mag, root)
+    by_phase_mag = [
+        trend(asked, rounding_mag, root)[0] for rounding_mag in seen.rounding_mag[used].T
+    ]
+    rounding_mag = float(np.sqrt(np.mean(np.square(by_phase_mag))))
+    return trend_mag, math.hypot(error_mag, rounding_mag)
+
+
+def _contradictions(scatter_mag: float, scatter_error_mag: float, error_mag: float) -> list[str]:
+    """What speaks against a scale that stars agree on."""
+    contradictions = []
+    if scatter_mag > max(UNSURE_MAG, FAR * scatter_error_mag):
+        contradictions.append(f"they disagree by {scatter_mag:.3f} mag")
+    if error_mag > UNSURE_MAG:
+        contradictions.append("they are too noisy: write a longer [tracker] exposure_s")
+    return contradictions
 
 
 def _white_e_per_s(file: BenchFile) -> float:
@@ -492,7 +516,9 @@ def trend(
         return 0.0, 0.0
     slope = float((share * x * centred_mag).sum()) / leverage
     centred_mag = centred_mag - slope * x
-    variance = float((share * centred_mag**2).sum()) * len(x) / max(len(x) - 2, 1)
+    count = len(x)
+    square_mag2 = float((share * centred_mag**2).sum())
+    variance = square_mag2 * count / max(count - 2, 1)
     alike = 1 / float((share**2).sum())
     return slope * span, math.sqrt(variance / (alike * leverage)) * span
 
@@ -509,9 +535,8 @@ def draw_light(
     `from_middle` (n,), half sides.
     """
     panels = [("light asked for [e-/s]", e_per_s)]
-    panels += (
-        [] if from_middle is None else [("from the middle of the screen [half sides]", from_middle)]
-    )
+    if from_middle is not None:
+        panels.append(("from the middle of the screen [half sides]", from_middle))
     with chart(path, finding, panels=len(panels), share_x=False) as drawn:
         for axes, (name, along) in zip(drawn, panels, strict=True):
             axes.errorbar(along, off_mag, noise_mag, fmt="o", markersize=4, color=INK, ecolor=MUTED)
@@ -527,10 +552,9 @@ def draw_residuals(
     """Draw places (n, 2) of stars on the tracker, and their residuals (n, 2) as arrows."""
     with chart(path, finding, height_inch=6.4) as (axes,):
         largest = max(float(np.hypot(*residual.T).max()), 1e-9)
+        scale = largest / (MAX_ARROW_SHARE * width_px)
         look = {"angles": "xy", "scale_units": "xy", "width": 0.003, "color": BLUE}
-        arrows = axes.quiver(
-            *place.T, *residual.T, scale=largest / (MAX_ARROW_SHARE * width_px), **look
-        )
+        arrows = axes.quiver(*place.T, *residual.T, scale=scale, **look)
         key = {"labelpos": "E", "coordinates": "axes", "fontproperties": {"size": SMALL_PT}}
         axes.quiverkey(arrows, 0.75, 1.03, largest, f"{largest:.3f} px, the longest", **key)
         axes.set(aspect="equal", xlabel="tracker x [px]", ylabel="tracker y [px]")

@@ -35,11 +35,13 @@ from hilstar.instruments.calibrate.geometric.dots import DOT_PX
 from hilstar.instruments.calibrate.warm_up import (
     AHEAD_S,
     S_PER_H,
+    WarmUp,
     fitted_white,
     judge_warm_up,
     watch_white,
 )
 from hilstar.instruments.simulate.bench_geometry import PIXELS_AT_ONCE, BenchGeometry
+from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.monitor import bench_calibration, calibration_source
 from hilstar.tracker.centroids import noisiest_background
 
@@ -86,8 +88,7 @@ class UniformityMap:
 
     `left_mag` is the rms error on held-out dots, and `left_error_mag2` the standard error of its
     square; `used` marks the dots that are no outliers. `fit_mag` is the standard error of the fit
-    at a
-    dot; `missed_mag` the rms of what a finer map may show and this one does not.
+    at a dot; `missed_mag` the rms of what a finer map may show and this one does not.
     """
 
     grid: FloatArray
@@ -118,74 +119,97 @@ class UniformityMap:
         """Standard deviation of the map over the dots, magnitudes."""
         return float(np.std(magnitude(self.at_dots[self.used])))
 
+    @property
+    def darkest_of_brightest(self) -> float:
+        """The map's smallest value at a dot over its largest."""
+        light = self.at_dots[self.used]
+        return float(light.min() / light.max())
+
 
 def uniformity(context: StepContext) -> StepOutcome:
     """Measure light against place, and write a calibration with the map where the bench's is
     wrong. Raises InputError.
     """
     dots, images = see_dots(context)
-    size_px, assumed = context.resolution_px, calibration_of(context)
-    known = assumed.uniformity_map(size_px)
-    as_known = (
-        np.ones(len(dots.light)) if known is None else known[dots.y, dots.x].astype(np.float64)
-    )
-    against = map_of(dots, dots.light / as_known, size_px)
+    size_px = context.resolution_px
+    known = calibration_of(context).uniformity_map(size_px)
     light_map = map_of(dots, dots.light, size_px)
+    # what the bench file's own map leaves; a map of many dots takes a second
+    against = light_map
+    if known is not None:
+        known_light = known[dots.y, dots.x].astype(np.float64)
+        against = map_of(dots, dots.light / known_light, size_px)
     figures = _figures(context, dots, light_map, against)
     if against.is_even:
         # The bench file keeps its map, and the error is that map's.
         figures["map_error_mag"] = math.hypot(against.error_mag(dots.noise_mag), against.rms_mag)
     elif light_map.is_even:
-        figures["map_error_mag"] = math.hypot(
-            light_map.error_mag(dots.noise_mag), light_map.rms_mag
-        )
-    picture = context.session / "uniformity.svg"
+        own_error_mag = light_map.error_mag(dots.noise_mag)
+        figures["map_error_mag"] = math.hypot(own_error_mag, light_map.rms_mag)
+    error_mag = float(figures["map_error_mag"])
     line = (
-        f"{_said(light_map, known is not None)}; {len(dots.light)} dots differ from that by"
-        f" {light_map.left_mag:.4f} mag"
+        f"{_in_words(light_map, known is not None)}; {len(dots.light)} dots differ from that by"
+        f" {light_map.left_mag:.4f} mag (noise {dots.noise_mag:.4f})"
     )
-    line += f" (noise {dots.noise_mag:.4f})"
+    picture = context.session / "uniformity.svg"
     draw_uniformity(picture, dots, light_map, line)
     files: list[Path] = [picture, *images]
     changes: tuple[KeyChange, ...] = ()
-    if against.is_even:
-        line += "; the bench file has it so" if known is not None else "; nothing was written"
-    else:
-        source, path = (
-            calibration_source(context.file.config.monitor, context.file.folder),
-            context.session / FILE,
-        )
-        grid, today = (
-            None if light_map.is_even else light_map.grid,
-            datetime.datetime.now(datetime.UTC).date().isoformat(),
-        )
-        relative, bits = (
-            float(figures["map_error_mag"]) / MAG_PER_RELATIVE,
-            context.file.config.monitor.bits,
-        )
-        files += with_uniformity(
-            source, bits, path, grid, context.source.monitor, today, relative=relative
-        )
-        changes = context.names("monitor", "calibration", path)
+    if not against.is_even:
+        written, changes = _write_map(context, light_map, error_mag)
+        files += written
         line += "; what the tracker's own lens darkens is part of it"
-    noisy = light_map.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG)
-    if noisy:
-        why = (
-            "dust, a panel uneven from pixel to pixel, or light that is not steady; look at the"
-            " images"
+    elif known is not None:
+        line += "; the bench file has it so"
+    else:
+        line += "; nothing was written"
+    verdict: Verdict = "done"
+    if light_map.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG):
+        verdict = "failed"
+        line += (
+            ": that is far above their noise: dust, a panel uneven from pixel to pixel, or light"
+            " that is not steady; look at the images"
         )
-        line = f"{line}: that is far above their noise: {why}"
-    verdict: Verdict = "failed" if noisy else "done"
-    darkest = 100 * float(figures["darkest_of_brightest"])
-    error = darkest * math.sqrt(2) * float(figures["map_error_mag"]) / MAG_PER_RELATIVE
+    darkest_percent = 100 * float(figures["darkest_of_brightest"])
+    # a ratio of two places, each with the map's error
+    error_percent = darkest_percent * math.sqrt(2) * error_mag / MAG_PER_RELATIVE
     number = StepNumber(
-        darkest, error, "%", "light at the darkest place of the screen, of that at the brightest"
+        darkest_percent,
+        error_percent,
+        "%",
+        "light at the darkest place of the screen, of that at the brightest",
     )
-    # A finer map than the last was not tried: where dots still differ by more than their noise, it
-    # may be needed.
-    ends = FittedFigure("the map's rows", light_map.grid.shape[0], 0.0, ROWS[-1])
-    fitted = (ends,) if light_map.left_mag > UNEXPLAINED * dots.noise_mag else ()
+    fitted: tuple[FittedFigure, ...] = ()
+    if light_map.left_mag > UNEXPLAINED * dots.noise_mag:
+        # A finer map than the last was not tried: where dots still differ by more than their
+        # noise, it may be needed.
+        fitted = (FittedFigure("the map's rows", light_map.grid.shape[0], 0.0, ROWS[-1]),)
     return StepOutcome(verdict, line, figures, tuple(files), (picture,), changes, number, fitted)
+
+
+def _write_map(
+    context: StepContext, light_map: UniformityMap, error_mag: float
+) -> tuple[list[Path], tuple[KeyChange, ...]]:
+    """Write the bench's calibration with this map, or with none where light is even; the files,
+    and the bench file's key that names them.
+    """
+    monitor = context.monitor
+    grid = None
+    if not light_map.is_even:
+        grid = light_map.grid
+    path = context.session / FILE
+    source = calibration_source(monitor, context.file.folder)
+    now = datetime.datetime.now(datetime.UTC)
+    files = with_uniformity(
+        source,
+        monitor.bits,
+        path,
+        grid,
+        context.source.monitor,
+        now.date().isoformat(),
+        relative=error_mag / MAG_PER_RELATIVE,
+    )
+    return list(files), context.names("monitor", "calibration", path)
 
 
 def warm_up(context: StepContext) -> StepOutcome:
@@ -197,94 +221,119 @@ def warm_up(context: StepContext) -> StepOutcome:
             "give --warm-up MINUTES, 30 for most monitors, right after the monitor was switched on"
         )
         return StepOutcome("skipped", f"not measured, the monitor is taken to be warm: {how}")
-    period = _spacing(context).period
-    firsts = [period // 2, period // 2]
-    dark, file, lit, number = (
-        context.read(context.dark()),
-        context.file,
-        np.zeros(0, dtype=np.bool_),
-        0,
-    )
-    code, _ = _unsaturated(context, dark, "white", [firsts], period)
-    codes = _shown(firsts, period, code, context.resolution_px)
-    cold, beside = dark < HOT_FILL * context.full_dn, lit
-
-    def read() -> float:
-        nonlocal lit, beside, number
-        pattern, number = Pattern(f"white_{number:03}", codes), number + 1
-        context.watch(pattern)
-        path = context.source.look(file, pattern, context.folder / pattern.name, context.exposure_s)
-        looked = context.looked(path, dark)
-        path.unlink()  # hundreds are taken, and an interrupted watch begins anew
-        _check_brightness(context, looked, code)
-        if not lit.size:
-            lit = (looked.image > LIT_SIGMAS * noisiest_background(looked.image).noise) & cold
-            if not lit.any():
-                raise InputError(
-                    f"no dot of code {code} is seen; look at the focus, and whether the screen"
-                    " is on"
-                )
-            beside = binary_dilation(lit, iterations=RING_PX) & cold & ~lit
-        # What black pixels glow more than in the dark frame is no light of the dots.
-        return float(looked.image[lit].sum() - looked.image[beside].mean() * lit.sum())
-
-    hold = Pattern("white", codes)
-    t_s, light = watch_white(
-        read,
-        context.source.clock_ns,
-        lambda seconds: context.source.hold(file, hold, seconds),
-        context.watched_s,
-    )
-    judged, ended_s = judge_warm_up(t_s, light), context.source.clock_ns() / NS_PER_S
-    table, picture = context.session / "warm-up.csv", context.session / "warm-up.svg"
+    white = _White(context)
+    t_s, light = watch_white(white.read, context.source.clock_ns, white.hold, context.watched_s)
+    judged = judge_warm_up(t_s, light)
+    ended_s = context.source.clock_ns() / NS_PER_S
+    table = context.session / "warm-up.csv"
+    picture = context.session / "warm-up.svg"
     write_csv(table, ("t_s", "light_dn"), zip(t_s.tolist(), light.tolist(), strict=True))
-    with chart(picture, judged.line) as (axes,):
-        axes.plot(t_s / 60, 100 * light / light[-1], ".", color=MUTED, markersize=4)
-        axes.plot(
-            t_s / 60,
-            100 * fitted_white(judged, t_s, light) / light[-1],
-            color=BLUE,
-            label=judged.law,
+    _draw_warm_up(picture, judged, t_s, light)
+    figures: dict[str, Figure] = asdict(judged)
+    del figures["is_stable"]
+    figures["readings"] = len(light)
+    figures["stable"] = "yes" if judged.is_stable else "no"
+    if context.truth is not None:
+        figures |= _warm_up_truth(context.truth, judged, ended_s, float(t_s[-1]))
+    number = None
+    if judged.law != "none":
+        number = StepNumber(
+            judged.drift_percent_per_h,
+            judged.drift_error_percent_per_h,
+            "%/h",
+            "drift of white at the last reading",
         )
+    files = (table, picture)
+    if not judged.is_stable:
+        line = f"{judged.line}; {judged.cure}"
+        return StepOutcome("failed", line, figures, files, (picture,), number=number)
+    percent = float(f"{100 * judged.bound:.3g}")
+    changes = context.change("certify", "warm_up_percent", percent)
+    return StepOutcome("done", judged.line, figures, files, (picture,), changes, number=number)
+
+
+class _White:
+    """A lattice of dots that the tracker watches while the monitor warms up. Raises InputError for
+    dots that saturate it.
+    """
+
+    def __init__(self, context: StepContext) -> None:
+        period = _spacing(context).period
+        firsts = [period // 2, period // 2]
+        self._context = context
+        self._dark = context.read(context.dark())
+        self._code, _ = _unsaturated(context, self._dark, "white", [firsts], period)
+        self._codes = _shown(firsts, period, self._code, context.resolution_px)
+        self._cold = self._dark < HOT_FILL * context.full_dn
+        # of the first image: which pixels have light, and which are beside those
+        self._lit: BoolArray | None = None
+        self._beside: BoolArray | None = None
+        self._number = 0
+
+    def hold(self, seconds: float) -> None:
+        """Show the lattice for a time without looking."""
+        self._context.source.hold(self._context.file, Pattern("white", self._codes), seconds)
+
+    def read(self) -> float:
+        """The light of all dots in one image, DN."""
+        context = self._context
+        pattern = Pattern(f"white_{self._number:03}", self._codes)
+        self._number += 1
+        context.watch(pattern)
+        path = context.folder / pattern.name
+        path = context.source.look(context.file, pattern, path, context.exposure_s)
+        looked = context.looked(path, self._dark)
+        path.unlink()  # hundreds are taken, and an interrupted watch begins anew
+        _check_brightness(context, looked, self._code)
+        if self._lit is None or self._beside is None:
+            self._lit = self._lit_pixels(looked)
+            near = binary_dilation(self._lit, iterations=RING_PX)
+            self._beside = near & self._cold & ~self._lit
+        # What black pixels glow more than in the dark frame is no light of the dots.
+        glow = looked.image[self._beside].mean() * self._lit.sum()
+        return float(looked.image[self._lit].sum() - glow)
+
+    def _lit_pixels(self, looked: DarkSubtracted) -> BoolArray:
+        """The pixels that the dots light. Raises InputError where there are none."""
+        threshold = LIT_SIGMAS * noisiest_background(looked.image).noise
+        lit = (looked.image > threshold) & self._cold
+        if not lit.any():
+            raise InputError(
+                f"no dot of code {self._code} is seen; look at the focus, and whether the screen"
+                " is on"
+            )
+        return np.asarray(lit)
+
+
+def _draw_warm_up(picture: Path, judged: WarmUp, t_s: FloatArray, light: FloatArray) -> None:
+    """Draw the readings and the law that was fitted, relative to the last reading."""
+    minutes = t_s / 60
+    fitted = fitted_white(judged, t_s, light)
+    with chart(picture, judged.line) as (axes,):
+        axes.plot(minutes, 100 * light / light[-1], ".", color=MUTED, markersize=4)
+        axes.plot(minutes, 100 * fitted / light[-1], color=BLUE, label=judged.law)
         axes.set(xlabel="time [min]", ylabel="white over the last reading [%]")
         label_ends(axes)
-    figures: dict[str, Figure] = {
-        name: value for name, value in asdict(judged).items() if name != "is_stable"
+
+
+def _warm_up_truth(
+    truth: BenchFile, judged: WarmUp, ended_s: float, last_s: float
+) -> dict[str, Figure]:
+    """The drift that was planted, and when it is within the limit; the watch ended at `ended_s` of
+    the monitor's own time, at `last_s` of the watch's.
+    """
+    virtual = truth.config.certify.virtual
+    tau_s = 60 * virtual.warm_up_min
+    change = virtual.cold_percent / 100
+    exponential_slope = change / tau_s * math.exp(-ended_s / tau_s)
+    slope = exponential_slope + virtual.drift_percent_per_h / 100 / S_PER_H
+    # by its exponential alone
+    change_ahead = abs(change) * -math.expm1(-AHEAD_S / tau_s)
+    stable_s = tau_s * math.log(max(change_ahead, 1e-300) / judged.limit)
+    return {
+        "truth_drift_percent_per_h": 100 * S_PER_H * slope,
+        "truth_stable_after_s": max(stable_s - (ended_s - last_s), 0.0),
     }
-    figures |= {"readings": len(light), "stable": "yes" if judged.is_stable else "no"}
-    if context.truth is not None:
-        virtual = context.truth.config.certify.virtual
-        tau_s, change = 60 * virtual.warm_up_min, virtual.cold_percent / 100
-        slope = (
-            change / tau_s * math.exp(-ended_s / tau_s)
-            + virtual.drift_percent_per_h / 100 / S_PER_H
-        )
-        figures["truth_drift_percent_per_h"] = 100 * S_PER_H * slope
-        stable_s = tau_s * math.log(
-            max(abs(change) * -math.expm1(-AHEAD_S / tau_s), 1e-300) / judged.limit
-        )
-        # by its exponential alone
-        figures["truth_stable_after_s"] = max(stable_s - (ended_s - float(t_s[-1])), 0.0)
-    changes = (
-        context.change("certify", "warm_up_percent", float(f"{100 * judged.bound:.3g}"))
-        if judged.is_stable
-        else ()
-    )
-    per_h = StepNumber(
-        judged.drift_percent_per_h,
-        judged.drift_error_percent_per_h,
-        "%/h",
-        "drift of white at the last reading",
-    )
-    return StepOutcome(
-        "done" if judged.is_stable else "failed",
-        judged.line if judged.is_stable else f"{judged.line}; {judged.cure}",
-        figures,
-        (table, picture),
-        (picture,),
-        changes,
-        number=per_h if judged.law != "none" else None,
-    )
 
 
 class DotSpacing(NamedTuple):
@@ -298,14 +347,16 @@ class DotSpacing(NamedTuple):
 
 
 def _spacing(context: StepContext) -> DotSpacing:
+    """A lattice whose dots are apart in the tracker's image, and not too many."""
     geometry = context.real_geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
     sigma_px = math.hypot(context.psf_sigma_px, DOT_PX * ratio / math.sqrt(12))
     apart_px = max(APART_TRACKER_PX, APART_SIGMAS * sigma_px) / ratio
-    period = max(
-        math.ceil(apart_px / 2) * 2, math.ceil(max(context.resolution_px) / MAX_DOTS / 2) * 2
-    )
-    return DotSpacing(sigma_px, period, min(REACH * period, REACH_SIGMAS * sigma_px / ratio))
+    fewest_px = max(context.resolution_px) / MAX_DOTS
+    # even: a shift by half of it is whole
+    period = 2 * math.ceil(max(apart_px, fewest_px) / 2)
+    reach = min(REACH * period, REACH_SIGMAS * sigma_px / ratio)
+    return DotSpacing(sigma_px, period, reach)
 
 
 def _check_brightness(context: StepContext, looked: DarkSubtracted, code: int) -> None:
@@ -316,15 +367,17 @@ def _check_brightness(context: StepContext, looked: DarkSubtracted, code: int) -
         )
 
 
-def _said(found: UniformityMap, assumed: bool) -> str:
-    if found.is_even:
-        return "the light is even over the screen" + (
-            ", where the bench file has it uneven" if assumed else ""
-        )
-    seen = found.at_dots[found.used]
-    rows, columns = found.grid.shape
+def _in_words(light_map: UniformityMap, is_known_uneven: bool) -> str:
+    """How uneven the light is, in words."""
+    if light_map.is_even:
+        text = "the light is even over the screen"
+        if is_known_uneven:
+            text += ", where the bench file has it uneven"
+        return text
+    darkest = light_map.darkest_of_brightest
+    rows, columns = light_map.grid.shape
     return (
-        f"the darkest place has {seen.min() / seen.max():.1%} of the brightest's light, in a map of"
+        f"the darkest place has {darkest:.1%} of the brightest's light, in a map of"
         f" {rows} x {columns}"
     )
 
@@ -332,12 +385,13 @@ def _said(found: UniformityMap, assumed: bool) -> str:
 def _figures(
     context: StepContext, dots: DotLight, found: UniformityMap, against: UniformityMap
 ) -> dict[str, Figure]:
-    seen_light = found.at_dots[found.used]
+    wild_dots = int((~found.used).sum())
+    rows, columns = found.grid.shape
     figures: dict[str, Figure] = {
         "dots": len(dots.light),
-        "wild_dots": int((~found.used).sum()),
-        "grid": " x ".join(map(str, found.grid.shape)),
-        "darkest_of_brightest": float(seen_light.min() / seen_light.max()),
+        "wild_dots": wild_dots,
+        "grid": f"{rows} x {columns}",
+        "darkest_of_brightest": found.darkest_of_brightest,
         "change_rms_mag": found.rms_mag,
         "off_bench_file_rms_mag": against.rms_mag,
         "left_rms_mag": found.left_mag,
@@ -346,15 +400,14 @@ def _figures(
     }
     if context.truth is not None:
         monitor = context.truth.config.monitor
-        true = bench_calibration(context.truth.config, context.truth.folder).uniformity_map(
-            monitor.resolution_px
-        )
+        calibration = bench_calibration(context.truth.config, context.truth.folder)
+        true_map = calibration.uniformity_map(monitor.resolution_px)
         if monitor.resolution_px == context.resolution_px:
-            if true is None:
-                its = np.ones(len(dots.light))
-            else:
-                its = true[dots.y, dots.x].astype(np.float64)
-            figures["truth_rms_mag"] = float(np.std(magnitude(found.at_dots / its)))
+            true_light = np.ones(len(dots.light))
+            if true_map is not None:
+                true_light = true_map[dots.y, dots.x].astype(np.float64)
+            error_mag = magnitude(found.at_dots / true_light)
+            figures["truth_rms_mag"] = float(np.std(error_mag))
     return figures
 
 
@@ -368,8 +421,7 @@ def _unsaturated(
     """The images of lattices, each from its first dot (x, y) on, and their code.
 
     It is the brightest of the codes from the focus's down at which no dot saturates the tracker:
-    the
-    focus saw other dots, and light differs from place to place. Raises InputError where none is
+    the focus saw other dots, and light differs from place to place. Raises InputError where none is
     left.
     """
     code = dot_code(context)
@@ -399,30 +451,37 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     dark = context.read(dark_path)
     bad = dark > HOT_FILL * context.full_dn
     # a dot that reaches the detector's edge has lost light
-    bad[[0, -1]], bad[:, [0, -1]] = True, True
+    bad[[0, -1]] = True
+    bad[:, [0, -1]] = True
     # their first dots' places; shifts are in half periods
-    lattices = [[period // 2 * (1 + right), period // 2 * (1 + down)] for right, down in SHIFTS]
+    half_period = period // 2
+    lattices = []
+    for right, down in SHIFTS:
+        lattices.append([half_period * (1 + right), half_period * (1 + down)])
     _, looks = _unsaturated(context, dark, "lattice", lattices, period)
     noise_dn = noisiest_background(looks[-1].image).noise
     size = np.array(context.resolution_px)
     sums = [LatticeSums(np.array(firsts), period, reach, size) for firsts in lattices]
     images = [looked.image for looked in looks]
     _add_rows(geometry, sums, images, bad)
-    paths = [dark_path, *(looked.path for looked in looks)]
-    whole = [lattice.whole() for lattice in sums]
-    columns, rows, light = (np.concatenate(part) for part in zip(*whole, strict=True))
+    dots = [lattice.whole() for lattice in sums]
+    column = np.concatenate([of_lattice.column for of_lattice in dots])
+    row = np.concatenate([of_lattice.row for of_lattice in dots])
+    light = np.concatenate([of_lattice.light for of_lattice in dots])
     lit = light > 0
     if lit.sum() < MIN_DOTS:
         few = f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed"
         raise InputError(f"{few}; look at the geometry and the focus")
-    detector = context.file.config.tracker.detector
+    detector = context.detector
     dn = float(np.median(light[lit]))
     pixels = math.pi * (reach * ratio) ** 2
     # The noise of the dark frame is in that of the image above it; PRNU averages over a dot's
     # pixels.
-    shared = detector.prnu**2 / (4 * math.pi * sigma_px**2)
-    noise = math.sqrt((dn / detector.gain_e_per_dn + pixels * noise_dn**2) / dn**2 + shared)
-    return DotLight(columns[lit], rows[lit], light[lit], MAG_PER_RELATIVE * noise), tuple(paths)
+    sum_dn2 = dn / detector.gain_e_per_dn + pixels * noise_dn**2
+    response2 = detector.prnu**2 / (4 * math.pi * sigma_px**2)
+    noise = math.sqrt(sum_dn2 / dn**2 + response2)
+    seen_dots = DotLight(column[lit], row[lit], light[lit], MAG_PER_RELATIVE * noise)
+    return seen_dots, (dark_path, *(looked.path for looked in looks))
 
 
 def _shown(firsts: list[int], period: int, code: int, resolution_px: tuple[int, int]) -> CodeImage:
@@ -454,29 +513,34 @@ class LatticeSums:
         self._reach = reach
         self._counts = (size - firsts - DOT_PX // 2 - 1) // period + 1
         total = int(self._counts[0] * self._counts[1])
-        self._light, self._pixels, self._bad = (np.zeros(total) for _ in range(3))
+        self._light = np.zeros(total)
+        self._pixels = np.zeros(total)
+        self._bad = np.zeros(total)
 
     def add(self, looked_at: FloatArray, image: FloatArray, bad: BoolArray) -> None:
         """Add pixels (n,) of the tracker, which look at places (2, n) on the monitor, px."""
         firsts = self._firsts
         counts = self._counts
         total = len(self._light)
+        # what looks past the screen is far from every dot
         place = (np.nan_to_num(looked_at, nan=-1e9) - firsts[:, None]) / self._period
         nearest = np.rint(place)
-        inside = (nearest >= 0).all(axis=0) & (nearest[0] < counts[0]) & (nearest[1] < counts[1])
-        inside &= np.hypot(*(place - nearest)) * self._period <= self._reach
-        index = (nearest[1][inside] * counts[0] + nearest[0][inside]).astype(np.intp)
-        self._light += np.bincount(index, image[inside], minlength=total)
-        self._pixels += np.bincount(index, minlength=total)
-        self._bad += np.bincount(index, bad[inside], minlength=total)
+        column, row = nearest
+        inside = (nearest >= 0).all(axis=0) & (column < counts[0]) & (row < counts[1])
+        distance = np.hypot(*(place - nearest)) * self._period
+        inside &= distance <= self._reach
+        dot = (row[inside] * counts[0] + column[inside]).astype(np.intp)
+        self._light += np.bincount(dot, image[inside], minlength=total)
+        self._pixels += np.bincount(dot, minlength=total)
+        self._bad += np.bincount(dot, bad[inside], minlength=total)
 
     def whole(self) -> DotSums:
         """The dots without a bad pixel in reach."""
-        which = np.flatnonzero((self._pixels > 0) & (self._bad == 0))
+        dot = np.flatnonzero((self._pixels > 0) & (self._bad == 0))
+        row, column = np.divmod(dot, self._counts[0])
+        first_x, first_y = self._firsts
         return DotSums(
-            self._firsts[0] + which % self._counts[0] * self._period,
-            self._firsts[1] + which // self._counts[0] * self._period,
-            self._light[which],
+            first_x + column * self._period, first_y + row * self._period, self._light[dot]
         )
 
 
@@ -500,42 +564,38 @@ def map_of(dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) ->
     """The simplest map of light (n,) at the dots: the coarsest grid that no finer one beats
     significantly.
     """
-    width, height = resolution_px
-    shapes = [(1, 1), *((rows, max(round(rows * width / height), 1)) for rows in ROWS)]
-    determined = [shape for shape in shapes if math.prod(shape) * DOTS_A_FIELD <= len(light)]
-    shapes = determined or shapes[:1]
-    designs = [_design(dots, shape, resolution_px) for shape in shapes]
-    relative = light / np.median(light)
-    used = _tame(relative, designs[-1], shapes[-1])
-    fold = np.random.default_rng(SEED).integers(0, FOLDS, len(light))
-    squares = [
-        _held_out(relative, design, shape, used, fold)
-        for design, shape in zip(designs, shapes, strict=True)
-    ]
-    best = min(squares, key=lambda square: float(square[used].mean()))
+    maps = _Maps.of(dots, light, resolution_px)
+    used = maps.used
+    squares = maps.held_out_squares()
+    best = min(squares, key=lambda of_map: float(of_map.mean()))
     # the coarsest grid that the best one does not surely beat
     place = 0
-    while _is_surely_larger(squares[place][used], best[used]):
+    while _is_surely_larger(squares[place], best):
         place += 1
-    grid = _fitted(relative[used], designs[place][used], shapes[place])
-    square = float(squares[place][used].mean())
+    design = maps.designs[place]
+    shape = maps.shapes[place]
+    grid = _fitted(maps.relative[used], design[used], shape)
+    square = float(squares[place].mean())
     count = int(used.sum())
-    error = float(squares[place][used].std()) / math.sqrt(count)
-    freedoms = _Freedoms(designs, shapes, used)
+    error = float(squares[place].std()) / math.sqrt(count)
+    freedom = maps.freedom(place)
     missed = 0.0
-    if finer := range(place + 1, len(shapes)):
-        nearest = min(finer, key=lambda k: float(squares[k][used].mean()))
-        gain = (squares[place] - squares[nearest])[used]
+    finer = range(place + 1, len(maps.shapes))
+    if finer:
+        nearest = min(finer, key=lambda k: float(squares[k].mean()))
+        gain = squares[place] - squares[nearest]
         # A finer map errs more by its fields' own noise, which hides as much of what it shows.
-        noise = square * (freedoms.of(nearest) - freedoms.of(place)) / count
-        missed = _not_negative(float(gain.mean()) + noise, float(gain.std()) / math.sqrt(count))
+        noise = square * (maps.freedom(nearest) - freedom) / count
+        gain_error = float(gain.std()) / math.sqrt(count)
+        missed = _not_negative(float(gain.mean()) + noise, gain_error)
+    fit_variance = square * freedom / count
     return UniformityMap(
-        grid.reshape(shapes[place]),
-        designs[place] @ grid,
+        grid.reshape(shape),
+        design @ grid,
         left_mag=MAG_PER_RELATIVE * math.sqrt(square),
         left_error_mag2=MAG_PER_RELATIVE**2 * error,
         used=used,
-        fit_mag=MAG_PER_RELATIVE * math.sqrt(square * freedoms.of(place) / count),
+        fit_mag=MAG_PER_RELATIVE * math.sqrt(fit_variance),
         missed_mag=MAG_PER_RELATIVE * math.sqrt(missed),
     )
 
@@ -546,25 +606,54 @@ def _is_surely_larger(squares: FloatArray, others: FloatArray) -> bool:
     return bool(more.mean() > SURE * more.std() / math.sqrt(len(more)))
 
 
-def _not_negative(found: float, error: float) -> float:
-    """The mean of a square that was found as `found` with a normal `error`, and cannot be
-    negative.
+def _not_negative(square: float, error: float) -> float:
+    """The expectation of a mean square that was measured as `square` with a normal `error`, and
+    cannot be negative.
     """
     if error <= 0:
-        return max(found, 0.0)
-    place = found / error
-    log_ratio = -(place**2) / 2 - float(log_ndtr(place)) - math.log(2 * math.pi) / 2
-    return max(found + error * math.exp(log_ratio), 0.0)
+        return max(square, 0.0)
+    place = square / error
+    # the normal density over its integral, at `place`: the mean of a normal cut at 0
+    log_density = -(place**2) / 2
+    log_ratio = log_density - float(log_ndtr(place)) - math.log(2 * math.pi) / 2
+    return max(square + error * math.exp(log_ratio), 0.0)
 
 
-class _Freedoms(NamedTuple):
-    """The designs of maps (dots, fields) with their shapes, and the dots that are used."""
+@dataclass(frozen=True, slots=True)
+class _Maps:
+    """Maps from coarse to fine: their shapes (rows, columns) and designs (dots, fields), the dots'
+    light relative to its median, and the dots that are used.
+    """
 
-    designs: list[Any]
     shapes: list[tuple[int, int]]
+    designs: list[Any]
+    relative: FloatArray
     used: BoolArray
 
-    def of(self, place: int) -> float:
+    @classmethod
+    def of(cls, dots: DotLight, light: FloatArray, resolution_px: tuple[int, int]) -> "_Maps":
+        """Those that the dots can determine."""
+        width, height = resolution_px
+        shapes = [(1, 1)]
+        for rows in ROWS:
+            columns = max(round(rows * width / height), 1)
+            if rows * columns * DOTS_A_FIELD <= len(light):
+                shapes.append((rows, columns))
+        designs = [_design(dots, shape, resolution_px) for shape in shapes]
+        relative = light / np.median(light)
+        used = _tame(relative, designs[-1], shapes[-1])
+        return cls(shapes, designs, relative, used)
+
+    def held_out_squares(self) -> list[FloatArray]:
+        """Squared relative errors of the used dots in each map made without them."""
+        fold = np.random.default_rng(SEED).integers(0, FOLDS, len(self.relative))
+        squares = []
+        for shape, design in zip(self.shapes, self.designs, strict=True):
+            of_map = _held_out(self.relative, design, shape, self.used, fold)
+            squares.append(of_map[self.used])
+        return squares
+
+    def freedom(self, place: int) -> float:
         """How many fields the dots determine: the trace of the fit's matrix from light to map."""
         design = self.designs[place][self.used]
         normal = (design.T @ design).toarray()
@@ -578,15 +667,18 @@ def _design(dots: DotLight, shape: tuple[int, int], resolution_px: tuple[int, in
     """
     from scipy.sparse import csr_array
 
-    across = _two(weights_of_grid(resolution_px[0], shape[1])[dots.x])
-    down = _two(weights_of_grid(resolution_px[1], shape[0])[dots.y])
-    dot = np.arange(len(dots.x))
-    sides = [(y, x) for y in down for x in across]
-    fields = np.concatenate([y[0] * shape[1] + x[0] for y, x in sides])
-    weights = np.concatenate([y[1] * x[1] for y, x in sides])
-    return csr_array(
-        (weights, (np.tile(dot, len(sides)), fields)), shape=(len(dot), math.prod(shape))
-    )
+    rows, columns = shape
+    across = _two(weights_of_grid(resolution_px[0], columns)[dots.x])
+    down = _two(weights_of_grid(resolution_px[1], rows)[dots.y])
+    fields = []
+    weights = []
+    for row, row_weight in down:
+        for column, column_weight in across:
+            fields.append(row * columns + column)
+            weights.append(row_weight * column_weight)
+    dot = np.tile(np.arange(len(dots.x)), len(fields))
+    entries = (np.concatenate(weights), (dot, np.concatenate(fields)))
+    return csr_array(entries, shape=(len(dots.x), rows * columns))
 
 
 def _two(weights: FloatArray) -> list[tuple[IntArray, FloatArray]]:
@@ -595,8 +687,11 @@ def _two(weights: FloatArray) -> list[tuple[IntArray, FloatArray]]:
     """
     row = np.arange(len(weights))
     last = weights.shape[1] - 1
-    lower_field = np.minimum((weights != 0).argmax(axis=1), max(last - 1, 0))
-    return [(field, weights[row, field]) for field in (lower_field, lower_field + 1)[: last + 1]]
+    lower = np.minimum((weights != 0).argmax(axis=1), max(last - 1, 0))
+    lower_weight = weights[row, lower]
+    if last == 0:
+        return [(lower, lower_weight)]
+    return [(lower, lower_weight), (lower + 1, weights[row, lower + 1])]
 
 
 def _fitted(light: FloatArray, design: Any, shape: tuple[int, int]) -> FloatArray:
@@ -613,11 +708,14 @@ def _smoothness(shape: tuple[int, int]) -> FloatArray:
     """The penalty (fields, fields) on differences between neighbouring fields."""
     number = np.arange(math.prod(shape)).reshape(shape)
     penalty = np.zeros((number.size, number.size))
-    for field_number, other in ((number[1:], number[:-1]), (number[:, 1:], number[:, :-1])):
+    rows = (number[1:], number[:-1])
+    columns = (number[:, 1:], number[:, :-1])
+    for field_number, neighbour in (rows, columns):
         a = field_number.ravel()
-        b = other.ravel()
-        np.add.at(penalty, (np.concatenate([a, b]), np.concatenate([a, b])), JOINED)
-        np.add.at(penalty, (np.concatenate([a, b]), np.concatenate([b, a])), -JOINED)
+        b = neighbour.ravel()
+        both = np.concatenate([a, b])
+        np.add.at(penalty, (both, both), JOINED)
+        np.add.at(penalty, (both, np.concatenate([b, a])), -JOINED)
     return penalty
 
 
@@ -625,10 +723,10 @@ def _tame(light: FloatArray, design: Any, shape: tuple[int, int]) -> BoolArray:
     """A mask of the dots (n,) that are no outliers from the finest map."""
     used = np.ones(len(light), dtype=np.bool_)
     for _ in range(3):
-        off = light / (design @ _fitted(light[used], design[used], shape)) - 1
-        used = np.abs(off) < WILD_SIGMAS * max(
-            MAD_TO_SIGMA * float(np.median(np.abs(off[used]))), 1e-6
-        )
+        fields = _fitted(light[used], design[used], shape)
+        off = np.abs(light / (design @ fields) - 1)
+        sigma = MAD_TO_SIGMA * float(np.median(off[used]))
+        used = off < WILD_SIGMAS * max(sigma, 1e-6)
     return used
 
 
@@ -638,11 +736,11 @@ def _held_out(
     """The squared relative error of each dot (n,) in a map made without it."""
     squares = np.zeros(len(light))
     for fold_number in range(FOLDS):
-        out = fold == fold_number
-        is_fitted = used & (fold != fold_number)
-        squares[out] = (
-            light[out] / (design[out] @ _fitted(light[is_fitted], design[is_fitted], shape)) - 1
-        ) ** 2
+        is_held_out = fold == fold_number
+        is_fitted = used & ~is_held_out
+        fields = _fitted(light[is_fitted], design[is_fitted], shape)
+        predicted = design[is_held_out] @ fields
+        squares[is_held_out] = (light[is_held_out] / predicted - 1) ** 2
     return squares
 
 
@@ -650,22 +748,25 @@ def draw_uniformity(path: Path, dots: DotLight, found: UniformityMap, finding: s
     """Draw how much fainter each used dot is than the brightest place, and than the map, over
     the screen.
     """
-    x, y, light, mapped = (
-        values[found.used]
-        for values in (dots.x, dots.y, dots.light / np.median(dots.light), found.at_dots)
-    )
-    panels = {
-        "fainter than the brightest place [mag]": np.asarray(magnitude(light / mapped.max())),
-        "fainter than the map has it [mag]": np.asarray(magnitude(light / mapped)),
-    }
-    with chart(path, finding, panels=2) as both:
-        for axes, (name, off_mag) in zip(both, panels.items(), strict=True):
-            low, high = (float(value) for value in np.percentile(off_mag, (0.5, 99.5)))
-            shown = axes.scatter(
-                x, y, c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=max(high, low + 1e-4)
-            )
-            shown.set_rasterized(True)  # thousands of dots
-            axes.figure.colorbar(shown, ax=axes, label=name)
-            axes.set(aspect="equal", ylabel="monitor y [px]")
-            axes.invert_yaxis()
-        both[-1].set_xlabel("monitor x [px]")
+    used = found.used
+    x = dots.x[used]
+    y = dots.y[used]
+    light = (dots.light / np.median(dots.light))[used]
+    mapped = found.at_dots[used]
+    with chart(path, finding, panels=2) as (against_brightest, against_map):
+        name = "fainter than the brightest place [mag]"
+        _scatter(against_brightest, x, y, np.asarray(magnitude(light / mapped.max())), name)
+        name = "fainter than the map has it [mag]"
+        _scatter(against_map, x, y, np.asarray(magnitude(light / mapped)), name)
+        against_map.set_xlabel("monitor x [px]")
+
+
+def _scatter(axes: Any, x: IntArray, y: IntArray, off_mag: FloatArray, name: str) -> None:
+    """Draw dots over the screen, coloured by a magnitude; a few outliers do not set the scale."""
+    low, high = np.percentile(off_mag, (0.5, 99.5)).tolist()
+    highest = max(high, low + 1e-4)
+    dots = axes.scatter(x, y, c=off_mag, s=8, cmap="viridis_r", vmin=low, vmax=highest)
+    dots.set_rasterized(True)  # thousands of dots
+    axes.figure.colorbar(dots, ax=axes, label=name)
+    axes.set(aspect="equal", ylabel="monitor y [px]")
+    axes.invert_yaxis()

@@ -97,6 +97,7 @@ def dots_of_frames(frames: int, dots_per_frame: int) -> int:
 
 
 def _weight(frames: int) -> int:
+    """In how many of so many frames a dot is lit."""
     return int(np.clip(round(LIT_SHARE * frames), MIN_LIT, MAX_LIT))
 
 
@@ -105,16 +106,14 @@ def _codes(count: int, frames: int, rng: np.random.Generator) -> BoolArray:
     InputError for too many.
     """
     weight = _weight(frames)
-    tried = (
-        _codes_apart(count, frames, weight, distance, rng) for distance in range(2 * weight, 0, -2)
+    for distance in range(2 * weight, 0, -2):
+        lit = _codes_apart(count, frames, weight, distance, rng)
+        if lit is not None:
+            return lit
+    raise InputError(
+        f"--dots: {count} dots are more than the codes of {frames} frames; write more --frames"
+        " or fewer --dots"
     )
-    lit = next((codes for codes in tried if codes is not None), None)
-    if lit is None:
-        raise InputError(
-            f"--dots: {count} dots are more than the codes of {frames} frames; write more --frames"
-            " or fewer --dots"
-        )
-    return lit
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +138,8 @@ class SeenScreen:
     @property
     def dot_sigma_px(self) -> float:
         """The sigma of a dot in the tracker's image: the PSF's and a square's."""
-        return math.hypot(self.psf_sigma_px, DOT_PX * self.tracker_px_a_monitor_px / math.sqrt(12))
+        square_sigma_px = DOT_PX * self.tracker_px_a_monitor_px / math.sqrt(12)
+        return math.hypot(self.psf_sigma_px, square_sigma_px)
 
     @property
     def turn_deg(self) -> float:
@@ -148,55 +148,51 @@ class SeenScreen:
         """
         low, high = self.box()
         x_px, y_px = (low + high) / 2
-        rays = self.monitor.rays(np.array([x_px, x_px + 1]), np.array([y_px, y_px]))
-        u, v = self.tracker.project(rays @ self.tracker.cam_to_image.T)
-        return math.degrees(math.atan2(v[1] - v[0], u[1] - u[0]))
+        # a pixel and the next one to its right
+        u, v = self._in_tracker(np.array([x_px, x_px + 1]), np.array([y_px, y_px]))
+        across = u[1] - u[0]
+        down = v[1] - v[0]
+        return math.degrees(math.atan2(down, across))
+
+    def _in_tracker(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where the tracker sees monitor pixels (n,): its pixels x and y (n,)."""
+        rays = self.monitor.rays(x_px, y_px)
+        return self.tracker.project(rays @ self.tracker.cam_to_image.T)
 
     def shows(self, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
         """Whether a whole dot at monitor pixels (n,) is on the screen and in the tracker's field
         (n,).
         """
-        width, height = self.monitor.resolution_px
-        on_screen = (
-            (x_px >= EDGE_PX)
-            & (x_px <= width - 1 - EDGE_PX)
-            & (y_px >= EDGE_PX)
-            & (y_px <= height - 1 - EDGE_PX)
-        )
-        rays = self.monitor.rays(x_px, y_px)
-        u, v = self.tracker.project(rays @ self.tracker.cam_to_image.T)
-        wide, high = self.tracker.resolution_px
-        margin_px = -UNSURE_SHARE * max(wide, high)
+        u, v = self._in_tracker(x_px, y_px)
+        margin_px = -UNSURE_SHARE * max(self.tracker.resolution_px)
         if self.is_sure:
             # A dot whose window leaves the image has a biased centroid, and is dropped by who
             # measures it.
             half_dot_px = DOT_PX / 2 * self.tracker_px_a_monitor_px
-            margin_px = max(half_dot_px + EDGE_PX, dot_centroids(self.dot_sigma_px).radius_px + 1)
-        with np.errstate(invalid="ignore"):
-            in_field = (
-                (u >= margin_px)
-                & (u <= wide - 1 - margin_px)
-                & (v >= margin_px)
-                & (v <= high - 1 - margin_px)
-            )
-        return np.asarray(on_screen & in_field)
+            window_px = dot_centroids(self.dot_sigma_px).radius_px + 1
+            margin_px = max(half_dot_px + EDGE_PX, window_px)
+        on_screen = _is_inside(x_px, y_px, self.monitor.resolution_px, EDGE_PX)
+        in_field = _is_inside(u, v, self.tracker.resolution_px, margin_px)
+        return on_screen & in_field
 
     def box(self) -> tuple[FloatArray, FloatArray]:
         """The lower and upper corner (2,) of the part of the screen that is seen, monitor px.
         Raises InputError for none.
         """
-        width, height = self.monitor.resolution_px
         wide, high = self.tracker.resolution_px
         reach = UNSURE_SHARE * max(wide, high)
-        along_x, along_y = (np.linspace(-reach, size - 1 + reach, GRID) for size in (wide, high))
-        u, v = (part.ravel() for part in np.meshgrid(along_x, along_y))
+        u_ends = (-reach, wide - 1 + reach)
+        v_ends = (-reach, high - 1 + reach)
+        u, v = _grid(u_ends, v_ends)
         rays = self.tracker.rays(u, v)
         of_field = np.stack(self.monitor.project(rays @ self.monitor.cam_to_image.T), axis=1)
-        screen_x, screen_y = (
-            np.linspace(EDGE_PX, size - 1 - EDGE_PX, GRID) for size in (width, height)
-        )
-        of_screen = np.stack([part.ravel() for part in np.meshgrid(screen_x, screen_y)], axis=1)
-        places = np.concatenate([of_field[np.isfinite(of_field).all(axis=1)], of_screen])
+        has_place = np.isfinite(of_field).all(axis=1)
+        width, height = self.monitor.resolution_px
+        x_ends = (EDGE_PX, width - 1 - EDGE_PX)
+        y_ends = (EDGE_PX, height - 1 - EDGE_PX)
+        screen_x, screen_y = _grid(x_ends, y_ends)
+        of_screen = np.stack([screen_x, screen_y], axis=1)
+        places = np.concatenate([of_field[has_place], of_screen])
         visible_px = places[self.shows(*places.T)]
         if not len(visible_px):
             raise InputError(
@@ -206,17 +202,37 @@ class SeenScreen:
         return visible_px.min(axis=0), visible_px.max(axis=0)
 
 
+def _is_inside(
+    x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], margin_px: float
+) -> BoolArray:
+    """Which places (n,) are within an image's outermost pixels, by a margin or more."""
+    width, height = resolution_px
+    with np.errstate(invalid="ignore"):
+        across = (x_px >= margin_px) & (x_px <= width - 1 - margin_px)
+        down = (y_px >= margin_px) & (y_px <= height - 1 - margin_px)
+    return np.asarray(across & down)
+
+
+def _grid(
+    x_ends: tuple[float, float], y_ends: tuple[float, float]
+) -> tuple[FloatArray, FloatArray]:
+    """Places (GRID^2,) between these ends, x and y."""
+    columns = np.linspace(*x_ends, GRID)
+    rows = np.linspace(*y_ends, GRID)
+    x, y = np.meshgrid(columns, rows)
+    return x.ravel(), y.ravel()
+
+
 def lit_for(seen: SeenScreen) -> int:
     """How many dots of a frame the tracker can tell apart on the part of the screen that it
     sees, through its PSF.
     """
     ratio = seen.tracker_px_a_monitor_px
-    apart_px = max(
-        MIN_APART_PX, APART_SIDES * DOT_PX * ratio + max(WINGS_PX, WINGS_SIGMAS * seen.psf_sigma_px)
-    )
+    wings_px = max(WINGS_PX, WINGS_SIGMAS * seen.psf_sigma_px)
+    apart_px = max(MIN_APART_PX, APART_SIDES * DOT_PX * ratio + wings_px)
     low, high = seen.box()
-    x, y = np.meshgrid(*np.linspace(low, high, GRID).T)
-    shown_share = float(seen.shows(x.ravel(), y.ravel()).mean())
+    x, y = _grid((low[0], high[0]), (low[1], high[1]))
+    shown_share = float(seen.shows(x, y).mean())
     area_px = float(np.prod(high - low)) * shown_share * ratio**2
     return int(np.clip(area_px / apart_px**2, MIN_LIT_DOTS, MAX_LIT_DOTS))
 
@@ -243,25 +259,23 @@ def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
     Raises InputError for few.
     """
     low, high = seen.box()
-    k = np.arange(TRIED * count)
-    unit = np.column_stack([(0.5 + k / GOLDEN) % 1.0, (0.5 + k / GOLDEN**2) % 1.0])
-    edge = np.linspace(0.0, 1.0, GRID)
-    rim = np.concatenate(
-        [np.column_stack(part) for part in ((edge, 0 * edge), (edge, 1 + 0 * edge))]
-    )
-    unit = np.concatenate([unit, rim, rim[:, ::-1]])
-    places = np.rint(low + unit * (high - low))
+    size = high - low
+    tried = TRIED * count
+    places = np.rint(low + np.concatenate([_even(tried), _rim()]) * size)
     is_seen = seen.shows(*places.T)
-    inside = places[: len(k)][is_seen[: len(k)]]
+    inside = places[:tried][is_seen[:tried]]
     turns = 2 * np.pi * (np.arange(BORDER_DIRECTIONS) + 0.5) / BORDER_DIRECTIONS
-    directions = np.column_stack([np.cos(turns), np.sin(turns)]) / np.maximum(high - low, 1.0)
-    outermost = places[is_seen][(places[is_seen] @ directions.T).argmax(axis=0)]
+    circle = np.column_stack([np.cos(turns), np.sin(turns)])
+    directions = circle / np.maximum(size, 1.0)
+    seen_places = places[is_seen]
+    outermost = seen_places[(seen_places @ directions.T).argmax(axis=0)]
     chosen = np.unique(outermost, axis=0)[:count]
     # Two dots at nearly one place would be taken for one dot that blinks both codes.
-    area_px = float(np.prod(high - low)) * len(inside) / len(k)
+    area_px = float(np.prod(size)) * len(inside) / tried
     apart_px = 0.5 * math.sqrt(area_px / count)
-    far = np.hypot(*(inside[:, None] - chosen[None]).transpose(2, 0, 1)).min(axis=1) > apart_px
-    chosen = np.concatenate([chosen, inside[far]])[:count]
+    dx_px, dy_px = (inside[:, None] - chosen[None]).transpose(2, 0, 1)
+    is_apart = np.hypot(dx_px, dy_px).min(axis=1) > apart_px
+    chosen = np.concatenate([chosen, inside[is_apart]])[:count]
     if len(chosen) < MIN_DOTS:
         raise InputError(
             f"the part of the screen that the tracker sees holds {len(chosen)} dots and {MIN_DOTS}"
@@ -270,28 +284,52 @@ def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
     return chosen[:, 0], chosen[:, 1]
 
 
+def _even(count: int) -> FloatArray:
+    """Places (count, 2) spread evenly over the unit square, each next one where space is left."""
+    k = np.arange(count)
+    x = (0.5 + k / GOLDEN) % 1.0
+    y = (0.5 + k / GOLDEN**2) % 1.0
+    return np.column_stack([x, y])
+
+
+def _rim() -> FloatArray:
+    """Places (n, 2) along the edges of the unit square."""
+    edge = np.linspace(0.0, 1.0, GRID)
+    top = np.column_stack([edge, np.zeros(GRID)])
+    bottom = np.column_stack([edge, np.ones(GRID)])
+    horizontal = np.concatenate([top, bottom])
+    return np.concatenate([horizontal, horizontal[:, ::-1]])
+
+
 def joined(first: DotPlan, second: DotPlan) -> DotPlan:
     """One plan of two: the frames and the dots of the first, then those of the second."""
-    lit = np.zeros((len(first) + len(second), first.frames + second.frames), dtype=bool)
+    dots = len(first) + len(second)
+    frames = first.frames + second.frames
+    lit = np.zeros((dots, frames), dtype=bool)
     lit[: len(first), : first.frames] = first.lit
     lit[len(first) :, first.frames :] = second.lit
-    return DotPlan(
-        np.concatenate([first.x_px, second.x_px]), np.concatenate([first.y_px, second.y_px]), lit
-    )
+    x_px = np.concatenate([first.x_px, second.x_px])
+    y_px = np.concatenate([first.y_px, second.y_px])
+    return DotPlan(x_px, y_px, lit)
 
 
 def _codes_apart(
     count: int, frames: int, weight: int, distance: int, rng: np.random.Generator
 ) -> BoolArray | None:
+    """Codes (count, frames) that differ in so many frames, each by random search; None where that
+    finds none.
+    """
     codes = np.zeros((count, frames), dtype=bool)
     load = np.zeros(frames)
     for k in range(count):
         for _ in range(TRIES):
             # Frames with few dots so far are more likely to be chosen.
-            chosen = np.argsort(load + rng.uniform(0.0, 2.0 + k / frames, frames))[:weight]
+            chance = rng.uniform(0.0, 2.0 + k / frames, frames)
+            chosen = np.argsort(load + chance)[:weight]
             code = np.zeros(frames, dtype=bool)
             code[chosen] = True
-            if k == 0 or int((codes[:k] != code).sum(axis=1).min()) >= distance:
+            differing = (codes[:k] != code).sum(axis=1)
+            if k == 0 or int(differing.min()) >= distance:
                 break
         else:
             return None
@@ -304,9 +342,8 @@ def _places(resolution_px: tuple[int, int], count: int) -> tuple[FloatArray, Flo
     """Whole pixels spread evenly over the screen, its corners first, so that no corner is
     extrapolated.
     """
-    k = np.arange(max(count - 4, 0))
-    spread = np.column_stack([(0.5 + k / GOLDEN) % 1.0, (0.5 + k / GOLDEN**2) % 1.0])
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    spread = _even(max(count - len(corners), 0))
     unit = np.concatenate([corners, spread])[:count]
     size = np.array(resolution_px) - 1 - 2 * EDGE_PX
     if (size < 1).any():
@@ -325,12 +362,11 @@ def dot_image(
     """
     width, height = resolution_px
     image = np.zeros((height, width), dtype=np.uint16)
-    for x, y in zip(
-        plan.x_px[plan.lit[:, frame]].astype(int),
-        plan.y_px[plan.lit[:, frame]].astype(int),
-        strict=True,
-    ):
-        image[y - DOT_PX // 2 :, x - DOT_PX // 2 :][:DOT_PX, :DOT_PX] = white
+    lit = plan.lit[:, frame]
+    first_columns = plan.x_px[lit].astype(int) - DOT_PX // 2
+    first_rows = plan.y_px[lit].astype(int) - DOT_PX // 2
+    for column, row in zip(first_columns, first_rows, strict=True):
+        image[row:, column:][:DOT_PX, :DOT_PX] = white
     return image
 
 
@@ -363,14 +399,17 @@ def read_plan(path: Path) -> DotPlan:
         raise InputError(f"{path}: has no dot; {PLAN_ADVICE}")
     dots = sorted({dot for _, dot, _, _ in rows})
     place = {dot: k for k, dot in enumerate(dots)}
-    x_px = np.full(len(place), np.nan)
-    y_px = np.full(len(place), np.nan)
-    lit = np.zeros((len(place), max(frame for frame, *_ in rows) + 1), dtype=bool)
+    frames = max(frame for frame, *_ in rows) + 1
+    x_px = np.full(len(dots), np.nan)
+    y_px = np.full(len(dots), np.nan)
+    lit = np.zeros((len(dots), frames), dtype=bool)
     for frame, dot, x, y in rows:
         k = place[dot]
         if lit[k].any() and (x_px[k], y_px[k]) != (x, y):
             raise InputError(f"{path}: dot {dot} is at two places; {PLAN_ADVICE}")
-        x_px[k], y_px[k], lit[k, frame] = x, y, True
+        x_px[k] = x
+        y_px[k] = y
+        lit[k, frame] = True
     if not (np.isfinite(x_px).all() and np.isfinite(y_px).all()):
         raise InputError(f"{path}: a dot's place is no number; {PLAN_ADVICE}")
     return DotPlan(x_px, y_px, lit)
@@ -397,9 +436,8 @@ def show_dots(plan: DotPlan, monitor: Monitor, seconds: float | None, *, windowe
     screen_px = orientation.screen_px(monitor.resolution_px)
     white = 2**monitor.bits - 1
     triples = np.array([[0, 0, 0], [white, white, white]], dtype=np.uint16)
-    with Window(
-        WindowSettings(screen_px, monitor.bits, None if windowed else monitor.display)
-    ) as window:
+    display = None if windowed else monitor.display
+    with Window(WindowSettings(screen_px, monitor.bits, display)) as window:
         view = ScreenView(
             monitor.resolution_px, window.size_px, monitor.bits, orientation, triples=triples
         )

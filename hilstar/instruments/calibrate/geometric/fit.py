@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.instruments.calibrate.geometric.dots import DotPlan
@@ -90,7 +90,8 @@ class Model:
     @property
     def size(self) -> int:
         """How many numbers the model has."""
-        return len(self.names) + len(self.tracker_names) + 3 * (self.poses - 1)
+        lens_numbers = len(self.names) + len(self.tracker_names)
+        return lens_numbers + 3 * (self.poses - 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,42 +113,45 @@ def geometry_of(
     (poses, 4).
     """
     values = dict.fromkeys(STEPS, 0.0)
-    values |= {
-        name: STEPS[name] * float(number)
-        for name, number in zip(model.names, numbers, strict=False)
-    }
+    for name, number in zip(model.names, numbers, strict=False):
+        values[name] = STEPS[name] * float(number)
     # The principal point moves with a turn, so that the image's middle stays: else the loss has one
     # long valley in the two.
-    follow = (
-        np.array([values["centre_y"], -values["centre_x"], 0.0]) / nominal.monitor.focal_length_px
-    )
+    shift_px = np.array([values["centre_y"], -values["centre_x"], 0.0])
+    follow = shift_px / nominal.monitor.focal_length_px
     turn = np.array([values["rotation_x"], values["rotation_y"], values["rotation_z"]]) + follow
     q = multiply(from_rotation_vector(turn), nominal.q_cam_to_mon)
     cx, cy = nominal.monitor.principal_point_px
-    tilt = (values["tilt_x"], values["tilt_y"])
-    lens = Lens((values["k1"], values["k2"], values["k3"]), (values["p1"], values["p2"]), tilt)
+    lens = None
+    if "k1" in model.names:
+        radial = (values["k1"], values["k2"], values["k3"])
+        tilt = (values["tilt_x"], values["tilt_y"])
+        lens = Lens(radial, (values["p1"], values["p2"]), tilt)
     monitor = Camera(
-        nominal.monitor.resolution_px,
-        nominal.monitor.focal_length_px * float(np.exp(values["log_focal"])),
-        (cx + values["centre_x"], cy + values["centre_y"]),
-        to_matrix(q),
-        lens if "k1" in model.names else None,
+        resolution_px=nominal.monitor.resolution_px,
+        focal_length_px=nominal.monitor.focal_length_px * float(np.exp(values["log_focal"])),
+        principal_point_px=(cx + values["centre_x"], cy + values["centre_y"]),
+        cam_to_image=to_matrix(q),
+        lens=lens,
     )
+    tracker_numbers = numbers[len(model.names) :]
     tracker = nominal.tracker
-    rest = numbers[len(model.names) :]
     if model.tracker_names:
-        lens_values = {
-            name: TRACKER_STEPS[name] * float(n)
-            for name, n in zip(model.tracker_names, rest, strict=False)
-        }
-        radial = (lens_values["tracker_k1"], lens_values["tracker_k2"], 0.0)
-        tangential = (lens_values["tracker_p1"], lens_values["tracker_p2"])
-        tracker = replace(tracker, lens=Lens(radial, tangential))
-    steps = POSE_STEP_RAD * rest[len(model.tracker_names) :].reshape(-1, 3)
-    turned = []
-    for step, pose in zip(steps, q_poses[1:], strict=True):
+        tracker = replace(tracker, lens=_tracker_lens(model.tracker_names, tracker_numbers))
+    pose_numbers = tracker_numbers[len(model.tracker_names) :].reshape(-1, 3)
+    turned = [q_poses[0]]
+    for step, pose in zip(POSE_STEP_RAD * pose_numbers, q_poses[1:], strict=True):
         turned.append(multiply(from_rotation_vector(step), pose))
-    return Geometry(monitor, q, tracker, np.array([q_poses[0], *turned]))
+    return Geometry(monitor, q, tracker, np.array(turned))
+
+
+def _tracker_lens(names: tuple[str, ...], numbers: FloatArray) -> Lens:
+    """The tracker's own lens by the numbers of its parameters; further ones are not read."""
+    values = {}
+    for name, number in zip(names, numbers, strict=False):
+        values[name] = TRACKER_STEPS[name] * float(number)
+    radial = (values["tracker_k1"], values["tracker_k2"], 0.0)
+    return Lens(radial, (values["tracker_p1"], values["tracker_p2"]))
 
 
 def directions_in_cam(
@@ -164,7 +168,7 @@ def directions_in_cam(
 class MatchedDots:
     """Centroids (n,) and the number of each one's dot (n,)."""
 
-    seen: Observed
+    centroids: Observed
     dot: IntArray
 
     def __len__(self) -> int:
@@ -172,7 +176,7 @@ class MatchedDots:
 
     def at(self, chosen: IntArray) -> "MatchedDots":
         """The matches at indices `chosen`."""
-        return MatchedDots(self.seen.at(chosen), self.dot[chosen])
+        return MatchedDots(self.centroids.at(chosen), self.dot[chosen])
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,24 +222,27 @@ class _Loss:
     data: MatchedDots
 
     def geometry(self, numbers: FloatArray) -> Geometry:
-        lens = numbers[: self.model.size]
-        field = numbers[self.model.size :]
-        geometry = geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens)
+        lens_numbers = numbers[: self.model.size]
+        geometry = geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens_numbers)
         if not self.field_degree:
             return geometry
-        x, y = field.reshape(2, -1)
+        x, y = numbers[self.model.size :].reshape(2, -1)
         camera = geometry.monitor
-        residual = ResidualField.of_terms(x, y, self.field_degree, camera.resolution_px)
-        return replace(
-            geometry, monitor=replace(camera, lens=replace(camera.lens or Lens(), field=residual))
-        )
+        field = ResidualField.of_terms(x, y, self.field_degree, camera.resolution_px)
+        lens = replace(camera.lens or Lens(), field=field)
+        return replace(geometry, monitor=replace(camera, lens=lens))
 
     def residuals(self, numbers: FloatArray) -> FloatArray:
+        """The residuals (2 n,) in sigmas, x then y, by numbers."""
         return self._off(self.geometry(numbers))
 
     def _off(self, geometry: Geometry, directions: FloatArray | None = None) -> FloatArray:
         off = residuals_sigma(self.problem, geometry, self.data, directions)
         return np.where(np.isfinite(off), off, FAR_SIGMA)
+
+    def _varied(self, numbers: FloatArray) -> Geometry:
+        """The cameras of the lens's and the poses' numbers, without the field."""
+        return geometry_of(self.model, self.problem.nominal, self.problem.q_poses, numbers)
 
     def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
         """Derivatives of the residuals by each number (2 n, numbers).
@@ -243,61 +250,65 @@ class _Loss:
         For the lens they are finite differences without the field, which hardly changes along a
         step; the field is linear.
         """
-        lens = numbers[: self.model.size]
-        pose_numbers = len(self.model.names) + len(self.model.tracker_names)
-        poses = (len(lens) - pose_numbers) // 3
-        # A pose turns its own centroids alone: one trial turns all poses about one axis.
-        turns = np.hstack([np.zeros((3, pose_numbers)), np.tile(np.eye(3), (1, poses))])[
-            : 3 * poses
-        ]
-        steps = DIFFERENCE * np.vstack([np.eye(pose_numbers, len(lens)), turns])
-        bare, *varied = (
-            geometry_of(self.model, self.problem.nominal, self.problem.q_poses, lens + n)
-            for n in (0 * lens, *steps)
-        )
-        seen_dots = self.data.seen
+        lens_numbers = numbers[: self.model.size]
+        first_pose = len(self.model.names) + len(self.model.tracker_names)
+        poses = (len(lens_numbers) - first_pose) // 3
+        centroids = self.data.centroids
+        bare = self._varied(lens_numbers)
         # the same for all terms of the monitor's camera
-        directions = directions_in_cam(bare, seen_dots.pose, seen_dots.x_px, seen_dots.y_px)
+        directions = directions_in_cam(bare, centroids.pose, centroids.x_px, centroids.y_px)
+        base = off
         if self.field_degree:
             base = self._off(bare, directions)
-        else:
-            base = off
-        offs = []
-        for number, geometry in enumerate(varied):
-            is_of_monitor = number < len(self.model.names)
-            offs.append(self._off(geometry, directions if is_of_monitor else None))
-        slope = np.stack([(trial - base) / DIFFERENCE for trial in offs], axis=1)
-        is_its = np.tile(seen_dots.pose, 2)[:, None] == np.repeat(np.arange(1, poses + 1), 3)
-        columns = np.hstack(
-            [
-                slope[:, :pose_numbers],
-                np.where(is_its, np.tile(slope[:, pose_numbers:], poses), 0.0),
-            ]
-        )
+        slopes = []
+        for number, step in enumerate(self._steps(first_pose, poses)):
+            geometry = self._varied(lens_numbers + step)
+            if number < len(self.model.names):
+                trial = self._off(geometry, directions)
+            else:
+                trial = self._off(geometry)
+            slopes.append((trial - base) / DIFFERENCE)
+        slope = np.stack(slopes, axis=1)
+        pose_of_number = np.repeat(np.arange(1, poses + 1), 3)
+        is_its = np.tile(centroids.pose, 2)[:, None] == pose_of_number
+        pose_slopes = np.where(is_its, np.tile(slope[:, first_pose:], poses), 0.0)
+        columns = np.hstack([slope[:, :first_pose], pose_slopes])
         if not self.field_degree:
             return columns
-        terms = np.nan_to_num(
-            field_terms(
-                *_places_px(bare, self.data, directions),
-                bare.monitor.resolution_px,
-                self.field_degree,
-            )
-        )
-        terms /= (self.problem.monitor_px_per_px * seen_dots.sigma_px * self.problem.noise_px)[
-            :, None
-        ]
+        x_px, y_px = _places_px(bare, self.data, directions)
+        terms = field_terms(x_px, y_px, bare.monitor.resolution_px, self.field_degree)
+        terms = np.nan_to_num(terms)
+        sigma_px = self.problem.monitor_px_per_px * centroids.sigma_px * self.problem.noise_px
+        terms /= sigma_px[:, None]
         return np.hstack([columns, _blocks(terms)])
 
+    def _steps(self, first_pose: int, poses: int) -> FloatArray:
+        """A step of each number, and of all poses about one axis: a pose turns its own centroids
+        alone, and one trial serves all.
+        """
+        size = first_pose + 3 * poses
+        lens_steps = np.eye(first_pose, size)
+        before = np.zeros((3, first_pose))
+        axes = np.tile(np.eye(3), (1, poses))
+        turns = np.hstack([before, axes])[: 3 * poses]
+        return np.asarray(DIFFERENCE * np.vstack([lens_steps, turns]))
+
     def prior(self, count: int) -> FloatArray:
-        weight = np.where(np.arange(count) < self.model.size, PRIOR, 1 / FIELD_PRIOR_PX)
-        for k, name in enumerate(self.model.tracker_names, start=len(self.model.names)):
-            weight[k] = ROUND_PRIOR if name in TRACKER_ROUND else PRIOR
+        """The prior's weights (count,) on the squares of the numbers."""
+        is_field = np.arange(count) >= self.model.size
+        weight = np.where(is_field, 1 / FIELD_PRIOR_PX, PRIOR)
+        first = len(self.model.names)
+        for k, name in enumerate(self.model.tracker_names):
+            if name in TRACKER_ROUND:
+                weight[first + k] = ROUND_PRIOR
         return weight**2
 
     def value(self, off: FloatArray, numbers: FloatArray) -> float:
+        """The loss: Huber's of the residuals, and the prior of the numbers."""
         size = np.abs(off)
         losses = np.where(size <= HUBER, 0.5 * size**2, HUBER * (size - HUBER / 2))
-        return float(losses.sum() + 0.5 * self.prior(len(numbers)) @ numbers**2)
+        prior_loss = 0.5 * self.prior(len(numbers)) @ numbers**2
+        return float(losses.sum() + prior_loss)
 
 
 def fit(
@@ -313,10 +324,12 @@ def fit(
     `start`, until a step gains less than `min_gain`.
     """
     loss = _Loss(problem, model, field_degree, data)
-    if start is None and field_degree:
-        lens = fit(problem, model, 0, data, min_gain=min_gain).numbers
-        start = np.concatenate([lens, np.zeros((field_degree + 1) * (field_degree + 2))])
-    numbers = _smallest(loss, np.zeros(model.size) if start is None else start, min_gain)
+    if start is None:
+        start = np.zeros(model.size)
+        if field_degree:
+            lens = fit(problem, model, 0, data, min_gain=min_gain).numbers
+            start = np.concatenate([lens, np.zeros((field_degree + 1) * (field_degree + 2))])
+    numbers = _smallest(loss, start, min_gain)
     return Fit(model, field_degree, numbers, loss.geometry(numbers))
 
 
@@ -331,8 +344,9 @@ def _smallest(loss: _Loss, numbers: FloatArray, min_gain: float) -> FloatArray:
         weight = np.minimum(1.0, HUBER / np.maximum(np.abs(off), HUBER))
         normal = slopes.T @ (weight[:, None] * slopes) + np.diag(prior)
         downhill = slopes.T @ (weight * off) + prior * numbers
+        diagonal = np.diag(np.diag(normal))
         for _ in range(MAX_DAMPINGS):
-            step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), -downhill)
+            step = np.linalg.solve(normal + damping * diagonal, -downhill)
             new_off = loss.residuals(numbers + step)
             new_value = loss.value(new_off, numbers + step)
             if new_value <= value:
@@ -361,17 +375,18 @@ def residuals_px(
     plan = problem.plan
     scale = problem.monitor_px_per_px
     x_px, y_px = _places_px(geometry, data, directions)
-    return (x_px - plan.x_px[data.dot]) / scale, (y_px - plan.y_px[data.dot]) / scale
+    dx_px = (x_px - plan.x_px[data.dot]) / scale
+    dy_px = (y_px - plan.y_px[data.dot]) / scale
+    return dx_px, dy_px
 
 
 def residuals_sigma(
     problem: Problem, geometry: Geometry, data: MatchedDots, directions: FloatArray | None = None
 ) -> FloatArray:
     """The residuals (2 n,), x then y, each in its own sigma."""
-    sigma = data.seen.sigma_px * problem.noise_px
-    return np.concatenate(
-        [part / sigma for part in residuals_px(problem, geometry, data, directions)]
-    )
+    sigma = data.centroids.sigma_px * problem.noise_px
+    dx_px, dy_px = residuals_px(problem, geometry, data, directions)
+    return np.concatenate([dx_px / sigma, dy_px / sigma])
 
 
 def _places_px(
@@ -379,7 +394,8 @@ def _places_px(
 ) -> tuple[FloatArray, FloatArray]:
     """Places of the centroids (n,) on the monitor by a geometry, px."""
     if directions is None:
-        directions = directions_in_cam(geometry, data.seen.pose, data.seen.x_px, data.seen.y_px)
+        centroids = data.centroids
+        directions = directions_in_cam(geometry, centroids.pose, centroids.x_px, centroids.y_px)
     return geometry.monitor.project(directions @ geometry.monitor.cam_to_image.T)
 
 
@@ -389,16 +405,18 @@ def noise_of_repeats(data: MatchedDots) -> float | None:
 
     It needs no model. It uses the median absolute deviation, so a few false matches do not count.
     """
-    key = data.seen.pose * (int(data.dot.max(initial=0)) + 1) + data.dot
+    centroids = data.centroids
+    dots = int(data.dot.max(initial=0)) + 1
+    key = centroids.pose * dots + data.dot
     order = np.argsort(key, kind="stable")
+    first_of_group = np.flatnonzero(np.diff(key[order])) + 1
     deviations = []
-    for group in np.split(order, np.flatnonzero(np.diff(key[order])) + 1):
+    for group in np.split(order, first_of_group):
         if len(group) > 2:
-            share = np.sqrt(len(group) / (len(group) - 1))
-            for part in (data.seen.x_px, data.seen.y_px):
-                deviations.append(
-                    share * (part[group] - part[group].mean()) / data.seen.sigma_px[group]
-                )
+            bessel = np.sqrt(len(group) / (len(group) - 1))
+            for places in (centroids.x_px[group], centroids.y_px[group]):
+                off = bessel * (places - places.mean())
+                deviations.append(off / centroids.sigma_px[group])
     if not deviations:
         return None
     return float(MAD_TO_SIGMA * np.median(np.abs(np.concatenate(deviations))))
@@ -436,30 +454,29 @@ def candidates(
     held-out dots.
     """
     poses = len(problem.q_poses)
-    wanted = [
+    forms = [
         ("pinhole", PINHOLE, 0),
         ("pinhole + k1", RADIAL, 0),
         ("Brown-Conrady + tilt", BROWN_CONRADY, 0),
     ]
-    wanted += [
-        (f"Brown-Conrady + tilt + field of degree {n}", BROWN_CONRADY, n) for n in FIELD_DEGREES
-    ]
-    candidate_models: list[Candidate] = []
-    for name, names, degree in wanted:
-        model = Model(names, tracker_names if names is BROWN_CONRADY else (), poses)
+    for degree in FIELD_DEGREES:
+        forms.append((f"Brown-Conrady + tilt + field of degree {degree}", BROWN_CONRADY, degree))
+    models: list[Candidate] = []
+    for name, names, degree in forms:
+        model = Model(names, (), poses)
+        if names is BROWN_CONRADY:
+            model = replace(model, tracker_names=tracker_names)
         numbers = model.size + (degree + 1) * (degree + 2)
         # A dot has two numbers of its own. Half as many are left over: a field of 55 numbers
         # followed 42 dots' own errors.
-        if 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers and len(np.unique(data.dot)) > numbers:
-            candidate_models.append(held_out(problem, name, model, degree, data))
-        if (
-            len(candidate_models) > 4
-            and candidate_models[-1].rms_arcsec
-            > candidate_models[-2].rms_arcsec
-            > candidate_models[-3].rms_arcsec
-        ):
-            break  # larger fields only follow the noise
-    return candidate_models
+        has_centroids = 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers
+        if has_centroids and len(np.unique(data.dot)) > numbers:
+            models.append(held_out(problem, name, model, degree, data))
+        if len(models) > 4:
+            third, second, last = (candidate.rms_arcsec for candidate in models[-3:])
+            if last > second > third:
+                break  # larger fields only follow the noise
+    return models
 
 
 def held_out(
@@ -470,18 +487,17 @@ def held_out(
     fold = np.zeros(int(dots.max()) + 1, dtype=np.intp)
     fold[dots] = np.arange(len(dots)) % FOLDS
     start = fit(problem, model, degree, data, min_gain=COMPARED_GAIN).numbers
-    off = np.full((len(data), 2), np.nan)
+    off_px = np.full((len(data), 2), np.nan)
     for k in range(FOLDS):
-        out = fold[data.dot] == k
-        if out.any() and not out.all():
-            others = data.at(np.flatnonzero(~out))
+        is_held_out = fold[data.dot] == k
+        if is_held_out.any() and not is_held_out.all():
+            others = data.at(np.flatnonzero(~is_held_out))
+            tested = data.at(np.flatnonzero(is_held_out))
             trained = fit(problem, model, degree, others, start, min_gain=COMPARED_GAIN)
-            off[out] = np.stack(
-                residuals_px(problem, trained.geometry, data.at(np.flatnonzero(out))), axis=1
-            )
-    arcsec = (
-        np.nan_to_num(off, nan=np.inf) * ARCSEC_PER_RAD / problem.nominal.tracker.focal_length_px
-    )
+            fold_off_px = residuals_px(problem, trained.geometry, tested)
+            off_px[is_held_out] = np.stack(fold_off_px, axis=1)
+    known_px = np.nan_to_num(off_px, nan=np.inf)
+    arcsec = known_px * ARCSEC_PER_RAD / problem.nominal.tracker.focal_length_px
     count = np.bincount(data.dot, minlength=len(fold))[dots]
     sum_x = np.bincount(data.dot, arcsec[:, 0], minlength=len(fold))[dots]
     sum_y = np.bincount(data.dot, arcsec[:, 1], minlength=len(fold))[dots]
@@ -502,9 +518,10 @@ def _is_beyond_chance(smaller: Candidate, larger: Candidate) -> bool:
     """Whether the larger model's gain on the held-out dots is more than the dots' scatter makes
     by chance.
     """
-    squares = [(model_fit.off_arcsec**2).sum(axis=1) for model_fit in (smaller, larger)]
+    smaller_squares = (smaller.off_arcsec**2).sum(axis=1)
+    larger_squares = (larger.off_arcsec**2).sum(axis=1)
     with np.errstate(invalid="ignore"):  # a dot that both put behind the lens
-        gain = np.nan_to_num(squares[0] - squares[1], nan=0.0)
+        gain = np.nan_to_num(smaller_squares - larger_squares, nan=0.0)
     # A dot that a model throws far off counts as one dot, not as all of them.
     limit = HUBER * MAD_TO_SIGMA * float(np.median(np.abs(gain)))
     gain = np.clip(gain, -limit, limit)
@@ -547,61 +564,83 @@ def uncertainty_of(problem: Problem, fit: Fit, data: MatchedDots) -> Uncertainty
     """The uncertainty of a fit to `data`, by the covariance of the whole lens and by what that
     would move.
     """
-    monitor = fit.geometry.monitor
-    fit, is_simpler = _with_whole_lens(fit), fit.model.names != BROWN_CONRADY
+    is_simpler = fit.model.names != BROWN_CONRADY
+    fit = _with_whole_lens(fit)
+    root = _covariance_root(problem, fit, data, is_simpler=is_simpler)
+    spread = np.linalg.norm(root, axis=1)
+    names = (*fit.model.names, *fit.model.tracker_names)
+    sigma = {}
+    for name, one_sigma in zip(names, spread, strict=False):
+        sigma[name] = float((STEPS | TRACKER_STEPS)[name] * one_sigma)
+    to_arcsec = ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px
+    field_x_px, field_y_px = _seen_places(fit.geometry)
+    field_places = np.stack(_slopes_of_places(problem, fit, field_x_px, field_y_px))
+    field_slopes = field_places @ root * to_arcsec
+    field_arcsec = np.sqrt((field_slopes**2).sum(axis=(0, 2)))
+    map_x_px, map_y_px = _grid_px(fit.geometry.monitor.resolution_px, MAP_PLACES)
+    map_places = np.stack(_slopes_of_places(problem, fit, map_x_px, map_y_px))
+    slopes = map_places @ root * to_arcsec
+    columns, rows = MAP_PLACES
+    is_visible = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(rows, columns)
+    # a place that was not seen has those of its neighbour
+    slopes = slopes[:, _nearest_true(is_visible).ravel()]
+    variance = (slopes**2).sum(axis=(0, 2)).reshape(is_visible.shape)
+    map_arcsec = np.sqrt(np.where(is_visible, variance, np.nan))
+    by_place = slopes.reshape(2 * is_visible.size, -1)
+    _, sizes, vectors = np.linalg.svd(by_place.T, full_matrices=False)
+    is_large = sizes**2 > MODE_SHARE * (sizes**2).sum()
+    modes_arcsec = (sizes[:, None] * vectors)[is_large]
+    return Uncertainty(sigma, map_arcsec, modes_arcsec, field_arcsec)
+
+
+def _covariance_root(
+    problem: Problem, fit: Fit, data: MatchedDots, *, is_simpler: bool
+) -> FloatArray:
+    """A matrix (numbers, errors) that times its transpose is the covariance of a fit's numbers.
+
+    Where the lens `is_simpler` than the whole one, a column more has what the whole one would move.
+    """
     off = residuals_sigma(problem, fit.geometry, data)
     residual = np.abs(off)
     weight = np.sqrt(np.minimum(1.0, HUBER / np.maximum(residual, 1e-12)))
     rows = _slopes_of_residuals(problem, fit, data) * weight[:, None]
     size = fit.model.size
-    field_numbers = rows.shape[1] - size
-    prior = np.concatenate([np.full(size, PRIOR), np.full(field_numbers, 1 / FIELD_PRIOR_PX)])
-    # times its transpose: the covariance
-    root = np.linalg.inv(np.linalg.qr(np.vstack([rows, np.diag(prior)]))[1])
-    scale = max(
-        1.0, MAD_TO_SIGMA * float(np.median(residual)), _scatter_of_dots(data, off, rows.shape[1])
-    )
-    if is_simpler:
-        # One step of Gauss and Newton from the simple lens to the whole one, as one more error
-        # beside the covariance's.
-        downhill = rows.T @ (weight * off) + prior**2 * fit.numbers
-        root = np.column_stack([root, root @ (root.T @ downhill) / scale])
-    steps = [STEPS[name] for name in fit.model.names] + [
-        TRACKER_STEPS[name] for name in fit.model.tracker_names
-    ]
-    spread = scale * np.linalg.norm(root, axis=1)
-    names = (*fit.model.names, *fit.model.tracker_names)
-    sigma = {name: float(step * s) for name, step, s in zip(names, steps, spread, strict=False)}
-    along = (
-        np.linspace(-0.5, size - 0.5, n)
-        for size, n in zip(monitor.resolution_px, MAP_PLACES, strict=True)
-    )
-    to_arcsec = scale * ARCSEC_PER_RAD / problem.nominal.monitor.focal_length_px
-    place_x, place_y = _slopes_of_places(
-        problem, fit, *(part.ravel() for part in np.meshgrid(*along))
-    )
-    slopes = np.stack([place_x, place_y]) @ root * to_arcsec
-    in_field = (
-        np.stack(_slopes_of_places(problem, fit, *_seen_places(fit.geometry))) @ root * to_arcsec
-    )
-    is_visible = np.asarray(np.isfinite(slopes).all(axis=(0, 2))).reshape(MAP_PLACES[::-1])
+    numbers = rows.shape[1]
+    field_prior = np.full(numbers - size, 1 / FIELD_PRIOR_PX)
+    prior = np.concatenate([np.full(size, PRIOR), field_prior])
+    _, triangle = np.linalg.qr(np.vstack([rows, np.diag(prior)]))
+    root = np.linalg.inv(triangle)
+    residual_scatter = MAD_TO_SIGMA * float(np.median(residual))
+    scale = max(1.0, residual_scatter, _scatter_of_dots(data, off, numbers))
+    if not is_simpler:
+        return np.asarray(scale * root)
+    # One step of Gauss and Newton from the simple lens to the whole one, as one more error
+    # beside the covariance's.
+    downhill = rows.T @ (weight * off) + prior**2 * fit.numbers
+    moved = root @ (root.T @ downhill)
+    return np.column_stack([scale * root, moved])
+
+
+def _nearest_true(mask: BoolArray) -> IntArray:
+    """The number, row by row, of the nearest true place (h, w) of a mask (h, w)."""
     row, column = distance_transform_edt(
-        (~is_visible).astype(np.int64), return_distances=False, return_indices=True
+        (~mask).astype(np.int64), return_distances=False, return_indices=True
     )
-    # a place that was not seen has those of its neighbour
-    slopes = slopes[:, (row * is_visible.shape[1] + column).ravel()]
-    variance = np.where(is_visible, (slopes**2).sum(axis=(0, 2)).reshape(is_visible.shape), np.nan)
-    _, size_of, modes = np.linalg.svd(
-        slopes.reshape(2 * is_visible.size, -1).T, full_matrices=False
-    )
-    modes = (size_of[:, None] * modes)[size_of**2 > MODE_SHARE * (size_of**2).sum()]
-    return Uncertainty(sigma, np.sqrt(variance), modes, np.sqrt((in_field**2).sum(axis=(0, 2))))
+    return np.asarray(row * mask.shape[1] + column)
+
+
+def _grid_px(size_px: tuple[int, int], places: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
+    """Places (n,) on a grid over an image, edges included, row by row: x and y, px."""
+    width, height = size_px
+    columns = np.linspace(-0.5, width - 0.5, places[0])
+    rows = np.linspace(-0.5, height - 0.5, places[1])
+    x_px, y_px = np.meshgrid(columns, rows)
+    return x_px.ravel(), y_px.ravel()
 
 
 def _seen_places(geometry: Geometry) -> tuple[FloatArray, FloatArray]:
     """Pixels (n,) of the monitor at a grid over the tracker's field in all its poses."""
-    sides = (np.linspace(-0.5, size - 0.5, FIELD_PLACES) for size in geometry.tracker.resolution_px)
-    u_px, v_px = (part.ravel() for part in np.meshgrid(*sides))
+    u_px, v_px = _grid_px(geometry.tracker.resolution_px, (FIELD_PLACES, FIELD_PLACES))
     monitor = geometry.monitor
     places = []
     for pose in range(len(geometry.q_poses)):
@@ -610,9 +649,9 @@ def _seen_places(geometry: Geometry) -> tuple[FloatArray, FloatArray]:
     x_px, y_px = np.concatenate(places, axis=1)
     width, height = monitor.resolution_px
     with np.errstate(invalid="ignore"):
-        on_screen = (np.abs(x_px - (width - 1) / 2) <= width / 2) & (
-            np.abs(y_px - (height - 1) / 2) <= height / 2
-        )
+        across = np.abs(x_px - (width - 1) / 2) <= width / 2
+        down = np.abs(y_px - (height - 1) / 2) <= height / 2
+    on_screen = across & down
     return x_px[on_screen], y_px[on_screen]
 
 
@@ -622,11 +661,14 @@ def _scatter_of_dots(data: MatchedDots, off: FloatArray, numbers: int) -> float:
     A dot is at one place in all its frames: what a detector's pixels do to it there is no average
     of the frames.
     """
-    dots, place, count = np.unique(data.dot, return_inverse=True, return_counts=True)
-    means = [np.bincount(place, part) / np.sqrt(count) for part in np.split(off, 2)]
+    dots, dot, count = np.unique(data.dot, return_inverse=True, return_counts=True)
+    x_off, y_off = np.split(off, 2)
+    root_count = np.sqrt(count)
+    x_means = np.bincount(dot, x_off) / root_count
+    y_means = np.bincount(dot, y_off) / root_count
     free = max(2 * len(dots) - numbers, 1)
-    typical = MAD_TO_SIGMA * float(np.median(np.abs(np.concatenate(means))))
-    return typical * math.sqrt(2 * len(dots) / free)
+    median = float(np.median(np.abs(np.concatenate([x_means, y_means]))))
+    return MAD_TO_SIGMA * median * math.sqrt(2 * len(dots) / free)
 
 
 def _with_whole_lens(fit: Fit) -> Fit:
@@ -650,17 +692,12 @@ def _varied(problem: Problem, fit: Fit, number: int) -> Geometry:
     """The geometry with one parameter slightly larger, and the same residual field."""
     step = np.zeros(fit.model.size)
     step[number] = DIFFERENCE
-    varied = geometry_of(
-        fit.model, problem.nominal, problem.q_poses, fit.numbers[: fit.model.size] + step
-    )
-    if fit.geometry.monitor.lens is not None:
-        field = fit.geometry.monitor.lens.field
-    else:
-        field = None
-    if field is None:
-        lens = varied.monitor.lens
-    else:
-        lens = replace(varied.monitor.lens or Lens(), field=field)
+    numbers = fit.numbers[: fit.model.size] + step
+    varied = geometry_of(fit.model, problem.nominal, problem.q_poses, numbers)
+    fitted_lens = fit.geometry.monitor.lens
+    lens = varied.monitor.lens
+    if fitted_lens is not None and fitted_lens.field is not None:
+        lens = replace(lens or Lens(), field=fitted_lens.field)
     return replace(varied, monitor=replace(varied.monitor, lens=lens))
 
 
@@ -669,21 +706,19 @@ def _slopes_of_residuals(problem: Problem, fit: Fit, data: MatchedDots) -> Float
     numbers).
     """
     base = residuals_sigma(problem, fit.geometry, data)
-    varied = []
+    columns = []
     for k in range(fit.model.size):
-        varied.append(residuals_sigma(problem, _varied(problem, fit, k), data))
-    slopes = np.stack([(varied_residual - base) / DIFFERENCE for varied_residual in varied], axis=1)
+        varied = residuals_sigma(problem, _varied(problem, fit, k), data)
+        columns.append((varied - base) / DIFFERENCE)
+    slopes = np.stack(columns, axis=1)
     if not fit.field_degree:
         return np.asarray(slopes)
-    dots = problem.plan
-    terms = field_terms(
-        dots.x_px[data.dot],
-        dots.y_px[data.dot],
-        problem.nominal.monitor.resolution_px,
-        fit.field_degree,
-    )
-    terms = terms / (problem.monitor_px_per_px * data.seen.sigma_px * problem.noise_px)[:, None]
-    return np.hstack([slopes, _blocks(terms)])
+    x_px = problem.plan.x_px[data.dot]
+    y_px = problem.plan.y_px[data.dot]
+    resolution_px = problem.nominal.monitor.resolution_px
+    terms = field_terms(x_px, y_px, resolution_px, fit.field_degree)
+    sigma_px = problem.monitor_px_per_px * data.centroids.sigma_px * problem.noise_px
+    return np.hstack([slopes, _blocks(terms / sigma_px[:, None])])
 
 
 def _slopes_of_places(
@@ -694,21 +729,23 @@ def _slopes_of_places(
     """
     monitor = fit.geometry.monitor
     directions = monitor.rays(x_px, y_px)
-    moved = []
+    x_columns = []
+    y_columns = []
     for k in range(fit.model.size):
         varied = _varied(problem, fit, k).monitor
-        moved.append(varied.project(directions @ varied.cam_to_image.T))
-    columns = (
-        np.stack([(x - x_px) / DIFFERENCE for x, _ in moved], axis=1),
-        np.stack([(y - y_px) / DIFFERENCE for _, y in moved], axis=1),
-    )
+        x, y = varied.project(directions @ varied.cam_to_image.T)
+        x_columns.append((x - x_px) / DIFFERENCE)
+        y_columns.append((y - y_px) / DIFFERENCE)
+    x_slopes = np.stack(x_columns, axis=1)
+    y_slopes = np.stack(y_columns, axis=1)
     if not fit.field_degree:
-        return columns
+        return x_slopes, y_slopes
     terms = field_terms(x_px, y_px, monitor.resolution_px, fit.field_degree)
     nothing = np.zeros_like(terms)
-    return np.hstack([columns[0], terms, nothing]), np.hstack([columns[1], nothing, terms])
+    return np.hstack([x_slopes, terms, nothing]), np.hstack([y_slopes, nothing, terms])
 
 
 def _blocks(terms: FloatArray) -> FloatArray:
+    """Terms (n, k) for x and for y: (2 n, 2 k)."""
     nothing = np.zeros_like(terms)
     return np.block([[terms, nothing], [nothing, terms]])

@@ -73,8 +73,8 @@ ARROW_SHARE = 0.03  # length of the median residual's arrow, relative to the scr
 
 @dataclass(frozen=True, slots=True)
 class Calibrated:
-    """The result of a geometric calibration: the fit, the models compared, its uncertainty, and
-    the centroids' fate.
+    """The result of a geometric calibration: the fit and its uncertainty, the models that were
+    compared, and how many `centroids` were given.
     """
 
     problem: fits.Problem
@@ -99,13 +99,15 @@ class Calibrated:
     @property
     def lost(self) -> int:
         """Lit dots in the tracker's field that have no centroid."""
-        expected = sum(int(self.plan.lit[inside].sum()) for inside in self.measurable)
+        expected = 0
+        for inside in self.measurable:
+            expected += int(self.plan.lit[inside].sum())
         return expected - len(self.data)
 
     @property
     def measurable(self) -> list[BoolArray]:
         """For each pose, a mask of the dots (dots,) whose windows are in the tracker's image."""
-        return _in_view(self.fit, self.plan.x_px, self.plan.y_px, self.data.seen.edge_px)
+        return _in_view(self.fit, self.plan.x_px, self.plan.y_px, self.data.centroids.edge_px)
 
     @property
     def false(self) -> int:
@@ -115,13 +117,16 @@ class Calibrated:
     @property
     def noise_arcsec(self) -> float:
         """The error of one centroid along one axis."""
-        return self.problem.noise_px * ARCSEC_PER_RAD / self.problem.nominal.tracker.focal_length_px
+        focal_length_px = self.problem.nominal.tracker.focal_length_px
+        return self.problem.noise_px * ARCSEC_PER_RAD / focal_length_px
 
     @property
     def held_out_noise_arcsec(self) -> float:
         """The rms that noise alone would give held-out dots."""
         count = np.bincount(self.data.dot)
-        return float(np.sqrt(2 * np.mean(1 / count[count > 0])) * self.noise_arcsec)
+        # of a dot's mean, along both axes
+        share2 = 2 * np.mean(1 / count[count > 0])
+        return float(np.sqrt(share2) * self.noise_arcsec)
 
 
 def calibrate_files(
@@ -138,7 +143,8 @@ def calibrate_files(
     config = file.config
     dots = read_plan(plan)
     width, height = config.monitor.resolution_px
-    if dots.x_px.max() > width - 1 or dots.y_px.max() > height - 1:
+    is_beyond = dots.x_px.max() > width - 1 or dots.y_px.max() > height - 1
+    if is_beyond:
         raise InputError(
             f"{plan}: has dots off this monitor of {width} x {height} px; plan them anew"
         )
@@ -149,9 +155,8 @@ def calibrate_files(
             )
         observed_dots = read_observed(observed[0])
     else:
-        observed_dots = measure_images(
-            observed, dark, config.tracker.resolution_px, dot_sigma_px(file)
-        )
+        resolution_px = config.tracker.resolution_px
+        observed_dots = measure_images(observed, dark, resolution_px, dot_sigma_px(file))
     return calibrate_seen(file, dots, observed_dots, tracker_is_ideal=tracker_is_ideal)
 
 
@@ -169,9 +174,8 @@ def nominal_of(file: BenchFile) -> fits.Nominal:
     """The geometry that a bench file has without its geometry file. Raises InputError."""
     config = file.config
     q_cam_to_mon = np.array(config.collimator.q_cam_to_mon)
-    return fits.Nominal(
-        ideal_monitor(config), q_cam_to_mon, tracker_camera(config.tracker, file.folder)
-    )
+    tracker = tracker_camera(config.tracker, file.folder)
+    return fits.Nominal(ideal_monitor(config), q_cam_to_mon, tracker)
 
 
 def seen_screen_of(file: BenchFile) -> SeenScreen:
@@ -189,9 +193,9 @@ def dot_sigma_px(file: BenchFile) -> float:
     InputError.
     """
     nominal = nominal_of(file)
-    return SeenScreen(
-        nominal.monitor, nominal.tracker, is_sure=False, psf_sigma_px=psf_sigma_of(file)
-    ).dot_sigma_px
+    psf_sigma_px = psf_sigma_of(file)
+    screen = SeenScreen(nominal.monitor, nominal.tracker, is_sure=False, psf_sigma_px=psf_sigma_px)
+    return screen.dot_sigma_px
 
 
 def psf_sigma_of(file: BenchFile) -> float:
@@ -245,20 +249,30 @@ def calibrate_geometry(
             " its flight model as [tracker] distortion, take a second pose (turn the tracker by 90"
             " or 180 degrees about its boresight), or add --tracker-is-ideal"
         )
-    tracker_names = () if tracker_known else tuple(fits.TRACKER_STEPS)
+    tracker_names: tuple[str, ...] = ()
+    if not tracker_known:
+        tracker_names = tuple(fits.TRACKER_STEPS)
     look = first_look(plan, nominal, seen, rng)
     problem, data = matched(plan, nominal, seen, look, tracker_names)
     if len(np.unique(data.dot)) < MIN_DOTS:
         raise _too_few(data)
     models = fits.candidates(problem, data, tracker_names)
     chosen = fits.best_of(models)
-    final = bounded_to_field(problem, fits.fit(problem, chosen.model, chosen.field_degree, data))
-    uncertainty = fits.uncertainty_of(problem, final, data)
+    fit = fits.fit(problem, chosen.model, chosen.field_degree, data)
+    bounded = bounded_to_field(problem, fit)
     calibrated = Calibrated(
-        problem, data, final, models, chosen, uncertainty, len(seen), tracker_known
+        problem=problem,
+        data=data,
+        fit=bounded,
+        models=models,
+        chosen=chosen,
+        uncertainty=fits.uncertainty_of(problem, bounded, data),
+        centroids=len(seen),
+        tracker_known=tracker_known,
     )
     _refuse_gaps(calibrated)
-    expected, error = calibrated.held_out_noise_arcsec, chosen.rms_arcsec
+    expected = calibrated.held_out_noise_arcsec
+    error = chosen.rms_arcsec
     if error > max(MAX_MISFIT * expected, expected + MISFIT_FLOOR_ARCSEC):
         raise InputError(
             f"dots held out of the fit are {error:.3g} arcsec rms off, where the noise of the"
@@ -275,23 +289,25 @@ def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:
     geometry = fit.geometry
     monitor = fit.geometry.monitor
     # By places over the whole screen, not by the dots: those stand where the tracker sees it.
-    sides = (np.linspace(-0.5, size - 0.5, SCREEN_PLACES) for size in monitor.resolution_px)
-    x_px, y_px = (part.ravel() for part in np.meshgrid(*sides))
-    if all(inside.all() for inside in _in_view(fit, x_px, y_px)):
+    screen_width, screen_height = monitor.resolution_px
+    columns = np.linspace(-0.5, screen_width - 0.5, SCREEN_PLACES)
+    rows = np.linspace(-0.5, screen_height - 0.5, SCREEN_PLACES)
+    x_px, y_px = np.meshgrid(columns, rows)
+    if all(inside.all() for inside in _in_view(fit, x_px.ravel(), y_px.ravel())):
         return fit
     width, height = geometry.tracker.resolution_px
-    corners = (
-        np.array([-0.5, width - 0.5, -0.5, width - 0.5]),
-        np.array([-0.5, -0.5, height - 0.5, height - 0.5]),
-    )
+    corner_x = np.array([-0.5, width - 0.5, -0.5, width - 0.5])
+    corner_y = np.array([-0.5, -0.5, height - 0.5, height - 0.5])
     reach = 0.0
     for pose in range(len(geometry.q_poses)):
-        rays = fits.directions_in_cam(geometry, np.full(4, pose), *corners) @ monitor.cam_to_image.T
-        reach = max(reach, float(np.nanmax(np.hypot(rays[:, 0], rays[:, 1]) / rays[:, 2])))
+        in_cam = fits.directions_in_cam(geometry, np.full(4, pose), corner_x, corner_y)
+        x, y, z = (in_cam @ monitor.cam_to_image.T).T
+        reach = max(reach, float(np.nanmax(np.hypot(x, y) / z)))
     # A pinhole is bounded, too: a tilt that it could not see within the field is 23 arcsec off at
     # the screen's far end.
     lens = replace(monitor.lens or Lens(), max_tangent=KNOWN_MARGIN * reach)
-    return replace(fit, geometry=replace(geometry, monitor=replace(monitor, lens=lens)))
+    bounded_monitor = replace(monitor, lens=lens)
+    return replace(fit, geometry=replace(geometry, monitor=bounded_monitor))
 
 
 def matched(
@@ -309,26 +325,31 @@ def matched(
     data = match_by_maps(plan, nominal, seen, look)
     refuse_motion(data)
     nominal = turned(plan, nominal, look)
+    poses = len(look.q_poses)
     for _ in range(MATCH_ROUNDS):
-        problem = fits.Problem(
-            plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX
-        )
+        problem = _problem(plan, nominal, look, data)
         # The largest model that these centroids can determine.
         if len(data) > 2 * len(fits.BROWN_CONRADY):
-            model = fits.Model(fits.BROWN_CONRADY, tracker_names, len(look.q_poses))
+            model = fits.Model(fits.BROWN_CONRADY, tracker_names, poses)
         elif len(data) > 2 * len(fits.RADIAL):
-            model = fits.Model(fits.RADIAL, (), len(look.q_poses))
+            model = fits.Model(fits.RADIAL, (), poses)
         else:
-            model = fits.Model(fits.PINHOLE, (), len(look.q_poses))
+            model = fits.Model(fits.PINHOLE, (), poses)
         rough = fits.fit(problem, model, 0, data)
-        reach_px = max(REACH_PX, REACH_SIGMAS * problem.noise_px) * problem.monitor_px_per_px
-        data = match_by_geometry(plan, seen, rough.geometry, reach_px)
+        reach_px = max(REACH_PX, REACH_SIGMAS * problem.noise_px)
+        reach_monitor_px = reach_px * problem.monitor_px_per_px
+        data = match_by_geometry(plan, seen, rough.geometry, reach_monitor_px)
         if len(data) < MIN_DOTS:
             break
-    return (
-        fits.Problem(plan, nominal, look.q_poses, fits.noise_of_repeats(data) or DEFAULT_NOISE_PX),
-        data,
-    )
+    return _problem(plan, nominal, look, data), data
+
+
+def _problem(
+    plan: DotPlan, nominal: fits.Nominal, look: FirstLook, data: fits.MatchedDots
+) -> fits.Problem:
+    """The problem of a fit to these centroids, whose repeats tell their noise."""
+    noise_px = fits.noise_of_repeats(data) or DEFAULT_NOISE_PX
+    return fits.Problem(plan, nominal, look.q_poses, noise_px)
 
 
 def _in_view(
@@ -344,7 +365,8 @@ def _in_view(
     for q in geometry.q_poses:
         x, y = geometry.tracker.project(directions @ to_matrix(q).T)
         across = (x > edge_px) & (x < width - 1 - edge_px)
-        in_view.append(across & (y > edge_px) & (y < height - 1 - edge_px))
+        down = (y > edge_px) & (y < height - 1 - edge_px)
+        in_view.append(across & down)
     return in_view
 
 
@@ -352,26 +374,26 @@ def _refuse_gaps(calibrated: Calibrated) -> None:
     """Refuse (InputError) a part of the screen in the tracker's field whose dots were not seen."""
     plan = calibrated.plan
     problem = calibrated.problem
-    wanted = np.any(calibrated.measurable, axis=0)
+    is_expected = np.any(calibrated.measurable, axis=0)
     is_seen = np.zeros(len(plan), dtype=bool)
     is_seen[np.unique(calibrated.data.dot)] = True
     width, height = problem.nominal.monitor.resolution_px
-    column, row = (
-        np.clip((place * 3 / size).astype(int), 0, 2)
-        for place, size in ((plan.x_px, width), (plan.y_px, height))
-    )
+    column = np.clip((plan.x_px * 3 / width).astype(int), 0, 2)
+    row = np.clip((plan.y_px * 3 / height).astype(int), 0, 2)
     for r, vertical in enumerate(CELLS[1]):
         for c, sideways in enumerate(CELLS[0]):
-            here = (column == c) & (row == r) & wanted
-            if here.sum() >= MIN_CELL_DOTS and is_seen[here].sum() < MIN_CELL_SHARE * here.sum():
-                if vertical == sideways:
-                    part = "middle"
-                else:
-                    part = f"{vertical} {sideways}"
-                raise InputError(
-                    f"only {is_seen[here].sum()} of {here.sum()} dots were recognised in the {part}"
-                    " of the screen: look for what covers or dims it, and take new frames"
-                )
+            in_cell = (column == c) & (row == r) & is_expected
+            expected = in_cell.sum()
+            recognised = is_seen[in_cell].sum()
+            if expected < MIN_CELL_DOTS or recognised >= MIN_CELL_SHARE * expected:
+                continue
+            part = f"{vertical} {sideways}"
+            if vertical == sideways:
+                part = "middle"
+            raise InputError(
+                f"only {recognised} of {expected} dots were recognised in the {part} of the"
+                " screen: look for what covers or dims it, and take new frames"
+            )
 
 
 class FittedParameter(NamedTuple):
@@ -382,30 +404,39 @@ class FittedParameter(NamedTuple):
 
 
 def summary_of(found: Calibrated, written: Sequence[str]) -> dict[str, Any]:
-    """The figures of a calibration, by the keys of --json; `tracker` is "held" or "fitted", its
-    own lens.
+    """The figures of a calibration, by the keys of --json; `tracker` says whether its own lens was
+    "held" or "fitted".
     """
     chosen = found.chosen
-    error = found.uncertainty
+    models = []
+    for model in found.models:
+        models.append({"name": model.name, **_both(model)})
+    parameters = {}
+    for name, parameter in parameters_of(found).items():
+        parameters[name] = parameter._asdict()
+    dots = {"planned": len(found.plan), "recognised": found.recognised}
+    centroids = {
+        "given": found.centroids,
+        "matched": len(found.data),
+        "lost": found.lost,
+        "false": found.false,
+    }
+    held_out = {**_both(chosen), "noise_arcsec": found.held_out_noise_arcsec}
+    tracker_lens = "fitted"
+    if found.tracker_known:
+        tracker_lens = "held"
     return {
         "model": chosen.name,
         "poses": len(found.problem.q_poses),
-        "dots": {"planned": len(found.plan), "recognised": found.recognised},
-        "centroids": {
-            "given": found.centroids,
-            "matched": len(found.data),
-            "lost": found.lost,
-            "false": found.false,
-        },
+        "dots": dots,
+        "centroids": centroids,
         "noise_px": found.problem.noise_px,
         "noise_arcsec": found.noise_arcsec,
-        "held_out": {**_both(chosen), "noise_arcsec": found.held_out_noise_arcsec},
-        "error": _both(error),
-        "models": [{"name": model.name, **_both(model)} for model in found.models],
-        "parameters": {
-            name: parameter._asdict() for name, parameter in parameters_of(found).items()
-        },
-        "tracker": "held" if found.tracker_known else "fitted",
+        "held_out": held_out,
+        "error": _both(found.uncertainty),
+        "models": models,
+        "parameters": parameters,
+        "tracker": tracker_lens,
         "notes": notes_for_a_person(found),
         "written": written,
     }
@@ -417,20 +448,21 @@ def _both(error: fits.Candidate | fits.Uncertainty) -> dict[str, float]:
 
 def notes_for_a_person(found: Calibrated) -> tuple[str, ...]:
     """What the figures alone do not say."""
-    if len(found.problem.q_poses) == 1:
-        notes: tuple[str, ...] = (
-            ONE_POSE if found.problem.nominal.tracker.lens is None else COLLIMATOR_ALONE,
-        )
+    if len(found.problem.q_poses) > 1:
+        notes = []
+        if not found.tracker_known:
+            notes.append(ROUND)
+    elif found.problem.nominal.tracker.lens is None:
+        notes = [ONE_POSE]
     else:
-        notes = () if found.tracker_known else (ROUND,)
+        notes = [COLLIMATOR_ALONE]
     lens = found.fit.geometry.monitor.lens
-    if lens is None or not math.isfinite(lens.max_tangent):
-        return notes
-    known_deg = math.degrees(math.atan(lens.max_tangent))
-    return (
-        *notes,
-        f"the tracker sees {known_deg:.2f} deg from the axis: no star is shown farther out",
-    )
+    if lens is not None and math.isfinite(lens.max_tangent):
+        known_deg = math.degrees(math.atan(lens.max_tangent))
+        notes.append(
+            f"the tracker sees {known_deg:.2f} deg from the axis: no star is shown farther out"
+        )
+    return tuple(notes)
 
 
 def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
@@ -438,29 +470,35 @@ def parameters_of(found: Calibrated) -> dict[str, FittedParameter]:
     monitor = found.fit.geometry.monitor
     sigma = found.uncertainty.sigma
     lens = monitor.lens or Lens()
-    focal = monitor.focal_length_px
-    pitch = ARCSEC_PER_RAD
+    cx, cy = monitor.principal_point_px
+    tilt_x_rad, tilt_y_rad = lens.tilt_rad
+    focal_px = monitor.focal_length_px
+    # the fit's parameter is the logarithm of the focal length
+    focal_sigma_px = focal_px * sigma.get("log_focal", 0.0)
+    tilt_x_sigma_rad = sigma.get("tilt_x", 0.0)
+    tilt_y_sigma_rad = sigma.get("tilt_y", 0.0)
     values = {
-        "focal_length_px": (focal, focal * sigma.get("log_focal", 0.0)),
-        "principal_point_x_px": (monitor.principal_point_px[0], sigma.get("centre_x", 0.0)),
-        "principal_point_y_px": (monitor.principal_point_px[1], sigma.get("centre_y", 0.0)),
-        "rotation_x_arcsec": (0.0, pitch * sigma["rotation_x"]),
-        "rotation_y_arcsec": (0.0, pitch * sigma["rotation_y"]),
-        "rotation_z_arcsec": (0.0, pitch * sigma["rotation_z"]),
-        "tilt_x_deg": (math.degrees(lens.tilt_rad[0]), math.degrees(sigma.get("tilt_x", 0.0))),
-        "tilt_y_deg": (math.degrees(lens.tilt_rad[1]), math.degrees(sigma.get("tilt_y", 0.0))),
+        "focal_length_px": (focal_px, focal_sigma_px),
+        "principal_point_x_px": (cx, sigma.get("centre_x", 0.0)),
+        "principal_point_y_px": (cy, sigma.get("centre_y", 0.0)),
+        "rotation_x_arcsec": (0.0, ARCSEC_PER_RAD * sigma["rotation_x"]),
+        "rotation_y_arcsec": (0.0, ARCSEC_PER_RAD * sigma["rotation_y"]),
+        "rotation_z_arcsec": (0.0, ARCSEC_PER_RAD * sigma["rotation_z"]),
+        "tilt_x_deg": (math.degrees(tilt_x_rad), math.degrees(tilt_x_sigma_rad)),
+        "tilt_y_deg": (math.degrees(tilt_y_rad), math.degrees(tilt_y_sigma_rad)),
     }
-    for name, value in zip(
-        ("k1", "k2", "k3", "p1", "p2"), (*lens.radial, *lens.tangential), strict=True
-    ):
+    distortion = (*lens.radial, *lens.tangential)
+    for name, value in zip(("k1", "k2", "k3", "p1", "p2"), distortion, strict=True):
         values[name] = (value, sigma.get(name, 0.0))
     tracker_lens = found.fit.geometry.tracker.lens or Lens()
-    for name, value in zip(
-        fits.TRACKER_STEPS, (*tracker_lens.radial[:2], *tracker_lens.tangential), strict=True
-    ):
+    tracker_distortion = (*tracker_lens.radial[:2], *tracker_lens.tangential)
+    for name, value in zip(fits.TRACKER_STEPS, tracker_distortion, strict=True):
         if name in found.fit.model.tracker_names:
             values[name] = (value, sigma[name])
-    return {name: FittedParameter(float(value), float(s)) for name, (value, s) in values.items()}
+    parameters = {}
+    for name, (value, one_sigma) in values.items():
+        parameters[name] = FittedParameter(float(value), float(one_sigma))
+    return parameters
 
 
 def write_calibrated(
@@ -492,12 +530,12 @@ def write_calibrated(
     sigma = {name: parameter.sigma for name, parameter in parameters_of(found).items()}
     when = datetime.datetime.now(datetime.UTC).date().isoformat()
     made = MadeTable(by=f"hilstar {__version__}", when=when, poses=len(found.problem.q_poses))
-    write_geometry(
-        path, geometry.monitor, geometry.q_cam_to_mon, Notes(sigma, error, made, identity)
-    )
-    if plot is not None:
-        draw_geometry(plot, found)
-    return [str(written_path) for written_path in (path, plot) if written_path is not None]
+    notes = Notes(sigma, error, made, identity)
+    write_geometry(path, geometry.monitor, geometry.q_cam_to_mon, notes)
+    if plot is None:
+        return [str(path)]
+    draw_geometry(plot, found)
+    return [str(path), str(plot)]
 
 
 def lines_of(found: Calibrated) -> list[str]:
@@ -505,56 +543,48 @@ def lines_of(found: Calibrated) -> list[str]:
     chosen = found.chosen
     error = found.uncertainty
     noise = found.held_out_noise_arcsec
+    poses = len(found.problem.q_poses)
     rows = [
-        (
-            "dots",
-            (
-                f"{found.recognised} of {len(found.plan)} recognised in"
-                f" {len(found.problem.q_poses)} pose(s)"
-            ),
-        ),
+        ("dots", f"{found.recognised} of {len(found.plan)} recognised in {poses} pose(s)"),
         ("centroids", f"{len(found.data)} matched, {found.lost} lost, {found.false} false"),
         ("centroid noise", f"{found.problem.noise_px:.4f} px, {found.noise_arcsec:.2f} arcsec"),
-        *(
-            (m.name, f"{m.rms_arcsec:.3f} / {m.max_arcsec:.3f} arcsec (rms / max of held-out dots)")
-            for m in found.models
-        ),
+    ]
+    for model in found.models:
+        errors = f"{model.rms_arcsec:.3f} / {model.max_arcsec:.3f} arcsec"
+        rows.append((model.name, f"{errors} (rms / max of held-out dots)"))
+    held_out = f"{chosen.rms_arcsec:.3f} arcsec rms, {chosen.max_arcsec:.3f} max"
+    place = f"{error.rms_arcsec:.3f} arcsec rms, {error.max_arcsec:.3f} max"
+    rows += [
         ("chosen", chosen.name),
-        (
-            "held-out dots",
-            f"{chosen.rms_arcsec:.3f} arcsec rms, {chosen.max_arcsec:.3f} max; noise: {noise:.3f}",
-        ),
-        (
-            "a star's place",
-            f"known to {error.rms_arcsec:.3f} arcsec rms, {error.max_arcsec:.3f} max (1 sigma)",
-        ),
+        ("held-out dots", f"{held_out}; noise: {noise:.3f}"),
+        ("a star's place", f"known to {place} (1 sigma)"),
     ]
     width = max(len(name) for name, _ in rows) + 2
-    return [f"{name:{width}}{text}" for name, text in rows] + list(notes_for_a_person(found))
+    lines = [f"{name:{width}}{text}" for name, text in rows]
+    return [*lines, *notes_for_a_person(found)]
 
 
 def draw_geometry(path: Path, found: Calibrated) -> None:
     """Draw the error of a star's place over the screen, and the dots' residuals as arrows."""
-    error, (width, height) = (
-        found.uncertainty.map_arcsec,
-        found.problem.nominal.monitor.resolution_px,
-    )
+    width, height = found.problem.nominal.monitor.resolution_px
     finding = (
         f"By {found.chosen.name} a star's place is known to {found.uncertainty.rms_arcsec:.2g}"
         f" arcsec rms, {found.uncertainty.max_arcsec:.2g} at most; held-out dots"
         f" {found.chosen.rms_arcsec:.2g} rms"
     )
     dot, place, count = np.unique(found.data.dot, return_inverse=True, return_counts=True)
-    residual = fits.residuals_px(found.problem, found.fit.geometry, found.data)
-    right, down = (np.bincount(place, part) / count for part in residual)
+    right_px, down_px = fits.residuals_px(found.problem, found.fit.geometry, found.data)
+    right = np.bincount(place, right_px) / count
+    down = np.bincount(place, down_px) / count
     to_arcsec = ARCSEC_PER_RAD / found.problem.nominal.tracker.focal_length_px
     median = max(float(np.median(np.hypot(right, down))), 1e-9)
-    with chart(path, finding, panels=2, height_inch=1.4 + 2 * WIDE_INCH * height / width) as (
-        places,
-        residuals,
-    ):
+    panel_inch = WIDE_INCH * height / width
+    with chart(path, finding, panels=2, height_inch=1.4 + 2 * panel_inch) as (places, residuals):
         image = places.imshow(
-            error, extent=(-0.5, width - 0.5, height - 0.5, -0.5), aspect="equal", cmap="viridis"
+            found.uncertainty.map_arcsec,
+            extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+            aspect="equal",
+            cmap="viridis",
         )
         places.figure.colorbar(
             image, ax=[places, residuals], label="1 sigma of a star's place [arcsec]", shrink=0.5

@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_matrix, to_matrix
 from hilstar.basics.units import MAD_TO_SIGMA
@@ -55,18 +55,12 @@ ORIENTATIONS = {
     (-1, 0, 0, -1): "upside down: add 180 to [monitor] rotate_deg",
     (0, 1, -1, 0): "turned by 90 degrees: add 270 to [monitor] rotate_deg, or turn the tracker",
     (0, -1, 1, 0): "turned by 270 degrees: add 90 to [monitor] rotate_deg, or turn the tracker",
-    (
-        0,
-        1,
-        1,
-        0,
-    ): "swapped, columns for rows: add 90 to [monitor] rotate_deg and set flip_x the other way",
-    (
-        0,
-        -1,
-        -1,
-        0,
-    ): "swapped, columns for rows: add 270 to [monitor] rotate_deg and set flip_x the other way",
+    (0, 1, 1, 0): (
+        "swapped, columns for rows: add 90 to [monitor] rotate_deg and set flip_x the other way"
+    ),
+    (0, -1, -1, 0): (
+        "swapped, columns for rows: add 270 to [monitor] rotate_deg and set flip_x the other way"
+    ),
 }
 ORDERS: dict[str, Callable[[IntArray, int], IntArray]] = {
     "in reverse order": lambda frame, frames: frames - 1 - frame,
@@ -91,40 +85,66 @@ def decode(plan: DotPlan, seen: Observed) -> Decoded:
     """The dots of one pose whose code is close to one dot's and clearly farther from every
     other's; each dot once.
     """
-    # Centroids close to each other are one dot's, and share a group.
-    places = np.column_stack([seen.x_px, seen.y_px])
-    if len(places):
-        area = float(np.prod(np.ptp(places, axis=0)))
-    else:
-        area = 0.0
-    link_px = min(MAX_LINK_PX, LINK_SHARE * np.sqrt(area / max(len(plan), 1)))
-    pairs = cKDTree(places).query_pairs(link_px, output_type="ndarray")
-    linked = coo_matrix(
-        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(places), len(places))
-    )
-    group = np.asarray(connected_components(linked, directed=False)[1], dtype=np.intp)
-    pattern = np.zeros((int(group.max()) + 1 if len(group) else 0, plan.frames), dtype=bool)
-    inside = seen.frame < plan.frames
-    pattern[group[inside], seen.frame[inside]] = True
-    far = pattern.astype(np.int32) @ (~plan.lit).T.astype(np.int32) + (~pattern).astype(
-        np.int32
-    ) @ plan.lit.T.astype(np.int32)
-    if far.shape[1] < 2 or not len(far):
-        return Decoded(*(np.zeros(0, dtype=kind) for kind in (np.intp, float, float)))
+    group = _groups(plan, seen)
+    pattern = _blinked(plan, seen, group)
+    if len(plan) < 2 or not len(pattern):
+        no_dot = np.zeros(0, dtype=np.intp)
+        return Decoded(no_dot, np.zeros(0), np.zeros(0))
+    far = _differing_frames(pattern, plan.lit)
     order = np.argsort(far, axis=1, kind="stable")
     rows = np.arange(len(far))
     best = far[rows, order[:, 0]]
     next_best = far[rows, order[:, 1]]
-    sure = np.flatnonzero((best <= MAX_CODE_ERRORS) & (next_best >= best + CODE_LEAD) | (best == 0))
+    is_clear = (best <= MAX_CODE_ERRORS) & (next_best >= best + CODE_LEAD)
     # Where several places blink one dot's code, the one with the fewest errors is taken.
-    by_dot: dict[int, list[int]] = {}
-    for k in sure:
-        by_dot.setdefault(int(order[k, 0]), []).append(int(k))
-    chosen = {dot: min(places, key=lambda k: far[k, dot]) for dot, places in by_dot.items()}
-    chosen_dots = sorted(chosen.items())
-    means = [(seen.x_px[group == k].mean(), seen.y_px[group == k].mean()) for _, k in chosen_dots]
-    x_px, y_px = np.array(means).reshape(-1, 2).T
-    return Decoded(np.array([dot for dot, _ in chosen_dots], dtype=np.intp), x_px, y_px)
+    group_of: dict[int, int] = {}
+    for k in np.flatnonzero(is_clear | (best == 0)).tolist():
+        dot = int(order[k, 0])
+        if dot not in group_of or far[k, dot] < far[group_of[dot], dot]:
+            group_of[dot] = k
+    dots = sorted(group_of)
+    x_px = []
+    y_px = []
+    for dot in dots:
+        is_dot = group == group_of[dot]
+        x_px.append(seen.x_px[is_dot].mean())
+        y_px.append(seen.y_px[is_dot].mean())
+    return Decoded(np.array(dots, dtype=np.intp), np.array(x_px), np.array(y_px))
+
+
+def _groups(plan: DotPlan, seen: Observed) -> IntArray:
+    """The group (n,) of each centroid: those close to each other are one dot's, and share one."""
+    places = np.column_stack([seen.x_px, seen.y_px])
+    area_px2 = 0.0
+    if len(places):
+        area_px2 = float(np.prod(np.ptp(places, axis=0)))
+    dot_distance_px = np.sqrt(area_px2 / max(len(plan), 1))
+    link_px = min(MAX_LINK_PX, LINK_SHARE * dot_distance_px)
+    first, second = cKDTree(places).query_pairs(link_px, output_type="ndarray").T
+    ones = np.ones(len(first))
+    linked = coo_matrix((ones, (first, second)), shape=(len(places), len(places)))
+    _, group = connected_components(linked, directed=False)
+    return np.asarray(group, dtype=np.intp)
+
+
+def _blinked(plan: DotPlan, seen: Observed, group: IntArray) -> BoolArray:
+    """In which frames each group has a centroid (groups, frames): its code."""
+    groups = 0
+    if len(group):
+        groups = int(group.max()) + 1
+    pattern = np.zeros((groups, plan.frames), dtype=bool)
+    inside = seen.frame < plan.frames
+    pattern[group[inside], seen.frame[inside]] = True
+    return pattern
+
+
+def _differing_frames(pattern: BoolArray, lit: BoolArray) -> IntArray:
+    """In how many frames each code (groups, frames) differs from each dot's (dots, frames):
+    (groups, dots).
+    """
+    seen_dark = pattern.astype(np.int32) @ (~lit).T.astype(np.int32)
+    unseen_lit = (~pattern).astype(np.int32) @ lit.T.astype(np.int32)
+    return np.asarray(seen_dark + unseen_lit)
 
 
 def homography(u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -135,16 +155,16 @@ def homography(u: FloatArray, v: FloatArray, x: FloatArray, y: FloatArray) -> Fl
     out = _normal(x, y)
     zero = np.zeros_like(u)
     ones = np.ones_like(u)
-    a, b, _ = np.moveaxis(into @ np.stack([u, v, ones], axis=-2), -2, 0)
-    c, d, _ = np.moveaxis(out @ np.stack([x, y, ones], axis=-2), -2, 0)
-    rows = np.concatenate(
-        [
-            np.stack([a, b, ones, zero, zero, zero, -c * a, -c * b, -c], axis=-1),
-            np.stack([zero, zero, zero, a, b, ones, -d * a, -d * b, -d], axis=-1),
-        ],
-        axis=-2,
-    )
-    solution = np.linalg.svd(rows)[2][..., -1, :].reshape(into.shape)
+    from_points = into @ np.stack([u, v, ones], axis=-2)
+    to_points = out @ np.stack([x, y, ones], axis=-2)
+    a, b, _ = np.moveaxis(from_points, -2, 0)
+    c, d, _ = np.moveaxis(to_points, -2, 0)
+    x_rows = np.stack([a, b, ones, zero, zero, zero, -c * a, -c * b, -c], axis=-1)
+    y_rows = np.stack([zero, zero, zero, a, b, ones, -d * a, -d * b, -d], axis=-1)
+    rows = np.concatenate([x_rows, y_rows], axis=-2)
+    # the null space: the singular vector of the smallest singular value
+    _, _, vectors = np.linalg.svd(rows)
+    solution = vectors[..., -1, :].reshape(into.shape)
     matrix = np.linalg.inv(out) @ solution @ into
     return np.asarray(matrix / matrix[..., 2:, 2:])
 
@@ -153,14 +173,13 @@ def _normal(x: FloatArray, y: FloatArray) -> FloatArray:
     """A similarity (..., 3, 3) that centres points (..., n) on the origin with a mean square
     distance of 2.
     """
-    scale = np.sqrt(2.0) / np.maximum(np.sqrt(x.var(axis=-1) + y.var(axis=-1)), 1e-300)
+    deviation = np.sqrt(x.var(axis=-1) + y.var(axis=-1))
+    scale = np.sqrt(2.0) / np.maximum(deviation, 1e-300)
     zero = np.zeros_like(scale)
     ones = np.ones_like(scale)
-    rows = [
-        [scale, zero, -scale * x.mean(axis=-1)],
-        [zero, scale, -scale * y.mean(axis=-1)],
-        [zero, zero, ones],
-    ]
+    shift_x = -scale * x.mean(axis=-1)
+    shift_y = -scale * y.mean(axis=-1)
+    rows = [[scale, zero, shift_x], [zero, scale, shift_y], [zero, zero, ones]]
     return np.asarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
 
 
@@ -196,15 +215,19 @@ def first_look(
         maps.append(frame_map)
     _refuse_orientation(nominal, maps[0])
     x_px, y_px = _middle_places(plan)
-    rays = [_rays_of(matrix, x_px, y_px) for matrix in maps]
-    turns = [Rotation.align_vectors(pose_rays, rays[0])[0] for pose_rays in rays]
-    return FirstLook(tuple(maps), np.array([from_matrix(turn.as_matrix()) for turn in turns]))
+    first_rays = _rays_of(maps[0], x_px, y_px)
+    q_poses = []
+    for matrix in maps:
+        turn, _ = Rotation.align_vectors(_rays_of(matrix, x_px, y_px), first_rays)
+        q_poses.append(from_matrix(turn.as_matrix()))
+    return FirstLook(tuple(maps), np.array(q_poses))
 
 
 def _middle_places(plan: DotPlan) -> tuple[FloatArray, FloatArray]:
     """Places (n,) on the monitor, px, over the middle of the part that the dots stand on."""
-    along_x, along_y = (np.quantile(part, [0.0, 1.0]) @ MIDDLE for part in (plan.x_px, plan.y_px))
-    x_px, y_px = np.meshgrid(along_x, along_y)
+    columns = np.quantile(plan.x_px, [0.0, 1.0]) @ MIDDLE
+    rows = np.quantile(plan.y_px, [0.0, 1.0]) @ MIDDLE
+    x_px, y_px = np.meshgrid(columns, rows)
     return x_px.ravel(), y_px.ravel()
 
 
@@ -212,7 +235,13 @@ def _rays_of(matrix: FloatArray, x_px: FloatArray, y_px: FloatArray) -> FloatArr
     """Unit directions (n, 3) in the tracker's axes of monitor pixels (n,), by a first map (3,
     3).
     """
-    u, v = mapped(np.asarray(np.linalg.inv(matrix), dtype=np.float64), x_px, y_px)
+    to_tangents = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    u, v = mapped(to_tangents, x_px, y_px)
+    return _unit_rays(u, v)
+
+
+def _unit_rays(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Unit directions (n, 3) of tangents (n,)."""
     rays = np.column_stack([u, v, np.ones_like(u)])
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
@@ -223,13 +252,11 @@ def turned(plan: DotPlan, nominal: Nominal, look: FirstLook) -> Nominal:
     """
     x_px, y_px = _middle_places(plan)
     monitor = nominal.monitor
-    tangent_rays = np.column_stack((*monitor.tangents(x_px, y_px), np.ones_like(x_px)))
-    tangent_rays /= np.linalg.norm(tangent_rays, axis=1, keepdims=True)
-    turn, _ = Rotation.align_vectors(tangent_rays, _rays_of(look.maps[0], x_px, y_px))
+    stated_rays = _unit_rays(*monitor.tangents(x_px, y_px))
+    turn, _ = Rotation.align_vectors(stated_rays, _rays_of(look.maps[0], x_px, y_px))
     q_cam_to_mon = from_matrix(turn.as_matrix())
-    return Nominal(
-        replace(monitor, cam_to_image=to_matrix(q_cam_to_mon)), q_cam_to_mon, nominal.tracker
-    )
+    turned_monitor = replace(monitor, cam_to_image=to_matrix(q_cam_to_mon))
+    return Nominal(turned_monitor, q_cam_to_mon, nominal.tracker)
 
 
 def _map_of(
@@ -245,13 +272,17 @@ def _map_of(
     x = plan.x_px[decoded.dot]
     y = plan.y_px[decoded.dot]
     best = np.zeros(len(u), dtype=bool)
-    trials = TRIALS if len(u) >= MIN_DECODED else 0
-    fours = np.array([rng.choice(len(u), 4, replace=False) for _ in range(trials)], dtype=int)
-    fours = fours[np.isfinite((u + v)[fours]).all(axis=-1)].reshape(-1, 4)
+    fours = np.empty((0, 4), dtype=int)
+    if len(u) >= MIN_DECODED:
+        samples = [rng.choice(len(u), 4, replace=False) for _ in range(TRIALS)]
+        fours = np.array(samples, dtype=int)
+    # a lens has no tangents for places far outside
+    fours = fours[np.isfinite((u + v)[fours]).all(axis=-1)]
     for trial in homography(u[fours], v[fours], x[fours], y[fours]):
-        seen_x, seen_y = mapped(trial, u, v)
+        mapped_x, mapped_y = mapped(trial, u, v)
         with np.errstate(invalid="ignore"):
-            inlier = np.hypot(seen_x - x, seen_y - y) < INLIER_SHARE * plan.extent_px
+            distance_px = np.hypot(mapped_x - x, mapped_y - y)
+            inlier = distance_px < INLIER_SHARE * plan.extent_px
         if inlier.sum() > best.sum():
             best = inlier
     if best.sum() < max(MIN_DECODED, len(u) / 3):
@@ -262,13 +293,17 @@ def _map_of(
 def _why_no_map(
     plan: DotPlan, nominal: Nominal, seen: Observed, pose: int, rng: np.random.Generator
 ) -> str:
-    where = f"pose {pose}: " if pose else ""
-    for words, reorder in ORDERS.items():
+    """Why codes match nothing: the frames are numbered otherwise, or they are another plan's."""
+    where = ""
+    if pose:
+        where = f"pose {pose}: "
+    for order, reorder in ORDERS.items():
         frame = reorder(seen.frame, plan.frames)
         inside = np.flatnonzero((frame >= 0) & (frame < plan.frames))
-        if _map_of(plan, nominal, replace(seen, frame=frame).at(inside), rng) is not None:
+        reordered = replace(seen, frame=frame).at(inside)
+        if _map_of(plan, nominal, reordered, rng) is not None:
             return (
-                f"{where}the frames are {words}: the codes match so; number the frames from 0 as"
+                f"{where}the frames are {order}: the codes match so; number the frames from 0 as"
                 " plan.csv does"
             )
     return (
@@ -281,26 +316,31 @@ def _refuse_orientation(nominal: Nominal, matrix: FloatArray) -> None:
     """Refuse (InputError) an image that is mirrored, swapped or turned by a right angle against
     what the bench file says.
     """
+    # the middle of the field, and steps along each axis from it
     u = np.array([0.0, 1e-4, 0.0])
     v = np.array([0.0, 0.0, 1e-4])
     rays = np.column_stack([u, v, np.ones_like(u)]) @ nominal.monitor.cam_to_image.T
-    seen_px = np.stack(mapped(matrix, u, v))
-    stated_px = np.stack(nominal.monitor.project(rays))
-    relative = (seen_px[:, 1:] - seen_px[:, :1]) @ np.linalg.inv(
-        stated_px[:, 1:] - stated_px[:, :1]
-    )
+    seen_steps = _steps(*mapped(matrix, u, v))
+    stated_steps = _steps(*nominal.monitor.project(rays))
+    relative = seen_steps @ np.linalg.inv(stated_steps)
     relative /= np.sqrt(abs(np.linalg.det(relative)))
-    turn_deg = float(
-        np.degrees(np.arctan2(relative[1, 0] - relative[0, 1], relative[0, 0] + relative[1, 1]))
-    )
+    sine = relative[1, 0] - relative[0, 1]
+    cosine = relative[0, 0] + relative[1, 1]
+    turn_deg = float(np.degrees(np.arctan2(sine, cosine)))
     if np.linalg.det(relative) > 0 and abs(turn_deg) < MAX_TURN_DEG:
         return
-    nearest = max(ORIENTATIONS, key=lambda o: float(np.dot(o, relative.ravel())))
-    way_text = ORIENTATIONS[nearest]
-    if way_text is not None:
+    nearest = max(ORIENTATIONS, key=lambda matrix: float(np.dot(matrix, relative.ravel())))
+    orientation = ORIENTATIONS[nearest]
+    if orientation is not None:
         raise InputError(
-            f"the tracker sees the monitor {way_text}, show the dots again, and take new frames"
+            f"the tracker sees the monitor {orientation}, show the dots again, and take new frames"
         )
+
+
+def _steps(x_px: FloatArray, y_px: FloatArray) -> FloatArray:
+    """Places (3,) less the first of them, as columns (2, 2)."""
+    places = np.stack([x_px, y_px])
+    return np.asarray(places[:, 1:] - places[:, :1])
 
 
 def match_by_maps(plan: DotPlan, nominal: Nominal, seen: Observed, look: FirstLook) -> MatchedDots:
@@ -330,37 +370,45 @@ def match_by_geometry(
 def _nearest(
     plan: DotPlan, seen: Observed, x_px: FloatArray, y_px: FloatArray, reach_px: float
 ) -> MatchedDots:
+    """Match each centroid that looks at (x_px, y_px) to the lit dot nearest to it, where it is that
+    dot's nearest, too, and within `reach_px`; the others are left out.
+    """
     dot: IntArray = np.full(len(seen), -1, dtype=np.intp)
+    is_on_screen = np.isfinite(x_px + y_px)
     for pose in range(int(seen.pose.max()) + 1):
         for frame in range(plan.frames):
-            here = np.flatnonzero(
-                (seen.frame == frame) & (seen.pose == pose) & np.isfinite(x_px + y_px)
-            )
+            is_here = (seen.frame == frame) & (seen.pose == pose) & is_on_screen
+            here = np.flatnonzero(is_here)
             lit = np.flatnonzero(plan.lit[:, frame])
             if not len(here) or not len(lit):
                 continue
-            far = np.hypot(x_px[here, None] - plan.x_px[lit], y_px[here, None] - plan.y_px[lit])
-            best = far.argmin(axis=1)
-            nearest = far.argmin(axis=0)
-            mutual = nearest[best] == np.arange(len(here))
-            near = mutual & (far[np.arange(len(here)), best] < reach_px)
-            dot[here[near]] = lit[best[near]]
+            dx_px = x_px[here, None] - plan.x_px[lit]
+            dy_px = y_px[here, None] - plan.y_px[lit]
+            distance_px = np.hypot(dx_px, dy_px)
+            best = distance_px.argmin(axis=1)
+            nearest = distance_px.argmin(axis=0)
+            rows = np.arange(len(here))
+            is_mutual = nearest[best] == rows
+            is_near = is_mutual & (distance_px[rows, best] < reach_px)
+            dot[here[is_near]] = lit[best[is_near]]
     matched = np.flatnonzero(dot >= 0)
     return MatchedDots(seen.at(matched), dot[matched])
 
 
 def refuse_motion(data: MatchedDots) -> None:
     """Refuse (InputError) frames between which the whole image moved."""
-    for pose in np.unique(data.seen.pose):
-        here = data.at(np.flatnonzero(data.seen.pose == pose))
-        for axis, places in (("x", here.seen.x_px), ("y", here.seen.y_px)):
+    for pose in np.unique(data.centroids.pose):
+        here = data.at(np.flatnonzero(data.centroids.pose == pose))
+        for axis, places in (("x", here.centroids.x_px), ("y", here.centroids.y_px)):
             frames, shift, noise = frame_shifts(here, places)
+            motion_px = np.ptp(shift)
             # the median of few dots scatters by itself
-            by_chance = MAX_CHANCE * noise / np.sqrt(len(here) / len(frames))
-            if np.ptp(shift) > max(MIN_MOTION_PX, MOTION_NOISE * noise, by_chance):
+            dots_a_frame = len(here) / len(frames)
+            by_chance = MAX_CHANCE * noise / np.sqrt(dots_a_frame)
+            if motion_px > max(MIN_MOTION_PX, MOTION_NOISE * noise, by_chance):
                 first, last = sorted((frames[shift.argmin()], frames[shift.argmax()]))
                 raise InputError(
-                    f"the image moved by {np.ptp(shift):.2f} px in {axis} between frames {first}"
+                    f"the image moved by {motion_px:.2f} px in {axis} between frames {first}"
                     f" and {last}: fix the tracker and the screen, and take new frames"
                 )
 
@@ -377,19 +425,20 @@ class FrameShifts(NamedTuple):
 
 def frame_shifts(data: MatchedDots, places: FloatArray) -> FrameShifts:
     """The shift of each frame along one axis, by Tukey's median polish over frames and dots."""
-    frames, frame = np.unique(data.seen.frame, return_inverse=True)
+    frames, frame = np.unique(data.centroids.frame, return_inverse=True)
     dots, dot = np.unique(data.dot, return_inverse=True)
     shift = np.zeros(len(frames))
     middle = np.zeros(len(dots))
-    by_dot = [np.flatnonzero(dot == k) for k in range(len(dots))]
-    by_frame = [np.flatnonzero(frame == k) for k in range(len(frames))]
+    rows_of_dot = [np.flatnonzero(dot == k) for k in range(len(dots))]
+    rows_of_frame = [np.flatnonzero(frame == k) for k in range(len(frames))]
     for _ in range(POLISH_ROUNDS):
-        middle = np.array(
-            [np.median(places[dot_rows] - shift[frame[dot_rows]]) for dot_rows in by_dot]
-        )
-        shift = np.array(
-            [np.median(places[dot_rows] - middle[dot[dot_rows]]) for dot_rows in by_frame]
-        )
+        for k in range(len(dots)):
+            rows = rows_of_dot[k]
+            middle[k] = np.median(places[rows] - shift[frame[rows]])
+        for k in range(len(frames)):
+            rows = rows_of_frame[k]
+            shift[k] = np.median(places[rows] - middle[dot[rows]])
         shift -= np.median(shift)
     residual_px = np.abs(places - middle[dot] - shift[frame])
-    return FrameShifts(frames, shift, MAD_TO_SIGMA * float(np.median(residual_px)))
+    noise_px = MAD_TO_SIGMA * float(np.median(residual_px))
+    return FrameShifts(frames, shift, noise_px)

@@ -63,7 +63,7 @@ class Given:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """The choice for a scene, and the largest part of what `effort = "auto"` leaves there."""
+    """The choice for a scene, and the largest part of the error of `effort = "auto"` there."""
 
     row: CombinationRow
     largest: ErrorPart
@@ -84,14 +84,16 @@ class Answer:
 
 
 def answers_among(rows: Sequence[CombinationRow]) -> list[CombinationRow]:
-    """The rows of a scene that may be an answer: whole depth, sprites within tolerance, paths."""
+    """The rows of a scene that may be an answer: the whole catalogue, sprites within tolerance,
+    paths.
+    """
     deepest = max(rows, key=BY_DEPTH).faintest_v_mag
     whole = [row for row in rows if row.faintest_v_mag == deepest and row.quantisation in ANSWERS]
     return [row for row in whole if row.sprite == "cut" and row.smear == "path"]
 
 
 def is_allowed(row: CombinationRow, given: Given) -> bool:
-    """Whether a choice can be made of what is given: rates that are given are used."""
+    """Whether a choice is possible with what bench and sender give. Given rates are used."""
     if row.bit_stealing == "true" and not given.primaries:
         return False
     by_rate = row.prediction == "rate"
@@ -104,12 +106,12 @@ def allowed(rows: Sequence[CombinationRow], given: Given) -> list[CombinationRow
 
 
 def simplicity(row: CombinationRow) -> tuple[bool, int, float]:
-    """The order of choices: without bit stealing first, then the cheaper codes."""
+    """The order of choices: no bit stealing before bit stealing, then the cheaper codes."""
     return row.bit_stealing == "true", ANSWERS.index(row.quantisation), row.error_arcsec
 
 
 def simplest(rows: Sequence[CombinationRow]) -> CombinationRow:
-    """The simplest of rows whose error is near the smallest one's, in place and in light."""
+    """The simplest row whose errors of place and light are near the smallest ones."""
     limit_arcsec = NEAR * min(rows, key=BY_ARCSEC).error_arcsec
     near = [row for row in rows if row.error_arcsec <= limit_arcsec]
     limit_mag = max(NEAR_MAG, NEAR * min(near, key=BY_MAG).error_mag)
@@ -122,7 +124,7 @@ def parts_of(budget: Sequence[ErrorPart], scene: str) -> dict[str, ErrorPart]:
 
 
 def largest_part(budget: Sequence[ErrorPart], scene: str) -> ErrorPart:
-    """The step that most of a scene's error comes from."""
+    """The step that contributes most to a scene's error."""
     steps = parts_of(budget, scene)
     del steps[RSS], steps[WHOLE]
     return max(steps.values(), key=BY_ARCSEC)
@@ -197,7 +199,7 @@ def turn_lines(
     scenes: Sequence[Sequence[CombinationRow]],
     budget: Sequence[ErrorPart],
 ) -> list[str]:
-    """A line for each turn from which on another step is most of the error, and what to do then."""
+    """A line for each turn at which another step becomes the largest part, and what to do."""
     lines = []
     last = ""
     for rows in scenes:
@@ -216,7 +218,7 @@ def turn_lines(
 
 
 def prediction_words(rows: Sequence[CombinationRow]) -> str:
-    """What to ask of the sender, and what each prediction leaves of a scene with the best codes."""
+    """What to ask of the sender, and the error of each prediction with the best codes."""
     deepest = max(rows, key=BY_DEPTH).faintest_v_mag
     errors: dict[str, float] = {}
     for row in rows:

@@ -43,7 +43,7 @@ QUANTISATIONS: tuple[Quantisation, ...] = ("round", "dither", "temporal", "exact
 SPRITES: tuple[Sprite, ...] = ("full", "cut", "coarse")
 COARSER = 10.0  # times the bench file's tolerance, for the sprites `coarse`
 SHALLOWER_MAG = 1.0  # by which the shallower catalogue that is tried ends earlier
-FIELDS = 200
+FIELDS = 200  # random fields, among which the scenes are chosen
 DENSE = 1  # the place of the densest field among the scenes
 SEED = 1
 ENOUGH = 0.5  # a faint field has at most this share of an average field's stars
@@ -51,7 +51,7 @@ ENOUGH = 0.5  # a faint field has at most this share of an average field's stars
 # electrons per second.
 Lit = tuple[IntArray, FloatArray]
 START_S = 0.0037  # exposure start after a frame's first light, within a refresh
-MAX_FRAMES = 16
+MAX_FRAMES = 16  # refreshes: of a longer exposure only so many are measured
 DEG_PER_RAD = math.degrees(1.0)
 OWN = {"effort": "auto", "quantisation": "auto"}
 
@@ -83,7 +83,7 @@ def filled_timeline(
 
 
 @dataclass(frozen=True, slots=True)
-class Combination:
+class ChainCombination:
     """One choice for each step.
 
     Depth: `bit_stealing`, and the catalogue's `faintest_v_mag`. `sprite`: `full`, `cut` as
@@ -99,13 +99,17 @@ class Combination:
     prediction: Prediction = "rate"
 
 
-def combinations(turns: bool, can_steal_bits: bool, faintest_v_mag: float) -> list[Combination]:
+def combinations(
+    turns: bool, can_steal_bits: bool, faintest_v_mag: float
+) -> list[ChainCombination]:
     """All combinations that are measured, for a scene that turns or one at rest."""
-    chosen: list[Combination] = []
+    chosen: list[ChainCombination] = []
     shallow = faintest_v_mag - SHALLOWER_MAG
     for stealing in (False, True) if can_steal_bits else (False,):
         for method in QUANTISATIONS:
-            chosen += [Combination(method, stealing, faintest_v_mag, sprite) for sprite in SPRITES]
+            chosen += [
+                ChainCombination(method, stealing, faintest_v_mag, sprite) for sprite in SPRITES
+            ]
             if turns:
                 crude: list[tuple[Smear, Prediction]] = [
                     ("point", "rate"),
@@ -113,17 +117,20 @@ def combinations(turns: bool, can_steal_bits: bool, faintest_v_mag: float) -> li
                     ("point", "held"),
                 ]
                 chosen += [
-                    Combination(method, stealing, faintest_v_mag, "cut", *ways) for ways in crude
+                    ChainCombination(method, stealing, faintest_v_mag, "cut", *ways)
+                    for ways in crude
                 ]
-        chosen += [Combination(method, stealing, shallow, "cut") for method in ("round", "exact")]
+        chosen += [
+            ChainCombination(method, stealing, shallow, "cut") for method in ("round", "exact")
+        ]
         if turns:
-            chosen.append(Combination("round", stealing, shallow, "cut", "point", "held"))
+            chosen.append(ChainCombination("round", stealing, shallow, "cut", "point", "held"))
     return chosen
 
 
 @dataclass(frozen=True, slots=True)
 class ChainScene:
-    """A field and how fast it is crossed, and why it is one of the five."""
+    """A field, the rate at which the camera crosses it, and why it is one of the five."""
 
     name: str
     why: str
@@ -162,11 +169,10 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
 
 @dataclass(frozen=True, slots=True)
 class PanelExposure:
-    """An exposure before a panel: its begin and length, and the frames in it by number and moment
-    of light, ns.
+    """An exposure of the tracker before a panel: its start and length, s, and the frames it sees.
 
-    `weights` (frames, H, 1), of a panel that is turned (frames, 1, W), are the factors of each row
-    of a frame's light.
+    `weights` (frames, H, 1) are the share of a frame's light that each row contributes; of a panel
+    that scans by columns (frames, 1, W).
     """
 
     begin_s: float
@@ -180,8 +186,8 @@ class PanelExposure:
         return round((self.begin_s + self.length_s / 2) * NS_PER_S)
 
     def mean(self, light_of: Callable[[int, int], Lit], size_px: tuple[int, int]) -> FloatArray:
-        """The mean light (H, W) of an image of `size_px`. `light_of` gives a frame's light by
-        number and moment of light.
+        """The mean light (H, W) over the exposure. `light_of` gives a frame's light by number and
+        time.
         """
         width, height = size_px
         total = np.zeros(height * width)
@@ -195,7 +201,7 @@ class PanelExposure:
         return total.reshape(height, width)
 
     def at_rest(self, light_of: Callable[[int, int], Lit], size_px: tuple[int, int]) -> FloatArray:
-        """The same where all frames are alike: by the first of them."""
+        """The same where all frames are alike, from the first of them."""
         whole = self.weights.sum(axis=0, keepdims=True)
         return replace(
             self, numbers=self.numbers[:1], light_ns=self.light_ns[:1], weights=whole
@@ -208,7 +214,7 @@ def exposure_s(bench: Bench) -> float:
 
 
 def shortened_line(bench: Bench) -> str | None:
-    """The note for an exposure that is longer than its measured part, or None."""
+    """The note that only a part of the exposure is measured, or None."""
     whole_s = bench.config.tracker.exposure_s
     measured_s = exposure_s(bench)
     exposure_text = (
@@ -219,7 +225,7 @@ def shortened_line(bench: Bench) -> str | None:
 
 
 def exposure(bench: Bench, first_frame: int) -> PanelExposure:
-    """An exposure that begins START_S after the first light of a frame's middle row."""
+    """An exposure that starts START_S after a frame's middle row lights."""
     period_s = 1 / bench.config.monitor.refresh_hz
     length_s = exposure_s(bench)
     scan = bench.scan
@@ -247,25 +253,22 @@ def exposure(bench: Bench, first_frame: int) -> PanelExposure:
     else:
         weights = ((lit_s >= begin_s) & (lit_s < begin_s + length_s)) * (period_s / length_s)
     used = weights.any(axis=(1, 2))
-    kept = tuple(numbers[used].tolist())
-    return PanelExposure(
-        begin_s, length_s, kept, tuple(round(n * period_s * NS_PER_S) for n in kept), weights[used]
-    )
+    frames = tuple(numbers[used].tolist())
+    light_ns = tuple(round(number * period_s * NS_PER_S) for number in frames)
+    return PanelExposure(begin_s, length_s, frames, light_ns, weights[used])
 
 
 @dataclass(frozen=True, slots=True)
 class Marks:
-    """The combinations with a name: hilstar's defaults, `effort = "auto"`, and the bench file as
-    it is.
-    """
+    """The named combinations: hilstar's defaults, `effort = "auto"`, and the bench file's own."""
 
-    default: Combination
-    auto: Combination
-    as_filed: Combination
+    default: ChainCombination
+    auto: ChainCombination
+    as_filed: ChainCombination
 
 
 class Parts(Closing):
-    """The benches of a bench file's combinations, without bodies. Free them with `close`.
+    """The benches that draw a bench file's combinations, without bodies. Free them with `close`.
 
     Raises InputError for a bench file that cannot be studied, MachineError without OpenGL.
     """
@@ -290,7 +293,7 @@ class Parts(Closing):
         self.own = self._with(OWN)
         self.can_steal_bits = self.own.calibration.can_steal_bits
 
-    def bench(self, combination: Combination) -> Bench:
+    def bench(self, combination: ChainCombination) -> Bench:
         """The bench that draws a combination."""
         render = self._file.config.render
         keys: dict[str, Any] = {
@@ -321,7 +324,7 @@ class Parts(Closing):
         return self._shallow[key]
 
     def marks(self, movement: Movement) -> Marks:
-        """What the marked combinations choose for a scene."""
+        """The named combinations of a scene."""
         defaults = RenderSettings()
         plain = {}
         for name in ("effort", "quantisation", "bit_stealing", "motion_above_px"):
@@ -333,7 +336,7 @@ class Parts(Closing):
             self._chosen(self._with({}), movement, ahead),
         )
 
-    def _chosen(self, bench: Bench, movement: Movement, ahead: bool) -> Combination:
+    def _chosen(self, bench: Bench, movement: Movement, ahead: bool) -> ChainCombination:
         render = bench.config.render
         motion_px = (
             abs(movement.rate_deg_s)
@@ -349,7 +352,7 @@ class Parts(Closing):
         if render.quantisation == "auto":
             raise AssertionError("the effort's plan has chosen")
         sprite: Sprite = "cut" if render.effort == "auto" else "full"
-        return Combination(
+        return ChainCombination(
             render.quantisation, render.bit_stealing, self.faintest_v_mag, sprite, smear, prediction
         )
 

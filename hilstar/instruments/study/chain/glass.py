@@ -6,7 +6,7 @@ each star in its own light, without noise, as the bench's centroider finds it, a
 whole basis, integrated over pixels star by star.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -23,8 +23,15 @@ from hilstar.instruments.simulate.glass import told_psf
 from hilstar.instruments.simulate.noise import field_stars
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.instruments.study.chain.choices import ChainScene
-from hilstar.instruments.study.chain.measuring import AUTO, rounded, said, times_of
+from hilstar.instruments.study.chain.measuring import (
+    AUTO,
+    noise_ends_ms,
+    rounded,
+    said,
+    times_of,
+)
 from hilstar.instruments.study.sweep import MAX_ROUNDS, in_turn, pareto_front
+from hilstar.instruments.study.trials import FrontLook, FrontPoint, draw_front
 from hilstar.optics.glass.glass_psf import GlassPsf
 from hilstar.optics.layers.view import View
 from hilstar.optics.psf import Psf
@@ -38,9 +45,13 @@ from hilstar.tracker.centroiders import star_places
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-TIME_S, QUICK_TIME_S = 30.0, 2.0
-MIN_STARS = 3
+TIME_S, QUICK_TIME_S = 30.0, 2.0  # for the frames of all PSFs
+MIN_STARS = 3  # an rms of fewer is chance
 SEED = 1
+# Without a line: each point is named.
+GLASS_LOOK = FrontLook(
+    line=None, bar={"lw": 1.0, "alpha": 0.4}, beaten={"ms": 4}, ring_pt={}, ring_width=0
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,13 +77,27 @@ class GlassRow:
     on_front: str
     chosen: str
 
+    @property
+    def name(self) -> str:
+        """The PSF, and what chooses it in brackets."""
+        if self.chosen:
+            return f"{self.psf} ({self.chosen})"
+        return self.psf
+
     def words(self) -> str:
         """ "a basis of 6: 0.12 arcsec, 0.4 %, 9.1 ms"."""
         error = f"{two_digits(self.error_arcsec)} arcsec, {two_digits(self.error_percent)} %"
-        return (
-            f"{self.psf}{f' ({self.chosen})' if self.chosen else ''}: {error},"
-            f" {two_digits(self.time_ms)} ms"
-        )
+        return f"{self.name}: {error}, {two_digits(self.time_ms)} ms"
+
+
+@dataclass(frozen=True, slots=True)
+class GlassErrors:
+    """The errors of a PSF over some stars: place, arcsec rms; light, rms and largest, %."""
+
+    stars: int
+    error_arcsec: float
+    error_percent: float
+    worst_percent: float
 
 
 def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow]:
@@ -81,41 +106,44 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
     """
     tracker = file.config.tracker
     if tracker.optics.psf == GAUSSIAN:
-        whole = None
-    else:
-        whole = tracker_psf(replace(tracker, effort="full"), file.folder)
+        return []
+    whole = tracker_psf(replace(tracker, effort="full"), file.folder)
     if not isinstance(whole, GlassPsf):
         return []
     drawable = dict(_drawable(whole))
+    works: dict[str, Callable[[int], object]] = {}
     with ExitStack() as stack:
-        simulators = {
-            name: stack.enter_context(Simulator(file, psf=psf)) for name, psf in drawable.items()
-        }
-        errors = _errors(next(iter(simulators.values())), whole, drawable, scene)
+        simulators = []
+        for psf in drawable.values():
+            simulators.append(stack.enter_context(Simulator(file, psf=psf)))
+        errors = _errors(simulators[0], whole, drawable, scene)
         if not errors:
             return []
-        view = next(iter(simulators.values())).view(scene.q_icrs_to_cam, np.zeros(3))
-        works = {name: partial(_exposed, simulator, view) for name, simulator in simulators.items()}
+        view = simulators[0].view(scene.q_icrs_to_cam, np.zeros(3))
+        for name, simulator in zip(drawable, simulators, strict=True):
+            works[name] = partial(_exposed, simulator, view)
         time_s = QUICK_TIME_S if quick else TIME_S
         spent_by_name = in_turn(works, MAX_ROUNDS, time_s / len(works))
     times = {name: times_of(np.array(spent)) for name, spent in spent_by_name.items()}
-    errors_arcsec = [errors[name][1] for name in drawable]
-    fronts = pareto_front(errors_arcsec, [times[name].time_ms for name in drawable])
+    errors_arcsec = [errors[name].error_arcsec for name in drawable]
+    times_ms = [times[name].time_ms for name in drawable]
+    fronts = pareto_front(errors_arcsec, times_ms)
     tolerance = tracker.tolerance_mag, tracker.tolerance_px
     _, reason = least_tracker_psf(whole, tracker.resolution_px, tolerance)
-    auto = reason.choice
-    return [
-        GlassRow(
-            scene.name,
-            name,
-            psf.components,
-            *errors[name],
-            **asdict(times[name]),
-            on_front=said(bool(on)),
-            chosen=AUTO if name == auto else "",
+    rows = []
+    for (name, psf), on_front in zip(drawable.items(), fronts, strict=True):
+        rows.append(
+            GlassRow(
+                scene=scene.name,
+                psf=name,
+                components=psf.components,
+                **asdict(errors[name]),
+                **asdict(times[name]),
+                on_front=said(bool(on_front)),
+                chosen=AUTO if name == reason.choice else "",
+            )
         )
-        for (name, psf), on in zip(drawable.items(), fronts, strict=True)
-    ]
+    return rows
 
 
 def _exposed(simulator: Simulator, view: View, number: int) -> object:
@@ -132,16 +160,15 @@ def _drawable(whole: GlassPsf) -> Iterator[tuple[str, Psf]]:
 
 
 def _errors(
-    tracker: Simulator, whole: GlassPsf, found: Mapping[str, Psf], scene: ChainScene
-) -> dict[str, tuple[int, float, float, float]]:
-    """How many stars, and how far off each PSF has them: place, rms arcsec; light, rms and most,
-    %.
-    """
+    tracker: Simulator, whole: GlassPsf, psfs: Mapping[str, Psf], scene: ChainScene
+) -> dict[str, GlassErrors]:
+    """The errors of each PSF in a scene; empty where too few stars are lit."""
     reach = whole.footprint_px // 2
-    rows = field_stars(tracker.stars, tracker.camera, scene.q_icrs_to_cam)
-    row, column = (np.floor(rows[name] + 0.5).astype(np.intp) for name in ("y_px", "x_px"))
-    shares = StarGlass(tracker.file, whole).shares_of(tracker.stars, rows["hip"])
-    light = whole.unreduced(rows["x_px"], rows["y_px"], shares)
+    stars = field_stars(tracker.stars, tracker.camera, scene.q_icrs_to_cam)
+    row = np.floor(stars["y_px"] + 0.5).astype(np.intp)
+    column = np.floor(stars["x_px"] + 0.5).astype(np.intp)
+    shares = StarGlass(tracker.file, whole).shares_of(tracker.stars, stars["hip"])
+    light = whole.unreduced(stars["x_px"], stars["y_px"], shares)
     lit = light.sum(axis=(1, 2)) > 0  # a corner may be dark
     if lit.sum() < MIN_STARS:
         return {}
@@ -149,58 +176,60 @@ def _errors(
     arcsec_per_px = ARCSEC_PER_RAD / tracker.camera.scales_px_rad()[1]
 
     def measured(stamps: FloatArray) -> FloatArray:
-        return np.stack(
-            [*star_places(stamps[lit], kind, whole.width_px), stamps[lit].sum(axis=(1, 2))]
-        )
+        """Places and light of the lit stars, (3, n)."""
+        x_px, y_px = star_places(stamps[lit], kind, whole.width_px)
+        return np.stack([x_px, y_px, stamps[lit].sum(axis=(1, 2))])
 
-    def off(psf: Psf) -> tuple[int, float, float, float]:
+    true_x, true_y, true_light = measured(light)
+    errors = {}
+    for name, psf in psfs.items():
         psf_stamp = told_psf(psf, (row, column), 2 * reach + 1, shares)
-        x, y, flux = measured(psf_stamp(rows["x_px"] - column, rows["y_px"] - row))
-        place = np.hypot(x - true[0], y - true[1]) * arcsec_per_px
-        percent = 100 * (flux / true[2] - 1)
-        rms = [rounded(float(np.sqrt(np.mean(error_px**2)))) for error_px in (place, percent)]
-        return len(place), rms[0], rms[1], rounded(float(np.abs(percent).max()))
-
-    true = measured(light)
-    return {name: off(psf) for name, psf in found.items()}
+        x, y, flux = measured(psf_stamp(stars["x_px"] - column, stars["y_px"] - row))
+        place = np.hypot(x - true_x, y - true_y) * arcsec_per_px
+        percent = 100 * (flux / true_light - 1)
+        largest = rounded(float(np.abs(percent).max()))
+        errors[name] = GlassErrors(len(place), _rms(place), _rms(percent), largest)
+    return errors
 
 
-def glass_line(rows: list[GlassRow]) -> str:
-    """What the PSFs cost, for a person."""
-    return f"PSF of the tracker's glass, {rows[0].scene}, {rows[0].stars} stars: " + "; ".join(
-        row.words() for row in rows
-    )
+def _rms(errors: FloatArray) -> float:
+    """The rms of errors, as the table has it."""
+    return rounded(float(np.sqrt(np.mean(errors**2))))
 
 
-def draw_glass(place: "Axes", light: "Axes", rows: list[GlassRow]) -> None:
+def glass_line(rows: Sequence[GlassRow]) -> str:
+    """The errors and times of the PSFs, in words."""
+    scene = f"{rows[0].scene}, {rows[0].stars} stars"
+    return f"PSF of the tracker's glass, {scene}: {'; '.join(row.words() for row in rows)}"
+
+
+def draw_glass(place: "Axes", light: "Axes", rows: Sequence[GlassRow]) -> None:
     """Two panels: error of place and of light against a frame's time, a point for each PSF."""
     place.set_title(f"PSF of the virtual tracker, {rows[0].scene}, {rows[0].stars} stars")
-    for axes, error, label in (
-        (place, "error_arcsec", "star's place, rms [arcsec]"),
-        (light, "error_percent", "light, rms [%]"),
-    ):
-        axes.set(xscale="log", yscale="log", ylabel=label)
-        floor = min((getattr(row, error) for row in rows if getattr(row, error) > 0), default=1.0)
-        named = []
-        for row in rows:
-            at = (row.time_ms, max(getattr(row, error), floor))
-            colour = RED if row.chosen else BLUE if row.on_front == "true" else INK
-            axes.plot(
-                [max(at[0] - row.noise_ms, at[0] / 2), at[0] + row.noise_ms],
-                [at[1]] * 2,
-                color=colour,
-                lw=1.0,
-                alpha=0.4,
-            )
-            axes.plot(*at, "o", color=colour, ms=6 if row.on_front == "true" else 4)
-            row_text = row.psf + (f" ({row.chosen})" if row.chosen else "")
-            named.append(
-                (
-                    f"{row_text}: {two_digits(getattr(row, error))}, {two_digits(row.time_ms)} ms",
-                    at,
-                    colour,
-                )
-            )
-        axes.margins(0.06, 0.12)
-        name_at_side(axes, named)
+    place.set_ylabel("star's place, rms [arcsec]")
+    light.set_ylabel("light, rms [%]")
     light.set_xlabel("median time of a frame of the virtual tracker [ms]")
+    for axes, error in ((place, "error_arcsec"), (light, "error_percent")):
+        errors = [getattr(row, error) for row in rows]
+        floor = min((size for size in errors if size > 0), default=1.0)
+        points = []
+        names = []
+        for row, size in zip(rows, errors, strict=True):
+            at = row.time_ms, max(size, floor)
+            colour = colour_of(row)
+            ends_ms = noise_ends_ms(row.time_ms, row.noise_ms)
+            points.append(FrontPoint(*at, ends_ms, colour, row.on_front == "true"))
+            name = f"{row.name}: {two_digits(size)}, {two_digits(row.time_ms)} ms"
+            names.append((name, at, colour))
+        draw_front(axes, points, GLASS_LOOK)
+        axes.margins(0.06, 0.12)
+        name_at_side(axes, names)
+
+
+def colour_of(row: GlassRow) -> str:
+    """The colour of a PSF's point."""
+    if row.chosen:
+        return RED
+    if row.on_front == "true":
+        return BLUE
+    return INK

@@ -43,8 +43,8 @@ NUDGE_RAD = np.array([1e-7, 1e-7, 0.0])
 FIRST_FRAMES = (20, 151, 325)
 PHASE_STEP_PX = (3.37, 4.71)  # tracker pixels, from exposure to exposure
 SIGMAS_IN_IQR = 1.349  # normal distribution
-FRAMES_A_VISIT = 2
-MIN_ROUNDS, MAX_ROUNDS = 4, 60
+FRAMES_A_VISIT = 2  # timed in a row, after one that does not count
+MIN_ROUNDS, MAX_ROUNDS = 4, 60  # whatever time they take
 SEED = 1
 STEPS = ("refresh", "prediction", "smear", "depth", "codes", "sprites")
 RSS, WHOLE = "rss", "whole"
@@ -54,26 +54,24 @@ DIGITS, MS_PLACES = 4, 4  # significant digits of an error, decimal places of a 
 
 @dataclass(slots=True)
 class DrawingChain:
-    """A combination on its bench, before a moving sky; `timed_frames` of its frames were timed,
-    from samples to codes.
+    """A combination on its bench, before a moving sky. `timed_frames` counts the frames timed so
+    far.
     """
 
-    combination: choices.Combination
+    combination: choices.ChainCombination
     bench: Bench
     movement: Movement
     timed_frames: int = 0
 
     def timeline(self, movement: Movement, light_ns: int) -> Timeline:
-        """The samples received when the frame is started whose light is at `light_ns`."""
+        """The samples that have arrived when the frame starts whose light is at `light_ns`."""
         samples = movement.samples(light_ns - choices.lead_ns(self.bench.config))
         return choices.filled_timeline(
             samples, self.combination.prediction, self.bench.config.attitude
         )
 
     def attitude(self, light_ns: int) -> Attitude:
-        """The attitude at a frame's light, predicted from the samples received when the frame is
-        started.
-        """
+        """The attitude at a frame's light, predicted when the frame starts."""
         return attitude_at(self.timeline(self.movement, light_ns), light_ns)
 
     def rate(self, attitude: Attitude) -> FloatArray | None:
@@ -85,7 +83,7 @@ class DrawingChain:
         return None
 
     def lit(self, number: int, light_ns: int) -> choices.Lit:
-        """The pixels that a frame's codes light, and the light of each, electrons per second."""
+        """The pixels that a frame's codes light, and each one's light, electrons per second."""
         attitude = self.attitude(light_ns)
         panel = self.bench.panel
         levels = self.bench.draw(attitude.q_icrs_to_cam, number, self.rate(attitude)).levels.ravel()
@@ -150,9 +148,7 @@ class DrawingChain:
 
 @dataclass(frozen=True, slots=True)
 class Rounds:
-    """How many exposures each combination is judged by, and for how long a scene's combinations
-    are timed, s.
-    """
+    """The exposures that judge a combination, and the time for a scene's combinations, s."""
 
     exposures: int = len(FIRST_FRAMES)
     time_s: float = 12.0
@@ -163,9 +159,7 @@ QUICK = Rounds(exposures=1, time_s=0.5)
 
 @dataclass(frozen=True, slots=True)
 class Error:
-    """The error of a combination's stars, rms: each star on its own, arcsec and mag, and all of
-    them as one attitude.
-    """
+    """The rms error of a combination: of each star, arcsec and mag, and of their attitude."""
 
     stars: int
     lost: int
@@ -177,8 +171,8 @@ class Error:
 
 @dataclass(frozen=True, slots=True)
 class Times:
-    """A frame's median time, quartile range and one sigma of the median, ms; its processor time;
-    how many were timed.
+    """A frame's median time, its quartile range and the sigma of the median, ms; its processor
+    time, ms; the number of frames.
     """
 
     time_ms: float
@@ -256,7 +250,7 @@ class CombinationRow:
 
 
 def said(flag: bool) -> str:
-    """A flag as it is written in the table."""
+    """A flag as the table writes it."""
     return "true" if flag else "false"
 
 
@@ -294,7 +288,9 @@ class SceneMeasurement:
         """The stars that are judged, over all exposures."""
         return sum(len(judge) for judge in self.judges)
 
-    def chain(self, combination: choices.Combination, exposure_number: int = 0) -> DrawingChain:
+    def chain(
+        self, combination: choices.ChainCombination, exposure_number: int = 0
+    ) -> DrawingChain:
         """A combination with the movement of one exposure."""
         return DrawingChain(
             combination, self.parts.bench(combination), self.judges[exposure_number].movement
@@ -333,7 +329,7 @@ class SceneMeasurement:
             **asdict(taken),
         )
 
-    def error(self, combination: choices.Combination) -> Error:
+    def error(self, combination: choices.ChainCombination) -> Error:
         """A combination's error over all exposures."""
         star_errors = []
         turns = []
@@ -366,10 +362,10 @@ def pooled(found: Sequence[Off]) -> tuple[float, float]:
 def timed(
     chains: Sequence[DrawingChain], time_s: float, staged: int
 ) -> tuple[list[Times], list[float]]:
-    """The times of all chains, and the median times of STAGES, ms, of one of them.
+    """Time all chains, and the STAGES of one of them; the stages' medians are in ms.
 
-    In rounds, each with an order of its own, so that other load on the machine affects all. A
-    visit's first frame is not counted: it fills caches that the chain before has emptied.
+    Each round has an order of its own, so that other load on the machine affects all. A visit's
+    first frame does not count: it fills caches that the chain before has emptied.
     """
     for chain in chains:
         chain.frame_ms()
@@ -391,13 +387,20 @@ def timed(
 
 
 def times_of(taken: FloatArray) -> Times:
-    """The times of a work by what its frames took (n, 2), `Spent`."""
+    """The statistics of frames' times (n, 2): wall and processor, ms."""
     low, middle, high = np.percentile(taken[:, 0], (25, 50, 75))
     noise = ERROR_OF_MEDIAN * (high - low) / SIGMAS_IN_IQR / math.sqrt(len(taken))
     time_ms, iqr_ms, noise_ms, cpu_ms = (
         round(float(ms), MS_PLACES) for ms in (middle, high - low, noise, np.median(taken[:, 1]))
     )
     return Times(time_ms, iqr_ms, noise_ms, cpu_ms, len(taken))
+
+
+def noise_ends_ms(time_ms: float, noise_ms: float) -> tuple[float, float]:
+    """The ends of the bar that shows a time's noise; at least half of the time, for a logarithmic
+    axis.
+    """
+    return max(time_ms - noise_ms, time_ms / 2), time_ms + noise_ms
 
 
 def rounded(value: float) -> float:
@@ -407,8 +410,8 @@ def rounded(value: float) -> float:
     return value
 
 
-def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> list[ErrorPart]:
-    """The parts of the error of the combination that `auto` takes, by STEPS, then RSS and WHOLE."""
+def error_budget(scene: SceneMeasurement, combination: choices.ChainCombination) -> list[ErrorPart]:
+    """The parts of the error of `auto`'s combination: STEPS, then RSS and WHOLE."""
     # by exposure: what is measured in the sky itself, then behind each step
     measured_by_step = []
     for number, judge in enumerate(scene.judges):
@@ -434,7 +437,7 @@ def error_budget(scene: SceneMeasurement, combination: choices.Combination) -> l
 
 
 def _lights(
-    scene: SceneMeasurement, combination: choices.Combination, number: int
+    scene: SceneMeasurement, combination: choices.ChainCombination, number: int
 ) -> Iterator[FloatArray]:
     """The mean light (H, W) of an exposure after each of STEPS."""
     chain = scene.chain(combination, number)

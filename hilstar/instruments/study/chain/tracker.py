@@ -35,13 +35,13 @@ from hilstar.server.bench.frame import Bench
 from hilstar.sky.stars import Stars
 
 # Gauss-Legendre over the exposure: 1.02 nodes to a sigma of path and three more are right to 1e-6
-# of a star in every pixel (scene/exposure_motion.py); JITTER's 37 Hz over the longest exposure are
+# of a star in every pixel (optics/exposure_motion.py); JITTER's 37 Hz over the longest exposure are
 # well within the minimum.
 NODES_PER_SIGMA, MIN_NODES = 1.02, 24
-REACH_SIGMAS = 4.0
+REACH_SIGMAS = 4.0  # beyond which a star has 3e-4 of its light
 LOST_SHARE = 0.1  # a star with a smaller share of its light in its pixels is lost
 LOST_MAG = MAG_PER_RELATIVE  # a lost star's flux is off by all of it
-PATH_STEP_PX = 0.5
+PATH_STEP_PX = 0.5  # between the places of a path
 # limit for others' light on a star's path, as a share of its own: at 50 px it moves the centre by
 # 0.05 px
 OTHERS_SHARE = 1e-3
@@ -49,24 +49,24 @@ OTHERS_SHARE = 1e-3
 
 def points(bench: Bench, q_icrs_to_cam: FloatArray, stars: Stars | None = None) -> FrameLight:
     """Stars, by default all of the bench's, as whole sprites at an attitude."""
+    if stars is None:
+        stars = bench.stars
     icrs_to_image = bench.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
-    return make_sprites(
-        bench.stars if stars is None else stars, icrs_to_image, bench.camera, bench.psf.footprint_px
-    )
+    return make_sprites(stars, icrs_to_image, bench.camera, bench.psf.footprint_px)
 
 
 def sky_light(bench: Bench, movement: Movement, seen: PanelExposure) -> FloatArray:
-    """The sky's own mean light (H, W) over an exposure, electrons per second, by enough instants
-    for every star's path.
+    """The sky's mean light (H, W) over an exposure, electrons per second.
+
+    It is summed over enough instants for every star's path.
     """
     times_s = [seen.begin_s + seen.length_s / 2]
     shares = [1.0]
     if movement.turns:
         path_rad = math.radians(abs(movement.rate_deg_s)) * seen.length_s
         sigmas = path_rad * bench.camera.scales_px_rad()[1] / min(bench.psf.width_px)
-        nodes, weights = np.polynomial.legendre.leggauss(
-            max(MIN_NODES, math.ceil(NODES_PER_SIGMA * sigmas) + 3)
-        )
+        count = max(MIN_NODES, math.ceil(NODES_PER_SIGMA * sigmas) + 3)
+        nodes, weights = np.polynomial.legendre.leggauss(count)
         times_s = (seen.begin_s + seen.length_s * (nodes + 1) / 2).tolist()
         shares = (weights / 2).tolist()
     total = np.zeros(bench.camera.resolution_px[::-1])
@@ -77,7 +77,7 @@ def sky_light(bench: Bench, movement: Movement, seen: PanelExposure) -> FloatArr
 
 
 def linear_light(bench: Bench, sprites: FrameLight) -> Lit:
-    """The pixels that a frame's sprites light, and the light of each before any quantisation."""
+    """The pixels that sprites light, and each one's light before quantisation."""
     image = np.zeros(bench.camera.resolution_px[::-1])
     add_stars(image, sprites, bench.psf, sprites.footprint_px)
     place = np.flatnonzero(image)
@@ -135,12 +135,12 @@ class StudyTracker(Closing):
 
 
 class StarJudge:
-    """One exposure of a scene: its stars that stand alone, as the tracker measures them in the
-    sky itself.
-    """
+    """The lone stars of one exposure, as the tracker measures them in the sky itself."""
 
     def __init__(self, tracker: StudyTracker, movement: Movement, seen: PanelExposure) -> None:
-        self.tracker, self.movement, self.seen = tracker, movement, seen
+        self.tracker = tracker
+        self.movement = movement
+        self.seen = seen
         bench = tracker.bench
         q = movement.at(seen.middle_ns())
         sprites = points(bench, q)
@@ -159,10 +159,13 @@ class StarJudge:
         path_rad = math.radians(abs(movement.rate_deg_s)) * (seen.length_s + 2 * self._late_s)
         self._path_px = path_rad * tracker.camera.scales_px_rad()[1]
         self.lost_arcsec = max(MATCH_PX, self._path_px) * tracker.arcsec_per_px
-        places_px = self._paths() if movement.turns else (self._x_px, self._y_px)
-        # Distance from the detector's edge beyond which a star is complete.
         radius_px = tracker.finder.settings.radius_px
-        margin_px = self._reach_px + 1 if movement.turns else radius_px + MATCH_PX
+        places_px = self._x_px, self._y_px
+        # Distance from the detector's edge beyond which a star is complete.
+        margin_px = radius_px + MATCH_PX
+        if movement.turns:
+            places_px = self._paths()
+            margin_px = self._reach_px + 1
         inside = np.atleast_2d(self._inside(*places_px, margin_px)).all(axis=0)
         if not (self._wanted & inside).any():
             return
@@ -172,9 +175,8 @@ class StarJudge:
             self._choose_paths(sky_e, *places_px)
         else:
             index = tracker.finder.match(sky_e, self._x_px, self._y_px).index
-            alone = ~shared(index) & ~crowded(
-                self._x_px, self._y_px, self._e, radius_px, tracker.psf
-            )
+            crowd = crowded(self._x_px, self._y_px, self._e, radius_px, tracker.psf)
+            alone = ~shared(index) & ~crowd
             self.judged = np.flatnonzero(self._wanted & (index >= 0) & alone)
         self.sky = self.measure(sky_e)
 
@@ -191,16 +193,13 @@ class StarJudge:
         if not is_matched.any():
             return MeasuredStars(np.full((len(index), 3), np.nan), np.zeros(len(index)))
         index = np.where(is_matched, index, 0)
-        directions = normalise(
-            self.tracker.camera.rays(match.found.x_px[index], match.found.y_px[index])
-        )
-        return MeasuredStars(
-            np.where(is_matched[:, None], directions, np.nan),
-            np.where(is_matched, match.found.flux[index], 0.0),
-        )
+        centroids = match.found
+        rays = self.tracker.camera.rays(centroids.x_px[index], centroids.y_px[index])
+        directions = np.where(is_matched[:, None], normalise(rays), np.nan)
+        return MeasuredStars(directions, np.where(is_matched, centroids.flux[index], 0.0))
 
     def _whole(self, star: IntArray) -> BoolArray:
-        """Stars bright enough for the panel's `exact` that clip at no sub-pixel phase."""
+        """Whether stars are bright enough for `exact` and clip at no place within a pixel."""
         bench = self.tracker.bench
         rates = bench.stars.electrons_per_s[star]
         white = bench.flux_at_white_e_per_s * bench.darkest
@@ -213,9 +212,9 @@ class StarJudge:
         """
         reach_px = self._reach_px
         y, x = np.mgrid[-reach_px : reach_px + 1, -reach_px : reach_px + 1]
-        disc = (x * x + y * y <= reach_px**2).nonzero()
-        near_x = disc[1] - reach_px
-        near_y = disc[0] - reach_px
+        rows, columns = (x * x + y * y <= reach_px**2).nonzero()
+        near_x = columns - reach_px
+        near_y = rows - reach_px
         width = sky_e.shape[1]
         flat = sky_e.ravel()
         judged = []
@@ -223,13 +222,15 @@ class StarJudge:
         for k in np.flatnonzero(self._wanted):
             column = np.rint(x_px[:, k]).astype(np.intp)
             row = np.rint(y_px[:, k]).astype(np.intp)
-            own_pixels = np.unique((row[:, None] + near_y) * width + column[:, None] + near_x)
+            path_pixels = (row[:, None] + near_y) * width + column[:, None] + near_x
+            own_pixels = np.unique(path_pixels)
             if flat[own_pixels].sum() <= (1 + OTHERS_SHARE) * self._e[k]:
                 judged.append(k)
                 pixels.append(own_pixels)
         self.judged = np.array(judged, dtype=np.intp)
-        self._pixels = np.concatenate(pixels) if pixels else np.zeros(0, dtype=np.intp)
-        self._begins = np.cumsum([0, *(len(own_pixels) for own_pixels in pixels)])[:-1]
+        counts = [len(own_pixels) for own_pixels in pixels]
+        self._pixels = np.concatenate([np.zeros(0, dtype=np.intp), *pixels])
+        self._begins = np.cumsum([0, *counts])[:-1]
 
     def _paths(self) -> tuple[FloatArray, FloatArray]:
         """Places (k, n) of the stars on the tracker along their whole paths, px."""
@@ -237,14 +238,14 @@ class StarJudge:
         visible = self.seen
         count = max(5, math.ceil(self._path_px / PATH_STEP_PX))
         at_s = np.linspace(-self._late_s, visible.length_s + self._late_s, count) + visible.begin_s
-        turns = []
-        for t in at_s:
-            turns.append(
-                tracker.camera.cam_to_image @ to_matrix(self.movement.at(round(t * NS_PER_S)))
-            )
         vectors = tracker.bench.stars.directions(self._star)
-        places = [tracker.camera.project(vectors @ turn.T) for turn in turns]
-        return np.stack([x for x, _ in places]), np.stack([y for _, y in places])
+        places = []
+        for t_s in at_s:
+            q_icrs_to_cam = self.movement.at(round(t_s * NS_PER_S))
+            turn = tracker.camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+            places.append(tracker.camera.project(vectors @ turn.T))
+        x_px, y_px = zip(*places, strict=True)
+        return np.stack(x_px), np.stack(y_px)
 
     def _measure_paths(self, image_e: FloatArray) -> MeasuredStars:
         if not len(self.judged):
@@ -252,49 +253,49 @@ class StarJudge:
         width = image_e.shape[1]
         light = image_e.ravel()[self._pixels]
         row, column = np.divmod(self._pixels, width)
-        total, by_x, by_y = (
-            np.add.reduceat(part, self._begins) for part in (light, light * column, light * row)
-        )
+        total = np.add.reduceat(light, self._begins)
+        by_x = np.add.reduceat(light * column, self._begins)
+        by_y = np.add.reduceat(light * row, self._begins)
         is_lit = total > LOST_SHARE * self._e[self.judged]
         divisor = np.where(is_lit, total, 1.0)
-        directions = normalise(self.tracker.camera.rays(by_x / divisor, by_y / divisor))
-        return MeasuredStars(
-            np.where(is_lit[:, None], directions, np.nan), np.where(is_lit, total, 0.0)
-        )
+        rays = self.tracker.camera.rays(by_x / divisor, by_y / divisor)
+        directions = np.where(is_lit[:, None], normalise(rays), np.nan)
+        return MeasuredStars(directions, np.where(is_lit, total, 0.0))
 
     def _inside(self, x_px: FloatArray, y_px: FloatArray, margin_px: float) -> BoolArray:
-        """Places on the tracker whose neighbourhood is whole on the detector and on the monitor."""
+        """Whether the surroundings of places are on the detector and on the monitor."""
         tracker = self.tracker
-        width, height = tracker.camera.resolution_px
-        inside = (
-            (x_px >= margin_px)
-            & (x_px < width - 1 - margin_px)
-            & (y_px >= margin_px)
-            & (y_px < height - 1 - margin_px)
-        )
-        seen_x, seen_y = (
-            part.reshape(x_px.shape)
-            for part in tracker.geometry.to_monitor(x_px.ravel(), y_px.ravel())
-        )
-        reach = tracker.bench.psf.footprint_px / 2 + margin_px * tracker.monitor_px_per_px
-        width, height = tracker.bench.camera.resolution_px
-        inside &= (seen_x >= reach) & (seen_x < width - 1 - reach)
-        return np.asarray(inside & (seen_y >= reach) & (seen_y < height - 1 - reach))
+        on_detector = within(x_px, y_px, tracker.camera.resolution_px, margin_px)
+        monitor_x, monitor_y = tracker.geometry.to_monitor(x_px.ravel(), y_px.ravel())
+        reach_px = tracker.bench.psf.footprint_px / 2 + margin_px * tracker.monitor_px_per_px
+        size_px = tracker.bench.camera.resolution_px
+        on_monitor = within(monitor_x, monitor_y, size_px, reach_px).reshape(x_px.shape)
+        return np.asarray(on_detector & on_monitor)
+
+
+def within(
+    x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int], margin_px: float
+) -> BoolArray:
+    """Whether places on an image are at least a margin from its edges."""
+    width, height = size_px
+    inside = (x_px >= margin_px) & (x_px < width - 1 - margin_px)
+    inside &= (y_px >= margin_px) & (y_px < height - 1 - margin_px)
+    return np.asarray(inside)
 
 
 def off(judge: StarJudge, shown: MeasuredStars, wanted: MeasuredStars) -> Off:
-    """Errors of the stars of a measurement in place and light.
+    """The errors of stars in place and light, between two measurements.
 
-    A lost one is off by all its light, and by 3 px or its path, whichever is longer: to lose a star
-    is no better than to find it late.
+    A lost star is off by all its light, and by 3 px or its path, whichever is longer: to lose a
+    star is no better than to find it late.
     """
     lost = shown.lost | wanted.lost
     chord = np.linalg.norm(shown.directions - wanted.directions, axis=1)
-    arcsec = np.where(
-        lost, judge.lost_arcsec, 2 * np.arcsin(np.minimum(chord, 2.0) / 2) * ARCSEC_PER_RAD
-    )
-    mag = magnitude(np.where(lost, 1.0, shown.light_e) / np.where(lost, 1.0, wanted.light_e))
-    return Off(arcsec, np.where(lost, LOST_MAG, mag), lost)
+    angle_arcsec = 2 * np.arcsin(np.minimum(chord, 2.0) / 2) * ARCSEC_PER_RAD
+    arcsec = np.where(lost, judge.lost_arcsec, angle_arcsec)
+    shown_e = np.where(lost, 1.0, shown.light_e)
+    wanted_e = np.where(lost, 1.0, wanted.light_e)
+    return Off(arcsec, np.where(lost, LOST_MAG, magnitude(shown_e / wanted_e)), lost)
 
 
 def attitude_off_arcsec(shown: MeasuredStars, wanted: MeasuredStars) -> tuple[float, float]:
@@ -304,7 +305,7 @@ def attitude_off_arcsec(shown: MeasuredStars, wanted: MeasuredStars) -> tuple[fl
     is_usable = ~(shown.lost | wanted.lost)
     if is_usable.sum() < 2:
         return math.nan, math.nan
-    x, y, z = ARCSEC_PER_RAD * turn_between(
-        wanted.directions[is_usable], shown.directions[is_usable], np.ones(is_usable.sum())
-    )
+    true = wanted.directions[is_usable]
+    turn_rad = turn_between(true, shown.directions[is_usable], np.ones(len(true)))
+    x, y, z = ARCSEC_PER_RAD * turn_rad
     return math.hypot(x, y), abs(float(z))

@@ -13,7 +13,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
@@ -111,17 +111,17 @@ def scene(
     visible = bench.sprites(q_icrs_to_cam, every).star
     ranked = visible[np.argsort(every.v_mag[visible], kind="stable")]
     if len(ranked) >= count:
-        is_shown = every.v_mag <= every.v_mag[ranked[count - 1]]
+        faintest = ranked[count - 1]
+        is_shown = every.v_mag <= every.v_mag[faintest]
         is_shown[ranked[count:]] = False
-        return BenchmarkScene(
-            _sorted(every, np.flatnonzero(is_shown), every.vectors[is_shown]), count
-        )
-    vectors = _directions(bench, q_icrs_to_cam, count - len(ranked), rng)
+        stars = _sorted(every, np.flatnonzero(is_shown), every.vectors[is_shown])
+        return BenchmarkScene(stars, count)
+    random_vectors = _directions(bench, q_icrs_to_cam, count - len(ranked), rng)
     faint = np.flatnonzero(every.v_mag >= np.median(every.v_mag))
-    sources = np.concatenate([np.arange(len(every)), rng.choice(faint, len(vectors))])
-    return BenchmarkScene(
-        _sorted(every, sources, np.concatenate([every.vectors, vectors])), len(ranked)
-    )
+    drawn = rng.choice(faint, len(random_vectors))
+    sources = np.concatenate([np.arange(len(every)), drawn])
+    vectors = np.concatenate([every.vectors, random_vectors])
+    return BenchmarkScene(_sorted(every, sources, vectors), len(ranked))
 
 
 def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
@@ -135,7 +135,9 @@ def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generat
     """ICRS unit vectors, even over a cap around the view, of which `wanted` are in view."""
     camera = bench.camera
     footprint_px = bench.psf.footprint_px
-    cos_cap = np.cos(min(SKY_BEYOND * camera.field_radius_rad(footprint_px), np.pi))
+    cap_rad = SKY_BEYOND * camera.field_radius_rad(footprint_px)
+    cos_cap = np.cos(min(cap_rad, np.pi))
+    icrs_to_image = camera.cam_to_image @ to_matrix(q)
     tries = 4 * wanted
     while True:
         z = 1 - rng.uniform(size=tries) * (1 - cos_cap)
@@ -143,20 +145,17 @@ def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generat
         across = np.sqrt(1 - z**2)
         vectors = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
         x_px, y_px = camera.project(vectors)
-        sprites = pack_sprites(
-            x_px, y_px, z, np.arange(tries), camera.resolution_px, footprint_px
-        ).star
-        if len(sprites) >= wanted:
-            return np.asarray(
-                vectors[: sprites[wanted - 1] + 1] @ (camera.cam_to_image @ to_matrix(q))
-            )
+        star = np.arange(tries)
+        sprites = pack_sprites(x_px, y_px, z, star, camera.resolution_px, footprint_px)
+        visible = sprites.star
+        if len(visible) >= wanted:
+            last = visible[wanted - 1]
+            return np.asarray(vectors[: last + 1] @ icrs_to_image)
         tries *= 2
 
 
 def other_methods() -> tuple[dict[str, Draw], dict[str, str]]:
-    """The methods that are installed here, imported and compiled; and by name the remedy for
-    each of the others.
-    """
+    """The installed methods, imported and compiled; and how to install each of the others."""
     draws: dict[str, Draw] = {}
     missing: dict[str, str] = {}
     for name, _, make in METHODS:
@@ -178,24 +177,26 @@ def numpy_linear(sprites: FrameLight, sigma_px: Sigma, shape: tuple[int, int]) -
     per second.
     """
     image = np.zeros(shape, np.float32)
+    height, width = shape
+    sigma_x, sigma_y = sigma_px
     steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
     columns = sprites.data["pixel"][:, :1] + steps
     rows = sprites.data["pixel"][:, 1:] + steps
-    share_y = _shares(rows, sprites.y_px, sigma_px[1]) * sprites.data["electrons_per_s"][:, None]
-    light = (share_y[:, :, None] * _shares(columns, sprites.x_px, sigma_px[0])[:, None, :]).astype(
-        np.float32
-    )
-    inside = ((rows >= 0) & (rows < shape[0]))[:, :, None] & (
-        (columns >= 0) & (columns < shape[1])
-    )[:, None, :]
-    place = rows[:, :, None] * shape[1] + columns[:, None, :]
+    share_x = _shares(columns, sprites.x_px, sigma_x)
+    share_y = _shares(rows, sprites.y_px, sigma_y) * sprites.data["electrons_per_s"][:, None]
+    light = (share_y[:, :, None] * share_x[:, None, :]).astype(np.float32)
+    inside_x = (columns >= 0) & (columns < width)
+    inside_y = (rows >= 0) & (rows < height)
+    inside = inside_y[:, :, None] & inside_x[:, None, :]
+    place = rows[:, :, None] * width + columns[:, None, :]
     np.add.at(image.ravel(), place[inside], light[inside])
     return image
 
 
 def _shares(pixels: IntArray, centre_px: FloatArray, sigma_px: float) -> FloatArray:
     edges = np.concatenate([pixels - 0.5, pixels[:, -1:] + 0.5], axis=1)
-    return np.asarray(0.5 * np.diff(erf((edges - centre_px[:, None]) / (sigma_px * SQRT2)), axis=1))
+    offset = (edges - centre_px[:, None]) / (sigma_px * SQRT2)
+    return np.asarray(0.5 * np.diff(erf(offset), axis=1))
 
 
 def _add_stars(
@@ -227,9 +228,8 @@ def _make_numba() -> Draw:
         first = sprites.data["pixel"] - (sprites.footprint_px - 1) // 2
         centre_px = np.stack([sprites.x_px, sprites.y_px])
         light = np.ascontiguousarray(sprites.data["electrons_per_s"])
-        add_stars(
-            image, first, centre_px, light, 1 / (np.array(sigma_px) * SQRT2), sprites.footprint_px
-        )
+        scale = 1 / (np.array(sigma_px) * SQRT2)
+        add_stars(image, first, centre_px, light, scale, sprites.footprint_px)
         return image
 
     return draw
@@ -244,14 +244,13 @@ def _make_galsim() -> Draw:
         last = sprites.footprint_px - 1
         first = (sprites.data["pixel"] - last // 2).tolist()
         light = sprites.data["electrons_per_s"].tolist()
-        for (column, row), x, y, electrons in zip(
-            first, sprites.x_px.tolist(), sprites.y_px.tolist(), light, strict=True
-        ):
-            bounds = galsim.BoundsI(column, column + last, row, row + last) & image.bounds
+        x_px = sprites.x_px.tolist()
+        y_px = sprites.y_px.tolist()
+        for (column, row), x, y, electrons in zip(first, x_px, y_px, light, strict=True):
+            stamp = galsim.BoundsI(column, column + last, row, row + last)
             star = profile.withFlux(electrons)
-            star.drawImage(
-                image=image[bounds], scale=1.0, center=galsim.PositionD(x, y), add_to_image=True
-            )
+            style = {"scale": 1.0, "center": galsim.PositionD(x, y), "add_to_image": True}
+            star.drawImage(image=image[stamp & image.bounds], **style)
         return np.asarray(image.array)
 
     return draw
@@ -263,19 +262,12 @@ def _make_photutils() -> Draw:
     table = import_module("astropy.table").QTable
 
     def draw(sprites: FrameLight, sigma_px: Sigma, shape: tuple[int, int]) -> Float32Array:
-        stars = table(
-            {
-                "x_0": sprites.x_px,
-                "y_0": sprites.y_px,
-                "flux": sprites.data["electrons_per_s"].astype(float),
-            }
-        )
+        flux = sprites.data["electrons_per_s"].astype(float)
+        stars = table({"x_0": sprites.x_px, "y_0": sprites.y_px, "flux": flux})
         fwhm = {"x_fwhm": sigma_px[0] * FWHM_PER_SIGMA, "y_fwhm": sigma_px[1] * FWHM_PER_SIGMA}
         side = sprites.footprint_px | 1
-        return np.asarray(
-            make_model_image(shape, model(**fwhm), stars, model_shape=(side, side)),
-            dtype=np.float32,
-        )
+        image = make_model_image(shape, model(**fwhm), stars, model_shape=(side, side))
+        return np.asarray(image, dtype=np.float32)
 
     return draw
 
@@ -306,19 +298,23 @@ def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: report.Size) -> rep
 
 def this_machine() -> report.Machine:
     """The processor, and the versions that the times depend on."""
-    cpus = Path("/proc/cpuinfo")
-    if cpus.is_file():
-        lines = cpus.read_text(encoding="utf-8").splitlines()
-    else:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return report.Machine(
-        cpu=next(iter(names), platform.machine()),
+        cpu=cpu_name(),
         cores=len(os.sched_getaffinity(0)),
         load=round(os.getloadavg()[0], 2),
         python=platform.python_version(),
         numpy=np.__version__,
     )
+
+
+def cpu_name() -> str:
+    """The processor's model, or its architecture where Linux does not tell it."""
+    cpus = Path("/proc/cpuinfo")
+    if cpus.is_file():
+        for line in cpus.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.machine()
 
 
 def _keep_image(
@@ -373,27 +369,27 @@ class CellMeasurement(Closing):
             self.result.agreement.append(report.Agreement(*self.cell_key, name, worst))
 
     def _keep(self, times_ms: dict[str, list[float]]) -> None:
-        self.result.python_ms.append(
-            report.PythonTime(*self.cell_key, _spread(times_ms.pop("python")))
-        )
+        python = report.PythonTime(*self.cell_key, _spread(times_ms.pop("python")))
+        self.result.python_ms.append(python)
         del times_ms["stages"]  # with its waits; its parts are kept
-        rows = [
-            ("hilstar", kind, times_ms.pop(kind))
-            for kind in ("whole_frame", "turning", "linear_only")
-        ]
+        rows = []
+        for kind in report.OF_AN_IMAGE:
+            rows.append(("hilstar", kind, times_ms.pop(kind)))
         for kind in (*STAGES, *GPU_STAGES):
-            if stage_ms := self.stage_ms.get(kind):
+            stage_ms = self.stage_ms.get(kind)
+            if stage_ms:
                 # without the first turn, as in `interleaved`
                 rows.append(("hilstar", kind, stage_ms[1:] or stage_ms))
-        rows += [(name, "linear_only", times) for name, times in times_ms.items()]
-        for method, kind, times in rows:
-            self.result.rows.append(
-                report.MethodTiming(*self.cell_key, method, kind, _spread(times))
-            )
+        for name, method_ms in times_ms.items():
+            rows.append((name, "linear_only", method_ms))
+        for method, kind, kind_ms in rows:
+            timing = report.MethodTiming(*self.cell_key, method, kind, _spread(kind_ms))
+            self.result.rows.append(timing)
 
     def _too_long(self, draw: Draw, budget_s: float) -> str | None:
-        """Why a method is skipped here: its time for all stars, estimated from that for one star
-        and for a hundred more.
+        """Why a method is skipped here, or None.
+
+        Its time for all stars is estimated from that for one star and for a hundred more.
         """
         if len(self.sprites) <= 101:
             return None
@@ -403,10 +399,12 @@ class CellMeasurement(Closing):
             for name in ("data", "star", "x_px", "y_px"):
                 few[name] = getattr(self.sprites, name)[:count]
             part = replace(self.sprites, **few)
-            return min(_seconds(lambda: draw(part, self.sigma_px, self.shape)) for _ in range(2))
+            work = partial(draw, part, self.sigma_px, self.shape)
+            return min(_seconds(work), _seconds(work))
 
         one_s = fastest_s(1)
-        frame_s = one_s + (fastest_s(101) - one_s) / 100 * len(self.sprites)
+        star_s = (fastest_s(101) - one_s) / 100
+        frame_s = one_s + star_s * len(self.sprites)
         if frame_s > budget_s:
             return f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s"
         return None
@@ -430,8 +428,9 @@ class CellMeasurement(Closing):
         projected = time.perf_counter()
         self.staged.draw(sprites)
         self.staged.levels()
-        before = {"cull": (culled - begin) * 1e3, "project": (projected - culled) * 1e3}
-        for kind, ms in {**before, **self.staged.stage_ms}.items():
+        stages_ms = {"cull": (culled - begin) * 1e3, "project": (projected - culled) * 1e3}
+        stages_ms |= self.staged.stage_ms
+        for kind, ms in stages_ms.items():
             self.stage_ms.setdefault(kind, []).append(ms)
 
     def _python(self) -> None:
@@ -456,18 +455,22 @@ class CellMeasurement(Closing):
 def interleaved(
     works: dict[str, Callable[[], object]], rounds: int, budget_s: float
 ) -> dict[str, list[float]]:
-    """Times in ms of each work, taken in turn; slow ones take fewer turns, evenly, to stay within
-    `budget_s` each.
+    """Times of each work, ms, in turn; a slow work gets fewer turns, to stay within `budget_s`.
 
     The first turn counts only where no other fits.
     """
     first_s = {name: _seconds(work) for name, work in works.items()}
     turns = {name: min(rounds, int(budget_s / seconds) - 1) for name, seconds in first_s.items()}
-    times = {name: [first_s[name] * 1e3] if turns[name] < 1 else [] for name in works}
-    for k in range(rounds):
+    times: dict[str, list[float]] = {name: [] for name in works}
+    for number in range(rounds):
         for name, work in works.items():
-            if turns[name] > 0 and (k + 1) * turns[name] // rounds > k * turns[name] // rounds:
+            before = number * turns[name] // rounds
+            after = (number + 1) * turns[name] // rounds
+            if after > before:
                 times[name].append(_seconds(work) * 1e3)
+    for name, seconds in first_s.items():
+        if turns[name] < 1:
+            times[name] = [seconds * 1e3]
     return times
 
 
@@ -477,8 +480,8 @@ def _seconds(work: Callable[[], object]) -> float:
     return time.perf_counter() - begin
 
 
-def _spread(times_ms: list[float]) -> report.Spread:
-    return report.Spread(float(np.median(times_ms)), min(times_ms), max(times_ms))
+def _spread(times_ms: list[float]) -> report.TimeSpread:
+    return report.TimeSpread(float(np.median(times_ms)), min(times_ms), max(times_ms))
 
 
 @dataclass(frozen=True, slots=True)
@@ -498,7 +501,7 @@ class BenchmarkPlan:
     file: BenchFile | None = None
 
 
-QUICK = BenchmarkPlan(
+QUICK: BenchmarkPlan = BenchmarkPlan(
     sizes=(report.REFERENCE_PX,), counts=COUNTS[:3], rounds=30, budget_s=2.0, exposures=1
 )
 
@@ -511,45 +514,41 @@ def run(
     """
     methods, missing = other_methods()
     others = OtherWork()
-    result = report.Result(
-        this_machine(), does={name: does for name, does, _ in METHODS if name in methods}
-    )
-    result.skipped += [report.Skipped(method=name, why=why) for name, why in missing.items()]
+    does = {name: does for name, does, _ in METHODS if name in methods}
+    result = report.Result(this_machine(), does=does)
+    for name, why in missing.items():
+        result.skipped.append(report.Skipped(method=name, why=why))
     q_icrs_to_cam = from_radec_roll_deg(*RADEC_ROLL_DEG)
+    cells_done = 0
     with TemporaryDirectory() as folder:
-        for place, size in enumerate(plan.sizes):
+        for size in plan.sizes:
             file = plan.file or own_bench_file(Path(folder) / "bench.toml", size, motion="on")
             with open_bench(file) as bench:
                 result.gl_renderer = bench.renderer.gl_renderer
                 every = bench.shown_stars
-                for k, count in enumerate(plan.counts):
+                for count in plan.counts:
                     shown = scene(bench, every, q_icrs_to_cam, count, rng)
-                    result.scenes.append(
-                        report.SceneOrigin(
-                            *size, count, shown.catalogue_count, count - shown.catalogue_count
-                        )
-                    )
-                    with CellMeasurement(
-                        bench.with_stars(shown.stars),
-                        q_icrs_to_cam,
-                        report.Cell(*size, count),
-                        result,
-                    ) as cell:
-                        cell.measure(methods, plan.rounds, plan.budget_s)
-                    advance(place * len(plan.counts) + k + 1)
-            result.startup += [
-                fresh_start(file.path, q_icrs_to_cam, size) for _ in range(plan.starts)
-            ]
+                    known = shown.catalogue_count
+                    origin = report.SceneOrigin(*size, count, known, count - known)
+                    result.scenes.append(origin)
+                    own_bench = bench.with_stars(shown.stars)
+                    cell = report.Cell(*size, count)
+                    with CellMeasurement(own_bench, q_icrs_to_cam, cell, result) as measurement:
+                        measurement.measure(methods, plan.rounds, plan.budget_s)
+                    cells_done += 1
+                    advance(cells_done)
+            for _ in range(plan.starts):
+                result.startup.append(fresh_start(file.path, q_icrs_to_cam, size))
     if plan.exposures:
         result.tracker, without = tracker.tracker_rows(plan.exposures, plan.budget_s)
         result.skipped += without
+    size = plan.sizes[0]
     if report.REFERENCE_PX in plan.sizes:
         size = report.REFERENCE_PX
-    else:
-        size = plan.sizes[0]
-    here = [start for start in result.startup if start.size == size]
+    starts = [start for start in result.startup if start.size == size]
     for name in ("import_ms", "first_frame_ms", "memory_mb"):
-        setattr(result, name, float(np.median([getattr(start, name) for start in here])))
+        median = np.median([getattr(start, name) for start in starts])
+        setattr(result, name, float(median))
     result.others_cores = round(others.cores(), 2)
     result.aims += _aims(result)
     return result
@@ -571,42 +570,40 @@ def own_bench_file(path: Path, size_px: report.Size, **render: Value) -> BenchFi
 
 
 def _aims(result: report.Result) -> list[report.Aim]:
-    at = {(row.size, row.stars, row.method, row.kind): row.ms.median for row in result.rows}
-    aims = []
-    for (size, stars, method, kind), ms in at.items():
-        where = f"{stars} stars, {size[0]} x {size[1]}"
-        still, numba = (
-            at.get((size, stars, *key))
-            for key in (("hilstar", "whole_frame"), ("numba", "linear_only"))
-        )
-        if kind == "whole_frame" and (size, stars) in AIMS_MS:
-            aims.append((f"whole frame to codes, {where}", AIMS_MS[size, stars], ms))
-        elif kind == "turning" and still is not None:
-            aims.append(
-                (
-                    f"turning by 10 deg/s, {where}, {TURNING_TIMES:g} still frames",
-                    TURNING_TIMES * still,
-                    ms,
-                )
-            )
-        elif kind == "linear_only" and method == "hilstar" and numba is not None:
-            aims.append((f"linear image, {where}, numba's time", numba, ms))
-    for python in result.python_ms:
-        if python.size == report.REFERENCE_PX and python.stars in PYTHON_AIMS_MS:
-            aims.append(
-                (
-                    f"Python outside GL, {python.stars} stars",
-                    PYTHON_AIMS_MS[python.stars],
-                    python.ms.median,
-                )
-            )
-    starts = []
+    """The project's aims, beside the measured times."""
+    aims = [*_frame_aims(result.rows), *_python_aims(result.python_ms)]
+    starts_ms = []
     for start in result.startup:
         if start.size == report.REFERENCE_PX:
-            starts.append(start.import_ms + start.first_frame_ms)
-    if starts:
-        aims.append(("import and first frame", START_AIM_MS, float(np.median(starts))))
-    judged = not result.load.busy
-    return [
-        report.Aim(what, aim_ms, ms, ms <= aim_ms if judged else None) for what, aim_ms, ms in aims
-    ]
+            starts_ms.append(start.import_ms + start.first_frame_ms)
+    if starts_ms:
+        aims.append(("import and first frame", START_AIM_MS, float(np.median(starts_ms))))
+    judged = []
+    for what, aim_ms, ms in aims:
+        reached = None if result.load.busy else ms <= aim_ms
+        judged.append(report.Aim(what, aim_ms, ms, reached))
+    return judged
+
+
+def _frame_aims(rows: Sequence[report.MethodTiming]) -> Iterator[tuple[str, float, float]]:
+    """Aims of frames and images: what, the aim and the time, ms."""
+    at = {(row.size, row.stars, row.method, row.kind): row.ms.median for row in rows}
+    for (size, stars, method, kind), ms in at.items():
+        where = f"{stars} stars, {size[0]} x {size[1]}"
+        still = at.get((size, stars, "hilstar", "whole_frame"))
+        numba = at.get((size, stars, "numba", "linear_only"))
+        if kind == "whole_frame" and (size, stars) in AIMS_MS:
+            yield f"whole frame to codes, {where}", AIMS_MS[size, stars], ms
+        elif kind == "turning" and still is not None:
+            what = f"turning by 10 deg/s, {where}, {TURNING_TIMES:g} still frames"
+            yield what, TURNING_TIMES * still, ms
+        elif kind == "linear_only" and method == "hilstar" and numba is not None:
+            yield f"linear image, {where}, numba's time", numba, ms
+
+
+def _python_aims(rows: Sequence[report.PythonTime]) -> Iterator[tuple[str, float, float]]:
+    """Aims of what is not OpenGL: what, the aim and the time, ms."""
+    for row in rows:
+        if row.size == report.REFERENCE_PX and row.stars in PYTHON_AIMS_MS:
+            what = f"Python outside GL, {row.stars} stars"
+            yield what, PYTHON_AIMS_MS[row.stars], row.ms.median

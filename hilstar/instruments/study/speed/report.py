@@ -1,13 +1,19 @@
 """The benchmark's result: the command's JSON object, lines for a person, a CSV and a chart."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from msgspec import UNSET, UnsetType
 
-from hilstar.basics.charts import BLUE, GREEN, ORANGE, PURPLE, RED, chart, plain_ticks, write_csv
+from hilstar.basics.charts import BLUE, GREEN, ORANGE, PURPLE, RED, write_csv
+from hilstar.instruments.study.engine import (
+    ChartSpec,
+    LineSpec,
+    PanelSpec,
+    SeriesLook,
+    row_panels,
+)
 from hilstar.instruments.study.sweep import Load
 
 Size = tuple[int, int]
@@ -16,15 +22,16 @@ COLOURS = {"hilstar": RED, "numpy": BLUE, "numba": ORANGE, "galsim": GREEN, "pho
 COLUMN = 12
 NAME = 26
 OF_AN_IMAGE = ("whole_frame", "turning", "linear_only")
+# By the kind of a row: its name, marker and line.
 LABELS = {
-    "whole_frame": ("whole frame to codes", "o-"),
-    "turning": ("the same turning by 10 deg/s", "o:"),
-    "linear_only": ("linear image only", "o--"),
+    "whole_frame": ("whole frame to codes", "o", "-"),
+    "turning": ("the same turning by 10 deg/s", "o", ":"),
+    "linear_only": ("linear image only", "o", "--"),
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Spread:
+class TimeSpread:
     """Times of a work, ms."""
 
     median: float
@@ -60,14 +67,14 @@ class MethodTiming(Cell):
 
     method: str
     kind: str
-    ms: Spread
+    ms: TimeSpread
 
 
 @dataclass(frozen=True, slots=True)
 class PythonTime(Cell):
     """How long all of a frame takes that is not OpenGL."""
 
-    ms: Spread
+    ms: TimeSpread
 
 
 @dataclass(frozen=True, slots=True)
@@ -258,44 +265,54 @@ def write(result: Result, folder: Path) -> None:
 
 
 def _draw(path: Path, result: Result) -> None:
+    """The time of a frame against the stars in view, a panel for each image size."""
     sizes = _sizes(result.rows)
+    rows = [row for row in result.rows if row.kind in OF_AN_IMAGE]
     across = min(2, len(sizes))
     down = -(-len(sizes) // across)
-    height = 2.1 + 2.5 * down
-    layout: dict[str, Any] = {"share_x": True, "share_y": True, "height_inch": height}
-    with chart(
-        path, _finding(result), down, across, note=result.load.note("Medians, in turn."), **layout
-    ) as grid:
-        for axes in grid[len(sizes) :]:
-            axes.set_axis_off()
-        for axes, size in zip(grid, sizes, strict=False):
-            rows = [row for row in result.rows if row.size == size and row.kind in OF_AN_IMAGE]
-            for method, kind in dict.fromkeys((row.method, row.kind) for row in rows):
-                points = [
-                    (row.stars, row.ms.median)
-                    for row in rows
-                    if (row.method, row.kind) == (method, kind)
-                ]
-                label, style = LABELS[kind]
-                axes.plot(
-                    *zip(*points, strict=True),
-                    style,
-                    color=COLOURS[method],
-                    ms=4,
-                    label=f"{method}, {label}",
-                )
-            axes.set(title=_words(size), xscale="log", yscale="log")
-            plain_ticks(axes.xaxis, _counts(rows))
-        for axes in grid[-across:]:
-            axes.set_xlabel("stars in view")
-        for axes in grid[::across]:
-            axes.set_ylabel("time of a frame [ms]")
-        handles = {
-            label: line
-            for axes in grid
-            for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
-        }
-        grid[0].figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=2)
+    looks = {}
+    for method, kind in dict.fromkeys(map(_series, rows)):
+        label, marker, _ = LABELS[kind]
+        looks[method, kind] = SeriesLook(f"{method}, {label}", COLOURS[method], marker)
+    panels = []
+    for number, size in enumerate(sizes):
+        xlabel = "stars in view" if number // across == down - 1 else ""
+        ylabel = "time of a frame [ms]" if number % across == 0 else ""
+        panels.append(replace(_size_panel(size, rows), xlabel=xlabel, ylabel=ylabel))
+    layout = {"share_x": True, "share_y": True, "height_inch": 2.1 + 2.5 * down}
+    spec = ChartSpec(tuple(panels), _series, looks, "Medians, in turn.", across, layout)
+    with row_panels(path, _finding(result), spec, rows, result.load) as grid:
+        handles = {}
+        for axes in grid:
+            for line, label in zip(*axes.get_legend_handles_labels(), strict=True):
+                handles[label] = line
+        names = handles.values(), handles.keys()
+        grid[0].figure.legend(*names, loc="outside lower center", ncols=2)
+
+
+def _series(row: MethodTiming) -> tuple[str, str]:
+    """The series of a row: its method and its kind."""
+    return row.method, row.kind
+
+
+def _size_panel(size: Size, rows: Sequence[MethodTiming]) -> PanelSpec:
+    """The times on one image size."""
+    lines = []
+    for kind, (_, _, style) in LABELS.items():
+
+        def is_drawn(row: MethodTiming, kind: str = kind) -> bool:
+            return row.size == size and row.kind == kind
+
+        lines.append(LineSpec("stars", _median_ms, style, where=is_drawn, look={"ms": 4}))
+    counts = _counts([row for row in rows if row.size == size])
+    return PanelSpec(
+        tuple(lines), title=_words(size), scales=("log", "log"), xticks=counts, names=False
+    )
+
+
+def _median_ms(row: MethodTiming) -> float:
+    """What is drawn of a row."""
+    return row.ms.median
 
 
 def _finding(result: Result) -> str:

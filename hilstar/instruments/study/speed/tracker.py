@@ -21,7 +21,7 @@ from hilstar.instruments.campaign.plan import parse_plan
 from hilstar.instruments.campaign.session import OWN_THREADS, Session
 from hilstar.instruments.campaign.solvers import CENTROIDS
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
-from hilstar.instruments.study.speed.report import Cell, MethodTiming, Skipped, Spread
+from hilstar.instruments.study.speed.report import Cell, MethodTiming, Skipped, TimeSpread
 from hilstar.instruments.study.sweep import in_turn
 from hilstar.instruments.verify.summary import verify
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
@@ -173,6 +173,6 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
         works, key=lambda each: (KINDS.index(each[1]), each[0] != "hilstar", each[0])
     ):
         ms = [timing.cpu_ms for timing in times[f"{name} {kind}"]]
-        spread = Spread(float(np.median(ms)), min(ms), max(ms))
+        spread = TimeSpread(float(np.median(ms)), min(ms), max(ms))
         rows.append(MethodTiming(cell.width, cell.height, cell.stars, name, kind, spread))
     return rows, skipped

@@ -23,7 +23,7 @@ COLUMNS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
+class CaseFigures:
     """One measure of two methods, in the unit of `tolerance`: `error` is hilstar's, `fault` that
     of the failing method.
     """
@@ -45,7 +45,7 @@ class FailureCase:
     fails: str
     happens: str
     why: str
-    figures: Figures
+    figures: CaseFigures
 
     @property
     def right(self) -> bool:
@@ -71,6 +71,6 @@ def recorded(name: str) -> list[FailureCase]:
     """The recorded cases of one of the tables beside this file."""
     with Path(__file__).with_name(f"{name}.csv").open(encoding="utf-8", newline="") as file:
         return [
-            FailureCase(case, method, fails, happens, why, Figures(*map(float, numbers)))
+            FailureCase(case, method, fails, happens, why, CaseFigures(*map(float, numbers)))
             for case, _, method, fails, happens, why, *numbers in list(csv.reader(file))[1:]
         ]

@@ -26,14 +26,16 @@ from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import Levels, Response, srgb_response
 from hilstar.instruments.study.codes import AIMS
-from hilstar.instruments.study.stability import FailureCase, Figures
+from hilstar.instruments.study.stability import CaseFigures, FailureCase
 from hilstar.optics.psf import MAX_CUT, SQRT2, GaussianPsf, pixel_shares
 from hilstar.optics.sprites import FrameLight, join_sprites, make_sprites, pack_sprites
 from hilstar.sky.catalog import HIPPARCOS_EPOCH_JYEAR, load_catalog
 from hilstar.sky.stars import make_stars, unit_vectors_icrs
 
 IMAGE_PX = (512, 512)
-SIGMA_PX = 0.85
+MIDDLE_PX = 256
+OFF_MIDDLE_PX = (256.3, 256.0)
+SIGMA_PX = 0.85  # of sprites by default
 SEED = 1
 # The shader's erf (tests/gpu/test_renderer.py); a share along an axis is half the difference of
 # two.
@@ -72,7 +74,7 @@ CODES_SEED = 6
 # groups of stars along either side of the image, and the side of each one's part of it
 COUNT, TILE_PX = 8, 22
 SIDE_PX = COUNT * TILE_PX
-WHITE = 1.0
+WHITE = 1.0  # light of white, of which errors are shares
 FAINT_MAG = 6.0  # under the star whose peak is white
 NARROW_PX = 0.3
 # A star of equal steps can have its light within half of one and no nearer; where steps differ it
@@ -88,14 +90,15 @@ TOGETHER = (
 
 
 def target(sigma_px: float, size_px: tuple[int, int] = IMAGE_PX) -> Target:
-    """A linear image, whose stars are round."""
+    """A linear image with round stars."""
     return Target(size_px, GaussianPsf((sigma_px, sigma_px)))
 
 
 def one_star(x_px: float, y_px: float, on: Target, electrons_per_s: float = 1.0) -> FrameLight:
-    """A star of a target's sigma."""
-    place = np.array([x_px]), np.array([y_px]), np.array([electrons_per_s])
-    return pack_sprites(*place, np.zeros(1, dtype=np.intp), on.resolution_px, on.psf.footprint_px)
+    """One star with the sigma of a target."""
+    star = np.zeros(1, dtype=np.intp)
+    x, y, rate = np.array([[x_px], [y_px], [electrons_per_s]])
+    return pack_sprites(x, y, rate, star, on.resolution_px, on.psf.footprint_px)
 
 
 @contextmanager
@@ -110,24 +113,35 @@ def by_renderer(on: Target) -> Iterator[Draw]:
         yield draw
 
 
+def drawn(on: Target, sprites: FrameLight) -> FloatArray:
+    """The linear image (h, w) of sprites as hilstar draws them."""
+    with by_renderer(on) as draw:
+        return draw(sprites)
+
+
 def _outer(
     on: Target, sprites: FrameLight, shares: Callable[[FloatArray, float], FloatArray]
 ) -> FloatArray:
-    """One star's image from its shares along each axis, by a pixel's offset from it and sigma,
-    px.
+    """One star's image from its shares along each axis.
+
+    `shares` takes the pixels' offsets from the star, px, and its sigma, px.
     """
-    places = zip((sprites.x_px[0], sprites.y_px[0]), on.resolution_px, on.psf.width_px, strict=True)
-    along_x, along_y = (shares(np.arange(size) - at, sigma_px) for at, size, sigma_px in places)
-    return np.asarray(float(sprites.data["electrons_per_s"][0]) * np.outer(along_y, along_x))
+    width, height = on.resolution_px
+    sigma_x, sigma_y = on.psf.width_px
+    along_x = shares(np.arange(width) - sprites.x_px[0], sigma_x)
+    along_y = shares(np.arange(height) - sprites.y_px[0], sigma_y)
+    rate = float(sprites.data["electrons_per_s"][0])
+    return np.asarray(rate * np.outer(along_y, along_x))
 
 
 def point_sampled(on: Target, sprites: FrameLight) -> FloatArray:
     """One star with the Gaussian's value at the middle of each pixel, (h, w)."""
-    return _outer(
-        on,
-        sprites,
-        lambda offset, sigma: np.exp(-0.5 * (offset / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)),
-    )
+
+    def gaussian(offset_px: FloatArray, sigma_px: float) -> FloatArray:
+        exponential = np.exp(-0.5 * (offset_px / sigma_px) ** 2)
+        return np.asarray(exponential / (sigma_px * np.sqrt(2 * np.pi)))
+
+    return _outer(on, sprites, gaussian)
 
 
 def half_float(on: Target, sprites: FrameLight) -> FloatArray:
@@ -144,7 +158,8 @@ def _by_erf(
     on: Target, sprites: FrameLight, erf_of: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
     def shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
-        far, near = (erf_of((offset_px + side) / (sigma_px * SQRT2)) for side in (0.5, -0.5))
+        far = erf_of((offset_px + 0.5) / (sigma_px * SQRT2))
+        near = erf_of((offset_px - 0.5) / (sigma_px * SQRT2))
         return np.asarray((far - near).astype(np.float64) / 2)
 
     return _outer(on, sprites, shares)
@@ -152,20 +167,20 @@ def _by_erf(
 
 def nearest_pixel(on: Target, sprites: FrameLight) -> FloatArray:
     """One star with all of its light in the nearest pixel."""
-    return _outer(
-        on,
-        sprites,
-        lambda offset, _: (np.arange(len(offset)) == np.abs(offset).argmin()).astype(np.float64),
-    )
+
+    def shares(offset_px: FloatArray, _: float) -> FloatArray:
+        nearest = np.zeros(len(offset_px))
+        nearest[np.abs(offset_px).argmin()] = 1.0
+        return nearest
+
+    return _outer(on, sprites, shares)
 
 
 def erf_float32(value: FloatArray) -> FloatArray:
     """erf by splat.frag's rational polynomial, every step in float32; same shape."""
     x = np.clip(value, -4, 4).astype(np.float32)
-    above, below = (
-        np.polyval(np.array(terms, dtype=np.float32), x * x)
-        for terms in (ERF_NUMERATOR, ERF_DENOMINATOR)
-    )
+    above = np.polyval(np.array(ERF_NUMERATOR, dtype=np.float32), x * x)
+    below = np.polyval(np.array(ERF_DENOMINATOR, dtype=np.float32), x * x)
     return np.asarray(x * above / below)
 
 
@@ -184,23 +199,22 @@ class PhaseErrors:
 
 def star_errors(draw: Draw, on: Target, phases_px: FloatArray) -> PhaseErrors:
     """The largest errors of a star's image over sub-pixel phases (n,)."""
+    sigma_x, sigma_y = on.psf.width_px
+    columns = np.arange(IMAGE_PX[0])
+    true_down = pixel_shares(np.zeros(1), sigma_y)[0]
     flux_error = 0.0
     off_px = 0.0
     peak_error = 0.0
     for phase in phases_px:
-        image = draw(one_star(256 + phase, 256.0, on))
+        image = draw(one_star(MIDDLE_PX + phase, float(MIDDLE_PX), on))
         light = float(image.sum())
-        flux_error = max(flux_error, abs(light - 1))
-        off_px = max(
-            off_px, abs(float(image.sum(axis=0) @ np.arange(IMAGE_PX[0])) / light - 256 - phase)
-        )
+        centre_px = float(image.sum(axis=0) @ columns) / light
         middle = np.rint(phase)
-        across, down = (
-            pixel_shares(np.array([at]), sigma)
-            for at, sigma in zip((middle - phase, 0.0), on.psf.width_px, strict=True)
-        )
-        off = float(image[256, int(256 + middle)]) / float(across[0] * down[0]) - 1
-        peak_error = max(peak_error, off, key=abs)
+        true_across = pixel_shares(np.array([middle - phase]), sigma_x)[0]
+        peak = float(image[MIDDLE_PX, int(MIDDLE_PX + middle)])
+        flux_error = max(flux_error, abs(light - 1))
+        off_px = max(off_px, abs(centre_px - MIDDLE_PX - phase))
+        peak_error = max(peak_error, peak / float(true_across * true_down) - 1, key=abs)
     return PhaseErrors(flux_error, off_px, peak_error)
 
 
@@ -208,16 +222,16 @@ def narrow_star() -> FailureCase:
     """Sigma 0.1 px."""
     ours, sampled = narrow_errors(0.1)
     wider, wider_sampled = narrow_errors(0.5)
+    places = f"{sampled.centroid_px:.2f} px ({wider_sampled.centroid_px:.4f} at sigma 0.5)"
+    own_places = f"{ours.centroid_px:.2f} px ({wider.centroid_px:.4f} at sigma 0.5)"
     return FailureCase(
         "sigma 0.1 px",
         POINT_SAMPLED,
-        f"flux off by up to {100 * sampled.flux:.0f} %, centre of gravity by"
-        f" {sampled.centroid_px:.2f} px ({wider_sampled.centroid_px:.4f} at sigma 0.5)",
-        f"flux off by {ours.flux:.1e}; centre of gravity by {ours.centroid_px:.2f} px"
-        f" ({wider.centroid_px:.4f} at sigma 0.5)",
+        f"flux off by up to {100 * sampled.flux:.0f} %, centre of gravity by {places}",
+        f"flux off by {ours.flux:.1e}; centre of gravity by {own_places}",
         "the Gaussian is integrated over pixels; pixels of any display keep that centroid error:"
         " write 0.5 px or more",
-        Figures(ours.flux, sampled.flux, FLUX_ERROR),
+        CaseFigures(ours.flux, sampled.flux, FLUX_ERROR),
     )
 
 
@@ -226,62 +240,60 @@ def narrow_errors(sigma_px: float) -> tuple[PhaseErrors, PhaseErrors]:
     on = target(sigma_px)
     phases = np.linspace(-0.5, 0.5, 21)
     with by_renderer(on) as draw:
-        return star_errors(draw, on, phases), star_errors(partial(point_sampled, on), on, phases)
+        ours = star_errors(draw, on, phases)
+    return ours, star_errors(partial(point_sampled, on), on, phases)
 
 
 def wide_star() -> FailureCase:
     """Sigma 20 px."""
     on = target(20.0)
-    sprites = one_star(256.3, 256.0, on)
+    sprites = one_star(*OFF_MIDDLE_PX, on)
     exact = linear_image(sprites, on.resolution_px, on.psf)
-    with by_renderer(on) as draw:
-        image = draw(sprites)
-    error, fault = (
-        float(np.abs(shown - exact).max() / exact.max())
-        for shown in (image, half_float(on, sprites))
-    )
+    image = drawn(on, sprites)
+    error = float(np.abs(image - exact).max() / exact.max())
+    fault = float(np.abs(half_float(on, sprites) - exact).max() / exact.max())
     return FailureCase(
         "sigma 20 px",
         "erf differences in half floats",
         f"a pixel off by up to {100 * fault:.0f} % of the peak",
         f"{error:.0e} of the peak; the star's flux off by {image.sum() - 1:+.0e}",
         "float32 differences are small against the flux, and their errors cancel in the sum",
-        Figures(error, fault, PEAK_ERROR),
+        CaseFigures(error, fault, PEAK_ERROR),
     )
 
 
 def negative_wings() -> FailureCase:
-    """Far out both erfs are 1 but for rounding."""
+    """Far from a star both erfs are 1 but for rounding."""
     on = target(20.0)
-    sprites = one_star(256.3, 256.0, on)
-    with by_renderer(on) as draw:
-        image = draw(sprites)
+    sprites = one_star(*OFF_MIDDLE_PX, on)
     bare = bare_polynomial(on, sprites)
-    error, fault = (int((shown < 0).sum()) for shown in (image, bare))
+    error = int((drawn(on, sprites) < 0).sum())
+    fault = int((bare < 0).sum())
     return FailureCase(
         "the wings of a star, sigma 20 px",
         "float32 erf differences as they come",
         f"{fault} pixels of negative light, down to {bare.min():.0e} of the star's",
         f"{error} negative pixels",
         "the shader takes the larger of difference and 0",
-        Figures(float(error), float(fault), NOTHING),
+        CaseFigures(float(error), float(fault), NOTHING),
     )
 
 
 def floored_wings() -> FailureCase:
     """A floor of 1e-7 under each pixel's share."""
     on = target(SIGMA_PX)
-    sprites = one_star(256.3, 256.0, on)
-    with by_renderer(on) as draw:
-        error = float(abs(draw(sprites).sum() - 1))
-    fault = float(np.maximum(_outer(on, sprites, pixel_shares), 1e-7).sum() - 1)
+    sprites = one_star(*OFF_MIDDLE_PX, on)
+    error = float(abs(drawn(on, sprites).sum() - 1))
+    floored = np.maximum(_outer(on, sprites, pixel_shares), 1e-7)
+    fault = float(floored.sum() - 1)
+    width, height = IMAGE_PX
     return FailureCase(
         "a floor of 1e-7 of a star's light",
         "max(share, 1e-7) in every pixel",
-        f"adds {100 * fault:.1f} % to each star, over {IMAGE_PX[0]} x {IMAGE_PX[1]} pixels",
+        f"adds {100 * fault:.1f} % to each star, over {width} x {height} pixels",
         f"flux off by {error:.0e}",
         "no floor: outside its footprint a star has no light",
-        Figures(error, fault, FLUX_ERROR),
+        CaseFigures(error, fault, FLUX_ERROR),
     )
 
 
@@ -290,22 +302,24 @@ def absurd_sigmas() -> FailureCase:
     context = create_context()
     point_px = int(context.info["GL_POINT_SIZE_RANGE"][1])
     context.release()
-    lines = []
+    refusals = []
+    cuts = []
     silently_cut = NOTHING
     for sigma_px in (60.0, 1e6):
+        psf = GaussianPsf((sigma_px, sigma_px))
+        cuts.append(psf.cut_share(point_px))
         try:
-            Renderer(Target(IMAGE_PX, GaussianPsf((sigma_px, sigma_px)))).close()
-            silently_cut = max(silently_cut, GaussianPsf((sigma_px, sigma_px)).cut_share(point_px))
+            Renderer(Target(IMAGE_PX, psf)).close()
+            silently_cut = max(silently_cut, cuts[-1])
         except InputError as refusal:
-            lines.append(str(refusal))
-    cuts = [GaussianPsf((sigma_px, sigma_px)).cut_share(point_px) for sigma_px in (60.0, 1e6)]
+            refusals.append(str(refusal))
     return FailureCase(
         "sigma 60 and 1e6 px",
         f"GL's largest point, {point_px} px, whatever the sigma",
         f"cuts {100 * cuts[0]:.1f} % and {100 * cuts[1]:.5f} % of a star's light",
-        "refused: " + " | ".join(lines),
+        f"refused: {' | '.join(refusals)}",
         "a point of GL is a star's footprint",
-        Figures(silently_cut, max(cuts), MAX_CUT),
+        CaseFigures(silently_cut, max(cuts), MAX_CUT),
     )
 
 
@@ -314,49 +328,58 @@ def star_on_pixel_edge() -> FailureCase:
     on = target(SIGMA_PX)
     phases = np.array([-0.5, 0.5 - 1e-9, 0.5, 0.5 + 1e-9])
     with by_renderer(on) as draw:
-        off_px, fault_px = (
-            star_errors(by, on, phases).centroid_px for by in (draw, partial(nearest_pixel, on))
-        )
+        off_px = star_errors(draw, on, phases).centroid_px
+    fault_px = star_errors(partial(nearest_pixel, on), on, phases).centroid_px
     return FailureCase(
         "a star on a pixel's edge",
         "the nearest pixel",
         f"centre {fault_px:.2f} px off, to either side",
         f"centre {off_px:.0e} px off",
         "light goes to both pixels; place is whole pixel and float32 fraction",
-        Figures(off_px, fault_px, CENTROID_PX),
+        CaseFigures(off_px, fault_px, CENTROID_PX),
     )
 
 
 def star_on_image_edge() -> FailureCase:
     """Stars whose centres are on and beyond the image's edges and corner."""
-    errors = []
-    faults = []
     last = IMAGE_PX[0] - 1.0
     on = target(SIGMA_PX)
+    beyond = last + 0.6
+    error = 0.0
+    fault = 0.0
     for x_px, y_px in (
-        (-0.5, 256.0),
-        (-0.6, 256.0),
-        (last + 0.6, 256.0),
-        (256.0, -2.0),
-        (-0.6, last + 0.6),
+        *((-0.5, 256.0), (-0.6, 256.0), (beyond, 256.0)),
+        *((256.0, -2.0), (-0.6, beyond)),
     ):
         places = np.array([x_px, y_px])
         shares = ndtr((places + 0.5) / SIGMA_PX) - ndtr((places - last - 0.5) / SIGMA_PX)
         exact = float(np.prod(shares))
-        inside = 0 <= np.rint(x_px) <= last and 0 <= np.rint(y_px) <= last
-        with by_renderer(on) as draw:
-            errors.append(abs(float(draw(one_star(x_px, y_px, on)).sum()) - exact))
-        faults.append(abs(float(inside) - exact))
-    error = max(errors)
-    fault = max(faults)
+        pixel = np.rint(places)
+        inside = bool(((pixel >= 0) & (pixel <= last)).all())
+        light = float(drawn(on, one_star(x_px, y_px, on)).sum())
+        error = max(error, abs(light - exact))
+        fault = max(fault, abs(float(inside) - exact))
     return FailureCase(
         "stars on the image's edge",
         "a star drawn whole or not at all, by its centre",
         f"up to {100 * fault:.0f} % of its light too much or too little",
         f"light on the image off by {error:.0e} of the star's",
         "a star is drawn where its footprint touches the image, and cut there",
-        Figures(error, fault, FLUX_ERROR),
+        CaseFigures(error, fault, FLUX_ERROR),
     )
+
+
+def indexed_light(sprites: FrameLight, size_px: tuple[int, int]) -> FloatArray:
+    """The image (h, w) of stars by `image[rows, columns] += light`."""
+    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
+    columns = sprites.data["pixel"][:, 0, None] + steps
+    rows = sprites.data["pixel"][:, 1, None] + steps
+    share_x = pixel_shares(columns - sprites.x_px[:, None], SIGMA_PX)
+    share_y = pixel_shares(rows - sprites.y_px[:, None], SIGMA_PX)
+    light = share_y * sprites.data["electrons_per_s"][:, None]
+    image = np.zeros(size_px[::-1])
+    image[rows[:, :, None], columns[:, None, :]] += light[:, :, None] * share_x[:, None, :]
+    return image
 
 
 def many_stars() -> FailureCase:
@@ -364,27 +387,19 @@ def many_stars() -> FailureCase:
     rng = np.random.default_rng(SEED)
     x_px, y_px = rng.uniform(10, CROWD_PX[0] - 11, (2, CROWD))
     flux = 10 ** rng.uniform(0, 4, CROWD)
+    star = np.arange(CROWD)
     on = target(SIGMA_PX, CROWD_PX)
-    size = (CORNER_PX, CORNER_PX)
-    sprites = pack_sprites(x_px, y_px, flux, np.arange(CROWD), CROWD_PX, on.psf.footprint_px)
-    with by_renderer(on) as draw:
-        image = draw(sprites)
-    corner = linear_image(
-        pack_sprites(x_px, y_px, flux, np.arange(CROWD), size, sprites.footprint_px),
-        size,
-        GaussianPsf((SIGMA_PX,) * 2),
-    )
-    pixel_error = float(np.abs(image[:CORNER_PX, :CORNER_PX] - corner).max() / corner.max())
-    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
-    columns, rows = (sprites.data["pixel"][:, axis, None] + steps for axis in (0, 1))
-    share_x, share_y = (
-        pixel_shares(pixel - place[:, None], SIGMA_PX)
-        for pixel, place in ((columns, sprites.x_px), (rows, sprites.y_px))
-    )
-    light = share_y * sprites.data["electrons_per_s"][:, None]
-    indexed = np.zeros(CROWD_PX[::-1])
-    indexed[rows[:, :, None], columns[:, None, :]] += light[:, :, None] * share_x[:, None, :]
-    error, fault = (float(abs(shown.sum() / flux.sum() - 1)) for shown in (image, indexed))
+    side_px = on.psf.footprint_px
+    sprites = pack_sprites(x_px, y_px, flux, star, CROWD_PX, side_px)
+    image = drawn(on, sprites)
+    corner_px = (CORNER_PX, CORNER_PX)
+    in_corner = pack_sprites(x_px, y_px, flux, star, corner_px, side_px)
+    corner = linear_image(in_corner, corner_px, on.psf)
+    off = np.abs(image[:CORNER_PX, :CORNER_PX] - corner)
+    pixel_error = float(off.max() / corner.max())
+    indexed = indexed_light(sprites, CROWD_PX)
+    error = float(abs(image.sum() / flux.sum() - 1))
+    fault = float(abs(indexed.sum() / flux.sum() - 1))
     return FailureCase(
         f"{CROWD} stars in view",
         "image[rows, columns] += light",
@@ -392,33 +407,34 @@ def many_stars() -> FailureCase:
         f"light off by {error:.0e}; {pixel_error:.0e} of the brightest pixel, over {CORNER_PX} x"
         f" {CORNER_PX}",
         "the GPU blends every sprite, in float32",
-        Figures(max(error, pixel_error), fault, CROWD_ERROR),
+        CaseFigures(max(error, pixel_error), fault, CROWD_ERROR),
     )
 
 
 def flux_range() -> FailureCase:
     """Twelve decades side by side."""
-    flux = np.array([1e12, 1.0])
+    bright_e, faint_e = 1e12, 1.0
     on = target(SIGMA_PX)
-    stars = [
-        one_star(x_px, 256.0, on, light) for x_px, light in zip((100.3, 120.3), flux, strict=True)
-    ]
-    with by_renderer(on) as draw:
-        image = draw(join_sprites(stars, stars[0].footprint_px))
+    bright = one_star(100.3, 256.0, on, bright_e)
+    faint = one_star(120.3, 256.0, on, faint_e)
+    image = drawn(on, join_sprites([bright, faint], bright.footprint_px))
     scaled = np.rint(image / image.max() * 65535) * image.max() / 65535
 
-    def flux_errors(shown: FloatArray) -> list[float]:
-        bright, faint = float(shown[:, :110].sum()), float(shown[:, 110:].sum())
-        return [abs(bright / flux[0] - 1), abs(faint / flux[1] - 1)]
+    def flux_errors(shown: FloatArray) -> tuple[float, float]:
+        """The errors of both stars' light, relative."""
+        bright_light = float(shown[:, :110].sum())
+        faint_light = float(shown[:, 110:].sum())
+        return abs(bright_light / bright_e - 1), abs(faint_light / faint_e - 1)
 
-    errors, faults = flux_errors(image), flux_errors(scaled)
+    errors = flux_errors(image)
+    faults = flux_errors(scaled)
     return FailureCase(
         "flux range 1e12",
         "16 bits, scaled to the brightest pixel",
         f"fluxes off by {faults[0]:.0e} and {faults[1]:.0e}: the faint star is gone",
         f"fluxes off by {errors[0]:.0e} and {errors[1]:.0e}",
         "float32, and each star in its own footprint",
-        Figures(max(errors), max(faults), FLUX_ERROR),
+        CaseFigures(max(errors), max(faults), FLUX_ERROR),
     )
 
 
@@ -431,29 +447,29 @@ def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[FrameLight
     stars = make_stars(sirius, vectors, np.full(1, np.nan), np.full(1, electrons_per_s))
     camera = monitor_camera(on.resolution_px, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
     start = from_radec_roll_deg(float(sirius.ra_deg[0]), float(sirius.dec_deg[0]), 20.0)
+    across_px, down_px = PATH_PX
     # A turn about x moves stars up the image, one about -y to the right.
-    turn_rad = np.array([-PATH_PX[1], -PATH_PX[0], 0.0]) / camera.focal_length_px
+    turn_rad = np.array([-down_px, -across_px, 0.0]) / camera.focal_length_px
     for share in np.linspace(0, 1, STEPS):
-        yield make_sprites(
-            stars, to_matrix(propagate(start, share * turn_rad, 1.0)), camera, on.psf.footprint_px
-        )
+        turn = to_matrix(propagate(start, share * turn_rad, 1.0))
+        yield make_sprites(stars, turn, camera, on.psf.footprint_px)
 
 
 def moving_fluxes(draw: Draw, on: Target) -> FloatArray:
-    """Its light (steps,) in each image."""
+    """The moving star's light (steps,) in each image."""
     return np.array([draw(sprites).sum() for sprites in moving_star(on)])
 
 
 @cache  # a case and a chart
 def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
-    """The light (steps,) that an sRGB monitor makes of it, relative to the light wanted.
+    """The light (steps,) of the moving star on an sRGB monitor, relative to the wanted light.
 
     It is CODES_MAG_UNDER_WHITE fainter than a star whose peak is white.
     """
-    sigma = (SIGMA_PX, SIGMA_PX)
+    psf = GaussianPsf((SIGMA_PX, SIGMA_PX))
     response = srgb_response(CODES_BITS)
-    flux = flux_ratio(CODES_MAG_UNDER_WHITE) / GaussianPsf(sigma).peak_share
-    on = Target(MOVING_PX, GaussianPsf(sigma), response, 1.0, quantisation)
+    flux = flux_ratio(CODES_MAG_UNDER_WHITE) / psf.peak_share
+    on = Target(MOVING_PX, psf, response, 1.0, quantisation)
     light = []
     with Renderer(on) as gl:
         for sprites in moving_star(on, flux):
@@ -463,37 +479,43 @@ def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
 
 
 def ripple(fluxes: FloatArray) -> float:
-    """From the faintest to the brightest of a star's fluxes, relative to their mean."""
+    """The range of a star's fluxes, relative to their mean."""
     return float((fluxes.max() - fluxes.min()) / fluxes.mean())
+
+
+def ripple_mag(fluxes: FloatArray) -> float:
+    """The range of a star's fluxes, mag."""
+    return float(magnitude(float(fluxes.min() / fluxes.max())))
 
 
 def popping() -> FailureCase:
     """A star's light in the linear image while the camera turns by parts of a pixel."""
     on = target(0.5, MOVING_PX)
     with by_renderer(on) as draw:
-        error, fault = (ripple(moving_fluxes(by, on)) for by in (draw, partial(point_sampled, on)))
+        error = ripple(moving_fluxes(draw, on))
+    fault = ripple(moving_fluxes(partial(point_sampled, on), on))
     return FailureCase(
         f"a star over {STEPS} sub-pixel steps, sigma 0.5 px",
         POINT_SAMPLED,
         f"its light varies by {100 * fault:.1f} %",
         f"varies by {error:.1e} in the linear image",
         "integrated over pixels, and cut where 1e-6 of the light remains",
-        Figures(error, fault, RIPPLE),
+        CaseFigures(error, fault, RIPPLE),
     )
 
 
 def popping_codes() -> FailureCase:
     """The same star's light through 8-bit codes."""
-    fluxes = moving_code_fluxes("round"), moving_code_fluxes("exact")
-    fault, error = (magnitude(float(f.min() / f.max())) for f in fluxes)
+    fault = ripple_mag(moving_code_fluxes("round"))
+    error = ripple_mag(moving_code_fluxes("exact"))
+    under_white = f"{CODES_MAG_UNDER_WHITE:g} mag under white"
     return FailureCase(
-        f"the same, {CODES_MAG_UNDER_WHITE:g} mag under white on {CODES_BITS} bits, sigma"
-        f" {SIGMA_PX:g} px",
+        f"the same, {under_white} on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
         ROUNDING,
         f"its light varies by {fault:.3f} mag",
         f'quantisation = "exact", what `auto` takes there: {error:.3f} mag',
         "round adds up the errors of its pixels; exact chooses a star's codes together",
-        Figures(error, fault, AIMS[CODES_BITS][0]),
+        CaseFigures(error, fault, AIMS[CODES_BITS][0]),
     )
 
 
@@ -506,28 +528,28 @@ class CodeScene:
     panel: Panel
     stars: int = 1
 
+    @property
+    def psf(self) -> GaussianPsf:
+        """The spread of a star."""
+        return GaussianPsf((self.sigma_px, self.sigma_px))
+
     def linear(self) -> FloatArray:
         """The light (h, w) of the stars."""
-        return linear_image(self.sprites, (SIDE_PX, SIDE_PX), GaussianPsf((self.sigma_px,) * 2))
+        return linear_image(self.sprites, (SIDE_PX, SIDE_PX), self.psf)
 
     def wanted(self) -> FloatArray:
         """The light (h, w) that a panel of any number of levels would show."""
-        even = 1.0 if self.panel.uniformity is None else self.panel.uniformity
-        return np.asarray(np.minimum(self.linear(), WHITE * even))
+        light = self.linear()
+        if self.panel.uniformity is None:
+            return np.asarray(np.minimum(light, WHITE))
+        return np.asarray(np.minimum(light, WHITE * self.panel.uniformity))
 
 
 def codes_of(scene: CodeScene, quantisation: Quantisation) -> Levels:
     """The codes (h, w) as hilstar draws them."""
     panel = scene.panel
-    sigma_px = (scene.sigma_px, scene.sigma_px)
-    on = Target(
-        (SIDE_PX, SIDE_PX),
-        GaussianPsf(sigma_px),
-        panel.response,
-        WHITE,
-        quantisation,
-        panel.uniformity,
-    )
+    size_px = (SIDE_PX, SIDE_PX)
+    on = Target(size_px, scene.psf, panel.response, WHITE, quantisation, panel.uniformity)
     with Renderer(on) as gl:
         gl.draw(scene.sprites)
         return gl.levels().copy()
@@ -538,30 +560,35 @@ def exact_codes(scene: CodeScene) -> Levels:
     return codes_of(scene, "exact")
 
 
+def light_by_part(image: FloatArray) -> FloatArray:
+    """The light of each part of an image, (COUNT, COUNT)."""
+    parts = image.reshape(COUNT, TILE_PX, COUNT, TILE_PX)
+    return np.asarray(parts.sum(axis=(1, 3)))
+
+
 def error_steps(codes: Levels, scene: CodeScene) -> float:
     """The error of the groups' light, rms, in the panel's smallest steps."""
-    shown, wanted = (
-        image.reshape(COUNT, TILE_PX, COUNT, TILE_PX).sum(axis=(1, 3))
-        for image in (shown_light(codes, scene.panel), scene.wanted())
-    )
+    shown = light_by_part(shown_light(codes, scene.panel))
+    wanted = light_by_part(scene.wanted())
     off = (shown - wanted)[wanted > 0]
-    return float(np.sqrt(np.mean(np.square(off))) / (scene.panel.response.light[1] * WHITE))
+    step = scene.panel.response.light[1] * WHITE
+    return float(np.sqrt(np.mean(np.square(off))) / step)
 
 
 def sprites_of(
     x_px: FloatArray, y_px: FloatArray, under_white_mag: FloatArray, sigma_px: float
 ) -> FrameLight:
-    """Stars at places (n,), so many magnitudes (n,) under the one whose peak is white."""
-    sigma = (sigma_px, sigma_px)
-    light = WHITE * flux_ratio(under_white_mag) / GaussianPsf(sigma).peak_share
-    return pack_sprites(
-        x_px, y_px, light, np.arange(len(x_px)), (SIDE_PX, SIDE_PX), GaussianPsf(sigma).footprint_px
-    )
+    """Stars at places (n,), px, in magnitudes (n,) under the one whose peak is white."""
+    psf = GaussianPsf((sigma_px, sigma_px))
+    light = WHITE * flux_ratio(under_white_mag) / psf.peak_share
+    star = np.arange(len(x_px))
+    return pack_sprites(x_px, y_px, light, star, (SIDE_PX, SIDE_PX), psf.footprint_px)
 
 
 def middles() -> tuple[FloatArray, FloatArray]:
     """A place in each part of the image, each at another sub-pixel phase: x and y."""
-    place = (np.arange(COUNT) + 0.5) * TILE_PX - 0.5 + (np.arange(COUNT) + 0.5) / COUNT - 0.5
+    number = np.arange(COUNT) + 0.5
+    place = number * TILE_PX - 0.5 + number / COUNT - 0.5
     x_px, y_px = np.meshgrid(place, place)
     return x_px.ravel(), y_px.ravel()
 
@@ -574,26 +601,39 @@ def lone_stars(
 ) -> CodeScene:
     """A star in each part of the image."""
     x_px, y_px = middles()
-    mags = np.full(len(x_px), under_white_mag)
-    return CodeScene(
-        sprites_of(x_px, y_px, mags, sigma_px), sigma_px, Panel(response, WHITE, uniformity)
-    )
+    sprites = sprites_of(x_px, y_px, np.full(len(x_px), under_white_mag), sigma_px)
+    return CodeScene(sprites, sigma_px, Panel(response, WHITE, uniformity))
 
 
 def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
     """Two stars in each part, in all directions from each other."""
     x_px, y_px = middles()
     angle = np.linspace(0, 2 * np.pi, len(x_px), endpoint=False)
-    both = (
-        np.append(x_px, x_px + apart_px * np.cos(angle)),
-        np.append(y_px, y_px + apart_px * np.sin(angle)),
-    )
-    return CodeScene(
-        sprites_of(*both, np.repeat(mags, len(x_px)), SIGMA_PX),
-        SIGMA_PX,
-        Panel(srgb_response(8), WHITE),
-        2,
-    )
+    both_x = np.append(x_px, x_px + apart_px * np.cos(angle))
+    both_y = np.append(y_px, y_px + apart_px * np.sin(angle))
+    sprites = sprites_of(both_x, both_y, np.repeat(mags, len(x_px)), SIGMA_PX)
+    return CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE), 2)
+
+
+def half_off() -> CodeScene:
+    """Stars centred on the screen's edges, at every place within a pixel along and across them."""
+    count = COUNT - 2
+    along = middles()[0][1 : COUNT - 1]
+    across = (np.roll(np.arange(count), 2) + 0.5) / count - 1.0
+    far = SIDE_PX - 1 - across
+    x_px = np.concatenate([across, far, along, along])
+    y_px = np.concatenate([along, along, across, far])
+    sprites = sprites_of(x_px, y_px, np.full(len(x_px), FAINT_MAG), SIGMA_PX)
+    return CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
+
+
+def uneven_panel() -> CodeScene:
+    """Stars on pixels that differ by 5 %, with a fall to the corners."""
+    y_px, x_px = np.mgrid[:SIDE_PX, :SIDE_PX] / SIDE_PX - 0.5
+    fall = 1 - 0.3 * np.hypot(x_px, y_px)
+    noise = np.random.default_rng(CODES_SEED).normal(0, 0.05, x_px.shape)
+    uniformity = (fall + noise).astype(np.float32)
+    return lone_stars(FAINT_MAG, srgb_response(8), uniformity=uniformity)
 
 
 def judged(
@@ -608,77 +648,75 @@ def judged(
         f"a star's light off by {fault:.2g} of the panel's smallest steps rms",
         f"by {error:.2g} steps",
         why,
-        Figures(error, fault, steps_a_star * scene.stars),
+        CaseFigures(error, fault, steps_a_star * scene.stars),
     )
 
 
-# Cases whose codes are rounded, or chosen by `exact`.
-CODES: tuple[Callable[[], FailureCase], ...] = (
-    lambda: judged(
-        f"stars half off the screen, {FAINT_MAG:g} mag under white on 8 bits", half_off()
-    ),
-    lambda: judged(
-        f"two stars 1 px apart, {FAINT_MAG:g} mag under white",
-        neighbours((FAINT_MAG, FAINT_MAG), 1.0),
+def coded_half_off() -> FailureCase:
+    """Stars on the screen's edges."""
+    case = f"stars half off the screen, {FAINT_MAG:g} mag under white on 8 bits"
+    return judged(case, half_off())
+
+
+def coded_neighbours() -> FailureCase:
+    """Two stars that share pixels."""
+    case = f"two stars 1 px apart, {FAINT_MAG:g} mag under white"
+    why = (
         "a pixel is the star's that gives more than half of its light, and it is chosen for the"
-        " light of both",
-    ),
-    lambda: judged(
-        f"codes of stars of sigma {NARROW_PX:g} px, {FAINT_MAG / 2:g} mag under white",
-        lone_stars(FAINT_MAG / 2, srgb_response(8), NARROW_PX),
-        steps_a_star=NARROW_STEPS,
-    ),
-    lambda: judged(
-        f"pixels 5 % apart, stars {FAINT_MAG:g} mag under white",
-        uneven_panel(),
-        "each pixel's own steps are weighed",
-    ),
-    lambda: judged(
-        "a panel of 2 bits, stars whose peak is white", lone_stars(0.0, srgb_response(2))
-    ),
-    lambda: judged(
-        "a panel of 16 bits, stars 10 mag under white", lone_stars(10.0, srgb_response(16))
-    ),
-)
-# Cases whose light over white goes to neighbours by error diffusion.
-SPILLED: tuple[Callable[[], FailureCase], ...] = (
-    lambda: spilled(
-        "a star 2.5 mag over white, 5 px from one 4 mag under it", neighbours((-2.5, 4.0), 5.0)
-    ),
-    lambda: spilled("every star 4 mag over white", lone_stars(-4.0, srgb_response(8))),
-)
-
-
-def half_off() -> CodeScene:
-    """Stars whose middles lie on the screen's edges, at every phase along them and across."""
-    along = middles()[0][1 : COUNT - 1]
-    across = (np.roll(np.arange(COUNT - 2), 2) + 0.5) / (COUNT - 2) - 1.0
-    x_px = np.concatenate([across, SIDE_PX - 1 - across, along, along])
-    y_px = np.concatenate([along, along, across, SIDE_PX - 1 - across])
-    sprites = sprites_of(x_px, y_px, np.full(len(x_px), FAINT_MAG), SIGMA_PX)
-    return CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
-
-
-def uneven_panel() -> CodeScene:
-    """Stars on pixels that differ by 5 %, with a fall to the corners."""
-    y_px, x_px = np.mgrid[:SIDE_PX, :SIDE_PX] / SIDE_PX - 0.5
-    uneven = (
-        1
-        - 0.3 * np.hypot(x_px, y_px)
-        + np.random.default_rng(CODES_SEED).normal(0, 0.05, x_px.shape)
+        " light of both"
     )
-    return lone_stars(FAINT_MAG, srgb_response(8), uniformity=uneven.astype(np.float32))
+    return judged(case, neighbours((FAINT_MAG, FAINT_MAG), 1.0), why)
+
+
+def coded_narrow() -> FailureCase:
+    """Stars of few pixels."""
+    mag = FAINT_MAG / 2
+    case = f"codes of stars of sigma {NARROW_PX:g} px, {mag:g} mag under white"
+    scene = lone_stars(mag, srgb_response(8), NARROW_PX)
+    return judged(case, scene, steps_a_star=NARROW_STEPS)
+
+
+def coded_uneven() -> FailureCase:
+    """Pixels of different light."""
+    case = f"pixels 5 % apart, stars {FAINT_MAG:g} mag under white"
+    return judged(case, uneven_panel(), "each pixel's own steps are weighed")
+
+
+def coded_coarse() -> FailureCase:
+    """The coarsest panel."""
+    case = "a panel of 2 bits, stars whose peak is white"
+    return judged(case, lone_stars(0.0, srgb_response(2)))
+
+
+def coded_fine() -> FailureCase:
+    """The finest panel."""
+    case = "a panel of 16 bits, stars 10 mag under white"
+    return judged(case, lone_stars(10.0, srgb_response(16)))
+
+
+def spilled_beside() -> FailureCase:
+    """A star over white beside a faint one."""
+    case = "a star 2.5 mag over white, 5 px from one 4 mag under it"
+    return spilled(case, neighbours((-2.5, 4.0), 5.0))
+
+
+def spilled_everywhere() -> FailureCase:
+    """Every star over white."""
+    return spilled("every star 4 mag over white", lone_stars(-4.0, srgb_response(8)))
 
 
 def spilled(case: str, scene: CodeScene) -> FailureCase:
     """The largest excess of a pixel's light: error diffusion hands light over white to
     neighbours.
     """
+    response = scene.panel.response
     wanted = scene.wanted()
     corner = slice(2 * TILE_PX), slice(2 * TILE_PX)
-    diffused = diffused_light(scene.linear()[corner], scene.panel.response) - wanted[corner]
-    error = float((shown_light(exact_codes(scene), scene.panel) - wanted).max())
+    diffused = diffused_light(scene.linear()[corner], response) - wanted[corner]
+    excess = shown_light(exact_codes(scene), scene.panel) - wanted
+    error = float(excess.max())
     fault = float(diffused.max())
+    largest_step = float(np.diff(response.light).max()) * WHITE
     return FailureCase(
         case,
         "error diffusion (Floyd and Steinberg 1976)",
@@ -686,7 +724,7 @@ def spilled(case: str, scene: CodeScene) -> FailureCase:
         " handed on",
         f"no pixel has more than {error:.1e} of white too much",
         "what is over white is lost, and told; no neighbour makes up for it",
-        Figures(error, fault, float(np.diff(scene.panel.response.light).max()) * WHITE),
+        CaseFigures(error, fault, largest_step),
     )
 
 
@@ -698,32 +736,49 @@ def diffused_light(linear: FloatArray, response: Response) -> FloatArray:
     remaining = np.zeros((height + 1, width + 2))
     remaining[:height, 1:-1] = linear / WHITE
     shown = np.zeros((height, width))
+    below = np.array([3, 5, 1]) / 16
     for row in range(height):
         for column in range(1, width + 1):
             asked = remaining[row, column]
-            shown[row, column - 1] = response.light[
-                np.searchsorted(response.threshold, asked, side="right")
-            ]
-            off = asked - shown[row, column - 1]
+            code = np.searchsorted(response.threshold, asked, side="right")
+            light = response.light[code]
+            shown[row, column - 1] = light
+            off = asked - light
             remaining[row, column + 1] += off * 7 / 16
-            remaining[row + 1, column - 1 : column + 2] += off * np.array([3, 5, 1]) / 16
+            remaining[row + 1, column - 1 : column + 2] += off * below
     return shown * WHITE
 
 
 def no_stars() -> FailureCase:
     """Nothing in view."""
     nothing = np.zeros(0)
-    none = CodeScene(
-        sprites_of(nothing, nothing, nothing, SIGMA_PX), SIGMA_PX, Panel(srgb_response(8), WHITE)
-    )
+    sprites = sprites_of(nothing, nothing, nothing, SIGMA_PX)
+    scene = CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
+    wanted = scene.wanted()
     with np.errstate(invalid="ignore"):
-        scaled = none.wanted() / none.wanted().max()
-    error = float((exact_codes(none) != 0).mean())
+        scaled = wanted / wanted.max()
+    error = float((exact_codes(scene) != 0).mean())
+    no_number = 100 * np.isnan(scaled).mean()
     return FailureCase(
         "no star in view",
         "an image scaled to its brightest pixel",
-        f"{100 * np.isnan(scaled).mean():.0f} % of the pixels are no number",
+        f"{no_number:.0f} % of the pixels are no number",
         f"{100 * error:.0f} % of the pixels are lit",
         "full scale is the bench's, whatever a frame has",
-        Figures(error, float(scaled.sum()), NOTHING),
+        CaseFigures(error, float(scaled.sum()), NOTHING),
     )
+
+
+Case = Callable[[], FailureCase]
+# Cases whose codes are rounded, or chosen by `exact`.
+CODES: tuple[Case, ...] = (
+    *(coded_half_off, coded_neighbours, coded_narrow),
+    *(coded_uneven, coded_coarse, coded_fine),
+)
+# In the order of the light's way; the codes of some spill light over white to neighbours.
+DRAWN: tuple[Case, ...] = (
+    *(narrow_star, wide_star, negative_wings, floored_wings, absurd_sigmas),
+    *(star_on_pixel_edge, star_on_image_edge, many_stars, flux_range),
+    *(popping, popping_codes),
+    *(*CODES, spilled_beside, spilled_everywhere, no_stars),
+)

@@ -2,7 +2,7 @@
 reason; charts of curves.
 """
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import astuple, replace
 from functools import partial
 from pathlib import Path
@@ -17,17 +17,16 @@ from hilstar.basics.charts import (
     MUTED,
     ORANGE,
     PURPLE,
-    chart,
     two_digits,
     write_csv,
 )
 from hilstar.basics.files import write_whole
 from hilstar.basics.units import magnitude
-from hilstar.instruments.study.row_charts import (
+from hilstar.instruments.study.engine import (
     HIDDEN,
     CurvePanel,
+    LevelLine,
     PanelSpec,
-    draw_curve_panel,
     draw_curves,
     write_columns,
 )
@@ -38,6 +37,14 @@ FIELD_TICKS_DEG = (0.1, 0.2, 0.5, 1, 2, 5, 10, 20, 60)
 TURN_TICKS_DEG, HALF_TURN_DEG = (0, 60, 120, 180, 240, 300, 360), 180
 SMALLEST_ARCSEC = 1e-12  # as drawn
 THIN = {"lw": 1.0}
+TURN_CURVES = ("straight line", "SLERP (without rates)", "with rates")
+# The errors that are drawn, by their columns.
+NARROW_LABELS = {
+    "flux_error": "flux error [share]",
+    "centroid_error_px": "place error [px]",
+    "peak_error": "middle pixel's error [share]",
+}
+NARROW_COLUMNS = (*NARROW_LABELS, *(f"sampled_{name}" for name in NARROW_LABELS))
 NARROW_NOTE = (
     "Largest errors over sub-pixel phases; the place by the centre of gravity. The errors of a wide"
     " sampled star's pixels cancel in its sums, here in float64 and without an end; hilstar draws"
@@ -52,27 +59,12 @@ POPPING_NOTE = (
     f" {image.PATH_PX[1] / image.PATH_PX[0]:.2f} of its way in x."
 )
 
-# In the order of the light's way, between the recorded cases of catalogue and geometry and those of
-# detector and attitude.
-DRAWN: tuple[Callable[[], FailureCase], ...] = (
-    *(
-        image.narrow_star,
-        image.wide_star,
-        image.negative_wings,
-        image.floored_wings,
-        image.absurd_sigmas,
-    ),
-    *(image.star_on_pixel_edge, image.star_on_image_edge, image.many_stars, image.flux_range),
-    *(image.popping, image.popping_codes),
-    *(*image.CODES, *image.SPILLED, image.no_stars),
-)
-
 
 def run(directory: Path) -> list[FailureCase]:
     """Measure the cases that are drawn, and write `stability.csv` and the charts; all cases in
     order. Raises InputError.
     """
-    drawn = [measure() for measure in DRAWN]
+    drawn = [measure() for measure in image.DRAWN]
     cases = [*recorded("catalogue_and_geometry"), *drawn, *recorded("detector_and_attitude")]
     write_csv(directory / "stability.csv", COLUMNS, [case.row() for case in cases])
     for draw in (narrow_sigmas, weak_perspectives, ripples, turns):
@@ -90,60 +82,63 @@ def _recorded_curves(directory: Path, name: str) -> FloatArray:
 def narrow_sigmas(directory: Path) -> None:
     """Errors of flux, place and middle pixel against sigma: sampling, and integral over pixels."""
     sigmas_px = np.geomspace(0.1, 2.0, 27)
-    pairs = [image.narrow_errors(float(sigma)) for sigma in sigmas_px]
-    errors = [(*astuple(integrated), *astuple(points)) for integrated, points in pairs]
-    ours, sampled = np.split(np.array(errors).T, 2)
-    columns = ("sigma_px", "flux_error", "centroid_error_px", "peak_error")
-    sampled_columns = ("sampled_flux_error", "sampled_centroid_error_px", "sampled_peak_error")
-    rows = np.column_stack([sigmas_px, errors]).tolist()
-    write_csv(directory / "narrow_stars.csv", (*columns, *sampled_columns), rows)
-    labels = "flux error [share]", "place error [px]", "middle pixel's error [share]"
+    table: dict[str, list[float]] = {name: [] for name in NARROW_COLUMNS}
+    for sigma_px in sigmas_px.tolist():
+        integrated, sampled = image.narrow_errors(sigma_px)
+        errors = (*astuple(integrated), *astuple(sampled))
+        for name, error in zip(NARROW_COLUMNS, errors, strict=True):
+            table[name].append(error)
+    columns = {name: np.array(errors) for name, errors in table.items()}
+    write_columns(directory / "narrow_stars.csv", {"sigma_px": sigmas_px, **columns})
     panels = []
-    for label, points, integrated in zip(labels, np.abs(sampled), np.abs(ours), strict=True):
-        curves = {"sampled": points, "integrated (hilstar)": integrated}
+    for name, label in NARROW_LABELS.items():
+        curves = {
+            "sampled": np.abs(columns[f"sampled_{name}"]),
+            "integrated (hilstar)": np.abs(columns[name]),
+        }
         spec = PanelSpec((), label, scales=("log", "log"))
         panels.append(CurvePanel(sigmas_px, curves, spec, (ORANGE, BLUE)))
     last = replace(panels[-1].spec, xlabel="sigma of the star [px]", xticks=SIGMA_TICKS_PX)
     panels[-1] = replace(panels[-1], spec=last)
-    finding = narrow_finding(sigmas_px, ours, sampled)
+    finding = narrow_finding(sigmas_px, columns)
     draw_curves(directory / "narrow_stars", finding, panels, NARROW_NOTE)
 
 
-def narrow_finding(sigmas_px: FloatArray, ours: FloatArray, sampled: FloatArray) -> str:
-    """From which sigma (n,) on sampling places a star nearer, and its middle pixel; errors (3,
-    n).
+def narrow_finding(sigmas_px: FloatArray, errors: Mapping[str, FloatArray]) -> str:
+    """From which sigma (n,) on sampling places a star nearer, and its middle pixel then; errors
+    (n,) by NARROW_COLUMNS.
     """
-    nearer = sampled[1] < ours[1]
+    own_px = errors["centroid_error_px"]
+    sampled_px = errors["sampled_centroid_error_px"]
+    nearer = sampled_px < own_px
     if not nearer.any():
         every = f"at every sigma to {sigmas_px[-1]:g} px"
         return f"Integrated over pixels a star is placed nearer than sampled, {every}"
     at = int(nearer.argmax())
+    places = f"{two_digits(sampled_px[at])} px, integrated {two_digits(own_px[at])}"
+    peak = errors["sampled_peak_error"][at]
+    too = "bright" if peak > 0 else "faint"
     return (
         f"From sigma {sigmas_px[at]:.2f} px on a star sampled at pixel middles is placed nearer"
-        f" ({two_digits(sampled[1, at])} px, integrated {two_digits(ours[1, at])}), but its middle"
-        f" pixel is {100 * abs(sampled[2, at]):.0f} % too"
-        f" {'bright' if sampled[2, at] > 0 else 'faint'}"
+        f" ({places}), but its middle pixel is {100 * abs(peak):.0f} % too {too}"
     )
 
 
 def weak_perspectives(directory: Path) -> None:
     """The error of one depth for every star, against the field angle."""
     angle_deg, off_px, off_arcsec = _recorded_curves(directory, "weak_perspective")
-    at_px, at_arcsec = (float(np.interp(10.0, angle_deg, off)) for off in (off_px, off_arcsec))
-    half_px = float(np.interp(5.0, angle_deg, off_px))
+    at_ten_px = float(np.interp(10.0, angle_deg, off_px))
+    at_ten_arcsec = float(np.interp(10.0, angle_deg, off_arcsec))
+    at_five_px = float(np.interp(5.0, angle_deg, off_px))
+    share = abs(at_five_px / at_ten_px)
     finding = (
-        f"Weak perspective (one depth for every star) is off by {abs(at_px):.0f} px or"
-        f" {abs(at_arcsec):.0f} arcsec ten degrees from the axis, and by {abs(half_px / at_px):.2f}"
-        " of that at five"
+        f"Weak perspective (one depth for every star) is off by {abs(at_ten_px):.0f} px or"
+        f" {abs(at_ten_arcsec):.0f} arcsec ten degrees from the axis, and by {share:.2f} of that at"
+        " five"
     )
     above = PanelSpec((), "error [monitor px]", scales=("log", "log"), names=False)
-    below = PanelSpec(
-        (),
-        "error [arcsec]",
-        "field angle [deg]",
-        scales=("log", "log"),
-        xticks=FIELD_TICKS_DEG,
-        names=False,
+    below = replace(
+        above, ylabel="error [arcsec]", xlabel="field angle [deg]", xticks=FIELD_TICKS_DEG
     )
     panels = (
         CurvePanel(angle_deg, {HIDDEN: np.abs(off_px)}, above, (INK,)),
@@ -156,12 +151,11 @@ def ripples(directory: Path) -> None:
     """One star's flux over sub-pixel steps: in the linear image, by codes, and point sampled."""
     on = image.target(image.SIGMA_PX, image.MOVING_PX)
     narrow = image.target(0.5, image.MOVING_PX)
+    sampled = partial(image.point_sampled, narrow)
     with image.by_renderer(on) as draw:
         linear = image.moving_fluxes(draw, on)
     curves = {
-        "point sampled, sigma 0.5 px": image.moving_fluxes(
-            partial(image.point_sampled, narrow), narrow
-        ),
+        "point sampled, sigma 0.5 px": image.moving_fluxes(sampled, narrow),
         "codes, round": image.moving_code_fluxes("round"),
         "codes, exact": image.moving_code_fluxes("exact"),
         "linear image": linear,
@@ -188,9 +182,7 @@ def ripples(directory: Path) -> None:
 def turns(directory: Path) -> None:
     """Interpolation against the turn from one sample to the next."""
     turn_deg, *errors = _recorded_curves(directory, "turns")
-    curves = dict(
-        zip(("straight line", "SLERP (without rates)", "with rates"), errors, strict=True)
-    )
+    curves = dict(zip(TURN_CURVES, errors, strict=True))
     largest = curves["with rates"].max()
     finding = (
         "Beyond half a turn between samples SLERP takes the wrong way round; with rates a steady"
@@ -198,13 +190,11 @@ def turns(directory: Path) -> None:
     )
     drawn = {name: np.maximum(error, SMALLEST_ARCSEC) for name, error in curves.items()}
     spec = PanelSpec(
-        (),
-        "largest error between samples [arcsec]",
-        "turn between samples [deg]",
+        ylabel="largest error between samples [arcsec]",
+        xlabel="turn between samples [deg]",
         scales=("linear", "log"),
         xticks=TURN_TICKS_DEG,
+        places=(LevelLine(HALF_TURN_DEG, HIDDEN, MUTED, width=1.0),),
     )
     panel = CurvePanel(turn_deg, drawn, spec, (PURPLE, ORANGE, BLUE))
-    with chart(directory / "turns", finding) as (axes,):
-        draw_curve_panel(axes, panel)
-        axes.axvline(HALF_TURN_DEG, color=MUTED, ls="--", lw=1.0)
+    draw_curves(directory / "turns", finding, (panel,))

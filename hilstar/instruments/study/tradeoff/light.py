@@ -2,12 +2,13 @@
 the catalogue.
 """
 
-import math
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.polynomial import Chebyshev
@@ -65,7 +66,7 @@ from hilstar.tracker.centroiders import FAMILY
 
 SENSOR = "ccd47-20"
 ADAPTIVE = "adaptive quadrature"
-COLOURS = 3000
+COLOURS = 3000  # stars of the catalogue that stand for all
 STEPS_NM = (1.0, 5.0, 10.0, 20.0)
 ORDERS = (1, 2, 3, 4, GAUSS_ORDER)
 DEGREES = (5, 10, 20, electrons.TABLE_DEGREE)
@@ -78,6 +79,7 @@ PHOTOMETRY_ROUNDING_MAG = 5e-12
 
 # Wavelengths, nm, and weights, m, that integrate a product of curves.
 Rule = Callable[..., tuple[FloatArray, FloatArray]]
+Integrand = Callable[[FloatArray], FloatArray]
 OWN_SPECTRUM = "each star's own spectrum"
 # A library's spectra are known to about 0.01 mag; a tenth of that counts as none.
 LIBRARY_MAG = 1e-3
@@ -89,7 +91,7 @@ TILE_PX = 26
 # Two stars' brightnesses: white, and 8 magnitudes under it, as faint as a 10-bit monitor is asked
 # to show.
 FAINTER_MAG = 8.0
-SMALL_SIGMA_PX = 0.4
+SMALL_SIGMA_PX = 0.4  # of a star that sampling at pixel centres spoils
 TABLE_SIZES = (64, 512, 4096)
 # float32 rounds a star's electrons by 6e-8, and its brightest pixels by as much again.
 ROUNDING_MAG = 1e-7
@@ -98,60 +100,121 @@ TAKEN = "exact"  # by `auto`, the default, at this depth
 LIMITS_V_MAG = (5.0, 6.0, 6.5, 7.0, 7.5, 8.0, 8.5, 9.0, 10.0)
 
 
-def brightness(stack: ExitStack, quick: bool) -> Trials:
-    """The integral of black bodies through a sensor: error, mag, worst over COLOURS of the
-    catalogue and at the median one.
+@dataclass(frozen=True, slots=True)
+class BlackBodies:
+    """Stars of V = 0 by their colours (n,) and temperatures (n,), behind a sensor, and ways to
+    their electron rates.
     """
-    del stack, quick
-    # Equal shares of the catalogue, the bluest and the reddest star among them.
-    bv_mag = np.quantile(load_catalog().bv_mag, np.linspace(0, 1, COLOURS), method="nearest")
-    optics = study_optics(SENSOR)
-    photometry = electrons.Photometry()
-    temperature = SkySettings().temperature
-    kelvin = electrons.star_temperatures_k(bv_mag, temperature)
 
-    def by_rule(rule: Rule) -> FloatArray:
-        def integral(integrand: Callable[[FloatArray], FloatArray], *curves: Curve) -> FloatArray:
+    bv_mag: FloatArray
+    kelvin: FloatArray
+    optics: electrons.Optics
+
+    def by_rule(self, rule: Rule) -> FloatArray:
+        """Rates (n,) by a rule of nodes and weights."""
+
+        def integral(integrand: Integrand, *curves: Curve) -> FloatArray:
             nodes_nm, weight_m = rule(*curves)
             return np.asarray(integrand(nodes_nm) @ weight_m)
 
-        return _rates(kelvin, optics, integral)
+        return self._rates(integral)
 
-    def by_table(degree: int) -> FloatArray:
+    def adaptive(self) -> FloatArray:
+        """Rates (n,) by adaptive quadrature between the curves' knots."""
+        return self._rates(adaptive_integral)
+
+    def by_table(self, degree: int) -> FloatArray:
+        """Rates (n,) by a table over 1/T, made for this."""
+        photometry = electrons.Photometry()
+        zero = np.zeros(len(self.bv_mag))
         if degree == electrons.TABLE_DEGREE:
-            return electrons.tabulate("dgs", optics, photometry).electrons_per_s(
-                np.zeros(COLOURS), kelvin
-            )
-        domain = [1 / electrons.TABLE_RANGE_K[1], 1 / electrons.TABLE_RANGE_K[0]]
-        log_rate = Chebyshev.interpolate(
-            lambda x: np.log(electrons.dgs_electrons_per_s(1 / x, optics, photometry)),
-            degree,
-            domain,
-        )
-        return electrons.RateTable(log_rate).electrons_per_s(np.zeros(COLOURS), kelvin)
+            table = electrons.tabulate("dgs", self.optics, photometry)
+            return table.electrons_per_s(zero, self.kelvin)
+        low_k, high_k = electrons.TABLE_RANGE_K
 
-    def by_colour(size: int) -> FloatArray:
-        at_mag = np.linspace(bv_mag.min(), bv_mag.max(), size)
-        rate = electrons.dgs_electrons_per_s(
-            electrons.star_temperatures_k(at_mag, temperature), optics, photometry
-        )
-        return np.asarray(np.exp(np.interp(bv_mag, at_mag, np.log(rate))))
+        def log_rate(per_kelvin: FloatArray) -> FloatArray:
+            rate = electrons.dgs_electrons_per_s(1 / per_kelvin, self.optics, photometry)
+            return np.asarray(np.log(rate))
 
-    tables = {degree: f"table over 1/T, degree {degree}" for degree in DEGREES}
-    works: dict[str, Callable[[], FloatArray]] = {ADAPTIVE: partial(adaptive_rates, kelvin, optics)}
-    works |= {f"trapezoid, {h:g} nm": partial(by_rule, partial(trapezoid, h)) for h in STEPS_NM}
-    works |= {f"Gauss-Legendre, {n} per knot": partial(by_rule, partial(gauss, n)) for n in ORDERS}
-    works |= {name: partial(by_table, degree) for degree, name in tables.items()}
-    works |= {f"straight lines over B-V, {n}": partial(by_colour, n) for n in BV_TABLE_SIZES}
-    works["AGS"] = lambda: np.full(COLOURS, electrons.ags_electrons_per_s(optics, photometry))
-    exact = adaptive_rates(kelvin, optics)
+        series = Chebyshev.interpolate(log_rate, degree, [1 / high_k, 1 / low_k])
+        return electrons.RateTable(series).electrons_per_s(zero, self.kelvin)
+
+    def by_colour(self, size: int) -> FloatArray:
+        """Rates (n,) by straight lines over B-V."""
+        at_mag = np.linspace(self.bv_mag.min(), self.bv_mag.max(), size)
+        kelvin = electrons.star_temperatures_k(at_mag, SkySettings().temperature)
+        rate = electrons.dgs_electrons_per_s(kelvin, self.optics, electrons.Photometry())
+        return np.asarray(np.exp(np.interp(self.bv_mag, at_mag, np.log(rate))))
+
+    def average(self) -> FloatArray:
+        """Rates (n,) by the average model, which are all one."""
+        rate = electrons.ags_electrons_per_s(self.optics, electrons.Photometry())
+        return np.full(len(self.bv_mag), rate)
+
+    def _rates(self, integral: Callable[..., FloatArray]) -> FloatArray:
+        """Thesis eq. 3.1 by any way of integrating.
+
+        Spectra are scaled to 1 at 550 nm, so that one tolerance fits all stars.
+        """
+        kelvin = self.kelvin[:, None]
+        passband = load_curve("johnson-v", "johnson-v")
+        efficiency = self.optics.quantum_efficiency
+        transmission = self.optics.transmission
+        scale = blackbody_exitance_w_m2_m(np.array([550.0]), kelvin)
+
+        def spectrum(nm: FloatArray) -> FloatArray:
+            return np.asarray(blackbody_exitance_w_m2_m(nm, kelvin) / scale)
+
+        def photons(nm: FloatArray) -> FloatArray:
+            return spectrum(nm) * (efficiency(nm) * transmission(nm) * nm * 1e-9)
+
+        v_band = integral(lambda nm: spectrum(nm) * passband(nm), passband)
+        width = integral(lambda nm: passband(nm)[None], passband)
+        detected = integral(photons, efficiency, transmission)
+        mean_w_m2_m = electrons.reference_mean_w_m2_m(electrons.Photometry())
+        per_spectrum = self.optics.area_m2 * mean_w_m2_m / (PLANCK_J_S * LIGHT_M_S)
+        return np.asarray(per_spectrum * detected * width / v_band)
+
+
+def adaptive_integral(integrand: Integrand, *curves: Curve) -> FloatArray:
+    """An integral over the range that curves share, by adaptive quadrature between their knots."""
+    knots = shared_knots(*curves)
+    low_nm, high_nm = float(knots[0]), float(knots[-1])
+
+    def at(nm: float) -> FloatArray:
+        return integrand(np.array([nm]))[:, 0]
+
+    exactly: Any = {"epsabs": 0, "epsrel": QUAD, "norm": "max", "points": knots}
+    return np.asarray(quad_vec(at, low_nm, high_nm, **exactly)[0]) * 1e-9
+
+
+def brightness(stack: ExitStack, quick: bool) -> Trials:
+    """The integral of black bodies through a sensor: errors, mag, of the worst and the median of
+    COLOURS stars of the catalogue.
+    """
+    del stack, quick
+    # Equal shares of the catalogue, the bluest and the reddest star among them.
+    shares = np.linspace(0, 1, COLOURS)
+    bv_mag = np.quantile(load_catalog().bv_mag, shares, method="nearest")
+    kelvin = electrons.star_temperatures_k(bv_mag, SkySettings().temperature)
+    bodies = BlackBodies(bv_mag, kelvin, study_optics(SENSOR))
+    default = table_name(electrons.TABLE_DEGREE)
+    works: dict[str, Callable[[], FloatArray]] = {ADAPTIVE: bodies.adaptive}
+    for step_nm in STEPS_NM:
+        works[f"trapezoid, {step_nm:g} nm"] = partial(bodies.by_rule, partial(trapezoid, step_nm))
+    for order in ORDERS:
+        works[f"Gauss-Legendre, {order} per knot"] = partial(bodies.by_rule, partial(gauss, order))
+    for degree in DEGREES:
+        works[table_name(degree)] = partial(bodies.by_table, degree)
+    for size in BV_TABLE_SIZES:
+        works[f"straight lines over B-V, {size}"] = partial(bodies.by_colour, size)
+    works["AGS"] = bodies.average
+    exact = bodies.adaptive()
     trials = []
     for name, work in works.items():
         error = np.abs(magnitude(work() / exact))
         figures = float(error.max()), float(np.median(error))
-        trials.append(
-            Trial(name, *figures, work, name == tables[electrons.TABLE_DEGREE], name == ADAPTIVE)
-        )
+        trials.append(Trial(name, *figures, work, name == default, name == ADAPTIVE))
     return Trials(
         "brightness",
         f"{COLOURS} black bodies, tables included",
@@ -164,50 +227,9 @@ def brightness(stack: ExitStack, quick: bool) -> Trials:
     )
 
 
-def adaptive_rates(kelvin: FloatArray, optics: electrons.Optics) -> FloatArray:
-    """Electron rates of V = 0 black bodies (n,) by adaptive quadrature between the curves'
-    knots.
-    """
-
-    def integral(integrand: Callable[[FloatArray], FloatArray], *curves: Curve) -> FloatArray:
-        knots = shared_knots(*curves)
-        ends = float(knots[0]), float(knots[-1])
-
-        def at(nm: float) -> FloatArray:
-            return integrand(np.array([nm]))[:, 0]
-
-        return (
-            np.asarray(quad_vec(at, *ends, epsabs=0, epsrel=QUAD, norm="max", points=knots)[0])
-            * 1e-9
-        )
-
-    return _rates(kelvin, optics, integral)
-
-
-def _rates(
-    kelvin: FloatArray, optics: electrons.Optics, integral: Callable[..., FloatArray]
-) -> FloatArray:
-    """Thesis eq. 3.1 with whatever integrates; spectra are scaled to 1 at 550 nm, so that one
-    tolerance fits all stars.
-    """
-    passband = load_curve("johnson-v", "johnson-v")
-    curves = (optics.quantum_efficiency, optics.transmission)
-    scale = blackbody_exitance_w_m2_m(np.array([550.0]), kelvin[:, None])
-
-    def spectrum(nm: FloatArray) -> FloatArray:
-        return np.asarray(blackbody_exitance_w_m2_m(nm, kelvin[:, None]) / scale)
-
-    v_band = integral(lambda nm: spectrum(nm) * passband(nm), passband)
-    width = integral(lambda nm: passband(nm)[None], passband)
-    detected = integral(
-        lambda nm: spectrum(nm) * (curves[0](nm) * curves[1](nm) * nm * 1e-9), *curves
-    )
-    per_spectrum = (
-        optics.area_m2
-        * electrons.reference_mean_w_m2_m(electrons.Photometry())
-        / (PLANCK_J_S * LIGHT_M_S)
-    )
-    return np.asarray(per_spectrum * detected * width / v_band)
+def table_name(degree: int) -> str:
+    """The name of a table of a degree."""
+    return f"table over 1/T, degree {degree}"
 
 
 def trapezoid(step_nm: float, *curves: Curve) -> tuple[FloatArray, FloatArray]:
@@ -215,7 +237,9 @@ def trapezoid(step_nm: float, *curves: Curve) -> tuple[FloatArray, FloatArray]:
     most `step_nm`.
     """
     knots = shared_knots(*curves)
-    nodes = np.linspace(knots[0], knots[-1], int(np.ceil((knots[-1] - knots[0]) / step_nm)) + 1)
+    first_nm, last_nm = knots[0], knots[-1]
+    steps = int(np.ceil((last_nm - first_nm) / step_nm))
+    nodes = np.linspace(first_nm, last_nm, steps + 1)
     weight = np.full(len(nodes), nodes[1] - nodes[0])
     weight[[0, -1]] /= 2
     return nodes, weight * 1e-9
@@ -228,14 +252,16 @@ def gauss(order: int, *curves: Curve) -> tuple[FloatArray, FloatArray]:
     at, weight = np.polynomial.legendre.leggauss(order)
     knots = shared_knots(*curves)
     half = np.diff(knots)[:, None] / 2
-    return (knots[:-1, None] + half * (1 + at)).ravel(), (half * weight).ravel() * 1e-9
+    nodes = knots[:-1, None] + half * (1 + at)
+    return nodes.ravel(), (half * weight).ravel() * 1e-9
 
 
 def shared_knots(*curves: Curve) -> FloatArray:
     """Knots of all curves, nm, within the range that they share."""
-    low = max(c.wavelength_nm[0] for c in curves)
-    high = min(c.wavelength_nm[-1] for c in curves)
-    knots = np.unique(np.concatenate([c.wavelength_nm for c in curves]))
+    by_curve = [curve.wavelength_nm for curve in curves]
+    low = max(nm[0] for nm in by_curve)
+    high = min(nm[-1] for nm in by_curve)
+    knots = np.unique(np.concatenate(by_curve))
     return np.asarray(knots[(knots >= low) & (knots <= high)])
 
 
@@ -246,13 +272,12 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
     del stack, quick
     library = electrons.load_library()
     optics = study_optics(SENSOR)
-    exact = electrons.library_electrons_per_s(library, optics, electrons.Photometry())
-    zero = np.zeros(len(library.spectral_type))
+    photometry = electrons.Photometry()
+    exact = electrons.library_electrons_per_s(library, optics, photometry)
+    count = len(library.spectral_type)
+    zero = np.zeros(count)
     sure = library.vi_mag < MAX_RELIABLE_VI_MAG
     sky = SkySettings()
-    real = electrons.tabulate_pickles(optics, electrons.Photometry())
-    bodies = electrons.tabulate("dgs", optics, electrons.Photometry())
-    average = electrons.tabulate("ags", optics, electrons.Photometry())
 
     def trial(
         name: str, rates: FloatArray, work: Callable[[], object], settings: tuple[str, ...]
@@ -262,36 +287,34 @@ def spectrum(stack: ExitStack, quick: bool) -> Trials:
         figures = float(np.percentile(error, 95)), float(np.median(error))
         return Trial(name, *figures, work, settings == default, name == OWN_SPECTRUM)
 
-    by_own = partial(electrons.library_electrons_per_s, library, optics, electrons.Photometry())
-    colours = zero, library.bv_mag, library.vi_mag
+    by_own = partial(electrons.library_electrons_per_s, library, optics, photometry)
+    trials = [trial(OWN_SPECTRUM, by_own(), by_own, ("dgs", "own"))]
+    table = electrons.tabulate_pickles(optics, photometry)
+    by_vi = partial(table.electrons_per_s, zero, library.bv_mag, library.vi_mag)
     held_out = exact * (1 + held_out_errors(exact))
-    trials = [
-        trial(OWN_SPECTRUM, by_own(), by_own, ("dgs", "own")),
-        trial(
-            "real spectra by V-I",
-            held_out,
-            partial(real.electrons_per_s, *colours),
-            ("dgs", "pickles"),
-        ),
-    ]
+    trials.append(trial("real spectra by V-I", held_out, by_vi, ("dgs", "pickles")))
+    bodies = electrons.tabulate("dgs", optics, photometry)
     for scale in TEMPERATURE_SCALES:
-
-        def body(scale: str = scale) -> FloatArray:
-            return bodies.electrons_per_s(
-                zero, electrons.star_temperatures_k(library.bv_mag, scale)
-            )
-
-        trials.append(trial(f"black body, {scale}", body(), body, ("dgs", "blackbody", scale)))
-    ags = partial(average.electrons_per_s, zero, np.full(len(zero), 9602.0))
+        body = partial(body_rates, bodies, library.bv_mag, scale)
+        settings = ("dgs", "blackbody", scale)
+        trials.append(trial(f"black body, {scale}", body(), body, settings))
+    average = electrons.tabulate("ags", optics, photometry)
+    ags = partial(average.electrons_per_s, zero, np.full(count, 9602.0))
     trials.append(trial("AGS, one average", ags(), ags, ("ags",)))
     return Trials(
         "spectrum",
-        f"{len(zero)} stars by a table made before",
+        f"{count} stars by a table made before",
         Figure("error of the electron rate, 95 % of library stars", "mag", LIBRARY_MAG),
         Figure("median star", "mag"),
         "a catalogue has colours and no spectra",
         trials,
     )
+
+
+def body_rates(table: electrons.RateTable, bv_mag: FloatArray, scale: str) -> FloatArray:
+    """Electron rates (n,) of black bodies of V = 0 by their colours."""
+    kelvin = electrons.star_temperatures_k(bv_mag, scale)
+    return table.electrons_per_s(np.zeros(len(bv_mag)), kelvin)
 
 
 def psf(stack: ExitStack, quick: bool) -> Trials:
@@ -300,10 +323,13 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
     """
     del quick  # every error is found in one draw
     side = PSF_PHASES * TILE_PX
-    errors = _psf_errors(TILE_PX, lambda sprites: linear_image(sprites, (side, side), SPRITE_PSF))
-    work: Callable[[], object] = partial(
-        linear_image, star_field(FRAME_PX, TILE_PX), FRAME_PX, SPRITE_PSF
-    )
+
+    def exact_image(sprites: FrameLight) -> FloatArray:
+        return linear_image(sprites, (side, side), SPRITE_PSF)
+
+    errors = _psf_errors(TILE_PX, exact_image)
+    field = star_field(FRAME_PX, TILE_PX)
+    work: Callable[[], object] = partial(linear_image, field, FRAME_PX, SPRITE_PSF)
     trials = [Trial("exact integral, erfc in float64", *errors, work, is_exact=True)]
     for name, variant in splat_variants().items():
         renderer = stack.enter_context(VariantRenderer(Target(FRAME_PX, SPRITE_PSF), variant))
@@ -312,22 +338,19 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
             renderer.draw(sprites)
             return renderer.linear()[:side, :side].astype(np.float64)
 
-        work = partial(renderer.draw_and_wait, star_field(FRAME_PX, renderer.footprint_px))
-        trials.append(
-            Trial(name, *_psf_errors(renderer.footprint_px, image), work, variant == SplatVariant())
-        )
-
-    def sampled_flux(phase_px: FloatArray) -> FloatArray:
-        offset_px = (np.arange(-TILE_PX, TILE_PX + 1) - phase_px[:, None]) / SMALL_SIGMA_PX
-        return np.asarray(
-            (np.exp(-0.5 * offset_px**2) / (SMALL_SIGMA_PX * np.sqrt(2 * np.pi))).sum(axis=1)
-        )
-
-    excess = 1 / (2 * np.pi * math.prod(SPRITE_PSF.width_px) * SPRITE_PSF.peak_share) - 1
-    worst = np.abs(magnitude(sampled_flux(np.arange(PSF_PHASES) / PSF_PHASES) ** 2)).max()
+        side_px = renderer.footprint_px
+        work = partial(renderer.draw_and_wait, star_field(FRAME_PX, side_px))
+        is_default = variant == SplatVariant()
+        trials.append(Trial(name, *_psf_errors(side_px, image), work, is_default))
+    sigma_x, sigma_y = SPRITE_PSF.width_px
+    middle_share = 1 / (2 * np.pi * sigma_x * sigma_y)
+    excess = middle_share / SPRITE_PSF.peak_share - 1
+    sampled = sampled_flux(np.arange(PSF_PHASES) / PSF_PHASES)
+    worst = np.abs(magnitude(sampled**2)).max()
+    width, height = FRAME_PX
     return Trials(
         "psf",
-        f"linear image of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}",
+        f"linear image of {STARS} stars, {width} x {height}",
         Figure("flux error, worst", "mag", ROUNDING_MAG),
         Figure("centre of gravity, worst", "px"),
         "methods this close change order from run to run; the default has the smallest footprint"
@@ -339,23 +362,27 @@ def psf(stack: ExitStack, quick: bool) -> Trials:
     )
 
 
+def sampled_flux(phase_px: FloatArray) -> FloatArray:
+    """The sum along an axis of a narrow star that is sampled at pixel centres, by phase (n,)."""
+    pixels = np.arange(-TILE_PX, TILE_PX + 1)
+    offset = (pixels - phase_px[:, None]) / SMALL_SIGMA_PX
+    height = np.exp(-0.5 * offset**2) / (SMALL_SIGMA_PX * np.sqrt(2 * np.pi))
+    return np.asarray(height.sum(axis=1))
+
+
 def splat_variants() -> dict[str, SplatVariant]:
     """The GPU's ways, by name; the renderer's own is the `SplatVariant()` that changes nothing."""
-    footprint_px = SPRITE_PSF.footprint_px
-    variants = {f"GL polynomial, R32F, {footprint_px} px": SplatVariant()}
-    variants |= {
-        f"GL polynomial, R32F, {size} px": SplatVariant(footprint_px=size)
-        for size in SIZES_PX
-        if size != footprint_px
-    }
-    variants |= {f"GL polynomial, R16F, {footprint_px} px": SplatVariant(half_float=True)}
-    variants |= {f"GL erf, {footprint_px} px": SplatVariant("erf")}
-    variants |= {f"GL erf by exp, {footprint_px} px": SplatVariant("exp erf")}
-    variants |= {
-        f"GL table of {size}, {footprint_px} px": SplatVariant("table", table_size=size)
-        for size in TABLE_SIZES
-    }
-    variants |= {f"GL pixel centre, {footprint_px} px": SplatVariant("centre")}
+    own_px = SPRITE_PSF.footprint_px
+    variants = {f"GL polynomial, R32F, {own_px} px": SplatVariant()}
+    for side_px in SIZES_PX:
+        if side_px != own_px:
+            variants[f"GL polynomial, R32F, {side_px} px"] = SplatVariant(footprint_px=side_px)
+    variants[f"GL polynomial, R16F, {own_px} px"] = SplatVariant(half_float=True)
+    variants[f"GL erf, {own_px} px"] = SplatVariant("erf")
+    variants[f"GL erf by exp, {own_px} px"] = SplatVariant("exp erf")
+    for size in TABLE_SIZES:
+        variants[f"GL table of {size}, {own_px} px"] = SplatVariant("table", table_size=size)
+    variants[f"GL pixel centre, {own_px} px"] = SplatVariant("centre")
     return variants
 
 
@@ -364,25 +391,26 @@ def _psf_errors(size_px: int, image: Callable[[FrameLight], FloatArray]) -> tupl
     them.
     """
     side = PSF_PHASES * TILE_PX
-    place = (
-        (np.arange(PSF_PHASES) + 0.5) * TILE_PX + (np.arange(PSF_PHASES) + 0.5) / PSF_PHASES - 0.5
-    )
-    x_px, y_px = (axis.ravel() for axis in np.meshgrid(place, place))
-    flux = np.full(PSF_PHASES**2, WHITE / SPRITE_PSF.peak_share)
+    number = np.arange(PSF_PHASES) + 0.5
+    place = number * TILE_PX + number / PSF_PHASES - 0.5
+    columns, rows = np.meshgrid(place, place)
     star = np.arange(PSF_PHASES**2)
-    sprites = pack_sprites(x_px, y_px, flux, star, (side, side), size_px)
+    flux = np.full(len(star), WHITE / SPRITE_PSF.peak_share)
+    sprites = pack_sprites(columns.ravel(), rows.ravel(), flux, star, (side, side), size_px)
     bright = linear_image(sprites, (side, side), SPRITE_PSF, TILE_PX)
-    errors = []
+    flux_mag = 0.0
+    centroid_px = 0.0
     for mag in (0.0, FAINTER_MAG):
-        errors.append(
-            measure(bright * flux_ratio(mag), image(fainter(sprites, mag)).copy(), TILE_PX)
-        )
-    return max(e.flux_max_mag for e in errors), max(e.centroid_max_px for e in errors)
+        drawn = image(fainter(sprites, mag)).copy()
+        errors = measure(bright * flux_ratio(mag), drawn, TILE_PX)
+        flux_mag = max(flux_mag, errors.flux_max_mag)
+        centroid_px = max(centroid_px, errors.centroid_max_px)
+    return flux_mag, centroid_px
 
 
 def quantisation(stack: ExitStack, quick: bool) -> Trials:
-    """From light to codes at the default depth: flux error, mag, and centroid error, px, of a
-    star at its aim's faint end.
+    """From light to codes at the default depth: errors of a star at the faint end of its aim, mag
+    and px.
     """
     del quick  # every error is found at once
     bits = Monitor(resolution_px=FRAME_PX, pixel_pitch_um=1.0).bits
@@ -390,35 +418,27 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
     stealing = RenderSettings().bit_stealing
     trials = []
     for way in WAYS:
-        code_error = code_errors(bits, way, PHASES, [mag])[0]
+        (errors,) = code_errors(bits, way, PHASES, [mag])
         target = Target(FRAME_PX, SPRITE_PSF, response_of(bits, way), WHITE, way.method)
         renderer = stack.enter_context(Renderer(target))
         work = partial(_codes, renderer, star_field(FRAME_PX, renderer.footprint_px), count())
-        max_px_by_kind = {f"max_px_{kind}": code_error.max_px(kind) for kind in FAMILY}
         is_default = (way.method, way.stealing) == (TAKEN, stealing)
-        trials.append(
-            Trial(
-                way.name,
-                code_error.flux_max_mag,
-                code_error.max_px(JUDGE),
-                work,
-                is_default,
-                more=max_px_by_kind,
-            )
-        )
+        figures = errors.flux_max_mag, errors.max_px(JUDGE)
+        more = {f"max_px_{kind}": errors.max_px(kind) for kind in FAMILY}
+        trials.append(Trial(way.name, *figures, work, is_default, more=more))
     taken = next(trial for trial in trials if trial.is_default)
-    by_each = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
+    by_kind = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)
+    light = f"flux error of a star {mag:g} mag under white, {bits} bits, worst"
+    width, height = FRAME_PX
     return Trials(
         "quantisation",
-        f"codes of {STARS} stars, {FRAME_PX[0]} x {FRAME_PX[1]}, light to memory",
-        Figure(
-            f"flux error of a star {mag:g} mag under white, {bits} bits, worst", "mag", ROUNDING_MAG
-        ),
+        f"codes of {STARS} stars, {width} x {height}, light to memory",
+        Figure(light, "mag", ROUNDING_MAG),
         Figure("centroid error by a PSF fit, worst", "px"),
         "it needs no more than one frame and leaves no pattern that a tracker could take for a"
         " star",
         trials,
-        f"by each centroider '{taken.method}' is off by at most: {by_each} px",
+        f"by each centroider '{taken.method}' is off by at most: {by_kind} px",
     )
 
 
@@ -428,45 +448,42 @@ def _codes(renderer: Renderer, field: FrameLight, numbers: Iterator[int]) -> Non
 
 
 def depth(stack: ExitStack, quick: bool) -> Trials:
-    """How deep the catalogue goes: light of the whole sky that is lost, %, and stars drawn in
-    the field.
+    """How faint the catalogue goes: the light of the whole sky that is lost, %, and the stars in
+    the frame.
     """
     del quick
     config = demo_config()
-    camera = ideal_monitor(demo_config())
+    camera = ideal_monitor(config)
     every = stars_to(NO_LIMIT_V_MAG)
     response = bench_calibration(config, Path()).response
     white = brightest_peak_e_per_s(every, SPRITE_PSF)
-    renderer = stack.enter_context(
-        Renderer(Target(camera.resolution_px, SPRITE_PSF, response, white))
-    )
+    target = Target(camera.resolution_px, SPRITE_PSF, response, white)
+    renderer = stack.enter_context(Renderer(target))
     default = SkySettings().faintest_v_mag
     turn = turn_to_image(ORION, camera)
-    trials = []
 
     def frame(stars: Stars) -> None:
         renderer.draw(make_sprites(stars, turn, camera, renderer.footprint_px))
         renderer.levels()
 
+    trials = []
     for limit in sorted({*LIMITS_V_MAG, default, NO_LIMIT_V_MAG}):
         stars = stars_to(limit)
+        lost = 0.0
         if len(stars) < len(every):
-            lost = 100 * (1 - stars.electrons_per_s.sum() / every.electrons_per_s.sum())
-        else:
-            lost = 0.0
-        drawn = len(make_sprites(stars, turn, camera, renderer.footprint_px))
+            share = stars.electrons_per_s.sum() / every.electrons_per_s.sum()
+            lost = 100 * (1 - share)
+        name = f"V to {limit:g}"
         if limit == NO_LIMIT_V_MAG:
             name = "all of Hipparcos"
-        else:
-            name = f"V to {limit:g}"
-        trials.append(
-            Trial(
-                name, lost, drawn, partial(frame, stars), limit == default, limit == NO_LIMIT_V_MAG
-            )
-        )
+        drawn = len(make_sprites(stars, turn, camera, renderer.footprint_px))
+        work = partial(frame, stars)
+        is_exact = limit == NO_LIMIT_V_MAG
+        trials.append(Trial(name, lost, drawn, work, limit == default, is_exact))
+    width, height = camera.resolution_px
     return Trials(
         "depth",
-        f"a frame of Orion to codes, {camera.resolution_px[0]} x {camera.resolution_px[1]}",
+        f"a frame of Orion to codes, {width} x {height}",
         Figure("light of the catalogue lost", "%", 0.1),
         Figure("sprites in the frame", "stars"),
         "Hipparcos is complete to about V = 7.5",

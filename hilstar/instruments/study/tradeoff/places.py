@@ -3,7 +3,7 @@ the demo's bench.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
+from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import angle_between_rad, normalise, to_matrix
@@ -30,6 +31,7 @@ from hilstar.instruments.study.predictors import (
     SLEW_DEG,
     SLEW_S,
     AttitudeAt,
+    Predictor,
     predictors,
     slew_attitude,
     slew_sample,
@@ -37,7 +39,7 @@ from hilstar.instruments.study.predictors import (
 from hilstar.instruments.study.trials import Figure, Trial, Trials
 from hilstar.optics.camera import Camera
 from hilstar.optics.exposure_motion import MIDDLE_S, Motion, smeared_sprites
-from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.psf import GaussianPsf, Psf
 from hilstar.optics.sprites import SPRITE_DTYPE, FrameLight, pack_sprites
 from hilstar.server.bench.cameras import ideal_monitor, tracker_psf
 from hilstar.server.bench.config import BenchConfig, RenderSettings, read_config
@@ -46,16 +48,16 @@ from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import CELL_DEG, Stars, cell_grid, make_stars
 
 SPRITE_PSF = GaussianPsf(RenderSettings().sprite_sigma_px)
-NO_LIMIT_V_MAG = 20.0
-ATTITUDES = 60
+NO_LIMIT_V_MAG = 20.0  # fainter than all of Hipparcos
+ATTITUDES = 60  # random fields
 SEED = 1
 STAR_COLUMNS = ("hip", "vectors", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row")
 CELLS_DEG = (1.0, 2.0, 3.0, 4.0, 6.0, 10.0, 20.0)
 # float64 places of 2000 px are a few steps of 2.3e-13 px off.
 ROUNDING_PX = 1e-12
-SAMPLE_MS = 50
+SAMPLE_MS = 50  # between attitudes
 FRAME_HZ = 60
-PREDICTIONS = 60
+PREDICTIONS = 60  # attitudes that are timed as one work
 RATE_DEG_S = (0.7, -0.7, 5.0)
 EVENLY = (4, 8, 16, 32, 64)
 GAUSS = (8, 16, 24, 32)
@@ -64,9 +66,86 @@ EXACT_NODES = 200
 # Wider than the path's own footprints, so that the steps' error is not their cut; 24 px are 21
 # sigma on either side.
 WIDE_PX = 24
-STARS_ACROSS = 16
+STARS_ACROSS = 16  # of a square grid
 # float32 fluxes and fractions of the sprites: 6e-8 of each.
 ROUNDING_SHARE = 1e-7
+MARGIN_PX = SPRITE_PSF.footprint_px / 2 + 1  # beyond the image, from where sprites reach into it
+
+
+@dataclass(frozen=True, slots=True)
+class CulledStars:
+    """The stars in view, as places (n,) in `Stars`, and how many were tested."""
+
+    star: IntArray
+    tested: int
+
+
+Finder = Callable[[Stars, FloatArray, Camera], CulledStars]
+SpritesOf = Callable[[Stars], FrameLight]
+
+
+@dataclass(frozen=True, slots=True)
+class Road:
+    """From directions to sprites: the precision of the mathematics, and the layout of the
+    sprites.
+    """
+
+    kind: type[np.floating[Any]]
+    dtype: np.dtype[np.void]
+
+    def pack(
+        self, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera
+    ) -> tuple[npt.NDArray[np.void], IntArray]:
+        """Sprites of stars of one electron per second, in the layout, and which of `vectors`
+        (n, 3) they are.
+        """
+        kind = self.kind
+        turned = vectors.astype(kind, copy=False) @ icrs_to_image.T.astype(kind)
+        x, y, z = turned.T
+        scale = kind(camera.focal_length_px) / z
+        centre_x, centre_y = camera.principal_point_px
+        x = x * scale + kind(centre_x)
+        y = y * scale + kind(centre_y)
+        star = np.arange(len(vectors))
+        width, height = camera.resolution_px
+        side_px = SPRITE_PSF.footprint_px
+        if self.dtype == SPRITE_DTYPE:
+            sprites = pack_sprites(x, y, np.ones(len(star)), star, (width, height), side_px)
+            return sprites.data, sprites.star
+        margin = side_px / 2
+        is_visible = (x > -margin) & (x < width + margin)
+        is_visible &= (y > -margin) & (y < height + margin)
+        data = np.empty(np.count_nonzero(is_visible), dtype=self.dtype)
+        data["place_px"][:, 0] = x[is_visible]
+        data["place_px"][:, 1] = y[is_visible]
+        data["electrons_per_s"] = 1.0
+        return data, star[is_visible]
+
+    def places_px(
+        self, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera
+    ) -> npt.NDArray[np.longdouble]:
+        """Places (n, 2) of the stars, px; NaN for one that is not seen."""
+        data, star = self.pack(vectors, icrs_to_image, camera)
+        places = np.full((len(vectors), 2), np.nan, dtype=np.longdouble)
+        if data.dtype == SPRITE_DTYPE:
+            places[star] = data["pixel"] + data["fraction_px"].astype(np.longdouble)
+        else:
+            places[star] = data["place_px"]
+        return places
+
+
+def _layout(place: type[np.floating[Any]]) -> np.dtype[np.void]:
+    return np.dtype([("place_px", place, 2), ("electrons_per_s", "<f4")])
+
+
+EXACT: Road = Road(np.longdouble, _layout(np.longdouble))
+ROADS: dict[str, Road] = {
+    "extended precision": EXACT,
+    "float64, place in float64": Road(np.float64, _layout(np.float64)),
+    "float64, place in float32": Road(np.float64, _layout(np.float32)),
+    "float32 throughout": Road(np.float32, _layout(np.float32)),
+    "float64, whole pixel + float32 fraction": Road(np.float64, SPRITE_DTYPE),
+}
 
 
 @cache
@@ -89,50 +168,79 @@ def turn_to_image(q: FloatArray, camera: Camera) -> FloatArray:
 
 
 def random_turns(count: int, camera: Camera) -> list[FloatArray]:
-    """ICRS to image axes, (3, 3) each, at attitudes of which any is as likely as any other;
-    ORION is the first.
-    """
-    drawn = normalise(np.random.default_rng(SEED).normal(size=(count - 1, 4)))
-    return [turn_to_image(q, camera) for q in (ORION, *drawn)]
+    """Rotations from ICRS to image axes, (3, 3) each: ORION's, then uniformly random ones."""
+    random_q = normalise(np.random.default_rng(SEED).normal(size=(count - 1, 4)))
+    return [turn_to_image(q, camera) for q in (ORION, *random_q)]
+
+
+def in_cells(stars: Stars, cell_deg: float, by_centres: bool = False) -> Stars:
+    """The stars in cells of another size; `by_centres` takes a cell for a point."""
+    grid = cell_grid(stars.vectors, cell_deg)
+    columns = {name: getattr(stars, name)[grid.order] for name in STAR_COLUMNS}
+    if by_centres:
+        cosine = np.ones_like(grid.cos_radius)
+        sine = np.zeros_like(grid.sin_radius)
+        grid = replace(grid, cos_radius=cosine, sin_radius=sine)
+    return replace(stars, **columns, grid=grid)
+
+
+def scan(stars: Stars, turn: FloatArray, camera: Camera) -> CulledStars:
+    """Every star projected."""
+    every = np.arange(len(stars))
+    return CulledStars(projected(stars, every, turn, camera), len(stars))
+
+
+def by_angle(stars: Stars, turn: FloatArray, camera: Camera) -> CulledStars:
+    """The stars within a circle about the boresight, by the angles of all stars."""
+    radius_rad = camera.field_radius_rad(MARGIN_PX)
+    near = np.flatnonzero(stars.vectors @ turn[2] >= np.cos(radius_rad))
+    return CulledStars(projected(stars, near, turn, camera), len(stars))
+
+
+def by_cells(stars: Stars, turn: FloatArray, camera: Camera) -> CulledStars:
+    """As `make_sprites` finds them."""
+    radius_rad = camera.field_radius_rad(MARGIN_PX)
+    near = stars.grid.near(turn[2], radius_rad, camera.edges(MARGIN_PX) @ turn)
+    return CulledStars(projected(stars, near, turn, camera), len(near))
+
+
+def projected(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> IntArray:
+    """The stars of `near` (n,) that are in view."""
+    x_px, y_px = camera.project(stars.vectors[near] @ turn.T)
+    rates = stars.electrons_per_s[near]
+    side_px = SPRITE_PSF.footprint_px
+    return pack_sprites(x_px, y_px, rates, near, camera.resolution_px, side_px).star
 
 
 def culling(stack: ExitStack, quick: bool) -> Trials:
-    """How the stars in view are found among all: stars missed over ATTITUDES fields, and stars
-    tested that are not in view.
+    """How the stars in view are found: stars missed over ATTITUDES fields, and stars tested in
+    vain.
     """
     del stack
     camera = ideal_monitor(demo_config())
     stars = stars_to(NO_LIMIT_V_MAG)
     turns = random_turns(10 if quick else ATTITUDES, camera)
-
-    def by_angle(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
-        radius_rad = camera.field_radius_rad(SPRITE_PSF.footprint_px / 2 + 1)
-        return _project(
-            stars, np.flatnonzero(stars.vectors @ turn[2] >= np.cos(radius_rad)), turn, camera
-        ), len(stars)
-
-    in_view = [set(stars.hip[_scan(stars, turn, camera)[0]].tolist()) for turn in turns]
-    finders: dict[str, tuple[Stars, Finder]] = {
-        "scan, every star projected": (stars, _scan),
+    in_view = [set(stars.hip[scan(stars, turn, camera).star].tolist()) for turn in turns]
+    methods: dict[str, tuple[Stars, Finder]] = {
+        "scan, every star projected": (stars, scan),
         "scan of angles": (stars, by_angle),
-        **{
-            f"cells of {deg:g} deg": (in_cells(stars, deg), _by_cells)
-            for deg in sorted({*CELLS_DEG, CELL_DEG})
-        },
-        "cells of 10 deg, by centres only": (in_cells(stars, 10.0, by_centres=True), _by_cells),
     }
+    for cell_deg in sorted({*CELLS_DEG, CELL_DEG}):
+        methods[f"cells of {cell_deg:g} deg"] = in_cells(stars, cell_deg), by_cells
+    by_centres = in_cells(stars, 10.0, by_centres=True)
+    methods["cells of 10 deg, by centres only"] = by_centres, by_cells
     trials = []
-    for name, (sorted_stars, finder) in finders.items():
+    for name, (sorted_stars, finder) in methods.items():
         missed = 0
         vain = 0
         for turn, wanted in zip(turns, in_view, strict=True):
-            visible, looked_at = finder(sorted_stars, turn, camera)
-            shown = set(sorted_stars.hip[visible].tolist())
+            culled = finder(sorted_stars, turn, camera)
+            shown = set(sorted_stars.hip[culled.star].tolist())
             missed += len(wanted - shown)
-            vain += looked_at - len(wanted & shown)
+            vain += culled.tested - len(wanted & shown)
         work = partial(finder, sorted_stars, turns[0], camera)
-        is_own = name == f"cells of {CELL_DEG:g} deg"
-        trials.append(Trial(name, missed, vain / len(turns), work, is_own, finder is _scan))
+        is_default = name == f"cells of {CELL_DEG:g} deg"
+        trials.append(Trial(name, missed, vain / len(turns), work, is_default, finder is scan))
     return Trials(
         "culling",
         f"{len(stars)} stars to the {len(in_view[0])} sprites of Orion",
@@ -144,70 +252,38 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
     )
 
 
-# Which stars (places in `Stars`) are in view, and how many were tested.
-Finder = Callable[[Stars, FloatArray, Camera], tuple[IntArray, int]]
-
-
-def in_cells(stars: Stars, cell_deg: float, by_centres: bool = False) -> Stars:
-    """The stars in cells of another size; `by_centres` takes a cell for a point."""
-    grid = cell_grid(stars.vectors, cell_deg)
-    columns = {name: getattr(stars, name)[grid.order] for name in STAR_COLUMNS}
-    if by_centres:
-        grid = replace(
-            grid,
-            cos_radius=np.ones_like(grid.cos_radius),
-            sin_radius=np.zeros_like(grid.sin_radius),
-        )
-    return replace(stars, **columns, grid=grid)
-
-
-def _by_cells(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
-    """As `make_sprites` finds them."""
-    margin_px = SPRITE_PSF.footprint_px / 2 + 1
-    near = stars.grid.near(
-        turn[2], camera.field_radius_rad(margin_px), camera.edges(margin_px) @ turn
-    )
-    return _project(stars, near, turn, camera), len(near)
-
-
-def _scan(stars: Stars, turn: FloatArray, camera: Camera) -> tuple[IntArray, int]:
-    return _project(stars, np.arange(len(stars)), turn, camera), len(stars)
-
-
-def _project(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> IntArray:
-    x_px, y_px = camera.project(stars.vectors[near] @ turn.T)
-    return pack_sprites(
-        x_px, y_px, stars.electrons_per_s[near], near, camera.resolution_px, SPRITE_PSF.footprint_px
-    ).star
-
-
 def projection(stack: ExitStack, quick: bool) -> Trials:
-    """Errors of star places, px, by the number format in which they are computed: the largest and
-    the rms over the stars of ATTITUDES random fields.
+    """Errors of star places, px, by number format: largest and rms over the stars of ATTITUDES
+    fields.
     """
     del stack
     camera = ideal_monitor(demo_config())
     stars = stars_to(NO_LIMIT_V_MAG)
     turns = random_turns(6 if quick else ATTITUDES, camera)
-    near = [stars.vectors[stars.grid.near(turn[2], camera.field_radius_rad(0.0))] for turn in turns]
-    truths = [
-        _places(EXACT, vectors, turn, camera) for vectors, turn in zip(near, turns, strict=True)
-    ]
+    radius_rad = camera.field_radius_rad(0.0)
+    near = [stars.vectors[stars.grid.near(turn[2], radius_rad)] for turn in turns]
+
+    def places(road: Road) -> npt.NDArray[np.longdouble]:
+        of_fields = []
+        for vectors, turn in zip(near, turns, strict=True):
+            of_fields.append(road.places_px(vectors, turn, camera))
+        return np.concatenate(of_fields)
+
+    truth = places(EXACT)
     trials = []
     for name, road in ROADS.items():
-        places = [
-            _places(road, vectors, turn, camera) for vectors, turn in zip(near, turns, strict=True)
-        ]
-        error = np.hypot(*(np.concatenate(places) - np.concatenate(truths)).T).astype(np.float64)
+        off_x, off_y = (places(road) - truth).T
+        error = np.hypot(off_x, off_y).astype(np.float64)
         error = error[np.isfinite(error)]
+        rms_px = float(np.sqrt(np.mean(error**2)))
         work = partial(road.pack, near[0], turns[0], camera)
         # The sprites' own layout says which of them the renderer is handed.
-        figures = float(error.max()), float(np.sqrt(np.mean(error**2)))
-        trials.append(Trial(name, *figures, work, road.dtype == SPRITE_DTYPE, road is EXACT))
+        is_default = road.dtype == SPRITE_DTYPE
+        trials.append(Trial(name, float(error.max()), rms_px, work, is_default, road is EXACT))
+    width, height = camera.resolution_px
     return Trials(
         "projection",
-        f"{len(near[0])} stars near the field to sprites, {camera.resolution_px[0]} x"
-        f" {camera.resolution_px[1]}",
+        f"{len(near[0])} stars near the field to sprites, {width} x {height}",
         Figure("position error, worst star", "px", ROUNDING_PX),
         Figure("rms", "px"),
         "OpenGL 3.3 takes no float64, and the error of a float32 position grows with the monitor",
@@ -216,78 +292,88 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
 
 
 @dataclass(frozen=True, slots=True)
-class Road:
-    """From directions to sprites: the precision of the mathematics, and the layout of the
-    sprites.
-    """
+class SmearBench:
+    """The demo's tracker as a display of its own pixels, and a turn of its camera."""
 
-    kind: type[np.floating[Any]]
-    dtype: np.dtype[np.void]
+    camera: Camera
+    psf: Psf
+    motion: Motion
 
-    def pack(
-        self, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera
-    ) -> tuple[npt.NDArray[np.void], IntArray]:
-        """Sprites of stars of one electron per second, in the layout, and which of `vectors`
-        (n, 3) they are.
+    @property
+    def side_px(self) -> int:
+        """The side of the detector."""
+        return self.camera.resolution_px[0]
+
+    def path_sprites(self, stars: Stars) -> FrameLight:
+        """Stars along their paths, as hilstar draws them."""
+        return smeared_sprites(stars, self.motion, self.camera, self.psf)
+
+    def chain(self, at: FloatArray, share: FloatArray, stars: Stars) -> FrameLight:
+        """Stars at the parts `at` (k,) of the exposure with shares (k,) of their light; 0 is its
+        middle.
         """
-        kind = self.kind
-        x, y, z = (vectors.astype(kind, copy=False) @ icrs_to_image.T.astype(kind)).T
-        scale = kind(camera.focal_length_px) / z
-        cx, cy = (kind(c) for c in camera.principal_point_px)
-        x = x * scale + cx
-        y = y * scale + cy
-        star, (width, height), side = (
-            np.arange(len(vectors)),
-            camera.resolution_px,
-            SPRITE_PSF.footprint_px,
-        )
-        if self.dtype == SPRITE_DTYPE:
-            sprites = pack_sprites(x, y, np.ones(len(star)), star, (width, height), side)
-            return sprites.data, sprites.star
-        margin = side / 2
-        is_visible = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
-        data = np.empty(np.count_nonzero(is_visible), dtype=self.dtype)
-        data["place_px"][:, 0], data["place_px"][:, 1] = x[is_visible], y[is_visible]
-        data["electrons_per_s"] = 1.0
-        return data, star[is_visible]
+        x_px, y_px = self.places_px(stars, at)
+        light = np.outer(share, stars.electrons_per_s).ravel()
+        star = np.tile(np.arange(len(stars)), len(at))
+        size_px = self.camera.resolution_px
+        side_px = self.psf.footprint_px
+        return pack_sprites(x_px.ravel(), y_px.ravel(), light, star, size_px, side_px)
+
+    def places_px(self, stars: Stars, at: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Places (k, n), px, at the parts `at` (k,) of the exposure; 0 is its middle."""
+        turns = self.motion.icrs_to_image(at * self.motion.exposure_s, self.camera)
+        directions = stars.vectors @ turns.transpose(0, 2, 1)
+        x_px, y_px = self.camera.project(directions.reshape(-1, 3))
+        return x_px.reshape(len(at), -1), y_px.reshape(len(at), -1)
+
+    def image(self, sprites: FrameLight) -> FloatArray:
+        """The exact linear image (h, w)."""
+        return linear_image(sprites, self.camera.resolution_px, self.psf, WIDE_PX)
+
+    def grid_stars(self, across: int) -> Stars:
+        """Stars of one electron per second, across^2 of them evenly over the detector in the middle
+        of the exposure.
+        """
+        count = across**2
+        place = (np.arange(across) + 0.5) * self.side_px / across - 0.5
+        columns, rows = np.meshgrid(place, place)
+        x_px = columns.ravel() - (self.side_px - 1) / 2
+        y_px = rows.ravel() - (self.side_px - 1) / 2
+        image = np.column_stack([x_px, y_px, np.full(count, self.camera.focal_length_px)])
+        directions = image / np.linalg.norm(image, axis=1, keepdims=True)
+        vectors = directions @ self.motion.icrs_to_image(MIDDLE_S, self.camera)[0]
+        zero = np.zeros(count)
+        catalog = plain_catalog("star", count, {"v_mag": zero, "ra_deg": zero, "dec_deg": zero})
+        return make_stars(catalog, vectors, zero, zero + 1)
 
 
-def _layout(place: type[np.floating[Any]]) -> np.dtype[np.void]:
-    return np.dtype([("place_px", place, 2), ("electrons_per_s", "<f4")])
-
-
-EXACT = Road(np.longdouble, _layout(np.longdouble))
-ROADS = {
-    "extended precision": EXACT,
-    "float64, place in float64": Road(np.float64, _layout(np.float64)),
-    "float64, place in float32": Road(np.float64, _layout(np.float32)),
-    "float32 throughout": Road(np.float32, _layout(np.float32)),
-    "float64, whole pixel + float32 fraction": Road(np.float64, SPRITE_DTYPE),
-}
-
-
-def _places(
-    road: Road, vectors: FloatArray, icrs_to_image: FloatArray, camera: Camera
-) -> npt.NDArray[np.longdouble]:
-    """Places (n, 2), px; NaN for a star that is not seen."""
-    data, star = road.pack(vectors, icrs_to_image, camera)
-    places = np.full((len(vectors), 2), np.nan, dtype=np.longdouble)
-    split = data.dtype == SPRITE_DTYPE
-    places[star] = (
-        data["pixel"] + data["fraction_px"].astype(np.longdouble) if split else data["place_px"]
+def smear_bench() -> SmearBench:
+    """The demo's tracker at RATE_DEG_S."""
+    tracker = demo_config().tracker
+    aligned = np.array([1.0, 0, 0, 0])
+    camera = monitor_camera(
+        tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, aligned
     )
-    return places
+    motion = Motion(ORION, np.radians(np.array(RATE_DEG_S)), tracker.exposure_s)
+    return SmearBench(camera, tracker_psf(tracker, Path()), motion)
 
 
-TRACKER = demo_config().tracker
-TRACKER_PSF = tracker_psf(TRACKER, Path())
-CAMERA = monitor_camera(
-    TRACKER.resolution_px, TRACKER.pixel_pitch_um, TRACKER.focal_length_mm, np.array([1.0, 0, 0, 0])
-)
-SIZE_PX = CAMERA.resolution_px[0]
+def smear_methods(bench: SmearBench) -> dict[str, SpritesOf]:
+    """Every fixed number of sprites on a path, by Gauss-Legendre quadrature and evenly in time."""
+    methods: dict[str, SpritesOf] = {}
+    for count in (*GAUSS, EXACT_NODES):
+        nodes, weights = np.polynomial.legendre.leggauss(count)
+        methods[gauss_name(count)] = partial(bench.chain, nodes / 2, weights / 2)
+    for count in EVENLY:
+        at = (np.arange(count) + 0.5) / count - 0.5
+        share = np.full(count, 1 / count)
+        methods[f"evenly in time, {count}"] = partial(bench.chain, at, share)
+    return methods
 
 
-SpritesOf = Callable[[Stars], FrameLight]
+def gauss_name(count: int) -> str:
+    """The name of so many nodes of quadrature."""
+    return f"Gauss-Legendre, {count}"
 
 
 def smear(stack: ExitStack, quick: bool) -> Trials:
@@ -295,59 +381,33 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
     over a grid of stars.
     """
     across = STARS_ACROSS // 2 if quick else STARS_ACROSS
-    motion = Motion(ORION, np.radians(np.array(RATE_DEG_S)), TRACKER.exposure_s)
-    few = grid_stars(across, motion)
-    many = grid_stars(STARS_ACROSS, motion)
-    renderer = stack.enter_context(
-        VariantRenderer(Target(TRACKER.resolution_px, TRACKER_PSF), SplatVariant())
-    )
-
-    def own(stars: Stars) -> FrameLight:
-        return smeared_sprites(stars, motion, CAMERA, TRACKER_PSF)
-
-    def gauss(count: int, stars: Stars) -> FrameLight:
-        nodes, weights = np.polynomial.legendre.leggauss(count)
-        return _chain(stars, motion, nodes / 2, weights / 2)
-
-    def evenly(count: int, stars: Stars) -> FrameLight:
-        return _chain(
-            stars, motion, (np.arange(count) + 0.5) / count - 0.5, np.full(count, 1 / count)
-        )
-
-    def image(sprites: FrameLight) -> FloatArray:
-        return linear_image(sprites, CAMERA.resolution_px, TRACKER_PSF, WIDE_PX)
+    bench = smear_bench()
+    few = bench.grid_stars(across)
+    many = bench.grid_stars(STARS_ACROSS)
+    target = Target(bench.camera.resolution_px, bench.psf)
+    renderer = stack.enter_context(VariantRenderer(target, SplatVariant()))
 
     def draw(sprites_of: SpritesOf) -> None:
         renderer.draw_and_wait(sprites_of(many))
 
-    names = {count: f"Gauss-Legendre, {count}" for count in (*GAUSS, EXACT_NODES)}
-    methods: dict[str, SpritesOf] = {
-        f"Gauss-Legendre by length, {len(own(few)) / len(few):.0f} on average": own
-    }
-    methods |= {name: partial(gauss, count) for count, name in names.items()}
-    methods |= {f"evenly in time, {count}": partial(evenly, count) for count in EVENLY}
-    exact = image(gauss(EXACT_NODES, few))
+    mean_count = len(bench.path_sprites(few)) / len(few)
+    default = f"Gauss-Legendre by length, {mean_count:.0f} on average"
+    methods = {default: bench.path_sprites, **smear_methods(bench)}
+    exact = bench.image(methods[gauss_name(EXACT_NODES)](few))
     trials = []
     for name, sprites_of in methods.items():
-        drawn = image(sprites_of(few))
+        drawn = bench.image(sprites_of(few))
         worst = float(np.abs(drawn - exact).max())
         off_px = measure(exact, drawn, len(exact) // across).centroid_max_px
-        trials.append(
-            Trial(
-                name,
-                worst,
-                off_px,
-                partial(draw, sprites_of),
-                sprites_of is own,
-                name == names[EXACT_NODES],
-            )
-        )
-    x_px, y_px = _places_px(many, motion, np.array([-0.5, 0.5]))
+        work = partial(draw, sprites_of)
+        is_exact = name == gauss_name(EXACT_NODES)
+        trials.append(Trial(name, worst, off_px, work, name == default, is_exact))
+    x_px, y_px = bench.places_px(many, np.array([-0.5, 0.5]))
     paths_px = np.hypot(np.diff(x_px, axis=0), np.diff(y_px, axis=0))
+    extent = f"{paths_px.min():.0f} to {paths_px.max():.0f} px"
     return Trials(
         "smear",
-        f"linear image of {len(many)} stars, paths of {paths_px.min():.0f} to {paths_px.max():.0f}"
-        f" px, {SIZE_PX} px squared",
+        f"linear image of {len(many)} stars, paths of {extent}, {bench.side_px} px squared",
         Figure("largest pixel error, share of its star", "1", ROUNDING_SHARE),
         Figure("centre of gravity, worst", "px"),
         "its error does not grow with the path, as that of a fixed number does",
@@ -355,40 +415,27 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
     )
 
 
-def grid_stars(across: int, motion: Motion) -> Stars:
-    """Stars of one electron per second, across^2 of them evenly over the detector in the middle
-    of the exposure.
-    """
-    place = (np.arange(across) + 0.5) * SIZE_PX / across - 0.5
-    x_px, y_px = (axis.ravel() - (SIZE_PX - 1) / 2 for axis in np.meshgrid(place, place))
-    image = np.column_stack([x_px, y_px, np.full(across**2, CAMERA.focal_length_px)])
-    vectors = (
-        image
-        / np.linalg.norm(image, axis=1, keepdims=True)
-        @ motion.icrs_to_image(MIDDLE_S, CAMERA)[0]
-    )
-    zero = np.zeros(across**2)
-    catalog = plain_catalog("star", across**2, {"v_mag": zero, "ra_deg": zero, "dec_deg": zero})
-    return make_stars(catalog, vectors, zero, zero + 1)
+def prediction_errors(predictor: Predictor, samples: Sequence[AttitudeSample]) -> list[float]:
+    """The errors of a predictor in every frame between its samples, arcsec."""
+    frame_ns = NS_PER_S / FRAME_HZ
+    errors = []
+    for after in range(NEAR, len(samples)):
+        # One that waits has the sample after the frame, too.
+        end = after + 1 if predictor.waits else after
+        attitude_at = predictor.load(samples[after - NEAR : end])
+        first = math.ceil(samples[after - 1].t_ns / frame_ns)
+        last = math.ceil(samples[after].t_ns / frame_ns)
+        for number in range(first, last):
+            t_ns = round(number * frame_ns)
+            off_rad = angle_between_rad(slew_attitude(t_ns), attitude_at(t_ns))
+            errors.append(off_rad * math.degrees(3600))
+    return errors
 
 
-def _chain(stars: Stars, motion: Motion, at: FloatArray, share: FloatArray) -> FrameLight:
-    x_px, y_px = _places_px(stars, motion, at)
-    light = np.outer(share, stars.electrons_per_s)
-    star = np.broadcast_to(np.arange(len(stars)), x_px.shape)
-    side = TRACKER_PSF.footprint_px
-    return pack_sprites(
-        x_px.ravel(), y_px.ravel(), light.ravel(), star.ravel(), CAMERA.resolution_px, side
-    )
-
-
-def _places_px(stars: Stars, motion: Motion, at: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Places (k, n), px, at the parts `at` (k,) of the exposure, 0 its middle."""
-    image_directions = stars.vectors @ motion.icrs_to_image(
-        at * motion.exposure_s, CAMERA
-    ).transpose(0, 2, 1)
-    x_px, y_px = CAMERA.project(image_directions.reshape(-1, 3))
-    return x_px.reshape(len(at), -1), y_px.reshape(len(at), -1)
+def attitudes_at(attitude_at: AttitudeAt, times_ns: Sequence[int]) -> None:
+    """The work that is timed."""
+    for t_ns in times_ns:
+        attitude_at(t_ns)
 
 
 def prediction(stack: ExitStack, quick: bool) -> Trials:
@@ -396,36 +443,19 @@ def prediction(stack: ExitStack, quick: bool) -> Trials:
     on a shaken slew.
     """
     del stack
-    samples = [
-        slew_sample(k * SAMPLE_MS * NS_PER_MS)
-        for k in range((10 if quick else 60) * 1000 // SAMPLE_MS)
-    ]
-    frames_ns = (
-        np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64) + samples[-2].t_ns
-    ).tolist()
-    frame_ns = NS_PER_S / FRAME_HZ
+    seconds = 10 if quick else 60
+    count = seconds * 1000 // SAMPLE_MS
+    samples = [slew_sample(k * SAMPLE_MS * NS_PER_MS) for k in range(count)]
+    after_ns = np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64)
+    times_ns = (after_ns + samples[-2].t_ns).tolist()
     trials = []
     for predictor in predictors():
-        errors = []
-        for after in range(NEAR, len(samples)):
-            attitude_at = predictor.load(
-                samples[after - NEAR : after + 1 if predictor.waits else after]
-            )
-            first, last = (math.ceil(samples[k].t_ns / frame_ns) for k in (after - 1, after))
-            for t_ns in (round(k * frame_ns) for k in range(first, last)):
-                errors.append(
-                    angle_between_rad(slew_attitude(t_ns), attitude_at(t_ns)) * math.degrees(3600)
-                )
-
-        def work(attitude_at: AttitudeAt) -> None:
-            for t_ns in frames_ns:
-                attitude_at(t_ns)
-
-        timed = partial(
-            work, predictor.load(samples[-1 - NEAR : len(samples) if predictor.waits else -1])
-        )
+        errors = prediction_errors(predictor, samples)
+        end = len(samples) if predictor.waits else -1
+        attitude_at = predictor.load(samples[-1 - NEAR : end])
+        work = partial(attitudes_at, attitude_at, times_ns)
         rms_arcsec = float(np.sqrt(np.mean(np.square(errors))))
-        trials.append(Trial(predictor.name, max(errors), rms_arcsec, timed, predictor.is_default))
+        trials.append(Trial(predictor.name, max(errors), rms_arcsec, work, predictor.is_default))
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
     return Trials(
         "prediction",

@@ -31,20 +31,6 @@ STEPS: tuple[Callable[[ExitStack, bool], Trials], ...] = (
 # Time for the rounds of one step, s: 30 s in all with --quick, five minutes without, set-up and
 # charts included.
 QUICK_BUDGET_S, BUDGET_S = 0.8, 25.0
-COLUMNS = (
-    *(
-        "step",
-        "work",
-        "method",
-        "error",
-        "error_unit",
-        "error_is",
-        "second",
-        "second_unit",
-        "second_is",
-    ),
-    *("time_ms", "quartile_1_ms", "quartile_3_ms", "default", "exact", "front", "beaten_by"),
-)
 # Columns of the step `quantisation` alone: the error by centroiders of every kind.
 MORE_COLUMNS = tuple(f"max_px_{kind}" for kind in FAMILY)
 
@@ -58,35 +44,52 @@ def run(directory: Path, quick: bool = False) -> Judged:
     machine = this_machine()
     budget_s = QUICK_BUDGET_S if quick else BUDGET_S
     steps = []
-    rows = []
+    table = []
     for plan in STEPS:
         with ExitStack() as stack:
             step = measured(plan(stack, quick), budget_s)
         draw_trials(directory / f"tradeoff_{step.name}", step, machine)
         steps.append(step)
-        rows += [_table_row(step, trial) for trial in step.trials]
-    write_csv(directory / "tradeoff.csv", (*COLUMNS, *MORE_COLUMNS), rows)
-    head = (
+        table += [cells_of_trial(step, trial) for trial in step.trials]
+    rows = [list(cells.values()) for cells in table]
+    write_csv(directory / "tradeoff.csv", list(table[0]), rows)
+    lines = [
         f"medians on {machine}; * no method is both as accurate (by the first figure) and as fast;"
         " > hilstar's default"
-    )
-    load = max((step.load for step in steps), key=lambda load: load.cores)
-    return load.judged([head, *(line for step in steps for line in table_lines(step))])
-
-
-def _table_row(step: Trials, trial: Trial) -> list[object]:
-    """A trial's cells, by COLUMNS and MORE_COLUMNS."""
-    on_front = "" if step.load.busy else trial.on_front
-    more = [trial.more.get(name, "") for name in MORE_COLUMNS]
-    return [
-        *(step.name, step.work, trial.method, trial.error, step.error.unit, step.error.name),
-        *(trial.second, step.second.unit, step.second.name, trial.time_ms, *trial.quartiles_ms),
-        *(trial.is_default, trial.is_exact, on_front, trial.beaten),
-        *more,
     ]
+    for step in steps:
+        lines += table_lines(step)
+    load = max((step.load for step in steps), key=lambda load: load.cores)
+    return load.judged(lines)
+
+
+def cells_of_trial(step: Trials, trial: Trial) -> dict[str, object]:
+    """A trial's cells by column; a cell that does not apply is empty."""
+    first_ms, third_ms = trial.quartiles_ms
+    cells: dict[str, object] = {
+        "step": step.name,
+        "work": step.work,
+        "method": trial.method,
+        "error": trial.error,
+        "error_unit": step.error.unit,
+        "error_is": step.error.name,
+        "second": trial.second,
+        "second_unit": step.second.unit,
+        "second_is": step.second.name,
+        "time_ms": trial.time_ms,
+        "quartile_1_ms": first_ms,
+        "quartile_3_ms": third_ms,
+        "default": trial.is_default,
+        "exact": trial.is_exact,
+        "front": "" if step.load.busy else trial.on_front,
+        "beaten_by": trial.beaten,
+    }
+    for name in MORE_COLUMNS:
+        cells[name] = trial.more.get(name, "")
+    return cells
 
 
 def this_machine() -> str:
-    """The machine and GL that the times hold for."""
+    """The renderer and the cores on which the times were taken."""
     with Renderer(Target((8, 8), SPRITE_PSF)) as renderer:
         return f"{renderer.gl_renderer}, {os.cpu_count()} cores"

@@ -58,6 +58,17 @@ MARGIN_NS = NS_PER_MS  # between a state's time and what it was read from
 POLL_S = 0.01
 ALIVE_NS = NS_PER_S  # the run writes its state ten times a second
 MAX_CONTROLLERS, MAX_STRANGERS = 16, 16
+# The commands without parameters; no query of QUERIES has any.
+BARE = {
+    "*CLS",
+    "*RST",
+    "*OPC",
+    "*OPC?",
+    "*WAI",
+    "STATus:PRESet",
+    "SKY:ATTitude?",
+    "SKY:RATE?",
+}
 # Lines, commands and queries of a turn: 0.2 ms of work. A controller that floods then leaves 1 ms
 # to the others.
 UNITS_A_TURN, TURN_S = 8, 0.001
@@ -388,7 +399,7 @@ class Connection:
                 )
             if unit.pattern not in UNLOCKED:
                 self._acts()
-            if unit.pattern in BARE:
+            if unit.pattern in QUERIES or unit.pattern in BARE:
                 scpi.count(unit, 0)
             self.look()
             query = QUERIES.get(unit.pattern)
@@ -600,16 +611,5 @@ COMMANDS: dict[str, Command] = {
     "SKY:RATE?": Connection.attitude,
     "SKY:FAULt": Connection.fault,
     "LEDGer:STATe": Connection.switch,
-}
-BARE = {
-    *QUERIES,
-    "*CLS",
-    "*RST",
-    "*OPC",
-    "*OPC?",
-    "*WAI",
-    "STATus:PRESet",
-    "SKY:ATTitude?",
-    "SKY:RATE?",
 }
 HEADERS = Headers([*QUERIES, *COMMANDS])

@@ -33,7 +33,7 @@ def usual(rng: np.random.Generator, k: int) -> float:
     return MIN_DELAY_MS * 1e6 + rng.exponential(50_000)
 
 
-class Run:
+class ClockRun:
     """A stream of 200 Hz through jump filter and clock, a frame every third packet; errors in ms
     of time shown.
     """
@@ -67,9 +67,9 @@ class Run:
 
 
 @pytest.fixture(scope="module")
-def plain() -> Run:
+def plain() -> ClockRun:
     """A clock that is right but for its offset, on a loopback."""
-    return Run(lambda host, k: host - 5 * 10**11)
+    return ClockRun(lambda host, k: host - 5 * 10**11)
 
 
 def test_a_one_way_stream_is_shown_late_by_its_minimum_delay_and_no_more(plain):
@@ -82,7 +82,7 @@ def test_a_drift_is_followed_and_stated(ppm):
     """Within 5 us of the minimum delay for 100 ppm, which is 0.02 arcsec at 1 deg/s; and the
     drift to 1 ppm.
     """
-    run = Run(lambda host, k: host + (host - HOST0_NS) * ppm // 1_000_000)
+    run = ClockRun(lambda host, k: host + (host - HOST0_NS) * ppm // 1_000_000)
     late_us = 1000 * np.abs(run.error_ms[600:] + MIN_DELAY_MS).max()
     holds("clock-drift", 100 * late_us / abs(ppm))
     assert run.clock.summary().drift_ppm == pytest.approx(ppm, abs=1.0)
@@ -92,7 +92,7 @@ def test_a_drift_is_followed_and_stated(ppm):
 @pytest.mark.parametrize("jump_ms", [20, -20, 300, -300, 3000, -3000, 10**9, -(10**9)])
 def test_a_clock_that_jumps_is_carried_on_without_a_step(jump_ms):
     """0.01 ms is 0.04 arcsec at 1 deg/s. No sample is lost."""
-    run = Run(lambda host, k: host + (jump_ms * NS_PER_MS if k > 3000 else 0))
+    run = ClockRun(lambda host, k: host + (jump_ms * NS_PER_MS if k > 3000 else 0))
     assert run.jumps.jumps == 1
     assert (run.accepted, run.refused) == (6000, 0)
     assert run.step_ms < 0.01
@@ -101,7 +101,7 @@ def test_a_clock_that_jumps_is_carried_on_without_a_step(jump_ms):
 
 @pytest.mark.parametrize("ahead_s", [1, 3600, 10**9])
 def test_one_packet_far_ahead_is_refused_and_changes_nothing(ahead_s):
-    run = Run(lambda host, k: host + (ahead_s * NS_PER_S if k == 3000 else 0))
+    run = ClockRun(lambda host, k: host + (ahead_s * NS_PER_S if k == 3000 else 0))
     assert (run.accepted, run.refused, run.jumps.jumps) == (5999, 1, 0)
     assert np.abs(run.error_ms[200:] + MIN_DELAY_MS).max() < 0.005
 
@@ -112,7 +112,7 @@ def test_a_queue_that_drains_is_no_jump():
     def held(rng: np.random.Generator, k: int) -> float:
         return usual(rng, k) + (3060 - k) * PERIOD_NS * (3000 <= k < 3060)
 
-    run = Run(lambda host, k: host, held)
+    run = ClockRun(lambda host, k: host, held)
     assert (run.accepted, run.jumps.jumps) == (6000, 0)
     assert np.abs(run.error_ms[200:] + MIN_DELAY_MS).max() < 0.005
 
@@ -121,13 +121,13 @@ def test_a_usb_adapter_that_gathers_for_16_ms_is_no_jump():
     def gathered(rng: np.random.Generator, k: int) -> float:
         return usual(rng, k) + -(k * PERIOD_NS) % 16_000_000
 
-    run = Run(lambda host, k: host, gathered)
+    run = ClockRun(lambda host, k: host, gathered)
     assert (run.accepted, run.jumps.jumps) == (6000, 0)
     assert np.abs(run.error_ms[300:] + MIN_DELAY_MS).max() < 0.03
 
 
 def test_jitter_of_5_ms_costs_a_tenth_of_a_millisecond():
-    run = Run(lambda host, k: host, lambda rng, k: MIN_DELAY_MS * 1e6 + rng.exponential(5e6))
+    run = ClockRun(lambda host, k: host, lambda rng, k: MIN_DELAY_MS * 1e6 + rng.exponential(5e6))
     assert np.abs(run.error_ms[300:] + MIN_DELAY_MS).max() < 0.1
 
 
@@ -135,7 +135,7 @@ def test_where_it_fails_a_jump_smaller_than_the_limit_is_a_step_until_the_line_f
     """2 ms are under what a queue may do: the time shown is off by up to that, 7 arcsec at 1
     deg/s.
     """
-    run = Run(lambda host, k: host - (2 * NS_PER_MS if k > 3000 else 0))
+    run = ClockRun(lambda host, k: host - (2 * NS_PER_MS if k > 3000 else 0))
     assert run.jumps.jumps == 0
     assert 1.5 < np.abs(run.error_ms[1100:1200]).max() < 2.1
 
@@ -145,7 +145,7 @@ def test_a_slow_clock_is_followed_in_small_steps_and_is_no_row_of_jumps(speed, p
     """A step of 5 ms, and what a packet's period adds. Known after three seconds; before, it is
     behind by what it is slow.
     """
-    run = Run(lambda host, k: round((host - HOST0_NS) * speed))
+    run = ClockRun(lambda host, k: round((host - HOST0_NS) * speed))
     assert run.accepted == 6000
     assert run.jumps.jumps == 0
     assert run.jumps.slowness == pytest.approx(1 - speed, rel=0.1)
@@ -154,7 +154,7 @@ def test_a_slow_clock_is_followed_in_small_steps_and_is_no_row_of_jumps(speed, p
 
 
 def test_a_fast_clock_is_known_to_be_one():
-    run = Run(lambda host, k: host * 3 // 2)
+    run = ClockRun(lambda host, k: host * 3 // 2)
     assert (run.accepted, run.jumps.jumps) == (6000, 0)
     assert run.jumps.slowness == pytest.approx(-0.5, rel=0.05)
 

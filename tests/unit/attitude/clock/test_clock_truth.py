@@ -36,7 +36,7 @@ Reading = Callable[[int], tuple[int, int]]
 
 
 @dataclass
-class Truth:
+class ClockTruth:
     """One run through filter and clock as the receiver does it; at every second packet, error
     and uncertainty, ms.
     """
@@ -115,7 +115,7 @@ def test_after_a_jump_of_2_ms_to_10_years_the_truth_is_within_the_stated_uncerta
     jump_ms, exchanges
 ):
     jump_ns = round(jump_ms * NS_PER_MS)
-    run = Truth(
+    run = ClockTruth(
         lambda host: host + (jump_ns if host > HOST0_NS + 10 * NS_PER_S else 0),
         count=3200,
         exchanges=exchanges,
@@ -131,7 +131,7 @@ def test_after_a_jump_of_2_ms_to_10_years_the_truth_is_within_the_stated_uncerta
 @pytest.mark.parametrize("ppm", [0, 20, -20, 100, -100, 1000, -1000])
 @pytest.mark.parametrize("exchanges", [False, True])
 def test_under_a_drift_the_truth_is_within_the_stated_uncertainty(ppm, exchanges):
-    run = Truth(lambda host: host + (host - HOST0_NS) * ppm // 1_000_000, exchanges=exchanges)
+    run = ClockTruth(lambda host: host + (host - HOST0_NS) * ppm // 1_000_000, exchanges=exchanges)
     assert run.beyond_ms() < ALLOWED_MS
     assert run.known_ms[-1] < (0.3 if exchanges else 0.15)  # LOCAL_DELAY_NS is part of the latter
 
@@ -151,7 +151,7 @@ def test_under_load_the_truth_is_within_the_stated_uncertainty(seed):
         newest = arrival_ns + PERIOD_NS >= end_ns
         return end_ns, 0 if newest else end_ns - arrival_ns
 
-    run = Truth(lambda host: host - 7 * NS_PER_S, read, seed=seed)
+    run = ClockTruth(lambda host: host - 7 * NS_PER_S, read, seed=seed)
     assert run.beyond_ms() < ALLOWED_MS
     assert (run.refused, run.jumps.jumps) == (0, 0)
     assert run.known_ms[-1] < 1.0
@@ -166,7 +166,7 @@ def test_a_wrong_first_guess_heals_within_two_seconds(late_ms, seed):
         late = arrival_ns < HOST0_NS + NS_PER_S
         return arrival_ns + round(late_ms * NS_PER_MS) * late, 0
 
-    run = Truth(lambda host: host, read, seed=seed)
+    run = ClockTruth(lambda host: host, read, seed=seed)
     healed = np.searchsorted(run.host_ns, HOST0_NS + 2 * NS_PER_S)
     assert np.abs(run.error_ms[healed:]).max() < 0.1
     assert (run.refused, run.jumps.jumps) == (0, 0)
@@ -178,7 +178,7 @@ def test_messages_that_waited_before_the_start_do_not_mislead_the_clock(seed):
         begin_ns = HOST0_NS + 2 * NS_PER_S
         return (begin_ns, WAITED_UNKNOWN_NS) if arrival_ns < begin_ns else (arrival_ns, 0)
 
-    run = Truth(lambda host: host + 10**15, read, seed=seed)
+    run = ClockTruth(lambda host: host + 10**15, read, seed=seed)
     assert run.beyond_ms() < ALLOWED_MS
     assert np.abs(run.error_ms[201:]).max() < 0.5
     assert (run.refused, run.jumps.jumps) == (0, 0)
@@ -200,7 +200,7 @@ def test_a_sender_that_restarts_is_followed_on_a_loaded_machine(timely, seed):
         late_ns += round(rng.exponential(2 * NS_PER_MS))
         return arrival_ns + late_ns, 0
 
-    run = Truth(
+    run = ClockTruth(
         lambda host: host + 10**15 if host < restart_ns else host - restart_ns, read, count=150
     )
     assert (run.refused, run.jumps.jumps) == (0, 1)
@@ -211,7 +211,7 @@ def test_a_link_20_ms_slower_for_a_while_is_not_a_jump_and_costs_no_packet():
         slow = 5 * NS_PER_S < arrival_ns - HOST0_NS < 8 * NS_PER_S
         return arrival_ns + 20 * NS_PER_MS * slow, 0
 
-    run = Truth(lambda host: host, read)
+    run = ClockTruth(lambda host: host, read)
     assert run.beyond_ms() < ALLOWED_MS
     assert (run.refused, run.jumps.jumps) == (0, 0)
     assert np.abs(run.error_ms[200:]).max() < MIN_DELAY_NS / NS_PER_MS + ALLOWED_MS
@@ -234,7 +234,7 @@ def test_clocks_that_parted_in_a_long_silence_are_no_jump(ppm, silent_s):
         host_ns += pause_ns * paused
         return host_ns + (host_ns - HOST0_NS) * ppm // 1_000_000
 
-    run = Truth(times, read)
+    run = ClockTruth(times, read)
     assert (run.refused, run.jumps.jumps) == (0, 0)
     assert run.beyond_ms(*(silent_s + 2.2 + 0.1 * k for k in range(5))) < ALLOWED_MS
 
@@ -248,11 +248,11 @@ def test_packets_queueing_on_a_slow_link_are_not_a_slow_clock_where_exchanges_sh
         behind_ns = min(max(arrival_ns - HOST0_NS - 4 * NS_PER_S, 0) // 10, 350 * NS_PER_MS)
         return arrival_ns + behind_ns, 0
 
-    run = Truth(lambda host: host, read, exchanges=True)
+    run = ClockTruth(lambda host: host, read, exchanges=True)
     assert run.clock.synchronised
     assert (run.refused, run.jumps.jumps, run.jumps.correction_ns) == (0, 0, 0)
     assert run.beyond_ms() < ALLOWED_MS
 
 
 def test_a_short_run_does_not_say_how_well_it_knows():
-    assert Truth(lambda host: host, count=100).clock.summary().uncertainty_ms is None
+    assert ClockTruth(lambda host: host, count=100).clock.summary().uncertainty_ms is None

@@ -80,6 +80,15 @@ def test_a_clock_of_another_pace_is_of_no_unit(pace):
     assert not unit.named and UNIT not in notices.counts()
 
 
+def test_one_tick_in_seconds_tells_no_unit():
+    """A clock that nearly stands is of no unit: one tick may be the end of any."""
+    notices = Notices()
+    unit = TimeUnit(notices)
+    for k in range(700):
+        unit.see(k // 310, k * NS_PER_S // 100)
+    assert not unit.named and UNIT not in notices.counts()
+
+
 def test_a_unit_that_was_named_stands_while_arrivals_are_uneven_and_goes_with_the_fault():
     """Of a busy machine: in windows of 0.5 s some ends are 60 ms late, so paces are 12 % off."""
     notices = Notices()

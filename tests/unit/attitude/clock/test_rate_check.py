@@ -36,7 +36,7 @@ TURN = np.radians([0.2, -0.35, 0.5])
 OTHER_FRAME = np.array([[0.6, 0.0, -0.8], [0.0, 1.0, 0.0], [0.8, 0.0, 0.6]])
 
 
-def moved(rates: FloatArray, step_s: float) -> FloatArray:
+def moved_attitudes(rates: FloatArray, step_s: float) -> FloatArray:
     """The attitudes (n, 4) from START at rates (n, 3), cam, that change linearly from one to the
     next.
     """
@@ -61,7 +61,7 @@ def steady(
     """Times, attitudes and true rates of a constant turn, noisy where a generator is given."""
     count = round(seconds * hz)
     rates = np.tile(turn, (count, 1))
-    q = moved(rates, 1 / hz)
+    q = moved_attitudes(rates, 1 / hz)
     if rng is not None:
         q = multiply(from_rotation_vectors(rng.normal(0, Q_NOISE_RAD, (count, 3))), q)
         rates = rates + rng.normal(0, RATE_NOISE_RAD_S, (count, 3))
@@ -207,7 +207,7 @@ def honest(rng: np.random.Generator) -> list[AttitudeSample]:
             * np.cos(2 * np.pi * hz_shaken * fine_s)[:, None]
         )
     at = np.round(t_s / FINE_S).astype(int)
-    q, rates, t_ns = moved(rates, FINE_S)[at], rates[at], at * round(FINE_S * NS_PER_S)
+    q, rates, t_ns = moved_attitudes(rates, FINE_S)[at], rates[at], at * round(FINE_S * NS_PER_S)
     q = multiply(
         from_rotation_vectors(rng.normal(0, rng.choice([0, Q_NOISE_RAD]), (len(at), 3))), q
     )
@@ -295,7 +295,7 @@ def swing(
     )
     t_s = np.arange(0, seconds, 1 / hz)
     now, then = (np.round((t_s + 1 - by_s) / FINE_S).astype(int) for by_s in (0.0, late_s))
-    q, sent = moved(rates, FINE_S)[now], rates[then]
+    q, sent = moved_attitudes(rates, FINE_S)[now], rates[then]
     if rng is not None:
         q = multiply(from_rotation_vectors(rng.normal(0, Q_NOISE_RAD, (len(q), 3))), q)
         sent = sent + rng.normal(0, RATE_NOISE_RAD_S, sent.shape)
@@ -331,7 +331,9 @@ def tumbling(late_s: Callable[[FloatArray], FloatArray], seconds: float = 12.0, 
     now, then = (
         np.round((at_s + before_s) / FINE_S).astype(int) for at_s in (t_s, t_s - late_s(t_s))
     )
-    return samples(np.round(t_s * NS_PER_S).astype(int), moved(rates, FINE_S)[now], rates[then])
+    return samples(
+        np.round(t_s * NS_PER_S).astype(int), moved_attitudes(rates, FINE_S)[now], rates[then]
+    )
 
 
 def test_a_lag_beyond_those_that_are_tried_is_told_as_at_least_that():

@@ -14,7 +14,7 @@ TURN_RAD_S = np.radians([0.1, -0.2, 0.5])
 START = from_radec_roll_deg(84.057, -1.2, 10.0)
 
 
-def turning(rounded, count: int = 100) -> list[AttitudeSample]:
+def rounded_turn(rounded, count: int = 100) -> list[AttitudeSample]:
     made = []
     for k in range(count):
         q = rounded(propagate(START, TURN_RAD_S, k / 50))
@@ -25,7 +25,7 @@ def turning(rounded, count: int = 100) -> list[AttitudeSample]:
 
 @pytest.mark.parametrize("decimals", [3, 4, 5])
 def test_decimals_are_told_in_arcsec_as_they_are_off(decimals):
-    stream = turning(lambda q: np.round(q, decimals))
+    stream = rounded_turn(lambda q: np.round(q, decimals))
     ((kind, line),) = coarse_lines(stream)
     assert kind == COARSE and f"steps of {10.0**-decimals:.3g}:" in line
     truth = [propagate(START, TURN_RAD_S, k / 50) for k in range(len(stream))]
@@ -39,14 +39,15 @@ def test_decimals_are_told_in_arcsec_as_they_are_off(decimals):
 @pytest.mark.parametrize("step", [2.0**-15, 1 / 32767])
 def test_fixed_point_numbers_are_told(step):
     assert (
-        f"steps of {step:.3g}:" in coarse_lines(turning(lambda q: np.round(q / step) * step))[0][1]
+        f"steps of {step:.3g}:"
+        in coarse_lines(rounded_turn(lambda q: np.round(q / step) * step))[0][1]
     )
 
 
 def test_a_rounded_attitude_at_rest_is_told_and_a_sender_is_told_of_once():
     told: list[str] = []
     resolution = Resolution(lambda kind, line: told.append(kind))
-    for sample in [turning(lambda q: np.round(q, 3), 1)[0]] * 500:
+    for sample in [rounded_turn(lambda q: np.round(q, 3), 1)[0]] * 500:
         resolution.see(sample)
     assert told == [COARSE]
 
@@ -55,7 +56,7 @@ def test_a_rounded_attitude_at_rest_is_told_and_a_sender_is_told_of_once():
     "rounded", [lambda q: q, lambda q: q.astype(np.float32).astype(float), lambda q: np.round(q, 7)]
 )
 def test_fine_quaternions_are_not_told(rounded):
-    assert coarse_lines(turning(rounded)) == []
+    assert coarse_lines(rounded_turn(rounded)) == []
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ HOST0_NS = 10**15
 HOSTILE = 3000  # of each kind
 
 
-def message(
+def sample_message(
     sequence: int, t_ns: int, host_ns: int | None = None, q: np.ndarray = ORION
 ) -> SampleArrival:
     """A message of its time, which arrives at once where nothing else is said."""
@@ -59,7 +59,7 @@ class Shown:
     def run(self, count: int, first: int = 0) -> Shown:
         """So many messages of one sender, one each PERIOD_NS."""
         for k in range(first, first + count):
-            self.take(message(k, HOST0_NS + k * PERIOD_NS))
+            self.take(sample_message(k, HOST0_NS + k * PERIOD_NS))
         return self
 
     @property
@@ -96,11 +96,11 @@ def test_hostile_messages_beside_a_sender_are_never_shown_and_cost_it_none(kind,
     for k in range(good):
         pause_ms = int(rng.integers(150)) if rng.random() < 0.02 else 0
         host_ns += PERIOD_NS + pause_ms * NS_PER_MS
-        shown.take(message(k, host_ns))
+        shown.take(sample_message(k, host_ns))
         for j in range(at_once if k > ESTABLISHED_AFTER else 0):
             now_ns = host_ns + (j + 1) * PERIOD_NS // (at_once + 1)
             sequence, t_ns = KINDS[kind](rng, k + 1, now_ns)
-            shown.take(message(sequence, t_ns, now_ns, LYRA))
+            shown.take(sample_message(sequence, t_ns, now_ns, LYRA))
             shown.expire(now_ns)
     assert [arrival.event.q_icrs_to_cam is ORION for arrival in shown.arrivals] == [True] * good
     assert len(shown.refused) >= (good - ESTABLISHED_AFTER - 2) * at_once
@@ -109,7 +109,7 @@ def test_hostile_messages_beside_a_sender_are_never_shown_and_cost_it_none(kind,
 def test_a_stray_message_is_refused_when_the_sender_goes_on_and_is_no_second_sender():
     shown = Shown().run(300)
     stray_ns = HOST0_NS + 300 * PERIOD_NS - PERIOD_NS // 2
-    shown.take(message(90_000, stray_ns, q=LYRA))
+    shown.take(sample_message(90_000, stray_ns, q=LYRA))
     assert shown.sequences == list(range(300))
     shown.run(10, first=300)
     assert shown.sequences == list(range(310))
@@ -117,14 +117,14 @@ def test_a_stray_message_is_refused_when_the_sender_goes_on_and_is_no_second_sen
 
 
 def test_a_time_off_the_others_is_left_to_the_clock_and_is_no_second_sender_s():
-    off = message(300, HOST0_NS + 3600 * NS_PER_S, HOST0_NS + 300 * PERIOD_NS)
+    off = sample_message(300, HOST0_NS + 3600 * NS_PER_S, HOST0_NS + 300 * PERIOD_NS)
     shown = Shown().run(300).take(off).run(10, first=301)
     assert shown.sequences == list(range(311))
     assert (shown.refused, shown.notices.counts()) == ([], {})
 
 
 def test_a_count_that_comes_with_two_times_is_shown_with_the_one_that_goes_on():
-    off = message(300, HOST0_NS + 3600 * NS_PER_S, HOST0_NS + 300 * PERIOD_NS - 1)
+    off = sample_message(300, HOST0_NS + 3600 * NS_PER_S, HOST0_NS + 300 * PERIOD_NS - 1)
     shown = Shown().run(300).take(off).run(10, first=300)
     assert shown.sequences == list(range(310))
     assert (shown.refused, shown.notices.counts()) == ([(300, "time")], {})
@@ -134,7 +134,9 @@ def test_a_second_counter_is_told_after_a_run_and_once_the_first_has_gone_on():
     shown = Shown().run(300)
     for k in range(MIN_RUN):
         assert shown.notices.counts() == {}
-        shown.take(message(7000 + k, HOST0_NS + (300 + k) * PERIOD_NS - PERIOD_NS // 2, q=LYRA))
+        shown.take(
+            sample_message(7000 + k, HOST0_NS + (300 + k) * PERIOD_NS - PERIOD_NS // 2, q=LYRA)
+        )
         shown.run(1, first=300 + k)
     assert shown.notices.counts() == {"second-sender": 1}
     assert shown.sequences == list(range(300 + MIN_RUN))
@@ -144,9 +146,9 @@ def test_a_restart_is_held_for_three_usual_silences_and_20_ms_and_released_in_or
     shown = Shown().run(300)
     restarted_ns = HOST0_NS + 300 * PERIOD_NS
     for k in range(6):
-        shown.take(message(k, restarted_ns + k * PERIOD_NS))
+        shown.take(sample_message(k, restarted_ns + k * PERIOD_NS))
     assert shown.sequences == list(range(300))
-    shown.take(message(6, restarted_ns + 6 * PERIOD_NS + 1))
+    shown.take(sample_message(6, restarted_ns + 6 * PERIOD_NS + 1))
     assert shown.sequences == [*range(300), *range(7)]
     assert shown.refused == []
 
@@ -155,7 +157,7 @@ def test_two_messages_that_nothing_follows_are_shown_when_the_first_sender_is_st
     shown = Shown().run(300)
     last_ns = HOST0_NS + 299 * PERIOD_NS
     for k in range(2):
-        shown.take(message(k, last_ns + (k + 1) * PERIOD_NS))
+        shown.take(sample_message(k, last_ns + (k + 1) * PERIOD_NS))
     assert shown.expire(last_ns + STALE_AFTER_NS).sequences == list(range(300))
     assert shown.expire(last_ns + STALE_AFTER_NS + 1).sequences == [*range(300), 0, 1]
 
@@ -164,7 +166,7 @@ def test_two_messages_that_nothing_follows_are_shown_when_the_first_sender_is_st
 def test_a_counter_that_wraps_is_held_once_and_known_from_then_on(size):
     shown, waits = Shown(), []
     for k in range(4 * size):
-        shown.take(message(k % size, HOST0_NS + k * PERIOD_NS))
+        shown.take(sample_message(k % size, HOST0_NS + k * PERIOD_NS))
         waits.append(k + 1 - len(shown.arrivals))
     assert shown.sequences == [k % size for k in range(4 * size)]
     assert shown.refused == []
@@ -176,7 +178,7 @@ def test_a_counter_that_wraps_is_held_once_and_known_from_then_on(size):
 def test_a_count_that_several_messages_have_is_one_sender_s(times):
     shown = Shown()
     for k in range(40 * times):
-        shown.take(message(k // times, HOST0_NS + k * PERIOD_NS))
+        shown.take(sample_message(k // times, HOST0_NS + k * PERIOD_NS))
     assert len(shown.arrivals) == 40 * times
 
 
@@ -185,14 +187,14 @@ def test_uneven_times_are_one_sender_s_as_its_count_goes_on():
     shown, t_ns = Shown(), HOST0_NS
     for k in range(400):
         t_ns += 80 * NS_PER_MS if k % 17 == 0 else NS_PER_MS // 2
-        shown.take(message(k, t_ns))
+        shown.take(sample_message(k, t_ns))
     assert shown.sequences == list(range(400))
 
 
 def test_times_of_a_simulation_a_hundred_times_as_fast_are_one_sender_s():
     shown = Shown()
     for k in range(400):
-        shown.take(message(k, HOST0_NS + 100 * k * PERIOD_NS, HOST0_NS + k * PERIOD_NS))
+        shown.take(sample_message(k, HOST0_NS + 100 * k * PERIOD_NS, HOST0_NS + k * PERIOD_NS))
     assert shown.sequences == list(range(400))
 
 
@@ -207,10 +209,10 @@ def test_packets_lost_late_doubled_and_off_in_time_are_one_sender_s():
         off_ns = near(rng, 5 * NS_PER_S) if rng.random() < 0.05 else 0
         late_ns = 8 * NS_PER_MS if rng.random() < 0.05 else 0
         host_ns = t_ns + late_ns + int(rng.exponential(4 * NS_PER_MS))
-        arrivals.append(message(k, t_ns + off_ns, host_ns))
+        arrivals.append(sample_message(k, t_ns + off_ns, host_ns))
         if rng.random() < 0.05:
             again_ns = host_ns + int(rng.integers(20 * NS_PER_MS))
-            arrivals.append(message(k, t_ns + off_ns, again_ns))
+            arrivals.append(sample_message(k, t_ns + off_ns, again_ns))
     shown = Shown()
     for arrival in sorted(arrivals, key=lambda arrival: arrival.host_ns):
         shown.take(arrival)

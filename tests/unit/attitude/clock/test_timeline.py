@@ -25,7 +25,7 @@ START = from_radec_roll_deg(10.0, 20.0, 30.0)
 EXACT_RAD = 1e-12
 
 
-def sample(
+def timeline_sample(
     t_ms: float, *, rate: bool = False, discontinuity: bool = False, sign: int = 1
 ) -> AttitudeSample:
     q = sign * propagate(START, RATE, t_ms / 1000)
@@ -52,42 +52,42 @@ def test_an_empty_timeline_has_no_attitude():
 
 
 def test_constant_rate_motion_is_reproduced_between_samples():
-    timeline = filled(*(sample(t) for t in (0, 10, 37, 100)))
+    timeline = filled(*(timeline_sample(t) for t in (0, 10, 37, 100)))
     for t in (0, 1, 10, 20, 36.9, 64.2, 100):
         assert error_rad(timeline, t, t) < EXACT_RAD
 
 
 def test_a_sign_flip_between_samples_changes_nothing():
-    timeline = filled(sample(0), sample(10, sign=-1), sample(20))
+    timeline = filled(timeline_sample(0), timeline_sample(10, sign=-1), timeline_sample(20))
     for t in (3, 10, 17):
         assert error_rad(timeline, t, t) < EXACT_RAD
 
 
 def test_prediction_uses_the_packet_s_rate_and_then_stops():
-    timeline = filled(sample(0, rate=True))
+    timeline = filled(timeline_sample(0, rate=True))
     assert error_rad(timeline, 60, 60) < EXACT_RAD
     assert error_rad(timeline, 100, 100) < EXACT_RAD
     assert error_rad(timeline, 200, 100) < EXACT_RAD
 
 
 def test_prediction_without_a_rate_uses_the_last_two_samples():
-    timeline = filled(sample(0), sample(10))
+    timeline = filled(timeline_sample(0), timeline_sample(10))
     assert error_rad(timeline, 60, 60) < EXACT_RAD
 
 
 def test_two_samples_around_a_silence_do_not_tell_a_rate_to_predict_with():
     """Over more than stale_after_ms the camera may have turned any way."""
-    assert error_rad(filled(sample(0), sample(250)), 300, 300) < EXACT_RAD
-    assert error_rad(filled(sample(0), sample(251)), 300, 251) < EXACT_RAD
+    assert error_rad(filled(timeline_sample(0), timeline_sample(250)), 300, 300) < EXACT_RAD
+    assert error_rad(filled(timeline_sample(0), timeline_sample(251)), 300, 251) < EXACT_RAD
 
 
 def test_a_lone_sample_without_a_rate_is_held():
-    assert error_rad(filled(sample(0)), 60, 0) < EXACT_RAD
+    assert error_rad(filled(timeline_sample(0)), 60, 0) < EXACT_RAD
 
 
 def test_nothing_is_interpolated_or_estimated_across_a_discontinuity():
     jump = AttitudeSample(10 * MS, from_radec_roll_deg(200.0, -50.0, 0.0), None, 0, True)
-    timeline = filled(sample(0), jump)
+    timeline = filled(timeline_sample(0), jump)
     assert error_rad(timeline, 9.9, 0) < EXACT_RAD
     after = timeline.at(30 * MS)
     assert after is not None
@@ -95,7 +95,7 @@ def test_nothing_is_interpolated_or_estimated_across_a_discontinuity():
 
 
 def test_an_old_sample_is_stale():
-    timeline = filled(sample(0), sample(10))
+    timeline = filled(timeline_sample(0), timeline_sample(10))
     for t_ms, stale in ((10, False), (259, False), (261, True), (5000, True)):
         attitude = timeline.at(t_ms * MS)
         assert attitude is not None
@@ -104,9 +104,9 @@ def test_an_old_sample_is_stale():
 
 
 def test_time_that_does_not_rise_is_refused_and_changes_nothing():
-    timeline = filled(sample(0), sample(10))
+    timeline = filled(timeline_sample(0), timeline_sample(10))
     for t in (10, 9, -5):
-        refusal = timeline.add(sample(t))
+        refusal = timeline.add(timeline_sample(t))
         assert refusal is not None
         assert refusal.reason == "time"
     assert len(timeline) == 2
@@ -115,7 +115,7 @@ def test_time_that_does_not_rise_is_refused_and_changes_nothing():
 def test_a_long_stream_keeps_its_newest_samples_and_bounded_memory():
     timeline = Timeline(Policy(0, S), capacity=100)
     for k in range(1000):
-        assert timeline.add(sample(10 * k)) is None
+        assert timeline.add(timeline_sample(10 * k)) is None
     assert 100 <= len(timeline) <= 200
     assert error_rad(timeline, 9985, 9985) < EXACT_RAD
 
@@ -224,7 +224,10 @@ def test_the_attitude_is_unit_everywhere():
 
 def test_constant_rate_motion_with_rates_is_reproduced():
     timeline = filled(
-        *(sample(t, rate=True, sign=(-1) ** k) for k, t in enumerate((0, 10, 37, 100, 180)))
+        *(
+            timeline_sample(t, rate=True, sign=(-1) ** k)
+            for k, t in enumerate((0, 10, 37, 100, 180))
+        )
     )
     for t in (0, 1, 10, 20, 36.9, 64.2, 100, 179):
         assert error_rad(timeline, t, t) < EXACT_RAD
@@ -328,7 +331,7 @@ def orbiting(t_ms: float, **more) -> AttitudeSample:
         7000 * np.array([np.cos(angle), np.sin(angle), 0]),
         7.5 * np.array([-np.sin(angle), np.cos(angle), 0]),
     )
-    return replace(sample(t_ms, **more), place_km=place, velocity_km_s=ahead)
+    return replace(timeline_sample(t_ms, **more), place_km=place, velocity_km_s=ahead)
 
 
 @pytest.mark.parametrize(

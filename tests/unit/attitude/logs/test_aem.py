@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.attitude.logs.log_file import open_log, read_log, write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
-from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
+from tests.support.sources.aem_messages import EPOCHS, aem_refusal, kvn, read, rows_of
 
 # Quaternions are written with 17 digits here; a matrix from one is a sum of four products, a few
 # roundings of 1.
@@ -91,7 +91,7 @@ def ccsds_quaternion(second_from_first):
     return Rotation.from_matrix(second_from_first.as_matrix().T).as_quat()
 
 
-def camera(seconds=0.0):
+def camera_turn(seconds=0.0):
     """The rotation of cam's components into ICRS components, turning at RATE_CAM_RAD_S."""
     return Rotation.from_quat([0.1, -0.5, 0.7, 0.3]) * Rotation.from_rotvec(
         RATE_CAM_RAD_S * seconds
@@ -103,10 +103,10 @@ def second_from_first(frame_a, direction, seconds=0.0):
     camera.
     """
     to_cam = (frame_a == "ICRF") == (direction == "A2B")
-    return (camera(seconds).inv() if to_cam else camera(seconds)), to_cam
+    return (camera_turn(seconds).inv() if to_cam else camera_turn(seconds)), to_cam
 
 
-def frames(frame_a):
+def frame_keywords(frame_a):
     return {"REF_FRAME_A": frame_a, "REF_FRAME_B": "SC_BODY_1" if frame_a == "ICRF" else "ICRF"}
 
 
@@ -121,10 +121,12 @@ def test_each_order_direction_and_frame_of_version_1_gives_the_same_attitude(
 ):
     q = ccsds_quaternion(second_from_first(frame_a, direction)[0])
     row = np.roll(q, 1) if order == "FIRST" else q
-    text = kvn(rows_of(row), ATTITUDE_DIR=direction, QUATERNION_TYPE=order, **frames(frame_a))
+    text = kvn(
+        rows_of(row), ATTITUDE_DIR=direction, QUATERNION_TYPE=order, **frame_keywords(frame_a)
+    )
     (sample,) = read(tmp_path, text)
     assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(
-        camera().inv().as_matrix(), abs=MATRIX_TOLERANCE
+        camera_turn().inv().as_matrix(), abs=MATRIX_TOLERANCE
     )
     assert sample.rate_cam_rad_s is None
 
@@ -132,9 +134,9 @@ def test_each_order_direction_and_frame_of_version_1_gives_the_same_attitude(
 @pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
 def test_version_2_is_scalar_last_and_from_a_to_b(tmp_path, frame_a):
     q = ccsds_quaternion(second_from_first(frame_a, "A2B")[0])
-    (sample,) = read(tmp_path, kvn(rows_of(q), "2.0", **frames(frame_a)))
+    (sample,) = read(tmp_path, kvn(rows_of(q), "2.0", **frame_keywords(frame_a)))
     assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(
-        camera().inv().as_matrix(), abs=MATRIX_TOLERANCE
+        camera_turn().inv().as_matrix(), abs=MATRIX_TOLERANCE
     )
 
 
@@ -154,7 +156,7 @@ def test_a_quaternions_derivative_gives_the_rate_of_the_camera(tmp_path, frame_a
         "ATTITUDE_DIR": direction,
         "QUATERNION_TYPE": order,
     }
-    (sample,) = read(tmp_path, kvn(rows_of(row), **keywords, **frames(frame_a)))
+    (sample,) = read(tmp_path, kvn(rows_of(row), **keywords, **frame_keywords(frame_a)))
     assert sample.rate_cam_rad_s == pytest.approx(RATE_CAM_RAD_S, abs=DERIVATIVE_TOLERANCE_RAD_S)
 
 
@@ -168,7 +170,7 @@ def test_an_angular_velocity_gives_the_rate_of_the_camera(
     rotation, to_cam = second_from_first(frame_a, direction)
     rate = RATE_CAM_RAD_S if to_cam else -RATE_CAM_RAD_S
     if resolved_in == "ICRF":
-        rate = camera().apply(rate)
+        rate = camera_turn().apply(rate)
     row = np.concatenate([ccsds_quaternion(rotation), np.degrees(rate)])
     frame = (
         resolved_in
@@ -178,7 +180,7 @@ def test_an_angular_velocity_gives_the_rate_of_the_camera(
     keywords = {"ATTITUDE_TYPE": "QUATERNION/RATE", "RATE_FRAME": frame, "ATTITUDE_DIR": direction}
     if version == "2.0":
         keywords = {"ATTITUDE_TYPE": "QUATERNION/ANGVEL", "ANGVEL_FRAME": frame}
-    (sample,) = read(tmp_path, kvn(rows_of(row), version, **keywords, **frames(frame_a)))
+    (sample,) = read(tmp_path, kvn(rows_of(row), version, **keywords, **frame_keywords(frame_a)))
     assert sample.rate_cam_rad_s == pytest.approx(RATE_CAM_RAD_S, abs=MATRIX_TOLERANCE)
 
 
@@ -310,7 +312,7 @@ REFUSED_BODY = [
 )
 def test_other_frames_are_refused_with_both_names(tmp_path, a, b):
     for frame_a, frame_b in ((a, b), (b, a)):
-        message = refusal(
+        message = aem_refusal(
             tmp_path, kvn(rows_of([0, 0, 0, 1]), REF_FRAME_A=frame_a, REF_FRAME_B=frame_b)
         )
         assert (

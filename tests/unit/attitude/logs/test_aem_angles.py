@@ -14,7 +14,7 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log, write_log
 from hilstar.attitude.wire.source import Mounting
 from hilstar.basics.rotation import to_matrix
-from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
+from tests.support.sources.aem_messages import EPOCHS, aem_refusal, kvn, read, rows_of
 
 # Angles are written with 17 digits; three turns of them are a few roundings of 1 rad.
 MATRIX_TOLERANCE = 2e-14
@@ -27,7 +27,7 @@ AXES = {"X": "1", "Y": "2", "Z": "3"}
 SEQUENCES = [a + b + c for a in AXES for b in AXES for c in AXES if a != b != c]
 
 
-def camera(seconds=0.0, first=None):
+def camera_turn_from(seconds=0.0, first=None):
     """Of cam's components into ICRS components."""
     return (first or Rotation.from_quat([0.1, -0.5, 0.7, 0.3])) * Rotation.from_rotvec(
         RATE_CAM_RAD_S * seconds
@@ -69,7 +69,7 @@ CASES = [("1.0", "A2B"), ("1.0", "B2A"), ("2.0", "A2B")]
 def test_each_sequence_of_euler_angles_is_scipys(tmp_path, frame_a, version, direction, names):
     rng = np.random.default_rng(SEQUENCES.index(names))
     for first in Rotation.random(4, random_state=rng):
-        rotation, _ = placed(frame_a, direction, camera(0.0, first))
+        rotation, _ = placed(frame_a, direction, camera_turn_from(0.0, first))
         written = "".join(AXES[name] for name in names) if version == "1.0" else names
         meta = keywords(version, frame_a, direction, written, ATTITUDE_TYPE="EULER_ANGLE")
         (sample,) = read(tmp_path, kvn(rows_of(angles_deg(rotation, names)), version, **meta))
@@ -83,14 +83,14 @@ def test_each_sequence_of_euler_angles_is_scipys(tmp_path, frame_a, version, dir
 @pytest.mark.parametrize("frame_a", ["ICRF", "SC_BODY_1"])
 def test_the_angles_derivatives_give_the_rate_of_the_camera(tmp_path, frame_a, names):
     before, angles, after = (
-        angles_deg(placed(frame_a, "A2B", camera(s))[0], names) for s in (-H_S, 0.0, H_S)
+        angles_deg(placed(frame_a, "A2B", camera_turn_from(s))[0], names) for s in (-H_S, 0.0, H_S)
     )
     turned = (after - before + 180.0) % 360.0 - 180.0
     row = np.concatenate([angles, turned / (2 * H_S)])
     meta = keywords("2.0", frame_a, "A2B", names, ATTITUDE_TYPE="EULER_ANGLE/DERIVATIVE")
     (sample,) = read(tmp_path, kvn(rows_of(row), "2.0", **meta))
     assert to_matrix(sample.q_icrs_to_cam) == pytest.approx(
-        camera().inv().as_matrix(), abs=MATRIX_TOLERANCE
+        camera_turn_from().inv().as_matrix(), abs=MATRIX_TOLERANCE
     )
     assert sample.rate_cam_rad_s == pytest.approx(RATE_CAM_RAD_S, abs=RATE_TOLERANCE_RAD_S)
 
@@ -100,10 +100,10 @@ def test_the_angles_derivatives_give_the_rate_of_the_camera(tmp_path, frame_a, n
 def test_an_angular_velocity_beside_euler_angles_gives_the_rate_of_the_camera(
     tmp_path, frame_a, resolved_in
 ):
-    rotation, to_cam = placed(frame_a, "A2B", camera())
+    rotation, to_cam = placed(frame_a, "A2B", camera_turn_from())
     rate = RATE_CAM_RAD_S if to_cam else -RATE_CAM_RAD_S
     if resolved_in == "ICRF":
-        rate = camera().apply(rate)
+        rate = camera_turn_from().apply(rate)
     row = np.concatenate([angles_deg(rotation, "ZYX"), np.degrees(rate)])
     meta = keywords(
         "2.0", frame_a, "A2B", "ZYX", ATTITUDE_TYPE="EULER_ANGLE/ANGVEL", ANGVEL_FRAME=resolved_in
@@ -223,7 +223,7 @@ def xml_of(version, text, state):
 """
 
 
-def turns(what, names):
+def angle_elements(what, names):
     values = zip(names, (10.0, 20.0, -30.0), strict=True)
     return "".join(
         f'<rotation{k} {what}="{n}_{what.upper()}">{v}</rotation{k}>'
@@ -231,7 +231,7 @@ def turns(what, names):
     )
 
 
-def flat(names, values):
+def elements(names, values):
     return "".join(
         f"<{name}>{value}</{name}>" for name, value in zip(names.split(), values, strict=True)
     )
@@ -247,7 +247,7 @@ XML_CASES = [
         "313",
         "eulerAngle",
         ANGLES,
-        f"<rotationAngles>{turns('angle', 'ZXZ')}</rotationAngles>",
+        f"<rotationAngles>{angle_elements('angle', 'ZXZ')}</rotationAngles>",
     ),
     (
         "1.0",
@@ -256,26 +256,35 @@ XML_CASES = [
         "eulerAngleRate",
         (*ANGLES, 1.0, 2.0, 3.0),
         (
-            f"<rotationAngles>{turns('angle', 'ZYX')}</rotationAngles><rotationRates>{turns('rate', 'ZYX')}</rotationRates>"
+            f"<rotationAngles>{angle_elements('angle', 'ZYX')}</rotationAngles><rotationRates>{angle_elements('rate', 'ZYX')}</rotationRates>"
         ),
     ),
-    ("1.0", "SPIN", None, "spin", SPIN_VALUES, flat(SPIN_NAMES, SPIN_VALUES)),
+    ("1.0", "SPIN", None, "spin", SPIN_VALUES, elements(SPIN_NAMES, SPIN_VALUES)),
     (
         "1.0",
         "SPIN/NUTATION",
         None,
         "spinNutation",
         (*SPIN_VALUES, 5.0, 6.0, 7.0),
-        flat(f"{SPIN_NAMES} NUTATION NUTATION_PER NUTATION_PHASE", (*SPIN_VALUES, 5.0, 6.0, 7.0)),
+        elements(
+            f"{SPIN_NAMES} NUTATION NUTATION_PER NUTATION_PHASE", (*SPIN_VALUES, 5.0, 6.0, 7.0)
+        ),
     ),
-    ("2.0", "EULER_ANGLE", "ZXZ", "eulerAngle", ANGLES, flat("ANGLE_1 ANGLE_2 ANGLE_3", ANGLES)),
+    (
+        "2.0",
+        "EULER_ANGLE",
+        "ZXZ",
+        "eulerAngle",
+        ANGLES,
+        elements("ANGLE_1 ANGLE_2 ANGLE_3", ANGLES),
+    ),
     (
         "2.0",
         "EULER_ANGLE/DERIVATIVE",
         "XYZ",
         "eulerAngleDerivative",
         (*ANGLES, 1.0, 2.0, 3.0),
-        flat(
+        elements(
             "ANGLE_1 ANGLE_2 ANGLE_3 ANGLE_1_DOT ANGLE_2_DOT ANGLE_3_DOT", (*ANGLES, 1.0, 2.0, 3.0)
         ),
     ),
@@ -285,7 +294,7 @@ XML_CASES = [
         None,
         "spinNutationMom",
         (*SPIN_VALUES, 5.0, 6.0, 7.0),
-        flat(
+        elements(
             f"{SPIN_NAMES} MOMENTUM_ALPHA MOMENTUM_DELTA NUTATION_VEL",
             (*SPIN_VALUES, 5.0, 6.0, 7.0),
         ),
@@ -318,9 +327,9 @@ def test_xml_whose_angles_are_not_those_of_the_sequence_is_refused(tmp_path):
     text = kvn(
         rows_of(ANGLES), **keywords("1.0", "ICRF", "A2B", "321", ATTITUDE_TYPE="EULER_ANGLE")
     )
-    angles = f"<rotationAngles>{turns('angle', 'XYZ')}</rotationAngles>"
+    angles = f"<rotationAngles>{angle_elements('angle', 'XYZ')}</rotationAngles>"
     state = f"<eulerAngle><EPOCH>{EPOCHS[0]}</EPOCH>{angles}</eulerAngle>"
-    assert "rotation1 is the X_ANGLE, and EULER_ROT_SEQ has Z_ANGLE there" in refusal(
+    assert "rotation1 is the X_ANGLE, and EULER_ROT_SEQ has Z_ANGLE there" in aem_refusal(
         tmp_path, xml_of("1.0", text, state)
     )
 
@@ -330,8 +339,9 @@ def test_a_sequence_that_is_none_is_refused(tmp_path, names):
     text = kvn(
         rows_of(ANGLES), **keywords("1.0", "ICRF", "A2B", names, ATTITUDE_TYPE="EULER_ANGLE")
     )
-    assert f"EULER_ROT_SEQ is {names or 'missing'}; write three axes such as 321 or ZYX" in refusal(
-        tmp_path, text
+    assert (
+        f"EULER_ROT_SEQ is {names or 'missing'}; write three axes such as 321 or ZYX"
+        in aem_refusal(tmp_path, text)
     )
 
 
@@ -377,4 +387,4 @@ def test_blocks_of_two_frames_of_the_spacecraft_are_refused(tmp_path):
         kvn(rows_of([0, 0, 0, 1]), REF_FRAME_B=frame) for frame in ("SC_BODY_1", "STARTRACKER_1")
     )
     text = one + two[two.index("META_START") :].replace("2024-02-29", "2024-02-28")
-    assert "the spacecraft's frame changes from block to block" in refusal(tmp_path, text)
+    assert "the spacecraft's frame changes from block to block" in aem_refusal(tmp_path, text)

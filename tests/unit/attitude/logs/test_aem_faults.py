@@ -14,7 +14,7 @@ from hilstar.attitude.logs.log_file import log_timeline, open_log, write_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import NS_PER_S
-from tests.support.sources.aem_messages import EPOCHS, kvn, read, refusal, rows_of
+from tests.support.sources.aem_messages import EPOCHS, aem_refusal, kvn, read, rows_of
 
 # Epochs
 
@@ -57,11 +57,11 @@ def test_epochs_are_written_with_nine_digits():
     ],
 )
 def test_an_epoch_that_is_none_is_refused(tmp_path, text):
-    assert ":17: " in refusal(tmp_path, kvn([f"{text.replace(' ', '_')} 0 0 0 1"]))
+    assert ":17: " in aem_refusal(tmp_path, kvn([f"{text.replace(' ', '_')} 0 0 0 1"]))
 
 
 def test_an_epoch_outside_64_bits_is_refused(tmp_path):
-    assert "64 bits" in refusal(tmp_path, kvn(["2262-04-11T23:47:16.854775808 0 0 0 1"]))
+    assert "64 bits" in aem_refusal(tmp_path, kvn(["2262-04-11T23:47:16.854775808 0 0 0 1"]))
 
 
 # Blocks
@@ -97,7 +97,7 @@ def test_blocks_may_share_an_epoch_and_the_earlier_then_ends_a_nanosecond_before
 TURN_DEG_S = 3.0
 
 
-def turned(number, second):
+def segment_turn(number, second):
     """Of segment `number`, about z at a constant rate; each segment has an offset of its own, so
     that it can be told.
     """
@@ -109,7 +109,9 @@ def overlapping(*segments):
     """Segments, each its seconds and its keywords, as one message."""
     text = ""
     for number, (seconds, keywords) in enumerate(segments):
-        own = kvn([turned(number, second) for second in seconds], REF_FRAME_B="CAM", **keywords)
+        own = kvn(
+            [segment_turn(number, second) for second in seconds], REF_FRAME_B="CAM", **keywords
+        )
         text += own if not number else own[own.index("META_START") :]
     return text
 
@@ -199,7 +201,7 @@ def test_useable_times_of_segments_that_do_not_overlap_change_nothing(tmp_path):
 
 
 def test_rows_that_go_back_in_time_are_refused_as_ever(tmp_path):
-    assert "time does not increase" in refusal(
+    assert "time does not increase" in aem_refusal(
         tmp_path, overlapping(([0, 20, 10], {}), ([15, 30], {}))
     )
 
@@ -212,18 +214,18 @@ def test_rows_that_go_back_in_time_are_refused_as_ever(tmp_path):
     ],
 )
 def test_useable_times_that_cannot_be_are_refused_where_they_are_needed(tmp_path, keywords, words):
-    assert words in refusal(tmp_path, overlapping(([0, 20], keywords), ([15, 30], {})))
+    assert words in aem_refusal(tmp_path, overlapping(([0, 20], keywords), ([15, 30], {})))
 
 
 def test_thousands_of_segments_that_overlap_are_refused(tmp_path):
     one = overlapping(([0, 20], {}))
     text = one + one[one.index("META_START") :] * aem.MAX_OVERLAPPING
-    assert "1001 segments overlap, and 1000 may" in refusal(tmp_path, text)
+    assert "1001 segments overlap, and 1000 may" in aem_refusal(tmp_path, text)
 
 
 def test_blocks_of_two_time_systems_are_refused(tmp_path):
     text = two_blocks(["2024-01-01T00:00:00"], ["2024-01-02T00:00:00"], TIME_SYSTEM="TAI")
-    assert "TIME_SYSTEM changes" in refusal(tmp_path, text)
+    assert "TIME_SYSTEM changes" in aem_refusal(tmp_path, text)
 
 
 # What is refused
@@ -232,7 +234,7 @@ def test_blocks_of_two_time_systems_are_refused(tmp_path):
 @pytest.mark.parametrize("version", ["1.0", "2.0"])
 @pytest.mark.parametrize("kind", ["SPIN/NUTATIONS", "EULER", "DCM"])
 def test_other_types_are_refused_with_those_that_work(tmp_path, kind, version):
-    message = refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), version, ATTITUDE_TYPE=kind))
+    message = aem_refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), version, ATTITUDE_TYPE=kind))
     assert f"ATTITUDE_TYPE = {kind}" in message
     assert (
         "QUATERNION, QUATERNION/DERIVATIVE, QUATERNION/"
@@ -254,7 +256,7 @@ def test_other_types_are_refused_with_those_that_work(tmp_path, kind, version):
     ],
 )
 def test_a_keyword_that_is_missing_or_wrong_is_named(tmp_path, keywords, word):
-    assert word in refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), **keywords))
+    assert word in aem_refusal(tmp_path, kvn(rows_of([0, 0, 0, 1]), **keywords))
 
 
 @pytest.mark.parametrize(
@@ -270,7 +272,7 @@ def test_a_keyword_that_is_missing_or_wrong_is_named(tmp_path, keywords, word):
 )
 def test_a_rate_without_one_meaning_is_refused(tmp_path, keywords, word):
     text = kvn(rows_of([0, 0, 0, 1, 0, 0, 0]), ATTITUDE_TYPE="QUATERNION/RATE", **keywords)
-    assert word in refusal(tmp_path, text)
+    assert word in aem_refusal(tmp_path, text)
 
 
 GOOD = kvn(rows_of([0, 0, 0, 1], [0, 0, 0, 1]))
@@ -306,7 +308,7 @@ GOOD = kvn(rows_of([0, 0, 0, 1], [0, 0, 0, 1]))
     ],
 )
 def test_a_message_that_is_wrong_is_refused_with_its_place(tmp_path, text, place, word):
-    message = refusal(tmp_path, text)
+    message = aem_refusal(tmp_path, text)
     assert message.startswith(f"{tmp_path / 'log'}{place}")
     assert word in message
 
@@ -315,17 +317,17 @@ def test_xml_that_is_cut_off_or_wrong_in_one_state_is_refused(tmp_path, caplog):
     samples = [AttitudeSample(t_ns, np.array([1.0, 0.0, 0.0, 0.0])) for t_ns in range(3)]
     write_log(tmp_path / "a.xml", samples)
     text = (tmp_path / "a.xml").read_text()
-    assert "not well-formed" in refusal(tmp_path, text[: len(text) // 2])
-    assert "not an AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0<", "<QC>one<", 1))
-    assert "not an AEM in XML" in refusal(tmp_path, text.replace("<QC>1.0</QC>", "", 1))
-    assert "not an AEM in XML" in refusal(
+    assert "not well-formed" in aem_refusal(tmp_path, text[: len(text) // 2])
+    assert "not an AEM in XML" in aem_refusal(tmp_path, text.replace("<QC>1.0<", "<QC>one<", 1))
+    assert "not an AEM in XML" in aem_refusal(tmp_path, text.replace("<QC>1.0</QC>", "", 1))
+    assert "not an AEM in XML" in aem_refusal(
         tmp_path, text.replace("<QC>1.0</QC>", "<QC>1.0</QC><QC>0.0</QC>", 1)
     )
     assert not caplog.records
-    assert ", 1970-01-01T00:00:00.000000002: the quaternion's norm" in refusal(
+    assert ", 1970-01-01T00:00:00.000000002: the quaternion's norm" in aem_refusal(
         tmp_path, "<QC>2.0</QC>".join(text.rsplit("<QC>1.0</QC>", 1))
     )
-    assert "is not the QUATERNION/DERIVATIVE" in refusal(
+    assert "is not the QUATERNION/DERIVATIVE" in aem_refusal(
         tmp_path, text.replace("QUATERNION<", "QUATERNION/DERIVATIVE<")
     )
 
@@ -381,7 +383,7 @@ def test_a_keyword_that_would_be_passed_over_is_refused_with_its_line(
     tmp_path, old, new, place, words
 ):
     assert old in GOOD
-    message = refusal(tmp_path, GOOD.replace(old, new, 1))
+    message = aem_refusal(tmp_path, GOOD.replace(old, new, 1))
     line = int(place.strip(":")) + (1 if "appears twice" in words else 0)
     assert message.startswith(f"{tmp_path / 'log'}:{line}:"), message
     assert re.search(words, message), message
@@ -448,7 +450,7 @@ def _n(text, count):
     ],
 )
 def test_xml_made_to_fill_the_memory_or_to_read_other_files_is_refused(tmp_path, text, word):
-    assert word in refusal(tmp_path, text)
+    assert word in aem_refusal(tmp_path, text)
 
 
 @pytest.mark.parametrize(
@@ -481,7 +483,9 @@ def test_xml_made_to_fill_the_memory_or_to_read_other_files_is_refused(tmp_path,
 )
 def test_what_xml_would_hide_is_refused(tmp_path, xml, old, new, word):
     text = xml.replace(old, new, 1)
-    assert word in refusal(tmp_path, text.replace("</aem>", "</oem>") if old == "<aem" else text)
+    assert word in aem_refusal(
+        tmp_path, text.replace("</aem>", "</oem>") if old == "<aem" else text
+    )
 
 
 def test_names_with_a_namespace_and_another_message_beside_the_aem_are_read(tmp_path, xml):
@@ -512,7 +516,7 @@ def test_a_keyword_of_the_other_version_is_refused_with_both_named(
     words = f"{key} is of AEM {own}, and CCSDS_AEM_VERS is {version}; {other}"
     text = kvn(rows_of([0, 0, 0, 1]), version, **{key: value})
     line = text[: text.index(key)].count("\n") + 1
-    assert f"log:{line}: {words}" in refusal(tmp_path, text)
+    assert f"log:{line}: {words}" in aem_refusal(tmp_path, text)
     meta = "".join(
         f"<{k}>{v}</{k}>" for k, v in re.findall(r"(\w+) = (.*)", text[text.index("META_START") :])
     )
@@ -520,13 +524,13 @@ def test_a_keyword_of_the_other_version_is_refused_with_both_named(
         '<aem id="CCSDS_AEM_VERS"'
         f' version="{version}"><body><segment><metadata>{meta}</metadata></segment></body></aem>'
     )
-    assert words in refusal(tmp_path, document)
+    assert words in aem_refusal(tmp_path, document)
 
 
 def test_an_element_that_would_be_passed_over_is_refused_with_its_line(tmp_path, xml):
     lines = xml.splitlines()
     number = next(k for k, line in enumerate(lines, start=1) if "<QUATERNION_TYPE>" in line)
-    message = refusal(tmp_path, xml.replace("QUATERNION_TYPE>", "QUATERNION_TYP>"))
+    message = aem_refusal(tmp_path, xml.replace("QUATERNION_TYPE>", "QUATERNION_TYP>"))
     assert message.startswith(
         f"{tmp_path / 'log'}:{number}: QUATERNION_TYP is not a keyword of an AEM's metadata; did"
         " you mean"
@@ -538,7 +542,7 @@ def test_one_aem_in_an_ndm_is_read_and_several_are_not(tmp_path, xml):
     samples = read(tmp_path, f"<ndm><MESSAGE_ID>1</MESSAGE_ID>{body}</ndm>")
     assert [s.t_ns for s in samples] == [0, 1, 2]
     for count, inside in ((0, ""), (2, body + body)):
-        assert f"the <ndm> contains {count} <aem>; write one" in refusal(
+        assert f"the <ndm> contains {count} <aem>; write one" in aem_refusal(
             tmp_path, f"<ndm>{inside}</ndm>"
         )
 

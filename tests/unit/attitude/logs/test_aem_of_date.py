@@ -17,7 +17,7 @@ from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import Mounting
 from hilstar.basics.rotation import to_matrix
 from tests.support.claims import holds
-from tests.support.sources.aem_messages import kvn, refusal
+from tests.support.sources.aem_messages import aem_refusal, kvn
 
 ARCSEC = np.radians(1 / 3600)
 # Astropy ties TEME to the Earth by GMST of 1982 and the Earth by IAU 2006/2000A; hilstar by IAU
@@ -33,7 +33,7 @@ DATES = ["1998-03-02T04:00:00", "2012-07-01T13:31:07.25", "2024-02-29T23:59:59.2
 FAR_KM = 1e13  # so far that neither the observer's place nor its velocity counts
 
 
-def aem(frame, epochs, scale="UTC", rates="", **keywords):
+def aem_of_date(frame, epochs, scale="UTC", rates="", **keywords):
     q = " ".join(map(repr, Q_FRAME_TO_BODY.inv().as_quat().tolist()))  # annex F: the conjugate
     return kvn(
         [f"{epoch} {q}{rates}" for epoch in epochs],
@@ -58,7 +58,7 @@ def frame_from_gcrs(frame):
         return axes.transform_to(frame).cartesian.xyz.to_value(u.km) / FAR_KM
 
 
-def off_rad(sample, frame_from_icrs):
+def off_frame_rad(sample, frame_from_icrs):
     return (
         Rotation.from_matrix(to_matrix(sample.q_icrs_to_cam))
         * (Q_FRAME_TO_BODY * frame_from_icrs).inv()
@@ -70,9 +70,9 @@ def off_rad(sample, frame_from_icrs):
     ("name", "frame"), [("TEME", TEME), ("TOD", TETE), ("ITRF", ITRS), ("ITRF-93", ITRS)]
 )
 def test_frames_of_date_are_astropys(tmp_path, name, frame, date):
-    (sample,) = samples_of(tmp_path, aem(name, [date])).samples
+    (sample,) = samples_of(tmp_path, aem_of_date(name, [date])).samples
     wanted = Rotation.from_matrix(frame_from_gcrs(frame(obstime=Time(date, scale="utc"))))
-    off_arcsec = off_rad(sample, wanted) / ARCSEC
+    off_arcsec = off_frame_rad(sample, wanted) / ARCSEC
     holds(CLAIMS[name.removesuffix("-93")], off_arcsec if name == "TEME" else 1000 * off_arcsec)
 
 
@@ -102,14 +102,16 @@ def test_the_mean_equator_of_date_is_that_of_the_published_precession(tmp_path, 
         * Rotation.from_euler("y", -xi)
         * Rotation.from_euler("z", -alpha)
     )  # R1(-eta) R2(xi) R3
-    (sample,) = samples_of(tmp_path, aem("MOD", [date])).samples
-    assert off_rad(sample, precession * bias) < MOD_TOLERANCE_RAD
+    (sample,) = samples_of(tmp_path, aem_of_date("MOD", [date])).samples
+    assert off_frame_rad(sample, precession * bias) < MOD_TOLERANCE_RAD
 
 
 def test_a_body_at_rest_on_the_earth_turns_with_it(tmp_path):
     epochs = ["2024-02-29T12:00:00", "2024-02-29T12:00:10"]
     keywords = {"ATTITUDE_TYPE": "QUATERNION/ANGVEL", "ANGVEL_FRAME": "ITRF"}
-    first, second = samples_of(tmp_path, aem("ITRF", epochs, rates=" 0 0 0", **keywords)).samples
+    first, second = samples_of(
+        tmp_path, aem_of_date("ITRF", epochs, rates=" 0 0 0", **keywords)
+    ).samples
     turned = (
         Rotation.from_matrix(to_matrix(first.q_icrs_to_cam))
         * Rotation.from_matrix(to_matrix(second.q_icrs_to_cam)).inv()
@@ -125,19 +127,22 @@ def test_a_body_at_rest_on_the_earth_turns_with_it(tmp_path):
 )
 def test_the_earth_turns_by_utc_whatever_the_scale(tmp_path, scale, ahead_s):
     date = np.datetime64("2024-02-29T12:00:00.000000000")
-    (utc,) = samples_of(tmp_path, aem("ITRF", [str(date)])).samples
+    (utc,) = samples_of(tmp_path, aem_of_date("ITRF", [str(date)])).samples
     (other,) = samples_of(
-        tmp_path, aem("ITRF", [str(date + np.timedelta64(round(ahead_s * 1e9), "ns"))], scale)
+        tmp_path,
+        aem_of_date("ITRF", [str(date + np.timedelta64(round(ahead_s * 1e9), "ns"))], scale),
     ).samples
     assert other.q_icrs_to_cam == pytest.approx(utc.q_icrs_to_cam, abs=1e-14)
 
 
 def test_what_tells_no_utc_or_lies_beyond_the_table_is_said(tmp_path):
-    assert "TIME_SYSTEM = UT1 does not tell UTC" in refusal(
-        tmp_path, aem("ITRF", [DATES[0]], "UT1")
+    assert "TIME_SYSTEM = UT1 does not tell UTC" in aem_refusal(
+        tmp_path, aem_of_date("ITRF", [DATES[0]], "UT1")
     )
-    assert "do not fit 64 bits" in refusal(tmp_path, aem("TEME", ["9999-01-01T00:00:00"]))
-    log = samples_of(tmp_path, aem("ITRF", ["2050-01-01T00:00:00"]))
+    assert "do not fit 64 bits" in aem_refusal(
+        tmp_path, aem_of_date("TEME", ["9999-01-01T00:00:00"])
+    )
+    log = samples_of(tmp_path, aem_of_date("ITRF", ["2050-01-01T00:00:00"]))
     assert "earth-orientation" in [kind for kind, _ in log.told]
     lines = log.conventions.lines(Mounting())
     assert (

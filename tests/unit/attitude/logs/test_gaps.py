@@ -31,7 +31,7 @@ def coning(spin_rad_s: float, nutation_rad_s: float, t_s: float) -> tuple[np.nda
     return propagate(q, np.array([nutation_rad_s, 0, 0]), t_s), rate
 
 
-def log(times_s, spin=0.02, nutation=0.03, *, rate=True):
+def coning_samples(times_s, spin=0.02, nutation=0.03, *, rate=True):
     moments = [(t, *coning(spin, nutation, t)) for t in times_s]
     return [
         AttitudeSample(round(t * S), q, omega if rate else None, k)
@@ -61,15 +61,15 @@ def test_a_slow_log_with_rates_is_blended_and_not_cut_at_the_corners(
     step_s, spin, nutation, limit_arcsec
 ):
     times = np.arange(0, 200, step_s)
-    blended = worst_arcsec(log(times, spin, nutation), spin, nutation)
-    slerped = worst_arcsec(log(times, spin, nutation, rate=False), spin, nutation)
+    blended = worst_arcsec(coning_samples(times, spin, nutation), spin, nutation)
+    slerped = worst_arcsec(coning_samples(times, spin, nutation, rate=False), spin, nutation)
     assert slerped == pytest.approx(np.degrees(spin * nutation) * 3600 * step_s**2 / 8, rel=0.1)
     assert blended < limit_arcsec
     assert blended < slerped / 30
 
 
 def test_the_display_and_the_twin_and_the_sender_take_a_log_alike():
-    samples = log(np.arange(0, 60, 4.0))
+    samples = coning_samples(np.arange(0, 60, 4.0))
     display = log_timeline(samples, STREAM)
     for motion, t_ns in zip(
         log_views(samples, 57, 0.1), np.linspace(0, samples[-1].t_ns, 57), strict=True
@@ -84,13 +84,15 @@ def test_the_display_and_the_twin_and_the_sender_take_a_log_alike():
 
 
 def test_more_than_a_half_turn_between_samples_is_made_where_rates_say_so():
-    samples = log(np.arange(0, 40, 4.0), spin=1.2, nutation=0.0)  # 275 degrees an interval
+    samples = coning_samples(
+        np.arange(0, 40, 4.0), spin=1.2, nutation=0.0
+    )  # 275 degrees an interval
     assert worst_arcsec(samples, 1.2, 0.0) < 1e-3
 
 
 def test_a_gap_of_a_log_without_rates_is_held_and_told():
     times = [*np.arange(0, 10, 0.5), *np.arange(30, 40, 0.5)]
-    samples = log(times, rate=False)
+    samples = coning_samples(times, rate=False)
     joins = log_joins(samples)
     assert joins.told == [
         (
@@ -118,7 +120,7 @@ def test_a_gap_of_a_log_without_rates_is_held_and_told():
 
 def test_a_few_lost_samples_are_no_gap():
     times = np.delete(np.arange(0, 20, 0.5), range(8, 8 + GAP_INTERVALS - 1))
-    assert log_joins(log(times, rate=False)).told == []
+    assert log_joins(coning_samples(times, rate=False)).told == []
 
 
 def test_a_gap_that_the_rates_on_both_sides_explain_is_blended():
@@ -126,7 +128,7 @@ def test_a_gap_that_the_rates_on_both_sides_explain_is_blended():
     degree.
     """
     times = [*np.arange(0, 10, 0.5), *np.arange(600, 610, 0.5)]
-    samples = log(times, spin=0.008, nutation=0.0)
+    samples = coning_samples(times, spin=0.008, nutation=0.0)
     assert log_joins(samples).told == []
     assert worst_arcsec(samples, 0.008, 0.0) < 0.1
     other = [
@@ -151,7 +153,7 @@ def test_rates_that_do_not_fit_the_attitudes_are_not_used_and_told():
 
 
 def test_a_discontinuity_holds_whatever_the_interval_and_the_rates():
-    samples = log(np.arange(0, 10, 0.5))
+    samples = coning_samples(np.arange(0, 10, 0.5))
     samples[7] = AttitudeSample(
         samples[7].t_ns, samples[7].q_icrs_to_cam, samples[7].rate_cam_rad_s, 7, True
     )
@@ -170,7 +172,7 @@ def test_times_beyond_64_bits_of_difference_do_no_harm():
 def test_a_log_s_rates_in_deg_s_are_named():
     samples = [
         replace(each, rate_cam_rad_s=np.degrees(each.rate_cam_rad_s))
-        for each in log(np.arange(0, 60, 0.5))
+        for each in coning_samples(np.arange(0, 60, 0.5))
     ]
     told = dict(log_joins(samples).told)["log-rates"]
     assert told.startswith("in 119 intervals") and told.endswith(

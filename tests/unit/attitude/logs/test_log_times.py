@@ -17,7 +17,7 @@ RATE = np.radians([0.1, -0.3, 1.0])
 COUNT = 50
 
 
-def rows(step_s: float, rates: bool, scale: float = 1.0):
+def rows_in_time(step_s: float, rates: bool, scale: float = 1.0):
     for k in range(COUNT):
         turn = Rotation.from_rotvec(-RATE * step_s * k) * Rotation.from_euler(
             "xyz", [10, 20, 30], degrees=True
@@ -29,17 +29,19 @@ def rows(step_s: float, rates: bool, scale: float = 1.0):
         )
 
 
-def written(tmp_path, kind: str, unit_s: float, step_s: float, rates: bool, scale: float = 1.0):
+def log_in_units(
+    tmp_path, kind: str, unit_s: float, step_s: float, rates: bool, scale: float = 1.0
+):
     """A log whose times are written in a unit of `unit_s` seconds."""
     path = tmp_path / f"a.{kind}"
     if kind == "csv":
         lines = ["t_s,qw,qx,qy,qz,rx,ry,rz"]
-        for t_s, q, rate in rows(step_s, rates, scale):
+        for t_s, q, rate in rows_in_time(step_s, rates, scale):
             turning = ["", "", ""] if rate is None else map(repr, rate)
             lines.append(",".join([repr(t_s / unit_s), *map(repr, q), *turning]))
     else:
         lines = []
-        for t_s, q, rate in rows(step_s, rates, scale):
+        for t_s, q, rate in rows_in_time(step_s, rates, scale):
             lines.append(
                 json.dumps({"t_ns": round(t_s / unit_s), "q": q} | ({"rate": rate} if rate else {}))
             )
@@ -58,7 +60,7 @@ def notices(path) -> tuple[str, str]:
     [("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9), ("minutes", 60.0), ("days", 86400.0)],
 )
 def test_the_rates_of_a_csv_name_the_unit_of_its_times(tmp_path, unit, unit_s, step_s):
-    said, rates = notices(written(tmp_path, "csv", unit_s, step_s, rates=True))
+    said, rates = notices(log_in_units(tmp_path, "csv", unit_s, step_s, rates=True))
     assert said.startswith(f"the rates do not fit the times: probably the times are in {unit}")
     assert said.endswith("; the format has s")
     assert "probably" not in rates, "one cause is named, not two"
@@ -66,15 +68,15 @@ def test_the_rates_of_a_csv_name_the_unit_of_its_times(tmp_path, unit, unit_s, s
 
 @pytest.mark.parametrize(("unit", "unit_s"), [("us", 1e-6), ("ms", 1e-3), ("100 ns", 1e-7)])
 def test_the_rates_of_json_lines_name_the_unit_of_their_times(tmp_path, unit, unit_s):
-    said, _ = notices(written(tmp_path, "jsonl", unit_s, 0.02, rates=True))
+    said, _ = notices(log_in_units(tmp_path, "jsonl", unit_s, 0.02, rates=True))
     assert f"the times are in {unit}" in said
     assert said.endswith("; the format has ns")
 
 
 def test_rates_of_another_unit_are_named_where_the_times_would_be_odd(tmp_path):
-    said, _ = notices(written(tmp_path, "csv", 1.0, 0.02, rates=True, scale=1e3))
+    said, _ = notices(log_in_units(tmp_path, "csv", 1.0, 0.02, rates=True, scale=1e3))
     assert "probably the rates are in mrad/s" in said
-    said, _ = notices(written(tmp_path, "csv", 1e-3, 0.005, rates=True))
+    said, _ = notices(log_in_units(tmp_path, "csv", 1e-3, 0.005, rates=True))
     # 5 s or 5 ms: both are a log's
     assert "the times are in ms, or the rates are in mrad/s" in said
 
@@ -83,7 +85,7 @@ def test_rates_of_another_unit_are_named_where_the_times_would_be_odd(tmp_path):
 @pytest.mark.parametrize(("kind", "unit_s"), [("csv", 1.0), ("jsonl", 1e-9)])
 def test_nothing_is_said_of_times_that_are_right(tmp_path, kind, unit_s, rates):
     for step_s in (0.001, 0.02, 1.0):
-        assert notices(written(tmp_path, kind, unit_s, step_s, rates)) == ("", "")
+        assert notices(log_in_units(tmp_path, kind, unit_s, step_s, rates)) == ("", "")
 
 
 @pytest.mark.parametrize(
@@ -91,7 +93,9 @@ def test_nothing_is_said_of_times_that_are_right(tmp_path, kind, unit_s, rates):
     [("csv", 1e-3, "over 10 s"), ("csv", 1e3, "under 0.1 ms"), ("jsonl", 1e-6, "under 0.1 ms")],
 )
 def test_without_rates_an_odd_step_is_told(tmp_path, kind, unit_s, limit):
-    said, _ = notices(written(tmp_path, kind, unit_s, 0.02 if unit_s != 1e3 else 0.05, rates=False))
+    said, _ = notices(
+        log_in_units(tmp_path, kind, unit_s, 0.02 if unit_s != 1e3 else 0.05, rates=False)
+    )
     assert limit in said
     assert "a step of" in said
 
@@ -106,7 +110,7 @@ def test_a_format_that_has_dates_is_not_asked(tmp_path):
 def test_every_command_that_reads_a_log_tells_of_an_odd_step(tmp_path, command):
     bench = tmp_path / "bench.toml"
     bench.write_text(SMALL_BENCH)
-    log = written(tmp_path, "csv", 1e-3, 0.02, rates=False)
+    log = log_in_units(tmp_path, "csv", 1e-3, 0.02, rates=False)
     words = {
         "replay": (bench, log, "--headless", "--speed", "max", "--step", "400"),
         "attitude": (log,),
@@ -125,7 +129,7 @@ def test_every_command_that_reads_a_log_tells_of_an_odd_step(tmp_path, command):
 def test_a_replay_says_how_long_its_log_is(tmp_path):
     bench = tmp_path / "bench.toml"
     bench.write_text(SMALL_BENCH)
-    log = written(tmp_path, "csv", 1.0, 0.02, rates=False)
+    log = log_in_units(tmp_path, "csv", 1.0, 0.02, rates=False)
     result = run_hilstar_here("replay", bench, log, "--headless", "--speed", "max", "--step", "0.5")
     assert "the log is 0.98 s long: 50 attitudes, a step of 0.02 s (median)\n" in result.stderr
     assert "which is" not in result.stderr

@@ -23,11 +23,12 @@ from hilstar.attitude.logs.mcap_log import (
 )
 from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.basics.errors import InputError
+from tests.support.refusals import refusal
 
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def sample(t_ns, sequence=0, rate=None):
+def upright_sample(t_ns, sequence=0, rate=None):
     return AttitudeSample(t_ns, UPRIGHT, rate, sequence)
 
 
@@ -49,8 +50,8 @@ def ledger(messages, chunk_size=1024 * 1024, finish=True):
 
 
 def test_an_mcap_log_opens_in_the_library_as_json_with_a_schema(tmp_path):
-    taken = sample(-5, 3, np.array([0.1, 0.2, 0.3]))
-    write_log(tmp_path / "a.mcap", [taken, sample(2**62, 4)])
+    taken = upright_sample(-5, 3, np.array([0.1, 0.2, 0.3]))
+    write_log(tmp_path / "a.mcap", [taken, upright_sample(2**62, 4)])
     with (tmp_path / "a.mcap").open("rb") as file:
         (schema, channel, first), (_, _, second) = make_reader(file).iter_messages()
     assert schema is not None
@@ -75,7 +76,7 @@ def test_the_schema_names_every_field_with_one_plain_type():
     # Foxglove's reader throws for a type that is a list (foxglove/studio,
     # packages/mcap-support/src/parseJsonSchema.ts).
     properties = json.loads(ATTITUDE_SCHEMA)["properties"]
-    assert list(properties) == list(json.loads(attitude_message(sample(0))))
+    assert list(properties) == list(json.loads(attitude_message(upright_sample(0))))
     assert {p["type"] for p in properties.values()} <= {
         "integer",
         "number",
@@ -86,9 +87,11 @@ def test_the_schema_names_every_field_with_one_plain_type():
 
 
 def test_a_message_keeps_the_packet_as_it_came():
-    packet = encode(sample(7))
+    packet = encode(upright_sample(7))
     assert (
-        bytes.fromhex(json.loads(attitude_message(sample(7), receive_ns=9, raw=packet))["raw"])
+        bytes.fromhex(
+            json.loads(attitude_message(upright_sample(7), receive_ns=9, raw=packet))["raw"]
+        )
         == packet
     )
     refused = json.loads(refused_message("crc", "the CRC-32 does not fit", 9, b"\x00\xff"))
@@ -109,7 +112,7 @@ def test_log_time_is_the_receivers_clock_where_known_and_never_below_zero():
 def test_other_channels_and_refused_packets_are_passed_over(tmp_path):
     refused = refused_message("norm", "2", 1, None)
     (tmp_path / "run.mcap").write_bytes(
-        ledger([attitude_message(sample(1)), refused, attitude_message(sample(2))])
+        ledger([attitude_message(upright_sample(1)), refused, attitude_message(upright_sample(2))])
     )
     assert [s.t_ns for s in read_log(tmp_path / "run.mcap")] == [1, 2]
 
@@ -117,7 +120,7 @@ def test_other_channels_and_refused_packets_are_passed_over(tmp_path):
 def test_a_killed_writer_leaves_everything_before_its_last_chunk(tmp_path):
     count = 40
     data = ledger(
-        [attitude_message(sample(i)) for i in range(count)], chunk_size=1500, finish=False
+        [attitude_message(upright_sample(i)) for i in range(count)], chunk_size=1500, finish=False
     )
     seen = []
     for size in range(8, len(data) + 1, 13):
@@ -132,7 +135,7 @@ def test_a_killed_writer_leaves_everything_before_its_last_chunk(tmp_path):
 
 def test_a_file_that_has_no_end_is_said_in_one_line_and_a_whole_one_in_none(tmp_path, caplog):
     whole, path = (
-        ledger([attitude_message(sample(i)) for i in range(40)], chunk_size=1500),
+        ledger([attitude_message(upright_sample(i)) for i in range(40)], chunk_size=1500),
         tmp_path / "run.mcap",
     )
     path.write_bytes(whole)
@@ -154,16 +157,15 @@ def test_what_is_no_mcap_file_is_called_so(tmp_path):
 
 
 def test_a_finished_file_that_is_damaged_is_refused(tmp_path):
-    data = bytearray(ledger([attitude_message(sample(i)) for i in range(40)]))
+    data = bytearray(ledger([attitude_message(upright_sample(i)) for i in range(40)]))
     data[len(data) // 4] ^= 0x55
     (tmp_path / "run.mcap").write_bytes(bytes(data))
-    with pytest.raises(InputError, match="damaged before byte"):
-        read_log(tmp_path / "run.mcap")
+    assert "damaged before byte" in refusal(read_log, tmp_path / "run.mcap")
 
 
 def test_chunks_taken_at_once_read_and_are_refused_as_by_the_library(tmp_path, monkeypatch):
     whole, rng, path = (
-        ledger([attitude_message(sample(i)) for i in range(40)], chunk_size=1500),
+        ledger([attitude_message(upright_sample(i)) for i in range(40)], chunk_size=1500),
         np.random.default_rng(1),
         tmp_path / "run.mcap",
     )
@@ -189,7 +191,7 @@ def test_chunks_taken_at_once_read_and_are_refused_as_by_the_library(tmp_path, m
 
 def test_a_sender_that_restarted_is_named_with_its_time(tmp_path):
     (tmp_path / "run.mcap").write_bytes(
-        ledger([attitude_message(sample(t)) for t in (100, 200, 50, 60)])
+        ledger([attitude_message(upright_sample(t)) for t in (100, 200, 50, 60)])
     )
     with pytest.raises(
         InputError, match=r"message 3 of /attitude: time does not increase .*; the sender restarted"
@@ -209,12 +211,11 @@ def test_a_sender_that_restarted_is_named_with_its_time(tmp_path):
     ],
 )
 def test_a_message_that_is_no_attitude_is_refused_with_its_number(tmp_path, message, word):
-    (tmp_path / "run.mcap").write_bytes(ledger([attitude_message(sample(1)), message]))
+    (tmp_path / "run.mcap").write_bytes(ledger([attitude_message(upright_sample(1)), message]))
     with pytest.raises(InputError, match=f"message 2 of /attitude: .*{word}"):
         read_log(tmp_path / "run.mcap")
 
 
 def test_a_file_without_attitudes_is_refused(tmp_path):
     (tmp_path / "run.mcap").write_bytes(ledger([]))
-    with pytest.raises(InputError, match="no attitude"):
-        read_log(tmp_path / "run.mcap")
+    assert "no attitude" in refusal(read_log, tmp_path / "run.mcap")

@@ -33,7 +33,7 @@ STATEMENTS = {
 }
 
 
-def attitudes(path: Path, stated: Stated) -> np.ndarray:
+def attitudes_of_log(path: Path, stated: Stated) -> np.ndarray:
     return np.array([sample.q_icrs_to_cam for sample in open_log(path, stated).samples])
 
 
@@ -54,7 +54,7 @@ def test_a_statement_is_used_or_refused_by_name(tmp_path, name, statement):
         return
     assert check_stated(path, stated) == own
     try:
-        found = attitudes(path, stated)
+        found = attitudes_of_log(path, stated)
     except InputError as error:  # what it names is not there, or needs another statement beside it
         said = str(error)
         assert (
@@ -63,7 +63,7 @@ def test_a_statement_is_used_or_refused_by_name(tmp_path, name, statement):
             or "no_such_file" in said
         )
         return
-    assert not np.allclose(found, attitudes(path, needed), atol=1e-6), (
+    assert not np.allclose(found, attitudes_of_log(path, needed), atol=1e-6), (
         "it was stated, and changed nothing"
     )
 
@@ -82,7 +82,7 @@ def test_a_place_or_a_date_of_attitudes_in_the_icrs_is_refused(tmp_path, name, s
 def test_a_mounting_of_the_command_says_that_a_log_is_the_bodys(tmp_path, name):
     path = FILES[name].make(tmp_path)
     found = Rotation.from_quat(
-        attitudes(path, Stated(Mounting(MOUNTING, by_option=True))), scalar_first=True
+        attitudes_of_log(path, Stated(Mounting(MOUNTING, by_option=True))), scalar_first=True
     )
     wanted = Rotation.from_quat(MOUNTING, scalar_first=True) * TURNS
     assert (found * wanted.inv()).magnitude().max() < ROUNDING
@@ -125,11 +125,11 @@ def test_the_columns_of_a_csv_are_told_by_name_or_in_their_order(tmp_path, order
     path = tmp_path / "a.csv"
     lines = [f"{k},{','.join(row)}" for k, row in enumerate(rows)]
     path.write_text("\n".join([f"t_s,{','.join(names)}", *lines]))
-    assert np.array_equal(attitudes(path, Stated()), QUATERNIONS)
+    assert np.array_equal(attitudes_of_log(path, Stated()), QUATERNIONS)
     last = [repr(float(c)) for c in TURNS[0].as_quat()]  # x, y, z, w
     path.write_text(f"t_s,{','.join(names)}\n0,{','.join(last)}\n")
     assert np.array_equal(
-        attitudes(path, Stated(convention=Convention(scalar="last")))[0], QUATERNIONS[0]
+        attitudes_of_log(path, Stated(convention=Convention(scalar="last")))[0], QUATERNIONS[0]
     )
 
 
@@ -157,7 +157,7 @@ def test_json_lines_of_each_convention(tmp_path, scalar, direction, frame):
     assert sample.rate_cam_rad_s == pytest.approx(rate, abs=ROUNDING)
 
 
-def turning(folder: Path, sent: Convention) -> Path:
+def turning_log(folder: Path, sent: Convention) -> Path:
     """A log of a steady turn with rates, its quaternions sent in a convention."""
     path, rate_rad_s = folder / "turning.jsonl", np.array([0.02, 0.05, -0.03])
     lines = []
@@ -195,17 +195,17 @@ def test_a_log_that_is_read_otherwise_is_told_what_to_state_in_place_of_what_is(
     tmp_path, stated, advice
 ):
     sent = Convention(scalar="last", direction="cam_to_icrs")
-    told = dict(open_log(turning(tmp_path, sent), stated).joins().told)
+    told = dict(open_log(turning_log(tmp_path, sent), stated).joins().told)
     assert told["convention-wrong"].endswith(advice)
 
 
 def test_a_log_that_is_read_as_it_was_sent_is_told_nothing(tmp_path):
     sent = Convention(scalar="last", direction="cam_to_icrs")
-    assert open_log(turning(tmp_path, sent), Stated(convention=sent)).joins().told == []
+    assert open_log(turning_log(tmp_path, sent), Stated(convention=sent)).joins().told == []
 
 
 def test_a_log_with_a_convention_of_its_own_is_told_no_statement_that_it_refuses(tmp_path):
-    log = open_log(turning(tmp_path, Convention(direction="cam_to_icrs")))
+    log = open_log(turning_log(tmp_path, Convention(direction="cam_to_icrs")))
     path = tmp_path / "conjugates.aem"
     write_log(path, log.samples)
     told = dict(open_log(path).joins().told)

@@ -10,26 +10,28 @@ ROW = "1,0,0,0"
 OBJECT = '{"t_ns":%d,"q":[1,0,0,0]}'
 
 
-def attitude(path, text):
+def attitudes_of_text(path, text):
     path.write_text(text)
     return run_hilstar_here("attitude", path)
 
 
 def test_blank_quaternions_at_the_beginning_are_left_out_with_a_notice(tmp_path):
-    told = attitude(tmp_path / "a.csv", f"t_s,qw,qx,qy,qz\n0,,,,\n1,,,,\n2,{ROW}\n3,{ROW}\n")
+    told = attitudes_of_text(
+        tmp_path / "a.csv", f"t_s,qw,qx,qy,qz\n0,,,,\n1,,,,\n2,{ROW}\n3,{ROW}\n"
+    )
     assert told.returncode == 0
     assert "2 attitudes are left out at the beginning" in told.stderr
     assert "t_ns 2000000000" in told.stdout
 
 
 def test_a_blank_quaternion_after_an_attitude_is_refused_as_a_dropout(tmp_path):
-    told = attitude(tmp_path / "a.csv", f"t_s,qw,qx,qy,qz\n0,{ROW}\n1,,,,\n2,{ROW}\n")
+    told = attitudes_of_text(tmp_path / "a.csv", f"t_s,qw,qx,qy,qz\n0,{ROW}\n1,,,,\n2,{ROW}\n")
     assert told.returncode == 2
     assert "a.csv:3" in told.stderr and "dropout" in told.stderr
 
 
 def test_a_row_with_a_part_of_a_quaternion_is_refused(tmp_path):
-    told = attitude(tmp_path / "a.csv", "t_s,qw,qx,qy,qz\n0,1,,,\n")
+    told = attitudes_of_text(tmp_path / "a.csv", "t_s,qw,qx,qy,qz\n0,1,,,\n")
     assert told.returncode == 2 and "a.csv:2" in told.stderr
 
 
@@ -37,7 +39,9 @@ def test_a_row_with_a_part_of_a_quaternion_is_refused(tmp_path):
     "names", ["wx,wy,wz", "omega_x,omega_y,omega_z", "p,q,r", "gyro_x,gyro_y,gyro_z"]
 )
 def test_rates_by_other_names_are_not_passed_over_without_a_word(tmp_path, names):
-    told = attitude(tmp_path / "a.csv", f"t_s,qw,qx,qy,qz,{names}\n0,{ROW},1,0,0\n1,{ROW},1,0,0\n")
+    told = attitudes_of_text(
+        tmp_path / "a.csv", f"t_s,qw,qx,qy,qz,{names}\n0,{ROW},1,0,0\n1,{ROW},1,0,0\n"
+    )
     assert told.returncode == 0
     for name in names.split(","):
         assert name in told.stderr
@@ -46,7 +50,7 @@ def test_rates_by_other_names_are_not_passed_over_without_a_word(tmp_path, names
 
 def test_rates_by_hilstars_names_are_used_without_a_word(tmp_path):
     text = f"t_s,qw,qx,qy,qz,rx,ry,rz,wx,wy,wz\n0,{ROW},0,0,0,1,1,1\n1,{ROW},0,0,0,1,1,1\n"
-    told = attitude(tmp_path / "a.csv", text)
+    told = attitudes_of_text(tmp_path / "a.csv", text)
     assert told.returncode == 0 and "rates are named" not in told.stderr
 
 
@@ -58,12 +62,12 @@ def test_rates_by_hilstars_names_are_used_without_a_word(tmp_path):
     ],
 )
 def test_an_object_that_the_files_end_cuts_is_left_out_with_a_notice(tmp_path, text):
-    told = attitude(tmp_path / "a.jsonl", text)
+    told = attitudes_of_text(tmp_path / "a.jsonl", text)
     assert told.returncode == 0
     assert "the last object has no end" in told.stderr
 
 
 def test_an_object_without_an_end_between_others_is_refused(tmp_path):
     text = f'{OBJECT % 0}\n{{"t_ns":5,"q":[1,0,0,0]\n{OBJECT % 10**9}\n'
-    told = attitude(tmp_path / "a.jsonl", text)
+    told = attitudes_of_text(tmp_path / "a.jsonl", text)
     assert told.returncode == 2 and "a.jsonl:2" in told.stderr

@@ -38,7 +38,7 @@ def json_lines(folder, rows):
     return path
 
 
-def aem(folder, rows):
+def unset_aem(folder, rows):
     path = folder / "a.aem"
     states = [f"2026-01-01T00:00:0{k} {' '.join(map(str, q))}" for k, q in enumerate(rows)]
     path.write_text(kvn(states, QUATERNION_TYPE="FIRST"))
@@ -71,7 +71,7 @@ def mcap(folder, rows):
     return path
 
 
-def bag(folder, rows, stamped=True):
+def unset_bag(folder, rows, stamped=True):
     make, sent = ros_bags.Make("humble"), []
     for k, q in enumerate(rows):
         t_ns = START_NS + k * 10**8
@@ -88,10 +88,10 @@ def bag(folder, rows, stamped=True):
 
 
 def unstamped_bag(folder, rows):
-    return bag(folder, rows, stamped=False)
+    return unset_bag(folder, rows, stamped=False)
 
 
-WRITERS = [csv, json_lines, aem, cic, stk, mcap, bag, unstamped_bag]
+WRITERS = [csv, json_lines, unset_aem, cic, stk, mcap, unset_bag, unstamped_bag]
 # JSON has no NaN
 CASES = [
     (write, empty) for write in WRITERS for empty in (ZEROS, NAN) if (write, empty) != (mcap, NAN)

@@ -8,6 +8,7 @@ import pytest
 
 from hilstar.attitude.wire.endpoint import check_use, parse_endpoint
 from hilstar.basics.errors import InputError
+from tests.support.refusals import refusal
 
 LOOPBACK = (
     "tcp://127.0.0.1:5560",
@@ -90,8 +91,7 @@ def test_what_others_can_reach_is_never_taken_for_loopback(text):
 
 @pytest.mark.parametrize("text", WRONG)
 def test_any_other_form_is_refused_in_one_short_line(text):
-    with pytest.raises(InputError, match="write "):
-        parse_endpoint(text)
+    assert "write " in refusal(parse_endpoint, text)
 
 
 def test_libzmq_gets_the_address_that_was_judged():
@@ -106,8 +106,7 @@ def test_libzmq_gets_the_address_that_was_judged():
 )
 def test_nothing_connects_to_any_port_or_every_interface(text):
     check_use(parse_endpoint(text), text, bind=True)
-    with pytest.raises(InputError, match="cannot connect to"):
-        check_use(parse_endpoint(text), text, bind=False)
+    assert "cannot connect to" in refusal(check_use, parse_endpoint(text), text, bind=False)
 
 
 def test_a_bind_deletes_no_file_and_takes_no_socket_from_a_running_program(tmp_path):

@@ -290,7 +290,7 @@ def test_messages_as_zeromq_brings_them_are_taken_alike(sanitized, rng):
     messages = [rng.bytes(int(rng.integers(130))) for _ in range(1000)]
     messages += [
         cobs.decode(mutant[:-1])
-        for mutant in (mutated([frame_of(m)], rng) for m in whole * 20)
+        for mutant in (mutated([cobs_frame(m)], rng) for m in whole * 20)
         if is_cobs(mutant)
     ]
     answers = driven(sanitized, [f"d {message.hex() or '-'}" for message in messages])
@@ -299,7 +299,7 @@ def test_messages_as_zeromq_brings_them_are_taken_alike(sanitized, rng):
         assert (kind if kind > 0 else None) == wire_level(message)
 
 
-def frame_of(message: bytes) -> bytes:
+def cobs_frame(message: bytes) -> bytes:
     return bytes(cobs.encode(message)) + DELIMITER
 
 

@@ -12,6 +12,7 @@ import zmq.auth
 
 from hilstar.attitude.wire.keys import AllowList, load_public, load_secret, make_keys
 from hilstar.basics.errors import InputError
+from tests.support.refusals import refusal
 
 
 def test_a_secret_key_is_its_owner_s_alone_before_anything_else_happens_to_it(
@@ -51,8 +52,7 @@ def test_a_client_in_an_allow_list_is_not_overwritten(tmp_path):
     allowed = tmp_path / "allowed_clients"
     allowed.mkdir()
     (allowed / "client.key").write_text("somebody's")
-    with pytest.raises(InputError, match="may be in use"):
-        make_keys(tmp_path)
+    assert "may be in use" in refusal(make_keys, tmp_path)
     assert (allowed / "client.key").read_text() == "somebody's"
 
 
@@ -93,8 +93,7 @@ def test_an_allow_list_follows_its_directory(tmp_path, caplog):
 def test_what_is_no_key_file_gets_one_line(tmp_path, text):
     path = tmp_path / "x.key"
     path.write_text(text)
-    with pytest.raises(InputError, match="not a key file"):
-        load_public(path)
+    assert "not a key file" in refusal(load_public, path)
     pipe = tmp_path / "pipe.key"
     os.mkfifo(pipe)
     with pytest.raises(InputError, match=r"pipe\.key"):

@@ -95,7 +95,7 @@ def wire_fields(message: bytes) -> tuple[int, dict]:
     return kind, dict(zip(FIELDS[kind], values, strict=True))
 
 
-def events(stream: bytes) -> list:
+def decoded_events(stream: bytes) -> list:
     return [event for event, _ in StreamDecoder().feed(DELIMITER + stream)]
 
 
@@ -221,7 +221,7 @@ def test_a_vector_is_what_struct_zlib_and_cobs_say(vector):
 def test_hilstar_reads_a_vector_and_writes_it_again(vector):
     message = bytes.fromhex(vector["packet_hex"])
     event = decode(message)
-    (framed,) = events(bytes.fromhex(vector["frame_hex"]))
+    (framed,) = decoded_events(bytes.fromhex(vector["frame_hex"]))
     assert repr(framed) == repr(event)
     assert not isinstance(event, Refusal)
     fields = vector["fields"]
@@ -254,7 +254,7 @@ def test_hilstar_reads_a_vector_and_writes_it_again(vector):
 
 @pytest.mark.parametrize("vector", REFUSED, ids=names(REFUSED))
 def test_hilstar_refuses_a_vector_for_the_reason_it_gives(vector):
-    (event,) = events(bytes.fromhex(vector["frame_hex"]))
+    (event,) = decoded_events(bytes.fromhex(vector["frame_hex"]))
     if vector["refused"] == "time":
         timeline = Timeline(NOT_ALWAYS)
         before = next(other for other in ACCEPTED if other["name"] == vector["after"])

@@ -106,7 +106,7 @@ def turn_at(t_s: float) -> Rotation:
     return Rotation.from_rotvec([0, 0, 3.1 + 0.1 * t_s + 0.005 * t_s**2])
 
 
-def turning(times_ns: list[int], max_rate_rad_s: float = 1.0) -> list[np.ndarray | None]:
+def rates_of_body(times_ns: list[int], max_rate_rad_s: float = 1.0) -> list[np.ndarray | None]:
     """The rates of that body."""
     by, rates = follower(max_rate_rad_s=max_rate_rad_s), []
     for t_ns in times_ns:
@@ -121,7 +121,7 @@ def test_a_rate_is_that_of_its_own_moment_and_the_shadow_switch_is_no_turn() -> 
     0.01 * h / 2; steps vary.
     """
     times_ns = [STEP_NS * k for k in (0, 1, 2, 4, 5, 9, 10, *range(11, 60))]
-    rates = turning(times_ns)
+    rates = rates_of_body(times_ns)
     assert rates[:2] == [None, None]
     for t_ns, rate in list(zip(times_ns, rates, strict=True))[2:]:
         assert rate == pytest.approx([0, 0, 0.1 + 0.01 * t_ns / 1e9], abs=1e-11)
@@ -182,9 +182,9 @@ def test_a_simulation_with_long_steps_is_not_held_for_long() -> None:
 
 def test_no_rate_across_a_silence_a_jump_or_a_restart() -> None:
     k = [0, 1, 2, 20, 21, 22, 5, 6, 7]
-    known = [rate is not None for rate in turning([STEP_NS * each for each in k])]
+    known = [rate is not None for rate in rates_of_body([STEP_NS * each for each in k])]
     assert known == [False, False, True, False, False, True, False, False, True]
-    assert turning([STEP_NS * each for each in range(4)], max_rate_rad_s=0.05) == [None] * 4
+    assert rates_of_body([STEP_NS * each for each in range(4)], max_rate_rad_s=0.05) == [None] * 4
 
 
 # Which spacecraft

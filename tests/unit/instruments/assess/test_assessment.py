@@ -301,7 +301,7 @@ def check_refused(ledger: Path, telemetry: Path, said: str) -> None:
     assert not (ledger.parent / "out").exists()
 
 
-def turned(planted: Planted, left: Rotation) -> FloatArray:
+def left_turned(planted: Planted, left: Rotation) -> FloatArray:
     return scalar_first(left * Rotation.from_quat(np.roll(planted.reported, -1, axis=1)))
 
 
@@ -322,7 +322,7 @@ def test_other_conventions_and_other_runs_are_told_apart(
     reported = {
         "inverse": lambda: planted.reported * [1, -1, -1, -1],
         "scalar last": lambda: np.roll(planted.reported, -1, axis=1),
-        "y up": lambda: turned(planted, Rotation.from_rotvec([np.pi, 0, 0])),
+        "y up": lambda: left_turned(planted, Rotation.from_rotvec([np.pi, 0, 0])),
         "another run": lambda: scalar_first(Rotation.random(len(planted.tau_s), random_state=rng)),
     }[convention]()
     telemetry = write_telemetry(tmp_path / "other.csv", planted.tau_s, reported)
@@ -410,7 +410,7 @@ BENCH_60_HZ = bench_text(
 )
 
 
-def turning(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def swing_rates(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Up to 1 deg/s across and 0.5 about the boresight: a frame that is missed is up to 60
     arcsec off.
     """
@@ -432,7 +432,7 @@ def missing_run(
         left_out.update(range(first, first + int(rng.integers(1, 8))))
     shown = np.array([slot for slot in slots.tolist() if slot not in left_out])
     frames_s = shown / REFRESH_HZ
-    frames_q = scalar_first(attitude(turning, frames_s))
+    frames_q = scalar_first(attitude(swing_rates, frames_s))
     before = np.diff(shown, prepend=-1) - 1
     ledger = write_ledger(
         folder / "run.mcap", frames_s, frames_q, bench=BENCH_60_HZ, missed_before=before.tolist()

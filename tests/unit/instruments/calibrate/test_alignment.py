@@ -29,6 +29,7 @@ from hilstar.instruments.calibrate.alignment import (
     residual_of,
 )
 from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs
+from tests.support.refusals import refusal
 
 CAMERA = monitor_camera(
     (1920, 1080), 57.65, 350.0, normalise(np.array([1.0, 0.001, -0.002, 0.003]))
@@ -217,8 +218,7 @@ def test_half_of_wild_ones_is_refused(rng):
     commanded = commanded_of(rng, 40)
     reported = turned_by(rng, commanded)
     reported[:20] = commanded_of(rng, 20)
-    with pytest.raises(InputError, match="half or more"):
-        align(pairs_of(commanded, reported), CAMERA)
+    assert "half or more" in refusal(align, pairs_of(commanded, reported), CAMERA)
 
 
 def test_a_frame_whose_z_is_not_the_boresight_is_refused(rng):
@@ -239,8 +239,7 @@ def test_a_tracker_turned_by_half_a_turn_is_no_mistake(rng):
 
 def test_two_pairs_are_too_few(rng):
     commanded = commanded_of(rng, 2)
-    with pytest.raises(InputError, match="2 pairs and 3 are needed"):
-        align(pairs_of(commanded, commanded), CAMERA)
+    assert "2 pairs and 3 are needed" in refusal(align, pairs_of(commanded, commanded), CAMERA)
 
 
 def test_repeats_are_of_one_attitude_whatever_their_sign(rng):
@@ -259,8 +258,7 @@ def test_telemetry_columns_are_named_in_the_cure(rng):
         conjugate(turned_by(rng, commanded)),
         names=COMMANDED,
     )
-    with pytest.raises(InputError, match="write qw,-qx,-qy,-qz"):
-        align(pairs, CAMERA)
+    assert "write qw,-qx,-qy,-qz" in refusal(align, pairs, CAMERA)
 
 
 def test_the_corrected_alignment_has_the_tracker_report_what_is_commanded(rng):

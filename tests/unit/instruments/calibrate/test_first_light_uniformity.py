@@ -32,7 +32,7 @@ MAP_MAG = 0.005
 NOISE = "[tracker.detector]\nread_noise_e = 12.0\nprnu = 0.005\ngain_e_per_dn = 4.0\nbits = 14\n"
 
 
-def planted(folder, grid, name="srgb", bench=None):
+def uneven_bench(folder, grid, name="srgb", bench=None):
     """A bench file that knows nothing of its truth's light against place."""
     bits = 10 if name == "srgb" else 8
     with_uniformity(name, bits, folder / "true.toml", grid)
@@ -78,7 +78,7 @@ def did(folder, step, patches=0, known=None, watched_s=0.0):
 )
 @pytest.mark.usefixtures("charts_of_one")
 def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp_path, grid, seen):
-    folder = planted(tmp_path, grid)
+    folder = uneven_bench(tmp_path, grid)
     before = did(folder, verify)
     assert before.verdict == "failed"
     assert "scatters" in before.line
@@ -102,7 +102,7 @@ def test_an_uneven_screen_is_a_finding_until_it_is_measured_and_then_is_gone(tmp
 
 @pytest.mark.usefixtures("without_charts")
 def test_an_even_screen_has_nothing_written(tmp_path):
-    folder = planted(tmp_path, None)
+    folder = uneven_bench(tmp_path, None)
     found = did(folder, uniformity)
     assert (found.verdict, found.changes) == ("done", ())
     assert "even" in found.line
@@ -112,7 +112,7 @@ def test_an_even_screen_has_nothing_written(tmp_path):
 
 @pytest.mark.usefixtures("without_charts")
 def test_a_map_that_holds_stays_and_one_that_does_not_goes(tmp_path):
-    folder = planted(tmp_path, VIGNETTING)
+    folder = uneven_bench(tmp_path, VIGNETTING)
     did(folder, uniformity)
     again = did(folder, uniformity)
     assert (again.verdict, again.changes) == ("done", ())
@@ -129,7 +129,7 @@ def test_the_example_monitor_keeps_its_shares_and_its_response(tmp_path):
     """By 8 bits, with the response measured after the map: both are in the file that the bench
     names.
     """
-    folder = planted(tmp_path, VIGNETTING, "lcd-example")
+    folder = uneven_bench(tmp_path, VIGNETTING, "lcd-example")
     found = did(folder, uniformity)
     assert found.verdict == "done", found.line
     mine, its = (
@@ -147,7 +147,7 @@ def test_the_example_monitor_keeps_its_shares_and_its_response(tmp_path):
 
 @pytest.mark.usefixtures("without_charts")
 def test_noise_of_the_tracker_is_in_the_errors_of_its_stars(tmp_path):
-    folder = planted(tmp_path, None, bench=NOISE)
+    folder = uneven_bench(tmp_path, None, bench=NOISE)
     found = did(folder, uniformity)
     assert (found.verdict, found.changes) == ("done", ()), found.line
     assert found.figures["left_rms_mag"] == pytest.approx(found.figures["dot_noise_mag"], rel=0.3)
@@ -175,7 +175,7 @@ def test_wild_dots_do_not_bend_the_map():
 @pytest.mark.usefixtures("without_charts")
 def test_dots_that_differ_from_one_to_the_next_are_a_finding(tmp_path):
     """A panel of 80 x 60 fields with 8 % between neighbours: no map of at most 18 x 24 has them."""
-    folder = planted(tmp_path, 1 + np.random.default_rng(2).normal(0, 0.08, (60, 80)))
+    folder = uneven_bench(tmp_path, 1 + np.random.default_rng(2).normal(0, 0.08, (60, 80)))
     found = did(folder, uniformity)
     assert found.verdict == "failed"
     assert "far above" in found.line
@@ -205,7 +205,7 @@ def test_unevenness_that_no_map_shows_for_sure_is_in_the_error(fall):
 @pytest.mark.usefixtures("without_charts")
 def test_dots_brighter_than_those_of_the_focus_are_shown_in_a_darker_code(tmp_path):
     """The step ended there, and sent its user back to a focus that was right."""
-    folder = planted(tmp_path, VIGNETTING)
+    folder = uneven_bench(tmp_path, VIGNETTING)
     found = did(folder, uniformity, known={"focus.dot_code": 1023})
     assert found.verdict == "done", found.line
     names = {
@@ -218,6 +218,6 @@ def test_dots_brighter_than_those_of_the_focus_are_shown_in_a_darker_code(tmp_pa
 
 @pytest.mark.usefixtures("without_charts")
 def test_white_is_watched_in_a_code_that_does_not_saturate(tmp_path):
-    folder = planted(tmp_path, None)
+    folder = uneven_bench(tmp_path, None)
     found = did(folder, warm_up, known={"focus.dot_code": 1023}, watched_s=600.0)
     assert found.verdict == "done", found.line

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.basics.errors import InputError
 from hilstar.display.calibration import load_calibration, primary_responses
 from hilstar.display.response import srgb_light
 from hilstar.instruments.calibrate.measurements import drift_over_run, read_measurements
@@ -19,6 +18,7 @@ from hilstar.instruments.calibrate.photometric import (
 )
 from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches, planned_codes
 from tests.support.commands import run_hilstar_here
+from tests.support.refusals import refusal
 
 NOISE = 0.01
 # The issue's aim, over three decades below white.
@@ -43,7 +43,7 @@ def write(path, rows, header="code,channel,value"):
     return path
 
 
-def measure(path, curve, rng, bits=8, repeats=3, black=0.0, noise=NOISE, unit=250.0):
+def measure_plan(path, curve, rng, bits=8, repeats=3, black=0.0, noise=NOISE, unit=250.0):
     """The default plan, measured with a noise relative to the light."""
     patches = plan_patches(PlanSettings(bits, repeats=repeats), rng)
     light = (curve(np.array([patch.code for patch in patches]) / (2**bits - 1)) + black) * unit
@@ -54,7 +54,7 @@ def measure(path, curve, rng, bits=8, repeats=3, black=0.0, noise=NOISE, unit=25
     )
 
 
-def errors(fit, curve):
+def curve_errors(fit, curve):
     true = curve(np.arange(len(fit.light)) / (len(fit.light) - 1))
     return (fit.light / np.where(true > 0, true, 1) - 1)[true >= FAINTEST]
 
@@ -71,10 +71,10 @@ def test_a_response_is_recovered_to_one_percent_over_three_decades(name, black, 
     repeats = 3 if name in ("gamma", "srgb") else 6
     met = 0
     for seed in range(10):
-        path = measure(
+        path = measure_plan(
             tmp_path / "m.csv", CURVES[name], np.random.default_rng(seed), bits, repeats, black
         )
-        error = errors(fit_channel(read_measurements(path), "w"), CURVES[name])
+        error = curve_errors(fit_channel(read_measurements(path), "w"), CURVES[name])
         met += np.abs(error).max() < WORST and np.sqrt((error**2).mean()) < RMS
     assert met >= 9
 
@@ -87,17 +87,17 @@ def test_even_steps_of_code_do_where_the_light_is_a_power_law(tmp_path):
             1 + NOISE * np.random.default_rng(seed).standard_normal(len(codes))
         )
         path = write(tmp_path / "m.csv", [(c, "w", v) for c, v in zip(codes, light, strict=True)])
-        error = errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])
+        error = curve_errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])
         met += np.abs(error).max() < WORST and np.sqrt((error**2).mean()) < RMS
     assert met >= 9
 
 
 @pytest.mark.parametrize("name", CURVES)
 def test_without_noise_nothing_is_lost(name, tmp_path, rng):
-    path = measure(tmp_path / "m.csv", CURVES[name], rng, black=1e-3, noise=0)
+    path = measure_plan(tmp_path / "m.csv", CURVES[name], rng, black=1e-3, noise=0)
     fit = fit_channel(read_measurements(path), "w")
     # sRGB's kink and the waves, between levels 8 % apart
-    assert np.abs(errors(fit, CURVES[name])).max() < 1e-3
+    assert np.abs(curve_errors(fit, CURVES[name])).max() < 1e-3
     assert fit.black / fit.white == pytest.approx(1e-3, rel=1e-3)
 
 
@@ -105,7 +105,7 @@ def test_the_stated_error_is_the_error(tmp_path):
     """Over 30 seeds and the codes above FAINTEST, error over its stated sigma has an rms near 1."""
     ratios = []
     for seed in range(30):
-        path = measure(tmp_path / "m.csv", cell, np.random.default_rng(seed), black=1e-3)
+        path = measure_plan(tmp_path / "m.csv", cell, np.random.default_rng(seed), black=1e-3)
         fit = fit_channel(read_measurements(path), "w")
         true = cell(np.arange(255) / 255)
         shown = true >= FAINTEST
@@ -117,7 +117,7 @@ def test_the_stated_error_is_the_error(tmp_path):
 
 
 def test_a_held_out_residual_is_that_of_a_fit_without_the_level(tmp_path, rng):
-    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
+    path = measure_plan(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
     data = read_measurements(path)
     whole = fit_channel(data, "w")
     for place in (8, 15, 25):
@@ -142,7 +142,7 @@ def test_a_flat_dark_end_is_made_strictly_rising():
 
 def test_a_link_in_limited_range_has_a_dark_end_that_loads(tmp_path, rng):
     """Codes 1 to 16 are as black as 0."""
-    path = measure(
+    path = measure_plan(
         tmp_path / "m.csv", lambda s: np.maximum(s - 16 / 255, 0) ** 2.2, rng, black=1e-3
     )
     calibrate_photometric(path, tmp_path / "monitor.toml")
@@ -150,12 +150,15 @@ def test_a_link_in_limited_range_has_a_dark_end_that_loads(tmp_path, rng):
 
 
 def test_every_code_of_16_bits_is_fitted(tmp_path, rng):
-    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, bits=16)
-    assert np.abs(errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])).max() < WORST
+    path = measure_plan(tmp_path / "m.csv", CURVES["gamma"], rng, bits=16)
+    assert (
+        np.abs(curve_errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])).max()
+        < WORST
+    )
 
 
 def test_dn_are_divided_by_their_exposure(tmp_path, rng):
-    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
+    path = measure_plan(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
     plain = read_measurements(path)
     rows = [
         (c, "w", v * t, t)
@@ -174,12 +177,14 @@ def test_a_floor_of_the_instrument_does_not_bend_the_faint_end(tmp_path):
     worst = []
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3, noise=0.003, unit=1.0)
+        path = measure_plan(
+            tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3, noise=0.003, unit=1.0
+        )
         data = read_measurements(path)
         value = np.maximum(data.value + 5e-5 * rng.standard_normal(len(data.value)), 0)
         write(path, [(c, "w", v) for c, v in zip(data.code, value, strict=True)])
         worst.append(
-            np.abs(errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])).max()
+            np.abs(curve_errors(fit_channel(read_measurements(path), "w"), CURVES["gamma"])).max()
         )
     assert np.median(worst) < WORST
 
@@ -194,7 +199,7 @@ def test_without_repeats_the_residuals_tell_the_noise(tmp_path, rng):
 
 
 def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rng):
-    path = measure(tmp_path / "m.csv", CURVES["srgb"], rng, black=1e-3)
+    path = measure_plan(tmp_path / "m.csv", CURVES["srgb"], rng, black=1e-3)
     summary = calibrate_photometric(
         path, tmp_path / "monitor.toml", Provenance('a "b"\nc', instrument="meter", unit="cd/m2")
     )
@@ -276,19 +281,17 @@ def test_the_scatter_of_a_black_without_light_is_no_relative_noise(tmp_path, rng
 
 
 def test_a_drawing_says_what_it_shows(tmp_path, rng):
-    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
+    path = measure_plan(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
     finding = draw_calibration(path, tmp_path / "m.png")
     assert "rms off" in finding
     with Image.open(tmp_path / "m.png") as image:
         assert image.size[0] > 500
 
 
-def refused(path, **more):
-    with pytest.raises(InputError) as caught:
-        calibrate_photometric(path, path.with_name("monitor.toml"), **more)
-    assert "\n" not in str(caught.value)
+def fit_refusal(path, **more):
+    line = refusal(calibrate_photometric, path, path.with_name("monitor.toml"), **more)
     assert not path.with_name("monitor.toml").exists()
-    return str(caught.value)
+    return line
 
 
 def ramp(codes, bits=8, curve=CURVES["gamma"], repeats=3, black=1e-3):
@@ -311,36 +314,36 @@ STEPS = [0, 1, *range(5, 256, 10)]
     ],
 )
 def test_levels_that_are_missing_are_named(codes, words, tmp_path):
-    assert words in refused(write(tmp_path / "m.csv", ramp(codes)))
+    assert words in fit_refusal(write(tmp_path / "m.csv", ramp(codes)))
 
 
 def test_a_saturated_instrument_is_named(tmp_path):
     clipped = ramp(STEPS, curve=lambda s: min(s**2.2, 0.8))
-    assert "saturated or the link clips" in refused(write(tmp_path / "m.csv", clipped))
+    assert "saturated or the link clips" in fit_refusal(write(tmp_path / "m.csv", clipped))
     at_limit = [(c, "w", min(round(4000 * (v / 0.85)), 4095)) for c, _, v in ramp(STEPS)]
-    assert "codes 245 to 255 read the same" in refused(write(tmp_path / "m.csv", at_limit))
+    assert "codes 245 to 255 read the same" in fit_refusal(write(tmp_path / "m.csv", at_limit))
 
 
 def test_light_that_falls_beyond_the_noise_is_named(tmp_path):
     rows = [(c, n, v * (0.7 if c == 125 else 1)) for c, n, v in ramp(STEPS)]
-    assert "from code 115 to code 125" in refused(write(tmp_path / "m.csv", rows))
+    assert "from code 115 to code 125" in fit_refusal(write(tmp_path / "m.csv", rows))
 
 
 def test_a_drift_is_refused_and_noise_is_not_taken_for_one(tmp_path, rng):
-    path = measure(tmp_path / "m.csv", CURVES["gamma"], rng)
+    path = measure_plan(tmp_path / "m.csv", CURVES["gamma"], rng)
     data = read_measurements(path)
     for seed in range(20):
         again = read_measurements(
-            measure(tmp_path / "m.csv", CURVES["gamma"], np.random.default_rng(seed))
+            measure_plan(tmp_path / "m.csv", CURVES["gamma"], np.random.default_rng(seed))
         )
         drift, error = drift_over_run(again)
         assert abs(drift) < 4 * error
     falling = data.value * np.linspace(1, 0.97, len(data.value))
     rows = list(zip(data.code, data.channel, falling, strict=True))
-    assert "light drifts by -" in refused(write(tmp_path / "m.csv", rows))
+    assert "light drifts by -" in fit_refusal(write(tmp_path / "m.csv", rows))
     # The same rows sorted, their times beside them.
     timed = sorted((c, n, v, 10.0 * t) for t, (c, n, v) in enumerate(rows))
-    assert "light drifts by -" in refused(
+    assert "light drifts by -" in fit_refusal(
         write(tmp_path / "m.csv", timed, "code,channel,value,t_s")
     )
 
@@ -368,22 +371,24 @@ def test_a_drift_is_refused_and_noise_is_not_taken_for_one(tmp_path, rng):
 )
 def test_a_malformed_file_is_refused_in_one_line(text, words, tmp_path):
     (tmp_path / "m.csv").write_text(text)
-    assert words in refused(tmp_path / "m.csv")
+    assert words in fit_refusal(tmp_path / "m.csv")
 
 
 def test_bits_are_those_of_the_largest_code_unless_given(tmp_path):
     path = write(tmp_path / "m.csv", ramp([0, 300]))
     assert read_measurements(path).bits == 10
     assert read_measurements(path, 12).bits == 12
-    assert "outside 8 bits" in refused(path, bits=8)
-    assert "white, code 1023 of 10 bits" in refused(path)
+    assert "outside 8 bits" in fit_refusal(path, bits=8)
+    assert "white, code 1023 of 10 bits" in fit_refusal(path)
 
 
 def test_other_files_are_refused(tmp_path):
-    assert "cannot be read" in refused(tmp_path / "none.csv")
+    assert "cannot be read" in fit_refusal(tmp_path / "none.csv")
     (tmp_path / "m.csv").write_bytes(b"\xff\xfe\x00")
-    assert "not UTF-16 to its end" in refused(tmp_path / "m.csv")
+    assert "not UTF-16 to its end" in fit_refusal(tmp_path / "m.csv")
     (tmp_path / "monitor.csv").write_text(
         "\ufeffcode,channel,value\n" + "".join(f"{c},w,{v}\n" for c, _, v in ramp(STEPS))
     )
-    assert "written over" in refused(tmp_path / "monitor.csv")  # and a byte-order mark is no fault
+    assert "written over" in fit_refusal(
+        tmp_path / "monitor.csv"
+    )  # and a byte-order mark is no fault

@@ -51,7 +51,7 @@ MAX_RMS_SIGMAS = 1.5
 GRID = 9
 
 
-def planted(folder, tilt_deg=0.0):
+def tilted_screen(folder, tilt_deg=0.0):
     """A bench file and the screen as it truly stands."""
     (folder / "bench.toml").write_text(bench_text(SMALL_FIELD))
     file = read_bench_file(folder / "bench.toml")
@@ -82,13 +82,15 @@ def dots_of(file, seen, seed, noise_px, dot_noise_px=0.0):
     return problem, data
 
 
-def error_of(file, seen, names, seed, noise_px, dot_noise_px=0.0):
+def lens_error(file, seen, names, seed, noise_px, dot_noise_px=0.0):
     """The rms error of a lens with such parameters over the tracker's field, in its stated
     error.
     """
     problem, data = dots_of(file, seen, seed, noise_px, dot_noise_px)
     found = fit(problem, Model(names), 0, data)
-    return off_arcsec(found.geometry, seen) / uncertainty_of(problem, found, data).rms_arcsec
+    return (
+        field_error_arcsec(found.geometry, seen) / uncertainty_of(problem, found, data).rms_arcsec
+    )
 
 
 @pytest.mark.parametrize(("names", "degree"), [(PINHOLE, 0), (BROWN_CONRADY, 3)])
@@ -98,7 +100,7 @@ def test_a_model_is_compared_in_few_steps_by_the_error_of_many(
     """Half of first light's time went to fits that crept along a bent valley, for a choice
     between models that differ by 2 % and more.
     """
-    problem, data = dots_of(*planted(tmp_path, tilt_deg=2.0), 3, 0.01)
+    problem, data = dots_of(*tilted_screen(tmp_path, tilt_deg=2.0), 3, 0.01)
     steps = []
     slopes = geometric_fit._Loss.slopes
 
@@ -116,7 +118,7 @@ def test_a_model_is_compared_in_few_steps_by_the_error_of_many(
     assert count < 0.75 * (len(steps) - count)
 
 
-def off_arcsec(geometry, seen):
+def field_error_arcsec(geometry, seen):
     """The rms error of directions over the tracker's field."""
     sides = (np.linspace(0, size - 1, GRID) for size in seen.tracker.resolution_px)
     u, v = (part.ravel() for part in np.meshgrid(*sides))
@@ -132,15 +134,15 @@ def test_a_lens_that_noise_hides_is_in_the_error_of_a_pinhole(tmp_path):
     """A tilt of 2.5 degrees: the covariance of a pinhole's four numbers alone is half of its
     error.
     """
-    file, seen = planted(tmp_path, tilt_deg=2.5)
-    off = [error_of(file, seen, PINHOLE, seed, noise_px=0.1) for seed in range(SEEDS)]
+    file, seen = tilted_screen(tmp_path, tilt_deg=2.5)
+    off = [lens_error(file, seen, PINHOLE, seed, noise_px=0.1) for seed in range(SEEDS)]
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS_SIGMAS
 
 
 def test_dots_with_errors_of_their_own_are_not_averaged_over_frames(tmp_path):
-    file, seen = planted(tmp_path, tilt_deg=3.0)
+    file, seen = tilted_screen(tmp_path, tilt_deg=3.0)
     off = [
-        error_of(file, seen, BROWN_CONRADY, seed, noise_px=0.004, dot_noise_px=0.02)
+        lens_error(file, seen, BROWN_CONRADY, seed, noise_px=0.004, dot_noise_px=0.02)
         for seed in range(SEEDS)
     ]
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS_SIGMAS
@@ -166,7 +168,7 @@ def test_a_larger_model_is_taken_for_more_than_chance(is_chance, chosen):
 
 @pytest.mark.parametrize("psf_sigma_px", [0.5, 2.8])
 def test_no_dot_is_planned_whose_window_leaves_the_image(tmp_path, psf_sigma_px):
-    _, seen = planted(tmp_path)
+    _, seen = tilted_screen(tmp_path)
     seen = dataclasses.replace(seen, psf_sigma_px=psf_sigma_px)
     plan = plan_seen_dots(seen, 16, lit_for(seen), np.random.default_rng(0))
     x, y = seen.tracker.project(

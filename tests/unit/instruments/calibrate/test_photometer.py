@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.basics.errors import InputError
 from hilstar.display.calibration import (
     CalibrationHead,
     NotesTable,
@@ -33,6 +32,7 @@ from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.tracker.rounding import before_adc_dn, cut_light, rounding_error, rounding_rms
 from tests.support.benches import TWIN, bench_text
+from tests.support.refusals import refusal
 
 pytestmark = pytest.mark.usefixtures("without_charts")
 BITS, BLACK, POWER = 8, 1e-3, 2.35
@@ -55,7 +55,7 @@ NOISY = {
 SILENT = {"gain_e_per_dn": 24.0, "read_noise_e": 0.0, "dark_e_per_s": 0.0, "offset_dn": 40.0}
 
 
-def planted(folder, detector, collimator_mm=120, black=BLACK):
+def power_law_bench(folder, detector, collimator_mm=120, black=BLACK):
     """A bench file that supposes sRGB, and its truth: a power law with a black level."""
     light = gamma_response(BITS, POWER).light + black
     head = CalibrationHead(
@@ -72,7 +72,7 @@ def planted(folder, detector, collimator_mm=120, black=BLACK):
     (folder / "truth.toml").write_text(bench_text(TWIN, true))
 
 
-def measured(folder, seed, sets_exposure=True, black=BLACK):
+def measured_light(folder, seed, sets_exposure=True, black=BLACK):
     """What the step comes to on the planted bench, and its figures in sigmas: the response by
     decades, and black.
     """
@@ -102,10 +102,10 @@ def test_a_response_and_its_black_level_are_as_far_off_as_their_errors_say(detec
     """The ratios of lattices, read once each, put all codes beside white up to 8 sigmas off, and
     black was 20 off.
     """
-    planted(tmp_path, detector)
+    power_law_bench(tmp_path, detector)
     off, black = [], []
     for seed in range(4):
-        _, response, level = measured(tmp_path, seed)
+        _, response, level = measured_light(tmp_path, seed)
         off.append(response)
         black.append(level)
     assert np.sqrt(np.mean(np.square(off))) < MAX_RMS
@@ -117,7 +117,7 @@ def test_the_glow_of_a_screen_that_is_darker_at_its_edges_is_counted_by_its_ligh
     """A black screen glows beyond the dots' square, where less light comes from: black was 0.5 %
     too low, 7 of its errors.
     """
-    planted(tmp_path, NOISY, black=BRIGHT_BLACK)
+    power_law_bench(tmp_path, NOISY, black=BRIGHT_BLACK)
     y, x = ((np.arange(count) + 0.5) / count * 2 - 1 for count in (9, 16))
     grid = 1 - EDGE_FALL * (x[None] ** 2 + y[:, None] ** 2) / 2
     add_uniformity(tmp_path / "true-light.toml", grid)
@@ -132,7 +132,7 @@ def test_the_glow_of_a_screen_that_is_darker_at_its_edges_is_counted_by_its_ligh
     tables = {"monitor": {"bits": BITS, "calibration": "known.toml"}, "tracker.detector": NOISY}
     tables["collimator"] = {"focal_length_mm": 120}
     bench.write_text(bench_text(TWIN, tables))
-    _, off, black = measured(tmp_path, 0, black=BRIGHT_BLACK)
+    _, off, black = measured_light(tmp_path, 0, black=BRIGHT_BLACK)
     assert np.abs(off).max() < SURE
     assert abs(black) < SURE
     error = read_toml(tmp_path / "response.toml").errors.black
@@ -142,22 +142,21 @@ def test_the_glow_of_a_screen_that_is_darker_at_its_edges_is_counted_by_its_ligh
 
 def test_a_black_screen_that_saturates_the_tracker_is_named(tmp_path):
     """It was told as squares that are not in the image, and to expose longer."""
-    planted(tmp_path, NOISY)
+    power_law_bench(tmp_path, NOISY)
     file, true = (read_bench_file(tmp_path / name) for name in ("bench.toml", "truth.toml"))
     with closing(VirtualBench(file, true, 0)) as source:
         context = StepContext(file, tmp_path, tmp_path / "images", source, {}, {}, 96)
         dark = context.dark()
         full = np.full_like(context.read(dark), context.full_dn)
-        with pytest.raises(InputError, match="black screen fills the tracker to 100%"):
-            context.looked(dark, full)
+        assert "black screen fills the tracker to 100%" in refusal(context.looked, dark, full)
 
 
 def test_a_tracker_without_noise_before_wide_pixels_gives_one_smooth_response(tmp_path):
     """A monitor pixel is 3.7 tracker pixels: no lattice is brighter than a lone pixel, and codes
     were read as 0 or 1 DN.
     """
-    planted(tmp_path, SILENT, collimator_mm=30)
-    outcome, off, black = measured(tmp_path, 0)
+    power_law_bench(tmp_path, SILENT, collimator_mm=30)
+    outcome, off, black = measured_light(tmp_path, 0)
     assert np.abs(off).max() < SURE
     assert abs(black) < SURE
     assert float(outcome.figures["error_at_1e-3_percent"]) < 1.0
@@ -165,8 +164,8 @@ def test_a_tracker_without_noise_before_wide_pixels_gives_one_smooth_response(tm
 
 
 def test_what_rounding_takes_of_codes_that_cannot_be_exposed_longer_is_in_their_errors(tmp_path):
-    planted(tmp_path, SILENT, collimator_mm=30)
-    outcome, off, black = measured(tmp_path, 0, sets_exposure=False)
+    power_law_bench(tmp_path, SILENT, collimator_mm=30)
+    outcome, off, black = measured_light(tmp_path, 0, sets_exposure=False)
     assert np.abs(off).max() < SURE
     assert abs(black) < SURE
     # Half a step of the ADC, of codes whose peak is a few steps.
@@ -174,8 +173,8 @@ def test_what_rounding_takes_of_codes_that_cannot_be_exposed_longer_is_in_their_
 
 
 def test_the_command_and_the_step_give_the_same_figures(tmp_path):
-    planted(tmp_path, NOISY)
-    outcome, _, _ = measured(tmp_path, 0)
+    power_law_bench(tmp_path, NOISY)
+    outcome, _, _ = measured_light(tmp_path, 0)
     found = calibrate_photometric(tmp_path / "measured.csv", tmp_path / "again.toml", bits=BITS)
     mine, its = (read_toml(tmp_path / name).errors for name in ("response.toml", "again.toml"))
     assert mine == its
@@ -188,7 +187,7 @@ def test_the_command_and_the_step_give_the_same_figures(tmp_path):
     assert np.array_equal(*responses)
 
 
-def written(path, rows, header):
+def write_rows(path, rows, header):
     path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
     return path
 
@@ -213,7 +212,7 @@ def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
             (code, "w", one, 0.001 * one + 1e-7, 0.01 * one * below)
             for code, one, below in zip(codes, value, faint, strict=True)
         ]
-        path = written(tmp_path / "m.csv", rows, "code,channel,value,sigma,common_range")
+        path = write_rows(tmp_path / "m.csv", rows, "code,channel,value,sigma,common_range")
         fit = fit_channel(read_measurements(path), "w")
         code = 60
         ratios.append(
@@ -233,7 +232,7 @@ def test_levels_that_no_smooth_curve_meets_have_larger_errors(tmp_path):
     light = gamma_response(BITS, POWER).light[codes] * scatter
     rows = [(code, "w", one, 1e-4 * one + 1e-9) for code, one in zip(codes, light, strict=True)]
     fit = fit_channel(
-        read_measurements(written(tmp_path / "m.csv", rows, "code,channel,value,sigma")), "w"
+        read_measurements(write_rows(tmp_path / "m.csv", rows, "code,channel,value,sigma")), "w"
     )
     codes = np.arange(40, 255)
     off = fit.light[codes] / gamma_response(BITS, POWER).light[codes] - 1

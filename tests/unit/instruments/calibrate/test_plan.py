@@ -17,6 +17,7 @@ from hilstar.instruments.calibrate.plan import (
     write_patches,
     write_plan,
 )
+from tests.support.refusals import refusal
 
 
 def read_png(path):
@@ -86,5 +87,4 @@ def test_a_patch_of_one_primary_lights_that_primary(tmp_path):
     ],
 )
 def test_a_plan_that_cannot_be_measured_is_refused(arguments):
-    with pytest.raises(InputError, match="; write "):
-        PlanSettings(**{"bits": 8, **arguments})
+    assert "; write " in refusal(PlanSettings, **{"bits": 8, **arguments})

@@ -33,6 +33,7 @@ from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.cameras import bench_camera
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.refusals import refusal
 
 NOISE_ARCSEC = 1.0
 BENCHES = 1000
@@ -42,7 +43,7 @@ EXACT_ARCSEC = 1e-3
 DOTS = ((0.05, 0.02, 1.0), (-0.06, 0.03, 1.0), (0.01, -0.07, 1.0))
 
 
-def turned(rng: np.random.Generator, size: float = 1.0) -> FloatArray:
+def random_rotation(rng: np.random.Generator, size: float = 1.0) -> FloatArray:
     """A rotation matrix by chance; with a small `size` near the identity."""
     q = normalise(np.array([1.0, *(size * rng.normal(size=3))]))
     return to_matrix(q)
@@ -53,7 +54,7 @@ def angles_deg(direction: FloatArray) -> tuple[float, float]:
     return azimuth, math.degrees(math.asin(-direction[2]))
 
 
-def planted(
+def planted_cube_readings(
     rng: np.random.Generator,
     noise_arcsec: float = NOISE_ARCSEC,
     stations: bool = True,
@@ -63,9 +64,9 @@ def planted(
     """The readings of a display and a cube that stand by chance, and the rotation between them."""
     # mon looks along the horizon, and the cube is levelled to some degrees
     level = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    from_mon = turned(rng, 0.05) @ level
+    from_mon = random_rotation(rng, 0.05) @ level
     cube = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
-    from_cube = turned(rng, 0.05) @ cube
+    from_cube = random_rotation(rng, 0.05) @ cube
     zero_deg = float(rng.uniform(-180, 180)) if stations else 0.0
     rows = []
 
@@ -92,13 +93,13 @@ def planted(
     return "\n".join([head, *rows]) + "\n", from_matrix(from_cube.T @ from_mon)
 
 
-def fitted(folder: Path, text: str) -> Any:
+def fitted_reference(folder: Path, text: str) -> Any:
     path = folder / "readings.csv"
     path.write_text(text)
     return fit_reference(path, read_readings(path, None))
 
 
-def off_arcsec(found: FloatArray, true: FloatArray) -> FloatArray:
+def axis_errors_arcsec(found: FloatArray, true: FloatArray) -> FloatArray:
     """The error of a rotation about mon's axes (3,)."""
     return np.asarray(ARCSEC_PER_RAD * to_rotation_vector(multiply(conjugate(true), found)))
 
@@ -107,9 +108,9 @@ def off_arcsec(found: FloatArray, true: FloatArray) -> FloatArray:
 def test_a_rotation_is_found_exactly_without_noise(
     tmp_path: Path, stations: bool, rng: np.random.Generator
 ) -> None:
-    text, true = planted(rng, 0.0, stations)
-    found = fitted(tmp_path, text)
-    assert np.abs(off_arcsec(found.q_mon_to_reference, true)).max() < EXACT_ARCSEC
+    text, true = planted_cube_readings(rng, 0.0, stations)
+    found = fitted_reference(tmp_path, text)
+    assert np.abs(axis_errors_arcsec(found.q_mon_to_reference, true)).max() < EXACT_ARCSEC
 
 
 @pytest.mark.parametrize("sigma", [False, True])
@@ -121,10 +122,10 @@ def test_the_intervals_of_1000_benches_hold(
     held = np.zeros(3)
     small = []
     for _ in range(BENCHES):
-        text, true = planted(rng, stations=True, sigma=sigma)
-        found = fitted(tmp_path, text)
+        text, true = planted_cube_readings(rng, stations=True, sigma=sigma)
+        found = fitted_reference(tmp_path, text)
         k = 1.96 if found.dof is None else float(stats.t.ppf(0.975, found.dof))
-        off = np.abs(off_arcsec(found.q_mon_to_reference, true))
+        off = np.abs(axis_errors_arcsec(found.q_mon_to_reference, true))
         held += off <= k * np.array(found.sigma_arcsec)
         small.append(max(found.sigma_arcsec[:2]))
     assert (held >= MIN_HELD).all() and (held <= MAX_HELD).all()
@@ -135,8 +136,8 @@ def test_the_intervals_of_1000_benches_hold(
 def test_scatter_that_contradicts_the_stated_sigmas_counts(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    text, _ = planted(rng, 10.0, sigma=True)
-    found = fitted(tmp_path, text.replace(",10,", ",1,"))
+    text, _ = planted_cube_readings(rng, 10.0, sigma=True)
+    found = fitted_reference(tmp_path, text.replace(",10,", ",1,"))
     assert found.dof is not None and max(found.sigma_arcsec) > 3.0
 
 
@@ -156,9 +157,9 @@ def test_scatter_that_contradicts_the_stated_sigmas_counts(
 def test_readings_that_tell_no_rotation_are_refused(
     tmp_path: Path, change: Any, told: str, rng: np.random.Generator
 ) -> None:
-    rows = planted(rng)[0].splitlines()
+    rows = planted_cube_readings(rng)[0].splitlines()
     with pytest.raises(InputError, match=told):
-        fitted(tmp_path, "\n".join(change(rows)) + "\n")
+        fitted_reference(tmp_path, "\n".join(change(rows)) + "\n")
 
 
 def test_a_dot_by_its_pixel_is_where_the_bench_shows_it(
@@ -174,14 +175,13 @@ def test_a_dot_by_its_pixel_is_where_the_bench_shows_it(
     ray = camera.rays(np.array([200.0]), np.array([300.0]))[0]
     assert reading.direction is not None
     assert reading.direction == pytest.approx(ray / np.linalg.norm(ray))
-    with pytest.raises(InputError, match="--bench"):
-        read_readings(path, None)
+    assert "--bench" in refusal(read_readings, path, None)
 
 
 def test_the_command_prints_a_table_that_a_bench_file_takes(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    text, true = planted(rng)
+    text, true = planted_cube_readings(rng)
     (tmp_path / "readings.csv").write_text(text)
     words = ("calibrate", "reference", "readings.csv", "-o", "alignment.toml", "--name", "cube 7")
     done = run_hilstar_here(*words, cwd=tmp_path)
@@ -194,8 +194,8 @@ def test_the_command_prints_a_table_that_a_bench_file_takes(
     after.write_text(f"{bench_text()}\n{table}")
     file = read_bench_file(after)
     assert file.config.alignment is not None and file.config.alignment.name == "cube 7"
-    off = off_arcsec(np.array(file.config.alignment.q_mon_to_reference), true)
-    assert np.abs(off).max() < 5 * max(fitted(tmp_path, text).sigma_arcsec)
+    off = axis_errors_arcsec(np.array(file.config.alignment.q_mon_to_reference), true)
+    assert np.abs(off).max() < 5 * max(fitted_reference(tmp_path, text).sigma_arcsec)
     # what is said of a bench changes no frame
     assert file.sha256 == read_bench_file(before).sha256
     assert_refused(run_hilstar_here(*words[:3], "-o", "a.csv", cwd=tmp_path), 2, ".toml")
@@ -217,7 +217,7 @@ def test_a_bench_file_with_a_wrong_table_is_refused(tmp_path: Path) -> None:
 
 
 def test_the_table_keeps_what_was_found(tmp_path: Path, rng: np.random.Generator) -> None:
-    found = fitted(tmp_path, planted(rng)[0])
+    found = fitted_reference(tmp_path, planted_cube_readings(rng)[0])
     path = tmp_path / "bench.toml"
     path.write_text(f"{bench_text()}\n{toml_of(found, '', '2026-01-01')}")
     settings = read_bench_file(path).config.alignment

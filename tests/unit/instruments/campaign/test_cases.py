@@ -22,11 +22,15 @@ from hilstar.instruments.campaign.plan import Design, parse_plan
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.sky.bodies.orbit import TleOrbit
+from hilstar.sky.bodies.shapes import EQUATOR_KM
+from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
 from tests.support.commands import run_hilstar_here
+from tests.support.refusals import refusal
 
 
-def session(folder: Path, images: bool = False) -> Session:
+def cases_session(folder: Path, images: bool = False) -> Session:
     """A session of the plan in a folder."""
     plan, bench = folder / "plan.toml", folder / "bench.toml"
 
@@ -61,7 +65,7 @@ def points(this: Session, cases: int) -> Any:
 
 def test_a_case_does_not_depend_on_the_cases_before_it(tmp_path: Path) -> None:
     write_campaign(tmp_path)
-    first, second = session(tmp_path), session(tmp_path)
+    first, second = cases_session(tmp_path), cases_session(tmp_path)
     where = points(first, 6)
     forwards = [first.row(k, where[k]) for k in range(6)]
     backwards = [second.row(k, where[k]) for k in reversed(range(6))]
@@ -73,7 +77,7 @@ def test_a_case_does_not_depend_on_the_cases_before_it(tmp_path: Path) -> None:
 
 def test_a_case_is_made_again_by_simulate_and_its_image_has_its_truth(tmp_path: Path) -> None:
     write_campaign(tmp_path, {"key": "noise_seed", "values": [11]})
-    this = session(tmp_path, images=True)
+    this = cases_session(tmp_path, images=True)
     row = this.row(0, points(this, 1)[0])
     this.close()
     q = ",".join(repr(row[name]) for name in ("qw", "qx", "qy", "qz"))
@@ -96,7 +100,7 @@ def test_a_case_is_made_again_by_simulate_and_its_image_has_its_truth(tmp_path: 
 
 def test_a_run_of_frames_turns_at_its_rate_and_its_scatter_is_its_noise(tmp_path: Path) -> None:
     write_campaign(tmp_path, {"key": "rate_deg_s.z", "values": [2.0]}, frames=4, step_s=0.5)
-    this = session(tmp_path)
+    this = cases_session(tmp_path)
     where = points(this, 1)[0]
     case = this.maker.case(0, where)
     last = this.maker.view(case, 3, 0.1)
@@ -132,7 +136,7 @@ def test_the_display_shows_what_the_tracker_would_see_and_its_misalignment(tmp_p
         parse_plan(tmp_path / "plan.toml", (tmp_path / "plan.toml").read_text()).through
         == "display"
     )
-    this = session(tmp_path)
+    this = cases_session(tmp_path)
     rows = [this.row(k, np.array([0.5, 0.0, 0.0, share])) for k, share in enumerate((0.25, 0.75))]
     this.close()
     straight, turned = (np.array([row[f"error_{axis}_arcsec"] for axis in "xyz"]) for row in rows)
@@ -162,7 +166,7 @@ def test_a_scenario_is_varied_like_any_key_and_a_file_that_changes_is_another_ca
     write_campaign(
         tmp_path, scenario, {"key": "time_s", "values": [0.0, 2.0]}, sampling="grid", cases=None
     )
-    this = session(tmp_path)
+    this = cases_session(tmp_path)
     look = np.array([0.3, 0.6, 0.1])
     found = [
         this.row(k, np.append(look, [(k // 2 + 0.5) / 2, (k % 2 + 0.5) / 2]))["matched"]
@@ -224,11 +228,45 @@ def test_a_case_beside_a_body_looks_at_its_angle_from_where_astropy_has_it(tmp_p
     assert np.linalg.norm(beside.mean(axis=0)) < 0.25  # on every side: 0.5 / sqrt(20), twice over
 
 
+@pytest.mark.parametrize("limb_deg", [20.0, -10.0, -90.0])
+def test_a_case_beside_the_earth_looks_at_its_angle_from_the_limb(
+    tmp_path: Path, limb_deg: float
+) -> None:
+    tle = ROOT / "configs" / "plans" / "low-orbit.tle"
+    plan = write_campaign(
+        tmp_path,
+        {"key": "sky.epoch_utc", "values": ["2026-03-20T12:00:00"]},
+        {"key": "spacecraft.orbit", "values": [str(tle)]},
+        {"key": "sky.bodies.earth", "values": [True]},
+        {"key": "limb_deg", "values": [limb_deg]},
+        {"key": "time_s", "values": [600.0]},
+        attitudes={"kind": "body", "body": "earth"},
+    )
+    file = read_bench_file(tmp_path / "bench.toml")
+    maker = CaseMaker(parse_plan(plan, plan.read_text()), file, tmp_path)
+    utc_ns = int(np.datetime64("2026-03-20T12:10:00", "ns").astype(np.int64))
+    place_km, _ = TleOrbit(tle.read_text(), "low-orbit.tle").state(utc_ns)
+    radius_deg = np.degrees(np.arcsin(EQUATOR_KM / np.linalg.norm(place_km)))
+    # deeper than the middle of the disc is nowhere
+    wanted_deg = max(radius_deg + limb_deg, 0.0)
+    for k, point in enumerate(np.random.default_rng(1).random((5, 8))):
+        boresight = to_matrix(maker.case(k, point).first.q_icrs_to_cam)[2]
+        off = np.arccos(-boresight @ place_km / np.linalg.norm(place_km))
+        # the aberration by the orbit's velocity: 5 arcsec
+        assert np.degrees(off) == pytest.approx(wanted_deg, abs=0.003)
+
+
+def test_a_body_has_an_angle_from_its_middle_or_from_its_limb(tmp_path: Path) -> None:
+    plan = write_campaign(
+        tmp_path, {"key": "body_deg", "values": [30.0]}, {"key": "limb_deg", "values": [30.0]}
+    )
+    with pytest.raises(InputError, match="are one angle"):
+        parse_plan(plan, plan.read_text())
+
+
 def test_a_body_that_the_bench_has_not_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="bench has none"):
-        bodied(tmp_path, body="moon")
-    with pytest.raises(InputError, match="go together"):
-        bodied(tmp_path, body=None)
+    assert "bench has none" in refusal(bodied, tmp_path, body="moon")
+    assert "go together" in refusal(bodied, tmp_path, body=None)
 
 
 def test_a_case_that_speeds_up_turns_as_its_rate_says(tmp_path: Path) -> None:
@@ -260,7 +298,7 @@ def test_a_case_that_speeds_up_turns_as_its_rate_says(tmp_path: Path) -> None:
 def test_stray_light_is_even_and_in_every_exposure(tmp_path: Path) -> None:
     vary = {"key": "stray_e_per_px", "values": [0.0, 5000.0]}
     write_campaign(tmp_path, vary, sampling="grid", cases=2, frames=2)
-    this = session(tmp_path)
+    this = cases_session(tmp_path)
     where = Design("grid", 7, 2, 3, [2]).points(0, 2)
     for number, wanted_e in ((0, 0.0), (1, 5000.0)):
         case = this.maker.case(number, where[number])

@@ -18,6 +18,7 @@ from hilstar.instruments.campaign.plan import Design, parse_plan, read_plan
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.campaigns import plan_text, write_campaign
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.refusals import refusal
 
 PSF: dict[str, Any] = {"key": "tracker.psf_sigma_px", "minimum": 0.5, "maximum": 1.0}
 
@@ -148,13 +149,11 @@ def test_attitudes_are_even_over_the_sky_and_within_the_field(tmp_path: Path) ->
 
 def test_a_quantity_of_further_columns_asks_for_them(tmp_path: Path) -> None:
     require = '[[require]]\nquantity = "rate-bias"\nmaximum = 1.0\n'
-    with pytest.raises(InputError, match="write columns = "):
-        parse_plan(tmp_path / "plan.toml", plan_text() + require)
+    assert "write columns = " in refusal(parse_plan, tmp_path / "plan.toml", plan_text() + require)
     plan = parse_plan(tmp_path / "plan.toml", plan_text(columns=["rate"]) + require)
     assert plan.columns == ("rate",)
 
 
 def test_an_edge_is_of_a_sweep(tmp_path: Path) -> None:
     require = '[[require]]\nquantity = "edge"\nmaximum = 1.0\n'
-    with pytest.raises(InputError, match="is of a sweep"):
-        parse_plan(tmp_path / "plan.toml", plan_text() + require)
+    assert "is of a sweep" in refusal(parse_plan, tmp_path / "plan.toml", plan_text() + require)

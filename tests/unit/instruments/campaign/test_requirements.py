@@ -15,6 +15,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import looking_q
 from hilstar.instruments.campaign.figures import BoundedFigure
 from hilstar.instruments.campaign.plan import Attitudes, Require, parse_plan
@@ -29,7 +30,6 @@ from hilstar.instruments.campaign.requirements import (
     quantile_limits,
     verdicts_of,
 )
-from hilstar.instruments.campaign.results import Columns
 
 SCALE = Scale(2000.0, (1024, 1024))
 RATES = 6000  # answers of a campaign that has to tell 0.12 from 0.1: five standard errors
@@ -100,7 +100,7 @@ def simulated(
     return Columns(n, columns, {})
 
 
-def verdict(cases: Columns, **keys: Any) -> RequirementVerdict:
+def requirement_verdict(cases: Columns, **keys: Any) -> RequirementVerdict:
     return verdicts_of([Require(**keys)], cases, SCALE, 1)[0]
 
 
@@ -145,12 +145,12 @@ def test_planted_violations_are_found_and_clean_campaigns_are_not_accused(
     make, keys = PLANTED[quantity]
     many = quantity in CHEAP
     for _ in range(VIOLATIONS if many else 1):
-        found = verdict(make(rng, 1.2), quantity=quantity, **keys)
+        found = requirement_verdict(make(rng, 1.2), quantity=quantity, **keys)
         assert found.verdict == NOT_MET and found.bound is not None
         limit = next(value for name, value in keys.items() if name in ("maximum", "minimum"))
         assert (found.bound > limit) == ("maximum" in keys)
     for _ in range(CLEAN if many else 1):
-        assert verdict(make(rng, 0.8), quantity=quantity, **keys).verdict != NOT_MET
+        assert requirement_verdict(make(rng, 0.8), quantity=quantity, **keys).verdict != NOT_MET
 
 
 def test_a_limit_of_clopper_pearson_and_of_order_statistics_fails_as_often_as_its_confidence_says(
@@ -172,7 +172,7 @@ def test_answers_of_one_case_that_go_together_are_not_counted_as_independent(
 ) -> None:
     cases = simulated(rng, RATES, frames=10)
     cases.numbers["solved"] = 10.0 * (rng.random(RATES) < 0.903)  # a case answers always or never
-    found = verdict(cases, quantity="availability", minimum=0.9)
+    found = requirement_verdict(cases, quantity="availability", minimum=0.9)
     assert found.verdict == NOT_SHOWN and found.more is not None and "design effect" in found.method
 
 
@@ -192,17 +192,22 @@ def test_the_benchs_own_error_is_taken_off_a_limit(rng: np.random.Generator) -> 
 
 def test_too_few_cases_say_how_many_more_it_takes(rng: np.random.Generator) -> None:
     # 59 cases without one over the limit show 95 % at 95 %, by 0.95^59 = 4.8 %.
-    few = verdict(simulated(rng, 40), quantity="recovery", maximum=1.0, share=0.95)
+    few = requirement_verdict(simulated(rng, 40), quantity="recovery", maximum=1.0, share=0.95)
     assert few.verdict == NOT_SHOWN and few.more == 19 and few.bound is None
-    assert verdict(simulated(rng, 59), quantity="recovery", maximum=1.0, share=0.95).verdict == MET
-    noise = verdict(simulated(rng, 60), quantity="noise", maximum=1.05)
+    assert (
+        requirement_verdict(
+            simulated(rng, 59), quantity="recovery", maximum=1.0, share=0.95
+        ).verdict
+        == MET
+    )
+    noise = requirement_verdict(simulated(rng, 60), quantity="noise", maximum=1.05)
     assert noise.verdict == NOT_SHOWN and noise.more and noise.more > 60
-    short = verdict(simulated(rng, 12), quantity="noise", maximum=1.0)
+    short = requirement_verdict(simulated(rng, 12), quantity="noise", maximum=1.0)
     assert (short.verdict, short.more, short.cases) == (NOT_SHOWN, 18, 12)
 
 
 def test_a_pixel_error_that_the_noise_hides_is_not_called_met(rng: np.random.Generator) -> None:
-    found = verdict(
+    found = requirement_verdict(
         simulated(rng, ERRORS, noise=20.0, pixel=2.0), quantity="pixel-error", maximum=1.0
     )
     assert found.verdict == NOT_SHOWN and found.bound is not None and found.bound > 2.0
@@ -213,14 +218,14 @@ def test_a_condition_chooses_cases(rng: np.random.Generator) -> None:
     rate = cases.numbers["vary.rate_deg_s.across"]
     chosen = chosen_cases("rate_deg_s.across <= 0.5 and rate_deg_s.across > 0.1", cases)
     assert np.array_equal(chosen, (rate <= 0.5) & (rate > 0.1))
-    found = verdict(
+    found = requirement_verdict(
         cases, quantity="availability", minimum=0.9, condition="rate_deg_s.across <= 0.5"
     )
     assert found.cases == int((rate <= 0.5).sum())
     with pytest.raises(
         InputError, match=r"nonsense is no key that the plan varies \(rate_deg_s.across\)"
     ):
-        verdict(cases, quantity="availability", minimum=0.9, condition="nonsense <= 1")
+        requirement_verdict(cases, quantity="availability", minimum=0.9, condition="nonsense <= 1")
 
 
 @pytest.mark.parametrize(

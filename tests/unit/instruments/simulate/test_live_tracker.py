@@ -21,7 +21,7 @@ PERIOD_NS = 100
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def frame(number, lit, light, q=IDENTITY, lit_ns=None):
+def frame_of_light(number, lit, light, q=IDENTITY, lit_ns=None):
     head = FrameHead(
         number,
         number * PERIOD_NS if lit_ns is None else lit_ns,
@@ -42,7 +42,11 @@ def watched(*frames):
 
 def test_an_exposure_has_of_each_frame_the_time_that_it_was_lit():
     turned = from_rotation_vector(np.array([0.0, 0.0, 0.01]))
-    kept = watched(frame(1, [3], [8]), frame(2, [3, 5], [4, 40], turned), frame(4, [], [], None))
+    kept = watched(
+        frame_of_light(1, [3], [8]),
+        frame_of_light(2, [3, 5], [4, 40], turned),
+        frame_of_light(4, [], [], None),
+    )
     # half of frame 1, all of frame 2 and, as 3 never came, of its time too; and of 4
     exposed = kept.exposed(150, 550)
     assert exposed.lit.tolist() == [3, 5]
@@ -55,7 +59,9 @@ def test_an_exposure_has_of_each_frame_the_time_that_it_was_lit():
 
 def test_a_run_that_begins_anew_forgets_the_one_before():
     kept = watched(
-        frame(7, [1], [1]), frame(1, [2], [2], lit_ns=800), frame(2, [2], [2], lit_ns=900)
+        frame_of_light(7, [1], [1]),
+        frame_of_light(1, [2], [2], lit_ns=800),
+        frame_of_light(2, [2], [2], lit_ns=900),
     )
     assert kept.exposed(700, 850) is None
     assert kept.exposed(800, 900).lit.tolist() == [2]

@@ -21,6 +21,7 @@ from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.tracker.mosaic import in_pixels, luminance
 from hilstar.tracker.settings import DetectorSettings
 from tests.support.benches import ORION_Q, bench_text
+from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
 from tests.unit.server.bench.test_channels import NM, PASSBANDS, integrals
 
@@ -28,8 +29,8 @@ PATTERNS = ("rggb", "bggr", "grbg", "gbrg")
 EXPOSURE_S, GAIN = 0.5, 4.0
 # Every second pixel samples a star of sigma 1.6 px to exp(-2 pi^2 1.6^2 / 4) = 3e-6 of its light,
 # and a circle of 12 px holds all of it. DN are rounded: half a DN in each of 113 pixels, mostly
-# cancelled, of some 1e4 DN. Asked for: 1 %.
-SIGMA_PX, RADIUS_PX, OFF = 1.6, 12.0, 5e-3
+# cancelled, of some 1e4 DN.
+SIGMA_PX, RADIUS_PX = 1.6, 12.0
 BRIGHTEST = 5
 
 
@@ -42,7 +43,7 @@ def folder(tmp_path_factory):
     return made
 
 
-def written(folder, bayer, *changes):
+def mosaic_bench(folder, bayer, *changes):
     keys = {
         "quantum_efficiency": None,
         "psf_sigma_px": [SIGMA_PX, SIGMA_PX],
@@ -73,7 +74,7 @@ def test_planes_of_the_raw_mosaic_have_each_channels_electrons_of_a_quadrature(
     """Photometry of each plane by `sep`, found by the keywords that other programs read."""
     out = tmp_path / "raw.fits"
     run = run_hilstar_here(
-        "simulate", written(folder, bayer), "--radec", "86,3,0", "--noise", "none", "-o", out
+        "simulate", mosaic_bench(folder, bayer), "--radec", "86,3,0", "--noise", "none", "-o", out
     )
     assert run.returncode == 0, run.stderr
     with fits.open(out) as (image, table):
@@ -96,7 +97,8 @@ def test_planes_of_the_raw_mosaic_have_each_channels_electrons_of_a_quadrature(
             at = (star["x_px"] - right) / 2, (star["y_px"] - down) / 2
             light, _, _ = sep.sum_circle(plane, [at[0]], [at[1]], RADIUS_PX / 2, subpix=0)
             found[colour] += 4 * GAIN * light[0] / EXPOSURE_S / pattern.count(colour)
-        np.testing.assert_allclose(list(found.values()), wanted, rtol=OFF)
+        off = np.array(list(found.values())) / wanted - 1
+        holds("mosaic-planes", 100 * np.abs(off).max())
 
 
 @pytest.mark.gpu
@@ -105,7 +107,7 @@ def test_noise_comes_after_the_mosaic_and_zodiacal_light_has_each_channels_own(f
         "background": {"zodiacal_v_mag_arcsec2": 20.0},
         "tracker.detector": {"read_noise_e": 5.0},
     }
-    with Simulator(read_bench_file(written(folder, "rggb", sky))) as simulator:
+    with Simulator(read_bench_file(mosaic_bench(folder, "rggb", sky))) as simulator:
         view = simulator.view(np.array(ORION_Q), np.zeros(3))
         exposure = simulator.expose(view, np.random.default_rng(3))
         levels = [
@@ -147,7 +149,7 @@ def before_display(folder, colour, **sky):
         "collimator": {"focal_length_mm": 120},
     }
     tables |= {"render": {"colour": colour, "quantisation": "exact", "brightest_v_mag": 0.0}}
-    return read_bench_file(written(folder, "rggb", tables, {"sky": sky}))
+    return read_bench_file(mosaic_bench(folder, "rggb", tables, {"sky": sky}))
 
 
 SHOWN = 0.02  # asked for: 2 % at 95 % of stars, of which these are the brightest
@@ -235,7 +237,7 @@ def test_a_mosaic_without_three_channels_is_refused_in_one_line(tmp_path, tables
 
 
 def test_three_channels_without_a_mosaic_are_added_up_with_a_line(folder, caplog):
-    with Simulator(read_bench_file(written(folder, None))) as simulator:
+    with Simulator(read_bench_file(mosaic_bench(folder, None))) as simulator:
         exposure = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     assert "without a mosaic: each pixel adds them up" in caplog.text
     row = exposure.truth[0]

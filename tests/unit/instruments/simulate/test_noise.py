@@ -116,7 +116,7 @@ def test_the_sources_add_up_to_the_total_each_as_table_4_1_has_it():
     )
 
 
-def exposed(
+def star_frames(
     star: NoisyStar, star_e: float, sky_e: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Frames [e-] of single stars (n, side, side) through the detector, and their places (2, n)
@@ -159,7 +159,7 @@ def beyond_bound(
 ) -> float:
     """The rms of most likely places over the bound."""
     star = gaussian(sigma_px, detector, 16)
-    seen, place = exposed(star, star_e, sky_e, np.random.default_rng(5))
+    seen, place = star_frames(star, star_e, sky_e, np.random.default_rng(5))
     off = most_likely(star, seen, place, star_e, sky_e) - place
     return float(np.sqrt(np.mean(off**2)) / one(star, star_e, sky_e)["bound_px"][0])
 

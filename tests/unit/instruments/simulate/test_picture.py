@@ -13,7 +13,7 @@ SKY_DN, NOISE_DN = 80, 5
 SEEN = 150  # a grey that discs of bright stars have, and noise has not
 
 
-def frame(rng, stars=(), size=200, across_dn=0, down_dn=0, body_dn=None):
+def noisy_frame(rng, stars=(), size=200, across_dn=0, down_dn=0, body_dn=None):
     """A frame of noise about SKY_DN with stars (row, column, peak DN) of sigma 0.7 px, cut at FULL.
 
     The sky grows by `across_dn` and `down_dn` from edge to edge; `body_dn` (height, width) is of a
@@ -33,7 +33,7 @@ def picture_of(dn):
     return exposure_picture(dn, FULL)
 
 
-def disc(row, column, radius, size=200):
+def disc_pixels(row, column, radius, size=200):
     rows, columns = np.mgrid[:size, :size]
     return np.hypot(rows - row, columns - column) <= radius
 
@@ -43,7 +43,7 @@ def test_a_gradient_of_stray_light_is_no_star(rng):
     have discs.
     """
     stars = [(60, 50, 1500), (190, 190, 1500), (15, 180, 1500)]
-    picture = picture_of(frame(rng, stars, across_dn=700, down_dn=500))
+    picture = picture_of(noisy_frame(rng, stars, across_dn=700, down_dn=500))
     _, count = label(picture > SEEN)
     assert count == len(stars)
     corners = [picture[:40, :40], picture[140:180, 140:180]]
@@ -55,7 +55,7 @@ def test_a_curved_sky_is_no_star(rng):
     """Vignetting and stray light fall off as a square of the distance from the middle."""
     rows, columns = np.mgrid[:200, :200]
     hill_dn = 800 * (1 - ((rows - 100) ** 2 + (columns - 100) ** 2) / 2e4)
-    picture = picture_of(frame(rng, [(100, 40, 1500)], body_dn=hill_dn))
+    picture = picture_of(noisy_frame(rng, [(100, 40, 1500)], body_dn=hill_dn))
     _, count = label(picture > SEEN)
     assert count == 1
 
@@ -63,8 +63,8 @@ def test_a_curved_sky_is_no_star(rng):
 @pytest.mark.parametrize("radius_px", [12, 30, 70])
 def test_a_body_has_its_own_size(rng, radius_px):
     """The Moon saturates: discs about its plateau made it a lump, wider by up to 16 px."""
-    shape = disc(100, 100, radius_px)
-    picture = picture_of(frame(rng, [(10, 10, 1500)], body_dn=5000.0 * shape))
+    shape = disc_pixels(100, 100, radius_px)
+    picture = picture_of(noisy_frame(rng, [(10, 10, 1500)], body_dn=5000.0 * shape))
     assert np.array_equal(picture[:, 30:] == 255, shape[:, 30:])
     assert picture[10, 10] > SEEN  # and a star beside it is seen
 
@@ -76,21 +76,23 @@ def test_a_body_over_the_frame_is_white(rng):
 
 def test_a_trail_has_no_discs(rng):
     """A star of 40 px of smear is seen as long as it is."""
-    trail_dn = 400.0 * (disc(100, 100, 40) & (np.abs(np.mgrid[:200, :200][0] - 100) <= 1))
-    picture = picture_of(frame(rng, body_dn=trail_dn))
+    trail_dn = 400.0 * (disc_pixels(100, 100, 40) & (np.abs(np.mgrid[:200, :200][0] - 100) <= 1))
+    picture = picture_of(noisy_frame(rng, body_dn=trail_dn))
     lit_rows = np.flatnonzero((picture > 100).any(axis=1))
     assert 99 <= lit_rows.min() <= lit_rows.max() <= 101
 
 
 def test_a_frame_of_noise_is_dark(rng):
     """Nothing at all was stretched until its noise was as bright as stars."""
-    picture = picture_of(frame(rng))
+    picture = picture_of(noisy_frame(rng))
     assert np.percentile(picture, 99) < 80
 
 
 def test_saturated_stars_have_discs_that_tell_their_magnitudes(rng):
     peaks = [4000 * 10 ** (0.4 * mag) for mag in range(5)]  # the faintest is full already
-    picture = picture_of(frame(rng, [(30 + 35 * k, 100, peak) for k, peak in enumerate(peaks)]))
+    picture = picture_of(
+        noisy_frame(rng, [(30 + 35 * k, 100, peak) for k, peak in enumerate(peaks)])
+    )
     boxes = [picture[20 + 35 * k : 41 + 35 * k, 90:111] for k in range(5)]
     areas = [int((box > 0.5 * box[10, 10]).sum()) for box in boxes]
     assert areas == sorted(areas)
@@ -101,7 +103,7 @@ def test_saturated_stars_have_discs_that_tell_their_magnitudes(rng):
 
 
 def test_noise_alone_has_no_discs(rng):
-    picture = picture_of(frame(rng))
+    picture = picture_of(noisy_frame(rng))
     _, count = label(picture > 200)
     assert count < 20
     assert 0 < np.median(picture[picture > 0]) < 180
@@ -115,7 +117,7 @@ def test_any_frame_has_a_picture():
 
 
 def test_a_star_at_the_edge_is_drawn_as_far_as_the_frame_goes(rng):
-    picture = picture_of(frame(rng, [(0, 199, 1e6)]))
+    picture = picture_of(noisy_frame(rng, [(0, 199, 1e6)]))
     assert picture[0, 199] == 255
     assert (picture[:MAX_RADIUS_PX, -MAX_RADIUS_PX:] == 255).mean() > 0.6
     assert (picture == 255).sum() < (MAX_RADIUS_PX + 1) ** 2

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.campaign.display_tracker import DisplayTracker
@@ -35,9 +35,19 @@ CAMERA = monitor_camera(SIZE, 13.0, 70.0, IDENTITY)
 PSF = GaussianPsf((0.85, 0.6))
 STEPS = 400
 ROLLING = {"tracker.detector": {"shutter": "rolling", "row_time_us": 40.0}}
+# three whole refreshes of a screen that scans out in nearly one, before rows that are exposed
+# nearly at once
+ROW_US, SCANOUT_MS, WHOLE_EXPOSURE_S = 1.0, 16.0, 0.05
+VEGA_ALONE = {
+    "tracker": {"exposure_s": WHOLE_EXPOSURE_S},
+    "tracker.detector": {"shutter": "rolling", "row_time_us": ROW_US},
+    "sky": {"faintest_v_mag": 0.2},
+    "monitor": {"scanout_ms": SCANOUT_MS},
+}
+SCAN_OUT_TOLERANCE_PX = 0.03  # of 0.4 px that a screen's scan-out is worth
 
 
-def star(x, y, z=CAMERA.focal_length_px):
+def star_on_pixel(x, y, z=CAMERA.focal_length_px):
     """A star of one electron per second at a pixel when the middle row is in the middle of its
     exposure.
     """
@@ -45,7 +55,7 @@ def star(x, y, z=CAMERA.focal_length_px):
     return stars_at(at @ CAMERA.cam_to_image, np.ones(1))
 
 
-def drawn(stars, rate, direction=1):
+def rolling_image(stars, rate, direction=1):
     view = View(
         IDENTITY, rate, scan=Scan((0, direction), SIZE[1] * ROW_S, EXPOSURE_S), exposed=True
     )
@@ -59,7 +69,7 @@ def drawn(stars, rate, direction=1):
 )
 def test_each_row_has_its_own_exposure(rate_deg_s, direction):
     """Row by row the mean of instants of that row's own time: light, and places along both axes."""
-    rate, stars = np.radians(np.array(rate_deg_s)), star(60.3, 30.6)
+    rate, stars = np.radians(np.array(rate_deg_s)), star_on_pixel(60.3, 30.6)
     exact, at = np.zeros(SIZE[::-1]), Motion(IDENTITY, rate, EXPOSURE_S)
     for row in range(10, 100):
         late_s = direction * (row - (SIZE[1] - 1) / 2) * ROW_S
@@ -70,7 +80,7 @@ def test_each_row_has_its_own_exposure(rate_deg_s, direction):
             for size, place, sigma in zip(SIZE, places, PSF.sigma_px, strict=True)
         )
         exact[row] = down[:, row] @ across / STEPS
-    found = drawn(stars, rate, direction)
+    found = rolling_image(stars, rate, direction)
     assert found.sum() == pytest.approx(exact.sum(), rel=2e-5)
     y, x = np.indices(found.shape)
     for place in (x, y):
@@ -89,7 +99,7 @@ def test_a_star_that_runs_with_the_rows_is_exposed_for_longer():
     # On the axis across the turn a star moves at f times the rate, but for 1 + tan^2.
     speed = np.sign(drawn_y(1e-3) - 59.5) * rate[0] * CAMERA.focal_length_px
     for y_px in (30.0, 59.5, 90.0):
-        image, share = drawn(star(79.5, y_px), rate), speed * ROW_S
+        image, share = rolling_image(star_on_pixel(79.5, y_px), rate), speed * ROW_S
         assert image.sum() == pytest.approx(1 / (1 - share), rel=1e-4 + MAX_CUT)
         centre = (image.sum(axis=1) @ np.arange(SIZE[1])) / image.sum()
         assert centre - 59.5 == pytest.approx((y_px - 59.5) / (1 - share), abs=3e-3)
@@ -100,7 +110,7 @@ def drawn_y(seconds):
     turned = CAMERA.cam_to_image @ to_matrix(
         propagate(IDENTITY, np.radians(np.array([2.0, 0, 0])), seconds)
     )
-    return CAMERA.project(star(79.5, 59.5).vectors @ turned.T)[1][0]
+    return CAMERA.project(star_on_pixel(79.5, 59.5).vectors @ turned.T)[1][0]
 
 
 def test_a_rolling_truth_is_where_the_light_is_and_a_still_one_is_global_bit_for_bit(tmp_path):
@@ -193,6 +203,37 @@ def test_a_moving_star_behind_a_rolling_shutter_sees_the_frames_of_its_own_rows(
     display.close()
     assert sums[1] == pytest.approx(sums[0], rel=0.05)
     assert centres[1] == pytest.approx(centres[0], abs=0.5)
+
+
+@pytest.mark.parametrize("motion", ["on", "off"])
+def test_a_still_picture_is_late_by_the_scan_out_which_drawing_along_the_path_takes_away(
+    tmp_path, motion
+):
+    """A turn about the image's y axis moves a star above the middle by f tan(rate t). Its rows of
+    the screen light early, so that more of each exposure is of later frames: without motion it
+    stands where it will be by that time.
+    """
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(TWIN, VEGA_ALONE, {"render": {"motion": motion}}))
+    q = from_radec_roll_deg(279.2347, 38.7837 - 5.0, 0.0)
+    display = DisplayTracker(read_bench_file(path))
+    centres = []
+    for rate_deg_s in (0.0, 2.0):
+        view = View.exposure(q, np.radians(np.array([0.0, rate_deg_s, 0.0])), WHOLE_EXPOSURE_S)
+        light_e = display.expose(view, None).mean_e
+        light_e -= np.median(light_e)
+        light_e[light_e < 0.003 * light_e.max()] = 0
+        y, x = np.indices(light_e.shape)
+        centres.append((light_e * x).sum() / light_e.sum())
+        y_px = (light_e * y).sum() / light_e.sum()
+    display.close()
+    above_px = y_px - 199.5
+    assert above_px < -160
+    tracker_late_s = above_px * ROW_US * 1e-6
+    screen_late_s = above_px * (120 / 0.05765) / (25 / 0.013) / 480 * SCANOUT_MS * 1e-3
+    seconds = tracker_late_s if motion == "on" else tracker_late_s - screen_late_s
+    moved_px = -25 / 0.013 * np.tan(np.radians(2.0) * seconds)
+    assert centres[1] - centres[0] == pytest.approx(moved_px, abs=SCAN_OUT_TOLERANCE_PX)
 
 
 def test_frame_transfer_smears_each_column_by_its_light(tmp_path):

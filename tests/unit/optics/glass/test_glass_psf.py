@@ -21,7 +21,7 @@ FLUX, CENTROID_PX, SECOND = 1e-3, 3e-3, 1e-2
 MEAN = np.array([0.2, 0.3, 0.3, 0.2])
 
 
-def errors(psf: GlassPsf, x_px, y_px, shares, focus_um=0.0) -> np.ndarray:
+def star_errors(psf: GlassPsf, x_px, y_px, shares, focus_um=0.0) -> np.ndarray:
     """Largest errors of flux, centroid (px) and second moments (relative) of stars."""
     found = psf.stamps_at(x_px, y_px, shares, np.ones(len(x_px)))
     worst = np.zeros(3)
@@ -44,7 +44,7 @@ def test_stars_have_their_flux_place_and_width_over_field_colour_and_focus(glass
     shares = rng.dirichlet(np.ones(4), 25)
     at = [part.ravel() for part in np.meshgrid(*[np.linspace(0, SIDE_PX - 1, 5)] * 2)]
     for x_px, y_px in (at, rng.uniform(0, SIDE_PX - 1, (2, 25))):
-        flux, centroid_px, second = errors(psf, x_px, y_px, shares, focus_um)
+        flux, centroid_px, second = star_errors(psf, x_px, y_px, shares, focus_um)
         holds("glass-flux", flux)
         holds("glass-centroid", centroid_px)
         holds("glass-moments", 100 * second)
@@ -52,7 +52,7 @@ def test_stars_have_their_flux_place_and_width_over_field_colour_and_focus(glass
 
 def test_a_pixel_integrated_map_gives_the_same_stars(rng):
     psf = glass_psf(glass_of(stack(integrated=True)), 0.0, MEAN)
-    flux, centroid_px, second = errors(
+    flux, centroid_px, second = star_errors(
         psf, *rng.uniform(0, SIDE_PX - 1, (2, 20)), rng.dirichlet(np.ones(4), 20)
     )
     assert (flux, centroid_px, second) < (FLUX, CENTROID_PX, SECOND)
@@ -179,7 +179,7 @@ def test_noise_of_a_measured_map_and_its_negative_lobes_move_no_star(rng):
     plain = stack(integrated=True, per_px=1)
     noisy = replace(plain, images=plain.images + rng.normal(0, 1e-4, plain.images.shape))
     psf = glass_psf(glass_of(noisy), 0.0, MEAN)
-    flux, centroid_px, _ = errors(
+    flux, centroid_px, _ = star_errors(
         psf, *rng.uniform(0, SIDE_PX - 1, (2, 20)), rng.dirichlet(np.ones(4), 20)
     )
     assert centroid_px < 3 * 6.5e-3 + CENTROID_PX

@@ -9,6 +9,7 @@ import re
 import sys
 import warnings
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,11 +18,13 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.resources import resource_path
 from hilstar.optics.glass import prescription
 from hilstar.optics.glass.codev_file import read_codev
+from hilstar.optics.glass.lens_data import FieldPoint
 from hilstar.optics.glass.psf_file import Glass, read_glass
 from hilstar.optics.glass.zemax_file import read_zemax
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.lenses import SCHOTT, focal_length_mm, lit_share, rms_radius_um, seq, zmx
+from tests.support.refusals import refusal
 
 SIZE, PITCH_UM = "101,81", 20.0
 # Measured: 0.002 px and 0.7 %; diffraction's wings beyond the stamp are what is left.
@@ -42,7 +45,7 @@ LIT_TOLERANCE = 0.02  # 96 rays across count a circle of half their width to 2 %
 CHIEF_PX, RAY_CENTROID_PX, RMS = 5e-4, 0.003, 0.01  # the issue's limits; measured 3e-4 px of 10 um
 
 
-def made(folder: Path, *options: object):
+def traced_psf(folder: Path, *options: object):
     lens = folder / "lens.json"
     if not lens.exists():
         lens.write_text("{}")
@@ -50,15 +53,19 @@ def made(folder: Path, *options: object):
 
 
 def test_it_says_what_it_lacks(tmp_path, monkeypatch):
-    assert_refused(made(tmp_path), 2, "--bench BENCH.toml, or --pitch-um and --resolution")
-    assert_refused(made(tmp_path, "--pitch-um", 5, "--resolution", "0,5"), 2, "--resolution 0,5")
+    assert_refused(traced_psf(tmp_path), 2, "--bench BENCH.toml, or --pitch-um and --resolution")
+    assert_refused(
+        traced_psf(tmp_path, "--pitch-um", 5, "--resolution", "0,5"), 2, "--resolution 0,5"
+    )
     monkeypatch.setitem(sys.modules, "optiland", None)
-    assert_refused(made(tmp_path, "--pitch-um", 5, "--resolution", "50,50"), 3, "hilstar[lens]")
+    assert_refused(
+        traced_psf(tmp_path, "--pitch-um", 5, "--resolution", "50,50"), 3, "hilstar[lens]"
+    )
 
 
 def test_a_file_that_is_no_lens_is_one_line(tmp_path):
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
-    assert_refused(made(tmp_path, "--pitch-um", 5, "--resolution", "50,50"), 2, "lens.json")
+    assert_refused(traced_psf(tmp_path, "--pitch-um", 5, "--resolution", "50,50"), 2, "lens.json")
 
 
 def test_a_triplet_is_what_its_rays_are(tmp_path):
@@ -68,7 +75,7 @@ def test_a_triplet_is_what_its_rays_are(tmp_path):
 
     lens = CookeTriplet()
     save_optiland_file(lens, str(tmp_path / "lens.json"))
-    result = made(
+    result = traced_psf(
         tmp_path, "--pitch-um", PITCH_UM, "--resolution", SIZE, "--half-px", 5, "--oversampling", 8
     )
     assert result.returncode == 0, result.stderr
@@ -135,7 +142,7 @@ def zemax(folder: Path) -> Path:
     return folder / "tilted.zmx"
 
 
-def frames(parts):
+def surface_frames(parts):
     """The rotation, origin and surface of each surface; Zemax turns about x, the new y, the
     newer z, or backwards.
     """
@@ -157,7 +164,7 @@ def frames(parts):
 def snell(at, along, um):
     """Places and directions (3, n) at the image, by Snell's law in vectors."""
     index = 1.0
-    for turn, origin, (radius, _, glass, conic, fourth) in frames(TILTED):
+    for turn, origin, (radius, _, glass, conic, fourth) in surface_frames(TILTED):
         at, along = turn.T @ (at - origin[:, None]), turn.T @ along
         far = -at[2] / along[2]
         for _ in range(20):  # Newton
@@ -181,8 +188,8 @@ def snell(at, along, um):
 def test_breaks_keep_zemax_s_order(tmp_path):
     """All surfaces stand where shifts and turns in Zemax's order put them."""
     lens = read_zemax(zemax(tmp_path).read_bytes())
-    assert len(lens.surfaces) == len(list(frames(TILTED)))
-    for surface, (turn, origin, _) in zip(lens.surfaces, frames(TILTED), strict=True):
+    assert len(lens.surfaces) == len(list(surface_frames(TILTED)))
+    for surface, (turn, origin, _) in zip(lens.surfaces, surface_frames(TILTED), strict=True):
         assert surface.turn == pytest.approx(turn, abs=1e-12)
         assert surface.origin_mm == pytest.approx(origin, abs=1e-12)
 
@@ -464,3 +471,65 @@ def test_a_constant_index_and_a_glass_without_numbers_are_traced(tmp_path):
     result = traced_here(tmp_path, "lens.zmx", data, "--json")
     assert result.returncode == 0, result.stderr
     assert json.loads(result.stdout)["focal_length_mm"] == pytest.approx(100.031, abs=1e-3)
+
+
+def test_the_camera_of_chief_rays_has_browns_coefficients_of_its_rays():
+    """The rays of a camera with radial and decentring distortion, in place of a traced lens."""
+    k1, k2, k3, p1, p2 = -0.31, 0.24, -0.5, 2e-3, -3e-3
+    focal_mm = 55.0
+
+    def chiefs(fields, um):
+        x, y = (0.2 * fields).T
+        r2 = x * x + y * y
+        radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+        bent = np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+            ],
+            axis=1,
+        )
+        places_mm = focal_mm * bent
+        places_mm[3] = np.nan  # a ray that an aperture stops
+        return 0.2 * fields, places_mm
+
+    rays = SimpleNamespace(max_field=1.0, primary_um=0.55, chiefs=chiefs)
+    camera = prescription._Chiefs.of(rays)
+    assert camera.focal_length_mm == pytest.approx(focal_mm, rel=1e-9)
+    assert camera.lens.radial == pytest.approx((k1, k2, k3), rel=1e-6)
+    assert camera.lens.tangential == pytest.approx((p1, p2), rel=1e-6)
+    on_axis = SimpleNamespace(max_field=0, focal_length_mm=40.0)
+    assert prescription._Chiefs.of(on_axis) == prescription._Chiefs(40.0, None)
+
+
+def test_vignetting_is_that_of_the_field_s_own_direction():
+    """One lens that cuts 0.2 off along each field's direction and 0.05 across it, 0.1 nearer to
+    the axis; and a field beside both axes with a smaller round pupil.
+    """
+    points = (
+        FieldPoint(0.0, 0.0),
+        FieldPoint(0.0, 1.0, compression=(0.05, 0.2), shift=(0.0, -0.1)),
+        FieldPoint(0.0, -2.0, compression=(0.05, 0.2), shift=(0.0, 0.1)),
+        FieldPoint(3.0, 0.0, compression=(0.2, 0.05), shift=(-0.1, 0.0)),
+        FieldPoint(-4.0, 0.0, compression=(0.2, 0.05), shift=(0.1, 0.0)),
+        FieldPoint(3.0, 4.0, compression=(0.3, 0.3)),
+        FieldPoint(6.0, 8.0),
+    )
+    alike = [0.05, 0.2, -0.1]
+    wanted = [[0, 0, 0, 0], *([radius, *alike] for radius in (1, 2, 3, 4))]
+    wanted += [[5, 0.3, 0.3, 0], [10, 0, 0, 0]]
+    assert pytest.approx(np.array(wanted)) == prescription._vignetting(points).T
+
+
+@pytest.mark.parametrize(
+    "point",
+    [
+        FieldPoint(1.0, 1.0, compression=(0.1, 0.2)),
+        FieldPoint(1.0, 1.0, compression=(0.1, 0.1), shift=(0.0, 0.1)),
+        FieldPoint(0.0, 1.0, shift=(0.1, 0.0)),
+        FieldPoint(1.0, 0.0, shift=(0.0, 0.1)),
+    ],
+)
+def test_vignetting_beside_a_field_s_direction_is_refused(point):
+    line = refusal(prescription._vignetting, (point,))
+    assert f"{point.x:g}, {point.y:g} is vignetted along neither x nor y" in line

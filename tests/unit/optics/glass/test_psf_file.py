@@ -11,12 +11,12 @@ import pytest
 from astropy.io import fits
 from scipy.ndimage import uniform_filter
 
-from hilstar.basics.errors import InputError
 from hilstar.optics.camera import Lens
 from hilstar.optics.glass.psf_file import Glass, Stack, facts_of, glass_of, read_glass, write_glass
 from hilstar.optics.psf import SampledPsf
 from hilstar.sky.spectrum import Curve
 from tests.support.glass import stack
+from tests.support.refusals import refusal
 
 FLOAT32 = 1e-6  # of the largest sample: the basis is float32
 
@@ -92,7 +92,7 @@ def spoilt(**changes):
     )
 
 
-def put(place, value):
+def put_value(place, value):
     def change(array):
         array[place] = value
         return array
@@ -107,23 +107,20 @@ def put(place, value):
             lambda s: replace(s, images=s.images[:, :-1]),
             "write images (n, height, width) of odd sides",
         ),
-        (spoilt(images=put((2, 0, 0), np.nan)), "image 3 has samples that are not finite"),
-        (spoilt(images=put(1, 0.0)), "image 2 has samples that are not finite, or no light"),
+        (spoilt(images=put_value((2, 0, 0), np.nan)), "image 3 has samples that are not finite"),
+        (spoilt(images=put_value(1, 0.0)), "image 2 has samples that are not finite, or no light"),
         (lambda s: replace(s, at=s.at[:-1]), "write one point for each image"),
-        (spoilt(at=put((0, 2), 999.0)), "give each point one image of each wavelength"),
+        (spoilt(at=put_value((0, 2), 999.0)), "give each point one image of each wavelength"),
         (spoilt(images=lambda i: np.roll(i, 26, axis=2)), "put the chief ray there"),
         (spoilt(images=lambda i: i - 0.3 * i.mean()), "subtract its background"),
-        (spoilt(facts=put((0, 0), 3.0)), "relative_illumination is not within 0 to 2"),
-        (spoilt(facts=put((0, 1), 1.0)), "outside_share is not within 0 to 1"),
+        (spoilt(facts=put_value((0, 0), 3.0)), "relative_illumination is not within 0 to 2"),
+        (spoilt(facts=put_value((0, 1), 1.0)), "outside_share is not within 0 to 1"),
         (spoilt(at=lambda at: at * [1, 1, -1, 1]), "write wavelengths over 0 nm"),
         (lambda s: replace(s, per_px=0), "0 samples a pixel; write 1 or more"),
     ],
 )
 def test_what_is_no_glass_is_one_line(change, advice):
-    with pytest.raises(InputError) as said:
-        glass_of(change(stack(2, (450.0, 650.0))))
-    assert advice in str(said.value)
-    assert "\n" not in str(said.value)
+    assert advice in refusal(glass_of, change(stack(2, (450.0, 650.0))))
 
 
 @pytest.mark.parametrize(
@@ -153,16 +150,14 @@ def test_a_file_that_another_program_spoilt_is_one_line(tmp_path, header, table,
         ]
         spoilt_table = fits.BinTableHDU.from_columns(columns, name="POINTS")
         fits.HDUList([hdus[0], spoilt_table]).writeto(tmp_path / "bad.fits")
-    with pytest.raises(InputError) as said:
-        read_glass(tmp_path / "bad.fits")
-    assert advice in str(said.value)
-    assert "bad.fits" in str(said.value)
+    line = refusal(read_glass, tmp_path / "bad.fits")
+    assert advice in line
+    assert "bad.fits" in line
 
 
 def test_a_cube_of_images_without_points_is_refused_as_before(tmp_path):
     fits.writeto(tmp_path / "cube.fits", np.ones((3, 5, 5)))
-    with pytest.raises(InputError, match="holds 3 images"):
-        read_glass(tmp_path / "cube.fits")
+    assert "holds 3 images" in refusal(read_glass, tmp_path / "cube.fits")
 
 
 def test_images_without_wavelengths_count_for_all_light():

@@ -22,6 +22,7 @@ from hilstar.server.answers.answer import Answer
 from hilstar.server.answers.explain import lines_of, under_conventions
 from hilstar.server.answers.formats import MAX_KEPT_BYTES, AnswerDecoder, RefusedAnswer
 from hilstar.server.bench.config.answers import AnswersSettings, check_answers
+from tests.support.refusals import refusal
 
 Q = from_radec_roll_deg(283.021, 35.349, 30.0)
 SCALE = 2.0**-31
@@ -362,6 +363,4 @@ WRONG = {
 
 @pytest.mark.parametrize("said", WRONG)
 def test_a_wrong_declaration_is_refused_with_what_to_write(said):
-    with pytest.raises(InputError) as refused:
-        settings_of(**WRONG[said])
-    assert said in str(refused.value)
+    assert said in refusal(settings_of, **WRONG[said])

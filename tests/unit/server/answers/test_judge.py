@@ -28,7 +28,7 @@ EXPOSURE_S, ANSWER_HZ = 0.1, 10.0
 START = np.array([0.5, 0.5, -0.5, 0.5])
 
 
-def attitude(t_s: float) -> np.ndarray:
+def attitude_at(t_s: float) -> np.ndarray:
     """A turn about two axes, whose rate changes by 0.6 deg/s."""
     turn = np.radians(0.3) * np.array([2.0 * np.sin(0.5 * t_s), 1.5 * np.sin(0.8 * t_s), t_s])
     return multiply(from_rotation_vector(turn), START)
@@ -38,7 +38,7 @@ def lit_until(t_s: float, **keys) -> LitFrames:
     frames = LitFrames(PERIOD_NS, **keys)
     for k in range(int(t_s * 60)):
         frames.add(
-            LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, attitude(k * PERIOD_NS / NS_PER_S))
+            LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, attitude_at(k * PERIOD_NS / NS_PER_S))
         )
     return frames
 
@@ -130,13 +130,13 @@ def judged(
         host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
         while k * PERIOD_NS < host_ns:
             frames.add(
-                LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S))
+                LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude_at(k * PERIOD_NS / NS_PER_S))
             )
             k += 1
         error = (BIAS_ARCSEC + NOISE_ARCSEC * rng.standard_normal(3)) / ARCSEC_PER_RAD
         if rng.random() < wild:
             error = rng.uniform(0.1, 1.0, 3)
-        q = multiply(from_rotation_vector(error), attitude(middle_s))
+        q = multiply(from_rotation_vector(error), attitude_at(middle_s))
         middle_ns = round(middle_s * NS_PER_S)
         t_ns = middle_ns if clock == "host" else round(middle_ns * (1 + DRIFT)) + EPOCH_NS
         found.append((judge.judge(Answer(host_ns, b"", t_ns, q)), np.linalg.norm(error) > 0.1))
@@ -179,8 +179,8 @@ def test_an_answer_without_attitude_or_of_a_dark_sky_is_neither_right_nor_wrong(
     assert judge.judge(Answer(at_ns, b"", at_ns, START, valid=False)).verdict == "invalid"
     assert judge.judge(Answer(at_ns, b"", at_ns)).verdict == "invalid"
     assert judge.judge(Answer(at_ns, b"", 30 * NS_PER_S, START)).verdict == "unpaired"
-    assert judge.judge(Answer(at_ns, b"", at_ns, attitude(0.5))).verdict == "right"
-    assert judge.judge(Answer(at_ns, b"", at_ns, -attitude(0.5))).verdict == "right"
+    assert judge.judge(Answer(at_ns, b"", at_ns, attitude_at(0.5))).verdict == "right"
+    assert judge.judge(Answer(at_ns, b"", at_ns, -attitude_at(0.5))).verdict == "right"
     figures = judge.figures(at_ns, {})
     assert (figures.answers, figures.right, figures.invalid, figures.unpaired) == (5, 2, 2, 1)
 
@@ -277,7 +277,7 @@ def spoilt(kind: str, seed: int) -> tuple[AnswerJudge, list]:
         host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
         while k * PERIOD_NS < host_ns:
             frames.add(
-                LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude(k * PERIOD_NS / NS_PER_S))
+                LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude_at(k * PERIOD_NS / NS_PER_S))
             )
             k += 1
         error_arcsec = CROSS_ARCSEC * rng.standard_normal(3) * [1.0, 1.0, ROLL_RATIO]
@@ -285,7 +285,7 @@ def spoilt(kind: str, seed: int) -> tuple[AnswerJudge, list]:
             error_arcsec = np.array([OUTLIER_ARCSEC, 0.0, 0.0])
         if kind == "some off" and rng.random() < OFF_SHARE:
             error_arcsec[0] += OFF_ARCSEC
-        q = multiply(from_rotation_vector(error_arcsec / ARCSEC_PER_RAD), attitude(middle_s))
+        q = multiply(from_rotation_vector(error_arcsec / ARCSEC_PER_RAD), attitude_at(middle_s))
         found.append(judge.judge(Answer(host_ns, b"", round(middle_s * NS_PER_S) + EPOCH_NS, q)))
     return judge, found
 
@@ -347,7 +347,7 @@ def test_no_finite_answers_in_any_order_end_the_judging(clock, many, seed):
     for (error, odd_ns, stamped), at_s in zip(many, arrivals_s.tolist(), strict=True):
         q = np.array(error)
         if len(error) == 3:
-            q = multiply(from_rotation_vector(q / ARCSEC_PER_RAD), attitude(at_s - 0.15))
+            q = multiply(from_rotation_vector(q / ARCSEC_PER_RAD), attitude_at(at_s - 0.15))
         t_ns = round((at_s - 0.15) * NS_PER_S) + odd_ns
         answer = Answer(
             round(at_s * NS_PER_S), b"", t_ns if stamped else None, q / np.linalg.norm(q)
@@ -381,12 +381,12 @@ def test_a_delay_under_which_no_answer_is_right_is_given_up():
         for number in range(6):
             lit_ns = at_ns - NS_PER_S // 10 + number * PERIOD_NS
             judge._frames.add(
-                LitFrame(10_000 + 6 * k + number, lit_ns, lit_ns, attitude(lit_ns / NS_PER_S))
+                LitFrame(10_000 + 6 * k + number, lit_ns, lit_ns, attitude_at(lit_ns / NS_PER_S))
             )
         middle_ns = at_ns - round(LATENCY_S * NS_PER_S)
         own_ns = round(middle_ns * (1 + DRIFT)) + EPOCH_NS
         again.append(
-            judge.judge(Answer(at_ns, b"", own_ns, attitude(middle_ns / NS_PER_S))).verdict
+            judge.judge(Answer(at_ns, b"", own_ns, attitude_at(middle_ns / NS_PER_S))).verdict
         )
     assert again[0] == "wrong" and set(again[-100:]) == {"right"}
     assert judge.times.delay_s == pytest.approx(LATENCY_S, abs=0.02)
@@ -400,7 +400,7 @@ def test_answers_that_were_overtaken_are_counted_and_judged_and_a_clock_that_is_
         middle_ns = NS_PER_S + number * NS_PER_S // 10
         host_ns = NS_PER_S + k * NS_PER_S // 10 + NS_PER_S // 4
         set_ns = -(10**15) if k >= 80 else 0
-        answer = Answer(host_ns, b"", middle_ns + set_ns, attitude(middle_ns / NS_PER_S))
+        answer = Answer(host_ns, b"", middle_ns + set_ns, attitude_at(middle_ns / NS_PER_S))
         judge.judge(answer)
     figures = judge.figures(host_ns, {})
     assert figures.out_of_order == 3 and figures.wrong == 0

@@ -27,7 +27,7 @@ BENCHES = 4000
 MIN_HELD, MAX_HELD = 3757, 3841
 
 
-def bench(folder: Path, *, covariance: bool = True) -> BenchFile:
+def aligned_bench(folder: Path, *, covariance: bool = True) -> BenchFile:
     path = folder / "bench.toml"
     lines = ["[alignment]", f"q_mon_to_reference = {Q_MON_TO_REFERENCE.tolist()}"]
     if covariance:
@@ -38,7 +38,7 @@ def bench(folder: Path, *, covariance: bool = True) -> BenchFile:
 
 
 def test_the_boresight_is_cam_z_in_the_reference(tmp_path: Path) -> None:
-    found = cube_to_boresight(bench(tmp_path), None)
+    found = cube_to_boresight(aligned_bench(tmp_path), None)
     assert found is not None
     z = to_matrix(Q_MON_TO_REFERENCE) @ to_matrix(Q_CAM_TO_MON) @ np.array([0.0, 0.0, 1.0])
     assert np.array(found.boresight) == pytest.approx(z, abs=1e-12)
@@ -51,14 +51,14 @@ def test_a_tracker_s_bias_turns_its_boresight_where_it_stands(tmp_path: Path) ->
     bias = multiply(conjugate(truly), Q_CAM_TO_MON)
     bias_arcsec = 2 * ARCSEC_PER_RAD * bias[1:]
     turned = Turned(bias_arcsec, np.zeros(3))
-    found = cube_to_boresight(bench(tmp_path), None, turned)
+    found = cube_to_boresight(aligned_bench(tmp_path), None, turned)
     assert found is not None
     z = to_matrix(Q_MON_TO_REFERENCE) @ to_matrix(truly) @ np.array([0.0, 0.0, 1.0])
     assert np.array(found.boresight) == pytest.approx(z, abs=1e-9)
 
 
 def test_the_radius_and_the_roll_hold_95_percent(tmp_path: Path, rng: np.random.Generator) -> None:
-    found = cube_to_boresight(bench(tmp_path), None)
+    found = cube_to_boresight(aligned_bench(tmp_path), None)
     assert found is not None and found.cross_arcsec is not None and found.roll_arcsec is not None
     errors = rng.multivariate_normal(np.zeros(3), COVARIANCE, BENCHES) / ARCSEC_PER_RAD
     across = about = 0
@@ -82,7 +82,7 @@ def test_the_radius_of_a_circle_and_of_a_line(sigmas: tuple[float, float], radiu
 
 
 def test_without_a_covariance_the_uncertainty_is_not_known(tmp_path: Path) -> None:
-    found = cube_to_boresight(bench(tmp_path, covariance=False), None)
+    found = cube_to_boresight(aligned_bench(tmp_path, covariance=False), None)
     assert found is not None and found.cross_arcsec is None and "not known" in found.line
 
 

@@ -51,7 +51,7 @@ def curves(tmp_path_factory):
     return folder
 
 
-def written(curves, channels, *changes):
+def channels_bench(curves, channels, *changes):
     keys = (
         {"quantum_efficiency": f"{channels}.csv"}
         if len(channels) == 1
@@ -66,7 +66,7 @@ def written(curves, channels, *changes):
 
 
 def bench_with(curves, channels, *changes):
-    return load(written(curves, channels, *changes))
+    return load(channels_bench(curves, channels, *changes))
 
 
 def light_of(curves, channels, *changes):
@@ -148,7 +148,7 @@ def test_light_that_is_no_stars_has_the_colour_of_its_own_bv(curves):
 def test_a_stars_electrons_by_channel_are_those_of_a_quadrature(curves):
     """Planck's law from its formula by trapezia of 0.5 nm: stars from 3000 to 20 000 K."""
     sky = {"sky": {"spectrum": "blackbody", "brightness": "dgs", "faintest_v_mag": 4.0}}
-    stars = bench_stars(read_bench_file(written(curves, "rgb", sky)).config, curves)
+    stars = bench_stars(read_bench_file(channels_bench(curves, "rgb", sky)).config, curves)
     assert (
         len(stars) > 400 and stars.temperature_k.min() < 3700 and stars.temperature_k.max() > 15_000
     )
@@ -176,7 +176,7 @@ def integrals(temperature_k):
 
 
 def test_all_channels_together_have_the_sum_of_their_curves_though_one_ends_above_zero(curves):
-    file = read_bench_file(written(curves, "rgb"))
+    file = read_bench_file(channels_bench(curves, "rgb"))
     tracker = replace_key(file.config.tracker, quantum_efficiency_g=0.25)
     nm = np.linspace(320.0, 1050.0, 7301)
     found = bench_optics(tracker, curves).quantum_efficiency(nm)

@@ -23,7 +23,9 @@ from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.console.overlay import colour_notes
 from hilstar.tracker.mosaic import luminance
 from tests.support.benches import ORION_Q, TWIN, bench_text
+from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
+from tests.support.refusals import refusal
 from tests.unit.display.test_primaries import NM, PANELS, bump, written
 
 SENSOR_NM = np.arange(400.0, 721.0, 10.0)
@@ -33,7 +35,7 @@ STRIPES = {
     "rgb-stripe": [(-THIRD, 0), (0, 0), (THIRD, 0)],
     "vertical": [(0, -THIRD), (0, 0), (0, THIRD)],
 }
-CENTROID_PX = 0.005  # the issue's aim; measured 1e-4 with 16 bits
+CENTROID_PX = 0.005  # the issue's aim
 CHANNEL_MAG = 0.02  # the issue's 2 %; measured 8e-4 at 95 % of stars
 # at least: of a star that is red or blue alone a third, of one in three channels less
 UNCORRECTED_PX = 0.1
@@ -60,7 +62,7 @@ def bench_path(folder, *changes, channels="rgb", panel="oled"):
     return path
 
 
-def centroids(frame, bench, places):
+def subpixel_errors(frame, bench, places):
     """How far stars that stand alone are from their places (n, 2), by sub-pixels of sRGB's
     formula at `places`.
     """
@@ -92,15 +94,15 @@ def test_all_light_of_a_star_has_one_centroid_whatever_its_colour(tmp_path, layo
     change = {"monitor": {"bits": 16}, "monitor.primaries": {"layout": layout}}
     with load(bench_path(tmp_path, change, channels=channels)) as bench:
         frame = bench.frame(ORION_Q)
-        off = centroids(frame, bench, STRIPES[layout])
-        assert (
-            frame.codes.shape == (240, 320, 3) and len(off) > 10 and np.abs(off).max() < CENTROID_PX
-        )
+        off = subpixel_errors(frame, bench, STRIPES[layout])
+        assert frame.codes.shape == (240, 320, 3) and len(off) > 10
+        holds("one-centroid", np.abs(off).max())
     with load(
         bench_path(tmp_path, change, {"monitor.primaries": {"layout": "white"}}, channels=channels)
     ) as bench:
         assert (
-            np.abs(centroids(bench.frame(ORION_Q), bench, STRIPES[layout])).max() > UNCORRECTED_PX
+            np.abs(subpixel_errors(bench.frame(ORION_Q), bench, STRIPES[layout])).max()
+            > UNCORRECTED_PX
         )
 
 
@@ -114,7 +116,7 @@ def test_a_turned_screen_has_its_stripes_turned(tmp_path):
         bench_path(tmp_path, {"monitor": keys, "monitor.primaries": {"layout": "rgb-stripe"}})
     ) as bench:
         found = bench.colours.places_px
-        off = centroids(bench.frame(ORION_Q), bench, found)
+        off = subpixel_errors(bench.frame(ORION_Q), bench, found)
     assert np.abs(off).max() < CENTROID_PX
     # (-1, 0) is flipped, then turned
     np.testing.assert_allclose(found, [(0, -THIRD), (0, 0), (0, THIRD)], atol=1e-12)
@@ -282,11 +284,9 @@ def test_a_ccss_has_its_primaries_among_its_samples(tmp_path):
     with pytest.raises(InputError, match="no three of its 4 samples are primaries"):
         read_primaries(ccss(tmp_path / "four.ccss", [r, g, b, bump(580, 15)]))
     (tmp_path / "other.ccss").write_text("CTI3\n")
-    with pytest.raises(InputError, match="its first word is not CCSS"):
-        read_primaries(tmp_path / "other.ccss")
+    assert "its first word is not CCSS" in refusal(read_primaries, tmp_path / "other.ccss")
     (tmp_path / "cut.ccss").write_text(CCSS.replace("SPECTRAL_BANDS", "BANDS"))
-    with pytest.raises(InputError, match="'SPECTRAL_BANDS' is wrong or missing"):
-        read_primaries(tmp_path / "cut.ccss")
+    assert "'SPECTRAL_BANDS' is wrong or missing" in refusal(read_primaries, tmp_path / "cut.ccss")
 
 
 def test_chromaticities_become_gaussians_that_add_up_to_d65():

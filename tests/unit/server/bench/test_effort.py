@@ -51,11 +51,11 @@ PAIRED = {"quantisation": "round", "tolerance_mag": 0.0002, "tolerance_px": 0.00
 WINGS_SHARE = 0.005  # of lit pixels: 6 of 2136 here with wings twice as high as those allowed
 
 
-def settings(**keys) -> RenderSettings:
+def render_settings(**keys) -> RenderSettings:
     return RenderSettings(**{"effort": "auto", "quantisation": "auto", **keys})
 
 
-def light(bits: int, magnitudes: float) -> Light:
+def light_range(bits: int, magnitudes: float) -> Light:
     """A white of 1e6 electrons/s, and stars from there down by so many magnitudes."""
     return Light(srgb_response(bits), 1e6, 5e6 * 10 ** (-0.4 * np.linspace(0, magnitudes, 50)))
 
@@ -70,14 +70,18 @@ def part(effort: Effort, name: str):
 
 def test_round_is_chosen_where_it_does_and_exact_where_it_does_not():
     assert (
-        planned(settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0)).quantisation
+        planned(
+            render_settings(tolerance_mag=0.1, tolerance_px=0.1), light_range(12, 6.0)
+        ).quantisation
         == "round"
     )
     assert (
-        planned(settings(tolerance_mag=0.05, tolerance_px=0.08), light(8, 6.0)).quantisation
+        planned(
+            render_settings(tolerance_mag=0.05, tolerance_px=0.08), light_range(8, 6.0)
+        ).quantisation
         == "exact"
     )
-    over = planned(settings(tolerance_mag=1e-4), light(8, 6.0))
+    over = planned(render_settings(tolerance_mag=1e-4), light_range(8, 6.0))
     assert over.quantisation == "exact" and not over.within and over.error_mag > 1e-4
 
 
@@ -85,23 +89,23 @@ def test_no_part_owns_a_share_of_the_tolerance():
     """Codes may take all of it but what the cheapest sprites need; half was theirs, a quarter
     each for edges and motion.
     """
-    sky = light(10, 6.0)
+    sky = light_range(10, 6.0)
     alone = planned(
-        settings(quantisation="round", tolerance_mag=9, tolerance_px=9, effort="full"), sky
+        render_settings(quantisation="round", tolerance_mag=9, tolerance_px=9, effort="full"), sky
     )
     tight = {"tolerance_mag": 1.05 * alone.error_mag, "tolerance_px": 1.05 * alone.error_px}
-    taken = planned(settings(**tight), sky)
+    taken = planned(render_settings(**tight), sky)
     assert taken.quantisation == "round" and taken.within
     none = {"tolerance_mag": 0.95 * alone.error_mag, "tolerance_px": 1.05 * alone.error_px}
-    assert planned(settings(**none), sky).quantisation == "exact"
+    assert planned(render_settings(**none), sky).quantisation == "exact"
 
 
 def test_the_cheapest_of_all_combinations_within_is_taken():
     """By every combination of sprites and motions: none that is within takes less time than the
     one taken.
     """
-    asked = settings(tolerance_mag=0.05, tolerance_px=0.08)
-    moving = replace(light(12, 6.0), turning=2 / 3, sky_share=0.1)
+    asked = render_settings(tolerance_mag=0.05, tolerance_px=0.08)
+    moving = replace(light_range(12, 6.0), turning=2 / 3, sky_share=0.1)
     taken = planned(asked, moving)
     assert taken.within
     tried = 0
@@ -114,7 +118,7 @@ def test_the_cheapest_of_all_combinations_within_is_taken():
 
 def test_a_scene_at_rest_asks_nothing_of_paths():
     """0.01 px were charged at rest, too."""
-    asked, sky = settings(tolerance_mag=0.1, tolerance_px=0.1), light(12, 6.0)
+    asked, sky = render_settings(tolerance_mag=0.1, tolerance_px=0.1), light_range(12, 6.0)
     still, turning = planned(asked, sky), planned(asked, replace(sky, turning=0.5))
     assert part(still, "paths").error_px == 0.0 and "none" in part(still, "paths").choice
     assert part(turning, "paths").error_px == pytest.approx(0.5 * turning.motion_above_px)
@@ -138,7 +142,7 @@ def test_paths_are_charged_where_frames_may_turn(motion, on_screen, turns, small
 
 def test_a_psf_in_place_of_a_glass_shares_the_tolerance():
     """Its error is taken from what is left for the codes."""
-    sky, asked = light(12, 6.0), settings(tolerance_mag=0.05, tolerance_px=0.1)
+    sky, asked = light_range(12, 6.0), render_settings(tolerance_mag=0.05, tolerance_px=0.1)
     assert planned(asked, sky).quantisation == "round"
     near = replace(sky, psf_choice=Choice("PSF", "a Gaussian", 0.045, 0.01))
     effort = planned(asked, near)
@@ -155,16 +159,18 @@ def test_the_worst_error_is_of_all_magnitudes_that_the_catalogue_has():
     errors = []
     for rates in (whole, half, np.concatenate([whole, half])):
         sky = Light(srgb_response(8), 1e6, rates)
-        errors.append(planned(settings(quantisation="exact"), sky).error_mag)
+        errors.append(planned(render_settings(quantisation="exact"), sky).error_mag)
     assert errors[0] < errors[1] / 2 and errors[2] == pytest.approx(errors[1], rel=0.3)
     assert errors[1] > 2.5 * math.log10(60.5 / 60.0)
 
 
 def test_auto_leaves_exact_where_numpy_would_be_late():
     """Some 1000 stars in view at 60 Hz: 3 ms by shaders, 50 ms where OpenGL has none."""
-    asked = settings(tolerance_mag=0.02, tolerance_px=0.04)
+    asked = render_settings(tolerance_mag=0.02, tolerance_px=0.04)
     bright = replace(
-        light(8, 6.0), rates_e_per_s=np.repeat(light(8, 6.0).rates_e_per_s, 200), sky_share=0.1
+        light_range(8, 6.0),
+        rates_e_per_s=np.repeat(light_range(8, 6.0).rates_e_per_s, 200),
+        sky_share=0.1,
     )
     by_shader, by_numpy = (
         planned(
@@ -183,7 +189,7 @@ def test_auto_leaves_exact_where_numpy_would_be_late():
 
 def test_the_tracker_s_own_centroider_and_pixels_judge_codes():
     """12 bits, 6.5 magnitudes: a fit is served by `round`, the worst of six centroiders is not."""
-    asked, sky = settings(tolerance_mag=0.05, tolerance_px=0.012), light(12, 6.5)
+    asked, sky = render_settings(tolerance_mag=0.05, tolerance_px=0.012), light_range(12, 6.5)
     of_fit, of_all = planned(asked, replace(sky, centroider="fit")), planned(asked, sky)
     assert (of_fit.quantisation, of_all.quantisation) == ("round", "exact")
     assert part(of_fit, "codes").note == "as `fit` finds stars"
@@ -196,7 +202,7 @@ def test_the_tracker_s_own_centroider_and_pixels_judge_codes():
         for pixel_px in (0.5, 1.0, 2.0):
             seen = Seen(0.55 * pixel_px, pixel_px)
             effort = planned(
-                settings(quantisation="round"), replace(sky, centroider=kind, seen=seen)
+                render_settings(quantisation="round"), replace(sky, centroider=kind, seen=seen)
             )
             rounded[kind, pixel_px] = effort.codes
     narrow, even, wide = (rounded["box3", pixel_px].place_px for pixel_px in (0.5, 1.0, 2.0))
@@ -206,17 +212,21 @@ def test_the_tracker_s_own_centroider_and_pixels_judge_codes():
 
 def test_what_the_file_asks_for_is_not_overruled():
     assert (
-        planned(settings(quantisation="round", tolerance_mag=1e-6), light(8, 8.0)).quantisation
+        planned(
+            render_settings(quantisation="round", tolerance_mag=1e-6), light_range(8, 8.0)
+        ).quantisation
         == "round"
     )
 
 
 def test_sprites_are_as_small_as_the_tolerance_lets_them_be():
     wide = planned(
-        settings(quantisation="exact", tolerance_mag=1e-6, tolerance_px=1e-6), light(8, 6.0)
+        render_settings(quantisation="exact", tolerance_mag=1e-6, tolerance_px=1e-6),
+        light_range(8, 6.0),
     )
     narrow = planned(
-        settings(quantisation="exact", tolerance_mag=0.2, tolerance_px=0.2), light(8, 6.0)
+        render_settings(quantisation="exact", tolerance_mag=0.2, tolerance_px=0.2),
+        light_range(8, 6.0),
     )
     full = GaussianPsf(SIGMA).footprint_px
     assert (wide.sides[0].below_e_per_s, wide.sides[0].side_px) == (pytest.approx(3e38), full)
@@ -272,7 +282,8 @@ def test_the_linear_image_is_whole_all_the_same(bench_with):
 
 def test_the_parts_add_up():
     effort = planned(
-        settings(tolerance_mag=0.1, tolerance_px=0.1), replace(light(12, 6.0), turning=0.5)
+        render_settings(tolerance_mag=0.1, tolerance_px=0.1),
+        replace(light_range(12, 6.0), turning=0.5),
     )
     assert [choice.part for choice in effort.choices] == ["codes", "sprites", "paths", "depth"]
     assert effort.error_mag == pytest.approx(sum(choice.error_mag for choice in effort.choices))
@@ -439,18 +450,24 @@ def test_fields_of_so_many_stars_that_exact_would_be_late_stay_with_round_and_sa
     """3000 stars on a screen that has the whole sky, at two refresh rates; 70 as wide as only
     NumPy takes them.
     """
-    crowded = replace(light(8, 6.0), sky_share=1.0, rates_e_per_s=np.full(3000, 1e4))
-    chosen = planned(settings(), crowded)
+    crowded = replace(light_range(8, 6.0), sky_share=1.0, rates_e_per_s=np.full(3000, 1e4))
+    chosen = planned(render_settings(), crowded)
     assert chosen.quantisation == "round"
     assert "exact takes 9 ms of 16.7 (round 6)" in part(chosen, "codes").note
-    assert planned(settings(), replace(crowded, refresh_hz=30.0)).quantisation == "exact"
+    assert planned(render_settings(), replace(crowded, refresh_hz=30.0)).quantisation == "exact"
     # `round` would be late, too
-    assert planned(settings(), replace(crowded, refresh_hz=90.0)).quantisation == "exact"
-    assert planned(settings(quantisation="exact"), crowded).quantisation == "exact"
-    assert "9 ms of 16.7" in part(planned(settings(quantisation="exact"), crowded), "codes").note
+    assert planned(render_settings(), replace(crowded, refresh_hz=90.0)).quantisation == "exact"
+    assert planned(render_settings(quantisation="exact"), crowded).quantisation == "exact"
+    assert (
+        "9 ms of 16.7"
+        in part(planned(render_settings(quantisation="exact"), crowded), "codes").note
+    )
     few = replace(crowded, rates_e_per_s=np.full(70, 1e3))
     wide = replace(few, psf=GaussianPsf((2.5, 2.5)))
-    assert (planned(settings(), few).quantisation, planned(settings(), wide).quantisation) == (
+    assert (
+        planned(render_settings(), few).quantisation,
+        planned(render_settings(), wide).quantisation,
+    ) == (
         "exact",
         "round",
     )
@@ -486,25 +503,25 @@ def test_a_measured_cost_overrules_the_table_only_where_it_is_clear_of_the_limit
 
 def test_a_machine_that_holds_exact_takes_it_where_the_table_would_not():
     """3000 stars in view at 60 Hz: 9 ms on two cores without a GPU; and 70 on a slow machine."""
-    crowded = replace(light(8, 6.0), sky_share=1.0, rates_e_per_s=np.full(3000, 1e4))
-    by_gpu = planned(settings(), replace(crowded, measured=cost(0.2, 0.4)))
+    crowded = replace(light_range(8, 6.0), sky_share=1.0, rates_e_per_s=np.full(3000, 1e4))
+    by_gpu = planned(render_settings(), replace(crowded, measured=cost(0.2, 0.4)))
     assert (by_gpu.quantisation, by_gpu.by_cost) == ("exact", True)
     assert "exact takes 0.4 ms of 16.7 (round 0.2)" in part(by_gpu, "codes").note
     few = replace(crowded, rates_e_per_s=np.full(70, 1e3))
-    slow = planned(settings(), replace(few, measured=cost(2.0, 25.0)))
+    slow = planned(render_settings(), replace(few, measured=cost(2.0, 25.0)))
     assert slow.quantisation == "round"
     assert (
         "takes 25 ms of 16.7 (round 2) for an average field at 1 deg/s here"
         in part(slow, "codes").note
     )
-    assert planned(settings(codes_ms=(2.0, 25.0)), few).quantisation == "round"
+    assert planned(render_settings(codes_ms=(2.0, 25.0)), few).quantisation == "round"
     assert (
         "by [render] codes_ms"
-        in part(planned(settings(codes_ms=(0.2, 0.4)), crowded), "codes").note
+        in part(planned(render_settings(codes_ms=(0.2, 0.4)), crowded), "codes").note
     )
     # `round` is within the tolerance, whatever it costs
-    assert not planned(settings(), light(16, 6.0)).by_cost
-    assert not planned(settings(quantisation="exact"), few).by_cost
+    assert not planned(render_settings(), light_range(16, 6.0)).by_cost
+    assert not planned(render_settings(quantisation="exact"), few).by_cost
 
 
 def test_round_is_timed_only_where_exact_may_be_late():

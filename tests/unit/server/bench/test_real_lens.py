@@ -41,7 +41,7 @@ def bench(folder):
         yield bench
 
 
-def attitude(rng):
+def random_attitude(rng):
     q = rng.normal(size=4)
     return q / np.linalg.norm(q)
 
@@ -49,7 +49,7 @@ def attitude(rng):
 def test_no_star_is_lost_and_none_is_a_ghost(bench, folder, rng):
     reach = bench.psf.footprint_px // 2
     for _ in range(FIELDS):
-        q = attitude(rng)
+        q = random_attitude(rng)
         x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
         inside = (
             (x > -0.5 - reach + 1)
@@ -69,7 +69,7 @@ def test_no_star_is_lost_and_none_is_a_ghost(bench, folder, rng):
 
 
 def test_light_truth_and_clipping_are_at_the_bent_places(bench, folder, rng):
-    q = attitude(rng)
+    q = random_attitude(rng)
     frame = bench.frame(q)
     x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
     star = np.flatnonzero((np.abs(x - 960) < 980) & (np.abs(y - 540) < 560))
@@ -98,7 +98,7 @@ def test_exact_codes_put_a_star_in_a_bent_corner_where_it_belongs(bench, folder,
     """
     offs = []
     for _ in range(6):
-        q = attitude(rng)
+        q = random_attitude(rng)
         frame = bench.frame(q)
         light = bench.panel.response.light[frame.levels]
         x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
@@ -131,7 +131,7 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
     """Each star's light on the screen, and its centroid, by small steps of time; none is lost
     that only cuts a corner.
     """
-    q, rate = attitude(rng), np.array(rate)
+    q, rate = random_attitude(rng), np.array(rate)
     found = bench.light(bench.view(q, rate))
     scan = bench.scan
     near = np.flatnonzero(
@@ -274,7 +274,7 @@ def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_p
         across = np.outer(1 - t, 0.8 + 0.2 * s) + np.outer(t, 1.0 - 0.1 * s)
         across /= across.max()
         for _ in range(6):
-            q = attitude(rng)
+            q = random_attitude(rng)
             shown = light[bench.frame(q).levels] * across * bench.flux_at_white_e_per_s
             x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
             rate = bench.stars.electrons_per_s

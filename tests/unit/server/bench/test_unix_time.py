@@ -35,7 +35,7 @@ def bench_file(tmp_path) -> Path:
     return path
 
 
-def moon(sky, t_ns: int) -> np.ndarray:
+def moon_km(sky, t_ns: int) -> np.ndarray:
     """From the Earth, km, geometric but for light time: no aberration, which is that of the
     start of each sky.
     """
@@ -52,7 +52,7 @@ def moon(sky, t_ns: int) -> np.ndarray:
 def test_before_and_after_a_leap_second_the_moon_is_where_its_utc_has_it(bench_file, started, utc):
     file = dated(read_bench_file(bench_file), None, utc_ns(started))
     sky = bench_moving(file.config, file.folder)
-    there, wanted = moon(sky, utc_ns(utc)), moon(moving_sky(utc_ns(utc), ("Moon",)), 0)
+    there, wanted = moon_km(sky, utc_ns(utc)), moon_km(moving_sky(utc_ns(utc), ("Moon",)), 0)
     assert np.linalg.norm(there - wanted) / np.linalg.norm(wanted) < LIMIT_ARCSEC * ARCSEC
 
 
@@ -65,13 +65,13 @@ def test_a_second_that_unix_time_leaves_out_moves_the_moon_on(bench_file):
     half = 500_000_000
 
     def moved_arcsec(begin_ns: int, end_ns: int) -> float:
-        a, b = (moon(sky, t_ns) for t_ns in (begin_ns, end_ns))
+        a, b = (moon_km(sky, t_ns) for t_ns in (begin_ns, end_ns))
         return float(np.linalg.norm(a / np.linalg.norm(a) - b / np.linalg.norm(b)) / ARCSEC)
 
     plain = moved_arcsec(zero + 10 * half, zero + 12 * half)
     assert moved_arcsec(zero - half, zero + half) == pytest.approx(2 * plain, rel=0.02)
     counted = moving_sky("1970-01-01T00:00:00Z", ("Moon",))
-    a, b = moon(sky, zero + half), moon(counted, zero + half)
+    a, b = moon_km(sky, zero + half), moon_km(counted, zero + half)
     late_s = np.linalg.norm(a / np.linalg.norm(a) - b / np.linalg.norm(b)) / ARCSEC / plain
     # TAI - UTC was 8.000 s in 1970 and is 37 s from 2017 on (IERS)
     assert late_s == pytest.approx(29, abs=0.01)
@@ -124,5 +124,7 @@ def test_a_log_in_utc_may_cross_a_leap_second(tmp_path):
     path.write_text(bench_text(MOON | {"sky": {"epoch_utc": "source"}}))
     file = dated(read_bench_file(path), "UTC", utc_ns("2016-12-31T22:00:00"))
     sky, utc = bench_moving(file.config, file.folder), utc_ns("2017-01-01T01:00:00")
-    wanted = moon(moving_sky(utc, ("Moon",)), 0)
-    assert np.linalg.norm(moon(sky, utc) - wanted) / np.linalg.norm(wanted) < LIMIT_ARCSEC * ARCSEC
+    wanted = moon_km(moving_sky(utc, ("Moon",)), 0)
+    assert (
+        np.linalg.norm(moon_km(sky, utc) - wanted) / np.linalg.norm(wanted) < LIMIT_ARCSEC * ARCSEC
+    )

@@ -24,7 +24,7 @@ TABLE = """ra,dec,v_mag,bv_mag,epoch_jyear,epoch_jd,period_d,amplitude_mag
 JD_LIMIT_MAG = 0.002  # the Julian year of UTC keeps the date to a minute, the period is float32
 
 
-def stars(folder, **sky):
+def variable_stars(folder, **sky):
     (folder / "stars.csv").write_text(TABLE)
     path = folder / "bench.toml"
     path.write_text(
@@ -47,7 +47,10 @@ def by_row(found):
 
 def test_a_table_s_stars_have_the_light_of_the_date(tmp_path):
     date = {"epoch_utc": "2025-11-21T00:00:00Z"}
-    mean, phase = stars(tmp_path, **date), stars(tmp_path, variables="phase", **date)
+    mean, phase = (
+        variable_stars(tmp_path, **date),
+        variable_stars(tmp_path, variables="phase", **date),
+    )
     assert list(by_row(mean).values()) == [5.0] * 5
     wanted = {
         "stars row 1": 4.6,
@@ -60,17 +63,20 @@ def test_a_table_s_stars_have_the_light_of_the_date(tmp_path):
     assert phase.electrons_per_s.max() / phase.electrons_per_s.min() == pytest.approx(
         10**0.32, rel=2 * JD_LIMIT_MAG
     )
-    half_later = stars(tmp_path, variables="phase", epoch_utc="2025-11-26T00:00:00Z")
+    half_later = variable_stars(tmp_path, variables="phase", epoch_utc="2025-11-26T00:00:00Z")
     assert by_row(half_later)["stars row 1"] == pytest.approx(5.4, abs=JD_LIMIT_MAG)
 
 
 def test_hipparcos_alone_stays_at_its_mean_and_a_line_says_so(tmp_path):
     sky = {"catalogue": "hipparcos", "faintest_v_mag": 4.0, "epoch_utc": "2025-11-21T00:00:00Z"}
-    mean, phase = stars(tmp_path, **sky), stars(tmp_path, variables="phase", **sky)
+    mean, phase = (
+        variable_stars(tmp_path, **sky),
+        variable_stars(tmp_path, variables="phase", **sky),
+    )
     assert phase.v_mag.tolist() == mean.v_mag.tolist()
     assert any("without an epoch of phase have their mean" in note for note in phase.catalog.notes)
 
 
 def test_phase_needs_a_date(tmp_path):
     with pytest.raises(InputError, match=r"needs a date; write \[sky\] epoch_utc"):
-        stars(tmp_path, variables="phase")
+        variable_stars(tmp_path, variables="phase")

@@ -38,7 +38,7 @@ TAKEN_APART = {
 }
 
 
-def names_of(struct: type[msgspec.Struct]) -> list[str]:
+def field_names(struct: type[msgspec.Struct]) -> list[str]:
     return [field.name for field in msgspec.structs.fields(struct)]
 
 
@@ -54,33 +54,33 @@ def test_the_page_takes_apart_only_what_its_server_sends(place, struct):
     file, function = place
     found = re.search(rf"\b{function}\(\{{ ([^}}]+) \}}", (PAGE_DIR / file).read_text())
     assert found, f"{function} of {file} takes no object apart any more"
-    assert {part.split(":")[0].strip() for part in found[1].split(",")} <= set(names_of(struct))
+    assert {part.split(":")[0].strip() for part in found[1].split(",")} <= set(field_names(struct))
 
 
 def test_the_page_hears_every_key_of_a_message():
     heard = re.search(
         r"const HEARD = \{\n(.*?)\n\};", (PAGE_DIR / "main.js").read_text(), re.DOTALL
     )
-    assert re.findall(r"^  (\w+)\(", heard[1], re.MULTILINE) == names_of(PageText)
+    assert re.findall(r"^  (\w+)\(", heard[1], re.MULTILINE) == field_names(PageText)
 
 
 def test_the_documentation_names_every_field():
     page = (ROOT / "docs" / "console.md").read_text()
     rows = {row.split("|")[1]: row for row in page.splitlines() if row.startswith("| `")}
     for key, struct in (("hello", Hello), ("state", PageState), ("event", EventLine)):
-        assert set(re.findall(r"`(\w+)`", rows[f" `{key}` "])) >= set(names_of(struct))
-    assert set(re.findall(r"`(\w+)`", rows[" `history`, `point` "])) >= set(names_of(ChartPoint))
-    assert f"`[{', '.join(names_of(StarMark))}]`" in rows[" `truth` "]
+        assert set(re.findall(r"`(\w+)`", rows[f" `{key}` "])) >= set(field_names(struct))
+    assert set(re.findall(r"`(\w+)`", rows[" `history`, `point` "])) >= set(field_names(ChartPoint))
+    assert f"`[{', '.join(field_names(StarMark))}]`" in rows[" `truth` "]
     for struct in (PageWants, PictureFormat, SkyHealth):
-        assert all(re.search(rf"[`\"]{name}[`\"]", page) for name in names_of(struct))
-    assert all(f'"{name}"' in page for name in names_of(OrderBody))
+        assert all(re.search(rf"[`\"]{name}[`\"]", page) for name in field_names(struct))
+    assert all(f'"{name}"' in page for name in field_names(OrderBody))
 
 
 def test_a_message_has_only_what_it_says_and_no_number_that_json_lacks():
     point = PageText(point=ChartPoint(t_s=1.5, age_ms=float("nan"), frame_ms=float("inf")))
     assert json.loads(point.json()) == {
         "point": (
-            dict.fromkeys(names_of(ChartPoint))
+            dict.fromkeys(field_names(ChartPoint))
             | {
                 "t_s": 1.5,
                 "missed": 0,

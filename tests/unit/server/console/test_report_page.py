@@ -33,7 +33,7 @@ UPLOT_SHA256 = {
 FRAMES = 32_000  # nearly as many spans as there may be, of 4 frames each
 
 
-def frame(k: int, **more: object) -> FrameRecord:
+def frame_record(k: int, **more: object) -> FrameRecord:
     swap_ns = 10**12 + k * PERIOD_NS
     turn = 1e-4 * k
     q = (np.cos(turn), 0.0, np.sin(turn), 0.0)
@@ -62,7 +62,7 @@ def run() -> RunFigures:
     for begin in range(0, FRAMES, BLOCK):
         block = range(begin, min(begin + BLOCK, FRAMES))
         late = {31_415: {"age_ns": 900_000_000, "stale": True, "missed_before": 3}}
-        figures.add(*(frame(k, **late.get(k, {})) for k in block))
+        figures.add(*(frame_record(k, **late.get(k, {})) for k in block))
         figures.add(*(PacketForm(True, None, 10**12 + k * PERIOD_NS) for k in block))
     figures.add(CountRecord(host_ns=10**12 + 500 * 10**9, kind="packet", reason="crc", count=77))
     figures.add(EventRecord(host_ns=10**12 + 90 * 10**9, kind="mark", detail="<b>cover off</b>"))
@@ -156,7 +156,7 @@ def test_the_verdict_names_everything_that_was_wrong():
             {"hidden": "covered", "missed": 2},
         ]
     ):
-        figures.add(frame(k, **more))
+        figures.add(frame_record(k, **more))
     told = verdict(summarise(figures), figures.counted["late"])
     assert not told["ok"]
     assert told["reasons"] == [
@@ -170,14 +170,14 @@ def test_the_verdict_names_everything_that_was_wrong():
     )  # 2 of 5 frames and 2 periods without one
     assert not told["late"]
     well = RunFigures({})
-    well.add(frame(0))
+    well.add(frame_record(0))
     assert verdict(summarise(well), 0)["ok"]
 
 
 def test_a_run_that_missed_frames_alone_was_late_and_right():
     figures = RunFigures({})
-    figures.add(frame(0))
-    figures.add(frame(1, missed_before=3, missed=3))
+    figures.add(frame_record(0))
+    figures.add(frame_record(1, missed_before=3, missed=3))
     told = verdict(summarise(figures), 0)
     assert not told["ok"] and told["late"]
     assert told["headline"] == "60 % of frames missed"  # 3 of 5 refresh periods
@@ -193,7 +193,7 @@ def event(k: int, kind: str, since: int | None = None) -> EventRecord:
 @pytest.mark.parametrize("block", [1, 7, 1000])
 def test_frames_of_a_wrong_sky_are_wrong_from_when_it_began(block):
     """It is found at frame 50, and began at 20; the frames between are in blocks before it."""
-    records = [frame(k, stale=k == 30) for k in range(100)]
+    records = [frame_record(k, stale=k == 30) for k in range(100)]
     records[51:51] = [event(50, "rates-wrong", 20)]
     records[71:71] = [event(70, "rates-right")]
     figures = RunFigures({})
@@ -209,7 +209,9 @@ def test_frames_of_a_wrong_sky_are_wrong_from_when_it_began(block):
 
 def test_lost_packets_are_a_figure_of_their_own():
     figures = RunFigures({})
-    figures.add(frame(0), CountRecord(host_ns=10**12, kind="lost", reason="sequence", count=3))
+    figures.add(
+        frame_record(0), CountRecord(host_ns=10**12, kind="lost", reason="sequence", count=3)
+    )
     found = summarise(figures)
     assert (
         found.lost_packets == 3 and "lost" not in found.packets and "sequence" not in found.packets
@@ -267,7 +269,7 @@ def test_a_steady_stream_has_a_steady_rate_however_long_it_lasts():
 
 def test_of_a_flood_of_events_the_first_and_the_last_are_told():
     figures = RunFigures({})
-    figures.add(frame(0))
+    figures.add(frame_record(0))
     for k in range(3 * MAX_EVENTS):
         figures.add(EventRecord(host_ns=k, kind="stale", detail="x" * 10_000))
     told = run_data("run.mcap", figures, summarise(figures))

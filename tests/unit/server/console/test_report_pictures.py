@@ -29,7 +29,7 @@ pytestmark = pytest.mark.gpu
 RATE = (0.0, 0.02, 0.0)
 
 
-def attitude(k: int) -> tuple[float, ...]:
+def attitude_of_frame(k: int) -> tuple[float, ...]:
     return tuple(
         multiply(from_rotation_vector(np.array([0.0, 1e-3 * k, 0.0])), np.array(ORION_Q)).tolist()
     )
@@ -41,7 +41,7 @@ def ledger(bench_with, tmp_path) -> tuple[Path, Bench]:
     bench = bench_with()
     with Ledger(tmp_path / "run.mcap", bench) as written:
         for k in range(40):
-            q, rate = (None, None) if k == 0 else (attitude(k), RATE)
+            q, rate = (None, None) if k == 0 else (attitude_of_frame(k), RATE)
             written.frame(
                 FrameRecord(
                     frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=10**9 + k, q=q, rate=rate
@@ -61,7 +61,9 @@ def test_pictures_are_the_codes_of_the_run(ledger, tmp_path):
     assert pictures[0]["frame"] == 0 and pictures[-1]["frame"] == 39 and len(pictures) >= 8
     assert pictures[0]["truth"] is None and not levels_of(pictures[0]).any()
     for picture in pictures[1:]:
-        shown = bench.draw(np.array(attitude(picture["frame"])), picture["frame"], RATE).levels
+        shown = bench.draw(
+            np.array(attitude_of_frame(picture["frame"])), picture["frame"], RATE
+        ).levels
         assert np.array_equal(levels_of(picture), shown) and shown.any()
         x, y, *_ = picture["truth"]["stars"][0]
         about = shown[round(y) - 1 : round(y) + 2, round(x) - 1 : round(x) + 2]
@@ -97,7 +99,9 @@ def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gon
 ):
     bench = bench_with('[verify]\ntrue_calibration = "truth.toml"\n')
     with Ledger(tmp_path / "run.mcap", bench) as written:
-        written.frame(FrameRecord(frame=0, t_ns=0, light_ns=0, draw_ns=0, swap_ns=1, q=attitude(0)))
+        written.frame(
+            FrameRecord(frame=0, t_ns=0, light_ns=0, draw_ns=0, swap_ns=1, q=attitude_of_frame(0))
+        )
     (tmp_path / "truth.toml").write_text("# the bench's hash covers every file that it names\n")
     report(tmp_path / "run.mcap", tmp_path)
     data = run_data_of((tmp_path / "report.html").read_text())

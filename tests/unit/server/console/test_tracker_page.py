@@ -37,7 +37,7 @@ def reader() -> RunReader:
     return RunReader(SharedMemory.make(12), setup)
 
 
-def put(reader: RunReader, figures: TrackerFigures) -> None:
+def put_answer(reader: RunReader, figures: TrackerFigures) -> None:
     reader._memory.answers.put(
         msgspec.json.encode(NewAnswer(figures, tuple(ORION_Q), [(1.0, 2.0)]))
     )
@@ -45,8 +45,8 @@ def put(reader: RunReader, figures: TrackerFigures) -> None:
 
 def test_an_answer_is_read_once_and_makes_a_point_of_the_chart(reader):
     assert reader.new_answer() is None
-    put(reader, FIGURES)
-    put(
+    put_answer(reader, FIGURES)
+    put_answer(
         reader,
         msgspec.structs.replace(FIGURES, wrong=2, verdict="wrong", residual_arcsec=[9e4, 0.0, 0.0]),
     )

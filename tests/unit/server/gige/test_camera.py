@@ -26,13 +26,14 @@ from tests.support.gige_client import (
     command,
     own_address,
 )
+from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
 
 SIDE_PX = 256
 
 
 @contextlib.contextmanager
-def camera(allow: tuple[str, ...] = (), rate_hz: float = 50.0) -> Iterator[GigECamera]:
+def served_camera(allow: tuple[str, ...] = (), rate_hz: float = 50.0) -> Iterator[GigECamera]:
     address = own_address()
     identity = CameraIdentity(ipaddress.IPv4Address(address), "virtual tracker", "1", "abc")
     settings = CameraSettings(SIDE_PX, SIDE_PX, 12, 0.01, rate_hz)
@@ -53,7 +54,7 @@ def streaming(made: GigECamera) -> Iterator[GigEClient]:
 
 def test_images_arrive_bit_for_bit_with_their_times():
     rng = np.random.default_rng(3)
-    with camera() as made, streaming(made) as client:
+    with served_camera() as made, streaming(made) as client:
         for k in range(5):
             dn = rng.integers(0, 4096, (SIDE_PX, SIDE_PX), dtype=np.uint16)
             begin_ns = time.monotonic_ns()
@@ -67,7 +68,7 @@ def test_images_arrive_bit_for_bit_with_their_times():
 
 def test_a_lost_packet_is_sent_again():
     dn = np.arange(SIDE_PX * SIDE_PX, dtype=np.uint16).reshape(SIDE_PX, SIDE_PX) % 4096
-    with camera() as made, streaming(made) as client:
+    with served_camera() as made, streaming(made) as client:
         made.take(dn, time.monotonic_ns())
         number, _, packets = client.block()
         body = struct.pack(">HHII", 0, number, 3, 4)
@@ -81,7 +82,7 @@ def test_a_lost_packet_is_sent_again():
 
 def test_a_single_frame_is_one_and_an_exposure_begun_before_the_start_is_none():
     dn = np.zeros((SIDE_PX, SIDE_PX), np.uint16)
-    with camera() as made, GigEClient(made.address) as client:  # type: ignore[attr-defined]
+    with served_camera() as made, GigEClient(made.address) as client:  # type: ignore[attr-defined]
         client.describe()
         client.control()
         client.set("AcquisitionMode", 1)
@@ -97,14 +98,14 @@ def test_a_single_frame_is_one_and_an_exposure_begun_before_the_start_is_none():
 
 
 def test_another_clients_address_is_refused_over_the_wire():
-    with camera() as made, streaming(made) as client:
+    with served_camera() as made, streaming(made) as client:
         elsewhere = int(ipaddress.IPv4Address("127.0.0.9"))
         assert client.write(STREAM_ADDRESS, elsewhere) == 0x8006
 
 
 def test_a_client_that_is_not_allowed_is_never_answered():
     with (
-        camera(allow=("127.0.9.9",)) as made,
+        served_camera(allow=("127.0.9.9",)) as made,
         GigEClient(made.address, own="127.0.9.9") as friend,  # type: ignore[attr-defined]
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
     ):
@@ -130,7 +131,7 @@ def test_hostile_clients_leave_the_controller_its_images():
                 body = mine.bytes(int(mine.integers(0, 64)))
                 sending.sendto(command(kind, body, int(mine.integers(1, 65536))), (address, 3956))
 
-    with camera() as made, streaming(made) as client:
+    with served_camera() as made, streaming(made) as client:
         crowd = [threading.Thread(target=attack, args=(client.address, seed)) for seed in range(24)]
         for thread in crowd:
             thread.start()
@@ -149,12 +150,11 @@ def test_hostile_clients_leave_the_controller_its_images():
 
 @pytest.mark.parametrize("text", ["0.0.0.0", "224.0.0.1", "camera", "::1", "127.0.0.2:3956", ""])
 def test_an_address_that_is_none_is_refused_in_one_line(text):
-    with pytest.raises(InputError, match="--camera"):
-        camera_address(text)
+    assert "--camera" in refusal(camera_address, text)
 
 
 def test_a_second_camera_at_one_address_says_what_to_do():
-    with camera() as made:
+    with served_camera() as made:
         identity = CameraIdentity(ipaddress.IPv4Address(made.address), "m", "1", "s")  # type: ignore[attr-defined]
         settings = CameraSettings(8, 8, 12, 0.01, 10.0)
         with pytest.raises(InputError, match="in use; stop the camera"):

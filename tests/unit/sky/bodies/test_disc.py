@@ -22,7 +22,9 @@ RAYS = 100_000
 AIR_LIMIT = 0.02
 
 
-def disc(phase_deg: float, distance: float, law="lambert", share=1.0, polar=1.0, air=None) -> Disc:
+def unit_disc(
+    phase_deg: float, distance: float, law="lambert", share=1.0, polar=1.0, air=None
+) -> Disc:
     """A body of one unit's radius, off every axis, with the Sun to its side."""
     towards = np.array([0.3, 0.5, 0.8]) / np.linalg.norm([0.3, 0.5, 0.8])
     side = np.cross(towards, [0.0, 0.0, 1.0])
@@ -51,18 +53,18 @@ def test_a_far_sphere_s_whole_light_is_that_of_the_closed_forms(phase_deg):
     lambertian = 2 / 3 * (np.sin(phase) + (np.pi - phase) * np.cos(phase)) / np.pi
     half = phase / 2
     lunar = 1 - np.sin(half) * np.tan(half) * np.log(1 / np.tan(half / 2)) if phase else 1.0
-    assert disc(phase_deg, FAR).law_integral_sr() == pytest.approx(
+    assert unit_disc(phase_deg, FAR).law_integral_sr() == pytest.approx(
         whole_sr * lambertian, rel=CLOSED_LIMIT
     )
-    assert disc(phase_deg, FAR, "lunar-lambert").law_integral_sr() == pytest.approx(
+    assert unit_disc(phase_deg, FAR, "lunar-lambert").law_integral_sr() == pytest.approx(
         whole_sr * lunar, rel=CLOSED_LIMIT
     )
-    assert disc(phase_deg, FAR, "uniform").law_integral_sr() == pytest.approx(
+    assert unit_disc(phase_deg, FAR, "uniform").law_integral_sr() == pytest.approx(
         whole_sr, rel=CLOSED_LIMIT
     )
     # 0.30 + 0.93 mu - 0.23 mu^2 over a disc: the mean of mu is 2/3 there, that of its square 1/2.
     limb = 0.30 + 0.93 * 2 / 3 - 0.23 / 2
-    assert disc(phase_deg, FAR, "limb-darkened").law_integral_sr() == pytest.approx(
+    assert unit_disc(phase_deg, FAR, "limb-darkened").law_integral_sr() == pytest.approx(
         whole_sr * limb, rel=CLOSED_LIMIT
     )
 
@@ -72,7 +74,7 @@ def test_a_far_sphere_s_whole_light_is_that_of_the_closed_forms(phase_deg):
 def test_each_ray_has_the_light_of_a_traced_one_and_all_have_the_integral(
     distance, polar, law, share, rng
 ):
-    one = disc(75.0, distance, law, share, polar)
+    one = unit_disc(75.0, distance, law, share, polar)
     rays, whole_sr = rays_about(one, rng)
     body = Body(
         distance * one.direction,
@@ -95,7 +97,7 @@ def test_each_ray_has_the_light_of_a_traced_one_and_all_have_the_integral(
 
 def test_air_dims_what_is_behind_it_as_traced_rays_say(rng):
     earth = Air(8.0 / 6378.0, 0.097)
-    one = disc(60.0, 1.1, polar=6356.75 / 6378.14, air=earth)
+    one = unit_disc(60.0, 1.1, polar=6356.75 / 6378.14, air=earth)
     body = Body(
         1.1 * one.direction * 6378.0,
         6378.0,

@@ -15,7 +15,7 @@ ARCSEC = np.pi / (180 * 3600)
 BARNARD, MIZAR, SIRIUS = 87937, 65378, 32349
 
 
-def moved(catalog: Catalog, epoch_jyear: float, fainter_mag: float = 0.0) -> Catalog:
+def moved_catalogue(catalog: Catalog, epoch_jyear: float, fainter_mag: float = 0.0) -> Catalog:
     """The same stars as another catalogue has them, at another epoch and without HIP numbers."""
     x, y, z = unit_vectors_icrs(catalog, epoch_jyear).T
     columns = {
@@ -45,20 +45,20 @@ def stacked(*parts: Catalog) -> Catalog:
 def test_no_star_of_hipparcos_stands_twice_at_any_epoch():
     hipparcos = load_catalog()
     for epoch_jyear in (1991.25, 2000.0, 2016.0):
-        joined = join(hipparcos, moved(hipparcos, epoch_jyear, 0.01))
+        joined = join(hipparcos, moved_catalogue(hipparcos, epoch_jyear, 0.01))
         assert len(joined.catalog) == len(hipparcos)
         assert np.array_equal(joined.catalog.hip, hipparcos.hip)
         assert "V differs by +0.010 mag in the median" in joined.line
         assert joined.doubt is None
     # Barnard's star moves by 258 arcsec in those 25 years: at the wrong epoch it would stand twice.
     barnard = hipparcos.taken(hipparcos.hip == BARNARD)
-    stale = replace(moved(barnard, 2016.0), epoch_jyear=np.array([1991.25]))
+    stale = replace(moved_catalogue(barnard, 2016.0), epoch_jyear=np.array([1991.25]))
     assert len(join(hipparcos, stale).catalog) == len(hipparcos) + 1
 
 
 def test_further_stars_are_added_with_their_own_name_and_epoch():
     hipparcos = load_catalog()
-    table = moved(hipparcos.taken(hipparcos.hip == SIRIUS), 2016.0)
+    table = moved_catalogue(hipparcos.taken(hipparcos.hip == SIRIUS), 2016.0)
     table = stacked(table, shifted(table, 0, 60.0, 8.0))
     catalog = join(hipparcos, table).catalog
     assert len(catalog) == len(hipparcos) + 1
@@ -69,11 +69,11 @@ def test_further_stars_are_added_with_their_own_name_and_epoch():
 def test_a_pair_that_hipparcos_sums_takes_in_both_components_of_the_table():
     """Mizar's V = 2.23 is of both, 14.4 arcsec apart: a table has 2.27 and 3.95 there."""
     hipparcos = load_catalog()
-    mizar = moved(hipparcos.taken(hipparcos.hip == MIZAR), 2016.0)
+    mizar = moved_catalogue(hipparcos.taken(hipparcos.hip == MIZAR), 2016.0)
     components = stacked(shifted(mizar, 0, 0.0, 0.04), shifted(mizar, 0, -14.4, 1.72))
     assert len(join(hipparcos, components).catalog) == len(hipparcos)
     # A star as near to a single one, and farther than any photometer's blur, is one of its own.
-    vega = moved(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
+    vega = moved_catalogue(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
     assert (
         len(join(hipparcos, stacked(vega, shifted(vega, 0, -14.4, 6.0))).catalog)
         == len(hipparcos) + 1
@@ -82,7 +82,7 @@ def test_a_pair_that_hipparcos_sums_takes_in_both_components_of_the_table():
 
 def test_a_star_off_its_place_is_the_same_where_its_magnitude_is():
     hipparcos = load_catalog()
-    vega = moved(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
+    vega = moved_catalogue(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
     assert len(join(hipparcos, shifted(vega, 0, 6.0, 0.3)).catalog) == len(hipparcos)
     assert len(join(hipparcos, shifted(vega, 0, 6.0, 3.0)).catalog) == len(hipparcos) + 1
 
@@ -96,7 +96,7 @@ def test_a_star_off_its_place_is_the_same_where_its_magnitude_is():
 )
 def test_an_overlap_that_does_not_fit_is_said(change, words):
     hipparcos = load_catalog()
-    table = moved(hipparcos.brighter_than(6.0), 2016.0)
+    table = moved_catalogue(hipparcos.brighter_than(6.0), 2016.0)
     (name, by), *_ = change.items()
     joined = join(hipparcos, replace(table, **{name: getattr(table, name) + by}))
     assert joined.doubt is not None

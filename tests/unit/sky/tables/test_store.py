@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +35,7 @@ def rewritten(path, **changes):
     np.savez(path.with_suffix(""), **arrays)
 
 
-def same(a, b):
+def is_same_catalogue(a, b):
     return all(
         np.array_equal(getattr(a, n), getattr(b, n), equal_nan=getattr(a, n).dtype.kind == "f")
         for n in column_names()
@@ -94,9 +95,27 @@ def test_a_damaged_or_hostile_cache_is_made_anew(table):
     ]
     for k, harm in enumerate(damage):
         harm()
-        assert same(choose_catalog(TableChoice(table)), whole), k
+        assert is_same_catalogue(choose_catalog(TableChoice(table)), whole), k
         if path.is_file():
             assert path.read_bytes() == good, k
+
+
+class Harm:
+    """An object that touches a file when it is read from a pickle."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def test_nothing_in_a_cache_is_run(table, tmp_path):
+    choose_catalog(TableChoice(table))
+    (path,) = stored(table)
+    rewritten(path, v_mag=np.array([Harm(tmp_path / "run"), None], dtype=object))
+    choose_catalog(TableChoice(table))
+    assert not (tmp_path / "run").exists()
 
 
 def test_nothing_depends_on_a_place_for_the_cache(table, monkeypatch, tmp_path):

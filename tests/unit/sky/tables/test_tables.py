@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from astropy.table import MaskedColumn, Table
 
-from hilstar.basics.errors import InputError
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.star_table import TableChoice, choose_catalog
 from hilstar.sky.table_reader import from_gaia
+from tests.support.refusals import refusal
 
 # CSV, ECSV and VOTable have float64 in 17 digits.
 SAME = 1e-12
@@ -24,7 +24,7 @@ def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
 
-def read(path, **choice):
+def read_stars(path, **choice):
     return choose_catalog(TableChoice(path, **choice))
 
 
@@ -67,7 +67,7 @@ FORMATS = {
 @pytest.mark.parametrize("name", FORMATS)
 def test_gaia_s_own_columns_are_read_from_every_format(tmp_path, name, caplog):
     gaia_table().write(tmp_path / name, **FORMATS[name])
-    catalog = read(tmp_path / name)
+    catalog = read_stars(tmp_path / name)
     assert [catalog.name(row) for row in np.argsort(catalog.v_mag)] == [
         "Gaia DR3 5",
         "Gaia DR3 4295806720",
@@ -110,7 +110,7 @@ def test_tycho_2_has_its_own_names_epoch_and_second_places(tmp_path):
         }
     )
     table.write(tmp_path / "tyc2.fits")
-    catalog = read(tmp_path / "tyc2.fits")
+    catalog = read_stars(tmp_path / "tyc2.fits")
     stars = {catalog.name(row): row for row in range(3)}
     # One HIP number is of one star, the brighter.
     assert sorted(stars) == ["HIP 77", "TYC 2-7-2", "TYC 9537-12121-3"]
@@ -119,7 +119,7 @@ def test_tycho_2_has_its_own_names_epoch_and_second_places(tmp_path):
     assert np.isnan(catalog.vi_mag).all()
     # Packed by gzip it is the same table.
     (tmp_path / "tyc2.fits.gz").write_bytes(gzip.compress((tmp_path / "tyc2.fits").read_bytes()))
-    assert (read(tmp_path / "tyc2.fits.gz").ra_deg == catalog.ra_deg).all()
+    assert (read_stars(tmp_path / "tyc2.fits.gz").ra_deg == catalog.ra_deg).all()
 
 
 def test_units_are_the_table_s(tmp_path):
@@ -136,7 +136,7 @@ def test_units_are_the_table_s(tmp_path):
         }
     )
     table.write(tmp_path / "t.ecsv")
-    catalog = read(tmp_path / "t.ecsv", epoch_jyear=2000.0)
+    catalog = read_stars(tmp_path / "t.ecsv", epoch_jyear=2000.0)
     order = np.argsort(catalog.v_mag)
     assert catalog.ra_deg[order] == pytest.approx([90, 180])
     assert catalog.dec_deg[order] == pytest.approx([10, -10])
@@ -160,7 +160,7 @@ def test_stars_of_hipparcos_in_its_own_columns_are_hipparcos(tmp_path):
         }
     )
     table.write(tmp_path / "hip.csv")
-    own = read(tmp_path / "hip.csv")
+    own = read_stars(tmp_path / "hip.csv")
     order = np.argsort(own.hip)
     for name in (
         "hip",
@@ -189,7 +189,7 @@ def test_repeated_and_impossible_rows_are_counted(tmp_path, caplog):
         "-20,3,4,1",
     ]
     (tmp_path / "t.csv").write_text("ra,dec,vmag,b-v\n" + "\n".join(rows) + "\n")
-    catalog = read(tmp_path / "t.csv")
+    catalog = read_stars(tmp_path / "t.csv")
     assert sorted(catalog.ra_deg.tolist()) == [1.0, 340.0]
     counts = (
         "1 without a place, 3 without a magnitude and a colour, 1 beyond what a star has, 1"
@@ -215,13 +215,12 @@ def test_hours_and_arcseconds_without_a_unit_are_noticed(tmp_path):
     table = sky(1000)
     table["pmra"], table["pmdec"] = table["dec"] / 100, table["dec"] / 200
     table.write(tmp_path / "t.csv")
-    with pytest.raises(InputError, match="so they are in arcsec a year; give the column its unit"):
-        read(tmp_path / "t.csv", epoch_jyear=2000.0)
+    line = refusal(read_stars, tmp_path / "t.csv", epoch_jyear=2000.0)
+    assert "so they are in arcsec a year; give the column its unit" in line
     hours = sky(1000)
     hours["ra"] /= 15
     hours.write(tmp_path / "hours.csv")
-    with pytest.raises(InputError, match="so it is in hours"):
-        read(tmp_path / "hours.csv")
+    assert "so it is in hours" in refusal(read_stars, tmp_path / "hours.csv")
 
 
 HEAD = "ra,dec,vmag,b-v\n"
@@ -258,10 +257,8 @@ REFUSED = {
 def test_what_is_no_table_of_stars_is_refused_in_one_line(tmp_path, text):
     path = tmp_path / "t.dat"
     path.write_text(text)
-    with pytest.raises(InputError) as refusal:
-        read(path)
-    assert REFUSED[text] in str(refusal.value)
-    assert str(refusal.value).startswith(str(path))
+    line = refusal(read_stars, path)
+    assert REFUSED[text] in line and line.startswith(str(path))
 
 
 def test_files_of_other_kinds_are_refused_by_name(tmp_path):
@@ -280,30 +277,30 @@ def test_files_of_other_kinds_are_refused_by_name(tmp_path):
         "missing.fits": "No such file",
     }
     for name, words in refused.items():
-        with pytest.raises(InputError, match=words.replace("(", r"\(").replace(")", r"\)")):
-            read(tmp_path / name)
+        assert words in refusal(read_stars, tmp_path / name)
 
 
 def test_a_unit_of_another_kind_is_refused(tmp_path):
     table = gaia_table()
     table["pmra"] = [1.0, 2.0, 3.0, 4.0, 5.0] * u.km / u.s
     table.write(tmp_path / "t.fits")
-    with pytest.raises(InputError, match="column pmra is in 'km s-1'; give it in mas/yr"):
-        read(tmp_path / "t.fits")
+    assert "column pmra is in 'km s-1'; give it in mas/yr" in refusal(
+        read_stars, tmp_path / "t.fits"
+    )
 
 
 def test_a_table_beside_hipparcos_has_to_have_an_epoch(tmp_path):
     sky(3).write(tmp_path / "t.csv")
-    assert len(read(tmp_path / "t.csv")) == 3
-    with pytest.raises(InputError, match="has no epoch of its places, and stars move; write "):
-        read(tmp_path / "t.csv", with_hipparcos=True)
+    assert len(read_stars(tmp_path / "t.csv")) == 3
+    line = refusal(read_stars, tmp_path / "t.csv", with_hipparcos=True)
+    assert "has no epoch of its places, and stars move; write " in line
     assert (
-        len(read(tmp_path / "t.csv", with_hipparcos=True, epoch_jyear=2000.0))
+        len(read_stars(tmp_path / "t.csv", with_hipparcos=True, epoch_jyear=2000.0))
         == len(load_catalog()) + 3
     )
 
 
 def test_keys_of_a_table_are_refused_for_hipparcos(tmp_path):
-    for choice in (TableChoice(with_hipparcos=True), TableChoice(epoch_jyear=2000.0)):
-        with pytest.raises(InputError, match=r"\[sky\] (with_hipparcos|catalogue_epoch_jyear)"):
-            choose_catalog(choice)
+    beside = refusal(choose_catalog, TableChoice(with_hipparcos=True))
+    dated = refusal(choose_catalog, TableChoice(epoch_jyear=2000.0))
+    assert "[sky] with_hipparcos" in beside and "[sky] catalogue_epoch_jyear" in dated

@@ -15,6 +15,7 @@ from hilstar.attitude.logs.ck_spice import answer
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.basics.errors import InputError, MachineError
+from tests.support.refusals import refusal
 from tests.support.sources import spice_kernels as ck
 
 TIMES = np.arange(0.0, 60.0, 0.25)  # more than 100, so that there is a directory
@@ -31,11 +32,9 @@ def raw(tmp_path):
     return bytearray((tmp_path / "whole.bc").read_bytes())
 
 
-def refusal(path, kernels=("leap.tls", "clock.tsc"), body=None):
-    with spiceypy.KernelPool([]), pytest.raises(InputError) as caught:
-        answer(path, [path.parent / name for name in kernels], body)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+def ck_refusal(path, kernels=("leap.tls", "clock.tsc"), body=None):
+    with spiceypy.KernelPool([]):
+        return refusal(answer, path, [path.parent / name for name in kernels], body)
 
 
 def words(at, *values):
@@ -64,7 +63,7 @@ def bytes_at(place, new):
     return edit
 
 
-def cut(count):
+def cut_to(count):
     def edit(raw):
         del raw[count:]
 
@@ -74,9 +73,9 @@ def cut(count):
 @pytest.mark.parametrize(
     ("edit", "words_said"),
     [
-        (cut(800), "SPICE refuses it (Error reading the file record"),
-        (cut(1500), "SPICE refuses it ("),
-        (cut(3 * RECORD_BYTES + 999), "segment 1 has the words 385 to"),
+        (cut_to(800), "SPICE refuses it (Error reading the file record"),
+        (cut_to(1500), "SPICE refuses it ("),
+        (cut_to(3 * RECORD_BYTES + 999), "segment 1 has the words 385 to"),
         (bytes_at(88, b"VAX-GFLT"), "VAX-GFLT"),
         (bytes_at(8, struct.pack("<2i", 99, 9999)), "is another kind of DAF than a CK"),
         # a list that goes round for ever
@@ -109,7 +108,7 @@ def cut(count):
 def test_a_damaged_file_is_refused_in_one_line(tmp_path, raw, edit, words_said):
     edit(raw)
     (tmp_path / "a.bc").write_bytes(raw)
-    assert words_said in refusal(tmp_path / "a.bc")
+    assert words_said in ck_refusal(tmp_path / "a.bc")
 
 
 @pytest.mark.parametrize(
@@ -118,7 +117,7 @@ def test_a_damaged_file_is_refused_in_one_line(tmp_path, raw, edit, words_said):
 def test_a_quaternion_that_is_none_is_refused_and_not_taken_for_an_attitude(tmp_path, raw, q, norm):
     words(DATA_WORD + 7, *q)(raw)
     (tmp_path / "a.bc").write_bytes(raw)
-    assert f"a.bc: segment 1: the norm of its quaternion 2 is {norm}; it must be 1" in refusal(
+    assert f"a.bc: segment 1: the norm of its quaternion 2 is {norm}; it must be 1" in ck_refusal(
         tmp_path / "a.bc"
     )
 
@@ -145,7 +144,7 @@ def test_a_file_on_which_spice_aborts_ends_a_process_of_its_own_and_is_one_line(
 def test_a_missing_kernel_is_named_with_the_option(tmp_path, raw):
     assert (
         "its clock is unknown; give its SCLK kernel, and leap seconds: --kernel FILE.tsc"
-        in refusal(tmp_path / "whole.bc", kernels=["leap.tls"])
+        in ck_refusal(tmp_path / "whole.bc", kernels=["leap.tls"])
     )
     with ck.new_ck(tmp_path / "a.bc") as handle:
         (tmp_path / "frames.tf").write_text(ck.frame_kernel())
@@ -155,7 +154,7 @@ def test_a_missing_kernel_is_named_with_the_option(tmp_path, raw):
             )
     assert (
         "a frame has no place among the stars; give what orients it: --kernel FILE.tf, or its own"
-        " .bc, or .tpc" in refusal(tmp_path / "a.bc")
+        " .bc, or .tpc" in ck_refusal(tmp_path / "a.bc")
     )
 
 
@@ -195,12 +194,12 @@ def test_a_kernel_that_is_none_is_refused(tmp_path, raw, monkeypatch, text, word
     monkeypatch.chdir(tmp_path)  # SPICE takes a name in a meta-kernel from where the command runs
     name = "all.tm" if "KPL/MK" in text else "x.tls"
     (tmp_path / name).write_text(text)
-    assert words_said in refusal(tmp_path / "whole.bc", kernels=[name])
+    assert words_said in ck_refusal(tmp_path / "whole.bc", kernels=[name])
 
 
 def test_a_structure_that_is_not_there_is_refused_with_those_that_are(tmp_path, raw):
     for stated in ("-7", "NOBODY", "MARS"):
-        assert f"contains no structure {stated!r}; it has -82000: --body ID" in refusal(
+        assert f"contains no structure {stated!r}; it has -82000: --body ID" in ck_refusal(
             tmp_path / "whole.bc", body=stated
         )
     with spiceypy.KernelPool([]):

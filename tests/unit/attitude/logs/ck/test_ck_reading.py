@@ -40,7 +40,7 @@ ALL = Policy(max_extrapolation_ns=0, stale_after_ns=0)
 TIMES = np.arange(0.0, 6.0, 0.25)
 
 
-def read(path, body=None, kernels=("leap.tls", "clock.tsc")):
+def read_ck(path, body=None, kernels=("leap.tls", "clock.tsc")):
     """What the process of its own would answer, in this one; the kernels that are loaded do not
     stay.
     """
@@ -71,7 +71,7 @@ def seconds_of(found):
 def test_instances_are_read_back_with_their_rates(folder, motion, kind, rates):
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, kind, motion, TIMES, rates=rates)
-    found, said = read(folder / "a.bc")
+    found, said = read_ck(folder / "a.bc")
     assert said == {"structure": "-82000", "references": ["J2000"]}
     assert seconds_of(found).tolist() == TIMES.tolist()
     for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
@@ -111,7 +111,7 @@ def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(
 ):
     path = folder / "a.bc"
     write_kind(path, motion, kind, subtype, rates)
-    found, _ = read(path)
+    found, _ = read_ck(path)
     samples = [AttitudeSample(t, q, rate, 0, b) for t, q, rate, b in zip(found.t_ns.tolist(), found.q, found.rate, found.breaks, strict=True)]  # fmt: skip
     timeline = log_timeline(samples, ALL, log_joins(samples))
     assert found.step_s is not None
@@ -138,7 +138,7 @@ OBLIQUITY_ARCSEC = 84381.448  # of J2000, IAU 1976: SPICE's ECLIPJ2000
 def test_the_ecliptic_is_turned_by_the_obliquity(folder, motion):
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, reference="ECLIPJ2000")
-    found, said = read(folder / "a.bc")
+    found, said = read_ck(folder / "a.bc")
     assert said["references"] == ["ECLIPJ2000"]
     ecliptic_to_icrs = Rotation.from_euler("x", OBLIQUITY_ARCSEC / 3600, degrees=True)
     for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
@@ -159,7 +159,7 @@ def test_other_frames_are_turned_as_spice_turns_vectors(folder, motion, referenc
         spiceypy.KernelPool([str(folder / kernel) for kernel in kernels]),
     ):
         ck.write_segment(handle, 3, motion, TIMES, reference=reference)
-    found, _ = read(folder / "b.bc", kernels=kernels)
+    found, _ = read_ck(folder / "b.bc", kernels=kernels)
     with spiceypy.KernelPool([str(folder / kernel) for kernel in kernels]):
         for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
             change = spiceypy.sxform("J2000", reference, ck.START_S + second)
@@ -175,7 +175,7 @@ def test_other_frames_are_turned_as_spice_turns_vectors(folder, motion, referenc
 def test_the_rate_carries_the_attitude_on(folder, motion):
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, np.array([0.0, 1.0 / 1024]), reference="J2000")
-    found, _ = read(folder / "a.bc")
+    found, _ = read_ck(folder / "a.bc")
     turned = to_matrix(found.q[1]) @ to_matrix(found.q[0]).T
     # v' = -w x v over h = 1e-3 s, by the mean rate: h^3 w^3 / 12 = 1e-14.
     by_rate = Rotation.from_rotvec(-found.rate.mean(axis=0) / 1024).as_matrix()
@@ -188,7 +188,7 @@ def test_the_rate_carries_the_attitude_on(folder, motion):
 def test_the_attitude_is_held_between_intervals_of_interpolation(folder, motion):
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, starts=[0.0, 2.0, 4.0])
-    found, _ = read(folder / "a.bc")
+    found, _ = read_ck(folder / "a.bc")
     assert TIMES[found.breaks].tolist() == [2.0, 4.0]
     assert found.gaps_s == pytest.approx([0.25, 0.25], abs=1e-6)
 
@@ -198,7 +198,7 @@ def test_segments_that_touch_join_where_they_agree_and_break_where_they_do_not(f
     with ck.new_ck(folder / "a.bc") as handle:
         for mover, times in ((motion, [0.0, 1.0, 2.0]), (motion, [2.0, 3.0]), (other, [3.0, 4.0])):
             ck.write_segment(handle, 3, mover, np.array(times))
-    found, _ = read(folder / "a.bc")
+    found, _ = read_ck(folder / "a.bc")
     seconds = seconds_of(found)
     assert seconds == pytest.approx([0.0, 1.0, 2.0, 3.0, 3.0, 4.0], abs=1e-5)
     assert found.breaks.tolist() == [False] * 4 + [True, False]
@@ -213,7 +213,7 @@ def test_the_later_segment_has_priority_where_two_overlap(folder, motion):
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, rates=False)
         ck.write_segment(handle, 3, other, np.array([2.0, 2.25, 2.5]))
-    found, _ = read(folder / "a.bc")
+    found, _ = read_ck(folder / "a.bc")
     for second, q, rate in zip(seconds_of(found), found.q, found.rate, strict=True):
         inside = 2.0 <= second <= 2.5
         mover = other if inside else motion
@@ -225,7 +225,7 @@ def test_the_later_segment_has_priority_where_two_overlap(folder, motion):
 def test_a_long_pause_that_an_interval_covers_is_no_gap(folder, motion):
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, np.array([0.0, 0.25, 0.5, 0.75, 1.0, 5.0]), rates=False)
-    found, _ = read(folder / "a.bc")
+    found, _ = read_ck(folder / "a.bc")
     samples = [AttitudeSample(t, q) for t, q in zip(found.t_ns.tolist(), found.q, strict=True)]
     assert not log_joins(samples).held_ns
     assert not found.breaks.any()
@@ -236,7 +236,7 @@ def test_a_gap_of_the_later_segment_is_filled_by_the_earlier_one(folder, motion)
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, rates=False)
         ck.write_segment(handle, 3, other, np.array([1.0, 1.5, 3.0, 3.5]), starts=[1.0, 3.0])
-    found, _ = read(folder / "a.bc")
+    found, _ = read_ck(folder / "a.bc")
     between = [
         q for second, q in zip(seconds_of(found), found.q, strict=True) if 1.6 < second < 2.9
     ]
@@ -251,7 +251,7 @@ def test_a_segment_with_a_directory_is_read(folder, motion, kind, count):
     times = np.arange(count) * 0.25
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, kind, motion, times)
-    found, _ = read(folder / "a.bc")
+    found, _ = read_ck(folder / "a.bc")
     assert seconds_of(found)[[0, -1]] == pytest.approx(times[[0, -1]], abs=1e-6)
     assert angle_between_rad(found.q[-1], motion.quaternion(float(times[-1]))) < READ_BACK_RAD
 
@@ -263,7 +263,7 @@ def test_functions_of_time_with_a_directory_are_read(folder, motion):
     ]
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_type_2(handle, steps)
-    found, _ = read(folder / "a.bc")
+    found, _ = read_ck(folder / "a.bc")
     assert len(found.gaps_s) == 100
 
 
@@ -273,7 +273,7 @@ def test_single_instants_are_read_and_held(folder, motion, kind, count):
     times = np.arange(count) * 1.0
     with ck.new_ck(folder / "a.bc") as handle:
         ck.write_segment(handle, kind, motion, times, starts=times)
-    found, _ = read(folder / "a.bc")
+    found, _ = read_ck(folder / "a.bc")
     assert seconds_of(found) == pytest.approx(times, abs=1e-6)
     assert found.breaks[1:].all()
     for second, q in zip(times.tolist(), found.q, strict=True):

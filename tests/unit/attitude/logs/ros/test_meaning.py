@@ -22,9 +22,17 @@ from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_radec_roll_deg
 from tests.support.sources import ros_bags
-from tests.support.sources.ros_bags import START_NS, Make, write_mcap
+from tests.support.sources.ros_bags import START_NS
+from tests.support.sources.ros_poses import (
+    MAKE,
+    attitudes_of,
+    pose,
+    poses,
+    recorded_in_turn,
+    rotations,
+    wxyz,
+)
 
-MAKE = Make("jazzy")
 PLACE = (48.1, 11.6, 500.0)
 # A chain of four products of unit quaternions in float64.
 ROUNDING = 1e-14
@@ -33,41 +41,13 @@ ROUNDING = 1e-14
 RATE_ROUNDING = 1e-9
 
 
-def rotations(count, seed=2):
-    return Rotation.random(count, rng=np.random.default_rng(seed))
-
-
-def first(rotation):
-    return rotation.as_quat(scalar_first=True)
-
-
-def attitudes(log):
-    return Rotation.from_quat([sample.q_icrs_to_cam for sample in log.samples], scalar_first=True)
-
-
-def poses(frame, turns, topic="/pose", step_ns=10**8, start_ns=START_NS):
-    for i, turn in enumerate(turns):
-        t_ns = start_ns + i * step_ns
-        yield (
-            topic,
-            ros_bags.POSE_STAMPED,
-            t_ns,
-            MAKE.of(ros_bags.POSE_STAMPED, t_ns, frame, "", first(turn), ()),
-        )
-
-
-@pytest.fixture
-def bag(tmp_path):
-    return lambda sent: write_mcap(tmp_path / "a.mcap", sent, "jazzy")
-
-
 # Frames
 
 
 @pytest.mark.parametrize("frame", ["icrs", "GCRF", "/j2000", "eme2000"])
 def test_a_frame_whose_name_is_the_icrs_needs_nothing_stated(bag, frame):
     log = open_log(bag(poses(frame, rotations(3))))
-    assert (attitudes(log) * rotations(3)).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert (attitudes_of(log) * rotations(3)).magnitude() == pytest.approx(0, abs=ROUNDING)
     assert all(kind != "reference" for kind, _ in log.told)
 
 
@@ -77,27 +57,11 @@ def test_an_inertial_frame_of_no_date_is_taken_and_said(bag):
 
 
 @pytest.mark.parametrize("frame", ["map", "odom", "world", "base_link", ""])
-def test_any_other_frame_is_refused_until_it_is_stated(bag, frame):
+def test_any_other_frame_is_what_is_stated(bag, frame):
     path = bag(poses(frame, rotations(3)))
-    with pytest.raises(InputError, match="state its axes with --reference icrs, or"):
-        open_log(path)
     log = open_log(path, Stated(reference="icrs"))
-    assert (attitudes(log) * rotations(3)).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert (attitudes_of(log) * rotations(3)).magnitude() == pytest.approx(0, abs=ROUNDING)
     assert any("is taken as the ICRS, as stated" in line for _, line in log.told)
-
-
-def test_what_is_stated_against_the_frames_own_name_is_refused(bag):
-    path = bag(poses("icrs", rotations(3)))
-    with pytest.raises(
-        InputError, match="'icrs', which is not east, north, up; leave out --reference"
-    ):
-        open_log(path, Stated(reference="enu", place=PLACE))
-    with pytest.raises(InputError, match="refer to the frame 'icrs', not to 'map'"):
-        open_log(path, Stated(reference="map=icrs"))
-    with pytest.raises(
-        InputError, match="the axes of map are icrs, enu or ned; write --reference map=icrs"
-    ):
-        open_log(path, Stated(reference="map=sideways"))
 
 
 @pytest.mark.parametrize(("stated", "turn"), [("enu", q_icrs_to_enu), ("ned", q_icrs_to_ned)])
@@ -108,17 +72,7 @@ def test_a_level_frame_turns_with_the_earth(bag, stated, turn):
     truth, times = rotations(5), START_NS + 10**8 * np.arange(5)
     level = Rotation.from_quat(turn(times, PLACE[0], PLACE[1]), scalar_first=True)
     log = open_log(bag(poses("map", level * truth.inv())), Stated(reference=stated, place=PLACE))
-    assert (attitudes(log) * truth.inv()).magnitude() == pytest.approx(0, abs=ROUNDING)
-
-
-def test_a_level_frame_needs_a_place_and_dates(bag):
-    path = bag(poses("map", rotations(3), start_ns=0))
-    with pytest.raises(
-        InputError, match="refer to east, north, up; give the place with --place LAT,LON,HEIGHT"
-    ):
-        open_log(path, Stated(reference="enu"))
-    with pytest.raises(InputError, match="begin at 0 s, no date; give --epoch-utc TIME"):
-        open_log(path, Stated(reference="enu", place=PLACE))
+    assert (attitudes_of(log) * truth.inv()).magnitude() == pytest.approx(0, abs=ROUNDING)
 
 
 def test_a_simulated_clock_gets_its_date_from_the_user(bag):
@@ -129,25 +83,10 @@ def test_a_simulated_clock_gets_its_date_from_the_user(bag):
     )
     dated = open_log(bag(poses("map", turned)), Stated(reference="enu", place=PLACE))
     assert utc_ns_of("2025-11-22T08:26:35", "") == START_NS - 5 * 10**9
-    assert (attitudes(simulated) * attitudes(dated).inv()).magnitude() == pytest.approx(
+    assert (attitudes_of(simulated) * attitudes_of(dated).inv()).magnitude() == pytest.approx(
         0, abs=ROUNDING
     )
     assert simulated.samples[0].t_ns == 5 * 10**9
-    with pytest.raises(InputError, match=r"dates already .* leave out --epoch-utc"):
-        open_log(
-            bag(poses("map", turned)),
-            Stated(reference="enu", place=PLACE, epoch_utc="2025-11-22T08:26:35"),
-        )
-
-
-def test_a_frame_that_changes_in_the_bag_is_refused(bag):
-    path = bag(
-        [*poses("icrs", rotations(3)), *poses("map", rotations(2), start_ns=START_NS + 10**9)]
-    )
-    with pytest.raises(
-        InputError, match="message 4 of /pose: refers to the frame 'map', the first to 'icrs'"
-    ):
-        open_log(path)
 
 
 @pytest.mark.parametrize("reference", ["icrs", "enu", "ned"])
@@ -184,7 +123,7 @@ def spinning(kind, frame, rate, earths, count=4):
             north, east, down = earth_rate_ned_rad_s(PLACE[0])
             own = (east, north, -down) if earths is q_icrs_to_enu else (north, east, down)
             told = rate - frame_from_body.inv().apply(own)
-        yield "/a", kind, t_ns, MAKE.of(kind, t_ns, frame, "imu_link", first(frame_from_body), told)
+        yield "/a", kind, t_ns, MAKE.of(kind, t_ns, frame, "imu_link", wxyz(frame_from_body), told)
 
 
 @pytest.mark.parametrize("kind", [ros_bags.IMU, ros_bags.ODOMETRY])
@@ -192,51 +131,34 @@ def spinning(kind, frame, rate, earths, count=4):
 def test_a_rate_is_with_respect_to_the_stars_in_the_bodys_components(bag, kind, stated, earths):
     rate = np.array([0.2, -0.3, 0.1])
     log = open_log(bag(spinning(kind, "map", rate, earths)), Stated(reference=stated, place=PLACE))
-    turns = attitudes(log)
+    turns = attitudes_of(log)
     for before, after, sample in zip(turns[:-1], turns[1:], log.samples, strict=False):
         assert -(after * before.inv()).as_rotvec() / 0.01 == pytest.approx(rate, abs=RATE_ROUNDING)
         assert sample.rate_cam_rad_s == pytest.approx(rate, abs=RATE_ROUNDING)
 
 
 def test_a_mounting_turns_attitude_and_rate_of_the_body(bag):
-    mounted = Mounting(tuple(first(rotations(1, seed=5)[0]).tolist()))
+    mounted = Mounting(tuple(wxyz(rotations(1, seed=5)[0]).tolist()))
     sent = list(spinning(ros_bags.IMU, "", np.array([0.2, -0.3, 0.1]), q_icrs_to_enu))
     plain = open_log(bag(sent), Stated(reference="icrs"))
     turned = open_log(bag(sent), Stated(mounted, reference="icrs"))
     body_to_cam = Rotation.from_quat(mounted.q_body_to_cam, scalar_first=True)
     assert (
-        attitudes(turned) * attitudes(plain).inv() * body_to_cam.inv()
+        attitudes_of(turned) * attitudes_of(plain).inv() * body_to_cam.inv()
     ).magnitude() == pytest.approx(0, abs=ROUNDING)
     assert turned.samples[0].rate_cam_rad_s == pytest.approx(
         body_to_cam.apply([0.2, -0.3, 0.1]), abs=ROUNDING
     )
 
 
-def test_an_imu_without_orientation_is_refused_and_without_rate_is_not(bag):
-    at = [START_NS, START_NS + 10**7]
-    blind = [
-        ("/imu", ros_bags.IMU, t, MAKE.imu(t, "imu", (1, 0, 0, 0), (0, 0, 0), covariance0=-1))
-        for t in at
-    ]
-    with pytest.raises(
-        InputError,
-        match=r"message 1 of /imu: orientation_covariance\[0\] is -1: the IMU gives no orientation",
-    ):
-        open_log(bag(blind), Stated(reference="icrs"))
+def test_an_imu_without_rate_gives_its_orientation(bag):
     still = [
-        ("/imu", ros_bags.IMU, t, MAKE.imu(t, "imu", (1, 0, 0, 0), (9, 9, 9), rate0=-1)) for t in at
+        ("/imu", ros_bags.IMU, t, MAKE.imu(t, "imu", (1, 0, 0, 0), (9, 9, 9), rate0=-1))
+        for t in (START_NS, START_NS + 10**7)
     ]
     assert [
         sample.rate_cam_rad_s for sample in open_log(bag(still), Stated(reference="icrs")).samples
     ] == [None, None]
-
-
-def test_an_imus_own_frame_is_its_body_and_never_its_reference(bag):
-    sent = [("/imu", ros_bags.IMU, START_NS, MAKE.imu(START_NS, "icrs", (1, 0, 0, 0), (0, 0, 0)))]
-    with pytest.raises(
-        InputError, match=r"do not say which frame their orientation refers to .*REP 145"
-    ):
-        open_log(bag(sent))
 
 
 def test_an_optical_frame_with_a_mounting_is_said(bag):
@@ -265,34 +187,8 @@ def test_of_several_topics_one_is_chosen_by_name(bag):
     path = bag(
         [*poses("icrs", rotations(2), "/a/pose"), *poses("icrs", rotations(3, seed=9), "/b/pose")]
     )
-    several = (
-        r"several topics with attitudes: /a/pose \(geometry_msgs/PoseStamped\), /b/pose .*; choose"
-        r" one with --topic NAME"
-    )
-    with pytest.raises(InputError, match=several):
-        open_log(path)
     assert len(open_log(path, Stated(topic="/b/pose")).samples) == 3
     assert len(open_log(path, Stated(topic="a/pose")).samples) == 2
-    with pytest.raises(
-        InputError, match=r"has no topic /c; it has /a/pose \(geometry_msgs/PoseStamped\), /b/pose"
-    ):
-        open_log(path, Stated(topic="/c"))
-
-
-def test_a_topic_of_a_type_that_says_no_attitude_is_refused(bag):
-    point = ("/p", "geometry_msgs/msg/Vector3", START_NS, MAKE.vector((1, 2, 3)))
-    with pytest.raises(
-        InputError, match=r"has no topic with attitudes; it has /p \(geometry_msgs/Vector3\)"
-    ):
-        open_log(bag([point]))
-    with pytest.raises(
-        InputError,
-        match=(
-            r"/p is of geometry_msgs/msg/Vector3, which says no attitude; read are Imu, Odometry,"
-            r" Pose"
-        ),
-    ):
-        open_log(bag([point, *poses("icrs", rotations(2))]), Stated(topic="/p"))
 
 
 def test_of_several_bodies_on_one_topic_one_is_chosen(bag):
@@ -302,20 +198,12 @@ def test_of_several_bodies_on_one_topic_one_is_chosen(bag):
             "/vicon",
             kind,
             START_NS + i,
-            MAKE.transform_stamped(START_NS + 10**7 * i, "icrs", child, first(turn)),
+            MAKE.transform_stamped(START_NS + 10**7 * i, "icrs", child, wxyz(turn)),
         )
         for i, turn in enumerate(rotations(4))
         for child in ("one", "two")
     ]
-    with pytest.raises(
-        InputError, match="is of the frame 'two', the first of 'one'; choose one with --body"
-    ):
-        open_log(bag(sent))
     assert len(open_log(bag(sent), Stated(body="two")).samples) == 4
-    with pytest.raises(InputError, match="has no attitude of three"):
-        open_log(bag(sent), Stated(body="three"))
-    with pytest.raises(InputError, match="name no body; leave out --body one"):
-        open_log(bag(poses("icrs", rotations(2))), Stated(body="one"))
 
 
 def test_a_type_that_only_has_the_name_of_ross_own_is_refused(tmp_path):
@@ -360,63 +248,23 @@ def test_a_type_whose_inner_type_has_other_fields_is_refused(tmp_path):
 # Times
 
 
-def recorded_in_turn(sent):
-    """Messages whose recorder's clock is right, whatever their stamps say: rosbags gives them in
-    its order.
-    """
-    return [
-        (topic, kind, START_NS + k * 10**8, message)
-        for k, (topic, kind, _, message) in enumerate(sent)
-    ]
-
-
 def test_messages_out_of_order_and_doubled_are_put_right_and_said(bag):
     sent = list(poses("icrs", rotations(6)))
     shuffled = [sent[0], sent[2], sent[1], sent[1], *sent[3:], sent[5]]
     log = open_log(bag(recorded_in_turn(shuffled)))
-    assert (attitudes(log) * rotations(6)).magnitude() == pytest.approx(0, abs=ROUNDING)
+    assert (attitudes_of(log) * rotations(6)).magnitude() == pytest.approx(0, abs=ROUNDING)
     told = dict(log.told)
     assert told["log-order"] == "2 attitudes came out of order, by up to 0.1 s, and are sorted"
     assert told["log-repeats"] == "2 attitudes are exact repeats of the one before, and are dropped"
 
 
-def test_two_attitudes_of_one_time_are_refused(bag):
-    both = [*poses("icrs", rotations(3)), *poses("icrs", rotations(3, seed=8))]
-    with pytest.raises(
-        InputError, match=r"time does not increase .*; the bag has two attitudes of one time"
-    ):
-        open_log(bag(both))
-
-
-def test_a_clock_that_was_set_back_is_refused(bag):
-    again = [
-        *poses("icrs", rotations(30)),
-        *poses("icrs", rotations(3, seed=8), start_ns=START_NS + 1),
-    ]
-    with pytest.raises(InputError, match=r"time does not increase .* or its clock was set back"):
-        open_log(bag(recorded_in_turn(again)))
-
-
 def test_messages_without_a_stamp_take_the_recorders_clock_and_say_so(bag):
-    sent = [
-        (
-            "/p",
-            ros_bags.POSE_STAMPED,
-            t,
-            MAKE.of(ros_bags.POSE_STAMPED, 0, "icrs", "", (1, 0, 0, 0), ()),
-        )
-        for t in (5, 9)
-    ]
+    sent = [pose("icrs", (1, 0, 0, 0), 0, at_ns=t_ns) for t_ns in (5, 9)]
     log = open_log(bag(sent))
     assert [sample.t_ns for sample in log.samples] == [5, 9]
     assert (
         "have no time of their own; when they were recorded is taken" in dict(log.told)["log-stamp"]
     )
-    mixed = [*sent, *poses("icrs", rotations(2), "/p")]
-    with pytest.raises(
-        InputError, match=r"message 3 of /p: some messages have a stamp and some have none"
-    ):
-        open_log(bag(mixed))
 
 
 def test_a_simulated_clock_may_begin_at_zero(bag):
@@ -428,23 +276,3 @@ def test_a_simulated_clock_may_begin_at_zero(bag):
     log = open_log(bag(sent))
     assert [sample.t_ns for sample in log.samples] == [0, 10**8, 2 * 10**8]
     assert log.conventions.time == "header.stamp: seconds of a simulated clock"
-
-
-@pytest.mark.parametrize(
-    ("q", "why"),
-    [
-        ((0, 0, 0, 0), "norm is 0;"),
-        ((1, 1, 0, 0), "norm is 1.41421"),
-        ((np.nan, 0, 0, 1), "not finite"),
-    ],
-)
-def test_a_quaternion_that_is_none_is_refused_with_its_message(bag, q, why):
-    stamp = START_NS + 10**9
-    bad = (
-        "/pose",
-        ros_bags.POSE_STAMPED,
-        stamp,
-        MAKE.of(ros_bags.POSE_STAMPED, stamp, "icrs", "", q, ()),
-    )
-    with pytest.raises(InputError, match=f"message 4 of /pose: .*{why}"):
-        open_log(bag([*poses("icrs", rotations(3)), bad]))

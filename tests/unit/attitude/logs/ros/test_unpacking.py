@@ -33,7 +33,7 @@ UNIT = (1.0, 0.0, 0.0, 0.0)
 ICRS = Stated(reference="icrs")
 
 
-def poses(release: str, frame: str) -> Iterator[Sent]:
+def poses_in_frame(release: str, frame: str) -> Iterator[Sent]:
     make = Make(release)
     for k in range(3):
         t_ns = START_NS + k * 10**8
@@ -42,16 +42,22 @@ def poses(release: str, frame: str) -> Iterator[Sent]:
 
 
 WRITERS: dict[str, Callable[[Path, str], Path]] = {
-    "ROS 1, bz2": lambda path, name: write_bag1(path / "a.bag", poses("noetic", name), "bz2"),
-    "ROS 1, lz4": lambda path, name: write_bag1(path / "a.bag", poses("noetic", name), "lz4"),
+    "ROS 1, bz2": lambda path, name: write_bag1(
+        path / "a.bag", poses_in_frame("noetic", name), "bz2"
+    ),
+    "ROS 1, lz4": lambda path, name: write_bag1(
+        path / "a.bag", poses_in_frame("noetic", name), "lz4"
+    ),
     "MCAP, zstd": lambda path, name: write_bag2(
-        path / "a", poses("jazzy", name), mcap=True, compression="storage"
+        path / "a", poses_in_frame("jazzy", name), mcap=True, compression="storage"
     ),
-    "MCAP, lz4": lambda path, name: write_mcap(path / "a.mcap", poses("humble", name)),
+    "MCAP, lz4": lambda path, name: write_mcap(path / "a.mcap", poses_in_frame("humble", name)),
     "messages": lambda path, name: write_bag2(
-        path / "a", poses("jazzy", name), compression="message"
+        path / "a", poses_in_frame("jazzy", name), compression="message"
     ),
-    "files": lambda path, name: write_bag2(path / "a", poses("jazzy", name), compression="file"),
+    "files": lambda path, name: write_bag2(
+        path / "a", poses_in_frame("jazzy", name), compression="file"
+    ),
 }
 
 

@@ -23,8 +23,8 @@ from hilstar.attitude.wire.nasa42 import (
 )
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
-from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_radec_roll_deg
+from tests.support.refusals import refusal
 from tests.support.sources.nasa42 import BEGIN_NS, STREAM_2024, STREAM_2025, message, report
 
 # 42 writes thirteen significant digits: four components off by 5e-13 turn a unit vector by 2e-12 at
@@ -36,15 +36,15 @@ NUTATION_RAD_S = 3e-7
 PERIOD_S = 0.1
 
 
-def attitudes(
+def attitudes_of_stream(
     stream: bytes, spacecraft: int = 0, mounting: Mounting | None = None
 ) -> list[AttitudeSample | Refusal]:
     reader = MessageReader(spacecraft, mounting or Mounting())
     return [reader.decode(each) for each in MessageSplitter().feed(stream)]
 
 
-def recorded() -> list[AttitudeSample]:
-    found = attitudes(STREAM_2025.read_bytes())
+def recorded_2025() -> list[AttitudeSample]:
+    found = attitudes_of_stream(STREAM_2025.read_bytes())
     assert all(isinstance(each, AttitudeSample) for each in found)
     return [each for each in found if isinstance(each, AttitudeSample)]
 
@@ -58,7 +58,7 @@ def test_the_recorded_attitudes_turn_42_s_vectors_of_n_into_its_own_of_b():
     nor scalar order is assumed.
     """
     by_time = report()
-    samples = recorded()
+    samples = recorded_2025()
     assert len(samples) == 61
     for sample in samples:
         row = by_time[sample.t_ns]
@@ -71,7 +71,7 @@ def test_the_recorded_attitudes_turn_42_s_vectors_of_n_into_its_own_of_b():
 
 
 def test_the_recorded_rates_are_how_the_recorded_attitudes_turn():
-    for before, after in pairwise(recorded()):
+    for before, after in pairwise(recorded_2025()):
         turn = rotation(after.q_icrs_to_cam) * rotation(before.q_icrs_to_cam).inv()
         mean = (before.rate_cam_rad_s + after.rate_cam_rad_s) / 2
         # vectors turn the other way
@@ -79,7 +79,7 @@ def test_the_recorded_rates_are_how_the_recorded_attitudes_turn():
 
 
 def test_a_stream_of_the_form_until_2025_is_read():
-    samples = attitudes(STREAM_2024.read_bytes())
+    samples = attitudes_of_stream(STREAM_2024.read_bytes())
     assert len(samples) == 20
     for before, after in pairwise(samples):
         assert after.t_ns - before.t_ns == 100_000_000
@@ -96,7 +96,7 @@ def test_a_random_body_and_mounting_see_a_star_where_scipy_does(seed, old):
     star, rate = rng.normal(size=3), rng.normal(size=3)
     mounting = Mounting(tuple(b_to_cam.as_quat(scalar_first=True)))
     text = message(3661.25, n_to_b, rate, old=old, number=3)
-    (sample,) = attitudes(text.encode(), 3, mounting)
+    (sample,) = attitudes_of_stream(text.encode(), 3, mounting)
     assert isinstance(sample, AttitudeSample)
     assert sample.t_ns == BEGIN_NS + 3_661_250_000_000
     seen = rotation(sample.q_icrs_to_cam).apply(star)
@@ -111,7 +111,7 @@ def test_the_self_check_s_own_words_point_where_it_says():
     words = re.search(r"qn = \(([-0-9., ]+)\)", CONVENTIONS.lines(mounting)[-1])
     assert words is not None
     text = f"TIME 2024-099-00:00:00.0\nSC[0].B[0].qn = [{words[1].replace(',', ' ')}]\n[ENDMSG]\n"
-    (sample,) = attitudes(text.encode(), 0, mounting)
+    (sample,) = attitudes_of_stream(text.encode(), 0, mounting)
     assert isinstance(sample, AttitudeSample)
     # Seven digits of each component: 2e-7 rad.
     assert to_radec_roll_deg(sample.q_icrs_to_cam)[:2] == pytest.approx(
@@ -167,7 +167,7 @@ GOOD = "TIME 2024-099-00:00:01.5\nSC[0].B[0].wn = [0 0 1e-3]\nSC[0].B[0].qn = [0
 )
 def test_a_wrong_message_is_refused_by_reason_and_the_next_is_read(was, becomes, reason):
     assert was in GOOD
-    wrong, good = attitudes((GOOD.replace(was, becomes) + GOOD).encode("latin-1"))
+    wrong, good = attitudes_of_stream((GOOD.replace(was, becomes) + GOOD).encode("latin-1"))
     assert (wrong.reason if isinstance(wrong, Refusal) else None) == reason
     assert isinstance(good, AttitudeSample)
     assert good.sequence == 2
@@ -184,8 +184,7 @@ def test_a_message_without_an_end_costs_its_bound_and_no_more():
 def test_the_spacecraft_is_a_number_or_42_s_own_name_of_it():
     assert [spacecraft_number(name) for name in (None, 0, 3, "SC[12]", "7")] == [0, 0, 3, 12, 7]
     for name in ("Aura", "SC[x]", -1, "SC[1].B[0]"):
-        with pytest.raises(InputError, match="SC"):
-            spacecraft_number(name)
+        assert "SC" in refusal(spacecraft_number, name)
 
 
 def test_a_message_that_comes_byte_by_byte_is_looked_through_once(monkeypatch):

@@ -38,7 +38,7 @@ def plain(bench):
     return bench.frame(ORION_Q)
 
 
-def shown(bench, *tables, since_ns=0, share=1.0, folder=None, **more):
+def frame_with_faults(bench, *tables, since_ns=0, share=1.0, folder=None, **more):
     """The frame with faults, and a table's own rows of the truth."""
     faults = [fault_of({"name": f"fault {k}", **table}) for k, table in enumerate(tables)]
     scenario = (
@@ -50,28 +50,28 @@ def shown(bench, *tables, since_ns=0, share=1.0, folder=None, **more):
     return frame, frame.truth[np.char.startswith(frame.truth["name"], "fault")]
 
 
-def light(frame):
+def total_light(frame):
     return frame.linear.sum(dtype=np.float64)
 
 
 def test_a_false_star_lies_where_a_real_star_of_its_place_would(bench, plain):
     star = plain.truth[plain.truth["hip"] == 26727][0]
     place = plain.star[plain.truth["hip"] == 26727][0]
-    frame, rows = shown(
+    frame, rows = frame_with_faults(
         bench, {"kind": "false-star", "icrs": bench.stars.vectors[place].tolist(), "electrons": 5e4}
     )
     assert [(row["hip"], row["name"]) for row in rows] == [(0, "fault 0")]
     assert abs(rows["x_px"][0] - star["x_px"]) < PX and abs(rows["y_px"][0] - star["y_px"]) < PX
     assert rows["electrons_per_s"][0] == 5e4 / EXPOSURE_S
     # of 47e6 in float32
-    assert light(frame) - light(plain) == pytest.approx(5e4 / EXPOSURE_S, rel=2e-4)
+    assert total_light(frame) - total_light(plain) == pytest.approx(5e4 / EXPOSURE_S, rel=2e-4)
 
 
 def test_magnitude_and_electrons_are_one_light(bench):
-    _, rows = shown(
+    _, rows = frame_with_faults(
         bench, {"kind": "false-star", "screen_px": [50, 60], "v_mag": 3.0, "bv_mag": 1.1}
     )
-    _, again = shown(
+    _, again = frame_with_faults(
         bench,
         {
             "kind": "false-star",
@@ -91,7 +91,9 @@ def test_a_false_star_of_the_detector_moves_at_its_rate(bench):
         "rate_px_s": [40, -20],
         "electrons": 1e4,
     }
-    places = [shown(bench, table, since_ns=since_ns)[1][0] for since_ns in (0, 1_000_000_000)]
+    places = [
+        frame_with_faults(bench, table, since_ns=since_ns)[1][0] for since_ns in (0, 1_000_000_000)
+    ]
     # 13 um behind 70 mm against 57.65 um behind 60 mm
     scale = (60 / 0.05765) / (70 / 0.013)
     assert places[1]["x_px"] - places[0]["x_px"] == pytest.approx(40 * scale, abs=1e-3)
@@ -104,33 +106,39 @@ def test_a_false_star_of_the_detector_moves_at_its_rate(bench):
 
 def test_a_star_that_is_gone_is_in_neither_image_nor_truth(bench, plain):
     row = plain.truth[plain.truth["hip"] == 26727][0]
-    frame, _ = shown(bench, {"kind": "star-gone", "star": "Alnitak"})
+    frame, _ = frame_with_faults(bench, {"kind": "star-gone", "star": "Alnitak"})
     assert 26727 not in frame.truth["hip"] and len(frame.truth) == len(plain.truth) - 1
-    assert light(plain) - light(frame) == pytest.approx(row["electrons_per_s"], rel=1e-5)
-    half, _ = shown(bench, {"kind": "star-gone", "hip": 26727}, share=0.5)
-    assert light(plain) - light(half) == pytest.approx(row["electrons_per_s"] / 2, rel=1e-5)
+    assert total_light(plain) - total_light(frame) == pytest.approx(
+        row["electrons_per_s"], rel=1e-5
+    )
+    half, _ = frame_with_faults(bench, {"kind": "star-gone", "hip": 26727}, share=0.5)
+    assert total_light(plain) - total_light(half) == pytest.approx(
+        row["electrons_per_s"] / 2, rel=1e-5
+    )
 
 
 def test_a_flash_at_a_star_adds_to_its_light_at_its_place(bench, plain):
     row = plain.truth[plain.truth["hip"] == 26727][0]
-    _, rows = shown(bench, {"kind": "flash", "hip": 26727, "electrons": 1e5, "for_s": 0.2})
+    _, rows = frame_with_faults(
+        bench, {"kind": "flash", "hip": 26727, "electrons": 1e5, "for_s": 0.2}
+    )
     assert abs(rows["x_px"][0] - row["x_px"]) < PX and abs(rows["y_px"][0] - row["y_px"]) < PX
 
 
 def test_tracks_have_their_electrons_in_each_exposure_and_are_the_seed_s(bench, plain):
     table = {"kind": "cosmic-rays", "number": 12, "electrons": 4000, "length_px": 9}
-    frame, rows = shown(bench, table)
+    frame, rows = frame_with_faults(bench, table)
     inside = (rows["x_px"] > 8) & (rows["x_px"] < 311) & (rows["y_px"] > 8) & (rows["y_px"] < 231)
     assert 0 < len(rows) <= 12 and inside.any()
-    assert light(frame) - light(plain) <= 12 * 4000 / EXPOSURE_S * (1 + 1e-3)
-    again, _ = shown(bench, table)
-    later, other = shown(bench, table, since_ns=150_000_000)
+    assert total_light(frame) - total_light(plain) <= 12 * 4000 / EXPOSURE_S * (1 + 1e-3)
+    again, _ = frame_with_faults(bench, table)
+    later, other = frame_with_faults(bench, table, since_ns=150_000_000)
     assert np.array_equal(frame.levels, again.levels)
     assert not np.array_equal(frame.linear, later.linear) and len(other)
 
 
 def test_a_gradient_has_its_light_in_a_tracker_pixel_at_the_bright_edge(bench, plain):
-    frame, _ = shown(bench, {"kind": "gradient", "electrons_per_s": 100.0})
+    frame, _ = frame_with_faults(bench, {"kind": "gradient", "electrons_per_s": 100.0})
     added = (frame.linear - plain.linear)[0]  # the first row has few stars
     # A monitor pixel collects the light of as many tracker pixels as it covers.
     covered = (0.05765 / 60 / (0.013 / 70)) ** 2
@@ -140,7 +148,7 @@ def test_a_gradient_has_its_light_in_a_tracker_pixel_at_the_bright_edge(bench, p
 
 
 def test_a_glow_off_the_field_falls_off_with_the_angle_from_it(bench, plain):
-    frame, _ = shown(
+    frame, _ = frame_with_faults(
         bench,
         {"kind": "glow", "tracker_px": [-700, 511.5], "electrons_per_s": 1000, "scale_deg": 2},
     )
@@ -159,7 +167,7 @@ def test_a_measured_map_covers_the_detector(bench, plain, tmp_path, ending):
     image[20:40, 10:50] = 200
     path = tmp_path / f"stray.{ending}"
     write_image(path, image)
-    frame, _ = shown(
+    frame, _ = frame_with_faults(
         bench, {"kind": "light-map", "file": path.name, "electrons_per_s": 50}, folder=tmp_path
     )
     covered = (0.05765 / 60 / (0.013 / 70)) ** 2
@@ -182,11 +190,11 @@ def write_image(path, image):
 
 
 def test_a_blank_field_has_no_light_and_a_step_turns_the_attitude(bench):
-    frame, _ = shown(
+    frame, _ = frame_with_faults(
         bench, {"kind": "blank"}, {"kind": "false-star", "screen_px": [5, 5], "electrons": 1e5}
     )
     assert not frame.linear.any() and not frame.levels.any() and not len(frame.truth)
-    stepped, _ = shown(bench, {"kind": "attitude-step", "turn_arcsec": [0, 90, 0]})
+    stepped, _ = frame_with_faults(bench, {"kind": "attitude-step", "turn_arcsec": [0, 90, 0]})
     turned = angle_between_rad(np.array(ORION_Q), stepped.q_icrs_to_cam) * ARCSEC_PER_RAD
     assert turned == pytest.approx(90, abs=1e-3)
 
@@ -214,7 +222,7 @@ def test_dropped_frames_are_the_seed_s(bench):
 )
 def test_what_this_bench_cannot_draw_is_refused(bench, table, said):
     with pytest.raises(InputError, match=said):
-        shown(bench, table)
+        frame_with_faults(bench, table)
 
 
 def cut_fits():
@@ -236,7 +244,7 @@ def test_a_map_that_is_no_image_is_refused(bench, tmp_path, content, said):
     (tmp_path / "stray.fits").write_bytes(content)
     with warnings.catch_warnings(record=True) as told, pytest.raises(InputError, match=said):
         warnings.simplefilter("always")
-        shown(bench, {"kind": "light-map", "file": "stray.fits"}, folder=tmp_path)
+        frame_with_faults(bench, {"kind": "light-map", "file": "stray.fits"}, folder=tmp_path)
     assert not told  # of a cut file one line is printed, not Astropy's besides
 
 

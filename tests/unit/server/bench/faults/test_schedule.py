@@ -7,6 +7,7 @@ import pytest
 from hilstar.basics.errors import InputError
 from hilstar.optics.layers.fault_kinds import fault_of
 from hilstar.server.bench.scenario import MAX_ON, FaultSchedule, Scenario
+from tests.support.refusals import refusal
 
 FRAME_NS = 10_000_000  # 100 Hz
 
@@ -15,7 +16,7 @@ def blank(name, **keys):
     return fault_of({"kind": "blank", "name": name, **keys})
 
 
-def star(name, **keys):
+def false_star(name, **keys):
     return fault_of(
         {"kind": "false-star", "name": name, "tracker_px": [5, 5], "electrons": 100, **keys}
     )
@@ -27,7 +28,7 @@ def schedule_of(*faults):
     return FaultSchedule(scenario, FRAME_NS / 1e9, listen=heard.append), heard
 
 
-def frames(schedule, count, first=0):
+def faults_by_frame(schedule, count, first=0):
     """What is on in frames in a row: names and shares."""
     return [
         [(now.fault.name, now.share) for now in schedule.at(k * FRAME_NS)]
@@ -37,7 +38,7 @@ def frames(schedule, count, first=0):
 
 def test_a_fault_of_the_file_is_on_at_its_time_for_its_time():
     schedule, heard = schedule_of(blank("cover", at_s=0.02, for_s=0.03))
-    assert [bool(on) for on in frames(schedule, 7)] == [
+    assert [bool(on) for on in faults_by_frame(schedule, 7)] == [
         False,
         False,
         True,
@@ -53,15 +54,15 @@ def test_a_fault_of_the_file_is_on_at_its_time_for_its_time():
 
 
 def test_light_between_two_frames_is_divided_among_them_in_proportion():
-    schedule, _ = schedule_of(star("flash", at_s=0.014, for_s=0.02))
-    on = frames(schedule, 5)
+    schedule, _ = schedule_of(false_star("flash", at_s=0.014, for_s=0.02))
+    on = faults_by_frame(schedule, 5)
     assert on == [[], [("flash", 0.6)], [("flash", 1.0)], [("flash", 0.4)], []]
     assert sum(share for row in on for _, share in row) * FRAME_NS == 0.02e9
 
 
 def test_what_is_shorter_than_a_frame_is_on_for_one():
     schedule, _ = schedule_of(blank("short", at_s=0.021, for_s=0.001))
-    assert [bool(on) for on in frames(schedule, 5)] == [False, False, True, False, False]
+    assert [bool(on) for on in faults_by_frame(schedule, 5)] == [False, False, True, False, False]
 
 
 def test_the_first_frame_is_the_zero_unless_it_is_said():
@@ -74,20 +75,20 @@ def test_the_first_frame_is_the_zero_unless_it_is_said():
 
 
 def test_the_console_starts_and_stops_a_fault_of_the_scenario_by_name():
-    schedule, heard = schedule_of(blank("cover"), star("ghost"))
+    schedule, heard = schedule_of(blank("cover"), false_star("ghost"))
     assert schedule.names() == ["cover", "ghost"]
-    assert frames(schedule, 2) == [[], []]
+    assert faults_by_frame(schedule, 2) == [[], []]
     schedule.start("ghost", "console")
     assert schedule.on() == ["ghost"]
-    assert frames(schedule, 2, 2) == [[("ghost", 1.0)]] * 2
+    assert faults_by_frame(schedule, 2, 2) == [[("ghost", 1.0)]] * 2
     schedule.stop("ghost", "console")
-    assert frames(schedule, 1, 4) == [[]]
+    assert faults_by_frame(schedule, 1, 4) == [[]]
     assert [(c.what, c.fault.name, c.who, c.t_ns) for c in heard] == [
         ("start", "ghost", "console", 2 * FRAME_NS),
         ("end", "ghost", "console", 4 * FRAME_NS),
     ]
     schedule.start("ghost", "console")
-    assert frames(schedule, 1, 5) == [[("ghost", 1.0)]]
+    assert faults_by_frame(schedule, 1, 5) == [[("ghost", 1.0)]]
     assert heard[-1].number == 2  # the second start of the run
 
 
@@ -97,21 +98,19 @@ def test_what_cannot_be_started_or_stopped_is_refused_in_a_line():
         InputError, match=r"no fault is called 'covre'; did you mean cover\? known are cover"
     ):
         schedule.start("covre", "console")
-    with pytest.raises(InputError, match="'cover' is not on; none is"):
-        schedule.stop("cover")
+    assert "'cover' is not on; none is" in refusal(schedule.stop, "cover")
     schedule.start("cover", "console")
-    with pytest.raises(InputError, match="on already"):
-        schedule.start("cover", "stream")
+    assert "on already" in refusal(schedule.start, "cover", "stream")
 
 
 def test_the_stream_asks_for_faults_of_its_own_now_or_later():
     schedule, _ = schedule_of()
     schedule.at(0)
-    schedule.ask(star("now", for_s=0.02), "stream")
+    schedule.ask(false_star("now", for_s=0.02), "stream")
     schedule.ask(blank("later", at_s=0.04, for_s=0.01), "stream")
     # a time that has passed means now
     schedule.ask(blank("past", at_s=0.001, for_s=0.01), "stream")
-    assert frames(schedule, 5, 1) == [
+    assert faults_by_frame(schedule, 5, 1) == [
         [("now", 1.0), ("past", 1.0)],
         [("now", 1.0)],
         [],

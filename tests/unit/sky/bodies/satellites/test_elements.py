@@ -17,7 +17,7 @@ NAME, FIRST, SECOND = STATION_TLE.splitlines()
 ONE, OTHER = (element_set(number, (51.6, 0.0, 0.0, 0.0), 0.001, 15.5) for number in (10, 11))
 
 
-def names_of(text: str) -> list[str]:
+def satellite_names(text: str) -> list[str]:
     return [one.name for one in read_satellites(text, "tles.txt", UTC_NS)]
 
 
@@ -35,14 +35,14 @@ def names_of(text: str) -> list[str]:
     ],
 )
 def test_lists_with_names_or_without_are_read(text, names):
-    assert names_of(text) == names
+    assert satellite_names(text) == names
 
 
 def test_of_several_sets_of_one_the_nearest_in_time_counts():
     later = with_checksum(FIRST[:18] + "08265.51782528" + FIRST[32:68])
     latest = with_checksum(FIRST[:18] + "08275.51782528" + FIRST[32:68])
     text = f"A\n{latest}\n{SECOND}\nB\n{FIRST}\n{SECOND}\nC\n{later}\n{SECOND}\n"
-    assert names_of(text) == ["B"]
+    assert satellite_names(text) == ["B"]
     assert [one.name for one in read_satellites(text, "f", UTC_NS + 9 * 86_400 * 10**9)] == ["A"]
 
 
@@ -125,7 +125,7 @@ META = {
 SAME_KM = 1e-3  # sgp4 rounds an OMM's epoch to a microsecond, in which a low orbit goes 8 mm
 
 
-def as_json(fields):
+def json_omm(fields):
     return json.dumps([fields], indent=1)
 
 
@@ -160,7 +160,7 @@ def as_kvn(fields):
     )
 
 
-FORMS = [as_json, as_text_json, as_csv, as_xml, as_kvn]
+FORMS = [json_omm, as_text_json, as_csv, as_xml, as_kvn]
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -213,7 +213,7 @@ def test_another_theory_or_frame_is_refused_by_name(key, value):
 def test_what_writers_leave_out_and_numbers_of_nine_digits_are_read():
     few = {name: FIELDS[name] for name in (*MEAN, "OBJECT_NAME", "BSTAR")}
     few |= {"NORAD_CAT_ID": 799_500_123, "EPOCH": "2008-09-20T12:25:40Z"}
-    (found,) = read_satellites(as_json(few), "omm", UTC_NS)
+    (found,) = read_satellites(json_omm(few), "omm", UTC_NS)
     assert found.number == 799_500_123
 
 

@@ -7,10 +7,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from hilstar.basics.units import KM_PER_AU
 from hilstar.sky.bodies.satellites import (
     EARTH_FLATTENING,
     EARTH_KM,
-    KM_PER_AU,
     SUN_KM,
     Brightness,
     in_front,

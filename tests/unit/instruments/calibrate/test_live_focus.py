@@ -1,0 +1,139 @@
+"""Live focus: planted widths of a lens whose ring is turned, motion, and saturation."""
+
+from __future__ import annotations
+
+import json
+from contextlib import ExitStack, closing
+
+import numpy as np
+import pytest
+
+from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
+from hilstar.instruments.calibrate.live_focus import FocusCurve, focus_readings, sparkline
+from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.benches import TWIN, bench_text
+from tests.support.commands import run_hilstar_here
+
+RING_PX = (3.0, 2.0, 1.4, 1.0, 0.8, 1.1, 1.6)  # sigma of the PSF as the ring is turned
+BEST = 5  # the image of the sharpest
+SURE_SIGMAS = 4.0
+EXPOSURE_S = 0.005  # no dot saturates the tracker
+NOISE = {"gain_e_per_dn": 8.0, "read_noise_e": 12.0, "full_well_e": 30_000.0, "offset_dn": 40.0}
+
+
+class Ring(ImageSource):
+    """A virtual bench for each place of the ring, one after another; the last stays."""
+
+    sets_exposure = True
+
+    def __init__(self, benches):
+        self._benches = benches
+        self._looks = 0
+
+    def look(self, file, pattern, stem, exposure_s):
+        place = max(0, self._looks - 1)  # the first look is the dark frame
+        self._looks += 1
+        return self._benches[min(place, len(self._benches) - 1)].look(
+            file, pattern, stem, exposure_s
+        )
+
+
+class Shaken(VirtualBench):
+    """A virtual bench whose second image is of a tracker that moves over 4 px to the right."""
+
+    looks = 0
+
+    def look(self, file, pattern, stem, exposure_s):
+        self.looks += 1
+        return super().look(file, pattern, stem, exposure_s)
+
+    def pixels(self, path, resolution_px):
+        image = super().pixels(path, resolution_px)
+        if self.looks == 3:
+            image = np.mean([np.roll(image, k, axis=1) for k in range(5)], axis=0)
+        return image
+
+
+@pytest.fixture
+def benches(tmp_path):
+    """The bench file, and a truth file for a width of the PSF."""
+
+    def truth(sigma_px):
+        path = tmp_path / f"truth-{sigma_px}.toml"
+        tracker = {"psf_sigma_px": [sigma_px, sigma_px]}
+        path.write_text(bench_text(TWIN, {"tracker": tracker, "tracker.detector": NOISE}))
+        return read_bench_file(path)
+
+    return truth(1.0), truth
+
+
+def readings(file, source, folder, count):
+    """The first readings, and the curve after them."""
+    curve = FocusCurve()
+    lines = []
+    images = focus_readings(file, source, folder, EXPOSURE_S)
+    for _ in range(count):
+        curve.add(next(images))
+        lines.append(curve.line())
+    return curve, lines
+
+
+def test_the_sharpest_place_of_the_ring_is_the_best(benches, tmp_path):
+    file, truth = benches
+    with ExitStack() as stack:
+        places = [
+            stack.enter_context(closing(VirtualBench(file, truth(sigma), 0))) for sigma in RING_PX
+        ]
+        curve, lines = readings(file, Ring(places), tmp_path, len(RING_PX))
+    for reading, sigma_px in zip(curve.readings, RING_PX, strict=True):
+        assert reading.figure is not None, reading.why
+        off_px = reading.figure.psf_sigma_px - sigma_px
+        assert abs(off_px) < SURE_SIGMAS * reading.figure.error_px
+    assert curve.best is curve.readings[BEST - 1]
+    assert "the best so far" in lines[BEST - 1]
+    assert "best 0.8" in lines[-1]
+
+
+def test_an_image_of_a_tracker_that_moves_is_named_and_is_no_best(benches, tmp_path):
+    file, truth = benches
+    with closing(Shaken(file, truth(1.0), 0)) as source:
+        curve, lines = readings(file, source, tmp_path, 3)
+    still, moved, after = (reading.figure for reading in curve.readings)
+    assert still and moved and after
+    assert moved.streak_px == pytest.approx(np.sqrt(12 * 2), rel=0.1)  # the variance of 0 to 4 is 2
+    assert min(moved.streak_deg, 180 - moved.streak_deg) < 5
+    assert max(still.streak_px, after.streak_px) < 1.0
+    assert "hold the tracker still" in lines[1]
+    assert curve.best is not curve.readings[1]
+
+
+def test_dots_that_saturate_have_no_figure_and_are_dimmed(benches, tmp_path):
+    file, truth = benches
+    with closing(VirtualBench(file, truth(1.0), 0)) as source:
+        images = focus_readings(file, source, tmp_path, 1.0)
+        reading = next(images)
+        assert reading.figure is None and "saturate" in reading.why
+        assert next(images).code < reading.code == 2**10 - 1
+
+
+def test_the_command_ends_with_the_best_image(benches, tmp_path):
+    _, truth = benches
+    bench = tmp_path / "truth-1.0.toml"
+    words = ("--images", "3", "--exposure", str(EXPOSURE_S), "--json")
+    done = run_hilstar_here("calibrate", "focus", bench, "--virtual", truth(1.4).path, *words)
+    assert done.returncode == 0, done.stderr
+    *figures, last = [json.loads(line) for line in done.stdout.splitlines()]
+    best = last["best"]["figure"]
+    assert [figure["number"] for figure in figures] == [1, 2, 3]
+    assert abs(best["psf_sigma_px"] - 1.4) < SURE_SIGMAS * best["error_px"]
+
+
+def test_the_command_without_images_says_what_to_give(benches, tmp_path):
+    done = run_hilstar_here("calibrate", "focus", tmp_path / "truth-1.0.toml")
+    assert done.returncode == 2
+    assert "give --grab CMD or a camera, or --virtual TRUTH.toml" in done.stderr
+
+
+def test_a_curve_is_as_high_as_its_values():
+    assert sparkline([3.0, 2.0, 1.0, 2.0, 3.0], 0.1) == "█▅▁▅█"
+    assert sparkline([1.0, 1.01], 0.1) == "▁▂"

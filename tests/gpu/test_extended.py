@@ -114,7 +114,8 @@ def test_a_floor_is_that_of_its_own_light(rng):
     panel = target.panel()
     with Renderer(target) as gl:
         none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
-        for light in (map_of(rng), map_of(rng, 3e-3, 6e-3)):
+        elsewhere = replace(map_of(rng, 3e-3, 6e-3), corner_px=(10, 110))
+        for light in (map_of(rng), elsewhere):
             gl.draw(replace(none, extended=(light,)))
             # ties alone
             assert np.mean(gl.levels() != dither_levels(gl.linear(), panel)) < 1e-4

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hilstar.instruments.certify.readings import BesideRatio, DotReadings, LightReadings
+from hilstar.instruments.certify.bench_readings import BesideRatio, DotReadings, LightReadings
 
 if TYPE_CHECKING:
     from collections.abc import Callable

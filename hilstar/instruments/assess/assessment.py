@@ -167,14 +167,16 @@ def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: Bool
             acquisitions.append(
                 Acquisition(float(first), float(inside[0] - first) if len(inside) else None)
             )
-    acquisitions += [Acquisition(each.start_s, each.length_s) for each in outages if each.lost]
+    acquisitions += [
+        Acquisition(outage.start_s, outage.length_s) for outage in outages if outage.lost
+    ]
     return Lock(
         cycle_s=cycle_s,
         due=int(due.sum()),
         right=int(right.sum()),
         availability=min(int(right.sum()) / max(int(due.sum()), 1), 1.0),
         outages=tuple(outages),
-        acquisitions=tuple(sorted(acquisitions, key=lambda each: each.start_s)),
+        acquisitions=tuple(sorted(acquisitions, key=lambda outage: outage.start_s)),
     )
 
 
@@ -418,8 +420,8 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     centroids: Sequence[Centroids] = ()
     overlap, out_of_order, clock_set = True, 0, False
     if telemetry is None:
-        own = read_answers(ledger, settings.stamp or AnswerRules.of(run.config).stamp)
-        answers, stamp, ahead_ns, centroids, out_of_order, clock_set = own
+        answer_record = read_answers(ledger, settings.stamp or AnswerRules.of(run.config).stamp)
+        answers, stamp, ahead_ns, centroids, out_of_order, clock_set = answer_record
         base_ns, telemetry = zero_ns + ahead_ns, ledger
     else:
         answers, stamp = read_telemetry(telemetry), settings.stamp or "middle"
@@ -595,8 +597,8 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
         if abs(np.linalg.det(nearest) - 1) <= 1e-9 and off <= NEAR_AXES_RAD:
             signs = ["-" if row.sum() < 0 else "+" for row in nearest]
             axes = ", ".join(
-                f"{own} = {sign}{'xyz'[k]}"
-                for own, sign, k in zip("xyz", signs, column, strict=True)
+                f"{letter} = {sign}{'xyz'[k]}"
+                for letter, sign, k in zip("xyz", signs, column, strict=True)
             )
             cure = "write them for x right, y down in the image, z boresight"
             raise InputError(f"{turned}: they fit axes with {axes} of hilstar's; {cure}")

@@ -61,7 +61,7 @@ class Slice:
 
 
 def slices_of(
-    value: FloatArray, left: FloatArray, error: FloatArray, freedom: float
+    value: FloatArray, residual: FloatArray, error: FloatArray, freedom: float
 ) -> tuple[Slice, ...]:
     """Up to five slices with equal numbers of answers, by a value (n,), of noise (n, 3) and errors
     about the bias (n, 3).
@@ -70,7 +70,7 @@ def slices_of(
     """
     known = np.isfinite(value)
     value = value[known]
-    left = left[known]
+    residual = residual[known]
     error = error[known]
     count = len(value)
     if count < MIN_IN_BIN:
@@ -89,7 +89,7 @@ def slices_of(
     for k in range(len(edges) - 1):
         rows = place == k
         if rows.sum() >= MIN_IN_BIN:
-            noise = growth * (left[rows] ** 2).mean(axis=0)
+            noise = growth * (residual[rows] ** 2).mean(axis=0)
             whole = (error[rows] ** 2).mean(axis=0)
             axes = []
             for bounds in (noise, whole):
@@ -196,11 +196,11 @@ class GlassCost:
 
     def line(self) -> str:
         """For a person."""
-        left = {name: f"{axes.cross or 0.0:.2g}" for name, axes in self.fov_arcsec.items()}
+        figures = {name: f"{axes.cross or 0.0:.2g}" for name, axes in self.fov_arcsec.items()}
         return (
-            f"{left['total']} arcsec across by the {self.source}, as `{self.centroider}` finds"
-            f" {self.stars} stars; distortion corrected {left['without_distortion']}, colour"
-            f" {left['without_colour']}, both {left['without_both']}"
+            f"{figures['total']} arcsec across by the {self.source}, as `{self.centroider}` finds"
+            f" {self.stars} stars; distortion corrected {figures['without_distortion']}, colour"
+            f" {figures['without_colour']}, both {figures['without_both']}"
         )
 
 
@@ -242,33 +242,29 @@ def seen_cost(
     camera = tracker_camera(file.config.tracker, file.folder)
     stars = bench_stars(file.config, file.folder)
     fields = []
-    named = [
-        k
-        for k, reported_stars in enumerate(centroids)
-        if sum(bool(star[3]) for star in reported_stars) >= MIN_STARS
-    ]
-    for k in (
-        named[j]
-        for j in np.unique(np.linspace(0, len(named) - 1, SEEN_FIELDS).astype(int))
-        if named
-    ):
+    named = []
+    for k, reported_stars in enumerate(centroids):
+        if len([star for star in reported_stars if star[3]]) >= MIN_STARS:
+            named.append(k)
+    if not named:
+        return None
+    spread = np.linspace(0, len(named) - 1, SEEN_FIELDS).astype(int)
+    for k in sorted({named[place] for place in spread.tolist()}):
         at = {star[3]: star[:2] for star in centroids[k] if star[3]}
         rows = field_stars(stars, camera, q_icrs_to_cam[k])
         rows = rows[np.isin(rows["hip"], list(at))]
         reported_px = np.array([at[hip] for hip in rows["hip"].tolist()]).reshape(-1, 2)
         fields.append((rows, reported_px - np.stack([rows["x_px"], rows["y_px"]], axis=1)))
-    if not fields:
-        return None
     far_px = np.concatenate([np.hypot(*off.T) for _, off in fields])
     # a star by another's name is no error of places
     usual_px = max(WRONG_SHARE * float(np.median(far_px)), 1.0)
     near = [np.hypot(*off.T) < usual_px for _, off in fields]
-    kept = [
+    good_fields = [
         (rows[good], off[good])
         for (rows, off), good in zip(fields, near, strict=True)
         if good.sum() >= MIN_STARS
     ]
-    return _cost("answers' stars", "tracker", camera, kept)
+    return _cost("answers' stars", "tracker", camera, good_fields)
 
 
 def _cost(

@@ -105,13 +105,15 @@ def coarse_offset(
         _by_attitude(commanded, t_s, reported),
     ):
         tried += [_nearby(commanded, t, q, float(offset_s), reach_s) for offset_s in peaks]
-    known = [each for each in tried if each is not None]
+    known = [clock for clock in tried if clock is not None]
     if not known:
         return None
-    limit = AS_GOOD * min(each.spread_rad for each in known) + SMALL_RAD
-    good = [each for each in known if each.spread_rad <= limit]
-    many = OVERLAP_SHARE * max(each.compared for each in good)
-    best = min((each for each in good if each.compared >= many), key=lambda each: each.turn_rad)
+    limit = AS_GOOD * min(clock.spread_rad for clock in known) + SMALL_RAD
+    good = [clock for clock in known if clock.spread_rad <= limit]
+    many = OVERLAP_SHARE * max(clock.compared for clock in good)
+    best = min(
+        (clock for clock in good if clock.compared >= many), key=lambda clock: clock.turn_rad
+    )
     as_they_are = _spread_at(commanded, t, q, 0.0)
     if as_they_are is not None and as_they_are.compared >= many and as_they_are.spread_rad <= limit:
         if as_they_are.turn_rad <= best.turn_rad + TURN_RAD:
@@ -143,9 +145,9 @@ def _nearby(
     better = optimize.minimize_scalar(
         spread, bounds=(low, high), method="bounded", options={"maxiter": 12}
     )
-    found = _spread_at(commanded, t_s, reported, float(better.x))
-    if found is not None and found.spread_rad < first.spread_rad:
-        return found
+    best = _spread_at(commanded, t_s, reported, float(better.x))
+    if best is not None and best.spread_rad < first.spread_rad:
+        return best
     return first
 
 

@@ -231,12 +231,12 @@ def bench_text(found: Assessment) -> str:
     """
     assert found.certificate is not None
     part = bench_part(found.certificate, found.found)
-    said = f"{found.certificate.line}: {off_by(found.certificate)}"
+    line = f"{found.certificate.line}: {off_by(found.certificate)}"
     if part["share_of_bias"] is None:
-        return said
+        return line
     cross, roll = (100 * share for share in part["share_of_bias"].values())
     return (
-        f"{said}; it could have made {cross:.0f} % of the bias across and {roll:.0f} % of that"
+        f"{line}; it could have made {cross:.0f} % of the bias across and {roll:.0f} % of that"
         " about"
     )
 

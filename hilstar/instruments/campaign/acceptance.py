@@ -23,6 +23,7 @@ from hilstar.instruments.campaign.acceptance_verdicts import (
     CostOfSet,
     SetResult,
 )
+from hilstar.instruments.campaign.case_table import Columns, read_cases
 from hilstar.instruments.campaign.figures import TooFewCases
 from hilstar.instruments.campaign.requirements import (
     NOT_SHOWN,
@@ -30,9 +31,9 @@ from hilstar.instruments.campaign.requirements import (
     judged_figure,
     verdicts_of,
 )
-from hilstar.instruments.campaign.results import Columns, read_cases
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
+from hilstar.instruments.campaign.star_motion import with_motion
 from hilstar.instruments.campaign.store import Directory, failures, require_parquet
 from hilstar.instruments.campaign.sweep import counted, edge_figure, next_level
 
@@ -167,7 +168,8 @@ class Acceptance(AcceptedBench):
         else:
             arcsec, seconds = self.own_error
             seed = self.plan.seed
-            verdicts = verdicts_of(requires, result.cases, self.scale, seed, arcsec, seconds)
+            cases = with_motion(result.cases, requires, self.file, self.scale)
+            verdicts = verdicts_of(requires, cases, self.scale, seed, arcsec, seconds)
         return [
             self._told(clause, verdict, unit)
             for clause, verdict, unit in zip(clauses, verdicts, units, strict=True)

@@ -82,11 +82,10 @@ def write_acceptance(
     """
     folder = acceptance.directory
     summary = summary_of(acceptance, verdicts, rows)
-    write_csv(
-        folder / CSV_FILE,
-        CSV_COLUMNS,
-        [[_plain(clause[name]) for name in CSV_COLUMNS] for clause in summary["clauses"]],
-    )
+    rows_text = []
+    for clause in summary["clauses"]:
+        rows_text.append([_plain(clause[name]) for name in CSV_COLUMNS])
+    write_csv(folder / CSV_FILE, CSV_COLUMNS, rows_text)
     import msgspec
 
     write_whole(folder / JSON_FILE, msgspec.json.format(msgspec.json.encode(summary), indent=1))
@@ -99,10 +98,10 @@ def write_acceptance(
 
 def verdict_of(verdicts: list[ClauseVerdict]) -> str:
     """The verdict of all tested clauses together: the worst."""
-    words = {verdict.word for verdict in verdicts}
-    if NOT_MET in words:
+    verdict_words = {verdict.word for verdict in verdicts}
+    if NOT_MET in verdict_words:
         return NOT_MET
-    if NOT_SHOWN in words or MET not in words:
+    if NOT_SHOWN in verdict_words or MET not in verdict_words:
         return NOT_SHOWN
     return MET
 
@@ -112,7 +111,7 @@ def summary_of(
 ) -> dict[str, Any]:
     """The JSON object of `hilstar accept`."""
     arcsec, seconds = acceptance.own_error
-    own = None if arcsec is None else {"cross": arcsec[0], "roll": arcsec[1]}
+    own_arcsec = None if arcsec is None else {"cross": arcsec[0], "roll": arcsec[1]}
     return {
         "title": acceptance.plan.title,
         "plan": str(acceptance.plan.path),
@@ -122,12 +121,13 @@ def summary_of(
         "hilstar": __version__,
         "verdict": verdict_of(verdicts),
         "cases": rows,
-        "bench_off_arcsec": own,
+        "bench_off_arcsec": own_arcsec,
         "bench_off_s": seconds,
         "cube_to_boresight": acceptance.cube,
         "clauses": [_clause(verdict) for verdict in verdicts],
         "untested": [
-            {"capability": each.capability, "why": each.why} for each in acceptance.plan.untested
+            {"capability": judged.capability, "why": judged.why}
+            for judged in acceptance.plan.untested
         ],
     }
 
@@ -163,17 +163,18 @@ def lines_of(
     acceptance: AcceptedBench, results: list[SetResult], verdicts: list[ClauseVerdict]
 ) -> list[str]:
     """A line for each clause on the terminal, for what no clause tests, and for failed cases."""
-    width = max(len(each.clause.capability) for each in verdicts)
+    width = max(len(judged.clause.capability) for judged in verdicts)
     lines = []
-    for each in verdicts:
-        head = f"{each.clause.capability:{width}}  {each.word:10}"
-        if each.verdict is None:
-            lines.append(f"{head}  {each.untested}")
+    for judged in verdicts:
+        head = f"{judged.clause.capability:{width}}  {judged.word:10}"
+        if judged.verdict is None:
+            lines.append(f"{head}  {judged.untested}")
         else:
-            more = f"; {_more(each)}" if _more(each) else ""
-            lines.append(f"{head}  {_requirement(each)}: {_measured(each)}{more}")
+            more = f"; {_more(judged)}" if _more(judged) else ""
+            lines.append(f"{head}  {_requirement(judged)}: {_measured(judged)}{more}")
     lines += [
-        f"{each.capability:{width}}  {NOT_TESTED}  {each.why}" for each in acceptance.plan.untested
+        f"{judged.capability:{width}}  {NOT_TESTED}  {judged.why}"
+        for judged in acceptance.plan.untested
     ]
     for result in results:
         for name, count, why in _failed_rows(result):
@@ -238,7 +239,7 @@ def _verdict(verdicts: list[ClauseVerdict]) -> Verdict:
     whole = verdict_of(verdicts)
     counts = []
     for word in (MET, NOT_MET, NOT_SHOWN, NOT_TESTED):
-        count = sum(each.word == word for each in verdicts)
+        count = sum(judged.word == word for judged in verdicts)
         if count:
             counts.append(f"{count} {word}")
     return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(verdicts)}: {', '.join(counts)}.")
@@ -246,7 +247,7 @@ def _verdict(verdicts: list[ClauseVerdict]) -> Verdict:
 
 def _counts(verdicts: list[ClauseVerdict]) -> Iterator[KeyFigure]:
     for word, state in ((MET, OK), (NOT_MET, BAD), (NOT_SHOWN, WARN), (NOT_TESTED, WARN)):
-        count = sum(each.word == word for each in verdicts)
+        count = sum(judged.word == word for judged in verdicts)
         if count or word == MET:
             yield KeyFigure(str(count), word, state if count else WARN)
 
@@ -280,21 +281,21 @@ def _asked(verdicts: list[ClauseVerdict], result: SetResult, quantities: tuple[s
     """Whether a clause limits one of these quantities of a set."""
     name = result.case_set.name
     return result.cases is not None and any(
-        each.clause.of == name and each.clause.quantity in quantities for each in verdicts
+        judged.clause.of == name and judged.clause.quantity in quantities for judged in verdicts
     )
 
 
 def _clauses(verdicts: list[ClauseVerdict]) -> Card:
     rows, methods = [], []
-    for each in verdicts:
-        verdict = each.verdict
+    for judged in verdicts:
+        verdict = judged.verdict
         if verdict is None:
             continue
-        chip = f'<span class="chip" data-state="{STATES[each.word]}">{each.word}</span>'
-        guard = f"{verdict.guard:.2g} {each.unit}" if verdict.guard else ""
-        figures = (_requirement(each), _measured(each), guard, _margin(each), Markup(chip))
-        rows.append((each.clause.capability, *figures, verdict.cases, _more(each)))
-        methods.append((each.clause.capability, each.clause.quantity, verdict.method))
+        chip = f'<span class="chip" data-state="{STATES[judged.word]}">{judged.word}</span>'
+        guard = f"{verdict.guard:.2g} {judged.unit}" if verdict.guard else ""
+        figures = (_requirement(judged), _measured(judged), guard, _margin(judged), Markup(chip))
+        rows.append((judged.clause.capability, *figures, verdict.cases, _more(judged)))
+        methods.append((judged.clause.capability, judged.clause.quantity, verdict.method))
     texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
     how = table_of(methods, ("capability", "quantity", "method"))
     cure = CURES.get(verdict_of(verdicts), "")
@@ -303,10 +304,10 @@ def _clauses(verdicts: list[ClauseVerdict]) -> Card:
 
 def _untested(acceptance: AcceptedBench, verdicts: list[ClauseVerdict]) -> Card:
     rows = []
-    for each in verdicts:
-        if each.verdict is None:
-            rows.append((each.clause.capability, each.untested))
-    rows += [(each.capability, each.why) for each in acceptance.plan.untested]
+    for judged in verdicts:
+        if judged.verdict is None:
+            rows.append((judged.clause.capability, judged.untested))
+    rows += [(judged.capability, judged.why) for judged in acceptance.plan.untested]
     if not rows:
         return Card("Not tested", words=[paragraph("Every clause of the plan was tested.")])
     return Card("Not tested", words=[table_of(rows, ("capability", "why"))])
@@ -331,9 +332,11 @@ def _sweep_card(result: SetResult) -> Card:
         axes.set_xlabel(f"{sweep.key}{unit}")
         axes.set_ylabel("share of cases")
     table = table_of(levels, (f"level{unit}", "successes", "cases"))
-    words = [paragraph(result.case_set.about)] if result.case_set.about else []
-    words.append(drawing_of(axes.figure, f"share of cases with an attitude against {sweep.key}"))
-    return Card(f"Sweep: {result.case_set.name}", words=words, details=[table])
+    paragraphs = [paragraph(result.case_set.about)] if result.case_set.about else []
+    paragraphs.append(
+        drawing_of(axes.figure, f"share of cases with an attitude against {sweep.key}")
+    )
+    return Card(f"Sweep: {result.case_set.name}", words=paragraphs, details=[table])
 
 
 def _first_attitude(result: SetResult) -> Card:
@@ -353,22 +356,22 @@ def _first_attitude(result: SetResult) -> Card:
         axes.set_xlabel("time to the first attitude [s]")
         axes.set_ylabel("share of cases")
     header = ("share of cases", "within [s]", "from (95 %)", "to")
-    words = [drawing_of(axes.figure, "distribution of the time to the first attitude")]
-    words.append(table_of(rows, header))
-    return Card(f"Time to the first attitude: {result.case_set.name}", words=words)
+    paragraphs = [drawing_of(axes.figure, "distribution of the time to the first attitude")]
+    paragraphs.append(table_of(rows, header))
+    return Card(f"Time to the first attitude: {result.case_set.name}", words=paragraphs)
 
 
-def _detection(found: StarTable) -> Iterator[tuple[float, float, float, float]]:
+def _detection(stars: StarTable) -> Iterator[tuple[float, float, float, float]]:
     """Of bins of magnitude: middle, share of stars reported, and 95 % below and above that."""
-    edges = np.linspace(float(found.v_mag.min()), float(found.v_mag.max()) + 1e-6, MAG_BINS + 1)
-    place = np.digitize(found.v_mag, edges) - 1
+    edges = np.linspace(float(stars.v_mag.min()), float(stars.v_mag.max()) + 1e-6, MAG_BINS + 1)
+    place = np.digitize(stars.v_mag, edges) - 1
     for k in range(MAG_BINS):
         lit = int((place == k).sum())
         if not lit:
             continue
-        seen = int((found.found & (place == k)).sum())
-        low, high = clopper_pearson(seen, lit, 0.975)
-        share = seen / lit
+        reported = int((stars.found & (place == k)).sum())
+        low, high = clopper_pearson(reported, lit, 0.975)
+        share = reported / lit
         yield float(edges[k] + edges[k + 1]) / 2, share, share - low, high - share
 
 
@@ -376,25 +379,25 @@ def _star_card(acceptance: AcceptedBench, result: SetResult) -> Iterator[Card]:
     """Detection against magnitude, and the map of stars' place errors; none without stars."""
     assert result.cases is not None
     try:
-        found = StarTable.of(result.cases)
-        offsets_px = place_map(found, acceptance.scale.resolution_px, GRID)
+        stars = StarTable.of(result.cases)
+        offsets_px = place_map(stars, acceptance.scale.resolution_px, GRID)
     except TooFewCases:
         return
-    at, share, below, above = np.array(list(_detection(found))).T
+    at, share, below, above = np.array(list(_detection(stars))).T
     largest_px = float(np.hypot(offsets_px.dx_px, offsets_px.dy_px).max())
     finding = f"Stars reported by magnitude; their places are off by at most {largest_px:.2g} px"
-    with panels_of(finding, 1, 2, share_x=False, height_inch=3.6) as (left, right):
-        left.errorbar(at, share, yerr=[below, above], fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
-        left.set_ylim(-0.05, 1.05)
-        left.set_xlabel("V [mag]")
-        left.set_ylabel("share reported")
+    with panels_of(finding, 1, 2, share_x=False, height_inch=3.6) as (curve, right):
+        curve.errorbar(at, share, yerr=[below, above], fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
+        curve.set_ylim(-0.05, 1.05)
+        curve.set_xlabel("V [mag]")
+        curve.set_ylabel("share reported")
         arrows = (offsets_px.x_px, offsets_px.y_px, offsets_px.dx_px, offsets_px.dy_px)
         right.quiver(*arrows, angles="xy", color=BLUE)
         right.set_xlabel("x [px]")
         right.set_ylabel("y [px]")
         right.invert_yaxis()
         right.set_aspect("equal")
-    drawing = drawing_of(left.figure, "detection against magnitude, and the map of place errors")
+    drawing = drawing_of(curve.figure, "detection against magnitude, and the map of place errors")
     yield Card(f"Single stars: {result.case_set.name}", words=[drawing])
 
 
@@ -417,8 +420,8 @@ def _about(acceptance: AcceptedBench, results: list[SetResult], rows: int) -> Ca
         ("ledger", f"{rows} cases in {LEDGER}, sha256 {ledger_sha256}"),
     ]
     if acceptance.certificate is not None:
-        found = acceptance.certificate
-        about.append(("certificate", f"{found.line}; {off_by(found)}"))
+        certificate = acceptance.certificate
+        about.append(("certificate", f"{certificate.line}; {off_by(certificate)}"))
     elif acceptance.on_bench:
         about.append(("certificate", "none: the bench's own uncertainty is not taken off"))
     cube = acceptance.cube

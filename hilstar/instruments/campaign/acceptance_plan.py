@@ -25,6 +25,7 @@ from hilstar.instruments.campaign.plan import (
     MAX_CASES,
     MAX_SEED,
     QUANTITY_COLUMNS,
+    SCENARIO,
     TYPE_WORDS,
     PlantedFaults,
     Require,
@@ -36,6 +37,7 @@ NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,39}")
 OWN = ("about", "quick_cases", "sweep")  # keys of a set that are not a campaign's
 GIVEN = ("bench", "require", "through", "planted")  # and those of a campaign that a set has not
 ONLY_TRACKER = ("step_s", "noise", "centroids")  # of a virtual tracker, left out on a bench
+ORBIT = "spacecraft.orbit"  # a path, which a campaign takes from the bench file's folder
 PLANS = "plans"  # the folder of configs with plans that ship
 Through = Literal["tracker", "display", "bench"]
 
@@ -153,9 +155,13 @@ def read_acceptance_plan(
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {explained(str(error), tables, KIND)}") from error
     try:
-        sets = _sets(plan, bench, quick, through or plan.through)
+        sets = _sets(plan, path.parent, bench, quick, through or plan.through)
         for number, clause in enumerate(plan.clause, start=1):
-            _check_clause(f"[[clause]] number {number}", clause, {each.name: each for each in sets})
+            _check_clause(
+                f"[[clause]] number {number}",
+                clause,
+                {case_set.name: case_set for case_set in sets},
+            )
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     asked = {clause.of for clause in plan.clause}
@@ -165,22 +171,26 @@ def read_acceptance_plan(
         title=plan.title,
         seed=plan.seed,
         through=through or plan.through,
-        sets=tuple(each for each in sets if each.name in asked),
+        sets=tuple(case_set for case_set in sets if case_set.name in asked),
         clauses=tuple(plan.clause),
         untested=tuple(plan.untested),
     )
 
 
-def _sets(plan: AcceptanceTables, bench: Path, quick: bool, through: Through) -> list[CaseSet]:
+def _sets(
+    plan: AcceptanceTables, folder: Path, bench: Path, quick: bool, through: Through
+) -> list[CaseSet]:
     sets = []
     for name, tables in plan.cases.items():
         where = f"[cases.{name}]"
-        own = _own_keys(where, name, tables)
+        set_keys = _own_keys(where, name, tables)
         campaign = {key: value for key, value in tables.items() if key not in OWN}
         campaign |= {"bench": str(bench.resolve()), "through": through}
+        if "vary" in campaign:
+            campaign["vary"] = [_with_files(varied, folder) for varied in campaign["vary"]]
         campaign.setdefault("seed", plan.seed)
-        if quick and own.quick_cases is not None:
-            campaign["cases"] = own.quick_cases
+        if quick and set_keys.quick_cases is not None:
+            campaign["cases"] = set_keys.quick_cases
         asked = {
             QUANTITY_COLUMNS[clause.quantity]
             for clause in plan.clause
@@ -190,11 +200,35 @@ def _sets(plan: AcceptanceTables, bench: Path, quick: bool, through: Through) ->
             campaign["columns"] = sorted({*asked, *campaign.get("columns", [])})
         refused = ""
         if through == "bench":
-            campaign, refused = _on_bench(campaign, own.sweep)
+            campaign, refused = _on_bench(campaign, set_keys.sweep)
         elif plan.planted is not None:
             campaign["planted"] = _without_defaults(plan.planted)
-        sets.append(CaseSet(name, own.about, campaign, own.sweep, refused))
+        sets.append(CaseSet(name, set_keys.about, campaign, set_keys.sweep, refused))
     return sets
+
+
+def _with_files(varied: Any, folder: Path) -> Any:
+    """A varied key, whose files are found: those beside the plan, or else those that ship."""
+    if not isinstance(varied, dict) or varied.get("key") not in (SCENARIO, ORBIT):
+        return varied
+    values = varied.get("values")
+    if not isinstance(values, list):
+        return varied
+    is_orbit = varied["key"] == ORBIT
+    return varied | {"values": [_file_value(value, folder, is_orbit) for value in values]}
+
+
+def _file_value(value: Any, folder: Path, is_orbit: bool) -> Any:
+    """The path of a plan's file as a campaign takes it. A scenario stands beside the plan anyway;
+    what is no file stays as it is.
+    """
+    if not isinstance(value, str) or not value:
+        return value
+    beside = folder / value
+    if beside.is_file():
+        return str(beside.resolve()) if is_orbit else value
+    shipped = plan_path(Path(value))
+    return str(shipped.resolve()) if shipped.is_file() else value
 
 
 def _own_keys(where: str, name: str, tables: dict[str, Any]) -> CaseKeys:
@@ -205,12 +239,12 @@ def _own_keys(where: str, name: str, tables: dict[str, Any]) -> CaseKeys:
         if key in tables:
             raise InputError(f"{where} {key}: is not of a set of cases; leave it out")
     try:
-        own = msgspec.convert({key: tables[key] for key in OWN if key in tables}, CaseKeys)
+        set_keys = msgspec.convert({key: tables[key] for key in OWN if key in tables}, CaseKeys)
     except msgspec.ValidationError as error:
         raise InputError(f"{where}: {error}") from error
-    if own.sweep is not None:
-        own.sweep.check(f"{where} sweep")
-    return own
+    if set_keys.sweep is not None:
+        set_keys.sweep.check(f"{where} sweep")
+    return set_keys
 
 
 def _without_defaults(planted: PlantedFaults) -> dict[str, Any]:

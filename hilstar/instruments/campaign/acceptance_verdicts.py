@@ -6,8 +6,8 @@ from pathlib import Path
 
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.acceptance_plan import AcceptancePlan, CaseSet, ClauseTable
+from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.requirements import RequirementVerdict
-from hilstar.instruments.campaign.results import Columns
 from hilstar.instruments.campaign.solvers import CENTROIDS
 from hilstar.instruments.campaign.sweep import LevelCount
 from hilstar.server.bench.alignment import cube_to_boresight

@@ -9,6 +9,8 @@ of others: covariances are sums over cases (Liang and Zeger 1986), bootstraps dr
                the motion, and turns its sign with the slew
     jitter     along a slew the error's variance exceeds that across it by (rate x jitter)^2
     aberration error = bias + share x the turn by v / c; a share of 1 leaves it all
+    motion     error = bias + (share x years since the bench's date + age) x the turn in a year by
+               the stars' proper motion; a share of 1 leaves the stars where they are
     stars      place error = a smooth map over the detector + noise; signal against B-V; a logistic
                curve of detection against V
 """
@@ -23,6 +25,7 @@ from scipy import optimize, stats
 
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
+from hilstar.instruments.campaign.case_table import VARY, Columns
 from hilstar.instruments.campaign.cases import (
     AXES,
     FALSE_STARS,
@@ -34,9 +37,9 @@ from hilstar.instruments.campaign.cases import (
     Q,
 )
 from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, drawn_limits
-from hilstar.instruments.campaign.plan import Require
+from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, Require
 from hilstar.instruments.campaign.planted import aberration_rad
-from hilstar.instruments.campaign.results import VARY, Columns
+from hilstar.instruments.campaign.star_motion import YEARLY_TURN, YEARS
 from hilstar.optics.camera import field_terms
 
 MIN_CASES = 8
@@ -44,6 +47,8 @@ MAP_DEGREE = 5  # of the polynomials of a star's place error over the detector
 WILD_SIGMAS = 6.0
 SMALL_RATE_DEG_S = 1e-6
 MAX_EXPONENT = 50.0
+SMALL_SHARE = 1e-3  # of a sum that all cases but a heavy one have
+JITTER_ROUNDS = 3  # of weights by the jitter that the last ones gave
 LIMIT_BIN_MAG = 0.05
 LIMIT_DRAWS = 200  # of the bootstrap of a detection curve
 MIN_SLOPE_MAG = 0.01  # width of a detection curve: a sharper one cannot be told from its bins
@@ -91,12 +96,14 @@ def answer_figure(
         return _time_figure(require, cases, rng)
     if quantity == "aberration":
         return _aberration(require, cases)
-    found = StarTable.of(cases)
+    if quantity in MOTION_QUANTITIES:
+        return _proper_motion(require, cases)
+    stars = StarTable.of(cases)
     figures: dict[str, Callable[[], BoundedFigure]] = {
-        "star-noise": lambda: _star_noise(require, found, resolution_px, rng),
-        "star-fov-error": lambda: _star_map(require, found, resolution_px, rng),
-        "star-colour": lambda: _star_colour(require, found),
-        "star-limit": lambda: _star_limit(require, found, rng),
+        "star-noise": lambda: _star_noise(require, stars, resolution_px, rng),
+        "star-fov-error": lambda: _star_map(require, stars, resolution_px, rng),
+        "star-colour": lambda: _star_colour(require, stars),
+        "star-limit": lambda: _star_limit(require, stars, rng),
         "false-stars": lambda: _false_stars(require, cases, rng),
     }
     return figures[quantity]()
@@ -154,15 +161,27 @@ def _root_mean(
     variance = float(sums.sum() / whole.sum())
     # few cases draw limits that are too narrow: by their scatter and Student's t they are wider,
     # and skew, as a variance is
-    count = len(sums)
-    if variance > 0 and count > 1:
-        scatter = float(((sums - variance * whole) ** 2).sum()) * count / (count - 1)
-        wide = float(stats.t.ppf(c, count - 1)) * math.sqrt(scatter) / float(whole.sum())
+    if variance > 0 and len(sums) > 1:
+        wide = _spread(sums, whole, c)
         high = max(high, variance * math.exp(min(wide / variance, MAX_EXPONENT)))
         low = min(low, variance - wide)
     value = math.sqrt(max(variance, 0.0))
     low, high = math.sqrt(max(low, 0.0)), math.sqrt(max(high, 0.0))
-    return BoundedFigure(value, min(low, value), max(high, value), count, method)
+    return BoundedFigure(value, min(low, value), max(high, value), len(sums), method)
+
+
+def _spread(sums: FloatArray, whole: FloatArray, confidence: float) -> float:
+    """How far the sum of `sums` (n,) over that of `whole` (n,) may be off, by the cases' scatter.
+
+    A heavy case draws the ratio to itself, so its residual counts more (MacKinnon and White 1985,
+    HC3), and fewer cases tell the scatter (Satterthwaite).
+    """
+    share = whole / whole.sum()
+    off = (sums - whole * sums.sum() / whole.sum()) / np.maximum(1 - share, SMALL_SHARE)
+    squares = share**2
+    freedom = max(float(squares.sum() ** 2 / (squares**2).sum()) - 1, 1.0)
+    sigma = math.sqrt(float((off**2).sum())) / float(whole.sum())
+    return float(stats.t.ppf(confidence, freedom)) * sigma
 
 
 def _summed(values: FloatArray, number: IntArray) -> FloatArray:
@@ -265,10 +284,32 @@ def _jitter(
     off = residual[slews]
     parallel = (off[:, :2] * along).sum(axis=1)
     normal = off[:, 1] * along[:, 0] - off[:, 0] * along[:, 1]
-    excess = parallel**2 - normal**2
     square = (across**2).sum(axis=1)
+    excess = (parallel**2 - normal**2) / _fitted_share(square)
     method = "excess of the error along slews over that across them, bootstrap over cases"
-    return _root_mean(excess * square, square**2, case[slews], require, rng, method)
+    weights = _jitter_weights(excess, square, float((normal**2).mean()))
+    return _root_mean(excess * weights, square * weights, case[slews], require, rng, method)
+
+
+def _fitted_share(square: FloatArray) -> FloatArray:
+    """What the fit of bias and stamp has left of the excesses (n,) at squared rates (n,): of errors
+    along the slews that grow with the rate, to the first order in 1 / n.
+    """
+    share = square / square.sum()
+    return np.asarray(1 - 2 / len(square) - 2 * share + (share**2).sum())
+
+
+def _jitter_weights(excess: FloatArray, square: FloatArray, variance: float) -> FloatArray:
+    """The weights (n,) of excesses, arcsec2, at squared rates (n,): the best ones for the jitter
+    that they give themselves, beside a noise of this variance. Small against the noise, fast slews
+    tell it; large, every slew does.
+    """
+    weights = square
+    for _ in range(JITTER_ROUNDS):
+        jitter = max(float((excess * weights).sum() / (square * weights).sum()), 0.0)
+        # of Gaussian errors the variance of a square is twice that of the errors, squared
+        weights = square / ((variance + jitter * square) ** 2 + variance**2)
+    return weights
 
 
 # ---- aberration ----
@@ -290,15 +331,52 @@ def _aberration(require: Require, cases: Columns) -> BoundedFigure:
     _enough(case, "attitude")
     turns = [aberration_rad(q[k], velocities[k])[:2] for k in case]
     predicted = ARCSEC_PER_RAD * np.array(turns)
-    design = np.zeros((2 * len(case), 3))
-    for k in range(2):
-        rows = slice(k * len(case), (k + 1) * len(case))
-        design[rows, k] = 1.0
-        design[rows, 2] = predicted[:, k]
-    fit = fit_by_cases(design, errors[case].T.ravel(), np.tile(case, 2))
-    sigma = math.sqrt(float(fit.covariance[2, 2]))
+    fit = _turn_fit(errors[case], predicted[:, :, None], case)
     method = "linear fit over the observer's velocity, Student's t"
-    return _size(fit.value[2:], np.array([sigma]), fit.cases, require.confidence, method)
+    return _turn_figure(fit, 0, require, method)
+
+
+def _turn_fit(errors: FloatArray, predicted: FloatArray, case: IntArray) -> CaseFit:
+    """The fit of errors (n, 2) of each case, across, by a bias of each axis and by predicted turns
+    (n, 2, k).
+    """
+    count, axes, terms = predicted.shape
+    design = np.zeros((axes * count, axes + terms))
+    for k in range(axes):
+        rows = slice(k * count, (k + 1) * count)
+        design[rows, k] = 1.0
+        design[rows, axes:] = predicted[:, k]
+    return fit_by_cases(design, errors.T.ravel(), np.tile(case, axes))
+
+
+def _turn_figure(fit: CaseFit, term: int, require: Require, method: str) -> BoundedFigure:
+    """The figure of a term of `_turn_fit`."""
+    column = 2 + term
+    sigma = math.sqrt(float(fit.covariance[column, column]))
+    value = fit.value[column : column + 1]
+    return _size(value, np.array([sigma]), fit.cases, require.confidence, method)
+
+
+# ---- proper motion ----
+
+
+def _proper_motion(require: Require, cases: Columns) -> BoundedFigure:
+    """The share of proper motion that the attitude has not followed, or the age of the places at
+    the bench's date.
+    """
+    errors = cases.vectors("error_{}_arcsec", "xyz")[:, :2]
+    yearly = cases.vectors(YEARLY_TURN, "xy")
+    years = cases.numbers[YEARS]
+    known = np.isfinite(errors).all(axis=1) & np.isfinite(yearly).all(axis=1)
+    case = np.flatnonzero(known)
+    _enough(case, "attitude")
+    if require.quantity == "proper-motion" and not np.ptp(years[case]):
+        raise TooFewCases("cases at several dates tell it", len(case))
+    turns = np.stack([yearly[case] * years[case, None], yearly[case]], axis=2)
+    fit = _turn_fit(errors[case], turns, case)
+    term = MOTION_QUANTITIES.index(require.quantity)
+    method = "linear fit over the yearly turn of each field, Student's t"
+    return _turn_figure(fit, term, require, method)
 
 
 # ---- single stars ----
@@ -353,13 +431,13 @@ class PlaceOffsets:
     dy_px: FloatArray
 
 
-def fitted_places(found: StarTable, resolution_px: tuple[int, int]) -> PlaceFit:
+def fitted_places(stars: StarTable, resolution_px: tuple[int, int]) -> PlaceFit:
     """The map of reported stars' place errors; wild ones do not count. Raises TooFewCases."""
-    kept = np.flatnonzero(found.found)
-    offsets = np.stack([found.dx_px, found.dy_px], axis=1)[kept]
-    terms = field_terms(found.x_px[kept], found.y_px[kept], resolution_px, MAP_DEGREE)
+    reported = np.flatnonzero(stars.found)
+    offsets = np.stack([stars.dx_px, stars.dy_px], axis=1)[reported]
+    terms = field_terms(stars.x_px[reported], stars.y_px[reported], resolution_px, MAP_DEGREE)
     needed = 4 * terms.shape[1]
-    near = np.ones(len(kept), dtype=np.bool_)
+    near = np.ones(len(reported), dtype=np.bool_)
     for _ in range(3):
         if near.sum() < needed:
             raise TooFewCases(f"{int(near.sum())} stars, and {needed} are needed for a map", 0)
@@ -370,7 +448,7 @@ def fitted_places(found: StarTable, resolution_px: tuple[int, int]) -> PlaceFit:
         close = np.abs(residual) <= WILD_SIGMAS * np.maximum(spread, 1e-9)
         near = np.asarray(close.all(axis=1), dtype=np.bool_)
     fitted = terms[near] @ solution
-    return PlaceFit(solution, found.case[kept][near], fitted, residual[near])
+    return PlaceFit(solution, stars.case[reported][near], fitted, residual[near])
 
 
 def place_map(found: StarTable, resolution_px: tuple[int, int], side: int) -> PlaceOffsets:
@@ -451,13 +529,13 @@ def _star_limit(require: Require, found: StarTable, rng: np.random.Generator) ->
     shape = (cases, bins)
     index = number * bins + place - first
     lit = np.bincount(index, minlength=cases * bins).reshape(shape)
-    seen = np.bincount(index[found.found], minlength=cases * bins).reshape(shape)
+    reported = np.bincount(index[found.found], minlength=cases * bins).reshape(shape)
     middle_mag = np.asarray((np.arange(bins) + first + 0.5) * LIMIT_BIN_MAG, dtype=np.float64)
-    value = half_seen(middle_mag, seen.sum(axis=0), lit.sum(axis=0))
+    value = half_seen(middle_mag, reported.sum(axis=0), lit.sum(axis=0))
     drawn = []
     for _ in range(LIMIT_DRAWS):
         chosen = rng.integers(0, cases, cases)
-        drawn.append(half_seen(middle_mag, seen[chosen].sum(axis=0), lit[chosen].sum(axis=0)))
+        drawn.append(half_seen(middle_mag, reported[chosen].sum(axis=0), lit[chosen].sum(axis=0)))
     low, high = np.quantile(drawn, [1 - require.confidence, require.confidence])
     # a curve that is sharper than a bin is known to within one
     low = min(float(low), value) - LIMIT_BIN_MAG / 2
@@ -487,8 +565,8 @@ def half_seen(v_mag: FloatArray, seen: IntArray, lit: IntArray) -> float:
     cut = int(np.argmin(missed + beyond))
     edges = np.concatenate([v_mag - LIMIT_BIN_MAG / 2, [v_mag[-1] + LIMIT_BIN_MAG / 2]])
     start = np.array([edges[cut], math.log(0.1)])
-    found = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-3})
-    return float(min(max(found.x[0], v_mag[0]), v_mag[-1]))
+    fitted = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-3})
+    return float(min(max(fitted.x[0], v_mag[0]), v_mag[-1]))
 
 
 def _false_stars(require: Require, cases: Columns, rng: np.random.Generator) -> BoundedFigure:

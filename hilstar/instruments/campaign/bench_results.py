@@ -9,7 +9,7 @@ import numpy as np
 
 from hilstar.basics.charts import write_csv
 from hilstar.instruments.campaign.bench_run import CHECKS, NO_ANSWER, drift_of
-from hilstar.instruments.campaign.results import read_cases
+from hilstar.instruments.campaign.case_table import read_cases
 
 WRONG_COLUMNS = ("case", "order", "begun_utc", "wrong", "off_deg")
 MAX_NAMED = 10

@@ -57,6 +57,7 @@ from hilstar.server.pacer import FrameSink, Moment, Pacer, Shown, ignore
 from hilstar.server.run_progress import Follower, Running
 from hilstar.server.screen.screen import DisplayPacer, Screen
 
+RENDERER_TABLES = ("sky", "render", "spacecraft")  # whose keys need another renderer
 ORDER_STREAM = 4  # stream of a plan's seed for the order of its cases
 BRIGHTEST = 5  # reported stars whose light is a case's signal
 MAX_SILENCE_S = 1.0  # at the end of a case: a tracker that said nothing for longer is silent
@@ -97,14 +98,10 @@ class BenchOrder:
         self.cases = cases
         self._design = design
         self._every = plan.check_every
-        self._keys = [
-            key
-            for key in (parameter.key for parameter in maker.parameters)
-            if key.split(".")[0] in ("sky", "render", "spacecraft")
-        ]
-        self._keys += (
-            [SCENARIO] if any(parameter.key == SCENARIO for parameter in maker.parameters) else []
-        )
+        keys = [parameter.key for parameter in maker.parameters]
+        self._keys = [key for key in keys if key.split(".")[0] in RENDERER_TABLES]
+        if SCENARIO in keys:
+            self._keys.append(SCENARIO)
         order = np.random.default_rng((plan.seed, ORDER_STREAM)).permutation(cases)
         if self._keys:
             group: dict[str, int] = {}
@@ -386,11 +383,11 @@ class BenchRun:
         """Take a frame that was shown."""
         assert self._frames is not None
         attitude, on_screen, now = shown.attitude, shown.on_screen, self._now
-        seen = attitude is not None and not on_screen.operator and not on_screen.hidden
+        is_lit = attitude is not None and not on_screen.operator and not on_screen.hidden
         host_ns = (
             shown.draw_ns if shown.predicted_swap_ns is None else shown.swap_ns + self._light_ns
         )
-        q = attitude.q_icrs_to_cam if attitude is not None and seen else None
+        q = attitude.q_icrs_to_cam if attitude is not None and is_lit else None
         number = self._base + shown.number
         self._next = number + 1
         self._frames.add(LitFrame(number, host_ns, host_ns, q, shown.drawn.rate_cam_rad_s))
@@ -404,17 +401,17 @@ class BenchRun:
             now.begun_ns, now.first_frame = host_ns, number
             now.begun_utc = f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + "Z"
             first = now.case.first
-            told = {
+            now_table = {
                 "case": now.case.number,
                 "order": now.place,
                 "q_icrs_to_cam": first.q_icrs_to_cam.tolist(),
             }
             rate = first.turn.rate_cam_rad_s if attitude is None else attitude.rate_cam_rad_s
-            told |= {"rate_cam_rad_s": None if rate is None else rate.tolist()}
-            told |= {"acceleration_cam_rad_s2": now.case.acceleration_rad_s2.tolist()}
+            now_table |= {"rate_cam_rad_s": None if rate is None else rate.tolist()}
+            now_table |= {"acceleration_cam_rad_s2": now.case.acceleration_rad_s2.tolist()}
             write_whole(
                 self._now_path,
-                msgspec.json.encode(told | {"light_ns": host_ns, "begun_utc": now.begun_utc}),
+                msgspec.json.encode(now_table | {"light_ns": host_ns, "begun_utc": now.begun_utc}),
             )
 
     def _listen(self, now_ns: int) -> None:
@@ -570,17 +567,11 @@ class BenchRun:
 
 def write_checks(path: Path, rows: list[Row], cases: int) -> None:
     """Write the check cases' rows as checks.csv."""
-    check_rows = [
-        (row["case"] - cases, row["begun_utc"], row["run"], row["received"]) for row in rows
-    ]
-    write_csv(
-        path,
-        CHECK_COLUMNS,
-        [
-            [*check_rows[k], *(row[name] for name in CHECK_COLUMNS[4:])]
-            for k, row in enumerate(rows)
-        ],
-    )
+    check_rows = []
+    for row in rows:
+        about = (row["case"] - cases, row["begun_utc"], row["run"], row["received"])
+        check_rows.append((*about, *(row[name] for name in CHECK_COLUMNS[4:])))
+    write_csv(path, CHECK_COLUMNS, check_rows)
 
 
 def drift_of(path: Path) -> dict[str, Any] | None:

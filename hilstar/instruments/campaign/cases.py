@@ -62,6 +62,7 @@ ON_BENCH = (
     "time_s",
     "scenario",
     "body_deg",
+    "limb_deg",
 )
 Kind = Literal["int64", "float64", "bool", "text", "floats"]
 
@@ -145,6 +146,16 @@ class Case:
     values: dict[str, Any]
     noise_seed: int
     first: View
+
+    @property
+    def body_deg(self) -> float:
+        """The angle from the body that the case looks beside: from its limb where the plan gives
+        that, else from its middle; 180 without a body.
+        """
+        limb_deg = self.values.get("limb_deg")
+        if limb_deg is None:
+            return float(self.values.get("body_deg", 180.0))
+        return float(limb_deg)
 
     @property
     def acceleration_rad_s2(self) -> FloatArray:
@@ -321,6 +332,10 @@ class CaseMaker:
                 f" and [sky.bodies] {attitudes.body} = true, or vary sky.bodies.{attitudes.body}"
             )
         off_rad = math.radians(float(values.get("body_deg", 0.0)))
+        limb_deg = values.get("limb_deg")
+        if limb_deg is not None:
+            # deeper than the middle of the disc is nowhere
+            off_rad = max(disc.radius_rad + math.radians(float(limb_deg)), 0.0)
         low_deg, high_deg = attitudes.roll_deg
         roll_deg = low_deg + float(look[2]) * (high_deg - low_deg)
         return beside_q(disc.direction, off_rad, 2 * math.pi * float(look[0]), roll_deg)
@@ -474,11 +489,11 @@ def columns(
 ) -> dict[str, Kind]:
     """The columns of a campaign's rows, in their order."""
     varied = {f"vary.{parameter.key}": value_kind(parameter) for parameter in parameters}
-    found: dict[str, Kind] = {}
+    kinds: dict[str, Kind] = {}
     recovery = RECOVERY if f"vary.{SCENARIO}" in varied else ()
     for name in (*BEFORE, *varied, *AFTER, *recovery, *(CENTROIDS if with_centroids else ())):
-        found[name] = varied.get(name) or columns_kind(name)
-    return found | further_columns(further)
+        kinds[name] = varied.get(name) or columns_kind(name)
+    return kinds | further_columns(further)
 
 
 def further_columns(further: tuple[Further, ...]) -> dict[str, Kind]:

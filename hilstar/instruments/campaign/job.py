@@ -111,9 +111,9 @@ def files_sha256(plan: Plan, folder: Path) -> str:
     digest = hashlib.sha256()
     varied = [
         str(name)
-        for each in plan.vary
-        if each.key == SCENARIO
-        for name in each.values or ()
+        for parameter in plan.vary
+        if parameter.key == SCENARIO
+        for name in parameter.values or ()
         if name
     ]
     if plan.centroids.psf in (TRACKER_PSF, GAUSSIAN):

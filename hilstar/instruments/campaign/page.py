@@ -127,10 +127,10 @@ def _cards(
     cure = ""
     if summary["wrong"]:
         cure = WRONG_CURE
-    for measure, found in costs.items():
-        drawing = drawing_of(found.chart, f"cost of each parameter in {measure}")
-        figure = KeyFigure(found.cost, found.of)
-        rows = [(_breakable(parameter), *texts) for parameter, *texts in found.rows]
+    for measure, measure_costs in costs.items():
+        drawing = drawing_of(measure_costs.chart, f"cost of each parameter in {measure}")
+        figure = KeyFigure(measure_costs.cost, measure_costs.of)
+        rows = [(_breakable(parameter), *texts) for parameter, *texts in measure_costs.rows]
         table = table_of(rows, COST_COLUMNS)
         yield Card(f"What costs the most: {measure}", figure, [table], drawing, cure)
         cure = ""

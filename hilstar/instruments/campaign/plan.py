@@ -53,18 +53,20 @@ Dec = Annotated[float, Meta(ge=-90, le=90)]
 Roll = Annotated[float, Meta(ge=-360, le=720)]
 # Keys of a case that are not in its bench file. Rates are those of cam with respect to icrs, in cam
 # components; `across` is about an axis in the image plane that each case draws.
-# `misalignment_arcsec` turns the display's true mounting, cam axes.
+# `misalignment_arcsec` turns the display's true mounting, cam axes. `body_deg` is from a body's
+# middle, `limb_deg` from its limb, below 0 within its disc.
 OWN_KEYS = (
     *("rate_deg_s.x", "rate_deg_s.y", "rate_deg_s.z", "rate_deg_s.across"),
     *("acceleration_deg_s2.x", "acceleration_deg_s2.y", "acceleration_deg_s2.z"),
     *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
-    *("time_s", "noise_seed", "scenario", "body_deg", "stray_e_per_px"),
+    *("time_s", "noise_seed", "scenario", "body_deg", "limb_deg", "stray_e_per_px"),
 )
 MAX_OWN = {
     "rate_deg_s": 360.0,
     "acceleration_deg_s2": 360.0,
     "misalignment_arcsec": 36_000.0,
     "body_deg": 180.0,
+    "limb_deg": 90.0,
     "stray_e_per_px": 1e9,
     "time_s": 9e9,
     "noise_seed": 2.0**63 - 1,
@@ -92,6 +94,8 @@ Quantity = Literal[
     "time-bias",
     "time-jitter",
     "aberration",
+    "proper-motion",
+    "catalogue-age",
     "star-noise",
     "star-fov-error",
     "star-colour",
@@ -104,6 +108,7 @@ RATE_QUANTITIES = ("rate-bias", "rate-noise", "rate-scale", "rate-lag")
 WITH_AXIS = (*AXIS_QUANTITIES, *RATE_QUANTITIES)
 TIME_QUANTITIES = ("time-to-first-attitude", "recovery")
 SHARE_QUANTITIES = ("availability", "wrong-rate", "no-attitude", "false-attitude")
+MOTION_QUANTITIES = ("proper-motion", "catalogue-age")
 STAR_QUANTITIES = ("star-noise", "star-fov-error", "star-colour", "star-limit", "false-stars")
 # These take `share`: the quantile of so many cases.
 WITH_SHARE = ("fov-error", "pixel-error", "noise", "nea", *TIME_QUANTITIES)
@@ -111,12 +116,13 @@ QUANTITY_UNITS = dict.fromkeys(AXIS_QUANTITIES, "arcsec") | dict.fromkeys(TIME_Q
 QUANTITY_UNITS |= dict.fromkeys(SHARE_QUANTITIES, "")
 QUANTITY_UNITS |= {"rate-bias": "deg/s", "rate-noise": "deg/s", "rate-scale": "", "rate-lag": "s"}
 QUANTITY_UNITS |= {"time-bias": "s", "time-jitter": "s", "aberration": ""}
+QUANTITY_UNITS |= {"proper-motion": "", "catalogue-age": "yr"}
 QUANTITY_UNITS |= {"star-noise": "px", "star-fov-error": "px", "star-colour": "mag/mag"}
 QUANTITY_UNITS |= {"star-limit": "mag", "false-stars": "a frame", "edge": ""}
 # The further columns that a quantity is found from.
 QUANTITY_COLUMNS: dict[str, Further] = {
     **dict.fromkeys(RATE_QUANTITIES, "rate"),
-    **dict.fromkeys(("time-bias", "time-jitter", "aberration"), "time"),
+    **dict.fromkeys(("time-bias", "time-jitter", "aberration", *MOTION_QUANTITIES), "time"),
     **dict.fromkeys(STAR_QUANTITIES, "stars"),
 }
 CONDITION = re.compile(
@@ -131,7 +137,8 @@ TRACKER_PSF = "tracker"
 
 class Attitudes(Table, frozen=True):
     """[attitudes]: where the cases look. `field` is a cap of `radius_deg` around `radec_deg`;
-    `log` goes along a log; `body` looks at the angle `body_deg` of the case from a `body`.
+    `log` goes along a log; `body` looks at the angle `body_deg` of the case from a `body`, or at
+    `limb_deg` from its limb.
     """
 
     kind: Literal["all-sky", "field", "log", "body"] = "all-sky"
@@ -244,6 +251,8 @@ class PlantedFaults(Table, frozen=True):
     stamp_bias_s: Number = 0.0
     stamp_jitter_s: Annotated[float, Meta(ge=0, le=1e6)] = 0.0
     aberration: Number = 0.0
+    proper_motion: Number = 0.0
+    catalogue_age_yr: Number = 0.0
     star_noise_px: Annotated[float, Meta(ge=0, le=100)] = 0.0
     star_fov_px: Annotated[float, Meta(ge=0, le=100)] = 0.0
     star_colour: Number = 0.0
@@ -327,6 +336,7 @@ def parse_plan(path: Path, text: str) -> Plan:
                     f'[[vary]] key = "{varied.key}" stands there twice; leave one of them out'
                 )
             _check_range(varied, plan.sampling)
+        _check_body_angle(keys)
         _check_requires(plan)
         if plan.cases is None and plan.sampling != "grid":
             raise InputError(
@@ -364,6 +374,14 @@ def _check_attitudes(attitudes: Attitudes) -> None:
         raise InputError(
             f'[attitudes] log is for kind = "log", and kind is "{attitudes.kind}"; write that, or'
             " leave it out"
+        )
+
+
+def _check_body_angle(keys: list[str]) -> None:
+    if {"body_deg", "limb_deg"} <= set(keys):
+        raise InputError(
+            '[[vary]] key = "limb_deg" and "body_deg" are one angle, from the limb and from the'
+            " middle of a body; leave one of them out"
         )
 
 
@@ -560,6 +578,10 @@ def changed_bench(file: BenchFile, tables: dict[str, Any], values: dict[str, Any
     if not changes:
         return file
     tables = copy.deepcopy(tables)
+    for key, other in (("epoch_utc", "epoch_jyear"), ("epoch_jyear", "epoch_utc")):
+        # a varied date stands in the place of the file's
+        if f"sky.{key}" in changes:
+            tables.get("sky", {}).pop(other, None)
     for key, value in changes.items():
         _set(tables, key.split("."), value, file.config)
     return changed_file(file, tables)

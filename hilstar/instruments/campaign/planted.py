@@ -6,7 +6,7 @@ A solver that tells no rate gets that of its last two attitudes, half a step old
 
 import math
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -35,8 +35,9 @@ FALSE_DN = 1000.0  # signal of a planted false star
 @dataclass(frozen=True, slots=True)
 class CaseConditions:
     """What a case's planted faults depend on: the observer's velocity, km/s, ICRS, the angular
-    acceleration, rad/s2, cam, the detector's false stars, the angle from a body, and the end of the
-    last fault, s (None: none).
+    acceleration, rad/s2, cam, the detector's false stars, the angle from a body (`Case.body_deg`),
+    the end of the last fault, s (None: none), and the turn (3,), rad, cam, by places of stars that
+    are old.
     """
 
     velocity_km_s: FloatArray
@@ -44,6 +45,7 @@ class CaseConditions:
     false_stars: int = 0
     body_deg: float = 180.0
     fault_end_s: float | None = None
+    old_places_rad: FloatArray = field(default_factory=lambda: np.zeros(3))
 
 
 class CaseTracker:
@@ -121,6 +123,7 @@ class CaseTracker:
         error_rad = error_rad + planted.aberration * aberration_rad(
             q, self._conditions.velocity_km_s
         )
+        error_rad = error_rad + self._conditions.old_places_rad
         return multiply(from_rotation_vector(error_rad), q)
 
     def _rate(self, rate_rad_s: FloatArray | None) -> FloatArray | None:
@@ -142,18 +145,18 @@ class CaseTracker:
         stars = []
         for star in answer.stars:
             match = judge_stars((star,), lit, (width, height))
-            found = np.flatnonzero(np.isfinite(match.dx_px))
-            v_mag = match.lit.v_mag[found]
+            matched = np.flatnonzero(np.isfinite(match.dx_px))
+            v_mag = match.lit.v_mag[matched]
             limit = planted.star_limit_v_mag
-            if limit is not None and (not len(found) or v_mag[0] > limit):
+            if limit is not None and (not len(matched) or v_mag[0] > limit):
                 continue
             wave = math.sqrt(2) * planted.star_fov_px
             wave_x_px = wave * math.sin(2 * math.pi * star.x_px / width)
             wave_y_px = wave * math.sin(2 * math.pi * star.y_px / height)
             noise_px = planted.star_noise_px * self._rng.standard_normal(2)
             dn = star.dn
-            if dn is not None and len(found):
-                dn *= 10 ** (-0.4 * planted.star_colour * float(match.lit.bv[found[0]]))
+            if dn is not None and len(matched):
+                dn *= 10 ** (-0.4 * planted.star_colour * float(match.lit.bv[matched[0]]))
             x_px = star.x_px + float(noise_px[0]) + wave_x_px
             y_px = star.y_px + float(noise_px[1]) + wave_y_px
             stars.append(ReportedStar(x_px, y_px, dn, star.hip))
@@ -181,6 +184,6 @@ def lit_stars(exposure: Exposure) -> LitStars:
         off_y = np.abs(truth["y_px"] - (height - 1) / 2)
         inside = (off_x <= width / 2) & (off_y <= height / 2)
     real = ~np.isin(truth["name"], exposure.faults) if exposure.faults else inside
-    seen = truth[inside & real & truth["drawn"] & (truth["electrons_per_s"] > 0)]
+    lit = truth[inside & real & truth["drawn"] & (truth["electrons_per_s"] > 0)]
     names = ("x_px", "y_px", "v_mag", "bv", "electrons_per_s")
-    return LitStars(*(np.asarray(seen[name], dtype=np.float64) for name in names))
+    return LitStars(*(np.asarray(lit[name], dtype=np.float64) for name in names))

@@ -37,6 +37,7 @@ from hilstar.instruments.assess.budget import Decomposed, assess_cases
 from hilstar.instruments.assess.components import HARMONICS, SURE_OF_MANY, Component
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.answer_figures import answer_figure
+from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.figures import (
     BoundedFigure,
     TooFewCases,
@@ -52,7 +53,7 @@ from hilstar.instruments.campaign.plan import (
     Require,
     checked_conditions,
 )
-from hilstar.instruments.campaign.results import MAX_FITTED_CASES, Columns, attitudes_of
+from hilstar.instruments.campaign.results import MAX_FITTED_CASES, attitudes_of
 
 AXIS_INDICES = {"x": [0], "y": [1], "z": [2], "cross": [0, 1], "roll": [2]}
 COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
@@ -204,18 +205,20 @@ def judged_figure(
 ) -> RequirementVerdict:
     """The verdict on a figure; the bench's own error narrows the limit (see `verdicts_of`)."""
     limit, maximum = require.limit, require.minimum is None
-    own = 0.0  # what of the error the bench could have made, or hidden
+    bench_error = 0.0  # what of the error the bench could have made, or hidden
     if bench_arcsec is not None and require.quantity in AXIS_QUANTITIES and maximum:
-        own = bench_arcsec[1 if AXIS_INDICES[require.axis or "cross"] == [2] else 0]
-        share = f"{100 * min(own / figure.value, 1.0):.0f} %" if figure.value > 0 else "all"
-        told = f"{own:.2g} arcsec taken off for the bench, which could have made {share} of it"
-        figure = replace(figure, method=f"{figure.method}; {told}")
+        bench_error = bench_arcsec[1 if AXIS_INDICES[require.axis or "cross"] == [2] else 0]
+        share = f"{100 * min(bench_error / figure.value, 1.0):.0f} %" if figure.value > 0 else "all"
+        note = (
+            f"{bench_error:.2g} arcsec taken off for the bench, which could have made {share} of it"
+        )
+        figure = replace(figure, method=f"{figure.method}; {note}")
     if bench_s and require.quantity == "time-bias" and maximum:
-        own = bench_s
-        told = f"{own:.2g} s taken off for the bench"
-        figure = replace(figure, method=f"{figure.method}; {told}")
-    met = figure.high <= limit - own if maximum else figure.low >= limit
-    missed = figure.low > limit + own if maximum else figure.high < limit
+        bench_error = bench_s
+        note = f"{bench_error:.2g} s taken off for the bench"
+        figure = replace(figure, method=f"{figure.method}; {note}")
+    met = figure.high <= limit - bench_error if maximum else figure.low >= limit
+    missed = figure.low > limit + bench_error if maximum else figure.high < limit
     verdict = MET if met else NOT_MET if missed else NOT_SHOWN
     bound = figure.high if maximum != missed else figure.low
     more = _more(require, figure) if verdict == NOT_SHOWN else None
@@ -230,7 +233,7 @@ def judged_figure(
         figure.method,
         figure.low if math.isfinite(figure.low) else None,
         figure.high if math.isfinite(figure.high) else None,
-        own,
+        bench_error,
     )
 
 

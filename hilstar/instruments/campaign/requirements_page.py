@@ -37,6 +37,7 @@ from hilstar.basics.pages import (
 )
 from hilstar.basics.version import __version__
 from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.case_table import VARY, Columns, read_cases
 from hilstar.instruments.campaign.plan import CONDITION, QUANTITY_UNITS, Plan
 from hilstar.instruments.campaign.requirements import (
     MET,
@@ -45,7 +46,7 @@ from hilstar.instruments.campaign.requirements import (
     RequirementVerdict,
     verdicts_of,
 )
-from hilstar.instruments.campaign.results import VARY, Columns, read_cases
+from hilstar.instruments.campaign.star_motion import with_motion
 from hilstar.instruments.campaign.store import file_sha256
 from hilstar.server.bench.alignment import cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile
@@ -106,15 +107,13 @@ def write_requirements(
         bench_arcsec = None
     else:
         bench_arcsec = certificate.attitude_arcsec
+    cases = with_motion(cases, plan.require, file, scale)
     verdicts = verdicts_of(plan.require, cases, scale, plan.seed, bench_arcsec)
-    write_csv(
-        table.with_name("requirements.csv"),
-        COLUMNS,
-        [
-            [summary_of(requirement_verdict)[name] for name in COLUMNS]
-            for requirement_verdict in verdicts
-        ],
-    )
+    rows = []
+    for verdict in verdicts:
+        summary = summary_of(verdict)
+        rows.append([summary[name] for name in COLUMNS])
+    write_csv(table.with_name("requirements.csv"), COLUMNS, rows)
     figure = _chart(cases, verdicts)
     write_whole(table.with_name("requirements.png"), png(figure))
     about = [
@@ -152,15 +151,20 @@ def _verdict(found: list[RequirementVerdict]) -> Verdict:
 def _verdicts(found: list[RequirementVerdict]) -> Card:
     """A row for each requirement."""
     rows = []
-    for each in found:
+    for verdict in found:
         more = ""
-        if each.verdict == NOT_SHOWN and each.more:
-            more = f"about {each.more} more cases"
-        chip = f'<span class="chip" data-state="{STATES[each.verdict]}">{each.verdict}</span>'
-        confidence = f"{100 * each.require.confidence:g} %"
-        unit = QUANTITY_UNITS[each.require.quantity]
-        figures = (_figure(each.value, unit), _figure(each.bound, unit), confidence, each.cases)
-        rows.append((each.require.words, Markup(chip), *figures, more, each.method))
+        if verdict.verdict == NOT_SHOWN and verdict.more:
+            more = f"about {verdict.more} more cases"
+        chip = f'<span class="chip" data-state="{STATES[verdict.verdict]}">{verdict.verdict}</span>'
+        confidence = f"{100 * verdict.require.confidence:g} %"
+        unit = QUANTITY_UNITS[verdict.require.quantity]
+        figures = (
+            _figure(verdict.value, unit),
+            _figure(verdict.bound, unit),
+            confidence,
+            verdict.cases,
+        )
+        rows.append((verdict.require.words, Markup(chip), *figures, more, verdict.method))
     texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
     return Card("Verdicts", words=texts, cure=CURES[verdict_of(found)])
 
@@ -214,11 +218,14 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
     at = rate if rated else cases.numbers["case"]
     known = np.flatnonzero(np.isfinite(error) & np.isfinite(at))
     drawn = [
-        each
-        for each in found
-        if each.require.quantity in DRAWN and (each.require.axis or "cross") in ("cross", "x", "y")
+        verdict
+        for verdict in found
+        if verdict.require.quantity in DRAWN
+        and (verdict.require.axis or "cross") in ("cross", "x", "y")
     ]
-    counts = f"{sum(each.verdict == MET for each in found)} of {len(found)} requirements are met"
+    counts = (
+        f"{sum(verdict.verdict == MET for verdict in found)} of {len(found)} requirements are met"
+    )
     note = (
         "Dots: cases about the median. Line: one sigma of each bin. Horizontal: one sigma that a"
         " requirement allows."
@@ -230,8 +237,8 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
             order = known[np.argsort(at[known], kind="stable")]
             bins = np.array_split(order, max(1, min(MAX_BINS, len(order) // MIN_IN_BIN)))
             # wild answers do not move it
-            sigma = [float(np.median(error[each])) / MEDIAN_OF_SIGMA for each in bins]
-            axes.plot([float(np.median(at[each])) for each in bins], sigma, "o-", color=BLUE)
+            sigma = [float(np.median(error[rows])) / MEDIAN_OF_SIGMA for rows in bins]
+            axes.plot([float(np.median(at[rows])) for rows in bins], sigma, "o-", color=BLUE)
             positive = at[known] > 0
             if rated and positive.all() and at[known].max() > 30 * at[known].min():
                 axes.set_xscale("log")
@@ -240,18 +247,21 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
             top = 1.15 * max(
                 float(np.quantile(error[known], 0.97)),
                 *sigma,
-                *(each.require.limit for each in drawn),
+                *(verdict.require.limit for verdict in drawn),
             )
             axes.set_ylim(0, top)
-            for each in drawn:
-                begin, end = _span(each.require.condition, low, high) if rated else (low, high)
+            for verdict in drawn:
+                begin, end = _span(verdict.require.condition, low, high) if rated else (low, high)
                 axes.plot(
-                    [begin, end], [each.require.limit] * 2, color=COLOURS[each.verdict], lw=2.2
+                    [begin, end],
+                    [verdict.require.limit] * 2,
+                    color=COLOURS[verdict.verdict],
+                    lw=2.2,
                 )
-                bar_text = f"{each.require.quantity} {each.verdict}"
+                bar_text = f"{verdict.require.quantity} {verdict.verdict}"
                 axes.annotate(
                     bar_text,
-                    (begin, each.require.limit),
+                    (begin, verdict.require.limit),
                     (2, 3),
                     textcoords="offset points",
                     fontsize=9,

@@ -16,7 +16,7 @@ no parameter costs.
 
 import math
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +40,11 @@ from hilstar.instruments.assess.figure_rows import (
     part_rows,
 )
 from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.case_table import VARY, Columns, read_cases
 from hilstar.instruments.campaign.page import PAGE_FILE, MeasureCosts, write_campaign_page
 from hilstar.instruments.campaign.store import failures, file_sha256
 from hilstar.server.bench.bench_file import BenchFile
 
-MAX_READ_CASES = 50_000  # cases read for the figures, spread evenly over a larger table
-VARY = "vary."
 SCATTER = "noise within a case"
 MAX_FITTED_CASES = 20_000  # cases in the fit of the budget, whose time grows with them
 MAX_BINS, MIN_IN_BIN = 8, 8
@@ -60,80 +59,10 @@ WORDS = {
     "unanswered": "answers that are missing or wrong",
 }
 MAX_REASONS = 5
-
-
-@dataclass(frozen=True)
-class Columns:
-    """Columns (n,) by name: numbers as float64 with NaN where there are none, text, and lists of
-    numbers (k,). `cases` counts the whole table's.
-    """
-
-    cases: int
-    numbers: dict[str, FloatArray]
-    texts: dict[str, list[str]]
-    lists: dict[str, list[FloatArray]] = field(default_factory=dict)
-
-    @property
-    def varied(self) -> list[str]:
-        """The names of the varied columns."""
-        return [name for name in (*self.numbers, *self.texts) if name.startswith(VARY)]
-
-    def some(self, chosen: npt.NDArray[np.bool_]) -> "Columns":
-        """The chosen (n,) cases alone."""
-        numbers = {name: column[chosen] for name, column in self.numbers.items()}
-        texts = {
-            name: [text for text, is_one in zip(column, chosen, strict=True) if is_one]
-            for name, column in self.texts.items()
-        }
-        lists = {
-            name: [values for values, is_one in zip(column, chosen, strict=True) if is_one]
-            for name, column in self.lists.items()
-        }
-        return Columns(self.cases, numbers, texts, lists)
-
-    def vectors(self, form: str, names: str) -> FloatArray:
-        """Columns (n, k) side by side: `form` with each of `names` in it."""
-        return np.stack([self.numbers[form.format(name)] for name in names], axis=1)
-
-
-def read_cases(path: Path, max_cases: int = MAX_READ_CASES) -> Columns:
-    """A campaign's table, or an even share of its cases. Raises InputError for another file."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    numbers: dict[str, list[FloatArray]] = {}
-    texts: dict[str, list[str]] = {}
-    lists: dict[str, list[FloatArray]] = {}
-    try:
-        file = pq.ParquetFile(path)
-        step = -(-file.metadata.num_rows // max_cases) or 1
-        for group in range(file.num_row_groups):
-            table = file.read_row_group(group)
-            table = table.take(pa.array(np.arange(0, table.num_rows, step)))
-            for name in table.column_names:
-                column: Any = table.column(name)
-                if pa.types.is_string(column.type):
-                    texts.setdefault(name, []).extend(value or "" for value in column.to_pylist())
-                elif pa.types.is_list(column.type):
-                    lists.setdefault(name, []).extend(
-                        np.array(values or [], dtype=np.float64) for values in column.to_pylist()
-                    )
-                else:
-                    values = np.array(
-                        [np.nan if v is None else float(v) for v in column.to_pylist()]
-                    )
-                    numbers.setdefault(name, []).append(values)
-        return Columns(
-            file.metadata.num_rows,
-            {name: np.concatenate(parts) for name, parts in numbers.items()},
-            texts,
-            lists,
-        )
-    except (OSError, pa.ArrowException, ValueError) as error:
-        raise InputError(
-            f"{path}: is no table of a campaign ({error}); delete it, and run the same command"
-            " again"
-        ) from error
+SENSITIVITY_COLUMNS = (
+    *("measure", "unit", "parameter", "overall", "cost", "share", "sure"),
+    *("best", "at_best", "worst", "at_worst"),
+)
 
 
 def case_budget(
@@ -463,6 +392,15 @@ def _level_text(cost: Cost, place: int) -> str:
     return f"{_figure(float(cost.level[place]), cost)} at {where}"
 
 
+def _sensitivity_row(cost: Cost) -> tuple[Any, ...]:
+    """A row of sensitivity.csv."""
+    sure = str(cost.sure).lower()
+    best, worst = cost.best, cost.worst
+    at_best, at_worst = float(cost.level[best]), float(cost.level[worst])
+    about = (cost.measure, cost.unit, cost.parameter, cost.overall, cost.cost, cost.share, sure)
+    return (*about, cost.places[best], at_best, cost.places[worst], at_worst)
+
+
 def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     """Write `budget.csv`, `sensitivity.csv`, a chart for each measure that varies, and the page
     `campaign.html`; the JSON object of `hilstar campaign`.
@@ -475,41 +413,8 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     budget_table = list(budget_rows(budget, parts))
     write_csv(table.with_name("budget.csv"), FigureRow._fields, budget_table)
     varied_costs = costs(cases)
-    names = (
-        "measure",
-        "unit",
-        "parameter",
-        "overall",
-        "cost",
-        "share",
-        "sure",
-        "best",
-        "at_best",
-        "worst",
-        "at_worst",
-    )
-    rows = []
-    for varied_cost in varied_costs:
-        rows.append(
-            (
-                *(
-                    varied_cost.measure,
-                    varied_cost.unit,
-                    varied_cost.parameter,
-                    varied_cost.overall,
-                    varied_cost.cost,
-                    varied_cost.share,
-                    str(varied_cost.sure).lower(),
-                ),
-                *(
-                    varied_cost.places[varied_cost.best],
-                    float(varied_cost.level[varied_cost.best]),
-                    varied_cost.places[varied_cost.worst],
-                    float(varied_cost.level[varied_cost.worst]),
-                ),
-            )
-        )
-    write_csv(table.with_name("sensitivity.csv"), names, rows)
+    rows = [_sensitivity_row(varied_cost) for varied_cost in varied_costs]
+    write_csv(table.with_name("sensitivity.csv"), SENSITIVITY_COLUMNS, rows)
     findings = []
     measure_costs = {}
     for measure in dict.fromkeys(cost.measure for cost in varied_costs):
@@ -556,12 +461,12 @@ def lines_of(summary: dict[str, Any]) -> list[str]:
                     for axis, value in asdict(axes).items()
                 )
                 lines.append(f"{name:20}{', '.join(values)}")
-    found = summary["centroids"]
-    if found is not None:
-        lines.append(
-            f"{'centroids':20}{found['sigma_x_px']:.3g}, {found['sigma_y_px']:.3g} px one sigma,"
-            f" {100 * found['found_share']:.3g} % of stars found, {found['false_a_frame']:.3g}"
-            " false a frame"
-        )
+    centroids = summary["centroids"]
+    if centroids is not None:
+        sigma_x_px, sigma_y_px = centroids["sigma_x_px"], centroids["sigma_y_px"]
+        share = f"{100 * centroids['found_share']:.3g} % of stars found"
+        false = f"{centroids['false_a_frame']:.3g} false a frame"
+        sigma = f"{sigma_x_px:.3g}, {sigma_y_px:.3g} px one sigma"
+        lines.append(f"{'centroids':20}{sigma}, {share}, {false}")
     lines.append(f"{'limit of its stars':20}{limit_text(summary['limit_arcsec'])}")
     return [*lines, *summary["notes"], *summary["findings"]]

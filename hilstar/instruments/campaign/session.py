@@ -15,6 +15,7 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.basics.files import make_directory
+from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.cases import (
     Case,
     CaseMaker,
@@ -35,6 +36,7 @@ from hilstar.instruments.campaign.job import (
 from hilstar.instruments.campaign.plan import Plan, parse_plan
 from hilstar.instruments.campaign.planted import CaseConditions, CaseTracker
 from hilstar.instruments.campaign.solvers import CENTROIDS, SolverFault, choose_solver
+from hilstar.instruments.campaign.star_motion import StarMotion
 from hilstar.instruments.campaign.store import Row
 from hilstar.instruments.campaign.tally import CaseTally
 from hilstar.instruments.simulate.pictures import write_exposure_fits
@@ -82,6 +84,7 @@ class Session:
             Path(job.plan_path).parent,
         )
         self._tracker: Imaging | None = None
+        self._motion: StarMotion | None = None
         self._at(self.maker.file)
 
     def identity(self) -> Identity:
@@ -129,14 +132,16 @@ class Session:
             acceleration_rad_s2=acceleration_rad_s2,
         )
         noise = FrameNoise(self.plan.noise, case.noise_seed)
-        velocity_km_s = np.array(tracker.config.sky.observer_velocity_km_s)
-        false_stars = tracker.config.tracker.detector.false_stars
-        body_deg = float(case.values.get("body_deg", 180.0))
         conditions = CaseConditions(
-            velocity_km_s, acceleration_rad_s2, false_stars, body_deg, fault_end_s
+            np.array(tracker.config.sky.observer_velocity_km_s),
+            acceleration_rad_s2,
+            tracker.config.tracker.detector.false_stars,
+            case.body_deg,
+            fault_end_s,
+            self._old_places_rad(case, tracker),
         )
-        told = "rate" in self.plan.columns
-        reporter = CaseTracker(self.plan.planted, case.noise_seed, conditions, told)
+        with_rate = "rate" in self.plan.columns
+        reporter = CaseTracker(self.plan.planted, case.noise_seed, conditions, with_rate)
         for frame in range(self.plan.frames):
             view = self.maker.view(case, frame, exposure_s)
             # A case of one frame has the noise of `hilstar simulate --seed` for the same bench and
@@ -165,6 +170,21 @@ class Session:
             except SolverFault as error:
                 return failed(tally.into(row), one_line(str(error)))
         return tally.into(row)
+
+    def _old_places_rad(self, case: Case, tracker: Imaging) -> FloatArray:
+        """The turn (3,), cam, that planted old places give a case."""
+        planted = self.plan.planted
+        if planted is None or not (planted.proper_motion or planted.catalogue_age_yr):
+            return np.zeros(3)
+        if self._motion is None:
+            self._motion = StarMotion.of(self.maker.file)
+        years = tracker.config.sky.epoch_jyear - self._motion.jyear
+        old_yr = planted.proper_motion * years + planted.catalogue_age_yr
+        settings = tracker.config.tracker
+        scale = Scale(
+            settings.focal_length_mm * 1e3 / settings.pixel_pitch_um, settings.resolution_px
+        )
+        return old_yr * self._motion.whole_turn_rad(case.first.q_icrs_to_cam, scale)
 
     def _at(self, file: BenchFile) -> Imaging:
         """The tracker, switched to a bench file; where that fails, the next case gets a new one."""

@@ -77,12 +77,12 @@ def write_table(path: Path, schema: "pa.Schema", blocks: Iterator[list[Row]]) ->
         }
         with pq.ParquetWriter(file, schema, **settings) as writer:
             for rows in blocks:
-                columns = {field.name: [row[field.name] for row in rows] for field in schema}
+                columns: dict[str, list[Any]] = {}
                 for field in schema:
+                    values = [row[field.name] for row in rows]
                     if field.type == pa.float64():  # JSON writes a whole number without its point
-                        columns[field.name] = [
-                            None if value is None else float(value) for value in columns[field.name]
-                        ]
+                        values = [None if value is None else float(value) for value in values]
+                    columns[field.name] = values
                 writer.write_table(
                     pa.Table.from_pydict(columns, schema=schema), row_group_size=max(1, len(rows))
                 )
@@ -341,18 +341,18 @@ class Directory:
 
 def _changed(before: About, now: About) -> str:
     """The first thing that differs, in words."""
-    said = msgspec.to_builtins(before), msgspec.to_builtins(now)
-    for table, words in (("plan", "the plan's "), ("identity", "this machine's ")):
-        for key in sorted(set(said[0][table]) | set(said[1][table])):
-            old, new = (part[table].get(key) for part in said)
+    tables = msgspec.to_builtins(before), msgspec.to_builtins(now)
+    for table, where in (("plan", "the plan's "), ("identity", "this machine's ")):
+        for key in sorted(set(tables[0][table]) | set(tables[1][table])):
+            old, new = (part[table].get(key) for part in tables)
             if old != new:
                 old, new = (shortened(msgspec.json.encode(value).decode()) for value in (old, new))
-                return f"{words}{key} was {old} and is {new}"
-    for key, words in (
+                return f"{where}{key} was {old} and is {new}"
+    for key, where in (
         ("bench_sha256", "its bench file"),
         ("files_sha256", "its log or scenario"),
         ("solver", "--solver"),
     ):
-        if said[0][key] != said[1][key]:
-            return f"{words} was {shortened(said[0][key])} and is {shortened(said[1][key])}"
+        if tables[0][key] != tables[1][key]:
+            return f"{where} was {shortened(tables[0][key])} and is {shortened(tables[1][key])}"
     return "--images was another"

@@ -20,9 +20,9 @@ from msgspec import Meta
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.toml_tables import Table
+from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, clopper_pearson
 from hilstar.instruments.campaign.plan import Number
-from hilstar.instruments.campaign.results import Columns
 
 STILL, NOT_EVEN = "still answers at", "does not even answer at"
 ENDS = 2  # levels before the first middle

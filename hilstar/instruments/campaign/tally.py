@@ -33,16 +33,12 @@ def spread_row(errors_arcsec: list[FloatArray]) -> Row:
     row: Row = {}
     if errors_arcsec:
         errors = np.array(errors_arcsec)
-        row |= {
-            f"error_{axis}_arcsec": float(value)
-            for axis, value in zip(AXES, errors.mean(axis=0), strict=True)
-        }
+        for axis, value in zip(AXES, errors.mean(axis=0).tolist(), strict=True):
+            row[f"error_{axis}_arcsec"] = value
         if len(errors) > 1:
-            scatter = errors.std(axis=0, ddof=1)
-            row |= {
-                f"scatter_{axis}_arcsec": float(value)
-                for axis, value in zip(AXES, scatter, strict=True)
-            }
+            scatter = errors.std(axis=0, ddof=1).tolist()
+            for axis, value in zip(AXES, scatter, strict=True):
+                row[f"scatter_{axis}_arcsec"] = value
     return row
 
 
@@ -194,15 +190,12 @@ class CaseTally:
         return row
 
     def _centroids(self) -> Row:
-        dx_px, dy_px = (
-            np.concatenate([getattr(star_errors, name) for star_errors in self.star_errors])
-            for name in ("dx_px", "dy_px")
-        )
-        v_mag = np.concatenate([star_errors.v_mag for star_errors in self.star_errors])
-        row: Row = {
-            name: sum(getattr(star_errors, name) for star_errors in self.star_errors)
-            for name in ("stars", "found", "matched", "false")
-        }
+        dx_px = np.concatenate([errors.dx_px for errors in self.star_errors])
+        dy_px = np.concatenate([errors.dy_px for errors in self.star_errors])
+        v_mag = np.concatenate([errors.v_mag for errors in self.star_errors])
+        row: Row = {}
+        for name in ("stars", "found", "matched", "false"):
+            row[name] = sum(getattr(errors, name) for errors in self.star_errors)
         row["measured"] = len(dx_px)
         if len(dx_px):
             row |= {"centroid_dx_px": float(dx_px.mean()), "centroid_dy_px": float(dy_px.mean())}

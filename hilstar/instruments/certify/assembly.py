@@ -7,13 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.instruments.certify.bench_readings import geometry_of
 from hilstar.instruments.certify.budget import Input, Model
 from hilstar.instruments.certify.effects import Effect
 from hilstar.instruments.certify.estimates import evenness, light_deviation, place_errors
 from hilstar.instruments.certify.lens import lens_fit
 from hilstar.instruments.certify.model import Deviations, Figures, reference_stars
 from hilstar.instruments.certify.read_effects import Read, of_readings
-from hilstar.instruments.certify.readings import Reader, dot_places, geometry_of
+from hilstar.instruments.certify.readings import Reader, dot_places
 from hilstar.instruments.certify.sky_effects import FLUX, SKY, of_sky
 from hilstar.instruments.certify.stated_effects import of_drift, of_files, of_settings, of_warm_up
 from hilstar.server.bench.bench_file import BenchFile

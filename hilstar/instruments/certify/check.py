@@ -26,15 +26,10 @@ from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.reading import NOT_JSON, exists, read_bytes, read_text
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.instruments.calibrate.warm_up import WarmUp, fitted_white, judge_warm_up, watch_white
+from hilstar.instruments.certify.bench_readings import DotReadings, geometry_of
 from hilstar.instruments.certify.budget import COVERAGE
 from hilstar.instruments.certify.estimates import place_errors, surface
-from hilstar.instruments.certify.readings import (
-    DotReadings,
-    Reader,
-    VirtualReader,
-    dot_places,
-    geometry_of,
-)
+from hilstar.instruments.certify.readings import Reader, VirtualReader, dot_places
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.config.certify import VirtualSettings
 
@@ -267,8 +262,8 @@ class _Noise:
         is_bright = codes > codes[len(codes) // 3]
         dof = squares = 0.0
         for of in noisy:
-            relative_squares = of.squares / of.mean**2
-            squares += float(relative_squares[is_bright].sum())
+            relative_squares = of.squares[is_bright] / of.mean[is_bright] ** 2
+            squares += float(relative_squares.sum())
             dof += float(of.freedom[is_bright].sum())
         relative = 0.0
         if dof:

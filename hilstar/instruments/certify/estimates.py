@@ -27,8 +27,7 @@ from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.display.calibration import weights_of_grid
-from hilstar.instruments.certify.effects import smooth_root
-from hilstar.instruments.certify.readings import (
+from hilstar.instruments.certify.bench_readings import (
     BesideRatio,
     DotReadings,
     LightReadings,
@@ -36,6 +35,7 @@ from hilstar.instruments.certify.readings import (
     grey_response,
     white_of,
 )
+from hilstar.instruments.certify.effects import smooth_root
 from hilstar.instruments.certify.structure import (
     Cells,
     Structure,

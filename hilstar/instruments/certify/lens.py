@@ -18,7 +18,7 @@ from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.instruments.calibrate.geometric import fit as fits
 from hilstar.instruments.calibrate.geometric.dots import DotPlan
 from hilstar.instruments.calibrate.geometric.observed import Observed
-from hilstar.instruments.certify.readings import DotReadings, geometry_of
+from hilstar.instruments.certify.bench_readings import DotReadings, geometry_of
 from hilstar.instruments.certify.structure import TINY, Cells, Structure, in_place
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.optics.camera import Camera, field_terms

@@ -18,7 +18,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 from hilstar.display.quantise import shown_light
-from hilstar.instruments.certify.readings import (
+from hilstar.instruments.certify.bench_readings import (
     geometry_of,
     grey_response,
     in_true_image,

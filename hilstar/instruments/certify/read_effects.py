@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
+from hilstar.instruments.certify.bench_readings import BesideRatio
 from hilstar.instruments.certify.budget import Input
 from hilstar.instruments.certify.effects import Effect, of_all_stars, root_mean_square
 from hilstar.instruments.certify.estimates import Evenness, LightDeviation
 from hilstar.instruments.certify.lens import LensFit, Places
 from hilstar.instruments.certify.model import Deviations, Figures
-from hilstar.instruments.certify.readings import BesideRatio
 from hilstar.instruments.certify.stated_effects import NEIGHBOURS, stated_delay
 from hilstar.instruments.certify.structure import in_time, lasting_root
 from hilstar.server.bench.bench_file import BenchFile

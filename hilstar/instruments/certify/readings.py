@@ -16,9 +16,7 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
-from hilstar.display.calibration import load_calibration
 from hilstar.display.identity import MonitorIdentity
-from hilstar.display.response import Response
 from hilstar.instruments.calibrate.first_light import image_sources
 from hilstar.instruments.calibrate.first_light.context import StepContext
 from hilstar.instruments.calibrate.first_light.focus import seen_sharpness
@@ -32,11 +30,20 @@ from hilstar.instruments.calibrate.geometric.dots import DOT_PX, SeenScreen
 from hilstar.instruments.calibrate.geometric.geometry_fit import dot_sigma_px, psf_sigma_of
 from hilstar.instruments.calibrate.latency import pair, swap_to_square_ms
 from hilstar.instruments.calibrate.plan import Patch
+from hilstar.instruments.certify.bench_readings import (
+    BesideRatio,
+    DotReadings,
+    LightReadings,
+    code_of_light,
+    geometry_of,
+    grey_response,
+    in_true_image,
+    white_of,
+)
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.build import open_bench
-from hilstar.server.bench.cameras import bench_camera, tracker_camera, tracker_psf
-from hilstar.server.bench.monitor import bench_calibration, calibration_source, orientation_of
+from hilstar.server.bench.cameras import tracker_psf
+from hilstar.server.bench.monitor import bench_calibration
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
 # from dot to dot: a dot that moved by half of it would be taken for its neighbour
@@ -51,64 +58,6 @@ WATCHED_S = 5.0
 DOT_REACH_SIGMAS = 5.0  # of a dot: its light is in a square of so many to each side
 THRESHOLD_SIGMA, MIN_PIXELS = 8.0, 3
 STEP_PX = 10.0  # of the screen, by which the mounting of a truth is compared
-
-
-@dataclass(frozen=True, slots=True)
-class BesideRatio:
-    """Light of a pixel among lit ones of its code, relative to that of one alone: 1 where pixels
-    leave each other's light as it is. `error` is one standard error.
-    """
-
-    ratio: float
-    error: float
-
-    @property
-    def excess(self) -> float:
-        """How far the ratio is from 1 beyond its noise, one sigma."""
-        square = (self.ratio - 1) ** 2 - self.error**2
-        return math.sqrt(max(square, 0.0))
-
-
-@dataclass(frozen=True, slots=True)
-class LightReadings:
-    """Light (n,) of one monitor pixel at the middle of the screen, black included, e-/s, by code
-    (n,), at t_s (n,).
-
-    It may be the mean over a square of pixels, `square_px` (left, top, side). What several readings
-    have in common, as the ratios of lattices, is in `common` (n, inputs), one sigma, e-/s. `noise`
-    (n,) is each reading's noise, e-/s, up to a factor that their scatter tells; None where it goes
-    with light. `beside` is None where no neighbouring pixels were read.
-    """
-
-    code: IntArray
-    light: FloatArray
-    t_s: FloatArray
-    square_px: tuple[int, int, int] | None = None
-    common: FloatArray | None = None
-    noise: FloatArray | None = None
-    beside: BesideRatio | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class DotReadings:
-    """Dots: places on the monitor and in the tracker's image (n,), px, and relative light (n,);
-    `psf_px` is the PSF's sigma.
-    """
-
-    x_px: FloatArray
-    y_px: FloatArray
-    seen_x_px: FloatArray
-    seen_y_px: FloatArray
-    light: FloatArray
-    psf_px: float = math.nan
-    psf_u_px: float = 0.0
-
-
-def geometry_of(file: BenchFile) -> BenchGeometry:
-    """Monitor and tracker as a bench file has them."""
-    return BenchGeometry(
-        bench_camera(file.config, file.folder), tracker_camera(file.config.tracker, file.folder)
-    )
 
 
 def dot_places(geometry: BenchGeometry) -> tuple[IntArray, IntArray]:
@@ -248,20 +197,6 @@ class VirtualReader:
         )
 
 
-def in_true_image(
-    file: BenchFile, truth: BenchFile, x_px: FloatArray, y_px: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """The pixels (n,) of the truth's image that are those of the bench file's, on one screen.
-
-    A screen can be stated in several ways: flipped both ways it is turned by 180 degrees, and
-    turned by nearly 45 degrees it may be taken for a quarter turn.
-    """
-    mine = file.config.monitor
-    its = truth.config.monitor
-    on_screen = orientation_of(mine).to_screen(x_px, y_px, mine.resolution_px)
-    return orientation_of(its).to_image(*on_screen, its.resolution_px)
-
-
 def _is_mounted_alike(file: BenchFile, truth: BenchFile) -> bool:
     """Whether steps right and down the image go the same way in the tracker by both files, to 45
     degrees, as they do after the step `orientation`.
@@ -277,15 +212,6 @@ def _is_mounted_alike(file: BenchFile, truth: BenchFile) -> bool:
     lengths = np.linalg.norm(steps, axis=0) * np.linalg.norm(true_steps, axis=0)
     cosines = (steps * true_steps).sum(axis=0) / lengths
     return bool((cosines > math.cos(math.pi / 4)).all())
-
-
-def white_of(file: BenchFile) -> float:
-    """The light of white of a bench file, e-/s."""
-    white = file.config.render.flux_at_white_e_per_s
-    if white is not None:
-        return white
-    with open_bench(file) as bench:
-        return bench.flux_at_white_e_per_s
 
 
 def dot_settings(file: BenchFile) -> CentroidSettings:
@@ -445,14 +371,3 @@ def _common(readings: Readings) -> FloatArray:
 
 
 Reader = VirtualReader | ImageReader
-
-
-def grey_response(file: BenchFile) -> Response:
-    """The response of greys, code by code, whatever the bench's quantisation."""
-    monitor = file.config.monitor
-    return load_calibration(calibration_source(monitor, file.folder), monitor.bits).response
-
-
-def code_of_light(file: BenchFile, share: float) -> int:
-    """The grey code of about a share of white's light."""
-    return int(np.searchsorted(grey_response(file).light, share))

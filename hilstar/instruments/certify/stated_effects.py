@@ -16,6 +16,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE
 from hilstar.display.calibration import BUILT_IN, read_toml, weights_of_grid
 from hilstar.display.geometry import load_notes
+from hilstar.instruments.certify.bench_readings import geometry_of
 from hilstar.instruments.certify.budget import Distribution, Input
 from hilstar.instruments.certify.effects import (
     Effect,
@@ -24,7 +25,6 @@ from hilstar.instruments.certify.effects import (
     smooth_root,
 )
 from hilstar.instruments.certify.model import Deviations, Figures
-from hilstar.instruments.certify.readings import geometry_of
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.config.certify import TrackerReferenceSettings
 from hilstar.server.bench.monitor import bench_calibration

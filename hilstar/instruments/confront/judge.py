@@ -275,13 +275,15 @@ class Judge:
         counted = [row for row in rows if row.counted]
         off_px = np.array([row.off_px for row in counted])
         off_mag = np.array([row.off_mag for row in counted])
+        # a star of no positive light has a place and no magnitude
+        has_light = np.isfinite(off_mag)
         return Verdict(
             shot=shot,
             number=number,
             stars=rows,
             sources=sources,
             rms_px=_rms(off_px.ravel()),
-            rms_mag=_rms(off_mag[np.isfinite(off_mag)]),
+            rms_mag=_rms(off_mag[has_light]),
             counted=len(counted),
             background_chi2=background_chi2,
             star_chi2=star_chi2,

@@ -149,6 +149,12 @@ def fit_light(
         colour_terms[" rgb"[plane]] = float(about_v.values[1])
     about_v = _about_v(stars, base, use, ones, vignetting)
     zero_points = slice(2, 2 + images)
+    sigma = {
+        "linearity": about_v.sigma[0],
+        "colour_term": about_v.sigma[1],
+        "zero_point_mag": float(about_v.sigma[zero_points].mean()),
+    }
+    mag = base + solution.model - ones @ offsets_mag
     return LightFit(
         offsets_mag=offsets_mag,
         vignetting_mag=(r2_mag, r4_mag),
@@ -156,12 +162,8 @@ def fit_light(
         zero_point_mag=-float(about_v.values[zero_points].mean()),
         colour_term=float(about_v.values[1]),
         linearity=float(about_v.values[0]),
-        sigma={
-            "linearity": about_v.sigma[0],
-            "colour_term": about_v.sigma[1],
-            "zero_point_mag": float(about_v.sigma[zero_points].mean()),
-        },
-        mag=base + solution.model - ones @ offsets_mag,
+        sigma=sigma,
+        mag=mag,
         colours=colours,
         colour_terms=colour_terms,
     )

@@ -145,12 +145,13 @@ def _tracker(session: Session, given: dict[str, Any], exposure_s: float) -> dict
     tracker = session.file.config.tracker
     # twice that of a mosaic's plane
     pitch_um = tracker.pixel_pitch_um * tracker.resolution_px[0] / camera.resolution_px[0]
+    principal_point_px = [round(place_px, 4) for place_px in camera.principal_point_px]
     table: dict[str, Any] = {
         "aperture_mm": tracker.aperture_mm,
         "focal_length_mm": camera.focal_length_px * pitch_um * 1e-3,
         "pixel_pitch_um": pitch_um,
         "resolution_px": list(camera.resolution_px),
-        "principal_point_px": [round(v, 4) for v in camera.principal_point_px],
+        "principal_point_px": principal_point_px,
         "quantum_efficiency": NAMES[2],
         "transmission": tracker.transmission,
         "exposure_s": exposure_s,

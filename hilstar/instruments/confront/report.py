@@ -67,17 +67,19 @@ def _camera_figures(session: Session, defects: tuple[int, int]) -> dict[str, Any
     fixed_pattern = None
     if math.isfinite(pixels.pattern.errors[0]):
         fixed_pattern = dict(zip(KINDS, pixels.pattern.rms, strict=True))
+    full_dn = session.shots[0].photo.full_dn
+    psf_fwhm_px = float(np.median(_fwhms(session)))
     return {
         "focal_length_px": fit.camera.focal_length_px,
         "principal_point_px": list(fit.camera.principal_point_px),
         "distortion": _distortion(session),
         "model": fit.model,
         "held_out_px": fit.held_out_px,
-        "psf_fwhm_px": float(np.median(_fwhms(session))),
+        "psf_fwhm_px": psf_fwhm_px,
         "gain_e_per_dn": pixels.gain_e_per_dn,
         "read_noise_e": pixels.read_noise_e,
         "pedestal_dn": pixels.pedestal_dn,
-        "saturation_dn": session.shots[0].photo.full_dn,
+        "saturation_dn": full_dn,
         "zero_point_mag": _number(light.zero_point_mag),
         "colour_term": _number(light.colour_term),
         "colour_terms": light.colour_terms,
@@ -147,6 +149,11 @@ def _image_figures(session: Session, verdict: Verdict) -> dict[str, Any]:
     if verdict.dated is not None:
         off_years = verdict.dated.years
         sigma_years = verdict.dated.sigma
+    fainter_than_catalogue = {
+        "complete_v_mag": fainter.complete_v_mag,
+        "reached_v_mag": _number(fainter.reached_v_mag),
+        "expected": fainter.expected,
+    }
     return {
         "file": verdict.shot.photo.name,
         "q_icrs_to_cam": pointing.q_icrs_to_cam.tolist(),
@@ -158,11 +165,7 @@ def _image_figures(session: Session, verdict: Verdict) -> dict[str, Any]:
         "star_chi2": _number(verdict.star_chi2),
         "unexplained": len(verdict.unexplained),
         "missing": len(verdict.missing),
-        "fainter_than_catalogue": {
-            "complete_v_mag": fainter.complete_v_mag,
-            "reached_v_mag": _number(fainter.reached_v_mag),
-            "expected": fainter.expected,
-        },
+        "fainter_than_catalogue": fainter_than_catalogue,
         "dim": verdict.dim,
         "offset_mag": float(session.light.offsets_mag[verdict.number]),
         "altitude_deg": pointing.altitude_deg,

@@ -19,7 +19,7 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import ARCSEC_PER_RAD, magnitude
 from hilstar.display.calibration import read_toml
-from hilstar.instruments.certify.readings import white_of
+from hilstar.instruments.certify.bench_readings import white_of
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.config.hardware import Monitor

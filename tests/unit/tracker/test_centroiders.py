@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.tracker.centroiders import Centroider, brightest, star_places
+from hilstar.tracker.centroiders import Centroider, _profile, brightest, star_places
 
 SIGMA = (1.05, 0.95)
 # Of Gaussians integrated over pixels: sampling's own errors; a box of 5 x 5 cuts wings, one of 3 x
@@ -87,3 +87,11 @@ def test_a_star_that_is_none_has_a_place_on_its_square(kind, sigma, rng):
     images = np.array([make(rng) for make in HOSTILE.values()])
     for x in star_places(images, kind, (sigma, sigma)):
         assert np.isfinite(x).all() and np.abs(x).max() <= 7
+
+
+def test_a_star_s_shares_change_with_its_place_as_their_slopes_say():
+    at, sigma_px, step_px = np.arange(-6.0, 7.0), 0.8, 1e-5
+    places = np.array([-0.4, 0.0, 0.3])
+    before, slopes = _profile(at, places, sigma_px)
+    after, _ = _profile(at, places + step_px, sigma_px)
+    assert slopes == pytest.approx((after - before) / step_px, abs=step_px)

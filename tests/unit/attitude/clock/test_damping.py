@@ -144,10 +144,11 @@ def test_jumps_and_gaps_begin_anew():
     assert all(after.t_ns > before.t_ns for before, after in pairwise(samples))
 
 
-def test_the_mean_of_equal_times_ahead_is_that_time():
+def test_a_steady_turn_has_no_jitter_and_the_mean_of_equal_times_ahead_is_that_time():
     """Of a stream that nobody predicts yet, each sample is ahead of the one before by the step."""
     damping = _Damping()
     step_ns = 10 * NS_PER_MS
     for k in range(40):
-        damped = damping.add(k * step_ns, (0.0, 0.0, 1.0), (0.0, 0.0, 0.01))
+        damped = damping.add(k * step_ns, (0.3, -0.2, 1.0), (3e-3, -2e-3, 0.01))
+        assert damped.excess == pytest.approx((0, 0, 0), abs=1e-12)
     assert damped.ahead_s == pytest.approx(step_ns / NS_PER_S, rel=1e-12)

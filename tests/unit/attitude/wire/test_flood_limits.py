@@ -10,6 +10,7 @@ import time
 import tty
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from hilstar.attitude.wire.links import (
@@ -30,6 +31,7 @@ from hilstar.attitude.wire.packet import (
 )
 from hilstar.attitude.wire.roads import PAUSE_S, LinkCounts, RawMessage
 from hilstar.attitude.wire.serial_link import SerialLink
+from hilstar.attitude.wire.zmq_socket import LOOK_S, _MemoryWatch
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_S
@@ -38,6 +40,7 @@ from tests.support.fake_clock import FakeClock
 from tests.support.waiting import PATIENCE_S
 from tests.support.wire.samples import sample
 
+GROWN_BYTES = 100_000_000
 FRAME = framed(encode(sample(7)))
 COUNT = 3 * MAX_BURST
 JUMPED, DAMAGED = {500, 1500, 1800}, 1800
@@ -150,3 +153,15 @@ def test_what_is_no_serial_port_gets_one_line_and_stays_as_it_is(tmp_path, kind)
     assert time.monotonic() - begin_s < PATIENCE_S
     if kind == "file":
         assert path.read_text() == "measured"
+
+
+def test_memory_that_is_used_is_seen_at_most_every_look():
+    clock = FakeClock()
+    watch = _MemoryWatch(clock)
+    watch.begin()
+    kept = np.ones(GROWN_BYTES // 8)
+    assert watch.grown_bytes() == pytest.approx(kept.nbytes, rel=0.1)
+    assert watch.grown_bytes() == 0
+    clock.sleep(LOOK_S)
+    assert watch.grown_bytes() == pytest.approx(kept.nbytes, rel=0.1)
+    watch.close()

@@ -58,6 +58,19 @@ SETS = {
         '[[cases.sun.vary]]\nkey = "sky.epoch_utc"\nvalues = ["2026-03-20T12:00:00"]\n'
         '[[cases.sun.vary]]\nkey = "sky.bodies.sun"\nvalues = [true]\n'
     ),
+    "dates": (
+        '[cases.dates]\ncases = 80\nframes = 2\n[[cases.dates.vary]]\nkey = "sky.epoch_utc"\n'
+        'values = ["1906-01-01T00:00:00", "1946-04-01T00:00:00", "2006-07-01T00:00:00",'
+        ' "2046-10-01T00:00:00"]\n'
+    ),
+    "earth": (
+        '[cases.earth]\ncases = 16\n[cases.earth.attitudes]\nkind = "body"\nbody = "earth"\n'
+        '[cases.earth.sweep]\nkey = "limb_deg"\nstart = 45.0\nstop = -30.0\n'
+        '[[cases.earth.vary]]\nkey = "sky.epoch_utc"\nvalues = ["2026-03-20T12:00:00"]\n'
+        '[[cases.earth.vary]]\nkey = "spacecraft.orbit"\nvalues = ["low-orbit.tle"]\n'
+        '[[cases.earth.vary]]\nkey = "sky.bodies.earth"\nvalues = [true]\n'
+        '[[cases.earth.vary]]\nkey = "time_s"\nminimum = -1400.0\nmaximum = 1400.0\n'
+    ),
     "false-stars": (
         "[cases.false-stars]\ncases = 16\n[cases.false-stars.sweep]\n"
         'key = "tracker.detector.false_stars"\nstart = 1\nstop = 200\nscale = "log"\nwhole = true\n'
@@ -83,6 +96,8 @@ FAULTS: dict[str, tuple[str, str, float, str]] = {
     "time-bias": ("slews", "stamp_bias_s = 0.02", 0.02, "maximum"),
     "time-jitter": ("slews", "stamp_jitter_s = 0.02", 0.02, "maximum"),
     "aberration": ("aberration", "aberration = 1.0", 1.0, "maximum"),
+    "proper-motion": ("dates", "proper_motion = 1.0", 1.0, "maximum"),
+    "catalogue-age": ("dates", "catalogue_age_yr = 100.0", 100.0, "maximum"),
     "star-noise": ("stars", "star_noise_px = 0.3", 0.3, "maximum"),
     "star-fov-error": ("stars", "star_fov_px = 0.3", 0.3, "maximum"),
     "star-colour": ("stars", "star_colour = 0.1", 0.1, "maximum"),
@@ -90,6 +105,7 @@ FAULTS: dict[str, tuple[str, str, float, str]] = {
     "false-stars": ("stars", "false_stars = 2.0", 2.0, "maximum"),
     "rate-limit": ("rate-limit", "max_rate_deg_s = 2.0", 2.0, "minimum"),
     "sun edge": ("sun", "exclusion_deg = 30.0", 30.0, "maximum"),
+    "earth edge": ("earth", "exclusion_deg = 20.0", 20.0, "maximum"),
     "false-stars edge": ("false-stars", "max_false_stars = 40", 40.0, "minimum"),
 }
 # A lag of 0.4 s is on top of the half step, 0.1 s, that a rate of two attitudes has; an attitude
@@ -130,6 +146,9 @@ def test_a_planted_fault_is_found_by_its_clause(tmp_path: Path, key: str) -> Non
     ends = [end for end in (verdict.low, verdict.high) if end is not None]
     sigma = (max(ends) - min(ends)) / (len(ends) * ONE_SIDED) if len(ends) == 2 else 0.0
     assert abs(verdict.value - size) <= max(SHARE * size, SIGMAS * sigma)
+    if found.clause.quantity == "edge":
+        assert verdict.low is not None and verdict.high is not None
+        assert verdict.low <= size <= verdict.high
     assert found.word == NOT_MET
     assert verdict.margin is not None and verdict.margin < 0
 
@@ -228,6 +247,21 @@ def test_a_lost_roll_is_no_attitude_of_the_sky(tmp_path: Path) -> None:
     assert found.word == NOT_MET and found.verdict is not None
     # any roll is within 1800 arcsec of the true one in 2 x 0.5 of 360 degrees
     assert found.verdict.value == pytest.approx(1 - 1 / 360, abs=0.02)
+
+
+def test_files_of_a_plan_stand_beside_it_or_ship(tmp_path: Path) -> None:
+    earth = SETS["earth"] + clause_text("earth edge", 20.0, "earth", "maximum")
+    shipped = ROOT / "configs" / "plans" / "low-orbit.tle"
+
+    def orbit() -> str:
+        (earth_set,) = read_plan_text(tmp_path, earth)
+        values = {varied["key"]: varied.get("values") for varied in earth_set.tables["vary"]}
+        return str(values["spacecraft.orbit"][0])
+
+    assert orbit() == str(shipped)
+    own = tmp_path / "low-orbit.tle"
+    own.write_text(shipped.read_text())
+    assert orbit() == str(own)
 
 
 def test_an_acceptance_goes_on_where_it_was_and_is_judged_again(tmp_path: Path) -> None:

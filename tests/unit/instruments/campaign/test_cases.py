@@ -14,6 +14,7 @@ from astropy.io import fits
 from astropy.time import Time
 from scipy.spatial.transform import Rotation
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.instruments.campaign.cases import CaseMaker
 from hilstar.instruments.campaign.job import Job, files_sha256
@@ -21,6 +22,9 @@ from hilstar.instruments.campaign.plan import Design, parse_plan
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.sky.bodies.orbit import TleOrbit
+from hilstar.sky.bodies.shapes import EQUATOR_KM
+from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
 from tests.support.commands import run_hilstar_here
 from tests.support.refusals import refusal
@@ -222,6 +226,42 @@ def test_a_case_beside_a_body_looks_at_its_angle_from_where_astropy_has_it(tmp_p
     assert np.degrees(np.arccos(boresights @ sun)) == pytest.approx(30.0, abs=0.01)
     beside = boresights - (boresights @ sun)[:, None] * sun
     assert np.linalg.norm(beside.mean(axis=0)) < 0.25  # on every side: 0.5 / sqrt(20), twice over
+
+
+@pytest.mark.parametrize("limb_deg", [20.0, -10.0, -90.0])
+def test_a_case_beside_the_earth_looks_at_its_angle_from_the_limb(
+    tmp_path: Path, limb_deg: float
+) -> None:
+    tle = ROOT / "configs" / "plans" / "low-orbit.tle"
+    plan = write_campaign(
+        tmp_path,
+        {"key": "sky.epoch_utc", "values": ["2026-03-20T12:00:00"]},
+        {"key": "spacecraft.orbit", "values": [str(tle)]},
+        {"key": "sky.bodies.earth", "values": [True]},
+        {"key": "limb_deg", "values": [limb_deg]},
+        {"key": "time_s", "values": [600.0]},
+        attitudes={"kind": "body", "body": "earth"},
+    )
+    file = read_bench_file(tmp_path / "bench.toml")
+    maker = CaseMaker(parse_plan(plan, plan.read_text()), file, tmp_path)
+    utc_ns = int(np.datetime64("2026-03-20T12:10:00", "ns").astype(np.int64))
+    place_km, _ = TleOrbit(tle.read_text(), "low-orbit.tle").state(utc_ns)
+    radius_deg = np.degrees(np.arcsin(EQUATOR_KM / np.linalg.norm(place_km)))
+    # deeper than the middle of the disc is nowhere
+    wanted_deg = max(radius_deg + limb_deg, 0.0)
+    for k, point in enumerate(np.random.default_rng(1).random((5, 8))):
+        boresight = to_matrix(maker.case(k, point).first.q_icrs_to_cam)[2]
+        off = np.arccos(-boresight @ place_km / np.linalg.norm(place_km))
+        # the aberration by the orbit's velocity: 5 arcsec
+        assert np.degrees(off) == pytest.approx(wanted_deg, abs=0.003)
+
+
+def test_a_body_has_an_angle_from_its_middle_or_from_its_limb(tmp_path: Path) -> None:
+    plan = write_campaign(
+        tmp_path, {"key": "body_deg", "values": [30.0]}, {"key": "limb_deg", "values": [30.0]}
+    )
+    with pytest.raises(InputError, match="are one angle"):
+        parse_plan(plan, plan.read_text())
 
 
 def test_a_body_that_the_bench_has_not_is_refused(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import looking_q
 from hilstar.instruments.campaign.figures import BoundedFigure
 from hilstar.instruments.campaign.plan import Attitudes, Require, parse_plan
@@ -29,7 +30,6 @@ from hilstar.instruments.campaign.requirements import (
     quantile_limits,
     verdicts_of,
 )
-from hilstar.instruments.campaign.results import Columns
 
 SCALE = Scale(2000.0, (1024, 1024))
 RATES = 6000  # answers of a campaign that has to tell 0.12 from 0.1: five standard errors

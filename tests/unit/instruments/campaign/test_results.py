@@ -10,7 +10,8 @@ import pytest
 from PIL import Image
 
 from hilstar.basics.rotation import from_radec_roll_deg
-from hilstar.instruments.campaign.results import Columns, costs, read_cases, write_results
+from hilstar.instruments.campaign.case_table import Columns, read_cases
+from hilstar.instruments.campaign.results import costs, write_results
 from hilstar.instruments.campaign.store import schema_of, write_table
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.campaigns import write_campaign

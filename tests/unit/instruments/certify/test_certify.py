@@ -18,19 +18,13 @@ from astropy.io import fits
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.instruments.certify.assembly import DOT_IMAGES, reference_stars
+from hilstar.instruments.certify.bench_readings import LightReadings, geometry_of, grey_response
 from hilstar.instruments.certify.budget import Input, by_trials, first_order, why_they_differ
 from hilstar.instruments.certify.check import compare, take_check
 from hilstar.instruments.certify.estimates import light_deviation, place_errors
 from hilstar.instruments.certify.lens import lens_fit
 from hilstar.instruments.certify.model import Figures, true_deviations
-from hilstar.instruments.certify.readings import (
-    LightReadings,
-    VirtualReader,
-    dot_places,
-    geometry_of,
-    grey_response,
-    light_in_squares,
-)
+from hilstar.instruments.certify.readings import VirtualReader, dot_places, light_in_squares
 from hilstar.instruments.certify.structure import in_place
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.record.ledger_records import read_head

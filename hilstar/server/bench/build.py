@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.panel import Panel
@@ -26,6 +27,7 @@ from hilstar.server.bench.cameras import (
     before_detector,
     bench_camera,
 )
+from hilstar.server.bench.colours import Colours
 from hilstar.server.bench.config.values import MIN_POSITIVE
 from hilstar.server.bench.effort import (
     BEST,
@@ -57,10 +59,8 @@ if TYPE_CHECKING:
 
 # Codes are timed in fields spread evenly over the sky, turning at 1 deg/s, as often as these times
 # allow. The fastest frame of each field counts.
-TIMED_FIELDS = [
-    from_radec_roll_deg(*place, 0.0)
-    for place in ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))
-]
+TIMED_RADEC_DEG = ((0, 0), (90, 0), (180, 0), (270, 0), (0, 90), (0, -90))
+TIMED_FIELDS = [from_radec_roll_deg(ra_deg, dec_deg, 0.0) for ra_deg, dec_deg in TIMED_RADEC_DEG]
 TIMED_EXACT_S, TIMED_ROUND_S, MAX_TIMED = 0.1, 0.05, 10
 
 
@@ -116,11 +116,11 @@ def _assembled(
     timed: bool,
     on_screen: bool,
 ) -> Bench:
-    render, calibration = file.config.render, bench_calibration(file.config, file.folder)
+    render = file.config.render
+    calibration = bench_calibration(file.config, file.folder)
     camera = bench_camera(file.config, file.folder)
     colours = bench_colours(file.config, file.folder, stars.catalog)
-    stars = stars if colours is None else colours.on(stars)
-    drive = 1.0 if stars.primaries is None or colours is None else colours.drive(stars.primaries)
+    stars, drive = _in_colour(stars, colours)
     uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
     darkest = 1.0 if uniformity is None else float(uniformity.min())
     display = Display(
@@ -134,7 +134,11 @@ def _assembled(
     )
     scenes = scenes_of(file, stars, display)
     (psf, drawn, white_e_per_s, light), planned = plan_scene(render, scenes)
-    panels = () if colours is None else primary_panels(file, colours, white_e_per_s, uniformity)
+    panels: tuple[Panel, ...] = ()
+    if colours is not None:
+        panels = primary_panels(file, colours, white_e_per_s, uniformity)
+    glass = star_glass(file, psf)
+    spectra = None if glass is None else glass.shares
 
     def bench_by(effort: Effort) -> Bench:
         codes = effort.quantisation
@@ -157,7 +161,6 @@ def _assembled(
             )
         faintest = QUANTISERS[codes].faintest_e_per_s(light.panel, psf)
         shown, faint = split_by_rate(stars, faintest, drive)
-        glass = star_glass(file, psf)
         return Bench(
             file=file,
             config=config,
@@ -174,7 +177,7 @@ def _assembled(
             faint_stars=faint,
             sources=sources,
             tracker_psf=before_detector(config, file.folder, camera),
-            spectra=None if glass is None else glass.shares,
+            spectra=spectra,
             drawn=drawn,
             renderer=open_backend(target, context),
             colours=colours,
@@ -183,7 +186,9 @@ def _assembled(
 
     def seen_with(some: Stars) -> Stars:
         among = moved(some, sources.moving)
-        return among if colours is None else colours.on(among)
+        if colours is None:
+            return among
+        return colours.on(among)
 
     bench = bench_by(planned)
     if not timed or not planned.by_cost or render.codes_ms is not None:
@@ -193,18 +198,29 @@ def _assembled(
 
     def frame_ms(method: Quantisation, for_s: float) -> float:
         if method not in benches:
-            benches[method] = bench_by(plan_effort(replace(render, quantisation=method), light))
+            by_method = replace(render, quantisation=method)
+            benches[method] = bench_by(plan_effort(by_method, light))
         return timed_frame_ms(benches[method], for_s)
 
-    cost = measured_cost(
-        frame_ms, light.tabulated_cost(bench.psf), IN_TIME_SHARE * light.refresh_ms
-    )
+    limit_ms = IN_TIME_SHARE * light.refresh_ms
+    cost = measured_cost(frame_ms, light.tabulated_cost(bench.psf), limit_ms)
     effort = plan_effort(render, dataclasses.replace(light, measured=cost))
     bench = benches[effort.quantisation]
-    config = replace(
-        bench.config, render=replace(bench.config.render, codes_ms=(cost.cheap_ms, cost.best_ms))
-    )
+    measured = replace(bench.config.render, codes_ms=(cost.cheap_ms, cost.best_ms))
+    config = replace(bench.config, render=measured)
     return dataclasses.replace(bench, effort=effort, config=config)
+
+
+def _in_colour(stars: Stars, colours: Colours | None) -> tuple[Stars, float | FloatArray]:
+    """The stars with the light of each primary, and how much of white each asks for (1: as much as
+    a white star).
+    """
+    if colours is None:
+        return stars, 1.0
+    stars = colours.on(stars)
+    if stars.primaries is None:
+        return stars, 1.0
+    return stars, colours.drive(stars.primaries)
 
 
 def measured_cost(
@@ -220,12 +236,14 @@ def measured_cost(
     else:
         share = table.cheap_ms / table.best_ms if table.best_ms else 1.0
         cheap_ms = best_ms * share
-    cheap_ms, best_ms = (max(float(f"{ms:.3g}"), MIN_POSITIVE) for ms in (cheap_ms, best_ms))
-    return FieldCost(
-        cheap_ms,
-        best_ms,
-        f"as measured here ([render] codes_ms = [{cheap_ms:g}, {best_ms:g}] fixes it)",
-    )
+    cheap_ms, best_ms = _written_ms(cheap_ms), _written_ms(best_ms)
+    key = f"[render] codes_ms = [{cheap_ms:g}, {best_ms:g}]"
+    return FieldCost(cheap_ms, best_ms, f"as measured here ({key} fixes it)")
+
+
+def _written_ms(ms: float) -> float:
+    """A time as a bench file would have it: three digits, and never 0."""
+    return max(float(f"{ms:.3g}"), MIN_POSITIVE)
 
 
 def timed_frame_ms(
@@ -243,6 +261,7 @@ def timed_frame_ms(
             break
         bench.draw(q_icrs_to_cam, 0, TIMED_RATE_RAD_S)
         bench.renderer.finish()
-        took_ms[k] = min(took_ms.get(k, math.inf), (now_ns() - begin_ns) / NS_PER_MS)
+        frame_ms = (now_ns() - begin_ns) / NS_PER_MS
+        took_ms[k] = min(took_ms.get(k, math.inf), frame_ms)
     bench.renderer.begin_anew()
     return sum(took_ms.values()) / len(took_ms)

@@ -13,6 +13,7 @@ import struct
 import zlib
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from hilstar.basics.files import as_text, whole_file, written
+from hilstar.basics.files import as_text, whole_file
 from hilstar.basics.rotation import to_matrix, to_radec_roll_deg
 from hilstar.basics.version import __version__
 from hilstar.display.response import Codes
@@ -72,32 +73,38 @@ def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> Keywords:
     `LENSERR` is the largest distance, px, on the image between where they and the camera have a
     star.
     """
+    tangent_plane = _tangent_plane(camera, q_icrs_to_cam, camera.principal_point_px, np.eye(2))
     if camera.lens is None:
-        return _tangent_plane(camera, q_icrs_to_cam, camera.principal_point_px, np.eye(2))
+        return tangent_plane
     sip = fit_sip(camera)
     if sip is None:
-        tan = _tangent_plane(camera, q_icrs_to_cam, camera.principal_point_px, np.eye(2))
-        x_px, y_px = camera.grid_px(HELD_OUT)
-        tan_x, tan_y = replace(camera, lens=None).places_px(*camera.tangents(x_px, y_px))
-        return tan | {
-            "LENS": True,
-            "LENSERR": round(float(np.nanmax(np.hypot(tan_x - x_px, tan_y - y_px))), 4),
-        }
+        tangent_plane["LENS"] = True
+        tangent_plane["LENSERR"] = round(_pinhole_error_px(camera), 4)
+        return tangent_plane
     keywords = _tangent_plane(camera, q_icrs_to_cam, sip.origin_px, sip.linear)
-    keywords |= {
-        "CTYPE1": "RA---TAN-SIP",
-        "CTYPE2": "DEC--TAN-SIP",
-        "LENS": True,
-        "LENSERR": round(sip.error_px, 6),
-    }
-    for names, terms, first in ((("A", "B"), sip.forward, 2), (("AP", "BP"), sip.back, 1)):
-        for name, column in zip(names, terms.T, strict=True):
-            keywords[f"{name}_ORDER"] = sip.degree
-            keywords |= {
-                f"{name}_{p}_{q}": float(c)
-                for p, q, c in zip(*_powers(sip.degree, first), column, strict=True)
-            }
+    keywords["CTYPE1"] = "RA---TAN-SIP"
+    keywords["CTYPE2"] = "DEC--TAN-SIP"
+    keywords["LENS"] = True
+    keywords["LENSERR"] = round(sip.error_px, 6)
+    a, b = sip.forward.T
+    ap, bp = sip.back.T
+    # A and B have no linear terms: those are in CD.
+    for name, coefficients, first in (("A", a, 2), ("B", b, 2), ("AP", ap, 1), ("BP", bp, 1)):
+        keywords[f"{name}_ORDER"] = sip.degree
+        powers = _powers(sip.degree, first)
+        for p, q, coefficient in zip(*powers, coefficients, strict=True):
+            keywords[f"{name}_{p}_{q}"] = float(coefficient)
     return keywords
+
+
+def _pinhole_error_px(camera: Camera) -> float:
+    """How far at most a pinhole has stars from where the camera's lens has them, px."""
+    x_px, y_px = camera.grid_px(HELD_OUT)
+    tangents = camera.tangents(x_px, y_px)
+    pinhole = replace(camera, lens=None)
+    pinhole_x_px, pinhole_y_px = pinhole.places_px(*tangents)
+    error_px = np.hypot(pinhole_x_px - x_px, pinhole_y_px - y_px)
+    return float(np.nanmax(error_px))  # NaN where the lens knows no direction
 
 
 def _tangent_plane(
@@ -106,28 +113,29 @@ def _tangent_plane(
     right, down, normal = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
     ra = np.arctan2(normal[1], normal[0])
     dec = np.arctan2(normal[2], np.hypot(normal[0], normal[1]))
-    east = np.array([-np.sin(ra), np.cos(ra), 0.0])
-    north = np.array([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])
+    sin_ra, cos_ra = np.sin(ra), np.cos(ra)
+    sin_dec, cos_dec = np.sin(dec), np.cos(dec)
+    east = np.array([-sin_ra, cos_ra, 0.0])
+    north = np.array([-sin_dec * cos_ra, -sin_dec * sin_ra, cos_dec])
+    axes = np.array([[right @ east, down @ east], [right @ north, down @ north]])
     deg_per_px = np.degrees(1.0 / camera.focal_length_px)
-    cd = (
-        np.array([[right @ east, down @ east], [right @ north, down @ north]]) @ linear * deg_per_px
-    )
-    return {
-        "CTYPE1": "RA---TAN",
-        "CTYPE2": "DEC--TAN",
-        "RADESYS": "ICRS",
-        "CUNIT1": "deg",
-        "CUNIT2": "deg",
-        "LONPOLE": 180.0,
-        "CRVAL1": float(np.degrees(ra) % 360),
-        "CRVAL2": float(np.degrees(dec)),
-        "CRPIX1": origin_px[0] + 1.0,
-        "CRPIX2": origin_px[1] + 1.0,
-        "CD1_1": float(cd[0, 0]),
-        "CD1_2": float(cd[0, 1]),
-        "CD2_1": float(cd[1, 0]),
-        "CD2_2": float(cd[1, 1]),
-    }
+    cd = axes @ linear * deg_per_px
+    keywords: Keywords = {}
+    keywords["CTYPE1"] = "RA---TAN"
+    keywords["CTYPE2"] = "DEC--TAN"
+    keywords["RADESYS"] = "ICRS"
+    keywords["CUNIT1"] = "deg"
+    keywords["CUNIT2"] = "deg"
+    keywords["LONPOLE"] = 180.0
+    keywords["CRVAL1"] = float(np.degrees(ra) % 360)
+    keywords["CRVAL2"] = float(np.degrees(dec))
+    keywords["CRPIX1"] = origin_px[0] + 1.0  # FITS counts from 1
+    keywords["CRPIX2"] = origin_px[1] + 1.0
+    keywords["CD1_1"] = float(cd[0, 0])
+    keywords["CD1_2"] = float(cd[0, 1])
+    keywords["CD2_1"] = float(cd[1, 0])
+    keywords["CD2_2"] = float(cd[1, 1])
+    return keywords
 
 
 @lru_cache(maxsize=4)
@@ -137,32 +145,37 @@ def fit_sip(camera: Camera) -> Sip | None:
     """
     x_px, y_px = camera.places_px(np.zeros(1), np.zeros(1))
     origin_px = float(x_px[0]), float(y_px[0])
-    fitted, held_out = (_pairs(camera, origin_px, count) for count in (FITTED, HELD_OUT))
-    polynomials = []  # the polynomials from pixels to the ideal image
+    pixel, ideal = _pairs(camera, origin_px, FITTED)
+    test_pixel, test_ideal = _pairs(camera, origin_px, HELD_OUT)
+    polynomials = []  # from pixels to the ideal image
     for degree in range(2, MAX_DEGREE + 1):
-        whole = _solved(*fitted, degree)
-        error_px = float(np.hypot(*(_terms(held_out[0], degree, 1) @ whole - held_out[1]).T).max())
+        whole = _solved(pixel, ideal, degree)
+        error_px = _largest_px(_terms(test_pixel, degree, 1) @ whole - test_ideal)
         polynomials.append((error_px, degree, whole))
         if error_px <= GOOD_PX:
             break
-    _, degree, whole = (
-        polynomials[-1] if error_px <= GOOD_PX else min(polynomials, key=lambda one: one[0])
-    )
+    # The one that is good, or else the best: a higher degree may fit the held-out pixels worse.
+    _, degree, whole = min(polynomials, key=itemgetter(0))
     p, q = _powers(degree, 1)
-    linear = np.concatenate([whole[(p == 1) & (q == 0)], whole[(p == 0) & (q == 1)]]).T
+    by_x = whole[(p == 1) & (q == 0)]
+    by_y = whole[(p == 0) & (q == 1)]
+    linear = np.concatenate([by_x, by_y]).T
     of_pixels = np.linalg.inv(linear).T  # rows of ideal places to pixels
     forward = whole[p + q >= 2] @ of_pixels
-    pixel = fitted[0]
-    flat = fitted[1] @ of_pixels
+    flat = ideal @ of_pixels
     back = _solved(flat, pixel - flat, degree)
-    pixel = held_out[0]
-    flat = held_out[1] @ of_pixels
-    there = pixel + _terms(pixel, degree, 2) @ forward - flat
-    again = flat + _terms(flat, degree, 1) @ back - pixel
-    error_px = max(float(np.hypot(*off.T).max()) for off in (there, again))
+    flat = test_ideal @ of_pixels
+    there = test_pixel + _terms(test_pixel, degree, 2) @ forward - flat
+    again = flat + _terms(flat, degree, 1) @ back - test_pixel
+    error_px = max(_largest_px(there), _largest_px(again))
     if error_px <= MAX_SIP_PX:
         return Sip(degree, origin_px, linear, forward, back, error_px)
     return None
+
+
+def _largest_px(off_px: FloatArray) -> float:
+    """The largest length of offsets (n, 2)."""
+    return float(np.hypot(off_px[:, 0], off_px[:, 1]).max())
 
 
 def _pairs(
@@ -174,8 +187,9 @@ def _pairs(
     x, y = camera.grid_px(count)
     u, v = camera.tangents(x, y)
     is_visible = np.isfinite(u)
-    pixel = np.column_stack([x - origin_px[0], y - origin_px[1]])[is_visible]
-    return pixel, camera.focal_length_px * np.column_stack([u, v])[is_visible]
+    pixel = np.column_stack([x - origin_px[0], y - origin_px[1]])
+    tangent = np.column_stack([u, v])[is_visible]
+    return pixel[is_visible], camera.focal_length_px * tangent
 
 
 def _solved(at: FloatArray, wanted: FloatArray, degree: int) -> FloatArray:
@@ -184,7 +198,8 @@ def _solved(at: FloatArray, wanted: FloatArray, degree: int) -> FloatArray:
     """
     terms = _terms(at, degree, 1)
     scale = np.abs(terms).max(axis=0)
-    return np.asarray(np.linalg.lstsq(terms / scale, wanted, rcond=None)[0] / scale[:, None])
+    coefficients, *_ = np.linalg.lstsq(terms / scale, wanted, rcond=None)
+    return np.asarray(coefficients / scale[:, None])
 
 
 def _powers(degree: int, first: int) -> tuple[IntArray, IntArray]:
@@ -209,9 +224,8 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     """
     from astropy.io import fits
 
-    header = sky_header(
-        bench.file.sha256, bench.config.sky.epoch_jyear, frame.q_icrs_to_cam, bench.camera
-    )
+    epoch_jyear = bench.config.sky.epoch_jyear
+    header = sky_header(bench.file.sha256, epoch_jyear, frame.q_icrs_to_cam, bench.camera)
     header["BUNIT"] = ("electron/s", "each pixel's share of the tracker's electrons")
     header["WHITE"] = (bench.flux_at_white_e_per_s, "[electron/s] one pixel at the white code")
     header["NSTARS"] = (len(frame.rows), "stars in view")
@@ -220,15 +234,16 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
     number = certificate_number(bench.file)
     if number:
         header["CERTIF"] = (number, "certificate of the bench")
+    image = frame.linear
     if len(frame.light) > 1:
-        header.update({"CTYPE3": "CHANNEL", "CRPIX3": 1.0, "CRVAL3": 1.0, "CD3_3": 1.0})
-        header.update(
-            {
-                f"CHANNEL{k}": key
-                for k, key in enumerate(bench.config.tracker.quantum_efficiencies, 1)
-            }
-        )
-    write_fits(path, fits.PrimaryHDU(frame.light if len(frame.light) > 1 else frame.linear, header))
+        image = frame.light
+        header["CTYPE3"] = "CHANNEL"
+        header["CRPIX3"] = 1.0
+        header["CRVAL3"] = 1.0
+        header["CD3_3"] = 1.0
+        for channel, key in enumerate(bench.config.tracker.quantum_efficiencies, 1):
+            header[f"CHANNEL{channel}"] = key
+    write_fits(path, fits.PrimaryHDU(image, header))
 
 
 def write_fits(path: Path, hdus: Any) -> None:
@@ -276,7 +291,8 @@ def write_truth_csv(path: Path, frame: Frame) -> None:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(truth.dtype.names or ())
         for row in truth.tolist():
-            writer.writerow([int(v) if isinstance(v, bool) else v for v in row])
+            values = [int(value) if isinstance(value, bool) else value for value in row]
+            writer.writerow(values)
 
 
 def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
@@ -289,7 +305,8 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
         image = np.asarray(codes, dtype=np.uint8)
     else:
         image = np.asarray(codes.astype(np.uint16) << (16 - bits), dtype=np.uint16)
-    written(path, lambda file: file.write(png_of(image)))
+    with whole_file(path) as file:
+        file.write(png_of(image))
 
 
 def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
@@ -302,10 +319,14 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
     import png
 
     height, width = image.shape[:2]
-    rows = np.ascontiguousarray(image, f">u{image.itemsize}").view(np.uint8).reshape(height, -1)
+    values = np.ascontiguousarray(image, f">u{image.itemsize}")  # PNG is big-endian
+    rows = values.view(np.uint8).reshape(height, -1)
     scanlines = np.zeros((height, 1 + rows.shape[1]), np.uint8)  # each begins with its filter: none
     scanlines[:, 1:] = rows
-    colour_type, channels = (PNG_GREY, 1) if image.ndim == 2 else (PNG_RGB, 3)
+    if image.ndim == 2:
+        colour_type, channels = PNG_GREY, 1
+    else:
+        colour_type, channels = PNG_RGB, 3
     header = struct.pack(">IIBBBBB", width, height, 8 * image.itemsize, colour_type, 0, 0, 0)
     chunks = [(b"IHDR", header)]
     if meant_bits is not None:
@@ -320,7 +341,8 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
 def write_preview_png(path: Path, codes: Codes) -> None:
     """A preview for the eye as a file (see `preview_png`)."""
     preview = preview_png(codes)
-    written(path, lambda file: file.write(preview))
+    with whole_file(path) as file:
+        file.write(preview)
 
 
 def preview_png(codes: Codes) -> bytes:
@@ -331,10 +353,13 @@ def preview_png(codes: Codes) -> bytes:
     """
     from scipy.ndimage import gaussian_filter
 
-    codes = codes if codes.ndim == 2 else codes.max(axis=2)
-    signal = codes.astype(np.float32) / np.float32(max(int(codes.max()), 1))
+    if codes.ndim == 3:
+        codes = codes.max(axis=2)
+    brightest = max(int(codes.max()), 1)
+    signal = codes.astype(np.float32) / np.float32(brightest)
     smooth = gaussian_filter(_discs(signal) ** PREVIEW_POWER, PREVIEW_BLUR_PX)
-    return png_of((255 * np.clip(smooth, 0, 1)).astype(np.uint8))
+    grey = 255 * np.clip(smooth, 0, 1)
+    return png_of(grey.astype(np.uint8))
 
 
 def _bodies(signal: Float32Array) -> BoolArray:
@@ -353,20 +378,21 @@ def _discs(signal: Float32Array) -> Float32Array:
     Only lit pixels are looked at, of which a frame of stars has few.
     """
     edge = PREVIEW_RADIUS_PX
-    reach = range(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
-    picture = np.zeros_like(signal, shape=(signal.shape[0] + 2 * edge, signal.shape[1] + 2 * edge))
+    height, width = signal.shape
+    picture = np.zeros_like(signal, shape=(height + 2 * edge, width + 2 * edge))
     body = _bodies(signal)
     picture[edge:-edge, edge:-edge] = np.where(body, signal, 0)
     row, column = np.nonzero(np.where(body, 0, signal))
     value = signal[row, column]
+    reach = range(-PREVIEW_RADIUS_PX, PREVIEW_RADIUS_PX + 1)
     for down in reach:
         for right in reach:
             radius = max(1, math.ceil(math.hypot(down, right)))
-            if radius <= PREVIEW_RADIUS_PX:
-                is_inside = value >= ((radius - 1) / PREVIEW_RADIUS_PX) ** 2
-                np.maximum.at(
-                    picture,
-                    (row[is_inside] + edge + down, column[is_inside] + edge + right),
-                    value[is_inside],
-                )
+            if radius > PREVIEW_RADIUS_PX:
+                continue
+            # The area of a star's disc goes with its value.
+            min_value = ((radius - 1) / PREVIEW_RADIUS_PX) ** 2
+            is_inside = value >= min_value
+            place = row[is_inside] + edge + down, column[is_inside] + edge + right
+            np.maximum.at(picture, place, value[is_inside])
     return picture[edge:-edge, edge:-edge]

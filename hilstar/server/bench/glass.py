@@ -37,7 +37,9 @@ def glass_in(tracker: Tracker, folder: Path) -> Glass | None:
     if tracker.optics.psf == GAUSSIAN:
         return None
     glass = read_glass(folder / tracker.optics.psf)
-    return glass if isinstance(glass, Glass) else None
+    if isinstance(glass, Glass):
+        return glass
+    return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,10 +51,10 @@ class Onto:
 
     def places_px(self, places_px: FloatArray) -> FloatArray:
         """Display pixels (n, 2) of tracker pixels (n, 2), without a mirror."""
-        return np.stack(
-            self.display.project(self.tracker.rays(*places_px.T) @ self.display.cam_to_image.T),
-            axis=1,
-        )
+        x_px, y_px = places_px.T
+        rays_cam = self.tracker.rays(x_px, y_px)
+        rays_image = rays_cam @ self.display.cam_to_image.T
+        return np.stack(self.display.project(rays_image), axis=1)
 
     @property
     def matrix(self) -> FloatArray:
@@ -70,12 +72,10 @@ def bench_glass_psf(
     """A tracker's glass at its focus, or as a display draws it; the same again is the same
     object. Says what is not covered.
     """
-    shares = _mean_shares(glass, tracker, folder)
+    shares = tuple(_mean_shares(glass, tracker, folder).tolist())  # a key of the cache
     optics = tracker.optics
     focus_um = optics.focus_um + optics.focus_um_per_k * optics.warmer_k
-    return _glass_psf(
-        glass, focus_um, decentre_px(tracker), tuple(shares.tolist()), tracker.resolution_px, onto
-    )
+    return _glass_psf(glass, focus_um, decentre_px(tracker), shares, tracker.resolution_px, onto)
 
 
 def decentre_px(tracker: Tracker) -> tuple[float, float]:
@@ -98,26 +98,13 @@ def _glass_psf(
     if any(moved_px):
         glass = replace(glass, places_px=glass.places_px + np.array(moved_px))
     if onto is not None:
-        basis, per_px = regridded(glass.basis.astype(np.float64), glass.per_px, onto.matrix)
-        weights = glass.weights / (glass.weights @ basis.sum(axis=(1, 2)))[..., None]
-        places_px = np.round(onto.places_px(glass.places_px), 6)
-        lateral_px = glass.lateral_px @ onto.matrix.T
-        glass_fields = {"places_px": places_px, "weights": weights, "lateral_px": lateral_px}
-        glass_fields |= {"illumination": glass.illumination, "outside": glass.outside}
-        # points far beyond the detector may lie beyond either lens
-        known = np.isfinite(places_px).all(axis=1)
-        if not known.any():
-            raise InputError("none of its points lies before the display's lens")
-        fine = {name: values[known] for name, values in glass_fields.items()}
-        return glass_psf(
-            replace(glass, basis=basis.astype(np.float32), per_px=per_px, **fine),
-            focus_um,
-            np.array(shares),
-        )
+        return glass_psf(_glass_on_display(glass, onto), focus_um, np.array(shares))
     whole_psf = glass_psf(glass, focus_um, np.array(shares))
-    width, height = resolution_px
-    corners = np.array([(x, y) for x in (0.0, width - 1.0) for y in (0.0, height - 1.0)])
-    beyond_px = float(whole_psf.field.within(*corners.T)[1].max())
+    right, bottom = resolution_px[0] - 1.0, resolution_px[1] - 1.0
+    x_px = np.array([0.0, 0.0, right, right])
+    y_px = np.array([0.0, bottom, 0.0, bottom])
+    _, corners_beyond_px = whole_psf.field.within(x_px, y_px)
+    beyond_px = float(corners_beyond_px.max())
     if len(glass.places_px) > 1 and beyond_px > SAID_PX:
         say_once(
             f"the detector reaches {beyond_px:.0f} px beyond the file's points; there the nearest"
@@ -130,6 +117,29 @@ def _glass_psf(
             " taken"
         )
     return whole_psf
+
+
+def _glass_on_display(glass: Glass, onto: Onto) -> Glass:
+    """A glass whose images, places and lateral colour are in the display's pixels."""
+    basis, per_px = regridded(glass.basis.astype(np.float64), glass.per_px, onto.matrix)
+    sums = glass.weights @ basis.sum(axis=(1, 2))  # each image's light is 1, as it was
+    weights = glass.weights / sums[..., None]
+    places_px = np.round(onto.places_px(glass.places_px), 6)
+    lateral_px = glass.lateral_px @ onto.matrix.T
+    # points far beyond the detector may lie beyond either lens
+    known = np.isfinite(places_px).all(axis=1)
+    if not known.any():
+        raise InputError("none of its points lies before the display's lens")
+    return replace(
+        glass,
+        basis=basis.astype(np.float32),
+        per_px=per_px,
+        places_px=places_px[known],
+        weights=weights[known],
+        lateral_px=lateral_px[known],
+        illumination=glass.illumination[known],
+        outside=glass.outside[known],
+    )
 
 
 @lru_cache(maxsize=32)
@@ -146,18 +156,17 @@ def _mean_shares(glass: Glass, tracker: Tracker, folder: Path) -> FloatArray:
     """
     if len(glass.wavelengths_nm) == 1:
         return np.ones(1)
-    nm, weight = np.concatenate(
-        [_detected(tracker, key, folder) for key in tracker.quantum_efficiencies], axis=1
-    )
-    shares = weight @ NodeSpline(glass.wavelengths_nm)(nm) / weight.sum()
+    channels = [_detected(tracker, key, folder) for key in tracker.quantum_efficiencies]
+    nm, weight = np.concatenate(channels, axis=1)
+    total = weight.sum()
+    splines = NodeSpline(glass.wavelengths_nm)
+    shares = weight @ splines(nm) / total
     first, last = glass.wavelengths_nm[[0, -1]]
-    for side, share in (("under", weight[nm < first].sum()), ("over", weight[nm > last].sum())):
-        if share > MAX_UNSAID * weight.sum():
-            limit = first if side == "under" else last
-            say_once(
-                f"{share / weight.sum():.0%} of the light is {side} the file's {limit:g} nm, whose"
-                " PSF it is given"
-            )
+    for side, limit, is_beyond in (("under", first, nm < first), ("over", last, nm > last)):
+        share = weight[is_beyond].sum()
+        if share > MAX_UNSAID * total:
+            light = f"{share / total:.0%} of the light"
+            say_once(f"{light} is {side} the file's {limit:g} nm, whose PSF it is given")
     return np.asarray(shares)
 
 
@@ -168,7 +177,8 @@ def _detected(tracker: Tracker, key: str, folder: Path) -> FloatArray:
     )
     optics = Optics(tracker.aperture_mm, efficiency, glass_transmission(tracker, folder))
     nm, weight_m = integration_nodes(optics.quantum_efficiency, optics.transmission)
-    return np.stack([nm, optics.quantum_efficiency(nm) * optics.transmission(nm) * weight_m])
+    response = optics.quantum_efficiency(nm) * optics.transmission(nm)
+    return np.stack([nm, response * weight_m])
 
 
 def glass_transmission(tracker: Tracker, folder: Path) -> Curve:
@@ -194,9 +204,10 @@ def through_glass(camera: Camera, tracker: Tracker, folder: Path) -> Camera:
     bent = replace(camera, lens=glass.lens)
     if camera.lens is None:
         return bent
-    places = camera.tangents(*camera.grid_px(GRID))
-    off = [a - b for a, b in zip(camera.places_px(*places), bent.places_px(*places), strict=True)]
-    off_px = float(np.nanmax(np.hypot(*off)))
+    tangents = camera.tangents(*camera.grid_px(GRID))
+    x_px, y_px = camera.places_px(*tangents)
+    bent_x_px, bent_y_px = bent.places_px(*tangents)
+    off_px = float(np.nanmax(np.hypot(x_px - bent_x_px, y_px - bent_y_px)))
     if off_px > SAID_PX:
         say_once(
             f"its distortion is up to {off_px:.1f} px from that of [tracker] distortion, which is"

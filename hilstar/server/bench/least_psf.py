@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import Float32Array, FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.optics.psf import ONE_PSF, GaussianPsf, Psf, SampledPsf
 from hilstar.sky.spectrum import blackbody_exitance_w_m2_m
@@ -42,7 +42,10 @@ class Choice:
         error = "exact"
         if self.error_mag or self.error_px:
             error = f"{self.error_mag:.2g} mag and {self.error_px:.2g} px off at most"
-        return "; ".join(part for part in (f"{self.part}: {self.choice}", error, self.note) if part)
+        line = f"{self.part}: {self.choice}; {error}"
+        if self.note:
+            line += f"; {self.note}"
+        return line
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,10 +117,13 @@ def first_within(
     """The first PSF whose errors are within a tolerance, mag and px, or that is the bench's own
     (without a Choice); the last one where none is.
     """
+    max_mag, max_px = tolerance
     last: tuple[Psf, Choice | None] | None = None
     for last in found:
-        choice = last[1]
-        if choice is None or (choice.error_mag <= tolerance[0] and choice.error_px <= tolerance[1]):
+        _, choice = last
+        if choice is None:
+            break
+        if choice.error_mag <= max_mag and choice.error_px <= max_px:
             break
     if last is None:
         raise AssertionError("the PSF itself is always among them")
@@ -128,48 +134,61 @@ def psf_errors(psf: SampledPsf, other: Psf, places_px: FloatArray) -> PsfErrors:
     """The largest errors of stars at places (n, 2) that are drawn by another PSF."""
     # where a field's corner has no light, nothing but the whole will do
     with np.errstate(divide="ignore", invalid="ignore"):
-        wanted, measured = (_measured(candidate, psf, places_px) for candidate in (psf, other))
-        mag = MAG_PER_SHARE * float(np.abs(measured[..., 0] / wanted[..., 0] - 1).max())
-    return PsfErrors(
-        mag, float(np.hypot(*np.moveaxis(measured[..., 1:] - wanted[..., 1:], 2, 0)).max())
-    )
+        wanted = _measured(psf, psf, places_px)
+        measured = _measured(other, psf, places_px)
+        light_error = measured[..., 0] / wanted[..., 0] - 1
+        mag = MAG_PER_SHARE * float(np.abs(light_error).max())
+    off_px = measured[..., 1:] - wanted[..., 1:]
+    distance_px = np.hypot(off_px[..., 0], off_px[..., 1])
+    return PsfErrors(mag, float(distance_px.max()))
 
 
-def _measured(one: Psf, psf: SampledPsf, places_px: FloatArray) -> FloatArray:
+def _measured(drawn_by: Psf, psf: SampledPsf, places_px: FloatArray) -> FloatArray:
     """Flux and centroid, px from the star (windows, n, 3), of stars of each spectrum at places,
-    drawn by `one`.
+    drawn by a PSF, in the stamps and windows of the whole `psf`.
     """
-    side, x, y = psf.footprint_px, *np.repeat(places_px, len(SPECTRA_K), axis=0).T
-    fraction = np.stack([place - np.floor(place + 0.5) for place in (x, y)])
-    if one.by_colour:
-        stamps = one.stamps_at(x, y, np.tile(_spectra(one), (len(places_px), 1)))
-        whole = stamps.shape[1]
-        cut = max(0, (whole - side) // 2)
-        more = max(0, (side - whole) // 2)
-        stamps = np.pad(
-            stamps[:, cut : cut + side, cut : cut + side], ((0, 0), (more, more), (more, more))
-        )
+    side = psf.footprint_px
+    star_px = np.repeat(places_px, len(SPECTRA_K), axis=0).T  # each place with each spectrum
+    x_px, y_px = star_px
+    fraction = star_px - np.floor(star_px + 0.5)
+    if drawn_by.by_colour:
+        spectra = np.tile(_spectra(drawn_by), (len(places_px), 1))
+        stamps = _with_side(drawn_by.stamps_at(x_px, y_px, spectra), side)
     else:
-        stamps = np.moveaxis(one.stamps(fraction, np.ones(len(x)), side), 2, 0)
+        unit_light = np.ones(len(x_px))
+        stamps = np.moveaxis(drawn_by.stamps(fraction, unit_light, side), 2, 0)
     light = stamps.astype(np.float64)
     pixel = np.arange(side) - side // 2
     across = pixel - fraction[0][:, None]
     down = pixel - fraction[1][:, None]
-    far = (
-        across[:, None, :] ** 2 / psf.variance_px2[0] + down[:, :, None] ** 2 / psf.variance_px2[1]
-    )
+    variance_x, variance_y = psf.variance_px2
+    far = across[:, None, :] ** 2 / variance_x + down[:, :, None] ** 2 / variance_y
     moments = []
     for window in (np.ones_like(far), np.exp(-far / 2)):
         inside = light * window
         flux = inside.sum(axis=(1, 2))
-        sums = [(inside.sum(axis=axis) * at).sum(axis=1) for axis, at in ((1, across), (2, down))]
-        moments.append(np.stack([flux, *(part / flux for part in sums)], axis=1))
+        column_sums = inside.sum(axis=1)
+        row_sums = inside.sum(axis=2)
+        x = (column_sums * across).sum(axis=1) / flux
+        y = (row_sums * down).sum(axis=1) / flux
+        moments.append(np.stack([flux, x, y], axis=1))
     return np.array(moments)
 
 
+def _with_side(stamps: Float32Array, side: int) -> Float32Array:
+    """Stamps (n, s, s) cut, or widened by zeros, to (n, side, side) about their middle."""
+    whole = stamps.shape[1]
+    cut = max(0, (whole - side) // 2)
+    more = max(0, (side - whole) // 2)
+    middle = stamps[:, cut : cut + side, cut : cut + side]
+    return np.pad(middle, ((0, 0), (more, more), (more, more)))
+
+
 def _spectra(psf: Psf) -> FloatArray:
+    """Shares of light (spectra, L) by wavelength of black bodies of SPECTRA_K."""
     nm = psf.wavelengths_nm
     if len(nm) == 1:
         return np.ones((len(SPECTRA_K), 1))
-    shares = psf.mean_shares * nm * blackbody_exitance_w_m2_m(nm, np.array(SPECTRA_K)[:, None])
+    exitance = blackbody_exitance_w_m2_m(nm, np.array(SPECTRA_K)[:, None])
+    shares = psf.mean_shares * nm * exitance  # of photons
     return np.asarray(shares / shares.sum(axis=1, keepdims=True))

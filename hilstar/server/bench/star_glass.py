@@ -47,9 +47,8 @@ class StarGlass:
         self._bands: list[StarRates] = []
         self._of_band = np.ones((0, 1))
         if len(psf.wavelengths_nm) > 1:
-            flat = self._cut(
-                file, optics or bench_optics(file.config.tracker, file.folder), band_nm
-            )
+            whole = optics or bench_optics(file.config.tracker, file.folder)
+            flat = self._cut(file, whole, band_nm)
             if optics is not None and self._bands:
                 self._mean = flat @ self._of_band / flat.sum()
 
@@ -58,26 +57,27 @@ class StarGlass:
         response to even photons.
         """
         low_nm, high_nm = optics.range_nm
-        nodes_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / band_nm) + 1)
-        fine_nm = np.linspace(low_nm, high_nm, math.ceil((high_nm - low_nm) / KNOT_NM) + 1)
-        own_nm = optics.quantum_efficiency.wavelength_nm
-        knots_nm = np.union1d(
-            np.union1d(nodes_nm, fine_nm), own_nm[(own_nm >= low_nm) & (own_nm <= high_nm)]
-        )
+        range_nm = high_nm - low_nm
+        nodes_nm = np.linspace(low_nm, high_nm, math.ceil(range_nm / band_nm) + 1)
+        fine_nm = np.linspace(low_nm, high_nm, math.ceil(range_nm / KNOT_NM) + 1)
+        curve_nm = optics.quantum_efficiency.wavelength_nm
+        is_inside = (curve_nm >= low_nm) & (curve_nm <= high_nm)
+        even_nm = np.union1d(nodes_nm, fine_nm)
+        knots_nm = np.union1d(even_nm, curve_nm[is_inside])
         efficiency = optics.quantum_efficiency(knots_nm)
-        shares = NodeSpline(self.psf.wavelengths_nm)(knots_nm)
+        splines = NodeSpline(self.psf.wavelengths_nm)
+        shares = splines(knots_nm)
+        triangles = np.eye(len(nodes_nm))
         of_band = []
         flat = []
-        for number in range(len(nodes_nm)):
-            part = efficiency * np.interp(knots_nm, nodes_nm, np.eye(len(nodes_nm))[number])
+        for triangle in triangles:
+            part = efficiency * np.interp(knots_nm, nodes_nm, triangle)
             response = part * optics.transmission(knots_nm) * np.gradient(knots_nm)
             if not response.any():
                 continue
+            band = dataclasses.replace(optics, quantum_efficiency=Curve(knots_nm, part))
             try:
-                rates = channel_rates(
-                    file.config.sky,
-                    dataclasses.replace(optics, quantum_efficiency=Curve(knots_nm, part)),
-                )
+                rates = channel_rates(file.config.sky, band)
             except InputError:
                 # so little light that some spectrum has none: the bands beside it stand for it
                 continue
@@ -94,27 +94,26 @@ class StarGlass:
         if not self._bands:
             return self._mean
         if self._catalog is not stars.catalog:
-            self._catalog, self._of_row = (
-                stars.catalog,
-                np.full((len(stars.catalog), self._of_band.shape[1]), np.nan),
-            )
+            self._catalog = stars.catalog
+            self._of_row = np.full((len(stars.catalog), self._of_band.shape[1]), np.nan)
         spectra_shares = np.tile(self._mean, (len(which), 1))
         rows = np.where(which >= 0, stars.row[np.maximum(which, 0)], -1)
         listed = rows >= 0
         body = (rows < 0) & (which >= 0)
-        new = np.unique(rows[listed][np.isnan(self._of_row[rows[listed], 0])])
-        if len(new):
-            some = stars.catalog.taken(new)
-            self._of_row[new] = self._through(
-                some.bv_mag, some.vi_mag, star_kinds(self._config, some)
-            )
-        spectra_shares[listed] = self._of_row[rows[listed]]
+        listed_rows = rows[listed]
+        is_new = np.isnan(self._of_row[listed_rows, 0])
+        new_rows = np.unique(listed_rows[is_new])
+        if len(new_rows):
+            some = stars.catalog.taken(new_rows)
+            kind = star_kinds(self._config, some)
+            self._of_row[new_rows] = self._through(some.bv_mag, some.vi_mag, kind)
+        spectra_shares[listed] = self._of_row[listed_rows]
         if body.any():
             bv_mag = stars.bv_mag[which[body]]
-            if star_kinds(self._config, stars.catalog.taken(np.arange(0))) is not None:
+            nobody = stars.catalog.taken(np.arange(0))
+            kind = None
+            if star_kinds(self._config, nobody) is not None:  # stars count by type, too
                 kind = np.full((len(bv_mag), 2), np.nan)
-            else:
-                kind = None
             spectra_shares[body] = self._through(bv_mag, np.full_like(bv_mag, np.nan), kind)
         return spectra_shares
 
@@ -127,9 +126,9 @@ class StarGlass:
     def _through(
         self, bv_mag: FloatArray, vi_mag: FloatArray, kind: FloatArray | None
     ) -> FloatArray:
-        rates = np.stack(
-            [band(np.zeros_like(bv_mag), bv_mag, vi_mag, kind) for band in self._bands], axis=1
-        )
+        v_mag = np.zeros_like(bv_mag)
+        by_band = [band(v_mag, bv_mag, vi_mag, kind) for band in self._bands]
+        rates = np.stack(by_band, axis=1)
         return np.asarray(rates @ self._of_band / rates.sum(axis=1, keepdims=True))
 
 

@@ -64,17 +64,14 @@ def bench_sources(config: BenchConfig, folder: Path) -> Sources:
     # WCS and coordinates take 200 ms, which only a map needs
     from hilstar.sky.diffuse import read_diffuse_map
 
-    ones = np.ones(1)
     bv_mag = diffuse.bv_mag
-    v0_e_per_s = np.float32(star_rates(config, folder)(0 * ones, bv_mag * ones, np.nan * ones)[0])
-    faces = read_diffuse_map(folder / diffuse.map)
-    return Sources(
-        moving,
-        tuple(
-            dataclasses.replace(face, image=face.image * v0_e_per_s, bv_mag=bv_mag)
-            for face in faces
-        ),
-    )
+    rates = star_rates(config, folder)
+    (v0_e_per_s,) = rates(np.zeros(1), np.array([bv_mag]), np.array([np.nan]))
+    faces = []
+    for face in read_diffuse_map(folder / diffuse.map):
+        image = face.image * np.float32(v0_e_per_s)
+        faces.append(dataclasses.replace(face, image=image, bv_mag=bv_mag))
+    return Sources(moving, tuple(faces))
 
 
 def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
@@ -94,7 +91,9 @@ def moved(stars: Stars, moving: MovingSky | None) -> Stars:
     """The stars with bodies among them at t = 0, in arrays that `moving` may change; without
     `moving` the stars themselves.
     """
-    return stars if moving is None else moving.among(stars)
+    if moving is None:
+        return stars
+    return moving.among(stars)
 
 
 def catalogue_choice(config: BenchConfig, folder: Path) -> TableChoice:
@@ -110,15 +109,13 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     """
     sky = config.sky
     epoch_utc_ns(config)  # which refuses one that a source was to give
+    choice = catalogue_choice(config, folder)
     if sky.variables == "phase":
-        faintest = math.inf
+        # A variable that is too faint on average may be bright enough at this time.
+        everything = dataclasses.replace(choice, faintest_v_mag=math.inf)
+        chosen = choose_catalog(everything).at_phase(sky_jd(config, None))
     else:
-        faintest = sky.faintest_v_mag
-    chosen = choose_catalog(
-        dataclasses.replace(catalogue_choice(config, folder), faintest_v_mag=faintest)
-    )
-    if sky.variables == "phase":
-        chosen = chosen.at_phase(sky_jd(config, None))
+        chosen = choose_catalog(dataclasses.replace(choice, faintest_v_mag=sky.faintest_v_mag))
     catalog = chosen.brighter_than(sky.faintest_v_mag)
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
     # A moving sky has its observer's place and velocity; without one the bench file has them.
@@ -139,13 +136,13 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     flux = through(catalog.v_mag, catalog.bv_mag, catalog.vi_mag, kind)
     by_bv = None
     if flux.shape[1] > 1:
-        by_bv = total_and_colours(through(0 * BV_MAG, BV_MAG, np.full_like(BV_MAG, np.nan))).colours
+        flux_by_bv = through(np.zeros_like(BV_MAG), BV_MAG, np.full_like(BV_MAG, np.nan))
+        by_bv = total_and_colours(flux_by_bv).colours
     # the air takes of each star by its own spectrum
     if config.site is not None and moving is not None:
         moving.air = site_air(config, folder, catalog, kind)
-    return dataclasses.replace(
-        make_stars(catalog, vectors, temperature_k, flux), colours_by_bv=by_bv
-    )
+    stars = make_stars(catalog, vectors, temperature_k, flux)
+    return dataclasses.replace(stars, colours_by_bv=by_bv)
 
 
 def site_air(

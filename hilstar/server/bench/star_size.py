@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import magnitude
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import PIXEL_VARIANCE, GaussianPsf, Psf, square_points
@@ -194,24 +195,25 @@ def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
     limit = config.verify.star_sigma_ratio
     ratio = tracker.focal_length_px / display.focal_length_px
     sprite = display_psf(config, folder, display)
-    lens, sky = (
-        psf.in_the_middle
-        for psf in (before_detector(config, folder, display), tracker_psf(config.tracker, folder))
-    )
+    lens = before_detector(config, folder, display).in_the_middle
+    sky = tracker_psf(config.tracker, folder).in_the_middle
     blur_px = config.collimator.psf_sigma_px
-    # A sprite that is the tracker's own PSF is as wide on the detector whatever the ratio.
     sprite_px2 = _variance_px2(sprite)
-    goes_along = config.render.psf == GAUSSIAN
-    widths = _Widths(
-        sky_px2=_variance_px2(sky),
-        by_ratio=2 * PIXEL_VARIANCE + blur_px**2 + (sprite_px2 if goes_along else 0.0),
-        fixed_px2=_variance_px2(lens)
-        - (blur_px * ratio) ** 2
-        + (0.0 if goes_along else sprite_px2 * ratio**2),
-    )
+    # `lens` has the collimator's blur at this ratio.
+    by_ratio = 2 * PIXEL_VARIANCE + blur_px**2
+    fixed_px2 = _variance_px2(lens) - (blur_px * ratio) ** 2
+    # A sprite that is the tracker's own PSF is as wide on the detector whatever the ratio.
+    if config.render.psf == GAUSSIAN:
+        by_ratio += sprite_px2
+    else:
+        fixed_px2 += sprite_px2 * ratio**2
+    widths = _Widths(_variance_px2(sky), by_ratio, fixed_px2)
     shown = _shown_shares(sprite, lens, ratio)
     of_sky = _sky_shares(sky)
     sigma_ratio = widths.sigma_ratio(ratio)
+    would_do = None
+    if sigma_ratio > limit:
+        would_do = _remedy(config, display, tracker, widths, limit)
     return StarSize(
         sigma_px=math.sqrt(widths.by_ratio * ratio**2 + widths.fixed_px2),
         sky_sigma_px=math.sqrt(widths.sky_px2),
@@ -220,7 +222,7 @@ def star_size(config: BenchConfig, folder: Path, display: Camera) -> StarSize:
         peak_loss_mag=float(magnitude(shown.peak / of_sky.peak)),
         shared_px=shown.shared_px,
         sky_shared_px=of_sky.shared_px,
-        would_do=_remedy(config, display, tracker, widths, limit) if sigma_ratio > limit else None,
+        would_do=would_do,
     )
 
 
@@ -246,32 +248,38 @@ def _shown_shares(sprite: Psf, lens: Psf, ratio: float) -> _Shares:
     if ratio > FINEST:
         coarser = ratio / FINEST
         wide, high = lens.width_px
-        shares = _shown_shares(sprite, GaussianPsf((wide / coarser, high / coarser)), FINEST)
+        narrower = GaussianPsf((wide / coarser, high / coarser))
+        shares = _shown_shares(sprite, narrower, FINEST)
         return _Shares(shares.peak / coarser**2, shares.shared_px * coarser**2)
     reach = sprite.footprint_px // 2 + 1
     pixels = np.arange(-reach, reach + 1)
-    weights = sprite.shares(*np.meshgrid(pixels.astype(np.float64), pixels.astype(np.float64)))
+    grid = np.meshgrid(pixels.astype(np.float64), pixels.astype(np.float64))
+    weights = sprite.shares(*grid)
     lit = weights > UNSEEN_SHARE * weights.max()
     rows, columns = np.nonzero(lit)
+    # Each lit monitor pixel is an even square of points.
     points, narrow = square_points(ratio, lens)
-    right, down = (part.ravel() for part in np.meshgrid(points, points))
-    x_px = ratio * (pixels[columns][:, None] + right).ravel()
-    y_px = ratio * (pixels[rows][:, None] + down).ravel()
-    light = np.repeat(weights[lit] / len(right), len(right))
-    half = math.ceil(np.abs(x_px).max(initial=0.0) + narrow.footprint_px / 2) + 1
-    image = narrow.spread(x_px, y_px, light, (-half, -half, 2 * half + 1, 2 * half + 1)).astype(
-        np.float64
-    )
-    image /= image.sum()
-    return _Shares(float(image.max()), 1 / float((image**2).sum()))
+    right, down = np.meshgrid(points, points)
+    x_px = ratio * (pixels[columns][:, None] + right.ravel()).ravel()
+    y_px = ratio * (pixels[rows][:, None] + down.ravel()).ravel()
+    light = np.repeat(weights[lit] / right.size, right.size)
+    reach_px = np.abs(x_px).max(initial=0.0) + narrow.footprint_px / 2
+    half = math.ceil(reach_px) + 1
+    side = 2 * half + 1
+    image = narrow.spread(x_px, y_px, light, (-half, -half, side, side))
+    return _image_shares(image.astype(np.float64))
 
 
 def _sky_shares(sky: Psf) -> _Shares:
     half = sky.footprint_px // 2 + 1
     pixels = np.arange(-half, half + 1, dtype=np.float64)
-    image = sky.shares(*np.meshgrid(pixels, pixels))
+    return _image_shares(sky.shares(*np.meshgrid(pixels, pixels)))
+
+
+def _image_shares(image: FloatArray) -> _Shares:
     image = image / image.sum()
-    return _Shares(float(image.max()), 1 / float((image**2).sum()))
+    square_sum = float((image**2).sum())
+    return _Shares(float(image.max()), 1 / square_sum)
 
 
 def _remedy(
@@ -282,31 +290,33 @@ def _remedy(
     ratio = tracker.focal_length_px / display.focal_length_px
     pitch_um = config.monitor.pixel_pitch_um
     collimator_mm = display.focal_length_px * pitch_um / UM_PER_MM
-    # Half the tracker's field as tangents, right and down.
-    width, height = (size / 2 / tracker.focal_length_px for size in tracker.resolution_px)
-
-    def share(longer: float) -> float:
-        """The share of the tracker's field on the screen behind a collimator so many times as
-        long.
-        """
-        screen = [size / 2 / display.focal_length_px / longer for size in display.resolution_px]
-        return min(1.0, screen[0] / width) * min(1.0, screen[1] / height)
-
     panels = tuple(_panel_option(*panel, tracker, widths, largest) for panel in PANELS)
     if largest is None:
         return StarRemedy(None, None, None, False, None, None, panels)
     longer = ratio / largest
-    on_screen = share(longer)
+    on_screen = _field_share(display, tracker, longer)
+    now = _field_share(display, tracker, 1.0)
     wide, high = (math.ceil(size / largest) for size in tracker.resolution_px)
     return StarRemedy(
         tracker_px_a_monitor_px=largest,
         collimator_mm=collimator_mm * longer,
         field_on_screen=on_screen,
-        field_fits=on_screen >= WHOLE * share(1.0),
+        field_fits=on_screen >= WHOLE * now,
         pixel_pitch_um=pitch_um / longer,
         resolution_px=(wide, high),
         panels=panels,
     )
+
+
+def _field_share(display: Camera, tracker: Camera, longer: float) -> float:
+    """The share of the tracker's field on the screen behind a collimator so many times as long."""
+    share = 1.0
+    for screen_px, field_px in zip(display.resolution_px, tracker.resolution_px, strict=True):
+        # Half of each as a tangent.
+        screen = screen_px / 2 / display.focal_length_px / longer
+        field = field_px / 2 / tracker.focal_length_px
+        share *= min(1.0, screen / field)
+    return share
 
 
 def _panel_option(
@@ -318,18 +328,14 @@ def _panel_option(
     largest: float | None,
 ) -> PanelOption:
     pitch_mm = inches * MM_PER_INCH / math.hypot(*size_px)
-    pixels_a_side = min(
-        screen_px / its for screen_px, its in zip(size_px, tracker.resolution_px, strict=True)
-    )
-    longest_mm = pixels_a_side * tracker.focal_length_px * pitch_mm
-    if largest is None:
-        shortest_mm = math.inf
-    else:
+    width, height = tracker.resolution_px
+    # Where the tracker's field just fits on the screen.
+    screen_px_a_tracker_px = min(size_px[0] / width, size_px[1] / height)
+    longest_mm = screen_px_a_tracker_px * tracker.focal_length_px * pitch_mm
+    lengths_mm = None
+    if largest is not None:
         shortest_mm = tracker.focal_length_px * pitch_mm / largest
-    if shortest_mm <= longest_mm:
-        lengths = (shortest_mm, longest_mm)
-    else:
-        lengths = None
-    return PanelOption(
-        name, size_px, pitch_mm * UM_PER_MM, lengths, widths.sigma_ratio(1 / pixels_a_side)
-    )
+        if shortest_mm <= longest_mm:
+            lengths_mm = (shortest_mm, longest_mm)
+    sigma_ratio = widths.sigma_ratio(1 / screen_px_a_tracker_px)
+    return PanelOption(name, size_px, pitch_mm * UM_PER_MM, lengths_mm, sigma_ratio)

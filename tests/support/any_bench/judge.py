@@ -379,8 +379,11 @@ def _afterwards(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
     """
     later = [name for name in COMMANDS[2:] if name in results and results[name].code]
     reasons = _reasons(results)
+    if later == [ASSESS] and reasons:
+        # A tracker before stars so wide sees few of them, or none, and `verify` said so.
+        return TOO_WIDE, reasons[0]
     if later == [ASSESS] and _is_short_of_frames(results):
-        return (TOO_WIDE, reasons[0]) if reasons else (BUSY, results[ASSESS].last_line)
+        return BUSY, results[ASSESS].last_line
     if later:
         return LATER, "; ".join(f"{name}: {results[name].last_line}" for name in later)
     return (TOO_WIDE, reasons[0]) if reasons else None

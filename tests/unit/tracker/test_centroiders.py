@@ -92,6 +92,6 @@ def test_a_star_that_is_none_has_a_place_on_its_square(kind, sigma, rng):
 def test_a_star_s_shares_change_with_its_place_as_their_slopes_say():
     at, sigma_px, step_px = np.arange(-6.0, 7.0), 0.8, 1e-5
     places = np.array([-0.4, 0.0, 0.3])
-    before, slopes = _profile(at, places, sigma_px)
-    after, _ = _profile(at, places + step_px, sigma_px)
+    before, slopes = _profile(at, places, sigma_px).swapaxes(0, 1)
+    after, _ = _profile(at, places + step_px, sigma_px).swapaxes(0, 1)
     assert slopes == pytest.approx((after - before) / step_px, abs=step_px)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import functools
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,12 +18,16 @@ from hilstar.instruments.calibrate.geometric.dots import DotPlan, plan_dots, rea
 from hilstar.instruments.calibrate.geometric.fit import Nominal
 from hilstar.instruments.calibrate.geometric.geometry_fit import (
     Calibrated,
+    MisfitError,
     calibrate_geometry,
+    calibrate_seen,
     lines_of,
 )
 from hilstar.instruments.calibrate.geometric.match import decode
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.optics.camera import Camera, Lens, bounded
+from hilstar.server.bench.bench_file import bench_file_of
+from tests.support.benches import bench_text
 from tests.support.traced_bench import TracedBench, observed_dots, turned
 
 ALIGNED = np.array([1.0, 0.0, 0.0, 0.0])
@@ -256,6 +261,29 @@ def test_a_mount_that_moved_between_frames_is_refused(rng):
     moved = replace(seen, x_px=seen.x_px + np.where(seen.frame > 9, 0.45, 0.0))
     with pytest.raises(InputError, match=r"moved by 0\.4\d px in x"):
         calibrate_geometry(plan, nominal_of(BENCH), moved, rng, tracker_known=True)
+
+
+@pytest.mark.parametrize(("finer", "is_narrow"), [(4, True), (1, False)])
+def test_dots_within_a_tracker_pixel_are_named_where_their_places_disagree(finer, is_narrow, rng):
+    """What the S-curve of a narrow dot does is the same in each frame, and no noise."""
+    width, height = (finer * side for side in BENCH.resolution_px)
+    bench = replace(BENCH, resolution_px=(width, height), pitch_mm=BENCH.pitch_mm / finer)
+    tracker = {
+        "focal_length_mm": TRACKER.focal_length_px * 5e-3,
+        "pixel_pitch_um": 5,
+        "resolution_px": list(TRACKER.resolution_px),
+        "psf_sigma_px": [0.3, 0.3],
+    }
+    monitor = {"resolution_px": [width, height], "pixel_pitch_um": bench.pitch_mm * 1e3}
+    tables = {"monitor": monitor, "collimator": {"focal_length_mm": bench.focal_mm}}
+    file = bench_file_of(Path("bench.toml"), bench_text({"tracker": tracker}, tables))
+    plan = plan_dots(bench.resolution_px, *MANY[:2], np.random.default_rng(0))
+    seen = observed_dots(bench, plan, TRACKER, rng, 0.003)
+    wave_px = 0.08 * np.sin(2 * np.pi * seen.x_px)
+    seen = replace(seen, x_px=seen.x_px + wave_px)
+    with pytest.raises(MisfitError) as refusal:
+        calibrate_seen(file, plan, seen, tracker_is_ideal=True)
+    assert ("defocus the tracker" in str(refusal.value)) == is_narrow
 
 
 def test_a_plan_is_read_as_it_was_written(tmp_path):

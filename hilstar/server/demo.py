@@ -78,10 +78,11 @@ def scan_samples(duration_s: float, rng: np.random.Generator) -> list[AttitudeSa
     """
 
     def scan(t_s: float) -> FloatArray:
-        turns = [size_deg * math.sin(2 * math.pi * t_s / period_s) for size_deg, period_s in SCAN]
-        return from_radec_roll_deg(
-            *(middle + turn for middle, turn in zip(WAYPOINTS_DEG[0], turns, strict=True))
-        )
+        radec_roll_deg = []
+        for middle_deg, (size_deg, period_s) in zip(WAYPOINTS_DEG[0], SCAN, strict=True):
+            turn_deg = size_deg * math.sin(2 * math.pi * t_s / period_s)
+            radec_roll_deg.append(middle_deg + turn_deg)
+        return from_radec_roll_deg(*radec_roll_deg)
 
     return _jittered(scan, duration_s, rng)
 
@@ -94,15 +95,18 @@ def _jittered(
     # Jitter about cam axes: first-order Gauss-Markov noise.
     keep = np.exp(-1.0 / (SEND_HZ * JITTER_SECONDS))
     jitter = rng.normal(size=(count, 3)) * np.array(JITTER_ARCSEC) / ARCSEC_PER_RAD
+    fresh = np.sqrt(1 - keep**2)
     for k in range(1, count):
-        jitter[k] = keep * jitter[k - 1] + np.sqrt(1 - keep**2) * jitter[k]
+        jitter[k] = keep * jitter[k - 1] + fresh * jitter[k]
     attitudes = [propagate(path(t), jitter[k], -1.0) for k, t in enumerate(times_s.tolist())]
     samples = []
     for k, q in enumerate(attitudes):
-        before = attitudes[max(k - 1, 0)]
-        after = attitudes[min(k + 1, count - 1)]
-        rate = rate_between_rad_s(before, after, (min(k + 1, count - 1) - max(k - 1, 0)) / SEND_HZ)
-        samples.append(AttitudeSample(round(times_s[k] * NS_PER_S), q, rate, k))
+        before = max(k - 1, 0)
+        after = min(k + 1, count - 1)
+        span_s = (after - before) / SEND_HZ
+        rate = rate_between_rad_s(attitudes[before], attitudes[after], span_s)
+        t_ns = round(times_s[k] * NS_PER_S)
+        samples.append(AttitudeSample(t_ns, q, rate, k))
     return samples
 
 
@@ -133,17 +137,7 @@ def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watchin
     with (
         load(shows.bench_file) as bench,
         ZmqApart(ZmqReceiver(bench.config.attitude.address, bind=True)) as link,
-        _DemoSender(
-            [
-                "send",
-                str(log_path),
-                "--to",
-                link.endpoint,
-                "--connect",
-                "--wait",
-                f"{LISTENER_WITHIN_S:g}",
-            ]
-        ) as sender,
+        _DemoSender(log_path, link.endpoint) as sender,
         watching(bench, link.endpoint) as (watch, outlet),
     ):
         frame_count = round(duration_s * bench.config.monitor.refresh_hz)
@@ -159,14 +153,15 @@ def run_demo(directory: Path, duration_s: float, shows: Shows, watching: Watchin
             watch(shown)
 
         link.await_ready()
-        summary = serve(
-            bench, link, Limit(slots=frame_count, from_first_attitude=True), sink, outlet
-        )
+        limit = Limit(slots=frame_count, from_first_attitude=True)
+        summary = serve(bench, link, limit, sink, outlet)
     return Demo(summary, codes_by_frame, bench.config.monitor.bits)
 
 
 class _DemoSender(Closing):
-    def __init__(self, arguments: list[str]) -> None:
+    def __init__(self, log_path: Path, endpoint: str) -> None:
+        arguments = ["send", str(log_path), "--to", endpoint, "--connect"]
+        arguments += ["--wait", f"{LISTENER_WITHIN_S:g}"]
         self._command = [sys.executable, "-m", "hilstar", *arguments]
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -192,10 +187,8 @@ def write_pictures(directory: Path, demo: Demo, advance: Callable[[int], None]) 
     many are written.
     """
     for written, (number, codes) in enumerate(demo.kept.items()):
-        exact, preview = (
-            directory / f"frame_{number:04d}_{kind}.png" for kind in ("codes", "preview")
-        )
-        write_codes_png(exact, codes, demo.bits)
+        stem = f"frame_{number:04d}"
+        write_codes_png(directory / f"{stem}_codes.png", codes, demo.bits)
         advance(2 * written + 1)
-        write_preview_png(preview, codes)
+        write_preview_png(directory / f"{stem}_preview.png", codes)
         advance(2 * written + 2)

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.display.geometry import load_distortion, load_geometry, monitor_camera
 from hilstar.optics.camera import Camera, bounded
@@ -168,14 +169,14 @@ def before_detector(config: BenchConfig, folder: Path, display: Camera) -> Psf:
 
     A display that draws the tracker's PSF has a detector without its objective before it.
     """
-    bare = config.render.psf != GAUSSIAN
-    psf = GaussianPsf(NO_OBJECTIVE_PX) if bare else tracker_psf(config.tracker, folder)
-    blur_px = (
-        config.collimator.psf_sigma_px
-        * tracker_camera(config.tracker, folder).focal_length_px
-        / display.focal_length_px
-    )
-    return psf.blurred(blur_px) if blur_px else psf
+    psf: Psf = GaussianPsf(NO_OBJECTIVE_PX)
+    if config.render.psf == GAUSSIAN:
+        psf = tracker_psf(config.tracker, folder)
+    tracker = tracker_camera(config.tracker, folder)
+    blur_px = config.collimator.psf_sigma_px * tracker.focal_length_px / display.focal_length_px
+    if blur_px:
+        return psf.blurred(blur_px)
+    return psf
 
 
 def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
@@ -195,9 +196,8 @@ def tracker_psf(tracker: Tracker, folder: Path) -> Psf:
         whole_psf = bench_glass_psf(glass, tracker, folder)
     if tracker.effort == "full":
         return whole_psf
-    least, choice = least_tracker_psf(
-        whole_psf, tracker.resolution_px, (tracker.tolerance_mag, tracker.tolerance_px)
-    )
+    tolerance = tracker.tolerance_mag, tracker.tolerance_px
+    least, choice = least_tracker_psf(whole_psf, tracker.resolution_px, tolerance)
     say_once(choice.line(), "[tracker] effort")
     return least
 
@@ -207,8 +207,12 @@ def least_tracker_psf(
     own: SampledPsf, size_px: tuple[int, int], tolerance: tuple[float, float]
 ) -> tuple[Psf, Choice]:
     """The least PSF that `[tracker] effort = "auto"` allows, and why."""
-    columns, rows = np.meshgrid(*(np.linspace(0, size - 1, FIELD_PLACES) for size in size_px))
-    return least_psf(own, np.stack([columns.ravel(), rows.ravel()], axis=1), tolerance)
+    width, height = size_px
+    x_px = np.linspace(0, width - 1, FIELD_PLACES)
+    y_px = np.linspace(0, height - 1, FIELD_PLACES)
+    columns, rows = np.meshgrid(x_px, y_px)
+    places_px = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    return least_psf(own, places_px, tolerance)
 
 
 def real_monitor(config: BenchConfig, folder: Path, path: str) -> Camera:
@@ -220,9 +224,8 @@ def real_monitor(config: BenchConfig, folder: Path, path: str) -> Camera:
         footprint_px = GaussianPsf(config.render.sprite_sigma_px).footprint_px
     else:
         tracker = config.tracker
-        ratio = camera.focal_length_px / (
-            tracker.focal_length_mm * UM_PER_MM / tracker.pixel_pitch_um
-        )
+        tracker_focal_px = tracker.focal_length_mm * UM_PER_MM / tracker.pixel_pitch_um
+        ratio = camera.focal_length_px / tracker_focal_px
         footprint_px = math.ceil(ratio * tracker_psf(tracker, folder).footprint_px) + 1
     return _bounded(camera, footprint_px / 2 + 1, folder / path)
 
@@ -237,10 +240,11 @@ def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
             "[tracker.optics] focus_um_per_k: a Gaussian has no focus; give psf a file, or leave"
             " it out"
         )
+    longer = 1 + optics.focal_length_ppm_per_k * 1e-6 * optics.warmer_k
     camera = monitor_camera(
         tracker.resolution_px,
         tracker.pixel_pitch_um,
-        tracker.focal_length_mm * (1 + optics.focal_length_ppm_per_k * 1e-6 * optics.warmer_k),
+        tracker.focal_length_mm * longer,
         NO_MISALIGNMENT,
         tracker.principal_point_px,
     )
@@ -254,7 +258,8 @@ def tracker_camera(tracker: Tracker, folder: Path) -> Camera:
     camera = through_glass(camera, tracker, folder)
     if camera.lens is None:
         return camera
-    return _bounded(camera, tracker_psf(tracker, folder).footprint_px / 2 + 1, path)
+    footprint_px = tracker_psf(tracker, folder).footprint_px
+    return _bounded(camera, footprint_px / 2 + 1, path)
 
 
 def flight_camera(tracker: Tracker, folder: Path, true: Camera) -> Camera:
@@ -316,7 +321,8 @@ def fields_of_view(config: BenchConfig, folder: Path) -> FieldsOfView:
     odd = list(_oddities(config, fields))
     if not odd:
         return fields
-    mends = _mends(config, folder, sum(oddity.decades for oddity in odd))[:MAX_MENDS]
+    decades = sum(oddity.decades for oddity in odd)
+    mends = _mends(config, folder, decades)[:MAX_MENDS]
     if mends:
         advice = f"is {', or '.join(mends)}?"
     else:
@@ -341,24 +347,29 @@ def _sides_deg(camera: Camera) -> tuple[float, float]:
     width, height = camera.resolution_px
     x = (width - 1) / 2
     y = (height - 1) / 2
-    places = np.array([(-0.5, y), (width - 0.5, y), (x, -0.5), (x, height - 0.5)])
-    rays = camera.rays(*places.T)
-    angles = []
-    for a, b in (rays[:2], rays[2:]):
-        angles.append(math.atan2(np.linalg.norm(np.cross(a, b)), float(a @ b)))
-    # beyond a lens that is known so far
-    sides = [2 * math.atan(size / 2 / camera.focal_length_px) for size in (width, height)]
-    across, down = (
-        math.degrees(side if math.isnan(angle) else angle)
-        for angle, side in zip(angles, sides, strict=True)
-    )
-    return across, down
+    x_px = np.array([-0.5, width - 0.5, x, x])
+    y_px = np.array([y, y, -0.5, height - 0.5])
+    left, right, top, bottom = camera.rays(x_px, y_px)
+    across_deg = _angle_deg(left, right)
+    down_deg = _angle_deg(top, bottom)
+    # Beyond the directions that a lens is known for, those of a pinhole stand for its own.
+    if math.isnan(across_deg):
+        across_deg = math.degrees(2 * math.atan(width / 2 / camera.focal_length_px))
+    if math.isnan(down_deg):
+        down_deg = math.degrees(2 * math.atan(height / 2 / camera.focal_length_px))
+    return across_deg, down_deg
+
+
+def _angle_deg(a: FloatArray, b: FloatArray) -> float:
+    sine = np.linalg.norm(np.cross(a, b))
+    return math.degrees(math.atan2(sine, float(a @ b)))
 
 
 def _share(of: Camera, within: Camera) -> float:
     """The share of an image's pixels whose directions are on the image of another camera."""
     middles = (np.arange(GRID) + 0.5) / GRID
-    columns, rows = np.meshgrid(*(middles * size - 0.5 for size in of.resolution_px))
+    width, height = of.resolution_px
+    columns, rows = np.meshgrid(middles * width - 0.5, middles * height - 0.5)
     rays = of.rays(columns.ravel(), rows.ravel())
     with np.errstate(invalid="ignore", over="ignore"):
         inside = within.contains_px(*within.project(rays @ within.cam_to_image.T))
@@ -377,7 +388,8 @@ class _Oddity(NamedTuple):
 def _decades_outside(value: float, limits: tuple[float, float]) -> float:
     """How far a value is outside limits, in decades; 0 within them."""
     low, high = limits
-    return max(0.0, math.log10(low / max(value, TINY)), math.log10(max(value, TINY) / high))
+    positive = max(value, TINY)
+    return max(0.0, math.log10(low / positive), math.log10(positive / high))
 
 
 def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
@@ -387,19 +399,15 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
     verify = config.verify
     pixels = found.tracker_px_a_monitor_px
     widest_deg = max(*found.screen_deg, *found.tracker_deg)
-    past = (
-        f"the tracker sees past the screen: {_percent(found.field_on_screen)} of its field is on it"
-        f" ({found.line()})"
-    )
-    part = f"the tracker sees {_percent(found.screen_seen)} of the screen ({found.line()})"
+    line = found.line()
+    on_screen = _percent(found.field_on_screen)
+    past = f"the tracker sees past the screen: {on_screen} of its field is on it ({line})"
+    part = f"the tracker sees {_percent(found.screen_seen)} of the screen ({line})"
+    pixel = f"a monitor pixel is {figure(pixels)} of the tracker's ({line})"
     judged = [
         (past, found.field_on_screen, (MIN_FILLED, 1.0)),
         (part, found.screen_seen, (MIN_SEEN, 1.0)),
-        (
-            f"a monitor pixel is {figure(pixels)} of the tracker's ({found.line()})",
-            pixels,
-            (1 / MAX_PIXELS, MAX_PIXELS),
-        ),
+        (pixel, pixels, (1 / MAX_PIXELS, MAX_PIXELS)),
     ]
     for name, value, (low, high), unit in (
         ("the tracker's lens", tracker.focal_length_mm / tracker.aperture_mm, F_NUMBERS, "f/"),
@@ -413,14 +421,11 @@ def _oddities(config: BenchConfig, found: FieldsOfView) -> Iterator[_Oddity]:
             f" {unit}{high:g}"
         )
         judged.append((text, value, (low, high)))
-    text = f"{figure(widest_deg)} deg is wider than a lens sees ({found.line()})"
-    judged.append(
-        (
-            text,
-            math.tan(math.radians(widest_deg) / 2),
-            (TINY, math.tan(math.radians(MAX_FIELD_DEG) / 2)),
-        )
-    )
+    text = f"{figure(widest_deg)} deg is wider than a lens sees ({line})"
+    # Fields are compared as a flat screen has them: by the tangent of the half angle.
+    widest = math.tan(math.radians(widest_deg) / 2)
+    max_field = math.tan(math.radians(MAX_FIELD_DEG) / 2)
+    judged.append((text, widest, (TINY, max_field)))
     for key, true, stated in (
         ("true_focal_length_mm", verify.true_focal_length_mm, config.collimator.focal_length_mm),
         ("true_pixel_pitch_um", verify.true_pixel_pitch_um, monitor.pixel_pitch_um),
@@ -444,11 +449,10 @@ def _mends(config: BenchConfig, folder: Path, decades: float) -> list[str]:
     rest_decades: dict[str, float] = {}
     for text, changed in _readings(config):
         try:
-            rest_decades[text] = sum(
-                oddity.decades for oddity in _oddities(changed, _measured(changed, folder))
-            )
+            fields = _measured(changed, folder)
         except InputError:  # such a lens leaves the screen
             continue
+        rest_decades[text] = sum(oddity.decades for oddity in _oddities(changed, fields))
     smallest = min(rest_decades.values(), default=math.inf)
     if smallest == 0:
         limit = 0.0
@@ -463,11 +467,9 @@ def _readings(config: BenchConfig) -> Iterator[tuple[str, BenchConfig]]:
     """
     tracker = config.tracker
     if F_NUMBERS[0] <= tracker.aperture_mm < F_NUMBERS[1]:
+        written = f"[tracker] aperture_mm = {tracker.aperture_mm:.6g}"
         aperture_mm = tracker.focal_length_mm / tracker.aperture_mm
-        text = (
-            f"[tracker] aperture_mm = {tracker.aperture_mm:.6g} the f-number, which is"
-            f" {aperture_mm:.6g}"
-        )
+        text = f"{written} the f-number, which is {aperture_mm:.6g}"
         yield text, replace(config, tracker=replace(tracker, aperture_mm=aperture_mm))
     for table, key in LENGTHS:
         settings = getattr(config, table)

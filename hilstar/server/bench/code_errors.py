@@ -354,7 +354,8 @@ class _Search:
         begin, end = stars.spans[corner.span]
         reach_mag = spans * (end - begin)
         mags = np.clip(corner.mag + reach_mag * (IN_SPAN - 0.5), begin, end)
-        return self._look(_grid_of(stars.psf, stars.seen, stars.path_px, phases), mags, corner.span)
+        grid = _grid_of(stars.psf, stars.seen, stars.path_px, phases)
+        return self._look(grid, mags, corner.span)
 
     def _look(self, grid: PhaseGrid, mags: FloatArray, span: int) -> bool:
         """Whether the errors of stars of magnitudes (PHASES^2,) at the phases of a grid are over
@@ -362,28 +363,34 @@ class _Search:
         """
         stars = self._stars
         share = flux_ratio(mags)
-        of_tiles = np.kron(share.reshape(PHASES, PHASES), np.ones((grid.tile_px, grid.tile_px)))
+        tile = np.ones((grid.tile_px, grid.tile_px))
+        of_tiles = np.kron(share.reshape(PHASES, PHASES), tile)
         linear = (grid.bright * of_tiles).astype(np.float32)
         sprites = fainter(grid.sprites, np.repeat(mags, grid.sprites.per_star))
         quantiser = QUANTISERS[self._method]
         image = shown_by(quantiser, stars.frames, self._panel, linear, sprites, self._balance)
-        flux_mag = self._beyond[0] * np.abs(grid.judge.errors(image, share, ()).flux_mag)
+        beyond_flux, beyond_place = self._beyond
+        max_mag, max_px = self._limit
+        # Light first, without a centroider: it is quick, and may end the search.
+        light_errors = grid.judge.errors(image, share, ())
+        flux_mag = beyond_flux * np.abs(light_errors.flux_mag)
         star = int(flux_mag.argmax())
         of_flux = Corner(float(flux_mag[star]), None, grid.phases, star, float(mags[star]), span)
         if self._of_flux is None or of_flux.error > self._of_flux.error:
             self._of_flux = of_flux
-        if of_flux.error > self._limit[0]:
+        if of_flux.error > max_mag:
             self._note(span, of_flux.error, math.inf)
             return True
         errors = grid.judge.errors(image, share, stars.kinds)
         kind = errors.worst()
-        off_px = self._beyond[1] * np.hypot(*errors.off_px[kind])
+        x_px, y_px = errors.off_px[kind]
+        off_px = beyond_place * np.hypot(x_px, y_px)
         star = int(off_px.argmax())
         of_place = Corner(float(off_px[star]), kind, grid.phases, star, float(mags[star]), span)
         if self._of_place is None or of_place.error > self._of_place.error:
             self._of_place = of_place
         self._note(span, of_flux.error, of_place.error)
-        return of_place.error > self._limit[1]
+        return of_place.error > max_px
 
     def _note(self, span: int, flux_mag: float, place_px: float) -> None:
         flux, place = self._by_span.get(span, (0.0, 0.0))

@@ -49,18 +49,18 @@ def bench_channels(tracker: Tracker, folder: Path) -> tuple[Optics, ...]:
             f"[tracker] {names}: no light of V ({band}), in which magnitudes are; all light is from"
             " their colours"
         )
-    return tuple(
-        Optics(
-            tracker.aperture_mm,
-            Curve(efficiency.wavelength_nm, efficiency.value * tracker.detector.fill_factor),
-            transmission,
-        )
-        for efficiency in efficiencies
-    )
+    channels = []
+    for efficiency in efficiencies:
+        filled = efficiency.value * tracker.detector.fill_factor
+        of_pixel = Curve(efficiency.wavelength_nm, filled)
+        channels.append(Optics(tracker.aperture_mm, of_pixel, transmission))
+    return tuple(channels)
 
 
 def _sees_v(efficiency: Curve) -> bool:
-    return bool(efficiency(np.linspace(*V_BAND_NM, V_BAND_POINTS)).any())
+    first_nm, last_nm = V_BAND_NM
+    nm = np.linspace(first_nm, last_nm, V_BAND_POINTS)
+    return bool(efficiency(nm).any())
 
 
 def bench_optics(tracker: Tracker, folder: Path) -> Optics:

@@ -16,7 +16,6 @@ of others: covariances are sums over cases (Liang and Zeger 1986), bootstraps dr
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +51,7 @@ JITTER_ROUNDS = 3  # of weights by the jitter that the last ones gave
 LIMIT_BIN_MAG = 0.05
 LIMIT_DRAWS = 200  # of the bootstrap of a detection curve
 MIN_SLOPE_MAG = 0.01  # width of a detection curve: a sharper one cannot be told from its bins
+RATE_TERMS = ("rate-bias", "rate-scale", "rate-lag")  # of the linear fit of a rate
 SILENT = "the answers carry no {}"
 
 
@@ -72,13 +72,21 @@ def fit_by_cases(design: FloatArray, values: FloatArray, case: IntArray) -> Case
     inverse = np.linalg.pinv(design.T @ design)
     value = inverse @ (design.T @ values)
     residual = values - design @ value
-    number = np.unique(case, return_inverse=True)[1].reshape(-1)
+    number = _numbered(case)
     cases = int(number.max()) + 1
-    score = np.zeros((cases, design.shape[1]))
+    terms = design.shape[1]
+    score = np.zeros((cases, terms))
     np.add.at(score, number, design * residual[:, None])
-    free = max(cases - design.shape[1], 1)
-    covariance = inverse @ (score.T @ score) @ inverse * cases / free
+    free = max(cases - terms, 1)
+    score_squares = score.T @ score
+    covariance = inverse @ score_squares @ inverse * cases / free
     return CaseFit(value, covariance, residual, cases)
+
+
+def _numbered(case: IntArray) -> IntArray:
+    """Cases (n,) numbered from 0, without gaps."""
+    _, number = np.unique(case, return_inverse=True)
+    return number.reshape(-1)
 
 
 def answer_figure(
@@ -98,25 +106,38 @@ def answer_figure(
         return _aberration(require, cases)
     if quantity in MOTION_QUANTITIES:
         return _proper_motion(require, cases)
+    return _star_figure(require, cases, resolution_px, rng)
+
+
+def _star_figure(
+    require: Require, cases: Columns, resolution_px: tuple[int, int], rng: np.random.Generator
+) -> BoundedFigure:
+    """A figure of single stars."""
+    quantity = require.quantity
+    # without a reported star there are no false ones to count, either
     stars = StarTable.of(cases)
-    figures: dict[str, Callable[[], BoundedFigure]] = {
-        "star-noise": lambda: _star_noise(require, stars, resolution_px, rng),
-        "star-fov-error": lambda: _star_map(require, stars, resolution_px, rng),
-        "star-colour": lambda: _star_colour(require, stars),
-        "star-limit": lambda: _star_limit(require, stars, rng),
-        "false-stars": lambda: _false_stars(require, cases, rng),
-    }
-    return figures[quantity]()
+    if quantity == "star-noise":
+        return _star_noise(require, stars, resolution_px, rng)
+    if quantity == "star-fov-error":
+        return _star_map(require, stars, resolution_px, rng)
+    if quantity == "star-colour":
+        return _star_colour(require, stars)
+    if quantity == "star-limit":
+        return _star_limit(require, stars, rng)
+    return _false_stars(require, cases, rng)
 
 
 def _joined(cases: Columns, names: tuple[str, ...]) -> tuple[FloatArray, IntArray]:
     """Lists of columns side by side (n, k), and the case of each row (n,)."""
-    lists = [cases.lists.get(name, []) for name in names]
-    counts = [len(values) for values in lists[0]]
+    counts = list(map(len, cases.lists.get(names[0], [])))
     case = np.repeat(np.arange(len(counts)), counts)
     if not len(case):
         return np.zeros((0, len(names))), case
-    return np.stack([np.concatenate(column) for column in lists], axis=1), case
+    columns = []
+    for name in names:
+        lists = cases.lists.get(name, [])
+        columns.append(np.concatenate(lists))
+    return np.stack(columns, axis=1), case
 
 
 def _enough(case: IntArray, what: str) -> None:
@@ -137,10 +158,14 @@ def _size(
     freedom = max(cases - 2, 1)
     upper = float(stats.t.ppf(confidence, freedom))
     # Bonferroni: of several axes any one may be the larger
-    lower = float(stats.t.ppf(1 - (1 - confidence) / len(size), freedom))
-    low = max(float((size - lower * sigma).max()), 0.0)
-    high = float((size + upper * sigma).max())
-    return BoundedFigure(float(size.max()), low, high, cases, method)
+    doubt = (1 - confidence) / len(size)
+    lower = float(stats.t.ppf(1 - doubt, freedom))
+    lowest = size - lower * sigma
+    highest = size + upper * sigma
+    low = max(float(lowest.max()), 0.0)
+    high = float(highest.max())
+    largest = float(size.max())
+    return BoundedFigure(largest, low, high, cases, method)
 
 
 def _root_mean(
@@ -154,8 +179,9 @@ def _root_mean(
     """The root of the sum of squares (n,) over that of weights (n,), by the bootstrap over cases;
     squares may be below 0.
     """
-    number = np.unique(case, return_inverse=True)[1].reshape(-1)
-    sums, whole = (_summed(values, number) for values in (squares, weights))
+    number = _numbered(case)
+    sums = _summed(squares, number)
+    whole = _summed(weights, number)
     c = require.confidence
     low, high = drawn_limits(sums, whole, rng, c).tolist()
     variance = float(sums.sum() / whole.sum())
@@ -163,11 +189,18 @@ def _root_mean(
     # and skew, as a variance is
     if variance > 0 and len(sums) > 1:
         wide = _spread(sums, whole, c)
-        high = max(high, variance * math.exp(min(wide / variance, MAX_EXPONENT)))
+        exponent = min(wide / variance, MAX_EXPONENT)
+        high = max(high, variance * math.exp(exponent))
         low = min(low, variance - wide)
-    value = math.sqrt(max(variance, 0.0))
-    low, high = math.sqrt(max(low, 0.0)), math.sqrt(max(high, 0.0))
-    return BoundedFigure(value, min(low, value), max(high, value), len(sums), method)
+    value = _root(variance)
+    lower = min(_root(low), value)
+    upper = max(_root(high), value)
+    return BoundedFigure(value, lower, upper, len(sums), method)
+
+
+def _root(variance: float) -> float:
+    """The square root of a variance, 0 where noise has made it negative."""
+    return math.sqrt(max(variance, 0.0))
 
 
 def _spread(sums: FloatArray, whole: FloatArray, confidence: float) -> float:
@@ -176,17 +209,23 @@ def _spread(sums: FloatArray, whole: FloatArray, confidence: float) -> float:
     A heavy case draws the ratio to itself, so its residual counts more (MacKinnon and White 1985,
     HC3), and fewer cases tell the scatter (Satterthwaite).
     """
-    share = whole / whole.sum()
-    off = (sums - whole * sums.sum() / whole.sum()) / np.maximum(1 - share, SMALL_SHARE)
+    total = whole.sum()
+    share = whole / total
+    residual = sums - whole * sums.sum() / total
+    off = residual / np.maximum(1 - share, SMALL_SHARE)
     squares = share**2
-    freedom = max(float(squares.sum() ** 2 / (squares**2).sum()) - 1, 1.0)
-    sigma = math.sqrt(float((off**2).sum())) / float(whole.sum())
+    fourths = squares**2
+    effective_cases = float(squares.sum() ** 2 / fourths.sum())
+    freedom = max(effective_cases - 1, 1.0)
+    off_square = float((off**2).sum())
+    sigma = math.sqrt(off_square) / float(total)
     return float(stats.t.ppf(confidence, freedom)) * sigma
 
 
 def _summed(values: FloatArray, number: IntArray) -> FloatArray:
     """Sums of values (n,) by the number of their case."""
-    return np.asarray(np.bincount(number, values), dtype=np.float64)
+    sums = np.bincount(number, values)
+    return np.asarray(sums, dtype=np.float64)
 
 
 # ---- angular rate ----
@@ -203,27 +242,43 @@ def _rate_figure(
     rates, errors, case = rates[known], errors[known], case[known]
     _enough(case, "rate")
     accelerations = _accelerations(cases)[case]
-    fits = [_rate_fit(errors[:, k], rates[:, k], accelerations[:, k], case) for k in axes]
+    fits = []
+    for k in axes:
+        fits.append(_rate_fit(errors[:, k], rates[:, k], accelerations[:, k], case))
+    fitted_cases = fits[0].cases
     quantity = require.quantity
     if quantity == "rate-noise":
         residual = np.stack([fit.residual for fit in fits], axis=1)
-        freedom = max(len(case) - 3, 1) / len(case)
+        rows = len(case)
+        freedom = max(rows - 3, 1) / rows
         squares = (residual**2).mean(axis=1) / freedom
-        return _root_mean(squares, np.ones(len(case)), case, require, rng)
-    column = {"rate-bias": 0, "rate-scale": 1, "rate-lag": 2}[quantity]
-    spread = (rates, accelerations)[column - 1] if column else None
-    if spread is not None and not np.ptp(spread[:, axes], axis=0).all():
-        what = "turns at several rates" if column == 1 else "accelerates"
-        raise TooFewCases(f"no case {what} about that axis", fits[0].cases)
-    value = np.array([fit.value[column] for fit in fits])
-    sigma = np.sqrt(np.array([fit.covariance[column, column] for fit in fits]))
-    return _size(value, sigma, fits[0].cases, require.confidence, "linear fit, Student's t")
+        return _root_mean(squares, np.ones(rows), case, require, rng)
+    if quantity == "rate-scale" and not _varies(rates[:, axes]):
+        raise TooFewCases("no case turns at several rates about that axis", fitted_cases)
+    if quantity == "rate-lag" and not _varies(accelerations[:, axes]):
+        raise TooFewCases("no case accelerates about that axis", fitted_cases)
+    column = RATE_TERMS.index(quantity)
+    values = []
+    variances = []
+    for fit in fits:
+        values.append(fit.value[column])
+        variances.append(fit.covariance[column, column])
+    value = np.array(values)
+    sigma = np.sqrt(np.array(variances))
+    return _size(value, sigma, fitted_cases, require.confidence, "linear fit, Student's t")
+
+
+def _varies(values: FloatArray) -> bool:
+    """Whether every column of values (n, k) has more than one value."""
+    return bool(np.ptp(values, axis=0).all())
 
 
 def _rate_fit(
     error: FloatArray, rate: FloatArray, acceleration: FloatArray, case: IntArray
 ) -> CaseFit:
-    design = np.stack([np.ones(len(rate)), rate, -acceleration], axis=1)
+    # the terms in the order of RATE_TERMS
+    ones = np.ones(len(rate))
+    design = np.stack([ones, rate, -acceleration], axis=1)
     return fit_by_cases(design, error, case)
 
 
@@ -232,7 +287,8 @@ def _accelerations(cases: Columns) -> FloatArray:
     count = len(cases.numbers["frames"])
     columns = []
     for axis in AXES:
-        columns.append(cases.numbers.get(f"{VARY}acceleration_deg_s2.{axis}", np.zeros(count)))
+        name = f"{VARY}acceleration_deg_s2.{axis}"
+        columns.append(cases.numbers.get(name, np.zeros(count)))
     return np.stack(columns, axis=1)
 
 
@@ -244,26 +300,41 @@ def _time_figure(require: Require, cases: Columns, rng: np.random.Generator) -> 
     rates_deg_s, _ = _joined(cases, FRAME_RATES)
     _enough(case, "attitude")
     rates = 3600.0 * rates_deg_s
-    turning = np.abs(rates_deg_s).max(axis=1) > SMALL_RATE_DEG_S
-    if not turning.any() or np.ptp(np.sign(rates[turning]), axis=0).max() < 2:
-        raise TooFewCases(
-            "slews of both signs tell it, and the cases have none", len(np.unique(case))
-        )
-    noise = MAD_TO_SIGMA * np.median(np.abs(errors - np.median(errors, axis=0)), axis=0)
+    if not _both_signs(rates_deg_s):
+        why = "slews of both signs tell it, and the cases have none"
+        raise TooFewCases(why, len(np.unique(case)))
+    deviation = np.abs(errors - np.median(errors, axis=0))
+    noise = MAD_TO_SIGMA * np.median(deviation, axis=0)
     noise = np.maximum(noise, 1e-9)
-    design = np.zeros((3 * len(case), 4))
+    count = len(case)
+    design = np.zeros((3 * count, 4))
     for k in range(3):
-        rows = slice(k * len(case), (k + 1) * len(case))
+        rows = slice(k * count, (k + 1) * count)
         design[rows, k] = 1 / noise[k]
         design[rows, 3] = rates[:, k] / noise[k]
-    fit = fit_by_cases(design, (errors / noise).T.ravel(), np.tile(case, 3))
+    weighted = errors / noise
+    fit = fit_by_cases(design, weighted.T.ravel(), np.tile(case, 3))
     if require.quantity == "time-bias":
-        sigma = math.sqrt(float(fit.covariance[3, 3]))
         method = "linear fit over slews of both signs, Student's t"
-        value = fit.value[3:]
-        return _size(value, np.array([sigma]), fit.cases, require.confidence, method)
+        return _column_size(fit, 3, require, method)
     residual = fit.residual.reshape(3, -1).T * noise
     return _jitter(require, residual, rates, case, rng)
+
+
+def _both_signs(rates_deg_s: FloatArray) -> bool:
+    """Whether some axis turns in both senses, by rates (n, 3)."""
+    turning = np.abs(rates_deg_s).max(axis=1) > SMALL_RATE_DEG_S
+    if not turning.any():
+        return False
+    senses = np.sign(rates_deg_s[turning])
+    return bool(np.ptp(senses, axis=0).max() >= 2)
+
+
+def _column_size(fit: CaseFit, column: int, require: Require, method: str) -> BoundedFigure:
+    """The size of a coefficient of a fit, with its limits."""
+    value = fit.value[column : column + 1]
+    sigma = math.sqrt(float(fit.covariance[column, column]))
+    return _size(value, np.array([sigma]), fit.cases, require.confidence, method)
 
 
 def _jitter(
@@ -276,19 +347,24 @@ def _jitter(
     """The jitter of the stamp, s, from residuals (n, 3), arcsec, at rates (n, 3), arcsec/s."""
     speed = np.linalg.norm(rates[:, :2], axis=1)
     slews = speed > 3600 * SMALL_RATE_DEG_S
-    if len(np.unique(case[slews])) < MIN_CASES:
+    slewing = case[slews]
+    if len(np.unique(slewing)) < MIN_CASES:
         raise TooFewCases("slews across the boresight tell it, and there are too few", 0)
     # the direction of the slew in the image plane, in which the noise has no preferred one
     across = rates[slews, :2]
     along = across / np.linalg.norm(across, axis=1, keepdims=True)
-    off = residual[slews]
-    parallel = (off[:, :2] * along).sum(axis=1)
-    normal = off[:, 1] * along[:, 0] - off[:, 0] * along[:, 1]
+    off = residual[slews, :2]
+    along_x, along_y = along.T
+    off_x, off_y = off.T
+    parallel = (off * along).sum(axis=1)
+    normal = off_y * along_x - off_x * along_y
+    normal_square = normal**2
     square = (across**2).sum(axis=1)
-    excess = (parallel**2 - normal**2) / _fitted_share(square)
+    excess = (parallel**2 - normal_square) / _fitted_share(square)
     method = "excess of the error along slews over that across them, bootstrap over cases"
-    weights = _jitter_weights(excess, square, float((normal**2).mean()))
-    return _root_mean(excess * weights, square * weights, case[slews], require, rng, method)
+    variance = float(normal_square.mean())
+    weights = _jitter_weights(excess, square, variance)
+    return _root_mean(excess * weights, square * weights, slewing, require, rng, method)
 
 
 def _fitted_share(square: FloatArray) -> FloatArray:
@@ -306,9 +382,12 @@ def _jitter_weights(excess: FloatArray, square: FloatArray, variance: float) -> 
     """
     weights = square
     for _ in range(JITTER_ROUNDS):
-        jitter = max(float((excess * weights).sum() / (square * weights).sum()), 0.0)
+        weighted_excess = (excess * weights).sum()
+        weighted_square = (square * weights).sum()
+        jitter = max(float(weighted_excess / weighted_square), 0.0)
         # of Gaussian errors the variance of a square is twice that of the errors, squared
-        weights = square / ((variance + jitter * square) ** 2 + variance**2)
+        along_variance = variance + jitter * square
+        weights = square / (along_variance**2 + variance**2)
     return weights
 
 
@@ -323,17 +402,25 @@ def _aberration(require: Require, cases: Columns) -> BoundedFigure:
         name = f"{VARY}sky.observer_velocity_km_s.{k}"
         velocity.append(cases.numbers.get(name, np.zeros(count)))
     q = np.stack([cases.numbers[name] for name in Q], axis=1)
-    known = np.isfinite(errors).all(axis=1) & np.isfinite(q).all(axis=1)
+    known = _finite_rows(errors) & _finite_rows(q)
     velocities = np.stack(velocity, axis=1)
     if not known.any() or not np.ptp(velocities[known], axis=0).any():
         raise TooFewCases("cases at several velocities of the observer tell it", int(known.sum()))
     case = np.flatnonzero(known)
     _enough(case, "attitude")
-    turns = [aberration_rad(q[k], velocities[k])[:2] for k in case]
+    turns = []
+    for k in case:
+        turn = aberration_rad(q[k], velocities[k])
+        turns.append(turn[:2])
     predicted = ARCSEC_PER_RAD * np.array(turns)
     fit = _turn_fit(errors[case], predicted[:, :, None], case)
     method = "linear fit over the observer's velocity, Student's t"
     return _turn_figure(fit, 0, require, method)
+
+
+def _finite_rows(values: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which rows of values (n, k) have no gap."""
+    return np.asarray(np.isfinite(values).all(axis=1), dtype=np.bool_)
 
 
 def _turn_fit(errors: FloatArray, predicted: FloatArray, case: IntArray) -> CaseFit:
@@ -351,10 +438,7 @@ def _turn_fit(errors: FloatArray, predicted: FloatArray, case: IntArray) -> Case
 
 def _turn_figure(fit: CaseFit, term: int, require: Require, method: str) -> BoundedFigure:
     """The figure of a term of `_turn_fit`."""
-    column = 2 + term
-    sigma = math.sqrt(float(fit.covariance[column, column]))
-    value = fit.value[column : column + 1]
-    return _size(value, np.array([sigma]), fit.cases, require.confidence, method)
+    return _column_size(fit, 2 + term, require, method)
 
 
 # ---- proper motion ----
@@ -367,12 +451,14 @@ def _proper_motion(require: Require, cases: Columns) -> BoundedFigure:
     errors = cases.vectors("error_{}_arcsec", "xyz")[:, :2]
     yearly = cases.vectors(YEARLY_TURN, "xy")
     years = cases.numbers[YEARS]
-    known = np.isfinite(errors).all(axis=1) & np.isfinite(yearly).all(axis=1)
+    known = _finite_rows(errors) & _finite_rows(yearly)
     case = np.flatnonzero(known)
     _enough(case, "attitude")
     if require.quantity == "proper-motion" and not np.ptp(years[case]):
         raise TooFewCases("cases at several dates tell it", len(case))
-    turns = np.stack([yearly[case] * years[case, None], yearly[case]], axis=2)
+    a_year = yearly[case]
+    since_date = a_year * years[case, None]
+    turns = np.stack([since_date, a_year], axis=2)
     fit = _turn_fit(errors[case], turns, case)
     term = MOTION_QUANTITIES.index(require.quantity)
     method = "linear fit over the yearly turn of each field, Student's t"
@@ -444,21 +530,27 @@ def fitted_places(stars: StarTable, resolution_px: tuple[int, int]) -> PlaceFit:
         found_terms = np.linalg.lstsq(terms[near], offsets[near], rcond=None)[0]
         solution = np.asarray(found_terms, dtype=np.float64)
         residual = offsets - terms @ solution
-        spread = MAD_TO_SIGMA * np.median(np.abs(residual[near]), axis=0)
-        close = np.abs(residual) <= WILD_SIGMAS * np.maximum(spread, 1e-9)
+        distance = np.abs(residual)
+        spread = MAD_TO_SIGMA * np.median(distance[near], axis=0)
+        close = distance <= WILD_SIGMAS * np.maximum(spread, 1e-9)
         near = np.asarray(close.all(axis=1), dtype=np.bool_)
     fitted = terms[near] @ solution
-    return PlaceFit(solution, stars.case[reported][near], fitted, residual[near])
+    case = stars.case[reported][near]
+    return PlaceFit(solution, case, fitted, residual[near])
 
 
 def place_map(found: StarTable, resolution_px: tuple[int, int], side: int) -> PlaceOffsets:
     """The map at `side` by `side` places of the detector, less its mean. Raises TooFewCases."""
     fit = fitted_places(found, resolution_px)
-    places = [(np.arange(side) + 0.5) * length / side for length in resolution_px]
-    x_px, y_px = (part.ravel() for part in np.meshgrid(*places))
-    offsets = field_terms(x_px, y_px, resolution_px, MAP_DEGREE) @ fit.solution
+    width, height = resolution_px
+    centres = np.arange(side) + 0.5
+    x_px, y_px = np.meshgrid(centres * width / side, centres * height / side)
+    x_px, y_px = x_px.ravel(), y_px.ravel()
+    terms = field_terms(x_px, y_px, resolution_px, MAP_DEGREE)
+    offsets = terms @ fit.solution
     offsets = offsets - offsets.mean(axis=0)
-    return PlaceOffsets(x_px, y_px, offsets[:, 0], offsets[:, 1])
+    dx_px, dy_px = offsets.T
+    return PlaceOffsets(x_px, y_px, dx_px, dy_px)
 
 
 def _star_noise(
@@ -483,24 +575,26 @@ def _star_map(
     fit = fitted_places(found, resolution_px)
     count = len(fit.case)
     terms = len(fit.solution)
-    variance = float((fit.residual_px**2).sum()) / (2 * (count - terms))
+    residual_square = float((fit.residual_px**2).sum())
+    variance = residual_square / (2 * (count - terms))
     fitted = fit.fitted_px - fit.fitted_px.mean(axis=0)
     # what the noise alone puts into so many terms
     taken = variance * (terms - 1) / count
-    number = np.unique(fit.case, return_inverse=True)[1].reshape(-1)
-    sums = _summed((fitted**2).mean(axis=1), number)
+    number = _numbered(fit.case)
+    squares = (fitted**2).mean(axis=1)
+    sums = _summed(squares, number)
     counts = _summed(np.ones(count), number)
-    low, high = drawn_limits(sums, counts, rng, require.confidence)
+    low, high = drawn_limits(sums, counts, rng, require.confidence).tolist()
     power = float(sums.sum() / counts.sum()) - taken
     # the spread of the fit's own power by noise: each term has one degree of freedom an axis
     free = 2 * (terms - 1)
-    hidden = float(stats.norm.ppf(require.confidence)) * taken * math.sqrt(2 / free)
-    hidden += 2 * math.sqrt(max(power, 0.0) * variance / (2 * count))
-    upper = max(float(high) - taken, power) + hidden
-    lower = min(float(low) - taken, power) - hidden
-    value = math.sqrt(max(power, 0.0))
-    limits = math.sqrt(max(lower, 0.0)), math.sqrt(max(upper, 0.0))
-    return BoundedFigure(value, *limits, len(counts), _map_method(count))
+    sigmas = float(stats.norm.ppf(require.confidence))
+    hidden = sigmas * taken * math.sqrt(2 / free)
+    mixed = max(power, 0.0) * variance / (2 * count)
+    hidden += 2 * math.sqrt(mixed)
+    upper = max(high - taken, power) + hidden
+    lower = min(low - taken, power) - hidden
+    return BoundedFigure(_root(power), _root(lower), _root(upper), len(counts), _map_method(count))
 
 
 def _star_colour(require: Require, found: StarTable) -> BoundedFigure:
@@ -509,13 +603,14 @@ def _star_colour(require: Require, found: StarTable) -> BoundedFigure:
     _enough(found.case[known], "stars' signal")
     signal = found.signal_mag[known]
     off = np.abs(signal - np.median(signal))
-    near = off <= WILD_SIGMAS * MAD_TO_SIGMA * max(float(np.median(off)), 1e-9)
+    middle = max(float(np.median(off)), 1e-9)
+    near = off <= WILD_SIGMAS * MAD_TO_SIGMA * middle
     bv = found.bv[known][near]
+    case = found.case[known][near]
     design = np.stack([np.ones(len(bv)), bv], axis=1)
-    fit = fit_by_cases(design, signal[near], found.case[known][near])
-    sigma = math.sqrt(float(fit.covariance[1, 1]))
+    fit = fit_by_cases(design, signal[near], case)
     method = f"linear fit over B-V of {len(bv)} stars, Student's t"
-    return _size(fit.value[1:], np.array([sigma]), fit.cases, require.confidence, method)
+    return _column_size(fit, 1, require, method)
 
 
 def _star_limit(require: Require, found: StarTable, rng: np.random.Generator) -> BoundedFigure:
@@ -524,18 +619,22 @@ def _star_limit(require: Require, found: StarTable, rng: np.random.Generator) ->
     place = np.floor(found.v_mag / LIMIT_BIN_MAG).astype(np.int64)
     first = int(place.min())
     bins = int(place.max()) - first + 1
-    number = np.unique(found.case, return_inverse=True)[1].reshape(-1)
+    number = _numbered(found.case)
     cases = int(number.max()) + 1
     shape = (cases, bins)
+    size = cases * bins
     index = number * bins + place - first
-    lit = np.bincount(index, minlength=cases * bins).reshape(shape)
-    reported = np.bincount(index[found.found], minlength=cases * bins).reshape(shape)
-    middle_mag = np.asarray((np.arange(bins) + first + 0.5) * LIMIT_BIN_MAG, dtype=np.float64)
+    lit = np.bincount(index, minlength=size).reshape(shape)
+    reported = np.bincount(index[found.found], minlength=size).reshape(shape)
+    middles = np.arange(bins) + first + 0.5
+    middle_mag = np.asarray(middles * LIMIT_BIN_MAG, dtype=np.float64)
     value = half_seen(middle_mag, reported.sum(axis=0), lit.sum(axis=0))
     drawn = []
     for _ in range(LIMIT_DRAWS):
         chosen = rng.integers(0, cases, cases)
-        drawn.append(half_seen(middle_mag, reported[chosen].sum(axis=0), lit[chosen].sum(axis=0)))
+        drawn_reported = reported[chosen].sum(axis=0)
+        drawn_lit = lit[chosen].sum(axis=0)
+        drawn.append(half_seen(middle_mag, drawn_reported, drawn_lit))
     low, high = np.quantile(drawn, [1 - require.confidence, require.confidence])
     # a curve that is sharper than a bin is known to within one
     low = min(float(low), value) - LIMIT_BIN_MAG / 2
@@ -552,36 +651,45 @@ def half_seen(v_mag: FloatArray, seen: IntArray, lit: IntArray) -> float:
     (n,) of those lit (n,) at magnitudes (n,).
     """
 
+    unseen = lit - seen
+
     def loss(parameters: FloatArray) -> float:
         limit_mag, log_width = parameters
         width = MIN_SLOPE_MAG + math.exp(log_width)
         share = stats.logistic.cdf((limit_mag - v_mag) / width)
         share = np.clip(share, 1e-9, 1 - 1e-9)
-        return -float((seen * np.log(share) + (lit - seen) * np.log1p(-share)).sum())
+        log_likelihood = seen * np.log(share) + unseen * np.log1p(-share)
+        return -float(log_likelihood.sum())
 
     # begun where the counts split best by one magnitude
-    missed = np.concatenate([[0], np.cumsum(lit - seen)])
-    beyond = np.concatenate([np.cumsum(seen[::-1])[::-1], [0]])
+    faintest_mag = v_mag[-1]
+    missed = np.concatenate([[0], np.cumsum(unseen)])
+    from_faint = np.cumsum(seen[::-1])
+    beyond = np.concatenate([from_faint[::-1], [0]])
     cut = int(np.argmin(missed + beyond))
-    edges = np.concatenate([v_mag - LIMIT_BIN_MAG / 2, [v_mag[-1] + LIMIT_BIN_MAG / 2]])
+    half_bin_mag = LIMIT_BIN_MAG / 2
+    edges = np.concatenate([v_mag - half_bin_mag, [faintest_mag + half_bin_mag]])
     start = np.array([edges[cut], math.log(0.1)])
     fitted = optimize.minimize(loss, start, method="Nelder-Mead", options={"xatol": 1e-3})
-    return float(min(max(fitted.x[0], v_mag[0]), v_mag[-1]))
+    half_mag = max(fitted.x[0], v_mag[0])
+    return float(min(half_mag, faintest_mag))
 
 
 def _false_stars(require: Require, cases: Columns, rng: np.random.Generator) -> BoundedFigure:
     """False stars a frame."""
-    frames, false = (cases.numbers[name] for name in (REPORTED_FRAMES, FALSE_STARS))
-    some = frames > 0
-    count = int(some.sum())
+    some = cases.numbers[REPORTED_FRAMES] > 0
+    frames = cases.numbers[REPORTED_FRAMES][some]
+    false = cases.numbers[FALSE_STARS][some]
+    count = len(frames)
     if not count:
         raise TooFewCases(SILENT.format("single stars"), 0)
-    total = float(false[some].sum())
-    exposed = float(frames[some].sum())
+    total = float(false.sum())
+    exposed = float(frames.sum())
     c = require.confidence
-    low = float(stats.gamma.ppf(1 - c, total)) / exposed if total else 0.0
+    low = 0.0
+    if total:
+        low = float(stats.gamma.ppf(1 - c, total)) / exposed
     high = float(stats.gamma.ppf(c, total + 1)) / exposed
-    drawn = drawn_limits(false[some], frames[some], rng, c)
-    low, high = min(low, float(drawn[0])), max(high, float(drawn[1]))
+    drawn_low, drawn_high = drawn_limits(false, frames, rng, c).tolist()
     method = "Poisson, or the bootstrap over cases where that is wider"
-    return BoundedFigure(total / exposed, low, high, count, method)
+    return BoundedFigure(total / exposed, min(low, drawn_low), max(high, drawn_high), count, method)

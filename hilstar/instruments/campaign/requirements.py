@@ -57,14 +57,12 @@ from hilstar.instruments.campaign.results import MAX_FITTED_CASES, attitudes_of
 
 AXIS_INDICES = {"x": [0], "y": [1], "z": [2], "cross": [0, 1], "roll": [2]}
 COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
-    **{
-        "<=": operator.le,
-        "<": operator.lt,
-        ">=": operator.ge,
-        ">": operator.gt,
-        "==": operator.eq,
-        "!=": operator.ne,
-    }
+    "<=": operator.le,
+    "<": operator.lt,
+    ">=": operator.ge,
+    ">": operator.gt,
+    "==": operator.eq,
+    "!=": operator.ne,
 }
 MET, NOT_MET, NOT_SHOWN = "met", "not met", "not shown"
 TIME_SHARE = 0.95  # a time's share where `share` is not given
@@ -114,15 +112,14 @@ class RequirementVerdict:
                 side = "not more"
             else:
                 side = "not less"
-            verdict_text += (
-                f", {self.value:.4g} in {self.cases} cases, {side} than {self.bound:.4g} at"
-                f" {100 * require.confidence:g} %"
-            )
-        if self.verdict == NOT_SHOWN:
-            verdict_text += (
-                f"; about {self.more} more cases would show it" if self.more else f"; {self.method}"
-            )
-        return verdict_text
+            percent = 100 * require.confidence
+            verdict_text += f", {self.value:.4g} in {self.cases} cases"
+            verdict_text += f", {side} than {self.bound:.4g} at {percent:g} %"
+        if self.verdict != NOT_SHOWN:
+            return verdict_text
+        if self.more:
+            return f"{verdict_text}; about {self.more} more cases would show it"
+        return f"{verdict_text}; {self.method}"
 
 
 def verdicts_of(
@@ -139,19 +136,17 @@ def verdicts_of(
     `bench_arcsec` is how far the bench's own attitude may be off, across and about, and `bench_s`
     its own time: that is taken off an error's limit.
     """
-    cases = cases.some(
-        np.arange(len(cases.numbers["frames"]))
-        % -(-len(cases.numbers["frames"]) // MAX_FITTED_CASES)
-        == 0
-    )
+    count = len(cases.numbers["frames"])
+    step = -(-count // MAX_FITTED_CASES)
+    cases = cases.some(np.arange(count) % step == 0)
     decomposed: dict[str, Decomposed | InputError] = {}
 
     def parts(condition: str, some: Columns) -> Decomposed:
         if condition not in decomposed:
+            rng = np.random.default_rng(seed)
             try:
-                decomposed[condition] = assess_cases(
-                    *attitudes_of(some), scale, np.random.default_rng(seed)
-                )
+                commanded, reported = attitudes_of(some)
+                decomposed[condition] = assess_cases(commanded, reported, scale, rng)
             except InputError as error:
                 decomposed[condition] = error
         decomposition = decomposed[condition]
@@ -164,20 +159,16 @@ def verdicts_of(
     for require in requires:
         chosen = chosen_cases(require.condition, cases)
         some = cases.some(chosen)
+        some_parts = partial(parts, require.condition, some)
+        rng = np.random.default_rng(seed)
         try:
-            figure = _figure(
-                require,
-                some,
-                partial(parts, require.condition, some),
-                scale.resolution_px,
-                np.random.default_rng(seed),
-            )
+            figure = _figure(require, some, some_parts, scale.resolution_px, rng)
         except TooFewCases as few:
-            verdicts.append(
-                RequirementVerdict(require, few.cases, None, None, NOT_SHOWN, few.more, str(few))
-            )
-            continue
-        verdicts.append(judged_figure(require, figure, bench_arcsec, bench_s))
+            why = str(few)
+            verdict = RequirementVerdict(require, few.cases, None, None, NOT_SHOWN, few.more, why)
+        else:
+            verdict = judged_figure(require, figure, bench_arcsec, bench_s)
+        verdicts.append(verdict)
     return verdicts
 
 
@@ -188,12 +179,13 @@ def chosen_cases(condition: str, cases: Columns) -> npt.NDArray[np.bool_]:
     kinds = dict.fromkeys(cases.numbers, "float64") | dict.fromkeys(cases.texts, "text")
     chosen = np.ones(len(cases.numbers["frames"]), dtype=np.bool_)
     for name, comparison, value in checked_conditions(condition, kinds):
-        column: Any = (
-            np.array(cases.texts[name], dtype=object)
-            if name in cases.texts
-            else cases.numbers[name]
-        )
-        chosen &= np.asarray(COMPARISONS[comparison](column, value), dtype=np.bool_)
+        column: Any
+        if name in cases.texts:
+            column = np.array(cases.texts[name], dtype=object)
+        else:
+            column = cases.numbers[name]
+        met = COMPARISONS[comparison](column, value)
+        chosen &= np.asarray(met, dtype=np.bool_)
     return chosen
 
 
@@ -207,66 +199,66 @@ def judged_figure(
     limit, maximum = require.limit, require.minimum is None
     bench_error = 0.0  # what of the error the bench could have made, or hidden
     if bench_arcsec is not None and require.quantity in AXIS_QUANTITIES and maximum:
-        bench_error = bench_arcsec[1 if AXIS_INDICES[require.axis or "cross"] == [2] else 0]
-        share = f"{100 * min(bench_error / figure.value, 1.0):.0f} %" if figure.value > 0 else "all"
-        note = (
-            f"{bench_error:.2g} arcsec taken off for the bench, which could have made {share} of it"
-        )
+        across, about = bench_arcsec
+        bench_error = across
+        if AXIS_INDICES[require.axis or "cross"] == [2]:
+            bench_error = about
+        share = "all"
+        if figure.value > 0:
+            percent = 100 * min(bench_error / figure.value, 1.0)
+            share = f"{percent:.0f} %"
+        note = f"{bench_error:.2g} arcsec taken off for the bench"
+        note = f"{note}, which could have made {share} of it"
         figure = replace(figure, method=f"{figure.method}; {note}")
     if bench_s and require.quantity == "time-bias" and maximum:
         bench_error = bench_s
         note = f"{bench_error:.2g} s taken off for the bench"
         figure = replace(figure, method=f"{figure.method}; {note}")
-    met = figure.high <= limit - bench_error if maximum else figure.low >= limit
-    missed = figure.low > limit + bench_error if maximum else figure.high < limit
-    verdict = MET if met else NOT_MET if missed else NOT_SHOWN
-    bound = figure.high if maximum != missed else figure.low
-    more = _more(require, figure) if verdict == NOT_SHOWN else None
-    value = figure.value if math.isfinite(figure.value) else None
+    low, high = figure.low, figure.high
+    if maximum:
+        met = high <= limit - bench_error
+        missed = low > limit + bench_error
+    else:
+        met = low >= limit
+        missed = high < limit
+    verdict, more = NOT_SHOWN, None
+    if met:
+        verdict = MET
+    elif missed:
+        verdict = NOT_MET
+    else:
+        more = _more(require, figure)
+    bound = low
+    if maximum != missed:
+        bound = high
     return RequirementVerdict(
         require,
         figure.cases,
-        value,
-        bound if math.isfinite(bound) else None,
+        _finite(figure.value),
+        _finite(bound),
         verdict,
         more,
         figure.method,
-        figure.low if math.isfinite(figure.low) else None,
-        figure.high if math.isfinite(figure.high) else None,
+        _finite(low),
+        _finite(high),
         bench_error,
     )
+
+
+def _finite(value: float) -> float | None:
+    """A value, None where it is infinite or unknown."""
+    if math.isfinite(value):
+        return value
+    return None
 
 
 def _more(require: Require, figure: BoundedFigure) -> int | None:
     """How many more cases would decide, if the figure stays as it is; None where no number of
     cases would.
     """
-    limit = require.limit
-    maximum = require.minimum is None
-    c = require.confidence
     if figure.rate is not None:
-        count, of = figure.rate
-        share = count / of
-        allowed = limit if require.quantity in SHARE_QUANTITIES else 1 - _share(require)
-
-        def decided(cases: int) -> bool:
-            n = cases * of / figure.cases
-            low, high = clopper_pearson(round(share * n), n, c)
-            return (
-                high <= allowed
-                or low > allowed
-                or (not maximum and (low >= allowed or high < allowed))
-            )
-
-        if share == allowed or not decided(MAX_MORE):
-            return None
-        # by halves: a count's steps move the end by a case or two
-        few = figure.cases
-        enough = MAX_MORE
-        while enough - few > 1:
-            middle = (few + enough) // 2
-            few, enough = (few, middle) if decided(middle) else (middle, enough)
-        return enough - figure.cases
+        return _more_of_rate(require, figure.rate, figure.cases)
+    limit = require.limit
     away = abs(limit - figure.value)
     if limit > figure.value:
         width = figure.high - figure.value
@@ -274,8 +266,42 @@ def _more(require: Require, figure: BoundedFigure) -> int | None:
         width = figure.value - figure.low
     if not away or not math.isfinite(width) or width <= 0:
         return None
-    more = math.ceil(figure.cases * (width / away) ** 2) - figure.cases
-    return max(more, 1) if more <= MAX_MORE else None
+    needed = math.ceil(figure.cases * (width / away) ** 2)
+    more = needed - figure.cases
+    if more > MAX_MORE:
+        return None
+    return max(more, 1)
+
+
+def _more_of_rate(require: Require, rate: tuple[float, float], cases: int) -> int | None:
+    """How many more cases would decide on a rate: what was counted, and in how many."""
+    maximum = require.minimum is None
+    count, of = rate
+    share = count / of
+    if require.quantity in SHARE_QUANTITIES:
+        allowed = require.limit
+    else:
+        allowed = 1 - _share(require)
+
+    def decided(all_cases: int) -> bool:
+        n = all_cases * of / cases
+        low, high = clopper_pearson(round(share * n), n, require.confidence)
+        if high <= allowed or low > allowed:
+            return True
+        return not maximum and (low >= allowed or high < allowed)
+
+    if share == allowed or not decided(MAX_MORE):
+        return None
+    # by halves: a count's steps move the end by a case or two
+    few = cases
+    enough = MAX_MORE
+    while enough - few > 1:
+        middle = (few + enough) // 2
+        if decided(middle):
+            enough = middle
+        else:
+            few = middle
+    return enough - cases
 
 
 def _share(require: Require) -> float:
@@ -300,7 +326,8 @@ def _figure(
     if quantity in QUANTITY_COLUMNS:
         return answer_figure(require, cases, axes, resolution_px, rng)
     if quantity in SHARE_QUANTITIES:
-        return _rate(*_share_of(quantity, cases), c)
+        hits, asked = _share_of(quantity, cases)
+        return _rate(hits, asked, c)
     if quantity in ("time-to-first-attitude", "recovery"):
         return _time(require, cases)
     if quantity == "nea" and np.nansum(cases.numbers["frames"] > 1):
@@ -310,15 +337,18 @@ def _figure(
 
 def _share_of(quantity: str, cases: Columns) -> tuple[FloatArray, FloatArray]:
     """What is counted in each case (n,), and among how many (n,)."""
-    solved, wrong = (np.nan_to_num(cases.numbers[name]) for name in ("solved", "wrong"))
+    solved = np.nan_to_num(cases.numbers["solved"])
+    wrong = np.nan_to_num(cases.numbers["wrong"])
     asked = np.nan_to_num(cases.numbers["frames"])
-    shares = {
-        "wrong-rate": (wrong, solved),
-        "false-attitude": (wrong, asked),
-        "no-attitude": (asked - solved, asked),
-        "availability": (solved - wrong, asked),
-    }
-    return shares[quantity]
+    if quantity == "wrong-rate":
+        return wrong, solved
+    if quantity == "false-attitude":
+        return wrong, asked
+    if quantity == "no-attitude":
+        return asked - solved, asked
+    if quantity == "availability":
+        return solved - wrong, asked
+    raise KeyError(quantity)
 
 
 def _decomposed(
@@ -326,11 +356,10 @@ def _decomposed(
 ) -> BoundedFigure:
     """A figure of the error budget, and the wild answers that it leaves out."""
     figure = _of_parts(components, axes, require, rng)
-    if len(components.wrong):
-        return replace(
-            figure, method=f"{figure.method}; {len(components.wrong)} wild answers left out"
-        )
-    return figure
+    wild = len(components.wrong)
+    if not wild:
+        return figure
+    return replace(figure, method=f"{figure.method}; {wild} wild answers left out")
 
 
 def _of_parts(
@@ -341,18 +370,19 @@ def _of_parts(
     c = require.confidence
     n = len(found.row)
     components = found.components
+    fov, pixel = components.fov, components.pixel
     if quantity == "bias":
-        total = components.left + components.fov.fitted + components.pixel.fitted
-        return _bias(components.mean[axes], total[:, axes].std(axis=0, ddof=1), n, c)
+        total = components.left + fov.fitted + pixel.fitted
+        sigma = total[:, axes].std(axis=0, ddof=1)
+        return _bias(components.mean[axes], sigma, n, c)
     if quantity in ("noise", "nea"):
-        freedom = n - 1 - components.fov.freedom - components.pixel.freedom
-        return _noise(
-            components.left[:, axes] * math.sqrt(n / max(freedom, 1.0)), freedom, require, rng
-        )
+        freedom = n - 1 - fov.freedom - pixel.freedom
+        spread = math.sqrt(n / max(freedom, 1.0))
+        noise = components.left[:, axes] * spread
+        return _noise(noise, freedom, require, rng)
+    part = pixel
     if quantity == "fov-error":
-        part = components.fov
-    else:
-        part = components.pixel
+        part = fov
     if part.reason:
         raise TooFewCases(part.reason, n)
     return _repeating(part, components.noise_variance, axes, require, rng)
@@ -373,30 +403,34 @@ def _rate(hits: FloatArray, asked: FloatArray, confidence: float) -> BoundedFigu
         method += " of cases"
         effective = float(cases)
         if 0 < share < 1 and cases > 1:
-            between = cases / (cases - 1) * float(((hits - share * asked) ** 2).sum()) / total**2
-            effect = max(between / (share * (1 - share) / total), 1.0)
+            off_square = float(((hits - share * asked) ** 2).sum())
+            between = cases / (cases - 1) * off_square / total**2
+            binomial = share * (1 - share) / total
+            effect = max(between / binomial, 1.0)
             effective = max(total / effect, 1.0)
             method = f"Clopper-Pearson, design effect {effect:.3g}"
-    low, high = clopper_pearson(share * effective, effective, confidence)
-    return BoundedFigure(share, low, high, cases, method, (share * effective, effective))
+    effective_hits = share * effective
+    low, high = clopper_pearson(effective_hits, effective, confidence)
+    return BoundedFigure(share, low, high, cases, method, (effective_hits, effective))
 
 
 def _quantile(values: FloatArray, require: Require, cases: int, method: str) -> BoundedFigure:
     share = _share(require)
     low, high = quantile_limits(values, share, require.confidence)
     ordered = np.sort(values)
-    value = float(ordered[min(math.ceil(share * len(values)), len(values)) - 1])
+    count = len(values)
+    place = min(math.ceil(share * count), count) - 1
+    value = float(ordered[place])
     beyond = float((values > require.limit).sum())
-    return BoundedFigure(value, max(low, 0.0), high, cases, method, (beyond, float(len(values))))
+    rate = (beyond, float(count))
+    return BoundedFigure(value, max(low, 0.0), high, cases, method, rate)
 
 
 def _time(require: Require, cases: Columns) -> BoundedFigure:
     numbers = cases.numbers
-    column, known = (
-        ("first_attitude_s", "frames")
-        if require.quantity != "recovery"
-        else ("recovery_s", "fault_end_s")
-    )
+    column, known = "first_attitude_s", "frames"
+    if require.quantity == "recovery":
+        column, known = "recovery_s", "fault_end_s"
     if column not in numbers or known not in numbers:
         if column == "recovery_s":
             why = "the table has no such column: a plan that varies scenario has"
@@ -406,7 +440,9 @@ def _time(require: Require, cases: Columns) -> BoundedFigure:
     is_timed = np.isfinite(numbers[known])
     if not is_timed.any():
         raise TooFewCases("no fault ended within a case", 0)
-    times = np.where(np.isfinite(numbers[column]), numbers[column], math.inf)[is_timed]
+    times = numbers[column][is_timed]
+    # a case that never had an attitude
+    times = np.where(np.isfinite(times), times, math.inf)
     return _quantile(times, require, len(times), "order statistics")
 
 
@@ -415,11 +451,14 @@ def _bias(mean: FloatArray, sigma: FloatArray, n: int, confidence: float) -> Bou
     size = np.abs(mean)
     upper = stats.t.ppf(confidence, n - 1)
     # Bonferroni: of several axes any one may be the larger
-    lower = stats.t.ppf(1 - (1 - confidence) / len(size), n - 1)
-    low = max(float((size - lower * standard).max()), 0.0)
-    return BoundedFigure(
-        float(size.max()), low, float((size + upper * standard).max()), n, "Student's t"
-    )
+    doubt = (1 - confidence) / len(size)
+    lower = stats.t.ppf(1 - doubt, n - 1)
+    lowest = size - lower * standard
+    highest = size + upper * standard
+    low = max(float(lowest.max()), 0.0)
+    high = float(highest.max())
+    largest = float(size.max())
+    return BoundedFigure(largest, low, high, n, "Student's t")
 
 
 def _noise(
@@ -429,15 +468,19 @@ def _noise(
     n = len(left)
     c = require.confidence
     if require.share is not None:
-        return _quantile(np.abs(left).ravel(), require, n, "order statistics")
-    variance = float((left**2).mean())
+        sizes = np.abs(left).ravel()
+        return _quantile(sizes, require, n, "order statistics")
+    squares = left**2
+    variance = float(squares.mean())
+    sigma = math.sqrt(variance)
     freedom = max(freedom, 1.0)
     # Few values cannot show that they are not Gaussian.
     if n < MIN_TESTED or float(stats.kurtosistest(left.ravel()).pvalue) > GAUSSIAN_P:
         low, high = sigma_limits(variance, freedom * left.shape[1], c)
-        return BoundedFigure(math.sqrt(variance), low, high, n, "chi-square, Gaussian")
-    low, high = np.sqrt(drawn_limits((left**2).mean(axis=1), np.ones(n), rng, c))
-    return BoundedFigure(math.sqrt(variance), float(low), float(high), n, "bootstrap, not Gaussian")
+        return BoundedFigure(sigma, low, high, n, "chi-square, Gaussian")
+    limits = drawn_limits(squares.mean(axis=1), np.ones(n), rng, c)
+    low, high = np.sqrt(limits).tolist()
+    return BoundedFigure(sigma, low, high, n, "bootstrap, not Gaussian")
 
 
 def _within(
@@ -454,20 +497,27 @@ def _within(
     variance = float(square @ freedom / freedom.sum())
     n = int(some.sum())
     method = "chi-square, Gaussian"
-    if require.share is None:
-        factor = 1.0
-    else:
-        factor = float(stats.norm.ppf((1 + require.share) / 2))
-    excess = float((freedom * len(axes) * (square / max(variance, 1e-300) - 1) ** 2).mean()) / 2 - 1
+    factor = _gaussian_factor(require)
+    ratio = square / max(variance, 1e-300)
+    scatter_square = freedom * len(axes) * (ratio - 1) ** 2
+    excess = float(scatter_square.mean()) / 2 - 1
     # 14: the variance of that square, one degree of freedom a case
     if n < MIN_TESTED or excess < 3 * math.sqrt(14 / n):
-        low, high = sigma_limits(variance, float(freedom.sum()) * len(axes), require.confidence)
+        all_freedom = float(freedom.sum()) * len(axes)
+        low, high = sigma_limits(variance, all_freedom, require.confidence)
     else:
-        low, high = np.sqrt(
-            drawn_limits(square * freedom, freedom, rng, require.confidence)
-        ).tolist()
+        limits = drawn_limits(square * freedom, freedom, rng, require.confidence)
+        low, high = np.sqrt(limits).tolist()
         method = "bootstrap, not Gaussian"
-    return BoundedFigure(factor * math.sqrt(variance), factor * low, factor * high, n, method)
+    sigma = math.sqrt(variance)
+    return BoundedFigure(factor * sigma, factor * low, factor * high, n, method)
+
+
+def _gaussian_factor(require: Require) -> float:
+    """How many sigma of Gaussian errors the requirement's share is within; 1 without a share."""
+    if require.share is None:
+        return 1.0
+    return float(stats.norm.ppf((1 + require.share) / 2))
 
 
 def _repeating(
@@ -482,25 +532,29 @@ def _repeating(
     noise = float(noise_variance[axes].mean())
     variance = float(part.variance[axes].mean())
     taken = part.freedom / n * noise
-    square = (part.fitted[:, axes] ** 2).mean(axis=1)
-    low, high = (
-        max(bound - taken, 0.0) for bound in drawn_limits(square, np.ones(n), rng, c).tolist()
-    )
+    fitted = part.fitted[:, axes]
+    square = (fitted**2).mean(axis=1)
+    limits = drawn_limits(square, np.ones(n), rng, c) - taken
+    low, high = np.maximum(limits, 0.0).tolist()
     if part.freedom:  # the noise in the fit: its own power, and what it adds to that of the part
-        power = noise * (2 * part.freedom * noise / n + 4 * variance) / (n * len(axes))
+        fit_noise = 2 * part.freedom * noise / n
+        power = noise * (fit_noise + 4 * variance) / (n * len(axes))
         hidden = float(stats.norm.ppf(c)) * math.sqrt(power)
         method = "bootstrap over blocks of cases"
     else:  # no waves were sure: as much power as they would have needed may be there
         hidden = SURE_OF_MANY * math.sqrt(6 * WAVE_COLUMNS) / 3 * noise / n
         method = "what the search for it would have missed"
-    low = max(variance - math.hypot(variance - min(low, variance), hidden), 0.0)
-    high = variance + math.hypot(max(high, variance) - variance, hidden)
-    factor = 1.0
+    below = variance - min(low, variance)
+    above = max(high, variance) - variance
+    low = max(variance - math.hypot(below, hidden), 0.0)
+    high = variance + math.hypot(above, hidden)
     if require.share is not None and variance > 0:
-        size = np.abs(part.fitted[:, axes]).ravel()
-        factor = float(np.quantile(size, require.share)) / math.sqrt(float((size**2).mean()))
-    elif require.share is not None:
-        factor = float(stats.norm.ppf((1 + require.share) / 2))
-    return BoundedFigure(
-        factor * math.sqrt(variance), factor * math.sqrt(low), factor * math.sqrt(high), n, method
-    )
+        size = np.abs(fitted).ravel()
+        mean_square = float((size**2).mean())
+        factor = float(np.quantile(size, require.share)) / math.sqrt(mean_square)
+    else:
+        factor = _gaussian_factor(require)
+    sigma = factor * math.sqrt(variance)
+    low_sigma = factor * math.sqrt(low)
+    high_sigma = factor * math.sqrt(high)
+    return BoundedFigure(sigma, low_sigma, high_sigma, n, method)

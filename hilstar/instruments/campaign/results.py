@@ -73,11 +73,13 @@ def case_budget(
 
     A figure that too few answers determine is None, and a note says why.
     """
-    asked, solved, wrong = (
-        float(np.nansum(cases.numbers[name])) for name in ("frames", "solved", "wrong")
-    )
+    numbers = cases.numbers
+    asked = float(np.nansum(numbers["frames"]))
+    solved = float(np.nansum(numbers["solved"]))
+    wrong = float(np.nansum(numbers["wrong"]))
     tracker = file.config.tracker
-    scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
+    focal_length_px = tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um
+    scale = Scale(focal_length_px, tracker.resolution_px)
     commanded, reported = attitudes_of(cases)
     step = -(-len(commanded) // MAX_FITTED_CASES)
     parts: Decomposed | None = None
@@ -86,36 +88,56 @@ def case_budget(
         notes = parts.notes
     except InputError as refusal:
         notes = (str(refusal),)
-    # between the frames of a case; none where cases have one
+    budget: dict[str, Any] = _parts_arcsec(parts)
+    budget["scatter_arcsec"] = _scatter_arcsec(cases)
+    budget["availability"] = 0.0
+    if asked:
+        budget["availability"] = (solved - wrong) / asked
+    budget["wrong"] = int(wrong)
+    budget["centroids"] = _centroids(cases)
+    budget["limit_arcsec"] = noise_limit(file, commanded)
+    budget["notes"] = notes
+    return budget, parts
+
+
+def _parts_arcsec(parts: Decomposed | None) -> dict[str, Any]:
+    """The bias and the parts of a budget by the keys of --json; None where they are unknown."""
+    keys = ["bias_arcsec"]
+    for name in PARTS:
+        keys.append(f"{name}_arcsec")
+    if parts is None:
+        return dict.fromkeys(keys)
+    values = {}
+    for key in keys:
+        values[key] = getattr(parts, key)
+    values["bias_arcsec"] = parts.bias_arcsec.tolist()
+    return values
+
+
+def _scatter_arcsec(cases: Columns) -> Axes | None:
+    """The scatter between the frames of a case; None where each case has a single frame."""
     scatter = cases.vectors("scatter_{}_arcsec", "xyz")
-    scatter = scatter[np.isfinite(scatter).all(axis=1)]
-    return {
-        "bias_arcsec": None if parts is None else parts.bias_arcsec.tolist(),
-        **{
-            f"{name}_arcsec": None if parts is None else getattr(parts, f"{name}_arcsec")
-            for name in PARTS
-        },
-        "scatter_arcsec": axes_of_variance((scatter**2).mean(axis=0)) if len(scatter) else None,
-        "availability": (solved - wrong) / asked if asked else 0.0,
-        "wrong": int(wrong),
-        "centroids": _centroids(cases),
-        "limit_arcsec": noise_limit(file, commanded),
-        "notes": notes,
-    }, parts
+    known = np.isfinite(scatter).all(axis=1)
+    if not known.any():
+        return None
+    variance = (scatter[known] ** 2).mean(axis=0)
+    return axes_of_variance(variance)
 
 
 def attitudes_of(cases: Columns) -> tuple[FloatArray, FloatArray]:
     """Commanded attitudes (n, 4), and reported ones, NaN where there is none: the case's mean
     error on the commanded one.
     """
-    commanded, reported = (cases.vectors(form, "wxyz") for form in ("q{}", "solved_q{}"))
+    commanded = cases.vectors("q{}", "wxyz")
+    reported = cases.vectors("solved_q{}", "wxyz")
     # on the bench a case in motion is where it was lit when the tracker looked
     if "lit_qw" in cases.numbers:
         lit = cases.vectors("lit_q{}", "wxyz")
         commanded = np.where(np.isfinite(lit), lit, commanded)
     error = cases.vectors("error_{}_arcsec", "xyz") / ARCSEC_PER_RAD
     known = np.isfinite(error).all(axis=1)
-    reported[known] = multiply(from_rotation_vectors(error[known]), commanded[known])
+    turn = from_rotation_vectors(error[known])
+    reported[known] = multiply(turn, commanded[known])
     return commanded, reported
 
 
@@ -129,8 +151,12 @@ def budget_rows(budget: dict[str, Any], parts: Decomposed | None) -> Iterator[Fi
     yield from limit_rows(budget["limit_arcsec"])
     yield FigureRow("availability", "", budget["availability"])
     yield FigureRow("wrong answers", "", budget["wrong"])
-    for name, value in (budget["centroids"] or {}).items():
-        yield FigureRow(f"centroids: {name}", "", value, "px" if name.endswith("_px") else "1")
+    centroids = budget["centroids"] or {}
+    for name, value in centroids.items():
+        unit = "1"
+        if name.endswith("_px"):
+            unit = "px"
+        yield FigureRow(f"centroids: {name}", "", value, unit)
 
 
 def _centroids(cases: Columns) -> dict[str, float] | None:
@@ -148,23 +174,25 @@ def _centroids(cases: Columns) -> dict[str, float] | None:
     def mean(values: FloatArray) -> float:
         return float(np.average(values[some], weights=weight[some]))
 
-    off_px = {axis: numbers[f"centroid_d{axis}_px"] for axis in "xy"}
-    bias_px = {axis: mean(off) for axis, off in off_px.items()}
-    square_px2 = {
-        axis: mean(numbers[f"centroid_sigma_{axis}_px"] ** 2 + off**2)
-        for axis, off in off_px.items()
-    }
-    return {
-        **{f"bias_{axis}_px": bias for axis, bias in bias_px.items()},
-        **{
-            f"sigma_{axis}_px": math.sqrt(max(0.0, square_px2[axis] - bias**2))
-            for axis, bias in bias_px.items()
-        },
-        "found_share": float(np.nansum(numbers["matched"]) / max(np.nansum(numbers["stars"]), 1.0)),
-        "false_a_frame": float(
-            np.nansum(numbers["false"]) / max(np.nansum(numbers["frames"]), 1.0)
-        ),
-    }
+    bias_px = {}
+    sigma_px = {}
+    for axis in "xy":
+        off = numbers[f"centroid_d{axis}_px"]
+        sigma = numbers[f"centroid_sigma_{axis}_px"]
+        bias = mean(off)
+        variance = mean(sigma**2 + off**2) - bias**2
+        bias_px[f"bias_{axis}_px"] = bias
+        sigma_px[f"sigma_{axis}_px"] = math.sqrt(max(0.0, variance))
+    figures = bias_px | sigma_px
+    figures["found_share"] = _ratio(numbers["matched"], numbers["stars"])
+    figures["false_a_frame"] = _ratio(numbers["false"], numbers["frames"])
+    return figures
+
+
+def _ratio(counts: FloatArray, of_counts: FloatArray) -> float:
+    """The sum of counts (n,) over that of others (n,), which counts as 1 where it is less."""
+    whole = max(np.nansum(of_counts), 1.0)
+    return float(np.nansum(counts) / whole)
 
 
 @dataclass(frozen=True)
@@ -210,39 +238,48 @@ def measures(cases: Columns) -> list[Measure]:
     errors, and missing answers.
     """
     numbers = cases.numbers
-    errors = (numbers[f"error_{axis}_arcsec"] for axis in "xyz")
-    x, y, z = (
-        axis_errors - np.nanmedian(axis_errors) if np.isfinite(axis_errors).any() else axis_errors
-        for axis_errors in errors
-    )
-    error_measures = [
-        Measure("cross", "arcsec", np.sqrt((x**2 + y**2) / 2)),
-        Measure("roll", "arcsec", np.abs(z)),
-    ]
+    x = _unbiased(numbers["error_x_arcsec"])
+    y = _unbiased(numbers["error_y_arcsec"])
+    z = _unbiased(numbers["error_z_arcsec"])
+    cross_arcsec = np.sqrt((x**2 + y**2) / 2)
+    candidates = [Measure("cross", "arcsec", cross_arcsec), Measure("roll", "arcsec", np.abs(z))]
     if "centroid_sigma_x_px" in numbers:
-        dx, dy, sx, sy = (
-            numbers[f"centroid_{name}_px"] for name in ("dx", "dy", "sigma_x", "sigma_y")
-        )
-        error_measures.append(
-            Measure("centroid", "px", np.sqrt((dx**2 + dy**2 + sx**2 + sy**2) / 2))
-        )
-    right = np.nan_to_num(numbers["solved"]) - np.nan_to_num(numbers["wrong"])
-    frames = np.maximum(np.nan_to_num(numbers["frames"], nan=1.0), 1.0)
-    error_measures.append(
-        Measure("unanswered", "1", 1 - np.minimum(right / frames, 1.0), mean=True)
-    )
-    return [
-        measure for measure in error_measures if np.isfinite(measure.values).sum() >= 2 * MIN_IN_BIN
-    ]
+        dx = numbers["centroid_dx_px"]
+        dy = numbers["centroid_dy_px"]
+        sx = numbers["centroid_sigma_x_px"]
+        sy = numbers["centroid_sigma_y_px"]
+        centroid_px = np.sqrt((dx**2 + dy**2 + sx**2 + sy**2) / 2)
+        candidates.append(Measure("centroid", "px", centroid_px))
+    solved = np.nan_to_num(numbers["solved"])
+    right = solved - np.nan_to_num(numbers["wrong"])
+    frames = np.nan_to_num(numbers["frames"], nan=1.0)
+    answered = right / np.maximum(frames, 1.0)
+    unanswered = 1 - np.minimum(answered, 1.0)
+    candidates.append(Measure("unanswered", "1", unanswered, mean=True))
+    known_measures = []
+    for measure in candidates:
+        known = np.isfinite(measure.values).sum()
+        if known >= 2 * MIN_IN_BIN:
+            known_measures.append(measure)
+    return known_measures
+
+
+def _unbiased(errors: FloatArray) -> FloatArray:
+    """Errors of an axis (n,) about their median."""
+    if not np.isfinite(errors).any():
+        return errors
+    return errors - np.nanmedian(errors)
 
 
 def costs(cases: Columns) -> list[Cost]:
     """The cost of each varied parameter in each measure, the largest first within a measure."""
     varied_costs = []
     for measure in measures(cases):
-        measure_costs = [
-            cost for name in cases.varied if (cost := _cost(measure, name, cases)) is not None
-        ]
+        measure_costs = []
+        for name in cases.varied:
+            cost = _cost(measure, name, cases)
+            if cost is not None:
+                measure_costs.append(cost)
         varied_costs += sorted(measure_costs, key=lambda cost: (not cost.sure, -cost.cost))
     return varied_costs
 
@@ -253,9 +290,20 @@ def _cost(measure: Measure, name: str, cases: Columns) -> Cost | None:
     if len(places) < 2:
         return None
     y = measure.values[good]
-    levels, errors = np.array([_level(y[index == k], measure.mean) for k in range(len(places))]).T
+    bin_levels = []
+    for k in range(len(places)):
+        bin_levels.append(_level(y[index == k], measure.mean))
+    levels, errors = np.array(bin_levels).T
     best = int(np.argmin(levels))
     worst = int(np.argmax(levels))
+    overall, _ = _level(y, measure.mean)
+    if measure.mean:
+        excess = float(levels.mean() - levels[best])
+    else:
+        excess_square = (levels**2).mean() - levels[best] ** 2
+        excess = math.sqrt(float(excess_square))
+    step = float(levels[worst] - levels[best])
+    step_error = math.hypot(float(errors[best]), float(errors[worst]))
     return Cost(
         measure=measure.name,
         unit=measure.unit,
@@ -263,15 +311,10 @@ def _cost(measure: Measure, name: str, cases: Columns) -> Cost | None:
         places=places,
         level=levels,
         error=errors,
-        overall=_level(y, measure.mean)[0],
-        cost=(
-            float(levels.mean() - levels[best])
-            if measure.mean
-            else math.sqrt(float((levels**2).mean() - levels[best] ** 2))
-        ),
+        overall=overall,
+        cost=excess,
         share=_share(y, index, len(places)),
-        sure=float(levels[worst] - levels[best])
-        > SURE * math.hypot(float(errors[best]), float(errors[worst])),
+        sure=step > SURE * step_error,
     )
 
 
@@ -279,9 +322,13 @@ def _level(values: FloatArray, mean: bool) -> tuple[float, float]:
     """A bin's median, or mean, and its standard error."""
     count = len(values)
     if mean:
-        return float(values.mean()), float(values.std() / math.sqrt(max(count - 1, 1)))
+        freedom = max(count - 1, 1)
+        error = values.std() / math.sqrt(freedom)
+        return float(values.mean()), float(error)
     beside = 0.5 / math.sqrt(count)
-    low, middle, high = np.quantile(values, [max(0.0, 0.5 - beside), 0.5, min(1.0, 0.5 + beside)])
+    below = max(0.0, 0.5 - beside)
+    above = min(1.0, 0.5 + beside)
+    low, middle, high = np.quantile(values, [below, 0.5, above])
     return float(middle), float(high - low) / 2
 
 
@@ -290,11 +337,14 @@ def _share(values: FloatArray, index: IntArray, bins: int) -> float:
     rank = rankdata(values)
     count = np.bincount(index, minlength=bins)
     mean = np.bincount(index, rank, minlength=bins) / count
-    within = np.bincount(index, (rank - mean[index]) ** 2, minlength=bins) / np.maximum(
-        count - 1, 1
-    )
-    between = float((count * (mean - rank.mean()) ** 2).sum() - within.sum()) / len(rank)
-    return max(0.0, between) / max(float(rank.var()), 1e-300)
+    squares = (rank - mean[index]) ** 2
+    square_sums = np.bincount(index, squares, minlength=bins)
+    # what bins of that size have by chance
+    within = square_sums / np.maximum(count - 1, 1)
+    spread = count * (mean - rank.mean()) ** 2
+    between = float(spread.sum() - within.sum()) / len(rank)
+    variance = float(rank.var())
+    return max(0.0, between) / max(variance, 1e-300)
 
 
 def _bins(
@@ -313,9 +363,14 @@ def _bins(
     if name not in cases.texts and len(values) > MAX_BINS:
         numbers = cases.numbers[name][good]
         count = min(MAX_BINS, len(numbers) // MIN_IN_BIN)
-        ends = np.quantile(numbers, np.linspace(0, 1, count + 1))[1:-1]
-        filled, index = np.unique(np.searchsorted(ends, numbers, side="right"), return_inverse=True)
-        values = np.array([np.median(numbers[index == k]) for k in range(len(filled))])
+        shares = np.linspace(0, 1, count + 1)
+        ends = np.quantile(numbers, shares)[1:-1]
+        interval = np.searchsorted(ends, numbers, side="right")
+        filled, index = np.unique(interval, return_inverse=True)
+        medians = []
+        for k in range(len(filled)):
+            medians.append(np.median(numbers[index == k]))
+        values = np.array(medians)
     enough = len(values) < 2 or np.bincount(index).min() >= MIN_IN_BIN // 2
     if enough:
         return (tuple(values.tolist()), index)
@@ -327,11 +382,8 @@ def finding(found: list[Cost]) -> str:
     first = found[0]
     what = WORDS[found[0].measure]
     if not first.sure:
-        return (
-            f"No parameter changes the {what} beyond these cases' noise:"
-            f" {_figure(first.overall, first)} in the median"
-        )
-
+        overall = _figure(first.overall, first)
+        return f"No parameter changes the {what} beyond these cases' noise: {overall} in the median"
     smallest = _level_text(first, first.best)
     largest = _level_text(first, first.worst)
     return f"{first.parameter} costs the most of the {what}: {smallest}, {largest}"
@@ -347,24 +399,37 @@ def cost_chart(found: list[Cost]) -> Any:
     """A figure of one measure's costs, with a panel for each of the parameters that cost most."""
     shown = found[:MAX_PANELS]
     with panels_of(finding(shown), len(shown), share_x=False) as axes:
-        top = 1.15 * max(float((cost.level + cost.error).max()) for cost in shown) or 1.0
+        highest = []
+        for cost in shown:
+            ends = cost.level + cost.error
+            highest.append(float(ends.max()))
+        top = 1.15 * max(highest) or 1.0
         for axis, cost in zip(axes, shown, strict=True):
-            where = [float(k) for k in range(len(cost.places))]
-            if not any(isinstance(place, str) for place in cost.places):
-                where = [float(place) for place in cost.places]
-            else:
-                axis.set_xticks(where, [str(place) for place in cost.places])
-            axis.errorbar(
-                where, cost.level, yerr=cost.error, fmt="o-", capsize=3, color=INK, ecolor=MUTED
-            )
-            axis.axhline(cost.overall, linewidth=0.8, linestyle="--", color=MUTED)
+            _cost_panel(axis, cost)
             axis.set_ylim(0, top)
-            if len(where) > 2 and min(where) > 0 and max(where) / min(where) > 30:
-                axis.set_xscale("log")
-            sure = "" if cost.sure else "  (no more than noise)"
-            axis.set_xlabel(f"{cost.parameter}: costs {_figure(cost.cost, cost)}{sure}")
-            axis.set_ylabel("share" if cost.unit == "1" else f"{cost.unit}, median")
     return axes[0].figure
+
+
+def _cost_panel(axis: Any, cost: Cost) -> None:
+    """Draw a parameter's bins with their standard errors."""
+    where: list[float] = list(range(len(cost.places)))
+    if any(isinstance(place, str) for place in cost.places):
+        axis.set_xticks(where, list(map(str, cost.places)))
+    else:
+        where = list(map(float, cost.places))
+    axis.errorbar(where, cost.level, yerr=cost.error, fmt="o-", capsize=3, color=INK, ecolor=MUTED)
+    axis.axhline(cost.overall, linewidth=0.8, linestyle="--", color=MUTED)
+    first, last = min(where), max(where)
+    if len(where) > 2 and first > 0 and last / first > 30:
+        axis.set_xscale("log")
+    label = f"{cost.parameter}: costs {_figure(cost.cost, cost)}"
+    if not cost.sure:
+        label = f"{label}  (no more than noise)"
+    axis.set_xlabel(label)
+    if cost.unit == "1":
+        axis.set_ylabel("share")
+    else:
+        axis.set_ylabel(f"{cost.unit}, median")
 
 
 def page_costs(found: list[Cost], figure: Any) -> MeasureCosts:
@@ -378,9 +443,9 @@ def page_costs(found: list[Cost], figure: Any) -> MeasureCosts:
         text = _figure(cost.cost, cost)
         if not cost.sure:
             text = f"{text} (noise)"
-        rows.append(
-            (cost.parameter, text, _level_text(cost, cost.best), _level_text(cost, cost.worst))
-        )
+        best = _level_text(cost, cost.best)
+        worst = _level_text(cost, cost.worst)
+        rows.append((cost.parameter, text, best, worst))
     return MeasureCosts(_figure(first.cost, first), of, rows, figure)
 
 
@@ -395,10 +460,12 @@ def _level_text(cost: Cost, place: int) -> str:
 def _sensitivity_row(cost: Cost) -> tuple[Any, ...]:
     """A row of sensitivity.csv."""
     sure = str(cost.sure).lower()
-    best, worst = cost.best, cost.worst
-    at_best, at_worst = float(cost.level[best]), float(cost.level[worst])
     about = (cost.measure, cost.unit, cost.parameter, cost.overall, cost.cost, cost.share, sure)
-    return (*about, cost.places[best], at_best, cost.places[worst], at_worst)
+    at_best = float(cost.level[cost.best])
+    at_worst = float(cost.level[cost.worst])
+    best = cost.places[cost.best]
+    worst = cost.places[cost.worst]
+    return (*about, best, at_best, worst, at_worst)
 
 
 def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
@@ -409,21 +476,27 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
     """
     because = failures(table)
     cases = read_cases(table)
-    budget, parts = case_budget(cases, file, np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    budget, parts = case_budget(cases, file, rng)
     budget_table = list(budget_rows(budget, parts))
-    write_csv(table.with_name("budget.csv"), FigureRow._fields, budget_table)
-    varied_costs = costs(cases)
-    rows = [_sensitivity_row(varied_cost) for varied_cost in varied_costs]
-    write_csv(table.with_name("sensitivity.csv"), SENSITIVITY_COLUMNS, rows)
+    budget_file = table.with_name("budget.csv")
+    write_csv(budget_file, FigureRow._fields, budget_table)
+    by_measure: dict[str, list[Cost]] = {}
+    rows = []
+    for cost in costs(cases):
+        rows.append(_sensitivity_row(cost))
+        by_measure.setdefault(cost.measure, []).append(cost)
+    sensitivity_file = table.with_name("sensitivity.csv")
+    write_csv(sensitivity_file, SENSITIVITY_COLUMNS, rows)
     findings = []
     measure_costs = {}
-    for measure in dict.fromkeys(cost.measure for cost in varied_costs):
-        of_it = [cost for cost in varied_costs if cost.measure == measure]
-        if max(float(cost.level.max()) for cost in of_it) > 0:
-            figure = cost_chart(of_it)
-            measure_costs[WORDS[measure]] = page_costs(of_it, figure)
-            write_whole(table.with_name(f"sensitivity_{measure}.png"), png(figure))
-            findings.append(finding(of_it))
+    for measure, parameter_costs in by_measure.items():
+        if any(cost.level.max() > 0 for cost in parameter_costs):
+            figure = cost_chart(parameter_costs)
+            measure_costs[WORDS[measure]] = page_costs(parameter_costs, figure)
+            chart_file = table.with_name(f"sensitivity_{measure}.png")
+            write_whole(chart_file, png(figure))
+            findings.append(finding(parameter_costs))
     summary = {
         "cases": cases.cases,
         "failed": sum(because.values()),
@@ -433,34 +506,28 @@ def write_results(table: Path, file: BenchFile, seed: int) -> dict[str, Any]:
         **budget,
         "findings": findings,
     }
-    write_campaign_page(table.with_name(PAGE_FILE), summary, budget_table, measure_costs)
+    page_file = table.with_name(PAGE_FILE)
+    write_campaign_page(page_file, summary, budget_table, measure_costs)
     return summary
 
 
 def lines_of(summary: dict[str, Any]) -> list[str]:
     """The summary's lines on the terminal."""
     lines = [f"{summary['cases']} cases in {summary['table']}, sha256 {summary['sha256']}"]
-    lines += [
-        f"{count} failed: {line}"
-        for line, count in list(summary["failed_because"].items())[:MAX_REASONS]
-    ]
-    lines.append(
-        f"{'availability':20}{100 * summary['availability']:.4g} %, {summary['wrong']} wrong"
-        " answers"
-    )
-    if summary["bias_arcsec"] is not None:
-        lines.append(
-            f"{'bias':20}{', '.join(f'{value:.3g}' for value in summary['bias_arcsec'])} arcsec"
-            " about x, y, z"
-        )
+    reasons = list(summary["failed_because"].items())
+    for reason, count in reasons[:MAX_REASONS]:
+        lines.append(f"{count} failed: {reason}")
+    availability_percent = 100 * summary["availability"]
+    wrong = summary["wrong"]
+    lines.append(f"{'availability':20}{availability_percent:.4g} %, {wrong} wrong answers")
+    bias_arcsec = summary["bias_arcsec"]
+    if bias_arcsec is not None:
+        bias = ", ".join(f"{value:.3g}" for value in bias_arcsec)
+        lines.append(f"{'bias':20}{bias} arcsec about x, y, z")
         for part, name in (*PARTS.items(), ("scatter", SCATTER)):
             axes: Axes | None = summary[f"{part}_arcsec"]
             if axes is not None:
-                values = (
-                    "-" if value is None else f"{value:.3g} arcsec {axis}"
-                    for axis, value in asdict(axes).items()
-                )
-                lines.append(f"{name:20}{', '.join(values)}")
+                lines.append(f"{name:20}{_axes_text(axes)}")
     centroids = summary["centroids"]
     if centroids is not None:
         sigma_x_px, sigma_y_px = centroids["sigma_x_px"], centroids["sigma_y_px"]
@@ -470,3 +537,14 @@ def lines_of(summary: dict[str, Any]) -> list[str]:
         lines.append(f"{'centroids':20}{sigma}, {share}, {false}")
     lines.append(f"{'limit of its stars':20}{limit_text(summary['limit_arcsec'])}")
     return [*lines, *summary["notes"], *summary["findings"]]
+
+
+def _axes_text(axes: Axes) -> str:
+    """A part of the budget across and about the boresight."""
+    texts = []
+    for axis, value in asdict(axes).items():
+        if value is None:
+            texts.append("-")
+        else:
+            texts.append(f"{value:.3g} arcsec {axis}")
+    return ", ".join(texts)

@@ -148,7 +148,8 @@ def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
         "render": {"quantisation": "round", "motion": "off", "brightest_v_mag": 2.0},
     }
     with TemporaryDirectory() as folder, ExitStack() as stack:
-        (Path(folder) / "low.tle").write_text(TLE)
+        orbit = Path(folder) / "low.tle"
+        orbit.write_text(TLE)
         benches = {}
         for name in names:
             tables = dict(common)
@@ -157,7 +158,8 @@ def opened(names: tuple[str, ...]) -> Iterator[dict[str, Bench]]:
                 tables["sky.bodies"] = bodies
             if spacecraft:
                 tables["spacecraft"] = spacecraft
-            path = Path(folder) / f"{name.replace(' ', '_')}.toml"
+            file_name = name.replace(" ", "_")
+            path = Path(folder) / f"{file_name}.toml"
             benches[name] = stack.enter_context(study_bench(path, tables))
         yield benches
 
@@ -180,9 +182,11 @@ def attitude(bench: Bench, body: str, off_deg: float, t_ns: int) -> FloatArray:
     else:
         # along declination, away from the near pole
         beside = north * (-np.sign(disc.direction[2]) or 1.0)
-    across = beside - (beside @ disc.direction) * disc.direction
+    along_direction = (beside @ disc.direction) * disc.direction
+    across = beside - along_direction
     across /= np.linalg.norm(across)
-    x, y, z = np.cos(off_rad) * disc.direction + np.sin(off_rad) * across
+    towards = np.cos(off_rad) * disc.direction + np.sin(off_rad) * across
+    x, y, z = towards
     ra_deg = float(np.degrees(np.arctan2(y, x)))
     dec_deg = float(np.degrees(np.arcsin(z)))
     return from_radec_roll_deg(ra_deg, dec_deg, 0.0)
@@ -255,16 +259,21 @@ def measure_cost(benches: Mapping[str, Bench], scene: BodyScene, rounds: int) ->
     if bench.moving is None or scene.body not in bench.moving.names:
         aimed = benches["all"]
     q = attitude(aimed, scene.body, scene.off_deg, scene.t_ns)
-    without, shown = fastest((benches["nothing"], bench), q, scene.t_ns, scene.step_ns, rounds)
+    empty = benches["nothing"]
+    without, shown = fastest((empty, bench), q, scene.t_ns, scene.step_ns, rounds)
     view = bench.view(q, None, scene.t_ns)
+    cost_ms = shown.wall_ms - without.wall_ms
+    cpu_ms = shown.cpu_ms - without.cpu_ms
+    discs = " ".join(disc.name for disc in bench.discs(view))
+    stars = bench.draw(q, t_ns=scene.t_ns).star_count
     return BodyCost(
         scene=scene.name,
         frame_ms=shown.wall_ms,
         without_ms=without.wall_ms,
-        cost_ms=shown.wall_ms - without.wall_ms,
-        cpu_ms=shown.cpu_ms - without.cpu_ms,
-        discs=" ".join(disc.name for disc in bench.discs(view)),
-        stars=bench.draw(q, t_ns=scene.t_ns).star_count,
+        cost_ms=cost_ms,
+        cpu_ms=cpu_ms,
+        discs=discs,
+        stars=stars,
     )
 
 
@@ -319,14 +328,17 @@ def moon(radius_px: float, phase_deg: float) -> Disc:
     side = np.cross(ahead, BESIDE_AXIS)
     side /= np.linalg.norm(side)
     phase = np.radians(phase_deg)
+    radius_rad = radius_px / FOCAL_PX
+    sun = -np.cos(phase) * ahead + np.sin(phase) * side
+    pole = np.array([0.0, 1.0, 0.0])
     disc = Disc(
         name="Moon",
         direction=ahead,
-        distance_km=1 / np.sin(radius_px / FOCAL_PX),
+        distance_km=1 / np.sin(radius_rad),
         equator_km=1.0,
         polar_km=1.0,
-        pole=np.array([0.0, 1.0, 0.0]),
-        sun=-np.cos(phase) * ahead + np.sin(phase) * side,
+        pole=pole,
+        sun=sun,
         law="lunar-lambert",
         normal_e_per_s_sr=1.0,
         lunar_share=lunar_share(phase_deg),
@@ -336,7 +348,9 @@ def moon(radius_px: float, phase_deg: float) -> Disc:
 
 def middle_direction() -> FloatArray:
     """The unit vector to the disc's centre."""
-    ahead = np.array([MIDDLE_PX[0] / FOCAL_PX, MIDDLE_PX[1] / FOCAL_PX, 1.0])
+    x = MIDDLE_PX[0] / FOCAL_PX
+    y = MIDDLE_PX[1] / FOCAL_PX
+    ahead = np.array([x, y, 1.0])
     return np.asarray(ahead / np.linalg.norm(ahead))
 
 
@@ -344,14 +358,18 @@ def drawn_discs(disc: Disc, camera: Camera) -> tuple[FloatArray, FloatArray]:
     """The images (h, w) of a disc as it is drawn, and of a point in its place."""
     psf = GaussianPsf(SIGMA_PX)
     size_px = camera.resolution_px
-    with Renderer(Target(size_px, psf)) as renderer:
+    target = Target(size_px, psf)
+    with Renderer(target) as renderer:
         x_px, y_px = camera.project(disc.direction[None])
         star = np.zeros(1, dtype=np.intp)
         side_px = renderer.footprint_px
-        point = pack_sprites(x_px, y_px, np.array([1e6]), star, size_px, side_px)
-        view = DiscView(camera, psf, (Pose(np.eye(3)),))
+        rate = np.array([1e6])
+        point = pack_sprites(x_px, y_px, rate, star, size_px, side_px)
+        pose = Pose(np.eye(3))
+        view = DiscView(camera, psf, (pose,))
         lights = tuple(disc_lights(disc, view, covers=True))
-        renderer.draw(replace(join_sprites([], side_px), extended=lights))
+        nothing = join_sprites([], side_px)
+        renderer.draw(replace(nothing, extended=lights))
         as_disc = renderer.linear().astype(np.float64)
         renderer.draw(point)
         as_point = renderer.linear().astype(np.float64)
@@ -371,18 +389,24 @@ def exactness(radius_px: float, phase_deg: float) -> Exactness:
     brightest = truth.max()
     limb_px = np.nan
     if radius_px >= LIMB_PX and phase_deg <= 90:
-        off_px = edges_px(drawn, radius_px, phase_deg) - edges_px(truth, radius_px, phase_deg)
+        true_edges_px = edges_px(truth, radius_px, phase_deg)
+        drawn_edges_px = edges_px(drawn, radius_px, phase_deg)
+        off_px = drawn_edges_px - true_edges_px
         limb_px = float(np.nanmax(np.abs(off_px)))
     middle_px = np.subtract(center_of_mass(drawn), center_of_mass(truth))
+    flux_off = float(drawn.sum() / truth.sum() - 1)
+    pixel_off = np.abs(drawn - truth).max()
+    point_pixel_off = np.abs(as_point - truth).max()
+    middle_off_px = float(np.abs(middle_px).max())
     return Exactness(
         body=disc.name,
         phase_deg=phase_deg,
         radius_px=radius_px,
-        flux_off=float(drawn.sum() / truth.sum() - 1),
-        middle_off_px=float(np.abs(middle_px).max()),
+        flux_off=flux_off,
+        middle_off_px=middle_off_px,
         limb_off_px=limb_px,
-        pixel_off=float(np.abs(drawn - truth).max() / brightest),
-        point_pixel_off=float(np.abs(as_point - truth).max() / brightest),
+        pixel_off=float(pixel_off / brightest),
+        point_pixel_off=float(point_pixel_off / brightest),
     )
 
 
@@ -392,8 +416,10 @@ def traced(disc: Disc, camera: Camera) -> FloatArray:
     """
     from scipy.special import ndtr
 
-    radius_px = np.tan(disc.radius_rad) * camera.focal_length_px * 1.001
-    count = int(np.clip(RAYS_A_PX * 2 * radius_px, MIN_RAYS, MAX_RAYS))
+    limb_tangent = np.tan(disc.radius_rad)
+    radius_px = limb_tangent * camera.focal_length_px * 1.001
+    rays_across = RAYS_A_PX * 2 * radius_px
+    count = int(np.clip(rays_across, MIN_RAYS, MAX_RAYS))
     step_px = 2 * radius_px / count
     along = (np.arange(count) + 0.5) * step_px - radius_px
     (x_mid,), (y_mid,) = camera.project(disc.direction[None])
@@ -401,11 +427,16 @@ def traced(disc: Disc, camera: Camera) -> FloatArray:
     rays = camera.rays(x_px.ravel(), y_px.ravel())
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     # The solid angle of a square of the image plane: the cube of the ray's cosine to the axis
-    light = disc.radiance(rays) * (step_px / camera.focal_length_px) ** 2 * rays[:, 2] ** 3
+    step_rad = step_px / camera.focal_length_px
+    solid_angle = step_rad**2
+    light = disc.radiance(rays) * solid_angle * rays[:, 2] ** 3
     width, height = camera.resolution_px
-    across = np.diff(ndtr(edges_in_sigmas(width, x_mid + along, SIGMA_PX[0])), axis=1)
-    down = np.diff(ndtr(edges_in_sigmas(height, y_mid + along, SIGMA_PX[1])), axis=1)
-    return np.asarray(down.T @ light.reshape(count, count) @ across)
+    x_edges = edges_in_sigmas(width, x_mid + along, SIGMA_PX[0])
+    across = np.diff(ndtr(x_edges), axis=1)
+    y_edges = edges_in_sigmas(height, y_mid + along, SIGMA_PX[1])
+    down = np.diff(ndtr(y_edges), axis=1)
+    lattice = light.reshape(count, count)
+    return np.asarray(down.T @ lattice @ across)
 
 
 def edges_in_sigmas(pixels: int, places_px: FloatArray, sigma_px: float) -> FloatArray:
@@ -424,21 +455,31 @@ def edges_px(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArra
     half = image.shape[0] // 2
     lit = 1.0 if phase_deg else np.pi  # radians to either side of the Sun's
     sun = np.cross(middle_direction(), BESIDE_AXIS)
-    angle = np.arctan2(sun[1], sun[0]) + np.linspace(-lit, lit, PLACES)
+    sun_rad = np.arctan2(sun[1], sun[0])
+    angle = sun_rad + np.linspace(-lit, lit, PLACES)
     steps = np.linspace(-3.0, 3.0, 241)
     from_middle = radius_px + steps[None, :]
-    x_px = half + MIDDLE_PX[0] + from_middle * np.cos(angle)[:, None]
-    y_px = half + MIDDLE_PX[1] + from_middle * np.sin(angle)[:, None]
+    cosine = np.cos(angle)[:, None]
+    x_from_middle = from_middle * cosine
+    x_px = half + MIDDLE_PX[0] + x_from_middle
+    sine = np.sin(angle)[:, None]
+    y_from_middle = from_middle * sine
+    y_px = half + MIDDLE_PX[1] + y_from_middle
     profile = map_coordinates(image, [y_px, x_px], order=3, mode="nearest")
     level = profile[:, :1] / 2
     below = profile < level
-    first = np.maximum(np.argmax(below, axis=1), 1)
+    first_below = np.argmax(below, axis=1)
+    first = np.maximum(first_below, 1)
     rows = np.arange(PLACES)
     high = profile[rows, first - 1]
     low = profile[rows, first]
-    share = (high - level[:, 0]) / (high - low)
-    place = steps[first - 1] + (steps[1] - steps[0]) * share
-    return np.asarray(np.where(below.any(axis=1), place, np.nan))
+    fall = high - low
+    above_level = high - level[:, 0]
+    share = above_level / fall
+    step_px = steps[1] - steps[0]
+    place = steps[first - 1] + step_px * share
+    falls = below.any(axis=1)
+    return np.asarray(np.where(falls, place, np.nan))
 
 
 @dataclass(frozen=True, slots=True)
@@ -469,22 +510,26 @@ def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: in
     bench = benches[body]
     start_ns = DAY_SIDE_NS if body == "Earth" else 0
     q = attitude(bench, body, off_deg, start_ns)
-    without, shown = fastest((benches["nothing"], bench), q, start_ns, FRAME_NS, rounds)
+    empty = benches["nothing"]
+    without, shown = fastest((empty, bench), q, start_ns, FRAME_NS, rounds)
     drawn = bench.draw(q, t_ns=start_ns)
     levels = drawn.levels.copy()
     light = bench.renderer.linear()
     white = bench.flux_at_white_e_per_s
     brightest = max(float(light.max()), 1e-9)
     over_white = levels[light > white]
+    over_white_mag = 2.5 * math.log10(brightest / white)
+    is_white = over_white == bench.calibration.response.white
+    finite = bool(np.isfinite(light).all())
     return Near(
         body=body,
         off_deg=off_deg,
         frame_ms=shown.wall_ms,
         cpu_ms=shown.cpu_ms,
         without_ms=without.wall_ms,
-        over_white_mag=2.5 * math.log10(brightest / white),
-        finite=bool(np.isfinite(light).all()),
-        white_is_white=bool((over_white == bench.calibration.response.white).all()),
+        over_white_mag=over_white_mag,
+        finite=finite,
+        white_is_white=bool(is_white.all()),
         stars=drawn.star_count,
     )
 
@@ -521,7 +566,8 @@ def run(directory: Path, quick: bool = False) -> Judged:
     draw_costs(directory / "bodies_cost", costs, load)
     draw_sizes(directory / "bodies_size", sizes)
     draw_limits(directory / "bodies_limits", nears, load)
-    return load.judged([cost_line(costs), size_line(sizes), limits_line(nears)])
+    findings = [cost_line(costs), size_line(sizes), limits_line(nears)]
+    return load.judged(findings)
 
 
 def unseen_ms(costs: Sequence[BodyCost]) -> float:
@@ -546,8 +592,10 @@ def cost_line(costs: Sequence[BodyCost]) -> str:
 
 def size_line(sizes: Sequence[Exactness]) -> str:
     """How exact discs are, in words."""
-    limb_px = float(np.nanmax([size.limb_off_px for size in sizes]))
-    flux_percent = 100 * max(abs(size.flux_off) for size in sizes)
+    limbs_px = [size.limb_off_px for size in sizes]
+    limb_px = float(np.nanmax(limbs_px))
+    largest_share = max(abs(size.flux_off) for size in sizes)
+    flux_percent = 100 * largest_share
     largest_px = max(size.radius_px for size in sizes)
     return (
         f"discs of {sizes[0].radius_px:g} to {largest_px:g} px in radius have their light within"
@@ -575,14 +623,16 @@ def light_words(nears: Sequence[Near]) -> str:
 def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> None:
     """What each scene costs."""
     dearest = max(costs, key=lambda cost: cost.cpu_ms)
+    unseen = unseen_ms(costs)
     finding = (
-        f"Between steps of an orbit bodies that are no discs cost at most {unseen_ms(costs):.1f}"
+        f"Between steps of an orbit bodies that are no discs cost at most {unseen:.1f}"
         f" ms; the dearest body, {dearest.scene}, {dearest.cpu_ms:.0f} ms"
     )
     title = load.title(finding, "Bodies of each kind on top of a frame")
     names = [capital(cost.scene) for cost in costs]
     times_ms = [round(max(cost.cpu_ms, 0.0), 2) for cost in costs]
-    with chart(path, title, note=load.note(COST_NOTE), height_inch=4.4) as (axes,):
+    note = load.note(COST_NOTE)
+    with chart(path, title, note=note, height_inch=4.4) as (axes,):
         value_bars(axes, names, times_ms, BLUE)
         axes.set_xlabel("processor time on top [ms]")
 
@@ -594,39 +644,51 @@ def size_line_of(error: str, style: str = "-", marker: str = "o", named: bool = 
 
 def draw_sizes(path: Path, sizes: Sequence[Exactness]) -> None:
     """The errors of discs against their radius."""
+    flux_limit = LevelLine(FLUX_LIMIT, "limit")
     light = PanelSpec(
         (size_line_of("flux_off"),),
         "error [share]",
         title="Light of the whole disc",
-        levels=(LevelLine(FLUX_LIMIT, "limit"),),
+        levels=(flux_limit,),
         **LOG_LOG,
     )
+    limb = size_line_of("limb_off_px", marker="s", named=False)
+    middle = size_line_of("middle_off_px", ":")
+    limb_limit = LevelLine(LIMB_LIMIT_PX, "limit")
     place = PanelSpec(
-        (size_line_of("limb_off_px", marker="s", named=False), size_line_of("middle_off_px", ":")),
+        (limb, middle),
         "error [px]",
         title="Place of its limb (squares, solid) and of its middle (dotted)",
-        levels=(LevelLine(LIMB_LIMIT_PX, "limit"),),
+        levels=(limb_limit,),
         **LOG_LOG,
     )
+    radii_px = sorted({size.radius_px for size in sizes})
+    disc = size_line_of("pixel_off")
+    point = size_line_of("point_pixel_off", ":", "x", False)
+    point_limit = LevelLine(DISC_PX / 2, HIDDEN, MUTED)
     pixel = PanelSpec(
-        (size_line_of("pixel_off"), size_line_of("point_pixel_off", ":", "x", False)),
+        (disc, point),
         "error [of the brightest]",
         "radius of the Moon's disc [px]",
         title="Its worst pixel, drawn as a disc (solid) and as a point (crosses, dotted)",
-        places=(LevelLine(DISC_PX / 2, HIDDEN, MUTED),),
-        xticks=sorted({size.radius_px for size in sizes}),
+        places=(point_limit,),
+        xticks=radii_px,
         **LOG_LOG,
     )
-    looks = looks_of({phase_deg: f"{phase_deg:g} deg" for phase_deg in PHASES_DEG})
+    phases = {phase_deg: f"{phase_deg:g} deg" for phase_deg in PHASES_DEG}
+    looks = looks_of(phases)
     layout = {"height_inch": 8.4}
     panels = (light, place, pixel)
     spec = ChartSpec(panels, lambda size: size.phase_deg, looks, SIZE_NOTE, layout=layout)
-    draw_rows(path, size_line(sizes), spec, sizes)
+    finding = size_line(sizes)
+    draw_rows(path, finding, spec, sizes)
 
 
 def draw_limits(path: Path, nears: Sequence[Near], load: Load) -> None:
     """Processor time and light as bodies come near."""
-    title = load.title(limits_line(nears), f"Every pixel's light is {light_words(nears)}")
+    light = f"Every pixel's light is {light_words(nears)}"
+    finding = limits_line(nears)
+    title = load.title(finding, light)
     bodies = dict.fromkeys(near.body for near in nears)
     looks = looks_of({body: body for body in bodies})
     spec = ChartSpec(LIMIT_PANELS, lambda near: near.body, looks, LIMIT_NOTE)

@@ -95,21 +95,28 @@ def observed_dots(
 
     def noisy_px(places: FloatArray, false_count: int, size: int) -> FloatArray:
         """Places along an axis with their noise, and false ones anywhere."""
-        scattered = places + rng.normal(0, faults.noise_px, len(places))
-        return np.concatenate([scattered, rng.uniform(0, size, false_count)])
+        noise_px = rng.normal(0, faults.noise_px, len(places))
+        scattered = places + noise_px
+        false_px = rng.uniform(0, size, false_count)
+        return np.concatenate([scattered, false_px])
 
     centroids: list[FloatArray] = []
     for frame in range(plan.frames):
-        dots = np.flatnonzero(plan.lit[:, frame] & inside)
-        dots = dots[rng.uniform(size=len(dots)) >= faults.lost]
-        false_count = int(rng.poisson(faults.false * len(dots)))
+        lit = plan.lit[:, frame]
+        dots = np.flatnonzero(lit & inside)
+        chance = rng.uniform(size=len(dots))
+        dots = dots[chance >= faults.lost]
+        false_mean = faults.false * len(dots)
+        false_count = int(rng.poisson(false_mean))
         x = noisy_px(x_px[dots], false_count, width)
         y = noisy_px(y_px[dots], false_count, height)
         number = np.full(len(x), float(frame))
         centroids.append(np.stack([number, x, y]))
     frames, x, y = np.concatenate(centroids, axis=1)
     frame_of = frames.astype(np.intp)
-    return Observed(frame_of, np.zeros_like(frame_of), x, y, np.ones(len(frame_of)))
+    poses = np.zeros_like(frame_of)
+    sigmas_px = np.ones(len(frame_of))
+    return Observed(frame_of, poses, x, y, sigmas_px)
 
 
 def turned(a_deg: float, b_deg: float, c_deg: float = 0.0) -> FloatArray:
@@ -141,14 +148,20 @@ class TracedBench:
         at, ray = self.behind_lens(directions)
         screen = turned(*self.screen_tilt_deg)
         scale = self.focal_mm / DESIGN_FOCAL_MM
-        to_screen_mm = self.to_lens_mm + (BACK_FOCUS_MM + sum(THICKNESS_MM)) * scale
+        behind_mm = (BACK_FOCUS_MM + sum(THICKNESS_MM)) * scale
+        to_screen_mm = self.to_lens_mm + behind_mm
         middle = np.array([*self.screen_shift_mm, to_screen_mm])
         normal = screen[:, 2]
-        length = ((middle - at) @ normal) / (ray @ normal)
-        from_middle = at + ray * length[:, None] - middle
-        x, y = (from_middle @ screen[:, :2] / self.pitch_mm).T
+        towards_mm = (middle - at) @ normal
+        length = towards_mm / (ray @ normal)
+        hit = at + ray * length[:, None]
+        from_middle = hit - middle
+        screen_axes = screen[:, :2]
+        x, y = (from_middle @ screen_axes / self.pitch_mm).T
         width, height = self.resolution_px
-        return x + (width - 1) / 2, y + (height - 1) / 2
+        x_middle_px = (width - 1) / 2
+        y_middle_px = (height - 1) / 2
+        return x + x_middle_px, y + y_middle_px
 
     def behind_lens(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Points on the last surface, mm, and directions behind it, (n, 3) in cam, of the rays of
@@ -157,26 +170,34 @@ class TracedBench:
         scale = self.focal_mm / DESIGN_FOCAL_MM
         axes = turned(*self.lens_tilt_deg)
         vertex = np.array([*self.lens_shift_mm, self.to_lens_mm])
-        ray = directions / np.linalg.norm(directions, axis=1, keepdims=True) @ axes
+        unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        ray = unit @ axes
         at = np.broadcast_to((-vertex) @ axes, ray.shape)
-        surfaces = zip(RADII_MM, INDEX[:-1], INDEX[1:], (*THICKNESS_MM, 0.0), strict=True)
+        steps_mm = (*THICKNESS_MM, 0.0)
+        surfaces = zip(RADII_MM, INDEX[:-1], INDEX[1:], steps_mm, strict=True)
         for radius, before, after, step in surfaces:
-            at, ray = _refracted(at, ray, radius * scale, before / after)
+            surface_radius_mm = radius * scale
+            at, ray = _refracted(at, ray, surface_radius_mm, before / after)
             at = at - along_axis(step * scale)
-        from_vertex = at + along_axis(sum(THICKNESS_MM) * scale)
+        thickness_mm = sum(THICKNESS_MM) * scale
+        from_vertex = at + along_axis(thickness_mm)
         return from_vertex @ axes.T + vertex, ray @ axes.T
 
     def directions(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
         """The directions (n, 3) in cam of pixels (n,), by Newton's method with differences."""
         width, height = self.resolution_px
-        u = (np.asarray(x_px) - (width - 1) / 2) * self.pitch_mm / self.focal_mm
-        v = (np.asarray(y_px) - (height - 1) / 2) * self.pitch_mm / self.focal_mm
+        x_from_middle_px = np.asarray(x_px) - (width - 1) / 2
+        u = x_from_middle_px * self.pitch_mm / self.focal_mm
+        y_from_middle_px = np.asarray(y_px) - (height - 1) / 2
+        v = y_from_middle_px * self.pitch_mm / self.focal_mm
         ones = np.ones_like(u)
         step = 1e-6
         for _ in range(12):
             x, y = self.places_px(np.column_stack([u, v, ones]))
-            xu, yu = self.places_px(np.column_stack([u + step, v, ones]))
-            xv, yv = self.places_px(np.column_stack([u, v + step, ones]))
+            right = np.column_stack([u + step, v, ones])
+            xu, yu = self.places_px(right)
+            below = np.column_stack([u, v + step, ones])
+            xv, yv = self.places_px(below)
             a = (xu - x) / step
             b = (xv - x) / step
             c = (yu - y) / step
@@ -184,10 +205,13 @@ class TracedBench:
             area = a * d - b * c
             off_x = x - x_px
             off_y = y - y_px
-            u = u - (d * off_x - b * off_y) / area
-            v = v - (a * off_y - c * off_x) / area
+            u_step = (d * off_x - b * off_y) / area
+            u = u - u_step
+            v_step = (a * off_y - c * off_x) / area
+            v = v - v_step
         length = np.sqrt(u**2 + v**2 + 1)
-        return np.column_stack([u, v, ones]) / length[:, None]
+        slopes = np.column_stack([u, v, ones])
+        return slopes / length[:, None]
 
 
 def along_axis(mm: float) -> FloatArray:
@@ -203,15 +227,21 @@ def _refracted(
     """
     centre = along_axis(radius)
     to_centre = at - centre
-    half = (ray * to_centre).sum(axis=1)
-    root = np.sqrt(half**2 - (to_centre**2).sum(axis=1) + radius**2)
+    towards = ray * to_centre
+    half = towards.sum(axis=1)
+    square = (to_centre**2).sum(axis=1)
+    root = np.sqrt(half**2 - square + radius**2)
     length = -half - np.sign(radius) * root
     hit = at + ray * length[:, None]
     normal = (hit - centre) / radius
-    cosine = -(ray * normal).sum(axis=1)
-    cosine_behind = np.sqrt(1 - ratio**2 * (1 - cosine**2))
+    against = ray * normal
+    cosine = -against.sum(axis=1)
+    cosine_square = cosine**2
+    sine_square = 1 - cosine_square
+    cosine_behind = np.sqrt(1 - ratio**2 * sine_square)
     bend = ratio * cosine - cosine_behind
-    return hit, ratio * ray + bend[:, None] * normal
+    along_normal = bend[:, None] * normal
+    return hit, ratio * ray + along_normal
 
 
 BENCH = TracedBench(lens_shift_mm=(8.0, -5.0), lens_tilt_deg=(4.0, 2.5))
@@ -279,7 +309,10 @@ def run(directory: Path, quick: bool = False) -> list[str]:
         f" {best.stars_rms_arcsec:.2g}"
     )
     draw(directory / "geometry", finding, outcomes, uncalibrated)
-    return [finding, *(line_of(outcome) for outcome in usual)]
+    lines = [finding]
+    for outcome in usual:
+        lines.append(line_of(outcome))
+    return lines
 
 
 def frames_of(quick: bool) -> list[Frames]:
@@ -308,8 +341,10 @@ def line_of(outcome: CalibrationOutcome) -> str:
 def ideal_arcsec() -> float:
     """The error of stars without any calibration, arcsec rms over the screen."""
     nominal = _nominal()
-    still = Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, np.eye(4)[:1])
-    return float(np.sqrt(np.square(_star_errors(still)).mean()))
+    still_turn = np.eye(4)[:1]
+    still = Geometry(nominal.monitor, nominal.q_cam_to_mon, TRACKER, still_turn)
+    errors = _star_errors(still)
+    return float(np.sqrt(np.square(errors).mean()))
 
 
 def _nominal() -> Nominal:
@@ -322,15 +357,19 @@ def _nominal() -> Nominal:
 def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
     rng = np.random.default_rng(SEED)
     plan = plan_dots(BENCH.resolution_px, frames.count, frames.dots, rng)
-    x_px, y_px = TRACKER.project(BENCH.directions(plan.x_px, plan.y_px))
-    dots = observed_dots(plan, x_px, y_px, TRACKER.resolution_px, DotFaults(frames.noise_px), rng)
+    rays = BENCH.directions(plan.x_px, plan.y_px)
+    x_px, y_px = TRACKER.project(rays)
+    faults = DotFaults(frames.noise_px)
+    dots = observed_dots(plan, x_px, y_px, TRACKER.resolution_px, faults, rng)
     nominal = _nominal()
-    problem, data = matched(plan, nominal, dots, first_look(plan, nominal, dots, rng))
+    look = first_look(plan, nominal, dots, rng)
+    problem, data = matched(plan, nominal, dots, look)
     for model in MODELS:
         free = Model(model.parameters)
         of_dots = held_out(problem, model.name, free, model.field_degree, data)
         fitted = fit(problem, free, model.field_degree, data)
         errors = _star_errors(fitted.geometry)
+        stars_rms_arcsec = float(np.sqrt((errors**2).mean()))
         yield CalibrationOutcome(
             frames=frames.count,
             dots_per_frame=frames.dots,
@@ -338,7 +377,7 @@ def _outcomes(frames: Frames) -> Iterator[CalibrationOutcome]:
             model=model.name,
             centroids=len(data),
             held_out_arcsec=of_dots.rms_arcsec,
-            stars_rms_arcsec=float(np.sqrt((errors**2).mean())),
+            stars_rms_arcsec=stars_rms_arcsec,
             stars_max_arcsec=float(errors.max()),
         )
 
@@ -350,7 +389,8 @@ def _star_errors(geometry: Geometry) -> np.ndarray[tuple[int], np.dtype[np.float
     x = rng.uniform(-0.5, width - 0.5, STARS)
     y = rng.uniform(-0.5, height - 0.5, STARS)
     monitor = geometry.monitor
-    in_image = BENCH.directions(x, y) @ monitor.cam_to_image.T
+    directions = BENCH.directions(x, y)
+    in_image = directions @ monitor.cam_to_image.T
     shown_x, shown_y = monitor.project(in_image)
     off_px = np.hypot(shown_x - x, shown_y - y)
     return np.asarray(off_px * ARCSEC_PER_RAD / monitor.focal_length_px)
@@ -362,23 +402,27 @@ def draw(
     """The errors of each model, by the number of centroids and by their noise."""
     models = dict.fromkeys(outcome.model for outcome in outcomes)
     labels = {name: SHORT.get(name, name) for name in models}
+    uncalibrated = LevelLine(uncalibrated_arcsec, "uncalibrated", style=":")
+    fails = LevelLine(FAIL_ARCSEC, "fails above")
     levels = (
-        LevelLine(uncalibrated_arcsec, "uncalibrated", style=":"),
-        LevelLine(FAIL_ARCSEC, "fails above"),
+        uncalibrated,
+        fails,
     )
-    by_dots = replace(
-        error_panel("centroids", has_usual_noise), xlabel="centroids [number]", levels=levels
-    )
+    dots_panel = error_panel("centroids", has_usual_noise)
+    by_dots = replace(dots_panel, xlabel="centroids [number]", levels=levels)
+    noise_panel = error_panel("noise_px", has_usual_size)
+    noises_px = sorted({outcome.noise_px for outcome in outcomes})
     by_noise = replace(
-        error_panel("noise_px", has_usual_size),
+        noise_panel,
         xlabel="noise of a centroid [px]",
         levels=levels,
-        xticks=sorted({outcome.noise_px for outcome in outcomes}),
+        xticks=noises_px,
     )
+    looks = looks_of(labels, MARKERS)
     spec = ChartSpec(
         (by_dots, by_noise),
         lambda row: row.model,
-        looks_of(labels, MARKERS),
+        looks,
         NOTE,
         layout={"share_x": False},
     )
@@ -407,4 +451,5 @@ def has_usual_noise(outcome: CalibrationOutcome) -> bool:
 
 def has_usual_size(outcome: CalibrationOutcome) -> bool:
     """Whether an outcome varies only the noise of its centroids."""
-    return (outcome.frames, outcome.dots_per_frame) == USUAL_SIZE
+    size = (outcome.frames, outcome.dots_per_frame)
+    return size == USUAL_SIZE

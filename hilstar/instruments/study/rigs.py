@@ -141,7 +141,8 @@ def run(directory: Path, quick: bool = False) -> list[str]:
     """Predict every figure, and write `rigs.csv` and its chart; a line for each. Raises
     InputError.
     """
-    places = place_rows(4 if quick else ATTITUDES)
+    count = 4 if quick else ATTITUDES
+    places = place_rows(count)
     codes_share = places[0].with_hilstar / places[0].predicted
     rows = [*places, *scatter_rows(quick), *constant_rows(codes_share)]
     rows += [*naples_rows(), *p13_rows()]
@@ -154,10 +155,14 @@ def attitudes(count: int) -> list[FloatArray]:
     """Random attitudes, evenly over the sky: `count` quaternions q_icrs_to_cam."""
     rng = np.random.default_rng(SEED)
     ra_deg = rng.uniform(0.0, 360.0, count)
-    dec_deg = np.degrees(np.arcsin(rng.uniform(-1.0, 1.0, count)))
+    dec_sine = rng.uniform(-1.0, 1.0, count)
+    dec_deg = np.degrees(np.arcsin(dec_sine))
     roll_deg = rng.uniform(0.0, 360.0, count)
     angles = zip(ra_deg, dec_deg, roll_deg, strict=True)
-    return [from_radec_roll_deg(*radec_roll_deg) for radec_roll_deg in angles]
+    quaternions = []
+    for radec_roll_deg in angles:
+        quaternions.append(from_radec_roll_deg(*radec_roll_deg))
+    return quaternions
 
 
 def place_rows(count: int) -> list[RigFigure]:
@@ -176,38 +181,31 @@ def place_rows(count: int) -> list[RigFigure]:
         for q_icrs_to_cam in attitudes(count):
             turn = CameraTurn(q_icrs_to_cam, np.zeros(3))
             rounded.append(pixel_errors(bench, turn))
-            errors = lone_errors(bench, turn, bench.draw(q_icrs_to_cam).levels)
+            levels = bench.draw(q_icrs_to_cam).levels
+            errors = lone_errors(bench, turn, levels)
             placed.append(errors.off_px["fit"])
             light += [star.flux_mag for star in errors.stars]
-    pixel_arcsec = rms(np.concatenate(rounded, axis=1)) * PIXEL_ARCSEC
-    codes_arcsec = rms(np.concatenate(placed, axis=1)) * PIXEL_ARCSEC
-    return [
-        RigFigure.of(
-            LASSI,
-            "places, one pixel a star",
-            PLACE_UNIT,
-            OUTSIDE_PIXEL_ARCSEC,
-            pixel_arcsec,
-            f"{SIMULATOR}; {OUTSIDE}",
-            with_hilstar=codes_arcsec,
-        ),
-        RigFigure.of(
-            LASSI,
-            "places, hilstar's codes",
-            PLACE_UNIT,
-            OUTSIDE_CODES_ARCSEC,
-            codes_arcsec,
-            OUTSIDE,
-        ),
-        RigFigure.of(
-            LASSI,
-            "light, hilstar's codes",
-            "mag rms",
-            OUTSIDE_CODES_MAG,
-            rms(np.array(light)),
-            OUTSIDE,
-        ),
-    ]
+    rounded_px = np.concatenate(rounded, axis=1)
+    pixel_arcsec = rms(rounded_px) * PIXEL_ARCSEC
+    placed_px = np.concatenate(placed, axis=1)
+    codes_arcsec = rms(placed_px) * PIXEL_ARCSEC
+    light_mag = rms(np.array(light))
+    pixel_places = RigFigure.of(
+        LASSI,
+        "places, one pixel a star",
+        PLACE_UNIT,
+        OUTSIDE_PIXEL_ARCSEC,
+        pixel_arcsec,
+        f"{SIMULATOR}; {OUTSIDE}",
+        with_hilstar=codes_arcsec,
+    )
+    codes_places = RigFigure.of(
+        LASSI, "places, hilstar's codes", PLACE_UNIT, OUTSIDE_CODES_ARCSEC, codes_arcsec, OUTSIDE
+    )
+    codes_light = RigFigure.of(
+        LASSI, "light, hilstar's codes", "mag rms", OUTSIDE_CODES_MAG, light_mag, OUTSIDE
+    )
+    return [pixel_places, codes_places, codes_light]
 
 
 def pixel_errors(bench: Bench, turn: CameraTurn) -> FloatArray:
@@ -215,14 +213,17 @@ def pixel_errors(bench: Bench, turn: CameraTurn) -> FloatArray:
     sprites = turning_sprites(bench, turn)
     places = np.stack([sprites.x_px, sprites.y_px])
     size_px = np.array(bench.camera.resolution_px)[:, None]
-    from_middle = np.abs(places - (size_px - 1) / 2)
+    middle_px = (size_px - 1) / 2
+    from_middle = np.abs(places - middle_px)
     inside = (from_middle < size_px / 2).all(axis=0)
-    return np.asarray(np.rint(places[:, inside]) - places[:, inside])
+    inside_px = places[:, inside]
+    return np.asarray(np.rint(inside_px) - inside_px)
 
 
 def rms(values: FloatArray) -> float:
     """The root of the mean square of all values."""
-    return float(np.sqrt(np.mean(np.square(values))))
+    mean_square = np.mean(np.square(values))
+    return float(np.sqrt(mean_square))
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,22 +242,31 @@ def rig_field() -> RigField:
     stars = load_catalog().brighter_than(FAINTEST_V_MAG)
     ra = np.radians(stars.ra_deg)
     dec = np.radians(stars.dec_deg)
-    directions = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-    directions = directions[:, directions[2] > 0.9]
+    x = np.cos(dec) * np.cos(ra)
+    y = np.cos(dec) * np.sin(ra)
+    z = np.sin(dec)
+    directions = np.stack([x, y, z])
+    in_front = directions[2] > 0.9
+    directions = directions[:, in_front]
     slopes = directions[:2] / directions[2]
     panel_size = np.array(PANEL_PX)[:, None]
-    panel_px = slopes * LENS_MM / PIXEL_MM + panel_size / 2
-    on_panel = (np.floor(panel_px) >= 0).all(axis=0)
+    panel_middle_px = panel_size / 2
+    panel_px = slopes * LENS_MM / PIXEL_MM + panel_middle_px
+    first_px = np.floor(panel_px)
+    on_panel = (first_px >= 0).all(axis=0)
     on_panel &= (panel_px < panel_size).all(axis=0)
-    own_pixel = np.floor(panel_px) + 0.5
-    shown_slopes = (own_pixel - panel_size / 2) * PIXEL_MM / LENS_MM
+    own_pixel = first_px + 0.5
+    from_middle_px = own_pixel - panel_middle_px
+    shown_slopes = from_middle_px * PIXEL_MM / LENS_MM
     principal = np.array(PRINCIPAL_PX)[:, None]
     pixel_px = FOCAL_PX * shown_slopes + principal
     true_px = FOCAL_PX * slopes + principal
     limit = np.array(CAMERA_PX)[:, None] - EDGE_PX
-    in_view = on_panel & (pixel_px > EDGE_PX).all(axis=0)
+    beyond_edge = pixel_px > EDGE_PX
+    in_view = on_panel & beyond_edge.all(axis=0)
     in_view &= (pixel_px < limit).all(axis=0)
-    return RigField(directions[:, in_view].T, pixel_px[:, in_view], true_px[:, in_view])
+    seen_directions = directions[:, in_view].T
+    return RigField(seen_directions, pixel_px[:, in_view], true_px[:, in_view])
 
 
 def centre_of_mass(image: FloatArray, columns: IntArray, rows: IntArray) -> Places:
@@ -273,8 +283,10 @@ def gaussian_grid(image: FloatArray, columns: IntArray, rows: IntArray) -> Place
     """Parabolas through the logarithms of each line's pixels, weighted by the pixels; their
     coefficients are summed over the lines (Delabie et al. 2014, J. Astronaut. Sci. 61, 60).
     """
-    stamps = np.maximum(stamps_at(image, columns, rows, GRID_HALF_PX), 1.0)
-    return columns + _vertex(stamps), rows + _vertex(stamps.transpose(0, 2, 1))
+    pixels = stamps_at(image, columns, rows, GRID_HALF_PX)
+    stamps = np.maximum(pixels, 1.0)
+    transposed = stamps.transpose(0, 2, 1)
+    return columns + _vertex(stamps), rows + _vertex(transposed)
 
 
 def _vertex(lines: FloatArray) -> FloatArray:
@@ -283,15 +295,21 @@ def _vertex(lines: FloatArray) -> FloatArray:
     Each line's coefficients are multiplied by the determinant of its normal equations.
     """
     half = lines.shape[2] // 2
-    powers = np.arange(-half, half + 1) ** np.arange(3)[:, None]
+    exponents = np.arange(3)[:, None]
+    at = np.arange(-half, half + 1)
+    powers = at**exponents
     normal = np.einsum("jp,nlp,kp->nljk", powers, lines, powers)
-    right_side = np.einsum("jp,nlp,nlp->nlj", powers, lines, np.log(lines))
+    logarithms = np.log(lines)
+    right_side = np.einsum("jp,nlp,nlp->nlj", powers, lines, logarithms)
     weight = np.linalg.det(normal)
-    solution = np.linalg.solve(normal, right_side[..., None])[..., 0] * weight[..., None]
+    columns = right_side[..., None]
+    coefficients = np.linalg.solve(normal, columns)[..., 0]
+    solution = coefficients * weight[..., None]
     linear = solution[..., 1].sum(axis=1)
     square = solution[..., 2].sum(axis=1)
     # Without a top the star stays in the middle.
-    top = np.divide(-linear, 2 * square, out=np.zeros_like(linear), where=square < 0)
+    zeros = np.zeros_like(linear)
+    top = np.divide(-linear, 2 * square, out=zeros, where=square < 0)
     return np.asarray(np.clip(top, -half, half))
 
 
@@ -319,12 +337,16 @@ def stamps_at(image: FloatArray, columns: IntArray, rows: IntArray, half: int) -
 
 def found_stars(image: FloatArray) -> tuple[IntArray, IntArray]:
     """Columns and rows (n,) by the rig's detection: the middles of lit areas, rounded down."""
-    labels, count = ndimage.label(image > DARK_DN + THRESHOLD_DN)
+    lit = image > DARK_DN + THRESHOLD_DN
+    labels, count = ndimage.label(lit)
     sizes = np.bincount(labels.ravel(), minlength=count + 1)
     wide = np.flatnonzero(sizes >= MIN_PIXELS)
     wide = wide[wide > 0]
-    middles = ndimage.center_of_mass(np.ones_like(image), labels, wide)
-    rows, columns = np.floor(np.array(middles).reshape(-1, 2)).astype(np.intp).T
+    equal = np.ones_like(image)
+    middles = ndimage.center_of_mass(equal, labels, wide)
+    middles_px = np.array(middles).reshape(-1, 2)
+    corners_px = np.floor(middles_px)
+    rows, columns = corners_px.astype(np.intp).T
     width, height = CAMERA_PX
     inside = (columns >= EDGE_PX) & (columns < width - EDGE_PX)
     inside &= (rows >= EDGE_PX) & (rows < height - EDGE_PX)
@@ -347,18 +369,26 @@ def scatter_arcsec(
     )
     detector = Detector(settings, CAMERA_PX, PITCH_UM)
     psf = GaussianPsf((PSF_SIGMA_PX, PSF_SIGMA_PX))
-    rates = np.full(places_px.shape[1], star_dn * GAIN_E_PER_DN)
-    mean_e = psf.spread(places_px[0], places_px[1], rates, (0, 0, *CAMERA_PX)).astype(np.float64)
+    star_e = star_dn * GAIN_E_PER_DN
+    rates = np.full(places_px.shape[1], star_e)
+    window = (0, 0, *CAMERA_PX)
+    light_e = psf.spread(places_px[0], places_px[1], rates, window)
+    mean_e = light_e.astype(np.float64)
     rng = np.random.default_rng(SEED)
     turns = {name: list[FloatArray]() for name in FINDERS}
     for _ in range(exposures):
-        image = detector.expose(mean_e, 0.0, rng).astype(np.float64)
+        exposed_dn = detector.expose(mean_e, 0.0, rng)
+        image = exposed_dn.astype(np.float64)
         columns, rows = found_stars(image)
         for name, finder in FINDERS.items():
-            turn = attitude_error(field, *finder(image, columns, rows))
+            places = finder(image, columns, rows)
+            turn = attitude_error(field, *places)
             if turn is not None:
                 turns[name].append(turn)
-    return {name: np.std(errors, axis=0) for name, errors in turns.items()}
+    scatter: dict[str, FloatArray] = {}
+    for name, errors in turns.items():
+        scatter[name] = np.std(errors, axis=0)
+    return scatter
 
 
 def attitude_error(field: RigField, x_px: FloatArray, y_px: FloatArray) -> FloatArray | None:
@@ -370,15 +400,20 @@ def attitude_error(field: RigField, x_px: FloatArray, y_px: FloatArray) -> Float
     off_x = x_px[:, None] - field.pixel_px[0]
     off_y = y_px[:, None] - field.pixel_px[1]
     distance_px = np.hypot(off_x, off_y)
-    matched = distance_px.min(axis=1, initial=np.inf) < MATCHED_PX
+    nearest_px = distance_px.min(axis=1, initial=np.inf)
+    matched = nearest_px < MATCHED_PX
     if matched.sum() < 3:
         return None
     star = distance_px[matched].argmin(axis=1)
-    from_axis = np.column_stack([x_px[matched], y_px[matched]]) - PRINCIPAL_PX
+    centroids_px = np.column_stack([x_px[matched], y_px[matched]])
+    from_axis = centroids_px - PRINCIPAL_PX
     rays = unit_rays(from_axis / FOCAL_PX)
-    turn = to_matrix(wahba(rays, field.directions[star], np.ones(len(rays))))
+    weights = np.ones(len(rays))
+    directions = field.directions[star]
+    turn = to_matrix(wahba(rays, directions, weights))
     twice = turn - turn.T
-    return np.array([twice[1, 0], twice[2, 1], twice[0, 2]]) / 2 * ARCSEC_PER_RAD
+    turns = np.array([twice[1, 0], twice[2, 1], twice[0, 2]])
+    return turns / 2 * ARCSEC_PER_RAD
 
 
 def about(scatter: Sequence[float] | FloatArray) -> float:
@@ -406,7 +441,8 @@ def fitted_light_dn(field: RigField, exposures: int) -> float:
     published = across_rms(SCATTER_ARCSEC[FITTED])
     # np.interp wants what it looks up in to rise; scatter falls with light.
     rising = np.log(by_light)[::-1]
-    light = np.interp(np.log(published), rising, np.log(LIGHTS_DN)[::-1])
+    rising_lights = np.log(LIGHTS_DN)[::-1]
+    light = np.interp(np.log(published), rising, rising_lights)
     return float(np.exp(light))
 
 
@@ -417,23 +453,26 @@ def scatter_rows(quick: bool) -> list[RigFigure]:
     light_dn = fitted_light_dn(field, exposures)
     before = scatter_arcsec(field, field.pixel_px, light_dn, exposures)
     after = scatter_arcsec(field, field.true_px, light_dn, exposures)
-    rows = [RigFigure.of(LASSI, "light of a star (fitted)", LIGHT_UNIT, math.nan, light_dn, "none")]
+    light = RigFigure.of(LASSI, "light of a star (fitted)", LIGHT_UNIT, math.nan, light_dn, "none")
+    rows = [light]
     for name, published in SCATTER_ARCSEC.items():
         for axis, size_of in SCATTER_AXES.items():
             figure = f"static scatter {axis}, {name}"
             if (name, axis) == (FITTED, "across"):
                 figure += " (fitted)"
-            rows.append(
-                RigFigure.of(
-                    LASSI,
-                    figure,
-                    "arcsec, sigma",
-                    size_of(published),
-                    size_of(before[name]),
-                    STATIC,
-                    with_hilstar=size_of(after[name]),
-                )
+            stated = size_of(published)
+            predicted = size_of(before[name])
+            with_hilstar = size_of(after[name])
+            row = RigFigure.of(
+                LASSI,
+                figure,
+                "arcsec, sigma",
+                stated,
+                predicted,
+                STATIC,
+                with_hilstar=with_hilstar,
             )
+            rows.append(row)
     return rows
 
 
@@ -444,18 +483,19 @@ def constant_rows(codes_share: float) -> list[RigFigure]:
     `codes_share` is the error of hilstar's codes over that of one pixel a star.
     """
     count = rig_field().pixel_px.shape[1]
-    half_sides = np.arctan(np.array(CAMERA_PX) / 2 / FOCAL_PX)
-    width_deg, height_deg = np.degrees(2 * half_sides).tolist()
+    half_slopes = np.array(CAMERA_PX) / 2 / FOCAL_PX
+    half_sides = np.arctan(half_slopes)
+    field_deg = np.degrees(2 * half_sides)
+    width_deg, height_deg = field_deg.tolist()
     turns = pixel_attitudes_arcsec(count, (width_deg, height_deg), PIXEL_ARCSEC)
     rows = []
     for axis, predicted in zip(SCATTER_AXES, turns, strict=True):
         figure = f"constant error of an attitude, {axis}"
         after = predicted * codes_share
-        rows.append(
-            RigFigure.of(
-                LASSI, figure, "arcsec rms", math.nan, predicted, "none", with_hilstar=after
-            )
+        row = RigFigure.of(
+            LASSI, figure, "arcsec rms", math.nan, predicted, "none", with_hilstar=after
         )
+        rows.append(row)
     return rows
 
 
@@ -465,7 +505,8 @@ def naples_rows() -> list[RigFigure]:
     rows = []
     for axis, published, predicted in zip(SCATTER_AXES, NAPLES_ARCSEC, turns, strict=True):
         figure = f"precision of tracking {axis}"
-        rows.append(RigFigure.of(NAPLES, figure, "arcsec", published, predicted, NAPLES_SOURCE))
+        row = RigFigure.of(NAPLES, figure, "arcsec", published, predicted, NAPLES_SOURCE)
+        rows.append(row)
     return rows
 
 
@@ -477,22 +518,29 @@ def pixel_attitudes_arcsec(
     Returns the error about the boresight, and that of an axis across it.
     """
     rng = np.random.default_rng(SEED)
-    half = np.tan(np.radians(field_deg) / 2)
+    half_field_rad = np.radians(field_deg) / 2
+    half = np.tan(half_field_rad)
     turns = []
     for _ in range(TRIALS):
-        slopes = rng.uniform(-1.0, 1.0, (stars, 2)) * half
-        off = rng.uniform(-0.5, 0.5, (stars, 2)) * pixel_arcsec / ARCSEC_PER_RAD
+        across = rng.uniform(-1.0, 1.0, (stars, 2))
+        slopes = across * half
+        off_pixels = rng.uniform(-0.5, 0.5, (stars, 2))
+        off = off_pixels * pixel_arcsec / ARCSEC_PER_RAD
         shown = unit_rays(slopes + off)
-        turn = to_matrix(wahba(shown, unit_rays(slopes), np.ones(stars)))
+        true_rays = unit_rays(slopes)
+        turn = to_matrix(wahba(shown, true_rays, np.ones(stars)))
         turns.append((turn[1, 0], turn[2, 1], turn[0, 2]))
-    scatter = np.sqrt(np.mean(np.square(turns), axis=0)) * ARCSEC_PER_RAD
+    mean_square = np.mean(np.square(turns), axis=0)
+    scatter = np.sqrt(mean_square) * ARCSEC_PER_RAD
     return about(scatter), across_rms(scatter)
 
 
 def unit_rays(slopes: FloatArray) -> FloatArray:
     """Unit vectors (n, 3) of slopes (n, 2)."""
-    rays = np.column_stack([slopes, np.ones(len(slopes))])
-    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+    ones = np.ones(len(slopes))
+    rays = np.column_stack([slopes, ones])
+    length = np.linalg.norm(rays, axis=1, keepdims=True)
+    return np.asarray(rays / length)
 
 
 def p13_rows() -> list[RigFigure]:
@@ -505,9 +553,10 @@ def p13_rows() -> list[RigFigure]:
 def finding_of(rows: Sequence[RigFigure]) -> str:
     """The error of places by each way on one panel."""
     first = rows[0]
+    with_hilstar = two_digits(first.with_hilstar)
     return (
         f"one pixel a star leaves {first.predicted:.1f} arcsec rms an axis on LASSI's"
-        f" panel, and hilstar's codes {two_digits(first.with_hilstar)}"
+        f" panel, and hilstar's codes {with_hilstar}"
     )
 
 
@@ -515,12 +564,21 @@ def line_of(row: RigFigure) -> str:
     """A row in words."""
     after = ""
     if not math.isnan(row.with_hilstar):
-        after = f", with hilstar's codes {two_digits(row.with_hilstar)}"
+        with_hilstar = two_digits(row.with_hilstar)
+        after = f", with hilstar's codes {with_hilstar}"
     published = "not published"
     if not math.isnan(row.published):
-        published = f"published {two_digits(row.published)}"
-    predicted = f"predicted {two_digits(row.predicted)} {row.unit}"
+        stated = two_digits(row.published)
+        published = f"published {stated}"
+    figure = two_digits(row.predicted)
+    predicted = f"predicted {figure} {row.unit}"
     return f"{row.rig}: {row.figure}: {published}, {predicted}{after}"
+
+
+def dots_name(row: RigFigure) -> str:
+    """A row's rig without its place, and its figure."""
+    rig = row.rig.partition(",")[0]
+    return f"{rig}: {row.figure}"
 
 
 def draw(path: Path, rows: Sequence[RigFigure]) -> None:
@@ -528,9 +586,11 @@ def draw(path: Path, rows: Sequence[RigFigure]) -> None:
     drawn = [row for row in rows if row.unit != LIGHT_UNIT]
     panel = PanelSpec(
         xlabel="arcsec, or mag",
-        dots=DotsSpec(DOTS, name=lambda row: f"{row.rig.partition(',')[0]}: {row.figure}"),
+        dots=DotsSpec(DOTS, name=dots_name),
         legend={"loc": "center left", "bbox_to_anchor": (0.0, 0.62)},
     )
-    layout = {"height_inch": 1.6 + 0.3 * len(drawn)}
+    height_inch = 1.6 + 0.3 * len(drawn)
+    layout = {"height_inch": height_inch}
     spec = ChartSpec((panel,), lambda row: row.rig, {}, NOTE, layout=layout)
-    draw_rows(path, finding_of(rows), spec, drawn)
+    finding = finding_of(rows)
+    draw_rows(path, finding, spec, drawn)

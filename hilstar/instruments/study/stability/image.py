@@ -128,8 +128,10 @@ def _outer(
     """
     width, height = on.resolution_px
     sigma_x, sigma_y = on.psf.width_px
-    along_x = shares(np.arange(width) - sprites.x_px[0], sigma_x)
-    along_y = shares(np.arange(height) - sprites.y_px[0], sigma_y)
+    x_offset_px = np.arange(width) - sprites.x_px[0]
+    along_x = shares(x_offset_px, sigma_x)
+    y_offset_px = np.arange(height) - sprites.y_px[0]
+    along_y = shares(y_offset_px, sigma_y)
     rate = float(sprites.data["electrons_per_s"][0])
     return np.asarray(rate * np.outer(along_y, along_x))
 
@@ -139,7 +141,8 @@ def point_sampled(on: Target, sprites: FrameLight) -> FloatArray:
 
     def gaussian(offset_px: FloatArray, sigma_px: float) -> FloatArray:
         exponential = np.exp(-0.5 * (offset_px / sigma_px) ** 2)
-        return np.asarray(exponential / (sigma_px * np.sqrt(2 * np.pi)))
+        area_px = sigma_px * np.sqrt(2 * np.pi)
+        return np.asarray(exponential / area_px)
 
     return _outer(on, sprites, gaussian)
 
@@ -158,8 +161,9 @@ def _by_erf(
     on: Target, sprites: FrameLight, erf_of: Callable[[FloatArray], FloatArray]
 ) -> FloatArray:
     def shares(offset_px: FloatArray, sigma_px: float) -> FloatArray:
-        far = erf_of((offset_px + 0.5) / (sigma_px * SQRT2))
-        near = erf_of((offset_px - 0.5) / (sigma_px * SQRT2))
+        width_px = sigma_px * SQRT2
+        far = erf_of((offset_px + 0.5) / width_px)
+        near = erf_of((offset_px - 0.5) / width_px)
         return np.asarray((far - near).astype(np.float64) / 2)
 
     return _outer(on, sprites, shares)
@@ -179,8 +183,11 @@ def nearest_pixel(on: Target, sprites: FrameLight) -> FloatArray:
 def erf_float32(value: FloatArray) -> FloatArray:
     """erf by splat.frag's rational polynomial, every step in float32; same shape."""
     x = np.clip(value, -4, 4).astype(np.float32)
-    above = np.polyval(np.array(ERF_NUMERATOR, dtype=np.float32), x * x)
-    below = np.polyval(np.array(ERF_DENOMINATOR, dtype=np.float32), x * x)
+    square = x * x
+    numerator = np.array(ERF_NUMERATOR, dtype=np.float32)
+    above = np.polyval(numerator, square)
+    denominator = np.array(ERF_DENOMINATOR, dtype=np.float32)
+    below = np.polyval(denominator, square)
     return np.asarray(x * above / below)
 
 
@@ -210,11 +217,14 @@ def star_errors(draw: Draw, on: Target, phases_px: FloatArray) -> PhaseErrors:
         light = float(image.sum())
         centre_px = float(image.sum(axis=0) @ columns) / light
         middle = np.rint(phase)
-        true_across = pixel_shares(np.array([middle - phase]), sigma_x)[0]
+        across_px = middle - phase
+        true_across = pixel_shares(np.array([across_px]), sigma_x)[0]
         peak = float(image[MIDDLE_PX, int(MIDDLE_PX + middle)])
         flux_error = max(flux_error, abs(light - 1))
-        off_px = max(off_px, abs(centre_px - MIDDLE_PX - phase))
-        peak_error = max(peak_error, peak / float(true_across * true_down) - 1, key=abs)
+        light_off_centre_px = centre_px - MIDDLE_PX - phase
+        off_px = max(off_px, abs(light_off_centre_px))
+        true_peak = float(true_across * true_down)
+        peak_error = max(peak_error, peak / true_peak - 1, key=abs)
     return PhaseErrors(flux_error, off_px, peak_error)
 
 
@@ -224,15 +234,14 @@ def narrow_star() -> FailureCase:
     wider, wider_sampled = narrow_errors(0.5)
     places = f"{sampled.centroid_px:.2f} px ({wider_sampled.centroid_px:.4f} at sigma 0.5)"
     own_places = f"{ours.centroid_px:.2f} px ({wider.centroid_px:.4f} at sigma 0.5)"
-    return FailureCase(
-        "sigma 0.1 px",
-        POINT_SAMPLED,
-        f"flux off by up to {100 * sampled.flux:.0f} %, centre of gravity by {places}",
-        f"flux off by {ours.flux:.1e}; centre of gravity by {own_places}",
+    fails = f"flux off by up to {100 * sampled.flux:.0f} %, centre of gravity by {places}"
+    happens = f"flux off by {ours.flux:.1e}; centre of gravity by {own_places}"
+    why = (
         "the Gaussian is integrated over pixels; pixels of any display keep that centroid error:"
-        " write 0.5 px or more",
-        CaseFigures(ours.flux, sampled.flux, FLUX_ERROR),
+        " write 0.5 px or more"
     )
+    figures = CaseFigures(ours.flux, sampled.flux, FLUX_ERROR)
+    return FailureCase("sigma 0.1 px", POINT_SAMPLED, fails, happens, why, figures)
 
 
 def narrow_errors(sigma_px: float) -> tuple[PhaseErrors, PhaseErrors]:
@@ -241,7 +250,8 @@ def narrow_errors(sigma_px: float) -> tuple[PhaseErrors, PhaseErrors]:
     phases = np.linspace(-0.5, 0.5, 21)
     with by_renderer(on) as draw:
         ours = star_errors(draw, on, phases)
-    return ours, star_errors(partial(point_sampled, on), on, phases)
+    sampled = star_errors(partial(point_sampled, on), on, phases)
+    return ours, sampled
 
 
 def wide_star() -> FailureCase:
@@ -250,16 +260,18 @@ def wide_star() -> FailureCase:
     sprites = one_star(*OFF_MIDDLE_PX, on)
     exact = linear_image(sprites, on.resolution_px, on.psf)
     image = drawn(on, sprites)
-    error = float(np.abs(image - exact).max() / exact.max())
-    fault = float(np.abs(half_float(on, sprites) - exact).max() / exact.max())
-    return FailureCase(
-        "sigma 20 px",
-        "erf differences in half floats",
-        f"a pixel off by up to {100 * fault:.0f} % of the peak",
-        f"{error:.0e} of the peak; the star's flux off by {image.sum() - 1:+.0e}",
-        "float32 differences are small against the flux, and their errors cancel in the sum",
-        CaseFigures(error, fault, PEAK_ERROR),
-    )
+    brightest = exact.max()
+    error = float(np.abs(image - exact).max() / brightest)
+    half_floats = half_float(on, sprites)
+    fault = float(np.abs(half_floats - exact).max() / brightest)
+    case = "sigma 20 px"
+    method = "erf differences in half floats"
+    fails = f"a pixel off by up to {100 * fault:.0f} % of the peak"
+    flux_off = image.sum() - 1
+    happens = f"{error:.0e} of the peak; the star's flux off by {flux_off:+.0e}"
+    why = "float32 differences are small against the flux, and their errors cancel in the sum"
+    figures = CaseFigures(error, fault, PEAK_ERROR)
+    return FailureCase(case, method, fails, happens, why, figures)
 
 
 def negative_wings() -> FailureCase:
@@ -269,14 +281,13 @@ def negative_wings() -> FailureCase:
     bare = bare_polynomial(on, sprites)
     error = int((drawn(on, sprites) < 0).sum())
     fault = int((bare < 0).sum())
-    return FailureCase(
-        "the wings of a star, sigma 20 px",
-        "float32 erf differences as they come",
-        f"{fault} pixels of negative light, down to {bare.min():.0e} of the star's",
-        f"{error} negative pixels",
-        "the shader takes the larger of difference and 0",
-        CaseFigures(float(error), float(fault), NOTHING),
-    )
+    case = "the wings of a star, sigma 20 px"
+    method = "float32 erf differences as they come"
+    fails = f"{fault} pixels of negative light, down to {bare.min():.0e} of the star's"
+    happens = f"{error} negative pixels"
+    why = "the shader takes the larger of difference and 0"
+    figures = CaseFigures(float(error), float(fault), NOTHING)
+    return FailureCase(case, method, fails, happens, why, figures)
 
 
 def floored_wings() -> FailureCase:
@@ -287,14 +298,13 @@ def floored_wings() -> FailureCase:
     floored = np.maximum(_outer(on, sprites, pixel_shares), 1e-7)
     fault = float(floored.sum() - 1)
     width, height = IMAGE_PX
-    return FailureCase(
-        "a floor of 1e-7 of a star's light",
-        "max(share, 1e-7) in every pixel",
-        f"adds {100 * fault:.1f} % to each star, over {width} x {height} pixels",
-        f"flux off by {error:.0e}",
-        "no floor: outside its footprint a star has no light",
-        CaseFigures(error, fault, FLUX_ERROR),
-    )
+    case = "a floor of 1e-7 of a star's light"
+    method = "max(share, 1e-7) in every pixel"
+    fails = f"adds {100 * fault:.1f} % to each star, over {width} x {height} pixels"
+    happens = f"flux off by {error:.0e}"
+    why = "no floor: outside its footprint a star has no light"
+    figures = CaseFigures(error, fault, FLUX_ERROR)
+    return FailureCase(case, method, fails, happens, why, figures)
 
 
 def absurd_sigmas() -> FailureCase:
@@ -313,14 +323,15 @@ def absurd_sigmas() -> FailureCase:
             silently_cut = max(silently_cut, cuts[-1])
         except InputError as refusal:
             refusals.append(str(refusal))
-    return FailureCase(
-        "sigma 60 and 1e6 px",
-        f"GL's largest point, {point_px} px, whatever the sigma",
-        f"cuts {100 * cuts[0]:.1f} % and {100 * cuts[1]:.5f} % of a star's light",
-        f"refused: {' | '.join(refusals)}",
-        "a point of GL is a star's footprint",
-        CaseFigures(silently_cut, max(cuts), MAX_CUT),
-    )
+    method = f"GL's largest point, {point_px} px, whatever the sigma"
+    first_percent = 100 * cuts[0]
+    last_percent = 100 * cuts[1]
+    fails = f"cuts {first_percent:.1f} % and {last_percent:.5f} % of a star's light"
+    reasons = " | ".join(refusals)
+    happens = f"refused: {reasons}"
+    why = "a point of GL is a star's footprint"
+    figures = CaseFigures(silently_cut, max(cuts), MAX_CUT)
+    return FailureCase("sigma 60 and 1e6 px", method, fails, happens, why, figures)
 
 
 def star_on_pixel_edge() -> FailureCase:
@@ -329,15 +340,15 @@ def star_on_pixel_edge() -> FailureCase:
     phases = np.array([-0.5, 0.5 - 1e-9, 0.5, 0.5 + 1e-9])
     with by_renderer(on) as draw:
         off_px = star_errors(draw, on, phases).centroid_px
-    fault_px = star_errors(partial(nearest_pixel, on), on, phases).centroid_px
-    return FailureCase(
-        "a star on a pixel's edge",
-        "the nearest pixel",
-        f"centre {fault_px:.2f} px off, to either side",
-        f"centre {off_px:.0e} px off",
-        "light goes to both pixels; place is whole pixel and float32 fraction",
-        CaseFigures(off_px, fault_px, CENTROID_PX),
-    )
+    by_nearest = partial(nearest_pixel, on)
+    fault_px = star_errors(by_nearest, on, phases).centroid_px
+    case = "a star on a pixel's edge"
+    method = "the nearest pixel"
+    fails = f"centre {fault_px:.2f} px off, to either side"
+    happens = f"centre {off_px:.0e} px off"
+    why = "light goes to both pixels; place is whole pixel and float32 fraction"
+    figures = CaseFigures(off_px, fault_px, CENTROID_PX)
+    return FailureCase(case, method, fails, happens, why, figures)
 
 
 def star_on_image_edge() -> FailureCase:
@@ -352,33 +363,38 @@ def star_on_image_edge() -> FailureCase:
         *((256.0, -2.0), (-0.6, beyond)),
     ):
         places = np.array([x_px, y_px])
-        shares = ndtr((places + 0.5) / SIGMA_PX) - ndtr((places - last - 0.5) / SIGMA_PX)
+        before = ndtr((places - last - 0.5) / SIGMA_PX)
+        until = ndtr((places + 0.5) / SIGMA_PX)
+        shares = until - before
         exact = float(np.prod(shares))
         pixel = np.rint(places)
-        inside = bool(((pixel >= 0) & (pixel <= last)).all())
-        light = float(drawn(on, one_star(x_px, y_px, on)).sum())
+        on_image = (pixel >= 0) & (pixel <= last)
+        inside = bool(on_image.all())
+        sprites = one_star(x_px, y_px, on)
+        light = float(drawn(on, sprites).sum())
         error = max(error, abs(light - exact))
         fault = max(fault, abs(float(inside) - exact))
-    return FailureCase(
-        "stars on the image's edge",
-        "a star drawn whole or not at all, by its centre",
-        f"up to {100 * fault:.0f} % of its light too much or too little",
-        f"light on the image off by {error:.0e} of the star's",
-        "a star is drawn where its footprint touches the image, and cut there",
-        CaseFigures(error, fault, FLUX_ERROR),
-    )
+    case = "stars on the image's edge"
+    method = "a star drawn whole or not at all, by its centre"
+    fails = f"up to {100 * fault:.0f} % of its light too much or too little"
+    happens = f"light on the image off by {error:.0e} of the star's"
+    why = "a star is drawn where its footprint touches the image, and cut there"
+    figures = CaseFigures(error, fault, FLUX_ERROR)
+    return FailureCase(case, method, fails, happens, why, figures)
 
 
 def indexed_light(sprites: FrameLight, size_px: tuple[int, int]) -> FloatArray:
     """The image (h, w) of stars by `image[rows, columns] += light`."""
-    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
+    half_px = (sprites.footprint_px - 1) // 2
+    steps = np.arange(sprites.footprint_px) - half_px
     columns = sprites.data["pixel"][:, 0, None] + steps
     rows = sprites.data["pixel"][:, 1, None] + steps
     share_x = pixel_shares(columns - sprites.x_px[:, None], SIGMA_PX)
     share_y = pixel_shares(rows - sprites.y_px[:, None], SIGMA_PX)
     light = share_y * sprites.data["electrons_per_s"][:, None]
     image = np.zeros(size_px[::-1])
-    image[rows[:, :, None], columns[:, None, :]] += light[:, :, None] * share_x[:, None, :]
+    pixels = light[:, :, None] * share_x[:, None, :]
+    image[rows[:, :, None], columns[:, None, :]] += pixels
     return image
 
 
@@ -398,17 +414,18 @@ def many_stars() -> FailureCase:
     off = np.abs(image[:CORNER_PX, :CORNER_PX] - corner)
     pixel_error = float(off.max() / corner.max())
     indexed = indexed_light(sprites, CROWD_PX)
-    error = float(abs(image.sum() / flux.sum() - 1))
-    fault = float(abs(indexed.sum() / flux.sum() - 1))
-    return FailureCase(
-        f"{CROWD} stars in view",
-        "image[rows, columns] += light",
-        f"{100 * fault:.0f} % of the light lost: a repeated index is added once",
+    wanted_flux = flux.sum()
+    error = float(abs(image.sum() / wanted_flux - 1))
+    fault = float(abs(indexed.sum() / wanted_flux - 1))
+    case = f"{CROWD} stars in view"
+    fails = f"{100 * fault:.0f} % of the light lost: a repeated index is added once"
+    happens = (
         f"light off by {error:.0e}; {pixel_error:.0e} of the brightest pixel, over {CORNER_PX} x"
-        f" {CORNER_PX}",
-        "the GPU blends every sprite, in float32",
-        CaseFigures(max(error, pixel_error), fault, CROWD_ERROR),
+        f" {CORNER_PX}"
     )
+    why = "the GPU blends every sprite, in float32"
+    figures = CaseFigures(max(error, pixel_error), fault, CROWD_ERROR)
+    return FailureCase(case, "image[rows, columns] += light", fails, happens, why, figures)
 
 
 def flux_range() -> FailureCase:
@@ -417,8 +434,10 @@ def flux_range() -> FailureCase:
     on = target(SIGMA_PX)
     bright = one_star(100.3, 256.0, on, bright_e)
     faint = one_star(120.3, 256.0, on, faint_e)
-    image = drawn(on, join_sprites([bright, faint], bright.footprint_px))
-    scaled = np.rint(image / image.max() * 65535) * image.max() / 65535
+    both = join_sprites([bright, faint], bright.footprint_px)
+    image = drawn(on, both)
+    full_scale = image.max()
+    scaled = np.rint(image / full_scale * 65535) * full_scale / 65535
 
     def flux_errors(shown: FloatArray) -> tuple[float, float]:
         """The errors of both stars' light, relative."""
@@ -428,14 +447,13 @@ def flux_range() -> FailureCase:
 
     errors = flux_errors(image)
     faults = flux_errors(scaled)
-    return FailureCase(
-        "flux range 1e12",
-        "16 bits, scaled to the brightest pixel",
-        f"fluxes off by {faults[0]:.0e} and {faults[1]:.0e}: the faint star is gone",
-        f"fluxes off by {errors[0]:.0e} and {errors[1]:.0e}",
-        "float32, and each star in its own footprint",
-        CaseFigures(max(errors), max(faults), FLUX_ERROR),
-    )
+    case = "flux range 1e12"
+    method = "16 bits, scaled to the brightest pixel"
+    fails = f"fluxes off by {faults[0]:.0e} and {faults[1]:.0e}: the faint star is gone"
+    happens = f"fluxes off by {errors[0]:.0e} and {errors[1]:.0e}"
+    why = "float32, and each star in its own footprint"
+    figures = CaseFigures(max(errors), max(faults), FLUX_ERROR)
+    return FailureCase(case, method, fails, happens, why, figures)
 
 
 def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[FrameLight]:
@@ -444,9 +462,13 @@ def moving_star(on: Target, electrons_per_s: float = 1.0) -> Iterator[FrameLight
     """
     sirius = load_catalog().brighter_than(-1.0)
     vectors = unit_vectors_icrs(sirius, HIPPARCOS_EPOCH_JYEAR)
-    stars = make_stars(sirius, vectors, np.full(1, np.nan), np.full(1, electrons_per_s))
+    rates = np.full(1, electrons_per_s)
+    unknown_mag = np.full(1, np.nan)
+    stars = make_stars(sirius, vectors, unknown_mag, rates)
     camera = monitor_camera(on.resolution_px, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
-    start = from_radec_roll_deg(float(sirius.ra_deg[0]), float(sirius.dec_deg[0]), 20.0)
+    sirius_ra_deg = float(sirius.ra_deg[0])
+    sirius_dec_deg = float(sirius.dec_deg[0])
+    start = from_radec_roll_deg(sirius_ra_deg, sirius_dec_deg, 20.0)
     across_px, down_px = PATH_PX
     # A turn about x moves stars up the image, one about -y to the right.
     turn_rad = np.array([-down_px, -across_px, 0.0]) / camera.focal_length_px
@@ -474,18 +496,21 @@ def moving_code_fluxes(quantisation: Quantisation) -> FloatArray:
     with Renderer(on) as gl:
         for sprites in moving_star(on, flux):
             gl.draw(sprites)
-            light.append(response.light[gl.levels()].sum())
+            shown = response.light[gl.levels()]
+            light.append(shown.sum())
     return np.array(light) / flux
 
 
 def ripple(fluxes: FloatArray) -> float:
     """The range of a star's fluxes, relative to their mean."""
-    return float((fluxes.max() - fluxes.min()) / fluxes.mean())
+    fluxes_range = fluxes.max() - fluxes.min()
+    return float(fluxes_range / fluxes.mean())
 
 
 def ripple_mag(fluxes: FloatArray) -> float:
     """The range of a star's fluxes, mag."""
-    return float(magnitude(float(fluxes.min() / fluxes.max())))
+    share = float(fluxes.min() / fluxes.max())
+    return float(magnitude(share))
 
 
 def popping() -> FailureCase:
@@ -493,15 +518,14 @@ def popping() -> FailureCase:
     on = target(0.5, MOVING_PX)
     with by_renderer(on) as draw:
         error = ripple(moving_fluxes(draw, on))
-    fault = ripple(moving_fluxes(partial(point_sampled, on), on))
-    return FailureCase(
-        f"a star over {STEPS} sub-pixel steps, sigma 0.5 px",
-        POINT_SAMPLED,
-        f"its light varies by {100 * fault:.1f} %",
-        f"varies by {error:.1e} in the linear image",
-        "integrated over pixels, and cut where 1e-6 of the light remains",
-        CaseFigures(error, fault, RIPPLE),
-    )
+    by_samples = partial(point_sampled, on)
+    fault = ripple(moving_fluxes(by_samples, on))
+    case = f"a star over {STEPS} sub-pixel steps, sigma 0.5 px"
+    fails = f"its light varies by {100 * fault:.1f} %"
+    happens = f"varies by {error:.1e} in the linear image"
+    why = "integrated over pixels, and cut where 1e-6 of the light remains"
+    figures = CaseFigures(error, fault, RIPPLE)
+    return FailureCase(case, POINT_SAMPLED, fails, happens, why, figures)
 
 
 def popping_codes() -> FailureCase:
@@ -509,14 +533,12 @@ def popping_codes() -> FailureCase:
     fault = ripple_mag(moving_code_fluxes("round"))
     error = ripple_mag(moving_code_fluxes("exact"))
     under_white = f"{CODES_MAG_UNDER_WHITE:g} mag under white"
-    return FailureCase(
-        f"the same, {under_white} on {CODES_BITS} bits, sigma {SIGMA_PX:g} px",
-        ROUNDING,
-        f"its light varies by {fault:.3f} mag",
-        f'quantisation = "exact", what `auto` takes there: {error:.3f} mag',
-        "round adds up the errors of its pixels; exact chooses a star's codes together",
-        CaseFigures(error, fault, AIMS[CODES_BITS][0]),
-    )
+    case = f"the same, {under_white} on {CODES_BITS} bits, sigma {SIGMA_PX:g} px"
+    fails = f"its light varies by {fault:.3f} mag"
+    happens = f'quantisation = "exact", what `auto` takes there: {error:.3f} mag'
+    why = "round adds up the errors of its pixels; exact chooses a star's codes together"
+    figures = CaseFigures(error, fault, AIMS[CODES_BITS][0])
+    return FailureCase(case, ROUNDING, fails, happens, why, figures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -572,7 +594,8 @@ def error_steps(codes: Levels, scene: CodeScene) -> float:
     wanted = light_by_part(scene.wanted())
     off = (shown - wanted)[wanted > 0]
     step = scene.panel.response.light[1] * WHITE
-    return float(np.sqrt(np.mean(np.square(off))) / step)
+    mean_square = np.mean(np.square(off))
+    return float(np.sqrt(mean_square) / step)
 
 
 def sprites_of(
@@ -582,7 +605,8 @@ def sprites_of(
     psf = GaussianPsf((sigma_px, sigma_px))
     light = WHITE * flux_ratio(under_white_mag) / psf.peak_share
     star = np.arange(len(x_px))
-    return pack_sprites(x_px, y_px, light, star, (SIDE_PX, SIDE_PX), psf.footprint_px)
+    size_px = (SIDE_PX, SIDE_PX)
+    return pack_sprites(x_px, y_px, light, star, size_px, psf.footprint_px)
 
 
 def middles() -> tuple[FloatArray, FloatArray]:
@@ -601,18 +625,24 @@ def lone_stars(
 ) -> CodeScene:
     """A star in each part of the image."""
     x_px, y_px = middles()
-    sprites = sprites_of(x_px, y_px, np.full(len(x_px), under_white_mag), sigma_px)
-    return CodeScene(sprites, sigma_px, Panel(response, WHITE, uniformity))
+    mags = np.full(len(x_px), under_white_mag)
+    sprites = sprites_of(x_px, y_px, mags, sigma_px)
+    panel = Panel(response, WHITE, uniformity)
+    return CodeScene(sprites, sigma_px, panel)
 
 
 def neighbours(mags: tuple[float, float], apart_px: float) -> CodeScene:
     """Two stars in each part, in all directions from each other."""
     x_px, y_px = middles()
     angle = np.linspace(0, 2 * np.pi, len(x_px), endpoint=False)
-    both_x = np.append(x_px, x_px + apart_px * np.cos(angle))
-    both_y = np.append(y_px, y_px + apart_px * np.sin(angle))
-    sprites = sprites_of(both_x, both_y, np.repeat(mags, len(x_px)), SIGMA_PX)
-    return CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE), 2)
+    across_px = apart_px * np.cos(angle)
+    both_x = np.append(x_px, x_px + across_px)
+    down_px = apart_px * np.sin(angle)
+    both_y = np.append(y_px, y_px + down_px)
+    both_mag = np.repeat(mags, len(x_px))
+    sprites = sprites_of(both_x, both_y, both_mag, SIGMA_PX)
+    panel = Panel(srgb_response(8), WHITE)
+    return CodeScene(sprites, SIGMA_PX, panel, 2)
 
 
 def half_off() -> CodeScene:
@@ -623,15 +653,18 @@ def half_off() -> CodeScene:
     far = SIDE_PX - 1 - across
     x_px = np.concatenate([across, far, along, along])
     y_px = np.concatenate([along, along, across, far])
-    sprites = sprites_of(x_px, y_px, np.full(len(x_px), FAINT_MAG), SIGMA_PX)
-    return CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
+    mags = np.full(len(x_px), FAINT_MAG)
+    sprites = sprites_of(x_px, y_px, mags, SIGMA_PX)
+    panel = Panel(srgb_response(8), WHITE)
+    return CodeScene(sprites, SIGMA_PX, panel)
 
 
 def uneven_panel() -> CodeScene:
     """Stars on pixels that differ by 5 %, with a fall to the corners."""
     y_px, x_px = np.mgrid[:SIDE_PX, :SIDE_PX] / SIDE_PX - 0.5
     fall = 1 - 0.3 * np.hypot(x_px, y_px)
-    noise = np.random.default_rng(CODES_SEED).normal(0, 0.05, x_px.shape)
+    rng = np.random.default_rng(CODES_SEED)
+    noise = rng.normal(0, 0.05, x_px.shape)
     uniformity = (fall + noise).astype(np.float32)
     return lone_stars(FAINT_MAG, srgb_response(8), uniformity=uniformity)
 
@@ -642,14 +675,10 @@ def judged(
     """Compares rounding with `exact` by the light of each group of stars."""
     fault = error_steps(codes_of(scene, "round"), scene)
     error = error_steps(exact_codes(scene), scene)
-    return FailureCase(
-        case,
-        ROUNDING,
-        f"a star's light off by {fault:.2g} of the panel's smallest steps rms",
-        f"by {error:.2g} steps",
-        why,
-        CaseFigures(error, fault, steps_a_star * scene.stars),
-    )
+    fails = f"a star's light off by {fault:.2g} of the panel's smallest steps rms"
+    happens = f"by {error:.2g} steps"
+    figures = CaseFigures(error, fault, steps_a_star * scene.stars)
+    return FailureCase(case, ROUNDING, fails, happens, why, figures)
 
 
 def coded_half_off() -> FailureCase:
@@ -712,20 +741,22 @@ def spilled(case: str, scene: CodeScene) -> FailureCase:
     response = scene.panel.response
     wanted = scene.wanted()
     corner = slice(2 * TILE_PX), slice(2 * TILE_PX)
-    diffused = diffused_light(scene.linear()[corner], response) - wanted[corner]
+    corner_light = scene.linear()[corner]
+    diffused = diffused_light(corner_light, response) - wanted[corner]
     excess = shown_light(exact_codes(scene), scene.panel) - wanted
     error = float(excess.max())
     fault = float(diffused.max())
-    largest_step = float(np.diff(response.light).max()) * WHITE
-    return FailureCase(
-        case,
-        "error diffusion (Floyd and Steinberg 1976)",
+    steps = np.diff(response.light)
+    largest_step = float(steps.max()) * WHITE
+    method = "error diffusion (Floyd and Steinberg 1976)"
+    fails = (
         f"pixels beside it have up to {fault:.2g} of white too much: what is over white is"
-        " handed on",
-        f"no pixel has more than {error:.1e} of white too much",
-        "what is over white is lost, and told; no neighbour makes up for it",
-        CaseFigures(error, fault, largest_step),
+        " handed on"
     )
+    happens = f"no pixel has more than {error:.1e} of white too much"
+    why = "what is over white is lost, and told; no neighbour makes up for it"
+    figures = CaseFigures(error, fault, largest_step)
+    return FailureCase(case, method, fails, happens, why, figures)
 
 
 def diffused_light(linear: FloatArray, response: Response) -> FloatArray:
@@ -753,20 +784,21 @@ def no_stars() -> FailureCase:
     """Nothing in view."""
     nothing = np.zeros(0)
     sprites = sprites_of(nothing, nothing, nothing, SIGMA_PX)
-    scene = CodeScene(sprites, SIGMA_PX, Panel(srgb_response(8), WHITE))
+    panel = Panel(srgb_response(8), WHITE)
+    scene = CodeScene(sprites, SIGMA_PX, panel)
     wanted = scene.wanted()
     with np.errstate(invalid="ignore"):
         scaled = wanted / wanted.max()
-    error = float((exact_codes(scene) != 0).mean())
+    lit = exact_codes(scene) != 0
+    error = float(lit.mean())
     no_number = 100 * np.isnan(scaled).mean()
-    return FailureCase(
-        "no star in view",
-        "an image scaled to its brightest pixel",
-        f"{no_number:.0f} % of the pixels are no number",
-        f"{100 * error:.0f} % of the pixels are lit",
-        "full scale is the bench's, whatever a frame has",
-        CaseFigures(error, float(scaled.sum()), NOTHING),
-    )
+    case = "no star in view"
+    method = "an image scaled to its brightest pixel"
+    fails = f"{no_number:.0f} % of the pixels are no number"
+    happens = f"{100 * error:.0f} % of the pixels are lit"
+    why = "full scale is the bench's, whatever a frame has"
+    figures = CaseFigures(error, float(scaled.sum()), NOTHING)
+    return FailureCase(case, method, fails, happens, why, figures)
 
 
 Case = Callable[[], FailureCase]

@@ -401,7 +401,9 @@ def draw(
 ) -> None:
     """The errors of each model, by the number of centroids and by their noise."""
     models = dict.fromkeys(outcome.model for outcome in outcomes)
-    labels = {name: SHORT.get(name, name) for name in models}
+    labels = {}
+    for name in models:
+        labels[name] = SHORT.get(name, name)
     uncalibrated = LevelLine(uncalibrated_arcsec, "uncalibrated", style=":")
     fails = LevelLine(FAIL_ARCSEC, "fails above")
     levels = (

@@ -466,11 +466,18 @@ def edges_px(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArra
     y_from_middle = from_middle * sine
     y_px = half + MIDDLE_PX[1] + y_from_middle
     profile = map_coordinates(image, [y_px, x_px], order=3, mode="nearest")
+    return half_level_px(profile, steps)
+
+
+def half_level_px(profile: FloatArray, steps: FloatArray) -> FloatArray:
+    """Where light (n, m) falls to half of its first value, by steps (m,), px; NaN where it does
+    not.
+    """
     level = profile[:, :1] / 2
     below = profile < level
     first_below = np.argmax(below, axis=1)
     first = np.maximum(first_below, 1)
-    rows = np.arange(PLACES)
+    rows = np.arange(len(profile))
     high = profile[rows, first - 1]
     low = profile[rows, first]
     fall = high - low

@@ -233,23 +233,29 @@ def stray_light(bench: Bench, share: float) -> Stray:
     no_sprites = join_sprites([], sprites.footprint_px)
     light_alone = replace(no_sprites, extended=lights)
     alone = light_of(bench, light_alone)
+    errors_mag = light_errors_mag(sprites, both - alone, bench.camera.resolution_px)
+    median, p95 = np.percentile(errors_mag, (50, 95)).tolist()
+    is_lost = np.array(errors_mag) > LOST_MAG
+    lost = float(is_lost.mean())
+    return Stray(bench.config.render.quantisation, share, len(errors_mag), median, p95, lost)
+
+
+def light_errors_mag(
+    sprites: FrameLight, shown_light: FloatArray, size_px: tuple[int, int]
+) -> list[float]:
+    """The errors of lone stars' light, mag, in an image (h, w) of what they add to a frame."""
     rates = sprites.data["electrons_per_s"]
-    size_px = bench.camera.resolution_px
     errors_mag = []
     windows = lone_windows(sprites, sprites.x_px, sprites.y_px, size_px, ISOLATION)
     for star, window in windows:
         of_star = sprites.star == star
         true = float(rates[of_star].sum())
-        shown_light_e = both[window] - alone[window]
-        shown = float(shown_light_e.sum())
+        shown = float(shown_light[window].sum())
         error_mag = NOTHING_MAG
         if shown > 0:
             error_mag = abs(magnitude(shown / true))
         errors_mag.append(error_mag)
-    median, p95 = np.percentile(errors_mag, (50, 95)).tolist()
-    is_lost = np.array(errors_mag) > LOST_MAG
-    lost = float(is_lost.mean())
-    return Stray(bench.config.render.quantisation, share, len(errors_mag), median, p95, lost)
+    return errors_mag
 
 
 def light_of(bench: Bench, sprites: FrameLight) -> FloatArray:

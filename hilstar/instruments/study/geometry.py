@@ -205,10 +205,8 @@ class TracedBench:
             area = a * d - b * c
             off_x = x - x_px
             off_y = y - y_px
-            u_step = (d * off_x - b * off_y) / area
-            u = u - u_step
-            v_step = (a * off_y - c * off_x) / area
-            v = v - v_step
+            u = u - (d * off_x - b * off_y) / area
+            v = v - (a * off_y - c * off_x) / area
         length = np.sqrt(u**2 + v**2 + 1)
         slopes = np.column_stack([u, v, ones])
         return slopes / length[:, None]

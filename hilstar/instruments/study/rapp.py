@@ -123,13 +123,19 @@ def rapp_ratios(temperature_k: FloatArray, optics: Optics, weighting: Weighting)
     return np.stack((irradiance, photons, electrons))
 
 
+def _ratios(kelvin: FloatArray, optics: Optics) -> dict[Weighting, FloatArray]:
+    """The three ratios (3, n) by weighting."""
+    ratios = {}
+    for weighting in WEIGHTINGS:
+        ratios[weighting] = rapp_ratios(kelvin, optics, weighting)
+    return ratios
+
+
 def rapp(directory: Path, sensor: str) -> ChartFinding:
     """The three ratios of a sensor, 3000 to 50 000 K, for both passband weightings."""
     optics = study_optics(sensor)
     kelvin = _temperatures_k()
-    ratios = {}
-    for weighting in WEIGHTINGS:
-        ratios[weighting] = rapp_ratios(kelvin, optics, weighting)
+    ratios = _ratios(kelvin, optics)
     # which the range of wavelengths alone makes
     hottest_k = kelvin[-1:]
     full_range = study_optics("ccd47-20")
@@ -166,9 +172,7 @@ def bench_rapp(
     optics = bench_optics(file.config.tracker, file.folder)
     weighting = file.config.sky.passband_weighting
     kelvin = _temperatures_k()
-    ratios = {}
-    for name in WEIGHTINGS:
-        ratios[name] = rapp_ratios(kelvin, optics, name)
+    ratios = _ratios(kelvin, optics)
     coolest, cool, hot, hottest = _quoted(kelvin, ratios[weighting])
     text = (
         f"By {file.path.name} a black body of 3000 K gives {coolest:.2f} times the electrons of"
@@ -185,10 +189,7 @@ def bench_rapp(
         _draw_stars(panels[1], stars, fields)
         _finish(panels)
     _write(directory / "rapp_bench.csv", kelvin, ratios)
-    rows: list[StarRatio] = []
-    for field in fields:
-        rows += _star_rows(field, stars)
-    write_csv(directory / "rapp_stars.csv", StarRatio._fields, rows)
+    _write_stars(directory / "rapp_stars.csv", fields, stars)
     findings = [ChartFinding("rapp_bench", text)]
     for field in fields:
         finding = ChartFinding("rapp_stars", f"RAPP3 of the stars of {field.text}")
@@ -292,6 +293,13 @@ def _finish(panels: "Sequence[Axes]") -> None:
     panels[-1].set(xlabel="black-body temperature [K]")
     plain_ticks(panels[-1].xaxis, TICKS_K)
     label_ends(panels[0])
+
+
+def _write_stars(path: Path, fields: Sequence[FieldRatios], stars: Stars) -> None:
+    rows: list[StarRatio] = []
+    for field in fields:
+        rows += _star_rows(field, stars)
+    write_csv(path, StarRatio._fields, rows)
 
 
 def _write(path: Path, kelvin: FloatArray, ratios: dict[Weighting, FloatArray]) -> None:

@@ -268,9 +268,7 @@ def vega_logarithmic(directory: Path) -> ChartFinding:
     body = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K)
     body_mean = curve_mean(Curve(nm, body), johnson_v)
     body *= ZERO_W_M2_M["v"] / body_mean
-    at_1000 = np.interp(1000, nm, flux)
-    at_5000 = np.interp(5000, nm, flux)
-    falls = float(at_1000 / at_5000)
+    falls = float(np.interp(1000, nm, flux) / np.interp(5000, nm, flux))
     over_body = flux / body
     blue, red = np.interp([350.0, 5000.0], nm, over_body)
     text = (

@@ -167,8 +167,8 @@ def weak_perspectives(directory: Path) -> None:
     draw_curves(directory / "weak_perspective", finding, panels, WEAK_NOTE)
 
 
-def ripples(directory: Path) -> None:
-    """One star's flux over sub-pixel steps: in the linear image, by codes, and point sampled."""
+def moving_lights() -> dict[str, FloatArray]:
+    """One moving star's light (steps,) by the way it is drawn."""
     on = image.target(image.SIGMA_PX, image.MOVING_PX)
     narrow = image.target(0.5, image.MOVING_PX)
     sampled = partial(image.point_sampled, narrow)
@@ -177,12 +177,17 @@ def ripples(directory: Path) -> None:
     sampled_light = image.moving_fluxes(sampled, narrow)
     round_light = image.moving_code_fluxes("round")
     exact_light = image.moving_code_fluxes("exact")
-    curves = {
+    return {
         "point sampled, sigma 0.5 px": sampled_light,
         "codes, round": round_light,
         "codes, exact": exact_light,
         "linear image": linear,
     }
+
+
+def ripples(directory: Path) -> None:
+    """One star's flux over sub-pixel steps: in the linear image, by codes, and point sampled."""
+    curves = moving_lights()
     step_px = np.linspace(0, image.PATH_PX[0], image.STEPS)
     columns = {"x_px": step_px}
     off_mag = {}

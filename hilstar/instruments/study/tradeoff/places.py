@@ -119,8 +119,7 @@ class Road:
         margin = side_px / 2
         is_visible = (x > -margin) & (x < width + margin)
         is_visible &= (y > -margin) & (y < height + margin)
-        visible_count = np.count_nonzero(is_visible)
-        data = np.empty(visible_count, dtype=self.dtype)
+        data = np.empty(np.count_nonzero(is_visible), dtype=self.dtype)
         data["place_px"][:, 0] = x[is_visible]
         data["place_px"][:, 1] = y[is_visible]
         data["electrons_per_s"] = 1.0
@@ -235,6 +234,45 @@ def projected(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) ->
     return sprites.star
 
 
+def stars_in_view(stars: Stars, turns: Sequence[FloatArray], camera: Camera) -> list[set[int]]:
+    """The Hipparcos numbers of the stars in view of each turn."""
+    in_view = []
+    for turn in turns:
+        star = scan(stars, turn, camera).star
+        in_view.append(set(stars.hip[star].tolist()))
+    return in_view
+
+
+def path_words(bench: "SmearBench", stars: Stars) -> str:
+    """The lengths of stars' paths, shortest to longest, in words."""
+    ends = np.array([-0.5, 0.5])
+    x_px, y_px = bench.places_px(stars, ends)
+    across_px = np.diff(x_px, axis=0)
+    down_px = np.diff(y_px, axis=0)
+    paths_px = np.hypot(across_px, down_px)
+    return f"{paths_px.min():.0f} to {paths_px.max():.0f} px"
+
+
+def worst_and_rms_px(off_px: npt.NDArray[np.longdouble]) -> tuple[float, float]:
+    """The largest and the rms distance of offsets (n, 2), px; NaN is a star that is not seen."""
+    off_x, off_y = off_px.T
+    distance_px = np.hypot(off_x, off_y)
+    error = distance_px.astype(np.float64)
+    error = error[np.isfinite(error)]
+    mean_square = np.mean(error**2)
+    return float(error.max()), float(np.sqrt(mean_square))
+
+
+def places_in_fields(
+    road: Road, fields: Sequence[FloatArray], turns: Sequence[FloatArray], camera: Camera
+) -> npt.NDArray[np.longdouble]:
+    """Places (n, 2), px, of the stars of all fields, whose directions are (k, 3) each."""
+    of_fields = []
+    for vectors, turn in zip(fields, turns, strict=True):
+        of_fields.append(road.places_px(vectors, turn, camera))
+    return np.concatenate(of_fields)
+
+
 def culling(stack: ExitStack, quick: bool) -> Trials:
     """How the stars in view are found: stars missed over ATTITUDES fields, and stars tested in
     vain.
@@ -244,10 +282,7 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
     stars = stars_to(NO_LIMIT_V_MAG)
     field_count = 10 if quick else ATTITUDES
     turns = random_turns(field_count, camera)
-    in_view = []
-    for turn in turns:
-        star = scan(stars, turn, camera).star
-        in_view.append(set(stars.hip[star].tolist()))
+    in_view = stars_in_view(stars, turns, camera)
     methods: dict[str, tuple[Stars, Finder]] = {
         "scan, every star projected": (stars, scan),
         "scan of angles": (stars, by_angle),
@@ -263,8 +298,7 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
         vain = 0
         for turn, wanted in zip(turns, in_view, strict=True):
             culled = finder(sorted_stars, turn, camera)
-            hip = sorted_stars.hip[culled.star]
-            shown = set(hip.tolist())
+            shown = set(sorted_stars.hip[culled.star].tolist())
             missed += len(wanted - shown)
             vain += culled.tested - len(wanted & shown)
         work = partial(finder, sorted_stars, turns[0], camera)
@@ -303,27 +337,14 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
     for turn in turns:
         star = stars.grid.near(turn[2], radius_rad)
         near.append(stars.vectors[star])
-
-    def places(road: Road) -> npt.NDArray[np.longdouble]:
-        of_fields = []
-        for vectors, turn in zip(near, turns, strict=True):
-            of_fields.append(road.places_px(vectors, turn, camera))
-        return np.concatenate(of_fields)
-
-    truth = places(EXACT)
+    truth = places_in_fields(EXACT, near, turns, camera)
     trials = []
     for name, road in ROADS.items():
-        off_px = places(road) - truth
-        off_x, off_y = off_px.T
-        distance_px = np.hypot(off_x, off_y)
-        error = distance_px.astype(np.float64)
-        error = error[np.isfinite(error)]
-        mean_square = np.mean(error**2)
-        rms_px = float(np.sqrt(mean_square))
+        off_px = places_in_fields(road, near, turns, camera) - truth
+        worst_px, rms_px = worst_and_rms_px(off_px)
         work = partial(road.pack, near[0], turns[0], camera)
         # The sprites' own layout says which of them the renderer is handed.
         is_default = road.dtype == SPRITE_DTYPE
-        worst_px = float(error.max())
         trial = Trial(name, worst_px, rms_px, work, is_default, road is EXACT)
         trials.append(trial)
     width, height = camera.resolution_px
@@ -463,12 +484,7 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
         is_exact = name == gauss_name(EXACT_NODES)
         trial = Trial(name, worst, off_px, work, name == default, is_exact)
         trials.append(trial)
-    ends = np.array([-0.5, 0.5])
-    x_px, y_px = bench.places_px(many, ends)
-    across_px = np.diff(x_px, axis=0)
-    down_px = np.diff(y_px, axis=0)
-    paths_px = np.hypot(across_px, down_px)
-    extent = f"{paths_px.min():.0f} to {paths_px.max():.0f} px"
+    extent = path_words(bench, many)
     scene = f"linear image of {len(many)} stars, paths of {extent}, {bench.side_px} px squared"
     pixel_figure = Figure("largest pixel error, share of its star", "1", ROUNDING_SHARE)
     centre_figure = Figure("centre of gravity, worst", "px")

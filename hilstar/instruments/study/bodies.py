@@ -466,11 +466,18 @@ def edges_px(image: FloatArray, radius_px: float, phase_deg: float) -> FloatArra
     y_from_middle = from_middle * sine
     y_px = half + MIDDLE_PX[1] + y_from_middle
     profile = map_coordinates(image, [y_px, x_px], order=3, mode="nearest")
+    return half_level_px(profile, steps)
+
+
+def half_level_px(profile: FloatArray, steps: FloatArray) -> FloatArray:
+    """Where light (n, m) falls to half of its first value, by steps (m,), px; NaN where it does
+    not.
+    """
     level = profile[:, :1] / 2
     below = profile < level
     first_below = np.argmax(below, axis=1)
     first = np.maximum(first_below, 1)
-    rows = np.arange(PLACES)
+    rows = np.arange(len(profile))
     high = profile[rows, first - 1]
     low = profile[rows, first]
     fall = high - low
@@ -559,7 +566,9 @@ def run(directory: Path, quick: bool = False) -> Judged:
             for off_deg in angles_deg:
                 nears.append(approach(benches, body, off_deg, near_rounds))
     load = others.load()
-    sizes = [exactness(radius, phase) for phase, radius in product(PHASES_DEG, radii_px)]
+    sizes = []
+    for phase, radius in product(PHASES_DEG, radii_px):
+        sizes.append(exactness(radius, phase))
     write_rows(directory / "bodies_cost.csv", costs)
     write_rows(directory / "bodies_size.csv", sizes)
     write_rows(directory / "bodies_limits.csv", nears)
@@ -629,8 +638,12 @@ def draw_costs(path: Path, costs: Sequence[BodyCost], load: Load) -> None:
         f" ms; the dearest body, {dearest.scene}, {dearest.cpu_ms:.0f} ms"
     )
     title = load.title(finding, "Bodies of each kind on top of a frame")
-    names = [capital(cost.scene) for cost in costs]
-    times_ms = [round(max(cost.cpu_ms, 0.0), 2) for cost in costs]
+    names = []
+    times_ms = []
+    for cost in costs:
+        names.append(capital(cost.scene))
+        positive_ms = max(cost.cpu_ms, 0.0)
+        times_ms.append(round(positive_ms, 2))
     note = load.note(COST_NOTE)
     with chart(path, title, note=note, height_inch=4.4) as (axes,):
         value_bars(axes, names, times_ms, BLUE)

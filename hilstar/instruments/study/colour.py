@@ -424,7 +424,9 @@ def shown_stars(bench: Bench, colours: Colours, fields: int) -> ShownStars:
                 continue
             total = by_primary.sum()
             rate = float(stars.electrons_per_s[number])
-            centroids = [centroid_px(images[..., k], window) for k in range(3)]
+            centroids = []
+            for k in range(3):
+                centroids.append(centroid_px(images[..., k], window))
             middles = np.nan_to_num(centroids) + colours.places_px
             row = int(np.flatnonzero(sprites.star == number)[0])
             true_px = sprites.x_px[row], sprites.y_px[row]
@@ -574,7 +576,9 @@ def study_mosaic(channels: Sequence[Optics]) -> Iterator[MosaicPlaces]:
     x_px = TILE_PX // 2 + across.ravel()
     y_px = TILE_PX // 2 + down.ravel()
     for sigma_px, kelvin in product(SIGMAS_PX, STARS_K):
-        rates = [float(dgs_electrons_per_s(kelvin, channel, Photometry())) for channel in channels]
+        rates = []
+        for channel in channels:
+            rates.append(float(dgs_electrons_per_s(kelvin, channel, Photometry())))
         stars = mosaic_image(sigma_px, x_px, y_px)
         raw = in_pixels([stars * rate / max(rates) for rate in rates], "rggb")
         images = {"mosaic": (raw, 0.0), "superpixel": (luminance(raw), SUPERPIXEL_VARIANCE_PX2)}
@@ -675,8 +679,10 @@ def run(directory: Path, quick: bool = False) -> Judged:
     write_rows(directory / "colour_mosaic.csv", mosaic)
     load = others.load()
     lines = [draw(directory / "colour", choices, load)]
-    lines += [lateral_line(row) for row in lateral]
-    lines += [mosaic_line(row) for row in mosaic if row.sigma_px == QUOTED_SIGMA_PX]
+    lines += map(lateral_line, lateral)
+    for places in mosaic:
+        if places.sigma_px == QUOTED_SIGMA_PX:
+            lines.append(mosaic_line(places))
     return load.judged(lines)
 
 

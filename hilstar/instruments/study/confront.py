@@ -62,7 +62,10 @@ def run(directory: Path, images: Path, quick: bool = False) -> list[str]:
         rows += confront_camera(camera, directory / camera.name, quick)
     write_rows(directory / "confront.csv", rows)
     draw(directory / "confront", rows)
-    return [line_of(row) for row in rows]
+    lines = []
+    for row in rows:
+        lines.append(line_of(row))
+    return lines
 
 
 def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographRow]:
@@ -85,9 +88,12 @@ def confront_camera(folder: Path, output: Path, quick: bool) -> list[PhotographR
     if fitted is None:
         return refused
     count = len(fitted.verdicts)
-    rows = [row_of(folder.name, fitted, number) for number in range(count)]
+    rows = []
+    for number in range(count):
+        rows.append(row_of(folder.name, fitted, number))
     if not quick and count == len(paths) >= MIN_HELD_OUT:
-        rows = [held_out(row, folder, output, paths) for row in rows]
+        for number, row in enumerate(rows):
+            rows[number] = held_out(row, folder, output, paths)
     return rows + refused
 
 
@@ -188,5 +194,7 @@ def draw(path: Path, rows: Sequence[PhotographRow]) -> None:
             axes.set(xlabel=f"rms [{unit}]", xlim=(0, None))
             axes.set_yticks(places, [])
             axes.invert_yaxis()
-        labels = [f"{row.camera}, {short_name(row, measured)}" for row in measured]
+        labels = []
+        for row in measured:
+            labels.append(f"{row.camera}, {short_name(row, measured)}")
         panels[0].set_yticks(places, labels, fontsize=SMALL_PT, color=MUTED)

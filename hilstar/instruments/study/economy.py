@@ -156,11 +156,14 @@ def run(directory: Path, quick: bool = False) -> Judged:
     for bits, scene in product(BITS, SCENES):
         full, *autos = compare(scene, bits, rounds)
         rows += [full, *autos]
-        comparisons += [EffortComparison(full, auto) for auto in autos]
+        for auto in autos:
+            comparisons.append(EffortComparison(full, auto))
     write_rows(directory / "economy.csv", rows)
     load = others.load()
     draw(directory / "economy", comparisons, load)
-    lines = [line_of(comparison, load) for comparison in comparisons]
+    lines = []
+    for comparison in comparisons:
+        lines.append(line_of(comparison, load))
     if not load.busy:
         lines.append(economy_finding(comparisons))
     return load.judged(lines)
@@ -193,7 +196,10 @@ def compare(scene: EffortScene, bits: int, rounds: int) -> list[EffortOutcome]:
             benches[name] = stack.enter_context(bench)
             works[name] = partial(frame_of, bench, scene.turn)
         times = in_turn(works, rounds)
-        return [outcome(scene, name, bench, times[name]) for name, bench in benches.items()]
+        outcomes = []
+        for name, bench in benches.items():
+            outcomes.append(outcome(scene, name, bench, times[name]))
+        return outcomes
 
 
 def frame_of(bench: Bench, turn: CameraTurn, number: int) -> Levels:

@@ -87,16 +87,17 @@ COSTS_NOTE = (
 )
 
 NOWHERE = "a scenario, nothing on"
+# Along a line across the field
+FALSE_STARS = [
+    {"kind": "false-star", "radec_deg": [82 + k / 16, -3 + k / 16], "v_mag": 4.0} for k in range(64)
+]
 CASES: dict[str, list[dict[str, Any]]] = {
     NOWHERE: [],
     "false star, on the sky": [{"kind": "false-star", "radec_deg": [84.2, -1.0], "v_mag": 2.0}],
     "false star, moving": [
         {"kind": "false-star", "tracker_px": [400, 500], "rate_px_s": [60, 10], "v_mag": 2.0}
     ],
-    "64 false stars": [
-        {"kind": "false-star", "radec_deg": [82 + k / 16, -3 + k / 16], "v_mag": 4.0}
-        for k in range(64)
-    ],
+    "64 false stars": FALSE_STARS,
     "star gone": [{"kind": "star-gone", "hip": 26311}],
     "flash at a star": [{"kind": "flash", "hip": 26727, "for_s": 10, "electrons": 1e5}],
     "40 tracks of 12 px": [
@@ -148,7 +149,8 @@ class Stray:
 def bench_of(folder: Path, quantisation: str) -> Bench:
     """The bench of a study: an 8-bit monitor of 1920 x 1080 before a tracker of 11 degrees."""
     from_corner = np.hypot(*np.indices((256, 256)))
-    np.save(folder / "stray.npy", from_corner * 3.0)
+    light = from_corner * 3.0
+    np.save(folder / "stray.npy", light)
     tables: dict[str, Table] = {
         "tracker": {"resolution_px": (1024, 1024)},
         "monitor": {**FULL_HD, "refresh_hz": REFRESH_HZ},
@@ -175,9 +177,14 @@ class CaseFrames:
         self.view = display_view(bench, scenario)
         # A run asks its schedule in every frame, whatever it has on.
         later = fault_of({"kind": "blank", "name": "later", "at_s": 1e6})
-        self.schedule = FaultSchedule(replace(scenario, faults=(later,)), 1 / REFRESH_HZ)
-        self.prepared = [self.view.prepare(fault) for fault in faults]
-        self.is_frozen = any(isinstance(fault, Freeze) for fault in self.prepared)
+        later_scenario = replace(scenario, faults=(later,))
+        self.schedule = FaultSchedule(later_scenario, 1 / REFRESH_HZ)
+        self.prepared = []
+        self.is_frozen = False
+        for fault in faults:
+            prepared = self.view.prepare(fault)
+            self.prepared.append(prepared)
+            self.is_frozen |= isinstance(prepared, Freeze)
 
     def without(self, frame: int) -> Levels:
         """A frame without faults."""
@@ -187,16 +194,19 @@ class CaseFrames:
         """The same frame with the faults."""
         t_ns = round(frame / REFRESH_HZ * NS_PER_S)
         self.schedule.at(t_ns)
-        faults = enumerate(self.prepared, start=1)
-        now = tuple(Now(number, fault, t_ns) for number, fault in faults)
-        effects = FaultLayer(self.view, now)
+        now = []
+        for number, fault in enumerate(self.prepared, start=1):
+            now.append(Now(number, fault, t_ns))
+        effects = FaultLayer(self.view, tuple(now))
         if self.is_frozen:
             return self.bench.renderer.levels()
         if effects.blank:
             return self.bench.draw_sprites(None).levels
-        turned_view = effects.turned(self.bench.view(attitude_of(frame)))
+        bench_view = self.bench.view(attitude_of(frame))
+        turned_view = effects.turned(bench_view)
         layer = effects if effects.now else None
-        return self.bench.draw_sprites(self.bench.light(turned_view, layer)).levels
+        light = self.bench.light(turned_view, layer)
+        return self.bench.draw_sprites(light).levels
 
 
 def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
@@ -210,33 +220,48 @@ def cost_of(bench: Bench, folder: Path, case: str, rounds: int) -> FaultCost:
 
 def stray_light(bench: Bench, share: float) -> Stray:
     """The errors of stars over even stray light, by frames with them and without them."""
-    sprites = bench.light(bench.view(FIELD))
+    view = bench.view(FIELD)
+    sprites = bench.light(view)
     lights: tuple[GlowLight, ...] = ()
     if share:
         boresight = np.array([0.0, 0.0, 1.0])
         light_e_per_s = share * bench.flux_at_white_e_per_s
-        lights = (GlowLight(boresight, light_e_per_s, EVEN_RAD, 1.0, bench.camera),)
-    both = light_of(bench, replace(sprites, extended=lights))
+        light = GlowLight(boresight, light_e_per_s, EVEN_RAD, 1.0, bench.camera)
+        lights = (light,)
+    with_light = replace(sprites, extended=lights)
+    both = light_of(bench, with_light)
     no_sprites = join_sprites([], sprites.footprint_px)
-    alone = light_of(bench, replace(no_sprites, extended=lights))
+    light_alone = replace(no_sprites, extended=lights)
+    alone = light_of(bench, light_alone)
+    errors_mag = light_errors_mag(sprites, both - alone, bench.camera.resolution_px)
+    median, p95 = np.percentile(errors_mag, (50, 95)).tolist()
+    is_lost = np.array(errors_mag) > LOST_MAG
+    lost = float(is_lost.mean())
+    return Stray(bench.config.render.quantisation, share, len(errors_mag), median, p95, lost)
+
+
+def light_errors_mag(
+    sprites: FrameLight, shown_light: FloatArray, size_px: tuple[int, int]
+) -> list[float]:
+    """The errors of lone stars' light, mag, in an image (h, w) of what they add to a frame."""
     rates = sprites.data["electrons_per_s"]
-    size_px = bench.camera.resolution_px
     errors_mag = []
-    for star, window in lone_windows(sprites, sprites.x_px, sprites.y_px, size_px, ISOLATION):
-        true = float(rates[sprites.star == star].sum())
-        shown = float((both[window] - alone[window]).sum())
+    windows = lone_windows(sprites, sprites.x_px, sprites.y_px, size_px, ISOLATION)
+    for star, window in windows:
+        of_star = sprites.star == star
+        true = float(rates[of_star].sum())
+        shown = float(shown_light[window].sum())
         error_mag = NOTHING_MAG
         if shown > 0:
             error_mag = abs(magnitude(shown / true))
         errors_mag.append(error_mag)
-    median, p95 = np.percentile(errors_mag, (50, 95)).tolist()
-    lost = float((np.array(errors_mag) > LOST_MAG).mean())
-    return Stray(bench.config.render.quantisation, share, len(errors_mag), median, p95, lost)
+    return errors_mag
 
 
 def light_of(bench: Bench, sprites: FrameLight) -> FloatArray:
     """The light (h, w) of the panel when it shows a frame of sprites."""
-    return shown_light(bench.draw_sprites(sprites).levels, bench.panel).copy()
+    levels = bench.draw_sprites(sprites).levels
+    return shown_light(levels, bench.panel).copy()
 
 
 def run(directory: Path, quick: bool = False) -> Judged:
@@ -252,16 +277,21 @@ def run(directory: Path, quick: bool = False) -> Judged:
         for quantisation in QUANTISATIONS:
             with bench_of(Path(name), quantisation) as bench:
                 bench.warm_up()
-                costs += [cost_of(bench, Path(name), case, rounds) for case in CASES]
-                strays += [stray_light(bench, share) for share in shares]
+                for case in CASES:
+                    costs.append(cost_of(bench, Path(name), case, rounds))
+                for share in shares:
+                    strays.append(stray_light(bench, share))
     load = others.load()
     write_rows(directory / "faults-cost.csv", costs)
     write_rows(directory / "faults-stray.csv", strays)
     draw_stray(directory / "faults", strays)
     draw_costs(directory / "faults_cost", costs, load)
-    lines = [cost_line(costs, quantisation) for quantisation in QUANTISATIONS]
-    lines += [stray_line(strays, quantisation) for quantisation in QUANTISATIONS]
-    return load.judged(lines)
+    cost_lines = []
+    stray_lines = []
+    for quantisation in QUANTISATIONS:
+        cost_lines.append(cost_line(costs, quantisation))
+        stray_lines.append(stray_line(strays, quantisation))
+    return load.judged([*cost_lines, *stray_lines])
 
 
 def cost_line(costs: Sequence[FaultCost], quantisation: str) -> str:
@@ -310,12 +340,12 @@ def draw_stray(path: Path, strays: Sequence[Stray]) -> None:
             limits.append(f"from {share:g} of white on with {name}")
     finding = "No stray light spoils stars"
     if limits:
-        finding = (
-            f"Stray light spoils stars by more than {SPOILT_MAG:g} mag {', and '.join(limits)}"
-        )
+        named_limits = ", and ".join(limits)
+        finding = f"Stray light spoils stars by more than {SPOILT_MAG:g} mag {named_limits}"
     looks = {name: SeriesLook(name, colour, "o") for name, colour in COLOURS.items()}
     spec = ChartSpec((STRAY_PANEL,), quantisation_of, looks, STRAY_NOTE)
-    draw_rows(path, finding, spec, [row for row in strays if row.share_of_white])
+    rows = [row for row in strays if row.share_of_white]
+    draw_rows(path, finding, spec, rows)
 
 
 def quantisation_of(row: Stray | FaultCost) -> str:
@@ -332,7 +362,7 @@ def draw_costs(path: Path, costs: Sequence[FaultCost], load: Load) -> None:
         f" {dearest.case}, {dearest.frame_ms:.0f} ms"
     )
     title = load.title(finding, "Times of frames with each fault")
-    panels = tuple(costs_panel(quantisation) for quantisation in QUANTISATIONS)
+    panels = tuple(map(costs_panel, QUANTISATIONS))
     layout = {"share_y": True, "height_inch": 5.2}
     spec = ChartSpec(panels, quantisation_of, {}, COSTS_NOTE, len(panels), layout)
     with row_panels(path, title, spec, costs, load) as grid:
@@ -343,10 +373,12 @@ def draw_costs(path: Path, costs: Sequence[FaultCost], load: Load) -> None:
 def costs_panel(quantisation: str) -> PanelSpec:
     """The times of frames of one quantisation; the first panel has the names for all."""
     colour = COLOURS[quantisation]
+    without = SeriesLook("without", colour, is_open=True)
+    with_fault = SeriesLook("with the fault", colour)
     dots = DotsSpec(
         (
-            ("without_ms", SeriesLook("without", colour, is_open=True)),
-            ("frame_ms", SeriesLook("with the fault", colour)),
+            ("without_ms", without),
+            ("frame_ms", with_fault),
         ),
         where=lambda row: row.quantisation == quantisation,
         name=(lambda row: row.case) if quantisation == QUANTISATIONS[0] else None,

@@ -205,10 +205,8 @@ class TracedBench:
             area = a * d - b * c
             off_x = x - x_px
             off_y = y - y_px
-            u_step = (d * off_x - b * off_y) / area
-            u = u - u_step
-            v_step = (a * off_y - c * off_x) / area
-            v = v - v_step
+            u = u - (d * off_x - b * off_y) / area
+            v = v - (a * off_y - c * off_x) / area
         length = np.sqrt(u**2 + v**2 + 1)
         slopes = np.column_stack([u, v, ones])
         return slopes / length[:, None]
@@ -401,7 +399,9 @@ def draw(
 ) -> None:
     """The errors of each model, by the number of centroids and by their noise."""
     models = dict.fromkeys(outcome.model for outcome in outcomes)
-    labels = {name: SHORT.get(name, name) for name in models}
+    labels = {}
+    for name in models:
+        labels[name] = SHORT.get(name, name)
     uncalibrated = LevelLine(uncalibrated_arcsec, "uncalibrated", style=":")
     fails = LevelLine(FAIL_ARCSEC, "fails above")
     levels = (

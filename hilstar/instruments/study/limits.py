@@ -127,7 +127,8 @@ class StressLimit:
     def at_unit(self) -> str:
         """The stress's unit: in brackets at its end, or what it counts."""
         bracketed = self.stress.partition("[")[2].partition("]")[0]
-        return bracketed or self.stress.split()[0].rstrip(",")
+        quantity = self.stress.split()[0]
+        return bracketed or quantity.rstrip(",")
 
     @property
     def tolerance(self) -> float:
@@ -146,13 +147,16 @@ class StressLimit:
         Between two points the error's logarithm is a straight line.
         """
         over = self.error > self.tolerance
-        crossing = np.flatnonzero(over[1:] != over[:-1])
+        crosses = over[1:] != over[:-1]
+        crossing = np.flatnonzero(crosses)
         if not len(crossing):
             return math.nan
         k = int(crossing[0])
-        low, high = np.log(np.maximum(self.error[k : k + 2], SMALLEST))
+        around = np.maximum(self.error[k : k + 2], SMALLEST)
+        low, high = np.log(around)
         share = (math.log(self.tolerance) - low) / (high - low)
-        return float(self.at[k] + share * (self.at[k + 1] - self.at[k]))
+        step = self.at[k + 1] - self.at[k]
+        return float(self.at[k] + share * step)
 
     @property
     def words(self) -> str:
@@ -161,14 +165,16 @@ class StressLimit:
             return self.says.format(two_digits(self.meets))
         if (self.error > self.tolerance).all():
             return "everywhere"
-        return f"nowhere to {two_digits(float(self.at[-1]))} {self.at_unit}"
+        last = two_digits(float(self.at[-1]))
+        return f"nowhere to {last} {self.at_unit}"
 
     def rows(self) -> list[LimitRow]:
         """Its rows of the table, from easy to hard."""
         ends = self.unit, self.tolerance, self.meets
         rows = []
         for at, error in zip(self.at.tolist(), self.error.tolist(), strict=True):
-            rows.append(LimitRow(self.method, self.stress, at, error, *ends))
+            row = LimitRow(self.method, self.stress, at, error, *ends)
+            rows.append(row)
         return rows
 
 
@@ -179,9 +185,13 @@ def narrow_sprites() -> StressLimit:
     pixels = np.arange(-8.0, 9.0)
     errors = []
     for sigma_px in sigmas_px.tolist():
-        shares = np.stack([pixel_shares(pixels - phase, sigma_px) for phase in phases])
+        by_phase = []
+        for phase in phases:
+            by_phase.append(pixel_shares(pixels - phase, sigma_px))
+        shares = np.stack(by_phase)
         places = shares @ pixels / shares.sum(axis=1)
-        errors.append(float(np.abs(places - phases).max()))
+        off_px = np.abs(places - phases)
+        errors.append(float(off_px.max()))
     says = "stars under {} px wide"
     return StressLimit("Integral over pixels", SIGMA, says, "px", sigmas_px, np.array(errors))
 
@@ -193,19 +203,21 @@ def coarse_codes(quick: bool) -> StressLimit:
     for count in bits:
         (star,) = codes.code_errors(count, EXACT, 8, [FAINT_MAG])
         errors.append(star.flux_max_mag)
+    at_bits = np.array(bits, dtype=float)
     return StressLimit(
         "Exact codes, light",
         BITS,
         "codes under {} bits",
         "mag",
-        np.array(bits, dtype=float),
+        at_bits,
         np.array(errors),
     )
 
 
 def faint_stars(quick: bool) -> StressLimit:
     """The place of a star with exact codes by the plain moment, against its magnitude."""
-    mags = np.linspace(0, 9, 5 if quick else 13)
+    count = 5 if quick else 13
+    mags = np.linspace(0, 9, count)
     stars = codes.code_errors(COARSE_BITS, EXACT, 8, mags)
     errors = [star.max_px("moment") for star in stars]
     stress = FAINT
@@ -217,13 +229,15 @@ def faint_stars(quick: bool) -> StressLimit:
 def red_stars() -> StressLimit:
     """The light of held-out spectra by their V-I, median, against V-I."""
     library = load_library()
-    rates = library_electrons_per_s(library, study_optics("ccd47-20"), Photometry())
+    optics = study_optics("ccd47-20")
+    rates = library_electrons_per_s(library, optics, Photometry())
     errors = held_out_errors(rates)
     at = np.arange(-0.2, 3.9, 0.2)
     medians = []
     for centre in at:
         near = np.abs(library.vi_mag - centre) <= WINDOW_VI_MAG
-        medians.append(float(np.median(np.abs(magnitude(1 + errors[near])))))
+        off_mag = np.abs(magnitude(1 + errors[near]))
+        medians.append(float(np.median(off_mag)))
     says = "spectra over V-I {}"
     return StressLimit("Spectra by colour, median", RED_STARS, says, "mag", at, np.array(medians))
 
@@ -231,14 +245,17 @@ def red_stars() -> StressLimit:
 def crowds() -> StressLimit:
     """The light of stars that do not fit into a frame, against the stars in view."""
     counts = np.geomspace(3e3, 3e6, 19)
-    room = max_stars(GaussianPsf((SIGMA_PX, SIGMA_PX)).footprint_px)
+    psf = GaussianPsf((SIGMA_PX, SIGMA_PX))
+    room = max_stars(psf.footprint_px)
     rng = np.random.default_rng(SEED)
     errors = []
     for count in counts.astype(int).tolist():
-        light = flux_ratio(np.log10(rng.uniform(size=count)) / STAR_SLOPE)
+        brighter = np.log10(rng.uniform(size=count))
+        light = flux_ratio(brighter / STAR_SLOPE)
         drawn = brightest(light, room)
         shown = light if drawn is None else light[drawn]
-        errors.append(abs(magnitude(float(shown.sum() / light.sum()))))
+        share = float(shown.sum() / light.sum())
+        errors.append(abs(magnitude(share)))
     return StressLimit(
         "A frame's room for stars", CROWD, "{} stars", "mag", counts, np.array(errors)
     )
@@ -255,10 +272,14 @@ def tilted_screen() -> StressLimit:
         across = x_px - camera.principal_point_px[0]
         down = y_px - camera.principal_point_px[1]
         depth = camera.focal_length_px + across * math.sin(tilt)
-        true = normalise(np.stack([across * math.cos(tilt), down, depth], axis=1))
-        turn = turn_between(true, shown, np.ones(len(true)))
-        residual = shown - true - np.cross(turn, true)
-        rms_rad = float(np.sqrt((residual**2).sum(axis=1).mean()))
+        turned = np.stack([across * math.cos(tilt), down, depth], axis=1)
+        true = normalise(turned)
+        weights = np.ones(len(true))
+        turn = turn_between(true, shown, weights)
+        turned_rad = np.cross(turn, true)
+        residual = shown - true - turned_rad
+        squares = (residual**2).sum(axis=1)
+        rms_rad = float(np.sqrt(squares.mean()))
         errors.append(rms_rad * camera.focal_length_px)
     says = "a tilt over {} deg"
     return StressLimit("Pinhole, no geometry file", TILT, says, "px", tilts_deg, np.array(errors))
@@ -269,9 +290,12 @@ def wide_fields() -> StressLimit:
     camera = monitor_camera(SIZE_PX, PITCH_UM, FOCAL_LENGTH_MM, ALIGNED)
     from_90_deg = np.geomspace(60.0, 1e-7, 15)
     angle = np.radians(90.0 - from_90_deg)
-    true = np.stack([np.sin(angle), np.zeros(len(angle)), np.cos(angle)], axis=1)
-    rays = normalise(camera.rays(*camera.project(true)))
-    errors = np.linalg.norm(np.cross(rays, true), axis=1) * ARCSEC_PER_RAD
+    zeros = np.zeros(len(angle))
+    true = np.stack([np.sin(angle), zeros, np.cos(angle)], axis=1)
+    places_px = camera.project(true)
+    rays = normalise(camera.rays(*places_px))
+    off_rad = np.cross(rays, true)
+    errors = np.linalg.norm(off_rad, axis=1) * ARCSEC_PER_RAD
     return StressLimit(
         "Perspective",
         "angle short of 90 deg [deg]",
@@ -288,8 +312,10 @@ def poles() -> StressLimit:
     errors = []
     for distance in from_pole_deg.tolist():
         q = from_radec_roll_deg(123.4, 90.0 - distance, 56.7)
-        back = from_radec_roll_deg(*to_radec_roll_deg(q))
-        errors.append(angle_between_rad(q, back) * ARCSEC_PER_RAD)
+        angles_deg = to_radec_roll_deg(q)
+        back = from_radec_roll_deg(*angles_deg)
+        off_rad = angle_between_rad(q, back)
+        errors.append(off_rad * ARCSEC_PER_RAD)
     return StressLimit(
         "RA, Dec and roll",
         "distance from the pole [deg]",
@@ -306,15 +332,17 @@ def parted_refreshes() -> StressLimit:
     `study timing` checks this law with the virtual tracker.
     """
     rates_deg_s = np.geomspace(0.03, 30.0, 13)
-    worst = beat(Exposures(REFRESH_HZ, PARTED_REFRESHES / REFRESH_HZ)).worst_arcsec_per_deg_s or 0.0
+    exposures = Exposures(REFRESH_HZ, PARTED_REFRESHES / REFRESH_HZ)
+    worst = beat(exposures).worst_arcsec_per_deg_s or 0.0
     stress = TURN
+    off_arcsec = worst * rates_deg_s
     return StressLimit(
         "Refreshes in an exposure",
         stress,
         "turns over {} deg/s",
         "arcsec",
         rates_deg_s,
-        worst * rates_deg_s,
+        off_arcsec,
     )
 
 
@@ -328,30 +356,43 @@ def predicted_rms_arcsec(
     """
     way = next(predictor for predictor in predictors() if predictor.is_default)
     errors = []
-    for frame in range(int(SPAN_S * REFRESH_HZ)):
+    count = int(SPAN_S * REFRESH_HZ)
+    for frame in range(count):
         t_ns = round((1 + frame / REFRESH_HZ) * NS_PER_S)
-        newest = math.floor((t_ns - age_ms * NS_PER_MS) * packet_hz / NS_PER_S)
+        newest_ns = t_ns - age_ms * NS_PER_MS
+        newest = math.floor(newest_ns * packet_hz / NS_PER_S)
         numbers = range(newest + 1 - NEAR_SAMPLES, newest + 1)
         samples = []
         for number in numbers:
             at_ns = round(number * NS_PER_S / packet_hz)
-            samples.append(AttitudeSample(at_ns, attitude(at_ns), rate_of(attitude, at_ns)))
-        errors.append(angle_between_rad(way.load(samples)(t_ns), attitude(t_ns)) * ARCSEC_PER_RAD)
-    return float(np.sqrt(np.mean(np.square(errors))))
+            true = attitude(at_ns)
+            rate = rate_of(attitude, at_ns)
+            samples.append(AttitudeSample(at_ns, true, rate))
+        predicted_q = way.load(samples)(t_ns)
+        off_rad = angle_between_rad(predicted_q, attitude(t_ns))
+        errors.append(off_rad * ARCSEC_PER_RAD)
+    mean_square = np.mean(np.square(errors))
+    return float(np.sqrt(mean_square))
 
 
 def old_packets(quick: bool) -> StressLimit:
     """The predicted attitude of a shaken slew, against the age of the newest packet."""
-    ages_ms = np.geomspace(0.5, 100.0, 6 if quick else 12)
-    errors = [predicted_rms_arcsec(slew_attitude, 1000.0, age) for age in ages_ms.tolist()]
+    count = 6 if quick else 12
+    ages_ms = np.geomspace(0.5, 100.0, count)
+    errors = []
+    for age in ages_ms.tolist():
+        errors.append(predicted_rms_arcsec(slew_attitude, 1000.0, age))
     says = "packets over {} ms old"
     return StressLimit("Prediction by rates", AGE, says, "arcsec", ages_ms, np.array(errors))
 
 
 def few_packets(quick: bool) -> StressLimit:
     """The predicted attitude of the same slew without delay, against the packet rate."""
-    rates_hz = np.geomspace(1000.0, 5.0, 6 if quick else 12)
-    errors = [predicted_rms_arcsec(slew_attitude, rate, 0.0) for rate in rates_hz.tolist()]
+    count = 6 if quick else 12
+    rates_hz = np.geomspace(1000.0, 5.0, count)
+    errors = []
+    for rate in rates_hz.tolist():
+        errors.append(predicted_rms_arcsec(slew_attitude, rate, 0.0))
     return StressLimit(
         "Prediction by rates",
         PACKETS,
@@ -364,12 +405,14 @@ def few_packets(quick: bool) -> StressLimit:
 
 def vibrations(quick: bool) -> StressLimit:
     """The predicted attitude of a vibration, 20 ms ahead, against its frequency."""
-    frequencies_hz = np.geomspace(0.5, 45.0, 6 if quick else 12)
+    count = 6 if quick else 12
+    frequencies_hz = np.geomspace(0.5, 45.0, count)
     errors = []
     for hz in frequencies_hz.tolist():
 
         def attitude(t_ns: int, hz: float = hz) -> FloatArray:
-            angle = VIBRATION_ARCSEC / ARCSEC_PER_RAD * math.sin(math.tau * hz * t_ns / NS_PER_S)
+            wave = math.sin(math.tau * hz * t_ns / NS_PER_S)
+            angle = VIBRATION_ARCSEC / ARCSEC_PER_RAD * wave
             return propagate(ORION, Z, angle)
 
         errors.append(predicted_rms_arcsec(attitude, 100.0, 20.0))
@@ -409,23 +452,30 @@ def run(directory: Path, quick: bool = False) -> list[str]:
 
 def limits_finding(limits: Sequence[StressLimit]) -> str:
     """How many methods leave their tolerance, and where those do that a bench meets first."""
-    failing = [limit for limit in limits if limit.fails]
-    met = [limit.words for limit in failing if limit.stress in MET_FIRST]
-    count = f"{len(failing)} of {len(limits)} methods of hilstar leave their tolerance"
-    return f"{count}: {', '.join(met)}"
+    failing = 0
+    met = []
+    for limit in limits:
+        failing += limit.fails
+        if limit.fails and limit.stress in MET_FIRST:
+            met.append(limit.words)
+    met_words = ", ".join(met)
+    return f"{failing} of {len(limits)} methods of hilstar leave their tolerance: {met_words}"
 
 
 def draw(path: Path, limits: Sequence[StressLimit]) -> None:
     """A panel for each method: its error, the tolerance, and where they meet."""
     rows = math.ceil(len(limits) / COLUMNS)
+    arcsec = two_digits(TOLERANCE_ARCSEC)
     note = (
         f"Blue: the error as measured, largest or rms. Red: the tolerance, {TOLERANCE_MAG:g} mag,"
-        f" {TOLERANCE_PX:g} px, or {two_digits(TOLERANCE_ARCSEC)} arcsec, which is {TOLERANCE_PX:g}"
+        f" {TOLERANCE_PX:g} px, or {arcsec} arcsec, which is {TOLERANCE_PX:g}"
         " px of the demo's monitor; the dot is where they meet. Each axis runs from easy to hard."
         " Places by the plain moment."
     )
-    layout: dict[str, Any] = {"share_x": False, "height_inch": EDGE_INCH + PANEL_INCH * rows}
-    with chart(path, limits_finding(limits), rows, COLUMNS, note=note, **layout) as grid:
+    height_inch = EDGE_INCH + PANEL_INCH * rows
+    layout: dict[str, Any] = {"share_x": False, "height_inch": height_inch}
+    finding = limits_finding(limits)
+    with chart(path, finding, rows, COLUMNS, note=note, **layout) as grid:
         for axes, limit in zip(grid, limits, strict=False):
             draw_limit(axes, limit)
         for axes in grid[len(limits) :]:
@@ -434,11 +484,13 @@ def draw(path: Path, limits: Sequence[StressLimit]) -> None:
 
 def draw_limit(axes: "Axes", limit: StressLimit) -> None:
     """One method: error against stress, from easy to hard, and where it meets its tolerance."""
-    axes.plot(limit.at, np.maximum(limit.error, SMALLEST), color=BLUE, label="_error")
+    errors = np.maximum(limit.error, SMALLEST)
+    axes.plot(limit.at, errors, color=BLUE, label="_error")
     axes.axhline(limit.tolerance, color=RED, ls="--", lw=1.2, label="_tolerance")
     axes.set(yscale="log", xlabel=limit.stress, ylabel=f"error [{limit.unit}]")
     axes.set_title(capital(limit.method), color=BLUE)  # the name of the line
-    low, high = sorted((float(limit.at[0]), float(limit.at[-1])))
+    ends = (float(limit.at[0]), float(limit.at[-1]))
+    low, high = sorted(ends)
     if high > LOG_FROM * abs(low) > 0:
         axes.set_xscale("log")
     if limit.at[0] > limit.at[-1]:
@@ -449,5 +501,6 @@ def draw_limit(axes: "Axes", limit: StressLimit) -> None:
         return
     place = limit.meets, limit.tolerance
     axes.plot(*place, "o", color=RED, ms=6, label="_meets", zorder=4)
-    label = f"{two_digits(limit.meets)} {limit.at_unit}".strip()
+    met = two_digits(limit.meets)
+    label = f"{met} {limit.at_unit}".strip()
     axes.annotate(label, place, (-7, 5), textcoords="offset points", ha="right", **style)

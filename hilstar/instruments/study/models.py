@@ -184,7 +184,8 @@ def catalogue_errors(directory: Path) -> ChartFinding:
     """
     catalog = load_catalog()
     errors = catalogue_medians(catalog)
-    write_rows(directory / "catalogue_errors.csv", [*source_counts(catalog), *errors])
+    counts = source_counts(catalog)
+    write_rows(directory / "catalogue_errors.csv", [*counts, *errors])
     medians = {row.what: row.here for row in errors}
     largest = max(abs(row.here - row.thesis) for row in errors)
     places = f"{medians['sigma_ra_mas']:.2f} and {medians['sigma_dec_mas']:.2f} mas"
@@ -204,8 +205,10 @@ def source_counts(catalog: Catalog) -> list[CatalogueFigure]:
     rows = []
     for source, (v_stars, bv_stars) in TABLE_2_2.items():
         key = source.encode()
-        rows.append(CatalogueFigure(f"V from {source}", "stars", v_sources[key], v_stars))
-        rows.append(CatalogueFigure(f"B-V from {source}", "stars", bv_sources[key], bv_stars))
+        of_v = CatalogueFigure(f"V from {source}", "stars", v_sources[key], v_stars)
+        rows.append(of_v)
+        of_bv = CatalogueFigure(f"B-V from {source}", "stars", bv_sources[key], bv_stars)
+        rows.append(of_bv)
     return rows
 
 
@@ -242,9 +245,11 @@ def draw_catalogue_errors(
             high = CLIPPED_TIMES * row.thesis
             style: dict[str, Any] = {"cmap": density(), "norm": "log", "rasterized": True}
             style |= {"bins": (120, 60), "range": (value.limits, (0.0, high))}
-            axes.hist2d(value.of_star, np.minimum(facts[row.what], high), **style)
+            errors_shown = np.minimum(facts[row.what], high)
+            axes.hist2d(value.of_star, errors_shown, **style)
             axes.set(ylabel=f"error [{row.unit}]", xlabel=value.label)
-            axes.set_title(f"{title}: {two_digits(row.here)} {row.unit}")
+            here = two_digits(row.here)
+            axes.set_title(f"{title}: {here} {row.unit}")
             axes.axhline(row.here, color=INK, label="_here")
             axes.axhline(row.thesis, color=MUTED, ls="--", label="_thesis")
         for axes, name in zip(panels[6:], ("sigma_ra_mas", "sigma_dec_mas"), strict=True):
@@ -269,23 +274,29 @@ def density() -> "Colormap":
     """A colour map from clear to blue, for light and dark pages."""
     from matplotlib.colors import LinearSegmentedColormap, to_rgba
 
-    return LinearSegmentedColormap.from_list("density", [to_rgba(BLUE, 0.06), to_rgba(BLUE, 1.0)])
+    clear = to_rgba(BLUE, 0.06)
+    full = to_rgba(BLUE, 1.0)
+    return LinearSegmentedColormap.from_list("density", [clear, full])
 
 
 def sky_map(axes: "Axes", catalog: Catalog, name: str, error_mas: FloatArray) -> None:
     """A map of the median of an error; Hipparcos scanned the sky about the ecliptic's poles."""
     ra_edges = np.linspace(0, 360, 73)
-    dec_edges = np.degrees(np.arcsin(np.linspace(-1, 1, 37)))
+    sines = np.linspace(-1, 1, 37)
+    dec_edges = np.degrees(np.arcsin(sines))
     column = np.digitize(catalog.ra_deg, ra_edges) - 1
     row = np.digitize(catalog.dec_deg, dec_edges) - 1
-    medians = np.full((len(dec_edges) - 1, len(ra_edges) - 1), np.nan)
-    for at in np.unique(row * medians.shape[1] + column):
+    rows_and_columns = (len(dec_edges) - 1, len(ra_edges) - 1)
+    medians = np.full(rows_and_columns, np.nan)
+    cells = row * medians.shape[1] + column
+    for at in np.unique(cells):
         cell_row, cell_column = divmod(int(at), medians.shape[1])
         in_cell = (row == cell_row) & (column == cell_column)
         medians[cell_row, cell_column] = np.median(error_mas[in_cell])
     style: dict[str, Any] = {"cmap": density(), "vmin": 0.5, "vmax": 1.3, "rasterized": True}
     image = axes.pcolormesh(ra_edges, dec_edges, medians, **style)
-    title = f"Sky map: {NAMES_2_3[list(TABLE_2_3).index(name)]}, medians"
+    place = list(TABLE_2_3).index(name)
+    title = f"Sky map: {NAMES_2_3[place]}, medians"
     axes.set(title=title, xlabel="right ascension [deg]", ylabel="declination [deg]")
     axes.figure.colorbar(image, ax=axes, label="Error [mas]", fraction=0.06, pad=0.02)
 
@@ -316,13 +327,16 @@ def passband_curves() -> dict[str, Curve]:
 def passband_rows(responses: Mapping[str, Curve]) -> list[PassbandRow]:
     """Table 2.5 by Vega's spectrum, scaled to V = 0."""
     light = vega()
-    scale = ZERO_W_M2_M["v"] / curve_mean(light, responses["v"])
+    johnson_v = curve_mean(light, responses["v"])
+    scale = ZERO_W_M2_M["v"] / johnson_v
     longest_nm = light.wavelength_nm.max()
-    by_wavelength = Curve(light.wavelength_nm, light.value * light.wavelength_nm / longest_nm)
+    by_nm = light.value * light.wavelength_nm / longest_nm
+    by_wavelength = Curve(light.wavelength_nm, by_nm)
     rows = []
     for band, (johnson, bessell, printed_nm) in TABLE_2_5.items():
         mean = curve_mean(light, responses[band])
-        effective_nm = curve_mean(by_wavelength, responses[band]) / mean * longest_nm
+        weighted = curve_mean(by_wavelength, responses[band])
+        effective_nm = weighted / mean * longest_nm
         flux = scale * mean / ERG_S_CM2_A
         rows.append(PassbandRow(band.upper(), effective_nm, printed_nm, flux, bessell, johnson))
     return rows
@@ -340,10 +354,12 @@ def passbands(directory: Path) -> ChartFinding:
     light = vega()
     exitance = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K)
     body = exitance / v_band_mean_w_m2_m(REFERENCE_TEMPERATURE_K, "energy")
-    shown = {"Vega": light(nm) / curve_mean(light, responses["v"]), "black body, 9602 K": body}
+    vega_shown = light(nm) / curve_mean(light, responses["v"])
+    shown = {"Vega": vega_shown, "black body, 9602 K": body}
     blue = float(shown["Vega"][50] / body[50])
+    off_percent = 100 * off
     text = (
-        f"Vega's spectrum at V = 0 has table 2.5's second fluxes within {100 * off:.1f} %;"
+        f"Vega's spectrum at V = 0 has table 2.5's second fluxes within {off_percent:.1f} %;"
         f" at 350 nm it has {blue:.2f} of the black body of 9602 K"
     )
     note = (
@@ -353,7 +369,8 @@ def passbands(directory: Path) -> ChartFinding:
     with chart(directory / "passbands", text, panels=2, note=note) as (upper, lower):
         draw_passbands(upper, responses)
         spec = PanelSpec((), "relative F_lambda [1]", "wavelength [nm]", legend={})
-        draw_curve_panel(lower, CurvePanel(nm, shown, spec, (INK, ORANGE)))
+        lower_panel = CurvePanel(nm, shown, spec, (INK, ORANGE))
+        draw_curve_panel(lower, lower_panel)
     columns_nm = {"wavelength_nm": nm, "vega": shown["Vega"], "blackbody_9602_k": body}
     write_columns(directory / "vega.csv", columns_nm)
     return ChartFinding("passbands", text)
@@ -372,14 +389,17 @@ def draw_passbands(axes: "Axes", responses: Mapping[str, Curve]) -> None:
 def sensor_words(curve: Curve) -> str:
     """The range of a sensor and its peak, in words."""
     first_nm, last_nm = curve.wavelength_nm[[0, -1]]
-    peak_nm = curve.wavelength_nm[curve.value.argmax()]
+    peak = curve.value.argmax()
+    peak_nm = curve.wavelength_nm[peak]
     return f"{first_nm:.0f} to {last_nm:.0f} nm, most at {peak_nm:.0f}"
 
 
 def curves(directory: Path) -> ChartFinding:
     """Figures 5.1, 5.2, 5.20 and 5.21: sensors, glass, and the black bodies that they see."""
     names = ("ccd47-20", "kai-4021", "n-bk7-10mm")
-    responses = {name: load_curve(name, name) for name in names}
+    responses = {}
+    for name in names:
+        responses[name] = load_curve(name, name)
     ccd = sensor_words(responses["ccd47-20"])
     kai = sensor_words(responses["kai-4021"])
     text = f"The CCD47-20 sees {ccd}; the approximate KAI-4021 {kai}"
@@ -389,7 +409,9 @@ def curves(directory: Path) -> ChartFinding:
     )
     nm = np.arange(300.0, 1101.0, 2.0)
     columns = {"wavelength_nm": nm}
-    of_sensors = {name: curve(nm) for name, curve in responses.items()}
+    of_sensors = {}
+    for name, curve in responses.items():
+        of_sensors[name] = curve(nm)
     columns |= of_sensors
     of_bodies = {}
     for kelvin in BODIES_K:
@@ -398,10 +420,16 @@ def curves(directory: Path) -> ChartFinding:
         of_bodies[f"{kelvin:.0f} K"] = relative
         columns[f"blackbody_{kelvin:.0f}_k"] = relative
     v_nm = load_curve("johnson-v", "johnson-v").wavelength_nm
-    edges = tuple(LevelLine(float(edge), HIDDEN, MUTED, "-", 1) for edge in v_nm[[0, -1]])
+    edges = []
+    for edge_nm in v_nm[[0, -1]]:
+        edges.append(LevelLine(float(edge_nm), HIDDEN, MUTED, "-", 1))
     sensors_spec = PanelSpec((), "electrons a photon, transmission [1]")
-    bodies_spec = PanelSpec((), "exitance over its largest [1]", "wavelength [nm]", places=edges)
-    panels = CurvePanel(nm, of_sensors, sensors_spec), CurvePanel(nm, of_bodies, bodies_spec)
+    bodies_spec = PanelSpec(
+        (), "exitance over its largest [1]", "wavelength [nm]", places=tuple(edges)
+    )
+    sensors_panel = CurvePanel(nm, of_sensors, sensors_spec)
+    bodies_panel = CurvePanel(nm, of_bodies, bodies_spec)
+    panels = sensors_panel, bodies_panel
     draw_curves(directory / "curves", text, panels, note)
     write_columns(directory / "curves.csv", columns)
     return ChartFinding("curves", text)
@@ -414,7 +442,8 @@ def dark_currents(kelvin: FloatArray) -> dict[str, FloatArray]:
         currents = []
         for temperature_k in kelvin.tolist():
             detector = structs.replace(TABLE_4_2_DARK, temperature_k=temperature_k, **law)
-            currents.append(TABLE_4_2_DARK.dark_e_per_s * detector.dark_factor)
+            current_e = TABLE_4_2_DARK.dark_e_per_s * detector.dark_factor
+            currents.append(current_e)
         dark[name] = np.array(currents)
     return dark
 
@@ -429,7 +458,8 @@ def read_noises(hz: FloatArray) -> dict[str, FloatArray]:
                 TABLE_4_2_DARK, read_noise_corner_hz=corner_hz, readout_hz=readout_hz
             )
             noise_e.append(detector.read_noise_now_e)
-        noises[f"1/f corner {corner_hz / 1e3:g} kHz"] = np.array(noise_e)
+        corner_khz = corner_hz / 1e3
+        noises[f"1/f corner {corner_khz:g} kHz"] = np.array(noise_e)
     return noises
 
 
@@ -440,7 +470,9 @@ def detector_laws(directory: Path) -> ChartFinding:
     kelvin = np.arange(230.0, 300.5, 1.0)
     hz = np.geomspace(1e4, 1e7, 61)
     dark = dark_currents(kelvin)
-    cold = {name: float(values[kelvin == COLD_K][0]) for name, values in dark.items()}
+    cold = {}
+    for name, values in dark.items():
+        cold[name] = float(values[kelvin == COLD_K][0])
     text = (
         f"Of 203 e-/s at 293 K (table 4.2) {COLD_K:.0f} K leaves {cold['e2v AIMO']:.0f} by e2v's"
         f" AIMO law, {cold['e2v NIMO']:.0f} by its NIMO law, {cold['Arrhenius, 0.56 eV']:.0f} by"
@@ -452,7 +484,10 @@ def detector_laws(directory: Path) -> ChartFinding:
     )
     upper = PanelSpec((), "dark current [e-/s]", "temperature [K]", scales=("linear", "log"))
     lower = PanelSpec((), "read noise [e-]", "readout frequency [Hz]", scales=("log", "log"))
-    panels = CurvePanel(kelvin, dark, upper), CurvePanel(hz, read_noises(hz), lower)
+    noises = read_noises(hz)
+    dark_panel = CurvePanel(kelvin, dark, upper)
+    noise_panel = CurvePanel(hz, noises, lower)
+    panels = dark_panel, noise_panel
     draw_curves(directory / "detector_laws", text, panels, note)
     write_columns(directory / "detector_laws.csv", {"temperature_k": kelvin, **dark})
     return ChartFinding("detector_laws", text)
@@ -477,13 +512,15 @@ ZODIACAL_LIGHTS: dict[str, Callable[[FloatArray], FloatArray]] = {
 
 def zodiacal_photons(nm: FloatArray) -> dict[str, FloatArray]:
     """Zodiacal light of V = 22.1, photons/s/m2/arcsec2/nm at nm (n,), by each spectrum."""
-    photons_per_j = nm * 1e-9 / (PLANCK_J_S * LIGHT_M_S)
+    joule_m = PLANCK_J_S * LIGHT_M_S
+    photons_per_j = nm * 1e-9 / joule_m
     v = load_curve("johnson-v", "johnson-v")
     v_nm = np.arange(v.wavelength_nm[0], v.wavelength_nm[-1] + 1)
     level = flux_ratio(ZODIACAL_V_MAG) * ZERO_W_M2_M["v"]
     spectra = {}
     for name, light in ZODIACAL_LIGHTS.items():
-        mean = float(light(v_nm) @ v(v_nm) / v(v_nm).sum())
+        weights = v(v_nm)
+        mean = float(light(v_nm) @ weights / weights.sum())
         spectra[name] = level * light(nm) / mean * 1e-9 * photons_per_j
     return spectra
 
@@ -492,7 +529,9 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
     """Equation 4.9 and figure 4.11: zodiacal light of V = 22.1 by table 19 and as sunlight."""
     nm = np.arange(ZODIACAL_NM[0], ZODIACAL_NM[1] + 1)
     spectra = zodiacal_photons(nm)
-    totals = {name: float(np.trapezoid(values, nm)) for name, values in spectra.items()}
+    totals = {}
+    for name, values in spectra.items():
+        totals[name] = float(np.trapezoid(values, nm))
     sun, far, near = totals.values()
     text = (
         f"Zodiacal light of V = {ZODIACAL_V_MAG:g} has {far:.1f} photons/s/m2/arcsec2 90 degrees"
@@ -502,9 +541,12 @@ def zodiacal_spectrum(directory: Path) -> ChartFinding:
         f"V = {ZODIACAL_V_MAG:g}. Leinert 1998, table 19 and equation 22, through Johnson V. The"
         " WFC3 handbook's spectrum, V = 22.15, gives 101.6."
     )
-    with_totals = {f"{name}: {totals[name]:.1f} in all": light for name, light in spectra.items()}
+    with_totals = {}
+    for name, light in spectra.items():
+        with_totals[f"{name}: {totals[name]:.1f} in all"] = light
     spec = PanelSpec((), "photons/s/m2/arcsec2/nm", "wavelength [nm]", legend={})
-    draw_curves(directory / "zodiacal", text, (CurvePanel(nm, with_totals, spec),), note)
+    panel = CurvePanel(nm, with_totals, spec)
+    draw_curves(directory / "zodiacal", text, (panel,), note)
     write_columns(directory / "zodiacal.csv", {"wavelength_nm": nm, **spectra})
     return ChartFinding("zodiacal", text)
 
@@ -519,7 +561,8 @@ class SpectrumErrors:
 
     def within(self, stars: BoolArray) -> tuple[float, float]:
         """The errors that half and 95 % of some stars are within, %."""
-        half, at_95 = np.percentile(np.abs(self.percent[stars]), (50, 95)).tolist()
+        off_percent = np.abs(self.percent[stars])
+        half, at_95 = np.percentile(off_percent, (50, 95)).tolist()
         return half, at_95
 
 
@@ -531,14 +574,18 @@ def spectrum_errors() -> list[SpectrumErrors]:
     for sensor in SENSORS:
         optics = study_optics(sensor)
         rates = library_electrons_per_s(library, optics, photometry)
-        dusty_rates = library_electrons_per_s(bare_and_dusty(), optics, photometry)
+        dusty = bare_and_dusty()
+        dusty_rates = library_electrons_per_s(dusty, optics, photometry)
         by_type = held_out_by_type(dusty_rates)[: len(rates)]
-        rows.append(SpectrumErrors(sensor, HELD_OUT, 100 * held_out_errors(rates)))
-        rows.append(SpectrumErrors(sensor, BY_TYPE, 100 * by_type))
+        held_out_percent = 100 * held_out_errors(rates)
+        rows.append(SpectrumErrors(sensor, HELD_OUT, held_out_percent))
+        type_percent = 100 * by_type
+        rows.append(SpectrumErrors(sensor, BY_TYPE, type_percent))
         for scale in TEMPERATURE_SCALES:
             kelvin = star_temperatures_k(library.bv_mag, scale)
             off = dgs_electrons_per_s(kelvin, optics, photometry) / rates - 1
-            rows.append(SpectrumErrors(sensor, f"black body, {scale}", 100 * off))
+            body_percent = 100 * off
+            rows.append(SpectrumErrors(sensor, f"black body, {scale}", body_percent))
     return rows
 
 
@@ -550,17 +597,25 @@ def spectra(directory: Path) -> ChartFinding:
     rows = spectrum_errors()
     by_method = {(row.sensor, row.method): row for row in rows}
     sure = library.vi_mag < MAX_RELIABLE_VI_MAG
-    late = ~sure & np.array([name.endswith("III") for name in library.spectral_type])
+    is_giant = []
+    for name in library.spectral_type:
+        is_giant.append(name.endswith("III"))
+    late = ~sure & np.array(is_giant)
     usual = []
     late_giants = []
+    worst_real = 0.0
+    worst_body = 0.0
     for sensor, title in SENSORS.items():
         name = title.split()[0]
         real = by_method[sensor, HELD_OUT]
         by_type = by_method[sensor, BY_TYPE]
-        usual.append(f"{name} {spectra_words(real, by_method[sensor, BODY], sure)}")
-        late_giants.append(f"{name} {late_words(real, by_type, late, sure)}")
-    worst_real = max(by_method[sensor, HELD_OUT].within(sure)[1] for sensor in SENSORS)
-    worst_body = max(by_method[sensor, BODY].within(sure)[1] for sensor in SENSORS)
+        body = by_method[sensor, BODY]
+        usual_words = spectra_words(real, body, sure)
+        usual.append(f"{name} {usual_words}")
+        giant_words = late_words(real, by_type, late, sure)
+        late_giants.append(f"{name} {giant_words}")
+        worst_real = max(worst_real, real.within(sure)[1])
+        worst_body = max(worst_body, body.within(sure)[1])
     text = (
         f"Median error of the electron rate (95 %), V-I < 2.5: {'; '.join(usual)}; late M giants"
         f" (95 %), {'; '.join(late_giants)}"
@@ -569,8 +624,9 @@ def spectra(directory: Path) -> ChartFinding:
         f"Real spectra by V-I give the electron rate within {worst_real:.1f} % for 95 % of stars to"
         f" V-I = {MAX_RELIABLE_VI_MAG:g}, black bodies by B-V within {worst_body:.0f} %"
     )
+    count = (~sure).sum()
     note = (
-        f"A mark a Pickles spectrum, each held out in turn; {(~sure).sum()} are redder than the"
+        f"A mark a Pickles spectrum, each held out in turn; {count} are redder than the"
         " dashed line."
     )
     with chart(directory / "spectra", finding, panels=2, note=note) as panels:
@@ -662,7 +718,8 @@ def zero_points(directory: Path) -> ChartFinding:
     rows = zero_point_rows()
     write_rows(directory / "zero_points.csv", rows)
     default, bolometric = rows[0], rows[2]
-    fewer = 100 * (1 - bolometric.electrons_per_s / default.electrons_per_s)
+    share = bolometric.electrons_per_s / default.electrons_per_s
+    fewer = 100 * (1 - share)
     text = (
         f"A V = 0 star of 9602 K gives {default.millions:.1f} million electrons/s by Vega's flux"
         f" (CCD47-20, 30 mm), {fewer:.0f} % ({bolometric.mag_against_default:.2f} mag) fewer by the"
@@ -675,18 +732,22 @@ def zero_points(directory: Path) -> ChartFinding:
     high = max(costs_mag)
     extent = high - low
     legend = {"loc": "upper left", "ncols": 2}
+    millions = BarSpec(setting_words, "millions", 0.8, "%.2f", look=BAR)
     upper = PanelSpec(
         ylabel="electrons a second [millions]",
-        bars=BarSpec(setting_words, "millions", 0.8, "%.2f", look=BAR),
+        bars=millions,
         ylim=(0, 1.3 * largest),
         legend=legend,
     )
+    fainter_mag = BarSpec(setting_words, "mag_against_default", 0.8, "%+.3f", look=BAR)
+    lowest = low - 0.15 * extent
+    highest = high + 0.4 * extent
     lower = PanelSpec(
         ylabel="fainter than vega, energy [mag]",
         xlabel="zero point, weighting of the passband",
-        bars=BarSpec(setting_words, "mag_against_default", 0.8, "%+.3f", look=BAR),
+        bars=fainter_mag,
         # with room for figures and names
-        ylim=(low - 0.15 * extent, high + 0.4 * extent),
+        ylim=(lowest, highest),
         legend=legend,
     )
     looks = looks_of(SENSORS)
@@ -704,14 +765,16 @@ def names_with(figures: Mapping[str, tuple[float, float]], form: str) -> str:
     """Names with their two figures, as `form` writes them, in one line."""
     named = []
     for name, (half, most) in figures.items():
-        named.append(form.format(name=name.split()[-1], half=half, most=most))
+        last_name = name.split()[-1]
+        named.append(form.format(name=last_name, half=half, most=most))
     return ", ".join(named)
 
 
 def within_mag(bv: FloatArray, mag: FloatArray) -> tuple[float, float]:
     """What half and 95 % of Hipparcos to V = 7.5 are within, mag, by errors (n,) over B-V (n,)."""
     stars_bv = load_catalog().brighter_than(BRIGHT_V_MAG).bv_mag
-    stars_bv = stars_bv[(stars_bv >= bv[0]) & (stars_bv <= bv[-1])]
+    in_scale = (stars_bv >= bv[0]) & (stars_bv <= bv[-1])
+    stars_bv = stars_bv[in_scale]
     off_mag = np.abs(np.interp(stars_bv, bv, mag))
     half, most = np.percentile(off_mag, (50, 95)).tolist()
     return half, most
@@ -730,19 +793,24 @@ def temperature_scales(directory: Path) -> ChartFinding:
     mag = {}
     for name, scale_k in kelvin.items():
         percent[name] = 100 * (scale_k / torres - 1)
-        mag[name] = magnitude(dgs_electrons_per_s(scale_k, optics, Photometry()) / base)
-    within = {name: within_mag(bv, mag[name]) for name in TEMPERATURE_SCALES}
+        electrons = dgs_electrons_per_s(scale_k, optics, Photometry())
+        mag[name] = magnitude(electrons / base)
+    within = {}
+    for name in TEMPERATURE_SCALES:
+        within[name] = within_mag(bv, mag[name])
     zero = int(np.searchsorted(bv, 0.0))
     before_step_k = kelvin["wang2021"][zero - 1]
     step_k = before_step_k - kelvin["wang2021"][zero]
     with_most = names_with(within, "{half:.3f} ({most:.2f}) mag by {name}")
+    step_percent = 100 * step_k / before_step_k
     text = (
-        f"wang2021 steps down by {step_k:.0f} K ({100 * step_k / before_step_k:.1f} %) at B-V = 0;"
+        f"wang2021 steps down by {step_k:.0f} K ({step_percent:.1f} %) at B-V = 0;"
         f" half of Hipparcos to V = 7.5 (95 %) is within {with_most} of Torres 2010"
     )
+    with_half = names_with(within, "{half:.3f} mag by {name}")
     finding = (
         f"The scale wang2021 steps down by {step_k:.0f} K at B-V = 0; half of Hipparcos is within"
-        f" {names_with(within, '{half:.3f} mag by {name}')} of Torres 2010"
+        f" {with_half} of Torres 2010"
     )
     note = (
         "Torres 2010 (Flower 1996) for dwarfs and giants is the reference. Electrons: CCD47-20, +"
@@ -758,10 +826,17 @@ def temperature_scales(directory: Path) -> ChartFinding:
     for name, (half, _) in within.items():
         mag_labels[name] = f"{name}: half within {half:.3f}"
     scales = {"Torres 2010": torres, **relabelled(kelvin, labels)}
+    percent_curves = relabelled(percent, labels)
+    mag_curves = relabelled(mag, mag_labels)
+    kelvin_colours = (INK, *SCALE_COLOURS)
+    kelvin_styles = ("-", *SCALE_STYLES)
+    kelvin_panel = CurvePanel(bv, scales, above, kelvin_colours, styles=kelvin_styles)
+    percent_panel = CurvePanel(bv, percent_curves, middle, SCALE_COLOURS, styles=SCALE_STYLES)
+    mag_panel = CurvePanel(bv, mag_curves, below, SCALE_COLOURS, styles=SCALE_STYLES)
     panels = (
-        CurvePanel(bv, scales, above, (INK, *SCALE_COLOURS), styles=("-", *SCALE_STYLES)),
-        CurvePanel(bv, relabelled(percent, labels), middle, SCALE_COLOURS, styles=SCALE_STYLES),
-        CurvePanel(bv, relabelled(mag, mag_labels), below, SCALE_COLOURS, styles=SCALE_STYLES),
+        kelvin_panel,
+        percent_panel,
+        mag_panel,
     )
     draw_curves(directory / "temperature_scales", finding, panels, note)
     columns = {"bv_mag": bv, "torres2010_k": torres}
@@ -775,7 +850,10 @@ def relabelled(
     curves: Mapping[str, FloatArray], labels: Mapping[str, str]
 ) -> dict[str, FloatArray]:
     """Curves by their labels."""
-    return {labels[name]: values for name, values in curves.items()}
+    by_label = {}
+    for name, values in curves.items():
+        by_label[labels[name]] = values
+    return by_label
 
 
 def choices(directory: Path) -> ChartFinding:
@@ -788,22 +866,26 @@ def choices(directory: Path) -> ChartFinding:
     low, middle, high, _ = percentiles
     paid = {}
     for name, mag in on_stars.items():
-        half, most = np.percentile(np.abs(mag), (50, 95)).tolist()
+        off_mag = np.abs(mag)
+        half, most = np.percentile(off_mag, (50, 95)).tolist()
         paid[name] = half, most
+    costs_words = names_with(paid, "{name} {half:.2f} ({most:.2f})")
     text = (
-        "What each choice costs half of Hipparcos to V = 7.5 (95 %), CCD47-20, mag: "
-        + names_with(paid, "{name} {half:.2f} ({most:.2f})")
+        f"What each choice costs half of Hipparcos to V = 7.5 (95 %), CCD47-20, mag: {costs_words}"
     )
+    brighter_mag = -np.nanmin(low)
     note = (
         f"At a name: half of {len(stars)} Hipparcos stars change by as much (a twentieth). Band: 5"
-        f" to 95 % of them. M giants share the B-V of K giants, and are up to {-np.nanmin(low):.1f}"
+        f" to 95 % of them. M giants share the B-V of K giants, and are up to {brighter_mag:.1f}"
         " mag brighter than the black body. + is fainter; CCD47-20."
     )
-    with chart(directory / "choices", choices_finding(paid), panels=2, note=note) as panels:
+    finding = choices_finding(paid)
+    with chart(directory / "choices", finding, panels=2, note=note) as panels:
         upper, lower = panels
         for (name, mag), colour in zip(cost.items(), SERIES, strict=False):
             upper.plot(BV_MAG, mag, color=colour, label=cost_label(name, paid))
-        upper.plot(BV_MAG, middle, color=INK, label=cost_label("spectrum pickles", paid))
+        pickles_label = cost_label("spectrum pickles", paid)
+        upper.plot(BV_MAG, middle, color=INK, label=pickles_label)
         lower.plot(BV_MAG, middle, color=INK, label="pickles, median")
         for axes in panels:
             axes.axhline(0, color=MUTED, lw=1)
@@ -813,7 +895,8 @@ def choices(directory: Path) -> ChartFinding:
         label_ends(upper, lower)
     columns = {"bv_mag": BV_MAG}
     for name, mag in cost.items():
-        columns[f"{name.replace(' ', '_')}_mag"] = mag
+        column = name.replace(" ", "_")
+        columns[f"{column}_mag"] = mag
     columns |= dict(zip(PERCENTILE_COLUMNS, percentiles, strict=True))
     write_columns(directory / "choices.csv", columns)
     return ChartFinding("choices", text)
@@ -822,17 +905,20 @@ def choices(directory: Path) -> ChartFinding:
 def cost_label(name: str, paid: Mapping[str, tuple[float, float]]) -> str:
     """A choice, what half of the stars pay for it, and what a twentieth pays."""
     half, most = paid[name]
-    return f"{name.rsplit(maxsplit=1)[-1]}: {half:.2f} ({most:.2f})"
+    choice = name.rsplit(maxsplit=1)[-1]
+    return f"{choice}: {half:.2f} ({most:.2f})"
 
 
 def star_costs_mag(stars: Catalog, optics: Optics) -> dict[str, FloatArray]:
     """The cost of each choice for stars (n,), mag, that of real spectra included."""
     table = tabulate_pickles(optics, Photometry())
-    real = table.electrons_per_s(np.zeros(len(stars)), stars.bv_mag, stars.vi_mag)
+    v_mag = np.zeros(len(stars))
+    real = table.electrons_per_s(v_mag, stars.bv_mag, stars.vi_mag)
     # a spectrum for each colour, of which there are few
     bv_mag, star = np.unique(stars.bv_mag, return_inverse=True)
     kelvin = star_temperatures_k(bv_mag, "ballesteros2012")
-    body = dgs_electrons_per_s(kelvin, optics, Photometry())[star]
+    body_rates = dgs_electrons_per_s(kelvin, optics, Photometry())
+    body = body_rates[star]
     costs = {}
     for name, mag in choice_costs_mag(bv_mag, optics).items():
         costs[name] = mag[star]
@@ -845,13 +931,16 @@ def choices_finding(paid: Mapping[str, tuple[float, float]]) -> str:
     dearest = max(paid, key=lambda name: paid[name][0])
     for_few = max(paid, key=lambda name: paid[name][1])
     half, most = paid[dearest]
+    dearest_name = dearest.split()[-1]
     text = (
-        f"Of the choices of brightness {dearest.split()[-1]} changes most: half of Hipparcos to"
+        f"Of the choices of brightness {dearest_name} changes most: half of Hipparcos to"
         f" V = {BRIGHT_V_MAG:g} by {half:.2f} mag and more"
     )
     if for_few == dearest:
         return f"{text}, a twentieth by {most:.2f} mag"
-    few = f"{for_few.split()[-1]}, by {paid[for_few][1]:.2f} mag"
+    few_name = for_few.split()[-1]
+    few_mag = paid[for_few][1]
+    few = f"{few_name}, by {few_mag:.2f} mag"
     return f"{text}; a twentieth are changed most by {few}"
 
 
@@ -872,7 +961,10 @@ def choice_costs_mag(bv_mag: FloatArray, optics: Optics) -> dict[str, FloatArray
         "brightness ags": np.full_like(bv_mag, average),
     }
     base = dgs_electrons_per_s(kelvin, optics, default)
-    return {name: magnitude(rate / base) for name, rate in rates.items()}
+    costs_mag = {}
+    for name, rate in rates.items():
+        costs_mag[name] = magnitude(rate / base)
+    return costs_mag
 
 
 def running_percentiles(bv_mag: FloatArray, value: FloatArray, at_bv_mag: FloatArray) -> FloatArray:
@@ -882,7 +974,8 @@ def running_percentiles(bv_mag: FloatArray, value: FloatArray, at_bv_mag: FloatA
     """
     rows = np.full((4, len(at_bv_mag)), np.nan)
     for k, centre in enumerate(at_bv_mag):
-        inside = value[np.abs(bv_mag - centre) <= WINDOW_MAG]
+        near = np.abs(bv_mag - centre) <= WINDOW_MAG
+        inside = value[near]
         rows[3, k] = len(inside)
         if len(inside) >= MIN_STARS:
             rows[:3, k] = np.percentile(inside, (5, 50, 95))
@@ -900,7 +993,10 @@ def run(directory: Path) -> list[ChartFinding]:
     """Write every chart and its table (CSV) into `directory`, and `findings.csv`. Raises
     InputError.
     """
-    findings = [rapp(directory, sensor) for sensor in SENSORS]
-    findings += [figure(directory) for figure in FIGURES]
+    findings = []
+    for sensor in SENSORS:
+        findings.append(rapp(directory, sensor))
+    for figure in FIGURES:
+        findings.append(figure(directory))
     write_findings(directory, findings)
     return findings

@@ -81,7 +81,8 @@ def run(
     lines = []
     if file is not None:
         for field in fields_of(radec_roll_deg):
-            scene = OutputScene(field.stem, f"{field.name}, {file.path.name}", field)
+            title = f"{field.name}, {file.path.name}"
+            scene = OutputScene(field.stem, title, field)
             lines.append(_output(directory, file, scene))
         return lines
     for field in FIELDS:
@@ -90,11 +91,11 @@ def run(
         mended = f"{field.name} with the thesis's errors mended"
         stem = field.stem + PUBLISHED
         bench = thesis_bench(f"thesis-{field.stem}-as-published.toml")
-        lines.append(_output(directory, bench, OutputScene(stem, published, field, field.zoom_hip)))
+        published_scene = OutputScene(stem, published, field, field.zoom_hip)
+        lines.append(_output(directory, bench, published_scene))
         bench = thesis_bench(f"thesis-{field.stem}.toml")
-        lines.append(
-            _output(directory, bench, OutputScene(field.stem, mended, field, field.zoom_hip))
-        )
+        mended_scene = OutputScene(field.stem, mended, field, field.zoom_hip)
+        lines.append(_output(directory, bench, mended_scene))
     return lines
 
 
@@ -124,22 +125,27 @@ def _output(directory: Path, file: BenchFile, scene: OutputScene) -> str:
     """Expose a scene and write its files; a line about it."""
     noise = FrameNoise(seed=SEED)
     with Simulator(file) as simulator:
-        view = simulator.view(from_radec_roll_deg(*scene.field.radec_roll_deg), np.zeros(3))
+        q_icrs_to_cam = from_radec_roll_deg(*scene.field.radec_roll_deg)
+        view = simulator.view(q_icrs_to_cam, np.zeros(3))
         clean = simulator.expose(view, None)
         noisy = simulator.expose(view, noise.rng())
         exposure_s = simulator.config.tracker.exposure_s
         sky_e = float(np.median(clean.mean_e))
         sky_noise = simulator.detector.settings.noise(sky_e, exposure_s)
         noise_e = math.sqrt(sky_noise.total_e2)
-        inside = simulator.camera.contains_px(noisy.truth["x_px"], noisy.truth["y_px"])
+        x_px = noisy.truth["x_px"]
+        y_px = noisy.truth["y_px"]
+        inside = simulator.camera.contains_px(x_px, y_px)
         camera_text = _camera_words(file, simulator.camera, sky_e, noise_e)
         gain = simulator.detector.settings.gain_e_per_dn
         outputs = Outputs(clean, noisy, inside, sky_e, noise_e, gain, camera_text)
         write_exposure_fits(directory / f"{scene.stem}.fits", simulator, noisy, noise)
         clean_path = directory / f"{scene.stem}{WITHOUT_NOISE}.fits"
-        write_exposure_fits(clean_path, simulator, clean, FrameNoise("none", SEED))
+        without_noise = FrameNoise("none", SEED)
+        write_exposure_fits(clean_path, simulator, clean, without_noise)
     truth = outputs.truth
-    write_csv(directory / f"{scene.stem}.csv", truth.dtype.names or (), truth.tolist())
+    names = truth.dtype.names or ()
+    write_csv(directory / f"{scene.stem}.csv", names, truth.tolist())
     _figure(directory / scene.stem, scene, outputs)
     return f"{scene.stem}: {_scene_words(outputs)}"
 
@@ -153,14 +159,17 @@ def _scene_words(outputs: Outputs) -> str:
         return f"no star; {sky}"
     v_mag = truth["v_mag"]
     kelvin = truth["temperature_k"]
-    beyond = int((~outputs.inside).sum())
+    off_image = ~outputs.inside
+    beyond = int(off_image.sum())
     edge = ""
     if beyond:
         edge = f", {beyond} more whose light reaches the image"
     heat = heat_words(kelvin)
     if heat and beyond:
-        heat += f" ({np.nanmean(kelvin[outputs.inside]):.0f} K on the image)"
-    stars = f"{int(outputs.inside.sum())} stars{edge}"
+        mean_k = np.nanmean(kelvin[outputs.inside])
+        heat += f" ({mean_k:.0f} K on the image)"
+    on_image = int(outputs.inside.sum())
+    stars = f"{on_image} stars{edge}"
     extent = f"V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f}"
     saturated = int(truth["clipped"].sum())
     return f"{stars}, {extent}{heat}; {saturated} stars saturated; {sky}"
@@ -170,7 +179,9 @@ def heat_words(kelvin: FloatArray) -> str:
     """The hottest and the mean of temperatures (n,), in words; empty where none is known."""
     if not np.isfinite(kelvin).any():
         return ""
-    return f"; hottest {np.nanmax(kelvin):.0f} K, mean {np.nanmean(kelvin):.0f} K"
+    hottest_k = np.nanmax(kelvin)
+    mean_k = np.nanmean(kelvin)
+    return f"; hottest {hottest_k:.0f} K, mean {mean_k:.0f} K"
 
 
 def _camera_words(file: BenchFile, camera: Camera, sky_e: float, noise_e: float) -> str:
@@ -193,14 +204,18 @@ def _field_deg(camera: Camera) -> tuple[float, float]:
     width, height = camera.resolution_px
     middle_x = np.full(2, width / 2 - 0.5)
     middle_y = np.full(2, height / 2 - 0.5)
-    across = camera.rays(np.array([-0.5, width - 0.5]), middle_y)
-    down = camera.rays(middle_x, np.array([-0.5, height - 0.5]))
+    ends_x = np.array([-0.5, width - 0.5])
+    across = camera.rays(ends_x, middle_y)
+    ends_y = np.array([-0.5, height - 0.5])
+    down = camera.rays(middle_x, ends_y)
     return _angle_deg(across), _angle_deg(down)
 
 
 def _angle_deg(rays: FloatArray) -> float:
-    first, last = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    return math.degrees(math.acos(float(np.clip(first @ last, -1, 1))))
+    length = np.linalg.norm(rays, axis=1, keepdims=True)
+    first, last = rays / length
+    cosine = float(np.clip(first @ last, -1, 1))
+    return math.degrees(math.acos(cosine))
 
 
 def _figure(path: Path, scene: OutputScene, outputs: Outputs) -> None:
@@ -237,7 +252,8 @@ def _draw_property(axes: "Axes", values: FloatArray, name: str, unit: str) -> No
         mean = float(values[known].mean())
         decimals = DECIMALS[unit]
         title = f"{name}, mean {mean:.{decimals}f} {unit}"
-        axes.plot(np.arange(1, len(values) + 1), values, ".", color=INK, ms=3)
+        numbers = np.arange(1, len(values) + 1)
+        axes.plot(numbers, values, ".", color=INK, ms=3)
         axes.axhline(mean, color=MUTED, lw=1)
     axes.set(xlabel="star", title=title, ylabel=f"{name} [{unit}]")
 
@@ -246,8 +262,11 @@ def _draw_images(panels: "list[Axes]", scene: OutputScene, outputs: Outputs) -> 
     """The images without and with noise, each with its zoom, and beside them scale and camera."""
     star, (x_px, y_px) = _zoom(scene, outputs)
     low, high = np.percentile(outputs.noisy.dn, STRETCH_PERCENT)
-    noise_dn = max(outputs.noise_e / outputs.gain_e_per_dn, 0.1)
-    high = float(np.clip(high, low + MIN_SIGMAS * noise_dn, low + MAX_SIGMAS * noise_dn))
+    sky_noise_dn = outputs.noise_e / outputs.gain_e_per_dn
+    noise_dn = max(sky_noise_dn, 0.1)
+    lowest = low + MIN_SIGMAS * noise_dn
+    highest = low + MAX_SIGMAS * noise_dn
+    high = float(np.clip(high, lowest, highest))
     images = (outputs.clean, outputs.clean, outputs.noisy, outputs.noisy)
     titles = ("Without noise", f"The same, {star}", "With noise", f"The same, {star}")
     drawn = [panels[0], panels[1], panels[3], panels[4]]
@@ -275,10 +294,12 @@ def _zoom(scene: OutputScene, outputs: Outputs) -> tuple[str, tuple[float, float
         stars = stars[stars["hip"] == scene.zoom_hip]
     if not len(stars):
         height, width = outputs.noisy.dn.shape
-        return "the middle", (width / 2, height / 2)
+        middle_px = (width / 2, height / 2)
+        return "the middle", middle_px
     star = stars[0]
     if star["hip"] > 0:
         name = f"HIP {star['hip']}"
     else:
         name = str(star["name"])
-    return name, (float(star["x_px"]), float(star["y_px"]))
+    place_px = (float(star["x_px"]), float(star["y_px"]))
+    return name, place_px

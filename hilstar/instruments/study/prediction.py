@@ -117,7 +117,8 @@ def run(directory: Path, quick: bool = False) -> Judged:
     InputError.
     """
     others = OtherWork()
-    outcomes = slew_outcomes(QUICK_SPAN_S if quick else SPAN_S)
+    span_s = QUICK_SPAN_S if quick else SPAN_S
+    outcomes = slew_outcomes(span_s)
     load = others.load()
     write_rows(directory / "prediction.csv", outcomes)
     usual = [row for row in outcomes if is_usual(row.rate_hz, row.latency_ms)]
@@ -127,7 +128,8 @@ def run(directory: Path, quick: bool = False) -> Judged:
     write_rows(directory / "prediction_jitter.csv", shaken)
     note = shaken_finding(shaken)
     draw_shaken(directory / "prediction_jitter", note, shaken)
-    return load.judged([finding, *map(line_of, usual), note])
+    lines = map(line_of, usual)
+    return load.judged([finding, *lines, note])
 
 
 def is_usual(packet_hz: int, age_ms: int) -> bool:
@@ -142,10 +144,14 @@ def slew_outcomes(span_s: float) -> list[PredictionOutcome]:
     outcomes = []
     for hz, ms in sorted(by_latency | by_rate):
         count = math.ceil(span_s * hz) + 1
-        samples = [slew_sample(round(k * NS_PER_S / hz)) for k in range(count)]
+        samples = []
+        for number in range(count):
+            t_ns = round(number * NS_PER_S / hz)
+            samples.append(slew_sample(t_ns))
         for predictor in predictors():
             if not predictor.waits:
-                outcomes.append(_outcome(predictor, samples, hz, ms))
+                outcome = _outcome(predictor, samples, hz, ms)
+                outcomes.append(outcome)
     return outcomes
 
 
@@ -153,10 +159,12 @@ def slew_finding(usual: Sequence[PredictionOutcome]) -> str:
     """The error of the default predictor, beside that of none."""
     rms_arcsec = {row.method: row.rms_arcsec for row in usual}
     default = next(predictor.name for predictor in predictors() if predictor.is_default)
+    held_arcsec = rms_arcsec["hold"]
+    default_arcsec = rms_arcsec[default]
     return (
         f"At {USUAL_HZ} Hz and {USUAL_MS} ms of latency, prediction by the newest sample's rate is"
-        f" off by {rms_arcsec[default]:.2g} arcsec rms, holding the sample by"
-        f" {rms_arcsec['hold']:.3g}"
+        f" off by {default_arcsec:.2g} arcsec rms, holding the sample by"
+        f" {held_arcsec:.3g}"
     )
 
 
@@ -180,16 +188,21 @@ def shaken_rows(quick: bool) -> list[Shaken]:
             continue  # it looks like a slow one
         has_rates = packets == SENDERS[0]
         residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, has_rates)
-        rows.append(Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual))
+        row = Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual)
+        rows.append(row)
     return rows
 
 
 def shaken_finding(rows: Sequence[Shaken]) -> str:
     """The frequency above which no prediction is better, and the error of "auto"."""
-    given, derived = (crossing_hz(rows, packets, USUAL_HZ, USUAL_MS) for packets in SENDERS)
+    crossings_hz = []
+    for packets in SENDERS:
+        crossings_hz.append(crossing_hz(rows, packets, USUAL_HZ, USUAL_MS))
+    given, derived = crossings_hz
+    times = auto_times(rows)
     return (
         f"Of a vibration above {given:.0f} Hz ({derived:.0f} without rates) the newest attitude is"
-        f' nearer than one predicted by {USUAL_MS} ms; "auto" is within {auto_times(rows):.1f}'
+        f' nearer than one predicted by {USUAL_MS} ms; "auto" is within {times:.1f}'
         " times the better of both"
     )
 
@@ -208,39 +221,51 @@ def shaken_error(
         turn = 0.0
         ahead_ns = 0
     prediction: Prediction = "auto" if way == "auto" else "rate"
-    timeline = Timeline(Policy(ahead_ns, NS_PER_S, prediction=prediction))
-    latency_s = max(age_ms / 1e3 - 0.5 / packet_hz, 0.0)
+    policy = Policy(ahead_ns, NS_PER_S, prediction=prediction)
+    timeline = Timeline(policy)
+    middle_s = age_ms / 1e3 - 0.5 / packet_hz
+    latency_s = max(middle_s, 0.0)
     amplitude = SHAKEN_ARCSEC / ARCSEC_PER_RAD
     turning = math.tau * jitter_hz
 
     def attitude(t_s: float) -> FloatArray:
-        angle = turn * t_s + amplitude * math.sin(turning * t_s + 0.3)
+        wave = amplitude * math.sin(turning * t_s + 0.3)
+        angle = turn * t_s + wave
         return propagate(ORION, Z, angle)
 
     def sample(t_s: float) -> AttitudeSample:
         rate = None
         if rates:
-            rate = Z * (turn + amplitude * turning * math.cos(turning * t_s + 0.3))
-        return AttitudeSample(round(t_s * NS_PER_S), attitude(t_s), rate)
+            wave_rate = amplitude * turning * math.cos(turning * t_s + 0.3)
+            rate = Z * (turn + wave_rate)
+        t_ns = round(t_s * NS_PER_S)
+        true_q = attitude(t_s)
+        return AttitudeSample(t_ns, true_q, rate)
 
     received = 0
     errors = []
-    times_s = np.arange(0, SETTLED_S + SHAKEN_S, 1 / SHAKEN_FRAME_HZ) + latency_s
+    frames_s = np.arange(0, SETTLED_S + SHAKEN_S, 1 / SHAKEN_FRAME_HZ)
+    times_s = frames_s + latency_s
     for t_s in times_s:
         while received / packet_hz <= t_s - latency_s:
             timeline.add(sample(received / packet_hz))
             received += 1
         shown = attitude_at(timeline, round(t_s * NS_PER_S))
         off = multiply(shown.q_icrs_to_cam, conjugate(attitude(t_s)))
-        errors.append(-to_rotation_vector(off)[2])
+        off_rad = to_rotation_vector(off)
+        errors.append(-off_rad[2])
     late = times_s >= SETTLED_S
     phase = turning * times_s[late] + 0.3
     error = np.array(errors)[late]
-    waves = np.column_stack((np.sin(phase), np.cos(phase), np.ones(len(phase))))
+    columns = (np.sin(phase), np.cos(phase), np.ones(len(phase)))
+    waves = np.column_stack(columns)
     shown_wave = error + amplitude * np.sin(phase)
-    sine, cosine, _ = np.linalg.lstsq(waves, shown_wave, rcond=None)[0]
-    residual = float(np.sqrt(2 * np.mean(error**2)) / amplitude)
-    return residual, float(np.hypot(sine, cosine) / amplitude)
+    solution = np.linalg.lstsq(waves, shown_wave, rcond=None)[0]
+    sine, cosine, _ = solution
+    rms = np.sqrt(2 * np.mean(error**2))
+    residual = float(rms / amplitude)
+    gain = float(np.hypot(sine, cosine) / amplitude)
+    return residual, gain
 
 
 def auto_times(rows: Sequence[Shaken]) -> float:
@@ -250,7 +275,11 @@ def auto_times(rows: Sequence[Shaken]) -> float:
         if is_usual(row.packet_hz, row.age_ms):
             by_way = residuals.setdefault((row.packets, row.jitter_hz), {})
             by_way[row.way] = row.residual
-    return max(way["auto"] / min(way["rate"], way["newest"]) for way in residuals.values())
+    times = []
+    for by_way in residuals.values():
+        better = min(by_way["rate"], by_way["newest"])
+        times.append(by_way["auto"] / better)
+    return max(times)
 
 
 def crossing_hz(rows: Sequence[Shaken], packets: str, packet_hz: int, age_ms: int) -> float:
@@ -265,7 +294,8 @@ def crossing_hz(rows: Sequence[Shaken], packets: str, packet_hz: int, age_ms: in
     worse_by = {hz: by_rate[hz] - residuals["newest"][hz] for hz in by_rate}
     for (low, under), (high, over) in pairwise(worse_by.items()):
         if under <= 0 < over:
-            return float(low * (high / low) ** (under / (under - over)))
+            crossing_share = under / (under - over)
+            return float(low * (high / low) ** crossing_share)
     return math.inf
 
 
@@ -280,15 +310,19 @@ def _outcome(
     for frame in range(math.ceil(first), math.floor(last)):
         t_ns = round(frame * NS_PER_S / FRAME_HZ)
         count = bisect_right(taken_ns, t_ns - latency_ns)
-        shown = predictor.load(samples[count - NEAR : count])(t_ns)
-        errors.append(angle_between_rad(slew_attitude(t_ns), shown) * ARCSEC_PER_RAD)
+        ready = samples[count - NEAR : count]
+        shown = predictor.load(ready)(t_ns)
+        off_rad = angle_between_rad(slew_attitude(t_ns), shown)
+        errors.append(off_rad * ARCSEC_PER_RAD)
     predict = predictor.load(samples[-NEAR:])
     times_us = []
     for _ in range(TIMED):
         begin_ns = time.perf_counter_ns()
         predict(taken_ns[-1] + latency_ns)
-        times_us.append((time.perf_counter_ns() - begin_ns) / 1e3)
-    rms = float(np.sqrt(np.mean(np.square(errors))))
+        spent_ns = time.perf_counter_ns() - begin_ns
+        times_us.append(spent_ns / 1e3)
+    mean_square = np.mean(np.square(errors))
+    rms = float(np.sqrt(mean_square))
     median_us = float(np.median(times_us))
     return PredictionOutcome(predictor.name, rate_hz, latency_ms, rms, max(errors), median_us)
 
@@ -305,7 +339,8 @@ def draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load
         times_us.setdefault(row.method, []).append(row.attitude_us)
 
     def with_time(row: PredictionOutcome) -> str:
-        return f"{row.method} ({np.median(times_us[row.method]):.0f} us)"
+        time_us = np.median(times_us[row.method])
+        return f"{row.method} ({time_us:.0f} us)"
 
     latency = LineSpec("latency_ms", "rms_arcsec", label=with_time, where=has_usual_rate)
     by_latency = PanelSpec(
@@ -315,14 +350,16 @@ def draw(path: Path, finding: str, outcomes: list[PredictionOutcome], load: Load
         scales=("log", "log"),
         xticks=LATENCIES_MS,
     )
+    rate = LineSpec("rate_hz", "rms_arcsec", where=has_usual_latency)
     by_rate = PanelSpec(
-        (LineSpec("rate_hz", "rms_arcsec", where=has_usual_latency),),
+        (rate,),
         "pointing error, rms [arcsec]",
         f"rate of packets [Hz], latency {USUAL_MS} ms",
         scales=("log", "log"),
         xticks=RATES_HZ,
     )
-    looks = looks_of({method: method for method in times_us}, MARKERS)
+    methods = {method: method for method in times_us}
+    looks = looks_of(methods, MARKERS)
     layout = {"share_x": False}
     panels = (by_latency, by_rate)
     spec = ChartSpec(panels, lambda row: row.method, looks, note, layout=layout)
@@ -350,13 +387,15 @@ def draw_shaken(path: Path, finding: str, shaken: list[Shaken]) -> None:
     looks = {way: SeriesLook(way, colour, "o") for way, colour in WAYS.items()}
     panels = (*map(error_panel, SENDERS), *map(gain_panel, SENDERS))
     layout = {"share_y": "row"}
-    draw_rows(path, finding, ChartSpec(panels, way_of, looks, note, 2, layout), usual)
+    spec = ChartSpec(panels, way_of, looks, note, 2, layout)
+    draw_rows(path, finding, spec, usual)
 
 
 def error_panel(packets: str) -> PanelSpec:
     """The error of a vibration, by its frequency, from one kind of sender."""
+    line = shaken_line("residual", packets)
     return PanelSpec(
-        (shaken_line("residual", packets),),
+        (line,),
         ERROR_LABELS[packets],
         title=f"packets {packets}",
         scales=("log", "linear"),
@@ -368,11 +407,13 @@ def error_panel(packets: str) -> PanelSpec:
 
 def gain_panel(packets: str) -> PanelSpec:
     """The amplitude of a vibration as shown, by its frequency, from one kind of sender."""
+    line = shaken_line("gain", packets)
+    whole = LevelLine(1.0, HIDDEN, MUTED, "-", 0.8)
     return PanelSpec(
-        (shaken_line("gain", packets),),
+        (line,),
         GAIN_LABELS[packets],
         "frequency of the vibration [Hz]",
-        levels=(LevelLine(1.0, HIDDEN, MUTED, "-", 0.8),),
+        levels=(whole,),
         scales=("log", "linear"),
         xticks=SHAKEN_TICKS_HZ,
         from_zero=True,

@@ -143,8 +143,12 @@ class Movement:
     def samples(self, until_ns: int) -> list[AttitudeSample]:
         """The newest NEAR samples at time `until_ns`."""
         last = until_ns * self.packet_hz // NS_PER_S
-        times_ns = [round(k * NS_PER_S / self.packet_hz) for k in range(last + 1 - NEAR, last + 1)]
-        return [AttitudeSample(t_ns, self.at(t_ns), self.rate_rad_s(t_ns)) for t_ns in times_ns]
+        samples = []
+        for number in range(last + 1 - NEAR, last + 1):
+            t_ns = round(number * NS_PER_S / self.packet_hz)
+            sample = AttitudeSample(t_ns, self.at(t_ns), self.rate_rad_s(t_ns))
+            samples.append(sample)
+        return samples
 
 
 def attitude_at(timeline: Timeline, t_ns: int) -> Attitude:
@@ -190,7 +194,9 @@ def _spline(near: Sequence[AttitudeSample]) -> AttitudeAt:
 
     def predicted(t_ns: int) -> FloatArray:
         seconds = [(s.t_ns - newest.t_ns) / NS_PER_S for s in near]
-        turns = [rate_between_rad_s(newest.q_icrs_to_cam, s.q_icrs_to_cam, 1.0) for s in near]
+        turns = []
+        for s in near:
+            turns.append(rate_between_rad_s(newest.q_icrs_to_cam, s.q_icrs_to_cam, 1.0))
         turn = CubicSpline(seconds, turns)((t_ns - newest.t_ns) / NS_PER_S)
         return propagate(newest.q_icrs_to_cam, np.asarray(turn), 1.0)
 

@@ -105,7 +105,9 @@ def run(directory: Path, quick: bool = False) -> Judged:
     draw_each(directory / "quantisation_centroiders", by_centroider)
     draw_times(directory / "quantisation_time", timed, load)
     write_rows(directory / "quantisation_time.csv", timed)
-    lines = [summary(bits, rows) for bits in codes.BITS]
+    lines = []
+    for bits in codes.BITS:
+        lines.append(summary(bits, rows))
     lines += [centroiders_line(by_centroider), times_line(timed)]
     lines.append(codes.study_frames(directory, quick))
     return load.judged(lines)
@@ -176,7 +178,9 @@ def centroider_errors(rows: Sequence[WayErrors]) -> list[CentroiderErrors]:
 def summary(bits: int, rows: Sequence[WayErrors]) -> str:
     """The largest errors of every way on a panel of these bits, beside its aim."""
     aim_mag, limit = codes.AIMS[bits]
-    largest = {way.name: largest_words(rows, bits, way.name) for way in codes.WAYS}
+    largest = {}
+    for way in codes.WAYS:
+        largest[way.name] = largest_words(rows, bits, way.name)
     others = ", ".join(f"{way.method} {largest[way.name]}" for way in codes.WAYS[:3])
     exact = largest["exact"]
     stealing = largest["exact" + codes.STEALING]

@@ -105,38 +105,56 @@ def rapp_ratios(temperature_k: FloatArray, optics: Optics, weighting: Weighting)
     def in_range(kelvin: FloatArray, response: FloatArray) -> FloatArray:
         spectrum = blackbody_exitance_w_m2_m(nm, kelvin[:, None])
         scale = reference / v_band_mean_w_m2_m(kelvin, weighting)
-        return np.asarray(scale * (spectrum @ (response * weight_m)))
+        weights = response * weight_m
+        return np.asarray(scale * (spectrum @ weights))
 
     ones = np.ones_like(nm)
-    average = in_range(np.array([REFERENCE_TEMPERATURE_K]), ones)[0]
+    reference_k = np.array([REFERENCE_TEMPERATURE_K])
+    average = in_range(reference_k, ones)[0]
     mean_nm = sum(optics.range_nm) / 2
     mean_photons_per_j = mean_nm * 1e-9 / joule_m
     irradiance = in_range(temperature_k, ones) / average
-    photons = in_range(temperature_k, nm * 1e-9 / joule_m) / (average * mean_photons_per_j)
+    photons_per_j = nm * 1e-9 / joule_m
+    average_photons = average * mean_photons_per_j
+    photons = in_range(temperature_k, photons_per_j) / average_photons
     spectral = dgs_electrons_per_s(temperature_k, optics, photometry)
-    electrons = spectral / ags_electrons_per_s(optics, photometry)
+    average_electrons = ags_electrons_per_s(optics, photometry)
+    electrons = spectral / average_electrons
     return np.stack((irradiance, photons, electrons))
+
+
+def _ratios(kelvin: FloatArray, optics: Optics) -> dict[Weighting, FloatArray]:
+    """The three ratios (3, n) by weighting."""
+    ratios = {}
+    for weighting in WEIGHTINGS:
+        ratios[weighting] = rapp_ratios(kelvin, optics, weighting)
+    return ratios
 
 
 def rapp(directory: Path, sensor: str) -> ChartFinding:
     """The three ratios of a sensor, 3000 to 50 000 K, for both passband weightings."""
     optics = study_optics(sensor)
     kelvin = _temperatures_k()
-    ratios = {weighting: rapp_ratios(kelvin, optics, weighting) for weighting in WEIGHTINGS}
+    ratios = _ratios(kelvin, optics)
     # which the range of wavelengths alone makes
-    in_full_range = rapp_ratios(kelvin[-1:], study_optics("ccd47-20"), "energy")
+    hottest_k = kelvin[-1:]
+    full_range = study_optics("ccd47-20")
+    in_full_range = rapp_ratios(hottest_k, full_range, "energy")
     coolest, cool, hot, hottest = _quoted(kelvin, ratios["energy"])
     thesis = SAID_OF_THESIS[sensor].format(ratios["energy"][0, -1], in_full_range[0, 0])
+    hot_percent = 100 * (hot - 1)
+    hottest_percent = 100 * (hottest - 1)
     text = (
         f"{SENSORS[sensor]}: the spectral model gives {coolest:.2f} times the electrons of the"
         f" average one at 3000 K, {cool:.2f} at 5000 K; at 9000 K they differ by"
-        f" {100 * (hot - 1):+.1f} %, at 50000 K by {100 * (hottest - 1):+.1f} %{thesis}"
+        f" {hot_percent:+.1f} %, at 50000 K by {hottest_percent:+.1f} %{thesis}"
     )
     title = (
         f"{SENSORS[sensor]}: a black body of 3000 K gives {coolest:.2f} times the electrons of the"
         f" average model, one of 5000 K {cool:.2f} times"
     )
-    with chart(directory / f"rapp_{sensor}", title, note=_note(optics, "energy")) as (axes,):
+    note = _note(optics, "energy")
+    with chart(directory / f"rapp_{sensor}", title, note=note) as (axes,):
         _draw_ratios(axes, ratios, "energy")
         _finish([axes])
     _write(directory / f"rapp_{sensor}.csv", kelvin, ratios)
@@ -154,7 +172,7 @@ def bench_rapp(
     optics = bench_optics(file.config.tracker, file.folder)
     weighting = file.config.sky.passband_weighting
     kelvin = _temperatures_k()
-    ratios = {name: rapp_ratios(kelvin, optics, name) for name in WEIGHTINGS}
+    ratios = _ratios(kelvin, optics)
     coolest, cool, hot, hottest = _quoted(kelvin, ratios[weighting])
     text = (
         f"By {file.path.name} a black body of 3000 K gives {coolest:.2f} times the electrons of"
@@ -162,19 +180,20 @@ def bench_rapp(
     )
     stars, ratio = _star_ratios(file)
     camera = tracker_camera(file.config.tracker, file.folder)
-    fields = [_in_field(field, stars, ratio, camera) for field in fields_of(radec_roll_deg)]
-    with chart(directory / "rapp_bench", text, 2, note=_note(optics, weighting)) as panels:
+    fields = []
+    for sky_field in fields_of(radec_roll_deg):
+        fields.append(_in_field(sky_field, stars, ratio, camera))
+    note = _note(optics, weighting)
+    with chart(directory / "rapp_bench", text, 2, note=note) as panels:
         _draw_ratios(panels[0], ratios, weighting)
         _draw_stars(panels[1], stars, fields)
         _finish(panels)
     _write(directory / "rapp_bench.csv", kelvin, ratios)
-    rows: list[StarRatio] = []
-    for field in fields:
-        rows += _star_rows(field, stars)
-    write_csv(directory / "rapp_stars.csv", StarRatio._fields, rows)
+    _write_stars(directory / "rapp_stars.csv", fields, stars)
     findings = [ChartFinding("rapp_bench", text)]
     for field in fields:
-        findings.append(ChartFinding("rapp_stars", f"RAPP3 of the stars of {field.text}"))
+        finding = ChartFinding("rapp_stars", f"RAPP3 of the stars of {field.text}")
+        findings.append(finding)
     write_findings(directory, findings)
     return findings
 
@@ -186,7 +205,8 @@ def _temperatures_k() -> FloatArray:
 
 def _quoted(kelvin: FloatArray, ratios: FloatArray) -> FloatArray:
     """RAPP3 at QUOTED_K."""
-    return np.asarray(ratios[2][np.searchsorted(kelvin, QUOTED_K)])
+    places = np.searchsorted(kelvin, QUOTED_K)
+    return np.asarray(ratios[2][places])
 
 
 def _star_ratios(file: BenchFile) -> tuple[Stars, FloatArray]:
@@ -198,21 +218,27 @@ def _star_ratios(file: BenchFile) -> tuple[Stars, FloatArray]:
             " larger magnitude"
         )
     average = _stars_by(file, "ags")
-    return spectral, spectral.electrons_per_s / average.electrons_per_s
+    ratio = spectral.electrons_per_s / average.electrons_per_s
+    return spectral, ratio
 
 
 def _stars_by(file: BenchFile, brightness: Literal["dgs", "ags"]) -> Stars:
     """The stars of a bench by one model of brightness."""
     sky = structs.replace(file.config.sky, brightness=brightness)
-    return bench_stars(structs.replace(file.config, sky=sky), file.folder)
+    config = structs.replace(file.config, sky=sky)
+    return bench_stars(config, file.folder)
 
 
 def _in_field(field: SkyField, stars: Stars, ratio: FloatArray, camera: Camera) -> FieldRatios:
     """The stars whose centre is on the image."""
-    to_image = camera.cam_to_image @ to_matrix(from_radec_roll_deg(*field.radec_roll_deg))
-    near = stars.near(to_image[2], camera.field_radius_rad(0.0))
-    x_px, y_px = camera.project(stars.directions(near) @ to_image.T)
-    star = near[camera.contains_px(x_px, y_px)]
+    q_icrs_to_cam = from_radec_roll_deg(*field.radec_roll_deg)
+    to_image = camera.cam_to_image @ to_matrix(q_icrs_to_cam)
+    radius_rad = camera.field_radius_rad(0.0)
+    near = stars.near(to_image[2], radius_rad)
+    directions = stars.directions(near) @ to_image.T
+    x_px, y_px = camera.project(directions)
+    on_image = camera.contains_px(x_px, y_px)
+    star = near[on_image]
     return FieldRatios(field, star, ratio[star])
 
 
@@ -220,16 +246,12 @@ def _star_rows(in_field: FieldRatios, stars: Stars) -> list[StarRatio]:
     """A row for each star of a field."""
     rows = []
     for star, ratio in zip(in_field.star.tolist(), in_field.ratio.tolist(), strict=True):
-        rows.append(
-            StarRatio(
-                field=in_field.field.stem,
-                hip=stars.hip[star].item(),
-                v_mag=stars.v_mag[star].item(),
-                bv_mag=stars.bv_mag[star].item(),
-                temperature_k=stars.temperature_k[star].item(),
-                rapp3=ratio,
-            )
-        )
+        hip = stars.hip[star].item()
+        v_mag = stars.v_mag[star].item()
+        bv_mag = stars.bv_mag[star].item()
+        temperature_k = stars.temperature_k[star].item()
+        row = StarRatio(in_field.field.stem, hip, v_mag, bv_mag, temperature_k, ratio)
+        rows.append(row)
     return rows
 
 
@@ -247,7 +269,8 @@ def _draw_ratios(axes: "Axes", ratios: dict[Weighting, FloatArray], solid: Weigh
     """The ratios over temperature, solid by the weighting `solid`."""
     kelvin = _temperatures_k()
     (dotted,) = set(WEIGHTINGS) - {solid}
-    for number, (name, colour) in enumerate(zip(RATIOS, SERIES, strict=False)):
+    series = zip(RATIOS, SERIES, strict=False)
+    for number, (name, colour) in enumerate(series):
         axes.loglog(kelvin, ratios[solid][number], color=colour, label=name)
         axes.loglog(kelvin, ratios[dotted][number], ":", color=colour, label="_dotted")
     axes.set(ylabel="ratio of the models [1]")
@@ -270,6 +293,13 @@ def _finish(panels: "Sequence[Axes]") -> None:
     panels[-1].set(xlabel="black-body temperature [K]")
     plain_ticks(panels[-1].xaxis, TICKS_K)
     label_ends(panels[0])
+
+
+def _write_stars(path: Path, fields: Sequence[FieldRatios], stars: Stars) -> None:
+    rows: list[StarRatio] = []
+    for field in fields:
+        rows += _star_rows(field, stars)
+    write_csv(path, StarRatio._fields, rows)
 
 
 def _write(path: Path, kelvin: FloatArray, ratios: dict[Weighting, FloatArray]) -> None:

@@ -237,8 +237,8 @@ class RigField:
     true_px: FloatArray
 
 
-def rig_field() -> RigField:
-    """The field of the rig's static run, q = (0, 0, 0, 1): the celestial pole."""
+def polar_stars() -> FloatArray:
+    """The directions (3, n) of the shown stars about the celestial pole, ICRS."""
     stars = load_catalog().brighter_than(FAINTEST_V_MAG)
     ra = np.radians(stars.ra_deg)
     dec = np.radians(stars.dec_deg)
@@ -247,7 +247,12 @@ def rig_field() -> RigField:
     z = np.sin(dec)
     directions = np.stack([x, y, z])
     in_front = directions[2] > 0.9
-    directions = directions[:, in_front]
+    return directions[:, in_front]
+
+
+def rig_field() -> RigField:
+    """The field of the rig's static run, q = (0, 0, 0, 1): the celestial pole."""
+    directions = polar_stars()
     slopes = directions[:2] / directions[2]
     panel_size = np.array(PANEL_PX)[:, None]
     panel_middle_px = panel_size / 2

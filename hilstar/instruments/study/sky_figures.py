@@ -79,7 +79,9 @@ def star_density(directory: Path) -> ChartFinding:
     across = np.linspace(0, 360, CELLS[0] + 1)
     down = np.linspace(-1, 1, CELLS[1] + 1)
     height = np.sin(np.radians(catalog.dec_deg))
-    stars, _, _ = np.histogram2d(catalog.ra_deg % 360, height, (across, down))
+    cells = (across, down)
+    ra_mod_deg = catalog.ra_deg % 360
+    stars, _, _ = np.histogram2d(ra_mod_deg, height, cells)
     cell_deg2 = SKY_DEG2 / stars.size
     density = stars.T / cell_deg2
     low, high = np.percentile(density, (5, 95))
@@ -95,7 +97,8 @@ def star_density(directory: Path) -> ChartFinding:
     with chart(directory / "star_density", text, note=note, height_inch=4.2) as (axes,):
         draw_density(axes, density)
     ra_deg = (across[:-1] + across[1:]) / 2
-    dec_deg = np.degrees(np.arcsin((down[:-1] + down[1:]) / 2))
+    sine = (down[:-1] + down[1:]) / 2
+    dec_deg = np.degrees(np.arcsin(sine))
     ra_grid, dec_grid = np.meshgrid(ra_deg, dec_deg)
     columns = {
         "ra_deg": ra_grid.ravel(),
@@ -117,8 +120,11 @@ def draw_density(axes: "Axes", density: FloatArray) -> None:
         interpolation="nearest",
     )
     declinations = np.array([-90, -60, -30, 0, 30, 60, 90])
-    axes.set_yticks(np.sin(np.radians(declinations)), [str(degree) for degree in declinations])
-    axes.set_xticks(np.arange(0, 361, 60))
+    sines = np.sin(np.radians(declinations))
+    names = [str(degree) for degree in declinations]
+    axes.set_yticks(sines, names)
+    hours_deg = np.arange(0, 361, 60)
+    axes.set_xticks(hours_deg)
     axes.set(xlim=(360, 0), xlabel="right ascension [deg]", ylabel="declination [deg]")
     axes.grid(False)
     axes.figure.colorbar(image, ax=axes, label="Stars a square degree")
@@ -129,14 +135,20 @@ def frames(directory: Path) -> ChartFinding:
     catalog = load_catalog().brighter_than(FRAME_V_MAG)
     vectors = unit_vectors_icrs(catalog, FRAME_EPOCH)
     angles = FIELDS[0].radec_roll_deg
-    matrix = to_matrix(from_radec_roll_deg(*angles))
+    q_icrs_to_cam = from_radec_roll_deg(*angles)
+    matrix = to_matrix(q_icrs_to_cam)
     cam = vectors @ matrix.T
-    limit = np.tan(np.radians(FRAME_DEG / 2)) * cam[:, 2:]
-    inside = (cam[:, 2] > 0) & (np.abs(cam[:, :2]) < limit).all(axis=1)
+    half_field_rad = np.radians(FRAME_DEG / 2)
+    limit = np.tan(half_field_rad) * cam[:, 2:]
+    off_axis = np.abs(cam[:, :2])
+    in_front = cam[:, 2] > 0
+    in_field = off_axis < limit
+    inside = in_front & in_field.all(axis=1)
     icrs = vectors[inside]
     cam = cam[inside]
     count = len(cam)
-    error = float(np.abs(icrs @ equation_2_3(*angles) - cam).max())
+    off = icrs @ equation_2_3(*angles) - cam
+    error = float(np.abs(off).max())
     agreement = f"{error:.0e}".replace("e-", " x 10^-")
     text = (
         f"{count} stars of Orion, in the celestial frame about +y, stand about +z in the camera's;"
@@ -174,13 +186,16 @@ def _write_frames(path: Path, hip: IntArray, icrs: FloatArray, cam: FloatArray) 
     for frame in ("icrs", "cam"):
         columns += [f"{axis}_{frame}" for axis in "xyz"]
     table = np.column_stack((icrs, cam)).tolist()
-    rows = [(number, *row) for number, row in zip(hip.tolist(), table, strict=True)]
+    rows = []
+    for number, row in zip(hip.tolist(), table, strict=True):
+        rows.append((number, *row))
     write_csv(path, columns, rows)
 
 
 def equation_2_3(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:
     """The matrix (3, 3) of camera components to celestial ones: A3(a3) A1(a2) A3(a1), table 2.4."""
-    roll, down, across = np.radians([roll_deg, dec_deg - 90, ra_deg - 90])
+    angles_rad = np.radians([roll_deg, dec_deg - 90, ra_deg - 90])
+    roll, down, across = angles_rad
     return np.asarray(_about_z(across) @ _about_x(down) @ _about_z(roll))
 
 
@@ -198,7 +213,8 @@ def _about_x(angle: float) -> FloatArray:
 
 def scaled_in_v(nm: FloatArray, flux: FloatArray) -> Curve:
     """A spectrum over its mean through Johnson V."""
-    mean = curve_mean(Curve(nm, flux), load_curve("johnson-v", "johnson-v"))
+    johnson_v = load_curve("johnson-v", "johnson-v")
+    mean = curve_mean(Curve(nm, flux), johnson_v)
     return Curve(nm, flux / mean)
 
 
@@ -206,16 +222,20 @@ def sun(directory: Path) -> ChartFinding:
     """Figure 3.1: a star of the Sun's type and the black body of the Sun's temperature."""
     library = load_library()
     nm = library.wavelength_nm
-    star = library.flux[library.spectral_type.index(SUN_TYPE)]
+    number = library.spectral_type.index(SUN_TYPE)
+    star = library.flux[number]
     spectrum = scaled_in_v(nm, star)
-    body = scaled_in_v(nm, blackbody_exitance_w_m2_m(nm, SUN_TEMPERATURE_K))
+    exitance = blackbody_exitance_w_m2_m(nm, SUN_TEMPERATURE_K)
+    body = scaled_in_v(nm, exitance)
     quoted = []
     for at_nm in QUOTED_NM:
-        share = float(spectrum(np.array([at_nm]))[0] / body(np.array([at_nm]))[0])
+        place_nm = np.array([at_nm])
+        share = float(spectrum(place_nm)[0] / body(place_nm)[0])
         quoted.append(f"{share:.2f} at {at_nm:.0f} nm")
+    quoted_shares = ", ".join(quoted)
     text = (
         f"A star of the Sun's type ({SUN_TYPE}) over the black body of {SUN_TEMPERATURE_K:.0f} K,"
-        f" scaled in V: {', '.join(quoted)}"
+        f" scaled in V: {quoted_shares}"
     )
     note = (
         "Pickles 1998, mean of stars of that type; no spectrum of the Sun itself is in the package."
@@ -238,14 +258,19 @@ def vega_logarithmic(directory: Path) -> ChartFinding:
     """Figure 2.13, right: Vega on logarithmic scales, beside the thesis's black body."""
     light = vega()
     first_nm, last_nm = VEGA_NM
-    shown = (light.wavelength_nm >= first_nm) & (light.wavelength_nm <= last_nm)
+    after_first = light.wavelength_nm >= first_nm
+    before_last = light.wavelength_nm <= last_nm
+    shown = after_first & before_last
     nm = light.wavelength_nm[shown]
     johnson_v = load_curve("johnson-v", "johnson-v")
-    flux = light.value[shown] / curve_mean(light, johnson_v) * ZERO_W_M2_M["v"]
+    mean = curve_mean(light, johnson_v)
+    flux = light.value[shown] / mean * ZERO_W_M2_M["v"]
     body = blackbody_exitance_w_m2_m(nm, REFERENCE_TEMPERATURE_K)
-    body *= ZERO_W_M2_M["v"] / curve_mean(Curve(nm, body), johnson_v)
+    body_mean = curve_mean(Curve(nm, body), johnson_v)
+    body *= ZERO_W_M2_M["v"] / body_mean
     falls = float(np.interp(1000, nm, flux) / np.interp(5000, nm, flux))
-    blue, red = np.interp([350.0, 5000.0], nm, flux / body)
+    over_body = flux / body
+    blue, red = np.interp([350.0, 5000.0], nm, over_body)
     text = (
         f"From 1 to 5 micrometres Vega's light falls by {falls:.0f} times; it has {blue:.2f} of"
         " the black body's at 350 nm,"
@@ -261,7 +286,8 @@ def vega_logarithmic(directory: Path) -> ChartFinding:
         xticks=VEGA_TICKS_NM,
         legend={},
     )
-    panel = CurvePanel(nm, {"Vega": flux, "black body": body}, spec, (INK, ORANGE))
+    curves = {"Vega": flux, "black body": body}
+    panel = CurvePanel(nm, curves, spec, (INK, ORANGE))
     draw_curves(directory / "vega_logarithmic", text, (panel,), note)
     columns = {"wavelength_nm": nm, "vega": flux, "blackbody": body}
     write_columns(directory / "vega_logarithmic.csv", columns)
@@ -277,11 +303,16 @@ def backgrounds(directory: Path) -> ChartFinding:
     for name, times in EARTHSHINES.items():
         lights[name] = times * high
     lights["from the ground"] = _glow_photons()
-    total = {name: float(np.nansum(values)) for name, values in lights.items()}
+    total = {}
+    for name, values in lights.items():
+        total[name] = float(np.nansum(values))
+    at_24_deg = total["earthshine, 24°"]
+    at_38_deg = total["earthshine, 38°"]
+    at_50_deg = total["earthshine, 50°"]
     text = (
         f"Zodiacal light of V = 22.1 has {total[ZODIACAL]:.0f} photons/s/m2/arcsec2 (300 to 1100"
-        f" nm); earthshine adds {total['earthshine, 38°']:.0f} at 38 degrees from the Earth's limb,"
-        f" {total['earthshine, 24°']:.0f} at 24, {total['earthshine, 50°']:.0f} at 50"
+        f" nm); earthshine adds {at_38_deg:.0f} at 38 degrees from the Earth's limb,"
+        f" {at_24_deg:.0f} at 24, {at_50_deg:.0f} at 50"
     )
     note = (
         "STIS Instrument Handbook, table 6.4. Ground: Paranal's glow (Hanuschik 2003) at V ="
@@ -298,18 +329,21 @@ def backgrounds(directory: Path) -> ChartFinding:
 
 def _photons(erg_s_cm2_a_arcsec2: Curve) -> FloatArray:
     """Photons/s/m2/arcsec2/nm at SHOWN_NM of a spectrum in erg/s/cm2/A/arcsec2."""
-    return _photons_of(erg_s_cm2_a_arcsec2(SHOWN_NM) * W_M2_M_OF_ERG)
+    w_m2_m = erg_s_cm2_a_arcsec2(SHOWN_NM) * W_M2_M_OF_ERG
+    return _photons_of(w_m2_m)
 
 
 def _photons_of(w_m2_m: FloatArray) -> FloatArray:
-    joules = PLANCK_J_S * LIGHT_M_S / (SHOWN_NM * 1e-9)
+    metres = SHOWN_NM * 1e-9
+    joules = PLANCK_J_S * LIGHT_M_S / metres
     return np.asarray(w_m2_m * 1e-9 / joules)
 
 
 def _glow_photons() -> FloatArray:
     """The night sky's, NaN where its spectrum ends."""
     spectrum = read_curve_csv(NIGHT_SKY, highest=np.inf)
-    mean = curve_mean(spectrum, load_curve("johnson-v", "johnson-v"))
+    johnson_v = load_curve("johnson-v", "johnson-v")
+    mean = curve_mean(spectrum, johnson_v)
     level = flux_ratio(GLOW_V_MAG) * ZERO_W_M2_M["v"]
     first_nm, last_nm = spectrum.wavelength_nm[[0, -1]]
     known = (first_nm <= SHOWN_NM) & (last_nm >= SHOWN_NM)

@@ -107,12 +107,18 @@ def measured(step: Trials, budget_s: float) -> Trials:
     On a busy machine no method is on the front, and none is said to beat the default.
     """
     others = OtherWork()
-    works = {trial.method: partial(called, trial.work) for trial in step.trials}
+    works = {}
+    for trial in step.trials:
+        works[trial.method] = partial(called, trial.work)
     times = in_turn(works, MAX_ROUNDS, budget_s / len(works))
     load = others.load()
-    quartiles = [quartiles_ms(taken) for taken in times.values()]
+    quartiles = []
+    for taken in times.values():
+        quartiles.append(quartiles_ms(taken))
     middle_ms = [middle for _, middle, _ in quartiles]
-    errors = [max(trial.error, step.error.floor) for trial in step.trials]
+    errors = []
+    for trial in step.trials:
+        errors.append(max(trial.error, step.error.floor))
     # On a busy machine every method counts as beaten: none is on the front.
     beaten = beaten_by(errors, middle_ms) | load.busy
     timed = []

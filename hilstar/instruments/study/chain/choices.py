@@ -143,7 +143,9 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
     where it has no stars.
     """
     fields = normalise(np.random.default_rng(SEED).normal(size=(FIELDS, 4)))
-    star_rates = [bench.sprites(q).data["electrons_per_s"] for q in fields]
+    star_rates = []
+    for q in fields:
+        star_rates.append(bench.sprites(q).data["electrons_per_s"])
     counts = np.array([len(rates) for rates in star_rates])
     if not counts.any():
         raise InputError(

@@ -124,7 +124,9 @@ def glass_rows(file: BenchFile, scene: ChainScene, quick: bool) -> list[GlassRow
             works[name] = partial(_exposed, simulator, view)
         time_s = QUICK_TIME_S if quick else TIME_S
         spent_by_name = in_turn(works, MAX_ROUNDS, time_s / len(works))
-    times = {name: times_of(np.array(spent)) for name, spent in spent_by_name.items()}
+    times = {}
+    for name, spent in spent_by_name.items():
+        times[name] = times_of(np.array(spent))
     errors_arcsec = [errors[name].error_arcsec for name in drawable]
     times_ms = [times[name].time_ms for name in drawable]
     fronts = pareto_front(errors_arcsec, times_ms)

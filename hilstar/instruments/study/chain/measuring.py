@@ -298,9 +298,13 @@ class SceneMeasurement:
 
     def outcomes(self) -> tuple[list[CombinationRow], list[StageTime]]:
         """Every combination's error and time, and the times of the stages of `auto`."""
-        chains = [self.chain(combination) for combination in self.combinations]
+        chains = []
+        for combination in self.combinations:
+            chains.append(self.chain(combination))
         times, stages = timed(chains, self.plan.time_s, self.combinations.index(self.marks.auto))
-        rows = [self.row(chain, taken) for chain, taken in zip(chains, times, strict=True)]
+        rows = []
+        for chain, taken in zip(chains, times, strict=True):
+            rows.append(self.row(chain, taken))
         return rows, [
             StageTime(self.scene.name, AUTO, stage, round(ms, MS_PLACES))
             for stage, ms in zip(STAGES, stages, strict=True)
@@ -309,7 +313,10 @@ class SceneMeasurement:
     def untimed(self) -> list[CombinationRow]:
         """Every combination's error, which is the same on every machine; its times are NaN."""
         untimed = Times(math.nan, math.nan, math.nan, math.nan, 0)
-        return [self.row(self.chain(combination), untimed) for combination in self.combinations]
+        rows = []
+        for combination in self.combinations:
+            rows.append(self.row(self.chain(combination), untimed))
+        return rows
 
     def row(self, chain: DrawingChain, taken: Times) -> CombinationRow:
         """A combination's row of the table."""
@@ -380,9 +387,11 @@ def timed(
             chain = chains[staged if k == len(chains) else k]
             chain.frame_ms()
             if k == len(chains):
-                stages += [chain.stages_ms() for _ in range(FRAMES_A_VISIT)]
+                for _ in range(FRAMES_A_VISIT):
+                    stages.append(chain.stages_ms())
             else:
-                taken[k] += [chain.frame_ms() for _ in range(FRAMES_A_VISIT)]
+                for _ in range(FRAMES_A_VISIT):
+                    taken[k].append(chain.frame_ms())
     return [times_of(np.array(times_ms)) for times_ms in taken], np.median(stages, axis=0).tolist()
 
 

@@ -573,7 +573,9 @@ def run(
         notes.append(load.caution)
     make_directory(directory)
     answers = write_chain(directory, results, glass, notes, load)
-    lines = [scene_line(result.rows, result.budget, result.stages, load) for result in results]
+    lines = []
+    for result in results:
+        lines.append(scene_line(result.rows, result.budget, result.stages, load))
     lines += unmeasured
     if glass:
         lines.append(glass_line(glass))

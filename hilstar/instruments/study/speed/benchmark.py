@@ -109,26 +109,36 @@ def scene(
             "bench: the bench file leaves no star to show; write a larger [sky] faintest_v_mag"
         )
     visible = bench.sprites(q_icrs_to_cam, every).star
-    ranked = visible[np.argsort(every.v_mag[visible], kind="stable")]
+    visible_mag = every.v_mag[visible]
+    by_light = np.argsort(visible_mag, kind="stable")
+    ranked = visible[by_light]
     if len(ranked) >= count:
         faintest = ranked[count - 1]
         is_shown = every.v_mag <= every.v_mag[faintest]
         is_shown[ranked[count:]] = False
-        stars = _sorted(every, np.flatnonzero(is_shown), every.vectors[is_shown])
+        shown = np.flatnonzero(is_shown)
+        stars = _sorted(every, shown, every.vectors[is_shown])
         return BenchmarkScene(stars, count)
-    random_vectors = _directions(bench, q_icrs_to_cam, count - len(ranked), rng)
-    faint = np.flatnonzero(every.v_mag >= np.median(every.v_mag))
+    random_count = count - len(ranked)
+    random_vectors = _directions(bench, q_icrs_to_cam, random_count, rng)
+    is_faint = every.v_mag >= np.median(every.v_mag)
+    faint = np.flatnonzero(is_faint)
     drawn = rng.choice(faint, len(random_vectors))
-    sources = np.concatenate([np.arange(len(every)), drawn])
+    own_sources = np.arange(len(every))
+    sources = np.concatenate([own_sources, drawn])
     vectors = np.concatenate([every.vectors, random_vectors])
-    return BenchmarkScene(_sorted(every, sources, vectors), len(ranked))
+    stars = _sorted(every, sources, vectors)
+    return BenchmarkScene(stars, len(ranked))
 
 
 def _sorted(every: Stars, sources: IntArray, vectors: FloatArray) -> Stars:
     """Stars at `vectors` (n, 3) that are otherwise those of `every` at `sources` (n,), by cell."""
     grid = cell_grid(vectors)
-    columns = {name: getattr(every, name)[sources[grid.order]] for name in STAR_COLUMNS}
-    return replace(every, vectors=np.asfortranarray(vectors[grid.order]), grid=grid, **columns)
+    columns = {}
+    for name in STAR_COLUMNS:
+        columns[name] = getattr(every, name)[sources[grid.order]]
+    by_cell = np.asfortranarray(vectors[grid.order])
+    return replace(every, vectors=by_cell, grid=grid, **columns)
 
 
 def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generator) -> FloatArray:
@@ -140,10 +150,13 @@ def _directions(bench: Bench, q: FloatArray, wanted: int, rng: np.random.Generat
     icrs_to_image = camera.cam_to_image @ to_matrix(q)
     tries = 4 * wanted
     while True:
-        z = 1 - rng.uniform(size=tries) * (1 - cos_cap)
+        depth = rng.uniform(size=tries) * (1 - cos_cap)
+        z = 1 - depth
         turn = rng.uniform(0, 2 * np.pi, tries)
         across = np.sqrt(1 - z**2)
-        vectors = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+        x = across * np.cos(turn)
+        y = across * np.sin(turn)
+        vectors = np.stack([x, y, z], axis=1)
         x_px, y_px = camera.project(vectors)
         star = np.arange(tries)
         sprites = pack_sprites(x_px, y_px, z, star, camera.resolution_px, footprint_px)
@@ -179,11 +192,13 @@ def numpy_linear(sprites: FrameLight, sigma_px: Sigma, shape: tuple[int, int]) -
     image = np.zeros(shape, np.float32)
     height, width = shape
     sigma_x, sigma_y = sigma_px
-    steps = np.arange(sprites.footprint_px) - (sprites.footprint_px - 1) // 2
+    half_px = (sprites.footprint_px - 1) // 2
+    steps = np.arange(sprites.footprint_px) - half_px
     columns = sprites.data["pixel"][:, :1] + steps
     rows = sprites.data["pixel"][:, 1:] + steps
     share_x = _shares(columns, sprites.x_px, sigma_x)
-    share_y = _shares(rows, sprites.y_px, sigma_y) * sprites.data["electrons_per_s"][:, None]
+    rates = sprites.data["electrons_per_s"][:, None]
+    share_y = _shares(rows, sprites.y_px, sigma_y) * rates
     light = (share_y[:, :, None] * share_x[:, None, :]).astype(np.float32)
     inside_x = (columns >= 0) & (columns < width)
     inside_y = (rows >= 0) & (rows < height)
@@ -194,7 +209,9 @@ def numpy_linear(sprites: FrameLight, sigma_px: Sigma, shape: tuple[int, int]) -
 
 
 def _shares(pixels: IntArray, centre_px: FloatArray, sigma_px: float) -> FloatArray:
-    edges = np.concatenate([pixels - 0.5, pixels[:, -1:] + 0.5], axis=1)
+    before = pixels - 0.5
+    last = pixels[:, -1:] + 0.5
+    edges = np.concatenate([before, last], axis=1)
     offset = (edges - centre_px[:, None]) / (sigma_px * SQRT2)
     return np.asarray(0.5 * np.diff(erf(offset), axis=1))
 
@@ -290,7 +307,8 @@ METHODS: tuple[tuple[str, str, Callable[[], Draw]], ...] = (
 
 def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: report.Size) -> report.ProcessStart:
     """Start a process that imports hilstar and draws one frame of the bench file."""
-    command = [sys.executable, "-c", FRESH, str(path), *map(repr, q_icrs_to_cam.tolist())]
+    attitude = map(repr, q_icrs_to_cam.tolist())
+    command = [sys.executable, "-c", FRESH, str(path), *attitude]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     import_ms, first_frame_ms, memory_mb = map(float, done.stdout.split())
     return report.ProcessStart(*size, import_ms, first_frame_ms, memory_mb)
@@ -298,10 +316,12 @@ def fresh_start(path: Path, q_icrs_to_cam: FloatArray, size: report.Size) -> rep
 
 def this_machine() -> report.Machine:
     """The processor, and the versions that the times depend on."""
+    load = round(os.getloadavg()[0], 2)
+    cores = len(os.sched_getaffinity(0))
     return report.Machine(
         cpu=cpu_name(),
-        cores=len(os.sched_getaffinity(0)),
-        load=round(os.getloadavg()[0], 2),
+        cores=cores,
+        load=load,
         python=platform.python_version(),
         numpy=np.__version__,
     )
@@ -342,7 +362,8 @@ class CellMeasurement(Closing):
         self.sprites = bench.sprites(self.q)
         self.icrs_to_image = bench.camera.cam_to_image @ to_matrix(self.q)
         self.staged = StagedRenderer(bench.renderer.target)
-        self.linear = Renderer(Target(bench.camera.resolution_px, GaussianPsf(self.sigma_px)))
+        target = Target(bench.camera.resolution_px, GaussianPsf(self.sigma_px))
+        self.linear = Renderer(target)
         self.stage_ms: dict[str, list[float]] = {}
 
     def measure(self, methods: dict[str, Draw], rounds: int, budget_s: float) -> None:
@@ -358,18 +379,23 @@ class CellMeasurement(Closing):
         for name, draw in methods.items():
             why = self._too_long(draw, budget_s)
             if why is not None:
-                self.result.skipped.append(report.Skipped(*self.cell_key, name, why))
+                skipped = report.Skipped(*self.cell_key, name, why)
+                self.result.skipped.append(skipped)
                 continue
             whole = partial(draw, self.sprites, self.sigma_px, self.shape)
             works[name] = partial(_keep_image, images, name, whole)
-        self._keep(interleaved(works, rounds, budget_s))
+        times_ms = interleaved(works, rounds, budget_s)
+        self._keep(times_ms)
         ours = self._draw_linear()
         for name, image in images.items():
-            worst = float(np.abs(image - ours).max() / ours.max())
-            self.result.agreement.append(report.Agreement(*self.cell_key, name, worst))
+            off = np.abs(image - ours).max()
+            worst = float(off / ours.max())
+            agreement = report.Agreement(*self.cell_key, name, worst)
+            self.result.agreement.append(agreement)
 
     def _keep(self, times_ms: dict[str, list[float]]) -> None:
-        python = report.PythonTime(*self.cell_key, _spread(times_ms.pop("python")))
+        python_ms = _spread(times_ms.pop("python"))
+        python = report.PythonTime(*self.cell_key, python_ms)
         self.result.python_ms.append(python)
         del times_ms["stages"]  # with its waits; its parts are kept
         rows = []
@@ -383,7 +409,8 @@ class CellMeasurement(Closing):
         for name, method_ms in times_ms.items():
             rows.append((name, "linear_only", method_ms))
         for method, kind, kind_ms in rows:
-            timing = report.MethodTiming(*self.cell_key, method, kind, _spread(kind_ms))
+            spread_ms = _spread(kind_ms)
+            timing = report.MethodTiming(*self.cell_key, method, kind, spread_ms)
             self.result.rows.append(timing)
 
     def _too_long(self, draw: Draw, budget_s: float) -> str | None:
@@ -403,7 +430,8 @@ class CellMeasurement(Closing):
             return min(_seconds(work), _seconds(work))
 
         one_s = fastest_s(1)
-        star_s = (fastest_s(101) - one_s) / 100
+        hundred_s = fastest_s(101) - one_s
+        star_s = hundred_s / 100
         frame_s = one_s + star_s * len(self.sprites)
         if frame_s > budget_s:
             return f"n/a: about {frame_s:.0f} s a frame, over the budget of {budget_s:g} s"
@@ -418,8 +446,9 @@ class CellMeasurement(Closing):
         camera = self.bench.camera
         footprint_px = self.staged.footprint_px
         begin = time.perf_counter()
+        margin_px = footprint_px / 2 + 1
         near, directions, rates_e_per_s = self.candidates.near(
-            stars, self.icrs_to_image, camera, footprint_px / 2 + 1
+            stars, self.icrs_to_image, camera, margin_px
         )
         culled = time.perf_counter()
         # make_sprites in its two halves.
@@ -428,7 +457,9 @@ class CellMeasurement(Closing):
         projected = time.perf_counter()
         self.staged.draw(sprites)
         self.staged.levels()
-        stages_ms = {"cull": (culled - begin) * 1e3, "project": (projected - culled) * 1e3}
+        cull_ms = (culled - begin) * 1e3
+        project_ms = (projected - culled) * 1e3
+        stages_ms = {"cull": cull_ms, "project": project_ms}
         stages_ms |= self.staged.stage_ms
         for kind, ms in stages_ms.items():
             self.stage_ms.setdefault(kind, []).append(ms)
@@ -437,9 +468,11 @@ class CellMeasurement(Closing):
         """All of a frame that is not OpenGL."""
         white = self.bench.flux_at_white_e_per_s
         size_px = self.bench.camera.resolution_px
+        sprites = self.bench.sprites(self.q)
+        psf = GaussianPsf(self.sigma_px)
         clipped_sprites(
-            self.bench.sprites(self.q),
-            GaussianPsf(self.sigma_px),
+            sprites,
+            psf,
             white,
             size_px,
             self.bench.uniformity,
@@ -459,15 +492,20 @@ def interleaved(
 
     The first turn counts only where no other fits.
     """
-    first_s = {name: _seconds(work) for name, work in works.items()}
-    turns = {name: min(rounds, int(budget_s / seconds) - 1) for name, seconds in first_s.items()}
+    first_s = {}
+    for name, work in works.items():
+        first_s[name] = _seconds(work)
+    turns = {}
+    for name, seconds in first_s.items():
+        turns[name] = min(rounds, int(budget_s / seconds) - 1)
     times: dict[str, list[float]] = {name: [] for name in works}
     for number in range(rounds):
         for name, work in works.items():
             before = number * turns[name] // rounds
             after = (number + 1) * turns[name] // rounds
             if after > before:
-                times[name].append(_seconds(work) * 1e3)
+                work_ms = _seconds(work) * 1e3
+                times[name].append(work_ms)
     for name, seconds in first_s.items():
         if turns[name] < 1:
             times[name] = [seconds * 1e3]
@@ -481,7 +519,8 @@ def _seconds(work: Callable[[], object]) -> float:
 
 
 def _spread(times_ms: list[float]) -> report.TimeSpread:
-    return report.TimeSpread(float(np.median(times_ms)), min(times_ms), max(times_ms))
+    median_ms = float(np.median(times_ms))
+    return report.TimeSpread(median_ms, min(times_ms), max(times_ms))
 
 
 @dataclass(frozen=True, slots=True)
@@ -515,21 +554,25 @@ def run(
     methods, missing = other_methods()
     others = OtherWork()
     does = {name: does for name, does, _ in METHODS if name in methods}
-    result = report.Result(this_machine(), does=does)
+    machine = this_machine()
+    result = report.Result(machine, does=does)
     for name, why in missing.items():
-        result.skipped.append(report.Skipped(method=name, why=why))
+        skipped = report.Skipped(method=name, why=why)
+        result.skipped.append(skipped)
     q_icrs_to_cam = from_radec_roll_deg(*RADEC_ROLL_DEG)
     cells_done = 0
     with TemporaryDirectory() as folder:
         for size in plan.sizes:
-            file = plan.file or own_bench_file(Path(folder) / "bench.toml", size, motion="on")
+            path = Path(folder) / "bench.toml"
+            file = plan.file or own_bench_file(path, size, motion="on")
             with open_bench(file) as bench:
                 result.gl_renderer = bench.renderer.gl_renderer
                 every = bench.shown_stars
                 for count in plan.counts:
                     shown = scene(bench, every, q_icrs_to_cam, count, rng)
                     known = shown.catalogue_count
-                    origin = report.SceneOrigin(*size, count, known, count - known)
+                    others_count = count - known
+                    origin = report.SceneOrigin(*size, count, known, others_count)
                     result.scenes.append(origin)
                     own_bench = bench.with_stars(shown.stars)
                     cell = report.Cell(*size, count)
@@ -538,7 +581,8 @@ def run(
                     cells_done += 1
                     advance(cells_done)
             for _ in range(plan.starts):
-                result.startup.append(fresh_start(file.path, q_icrs_to_cam, size))
+                started = fresh_start(file.path, q_icrs_to_cam, size)
+                result.startup.append(started)
     if plan.exposures:
         result.tracker, without = tracker.tracker_rows(plan.exposures, plan.budget_s)
         result.skipped += without
@@ -571,13 +615,17 @@ def own_bench_file(path: Path, size_px: report.Size, **render: Value) -> BenchFi
 
 def _aims(result: report.Result) -> list[report.Aim]:
     """The project's aims, beside the measured times."""
-    aims = [*_frame_aims(result.rows), *_python_aims(result.python_ms)]
+    frame_aims = _frame_aims(result.rows)
+    python_aims = _python_aims(result.python_ms)
+    aims = [*frame_aims, *python_aims]
     starts_ms = []
     for start in result.startup:
         if start.size == report.REFERENCE_PX:
-            starts_ms.append(start.import_ms + start.first_frame_ms)
+            start_ms = start.import_ms + start.first_frame_ms
+            starts_ms.append(start_ms)
     if starts_ms:
-        aims.append(("import and first frame", START_AIM_MS, float(np.median(starts_ms))))
+        median_ms = float(np.median(starts_ms))
+        aims.append(("import and first frame", START_AIM_MS, median_ms))
     judged = []
     for what, aim_ms, ms in aims:
         reached = None if result.load.busy else ms <= aim_ms

@@ -158,9 +158,9 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
                         why=f"{kind}: not installed ({error}): pip install 'hilstar[benchmark]'",
                     )
                 )
-        by_name = {
-            f"{name} {kind}": lambda turn, work=work: work() for (name, kind), work in works.items()
-        }
+        by_name = {}
+        for (name, kind), work in works.items():
+            by_name[f"{name} {kind}"] = lambda turn, work=work: work()
         times = in_turn(by_name, rounds, budget_s)
         width, height = file.config.tracker.resolution_px
         cell = Cell(width, height, len(exposing.exposure.truth))

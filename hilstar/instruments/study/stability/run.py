@@ -64,9 +64,14 @@ def run(directory: Path) -> list[FailureCase]:
     """Measure the cases that are drawn, and write `stability.csv` and the charts; all cases in
     order. Raises InputError.
     """
-    drawn = [measure() for measure in image.DRAWN]
-    cases = [*recorded("catalogue_and_geometry"), *drawn, *recorded("detector_and_attitude")]
-    write_csv(directory / "stability.csv", COLUMNS, [case.row() for case in cases])
+    drawn = []
+    for measure in image.DRAWN:
+        drawn.append(measure())
+    geometry = recorded("catalogue_and_geometry")
+    attitude = recorded("detector_and_attitude")
+    cases = [*geometry, *drawn, *attitude]
+    rows = [case.row() for case in cases]
+    write_csv(directory / "stability.csv", COLUMNS, rows)
     for draw in (narrow_sigmas, weak_perspectives, ripples, turns):
         draw(directory)
     return cases
@@ -76,7 +81,8 @@ def _recorded_curves(directory: Path, name: str) -> FloatArray:
     """The columns of a recorded table, which is copied into `directory`."""
     source = Path(__file__).with_name(f"{name}.csv")
     write_whole(directory / source.name, source.read_bytes())
-    return np.loadtxt(source, delimiter=",", skiprows=1).T
+    columns = np.loadtxt(source, delimiter=",", skiprows=1)
+    return columns.T
 
 
 def narrow_sigmas(directory: Path) -> None:
@@ -88,16 +94,21 @@ def narrow_sigmas(directory: Path) -> None:
         errors = (*astuple(integrated), *astuple(sampled))
         for name, error in zip(NARROW_COLUMNS, errors, strict=True):
             table[name].append(error)
-    columns = {name: np.array(errors) for name, errors in table.items()}
+    columns = {}
+    for name, column in table.items():
+        columns[name] = np.array(column)
     write_columns(directory / "narrow_stars.csv", {"sigma_px": sigmas_px, **columns})
     panels = []
     for name, label in NARROW_LABELS.items():
+        integrated_errors = np.abs(columns[name])
+        sampled_errors = np.abs(columns[f"sampled_{name}"])
         curves = {
-            "sampled": np.abs(columns[f"sampled_{name}"]),
-            "integrated (hilstar)": np.abs(columns[name]),
+            "sampled": sampled_errors,
+            "integrated (hilstar)": integrated_errors,
         }
         spec = PanelSpec((), label, scales=("log", "log"))
-        panels.append(CurvePanel(sigmas_px, curves, spec, (ORANGE, BLUE)))
+        panel = CurvePanel(sigmas_px, curves, spec, (ORANGE, BLUE))
+        panels.append(panel)
     last = replace(panels[-1].spec, xlabel="sigma of the star [px]", xticks=SIGMA_TICKS_PX)
     panels[-1] = replace(panels[-1], spec=last)
     finding = narrow_finding(sigmas_px, columns)
@@ -115,12 +126,15 @@ def narrow_finding(sigmas_px: FloatArray, errors: Mapping[str, FloatArray]) -> s
         every = f"at every sigma to {sigmas_px[-1]:g} px"
         return f"Integrated over pixels a star is placed nearer than sampled, {every}"
     at = int(nearer.argmax())
-    places = f"{two_digits(sampled_px[at])} px, integrated {two_digits(own_px[at])}"
+    sampled_at_px = two_digits(sampled_px[at])
+    own_at_px = two_digits(own_px[at])
+    places = f"{sampled_at_px} px, integrated {own_at_px}"
     peak = errors["sampled_peak_error"][at]
     too = "bright" if peak > 0 else "faint"
+    peak_percent = 100 * abs(peak)
     return (
         f"From sigma {sigmas_px[at]:.2f} px on a star sampled at pixel middles is placed nearer"
-        f" ({places}), but its middle pixel is {100 * abs(peak):.0f} % too {too}"
+        f" ({places}), but its middle pixel is {peak_percent:.0f} % too {too}"
     )
 
 
@@ -131,50 +145,75 @@ def weak_perspectives(directory: Path) -> None:
     at_ten_arcsec = float(np.interp(10.0, angle_deg, off_arcsec))
     at_five_px = float(np.interp(5.0, angle_deg, off_px))
     share = abs(at_five_px / at_ten_px)
+    ten_px = abs(at_ten_px)
+    ten_arcsec = abs(at_ten_arcsec)
     finding = (
-        f"Weak perspective (one depth for every star) is off by {abs(at_ten_px):.0f} px or"
-        f" {abs(at_ten_arcsec):.0f} arcsec ten degrees from the axis, and by {share:.2f} of that at"
+        f"Weak perspective (one depth for every star) is off by {ten_px:.0f} px or"
+        f" {ten_arcsec:.0f} arcsec ten degrees from the axis, and by {share:.2f} of that at"
         " five"
     )
     above = PanelSpec((), "error [monitor px]", scales=("log", "log"), names=False)
     below = replace(
         above, ylabel="error [arcsec]", xlabel="field angle [deg]", xticks=FIELD_TICKS_DEG
     )
+    shown_px = np.abs(off_px)
+    shown_arcsec = np.abs(off_arcsec)
+    upper = CurvePanel(angle_deg, {HIDDEN: shown_px}, above, (INK,))
+    lower = CurvePanel(angle_deg, {HIDDEN: shown_arcsec}, below, (INK,))
     panels = (
-        CurvePanel(angle_deg, {HIDDEN: np.abs(off_px)}, above, (INK,)),
-        CurvePanel(angle_deg, {HIDDEN: np.abs(off_arcsec)}, below, (INK,)),
+        upper,
+        lower,
     )
     draw_curves(directory / "weak_perspective", finding, panels, WEAK_NOTE)
 
 
-def ripples(directory: Path) -> None:
-    """One star's flux over sub-pixel steps: in the linear image, by codes, and point sampled."""
+def moving_lights() -> dict[str, FloatArray]:
+    """One moving star's light (steps,) by the way it is drawn."""
     on = image.target(image.SIGMA_PX, image.MOVING_PX)
     narrow = image.target(0.5, image.MOVING_PX)
     sampled = partial(image.point_sampled, narrow)
     with image.by_renderer(on) as draw:
         linear = image.moving_fluxes(draw, on)
-    curves = {
-        "point sampled, sigma 0.5 px": image.moving_fluxes(sampled, narrow),
-        "codes, round": image.moving_code_fluxes("round"),
-        "codes, exact": image.moving_code_fluxes("exact"),
+    sampled_light = image.moving_fluxes(sampled, narrow)
+    round_light = image.moving_code_fluxes("round")
+    exact_light = image.moving_code_fluxes("exact")
+    return {
+        "point sampled, sigma 0.5 px": sampled_light,
+        "codes, round": round_light,
+        "codes, exact": exact_light,
         "linear image": linear,
     }
-    off_mag = {name: magnitude(light) for name, light in curves.items()}
+
+
+def ripples(directory: Path) -> None:
+    """One star's flux over sub-pixel steps: in the linear image, by codes, and point sampled."""
+    curves = moving_lights()
     step_px = np.linspace(0, image.PATH_PX[0], image.STEPS)
-    in_mag = {f"{name} [mag]": mag for name, mag in off_mag.items()}
-    write_columns(directory / "popping.csv", {"x_px": step_px, **in_mag})
-    spread = {name: float(np.ptp(mag)) for name, mag in off_mag.items()}
+    columns = {"x_px": step_px}
+    off_mag = {}
+    spread = {}
+    for name, light in curves.items():
+        mag = magnitude(light)
+        off_mag[name] = mag
+        columns[f"{name} [mag]"] = mag
+        spread[name] = float(np.ptp(mag))
+    write_columns(directory / "popping.csv", columns)
+    exact_mag = spread["codes, exact"]
+    round_mag = spread["codes, round"]
     finding = (
-        f"Moved in sub-pixel steps a star's light varies by {spread['codes, exact']:.3f} mag with"
-        f" exact codes and by {spread['codes, round']:.3f} mag with rounded ones"
+        f"Moved in sub-pixel steps a star's light varies by {exact_mag:.3f} mag with"
+        f" exact codes and by {round_mag:.3f} mag with rounded ones"
     )
-    linear_only = {"linear image": 1e6 * off_mag["linear image"]}
+    millionths = 1e6 * off_mag["linear image"]
+    linear_only = {"linear image": millionths}
     above = PanelSpec((), "light lost [mag]")
     below = PanelSpec((), "light lost [millionths of a mag]", "displacement in x [px]")
+    colours = (GREEN, ORANGE, BLUE, INK)
+    upper = CurvePanel(step_px, off_mag, above, colours, THIN)
+    lower = CurvePanel(step_px, linear_only, below, (INK,), THIN)
     panels = (
-        CurvePanel(step_px, off_mag, above, (GREEN, ORANGE, BLUE, INK), THIN),
-        CurvePanel(step_px, linear_only, below, (INK,), THIN),
+        upper,
+        lower,
     )
     draw_curves(directory / "popping", finding, panels, POPPING_NOTE)
 
@@ -184,17 +223,21 @@ def turns(directory: Path) -> None:
     turn_deg, *errors = _recorded_curves(directory, "turns")
     curves = dict(zip(TURN_CURVES, errors, strict=True))
     largest = curves["with rates"].max()
+    within_arcsec = two_digits(largest)
     finding = (
         "Beyond half a turn between samples SLERP takes the wrong way round; with rates a steady"
-        f" turn is followed within {two_digits(largest)} arcsec"
+        f" turn is followed within {within_arcsec} arcsec"
     )
-    drawn = {name: np.maximum(error, SMALLEST_ARCSEC) for name, error in curves.items()}
+    drawn = {}
+    for name, error in curves.items():
+        drawn[name] = np.maximum(error, SMALLEST_ARCSEC)
+    half_turn = LevelLine(HALF_TURN_DEG, HIDDEN, MUTED, width=1.0)
     spec = PanelSpec(
         ylabel="largest error between samples [arcsec]",
         xlabel="turn between samples [deg]",
         scales=("linear", "log"),
         xticks=TURN_TICKS_DEG,
-        places=(LevelLine(HALF_TURN_DEG, HIDDEN, MUTED, width=1.0),),
+        places=(half_turn,),
     )
     panel = CurvePanel(turn_deg, drawn, spec, (PURPLE, ORANGE, BLUE))
     draw_curves(directory / "turns", finding, (panel,))

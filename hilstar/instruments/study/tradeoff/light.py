@@ -424,7 +424,9 @@ def quantisation(stack: ExitStack, quick: bool) -> Trials:
         work = partial(_codes, renderer, star_field(FRAME_PX, renderer.footprint_px), count())
         is_default = (way.method, way.stealing) == (TAKEN, stealing)
         figures = errors.flux_max_mag, errors.max_px(JUDGE)
-        more = {f"max_px_{kind}": errors.max_px(kind) for kind in FAMILY}
+        more = {}
+        for kind in FAMILY:
+            more[f"max_px_{kind}"] = errors.max_px(kind)
         trials.append(Trial(way.name, *figures, work, is_default, more=more))
     taken = next(trial for trial in trials if trial.is_default)
     by_kind = ", ".join(f"{kind} {taken.more[f'max_px_{kind}']:.3f}" for kind in FAMILY)

@@ -100,9 +100,11 @@ class Road:
         (n, 3) they are.
         """
         kind = self.kind
-        turned = vectors.astype(kind, copy=False) @ icrs_to_image.T.astype(kind)
+        axes = icrs_to_image.T.astype(kind)
+        turned = vectors.astype(kind, copy=False) @ axes
         x, y, z = turned.T
-        scale = kind(camera.focal_length_px) / z
+        focal_length_px = kind(camera.focal_length_px)
+        scale = focal_length_px / z
         centre_x, centre_y = camera.principal_point_px
         x = x * scale + kind(centre_x)
         y = y * scale + kind(centre_y)
@@ -110,7 +112,9 @@ class Road:
         width, height = camera.resolution_px
         side_px = SPRITE_PSF.footprint_px
         if self.dtype == SPRITE_DTYPE:
-            sprites = pack_sprites(x, y, np.ones(len(star)), star, (width, height), side_px)
+            rates = np.ones(len(star))
+            size_px = (width, height)
+            sprites = pack_sprites(x, y, rates, star, size_px, side_px)
             return sprites.data, sprites.star
         margin = side_px / 2
         is_visible = (x > -margin) & (x < width + margin)
@@ -126,9 +130,11 @@ class Road:
     ) -> npt.NDArray[np.longdouble]:
         """Places (n, 2) of the stars, px; NaN for one that is not seen."""
         data, star = self.pack(vectors, icrs_to_image, camera)
-        places = np.full((len(vectors), 2), np.nan, dtype=np.longdouble)
+        pairs = (len(vectors), 2)
+        places = np.full(pairs, np.nan, dtype=np.longdouble)
         if data.dtype == SPRITE_DTYPE:
-            places[star] = data["pixel"] + data["fraction_px"].astype(np.longdouble)
+            fraction_px = data["fraction_px"].astype(np.longdouble)
+            places[star] = data["pixel"] + fraction_px
         else:
             places[star] = data["place_px"]
         return places
@@ -159,7 +165,8 @@ def stars_to(faintest_v_mag: float) -> Stars:
     """The demo's stars to a magnitude."""
     config = demo_config()
     sky = msgspec.structs.replace(config.sky, faintest_v_mag=faintest_v_mag)
-    return bench_stars(msgspec.structs.replace(config, sky=sky), Path())
+    to_faintest = msgspec.structs.replace(config, sky=sky)
+    return bench_stars(to_faintest, Path())
 
 
 def turn_to_image(q: FloatArray, camera: Camera) -> FloatArray:
@@ -169,14 +176,21 @@ def turn_to_image(q: FloatArray, camera: Camera) -> FloatArray:
 
 def random_turns(count: int, camera: Camera) -> list[FloatArray]:
     """Rotations from ICRS to image axes, (3, 3) each: ORION's, then uniformly random ones."""
-    random_q = normalise(np.random.default_rng(SEED).normal(size=(count - 1, 4)))
-    return [turn_to_image(q, camera) for q in (ORION, *random_q)]
+    rng = np.random.default_rng(SEED)
+    directions = rng.normal(size=(count - 1, 4))
+    random_q = normalise(directions)
+    turns = []
+    for q in (ORION, *random_q):
+        turns.append(turn_to_image(q, camera))
+    return turns
 
 
 def in_cells(stars: Stars, cell_deg: float, by_centres: bool = False) -> Stars:
     """The stars in cells of another size; `by_centres` takes a cell for a point."""
     grid = cell_grid(stars.vectors, cell_deg)
-    columns = {name: getattr(stars, name)[grid.order] for name in STAR_COLUMNS}
+    columns = {}
+    for name in STAR_COLUMNS:
+        columns[name] = getattr(stars, name)[grid.order]
     if by_centres:
         cosine = np.ones_like(grid.cos_radius)
         sine = np.zeros_like(grid.sin_radius)
@@ -187,29 +201,76 @@ def in_cells(stars: Stars, cell_deg: float, by_centres: bool = False) -> Stars:
 def scan(stars: Stars, turn: FloatArray, camera: Camera) -> CulledStars:
     """Every star projected."""
     every = np.arange(len(stars))
-    return CulledStars(projected(stars, every, turn, camera), len(stars))
+    star = projected(stars, every, turn, camera)
+    return CulledStars(star, len(stars))
 
 
 def by_angle(stars: Stars, turn: FloatArray, camera: Camera) -> CulledStars:
     """The stars within a circle about the boresight, by the angles of all stars."""
     radius_rad = camera.field_radius_rad(MARGIN_PX)
-    near = np.flatnonzero(stars.vectors @ turn[2] >= np.cos(radius_rad))
-    return CulledStars(projected(stars, near, turn, camera), len(stars))
+    cosines = stars.vectors @ turn[2]
+    in_circle = cosines >= np.cos(radius_rad)
+    near = np.flatnonzero(in_circle)
+    star = projected(stars, near, turn, camera)
+    return CulledStars(star, len(stars))
 
 
 def by_cells(stars: Stars, turn: FloatArray, camera: Camera) -> CulledStars:
     """As `make_sprites` finds them."""
     radius_rad = camera.field_radius_rad(MARGIN_PX)
-    near = stars.grid.near(turn[2], radius_rad, camera.edges(MARGIN_PX) @ turn)
-    return CulledStars(projected(stars, near, turn, camera), len(near))
+    edges = camera.edges(MARGIN_PX) @ turn
+    near = stars.grid.near(turn[2], radius_rad, edges)
+    star = projected(stars, near, turn, camera)
+    return CulledStars(star, len(near))
 
 
 def projected(stars: Stars, near: IntArray, turn: FloatArray, camera: Camera) -> IntArray:
     """The stars of `near` (n,) that are in view."""
-    x_px, y_px = camera.project(stars.vectors[near] @ turn.T)
+    directions = stars.vectors[near] @ turn.T
+    x_px, y_px = camera.project(directions)
     rates = stars.electrons_per_s[near]
     side_px = SPRITE_PSF.footprint_px
-    return pack_sprites(x_px, y_px, rates, near, camera.resolution_px, side_px).star
+    sprites = pack_sprites(x_px, y_px, rates, near, camera.resolution_px, side_px)
+    return sprites.star
+
+
+def stars_in_view(stars: Stars, turns: Sequence[FloatArray], camera: Camera) -> list[set[int]]:
+    """The Hipparcos numbers of the stars in view of each turn."""
+    in_view = []
+    for turn in turns:
+        star = scan(stars, turn, camera).star
+        in_view.append(set(stars.hip[star].tolist()))
+    return in_view
+
+
+def path_words(bench: "SmearBench", stars: Stars) -> str:
+    """The lengths of stars' paths, shortest to longest, in words."""
+    ends = np.array([-0.5, 0.5])
+    x_px, y_px = bench.places_px(stars, ends)
+    across_px = np.diff(x_px, axis=0)
+    down_px = np.diff(y_px, axis=0)
+    paths_px = np.hypot(across_px, down_px)
+    return f"{paths_px.min():.0f} to {paths_px.max():.0f} px"
+
+
+def worst_and_rms_px(off_px: npt.NDArray[np.longdouble]) -> tuple[float, float]:
+    """The largest and the rms distance of offsets (n, 2), px; NaN is a star that is not seen."""
+    off_x, off_y = off_px.T
+    distance_px = np.hypot(off_x, off_y)
+    error = distance_px.astype(np.float64)
+    error = error[np.isfinite(error)]
+    mean_square = np.mean(error**2)
+    return float(error.max()), float(np.sqrt(mean_square))
+
+
+def places_in_fields(
+    road: Road, fields: Sequence[FloatArray], turns: Sequence[FloatArray], camera: Camera
+) -> npt.NDArray[np.longdouble]:
+    """Places (n, 2), px, of the stars of all fields, whose directions are (k, 3) each."""
+    of_fields = []
+    for vectors, turn in zip(fields, turns, strict=True):
+        of_fields.append(road.places_px(vectors, turn, camera))
+    return np.concatenate(of_fields)
 
 
 def culling(stack: ExitStack, quick: bool) -> Trials:
@@ -219,13 +280,15 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
     del stack
     camera = ideal_monitor(demo_config())
     stars = stars_to(NO_LIMIT_V_MAG)
-    turns = random_turns(10 if quick else ATTITUDES, camera)
-    in_view = [set(stars.hip[scan(stars, turn, camera).star].tolist()) for turn in turns]
+    field_count = 10 if quick else ATTITUDES
+    turns = random_turns(field_count, camera)
+    in_view = stars_in_view(stars, turns, camera)
     methods: dict[str, tuple[Stars, Finder]] = {
         "scan, every star projected": (stars, scan),
         "scan of angles": (stars, by_angle),
     }
-    for cell_deg in sorted({*CELLS_DEG, CELL_DEG}):
+    cells_deg = sorted({*CELLS_DEG, CELL_DEG})
+    for cell_deg in cells_deg:
         methods[f"cells of {cell_deg:g} deg"] = in_cells(stars, cell_deg), by_cells
     by_centres = in_cells(stars, 10.0, by_centres=True)
     methods["cells of 10 deg, by centres only"] = by_centres, by_cells
@@ -240,14 +303,22 @@ def culling(stack: ExitStack, quick: bool) -> Trials:
             vain += culled.tested - len(wanted & shown)
         work = partial(finder, sorted_stars, turns[0], camera)
         is_default = name == f"cells of {CELL_DEG:g} deg"
-        trials.append(Trial(name, missed, vain / len(turns), work, is_default, finder is scan))
+        mean_vain = vain / len(turns)
+        trial = Trial(name, missed, mean_vain, work, is_default, finder is scan)
+        trials.append(trial)
+    missed_figure = Figure(f"stars missed in {len(turns)} fields", "stars", 0.1)
+    tested_figure = Figure("tested but not in view, mean", "stars")
+    scene = f"{len(stars)} stars to the {len(in_view[0])} sprites of Orion"
+    why = (
+        "a smaller cell passes on fewer stars in a rich field, a larger one costs less in a"
+        " sparse one"
+    )
     return Trials(
         "culling",
-        f"{len(stars)} stars to the {len(in_view[0])} sprites of Orion",
-        Figure(f"stars missed in {len(turns)} fields", "stars", 0.1),
-        Figure("tested but not in view, mean", "stars"),
-        "a smaller cell passes on fewer stars in a rich field, a larger one costs less in a"
-        " sparse one",
+        scene,
+        missed_figure,
+        tested_figure,
+        why,
         trials,
     )
 
@@ -259,33 +330,32 @@ def projection(stack: ExitStack, quick: bool) -> Trials:
     del stack
     camera = ideal_monitor(demo_config())
     stars = stars_to(NO_LIMIT_V_MAG)
-    turns = random_turns(6 if quick else ATTITUDES, camera)
+    field_count = 6 if quick else ATTITUDES
+    turns = random_turns(field_count, camera)
     radius_rad = camera.field_radius_rad(0.0)
-    near = [stars.vectors[stars.grid.near(turn[2], radius_rad)] for turn in turns]
-
-    def places(road: Road) -> npt.NDArray[np.longdouble]:
-        of_fields = []
-        for vectors, turn in zip(near, turns, strict=True):
-            of_fields.append(road.places_px(vectors, turn, camera))
-        return np.concatenate(of_fields)
-
-    truth = places(EXACT)
+    near = []
+    for turn in turns:
+        star = stars.grid.near(turn[2], radius_rad)
+        near.append(stars.vectors[star])
+    truth = places_in_fields(EXACT, near, turns, camera)
     trials = []
     for name, road in ROADS.items():
-        off_x, off_y = (places(road) - truth).T
-        error = np.hypot(off_x, off_y).astype(np.float64)
-        error = error[np.isfinite(error)]
-        rms_px = float(np.sqrt(np.mean(error**2)))
+        off_px = places_in_fields(road, near, turns, camera) - truth
+        worst_px, rms_px = worst_and_rms_px(off_px)
         work = partial(road.pack, near[0], turns[0], camera)
         # The sprites' own layout says which of them the renderer is handed.
         is_default = road.dtype == SPRITE_DTYPE
-        trials.append(Trial(name, float(error.max()), rms_px, work, is_default, road is EXACT))
+        trial = Trial(name, worst_px, rms_px, work, is_default, road is EXACT)
+        trials.append(trial)
     width, height = camera.resolution_px
+    scene = f"{len(near[0])} stars near the field to sprites, {width} x {height}"
+    worst_figure = Figure("position error, worst star", "px", ROUNDING_PX)
+    rms_figure = Figure("rms", "px")
     return Trials(
         "projection",
-        f"{len(near[0])} stars near the field to sprites, {width} x {height}",
-        Figure("position error, worst star", "px", ROUNDING_PX),
-        Figure("rms", "px"),
+        scene,
+        worst_figure,
+        rms_figure,
         "OpenGL 3.3 takes no float64, and the error of a float32 position grows with the monitor",
         trials,
     )
@@ -313,8 +383,10 @@ class SmearBench:
         middle.
         """
         x_px, y_px = self.places_px(stars, at)
-        light = np.outer(share, stars.electrons_per_s).ravel()
-        star = np.tile(np.arange(len(stars)), len(at))
+        lights = np.outer(share, stars.electrons_per_s)
+        light = lights.ravel()
+        numbers = np.arange(len(stars))
+        star = np.tile(numbers, len(at))
         size_px = self.camera.resolution_px
         side_px = self.psf.footprint_px
         return pack_sprites(x_px.ravel(), y_px.ravel(), light, star, size_px, side_px)
@@ -335,13 +407,18 @@ class SmearBench:
         of the exposure.
         """
         count = across**2
-        place = (np.arange(across) + 0.5) * self.side_px / across - 0.5
+        number = np.arange(across) + 0.5
+        place = number * self.side_px / across - 0.5
         columns, rows = np.meshgrid(place, place)
-        x_px = columns.ravel() - (self.side_px - 1) / 2
-        y_px = rows.ravel() - (self.side_px - 1) / 2
-        image = np.column_stack([x_px, y_px, np.full(count, self.camera.focal_length_px)])
-        directions = image / np.linalg.norm(image, axis=1, keepdims=True)
-        vectors = directions @ self.motion.icrs_to_image(MIDDLE_S, self.camera)[0]
+        middle_px = (self.side_px - 1) / 2
+        x_px = columns.ravel() - middle_px
+        y_px = rows.ravel() - middle_px
+        focal_px = np.full(count, self.camera.focal_length_px)
+        image = np.column_stack([x_px, y_px, focal_px])
+        length = np.linalg.norm(image, axis=1, keepdims=True)
+        directions = image / length
+        turn = self.motion.icrs_to_image(MIDDLE_S, self.camera)[0]
+        vectors = directions @ turn
         zero = np.zeros(count)
         catalog = plain_catalog("star", count, {"v_mag": zero, "ra_deg": zero, "dec_deg": zero})
         return make_stars(catalog, vectors, zero, zero + 1)
@@ -354,8 +431,10 @@ def smear_bench() -> SmearBench:
     camera = monitor_camera(
         tracker.resolution_px, tracker.pixel_pitch_um, tracker.focal_length_mm, aligned
     )
-    motion = Motion(ORION, np.radians(np.array(RATE_DEG_S)), tracker.exposure_s)
-    return SmearBench(camera, tracker_psf(tracker, Path()), motion)
+    rate_rad_s = np.radians(np.array(RATE_DEG_S))
+    motion = Motion(ORION, rate_rad_s, tracker.exposure_s)
+    psf = tracker_psf(tracker, Path())
+    return SmearBench(camera, psf, motion)
 
 
 def smear_methods(bench: SmearBench) -> dict[str, SpritesOf]:
@@ -365,7 +444,8 @@ def smear_methods(bench: SmearBench) -> dict[str, SpritesOf]:
         nodes, weights = np.polynomial.legendre.leggauss(count)
         methods[gauss_name(count)] = partial(bench.chain, nodes / 2, weights / 2)
     for count in EVENLY:
-        at = (np.arange(count) + 0.5) / count - 0.5
+        number = np.arange(count) + 0.5
+        at = number / count - 0.5
         share = np.full(count, 1 / count)
         methods[f"evenly in time, {count}"] = partial(bench.chain, at, share)
     return methods
@@ -393,7 +473,8 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
     mean_count = len(bench.path_sprites(few)) / len(few)
     default = f"Gauss-Legendre by length, {mean_count:.0f} on average"
     methods = {default: bench.path_sprites, **smear_methods(bench)}
-    exact = bench.image(methods[gauss_name(EXACT_NODES)](few))
+    exact_method = methods[gauss_name(EXACT_NODES)]
+    exact = bench.image(exact_method(few))
     trials = []
     for name, sprites_of in methods.items():
         drawn = bench.image(sprites_of(few))
@@ -401,15 +482,17 @@ def smear(stack: ExitStack, quick: bool) -> Trials:
         off_px = measure(exact, drawn, len(exact) // across).centroid_max_px
         work = partial(draw, sprites_of)
         is_exact = name == gauss_name(EXACT_NODES)
-        trials.append(Trial(name, worst, off_px, work, name == default, is_exact))
-    x_px, y_px = bench.places_px(many, np.array([-0.5, 0.5]))
-    paths_px = np.hypot(np.diff(x_px, axis=0), np.diff(y_px, axis=0))
-    extent = f"{paths_px.min():.0f} to {paths_px.max():.0f} px"
+        trial = Trial(name, worst, off_px, work, name == default, is_exact)
+        trials.append(trial)
+    extent = path_words(bench, many)
+    scene = f"linear image of {len(many)} stars, paths of {extent}, {bench.side_px} px squared"
+    pixel_figure = Figure("largest pixel error, share of its star", "1", ROUNDING_SHARE)
+    centre_figure = Figure("centre of gravity, worst", "px")
     return Trials(
         "smear",
-        f"linear image of {len(many)} stars, paths of {extent}, {bench.side_px} px squared",
-        Figure("largest pixel error, share of its star", "1", ROUNDING_SHARE),
-        Figure("centre of gravity, worst", "px"),
+        scene,
+        pixel_figure,
+        centre_figure,
         "its error does not grow with the path, as that of a fixed number does",
         trials,
     )
@@ -422,12 +505,15 @@ def prediction_errors(predictor: Predictor, samples: Sequence[AttitudeSample]) -
     for after in range(NEAR, len(samples)):
         # One that waits has the sample after the frame, too.
         end = after + 1 if predictor.waits else after
-        attitude_at = predictor.load(samples[after - NEAR : end])
+        ready = samples[after - NEAR : end]
+        attitude_at = predictor.load(ready)
         first = math.ceil(samples[after - 1].t_ns / frame_ns)
         last = math.ceil(samples[after].t_ns / frame_ns)
         for number in range(first, last):
             t_ns = round(number * frame_ns)
-            off_rad = angle_between_rad(slew_attitude(t_ns), attitude_at(t_ns))
+            true_q = slew_attitude(t_ns)
+            predicted_q = attitude_at(t_ns)
+            off_rad = angle_between_rad(true_q, predicted_q)
             errors.append(off_rad * math.degrees(3600))
     return errors
 
@@ -445,23 +531,32 @@ def prediction(stack: ExitStack, quick: bool) -> Trials:
     del stack
     seconds = 10 if quick else 60
     count = seconds * 1000 // SAMPLE_MS
-    samples = [slew_sample(k * SAMPLE_MS * NS_PER_MS) for k in range(count)]
+    samples = []
+    for number in range(count):
+        t_ns = number * SAMPLE_MS * NS_PER_MS
+        samples.append(slew_sample(t_ns))
     after_ns = np.linspace(0, SAMPLE_MS * NS_PER_MS, PREDICTIONS, dtype=np.int64)
     times_ns = (after_ns + samples[-2].t_ns).tolist()
     trials = []
     for predictor in predictors():
         errors = prediction_errors(predictor, samples)
         end = len(samples) if predictor.waits else -1
-        attitude_at = predictor.load(samples[-1 - NEAR : end])
+        ready = samples[-1 - NEAR : end]
+        attitude_at = predictor.load(ready)
         work = partial(attitudes_at, attitude_at, times_ns)
-        rms_arcsec = float(np.sqrt(np.mean(np.square(errors))))
-        trials.append(Trial(predictor.name, max(errors), rms_arcsec, work, predictor.is_default))
+        mean_square = np.mean(np.square(errors))
+        rms_arcsec = float(np.sqrt(mean_square))
+        trial = Trial(predictor.name, max(errors), rms_arcsec, work, predictor.is_default)
+        trials.append(trial)
     shaken = ", ".join(f"{size:g} arcsec at {hz:g} Hz" for size, hz in JITTER)
+    worst_figure = Figure("attitude error, worst", "arcsec")
+    rms_figure = Figure("rms", "arcsec")
+    scene = f"{PREDICTIONS} attitudes, samples every {SAMPLE_MS} ms"
     return Trials(
         "prediction",
-        f"{PREDICTIONS} attitudes, samples every {SAMPLE_MS} ms",
-        Figure("attitude error, worst", "arcsec"),
-        Figure("rms", "arcsec"),
+        scene,
+        worst_figure,
+        rms_figure,
         "it needs nothing but the newest sample",
         trials,
         f"a swing of {SLEW_DEG:g} degrees in {SLEW_S:g} s, shaken on each axis by {shaken}; waiting"

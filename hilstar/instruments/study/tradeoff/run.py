@@ -50,7 +50,8 @@ def run(directory: Path, quick: bool = False) -> Judged:
             step = measured(plan(stack, quick), budget_s)
         draw_trials(directory / f"tradeoff_{step.name}", step, machine)
         steps.append(step)
-        table += [cells_of_trial(step, trial) for trial in step.trials]
+        for trial in step.trials:
+            table.append(cells_of_trial(step, trial))
     rows = [list(cells.values()) for cells in table]
     write_csv(directory / "tradeoff.csv", list(table[0]), rows)
     lines = [

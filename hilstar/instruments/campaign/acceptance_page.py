@@ -17,7 +17,6 @@ from hilstar.basics.pages import (
     WARN,
     Card,
     KeyFigure,
-    Markup,
     Verdict,
     drawing_of,
     figures_of,
@@ -37,7 +36,7 @@ from hilstar.instruments.campaign.answer_figures import StarTable, place_map
 from hilstar.instruments.campaign.figures import TooFewCases, clopper_pearson, quantile_limits
 from hilstar.instruments.campaign.plan import STAR_QUANTITIES
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
-from hilstar.instruments.campaign.requirements_page import SIGN, SIGN_STYLE, STATES
+from hilstar.instruments.campaign.requirements_page import STATES, signed_card, verdict_chip
 from hilstar.instruments.campaign.store import file_sha256
 from hilstar.instruments.campaign.sweep import NOT_EVEN, STILL, levels_text
 from hilstar.server.bench.certificate_file import off_by
@@ -88,11 +87,14 @@ def write_acceptance(
     write_csv(folder / CSV_FILE, CSV_COLUMNS, rows_text)
     import msgspec
 
-    write_whole(folder / JSON_FILE, msgspec.json.format(msgspec.json.encode(summary), indent=1))
+    packed = msgspec.json.encode(summary)
+    write_whole(folder / JSON_FILE, msgspec.json.format(packed, indent=1))
     parts = [figures_of(_counts(verdicts))]
-    parts += [card.html() for card in _cards(acceptance, results, verdicts, rows)]
+    for card in _cards(acceptance, results, verdicts, rows):
+        parts.append(card.html())
     title = f"{acceptance.plan.title}: {acceptance.file.path.name}"
-    write_whole(folder / PAGE_FILE, page_of(title, _verdict(verdicts), parts))
+    page = page_of(title, _verdict(verdicts), parts)
+    write_whole(folder / PAGE_FILE, page)
     return summary
 
 
@@ -110,46 +112,65 @@ def summary_of(
     acceptance: AcceptedBench, verdicts: list[ClauseVerdict], rows: int
 ) -> dict[str, Any]:
     """The JSON object of `hilstar accept`."""
+    plan, file = acceptance.plan, acceptance.file
     arcsec, seconds = acceptance.own_error
-    own_arcsec = None if arcsec is None else {"cross": arcsec[0], "roll": arcsec[1]}
+    own_arcsec = None
+    if arcsec is not None:
+        across, about = arcsec
+        own_arcsec = {"cross": across, "roll": about}
+    clauses = [_clause(verdict) for verdict in verdicts]
+    untested = []
+    for judged in plan.untested:
+        untested.append({"capability": judged.capability, "why": judged.why})
     return {
-        "title": acceptance.plan.title,
-        "plan": str(acceptance.plan.path),
-        "bench": str(acceptance.file.path),
-        "bench_sha256": acceptance.file.sha256,
-        "through": acceptance.plan.through,
+        "title": plan.title,
+        "plan": str(plan.path),
+        "bench": str(file.path),
+        "bench_sha256": file.sha256,
+        "through": plan.through,
         "hilstar": __version__,
         "verdict": verdict_of(verdicts),
         "cases": rows,
         "bench_off_arcsec": own_arcsec,
         "bench_off_s": seconds,
         "cube_to_boresight": acceptance.cube,
-        "clauses": [_clause(verdict) for verdict in verdicts],
-        "untested": [
-            {"capability": judged.capability, "why": judged.why}
-            for judged in acceptance.plan.untested
-        ],
+        "clauses": clauses,
+        "untested": untested,
     }
 
 
 def _clause(each: ClauseVerdict) -> dict[str, Any]:
     clause, verdict = each.clause, each.verdict
+    axis = ""
+    if clause.of_axis:
+        axis = clause.axis or "cross"
+    side = "minimum"
+    if clause.minimum is None:
+        side = "maximum"
     row: dict[str, Any] = {
         "capability": clause.capability,
         "of": clause.of,
         "quantity": clause.quantity,
-        "axis": (clause.axis or "cross") if clause.of_axis else "",
+        "axis": axis,
         "condition": clause.condition,
         "limit": clause.limit,
-        "side": "maximum" if clause.minimum is None else "minimum",
+        "side": side,
         "unit": each.unit,
         "confidence": clause.confidence,
         "verdict": each.word,
         "why": each.untested,
     }
-    names = ("value", "low", "high", "guard", "margin", "cases", "method")
-    row |= {name: getattr(verdict, name) if verdict is not None else None for name in names}
-    row["more_cases"] = None if verdict is None else verdict.more
+    row |= dict.fromkeys(("value", "low", "high", "guard", "margin", "cases", "method"))
+    row["more_cases"] = None
+    if verdict is not None:
+        row["value"] = verdict.value
+        row["low"] = verdict.low
+        row["high"] = verdict.high
+        row["guard"] = verdict.guard
+        row["margin"] = verdict.margin
+        row["cases"] = verdict.cases
+        row["method"] = verdict.method
+        row["more_cases"] = verdict.more
     return row
 
 
@@ -170,12 +191,13 @@ def lines_of(
         if judged.verdict is None:
             lines.append(f"{head}  {judged.untested}")
         else:
-            more = f"; {_more(judged)}" if _more(judged) else ""
-            lines.append(f"{head}  {_requirement(judged)}: {_measured(judged)}{more}")
-    lines += [
-        f"{judged.capability:{width}}  {NOT_TESTED}  {judged.why}"
-        for judged in acceptance.plan.untested
-    ]
+            line = f"{head}  {_requirement(judged)}: {_measured(judged)}"
+            more = _more(judged)
+            if more:
+                line = f"{line}; {more}"
+            lines.append(line)
+    for untested in acceptance.plan.untested:
+        lines.append(f"{untested.capability:{width}}  {NOT_TESTED}  {untested.why}")
     for result in results:
         for name, count, why in _failed_rows(result):
             lines.append(f"{name}: {count} cases failed: {why}")
@@ -194,11 +216,17 @@ def _more(each: ClauseVerdict) -> str:
 def _requirement(each: ClauseVerdict) -> str:
     """The limit in words, without the quantity, which the capability names."""
     require = each.clause.require
-    side = "at most" if require.minimum is None else "at least"
-    share = f" in {100 * require.share:g} % of cases" if require.share else ""
-    where = f" where {require.condition}" if require.condition else ""
+    side = "at least"
+    if require.minimum is None:
+        side = "at most"
     limit = f"{require.limit:g} {each.unit}".rstrip()
-    return f"{side} {limit}{share}{where}"
+    limit_text = f"{side} {limit}"
+    if require.share:
+        percent = 100 * require.share
+        limit_text = f"{limit_text} in {percent:g} % of cases"
+    if require.condition:
+        limit_text = f"{limit_text} where {require.condition}"
+    return limit_text
 
 
 def _measured(each: ClauseVerdict) -> str:
@@ -210,7 +238,7 @@ def _measured(each: ClauseVerdict) -> str:
         for end in (STILL, NOT_EVEN):
             if end in verdict.method:
                 return f"{end} {_digits(verdict.value)} {each.unit}".rstrip()
-    low, high = (_digits(end) for end in (verdict.low, verdict.high))
+    low, high = _digits(verdict.low), _digits(verdict.high)
     return f"{_digits(verdict.value)} ({low} to {high}) {each.unit}".rstrip()
 
 
@@ -242,7 +270,8 @@ def _verdict(verdicts: list[ClauseVerdict]) -> Verdict:
         count = sum(judged.word == word for judged in verdicts)
         if count:
             counts.append(f"{count} {word}")
-    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(verdicts)}: {', '.join(counts)}.")
+    counts_text = ", ".join(counts)
+    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(verdicts)}: {counts_text}.")
 
 
 def _counts(verdicts: list[ClauseVerdict]) -> Iterator[KeyFigure]:
@@ -257,7 +286,10 @@ def _cards(
 ) -> Iterator[Card]:
     yield _clauses(verdicts)
     yield _untested(acceptance, verdicts)
-    if failed := [row for result in results for row in _failed_rows(result)]:
+    failed: list[tuple[str, int, str]] = []
+    for result in results:
+        failed += _failed_rows(result)
+    if failed:
         yield Card("Failed cases", words=[table_of(failed, FAILED_HEADER)], cure=FAILED_CURE)
     for result in results:
         if result.levels:
@@ -267,8 +299,7 @@ def _cards(
         elif _asked(verdicts, result, STAR_QUANTITIES):
             yield from _star_card(acceptance, result)
     yield _about(acceptance, results, rows)
-    names = "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN)
-    yield Card("Signed", words=[names])
+    yield signed_card()
 
 
 def _failed_rows(result: SetResult) -> Iterator[tuple[str, int, str]]:
@@ -279,23 +310,30 @@ def _failed_rows(result: SetResult) -> Iterator[tuple[str, int, str]]:
 
 def _asked(verdicts: list[ClauseVerdict], result: SetResult, quantities: tuple[str, ...]) -> bool:
     """Whether a clause limits one of these quantities of a set."""
+    if result.cases is None:
+        return False
     name = result.case_set.name
-    return result.cases is not None and any(
-        judged.clause.of == name and judged.clause.quantity in quantities for judged in verdicts
-    )
+    for judged in verdicts:
+        clause = judged.clause
+        if clause.of == name and clause.quantity in quantities:
+            return True
+    return False
 
 
 def _clauses(verdicts: list[ClauseVerdict]) -> Card:
     rows, methods = [], []
     for judged in verdicts:
-        verdict = judged.verdict
+        clause, verdict = judged.clause, judged.verdict
         if verdict is None:
             continue
-        chip = f'<span class="chip" data-state="{STATES[judged.word]}">{judged.word}</span>'
-        guard = f"{verdict.guard:.2g} {judged.unit}" if verdict.guard else ""
-        figures = (_requirement(judged), _measured(judged), guard, _margin(judged), Markup(chip))
-        rows.append((judged.clause.capability, *figures, verdict.cases, _more(judged)))
-        methods.append((judged.clause.capability, judged.clause.quantity, verdict.method))
+        requirement = _requirement(judged)
+        measured = _measured(judged)
+        guard = ""
+        if verdict.guard:
+            guard = f"{verdict.guard:.2g} {judged.unit}"
+        figures = (requirement, measured, guard, _margin(judged), verdict_chip(judged.word))
+        rows.append((clause.capability, *figures, verdict.cases, _more(judged)))
+        methods.append((clause.capability, clause.quantity, verdict.method))
     texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
     how = table_of(methods, ("capability", "quantity", "method"))
     cure = CURES.get(verdict_of(verdicts), "")
@@ -318,11 +356,15 @@ def _sweep_card(result: SetResult) -> Card:
     sweep = result.case_set.sweep
     assert sweep is not None
     levels = list(levels_text(result.levels))
-    at = [level for level, _, _ in levels]
-    share = [successes / cases for _, successes, cases in levels]
-    ends = [clopper_pearson(successes, cases, 0.975) for _, successes, cases in levels]
+    at, share, ends = [], [], []
+    for level, successes, cases in levels:
+        at.append(level)
+        share.append(successes / cases)
+        ends.append(clopper_pearson(successes, cases, 0.975))
     bars = np.abs(np.array(ends).T - np.array(share))
-    unit = f" [{sweep.unit}]" if sweep.unit else ""
+    unit = ""
+    if sweep.unit:
+        unit = f" [{sweep.unit}]"
     with panels_of(f"Share of cases with an attitude against {sweep.key}") as (axes,):
         axes.errorbar(at, share, yerr=bars, fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
         axes.axhline(sweep.share, linewidth=0.8, linestyle="--", color=MUTED)
@@ -332,10 +374,11 @@ def _sweep_card(result: SetResult) -> Card:
         axes.set_xlabel(f"{sweep.key}{unit}")
         axes.set_ylabel("share of cases")
     table = table_of(levels, (f"level{unit}", "successes", "cases"))
-    paragraphs = [paragraph(result.case_set.about)] if result.case_set.about else []
-    paragraphs.append(
-        drawing_of(axes.figure, f"share of cases with an attitude against {sweep.key}")
-    )
+    paragraphs = []
+    if result.case_set.about:
+        paragraphs.append(paragraph(result.case_set.about))
+    alt = f"share of cases with an attitude against {sweep.key}"
+    paragraphs.append(drawing_of(axes.figure, alt))
     return Card(f"Sweep: {result.case_set.name}", words=paragraphs, details=[table])
 
 
@@ -343,15 +386,20 @@ def _first_attitude(result: SetResult) -> Card:
     """The distribution of the time to the first attitude."""
     assert result.cases is not None
     column = result.cases.numbers["first_attitude_s"]
+    # a case without an attitude has waited for ever
     times = np.sort(np.where(np.isfinite(column), column, math.inf))
+    count = len(times)
     rows = []
     for share in QUANTILES:
         low, high = quantile_limits(times, share, 0.975)
-        value = float(times[min(math.ceil(share * len(times)), len(times)) - 1])
-        rows.append((f"{100 * share:g} %", *(_seconds(part) for part in (value, low, high))))
+        place = min(math.ceil(share * count), count) - 1
+        value = float(times[place])
+        percent = 100 * share
+        rows.append((f"{percent:g} %", _seconds(value), _seconds(low), _seconds(high)))
     known = times[np.isfinite(times)]
+    shares = np.arange(1, len(known) + 1) / count
     with panels_of("Time to the first attitude") as (axes,):
-        axes.step(known, np.arange(1, len(known) + 1) / len(times), where="post", color=BLUE)
+        axes.step(known, shares, where="post", color=BLUE)
         axes.set_ylim(0, 1.05)
         axes.set_xlabel("time to the first attitude [s]")
         axes.set_ylabel("share of cases")
@@ -363,16 +411,20 @@ def _first_attitude(result: SetResult) -> Card:
 
 def _detection(stars: StarTable) -> Iterator[tuple[float, float, float, float]]:
     """Of bins of magnitude: middle, share of stars reported, and 95 % below and above that."""
-    edges = np.linspace(float(stars.v_mag.min()), float(stars.v_mag.max()) + 1e-6, MAG_BINS + 1)
+    brightest_mag = float(stars.v_mag.min())
+    faintest_mag = float(stars.v_mag.max())
+    edges = np.linspace(brightest_mag, faintest_mag + 1e-6, MAG_BINS + 1)
     place = np.digitize(stars.v_mag, edges) - 1
     for k in range(MAG_BINS):
-        lit = int((place == k).sum())
+        in_bin = place == k
+        lit = int(in_bin.sum())
         if not lit:
             continue
-        reported = int((stars.found & (place == k)).sum())
+        reported = int((stars.found & in_bin).sum())
         low, high = clopper_pearson(reported, lit, 0.975)
         share = reported / lit
-        yield float(edges[k] + edges[k + 1]) / 2, share, share - low, high - share
+        middle_mag = float(edges[k] + edges[k + 1]) / 2
+        yield middle_mag, share, share - low, high - share
 
 
 def _star_card(acceptance: AcceptedBench, result: SetResult) -> Iterator[Card]:
@@ -383,8 +435,10 @@ def _star_card(acceptance: AcceptedBench, result: SetResult) -> Iterator[Card]:
         offsets_px = place_map(stars, acceptance.scale.resolution_px, GRID)
     except TooFewCases:
         return
-    at, share, below, above = np.array(list(_detection(stars))).T
-    largest_px = float(np.hypot(offsets_px.dx_px, offsets_px.dy_px).max())
+    bins = list(_detection(stars))
+    at, share, below, above = np.array(bins).T
+    distance_px = np.hypot(offsets_px.dx_px, offsets_px.dy_px)
+    largest_px = float(distance_px.max())
     finding = f"Stars reported by magnitude; their places are off by at most {largest_px:.2g} px"
     with panels_of(finding, 1, 2, share_x=False, height_inch=3.6) as (curve, right):
         curve.errorbar(at, share, yerr=[below, above], fmt="o", capsize=3, color=BLUE, ecolor=MUTED)

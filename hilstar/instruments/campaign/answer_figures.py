@@ -409,7 +409,7 @@ def _aberration(require: Require, cases: Columns) -> BoundedFigure:
     case = np.flatnonzero(known)
     _enough(case, "attitude")
     turns = []
-    for k in case:
+    for k in case.tolist():
         turn = aberration_rad(q[k], velocities[k])
         turns.append(turn[:2])
     predicted = ARCSEC_PER_RAD * np.array(turns)
@@ -544,8 +544,8 @@ def place_map(found: StarTable, resolution_px: tuple[int, int], side: int) -> Pl
     fit = fitted_places(found, resolution_px)
     width, height = resolution_px
     centres = np.arange(side) + 0.5
-    x_px, y_px = np.meshgrid(centres * width / side, centres * height / side)
-    x_px, y_px = x_px.ravel(), y_px.ravel()
+    columns_px, rows_px = np.meshgrid(centres * width / side, centres * height / side)
+    x_px, y_px = columns_px.ravel(), rows_px.ravel()
     terms = field_terms(x_px, y_px, resolution_px, MAP_DEGREE)
     offsets = terms @ fit.solution
     offsets = offsets - offsets.mean(axis=0)

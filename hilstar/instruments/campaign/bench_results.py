@@ -21,57 +21,62 @@ def bench_summary(table: Path) -> dict[str, Any]:
     """
     cases = read_cases(table)
     numbers = cases.numbers
-    some = np.flatnonzero(np.nan_to_num(cases.numbers["wrong"]) > 0)
-    wrong = [
-        (
-            int(numbers["case"][k]),
-            int(numbers["order"][k]),
-            cases.texts["begun_utc"][k],
-            int(numbers["wrong"][k]),
-            off_deg,
-        )
-        for k in some
-        if np.isfinite(off_deg := float(numbers["wrong_deg"][k]))
-    ]
-    write_csv(table.with_name("wrong.csv"), WRONG_COLUMNS, wrong)
+    is_wrong = np.nan_to_num(numbers["wrong"]) > 0
+    is_wrong &= np.isfinite(numbers["wrong_deg"])
+    rows = []
+    wrong_cases = []
+    for k in np.flatnonzero(is_wrong).tolist():
+        case = int(numbers["case"][k])
+        order = int(numbers["order"][k])
+        begun_utc = cases.texts["begun_utc"][k]
+        answers = int(numbers["wrong"][k])
+        off_deg = float(numbers["wrong_deg"][k])
+        row = (case, order, begun_utc, answers, off_deg)
+        rows.append(row)
+        wrong_cases.append(dict(zip(WRONG_COLUMNS, row, strict=True)))
+    wrong_file = table.with_name("wrong.csv")
+    write_csv(wrong_file, WRONG_COLUMNS, rows)
     checks = table.with_name(CHECKS)
-    return {
-        "no_answer": cases.texts["status"].count(NO_ANSWER),
-        "wrong_cases": [dict(zip(WRONG_COLUMNS, row, strict=True)) for row in wrong],
-        "drift": drift_of(checks) if checks.exists() else None,
-    }
+    drift = None
+    if checks.exists():
+        drift = drift_of(checks)
+    no_answer = cases.texts["status"].count(NO_ANSWER)
+    return {"no_answer": no_answer, "wrong_cases": wrong_cases, "drift": drift}
 
 
 def bench_lines(summary: dict[str, Any]) -> list[str]:
     """The same on the terminal."""
+    lines = []
     if summary["no_answer"]:
-        lines = [f"{summary['no_answer']} cases without an answer"]
-    else:
-        lines = []
+        lines.append(f"{summary['no_answer']} cases without an answer")
     wrong = summary["wrong_cases"]
-    drift = summary["drift"]
     if wrong:
-        named = ", ".join(
-            f"case {case['case']} by {case['off_deg']:.3g} deg" for case in wrong[:MAX_NAMED]
-        )
-        lines.append(
-            f"wrong answers in {len(wrong)} cases:"
-            f" {named}{', ...' if len(wrong) > MAX_NAMED else ''}"
-        )
+        named = []
+        for case in wrong[:MAX_NAMED]:
+            named.append(f"case {case['case']} by {case['off_deg']:.3g} deg")
+        if len(wrong) > MAX_NAMED:
+            named.append("...")
+        names = ", ".join(named)
+        lines.append(f"wrong answers in {len(wrong)} cases: {names}")
+    drift = summary["drift"]
     if drift is not None:
-        parts = []
-        for value, sigma in zip(drift["arcsec"], drift["sigma_arcsec"], strict=True):
-            parts.append(f"{value:.3g}{_sigma(sigma)}")
-        if drift["mag"] is None:
-            mag = ""
-        else:
-            mag = f", {drift['mag']:.3g}{_sigma(drift['sigma_mag'])} mag"
-        lines.append(
-            f"{'drift of the bench':20}{', '.join(parts)} arcsec about x, y, z{mag}, by"
-            f" {drift['checks']} check cases"
-        )
+        lines.append(_drift_line(drift))
     return lines
 
 
+def _drift_line(drift: dict[str, Any]) -> str:
+    parts = []
+    for value, sigma in zip(drift["arcsec"], drift["sigma_arcsec"], strict=True):
+        parts.append(f"{value:.3g}{_sigma(sigma)}")
+    turn = ", ".join(parts)
+    line = f"{'drift of the bench':20}{turn} arcsec about x, y, z"
+    mag = drift["mag"]
+    if mag is not None:
+        line = f"{line}, {mag:.3g}{_sigma(drift['sigma_mag'])} mag"
+    return f"{line}, by {drift['checks']} check cases"
+
+
 def _sigma(sigma: float | None) -> str:
-    return "" if sigma is None else f" +- {sigma:.2g}"
+    if sigma is None:
+        return ""
+    return f" +- {sigma:.2g}"

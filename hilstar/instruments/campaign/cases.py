@@ -160,9 +160,16 @@ class Case:
     @property
     def acceleration_rad_s2(self) -> FloatArray:
         """The angular acceleration (3,), cam."""
-        return np.radians(
-            [float(self.values.get(f"acceleration_deg_s2.{axis}", 0.0)) for axis in AXES]
-        )
+        return np.radians(_by_axis(self.values, "acceleration_deg_s2"))
+
+
+def _by_axis(values: dict[str, Any], key: str) -> list[float]:
+    """The values of a key's x, y and z; 0 where a case has none."""
+    axis_values = []
+    for axis in AXES:
+        value = values.get(f"{key}.{axis}", 0.0)
+        axis_values.append(float(value))
+    return axis_values
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +177,11 @@ class _Log:
     timeline: Timeline
     span_ns: tuple[int, int]
     scale: str | None
+
+    @property
+    def begin_ns(self) -> int:
+        """The time of the log's first sample."""
+        return self.span_ns[0]
 
 
 class CaseMaker:
@@ -181,24 +193,21 @@ class CaseMaker:
         self.plan = plan
         self.file = file
         self._tables = parse_toml(file.path, file.text)
-        self._log = (
-            None if plan.attitudes.log is None else _read_log(folder / plan.attitudes.log, file)
-        )
-        if self._log is not None:
-            self.file = dated(file, self._log.scale, self._log.span_ns[0])
+        self._log: _Log | None = None
+        if plan.attitudes.log is not None:
+            self._log = _read_log(folder / plan.attitudes.log, file)
+            self.file = dated(file, self._log.scale, self._log.begin_ns)
         self.parameters: list[Parameter] = parameters(plan, file)
-        named = [
-            str(name)
-            for parameter in self.parameters
-            if parameter.key == SCENARIO
-            for name in parameter.values
-            if name
-        ]
-        self._scenarios = {name: read_scenario(folder / name) for name in named}
+        self._scenarios: dict[str, Scenario] = {}
+        for parameter in self.parameters:
+            if parameter.key == SCENARIO:
+                for name in filter(None, parameter.values):
+                    self._scenarios[str(name)] = read_scenario(folder / str(name))
         self._skies: dict[str, MovingSky | None] = {}
         _check_through(plan, self.parameters, file)
         if plan.attitudes.body is not None:  # so that a body that is not there is refused here
-            self.case(0, np.full(self.attitude_dimensions + len(self.parameters), 0.5))
+            dimensions = self.attitude_dimensions + len(self.parameters)
+            self.case(0, np.full(dimensions, 0.5))
 
     @property
     def attitude_dimensions(self) -> int:
@@ -214,9 +223,11 @@ class CaseMaker:
             values[parameter.key] = parameter.value(float(u))
         seed = values.get("noise_seed")
         if seed is None:
-            state = np.random.SeedSequence((self.plan.seed, number)).generate_state(1, np.uint64)
+            sequence = np.random.SeedSequence((self.plan.seed, number))
+            state = sequence.generate_state(1, np.uint64)
             seed = int(state[0]) >> 64 - SEED_BITS
-        return Case(number, values, int(seed), self._first(number, look, values))
+        first = self._first(number, look, values)
+        return Case(number, values, int(seed), first)
 
     def bench(self, case: Case) -> BenchFile:
         """The bench file with the case's values. Raises InputError where they do not go
@@ -224,8 +235,8 @@ class CaseMaker:
         """
         file = changed_bench(self.file, self._tables, case.values)
         if self._log is not None:
-            file = dated(file, self._log.scale, self._log.span_ns[0])
-        turn_arcsec = [float(case.values.get(f"misalignment_arcsec.{axis}", 0.0)) for axis in "xyz"]
+            file = dated(file, self._log.scale, self._log.begin_ns)
+        turn_arcsec = _by_axis(case.values, "misalignment_arcsec")
         if any(turn_arcsec):
             return _misaligned(file, np.array(turn_arcsec))
         return file
@@ -234,26 +245,30 @@ class CaseMaker:
         """The view of one of the case's exposures, `step_s` apart: at the case's rate, or along
         the log.
         """
-        return self.after(case, round(frame * self.plan.step_s * NS_PER_S), exposure_s)
+        step_ns = round(frame * self.plan.step_s * NS_PER_S)
+        return self.after(case, step_ns, exposure_s)
 
     def after(self, case: Case, step_ns: int, exposure_s: float = 0.0) -> View:
         """The view so long after the case's begin."""
         first = case.first
         if self._log is not None and first.t_ns is not None:
-            t_ns = min(first.t_ns + step_ns, self._log.span_ns[1])
+            _, end_ns = self._log.span_ns
+            t_ns = min(first.t_ns + step_ns, end_ns)
             along = view_at(self._log.timeline, self._log.span_ns, t_ns, exposure_s)
             if not any(key.startswith("rate_deg_s.") for key in case.values):
                 return along
             return View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
         rate_rad_s = first.turn.rate_cam_rad_s
         acceleration_rad_s2 = case.acceleration_rad_s2
+        step_s = step_ns / NS_PER_S
         if acceleration_rad_s2.any():
-            q, rate_rad_s = accelerated(first.turn, acceleration_rad_s2, step_ns / NS_PER_S)
+            q, rate_rad_s = accelerated(first.turn, acceleration_rad_s2, step_s)
         elif step_ns:
-            q = propagate(first.q_icrs_to_cam, rate_rad_s, step_ns / NS_PER_S)
+            q = propagate(first.q_icrs_to_cam, rate_rad_s, step_s)
         else:
             q = first.q_icrs_to_cam
-        return View.exposure(q, rate_rad_s, exposure_s, (first.t_ns or 0) + step_ns)
+        t_ns = (first.t_ns or 0) + step_ns
+        return View.exposure(q, rate_rad_s, exposure_s, t_ns)
 
     def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
         """The faults of the case's scenario in an exposure, at the case's time or the log's
@@ -262,16 +277,20 @@ class CaseMaker:
         scenario = self.scenario(case)
         if scenario is None:
             return None
-        return faulty_exposure(simulator, view, scenario, (view.t_ns or 0) - self.begin_ns)
+        since_begin_ns = (view.t_ns or 0) - self.begin_ns
+        return faulty_exposure(simulator, view, scenario, since_begin_ns)
 
     @property
     def begin_ns(self) -> int:
         """The time of a case's view from which its scenario counts: 0, or the log's begin."""
-        return 0 if self._log is None else self._log.span_ns[0]
+        if self._log is None:
+            return 0
+        return self._log.begin_ns
 
     def scenario(self, case: Case) -> Scenario | None:
         """The case's scenario, its stray light among the faults."""
-        scenario = self._scenarios.get(str(case.values.get(SCENARIO, "")))
+        name = str(case.values.get(SCENARIO, ""))
+        scenario = self._scenarios.get(name)
         stray_e = float(case.values.get(STRAY, 0.0))
         if stray_e <= 0:
             return scenario
@@ -287,27 +306,28 @@ class CaseMaker:
         scenario = self.scenario(case)
         if scenario is None:
             return None
-        end_s = scenario.end_s - ((case.first.t_ns or 0) - self.begin_ns) / NS_PER_S
-        return end_s if 0 < end_s <= length_s else None
+        since_begin_ns = (case.first.t_ns or 0) - self.begin_ns
+        end_s = scenario.end_s - since_begin_ns / NS_PER_S
+        if 0 < end_s <= length_s:
+            return end_s
+        return None
 
     def _first(self, number: int, look: FloatArray, values: dict[str, Any]) -> View:
-        rate_rad_s = np.radians([float(values.get(f"rate_deg_s.{axis}", 0.0)) for axis in "xyz"])
-        across = math.radians(float(values.get("rate_deg_s.across", 0.0)))
+        rate_rad_s = np.radians(_by_axis(values, "rate_deg_s"))
+        across_deg_s = float(values.get("rate_deg_s.across", 0.0))
+        across = math.radians(across_deg_s)
         if across:
-            angle_rad = np.random.default_rng((self.plan.seed, number, AXIS_STREAM)).uniform(
-                0.0, 2 * math.pi
-            )
-            rate_rad_s += across * np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
+            rng = np.random.default_rng((self.plan.seed, number, AXIS_STREAM))
+            angle_rad = rng.uniform(0.0, 2 * math.pi)
+            axis = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
+            rate_rad_s += across * axis
         if self._log is not None:
             begin_ns, end_ns = self._log.span_ns
             t_ns = begin_ns + round(float(look[0]) * (end_ns - begin_ns))
-            return View.exposure(
-                view_at(self._log.timeline, self._log.span_ns, t_ns, 0.0).q_icrs_to_cam,
-                rate_rad_s,
-                0.0,
-                t_ns,
-            )
-        t_ns = round(float(values.get("time_s", 0.0)) * NS_PER_S)
+            along = view_at(self._log.timeline, self._log.span_ns, t_ns, 0.0)
+            return View.exposure(along.q_icrs_to_cam, rate_rad_s, 0.0, t_ns)
+        time_s = float(values.get("time_s", 0.0))
+        t_ns = round(time_s * NS_PER_S)
         if self.plan.attitudes.body is None:
             q = looking_q(self.plan.attitudes, look)
         else:
@@ -324,8 +344,11 @@ class CaseMaker:
         if file.sha256 not in self._skies:
             self._skies = {file.sha256: bench_moving(file.config, file.folder)}
         moving = self._skies[file.sha256]
-        discs = [] if moving is None else moving.discs(np.eye(3)[2], math.pi, t_ns=t_ns)
-        disc = next((disc for disc in discs if disc.name.lower() == attitudes.body), None)
+        disc = None
+        if moving is not None:
+            pole = np.array([0.0, 0.0, 1.0])
+            discs = moving.discs(pole, math.pi, t_ns=t_ns)
+            disc = next((disc for disc in discs if disc.name.lower() == attitudes.body), None)
         if disc is None:
             raise InputError(
                 f'[attitudes] body = "{attitudes.body}": the bench has none; write [sky] epoch_utc'
@@ -335,10 +358,11 @@ class CaseMaker:
         limb_deg = values.get("limb_deg")
         if limb_deg is not None:
             # deeper than the middle of the disc is nowhere
-            off_rad = max(disc.radius_rad + math.radians(float(limb_deg)), 0.0)
-        low_deg, high_deg = attitudes.roll_deg
-        roll_deg = low_deg + float(look[2]) * (high_deg - low_deg)
-        return beside_q(disc.direction, off_rad, 2 * math.pi * float(look[0]), roll_deg)
+            limb_rad = math.radians(float(limb_deg))
+            off_rad = max(disc.radius_rad + limb_rad, 0.0)
+        position_angle_rad = 2 * math.pi * float(look[0])
+        roll_deg = _roll_deg(attitudes, float(look[2]))
+        return beside_q(disc.direction, off_rad, position_angle_rad, roll_deg)
 
 
 def accelerated(
@@ -352,7 +376,8 @@ def accelerated(
     step_s = seconds / steps
     for step in range(steps):
         middle_s = (step + 0.5) * step_s
-        q = propagate(q, turn.rate_cam_rad_s + acceleration_rad_s2 * middle_s, step_s)
+        rate_rad_s = turn.rate_cam_rad_s + acceleration_rad_s2 * middle_s
+        q = propagate(q, rate_rad_s, step_s)
     return q, turn.rate_cam_rad_s + acceleration_rad_s2 * seconds
 
 
@@ -360,31 +385,45 @@ def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
     """`q_icrs_to_cam` (4,) at three coordinates in [0, 1): uniform over the sphere or the
     field's cap, and over the rolls.
     """
-    low_deg, high_deg = attitudes.roll_deg
-    roll_deg = low_deg + float(look[2]) * (high_deg - low_deg)
+    around, along, rolled = look.tolist()
+    roll_deg = _roll_deg(attitudes, rolled)
     if attitudes.kind == "all-sky" or attitudes.radec_deg is None:
-        return from_radec_roll_deg(
-            360 * float(look[0]), math.degrees(math.asin(2 * float(look[1]) - 1)), roll_deg
-        )
-    off = math.acos(1 - float(look[1]) * (1 - math.cos(math.radians(attitudes.radius_deg))))
-    ra, dec = (math.radians(degrees) for degrees in attitudes.radec_deg)
-    middle = np.array([math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)])
-    return beside_q(middle, off, 2 * math.pi * float(look[0]), roll_deg)
+        dec_rad = math.asin(2 * along - 1)
+        return from_radec_roll_deg(360 * around, math.degrees(dec_rad), roll_deg)
+    radius_rad = math.radians(attitudes.radius_deg)
+    off_rad = math.acos(1 - along * (1 - math.cos(radius_rad)))
+    ra_deg, dec_deg = attitudes.radec_deg
+    ra, dec = math.radians(ra_deg), math.radians(dec_deg)
+    x = math.cos(dec) * math.cos(ra)
+    y = math.cos(dec) * math.sin(ra)
+    middle = np.array([x, y, math.sin(dec)])
+    return beside_q(middle, off_rad, 2 * math.pi * around, roll_deg)
+
+
+def _roll_deg(attitudes: Attitudes, rolled: float) -> float:
+    """The roll at a coordinate in [0, 1)."""
+    low_deg, high_deg = attitudes.roll_deg
+    return low_deg + rolled * (high_deg - low_deg)
 
 
 def beside_q(middle: FloatArray, off: float, angle: float, roll_deg: float) -> FloatArray:
     """`q_icrs_to_cam` (4,) with the boresight `off` (rad) from an ICRS direction (3,), at a
     position angle (rad) from north to east.
     """
-    ra, dec = math.atan2(middle[1], middle[0]), math.asin(max(-1.0, min(1.0, float(middle[2]))))
+    middle_x, middle_y, middle_z = middle.tolist()
+    ra = math.atan2(middle_y, middle_x)
+    # rounding may have made a direction longer than 1
+    sin_dec = max(-1.0, min(1.0, middle_z))
+    dec = math.asin(sin_dec)
     east = np.array([-math.sin(ra), math.cos(ra), 0.0])
-    north = np.array([-math.sin(dec) * math.cos(ra), -math.sin(dec) * math.sin(ra), math.cos(dec)])
-    x, y, z = math.cos(off) * middle + math.sin(off) * (
-        math.sin(angle) * east + math.cos(angle) * north
-    )
-    return from_radec_roll_deg(
-        math.degrees(math.atan2(y, x)), math.degrees(math.atan2(z, math.hypot(x, y))), roll_deg
-    )
+    north_x = -math.sin(dec) * math.cos(ra)
+    north_y = -math.sin(dec) * math.sin(ra)
+    north = np.array([north_x, north_y, math.cos(dec)])
+    sideways = math.sin(angle) * east + math.cos(angle) * north
+    x, y, z = math.cos(off) * middle + math.sin(off) * sideways
+    boresight_ra = math.atan2(y, x)
+    boresight_dec = math.atan2(z, math.hypot(x, y))
+    return from_radec_roll_deg(math.degrees(boresight_ra), math.degrees(boresight_dec), roll_deg)
 
 
 def stray_light(electrons: float, file: BenchFile) -> Fault:
@@ -400,7 +439,8 @@ def _read_log(path: Path, file: BenchFile) -> _Log:
     read = open_log(path, stated_in(file.config))
     max_rate_rad_s = math.radians(file.config.attitude.max_rate_deg_s)
     timeline = log_timeline(read.samples, Policy(0, NS_PER_S, max_rate_rad_s))
-    return _Log(timeline, (read.samples[0].t_ns, read.samples[-1].t_ns), read.conventions.scale)
+    begin, end = read.samples[0], read.samples[-1]
+    return _Log(timeline, (begin.t_ns, end.t_ns), read.conventions.scale)
 
 
 def _misaligned(file: BenchFile, turn_arcsec: FloatArray) -> BenchFile:
@@ -409,10 +449,12 @@ def _misaligned(file: BenchFile, turn_arcsec: FloatArray) -> BenchFile:
     """
     config = file.config
     assumed = np.array(config.verify.true_q_cam_to_mon or config.collimator.q_cam_to_mon)
-    true = normalise(multiply(assumed, from_rotation_vector(turn_arcsec / ARCSEC_PER_RAD)))
+    turn = from_rotation_vector(turn_arcsec / ARCSEC_PER_RAD)
+    true = normalise(multiply(assumed, turn))
     w, x, y, z = true.tolist()
     verify = msgspec.structs.replace(config.verify, true_q_cam_to_mon=(w, x, y, z))
-    return dataclasses.replace(file, config=msgspec.structs.replace(config, verify=verify))
+    config = msgspec.structs.replace(config, verify=verify)
+    return dataclasses.replace(file, config=config)
 
 
 def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None:
@@ -468,10 +510,13 @@ def bench_columns(
     """The columns of the rows of a campaign on the bench, in their order."""
     names = columns(parameters, False)
     varied = [name for name in names if name.startswith("vary.")]
-    kinds = {name: columns_kind(name) for name in (*BENCH_BEFORE, *varied, *BENCH_AFTER)} | {
-        "stars": "float64"
-    }
-    kinds |= {name: names[name] for name in (*varied, *RECOVERY) if name in names}
+    kinds: dict[str, Kind] = {}
+    for name in (*BENCH_BEFORE, *varied, *BENCH_AFTER):
+        kinds[name] = columns_kind(name)
+    kinds["stars"] = "float64"
+    for name in (*varied, *RECOVERY):
+        if name in names:
+            kinds[name] = names[name]
     return kinds | further_columns(further)
 
 
@@ -488,10 +533,16 @@ def columns(
     parameters: list[Parameter], with_centroids: bool, further: tuple[Further, ...] = ()
 ) -> dict[str, Kind]:
     """The columns of a campaign's rows, in their order."""
-    varied = {f"vary.{parameter.key}": value_kind(parameter) for parameter in parameters}
+    varied: dict[str, Kind] = {}
+    for parameter in parameters:
+        varied[f"vary.{parameter.key}"] = value_kind(parameter)
+    names = [*BEFORE, *varied, *AFTER]
+    if f"vary.{SCENARIO}" in varied:
+        names += RECOVERY
+    if with_centroids:
+        names += CENTROIDS
     kinds: dict[str, Kind] = {}
-    recovery = RECOVERY if f"vary.{SCENARIO}" in varied else ()
-    for name in (*BEFORE, *varied, *AFTER, *recovery, *(CENTROIDS if with_centroids else ())):
+    for name in names:
         kinds[name] = varied.get(name) or columns_kind(name)
     return kinds | further_columns(further)
 
@@ -499,8 +550,11 @@ def columns(
 def further_columns(further: tuple[Further, ...]) -> dict[str, Kind]:
     """The columns that a plan's `columns` ask for."""
     kinds: dict[str, Kind] = {}
-    for name in (name for part in further for name in FURTHER[part]):
-        kinds[name] = "int64" if name in (REPORTED_FRAMES, FALSE_STARS) else "floats"
+    for part in further:
+        for name in FURTHER[part]:
+            kinds[name] = "floats"
+            if name in (REPORTED_FRAMES, FALSE_STARS):
+                kinds[name] = "int64"
     return kinds
 
 
@@ -532,7 +586,9 @@ def first_row(case: Case, plan_columns: dict[str, Kind]) -> Row:
     row |= {"ra_deg": ra_deg, "dec_deg": dec_deg, "roll_deg": roll_deg}
     for key, value in case.values.items():
         name = f"vary.{key}"
-        row[name] = str(value) if plan_columns[name] == "text" else value
+        row[name] = value
+        if plan_columns[name] == "text":
+            row[name] = str(value)
     return row
 
 

@@ -60,17 +60,23 @@ def quantile_limits(values: FloatArray, share: float, confidence: float) -> tupl
     # the smallest k with P(count <= k) >= confidence
     upper = int(stats.binom.ppf(confidence, n, share))
     lower = int(stats.binom.ppf(1 - confidence, n, share))
-    lower -= lower > 0 and float(stats.binom.cdf(lower - 1, n, share)) > 1 - confidence
-    return float(ordered[lower - 1]) if lower > 0 else -math.inf, (
-        float(ordered[upper]) if upper < n else math.inf
-    )
+    if lower > 0:
+        below = float(stats.binom.cdf(lower - 1, n, share))
+        if below > 1 - confidence:
+            lower -= 1
+    low, high = -math.inf, math.inf
+    if lower > 0:
+        low = float(ordered[lower - 1])
+    if upper < n:
+        high = float(ordered[upper])
+    return low, high
 
 
 def sigma_limits(variance: float, freedom: float, confidence: float) -> tuple[float, float]:
     """The one-sided limits of a sigma by chi-square, of Gaussian errors."""
-    low, high = (
-        variance * freedom / stats.chi2.ppf(p, freedom) for p in (confidence, 1 - confidence)
-    )
+    squares = variance * freedom
+    low = squares / stats.chi2.ppf(confidence, freedom)
+    high = squares / stats.chi2.ppf(1 - confidence, freedom)
     return math.sqrt(low), math.sqrt(high)
 
 
@@ -78,9 +84,13 @@ def drawn_limits(
     sums: FloatArray, weights: FloatArray, rng: np.random.Generator, confidence: float
 ) -> FloatArray:
     """The limits (2,) of sum over weight of cases (n,), by the bootstrap over blocks of them."""
-    blocks = min(MAX_BLOCKS, len(sums))
-    block = np.arange(len(sums)) * blocks // len(sums)
-    total, weight = (np.bincount(block, values, blocks) for values in (sums, weights))
+    cases = len(sums)
+    blocks = min(MAX_BLOCKS, cases)
+    block = np.arange(cases) * blocks // cases
+    total = np.bincount(block, sums, blocks)
+    weight = np.bincount(block, weights, blocks)
     drawn = rng.integers(0, blocks, (DRAWS, blocks))
-    ratio = total[drawn].sum(axis=1) / np.maximum(weight[drawn].sum(axis=1), 1e-300)
+    drawn_total = total[drawn].sum(axis=1)
+    drawn_weight = weight[drawn].sum(axis=1)
+    ratio = drawn_total / np.maximum(drawn_weight, 1e-300)
     return np.asarray(np.quantile(ratio, [1 - confidence, confidence]))

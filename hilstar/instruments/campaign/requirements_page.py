@@ -98,14 +98,13 @@ def write_requirements(
     """
     cases = read_cases(table)
     tracker = file.config.tracker
-    scale = Scale(tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um, tracker.resolution_px)
+    focal_length_px = tracker.focal_length_mm * 1e3 / tracker.pixel_pitch_um
+    scale = Scale(focal_length_px, tracker.resolution_px)
+    certificate = None
     if plan.through == "bench":
         certificate = bench_certificate(file)
-    else:
-        certificate = None
-    if certificate is None:
-        bench_arcsec = None
-    else:
+    bench_arcsec = None
+    if certificate is not None:
         bench_arcsec = certificate.attitude_arcsec
     cases = with_motion(cases, plan.require, file, scale)
     verdicts = verdicts_of(plan.require, cases, scale, plan.seed, bench_arcsec)
@@ -113,29 +112,41 @@ def write_requirements(
     for verdict in verdicts:
         summary = summary_of(verdict)
         rows.append([summary[name] for name in COLUMNS])
-    write_csv(table.with_name("requirements.csv"), COLUMNS, rows)
+    csv_file = table.with_name("requirements.csv")
+    write_csv(csv_file, COLUMNS, rows)
     figure = _chart(cases, verdicts)
-    write_whole(table.with_name("requirements.png"), png(figure))
+    chart_file = table.with_name("requirements.png")
+    write_whole(chart_file, png(figure))
+    table_sha256 = file_sha256(table)
+    table_text = f"{cases.cases} through {plan.through}, in {table.name}, sha256 {table_sha256}"
     about = [
         ("plan", str(path)),
         ("bench", f"{file.path}, sha256 {file.sha256}"),
-        (
-            "cases",
-            f"{cases.cases} through {plan.through}, in {table.name}, sha256 {file_sha256(table)}",
-        ),
+        ("cases", table_text),
         ("program", f"hilstar {__version__}"),
-        *([("certificate", f"{certificate.line}; {off_by(certificate)}")] if certificate else []),
     ]
+    if certificate is not None:
+        about.append(("certificate", f"{certificate.line}; {off_by(certificate)}"))
     cube = cube_to_boresight(file, certificate)
     if cube is not None:
         about.append(("cube to boresight", cube.line))
-    parts = [_verdicts(verdicts).html(), _error_card(figure).html()]
-    parts.append(Card("Campaign", words=[key_table(about)]).html())
-    names = "".join(f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN)
-    parts.append(Card("Signed", words=[names]).html())
+    cards = [
+        _verdicts(verdicts),
+        _error_card(figure),
+        Card("Campaign", words=[key_table(about)]),
+        signed_card(),
+    ]
+    parts = [card.html() for card in cards]
     page = page_of(f"Requirements of {path.name}", _verdict(verdicts), parts)
-    write_whole(table.with_name("requirements.html"), page)
+    page_file = table.with_name("requirements.html")
+    write_whole(page_file, page)
     return verdicts
+
+
+def signed_card() -> Card:
+    """The lines on which a page is signed."""
+    lines = [f'<span style="{SIGN_STYLE}">{name}</span>' for name in SIGN]
+    return Card("Signed", words=["".join(lines)])
 
 
 def _verdict(found: list[RequirementVerdict]) -> Verdict:
@@ -145,7 +156,8 @@ def _verdict(found: list[RequirementVerdict]) -> Verdict:
         count = sum(requirement_verdict.verdict == verdict for requirement_verdict in found)
         if count:
             texts.append(f"{count} {verdict}")
-    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(found)}: {', '.join(texts)}.")
+    counts = ", ".join(texts)
+    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(found)}: {counts}.")
 
 
 def _verdicts(found: list[RequirementVerdict]) -> Card:
@@ -155,18 +167,22 @@ def _verdicts(found: list[RequirementVerdict]) -> Card:
         more = ""
         if verdict.verdict == NOT_SHOWN and verdict.more:
             more = f"about {verdict.more} more cases"
-        chip = f'<span class="chip" data-state="{STATES[verdict.verdict]}">{verdict.verdict}</span>'
-        confidence = f"{100 * verdict.require.confidence:g} %"
-        unit = QUANTITY_UNITS[verdict.require.quantity]
-        figures = (
-            _figure(verdict.value, unit),
-            _figure(verdict.bound, unit),
-            confidence,
-            verdict.cases,
-        )
-        rows.append((verdict.require.words, Markup(chip), *figures, more, verdict.method))
+        require = verdict.require
+        chip = verdict_chip(verdict.verdict)
+        percent = 100 * require.confidence
+        unit = QUANTITY_UNITS[require.quantity]
+        value = _figure(verdict.value, unit)
+        bound = _figure(verdict.bound, unit)
+        figures = (value, bound, f"{percent:g} %", verdict.cases)
+        rows.append((require.words, chip, *figures, more, verdict.method))
     texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
     return Card("Verdicts", words=texts, cure=CURES[verdict_of(found)])
+
+
+def verdict_chip(verdict: str) -> Markup:
+    """A verdict in the colour of its state."""
+    state = STATES[verdict]
+    return Markup(f'<span class="chip" data-state="{state}">{verdict}</span>')
 
 
 def _figure(value: float | None, unit: str) -> str | None:
@@ -184,9 +200,12 @@ def _error_card(figure: Any) -> Card:
 def summary_of(each: RequirementVerdict) -> dict[str, Any]:
     """The JSON object of a verdict, with the columns of requirements.csv."""
     require = each.require
+    axis = ""
+    if require.of_axis:
+        axis = require.axis or "cross"
     return {
         "quantity": require.quantity,
-        "axis": (require.axis or "cross") if require.of_axis else "",
+        "axis": axis,
         "condition": require.condition,
         "limit": require.limit,
         "bound": each.bound,
@@ -214,78 +233,99 @@ def _chart(cases: Columns, found: list[RequirementVerdict]) -> Any:
     requirements of such errors.
     """
     error, rate = _error_and_rate(cases)
-    rated = bool(np.isfinite(rate).any() and np.ptp(rate[np.isfinite(rate)]) > 0)
-    at = rate if rated else cases.numbers["case"]
-    known = np.flatnonzero(np.isfinite(error) & np.isfinite(at))
-    drawn = [
-        verdict
-        for verdict in found
-        if verdict.require.quantity in DRAWN
-        and (verdict.require.axis or "cross") in ("cross", "x", "y")
-    ]
-    counts = (
-        f"{sum(verdict.verdict == MET for verdict in found)} of {len(found)} requirements are met"
-    )
+    rates = rate[np.isfinite(rate)]
+    rated = len(rates) > 0 and bool(np.ptp(rates) > 0)
+    at = cases.numbers["case"]
+    if rated:
+        at = rate
+    known = np.isfinite(error) & np.isfinite(at)
+    met = sum(verdict.verdict == MET for verdict in found)
+    counts = f"{met} of {len(found)} requirements are met"
     note = (
         "Dots: cases about the median. Line: one sigma of each bin. Horizontal: one sigma that a"
         " requirement allows."
     )
     with panels_of(counts, 1, note=note) as (axes,):
-        if len(known):
-            some = known[np.unique(np.linspace(0, len(known) - 1, MAX_POINTS).astype(int))]
-            axes.plot(at[some], error[some], ".", ms=3, color=MUTED, alpha=0.6, rasterized=True)
-            order = known[np.argsort(at[known], kind="stable")]
-            bins = np.array_split(order, max(1, min(MAX_BINS, len(order) // MIN_IN_BIN)))
-            # wild answers do not move it
-            sigma = [float(np.median(error[rows])) / MEDIAN_OF_SIGMA for rows in bins]
-            axes.plot([float(np.median(at[rows])) for rows in bins], sigma, "o-", color=BLUE)
-            positive = at[known] > 0
-            if rated and positive.all() and at[known].max() > 30 * at[known].min():
-                axes.set_xscale("log")
-            low = float(at[known].min())
-            high = float(at[known].max())
-            top = 1.15 * max(
-                float(np.quantile(error[known], 0.97)),
-                *sigma,
-                *(verdict.require.limit for verdict in drawn),
-            )
-            axes.set_ylim(0, top)
-            for verdict in drawn:
-                begin, end = _span(verdict.require.condition, low, high) if rated else (low, high)
-                axes.plot(
-                    [begin, end],
-                    [verdict.require.limit] * 2,
-                    color=COLOURS[verdict.verdict],
-                    lw=2.2,
-                )
-                bar_text = f"{verdict.require.quantity} {verdict.verdict}"
-                axes.annotate(
-                    bar_text,
-                    (begin, verdict.require.limit),
-                    (2, 3),
-                    textcoords="offset points",
-                    fontsize=9,
-                    color=INK,
-                )
-        axes.set_xlabel("rate [deg/s]" if rated else "case")
+        if known.any():
+            _draw_cases(axes, at[known], error[known], found, rated)
+        axes.set_xlabel("case")
+        if rated:
+            axes.set_xlabel("rate [deg/s]")
         axes.set_ylabel("error across [arcsec]")
     return axes.figure
+
+
+def _draw_cases(
+    axes: Any, at: FloatArray, error: FloatArray, found: list[RequirementVerdict], rated: bool
+) -> None:
+    """Draw errors (n,) at rates or cases (n,), their bins, and what requirements allow."""
+    count = len(at)
+    evenly = np.linspace(0, count - 1, MAX_POINTS).astype(int)
+    some = np.unique(evenly)
+    axes.plot(at[some], error[some], ".", ms=3, color=MUTED, alpha=0.6, rasterized=True)
+    order = np.argsort(at, kind="stable")
+    bins = max(1, min(MAX_BINS, count // MIN_IN_BIN))
+    middles = []
+    sigmas = []
+    for rows in np.array_split(order, bins):
+        middles.append(float(np.median(at[rows])))
+        # wild answers do not move it
+        sigmas.append(float(np.median(error[rows])) / MEDIAN_OF_SIGMA)
+    axes.plot(middles, sigmas, "o-", color=BLUE)
+    low, high = float(at.min()), float(at.max())
+    if rated and low > 0 and high > 30 * low:
+        axes.set_xscale("log")
+    drawn = []
+    limits = []
+    for verdict in found:
+        require = verdict.require
+        if require.quantity in DRAWN and (require.axis or "cross") in ("cross", "x", "y"):
+            drawn.append(verdict)
+            limits.append(require.limit)
+    highest = float(np.quantile(error, 0.97))
+    top = 1.15 * max(highest, *sigmas, *limits)
+    axes.set_ylim(0, top)
+    for verdict in drawn:
+        begin, end = low, high
+        if rated:
+            begin, end = _span(verdict.require.condition, low, high)
+        _draw_limit(axes, verdict, begin, end)
+
+
+def _draw_limit(axes: Any, verdict: RequirementVerdict, begin: float, end: float) -> None:
+    """Draw the limit of a requirement from one rate or case to another."""
+    limit = verdict.require.limit
+    axes.plot([begin, end], [limit, limit], color=COLOURS[verdict.verdict], lw=2.2)
+    label = f"{verdict.require.quantity} {verdict.verdict}"
+    offset_points = (2, 3)
+    axes.annotate(
+        label,
+        (begin, limit),
+        offset_points,
+        textcoords="offset points",
+        fontsize=9,
+        color=INK,
+    )
 
 
 def _error_and_rate(cases: Columns) -> tuple[FloatArray, FloatArray]:
     """Each case's error across the boresight about the median, arcsec, and its rate, deg/s (NaN:
     none is varied): (n,) each.
     """
-    x, y = (cases.numbers[f"error_{axis}_arcsec"] for axis in "xy")
+    x = cases.numbers["error_x_arcsec"]
+    y = cases.numbers["error_y_arcsec"]
     known = np.isfinite(x) & np.isfinite(y)
     if known.any():
         x = x - np.median(x[known])
         y = y - np.median(y[known])
-    names = [name for name in cases.varied if name.startswith(f"{VARY}rate_deg_s.")]
-    rate = np.full(len(x), np.nan)
-    if names:
-        rate = np.sqrt(sum(cases.numbers[name] ** 2 for name in names))
-    return np.sqrt((x**2 + y**2) / 2), rate
+    error = np.sqrt((x**2 + y**2) / 2)
+    squares = []
+    for name in cases.varied:
+        if name.startswith(f"{VARY}rate_deg_s."):
+            squares.append(cases.numbers[name] ** 2)
+    if not squares:
+        return error, np.full(len(x), np.nan)
+    return error, np.sqrt(sum(squares))
 
 
 def _span(condition: str, low: float, high: float) -> tuple[float, float]:
@@ -294,7 +334,10 @@ def _span(condition: str, low: float, high: float) -> tuple[float, float]:
         match = CONDITION.fullmatch(part)
         if match and match[1].startswith("rate_deg_s.") and match[4]:
             value = float(match[4])
-            low, high = (low, min(high, value)) if match[2] in ("<", "<=") else (low, high)
-            low, high = (max(low, value), high) if match[2] in (">", ">=") else (low, high)
-            low, high = (value, value) if match[2] == "==" else (low, high)
+            if match[2] in ("<", "<="):
+                high = min(high, value)
+            elif match[2] in (">", ">="):
+                low = max(low, value)
+            elif match[2] == "==":
+                low, high = value, value
     return low, high

@@ -55,7 +55,9 @@ class StarMotion:
     def in_field(self, q_icrs_to_cam: FloatArray, scale: Scale) -> IntArray:
         """The rows of the stars in the tracker's field, the brightest first."""
         seen_cam = self.vectors @ to_matrix(q_icrs_to_cam).T
-        half_x, half_y = (side / 2 / scale.focal_px for side in scale.resolution_px)
+        width, height = scale.resolution_px
+        half_x = width / 2 / scale.focal_px
+        half_y = height / 2 / scale.focal_px
         depth = seen_cam[:, 2]
         inside = depth > 0
         inside &= np.abs(seen_cam[:, 0]) < half_x * depth
@@ -91,7 +93,9 @@ def with_motion(cases: Columns, requires: list[Require], file: BenchFile, scale:
         return cases
     motion = StarMotion.of(file)
     q = cases.vectors("q{}", "wxyz")
-    turns = np.array([motion.likely_turn_rad(attitude, scale) for attitude in q]).reshape(-1, 3)
+    turns = np.zeros((len(q), 3))
+    for case, attitude in enumerate(q):
+        turns[case] = motion.likely_turn_rad(attitude, scale)
     numbers = dict(cases.numbers)
     numbers[YEARS] = _jyears(cases, motion.jyear) - motion.jyear
     for k, axis in enumerate("xy"):
@@ -115,4 +119,5 @@ def turn_of(vectors: FloatArray, motion: FloatArray) -> FloatArray:
     """
     # of |turn x v - motion|^2: (sum of 1 - v v^T) turn = sum of v x motion
     matrix = len(vectors) * np.eye(3) - vectors.T @ vectors
-    return np.asarray(np.linalg.solve(matrix, np.cross(vectors, motion).sum(axis=0)))
+    moments = np.cross(vectors, motion)
+    return np.asarray(np.linalg.solve(matrix, moments.sum(axis=0)))

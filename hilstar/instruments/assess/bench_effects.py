@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import normalise, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 from hilstar.instruments.assess.budget import Axes, axes_of_variance
+from hilstar.instruments.assess.places import spread_rows
 from hilstar.instruments.simulate.glass import MIN_STARS as MIN_SPLIT_STARS
 from hilstar.instruments.simulate.glass import split_errors, told_psf
 from hilstar.instruments.simulate.noise import attitude_limits_arcsec, field_stars
@@ -122,7 +123,7 @@ def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
     camera = tracker_camera(file.config.tracker, file.folder)
     width, height = camera.resolution_px
     answers = len(q_icrs_to_cam)
-    some = _spread_rows(answers, FIELDS)
+    some = spread_rows(answers, FIELDS)
     axes = to_matrix(q_icrs_to_cam[some])
     radius_rad = min(camera.field_radius_rad(0.0), np.pi / 2)
     reach = 2 * np.sin(radius_rad / 2)  # a chord
@@ -142,19 +143,13 @@ def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
     return np.asarray(field_mag[nearest])
 
 
-def _spread_rows(count: int, some: int) -> IntArray:
-    """At most `some` rows of `count`, spread evenly over them."""
-    places = np.linspace(0, count - 1, some)
-    return np.unique(places.astype(int))
-
-
 def noise_limit(file: BenchFile, q_icrs_to_cam: FloatArray) -> Axes:
     """The smallest noise of an answer by the bench's tracker (Cramer and Rao): the median along
     attitudes (n, 4).
 
     One exposure at rest, arcsec; None for fields of too few stars. Raises InputError.
     """
-    some = _spread_rows(len(q_icrs_to_cam), LIMIT_FIELDS)
+    some = spread_rows(len(q_icrs_to_cam), LIMIT_FIELDS)
     limits_arcsec = attitude_limits_arcsec(file, q_icrs_to_cam[some])
     cross_arcsec, roll_arcsec = np.median(limits_arcsec, axis=0).tolist()
     return Axes(_finite(cross_arcsec), _finite(roll_arcsec))
@@ -256,7 +251,7 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
     kind = file.config.verify.judge or "window"
     reach = math.ceil(4 * max(1.0, *psf.width_px))
     side_px = 2 * reach + 1
-    some = _spread_rows(len(q_icrs_to_cam), GLASS_FIELDS)
+    some = spread_rows(len(q_icrs_to_cam), GLASS_FIELDS)
     for q in normalise(q_icrs_to_cam[some]):
         rows = field_stars(stars, camera, q)[:GLASS_STARS]
         row_px = np.rint(rows["y_px"]).astype(np.intp)
@@ -292,7 +287,7 @@ def seen_cost(
         return None
     fields = []
     distances_px = []
-    for place in _spread_rows(len(named), SEEN_FIELDS).tolist():
+    for place in spread_rows(len(named), SEEN_FIELDS).tolist():
         k = named[place]
         at = {star[3]: star[:2] for star in centroids[k] if star[3]}
         rows = field_stars(stars, camera, q_icrs_to_cam[k])

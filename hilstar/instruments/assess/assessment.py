@@ -4,8 +4,8 @@ bench's own errors.
 Lock is availability, acquisition and loss: which of the answers that were due came.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
@@ -15,7 +15,13 @@ import numpy as np
 from hilstar.attitude.logs.telemetry import Telemetry, read_telemetry
 from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.errors import HilstarError, InputError
-from hilstar.basics.rotation import from_rotation_vector, multiply, to_matrix, to_rotation_vector
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    to_matrix,
+    to_rotation_vector,
+)
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.assess.bench_effects import (
     FILE,
@@ -40,7 +46,7 @@ from hilstar.instruments.assess.budget import (
 )
 from hilstar.instruments.assess.clock import CoarseClock, coarse_offset, speed_offsets
 from hilstar.instruments.assess.components import MIN_ROWS
-from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.assess.places import Scale, spread_rows
 from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs, refuse_conventions
 from hilstar.server.answers.answer import JUMP_NS
 from hilstar.server.answers.judge import TO_MIDDLE, AnswerRules, Stamp
@@ -120,19 +126,23 @@ class Lock:
         """The share of appearances of a sky and losses of lock after which a right answer came."""
         if not self.acquisitions:
             return None
-        return sum(acquisition.wait_s is not None for acquisition in self.acquisitions) / len(
-            self.acquisitions
-        )
+        return len(self._waits_s) / len(self.acquisitions)
 
     @property
     def acquisition_s(self) -> float | None:
         """The median time until the first right answer."""
-        waits = [
-            acquisition.wait_s
-            for acquisition in self.acquisitions
-            if acquisition.wait_s is not None
-        ]
-        return float(np.median(waits)) if waits else None
+        if not self._waits_s:
+            return None
+        return float(np.median(self._waits_s))
+
+    @property
+    def _waits_s(self) -> list[float]:
+        """The waits that ended in a right answer."""
+        waits_s = []
+        for acquisition in self.acquisitions:
+            if acquisition.wait_s is not None:
+                waits_s.append(acquisition.wait_s)
+        return waits_s
 
 
 def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: BoolArray) -> Lock:
@@ -140,44 +150,67 @@ def lock_of(commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: Bool
     an answer.
     """
     cycle_s = max(float(np.median(np.diff(t_s))), 1e-6)
-    cycle_s = max(cycle_s, float(t_s[-1] - t_s[0]) / MAX_CYCLES)
-    due = commanded.at(np.arange(t_s[0], t_s[-1] + cycle_s / 2, cycle_s)).known
+    span_s = float(t_s[-1] - t_s[0])
+    cycle_s = max(cycle_s, span_s / MAX_CYCLES)
+    due_s = np.arange(t_s[0], t_s[-1] + cycle_s / 2, cycle_s)
+    due = int(commanded.at(due_s).known.sum())
+    right_count = int(right.sum())
+    outages = _outages(commanded, t_s, right, wrong, cycle_s)
+    # After each appearance of the sky during the telemetry, and after each loss of the lock.
+    acquisitions = _acquisitions(commanded, t_s, right)
+    for outage in outages:
+        if outage.lost:
+            acquisitions.append(Acquisition(outage.start_s, outage.length_s))
+    acquisitions.sort(key=lambda acquisition: acquisition.start_s)
+    return Lock(
+        cycle_s=cycle_s,
+        due=due,
+        right=right_count,
+        availability=min(right_count / max(due, 1), 1.0),
+        outages=tuple(outages),
+        acquisitions=tuple(acquisitions),
+    )
+
+
+def _outages(
+    commanded: Commanded, t_s: FloatArray, right: BoolArray, wrong: BoolArray, cycle_s: float
+) -> list[Outage]:
+    """The times without right answers while a sky was shown for more than half of them."""
     outages = []
     for before, after in pairwise(np.flatnonzero(right).tolist()):
         gap_s = float(t_s[after] - t_s[before])
         if gap_s <= MISSED_CYCLES * cycle_s:
             continue
-        inner = np.arange(t_s[before] + cycle_s, t_s[after] - cycle_s / 2, cycle_s)
-        if len(inner) and commanded.at(inner).known.mean() > 0.5:
-            length_s = gap_s - cycle_s
-            rows = after - before - 1
-            lost = length_s > LOST_CYCLES * cycle_s
-            outages.append(
-                Outage(float(inner[0]), length_s, lost, rows, int(wrong[before + 1 : after].sum()))
-            )
-    # After each appearance of the sky during the telemetry, and after each loss of the lock.
+        inner_s = np.arange(t_s[before] + cycle_s, t_s[after] - cycle_s / 2, cycle_s)
+        if not len(inner_s) or commanded.at(inner_s).known.mean() <= 0.5:
+            continue
+        start_s = float(inner_s[0])
+        length_s = gap_s - cycle_s
+        is_lost = length_s > LOST_CYCLES * cycle_s
+        rows = after - before - 1
+        wrong_rows = int(wrong[before + 1 : after].sum())
+        outages.append(Outage(start_s, length_s, is_lost, rows, wrong_rows))
+    return outages
+
+
+def _acquisitions(commanded: Commanded, t_s: FloatArray, right: BoolArray) -> list[Acquisition]:
+    """The wait after each appearance of the sky during the telemetry."""
+    appears = np.diff(np.r_[False, commanded.joined].astype(int)) == 1
+    goes = np.diff(np.r_[commanded.joined, False].astype(int)) == -1
+    starts_s = commanded.t_s[np.flatnonzero(appears)]
+    ends_s = commanded.t_s[np.flatnonzero(goes) + 1]
+    right_s = t_s[right]
     acquisitions = []
-    shown = np.flatnonzero(np.diff(np.r_[False, commanded.joined].astype(int)) == 1)
-    ends = np.flatnonzero(np.diff(np.r_[commanded.joined, False].astype(int)) == -1) + 1
-    answers = t_s[right]
-    for first, last in zip(commanded.t_s[shown], commanded.t_s[ends], strict=True):
-        if last > t_s[0] and first < t_s[-1]:
-            first = max(first, t_s[0])  # what the tracker did before its first row is unknown
-            inside = answers[(answers >= first) & (answers <= last)]
-            acquisitions.append(
-                Acquisition(float(first), float(inside[0] - first) if len(inside) else None)
-            )
-    acquisitions += [
-        Acquisition(outage.start_s, outage.length_s) for outage in outages if outage.lost
-    ]
-    return Lock(
-        cycle_s=cycle_s,
-        due=int(due.sum()),
-        right=int(right.sum()),
-        availability=min(int(right.sum()) / max(int(due.sum()), 1), 1.0),
-        outages=tuple(outages),
-        acquisitions=tuple(sorted(acquisitions, key=lambda outage: outage.start_s)),
-    )
+    for start_s, end_s in zip(starts_s, ends_s, strict=True):
+        if end_s <= t_s[0] or start_s >= t_s[-1]:
+            continue
+        start_s = max(start_s, t_s[0])  # what the tracker did before its first row is unknown
+        inside_s = right_s[(right_s >= start_s) & (right_s <= end_s)]
+        wait_s = None
+        if len(inside_s):
+            wait_s = float(inside_s[0] - start_s)
+        acquisitions.append(Acquisition(float(start_s), wait_s))
+    return acquisitions
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,15 +245,15 @@ class RunLedger:
         """The tracker's sizes, by the bench file in the ledger."""
         tracker = self.config.tracker
         width, height = tracker.resolution_px
-        return Scale(1e3 * tracker.focal_length_mm / tracker.pixel_pitch_um, (width, height))
+        focal_px = 1e3 * tracker.focal_length_mm / tracker.pixel_pitch_um
+        return Scale(focal_px, (width, height))
 
     def bench_file(self) -> BenchFile:
         """The bench by its text in the ledger; the files that it names have to be where they
         were. Raises InputError.
         """
-        return bench_file_of(
-            Path(self.head.get("bench_file", "bench.toml")), self.head.get("bench_text", "")
-        )
+        path = Path(self.head.get("bench_file", "bench.toml"))
+        return bench_file_of(path, self.head.get("bench_text", ""))
 
 
 def read_ledger(path: Path) -> RunLedger:
@@ -248,9 +281,8 @@ def read_ledger(path: Path) -> RunLedger:
     # A moment stands for an exposure about it; a refresh period more, for it is known to some
     # milliseconds.
     reach_s = config.tracker.exposure_s / 2 + 1 / config.monitor.refresh_hz
-    return RunLedger(
-        path, head, config, replace(run, commanded=run.commanded.over_exposures(reach_s))
-    )
+    exposed = run.commanded.over_exposures(reach_s)
+    return RunLedger(path, head, config, replace(run, commanded=exposed))
 
 
 @dataclass(frozen=True, slots=True)
@@ -303,21 +335,17 @@ class Assessment:
     def missed_line(self) -> str:
         """The run's missed frames and what they do to the budget, in words."""
         missed = self.run.run.missed
-        held_s = self.run.commanded.held_s
-        hold_s = self.run.commanded.hold_s
         if not missed:
             return "none"
-        share = 100 * self.run.run.missed_share
-        longest = int(np.argmax(hold_s)) if len(hold_s) else -1
-        if longest >= 0:
-            where = f", up to {hold_s[longest]:.3f} s about {held_s[longest].mean():.2f} s"
-        else:
-            where = ""
+        percent = 100 * self.run.run.missed_share
+        share = f"{percent:.2g} % of refresh periods"
+        hold_s = self.run.commanded.hold_s
+        if len(hold_s):
+            longest = int(np.argmax(hold_s))
+            middle_s = self.run.commanded.held_s[longest].mean()
+            share = f"{share}, up to {hold_s[longest]:.3f} s about {middle_s:.2f} s"
         touched = f"{len(self.found.held)} answers looked while a frame was held for them"
-        return (
-            f"{missed} ({share:.2g} % of refresh periods{where}); {touched}, and are in no figure"
-            " but the availability"
-        )
+        return f"{missed} ({share}); {touched}, and are in no figure but the availability"
 
 
 class LedgerAnswers(NamedTuple):
@@ -352,28 +380,45 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
             " [answers]"
         )
     on_run_ns = _on_run_ns(records)
-    stamped = stamp != "arrival" and all(record.t_ns is not None for record in records)
-    t_ns = np.array([record.t_ns for record in records] if stamped else on_run_ns, dtype=np.int64)
-    clock_set = stamped and _clock_was_set(
-        t_ns, np.array([record.host_ns for record in records], dtype=np.int64)
-    )
-    if clock_set or not stamped:
-        t_ns = on_run_ns
+    t_ns = on_run_ns
+    overtaken = 0
+    clock_set = False
+    stamps_ns = [record.t_ns for record in records]
+    if stamp == "arrival" or None in stamps_ns:
         stamp = "middle"
-    if stamped and not clock_set:
-        overtaken = int((t_ns[1:] < np.maximum.accumulate(t_ns)[:-1]).sum())
     else:
-        overtaken = 0
+        t_ns = np.array(stamps_ns, dtype=np.int64)
+        host_ns = np.array([record.host_ns for record in records], dtype=np.int64)
+        clock_set = _clock_was_set(t_ns, host_ns)
+        if clock_set:
+            t_ns = on_run_ns
+            stamp = "middle"
+        else:
+            latest_ns = np.maximum.accumulate(t_ns)[:-1]
+            overtaken = int((t_ns[1:] < latest_ns).sum())
     # By their times, for a datagram may be overtaken; of one time the first that came.
     rising_ns, order = np.unique(t_ns, return_index=True)
-    ordered = [records[k] for k in order.tolist()]
-    valid = np.array([record.valid and record.q is not None for record in ordered], dtype=np.bool_)
-    q = np.array(
-        [NOT_SHOWN if record.q is None else record.q for record in ordered], dtype=np.float64
+    valid = []
+    q = []
+    centroids = []
+    for k in order.tolist():
+        record = records[k]
+        centroids.append(record.centroids)
+        if record.q is None:
+            valid.append(False)
+            q.append(NOT_SHOWN)
+        else:
+            valid.append(record.valid)
+            q.append(record.q)
+    telemetry = Telemetry(
+        ledger,
+        rising_ns,
+        np.array(q, dtype=np.float64),
+        np.array(valid, dtype=np.bool_),
+        order + 1,
+        of_lines=False,
     )
-    telemetry = Telemetry(ledger, rising_ns, q, valid, order + 1, of_lines=False)
     ahead_ns = int(np.median(t_ns - on_run_ns))
-    centroids = [record.centroids for record in ordered]
     return LedgerAnswers(telemetry, stamp, ahead_ns, centroids, overtaken, clock_set)
 
 
@@ -381,17 +426,29 @@ def _on_run_ns(records: Sequence[AnswerRecord]) -> IntArray:
     """When each answer (n,) looked, on the run's clock, ns, as it was known live; of one not
     judged by the others' delay.
     """
-    judged = [record for record in records if record.verdict != "unjudged"]
-    late_ns = [record.host_ns - record.middle_ns for record in judged]
-    usual_ns = int(np.median(late_ns)) if late_ns else 0
-    to_light_ns = [
-        record.light_ns - record.middle_ns for record in judged if record.light_ns is not None
-    ]
-    middle_ns = [
-        record.host_ns - usual_ns if record.verdict == "unjudged" else record.middle_ns
-        for record in records
-    ]
-    return np.array(middle_ns, dtype=np.int64) + (int(np.median(to_light_ns)) if to_light_ns else 0)
+    late_ns = []
+    to_light_ns = []
+    for record in records:
+        if record.verdict == "unjudged":
+            continue
+        late_ns.append(record.host_ns - record.middle_ns)
+        if record.light_ns is not None:
+            to_light_ns.append(record.light_ns - record.middle_ns)
+    usual_late_ns = _median_ns(late_ns)
+    middle_ns = []
+    for record in records:
+        if record.verdict == "unjudged":
+            middle_ns.append(record.host_ns - usual_late_ns)
+        else:
+            middle_ns.append(record.middle_ns)
+    return np.array(middle_ns, dtype=np.int64) + _median_ns(to_light_ns)
+
+
+def _median_ns(times_ns: Sequence[int]) -> int:
+    """The median, cut to a whole number; 0 of none."""
+    if not times_ns:
+        return 0
+    return int(np.median(times_ns))
 
 
 def _clock_was_set(t_ns: IntArray, host_ns: IntArray) -> bool:
@@ -402,9 +459,46 @@ def _clock_was_set(t_ns: IntArray, host_ns: IntArray) -> bool:
     if blocks < 2:
         return False
     rows = slice(0, blocks * SET_BLOCK)
-    ahead_ns = np.median((t_ns - host_ns)[rows].reshape(blocks, SET_BLOCK), axis=1)
-    passed_ns = np.diff(np.median(host_ns[rows].reshape(blocks, SET_BLOCK), axis=1))
-    return bool((np.abs(np.diff(ahead_ns)) > JUMP_NS + MAX_CLOCK_DRIFT * np.abs(passed_ns)).any())
+    ahead_ns = (t_ns - host_ns)[rows].reshape(blocks, SET_BLOCK)
+    arrived_ns = host_ns[rows].reshape(blocks, SET_BLOCK)
+    step_ns = np.abs(np.diff(np.median(ahead_ns, axis=1)))
+    passed_ns = np.abs(np.diff(np.median(arrived_ns, axis=1)))
+    largest_ns = JUMP_NS + MAX_CLOCK_DRIFT * passed_ns
+    return bool((step_ns > largest_ns).any())
+
+
+@dataclass(frozen=True)
+class TimedAnswers:
+    """Answers of a file or of the ledger, with the middles of their exposures, `tau_s` (n,), on the
+    tracker's clock.
+
+    `tau_s` counts from a reading `base_s` above the run's zero. `overlap` is whether the answers'
+    times meet the run's.
+    """
+
+    path: Path
+    answers: Telemetry
+    tau_s: FloatArray
+    base_s: float
+    overlap: bool = True
+    centroids: Sequence[Centroids] = ()
+    out_of_order: int = 0
+    clock_set: bool = False
+
+
+@dataclass
+class BenchFigures:
+    """What the bench tells beside the budget, with notes; None or empty where it could not be
+    built.
+    """
+
+    by_magnitude: tuple[Slice, ...] = ()
+    display: DisplayCost | None = None
+    limit_arcsec: Axes | None = None
+    glass: GlassCost | None = None
+    certificate: Certificate | None = None
+    cube: CubeToBoresight | None = None
+    notes: list[str] = field(default_factory=list)
 
 
 def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings) -> Assessment:
@@ -412,131 +506,168 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     fault of either.
     """
     run = read_ledger(ledger)
-    zero_ns, start_s, end_s = (
-        run.run.zero_ns,
-        float(run.commanded.t_s[0]),
-        float(run.commanded.t_s[-1]),
-    )
-    centroids: Sequence[Centroids] = ()
-    overlap, out_of_order, clock_set = True, 0, False
     if telemetry is None:
-        answer_record = read_answers(ledger, settings.stamp or AnswerRules.of(run.config).stamp)
-        answers, stamp, ahead_ns, centroids, out_of_order, clock_set = answer_record
-        base_ns, telemetry = zero_ns + ahead_ns, ledger
+        timed = _answers_of_ledger(run, settings)
     else:
-        answers, stamp = read_telemetry(telemetry), settings.stamp or "middle"
-        # The telemetry's times from the run's zero where the two overlap, else from their own
-        # first.
-        overlap = (
-            answers.t_ns[0] <= zero_ns + round(end_s * NS_PER_S) and answers.t_ns[-1] >= zero_ns
-        )
-        base_ns = zero_ns if overlap else int(answers.t_ns[0])
-    base_s = (base_ns - zero_ns) / NS_PER_S
-    tau_s = (
-        (answers.t_ns - base_ns) / NS_PER_S
-        + TO_MIDDLE[stamp] * run.config.tracker.exposure_s
-        - settings.latency_s
-    )
+        timed = _answers_of_file(run, telemetry, settings)
+    answers = timed.answers
+    tau_s = timed.tau_s
     valid = np.flatnonzero(answers.valid)
-    if len(valid) < MIN_ROWS:
-        raise InputError(
-            f"{telemetry}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer"
-            " telemetry"
-        )
-    coarse = matched(run, answers, tau_s[valid], answers.q[valid])
+    error_budget = _budget_of(run, timed, valid)
+    clock = error_budget.clock
+    start_s = float(run.commanded.t_s[0])
+    t_s = start_s + (tau_s - clock.offset_s - start_s) / (1 + clock.drift)
+    right_rows = valid[error_budget.row]
+    right = np.zeros(len(t_s), dtype=np.bool_)
+    right[right_rows] = True
+    right[valid[error_budget.held]] = True
+    wrong = np.zeros(len(t_s), dtype=np.bool_)
+    wrong[valid[error_budget.wrong]] = True
+    notes = _notes(run, error_budget, timed)
+    rate_deg_s = np.degrees(np.linalg.norm(error_budget.rate_rad_s, axis=1))
+    by_rate = _slices_by(rate_deg_s, error_budget)
+    right_centroids = []
+    if any(timed.centroids):
+        right_centroids = [timed.centroids[row] for row in right_rows.tolist()]
+    bench = BenchFigures()
     try:
-        error_budget = assess_run(
-            run.commanded,
-            tau_s[valid],
-            answers.q[valid],
-            coarse,
-            run.scale,
-            np.random.default_rng(SEED),
-        )
-    except InputError as refusal:
-        raise InputError(f"{telemetry}: {refusal}") from refusal
-    t_s = start_s + (tau_s - error_budget.clock.offset_s - start_s) / (1 + error_budget.clock.drift)
-    right, wrong = np.zeros(len(t_s), dtype=np.bool_), np.zeros(len(t_s), dtype=np.bool_)
-    (
-        right[valid[error_budget.row]],
-        right[valid[error_budget.held]],
-        wrong[valid[error_budget.wrong]],
-    ) = True, True, True
-    off_deg = np.degrees(
-        np.linalg.norm(error_budget.clock.residual_arcsec, axis=1) / ARCSEC_PER_RAD
-    )
-    notes = [
-        *_notes(run, error_budget, 0.0 if overlap else base_s),
-        *([CLOCK_SET] if clock_set else []),
-    ]
-    # The error by rate and by magnitude, and the display's own.
-    parts = error_budget.components
-    error = parts.fov.fitted + parts.pixel.fitted + parts.left
-    freedom = parts.fov.freedom + parts.pixel.freedom + 1
-    by_rate = slices_of(
-        np.degrees(np.linalg.norm(error_budget.rate_rad_s, axis=1)), parts.left, error, freedom
-    )
-    by_magnitude: tuple[Slice, ...] = ()
-    display = limit = glass = certificate = cube = None
-    try:
-        file = run.bench_file()
-        certificate = bench_certificate(file)
-        cube = _cube_of(file, certificate, error_budget)
-        by_magnitude = slices_of(
-            field_magnitudes(file, error_budget.commanded_q), parts.left, error, freedom
-        )
-        limit = noise_limit(file, error_budget.commanded_q)
-        glass, told_by = _glass_of(
-            file,
-            error_budget,
-            [centroids[row] for row in valid[error_budget.row]] if any(centroids) else (),
-        )
-        notes += told_by
-        if settings.display_attitudes:
-            some = np.unique(
-                np.linspace(0, len(error_budget.row) - 1, settings.display_attitudes).astype(int)
-            )
-            display = display_cost(
-                display_errors(file, error_budget.commanded_q[some]), parts.left[some]
-            )
-            if display is None:
-                notes.append(
-                    "the display shows too few stars at once for an attitude: its own error was not"
-                    " found"
-                )
+        _look_at_bench(bench, run, error_budget, right_centroids, settings)
     except HilstarError as refusal:
-        notes.append(
+        bench.notes.append(
             "neither the field's magnitude nor the display's own error could be found from the"
             f" ledger: {refusal}"
         )
-    noise_arcsec, display_note = _without_display(error_budget, display)
+    noise_arcsec, display_note = _without_display(error_budget, bench.display)
     return Assessment(
         run=run,
         telemetry=answers,
         found=error_budget,
         noise_arcsec=noise_arcsec,
-        offset_s=error_budget.clock.offset_s + base_s,
+        offset_s=clock.offset_s + timed.base_s,
         lock=lock_of(run.commanded, t_s, right, wrong),
-        wrong=tuple(
-            WrongAnswer(
-                int(answers.line[at]),
-                int(answers.t_ns[at]) / 1e9,
-                float(t_s[at]),
-                float(off_deg[k]),
-            )
-            for k, at in zip(error_budget.wrong, valid[error_budget.wrong], strict=True)
-        ),
-        display=display,
-        limit_arcsec=limit,
-        glass=glass,
+        wrong=tuple(_wrong_answers(answers, error_budget, valid, t_s)),
+        display=bench.display,
+        limit_arcsec=bench.limit_arcsec,
+        glass=bench.glass,
         by_rate=by_rate,
-        by_magnitude=by_magnitude,
+        by_magnitude=bench.by_magnitude,
         t_s=t_s,
-        notes=(*notes, *display_note),
-        certificate=certificate,
-        out_of_order=out_of_order,
-        cube=cube,
+        notes=(*notes, *bench.notes, *display_note),
+        certificate=bench.certificate,
+        out_of_order=timed.out_of_order,
+        cube=bench.cube,
     )
+
+
+def _answers_of_ledger(run: RunLedger, settings: AssessSettings) -> TimedAnswers:
+    """The ledger's own answers, by their times as far as these are ahead of the run's."""
+    stamp = settings.stamp or AnswerRules.of(run.config).stamp
+    record = read_answers(run.path, stamp)
+    zero_ns = run.run.zero_ns
+    base_ns = zero_ns + record.ahead_ns
+    return TimedAnswers(
+        run.path,
+        record.telemetry,
+        _tau_s(run, record.telemetry, base_ns, record.stamp, settings),
+        (base_ns - zero_ns) / NS_PER_S,
+        centroids=record.centroids,
+        out_of_order=record.out_of_order,
+        clock_set=record.clock_set,
+    )
+
+
+def _answers_of_file(run: RunLedger, path: Path, settings: AssessSettings) -> TimedAnswers:
+    """A file's answers: their times from the run's zero where the two overlap, else from their own
+    first.
+    """
+    answers = read_telemetry(path)
+    stamp = settings.stamp or "middle"
+    zero_ns = run.run.zero_ns
+    end_s = float(run.commanded.t_s[-1])
+    end_ns = zero_ns + round(end_s * NS_PER_S)
+    first_ns = int(answers.t_ns[0])
+    last_ns = int(answers.t_ns[-1])
+    overlap = first_ns <= end_ns and last_ns >= zero_ns
+    base_ns = zero_ns
+    if not overlap:
+        base_ns = first_ns
+    tau_s = _tau_s(run, answers, base_ns, stamp, settings)
+    base_s = (base_ns - zero_ns) / NS_PER_S
+    return TimedAnswers(path, answers, tau_s, base_s, overlap)
+
+
+def _tau_s(
+    run: RunLedger, answers: Telemetry, base_ns: int, stamp: Stamp, settings: AssessSettings
+) -> FloatArray:
+    """The middles of the answers' exposures (n,) after a time of the tracker's clock."""
+    to_middle_s = TO_MIDDLE[stamp] * run.config.tracker.exposure_s
+    stamped_s = (answers.t_ns - base_ns) / NS_PER_S
+    return np.asarray(stamped_s + to_middle_s - settings.latency_s)
+
+
+def _budget_of(run: RunLedger, timed: TimedAnswers, valid: IntArray) -> DecomposedRun:
+    """The budget of the valid answers, rows (k,). Raises InputError."""
+    if len(valid) < MIN_ROWS:
+        raise InputError(
+            f"{timed.path}: {len(valid)} valid answers, and {MIN_ROWS} are needed; give longer"
+            " telemetry"
+        )
+    tau_s = timed.tau_s[valid]
+    q = timed.answers.q[valid]
+    coarse = matched(run, timed.answers, tau_s, q)
+    rng = np.random.default_rng(SEED)
+    try:
+        return assess_run(run.commanded, tau_s, q, coarse, run.scale, rng)
+    except InputError as refusal:
+        raise InputError(f"{timed.path}: {refusal}") from refusal
+
+
+def _slices_by(value: FloatArray, found: DecomposedRun) -> tuple[Slice, ...]:
+    """Noise and error of the right answers by a value (k,) of each."""
+    parts = found.components
+    error = parts.fov.fitted + parts.pixel.fitted + parts.left
+    freedom = parts.fov.freedom + parts.pixel.freedom + 1
+    return slices_of(value, parts.left, error, freedom)
+
+
+def _look_at_bench(
+    bench: BenchFigures,
+    run: RunLedger,
+    found: DecomposedRun,
+    centroids: Sequence[Centroids],
+    settings: AssessSettings,
+) -> None:
+    """Fill in what the bench tells, as far as it can be built. Raises HilstarError."""
+    file = run.bench_file()
+    bench.certificate = bench_certificate(file)
+    bench.cube = _cube_of(file, bench.certificate, found)
+    field_mag = field_magnitudes(file, found.commanded_q)
+    bench.by_magnitude = _slices_by(field_mag, found)
+    bench.limit_arcsec = noise_limit(file, found.commanded_q)
+    bench.glass, glass_notes = _glass_of(file, found, centroids)
+    bench.notes += glass_notes
+    if not settings.display_attitudes:
+        return
+    some = spread_rows(len(found.row), settings.display_attitudes)
+    display_arcsec = display_errors(file, found.commanded_q[some])
+    bench.display = display_cost(display_arcsec, found.components.left[some])
+    if bench.display is None:
+        bench.notes.append(
+            "the display shows too few stars at once for an attitude: its own error was not found"
+        )
+
+
+def _wrong_answers(
+    answers: Telemetry, found: DecomposedRun, valid: IntArray, t_s: FloatArray
+) -> Iterator[WrongAnswer]:
+    """The wrong ones of answers with run times (n,), of which `valid` (k,) were assessed."""
+    off_rad = np.linalg.norm(found.clock.residual_arcsec, axis=1) / ARCSEC_PER_RAD
+    off_deg = np.degrees(off_rad)
+    for k in found.wrong.tolist():
+        row = valid[k]
+        line = int(answers.line[row])
+        own_s = int(answers.t_ns[row]) / 1e9
+        yield WrongAnswer(line, own_s, float(t_s[row]), float(off_deg[k]))
 
 
 def _cube_of(
@@ -554,7 +685,8 @@ def _glass_of(
     """What the glass costs, by the stars of the right answers where these have enough; a note
     where the PSF file tells it.
     """
-    turned = multiply(from_rotation_vector(found.bias_arcsec / ARCSEC_PER_RAD), found.commanded_q)
+    bias = from_rotation_vector(found.bias_arcsec / ARCSEC_PER_RAD)
+    turned = multiply(bias, found.commanded_q)
     cost = seen_cost(file, turned, centroids) or glass_cost(file, found.commanded_q)
     if cost is None or cost.source != FILE:
         return cost, []
@@ -573,40 +705,25 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
     """
     commanded = run.commanded
     coarse = coarse_offset(commanded, tau_s, q)
+    agreed = None
     if coarse is not None and coarse.spread_rad <= AGREE_RAD:
         agreed = coarse
-    else:
-        agreed = None
-    if agreed is not None and agreed.turn_rad <= MAX_TURN_RAD:
-        return agreed
     turned = ""
     if agreed is not None:
-        turn = to_rotation_vector(agreed.rotation)
-        angle = float(np.linalg.norm(turn))
-        axis = ",".join(f"{value:.3f}" for value in turn / max(angle, 1e-12))
-        turned = (
-            f"{telemetry.path}: the reported attitudes are turned by {np.degrees(angle):.4g}"
-            f" degrees about {axis} (cam) from the commanded ones"
-        )
-        # The nearest rotation that only names the axes otherwise, of which there are 24.
-        matrix = to_matrix(agreed.rotation)
-        nearest = np.zeros((3, 3))
-        column = np.argmax(np.abs(matrix), axis=1)
-        nearest[range(3), column] = np.sign(matrix[range(3), column])
-        off = np.arccos(np.clip((np.trace(matrix @ nearest.T) - 1) / 2, -1, 1))
-        if abs(np.linalg.det(nearest) - 1) <= 1e-9 and off <= NEAR_AXES_RAD:
-            signs = ["-" if row.sum() < 0 else "+" for row in nearest]
-            axes = ", ".join(
-                f"{letter} = {sign}{'xyz'[k]}"
-                for letter, sign, k in zip("xyz", signs, column, strict=True)
-            )
+        if agreed.turn_rad <= MAX_TURN_RAD:
+            return agreed
+        turned = _turned(telemetry, agreed.rotation)
+        axes = _axes_by_name(agreed.rotation)
+        if axes:
             cure = "write them for x right, y down in the image, z boresight"
             raise InputError(f"{turned}: they fit axes with {axes} of hilstar's; {cure}")
-    offsets = [] if coarse is None else [coarse.offset_s]
-    for offset in [*offsets, *speed_offsets(commanded, tau_s, q).tolist()]:
-        _refuse(run, telemetry, tau_s + offset, q)
+    offsets_s = speed_offsets(commanded, tau_s, q).tolist()
+    if coarse is not None:
+        offsets_s.insert(0, coarse.offset_s)
+    for offset_s in offsets_s:
+        _refuse(run, telemetry, tau_s + offset_s, q)
     if agreed is not None:
-        w, x, y, z = (float(value) for value in agreed.rotation * [1, -1, -1, -1])
+        w, x, y, z = conjugate(agreed.rotation).tolist()
         cure = f"turn them back by the quaternion {w:.6f},{x:.6f},{y:.6f},{z:.6f} from the left"
         raise InputError(f"{turned}: another frame or mounting; {cure}")
     raise InputError(
@@ -616,37 +733,64 @@ def matched(run: RunLedger, telemetry: Telemetry, tau_s: FloatArray, q: FloatArr
     )
 
 
+def _turned(telemetry: Telemetry, rotation: FloatArray) -> str:
+    """The rotation (4,) from commanded to reported attitudes, in words."""
+    turn_rad = to_rotation_vector(rotation)
+    angle_rad = float(np.linalg.norm(turn_rad))
+    x, y, z = turn_rad / max(angle_rad, 1e-12)
+    axis = f"{x:.3f},{y:.3f},{z:.3f}"
+    angle = f"{np.degrees(angle_rad):.4g} degrees"
+    turned = f"turned by {angle} about {axis} (cam) from the commanded ones"
+    return f"{telemetry.path}: the reported attitudes are {turned}"
+
+
+def _axes_by_name(rotation: FloatArray) -> str:
+    """The nearest rotation that only names the axes otherwise, of which there are 24; "" where none
+    is within NEAR_AXES_RAD.
+    """
+    matrix = to_matrix(rotation)
+    nearest = np.zeros((3, 3))
+    column = np.argmax(np.abs(matrix), axis=1)
+    nearest[range(3), column] = np.sign(matrix[range(3), column])
+    cosine = (np.trace(matrix @ nearest.T) - 1) / 2
+    off_rad = np.arccos(np.clip(cosine, -1, 1))
+    if abs(np.linalg.det(nearest) - 1) > 1e-9 or off_rad > NEAR_AXES_RAD:
+        return ""
+    axes = []
+    for letter, row, k in zip("xyz", nearest, column.tolist(), strict=True):
+        sign = "+"
+        if row.sum() < 0:
+            sign = "-"
+        axes.append(f"{letter} = {sign}{'xyz'[k]}")
+    return ", ".join(axes)
+
+
 def _refuse(run: RunLedger, telemetry: Telemetry, t_s: FloatArray, q: FloatArray) -> None:
     """Refuse (InputError) answers that agree with the run at these times by another convention."""
     moments = run.commanded.at(t_s)
     if moments.known.sum() < max(MIN_PAIRS, 0.1 * len(t_s)):
         return
     rows = np.flatnonzero(moments.known)
-    pairs = Pairs(
-        telemetry.path,
-        telemetry.line[telemetry.valid][rows],
-        moments.q[rows],
-        q[rows],
-        names=COMMANDED,
-    )
+    lines = telemetry.line[telemetry.valid][rows]
+    pairs = Pairs(telemetry.path, lines, moments.q[rows], q[rows], names=COMMANDED)
+    half_diagonal_px = 0.5 * np.hypot(*run.scale.resolution_px)
+    field_radius_rad = float(np.arctan(half_diagonal_px / run.scale.focal_px))
     try:
-        refuse_conventions(
-            pairs, float(np.arctan(0.5 * np.hypot(*run.scale.resolution_px) / run.scale.focal_px))
-        )
+        refuse_conventions(pairs, field_radius_rad)
     except InputError as refusal:
         if "wild" not in str(refusal) and "out of view" not in str(refusal):
             raise
 
 
-def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
+def _notes(run: RunLedger, found: DecomposedRun, timed: TimedAnswers) -> list[str]:
     """What a reader of the budget has to know beside its figures."""
     notes = [*found.notes]
     clock = found.clock
     parts = found.components
-    if base_s:
+    if timed.base_s and not timed.overlap:
         notes.append(
-            f"the telemetry's times, {abs(base_s):.9g} s from the run's, do not overlap it: its"
-            " clock is taken as one of its own"
+            f"the telemetry's times, {abs(timed.base_s):.9g} s from the run's, do not overlap it:"
+            " its clock is taken as one of its own"
         )
     if not clock.drift_told:
         notes.append(
@@ -659,35 +803,47 @@ def _notes(run: RunLedger, found: DecomposedRun, base_s: float) -> list[str]:
             f" along the motion, and is taken to be {1e3 * clock.offset_s:.3g} ms beside the"
             " rough one"
         )
-    # A tracker averages over its exposure E: under an acceleration alpha that is alpha E^2 / 24 off
-    # the middle's attitude.
-    step_s = np.diff(clock.t_s[found.row])
-    near = step_s < 1.0
-    if len(found.row) >= MIN_ROWS and near.any():
-        change = np.linalg.norm(np.diff(ARCSEC_PER_RAD * found.rate_rad_s, axis=0)[near], axis=1)
-        bent = (
-            float(np.percentile(change / step_s[near], 99)) * run.config.tracker.exposure_s**2 / 24
+    bent_arcsec = _bent_arcsec(found, run.config.tracker.exposure_s)
+    if bent_arcsec >= BENT_ARCSEC:
+        notes.append(
+            "in an exposure the attitude's mean differs from that in its middle by up to"
+            f" {bent_arcsec:.2g} arcsec"
         )
-        if bent >= BENT_ARCSEC:
-            notes.append(
-                "in an exposure the attitude's mean differs from that in its middle by up to"
-                f" {bent:.2g} arcsec"
-            )
     # Noise that lasts: a slow drift, or an error that changes over the field more sharply than the
     # bumps do.
     rows = len(parts.left) // TOGETHER * TOGETHER
     if rows >= MIN_ROWS * TOGETHER:
         means = parts.left[:rows].reshape(-1, TOGETHER, 3).mean(axis=1)
         slow = (means**2).mean(axis=0) - parts.noise_variance / TOGETHER
-        if (slow / np.maximum(parts.noise_variance, 1e-12)).max() >= SLOW_SHARE:
+        slow_share = slow / np.maximum(parts.noise_variance, 1e-12)
+        if slow_share.max() >= SLOW_SHARE:
             size = axes_of_variance(slow)
+            across = f"{size.cross:.2g} arcsec across the boresight"
+            beside = parts.fov.detail or "the bias"
             notes.append(
-                f"the noise is not white: {size.cross:.2g} arcsec across the boresight and"
-                f" {size.roll:.2g} about it last for {TOGETHER} answers and more, besides"
-                f" {parts.fov.detail or 'the bias'}: does the alignment drift with time, or does"
-                " the field-of-view error jump somewhere?"
+                f"the noise is not white: {across} and {size.roll:.2g} about it last for"
+                f" {TOGETHER} answers and more, besides {beside}: does the alignment drift with"
+                " time, or does the field-of-view error jump somewhere?"
             )
+    if timed.clock_set:
+        notes.append(CLOCK_SET)
     return notes
+
+
+def _bent_arcsec(found: DecomposedRun, exposure_s: float) -> float:
+    """How far an exposure's mean attitude is off that in its middle, in 99 of 100 answers; 0 of
+    too few answers.
+
+    Under an acceleration alpha the mean over an exposure E is alpha E^2 / 24 off.
+    """
+    step_s = np.diff(found.clock.t_s[found.row])
+    near = step_s < 1.0
+    if len(found.row) < MIN_ROWS or not near.any():
+        return 0.0
+    change = np.diff(ARCSEC_PER_RAD * found.rate_rad_s, axis=0)[near]
+    acceleration = np.linalg.norm(change, axis=1) / step_s[near]
+    usual = float(np.percentile(acceleration, 99))
+    return usual * exposure_s**2 / 24
 
 
 def _without_display(found: Decomposed, display: DisplayCost | None) -> tuple[Axes, list[str]]:
@@ -696,14 +852,14 @@ def _without_display(found: Decomposed, display: DisplayCost | None) -> tuple[Ax
     if display is None or noise.cross is None or noise.roll is None:
         return noise, []
     share = display.subtracted
-    cost = np.array([display.cross_arcsec, display.cross_arcsec, display.roll_arcsec]) ** 2
-    without = axes_of_variance(found.components.noise_variance - share * cost)
-    if display.cross_arcsec <= SMALL * noise.cross and display.roll_arcsec <= SMALL * noise.roll:
+    cross_arcsec = display.cross_arcsec
+    roll_arcsec = display.roll_arcsec
+    cost = np.array([cross_arcsec, cross_arcsec, roll_arcsec]) ** 2
+    variance = found.components.noise_variance - share * cost
+    without = axes_of_variance(variance)
+    if cross_arcsec <= SMALL * noise.cross and roll_arcsec <= SMALL * noise.roll:
         return without, []
-    size = (
-        f"{display.cross_arcsec:.2g} arcsec across the boresight and {display.roll_arcsec:.2g}"
-        " about it"
-    )
+    size = f"{cross_arcsec:.2g} arcsec across the boresight and {roll_arcsec:.2g} about it"
     says = f"the answers show {display.seen:.2f} +- {display.sigma_seen:.2f} of it"
     if share:
         done = f"{100 * share:.0f} % of its variance are subtracted from the noise"

@@ -16,10 +16,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import normalise, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 from hilstar.instruments.assess.budget import Axes, axes_of_variance
+from hilstar.instruments.assess.places import spread_rows
 from hilstar.instruments.simulate.glass import MIN_STARS as MIN_SPLIT_STARS
 from hilstar.instruments.simulate.glass import split_errors, told_psf
 from hilstar.instruments.simulate.noise import attitude_limits_arcsec, field_stars
@@ -77,26 +78,38 @@ def slices_of(
         return ()
     growth = len(known) / max(len(known) - freedom, 1.0)
     spread = float(np.ptp(value))
-    if spread > 1e-3 * max(abs(float(np.median(value))), 1e-6):
+    usual = abs(float(np.median(value)))
+    if spread > 1e-3 * max(usual, 1e-6):
         bins = min(BINS, count // MIN_IN_BIN)
     else:
         bins = 1
-    edges = np.unique(np.quantile(value, np.linspace(0, 1, bins + 1)))
+    shares = np.linspace(0, 1, bins + 1)
+    edges = np.unique(np.quantile(value, shares))
     if len(edges) < 2:
         edges = np.array([value.min(), value.max()])
-    place = np.clip(np.searchsorted(edges, value, side="right") - 1, 0, len(edges) - 2)
+    last = len(edges) - 2
+    above = np.searchsorted(edges, value, side="right")
+    place = np.clip(above - 1, 0, last)
     slices = []
-    for k in range(len(edges) - 1):
+    for k in range(last + 1):
         rows = place == k
-        if rows.sum() >= MIN_IN_BIN:
-            noise = growth * (residual[rows] ** 2).mean(axis=0)
-            whole = (error[rows] ** 2).mean(axis=0)
-            axes = []
-            for bounds in (noise, whole):
-                for part in ((bounds[0] + bounds[1]) / 2, bounds[2]):
-                    axes.append(float(np.sqrt(part)))
-            slices.append(Slice(float(edges[k]), float(edges[k + 1]), int(rows.sum()), *axes))
+        answers = int(rows.sum())
+        if answers < MIN_IN_BIN:
+            continue
+        noise = growth * (residual[rows] ** 2).mean(axis=0)
+        whole = (error[rows] ** 2).mean(axis=0)
+        low = float(edges[k])
+        high = float(edges[k + 1])
+        slices.append(Slice(low, high, answers, *_across_about(noise), *_across_about(whole)))
     return tuple(slices)
+
+
+def _across_about(variance: FloatArray) -> tuple[float, float]:
+    """One sigma across and about the boresight from variances (3,)."""
+    x, y, z = variance
+    cross = float(np.sqrt((x + y) / 2))
+    roll = float(np.sqrt(z))
+    return cross, roll
 
 
 def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
@@ -109,21 +122,25 @@ def field_magnitudes(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
     stars = bench_stars(file.config, file.folder)
     camera = tracker_camera(file.config.tracker, file.folder)
     width, height = camera.resolution_px
-    some = np.unique(np.linspace(0, len(q_icrs_to_cam) - 1, FIELDS).astype(int))
+    answers = len(q_icrs_to_cam)
+    some = spread_rows(answers, FIELDS)
     axes = to_matrix(q_icrs_to_cam[some])
-    reach = 2 * np.sin(min(camera.field_radius_rad(0.0), np.pi / 2) / 2)
+    radius_rad = min(camera.field_radius_rad(0.0), np.pi / 2)
+    reach = 2 * np.sin(radius_rad / 2)  # a chord
     light = np.zeros(len(some))
-    near: list[IntArray] = [
-        np.array(star_rows, dtype=np.intp)
-        for star_rows in cKDTree(stars.vectors).query_ball_point(axes[:, 2], reach)
-    ]
-    for k, star_rows in enumerate(near):
+    near = cKDTree(stars.vectors).query_ball_point(axes[:, 2], reach)
+    for k, near_rows in enumerate(near):
+        star_rows = np.array(near_rows, dtype=np.intp)
         x_px, y_px = camera.project(stars.vectors[star_rows] @ axes[k].T)
-        inside = (x_px > -0.5) & (x_px < width - 0.5) & (y_px > -0.5) & (y_px < height - 0.5)
-        light[k] = float(flux_ratio(stars.v_mag[star_rows][inside]).sum())
-    field = np.where(light > 0, magnitude(np.maximum(light, 1e-30)), np.nan)
-    nearest = np.abs(np.searchsorted(some, np.arange(len(q_icrs_to_cam))).clip(0, len(some) - 1))
-    return np.asarray(field[nearest])
+        inside_x = (x_px > -0.5) & (x_px < width - 0.5)
+        inside_y = (y_px > -0.5) & (y_px < height - 0.5)
+        v_mag = stars.v_mag[star_rows][inside_x & inside_y]
+        light[k] = float(flux_ratio(v_mag).sum())
+    field_mag = magnitude(np.maximum(light, 1e-30))
+    field_mag = np.where(light > 0, field_mag, np.nan)
+    nearest = np.searchsorted(some, np.arange(answers))
+    nearest = np.abs(nearest.clip(0, len(some) - 1))
+    return np.asarray(field_mag[nearest])
 
 
 def noise_limit(file: BenchFile, q_icrs_to_cam: FloatArray) -> Axes:
@@ -132,9 +149,16 @@ def noise_limit(file: BenchFile, q_icrs_to_cam: FloatArray) -> Axes:
 
     One exposure at rest, arcsec; None for fields of too few stars. Raises InputError.
     """
-    some = np.unique(np.linspace(0, len(q_icrs_to_cam) - 1, LIMIT_FIELDS).astype(int))
-    median = np.median(attitude_limits_arcsec(file, q_icrs_to_cam[some]), axis=0).tolist()
-    return Axes(*(axis_arcsec if math.isfinite(axis_arcsec) else None for axis_arcsec in median))
+    some = spread_rows(len(q_icrs_to_cam), LIMIT_FIELDS)
+    limits_arcsec = attitude_limits_arcsec(file, q_icrs_to_cam[some])
+    cross_arcsec, roll_arcsec = np.median(limits_arcsec, axis=0).tolist()
+    return Axes(_finite(cross_arcsec), _finite(roll_arcsec))
+
+
+def _finite(value: float) -> float | None:
+    if math.isfinite(value):
+        return value
+    return None
 
 
 def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
@@ -148,17 +172,18 @@ def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
         finder = star_finder(twin.bench, twin.monitor_px_per_px)
         for number, q in enumerate(q_icrs_to_cam):
             field = twin.field(q, number)
-            sky, shown = (
-                finder.match(image, field.x_px, field.y_px)
-                for image in (field.sky_e, field.shown_e)
-            )
+            sky = finder.match(field.sky_e, field.x_px, field.y_px)
+            shown = finder.match(field.shown_e, field.x_px, field.y_px)
             both = (sky.index >= 0) & (shown.index >= 0)
-            if both.sum() >= MIN_STARS:
-                i = sky.index[both]
-                j = shown.index[both]
-                true = normalise(twin.camera.rays(sky.found.x_px[i], sky.found.y_px[i]))
-                rays = normalise(twin.camera.rays(shown.found.x_px[j], shown.found.y_px[j]))
-                errors[number] = ARCSEC_PER_RAD * turn_between(true, rays, sky.found.flux[i])
+            if both.sum() < MIN_STARS:
+                continue
+            i = sky.index[both]
+            j = shown.index[both]
+            true_rays = twin.camera.rays(sky.found.x_px[i], sky.found.y_px[i])
+            shown_rays = twin.camera.rays(shown.found.x_px[j], shown.found.y_px[j])
+            light = sky.found.flux[i]
+            turn_rad = turn_between(normalise(true_rays), normalise(shown_rays), light)
+            errors[number] = ARCSEC_PER_RAD * turn_rad
     return errors
 
 
@@ -168,12 +193,14 @@ def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> Floa
     """
     cross = np.zeros((len(true), 3, 3))  # e x v = -[v] e
     x, y, z = true.T
-    cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = z, -y, x
+    cross[:, 0, 1] = z
+    cross[:, 0, 2] = -y
+    cross[:, 1, 2] = x
     cross -= np.swapaxes(cross, 1, 2)
     root = np.sqrt(weight)[:, None]
-    turn, *_ = np.linalg.lstsq(
-        (cross * root[:, :, None]).reshape(-1, 3), ((seen - true) * root).ravel(), rcond=None
-    )
+    design = (cross * root[:, :, None]).reshape(-1, 3)
+    difference = ((seen - true) * root).ravel()
+    turn, *_ = np.linalg.lstsq(design, difference, rcond=None)
     return np.asarray(turn)
 
 
@@ -196,12 +223,17 @@ class GlassCost:
 
     def line(self) -> str:
         """For a person."""
-        figures = {name: f"{axes.cross or 0.0:.2g}" for name, axes in self.fov_arcsec.items()}
-        return (
-            f"{figures['total']} arcsec across by the {self.source}, as `{self.centroider}` finds"
-            f" {self.stars} stars; distortion corrected {figures['without_distortion']}, colour"
-            f" {figures['without_colour']}, both {figures['without_both']}"
-        )
+        total = self._across("total")
+        distortion = self._across("without_distortion")
+        colour = self._across("without_colour")
+        both = self._across("without_both")
+        means = f"by the {self.source}, as `{self.centroider}` finds {self.stars} stars"
+        corrected = f"distortion corrected {distortion}, colour {colour}, both {both}"
+        return f"{total} arcsec across {means}; {corrected}"
+
+    def _across(self, part: str) -> str:
+        cross_arcsec = self.fov_arcsec[part].cross or 0.0
+        return f"{cross_arcsec:.2g}"
 
 
 def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
@@ -218,16 +250,21 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
     stars = bench_stars(file.config, file.folder)
     kind = file.config.verify.judge or "window"
     reach = math.ceil(4 * max(1.0, *psf.width_px))
-    some = np.unique(np.linspace(0, len(q_icrs_to_cam) - 1, GLASS_FIELDS).astype(int))
+    side_px = 2 * reach + 1
+    some = spread_rows(len(q_icrs_to_cam), GLASS_FIELDS)
     for q in normalise(q_icrs_to_cam[some]):
         rows = field_stars(stars, camera, q)[:GLASS_STARS]
-        pixels = np.rint(rows["y_px"]).astype(np.intp), np.rint(rows["x_px"]).astype(np.intp)
-        true = np.stack([rows["x_px"] - pixels[1], rows["y_px"] - pixels[0]], axis=1)
-        stamps = told_psf(psf, pixels, 2 * reach + 1, glass.shares_of(stars, rows["hip"]))(*true.T)
+        row_px = np.rint(rows["y_px"]).astype(np.intp)
+        column_px = np.rint(rows["x_px"]).astype(np.intp)
+        true_px = np.stack([rows["x_px"] - column_px, rows["y_px"] - row_px], axis=1)
+        shares = glass.shares_of(stars, rows["hip"])
+        star_psf = told_psf(psf, (row_px, column_px), side_px, shares)
+        stamps = star_psf(*true_px.T)
         places_px = np.stack(star_places(stamps, kind, psf.width_px), axis=1)
+        errors_px = places_px - true_px
         lit = stamps.sum(axis=(1, 2)) > 0  # a corner may be dark
         if lit.sum() >= MIN_STARS:
-            fields.append((rows[lit], (places_px - true)[lit]))
+            fields.append((rows[lit], errors_px[lit]))
     return _cost(FILE, kind, camera, fields)
 
 
@@ -241,29 +278,34 @@ def seen_cost(
     """
     camera = tracker_camera(file.config.tracker, file.folder)
     stars = bench_stars(file.config, file.folder)
-    fields = []
     named = []
     for k, reported_stars in enumerate(centroids):
-        if len([star for star in reported_stars if star[3]]) >= MIN_STARS:
+        named_stars = [star for star in reported_stars if star[3]]
+        if len(named_stars) >= MIN_STARS:
             named.append(k)
     if not named:
         return None
-    spread = np.linspace(0, len(named) - 1, SEEN_FIELDS).astype(int)
-    for k in sorted({named[place] for place in spread.tolist()}):
+    fields = []
+    distances_px = []
+    for place in spread_rows(len(named), SEEN_FIELDS).tolist():
+        k = named[place]
         at = {star[3]: star[:2] for star in centroids[k] if star[3]}
         rows = field_stars(stars, camera, q_icrs_to_cam[k])
         rows = rows[np.isin(rows["hip"], list(at))]
-        reported_px = np.array([at[hip] for hip in rows["hip"].tolist()]).reshape(-1, 2)
-        fields.append((rows, reported_px - np.stack([rows["x_px"], rows["y_px"]], axis=1)))
-    far_px = np.concatenate([np.hypot(*off.T) for _, off in fields])
+        reported = [at[hip] for hip in rows["hip"].tolist()]
+        reported_px = np.array(reported).reshape(-1, 2)
+        true_px = np.stack([rows["x_px"], rows["y_px"]], axis=1)
+        errors_px = reported_px - true_px
+        fields.append((rows, errors_px))
+        distances_px.append(np.hypot(*errors_px.T))
+    median_px = float(np.median(np.concatenate(distances_px)))
     # a star by another's name is no error of places
-    usual_px = max(WRONG_SHARE * float(np.median(far_px)), 1.0)
-    near = [np.hypot(*off.T) < usual_px for _, off in fields]
-    good_fields = [
-        (rows[good], off[good])
-        for (rows, off), good in zip(fields, near, strict=True)
-        if good.sum() >= MIN_STARS
-    ]
+    usual_px = max(WRONG_SHARE * median_px, 1.0)
+    good_fields = []
+    for (rows, errors_px), distance_px in zip(fields, distances_px, strict=True):
+        good = distance_px < usual_px
+        if good.sum() >= MIN_STARS:
+            good_fields.append((rows[good], errors_px[good]))
     return _cost("answers' stars", "tracker", camera, good_fields)
 
 
@@ -276,38 +318,42 @@ def _cost(
     """By stars of fields, rows of TRUTH_DTYPE, and errors of their places (n, 2), px; None for
     too few stars.
     """
-    if sum(len(rows) for rows, _ in fields) < MIN_SPLIT_STARS:
+    counts = [len(field_rows) for field_rows, _ in fields]
+    if sum(counts) < MIN_SPLIT_STARS:
         return None
-    rows, errors = (np.concatenate(parts) for parts in zip(*fields, strict=True))
-    split = split_errors(
-        np.stack([rows["x_px"], rows["y_px"]], axis=1), rows["bv"], errors, camera.resolution_px
-    )
+    stars_of_fields, errors_of_fields = zip(*fields, strict=True)
+    rows = np.concatenate(stars_of_fields)
+    errors_px = np.concatenate(errors_of_fields)
+    places_px = np.stack([rows["x_px"], rows["y_px"]], axis=1)
+    split = split_errors(places_px, rows["bv"], errors_px, camera.resolution_px)
     parts = {
         "total": split.total,
         "without_distortion": split.total - split.distortion,
         "without_colour": split.total - split.colour,
         "without_both": split.psf,
     }
-    ends = np.cumsum([len(field_rows) for field_rows, _ in fields])[:-1]
-    fov = {}
-    for name, off in parts.items():
-        turns = np.array(
-            [
-                _field_turn(camera, field_rows, px)
-                for (field_rows, _), px in zip(fields, np.split(off, ends), strict=True)
-            ]
-        )
-        fov[name] = axes_of_variance(turns.var(axis=0))
-    rms_px = {name: float(np.sqrt((off**2).sum(axis=1).mean())) for name, off in parts.items()}
-    return GlassCost(source, kind, len(rows), len(fields), rms_px, fov)
+    ends = np.cumsum(counts)[:-1]
+    rms_px = {}
+    fov_arcsec = {}
+    for name, off_px in parts.items():
+        turns_arcsec = []
+        off_of_fields = np.split(off_px, ends)
+        for field_rows, field_off_px in zip(stars_of_fields, off_of_fields, strict=True):
+            turns_arcsec.append(_field_turn(camera, field_rows, field_off_px))
+        variance = np.array(turns_arcsec).var(axis=0)
+        fov_arcsec[name] = axes_of_variance(variance)
+        squared_px = (off_px**2).sum(axis=1)
+        rms_px[name] = float(np.sqrt(squared_px.mean()))
+    return GlassCost(source, kind, len(rows), len(fields), rms_px, fov_arcsec)
 
 
 def _field_turn(camera: Camera, rows: npt.NDArray[np.void], off_px: FloatArray) -> FloatArray:
     """The attitude's error (3,), arcsec, by stars whose places are off by `off_px` (n, 2)."""
-    true, shown = (
-        normalise(camera.rays(rows["x_px"] + dx, rows["y_px"] + dy))
-        for dx, dy in ((0.0, 0.0), off_px.T)
-    )
+    x_px = rows["x_px"]
+    y_px = rows["y_px"]
+    dx_px, dy_px = off_px.T
+    true = normalise(camera.rays(x_px, y_px))
+    shown = normalise(camera.rays(x_px + dx_px, y_px + dy_px))
     return ARCSEC_PER_RAD * turn_between(true, shown, rows["electrons_per_s"])
 
 
@@ -343,16 +389,19 @@ def display_cost(error_arcsec: FloatArray, left_arcsec: FloatArray) -> DisplayCo
     known = np.isfinite(error_arcsec).all(axis=1)
     if known.sum() < MIN_STARS:
         return None
-    error = error_arcsec[known] - error_arcsec[known].mean(axis=0)
+    error = error_arcsec[known]
+    error = error - error.mean(axis=0)
     residual = left_arcsec[known]
     variance = np.maximum((residual**2).mean(axis=0), 1e-12)
     information = float((error**2 / variance).sum())
-    share = float((error * residual / variance).sum()) / max(information, 1e-30)
-    power = (error**2).sum(axis=0) / max(len(error) - 1, 1)
+    information = max(information, 1e-30)
+    common = float((error * residual / variance).sum())
+    count = len(error)
+    power = (error**2).sum(axis=0) / max(count - 1, 1)
     return DisplayCost(
         cross_arcsec=float(np.sqrt(power[:2].mean())),
         roll_arcsec=float(np.sqrt(power[2])),
-        attitudes=int(known.sum()),
-        seen=share,
-        sigma_seen=1 / float(np.sqrt(max(information, 1e-30))),
+        attitudes=count,
+        seen=common / information,
+        sigma_seen=1 / float(np.sqrt(information)),
     )

@@ -38,7 +38,13 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
-from hilstar.instruments.assess.places import Scale, bumps_at, centres_of, places_of
+from hilstar.instruments.assess.places import (
+    Scale,
+    bumps_at,
+    centres_of,
+    places_of,
+    spread_rows,
+)
 from hilstar.server.record.commanded import Commanded, Moments
 
 # Coarse.
@@ -86,7 +92,9 @@ class CoarseClock:
     @property
     def turn_rad(self) -> float:
         """The angle of the rotation."""
-        return float(2 * np.arctan2(np.linalg.norm(self.rotation[1:]), abs(self.rotation[0])))
+        sine = np.linalg.norm(self.rotation[1:])
+        cosine = abs(self.rotation[0])
+        return float(2 * np.arctan2(sine, cosine))
 
 
 def coarse_offset(
@@ -95,30 +103,32 @@ def coarse_offset(
     """The coarse offset of telemetry with times (n,) and attitudes (n, 4); None where no offset
     gives an overlap.
     """
-    few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED).astype(int))
+    few = spread_rows(len(t_s), COMPARED)
     t = t_s[few]
     q = reported[few]
     # Starts or ends together, and where speeds or attitudes agree.
-    tried = [_spread_at(commanded, t, q, float(commanded.t_s[end] - t_s[end])) for end in (0, -1)]
-    for peaks, reach_s in (
-        _by_speed(commanded, t_s, reported),
-        _by_attitude(commanded, t_s, reported),
-    ):
-        tried += [_nearby(commanded, t, q, float(offset_s), reach_s) for offset_s in peaks]
+    starts_s = float(commanded.t_s[0] - t_s[0])
+    ends_s = float(commanded.t_s[-1] - t_s[-1])
+    tried = [_spread_at(commanded, t, q, starts_s), _spread_at(commanded, t, q, ends_s)]
+    for search in (_by_speed, _by_attitude):
+        peaks, reach_s = search(commanded, t_s, reported)
+        for offset_s in peaks.tolist():
+            tried.append(_nearby(commanded, t, q, offset_s, reach_s))
     known = [clock for clock in tried if clock is not None]
     if not known:
         return None
-    limit = AS_GOOD * min(clock.spread_rad for clock in known) + SMALL_RAD
+    smallest_rad = min(clock.spread_rad for clock in known)
+    limit = AS_GOOD * smallest_rad + SMALL_RAD
     good = [clock for clock in known if clock.spread_rad <= limit]
-    many = OVERLAP_SHARE * max(clock.compared for clock in good)
-    best = min(
-        (clock for clock in good if clock.compared >= many), key=lambda clock: clock.turn_rad
-    )
+    largest = max(clock.compared for clock in good)
+    many = OVERLAP_SHARE * largest
+    good = [clock for clock in good if clock.compared >= many]
+    best = min(good, key=lambda clock: clock.turn_rad)
     as_they_are = _spread_at(commanded, t, q, 0.0)
-    if as_they_are is not None and as_they_are.compared >= many and as_they_are.spread_rad <= limit:
-        if as_they_are.turn_rad <= best.turn_rad + TURN_RAD:
-            return as_they_are
+    if as_they_are is None or as_they_are.compared < many or as_they_are.spread_rad > limit:
         return best
+    if as_they_are.turn_rad <= best.turn_rad + TURN_RAD:
+        return as_they_are
     return best
 
 
@@ -126,7 +136,8 @@ def speed_offsets(commanded: Commanded, t_s: FloatArray, reported: FloatArray) -
     """Offsets (k,), s, at which the angular speeds agree, best first, and zero. They hold in
     every convention.
     """
-    return np.append(_by_speed(commanded, t_s, reported)[0], 0.0)
+    offsets_s, _ = _by_speed(commanded, t_s, reported)
+    return np.append(offsets_s, 0.0)
 
 
 def _nearby(
@@ -137,13 +148,14 @@ def _nearby(
         return first
 
     def spread(offset: float) -> float:
-        spread_there = _spread_at(commanded, t_s, reported, offset)
-        return np.pi if spread_there is None else spread_there.spread_rad
+        clock = _spread_at(commanded, t_s, reported, offset)
+        if clock is None:
+            return np.pi
+        return clock.spread_rad
 
-    low = offset_s - reach_s
-    high = offset_s + reach_s
+    bounds = (offset_s - reach_s, offset_s + reach_s)
     better = optimize.minimize_scalar(
-        spread, bounds=(low, high), method="bounded", options={"maxiter": 12}
+        spread, bounds=bounds, method="bounded", options={"maxiter": 12}
     )
     best = _spread_at(commanded, t_s, reported, float(better.x))
     if best is not None and best.spread_rad < first.spread_rad:
@@ -155,24 +167,29 @@ def _spread_at(
     commanded: Commanded, t_s: FloatArray, reported: FloatArray, offset_s: float
 ) -> CoarseClock | None:
     moments = commanded.at(t_s + offset_s)
-    if moments.known.sum() < max(3, MIN_OVERLAP * len(t_s)):
+    known = moments.known
+    compared = int(known.sum())
+    if compared < max(3, MIN_OVERLAP * len(t_s)):
         return None
-    rotations = multiply(reported[moments.known], conjugate(moments.q[moments.known]))
-    rotation, spread = nearest_to_half(rotations)
-    return CoarseClock(offset_s, spread, rotation, int(moments.known.sum()))
+    back = conjugate(moments.q[known])
+    rotations = multiply(reported[known], back)
+    rotation, spread_rad = nearest_to_half(rotations)
+    return CoarseClock(offset_s, spread_rad, rotation, compared)
 
 
 def nearest_to_half(rotations: FloatArray) -> tuple[FloatArray, float]:
     """The rotation among (n, 4) with half of all nearest to it, and the angle within which they
     lie, rad.
     """
-    chosen = np.unique(np.linspace(0, len(rotations) - 1, STARTS).astype(int))
-    cosine = np.abs(rotations @ rotations[chosen].T)
+    starts = rotations[spread_rows(len(rotations), STARTS)]
+    cosine = np.abs(rotations @ starts.T)
     # The chord is exact for tiny angles, where the cosine is not.
     chord = np.sqrt(np.maximum(2 - 2 * cosine, 0))
-    half = np.quantile(4 * np.arcsin(np.minimum(chord / 2, 1)), 0.5, axis=0, method="higher")
-    best = int(np.argmin(half))
-    return rotations[chosen[best]], float(half[best])
+    sine = np.minimum(chord / 2, 1)
+    angle_rad = 4 * np.arcsin(sine)
+    half_rad = np.quantile(angle_rad, 0.5, axis=0, method="higher")
+    best = int(np.argmin(half_rad))
+    return starts[best], float(half_rad[best])
 
 
 def _by_attitude(
@@ -181,21 +198,26 @@ def _by_attitude(
     """The offsets at which attitudes are nearest to the commanded ones, and the step of the
     scan.
     """
-    few = np.unique(np.linspace(0, len(t_s) - 1, COMPARED // 4).astype(int))
+    few = spread_rows(len(t_s), COMPARED // 4)
     t = t_s[few]
     q = reported[few]
-    reach = np.linspace(commanded.t_s[0] - t_s[-1], commanded.t_s[-1] - t_s[0], SCANNED)
+    first_s = commanded.t_s[0] - t_s[-1]
+    last_s = commanded.t_s[-1] - t_s[0]
+    reach = np.linspace(first_s, last_s, SCANNED)
     angle = np.full(len(reach), np.inf)
     shown = commanded.shown
     frame_s = commanded.t_s[shown]
     frame_q = commanded.q[shown]
+    enough = max(3, MIN_OVERLAP * len(t))
     for k, offset in enumerate(reach):  # the frame after each moment is near enough for a scan
         frame = np.searchsorted(frame_s, t + offset)
         inside = (frame > 0) & (frame < len(frame_s))
-        if inside.sum() >= max(3, MIN_OVERLAP * len(t)):
-            cosine = np.abs((q[inside] * frame_q[frame[inside]]).sum(axis=1))
+        if inside.sum() >= enough:
+            commanded_q = frame_q[frame[inside]]
+            cosine = np.abs((q[inside] * commanded_q).sum(axis=1))
             angle[k] = float(np.median(1 - np.minimum(cosine, 1)))
-    return _peaks(-angle, reach), float(reach[1] - reach[0])
+    step_s = float(reach[1] - reach[0])
+    return _peaks(-angle, reach), step_s
 
 
 def _by_speed(
@@ -206,16 +228,21 @@ def _by_speed(
         cycle_s = float(np.median(np.diff(t_s)))
     else:
         cycle_s = 0.0
+    run_start_s = commanded.t_s[0]
+    start_s = t_s[0]
+    run_span_s = commanded.t_s[-1] - run_start_s
+    span_s = t_s[-1] - start_s
     step_s = max(STEP_S, 2 * cycle_s, 2 * commanded.interval_s)
-    spans = commanded.t_s[-1] - commanded.t_s[0], t_s[-1] - t_s[0]
-    step_s = max(step_s, max(spans) / MAX_BINS)
+    step_s = max(step_s, max(run_span_s, span_s) / MAX_BINS)
     shown = commanded.shown
-    of_run = _speeds(commanded.t_s[shown], commanded.q[shown], step_s, commanded.t_s[0], spans[0])
-    of_tracker = _speeds(t_s, reported, step_s, t_s[0], spans[1])
+    frame_s = commanded.t_s[shown]
+    of_run = _speeds(frame_s, commanded.q[shown], step_s, run_start_s, run_span_s)
+    of_tracker = _speeds(t_s, reported, step_s, start_s, span_s)
     if min(len(of_run), len(of_tracker)) < MIN_BINS:
         return np.zeros(0), step_s
     score, lag = _correlation(of_run, of_tracker)
-    return _peaks(score, commanded.t_s[0] - t_s[0] + step_s * lag), step_s
+    offset_s = run_start_s - start_s + step_s * lag
+    return _peaks(score, offset_s), step_s
 
 
 def _speeds(
@@ -230,21 +257,26 @@ def _speeds(
     before = np.flatnonzero(inside)
     after = after[inside]
     gap_s = t_s[after] - t_s[before]
-    cosine = np.minimum(np.abs((q[before] * q[after]).sum(axis=1)), 1)
-    chord = np.sqrt(2 - 2 * cosine)
-    speed = 4 * np.arcsin(np.minimum(chord / 2, 1)) / gap_s
-    place = np.clip((((t_s[before] + t_s[after]) / 2 - start_s) / step_s).astype(int), 0, bins - 1)
+    cosine = np.abs((q[before] * q[after]).sum(axis=1))
+    chord = np.sqrt(2 - 2 * np.minimum(cosine, 1))
+    sine = np.minimum(chord / 2, 1)
+    speed = 4 * np.arcsin(sine) / gap_s
+    middle_s = (t_s[before] + t_s[after]) / 2
+    steps = (middle_s - start_s) / step_s
+    place = np.clip(steps.astype(int), 0, bins - 1)
     good = gap_s < 3 * step_s
     place = place[good]
     speed = speed[good]
     order = np.lexsort((speed, place))
     place = place[order]
     speed = speed[order]
-    first = np.searchsorted(place, np.arange(bins))
-    count = np.searchsorted(place, np.arange(bins), side="right") - first
+    numbers = np.arange(bins)
+    first = np.searchsorted(place, numbers)
+    count = np.searchsorted(place, numbers, side="right") - first
     median = np.full(bins, np.nan)
     filled = count > 0
-    median[filled] = speed[(first + count // 2)[filled]]
+    middle = first + count // 2
+    median[filled] = speed[middle[filled]]
     return median
 
 
@@ -264,7 +296,9 @@ def _correlation(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
     b = (b - mean) * weight_b
 
     def over_lags(x: FloatArray, y: FloatArray) -> FloatArray:
-        return np.asarray(fft.irfft(fft.rfft(x, size) * np.conj(fft.rfft(y, size)), size))
+        spectrum_x = fft.rfft(x, size)
+        spectrum_y = fft.rfft(y, size)
+        return np.asarray(fft.irfft(spectrum_x * np.conj(spectrum_y), size))
 
     count = np.maximum(np.rint(over_lags(weight_a, weight_b)), 0)
     sum_a = over_lags(a, weight_b)
@@ -273,14 +307,18 @@ def _correlation(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
         covariance = over_lags(a, b) - sum_a * sum_b / count
         spread_a = over_lags(a * a, weight_b) - sum_a**2 / count
         spread_b = over_lags(weight_a, b * b) - sum_b**2 / count
-        floor = 1e-9 * max(float((a * a).sum()), 1e-300)
-        r = np.where(
-            (spread_a > floor) & (spread_b > floor), covariance / np.sqrt(spread_a * spread_b), 0.0
-        )
-    enough = count >= max(MIN_BINS, MIN_OVERLAP * min(weight_a.sum(), weight_b.sum()))
-    r = np.clip(np.where(enough, np.nan_to_num(r), 0.0), 0.0, 1 - 1e-9)
+        power_a = float((a * a).sum())
+        floor = 1e-9 * max(power_a, 1e-300)
+        varies = (spread_a > floor) & (spread_b > floor)
+        r = covariance / np.sqrt(spread_a * spread_b)
+        r = np.where(varies, r, 0.0)
+    fewer = min(weight_a.sum(), weight_b.sum())
+    enough = count >= max(MIN_BINS, MIN_OVERLAP * fewer)
+    r = np.where(enough, np.nan_to_num(r), 0.0)
+    r = np.clip(r, 0.0, 1 - 1e-9)
+    information = -count * np.log1p(-(r**2))
     lag = np.arange(size)
-    return -count * np.log1p(-(r**2)), np.where(lag < len(a), lag, lag - size)
+    return information, np.where(lag < len(a), lag, lag - size)
 
 
 def _peaks(score: FloatArray, at: FloatArray) -> FloatArray:
@@ -289,8 +327,12 @@ def _peaks(score: FloatArray, at: FloatArray) -> FloatArray:
     score = score[order]
     at = at[order]
     inner = np.r_[-np.inf, score, -np.inf]
-    peak = np.flatnonzero((score >= inner[:-2]) & (score >= inner[2:]) & np.isfinite(score))
-    return at[peak[np.argsort(-score[peak])][:TRIED]]
+    rises = score >= inner[:-2]
+    falls = score >= inner[2:]
+    peak = np.flatnonzero(rises & falls & np.isfinite(score))
+    best_first = np.argsort(-score[peak])
+    highest = peak[best_first][:TRIED]
+    return at[highest]
 
 
 @dataclass(frozen=True)
@@ -350,9 +392,9 @@ class ClockSolver:
         self.stretch_s = 0.0
         self._align()
         used = self._robust(-coarse.offset_s)
-        covariance = np.linalg.inv(
-            self._prior(0.0)[0] + np.diag([1.0, 1.0, 1.0, 0.0, 0.0]) / AGREE_ARCSEC**2
-        )
+        precision, _ = self._prior(0.0)
+        loose = np.diag([1.0, 1.0, 1.0, 0.0, 0.0]) / AGREE_ARCSEC**2
+        covariance = np.linalg.inv(precision + loose)
         for _ in range(REFINED):
             used = used & self.free
             if used.sum() < MIN_USED:
@@ -381,21 +423,19 @@ class ClockSolver:
         if step is not None:
             turn = from_rotation_vector(step[:3] / ARCSEC_PER_RAD)
             self.rotation = normalise(multiply(turn, self.rotation))
-            self.delay_s, self.stretch_s = (
-                self.delay_s + float(step[3]),
-                self.stretch_s + float(step[4]),
-            )
+            self.delay_s += float(step[3])
+            self.stretch_s += float(step[4])
         plain = self.tau_s - self.delay_s
         self.share = (plain - self.start_s) / self.span_s
         self.t_s = plain - self.stretch_s * self.share
         self.moments = self.commanded.at(self.t_s)
         known = self.moments.known
         self.free = known & (self.moments.held_s == 0)
-        turn = multiply(
-            multiply(self.reported, conjugate(self.moments.q)), conjugate(self.rotation)
-        )
+        reported_from_commanded = multiply(self.reported, conjugate(self.moments.q))
+        turn = multiply(reported_from_commanded, conjugate(self.rotation))
+        turn_rad = to_rotation_vector(turn[known])
         self.residual = np.full((len(self.t_s), 3), np.nan)
-        self.residual[known] = ARCSEC_PER_RAD * to_rotation_vector(turn[known])
+        self.residual[known] = ARCSEC_PER_RAD * turn_rad
 
     def _design(self, rows: BoolArray) -> FloatArray:
         """The change of the residuals per unit of bias (arcsec), delay and stretch (s): (3,
@@ -411,10 +451,11 @@ class ClockSolver:
 
     def _prior(self, delay_s: float) -> tuple[FloatArray, FloatArray]:
         """The prior's precision (5, 5), and its pull (5,) towards it."""
-        precision = np.array([0, 0, 0, 1 / OFFSET_PRIOR_S**2, 1 / (DRIFT_PRIOR * self.span_s) ** 2])
-        return np.diag(precision), precision * np.array(
-            [0, 0, 0, delay_s - self.delay_s, -self.stretch_s]
-        )
+        of_delay = 1 / OFFSET_PRIOR_S**2
+        of_stretch = 1 / (DRIFT_PRIOR * self.span_s) ** 2
+        precision = np.array([0, 0, 0, of_delay, of_stretch])
+        away = np.array([0, 0, 0, delay_s - self.delay_s, -self.stretch_s])
+        return np.diag(precision), precision * away
 
     def _robust(self, begun_s: float) -> BoolArray:
         """Bias and clock by Tukey's weights, scaled for each axis; which answers (n,) are not
@@ -436,26 +477,32 @@ class ClockSolver:
                 right = right + scaled.T @ residual[:, axis]
             step = np.asarray(np.linalg.solve(normal, right), dtype=np.float64)
             self._align(step)
-            if max(np.abs(step[:3]).max(), 1e3 * np.abs(step[3:]).max()) < DONE_ARCSEC:
+            bias_step = np.abs(step[:3]).max()
+            clock_step = 1e3 * np.abs(step[3:]).max()
+            if max(bias_step, clock_step) < DONE_ARCSEC:
                 break
         used: BoolArray = self.free.copy()
         if used.sum() >= MIN_USED:
-            used[self.free] = weights_of(self.residual[self.free])[1] > 0
+            _, weight = weights_of(self.residual[self.free])
+            used[self.free] = weight > 0
         return used
 
     def _refine(self, used: BoolArray, begun_s: float) -> FloatArray:
         """One generalised least squares step; its covariance (5, 5)."""
         design = self._design(used)
         residual = self.residual[used]
-        place = places_of(to_matrix(self.moments.q[used]), self.scale.focal_px, self.scale.roll_px)
+        axes = to_matrix(self.moments.q[used])
+        place = places_of(axes, self.scale.focal_px, self.scale.roll_px)
         normal, right = self._prior(begun_s)
         smooth = most_likely(place, residual)
         pulls = np.zeros((len(residual), 5))
         for axis in range(3):
-            whitened = smooth.whiten(np.column_stack([design[axis], residual[:, axis]]), axis)
-            normal = normal + design[axis].T @ whitened[:, :5]
+            columns = np.column_stack([design[axis], residual[:, axis]])
+            whitened = smooth.whiten(columns, axis)
+            white_design = whitened[:, :5]
+            normal = normal + design[axis].T @ white_design
             right = right + design[axis].T @ whitened[:, 5]
-            pulls += whitened[:, :5] * residual[:, axis : axis + 1]
+            pulls += white_design * residual[:, axis : axis + 1]
         covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
         self._align(covariance @ right)
         return honest(covariance, pulls, place)
@@ -469,12 +516,15 @@ def honest(covariance: FloatArray, pulls: FloatArray, place: FloatArray) -> Floa
     """
     centre = centres_of(place, PART_PX)
     _, part = cKDTree(centre).query(place)
-    sums = np.stack(
-        [np.bincount(part, column, minlength=len(centre)) for column in pulls.T], axis=1
-    )
+    parts = len(centre)
+    columns = []
+    for column in pulls.T:
+        columns.append(np.bincount(part, column, minlength=parts))
+    sums = np.stack(columns, axis=1)
     sums = sums - sums.mean(axis=0)
     spread = covariance @ (sums.T @ sums) @ covariance
-    growth = np.sqrt(np.maximum(np.diag(spread) / np.diag(covariance), 1.0))
+    ratio = np.diag(spread) / np.diag(covariance)
+    growth = np.sqrt(np.maximum(ratio, 1.0))
     return np.asarray(covariance * np.outer(growth, growth))
 
 
@@ -483,10 +533,13 @@ def weights_of(residual_arcsec: FloatArray) -> tuple[FloatArray, FloatArray]:
     for a wild answer.
     """
     off = residual_arcsec - np.median(residual_arcsec, axis=0)
-    sigma = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off), axis=0), FLOOR_ARCSEC)
+    deviation = np.median(np.abs(off), axis=0)
+    sigma = np.maximum(MAD_TO_SIGMA * deviation, FLOOR_ARCSEC)
     squared = ((off / sigma) ** 2).sum(axis=1)
-    near = (squared < CUT_SIGMAS**2) & ((off**2).sum(axis=1) < AGREE_ARCSEC**2)
-    return sigma, np.where(near, (1 - squared / CUT_SIGMAS**2) ** 2, 0.0)
+    squared_arcsec2 = (off**2).sum(axis=1)
+    near = (squared < CUT_SIGMAS**2) & (squared_arcsec2 < AGREE_ARCSEC**2)
+    weight = (1 - squared / CUT_SIGMAS**2) ** 2
+    return sigma, np.where(near, weight, 0.0)
 
 
 @dataclass(frozen=True)
@@ -508,9 +561,12 @@ class Smooth:
         """An axis's inverse covariance times columns (n, k)."""
         if self.bumps is None or self.kappa[axis] == 0:
             return np.asarray(columns / self.variance[axis])
-        share = self.kappa[axis] / (1 + self.kappa[axis] * self.square)
-        inner = self.turn @ (share[:, None] * (self.turn.T @ (self.bumps.T @ columns)))
-        return np.asarray((columns - self.bumps @ inner) / self.variance[axis])
+        kappa = self.kappa[axis]
+        share = kappa / (1 + kappa * self.square)
+        turned = self.turn.T @ (self.bumps.T @ columns)
+        inner = self.turn @ (share[:, None] * turned)
+        rest = columns - self.bumps @ inner
+        return np.asarray(rest / self.variance[axis])
 
 
 def most_likely(place: FloatArray, residual: FloatArray) -> Smooth:
@@ -526,7 +582,8 @@ def most_likely(place: FloatArray, residual: FloatArray) -> Smooth:
     while spacing <= MAX_SPACING_PX:
         centre = centres_of(place, spacing)
         if 1 < len(centre) <= min(MAX_BUMPS, n // 8):
-            variances, likelihood = _variances(bumps_at(place, centre, spacing), centred)
+            bumps = bumps_at(place, centre, spacing)
+            variances, likelihood = _variances(bumps, centred)
             if likelihood > likely:
                 best = variances
                 likely = likelihood
@@ -538,7 +595,8 @@ def most_likely(place: FloatArray, residual: FloatArray) -> Smooth:
 
 def _variances(bumps: sparse.csr_matrix, left: FloatArray) -> tuple[Smooth, float]:
     """The most likely variances with these bumps, and the logarithm of their likelihood."""
-    square, turn = linalg.eigh(np.asarray((bumps.T @ bumps).todense()), check_finite=False)
+    normal = np.asarray((bumps.T @ bumps).todense())
+    square, turn = linalg.eigh(normal, check_finite=False)
     square = np.maximum(square, 0.0)
     projected = (turn.T @ (bumps.T @ left)) ** 2  # (p, 3)
     n = len(left)
@@ -548,11 +606,14 @@ def _variances(bumps: sparse.csr_matrix, left: FloatArray) -> tuple[Smooth, floa
     likelihood = 0.0
     grown = 1 + KAPPAS[:, None] * square  # (kappas, p)
     logs = np.log(grown).sum(axis=1)
+    shares = KAPPAS[:, None] / grown
     for axis in range(3):
-        rest = total[axis] - ((KAPPAS[:, None] / grown) * projected[:, axis]).sum(axis=1)
+        explained = (shares * projected[:, axis]).sum(axis=1)
+        rest = total[axis] - explained
         rest = np.maximum(rest / n, FLOOR_ARCSEC**2)
         likelihoods = -0.5 * (n * np.log(rest) + logs)
         k = int(np.argmax(likelihoods))
-        kappa[axis], variance[axis] = KAPPAS[k], rest[k]
+        kappa[axis] = KAPPAS[k]
+        variance[axis] = rest[k]
         likelihood += float(likelihoods[k])
     return Smooth(bumps, turn, square, kappa, variance), likelihood

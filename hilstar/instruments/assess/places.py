@@ -14,7 +14,7 @@ import numpy.typing as npt
 from scipy import linalg, sparse
 from scipy.spatial import cKDTree
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.units import ARCSEC_PER_RAD
 
 ROLL_SHARE = 0.3  # usual distance of a star from the boresight, in sides of the detector
@@ -42,6 +42,12 @@ class Scale:
         return ARCSEC_PER_RAD / self.focal_px
 
 
+def spread_rows(count: int, some: int) -> IntArray:
+    """At most `some` rows of `count`, spread evenly over them."""
+    places = np.linspace(0, count - 1, some)
+    return np.unique(places.astype(int))
+
+
 def places_of(axes: FloatArray, focal_px: float, roll_px: float) -> FloatArray:
     """The places (n, 6), px, of attitudes with axes (n, 3, 3)."""
     return np.concatenate([focal_px * axes[:, 2], roll_px * axes[:, 0]], axis=1)
@@ -54,9 +60,13 @@ def centres_of(place: FloatArray, spacing_px: float) -> FloatArray:
     # cells in the order in which they were first seen
     inverse = np.argsort(np.argsort(first))[inverse]
     count = np.bincount(inverse)
-    mean = np.stack([np.bincount(inverse, column) for column in place.T], axis=1) / count[:, None]
+    sums = []
+    for column in place.T:
+        sums.append(np.bincount(inverse, column))
+    mean = np.stack(sums, axis=1) / count[:, None]
     is_kept = np.ones(len(mean), dtype=bool)
-    for a, b in sorted(cKDTree(mean).query_pairs(CLOSE * spacing_px)):
+    close_pairs = cKDTree(mean).query_pairs(CLOSE * spacing_px)
+    for a, b in sorted(close_pairs):
         if is_kept[a] and is_kept[b]:
             is_kept[b] = False
     return np.asarray(mean[is_kept])
@@ -79,14 +89,16 @@ def bumps_at(place: FloatArray, centre: FloatArray, spacing_px: float) -> sparse
 
     The bumps of a sample add to 1, so a constant fits up to the edge.
     """
-    near = cKDTree(place).sparse_distance_matrix(
-        cKDTree(centre), REACH * spacing_px, output_type="ndarray"
-    )
-    r = near["v"] / (REACH * spacing_px)
+    radius_px = REACH * spacing_px
+    tree = cKDTree(place)
+    near = tree.sparse_distance_matrix(cKDTree(centre), radius_px, output_type="ndarray")
+    r = near["v"] / radius_px
     value = (1 - r) ** 4 * (4 * r + 1)
-    total = np.bincount(near["i"], value, minlength=len(place))
-    entries = (value / total[near["i"]], (near["i"], near["j"]))
-    return sparse.csr_matrix(entries, shape=(len(place), len(centre)))
+    samples = near["i"]
+    total = np.bincount(samples, value, minlength=len(place))
+    share = value / total[samples]
+    shape = (len(place), len(centre))
+    return sparse.csr_matrix((share, (samples, near["j"])), shape=shape)
 
 
 class Projector:
@@ -100,7 +112,8 @@ class Projector:
         self.value = value
         gram = np.asarray((value.T @ value).todense())
         size = len(gram)
-        ridge = RIDGE * max(float(np.trace(gram)) / max(size, 1), 1e-30)
+        mean_diagonal = float(np.trace(gram)) / max(size, 1)
+        ridge = RIDGE * max(mean_diagonal, 1e-30)
         gram[np.diag_indices_from(gram)] += ridge
         self._factor = linalg.cho_factor(gram, lower=True, overwrite_a=True, check_finite=False)
         inverse, _ = linalg.lapack.dpotri(self._factor[0], lower=1)
@@ -108,5 +121,6 @@ class Projector:
 
     def fit(self, wanted: FloatArray) -> FloatArray:
         """The fit (n, k) to values (n, k)."""
-        coefficient = linalg.cho_solve(self._factor, self.value.T @ wanted, check_finite=False)
+        projected = self.value.T @ wanted
+        coefficient = linalg.cho_solve(self._factor, projected, check_finite=False)
         return np.asarray(self.value @ coefficient)

@@ -5,7 +5,8 @@ import os
 import stat
 from pathlib import Path
 
-from hilstar.attitude.wire.roads import ANSWERS, MAX_READ_BYTES, ByteRoad, RawMessage, RoadUse
+from hilstar.attitude.wire.road_use import RoadUse
+from hilstar.attitude.wire.roads import ANSWERS, MAX_READ_BYTES, ByteRoad, RawMessage
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock

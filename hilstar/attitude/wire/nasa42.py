@@ -30,7 +30,8 @@ from hilstar.attitude.wire.links import (
     pieces,
 )
 from hilstar.attitude.wire.packet import AttitudeSample, Event, Refusal, Status, checked_sample
-from hilstar.attitude.wire.roads import RawMessage, RoadUse
+from hilstar.attitude.wire.road_use import RoadUse
+from hilstar.attitude.wire.roads import RawMessage
 from hilstar.attitude.wire.source import Conventions, Mounting, components
 from hilstar.attitude.wire.tcp import TcpRoad
 from hilstar.basics.arrays import FloatArray

@@ -23,6 +23,7 @@ from dataclasses import asdict, astuple, dataclass
 from operator import add, sub
 from typing import Any, ClassVar, NamedTuple
 
+from hilstar.attitude.wire.road_use import RoadUse
 from hilstar.basics.errors import one_line
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.closing import Closing
@@ -32,6 +33,25 @@ MAX_READ_BYTES = 65_536  # in one go
 MIN_BACK_OFF_S = 0.05
 PAUSE_S = 0.005  # a flooded receiver rests: the frame loop needs the interpreter lock
 MAX_BACK_OFF_S = 0.25  # what comes back is opened within a second
+
+ATTITUDES = RoadUse(
+    table="[attitude]",
+    where="",
+    lost="lost",
+    lost_line="{endpoint} disconnected ({why}); waiting for it to come back",
+    back="back",
+    back_line="{endpoint} is back",
+)
+ANSWERS = RoadUse(
+    table="[answers]",
+    where="[answers] ",
+    lost="answers-lost",
+    lost_line="{endpoint}: the tracker's line is lost ({why}); waiting for it",
+    back="answers-back",
+    back_line="{endpoint}: the tracker's line is back",
+    second="second-connection",
+    second_line="a second connection, from {peer}, is refused: {holder} holds the line and sends",
+)
 
 
 @dataclass(slots=True)
@@ -78,45 +98,6 @@ class RawMessage(NamedTuple):
     def waited_ns(self) -> int:
         """How long it may have waited before it was stamped, ns."""
         return 0 if self.timely else self.host_ns - self.empty_ns
-
-
-@dataclass(frozen=True, slots=True)
-class RoadUse:
-    """What a road is for, as its refusals and notices say it.
-
-    `table` has its keys in a bench file; `where` stands before its endpoint in a refusal. `lost`,
-    `back` and `second` are kinds of notices; `{endpoint}`, `{why}`, `{peer}`, `{host}` and
-    `{holder}` stand in their lines.
-    """
-
-    table: str
-    where: str
-    lost: str
-    lost_line: str
-    back: str
-    back_line: str
-    second: str = "connections-refused"
-    second_line: str = ""
-
-
-ATTITUDES = RoadUse(
-    table="[attitude]",
-    where="",
-    lost="lost",
-    lost_line="{endpoint} disconnected ({why}); waiting for it to come back",
-    back="back",
-    back_line="{endpoint} is back",
-)
-ANSWERS = RoadUse(
-    table="[answers]",
-    where="[answers] ",
-    lost="answers-lost",
-    lost_line="{endpoint}: the tracker's line is lost ({why}); waiting for it",
-    back="answers-back",
-    back_line="{endpoint}: the tracker's line is back",
-    second="second-connection",
-    second_line="a second connection, from {peer}, is refused: {holder} holds the line and sends",
-)
 
 
 class ByteRoad(Closing, ABC):

@@ -21,14 +21,8 @@ from hilstar.attitude.wire import packet as wire
 from hilstar.attitude.wire.apart import ReaderProcess
 from hilstar.attitude.wire.likeness import MAX_LOOKED_AT, unframed_packet
 from hilstar.attitude.wire.links import Decoder, StreamLink, pieces
-from hilstar.attitude.wire.roads import (
-    ATTITUDES,
-    ByteRoad,
-    RawMessage,
-    RoadUse,
-    is_readable,
-    read_device,
-)
+from hilstar.attitude.wire.road_use import RoadUse
+from hilstar.attitude.wire.roads import ATTITUDES, ByteRoad, RawMessage, is_readable, read_device
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.basics.errors import HilstarError, InputError, NotThereError, one_line
 from hilstar.basics.notices import Notices

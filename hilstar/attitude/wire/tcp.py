@@ -10,7 +10,8 @@ import socket
 
 from hilstar.attitude.wire.endpoint import AllowedSenders
 from hilstar.attitude.wire.kernel_stamps import ANCILLARY_BYTES, KernelStamps
-from hilstar.attitude.wire.roads import ATTITUDES, MAX_READ_BYTES, ByteRoad, RawMessage, RoadUse
+from hilstar.attitude.wire.road_use import RoadUse
+from hilstar.attitude.wire.roads import ATTITUDES, MAX_READ_BYTES, ByteRoad, RawMessage
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock

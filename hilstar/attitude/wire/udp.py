@@ -30,7 +30,8 @@ from hilstar.attitude.wire.endpoint import AllowedSenders, Network, UdpPlace
 from hilstar.attitude.wire.kernel_stamps import ANCILLARY_BYTES, KernelStamps
 from hilstar.attitude.wire.links import Arrival, PacketDecoder, StreamLink
 from hilstar.attitude.wire.packet import MAX_JSON_BYTES, Event, Packet, Status, encode
-from hilstar.attitude.wire.roads import ATTITUDES, PAUSE_S, ByteRoad, RawMessage, RoadUse
+from hilstar.attitude.wire.road_use import RoadUse
+from hilstar.attitude.wire.roads import ATTITUDES, PAUSE_S, ByteRoad, RawMessage
 from hilstar.attitude.wire.source import AS_SENT, SentAttitudes
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices

@@ -30,14 +30,8 @@ from hilstar.attitude.wire.keys import (
     load_public,
     load_secret,
 )
-from hilstar.attitude.wire.roads import (
-    ATTITUDES,
-    PAUSE_S,
-    ByteRoad,
-    LinkCounts,
-    RawMessage,
-    RoadUse,
-)
+from hilstar.attitude.wire.road_use import RoadUse
+from hilstar.attitude.wire.roads import ATTITUDES, PAUSE_S, ByteRoad, LinkCounts, RawMessage
 from hilstar.attitude.wire.zmq_peer import PeerLook
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices

@@ -45,8 +45,8 @@ from hilstar.server.gige.control import (
     Resend,
 )
 from hilstar.server.gige.description import describe
+from hilstar.server.gige.features import ACQUISITION_MODES
 from hilstar.server.gige.registers import (
-    ACQUISITION_MODES,
     STREAM_DELAY,
     STREAM_SOURCE_PORT,
     CameraIdentity,

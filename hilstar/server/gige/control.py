@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from hilstar.basics.units import NS_PER_MS
+from hilstar.server.gige.features import WORD_BYTES
 from hilstar.server.gige.registers import (
     CONTROL,
     EXCLUSIVE,
@@ -30,7 +31,6 @@ from hilstar.server.gige.registers import (
     STREAM_ADDRESS,
     STREAM_PACKET_BYTES,
     STREAM_PORT,
-    WORD_BYTES,
     GvcpStatus,
     RegisterError,
     Registers,

@@ -4,10 +4,10 @@ of its registers.
 
 from xml.sax.saxutils import escape
 
+from hilstar.server.gige.feature_kinds import Feature
+from hilstar.server.gige.features import ADDRESSES, FEATURES, PIXEL_FORMATS
 from hilstar.server.gige.registers import (
-    ADDRESSES,
     CURRENT_IP,
-    FEATURES,
     HEARTBEAT_MS,
     MANUFACTURER,
     MAX_EXPOSURE_US,
@@ -17,7 +17,6 @@ from hilstar.server.gige.registers import (
     MIN_PACKET_BYTES,
     MIN_RATE_HZ,
     MODEL,
-    PIXEL_FORMATS,
     SERIAL,
     STREAM_ADDRESS,
     STREAM_DELAY,
@@ -28,7 +27,6 @@ from hilstar.server.gige.registers import (
     TIME_HIGH,
     USER_NAME,
     CameraSettings,
-    Feature,
 )
 
 PORT = "<pPort>Device</pPort>"

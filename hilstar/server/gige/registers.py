@@ -18,14 +18,21 @@ Laws:
 import ipaddress
 import math
 import struct
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal
 
-WORD_BYTES = 4
+from hilstar.server.gige.features import (
+    ACQUISITION_MODES,
+    BY_ADDRESS,
+    FEATURES,
+    FEATURES_AT,
+    FORMAT_NAMES,
+    PIXEL_FORMATS,
+    WORD_BYTES,
+)
+
 BOOTSTRAP_BYTES = 0x1000
-FEATURES_AT, DESCRIPTION_AT = 0x1_0000, 0x2_0000
+DESCRIPTION_AT = 0x2_0000
 DISCOVERY_BYTES = 0xF8  # a discovery's answer is the beginning of the memory
 
 VERSION, DEVICE_MODE, MAC_HIGH, MAC_LOW = 0x0000, 0x0004, 0x0008, 0x000C
@@ -55,7 +62,6 @@ USER_NAME_BYTES = 16
 
 MIN_EXPOSURE_US, MAX_EXPOSURE_US = 10.0, 60e6
 MIN_RATE_HZ, MAX_GAIN_DB = 0.01, 24.0
-ACQUISITION_MODES = {"Continuous": 0, "SingleFrame": 1, "MultiFrame": 2}
 # A client that grabs holds these: images of two formats would look alike on the wire.
 LOCKED_WHILE_STREAMING = {"PixelFormat", "AcquisitionMode", "AcquisitionFrameCount"}
 
@@ -80,103 +86,6 @@ class RegisterError(Exception):
     def __init__(self, status: GvcpStatus) -> None:
         super().__init__(status.name)
         self.status = status
-
-
-@dataclass(frozen=True, slots=True)
-class PixelFormat:
-    """A GenICam pixel format: its number, bits of a value, and bits that a pixel takes."""
-
-    number: int
-    bits: int
-    stored_bits: int
-
-
-PIXEL_FORMATS = {
-    "Mono8": PixelFormat(0x0108_0001, 8, 8),
-    "Mono10": PixelFormat(0x0110_0003, 10, 16),
-    "Mono10Packed": PixelFormat(0x010C_0004, 10, 12),
-    "Mono12": PixelFormat(0x0110_0005, 12, 16),
-    "Mono12Packed": PixelFormat(0x010C_0006, 12, 12),
-    "Mono14": PixelFormat(0x0110_0025, 14, 16),
-    "Mono16": PixelFormat(0x0110_0007, 16, 16),
-}
-FORMAT_NAMES = {form.number: name for name, form in PIXEL_FORMATS.items()}
-
-
-@dataclass(frozen=True, slots=True)
-class Feature:
-    """A register of the camera's own, as GenICam's naming convention (SFNC) calls it.
-
-    `access` is RO, RW or WO; `entries` are an enumeration's names and numbers.
-    """
-
-    name: str
-    kind: Literal["integer", "float", "enumeration", "command"]
-    category: str
-    access: Literal["RO", "RW", "WO"]
-    about: str
-    unit: str = ""
-    entries: Mapping[str, int] = field(default_factory=dict)
-
-
-FEATURES = (
-    Feature("Width", "integer", "ImageFormatControl", "RO", "Columns of an image.", "px"),
-    Feature("Height", "integer", "ImageFormatControl", "RO", "Rows of an image.", "px"),
-    Feature("SensorWidth", "integer", "ImageFormatControl", "RO", "Columns of the sensor.", "px"),
-    Feature("SensorHeight", "integer", "ImageFormatControl", "RO", "Rows of the sensor.", "px"),
-    Feature("OffsetX", "integer", "ImageFormatControl", "RO", "First column.", "px"),
-    Feature("OffsetY", "integer", "ImageFormatControl", "RO", "First row.", "px"),
-    Feature("PixelFormat", "enumeration", "ImageFormatControl", "RW", "How DN are packed."),
-    Feature("PayloadSize", "integer", "TransportLayerControl", "RO", "Bytes of an image.", "B"),
-    Feature("TLParamsLocked", "integer", "TransportLayerControl", "RW", "1 while a client grabs."),
-    Feature(
-        "AcquisitionMode",
-        "enumeration",
-        "AcquisitionControl",
-        "RW",
-        "How many images a start gives.",
-        entries=ACQUISITION_MODES,
-    ),
-    Feature("AcquisitionStart", "command", "AcquisitionControl", "WO", "Begin."),
-    Feature("AcquisitionStop", "command", "AcquisitionControl", "WO", "End."),
-    Feature(
-        "AcquisitionFrameCount", "integer", "AcquisitionControl", "RW", "Images of MultiFrame."
-    ),
-    Feature(
-        "AcquisitionFrameRate", "float", "AcquisitionControl", "RW", "Exposures a second.", "Hz"
-    ),
-    Feature("ExposureTime", "float", "AcquisitionControl", "RW", "Of an image.", "us"),
-    Feature(
-        "TriggerSelector",
-        "enumeration",
-        "AcquisitionControl",
-        "RW",
-        "What is triggered.",
-        entries={"FrameStart": 0},
-    ),
-    Feature(
-        "TriggerMode",
-        "enumeration",
-        "AcquisitionControl",
-        "RW",
-        "On: an exposure begins with TriggerSoftware alone.",
-        entries={"Off": 0, "On": 1},
-    ),
-    Feature(
-        "TriggerSource",
-        "enumeration",
-        "AcquisitionControl",
-        "RW",
-        "Where triggers come from.",
-        entries={"Software": 0},
-    ),
-    Feature("TriggerSoftware", "command", "AcquisitionControl", "WO", "Begin one exposure."),
-    Feature("Gain", "float", "AnalogControl", "RW", "Over that of the bench file.", "dB"),
-)
-ADDRESSES = {
-    feature.name: FEATURES_AT + WORD_BYTES * index for index, feature in enumerate(FEATURES)
-}
-BY_ADDRESS = {ADDRESSES[feature.name]: feature for feature in FEATURES}
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.server.gige.registers import PIXEL_FORMATS, CameraSettings, GvcpStatus
+from hilstar.server.gige.features import PIXEL_FORMATS
+from hilstar.server.gige.registers import CameraSettings, GvcpStatus
 
 HEADER = struct.Struct(">HHI")
 LEADER_BODY = struct.Struct(">HHIIIIIIIHH")

@@ -13,11 +13,9 @@ from hypothesis import strategies as st
 from hilstar.basics.units import NS_PER_MS
 from hilstar.server.gige.control import ControlChannel, FeatureCommand, Released, Resend
 from hilstar.server.gige.description import describe
+from hilstar.server.gige.features import ADDRESSES, FEATURES, PIXEL_FORMATS
 from hilstar.server.gige.registers import (
-    ADDRESSES,
     DESCRIPTION_AT,
-    FEATURES,
-    PIXEL_FORMATS,
     CameraIdentity,
     CameraSettings,
     GvcpStatus,

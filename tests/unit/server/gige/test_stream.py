@@ -7,7 +7,8 @@ import struct
 import numpy as np
 import pytest
 
-from hilstar.server.gige.registers import PIXEL_FORMATS, CameraSettings
+from hilstar.server.gige.features import PIXEL_FORMATS
+from hilstar.server.gige.registers import CameraSettings
 from hilstar.server.gige.stream import LAST_BLOCK, image_block, next_block, packed
 
 RNG = np.random.default_rng(5)

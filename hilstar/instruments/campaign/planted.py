@@ -98,8 +98,11 @@ class CaseTracker:
         planted = self._planted
         conditions = self._conditions
         end_s = conditions.fault_end_s
-        since_s = math.inf if end_s is None else middle_s - end_s
-        rate_deg_s = math.degrees(float(np.linalg.norm(exposure.view.turn.rate_cam_rad_s)))
+        since_s = math.inf
+        if end_s is not None:
+            since_s = middle_s - end_s
+        rate_rad_s = float(np.linalg.norm(exposure.view.turn.rate_cam_rad_s))
+        rate_deg_s = math.degrees(rate_rad_s)
         fastest, most = planted.max_rate_deg_s, planted.max_false_stars
         silent = {
             "missing": self._rng.random() < planted.missing,
@@ -109,7 +112,10 @@ class CaseTracker:
             "max_false_stars": most is not None and conditions.false_stars > most,
             "exclusion_deg": conditions.body_deg < planted.exclusion_deg,
         }
-        return next((f"planted: {name}" for name, is_silent in silent.items() if is_silent), "")
+        for name, is_silent in silent.items():
+            if is_silent:
+                return f"planted: {name}"
+        return ""
 
     def _turned(self, q: FloatArray) -> FloatArray:
         planted = self._planted
@@ -120,9 +126,8 @@ class CaseTracker:
             q = from_radec_roll_deg(ra_deg, dec_deg, float(self._rng.uniform(0, 360)))
         noise = np.array(planted.noise_arcsec) * self._rng.standard_normal(3)
         error_rad = (np.array(planted.bias_arcsec) + noise) / ARCSEC_PER_RAD
-        error_rad = error_rad + planted.aberration * aberration_rad(
-            q, self._conditions.velocity_km_s
-        )
+        turn_rad = aberration_rad(q, self._conditions.velocity_km_s)
+        error_rad = error_rad + planted.aberration * turn_rad
         error_rad = error_rad + self._conditions.old_places_rad
         return multiply(from_rotation_vector(error_rad), q)
 
@@ -156,7 +161,8 @@ class CaseTracker:
             noise_px = planted.star_noise_px * self._rng.standard_normal(2)
             dn = star.dn
             if dn is not None and len(matched):
-                dn *= 10 ** (-0.4 * planted.star_colour * float(match.lit.bv[matched[0]]))
+                bv = float(match.lit.bv[matched[0]])
+                dn *= 10 ** (-0.4 * planted.star_colour * bv)
             x_px = star.x_px + float(noise_px[0]) + wave_x_px
             y_px = star.y_px + float(noise_px[1]) + wave_y_px
             stars.append(ReportedStar(x_px, y_px, dn, star.hip))
@@ -183,7 +189,11 @@ def lit_stars(exposure: Exposure) -> LitStars:
         off_x = np.abs(truth["x_px"] - (width - 1) / 2)
         off_y = np.abs(truth["y_px"] - (height - 1) / 2)
         inside = (off_x <= width / 2) & (off_y <= height / 2)
-    real = ~np.isin(truth["name"], exposure.faults) if exposure.faults else inside
-    lit = truth[inside & real & truth["drawn"] & (truth["electrons_per_s"] > 0)]
-    names = ("x_px", "y_px", "v_mag", "bv", "electrons_per_s")
-    return LitStars(*(np.asarray(lit[name], dtype=np.float64) for name in names))
+    chosen = inside & truth["drawn"] & (truth["electrons_per_s"] > 0)
+    if exposure.faults:
+        chosen &= ~np.isin(truth["name"], exposure.faults)
+    lit = truth[chosen]
+    columns = []
+    for name in ("x_px", "y_px", "v_mag", "bv", "electrons_per_s"):
+        columns.append(np.asarray(lit[name], dtype=np.float64))
+    return LitStars(*columns)

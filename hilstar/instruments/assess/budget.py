@@ -103,52 +103,68 @@ def assess_run(
     them are wild.
     """
     clock = ClockSolver(commanded, tau_s, reported, scale).fit(coarse)
-    known = clock.moments.known
-    held = clock.moments.known & (clock.moments.held_s > 0)
+    moments = clock.moments
+    known = moments.known
+    held = known & (moments.held_s > 0)
     free = known & ~held
-    if known.sum() < MIN_ROWS:
+    _refuse_few(known, held, clock.used)
+    deviation_arcsec = np.abs(clock.residual_arcsec[clock.used][:, :2])
+    largest_arcsec = float(np.median(deviation_arcsec, axis=0).max())
+    spread_arcsec = MAD_TO_SIGMA * largest_arcsec
+    if spread_arcsec > MAX_SPREAD_ARCSEC:
         raise InputError(
-            f"{int(known.sum())} answers fall into the run, and {MIN_ROWS} are needed; give longer"
+            f"the answers scatter by {spread_arcsec:.4g} arcsec about the commanded attitudes: they"
+            " are of another run"
+        )
+    bias_arcsec = ARCSEC_PER_RAD * to_rotation_vector(clock.rotation)
+    total_arcsec = clock.residual_arcsec + bias_arcsec
+    right, parts = _right_answers(total_arcsec, moments.q, clock.used, scale)
+    intervals = intervals_of(parts, rng, clock.sigma_bias_arcsec)
+    decomposed = _decomposed(parts, intervals, free, right, moments.q, moments.rate_rad_s)
+    ingredients = vars(decomposed).copy()
+    astray = held & _beyond_turn(clock, parts)
+    ingredients["wrong"] = np.sort(np.append(decomposed.wrong, np.flatnonzero(astray)))
+    held_rows = np.flatnonzero(held & ~astray)
+    return DecomposedRun(**ingredients, clock=clock, held=held_rows)
+
+
+def _refuse_few(
+    known: npt.NDArray[np.bool_], held: npt.NDArray[np.bool_], used: npt.NDArray[np.bool_]
+) -> None:
+    """Refuse (InputError) a run with too few answers (n,): known, while no frame was held, or of
+    this sky.
+    """
+    known_count = int(known.sum())
+    held_count = int(held.sum())
+    used_count = int(used.sum())
+    free_count = known_count - held_count
+    if known_count < MIN_ROWS:
+        raise InputError(
+            f"{known_count} answers fall into the run, and {MIN_ROWS} are needed; give longer"
             " telemetry"
         )
-    if free.sum() < MIN_ROWS:
+    if free_count < MIN_ROWS:
         raise InputError(
-            f"the run missed so many frames that {int(held.sum())} of {int(known.sum())} answers"
-            f" looked while one was held, and {MIN_ROWS} others are needed; give a run that keeps"
-            " its refresh rate, or a lower [monitor] refresh_hz"
+            f"the run missed so many frames that {held_count} of {known_count} answers looked while"
+            f" one was held, and {MIN_ROWS} others are needed; give a run that keeps its refresh"
+            " rate, or a lower [monitor] refresh_hz"
         )
-    if 2 * clock.used.sum() <= free.sum():
+    if 2 * used_count <= free_count:
         raise InputError(
-            f"half or more of the answers are wild: {int(clock.used.sum())} of {int(free.sum())}"
-            " agree with one rotation"
+            f"half or more of the answers are wild: {used_count} of {free_count} agree with one"
+            " rotation"
         )
-    spread = MAD_TO_SIGMA * float(
-        np.median(np.abs(clock.residual_arcsec[clock.used][:, :2]), axis=0).max()
-    )
-    if spread > MAX_SPREAD_ARCSEC:
-        raise InputError(
-            f"the answers scatter by {spread:.4g} arcsec about the commanded attitudes: they are of"
-            " another run"
-        )
-    total = clock.residual_arcsec + ARCSEC_PER_RAD * to_rotation_vector(clock.rotation)
-    right, parts = _right_answers(total, clock.moments.q, clock.used, scale)
-    intervals = intervals_of(parts, rng, clock.sigma_bias_arcsec)
-    decomposed = _decomposed(
-        parts, intervals, free, right, clock.moments.q, clock.moments.rate_rad_s
-    )
-    astray = held & _beyond_turn(clock, parts)
-    wrong = np.sort(np.append(decomposed.wrong, np.flatnonzero(astray)))
-    return DecomposedRun(
-        **{**vars(decomposed), "wrong": wrong}, clock=clock, held=np.flatnonzero(held & ~astray)
-    )
 
 
 def _beyond_turn(clock: ClockFit, parts: Components) -> npt.NDArray[np.bool_]:
     """Answers (n,) further off than noise and the field's turn while a frame was held explain."""
     moments = clock.moments
-    turned = ARCSEC_PER_RAD * np.linalg.norm(moments.rate_rad_s, axis=1) * moments.held_s
-    noise = float(np.sqrt(np.maximum(parts.noise_variance, FLOOR_ARCSEC**2).sum()))
-    return np.asarray(np.linalg.norm(clock.residual_arcsec, axis=1) > turned + CUT_SIGMAS * noise)
+    rate_arcsec_s = ARCSEC_PER_RAD * np.linalg.norm(moments.rate_rad_s, axis=1)
+    turned_arcsec = rate_arcsec_s * moments.held_s
+    variance = np.maximum(parts.noise_variance, FLOOR_ARCSEC**2)
+    noise_arcsec = float(np.sqrt(variance.sum()))
+    off_arcsec = np.linalg.norm(clock.residual_arcsec, axis=1)
+    return np.asarray(off_arcsec > turned_arcsec + CUT_SIGMAS * noise_arcsec)
 
 
 def assess_cases(
@@ -164,25 +180,30 @@ def assess_cases(
     `rate_rad_s` (n, 3), cam, is the rate of each case. Raises InputError for fewer than MIN_ROWS
     answers, or half of them wild.
     """
-    known = np.asarray(np.isfinite(reported).all(axis=1) & np.isfinite(commanded).all(axis=1))
-    if known.sum() < MIN_ROWS:
-        raise InputError(f"{int(known.sum())} answers, and {MIN_ROWS} are needed; plan more cases")
+    is_reported = np.isfinite(reported).all(axis=1)
+    is_commanded = np.isfinite(commanded).all(axis=1)
+    known = np.asarray(is_reported & is_commanded)
+    known_count = int(known.sum())
+    if known_count < MIN_ROWS:
+        raise InputError(f"{known_count} answers, and {MIN_ROWS} are needed; plan more cases")
+    turn = multiply(reported[known], conjugate(commanded[known]))
     error = np.full((len(reported), 3), np.nan)
-    error[known] = ARCSEC_PER_RAD * to_rotation_vector(
-        multiply(reported[known], conjugate(commanded[known]))
-    )
+    error[known] = ARCSEC_PER_RAD * to_rotation_vector(turn)
+    _, weight = weights_of(error[known])
     used = known.copy()
-    used[known] = weights_of(error[known])[1] > 0
-    if 2 * used.sum() <= known.sum():
+    used[known] = weight > 0
+    used_count = int(used.sum())
+    if 2 * used_count <= known_count:
         raise InputError(
-            f"half or more of the answers are wild: {int(used.sum())} of {int(known.sum())} agree"
+            f"half or more of the answers are wild: {used_count} of {known_count} agree"
         )
     if rate_rad_s is None:
         rate = np.zeros_like(error)
     else:
         rate = rate_rad_s
     right, parts = _right_answers(error, commanded, used, scale)
-    return _decomposed(parts, intervals_of(parts, rng), known, right, commanded, rate)
+    intervals = intervals_of(parts, rng)
+    return _decomposed(parts, intervals, known, right, commanded, rate)
 
 
 def _right_answers(
@@ -210,6 +231,7 @@ def _decomposed(
 ) -> Decomposed:
     right = np.zeros(len(known), dtype=bool)
     right[row] = True
+    reasons = (parts.fov.reason, parts.pixel.reason)
     return Decomposed(
         bias_arcsec=parts.mean,
         fov_arcsec=_told(parts.fov),
@@ -221,7 +243,7 @@ def _decomposed(
         wrong=np.flatnonzero(known & ~right),
         commanded_q=q[row],
         rate_rad_s=rate[row],
-        notes=tuple(component.reason for component in (parts.fov, parts.pixel) if component.reason),
+        notes=tuple(filter(None, reasons)),
     )
 
 
@@ -231,15 +253,19 @@ def _stray(parts: Components, error_arcsec: FloatArray) -> npt.NDArray[np.bool_]
     """
     sigma = np.sqrt(np.maximum(parts.noise_variance, FLOOR_ARCSEC**2))
     off = error_arcsec - np.median(error_arcsec, axis=0)
-    usual = np.maximum(MAD_TO_SIGMA * np.median(np.abs(off), axis=0), FLOOR_ARCSEC)
+    deviation = np.median(np.abs(off), axis=0)
+    usual = np.maximum(MAD_TO_SIGMA * deviation, FLOOR_ARCSEC)
     out_of_noise = ((parts.left / sigma) ** 2).sum(axis=1) > CUT_SIGMAS**2
-    return np.asarray(out_of_noise & (((off / usual) ** 2).sum(axis=1) > UNUSUAL_SIGMAS**2))
+    unusual = ((off / usual) ** 2).sum(axis=1) > UNUSUAL_SIGMAS**2
+    return np.asarray(out_of_noise & unusual)
 
 
 def axes_of_variance(variance: FloatArray) -> Axes:
     """One sigma across and about the boresight from the variances (3,) of the camera's axes."""
     x, y, z = np.maximum(variance, 0.0).tolist()
-    return Axes(float(np.sqrt((x + y) / 2)), float(np.sqrt(z)))
+    cross = float(np.sqrt((x + y) / 2))
+    roll = float(np.sqrt(z))
+    return Axes(cross, roll)
 
 
 def _told(part: Component) -> Axes:
@@ -265,29 +291,32 @@ def intervals_of(
     block = np.arange(n) * blocks // n
     count = np.bincount(block).astype(float)
 
-    def sums(values: FloatArray) -> FloatArray:
-        return np.stack([np.bincount(block, column) for column in values.T], axis=1)
-
     drawn = rng.integers(0, blocks, (DRAWS, blocks))
     rows = count[drawn].sum(axis=1)[:, None]
-    total = sums(residual + fov.fitted + pixel.fitted)[drawn].sum(axis=1) / rows
+
+    def means(values: FloatArray) -> FloatArray:
+        sums = []
+        for column in values.T:
+            sums.append(np.bincount(block, column))
+        by_block = np.stack(sums, axis=1)
+        return np.asarray(by_block[drawn].sum(axis=1) / rows)
+
+    total = means(residual + fov.fitted + pixel.fitted)
     spread = np.std(total, axis=0)
     if sigma_bias_arcsec is not None:
         spread = np.maximum(spread, sigma_bias_arcsec)
+    half_width = HALF_OF_95 * spread
     freedom = n - 1 - fov.freedom - pixel.freedom
-    noise = sums(residual**2)[drawn].sum(axis=1) / rows * (n / max(freedom, 1.0))
-    repeating = []
-    for component in (fov, pixel):
-        repeating.append(
-            np.maximum(
-                sums(component.fitted**2)[drawn].sum(axis=1) / rows - component.freedom / n * noise,
-                0.0,
-            )
-        )
+    noise = means(residual**2) * (n / max(freedom, 1.0))
+
+    def repeating(component: Component) -> FloatArray:
+        noise_in_fit = component.freedom / n * noise
+        return np.maximum(means(component.fitted**2) - noise_in_fit, 0.0)
+
     return Intervals(
-        bias=np.stack([parts.mean - HALF_OF_95 * spread, parts.mean + HALF_OF_95 * spread]),
-        fov=_covered(repeating[0]),
-        pixel=_covered(repeating[1]),
+        bias=np.stack([parts.mean - half_width, parts.mean + half_width]),
+        fov=_covered(repeating(fov)),
+        pixel=_covered(repeating(pixel)),
         noise=_covered(noise),
     )
 
@@ -296,5 +325,7 @@ def _covered(variance: FloatArray) -> FloatArray:
     """Low and high of one sigma across and about the boresight, (2, 2), from drawn variances
     (draws, 3).
     """
-    axes = np.sqrt(np.stack([variance[:, :2].mean(axis=1), variance[:, 2]], axis=1))
+    across = variance[:, :2].mean(axis=1)
+    about = variance[:, 2]
+    axes = np.sqrt(np.stack([across, about], axis=1))
     return np.asarray(np.percentile(axes, COVERED, axis=0))

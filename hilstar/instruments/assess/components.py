@@ -35,7 +35,14 @@ from scipy import sparse
 
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.rotation import conjugate, multiply, normalise, to_matrix, to_rotation_vector
-from hilstar.instruments.assess.places import Projector, Scale, bumps_at, centres_of, places_of
+from hilstar.instruments.assess.places import (
+    Projector,
+    Scale,
+    bumps_at,
+    centres_of,
+    places_of,
+    spread_rows,
+)
 
 MIN_ROWS = 30
 TURNS = 3  # fits of bumps and waves by turns
@@ -49,9 +56,10 @@ COARSEST_SHARE = 0.25  # largest spacing, in sides of the detector
 MAX_BUMPS = 1500
 MIN_EXTENT_PX = 40.0
 # Waves.
-HARMONICS = ((1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2))  # cycles per pixel along x and y
+Harmonics = tuple[tuple[int, int], ...]  # cycles per pixel along x and y
+HARMONICS: Harmonics = ((1, 0), (0, 1), (1, 1), (1, -1), (2, 0), (0, 2))
 # 89 % of a saw's power; two harmonics have 76 %
-SHARP_HARMONICS = (*HARMONICS, (3, 0), (0, 3), (4, 0), (0, 4), (5, 0), (0, 5))
+SHARP_HARMONICS: Harmonics = (*HARMONICS, (3, 0), (0, 3), (4, 0), (0, 4), (5, 0), (0, 5))
 LOCAL_HARMONICS = ((1, 0), (0, 1))
 LOCAL_SPACINGS_PX = (160.0, 80.0, 40.0, 20.0)
 MAX_LOCAL = 3000
@@ -125,14 +133,18 @@ def components_of(
         fov = replace(pixel, reason=bumps_note)
     for turn in range(TURNS):
         if bumps is not None:
-            fov = replace(_component(bumps, about - pixel.fitted, pixel.freedom), detail=bumps_note)
+            fov = _component(bumps, about - pixel.fitted, pixel.freedom)
+            fov = replace(fov, detail=bumps_note)
+        without_fov = about - fov.fitted
         if turn == 0:
-            waves, pixel = _waves(about - fov.fitted, q_icrs_to_cam, scale, extent, bumps)
+            waves, pixel = _waves(without_fov, q_icrs_to_cam, scale, extent, bumps)
         if waves is None:
             break
-        pixel = replace(_component(waves, about - fov.fitted, fov.freedom), detail=pixel.detail)
+        fit = _component(waves, without_fov, fov.freedom)
+        pixel = replace(fit, detail=pixel.detail)
     residual = about - fov.fitted - pixel.fitted
-    noise = (residual**2).sum(axis=0) / max(len(residual) - 1 - fov.freedom - pixel.freedom, 1.0)
+    freedom = len(residual) - 1 - fov.freedom - pixel.freedom
+    noise = (residual**2).sum(axis=0) / max(freedom, 1.0)
     return Components(mean, fov, pixel, noise, residual, extent)
 
 
@@ -140,11 +152,11 @@ def _component(functions: Projector, wanted: FloatArray, other_freedom: float) -
     """The fit of functions to (n, 3), and its variance less the noise in it."""
     n = len(wanted)
     fitted = functions.fit(wanted)
-    noise = ((wanted - fitted) ** 2).sum(axis=0) / max(
-        n - 1 - functions.freedom - other_freedom, 1.0
-    )
-    variance = ((fitted**2).sum(axis=0) - functions.freedom * noise) / n
-    return Component(np.maximum(variance, 0.0), fitted, functions.freedom)
+    freedom = functions.freedom
+    free_rows = n - 1 - freedom - other_freedom
+    noise = ((wanted - fitted) ** 2).sum(axis=0) / max(free_rows, 1.0)
+    variance = ((fitted**2).sum(axis=0) - freedom * noise) / n
+    return Component(np.maximum(variance, 0.0), fitted, freedom)
 
 
 def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector | None, str]:
@@ -153,13 +165,8 @@ def _bumps(place: FloatArray, extent_px: float, scale: Scale) -> tuple[Projector
     """
     n = len(place)
     if extent_px < MIN_EXTENT_PX:
-        return (
-            None,
-            (
-                f"the star field moved by {extent_px:.3g} px only: field-of-view error cannot be"
-                " told from bias"
-            ),
-        )
+        moved = f"the star field moved by {extent_px:.3g} px only"
+        return None, f"{moved}: field-of-view error cannot be told from bias"
     spacing = FINEST_PX
     while spacing <= COARSEST_SHARE * min(scale.resolution_px):
         centre = centres_of(place, spacing)
@@ -186,14 +193,17 @@ def _waves(
             f"the star field moved by {extent_px:.3g} px only: pixel error cannot be told from bias"
         )
         return None, replace(none, reason=reason)
-    tried = [*global_phases(about, q_icrs_to_cam, scale)]
-    if bumps is not None and max(_apart(phases.columns(), bumps) for phases in tried) < APART:
-        reason = (
-            "each place within a pixel was seen at one place in the field only: pixel error cannot"
-            " be told from it"
-        )
-        return None, replace(none, reason=reason)
-    freedom = 0.0 if bumps is None else bumps.freedom
+    tried = list(global_phases(about, q_icrs_to_cam, scale))
+    freedom = 0.0
+    if bumps is not None:
+        freedom = bumps.freedom
+        largest_share = max(_apart(phases.columns(), bumps) for phases in tried)
+        if largest_share < APART:
+            reason = (
+                "each place within a pixel was seen at one place in the field only: pixel error"
+                " cannot be told from it"
+            )
+            return None, replace(none, reason=reason)
     waves, component, best = _best_of(tried, about, freedom)
     power = _surely(component, about, freedom, 0.0)
     for spacing in LOCAL_SPACINGS_PX:
@@ -201,7 +211,8 @@ def _waves(
         if columns.shape[1] > min(MAX_LOCAL, len(about) // ROWS_A_BUMP):
             break
         local = Projector(columns)
-        fit = replace(_component(local, about, freedom), detail=f"{LOCAL}, {spacing:.0f} px apart")
+        fit = _component(local, about, freedom)
+        fit = replace(fit, detail=f"{LOCAL}, {spacing:.0f} px apart")
         explained = _surely(fit, about, freedom, SURE)
         if explained > power:
             power = explained
@@ -212,16 +223,24 @@ def _waves(
             break
     if waves is None:
         return None, replace(none, detail="nothing repeats with the place within a pixel")
-    if best is not None:  # the jumps within a pixel that the waves leave unexplained
-        base = np.asarray(waves.value.todense())
-        edges = edges_of(best, base, about)
-        if edges.shape[1]:
-            waves = Projector(sparse.csr_matrix(np.concatenate([base, edges], axis=1)))
-            component = replace(
-                _component(waves, about, freedom),
-                detail=f"{component.detail}, with {edges.shape[1]} {EDGES}",
-            )
-    return waves, component
+    if best is None:
+        return waves, component
+    return _with_edges(best, waves, component, about, freedom)
+
+
+def _with_edges(
+    phases: "Phases", waves: Projector, component: Component, about: FloatArray, freedom: float
+) -> tuple[Projector, Component]:
+    """The waves with the jumps within a pixel that they leave unexplained."""
+    base = np.asarray(waves.value.todense())
+    edges = edges_of(phases, base, about)
+    edge_count = edges.shape[1]
+    if not edge_count:
+        return waves, component
+    columns = np.concatenate([base, edges], axis=1)
+    with_edges = Projector(sparse.csr_matrix(columns))
+    detail = f"{component.detail}, with {edge_count} {EDGES}"
+    return with_edges, replace(_component(with_edges, about, freedom), detail=detail)
 
 
 def _best_of(
@@ -235,19 +254,22 @@ def _best_of(
     best = None
     component = Component(NOTHING, np.zeros_like(about), 0.0)
     # With answers enough those of an error that jumps from pixel to pixel are tried as well.
-    kinds = [(HARMONICS, ""), (SHARP_HARMONICS, SHARP)][
-        : 1 + (len(about) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP)
-    ]
+    kinds = [(HARMONICS, "")]
+    if len(about) >= 2 * len(SHARP_HARMONICS) * ROWS_A_BUMP:
+        kinds.append((SHARP_HARMONICS, SHARP))
     for phases in tried:
+        sure = SURE
+        if phases.name == SOUGHT:
+            sure = SURE_OF_MANY
         for harmonics, sharp in kinds:
-            mine = Projector(sparse.csr_matrix(phases.columns(harmonics)))
-            fit = replace(_component(mine, about, freedom), detail=f"{phases.name}{sharp}")
-            explained = _surely(
-                fit, about, freedom, SURE_OF_MANY if phases.name == SOUGHT else SURE
-            )
+            columns = phases.columns(harmonics)
+            functions = Projector(sparse.csr_matrix(columns))
+            fit = _component(functions, about, freedom)
+            fit = replace(fit, detail=f"{phases.name}{sharp}")
+            explained = _surely(fit, about, freedom, sure)
             if explained > power:
                 power = explained
-                waves = mine
+                waves = functions
                 component = fit
                 best = phases
     return waves, component, best
@@ -258,7 +280,8 @@ def _apart(columns: FloatArray, bumps: Projector) -> float:
     columns = columns - columns.mean(axis=0)
     power = float((columns**2).sum())
     if power > 0:
-        return float(((columns - bumps.fit(columns)) ** 2).sum()) / power
+        rest = columns - bumps.fit(columns)
+        return float((rest**2).sum()) / power
     return 0.0
 
 
@@ -268,8 +291,10 @@ def _surely(found: Component, about: FloatArray, other_freedom: float, sure: flo
     """
     n = len(about)
     freedom = max(found.freedom, 1.0)
-    noise = ((about - found.fitted) ** 2).sum(axis=0) / max(n - freedom - other_freedom, 1.0)
-    excess = n * float((found.variance / np.maximum(noise, 1e-12)).sum())
+    free_rows = n - freedom - other_freedom
+    noise = ((about - found.fitted) ** 2).sum(axis=0) / max(free_rows, 1.0)
+    variance_to_noise = found.variance / np.maximum(noise, 1e-12)
+    excess = n * float(variance_to_noise.sum())
     chance = float(np.sqrt(2 * 3 * freedom))
     if excess <= sure * chance:
         return 0.0
@@ -285,7 +310,7 @@ class Phases:
     name: str
     place_px: FloatArray
 
-    def columns(self, harmonics: tuple[tuple[int, int], ...] = HARMONICS) -> FloatArray:
+    def columns(self, harmonics: Harmonics = HARMONICS) -> FloatArray:
         """Cosines and sines (n, 2 k) of the harmonics."""
         angle = 2 * np.pi * (self.place_px @ np.array(harmonics, dtype=float).T)
         return np.concatenate([np.cos(angle), np.sin(angle)], axis=1)
@@ -301,22 +326,30 @@ def edges_of(phases: Phases, base: FloatArray, about: FloatArray) -> FloatArray:
     """
     columns = base
     n = len(about)
-    spectrum = np.fft.rfft((np.arange(EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5)
-    highest = max(SHARP_HARMONICS if base.shape[1] == 2 * len(SHARP_HARMONICS) else HARMONICS)[0]
+    saw = (np.arange(EDGE_STEPS) + 0.5) / EDGE_STEPS - 0.5
+    spectrum = np.fft.rfft(saw)
+    harmonics = HARMONICS
+    if base.shape[1] == 2 * len(SHARP_HARMONICS):
+        harmonics = SHARP_HARMONICS
+    highest, _ = max(harmonics)
     spectrum[: highest + 1] = 0.0  # these are in the base
-    power = float((np.fft.irfft(spectrum, EDGE_STEPS) ** 2).mean())
+    sharp_saw = np.fft.irfft(spectrum, EDGE_STEPS)
+    power = float((sharp_saw**2).mean())
     bin_of = []
     for u in phases.place_px.T:
-        bin_of.append(np.minimum((EDGE_STEPS * (u % 1)).astype(np.int64), EDGE_STEPS - 1))
+        bins = (EDGE_STEPS * (u % 1)).astype(np.int64)
+        bin_of.append(np.minimum(bins, EDGE_STEPS - 1))
     for _ in range(MAX_EDGES):
-        fitted = columns @ np.linalg.lstsq(columns, about, rcond=None)[0]
-        standardised = (about - fitted) / np.maximum((about - fitted).std(axis=0), 1e-12)
+        coefficients, *_ = np.linalg.lstsq(columns, about, rcond=None)
+        rest = about - columns @ coefficients
+        standardised = rest / np.maximum(rest.std(axis=0), 1e-12)
         best = (SURE_OF_EDGE, 0, 0)
         for axis, bins in enumerate(bin_of):
-            sums = np.stack(
-                [np.bincount(bins, value, minlength=EDGE_STEPS) for value in standardised.T]
-            )
-            met = np.fft.irfft(np.fft.rfft(sums) * np.conj(spectrum), EDGE_STEPS)
+            sums = []
+            for value in standardised.T:
+                sums.append(np.bincount(bins, value, minlength=EDGE_STEPS))
+            product = np.fft.rfft(np.stack(sums)) * np.conj(spectrum)
+            met = np.fft.irfft(product, EDGE_STEPS)
             gain = (met**2).sum(axis=0) / (n * power)
             place = int(np.argmax(gain))
             best = max(best, (float(gain[place]), axis, place))
@@ -331,7 +364,8 @@ def edges_of(phases: Phases, base: FloatArray, about: FloatArray) -> FloatArray:
 def phases_of(direction: FloatArray, axes: FloatArray, scale: Scale, name: str = "") -> Phases:
     """The phases of a direction (3,), ICRS."""
     direction_in_cam = axes @ direction
-    return Phases(name, scale.focal_px * direction_in_cam[:, :2] / direction_in_cam[:, 2:])
+    place_px = scale.focal_px * direction_in_cam[:, :2] / direction_in_cam[:, 2:]
+    return Phases(name, place_px)
 
 
 def global_phases(about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) -> Iterator[Phases]:
@@ -346,15 +380,15 @@ def global_phases(about: FloatArray, q_icrs_to_cam: FloatArray, scale: Scale) ->
     ):
         if (boresight @ direction).min() > MIN_FORWARD:
             yield phases_of(direction, axes, scale, name)
-    turn = to_rotation_vector(multiply(q_icrs_to_cam, conjugate(q_icrs_to_cam[0])))
-    yield Phases(
-        "the phase of the turn from the start",
-        scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1),
-    )
+    from_start = multiply(q_icrs_to_cam, conjugate(q_icrs_to_cam[0]))
+    turn = to_rotation_vector(from_start)
+    turned_px = scale.focal_px * np.stack([-turn[:, 1], turn[:, 0]], axis=1)
+    yield Phases("the phase of the turn from the start", turned_px)
     # Right ascension times the cosine of the mean declination, and declination.
     ra = np.unwrap(np.arctan2(boresight[:, 1], boresight[:, 0]))
     dec = np.arcsin(np.clip(boresight[:, 2], -1, 1))
-    place_px = scale.focal_px * np.stack([(ra - ra[0]) * np.cos(dec.mean()), dec], axis=1)
+    along_ra = (ra - ra[0]) * np.cos(dec.mean())
+    place_px = scale.focal_px * np.stack([along_ra, dec], axis=1)
     yield Phases("the phase of the boresight's right ascension and declination", place_px)
     direction = best_direction(about, axes, scale)
     if direction is not None:
@@ -369,14 +403,13 @@ def local_columns(q_icrs_to_cam: FloatArray, scale: Scale, spacing_px: float) ->
     direction = centre[:, :3] / np.linalg.norm(centre[:, :3], axis=1, keepdims=True)
     near = bumps_at(place, centre, spacing_px).tocoo()
     direction_in_cam = np.einsum("nij,nj->ni", axes[near.row], direction[near.col])
-    phase = Phases("", scale.focal_px * direction_in_cam[:, :2] / direction_in_cam[:, 2:]).columns(
-        LOCAL_HARMONICS
-    )
+    place_px = scale.focal_px * direction_in_cam[:, :2] / direction_in_cam[:, 2:]
+    waves = Phases("", place_px).columns(LOCAL_HARMONICS)
+    indices = (near.row, near.col)
     parts = []
-    for column in phase.T:
-        parts.append(
-            sparse.csr_matrix((near.data * column, (near.row, near.col)), shape=near.shape)
-        )
+    for column in waves.T:
+        entries = (near.data * column, indices)
+        parts.append(sparse.csr_matrix(entries, shape=near.shape))
     return sparse.csr_matrix(sparse.hstack(parts))
 
 
@@ -402,31 +435,30 @@ def best_direction(
     low = trace.min(axis=0) - margin
     high = trace.max(axis=0) + margin
     step = (high - low) / (GRID - 1)
-    best = np.stack(
-        np.meshgrid(*(np.linspace(a, b, GRID) for a, b in zip(low, high, strict=True))), axis=-1
-    ).reshape(-1, 2)
+    along_x = np.linspace(low[0], high[0], GRID)
+    along_y = np.linspace(low[1], high[1], GRID)
+    best = np.stack(np.meshgrid(along_x, along_y), axis=-1).reshape(-1, 2)
+    neighbours = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2)
     value = residual_arcsec / np.maximum(residual_arcsec.std(axis=0), 1e-9)
     steps = axes[1:] @ np.swapaxes(axes[:-1], 1, 2)
     roll_rad = np.concatenate([[0.0], np.cumsum(np.abs(steps[:, 0, 1]))])
     for level in range(LEVELS):
-        start, rows = _stretches(
-            roll_rad,
-            float(np.max(step)) * scale.focal_px,
-            FINE_ANSWERS if level else COARSE_ANSWERS,
-        )
-        score = _wave_power(
-            value[rows],
-            axes[rows],
-            normalise(np.c_[best, np.ones(len(best))] @ frame),
-            scale,
-            start,
-        )
-        best = best[np.argsort(-score)[: KEPT if level < LEVELS - 1 else 1]]
-        if float(np.max(step)) * scale.focal_px < FOUND_TO_PX:
+        answers = COARSE_ANSWERS
+        if level:
+            answers = FINE_ANSWERS
+        cell_px = float(np.max(step)) * scale.focal_px
+        start, rows = _stretches(roll_rad, cell_px, answers)
+        directions = normalise(np.c_[best, np.ones(len(best))] @ frame)
+        score = _wave_power(value[rows], axes[rows], directions, scale, start)
+        best = best[np.argsort(-score)]
+        if level < LEVELS - 1:
+            best = best[:KEPT]
+        else:
+            best = best[:1]
+        if cell_px < FOUND_TO_PX:
             break
         step = step / 2
-        around = np.stack(np.meshgrid((-1, 0, 1), (-1, 0, 1)), axis=-1).reshape(-1, 2) * step
-        best = (best[:, None] + around).reshape(-1, 2)
+        best = (best[:, None] + neighbours * step).reshape(-1, 2)
     return normalise(np.append(best[0], 1.0) @ frame)
 
 
@@ -458,19 +490,23 @@ def _stretches(roll_rad: FloatArray, cell_px: float, answers: int) -> tuple[IntA
     """
     total = len(roll_rad)
     by_roll = np.floor(roll_rad / (PHASE_CYCLES / cell_px)).astype(np.int64)
-    by_count = np.arange(total) // (total if cell_px < 1 else MAX_STRETCH)
+    longest = MAX_STRETCH
+    if cell_px < 1:
+        longest = total
+    by_count = np.arange(total) // longest
+    changes = np.diff(by_roll, prepend=-1) | np.diff(by_count, prepend=-1)
     borders = [0]
-    for border in np.flatnonzero(np.diff(by_roll, prepend=-1) | np.diff(by_count, prepend=-1))[
-        1:
-    ].tolist():
+    for border in np.flatnonzero(changes)[1:].tolist():
         if border - borders[-1] >= MIN_STRETCH:
             borders.append(border)
     start = np.array(borders)
     if answers >= total:
         return start, np.arange(total)
     end = np.append(start[1:], total)
-    chosen = np.unique(
-        np.linspace(0, len(start) - 1, max(4, round(len(start) * answers / total))).astype(int)
-    )
+    stretches = len(start)
+    some = max(4, round(stretches * answers / total))
+    chosen = spread_rows(stretches, some)
     rows = np.concatenate([np.arange(start[k], end[k]) for k in chosen])
-    return np.concatenate([[0], np.cumsum((end - start)[chosen])[:-1]]), rows
+    counts = (end - start)[chosen]
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return first, rows

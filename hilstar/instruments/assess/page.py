@@ -38,6 +38,7 @@ from hilstar.instruments.assess.assessment import Assessment
 from hilstar.instruments.assess.bench_effects import Slice
 from hilstar.instruments.assess.budget import Axes
 from hilstar.instruments.assess.figure_rows import PARTS, figures_table, limit_text
+from hilstar.instruments.assess.places import spread_rows
 from hilstar.instruments.assess.report import bench_text, display_text, lines_of, rows_of
 
 AVAILABLE = 0.99  # a smaller availability is a warning
@@ -102,19 +103,16 @@ def verdict_of(found: Assessment) -> Verdict:
     wrong = len(found.wrong)
     lost = len(found.lock.lost)
     missed = found.run.run.missed
-    counts = ", ".join(
-        (
-            _counted(wrong, "wrong answer"),
-            _counted(lost, "lost lock"),
-            _counted(missed, "missed frame"),
-        )
-    )
+    wrong_text = _counted(wrong, "wrong answer")
+    lost_text = _counted(lost, "lost lock")
+    missed_text = _counted(missed, "missed frame")
+    counts = f"{wrong_text}, {lost_text}, {missed_text}."
     headline = f"The tracker was right in {_percent(found)} of the answers due"
     if wrong or lost:
-        return Verdict(BAD, headline, f"{counts}.")
+        return Verdict(BAD, headline, counts)
     if missed or found.lock.availability < AVAILABLE:
-        return Verdict(WARN, headline, f"{counts}.")
-    return Verdict(OK, headline, f"{counts}.")
+        return Verdict(WARN, headline, counts)
+    return Verdict(OK, headline, counts)
 
 
 def _counted(count: int, noun: str) -> str:
@@ -128,7 +126,8 @@ def _percent(found: Assessment) -> str:
     lock = found.lock
     if lock.right >= lock.due:
         return "100 %"
-    return f"{min(100 * lock.availability, 99.99):.3g} %"
+    percent = min(100 * lock.availability, 99.99)
+    return f"{percent:.3g} %"
 
 
 def _counts(found: Assessment) -> Iterator[KeyFigure]:
@@ -205,6 +204,12 @@ class BudgetPart(NamedTuple):
     axes: Axes
     interval: FloatArray
 
+    @property
+    def half_width(self) -> float:
+        """Half of the interval across the boresight."""
+        low, high = self.interval[:, 0].tolist()
+        return float(high - low) / 2
+
 
 def _parts(found: Assessment) -> list[BudgetPart]:
     """Bias, field-of-view error, pixel error and noise."""
@@ -214,9 +219,11 @@ def _parts(found: Assessment) -> list[BudgetPart]:
     cross = parts.bias_arcsec[:2]
     half = (high - low) / 2
     across = float(np.hypot(*cross))
-    off = float(np.hypot(*(cross * half[:2]))) / max(across, 1e-12)  # to first order
+    weighted = float(np.hypot(*(cross * half[:2])))
+    off = weighted / max(across, 1e-12)  # to first order
     about = abs(float(parts.bias_arcsec[2]))
-    bias = np.array([[across - off, about - half[2]], [across + off, about + half[2]]])
+    off_about = half[2]
+    bias = np.array([[across - off, about - off_about], [across + off, about + off_about]])
     return [
         BudgetPart(BIAS, Axes(across, about), bias),
         BudgetPart(PARTS["fov"], parts.fov_arcsec, intervals.fov),
@@ -232,10 +239,12 @@ def _budget(found: Assessment) -> Card:
     for part in parts:
         rows.append((part.name, _interval(part, 0), _interval(part, 1)))
     cross = np.array([part.axes.cross for part in parts], dtype=float)
-    half = np.array([(part.interval[1, 0] - part.interval[0, 0]) / 2 for part in parts])
+    half = np.array([part.half_width for part in parts])
     about_bias = [k for k, part in enumerate(parts) if part.name != BIAS]
     size = float(np.hypot.reduce(cross[about_bias], initial=0.0))
-    off = float(np.hypot.reduce((cross * half)[about_bias], initial=0.0)) / max(size, 1e-12)
+    weighted = (cross * half)[about_bias]
+    off = float(np.hypot.reduce(weighted, initial=0.0)) / max(size, 1e-12)
+    largest = parts[int(np.argmax(cross))]
     figure = KeyFigure(
         measured(size, off, ARCSEC),
         "error about the bias, one sigma across the boresight; \N{PLUS-MINUS SIGN} at 95 %",
@@ -250,7 +259,7 @@ def _budget(found: Assessment) -> Card:
         figure,
         [table_of(rows, header), paragraph(note, "small")],
         _bars(parts),
-        cure=LARGEST_CURES[parts[int(np.argmax(cross))].name],
+        cure=LARGEST_CURES[largest.name],
     )
 
 
@@ -268,19 +277,20 @@ def _bars(parts: Sequence[BudgetPart]) -> str:
     names = [part.name for part in parts]
     cross = [float(part.axes.cross or 0.0) for part in parts]
     largest = int(np.argmax(cross))
-    finding = (
-        f"Across the boresight the {names[largest]} is the largest: {cross[largest]:.2g} arcsec"
-    )
+    size = f"{cross[largest]:.2g} arcsec"
+    finding = f"Across the boresight the {names[largest]} is the largest: {size}"
     note = "Bars: one sigma an axis; of the bias its size. Lines: 95 % intervals."
     with panels_of(finding, 1, 2, share_x=False, note=note, height_inch=3.2) as panels:
+        heights = range(len(parts))
+        labels = names
+        sizes = (cross, [float(part.axes.roll or 0.0) for part in parts])
         for k, (axes, name) in enumerate(zip(panels, DIRECTIONS, strict=True)):
-            values = [float((part.axes.cross, part.axes.roll)[k] or 0.0) for part in parts]
             low = [max(float(part.interval[0, k]), 0.0) for part in parts]
             high = [float(part.interval[1, k]) for part in parts]
-            heights = range(len(parts))
-            axes.barh(heights, values, color=BLUE, alpha=0.75)
+            axes.barh(heights, sizes[k], color=BLUE, alpha=0.75)
             axes.hlines(heights, low, high, color=INK, lw=1.6)
-            axes.set_yticks(heights, names if k == 0 else [""] * len(names))
+            axes.set_yticks(heights, labels)
+            labels = [""] * len(names)
             axes.invert_yaxis()
             axes.set_xlim(left=0.0)
             axes.grid(visible=False, axis="y")
@@ -294,17 +304,16 @@ def _bias(found: Assessment) -> Card:
     rows = []
     for k, axis in enumerate(AXES):
         value = float(found.found.bias_arcsec[k])
-        rows.append((axis, within(value, float(low[k]), float(high[k]), ARCSEC)))
+        text = within(value, float(low[k]), float(high[k]), ARCSEC)
+        rows.append((axis, text))
     bias = _parts(found)[0]
     assert bias.axes.cross is not None
-    half = float(bias.interval[1, 0] - bias.interval[0, 0]) / 2
     figure = KeyFigure(
-        measured(bias.axes.cross, half, ARCSEC),
+        measured(bias.axes.cross, bias.half_width, ARCSEC),
         "constant turn across the boresight; \N{PLUS-MINUS SIGN} at 95 %",
     )
-    return Card(
-        "Bias", figure, [key_table(rows), paragraph("95 % intervals in brackets.", "small")]
-    )
+    note = paragraph("95 % intervals in brackets.", "small")
+    return Card("Bias", figure, [key_table(rows), note])
 
 
 def _pixel(found: Assessment) -> Card:
@@ -409,41 +418,34 @@ def _over_time(found: Assessment) -> str:
     parts = found.found.components
     valid = np.flatnonzero(found.telemetry.valid)
     t_s = found.t_s[valid[found.found.row]]
-    some = np.unique(np.linspace(0, len(t_s) - 1, MAX_POINTS).astype(int))
+    some = spread_rows(len(t_s), MAX_POINTS)
+    some_s = t_s[some]
     wrong_s = np.array([answer.run_s for answer in found.wrong])
-    repeating = parts.fov.fitted + parts.pixel.fitted
-    rms = np.sqrt(np.mean((repeating + parts.left) ** 2, axis=0))
-    finding = (
-        f"The error about the bias is {rms[0]:.2g} arcsec rms in x, {rms[1]:.2g} in y, {rms[2]:.2g}"
-        " about the boresight"
-    )
+    error = parts.fov.fitted + parts.pixel.fitted + parts.left
+    some_error = error[some]
+    some_fitted = parts.fov.fitted[some]
+    x, y, z = np.sqrt(np.mean(error**2, axis=0))
+    across = f"{x:.2g} arcsec rms in x, {y:.2g} in y"
+    finding = f"The error about the bias is {across}, {z:.2g} about the boresight"
     note = (
         "Grey: the error. Blue: what of it repeats with the place in the field. Bands: lock lost."
         " Red marks: wrong answers."
     )
     with panels_of(finding, 3, note=note, height_inch=7.0) as panels:
         for axes, name, k in zip(panels, AXES, range(3), strict=True):
+            axes.plot(some_s, some_error[:, k], ".", ms=3.5, color=MUTED, rasterized=True)
             axes.plot(
-                t_s[some],
-                (repeating + parts.left)[some, k],
-                ".",
-                ms=3.5,
-                color=MUTED,
-                rasterized=True,
-            )
-            axes.plot(
-                t_s[some],
-                parts.fov.fitted[some, k],
+                some_s,
+                some_fitted[:, k],
                 ".",
                 ms=2.5,
                 color=BLUE,
                 rasterized=True,
                 label="repeats",
             )
-            for answer in found.lock.lost:
-                axes.axvspan(
-                    answer.start_s, answer.start_s + answer.length_s, color=MUTED, alpha=0.15, lw=0
-                )
+            for outage in found.lock.lost:
+                end_s = outage.start_s + outage.length_s
+                axes.axvspan(outage.start_s, end_s, color=MUTED, alpha=0.15, lw=0)
             if found.wrong:
                 height = np.full(len(wrong_s), WRONG_HEIGHT)
                 place = axes.get_xaxis_transform()
@@ -459,7 +461,7 @@ def _field_map(found: Assessment) -> tuple[str, str]:
     parts = found.found.components
     scale = found.run.scale
     axes = to_matrix(found.found.commanded_q)
-    some = np.unique(np.linspace(0, len(axes) - 1, MAX_POINTS).astype(int))
+    some = spread_rows(len(axes), MAX_POINTS)
     mean = axes[:, 2].mean(axis=0)
     size = float(np.linalg.norm(mean))
     in_field = axes[some] @ (mean / max(size, 1e-9))
@@ -471,10 +473,8 @@ def _field_map(found: Assessment) -> tuple[str, str]:
         return "", f"no map: {reason}"
     place = scale.focal_px * in_field[:, :2] / in_field[:, 2:]
     largest = np.abs(parts.fov.fitted).max(axis=0)
-    finding = (
-        f"It is up to {largest[0]:.2g} arcsec in x, {largest[1]:.2g} in y and {largest[2]:.2g}"
-        " about the boresight"
-    )
+    x, y, z = largest
+    finding = f"It is up to {x:.2g} arcsec in x, {y:.2g} in y and {z:.2g} about the boresight"
     with panels_of(finding, 1, 3, share_x=False, height_inch=3.9) as panels:
         for k, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
             value = parts.fov.fitted[some, k]
@@ -501,10 +501,9 @@ def _histogram(found: Assessment) -> str:
     residual = found.found.components.left
     variance = found.found.components.noise_variance
     sigmas = np.sqrt(variance)
-    finding = (
-        f"Noise is {sigmas[0]:.2g} arcsec in x, {sigmas[1]:.2g} in y and {sigmas[2]:.2g} about the"
-        " boresight, one sigma"
-    )
+    x, y, z = sigmas
+    across = f"{x:.2g} arcsec in x, {y:.2g} in y"
+    finding = f"Noise is {across} and {z:.2g} about the boresight, one sigma"
     note = (
         "Bars: what is left when all that repeats is taken away. Line: the normal distribution of"
         " that sigma."
@@ -514,12 +513,9 @@ def _histogram(found: Assessment) -> str:
             sigma = max(float(sigmas[k]), 1e-9)
             edges = np.linspace(-5, 5, 61) * sigma
             axes.hist(residual[:, k], edges.tolist(), density=True, color=BLUE, alpha=0.5)
-            axes.plot(
-                edges,
-                np.exp(-0.5 * (edges / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi)),
-                color=INK,
-                lw=1.2,
-            )
+            area = sigma * np.sqrt(2 * np.pi)
+            normal = np.exp(-0.5 * (edges / sigma) ** 2) / area
+            axes.plot(edges, normal, color=INK, lw=1.2)
             axes.set_yscale("log")
             axes.set_ylim(1e-6 / sigma, 1 / sigma)
             axes.set_xlabel(f"{name} [arcsec]")

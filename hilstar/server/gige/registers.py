@@ -21,6 +21,7 @@ import struct
 from dataclasses import dataclass
 from enum import IntEnum
 
+from hilstar.server.gige.feature_kinds import Feature
 from hilstar.server.gige.features import (
     ACQUISITION_MODES,
     BY_ADDRESS,

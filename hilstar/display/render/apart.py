@@ -60,8 +60,8 @@ class ApartBackend(Backend):
         for k, turn in self._turns.items():
             before = chosen[: len(turn.makes_up)]
             chosen.append(open_panel(target.of_primary(k, turn), before))
-        by_primary = dict(zip(self._turns, chosen, strict=True))
-        self.panels = [by_primary[k] for k in range(len(chosen))]
+        panel_of = dict(zip(self._turns, chosen, strict=True))
+        self.panels = [panel_of[k] for k in range(len(chosen))]
         first = self.panels[0]
         self.gl_renderer = first.gl_renderer
         self.gl_version = first.gl_version
@@ -93,8 +93,8 @@ class ApartBackend(Backend):
         """See `Backend.levels`."""
         # Primary by primary in memory: a pixel's three side by side take 12 times as long to write,
         # and the lit pixels of all three 25 times as long to find (1920 x 1080).
-        by_primary = np.stack([panel.levels() for panel in self.panels])
-        return Levels(np.moveaxis(by_primary, 0, -1))
+        stacked = np.stack([panel.levels() for panel in self.panels])
+        return Levels(np.moveaxis(stacked, 0, -1))
 
     def show_on(self, view: ScreenView, beside: Sequence[Backend] = ()) -> None:
         """See `Backend.show_on`."""

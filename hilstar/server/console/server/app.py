@@ -51,7 +51,7 @@ FAMILIES: dict[str, type[CounterMetricFamily | GaugeMetricFamily]] = {
     "counter": CounterMetricFamily,
     "gauge": GaugeMetricFamily,
 }
-# Names that no name server resolves, so that no site can point them at another machine.
+# No name server resolves these, so that no other site can have one of them.
 LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}
 HEADERS = {
     "Cache-Control": "no-store",
@@ -397,6 +397,7 @@ class Page:
                 hello=self.setup.hello, state=self.reader.state(), history=list(self.reader.points)
             ).json()
         )
+        # Fewer than MAX_WAITING_TEXTS, at which a page would be closed.
         for event in list(self.reader.events)[-90:]:
             client.tell(PageText(event=event).json())
         await self.pages.follow(client)

@@ -155,6 +155,7 @@ def lines_of(
     if matching is not None:
         found_as = matching.convention
         form = decoder.settings.format
+        # In a frame the field names say which number is the scalar: `[answers]` refuses "last".
         scalar = "first" if form == "frame" else found_as.scalar
         written = msgspec.structs.replace(found_as, scalar=scalar)
         is_own = found_as == decoder.sent.convention

@@ -274,6 +274,7 @@ class Measured:
             yield from self._cut()
 
     def _cut(self) -> Iterator[Cut]:
+        """The frames and refusals in the buffered bytes, which leave the buffer with them."""
         buffered = self._kept
         at = 0
         while at < len(buffered):
@@ -538,6 +539,7 @@ class AnswerDecoder:
 
 
 def _of_packet(body: bytes) -> JsonAnswer | RefusedAnswer:
+    """The content of an answer packet of the wire, or its refusal."""
     event = decode(body)
     # The wire's decoder expects an attitude packet: its refusal is reworded for an answer.
     if isinstance(event, Refusal):
@@ -564,6 +566,7 @@ _json = msgspec.json.Decoder(JsonAnswer)
 
 
 def _of_json(line: bytes) -> JsonAnswer | RefusedAnswer:
+    """The content of a JSON object, or the refusal of a text that is none."""
     if len(line) > MAX_JSON_BYTES:
         return RefusedAnswer(
             "format", f"more than {MAX_JSON_BYTES} bytes of JSON", line[:MAX_FRAME_BYTES]

@@ -124,6 +124,7 @@ class CameraMarks:
             return np.asarray(inside & (np.abs(y_px - (height - 1) / 2) <= height * (0.5 + beyond)))
 
     def _grid(self, q_icrs_to_cam: FloatArray, turn: FloatArray) -> Iterator[GridLine]:
+        """The lines of RA and Dec in the field; `turn` (3, 3) turns ICRS into image axes."""
         ra_deg, dec_deg, _ = to_radec_roll_deg(q_icrs_to_cam)
         radius_deg = math.degrees(self.monitor.field_radius_rad(0.0))
         step_deg = _step(STEPS_DEG, radius_deg / LINES_ACROSS)
@@ -285,10 +286,12 @@ def _border(resolution_px: tuple[int, int], places: int) -> tuple[FloatArray, Fl
 
 
 def _step(steps: tuple[float, ...], most: float) -> float:
+    """The largest of `steps` (rising) that is not above `most`, else the smallest."""
     return max((step for step in steps if step <= most), default=steps[0])
 
 
 def _multiples(low: float, high: float, step: float) -> list[float]:
+    """The multiples of `step` from `low` to `high`, ends included in spite of rounding."""
     return [
         k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     ]

@@ -43,6 +43,7 @@ MAX_ORDER_BYTES = 8_000
 # Environment variables for the run alone: those by which it reports to systemd, and the token,
 # which the page's process gets in its Setup.
 OF_THE_RUN = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC", "HILSTAR_TOKEN"}
+# -P: no module is imported from the working directory.
 PAGE = (sys.executable, "-P", "-m", "hilstar.server.console.server")
 
 
@@ -113,6 +114,7 @@ class PageProcess(Closing):
         return self._page.process.pid
 
     def _run(self) -> None:
+        """The thread: ticks and orders until `close`, then the end of the page's process."""
         next_s = 0.0
         while not self._stop.is_set():
             now_s = time.monotonic()
@@ -132,6 +134,7 @@ class PageProcess(Closing):
             page.process.wait()
 
     def _tick(self, now_s: float) -> None:
+        """Publish the state and new events; start the page's process, or note that it has ended."""
         try:
             self._memory.states.put(msgspec.json.encode(self._now()))
             ahead_s = time.time() - time.monotonic_ns() * 1e-9
@@ -163,6 +166,7 @@ class PageProcess(Closing):
             self._lose(f"the operator's page ended ({how})", anew=now_s - page.begun_s > STEADY_S)
 
     def _start_page(self, now_s: float) -> None:
+        # Packets of a sequence: each message arrives whole.
         channel, its_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         environment = {name: value for name, value in os.environ.items() if name not in OF_THE_RUN}
         given = (self._setup_fd, self._memory.fd, its_end.fileno(), *self._listener_fds)
@@ -189,6 +193,7 @@ class PageProcess(Closing):
         self._again.put_off(anew=anew)
 
     def _listen(self, seconds: float) -> None:
+        """Wait for an order for at most `seconds`, and have a worker carry it out."""
         page = self._page
         if page is None:
             self._stop.wait(seconds)

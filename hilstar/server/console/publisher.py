@@ -108,6 +108,7 @@ class FramePublisher:
             | messages.BLANK * (attitude is None)
             | messages.HAS_AGE * (attitude is not None)
         )
+        # The age of an absurd stamp is limited, so that FRAME can hold it.
         self._memory.frames.put(
             messages.FRAME.pack(
                 shown.number,
@@ -348,6 +349,7 @@ class OrderHandler:
             return 200, f"ledger off: {ledger_now.path} is whole"
 
     def _free_path(self) -> Path:
+        """A free path for a ledger, named by UTC, beside the newest one or in the working one."""
         if self._ledger.last is None:
             folder = Path.cwd()
         else:

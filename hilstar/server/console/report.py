@@ -91,6 +91,7 @@ def one_script(entry: str, folder: Path = PAGE_DIR) -> str:
 
 
 def _take(name: str, folder: Path, done: dict[str, str]) -> None:
+    """Add a module as a function to `done`, after the modules that it imports."""
     text = (folder / f"{name}.js").read_text(encoding="utf-8")
     wanted = _import.findall(text)
     for _, other in wanted:
@@ -466,6 +467,7 @@ def _motion(rows: FloatArray) -> dict[str, Any] | None:
 
 
 def _curves(angles_deg: FloatArray, names: tuple[str, str, str]) -> dict[str, Any]:
+    """The data of three curves, angles (n, 3), deg, by name; in arcsec if they are small."""
     in_arcsec = float(np.ptp(angles_deg, axis=0).max()) < IN_ARCSEC_DEG
     scaled = angles_deg * (3600 if in_arcsec else 1)
     return {

@@ -145,6 +145,8 @@ class SpanTally:
 
 @dataclass(slots=True)
 class _Fault:
+    """A fault, and the answers before, during and after it (`parts`); times in ns, host time."""
+
     record: FaultRecord
     start_ns: int
     end_ns: int | None = None

@@ -264,6 +264,7 @@ class Ledger(Closing):
             "codes_ms": json.dumps(bench.config.render.codes_ms),
             "raw_convention": raw_convention(bench.config),
             "output": json.dumps(bench.output),
+            # Both clocks at one moment: a report converts host times to UTC by them.
             "monotonic_ns": str(time.monotonic_ns()),
             "unix_ns": str(time.time_ns()),
             "run_id": uuid.uuid4().hex,
@@ -389,8 +390,10 @@ class Ledger(Closing):
             self._file.close()
 
     def _turn(self, last: bool) -> None:
+        """Write what is queued; `last` also the end of the file. No error leaves it."""
         try:
             harm = self._file.harm(self._writer.size_bytes, self._writer.crc)
+            # At the end of a run a damaged file is replaced without the pause between new files.
             if harm is None:
                 self._look_at_place()
             elif last or time.monotonic() - self._renewed_s > self._rest_s:
@@ -428,6 +431,7 @@ class Ledger(Closing):
             self._flush()
 
     def _each_second(self) -> None:
+        """Record the counts and the process, and check the disk."""
         now_ns = time.monotonic_ns()
         dropped, self._queue.dropped = self._queue.dropped, type(self._queue.dropped)()
         for kind, number in dropped.items():
@@ -443,6 +447,7 @@ class Ledger(Closing):
         self._look_at_disk()
 
     def _renew(self, harm: str, last: bool) -> None:
+        """Continue in another file; `harm` is "deleted", "truncated" or "overwritten"."""
         if self._renewed_s > 0:  # repeated damage must not fill the disk with files
             self._rest_s = min(2 * self._rest_s, MAX_REST_S)
         self._renewed_s = time.monotonic()
@@ -490,6 +495,7 @@ class Ledger(Closing):
             self._notices.begin("ledger-lost", line)
 
     def _look_at_place(self) -> None:
+        """Report once that the file was moved: it is still written, at its new place."""
         if self._moved:
             return
         place = part_path(self.path, self._part)
@@ -531,6 +537,7 @@ class Ledger(Closing):
             )
 
     def _flush(self) -> None:
+        """Write the pending chunk; if that fails, without its frames, so that packets may fit."""
         try:
             self._writer.flush()
         except OSError:
@@ -555,6 +562,7 @@ class Ledger(Closing):
         )
 
     def _go_on_in_another(self) -> None:
+        """Continue in the next part of a split ledger, or stay if it cannot be created."""
         self._part += 1
         try:
             file, writer = self._begin(part_path(self.path, self._part), self._overwrite)

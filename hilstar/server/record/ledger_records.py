@@ -477,9 +477,10 @@ def _checked(records: list[RunRecord]) -> list[RunRecord]:
     return records
 
 
-# Blocks are decoded without numbers of their messages, for speed: after an error the file is read
-# again to name the message.
 def _first_fault(path: Path, error: Exception) -> InputError:
+    """The refusal that names the first wrong message. `run_blocks` does not number messages: after
+    its `error` the file is read again.
+    """
     every = (
         (topics[channel], data)
         for topics, messages in read_chunks(path, tell=False)

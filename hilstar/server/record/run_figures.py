@@ -162,6 +162,7 @@ class SpanTable:
             rows = rows[count:]
 
     def _add(self, rows: FloatArray, spans: int) -> None:
+        """Add rows to the last span, or, if it is empty, whole rows of `spans` new ones."""
         columns = rows.shape[1] - 1
         values = rows[:, 1:].reshape(spans, -1, columns)
         first = self._used - 1
@@ -178,6 +179,7 @@ class SpanTable:
         self._in_last += values.shape[1]
 
     def _halve(self) -> None:
+        """Join the spans in pairs; the last one is full then."""
         half = self._used // 2
         self._low[:half] = np.minimum(self._low[::2], self._low[1::2])
         self._high[:half] = np.maximum(self._high[::2], self._high[1::2])

@@ -175,6 +175,9 @@ class Guard:
 
 
 def _split(host: str) -> tuple[str, str]:
+    """The name and the port of a `Host` header, "" without a port. A malformed port is "x", which
+    no check accepts.
+    """
     if host.startswith("["):
         name, _, rest = host.partition("]")
         return name + "]", rest[1:] if rest.startswith(":") else ("x" if rest else "")
@@ -404,6 +407,8 @@ class Page:
 
 
 async def _body(request: Request) -> bytes:
+    """The body of a request. Raises Refused if it is too long (413), late (408) or cut (400)."""
+    # A client that expects "100 Continue" has not sent its body yet: it is refused before it does.
     if (
         int(request.headers.get("content-length", "0")) > MAX_BODY_BYTES
         and "expect" in request.headers

@@ -271,6 +271,7 @@ class RunReader:
         return point
 
     def _add(self, point: protocol.ChartPoint, frame: messages.FrameNumbers) -> None:
+        """Add a frame to the present point of the charts and to the intervals of the pacing."""
         last = self._last
         self._last = frame
         if frame.flags & messages.HAS_AGE:

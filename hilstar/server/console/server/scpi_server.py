@@ -411,6 +411,7 @@ class Connection:
         return ";".join(self._answers)
 
     async def _do(self, unit: Unit) -> None:
+        """Run a command or query, and add its answer to the line's or its error to the queue."""
         try:
             if not self.unlocked and unit.pattern not in UNLOCKED:
                 raise ScpiError(

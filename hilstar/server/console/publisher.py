@@ -349,7 +349,9 @@ class OrderHandler:
             return 200, f"ledger off: {ledger_now.path} is whole"
 
     def _free_path(self) -> Path:
-        """A free path for a ledger, named by UTC, beside the newest one or in the working one."""
+        """A free path for a new ledger, named by UTC: in the folder of the newest ledger, else in
+        the current working directory.
+        """
         if self._ledger.last is None:
             folder = Path.cwd()
         else:

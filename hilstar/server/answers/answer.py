@@ -33,7 +33,7 @@ class Answer:
     `q_icrs_to_cam`: unit quaternion (w, x, y, z), None where the answer has no attitude.
     `rate_cam_rad_s`: (3,), rad/s, camera axes, None where it has no rate. `valid`: False where the
     tracker marks the answer as invalid or sends no attitude. `mode`: the tracker's name for its
-    mode. `rms_arcsec`: the residual of its star fit, as the tracker reports it.
+    mode. `rms_arcsec`: the rms that the tracker reports.
     """
 
     host_ns: int

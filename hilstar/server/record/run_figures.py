@@ -162,7 +162,7 @@ class SpanTable:
             rows = rows[count:]
 
     def _add(self, rows: FloatArray, spans: int) -> None:
-        """Add rows to the last span, or, if it is empty, whole rows of `spans` new ones."""
+        """Add rows to the last span; if it is empty, they fill it and more: `spans` in all."""
         columns = rows.shape[1] - 1
         values = rows[:, 1:].reshape(spans, -1, columns)
         first = self._used - 1

@@ -1,1 +1,3 @@
-"""What a star tracker answers while it runs: its bytes, decoded and read in a process apart."""
+"""A star tracker's answers during a run: a separate process reads and decodes its bytes, and the
+server compares each answer with the sky that was lit.
+"""

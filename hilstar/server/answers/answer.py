@@ -1,5 +1,5 @@
-"""An answer of a star tracker, whatever its format: when, which attitude, and what the tracker
-says of itself.
+"""One answer of a star tracker, independent of the byte format: its times, its attitude, and the
+tracker's status.
 """
 
 from dataclasses import dataclass
@@ -8,13 +8,14 @@ from typing import NamedTuple, Protocol
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import NS_PER_S
 
-# a stamp that is off by more is of a clock that was set, not of an answer that was overtaken
+# A stamp that steps back by more means that the tracker's clock was set; by less, that a datagram
+# was overtaken on its way.
 JUMP_NS = NS_PER_S
 
 
 class ReportedStar(NamedTuple):
-    """A star that the tracker reports: its centroid in the tracker's pixels, its signal, and its
-    Hipparcos number, if given.
+    """A star that the tracker reports: its centroid in the tracker's pixels, its signal `dn` in
+    digital numbers and its Hipparcos number `hip`, None where the tracker gives none.
     """
 
     x_px: float
@@ -27,9 +28,12 @@ class ReportedStar(NamedTuple):
 class Answer:
     """One answer, after the bench file's conventions were applied.
 
-    `host_ns`: the host's monotonic clock at its last byte. `t_ns`: the tracker's own stamp on its
-    own clock, None where it sends none. `q_icrs_to_cam`: unit quaternion (w, x, y, z), None where
-    it has no attitude. `mode` is the tracker's own word.
+    `host_ns`: the host's monotonic clock when the last byte arrived. `raw`: the answer's bytes.
+    `t_ns`: the time stamp that the tracker sends, on the tracker's clock, None where it sends none.
+    `q_icrs_to_cam`: unit quaternion (w, x, y, z), None where the answer has no attitude.
+    `rate_cam_rad_s`: (3,), rad/s, camera axes, None where it has no rate. `valid`: False where the
+    tracker marks the answer as invalid or sends no attitude. `mode`: the tracker's name for its
+    mode. `rms_arcsec`: the rms that the tracker reports.
     """
 
     host_ns: int
@@ -45,8 +49,8 @@ class Answer:
 
 
 class StampOrder:
-    """Counts the stamps that are before an earlier answer's (`fallen`): a datagram was overtaken
-    by another.
+    """Counts answers that arrive out of order: `fallen` is the number of stamps that lie before
+    the stamp of an answer that arrived earlier.
     """
 
     def __init__(self) -> None:
@@ -54,8 +58,9 @@ class StampOrder:
         self._newest_ns: int | None = None
 
     def take(self, t_ns: int) -> None:
-        """Take the stamp of the next answer. A step back by more than JUMP_NS begins anew: the
-        clock was set.
+        """Compare the stamp of the next answer, ns on the tracker's clock, with the newest one.
+        After a step back by more than JUMP_NS the count goes on from the new stamp: the clock was
+        set.
         """
         newest_ns = self._newest_ns
         if newest_ns is not None and 0 < newest_ns - t_ns <= JUMP_NS:
@@ -65,24 +70,24 @@ class StampOrder:
 
 
 class AnswerSource(Protocol):
-    """Where answers come from. Never waits, never raises for what a tracker sends.
-
-    `unread` says why nothing is read, "" while answers are: then it is not the tracker that is
-    silent.
+    """Gives the tracker's answers to the server. No method waits, and none raises an exception
+    because of what a tracker sends.
     """
 
     @property
     def unread(self) -> str:
-        """Why nothing is read now."""
+        """Why the server itself cannot read the line now, "" while it can. Tells a failed reader
+        from a silent tracker.
+        """
 
     def take(self) -> list[Answer]:
         """The answers since the last call, oldest first."""
 
     def refusals(self) -> dict[str, int]:
-        """How much was refused so far, by reason."""
+        """How many messages or pieces of data were refused since the start, by reason."""
 
     def trouble(self) -> str:
-        """What is wrong with the tracker's line for as long as it lasts, "" while nothing is."""
+        """The present fault of the tracker's line (e.g. an unplugged port), "" without a fault."""
 
     def close(self) -> None:
-        """Close it."""
+        """Stop reading and close the line."""

@@ -1,5 +1,5 @@
-"""An answer explained: which bytes became which field, why bytes were refused, and which
-convention makes it what is shown.
+"""Explains an answer to the engineer who writes `[answers]`: which bytes became which field, why
+bytes were refused, and which quaternion convention agrees with the attitude on the display.
 """
 
 from dataclasses import dataclass, replace
@@ -18,15 +18,17 @@ from hilstar.server.answers.formats import CHECKSUMS, AnswerDecoder, RefusedAnsw
 from hilstar.server.bench.config.answers import field_format
 
 MAX_SHOWN_BYTES = 96
-# an answer this near to what is shown has its convention, whatever its bias
+# A convention is certain only where its attitude is nearer than NEAR_RAD to the shown one (the
+# tracker may have a bias), and every other convention is over APART times as far from it.
 NEAR_RAD = np.radians(5.0)
-APART = 20.0  # and other conventions are so many times further off
+APART = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class UnderConvention:
-    """An answer under a convention: q_icrs_to_cam, and how far it is from what is shown, rad
-    (None: not known).
+    """The attitude that an answer has under one convention: unit quaternion q_icrs_to_cam, its
+    angle `off_rad` to the shown attitude, rad (None: the shown one is not known), and whether this
+    convention `matches`.
     """
 
     convention: Convention
@@ -35,7 +37,7 @@ class UnderConvention:
     matches: bool = False
 
     def line(self) -> str:
-        """For a person."""
+        """One line of text; ">" at its start marks the convention that matches."""
         c = self.convention
         ra_deg, dec_deg, roll_deg = to_radec_roll_deg(self.q_icrs_to_cam)
         ra = turn_text(ra_deg)
@@ -60,8 +62,8 @@ def _angle(off_rad: float) -> str:
 def under_conventions(
     answer: Answer, decoder: AnswerDecoder, shown: FloatArray | None
 ) -> list[UnderConvention]:
-    """A valid answer under each convention, the matching one marked; `shown` is q_icrs_to_cam of
-    what is shown.
+    """The attitude of an answer under every convention, the matching one marked; [] for an answer
+    without an attitude. `shown` is the displayed q_icrs_to_cam, None where it is not known.
     """
     mounted = decoder.q_body_to_cam
     if answer.q_icrs_to_cam is None:
@@ -89,7 +91,9 @@ def under_conventions(
 
 
 def hex_line(raw: bytes) -> str:
-    """Bytes in hexadecimal, cut where there are many."""
+    """The first MAX_SHOWN_BYTES bytes in hexadecimal, and the number of bytes where there are
+    more.
+    """
     if len(raw) > MAX_SHOWN_BYTES:
         more = f" ... ({len(raw)} bytes)"
     else:
@@ -98,7 +102,9 @@ def hex_line(raw: bytes) -> str:
 
 
 def byte_lines(raw: bytes, decoder: AnswerDecoder) -> list[str]:
-    """Which bytes of an answer became which field."""
+    """Lines of text that show which bytes of an answer became the checksum and each field; the
+    raw bytes or text alone for a format without declared fields.
+    """
     settings = decoder.settings
     if settings.format != "frame":
         text = raw[:1] in {b"{", b" "}
@@ -136,7 +142,9 @@ def byte_lines(raw: bytes, decoder: AnswerDecoder) -> list[str]:
 def lines_of(
     found: Answer | RefusedAnswer, decoder: AnswerDecoder, shown: FloatArray | None
 ) -> list[str]:
-    """An answer or a refusal explained, a line each."""
+    """The explanation of an answer or a refusal, as lines of text: its bytes, its attitude under
+    every convention, and what to write in the bench file. `shown` as in `under_conventions`.
+    """
     if isinstance(found, RefusedAnswer):
         if found.reason == "framing":
             return [f"  {hex_line(found.raw)}"]
@@ -147,6 +155,7 @@ def lines_of(
     if matching is not None:
         found_as = matching.convention
         form = decoder.settings.format
+        # In a frame the field names say which number is the scalar: `[answers]` refuses "last".
         scalar = "first" if form == "frame" else found_as.scalar
         written = msgspec.structs.replace(found_as, scalar=scalar)
         is_own = found_as == decoder.sent.convention

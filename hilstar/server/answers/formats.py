@@ -1,13 +1,14 @@
-"""The bytes of a tracker to answers: frames cut out of a stream, checked and decoded; no I/O.
+"""Decodes a tracker's bytes into answers: cuts frames out of a stream, checks and decodes them; no
+I/O.
 
 Laws:
-1. Nothing that a tracker sends raises. Bytes that are no answer give a `RefusedAnswer`, which says
-   why.
-2. However a stream is cut into chunks, the answers are the same, while no pause lasts PAUSE_NS.
-   After one a frame begins anew:
-   what was kept is then looked through for whole frames, and dropped.
-3. At most MAX_KEPT_BYTES are kept between chunks.
-4. A frame whose checksum is wrong is never an answer.
+1. No bytes that a tracker sends raise an exception. Bytes that are no answer give a
+   `RefusedAnswer`, which states the reason.
+2. The answers do not depend on how a stream is cut into chunks, as long as no pause lasts PAUSE_NS.
+   After such a pause a new frame begins: the buffered bytes are searched for whole frames, and
+   dropped.
+3. At most MAX_KEPT_BYTES are buffered between chunks.
+4. A frame with a wrong checksum is never an answer.
 """
 
 import binascii
@@ -42,9 +43,9 @@ from hilstar.server.bench.config.answers import (
 
 MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
 MAX_JSON_BYTES = 65_536  # with the centroids of a thousand stars
-# a number beyond its limit is left out, a word is cut
+# A number beyond its limit is dropped without refusing the answer; a longer mode is cut.
 MAX_STARS, MAX_HIP, MAX_MODE_CHARACTERS = 1_000_000, 2**31 - 1, 64
-PAUSE_NS = NS_PER_S // 10
+PAUSE_NS = NS_PER_S // 10  # after a longer silence on the line a new frame begins
 CCSDS_HEADER_BYTES, CCSDS_VERSION_MASK = 6, 0xE0
 SLIP_END, SLIP_ESC, SLIP_ESC_END, SLIP_ESC_ESC = b"\xc0", b"\xdb", b"\xdc", b"\xdd"
 CHECKSUMS: dict[str, tuple[Callable[[bytes], int], int]] = {
@@ -64,7 +65,9 @@ MODES = (
 
 @dataclass(frozen=True, slots=True)
 class RefusedAnswer:
-    """Bytes that are no answer, and why: a reason in one word, and a line for a person."""
+    """Bytes that are no answer: the `reason` in one word (`docs/answers.md` lists them), and the
+    `detail`, a line of text for the user.
+    """
 
     reason: str
     detail: str
@@ -72,7 +75,12 @@ class RefusedAnswer:
 
 
 class JsonAnswer(msgspec.Struct, frozen=True):
-    """An answer as a JSON object, and as a Python function gives it."""
+    """The content of one answer in the tracker's own convention, as a JSON object or a user's
+    Python function gives it, and as the other formats are decoded to.
+
+    `t_ns` is on the tracker's clock; `q` has the order and direction of `[answers] convention`;
+    `rate` is in rad/s; `centroids` are rows [x_px, y_px, dn, hip].
+    """
 
     t_ns: int | None = None
     q: tuple[float, float, float, float] | None = None
@@ -87,8 +95,8 @@ class JsonAnswer(msgspec.Struct, frozen=True):
 def answer_of(
     sent: SentAttitudes, host_ns: int, raw: bytes, said: JsonAnswer
 ) -> Answer | RefusedAnswer:
-    """The answer that a tracker's numbers are, or why they are none; `sent` says what its
-    quaternions mean.
+    """The answer with the content `said`, or the refusal of its numbers. `sent` converts the
+    tracker's quaternion and rate to hilstar's; `host_ns` is the host time of the last byte.
     """
     t_ns = said.t_ns
     if t_ns is not None and t_ns not in INT64:
@@ -113,7 +121,8 @@ def answer_of(
         said.rms_arcsec,
         reported_stars(said.centroids),
     )
-    if said.q is None or not said.valid:  # without an attitude its numbers may be anything
+    # Without a valid attitude a tracker may send any numbers: these are not checked.
+    if said.q is None or not said.valid:
         if said.q is None:
             return replace(plain, valid=False)
         return plain
@@ -125,7 +134,9 @@ def answer_of(
 
 
 def reported_stars(rows: list[list[float | None]]) -> tuple[ReportedStar, ...]:
-    """The stars of rows [x_px, y_px, dn, hip]; rows that are none of that are left out."""
+    """The stars in rows [x_px, y_px, dn, hip], whose last two may be missing; rows without a finite
+    position are dropped.
+    """
     stars = []
     for row in rows:
         x_px, y_px, dn, hip = [*row, None, None, None, None][:4]
@@ -142,7 +153,9 @@ def reported_stars(rows: list[list[float | None]]) -> tuple[ReportedStar, ...]:
 
 
 class Cut(NamedTuple):
-    """What was cut out of a stream: a frame's bytes, or with `reason` what is none."""
+    """A piece of a stream: the bytes of a frame, or, if `reason` is not "", bytes that are no
+    frame; `detail` says why, for the user.
+    """
 
     body: bytes
     reason: str = ""
@@ -150,8 +163,11 @@ class Cut(NamedTuple):
 
 
 class Delimited:
-    """Frames that end with a delimiter: COBS, SLIP and lines. What precedes the first delimiter
-    of a stream may be cut off.
+    """Cuts frames that end with a delimiter: COBS, SLIP and lines of text.
+
+    `unstuff` turns the bytes before a delimiter into a frame (ValueError: they are none), `word`
+    names a frame in refusals, and `max_bytes` limits its length. A stream may begin within a frame:
+    the bytes before the first delimiter are refused only if `whole` says that they are complete.
     """
 
     def __init__(
@@ -171,7 +187,7 @@ class Delimited:
         self._whole = whole
 
     def cut(self, chunk: bytes) -> Iterator[Cut]:
-        """The frames that `chunk` completes."""
+        """The frames and refusals that `chunk` completes, in their order."""
         *bodies, rest = chunk.split(self._end)
         for body in bodies:
             self._keep(body)
@@ -198,7 +214,7 @@ class Delimited:
 
 
 def uncobs(body: bytes) -> bytes:
-    """The bytes that a COBS frame holds. Raises ValueError."""
+    """The content of a COBS frame without its delimiter. Raises ValueError if it is not COBS."""
     try:
         return bytes(cobs.decode(body))
     except cobs.DecodeError as error:
@@ -206,7 +222,9 @@ def uncobs(body: bytes) -> bytes:
 
 
 def unslip(body: bytes) -> bytes:
-    """The bytes that a SLIP frame holds (RFC 1055). Raises ValueError."""
+    """The content of a SLIP frame without its delimiter (RFC 1055). Raises ValueError for an escape
+    that RFC 1055 does not define.
+    """
     first, *others = body.split(SLIP_ESC)
     out = bytearray(first)
     for part in others:
@@ -217,11 +235,12 @@ def unslip(body: bytes) -> bytes:
 
 
 class Measured:
-    """Frames told apart by what they begin with and how long they are: sync bytes, Space Packets,
-    or a fixed length.
+    """Cuts frames that have no delimiter, by their sync bytes, their length field, a fixed length
+    or a Space Packet's header.
 
-    A frame that is wrong may have begun at the wrong byte: the next is looked for from its second
-    byte on.
+    `check` returns what is wrong with a frame's checksum, "" for nothing; `certain` says that
+    frames have a checksum. A wrong frame may have begun at the wrong byte: the search goes on at
+    its second byte.
     """
 
     def __init__(
@@ -233,12 +252,13 @@ class Measured:
         self._check = check
         self._certain = certain
         self._kept = bytearray()
-        self._silent_bytes = 0  # lost bytes of which nothing more is said
+        self._silent_bytes = 0  # this many more lost bytes are not reported
 
     def pause(self) -> Iterator[Cut]:
-        """Nothing came for a while: what is kept is no frame from its beginning on, or one whose
-        end is lost.
+        """The frames and refusals in the buffered bytes after a pause of the line, and an empty
+        buffer: no frame begins at its first byte, or the frame's end is lost.
         """
+        # Nothing in these bytes could show that a frame begins at a later one.
         if not self._certain and not self._sync and not self._ccsds:
             self._kept.clear()
         while self._kept:
@@ -247,18 +267,20 @@ class Measured:
             yield from self._cut()
 
     def cut(self, chunk: bytes) -> Iterator[Cut]:
-        """The frames that `chunk` completes."""
+        """The frames and refusals that `chunk` completes, in their order."""
+        # In pieces, so that no more than MAX_KEPT_BYTES are buffered.
         for begin in range(0, len(chunk), MAX_FRAME_BYTES):
             self._kept += chunk[begin : begin + MAX_FRAME_BYTES]
             yield from self._cut()
 
     def _cut(self) -> Iterator[Cut]:
+        """The frames and refusals in the buffered bytes, which leave the buffer with them."""
         buffered = self._kept
         at = 0
         while at < len(buffered):
             if self._sync and not buffered.startswith(self._sync, at):
                 sync_place = buffered.find(self._sync, at)
-                # The last bytes may be the beginning of the sync bytes.
+                # The last bytes may be the beginning of sync bytes, so that they stay.
                 if sync_place >= 0:
                     beyond = sync_place
                 else:
@@ -287,10 +309,11 @@ class Measured:
         del buffered[:at]
 
     def _lose(self, raw: bytes, detail: str) -> Iterator[Cut]:
-        """Say what was wrong: each wrong checksum after sync bytes, of other lost bytes the first
-        of as many as a frame has.
+        """Refuse lost bytes `raw`: every wrong checksum after sync bytes; of other losses one for
+        as many bytes as a frame has.
 
-        Where nothing tells where a frame begins, each of a damaged one's bytes is tried.
+        Without sync bytes every byte of a damaged frame is tried as a beginning, and would be
+        refused.
         """
         of_checksum = "checksum" in detail
         is_reported = (of_checksum and bool(self._sync)) or self._silent_bytes <= 0
@@ -300,13 +323,14 @@ class Measured:
             yield Cut(raw, "checksum" if of_checksum else "framing", detail)
 
     def _size(self, at: int) -> int | None:
-        """Bytes of the frame that begins there; 0 where none can, None where too few have come
-        to tell.
+        """The length, bytes, of the frame that begins at index `at` of the buffer; 0 where no frame
+        can begin there, None where too few bytes have arrived to read its length.
         """
         buffered = self._kept
         if self._ccsds:
             if len(buffered) - at < CCSDS_HEADER_BYTES:
                 return None
+            # A Space Packet's length field is the number of its data bytes minus one.
             size = CCSDS_HEADER_BYTES + 1 + int.from_bytes(buffered[at + 4 : at + 6], "big")
             if isinstance(self._length, int):
                 wanted = self._length
@@ -328,7 +352,9 @@ class Measured:
 
 
 def raw_number(body: bytes, at: int, kind: str) -> int | float:
-    """A number in a frame. Raises IndexError beyond its end."""
+    """The number of type `kind` (as "u16be", see `[answers] fields`) at byte `at` of a frame.
+    Raises IndexError where it extends beyond the frame's end.
+    """
     form, size, big = field_format(kind) or ("u", 1, False)
     raw = body[at : at + size]
     if len(raw) < size:
@@ -340,14 +366,14 @@ def raw_number(body: bytes, at: int, kind: str) -> int | float:
 
 
 class FrameDecoder:
-    """A tracker's own frames, as a bench file declares them."""
+    """Checks and decodes frames whose layout `[answers]` declares."""
 
     def __init__(self, settings: AnswersSettings) -> None:
         self.settings = settings
         self._matches = [(match.at, bytes.fromhex(match.hex)) for match in settings.match]
 
     def fault(self, body: bytes) -> str:
-        """What is wrong with a frame's checksum; "" where it is right, or there is none."""
+        """A line of text on a frame's wrong checksum; "" where it is right, or none is declared."""
         settings = self.settings
         if settings.checksum == "none":
             return ""
@@ -366,7 +392,9 @@ class FrameDecoder:
         return f"the {settings.checksum} checksum is {stated:#x}, and {wanted:#x} by the bytes"
 
     def decoded(self, body: bytes) -> JsonAnswer | RefusedAnswer:
-        """What a frame says."""
+        """The content of a frame, or its refusal: for a wrong checksum, for another kind of frame,
+        or for a field beyond its end.
+        """
         if fault := self.fault(body):
             return RefusedAnswer("checksum", fault, body)
         if any(body[at : at + len(wanted)] != wanted for at, wanted in self._matches):
@@ -380,25 +408,29 @@ class FrameDecoder:
         return said_by(values, body)
 
     def value(self, body: bytes, field: FrameField) -> int | float:
-        """The value of a field: whole where neither scale nor sum says otherwise. Raises
-        IndexError beyond the frame's end.
+        """The value of a field after its mask, scale and sum; an int where all of these are whole.
+        Raises IndexError where the field extends beyond the frame's end.
         """
         raw = raw_number(body, field.at, field.type)
+        # The value is shifted down to the mask's lowest bit.
         if field.mask is not None and isinstance(raw, int):
             raw = (raw & field.mask) >> ((field.mask & -field.mask).bit_length() - 1)
+        # In whole numbers, because a time in ns has more digits than a float.
         if isinstance(raw, int) and field.scale.is_integer() and field.add.is_integer():
             return raw * int(field.scale) + int(field.add)
         return raw * field.scale + field.add
 
 
 def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | RefusedAnswer:
-    """An answer of the named numbers of a frame."""
+    """The answer's content from a frame's numbers by field name (`body` is the frame), or the
+    refusal of a time that is not finite.
+    """
     q = tuple(float(found[name]) for name in ("qw", "qx", "qy", "qz"))
     if "wx" in found:
         rate = tuple(float(found[name]) for name in ("wx", "wy", "wz"))
     else:
         rate = None
-    # Each by itself: whole seconds and a fraction stay exact.
+    # Each field is rounded to ns by itself, so that large whole seconds do not blur the fraction.
     times_ns = [
         found[name] * unit_ns
         for name, unit_ns in (("t_ns", 1), ("t_s", NS_PER_S), ("t_sub", NS_PER_S))
@@ -412,8 +444,6 @@ def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | Refus
     if not all(number is None or math.isfinite(number) for number in (stars, mode)):
         stars = mode = None
     valid = "valid" not in found or (math.isfinite(found["valid"]) and found["valid"] != 0)
-    # Numbers of another kind in a frame are the tracker's own affair; four and three of them are
-    # fixed by the bench file.
     return JsonAnswer(
         t_ns, (q[0], q[1], q[2], q[3]),
         None if rate is None else (rate[0], rate[1], rate[2]), valid,
@@ -425,10 +455,10 @@ def said_by(found: Mapping[str, int | float], body: bytes) -> JsonAnswer | Refus
 
 
 class AnswerDecoder:
-    """Bytes in, answers and refusals out, by the format that a bench file names.
+    """Decodes bytes into answers and refusals, by the format that a bench file names.
 
-    `messages` says that each chunk is whole by itself (UDP, ZeroMQ). Raises InputError where a
-    Python function cannot be loaded, whose module stands in `folder` or in a package of `trust`.
+    `messages` says that each chunk is a complete message (UDP, ZeroMQ). A Python function's module
+    is in `folder` or in a package that `trust` names; raises InputError if it cannot be loaded.
     """
 
     def __init__(
@@ -462,12 +492,12 @@ class AnswerDecoder:
         return Delimited(b"\0", MAX_KEPT_BYTES, uncobs, "a COBS frame")
 
     def feed(self, host_ns: int, chunk: bytes) -> list[Answer | RefusedAnswer]:
-        """What `chunk` completes, which came at a host time, ns."""
+        """The answers and refusals that `chunk` completes; it arrived at host time `host_ns`."""
         cutter = self._cutter
         if cutter is None:
             return [self._answer(host_ns, statement, chunk) for statement in self._said(chunk)]
         cuts = cutter.cut(chunk + self._end() if self._messages else chunk)
-        # A program that writes a file may leave a frame in two for as long as it likes.
+        # A program that appends to a file may pause within a frame for any time.
         if (
             isinstance(cutter, Measured)
             and host_ns - self._last_ns > PAUSE_NS
@@ -486,7 +516,9 @@ class AnswerDecoder:
         return answers
 
     def _end(self) -> bytes:
-        """A message over UDP or ZeroMQ need not have the end that its framing has on a line."""
+        """The delimiter that is appended to a message: over UDP or ZeroMQ a frame may come without
+        the one that it needs on a line.
+        """
         return {"cobs": b"\0", "slip": SLIP_END}.get(self.settings.framing or "", b"")
 
     def _answer(
@@ -507,7 +539,9 @@ class AnswerDecoder:
 
 
 def _of_packet(body: bytes) -> JsonAnswer | RefusedAnswer:
+    """The content of an answer packet of the wire, or its refusal."""
     event = decode(body)
+    # The wire's decoder expects an attitude packet: its refusal is reworded for an answer.
     if isinstance(event, Refusal):
         return RefusedAnswer(
             event.reason, event.detail.replace("an attitude of 64", "an answer of 68"), body
@@ -532,6 +566,7 @@ _json = msgspec.json.Decoder(JsonAnswer)
 
 
 def _of_json(line: bytes) -> JsonAnswer | RefusedAnswer:
+    """The content of a JSON object, or the refusal of a text that is none."""
     if len(line) > MAX_JSON_BYTES:
         return RefusedAnswer(
             "format", f"more than {MAX_JSON_BYTES} bytes of JSON", line[:MAX_FRAME_BYTES]
@@ -539,6 +574,7 @@ def _of_json(line: bytes) -> JsonAnswer | RefusedAnswer:
     try:
         return _json.decode(line)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:
+        # JSON has no such numbers: "nan" tells the user more than the parser's error.
         if b"NaN" in line or b"Infinity" in line:
             return RefusedAnswer("nan", "a number is NaN or Infinity", line)
         return RefusedAnswer("format", f'{error}; write {{"t_ns":..., "q":[w,x,y,z]}}', line)
@@ -557,12 +593,14 @@ def _load(settings: AnswersSettings, folder: Path | None) -> Callable[[bytes], A
 def _of_function(
     function: Callable[[bytes], Any], chunk: bytes
 ) -> Iterator[JsonAnswer | RefusedAnswer]:
-    """The answers of a user's function: a dictionary each, as the JSON object."""
+    """The answers that a user's function returns for the bytes `chunk`, each a dictionary with the
+    keys of `JsonAnswer`; a refusal where it raises or returns anything else.
+    """
     try:
         for statement in function(chunk) or ():
             try:
                 yield msgspec.convert(statement, JsonAnswer, strict=False, builtin_types=())
             except msgspec.ValidationError as error:
                 yield RefusedAnswer("format", f"the function gave {error}", chunk)
-    except Exception as error:  # a user's code: its fault is told as any other bytes'
+    except Exception as error:  # a fault of the user's code must not end the run
         yield RefusedAnswer("python", one_line(f"{type(error).__name__}: {error}"), chunk)

@@ -1,17 +1,17 @@
-"""A tracker's answers judged as they come: when each looked, how far it is off, and the figures of
-the last minute; no I/O.
+"""Judges a tracker's answers as they arrive: when the tracker looked, how large the error is, and
+the statistics of the last minute; no I/O.
 
-**When.** A stamp on the tracker's own clock is followed as a sender's clock is (`SenderClock`),
-from arrivals alone. That tells times up to the shortest delay D from an exposure's middle to its
-answer. D is found from the motion: reading the lit attitude too late by delta turns a residual by
-omega delta, so that e_i = b + omega_i delta. Bias b and delta are fitted together to the answers of
-the last minute. Before the rate has changed enough, D is what is guessed: half an exposure and
-GUESSED_DELAY_S.
+**When.** Where the tracker stamps answers on a clock of its own, `SenderClock` fits that clock to
+the arrival times, as it does for a sender's. The fit leaves one time unknown: the shortest delay D
+from the middle of an exposure to the arrival of its answer. The motion reveals D: if the lit
+attitude is read too late by delta, the residual turns by omega delta, so that e_i = b + omega_i
+delta. The bias b and delta are fitted together to the answers of the last minute. Until the rate
+has changed enough, D is assumed to be half an exposure plus GUESSED_DELAY_S.
 
-**Laws.** Answers of finite numbers, however odd and in whatever order, never end the judging. No
-number that is not finite is stored. A fit that is not finite, that has too few answers near it, or
-whose delay is over MAX_DELAY_S is dropped, and the delay before it stays. A delay under which
-answers are no longer right is given up for the guess.
+**Laws.** Answers of finite numbers, whatever their values and order, never end the judging. Only
+finite numbers are stored. A fit that is not finite, that has too few answers near it, or whose
+delay is over MAX_DELAY_S is dropped, and the previous delay stays. If answers are no longer right
+under a fitted delay, the assumed delay replaces it.
 """
 
 import math
@@ -35,32 +35,36 @@ if TYPE_CHECKING:
 
 Verdict = Literal["right", "wrong", "invalid", "unpaired", "unjudged"]
 Stamp = Literal["start", "middle", "end", "arrival"]
-TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # from the stamp to the middle, in exposures
+TO_MIDDLE = {"start": 0.5, "middle": 0.0, "end": -0.5}  # stamp to exposure's middle, in exposures
 WINDOW_S = 60.0
-MAX_IN_WINDOW = 4096  # at over 68 answers a second less than a minute
+MAX_IN_WINDOW = 4096  # above 68 answers a second these cover less than WINDOW_S
 GUESSED_DELAY_S, GUESSED_SIGMA_S = 0.1, 0.1
 FIT_EACH_NS, MIN_FITTED = NS_PER_S, 10
-MAX_ROUNDS = 8  # of the fit, which ends earlier where the same answers count as in the round before
+MAX_ROUNDS = 8  # of the fit, which ends earlier where a round selects the same answers again
 CUT_SIGMAS = 8.0
-# least noise that the fit takes: answers without noise have errors of the pairing
+# Smallest noise that the fit assumes: answers without noise still have the errors of the pairing.
 MIN_NOISE_ARCSEC = 0.1
-# under a longer one the frames of an exposure are soon forgotten
+# Under a longer delay the frames of an exposure are soon older than KEPT_NS, and forgotten.
 MAX_DELAY_S = KEPT_NS / NS_PER_S / 2
-# sigmas of the time by which an answer may be off for its rate, and at most so long
+# An error that the unknown time explains does not count against the tracker: SURE sigmas of that
+# time, at most MAX_EXCUSED_S, times the rate.
 SURE, MAX_EXCUSED_S = 3.0, 0.3
-KNOWN_AGAIN_NS = NS_PER_S  # between two looks at how far this host's Unix time is off
-JUMPS = 3  # answers in a row that are later by JUMP_NS: the tracker's clock was set
-SILENT_S, SILENT_CYCLES, FIRST_S = 1.0, 5.0, 3.0  # without an answer; before the first one
+KNOWN_AGAIN_NS = NS_PER_S  # between two readings of this host's Unix offset
+JUMPS = 3  # so many answers in a row that are late by over JUMP_NS: the tracker's clock was set
+# A tracker is silent after SILENT_S or SILENT_CYCLES answer periods, the longer of the two, without
+# an answer; before its first answer after FIRST_S.
+SILENT_S, SILENT_CYCLES, FIRST_S = 1.0, 5.0, 3.0
 VERDICTS: tuple[Verdict, ...] = ("right", "wrong", "invalid", "unpaired", "unjudged")
-# Columns of the last minute: host time, s; place in VERDICTS; how long it was dark until then, s;
-# residual; rate, arcsec/s.
+# Columns of an answer's row: host time, s; index in VERDICTS; total time without a sky until then,
+# s; residual, arcsec; rate, arcsec/s.
 HOST_S, VERDICT, DARK_S, ERROR, RATE, COLUMNS = 0, 1, 2, slice(3, 6), slice(6, 9), 9
 
 
 @dataclass(frozen=True, slots=True)
 class AnswerRules:
-    """What the bench file says of answers' times, and from which angle on one is wrong.
-    `latency_s` None: not known.
+    """The bench file's rules for judging answers: the exposure, s; where in it the stamp stands
+    (`stamp`) and on which `clock`; the error above which an answer is wrong, arcsec; and the delay
+    `latency_s` from the exposure's middle to the answer, None where it is not known.
     """
 
     exposure_s: float
@@ -71,7 +75,7 @@ class AnswerRules:
 
     @classmethod
     def of(cls, config: "BenchConfig") -> Self:
-        """Those of a bench file; the defaults for one without `[answers]`."""
+        """The rules of a bench file; the defaults where it has no `[answers]`."""
         settings = config.answers
         exposure_s = config.tracker.exposure_s
         if settings is None:
@@ -84,8 +88,9 @@ class AnswerRules:
 
 
 class Judged(NamedTuple):
-    """An answer, its exposure's middle (host time, ns, with its sigma, s), what was lit, and the
-    residual (3,), arcsec, cam.
+    """A judged answer: its verdict, the middle of its exposure (host time, ns, with its sigma, s),
+    what was lit during the exposure, and the residual (3,), arcsec, camera axes. `lit` and
+    `residual` are None where the answer is compared with nothing.
     """
 
     answer: Answer
@@ -97,23 +102,23 @@ class Judged(NamedTuple):
 
 
 def unjudged(answer: Answer) -> Judged:
-    """An answer that is compared with nothing: its exposure is not known, and its arrival stands
-    for it.
+    """The answer with the verdict "unjudged" and no comparison. Its exposure is not known, so that
+    its arrival stands for the exposure's middle.
     """
     return Judged(answer, "unjudged", answer.host_ns, 0.0)
 
 
 class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
-    """A tracker's answers: counts of the run, the newest answer, and the last minute's figures;
-    arcsec about x, y, z (cam).
+    """The statistics of a tracker's answers: counts over the run, the newest answer, and figures of
+    the last minute. Errors are in arcsec about the camera's x, y and z.
 
-    `out_of_order` counts answers whose stamp is before that of one that came earlier, `unjudged`
-    those that judging failed on. `rms_arcsec` is about zero, `sigma3_arcsec` three standard
-    deviations about the mean, both of right answers.
-    `latency_ms` is from the exposure's middle to the last byte, known to `latency_sigma_ms` (null:
-    not known). `availability` is right answers over those due while a sky was shown. `silent` says
-    that no answer comes, "" while they do, and `trouble` what is wrong with the tracker's line for
-    as long as it lasts.
+    `out_of_order` counts answers whose stamp lies before the stamp of an earlier arrival,
+    `unjudged` answers for which the judging failed. `rms_arcsec` is about zero, `sigma3_arcsec`
+    three standard deviations about the mean, both of right answers. `latency_ms` is from the
+    exposure's middle to the last byte, `latency_sigma_ms` its sigma (null: not known).
+    `availability` is the number of right answers over the number due while a sky was shown. `age_s`
+    is the time since the newest answer. `silent` is a line of text where the tracker does not
+    answer, else ""; `trouble` names the present fault of its line, "" without one.
     """
 
     answers: int = 0
@@ -141,7 +146,12 @@ class TrackerFigures(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AnswerTimes:
-    """When the tracker looked: the middle of an answer's exposure on the host's clock."""
+    """Finds when the tracker looked: the middle of an answer's exposure on the host's clock.
+
+    `delay_s` is the present delay from the exposure's middle to the answer, `sigma_s` its sigma,
+    `guess_s` the delay that is assumed at the start. `fits` says that the delay is to be found from
+    the motion.
+    """
 
     def __init__(
         self, rules: AnswerRules, unix_offset: Callable[[], UnixOffset] = HOST_CLOCK.unix_offset
@@ -160,17 +170,17 @@ class AnswerTimes:
         self.delay_s, self.sigma_s = self.guess_s, GUESSED_SIGMA_S if self.fits else 0.0
 
     def shift(self, delay: "DelayFit") -> None:
-        """Take a delay that was found from the motion."""
+        """Change the delay by the result of a fit to the motion."""
         self.delay_s += delay.shift_s
         self.sigma_s = delay.sigma_s
 
     def give_up(self) -> None:
-        """Go back to the guess: under the delay that was found, answers are not right."""
+        """Return to the assumed delay, because under the fitted one answers are not right."""
         self.delay_s = self.guess_s
         self.sigma_s = GUESSED_SIGMA_S
 
     def middle(self, answer: Answer) -> tuple[int, float]:
-        """The middle of the exposure, host time, ns, and its sigma, s."""
+        """The middle of the answer's exposure, host time, ns, and its sigma, s."""
         rules = self._rules
         if answer.t_ns is not None:
             self.order.take(answer.t_ns)
@@ -197,7 +207,7 @@ class AnswerTimes:
 
 
 class DelayFit(NamedTuple):
-    """What the delay changes by, s, and one sigma of it, s."""
+    """The change of the delay that a fit finds, s, and its standard deviation, s."""
 
     shift_s: float
     sigma_s: float
@@ -206,12 +216,14 @@ class DelayFit(NamedTuple):
 def fitted_delay(
     error_arcsec: FloatArray, rate_arcsec_s: FloatArray, pull_s: float
 ) -> DelayFit | None:
-    """The delay, together with a bias, by residuals (n, 3) and rates (n, 3), cam; None where they
-    tell none.
+    """The change of the delay, fitted together with a bias to residuals (n, 3), arcsec, and rates
+    (n, 3), arcsec/s, camera axes; None where fewer than MIN_FITTED answers agree, or the fit has no
+    finite result.
 
-    `pull_s` is from the present delay to the guessed one, which is known to GUESSED_SIGMA_S. An
-    axis has its own noise: a tracker's roll is many times as noisy as its cross axes. Answers far
-    from the others, by their axes' noise, do not count.
+    `pull_s` is the assumed delay minus the present one: the assumption, with its sigma
+    GUESSED_SIGMA_S, is one more measurement in the fit. The noise is estimated for each axis,
+    because a tracker's roll is many times as noisy as its cross axes. Answers over CUT_SIGMAS of
+    that noise from the fit are left out.
     """
     design = np.zeros((len(error_arcsec), 3, 4))
     design[:, range(3), range(3)], design[:, :, 3] = 1.0, rate_arcsec_s
@@ -241,7 +253,9 @@ def fitted_delay(
 
 
 class AnswerJudge:
-    """Judges answers against the lit frames, and keeps the last minute's figures."""
+    """Judges answers against the frames that were lit, and computes the statistics of the last
+    minute. `counts` has the number of answers of each verdict over the run.
+    """
 
     def __init__(self, rules: AnswerRules, frames: LitFrames) -> None:
         self.counts: Counter[Verdict] = Counter()
@@ -255,7 +269,7 @@ class AnswerJudge:
         self._begun_ns: int | None = None
 
     def judge(self, answer: Answer) -> Judged:
-        """Judge one answer."""
+        """Compare an answer with the attitude that was lit during its exposure, and count it."""
         middle_ns, sigma_s = self.times.middle(answer)
         verdict: Verdict = "invalid"
         lit = residual = None
@@ -276,14 +290,15 @@ class AnswerJudge:
         return judged
 
     def pass_over(self, answer: Answer) -> Judged:
-        """An answer that judging failed on: it is counted, and compared with nothing."""
+        """Count an answer as "unjudged" after `judge` has failed on it."""
         judged = unjudged(answer)
         self._keep(judged)
         return judged
 
     def _verdict(self, residual: FloatArray, lit: Lit, sigma_s: float) -> Verdict:
-        """Whether a residual is an attitude of the sky that was lit, by a time known to
-        `sigma_s`.
+        """The verdict: "right" where the residual (3,), arcsec, is within the bench file's limit,
+        else "wrong"; "unjudged" for numbers that are not finite. `sigma_s` is the sigma of the
+        exposure's time: the motion during this uncertainty adds to the limit.
         """
         off_arcsec = float(np.linalg.norm(residual))
         rate_arcsec_s = ARCSEC_PER_RAD * float(np.linalg.norm(lit.rate_rad_s))
@@ -294,8 +309,8 @@ class AnswerJudge:
         return "wrong" if off_arcsec > bound_arcsec else "right"
 
     def _keep(self, found: Judged) -> None:
-        """Count an answer, and keep its row; without a comparison its error and rate are 0,
-        which nothing reads.
+        """Count an answer and store its row. Without a comparison its error and rate are 0; they
+        are read of right answers only.
         """
         row = self._rows[self._count % MAX_IN_WINDOW]
         row[:] = 0.0
@@ -319,7 +334,7 @@ class AnswerJudge:
         return rows[rows[:, HOST_S] >= now_ns / NS_PER_S - WINDOW_S]
 
     def _fit(self, now_ns: int) -> None:
-        """Find the delay, together with the bias, from the last minute's right answers."""
+        """Fit the delay and the bias to the right answers of the last minute."""
         rows = self._lately(now_ns)
         times = self.times
         right = rows[rows[:, VERDICT] == VERDICTS.index("right")]
@@ -333,19 +348,18 @@ class AnswerJudge:
         delay_fit = fitted_delay(right[:, ERROR], right[:, RATE], times.guess_s - times.delay_s)
         if delay_fit is None or times.delay_s + delay_fit.shift_s > max(MAX_DELAY_S, times.guess_s):
             return
+        # An answer cannot arrive before its exposure ends, half an exposure after its middle.
         shift_s = max(delay_fit.shift_s, self._rules.exposure_s / 2 - times.delay_s)
         times.shift(DelayFit(shift_s, delay_fit.sigma_s))
         self._turn_errors(shift_s)
 
     def _turn_errors(self, shift_s: float) -> None:
-        """The errors of the answers that are kept, under a delay that is longer by `shift_s`."""
+        """Correct the stored errors for a delay that is longer by `shift_s`."""
         self._rows[:, ERROR] -= self._rows[:, RATE] * shift_s
 
     def figures(self, now_ns: int, refused: dict[str, int], trouble: str = "") -> TrackerFigures:
-        """The figures at a host time; `refused` counts bytes or messages that were no answer, by
-        reason.
-
-        `trouble` is what is wrong with the tracker's line.
+        """The statistics at the host time `now_ns`. `refused` counts data that was no answer, by
+        reason; `trouble` is the present fault of the tracker's line. Both go into the result.
         """
         self._begun_ns = now_ns if self._begun_ns is None else self._begun_ns
         rows = self._lately(now_ns)
@@ -383,7 +397,8 @@ class AnswerJudge:
             }
         if len(error) > 1:
             figure_values |= {"sigma3_arcsec": _rounded(3 * error.std(axis=0, ddof=1))}
-        if cycle_s is not None:  # arrivals jitter by less than half a cycle
+        # An answer counts as due half a cycle after its time: arrivals jitter by less than that.
+        if cycle_s is not None:
             dark_s = self._frames.dark_ns / NS_PER_S - rows[0, DARK_S]
             due = math.floor((now_ns / NS_PER_S - rows[0, HOST_S] - dark_s) / cycle_s - 0.5) + 1
             figure_values |= {
@@ -404,7 +419,9 @@ class AnswerJudge:
 
 
 def cycle_of(at_s: FloatArray) -> float | None:
-    """The usual time between answers at rising times (n,), s; None for fewer than three."""
+    """The median time between answers, s, from their rising times (n,), s; None for fewer than
+    three answers.
+    """
     if len(at_s) > 2:
         return max(float(np.median(np.diff(at_s))), 1e-4)
     return None

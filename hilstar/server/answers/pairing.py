@@ -1,5 +1,5 @@
-"""An answer and what was lit while the tracker looked: the mean attitude over an exposure, frame
-by frame.
+"""Finds the attitude that an answer is compared with: the mean of the attitudes that the display
+lit during the tracker's exposure, weighted by how long each frame was lit.
 """
 
 from collections import deque
@@ -19,17 +19,22 @@ from hilstar.basics.rotation import (
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 
-# how long a frame is kept: an answer that comes later than that is not compared
+# Frames older than this are forgotten; an answer that arrives later is not compared.
 KEPT_NS = 20 * NS_PER_S
-MAX_HELD_NS = NS_PER_S // 2  # a frame without a following one is taken to stay for so long
-MIN_LIT_SHARE = 0.5  # an exposure that was darker shows no commanded attitude
-# between two frames of an exposure: a larger step is a jump, and the exposure has two skies
+# The newest frame has no successor yet that ends it: it counts as lit for this long.
+MAX_HELD_NS = NS_PER_S // 2
+# Smallest share of an exposure with a sky: below it the answer is "unpaired".
+MIN_LIT_SHARE = 0.5
+# A larger step between two frames is a jump: an exposure across it has two skies and no mean.
 MAX_STEP_RAD = np.radians(2.0)
 
 
 class LitFrame(NamedTuple):
-    """A frame: its light's begin on the host's and on the sender's clock, ns, and what it shows;
-    `q` None shows no sky.
+    """One displayed frame. Its light begins at `host_ns` on the host's clock and at `light_ns` on
+    the sender's clock, ns.
+
+    `q` is the displayed q_icrs_to_cam (w, x, y, z), None where the frame shows no sky.
+    `rate_rad_s` (3,), rad/s, camera axes, is None unless the frame is drawn in motion.
     """
 
     number: int
@@ -41,8 +46,8 @@ class LitFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Lit:
-    """What was lit over an exposure: the mean `q_icrs_to_cam`, the rate (3,), rad/s, cam, and its
-    first and last frames.
+    """What the display lit during an exposure: the mean attitude `q` (q_icrs_to_cam, w, x, y, z),
+    the rate (3,), rad/s, camera axes, and the numbers of the first and last frame.
 
     `light_ns` is the exposure's middle on the sender's clock.
     """
@@ -55,15 +60,16 @@ class Lit:
 
 
 class LitFrames:
-    """The frames of the last seconds. One thread adds them, another asks.
+    """The frames of the last KEPT_NS. One thread may add frames while another calls `over`.
 
-    A frame is lit until the next one. `centred`: frames stand for the time about their moment, as
-    without a screen that holds them; `hold_s` is how long a row of a screen stays lit, through the
-    middle of which a frame drawn in motion passes.
+    A frame is lit until the next one; `period_ns` is the refresh period. `centred`: no screen holds
+    the frames, so each stands for one period centred on its moment. `hold_s` is how long a row of
+    the screen stays lit: a frame drawn in motion shows its mean attitude `hold_s` / 2 after its
+    begin.
     """
 
     def __init__(self, period_ns: float, hold_s: float = 0.0, *, centred: bool = True) -> None:
-        self.dark_ns = 0  # how long no sky was shown
+        self.dark_ns = 0  # time without a sky since the start
         self._frames: deque[LitFrame] = deque(maxlen=max(16, int(KEPT_NS / period_ns)))
         self._hold_s = hold_s
         self._early_ns = round(period_ns / 2) if centred else 0
@@ -80,8 +86,10 @@ class LitFrames:
         return self._frames[-1] if self._frames else None
 
     def over(self, start_ns: int, end_ns: int) -> Lit | None:
-        """What was lit from `start_ns` to `end_ns` of the host's clock; None where that was no
-        one sky, or is forgotten.
+        """What the display lit from `start_ns` to `end_ns` on the host's clock.
+
+        None where it was dark for more than half of that time, where the attitude jumped, or where
+        the frames are older than KEPT_NS.
         """
         frames = list(self._frames)
         first = len(frames) - 1
@@ -101,6 +109,7 @@ class LitFrames:
                 gone_ns = self._begin_ns(frames[k + 1])
             else:
                 gone_ns = begin_ns + MAX_HELD_NS
+            # An exposure of no length still has the frame at its moment: any weight will do.
             if end_ns > start_ns:
                 overlap_ns = max(min(gone_ns, end_ns) - max(begin_ns, start_ns), 0)
             else:
@@ -121,10 +130,10 @@ class LitFrames:
     def _mean(
         self, frames: list[LitFrame], kept: list[int], lit_ns: FloatArray, middle_ns: int
     ) -> Lit | None:
-        """The mean rotation of the frames `kept`, weighted by how long each was lit; None across
-        a jump.
+        """The mean attitude and the rate over the frames with indices `kept`, which were lit for
+        `lit_ns` (n,); None across a jump. `middle_ns` is the exposure's middle, host time.
         """
-        # The rate needs two frames: of a short exposure a neighbour too.
+        # A rate needs two frames: an exposure within one frame takes its neighbours too.
         if len(kept) > 1:
             near = kept
         else:
@@ -150,8 +159,8 @@ class LitFrames:
         return Lit(q_mean, rate, light_ns, frames[kept[0]].number, frames[kept[-1]].number)
 
     def _shown(self, frame: LitFrame) -> FloatArray:
-        """The mean attitude of what a frame shows: of one drawn in motion that of the middle of
-        its light.
+        """The mean attitude q_icrs_to_cam that a frame shows; for a frame drawn in motion, the
+        attitude at the middle of its light.
         """
         assert frame.q is not None
         if frame.rate_rad_s is None:
@@ -160,7 +169,7 @@ class LitFrames:
 
 
 def residual_arcsec(reported: FloatArray, lit: FloatArray) -> FloatArray:
-    """The rotation vector (3,) from a lit to a reported attitude, cam, as `hilstar assess` has
-    it.
+    """The rotation vector (3,), arcsec, camera axes, from the lit to the reported q_icrs_to_cam.
+    `hilstar assess` has the same sign.
     """
     return np.asarray(ARCSEC_PER_RAD * to_rotation_vector(multiply(reported, conjugate(lit))))

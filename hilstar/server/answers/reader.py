@@ -1,11 +1,12 @@
-"""A tracker's answers, read by a process apart: a tracker that is dead, silent, babbling or lying
-never disturbs a frame.
+"""Reads a tracker's answers in a separate process, so that a tracker that is dead, silent or
+babbling never delays a frame.
 
-The other process (`hilstar.attitude.wire.apart_child`) opens the road, asks, stamps, decodes, and
-hands over answers and counts of what it refused. It decodes at most MAX_BYTES_PER_S, for at most
-WORK_SHARE of the time, and gives at most MAX_ANSWERS_PER_S; the rest is counted as `flood`: noise
-in which a frame may begin at every byte would otherwise take a whole core. What cannot end is read
-no faster than a chunk each FLOOD_REST_S: a core that only reads and drops is missing to the frames.
+The other process (`hilstar.attitude.wire.apart_child`) opens the line (a `ByteRoad`), polls the
+tracker, stamps and decodes its bytes, and passes on answers and counts of refusals. It decodes at
+most MAX_BYTES_PER_S, for at most WORK_SHARE of the time, and passes on at most MAX_ANSWERS_PER_S;
+the rest is counted as `flood`. Otherwise noise in which a frame may begin at every byte would take
+a whole core. During a flood it rests FLOOD_REST_S after each read, because the display needs the
+core.
 """
 
 from collections import Counter
@@ -42,21 +43,21 @@ from hilstar.server.bench.config.answers import AnswersSettings, answers_place, 
 ZMQ_ENDPOINT = "tcp://127.0.0.1:5562"
 MAX_BYTES_PER_S, MAX_BURST_BYTES = 500_000, 250_000
 WORK_SHARE, MAX_WORK_S = 0.2, 0.1
-PIECE_BYTES = 4096  # decoded in one go, of what is no message
-# no tracker says more; 1000 decoded here would delay one frame in ten by a millisecond or two
+PIECE_BYTES = 4096  # of a stream are decoded before the limits are checked again
+# No tracker sends more; 1000 decoded here would delay one frame in ten by a millisecond or two.
 MAX_ANSWERS_PER_S = 200
 FLOOD = "flood"
 FLOOD_REST_S = 0.01
 CHUNK_BYTES, LOOK_MS = 65_536, 100
-MAX_DETAILS = 20  # reasons whose newest example is kept
-HELD_S = 3.0  # for so long after its last byte a tracker's connection holds the line
+MAX_DETAILS = 20  # reasons with a stored example
+HELD_S = 3.0  # after its last byte a tracker's connection holds the line against a second one
 
 
 class HandedOver(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What the other process decoded: an answer, or counts of refusals with an example of each.
+    """A message of the reading process: an answer, or the number of refusals by reason (`refused`)
+    with an example of each (`details`), or a change of the line's state.
 
-    `trouble` is what is wrong with the line from now on, "" for nothing; None where that is as
-    before.
+    `trouble` is the line's fault from now on, "" where it has none; None where nothing changed.
     """
 
     answer: Answer | None = None
@@ -73,14 +74,16 @@ handed_over = msgspec.msgpack.Decoder(
 
 @dataclass(frozen=True)
 class ReadPlan:
-    """What the other process is to read, and how."""
+    """What the reading process needs: `[answers]`, the bench file's `folder`, and the tracker's
+    mounting q_body_to_cam (w, x, y, z), if given.
+    """
 
     settings: AnswersSettings
     folder: Path
     q_body_to_cam: Components | None
 
     def open(self, notices: Notices, clock: HostClock = HOST_CLOCK) -> ByteRoad:
-        """The road. Raises InputError where it cannot be opened."""
+        """Open the line that `[answers] source` names. Raises InputError if it cannot be opened."""
         settings = self.settings
         if settings.source == "serial":
             return SerialRoad(str(settings.port), settings.baud, ANSWERS, notices, clock)
@@ -117,21 +120,23 @@ class ReadPlan:
             raise InputError(f"[answers] endpoint: {error}") from error
 
     def open_first(self, notices: Notices) -> ByteRoad:
-        """The road, at a run's start: where a file is to come, nothing else may be there. Raises
-        InputError as `open`.
+        """Open the line at a run's start. Raises InputError as `open`, and if `path` is a device,
+        FIFO, socket or directory.
         """
         if self.settings.source == "file":
             refuse_no_file(self.folder / str(self.settings.path))
         return self.open(notices)
 
     def decoder(self, messages: bool) -> AnswerDecoder:
-        """The decoder of what comes. Raises InputError."""
+        """The decoder of the line's bytes; `messages` as in `AnswerDecoder`. Raises InputError if a
+        Python function cannot be loaded.
+        """
         return AnswerDecoder(self.settings, self.q_body_to_cam, messages, self.folder)
 
 
 class DecodingLink:
-    """In the other process: the road, its bounds, its questions, and what the bytes say, each
-    message a `HandedOver`.
+    """Runs in the reading process: reads and polls the line, keeps the limits of a flood, and
+    decodes the bytes. Its messages are encoded `HandedOver`s.
     """
 
     def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
@@ -150,15 +155,15 @@ class DecodingLink:
 
     @property
     def link_counts(self) -> LinkCounts:
-        """What the road counts."""
+        """The counts of the line's messages and losses."""
         return self._road.link_counts
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """Never known before it is read."""
+        """Always False: a message exists only after bytes were read and decoded."""
         return False
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
-        """What came and what it says; waits at most `timeout_ms`."""
+        """Read and decode what arrives within `timeout_ms`; the messages for the server."""
         if self._question is not None and self._next_question.over:
             self._road.put(self._question)
             self._next_question = self._clock.within(self._period_s)
@@ -230,13 +235,15 @@ class DecodingLink:
 
 
 class AnswersApart(Closing):
-    """A bench's answers, an `AnswerSource`: the other process is started at once, and restarted
-    where it ends.
+    """The `AnswerSource` of a bench. It starts the reading process at once, and restarts it if it
+    ends.
 
-    Raises InputError where the road cannot be opened, or a Python function cannot be loaded.
+    `details` has the newest example of each refusal, by reason. Raises InputError where the line
+    cannot be opened, or a Python function cannot be loaded.
     """
 
     def __init__(self, plan: ReadPlan, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
+        # Both are tried here, so that a wrong bench file is refused before the run begins.
         with plan.open_first(notices) as tried:
             self.endpoint = tried.endpoint
             messages = tried.messages
@@ -252,18 +259,18 @@ class AnswersApart(Closing):
 
     @property
     def unread(self) -> str:
-        """Why nothing is read now, "" while answers are: then it is not the tracker that is
-        silent.
+        """Why the reading process does not read the line now, "" while it does. Tells a failed
+        reader from a silent tracker.
         """
         return self._process.trouble
 
     def await_ready(self) -> None:
-        """Wait until the process reads; not for long."""
+        """Wait, for a limited time, until the process reads."""
         self._process.await_ready()
 
     def take(self, timeout_ms: float = 0.0) -> list[Answer]:
-        """The answers since the last call, oldest first; waits at most `timeout_ms` for the
-        first.
+        """The answers since the last call, oldest first. Waits at most `timeout_ms` for a first
+        one.
         """
         answers: list[Answer] = []
         for record in self._process.take() if self._process.wait(timeout_ms) else ():
@@ -279,11 +286,11 @@ class AnswersApart(Closing):
         return answers
 
     def refusals(self) -> dict[str, int]:
-        """How much was refused so far, by reason."""
+        """How many messages or pieces of data were refused since the start, by reason."""
         return dict(self._refused)
 
     def trouble(self) -> str:
-        """What is wrong with the tracker's line for as long as it lasts, "" while nothing is."""
+        """The present fault of the tracker's line, "" without a fault."""
         return self._trouble
 
     def close(self) -> None:
@@ -294,7 +301,9 @@ class AnswersApart(Closing):
 def recorded_answers(
     plan: ReadPlan, decoder: AnswerDecoder, path: Path
 ) -> Iterator[Answer | RefusedAnswer]:
-    """The answers in a file of recorded bytes. Raises InputError where it cannot be read."""
+    """The answers and refusals in a file of bytes recorded from a tracker's line; their host time
+    is 0. Raises InputError if it cannot be read.
+    """
     with open_regular(path, "give the bytes that were recorded from the tracker's line") as file:
         while chunk := file.read(CHUNK_BYTES):
             yield from decoder.feed(0, chunk)
@@ -310,8 +319,8 @@ def live_answers(
     stopped: Callable[[], bool],
     clock: HostClock = HOST_CLOCK,
 ) -> Iterator[Answer | RefusedAnswer]:
-    """The answers of an open road, read in this process for so long; the tracker is asked where
-    it has to be.
+    """The answers and refusals of an open line, read in this process for `seconds` or until
+    `stopped()`. Polls the tracker where `poll_hex` is given.
     """
     settings = plan.settings
     begun_ns = clock.now_ns()
@@ -331,8 +340,8 @@ def live_answers(
 
 
 def open_answers(config: BenchConfig, folder: Path, notices: Notices) -> AnswersApart:
-    """The answers that a bench file in `folder` names. Raises InputError where it names none, or
-    they cannot be opened.
+    """Start reading the answers that the bench file in `folder` declares. Raises InputError where
+    it has no `[answers]`, or the line cannot be opened.
     """
     if config.answers is None:
         raise InputError(

@@ -1,7 +1,8 @@
-"""Single stars that a tracker reports, star by star against those that were lit.
+"""Compares the single stars that a tracker reports with the stars that the display lit.
 
-Reports are matched with all lit stars. Figures are of stars that stand alone, ALONE_PX from any
-brighter one and from the edges: a star that hides in another's light is no lack of the tracker.
+Reports are matched with all lit stars. The results are those of stars that stand alone, ALONE_PX
+from any brighter star and from the edges: a tracker is not at fault where a star hides in the light
+of another.
 """
 
 from dataclasses import dataclass
@@ -27,8 +28,8 @@ EDGE_PX = 1.0
 
 @dataclass(frozen=True, slots=True)
 class LitStars:
-    """Stars (n,) that were lit within the detector: places, tracker pixels, V, B-V, and light in
-    electrons per second.
+    """Stars (n,) that were lit within the detector: positions in tracker pixels, V magnitude,
+    colour index B-V, and signal in electrons per second.
     """
 
     x_px: FloatArray
@@ -38,17 +39,18 @@ class LitStars:
     electrons_per_s: FloatArray
 
     def some(self, chosen: IntArray) -> "LitStars":
-        """The chosen stars alone."""
+        """The stars with the indices `chosen` (m,)."""
         parts = (self.x_px, self.y_px, self.v_mag, self.bv, self.electrons_per_s)
         return LitStars(*(part[chosen] for part in parts))
 
 
 @dataclass(frozen=True, slots=True)
 class StarResiduals:
-    """Each lit star (n,) that stands alone against its report: reported minus lit place, px, and
-    signal in magnitudes minus that of its light; NaN where it was not reported.
+    """The residuals of the lit stars (n,) that stand alone: reported minus lit position, px, and
+    the magnitude of the reported signal minus that of the star's light; NaN for a star that was not
+    reported.
 
-    The signal's zero point is any. `false` counts reported stars that were not lit.
+    The zero point of `signal_mag` is arbitrary. `false` counts reported stars that were not lit.
     """
 
     lit: LitStars
@@ -61,8 +63,8 @@ class StarResiduals:
 def judge_stars(
     reported: tuple[ReportedStar, ...], lit: LitStars, size_px: tuple[int, int]
 ) -> StarResiduals:
-    """Match reported stars with the lit ones within MATCH_PX, each with one at most, the brightest
-    lit star first; the detector is `size_px` (width, height).
+    """Match reported stars with lit stars within MATCH_PX, at most one report to a star, the
+    brightest lit star first. `size_px` is the detector's (width, height).
     """
     order = np.argsort(-lit.electrons_per_s, kind="stable")
     lit = lit.some(order)
@@ -74,7 +76,9 @@ def judge_stars(
 def lit_at(
     q_icrs_to_cam: FloatArray, stars: Stars, camera: Camera, faintest_e_per_s: float
 ) -> LitStars:
-    """The stars that a display shows a tracker's `camera` at an attitude, of a given light on."""
+    """The stars that a tracker's `camera` sees on its detector at an attitude, without stars
+    fainter than `faintest_e_per_s`, electrons per second.
+    """
     axes = to_matrix(q_icrs_to_cam)
     near = stars.near(axes[2], camera.field_radius_rad(EDGE_PX))
     near = near[stars.electrons_per_s[near] >= faintest_e_per_s]
@@ -91,13 +95,16 @@ def lit_at(
 
 
 def _stands_alone(lit: LitStars, size_px: tuple[int, int]) -> BoolArray:
-    """Which stars (n,), the brightest first, have no brighter one and no edge near."""
+    """Whether each star (n,), sorted by brightness, has neither a brighter star nor an edge within
+    ALONE_PX.
+    """
     alone = np.ones(len(lit.x_px), dtype=np.bool_)
     for place_px, side in zip((lit.x_px, lit.y_px), size_px, strict=True):
         alone &= (place_px >= ALONE_PX) & (place_px <= side - 1 - ALONE_PX)
     if len(lit.x_px):
         places = np.stack([lit.x_px, lit.y_px], axis=1)
         pairs: Any = KDTree(places).query_pairs(ALONE_PX, output_type="ndarray")
+        # Stars are sorted by brightness: the larger index of a pair is the fainter star.
         alone[pairs.max(axis=1)] = False
     return alone
 
@@ -105,7 +112,9 @@ def _stands_alone(lit: LitStars, size_px: tuple[int, int]) -> BoolArray:
 def _matched(
     reported: tuple[ReportedStar, ...], lit: LitStars
 ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
-    """Places off (n,), px, and signals (n,), mag, of lit stars, and how many reports are left."""
+    """The position errors in x and y (n,), px, the signals (n,), mag, of the lit stars, and the
+    number of reports that match no star.
+    """
     dx_px, dy_px, signal_mag = np.full((3, len(lit.x_px)), np.nan)
     if not reported or not len(lit.x_px):
         return dx_px, dy_px, signal_mag, len(reported)

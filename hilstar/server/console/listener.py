@@ -1,4 +1,6 @@
-"""The page's address, the socket that listens there, and the token that admits a browser."""
+"""The address of the page or of SCPI, the socket that listens there, and the token that admits a
+browser or controller.
+"""
 
 import contextlib
 import ipaddress
@@ -16,7 +18,7 @@ PORTS = {"--console": PORT, "--scpi": SCPI_PORT}
 FORM = "write HOST:PORT, such as 127.0.0.1:8765, or 0.0.0.0:8765 to be reached from elsewhere"
 BACKLOG = 512
 TOKEN_BYTES = 32
-# what a URL and a WebSocket's subprotocol carry as it is
+# Characters that need no escapes in a URL and in a WebSocket's subprotocol.
 TOKEN = re.compile(r"[A-Za-z0-9._~-]{16,200}")
 NAME = re.compile(
     r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?(\.[A-Za-z0-9]([A-Za-z0-9-]*[A-Za-z0-9])?)*(:\d{1,5})?"
@@ -25,14 +27,14 @@ NAME = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class ListenAddress:
-    """A host and a port; port 0 is any free one."""
+    """A host (name or numeric address) and a port; port 0 means any free port."""
 
     host: str
     port: int
 
     @property
     def is_loopback(self) -> bool:
-        """Whether only this machine can reach it."""
+        """Whether only programs on this machine can reach the address."""
         if self.host == "localhost":
             return True
         with contextlib.suppress(ValueError):
@@ -41,7 +43,9 @@ class ListenAddress:
 
 
 def parse_address(text: str, option: str = "--console") -> ListenAddress:
-    """ "HOST:PORT", "HOST", ":PORT" or "PORT" of --console or --scpi. Raises InputError."""
+    """The address in the text of --console or --scpi: "HOST:PORT", "HOST", ":PORT" or "PORT", with
+    the option's usual host and port for a missing part. Raises InputError for any other text.
+    """
     wrong = InputError(f"{option} {shortened(text)}: {_form(option)}")
     if text.isdecimal() and text.isascii():
         host = HOST
@@ -74,12 +78,11 @@ def _form(option: str) -> str:
 
 
 class PageListener(Closing):
-    """The page's listening socket, its names and its token. Raises InputError where the address
-    cannot be used.
+    """The listening socket of the page, its names and its token; SCPI listens by the same rules.
 
-    Where the page can be reached from other machines and no token is given, one is made (`made`).
-    `names` has further names of the page, under which a proxy shows it. SCPI listens by the same
-    rules.
+    If other machines can reach the page and no token is given, a random one is made (`made`).
+    `names` are further names of the page, under which a proxy serves it. Raises InputError if the
+    address, the token or a name cannot be used.
     """
 
     def __init__(
@@ -110,8 +113,8 @@ class PageListener(Closing):
 
     @property
     def hosts(self) -> list[str]:
-        """The host names under which a browser may ask for the page, besides numeric addresses
-        where `any_address`.
+        """The host names, in lower case, under which a browser may request the page. With
+        `any_address` every numeric address is allowed too.
         """
         own_hosts = ["localhost", "127.0.0.1", "[::1]", _bracketed(self.host)]
         if self.any_address:
@@ -120,14 +123,16 @@ class PageListener(Closing):
 
     @property
     def url(self) -> str:
-        """The address to open. It has the token if that was made here, never one that was given."""
+        """The URL to open in a browser. It contains the token if hilstar made it; a token that the
+        user gave is never printed.
+        """
         host = self.host
         with contextlib.suppress(ValueError):
             if ipaddress.ip_address(host).is_unspecified:
-                # This machine's address on its route out, by which others most likely reach it.
-                # Nothing is sent.
+                # This machine's address on its route out, by which others most likely reach it:
+                # connecting a UDP socket sends nothing.
                 is_v6 = self.socket.family == socket.AF_INET6
-                # documentation: RFC 3849, RFC 5737
+                # Addresses that are reserved for documentation (RFC 3849, RFC 5737).
                 beyond, host = ("2001:db8::1", "::1") if is_v6 else ("192.0.2.1", HOST)
                 with (
                     contextlib.suppress(OSError),

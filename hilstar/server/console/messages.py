@@ -1,9 +1,10 @@
-"""Messages between a run and its page's process, and the memory that the two share.
+"""The messages between a run and the process of its page, and the memory that both share.
 
-The memory has rings of numbered records, written without waiting and read without a lock. Each slot
-holds the number being written, the number that is complete (a seqlock) and a CRC, so that a reader
-notices a record that is incomplete or was overwritten. Each ring has one writer. The memory has no
-name (memfd): it is gone with the last process that has it open.
+The memory has rings of numbered records, which are written without waiting and read without a lock.
+Each slot holds the number of the record being written, the number of the complete record (a
+seqlock) and a CRC, so that a reader notices a record that is incomplete or was overwritten. Each
+ring has one writer. The memory has no name (memfd): it disappears with the last process that has it
+open.
 """
 
 import math
@@ -25,8 +26,8 @@ FRAME = struct.Struct("<9qI")
 PICTURE = struct.Struct("<3q4I4d")
 STALE, MISSING, BLANK, HAS_AGE = 1, 2, 4, 8
 _HEAD = struct.Struct("<Q")
-_SLOT = struct.Struct("<QQII")  # the number being written, the number that is whole, bytes, CRC-32
-_REQUEST = struct.Struct("<QQ")  # interval of pictures, and until when (host time), ns
+_SLOT = struct.Struct("<QQII")  # number being written, number that is complete, bytes, CRC-32
+_REQUEST = struct.Struct("<QQ")  # interval of pictures, and end of the request (host time), ns
 _WRONG_SINCE = struct.Struct("<d")  # UTC, s
 _PAGE = 4096
 FRAMES, FRAME_BYTES = 512, 128  # 8 s at 60 Hz
@@ -40,8 +41,8 @@ PICTURE_HEAD_BYTES = 128
 
 
 class FrameNumbers(NamedTuple):
-    """A frame and the counts up to it, packed by FRAME; host times, ns. `flags` combines STALE,
-    MISSING, BLANK, HAS_AGE.
+    """A frame's number, its host times, ns, the age of its attitude, ns, and the run's counts so
+    far, as FRAME packs them. `flags` combines STALE, MISSING, BLANK and HAS_AGE.
     """
 
     number: int
@@ -57,10 +58,11 @@ class FrameNumbers(NamedTuple):
 
 
 class PictureHead(NamedTuple):
-    """The head of a picture, as PICTURE packs it: frame, swap (host time, ns), attitude `q_w` to
-    `q_z`, NaN without one.
+    """The head of a picture, as PICTURE packs it: the frame's number, its swap (host time, ns), its
+    time `t_ns` on the timeline, and q_icrs_to_cam `q_w` to `q_z`, NaN without an attitude.
 
-    Levels of `item_bytes` each follow, `width` by `height`, then `sprites` records of SPRITE.
+    After it follow `height` rows of `width` levels of `item_bytes` bytes, then `sprites` records of
+    SPRITE.
     """
 
     frame: int
@@ -77,8 +79,13 @@ class PictureHead(NamedTuple):
 
 
 class RunState(protocol.SkyState, frozen=True, kw_only=True):
-    """The run at a host time, ns; `alive_ns` is when the frame loop last moved, 0 before it
-    began.
+    """The state of the run at the host time `host_ns`, ns. `alive_ns` is the host time of the frame
+    loop's last step, 0 before the first.
+
+    `operator_text` names the operator's switches that are on; `overlay` combines the aids that are
+    drawn, `patch_share` is the patch's level relative to white. The other texts report a fault, ""
+    without one: of the window, the display, the gamma ramp, a monitor shown by --force, and the
+    reading of the state itself (`note`). `failed` are the failed steps of a first-light session.
     """
 
     host_ns: int
@@ -95,8 +102,8 @@ class RunState(protocol.SkyState, frozen=True, kw_only=True):
 
 
 class NewAnswer(msgspec.Struct, frozen=True):
-    """The tracker's newest answer: its figures, the attitude that was lit, and places of stars
-    in the tracker's pixels.
+    """The tracker's newest answer: the statistics up to it, q_icrs_to_cam that was lit during its
+    exposure, and the reported centroids (x, y), tracker pixels.
     """
 
     figures: TrackerFigures
@@ -105,7 +112,7 @@ class NewAnswer(msgspec.Struct, frozen=True):
 
 
 class RunEvent(msgspec.Struct, frozen=True):
-    """An event of the run, at UTC, seconds."""
+    """An event of the run at Unix time `unix_s`, s: its kind and its text."""
 
     unix_s: float
     kind: str
@@ -113,7 +120,9 @@ class RunEvent(msgspec.Struct, frozen=True):
 
 
 class Order(msgspec.Struct, kw_only=True):
-    """An operator's order: a name of CONTROLS, the wanted state, and who gave it."""
+    """An operator's order: a name of CONTROLS, who gave it, and its arguments: the switch `on` or
+    off, the patch's `level` relative to white, a mark's `text`, the name of a `fault`.
+    """
 
     id: int
     name: str
@@ -125,7 +134,7 @@ class Order(msgspec.Struct, kw_only=True):
 
 
 class OrderAnswer(msgspec.Struct, kw_only=True):
-    """The answer to an order: an HTTP status and a line."""
+    """The answer to the order `id`: an HTTP status and a line of text."""
 
     id: int
     status: int
@@ -136,8 +145,8 @@ Pace = Literal["clock", "asked", "session"]
 
 
 class ScpiSetup(msgspec.Struct, frozen=True):
-    """SCPI's token ("" for none), the run's source of attitudes, and the UDP port where SCPI
-    steers the sky (0: it may not).
+    """The settings of SCPI: its token ("" for none), the run's source of attitudes, the run's UDP
+    port to which SCPI sends attitudes (0: it may not), and the largest rate, deg/s.
     """
 
     token: str
@@ -147,11 +156,13 @@ class ScpiSetup(msgspec.Struct, frozen=True):
 
 
 class Setup(msgspec.Struct, kw_only=True):
-    """What the page's process is given at its start; `hello` is the first message to every page.
+    """The settings that the page's process gets at its start; `hello` is the first message to every
+    page.
 
-    `pace` says when frames come: at their due time ("clock"), when a simulator asks or as fast as
-    possible ("asked"), or not at all, in a first-light session ("session"). Without a `token`
-    anybody who reaches the page may see it.
+    `hosts`, `names`, `any_address`, `port` and `token` are those of the PageListener. `pace` says
+    when frames are due: at fixed times ("clock"), when a simulator asks or as fast as possible
+    ("asked"), or never, in a first-light session ("session"). Without a `token` anybody who reaches
+    the page may see it. `picture_bytes` is the size of a picture's levels.
     """
 
     hello: protocol.Hello
@@ -168,7 +179,9 @@ class Setup(msgspec.Struct, kw_only=True):
 
 
 class Ring:
-    """A ring of `slots` records numbered from 1, each of at most `slot_bytes`."""
+    """A ring of `slots` records in shared memory, numbered from 1, of at most `slot_bytes` each.
+    Only one process may write to it.
+    """
 
     def __init__(self, memory: memoryview, slots: int, slot_bytes: int) -> None:
         self._memory = memory
@@ -179,45 +192,46 @@ class Ring:
 
     @staticmethod
     def size(slots: int, slot_bytes: int) -> int:
-        """The memory that a ring takes, bytes."""
+        """The size of a ring in memory, bytes."""
         return _HEAD.size + slots * (_SLOT.size + slot_bytes)
 
     @property
     def newest(self) -> int:
-        """The number of the newest record, 0 for none."""
+        """The number of the newest complete record, 0 for none."""
         return int(_HEAD.unpack_from(self._memory, 0)[0])
 
     def put(self, data: bytes) -> None:
-        """Write a record, cut to the slot's length."""
+        """Write a record; bytes beyond `slot_bytes` are cut off."""
         data = data[: self.slot_bytes]
         place = self.begin()
         self._memory[place : place + len(data)] = data
         self.end(len(data), zlib.crc32(data))
 
     def begin(self) -> int:
-        """Open the next slot; the offset of its bytes."""
+        """Mark the next slot as being written; returns the offset of its bytes in the memory."""
         place = self._place(self._next)
         _SLOT.pack_into(self._memory, place, self._next, 0, 0, 0)
         return place + _SLOT.size
 
     def end(self, length: int, crc: int) -> None:
-        """Close the slot, which has `length` bytes."""
+        """Mark the slot as complete, with `length` bytes; a `crc` of 0 is not checked."""
         _SLOT.pack_into(self._memory, self._place(self._next), self._next, self._next, length, crc)
         _HEAD.pack_into(self._memory, 0, self._next)
         self._next += 1
 
     def room(self, length: int) -> memoryview:
-        """The first `length` bytes of the slot that `begin` opened."""
+        """The memory of the first `length` bytes of the slot that `begin` opened."""
         place = self._place(self._next) + _SLOT.size
         return self._memory[place : place + length]
 
     def read(self, number: int) -> bytes | None:
-        """The record of that number; None where it is incomplete or overwritten."""
+        """The record of a number; None if it is incomplete or was overwritten."""
         place = self._place(number)
         begun, whole, length, crc = _SLOT.unpack_from(self._memory, place)
         if not number or begun != number or whole != number or length > self.slot_bytes:
             return None
         data = bytes(self._memory[place + _SLOT.size : place + _SLOT.size + length])
+        # The writer may have begun the slot anew while the bytes were copied.
         if _SLOT.unpack_from(self._memory, place) != (begun, whole, length, crc):
             return None
         if not crc or zlib.crc32(data) == crc:
@@ -225,7 +239,7 @@ class Ring:
         return None
 
     def last(self) -> tuple[int, bytes] | None:
-        """The newest complete record with its number; None where there is none yet."""
+        """The number and bytes of the newest complete record; None if there is none yet."""
         newest = self.newest
         for number in range(newest, max(newest - self._slots + 1, 0), -1):
             data = self.read(number)
@@ -234,8 +248,11 @@ class Ring:
         return None
 
     def after(self, number: int) -> Iterator[tuple[int, bytes]]:
-        """The complete records after `number` that are still there, oldest first."""
+        """The numbers and bytes of the complete records after `number` that are not overwritten
+        yet, oldest first.
+        """
         newest = self.newest
+        # The oldest slot is left out: the writer takes it next.
         for k in range(max(number + 1, newest - self._slots + 2, 1), newest + 1):
             data = self.read(k)
             if data is not None:
@@ -247,8 +264,8 @@ class Ring:
 
 @dataclass(frozen=True, slots=True)
 class PictureRequest:
-    """The interval at which the page wants pictures, and until when (host time), ns; 0 for
-    never.
+    """The interval at which the page needs pictures, ns, and the host time until which it needs
+    them, ns; 0 where it needs none.
     """
 
     each_ns: int = 0
@@ -256,8 +273,8 @@ class PictureRequest:
 
 
 class SharedMemory:
-    """The rings of a run (frames, states, events, answers, pictures), and the page's request for
-    pictures; `fd` is its file.
+    """The rings of a run (frames, states, events, answers, pictures) and the page's request for
+    pictures, in the file `fd`, for pictures of at most `picture_bytes`.
     """
 
     def __init__(self, fd: int, picture_bytes: int) -> None:
@@ -283,14 +300,14 @@ class SharedMemory:
 
     @classmethod
     def make(cls, picture_bytes: int) -> "SharedMemory":
-        """New memory for pictures of at most `picture_bytes`."""
+        """Create a new memory for pictures of at most `picture_bytes`."""
         return cls(os.memfd_create("hilstar-console"), picture_bytes)
 
     def put_picture(
         self, head: PictureHead, levels: np.ndarray, sprites: Sequence[np.ndarray] = ()
     ) -> None:
-        """Write a picture: its levels (h, w), and the star, x and y of its sprites, (n,) each.
-        Raises ValueError (size).
+        """Write a picture: its levels (h, w), and the star number, x and y, monitor px, of its
+        sprites, (n,) each. Raises ValueError if it does not fit.
         """
         end = PICTURE_HEAD_BYTES + levels.nbytes
         whole = end + head.sprites * SPRITE.itemsize
@@ -308,7 +325,7 @@ class SharedMemory:
 
     @property
     def want(self) -> PictureRequest:
-        """The page's request for pictures."""
+        """The page's present request for pictures."""
         return PictureRequest(*_REQUEST.unpack_from(self._memory, 0))
 
     @want.setter
@@ -317,8 +334,8 @@ class SharedMemory:
 
     @property
     def wrong_since_s(self) -> float:
-        """Since when the page has judged the run wrong (UTC, s), for a page that takes over; 0
-        while it is right.
+        """The Unix time, s, since which the page has judged the sky wrong; 0 while it is right. A
+        page's process that is started again reads it.
         """
         return float(_WRONG_SINCE.unpack_from(self._memory, _REQUEST.size)[0])
 

@@ -1,5 +1,5 @@
-"""What the page draws over a picture: stars, outline and grid, from the bench's stars and its
-two cameras.
+"""Computes the marks that the page draws over a picture: star labels, the tracker's outline, and
+the grid of right ascension and declination, from the bench's stars and its two cameras.
 """
 
 import math
@@ -25,19 +25,21 @@ from hilstar.sky.stars import Stars
 if TYPE_CHECKING:
     from hilstar.server.bench.frame import Bench
 
-MAX_STARS, MAX_COLOURS = 400, 5000  # the brightest of a picture, and those whose colour is written
+MAX_STARS, MAX_COLOURS = 400, 5000  # marked stars of a picture; stars with a note on their colour
 SKY_FAINTEST_MAG = 5.5
-SIDE_PLACES = 9  # points along each side of the tracker's outline, which a lens bends
+SIDE_PLACES = 9  # points on each side of the tracker's outline: a lens bends the sides
 LINE_PLACES = 49  # points on a line of the grid
 LINES_ACROSS = 3  # minimum number of grid lines from the image's middle to its corner
 STEPS_DEG = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0)
 RA_STEPS_DEG = (*STEPS_DEG, 45.0, 90.0)
-BEYOND = 0.1  # relative to the image's size: how far lines go on outside it
+BEYOND = 0.1  # lines extend so far outside the image, relative to its size
 PX_DIGITS, SKY_DIGITS = 2, 4
 
 
 class AnswerMarks(NamedTuple):
-    """A tracker's answer on the monitor, px: the field that it reports, and its centroids."""
+    """A tracker's answer on the monitor: the outline of the field that it reports, and its
+    centroids, lists of (x, y), monitor px.
+    """
 
     field_px: list[list[float]]
     centroids_px: list[list[float]]
@@ -45,8 +47,8 @@ class AnswerMarks(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CameraMarks:
-    """Marks that need no stars: boresight, tracker's outline, lines of RA and Dec, by the two
-    cameras of a bench.
+    """The marks that need no stars: boresight, outline of the tracker's field, and lines of RA and
+    Dec, computed with the two cameras of a bench.
     """
 
     monitor: Camera
@@ -59,8 +61,8 @@ class CameraMarks:
         q_icrs_to_cam: FloatArray | None,
         grid: bool = False,
     ) -> Truth:
-        """The truth of a picture: its stars, the marks, and with `grid` and an attitude the
-        lines of RA and Dec.
+        """All marks of a picture: the given stars, boresight and outline, and, with `grid` and an
+        attitude, the lines of RA and Dec.
         """
         lines: list[GridLine] = []
         if grid and q_icrs_to_cam is not None:
@@ -84,10 +86,11 @@ class CameraMarks:
         shown: FloatArray,
         centroids: list[tuple[float, float]],
     ) -> AnswerMarks:
-        """Where a tracker takes its field to be, and its centroids, in a picture of the attitude
-        `shown`.
+        """The marks of a tracker's answer in a picture of the attitude `shown`: the field that the
+        tracker reports and its `centroids`, tracker px.
 
-        `lit` is the attitude that the answer was compared with: its stars have moved on since.
+        `residual_arcsec` (3,) is the answer's, None without one. `lit` is the attitude that the
+        answer was compared with: the stars have moved since, so that the centroids move with them.
         """
         field_px: list[list[float]] = []
         if residual_arcsec is not None:
@@ -104,19 +107,24 @@ class CameraMarks:
         )
 
     def _on_monitor(self, rays: FloatArray) -> list[list[float]]:
-        """The places (x, y) on the monitor of those rays (n, 3), cam, that have one."""
+        """The positions (x, y), monitor px, of rays (n, 3), camera axes; rays without a position
+        on the monitor's plane are left out.
+        """
         x_px, y_px = self.monitor.project_outward(rays @ self.monitor.cam_to_image.T)
         known = np.isfinite(x_px) & np.isfinite(y_px)
         return [[x, y] for x, y in np.column_stack((x_px, y_px))[known].round(PX_DIGITS).tolist()]
 
     def on_screen(self, x_px: FloatArray, y_px: FloatArray, beyond: float) -> np.ndarray[Any, Any]:
-        """A mask of places (n,) on the monitor, or outside by at most `beyond` of its size."""
+        """Whether positions (n,), px, lie on the monitor or outside it by at most `beyond` times
+        its size.
+        """
         width, height = self.monitor.resolution_px
         with np.errstate(invalid="ignore"):  # NaN: behind the camera, or beyond the lens
             inside = np.abs(x_px - (width - 1) / 2) <= width * (0.5 + beyond)
             return np.asarray(inside & (np.abs(y_px - (height - 1) / 2) <= height * (0.5 + beyond)))
 
     def _grid(self, q_icrs_to_cam: FloatArray, turn: FloatArray) -> Iterator[GridLine]:
+        """The lines of RA and Dec in the field; `turn` (3, 3) turns ICRS into image axes."""
         ra_deg, dec_deg, _ = to_radec_roll_deg(q_icrs_to_cam)
         radius_deg = math.degrees(self.monitor.field_radius_rad(0.0))
         step_deg = _step(STEPS_DEG, radius_deg / LINES_ACROSS)
@@ -124,7 +132,7 @@ class CameraMarks:
         high_deg = min(dec_deg + radius_deg, 90.0)
         wide_deg = 180.0
         ra_step_deg = 30.0
-        # the widest circle of right ascension that the field touches
+        # How far in right ascension the field reaches; all around where it contains a pole.
         if max(-low_deg, high_deg) < 90.0:
             share = math.sin(math.radians(min(radius_deg, 89.0))) / math.cos(math.radians(dec_deg))
             wide_deg = math.degrees(math.asin(min(share, 1.0)))
@@ -160,7 +168,9 @@ class CameraMarks:
 
 @dataclass(frozen=True, slots=True)
 class Overlay:
-    """The marks of a bench's two cameras, and the stars bright enough for the monitor."""
+    """The marks of a bench: those of its two cameras, and its stars that are bright enough for the
+    monitor.
+    """
 
     marks: CameraMarks
     stars: Stars
@@ -171,7 +181,9 @@ class Overlay:
         return self.marks.monitor
 
     def sky(self) -> SkyMap:
-        """Stars and bodies of the whole sky, the brightest first, and the screen's corners."""
+        """The map of the whole sky: stars and bodies brighter than SKY_FAINTEST_MAG, the brightest
+        first, and the directions of the screen's corners, camera axes.
+        """
         bodies = len(self.stars.bodies)
         order = np.argsort(self.stars.v_mag, kind="stable")
         bright = order[self.stars.v_mag[order] < SKY_FAINTEST_MAG]
@@ -197,8 +209,8 @@ class Overlay:
         return [SkyPlace(*row) for row in zip(*places, v_mag, self._labels(which, ""), strict=True)]
 
     def _labels(self, which: np.ndarray[Any, Any], none: str | None = None) -> list[str]:
-        """A star's label: a body's name, else its designation, else its HIP number, or `none`
-        where that is given.
+        """The labels of stars: a body's name, else the star's designation, else its HIP number, or
+        `none` in place of the number if that is given.
         """
         found = zip(self.stars.names(which), self.stars.hip[which].tolist(), strict=True)
         labels = [name or label_of(hip) for name, hip in found]
@@ -209,8 +221,8 @@ class Overlay:
     def truth(
         self, frame: int, q_icrs_to_cam: FloatArray, clipped: tuple[int | str, ...] = ()
     ) -> Truth:
-        """What is where in a picture at an attitude, with the grid; `clipped` are HIP numbers,
-        and names of what has none.
+        """All marks of a picture at an attitude, with its MAX_STARS brightest stars and the grid.
+        `clipped` are the HIP numbers of clipped stars, and names of those without one.
         """
         turn = self.monitor.cam_to_image @ to_matrix(q_icrs_to_cam)
         near = self.stars.near(turn[2], self.monitor.field_radius_rad(0.0))
@@ -234,7 +246,7 @@ class Overlay:
 
 
 def overlay_of(bench: "Bench") -> Overlay:
-    """The overlay of an assembled bench."""
+    """The overlay of an open bench."""
     return Overlay(
         CameraMarks(bench.camera, tracker_camera(bench.config.tracker, bench.file.folder)),
         bench.shown_stars,
@@ -242,7 +254,9 @@ def overlay_of(bench: "Bench") -> Overlay:
 
 
 def catalogue_sky() -> SkyMap:
-    """The map of the sky without a bench: Hipparcos' bright stars at their places of 1991."""
+    """The map of the sky without a bench: the bright stars of Hipparcos at their catalogue
+    positions (epoch 1991.25).
+    """
     catalog = load_catalog()
     bright = np.argsort(catalog.v_mag, kind="stable")
     bright = bright[catalog.v_mag[bright] < SKY_FAINTEST_MAG]
@@ -261,7 +275,9 @@ def catalogue_sky() -> SkyMap:
 
 
 def _border(resolution_px: tuple[int, int], places: int) -> tuple[FloatArray, FloatArray]:
-    """Points around an image's edge in order, `places` along each side."""
+    """Points around the edge of an image in order, x and y, px: `places` on each side, its corners
+    included.
+    """
     width, height = resolution_px
     along = np.linspace(0.0, 1.0, places)[:-1]
     share_x = np.concatenate((along, np.ones_like(along), 1 - along, np.zeros_like(along)))
@@ -270,10 +286,12 @@ def _border(resolution_px: tuple[int, int], places: int) -> tuple[FloatArray, Fl
 
 
 def _step(steps: tuple[float, ...], most: float) -> float:
+    """The largest of `steps` (rising) that is not above `most`, else the smallest."""
     return max((step for step in steps if step <= most), default=steps[0])
 
 
 def _multiples(low: float, high: float, step: float) -> list[float]:
+    """The multiples of `step` from `low` to `high`, ends included in spite of rounding."""
     return [
         k * step for k in range(math.ceil(low / step - 1e-9), math.floor(high / step + 1e-9) + 1)
     ]
@@ -289,12 +307,12 @@ def _digits(step_deg: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class OverlayScene:
-    """What the page's process draws over a bench's pictures, in a form that can be pickled.
+    """What the page's process needs to draw over a bench's pictures, in a form that can be pickled.
 
-    `hip` and `v_mag` (n,) are those of the bench's shown stars, `names` what those without a HIP
-    number are called, by place, and `sky` is the map of the whole sky. `aids_in_levels` says that
-    levels have the operator's aids in them already. `colours` says of stars, by place, what the
-    tracker sees of them and what a display that drives its primaries apart shows.
+    `hip` and `v_mag` (n,) belong to the bench's shown stars. `names` are the names of stars without
+    a HIP number, by index, and `sky` is the map of the whole sky. `aids_in_levels` says that the
+    levels of a picture contain the operator's aids already. `colours` are the notes of
+    `colour_notes`.
     """
 
     marks: CameraMarks
@@ -307,13 +325,14 @@ class OverlayScene:
     colours: dict[int, str]
 
     def label(self, star: int) -> str:
-        """What is written beside a star."""
+        """The text beside the star of that index."""
         return self.names.get(star) or label_of(int(self.hip[star]))
 
 
 def colour_notes(bench: "Bench") -> dict[int, str]:
-    """The colours of a bench's brightest shown stars, where its primaries are driven apart: by
-    channel, or mean wavelength.
+    """A note on the colour of each of the MAX_COLOURS brightest stars, by the star's index: the
+    shares of the tracker's channels, or the mean wavelength for a tracker without channels.
+    {} where the monitor's primaries are not driven separately.
     """
     colours = bench.colours
     stars = bench.shown_stars

@@ -1,10 +1,10 @@
-"""The figures of the operator's page: one row each, with its name, unit, digits and source.
+"""The table of the figures on the operator's page: name, unit, digits and source of each.
 
-A new figure is a row of FIGURES. Its key is its place in the page's state, as `counts.missed`; a
-key of `counts` is a field of RunCounts too, and its row says where the run keeps it. From the rows
-follow the counts that a run publishes (`counts_of`), the metrics of `GET /metrics`
-(`metrics_of`), and the lines of the page's panels (`page/protocol.js`, made by
-tools/make_page_protocol.py).
+A new figure is a row of FIGURES. Its key is its path in the page's state, as `counts.missed`; a
+key of `counts` is also a field of RunCounts, and its row has the function that reads it from the
+run. The counts that a run publishes (`counts_of`), the metrics of `GET /metrics` (`metrics_of`) and
+the lines of the page's panels (`page/protocol.js`, made by tools/make_page_protocol.py) follow from
+the rows.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from hilstar.attitude.receiver import PacketCounts
     from hilstar.server.loop import FrameLoop
 
-# The panels of the page; HIDDEN is in the state and the metrics alone, or drawn in another way.
+# The panels of the page; a HIDDEN figure is only in the state and the metrics, or drawn elsewhere.
 Panel = Literal["pointing", "source", "run", "tracker", ""]
 HIDDEN: Panel = ""
 # How the page writes a value, by the function of that name in page/figures.js: a number with its
@@ -33,8 +33,8 @@ PLUS_MINUS, NONE = "\N{PLUS-MINUS SIGN}", "\N{EN DASH}"
 
 
 class RunCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """Frames and packets since the run began; `refused` by reason; `lost` as gaps of their
-    `sequence` show.
+    """Counts of frames and packets since the run began. `refused` is by reason; `lost` counts
+    packets that gaps in their `sequence` show.
     """
 
     frames: int = 0
@@ -48,7 +48,7 @@ class RunCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class CountedRun(Protocol):
-    """What the page shows of a run's counters (`hilstar.server.run_progress.Running`)."""
+    """The counters of a run that the page reads; see `hilstar.server.run_progress.Running`."""
 
     @property
     def loop(self) -> "FrameLoop": ...  # noqa: D102
@@ -58,7 +58,9 @@ class CountedRun(Protocol):
 
 
 class FigureMetric(NamedTuple):
-    """A metric of `GET /metrics`, named without `hilstar_`; its unit is `scale` of the figure's."""
+    """A metric of `GET /metrics`; its name lacks `hilstar_`, and its value is `scale` times the
+    figure's.
+    """
 
     name: str
     help: str
@@ -68,10 +70,11 @@ class FigureMetric(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PageFigure:
-    """A figure. `text` is how the page writes it: {} is the value, {KEY} and {KEY UNIT} another.
+    """A figure of the page. `text` is the format of its line: {} is its value, {KEY} and {KEY UNIT}
+    the value of another key.
 
-    `none` stands where there is no value. A figure over zero, or not empty, has the colour of
-    `shade`. `source` is where the run keeps what RunCounts has.
+    `none` is the text where there is no value. A figure above zero, or not empty, is drawn in the
+    colour of `shade`. `source` reads a figure of RunCounts from the run.
     """
 
     panel: Panel
@@ -346,7 +349,7 @@ def _some(counts: Mapping[Reason, int]) -> dict[str, int]:
 
 
 def counts_of(running: CountedRun) -> RunCounts:
-    """The counts of a run, each from its row's source."""
+    """The counts of a run, each read by the source of its row."""
     counts: dict[str, Any] = {}
     for figure in FIGURES:
         if figure.source is not None:
@@ -355,7 +358,9 @@ def counts_of(running: CountedRun) -> RunCounts:
 
 
 def value_of(state: object, key: str) -> Any:
-    """The value of a key in the page's state; None where there is none."""
+    """The value at the path `key` (as "counts.missed") in the page's state; None if a part of the
+    path is None.
+    """
     value: Any = state
     for name in key.split("."):
         if value is None:
@@ -365,7 +370,9 @@ def value_of(state: object, key: str) -> Any:
 
 
 def metrics_of(state: object) -> Iterator[tuple[FigureMetric, float]]:
-    """The metrics of the figures that have one and a value; of a list, how many it has."""
+    """The metrics and their values, of all figures that have both; the value of a list is its
+    length.
+    """
     for figure in FIGURES:
         value = value_of(state, figure.key)
         if figure.metric is None or value is None:

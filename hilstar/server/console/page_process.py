@@ -1,7 +1,7 @@
-"""Keeps the process of the page and of SCPI alive beside a run: starts it again, publishes the
-run's state, takes its orders.
+"""Runs the process of the page and of SCPI beside a run: starts it, restarts it if it ends,
+publishes the run's state to it, and carries out its orders.
 
-One thread does this ten times a second; the frame loop takes no part in it.
+A thread of its own does this ten times a second; the frame loop takes no part in it.
 """
 
 import contextlib
@@ -35,17 +35,20 @@ from hilstar.server.console.messages import (
 )
 
 TICK_S = 0.1
-FIRST_WAIT_S, MAX_WAIT_S = 0.1, 5.0  # before the page's process is started again
-STEADY_S = 10.0  # a process that lived this long is restarted at once
+FIRST_WAIT_S, MAX_WAIT_S = 0.1, 5.0  # shortest and longest pause before a restart
+STEADY_S = 10.0  # a process that ran for longer is restarted after the shortest pause
 END_WAITS_S = 1.0
 MAX_ORDERS = 8  # at once
 MAX_ORDER_BYTES = 8_000
+# Environment variables for the run alone: those by which it reports to systemd, and the token,
+# which the page's process gets in its Setup.
 OF_THE_RUN = {"NOTIFY_SOCKET", "WATCHDOG_PID", "WATCHDOG_USEC", "HILSTAR_TOKEN"}
+# -P: no module is imported from the working directory.
 PAGE = (sys.executable, "-P", "-m", "hilstar.server.console.server")
 
 
 class Listeners(NamedTuple):
-    """Where the page is served, and where SCPI is; None where it is not."""
+    """The listeners of the page and of SCPI; None for one that is not served."""
 
     page: PageListener | None
     scpi: PageListener | None = None
@@ -62,8 +65,10 @@ class _Page:
 
 
 class PageProcess(Closing):
-    """The page of a run or session while this is open: `now` is its state, and `notices` are its
-    events.
+    """Serves the page of a run or session from a separate process until it is closed.
+
+    `now` returns the current state, `notices` give the events, and `do` carries out an order, on a
+    thread of its own. `memory` is shared with the process.
     """
 
     def __init__(
@@ -95,7 +100,7 @@ class PageProcess(Closing):
         self._thread.start()
 
     def close(self) -> None:
-        """End the page's process."""
+        """End the page's process, at the latest END_WAITS_S after it was asked to."""
         self._stop.set()
         self._thread.join()
         self._workers.shutdown(wait=False, cancel_futures=True)
@@ -103,12 +108,13 @@ class PageProcess(Closing):
 
     @property
     def pid(self) -> int | None:
-        """The process ID of the page's process, None while there is none."""
+        """The ID of the page's process, None while there is none."""
         if self._page is None:
             return None
         return self._page.process.pid
 
     def _run(self) -> None:
+        """The thread: ticks and orders until `close`, then the end of the page's process."""
         next_s = 0.0
         while not self._stop.is_set():
             now_s = time.monotonic()
@@ -120,7 +126,7 @@ class PageProcess(Closing):
         self._page = None
         if page is None:
             return
-        page.channel.close()  # which tells it to end
+        page.channel.close()  # the page's process ends when its channel is closed
         try:
             page.process.wait(END_WAITS_S)
         except subprocess.TimeoutExpired:
@@ -128,6 +134,7 @@ class PageProcess(Closing):
             page.process.wait()
 
     def _tick(self, now_s: float) -> None:
+        """Publish the state and new events; start the page's process, or note that it has ended."""
         try:
             self._memory.states.put(msgspec.json.encode(self._now()))
             ahead_s = time.time() - time.monotonic_ns() * 1e-9
@@ -138,7 +145,8 @@ class PageProcess(Closing):
                 )
                 self._memory.events.put(msgspec.json.encode(event))
         except Exception as error:
-            # such as a container that changed while it was read: the next tick reads it again
+            # E.g. the frame loop changed a container that was being read: the next tick reads it
+            # again.
             self._memory.states.put(
                 msgspec.json.encode(
                     RunState(host_ns=time.monotonic_ns(), note=one_line(repr(error)))
@@ -158,6 +166,7 @@ class PageProcess(Closing):
             self._lose(f"the operator's page ended ({how})", anew=now_s - page.begun_s > STEADY_S)
 
     def _start_page(self, now_s: float) -> None:
+        # Packets of a sequence: each message arrives whole.
         channel, its_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         environment = {name: value for name, value in os.environ.items() if name not in OF_THE_RUN}
         given = (self._setup_fd, self._memory.fd, its_end.fileno(), *self._listener_fds)
@@ -184,6 +193,7 @@ class PageProcess(Closing):
         self._again.put_off(anew=anew)
 
     def _listen(self, seconds: float) -> None:
+        """Wait for an order for at most `seconds`, and have a worker carry it out."""
         page = self._page
         if page is None:
             self._stop.wait(seconds)
@@ -196,12 +206,13 @@ class PageProcess(Closing):
             if data:
                 order = msgspec.json.decode(data, type=Order)
                 self._workers.submit(self._do, order).add_done_callback(self._answer)
-            else:  # the page has ended, which the next tick reports
+            # No data: the page has ended, which the next tick reports.
+            else:
                 self._stop.wait(seconds)
 
     def _answer(self, done: Future[OrderAnswer]) -> None:
         page = self._page
         if page is None or done.cancelled() or done.exception() is not None:
             return
-        with contextlib.suppress(OSError):  # it has gone meanwhile
+        with contextlib.suppress(OSError):  # the page may have ended meanwhile
             page.channel.send(msgspec.json.encode(done.result()))

@@ -1,5 +1,4 @@
-"""What the page's server and a browser say to each other, as JSON: `docs/console.md` has the
-same for a reader.
+"""The JSON messages between the page's server and a browser; `docs/console.md` describes them.
 
 `tools/make_page_protocol.py` makes the page's constants (`page/protocol.js`) from this file.
 Numbers that JSON does not know (NaN, infinity) are sent as null.
@@ -15,18 +14,23 @@ from hilstar.server.console.page_figures import RunCounts
 
 # the WebSocket's subprotocols; the token follows the second
 SUBPROTOCOL, TOKEN_PROTOCOL = "hilstar", "hilstar.token."
-# close code: the page waits before it comes back, so as not to displace the next one
+# Close code: the page waits before it connects again, so that it does not displace another one.
 GIVES_WAY = 4013
 HISTORY_S = 60  # length of the charts
 KEPT_EVENTS = 200
 MIN_HZ, MAX_HZ = 0.1, 10.0  # bounds on a page's rate of pictures
-SWITCHES = ("blank", "pause", "patch", "crosshair", "grid")  # as `run.aids` has them
+SWITCHES = ("blank", "pause", "patch", "crosshair", "grid")  # the names in the operator's `Aids`
 CONTROLS = (*SWITCHES, "ledger", "mark", "fault")
 PATCH_SHARE = 0.5  # relative to white, where an order has no level
 
 
 class Hello(msgspec.Struct, kw_only=True):
-    """What a page is told first: the run, its monitor, and what the page may do."""
+    """The first message to a page: the run, its monitor, and what the page may do.
+
+    `white_level` is the largest level of a picture; `faults` are the names of the scenario's
+    faults; `session` marks a first-light session; `answers` says that the run has a tracker's
+    answers; `control` that the page may give orders.
+    """
 
     version: str
     command: str
@@ -46,9 +50,10 @@ class Hello(msgspec.Struct, kw_only=True):
 
 
 class SkyHealth(msgspec.Struct, frozen=True):
-    """Whether the sky is right, since when (UTC), and why not. Also the answer of `GET /health`.
+    """Whether the sky is right, since when (UTC), and the reasons if it is not. Also the answer of
+    `GET /health`.
 
-    `headline` says it in a few words. `late`: the sky itself is right, and its frames are missed.
+    `headline` is a summary in a few words. `late`: the sky is right, but frames are missed.
     """
 
     ok: bool
@@ -59,8 +64,8 @@ class SkyHealth(msgspec.Struct, frozen=True):
 
 
 class ShownAttitude(msgspec.Struct, frozen=True, kw_only=True):
-    """The attitude of the newest frame: q_icrs_to_cam, its pointing, its rate in cam, and its
-    age at light.
+    """The attitude of the newest frame: q_icrs_to_cam (w, x, y, z), RA, Dec and roll, the rate
+    about the camera's axes, and its age when the frame lit.
     """
 
     q: tuple[float, float, float, float]
@@ -72,14 +77,17 @@ class ShownAttitude(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AttitudeSource(msgspec.Struct, frozen=True):
-    """Where attitudes come from: the kind of link, and its endpoint."""
+    """The source of attitudes: the kind of link, and its endpoint."""
 
     kind: str
     endpoint: str
 
 
 class ShownClock(msgspec.Struct, frozen=True, kw_only=True):
-    """The sender's clock against this machine's."""
+    """The sender's clock relative to this machine's: the offset (host minus sender) with its sigma,
+    the drift, and how the clocks are compared (`mode`). `synchronised`: latencies are absolute, not
+    only above the shortest one.
+    """
 
     offset_ms: float | None
     sigma_ms: float | None
@@ -97,7 +105,10 @@ class Pacing(msgspec.Struct, frozen=True):
 
 
 class NewestFrame(msgspec.Struct, frozen=True, kw_only=True):
-    """The newest frame; `clipped` has HIP numbers, and names of bodies."""
+    """The newest frame: its number, whether no attitude has come yet (`missing`), whether its
+    attitude is `stale`, whether it is `blank`, the number of `stars`, and the clipped ones by HIP
+    number or name.
+    """
 
     number: int = -1
     missing: bool = True
@@ -108,7 +119,9 @@ class NewestFrame(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class LedgerState(msgspec.Struct, frozen=True):
-    """The ledger: `failing` says why it cannot be written now, "" where it can."""
+    """The ledger: its path, its size, and why it cannot be written now (`failing`), "" while it
+    can.
+    """
 
     path: str
     bytes: int
@@ -116,8 +129,8 @@ class LedgerState(msgspec.Struct, frozen=True):
 
 
 class WrongCondition(msgspec.Struct, frozen=True):
-    """A condition under which the sky that is shown is wrong: its kind, a line with figures and
-    what to write instead.
+    """A condition under which the sky on the display is wrong: its kind, and a line with figures
+    and what to write in the bench file instead.
     """
 
     kind: str
@@ -125,11 +138,11 @@ class WrongCondition(msgspec.Struct, frozen=True):
 
 
 class SkyState(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run tells of itself and the page shows as it is; `operator` has the switches, `faults`
-    those that are on.
+    """The part of a run's state that the page shows unchanged. `operator` has the operator's
+    switches, `faults` the names of the faults that are on.
 
-    `wrong_sky_s` is for how long the sky has been wrong in all, `pointing` where the first attitude
-    points.
+    `wrong_sky_s` is the total time with a wrong sky, s; `pointing` a line on where the first
+    attitude points.
     """
 
     attitude: ShownAttitude | None = None
@@ -146,7 +159,7 @@ class SkyState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PageState(SkyState, frozen=True, kw_only=True):
-    """The run as the page shows it, ten times a second."""
+    """The state of the run that pages get ten times a second."""
 
     utc: str
     health: SkyHealth
@@ -155,10 +168,11 @@ class PageState(SkyState, frozen=True, kw_only=True):
 
 
 class ChartPoint(msgspec.Struct, kw_only=True):
-    """What the frames since the point before add to the charts: the largest times, and how many
-    went wrong.
+    """A point of the page's charts, from the frames since the previous point: the largest times,
+    and the numbers of missed frames, refused packets and wrong answers.
 
-    `x_arcsec`, `y_arcsec` and `z_arcsec` are the residual of the newest right answer since then.
+    `t_s` is the time since the page's process began. `x_arcsec`, `y_arcsec` and `z_arcsec` are the
+    residual of the newest right answer since the previous point.
     """
 
     t_s: float
@@ -174,13 +188,13 @@ class ChartPoint(msgspec.Struct, kw_only=True):
     z_arcsec: float | None = None
 
     def take(self, key: str, value: float) -> None:
-        """Keep the larger of the time that is there and `value`, ms."""
+        """Set the time `key`, ms, to `value` if that is larger than the present one."""
         before = getattr(self, key)
         setattr(self, key, round(value if before is None else max(value, before), 3))
 
 
 class EventLine(msgspec.Struct, frozen=True):
-    """An event of the run at UTC."""
+    """An event of the run: its UTC time, its kind, and its text."""
 
     utc: str
     kind: str
@@ -188,8 +202,8 @@ class EventLine(msgspec.Struct, frozen=True):
 
 
 class StarMark(msgspec.Struct, frozen=True, array_like=True):
-    """A star of a picture, as an array; `clipped` is 0 or 1, and `colour` what a coloured
-    display shows of it.
+    """A star of a picture, sent as an array: its position, monitor px, magnitude, HIP number (0 for
+    none) and label; `clipped` is 0 or 1, `colour` a note on its colour on a coloured display.
     """
 
     x_px: float
@@ -202,8 +216,8 @@ class StarMark(msgspec.Struct, frozen=True, array_like=True):
 
 
 class GridLine(msgspec.Struct, frozen=True):
-    """A line of right ascension or declination, or a piece of one: its label and places, monitor
-    px.
+    """A line of right ascension or declination, or a piece of one: its label, and points (x, y),
+    monitor px.
     """
 
     label: str
@@ -211,11 +225,11 @@ class GridLine(msgspec.Struct, frozen=True):
 
 
 class Truth(msgspec.Struct, frozen=True, kw_only=True):
-    """What is where in a picture: stars, the brightest first, and the marks of the two cameras;
-    monitor px.
+    """The marks of a picture, monitor px: its stars, the brightest first, the boresight, and the
+    outline of the tracker's field.
 
-    Of the tracker's newest answer: where it takes its field to be, and the centroids that it
-    reports.
+    `reported_px` is the outline of the field that the tracker's newest answer reports,
+    `centroids_px` its reported centroids.
     """
 
     frame: int
@@ -228,7 +242,7 @@ class Truth(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PageText(msgspec.Struct, kw_only=True, omit_defaults=True):
-    """A text message to a page: its keys say what it has."""
+    """A text message to a page; it has only the keys that are set."""
 
     hello: Hello | None = None
     state: PageState | None = None
@@ -239,12 +253,14 @@ class PageText(msgspec.Struct, kw_only=True, omit_defaults=True):
     truth: Truth | None = None
 
     def json(self) -> str:
-        """The message as it is sent."""
+        """The message as JSON."""
         return msgspec.json.encode(self).decode()
 
 
 class PictureFormat(msgspec.Struct, frozen=True, kw_only=True):
-    """The head of a picture's binary message; `dtype` is u1 or u2."""
+    """The head of a picture's binary message: width and height, the frame's number, and the type of
+    its levels, "u1" or "u2".
+    """
 
     w: int
     h: int
@@ -254,7 +270,7 @@ class PictureFormat(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SkyPlace(msgspec.Struct, frozen=True, array_like=True):
-    """A star or a body of the whole sky, as an array."""
+    """A star or a body of the map of the sky, sent as an array."""
 
     ra_deg: float
     dec_deg: float
@@ -263,8 +279,8 @@ class SkyPlace(msgspec.Struct, frozen=True, array_like=True):
 
 
 class SkyMap(msgspec.Struct, frozen=True):
-    """The answer of `GET /sky`: stars, bodies, and the screen's corners as directions in cam ([]
-    where the lens ends).
+    """The map of the sky, the answer of `GET /sky`: stars, bodies (`moving`), and the directions of
+    the screen's corners, unit vectors in camera axes ([] where the lens does not reach them).
     """
 
     stars: list[SkyPlace] = []
@@ -273,7 +289,7 @@ class SkyMap(msgspec.Struct, frozen=True):
 
 
 class PageWants(msgspec.Struct):
-    """What a page wants besides the state."""
+    """What a page requests besides the state: pictures, how often, and the grid."""
 
     picture: bool = False
     hz: Annotated[float, msgspec.Meta(gt=0)] = 8.0
@@ -281,21 +297,21 @@ class PageWants(msgspec.Struct):
 
     @property
     def picture_hz(self) -> float:
-        """How often it wants pictures, within bounds; 0 for never."""
+        """The requested rate of pictures, Hz, from MIN_HZ to MAX_HZ; 0 for none."""
         if self.picture:
             return min(max(self.hz, MIN_HZ), MAX_HZ)
         return 0.0
 
 
 class PageMessage(msgspec.Struct):
-    """A page's message."""
+    """A message from a page."""
 
     want: PageWants
 
 
 class OrderBody(msgspec.Struct, forbid_unknown_fields=True):
-    """The body of `POST /control/NAME`. A key that is misspelt is refused: it must not act as if
-    it were not there.
+    """The body of `POST /control/NAME`: the arguments of an order. Unknown keys are refused: a
+    misspelt key must not act as a missing one.
     """
 
     on: bool = True

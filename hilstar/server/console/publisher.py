@@ -1,5 +1,5 @@
-"""What a run or a first-light session publishes to its page: frames, pictures, its state; and
-what operators order.
+"""Publishes the frames, pictures and state of a run or a first-light session to its page, and
+carries out the orders of operators.
 """
 
 import contextlib
@@ -44,9 +44,9 @@ if TYPE_CHECKING:
     from hilstar.server.run_progress import Running
     from hilstar.server.screen.screen import Screen
 
-MIN_PICTURE_NS = NS_PER_S // 10
-MAX_CLIPPED = 300  # by name; a picture has hundreds of stars
-# Lasting events that keep the ledger from being written, as `run.record.ledger` names them.
+MIN_PICTURE_NS = NS_PER_S // 10  # shortest interval between two pictures
+MAX_CLIPPED = 300  # clipped stars in the state; a picture has hundreds of stars
+# Events of `server.record.ledger` that last while the ledger cannot be written.
 LEDGER_TROUBLES = {
     "ledger-failed": "cannot be written",
     "ledger-lost": "a file was deleted, truncated or overwritten",
@@ -59,14 +59,14 @@ MAX_MARK_CHARACTERS = 200
 MAX_WHO_CHARACTERS = 60
 MAX_NAMES = 5000  # the brightest stars without a HIP number
 CODE_BYTES = 2
-FAILED, FORCED = "failed:", "forced"  # as `first-light` says of a step, and of a monitor
+FAILED, FORCED = "failed:", "forced"  # in `first-light`'s lines on a failed step, a forced monitor
 
 
 class FramePublisher:
-    """Writes each frame's numbers, and now and then its picture, into shared memory.
+    """Writes the numbers of every frame, and the pictures of some, into shared memory.
 
-    The frame loop's own thread does it, in microseconds: without a lock and without a call that
-    waits. A picture is copied at most ten times a second, and only while somebody looks at one.
+    The frame loop's thread does this in microseconds, without a lock and without a call that waits.
+    A picture is copied at most ten times a second, and only while a page requests pictures.
     """
 
     def __init__(self, memory: messages.SharedMemory) -> None:
@@ -77,13 +77,13 @@ class FramePublisher:
         self._picture_due_ns = 0
 
     def follow(self, running: "Running") -> None:
-        """Follow a run, whose counters go on changing."""
+        """Set the run whose counters are published."""
         self.running = running
         if running.answers is not None:
             running.answers.heard = self._hear
 
     def _hear(self, answers: "LiveAnswers") -> None:
-        """Publish a new answer of the tracker. Called by the thread that takes answers."""
+        """Publish a new answer of the tracker. Called by the thread that reads the answers."""
         newest = answers.newest
         lit = None if newest is None or newest.lit is None else tuple(newest.lit.q.tolist())
         stars = () if newest is None else newest.answer.centroids[:MAX_CENTROIDS]
@@ -108,6 +108,7 @@ class FramePublisher:
             | messages.BLANK * (attitude is None)
             | messages.HAS_AGE * (attitude is not None)
         )
+        # The age of an absurd stamp is limited, so that FRAME can hold it.
         self._memory.frames.put(
             messages.FRAME.pack(
                 shown.number,
@@ -125,7 +126,8 @@ class FramePublisher:
         want = self._memory.want
         if want.each_ns and self._picture_due_ns <= shown.swap_ns < want.until_ns:
             self._picture_due_ns = shown.swap_ns + max(want.each_ns, MIN_PICTURE_NS)
-            # levels of another size than the bench's: no picture, and the run goes on
+            # Levels that are larger than the bench's monitor do not fit: the run goes on without
+            # the picture.
             with contextlib.suppress(ValueError):
                 self._copy(shown)
 
@@ -153,7 +155,9 @@ class FramePublisher:
 
 @dataclass(frozen=True, slots=True)
 class PageParts:
-    """The parts of a run; `make_ledger` begins a ledger at a path, `answers` are the tracker's."""
+    """The parts of a run that its page reads and controls. `make_ledger` begins a ledger at a path,
+    `answers` are the tracker's; None for a part that the run does not have.
+    """
 
     bench: Bench
     notices: Notices
@@ -165,7 +169,7 @@ class PageParts:
 
 
 class WatchedRun:
-    """The state of a run, read from its parts beside the frame loop."""
+    """Reads the state of a run from its parts, on another thread than the frame loop's."""
 
     def __init__(self, feed: FramePublisher, parts: PageParts) -> None:
         self._feed = feed
@@ -173,7 +177,7 @@ class WatchedRun:
         self._notices = parts.notices
 
     def now(self) -> messages.RunState:
-        """The run's current state, read beside the frame loop."""
+        """The current state of the run."""
         running = self._feed.running
         shown = self._feed.shown
         if running is None:
@@ -270,14 +274,15 @@ def _clock(running: "Running") -> protocol.ShownClock | None:
     )
 
 
-Done = tuple[int, str]  # what became of an order: an HTTP status and a line
+Done = tuple[int, str]  # the result of an order: an HTTP status and a line of text
 
 
 class OrderHandler:
-    """Checks an operator's order, has it done by the frame loop or beside it, and records it.
+    """Checks an operator's orders, passes them to the frame loop or carries them out itself, and
+    records them.
 
-    Each call runs on its own thread and returns once the frame loop, or the disk, has taken the
-    order.
+    Each call runs on its own thread, and returns when the frame loop, or the disk, has carried out
+    the order.
     """
 
     def __init__(self, requests: SwitchRequests, feed: FramePublisher, parts: PageParts) -> None:
@@ -290,7 +295,9 @@ class OrderHandler:
         self._ledger_lock = threading.Lock()
 
     def do(self, order: messages.Order) -> messages.OrderAnswer:
-        """Carry out an order; the answer says what went wrong."""
+        """Carry out an order. The answer has an HTTP status and a line with the result or the
+        fault.
+        """
         who = one_line(order.who)[:MAX_WHO_CHARACTERS]
         doers = {
             "ledger": self._switch_ledger,
@@ -302,7 +309,7 @@ class OrderHandler:
         except HilstarError as error:
             status = 409
             line = one_line(str(error))
-        # a ledger may be called anything
+        # The name of a ledger may contain any characters.
         return messages.OrderAnswer(id=order.id, status=status, line=printable(line))
 
     def _switch(self, order: messages.Order, who: str) -> Done:
@@ -342,6 +349,9 @@ class OrderHandler:
             return 200, f"ledger off: {ledger_now.path} is whole"
 
     def _free_path(self) -> Path:
+        """A free path for a new ledger, named by UTC: in the folder of the newest ledger, else in
+        the current working directory.
+        """
         if self._ledger.last is None:
             folder = Path.cwd()
         else:
@@ -369,6 +379,7 @@ class OrderHandler:
             known = ", ".join(faults.names())
             return 404, f"no fault of that name; {meant}write one of {known}"
         before = self._feed.count
+        # The next frame may have been in drawing already: the second one has the fault.
         act = faults.start if order.on else faults.stop
         act(order.fault, who)
         if self._waits_for(lambda: self._feed.count > before + 1):
@@ -378,8 +389,8 @@ class OrderHandler:
 
 @dataclass(frozen=True, slots=True)
 class RunDescription:
-    """What the page says of a run: command, source of attitudes, pace of frames; and the UDP
-    port by which SCPI steers it.
+    """The description of a run for its page: command, kind and endpoint of the source of attitudes,
+    pace of frames (see `Setup.pace`), and the UDP port to which SCPI sends attitudes (0: none).
     """
 
     command: str
@@ -396,7 +407,9 @@ def setup_for(
     file: "BenchFile",
     picture_bytes: int,
 ) -> messages.Setup:
-    """The setup of a page and of SCPI for a bench file; a run adds to `hello`."""
+    """The settings of the page's process for a bench file. `control`: pages may give orders.
+    `picture_bytes` is the size of a picture's levels. A run adds its facts to `hello`.
+    """
     monitor = file.config.monitor
     page = listeners.page
     scpi = listeners.scpi
@@ -435,8 +448,8 @@ def setup_for(
 
 
 def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
-    """The overlay's scene for a bench; `aids_in_levels`: the levels contain the operator's aids
-    already.
+    """The scene of a bench, from which the page's process draws its overlay. `aids_in_levels`: the
+    levels of pictures contain the operator's aids already.
     """
     stars = bench.shown_stars
     overlay = overlay_of(bench)
@@ -462,8 +475,8 @@ def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
 def opened_page(
     listeners: Listeners, control: bool, description: RunDescription, parts: PageParts
 ) -> Iterator[tuple[FramePublisher, SwitchRequests]]:
-    """The page and the SCPI of a run while this is open: the publisher of its frames, and the
-    queue of its requests.
+    """Serve the page and SCPI of a run during the `with` block; gives the publisher of its frames,
+    and the queue of the operators' switch requests.
     """
     width, height = parts.bench.config.monitor.resolution_px
     picture_bytes = width * height * (1 if parts.bench.calibration.response.white < 2**8 else 2)
@@ -489,14 +502,14 @@ def opened_page(
 
 
 class _SessionNotices(Notices):
-    """Events of a session: the terminal has its lines already."""
+    """The events of a session, which go to the page only: the terminal has their lines already."""
 
     def tell(self, kind: str, detail: str, who: str = "", since_ns: int | None = None) -> None:
         self._hand_on(Notice.now(kind, " ".join(detail.split()), who))
 
 
 class ShownPattern(Protocol):
-    """Codes (h, w) or (h, w, 3) that a session shows on the monitor, and their name."""
+    """A pattern that a session shows on the monitor."""
 
     @property
     def name(self) -> str:
@@ -504,12 +517,12 @@ class ShownPattern(Protocol):
 
     @property
     def codes(self) -> npt.NDArray[np.uint16]:
-        """What the monitor shows."""
+        """The codes of the monitor's pixels, (h, w) or (h, w, 3)."""
 
 
 class SessionPublisher:
-    """Publishes a first-light session: the session's thread writes pictures, the page's keeper
-    reads the state.
+    """Publishes a first-light session. The session's thread calls `show` and `say`, the thread of
+    PageProcess calls `now`.
     """
 
     def __init__(self, memory: messages.SharedMemory) -> None:
@@ -519,13 +532,15 @@ class SessionPublisher:
         self._patterns = 0
 
     def show(self, pattern: ShownPattern) -> None:
-        """Publish the pattern now shown; of a coloured one the brightest channel."""
+        """Publish the pattern that the monitor shows now; a coloured one in grey, by the largest
+        code of each pixel.
+        """
         if pattern.codes.ndim == 2:
             codes = pattern.codes
         else:
             codes = pattern.codes.max(axis=2)
         height, width = codes.shape
-        # A step may have found that the monitor is larger than the bench file said.
+        # A step may have measured a larger monitor than the bench file's: its picture does not fit.
         if messages.PICTURE_HEAD_BYTES + codes.nbytes > self._memory.pictures.slot_bytes:
             return
         self._patterns += 1
@@ -536,7 +551,9 @@ class SessionPublisher:
         self.notices.tell("pattern", f"shows {pattern.name}")
 
     def say(self, line: str) -> None:
-        """Publish a line of the session: a step begins or ends."""
+        """Publish a line of the session on the beginning or the end of a step; a failed step stays
+        in the state until it begins anew.
+        """
         step, _, step_text = line.partition(" ")
         if step == FORCED or step_text.strip().startswith(FAILED):
             self._failed[step] = f"{step} {step_text.strip()}"
@@ -545,14 +562,14 @@ class SessionPublisher:
         self.notices.tell("step", line)
 
     def now(self) -> messages.RunState:
-        """The session's current state."""
+        """The current state of the session."""
         now_ns = time.monotonic_ns()
         failed = list(self._failed.values())
         shown = protocol.NewestFrame(number=self._patterns, missing=False, blank=False)
         return messages.RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed)
 
     def do(self, order: messages.Order) -> messages.OrderAnswer:
-        """Record a mark; a session takes no other order."""
+        """Record a mark; a session refuses every other order (409)."""
         if order.name != "mark" or not order.text.strip():
             line = "a session of first light takes marks with a text, and no other order"
             return messages.OrderAnswer(id=order.id, status=409, line=line)
@@ -566,7 +583,7 @@ class SessionPublisher:
 def session_page(
     listener: PageListener, control: bool, file: "BenchFile"
 ) -> Iterator[SessionPublisher]:
-    """The page of a session while this is open."""
+    """Serve the page of a first-light session during the `with` block; gives its publisher."""
     monitor = file.config.monitor
     width, height = monitor.resolution_px
     picture_bytes = width * height * CODE_BYTES

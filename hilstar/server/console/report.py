@@ -1,5 +1,5 @@
-"""A run's report: the operator's page as one file with the whole run in it, and its figures as
-JSON.
+"""Writes the report of a run from its ledger: the operator's page as one HTML file that contains
+the run's data, and the figures as JSON.
 """
 
 import base64
@@ -55,14 +55,16 @@ CAUTION = (
     "Drawn by a bench that is not the run's own: a file that it names has changed since, or another"
     " version of hilstar wrote the ledger. Codes may differ from those shown."
 )
-NO_VALUES = "- / - / -"  # how a row of percentiles begins that the run has no values of
+NO_VALUES = "- / - / -"  # the beginning of a row of percentiles without values
 BINS = 60
-HISTOGRAM_SPREAD = 99.9  # percent of the frames that a histogram shows; the worst is in the table
-MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # smallest range of a histogram, and relative to its values
+# A histogram ends at this percentile and at 100 minus it; the worst value is in the table.
+HISTOGRAM_SPREAD = 99.9
+MIN_RANGE_MS, NARROWEST = 1e-3, 1e-9  # smallest range of a histogram, in ms and relative
 MS_DIGITS, S_DIGITS, Q_DIGITS, ANGLE_DIGITS = 3, 3, 8, 6
 MAX_WHO_CHARACTERS = 60
-IN_ARCSEC_DEG = 0.2  # a motion over less is drawn in arcsec
-# beyond it right ascension and roll say nothing: turns about the camera's axes are drawn
+IN_ARCSEC_DEG = 0.2  # a smaller motion is drawn in arcsec
+# Near a pole right ascension and roll mean nothing: at larger declinations turns about the camera's
+# axes are drawn instead.
 POLE_DEG = 88.0
 NAMES = ("RA \N{MULTIPLICATION SIGN} cos Dec", "Dec", "roll")
 AXES = ("about x (right)", "about y (down)", "about z (boresight)")
@@ -77,12 +79,11 @@ DISTRIBUTIONS = {
 
 
 def one_script(entry: str, folder: Path = PAGE_DIR) -> str:
-    """The module `entry` and all that it imports, as one script. Raises ValueError for an import
-    that it does not know.
+    """The JavaScript module `entry` and all that it imports, as one script.
 
-    A browser loads no module from a file beside a page that is itself a file, so each module
-    becomes a function. The page's modules keep to what this reads: imports and exports that begin a
-    line, by name, and no default export.
+    If the page is a file, a browser loads no module from another file, so that each module becomes
+    a function here. Imports and exports have to begin a line and to be by name, without a default
+    export. Raises ValueError for any other form.
     """
     done: dict[str, str] = {}
     _take(entry, folder, done)
@@ -90,6 +91,7 @@ def one_script(entry: str, folder: Path = PAGE_DIR) -> str:
 
 
 def _take(name: str, folder: Path, done: dict[str, str]) -> None:
+    """Add a module as a function to `done`, after the modules that it imports."""
     text = (folder / f"{name}.js").read_text(encoding="utf-8")
     wanted = _import.findall(text)
     for _, other in wanted:
@@ -116,8 +118,8 @@ def _hash(text: str) -> str:
 
 
 def report_page(data: dict[str, Any]) -> str:
-    """The page with a run's data (see `run_data`), as HTML that needs no other file and no
-    network.
+    """The HTML of a report with a run's data (see `run_data`, `run_pictures`); it needs no other
+    file and no network.
     """
     html, uplot, uplot_style, page_style = (
         (PAGE_DIR / name).read_text(encoding="utf-8")
@@ -140,20 +142,21 @@ def report_page(data: dict[str, Any]) -> str:
         f'<script type="module">{script}</script>\n'
     )
     html = LINKS.sub("", html).replace('data-mode="live"', 'data-mode="report"')
-    # The data come before the script that reads them, and both after the page's own text.
+    # The data come before the script that reads them, and both after the page's own elements.
     return html.replace("</head>", f"{head}</head>").replace("</body>", f"{tail}</body>")
 
 
 class _Unreported(Notices):
-    """Notices that are dropped: those of redrawing are not the run's."""
+    """Drops all notices: events of the redrawing are not events of the run."""
 
     def tell(self, kind: str, detail: str, who: str = "", since_ns: int | None = None) -> None:
-        """Say nothing."""
+        """Drop the notice."""
 
 
 def run_pictures(run: RunFigures, ledger: Path) -> dict[str, Any]:
-    """The run's `pictures` and a `caution` where the bench has changed, or why `no_pictures`;
-    `sky` is the map of the sky.
+    """Redraw the run's key frames: a dictionary with `pictures`, the map of the `sky`, and a
+    `caution` where the bench has changed since the run. Without a usable bench `pictures` is empty,
+    and `no_pictures` says why.
     """
     try:
         file = with_codes_ms(_bench_file(run.head, ledger), codes_ms_of(run.head))
@@ -170,10 +173,10 @@ def run_pictures(run: RunFigures, ledger: Path) -> dict[str, Any]:
 
 
 def _bench_file(head: dict[str, str], ledger: Path) -> BenchFile:
-    """The bench file of a run: the text in the ledger's head with the files that it names,
-    preferably unchanged.
+    """The bench file of a run: the text in the ledger's head, and the files that it names, beside
+    the original file or beside the ledger; the place where they are unchanged goes first.
 
-    Raises InputError where the head has none, or one that cannot be read.
+    Raises InputError where the head has no bench file, or one that cannot be read.
     """
     text = head.get("bench_text")
     named = Path(head.get("bench_file", "bench.toml"))
@@ -188,7 +191,7 @@ def _pictures(
 ) -> list[dict[str, Any]]:
     recording = read_recording(ledger, run.faults)
     frames = run.keyframes.chosen(run.last)
-    # Where a fault froze the sky, the picture is an earlier frame's.
+    # Frames of a frozen sky are left out: they showed the picture of an earlier frame.
     frozen = {number for number, fault in recording.faults.items() if isinstance(fault, Freeze)}
     chosen = [
         (record, why)
@@ -209,7 +212,7 @@ def _pictures(
             lambda: (record for record, _ in chosen), len(chosen), 0, False, recording
         )
         replay(bench, play, take, Outlet(notices=_Unreported()))
-    # As many pictures, evenly over the run, as fit.
+    # Every second picture is dropped until the rest fits into MAX_BYTES.
     while len(pictures) > 1 and sum(len(picture["data"]) for picture in pictures) > MAX_BYTES:
         pictures = pictures[::2]
     return pictures
@@ -239,8 +242,8 @@ def _picture(overlay: Overlay, shown: Shown) -> dict[str, Any]:
 
 
 def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
-    """The figures of a run for the page: lists of numbers, None for no value; times in s from
-    the first swap.
+    """The data of a run for the report's page, ready for JSON: lists of numbers, None for a missing
+    value; times in s after the first swap. `name` is the ledger's name.
     """
     config = config_of(run.head)
     rows = table_rows(summary)
@@ -254,7 +257,7 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
         "resolution_px": None if monitor is None else monitor.resolution_px,
         "bits": None if monitor is None else monitor.bits,
     }
-    with np.errstate(all="ignore"):  # absurd figures of a foreign file become no value
+    with np.errstate(all="ignore"):  # impossible numbers of a foreign file become None
         return {
             "about": about,
             "verdict": verdict(summary, run.counted["late"]),
@@ -279,10 +282,11 @@ def run_data(name: str, run: RunFigures, summary: RunReport) -> dict[str, Any]:
 
 
 def verdict(found: RunReport, late: int) -> dict[str, Any]:
-    """Whether the sky was right throughout, in which share of the refresh periods it was, and
-    why not in the others.
+    """The verdict on a run, a dictionary: `ok`, whether the sky was right throughout; the `share`
+    of refresh periods in which it was; a `headline`; and the `reasons` for the others.
 
-    `late`: frames were missed, and nothing else was wrong: what was shown was the right sky.
+    `late` counts stale frames with an attitude. The result's "late" says that the only fault is
+    missed frames: what was shown was the right sky.
     """
     counted = (
         (found.blank_frames, "without an attitude"),
@@ -314,7 +318,7 @@ def verdict(found: RunReport, late: int) -> dict[str, Any]:
         digits = 2
     else:
         digits = 1
-    # rounded down: only all of them are 100 %
+    # Rounded down, so that only a run without a fault has 100 %.
     share = f"{math.floor(percent * 10**digits) / 10**digits:.{digits}f} %"
     told = {"ok": not reasons, "late": only_late, "headline": headline}
     return told | {"share": share, "reasons": reasons}
@@ -353,7 +357,7 @@ def _packets(run: RunFigures) -> dict[str, Any]:
     accepted, refused = (_numbers(rates_hz[:, kind], MS_DIGITS) for kind in range(2))
     width_s = run.packet_times.width_ns / NS_PER_S
     if len(begin_s) and begin_s[-1] + width_s > run.duration_s:
-        accepted[-1] = None  # the run ended before this bin did
+        accepted[-1] = None  # the run ended within this bin: its rate would be too low
     return {
         "t_s": _numbers(begin_s, S_DIGITS),
         "width_s": width_s,
@@ -390,8 +394,8 @@ def _histograms(run: RunFigures) -> list[dict[str, Any]]:
 
 
 def _answers(run: RunFigures, summary: RunReport) -> dict[str, Any] | None:
-    """Residuals along the run, wrong answers, and what each fault did to the answers; None
-    without answers.
+    """The data of the tracker's answers: residuals along the run, times of wrong answers, the
+    number of faults that are on, and the effect of each fault; None for a run without answers.
     """
     if not summary.answers:
         return None
@@ -438,8 +442,9 @@ def _path(rows: FloatArray) -> dict[str, Any]:
 
 
 def _motion(rows: FloatArray) -> dict[str, Any] | None:
-    """Three angles about their mean, and the turns about the camera's axes minus a steady
-    motion.
+    """The curves of the run's motion: three angles minus their means, and the turns about the
+    camera's axes minus a steady motion; None without attitudes. `rows` are those of RunFigures'
+    `path`.
     """
     if not len(rows):
         return None
@@ -462,6 +467,7 @@ def _motion(rows: FloatArray) -> dict[str, Any] | None:
 
 
 def _curves(angles_deg: FloatArray, names: tuple[str, str, str]) -> dict[str, Any]:
+    """The data of three curves, angles (n, 3), deg, by name; in arcsec if they are small."""
     in_arcsec = float(np.ptp(angles_deg, axis=0).max()) < IN_ARCSEC_DEG
     scaled = angles_deg * (3600 if in_arcsec else 1)
     return {
@@ -474,8 +480,10 @@ def _curves(angles_deg: FloatArray, names: tuple[str, str, str]) -> dict[str, An
 
 
 def _angles(q: FloatArray, turned_rad: FloatArray) -> tuple[FloatArray, tuple[str, str, str]]:
-    """Three angles of the camera's motion, deg (n, 3), and their names."""
-    # As `rotation.to_radec_roll_deg`, for an array.
+    """Three angles of the camera's motion, deg (n, 3), and their names, from q_icrs_to_cam (n, 4):
+    RA times cos Dec, Dec and roll, or, near a pole, the turns `turned_rad` (n, 3).
+    """
+    # The formulae of `rotation.to_radec_roll_deg`, for arrays.
     w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
     boresight = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
     dec_deg = np.degrees(np.arctan2(boresight[2], np.hypot(boresight[0], boresight[1])))
@@ -495,9 +503,10 @@ def _angles(q: FloatArray, turned_rad: FloatArray) -> tuple[FloatArray, tuple[st
 
 
 def report(path: Path, directory: Path) -> RunReport:
-    """Write `report.html` and `report.json` of a ledger into a directory; the figures.
+    """Write `report.html` and `report.json` of the ledger `path` into a directory, and return the
+    figures.
 
-    Raises InputError for a file that is no ledger, and if it cannot write.
+    Raises InputError for a file that is no ledger, and if a file cannot be written.
     """
     run = figures_of(path)
     summary = summarise(run)

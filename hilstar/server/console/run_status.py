@@ -1,7 +1,7 @@
-"""The live status of a run on the terminal: a few lines that stay in place, or one plain line every
-ten seconds elsewhere.
+"""The live status of a run on the terminal: a few lines that stay in place, or a plain line every
+ten seconds where stderr is no terminal.
 
-The frame loop only leaves its newest frame here; a thread of the status words it, so that no
+The frame loop only stores its newest frame here; another thread writes the text, so that no
 terminal delays a frame.
 """
 
@@ -28,14 +28,16 @@ if TYPE_CHECKING:
 
 LIVE_EACH_S = 0.5
 PLAIN_EACH_S = 10.0
-STANDS_STILL_NS = NS_PER_S  # without a frame for so long
+STANDS_STILL_NS = NS_PER_S  # after this time without a frame the status says so
+# The frame loop is alive if its last step is not longer ago than the longer of these.
 ALIVE_NS, ALIVE_PERIODS = NS_PER_S, 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class RunSource:
-    """What a run shows: where its attitudes come from, on what it is drawn, how many frames there
-    will be, and what is wrong with the screen that --force shows it on.
+    """The facts of a run that its status shows: the source of its attitudes, the renderer, the
+    refresh rate, the number of frames (infinite where it is open), and what is wrong with a screen
+    that is used by --force.
     """
 
     attitudes: str
@@ -46,7 +48,7 @@ class RunSource:
 
 
 class StatusLine(NamedTuple):
-    """One line of the status: what of, what it says, and whether that is as it should be."""
+    """One line of the status: its label, its text, and whether all is well."""
 
     label: str
     text: str
@@ -54,7 +56,7 @@ class StatusLine(NamedTuple):
 
 
 class RunStatus:
-    """What a run is doing, from the newest frame that `see` was given."""
+    """The status of a run as text, from its counters and its newest frame."""
 
     def __init__(self, source: RunSource, ledger: "LedgerSwitch | None" = None) -> None:
         self._source = source
@@ -66,27 +68,27 @@ class RunStatus:
         self._before = (self._begun_ns, 0, 0)
 
     def follow(self, running: "Running") -> None:
-        """Take the run, which goes on counting."""
+        """Set the run whose counters are read from now on."""
         self._running = running
 
     def see(self, shown: "Shown") -> None:
-        """Take the newest frame; costs the frame loop one assignment."""
+        """Set the newest frame; costs the frame loop one assignment."""
         self._shown = shown
 
     def begun(self) -> bool:
-        """Whether a frame has been shown, or is waited for."""
+        """Whether the frame loop has begun: it has shown a frame, or waits for the first."""
         return self._running is not None and self._running.loop.watch.alive_ns > 0
 
     def alive(self) -> bool:
-        """Whether the frame loop moves: its last step is not longer ago than ALIVE_NS, or a few
-        frames where those are slow.
+        """Whether the frame loop is alive: its last step is not longer ago than ALIVE_NS, or
+        ALIVE_PERIODS refresh periods where these are longer.
         """
         running = self._running
         limit_ns = max(ALIVE_NS, ALIVE_PERIODS / self._source.refresh_hz * NS_PER_S)
         return running is not None and time.monotonic_ns() - running.loop.watch.alive_ns < limit_ns
 
     def line(self) -> str:
-        """The run in one line that is quickly read."""
+        """The status in one short line: a wrong sky, the attitude, frames and packets."""
         shown = self._shown
         running = self._running
         if shown is None or running is None:
@@ -104,7 +106,7 @@ class RunStatus:
         )
 
     def lines(self, now_ns: int) -> list[StatusLine]:
-        """The status at a host time; rates are since it was last asked for."""
+        """The status at the host time `now_ns`; rates are averages since the last call."""
         shown = self._shown
         running = self._running
         if shown is None or running is None:
@@ -176,7 +178,7 @@ def _attitude_line(shown: "Shown") -> StatusLine:
         return StatusLine(
             "attitude", f"{'none yet' if shown.missing else 'hidden'}: the frames are blank", False
         )
-    # with NumPy 0.1 s, which Tab and --help do not need
+    # Imports NumPy, which takes 0.1 s and is not needed for Tab and --help.
     from hilstar.basics.rotation import to_radec_roll_deg, turn_text
 
     ra_deg, dec_deg, roll_deg = to_radec_roll_deg(attitude.q_icrs_to_cam)
@@ -221,13 +223,13 @@ def _tracker_line(found: "TrackerFigures") -> StatusLine:
 
 @contextmanager
 def on_terminal(status: RunStatus) -> Iterator[None]:
-    """Keep the status on stderr while the run lasts: in place on a terminal, else a line every
-    PLAIN_EACH_S.
+    """Show the status on stderr during the `with` block: lines in place on a terminal, else a line
+    every PLAIN_EACH_S.
     """
     stop = threading.Event()
     live = sys.stderr is not None and sys.stderr.isatty()
     if live:
-        import rich.live  # noqa: F401 - takes 0.1 s, which is not to cost a frame
+        import rich.live  # noqa: F401 - takes 0.1 s, which must not delay a frame later
     thread = threading.Thread(
         target=_live if live else _plain, args=(status, stop), name="hilstar-status", daemon=True
     )
@@ -279,8 +281,8 @@ def _table(lines: list[StatusLine]) -> "Table":
 
 @contextmanager
 def _logs_above() -> Iterator[None]:
-    """What is logged goes through the stream that the live lines have put in stderr's place, and
-    so above them.
+    """Send log messages through the stream by which rich replaces stderr, so that they appear above
+    the live lines.
     """
     handlers = [h for h in logging.getLogger().handlers if isinstance(h, logging.StreamHandler)]
     before = [handler.setStream(sys.stderr) for handler in handlers]

@@ -1,18 +1,17 @@
-"""SCPI-1999 and IEEE 488.2 as a bench speaks them: a line in, program units out, and an
-instrument's status; no I/O.
+"""The syntax and the status model of SCPI-1999 and IEEE 488.2: parses lines into program units, and
+has an instrument's registers and error queue; no I/O.
 
 Laws:
-1. Every line gives units up to its end or its first syntax error (a standard number of the -100s).
-   Nothing else raises.
-2. A keyword has two forms, short and long, in any case. Nodes in brackets may be left out. A header
-   after `;` goes on from the
-   node before the last keyword of the header before; `:` goes back to the root, and a common
-   command (`*`) moves nothing.
-3. Memory is bounded: a line by MAX_LINE_BYTES, the queue of errors by MAX_ERRORS, whose last then
-   says that it is full.
-4. What no test stand sends ends the connection (`NotScpi`): a web page can have a browser send a
-   line of SCPI, but only after
-   the request line of HTTP, or after the first byte of TLS or STUN, which is a control character.
+1. A line gives units up to its end or its first syntax error (a standard number of the -100s).
+   No other exception is raised.
+2. A keyword has a short and a long form, in upper or lower case. Nodes in brackets may be omitted.
+   A header after `;` continues at the node before the last keyword of the previous header; `:`
+   returns to the root, and a common command (`*`) changes nothing.
+3. Memory is limited: a line to MAX_LINE_BYTES, the error queue to MAX_ERRORS, of which the last
+   then reports the overflow.
+4. Bytes that no test stand sends end the connection (`NotScpi`): a web page can make a browser send
+   a line of SCPI, but only after the request line of HTTP, or after the first byte of TLS or STUN,
+   which is a control character.
 """
 
 import itertools
@@ -25,9 +24,9 @@ from typing import Literal, NamedTuple
 
 MAX_LINE_BYTES = 4096
 MAX_ERRORS = 20
-MAX_MNEMONIC = 12
-MAX_DIGITS = 255
-HEAD_BYTES, END_BYTES = 128, 64  # of a line of any length, by which HTTP is known
+MAX_MNEMONIC = 12  # IEEE 488.2, 7.6.1.4.1
+MAX_DIGITS = 255  # IEEE 488.2, 7.7.2.4.1, which also limits an exponent to 32000
+HEAD_BYTES, END_BYTES = 128, 64  # stored of a line of any length, to recognise HTTP
 MAX_DETAIL = 200  # SCPI-1999 vol. 2, 21.8: 255 characters with the description
 NOT_A_NUMBER = "9.91E37"  # SCPI-1999 vol. 1, 7.2.1.5
 
@@ -71,7 +70,7 @@ EVENT_BITS = {1: 32, 2: 16, 3: 8, 4: 4}
 ERRORS_WAIT, QUESTIONABLE, MESSAGE_WAITS, STANDARD_EVENT, MASTER, OPERATION = 4, 8, 16, 32, 64, 128
 
 Kind = Literal["number", "word", "string"]
-# the error where that kind does not belong
+# The error for a parameter of that kind in the place of another.
 KINDS: dict[Kind, int] = {"number": -128, "word": -148, "string": -158}
 NODE = re.compile(r"(\[)?:?([A-Za-z*]+)\]?")
 HEADER = re.compile(
@@ -83,7 +82,7 @@ NUMBER = re.compile(
 )
 INTEGER = re.compile(r"#(?:[Hh]([0-9A-Fa-f]+)|[Qq]([0-7]+)|[Bb]([01]+))")
 WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-# All but tab, LF and CR.
+# Control characters other than tab, LF and CR.
 CONTROL = re.compile(rb"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f]")
 WHITE = re.compile(rb"[ \t\r]+")
 # A request line of HTTP (RFC 9112, 3): a method in any case, a target, and since HTTP/1.0 a
@@ -94,7 +93,7 @@ REQUEST_ENDS = re.compile(rb"[ ]HTTP/\d+(?:\.\d+)?[ ]?\Z", re.IGNORECASE)
 
 
 class ScpiError(Exception):
-    """An error by its standard number, with what is wrong here."""
+    """An error with its standard number (a key of DESCRIPTIONS) and a detail for the user."""
 
     def __init__(self, number: int, detail: str = "") -> None:
         super().__init__(number, detail)
@@ -103,7 +102,7 @@ class ScpiError(Exception):
 
     @property
     def text(self) -> str:
-        """As `SYST:ERR?` answers it."""
+        """The answer to `SYST:ERR?`, in printable ASCII: number, description and detail."""
         clean = "".join(
             c if " " <= c <= "~" and c != '"' else "'" if c == '"' else "?" for c in self.detail
         )[:MAX_DETAIL]
@@ -111,8 +110,8 @@ class ScpiError(Exception):
 
 
 class Parameter(NamedTuple):
-    """One parameter: a number with its suffix (upper case, "" for none), a word (upper case) or
-    a string.
+    """One parameter of a command: a number with its suffix (the unit in upper case, "" for none),
+    a word in upper case, or a string without its quotes.
     """
 
     kind: Kind
@@ -121,21 +120,23 @@ class Parameter(NamedTuple):
 
 
 class Unit(NamedTuple):
-    """A command or query (`SKY:ATTitude?`) by its pattern, and its parameters."""
+    """A command or query: its pattern (such as `SKY:ATTitude?`) and its parameters."""
 
     pattern: str
     parameters: tuple[Parameter, ...]
 
 
 class Headers:
-    """The headers that a device knows, from patterns such as `SYSTem:ERRor[:NEXT]?` and `*CLS`."""
+    """Parses lines by the headers that an instrument knows, which are given as patterns such as
+    `SYSTem:ERRor[:NEXT]?` and `*CLS`.
+    """
 
     def __init__(self, patterns: Iterable[str]) -> None:
         self._patterns = {form: pattern for pattern in patterns for form in _forms(pattern)}
 
     def units(self, line: str) -> Iterator[Unit]:
-        """The program units of a line, without its end. Raises ScpiError at the first that is
-        wrong.
+        """The program units of a line, which comes without its LF. Raises ScpiError at the first
+        wrong one, after those before it.
         """
         path: tuple[str, ...] = ()
         for text in _split(line, ";"):
@@ -165,6 +166,7 @@ class Headers:
 
 
 def _forms(pattern: str) -> Iterator[str]:
+    """All headers that a pattern allows, in upper case: short, long, without optional nodes."""
     if pattern.startswith("*"):
         yield pattern
         return
@@ -177,8 +179,8 @@ def _forms(pattern: str) -> Iterator[str]:
 
 
 def _split(text: str, at: str) -> Iterator[str]:
-    """The parts of a text between separators that stand in no string. Raises ScpiError (-151)
-    where a string has no end.
+    """The parts of a text between separators `at`; those within a quoted string do not separate.
+    Raises ScpiError (-151) for a string without an end.
     """
     quote = ""
     begin = 0
@@ -219,7 +221,7 @@ def _parameter(text: str) -> Parameter:
 
 
 def _by_base(text: str) -> Parameter:
-    """A whole number to base 16, 8 or 2 (IEEE 488.2, 7.7.4)."""
+    """A whole number in base 16, 8 or 2, as `#HFF` (IEEE 488.2, 7.7.4). Raises ScpiError."""
     match = INTEGER.fullmatch(text)
     if match is None:
         raise ScpiError(-168, text[:40])
@@ -255,7 +257,9 @@ def _string(text: str) -> str:
 
 
 def count(unit: Unit, at_least: int, at_most: int | None = None) -> tuple[Parameter, ...]:
-    """The parameters of a unit, as many as it takes. Raises ScpiError."""
+    """The parameters of a unit, from `at_least` to `at_most` (None: exactly `at_least`). Raises
+    ScpiError for another number of them.
+    """
     at_most = at_least if at_most is None else at_most
     if len(unit.parameters) < at_least:
         raise ScpiError(-109, f"{unit.pattern} takes {at_least}")
@@ -265,7 +269,9 @@ def count(unit: Unit, at_least: int, at_most: int | None = None) -> tuple[Parame
 
 
 def number(parameter: Parameter, suffix: str = "") -> float:
-    """A finite number; `suffix` is the only unit that it may be given in. Raises ScpiError."""
+    """The finite number of a parameter, whose suffix may be "" or `suffix`. Raises ScpiError for
+    anything else.
+    """
     if parameter.kind != "number":
         raise ScpiError(KINDS[parameter.kind], "write a number")
     if parameter.suffix not in {"", suffix}:
@@ -280,7 +286,9 @@ def number(parameter: Parameter, suffix: str = "") -> float:
 
 
 def integer(parameter: Parameter, maximum: int) -> int:
-    """A number from 0 to `maximum`, rounded. Raises ScpiError."""
+    """The number of a parameter, rounded, from 0 to `maximum`. Raises ScpiError for anything
+    else.
+    """
     value = round(number(parameter))
     if not 0 <= value <= maximum:
         raise ScpiError(-222, f"write 0 to {maximum}")
@@ -288,7 +296,9 @@ def integer(parameter: Parameter, maximum: int) -> int:
 
 
 def boolean(parameter: Parameter) -> bool:
-    """ON, OFF, or a number, of which only 0 is off. Raises ScpiError."""
+    """Whether a parameter is ON, or a number that does not round to 0. Raises ScpiError for
+    anything but ON, OFF or a number.
+    """
     if parameter.kind == "word":
         if parameter.text not in {"ON", "OFF"}:
             raise ScpiError(-224, f"{parameter.text[:40]}; write ON or OFF")
@@ -298,8 +308,8 @@ def boolean(parameter: Parameter) -> bool:
 
 @dataclass(slots=True)
 class Register:
-    """A SCPI status register: its condition now, what has become true since it was read, and
-    what is summed up.
+    """A SCPI status register: the present `condition`, the bits that have turned on since the last
+    reading (`event`), and the mask of events that the status byte reports (`enable`).
     """
 
     condition: int = 0
@@ -307,12 +317,12 @@ class Register:
     enable: int = 0
 
     def see(self, condition: int) -> None:
-        """The condition as it is now; bits that turn on are kept as events."""
+        """Set the present condition; bits that turn on are added to the events."""
         self.event |= condition & ~self.condition
         self.condition = condition
 
     def read(self) -> int:
-        """The events since it was read last, which reading clears."""
+        """The events since the last reading; this clears them."""
         event = self.event
         self.event = 0
         return event
@@ -320,8 +330,8 @@ class Register:
 
 @dataclass(slots=True)
 class InstrumentStatus:
-    """What IEEE 488.2 and SCPI keep for a connection: the queue of errors, the registers, what
-    `*OPC` waits for.
+    """The status of one connection by IEEE 488.2 and SCPI: the error queue, the registers, and
+    whether an `*OPC` waits.
     """
 
     errors: deque[str] = field(default_factory=deque)
@@ -332,7 +342,9 @@ class InstrumentStatus:
     completes: bool = False  # whether `*OPC` waits
 
     def add(self, error: ScpiError) -> None:
-        """Queue an error, and set its bit of the standard event register."""
+        """Queue an error, and set its bit in the standard event register. In a full queue the last
+        error becomes -350 (SCPI-1999).
+        """
         self.standard.event |= EVENT_BITS[-error.number // 100]
         if len(self.errors) < MAX_ERRORS:
             self.errors.append(error.text)
@@ -341,23 +353,23 @@ class InstrumentStatus:
             self.standard.event |= EVENT_BITS[3]
 
     def next_error(self) -> str:
-        """The oldest error, which leaves the queue."""
+        """Remove the oldest error from the queue, and return its text; "No error" without one."""
         if self.errors:
             return self.errors.popleft()
         return ScpiError(0).text
 
     def clear(self) -> None:
-        """`*CLS`: events and errors are gone, enables stay."""
+        """`*CLS`: clear events and errors; the enable masks stay."""
         self.errors.clear()
         self.standard.event = self.operation.event = self.questionable.event = 0
         self.completes = False
 
     def preset(self) -> None:
-        """`STAT:PRES`: neither register is summed up."""
+        """`STAT:PRES`: clear the enable masks of the operation and questionable registers."""
         self.operation.enable = self.questionable.enable = 0
 
     def byte(self, message_waits: bool) -> int:
-        """The status byte, as `*STB?` has it."""
+        """The status byte of `*STB?`; `message_waits` sets its bit of a waiting answer."""
         status_byte = ERRORS_WAIT * bool(self.errors) | MESSAGE_WAITS * message_waits
         status_byte |= STANDARD_EVENT * bool(self.standard.event & self.standard.enable)
         status_byte |= QUESTIONABLE * bool(self.questionable.event & self.questionable.enable)
@@ -366,26 +378,24 @@ class InstrumentStatus:
 
 
 class NotScpi(Exception):
-    """Something came that no test stand sends, and the connection has to be closed; the message
-    says what.
+    """Bytes arrived that no test stand sends: the connection must be closed. The message names
+    them.
     """
 
 
 class LineBuffer:
-    """Bytes to lines, however they are cut: a line ends with LF, before which a CR counts as a
-    space.
-    """
+    """Cuts a stream of bytes into lines, which end with LF; a CR before it is removed."""
 
     def __init__(self) -> None:
         self._bytes = bytearray()
-        # of the line so far, also of one that is too long to be kept
+        # The beginning and the end of the present line, also where it is too long to be stored.
         self._head = b""
         self._end = b""
         self._too_long = False
 
     def feed(self, data: bytes) -> Iterator[str | None]:
-        """The lines that are whole now; None for one that was longer than MAX_LINE_BYTES. Raises
-        NotScpi.
+        """The lines that `data` completes; None for one over MAX_LINE_BYTES. Raises NotScpi for
+        bytes that no test stand sends.
         """
         *whole, rest = data.split(b"\n")
         for part in whole:

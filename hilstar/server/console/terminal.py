@@ -1,4 +1,6 @@
-"""What the commands print: lines, one JSON object, a summary, a progress bar, a refusal."""
+"""Prints the output of commands: lines of text, a JSON object, the summary of a run, a progress
+bar, or a refusal.
+"""
 
 import json
 import math
@@ -41,29 +43,29 @@ STATE_STYLES = {
     "MISSING": "bold red",
     "CHANGED": "bold red",
 }
-NAME_STYLE = "bold cyan"  # that of an option in --help
-BUSY_AFTER_S = 1.0  # a command that ends sooner shows no bar
+NAME_STYLE = "bold cyan"  # as options in --help
+BUSY_AFTER_S = 1.0  # a command that ends sooner shows no spinner
 ERASED_WITHIN_S = 0.5
 CLOCK_WORDS = {"one-way": "from arrivals", "exchange": "from time exchanges"}
 
 
 def say(line: str) -> None:
-    """A line for the person at the terminal."""
+    """Print a line on stderr, for the person at the terminal."""
     typer.echo(line, err=True)
 
 
 def print_json(value: Any) -> None:
-    """The one JSON object of --json; NumPy's numbers come out as plain ones."""
+    """Print the JSON object of --json on stdout; NumPy numbers and arrays become plain ones."""
     try:
         typer.echo(msgspec.json.encode(value, enc_hook=_plain).decode())
     except UnicodeEncodeError:
-        # a file's name that is not UTF-8; Python's own writes its bytes as escapes
+        # The name of a file may not be UTF-8: Python's `json` writes such bytes as escapes.
         typer.echo(json.dumps(msgspec.to_builtins(value, enc_hook=_plain)))
 
 
 def print_found(as_json: bool, found: Any, lines: Iterable[str]) -> None:
-    """What a command found: an object (a dictionary, dataclass or struct) for a program, or
-    lines for a person.
+    """Print the result of a command on stdout: the object `found` (dictionary, dataclass or struct)
+    as JSON, or `lines` of text.
     """
     if as_json:
         print_json(found)
@@ -73,8 +75,8 @@ def print_found(as_json: bool, found: Any, lines: Iterable[str]) -> None:
 
 
 def print_states(lines: Iterable[str]) -> None:
-    """Lines that begin with a state and a name, 8 and 12 characters; in the colours of --help on a
-    terminal, without any elsewhere and with NO_COLOR.
+    """Print lines that begin with a state and a name, in columns of 8 and 12 characters; in colour
+    on a terminal, unless NO_COLOR is set.
     """
     if not sys.stdout.isatty() or os.environ.get("NO_COLOR"):
         for line in lines:
@@ -95,7 +97,7 @@ def print_states(lines: Iterable[str]) -> None:
 
 
 def _plain(value: Any) -> Any:
-    import numpy as np  # 0.1 s, which Tab and --help do not need
+    import numpy as np  # takes 0.1 s, and is not needed for Tab and --help
 
     if isinstance(value, np.generic | np.ndarray):
         return value.tolist()
@@ -103,7 +105,7 @@ def _plain(value: Any) -> Any:
 
 
 def report(summary: "RunSummary", as_json: bool) -> None:
-    """The summary of a run, for a program or a person."""
+    """Print the summary of a run on stdout, as JSON or as lines of text."""
     if as_json:
         print_json(summary)
         return
@@ -143,7 +145,7 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         "packets": f"{packets.received} received, {packets.refused} refused{turned_away}{lost}",
     }
     if summary.clock:
-        # brings NumPy, which Tab and --help do not need
+        # Imports NumPy, which is not needed for Tab and --help.
         from hilstar.attitude.clock.sender_clock import KNOWN_MODES
 
         if summary.clock.mode in KNOWN_MODES:
@@ -162,7 +164,9 @@ def report(summary: "RunSummary", as_json: bool) -> None:
 
 
 def _last_lines(summary: "RunSummary") -> Iterator[tuple[str, str]]:
-    """What was wrong with the sky for a time, the renderer, and at the end the verdict."""
+    """The last lines of a summary, (name, text): what was wrong with the sky and for how long, the
+    renderer, and the verdict.
+    """
     for name, what in (
         ("operator", "changed by an operator's keys"),
         ("hidden", "not fully visible"),
@@ -179,8 +183,8 @@ def _last_lines(summary: "RunSummary") -> Iterator[tuple[str, str]]:
 
 
 def without_attitude(endpoint: str, packets: "PacketSummary", trouble: str = "") -> str:
-    """Why a run had no attitude, and what to change; `trouble` is what its link knows of the
-    other side.
+    """A line that says why a run got no attitude, and what to change. `trouble` is the fault that
+    the link reports, "" for none.
     """
     if not packets.received:
         advice = trouble.removeprefix(f"{endpoint}: ") or "start the sender, and check its address"
@@ -197,7 +201,9 @@ def without_attitude(endpoint: str, packets: "PacketSummary", trouble: str = "")
 
 
 def clock_line(clock: "ClockSummary") -> str:
-    """How the sender's clock stands to this machine's."""
+    """A line on the sender's clock relative to this machine's: how they are compared, the drift and
+    the uncertainty.
+    """
     if clock.mode == "none":
         return "no attitude has arrived"
     if clock.mode == "shared":
@@ -223,7 +229,9 @@ def _shows_bars() -> bool:
 
 @contextmanager
 def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
-    """A bar on a terminal's stderr, nothing elsewhere."""
+    """Show a progress bar on stderr during the `with` block, if stderr is a terminal. Call the
+    function that it gives with the number of steps done, of `total` (infinite: not known).
+    """
     if not _shows_bars():
         yield lambda done: None
         return
@@ -243,7 +251,7 @@ def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
         MofNCompleteColumn(),
         TimeRemainingColumn(),
     )
-    # What is printed meanwhile stays on stdout; redirected, it would come out on stderr.
+    # Without redirection, or rich would send to stderr what is printed on stdout meanwhile.
     with Progress(
         *columns, console=console, transient=True, refresh_per_second=4, redirect_stdout=False
     ) as bar:
@@ -254,8 +262,8 @@ def progress(what: str, total: float) -> Iterator[Callable[[int], None]]:
 
 @contextmanager
 def busy(what: str, after_s: float = BUSY_AFTER_S) -> Iterator[None]:
-    """The time that a computation of unknown length takes, on a terminal's stderr once it has
-    taken `after_s`; nothing elsewhere.
+    """Show the elapsed time of a computation of unknown length on stderr during the `with` block,
+    once it has taken `after_s`, if stderr is a terminal.
     """
     if not _shows_bars():
         yield
@@ -268,7 +276,8 @@ def busy(what: str, after_s: float = BUSY_AFTER_S) -> Iterator[None]:
     finally:
         ended.set()
         shower.join()
-        # stderr is written by a thread: what follows on stdout would come before its last erasure
+        # A thread writes stderr: without this wait, text on stdout would come before the line is
+        # erased.
         finish_stderr(ERASED_WITHIN_S)
 
 
@@ -288,6 +297,6 @@ def _show_busy(what: str, after_s: float, ended: threading.Event) -> None:
 
 
 def fail(line: str, code: int) -> NoReturn:
-    """One line on stderr, and out."""
+    """Print one line on stderr and exit with `code`."""
     print("hilstar: " + one_line(line), file=sys.stderr)
     sys.exit(code)

@@ -1,1 +1,1 @@
-"""What a run leaves behind: its ledger, its frames as files, its report."""
+"""The ledger of a run: its file and its records, and the figures that a report computes from it."""

@@ -1,7 +1,7 @@
-"""What a run's ledger says of the tracker's answers: over the whole run, and before, during and
+"""The statistics of the tracker's answers in a ledger: over the whole run, and before, during and
 after each fault.
 
-Answers are placed by the middle of their exposure. Memory does not grow with the run, except by up
+The time of an answer is the middle of its exposure. Memory does not grow with the run, except by up
 to MAX_FAULTS faults.
 """
 
@@ -18,15 +18,16 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server.answers.answer import StampOrder
 from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
 
-AROUND_S = 10.0  # before and after a fault
+AROUND_S = 10.0  # length of the spans before and after a fault
 MAX_FAULTS = 500
 VERDICTS = ("right", "wrong", "invalid", "unpaired", "unjudged")
-MAX_WRONG = 1000  # whose times are kept
+MAX_WRONG = 1000  # wrong answers with a stored time
 
 
 class AnswerSpan(msgspec.Struct, frozen=True, kw_only=True):
-    """The answers of a part of a run: `availability` is right answers over those due; right
-    answers' errors, x, y, z (cam).
+    """The answers in a part of a run: their number by verdict, and `availability`, the right
+    answers over those due. Errors in arcsec: `rms_arcsec` of right answers about the camera's x, y
+    and z, `largest_arcsec` of any compared answer.
     """
 
     length_s: float
@@ -39,11 +40,11 @@ class AnswerSpan(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class FaultEffect(msgspec.Struct, frozen=True, kw_only=True):
-    """A fault and the answers around it; times s after the run's first swap.
+    """A fault and its effect on the answers; `start_s` and `end_s` in s after the run's first swap.
 
-    `first_wrong_s` is from its begin to the exposure of the first wrong answer before it was over
-    and recovered from. `recovered_s` is from its end to that of the first right answer; 0 where the
-    last answer before its end was right, None where none came.
+    `first_wrong_s` is the time from the fault's beginning to the exposure of the first wrong answer
+    before the recovery. `recovered_s` is the time from its end to the exposure of the first right
+    answer: 0 where the last answer during the fault was right, None where no right answer followed.
     """
 
     name: str
@@ -58,11 +59,12 @@ class FaultEffect(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class AnswerReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The tracker's answers over a run. `rms_arcsec` is about zero, `sigma3_arcsec` about the mean;
-    of right answers.
+    """The statistics of the tracker's answers over a run. Errors of right answers, arcsec about the
+    camera's x, y and z: `rms_arcsec` is about zero, `sigma3_arcsec` three standard deviations about
+    the mean.
 
-    `out_of_order` counts stamps before an earlier answer's, `unjudged` answers that were compared
-    with nothing.
+    `out_of_order` counts answers whose stamp lies before that of an earlier arrival, `unjudged`
+    answers that were compared with nothing.
     """
 
     answers: int
@@ -83,7 +85,9 @@ class AnswerReport(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(slots=True)
 class SpanTally:
-    """Counts and sums of the answers of a part of a run."""
+    """Adds up the answers of a part of a run: `counts` by verdict, and the sums of the right
+    answers' errors and of their squares, arcsec, (3,).
+    """
 
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(VERDICTS, 0))
     total: FloatArray = field(default_factory=lambda: np.zeros(3))
@@ -101,19 +105,21 @@ class SpanTally:
             self.squares = self.squares + np.square(record.residual_arcsec)
 
     def mean(self) -> list[float] | None:
-        """The mean error, arcsec; None without a right answer."""
+        """The mean error of right answers, arcsec about x, y and z; None without one."""
         if self.counts["right"]:
             return _rounded(self.total / self.counts["right"])
         return None
 
     def rms(self) -> list[float] | None:
-        """The rms about zero."""
+        """Their rms about zero, arcsec about x, y and z; None without a right answer."""
         if self.counts["right"]:
             return _rounded(np.sqrt(self.squares / self.counts["right"]))
         return None
 
     def sigma3(self) -> list[float] | None:
-        """Three standard deviations; None for fewer than two right answers."""
+        """Three standard deviations about the mean, arcsec about x, y and z; None for fewer than
+        two right answers.
+        """
         count = self.counts["right"]
         if count < 2:
             return None
@@ -122,7 +128,9 @@ class SpanTally:
         )
 
     def span(self, length_s: float, cycle_s: float | None) -> AnswerSpan:
-        """Its figures, where an answer was due each `cycle_s`."""
+        """The statistics of a part that is `length_s` long; an answer is due every `cycle_s`, None
+        if that is not known.
+        """
         share = None
         if cycle_s and length_s > cycle_s / 2:
             share = round(min(self.counts["right"] / max(round(length_s / cycle_s), 1), 1.0), 4)
@@ -137,6 +145,8 @@ class SpanTally:
 
 @dataclass(slots=True)
 class _Fault:
+    """A fault, and the answers before, during and after it (`parts`); times in ns, host time."""
+
     record: FaultRecord
     start_ns: int
     end_ns: int | None = None
@@ -166,7 +176,7 @@ class _Fault:
             self.parts[2].add(record)
 
     def over(self, at_ns: int) -> bool:
-        """Whether no answer of that time can add to it."""
+        """Whether an answer at `at_ns`, host time, or later no longer changes the statistics."""
         return (
             self.end_ns is not None
             and self.recovered_ns is not None
@@ -207,8 +217,10 @@ class _Fault:
 
 
 class AnswerTally:
-    """The answers of a run, record by record. Faults older than the ledger's begin, `begun_ns`,
-    are those of a replayed run.
+    """Computes the statistics of a run's answers from its records, one by one in their order.
+
+    A fault older than the beginning of the ledger, `begun_ns` (host time), belongs to the run that
+    is replayed. `wrong_ns` are the times of wrong answers, host time.
     """
 
     def __init__(self, begun_ns: int = 0) -> None:
@@ -230,7 +242,8 @@ class AnswerTally:
         self.whole.add(record)
         if record.t_ns is not None:
             self._order.take(record.t_ns)
-        # of more than are judged: the others stand for the rate and for what is due
+        # Where answers arrive faster than they are judged, the judged ones alone give the interval
+        # and the number due.
         if record.verdict == "unjudged":
             return
         if self._host_ns:
@@ -248,8 +261,8 @@ class AnswerTally:
         self._open = [fault for fault in self._open if not fault.over(record.middle_ns)]
 
     def fault(self, record: FaultRecord) -> None:
-        """Add a fault's begin or end. Those of a replayed run come before its frames, which say
-        when they are on.
+        """Add the beginning or end of a fault. The faults of a replayed run come before its frames;
+        the frames say when these faults are on.
         """
         if record.event == "start" and record.host_ns < self._begun_ns:
             self.replayed[record.number] = record
@@ -259,7 +272,7 @@ class AnswerTally:
             self._end(record.number, record.host_ns)
 
     def frame(self, record: FrameRecord) -> None:
-        """Follow the faults of a replayed run."""
+        """Find in a frame which faults of a replayed run begin or end with it."""
         if not self.replayed:
             return
         shown = frozenset(record.faults)
@@ -285,14 +298,15 @@ class AnswerTally:
                 fault.end_ns = at_ns
 
     def report(self, zero_ns: int) -> AnswerReport | None:
-        """The figures, with times after `zero_ns` of the host's clock; None for a run without
-        answers.
+        """The statistics of the run, with times in s after `zero_ns`, host time; None for a run
+        without answers.
         """
         counts = self.whole.counts
         answers = sum(counts.values())
         if not answers:
             return None
         cycle_s = self._interval_s.percentile(50)
+        # No answer was due while no sky was shown: unpaired answers are subtracted.
         if not cycle_s:
             due = 0
         else:
@@ -301,7 +315,7 @@ class AnswerTally:
                 + 1
                 - counts["unpaired"]
             )
-        # the last answer stands for the time to the next
+        # The last answer stands for the time until the next one would have come.
         end_ns = self._last_ns + round((cycle_s or 0.0) * NS_PER_S)
         return AnswerReport(
             answers=answers,
@@ -320,7 +334,7 @@ class AnswerTally:
 
 
 def answer_rows(found: AnswerReport | None) -> list[tuple[str, str]]:
-    """The figures as rows of text: name and value."""
+    """The statistics as rows of text, (name, value); [] for a run without answers."""
     if found is None:
         return []
     refused = (

@@ -13,25 +13,25 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 
-# Two frames further apart than MAX_GAP_S and USUAL_INTERVALS median intervals do not say what was
-# shown between them.
+# What was shown between two frames is not known if they are further apart than both MAX_GAP_S and
+# USUAL_INTERVALS median intervals.
 MAX_GAP_S, USUAL_INTERVALS = 0.5, 3.0
 # A jump: a larger step than MAX_STEP_RAD, or one over JUMP_RAD that is JUMP_RATIO times as fast as
 # both of its neighbours.
 MAX_STEP_RAD = np.radians(2.0)
 JUMP_RAD, JUMP_RATIO = np.radians(0.02), 4.0
-SAME_RAD = 1e-9  # two frames of one attitude are joined whatever lies between them
+SAME_RAD = 1e-9  # two frames with the same attitude are joined, however long the gap between them
 UNEVEN = 1.6  # largest ratio of neighbouring intervals for a cubic through four frames
 NO_SPANS = np.zeros((0, 2))
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
-    """The commanded `q_icrs_to_cam` (n, 4) and rate (n, 3), rad/s, cam, at some moments; NaN where
-    not `known` (n,).
+    """The commanded attitude q_icrs_to_cam (n, 4) and rate (n, 3), rad/s, camera axes, at n
+    moments; NaN where not `known` (n,).
 
-    `held_s` (n,) is for how long a frame was held for missed ones about a moment, 0 where none was:
-    what was lit then is not what was commanded.
+    `held_s` (n,) is how long, s, a frame stood on the screen at a moment because frames after it
+    were missed; 0 where none was. The screen did not show the commanded attitude then.
     """
 
     q: FloatArray
@@ -41,12 +41,12 @@ class Moments:
 
 
 class Commanded:
-    """The attitudes of a run's frames, interpolated between them.
+    """The attitudes that a run commanded, interpolated between its frames.
 
-    `t_s` (m,) rises; `q` (m, 4), unit q_icrs_to_cam, is NaN where the sky was not shown as
-    commanded. `held_s` (k, 2), rising, are the spans from a frame to the next in which refresh
-    periods had no frame of their own, `hold_s` (k,) the longest time in each for which one frame
-    stood.
+    `t_s` (m,), s, rises; `q` (m, 4), unit q_icrs_to_cam, is NaN where the sky was not shown as
+    commanded. `held_s` (k, 2), s, rising, are the begin and end of each span between two frames in
+    which frames were missed; `hold_s` (k,), s, is the longest time in each span for which one frame
+    stood on the screen, by default the span's length.
     """
 
     def __init__(
@@ -71,14 +71,15 @@ class Commanded:
         self.joined = self._joined()
 
     def _joined(self) -> BoolArray:
-        """Whether each frame (m - 1,) and the next say what was shown between them."""
+        """Whether it is known what was shown between each frame and the next, (m - 1,): both show
+        the sky, they are near in time, and no jump lies between them.
+        """
         turned = np.linalg.norm(self._step, axis=1)
         is_shown = np.isfinite(turned)
         turned = np.nan_to_num(turned)
         max_gap_s = max(MAX_GAP_S, USUAL_INTERVALS * self.interval_s)
         is_near = (self._gap_s <= max_gap_s) & (turned <= MAX_STEP_RAD)
         is_same = turned <= SAME_RAD
-        # A step is a jump where it is much faster than the one before and the one after it.
         rate = turned / self._gap_s
         before = np.append(0.0, rate[:-1])
         after = np.append(rate[1:], 0.0)
@@ -93,11 +94,11 @@ class Commanded:
         return np.asarray(np.isfinite(self.q[:, 0]))
 
     def at(self, t_s: FloatArray) -> Moments:
-        """The commanded attitudes at times (n,), s: a cubic through four frames, or the great arc
-        between two.
+        """The commanded attitudes and rates at times (n,), s: a cubic through four frames, or the
+        great arc between two where neighbours are missing.
 
-        Of a trajectory of angular acceleration change j (rad/s^3) the cubic is off by less than j
-        dt^3 / 15.
+        For a trajectory whose angular acceleration changes by j (rad/s^3), frames dt apart, the
+        error of the cubic is below j dt^3 / 15, rad.
         """
         last_interval = len(self.t_s) - 2
         frames_before = np.searchsorted(self.t_s, t_s, side="right")
@@ -132,12 +133,14 @@ class Commanded:
         return Moments(q, rate, known, self._held_about(t_s))
 
     def over_exposures(self, reach_s: float) -> "Commanded":
-        """The same, where a moment stands for what was lit up to `reach_s` before and after it."""
+        """The same attitudes for moments that stand for exposures: a moment within `reach_s`, s, of
+        a held span counts as held.
+        """
         if not len(self.held_s):
             return self
         start_s = self.held_s[:, 0] - reach_s
         end_s = self.held_s[:, 1] + reach_s
-        # Spans that meet become one.
+        # Spans that now overlap become one, so that a moment lies in one span at most.
         latest_end_s = np.maximum.accumulate(end_s)
         is_apart = start_s[1:] > latest_end_s[:-1]
         first = np.flatnonzero(np.append(True, is_apart))
@@ -147,8 +150,8 @@ class Commanded:
         return Commanded(self.t_s, self.q, spans_s, hold_s)
 
     def _held_about(self, t_s: FloatArray) -> FloatArray:
-        """How long a frame stood in the held span in which each time (n,) lies, s; 0 where it
-        lies in none.
+        """How long, s, a frame stood on the screen in the held span that contains each time (n,); 0
+        for a time outside all of them.
         """
         if not len(self.held_s):
             return np.zeros(len(t_s))
@@ -158,12 +161,12 @@ class Commanded:
         return np.where(inside, self.hold_s[span], 0.0)
 
     def _bend(self, interval: IntArray, side: int) -> FloatArray:
-        """How far the turn at one end of each interval, rad per interval, differs from the
-        interval's own (n, 3).
+        """The turn at one end of each interval minus the interval's mean turn, rad per interval
+        (n, 3).
 
-        `side` is -1 for the beginning and 1 for the end. Finite differences at the frame that the
-        interval shares with its neighbour, weighted for unequal lengths; 0 where the neighbour is
-        missing, not joined, or of another length.
+        `side` is -1 for the beginning and 1 for the end. Computed as finite differences at the
+        frame that the interval shares with its neighbour, weighted for unequal lengths; 0 where the
+        neighbour is missing, not joined, or too different in length (UNEVEN).
         """
         last = len(self._step) - 1
         other = interval + side

@@ -1,4 +1,4 @@
-"""The attitudes that a run commanded, read from its ledger."""
+"""Reads the attitudes that a run commanded from its ledger."""
 
 from array import array
 from dataclasses import dataclass
@@ -17,11 +17,11 @@ NOT_SHOWN = (np.nan,) * 4
 
 @dataclass(frozen=True, slots=True)
 class CommandedRun:
-    """A run's commanded attitudes by the moment of light, in seconds after `zero_ns` of the
-    sender's clock.
+    """The commanded attitudes of a run at the moments when its frames light, in seconds after
+    `zero_ns` of the sender's clock.
 
-    `changed` counts the frames that the operator's keys or a hidden window changed: these show no
-    commanded attitude. `missed` counts the refresh periods without a frame of their own.
+    `changed` counts the frames that an operator changed or a hidden window concealed: these show no
+    commanded attitude. `missed` counts the refresh periods without a new frame.
     """
 
     commanded: Commanded
@@ -31,22 +31,24 @@ class CommandedRun:
 
     @property
     def held(self) -> int:
-        """How many frames were held beyond their refresh period, for missed ones."""
+        """The number of frames that stood longer than a refresh period, because later ones were
+        missed.
+        """
         return len(self.commanded.held_s)
 
     @property
     def missed_share(self) -> float:
-        """The missed refresh periods over all."""
+        """The share of refresh periods without a new frame, 0 to 1."""
         return self.missed / (self.missed + len(self.commanded.t_s))
 
     def seconds(self, t_ns: IntArray) -> FloatArray:
-        """Times (n,) of the sender's clock, ns, as the run's seconds."""
+        """Times (n,), ns, of the sender's clock, as seconds after `zero_ns`."""
         return np.asarray((t_ns - self.zero_ns) / NS_PER_S)
 
 
 def read_commanded(ledger: Path) -> CommandedRun:
-    """The commanded attitudes in a ledger. Raises InputError for what is no ledger, for damage,
-    for under two frames.
+    """Read the commanded attitudes from a ledger. Raises InputError if the file is no ledger, is
+    damaged, or has fewer than two frames.
     """
     light = array("q")
     shown = array("d")
@@ -62,7 +64,8 @@ def read_commanded(ledger: Path) -> CommandedRun:
             shown.extend(NOT_SHOWN)
         else:
             shown.extend(record.q)
-    # Of frames of one moment the last counts.
+    # Of several frames at one moment the last counts: `unique` keeps the first of equals, so that
+    # the order is reversed.
     newest_first_ns = np.array(light, dtype=np.int64)[::-1]
     light_ns, last = np.unique(newest_first_ns, return_index=True)
     if not len(light_ns):

@@ -1,11 +1,11 @@
-"""The ledger of a run: every packet as received and every frame as drawn, in an MCAP file that
-survives a kill.
+"""Writes the ledger of a run: every packet as received and every frame as drawn, in an MCAP file
+that stays readable if the process is killed.
 
 A separate thread writes a complete chunk with its CRC five times a second, so that no disk delays a
-frame. In a flood the first messages are kept whole and the others counted second by second. When a
-disk fills up, frames are dropped first and packets last. A disk that fails is tried again and never
-ends the display. Where somebody deletes, truncates or overwrites the file, an event says so and the
-ledger continues in another file, because the rest of the first could not be read.
+frame. In a flood the first messages are recorded whole and the others counted second by second.
+When a disk fills up, frames are dropped first and packets last. A disk that fails is tried again
+and never ends the display. If somebody deletes, truncates or overwrites the file, an event reports
+it and the ledger continues in another file, because the rest of the first could not be read.
 """
 
 import contextlib
@@ -67,15 +67,16 @@ FRAMES_SHARE = 0.5  # frames may use this share of it; the rest is for packets
 ENTRY_BYTES = {"packet": 1500, "frame": 2500, "event": 1000, "fault": 4000, "answer": 4000}
 NO_ROOM = "no room"  # the reason given for lost messages
 FLUSH_S = 0.2
-EACH_S = 1.0  # how often counts, the process and the disk are looked at
+EACH_S = 1.0  # interval at which counts and the process are recorded and the disk is checked
 MAX_CHUNK_BYTES = 1_000_000
 MAX_DETAIL_CHARACTERS = 200
-# for a disk that stalls at the end, without and with a signal
+# How long `close` waits for a disk that stalls, without and after a signal that ends the run.
 DISK_WAITS_S, STOPPED_DISK_WAITS_S = 20.0, 0.4
-MAX_REST_S = 60.0  # between two files begun because one was deleted, truncated or overwritten
-STALLED_S = 5.0  # since the writer's last pass
-LOW_SHARE, WELL_SHARE = 0.10, 0.12  # shares of the disk
-# reserved for packets, the smaller of the two
+MAX_REST_S = 60.0  # longest pause between new files after repeated damage
+STALLED_S = 5.0  # without a pass of the writer's thread the disk counts as stalled
+# Free shares of the disk at which the warning begins and ends.
+LOW_SHARE, WELL_SHARE = 0.10, 0.12
+# Below the smaller of these frames are no longer recorded: the rest of the disk is for packets.
 FRAMES_RESERVE_BYTES, FRAMES_RESERVE_SHARE = 64_000_000, 0.02
 TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
     key: JsonTopic(topic, f"hilstar.{key.title()}", schema_of(record, f"hilstar.{key.title()}"))
@@ -85,8 +86,8 @@ TOPICS = {"packet": ATTITUDE_TOPIC_OF_RUN} | {
 
 @dataclass(frozen=True, slots=True)
 class QueueEntry:
-    """A message to be written: its host time, a sequence number, its JSON once the writer asks
-    for it, and a packet's bytes.
+    """A message to be written: its kind, host time and sequence number. `encoded` makes its JSON
+    when the writer's thread needs it; `raw_bytes` is the length of a packet's bytes in it.
     """
 
     kind: Kind
@@ -97,13 +98,13 @@ class QueueEntry:
 
     @property
     def size_bytes(self) -> int:
-        """Approximate size in memory."""
+        """Approximate size in memory, bytes."""
         return ENTRY_BYTES[self.kind] + self.raw_bytes
 
 
 class LedgerQueue:
-    """Entries in order of arrival, bounded by bytes. Never blocks; drops frames first when it is
-    full.
+    """The messages that wait for the writer, in order of arrival, limited in bytes. Never waits
+    for the disk. When it is full, frames are dropped before packets; `dropped` counts by kind.
     """
 
     def __init__(self) -> None:
@@ -113,7 +114,7 @@ class LedgerQueue:
         self._lock = threading.Lock()
 
     def put(self, entry: QueueEntry) -> bool:
-        """Queue an entry; where it is full, count the entry and return False."""
+        """Queue an entry and return True; without room count it in `dropped` and return False."""
         room = MAX_WAITING_BYTES * (FRAMES_SHARE if entry.kind == "frame" else 1)
         with self._lock:
             if self._bytes + entry.size_bytes > room:
@@ -124,7 +125,7 @@ class LedgerQueue:
             return True
 
     def take(self) -> list[QueueEntry]:
-        """Take all entries."""
+        """Remove and return all entries, oldest first."""
         with self._lock:
             taken = self._entries
             self._entries = []
@@ -136,10 +137,12 @@ Counted = Kind | Literal["pulse", "lost"]  # pulses and lost packets are only co
 
 
 class FloodFilter:
-    """In a flood, passes the first messages of each kind and reason and counts the others."""
+    """Decides in a flood which messages are recorded: the first of each kind and reason; the
+    others are only counted.
+    """
 
-    # Refused packets tell little after the first ones; no sender means to send more than 2000 good
-    # ones a second.
+    # Burst, and messages a second. After the first ones refused packets add little information; no
+    # sender sends more than 2000 good ones a second on purpose.
     ALLOWED: ClassVar[Mapping[str, tuple[int, int]]] = {
         "accepted": (4000, 2000),
         "refused": (20, 1),
@@ -152,7 +155,9 @@ class FloodFilter:
         self._lock = threading.Lock()
 
     def keeps(self, kind: Kind, reason: str, now_ns: int) -> bool:
-        """Whether a message that arrives now is recorded in full; it is counted if not."""
+        """Whether a message that arrives at `now_ns`, host time, is to be recorded in full. If not,
+        it is counted.
+        """
         with self._lock:
             allowance = self._allowances.get((kind, reason))
             if allowance is None:
@@ -169,7 +174,7 @@ class FloodFilter:
         return is_kept
 
     def count(self, kind: Counted, reason: str, number: int = 1) -> None:
-        """Count messages that are not recorded for other reasons."""
+        """Count `number` messages that are not recorded for another reason than a flood."""
         with self._lock:
             self._counts[kind, reason] += number
 
@@ -182,8 +187,8 @@ class FloodFilter:
 
 
 class ProcessProbe:
-    """Measures this process's memory and CPU time. Opens /proc once, because later no descriptor
-    may be free.
+    """Measures the memory and CPU time of this process. Opens its file in /proc at the start,
+    because the process may have no free descriptor later.
     """
 
     def __init__(self) -> None:
@@ -192,7 +197,7 @@ class ProcessProbe:
             self._fd = os.open("/proc/self/statm", os.O_RDONLY | os.O_CLOEXEC)
 
     def record(self) -> ProcessRecord | None:
-        """The current figures; None if the system has none."""
+        """Resident memory and CPU time now; None where /proc cannot be read."""
         if self._fd is None:
             return None
         try:
@@ -216,7 +221,7 @@ class ProcessProbe:
 
 @dataclass(frozen=True, slots=True)
 class SplitLimits:
-    """The size or age at which a ledger continues in another file."""
+    """The size, bytes, or age, s, at which a ledger continues in another file."""
 
     bytes: float = math.inf
     seconds: float = math.inf
@@ -226,7 +231,11 @@ NO_SPLIT = SplitLimits()
 
 
 class Ledger(Closing):
-    """Writes a run's MCAP file. Raises InputError if it cannot be created."""
+    """Writes the MCAP file of a run, whose head describes `bench`. Raises InputError if it cannot
+    be created.
+
+    `path` is the newest file. `failure` says why it could not be written, None without a failure.
+    """
 
     def __init__(
         self,
@@ -255,6 +264,7 @@ class Ledger(Closing):
             "codes_ms": json.dumps(bench.config.render.codes_ms),
             "raw_convention": raw_convention(bench.config),
             "output": json.dumps(bench.output),
+            # Both clocks at one moment: a report converts host times to UTC by them.
             "monotonic_ns": str(time.monotonic_ns()),
             "unix_ns": str(time.time_ns()),
             "run_id": uuid.uuid4().hex,
@@ -265,7 +275,7 @@ class Ledger(Closing):
         self._thin = self._moved = False
         self._renewed_s = -math.inf
         self._rest_s = EACH_S
-        # records that a file begun during a run repeats
+        # The records with which a new file begins during a run: faults and a wrong sky that last.
         self.standing: Callable[[], list[FaultRecord | EventRecord]] = list
         self._file, self._writer = self._begin(path, overwrite)
         self._notices.end("ledger-lost", "ledger-new", f"{path}: a new ledger is begun")
@@ -291,7 +301,7 @@ class Ledger(Closing):
 
     @property
     def size_bytes(self) -> int:
-        """The size of its newest file."""
+        """The size of its newest file, bytes."""
         try:
             return os.fstat(self._file.fd).st_size
         except OSError:  # between two files
@@ -302,7 +312,9 @@ class Ledger(Closing):
     def packet(
         self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None
     ) -> None:
-        """Record a packet; see `attitude.receiver.Watch`."""
+        """Record a packet that arrived at host time `host_ns`: its attitude, or its `refusal`. See
+        `attitude.receiver.Watch`.
+        """
         raw = raw[:MAX_RAW_BYTES]
         if sample is not None and refusal is None:
             reason = "accepted"
@@ -318,7 +330,9 @@ class Ledger(Closing):
             self._queue.put(QueueEntry("packet", host_ns, sequence, encoded, len(raw)))
 
     def frame(self, record: FrameRecord) -> None:
-        """Record a frame."""
+        """Record a frame. Also reports a disk that stalls: the writer's thread cannot, while it
+        waits for the disk.
+        """
         self._queue.put(
             QueueEntry("frame", record.swap_ns, record.frame, partial(msgspec.json.encode, record))
         )
@@ -338,13 +352,15 @@ class Ledger(Closing):
             )
 
     def stands(self, record: EventRecord) -> None:
-        """Record an event from before this ledger."""
+        """Record an event that began before this ledger and lasts; no flood filter applies."""
         self._queue.put(
             QueueEntry("event", record.host_ns, 0, partial(msgspec.json.encode, record))
         )
 
     def fault(self, record: FaultRecord) -> None:
-        """Record the beginning or the end of a fault; a replay needs each."""
+        """Record the beginning or end of a fault; no flood filter applies, because a replay needs
+        each.
+        """
         self._queue.put(
             QueueEntry("fault", record.host_ns, record.number, partial(msgspec.json.encode, record))
         )
@@ -357,11 +373,11 @@ class Ledger(Closing):
             )
 
     def pulse(self, what: str) -> None:
-        """Count what became of a pulse: "sent", "skipped" or "lost"."""
+        """Count a pulse by its outcome `what`: "sent", "skipped" or "lost" (see PULSES)."""
         self._filter.count("pulse", what)
 
     def lost(self, number: int) -> None:
-        """Count packets that a gap of their `sequence` shows."""
+        """Count `number` packets that a gap in their `sequence` shows as lost."""
         self._filter.count("lost", LOST, number)
 
     # The writer's thread
@@ -374,8 +390,10 @@ class Ledger(Closing):
             self._file.close()
 
     def _turn(self, last: bool) -> None:
+        """Write what is queued; `last` also the end of the file. No error leaves it."""
         try:
             harm = self._file.harm(self._writer.size_bytes, self._writer.crc)
+            # At the end of a run a damaged file is replaced without the pause between new files.
             if harm is None:
                 self._look_at_place()
             elif last or time.monotonic() - self._renewed_s > self._rest_s:
@@ -413,11 +431,13 @@ class Ledger(Closing):
             self._flush()
 
     def _each_second(self) -> None:
+        """Record the counts and the process, and check the disk."""
         now_ns = time.monotonic_ns()
         dropped, self._queue.dropped = self._queue.dropped, type(self._queue.dropped)()
         for kind, number in dropped.items():
             self._lose(kind, number)
         for (kind, reason), number in self._filter.counted().items():
+            # The summary counts what a flood left out; pulses and lost packets have no message.
             self._counted += 0 if reason == NO_ROOM or kind in {"pulse", "lost"} else number
             record = CountRecord(host_ns=now_ns, kind=kind, reason=reason, count=number)
             self._add("count", now_ns, msgspec.json.encode(record))
@@ -427,6 +447,7 @@ class Ledger(Closing):
         self._look_at_disk()
 
     def _renew(self, harm: str, last: bool) -> None:
+        """Continue in another file; `harm` is "deleted", "truncated" or "overwritten"."""
         if self._renewed_s > 0:  # repeated damage must not fill the disk with files
             self._rest_s = min(2 * self._rest_s, MAX_REST_S)
         self._renewed_s = time.monotonic()
@@ -474,6 +495,7 @@ class Ledger(Closing):
             self._notices.begin("ledger-lost", line)
 
     def _look_at_place(self) -> None:
+        """Report once that the file was moved: it is still written, at its new place."""
         if self._moved:
             return
         place = part_path(self.path, self._part)
@@ -515,6 +537,7 @@ class Ledger(Closing):
             )
 
     def _flush(self) -> None:
+        """Write the pending chunk; if that fails, without its frames, so that packets may fit."""
         try:
             self._writer.flush()
         except OSError:
@@ -539,6 +562,7 @@ class Ledger(Closing):
         )
 
     def _go_on_in_another(self) -> None:
+        """Continue in the next part of a split ledger, or stay if it cannot be created."""
         self._part += 1
         try:
             file, writer = self._begin(part_path(self.path, self._part), self._overwrite)
@@ -560,8 +584,8 @@ class Ledger(Closing):
     # The end
 
     def close(self) -> None:
-        """Write what is queued and the end of the file; a disk that does not accept it in time
-        has failed.
+        """Write the queued messages and the end of the file. If the disk does not accept them in
+        time (DISK_WAITS_S), the ledger has failed.
         """
         self._closing.set()
         if caught() is None:
@@ -577,8 +601,9 @@ class Ledger(Closing):
         self._probe.close()
 
     def summary(self) -> dict[str, str | int | None]:
-        """Its path, what went wrong, how many messages were lost, and how many of a flood were
-        only counted.
+        """The ledger in the run's summary: its `path`, its `failure` or None, the number of lost
+        messages (`unrecorded`), of messages of a flood that were `only_counted`, and of its
+        `files`, where there are several.
         """
         lost = self._lost + sum(self._queue.dropped.values())
         told: dict[str, str | int | None] = {
@@ -594,7 +619,7 @@ class Ledger(Closing):
 
 
 def event_record(notice: Notice) -> EventRecord:
-    """The ledger's record of an event."""
+    """The ledger's record of a notice."""
     return EventRecord(
         host_ns=notice.host_ns,
         kind=notice.kind,
@@ -605,16 +630,16 @@ def event_record(notice: Notice) -> EventRecord:
 
 
 class LedgerSwitch:
-    """Passes a run's records to the current ledger, which can be begun and ended during the run;
-    drops them without one.
+    """Passes the records of a run to the current ledger, which an operator may begin and end during
+    the run; without a ledger they are dropped.
 
-    Frames and packets come from any thread and never wait. `begin` and `end` are for one thread,
+    Any thread may add records, and none waits. `begin` and `end` are for one thread at a time,
     which may wait for a disk.
     """
 
     def __init__(self, ledger: Ledger | None = None) -> None:
         self.current = self.last = ledger  # `last` is the newest one
-        # the end of a run waits for an end that an operator asked for
+        # The end of a run waits until a ledger that an operator ends is complete.
         self._ending = threading.Lock()
         self._scenario: list[FaultRecord] = []
         self._faults_on: dict[int, FaultRecord] = {}
@@ -629,13 +654,13 @@ class LedgerSwitch:
 
     @property
     def failure(self) -> str | None:
-        """Why the newest ledger could not be written, else None."""
+        """Why the newest ledger could not be written, None without a failure."""
         return None if self.last is None else self.last.failure
 
     def packet(
         self, host_ns: int, raw: bytes, sample: AttitudeSample | None, refusal: Refusal | None
     ) -> None:
-        """Record a packet; see `attitude.receiver.Watch`."""
+        """Record a packet that arrived at host time `host_ns`; see `attitude.receiver.Watch`."""
         ledger = self.current
         if ledger is not None:
             ledger.packet(host_ns, raw, sample, refusal)
@@ -647,8 +672,8 @@ class LedgerSwitch:
             ledger.frame(record)
 
     def notice(self, notice: Notice) -> None:
-        """Record an event of the run; a ledger that begins later repeats the conditions of a
-        wrong sky that hold.
+        """Record an event of the run. The conditions of a wrong sky that last are repeated in a
+        ledger that begins later.
         """
         if notice.kind in ENDS:
             self._wrong_sky[notice.kind] = event_record(notice)
@@ -665,20 +690,20 @@ class LedgerSwitch:
             ledger.answer(record)
 
     def lost(self, number: int) -> None:
-        """Count packets that a gap of their `sequence` shows."""
+        """Count `number` packets that a gap in their `sequence` shows as lost."""
         ledger = self.current
         if ledger is not None:
             ledger.lost(number)
 
     def pulse(self, what: str) -> None:
-        """Count what became of a pulse: "sent", "skipped" or "lost"."""
+        """Count a pulse by its outcome `what`: "sent", "skipped" or "lost"."""
         ledger = self.current
         if ledger is not None:
             ledger.pulse(what)
 
     def fault(self, record: FaultRecord) -> None:
-        """Record a fault's event; a ledger that begins later repeats the scenario and the faults
-        that are on.
+        """Record an event of a fault. The scenario and the faults that are on are repeated in a
+        ledger that begins later.
         """
         if record.event == "scenario":
             self._scenario.append(record)
@@ -691,8 +716,8 @@ class LedgerSwitch:
             ledger.fault(record)
 
     def begin(self, make: Callable[[], Ledger]) -> Ledger:
-        """Begin a ledger if there is none; the current ledger. Raises InputError where it cannot
-        be made.
+        """Begin the ledger that `make` creates if there is none, and return the current one. Raises
+        InputError if it cannot be created.
         """
         ledger = self.current
         if ledger is None:
@@ -710,8 +735,10 @@ class LedgerSwitch:
         return [*self._scenario, *list(self._faults_on.values()), *list(self._wrong_sky.values())]
 
     def end(self) -> Ledger | None:
-        """End the ledger and wait until it is complete on the disk; the ended ledger."""
-        # a signal that comes now does not interrupt this
+        """End the current ledger, wait until it is complete on the disk, and return it; None where
+        there is none.
+        """
+        # A signal that arrives meanwhile must not leave the file without its end.
         with self._ending, stop_on_signal(threading.Event()):
             ledger = self.current
             self.current = None

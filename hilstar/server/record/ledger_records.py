@@ -1,8 +1,8 @@
-"""What a ledger holds, and how it is read: its head, its records in their order, and the frames to
-be drawn again.
+"""The records of a ledger, and the functions that read them: its head, its records in their order,
+and the frames that a replay draws again.
 
-There is a record for each frame, each event, each second of the process, and for what was only
-counted.
+There is a record for each frame, event, fault and answer, for each second of the process, and for
+messages that were only counted.
 """
 
 import math
@@ -48,15 +48,15 @@ FRAME_TOPIC, PROCESS_TOPIC, EVENT_TOPIC, COUNT_TOPIC, FAULT_TOPIC = (
     "/fault",
 )
 ANSWER_TOPIC = "/answer"
-# What becomes of the pulse of a frame: a pulse that the line was lost in is "lost", and its frame
-# "skipped" too.
+# The outcomes of a frame's pulse. Where the line is lost during a pulse, the pulse counts as "lost"
+# and as "skipped".
 PULSES = ("sent", "skipped", "lost")
-LOST = "sequence"  # why packets count as lost
-# kept of a message; every packet is shorter, a simulator's own messages may be cut
+LOST = "sequence"  # the reason in the records of lost packets
+# Recorded of a message: every packet is shorter, a simulator's own messages may be cut.
 MAX_RAW_BYTES = 1024
-MAX_CENTROIDS = 200  # kept of an answer
-HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # this host's clock, which began at its start
-# a sender's clock, or the difference to the host's
+MAX_CENTROIDS = 200  # recorded of an answer
+HostNs = Annotated[int, msgspec.Meta(ge=0, le=2**62)]  # host time, ns; 0 at the machine's start
+# Times of another clock, or time differences, ns.
 AnyNs = Annotated[int, msgspec.Meta(ge=-(2**63), le=2**63 - 1)]
 Marker = Annotated[int, msgspec.Meta(ge=0, le=1)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**53)]
@@ -84,16 +84,19 @@ MAX_REASONS, MAX_REASON_CHARACTERS = 50, 40
 
 
 class FrameRecord(msgspec.Struct, kw_only=True, gc=False):
-    """One frame; times ns: `t_ns` of the timeline, `light_ns` of the sender's clock, the others of
-    this host's.
+    """One frame. Times in ns: `t_ns` on the timeline, `light_ns` on the sender's clock, the others
+    on this host's.
 
-    `q` is the attitude at `light_ns`, when the middle row lights. `rate` (rad/s, cam) is the turn
-    along which stars are drawn as paths, null for points. `velocity_km_s` (ICRS, for aberration)
-    and `place_km` (about the Earth) are the observer's where the source gives them, else null.
-    `capped` counts stars with coarser paths. `missed_before` counts the refresh periods just before
-    it without a frame, `missed` those of the run. `marker` is the photodiode square. `operator`
-    names the operator's switches ("blank, grid"; under a blank or a patch `q` is null), `hidden`
-    says why the window was not seen; "" for neither.
+    `q` is q_icrs_to_cam (w, x, y, z) at `light_ns`, when the middle row lights. `rate` (rad/s,
+    camera axes) is the turn along which stars are drawn as paths, null where they are points.
+    `velocity_km_s` (ICRS, for aberration) and `place_km` (position relative to the Earth) are the
+    observer's where the source gives them, else null. `clipped` counts stars that are too bright
+    for the monitor, `below_step` stars that are too faint for it, `capped` stars with coarser
+    paths. `missed_before` counts the refresh periods just before it without a frame, `missed` those
+    of the run so far. `marker` is the state of the photodiode square. `operator` names the
+    operator's switches that are on ("blank, grid"; under a blank or a patch `q` is null), `hidden`
+    says why the window was not visible; "" for neither. `faults` are the numbers of the faults that
+    are on, `fault_since_ns` the times since when.
     """
 
     frame: Count
@@ -127,8 +130,8 @@ class FrameRecord(msgspec.Struct, kw_only=True, gc=False):
 
 
 def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
-    """The JSON schema of a record, of plain types only (see
-    `attitude.logs.mcap_log.ATTITUDE_SCHEMA`).
+    """The JSON schema of a record class, as bytes, with the name `title`. It has plain types only
+    (see `attitude.logs.mcap_log.ATTITUDE_SCHEMA`).
     """
     array = {"type": "array", "items": {"type": "number"}}
     fields = {}
@@ -140,7 +143,7 @@ def schema_of(record: type[msgspec.Struct], title: str) -> bytes:
 
 
 class ProcessRecord(msgspec.Struct, kw_only=True):
-    """The process's memory and CPU time at a moment of host time, ns."""
+    """The memory, bytes, and total CPU time, s, of the process at a host time, ns."""
 
     host_ns: HostNs
     resident_bytes: Count
@@ -148,10 +151,10 @@ class ProcessRecord(msgspec.Struct, kw_only=True):
 
 
 class EventRecord(msgspec.Struct, kw_only=True):
-    """An event of a run (see `hilstar.basics.notices`): host time, ns, its kind, its text, and the
-    person that it comes from.
+    """An event of a run (see `hilstar.basics.notices`): host time, ns, its kind, its text
+    (`detail`), and the person who caused it (`who`).
 
-    `since_ns` is when that began of which it tells, where this was earlier.
+    `since_ns` is the host time at which the reported condition began, where that was earlier.
     """
 
     host_ns: HostNs
@@ -162,13 +165,12 @@ class EventRecord(msgspec.Struct, kw_only=True):
 
 
 class FaultRecord(msgspec.Struct, kw_only=True):
-    """A fault begins or ends ("start", "end"), or fell between two frames ("missed"): at host time,
-    and `t_ns` of the run.
+    """The beginning ("start") or end ("end") of a fault, or a fault that fell between two frames
+    ("missed"): at host time `host_ns` and `t_ns` of the timeline.
 
-    `number` counts the starts of a run, `who` is "file", "stream" or a person. `table` is the fault
-    as JSON, with the
-    keys of a scenario; `seed` that of its randomness, `folder` where its files are, and
-    `file_sha256` that of its map.
+    `number` counts the starts in a run; `who` is "file", "stream" or a person's name. `table` is
+    the fault as JSON with the keys of a scenario, `seed` the seed of its random numbers, `folder`
+    the folder of its files, and `file_sha256` the SHA-256 of its map.
     """
 
     host_ns: HostNs
@@ -185,18 +187,18 @@ class FaultRecord(msgspec.Struct, kw_only=True):
 
 
 class AnswerRecord(msgspec.Struct, kw_only=True):
-    """An answer of the tracker: its bytes (`raw`, hexadecimal), what they say, and what was lit
-    while it looked.
+    """An answer of the tracker: its bytes (`raw`, hexadecimal), its content, and what the display
+    lit during its exposure.
 
-    Host times, ns: `host_ns` of its last byte, `middle_ns` of its exposure's middle, as known then.
-    `t_ns` is the tracker's stamp on its own clock, `light_ns` the exposure's middle on the sender's
-    clock. `centroids` are [x_px, y_px, dn, hip]. `verdict` is "right", "wrong" (see `[answers]
-    wrong_arcsec`), "invalid" (without an attitude), "unpaired" (no one sky was lit) or "unjudged"
-    (compared with nothing; `middle_ns` is then `host_ns`).
+    Host times, ns: `host_ns` of its last byte, `middle_ns` of its exposure's middle, as estimated
+    on arrival. `t_ns` is the tracker's stamp on the tracker's clock, `light_ns` the exposure's
+    middle on the sender's clock. `q` is q_icrs_to_cam (w, x, y, z), `rate` is in rad/s, camera
+    axes. `centroids` are [x_px, y_px, dn, hip]. `verdict` is "right", "wrong" (see `[answers]
+    wrong_arcsec`), "invalid" (without an attitude), "unpaired" (no single sky was lit) or
+    "unjudged" (compared with nothing; `middle_ns` may be `host_ns`).
 
     `q_lit` is the mean attitude of the frames `first_frame` to `last_frame`, `residual_arcsec` the
-    rotation vector from
-    it to `q`, cam.
+    rotation vector from it to `q`, camera axes.
     """
 
     host_ns: HostNs
@@ -219,12 +221,12 @@ class AnswerRecord(msgspec.Struct, kw_only=True):
 
 
 class CountRecord(msgspec.Struct, kw_only=True):
-    """What was only counted, second by second (host time, ns): refused packets by reason, a flood,
-    or pulses.
+    """A number of messages that were only counted in the second before `host_ns` (host time, ns):
+    of a flood, without room on the disk, or without a message, as pulses.
 
-    `kind` is "packet", "frame", "event", "answer", "pulse" or "lost"; `reason` that of a refusal,
-    "accepted" of other packets and answers, the kind of an event, of a pulse one of PULSES, and
-    LOST of packets that a gap of their `sequence` shows.
+    `kind` is "packet", "frame", "event", "answer", "pulse" or "lost". `reason` is the reason of a
+    refused packet, "accepted" for other packets and answers, an event's kind, one of PULSES for a
+    pulse, "no room" for lost messages, or LOST for packets that a gap in their `sequence` shows.
     """
 
     host_ns: HostNs
@@ -234,7 +236,9 @@ class CountRecord(msgspec.Struct, kw_only=True):
 
 
 class PacketForm(msgspec.Struct, gc=False):
-    """What a report reads of a packet."""
+    """The part of a recorded packet that a report needs: whether it was accepted, else the reason,
+    and when it was received, host time, ns.
+    """
 
     accepted: bool = True
     reason: str | None = None
@@ -269,8 +273,8 @@ _DECODERS[ATTITUDE_TOPIC] = msgspec.json.Decoder(PacketForm)
 
 def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> FrameRecord:
     """The ledger's record of a frame; `light_ns` is on the sender's clock, `missed` counts the
-    run's missed frames
-    so far, and `below_step` the stars in view that are too faint for the monitor.
+    run's missed frames so far, and `below_step` the stars in view that are too faint for the
+    monitor.
     """
     attitude = shown.attitude
     drawn = shown.drawn
@@ -313,7 +317,7 @@ def frame_record(shown: Shown, light_ns: int, missed: int, below_step: int) -> F
 
 
 def answer_record(judged: Judged) -> AnswerRecord:
-    """The ledger's record of an answer of the tracker."""
+    """The ledger's record of a judged answer."""
     answer = judged.answer
     lit = judged.lit
     record = AnswerRecord(
@@ -346,7 +350,9 @@ def _numbers(values: FloatArray | None) -> Any:
 
 
 def below_step(bench: Bench, shown: Shown) -> int:
-    """How many stars in view of a frame are too faint for the monitor."""
+    """The number of stars in view of a frame that are too faint for the monitor; 0 without an
+    attitude.
+    """
     if shown.attitude is None:
         return 0
     return bench.count_faint(shown.attitude.q_icrs_to_cam)
@@ -357,28 +363,28 @@ def _within_64_bits(value_ns: int) -> int:
 
 
 def frame_records(path: Path, *, tell: bool = True) -> Iterator[FrameRecord]:
-    """The frames of a ledger as they were written, none if the file is no ledger. Raises
-    InputError for damage.
+    """The frames of a ledger as they were written; none if the file is no ledger. `tell`: a
+    missing end is reported. Raises InputError for damage.
     """
     return _records(path, FRAME_TOPIC, tell)
 
 
 def fault_records(path: Path) -> Iterator[FaultRecord]:
-    """The beginnings and ends of faults in a ledger. Raises InputError for damage; says nothing
-    of a missing end.
+    """The beginnings and ends of faults in a ledger. Raises InputError for damage; does not report
+    a missing end.
     """
     return _records(path, FAULT_TOPIC)
 
 
 def event_records(path: Path) -> Iterator[EventRecord]:
-    """The events of a run in its ledger. Raises InputError for damage; says nothing of a missing
+    """The events of a run in its ledger. Raises InputError for damage; does not report a missing
     end.
     """
     return _records(path, EVENT_TOPIC)
 
 
 def answer_records(path: Path) -> Iterator[AnswerRecord]:
-    """The tracker's answers in a ledger, none if the run had none. Raises InputError for damage."""
+    """The tracker's answers in a ledger; none if the run had none. Raises InputError for damage."""
     return _records(path, ANSWER_TOPIC)
 
 
@@ -396,8 +402,8 @@ def _not_ours(path: Path, which: str, error: Exception) -> InputError:
 
 
 def drawable_frames(path: Path, max_rate_rad_s: float = math.inf) -> Iterator[FrameRecord]:
-    """The frames of a ledger, to be drawn again. Raises InputError for damage, and for what the
-    wire would refuse.
+    """The frames of a ledger, for drawing them again. Raises InputError for damage, and for numbers
+    that an attitude packet may not have; `max_rate_rad_s` is the largest rate, rad/s.
     """
     for number, record in enumerate(frame_records(path), start=1):
         wrong = wrong_in_frame(record, max_rate_rad_s)
@@ -407,7 +413,9 @@ def drawable_frames(path: Path, max_rate_rad_s: float = math.inf) -> Iterator[Fr
 
 
 def wrong_in_frame(record: FrameRecord, max_rate_rad_s: float = math.inf) -> str:
-    """What the wire would refuse of a frame; "" where it can be drawn again."""
+    """A line of text on a frame's numbers that an attitude packet may not have; "" where the frame
+    can be drawn again.
+    """
     if record.q is not None:
         sample = checked_sample(record.t_ns, record.q, record.rate)
         refusal = sample if isinstance(sample, Refusal) else rate_refusal(sample, max_rate_rad_s)
@@ -424,15 +432,17 @@ def wrong_in_frame(record: FrameRecord, max_rate_rad_s: float = math.inf) -> str
 
 
 def run_records(path: Path) -> Iterator[RunRecord]:
-    """The records of a ledger, in order. Raises InputError for a file that is no ledger or is
-    damaged.
+    """The records of a ledger, in their order. Raises InputError for a file that is no ledger or
+    is damaged.
     """
     for block in run_blocks(path, 1):
         yield from block
 
 
 def run_blocks(path: Path, size: int) -> Iterator[list[RunRecord]]:
-    """The records of a ledger, in order, `size` at once. Raises InputError as `run_records`."""
+    """The records of a ledger, in their order, in lists of `size`; the last may be shorter. Raises
+    InputError as `run_records`.
+    """
     block: list[RunRecord] = []
     last: Topics = {}
     try:
@@ -454,13 +464,13 @@ def run_blocks(path: Path, size: int) -> Iterator[list[RunRecord]]:
 
 
 def attitudes_of(records: Sequence[Any]) -> FloatArray:
-    """The attitudes (n, 4) of the frames that have one."""
+    """The attitudes q_icrs_to_cam (n, 4) of the frames among `records` that have one."""
     q = [record.q for record in records if type(record) is FrameRecord and record.q is not None]
     return np.fromiter(chain.from_iterable(q), np.float64, 4 * len(q)).reshape(-1, 4)
 
 
 def _checked(records: list[RunRecord]) -> list[RunRecord]:
-    # `checked_sample` has the same rule, and costs ten times as much.
+    # `checked_sample` checks the same norm, one attitude at a time, and takes ten times as long.
     with np.errstate(over="ignore"):
         if (np.abs(np.linalg.norm(attitudes_of(records), axis=1) - 1.0) > NORM_TOLERANCE).any():
             raise ArithmeticError("a quaternion's norm is not 1")
@@ -468,6 +478,9 @@ def _checked(records: list[RunRecord]) -> list[RunRecord]:
 
 
 def _first_fault(path: Path, error: Exception) -> InputError:
+    """The refusal that names the first wrong message. `run_blocks` does not number messages: after
+    its `error` the file is read again.
+    """
     every = (
         (topics[channel], data)
         for topics, messages in read_chunks(path, tell=False)
@@ -492,13 +505,15 @@ def _first_fault(path: Path, error: Exception) -> InputError:
 
 
 class PacketTally:
-    """The number of packets, accepted or by the reason for their refusal."""
+    """Counts packets: those accepted, and those refused by reason, in `counts`. After MAX_REASONS
+    different reasons further ones are counted as "others".
+    """
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
 
     def add(self, record: RunRecord) -> None:
-        """Add a recorded packet, or a count of packets."""
+        """Add a recorded packet, or a record that counts packets; other records change nothing."""
         if isinstance(record, PacketForm):
             self.count(
                 "accepted" if record.accepted else (record.reason or "format").split(":")[0], 1
@@ -507,7 +522,7 @@ class PacketTally:
             self.count(record.reason, record.count)
 
     def count(self, reason: str, number: int) -> None:
-        """Add packets of one kind."""
+        """Add `number` packets with a reason, "accepted" for accepted ones."""
         if len(self.counts) < MAX_REASONS or reason in self.counts:
             key = reason[:MAX_REASON_CHARACTERS]
         else:
@@ -516,7 +531,9 @@ class PacketTally:
 
 
 def read_head(path: Path) -> dict[str, str]:
-    """The head of a ledger, {} if there is none. Raises InputError for damage."""
+    """The head of a ledger (the keys that `Ledger` writes); {} if there is none. Raises InputError
+    for damage.
+    """
     try:
         return read_metadata(path, RUN_METADATA)
     except OSError as error:
@@ -524,8 +541,8 @@ def read_head(path: Path) -> dict[str, str]:
 
 
 def codes_ms_of(head: dict[str, str]) -> tuple[float, float] | None:
-    """What codes cost in a run (see `[render] codes_ms`), from its ledger's head; None where
-    nothing was measured or fixed.
+    """The time of an average frame by `round` and by `exact`, ms, in a run (see `[render]
+    codes_ms`), from its ledger's head; None where it was neither measured nor fixed.
     """
     try:
         return msgspec.json.decode(head.get("codes_ms", "null"), type=tuple[float, float] | None)
@@ -534,11 +551,10 @@ def codes_ms_of(head: dict[str, str]) -> tuple[float, float] | None:
 
 
 def raw_convention(config: BenchConfig) -> str:
-    """What a ledger's head says of the bytes in `raw`: their convention and the mounting, by which
-    `q` was made of them.
+    """The entry of a ledger's head that explains the bytes in `raw`: the convention and the
+    mounting by which they were converted to `q`. JSON; null for a source without packets.
 
-    `q` and `rate` of the ledger are hilstar's own: whoever reads them applies neither again. JSON;
-    null for a source that has no packets.
+    `q` and `rate` in the ledger are hilstar's own already: a reader applies neither again.
     """
     settings = config.attitude
     if settings.source not in PACKET_SOURCES:
@@ -553,8 +569,8 @@ def raw_convention(config: BenchConfig) -> str:
 
 
 def config_of(head: dict[str, str]) -> BenchConfig | None:
-    """The configuration of a run, from its ledger's head; None if that holds none that can be
-    read.
+    """The configuration of a run, from its ledger's head; None if the head has none, or none that
+    can be read.
     """
     try:
         return msgspec.convert(

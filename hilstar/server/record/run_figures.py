@@ -1,5 +1,5 @@
-"""The figures of a run's report, from its ledger: added in blocks, in memory that does not grow
-with the run.
+"""Computes the figures of a run's report from its ledger, block by block, in memory that does not
+grow with the run.
 """
 
 from collections import Counter, deque
@@ -41,15 +41,16 @@ from hilstar.server.record.ledger_records import (
     run_blocks,
 )
 
-SAMPLES = 1 << 16  # frames of which each figure is kept: all of a run of a quarter of an hour
-SPANS = 8192  # in which a run is drawn along its time
+SAMPLES = 1 << 16  # frames with stored times: at 60 Hz all of a run of a quarter of an hour
+SPANS = 8192  # largest number of points of a chart along the run
 BLOCK = 4096  # records that are added at once
 MEGABYTE = 1e6
 WARM_UP_S = 60.0  # after this the process has allocated all the memory that it needs
 KEYFRAMES = 16  # drawn in the report, evenly over the run
-MAX_EVENTS = 1000  # the first ones, and as many of the last, are kept
-SMALL_RAD = 1e-8
-# newest frames, which a condition may be found to have spoilt: over a minute at 120 Hz
+MAX_EVENTS = 1000  # so many of the first events and of the last are stored
+SMALL_RAD = 1e-8  # up to this angle, angle / sine is 1 to the last bit
+# A condition is noticed after it began: it may change the count of this many newest frames, over a
+# minute at 120 Hz.
 RECOUNTED = 8192
 # Times of a frame, ms, and the keys that a report has them under.
 METRICS = {
@@ -82,7 +83,9 @@ SAME_NAME = ("duration_s", "events", "pulses", "memory_growth_mb")
 
 
 class ThinnedRows:
-    """Every n-th row of a stream; n doubles as the stream grows."""
+    """Stores every n-th row of a stream, at most `capacity` rows: n (`stride`) doubles whenever
+    the storage is full.
+    """
 
     def __init__(self, columns: int, capacity: int = SAMPLES, kind: type = float) -> None:
         self._rows: npt.NDArray[Any] = np.zeros((capacity, columns), dtype=kind)
@@ -91,7 +94,7 @@ class ThinnedRows:
         self.stride = 1
 
     def add(self, rows: npt.NDArray[Any]) -> None:
-        """Add rows (n, columns), or skip them."""
+        """Take the next rows (n, columns) of the stream, and store every n-th."""
         while len(rows):
             first = -self._seen % self.stride
             free = len(self._rows) - self._kept
@@ -110,12 +113,14 @@ class ThinnedRows:
 
     @property
     def rows(self) -> npt.NDArray[Any]:
-        """The rows that are kept, (n, columns)."""
+        """The stored rows, (n, columns)."""
         return self._rows[: self._kept]
 
 
 class SpanColumn(NamedTuple):
-    """Minimum and maximum, NaN where a span has no value, and the sum, (n,) each."""
+    """One column of a SpanTable: minimum and maximum of each span, NaN where it has no value, and
+    the sum, (n,) each.
+    """
 
     low: FloatArray
     high: FloatArray
@@ -123,8 +128,8 @@ class SpanColumn(NamedTuple):
 
 
 class SpanTable:
-    """The minimum, maximum and sum of each column over equal numbers of frames: at most
-    `capacity` spans.
+    """The minimum, maximum and sum of each column over spans of equal numbers of frames (`length`),
+    at most `capacity` spans: the length doubles whenever all are used.
     """
 
     def __init__(self, columns: int, capacity: int = SPANS) -> None:
@@ -137,7 +142,7 @@ class SpanTable:
         self.length = 1
 
     def add(self, rows: FloatArray) -> None:
-        """Add frames (n, 1 + columns): when each was, and its values; NaN is no value."""
+        """Add frames, rows (n, 1 + columns) of the frame's time and its values; NaN is no value."""
         while len(rows):
             if self._used == 0 or self._in_last == self.length:
                 if self._used == len(self._begin):
@@ -146,7 +151,7 @@ class SpanTable:
                 self._begin[self._used] = rows[0, 0]
                 self._used = self._used + 1
                 self._in_last = 0
-            # Whole spans are added at once; one that has begun is filled first.
+            # Whole spans are added at once, for speed; a span that has begun is filled first.
             spans = 1
             if not self._in_last:
                 free = len(self._begin) - self._used + 1
@@ -157,6 +162,7 @@ class SpanTable:
             rows = rows[count:]
 
     def _add(self, rows: FloatArray, spans: int) -> None:
+        """Add rows to the last span; if it is empty, they fill it and more: `spans` in all."""
         columns = rows.shape[1] - 1
         values = rows[:, 1:].reshape(spans, -1, columns)
         first = self._used - 1
@@ -173,6 +179,7 @@ class SpanTable:
         self._in_last += values.shape[1]
 
     def _halve(self) -> None:
+        """Join the spans in pairs; the last one is full then."""
         half = self._used // 2
         self._low[:half] = np.minimum(self._low[::2], self._low[1::2])
         self._high[:half] = np.maximum(self._high[::2], self._high[1::2])
@@ -187,11 +194,11 @@ class SpanTable:
 
     @property
     def begin(self) -> FloatArray:
-        """When each span begins, (n,)."""
+        """The time of each span's first frame, (n,)."""
         return self._begin[: self._used]
 
     def column(self, number: int) -> SpanColumn:
-        """One column over all spans."""
+        """Minimum, maximum and sum of a column, by its number, over all spans."""
         low = self._low[: self._used, number]
         high = self._high[: self._used, number]
         total = self._sum[: self._used, number]
@@ -202,7 +209,9 @@ class SpanTable:
 
 
 class TimeBins:
-    """Counts of some kinds over time, in bins of a width that doubles as the run grows."""
+    """Counts events of several kinds in bins of time, at most `capacity` bins: their width doubles
+    whenever a run outgrows them.
+    """
 
     def __init__(self, kinds: int, capacity: int = SPANS) -> None:
         self._counts = np.zeros((capacity, kinds), dtype=np.int64)
@@ -211,8 +220,8 @@ class TimeBins:
         self.width_ns = NS_PER_S
 
     def add(self, at_ns: npt.NDArray[np.int64], kinds: IntArray, number: int = 1) -> None:
-        """Count `number` arrivals of `kinds` (n,) at host times (n,); a time before the first
-        counts in the first bin.
+        """Count `number` events of `kinds` (n,), column numbers, at each of the host times (n,),
+        ns. A time before the first one counts in the first bin.
         """
         if not len(at_ns):
             return
@@ -233,8 +242,8 @@ class TimeBins:
         self.width_ns = 2 * self.width_ns
 
     def rates_hz(self, zero_ns: int) -> tuple[FloatArray, FloatArray]:
-        """The start of each bin, s after a host time, (n,), and the rate of each kind in it,
-        1/s, (n, kinds).
+        """The beginning of each bin, s after the host time `zero_ns`, (n,), and the rate of each
+        kind in it, 1/s, (n, kinds).
         """
         if self._first_ns is None:
             return np.zeros(0), np.zeros((0, self._counts.shape[1]))
@@ -245,8 +254,8 @@ class TimeBins:
 
 
 class Keyframes:
-    """Frames of a run to be drawn in its report: some evenly over the run, and the first or
-    worst of each kind.
+    """Chooses the frames that a report draws: KEYFRAMES evenly over the run, and the first or the
+    worst frame of each kind.
     """
 
     def __init__(self) -> None:
@@ -254,7 +263,9 @@ class Keyframes:
         self._best: dict[str, tuple[int, FrameRecord]] = {}
 
     def add(self, frames: list[FrameRecord], worths: dict[str, IntArray]) -> None:
-        """Look at frames (n), whose `worths` (n,) say how special each is."""
+        """Add frames (n). `worths` has, by the reason to draw a frame, a number (n,) for each: the
+        first frame with the largest number over 0 is drawn.
+        """
         rows = np.empty((len(frames), 1), dtype=object)
         rows[:, 0] = frames
         self._even.add(rows)
@@ -265,9 +276,12 @@ class Keyframes:
                 self._best[why] = int(worth[place]), frames[place]
 
     def chosen(self, last: FrameRecord | None) -> list[tuple[FrameRecord, str]]:
-        """The frames in order, each with what is special about it, or ""."""
+        """The chosen frames and the `last` one in order of time, each with the reasons to draw it,
+        "" for none.
+        """
         frames = list(self._even.rows[:, 0])
-        reasons: dict[int, list[str]] = {}  # by the frame's identity
+        # By the object's id: a frame may be chosen for several reasons.
+        reasons: dict[int, list[str]] = {}
         for why, (_, frame) in self._best.items():
             frames.append(frame)
             reasons.setdefault(id(frame), []).append(why)
@@ -280,8 +294,8 @@ class Keyframes:
 
 @dataclass(slots=True)
 class FrameMarks:
-    """The newest frames (n,): when each was swapped, whether nothing else is wrong with it, and
-    whether its sky was.
+    """The newest frames (n,): host time of the swap, ns; whether the frame is right apart from a
+    wrong sky (`plain`); and whether it falls within a wrong sky (`wrong`).
     """
 
     swap_ns: npt.NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -289,14 +303,14 @@ class FrameMarks:
     wrong: BoolArray = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def add(self, swap_ns: npt.NDArray[np.int64], plain: BoolArray, wrong: BoolArray) -> None:
-        """Add frames, and forget the oldest ones."""
+        """Add frames (n,), and forget the oldest beyond RECOUNTED."""
         self.swap_ns = np.concatenate([self.swap_ns, swap_ns])[-RECOUNTED:]
         self.plain = np.concatenate([self.plain, plain])[-RECOUNTED:]
         self.wrong = np.concatenate([self.wrong, wrong])[-RECOUNTED:]
 
 
 def _covered(wrong_sky: WrongSky, swap_ns: npt.NDArray[np.int64]) -> BoolArray:
-    """Whether there was a wrong sky at each of these host times (n,)."""
+    """Whether each host time (n,), ns, falls within a span of a wrong sky."""
     covered = np.zeros(len(swap_ns), dtype=bool)
     if wrong_sky.any:
         for begin_ns, end_ns in wrong_sky.spans_ns():
@@ -306,14 +320,17 @@ def _covered(wrong_sky: WrongSky, swap_ns: npt.NDArray[np.int64]) -> BoolArray:
 
 @dataclass(slots=True)
 class RunFigures:
-    """The figures of a run's report."""
+    """Adds up the records of a run, from which `summarise` makes the figures of its report.
+
+    `head` is the ledger's head.
+    """
 
     head: dict[str, str]
     packets: PacketTally = field(default_factory=PacketTally)
     events: dict[str, int] = field(default_factory=dict)
     pulses: dict[str, int] = field(default_factory=dict)  # by PULSES; {} where none was due
-    # Frames, with how many of each fault, "right_frames" with none and "late" stale ones with an
-    # attitude.
+    # Numbers of all "frames", of frames with each of FAULTS, of "right_frames" with none of these,
+    # and of "late" frames: stale, but with an attitude.
     counted: Counter[str] = field(default_factory=Counter)
     most: dict[str, int] = field(
         default_factory=lambda: dict.fromkeys(("clipped", "below_step", "stars_drawn"), 0)
@@ -349,23 +366,25 @@ class RunFigures:
 
     @property
     def duration_s(self) -> float:
-        """From the first swap to the last."""
+        """The time from the first swap to the last, s."""
         if self.last is None:
             return 0.0
         return (self.last.swap_ns - self.first_swap_ns) / NS_PER_S
 
     @property
     def memory_growth_mb(self) -> float | None:
-        """Growth of the process's memory since its first minute; None for a shorter run."""
+        """The growth of the process's memory after its first minute, MB; None for a shorter run."""
         if self.warm is None or self.last_process is None or self.warm is self.last_process:
             return None
         return (self.last_process.resident_bytes - self.warm.resident_bytes) / MEGABYTE
 
     def add(self, *records: RunRecord) -> None:
-        """Add records of the ledger, in their order: many at once take a third of the time."""
+        """Add records of the ledger, in their order. Many in one call take a third of the time."""
         frames = [record for record in records if type(record) is FrameRecord]
         packets = [record for record in records if type(record) is PacketForm]
         others = [record for record in records if type(record) not in {FrameRecord, PacketForm}]
+        # The frames of a replayed run say when its faults are on: answers, faults and frames are
+        # then added in the ledger's order.
         in_order = self.answers.replayed or FaultRecord in set(map(type, others))
         for record in records if in_order else others:
             if isinstance(record, FrameRecord):
@@ -373,7 +392,7 @@ class RunFigures:
             elif not isinstance(record, PacketForm):
                 self._add_one(record)
         accepted = _whole(packets, "accepted")[0] > 0
-        # Of packets that are all accepted nothing but their number is counted: all at once.
+        # If all packets are accepted, only their number matters: one call counts them, for speed.
         all_at_once = bool(accepted.all()) and "accepted" in self.packets.counts
         if all_at_once:
             self.packets.count("accepted", len(packets))
@@ -386,8 +405,8 @@ class RunFigures:
             self._add_frames(frames)
 
     def _recount(self) -> None:
-        """Count frames as wrong that were added before it was found that they are: conditions
-        say since when they hold.
+        """Correct the counts of frames that were added before a wrong sky was noticed: its event
+        says since when it holds.
         """
         if not self.wrong_sky.any:
             return
@@ -496,8 +515,8 @@ def _times_ms(
     before: FrameRecord | None,
     after_missed: BoolArray,
 ) -> FloatArray:
-    """The METRICS of frames (n, 6); NaN where there is none. An interval across missed frames
-    does not count.
+    """The METRICS of frames, ms, (n, 6); NaN where a frame has none. `before` is the frame before
+    them. The interval after missed frames (`after_missed`) is NaN.
     """
     swap_before_ns = swap_ns[0] if before is None else before.swap_ns
     intervals_ns = np.diff(swap_ns, prepend=swap_before_ns).astype(np.float64)
@@ -514,12 +533,14 @@ def _times_ms(
 
 
 def _has_text(frames: Sequence[FrameRecord], name: str) -> BoolArray:
-    """Whether frames (n,) have any text in a column."""
+    """Whether the field `name` of each frame has a text, (n,)."""
     return np.array([getattr(frame, name) != "" for frame in frames])
 
 
 def _whole(records: Sequence[RunRecord], name: str) -> tuple[npt.NDArray[np.int64], BoolArray]:
-    """A whole number of each record, 0 for None, and whether it is known, (n,) each."""
+    """The whole number in the field `name` of each record, 0 for None, and whether it is not None,
+    (n,) each.
+    """
     count = len(records)
     try:
         numbers = np.fromiter(map(attrgetter(name), records), np.int64, count)
@@ -531,7 +552,9 @@ def _whole(records: Sequence[RunRecord], name: str) -> tuple[npt.NDArray[np.int6
 
 
 def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
-    """The turns (n, 3) from attitudes (n, 4) to others about the camera's axes."""
+    """The rotation vectors (n, 3), rad, about the camera's axes from attitudes `a` (n, 4) to `b`
+    (n, 4), unit q_icrs_to_cam.
+    """
     (aw, ax, ay, az), (bw, bx, by, bz) = a.T, b.T
     w = aw * bw + ax * bx + ay * by + az * bz
     x = -bw * ax + bx * aw - by * az + bz * ay
@@ -540,7 +563,6 @@ def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
     sine = np.sqrt(x * x + y * y + z * z)
     small = sine <= SMALL_RAD
     half_rad = np.arctan2(sine, np.abs(w))
-    # Of a small angle the angle over its sine is 1 to the last bit.
     angle_over_sine = np.where(small, 1.0, half_rad / np.where(small, 1.0, sine))
     sign = np.copysign(1.0, w)
     scale = -2.0 * sign * angle_over_sine
@@ -548,8 +570,8 @@ def _turns_rad(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def figures_of(path: Path) -> RunFigures:
-    """Read a ledger. Raises InputError for a file that is no ledger, has no frame, or is
-    damaged.
+    """Read a ledger and add up its records. Raises InputError for a file that is no ledger, has no
+    frame, or is damaged.
     """
     figures = RunFigures(read_head(path))
     figures.answers = AnswerTally(_begun_ns(figures.head))
@@ -566,8 +588,10 @@ def _begun_ns(head: dict[str, str]) -> int:
 
 
 class RunReport(msgspec.Struct, frozen=True, kw_only=True):
-    """The figures of a run: the JSON object of `hilstar report`. Times in ms, but for
-    `duration_s`.
+    """The figures of a run, the JSON object of `hilstar report`. Percentiles of times are in ms.
+
+    Figures without a value are None. `clipped`, `below_step` and `stars_drawn` are the largest
+    numbers of stars in any frame.
     """
 
     frames: int
@@ -591,7 +615,7 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
     packets: dict[str, int]
     events: dict[str, int]
     pulses: dict[str, int]
-    # on the screen, with a fresh attitude, not changed by the operator, of a sky that is right
+    # Frames on the screen with a fresh attitude and the right sky, unchanged by an operator.
     right_frames: int = 0
     wrong_frames: int = 0
     wrong_sky: WrongSkyTotal = WrongSkyTotal()
@@ -611,7 +635,7 @@ class RunReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def summarise(run: RunFigures) -> RunReport:
-    """The figures of a run, from those of its frames."""
+    """The figures of a run's report, from its added records."""
     figures: dict[str, Any] = dict(run.most)
     for name, key in METRICS.items():
         figures[key] = run.spreads[name].percentiles()
@@ -649,7 +673,7 @@ def summarise(run: RunFigures) -> RunReport:
 
 
 def table_rows(report: RunReport) -> list[tuple[str, str]]:
-    """The figures as rows of text: name and value."""
+    """The figures of a report as rows of text, (name, value)."""
     rows = [*_frame_rows(report).items(), *_time_rows(report).items()]
     for condition in report.wrong_sky.conditions:
         rows.append((condition.kind, f"{condition.seconds:.1f} s: {condition.text}"))

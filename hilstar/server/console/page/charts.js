@@ -1,4 +1,4 @@
-// Charts along time, and histograms, drawn by uPlot (uplot.min.js, MIT). What a chart shows is written in words too.
+// Charts along time, and histograms, drawn by uPlot (uplot.min.js, MIT). Each chart also has its content as text.
 
 import { count, duration, fixed, make, quantity, write } from "./format.js";
 
@@ -7,16 +7,16 @@ const { uPlot } = globalThis;
 const HEIGHT = 144;
 const HISTOGRAM_HEIGHT = 132;
 const FONT = "11px system-ui, sans-serif";
-const LEFT = 44; // for the figures of the axis
-const PADDING = [22, 10, 0, 0]; // above there is room for marks
-const HISTOGRAM_PADDING = [22, 26, 0, 0]; // at the right there is room for the last value
+const LEFT = 44; // CSS pixels for the numbers of the axis
+const PADDING = [22, 10, 0, 0]; // room for marks above the plot
+const HISTOGRAM_PADDING = [22, 26, 0, 0]; // and at the right for the last number of the axis
 const TIME_ROOM_PX = 90;
 const VALUE_ROOM_PX = 24;
-const RECENT_S = 2; // a value that is older is none
-const IN_SECONDS_MS = 2000; // an axis of more is in s
-const CROWDED_PX = 16; // between marks, from which their lines would hide the curves
-const CLICK_PX = 6; // a drag over less is a press
-const KEY_STEP = 0.2; // of what is seen
+const RECENT_S = 2; // an older value is not shown as the present one
+const IN_SECONDS_MS = 2000; // an axis with a larger range is in s
+const CROWDED_PX = 16; // marks that are nearer to each other get no lines, which would hide the curves
+const CLICK_PX = 6; // a shorter drag counts as a click
+const KEY_STEP = 0.2; // relative to the visible part
 const KEY_ZOOM = 2;
 const STEPS = [1, 2, 2.5, 5, 10];
 const TIME_STEPS_S = [0.1, 0.2, 0.5, 1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 14400, 28800, 86400];
@@ -126,7 +126,7 @@ export class Chart {
     this.plot = new uPlot(options, this.aligned(), this.box);
   }
 
-  // Each span has its minimum and its maximum at one time: no spike is too thin to be seen.
+  // The minimum and the maximum of a span stand at one time, so that a narrow spike stays visible.
   aligned() {
     const [first] = this.series;
     if (!first) return [[]];
@@ -136,7 +136,7 @@ export class Chart {
     return [twice(first.t, first.t), ...this.series.map(({ low, high }) => twice(low, high))];
   }
 
-  // Times without a value are a gap where they are more than those between the series' own samples.
+  // Missing values make a gap only where there are more of them than between two samples of the series.
   gaps(plot, number, first, last) {
     const [times, values] = [plot.data[0], plot.data[number]];
     const known = [];
@@ -174,7 +174,7 @@ export class Chart {
     });
   }
 
-  // What is drawn beside the curves, in CSS pixels of the plot: f(context, x of a time, {left, top, right, bottom}).
+  // Sets a function that draws besides the curves, in CSS pixels of the plot: f(context, x of a time, {left, top, right, bottom}).
   drawn(act) {
     const { ctx, bbox } = this.plot;
     const ratio = uPlot.pxRatio;
@@ -202,7 +202,8 @@ export class Chart {
     });
   }
 
-  // A triangle, and where they are few a line to the bottom: lost frames and refused packets are seen without their colour.
+  // A triangle, with a line to the bottom where there are few: missed frames and refused packets differ from curves in shape, not
+  // in colour alone.
   drawMarks(context, x, { top, bottom, right, left }, { ink, t, n, flag }) {
     context.fillStyle = this.ink[ink];
     const places = t.filter((at, k) => n[k] && at >= this.from && at <= this.to).map(x);
@@ -212,14 +213,14 @@ export class Chart {
       if (!crowded && !flag) context.fillRect(at - 0.5, top, 1, bottom - top);
       context.globalAlpha = 1;
       context.beginPath();
-      // what somebody did is a diamond on the axis
+      // an operator's action is a diamond on the axis
       const corners = flag ? [[0, bottom - 5], [5, bottom], [0, bottom + 5], [-5, bottom]] : [[-4, top - 6], [4, top - 6], [0, top + 1]];
       for (const [dx, y] of corners) context.lineTo(at + dx, y);
       context.fill();
     }
   }
 
-  // What lasts is a shade over its time, with a bar above.
+  // A lasting condition shades its time, with a bar above.
   drawLasting(context, x, { top, bottom }, { ink, t, n }) {
     context.fillStyle = this.ink[ink];
     let begun = null;
@@ -239,8 +240,9 @@ export class Chart {
     }
   }
 
-  // A part of the time is chosen by dragging, by keys when the chart has the focus, by the wheel with Ctrl; a press picks a moment.
-  // onRange({from, to}) for a new part, {pick} for a moment, {whole: true} for all of it.
+  // The user chooses a part of the time by dragging, by keys while the chart has the focus, or by the wheel with Ctrl; a click
+  // chooses a moment.
+  // Calls onRange({from, to}) for a part, {pick} for a moment, {whole: true} for all of it.
   listen() {
     const { box } = this;
     box.tabIndex = 0;
@@ -304,7 +306,7 @@ export class Chart {
     this.tell();
   }
 
-  // The newest value, or that under the pointer, the cursor; minimum and maximum of what is seen.
+  // Writes the newest value or the one under the pointer or cursor, and the minimum and maximum of the visible part.
   tell() {
     const at = this.hover ?? this.cursor;
     const parts = this.series.map((one) => {

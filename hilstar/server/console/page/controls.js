@@ -1,4 +1,5 @@
-// What an operator may change: each asks the server, says what it answered, and shows the state that comes back, never the wish.
+// The operator's controls: each sends a request to the server, shows its answer, and shows the state that the run reports, never the
+// requested one.
 
 import { byId, make, write } from "./format.js";
 import { SWITCHES } from "./protocol.js";
@@ -36,7 +37,7 @@ export class Controls {
     byId("fault-form").hidden = !(faults || []).length;
   }
 
-  // Nothing can be asked of a run that does not answer: `setUp` is called again once it does. What is written in a field stays.
+  // Disables the controls while the run does not answer; `setUp` enables them again. Text in a field stays.
   lose() {
     this.disarm();
     this.allowed = false;
@@ -59,12 +60,12 @@ export class Controls {
     said.dataset.state = ledger === null ? "warn" : ledger.failing ? "bad" : "ok";
   }
 
-  // A switch has its name on it, the ledger's button what it does.
+  // A switch shows its name, the ledger's button shows what a press does.
   wordsOf(name) {
     return name === "ledger" ? (this.on.ledger ? "Stop" : "Start") : titleOf(name);
   }
 
-  // Blanking, and ending a ledger, take a second press within three seconds.
+  // Blanking the sky and ending a ledger need a second press within three seconds.
   press(name) {
     if (!this.allowed) return;
     const on = !this.on[name];
@@ -108,7 +109,7 @@ export class Controls {
     this.send("mark", { text }, "Mark written").then((ok) => ok && (field.value = ""));
   }
 
-  // The button ends a fault that is on: one without an end of its own would stay for ever.
+  // While a fault is on, its button ends it: a fault without an end in the scenario would last for ever.
   tellFault() {
     const name = byId("fault-name").value;
     write(byId("control-fault"), this.faultsOn.includes(name) ? "End" : "Inject");

@@ -3,10 +3,10 @@
 import { NONE, bytes, count, fixed, quantity, signed } from "./format.js";
 import { FIGURES } from "./protocol.js";
 
-const MOST_NAMED = 4; // stars that clip
+const MOST_NAMED = 4; // clipped stars that are named
 const PLACES = /\{([\w.]*)(?: ([^}]+))?\}/g; // in a figure's text: {}, {KEY} or {KEY UNIT}
 
-const starNames = new Map(); // by HIP number, as the picture has them
+const starNames = new Map(); // by HIP number, from the picture's stars
 
 // The stars of a picture: the panels call them as the picture does.
 export function nameStars(stars) {
@@ -27,7 +27,7 @@ function number(value, unit, digits) {
 function signedAll(values, unit, digits) {
   const pairs = [];
   for (let k = 0; k < values.length; k += 2) pairs.push(values.slice(k, k + 2).map((value) => signed(value, digits)).join("\u00a0\u00a0"));
-  const gap = /^\w|^\u00b0/.test(unit) ? "\u00a0" : ""; // none before a mark of minutes or seconds
+  const gap = /^\w|^\u00b0/.test(unit) ? "\u00a0" : ""; // no space before the sign of arcminutes or arcseconds
   return pairs.join(values.length === 3 ? "\u00a0\u00a0" : "  ") + gap + unit;
 }
 
@@ -36,7 +36,7 @@ const FORMS = {
   share: (value, unit, digits) => number(100 * value, unit, digits),
   signed: signedAll,
   text: (value) => value,
-  clause: (value) => value.split(": ")[0], // the whole of it stands under Events
+  clause: (value) => value.split(": ")[0], // the whole text is under Events
   clock: (synchronised) => (synchronised ? "time exchange" : "arrivals (excludes the minimum delay)"),
   reasons: (counts) => Object.entries(counts).map(([reason, n]) => `${n} ${reason}`).join(", "),
   clipped: (stars) => stars.length && `${stars.length}: ${stars.slice(0, MOST_NAMED).map(starName).join(", ")}${stars.length > MOST_NAMED ? ", \u2026" : ""}`,

@@ -1,4 +1,4 @@
-// Whether what is shown is right, since when, and why not: in one colour, one word and one sign.
+// Shows whether the sky is right, since when, and why not, by a colour, a word and a sign.
 
 import { byId, clock, duration, write } from "./format.js";
 
@@ -21,12 +21,12 @@ export class Health {
     this.check();
   }
 
-  // The server's clock now; the browser's own may be wrong.
+  // The present time of the server's clock: the browser's clock may be wrong.
   get nowMs() {
     return this.serverMs + performance.now() - this.saidAt;
   }
 
-  // {ok, late, headline, reasons, since}: what the server says, unless it says nothing.
+  // The health {ok, late, headline, reasons, since}: as the server sent it, or that no message has come for SILENT_MS.
   judge() {
     const silent = performance.now() - this.saidAt;
     if (this.said === null) return { ok: false, late: false, headline: "Connecting", reasons: this.link.refusedWhy || "no word from hilstar yet", since: null };

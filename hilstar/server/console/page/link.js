@@ -1,10 +1,10 @@
-// The connection to the run: one WebSocket that comes back by itself, and requests with the token.
+// The connection to the run: a WebSocket that is opened again when it is lost, and HTTP requests with the token.
 
 import { GIVES_WAY, SUBPROTOCOL, TOKEN_PROTOCOL } from "./protocol.js";
 
 const RETRY_MS = [200, 400, 800, 1500];
-const SILENT_MS = 3000; // without any message: the socket is given up and opened anew
-const GAVE_WAY_MS = 10000; // as many pages were open as there are places for, and another one came
+const SILENT_MS = 3000; // after this time without a message the socket is closed and opened again
+const GAVE_WAY_MS = 10000; // pause after the server closed this page because too many were open
 const TOKEN_KEY = "hilstar.token";
 
 // The token comes in the address once, and is taken out of it: it would stay in the history and in what is copied.
@@ -60,7 +60,7 @@ export class Link {
     setTimeout(() => this.connect(), wait);
   }
 
-  // A browser does not say why a WebSocket was refused; a plain request does.
+  // A browser does not tell a page why a WebSocket was refused; an HTTP request gets the reason.
   async askWhy() {
     try {
       const answer = await this.get("/state");
@@ -71,7 +71,7 @@ export class Link {
     this.onChange();
   }
 
-  // Called often: a socket that says nothing is closed, so that a server that froze is found again.
+  // To be called often: closes a socket without messages, so that the page connects again after the server froze.
   check() {
     const socket = this.socket;
     const since = Math.max(this.heardAt, this.openedAt || 0);
@@ -98,7 +98,7 @@ export class Link {
     return fetch(path, { headers: this.headers(), cache: "no-store" });
   }
 
-  // What the server said, in one line: {ok, line}.
+  // Sends a request; gives {ok, line}, with the server's answer in one line.
   async control(name, body, operator) {
     const headers = this.headers({ "Content-Type": "application/json" });
     if (operator) headers["X-Operator"] = encodeURIComponent(operator);

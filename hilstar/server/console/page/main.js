@@ -1,4 +1,4 @@
-// The operator's page: what comes over the link goes to the picture, the map, the charts, the numbers and the health.
+// The operator's page: passes the messages of the link to the picture, the map, the charts, the numbers and the health.
 
 import { Chart } from "./charts.js";
 import { Controls, listKeys } from "./controls.js";
@@ -14,10 +14,10 @@ import { Sky } from "./sky.js";
 import { ink, startTheme } from "./theme.js";
 
 const PICTURE_HZ = 8;
-const CALM_HZ = 2; // for who asked their system for less motion
+const CALM_HZ = 2; // pictures a second if the system is set to reduced motion
 const OLD_PICTURE_MS = 700;
 const SKY_MS = 250;
-const TRAIL_DEG = 0.05; // the boresight's track has a point each time it has moved this far
+const TRAIL_DEG = 0.05; // the boresight's track gets a point after each motion of this angle
 
 let hello = null;
 let state = null;
@@ -81,7 +81,7 @@ const HEARD = {
     document.body.dataset.answers = String(said.answers);
     byId("tracker").hidden = byId("chart-residual").hidden = !said.answers;
     overlays.buttons.answer.hidden = !said.answers;
-    picture.setRedClipped(overlays.on.clipped && !said.session); // a pattern's white is meant
+    picture.setRedClipped(overlays.on.clipped && !said.session); // a pattern's white pixels are intended
     health.session = Boolean(said.session);
     write(byId("bench"), said.bench);
     byId("bench").title = said.bench;
@@ -118,14 +118,14 @@ const HEARD = {
   },
   event(said) {
     const newest = byId("events").firstElementChild;
-    if (said.kind === "pattern" && newest?.dataset.kind === "pattern") newest.remove(); // a step is worth a line, not each of its patterns
+    if (said.kind === "pattern" && newest?.dataset.kind === "pattern") newest.remove(); // a step keeps one line for all its patterns
     addEvent(said);
   },
   answer(said) {
     writeTracker(said, trackerRows);
   },
   truth(said) {
-    if (held && said.frame !== picture.frame) return; // the truth of the picture that is held stays
+    if (held && said.frame !== picture.frame) return; // a held picture keeps the marks of its own frame
     overlays.add(said);
     nameStars(said.stars);
     redraw("picture");

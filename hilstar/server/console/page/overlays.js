@@ -1,4 +1,4 @@
-// What is drawn over the picture: the truth of the same frame, from the bench's own stars and lens.
+// The marks over the picture: stars, boresight, outline and grid of the same frame, computed from the bench's stars and lens.
 
 import { make } from "./format.js";
 import { STAR } from "./protocol.js";
@@ -15,12 +15,12 @@ export const OVERLAYS = [
   ["answer", "Answer", true, "a"],
 ];
 const INK = { truth: "#63d2a1", name: "#c9d6ee", grid: "rgba(110, 150, 225, 0.6)", tracker: "#ffcf70", boresight: "#7db4ff", clipped: "#ff6b6b", answer: "#f08bd8" };
-const LABELS = 40; // the brightest in view; more would hide the stars
+const LABELS = 40; // of the brightest stars in view; more labels would hide the stars
 const FAINTEST_RING_MAG = 8;
 const KEPT_TRUTHS = 12;
-const UNDER_CODES = 0.6; // opacity of lines over pixels whose codes are written
-const LABEL_AREA_PX = 24000; // of the picture, in CSS pixels squared, for each label
-const POINTED_PX = 12; // from the pointer to the star that it names
+const UNDER_CODES = 0.6; // opacity of lines over pixels with code values
+const LABEL_AREA_PX = 24000; // visible area of the picture, in CSS pixels squared, per label
+const POINTED_PX = 12; // largest distance from the pointer to the star that it names
 
 export class Overlays {
   constructor(canvas, view, onChange) {
@@ -56,7 +56,7 @@ export class Overlays {
     while (this.truths.size > KEPT_TRUTHS) this.truths.delete(this.truths.keys().next().value);
   }
 
-  // The truth of this frame; of the newest one where the picture's own has not come.
+  // The marks of the picture's frame, or the newest ones while those of the frame have not come.
   of(frame) {
     return this.truths.get(frame) || this.newest;
   }
@@ -87,7 +87,7 @@ export class Overlays {
     if (this.on.answer) this.drawAnswer(truth);
     if (this.on.truth || this.on.clipped) this.drawRings(stars);
     if (this.on.boresight && truth.boresight_px) this.drawBoresight(truth.boresight_px);
-    if (picture.hasValues) return; // names would hide the codes: they stand below the picture
+    if (picture.hasValues) return; // labels would hide the codes: the names are below the picture instead
     if (this.on.names || this.on.magnitudes) this.drawLabels(stars);
     this.drawPointed(stars, picture.pointer);
   }
@@ -147,7 +147,7 @@ export class Overlays {
     if (top && this.place(label, top[0] + 6 * unit, top[1] + 12 * unit, 11)) this.write(label, top[0] + 6 * unit, top[1] + 12 * unit, INK.tracker, 11);
   }
 
-  // The tracker's newest answer: the field that it takes for its own, and a diamond about each centroid that it reports.
+  // The tracker's newest answer: the outline of the field that it reports, and a diamond about each reported centroid.
   drawAnswer({ reported_px: field, centroids_px: places }) {
     const { context, unit, view } = this;
     context.strokeStyle = INK.answer;
@@ -167,7 +167,7 @@ export class Overlays {
     }
   }
 
-  // Clipped stars have a second, square ring: they are told by shape as well as by colour.
+  // Clipped stars have a second, square ring, so that they differ in shape, not in colour alone.
   drawRings(stars) {
     const { context, unit, view } = this;
     for (const [x, y, magnitude, , , clipped] of stars) {
@@ -192,7 +192,7 @@ export class Overlays {
   drawBoresight([x, y]) {
     const { context, unit } = this;
     const [u, v] = this.view.toCanvas(x, y);
-    // A name under one of its bars would look struck out.
+    // A name crossed by one of the cross's bars would look struck out.
     this.taken.push([u - 24 * unit, v - unit, u + 24 * unit, v + unit], [u - unit, v - 24 * unit, u + unit, v + 24 * unit]);
     context.strokeStyle = INK.boresight;
     context.lineWidth = 1.5 * unit;
@@ -210,7 +210,7 @@ export class Overlays {
     return [u - 2 * unit, v - size * 0.65 * unit, u + context.measureText(text).width + 2 * unit, v + size * 0.65 * unit];
   }
 
-  // True, and the place is taken, where the whole label is inside, and on no other one, no star and not on the field's line.
+  // True if the whole label fits: inside, on no other label, no star and not on the outline of the field. Its place is then reserved.
   place(text, u, v, size) {
     const box = this.boxOf(text, u, v, size);
     const { width, height } = this.canvas;
@@ -235,7 +235,7 @@ export class Overlays {
     return square + Math.max((6 + 0.9 * Math.max(FAINTEST_RING_MAG - magnitude, 0)) * this.unit, this.view.scale * 2.5 + 3 * this.unit);
   }
 
-  // The brightest, as many as the picture has room for; the rest are named under the pointer.
+  // Labels of the brightest stars, as many as fit; other stars are named when the pointer is on them.
   drawLabels(stars) {
     const { unit, view, context } = this;
     const places = stars.map(([x, y]) => view.toCanvas(x, y));
@@ -259,7 +259,7 @@ export class Overlays {
     }
   }
 
-  // The star under the pointer, whatever else is written: its name, V, colour, and whether it clips.
+  // The star under the pointer, whether it has a label or not: its name, V, colour, and whether it clips.
   drawPointed(stars, pointer) {
     if (!pointer) return;
     const { unit, view, context } = this;

@@ -1,4 +1,5 @@
-// The numbers beside the picture: attitude, clock, counts, refusals, ledger and events. Names from outside are only ever text.
+// The numbers beside the picture: attitude, clock, counts, refusals, ledger and events. Names from outside are written as text, never
+// as HTML.
 
 import { writeFigures } from "./figures.js";
 import { NONE, byId, clock, count, degreesMinutes, fixed, hours, make, signed, write } from "./format.js";

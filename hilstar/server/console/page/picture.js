@@ -6,10 +6,10 @@ import { STAR } from "./protocol.js";
 import { PIXELS_ZOOM, View } from "./view.js";
 
 const STRETCH_GAIN = 4; // asinh(gain * level) / asinh(gain * white): the first level of 8 bits has 27 % of the way to white
-const GRID_FROM = 9; // CSS pixels per monitor pixel from which their edges are drawn
+const GRID_FROM = 9; // CSS pixels per monitor pixel from which pixel edges are drawn
 const VALUES_FROM = 22;
 const MAX_RATIO = 2;
-const SAME_STAR_PX = 4; // from the brightest pixel to the place of its star
+const SAME_STAR_PX = 4; // largest distance from the brightest pixel to its star
 const CLIPPED_RED = 0xff4d4dff; // ABGR
 
 const STRETCHES = {
@@ -132,7 +132,7 @@ export class Picture {
     this.canvas.dataset.frame = String(frame);
   }
 
-  // The canvas has as many pixels as its place on the screen has; true if that changed.
+  // Gives the canvas as many pixels as its place on the screen has; true if the size changed.
   fitStage() {
     const box = this.canvas.parentElement.getBoundingClientRect();
     const ratio = Math.min(window.devicePixelRatio || 1, MAX_RATIO);
@@ -174,7 +174,7 @@ export class Picture {
     this.context.putImageData(this.image, 0, 0);
   }
 
-  // The pixels that are seen: left, top, columns, rows.
+  // The visible monitor pixels: left, top, columns, rows.
   seen() {
     const { w, h } = this.view;
     const [x0, y0] = this.view.toMonitor(0, 0).map((at) => Math.floor(at + 0.5));
@@ -202,7 +202,7 @@ export class Picture {
     if (view.scale >= GRID_FROM * view.ratio) this.drawEdges(left, top, columns, rows);
   }
 
-  // Near enough that each pixel has its code written in it.
+  // Whether the zoom is large enough for code values in the pixels.
   get hasValues() {
     return Boolean(this.levels) && this.view.scale >= VALUES_FROM * this.view.ratio;
   }
@@ -225,7 +225,7 @@ export class Picture {
     context.stroke();
   }
 
-  // The codes, onto a canvas over this one, so that no overlay hides them.
+  // Writes the codes on a canvas above this one, so that no overlay hides them.
   drawValues(context) {
     const { view } = this;
     const [left, top, columns, rows] = this.seen();
@@ -259,7 +259,7 @@ export class Picture {
     write(byId("pixel"), level === null ? "" : `(${this.pointer[0]}, ${this.pointer[1]}) px: code ${level}`);
   }
 
-  // Close to the brightest pixel of what is seen now, and to its star wherever that moves.
+  // Zooms in on the brightest visible pixel, and then follows its star.
   showPixels(truth) {
     if (!this.levels) return;
     const [left, top, columns, rows] = this.seen();
@@ -276,10 +276,10 @@ export class Picture {
     this.view.setZoom(PIXELS_ZOOM * this.view.ratio, best, true);
     const away = (star) => Math.hypot(star[STAR.x_px] - best[0], star[STAR.y_px] - best[1]);
     const near = (truth?.stars || []).filter((star) => away(star) < SAME_STAR_PX);
-    this.followed = near.length ? identity(near[0]) : null; // the brightest comes first
+    this.followed = near.length ? identity(near[0]) : null; // stars are sorted, the brightest first
   }
 
-  // The star that is followed stays in the middle, to whole pixels, so that their edges stand still.
+  // Keeps the followed star in the middle. The picture moves by whole pixels, so that pixel edges stand still.
   follow(truth) {
     if (this.followed === null || truth?.frame !== this.frame) return;
     const star = truth.stars.find((one) => identity(one) === this.followed);

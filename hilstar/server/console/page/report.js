@@ -1,4 +1,4 @@
-// A run that is over, on the same page: all of it along its time, and any moment of it.
+// The report of a finished run, on the same page: the whole run along its time, and any moment of it.
 
 import { Chart, Histogram, timeText } from "./charts.js";
 import { byId, clock, duration, fixed, make, quantity, write } from "./format.js";
@@ -9,10 +9,10 @@ import { Sky } from "./sky.js";
 import { radecRollOf } from "./sphere.js";
 import { ink, startTheme } from "./theme.js";
 
-const PLAY_MS = 900; // each picture
-const MIN_SPANS = 24; // that a chart shows at its nearest
+const PLAY_MS = 900; // duration of each picture
+const MIN_SPANS = 24; // shown by a chart at its largest zoom
 const FEWEST_S = 0.05;
-const FAR_S = 1; // from a moment to the nearest attitude
+const FAR_S = 1; // an attitude that is further from the chosen moment is not shown
 
 // Id, title, unit, digits, its curves as [key of the run's spans, words, colour], and its marks, which may be lasting.
 const CHARTS = [
@@ -324,7 +324,7 @@ function startPicture() {
   if (!pictures.length) return;
   picture.setScreen(about.resolution_px, run.white_level);
   overlays.makeButtons(byId("overlays"));
-  overlays.buttons.answer.hidden = true; // a ledger's pictures have no answer
+  overlays.buttons.answer.hidden = true; // the pictures of a report have no marks of answers
   picture.setRedClipped(overlays.on.clipped);
   byId("scrub").max = String(pictures.length - 1);
 }

@@ -1,12 +1,12 @@
-// The whole sky in the Hammer projection with the field in it: a wrong attitude is seen at once.
+// The map of the whole sky in the Hammer projection, with the field of view in it, which shows a wrong attitude at once.
 
 import { DEG, HAMMER_WIDTH, axesOf, hammer, radecOf, toIcrs, unit, vectorOf } from "./sphere.js";
 
 const OBLIQUITY_DEG = 23.4393; // IAU 2006, J2000
 const GALACTIC_POLE = [192.8595, 27.1283]; // RA, Dec of the north galactic pole, ICRS (Hipparcos, ESA SP-1200, 1.5.3)
-const NODES = 8; // of the field's filling, from its middle to its edge
+const NODES = 8; // points of the filled field from its middle to its edge
 const FAINTEST = 5.5;
-const LANDMARK_MAG = 3.2; // of a star that says to a person where the camera looks
+const LANDMARK_MAG = 3.2; // limit of the stars that are named as landmarks
 
 function circleAbout(pole, steps = 180) {
   const [x, y, z] = pole;
@@ -33,7 +33,7 @@ export class Sky {
     this.baseKey = "";
   }
 
-  // The canvas fills its box; what does not move is drawn once into a picture of its own.
+  // Fits the canvas to its box. What does not move is drawn once, into a separate picture.
   fit() {
     const ratio = Math.min(window.devicePixelRatio || 1, 2);
     const w = Math.round(this.canvas.clientWidth * ratio);
@@ -55,7 +55,7 @@ export class Sky {
     return [this.w / 2 + x * scale, this.h / 2 - y * scale];
   }
 
-  // A line over the sky, broken where it leaves on one side and comes in on the other.
+  // A line on the sky, interrupted where it leaves the map on one side and enters on the other.
   line(context, points) {
     context.beginPath();
     let before = null;
@@ -139,7 +139,7 @@ export class Sky {
     this.line(this.context, [...corners, corners[0]].map((v) => radecOf(toIcrs(axes, v))));
   }
 
-  // In small pieces, so that a field over a pole or over the map's edge is filled right.
+  // Filled in small pieces, so that a field over a pole or over the map's edge is correct.
   fill(axes, corners) {
     const { context } = this;
     context.fillStyle = this.ink.fieldFill;
@@ -156,7 +156,7 @@ export class Sky {
     }
   }
 
-  // A dot on the boresight, a line from it to beyond the image's top, and a ring where the field is too small to be found.
+  // A dot on the boresight, a line from it beyond the image's top, and a ring if the field is too small to be visible.
   drawBoresight(axes) {
     const { context, ratio } = this;
     const [u, v] = this.at(...radecOf(axes[2]));
@@ -182,7 +182,7 @@ export class Sky {
     context.stroke();
   }
 
-  // The nearest bright star with a name within so many degrees of the boresight.
+  // The named bright star that is nearest to the boresight, within the given number of degrees.
   nearest(q, withinDeg = 20) {
     const [, , boresight] = axesOf(q);
     let best = Math.cos(withinDeg * DEG);

@@ -1,4 +1,4 @@
-// Light and dark: as the system says, or as chosen; and the colours that canvases need, read from the style sheet.
+// The light or dark theme, by the system's setting or the user's choice, and the colours for canvases, read from the style sheet.
 
 import { byId } from "./format.js";
 
@@ -48,7 +48,7 @@ export function startTheme(onChange, onPrint) {
     apply();
   });
   dark.addEventListener("change", apply);
-  // Canvases have the colours of when they were drawn: on paper, the light ones.
+  // Canvases stay in the colours in which they were drawn: for printing they are drawn again in the light ones.
   window.addEventListener("beforeprint", () => {
     document.documentElement.dataset.theme = "light";
     readInks();

@@ -1,13 +1,13 @@
-// Which part of the picture is seen, and how large: zoom in device pixels per monitor pixel, and panning, by mouse, touch and keys.
+// The visible part of the picture: zoom, in device pixels per monitor pixel, and panning, by mouse, touch and keys.
 
 export const PIXELS_ZOOM = 40; // CSS pixels per monitor pixel at which code values are easily read
 const MAX_ZOOM = 96;
 const STEP = Math.SQRT2;
-const PAN_SHARE = 0.15; // of the view, for one arrow key
+const PAN_SHARE = 0.15; // relative to the view, per press of an arrow key
 
 export class View {
   constructor(canvas, onChange) {
-    // `onHand` is told when a person moves the picture: it then follows no star any more
+    // `onHand` is called when the user moves the picture, which then follows no star any more
     Object.assign(this, { canvas, onChange, onHand: () => {}, w: 16, h: 9, cx: 7.5, cy: 4, zoom: null, ratio: 1, pointers: new Map(), moved: 0 });
     canvas.addEventListener("pointerdown", (event) => this.press(event));
     canvas.addEventListener("pointermove", (event) => this.drag(event));
@@ -38,7 +38,7 @@ export class View {
     return this.zoom === null;
   }
 
-  // Device pixels of the canvas of a place on the monitor, whose top-left pixel has its centre at (0, 0).
+  // The position on the canvas, device pixels, of a position on the monitor, whose top-left pixel has its centre at (0, 0).
   toCanvas(x, y) {
     const s = this.scale;
     return [(x - this.cx) * s + this.canvas.width / 2, (y - this.cy) * s + this.canvas.height / 2];
@@ -90,7 +90,7 @@ export class View {
     this.settle();
   }
 
-  // The picture stays in the window: no black beyond its edges unless it is smaller than the window.
+  // Limits panning: beyond the edges of the picture nothing black is visible, unless the picture is smaller than the window.
   settle() {
     const s = this.scale;
     for (const [centre, size, room] of [["cx", this.w, this.canvas.width], ["cy", this.h, this.canvas.height]]) {
@@ -138,7 +138,7 @@ export class View {
     this.pointers.delete(event.pointerId);
   }
 
-  // A page that scrolls is not held up by the picture: the wheel zooms with Ctrl, once zoomed, or when the picture has the focus.
+  // The wheel zooms only with Ctrl, in a zoomed picture, or while the picture has the focus: otherwise it scrolls the page.
   wheel(event) {
     if (!event.ctrlKey && this.fitted && document.activeElement !== this.canvas) return;
     event.preventDefault();

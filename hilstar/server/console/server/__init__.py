@@ -1,3 +1,3 @@
-"""The page's own process: reads a run's shared memory and serves it to browsers and monitoring,
-without OpenGL.
+"""The process of the page and of SCPI: reads a run's shared memory and serves it to browsers,
+monitoring and test stands, without OpenGL.
 """

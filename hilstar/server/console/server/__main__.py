@@ -1,7 +1,8 @@
-"""The page's process. `console.page_process` starts it with five file descriptors: setup, shared
-memory, channel, and the listeners of the page and of SCPI, of which one may be missing (-1).
+"""The main program of the page's process. `console.page_process` starts it with five file
+descriptors as arguments: setup, shared memory, channel, and the listeners of the page and of SCPI,
+of which one may be missing (-1).
 
-It ends with the run, when the other end of the channel is closed for whatever reason.
+It ends with the run: when the other end of the channel is closed, for whatever reason.
 """
 
 import asyncio
@@ -48,16 +49,16 @@ GOING_AWAY = 1001
 
 
 class Server(uvicorn.Server):
-    """uvicorn's server without its signal handlers: this process ends by itself."""
+    """uvicorn's server without its signal handlers: this process ends with its channel."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Leave signals as they are."""
+        """Install no signal handler."""
         yield
 
 
 class OrderChannel:
-    """Sends orders to the run and receives its answers."""
+    """Sends operators' orders to the run, and receives its answers, over the socket `channel`."""
 
     def __init__(self, channel: socket.socket) -> None:
         channel.setblocking(False)
@@ -66,7 +67,9 @@ class OrderChannel:
         self._waiting: dict[int, asyncio.Future[OrderAnswer]] = {}
 
     async def give(self, order: Order) -> OrderAnswer:
-        """Send an order and wait for its answer."""
+        """Send an order and wait for its answer. The answer has status 503 if MAX_ORDERS already
+        wait, and 504 if the run does not answer within ORDERED_S.
+        """
         if len(self._waiting) >= MAX_ORDERS:
             return OrderAnswer(id=0, status=503, line="too many orders at once; try again")
         order.id = next(self._numbers)
@@ -86,7 +89,7 @@ class OrderChannel:
             self._waiting.pop(order.id, None)
 
     async def listen(self) -> None:
-        """Receive answers until the run closes its end."""
+        """Receive answers until the run closes its end of the channel."""
         while True:
             try:
                 data = await asyncio.get_running_loop().sock_recv(self._channel, MAX_ANSWER_BYTES)
@@ -101,7 +104,9 @@ class OrderChannel:
 
 
 async def tick(reader: RunReader, memory: SharedMemory, pages: OpenPages) -> None:
-    """Read the shared memory and tell all pages, ten times a second."""
+    """Read the shared memory and send the state and new events to all pages, ten times a second;
+    renew the request for pictures while a page needs them.
+    """
     loop = asyncio.get_running_loop()
     due_s = loop.time()
     while True:
@@ -119,7 +124,9 @@ async def tick(reader: RunReader, memory: SharedMemory, pages: OpenPages) -> Non
 
 
 async def show(room: PicturePacker, reader: RunReader, pages: OpenPages) -> None:
-    """Pack each new picture once, on another thread, and offer it to all pages."""
+    """Send new answers of the tracker to all pages, and each new picture, which is packed once, on
+    another thread.
+    """
     last = 0
     while True:
         await asyncio.sleep(PICTURE_POLL_S)
@@ -136,7 +143,9 @@ async def show(room: PicturePacker, reader: RunReader, pages: OpenPages) -> None
 async def run(
     setup: Setup, memory: SharedMemory, channel: OrderChannel, page_fd: int, scpi_fd: int
 ) -> None:
-    """Serve until the run has ended."""
+    """Serve the page and SCPI (file descriptors of their listeners, -1 for none) until the run
+    ends. Raises what ends a server before.
+    """
     scene: OverlayScene | None = pickle.loads(setup.scene) if setup.scene else None
     reader = RunReader(memory, setup)
     pages = OpenPages()
@@ -174,20 +183,21 @@ async def run(
     ended = asyncio.create_task(channel.listen())
     done, _ = await asyncio.wait([ended, *tasks], return_when=asyncio.FIRST_COMPLETED)
     if ended not in done:
-        done.pop().result()  # what went wrong
+        done.pop().result()  # raises the error that ended the task
     await pages.close_all(GOING_AWAY)
 
 
 def main() -> None:
-    """Set the process up, and serve."""
+    """Set up the process and serve. Exit code 1 where the servers fail, else 0."""
     setup_fd, board_fd, wire_fd, page_fd, scpi_fd = map(int, sys.argv[1:])
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # even where this process hangs
-    # a terminal sends them to all; the run ends this process
+    # The kernel ends this process with the run, even if it hangs.
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+    # A terminal sends these signals to both processes, but the run ends this one.
     for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     with contextlib.suppress(OSError):
         os.nice(NICE)
-    logging.disable(logging.CRITICAL)  # the run says what there is to say
+    logging.disable(logging.CRITICAL)  # the run reports what the user needs to know
     setup = msgspec.msgpack.decode(os.pread(setup_fd, os.fstat(setup_fd).st_size, 0), type=Setup)
     memory = SharedMemory(board_fd, setup.picture_bytes)
     code = 0
@@ -195,14 +205,14 @@ def main() -> None:
         asyncio.run(
             run(setup, memory, OrderChannel(socket.socket(fileno=wire_fd)), page_fd, scpi_fd)
         )
-    except Exception as error:  # whatever it is: the run starts the page again
+    except Exception as error:  # after any error the run starts the page again
         print(
             one_line(f"hilstar: the operator's page failed ({type(error).__name__}: {error})"),
             file=sys.stderr,
             flush=True,
         )
         code = 1
-    os._exit(code)  # without waiting for threads
+    os._exit(code)  # does not wait for threads, such as one that packs a picture
 
 
 if __name__ == "__main__":

@@ -1,5 +1,5 @@
-"""The page's addresses, what each answers, and who may ask. The protocol of the WebSocket is in
-docs/console.md.
+"""The web application of the page: its addresses, the answer of each, and the checks of a request.
+The protocol of the WebSocket is in docs/console.md.
 """
 
 import asyncio
@@ -46,12 +46,13 @@ from hilstar.server.console.protocol import (
 from hilstar.server.console.server.connections import OpenPage, OpenPages
 from hilstar.server.console.server.reader import RunReader
 
-# Of metrics that have a value of their own, by the kind that `page_figures` states.
+# The classes of metrics with a single value, by the kind in `page_figures`.
 FAMILIES: dict[str, type[CounterMetricFamily | GaugeMetricFamily]] = {
     "counter": CounterMetricFamily,
     "gauge": GaugeMetricFamily,
 }
-LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}  # no name server says where they are
+# No name server resolves these, so that no other site can have one of them.
+LOOPBACK = {"localhost", "127.0.0.1", "[::1]"}
 HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -72,16 +73,16 @@ TYPES = {
     ".svg": "image/svg+xml",
 }
 MAX_BODY_BYTES = 4_000
-# a body that is too long is read this far, so that its sender comes to read why
+# A body that is too long is read up to here: its sender reads the refusal only after sending it.
 MAX_DRAINED_BYTES = 64_000_000
 BODY_S = 5.0
-STATE_S = 0.5  # maximum wait for the state after an order; there are ten a second
-ORDERED_S = 30.0  # a ledger on a slow disk
+STATE_S = 0.5  # longest wait for a new state after an order; there are ten states a second
+ORDERED_S = 30.0  # longest wait for an order: a ledger on a slow disk takes long
 PAGE_FOLDER = Path(__file__).resolve().parents[1] / "page"
 
 
 class Refused(Exception):
-    """A refused request: HTTP status and a line."""
+    """A request is refused, with an HTTP status and a line of text for the user."""
 
     def __init__(self, status: int, line: str) -> None:
         super().__init__(line)
@@ -90,11 +91,11 @@ class Refused(Exception):
 
 
 class Guard:
-    """Judges requests by their headers (lower-case names).
+    """Checks requests by their headers (with lower-case names).
 
-    A page of another site can make a browser send requests here. By a name that it points at this
-    machine (DNS rebinding) it can even read the answers. So the name in `Host` has to be one of
-    this page's, and an `Origin` that of the page itself.
+    A page of another site can make a browser send requests here. With a name that it points at this
+    machine (DNS rebinding) it can even read the answers. Therefore `Host` must be one of this
+    page's names, and `Origin`, if there is one, the page itself.
     """
 
     def __init__(self, setup: Setup) -> None:
@@ -110,7 +111,7 @@ class Guard:
         self._token = setup.token
 
     def check_host(self, host: str) -> None:
-        """Raises Refused (421) for a name that is not the page's."""
+        """Check the `Host` header. Raises Refused (421) for a name that is not the page's."""
         host = host.lower()
         if host not in self._names and not self._is_own(host):
             raise Refused(
@@ -121,7 +122,7 @@ class Guard:
 
     def _is_own(self, host: str) -> bool:
         name, port = _split(host)
-        # by any port: that of a tunnel, such as ssh -L
+        # With any port: a tunnel, such as ssh -L, has a port of its own.
         if name in LOOPBACK and (port.isdecimal() or not port):
             return True
         if port not in {"", str(self._port)} or (not port and self._port != 80):
@@ -133,7 +134,9 @@ class Guard:
         return False
 
     def check_origin(self, headers: Mapping[str, str]) -> None:
-        """Raises Refused (403) for a request that another site's page made."""
+        """Check where a request comes from. Raises Refused (403) for one that another site's page
+        made.
+        """
         origin = headers.get("origin")
         host = headers.get("host", "").lower()
         if origin is not None and origin.lower() not in {f"http://{host}", f"https://{host}"}:
@@ -145,8 +148,8 @@ class Guard:
             raise Refused(403, "another site's page may not ask here")
 
     def check_token(self, headers: Mapping[str, str], protocols: Iterable[str] = ()) -> None:
-        """Raises Refused (401) without the token, in a header or as a WebSocket's subprotocol;
-        compared in constant time.
+        """Check the token in the `Authorization` header or in a WebSocket's subprotocols. Raises
+        Refused (401) without the right one.
         """
         if not self._token:
             return
@@ -161,7 +164,7 @@ class Guard:
             if name.startswith(TOKEN_PROTOCOL)
         ]
         wanted = self._token.encode()
-        # each, whichever was right
+        # All are compared, in constant time: the time of the answer must not reveal the token.
         matches = [hmac.compare_digest(token.encode(), wanted) for token in tokens]
         if True not in matches:
             raise Refused(
@@ -172,6 +175,9 @@ class Guard:
 
 
 def _split(host: str) -> tuple[str, str]:
+    """The name and the port of a `Host` header, "" without a port. A malformed port is "x", which
+    no check accepts.
+    """
     if host.startswith("["):
         name, _, rest = host.partition("]")
         return name + "]", rest[1:] if rest.startswith(":") else ("x" if rest else "")
@@ -180,7 +186,9 @@ def _split(host: str) -> tuple[str, str]:
 
 
 class RunCollector(Collector):
-    """Makes a run's metrics on request."""
+    """Makes the metrics of a run when `GET /metrics` asks for them. `clients` is the number of open
+    pages.
+    """
 
     def __init__(self, reader: RunReader) -> None:
         self._reader = reader
@@ -189,11 +197,11 @@ class RunCollector(Collector):
         self._registry.register(self)
 
     def text(self) -> bytes:
-        """The answer of `GET /metrics`."""
+        """The answer of `GET /metrics`, in the OpenMetrics text format."""
         return bytes(generate_latest(self._registry))  # type: ignore[no-untyped-call]
 
     def collect(self) -> Iterator[Metric]:
-        """The metrics with their current values."""
+        """The metrics with their present values."""
         hello = self._reader.setup.hello
         state = self._reader.seen or RunState(host_ns=0)
         health = self._reader.health
@@ -249,7 +257,9 @@ class RunCollector(Collector):
 
 
 def tracker_metrics(found: TrackerFigures) -> Iterator[Metric]:
-    """The metrics of a tracker's answers; residuals over the last minute."""
+    """The metrics of a tracker's answers: counts by verdict and refusal, residuals, arcsec, and
+    whether the tracker is silent or its line has a fault.
+    """
     answers = CounterMetricFamily(
         "hilstar_tracker_answers", "Answers of the tracker, by verdict.", labels=["verdict"]
     )
@@ -283,7 +293,9 @@ Give = Callable[[Order], Awaitable[OrderAnswer]]
 
 
 class Page:
-    """The application's handlers, one per address."""
+    """The handlers of the page's addresses. `sky` is the map of the sky, `give` sends an order to
+    the run.
+    """
 
     def __init__(
         self, setup: Setup, reader: RunReader, pages: OpenPages, sky: SkyMap | None, give: Give
@@ -301,7 +313,7 @@ class Page:
         self._files["palette.css"] = palette_css().encode()
 
     def app(self) -> ASGIApp:
-        """The application, with its guard before it."""
+        """The ASGI application, which checks each request before it is handled."""
         routes = [
             Route("/", self._index),
             Route("/static/{name}", self._static),
@@ -357,7 +369,8 @@ class Page:
             body = msgspec.json.decode(data or b"{}", type=OrderBody)
         except (msgspec.MsgspecError, UnicodeDecodeError) as error:
             return _refusal(400, f"not the JSON of a control: {error}")
-        # The operator's name as the page gives it, with the address unless that is this machine.
+        # The record of the order names the operator by the page's header, and by the address unless
+        # that is this machine.
         who = urllib.parse.unquote(
             request.headers.get("x-operator", "")[:400], errors="replace"
         ).strip()
@@ -370,7 +383,8 @@ class Page:
         )
         answer = await self.give(order)
         done_ns = time.monotonic_ns()
-        with contextlib.suppress(TimeoutError):  # the next request is to see what the order changed
+        # The answer waits for a state after the order, so that the next request sees its effect.
+        with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(STATE_S):
                 while self.reader.seen is not None and self.reader.seen.host_ns <= done_ns:
                     await asyncio.sleep(0.02)
@@ -386,12 +400,15 @@ class Page:
                 hello=self.setup.hello, state=self.reader.state(), history=list(self.reader.points)
             ).json()
         )
+        # Fewer than MAX_WAITING_TEXTS, at which a page would be closed.
         for event in list(self.reader.events)[-90:]:
             client.tell(PageText(event=event).json())
         await self.pages.follow(client)
 
 
 async def _body(request: Request) -> bytes:
+    """The body of a request. Raises Refused if it is too long (413), late (408) or cut (400)."""
+    # A client that expects "100 Continue" has not sent its body yet: it is refused before it does.
     if (
         int(request.headers.get("content-length", "0")) > MAX_BODY_BYTES
         and "expect" in request.headers
@@ -435,8 +452,8 @@ def _refusal(status: int, line: str) -> JSONResponse:
 
 
 class Guarded:
-    """The application behind its guard: every request is checked first, and every answer has the
-    same headers.
+    """An ASGI application that checks every request by `guard` before `app` handles it, and adds
+    the security headers to every answer.
     """
 
     def __init__(self, app: ASGIApp, guard: Guard) -> None:
@@ -454,7 +471,7 @@ class Guarded:
             self._guard.check_host(headers.get("host", ""))
             host = headers["host"]
             self._guard.check_origin(headers)
-            # The page itself has no secret; it brings the token that its address has.
+            # The page's files contain no secret and need no token: the page reads it from its URL.
             if scope["type"] == "websocket" or not (
                 scope["path"] == "/" or scope["path"].startswith("/static/")
             ):
@@ -471,8 +488,8 @@ class Guarded:
 
 
 def _with_headers(send: Send, host: str) -> Send:
-    """Add the headers of every answer; `host` is the name in an allowed request, "" in a refused
-    one.
+    """A `send` that adds the headers of every answer. `host` is the name in the request, to which
+    the page may open WebSockets, or "" in a refused one.
     """
     sockets = f" ws://{host} wss://{host}" if host else ""
     headers = HEADERS | {"Content-Security-Policy": POLICY.format(sockets=sockets)}

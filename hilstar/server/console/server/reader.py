@@ -1,5 +1,5 @@
-"""A run's shared memory, read ten times a second and worded for the page: state, health, chart
-points, events, pictures.
+"""Reads the shared memory of a run ten times a second, and prepares what pages get: state, health,
+chart points, events and pictures.
 """
 
 import contextlib
@@ -23,10 +23,12 @@ from hilstar.server.console import messages, protocol
 from hilstar.server.console.overlay import MAX_STARS, OverlayScene
 from hilstar.server.console.page_figures import RunCounts
 
-SILENT_NS = 6 * NS_PER_S // 10  # the run is seen ten times a second
+SILENT_NS = 6 * NS_PER_S // 10  # the age of a state that is too old: ten come each second
+# The frame loop hangs if its last step is older than the longer of these, in ns and in refresh
+# periods.
 HUNG_NS = 4 * NS_PER_S // 10
 HUNG_PERIODS = 2.5
-UNASKED_NS = 2 * NS_PER_S  # in lockstep, without a request
+UNASKED_NS = 2 * NS_PER_S  # in lockstep: a simulator without a request for longer is reported
 MANY_MISSED_SHARE = 0.5  # share of the last second's frames
 MISSING = "frames are missing"
 HEADLINES = {True: "Sky is right", False: "Sky is not right"}
@@ -38,14 +40,14 @@ LEVEL = 1  # zlib's fastest: a night sky is nearly all zeros
 
 
 def utc_text(unix_s: float) -> str:
-    """ "2026-11-22T19:00:00.123Z"."""
+    """A Unix time, s, as text in UTC: "2026-11-22T19:00:00.123Z"."""
     return f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%dT%H:%M:%S.%f}"[:-3] + "Z"
 
 
 @dataclass(frozen=True, slots=True)
 class RecentFrames:
-    """The newest frame's swap (host time, ns), and the missing share of the last second's
-    frames.
+    """The swap of the newest frame (host time, ns; 0 for none), and the share of missed frames in
+    the last second, 0 to 1.
     """
 
     swap_ns: int = 0
@@ -54,9 +56,9 @@ class RecentFrames:
 
 @dataclass(frozen=True, slots=True)
 class SkyJudgement:
-    """Why the sky is not right, [] where it is, and that in a few words.
+    """The judgement whether the sky is right: the reasons if not, [] if it is, and a headline.
 
-    `late`: frames are missed, and nothing else is wrong: what is shown is the right sky.
+    `late`: frames are missed, but what is shown is the right sky.
     """
 
     reasons: list[str]
@@ -71,7 +73,9 @@ def judged(
     refresh_hz: float,
     pace: messages.Pace,
 ) -> SkyJudgement:
-    """The judgement on a run now. See `Setup.pace`."""
+    """The judgement on a run at host time `now_ns`, from its newest state `seen` (None: none yet)
+    and the recent frames. For `pace` see `Setup`.
+    """
     found = reasons(seen, now_ns, lately, refresh_hz, pace)
     if pace == "session":
         return SkyJudgement(found, SESSION_HEADLINES[not found])
@@ -89,7 +93,9 @@ def reasons(
     refresh_hz: float,
     pace: messages.Pace,
 ) -> list[str]:
-    """The reasons why the sky is not right, [] where it is. See `Setup.pace`."""
+    """The reasons why the sky is not right, as lines of text; [] if it is. The arguments are those
+    of `judged`.
+    """
     if seen is None:
         return ["the run has not begun"]
     if now_ns - seen.host_ns > SILENT_NS:
@@ -156,7 +162,9 @@ def _s(time_ns: int) -> str:
 
 
 class Health:
-    """Whether the sky is right, and since when that is so (UTC, seconds)."""
+    """Whether the sky is right (`ok`), since when that is so (`since_s`, Unix time, s), and the
+    newest judgement (`found`).
+    """
 
     def __init__(self, unix_s: float) -> None:
         self.ok = False
@@ -165,11 +173,11 @@ class Health:
 
     @property
     def reasons(self) -> list[str]:
-        """Why the sky is not right, [] where it is."""
+        """The reasons why the sky is not right; [] if it is."""
         return self.found.reasons
 
     def update(self, found: SkyJudgement, unix_s: float) -> None:
-        """Set the current judgement."""
+        """Set the judgement at Unix time `unix_s`, s."""
         right = not found.reasons
         if right != self.ok:
             self.ok = right
@@ -178,13 +186,17 @@ class Health:
 
 
 class RunReader:
-    """A run for its page. `look` brings it up to date."""
+    """The state of a run as its page's process knows it; `look` updates it.
+
+    `seen` is the newest state, None before the first; `points` and `events` are the recent history
+    for a new page; `answer` is the tracker's newest answer.
+    """
 
     def __init__(self, memory: messages.SharedMemory, setup: messages.Setup) -> None:
         self._memory = memory
         self.setup = setup
         self.seen: messages.RunState | None = None
-        # an earlier page of this run may have died
+        # If a previous page's process of this run died, its judgement still holds.
         self.health = Health(memory.wrong_since_s or time.time())
         self.points: deque[protocol.ChartPoint] = deque(maxlen=round(protocol.HISTORY_S / TICK_S))
         self.events: deque[protocol.EventLine] = deque(maxlen=protocol.KEPT_EVENTS)
@@ -200,12 +212,12 @@ class RunReader:
         self._pacing_ns = 0
 
     def look(self) -> list[protocol.EventLine]:
-        """Read the shared memory; the new events."""
+        """Read the shared memory, and return the events since the last call."""
         now_ns = time.monotonic_ns()
         unix_s = time.time()
         newest_state = self._memory.states.last()
         if newest_state is not None:
-            # cut, being too long: the one before stays
+            # A state that is too long for its slot is cut, and cannot be read: the previous stays.
             with contextlib.suppress(msgspec.MsgspecError, UnicodeDecodeError):
                 self.seen = msgspec.json.decode(newest_state[1], type=messages.RunState)
         self.points.append(self._point(now_ns))
@@ -225,7 +237,7 @@ class RunReader:
         return new
 
     def new_answer(self) -> TrackerFigures | None:
-        """The tracker's figures where it has answered since the last call."""
+        """The tracker's statistics if it has answered since the last call, else None."""
         figures = None
         for number, data in self._memory.answers.after(self._answer_at):
             self._answer_at = number
@@ -236,7 +248,7 @@ class RunReader:
         return figures
 
     def _point(self, now_ns: int) -> protocol.ChartPoint:
-        """What the frames since the last look add to the charts."""
+        """The next point of the charts, from the frames and answers since the previous one."""
         point = protocol.ChartPoint(t_s=round((now_ns - self._begun_ns) / NS_PER_S, 3))
         for number, data in self._memory.frames.after(self._frame_at):
             self._frame_at = number
@@ -259,11 +271,13 @@ class RunReader:
         return point
 
     def _add(self, point: protocol.ChartPoint, frame: messages.FrameNumbers) -> None:
+        """Add a frame to the present point of the charts and to the intervals of the pacing."""
         last = self._last
         self._last = frame
         if frame.flags & messages.HAS_AGE:
             point.take("age_ms", frame.age_ns / NS_PER_MS)
         point.take("frame_ms", (frame.swap_ns - frame.draw_ns) / NS_PER_MS)
+        # Frames that the page's process missed in the ring leave no interval and no difference.
         if last is None or frame.frames != last.frames + 1:
             return
         interval_ms = (frame.swap_ns - last.swap_ns) / NS_PER_MS
@@ -303,7 +317,7 @@ class RunReader:
         return protocol.SkyHealth(self.health.ok, since, found.reasons, found.headline, found.late)
 
     def state(self) -> protocol.PageState:
-        """The state of the run, as the page shows it."""
+        """The state of the run that pages get; an empty one before the first."""
         if self.seen is None:
             seen = messages.RunState(host_ns=0)
         else:
@@ -320,7 +334,9 @@ class RunReader:
 
 @dataclass(frozen=True, eq=False)
 class PackedPicture:
-    """A picture's message, and the truth of its frame without and with the grid of RA and Dec."""
+    """A picture ready to be sent: its number in the ring, its binary message, and the JSON of its
+    marks without and with the grid.
+    """
 
     number: int
     picture: bytes
@@ -329,7 +345,9 @@ class PackedPicture:
 
 
 class PicturePacker:
-    """Packs the newest picture for pages, which takes 10 to 30 ms; called on another thread."""
+    """Packs the newest picture for pages, which takes 10 to 30 ms: to be called on another thread
+    than the servers'. `scene` is None for a session, which has no marks.
+    """
 
     def __init__(self, memory: messages.SharedMemory, scene: OverlayScene | None) -> None:
         self._memory = memory
@@ -338,7 +356,9 @@ class PicturePacker:
     def newest(
         self, after: int, seen: messages.RunState | None, answer: messages.NewAnswer | None = None
     ) -> PackedPicture | None:
-        """The newest picture, None where there is none after that number."""
+        """The newest picture with its marks; None if its number is not above `after`. `seen` is
+        the run's newest state, `answer` the tracker's newest answer.
+        """
         if self._memory.pictures.newest > after:
             found = self._memory.pictures.last()
         else:
@@ -402,8 +422,10 @@ class PicturePacker:
 def stars_of(
     scene: OverlayScene, sprites: np.ndarray, seen: messages.RunState | None
 ) -> list[protocol.StarMark]:
-    """Where the stars of a picture were drawn, the brightest first."""
-    # A moving star has several sprites along its path: the mean place of each.
+    """The marks of the MAX_STARS brightest stars of a picture, the brightest first, from its
+    sprites (records of SPRITE).
+    """
+    # A moving star has several sprites along its path: its mark is at their mean position.
     stars, which = np.unique(sprites["star"], return_inverse=True)
     count = np.bincount(which, minlength=len(stars))
     x_px, y_px = (

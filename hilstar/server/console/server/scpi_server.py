@@ -1,14 +1,14 @@
-"""SCPI over TCP, in the page's process: a test stand asks the run, gives it orders, and may steer
-the sky.
+"""Serves SCPI over TCP, in the page's process: a test stand can read the state of a run, give it
+orders, and set the attitude of the sky.
 
-Commands go where the page's go: the run's state is read from shared memory, orders are those of an
-operator. With `[attitude] source = "scpi"` an attitude packet goes to the run's own UDP port on
-loopback SENT_HZ times a second, as any sender's does. No frame waits for any of it. Every
-connection has registers and a queue of errors of its own. docs/scpi.md has the commands.
+The run's state is read from shared memory, and orders are an operator's, both as for the page. With
+`[attitude] source = "scpi"` this process sends an attitude packet to the run's UDP port on loopback
+SENT_HZ times a second, like any other sender. No frame waits for it. Every connection has registers
+and an error queue of its own. docs/scpi.md lists the commands.
 
-A controller is a connection that gave the token, or acted where none is needed; any other is a
-stranger. Whatever strangers do, attitudes go out in time: a connection has few commands a turn, all
-strangers together have one turn in STRANGERS_S, and a stranger takes the place of strangers alone
+A controller is a connection that gave the token, or that acted where none is needed; any other is a
+stranger. Strangers cannot delay the attitudes: a connection has few commands in a turn, all
+strangers together have one turn in STRANGERS_S, and a new stranger displaces strangers only
 (`Turns`, `Peers`).
 """
 
@@ -53,10 +53,10 @@ from hilstar.server.console.scpi import (
 from hilstar.server.console.server.reader import TICK_S, RunReader
 
 SENT_HZ = 50.0
-SETTLES_NS = 2 * NS_PER_S  # an attitude that is not shown by then is given up (-365)
-MARGIN_NS = NS_PER_MS  # between a state's time and what it was read from
+SETTLES_NS = 2 * NS_PER_S  # a command that waits for an attitude waits no longer (error -365)
+MARGIN_NS = NS_PER_MS  # the frame in a state may have been read so long before the state's time
 POLL_S = 0.01
-ALIVE_NS = NS_PER_S  # the run writes its state ten times a second
+ALIVE_NS = NS_PER_S  # an older state or step is a fault: the run writes ten states a second
 MAX_CONTROLLERS, MAX_STRANGERS = 16, 16
 # The commands without parameters; no query of QUERIES has any.
 BARE = {
@@ -69,18 +69,19 @@ BARE = {
     "SKY:ATTitude?",
     "SKY:RATE?",
 }
-# Lines, commands and queries of a turn: 0.2 ms of work. A controller that floods then leaves 1 ms
-# to the others.
+# Lines, commands and queries in a controller's turn, 0.2 ms of work. Before its next turn it waits
+# TURN_S, so that a flood leaves time to the others.
 UNITS_A_TURN, TURN_S = 8, 0.001
-# Strangers have 800 a second together, 3 % of a core.
+# All strangers together may send 800 a second, 3 % of a core.
 STRANGER_UNITS_A_TURN, STRANGERS_S = 4, 0.005
 MAX_READ_BYTES = 4096
 MAX_UNSENT_BYTES = 65_536
 UNREAD_S = 10.0
 MAX_WRONG_TOKENS = 5
 WRONG_TOKEN_S = 0.5
-# by an order's HTTP status; else -310
+# The error number by the HTTP status of an order's answer; -310 for any other.
 ORDER_ERRORS = {400: -224, 404: -224, 409: -221, 500: -250, 504: -365}
+# Commands that need no token (docs/scpi.md, "Who may").
 UNLOCKED = {
     "*IDN?",
     "*CLS",
@@ -99,8 +100,8 @@ Give = Callable[[Order], Awaitable[OrderAnswer]]
 
 
 class SkySource:
-    """The attitude that SCPI steers: held, or turning at a rate from the moment that it was set;
-    sent to a UDP port.
+    """The attitude that SCPI sets: constant, or turning at a rate since it was set. It is sent as
+    packets to the UDP port `port` of this machine.
     """
 
     def __init__(self, port: int, max_rate_deg_s: float) -> None:
@@ -114,7 +115,9 @@ class SkySource:
         self.set_ns = 0  # host time of the newest setting
 
     def attitude(self, q: tuple[float, ...]) -> None:
-        """Show this attitude from now on, q_icrs_to_cam (4,); the rate stays. Raises ScpiError."""
+        """Set q_icrs_to_cam (w, x, y, z) from now on; the rate stays. Raises ScpiError for numbers
+        that are no unit quaternion.
+        """
         sample = checked_sample(0, q, None)
         if isinstance(sample, Refusal):
             raise ScpiError(-222, sample.detail)
@@ -123,7 +126,9 @@ class SkySource:
         self.send(jumps=True)
 
     def rate(self, rate_deg_s: tuple[float, ...]) -> None:
-        """Turn at this rate from now on, deg/s, cam (3,). Raises ScpiError."""
+        """Set the rate from now on, deg/s about the camera's axes, (3,). Raises ScpiError if it
+        exceeds [attitude] max_rate_deg_s.
+        """
         if math.hypot(*rate_deg_s) > self._max_rate_deg_s:
             raise ScpiError(
                 -222, f"faster than [attitude] max_rate_deg_s = {self._max_rate_deg_s:g}"
@@ -139,7 +144,9 @@ class SkySource:
         return propagate(q, self._rate_rad_s, (t_ns - self.set_ns) / NS_PER_S)
 
     def send(self, jumps: bool = False) -> None:
-        """Send the attitude of now; nothing before there is one."""
+        """Send the present attitude; nothing before one is set. `jumps` marks an attitude that does
+        not continue the previous motion: it is that of `set_ns`.
+        """
         if self._q is None:
             return
         t_ns = self.set_ns if jumps else time.monotonic_ns()
@@ -152,28 +159,30 @@ class SkySource:
             self._socket.send(encode(sample))
 
     async def run(self) -> None:
-        """Send for ever."""
+        """Send the attitude SENT_HZ times a second until the task is cancelled."""
         while True:
             self.send()
             await asyncio.sleep(1 / SENT_HZ)
 
 
 class Settled(NamedTuple):
-    """A setting of the sky that was shown, by its host time, and when that was found; ns."""
+    """The newest setting of the sky that the display has shown: the host time of the setting, and
+    the host time from which a state is certain to include it, ns.
+    """
 
     set_ns: int
     seen_ns: int
 
 
 class Turns:
-    """Whose commands are next. Attitudes are sent between any two turns."""
+    """Gives connections their turns to run commands. Attitudes are sent between turns."""
 
     def __init__(self) -> None:
-        self._strangers = asyncio.Lock()  # whose waiters are in order of arrival
+        self._strangers = asyncio.Lock()  # gives strangers their turns in order of arrival
         self._next_s = 0.0
 
     async def await_turn(self, stranger: bool) -> int:
-        """Wait for a turn; how many lines, commands and queries it has."""
+        """Wait for a turn; returns the number of lines, commands and queries in it."""
         if not stranger:
             await asyncio.sleep(TURN_S)
             return UNITS_A_TURN
@@ -185,8 +194,8 @@ class Turns:
 
 
 class Peers:
-    """The connections that are open, controllers and strangers apart, in each the one that was
-    silent longest first.
+    """The open connections, controllers and strangers separately. In each the connection that has
+    been silent longest comes first.
     """
 
     def __init__(self) -> None:
@@ -194,8 +203,8 @@ class Peers:
         self.strangers: dict[Connection, asyncio.StreamWriter] = {}
 
     def enter(self, client: "Connection", outgoing: asyncio.StreamWriter) -> None:
-        """Let a stranger in. Where there are too many, one of the address that has most of them
-        gives way.
+        """Add a new connection as a stranger. If there are MAX_STRANGERS, one is closed: of the
+        address with the most strangers, the one that has been silent longest.
         """
         if len(self.strangers) >= MAX_STRANGERS:
             ((crowded, _),) = Counter(stranger.address for stranger in self.strangers).most_common(
@@ -206,14 +215,14 @@ class Peers:
         self.strangers[client] = outgoing
 
     def heard(self, client: "Connection") -> None:
-        """Something came from this one."""
+        """Note that a connection has sent something."""
         for peers in (self.controllers, self.strangers):
             if client in peers:
                 peers[client] = peers.pop(client)
 
     def promote(self, client: "Connection") -> None:
-        """A stranger is a controller from now on. Where there are too many, the one that was
-        silent longest gives way.
+        """Make a stranger a controller. If there are MAX_CONTROLLERS, the one that has been silent
+        longest is closed.
         """
         outgoing = self.strangers.pop(client, None)
         if outgoing is None:
@@ -223,13 +232,16 @@ class Peers:
         self.controllers[client] = outgoing
 
     def leave(self, client: "Connection") -> None:
-        """A connection has ended."""
+        """Remove a connection that has ended."""
         self.controllers.pop(client, None)
         self.strangers.pop(client, None)
 
 
 class ScpiServer:
-    """What all connections share: the run, its orders, and the sky where SCPI steers it."""
+    """The server of SCPI, and what all connections share: the run's state (`reader`), the function
+    that sends an order (`give`), and the source of attitudes (`sky`, None if SCPI may not set
+    them).
+    """
 
     def __init__(
         self, setup: ScpiSetup, reader: RunReader, memory: SharedMemory, give: Give
@@ -245,7 +257,7 @@ class ScpiServer:
         self._settled = Settled(0, 0)
 
     async def serve(self, listener: socket.socket) -> None:
-        """Serve for ever."""
+        """Serve connections until the task is cancelled."""
         server = await asyncio.start_server(self._client, sock=listener, limit=MAX_READ_BYTES)
         async with server, asyncio.TaskGroup() as tasks:
             if self.sky is not None:
@@ -255,13 +267,13 @@ class ScpiServer:
                 self._look()
 
     def _look(self) -> None:
-        self.pending()  # what is shown while nobody waits counts, too
+        self.pending()  # notes a setting that is shown while no command waits for it
         for client in (*self.peers.controllers, *self.peers.strangers):
             client.look()
         self._missed = 0 if self.reader.seen is None else self.reader.seen.counts.missed
 
     def conditions(self) -> tuple[int, int]:
-        """The conditions of the operation and the questionable status."""
+        """The present conditions of the operation and the questionable status registers."""
         state = self.reader.seen
         if state is None:
             return 0, NO_ATTITUDE | NOT_WELL
@@ -275,8 +287,8 @@ class ScpiServer:
         return operation, questionable | NOT_WELL * (not self.reader.health.ok)
 
     def pending(self) -> bool:
-        """Whether the newest setting of the sky is not shown yet, or not in the run's state; for
-        SETTLES_NS at most.
+        """Whether the newest setting of the sky is not yet on the display, or not yet in the run's
+        state. False at the latest SETTLES_NS after the setting.
         """
         sky = self.sky
         state = self.reader.seen
@@ -288,7 +300,8 @@ class ScpiServer:
             if newest_frame is None or state is None:
                 return True
             frame = FrameNumbers._make(FRAME.unpack(newest_frame[1]))
-            # a covered or paused sky is not of now
+            # The attitude of a blank or paused frame is not the present one: then the frame's
+            # drawing has to be later than the setting.
             follows = frame.flags & HAS_AGE and not state.operator.get("pause")
             if (frame.swap_ns - frame.age_ns if follows else frame.draw_ns) < sky.set_ns:
                 return True
@@ -296,8 +309,8 @@ class ScpiServer:
         return state is None or state.host_ns <= self._settled.seen_ns
 
     async def settled(self) -> None:
-        """Wait until the sky is as it was set. Raises ScpiError (-365) where that takes over
-        SETTLES_S.
+        """Wait until the newest setting of the sky is shown. Raises ScpiError (-365) if that takes
+        over SETTLES_NS.
         """
         if not self.pending():
             return
@@ -307,7 +320,9 @@ class ScpiServer:
             raise ScpiError(-365, f"the attitude was not shown within {SETTLES_NS / NS_PER_S:g} s")
 
     async def _client(self, incoming: asyncio.StreamReader, outgoing: asyncio.StreamWriter) -> None:
-        """Serve one connection until it ends, says what no SCPI says, or does not read."""
+        """Serve a connection until it ends. It is closed if it sends bytes that no test stand
+        sends, does not read its answers, or has given MAX_WRONG_TOKENS wrong tokens.
+        """
         peer = outgoing.get_extra_info("peername")
         client = Connection(self, "" if not peer else str(peer[0]))
         connected = outgoing.get_extra_info("socket")
@@ -317,13 +332,13 @@ class ScpiServer:
         lines = LineBuffer()
         try:
             while data := await incoming.read(MAX_READ_BYTES):
-                # else a write after a write waits for 40 ms
+                # Otherwise a controller's second write waits 40 ms for a delayed acknowledgement.
                 connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
                 self.peers.heard(client)
                 await client.turn()
                 for line in lines.feed(data):
                     answer = await client.answer(line)
-                    # it gave way to another
+                    # `Peers` closes a connection that is displaced by another.
                     if client.wrong_tokens >= MAX_WRONG_TOKENS or outgoing.is_closing():
                         return
                     if answer:
@@ -331,17 +346,21 @@ class ScpiServer:
                         async with asyncio.timeout(UNREAD_S):
                             await outgoing.drain()
         except NotScpi:
-            # a browser, as a rule, that another site's page made ask here: it gets no answer
+            # Usually another site's page makes a browser send this: it must get no answer.
             outgoing.transport.abort()
         except (OSError, TimeoutError):
-            outgoing.transport.abort()  # it has gone, or does not read
+            outgoing.transport.abort()  # the peer has gone, or does not read its answers
         finally:
             self.peers.leave(client)
             outgoing.close()
 
 
 class Connection:
-    """One controller's instrument: each command by its pattern in COMMANDS."""
+    """The instrument that one connection sees: its status, and a method for each command of
+    COMMANDS and for some queries of QUERIES.
+
+    `unlocked` says that the token was given or is not needed.
+    """
 
     def __init__(self, server: ScpiServer, address: str) -> None:
         self.status = InstrumentStatus()
@@ -356,18 +375,18 @@ class Connection:
         self._answers: list[str] = []
 
     async def turn(self) -> None:
-        """Wait until this connection may go on, before each line, command and query."""
+        """Wait until this connection may continue: called before each line, command and query."""
         if not self._units_left:
             self._units_left = await self._server.turns.await_turn(not self.is_controller)
         self._units_left -= 1
 
     def _acts(self) -> None:
-        """This connection has shown that it may act, and does."""
+        """Make this connection a controller: it may act, and does."""
         self.is_controller = True
         self._server.peers.promote(self)
 
     def look(self) -> None:
-        """Take the run's conditions as they are now."""
+        """Update the registers by the run's present conditions, and complete a waiting `*OPC`."""
         operation, questionable = self._server.conditions()
         self.status.operation.see(operation)
         self.status.questionable.see(questionable)
@@ -376,7 +395,9 @@ class Connection:
             self.status.standard.event |= OPERATION_COMPLETE
 
     async def answer(self, line: str | None) -> str:
-        """Do what a line says; its answers, "" for none. None is a line that was too long."""
+        """Run the commands of a line (None: a line that was too long), and return its answers,
+        separated by `;`, "" for none. Errors go into the queue.
+        """
         self._answers = []
         await self.turn()
         try:
@@ -385,11 +406,12 @@ class Connection:
             for unit in HEADERS.units(line):
                 await self.turn()
                 await self._do(unit)
-        except ScpiError as error:  # bad syntax: the rest of the line has no meaning
+        except ScpiError as error:  # after an error of syntax the rest of the line is ignored
             self.status.add(error)
         return ";".join(self._answers)
 
     async def _do(self, unit: Unit) -> None:
+        """Run a command or query, and add its answer to the line's or its error to the queue."""
         try:
             if not self.unlocked and unit.pattern not in UNLOCKED:
                 raise ScpiError(
@@ -417,46 +439,48 @@ class Connection:
         if answer.status >= 400:
             raise ScpiError(ORDER_ERRORS.get(answer.status, -310), answer.line)
         done_ns = time.monotonic_ns()
-        # the next query is to see what the order changed
+        # Wait for a state after the order, so that the next query sees its effect.
         for _ in range(round(2 * TICK_S / POLL_S) + 1):
             if self._reader.seen is not None and self._reader.seen.host_ns > done_ns:
                 break
             await asyncio.sleep(POLL_S)
 
     async def reset(self, unit: Unit) -> None:
-        """`*RST`: the sky uncovered and without faults, standing still; the attitude and the
-        ledger stay.
+        """`*RST`: switch off the operator's switches and the faults, and stop the motion; the
+        attitude and the ledger stay.
         """
         self.status.completes = False
         state = self._reader.seen
         for name in () if state is None else [name for name, on in state.operator.items() if on]:
             await self._order(Order(id=0, name=name, who=self._who, on=False))
         for name in [] if state is None else state.faults:
-            # one of the faults' stream is not this run's to end
+            # A fault that came by the stream of faults cannot be ended by an operator.
             with contextlib.suppress(ScpiError):
                 await self._order(Order(id=0, name="fault", who=self._who, on=False, fault=name))
         if self._server.sky is not None:
             self._server.sky.rate((0.0, 0.0, 0.0))
 
     async def complete_later(self, unit: Unit) -> None:
-        """`*OPC`."""
+        """`*OPC`: set the bit "operation complete" once the sky is as it was set."""
         self.status.completes = True
         self.look()
 
     async def complete(self, unit: Unit) -> str:
-        """`*OPC?`."""
+        """`*OPC?`: answer 1 once the sky is as it was set."""
         await self.wait(unit)
         return "1"
 
     async def wait(self, unit: Unit) -> None:
-        """`*WAI`; what does not settle is an error, and waited for no longer."""
+        """`*WAI`: wait until the sky is as it was set; after SETTLES_NS that is an error."""
         try:
             await self._server.settled()
         except ScpiError as error:
             self.status.add(error)
 
     async def authenticate(self, unit: Unit) -> None:
-        """`SYST:AUTH "TOKEN"`; compared in constant time, a wrong one slowly."""
+        """`SYST:AUTH "TOKEN"`: check the token, in constant time. A wrong one is refused only
+        after WRONG_TOKEN_S.
+        """
         (given,) = scpi.count(unit, 1)
         if given.kind != "string":
             raise ScpiError(-104, 'write SYST:AUTH "TOKEN"')
@@ -469,7 +493,7 @@ class Connection:
         self._acts()
 
     async def switch(self, unit: Unit) -> None:
-        """`SKY:BLAN ON` (no light) and `LEDG:STAT ON`: the switches of the page."""
+        """`SKY:BLAN` (no light) and `LEDG:STAT` with ON or OFF: the switches of the page."""
         (on,) = scpi.count(unit, 1)
         if unit.pattern.startswith("SKY"):
             name = "blank"
@@ -478,7 +502,7 @@ class Connection:
         await self._order(Order(id=0, name=name, who=self._who, on=scpi.boolean(on)))
 
     async def fault(self, unit: Unit) -> None:
-        """`SKY:FAUL "NAME"[,ON|OFF]`: one of the scenario's."""
+        """`SKY:FAUL "NAME"[,ON|OFF]`: begin or end a fault of the scenario."""
         name, *on = scpi.count(unit, 1, 2)
         if name.kind != "string":
             raise ScpiError(-104, 'write SKY:FAUL "NAME",ON')
@@ -495,19 +519,21 @@ class Connection:
         return self._server.sky
 
     async def set_attitude(self, unit: Unit) -> None:
-        """`SKY:ATT w,x,y,z`: q_icrs_to_cam, from now on."""
+        """`SKY:ATT w,x,y,z`: set q_icrs_to_cam from now on."""
         sky = self._steered()
         given = scpi.count(unit, 4)
         sky.attitude(tuple(map(scpi.number, given)))
 
     async def set_rate(self, unit: Unit) -> None:
-        """`SKY:RATE x,y,z`: deg/s about the camera's axes, from now on."""
+        """`SKY:RATE x,y,z`: set the rate from now on, deg/s about the camera's axes."""
         sky = self._steered()
         given = scpi.count(unit, 3)
         sky.rate(tuple(scpi.number(parameter, "DEG/S") for parameter in given))
 
     async def attitude(self, unit: Unit) -> str:
-        """`SKY:ATT?` and `SKY:RATE?`: of the newest frame, once what was set is shown; deg/s."""
+        """`SKY:ATT?` and `SKY:RATE?`: q_icrs_to_cam and rate, deg/s, of the newest frame, once the
+        newest setting is shown.
+        """
         await self.wait(unit)
         shown = self.seen.attitude
         if unit.pattern == "SKY:RATE?":
@@ -516,15 +542,15 @@ class Connection:
 
     @property
     def seen(self) -> RunState:
-        """The run's newest state."""
+        """The run's newest state; an empty one before the first."""
         return self._reader.seen or RunState(host_ns=0)
 
     def status_byte(self) -> str:
-        """`*STB?`; a message waits where this line has answered before."""
+        """`*STB?`: the status byte. A message waits if this line has had an answer before."""
         return str(self.status.byte(bool(self._answers)))
 
     def self_test(self) -> str:
-        """`*TST?`: 0 while the run answers and its frame loop moves."""
+        """`*TST?`: 0 while the run writes its state and its frame loop moves, else 1."""
         state = self.seen
         alive = (
             time.monotonic_ns() - state.host_ns < ALIVE_NS
@@ -533,11 +559,11 @@ class Connection:
         return str(int(not alive))
 
     def faults(self) -> str:
-        """`SKY:FAUL?`: the names of those that are on."""
+        """`SKY:FAUL?`: the quoted names of the faults that are on, "" in quotes for none."""
         return ",".join('"' + name.replace('"', '""') + '"' for name in self.seen.faults) or '""'
 
     def residual(self) -> str:
-        """`TRAC:RES?`: of the tracker's newest answer, arcsec about x, y, z."""
+        """`TRAC:RES?`: the residual of the tracker's newest answer, arcsec about x, y, z."""
         figures = self.seen.tracker
         return _numbers(None if figures is None else figures.residual_arcsec, 3)
 
@@ -563,7 +589,7 @@ def _bare(what: Callable[[InstrumentStatus], None]) -> "Command":
 
 
 Command = Callable[[Connection, Unit], Awaitable[str | None]]
-# Queries that answer at once. None of any kind has parameters.
+# Queries that answer at once. No query has parameters.
 QUERIES: dict[str, Callable[[Connection], str]] = {
     "*IDN?": lambda at: f"hilstar,star display,0,{__version__}",
     "*ESE?": lambda at: str(at.status.standard.enable),

@@ -24,8 +24,8 @@ from typing import Literal, NamedTuple
 
 MAX_LINE_BYTES = 4096
 MAX_ERRORS = 20
-MAX_MNEMONIC = 12  # IEEE 488.2, 7.6.1.4.1
-MAX_DIGITS = 255  # IEEE 488.2, 7.7.2.4.1, which also limits an exponent to 32000
+MAX_MNEMONIC = 12  # by IEEE 488.2
+MAX_DIGITS = 255  # by IEEE 488.2
 HEAD_BYTES, END_BYTES = 128, 64  # stored of a line of any length, to recognise HTTP
 MAX_DETAIL = 200  # SCPI-1999 vol. 2, 21.8: 255 characters with the description
 NOT_A_NUMBER = "9.91E37"  # SCPI-1999 vol. 1, 7.2.1.5

@@ -1,7 +1,7 @@
-"""Unit quaternions: Hamilton, scalar first (w, x, y, z), float64; q and -q are one attitude.
+"""Unit quaternions: Hamilton, scalar first (w, x, y, z), float64. q and -q are the same attitude.
 
-`q_icrs_to_cam` turns ICRS components of a vector into camera components: v_cam = q v_icrs q*.
-Arrays may carry leading axes: a quaternion is the last axis.
+`q_icrs_to_cam` turns a vector's ICRS components into camera components: v_cam = q v_icrs q*.
+Arrays of quaternions may have leading axes; the last axis has the four components.
 """
 
 from __future__ import annotations
@@ -13,25 +13,25 @@ from numpy.typing import ArrayLike
 
 from hilstar.basics.arrays import FloatArray
 
-# Below this half angle sin(x)/x is 1 - x^2/6 to the last bit.
+# Below this half angle, rad, sin(x)/x is 1 - x^2/6 to the last bit.
 SMALL_RAD = 1e-4
 
 
 def normalise(q: FloatArray) -> FloatArray:
-    """`q` scaled to unit length."""
+    """`q` (..., 4) scaled to unit length."""
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
 def conjugate(q: FloatArray) -> FloatArray:
-    """The inverse rotation of a unit quaternion."""
+    """The inverse rotations of unit quaternions (..., 4)."""
     return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))
 
 
 def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Hamilton product a b: first the rotation b, then a."""
+    """The Hamilton product a b of quaternions (..., 4): the rotation b, then the rotation a."""
     a = np.asarray(a, dtype=np.float64)
     b = np.asarray(b, dtype=np.float64)
-    # then Python's floats give the same bits, several times faster than arrays
+    # For a single quaternion Python's floats give the same bits several times faster than arrays.
     single = a.ndim == b.ndim == 1
     aw, ax, ay, az = a.tolist() if single else np.moveaxis(a, -1, 0)
     bw, bx, by, bz = b.tolist() if single else np.moveaxis(b, -1, 0)
@@ -47,8 +47,8 @@ def multiply(a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def to_matrix(q: FloatArray) -> FloatArray:
-    """The matrices R (..., 3, 3) of unit quaternions (..., 4): v_cam = R v_icrs, so that rows
-    are the camera's axes in ICRS.
+    """The rotation matrices R (..., 3, 3) of unit quaternions (..., 4). For q_icrs_to_cam v_cam = R
+    v_icrs, so that the rows of R are the camera's axes in ICRS components.
     """
     q = np.asarray(q, dtype=np.float64)
     w, x, y, z = q.tolist() if q.ndim == 1 else np.moveaxis(q, -1, 0)
@@ -65,14 +65,17 @@ def to_matrix(q: FloatArray) -> FloatArray:
 
 
 def from_rotation_vector(vector_rad: FloatArray) -> FloatArray:
-    """The rotation (4,) by the angle |v| about the axis v (3,), right-handed."""
+    """The quaternion (4,) of the right-handed rotation of vectors by the angle |v|, rad, about the
+    axis v (3,).
+    """
     angle = float(np.linalg.norm(vector_rad))
-    share = np.sinc(angle / (2 * np.pi)) / 2  # sin(angle / 2) / angle
+    # sin(angle / 2) / angle, which numpy's sinc gives at 0 too
+    share = np.sinc(angle / (2 * np.pi)) / 2
     return np.array([np.cos(angle / 2), *(share * vector_rad)])
 
 
 def from_rotation_vectors(vectors_rad: FloatArray) -> FloatArray:
-    """The rotations (n, 4) of rotation vectors (n, 3), as `from_rotation_vector` has one."""
+    """The quaternions (n, 4) of rotation vectors (n, 3), rad; see `from_rotation_vector`."""
     angle = np.linalg.norm(vectors_rad, axis=-1, keepdims=True)
     return np.concatenate(
         [np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * vectors_rad], axis=-1
@@ -80,14 +83,16 @@ def from_rotation_vectors(vectors_rad: FloatArray) -> FloatArray:
 
 
 def rotate(q: FloatArray, vectors: FloatArray) -> FloatArray:
-    """The components (n, 3) of vectors after rotations (n, 4) of unit length."""
+    """The components (n, 3) of vectors (n, 3) after rotations by unit quaternions (n, 4): q v
+    q*.
+    """
     pure = np.concatenate((np.zeros((len(vectors), 1)), vectors), axis=1)
     return np.asarray(multiply(multiply(q, pure), conjugate(q))[:, 1:])
 
 
 def frame_turns(axis: int, angle_rad: FloatArray) -> FloatArray:
-    """The rotations (n, 4) of components into frames that are turned by angles (n,) about their
-    axis 0, 1 or 2.
+    """The quaternions (n, 4) that turn a vector's components into those of frames which are turned
+    by angles (n,), rad, about their axis 0, 1 or 2.
     """
     q = np.zeros((len(angle_rad), 4))
     q[:, 0], q[:, 1 + axis] = np.cos(angle_rad / 2), -np.sin(angle_rad / 2)
@@ -95,7 +100,9 @@ def frame_turns(axis: int, angle_rad: FloatArray) -> FloatArray:
 
 
 def to_rotation_vector(q: FloatArray) -> FloatArray:
-    """The rotation vectors (..., 3), rad, of unit quaternions (..., 4), the shorter way round."""
+    """The rotation vectors (..., 3), rad, of unit quaternions (..., 4), by the shorter way; the
+    inverse of `from_rotation_vectors`.
+    """
     q = np.where(q[..., :1] < 0, -q, q)
     sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     tiny = sine < SMALL_RAD
@@ -106,8 +113,8 @@ def to_rotation_vector(q: FloatArray) -> FloatArray:
 
 
 def from_matrix(matrix: FloatArray) -> FloatArray:
-    """The quaternion (4,), w >= 0, of a rotation matrix (3, 3): the largest component first
-    (Shepperd 1978).
+    """The quaternion (4,), w >= 0, of a rotation matrix (3, 3). The largest component is computed
+    first, so that none is divided by a small one (Shepperd 1978).
     """
     trace = float(np.trace(matrix))
     squares = np.array([trace, *np.diag(matrix)])
@@ -127,8 +134,8 @@ def from_matrix(matrix: FloatArray) -> FloatArray:
 
 
 def direction_of(ra_deg: ArrayLike, dec_deg: ArrayLike) -> FloatArray:
-    """The unit vectors (..., 3) of right ascensions and declinations, degrees, in the axes that
-    these are of.
+    """The unit vectors (..., 3) of right ascensions and declinations (...), degrees, in the frame
+    to which these refer.
     """
     ra = np.radians(ra_deg)
     dec = np.radians(dec_deg)
@@ -136,15 +143,15 @@ def direction_of(ra_deg: ArrayLike, dec_deg: ArrayLike) -> FloatArray:
 
 
 class Places(NamedTuple):
-    """Right ascensions [0, 360) and declinations (...), degrees."""
+    """Right ascensions (...), from 0 to below 360, and declinations (...), degrees."""
 
     ra_deg: FloatArray
     dec_deg: FloatArray
 
 
 def to_radec_deg(directions: FloatArray) -> Places:
-    """The places of directions (..., 3), of any length, in the axes that these have; the inverse of
-    `direction_of`.
+    """The right ascensions and declinations of directions (..., 3), vectors of any length, in the
+    same frame; the inverse of `direction_of`.
     """
     x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
     ra_deg = np.degrees(np.arctan2(y, x)) % 360.0
@@ -152,8 +159,8 @@ def to_radec_deg(directions: FloatArray) -> Places:
 
 
 def from_radec_roll_deg(ra_deg: float, dec_deg: float, roll_deg: float) -> FloatArray:
-    """q_icrs_to_cam of a boresight and roll (thesis eq. 2.3): R_icrs_from_cam = A3(ra-90)
-    A1(dec-90) A3(roll).
+    """q_icrs_to_cam (4,), w >= 0, of a boresight's right ascension and declination and of a roll,
+    degrees (thesis eq. 2.3): R_icrs_from_cam = A3(ra-90) A1(dec-90) A3(roll).
 
     At roll 0 the image has north up and east left.
     """
@@ -166,10 +173,11 @@ def from_radec_roll_deg(ra_deg: float, dec_deg: float, roll_deg: float) -> Float
 
 
 def to_radec_roll_deg(q_icrs_to_cam: FloatArray) -> tuple[float, float, float]:
-    """Boresight right ascension [0, 360), declination and roll [0, 360) of one attitude, degrees.
+    """The boresight's right ascension, its declination, and the roll of an attitude (4,), degrees;
+    right ascension and roll from 0 to below 360. The inverse of `from_radec_roll_deg`.
 
-    At a pole, where right ascension and roll are one angle, the right ascension comes out as
-    `arctan2` has it.
+    At a pole only right ascension and roll together are defined; the right ascension is then what
+    `arctan2` returns.
     """
     r = to_matrix(q_icrs_to_cam)
     dec = np.arctan2(r[2, 2], np.hypot(r[2, 0], r[2, 1]))
@@ -181,21 +189,21 @@ def to_radec_roll_deg(q_icrs_to_cam: FloatArray) -> tuple[float, float, float]:
 
 
 def angle_between_rad(a: FloatArray, b: FloatArray) -> float:
-    """The angle of the rotation from attitude `a` to attitude `b`, 0 to pi; exact for tiny
-    angles too.
+    """The angle of the rotation from attitude `a` (4,) to attitude `b` (4,), rad, 0 to pi; it is
+    exact for tiny angles too.
     """
     d = multiply(a, conjugate(b))
     return float(2 * np.arctan2(np.linalg.norm(d[..., 1:]), abs(d[..., 0])))
 
 
 def slerp(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
-    """The attitude at `fraction` of the shorter way from `a` to `b` (Shoemake 1985); unit
-    length.
+    """The attitude (4,), unit, at `fraction` (0 to 1) of the shorter way from `a` (4,) to `b` (4,)
+    at a constant rate (Shoemake 1985).
     """
     if float(np.dot(a, b)) < 0:
         b = -b
-    # The half angle from both chords is well conditioned from 0 to pi/2; arccos of the dot product
-    # is not.
+    # Half the rotation's angle from both chords is accurate from 0 to pi/2; arccos of the dot
+    # product is not.
     half = 2 * np.arctan2(np.linalg.norm(b - a), np.linalg.norm(b + a))
     if half < SMALL_RAD:
         return normalise(a + fraction * (b - a))
@@ -205,8 +213,8 @@ def slerp(a: FloatArray, b: FloatArray, fraction: float) -> FloatArray:
 
 
 def propagate(q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, seconds: float) -> FloatArray:
-    """The attitude after turning at a constant rate (of cam with respect to icrs, cam
-    components): v_cam' = -omega x v_cam.
+    """The attitude q_icrs_to_cam (4,) after `seconds` at a constant rate (3,), rad/s, of cam with
+    respect to ICRS in cam components: v_cam' = -omega x v_cam.
     """
     vector = -0.5 * seconds * np.asarray(rate_cam_rad_s, dtype=np.float64)
     half = float(np.linalg.norm(vector))
@@ -219,8 +227,8 @@ def propagate(q_icrs_to_cam: FloatArray, rate_cam_rad_s: FloatArray, seconds: fl
 
 
 def rate_between_rad_s(earlier: FloatArray, later: FloatArray, seconds: float) -> FloatArray:
-    """The constant rate that turns `earlier` into `later` the shorter way (inverse of
-    `propagate`).
+    """The constant rate (3,), rad/s, of cam with respect to ICRS in cam components, that turns the
+    attitude `earlier` (4,) into `later` (4,) by the shorter way; the inverse of `propagate`.
     """
     d = multiply(later, conjugate(earlier))
     if d[0] < 0:
@@ -235,13 +243,16 @@ def rate_between_rad_s(earlier: FloatArray, later: FloatArray, seconds: float) -
 
 
 def _turn_deg(angle_rad: float) -> float:
-    """Degrees in [0, 360); the remainder of a tiny negative angle rounds to 360 itself."""
+    """An angle in degrees, from 0 to below 360."""
+    # the remainder of a tiny negative angle rounds to 360 itself
     turn = float(np.degrees(angle_rad)) % 360.0
     return 0.0 if turn == 360.0 else turn
 
 
 def turn_text(turn_deg: float, decimals: int = 4) -> str:
-    """An angle in degrees for a person, in [0, 360) as it is written: 359.99999 is "0.0000"."""
+    """An angle in degrees as text, which as written is from 0 to below 360: 359.99999 is
+    "0.0000".
+    """
     return f"{round(turn_deg, decimals) % 360:.{decimals}f}"
 
 

@@ -1,8 +1,8 @@
-"""A monitor's primaries and a tracker's channels: the electrons of each channel by each primary,
-one matrix from spectra.
+"""The matrix that gives the electrons in each channel of a tracker for each primary of a monitor,
+computed from spectra.
 
-The spectra come from a table, from an ArgyllCMS file of the display's own samples, or from CIE
-chromaticities.
+The primaries' spectra come from a table, from an ArgyllCMS file of samples measured on the
+display, or from CIE chromaticities.
 """
 
 import itertools
@@ -33,18 +33,23 @@ COLUMNS = ("wavelength_nm", *PRIMARIES)
 ADVICE = "write wavelength_nm,r,g,b: each primary's relative spectral power at full drive"
 CCSS_ADVICE = "give a .ccss of this display (ccxxmake -S), or a CSV of wavelength_nm,r,g,b"
 MAX_SAMPLES = 40
-# relative rms: a spectrometer's repeatability, and a display whose primaries add up
+# Largest rms residual of a mixture, relative to its sample: a spectrometer's repeatability, and the
+# additivity of a display without a fourth subpixel, stay below it.
 MIXED_WITHIN = 0.03
-# light of white over that of its primaries: screens that dim with what they show are off by less
+# How much more light than its primaries' sum a sample may have, as a share: screens that dim with
+# what they show are off by less, a white subpixel by more.
 MAX_EXCESS = 0.15
-DARK_SHARE = 0.02  # relative to the brightest sample: black and near it
-SINGULAR = 1e-12  # for a Gram matrix
+DARK_SHARE = 0.02  # a sample with less light, relative to the brightest, is black or nearly so
+# relative to the largest: pinv takes smaller singular values of a Gram matrix for rounding
+SINGULAR = 1e-12
 D65_XY = (0.3127, 0.3290)
-FAR_XY = 0.08  # the blue of sRGB is 0.03 from a Gaussian of 30 nm
-FWHM_SIGMAS = 2.3548
+# largest distance in xy from a Gaussian's chromaticity: the blue of sRGB is 0.03 from one of 30 nm
+FAR_XY = 0.08
+FWHM_SIGMAS = 2.3548  # a Gaussian's full width at half maximum, in units of its sigma
 XY_NM = np.arange(380.0, 781.0, 1.0)
-# CIE 1931 2 degrees, as sums of Gaussians with two sides (Wyman, Sloan and Shirley 2013, JCGT 2,
-# 1): times, middle, 1 / sigma.
+# The CIE 1931 colour matching functions x, y and z (2 degrees), each a sum of Gaussians with two
+# sides (Wyman, Sloan and Shirley 2013, JCGT 2, 1). Of each Gaussian: its weight, its middle, nm,
+# and 1 / sigma, 1/nm, below and above the middle.
 MATCHING = (
     (
         (0.362, 442.0, 0.0624, 0.0374),
@@ -58,12 +63,12 @@ MATCHING = (
 
 @dataclass(frozen=True, slots=True)
 class ChannelMatrix:
-    """`e_per_s` (channels, 3): electrons per second in each of `channels` by each primary of a
-    pixel at full light.
+    """`e_per_s` (channels, 3): the electrons per second that each primary (r, g, b) of one pixel at
+    full light causes in each of `channels`.
 
-    `condition` is the matrix's condition number: a relative error of the channels' light may be so
-    many times as large in the primaries' light. None where two channels, or two primaries, have the
-    same colour.
+    `condition` is the matrix's condition number: the factor by which a relative error of the
+    channels' light may grow in the primaries' light. It is None where two channels, or two
+    primaries, have the same colour.
     """
 
     channels: tuple[str, ...]
@@ -72,10 +77,11 @@ class ChannelMatrix:
 
 
 def read_primaries(path: Path) -> tuple[Curve, ...]:
-    """The spectra of red, green and blue in a CSV file or a .ccss, per nm in one unit, zero outside
-    its wavelengths.
+    """The spectra of red, green and blue from a CSV file (columns wavelength_nm, r, g, b) or a
+    .ccss: power per nm, all three in one arbitrary unit, and zero outside the file's wavelengths.
 
-    Raises InputError.
+    Raises InputError for a file that is neither, wavelengths that do not rise, power below 0 and a
+    primary without light.
     """
     if path.suffix.lower() == ".ccss":
         return read_ccss(path)
@@ -104,19 +110,22 @@ def read_primaries(path: Path) -> tuple[Curve, ...]:
 
 
 def _curves(nm: FloatArray, power: FloatArray) -> tuple[Curve, ...]:
-    """A curve of each power (curves, n) at `nm` (n,), which falls to zero beside both ends."""
-    first, last = np.nextafter(nm[[0, -1]], [0.0, np.inf])  # knots beside both ends and far off
+    """A curve for each row of `power` (curves, n) at the wavelengths `nm` (n,), zero outside
+    them.
+    """
+    # A curve is linear between its knots, so zeros stand at the next numbers outside `nm`.
+    first, last = np.nextafter(nm[[0, -1]], [0.0, np.inf])
     knots = np.concatenate([[RANGE_NM[0], first], nm, [last, RANGE_NM[1]]])
     return tuple(Curve(knots, np.pad(channel_power, 2)) for channel_power in power)
 
 
 def read_ccss(path: Path) -> tuple[Curve, ...]:
-    """The primaries of an ArgyllCMS .ccss (CGATS text): those three samples of which all others are
-    mixtures.
+    """The spectra of red, green and blue from an ArgyllCMS .ccss (CGATS text): the three samples of
+    which all other samples are mixtures.
 
-    Of samples of one colour the brightest counts; red and blue are those of the longest and the
-    shortest mean wavelength. Raises InputError for another file, and where no three samples make
-    the others, as of a panel with a fourth subpixel.
+    Of several samples of one colour, the brightest is the primary. Red is the primary with the
+    longest mean wavelength, blue the one with the shortest. Raises InputError for another file, and
+    where no three samples mix to the others, as with a panel that has a fourth subpixel.
     """
     nm, samples = _samples(path)
     power = samples.sum(axis=1)
@@ -141,7 +150,8 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
             f" mixtures (the nearest leave {100 * nearest:.0f} % of one): a white subpixel, or"
             f" samples of several displays; {CCSS_ADVICE}"
         )
-    # among those that fit as well, within the square of what a sample may be off
+    # Brighter and dimmer samples of one colour fit alike but for noise: of the fits within
+    # MIXED_WITHIN squared of the best, the brightest counts.
     near_best = [fit for fit in fits if fit.worst <= nearest + MIXED_WITHIN**2]
     best = max(near_best, key=lambda fit: float(lit[fit.samples].sum()))
     drive = best.mixtures * size[:, None] / size[best.samples]
@@ -156,8 +166,8 @@ def read_ccss(path: Path) -> tuple[Curve, ...]:
 
 
 class _Fit(NamedTuple):
-    """Three `samples` as primaries: the `mixtures` (n, 3) of all that come nearest to samples of
-    norm 1, and how far the worst is off.
+    """Three samples, by their indices `samples`, tried as primaries. `mixtures` (n, 3) are their
+    amounts that come nearest to each of the n samples of norm 1; `worst` is the largest residual.
     """
 
     samples: list[int]
@@ -166,8 +176,8 @@ class _Fit(NamedTuple):
 
 
 def _fit(together: FloatArray, samples: list[int]) -> _Fit | None:
-    """Three samples as primaries, by the products (n, n) of all samples; None where one of them
-    is nearly a mixture of the others.
+    """The fit with three samples as primaries, from the inner products `together` (n, n) of all
+    samples of norm 1; None where one of the three is nearly a mixture of the other two.
     """
     gram = together[np.ix_(samples, samples)]
     # The determinant is the square of their volume. Colours within MIXED_WITHIN of each other, by
@@ -184,7 +194,9 @@ def _fit(together: FloatArray, samples: list[int]) -> _Fit | None:
 
 
 def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Wavelengths (bands,), nm, and the spectra (samples, bands) of a .ccss. Raises InputError."""
+    """The wavelengths (bands,), nm, and the spectra (samples, bands) of a .ccss. Raises InputError
+    for text that is no .ccss, or a table that does not fit its header.
+    """
     text = named_text(path, CCSS_ADVICE, MAX_CURVE_BYTES)
     if not text.lstrip().startswith("CCSS"):
         raise InputError(f"{path}: its first word is not CCSS; {CCSS_ADVICE}")
@@ -214,14 +226,16 @@ def _samples(path: Path) -> tuple[FloatArray, FloatArray]:
         raise InputError(f"{path}: {error} is wrong or missing; {CCSS_ADVICE}") from error
     if not good or not 0 < len(samples) <= MAX_SAMPLES:
         raise InputError(f"{path}: {len(samples)} samples of {len(spectral)} bands; {CCSS_ADVICE}")
-    return nm, np.maximum(samples, 0.0)  # a spectrometer's noise
+    # a spectrometer's noise takes dark bands below 0, where no light can be
+    return nm, np.maximum(samples, 0.0)
 
 
 def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tuple[Curve, ...]:
-    """Gaussian spectra whose chromaticities are nearest to `xy` of red, green and blue; all three
-    together are D65.
+    """Gaussian spectra of width `fwhm_nm` whose CIE 1931 chromaticities are nearest to `xy` of red,
+    green and blue, in such amounts that all three together are D65 white.
 
-    Raises InputError where none is near.
+    Raises InputError where no Gaussian is within FAR_XY of one of them, and where D65 is not within
+    their triangle.
     """
     matching = np.array([_matching_function(lobes) for lobes in MATCHING])
     middles_nm = np.arange(XY_NM[0], XY_NM[-1], 0.25)
@@ -257,8 +271,8 @@ def chromatic_primaries(xy: Sequence[tuple[float, float]], fwhm_nm: float) -> tu
 
 
 def _matching_function(lobes: Sequence[tuple[float, float, float, float]]) -> FloatArray:
-    """A colour matching function at XY_NM, of lobes (weight, middle, and the inverse of its
-    sigmas below and above).
+    """A colour matching function at XY_NM (n,), the sum of lobes (weight, middle in nm, and the
+    inverse of sigma, 1/nm, below and above the middle).
     """
     values = np.zeros(len(XY_NM))
     for weight, middle_nm, below, above in lobes:
@@ -267,7 +281,9 @@ def _matching_function(lobes: Sequence[tuple[float, float, float, float]]) -> Fl
 
 
 def _lobe(middle_nm: float, below: float, above: float) -> FloatArray:
-    """A Gaussian at XY_NM with an inverse sigma below its middle and another above it."""
+    """A Gaussian of height 1 at XY_NM (n,), with one inverse sigma, 1/nm, below its middle and
+    another above it.
+    """
     away_nm = XY_NM - middle_nm
     inverse_sigma = np.where(away_nm < 0, below, above)
     sigmas = away_nm * inverse_sigma
@@ -275,7 +291,9 @@ def _lobe(middle_nm: float, below: float, above: float) -> FloatArray:
 
 
 def reddest_nm(primaries: Sequence[Curve], least: float = 0.01) -> float:
-    """The longest wavelength at which a primary has `least` of its largest power."""
+    """The longest wavelength, nm, at which any primary has more than `least` of its largest
+    power.
+    """
     longest_nm = []
     for curve in primaries:
         is_lit = curve.value > least * curve.value.max()
@@ -286,12 +304,12 @@ def reddest_nm(primaries: Sequence[Curve], least: float = 0.01) -> float:
 def channel_matrix(
     primaries: Sequence[Curve], channels: Mapping[str, Optics], white_e_per_s: float
 ) -> ChannelMatrix:
-    """The matrix of a monitor and a tracker: all primaries give `white_e_per_s` in all channels
-    together.
+    """The matrix of a monitor and a tracker, scaled so that the sum of its entries, a white pixel's
+    electrons per second in all channels together, is `white_e_per_s`.
 
     An entry is in proportion to the integral of power, quantum efficiency, transmission and
-    wavelength: photons are counted. Raises InputError where the tracker detects no light of the
-    primaries.
+    wavelength; the wavelength turns power into photons. Raises InputError where the tracker detects
+    none of the primaries' light.
     """
     matrix = np.empty((len(channels), len(primaries)))
     for row, optics in enumerate(channels.values()):
@@ -309,7 +327,9 @@ def channel_matrix(
 
 
 def _electrons(primary: Curve, optics: Optics) -> float:
-    """The integral of a primary's detected photons, in proportion to electrons."""
+    """A primary's electrons in a channel, in arbitrary units: the integral of its detected
+    photons.
+    """
     curves = primary, optics.quantum_efficiency, optics.transmission
     nm, weight = integration_nodes(*curves)
     detected = np.prod([curve(nm) for curve in curves], axis=0)
@@ -317,18 +337,18 @@ def _electrons(primary: Curve, optics: Optics) -> float:
 
 
 def nearest_mixtures(gram: FloatArray, wanted: FloatArray, *, whole: bool = False) -> FloatArray:
-    """The mixtures s (n, 3), none below 0, with the least s gram s - 2 s wanted: non-negative least
-    squares by its products.
+    """The amounts s (n, 3) of three parts, none below 0, that minimise s gram s - 2 s wanted:
+    non-negative least squares from inner products.
 
-    `gram` (3, 3) has the products of the three parts, `wanted` (n, 3) those of each with what is
-    wanted; `whole` holds the sum of a mixture to 1. Every set of parts is tried: the best of those
-    without a negative part is the solution.
+    `gram` (3, 3) are the inner products of the three parts with each other, `wanted` (n, 3) those
+    of the parts with each of n vectors to mix. With `whole` the amounts of a mixture add up to 1.
+    Every set of parts is tried; the best without a negative amount is the solution.
     """
     scale = np.trace(gram)
     gram = gram / scale
     wanted = wanted / scale
     best = np.zeros_like(wanted)
-    # the cost of no light at all, which a mixture that has to be whole cannot be
+    # No light at all costs 0. A mixture that must add up to 1 cannot be that.
     least = np.full(len(wanted), np.inf if whole else 0.0)
     for parts in _sets_of(len(gram)):
         mixtures = np.zeros_like(wanted)
@@ -342,14 +362,14 @@ def nearest_mixtures(gram: FloatArray, wanted: FloatArray, *, whole: bool = Fals
 
 
 def _sets_of(count: int) -> Iterator[list[int]]:
-    """Every set of so many parts but the empty one, the smaller first."""
+    """Every set of indices below `count` except the empty one, smaller sets first."""
     for size in range(1, count + 1):
         yield from map(list, itertools.combinations(range(count), size))
 
 
 def _mixtures_of(gram: FloatArray, wanted: FloatArray, whole: bool) -> FloatArray:
-    """The mixtures (n, k) of k parts by linear least squares, of any sign; `whole` ones by a
-    Lagrange multiplier for their sum.
+    """The amounts (n, k), of any sign, of k parts by linear least squares. With `whole` a Lagrange
+    multiplier makes each mixture's amounts add up to 1.
     """
     size = len(gram)
     if whole:

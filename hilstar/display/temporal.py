@@ -1,14 +1,16 @@
-"""`temporal`: `exact` from frame to frame, so that a star's light and place are right over any
-exposure of several frames.
+"""The quantiser `temporal`: `exact` continued from frame to frame, so that a star's light and place
+are right over any exposure of several frames.
 
-What a frame leaves of the ten sums of `balance` the same star has to make up for in the next one.
-The errors of any N frames in a row add up to the difference of two such remainders, each about as
-large as the error of one frame of `exact`: their mean falls as 1/N, whichever frame the exposure
-begins with, and with parts of a frame at its ends. A remainder is about the star's own centre and
-moves with it. A star too faint to light a pixel in every frame lights one in some: its light is
-then a rate of pulses (a sigma-delta modulation), and each star begins at a place of its own in that
-cycle, so that alike stars do not blink in step. A star keeps its remainder for as long as every
-frame has it, and begins anew when it comes back.
+A frame's codes leave an error in the ten sums of `balance` for each star: its remainder. The next
+frame makes up for it. The errors of any N frames in a row add up to the difference of two
+remainders, each about as large as the error of one frame of `exact`. So their mean falls as 1/N,
+whichever frame the exposure begins with, also where it has parts of a frame at its ends. A
+remainder is about the star's own centre and moves with it.
+
+A star too faint to light a pixel in every frame lights one in some frames: its light is then a rate
+of pulses (a sigma-delta modulation). Each star begins at another point of that cycle, so that
+similar stars do not blink in step. A star's remainder lasts for as long as every frame shows the
+star; a star that comes back begins anew.
 """
 
 import numpy as np
@@ -23,16 +25,19 @@ from hilstar.display.response import Levels
 from hilstar.optics.psf import Psf
 from hilstar.optics.sprites import FrameLight
 
-# What a star is given to make up for, in its largest steps: more than the 3 that occur, little
-# enough for one that cannot (its pixels are white) to be right again a few frames after it can.
+# The largest remainder that a star carries over, in units of its largest step. It is more than the
+# 3 that occur. A star that cannot make up for its remainder, as its pixels are white, has so little
+# of it that it is right a few frames after it can again.
 MAX_CARRIED_STEPS = 8.0
-# 2^32 over the golden ratio: its multiples, modulo 2^32, are spread evenly, any number of them
+# 2^32 over the golden ratio: any number of its multiples, modulo 2^32, are spread evenly
 GOLDEN = 2654435769
 NONE_BEFORE = -1
 
 
 class TemporalQuantiser(ExactQuantiser):
-    """Levels of one frame after another, each of which makes up for what the last one left."""
+    """Computes the levels of successive frames, each of which makes up for the errors that the one
+    before left.
+    """
 
     words = (
         "and so that each frame makes up for what the one before left, by which the mean of any N"
@@ -62,13 +67,13 @@ class TemporalQuantiser(ExactQuantiser):
 
     @classmethod
     def exposure(cls, before: int, count: int) -> range:
-        """All frames of the exposure: each is unlike the one before."""
+        """All frames of the exposure, `count` from `before` on, as no two frames are alike."""
         return range(before, before + count)
 
     @classmethod
     def fewest(cls, order: PixelOrder) -> int:
-        """All pixels: those that stay dark are off the same way in each frame, and the others
-        cannot make up for it.
+        """The minimum number of a star's pixels to choose among: all near ones. Any that stay dark
+        cause the same error in every frame, and the others cannot make up for it.
         """
         return order.near
 
@@ -78,7 +83,7 @@ class TemporalQuantiser(ExactQuantiser):
         return mask_turn(number)
 
     def levels(self, sprites: FrameLight | None, floor: Levels | None = None) -> Levels:
-        """The levels of the next frame, as `exact`'s."""
+        """The levels of the next frame; see `ExactQuantiser.levels`."""
         # a frame without stars ends the sequence: nothing makes up for the errors before it
         if sprites is None or not len(sprites):
             self.left = None
@@ -96,18 +101,18 @@ class TemporalQuantiser(ExactQuantiser):
         return carried
 
     def _bounded(self, error: Float32Array, step: Float32Array) -> Float32Array:
-        """At most MAX_CARRIED_STEPS of each star's largest step."""
+        """The remainders, limited to MAX_CARRIED_STEPS times each star's largest step."""
         limit = np.float32(MAX_CARRIED_STEPS) * step.max(axis=0)
         return np.clip(error, -limit, limit)
 
     def _keep(self, sprites: FrameLight, left: Float32Array) -> None:
-        """Keep what the last sprite of each star leaves, for the next frame."""
+        """Store the remainder of each star's last sprite for the next frame."""
         _, last = ends_of_paths(sprites)
         self.left = Left(sprites.star[last].copy(), left[:, last])
 
 
 def ends_of_paths(sprites: FrameLight) -> tuple[IntArray, IntArray]:
-    """The places of the first and of the last sprite of each star."""
+    """The indices (stars,) of the first and of the last sprite of each star."""
     if sprites.per_star == 1:
         every = np.arange(len(sprites))
         return every, every
@@ -116,10 +121,10 @@ def ends_of_paths(sprites: FrameLight) -> tuple[IntArray, IntArray]:
 
 
 def places_before(before: IntArray | None, star: IntArray) -> IntArray:
-    """Where each of `star` (n,) was among those of the frame before, int32 (n,); NONE_BEFORE for
-    new ones.
+    """The index in `before`, the star numbers of the frame before, of each of `star` (n,), int32
+    (n,); NONE_BEFORE for a new star.
 
-    Of several of one number the last counts.
+    Where a number is there several times, the last counts.
     """
     if before is None or not len(before) or not len(star):
         return np.full(len(star), NONE_BEFORE, dtype=np.int32)
@@ -131,8 +136,8 @@ def places_before(before: IntArray | None, star: IntArray) -> IntArray:
 
 
 def first_phases(star: IntArray, before: IntArray) -> Float32Array:
-    """The part of a step (n,), -0.5 to 0.5, that new stars have in hand; 0 for those that were
-    there before.
+    """The part of a step (n,), -0.5 to 0.5, by which new stars begin ahead in their cycle; 0 for
+    stars that were in the frame before.
     """
     product = star.astype(np.uint64) * np.uint64(GOLDEN)
     low_bits = product & np.uint64(0xFFFFFFFF)

@@ -1,11 +1,14 @@
-"""Where centroiders of several kinds find a star: in squares of pixels around it, one star to a
-square.
+"""Centroiders of several kinds: each computes a star's place in a square of pixels around it, one
+star to a square. A display's artefacts shift the result of each kind differently.
 
-`moment`: the plain first moment. `window`: the mean under a Gaussian that follows the star and is
-as wide, a pixel at least (SExtractor's XWIN_IMAGE); `wide`: under one half as wide again. `fit`:
-least squares of a Gaussian integrated over pixels. `psf`: least squares of any PSF that it is told.
-`box3`, `box5`: the centre of mass of 3 x 3 or 5 x 5 pixels, of those over a fiftieth of the
-brightest. What a display does to a star's light, each sees differently.
+- `moment`: the plain first moment.
+- `window`: the mean under a Gaussian window that follows the star and is as wide as the star, but
+  at least a pixel (SExtractor's XWIN_IMAGE).
+- `wide`: the same with a window one and a half times as wide.
+- `fit`: least squares of a Gaussian integrated over pixels.
+- `psf`: least squares of any PSF that is given.
+- `box3`, `box5`: the centre of mass of those of 3 x 3 or 5 x 5 pixels that have more than a
+  fiftieth of the brightest pixel's light.
 """
 
 from collections.abc import Callable
@@ -17,27 +20,28 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray, IntArray
 
 Kind = Literal["moment", "window", "wide", "fit", "box3", "box5"]
-Centroider = Literal[Kind, "psf"]  # which is `fit` where a star is a Gaussian
+Centroider = Literal[Kind, "psf"]  # without a given PSF, "psf" is "fit": the star is a Gaussian
 FAMILY: tuple[Kind, ...] = get_args(Kind)
-WIDE = 1.5  # in units of the star's sigma
-MIN_WINDOW_PX = 1.0  # a narrower one sees the one pixel that it stands on
-FIT_STEPS, WINDOW_STEPS = 8, 20  # at most: stars that have settled end them before
+WIDE = 1.5  # sigma of the wide window, in units of the star's sigma
+MIN_WINDOW_PX = 1.0  # a narrower window sees only the one pixel that it stands on
+FIT_STEPS, WINDOW_STEPS = 8, 20  # at most: they end before once no star moves any more
 FIRST_STEPS = 3  # steps with a window before a fit
-# A window as wide as the star moves the mean half of the way, one on a single pixel all of it: both
-# come to rest by this.
+# A step with a window as wide as the star moves the mean half of the way to the star, one with all
+# light in a single pixel the whole way. Steps lengthened by this factor converge for both.
 PACE = 1.5
-SETTLED_PX = 1e-6  # a step under it moves no star any more
+SETTLED_PX = 1e-6  # a shorter step does not matter any more
 MAX_STEP_PX = 0.3  # largest step of a fit: its model is nearly linear within that
-BOX_SHARE = 0.02  # of its brightest pixel: darker ones do not count in a box
-BOX_HALVES: dict[str, int] = {"box3": 1, "box5": 2}
-MIN_LIGHT = 1e-30  # a square with less is dark
-SLOPE_PX = 0.02  # to either side of a place, for a told PSF's slope
+BOX_SHARE = 0.02  # pixels with less than this share of the box's brightest do not count
+BOX_HALVES: dict[str, int] = {"box3": 1, "box5": 2}  # pixels from the middle of a box to its edge
+MIN_LIGHT = 1e-30  # a square with less light is dark
+SLOPE_PX = 0.02  # the slope of a given PSF is the difference over so much to either side
 
 
 Pixels = tuple[IntArray, IntArray]  # rows and columns (n,)
-Sigma = tuple[float, float]
-Places = tuple[FloatArray, FloatArray]
-# Shares (n, side, side) of stars at x and y (n,), px from the middles of their squares.
+Sigma = tuple[float, float]  # along x and y, px
+Places = tuple[FloatArray, FloatArray]  # x and y (n,), px from the middles of the stars' squares
+# A PSF: from x and y (n,), px from the middles of squares, the shares (n, side, side) of a star's
+# light in each pixel of its square.
 ToldPsf = Callable[[FloatArray, FloatArray], FloatArray]
 
 
@@ -48,12 +52,13 @@ def star_places(
     pixels: Pixels | None = None,
     box_share: float = BOX_SHARE,
 ) -> Places:
-    """Each star's x and y (n,), px from the middle of its square (n, side, side), side odd; 0 for a
-    square without light.
+    """The x and y (n,) of stars, px from the middles of their squares `stamps` (n, side, side),
+    side odd; 0 for a square without light.
 
-    `sigma_px` (x, y) is the star's. A box is about one of `pixels`, at least two from the edge, by
-    default the brightest: two images of a star between two pixels are to be compared in one box.
-    The others begin there. Of a box those pixels count that have over `box_share` of its brightest.
+    `sigma_px` (x, y) is the sigma of a star. `pixels`, at least two from the edge, are the middles
+    of boxes, and where the iterating kinds begin; by default they are the brightest pixels. Give
+    them to compare two images of a star that lies between two pixels: both need the same box. In a
+    box only pixels with more than `box_share` of its brightest pixel count.
     """
     x = np.zeros(len(stamps))
     y = np.zeros(len(stamps))
@@ -77,10 +82,11 @@ def star_places(
 
 
 def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
-    """Each star's x and y (n,), px from the middle of its square (n, side, side), by least squares
-    of a PSF from `first` on.
+    """The x and y (n,) of stars, px from the middles of their squares `stamps` (n, side, side), by
+    least squares of the PSF `told`, beginning at the places `first`.
 
-    The place is that of the PSF's middle, the chief ray: with coma the star's light lies beside it.
+    A place is that of the PSF's middle, the chief ray; with coma most of the star's light lies to
+    one side of it.
     """
     half = stamps.shape[1] // 2
     first_x, first_y = first
@@ -93,7 +99,7 @@ def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
         right_side = parts @ pixels
         solution = np.linalg.solve(normal + _ridge(normal), right_side)
         flux, flux_dx, flux_dy = solution[..., 0].T
-        # where there is no light, no step
+        # a star without light takes no step: its derivatives divided by infinity are 0
         divisor = np.where(flux > MIN_LIGHT, flux, np.inf)
         dx = np.clip(flux_dx / divisor, -MAX_STEP_PX, MAX_STEP_PX)
         dy = np.clip(flux_dy / divisor, -MAX_STEP_PX, MAX_STEP_PX)
@@ -105,7 +111,9 @@ def psf_places(stamps: FloatArray, told: ToldPsf, first: Places) -> Places:
 
 
 def _told_parts(told: ToldPsf, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Shares of a told PSF at places (n,), and their slopes along x and y: (n, 3, side, side)."""
+    """The pixels' shares of a star's light by the PSF `told` at places x and y (n,), px, and their
+    derivatives by x and y, 1/px: (n, 3, side, side).
+    """
     shares = told(x, y)
     by_x = (told(x + SLOPE_PX, y) - told(x - SLOPE_PX, y)) / (2 * SLOPE_PX)
     by_y = (told(x, y + SLOPE_PX) - told(x, y - SLOPE_PX)) / (2 * SLOPE_PX)
@@ -113,20 +121,24 @@ def _told_parts(told: ToldPsf, x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _ridge(normal: FloatArray) -> FloatArray:
-    """What is added to normal matrices (n, 3, 3), so that a star without light has a solution."""
+    """The diagonal matrices (n, 3, 3) to add to normal matrices (n, 3, 3), so that a star without
+    light has a solution too.
+    """
     trace = np.trace(normal, axis1=1, axis2=2)
     weight = np.maximum(1e-12 * trace, MIN_LIGHT)
     return np.asarray(np.eye(3) * weight[:, None, None])
 
 
 def _are_settled(dx_px: FloatArray, dy_px: FloatArray) -> bool:
-    """Whether no star takes a step that matters any more."""
+    """Whether the largest of all stars' steps, dx and dy (n,), px, is below SETTLED_PX."""
     largest_px = max(np.abs(dx_px).max(), np.abs(dy_px).max())
     return bool(largest_px < SETTLED_PX)
 
 
 def brightest(stamps: FloatArray) -> Pixels:
-    """The brightest pixel of each square, two or more from its edge."""
+    """The row and column (n,) of the brightest pixel of each square (n, side, side), at least two
+    pixels from the edge: a box of 5 x 5 about it lies within the square.
+    """
     side = stamps.shape[1]
     inner = stamps[:, 2 : side - 2, 2 : side - 2]
     place = inner.reshape(len(stamps), -1).argmax(axis=1)
@@ -135,18 +147,18 @@ def brightest(stamps: FloatArray) -> Pixels:
 
 
 def _axis(stamps: FloatArray) -> FloatArray:
-    """The places (side,), px from the middle, of the pixels of squares along a side."""
+    """The places (side,) of a square's pixels along one axis, px from its middle."""
     side = stamps.shape[1]
     return np.asarray(np.arange(side) - side // 2, dtype=np.float64)
 
 
 def _moment(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
-    """See the module: places (n,) by the plain first moment."""
+    """Places by `moment`; see the module."""
     at = _axis(stamps)
     light = stamps.sum(axis=(1, 2))
     x = stamps.sum(axis=1) @ at / light
     y = stamps.sum(axis=2) @ at / light
-    # noise below 0 may leave little light
+    # Noise below 0 may make the sum of the light nearly 0, and the quotient far outside the square.
     return np.clip(x, at[0], at[-1]), np.clip(y, at[0], at[-1])
 
 
@@ -157,8 +169,8 @@ def _window(
     wide: float = 1.0,
     steps: int = WINDOW_STEPS,
 ) -> Places:
-    """See the module: places (n,) by a Gaussian window, `wide` times as wide as the star, that
-    follows it.
+    """Places by `window`, or by `wide`: with a window `wide` times as wide as the star. See the
+    module.
     """
     at = _axis(stamps)
     x, y = _box(stamps, 2, pixels)
@@ -183,14 +195,14 @@ def _window(
 
 
 def _sums(stamps: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
-    """Sums of each square under products of `rows` (n, j, side) and `columns` (n, side, k): (n,
-    j, k).
+    """The sums (n, j, k) of each square (n, side, side), weighted by the products of each of its
+    `rows` (n, j, side) with each of its `columns` (n, side, k).
     """
     return np.asarray(rows @ (stamps @ columns))
 
 
 def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
-    """See the module: places (n,) by least squares of a Gaussian, after some steps of a window."""
+    """Places by `fit`; see the module. It begins where FIRST_STEPS steps of a window end."""
     at = _axis(stamps)
     x, y = _window(stamps, sigma_px, pixels, steps=FIRST_STEPS)
     sigma_x, sigma_y = sigma_px
@@ -211,8 +223,8 @@ def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:
 
 
 def _products(profile: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Sums along a side of shares and their slopes (n, 2, side): shares squared, shares times
-    slopes, and slopes squared.
+    """Three sums (n,) along a side of `profile` (n, 2, side), shares and their slopes: of shares
+    squared, of shares times slopes, and of slopes squared.
     """
     share = profile[:, 0]
     slope = profile[:, 1]
@@ -225,10 +237,12 @@ def _products(profile: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 def _fit_step(
     sums: FloatArray, across: FloatArray, down: FloatArray, flux: FloatArray
 ) -> FloatArray:
-    """What least squares adds to flux, x and y, (n, 3).
+    """The step (n, 3) in flux, x (px) and y (px) by least squares, linearised at the star's present
+    place.
 
-    `across` and `down` (n, 2, side) are a star's shares and their slopes in columns and rows,
-    `sums` (n, 2, 2) those of the square under their products.
+    `across` and `down` (n, 2, side) are a star's shares and their slopes (see `_profile`) along x
+    and y; `sums` (n, 2, 2) are the square's sums weighted by their products, rows first; `flux`
+    (n,) is the star's.
     """
     xx, xd, dd = _products(across)
     yy, yd, ee = _products(down)
@@ -252,8 +266,11 @@ def _fit_step(
 
 
 def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> FloatArray:
-    """A star's shares in a row of pixels, and how they change with its place, (n, 2, side)."""
-    from scipy.special import ndtr  # 0.1 s of every command that needs none of it
+    """The shares of a Gaussian star at `place` (n,), px, in the pixels at `at` (side,), px, along
+    one axis, and their derivatives by its place, 1/px: (n, 2, side).
+    """
+    # The import takes 0.1 s, which commands without a fit save.
+    from scipy.special import ndtr
 
     edges_px = np.append(at - 0.5, at[-1] + 0.5)
     edges = (edges_px - place[:, None]) / sigma_px
@@ -264,8 +281,8 @@ def _profile(at: FloatArray, place: FloatArray, sigma_px: float) -> FloatArray:
 
 
 def _box(stamps: FloatArray, half: int, pixels: Pixels, share: float = BOX_SHARE) -> Places:
-    """See the module: places (n,) by the centre of mass of boxes that reach `half` pixels from
-    `pixels`.
+    """Places by `box3` (`half` 1) or `box5` (2): the centre of mass in boxes that reach `half`
+    pixels to each side of `pixels`. See the module.
     """
     rows, columns = pixels
     side = stamps.shape[1]

@@ -1,5 +1,5 @@
-"""A Bayer mosaic: light by channel to the pixels that see it; and the image in which a tracker's
-software finds stars: the luminance of a mosaic, and what a black screen is in it.
+"""A Bayer mosaic: which pixels get the light of each channel. And the image in which a tracker's
+software looks for stars: the luminance of a mosaic, and how a black screen appears in it.
 """
 
 from collections.abc import Iterable
@@ -12,18 +12,21 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.tracker.settings import DetectorSettings
 
 CHANNELS = "rgb"
-# The pixel's weight in its own superpixels' mean, along an axis. Their light is spread by half a
-# pixel squared more.
+# Along one axis: the weights of a pixel and its two neighbours in the mean of the superpixels that
+# the pixel belongs to. This mean widens a star: its variance along the axis grows by 0.5 px^2.
 SUPERPIXEL = np.array([0.25, 0.5, 0.25])
 SUPERPIXEL_VARIANCE_PX2 = 0.5
-EVEN_DARK_DN = 1.0  # a step of the ADC, from the darkest pixel of a black screen to the brightest
+# A black screen counts as even where its brightest pixel is at most one step of the ADC above its
+# darkest.
+EVEN_DARK_DN = 1.0
 
 
 def in_pixels(images: Iterable[npt.NDArray[Any]], bayer: str | None) -> FloatArray:
-    """The light of a sensor's pixels (height, width), by images of each channel: a pixel has that
-    of its own colour. A mono sensor has one image.
+    """The light in a sensor's pixels (height, width), from one image (height, width) of each
+    channel, r, g and b in this order: each pixel gets the light of its own colour. With `bayer`
+    None, the sensor is mono, and there is one image.
 
-    Images may share their memory, where they come one after the other.
+    The images of a mosaic may share one array, where an iterator gives them one after the other.
     """
     if bayer is None:
         (image,) = images
@@ -38,8 +41,8 @@ def in_pixels(images: Iterable[npt.NDArray[Any]], bayer: str | None) -> FloatArr
 
 
 def of_colour(bayer: str, channel: str) -> list[tuple[slice, slice]]:
-    """The pixels of a channel in an image of a pattern, whose first row is the top: green has
-    two of four.
+    """The slices (rows, columns) of an image that have the pixels of a channel: one for red and
+    blue, two for green. `bayer` names the colours of the top left 2 x 2 pixels row by row ("rggb").
     """
     return [
         np.s_[place // 2 :: 2, place % 2 :: 2]
@@ -49,11 +52,11 @@ def of_colour(bayer: str, channel: str) -> list[tuple[slice, slice]]:
 
 
 def luminance(image: npt.NDArray[Any]) -> FloatArray:
-    """The mean of the four superpixels of 2 x 2 that each pixel belongs to: of red, green and blue
-    1, 2 and 1 parts everywhere.
+    """The mean (height, width) of the four superpixels of 2 x 2 pixels that each pixel of a mosaic
+    belongs to: 1, 2 and 1 parts of red, green and blue at every pixel.
 
-    It has the mosaic's pixels, all of its light, and no pattern where the light has none; beyond
-    its edges it is mirrored.
+    It has as many pixels as the mosaic, and all of its light. Even light gives an even image,
+    without the mosaic's pattern. Beyond the edges the mosaic is continued as its mirror image.
     """
     from scipy.ndimage import correlate1d
 
@@ -62,8 +65,8 @@ def luminance(image: npt.NDArray[Any]) -> FloatArray:
 
 
 def software_image(dn: npt.NDArray[Any], detector: DetectorSettings) -> npt.NDArray[Any]:
-    """The image of an exposure in which a tracker's software finds stars: its DN, or the
-    luminance of its superpixels.
+    """The image (height, width), DN, in which a tracker's software looks for stars: the exposure
+    `dn` itself, or the luminance of its superpixels where the detector takes those.
     """
     if detector.takes_superpixels:
         return luminance(dn)
@@ -71,7 +74,7 @@ def software_image(dn: npt.NDArray[Any], detector: DetectorSettings) -> npt.NDAr
 
 
 def software_psf_px(psf_px: tuple[float, float], detector: DetectorSettings) -> tuple[float, float]:
-    """The sigma (x, y), px, of a star in the software's image, by that of the optics."""
+    """The sigma (x, y), px, of a star in the software's image, from its sigma by the optics."""
     if not detector.takes_superpixels:
         return psf_px
     x, y = (float(np.sqrt(sigma**2 + SUPERPIXEL_VARIANCE_PX2)) for sigma in psf_px)
@@ -79,11 +82,11 @@ def software_psf_px(psf_px: tuple[float, float], detector: DetectorSettings) -> 
 
 
 def uneven_dark_dn(under_e: FloatArray, detector: DetectorSettings) -> FloatArray | None:
-    """The level (h, w), DN, that electrons under the stars have in the software's image; None where
-    it is even.
+    """The dark level (height, width), DN, of the software's image, from the electrons `under_e`
+    (height, width) that lie under the stars; None where it is even within EVEN_DARK_DN.
 
-    A screen that is seen whole glows over a part of the field, which is one large spot to software
-    that takes one level for the whole image.
+    A screen that fills only a part of the field glows there. Software that subtracts one level from
+    the whole image takes that part for one large spot.
     """
     dark_dn = detector.offset_dn + under_e / detector.gain_e_per_dn
     dark_dn = software_image(np.clip(dark_dn, 0.0, 2.0**detector.bits - 1), detector)

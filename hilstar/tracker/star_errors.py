@@ -1,9 +1,9 @@
-"""What a tracker finds wrong with a display's stars: each centroider, in the tracker's own pixels
-after its own blur.
+"""The errors that a tracker measures in a display's stars, by each centroider, in the tracker's own
+pixels and after its own blur.
 
-A lit monitor pixel is a square of light. The tracker's optics blur it (a Gaussian), and its pixels,
-of any width, collect it. Stars stand in the tiles of a square image (`monitor.phases`); each row
-and column of tiles meets the tracker's pixels at a phase of its own.
+A lit monitor pixel is a square of light. The tracker's optics blur it by a Gaussian, and its
+pixels, of any width, collect it. The stars are in the tiles of a square image, one to a tile; the
+stars of each row and column of tiles lie at another phase of the tracker's pixels.
 """
 
 import math
@@ -23,23 +23,24 @@ from hilstar.tracker.centroiders import (
     star_places,
 )
 
-# a pixel's width twice: a star is sampled by squares, and shown by squares
+# px^2: twice the variance 1/12 of a pixel's width, as a star is sampled and shown by squares
 SQUARES_VARIANCE = 1 / 6
-REACH_SIGMAS = 5.0  # of a star, where it is looked at: beyond lie 6e-7 of a Gaussian
-BOX_SIDE = 9  # tracker pixels: a box of 5, and two on either side for its centre
-# Pixels finer than this show windows and fits the same star: its sigma is 0.85 px and more.
+REACH_SIGMAS = 5.0  # half the side of a star's square, in sigmas: 6e-7 of a Gaussian lie beyond
+BOX_SIDE = 9  # tracker pixels: a box of 5, and two to each side, as its middle may move
+# Windows and fits see the same star in any finer pixels, as its sigma is 0.85 px or more; so they
+# get pixels of this width at least.
 FINEST_PX = 0.5
 BOXES = ("box3", "box5")
-GOLDEN = 0.6180339887498949  # its multiples fill a pixel most evenly
-MIN_BLUR_PX = 1e-3  # in place of none, by which places would be divided
+GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, fill a pixel most evenly
+MIN_BLUR_PX = 1e-3  # replaces a blur of 0, by which `_ramp` would divide
 
 
 @dataclass(frozen=True, slots=True)
 class StarErrors:
-    """Of n stars: flux errors, mag, positive too faint, and how far off each centroider finds them,
-    px along x and y (2, n).
+    """The errors of n stars: `flux_mag` (n,), mag, positive for a star that is too faint, and for
+    each centroider `off_px` (2, n), the error of a star's place along x and y, monitor pixels.
 
-    Infinite where a star shows nothing.
+    Both are infinite for a star of which nothing is shown.
     """
 
     flux_mag: FloatArray
@@ -47,24 +48,24 @@ class StarErrors:
 
     @property
     def flux_rms_mag(self) -> float:
-        """The rms of the flux errors."""
+        """The rms of the flux errors, mag."""
         return _rms(self.flux_mag)
 
     @property
     def flux_max_mag(self) -> float:
-        """The largest flux error."""
+        """The largest flux error, mag, without its sign."""
         return float(np.abs(self.flux_mag).max())
 
     def axis_rms_px(self, kind: Centroider) -> float:
-        """The rms along an axis."""
+        """The rms of a centroider's errors along one axis, px, over both axes."""
         return _rms(self.off_px[kind])
 
     def max_px(self, kind: Centroider) -> float:
-        """The largest distance."""
+        """The largest distance of a star from its place by a centroider, px."""
         return float(np.hypot(*self.off_px[kind]).max())
 
     def worst(self) -> Centroider:
-        """The centroider with the largest distance."""
+        """The centroider whose largest distance is the largest."""
         return max(self.off_px, key=self.max_px)
 
 
@@ -73,14 +74,15 @@ def _rms(errors: FloatArray) -> float:
 
 
 class Judge:
-    """A tracker that measures the stars in the tiles of an image against the same stars in the
-    image that is wanted.
+    """A tracker that measures the stars in the tiles of a shown image, and compares them with the
+    same stars in the `wanted` image.
 
-    `wanted` (count * tile, count * tile) has one star near the middle of each tile: those of a
-    column of tiles at one x of `places_px`, those of a row at one y (count,). `sigma_px` (x, y) is
-    a star's; `blur_px` and `pixel_px` are the tracker's; all in monitor pixels. `box_share` is the
-    threshold of its boxes. `phases` (count,) along x and y say where in a tracker's pixel the stars
-    of a column and of a row are; by default they are spread evenly.
+    `wanted` (count * tile, count * tile) has one star near the middle of each tile. `places_px` are
+    the stars' x (count,), one for each column of tiles, and y (count,), one for each row.
+    `sigma_px` (x, y) is the sigma of a star, `blur_px` that of the tracker's blur, `pixel_px` the
+    width of its pixels; all in monitor pixels. `box_share` is the threshold of its boxes. `phases`
+    (x, y), each (count,), say where in a tracker's pixel the stars of a column and of a row are; by
+    default they are spread evenly.
     """
 
     def __init__(
@@ -121,8 +123,8 @@ class Judge:
         share: float | FloatArray = 1.0,
         kinds: tuple[Centroider, ...] = FAMILY,
     ) -> StarErrors:
-        """The errors of an image of the same stars, whose light should be `share` of those
-        wanted: all's, or each one's.
+        """The errors of an image with the same stars. Their light should be `share`, one number or
+        (n,), of that of the wanted stars.
         """
         light = self._light_of(shown)
         off_px = {}
@@ -135,10 +137,10 @@ class Judge:
         return StarErrors(np.asarray(magnitude(flux_ratio)), off_px)
 
     def _places_of(self, image: FloatArray, kind: Centroider) -> FloatArray:
-        """The places (2, n), px, at which a centroider finds the stars, from the tracker's pixel in
-        the middle.
+        """The x and y (2, n) of the stars by a centroider, monitor pixels, from the middle of the
+        tracker's pixel in the middle (by `moment`, from the tile's first pixel).
         """
-        if kind == "moment":  # no blur and no pixel changes it
+        if kind == "moment":  # neither blur nor pixels change a first moment
             tiles = self._tiles(image, self._tile)
             at = np.arange(self._tile)
             light = np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny)
@@ -153,7 +155,9 @@ class Judge:
         return np.stack(places) * pixel_px
 
     def _middles(self, stamps: FloatArray, boxed: bool) -> Pixels:
-        """The pixels that centroiders begin at: a box's is the brightest of the stars wanted."""
+        """The pixels at which centroiders begin: a box at the brightest pixel of the wanted star,
+        so that both images are measured in one box; the others in the middle.
+        """
         if boxed:
             return self._pixels
         middle = np.full(len(stamps), stamps.shape[1] // 2)
@@ -164,20 +168,24 @@ class Judge:
         return np.asarray(self._tiles(image, self._tile).sum(axis=(1, 2)))
 
     def _tiles(self, image: FloatArray, side: int) -> FloatArray:
-        """An image of tiles with so many pixels along a side as (n, side, side), row by row."""
+        """The tiles (n, side, side) of an image (count * side, count * side), row by row."""
         count = self._count
         by_tile = image.reshape(count, side, count, side).transpose(0, 2, 1, 3)
         return by_tile.reshape(-1, side, side)
 
     def _views_of(self, pixel_px: float, blur_px: float, half: int) -> list[FloatArray]:
-        """What tracker pixels collect of a tile's columns and of its rows (see `_collected`)."""
+        """The shares of a tile's columns, and of its rows, that tracker pixels collect, each as
+        `_collected` returns them.
+        """
         views = []
         for place_px, phase in zip(self._in_tile_px, self._phases, strict=True):
             views.append(_collected(place_px, self._tile, pixel_px, blur_px, half, phase))
         return views
 
     def _seen(self, image: FloatArray, pixel_px: float) -> FloatArray:
-        """The tracker's pixels about each star, (n, side, side)."""
+        """The light (n, side, side) in the tracker's pixels, of width `pixel_px`, about each
+        star.
+        """
         columns, rows = self._views[pixel_px]
         count = self._count
         tile = self._tile
@@ -190,7 +198,9 @@ class Judge:
 
 
 def _shown_sigma(sigma_px: Sigma, blur_px: float, sampled_px: float) -> Sigma:
-    """A star's sigma (x, y) as a tracker sees it, in its sampled pixels."""
+    """A star's sigma (x, y) after the display's pixels, the tracker's blur and its pixels, in units
+    of `sampled_px`.
+    """
     sigma_x, sigma_y = sigma_px
     x_px = math.sqrt(sigma_x**2 + SQUARES_VARIANCE + blur_px**2)
     y_px = math.sqrt(sigma_y**2 + SQUARES_VARIANCE + blur_px**2)
@@ -206,11 +216,11 @@ def stamp_errors(
     *,
     box_share: float = BOX_SHARE,
 ) -> dict[Centroider, FloatArray]:
-    """How far off each centroider finds the stars of squares `shown` from those `wanted`, both (n,
-    side, side): px (2, n).
+    """By centroider, the error (2, n) along x and y, monitor pixels, of the stars in the squares
+    `shown` with respect to those in `wanted`, both (n, side, side).
 
-    Stars may be paths; sigmas, blur, pixels and threshold as for a `Judge`. Infinite where nothing
-    is shown.
+    Stars may be paths. Sigmas, blur, pixels and threshold are those of a `Judge`. The error is
+    infinite where nothing is shown.
     """
     count, side = wanted.shape[:2]
     phases = spread_phases(count)
@@ -227,7 +237,7 @@ def stamp_errors(
         rows = _collected(middle_y, side, width_px, blur_px, half, phases)
         return rows @ images @ columns.transpose(0, 2, 1)
 
-    # Centroiders of a box see the tracker's pixels in it; all others the whole star.
+    # Centroiders of a box see the tracker's pixels about it; all others see the whole star.
     box_half = BOX_SIDE // 2
     boxed_wanted = seen(wanted, pixel_px, box_half)
     boxed_shown = seen(shown, pixel_px, box_half)
@@ -266,26 +276,29 @@ def _collected(
     half: int,
     phase: FloatArray,
 ) -> FloatArray:
-    """What each of 2 half + 1 tracker pixels about a star collects of each of `side` monitor
-    pixels, along one axis.
+    """The share (n, 2 half + 1, side) of the light of each of `side` monitor pixels that each of
+    2 half + 1 tracker pixels about a star collects, along one axis.
 
-    (n, 2 half + 1, side), for stars at places (n,) from the first monitor pixel; each meets the
-    tracker's pixels at its `phase` (n,).
+    `star_px` (n,) are the stars' places from the first monitor pixel. The middle tracker pixel is
+    centred `phase` (n,) tracker pixels after its star. Lengths are in monitor pixels.
     """
     steps = np.arange(-half, half + 1) + phase[:, None]
     middles = (star_px[:, None] + pixel_px * steps)[:, :, None]
     edges = np.arange(side + 1) - 0.5
     to_left = middles - pixel_px / 2 - edges
     to_right = middles + pixel_px / 2 - edges
-    # Cumulative light of a blurred point up to a place, and the integral of that over a monitor
-    # pixel.
+    # `_ramp` integrates the light of a blurred point up to a place: its difference over a monitor
+    # pixel's two edges is the light of that pixel up to a tracker pixel's edge.
     within = _ramp(to_right, blur_px) - _ramp(to_left, blur_px)
     return -np.diff(within, axis=-1)
 
 
 def _ramp(to_px: FloatArray, blur_px: float) -> FloatArray:
-    """The integral of a Gaussian's distribution up to each place."""
-    from scipy.special import ndtr  # 0.1 s of every command that needs none of it
+    """The integral, px, of a Gaussian's cumulative distribution (sigma `blur_px`) up to each
+    place.
+    """
+    # The import takes 0.1 s, which commands without a judge save.
+    from scipy.special import ndtr
 
     sigmas = to_px / blur_px
     density = np.exp(-np.square(sigmas) / 2) / math.sqrt(2 * math.pi)

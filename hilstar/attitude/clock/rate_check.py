@@ -1,19 +1,20 @@
-"""Whether the rates that packets carry are those of their own attitudes, packet by packet; no I/O.
+"""Checks, packet by packet, whether the rates in packets are those of the packets' own attitudes.
+It does no I/O.
 
 Laws:
-1. Stretches of packets are compared: the turn of their quaternions with the mean of their rates,
-   each with its own noise.
-2. A stretch whose attitude turns by less than its noise says nothing; nor does one that jumps, or
-   stands and steps.
+1. Stretches of successive packets are compared: the turn of their quaternions with the mean of
+   their rates, each with its own noise.
+2. A stretch whose attitude turns by less than its noise says nothing; nor does one whose attitude
+   jumps, or stands still and steps.
 3. Rates are wrong where all of MIN_STRETCHES in a row (or all but one of MORE_STRETCHES) are off by
-   far more than the noise and
-   either one cause explains them all, or the error is gross. They are right again where all of
-   MIN_STRETCHES fit.
-4. Stretches of several lengths are compared: a short one finds a fast turn in half a second, a long
-   one a slow turn in noise.
-5. Late rates, and those that are renewed seldom, fit and do not fit by turns: the last HISTORY_S
-   are compared with the turn before. Rates that are off by it in OFF_LOOKS in a row are wrong,
-   though no lag explains them. By the whole of it they are right again.
+   far more than the noise, and either one cause explains them all, or the error is gross. They are
+   right again where all of MIN_STRETCHES in a row fit.
+4. Stretches of several lengths are compared: short ones show a fast turn within half a second, long
+   ones a slow turn in noise.
+5. Rates that are late or seldom renewed fit at some times and not at others. So the rates of the
+   last HISTORY_S are also compared with the turn as it was earlier. Rates that this shows to be off
+   in OFF_LOOKS comparisons in a row are wrong, even if no lag explains them. Such rates are right
+   again only by this comparison.
 """
 
 import math
@@ -57,19 +58,22 @@ WRONG, RIGHT = RATES, ENDS[RATES]
 STRETCHES_S = (0.1, 0.2, LONGEST_S)
 MANY_WITHOUT = 20
 MAX_GAP_NS = NS_PER_S // 2
-# t_ns goes back by as much where a sender starts anew; by less where packets overtake each other
+# Where t_ns goes back by so much or more, the sender has started anew; where it goes back by less,
+# packets have overtaken each other.
 RESTART_NS = NS_PER_S
 HISTORY_S = 4.0
 LAG_EACH_NS = NS_PER_S // 2
-# comparisons in a row by which late rates are right again: a slow swing has times without an error
+# Comparisons in a row that must fit before late rates count as right again: in a slow swing there
+# are times without an error.
 LATE_NO_MORE = 8
-# comparisons in a row by which rates are wrong that no lag explains: by then a constant is named
+# Comparisons in a row that must be off before rates that no lag explains count as wrong: a constant
+# error has been named by then.
 OFF_LOOKS = 8
 
 
 def cause_in(samples: Sequence[AttitudeSample], read_as: ReadAs = AS_PACKETS) -> Cause | None:
-    """The first cause that a log's samples show, all of which have rates; None where they show
-    none.
+    """The first cause of wrong rates that a log's samples, all of which have rates, show; None
+    where they show none. `read_as` is how the log's quaternions have been read.
     """
     length = _Length(0.0)
     others = tuple(read_otherwise(readings(read_as)))
@@ -83,8 +87,8 @@ def cause_in(samples: Sequence[AttitudeSample], read_as: ReadAs = AS_PACKETS) ->
 
 
 def _first_cause(length: "_Length", history_s: float, others: Sequence[Cause]) -> Cause | None:
-    """The cause that the newest stretches of a length show: the few newest are asked first, then
-    more; None where none shows one.
+    """The cause of wrong rates that the newest stretches of a length show, by the few newest first,
+    then by more; None where they show none.
     """
     for count in (MIN_STRETCHES, MORE_STRETCHES, MANY_STRETCHES):
         newest = length.newest(count)
@@ -104,7 +108,7 @@ class _Length:
         self.stretches: deque[Stretch] = deque(maxlen=MANY_STRETCHES)
 
     def add(self, sample: AttitudeSample) -> bool:
-        """Take the next packet; True where it completes a stretch."""
+        """Add the next packet; True where it completes a stretch that can be compared."""
         samples = self.samples
         samples.append(sample)
         if len(samples) <= MIN_INTERVALS or sample.t_ns - samples[0].t_ns < self._length_ns:
@@ -134,7 +138,7 @@ class _History:
 
     @property
     def looked_s(self) -> float:
-        """Over how long rates and turn have been compared."""
+        """The length of the history, s, once rates and turn have been compared over it; else 0."""
         if not self._has_looked:
             return 0.0
         return (self._stretches[-1].to_ns - self._stretches[0].from_ns) / NS_PER_S
@@ -148,7 +152,9 @@ class _History:
         self._has_looked = False
 
     def add(self, stretch: Stretch) -> LagFit | None:
-        """Take the next stretch; how rates and turn compare, twice a second."""
+        """Add the next stretch. Returns, twice a second, how rates and turn compare over the
+        history; else None.
+        """
         if not stretch.whole.all() or (
             self._stretches and self._stretches[-1].to_ns != stretch.from_ns
         ):
@@ -158,7 +164,8 @@ class _History:
         self._stretches.append(stretch)
         while stretch.to_ns - self._stretches[0].to_ns > HISTORY_S * NS_PER_S:
             self._stretches.popleft()
-        # not yet due; a time far ahead is that of a sender that has started anew since
+        # The comparison is not yet due. A due time far ahead is from before the sender started
+        # anew, and does not count.
         if self._next_ns is not None and 0 <= self._next_ns - stretch.to_ns <= LAG_EACH_NS:
             return None
         self._next_ns = stretch.to_ns + LAG_EACH_NS
@@ -168,10 +175,11 @@ class _History:
 
 
 class RateCheck:
-    """Follows one sender: tells of wrong rates once, and of right ones after that.
+    """Checks the rates of one sender. One notice says that they are wrong, and one that they are
+    right again after that.
 
-    `wrong` says what is done with rates that are: "off" looks at nothing. `used` is False for a run
-    that draws without rates. `read_as` is how quaternions have been read.
+    `wrong` says what to do with wrong rates; with "off" nothing is checked. `used` is False for a
+    run that draws without rates. `read_as` is how quaternions have been read.
     """
 
     def __init__(
@@ -188,10 +196,10 @@ class RateCheck:
         self._notices = notices
         self._lengths = [_Length(length_s) for length_s in STRETCHES_S]
         self._history = _History()
-        # as rates were when their history showed them to be late or off
+        # the comparison by which the history showed rates to be late or off; None for others
         self._late: LagFit | None = None
         self._no_more = self._off_looks = 0
-        # by which share of the turn rates were off when they were found to be wrong
+        # the share of the turn by which rates were off when they were judged wrong
         self._was_off = 0.0
         self._last_ns: int | None = None
         self._without = 0  # packets in a row without a rate
@@ -199,11 +207,13 @@ class RateCheck:
 
     @property
     def distrusts(self) -> bool:
-        """Whether rates are left out now."""
+        """Whether rates are wrong at present, and are not to be used."""
         return self.cause is not None and self._use == "use-quaternions"
 
     def see(self, sample: AttitudeSample, host_ns: int | None = None) -> None:
-        """Take the next packet as it was sent, on the sender's own clock; it came at `host_ns`."""
+        """Check the next packet as it was sent, with times on the sender's own clock; `host_ns` is
+        the host time at which it came, None for a log.
+        """
         if self._use == "off" or not self._follows(sample):
             return
         self._without = self._without + 1 if sample.rate_cam_rad_s is None else 0
@@ -218,20 +228,21 @@ class RateCheck:
                 self._judge(length, host_ns)
 
     def believed(self, sample: AttitudeSample) -> AttitudeSample:
-        """The sample as it is to be drawn: without its rate where rates are wrong."""
+        """The sample to draw: without rate and acceleration where rates are not to be used."""
         if not self.distrusts or sample.rate_cam_rad_s is None:
             return sample
         return replace(sample, rate_cam_rad_s=None, acceleration_cam_rad_s2=None)
 
     def _follows(self, sample: AttitudeSample) -> bool:
-        """False for a packet that others overtook; a gap and a sender that starts anew begin
-        anew.
+        """Whether a packet follows the last one; False for one that others have overtaken. After a
+        gap, or where the sender starts anew, the stretches begin anew.
         """
         last_ns = self._last_ns
-        # a little earlier: overtaken, or sent twice
+        # A packet that is a little earlier was overtaken, or sent twice.
         if last_ns is not None and last_ns - RESTART_NS < sample.t_ns <= last_ns:
             return False
-        # much earlier is a sender that starts anew; across a gap nothing says how it turned
+        # One that is much earlier is of a sender that starts anew; and across a gap nothing says
+        # how the attitude turned.
         if last_ns is not None and not 0 < sample.t_ns - last_ns <= MAX_GAP_NS:
             self._restart()
         self._last_ns = sample.t_ns

@@ -1,13 +1,13 @@
-"""The text of a CCSDS Attitude Ephemeris Message, 1.0 (504.0-B-1) or 2.0 (504.0-B-2): KVN or XML to
-blocks of numbers.
+"""Reads the text of a CCSDS Attitude Ephemeris Message (AEM), 1.0 (504.0-B-1) or 2.0 (504.0-B-2),
+in KVN or XML, into blocks of numbers.
 
 An unknown keyword is refused, and so is a keyword of the other version: ignoring QUATERNION_TYP, or
 QUATERNION_TYPE in a version 2.0 file, would show another orientation than the writer meant. A file
 that is cut off is refused.
 
-XML goes through Python's expat parser, element by element. A DOCTYPE is refused where it begins, so
-no entity is expanded and nothing outside the text is read. Depth and element size are bounded, and
-of each state only the numbers are kept.
+XML is read by Python's expat parser, element by element. A DOCTYPE is refused where it begins, so
+that no entity is expanded and nothing outside the text is read. The depth, the number and the
+length of elements are limited, and of each state only the numbers are stored.
 """
 
 import difflib
@@ -53,7 +53,8 @@ METADATA = (
     ),
 )
 SECTIONS = {"header": HEADER, "metadata": METADATA}
-# Keywords that one version alone has (504.0-B-2 annex J), and what the other has in their place.
+# Keywords that only one version has (504.0-B-2 annex J): that version, and what the other version
+# has in their place.
 ONLY_IN = {
     "ATTITUDE_DIR": ("1.0", "2.0 always turns from REF_FRAME_A to REF_FRAME_B"),
     "QUATERNION_TYPE": ("1.0", "2.0 always has the scalar last"),
@@ -75,23 +76,24 @@ SPINS = frozenset({SPIN, SPIN_NUTATION, SPIN_NUTATION_MOM})
 AXES = {"1": 0, "2": 1, "3": 2, "X": 0, "Y": 1, "Z": 2}
 DAY_NS = 86_400 * NS_PER_S
 UNIX_DAY = date(1970, 1, 1).toordinal()
-# A leap second stands at 23:59:60 alone.
+# Only 23:59 has a second 60, the leap second.
 EPOCH = re.compile(
     r"(\d{4}-(?:\d\d-\d\d|\d{3}))T([01]\d|2[0-3]):([0-5]\d):([0-5]\d|(?<=23:59:)60)(?:\.(\d+))?Z?",
     re.ASCII,
 )
-MARKERS = {  # the section that a marker ends, and the one that it begins
+MARKERS = {  # the section that each marker ends, and the one that it begins
     "META_START": ("header", "metadata"),
     "META_STOP": ("metadata", "gap before DATA_START"),
     "DATA_START": ("gap before DATA_START", "data"),
     "DATA_STOP": ("data", "header"),
 }
-MAX_DEPTH = 12  # in an <ndm> a number stands nine deep
-MAX_ELEMENTS = 100_000  # besides the states, and in one of them
+MAX_DEPTH = 12  # a number in an <ndm> is nine elements deep
+# at one time: of the message outside the states that have been read, and in the present state
+MAX_ELEMENTS = 100_000
 LONG_ELEMENT = re.compile("<[^<]{1000000}")
 
-# A state's element in XML, and its numbers by their elements within it: in the order of KVN, the
-# quaternion's scalar first.
+# For each version and ATTITUDE_TYPE: a state's element in XML, and the paths in it of its numbers,
+# in the order of KVN with the quaternion's scalar first.
 Q = "quaternion/QC quaternion/Q1 quaternion/Q2 quaternion/Q3"
 Q_RATE = " quaternionRate/QC_DOT quaternionRate/Q1_DOT quaternionRate/Q2_DOT quaternionRate/Q3_DOT"
 TURNS = "rotationAngles/rotation1 rotationAngles/rotation2 rotationAngles/rotation3"
@@ -133,8 +135,8 @@ STATES = {
 
 
 class AemFaultError(Exception):
-    """What is wrong in an AEM, and where: a line (":12"), an epoch (", 2024-01-01T00:00:00") or
-    nowhere in particular.
+    """What is wrong in an AEM, and `where`, to append to the file's name: a line (":12"), an epoch
+    (", 2024-01-01T00:00:00") or "" for the file as a whole.
     """
 
     def __init__(self, where: str, detail: str) -> None:
@@ -144,8 +146,9 @@ class AemFaultError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Block:
-    """One block of data: its keywords; for each state its place and epoch; and `values` (n,
-    numbers), scalar first.
+    """One block of data: its keywords `meta`, those of the header among them; the place `where` and
+    the epoch of each of its n states; and their `values` (n, numbers) in the order of KVN, the
+    quaternion's scalar first, in the file's units.
     """
 
     meta: dict[str, str]
@@ -155,8 +158,8 @@ class Block:
 
 
 def _fault_of(key: str, section: str, version: str) -> str | None:
-    """Why a keyword (other than COMMENT) may not stand in the "header" or "metadata", and what
-    to write; None where it may.
+    """Why a keyword (other than COMMENT) is not allowed in a section ("header" or "metadata") of
+    an AEM of this version, and what to write; None where it is allowed.
     """
     if key in SECTIONS[section]:
         own, instead = ONLY_IN.get(key, (version, ""))
@@ -183,7 +186,9 @@ def _check_version(version: str) -> None:
 
 
 def _check_metadata(meta: dict[str, str], where: str) -> None:
-    """Raises AemFaultError for a version or type that is not supported, or a missing keyword."""
+    """Check the keywords of a block. Raises AemFaultError for a version or ATTITUDE_TYPE that is
+    not supported, a missing keyword, and a QUATERNION_TYPE other than FIRST or LAST.
+    """
     version = meta.get(VERSION_KEY, "missing")
     _check_version(version)
     for key in ("REF_FRAME_A", "REF_FRAME_B", "TIME_SYSTEM", "ATTITUDE_TYPE"):
@@ -204,14 +209,16 @@ def _check_metadata(meta: dict[str, str], where: str) -> None:
 
 
 def plain(value: str) -> str:
-    """A text value normalised for comparison: 504.0-B-2 6.8 ignores case, and treats blanks as
-    underscores.
+    """A text value in capitals, with single underscores for blanks, to be compared: 504.0-B-2 6.8
+    ignores case and treats underscores as blanks.
     """
     return "_".join(value.upper().replace("_", " ").split())
 
 
 def sequence(meta: dict[str, str]) -> tuple[int, int, int]:
-    """The axes (0 to 2) of EULER_ROT_SEQ, such as 321 or ZYX. Raises AemFaultError."""
+    """The three axes (0, 1, 2 for X, Y, Z) of EULER_ROT_SEQ, such as 321 or ZYX. Raises
+    AemFaultError for other text, and for an axis twice in a row.
+    """
     text = meta.get("EULER_ROT_SEQ", "missing")
     axes = [AXES.get(letter, -1) for letter in text]
     if len(axes) != 3 or -1 in axes or axes[0] == axes[1] or axes[1] == axes[2]:
@@ -224,10 +231,11 @@ def sequence(meta: dict[str, str]) -> tuple[int, int, int]:
 
 
 def epoch_ns(where: str, text: str) -> int:
-    """Nanoseconds from 1970-01-01T00:00:00 to an epoch (calendar or day-of-year form), rounded;
-    every day has 86400 s.
+    """The time of an epoch (calendar or day-of-year form), ns since 1970-01-01T00:00:00 on the
+    file's own time scale, rounded, with 86400 s in every day.
 
-    A leap second 23:59:60 is the next day's 00:00:00. Raises AemFaultError.
+    A leap second 23:59:60 is the next day's 00:00:00. Raises AemFaultError, at `where`, for text
+    that is no epoch.
     """
     match = EPOCH.fullmatch(text)
     day = _day(match[1]) if match else None
@@ -242,7 +250,9 @@ def epoch_ns(where: str, text: str) -> int:
 
 @lru_cache(maxsize=1024)
 def _day(text: str) -> int | None:
-    """Days from 1970-01-01 to YYYY-MM-DD or YYYY-DDD, or None when the calendar has no such day."""
+    """The days from 1970-01-01 to YYYY-MM-DD or YYYY-DDD; None where the calendar has no such
+    day.
+    """
     year, first, *second = map(int, text.split("-"))
     try:
         if second:
@@ -257,7 +267,9 @@ def _day(text: str) -> int | None:
 
 
 def epoch_text(t_ns: int) -> str:
-    """The calendar form of `t_ns` with all nine digits; exact for every 64-bit value."""
+    """The epoch, in calendar form with nine decimals of a second, of a time in ns since
+    1970-01-01T00:00:00 (days of 86400 s); exact for every 64-bit value.
+    """
     day, ns = divmod(t_ns, DAY_NS)
     seconds, ns = divmod(ns, NS_PER_S)
     clock = f"{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}.{ns:09}"
@@ -265,7 +277,9 @@ def epoch_text(t_ns: int) -> str:
 
 
 def kvn_blocks(text: str) -> list[Block]:
-    """The blocks of an AEM's text in KVN. Raises AemFaultError."""
+    """The blocks of an AEM's text in KVN. Raises AemFaultError for text that is no such AEM, or is
+    cut off.
+    """
     header: dict[str, str] = {}
     meta: dict[str, str] = {}
     rows: list[tuple[str, list[str]]] = []
@@ -360,8 +374,8 @@ class _Element:
         return AemFaultError(f":{self.line}", f"is not an AEM in XML ({detail})")
 
     def parts(self, *names: str) -> "list[_Element]":
-        """Its children, where all have one of these names and no text stands between them.
-        Raises AemFaultError.
+        """The element's children. Raises AemFaultError where a child has none of these names, or
+        text stands between them.
         """
         for child in self.children:
             if child.name not in names:
@@ -375,7 +389,7 @@ class _Element:
 
 @dataclass(slots=True)
 class _XmlSegment:
-    """The keywords of a <segment>, and of each of its states the epoch and the numbers."""
+    """The keywords `meta` of a <segment>, and the epoch and the numbers of each of its states."""
 
     meta: dict[str, str]
     epochs: list[str] = field(default_factory=list)
@@ -383,7 +397,9 @@ class _XmlSegment:
 
 
 def xml_blocks(text: str) -> list[Block]:
-    """The blocks of an AEM's text in XML. Raises AemFaultError."""
+    """The blocks of an AEM's text in XML, of an <aem> or an <ndm> with one. Raises AemFaultError
+    for text that is no such AEM, or is cut off.
+    """
     long = LONG_ELEMENT.search(text)
     if long is not None:
         line = text.count("\n", 0, long.start()) + 1
@@ -408,14 +424,14 @@ def xml_blocks(text: str) -> list[Block]:
 
 
 class _XmlReading:
-    """Handles elements as the parser meets them; a state that has ended is reduced to its
-    numbers.
+    """Handles elements as the parser reads them. At its end a state is reduced to its numbers, and
+    its elements are released.
     """
 
     def __init__(self) -> None:
         self.messages = 0
         self.segments: list[_XmlSegment] = []
-        # names come with their namespace and a blank before them
+        # With a separator, expat gives an element's name after its namespace and a blank.
         self.parser = expat.ParserCreate("utf-8", " ")
         self.parser.buffer_text = True
         self.parser.StartDoctypeDeclHandler = self._doctype
@@ -451,7 +467,7 @@ class _XmlReading:
         place = [each.name for each in self._open]
         if place[:1] == ["ndm"]:
             place = place[1:]
-            if not place and element.name != "aem":  # another message
+            if not place and element.name != "aem":  # another kind of message, which is passed over
                 self._let_go(element)
                 return
         if place == ["aem", "body", "segment"] and element.name == "metadata":
@@ -501,7 +517,9 @@ class _XmlReading:
 
 
 def _keywords(element: _Element, version: str) -> dict[str, str]:
-    """The keywords of a <header> or <metadata>. Raises AemFaultError."""
+    """The keywords in a <header> or <metadata> of an AEM of this version. Raises AemFaultError for
+    one that is unknown, of the other version, or there twice.
+    """
     given: dict[str, str] = {}
     for child in element.children:
         for inner in child.children:
@@ -522,8 +540,8 @@ def _keywords(element: _Element, version: str) -> dict[str, str]:
 
 
 def _state(holder: _Element, meta: dict[str, str]) -> tuple[str, list[float]]:
-    """The epoch of an <attitudeState>, and its numbers in the order of KVN. Raises
-    AemFaultError.
+    """The epoch of an <attitudeState>, and its numbers in the order of KVN with the scalar first.
+    Raises AemFaultError where its elements are not those of the ATTITUDE_TYPE.
     """
     name, paths = STATES[meta[VERSION_KEY]][meta["ATTITUDE_TYPE"]]
     if [child.name for child in holder.children] != [name]:
@@ -563,7 +581,9 @@ def _leaves(element: _Element, path: str) -> Iterator[tuple[str, _Element]]:
 
 
 def _key(path: str, leaf: _Element, wanted: list[str], meta: dict[str, str]) -> str:
-    """The path of a number in STATES; the axis of a rotation may stand in an attribute."""
+    """The path of a number as STATES writes it. The axis of a rotation may be an attribute of its
+    element. Raises AemFaultError where that axis is not the one of EULER_ROT_SEQ.
+    """
     if leaf.name not in {"rotation1", "rotation2", "rotation3"}:
         return path
     container = path.partition("/")[0]
@@ -586,7 +606,7 @@ def _number(leaf: _Element, key: str) -> float:
     for name, value in leaf.attributes.items():
         if name == "units" and value.lower() != unit:
             raise leaf.unlike(f"<{leaf.name}> in {value[:40]!r}; write {unit or 'no units'}")
-        # with a blank it is of a namespace
+        # a name with a blank has a namespace, and is not the AEM's
         if name not in {"units", "angle", "rate"} and " " not in name:
             raise leaf.unlike(f"<{leaf.name}> has no {name[:40]}")
     try:

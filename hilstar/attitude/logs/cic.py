@@ -1,13 +1,13 @@
 """CNES's CIC AEM, the attitude files of VTS and of the tools around it: CIC_AEM_VERS = 1.0 or 2.0.
 
-The keywords are those of a CCSDS AEM 1.0. What differs (the protocol's own comment in files of
-CNES's tools: "days (MJD), sec (UTC), q0 (real part), q1, q2, q3"):
+The keywords are those of a CCSDS AEM 1.0. Four things differ or need care (files of CNES's tools
+describe their columns in a comment: "days (MJD), sec (UTC), q0 (real part), q1, q2, q3"):
 1. No marker begins or ends the data, which follow META_STOP.
 2. A time is two columns, the modified Julian day (from 1858-11-17) and the seconds of that day, on
-   TIME_SYSTEM. An epoch in one column, as the CCSDS has it, is taken too.
-3. The real part of a quaternion comes first. Some writers state QUATERNION_TYPE = LAST and put it
-   first all the same, others put it last: such a file is read as a comment of its metadata names
-   the order ("q1, q2, q3, q0 (real part)"), and is refused without one.
+   TIME_SYSTEM. An epoch in one column, as the CCSDS writes it, is read too.
+3. The real part of a quaternion comes first. Of the writers that state QUATERNION_TYPE = LAST,
+   some put it first all the same and others put it last. Such a file is read only where a comment
+   of its metadata names the order ("q1, q2, q3, q0 (real part)"), and in that order.
 4. The quaternion is the AEM's: with A2B, its axis and angle turn the axes of REF_FRAME_A onto those
    of REF_FRAME_B, so hilstar's is its conjugate.
 """
@@ -34,16 +34,17 @@ VERSION_KEY = "CIC_AEM_VERS"
 VERSIONS = frozenset({"1.0", "2.0"})
 HEADER = frozenset({VERSION_KEY, "CREATION_DATE", "ORIGINATOR"})
 METADATA = frozenset(ccsds.METADATA)
-MARKERS = {"META_START": "metadata", "META_STOP": "data"}  # and the section that each begins
-FREE_KEYS = "USER_DEFINED_"  # which say nothing of the attitude
+MARKERS = {"META_START": "metadata", "META_STOP": "data"}  # the section that each marker begins
+FREE_KEYS = "USER_DEFINED_"  # keywords that begin so say nothing of the attitude
 MAX_BYTES = 50_000_000
-UNIX_MJD = 40_587
-# Sputnik's day and 2100: what is before is a day from 1950, as CNES's Julian days are.
+UNIX_MJD = 40_587  # the modified Julian day of 1970-01-01
+# From Sputnik's launch (1957-10-04) to the end of 2099. A smaller number is a day from 1950, as
+# CNES's own Julian days are.
 DAYS = range(36_115, 88_070)
-DAY_SECONDS = 86_401  # with a leap second
+DAY_SECONDS = 86_401  # of a day with a leap second
 FORM = "write the modified Julian day, its seconds and the quaternion, the real part first"
-UNNAMED_BODY = "UNDEFINED"  # what writers have in place of the spacecraft's frame
-# The order of the columns, as a comment names it.
+UNNAMED_BODY = "UNDEFINED"  # what some writers put where the spacecraft's frame belongs
+# Match a comment that names the columns with the real part first, or last.
 REAL_FIRST = re.compile(r"\bq0\b.*\bq1\b", re.IGNORECASE)
 REAL_LAST = re.compile(r"\bq1\b.*\bq2\b.*\bq3\b.*\b(?:q0|q4|qc|qs|qw)\b", re.IGNORECASE)
 FIRST, LAST = "FIRST", "LAST"
@@ -53,20 +54,22 @@ NAMED_FIRST, NAMED_LAST = "COMMENT q0 (real part), q1, q2, q3", "COMMENT q1, q2,
 
 @dataclass(slots=True)
 class _CicSegment:
-    """One segment as it is read: its keywords, each with its line, and its rows."""
+    """One segment of the file: its keywords `meta` and their `lines` in the file (":12"), and for
+    each row of data its place `where`, its epoch and its four numbers in the file's order.
+    """
 
     meta: dict[str, str]
     lines: dict[str, str] = field(default_factory=dict)
     where: list[str] = field(default_factory=list)
     epochs: list[str] = field(default_factory=list)
     rows: list[list[float]] = field(default_factory=list)
-    # Where a comment has the real part: FIRST or LAST.
+    # FIRST or LAST, as a comment says where the real part is; "" without such a comment
     named_order: str = ""
 
 
 @contextlib.contextmanager
 def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
-    from hilstar.attitude.logs.earth import q_icrs_to_date  # 30 ms
+    from hilstar.attitude.logs.earth import q_icrs_to_date  # takes 30 ms, which other logs save
 
     text = read_text(path, "write a shorter file", MAX_BYTES)
     notices: list[tuple[str, str]] = []
@@ -82,7 +85,7 @@ def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
 
 
 class _CicReading:
-    """Takes a file's lines in turn; `segments` are those that it has begun."""
+    """Reads a file's lines one by one; `segments` are the segments that have begun so far."""
 
     def __init__(self) -> None:
         self.segments: list[_CicSegment] = []
@@ -90,7 +93,9 @@ class _CicReading:
         self._header: dict[str, str] = {}
 
     def take(self, where: str, line: str) -> None:
-        """Take a line that is not empty. Raises AemFaultError."""
+        """Read a line that is not empty; `where` is its place (":12"). Raises AemFaultError for a
+        line that does not belong there.
+        """
         if line.startswith("COMMENT"):
             self._comment(line)
         elif line in MARKERS:
@@ -120,13 +125,16 @@ class _CicReading:
             _check_header(self._header)
             self.segments.append(_CicSegment({}))
         else:
-            # Before the rows: three angles in a row are refused by their type, not by their count.
+            # Checked before the rows are read, so that a file of Euler angles is refused for its
+            # ATTITUDE_TYPE, not for how many numbers its rows have.
             _check_metadata(self.segments[-1])
         self.section = MARKERS[line]
 
 
 def _segments(text: str) -> list[_CicSegment]:
-    """The segments of a file. Raises AemFaultError."""
+    """The segments of a file's text. Raises AemFaultError for a line that does not belong where it
+    stands, and for a text that is cut off.
+    """
     reading = _CicReading()
     number = 0
     for number, raw in enumerate(io.StringIO(text, newline=None), start=1):
@@ -198,7 +206,9 @@ def _add_row(segment: _CicSegment, where: str, words: list[str]) -> None:
 
 
 def _epoch(where: str, day_text: str, seconds_text: str) -> str:
-    """The epoch of a day and its seconds. Raises AemFaultError, ValueError and ArithmeticError."""
+    """The epoch, as CCSDS text, of a modified Julian day and the seconds of that day. Raises
+    AemFaultError for a day or seconds out of range, ValueError or ArithmeticError for no numbers.
+    """
     day = float(day_text)
     if not day.is_integer():
         raise AemFaultError(where, f"the day {day_text[:40]} is no whole number; {FORM}")
@@ -213,7 +223,9 @@ def _epoch(where: str, day_text: str, seconds_text: str) -> str:
 
 
 def _block(segment: _CicSegment, told: list[tuple[str, str]]) -> ccsds.Block:
-    """The segment as a block of an AEM 1.0 whose scalar is first. Raises AemFaultError."""
+    """The segment as a block of an AEM 1.0 with the scalar first; notices are appended to `told`.
+    Raises AemFaultError for a segment without rows, or whose order is unclear.
+    """
     meta = dict(segment.meta)
     if not segment.rows:
         end = segment.lines["ATTITUDE_TYPE"]
@@ -232,7 +244,9 @@ def _block(segment: _CicSegment, told: list[tuple[str, str]]) -> ccsds.Block:
 
 
 def _order(segment: _CicSegment) -> str:
-    """Where the real part is: FIRST or LAST. Raises AemFaultError where that is open."""
+    """Where the real part is: FIRST or LAST. Raises AemFaultError where the keyword and the
+    comments leave that unclear or contradict each other.
+    """
     stated = segment.meta.get("QUATERNION_TYPE", "")
     named = segment.named_order
     if stated in ("", FIRST) and named != LAST:

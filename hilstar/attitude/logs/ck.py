@@ -2,17 +2,17 @@
 evaluated by SPICE itself.
 
 Rules:
-1. The C-matrix turns components of a segment's reference frame into the structure's; SPICE turns
-   the reference into J2000,
-   its name of the axes of the ICRF.
-2. The angular velocity is the structure's with respect to J2000, in the structure's components. A
-   segment without one gives no
-   rate (types 1 and 3), or the rate of its own function by difference (types 2, 4, 5 and 6).
-3. `t_ns` is TDB nanoseconds since 1970-01-01T00:00:00 TDB, which the SCLK kernel computes from
-   ticks.
+1. The C-matrix turns components of a segment's reference frame into the structure's. SPICE turns
+   the reference frame into J2000, its name of the axes of the ICRF.
+2. The angular velocity is the structure's with respect to J2000, rad/s, in the structure's
+   components. A segment without one gives no rate (types 1 and 3), or a rate by differences of its
+   attitudes (types 2, 4, 5 and 6, which are functions of time).
+3. `t_ns` is TDB nanoseconds since 1970-01-01T00:00:00 TDB, which SPICE computes from clock ticks
+   by the SCLK kernel.
 4. Where nothing covers a time, or segments disagree, the previous attitude is held.
 
-SPICE runs in a process of its own (`ck_spice`).
+SPICE runs in a separate process (`ck_spice`): a damaged kernel may abort it, and the kernels of two
+logs would mix in one process.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ from hilstar.attitude.wire.source import Conventions, components
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import by_number
 
-BESIDE = (".tls", ".tsc", ".tf")  # leap seconds, clocks and frames, as NAIF ends their names
+BESIDE = (".tls", ".tsc", ".tf")  # NAIF's file endings of leap seconds, clocks and frames
 MAX_BESIDE = 30
 MAS_PER_RAD = math.degrees(1.0) * 3_600_000
 LONGEST_S = 600.0  # the largest CK takes a few minutes
@@ -44,10 +44,11 @@ Arrays = Mapping[str, npt.NDArray[Any]]
 
 
 def _kernels_beside(path: Path) -> list[Path]:
-    """The leap second, clock and frame kernels in the CK's folder, in that order and by name: a
-    later version counts.
+    """The leap second, clock and frame kernels in the CK's folder, in this order and within a kind
+    by name. SPICE uses the last where several differ, so a later version counts.
 
-    Versions are numbers: clock_10 comes after clock_9.
+    Numbers in names are compared as numbers: clock_10 comes after clock_9. Raises InputError where
+    the folder cannot be searched, or has more than MAX_BESIDE kernels.
     """
     try:
         files = [
@@ -68,7 +69,9 @@ def _kernels_beside(path: Path) -> list[Path]:
 
 
 def _beside_line(kernels: list[Path]) -> str:
-    """The kernels from beside the CK in their order, and which of several of one kind counts."""
+    """A notice's text: the kernels in the CK's folder in their order, and which one counts where
+    there are several of a kind.
+    """
     names = ", ".join(kernel.name for kernel in kernels) or "none"
     last_of_kind = {kernel.suffix.lower(): kernel.name for kernel in kernels}
     kinds = [kernel.suffix.lower() for kernel in kernels]
@@ -87,11 +90,11 @@ def _open(path: Path, stated: Stated) -> Iterator[LogReading]:
 
 
 def read_ck(path: Path, stated: Stated) -> LogReading:
-    """The attitudes of the CK's only structure, or of `stated.body` (an id or a name), with the
-    kernels stated or beside it.
+    """The attitudes of the CK's only structure, or of `stated.body` (an id or a name), by the
+    kernels `stated.kernels` or, without these, by those in the CK's folder.
 
-    Raises InputError for a file that is damaged, a kernel that is missing and a choice that is
-    open.
+    Raises InputError for a damaged file, a missing kernel, and a CK with several structures where
+    none is stated.
     """
     kernels = list(stated.kernels)
     notices = []
@@ -128,7 +131,9 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
 
 
 def _entries(arrays: Mapping[str, Any]) -> Iterator[LogEntry]:
-    """The attitudes of a CK's arrays, in their order; NaN is no rate."""
+    """The attitudes in the arrays of `ck_spice`, in their order; a rate of NaN means that there is
+    none.
+    """
     columns = [arrays[name].tolist() for name in ("t_ns", "q", "rate", "breaks", "tick")]
     for t_ns, q, rate, breaks, tick in zip(*columns, strict=True):
         known_rate = None if math.isnan(rate[0]) else rate
@@ -137,10 +142,14 @@ def _entries(arrays: Mapping[str, Any]) -> Iterator[LogEntry]:
 
 
 def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, dict[str, Any]]:
-    """Ask the process that runs SPICE: its arrays, and the rest of its answer."""
+    """The arrays that the process with SPICE answers for a CK, and the rest of its answer. Raises
+    InputError for what it refuses, where it breaks off, and after LONGEST_S.
+    """
     request = json.dumps(
         {"path": str(path), "kernels": [str(kernel) for kernel in kernels], "body": body}
     )
+    # The process imports hilstar from the same places as this one: -P keeps Python from adding the
+    # working directory to them, and "" stands for that directory.
     places = os.pathsep.join(place or str(Path.cwd()) for place in sys.path)
     try:
         done = subprocess.run(

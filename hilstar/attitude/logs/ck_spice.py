@@ -1,19 +1,18 @@
-"""The process that evaluates a CK with SPICE: a damaged kernel may abort it, and SPICE's kernel
-pool is global to a process.
+"""The process that evaluates a CK with SPICE. It is separate because a damaged kernel may abort it,
+and because SPICE's kernel pool is global to a process.
 
 A request is one JSON object on stdin: `path`, `kernels` and `body`. The answer is an NPZ file on
 stdout: the arrays of `_Sampled`, and `said`, JSON text with the rest, or with `error` alone. Times
-are spacecraft clock ticks throughout.
+are ticks of the spacecraft's clock throughout.
 
 1. SPICE reads the file: its list of segments (`daf...`), what they cover (`ckcov`) and their
-   attitudes (`ckgp`). What SPICE
-   trusts is checked before: a list of segments that never ends, counts, and quaternions that are
-   not unit.
-2. Of two segments at one time, SPICE takes the later one.
+   attitudes (`ckgp`). What SPICE trusts without a check is checked here before: that the list of
+   segments ends, that the counts fit, and that quaternions are unit.
+2. Where two segments cover one time, SPICE uses the later one in the file.
 3. Segments with attitudes at given times (types 1 and 3) are read at those times.
-4. Types 2, 4, 5 and 6 are functions of time. They are read at even steps, halved until the
-   interpolation between them is
-   within TARGET_RAD (and the clock's resolution), or until MAX_STEPS.
+4. Types 2, 4, 5 and 6 are functions of time. They are read at even steps, which are halved until
+   the interpolation between them is within TARGET_RAD (and the clock's resolution), or until there
+   are MAX_STEPS.
 5. There is a break between two pieces of coverage, unless they touch and their attitudes agree.
 """
 
@@ -48,11 +47,11 @@ WORD_BYTES = 8
 MAX_SUMMARY_WORDS = 125  # SPICE's own limit of a summary
 MAX_SUMMARIES = 100_000
 MAX_TEXT_BYTES, MAX_BINARY_BYTES = 50_000_000, 4_000_000_000
-MAX_NAMED = 1000  # kernels of one meta-kernel
+MAX_NAMED = 1000  # kernels, or path symbols, in one meta-kernel
 ADVICE = "give a SPICE kernel (.tls, .tsc, .tf, .tm, ...)"
-CK_DOUBLES, CK_INTEGERS = 2, 6
+CK_DOUBLES, CK_INTEGERS = 2, 6  # numbers in a segment's summary, which mark a DAF as a CK
 QUATERNION_WORDS, RATE_WORDS, TYPE_2_WORDS = 4, 3, 8
-DIRECTORY = 100  # every hundredth time stands in a directory too
+DIRECTORY = 100  # every hundredth time is also in the segment's directory
 TYPE_5_WORDS = {0: 8, 1: 4, 2: 14, 3: 7}  # words in a packet, by subtype
 TYPES = range(1, 7)
 Span = tuple[float, float]
@@ -63,23 +62,26 @@ FRAME = "J2000"  # SPICE's name of the axes of the ICRF
 SMOOTH = frozenset({2, 4, 5, 6})
 TARGET_RAD = math.radians(1e-3 / 3600)  # 1 mas, a hundredth of the best tracker's error
 FIRST_STEPS, MAX_STEPS = 128, 100_000  # for all smooth pieces together: 10 s at 0.1 ms each
-PROBES = 200  # places between samples at which the error is looked at
-# share of a step: no symmetry of an interpolation hides its error there
+PROBES = 200  # intervals between samples in which the error is measured
+# Where in the interval, as a share of it: an interpolation's symmetry may make its error 0 at a
+# half, but not here.
 PROBED = (math.sqrt(5) - 1) / 2
-# a rate by difference, whose error h^2 w''/6 is then 1/256 of that over the step
+# Half the span of a rate by difference, in steps: its error h^2 w''/6 is 1/256 of that with a whole
+# step.
 DIFFERENCE_STEPS = 1 / 16
-BESIDE_S = 2e-6  # beside a boundary: twenty times what ephemeris time resolves
-# a boundary's attitudes agree within this, and three times the turn in BESIDE_S
+BESIDE_S = 2e-6  # distance of samples from a boundary: twenty times what ephemeris time resolves
+# the attitudes at a boundary agree if they differ by at most this and three times the turn before
 JUMP_RAD = math.radians(1e-2 / 3600)
 ALL = Policy(max_extrapolation_ns=0, stale_after_ns=0)
 MAX_CK_BYTES = 500_000_000
-MAX_NAMED_BODIES = 12
+MAX_NAMED_BODIES = 12  # structures listed in a refusal
 CK_CLASS = 3  # SPICE's class of frames whose attitude is in CKs
 
 
 class Segment(NamedTuple):
-    """One segment of a CK by its summary: ticks of the clock, ids, its type, and its first and
-    last word in the file.
+    """One segment of a CK, from its summary: its `number` in the file, from 1; `start` and `stop`,
+    ticks; SPICE's ids of the structure (`body`) and of the `reference` frame; its type `kind`;
+    and its first and last word in the file, from 1.
     """
 
     number: int
@@ -94,8 +96,8 @@ class Segment(NamedTuple):
 
 
 class Coverage(NamedTuple):
-    """The intervals (n, 2) that a segment covers, and the times (n,) of its attitudes if it has
-    some, both increasing.
+    """The intervals (n, 2), ticks, that a segment covers, and the times (m,), ticks, of its
+    attitudes, both increasing; no times for a function of time.
     """
 
     intervals: FloatArray
@@ -104,10 +106,11 @@ class Coverage(NamedTuple):
 
 @contextmanager
 def _opened(spice: Any, path: Path) -> Iterator[int]:
-    """A DAF as SPICE opens it. Raises InputError for what is no regular file.
+    """SPICE's handle of a DAF, open within the `with`. Raises InputError for what is no regular
+    file.
 
-    An error leaves it open, for this process then ends; closing what SPICE has closed would hide
-    what it said.
+    An error leaves the DAF open, as this process then ends: SPICE may have closed it already, and
+    closing it once more would hide SPICE's message.
     """
     open_regular(path, ADVICE).close()
     handle = spice.dafopr(str(path))
@@ -119,9 +122,8 @@ def _summaries(spice: Any, path: Path, handle: int) -> Iterator[tuple[FloatArray
     """The doubles and integers of each summary of a DAF, in the file's order. Raises InputError for
     a list without an end.
 
-    SPICE follows a damaged list for ever, also where it only looks for an attitude. So the list is
-    walked, and
-    counted, before anything is looked for.
+    SPICE follows a damaged list for ever, even where it only looks for an attitude. So the list is
+    walked through, and its entries are counted, before SPICE searches it.
     """
     doubles, integers = spice.dafhsf(handle)
     spice.dafbfs(handle)
@@ -140,8 +142,8 @@ def _summaries(spice: Any, path: Path, handle: int) -> Iterator[tuple[FloatArray
 
 
 def read_segments(spice: Any, path: Path, handle: int) -> list[Segment]:
-    """The segments of a CK in the file's order. Raises InputError for another file and another
-    type of segment.
+    """The segments of a CK in the file's order. Raises InputError for another kind of file, a
+    segment of another type, and a file that is damaged or cut off.
     """
     if tuple(spice.dafhsf(handle)) != (CK_DOUBLES, CK_INTEGERS):
         raise InputError(f"{path}: is another kind of DAF than a CK")
@@ -172,14 +174,14 @@ def read_segments(spice: Any, path: Path, handle: int) -> list[Segment]:
 
 
 def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray:
-    """The times (n,) at which a segment of type 1 or 3 has attitudes; none for the other types.
+    """The times (n,), ticks, at which a segment of type 1 or 3 has attitudes; none for the other
+    types.
 
-    Raises InputError for a quaternion that is not unit: of one that is all zeros SPICE would make
-    an attitude. Types 1,
-    2, 3 and 5 begin with their packets, whose first words are the quaternion; in all but type 2
-    their times follow.
-    SPICE has no other way to them. Packets of types 4 and 6 are polynomials, which it checks
-    itself.
+    Raises InputError for a quaternion that is not unit, as SPICE would make an attitude even of one
+    that is all zeros, and for times or counts that do not fit. The words are read directly, as
+    SPICE has no other way to them: types 1, 2, 3 and 5 begin with their packets, whose first words
+    are the quaternion; in all but type 2 their times follow. The packets of types 4 and 6 are
+    polynomials, which SPICE itself checks.
     """
     if segment.kind in {4, 6}:
         return np.empty(0)
@@ -204,8 +206,8 @@ def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray
     epochs = numbers[packet_words * count : (packet_words + 1) * count]
     if not np.isfinite(epochs).all() or (np.diff(epochs) <= 0).any():
         raise InputError(f"{where}: its times do not increase; is the file damaged?")
-    # SPICE searches by a directory: the hundredth time (type 3), or the mean of it and the next
-    # (type 1).
+    # SPICE searches the times by a directory of every hundredth time (type 3), or of the mean of it
+    # and the next one (type 1). With a wrong one it would find a wrong attitude, or none.
     directory = numbers[(packet_words + 1) * count :][: (count - 1) // DIRECTORY]
     hundredth = epochs[DIRECTORY - 1 : -1 : DIRECTORY]
     following = epochs[DIRECTORY::DIRECTORY]
@@ -215,10 +217,11 @@ def _epochs(spice: Any, path: Path, handle: int, segment: Segment) -> FloatArray
 
 
 def _packets(words: FloatArray, segment: Segment) -> tuple[int, int]:
-    """How many packets a segment of type 1, 2, 3 or 5 has, and the words of each; 0 and 0 where
-    that cannot be told.
+    """How many packets a segment of type 1, 2, 3 or 5 has, and the words in each; 0 and 0 where
+    the segment's words do not say.
     """
-    # it states no count: packets of 8 words, two times each, and a directory of every hundredth
+    # Type 2 states no count. With each packet's 8 words and two times, and a directory of every
+    # hundredth time, 100 packets have 1001 words.
     if segment.kind == 2:
         return -(-(100 * len(words) + 1) // 1001), TYPE_2_WORDS
     trailer_words = {1: 1, 3: 2, 5: 5}[segment.kind]
@@ -231,14 +234,16 @@ def _packets(words: FloatArray, segment: Segment) -> tuple[int, int]:
 
 
 def _coverages(spice: Any, path: Path, segments: Sequence[Segment]) -> list[Coverage]:
-    """What each of these segments of one structure covers."""
+    """The coverage of each of these segments of one structure. Raises InputError for a damaged
+    one.
+    """
     with _opened(spice, path) as handle:
         epochs = [_epochs(spice, path, handle, segment) for segment in segments]
     intervals = _intervals(spice, path, segments)
     coverages = []
     for segment, own_epochs, own_intervals in zip(segments, epochs, intervals, strict=True):
-        # SPICE counts each instance of type 1 as an interval of its own; hilstar goes on from one
-        # to the next.
+        # SPICE counts each attitude of type 1 as an interval of its own; hilstar interpolates from
+        # one to the next.
         if segment.kind == 1:
             spans = own_epochs[[0, -1]].reshape(1, 2)
         else:
@@ -255,11 +260,10 @@ def _coverages(spice: Any, path: Path, segments: Sequence[Segment]) -> list[Cove
 
 
 def _intervals(spice: Any, path: Path, segments: Sequence[Segment]) -> list[FloatArray]:
-    """The intervals (n, 2) that each segment covers, by SPICE.
+    """The intervals (n, 2), ticks, that each segment covers, by SPICE.
 
-    SPICE tells the coverage of a structure, all its segments together, and which of two that
-    overlap has a gap is lost
-    in that. So each segment becomes a structure of its own, in a copy of the file.
+    SPICE gives the coverage of a structure by all its segments together, which hides a gap in one
+    of two that overlap. So in a copy of the file each segment becomes a structure of its own.
     """
     if len(segments) == 1:
         return [_covered(spice, path, segments[0].body, segments[0])]
@@ -276,7 +280,8 @@ def _intervals(spice: Any, path: Path, segments: Sequence[Segment]) -> list[Floa
 
 
 def _covered(spice: Any, path: Path, body: int, segment: Segment) -> FloatArray:
-    # No type takes fewer than two words of a segment for each interval's two bounds.
+    # Every type has at least two words for each interval's two bounds, so this cell is large
+    # enough.
     cell = spice.cell_double(segment.last_word - segment.first_word + 3)
     window = spice.ckcov(str(path), body, False, "INTERVAL", 0.0, "SCLK", cell)
     return np.array(list(window), dtype=np.float64).reshape(-1, 2)
@@ -284,8 +289,8 @@ def _covered(spice: Any, path: Path, body: int, segment: Segment) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class _Piece:
-    """Ticks from `start` to `stop` of a segment; `epochs` (n,) are the times strictly within at
-    which it holds attitudes.
+    """A part of a segment, from `start` to `stop`, ticks; `epochs` (n,) are the times strictly
+    between them at which the segment has attitudes.
     """
 
     segment: Segment
@@ -294,8 +299,9 @@ class _Piece:
     epochs: FloatArray
 
     def ticks(self, step: float) -> FloatArray:
-        """The ticks at which it is read, both ends among them; a long pause between them is
-        filled, as the file covers it.
+        """The ticks (n,) at which the piece is read, both ends among them; `step`, ticks, is for
+        functions of time. A long pause between given times (type 3) is filled, as the file covers
+        it, and would else count as a gap.
         """
         if self.stop <= self.start:
             return np.array([self.start])
@@ -320,8 +326,8 @@ class _Piece:
 
 
 def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
-    """The pieces of the segments of one structure, in order of time; segments come in the file's
-    order.
+    """The pieces of the segments of one structure, in order of time. The segments are `covered` in
+    the file's order: where they overlap, the later one counts, as in SPICE.
     """
     owners = [
         (segment, cover.epochs, *span)
@@ -331,7 +337,7 @@ def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
     if not owners:
         return []
     bounds = np.unique(np.array([owner[2:] for owner in owners]))
-    # the cell k is from bound k to bound k + 1; the last one stays empty
+    # Cell k goes from bound k to bound k + 1; the last cell has no owner.
     owner_of_cell = np.full(len(bounds), -1)
     owner_of_point = np.full(len(bounds), -1)
     for index, (_, _, start, stop) in enumerate(owners):
@@ -340,7 +346,7 @@ def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
         if start == stop:
             owner_of_point[cells.start] = index
     begins = np.flatnonzero(np.diff(owner_of_cell, prepend=-1))
-    # none begins where a CK has instants alone
+    # where a CK has single instants only, no span begins
     ends = np.append(begins[1:], len(bounds) - 1)[: len(begins)]
     spans = [
         (owner_of_cell[k], k, end)
@@ -366,8 +372,8 @@ def _pieces_of(covered: list[tuple[Segment, Coverage]]) -> list[_Piece]:
 
 @dataclass(frozen=True)
 class _Structure:
-    """A structure whose CK is loaded: `body` its id, `clock` that of its clock; `turning` where
-    all its segments have rates.
+    """A structure whose CK and kernels SPICE has loaded: `body` is its id, `clock` the id of its
+    clock; `turning` says whether all its segments have rates.
     """
 
     path: Path
@@ -383,8 +389,8 @@ class _Structure:
         return float(self.spice.sct2e(self.clock, tick))
 
     def t_ns(self, tick: float) -> int:
-        """TDB nanoseconds since 1970-01-01T00:00:00 TDB; a double of ephemeris time resolves 0.1
-        us.
+        """The time of a tick, TDB nanoseconds since 1970-01-01T00:00:00 TDB, to the 0.1 us that
+        SPICE's ephemeris time, a double, resolves.
         """
         seconds = self.t_s(tick)
         whole = int(seconds // 1)
@@ -406,11 +412,12 @@ class _Structure:
         return from_matrix(self.matrix(tick))
 
     def attitude(self, tick: float, with_rate: bool) -> tuple[FloatArray, FloatArray | None]:
-        """The attitude (4,), and the angular velocity (3,), rad/s, in the structure's components,
-        where its segment has one.
+        """The attitude q_icrs_to_body (4,) at a tick, and the angular velocity (3,), rad/s, in the
+        structure's components; None for that without `with_rate`, or where SPICE has none.
 
-        SPICE gives the angular velocity in components of the reference frame, and passes over
-        segments without one.
+        Asked for a rate, SPICE passes over segments without one, and may answer by another segment.
+        So its rate counts only where its matrix is that of `matrix`. SPICE gives the rate in
+        components of J2000.
         """
         if not with_rate:
             return self.q_icrs_to_body(tick), None
@@ -422,10 +429,11 @@ class _Structure:
         return from_matrix(matrix), matrix @ np.asarray(rate, dtype=np.float64)
 
     def rate_by_difference(self, tick: float, step: float, span: tuple[float, float]) -> FloatArray:
-        """The rate (3,) at a tick of a smooth segment, from attitudes `step` ticks away on both
-        sides within `span`.
+        """The rate (3,), rad/s, in the structure's components, at a tick of a function of time,
+        from its attitudes `step` ticks before and after.
 
-        At an end of the span, from two on one side (second order: 2 r(h) - r(2 h)).
+        Near an end of `span` (ticks) it is from two attitudes on one side, to second order too:
+        2 r(h) - r(2 h).
         """
         start, stop = span
         s_per_tick = (self.t_s(stop) - self.t_s(start)) / (stop - start)
@@ -448,10 +456,11 @@ class _Structure:
 class _Sampled:
     """n attitudes of a structure, and how good they are.
 
-    `t_ns` (n,); `q` (n, 4) is q_icrs_to_body; `rate` (n, 3), rad/s, in the structure's components,
-    NaN where there is none; `breaks` (n,) where nothing leads from the one before; `tick` (n,). For
-    segments that are functions of time, the step between them, s, and the largest error found
-    between them, rad; the lengths of the gaps of coverage, s.
+    `t_ns` (n,), TDB from 1970; `q` (n, 4) is q_icrs_to_body; `rate` (n, 3), rad/s, in the
+    structure's components, NaN where there is none; `breaks` (n,) is True where nothing is
+    interpolated from the attitude before; `tick` (n,). `step_s` and `error_rad` are the step of
+    functions of time (None without any) and the largest error measured between their samples.
+    `gaps_s` are the lengths of the gaps of coverage.
     """
 
     t_ns: npt.NDArray[np.int64]
@@ -465,8 +474,8 @@ class _Sampled:
 
 
 def sample(structure: _Structure, pieces: Sequence[_Piece]) -> _Sampled:
-    """The attitudes of pieces in order of time. Raises InputError for more than MAX_SAMPLES of
-    them.
+    """The attitudes of the pieces, which come in order of time. Raises InputError for more than
+    MAX_SAMPLES of them.
     """
     smooth = [
         piece for piece in pieces if piece.segment.kind in SMOOTH and piece.stop > piece.start
@@ -493,8 +502,8 @@ def sample(structure: _Structure, pieces: Sequence[_Piece]) -> _Sampled:
 
 
 def _step_of(structure: _Structure, smooth: Sequence[_Piece]) -> tuple[float, float]:
-    """The step of the smooth pieces, ticks, and the largest error between samples that far
-    apart, rad.
+    """The step for pieces that are functions of time, ticks, and the largest error measured between
+    samples with that step, rad.
     """
     total = sum(piece.stop - piece.start for piece in smooth)
     steps = FIRST_STEPS
@@ -517,12 +526,11 @@ def _step_of(structure: _Structure, smooth: Sequence[_Piece]) -> tuple[float, fl
 def _error_rad(
     structure: _Structure, piece: _Piece, ticks: FloatArray, k: int
 ) -> tuple[float, float]:
-    """How far the log's interpolation is off at one place between the ticks k and k + 1 of a piece,
-    rad.
-
-    And the share of it that no step mends: the turn in the time that a double of ephemeris time
-    does not resolve.
+    """The error, rad, of the log's interpolation at one place between the ticks k and k + 1 of a
+    piece, and the error, rad, that no smaller step removes: the turn in the time that ephemeris
+    time, a double, does not resolve.
     """
+    # two samples on each side, as the log's interpolation uses them
     near = []
     for t_ns, q, rate in zip(
         *_attitudes(structure, piece, ticks[max(k - 1, 0) : k + 3]), strict=True
@@ -544,8 +552,8 @@ def _error_rad(
 def _attitudes(
     structure: _Structure, piece: _Piece, ticks: FloatArray
 ) -> tuple[npt.NDArray[np.int64], FloatArray, FloatArray]:
-    """Times (n,), attitudes (n, 4) and rates (n, 3) of a piece; a smooth segment without rates
-    has them by difference.
+    """The times (n,), ns, attitudes (n, 4) and rates (n, 3), rad/s, of a piece at `ticks` (n,). A
+    function of time without rates gets them by difference.
     """
     by_difference = piece.segment.kind in SMOOTH and not piece.segment.has_rate and len(ticks) > 1
     if by_difference:
@@ -568,11 +576,12 @@ def _attitudes(
 def _parted(
     structure: _Structure, pieces: Sequence[_Piece], ticks: list[FloatArray]
 ) -> tuple[list[bool], list[float]]:
-    """Whether each piece begins with a break, after a gap or a jump, and the lengths of the gaps,
-    s.
+    """Whether each piece begins with a break, that is after a gap or a jump, and the lengths of the
+    gaps, s.
 
-    Where two pieces touch, both ends lie on one tick: `ticks` is changed to have one of them, or
-    both beside it. The attitude jumps there where it turns by more than it does in the same time
+    Where two pieces touch, both have a sample at the same tick. `ticks` is changed: without a jump
+    only the later piece has that sample, with a jump each has one a little to its side of it. The
+    attitude jumps where it turns by more than JUMP_RAD and three times its turn in equal time just
     before.
     """
     broken = [False]
@@ -598,8 +607,8 @@ def _parted(
 
 
 def load(spice: Any, path: Path, kernels: Sequence[Path]) -> None:
-    """Load the kernels and then the CK, which so comes before any other; files are checked first
-    (InputError).
+    """Load the kernels into SPICE, each after a check, and the CK last, so that it comes before any
+    other CK. Raises InputError for a kernel that is refused.
     """
     for kernel in kernels:
         for file in _checked(spice, kernel):
@@ -608,8 +617,9 @@ def load(spice: Any, path: Path, kernels: Sequence[Path]) -> None:
 
 
 def _checked(spice: Any, kernel: Path, meta: Path | None = None) -> list[Path]:
-    """The files of a kernel, checked before SPICE opens them: itself, or those that a
-    meta-kernel names.
+    """The files of a kernel: itself, or those that it names if it is a meta-kernel; all are checked
+    before SPICE opens them. Raises InputError for one that cannot be read, is too large, or is a
+    transfer file or a meta-kernel in a meta-kernel.
     """
     with open_regular(kernel, ADVICE if meta is None else f"{meta} names it") as file:
         head = file.read(HEAD_BYTES)
@@ -630,8 +640,8 @@ def _checked(spice: Any, kernel: Path, meta: Path | None = None) -> list[Path]:
 
 
 def _named(spice: Any, meta: Path) -> list[Path]:
-    """The kernels that a meta-kernel names, its path symbols replaced; from the working
-    directory, as SPICE has it.
+    """The kernels that a meta-kernel names, with its path symbols replaced. As in SPICE, relative
+    paths are relative to the working directory. Raises InputError where it names none.
     """
     names = ("KERNELS_TO_LOAD", "PATH_SYMBOLS", "PATH_VALUES")
     spice.ldpool(str(meta))
@@ -649,7 +659,9 @@ def _named(spice: Any, meta: Path) -> list[Path]:
 
 
 def _strings(spice: Any, name: str) -> list[str]:
-    """The strings of a variable of the pool; one that ends in + goes on in the next."""
+    """The strings of a variable in SPICE's kernel pool; one that ends in + continues in the next.
+    Raises InputError for more than MAX_NAMED of them.
+    """
     strings: list[str] = []
     for k in range(MAX_NAMED + 1):
         text, _, there = spice.stpool(name, k, "+")
@@ -660,7 +672,7 @@ def _strings(spice: Any, name: str) -> list[str]:
 
 
 def _in_words(error: Any) -> str:
-    """What SPICE says, and what to give where a kernel is missing."""
+    """SPICE's message in one line, and which kernel to give where one is missing."""
     reason = shortened(" ".join(str(error.long or error.explain or error.short).split()), 300)
     if "SCLK" in reason and ("not found" in reason or "kernel" in reason.lower()):
         return (
@@ -676,8 +688,8 @@ def _in_words(error: Any) -> str:
 
 
 def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sampled, dict[str, Any]]:
-    """The attitudes of the CK's structure, with its name and the frames that its segments refer
-    to. Raises InputError.
+    """The attitudes of a structure of the CK, and a table with its name (`structure`) and the
+    names of the frames that its segments refer to (`references`). Raises InputError.
     """
     import spiceypy
 
@@ -712,8 +724,8 @@ def answer(path: Path, kernels: list[Path], stated: str | None) -> tuple[_Sample
 
 
 def _body(spice: Any, path: Path, segments: list[Segment], stated: str | None) -> int:
-    """The id of the structure: the only one, or what the user states by a number, a frame's name
-    or a body's.
+    """The id of the structure: the only one in the CK, or the one that the user states by its id,
+    a frame's name or a body's name. Raises InputError where that is none, or several are left.
     """
     bodies = sorted({segment.body for segment in segments})
     named = ", ".join(_name(spice, body) for body in bodies[:MAX_NAMED_BODIES]) + (
@@ -748,7 +760,7 @@ def _name(spice: Any, body: int) -> str:
 
 
 def main() -> None:
-    """Answer the request on stdin."""
+    """Answer the request on stdin, on stdout (see the module)."""
     request = json.loads(sys.stdin.read())
     arrays: dict[str, Any] = {}
     try:

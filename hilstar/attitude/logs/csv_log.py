@@ -1,9 +1,9 @@
 """Attitude logs as CSV.
 
-Columns `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s), `sequence`, `discontinuity`,
-`valid`, in any order and any dialect of a text table; times and rates in the units that their
-columns state (`t_ms`, `rx [deg/s]`). Rows that the file marks as not valid are left out, and so is
-a last line that was cut off, each with a notice.
+The columns are `t_s,qw,qx,qy,qz` and, where known, `rx,ry,rz` (rad/s), `sequence`, `discontinuity`
+and `valid`, in any order and any dialect of a text table. Times and rates are in the units that
+their columns state (`t_ms`, `rx [deg/s]`). Rows that the file marks as not valid are left out, and
+so is a last line that was cut off; a notice says so.
 """
 
 import contextlib
@@ -39,12 +39,12 @@ from hilstar.basics.units import NS_PER_S
 CSV_COLUMNS = ("t_s", "qw", "qx", "qy", "qz")
 RATE_COLUMNS = ("rx", "ry", "rz")
 RATE_UNIT = "rad/s"
-# A JSON number that msgspec takes as an integer: what one format can hold, all can.
+# The integers that msgspec reads from JSON: a sequence that JSON lines can hold, CSV can hold too.
 WHOLE_NUMBERS = range(-(2**63), 2**64)
 INT64_NS = range(-(2**63), 2**63)
 DISCONTINUITY = {"": False, "0": False, "1": True}
 TIME_UNITS = {Decimal("1e-3"): "ms", Decimal("1e-6"): "us", Decimal("1e-9"): "ns"}
-# Columns by which other programs mark rows, in words or numbers of their own.
+# Names of columns in which other programs mark their rows; what the marks mean is not known here.
 MARKS = frozenset(
     [
         "status",
@@ -58,10 +58,11 @@ MARKS = frozenset(
         "tracking",
     ],
 )
-# Words that mark rows where the column has flags, and are about something else where it has not.
+# In a column's name these words announce marks only where its cells are flags; elsewhere, as in
+# an error in degrees, they name something else.
 FLAG_WORDS = frozenset({"ok", "good", "bad", "valid", "error", "err", "fault", "lost", "converged"})
-# Names that other programs give to angular rates. Whose axes and sign they have is not known, so
-# they are not taken for hilstar's; nor are they passed over without a word.
+# Names that other programs give to angular rates. Their axes and their sign are not known, so they
+# are not read as rates; a notice says so.
 RATES_OF_OTHERS = re.compile(
     r"(?:w|om|omega|rate|gyro|gyr|ang_?vel|angular_velocity|body_rate)_?[xyz]|[xyz]_?rate|[pqr]"
 )
@@ -72,13 +73,16 @@ TABLE_KIND, VALID_KIND, CUT_KIND = "log-table", "log-valid", "log-cut"
 
 @contextlib.contextmanager
 def read_csv_log(path: Path, stated: Stated) -> Iterator[LogReading]:
-    """The reading of a CSV. Raises InputError."""
+    """Open a CSV log; its attitudes are read as the entries are. Raises InputError for a header
+    without the columns of an attitude, or with one of them twice.
+    """
     scalar = (stated.convention or HILSTARS).scalar
     with open_table(path, readable(), MAX_LOG_BYTES) as table:
         csv_log = CsvLog(table, scalar)
         entries = itertools.starmap(LogEntry, csv_log.entries())
         reading = of_packets(path, entries, "CSV", stated)
-        # The last notices are known when the last row is read.
+        # Some notices are known only once the last row has been read. So the log and the reading
+        # share one list, to which the log adds these.
         reading.told.extend(csv_log.told)
         csv_log.told = reading.told
         conventions = replace(reading.conventions, time_unit=csv_log.time_unit)
@@ -86,10 +90,11 @@ def read_csv_log(path: Path, stated: Stated) -> Iterator[LogReading]:
 
 
 class CsvLog:
-    """A CSV log: its `entries`, once, and in `told` the notices, complete when these are read.
+    """A CSV log. Its `entries` can be read once; the notices `told` (kind, line) are complete after
+    that.
 
-    `time_unit` is that of its time column. With the scalar last, the quaternion's columns count as
-    x, y, z, w in turn.
+    `time_unit` is the unit of its time column: s, ms, us or ns. With `scalar` "last", the
+    quaternion's four columns are taken as x, y, z, w from left to right, whatever their names.
     Raises InputError for a header without the columns of an attitude, or with one of them twice.
     """
 
@@ -102,10 +107,12 @@ class CsvLog:
         table.advice = f"write finite numbers for {','.join(CSV_COLUMNS)}"
         of_the_head = list(table.notices)
         has_rates = any(table.chosen(name, RATE_UNIT) for name in RATE_COLUMNS)
-        table.notices[:] = of_the_head  # what is chosen is told when it is taken
+        # That look added notices about columns; choosing them below adds the right ones.
+        table.notices[:] = of_the_head
         names = CSV_COLUMNS + (RATE_COLUMNS if has_rates else ())
         self._t, *numbers = [self._needed(name, names) for name in CSV_COLUMNS]
-        # Whatever the columns are called: a table that says so by its names needs no statement.
+        # The convention overrides the columns' names: a table whose names say where the scalar is
+        # needs no convention.
         self._q = sorted(numbers) if scalar == "last" else numbers
         self._rates = [self._needed(name, names) for name in names[len(CSV_COLUMNS) :]]
         self._sequence = table.chosen("sequence")
@@ -163,7 +170,9 @@ class CsvLog:
             )
 
     def entries(self) -> Iterator[tuple[str, AttitudeSample | Refusal]]:
-        """Each attitude, or why it is refused, with its place in the file (":12"), in its order."""
+        """Each row's place in the file (":12"), and its attitude or why it is refused, in the
+        file's order.
+        """
         table = self.table
         if not table.columns:
             return
@@ -184,7 +193,9 @@ class CsvLog:
             self.told.append((CUT_KIND, CUT))
 
     def _conversions(self) -> list[Chosen]:
-        """The columns whose cells are not taken as they stand."""
+        """The columns whose cells must be converted first: all of them where the table has decimal
+        commas, else those in another unit or form.
+        """
         columns = [self._t, *self._q, *self._rates]
         if self.table.decimal_comma:
             return columns
@@ -203,10 +214,12 @@ class CsvLog:
             pass
         texts = [cells[column.place] for column in self._q]
         if all(map(is_no_number, texts)) and texts != ["nan"] * len(texts):
-            # An estimator that has not begun writes nothing, or a word, as another writes NaN.
+            # An estimator that has not begun yet writes nothing or a word where another writes
+            # NaN, so such a row is treated as one with NaN.
             return self._event(self._without_quaternion(cells))
         row = self.table.delimiter.join(cells)
-        if not row.isascii():  # a minus or a blank of typesetters
+        # A typographic minus or blank: `table.cell` reads such numbers.
+        if not row.isascii():
             try:
                 return self._sample(self._converted(cells, [self._t, *self._q, *self._rates]))
             except (ValueError, LookupError, ArithmeticError):
@@ -223,9 +236,12 @@ class CsvLog:
         return cells
 
     def _sample(self, cells: list[str]) -> AttitudeSample | Refusal:
-        """The attitude of a row, as sent. Raises ValueError, LookupError or ArithmeticError."""
+        """The attitude of a row in the log's own convention, or why it is refused. Raises
+        ValueError, LookupError or ArithmeticError for cells that are no numbers.
+        """
         t_ns = ns_of_seconds(cells[self._t.place])
         w, x, y, z = (cells[column.place] for column in self._q)
+        # float() would read 1_0 as 10
         if "_" in w + x + y + z:
             raise ValueError
         q = float(w), float(x), float(y), float(z)
@@ -249,7 +265,9 @@ class CsvLog:
 
 
 def invalid_notice(count: int, what: str) -> tuple[str, str]:
-    """The notice of rows or lines that a log itself marks as not valid."""
+    """The notice (kind, line) that `count` rows or lines (`what`), which a log itself marks as not
+    valid, are left out.
+    """
     if count == 1:
         number = f"1 {what} is"
     else:
@@ -258,7 +276,9 @@ def invalid_notice(count: int, what: str) -> tuple[str, str]:
 
 
 def write_csv_log(file: IO[bytes], samples: Sequence[AttitudeSample], writing: Writing) -> None:
-    """Write samples as a CSV log with every column, every bit of them."""
+    """Write samples as a CSV log with all columns except `valid`; a number read back has the same
+    bits.
+    """
     header = ",".join((*CSV_COLUMNS, *RATE_COLUMNS, "sequence", "discontinuity"))
     file.write(f"{header}\n".encode())
     for sample in samples:
@@ -275,7 +295,7 @@ def _seconds_text(t_ns: int) -> str:
     return f"{sign}{seconds}.{ns:09}"
 
 
-# What no other format takes is read as CSV.
+# A file that no other format recognises is read as CSV.
 log_format = LogFormat(
     "CSV",
     read_csv_log,

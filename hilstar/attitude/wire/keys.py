@@ -1,4 +1,5 @@
-"""CURVE keys for ZeroMQ: made, read, and required for non-loopback endpoints.
+"""CURVE keys for ZeroMQ: this module makes them, reads them, and refuses endpoints beyond this
+machine without them.
 
 The side that binds is the CURVE server, with an allow-list of its clients' public keys. The side
 that connects needs the server's public key. Key files are pyzmq certificates.
@@ -22,17 +23,16 @@ from hilstar.basics.reading import exists, read_bytes
 MAKE_KEYS = "make keys with `hilstar keys -o DIR`"
 MAX_KEY_FILE_BYTES = 16_384
 KEY_BYTES = 32
-OTHERS = 0o077  # file mode bits: the rights of its group and of everybody else
+OTHERS = 0o077  # file mode bits: the rights of the file's group and of all other users
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class CurveKeys:
-    """One side's keys: its own secret key file, and the peers that it trusts.
+    """One side's keys, as paths: its own secret key file, and the peers that it trusts.
 
-    `server_key` is the public key file of the side that binds, for the side that connects;
-    `allowed_clients` a
-    directory of public key files, for the side that binds.
+    The side that connects has `server_key`, the public key file of the side that binds. The side
+    that binds has `allowed_clients`, a directory with its clients' public key files.
     """
 
     secret_key: Path | None = None
@@ -41,7 +41,7 @@ class CurveKeys:
 
     @property
     def given(self) -> bool:
-        """True where any file is named."""
+        """True where at least one of the three paths is given."""
         return any((self.secret_key, self.server_key, self.allowed_clients))
 
 
@@ -49,7 +49,9 @@ NO_KEYS = CurveKeys()
 
 
 def check_reach(endpoint: Endpoint, text: str, *, bind: bool, keys: CurveKeys) -> None:
-    """Refuse (InputError) a non-loopback endpoint without its keys, and keys of the other side."""
+    """Check that the keys suit an endpoint, which the user wrote as `text`. Raises InputError for a
+    non-loopback endpoint without keys, and for keys that lack one that this side needs.
+    """
     if not keys.given:
         if not endpoint.loopback:
             raise InputError(
@@ -74,11 +76,11 @@ def check_reach(endpoint: Endpoint, text: str, *, bind: bool, keys: CurveKeys) -
 
 
 def make_keys(directory: Path) -> list[Path]:
-    """Make two key pairs, `server` for the side that binds and `client` for the other, and the
-    server's allow-list.
+    """Make two key pairs in a directory, `server` for the side that binds and `client` for the side
+    that connects, and the server's allow-list. Returns the paths of the files.
 
-    Only its owner can read a secret key, from its first byte on. Returns the paths. Raises
-    InputError where a key exists already: a key in use is never overwritten.
+    From its first byte on, only its owner can read a secret key. Raises InputError where a key
+    file exists already, as a key in use is never overwritten, or where the files cannot be written.
     """
     allowed = directory / "allowed_clients"
     written = [
@@ -95,8 +97,8 @@ def make_keys(directory: Path) -> list[Path]:
                 f"{there[0]}: exists already, and may be in use; choose another directory"
             )
         allowed.mkdir(parents=True, exist_ok=True)
-        # All keys are made in a temporary directory, then renamed into place: an incomplete set is
-        # useless.
+        # An incomplete set of keys is useless, so all are made in a temporary directory, and only
+        # then renamed into place.
         with tempfile.TemporaryDirectory(dir=directory, prefix=".keys") as folder:
             for name in ("server", "client"):
                 zmq.auth.create_certificates(folder, name)
@@ -113,13 +115,13 @@ def make_keys(directory: Path) -> list[Path]:
 
 
 def load_public(path: Path) -> bytes:
-    """The public key of a key file. Raises InputError."""
+    """The public key (Z85) in a key file. Raises InputError where it is missing or no key file."""
     return _load(path)[0]
 
 
 def load_secret(path: Path) -> tuple[bytes, bytes]:
-    """The public and the secret key of a secret key file; warns where others may read it. Raises
-    InputError.
+    """The public and the secret key (Z85) in a secret key file; logs a warning where other users
+    may read it. Raises InputError where it is missing, or contains no secret key.
     """
     public, secret = _load(path)
     if secret is None:
@@ -140,7 +142,8 @@ def _load(path: Path) -> tuple[bytes, bytes | None]:
     if not exists(path):
         raise InputError(f"{path}: no such key file; {MAKE_KEYS}")
     try:
-        read_bytes(path, MAKE_KEYS, MAX_KEY_FILE_BYTES)  # refuses pipes, devices and gigabytes
+        # pyzmq would read anything: this refuses pipes, devices and large files before that
+        read_bytes(path, MAKE_KEYS, MAX_KEY_FILE_BYTES)
         public, secret = zmq.auth.load_certificate(path)
         for key in (public, secret):
             if key is not None and len(z85.decode(key)) != KEY_BYTES:
@@ -151,12 +154,12 @@ def _load(path: Path) -> tuple[bytes, bytes | None]:
 
 
 class AllowList:
-    """The clients in a directory of public keys, reread whenever the directory or a file in it has
-    changed.
+    """The clients whose public keys are in a directory. The directory is read again at a handshake
+    where a key file has been added, removed or changed.
 
-    pyzmq calls `callback` at each handshake, in one thread. Raises InputError at the start where it
-    contains no key, or a file that is not a key; later such a file causes a warning, and its client
-    is rejected.
+    pyzmq calls `callback` at each handshake, in one thread. Raises InputError at the start where
+    the directory contains no key file, or one without a valid key. Later such a file causes a
+    warning, and its client is rejected.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -183,7 +186,9 @@ class AllowList:
         return key in self._keys
 
     def _look(self) -> dict[Path, tuple[int, int, int]]:
-        """Each key file, with what changes when it is written or replaced."""
+        """Each key file with its modification time, size and inode: at least one of them changes
+        when the file is written or replaced.
+        """
         file_stamps = {}
         with contextlib.suppress(OSError):
             for path in sorted(self._directory.glob("*.key")):

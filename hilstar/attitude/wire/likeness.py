@@ -1,11 +1,11 @@
 """What bytes that are no packet look like: text, HTTP, TLS, a packet in another byte order. Every
-link asks here.
+link uses this to describe what it refuses.
 
-Nothing is accepted by this: a refused message, or bytes that never end, are only named, so that
-their sender can be mended. Laws:
-1. Any bytes give a `Likeness`; nothing raises, and no more than MAX_LOOKED_AT bytes are looked at.
-2. `instead` says what to change where the bytes show it. It is "" where only the form of what is
-   expected helps.
+Nothing is accepted here. A refused message, or bytes that never end, are only named, so that the
+user can mend their sender. Laws:
+1. Any bytes give a `Likeness`; nothing raises, and `likeness` looks at MAX_LOOKED_AT bytes at most.
+2. `instead` says what to change where the bytes show it. It is "" where they do not, and only a
+   description of the expected form helps.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from hilstar.basics.errors import printable
 MAX_LOOKED_AT = 512
 SHOWN_CHARACTERS = 32
 SHOWN_BYTES = 8
-MIN_TEXT_BYTES = 4  # so many random bytes are all printable once in 50 times
-MIN_LEADING_TEXT_BYTES = 6
+MIN_TEXT_BYTES = 4  # shorter is not called text: 4 random bytes are all printable once in 50 times
+MIN_LEADING_TEXT_BYTES = 6  # before binary: 6 random bytes are all printable once in 300 times
 CRC_BYTES = 4
 ALL_ONES = 0xFFFFFFFF
-FRAME_BYTES = protocol.ATTITUDE_BYTES + 1  # an attitude's COBS frame, without its 0x00
+FRAME_BYTES = protocol.ATTITUDE_BYTES + 1  # an attitude's COBS frame, without its 0x00 at the end
 HEAD = bytes([VERSION, protocol.KIND_ATTITUDE])
-# in an attitude: version, kind, flags, sequence and t_ns precede it
+# the quaternion's offset in an attitude: version, kind, flags, sequence and t_ns precede it
 Q_AT = struct.calcsize("<BBHIq")
 HTTP = re.compile(
     rb"(?:GET|POST|PUT|HEAD|OPTIONS|DELETE|PATCH|CONNECT|TRACE) \S{1,300} HTTP/|HTTP/\d",
@@ -43,10 +43,12 @@ ZMTP_SIGNATURE_BYTES = 10  # 0xFF, eight of padding, 0x7F (rfc.zeromq.org, 23/ZM
 TLS_RECORDS = range(0x14, 0x18)  # RFC 8446, section 5.1: the type, then version 3.x
 SLIP_END = 0xC0  # RFC 1055
 PICKLE_PROTOCOLS = range(2, 6)
+# By the first byte of a frame, of version 1 and 2: how many bytes a frame has besides its payload,
+# without a signature and (version 2) with one.
 MAVLINK = {
     0xFE: (8,),
     0xFD: (12, 25),
-}  # start of a frame of version 1 and 2: bytes beside its payload, without and with signature
+}
 UBX = b"\xb5\x62"
 BITS_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 LITTLE_ENDIAN = "send it little-endian, CRC-32 included"
@@ -54,9 +56,9 @@ ZLIB_CRC = "end each packet with the CRC-32 of zlib, little-endian"
 
 
 class Likeness(NamedTuple):
-    """What bytes look like, and what to send instead; "" where the bytes do not show that.
+    """`what` bytes look like, and what to send `instead` ("" where the bytes do not show that).
 
-    `known` is false for bytes that look like nothing in particular: noise, or damage.
+    `known` is False for bytes that look like nothing in particular: noise, or a damaged packet.
     """
 
     what: str
@@ -65,7 +67,9 @@ class Likeness(NamedTuple):
 
 
 def likeness(data: bytes) -> Likeness:
-    """What a message, or the beginning of a stream, looks like."""
+    """What a message, or the beginning of a stream, looks like, by its first MAX_LOOKED_AT
+    bytes.
+    """
     beginning = data[:MAX_LOOKED_AT]
     for kind in (_protocol, _packet_inside, _serialised, _text):
         likely = kind(beginning)
@@ -82,8 +86,8 @@ def likeness(data: bytes) -> Likeness:
 
 
 def packet_likeness(message: bytes) -> Likeness | None:
-    """What is wrong with a packet whose CRC-32 does not fit, where that can be known; None where
-    it cannot.
+    """What is wrong with a packet (its last 4 bytes a CRC-32) whose CRC-32 does not fit: the
+    wrong CRC, the wrong byte order, or no packet at all. None where the bytes do not show it.
     """
     body = message[:-CRC_BYTES]
     given = message[-CRC_BYTES:]
@@ -109,15 +113,15 @@ def packet_likeness(message: bytes) -> Likeness | None:
 
 
 def numbers_likeness(message: bytes) -> Likeness | None:
-    """What is wrong with an attitude of the right CRC-32 whose numbers are refused; None where
-    that cannot be known.
+    """What is wrong with an attitude packet whose CRC-32 fits and whose numbers are refused: their
+    byte order. None where the bytes do not show it.
     """
     return _big_endian_numbers(message)
 
 
 def _telling(message: bytes) -> Likeness | None:
-    """The likeness of a message that is something else altogether; None for a packet that was
-    damaged on its way.
+    """The likeness of a message that is something other than a packet; None where it may be a
+    packet that was damaged on its way.
     """
     likely = likeness(message)
     if likely.known and message[: len(HEAD)] != HEAD:
@@ -140,19 +144,21 @@ def _is_unit(attitude: bytes, order: str) -> bool:
 
 
 def _unit_at(data: bytes, at: int, order: str) -> bool:
-    """Whether four float64 at a place have the norm 1; denormal numbers, as other fields look,
-    do not count.
+    """Whether the four float64 at the offset `at`, in byte order `order` ("<" or ">"), have the
+    norm 1, within NORM_TOLERANCE. Other fields read as float64 are mostly denormal, so their norm
+    is not 1.
     """
     norm = math.hypot(*struct.unpack_from(f"{order}4d", data, at))
     return abs(norm - 1.0) <= NORM_TOLERANCE
 
 
 def _other_crc(body: bytes, given: int) -> str:
-    """The name of another usual CRC with the same polynomial that fits; "" for none.
+    """The name of another usual CRC of the same polynomial by which `given` fits `body`; "" for
+    none.
 
-    Parameters as in the catalogue of parametrised CRC algorithms
-    (reveng.sourceforge.io/crc-catalogue). STM32's unit takes the body as 32-bit words, the most
-    significant bit first.
+    Parameters are those of the catalogue of parametrised CRC algorithms
+    (reveng.sourceforge.io/crc-catalogue). An STM32's unit takes the body as 32-bit words, the most
+    significant bit first; the words are little-endian in memory, so their bytes are swapped here.
     """
     forward = _unreflected(body)
     swapped = b"".join(body[at : at + CRC_BYTES][::-1] for at in range(0, len(body), CRC_BYTES))
@@ -167,13 +173,17 @@ def _other_crc(body: bytes, given: int) -> str:
 
 
 def _unreflected(body: bytes) -> int:
-    """CRC-32/BZIP2: zlib's, with the bits of each byte and of the result in the other order."""
+    """The CRC-32/BZIP2 of `body`: zlib's CRC-32, with the bits of each byte and of the result in
+    the other order.
+    """
     reversed_crc = zlib.crc32(body.translate(BITS_REVERSED)).to_bytes(CRC_BYTES, "little")
     return int.from_bytes(reversed_crc.translate(BITS_REVERSED), "big")
 
 
 def _protocol(data: bytes) -> Likeness | None:
-    """Another protocol, by its first bytes."""
+    """Another protocol that `data` begins like (HTTP, TLS, ZeroMQ, or one of vehicles); None where
+    it begins like none.
+    """
     if HTTP.match(data):
         return Likeness(
             f"HTTP, {_quoted(data)}",
@@ -206,7 +216,9 @@ def _protocol_of_vehicles(data: bytes) -> Likeness | None:
 
 
 def _packet_inside(data: bytes) -> Likeness | None:
-    """Our own packet, in the frame of another road, or cut."""
+    """A packet of hilstar itself that is framed as on another kind of link, or lacks its CRC-32;
+    None where there is none.
+    """
     unframed = unframed_packet(data)
     if unframed is not None:
         return unframed
@@ -220,8 +232,8 @@ def _packet_inside(data: bytes) -> Likeness | None:
 
 
 def unframed_packet(data: bytes) -> Likeness | None:
-    """A whole attitude among the bytes of a serial line that is in no COBS frame; None where
-    there is none.
+    """The likeness of serial bytes that contain a whole attitude outside any COBS frame, bare or
+    in SLIP; None where they contain none.
     """
     for at in range(len(data) - protocol.ATTITUDE_BYTES + 1):
         message = data[at : at + protocol.ATTITUDE_BYTES]
@@ -235,8 +247,8 @@ def unframed_packet(data: bytes) -> Likeness | None:
 
 
 def frame_likeness(body: bytes) -> Likeness:
-    """What the body of a frame, or bytes without a 0x00, look like where they are no COBS of a
-    packet.
+    """What a frame's body, or bytes without a 0x00, look like where they are not the COBS encoding
+    of a packet.
     """
     for at in range(len(body) - FRAME_BYTES + 1):
         if _is_attitude_frame(body[at : at + FRAME_BYTES]):
@@ -250,7 +262,7 @@ def frame_likeness(body: bytes) -> Likeness:
 
 
 def _beside_a_frame(before: bytes, after: bytes) -> Likeness:
-    """What stands beside a whole frame where only a 0x00 belongs."""
+    """What to say of a whole frame with bytes before or after it, where only a 0x00 belongs."""
     if after or not before:
         return Likeness(
             "COBS frames without an end", "send 0x00 after each, which COBS libraries do not add"
@@ -265,7 +277,9 @@ def _beside_a_frame(before: bytes, after: bytes) -> Likeness:
 
 
 def _is_attitude_frame(body: bytes) -> bool:
-    """Whether a body is the COBS of a whole attitude, whose first bytes are never 0."""
+    """Whether a body is the COBS encoding of a whole attitude. The attitude's first bytes, HEAD,
+    are never 0, so COBS leaves them as they are, after its own first byte.
+    """
     if len(body) != FRAME_BYTES or body[1 : 1 + len(HEAD)] != HEAD:
         return False
     try:
@@ -279,13 +293,17 @@ def _crc_fits(message: bytes) -> bool:
 
 
 def _serialised(data: bytes) -> Likeness | None:
-    """A form in which programs write objects, or bare numbers."""
+    """An object in a binary form (pickle, MessagePack, CBOR), or a quaternion of bare float64;
+    None for neither.
+    """
     if len(data) > 2 and data[0] == 0x80 and data[1] in PICKLE_PROTOCOLS:
         return Likeness("a Python pickle", "send json.dumps of the object")
     if b"t_ns" in data and LEADING_TEXT.fullmatch(data) is None:
         return Likeness(
             "an object in a binary form, such as MessagePack or CBOR", "send it as JSON text"
         )
+    # A quaternion alone is 32 bytes; with a time before it 40, with a rate after it 56, with both
+    # 64. So it begins at 0, or after the time at 8.
     for at in (0, 8) if len(data) in {32, 40, 56, 64} else ():
         for order, name in (("<", "little"), (">", "big")):
             if at + 32 <= len(data) and _unit_at(data, at, order):
@@ -297,8 +315,9 @@ def _serialised(data: bytes) -> Likeness | None:
 
 
 def _text(data: bytes) -> Likeness | None:
-    """Text, of one kind or another."""
-    text = data.removeprefix(b"\xef\xbb\xbf")
+    """Text of any kind: UTF-16, UTF-8, or text before binary; None for no text."""
+    text = data.removeprefix(b"\xef\xbb\xbf")  # the byte order mark of UTF-8
+    # UTF-16 begins with its own mark, or has a 0x00 as every other byte (of Latin letters).
     if data[:2] in {b"\xff\xfe", b"\xfe\xff"} or (
         len(data) >= 2 * MIN_TEXT_BYTES and not any(data[1::2]) and all(data[::2])
     ):
@@ -316,7 +335,8 @@ def _text(data: bytes) -> Likeness | None:
 
 
 def _is_utf8(text: bytes) -> bool:
-    """Whether bytes are UTF-8 text, the last character perhaps cut."""
+    """Whether bytes are UTF-8 text, of which the last character may be cut off."""
+    # a character has 4 bytes at most, so a cut one has up to 3
     whole = text.decode(errors="ignore")
     return (
         len(text) >= MIN_TEXT_BYTES
@@ -341,7 +361,7 @@ def _kind_of_text(text: bytes) -> Likeness:
 
 
 def _quoted(data: bytes) -> str:
-    """The first characters, as a person can read them."""
+    """The first SHOWN_CHARACTERS characters in quotes, as a person can read them."""
     shown = printable(data[:SHOWN_CHARACTERS].decode(errors="backslashreplace"))
     return f"'{shown}{'...' if len(data) > SHOWN_CHARACTERS else ''}'"
 

@@ -1,7 +1,8 @@
-"""The contract of every link into hilstar: a road, what its bytes mean, and limits against floods.
+"""The contract of every link into hilstar: a road, a decoder of its bytes, and limits against
+floods.
 
-A packet has two names on its way in: what arrived (`RawMessage`, once decoded `Arrival`), and the
-`AttitudeSample` in it.
+On its way in a packet is first a `RawMessage`, as it arrived; once decoded it is an `Arrival`, with
+an event such as an `AttitudeSample`.
 """
 
 from __future__ import annotations
@@ -32,14 +33,15 @@ if TYPE_CHECKING:
 
 MAX_PACKETS_PER_S = 3000  # decoded: some 10 % of one core, and more than any serial line carries
 MAX_BURST = 1000  # as many as may have waited while the receiver was stopped
-OVER_NS = NS_PER_S  # a flood is over once no packet was dropped for this long
-MAX_LOOKED_AT = 1000  # passed-over packets searched for a discontinuity, which is declared once
+OVER_NS = NS_PER_S  # a flood is over once no packet has been dropped for this long
+# Dropped packets that are searched for a discontinuity: a sender declares each only once.
+MAX_LOOKED_AT = 1000
 E_co = TypeVar("E_co", bound=Event, covariant=True)
 
 
 class FloodGate:
-    """Admits MAX_PACKETS_PER_S, and MAX_BURST at once, the newest. The others are passed over:
-    counted and reported.
+    """Admits at most MAX_PACKETS_PER_S messages per second, and MAX_BURST at once, always the
+    newest. The others are dropped unread; they are counted, and a notice says so.
     """
 
     def __init__(self, counts: LinkCounts, notices: Notices, clock: HostClock = HOST_CLOCK) -> None:
@@ -53,11 +55,11 @@ class FloodGate:
     def newest(
         self, waiting: list[RawMessage], declares_discontinuity: Callable[[bytes], bool]
     ) -> list[RawMessage]:
-        """The newest of the waiting messages (oldest first), as many as may be decoded. Pauses
-        where others are passed over.
+        """The newest of the `waiting` messages, as many as may be decoded now, both oldest first.
+        Sleeps for PAUSE_S where it drops others.
 
-        The newest passed-over message whose last part declares a discontinuity is taken too: no
-        attitude is interpolated across it.
+        Of the dropped messages the newest whose last part declares a discontinuity is returned too,
+        as no attitude may be interpolated across it.
         """
         now_ns = self._clock.now_ns()
         self._left = min(
@@ -85,11 +87,11 @@ class FloodGate:
 
 @dataclass(frozen=True, slots=True)
 class Arrival(Generic[E_co]):
-    """What arrived: host time, what it says, its bytes as received, and how long it may have waited
-    unread.
+    """A message that arrived: the host time of its arrival, ns, the event that it means, its bytes
+    as received, and how long it may have waited unread, ns.
 
-    `refusal` says why a packet that is an attitude is not used. `back` sends to the sender of this
-    message, and `address` is where that is, where a link has several senders.
+    `refusal` says why an attitude is not used. Where a link has several senders, `back` sends a
+    packet to the sender of this message, whose address is `address`.
     """
 
     host_ns: int
@@ -106,39 +108,42 @@ SampleArrival: TypeAlias = Arrival[AttitudeSample]
 
 @dataclass(frozen=True, slots=True)
 class TrackerCamera:
-    """The bench's tracker: its mounting, its size, and its field of view along y, degrees."""
+    """The camera of the bench's tracker: its mounting, a unit quaternion (4,), the number of its
+    pixels (x, y), and its field of view along y, degrees.
+    """
 
     q_body_to_cam: FloatArray
     resolution_px: tuple[int, int]
     field_of_view_deg: float
 
 
-# The picture (a PNG) of the tracker at an attitude, for a simulation that asks for it.
+# Gives the tracker's image (a PNG) at an attitude, for a simulation that asks for it.
 Pictures = Callable[[AttitudeSample], bytes]
 
 
 class Decoder:
-    """What the bytes of a road mean: which of them are a message, and what each says.
+    """Divides the bytes of a road into messages, and decodes these into events.
 
-    `conventions` are those of its numbers. `stamped`: messages carry their own times of arrival.
+    `conventions` say what the numbers in messages mean. `stamped`: messages carry their own times
+    of arrival.
     """
 
     stamped: ClassVar[bool] = False
     conventions: Conventions = PACKETS
 
     def begin(self) -> None:
-        """Forget the beginning of a message: the road was opened anew."""
+        """Discard an incomplete message, as the road was opened anew."""
 
     def whole(self, chunk: RawMessage) -> list[RawMessage]:
         """The messages that a chunk completes, in order."""
         return [chunk]
 
     def declares_discontinuity(self, message: bytes) -> bool:
-        """Whether a message says that no attitude is to be interpolated across it."""
+        """Whether a message states that no attitude may be interpolated across it."""
         return False
 
     def arrivals(self, messages: Iterable[RawMessage]) -> list[Arrival[Event]]:
-        """What whole messages say."""
+        """The arrivals that whole messages are decoded to, in their order."""
         return [self._arrival(message) for message in messages]
 
     def _arrival(self, message: RawMessage) -> Arrival[Event]:
@@ -146,13 +151,13 @@ class Decoder:
         return Arrival(message.host_ns, self.event(raw), raw, message.waited_ns)
 
     def event(self, message: bytes) -> Event:
-        """What a whole message says, or why it says nothing."""
+        """The event that a whole message means; a `Refusal` where it cannot be read."""
         raise NotImplementedError
 
 
 def pieces(chunk: RawMessage, messages: list[bytes]) -> list[RawMessage]:
-    """The messages that a chunk completed, each with its stamp: those before the last were there
-    earlier, and waited for it.
+    """The messages that a chunk completed, each with the chunk's stamp. The stamp is that of the
+    chunk's last byte, so all messages but the last may have waited, and are not `timely`.
     """
     return [
         chunk._replace(parts=[message], timely=chunk.timely and k == len(messages))
@@ -161,7 +166,9 @@ def pieces(chunk: RawMessage, messages: list[bytes]) -> list[RawMessage]:
 
 
 class PacketDecoder(Decoder):
-    """Packets or JSON, whole as they come, of which only the last part counts."""
+    """Decodes packets or JSON, of which each message is a whole one; of a message of several parts
+    only the last counts.
+    """
 
     def __init__(self, sent: SentAttitudes = AS_SENT) -> None:
         self.conventions = sent.conventions
@@ -177,12 +184,12 @@ class PacketDecoder(Decoder):
 
 
 class Link(Closing, ABC):
-    """A road into hilstar and what its messages mean, closed when its `with` ends.
+    """A road into hilstar with a decoder of its messages; it is closed when its `with` ends.
 
     `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"), `conventions`
     what its numbers mean. `steps`: its simulation waits for a frame after each attitude (lockstep).
-    `two_way`: packets can go back to the sender. `stamped`: times of arrival are the kernel's, or
-    of a process that only reads; else they are of the thread that reads here.
+    `two_way`: packets can be sent back to the sender. `stamped`: the kernel, or a process that only
+    reads, stamps arrivals; otherwise the thread that reads here does.
     """
 
     steps: ClassVar[bool]
@@ -197,28 +204,28 @@ class Link(Closing, ABC):
 
     @property
     def verb(self) -> str:
-        """What the road does with its endpoint, for a person."""
+        """What the road does with its endpoint, such as "connected to"."""
         return self._road.verb
 
     @property
     def endpoint(self) -> str:
-        """Where the road is."""
+        """The road's endpoint, such as "tcp://127.0.0.1:5560"."""
         return self._road.endpoint
 
     @property
     def link_counts(self) -> LinkCounts:
-        """What the road counts."""
+        """The road's counts of connections and messages."""
         return self._road.link_counts
 
     @property
     def stamped(self) -> bool:
-        """Whether times of arrival do not wait for this process."""
+        """Whether arrivals are stamped however busy this process is."""
         return self._road.stamped
 
     @property
     def trouble(self) -> str:
-        """Why the other side gives no messages, as far as that shows: a line; "" where it does
-        not.
+        """A line that says why the other side sends no usable messages; "" where nothing shows
+        that.
         """
         return self._road.trouble
 
@@ -232,7 +239,7 @@ class Link(Closing, ABC):
 
 
 class MessageLink(Link):
-    """A link whose messages are put together again from what its road brings."""
+    """A link that puts messages together from the pieces of bytes that its road brings."""
 
     def __init__(self, road: ByteRoad, decoder: Decoder) -> None:
         super().__init__(road, decoder.conventions)
@@ -245,8 +252,8 @@ class MessageLink(Link):
         return self._road.stamped or self._decoder.stamped
 
     def messages(self, timeout_ms: int) -> list[RawMessage]:
-        """The whole messages so far, oldest first; waits at most `timeout_ms` for the first
-        bytes.
+        """The messages that are complete by now, not decoded, oldest first; waits at most
+        `timeout_ms` for the first bytes.
         """
         whole: list[RawMessage] = []
         for chunk in self._road.taken(timeout_ms):
@@ -259,12 +266,12 @@ class MessageLink(Link):
         return whole
 
     def _begin(self) -> None:
-        """The road was opened anew."""
+        """Begin again with the decoder, as the road was opened anew."""
         self._decoder.begin()
 
 
 class StreamLink(MessageLink):
-    """A link whose sender runs freely."""
+    """A link whose sender runs freely, without waiting for answers."""
 
     steps: ClassVar[Literal[False]] = False
 
@@ -278,24 +285,24 @@ class StreamLink(MessageLink):
         return self._road.reconnects
 
     def receive(self, timeout_ms: int) -> list[Arrival[Event]]:
-        """The messages so far, oldest first, and only the newest of a flood; waits at most
-        `timeout_ms` for the first. A lost peer raises nothing.
+        """The arrivals since the last call, oldest first, and of a flood only the newest; waits at
+        most `timeout_ms` for the first. A lost peer raises nothing.
         """
         return self._decoder.arrivals(self.taken(timeout_ms))
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
-        """The same, not decoded."""
+        """The same messages as `receive`, not decoded."""
         return self._gate.newest(self.messages(timeout_ms), self._decoder.declares_discontinuity)
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once something unread has arrived."""
+        """True once something unread has arrived, False after `timeout_ms` without it."""
         return self._road.wait_for_message(timeout_ms)
 
     def send(self, packet: Packet) -> None:
-        """Send to the other side, never waiting; lost if there is no listener."""
+        """Send a packet to the other side without waiting; it is lost if nobody listens."""
 
     def wire_ns(self, packet: Packet) -> int:
-        """How long the wire alone takes for a packet, ns; negligible on most."""
+        """How long a packet takes on the wire itself, ns; 0 on links where that is negligible."""
         return 0
 
 
@@ -310,7 +317,9 @@ class LockstepLink(Link):
 
     @abstractmethod
     def answer(self, status: Status, shown_ns: int, refusal: Refusal | None) -> None:
-        """Answer the request, shown at a host time; a refused one left the last frame."""
+        """Answer the request, whose frame was shown at the host time `shown_ns`. With a `refusal`
+        the request changed nothing, and the last frame stayed.
+        """
 
     def show_camera(self, tracker: TrackerCamera, pictures: Pictures | None) -> None:
-        """What to answer a simulation that asks for its camera's pictures."""
+        """Set what to answer a simulation that asks for its camera's images."""

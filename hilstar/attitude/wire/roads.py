@@ -1,17 +1,20 @@
-"""The contract of every road into hilstar: how it opens, is lost and comes back, what it counts,
-how what comes is stamped, and what goes back.
+"""The contract of every road into hilstar, a way by which bytes come (a serial line, UDP, TCP,
+ZeroMQ, a file): how it opens, is lost and comes back, what it counts, how arrivals are stamped, and
+how bytes are sent back.
 
-A road brings bytes and knows nothing of what they mean. An attitude's link (`links`) is a road and
-a decoder behind a gate against floods; a tracker's answers (`hilstar.server.answers.reader`) are a
-road and their own decoder.
+A road brings bytes and knows nothing of what they mean. A link of attitudes (`links`) is a road and
+a decoder behind a gate against floods; a tracker's answers (`hilstar.server.answers.reader`) come
+by a road with a decoder of their own.
 
 Laws:
-1. A road that is there at the start is opened at the start; what cannot be opened is refused there.
-2. Losing the other side raises nothing: it is counted, told once, and the road is opened again, at
-   first after MIN_BACK_OFF_S and at least each MAX_BACK_OFF_S; that it is back is told once.
-3. A read that opens the road brings nothing: what a read brings is of the opening before it.
-4. A read waits at most as long as it is told to (or for TCP's handshake, 0.3 s), and a write never,
-   where it is not told to.
+1. A road whose other side is there at the start is opened at the start. One that cannot be opened
+   is refused there.
+2. Losing the other side raises nothing. It is counted, and one notice says so. The road is opened
+   again, first after MIN_BACK_OFF_S and then at least every MAX_BACK_OFF_S, and one notice says
+   that it is back.
+3. A read that opens the road returns nothing: what a read returns came by an earlier opening.
+4. A read waits at most for its `timeout_ms` (or for TCP's handshake, 0.3 s). A write waits at most
+   for its `patience_s`, by default not at all.
 """
 
 import errno
@@ -29,10 +32,10 @@ from hilstar.basics.notices import Notices
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff, HostClock
 
-MAX_READ_BYTES = 65_536  # in one go
+MAX_READ_BYTES = 65_536  # in one read
 MIN_BACK_OFF_S = 0.05
 PAUSE_S = 0.005  # a flooded receiver rests: the frame loop needs the interpreter lock
-MAX_BACK_OFF_S = 0.25  # what comes back is opened within a second
+MAX_BACK_OFF_S = 0.25  # so that a road is open again within a second of coming back
 
 ATTITUDES = RoadUse(
     table="[attitude]",
@@ -58,9 +61,10 @@ ANSWERS = RoadUse(
 class LinkCounts:
     """The counts of a road's connections and messages.
 
-    `connections`: made. `rejected`: failed handshakes, and datagrams of senders that are not
-    allowed. `refused`: too many at once. `lost`: ended, on the side that connects. `resets`: of the
-    link, for memory or for messages without end. `flooded`: messages dropped unread.
+    `connections`: connections made. `rejected`: failed handshakes, and connections and datagrams
+    of senders that are not allowed. `refused`: connections refused because there were too many at
+    once. `lost`: losses of the other side. `resets`: restarts of the link, because of its memory or
+    of messages without end. `flooded`: messages dropped unread.
     """
 
     connections: int = 0
@@ -71,7 +75,7 @@ class LinkCounts:
     flooded: int = 0
 
     def summary(self) -> dict[str, int]:
-        """The counts by name."""
+        """The counts by their names."""
         return asdict(self)
 
     def __add__(self, other: "LinkCounts") -> "LinkCounts":
@@ -82,10 +86,11 @@ class LinkCounts:
 
 
 class RawMessage(NamedTuple):
-    """What arrived, before it is decoded: host time in ns, its parts, and who sent it, where a link
-    has several senders.
+    """What arrived, before it is decoded: its parts, the host time of its arrival in ns, and the
+    address of its sender, where a link has several senders.
 
-    `empty_ns` is when nothing waited last. A `timely` message woke its reader and did not wait.
+    `empty_ns` is the last host time at which nothing waited, ns. A `timely` message was read as it
+    arrived; one that is not may have waited since `empty_ns`.
     """
 
     host_ns: int
@@ -96,17 +101,17 @@ class RawMessage(NamedTuple):
 
     @property
     def waited_ns(self) -> int:
-        """How long it may have waited before it was stamped, ns."""
+        """How long the message may have waited before it was stamped, ns; 0 if it was timely."""
         return 0 if self.timely else self.host_ns - self.empty_ns
 
 
 class ByteRoad(Closing, ABC):
-    """A way by which bytes come, closed when its `with` ends.
+    """A way by which bytes come; it is closed when its `with` ends.
 
-    `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"). `messages`: what
-    comes is whole by itself; else it is cut anywhere. `stamped`: times of arrival are the kernel's,
-    or of a process that only reads; else they are of the thread that reads here. `openings` counts
-    how often it was opened.
+    `verb` and `endpoint` say where it is ("connected to", "tcp://127.0.0.1:5560"). `messages`: each
+    item that comes is one whole message; otherwise bytes come in pieces that are cut anywhere.
+    `stamped`: the kernel, or a process that only reads, stamps arrivals; otherwise the thread that
+    reads here does. `openings` counts how often the road was opened.
     """
 
     messages: ClassVar[bool] = False
@@ -130,12 +135,12 @@ class ByteRoad(Closing, ABC):
 
     @property
     def notices(self) -> Notices:
-        """What hears of it."""
+        """The notices to which the road reports losses and returns."""
         return self._notices
 
     @property
     def clock(self) -> HostClock:
-        """What times it."""
+        """The clock by which the road stamps and waits."""
         return self._clock
 
     @property
@@ -145,31 +150,33 @@ class ByteRoad(Closing, ABC):
 
     @property
     def trouble(self) -> str:
-        """What is wrong with it for as long as it lasts: a line; "" while nothing is."""
+        """A line about what is wrong with the road at present; "" where nothing is."""
         return ""
 
     @abstractmethod
     def taken(self, timeout_ms: int) -> list[RawMessage]:
-        """What has come, in order; waits at most `timeout_ms` for the first."""
+        """The messages or pieces of bytes that have come, in order; waits at most `timeout_ms` for
+        the first.
+        """
 
     @abstractmethod
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once something unread has arrived."""
+        """True once something unread has arrived, False after `timeout_ms` without it."""
 
     def put(self, data: bytes, patience_s: float = 0.0) -> bool:
-        """Send to the other side, waiting at most `patience_s` while it takes nothing; False
-        where some was lost.
+        """Send to the other side, waiting at most `patience_s` while it accepts nothing; False
+        where not all bytes were sent.
         """
         return False
 
     def await_ready(self) -> None:
-        """Wait until a sender is heard from the first read on: for a process that reads, and not
-        for long.
+        """Wait, not for long, until no message is missed from the first read on. Only a road that
+        is read by a separate process needs this.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Close it."""
+        """Close the road."""
 
     def _opened(self) -> None:
         self.openings += 1
@@ -187,7 +194,10 @@ class ByteRoad(Closing, ABC):
     def _try_again(
         self, opens: Callable[[], None], failures: tuple[type[Exception], ...], timeout_ms: int
     ) -> None:
-        """Open what was lost once that is due; until then rest, at most `timeout_ms`."""
+        """Open a lost road again by `opens` where the next attempt is due, and put the attempt
+        after it off where this raises one of `failures`; before that only sleep, at most
+        `timeout_ms`.
+        """
         if not self._retry.over:
             self._clock.sleep(min(self._retry.left_s, timeout_ms / 1000))
             return
@@ -198,15 +208,16 @@ class ByteRoad(Closing, ABC):
 
 
 def is_readable(file: int, timeout_ms: float) -> bool:
-    """Whether bytes, or an end, wait at an open file, of any number; waits at most `timeout_ms`."""
+    """Whether bytes, or the end, can be read at a file descriptor; waits at most `timeout_ms`."""
+    # poll, as select refuses descriptors from 1024 on
     poll = select.poll()
     poll.register(file, select.POLLIN)
     return bool(poll.poll(timeout_ms))
 
 
 def read_device(file: int, timeout_ms: int, clock: HostClock = HOST_CLOCK) -> list[RawMessage]:
-    """The bytes that wait at an open device; waits at most `timeout_ms` for the first. Raises
-    OSError where it no longer answers.
+    """The bytes that wait at an open device, as at most one message; waits at most `timeout_ms` for
+    them. Raises OSError where the device has gone.
     """
     if not is_readable(file, timeout_ms):
         return []

@@ -1,5 +1,5 @@
-"""Serial ports: the road of a device that may be unplugged and come back, the link of COBS frames
-on it, lines of text, and the RTS output.
+"""Serial ports: a road of bytes by a device that may be unplugged and come back, the link of COBS
+frames on it, lines of text, and the output line RTS.
 """
 
 import contextlib
@@ -31,21 +31,21 @@ from hilstar.basics.units import NS_PER_S
 
 DEFAULT_BAUD = 115_200
 MAX_DRAIN_S, DRAIN_LOOK_S = 0.5, 0.005
-BITS_PER_BYTE = 10  # 8N1
-FRAMING_BYTES = 2  # the COBS byte and the 0x00
+BITS_PER_BYTE = 10  # 8N1: a start bit, 8 bits, a stop bit
+FRAMING_BYTES = 2  # the byte that COBS adds, and the 0x00 at the end
 READ_S = 0.05
 MAX_LINE_BYTES = 256
-# of a port on the network
+# what pyserial says where no server answers for a port on the network
 NO_SERVER = re.compile("refused|timed out|unreachable|No route", re.IGNORECASE)
 NOT_THERE = (errno.ENOENT, errno.ENODEV, errno.ENXIO)
-# What pyserial raises for a port that is gone: OSError from the system, the others from its own
-# port over a network.
+# What pyserial raises for a port that has gone: OSError from the system, the others from its own
+# ports over a network.
 LOST = (OSError, TypeError, ValueError)
 
 
 def serial_target(text: str) -> tuple[str, int] | None:
-    """Port and baud rate of "serial:/dev/ttyX@BAUD"; None for any other target. Raises
-    InputError.
+    """The port and the baud rate of "serial:/dev/ttyX@BAUD" (without @BAUD, DEFAULT_BAUD); None
+    for a target that is not serial. Raises InputError for one that is written wrong.
     """
     if not text.startswith("serial:"):
         return None
@@ -56,13 +56,13 @@ def serial_target(text: str) -> tuple[str, int] | None:
 
 
 def serial_ports() -> list[str]:
-    """The serial ports of this machine, each with its description."""
+    """The serial ports of this machine as text, each with its description in brackets."""
     return [f"{port.device} ({port.description})" for port in sorted(list_ports.comports())]
 
 
 def adapters() -> list[str]:
-    """What the serial ports are, without their names and serial numbers: "FT232R USB UART
-    (0403:6001)".
+    """The kinds of this machine's serial ports, with their USB ids and without names and serial
+    numbers, such as "FT232R USB UART (0403:6001)"; "2 x " precedes a kind that is there twice.
     """
     ports = sorted(list_ports.comports())
     kinds: Counter[str] = Counter()
@@ -75,9 +75,11 @@ def adapters() -> list[str]:
 
 
 def open_port(port: str, baud: int) -> serial.Serial:
-    """A port of its own, whose bytes come at once. Raises OSError, ValueError or OverflowError."""
+    """A port, opened for this process alone, whose reads do not wait. Raises OSError, ValueError or
+    OverflowError where it cannot be opened at this baud rate.
+    """
     device = serial.Serial(port, baud, timeout=0, exclusive=True)
-    # else a USB adapter buffers for 16 ms; a pty has no such mode
+    # A USB adapter otherwise buffers for 16 ms. A pty has no such mode.
     with contextlib.suppress(OSError, ValueError):
         device.set_low_latency_mode(True)
     return device
@@ -127,15 +129,17 @@ class SerialRoad(ByteRoad):
         return read_device(device.fileno(), timeout_ms, self._clock)
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once unread bytes wait."""
+        """True once unread bytes wait, False after `timeout_ms` without any."""
         device = self._device
         try:
             return device is not None and is_readable(device.fileno(), timeout_ms)
-        except LOST:  # gone: `taken` notices, and reports it
+        except LOST:  # `taken` notices that the device has gone, and reports it
             return False
 
     def put(self, data: bytes, patience_s: float = 0.0) -> bool:
-        """See `ByteRoad.put`: what a full line does not take within `patience_s` is lost."""
+        """See `ByteRoad.put`: bytes that a full line does not accept within `patience_s` are
+        lost.
+        """
         device = self._device
         if device is None:
             return False
@@ -154,13 +158,13 @@ class SerialRoad(ByteRoad):
         return not data
 
     def drain(self) -> None:
-        """Wait until the bytes sent have left the machine; drop those that a stalled line does
-        not take.
+        """Wait until the sent bytes have left the machine, at most MAX_DRAIN_S, and drop those that
+        a stalled line has not accepted by then.
         """
         deadline = self._clock.within(MAX_DRAIN_S)
         with contextlib.suppress(OSError, TypeError, termios.error):
             while self._device is not None and self._device.out_waiting:
-                if deadline.over:  # closing it would block for half a minute
+                if deadline.over:  # with unsent bytes, closing would block for half a minute
                     self._device.reset_output_buffer()
                     return
                 self._clock.sleep(DRAIN_LOOK_S)
@@ -182,8 +186,8 @@ class SerialRoad(ByteRoad):
 
 
 class SerialRoadApart(SerialRoad):
-    """A SerialRoad whose bytes a process of its own reads and stamps; it is opened and written to
-    here.
+    """A SerialRoad whose bytes a separate process reads and stamps. This process opens the port and
+    writes to it.
 
     Raises InputError where the port cannot be opened at the start, MachineError where it is not
     there.
@@ -204,7 +208,7 @@ class SerialRoadApart(SerialRoad):
         self._reader = ReaderProcess(self._notices, clock=clock)
 
     def await_ready(self) -> None:
-        """Wait until the device can be read, or for a moment."""
+        """Wait, not for long, until the separate process is ready to read."""
         self._reader.await_ready()
 
     def _read(self, device: serial.Serial, timeout_ms: int) -> list[RawMessage]:
@@ -221,11 +225,12 @@ class SerialRoadApart(SerialRoad):
         return [record.message for record in records if record.message is not None]
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once something has come that was not read."""
+        """True once something unread has come, False after `timeout_ms` without it."""
         return self._device is not None and self._reader.wait(timeout_ms)
 
     def _shut(self) -> None:
-        if self._given is not None:  # else its line would stay open and locked
+        # The process must let go of the device, or the port would stay open and locked.
+        if self._given is not None:
             self._given = None
             self._reader.read()
         super()._shut()
@@ -237,7 +242,7 @@ class SerialRoadApart(SerialRoad):
 
 
 class FrameSplitter(wire.StreamDecoder):
-    """A StreamDecoder that keeps the newest bytes as they came."""
+    """A StreamDecoder that also stores the newest MAX_LOOKED_AT bytes as they came (`recent`)."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -250,7 +255,7 @@ class FrameSplitter(wire.StreamDecoder):
 
 
 class SerialDecoder(Decoder):
-    """COBS frames, each ended by 0x00, and the packets in them."""
+    """Divides bytes into COBS frames, each ended by 0x00, and decodes the packets in them."""
 
     def __init__(self, sent: SentAttitudes = AS_SENT) -> None:
         self.conventions = sent.conventions
@@ -275,9 +280,9 @@ class SerialDecoder(Decoder):
         return self._splitter.unended
 
     def event(self, message: bytes) -> wire.Event:
-        """What a frame says. One that says nothing may be a piece of a packet that was not
-        framed, cut at its zeros.
-        """
+        """The event of a frame; a `Refusal` where it is none."""
+        # A packet that was sent without COBS is cut at its zeros into frames that mean nothing. So
+        # the bytes as they came are searched for one, to name that fault.
         event = self._decode(message)
         if not isinstance(event, wire.Refusal) or event.reason != "format":
             return event
@@ -314,23 +319,23 @@ class SerialLink(StreamLink):
 
     @property
     def trouble(self) -> str:
-        """See `Link.trouble`: the bytes that came, and are no frame."""
+        """A line about bytes that came and contain no end of a frame; "" without such bytes."""
         unended = self._decoder.unended
         if unended:
             return f"{self.endpoint}: {wire.unended_line(unended)}"
         return ""
 
     def _begin(self) -> None:
-        """The other side's first frame after a gap begins anew, too."""
+        """Begin anew after a gap, here and, by a 0x00, with the other side's next frame."""
         super()._begin()
         self.send_bytes(wire.DELIMITER)
 
     def send(self, packet: wire.Packet) -> None:
-        """Send to the other side without waiting: what the line does not take at once is lost."""
+        """Send a packet without waiting; bytes that the line does not accept at once are lost."""
         self.send_bytes(wire.frame(packet))
 
     def send_bytes(self, data: bytes, patience_s: float = 0.0) -> bool:
-        """Send bytes as they are: see `ByteRoad.put`."""
+        """Send bytes without a frame; see `ByteRoad.put`."""
         return self._road.put(data, patience_s)
 
     def drain(self) -> None:
@@ -338,12 +343,12 @@ class SerialLink(StreamLink):
         self._road.drain()
 
     def wire_ns(self, packet: wire.Packet) -> int:
-        """How long a packet's frame takes at this baud rate."""
+        """How long a packet's frame takes at this baud rate, ns."""
         return (len(wire.encode(packet)) + FRAMING_BYTES) * BITS_PER_BYTE * NS_PER_S // self._baud
 
 
 class SerialApart(SerialLink):
-    """A SerialLink whose bytes a process of its own reads and stamps; they are decoded here."""
+    """A SerialLink whose bytes a separate process reads and stamps; they are decoded here."""
 
     road_kind = SerialRoadApart
 
@@ -353,8 +358,8 @@ def _reason(error: Exception) -> str:
 
 
 def opening_refusal(where: str, error: BaseException, port: str) -> HilstarError:
-    """The refusal of a port that could not be opened: a NotThereError where the device is not
-    there, else an InputError.
+    """The error to raise for a port that could not be opened: a NotThereError where the device, or
+    the server of a network port, is not there, else an InputError.
     """
     if getattr(error, "errno", None) in NOT_THERE:
         if not port.startswith("/") and Path("/dev", port).exists():
@@ -371,7 +376,7 @@ def opening_refusal(where: str, error: BaseException, port: str) -> HilstarError
 
 
 def _opening_fault(error: BaseException, port: str) -> str:
-    """Why a port that is there could not be opened, and what to do."""
+    """A text that says why a port that is there could not be opened, and what to do."""
     text = str(error).lower()
     if "permission" in text:
         instead = "join the group that owns it (often dialout)"
@@ -390,8 +395,8 @@ def _opening_fault(error: BaseException, port: str) -> str:
 def read_lines(
     port: str, baud: int, seconds: float, clock: HostClock = HOST_CLOCK
 ) -> Iterator[tuple[int, bytes]]:
-    """Host time (monotonic ns, less the time on the wire) and text of each line that arrives within
-    `seconds`.
+    """The host time and the text of each line that arrives within `seconds`. The time is monotonic,
+    ns, from which the line's time on the wire is subtracted: that of its first bit.
 
     Raises InputError where the port cannot be opened, or disappears.
     """
@@ -420,8 +425,8 @@ def read_lines(
 
 
 class RtsLine:
-    """RTS of a port, such as "/dev/ttyUSB0" or a URL of pyserial; at rest it is cleared, or set
-    where `active_high` is false.
+    """The output line RTS of a port, such as "/dev/ttyUSB0" or a URL of pyserial. At rest it is
+    cleared, or set where `active_high` is False.
 
     Raises InputError where the port cannot be opened, or has no such line. The system itself may
     set RTS for a moment while it opens a port.
@@ -445,13 +450,14 @@ class RtsLine:
 
     @property
     def is_open(self) -> bool:
-        """Whether there is a port to pulse."""
+        """Whether the port is open, so that RTS can be set."""
         return self._device is not None
 
     def open(self) -> None:
         """Open the port, with the line at rest. Raises one of LOST."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", DeprecationWarning)  # pyserial's own, of threads
+            # pyserial itself uses deprecated methods of threads
+            warnings.simplefilter("ignore", DeprecationWarning)
             device = serial.serial_for_url(self.port, do_not_open=True, exclusive=True)
             device.rts = not self._active_high
             try:
@@ -460,7 +466,8 @@ class RtsLine:
                 _shut(device)
                 raise
         self._device = device
-        device.rts = not self._active_high  # opening suppresses that a port has no such line
+        # Set again, as `open` hides the error of a port without RTS, which this raises.
+        device.rts = not self._active_high
 
     def set(self, active: bool) -> None:
         """Bring the line to its active level, or to rest. Raises one of LOST."""
@@ -479,7 +486,7 @@ class RtsLine:
 
 
 def _shut(device: serial.SerialBase) -> None:
-    """Close a port, and the socket that pyserial leaves open where its other side has gone."""
+    """Close a port, and the socket that pyserial does not close where its other side has gone."""
     behind = getattr(device, "_socket", None)
     with contextlib.suppress(*LOST):
         device.close()

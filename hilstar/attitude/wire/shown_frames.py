@@ -1,19 +1,19 @@
-"""The frames that a display shows, sent to whoever watches: over ZeroMQ, each a message of three
-parts.
+"""The frames that a display shows, sent over ZeroMQ to every program that watches. Each frame is
+one message of three parts.
 
-1. A JSON object: `frame` (its number), `lit_ns` (when its light begins, `time.monotonic_ns()` of
-   this machine: of a screen
-   when the middle row lights; without one half a refresh period before the moment of `q`, which
-   then stands for the half period before it and the one after it), `q` (q_icrs_to_cam, null for a
-   blank frame), `width`, `height`, `bits`,
-   `channels` (1, or 3 where the primaries are driven apart), `bench_sha256`.
-2. The lit pixels, uint32, little-endian: row * width + column, rising. All others have code 0.
-3. Their codes: uint8, or uint16 little-endian above 8 bits; `channels` of each.
+1. A JSON object: `frame` (the frame's number), `lit_ns` (when its light begins, in ns of this
+   machine's `time.monotonic_ns()`: with a screen, when the middle row lights; without a screen,
+   half a refresh period before the time of `q`), `q` (q_icrs_to_cam, unit, scalar first; null for
+   a blank frame), `width` and `height` (px), `bits` of a code, `channels` (1, or 3 where the
+   primaries are driven apart), `bench_sha256`.
+2. The flat indices of the lit pixels, row * width + column, in rising order: uint32,
+   little-endian. All other pixels have code 0.
+3. The codes of these pixels, `channels` for each: uint8 up to 8 bits, else uint16, little-endian.
 
 A frame of stars has some thousand lit pixels of two million, so its message has 20 to 100 kB and
 needs no shared memory.
-A frame is lit until the next one is. The sender keeps few frames for a watcher: one that is slow
-loses frames, and its gap in `frame` says so.
+A frame stays lit until the next one is. The sender queues few frames for each watcher: a slow
+watcher loses frames, and notices it by a gap in `frame`.
 """
 
 import contextlib
@@ -31,14 +31,17 @@ from hilstar.attitude.wire.zmq_links import ZmqRoad, ZmqSender
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import one_line
 
-KEPT_FRAMES = 8  # at the sender for each watcher, an eighth of a second at 60 Hz
-WAITING_FRAMES = 64  # at the watcher, which reads between two answers
-MAX_FRAME_BYTES = 1 << 27  # every pixel of 4K, three channels of 16 bits
+KEPT_FRAMES = 8  # the sender's queue for each watcher, an eighth of a second at 60 Hz
+WAITING_FRAMES = 64  # the watcher's own queue: it reads only between two answers
+MAX_FRAME_BYTES = 1 << 27  # a part with every pixel of 4K, three channels of 16 bits, fits
 MAX_SIDE_PX = 32_768
-HEAD_BEGINS = b'{"frame":'  # a topic asks for frames where it begins so, or this begins with it
-SUBSCRIBES, UNSUBSCRIBES = 1, 0  # the first byte of what a watcher sends
-MAX_TOPICS = 64  # of a connection; one with more counts as watching until it ends
-MAX_READ = 1000  # subscriptions in one look: one who floods delays no frame
+# ZeroMQ matches the beginning of a message: a topic selects frames where it begins with this, or
+# this begins with it.
+HEAD_BEGINS = b'{"frame":'
+SUBSCRIBES, UNSUBSCRIBES = 1, 0  # first byte of a subscription message (ZMTP)
+# recorded of a connection; one with more counts as watching until it ends
+MAX_TOPICS = 64
+MAX_READ = 1000  # subscriptions read in one call: a flood of them delays no frame
 
 
 class FrameHead(msgspec.Struct, frozen=True):
@@ -56,8 +59,8 @@ class FrameHead(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class ShownFrame:
-    """A frame as it was shown: `lit` (n,) are the flat indices of its pixels over code 0,
-    `codes` (n,) or (n, 3) theirs.
+    """A frame as it was shown: `lit` (n,) are the flat indices of the pixels above code 0, and
+    `codes` (n,) or (n, 3) are their codes.
     """
 
     head: FrameHead
@@ -66,7 +69,7 @@ class ShownFrame:
 
     @property
     def q_icrs_to_cam(self) -> FloatArray | None:
-        """Its attitude (4,), unit; None where it is blank."""
+        """The frame's attitude (4,), a unit quaternion, scalar first; None for a blank frame."""
         if self.head.q is None:
             return None
         return np.array(self.head.q)
@@ -76,7 +79,7 @@ _heads = msgspec.json.Decoder(FrameHead)
 
 
 def frame_parts(frame: ShownFrame) -> list[bytes]:
-    """The parts of a frame's message."""
+    """The three parts of a frame's message, as the module describes them."""
     kind = "<u1" if frame.head.bits <= 8 else "<u2"
     return [
         msgspec.json.encode(frame.head),
@@ -86,7 +89,9 @@ def frame_parts(frame: ShownFrame) -> list[bytes]:
 
 
 def read_frame(parts: list[bytes]) -> ShownFrame | str:
-    """The frame of a message, or why it is none."""
+    """The frame that a message's parts describe, or a line of text that says why they describe
+    none.
+    """
     try:
         return _checked(*parts)
     except (TypeError, ValueError, RecursionError, msgspec.MsgspecError) as error:
@@ -113,12 +118,12 @@ def _checked(first: bytes, indices: bytes, values: bytes) -> ShownFrame:
 
 
 class FrameSender(ZmqSender):
-    """Sends frames to watchers; never waits for one.
+    """Sends frames to watchers, and never waits for one.
 
-    It counts who watches by connection. libzmq also passes an unsubscription on whose connection
-    never subscribed, and one that ends without a word it reports without saying whose it was: so
-    each is taken from its own connection alone, and what a connection has left is forgotten when
-    the connection ends.
+    It records subscriptions by connection. libzmq also passes on an unsubscription from a
+    connection that never subscribed; and where a connection ends without unsubscribing, it does
+    not report whose subscription ended. So an unsubscription removes only a topic of its own
+    connection, and all topics of a connection are removed when it ends.
     """
 
     LINGER_MS, STOPPED_LINGER_MS = 0, 0
@@ -126,12 +131,14 @@ class FrameSender(ZmqSender):
     def _configure(self, made: zmq.Socket[bytes]) -> None:
         super()._configure(made)
         made.setsockopt(zmq.SNDHWM, KEPT_FRAMES)
-        # every connection's, not only the first and the last of a topic
+        # report every connection's subscriptions, not only the first and the last of a topic
         made.setsockopt(zmq.XPUB_VERBOSER, 1)
         self._topics: dict[int, set[bytes]] = {}  # by the connection's file descriptor
 
     def look(self) -> bool:
-        """Read who subscribes and who leaves; True while somebody watches."""
+        """Read the subscriptions that have come, without waiting; True while any watcher is
+        subscribed.
+        """
         self._tend()
         if self._keeper is not None:
             for file in self._keeper.left:
@@ -142,7 +149,8 @@ class FrameSender(ZmqSender):
                 subscription = self._ready().recv(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 break
-            with contextlib.suppress(zmq.ZMQError):  # libzmq's own, of a connection that has ended
+            # what libzmq itself reports of an ended connection has no file descriptor
+            with contextlib.suppress(zmq.ZMQError):
                 self._take_subscription(subscription.get(zmq.SRCFD), subscription.bytes)
         return bool(self._topics)
 
@@ -151,7 +159,7 @@ class FrameSender(ZmqSender):
         topic = said[1:]
         if not (HEAD_BEGINS.startswith(topic) or topic.startswith(HEAD_BEGINS)):
             return
-        # what it sent is read after its end
+        # libzmq may deliver a subscription after its connection has ended
         if self._keeper is None or not self._keeper.is_open(file):
             return
         if kind == bytes([SUBSCRIBES]):
@@ -166,14 +174,14 @@ class FrameSender(ZmqSender):
                 del self._topics[file]
 
     def put_frame(self, frame: ShownFrame) -> None:
-        """Send one frame."""
+        """Send one frame to every watcher; a watcher whose queue is full does not get it."""
         with contextlib.suppress(zmq.Again):
             self._ready().send_multipart(frame_parts(frame), zmq.NOBLOCK, copy=False)
 
 
 class FrameWatch(ZmqRoad):
-    """The watcher's end: connects to where the frames are sent from. `refused` counts messages
-    that are no frames.
+    """The watcher's end, which connects to a `FrameSender`. `refused` counts the messages that
+    were no frames, and `why_refused` says what was wrong with the last of them.
     """
 
     def __init__(self, endpoint: str) -> None:
@@ -187,7 +195,7 @@ class FrameWatch(ZmqRoad):
         )
 
     def frames(self, timeout_ms: int) -> list[ShownFrame]:
-        """The frames that came, oldest first; waits at most `timeout_ms` for the first."""
+        """The frames that have arrived, oldest first; waits at most `timeout_ms` for the first."""
         frames_shown = []
         for message in self.taken(timeout_ms):
             frame = read_frame(list(message.parts))

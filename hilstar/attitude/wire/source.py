@@ -1,10 +1,10 @@
 """What a source of attitudes means by its numbers, and how they become the attitude of the camera.
 
-Two steps, in this order, each of which may be the identity:
-1. The convention: a quaternion as it was sent becomes the Hamilton one, scalar first, that turns
-   ICRS components into those of the sender's frame. Rates are of that frame with respect to the
-   ICRS, in its own components, whatever the convention.
-2. The mounting: an attitude and a rate of the body become the camera's.
+There are two steps, in this order, each of which may change nothing:
+1. The convention: a quaternion as it was sent becomes the Hamilton quaternion, scalar first, that
+   turns ICRS components into components of the sender's frame. Whatever the convention, rates are
+   of that frame with respect to the ICRS, in components of that frame.
+2. The mounting: an attitude and a rate of the spacecraft's body become those of the camera.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Literal
 
 from hilstar.basics.toml_tables import Table
 
-# NumPy takes 70 ms, and a process that only stamps packets needs none; a bench file needs no
-# packets
+# Importing NumPy takes 70 ms, which a process that only stamps packets saves; and reading a bench
+# file needs no packets.
 if TYPE_CHECKING:
     from hilstar.attitude.wire.packet import AttitudeSample, Event
     from hilstar.basics.arrays import FloatArray
 
 Components = tuple[float, float, float, float]
 IDENTITY: Components = (1.0, 0.0, 0.0, 0.0)
-# by places: a tenth of what numpy.roll takes
+# Indices that move the scalar to the other end: a tenth of the time that numpy.roll takes.
 SCALAR_FROM_LAST, SCALAR_TO_LAST = [3, 0, 1, 2], [1, 2, 3, 0]
-# Orion's belt at roll 0, which everybody finds: the star is Alnilam (HIP 26311), 15 arcsec from the
-# boresight.
+# The self-check looks at Orion's belt at roll 0, which everybody recognises. The star in the middle
+# is Alnilam (HIP 26311), 15 arcsec from the boresight.
 CHECK_RADEC_DEG, CHECK_STAR = (84.057, -1.200), "Alnilam"
 UNSTATED = (
     "the source holds the body's attitude, and the tracker's axes are taken as the body's; "
@@ -54,12 +54,14 @@ class Convention(Table, frozen=True):
 
     @property
     def is_hilstars(self) -> bool:
-        """Whether a quaternion is sent as hilstar has it, of whichever frame."""
+        """Whether a quaternion is sent in hilstar's own order and direction; its frame may be
+        either.
+        """
         return self.scalar == "first" and self.direction == "icrs_to_cam"
 
     def q_icrs_to_frame(self, sent: FloatArray) -> FloatArray:
-        """The Hamilton quaternion (4,), scalar first, of a unit quaternion (4,) in the order in
-        which it was sent.
+        """The Hamilton quaternion (4,), scalar first, that turns ICRS components into those of
+        `frame`, from a unit quaternion (4,) as it was sent.
         """
         from hilstar.basics.rotation import conjugate
 
@@ -72,7 +74,9 @@ class Convention(Table, frozen=True):
         return q
 
     def as_sent(self, q_icrs_to_frame: FloatArray) -> FloatArray:
-        """What a sender of this convention sends for an attitude (4,) of its frame."""
+        """The quaternion (4,) that a sender with this convention sends for an attitude (4,) of its
+        frame; the inverse of `q_icrs_to_frame`.
+        """
         from hilstar.basics.rotation import conjugate
 
         if self.direction == "cam_to_icrs":
@@ -82,13 +86,15 @@ class Convention(Table, frozen=True):
         return q if self.scalar == "first" else q[SCALAR_TO_LAST]
 
     def sample(self, sent: AttitudeSample) -> AttitudeSample:
-        """The sample with its quaternion from ICRS to its frame; its rate is what it was."""
+        """The sample with its quaternion turned into q_icrs_to_frame, scalar first; its rate is
+        unchanged. In the result `q_icrs_to_cam` and the rate are those of `frame`.
+        """
         if self.is_hilstars:
             return sent
         return replace(sent, q_icrs_to_cam=self.q_icrs_to_frame(sent.q_icrs_to_cam))
 
     def __str__(self) -> str:
-        """As a bench file has it."""
+        """The convention as a bench file writes it: an inline table of TOML."""
         return (
             f'{{ scalar = "{self.scalar}", direction = "{self.direction}", frame ='
             f' "{self.frame}" }}'
@@ -99,12 +105,12 @@ HILSTARS = Convention()
 
 
 class Mounting:
-    """How the camera sits in the body: `q_body_to_cam`, which turns body components into camera
-    components.
+    """How the camera is mounted in the body: `q_body_to_cam` (w, x, y, z), normalised here, turns
+    body components into camera components.
 
-    None where nobody has said: the camera's axes are then taken as the body's, and `told` says so.
-    `by_option`: the command line says it (`--mounting`), which is refused where the source is not
-    the body's.
+    Where the user states none (None), the camera's axes are taken as the body's, and the notices
+    `told` say so. `by_option`: the command line states it (`--mounting`), which is refused where
+    the source does not give the body's attitude.
     """
 
     def __init__(self, q_body_to_cam: Components | None = None, *, by_option: bool = False) -> None:
@@ -119,8 +125,8 @@ class Mounting:
         self.is_identity = q_body_to_cam in {None, IDENTITY}
 
     def sample(self, body: AttitudeSample) -> AttitudeSample:
-        """The camera's attitude and motion of a sample that holds the body's: q_icrs_to_body,
-        rate in body components.
+        """The sample with the camera's attitude, rate and acceleration, from one with the body's:
+        q_icrs_to_body, and a rate and an acceleration in body components.
         """
         if self.is_identity:
             return body
@@ -136,11 +142,11 @@ class Mounting:
         )
 
     def in_cam(self, in_body: FloatArray) -> FloatArray:
-        """Camera components (3,) of a vector in body components (3,)."""
+        """The camera components (3,) of a vector given in body components (3,)."""
         return self._matrix @ in_body
 
     def q_icrs_to_body(self, q_icrs_to_cam: FloatArray) -> FloatArray:
-        """The body's attitude of the camera's."""
+        """The body's attitude q_icrs_to_body (4,) for an attitude (4,) of the camera."""
         from hilstar.basics.rotation import conjugate, multiply
 
         return multiply(conjugate(self.q_body_to_cam), q_icrs_to_cam)
@@ -148,15 +154,15 @@ class Mounting:
 
 @dataclass(frozen=True, slots=True)
 class Conventions:
-    """What a source means by its numbers: `--explain` shows it, and the documentation says the
-    same.
+    """What a source means by its numbers, as `--explain` shows it and the documentation says it.
 
-    `turns` says from which frame to which; `scalar` the order of the components; `time` the scale
-    and the zero of its times; `of_body` whether `[tracker] q_body_to_cam` applies; `written` gives
-    an attitude in the source's own words; `scale` is the time scale (UTC, TAI, TT, TDB, GPS) whose
-    ns since 1970-01-01T00:00:00 its times are, in days of 86400 s; None for others. `of_packets`: a
-    `Convention` says what its quaternions are, and its times are plain numbers (of
-    `time_unit` in a log).
+    These are texts: `source` names the source; `turns` says from which frame to which a quaternion
+    turns, `scalar` the order of its components, `time` the scale and the zero of its times.
+    `of_body`: the attitudes are the body's, so that `[tracker] q_body_to_cam` applies. `written`
+    gives the text by which the source writes an attitude (4,). `scale` is the time scale (UTC, TAI,
+    TT, TDB, GPS) of its times, which are ns since 1970-01-01T00:00:00 in days of 86400 s; None for
+    other times. `of_packets`: a `Convention` says what its quaternions mean, and its times are
+    plain numbers (of `time_unit` in a log).
     """
 
     source: str
@@ -170,8 +176,8 @@ class Conventions:
     time_unit: str = "ns"
 
     def mounting_notices(self, mounting: Mounting) -> list[tuple[str, str]]:
-        """What the user must know of the mounting: that nobody stated one, or that one is stated
-        and not used.
+        """Notices (kind, line) about the mounting: that none is stated where one is needed, or that
+        one is stated and not used.
         """
         if self.of_body:
             return mounting.told
@@ -180,7 +186,9 @@ class Conventions:
         return []
 
     def lines(self, mounting: Mounting) -> list[str]:
-        """The conventions, and the self-check, for a person."""
+        """The lines that explain the conventions to a person, and a self-check as the last: what
+        the source writes for the camera at `CHECK_RADEC_DEG`, roll 0.
+        """
         from hilstar.basics.rotation import from_radec_roll_deg
 
         q = from_radec_roll_deg(*CHECK_RADEC_DEG, 0.0)
@@ -204,16 +212,16 @@ class Conventions:
 
 
 def components(q: FloatArray) -> str:
-    """Components as text with seven digits, in the order given."""
+    """The components of a quaternion or vector as text, in their order, with seven decimals."""
     return "(" + ", ".join(f"{c:.7f}" for c in q) + ")"
 
 
 class SentAttitudes:
-    """The way from what a sender sends to the camera's attitude: its convention, then the mounting
-    where that is the body's.
+    """Turns what a sender sends into the camera's attitude: by its convention, and then by the
+    mounting where the sender gives the body's attitude.
 
-    Links hand it their decoders, so that whoever reads a link sees the camera's attitudes, and the
-    bytes as they came.
+    Links wrap their decoders with it (`decoder`). So whoever reads a link gets the camera's
+    attitudes, and beside them the bytes as they came.
     """
 
     def __init__(self, convention: Convention = HILSTARS, mounting: Mounting | None = None) -> None:
@@ -223,7 +231,7 @@ class SentAttitudes:
         self._mounting = mounting if turns else None
 
     def q_icrs_to_cam(self, sent: FloatArray) -> FloatArray:
-        """The camera's attitude of a unit quaternion (4,) in the order in which it was sent."""
+        """The camera's attitude (4,), scalar first, from a unit quaternion (4,) as it was sent."""
         from hilstar.basics.rotation import multiply
 
         q = self.convention.q_icrs_to_frame(sent)
@@ -232,7 +240,7 @@ class SentAttitudes:
         return multiply(self._mounting.q_body_to_cam, q)
 
     def as_sent(self, q_icrs_to_cam: FloatArray) -> FloatArray:
-        """What the sender sends for an attitude (4,) of the camera."""
+        """The quaternion (4,) that the sender sends for an attitude (4,) of the camera."""
         if self._mounting is None:
             q = q_icrs_to_cam
         else:
@@ -240,15 +248,15 @@ class SentAttitudes:
         return self.convention.as_sent(q)
 
     def sample(self, sent: AttitudeSample) -> AttitudeSample:
-        """The camera's attitude and motion of a sample as it was sent."""
+        """The sample with the camera's attitude and motion, from one as it was sent."""
         sample = self.convention.sample(sent)
         if self._mounting is None:
             return sample
         return self._mounting.sample(sample)
 
     def decoder(self, decode: Callable[[bytes], Event]) -> Callable[[bytes], Event]:
-        """A decoder whose samples are the camera's; `decode` itself where they are already, which
-        costs nothing.
+        """A decoder whose samples are the camera's, made from `decode`; `decode` itself, at no cost
+        for each message, where its samples are the camera's already.
         """
         if self._mounting is None and self.convention.is_hilstars:
             return decode
@@ -266,8 +274,8 @@ class SentAttitudes:
 def packet_conventions(
     convention: Convention, source: str = "hilstar's packets and logs", reference: str = "ICRS"
 ) -> Conventions:
-    """The conventions of packets, JSON and the logs that are written like them; `reference` is what
-    attitudes refer to.
+    """The conventions of packets, JSON and the logs that are written like them, for `--explain`.
+    `reference` names the frame that attitudes refer to.
     """
     frames = [
         f"{reference} components",

@@ -1,7 +1,7 @@
-"""TCP: the road that connects to the other side, or listens for the one that connects.
+"""TCP: a road of bytes that connects to a host and port, or listens there for a peer to connect.
 
-The kernel stamps what comes, and asks a peer that says nothing whether it is still there: a cable
-that was pulled ends the connection in seconds.
+The kernel stamps the arrival of the bytes. It also probes a silent peer (keep-alive), so that a
+connection whose cable was pulled ends within seconds.
 """
 
 import contextlib
@@ -16,20 +16,23 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 
-CONNECT_S = 0.3
-# between two connections: whoever connects in a loop does not keep a core busy
+CONNECT_S = 0.3  # the longest that a read may wait for a handshake (law 4 of `roads`)
+# between two connections: a peer that connects in a loop does not keep a core busy
 ACCEPT_EACH_S = 0.02
-TOLD_S = 10.0  # for so long after the last one a refused connection stands in the status
+TOLD_S = 10.0  # how long the status shows a refused connection
+# Probes begin after 3 s of silence, 1 s apart; after three without an answer, at about 6 s, the
+# kernel ends the connection.
 KEEPALIVE = {socket.TCP_KEEPIDLE: 3, socket.TCP_KEEPINTVL: 1, socket.TCP_KEEPCNT: 3}
 
 
 class TcpRoad(ByteRoad):
-    """One connection at a time, to a host and port, or `listening` there. Raises InputError where
-    that cannot be bound.
+    """One TCP connection at a time: to `place` (host, port), or, where `listening`, from a peer
+    that connects to `place`. Raises InputError where `place` cannot be bound.
 
-    Of several that connect the first holds the line, for as long as it stands, or with `held_s`
-    only while it has sent within that; others are refused and named meanwhile. Then the next one
-    to connect takes its place: a peer that rebooted behind a line that never closed.
+    The first peer that connects holds the line until its connection ends. With `held_s` it holds
+    the line only while its last bytes are at most `held_s` seconds old. Other peers are refused
+    and named in a notice meanwhile. After that the next peer that connects takes its place: a peer
+    that has rebooted gets in, although its old connection was never closed.
     """
 
     stamped = True
@@ -75,7 +78,7 @@ class TcpRoad(ByteRoad):
 
     @property
     def trouble(self) -> str:
-        """See `ByteRoad.trouble`: a second connection that was refused."""
+        """The line about a second connection that was refused within the last TOLD_S; else ""."""
         return "" if self._told.over else self._refused
 
     def taken(self, timeout_ms: int) -> list[RawMessage]:
@@ -83,11 +86,13 @@ class TcpRoad(ByteRoad):
         if self._listener is None and self._connection is None:
             self._try_again(self._connect, (OSError,), timeout_ms)
             return []
-        if not self._ends():  # a connection was refused a moment ago
+        # A connection was accepted or refused less than ACCEPT_EACH_S ago, and none stands.
+        if not self._ends():
             self._clock.sleep(min(self._accepts.left_s, timeout_ms / 1000))
             return []
         ready = self._ready(timeout_ms)
-        # The peer's own bytes first: they hold the line, and its end lets a new connection in.
+        # The peer's bytes are read first: they renew its hold on the line, and where the read
+        # shows that it has ended, a new connection can be accepted at once.
         if self._connection is not None and self._connection in ready:
             chunks = self._read(self._connection)
         else:
@@ -97,11 +102,11 @@ class TcpRoad(ByteRoad):
         return chunks
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once bytes wait, or a connection does."""
+        """True once bytes or a new connection wait, False after `timeout_ms` without either."""
         return bool(self._ends() and self._ready(timeout_ms))
 
     def _ends(self) -> list[socket.socket]:
-        """The sockets that are looked at now."""
+        """The open sockets to poll now: the listener only where ACCEPT_EACH_S is over."""
         if self._accepts.over:
             listener = self._listener
         else:
@@ -109,7 +114,7 @@ class TcpRoad(ByteRoad):
         return [end for end in (listener, self._connection) if end is not None]
 
     def _ready(self, timeout_ms: int) -> list[socket.socket]:
-        """Those of them at which something waits; waits at most `timeout_ms` for the first."""
+        """The sockets of `_ends` with something to read; waits at most `timeout_ms` for it."""
         ends = {end.fileno(): end for end in self._ends()}
         poll = select.poll()
         for file in ends:
@@ -141,7 +146,7 @@ class TcpRoad(ByteRoad):
     def _accept(self, listener: socket.socket) -> None:
         try:
             made, (host, port, *_) = listener.accept()
-        except OSError:  # it has gone again
+        except OSError:  # the peer has already ended the connection
             return
         self._accepts = self._clock.within(ACCEPT_EACH_S)
         peer = f"{host}:{port}"
@@ -192,14 +197,14 @@ class TcpRoad(ByteRoad):
             connection.close()
 
     def put(self, data: bytes, patience_s: float = 0.0) -> bool:
-        """See `ByteRoad.put`; nothing is waited for."""
-        with contextlib.suppress(OSError):  # one that is gone is noticed by the next read
+        """See `ByteRoad.put`; it never waits, so `patience_s` has no effect."""
+        with contextlib.suppress(OSError):  # the next read notices that the connection has ended
             if self._connection is not None:
                 return self._connection.send(data) == len(data)
         return False
 
     def close(self) -> None:
-        """Close both sockets."""
+        """Close the listener and the connection."""
         for end in (self._listener, self._connection):
             if end is not None:
                 end.close()

@@ -1,18 +1,17 @@
-"""UDP: one packet or JSON object a datagram, from listed addresses only, and answers that never
-amount to more.
+"""UDP: each datagram is one packet or JSON object. Only listed addresses are read, and a sender
+gets no more bytes in answer than it sent.
 
 Laws:
-1. A datagram from an address that is not allowed is counted and never answered; the kernel drops a
-   flood of them, by a socket
-   filter (classic BPF; Linux, Documentation/networking/filter.rst), before it costs buffer space or
-   a read.
-2. To an address go at most as many bytes of time requests, replies and answers as came from it;
-   statuses besides, at a rate.
-3. A flood costs the reading of MAX_TAKEN datagrams every PAUSE_S, and the decoding of what
+1. A datagram from an address that is not allowed is counted and never answered. The kernel drops a
+   flood of them by a socket filter (classic BPF; Linux, Documentation/networking/filter.rst),
+   before they cost buffer space or a read.
+2. An address gets at most as many bytes of time requests, replies and answers as came from it.
+   Statuses do not count in this; they go at a limited rate.
+3. A flood costs the reading of MAX_TAKEN datagrams every PAUSE_S, and the decoding of those that
    `FloodGate` admits.
 
-The kernel stamps the arrival (SO_TIMESTAMPNS), however late a datagram is read; `KernelStamps` does
-the same for TCP.
+The kernel stamps the arrival (SO_TIMESTAMPNS), so that the stamp is right however late a datagram
+is read; `KernelStamps` does the same for TCP.
 """
 
 import contextlib
@@ -39,16 +38,17 @@ from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.basics.units import NS_PER_S
 
 SO_ATTACH_FILTER = 26  # asm-generic/socket.h
-SKF_NET_OFF = 0xFFF00000
-SOURCE_AT = {4: 12, 6: 8}  # in the IP header
+SKF_NET_OFF = 0xFFF00000  # linux/filter.h: offsets from here on count from the IP header
+SOURCE_AT = {4: 12, 6: 8}  # offset of the source address in the IP header, by IP version
 WORD_BYTES = 4
+# opcodes of classic BPF: BPF_LD | BPF_W | BPF_ABS, BPF_ALU | BPF_AND, BPF_JMP | BPF_JEQ, BPF_RET
 LOAD_WORD, AND, JUMP_IF_EQUAL, RETURN = 0x20, 0x54, 0x15, 0x06
-WHOLE, NOTHING = 0xFFFF, 0
-INSTRUCTION = struct.Struct("=HBBI")
-MAX_INSTRUCTIONS = 4096
-# the rest of a longer one is cut off, and `packet.decode` refuses what is left
+WHOLE, NOTHING = 0xFFFF, 0  # how many bytes of the datagram a filter lets through
+INSTRUCTION = struct.Struct("=HBBI")  # struct sock_filter: code, jump if true, if false, operand
+MAX_INSTRUCTIONS = 4096  # BPF_MAXINSNS of linux/bpf_common.h
+# A longer datagram is cut to one byte over the limit, which `packet.decode` then refuses.
 MAX_DATAGRAM_BYTES = MAX_JSON_BYTES + 1
-# the kernel gives what it allows; a small datagram takes some 800 bytes of it
+# the kernel gives as much as it allows; a small datagram takes some 800 bytes of it
 WANTED_BUFFER_BYTES = 1 << 20
 SO_MEMINFO = 55  # Linux's number, which Python does not name (asm-generic/socket.h)
 MEMINFO = struct.Struct("=9I")  # linux/sock_diag.h; the last is SK_MEMINFO_DROPS
@@ -61,17 +61,17 @@ TROUBLE = {
     errno.EACCES: "not permitted; write a port from 1024 to 65535",
 }
 SocketAddress = tuple[Any, ...]
-MAX_TAKEN = 1000  # in one go
-# datagrams a second of senders that are not allowed, before the kernel is asked
+MAX_TAKEN = 1000  # datagrams read in one call
+# datagrams a second from senders that are not allowed; above it the kernel is made to drop them
 MAX_STRANGERS = 1000
-LOOK_NS = NS_PER_S
+LOOK_NS = NS_PER_S  # the second over which strangers are counted
 MAX_CREDIT_BYTES = 4096
-MAX_PEERS = 64  # whose credit is kept
+MAX_PEERS = 64  # whose credit is recorded
 
 
 def filter_program(networks: Sequence[Network], version: int) -> bytes:
-    """The program that keeps what comes from these networks, all of that IP version, and drops
-    the rest.
+    """The classic BPF program, as bytes, that lets datagrams from `networks` through and drops all
+    others. It serves a socket of one IP `version`, 4 or 6; networks of the other are left out.
     """
     code = []
     for network in networks:
@@ -79,7 +79,8 @@ def filter_program(networks: Sequence[Network], version: int) -> bytes:
             continue
         address, mask = network.network_address.packed, network.netmask.packed
         word_places = range(0, len(address), WORD_BYTES)
-        # each word of the source address must be the network's, else go on after this network
+        # Each word of the source address, under the mask, must be the network's. Otherwise jump
+        # over the network's other words, three instructions each, and its RETURN.
         for k, at in enumerate(word_places):
             address_word = int.from_bytes(address[at : at + WORD_BYTES], "big")
             mask_word = int.from_bytes(mask[at : at + WORD_BYTES], "big")
@@ -92,8 +93,8 @@ def filter_program(networks: Sequence[Network], version: int) -> bytes:
 
 
 def keep_only_networks(receiving: socket.socket, networks: Sequence[Network]) -> bool:
-    """Have the kernel drop datagrams from other addresses at a socket; False where it does not
-    take the filter.
+    """Make the kernel drop datagrams from all other addresses at a socket; False where the filter
+    is too long, or the kernel refuses it.
     """
     code = filter_program(networks, 6 if receiving.family == socket.AF_INET6 else 4)
     count = len(code) // INSTRUCTION.size
@@ -108,8 +109,8 @@ def keep_only_networks(receiving: socket.socket, networks: Sequence[Network]) ->
 
 
 class Datagrams:
-    """A socket, bound to a place of this machine or connected to a peer, that never waits but in
-    `wait`.
+    """A UDP socket, bound to an address of this machine or connected to a peer. Only `wait`
+    waits.
     """
 
     def __init__(self, made: socket.socket, clock: HostClock = HOST_CLOCK) -> None:
@@ -123,7 +124,7 @@ class Datagrams:
 
     @classmethod
     def bound(cls, place: UdpPlace, clock: HostClock = HOST_CLOCK) -> "Datagrams":
-        """Bound to a place. Raises InputError where it cannot be."""
+        """A socket bound to `place`. Raises InputError where that cannot be bound."""
         made = socket.socket(
             socket.AF_INET6 if place.host.version == 6 else socket.AF_INET, socket.SOCK_DGRAM
         )
@@ -145,8 +146,8 @@ class Datagrams:
 
     @classmethod
     def connected(cls, host: str, port: int, clock: HostClock = HOST_CLOCK) -> "Datagrams":
-        """Connected to a peer: only its datagrams arrive. Raises OSError where the host is
-        unknown.
+        """A socket connected to a peer, which receives the peer's datagrams alone. Raises OSError
+        where the host is unknown or cannot be reached.
         """
         addresses = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
         made = socket.socket(addresses[0][0], socket.SOCK_DGRAM)
@@ -159,11 +160,11 @@ class Datagrams:
 
     @property
     def port(self) -> int:
-        """The port of this end."""
+        """The port of this machine that the socket is bound to."""
         return int(self._socket.getsockname()[1])
 
     def wait(self, timeout_ms: float) -> bool:
-        """True once a datagram waits."""
+        """True once a datagram waits, False after `timeout_ms` without one."""
         asked_ns = self._clock.now_ns()
         if self._poll.poll(timeout_ms):
             return True
@@ -171,7 +172,7 @@ class Datagrams:
         return False
 
     def take(self, count: int) -> list[RawMessage]:
-        """The datagrams that wait, oldest first, `count` at most."""
+        """The datagrams that wait, at most `count`, oldest first; it does not wait for one."""
         offset_ns = self._clock.monotonic_minus_realtime_ns()
         taken: list[RawMessage] = []
         for _ in range(count):
@@ -183,15 +184,18 @@ class Datagrams:
             except BlockingIOError:
                 self._stamps.empty_ns = asked_ns
                 break
-            except OSError:  # a connected socket hears that nobody listens at its peer's port
+            except OSError:  # a connected socket reports that nobody listens at its peer's port
                 continue
             host_ns = self._stamps.arrived_ns(ancillary, asked_ns, offset_ns)
             taken.append(RawMessage(host_ns, [data], sender=sender))
         return taken
 
     def put(self, data: bytes, to: SocketAddress | None = None) -> bool:
-        """Send without waiting; False where it did not leave."""
-        # a connected socket's send may report what became of an earlier datagram, and sends nothing
+        """Send a datagram without waiting, to the address `to` or to the connected peer; False
+        where it was not sent.
+        """
+        # Where a connected socket's peer refused an earlier datagram, the next send reports that
+        # and sends nothing: so it is tried once more.
         for _ in range(2):
             try:
                 if to is None:
@@ -206,13 +210,15 @@ class Datagrams:
         return False
 
     def keep_only(self, networks: Sequence[Network]) -> bool:
-        """Have the kernel drop datagrams from other addresses; False where it does not take the
-        filter.
+        """Make the kernel drop datagrams from all other addresses; False where the filter is too
+        long, or the kernel refuses it.
         """
         return keep_only_networks(self._socket, networks)
 
     def dropped(self) -> int:
-        """How many datagrams the kernel dropped so far: by that filter, or for want of room."""
+        """How many datagrams the kernel has dropped so far, by the filter or because the buffer
+        was full; 0 where it does not say.
+        """
         with contextlib.suppress(OSError, struct.error):
             memory_info = self._socket.getsockopt(socket.SOL_SOCKET, SO_MEMINFO, MEMINFO.size)
             return int(MEMINFO.unpack(memory_info)[-1])
@@ -224,19 +230,22 @@ class Datagrams:
 
 
 class Credit:
-    """How many bytes may go back to each address: what came from it, less what went."""
+    """How many bytes may be sent to each address: the bytes that came from it less those sent to
+    it, at most MAX_CREDIT_BYTES. Of more than MAX_PEERS addresses the one last heard longest ago
+    is forgotten.
+    """
 
     def __init__(self) -> None:
         self._bytes: OrderedDict[SocketAddress, int] = OrderedDict()
 
     def earn(self, peer: SocketAddress, count: int) -> None:
-        """Credit a peer with the bytes that came from it."""
+        """Add `count` bytes that came from a peer to its credit."""
         self._bytes[peer] = min(self._bytes.pop(peer, 0) + count, MAX_CREDIT_BYTES)
         if len(self._bytes) > MAX_PEERS:
             self._bytes.popitem(last=False)
 
     def spend(self, peer: SocketAddress, count: int) -> bool:
-        """Whether `count` bytes may go to a peer; if so, they are deducted."""
+        """Whether `count` bytes may be sent to a peer; if so, they are deducted."""
         rest_bytes = self._bytes.get(peer, 0) - count
         if rest_bytes < 0:
             return False
@@ -245,9 +254,10 @@ class Credit:
 
 
 class UdpRoad(ByteRoad):
-    """Datagrams: bound to a place, with the senders that are allowed, or connected to a peer.
+    """Datagrams, at a socket that is bound to a `UdpPlace` and reads the `allowed` senders, or is
+    connected to a peer (host, port).
 
-    Raises InputError where that cannot be.
+    Raises InputError where `place` cannot be bound or reached.
     """
 
     messages = stamped = True
@@ -307,7 +317,10 @@ class UdpRoad(ByteRoad):
         return admitted
 
     def _look(self, allowed: AllowedSenders, strangers: int) -> None:
-        """Count what the kernel dropped, and have it drop the strangers where they are many."""
+        """Count the `strangers`, datagrams of senders that are not allowed, and make the kernel
+        drop them where there are more than MAX_STRANGERS a second; once a second count what the
+        kernel has dropped.
+        """
         self._strangers += strangers
         now_ns = self._clock.now_ns()
         if self._strangers > MAX_STRANGERS and not self._filtered:
@@ -326,15 +339,17 @@ class UdpRoad(ByteRoad):
             self._dropped = dropped
 
     def wait_for_message(self, timeout_ms: int) -> bool:
-        """True once a datagram waits."""
+        """True once a datagram waits, False after `timeout_ms` without one."""
         return self._datagrams.wait(timeout_ms)
 
     def put(self, data: bytes, patience_s: float = 0.0) -> bool:
-        """See `ByteRoad.put`; nothing is waited for, and a bound road knows nobody to send to."""
+        """See `ByteRoad.put`. It never waits, so `patience_s` has no effect; a bound road sends
+        nothing here, as it has no single peer.
+        """
         return self._allowed is None and self._datagrams.put(data)
 
     def put_to(self, peer: SocketAddress, data: bytes) -> bool:
-        """Send to one of several senders, never waiting; False where it did not leave."""
+        """Send to one of several senders without waiting; False where nothing was sent."""
         return self._datagrams.put(data, peer)
 
     def close(self) -> None:
@@ -343,8 +358,8 @@ class UdpRoad(ByteRoad):
 
 
 class DatagramDecoder(PacketDecoder):
-    """Packets of several senders, each of which is answered for itself, and never by more bytes
-    than came from it; statuses besides.
+    """Decodes the packets of several senders. Each arrival can be answered to its own sender, with
+    no more bytes than came from that sender; statuses do not count in this.
     """
 
     def __init__(self, road: UdpRoad, sent: SentAttitudes = AS_SENT) -> None:
@@ -366,10 +381,10 @@ class DatagramDecoder(PacketDecoder):
 
 
 class UdpLink(StreamLink):
-    """A bound socket. Raises InputError where it cannot be bound.
+    """Attitudes from a bound UDP socket. Raises InputError where it cannot be bound.
 
-    Each arrival says how to answer its sender (`Arrival.back`); the link itself knows no sender to
-    send to.
+    Each arrival has a function that answers its sender (`Arrival.back`); the link itself has no
+    single peer to send to.
     """
 
     two_way = True

@@ -1,7 +1,7 @@
-"""A campaign on a cluster: a Dask scheduler that somebody started, and its workers, which come and
-go.
+"""A campaign on a cluster: a Dask scheduler that the user has started, and its workers, which may
+come and go during the campaign.
 
-Each thread of a worker has a session, and a GL context, of its own.
+Each thread of a worker has its own session, with its own GL context.
 """
 
 import asyncio
@@ -33,16 +33,16 @@ GIVE_TLS = (
 )
 # seconds of work in a task; handing one out costs the scheduler milliseconds (docs/campaign.md)
 TASK_S = 1.0
-SPARE_TASKS = 1  # that wait at a worker beside those that its threads work on
+SPARE_TASKS = 1  # tasks that wait at a worker, besides those on which its threads work
 POLL_S, LOOK_S = 0.25, 0.5
 CONNECT_S, ANSWER_S, MAX_SILENCE_S = 30.0, 30.0, 90.0
-FETCH_S = 5.0  # a task's rows come at once, or their worker is gone
+FETCH_S = 5.0  # the rows of a finished task come at once, or their worker has gone
 MAX_WITHOUT_WORKER_S = 60.0
 CLOSE_S = 0.3  # a Ctrl-C ends a command within a second
 
 
 def examine(job: Job) -> Identity | str:
-    """On a worker: its identity, or the reason why it cannot do the job."""
+    """Runs on a worker: returns its identity, or a text that says why it cannot do the job."""
     try:
         return _session(job).identity()
     except HilstarError as error:
@@ -50,12 +50,14 @@ def examine(job: Job) -> Identity | str:
 
 
 def run_task(job: Job, begin: int, points: FloatArray) -> Answered:
-    """On a worker: the rows of the cases from `begin` on at their points (n, dimensions)."""
+    """Runs on a worker: returns the rows of n cases, the first of which has the number `begin`, at
+    their points (n, dimensions).
+    """
     return _session(job).run(begin, points)
 
 
 def _session(job: Job) -> Session:
-    """This thread's session of a job; the one of an older job is closed."""
+    """This thread's session of a job, opened where needed; a session of another job is closed."""
     session: Session | None = getattr(_here, "session", None)
     if session is None or session.job != job:
         _here.session = None
@@ -67,11 +69,11 @@ def _session(job: Job) -> Session:
 
 @dataclass(frozen=True, slots=True)
 class Scheduler:
-    """A scheduler's address ("tcp://HOST:PORT", "tls://HOST:PORT"), and TLS files under Dask's
-    names.
+    """A scheduler's address ("tcp://HOST:PORT", "tls://HOST:PORT"), and its TLS files, named as in
+    Dask.
 
-    `tls_key` may be missing where the certificate's file has the key, and all three where Dask's
-    own configuration has them.
+    `tls_key` may be missing where the certificate's file contains the key, and all three where
+    Dask's own configuration names them.
     """
 
     address: str
@@ -114,8 +116,8 @@ class Scheduler:
         return f"{protocol}://{endpoint.address.removeprefix('tcp://')}"
 
     def security(self) -> Any:
-        """Dask's security object. Raises InputError for files that are no certificates, and for
-        tls:// without any.
+        """Dask's security object; None for an address without TLS. Raises InputError for files that
+        are no certificates, and for tls:// without any.
         """
         from distributed.security import Security
 
@@ -148,8 +150,8 @@ class Scheduler:
 
 @dataclass(slots=True)
 class _Worker:
-    """A worker: its threads, whether its identity is checked or refused, and its tasks, oldest
-    first.
+    """A worker: the number of its threads, whether its identity has been checked, whether it was
+    refused, and its tasks (Dask's future, task), oldest first.
     """
 
     threads: int
@@ -184,8 +186,9 @@ class Cluster(Closing):
         self._alone_since_s: float | None = None
         self._looked_s = 0.0
         self._answered_s = time.monotonic()
-        self._something = threading.Event()  # a future is done
-        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # it logs each worker that goes
+        self._something = threading.Event()  # set when a future is done
+        # Dask logs each worker that goes, which is usual here
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)
         security = scheduler.security()
         try:
             client: Any = distributed.Client
@@ -205,7 +208,7 @@ class Cluster(Closing):
                 why = f"nothing answers there; start one: dask scheduler {self._dask_words()}"
             raise MachineError(f"--scheduler {address}: {why}") from error
         listens: str = self._client.scheduler_info()["address"]
-        # reached over loopback, and open to the network as well?
+        # A scheduler that is reached over loopback may be open to the network as well.
         if not listens.startswith("tls://"):
             with contextlib.suppress(InputError):
                 if not parse_endpoint(f"tcp://{listens.partition('://')[2]}").loopback:
@@ -215,7 +218,7 @@ class Cluster(Closing):
                     )
 
     def _dask_words(self) -> str:
-        """The options with which a scheduler or worker for this address is started."""
+        """The options, as text, with which to start a scheduler or worker for this address."""
         if self._address.startswith("tls://"):
             return "--tls-ca-file CA.pem --tls-cert CERT.pem --tls-key KEY.pem"
         return "--host 127.0.0.1"
@@ -227,7 +230,8 @@ class Cluster(Closing):
         while True:
             if self._client.status == "closed":
                 raise self._gone()
-            if self._client.status == "running":  # else it looks for a scheduler that it has lost
+            # In another state the client is trying to reconnect to the scheduler.
+            if self._client.status == "running":
                 self._look(backlog, lost)
                 self._hand_out(backlog)
             if backlog.to_run <= 0:
@@ -248,7 +252,7 @@ class Cluster(Closing):
             )
         except (OSError, TimeoutError, asyncio.CancelledError, RuntimeError) as error:
             if time.monotonic() - self._answered_s < MAX_SILENCE_S:
-                return  # a busy one answers later
+                return  # a busy scheduler answers later
             raise self._gone() from error
         self._answered_s = time.monotonic()
         for address in [address for address in self._workers if address not in present]:
@@ -266,8 +270,8 @@ class Cluster(Closing):
         )
 
     def _bury(self, address: str, backlog: Backlog, lost: Lost) -> None:
-        """Drop a worker that is gone: a task that it worked on may be the cause, its other tasks
-        are handed out again.
+        """Drop a worker that has gone. The tasks on which it worked may be the cause, which is
+        recorded (`Backlog.died`); its other tasks are handed out again.
         """
         worker = self._workers.pop(address)
         gone = [future for future, at in self._examined.items() if at == address]
@@ -317,8 +321,10 @@ class Cluster(Closing):
                     why = difference(identity, self._identity)
                 else:
                     why = str(identity)
-            except Exception as error:  # an older hilstar without campaigns, or none at all
-                # worker or scheduler is gone; a worker that is still there is asked again
+            # A worker with an older hilstar without campaigns, or with none, raises anything.
+            except Exception as error:
+                # The worker or the scheduler has gone. A worker that is still there is examined
+                # again.
                 if future.status != "error":
                     del self._workers[address]
                     continue
@@ -344,7 +350,7 @@ class Cluster(Closing):
                 if answered is not None:
                     backlog.done(task, answered.seconds)
                     done(task, answered)
-                elif future.status == "cancelled":  # with the scheduler's connection
+                elif future.status == "cancelled":  # as the connection to the scheduler ended
                     backlog.give_back(task)
                 elif (
                     future.status == "error" and type(future.exception()).__name__ != "KilledWorker"
@@ -356,7 +362,9 @@ class Cluster(Closing):
                     lost(task, backlog.died(task))
 
     def _check_alone(self) -> None:
-        """Raise MachineError after a long wait for workers."""
+        """Say once where there is no worker for the campaign. Raises MachineError after
+        MAX_WITHOUT_WORKER_S without one.
+        """
         if any(not worker.refused for worker in self._workers.values()):
             self._alone_since_s = None
             return
@@ -382,7 +390,7 @@ class Cluster(Closing):
             )
 
     def close(self) -> None:
-        """Cancel what is still asked for, and let the scheduler go."""
+        """Cancel the tasks that are not done, and disconnect from the scheduler."""
         with contextlib.suppress(Exception):
             self._client.cancel(
                 [future for worker in self._workers.values() for future, _ in worker.tasks]

@@ -1,10 +1,10 @@
-"""The model of a certificate: reference stars, and what a bench's deviations do to light, places,
-attitude and delay.
+"""The model of a certificate: reference stars, and how a bench's deviations change their light and
+places, and the attitude and delay that a tracker would measure.
 
-A star's light is the sum over its pixels, each with the deviation of its own level and place; its
-place is where the true lens shows the pixel that the bench draws it at. A field's attitude is the
-rotation nearest to all its stars' displacements (Wahba's problem, by SVD), which is what a tracker
-would report.
+A star's light is the sum over its pixels, each with the deviation of its own level and place. Its
+place is where the true lens shows the pixel at which the bench draws it. A field's attitude error
+is the rotation that best fits the displacements of all its stars (Wahba's problem, by SVD), as a
+tracker would report it.
 """
 
 import math
@@ -30,14 +30,15 @@ from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.frame import Bench, Frame
 from hilstar.server.bench.monitor import bench_calibration
 
-ATTITUDES, SEED = 40, 3  # random ones, of which the fields with the most stars are taken
-# in sprites: stars nearer than this share pixels; a star's own pixels
+ATTITUDES, SEED = 40, 3  # random attitudes, of which the fields with the most stars are chosen
+# In widths of the PSF: stars nearer to each other than the first share pixels; the second is the
+# reach of a star's own pixels.
 ALONE_SIGMAS, REACH_SIGMAS = 9.0, 4.0
 EDGE_TRACKER_PX = 10.0
 STARS_A_THIRD = 4
 NO_LIGHT = 1e-6
-SMALLEST = 1e-300  # of a sine, so that no rotation is none
-MIN_STARS = 3  # for an attitude
+SMALLEST = 1e-300  # smallest sine to divide by, so that the rotation vector of no rotation is 0
+MIN_STARS = 3  # of a field, for an attitude
 THIRDS = ("left third", "middle third", "right third")
 STAR_QUANTITIES = (("flux", "mag"), ("place_along", "arcsec"), ("place_across", "arcsec"))
 AXES = ("attitude_x", "attitude_y", "attitude_z")
@@ -45,11 +46,13 @@ AXES = ("attitude_x", "attitude_y", "attitude_z")
 
 @dataclass(frozen=True, slots=True)
 class ReferenceStar:
-    """A star of a reference field: its place on the monitor, its direction in cam, and its pixels
-    with their shares of light.
+    """A star of a reference field. `row` is its row in the bench's catalogue, `field` and `third`
+    number its field and the third of the screen in which it is; `x_px` and `y_px` are its place on
+    the monitor, `direction` (3,) is the unit vector to it in cam axes.
 
-    `log_light` (p,) is that asked of its pixels, relative to white, `pixel_px` (p, 2) their rows
-    and columns on the screen, `quantised_mag` how much too faint their codes make it.
+    Of its p lit pixels, `log_light` (p,) is the natural logarithm of the light of their codes,
+    relative to white, `share` (p,) their shares of the star's light, and `pixel_px` (p, 2) their
+    rows and columns on the screen. `quantised_mag` is how much too faint their codes make the star.
     """
 
     hip: int
@@ -68,8 +71,8 @@ class ReferenceStar:
 
 
 def reference_stars(file: BenchFile) -> list[ReferenceStar]:
-    """The stars of a bench's reference fields, drawn by the bench itself. Raises InputError
-    where they are too few.
+    """The stars of a bench's reference fields, as the bench itself draws them. Raises InputError
+    where no field has MIN_STARS stars that stand alone.
     """
     rng = np.random.default_rng(SEED)
     stars: list[ReferenceStar] = []
@@ -140,8 +143,8 @@ def _of_field(
 
 
 def _usable(bench: Bench, frame: Frame, geometry: BenchGeometry) -> BoolArray:
-    """Which rows of a frame are stars that stand alone, whole on the monitor and seen by the
-    tracker.
+    """Whether each row of a frame (n,) is a star that stands alone, is wholly on the monitor, and
+    is seen by the tracker.
     """
     rows = frame.rows
     x = rows["x_px"].astype(np.float64)
@@ -159,12 +162,12 @@ def _usable(bench: Bench, frame: Frame, geometry: BenchGeometry) -> BoolArray:
 
 
 def _reach(bench: Bench) -> int:
-    """The pixels of a star to each side of its middle."""
+    """How many pixels a star has to each side of its middle."""
     return math.ceil(REACH_SIGMAS * max(bench.psf.width_px))
 
 
 def _window(bench: Bench, x_px: float, y_px: float) -> IntArray:
-    """The rows and columns (n, 2) of the pixels about a place."""
+    """The rows and columns (n, 2) of a star's pixels about a place on the monitor."""
     reach = _reach(bench)
     about = np.arange(-reach, reach + 1, dtype=np.intp)
     row, column = np.meshgrid(round(y_px) + about, round(x_px) + about, indexing="ij")
@@ -172,7 +175,9 @@ def _window(bench: Bench, x_px: float, y_px: float) -> IntArray:
 
 
 def _seen(geometry: BenchGeometry, x_px: FloatArray, y_px: FloatArray) -> BoolArray:
-    """Which places (n,) on the monitor the tracker sees, its edge aside."""
+    """Whether the tracker sees each place (n,) on the monitor, EDGE_TRACKER_PX or more within its
+    image.
+    """
     at = np.stack(geometry.to_tracker(x_px, y_px))
     size = np.array(geometry.tracker.resolution_px)[:, None]
     with np.errstate(invalid="ignore"):
@@ -181,7 +186,9 @@ def _seen(geometry: BenchGeometry, x_px: FloatArray, y_px: FloatArray) -> BoolAr
 
 
 def thirds(geometry: BenchGeometry, x_px: FloatArray) -> IntArray:
-    """The third (n,) of what the tracker sees of the screen, 0 at the left, by columns."""
+    """The third (n,) in which each column of the monitor is, of the part that the tracker sees: 0,
+    1 or 2 from the left.
+    """
     along, down = geometry.monitor.grid_px((181, 61))
     visible = along[_seen(geometry, along, down)]
     if not len(visible):
@@ -194,12 +201,13 @@ def thirds(geometry: BenchGeometry, x_px: FloatArray) -> IntArray:
 
 @dataclass(frozen=True, slots=True)
 class Deviations:
-    """A bench's deviations of one or many trials (b, ...): light at levels and at stars, places of
-    stars, delay.
+    """A bench's deviations in b trials: of the light of levels, of the light and places of stars,
+    and of the delay.
 
-    `levels` (b, levels) is true over expected light at the model's `log_light`, `even` (b, stars)
-    its log at stars' places; `place_arcsec` (b, stars, 2); `delay_ms` (b,); `late_ms` (b,) is what
-    the moment of light is late beyond the delay.
+    `levels` (b, levels) is true over expected light at the levels `Figures.log_light`; `even` (b,
+    stars) is the natural logarithm of true over expected light at the stars' places;
+    `place_arcsec` (b, stars, 2) is the error of the stars' places along and across; `delay_ms` (b,)
+    is the true delay of the panel, and `late_ms` (b,) how much later than that light begins.
     """
 
     levels: FloatArray
@@ -210,8 +218,8 @@ class Deviations:
 
 
 class Figures:
-    """The figures of a bench's reference stars by its deviations, in a fixed order: `names` has
-    quantity and place of each.
+    """Computes the figures of a bench's reference stars from its deviations, in a fixed order.
+    `names` has the quantity, the star or field (-1 for the first field), and the unit of each.
     """
 
     def __init__(self, file: BenchFile, stars: list[ReferenceStar]) -> None:
@@ -239,8 +247,8 @@ class Figures:
         self.names.append(("latency", 0, "ms"))
 
     def turned(self, turns_arcsec: FloatArray) -> FloatArray:
-        """What turns of the bench (n, 3), arcsec about cam's axes, add to the stars' places (n,
-        stars, 2).
+        """The displacements (n, stars, 2), arcsec, of the stars' places by turns (n, 3) of the
+        bench, arcsec about the axes of cam.
         """
         u, v = self.tangent.T
         a, b, c = turns_arcsec.T[:, :, None]
@@ -250,8 +258,8 @@ class Figures:
         return np.stack([along, across], axis=2)
 
     def of(self, off: Deviations) -> FloatArray:
-        """The figures (b, figures): flux mag (fainter is positive), places arcsec, attitudes
-        arcsec, latency ms.
+        """The figures (b, figures), in the order of `names`: errors of flux, mag (fainter is
+        positive), of places and attitudes, arcsec, and the latency, ms.
         """
         certify = self.file.config.certify
         monitor = self.file.config.monitor
@@ -259,15 +267,15 @@ class Figures:
         flux = magnitude(light) - MAG_PER_RELATIVE * off.even
         late_ms = off.delay_ms - monitor.panel_delay_ms + off.late_ms
         place = off.place_arcsec.copy()
-        # deg/s to arcsec/ms; what is late lags behind
+        # 3.6 turns deg/s into arcsec/ms. A late star lags behind its motion.
         place[..., 0] -= certify.rate_deg_s * 3.6 * late_ms[:, None]
         columns = [flux, place[..., 0], place[..., 1]]
         columns += [self._attitude(place[:, stars], stars) for stars in self._of_field]
         return np.concatenate([*columns, off.delay_ms[:, None]], axis=1)
 
     def _attitude(self, place_arcsec: FloatArray, stars: IntArray) -> FloatArray:
-        """Rotation vectors (b, 3), arcsec, cam axes, from the commanded to the reported
-        attitude.
+        """The rotation vectors (b, 3), arcsec, in cam axes, from the commanded attitude to the one
+        that a tracker would report, by the places of a field's `stars`.
         """
         rays = np.ones((len(place_arcsec), len(stars), 3))
         rays[..., :2] = self.tangent[stars] + place_arcsec / ARCSEC_PER_RAD
@@ -277,7 +285,7 @@ class Figures:
         u[..., 2] *= np.linalg.det(u @ right)[:, None]
         turn = u @ right
         skew = turn - turn.transpose(0, 2, 1)
-        # The axial vector of a rotation by an angle a is 2 sin(a) times its axis.
+        # The skew part R - R^T of a rotation by an angle a is 2 sin(a) times its axis.
         axial = skew[:, (2, 0, 1), (1, 2, 0)] / 2
         sine = np.linalg.norm(axial, axis=1, keepdims=True)
         sine = np.clip(sine, SMALLEST, 1.0)
@@ -286,7 +294,7 @@ class Figures:
 
 
 def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
-    """The deviations of a bench whose truth is known (b = 1), at its reference stars."""
+    """The deviations (b = 1) of a bench from the bench file `truth`, at its reference stars."""
     file = figures.file
     stated = grey_response(file).light[1:]
     ratio = grey_response(truth).light[1:] / stated
@@ -302,7 +310,7 @@ def true_deviations(figures: Figures, truth: BenchFile) -> Deviations:
 
 
 def _evenness_at(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    """A bench's relative light (n,) at pixels."""
+    """The relative light (n,) of a bench's pixels by its uniformity map; 1 without one."""
     size_px = file.config.monitor.resolution_px
     known = bench_calibration(file.config, file.folder).uniformity_map(size_px)
     if known is None:
@@ -313,6 +321,6 @@ def _evenness_at(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatAr
 
 
 def _tangents_at(file: BenchFile, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    """Where a bench's collimator shows pixels (n, 2), tangents in cam."""
+    """The directions (n, 2), tangents in cam axes, in which a bench's collimator shows pixels."""
     rays = geometry_of(file).monitor.rays(x_px, y_px)
     return np.asarray(rays[:, :2] / rays[:, 2:])

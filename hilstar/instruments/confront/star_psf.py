@@ -1,9 +1,9 @@
-"""The point spread function of photographs: a core that changes over the field and with colour, and
-wings; and stars by it.
+"""The point spread function (PSF) of photographs, a core that changes over the field and with
+colour, and wings; and the measurement of stars by it.
 
-The core is an elliptical Gaussian whose covariance is a polynomial of the place, times a factor of
-B-V (a lens focuses one colour). The wings are a round Gaussian with a share of the light. Both are
-integrated over pixels.
+The core is an elliptical Gaussian. Its covariance is a polynomial of the place in the image, times
+a factor that depends on B-V, as a lens focuses one colour only. The wings are a round Gaussian with
+a share of the light. Both are integrated over pixels.
 """
 
 import math
@@ -26,27 +26,29 @@ from hilstar.optics.psf_fit import (
 
 STAMP_PX = 11
 HALF = STAMP_PX // 2
-NODES = 3  # within a pixel: right to 1e-3 of its light from 0.35 px of sigma
-START_ROUNDS = 4  # of each star's own Gaussian, from whose median the PSF's starts
+NODES = 3  # of quadrature in a pixel: its light is right to 1e-3 for a sigma of 0.35 px or more
+# Rounds in which each star's own Gaussian is fitted; the fit of the PSF begins at their median.
+START_ROUNDS = 4
 MIN_SIGMA_PX, MAX_SIGMA_PX = 0.15, 5.0
 MEAN_BV_MAG = 0.65
 PLACE_STEPS, SHAPE_ROUNDS = 8, 2
 PLACE_DONE_PX = 1e-3
-SHAPE_GAIN = 0.1  # a step of the PSF's numbers that lowers the loss by less is the last
+SHAPE_GAIN = 0.1  # the fit ends with a step that lowers the loss by less
 WING_SIGMA_PX = 0.8, 6.0
-# share of a pixel's light by which the model may be wrong: so no bright star outvotes all others
+# Error of the model as a share of a pixel's light. It limits the weight of bright stars, so that
+# none outvotes all others.
 MODEL_ERROR = 0.01
-STARS_FOR = ((40, 6), (12, 2), (0, 1))  # stars that a number of terms of the field takes
+STARS_FOR = ((40, 6), (12, 2), (0, 1))  # from how many stars on how many field terms are fitted
 
 
 @dataclass(frozen=True, slots=True)
 class StarPsf:
     """A point spread function over an image of `size_px`.
 
-    `covariance` (3, terms) are coefficients of the core's xx, yy and xy, px^2. Terms are 1, r^2, u,
-    v, u^2 - v^2, u v of the place (u, v) from the image's middle in half diagonals. `colour` is the
-    relative change of the covariance per magnitude of B-V. `wing_share` is the wings' share of the
-    light.
+    `covariance` (3, terms) are the coefficients, px^2, of the core's xx, yy and xy. The terms are
+    1, r^2, u, v, u^2 - v^2 and u v, of the place (u, v) from the image's middle in half diagonals.
+    `colour` is the relative change of the covariance per magnitude of B-V. `wing_share` is the
+    wings' share of the light, `wing_sigma_px` their sigma.
     """
 
     covariance: FloatArray
@@ -56,7 +58,9 @@ class StarPsf:
     size_px: tuple[int, int]
 
     def core(self, x_px: FloatArray, y_px: FloatArray, bv_mag: FloatArray) -> FloatArray:
-        """Covariances xx, yy and xy (n, 3) of the core at places, px^2, before pixels widen it."""
+        """The core's covariances xx, yy and xy (n, 3), px^2, at places (n,), px, for stars of
+        colour B-V (n,), without the widening by pixels. NaN as a colour counts as MEAN_BV_MAG.
+        """
         count = self.covariance.shape[1]
         terms = field_terms(x_px, y_px, self.size_px)[:, :count]
         covariance = terms @ self.covariance.T
@@ -64,14 +68,14 @@ class StarPsf:
         factor = np.clip(1 + self.colour * redness_mag, 0.3, 3.0)
         covariance *= factor[:, None]
         covariance[:, :2] = np.clip(covariance[:, :2], MIN_SIGMA_PX**2, MAX_SIGMA_PX**2)
-        # a covariance is positive definite: |xy| < sqrt(xx yy)
+        # kept positive definite, which requires |xy| < sqrt(xx yy)
         limit = 0.9 * np.sqrt(covariance[:, 0] * covariance[:, 1])
         covariance[:, 2] = np.clip(covariance[:, 2], -limit, limit)
         return covariance
 
     def fwhm_px(self, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-        """Full width at half maximum of what pixels get, (n,): of core, wings and a pixel, all
-        made round.
+        """The full width at half maximum (n,), px, at places (n,), of core and wings as pixels
+        widen them, all approximated as round Gaussians.
         """
         core = self.core(x_px, y_px, np.full(len(x_px), MEAN_BV_MAG))
         # a square pixel's variance along an axis is 1/12
@@ -87,10 +91,9 @@ class StarPsf:
     def on_pixels(
         self, dx: FloatArray, dy: FloatArray, core: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Shares of light in pixels at offsets dx (n, columns), dy (n, rows) from the stars, (n,
-        rows, columns).
-
-        With them their derivatives by the star's x and y.
+        """The shares (n, rows, columns) of a star's light in pixels at offsets dx (n, columns) and
+        dy (n, rows), px, from the stars, and their derivatives by the star's x and by its y, 1/px.
+        `core` (n, 3) are the covariances of `StarPsf.core`.
         """
         narrow = _gaussians(dx, dy, core).slopes()
         wide = _gaussians(dx, dy, self._wing(len(core))).slopes()
@@ -104,8 +107,8 @@ class StarPsf:
     def by_shape(
         self, dx: FloatArray, dy: FloatArray, core: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Shares as `on_pixels`, and their derivatives (5, n, rows, columns) by xx, yy, xy, the
-        wings' share and sigma.
+        """The shares (n, rows, columns) of `on_pixels`, and their derivatives (5, n, rows, columns)
+        by the core's xx, yy and xy, and by the wings' share and sigma.
         """
         wing_share = self.wing_share
         core_share = 1 - wing_share
@@ -119,13 +122,13 @@ class StarPsf:
         return share, slopes
 
     def _wing(self, count: int) -> FloatArray:
-        """Covariances (count, 3) of the wings, px^2."""
+        """The wings' covariance xx, yy and xy, px^2, repeated: (count, 3)."""
         variance = self.wing_sigma_px**2
         return np.broadcast_to([variance, variance, 0.0], (count, 3))
 
     def samples(self, x_px: float, y_px: float, per_px: int, half_px: int) -> FloatArray:
-        """The light itself on a grid of `per_px` samples a pixel, (side, side), without the
-        pixel; sums to 1.
+        """The PSF (side, side) at a place of the image, on a grid of `per_px` samples a pixel that
+        reaches `half_px` to each side, without the widening by pixels. Its sum is 1.
         """
         half = half_px * per_px
         offsets_px = np.arange(-half, half + 1) / per_px
@@ -143,14 +146,16 @@ class StarPsf:
 
 
 def _round_light(share: float, variance_px2: FloatArray, radius_px: FloatArray) -> FloatArray:
-    """Light (n, radii) of round Gaussians with a share of all light, but for a factor."""
+    """The surface brightness (n, radii), in arbitrary units, of round Gaussians with a `share` of
+    the light and variances (n,), at radii (radii,).
+    """
     variance = variance_px2[:, None]
     profile = np.exp(-(radius_px**2) / (2 * variance))
     return np.asarray(share / variance * profile)
 
 
 def field_terms(x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int]) -> FloatArray:
-    """Terms (n, 6) of the field: 1, r^2, u, v, u^2 - v^2, u v."""
+    """The field terms (n, 6) at places (n,), px: 1, r^2, u, v, u^2 - v^2 and u v; see `StarPsf`."""
     half = math.hypot(*size_px) / 2
     u = (x_px - (size_px[0] - 1) / 2) / half
     v = (y_px - (size_px[1] - 1) / 2) / half
@@ -159,16 +164,19 @@ def field_terms(x_px: FloatArray, y_px: FloatArray, size_px: tuple[int, int]) ->
 
 
 def _gaussians(dx: FloatArray, dy: FloatArray, covariance: FloatArray) -> PixelGaussians:
-    """Gaussians of points in pixels at offsets from them."""
+    """Gaussians of covariances (n, 3), px^2, in pixels at offsets dx (n, columns) and dy (n, rows)
+    from their middles.
+    """
     return PixelGaussians(dx, dy, covariance, np.zeros(len(dx)), NODES)
 
 
 @dataclass(frozen=True, slots=True)
 class Stamps:
-    """Squares of pixels about stars: values over the background and variances (n, k, k), DN;
-    (column, row) of each middle.
+    """Squares of k x k pixels about n stars: their `values` (n, k, k), DN above the background, the
+    `variance` (n, k, k), DN^2, without the stars' own noise, and the `column` and `row` (n,) of
+    each square's middle pixel.
 
-    `variance` is infinite where a pixel does not count. `bv_mag` (n,) is each star's colour.
+    `variance` is infinite where a pixel does not count. `bv_mag` (n,) is each star's B-V.
     """
 
     values: FloatArray
@@ -181,7 +189,7 @@ class Stamps:
         return len(self.column)
 
     def at(self, chosen: BoolArray) -> "Stamps":
-        """The stamps that are `chosen` (n,)."""
+        """The stamps for which `chosen` (n,) is True."""
         return Stamps(
             self.values[chosen],
             self.variance[chosen],
@@ -191,19 +199,25 @@ class Stamps:
         )
 
     def middle(self, reach: int) -> FloatArray:
-        """Values (n, side, side) of the pixels up to `reach` from the middle one."""
+        """The values (n, side, side), DN, of the pixels up to `reach` pixels from the middle
+        one.
+        """
         near = slice(HALF - reach, HALF + reach + 1)
         return self.values[:, near, near]
 
     def offsets(self, x_px: FloatArray, y_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Offsets of the pixels' columns and rows from places (n,): dx (n, k) and dy (n, k), px."""
+        """The offsets dx (n, k) and dy (n, k), px, of the stamps' columns and rows from places
+        (n,), px, in the image.
+        """
         reach = np.arange(-HALF, HALF + 1)
         dx = self.column[:, None] + reach - x_px[:, None]
         dy = self.row[:, None] + reach - y_px[:, None]
         return dx, dy
 
     def weight(self, light_dn: FloatArray, gain_e_per_dn: float) -> FloatArray:
-        """One over the variance of pixels (n, k, k) that have this light of their stars, DN."""
+        """The weights (n, k, k), 1/DN^2, of pixels with the light `light_dn` (n, k, k) of their
+        stars: one over the variance of background, photons and the model's error.
+        """
         photon_variance = light_dn / gain_e_per_dn
         model_variance = (MODEL_ERROR * light_dn) ** 2
         return np.asarray(1 / (self.variance + photon_variance + model_variance))
@@ -219,8 +233,8 @@ def join(parts: Sequence[Stamps]) -> Stamps:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Stars by the PSF: place, px, and flux, DN, with one sigma of place and flux, and reduced
-    chi^2, (n,).
+    """Stars measured by the PSF, each (n,): the place, px, the flux, DN, one sigma of a place along
+    an axis and of the flux, and the reduced chi^2.
     """
 
     x_px: FloatArray
@@ -232,15 +246,16 @@ class Measured:
 
     @property
     def places_px(self) -> FloatArray:
-        """Places (n, 2), x and y."""
+        """The places (n, 2), x and y, px."""
         return np.column_stack([self.x_px, self.y_px])
 
 
 def cut_stamps(
     above: FloatArray, variance: FloatArray, x_px: FloatArray, y_px: FloatArray, bv_mag: FloatArray
 ) -> Stamps:
-    """Stamps of an image above its background about places (n,), and the variance of its pixels
-    without the stars'.
+    """Cut stamps about places (n,), px, from the image `above` its background (height, width), DN,
+    and from the `variance` (height, width), DN^2, of its pixels without the stars' own noise.
+    Pixels beyond the image's edge do not count.
     """
     height, width = above.shape
     reach = np.arange(-HALF, HALF + 1)
@@ -262,8 +277,8 @@ def cut_stamps(
 def measure(
     stamps: Stamps, psf: StarPsf, x_px: FloatArray, y_px: FloatArray, gain_e_per_dn: float
 ) -> Measured:
-    """Stars by least squares of place, flux and a level, from starting places; photon noise by
-    `gain_e_per_dn`.
+    """Measure stars by least squares of place, flux and a level of the background, from starting
+    places (n,), px. Their photon noise follows from `gain_e_per_dn`.
     """
     count = len(x_px)
     x = x_px.copy()
@@ -275,7 +290,8 @@ def measure(
         dx, dy = stamps.offsets(x, y)
         shape, by_x, by_y = psf.on_pixels(dx, dy, core)
         if number:
-            # photon noise of the model, not of what was seen: else faint stars come out too faint
+            # The photon noise is that of the model. By that of the measured light, low pixels would
+            # weigh more, and faint stars would come out too faint.
             star_dn = np.maximum(flux, 0)[:, None, None] * shape
             weight = stamps.weight(star_dn, gain_e_per_dn)
             flux = np.maximum(flux, 1e-3)
@@ -294,7 +310,7 @@ def measure(
         y += np.clip(move[:, 1], -0.5, 0.5)
         flux = flux + move[:, 2]
         level = level + move[:, 3]
-        # the few that never settle (blends, cosmic rays) do not hold up the others
+        # The last 2 % of stars, which may never converge (blends, cosmic rays), are not waited for.
         if np.quantile(np.abs(move[:, :2]), 0.98) < PLACE_DONE_PX:
             break
     covariance = np.linalg.inv(normal)
@@ -308,7 +324,9 @@ def measure(
 def _linear(
     shape: FloatArray, values: FloatArray, weight: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Flux and level (n,) of stars of a `shape` by weighted least squares."""
+    """The flux (n,) and the level (n,) of stars by weighted least squares, from their pixels'
+    shares `shape`, `values` and weights, each (n, rows, columns).
+    """
     count = len(shape)
     s = shape.reshape(count, -1)
     v = values.reshape(count, -1)
@@ -331,14 +349,16 @@ def fit_psf(
     size_px: tuple[int, int],
     gain_e_per_dn: float,
 ) -> StarPsf:
-    """The PSF of stars that stand alone and are not saturated, from starting places."""
+    """The PSF of an image of `size_px`, by stars that stand alone and are not saturated, from their
+    starting places (n,), px.
+    """
     terms = next(count for minimum, count in STARS_FOR if len(stamps) >= minimum)
     start = np.zeros((3, terms))
     start[:, 0] = _first_covariance(stamps, x_px, y_px)
     psf = StarPsf(start, 0.0, 0.05, 2.0, size_px)
     measured = measure(stamps, psf, x_px, y_px, gain_e_per_dn)
     for number in range(SHAPE_ROUNDS):
-        # colour and wings once the core is near
+        # colour and wings are fitted only after a first fit of the core
         psf = _shape(stamps, measured, psf, gain_e_per_dn, wide=number > 0)
         moved_px = np.hypot(measured.x_px - x_px, measured.y_px - y_px)
         is_near = moved_px < 2
@@ -349,7 +369,9 @@ def fit_psf(
 
 
 def _first_covariance(stamps: Stamps, x_px: FloatArray, y_px: FloatArray) -> FloatArray:
-    """The median covariance, xx, yy and xy, px^2, of the stars, each by a Gaussian of its own."""
+    """The median of the stars' covariances xx, yy and xy (3,), px^2, each by a Gaussian fitted to
+    the star alone.
+    """
     weight = 1 / stamps.variance
     none_px = np.zeros(len(stamps))
     points = PointImages(stamps.values, weight, stamps.column, stamps.row, none_px)
@@ -360,8 +382,8 @@ def _first_covariance(stamps: Stamps, x_px: FloatArray, y_px: FloatArray) -> Flo
 
 
 def _first_width(stamps: Stamps) -> float:
-    """A variance, px^2, from how much of a star's light its highest pixel and the eight about it
-    have.
+    """A first estimate of the stars' variance along an axis, px^2, from the median share of a
+    star's light in its brightest pixel.
     """
     middle = stamps.middle(3)
     total = np.maximum(middle.sum(axis=(1, 2)), 1e-9)
@@ -374,9 +396,10 @@ def _first_width(stamps: Stamps) -> float:
 def _shape(
     stamps: Stamps, at: Measured, psf: StarPsf, gain_e_per_dn: float, *, wide: bool
 ) -> StarPsf:
-    """The PSF's numbers with the stars where they are; flux and level of each follow.
+    """The PSF fitted with the stars at fixed places, and with the flux and the level of each star
+    at their best.
 
-    With `wide` also colour and wings, else the core's covariance alone.
+    Without `wide` only the core's covariance is fitted, with it also colour and wings.
     """
     loss = _ShapeLoss(stamps, at, psf, gain_e_per_dn, wide=wide)
     numbers, _ = minimised(loss.residuals, loss.slopes, loss.start, SHAPE_GAIN)
@@ -384,9 +407,9 @@ def _shape(
 
 
 class _ShapeLoss:
-    """The residuals of stamps, in sigmas, as a function of the PSF's numbers: coefficients of the
-    covariance, and where it is `wide` colour, logistic of the wings' share, and logarithm of their
-    sigma.
+    """The residuals of stamps, in sigmas, as a function of the PSF's parameters: the coefficients
+    of the covariance and, with `wide`, the colour, the logit of the wings' share, and the logarithm
+    of their sigma.
     """
 
     def __init__(
@@ -406,14 +429,15 @@ class _ShapeLoss:
         self.root = np.sqrt(self.weight)
         tail = []
         if wide:
-            # the share by its logistic, of at most one half: no step leads out of its range
+            # The share is half a logistic function of its parameter, so that no step leads out of 0
+            # to 0.5.
             ratio = np.clip(psf.wing_share, 0.01, 0.49) / 0.5
             tail = [psf.colour, math.log(ratio / (1 - ratio)), math.log(psf.wing_sigma_px)]
         self.start = np.concatenate([psf.covariance.ravel(), tail])
         is_field_term = np.arange(3 * self.count) % self.count > 0
         is_held = [*is_field_term, *(False, True, True)[: len(tail)]]
-        # weak: terms of the field are 0 +- 1 px^2, and the wings stay within factors of those
-        # before
+        # Weak priors: the field's coefficients are 0 +- 1 px^2, and the wings' logit and logarithm
+        # are within +- 1 of those before.
         self.prior = np.eye(len(self.start))[is_held]
         is_covariance = np.arange(len(self.start)) < 3 * self.count
         self.prior_mean = np.where(is_covariance, 0.0, self.start)
@@ -422,7 +446,7 @@ class _ShapeLoss:
         return psf.core(self.at.x_px, self.at.y_px, self.stamps.bv_mag)
 
     def psf_of(self, numbers: FloatArray) -> StarPsf:
-        """The PSF of numbers."""
+        """The PSF with these parameters."""
         covariance = numbers[: 3 * self.count].reshape(3, self.count)
         if not self.wide:
             return replace(self.psf, covariance=covariance)
@@ -436,19 +460,23 @@ class _ShapeLoss:
         )
 
     def residuals(self, numbers: FloatArray) -> FloatArray:
-        """Those of all pixels, with the stars' flux and level that fit best, then the priors."""
+        """The residuals of all pixels, with the flux and level of each star that fit best, and then
+        those of the priors.
+        """
         values = self.stamps.values
         trial = self.psf_of(numbers)
         shape = trial.on_pixels(self.dx, self.dy, self._core(trial))[0]
         flux, level = _linear(shape, values, self.weight)
         model = flux[:, None, None] * shape
         off = (values - model - level[:, None, None]) * self.root
-        # a pixel of a neighbour that no catalogue has pulls no further than 30 sigmas
+        # so that a pixel of a neighbour that no catalogue has counts by 30 sigmas at most
         clipped = np.clip(off.ravel(), -30, 30)
         return np.concatenate([clipped, self.prior @ (numbers - self.prior_mean)])
 
     def slopes(self, numbers: FloatArray, off: FloatArray) -> FloatArray:
-        """Derivatives with each star's flux and level following (Kaufman 1975)."""
+        """The derivatives (residuals, parameters) of `residuals`, with the flux and level of each
+        star adjusted along with the parameters (Kaufman 1975).
+        """
         trial = self.psf_of(numbers)
         shape, by_shape = trial.by_shape(self.dx, self.dy, self._core(trial))
         flux = _linear(shape, self.stamps.values, self.weight)[0][:, None, None]
@@ -466,7 +494,7 @@ class _ShapeLoss:
         return jacobian
 
     def _light_slopes(self, trial: StarPsf, by_shape: FloatArray) -> list[FloatArray]:
-        """Derivatives of the light (n, rows, columns) by each number."""
+        """The derivatives (n, rows, columns) of a star's shares by each parameter in turn."""
         redness = 1 + trial.colour * self.redness_mag
         slopes = []
         for k in range(3):

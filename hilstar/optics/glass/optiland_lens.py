@@ -1,7 +1,8 @@
-"""A lens as optiland's, made of what a file states: surfaces in their axes, glasses by name.
+"""Makes a lens of optiland from what a lens file states: its surfaces in their own axes, its
+glasses by name.
 
-optiland finds glasses by likeness (SF11 as N-SF11), and takes AIR or a placeholder for what it does
-not find. So its database is searched here, by name and catalogue.
+optiland itself looks a glass up by similarity (N-SF11 for SF11), and uses AIR or a placeholder
+where it finds none. So its database is searched here, by exact name and catalogue.
 """
 
 import csv
@@ -19,11 +20,11 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, did_you_mean
 from hilstar.optics.glass.lens_data import Aperture, Glass, LensPrescription, LensSurface
 
-# Where a name stands in several catalogues and the file names none of them: the order of searching.
+# The order in which catalogues are searched for a glass where the lens file names none of them.
 CATALOGUE_ORDER = ("schott", "ohara", "hoya", "cdgm", "hikari", "sumita")
-# Materials that catalogues of Zemax (MISC, INFRARED) and of CODE V have under names of their own,
-# with the published formula that those have: Malitson 1965 and 1963. Corning states n_d = 1.458467
-# for its 7980, Malitson 1.458464 for fused silica.
+# Materials to which catalogues of Zemax (MISC, INFRARED) and of CODE V give names of their own, and
+# the published formula that those catalogues use: Malitson 1965 and 1963. Corning states n_d =
+# 1.458467 for its 7980, Malitson 1.458464 for fused silica.
 MATERIALS = {
     "C79-80": "main/SiO2/Malitson.yml",
     "F_SILICA": "main/SiO2/Malitson.yml",
@@ -31,10 +32,11 @@ MATERIALS = {
     "FSILICA": "main/SiO2/Malitson.yml",
     "CAF2": "main/CaF2/Malitson.yml",
 }
-# Old glasses that the database lacks, and whose n_d and V_d the new one has to the last digit of
-# Schott's data sheets.
+# Old glasses that the database lacks, and the new ones with the same n_d and V_d to the last digit
+# of Schott's data sheets.
 SAME_GLASSES = {"bk7": "nbk7"}
-# Of a conic's series: at 0.8 of the radius where it stands upright, the next is 1e-8 of the first.
+# Terms of a conic's series: at 0.8 of the radius at which the surface is upright, the term after
+# the last is 1e-8 of the first.
 SERIES_TERMS = 40
 GLASS_GROUP = "glass"
 FURTHER_FOLDER = "misc"  # of a maker's glasses beside its catalogue, such as Schott's B270
@@ -48,7 +50,9 @@ PUPIL_NAMES = {"diameter": "EPD", "f_number": "imageFNO", "stop": "float_by_stop
 
 @dataclass(frozen=True, slots=True)
 class GlassFile:
-    """A material of optiland's database; name and catalogue are in small letters and digits."""
+    """A material in optiland's database, with the wavelengths at which it is known, um. Name and
+    catalogue are in small letters and digits only.
+    """
 
     name: str
     catalogue: str
@@ -59,9 +63,9 @@ class GlassFile:
 
 
 def optic_of(lens: LensPrescription) -> tuple[Any, tuple[str, ...]]:
-    """optiland's Optic, and notes for the person.
+    """optiland's Optic of a lens, and notes for the user on how its glasses were read.
 
-    Raises InputError for a glass that no catalogue has.
+    Raises InputError for a glass that no catalogue has, or that is not known at a wavelength.
     """
     from optiland.optic import Optic
 
@@ -86,7 +90,7 @@ def optic_of(lens: LensPrescription) -> tuple[Any, tuple[str, ...]]:
 def _geometry(surface: LensSurface) -> dict[str, Any]:
     x_mm, y_mm, z_mm = surface.origin_mm.tolist()
     rx, ry, rz = _euler_rad(surface.turn)
-    # optiland's paraxial rays see the base sphere alone: a term in r^2 is made part of it.
+    # optiland's paraxial rays use the base sphere alone, so a term in r^2 is made part of it.
     curvature = surface.paraxial_curvature_per_mm
     radius_mm = 1 / curvature if curvature else np.inf
     made: dict[str, Any] = {
@@ -117,7 +121,9 @@ def _shape(surface: LensSurface) -> dict[str, Any]:
 
 
 def _terms_beside_base(surface: LensSurface) -> FloatArray:
-    """Coefficients of r, r^2, ... beside a base with the surface's curvature at its vertex, mm."""
+    """The coefficients of r, r^2, ... (lengths in mm) of a surface, to be added to a base conic
+    that has the surface's curvature at its vertex.
+    """
     terms = np.array(surface.polynomial)
     if len(terms) < 2 or not terms[1]:
         return terms
@@ -131,7 +137,9 @@ def _terms_beside_base(surface: LensSurface) -> FloatArray:
 
 
 def _conic_series(curvature_per_mm: float, conic: float) -> FloatArray:
-    """Coefficients of r^2, r^4, ... of a conic's height: the binomial series of its root."""
+    """The coefficients of r^2, r^4, ... (SERIES_TERMS,) of a conic's height, lengths in mm: the
+    binomial series of its root.
+    """
     binomial = 1.0
     coefficients = []
     for number in range(1, SERIES_TERMS + 1):
@@ -142,19 +150,21 @@ def _conic_series(curvature_per_mm: float, conic: float) -> FloatArray:
 
 
 def _euler_rad(turn: FloatArray) -> list[float]:
-    """optiland turns about the fixed x, then y, then z."""
+    """The three angles, rad, of a rotation matrix (3, 3) as optiland turns: about the fixed x axis,
+    then y, then z.
+    """
     angles_rad = Rotation.from_matrix(turn).as_euler("xyz")
-    # Its fast path for lenses without tilts asks whether angles are 0.
+    # optiland takes its fast path for lenses without tilts only where angles are exactly 0.
     angles_rad[np.abs(angles_rad) < np.finfo(np.float64).eps] = 0.0
     return list(angles_rad.tolist())
 
 
 def _mask(apertures: Sequence[Aperture]) -> Any:
-    """All apertures of a surface as one of optiland's."""
+    """All apertures of a surface as a single aperture of optiland."""
     from optiland.physical_apertures.base import BaseAperture
 
     class Mask(BaseAperture):  # type: ignore[misc]
-        """All apertures of a surface as one: light passes that passes each of them."""
+        """All apertures of a surface as one: light passes it where it passes each of them."""
 
         @property
         def extent(self) -> tuple[float, float, float, float]:
@@ -172,7 +182,9 @@ def _mask(apertures: Sequence[Aperture]) -> Any:
 
 
 def _material(surface: LensSurface, wavelengths_um: Sequence[float]) -> tuple[Any, list[str]]:
-    """optiland's material behind a surface, and what is to be said of it."""
+    """optiland's material behind a surface, and notes for the user on how it was read. Raises
+    InputError for an unknown glass, or one that is not known at a wavelength of the lens.
+    """
     glass = surface.glass
     if glass.is_mirror:
         return "mirror", []
@@ -198,7 +210,7 @@ def _model(glass: Glass) -> Any:
     from optiland.materials.base import BaseMaterial
 
     class ModelGlass(BaseMaterial):  # type: ignore[misc]
-        """An index of the lens file's own."""
+        """A glass whose index the lens file itself states."""
 
         def _calculate_n(self, wavelength: Any, **_: Any) -> Any:
             return glass.model_index(np.asarray(wavelength))
@@ -210,15 +222,16 @@ def _model(glass: Glass) -> Any:
 
 
 def find_glass(glass: Glass, label: str) -> tuple[GlassFile, list[str]]:
-    """The file of a catalogue's glass, by its exact name, and notes.
+    """The material in optiland's database with a glass's exact name, and notes for the user on
+    which of several it is.
 
-    Raises InputError where none has it.
+    Raises InputError, which begins with `label`, where no catalogue has it.
     """
     name = _plain(glass.name)
     by_name = [file for file in _database() if file.name == name]
     listed = [_plain(catalogue) for catalogue in glass.catalogues]
     for catalogue in listed:
-        # SCHOTT_2014 and SCHOTT are one maker's.
+        # SCHOTT_2014 and SCHOTT are catalogues of one maker, so the beginning of a name counts.
         for file in by_name:
             if catalogue.startswith(file.catalogue):
                 return file, []
@@ -249,8 +262,8 @@ def _where(glass: Glass) -> str:
 
 
 def _instead(written: str, plain: str) -> str:
-    """What to write for a glass that no catalogue has: its maker may have a successor (N-SF11 for
-    SF11), which is another glass.
+    """A text that says what to write for a glass that no catalogue has. Its maker may have a
+    successor (N-SF11 for SF11), which is a different glass.
     """
     glasses = [file for file in _database() if file.is_glass]
     for file in glasses:
@@ -269,7 +282,7 @@ def _place_in_order(file: GlassFile) -> int:
 
 
 def _plain(name: str) -> str:
-    """CODE V writes NBK7 for N-BK7."""
+    """A name in small letters and digits only, as CODE V writes NBK7 for N-BK7."""
     return "".join(character for character in name.lower() if character.isalnum())
 
 

@@ -1,8 +1,8 @@
-"""A bench's catalogue as its tracker sees it: a row a star, with errors, origins and synthetic
-magnitudes; and its files.
+"""The catalogue of a bench's tracker, one row for each star, with errors, origins and synthetic
+magnitudes; and the files to which it is written.
 
-`catalogue_columns.csv` beside this file has the columns in their order, with units, UCDs and
-descriptions; the functions here have their values.
+`catalogue_columns.csv` beside this file lists the columns in their order, with units, UCDs and
+descriptions; the functions here compute their values.
 """
 
 import csv
@@ -35,21 +35,23 @@ from hilstar.sky.synthetic import (
     vega_electrons_per_s,
 )
 
-MIN_PARALLAX_SIGMAS = 5.0  # beyond which a distance is within 20 %
-FAINTER_MAG = 3.0  # by this a neighbour may be fainter
-COLOUR_STEP_MAG = 0.01  # step of the derivative of a rate by a colour
+MIN_PARALLAX_SIGMAS = 5.0  # for an absolute magnitude: the distance is then known within 20 %
+FAINTER_MAG = 3.0  # how much fainter than its star a neighbour may be
+COLOUR_STEP_MAG = 0.01  # difference of a colour over which a rate's derivative is taken
 DECIMALS = 9  # places in degrees: 4 microarcseconds
 ENDINGS = (".csv", ".fits", ".parquet", ".vot")
 COLUMNS = Path(__file__).with_name("catalogue_columns.csv")
 PARQUET = "parquet needs pyarrow: pip install 'hilstar[campaign]', or write .csv, .fits or .vot"
 
 
-# Figures or text of each star (n,), by the column's name.
+# The figures or texts (n,) of all stars, by the name of the column.
 Values = dict[str, npt.NDArray[Any]]
 
 
 class Column(NamedTuple):
-    """A column: figures or text (n,), its unit as astropy writes it, its UCD, and what it is."""
+    """A column: its figures or texts (n,), its unit as astropy writes it ("" for none), its UCD,
+    and its description.
+    """
 
     values: npt.NDArray[Any]
     unit: str
@@ -59,7 +61,9 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class InstrumentCatalogue:
-    """The columns by name, the brightest star first, and what is to be said of them."""
+    """The columns by name, with the brightest star first; the epoch of the places, a Julian year;
+    and the zero points, the magnitude of one electron per second by the system ("vega", "ab").
+    """
 
     columns: dict[str, Column]
     epoch_jyear: float
@@ -72,10 +76,11 @@ class InstrumentCatalogue:
 def bench_catalogue(
     file: BenchFile, faintest_v_mag: float | None, epoch_jyear: float | None
 ) -> InstrumentCatalogue:
-    """The catalogue of a bench to V = `faintest_v_mag` (None: the bench's) at an epoch (None: the
-    bench's).
+    """The catalogue of a bench's stars down to V = `faintest_v_mag`, with places at an epoch, a
+    Julian year; None for either means that of the bench file.
 
-    Places are barycentric ICRS, without aberration or parallax. Raises InputError.
+    Places are barycentric, ICRS, without aberration or parallax. Raises InputError where no star is
+    that bright, or a file cannot be read.
     """
     sky = file.config.sky
     choice = catalogue_choice(file.config, file.folder)
@@ -110,7 +115,9 @@ def bench_catalogue(
 def _described(
     values: Values, temperature: str, zero_points: dict[str, float]
 ) -> dict[str, Column]:
-    """The columns in the order of COLUMNS. A description may name the bench's choices in braces."""
+    """The columns in the order of the file COLUMNS. In its descriptions, names in braces are
+    replaced by the bench's own choices.
+    """
     columns = {}
     with COLUMNS.open(newline="", encoding="utf-8") as file:
         for row in csv.DictReader(file):
@@ -136,7 +143,7 @@ def _places(stars: Catalog, facts: dict[str, Any], epoch_jyear: float) -> Values
     values: Values = {}
     values["hip"] = stars.hip
     values["name"] = np.array(names, dtype=np.str_)
-    # A place may round up to 360 degrees.
+    # A right ascension may round up to 360 degrees, which is 0.
     values["ra_deg"] = np.round(motion.ra_deg, DECIMALS) % 360.0
     values["dec_deg"] = np.round(motion.dec_deg, DECIMALS)
     values["sigma_ra_mas"] = sigma[0]
@@ -173,12 +180,12 @@ def _photometry(stars: Catalog, facts: dict[str, Any]) -> Values:
 
 
 def _decimals(values: npt.NDArray[np.float32]) -> FloatArray:
-    # back to the catalogue's from float32
+    # from float32 back to the catalogue's own decimals
     return np.asarray(np.round(values.astype(np.float64), 3), dtype=np.float64)
 
 
 def _zero_points(file: BenchFile) -> dict[str, float]:
-    """The magnitude of one electron per second, by the system."""
+    """The magnitude of one electron per second, by the system ("vega", "ab")."""
     sky = file.config.sky
     optics = bench_optics(file.config.tracker, file.folder)
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
@@ -199,7 +206,8 @@ def _light(
     rate = rates(v, bv, vi, kind)
     values: Values = {}
     values["temperature_k"] = star_temperatures_k(bv, sky.temperature)
-    # A star's spectrum is chosen by its V-I, or its type: its synthetic B is then not V + (B-V).
+    # A star's spectrum is chosen by its V-I or its type. Its synthetic B is then not V + (B-V), so
+    # the measured B has a column of its own.
     for band in BANDS:
         values[f"{band}_mag"] = v + colour[band](bv, vi, kind)
     values["b_measured_mag"] = v + bv
@@ -215,10 +223,10 @@ def _light(
 def sigma_instrument_mag(
     stars: Catalog, facts: dict[str, Any], rates: StarRates, kind: FloatArray | None = None
 ) -> FloatArray:
-    """The error of each star's magnitude in the tracker (n,), by the errors of V, B-V and V-I taken
-    as independent.
+    """The error (n,), mag, of each star's magnitude in the tracker, by the errors of V, B-V and
+    V-I, which are taken as independent.
 
-    That of the step from colours to a spectrum is not in it.
+    It does not include the error of choosing a spectrum by colours.
     """
     v = stars.v_mag
     bv = stars.bv_mag
@@ -230,7 +238,7 @@ def sigma_instrument_mag(
     redder = rates(v, bv, vi + half, kind)
     bluer = rates(v, bv, vi - half, kind)
     by_vi = magnitude(redder / bluer) / COLOUR_STEP_MAG
-    # An error of a colour that does not count may be unknown (NaN), and then it does not count.
+    # Where a colour has no effect on the rate, its error may be unknown (NaN), and counts as 0.
     of_bv = by_bv * np.where(by_bv == 0, 0, facts["sigma_bv_mag"])
     of_vi = by_vi * np.where(by_vi == 0, 0, facts["sigma_vi_mag"])
     return np.sqrt(sigma_v_mag(facts, bv) ** 2 + of_bv**2 + of_vi**2)
@@ -239,7 +247,7 @@ def sigma_instrument_mag(
 def _distances(stars: Catalog, facts: dict[str, Any], bolometric_mag: FloatArray) -> Values:
     parallax = stars.parallax_mas
     min_parallax = MIN_PARALLAX_SIGMAS * facts["sigma_parallax_mas"]
-    # A parallax of unknown error (NaN) is taken as it is.
+    # A parallax of unknown error (NaN) is used as it is, since the comparison with NaN is False.
     is_sure = (parallax > 0) & ~(parallax < min_parallax)
     modulus = 10 - 5 * np.log10(np.where(is_sure, parallax, np.nan))
     values: Values = {}
@@ -271,10 +279,10 @@ def _company(
 def nearest_neighbours(
     every: Catalog, rows: npt.NDArray[np.intp], epoch_jyear: float
 ) -> tuple[npt.NDArray[np.intp], FloatArray]:
-    """For the stars at `rows` (n,) the nearest other star brighter than their V + FAINTER_MAG, and
-    its distance, arcsec.
+    """For each of the stars at `rows` (n,), the row (n,) of the nearest other star that is brighter
+    than its V + FAINTER_MAG, and the distance (n,) to that, arcsec.
 
-    A star without one has itself, at NaN.
+    A star without such a neighbour has its own row, and NaN as the distance.
     """
     from scipy.spatial import cKDTree
 
@@ -283,7 +291,8 @@ def nearest_neighbours(
     neighbours = rows.copy()
     chord = np.full(len(rows), np.nan)
     limit_mag = every.v_mag[rows] + FAINTER_MAG
-    # The nearest few do for most stars; the rest are asked again for four times as many.
+    # For most stars the nearest few contain a neighbour. For the rest the search is repeated with
+    # four times as many, up to all.
     rest = np.arange(len(rows))
     count = 8
     while len(rest):
@@ -307,8 +316,8 @@ def nearest_neighbours(
 
 
 def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
-    """Write a CSV, a FITS table, a VOTable or a Parquet file by the name's ending. Raises
-    InputError or MachineError.
+    """Write a catalogue as CSV, VOTable, Parquet or a FITS table, by the ending of the file's name.
+    Raises InputError where it cannot be written, MachineError for Parquet without pyarrow.
     """
 
     ending = path.suffix.lower()
@@ -327,7 +336,7 @@ def write_catalogue(path: Path, catalogue: InstrumentCatalogue) -> None:
 
 
 def _table(catalogue: InstrumentCatalogue) -> Any:
-    """Astropy's table of it."""
+    """The catalogue as Astropy's table, with units, descriptions and UCDs."""
     from astropy.table import Table
 
     table = Table()
@@ -349,7 +358,7 @@ def _write_csv(path: Path, catalogue: InstrumentCatalogue) -> None:
         else:
             form = ""
         texts.append([format(value, form) for value in column.values.tolist()])
-    # MK types such as "S5,1" have commas
+    # write_csv quotes cells where needed: MK types such as "S5,1" contain commas
     write_csv(path, list(catalogue.columns), zip(*texts, strict=True))
 
 

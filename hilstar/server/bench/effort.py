@@ -1,8 +1,9 @@
-"""The cheapest sprites, paths and codes whose errors together are within a bench's tolerance.
+"""Chooses the cheapest sprites, paths and codes whose errors together are within a bench's
+tolerance.
 
-Each part of a frame is a list of candidates, with the worst error and the time of each. The errors
-of the parts add up, and all parts share one tolerance: the cheapest combination is taken whose sum
-is within it.
+For each part of a frame (codes, sprites, paths) there is a list of candidates, each with its worst
+error and its time. The errors of the parts add up, and all parts share one tolerance: the cheapest
+combination whose sum is within it is chosen.
 """
 
 from __future__ import annotations
@@ -33,38 +34,38 @@ from hilstar.tracker.centroiders import FAMILY, Centroider
 
 TIMED_RATE_RAD_S = np.array([math.radians(1.0), 0.0, 0.0])
 
-# Light beyond a small sprite is under this share of what lights a pixel: only where the wings of
-# stars meet is a code lower
+# A star gets a smaller sprite where its light beyond it is under this share of what lights a pixel:
+# a code is then lower only where the wings of several stars meet.
 UNLIT = 0.25
-CUT_PHASES = 51
-# Of a frame's time by the table (MS_A_STAR, EXACT_MS_A_STAR): what a pixel of a sprite takes, and a
-# star on a path more than one at a point. 1000 stars of 100 px in place of 22 take 0.3 ms, on paths
-# 0.7 ms, where `round` takes 3.9 ms in all and `exact` 7.0 (llvmpipe, two busy cores, processor
-# time, turning at 1 deg/s; in a ratio to 0.002 ms a star).
+CUT_PHASES = 51  # places of a star across a pixel at which the shift of its centroid is computed
+# The time of a sprite's pixel, and of a star on a path beyond that of one at a point, on the scale
+# of the table of times (MS_A_STAR, EXACT_MS_A_STAR). Measured: sprites of 100 px in place of 22 add
+# 0.3 ms for 1000 stars, and paths 0.7 ms, where `round` takes 3.9 ms in all and `exact` 7.0
+# (llvmpipe, two busy cores, processor time, turning at 1 deg/s; in a ratio to 0.002 ms a star).
 PIXEL_MS, PATH_MS = 2e-6, 4e-4
 GLASS_MS_A_STAR = 0.01  # results/kinds_h200.csv: 27 ms more for 3615 stars
 # Stars that move less than these shares of the tolerance may be drawn as points.
 MOTION_SHARES = (0.05, 0.1, 0.25, 0.5)
-# Where no combination is within the tolerance, the other parts may add so much of it to the codes'
+# Where no combination is within the tolerance, sprites may add this share of it to the codes'
 # error.
 SLIGHT = 0.01
 IN_TIME_SHARE = 0.5  # share of a refresh period that a frame may take
 CHEAP, BEST = BY_COST[0], BY_COST[-1]
-# Between these times, in limits, a measured frame leaves the choice as the table has it: two starts
-# of a run then have the same codes. Other programs slow frames down, and nothing speeds them up:
-# the upper time is a whole refresh.
+# A measured time between these two, in units of the limit, does not decide; the table of times then
+# does, so that two starts of a run have the same codes. The range is wider above the limit, to a
+# whole refresh period, as other programs slow frames down and nothing speeds them up.
 SURELY_IN_TIME, SURELY_LATE = 0.8, 2.0
 NO_ERROR = (0.0, 0.0)
-# Errors are claimed of frames that turn up to this. On longer paths `round` shows fainter stars
-# worse, and centroiders that look for a point have no place of their own along a path.
+# Errors are stated for frames that turn at most so fast. On longer paths `round` shows faint stars
+# worse, and a centroider that looks for a point has no defined place along a path.
 CLAIMED_TURN_DEG_S = 1.0
 CLAIMED = f"errors are of turns up to {CLAIMED_TURN_DEG_S:g} deg/s; those of faster ones are larger"
 
 
 @dataclass(frozen=True, slots=True)
 class FieldCost:
-    """Milliseconds that a frame of an average field, turning at 1 deg/s, takes by `round` and by
-    `exact`.
+    """The time, ms, of a frame of an average field that turns at 1 deg/s: `cheap_ms` by `round`,
+    `best_ms` by `exact`.
 
     `where` says on which machine, `why` why `exact` takes long ("" where it does not).
     """
@@ -75,23 +76,27 @@ class FieldCost:
     why: str = ""
 
     def in_time(self, limit_ms: float) -> bool:
-        """Whether `exact` is drawn within a limit, or `round` is not either."""
+        """Whether `exact` is drawn within a limit; True also where even `round` is late, as `exact`
+        then loses nothing.
+        """
         return self.best_ms <= limit_ms or self.cheap_ms > limit_ms
 
 
 @dataclass(frozen=True, slots=True)
 class Light:
-    """The light of a bench: the panel's response, its minimum white (electrons per second), the
-    stars' rates (n,).
+    """What the choice of effort depends on: the panel's response, the rate of its darkest white,
+    electrons/s, and the stars' rates (n,), electrons/s.
 
     `sky_share` is the share of the whole sky that the screen covers. `seen` is how the tracker sees
-    the monitor, `centroider` what it finds stars by: None where the bench does not say, and then
-    all of them judge. `psf` is how stars are drawn, and `psf_choice` why so where the tolerance
-    decides. The exposure has `exposure_frames`. `cost` is what a quantiser costs by the table,
-    `measured` what it costs where the bench is drawn (None: not measured). Of a scene that turns,
-    `turning` is how far a star of a frame without paths is from its place, in units of its motion;
-    None for a scene at rest; `path_px` is how far one moves while its row is lit, at
-    CLAIMED_TURN_DEG_S.
+    the monitor. `centroider` is the one that the bench states; without one (None) errors are the
+    worst of all centroiders. `psf` is the PSF with which stars are drawn, and `psf_choice` its
+    reasons where the tolerance decides it. An exposure has `exposure_frames`. `cost` gives the time
+    of a quantiser by the table, `measured` is the time on the machine that draws (None: not
+    measured).
+
+    For a scene that turns, `turning` is how far a star that is drawn as a point is from its place,
+    in units of its motion; None for a scene at rest. `path_px` is how far a star moves while its
+    row is lit, at CLAIMED_TURN_DEG_S.
     """
 
     response: Response
@@ -111,24 +116,24 @@ class Light:
 
     @property
     def panel(self) -> Panel:
-        """The monitor, where the screen is darkest."""
+        """The panel with the response, and with white as at the darkest place of the screen."""
         return Panel(self.response, self.white_e_per_s)
 
     @property
     def judges(self) -> tuple[Centroider, ...]:
-        """The centroiders that judge where codes show a star."""
+        """The centroiders by which errors of a star's place are measured."""
         if self.centroider is None:
             return FAMILY
         return (self.centroider,)
 
     @property
     def stars(self) -> float:
-        """How many stars an average field shows."""
+        """The number of stars in an average field that light a pixel."""
         lit = self.rates_e_per_s >= self.response.half_step * self.white_e_per_s
         return self.sky_share * float(np.count_nonzero(lit))
 
     def tabulated_cost(self, psf: Psf) -> FieldCost:
-        """The cost of codes by the quantisers' own figures: on two cores without a GPU."""
+        """The time of codes by the quantisers' table, measured on two cores without a GPU."""
         cheap, best = (self.cost(QUANTISERS[method], psf) for method in (CHEAP, BEST))
         return FieldCost(
             cheap.a_star_ms * self.stars,
@@ -139,11 +144,11 @@ class Light:
 
     @property
     def refresh_ms(self) -> float:
-        """The time between two frames."""
+        """The refresh period, ms."""
         return 1e3 / self.refresh_hz
 
     def code_stars(self) -> CodeStars:
-        """The catalogue's stars for the worst errors of codes."""
+        """The catalogue's stars, as `worst_errors` needs them."""
         peaks = self.rates_e_per_s * (self.psf.peak_share / self.white_e_per_s)
         still = code_stars(
             self.psf, self.seen, self.exposure_frames, self.judges, self.response, peaks
@@ -153,9 +158,10 @@ class Light:
 
 @dataclass(frozen=True, slots=True)
 class Sides:
-    """A candidate for sprites: their sides by rate (see `Target.sides`), with what their edges cut.
+    """A candidate for sprites: their sides by a star's rate (see `Target.sides`), and the error by
+    the light beyond their edges, `choice`.
 
-    They cut light that is shown of stars up to `cut_to_mag` below full scale.
+    Only of stars up to `cut_to_mag` magnitudes below full scale would that light be visible.
     """
 
     sides: SpriteSides
@@ -163,8 +169,8 @@ class Sides:
     cut_to_mag: float = math.inf
 
     def beside(self, codes: CodeErrors) -> Choice:
-        """The choice, with what it adds to the codes' worst: bright stars are cut, faint ones
-        rounded.
+        """The choice with the errors that it adds to the worst of the codes. They add less than
+        they are: sprites cut bright stars, whose codes are less wrong than those of faint stars.
         """
         flux_mag, place_px = codes.brighter_than(self.cut_to_mag)
         more_mag = flux_mag + self.choice.error_mag - codes.flux_mag
@@ -176,14 +182,14 @@ class Sides:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """A candidate for paths: the smallest motion that is drawn as one."""
+    """A candidate for paths: the smallest motion within a frame, px, that is drawn as a path."""
 
     above_px: float
     choice: Choice
 
     def beside(self, codes: CodeErrors) -> Choice:
-        """The choice, with what it adds to the codes' worst: a star that is drawn as a point, for
-        it moves less, has the codes of one at rest.
+        """The choice with the error that it adds to the worst of the codes. A star that moves less
+        is drawn as a point, with the codes of a star at rest, which are less wrong.
         """
         if codes.still_px is None or not math.isfinite(codes.place_px):
             return self.choice
@@ -193,7 +199,7 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Combination:
-    """A candidate of each part; the codes' errors are found when they are asked for."""
+    """One candidate of each part, with the codes' time; their errors are not computed here."""
 
     method: Quantisation
     method_ms: float
@@ -202,18 +208,18 @@ class Combination:
 
     @property
     def ms(self) -> float:
-        """The time of all parts together."""
+        """The time of all parts together, ms."""
         return self.method_ms + self.sprites.choice.ms + self.motion.choice.ms
 
 
 @dataclass(frozen=True)
 class Effort:
-    """The effort for a bench's stars: quantisation, sprite sides by rate, and the smallest motion
-    drawn.
+    """The effort chosen for a bench's stars, `taken`: the quantisation, the sides of sprites by
+    rate, and the smallest motion that is drawn as a path.
 
-    `by_cost` says whether the time of a frame took part in the choice of the quantisation, `asked`
-    and `light` what the choice was made for. Errors are the worst of all choices together, of the
-    catalogue's stars at any phase; they are found when they are first asked for.
+    `asked` and `light` are what it was chosen for; `by_cost` says whether the time of a frame took
+    part in the choice of the quantisation. Errors are the worst of all choices together, of the
+    catalogue's stars at any phase of a pixel; they are computed when they are first asked for.
     """
 
     asked: RenderSettings
@@ -223,35 +229,35 @@ class Effort:
 
     @property
     def quantisation(self) -> Quantisation:
-        """The codes."""
+        """The quantisation by which codes are chosen."""
         return self.taken.method
 
     @property
     def sides(self) -> SpriteSides:
-        """The sides of sprites by rate."""
+        """The sides of sprites by a star's rate."""
         return self.taken.sprites.sides
 
     @property
     def is_chosen(self) -> bool:
-        """Whether the bench leaves a part to its tolerance."""
+        """Whether the bench lets the tolerance decide a part."""
         return self.asked.effort == "auto" or self.asked.quantisation == "auto"
 
     @property
     def claimed_turn_deg_s(self) -> float:
-        """The fastest turn that the errors are claimed of; 0 where no frame turns."""
+        """The fastest turn, deg/s, for which the errors are stated; 0 where no frame turns."""
         if self.light.turning is None:
             return 0.0
         return CLAIMED_TURN_DEG_S
 
     @property
     def motion_above_px(self) -> float:
-        """The smallest motion that is drawn as a path."""
+        """The smallest motion within a frame, px, that is drawn as a path."""
         return self.taken.motion.above_px
 
     @cached_property
     def _found(self) -> CodeErrors:
-        """The codes' worst errors if they are within the tolerance; else the first that are over
-        it.
+        """The codes' worst errors where these are within the tolerance; else the first errors over
+        it, at which the search ends early.
         """
         return worst_errors(self.light.code_stars(), self.quantisation, self._tolerance)
 
@@ -261,14 +267,14 @@ class Effort:
 
     @cached_property
     def codes(self) -> CodeErrors:
-        """The worst errors of the codes."""
+        """The worst errors of the codes, also where they are over the tolerance."""
         if self._found.within(self._tolerance):
             return self._found
         return worst_errors(self.light.code_stars(), self.quantisation)
 
     @cached_property
     def choices(self) -> tuple[Choice, ...]:
-        """The choice of each part."""
+        """The choice of each part, with its errors and times, as a report lists them."""
         parts = [
             code_part(self),
             self.taken.sprites.beside(self.codes),
@@ -280,17 +286,19 @@ class Effort:
 
     @property
     def error_mag(self) -> float:
-        """The worst error of a star's light."""
+        """The worst error of a star's light, mag, by all parts together."""
         return sum(choice.error_mag for choice in self.choices)
 
     @property
     def error_px(self) -> float:
-        """The worst error of a star's place."""
+        """The worst error of a star's place, px, by all parts together."""
         return sum(choice.error_px for choice in self.choices)
 
     @property
     def within(self) -> bool:
-        """Whether both are within the tolerance; found sooner than how far they are over it."""
+        """Whether both errors are within the tolerance. Where they are not, this is known sooner
+        than the errors themselves.
+        """
         if not self._found.within(self._tolerance):
             return False
         return (
@@ -299,15 +307,17 @@ class Effort:
 
 
 def plan_effort(render: RenderSettings, light: Light) -> Effort:
-    """The cheapest combination within the tolerance; where none is, the most accurate one.
+    """The cheapest combination within the tolerance; where none is, the most accurate
+    quantisation, with the cheapest sprites and paths that add next to nothing to its errors.
 
-    What the file fixes is the only candidate of its part.
+    A part that the bench file fixes has that as its only candidate.
     """
     auto = render.quantisation == "auto"
     methods = _methods(render, light)
     combinations = sorted(_combinations(render, light, methods), key=lambda choice: choice.ms)
     most_accurate = [choice for choice in combinations if choice.method == methods[-1]]
-    # A single combination is not tested where nothing is left to choose: its errors take 0.1 s.
+    # The errors of a combination take 0.1 s. The last one need not be tested where it is the only
+    # one of its quantisation: it is chosen anyway.
     if len(most_accurate) > 1:
         tested = combinations
     else:
@@ -321,10 +331,10 @@ def plan_effort(render: RenderSettings, light: Light) -> Effort:
 
 
 def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:
-    """The quantisations to choose among, from the cheapest on.
+    """The quantisations to choose among, the cheapest first.
 
-    `auto` does not take `exact` where that would be late in fields of many stars and `round` would
-    not.
+    With `auto`, `exact` is not among them where it would be late in an average field and `round`
+    would not.
     """
     if render.quantisation != "auto":
         return (render.quantisation,)
@@ -336,7 +346,7 @@ def _methods(render: RenderSettings, light: Light) -> tuple[Quantisation, ...]:
 
 
 def known_cost(render: RenderSettings, light: Light) -> FieldCost | None:
-    """The cost of choosing codes where they are drawn, as it was measured, or as `[render]
+    """The time of codes on the machine that draws them, as it was measured or as `[render]
     codes_ms` states it; None for neither.
     """
     if light.measured is None and render.codes_ms is not None:
@@ -345,8 +355,8 @@ def known_cost(render: RenderSettings, light: Light) -> FieldCost | None:
 
 
 def exact_in_time(table: FieldCost, measured: FieldCost | None, limit_ms: float) -> bool:
-    """Whether `auto` may take `exact`: by the measured cost where that is clear of the limit,
-    and else by the table's.
+    """Whether `auto` may choose `exact`: by the measured time where this is clearly within or over
+    the limit, else by the table's time.
     """
     if measured is not None:
         clear = {
@@ -384,8 +394,9 @@ def _is_within(render: RenderSettings, light: Light, stars: CodeStars, one: Comb
 
 
 def _is_slight(render: RenderSettings, one: Combination) -> bool:
-    """Whether sprites and paths add next to nothing to the codes' error, or as little as they
-    can.
+    """Whether the sprites of a combination add next to nothing to the codes' error (SLIGHT of the
+    tolerance), or as little as any can, and it draws no motion as a point that the bench draws as a
+    path.
     """
     sprites = one.sprites.choice
     motion = one.motion
@@ -395,7 +406,9 @@ def _is_slight(render: RenderSettings, one: Combination) -> bool:
 
 
 def _scale(render: RenderSettings, light: Light) -> float:
-    """How long a frame takes where it is drawn, by the table's time."""
+    """How many times as long as by the table a frame takes on the machine that draws it; 1 where
+    that is not known.
+    """
     table = light.tabulated_cost(light.psf)
     known = known_cost(render, light)
     if known is None or not table.cheap_ms:
@@ -404,8 +417,8 @@ def _scale(render: RenderSettings, light: Light) -> float:
 
 
 def codes_ms(render: RenderSettings, light: Light, method: Quantisation) -> float:
-    """The time of an average field's frame, ms, less what its sprites' pixels and paths take: what
-    choosing the codes costs.
+    """The time, ms, that the codes of an average field's frame take: the frame's time less that of
+    its sprites' pixels and of its paths.
     """
     scale = _scale(render, light)
     known = known_cost(render, light)
@@ -420,7 +433,7 @@ def codes_ms(render: RenderSettings, light: Light, method: Quantisation) -> floa
 
 
 def code_part(effort: Effort) -> Choice:
-    """The choice of the codes."""
+    """The choice of the codes with its errors, its time, and notes on them."""
     render = effort.asked
     light = effort.light
     method = effort.quantisation
@@ -445,7 +458,7 @@ def code_part(effort: Effort) -> Choice:
 
 
 def _price(cost: FieldCost, light: Light) -> str:
-    """The time that `exact` takes of a refresh, in words."""
+    """A text that says how much of a refresh period `exact` takes, and `round`."""
     best_ms, cheap_ms = (_two_digits(ms) for ms in (cost.best_ms, cost.cheap_ms))
     price_text = f"exact takes {best_ms} ms of {light.refresh_ms:.3g} (round {cheap_ms})"
     price_text += f" for an average field at 1 deg/s {cost.where}"
@@ -453,14 +466,16 @@ def _price(cost: FieldCost, light: Light) -> str:
 
 
 def _two_digits(number: float) -> str:
-    """A number to two digits, and whole from 100 on."""
+    """A number with two digits, or whole from 100 on, as text."""
     if number < 99.5:
         return f"{number:.2g}"
     return f"{number:.0f}"
 
 
 def side_candidates(render: RenderSettings, light: Light, method: Quantisation) -> list[Sides]:
-    """Sprites from the smallest to the whole footprint; the whole one alone at full effort."""
+    """The candidates for sprites, from the smallest to the PSF's whole footprint; at full effort,
+    and for a PSF that differs over the field, the whole footprint alone.
+    """
     psf = light.psf
     full = psf.footprint_px
     sizes = list(range(full % 2 or 2, full, 2))
@@ -500,11 +515,13 @@ def side_candidates(render: RenderSettings, light: Light, method: Quantisation) 
 
 
 def _sides(light: Light, method: Quantisation, sizes: list[int], largest: int) -> SpriteSides:
-    """The largest sprite, and the smaller ones of stars whose light beyond them lights no pixel."""
+    """The sides of sprites by rate: `largest`, and for fainter stars the smaller `sizes` beyond
+    which their light lights no pixel.
+    """
     sides = [(math.inf, largest)]
     unlit = UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel)
     if unlit:
-        # Falling rates: a star under the last of them that it is under gets the smallest sprite.
+        # The rates fall from entry to entry: the last entry whose rate a star is under counts.
         sides += [
             (unlit / light.psf.outside_share(size), size) for size in sizes[::-1] if size < largest
         ]
@@ -512,7 +529,9 @@ def _sides(light: Light, method: Quantisation, sizes: list[int], largest: int) -
 
 
 def _cut_to_mag(light: Light, method: Quantisation, size_px: int) -> float:
-    """The magnitude below full scale from which on what is beyond a sprite lights no pixel."""
+    """How many magnitudes below full scale a star's light beyond a sprite of this size begins to
+    light no pixel.
+    """
     unlit = UNLIT * QUANTISERS[method].lit_from_e_per_s(light.panel)
     if not unlit:
         return math.inf
@@ -549,7 +568,9 @@ def cut_px(size_px: int, psf: Psf) -> float:
 
 
 def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
-    """From which motion on stars are paths: none at rest; else from the file's on, or from more."""
+    """The candidates for paths: one without paths for a scene at rest; else the bench file's
+    smallest motion and, with `auto`, shares of the tolerance that are larger.
+    """
     floor_px = render.motion_above_px
     if light.turning is None:
         return [Motion(floor_px, Choice("paths", "none: nothing moves within a frame", *NO_ERROR))]
@@ -567,7 +588,7 @@ def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
         saved_ms = 0.0
         note = CLAIMED
         if px > floor_px:
-            # Only frames between the file's motion and this one are drawn sooner.
+            # Time is saved only in frames whose motion is between the file's and this one.
             ms = 0.0
             saved_ms = path_ms
             note = f"{CLAIMED}; saves in frames that move less"
@@ -585,7 +606,9 @@ def motion_candidates(render: RenderSettings, light: Light) -> list[Motion]:
 
 
 def psf_part(light: Light, choice: Choice) -> Choice:
-    """The choice of the PSF, with what a glass takes."""
+    """The choice of the PSF, with the time that a PSF by colour takes, or that is saved without
+    one.
+    """
     glass_ms = GLASS_MS_A_STAR * light.stars
     if light.psf.by_colour:
         return replace(choice, ms=glass_ms)

@@ -1,8 +1,9 @@
-"""Frames as files: FITS with a world coordinate system, CSV and PNG.
+"""Writes frames as files: FITS with a world coordinate system, CSV and PNG.
 
 The world coordinate system is a tangent plane with the lens as SIP polynomials (Shupe et al. 2005):
-a pixel at (X, Y) from CRPIX is at CD (X + A(X, Y), Y + B(X, Y)) on the tangent plane, and AP and BP
-lead back. Their degree is the smallest that is right to GOOD_PX at pixels that were held out.
+a pixel at (X, Y) from CRPIX is at CD (X + A(X, Y), Y + B(X, Y)) on the tangent plane; AP and BP are
+the inverse. Their degree is the smallest with an error of at most GOOD_PX at pixels that were not
+used in the fit.
 """
 
 import csv
@@ -31,31 +32,30 @@ from hilstar.server.bench.frame import Bench, Frame
 
 GOOD_PX = 0.01
 MAX_SIP_PX = 0.1  # a polynomial with a larger error is not written
-MAX_DEGREE = 9  # the convention's
-# places along each side of the image; the latter have its edges among them
+MAX_DEGREE = 9  # the largest degree that the SIP convention allows
+# Grid points along each side of the image for the fit, and for its test.
 FITTED, HELD_OUT = 28, 25
 
 Keywords = dict[str, str | float]
 PNG_GREY, PNG_RGB = 0, 2  # colour types
 PNG_LEVEL = 1  # 6 takes twelve times as long for a noisy frame and saves 5 %
-PREVIEW_RADIUS_PX = 9  # the brightest star's
+PREVIEW_RADIUS_PX = 9  # of the brightest star's disc
 PREVIEW_BLUR_PX = 0.7
 PREVIEW_POWER = 0.35
-# Light as bright over a square of this side is a body's or a map's, which is drawn as it is: at its
-# size. A star's
-# brightest pixels are fewer.
+# Where a square of this side is lit throughout, the light is a body's or a map's, which is drawn at
+# its own size. A star has fewer bright pixels.
 BODY_SIDE_PX = 9
-BODY_EDGE_PX = 3  # a round limb goes beyond the squares within it by so much
-BODY_SHARE = 1.5  # to this multiple of the square's light
+BODY_EDGE_PX = 3  # so far a round limb reaches beyond the squares within the body
+BODY_SHARE = 1.5  # and so many times the square's light a pixel of the body may have
 
 
 @dataclass(frozen=True, slots=True)
 class Sip:
-    """SIP of one degree, about `origin_px`: the linear part (2, 2), of pixels to those of an ideal
-    image, and all other terms.
+    """SIP polynomials of one degree about `origin_px`: `linear` (2, 2) turns pixels into those of
+    an ideal (pinhole) image, to first order.
 
-    `forward` and `back` (terms, 2) are A, B and AP, BP by `_powers`. `error_px` is their largest
-    error over the image.
+    `forward` (terms, 2) are the coefficients of A and B, `back` (terms, 2) those of AP and BP, in
+    the order of `_powers`. `error_px` is the largest error of either over the image.
     """
 
     degree: int
@@ -67,11 +67,11 @@ class Sip:
 
 
 def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> Keywords:
-    """The FITS keywords of an image: TAN, exact for a pinhole; behind a lens with SIP, or TAN alone
-    where no SIP fits.
+    """The FITS keywords of an image's world coordinate system: TAN for a pinhole camera, where it
+    is exact; TAN-SIP for one with a lens, or TAN alone where no SIP fits.
 
-    `LENSERR` is the largest distance, px, on the image between where they and the camera have a
-    star.
+    `LENSERR` is the largest distance, px, between a star's place by these keywords and by the
+    camera.
     """
     tangent_plane = _tangent_plane(camera, q_icrs_to_cam, camera.principal_point_px, np.eye(2))
     if camera.lens is None:
@@ -88,7 +88,7 @@ def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> Keywords:
     keywords["LENSERR"] = round(sip.error_px, 6)
     a, b = sip.forward.T
     ap, bp = sip.back.T
-    # A and B have no linear terms: those are in CD.
+    # A and B have no linear terms, as CD contains them.
     for name, coefficients, first in (("A", a, 2), ("B", b, 2), ("AP", ap, 1), ("BP", bp, 1)):
         keywords[f"{name}_ORDER"] = sip.degree
         powers = _powers(sip.degree, first)
@@ -98,13 +98,13 @@ def world_coordinates(camera: Camera, q_icrs_to_cam: FloatArray) -> Keywords:
 
 
 def _pinhole_error_px(camera: Camera) -> float:
-    """How far at most a pinhole has stars from where the camera's lens has them, px."""
+    """The largest distance, px, between a star's place by a pinhole and by the camera's lens."""
     x_px, y_px = camera.grid_px(HELD_OUT)
     tangents = camera.tangents(x_px, y_px)
     pinhole = replace(camera, lens=None)
     pinhole_x_px, pinhole_y_px = pinhole.places_px(*tangents)
     error_px = np.hypot(pinhole_x_px - x_px, pinhole_y_px - y_px)
-    return float(np.nanmax(error_px))  # NaN where the lens knows no direction
+    return float(np.nanmax(error_px))  # NaN at pixels for which the lens has no direction
 
 
 def _tangent_plane(
@@ -140,8 +140,8 @@ def _tangent_plane(
 
 @lru_cache(maxsize=4)
 def fit_sip(camera: Camera) -> Sip | None:
-    """The SIP of a camera with a lens, by least squares over its image; None where no degree is
-    within MAX_SIP_PX.
+    """The SIP polynomials of a camera with a lens, by least squares over its image; None where the
+    best have an error over MAX_SIP_PX.
     """
     x_px, y_px = camera.places_px(np.zeros(1), np.zeros(1))
     origin_px = float(x_px[0]), float(y_px[0])
@@ -154,7 +154,8 @@ def fit_sip(camera: Camera) -> Sip | None:
         polynomials.append((error_px, degree, whole))
         if error_px <= GOOD_PX:
             break
-    # The one that is good, or else the best: a higher degree may fit the held-out pixels worse.
+    # The first within GOOD_PX, or else the best: a higher degree may be worse at pixels that were
+    # not fitted.
     _, degree, whole = min(polynomials, key=itemgetter(0))
     p, q = _powers(degree, 1)
     by_x = whole[(p == 1) & (q == 0)]
@@ -174,15 +175,15 @@ def fit_sip(camera: Camera) -> Sip | None:
 
 
 def _largest_px(off_px: FloatArray) -> float:
-    """The largest length of offsets (n, 2)."""
+    """The largest length of offsets (n, 2), px."""
     return float(np.hypot(off_px[:, 0], off_px[:, 1]).max())
 
 
 def _pairs(
     camera: Camera, origin_px: tuple[float, float], count: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Pixels and their places on the ideal image, both (n, 2) px from the origin; those that the
-    lens knows.
+    """A grid of `count` by `count` pixels, without those for which the lens has no direction, and
+    their places on the ideal image, both (n, 2), px from the origin.
     """
     x, y = camera.grid_px(count)
     u, v = camera.tangents(x, y)
@@ -193,9 +194,10 @@ def _pairs(
 
 
 def _solved(at: FloatArray, wanted: FloatArray, degree: int) -> FloatArray:
-    """The coefficients (terms, 2), without a constant, by least squares; scaled, because powers
-    of pixels are large.
+    """The coefficients (terms, 2) of polynomials without a constant, by least squares, from places
+    `at` (n, 2) and their values `wanted` (n, 2).
     """
+    # Powers of pixels are large and unlike: scaled, the problem is well conditioned.
     terms = _terms(at, degree, 1)
     scale = np.abs(terms).max(axis=0)
     coefficients, *_ = np.linalg.lstsq(terms / scale, wanted, rcond=None)
@@ -216,8 +218,8 @@ def _terms(at: FloatArray, degree: int, first: int) -> FloatArray:
 
 
 def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
-    """The linear image (electron/s, float32) with attitude, epoch, bench hash and a world
-    coordinate system.
+    """Write the linear image (electron/s, float32) as FITS, with attitude, epoch, bench hash and a
+    world coordinate system.
 
     The first row of the array is the top of the monitor. Light of several channels is a cube, whose
     third axis is CHANNEL.
@@ -247,7 +249,9 @@ def write_frame_fits(path: Path, bench: Bench, frame: Frame) -> None:
 
 
 def write_fits(path: Path, hdus: Any) -> None:
-    """A FITS file of Astropy's HDU or list of them, packed where the name ends in .gz."""
+    """Write one of Astropy's HDUs, or a list of them, as a FITS file, compressed where its name
+    ends in .gz.
+    """
     with whole_file(path) as file:
         if path.suffix != ".gz":
             hdus.writeto(file)
@@ -283,8 +287,8 @@ def sky_header(
 
 
 def write_truth_csv(path: Path, frame: Frame) -> None:
-    """One row per star: the columns of TRUTH_DTYPE, brightest first; drawn and clipped are 1 or 0,
-    an unknown figure is nan.
+    """Write a frame's stars as CSV, one row per star, brightest first, with the columns of
+    TRUTH_DTYPE; drawn and clipped are 1 or 0, an unknown figure is nan.
     """
     truth = frame.truth
     with whole_file(path) as whole, as_text(whole) as file:
@@ -296,10 +300,10 @@ def write_truth_csv(path: Path, frame: Frame) -> None:
 
 
 def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
-    """The code values: 8 bit, or 16 bit for deeper monitors, left-aligned. Shallower ones stay as
-    they are.
+    """Write code values (height, width) as a PNG: codes of up to 8 bits unchanged in 8 bits, deeper
+    ones in 16 bits, left-aligned.
 
-    Codes of three channels (height, width, 3) become an RGB picture.
+    Codes of three channels (height, width, 3) become an RGB image.
     """
     if bits <= 8:
         image = np.asarray(codes, dtype=np.uint8)
@@ -310,18 +314,19 @@ def write_codes_png(path: Path, codes: Codes, bits: int) -> None:
 
 
 def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
-    """A PNG of values (height, width) or (height, width, 3), uint8 or uint16, of which `meant_bits`
-    mean something (sBIT).
+    """A PNG's bytes, from values (height, width) or (height, width, 3), uint8 or uint16, of which
+    `meant_bits` are significant (sBIT; None: not stated).
 
-    Its rows are not filtered, and are compressed at once: a tracker's frame, which is noise, takes
-    a third of the time that `png.Writer` takes row by row.
+    Rows are not filtered, and all are compressed in one call. For a tracker's frame, which is
+    noise, this takes a third of the time that `png.Writer` takes row by row.
     """
     import png
 
     height, width = image.shape[:2]
     values = np.ascontiguousarray(image, f">u{image.itemsize}")  # PNG is big-endian
     rows = values.view(np.uint8).reshape(height, -1)
-    scanlines = np.zeros((height, 1 + rows.shape[1]), np.uint8)  # each begins with its filter: none
+    # a scanline begins with the number of its filter, 0 for none
+    scanlines = np.zeros((height, 1 + rows.shape[1]), np.uint8)
     scanlines[:, 1:] = rows
     if image.ndim == 2:
         colour_type, channels = PNG_GREY, 1
@@ -339,17 +344,17 @@ def png_of(image: npt.NDArray[Any], meant_bits: int | None = None) -> bytes:
 
 
 def write_preview_png(path: Path, codes: Codes) -> None:
-    """A preview for the eye as a file (see `preview_png`)."""
+    """Write a frame's preview for the eye as a PNG file; see `preview_png`."""
     preview = preview_png(codes)
     with whole_file(path) as file:
         file.write(preview)
 
 
 def preview_png(codes: Codes) -> bytes:
-    """A preview for the eye: each star a disc that grows with its code, as on a star chart; a body
-    has its own size.
+    """A preview for the eye, as a PNG's bytes: each star is a disc that grows with its code, as on
+    a star chart; a body has its own size.
 
-    It is stretched to the brightest pixel of the frame.
+    It is scaled so that the brightest pixel of the frame is white.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -363,7 +368,9 @@ def preview_png(codes: Codes) -> bytes:
 
 
 def _bodies(signal: Float32Array) -> BoolArray:
-    """Which pixels of (height, width) are of light wider than a star's."""
+    """Whether each pixel (height, width) belongs to light that is wider than a star, as a body's
+    is.
+    """
     from scipy.ndimage import grey_opening, maximum_filter
 
     wide = grey_opening(signal, (BODY_SIDE_PX, BODY_SIDE_PX), mode="constant")
@@ -372,10 +379,10 @@ def _bodies(signal: Float32Array) -> BoolArray:
 
 
 def _discs(signal: Float32Array) -> Float32Array:
-    """Each pixel of (height, width), 0 to 1, as a disc of its value; the brightest of those that
-    overlap.
+    """An image (height, width) in which each pixel of `signal`, 0 to 1, is a disc of its value, and
+    pixels of bodies are unchanged; where discs overlap, the brightest counts.
 
-    Only lit pixels are looked at, of which a frame of stars has few.
+    Only lit pixels are drawn, of which a frame of stars has few.
     """
     edge = PREVIEW_RADIUS_PX
     height, width = signal.shape
@@ -390,7 +397,7 @@ def _discs(signal: Float32Array) -> Float32Array:
             radius = max(1, math.ceil(math.hypot(down, right)))
             if radius > PREVIEW_RADIUS_PX:
                 continue
-            # The area of a star's disc goes with its value.
+            # The area of a star's disc is in proportion to its value.
             min_value = ((radius - 1) / PREVIEW_RADIUS_PX) ** 2
             is_inside = value >= min_value
             place = row[is_inside] + edge + down, column[is_inside] + edge + right

@@ -56,12 +56,14 @@ SUNLIGHT, V_NM = (0.0, 0.65, 0.70), 545.0  # V, B-V and V-I; the wavelength of V
 
 
 def bench_sources(config: BenchConfig, folder: Path) -> Sources:
-    """The light of a bench's sky beside its stars. Raises InputError or MachineError."""
+    """The light of a bench's sky other than its stars: bodies, and a map of diffuse light. Raises
+    InputError or MachineError.
+    """
     moving = bench_moving(config, folder)
     diffuse = config.sky.diffuse
     if diffuse.map is None:
         return Sources(moving)
-    # WCS and coordinates take 200 ms, which only a map needs
+    # Importing WCS and coordinates takes 200 ms, which a bench without a map saves.
     from hilstar.sky.diffuse import read_diffuse_map
 
     bv_mag = diffuse.bv_mag
@@ -75,7 +77,7 @@ def bench_sources(config: BenchConfig, folder: Path) -> Sources:
 
 
 def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
-    """The bodies and the observer of a bench, None where its file has neither. Raises InputError
+    """The bodies and the observer of a bench; None where its file states neither. Raises InputError
     or MachineError.
     """
     if not has_observer(config):
@@ -88,8 +90,8 @@ def bench_moving(config: BenchConfig, folder: Path) -> MovingSky | None:
 
 
 def moved(stars: Stars, moving: MovingSky | None) -> Stars:
-    """The stars with bodies among them at t = 0, in arrays that `moving` may change; without
-    `moving` the stars themselves.
+    """The stars with the bodies among them at t = 0, in new arrays that `moving` may change;
+    without `moving` the stars themselves.
     """
     if moving is None:
         return stars
@@ -97,28 +99,31 @@ def moved(stars: Stars, moving: MovingSky | None) -> Stars:
 
 
 def catalogue_choice(config: BenchConfig, folder: Path) -> TableChoice:
-    """What `[sky] catalogue` names, and how it is read."""
+    """The catalogue that `[sky] catalogue` names, and the options with which it is read."""
     sky = config.sky
     source = sky.catalogue if sky.catalogue == "hipparcos" else folder / sky.catalogue
     return TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear)
 
 
 def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = None) -> Stars:
-    """The stars of a bench with their electron rates, which are computed only here, as
-    `moving`'s observer sees them.
+    """The stars of a bench, with directions as the observer of `moving` sees them, and with their
+    electron rates, which are computed only here. Raises InputError.
     """
     sky = config.sky
-    epoch_utc_ns(config)  # which refuses one that a source was to give
+    # called for its check: it refuses an epoch that a source should have given
+    epoch_utc_ns(config)
     choice = catalogue_choice(config, folder)
     if sky.variables == "phase":
-        # A variable that is too faint on average may be bright enough at this time.
+        # All stars are read first, as a variable that is too faint on average may be bright enough
+        # at this time.
         everything = dataclasses.replace(choice, faintest_v_mag=math.inf)
         chosen = choose_catalog(everything).at_phase(sky_jd(config, None))
     else:
         chosen = choose_catalog(dataclasses.replace(choice, faintest_v_mag=sky.faintest_v_mag))
     catalog = chosen.brighter_than(sky.faintest_v_mag)
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
-    # A moving sky has its observer's place and velocity; without one the bench file has them.
+    # A moving sky has its observer's position and velocity; without one the bench file may state a
+    # velocity.
     if moving is not None:
         vectors = moving.stars_seen(vectors, catalog.parallax_mas)
     elif any(sky.observer_velocity_km_s):
@@ -138,7 +143,7 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
     if flux.shape[1] > 1:
         flux_by_bv = through(np.zeros_like(BV_MAG), BV_MAG, np.full_like(BV_MAG, np.nan))
         by_bv = total_and_colours(flux_by_bv).colours
-    # the air takes of each star by its own spectrum
+    # set here, as the air dims each star by its own spectrum
     if config.site is not None and moving is not None:
         moving.air = site_air(config, folder, catalog, kind)
     stars = make_stars(catalog, vectors, temperature_k, flux)
@@ -148,8 +153,10 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
 def site_air(
     config: BenchConfig, folder: Path, catalog: Catalog, kind: FloatArray | None = None
 ) -> SiteAir:
-    """The air over `[site]` for stars of a catalogue. Raises InputError."""
-    # ERFA takes 30 ms
+    """The air over `[site]`, with the dimming of each star of a catalogue and, as the last, of
+    sunlight. `kind` are the stars' MK types, None where spectra are by colour. Raises InputError.
+    """
+    # Importing ERFA takes 30 ms, which a bench without a site saves.
     from hilstar.server.bench.site import (
         Ground,
         site_extinction,
@@ -194,8 +201,7 @@ def site_air(
 
 
 def brightest_seen(file: BenchFile, view: View, count: int) -> list[StarInView]:
-    """The `count` brightest stars and bodies that a bench's tracker sees in a view, the brightest
-    first.
+    """The `count` brightest stars and bodies in a view of a bench's tracker, the brightest first.
 
     Raises InputError or MachineError (see `bench_sources`).
     """

@@ -1,9 +1,9 @@
-"""A body wide enough to have a face: where its disc is seen, how bright each place of it is, and
-what it hides.
+"""A body that is seen as a disc, not a point: in which directions, how bright each place of it is,
+and what it hides.
 
-All is computed in the axes that make the body's spheroid a unit sphere, where limb and terminator
-are circles; a true distance counts, so that a near Earth is the cap that it is. Laws give radiance
-relative to `normal_e_per_s_sr`:
+All is computed in axes in which the body's spheroid is a unit sphere, and limb and terminator are
+circles. The true distance is used, so that of a near Earth only the cap is seen that is in view.
+Laws give the radiance relative to `normal_e_per_s_sr`:
 
 - `lambert`: mu0, the cosine of the Sun's angle from the place's normal;
 - `lunar-lambert`: 2 l mu0 / (mu0 + mu) + (1 - l) mu0, mu the observer's (McEwen 1991, Icarus 92,
@@ -12,7 +12,8 @@ relative to `normal_e_per_s_sr`:
   Quantities, 14.7);
 - `uniform`: 1.
 
-The law gives a disc its shape, the body's magnitude its sum: `of_rate` scales the one to the other.
+The law gives how light is spread over a disc, the body's magnitude gives its sum: `of_rate` scales
+the disc to that.
 """
 
 from dataclasses import dataclass, replace
@@ -25,18 +26,18 @@ from hilstar.basics.arrays import FloatArray
 
 Law = Literal["uniform", "lambert", "lunar-lambert", "limb-darkened"]
 SOLAR_LIMB = (0.30, 0.93, -0.23)
-# Gauss-Legendre nodes along each axis of the lit face: 1e-5 of the flux,
-# tests/unit/sky/bodies/test_disc.py
+# Gauss-Legendre nodes along each axis of the lit face: the flux is right to 1e-5
+# (tests/unit/sky/bodies/test_disc.py).
 QUADRATURE = 40
-# scale heights over the limb: beyond, the Earth's air is 1e-8 deep along the ray, which no code
-# shows
+# Height of the air over the limb, in scale heights. Above it the optical depth of the Earth's air
+# along a ray is 1e-8, which no code shows.
 AIR_TOP = 20.0
 
 
 @dataclass(frozen=True, slots=True)
 class Air:
-    """An exponential atmosphere: its scale height, and its vertical optical depth from the
-    limb's surface up.
+    """An exponential atmosphere: its scale height, and its vertical optical depth above the
+    surface.
     """
 
     scale_km: float
@@ -45,11 +46,11 @@ class Air:
 
 @dataclass(frozen=True, eq=False)
 class Disc:
-    """A body's disc as seen: `direction` (3,) to its centre and `pole`, unit vectors, ICRS axes;
-    `sun`, from it to the Sun.
+    """A body's disc as the observer sees it. In ICRS axes, each (3,) and unit: `direction` to its
+    centre, `pole` along its axis, and `sun`, the direction from the body to the Sun.
 
-    `equator_km` and `polar_km` are the spheroid's radii, `normal_e_per_s_sr` the radiance where the
-    law's function is 1.
+    `equator_km` and `polar_km` are the spheroid's radii. `normal_e_per_s_sr` is the radiance,
+    electrons per second and steradian, where the law's function is 1.
     """
 
     name: str
@@ -66,15 +67,15 @@ class Disc:
 
     @cached_property
     def to_sphere(self) -> FloatArray:
-        """The map (3, 3) of ICRS vectors to axes in which the body is a unit sphere on +z, in
-        equatorial radii.
+        """The matrix (3, 3) that turns ICRS vectors, in equatorial radii, into axes in which the
+        body is a unit sphere with its centre on +z, and the Sun to the right (+x).
         """
         stretch = self.equator_km / self.polar_km - 1
         squash = np.eye(3) + stretch * np.outer(self.pole, self.pole)
         towards = squash @ self.direction
         z = towards / np.linalg.norm(towards)
         sun = squash @ self.sun
-        # The Sun to the right; any direction where it stands before or behind.
+        # x points to the Sun's side; any x will do where the Sun is in front of or behind the body.
         side = sun - (sun @ z) * z
         if side @ side < 1e-12 * (sun @ sun):
             side = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
@@ -83,20 +84,20 @@ class Disc:
 
     @cached_property
     def distance_radii(self) -> float:
-        """The distance of the centre in the axes of `to_sphere`."""
+        """The distance of the body's centre in the axes of `to_sphere`, in sphere radii."""
         direction_length = float(np.linalg.norm(self.to_sphere @ self.direction))
         return direction_length * self.distance_km / self.equator_km
 
     @cached_property
     def sun_sphere(self) -> FloatArray:
-        """The vector (3,) whose product with a place of the sphere is the cosine of the Sun's angle
-        there, times the length of the normal.
+        """The vector (3,) whose inner product with a place on the sphere is the cosine of the angle
+        between the Sun and the normal there, times the length of the normal in space.
         """
         return np.asarray(self.to_sphere @ self.sun)
 
     @property
     def radius_rad(self) -> float:
-        """The largest angle from the centre to the limb."""
+        """The largest angle from the centre to the limb, rad."""
         sine = max(self.equator_km, self.polar_km) / self.distance_km
         return float(np.arcsin(min(1.0, sine)))
 
@@ -117,8 +118,8 @@ class Disc:
         return self.air.depth * float(np.sqrt(2 * np.pi / self.air_radii))
 
     def limb(self, count: int, radii: float = 1.0) -> FloatArray:
-        """Unit directions (count, 3), ICRS, of rays that pass the centre at `radii` of it, all
-        round.
+        """Unit directions (count, 3), ICRS axes, of rays evenly around the body that pass its
+        centre at a distance of `radii` of its radius; 1 is the limb.
         """
         sine = min(1.0, radii / self.distance_radii)
         turn = np.linspace(0.0, 2 * np.pi, count, endpoint=False)
@@ -128,20 +129,20 @@ class Disc:
         return np.asarray(on_sphere / np.linalg.norm(on_sphere, axis=1, keepdims=True))
 
     def of_rate(self, electrons_per_s: float) -> "Disc":
-        """The same disc with this flux in all; black where nothing of it is lit."""
+        """The same disc scaled to this flux of the whole disc; black where none of it is lit."""
         whole_sr = self.law_integral_sr()
         radiance_e_per_s_sr = electrons_per_s / whole_sr if whole_sr > 0 else 0.0
         return replace(self, normal_e_per_s_sr=radiance_e_per_s_sr)
 
     def impact(self, directions: FloatArray) -> FloatArray:
-        """How close rays along ICRS directions (n, 3) pass the centre, radii (n,); infinite for
-        those that lead away.
+        """The distance (n,), in radii, at which rays along ICRS directions (n, 3) pass the centre;
+        infinite for rays that lead away from it.
         """
         return self._impact(directions @ self.to_sphere.T)
 
     def transmission(self, directions: FloatArray) -> FloatArray:
-        """The share of light from behind the body in ICRS directions (n, 3): 0 on its disc, less
-        than 1 through its air.
+        """The share (n,) of light from behind the body that comes from ICRS directions (n, 3): 0
+        on the disc, below 1 through its air.
         """
         impact = self._impact(directions @ self.to_sphere.T)
         height = (impact - 1) / (self.air_radii or 1.0)
@@ -149,16 +150,14 @@ class Disc:
         return np.where(height < 0, 0.0, through)
 
     def _impact(self, seen: FloatArray) -> FloatArray:
-        """How close rays (n, 3), `to_sphere` axes, pass the centre, radii; infinite for those
-        that lead away.
-        """
+        """As `impact`, for rays (n, 3) in the axes of `to_sphere`."""
         across = np.hypot(seen[:, 0], seen[:, 1])
         impact = self.distance_radii * across / np.linalg.norm(seen, axis=1)
         return np.where(seen[:, 2] > 0, impact, np.inf)
 
     def radiance(self, directions: FloatArray) -> FloatArray:
-        """Electrons per second and steradian of the solid disc in ICRS directions (n, 3); 0
-        beside it.
+        """The radiance (n,), electrons per second and steradian, of the solid disc in ICRS
+        directions (n, 3); 0 beside it.
         """
         rays = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         sphere_rays = rays @ self.to_sphere.T
@@ -174,8 +173,8 @@ class Disc:
         return light
 
     def with_air(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """The radiance (n,) of disc and air in ICRS directions (n, 3), and the share (n,) of
-        what is behind that they hide.
+        """The radiance (n,), electrons per second and steradian, of disc and air in ICRS directions
+        (n, 3), and the share (n,) of the light behind them that they hide.
         """
         covered = 1 - self.transmission(directions)
         light = self.radiance(directions)
@@ -186,26 +185,26 @@ class Disc:
         return light, covered
 
     def air_light(self, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Electrons per second and steradian of the air beside the disc in ICRS directions (n, 3),
-        and the share that it hides.
+        """The radiance (n,), electrons per second and steradian, of the air beside the disc in ICRS
+        directions (n, 3), and the share (n,) of the light behind it that it hides.
 
-        It is as bright as ground that a ray just touches on that side, by the share of light that
-        it stops.
+        The radiance is in proportion to that share; it continues the radiance of the ground that a
+        ray just touches on that side.
         """
         height = np.maximum(self.impact(directions) - 1, 0.0) / (self.air_radii or 1.0)
         hidden = -np.expm1(-self.slant_depth * np.exp(-height))
         return self.touched_light(directions) * hidden, hidden
 
     def touched_light(self, directions: FloatArray) -> FloatArray:
-        """The radiance (n,), electrons per second and steradian, of ground that a ray just touches,
-        over the share of light that air stops there.
+        """The radiance (n,), electrons per second and steradian, of the ground that a ray just
+        touches, divided by the share of light that the air hides there.
 
-        Of ICRS directions (n, 3) only the side of the disc on which they lie counts.
+        Of the ICRS directions (n, 3) only the side of the disc on which each lies counts.
         """
         sphere_directions = directions @ self.to_sphere.T
         sideways = sphere_directions[:, :2]
         length = np.hypot(sphere_directions[:, 0], sphere_directions[:, 1])
-        # any at the middle
+        # at the disc's very middle, where no side is defined, any will do
         side = sideways / np.maximum(length, 1e-30)[:, None]
         sine = 1 / self.distance_radii
         up = np.column_stack((side * np.sqrt(1 - sine**2), np.full(len(side), -sine)))
@@ -214,8 +213,8 @@ class Disc:
         return np.asarray(self.normal_e_per_s_sr * mu0 / -np.expm1(-self.slant_depth))
 
     def _shaded(self, place: FloatArray, seen: FloatArray) -> FloatArray:
-        """The law at places of the sphere (n, 3), along `seen` (n, 3): unit rays, but in the
-        sphere's axes.
+        """The law's function (n,) at places (n, 3) on the sphere, seen along the rays `seen` (n,
+        3), which are unit vectors in space, in the sphere's axes.
         """
         length = np.linalg.norm(place @ self.to_sphere, axis=1)
         mu0: FloatArray = np.maximum(0.0, place @ self.sun_sphere / length)
@@ -231,18 +230,18 @@ class Disc:
         return np.asarray(self.lunar_share * lunar + (1 - self.lunar_share) * mu0)
 
     def law_integral_sr(self) -> float:
-        """The law's function over the seen disc, steradian."""
+        """The integral of the law's function over the visible disc, sr."""
         _, shares_sr = self.points(QUADRATURE)
         return float(shares_sr.sum())
 
     def points(self, nodes: int) -> tuple[FloatArray, FloatArray]:
-        """Directions (n, 3), ICRS axes, of places on the lit face, and the law's function times the
-        steradian of each (n,).
+        """Unit directions (n, 3), ICRS axes, of places on the lit face, and the law's function
+        times the solid angle, sr, of each (n,).
 
-        `nodes` is their number along either axis of the face.
+        `nodes` is the number of places along each axis of the face.
         """
         place, area = self._lit_face(nodes)
-        # From the sphere's axes to space; the distance of each place along its ray.
+        # from the sphere's axes back to space
         back = np.linalg.inv(self.to_sphere)
         from_observer = place + np.array([0.0, 0.0, self.distance_radii])
         true = from_observer @ back.T
@@ -252,22 +251,23 @@ class Disc:
         return true / distance[:, None], shaded * facing * area / distance**3
 
     def _lit_face(self, nodes: int) -> tuple[FloatArray, FloatArray]:
-        """Places (n, 3) of the sphere that are seen and lit, and the area that each stands for
-        (n,).
+        """Places (n, 3) on the sphere that are visible and lit, and the area (n,) that each
+        represents.
 
         A place has a longitude from the observer's meridian towards the Sun, and a latitude from
-        the plane of both.
+        the plane in which observer and Sun are.
         """
         node, weight = gauss_legendre(nodes)
         top = np.arccos(1 / self.distance_radii)
-        # The limb ends latitudes as a square root does: evenly in an angle it is smooth.
+        # Towards the ends of latitude the visible range of longitude falls as a square root. With
+        # latitudes as the sine of an angle the integrand is smooth there.
         latitude = top * np.sin(node * np.pi / 2)
         stretch = top * np.cos(node * np.pi / 2) * np.pi / 2
         cos_reach = 1 / (self.distance_radii * np.cos(latitude))
         reach = np.arccos(np.minimum(1.0, cos_reach))
         first = -reach
         if self.law in ("lambert", "lunar-lambert"):
-            # Sun's longitude; +x is its side, -z the observer's
+            # the Sun's longitude: it is on the side of +x, the observer on that of -z
             sun = np.arctan2(self.sun_sphere[0], -self.sun_sphere[2])
             first = np.clip(sun - np.pi / 2, -reach, reach)
         half = (reach - first) / 2
@@ -283,6 +283,8 @@ class Disc:
 
 @lru_cache(maxsize=64)
 def gauss_legendre(count: int) -> tuple[FloatArray, FloatArray]:
-    """Places from -1 to 1 and weights (count,), kept: a frame asks for the same again."""
+    """The nodes from -1 to 1 and the weights (count,) of Gauss-Legendre quadrature. They are
+    cached, as each frame needs the same ones again.
+    """
     place, weight = np.polynomial.legendre.leggauss(count)
     return place, weight

@@ -1,6 +1,7 @@
-"""Observers: the Earth's centre, or a satellite on an element set (two lines, or an OMM).
+"""Where the observer is: at the Earth's centre, or on a satellite's orbit, given by an element set
+(two lines, or an OMM).
 
-SGP4 is that of Vallado et al. 2006, AIAA 2006-6753.
+The orbit is computed by SGP4 as Vallado et al. give it (2006, AIAA 2006-6753).
 """
 
 import importlib.util
@@ -16,44 +17,51 @@ from hilstar.basics.errors import InputError, MachineError
 from hilstar.sky.bodies.kernel import INSTALL, NS_PER_DAY, UNIX_JD, Tdb, tdb_of_utc
 from hilstar.sky.bodies.omm import is_omm, read_omm
 
-LINE_LENGTH = 69  # with its checksum
-# What an ASCII character adds to its line's checksum: lists have tens of thousands of lines.
+LINE_LENGTH = 69  # characters of an element line, its checksum included
+# What each ASCII character adds to its line's checksum. It is a table for speed: lists of elements
+# have tens of thousands of lines.
 DIGIT_VALUE = dict.fromkeys(range(128), 0) | {ord("-"): 1} | {ord(str(n)): n for n in range(10)}
 TLE_ADVICE = "give a file with one two-line element set, or one OMM in JSON, XML or CSV"
-TURN_NS = 3600 * 10**9  # the equator's axes move by 0.006 arcsec an hour: 0.2 m of a low orbit
+# How long one rotation from TEME to ICRS serves: the equator's axes move by 0.006 arcsec an hour,
+# which is 0.2 m in a low orbit.
+TURN_NS = 3600 * 10**9
 log = logging.getLogger(__name__)
 
 
 class Orbit(Protocol):
-    """Where an observer is about the Earth's centre."""
+    """An observer's position and velocity with respect to the Earth's centre."""
 
     @property
     def step_s(self) -> float:
-        """Straight lines over this time keep the apparent places of bodies within 5 mas."""
+        """The time between two exact positions, s: straight lines between them give the apparent
+        places of bodies within 5 mas.
+        """
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Place (3,), km, and velocity (3,), km/s, ICRS axes, at a UTC, ns since 1970. Raises
-        InputError where it ends.
+        """The position (3,), km, and velocity (3,), km/s, in ICRS axes, at a UTC, ns since 1970.
+        Raises InputError for a time for which there is no orbit.
         """
 
 
 class Geocentre:
     """The Earth's centre itself."""
 
-    # The Moon, the fastest, is 0.06 mas off in the middle: 1e-7 arcsec/s^2 and its own path's bend.
+    # The Moon, the fastest body, is 0.06 mas off midway between two exact positions, by 1e-7
+    # arcsec/s^2 and its own path's bend.
     step_s = 60.0
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
-        """No offset."""
+        """Position and velocity 0: the observer is the Earth's centre."""
         return np.zeros(3), np.zeros(3)
 
 
 class TleOrbit:
-    """A satellite on the elements in the text of a file `name`. Raises InputError for wrong
-    ones, MachineError without SGP4.
+    """A satellite's orbit from the elements in `text`, the contents of the file `name`. Raises
+    InputError for wrong elements, MachineError where SGP4 is not installed.
     """
 
-    # From 400 km the Moon's parallax bends its path by 5e-3 arcsec/s^2: 2.5 mas off in the middle.
+    # Seen from an orbit at 400 km, parallax bends the Moon's path by 5e-3 arcsec/s^2: it is 2.5 mas
+    # off midway between two exact positions.
     step_s = 2.0
 
     def __init__(self, text: str, name: str) -> None:
@@ -78,13 +86,15 @@ class TleOrbit:
             self.number = int(self._satellite.satnum)
 
     def age_days(self, utc_ns: int) -> float:
-        """How many days a UTC is after the elements' own date."""
+        """How many days a UTC, ns since 1970, is after the elements' epoch; below 0 before it."""
         epoch_jd = float(self._satellite.jdsatepoch)
         epoch_part = float(self._satellite.jdsatepochF)
         return utc_ns / NS_PER_DAY + UNIX_JD - epoch_jd - epoch_part
 
     def state(self, utc_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Place and velocity by SGP4, from the true equator and mean equinox to the ICRS."""
+        """Position and velocity by SGP4, which gives them in TEME (true equator, mean equinox),
+        turned into ICRS axes; see `Orbit.state`.
+        """
         days, rest_ns = divmod(utc_ns, NS_PER_DAY)
         jd = UNIX_JD + days
         jd_part = rest_ns / NS_PER_DAY
@@ -99,8 +109,8 @@ class TleOrbit:
 
 
 def _checked(name: str, text: str) -> tuple[str, str]:
-    """The two element lines of a text, other lines left out. Raises InputError where they are not
-    two, or with a wrong checksum.
+    """The two element lines of a text, without its other lines. Raises InputError where there is
+    not exactly one pair, or a checksum is wrong.
     """
     tle_lines = []
     numbers = ""
@@ -127,8 +137,8 @@ def _checked(name: str, text: str) -> tuple[str, str]:
 
 
 def digit_sum(line: str) -> int:
-    """The checksum of an element line (ASCII) by all its characters but the last, which states it:
-    the sum of its digits, a minus sign as 1, modulo 10.
+    """The checksum of an element line (ASCII): the sum of its digits, with a minus sign as 1,
+    modulo 10. The last character is left out, as it states the checksum.
     """
     values = map(DIGIT_VALUE.__getitem__, line[:-1].encode())
     return sum(values) % 10
@@ -136,8 +146,8 @@ def digit_sum(line: str) -> int:
 
 @lru_cache(maxsize=8)
 def icrs_from_teme(hour: int) -> FloatArray:
-    """The rotation (3, 3) at an hour since 1970 (UTC): equation of the equinoxes, then nutation
-    and precession (IAU 2006).
+    """The matrix (3, 3) that turns TEME components into ICRS components at `hour`, hours since 1970
+    (UTC): first the equation of the equinoxes, then nutation and precession (IAU 2006).
     """
     date: Tdb = tdb_of_utc(hour * TURN_NS)
     equinoxes_rad = erfa.ee06a(date.whole, date.part)

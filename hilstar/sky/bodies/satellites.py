@@ -1,25 +1,21 @@
-"""Lists of element sets, as CelesTrak and Space-Track give them: two lines each, with or without
-names, or OMM (`omm`).
+"""Satellites: their element sets, their brightness and their positions.
 
-How bright a satellite is: a diffuse sphere in sunlight, in and out of the Earth's shadow, and its
-flashes.
-
-A standard magnitude is V at 1000 km and 90 degrees of phase, in full sunlight at 1 au (McCants,
-Heavens-Above). A diffuse sphere's light goes with sin p + (pi - p) cos p of the phase angle p
-(Lambert; Hejduk 2011, AMOS Conference, eq. 2), which is 1 there, and with the square of the
-distance.
-
-A table of what users know of satellites: their brightness, flashes and sizes, by catalogue number.
-
-Places of many satellites at any time: SGP4 (Vallado et al. 2006, AIAA 2006-6753) seldom, cubics
-between.
-
-SGP4 takes 0.5 us a satellite, 11 ms for 20 000: most of a frame. It is therefore asked at the ends
-of STEP_S only, for a share of the list at a time, and between them places follow the cubic through
-both places and velocities. Low orbits are then within
-0.25 m of SGP4 (0.05 arcsec at 1000 km), others within 3.2 m, nowhere more than 0.07 arcsec from the
-Earth's centre: measured over three days. A cubic of exact velocities would be within 5 mm; SGP4's
-own are not quite the slopes of its places.
+- Lists of element sets are read as CelesTrak and Space-Track write them: two lines each, with or
+  without names, or OMM (`omm`).
+- A satellite is as bright as a diffuse sphere in sunlight, in and out of the Earth's shadow, with
+  flashes. A standard magnitude is V at 1000 km and 90 degrees of phase, in full sunlight at 1 au
+  (McCants, Heavens-Above). A diffuse sphere's light is in proportion to sin p + (pi - p) cos p of
+  the phase angle p (Lambert; Hejduk 2011, AMOS Conference, eq. 2), which is 1 at 90 degrees, and
+  to the inverse square of the distance.
+- A table gives what users know of satellites, by catalogue number: brightness, flashes and sizes.
+- The positions of many satellites at any time come from SGP4 (Vallado et al. 2006, AIAA
+  2006-6753), with cubics between. SGP4 takes 0.5 us a satellite, 11 ms for 20 000, which is most of
+  a frame. So it is computed only at the ends of steps of STEP_S, for a share of the list at a time.
+  Between them a position follows the cubic through the positions and velocities at both ends. Low
+  orbits are then within 0.25 m of SGP4 (0.05 arcsec at 1000 km), others within 3.2 m, and none is
+  more than 0.07 arcsec off as seen from the Earth's centre, measured over three days. With exact
+  velocities a cubic would be within 5 mm, but SGP4's velocities are not quite the derivatives of
+  its positions.
 """
 
 import importlib.util
@@ -44,11 +40,11 @@ if TYPE_CHECKING:
     from sgp4.api import Satrec
 
 
-MAX_NAME = 24  # characters, as CelesTrak has them
+MAX_NAME = 24  # characters, as in CelesTrak's lists
 LIST_FORM = (
     "give a list of two-line element sets, with name lines or without, or OMM in JSON, XML or CSV"
 )
-# Numeric columns of each line (from 0), and what they hold.
+# What the numeric columns (from 0) of each element line contain.
 NUMBERS = {
     "1": {
         "epoch's year": (18, 20),
@@ -65,15 +61,17 @@ NUMBERS = {
     },
 }
 
-STANDARD_KM = 1000.0  # the range that a standard magnitude is for, at 90 degrees of phase
+STANDARD_KM = 1000.0  # the distance to which a standard magnitude refers
 SUN_KM = 695_700.0
 EARTH_KM, EARTH_FLATTENING = 6378.137, 1 / 298.257  # IERS Conventions 2010
 MAX_PHASE_FACTOR = np.pi  # at full phase
 FWHM_SIGMAS = 2 * float(np.sqrt(2 * np.log(2)))
-NEIGHBOURS = np.arange(-3, 4)  # a flash lasts at most half a period: 3 periods are 14 sigmas
-SHORTEST_S = 1e-6  # a mean over a shorter time is the light at its middle
+# Which flashes may be under way at a time, in periods from the last: one lasts at most half a
+# period (at half height), so 3 periods are 14 sigmas.
+NEIGHBOURS = np.arange(-3, 4)
+SHORTEST_S = 1e-6  # a mean is over this time at least, as it divides by it
 KEY = "norad"
-# Each column that a row may leave empty, with its limits.
+# The optional columns, with the limits of their values.
 COLUMNS = {
     "standard_mag": (-30.0, 50.0),
     "period_s": (1e-3, 1e7),
@@ -89,11 +87,11 @@ TABLE_FORM = (
 Row = dict[str, float]
 STEP_S = 20
 STEP_NS = STEP_S * NS_PER_S
-# So many at a time take 0.3 ms; the moments of a step at which a share's turn comes are spread over
-# it.
+# Satellites in one call of SGP4, which takes 0.3 ms. The steps of different shares begin at times
+# spread over a step, so that no frame computes all of them.
 SHARE = 512
-# Coefficients of 1, s, s^2, s^3 of the cubic through place and velocity (times the step) at both
-# ends
+# Turns the position and the velocity times the step at the beginning, then at the end, into the
+# coefficients of 1, s, s^2 and s^3 of the cubic through them, s from 0 to 1.
 HERMITE = np.array(
     [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [-3.0, -2.0, 3.0, -1.0], [2.0, 1.0, -2.0, 1.0]]
 )
@@ -101,8 +99,8 @@ HERMITE = np.array(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Satellite:
-    """One satellite: its name (that of no other in its list), its catalogue number, and its
-    elements.
+    """One satellite: its name, which no other in its list has, its catalogue number, and its
+    elements as SGP4 needs them.
     """
 
     name: str
@@ -110,19 +108,20 @@ class Satellite:
     satrec: "Satrec"
 
     def age_days(self, utc_ns: int) -> float:
-        """How many days a UTC is after the elements' own date."""
+        """How many days a UTC, ns since 1970, is after the elements' epoch; below 0 before it."""
         epoch_jd = self.satrec.jdsatepoch
         return float(utc_ns / NS_PER_DAY + UNIX_JD - epoch_jd - self.satrec.jdsatepochF)
 
 
 def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
-    """The satellites in the text of a list, in its order; of several sets of one, that of the date
-    nearest to a UTC.
+    """The satellites in the text of a list (of the file `file`), in its order. Where it has several
+    element sets of one satellite, the one whose epoch is nearest to a UTC, ns since 1970, counts.
 
-    A name that several have is followed by the catalogue number; one without a name is called by
-    that.
+    Where several satellites have the same name, the catalogue number follows it; a satellite
+    without a name is named by its number ("NORAD 25544").
 
-    Raises InputError with the line that is wrong, and MachineError without SGP4.
+    Raises InputError, which names the line that is wrong, and MachineError where SGP4 is not
+    installed.
     """
     if importlib.util.find_spec("sgp4") is None:
         raise MachineError(f"[sky.bodies] satellites need SGP4; {INSTALL}")
@@ -148,8 +147,8 @@ def read_satellites(text: str, file: str, utc_ns: int) -> list[Satellite]:
 
 
 def _satellites(text: str, file: str) -> "Iterator[Satellite]":
-    """Each element set of a list, as a satellite with the name that it has there. Raises
-    InputError.
+    """Each element set of a list as a satellite, with the name in the list ("" for none). Raises
+    InputError for a damaged line or set.
     """
     from sgp4.api import Satrec
 
@@ -163,7 +162,9 @@ def _satellites(text: str, file: str) -> "Iterator[Satellite]":
 
 
 def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
-    """The name (empty where there is none), the first and the second line of each set."""
+    """The name ("" for none), the first line and the second line of each element set. Raises
+    InputError for a line that is damaged or missing.
+    """
     name = ""
     first = ""
     first_at = 0
@@ -203,21 +204,23 @@ def _sets(text: str, file: str) -> Iterator[tuple[str, str, str]]:
 
 
 def _name(line: str) -> str:
-    """A name line's name in ASCII, as tables have it; Space-Track writes "0 " before it."""
+    """The name in a name line, in ASCII and of MAX_NAME characters at most. Space-Track writes
+    "0 " before it, which is left out.
+    """
     text = line[2:] if line.startswith("0 ") else line
     ascii_text = printable(text.strip()).encode("ascii", "replace").decode()
     return ascii_text[:MAX_NAME].strip()
 
 
 def _check(line: str, where: str) -> None:
-    """Refuse (InputError) a line of the wrong length, with a wrong checksum, or without its
-    numbers.
+    """Check an element line. Raises InputError for a wrong length, a control character, a wrong
+    checksum, or a column that is no number.
     """
     if len(line) != LINE_LENGTH or not line.isascii():
         raise InputError(
             f"{where}: {len(line)} characters, where an element line has {LINE_LENGTH}; {LIST_FORM}"
         )
-    # SGP4's parser is C, where a NUL ends a text.
+    # SGP4's parser is written in C, where a NUL ends the text.
     if not line.isprintable():
         raise InputError(f"{where}: it has a control character: a damaged line; take the list anew")
     total = digit_sum(line)
@@ -238,11 +241,11 @@ def _check(line: str, where: str) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Brightness:
-    """The brightness of n satellites, (n,) each (see `read_table`). `standard_e_per_s` are rates at
-    the standard magnitude.
+    """The brightness of n satellites by the columns of `read_table`, each (n,);
+    `standard_e_per_s` is the rate, electrons/s, at a satellite's standard magnitude.
 
-    Without `period_s` (NaN) a satellite's light is steady; with `flash_s` (else NaN) it flashes,
-    otherwise it goes up and down.
+    Without a `period_s` (NaN) a satellite's light is steady. With a period and a `flash_s` it
+    flashes; with a period alone (`flash_s` NaN) its light varies as a cosine.
     """
 
     standard_e_per_s: FloatArray
@@ -253,8 +256,8 @@ class Brightness:
     size_m: FloatArray
 
     def most(self, which: IntArray) -> FloatArray:
-        """The largest factor (n,) by which these are ever brighter than their mean; of those that
-        flash, than without a flash.
+        """The largest factor (n,) by which the satellites `which` (n,) are ever brighter than their
+        mean, or, for those that flash, than between flashes.
         """
         ratio = flux_ratio(-self.amplitude_mag[which])
         waved = 2 * ratio / (ratio + 1)
@@ -264,12 +267,12 @@ class Brightness:
         return np.where(is_steady, 1.0, varied)
 
     def variation(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
-        """The mean factor of each of these (n,) between two times, seconds after `epoch_utc`, in
-        closed form.
+        """The mean factor (n,) of the light of the satellites `which` (n,) between two times (n,),
+        seconds after `epoch_utc`, in closed form.
 
-        Up and down: a cosine of the flux whose extremes are `amplitude_mag` apart, with a mean
-        of 1. Flashes: Gaussian ones of `flash_s` at half height, `amplitude_mag` brighter at their
-        top. A maximum is at `flash_at_s`.
+        Without flashes the flux varies as a cosine, whose extremes are `amplitude_mag` apart, with
+        a mean of 1. Flashes are Gaussians that last `flash_s` at half height, and are
+        `amplitude_mag` brighter at their top. A maximum is at `flash_at_s`.
         """
         factor = np.ones(len(which))
         steady = np.isnan(self.period_s[which])
@@ -284,7 +287,9 @@ class Brightness:
         return factor
 
     def _waved(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
-        """As `variation`, of those that go up and down: the cosine's mean is a sinc."""
+        """The mean factors (n,) of satellites whose light varies as a cosine: the mean of the
+        cosine over a time is damped by a sinc. See `variation`.
+        """
         ratio = flux_ratio(-self.amplitude_mag[which])
         per_s = 1 / self.period_s[which]
         middle_s = (begin_s + end_s) / 2 - self.flash_at_s[which]
@@ -295,14 +300,15 @@ class Brightness:
         return np.asarray(1 + wave * damping)
 
     def _flashed(self, which: IntArray, begin_s: FloatArray, end_s: FloatArray) -> FloatArray:
-        """As `variation`, of those that flash."""
-        from scipy.special import ndtr  # 0.1 s, which only flashes need
+        """The mean factors (n,) of satellites that flash; see `variation`."""
+        # The import takes 0.1 s, which benches without flashes save.
+        from scipy.special import ndtr
 
         period_s = self.period_s[which]
         sigma_s = self.flash_s[which] / FWHM_SIGMAS
         flash_at_s = self.flash_at_s[which]
-        # The light of all flashes up to each end, in flashes: whole periods, and those near that
-        # have not ended
+        # The light of all flashes up to each of the two times, in flashes: one for each whole
+        # period, and the parts of those near the time.
         ends = []
         for seconds in (begin_s, end_s):
             turn = np.floor((seconds - flash_at_s) / period_s)
@@ -320,13 +326,16 @@ class Brightness:
 def reflected_share(
     from_observer_km: FloatArray, place_km: FloatArray, sun_km: FloatArray
 ) -> FloatArray:
-    """Flux over that of the standard magnitude (n,), of satellites at vectors from the observer and
-    from the Earth (n, 3).
+    """The flux (n,) of satellites, relative to that of their standard magnitude, with the Earth's
+    shadow.
 
-    The Sun stands at a vector (3,) from the Earth; the Earth's shadow is in it.
+    `from_observer_km` (n, 3) are their positions from the observer, `place_km` (n, 3) those from
+    the Earth's centre, and `sun_km` (3,) is the Sun's position from the Earth's centre, all in ICRS
+    axes.
     """
     distance_au = float(np.linalg.norm(sun_km)) / KM_PER_AU
-    to_sun = sun_km / np.linalg.norm(sun_km)  # from any satellite of the Earth within 1 arcmin
+    # The Earth's direction to the Sun: that of any satellite is within 1 arcmin of it.
+    to_sun = sun_km / np.linalg.norm(sun_km)
     range_km = np.linalg.norm(from_observer_km, axis=1)
     cos_phase = np.clip(-(from_observer_km @ to_sun) / range_km, -1.0, 1.0)
     by_distance = (STANDARD_KM / range_km) ** 2 / distance_au**2
@@ -335,19 +344,19 @@ def reflected_share(
 
 
 def phase_factor(cos_phase: FloatArray) -> FloatArray:
-    """The light of a diffuse sphere over that at 90 degrees of phase (n,), by the cosines of its
-    phase angles.
+    """The light (n,) of a diffuse sphere, relative to that at 90 degrees of phase, by the cosines
+    (n,) of its phase angles.
     """
     phase_rad = np.arccos(cos_phase)
     return np.asarray(np.sqrt(1 - cos_phase**2) + (np.pi - phase_rad) * cos_phase)
 
 
 def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
-    """The share (n,) of the Sun's disc that the Earth leaves free, seen from places (n, 3) about
-    the Earth; without its air.
+    """The share (n,) of the Sun's disc that the Earth, without its air, does not hide at positions
+    (n, 3), km, from the Earth's centre; `sun_km` (3,) is the Sun's.
 
-    The area of two overlapping circles, in space stretched along the Earth's axis so that it is a
-    sphere.
+    It is the area of two overlapping circles, in space that is stretched along the Earth's axis so
+    that the Earth is a sphere.
     """
     place = _stretched(place_km)
     sun = _stretched(sun_km)
@@ -359,7 +368,8 @@ def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
     cosine = -np.einsum("ij,ij->i", place, to_sun) / (distance * far)
     apart = np.arccos(np.clip(cosine, -1.0, 1.0))
     within = np.abs(earth - disc)
-    # one circle inside the other: the Earth hides all, or as much as its own area
+    # Where one circle is inside the other, the Earth hides the whole disc, or as much as its own
+    # area.
     ring = np.maximum(0.0, 1 - (earth / disc) ** 2)
     share = np.where(apart <= within, ring, 1.0)
     partly = np.flatnonzero((apart > within) & (apart < earth + disc))
@@ -371,7 +381,9 @@ def sunlit_share(place_km: FloatArray, sun_km: FloatArray) -> FloatArray:
 
 
 def _overlap(a: FloatArray, b: FloatArray, apart: FloatArray) -> FloatArray:
-    """The area that circles of radii a and b share, on a plane."""
+    """The area (n,) common to two circles in a plane, of radii a and b (n,), whose middles are
+    `apart` (n,).
+    """
     from_a = (apart**2 + a**2 - b**2) / (2 * apart)
     from_b = apart - from_a
     in_a = np.arccos(np.clip(from_a / a, -1.0, 1.0))
@@ -382,10 +394,10 @@ def _overlap(a: FloatArray, b: FloatArray, apart: FloatArray) -> FloatArray:
 
 
 def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.0) -> FloatArray:
-    """0 (n,) for places (n, 3) that the Earth hides from observers (n, 3), else 1; an observer
-    inside it sees all.
+    """0 (n,) for positions (n, 3) that the Earth hides from observers at (n, 3), else 1; an
+    observer inside the Earth sees all. Both are km from the Earth's centre.
 
-    What is seen through less than `depth_km` of it counts as seen.
+    A line of sight that goes at most `depth_km` deep below the Earth's surface is not hidden.
     """
     observer = _stretched(observer_km)
     place = _stretched(place_km)
@@ -399,16 +411,16 @@ def in_front(observer_km: FloatArray, place_km: FloatArray, depth_km: float = 0.
 
 
 def _stretched(vectors_km: FloatArray) -> FloatArray:
-    """Vectors in axes in which the Earth is a sphere of its equatorial radius; its axis is ICRS
-    z within 0.2 degrees.
+    """Vectors (..., 3), km, ICRS axes, stretched along z so that the Earth is a sphere of its
+    equatorial radius. The Earth's axis is ICRS z within 0.2 degrees.
     """
     to_sphere = np.array([1.0, 1.0, 1 / (1 - EARTH_FLATTENING)])
     return np.asarray(vectors_km * to_sphere)
 
 
 def read_table(text: str, file: str) -> dict[int, Row]:
-    """The rows of a table by catalogue number, each with the columns that are filled. Raises
-    InputError with the line.
+    """The rows of a table by catalogue number, each with the values of its filled columns. Raises
+    InputError, which names the line that is wrong.
     """
     rows: dict[int, Row] = {}
     table = table_of(Path(file), TABLE_FORM, iter(text.splitlines(keepends=True)))
@@ -446,7 +458,9 @@ def _columns(table: TextTable) -> tuple[Chosen, dict[str, Chosen]]:
 
 
 def _number(text: str, where: str) -> int:
-    """A catalogue number, as digits or in Alpha-5. Raises InputError."""
+    """A catalogue number from its digits, or from Alpha-5 (a letter and four digits). Raises
+    InputError for other text.
+    """
     from sgp4.alpha5 import from_alpha5
 
     try:
@@ -458,7 +472,9 @@ def _number(text: str, where: str) -> int:
 
 
 def _values(row: dict[str, str], where: str) -> Row:
-    """The columns that a row fills, as numbers. Raises InputError."""
+    """The values of a row's filled columns. Raises InputError for one that is no number or beyond
+    its limits, and for flashes or variations that are incomplete.
+    """
     values: Row = {}
     for name, text in row.items():
         if not text:
@@ -490,10 +506,10 @@ def _values(row: dict[str, str], where: str) -> Row:
 def brightness_of(
     satellites: Sequence[Satellite], rows: dict[int, Row], default_mag: float, v0_e_per_s: float
 ) -> Brightness:
-    """The brightness of satellites by a table's rows and a standard magnitude for those that have
-    none.
+    """The brightness of satellites by a table's rows; `default_mag` is the standard magnitude of
+    those without one in the table.
 
-    `v0_e_per_s` is the electron rate of sunlight of V = 0.
+    `v0_e_per_s` is the electron rate, electrons/s, of sunlight of V = 0.
     """
 
     def column(name: str, default: float) -> FloatArray:
@@ -514,8 +530,8 @@ def brightness_of(
 
 
 class Swarm:
-    """Satellites moved by their elements (SGP4) in steps of STEP_S, with cubics between; a place
-    depends on its moment alone.
+    """Many satellites, whose positions follow SGP4 at steps of STEP_S and cubics between. A
+    position depends on its time alone, not on the times asked for before.
     """
 
     def __init__(self, satrecs: "Sequence[Satrec]") -> None:
@@ -535,8 +551,8 @@ class Swarm:
         return len(self.error)
 
     def move_to(self, utc_ns: int) -> bool:
-        """Prepare the places about a UTC, ns since 1970; returns whether any satellite entered
-        another step.
+        """Prepare the positions about a UTC, ns since 1970; returns whether new cubics were
+        computed, as a satellite entered another step.
         """
         step = (utc_ns - self._late_ns) // STEP_NS
         due = np.flatnonzero(step != self._step)
@@ -553,7 +569,9 @@ class Swarm:
         return True
 
     def _load(self, k: int, part: slice, begin_ns: int, follows: bool) -> None:
-        """Make the cubics of a share's step; one that follows the last begins where that ended."""
+        """Compute the cubics of share `k`, the satellites `part`, for the step that begins at
+        `begin_ns`. Where it follows the last step, it begins with the states at that one's end.
+        """
         last = self._ends[k]
         if last is None or not follows:
             last, error = self._states(k, begin_ns)
@@ -567,8 +585,9 @@ class Swarm:
         self._ends[k] = end
 
     def _states(self, k: int, utc_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Place, km, and velocity times the step, (n, 2, 3), ICRS axes, and errors (n,); NaN
-        where there is one.
+        """The positions, km, and the velocities times STEP_S, km, as (n, 2, 3) in ICRS axes, of
+        share `k` at a UTC; and SGP4's error codes (n,), 0 for none. Where there is an error the
+        state is NaN.
         """
         days, rest_ns = divmod(utc_ns, NS_PER_DAY)
         utc_days = np.array([UNIX_JD + days])
@@ -587,8 +606,8 @@ class Swarm:
     def places_km(
         self, which: IntArray | slice, utc_ns: int, seconds: FloatArray | float = 0.0
     ) -> FloatArray:
-        """Places (n, 3), km from the Earth's centre, ICRS axes, `seconds` (n,) after the UTC it
-        was moved to; NaN for none.
+        """The positions (n, 3), km from the Earth's centre, ICRS axes, of the satellites `which`
+        `seconds` (n,) after `utc_ns`, the time of `move_to`; NaN where SGP4 gives none.
         """
         after_s = (utc_ns - self._begin_ns[which]) / NS_PER_S + seconds
         s = after_s[:, None] / STEP_S
@@ -596,13 +615,13 @@ class Swarm:
         return np.asarray(a + s * (b + s * (c + s * d)))
 
     def motion_km(self, which: IntArray, utc_ns: int) -> FloatArray:
-        """Coefficients (4, n, 3) of 1, s, s^2 and s^3 of the same places, s in seconds after
-        that UTC.
+        """The coefficients (4, n, 3) of 1, s, s^2 and s^3 of the positions of `places_km`, s in
+        seconds after `utc_ns`.
         """
         after_s = (utc_ns - self._begin_ns[which]) / NS_PER_S
         s = after_s[:, None] / STEP_S
         a, b, c, d = np.moveaxis(self._terms[which], 1, 0)
-        # the cubic about s in place of 0
+        # the same cubic, expanded about s instead of 0
         place = a + s * (b + s * (c + s * d))
         velocity = b + s * (2 * c + s * 3 * d)
         bend = c + s * 3 * d

@@ -1,4 +1,6 @@
-"""The steps that find where the tracker sees each pixel: orientation, focus, geometry."""
+"""The steps of first light that find where the tracker sees the monitor's pixels: the orientation
+of the screen, and the geometry.
+"""
 
 import itertools
 import math
@@ -51,26 +53,29 @@ from hilstar.instruments.calibrate.geometric.observed import Observed, measure_i
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background, squares
 
-# an orientation: a matrix (2, 2), row by row
+# An orientation: a matrix (2, 2), row by row, whose columns are the directions (x right, y down) in
+# which the screen's right and its down appear to the tracker.
 Way = tuple[int, int, int, int]
-# half the figure's side, relative to the smaller side of what both screen and tracker have
+# half the figure's side, relative to the smallest side of the screen and of the tracker's field
 FIGURE_REACH = 0.25
-SQUARE_TRACKER_PX = 2.5  # side of its smallest square as the tracker sees it
-# sides of the squares at the corner, to its right and below it, in those of the smallest
+SQUARE_TRACKER_PX = 2.5  # side of the smallest square in the tracker's image
+# sides of the squares at the corner, to its right and below it, in sides of the smallest
 SQUARES = (3, 2, 1)
 THRESHOLD_SIGMA = 8.0
 MIN_PIXELS = 3
 MAX_STRETCH = 1.25  # of the figure's one side to its other: a tilt of 35 degrees
-SPOT_ERROR_PX = 0.1  # of a square's centroid in the tracker's image, by its threshold and the lens
-MAX_SCALE = 2.0
-# between the light of one square and the next: 9, 4 and 1 of one code, however wide the PSF is
+# Error of a square's centroid in the tracker's image, because of the threshold and the lens.
+SPOT_ERROR_PX = 0.1
+MAX_SCALE = 2.0  # largest ratio of the figure's size to the expected one, or the inverse
+# Smallest ratio of the light of one square to that of the next. The squares have 9, 4 and 1 parts
+# of light, however wide the PSF is.
 MIN_LIGHT_STEP = 1.3
 WINDOW_SIDES = 0.75  # half the side of a square's window, in sides of the largest spot
 DRAWN_PX = 1460  # along the longer side of an image in a chart: twice its width
 MAX_SPOTS = 12  # the largest, of which the three brightest are the squares
 UPRIGHT = (1, 0, 0, 1)
 QUARTER_TURNS_DEG = {(0, -1, 1, 0): 90.0, (0, 1, -1, 0): -90.0}
-OBLIQUE_DEG = 40.0  # from the nearest right angle
+OBLIQUE_DEG = 40.0  # a figure turned by more from the nearest right angle is oblique
 WAYS = {
     UPRIGHT: "upright",
     (-1, 0, 0, 1): "mirrored left to right",
@@ -91,16 +96,17 @@ SIDES = {(1, 0): "to its right", (-1, 0): "to its left", (0, 1): "below it", (0,
 NOT_SEEN = (
     "show the monitor to the whole of the tracker's field, expose longer, and look at the focus"
 )
-FRAMES = 16  # of dots where the fit to the first ones says that the tracker looks
-MAX_TILT_DEG = 60.0  # of a geometry file
-FAR = 1.5  # times the noise of held-out dots: a lens that leaves more is not followed
+FRAMES = 16  # of dots in the field that the tracker sees, by the fit to the first dots
+MAX_TILT_DEG = 60.0  # the largest that a geometry file may state
+FAR = 1.5  # a lens model does not fit where held-out dots are off by more, in units of their noise
 SQUARE_NAMES = ("corner", "right", "below")
 
 
 @dataclass(frozen=True, slots=True)
 class OrientationFigure:
-    """An asymmetric figure: squares of three sizes at a corner, to its right and below it, (3,)
-    monitor px.
+    """An asymmetric figure: three squares of different sizes, at a corner, to its right and below
+    it. `x_px` and `y_px` (3,) are their middles, `side_px` is the side of the smallest, and
+    `reach_px` is half the distance between the corner and the next square; all in monitor pixels.
     """
 
     x_px: FloatArray
@@ -109,7 +115,7 @@ class OrientationFigure:
     reach_px: float
 
     def pattern(self, name: str, resolution_px: tuple[int, int], code: int) -> Pattern:
-        """The figure in squares of `code`."""
+        """The pattern `name` with the figure on black, its squares at `code`."""
         codes = black(resolution_px)
         for x, y, sides in zip(self.x_px, self.y_px, SQUARES, strict=True):
             half = self.side_px * sides / 2
@@ -120,8 +126,9 @@ class OrientationFigure:
 
 
 def figure_for(geometry: BenchGeometry) -> OrientationFigure:
-    """The figure in the middle of what the bench file's ideal lens shows the tracker. Raises
-    InputError without space.
+    """The figure in the middle of the tracker's field by the bench file's ideal lens, or in the
+    middle of the screen where that lies far away. Raises InputError where there is no space for
+    it.
     """
     monitor = geometry.monitor
     tracker = geometry.tracker
@@ -139,7 +146,8 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
     tracker_y = np.array([(tracker_height - 1) / 2])
     (middle_x,), (middle_y,) = geometry.to_monitor(tracker_x, tracker_y)
     width, height = monitor.resolution_px
-    # Where the bench file has the tracker look far beside the middle, it may well be wrong.
+    # Where by the bench file the tracker looks far from the screen's middle, the file may well be
+    # wrong, so the figure is shown in the middle.
     is_near_middle = abs(middle_x - width / 2) < width / 4
     is_near_middle = is_near_middle and abs(middle_y - height / 2) < height / 4
     if not is_near_middle:
@@ -152,12 +160,13 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
 
 @dataclass(frozen=True, slots=True)
 class SeenFigure:
-    """The figure in the tracker's image: its orientation (a 2 x 2 matrix, row by row), scale,
-    remaining turn and squares.
+    """The figure in the tracker's image: its orientation `way`, its `scale` relative to the
+    expected size, the turn that remains after the orientation, degrees, and the places of its
+    squares, `x_px` and `y_px` (3,), tracker pixels, the largest first.
 
-    The turn's error is half of what the figure's two sides disagree by, and that of the spots.
-    `focal_length_px` of the monitor and `q_cam_to_mon` (4,) are those that put the figure where it
-    is seen.
+    The turn's error is half the difference of the turns of the figure's two sides, with the error
+    of the spots. `focal_length_px` of the monitor and `q_cam_to_mon` (4,) are those by which the
+    figure is where the tracker sees it.
     """
 
     way: Way
@@ -181,14 +190,15 @@ Measurement = tuple[SeenFigure, DarkSubtracted]
 
 
 class SquaresAlike(InputError):
-    """The figure's squares have about the same light: they saturate the tracker, or other light
-    is among them.
+    """Raised where the figure's squares have about the same light: they saturate the tracker, or
+    other light is among them.
     """
 
 
 def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Places (3,) of the figure's squares in an image (h, w), the largest first. Raises
-    InputError, SquaresAlike.
+    """The x and y (3,), tracker pixels, of the figure's squares in an image (height, width), DN,
+    the largest square first. Raises InputError where fewer than three are there, SquaresAlike where
+    they have about the same light.
     """
     settings = CentroidSettings(threshold_sigma=THRESHOLD_SIGMA, minimum_pixels=MIN_PIXELS)
     background = noisiest_background(image)
@@ -196,7 +206,8 @@ def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
     if len(stars) < len(SQUARES):
         raise InputError(f"{len(stars)} of the figure's three squares are in the image; {NOT_SEEN}")
     largest = np.argsort(-stars.pixels, kind="stable")[:MAX_SPOTS]
-    # By light, for a wide PSF makes spots of nearly one size of squares of three.
+    # The squares are sorted by their light: with a wide PSF, squares of three sizes become spots of
+    # nearly one size.
     radius_px = math.ceil(WINDOW_SIDES * math.sqrt(stars.pixels.max()))
     x_px = stars.x_px[largest]
     y_px = stars.y_px[largest]
@@ -218,10 +229,11 @@ def _squares_of(image: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeometry) -> SeenFigure:
-    """Find the figure in a tracker's image (h, w) above its dark frame, by the bench file's lens.
+    """Find the figure in a tracker's image (height, width), DN above its dark frame, by the bench
+    file's lens.
 
-    Raises InputError where it is not there, or not as large as the focal lengths say, SquaresAlike
-    where its squares are.
+    Raises InputError where it is not there, is no square, or is not of about the size that the
+    focal lengths give; SquaresAlike where its squares have about the same light.
     """
     x_px, y_px = _squares_of(image)
     monitor_px = geometry.monitor.focal_length_px / geometry.tracker.focal_length_px
@@ -249,8 +261,8 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     turn_of_below = np.degrees(np.arctan2(-below_x, below_y))
     by_spots = math.degrees(SPOT_ERROR_PX * monitor_px / side_px)
     turn_error = math.hypot(float(turn_of_right - turn_of_below) / 2, by_spots)
-    # The rotation that takes the spots' directions to the figure's, on a monitor as far away as the
-    # figure is large.
+    # The rotation that turns the directions of the spots into those of the figure. The monitor's
+    # focal length is such that the figure has the size in which it is seen.
     focal_length_px = geometry.monitor.focal_length_px / scale
     camera = replace(geometry.monitor, focal_length_px=focal_length_px)
     u, v = camera.tangents(figure.x_px, figure.y_px)
@@ -270,25 +282,27 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
 
 
 def _matrix_of(way: Way) -> FloatArray:
-    """The matrix (2, 2) of an orientation: its columns are where right and below appear."""
+    """The matrix (2, 2) of an orientation: its columns are the directions in which the screen's
+    right and down appear.
+    """
     return np.array(way, dtype=np.float64).reshape(2, 2)
 
 
 def _unit(rays: FloatArray) -> FloatArray:
-    """Directions (n, 3) of norm 1."""
+    """The directions (n, 3) of `rays` (n, 3), scaled to norm 1."""
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
 
 def keys_of_ways() -> dict[str, Way]:
-    """The key to press for each orientation; the first is upright."""
+    """The orientation for each key that a person may press; the first is upright."""
     return {str(number): way for number, way in enumerate(WAYS, start=1)}
 
 
 def look_of(way: Way) -> str:
-    """Where the figure's squares appear in this orientation, in words."""
+    """A text that says where the figure's squares appear in an orientation."""
     right = (way[0], way[2])
     below = (way[1], way[3])
-    # opposite to both
+    # the corner lies opposite to both other squares
     corner_x = -right[0] - below[0]
     corner_y = -right[1] - below[1]
     corner = CORNERS[corner_x, corner_y]
@@ -300,7 +314,7 @@ def look_of(way: Way) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ScreenMounting:
-    """How the screen is mounted: keys of [monitor]."""
+    """How the screen is mounted, by three keys of [monitor] in the bench file."""
 
     flip_x: bool
     flip_y: bool
@@ -308,7 +322,9 @@ class ScreenMounting:
 
     @property
     def matrix(self) -> FloatArray:
-        """The matrix (2, 2) from the image's axes to the screen's, x right and y down."""
+        """The matrix (2, 2) that turns components along the image's axes into those along the
+        screen's; x is right, y is down.
+        """
         turn = np.linalg.matrix_power(np.array([[0, -1], [1, 0]]), self.rotate_deg // 90)
         x_sign = -1.0 if self.flip_x else 1.0
         y_sign = -1.0 if self.flip_y else 1.0
@@ -316,8 +332,8 @@ class ScreenMounting:
 
 
 def corrected(mounting: ScreenMounting, way: Way) -> ScreenMounting:
-    """The mounting that turns an image seen in orientation `way` upright, with the fewest keys
-    changed.
+    """The mounting by which an image that now appears in the orientation `way` is upright; of two
+    such, the one in which fewer keys differ from `mounting`.
     """
     wanted = mounting.matrix @ np.linalg.inv(_matrix_of(way))
     flips = (False, True)
@@ -335,8 +351,8 @@ def corrected(mounting: ScreenMounting, way: Way) -> ScreenMounting:
 
 
 def orientation(context: StepContext) -> StepOutcome:
-    """Find how the screen is mounted, set the bench file's keys, and check that the figure is
-    upright. Raises InputError.
+    """The step that finds how the screen is mounted, sets the bench file's keys, and checks that
+    the figure is then upright. Raises InputError where it is not, or cannot be found.
     """
     monitor = context.monitor
     before = ScreenMounting(monitor.flip_x, monitor.flip_y, monitor.rotate_deg)
@@ -356,8 +372,8 @@ def orientation(context: StepContext) -> StepOutcome:
         way = f"first {WAYS[first]}, now upright"
         mounted = replace(context, file=with_changes(context.file, changes))
         now, measured = _way(mounted, "figure_001")
-        # A screen that is turned by nearly 45 degrees may now be nearest to 90: the geometry's fit
-        # takes either.
+        # A screen turned by nearly 45 degrees may now appear nearer to 90. The fit of the geometry
+        # works from either.
         is_quarter_off = now in QUARTER_TURNS_DEG and _is_oblique(measured)
         if now != UPRIGHT and not is_quarter_off:
             made = "; ".join(change.line for change in changes)
@@ -387,7 +403,9 @@ def orientation(context: StepContext) -> StepOutcome:
 
 
 def _is_oblique(measured: Measurement | None) -> bool:
-    """Whether the figure is nearly half-way between two right angles."""
+    """Whether the figure is turned nearly half-way between two right angles; False without a
+    measurement.
+    """
     if measured is None:
         return False
     seen_figure, _ = measured
@@ -395,7 +413,9 @@ def _is_oblique(measured: Measurement | None) -> bool:
 
 
 def _way(context: StepContext, name: str) -> tuple[Way, Measurement | None]:
-    """The figure's orientation, and its measurement; None where a person pressed a key instead."""
+    """The figure's orientation, and its measurement, or None for that where a person pressed the
+    orientation's key instead. Where the squares saturate, it is shown again, darker.
+    """
     geometry = context.geometry()
     figure = figure_for(geometry)
     keys = keys_of_ways()
@@ -414,7 +434,7 @@ def _way(context: StepContext, name: str) -> tuple[Way, Measurement | None]:
         try:
             seen_figure = see_figure(looked.image, figure, geometry)
         except SquaresAlike:
-            # Squares that saturate the tracker are alike: darker ones are not.
+            # Squares that saturate the tracker look alike; darker ones do not.
             if not context.is_too_bright(looked):
                 raise
             code = context.darker(code)
@@ -426,9 +446,12 @@ def _way(context: StepContext, name: str) -> tuple[Way, Measurement | None]:
 def draw_spots(
     path: Path, image: FloatArray, x_px: FloatArray, y_px: FloatArray, finding: str
 ) -> None:
-    """Draw an image of the tracker (h, w) with a ring about each spot found."""
+    """Draw an image of the tracker (height, width), with a ring about each spot at `x_px` and
+    `y_px` (n,), as a chart titled `finding`.
+    """
     height, width = image.shape
-    # Of 16 million pixels Matplotlib makes 1 GB of colours. A spot of one pixel stays bright.
+    # Matplotlib makes 1 GB of colours for 16 million pixels, so the image is reduced; by maxima, so
+    # that a spot of one pixel stays bright.
     step = max(math.ceil(max(height, width) / DRAWN_PX), 1)
     rows = height // step
     columns = width // step
@@ -440,7 +463,7 @@ def draw_spots(
     with chart(path, finding, height_inch=6.4) as (axes,):
         axes.imshow(grey, cmap="gray", vmax=np.sqrt(max(high - low, 1.0)), extent=edges)
         axes.scatter(x_px, y_px, s=260, facecolors="none", edgecolors=DARK[ORANGE], linewidths=1.8)
-        # readable over stars and on black
+        # a plate behind the text, readable over stars and on black
         plate = {"facecolor": "black", "edgecolor": "none", "boxstyle": "round,pad=0.25"}
         look: dict[str, Any] = {"color": DARK[ORANGE], "size": TEXT_PT + 1, "bbox": plate}
         for name, x, y in zip(SQUARE_NAMES, x_px[:3], y_px[:3], strict=False):
@@ -455,8 +478,8 @@ def draw_spots(
 
 
 def geometry(context: StepContext) -> StepOutcome:
-    """Fit lens, tilt and alignment to dots, and name the geometry file in the bench file. Raises
-    InputError.
+    """The step that fits lens, tilt and alignment to dots, writes the geometry file, and names it
+    in the bench file. Raises InputError where the dots do not allow a fit.
     """
     code = dot_code(context)
     make_directory(context.folder)
@@ -482,7 +505,7 @@ def geometry(context: StepContext) -> StepOutcome:
         f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f}"
         f" max; a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
     )
-    # from an rms over two axes
+    # the standard error of an rms over n dots of two axes each, 2 n numbers
     rms_error_arcsec = chosen.rms_arcsec / math.sqrt(4 * len(calibrated.data))
     number = StepNumber(
         chosen.rms_arcsec,
@@ -503,7 +526,9 @@ def geometry(context: StepContext) -> StepOutcome:
 
 
 def _geometry_figures(found: Calibrated) -> dict[str, Figure]:
-    """The figures of a geometry: its model and errors, dots and centroids, and the lens."""
+    """A fitted geometry's figures for the report: its model and errors, the counts of dots and
+    centroids, and the lens's parameters.
+    """
     chosen = found.chosen
     error = found.uncertainty
     figures: dict[str, Figure] = {
@@ -518,7 +543,8 @@ def _geometry_figures(found: Calibrated) -> dict[str, Figure]:
         "centroids_lost": int(found.lost),
         "centroids_false": int(found.false),
     }
-    # a rotation is counted from the bench file's, which the geometry file replaces
+    # Rotations are left out: they are relative to the bench file's, which the geometry file
+    # replaces.
     for name, parameter in parameters_of(found).items():
         if "rotation" not in name:
             figures[name] = parameter.value
@@ -529,8 +555,8 @@ def _geometry_figures(found: Calibrated) -> dict[str, Figure]:
 def _frames_of(
     context: StepContext, plan: DotPlan, first: int, code: int, dark: Path
 ) -> tuple[list[Path], Observed]:
-    """Images of a plan's frames, numbered from `first`, and the centroids in them. Raises
-    InputError.
+    """The tracker's images of a plan's frames, with names that are numbered from `first`, and the
+    centroids in them. Raises InputError for images that cannot be measured.
     """
     paths = []
     for frame in range(plan.frames):
@@ -542,8 +568,9 @@ def _frames_of(
 
 
 def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:
-    """The tilts, and where dots are farther off than their noise the degree of the field: a
-    larger one was not tried.
+    """Fitted figures with their limits, so that one at a limit can be reported: the tilts, and,
+    where held-out dots are farther off than FAR times their noise, the degree of the lens's field,
+    of which no larger one was tried.
     """
     parameters = parameters_of(found)
     figures = []

@@ -4,7 +4,13 @@ CI.
 
 from __future__ import annotations
 
+import ast
 import re
+import sys
+from importlib.metadata import PackageNotFoundError, packages_distributions, requires
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from tests.support.benches import ROOT
 
@@ -28,3 +34,46 @@ def test_readme_contributing_and_ci_install_what_their_tests_need():
     assert readme < contributing <= ci
     assert not readme & SCREENS_AND_BROWSERS
     assert contributing >= SCREENS_AND_BROWSERS
+
+
+def installed_by(distribution: str, extras: frozenset[str], known: set[str]) -> None:
+    """Add what pip installs with a distribution and these extras of it to `known`."""
+    try:
+        requirements = requires(distribution) or []
+    except PackageNotFoundError:  # of another system
+        return
+    for text in requirements:
+        requirement = Requirement(text)
+        marker = requirement.marker
+        if marker is not None and not any(
+            marker.evaluate({"extra": extra}) for extra in (*extras, "")
+        ):
+            continue
+        name = canonicalize_name(requirement.name)
+        asked = f"{name}[{','.join(sorted(requirement.extras))}]"
+        if asked not in known:
+            known |= {name, asked}
+            installed_by(name, frozenset(requirement.extras), known)
+
+
+def test_readme_s_command_installs_what_its_tests_import():
+    known: set[str] = set()
+    installed_by("hilstar", frozenset({"test"}), known)
+    distributions = packages_distributions()
+    missing = []
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        for statement in ast.parse(path.read_text()).body:
+            if isinstance(statement, ast.Import):
+                modules = [alias.name for alias in statement.names]
+            elif isinstance(statement, ast.ImportFrom) and not statement.level:
+                modules = [str(statement.module)]
+            else:
+                continue
+            for module in modules:
+                top = module.partition(".")[0]
+                if top in sys.stdlib_module_names or top in {"tests", "hilstar"}:
+                    continue
+                names = {canonicalize_name(name) for name in distributions.get(top, [])}
+                if names and not names & known:
+                    missing.append(f"{path.relative_to(ROOT)}: {top}")
+    assert missing == []

@@ -178,9 +178,8 @@ class KeptFiles:
         self._contents: OrderedDict[tuple[int, ...], bytes] = OrderedDict()
         self._lock = threading.Lock()
 
-    def content(self, path: Path) -> bytes | None:
-        """What the file holds, without opening it; None where it is not kept in its state."""
-        state = _settled_state(path)
+    def content(self, state: tuple[int, ...] | None) -> bytes | None:
+        """What a file of this state holds, without opening it; None where it is not kept."""
         with self._lock:
             if state is None or state not in self._contents:
                 return None
@@ -224,9 +223,9 @@ def named_bytes(path: Path, advice: str, limit_bytes: int) -> bytes:
     """What a file holds that a bench file names, as `read_bytes`; the same again is the same
     object. Raises InputError.
     """
-    content = _named.content(path)
+    state = _settled_state(path)
+    content = _named.content(state)
     if content is None:
-        state = _settled_state(path)
         content = read_bytes(path, advice, limit_bytes)
         _named.keep(state, content)
     if len(content) > limit_bytes:
@@ -293,7 +292,7 @@ def open_lines(
     Raises InputError as `read_text` does, for what is no text, and for a line of more than
     MAX_LINE_CHARACTERS: unless `whole_lines`, such a line is given in pieces of that length.
     """
-    content = _named.content(path)
+    content = _named.content(_settled_state(path))
     if content is None or len(content) > limit_bytes:
         opened: IO[bytes] = open_regular(path, advice, limit_bytes)
     else:

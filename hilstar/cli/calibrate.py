@@ -29,6 +29,7 @@ from hilstar.cli.image_source import (
     ImageOptions,
     dot_images,
     exposure_option,
+    grab_option,
     handed_on,
     image_source,
 )
@@ -232,11 +233,7 @@ class FocusOptions:
     """The options of `hilstar calibrate focus`."""
 
     bench_file: Path = bench_argument()
-    grab: str | None = option(
-        "CMD|genicam:NAME",
-        "Take the images here: a command as that of first-light ({output}, {pattern},"
-        " {exposure_s}), or a camera.",
-    )
+    grab: str | None = grab_option()
     virtual: Path | None = option(
         "TRUTH.toml", "Without hardware: a bench file that says how the bench really is."
     )

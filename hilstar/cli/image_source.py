@@ -29,6 +29,15 @@ def exposure_option() -> Any:
     )
 
 
+def grab_option() -> Any:
+    """The option of a command or a camera that takes images of dots."""
+    return option(
+        "CMD|genicam:NAME",
+        "Take the images here: a command as that of first-light ({output}, {pattern},"
+        " {exposure_s}), or a camera.",
+    )
+
+
 @struct
 class ImageOptions:
     """Where images of a tracker come from that sees the bench: a person, a command, a camera, or a
@@ -67,11 +76,7 @@ class ImageOptions:
 class DotOptions:
     """Where the images of dots come from, where they are no files."""
 
-    grab: str | None = option(
-        "CMD|genicam:NAME",
-        "Take the images here: a command as that of first-light ({output}, {pattern},"
-        " {exposure_s}), or a camera.",
-    )
+    grab: str | None = grab_option()
     exposure: float | None = exposure_option()
     feed: str | None = option(
         "ENDPOINT",

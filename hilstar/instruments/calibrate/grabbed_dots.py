@@ -62,7 +62,7 @@ def grab_dots(
         pattern = _dots_of(file, dots, len(images), code)
         path = taken(pattern)
         # Dots of all frames are alike: the first says which code is dark enough.
-        if not images and _too_bright(
+        if not images and is_too_bright(
             source.pixels(path, tracker.resolution_px), under, tracker.detector
         ):
             code = darker_code(code)
@@ -89,7 +89,10 @@ def _dots_of(file: BenchFile, dots: DotPlan, frame: int, code: int) -> Pattern:
     return Pattern(FRAME.format(frame), codes)
 
 
-def _too_bright(image: FloatArray, dark: FloatArray, detector: DetectorSettings) -> bool:
+def is_too_bright(image: FloatArray, dark: FloatArray, detector: DetectorSettings) -> bool:
+    """Whether dots in an image (h, w) are near the detector's saturation, hot pixels of the dark
+    frame (h, w) apart.
+    """
     cold = dark < HOT_FILL * detector.saturation_dn
     peak_dn = float(image[cold].max(initial=0.0))
     # Images of more bits than the bench file's detector has are of another one: nothing is known

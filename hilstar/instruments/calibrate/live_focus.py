@@ -22,9 +22,8 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
-from hilstar.instruments.calibrate.first_light.context import HOT_FILL, darker_code
+from hilstar.instruments.calibrate.first_light.context import darker_code
 from hilstar.instruments.calibrate.first_light.focus import (
-    DOT_FILL,
     Sharpness,
     first_dots,
     seen_sharpness,
@@ -32,6 +31,7 @@ from hilstar.instruments.calibrate.first_light.focus import (
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, Pattern, black
 from hilstar.instruments.calibrate.geometric.dots import dot_image
 from hilstar.instruments.calibrate.geometric.geometry_fit import seen_screen_of
+from hilstar.instruments.calibrate.grabbed_dots import is_too_bright
 from hilstar.server.bench.bench_file import BenchFile
 
 DARK, IMAGE = "dark", "focus_{:04}"
@@ -163,7 +163,6 @@ def focus_readings(
     screen_px = file.config.monitor.resolution_px
     dark_path = source.look(file, Pattern(DARK, black(screen_px)), folder / DARK, exposure_s)
     dark = source.pixels(dark_path, tracker.resolution_px)
-    cold = dark < HOT_FILL * tracker.detector.saturation_dn
     code = 2**file.config.monitor.bits - 1
     begin_s = time.monotonic()
     for number in itertools.count(1):
@@ -172,19 +171,19 @@ def focus_readings(
         path = source.look(file, pattern, folder / name, exposure_s)
         t_s = time.monotonic() - begin_s
         image = source.pixels(path, tracker.resolution_px)
-        peak_dn = float(image[cold].max(initial=0.0))
-        if peak_dn >= DOT_FILL * tracker.detector.saturation_dn:
+        if is_too_bright(image, dark, tracker.detector):
             darker = darker_code(code)
             why = f"dots saturate the tracker: code {darker} in their place"
             yield FocusReading(number, t_s, code, None, why)
             code = darker
             continue
+        light = image - dark
         try:
-            sharp = seen_sharpness(image - dark, seen_screen, tracker.detector)
+            sharp = seen_sharpness(light, seen_screen, tracker.detector)
         except InputError as error:
             yield FocusReading(number, t_s, code, None, str(error))
             continue
-        yield FocusReading(number, t_s, code, figure_of(image - dark, sharp))
+        yield FocusReading(number, t_s, code, figure_of(light, sharp))
 
 
 def figure_of(image: FloatArray, sharp: Sharpness) -> FocusFigure:

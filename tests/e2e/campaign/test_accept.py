@@ -173,8 +173,6 @@ quantity = "availability"
 minimum = 0.9
 """
 
-FRAME_S = 0.01  # of a headless display
-
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("clock", ["host", "own"])
@@ -206,6 +204,6 @@ def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, c
     if clock == "own":
         assert time["verdict"] == "not tested" and "own clock" in time["why"]
     else:
-        # half a frame of 100 Hz, 5 ms, is the display's own, and on a busy machine a whole one
-        assert abs(time["value"] - 0.1) <= 0.01 + FRAME_S / 2
+        # within 10 %: frames that a busy machine misses without a screen add nothing
+        assert abs(time["value"] - 0.1) <= 0.01
         assert time["verdict"] == "not met"

@@ -26,6 +26,7 @@ import ast
 import contextlib
 import copy
 import csv
+import gc
 import importlib
 import itertools
 import json
@@ -47,6 +48,8 @@ from pathlib import Path
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import pytest
+
+sys.dont_write_bytecode = False  # else each run compiles what it imports
 
 ROOT = Path(__file__).parent.parent
 ROOMS = ("sky", "optics", "display", "attitude", "tracker", "server/loop.py")
@@ -451,6 +454,7 @@ def main() -> None:
     for name in LIBRARIES:
         with contextlib.suppress(ImportError):
             importlib.import_module(name)
+    gc.freeze()
     with tempfile.TemporaryDirectory() as temporary:
         checkout = Path(temporary)
         copy_checkout(checkout)

@@ -76,7 +76,7 @@ def boresight_deg(icrs_to_cam: Rotation) -> tuple[float, float]:
 
 
 @pytest.fixture(params=["csv", "jsonl"])
-def log(request, tmp_path):
+def level_log(request, tmp_path):
     path = tmp_path / f"body.{request.param}"
     rows = [f"{k},{','.join(map(str, ORION))}" for k in range(2)]
     objects = [json.dumps({"t_ns": k * 10**9, "q": ORION}) for k in range(2)]
@@ -86,18 +86,18 @@ def log(request, tmp_path):
     return path
 
 
-def test_a_log_of_the_body_looks_where_scipy_says(log):
+def test_a_log_of_the_body_looks_where_scipy_says(level_log):
     camera = Rotation.from_quat(MOUNTING, scalar_first=True) * Rotation.from_quat(
         ORION, scalar_first=True
     )
-    ra_deg, dec_deg = pointing(log, "--mounting", ",".join(map(str, MOUNTING)))
+    ra_deg, dec_deg = pointing(level_log, "--mounting", ",".join(map(str, MOUNTING)))
     assert (ra_deg, dec_deg) == pytest.approx(boresight_deg(camera), abs=SHOWN_DEG)
     assert (ra_deg, dec_deg) == pytest.approx((354.0570, 0.0), abs=SHOWN_DEG)
 
 
-def test_a_log_that_refers_to_east_north_up_looks_where_astropy_says(log):
+def test_a_log_that_refers_to_east_north_up_looks_where_astropy_says(level_log):
     camera = Rotation.from_quat(ORION, scalar_first=True) * icrs_to_enu(0.0)
-    ra_deg, dec_deg = pointing(log, "--reference", "enu", *LEVEL)
+    ra_deg, dec_deg = pointing(level_log, "--reference", "enu", *LEVEL)
     assert (ra_deg, dec_deg) == pytest.approx(boresight_deg(camera), abs=SHOWN_DEG)
     assert (ra_deg, dec_deg) == pytest.approx((280.0145, 41.4978), abs=SHOWN_DEG)
 

@@ -23,7 +23,7 @@ CASES = 43
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def stability_study(tmp_path_factory):
     """The command's folder and output, and its cases."""
     folder, found = tmp_path_factory.mktemp("stability"), []
 
@@ -40,8 +40,8 @@ def study(tmp_path_factory):
 
 
 @pytest.mark.parametrize("number", range(CASES))
-def test_hilstar_is_right_where_the_method_named_there_is_not(study, number):
-    case = study[2][number]
+def test_hilstar_is_right_where_the_method_named_there_is_not(stability_study, number):
+    case = stability_study[2][number]
     assert case.right, case
     assert not case.figures.fault <= case.figures.tolerance, case
     assert all((case.case, case.method, case.fails, case.happens, case.why))
@@ -49,8 +49,8 @@ def test_hilstar_is_right_where_the_method_named_there_is_not(study, number):
     assert not theirs.right
 
 
-def test_the_table_has_every_case_and_the_curves_have_charts(study):
-    folder, printed, measured = study
+def test_the_table_has_every_case_and_the_curves_have_charts(stability_study):
+    folder, printed, measured = stability_study
     assert printed["right"] is True and len(printed["findings"]) == len(measured) == CASES
     rows = table(folder / "stability.csv")
     assert [row["case"] for row in rows] == [case.case for case in measured]
@@ -130,8 +130,8 @@ def test_the_polynomial_of_the_shader_is_the_shader_s():
     assert np.abs(image.erf_float32(x) - erf(x)).max() <= image.ERF_ERROR + 6e-8
 
 
-def test_the_chart_of_popping_shows_what_its_title_says(study):
-    rows = table(study[0] / "popping.csv")
+def test_the_chart_of_popping_shows_what_its_title_says(stability_study):
+    rows = table(stability_study[0] / "popping.csv")
     assert len(rows) == image.STEPS
     spread = {
         name: np.ptp([float(row[f"{name} [mag]"]) for row in rows])

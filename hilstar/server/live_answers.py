@@ -85,12 +85,13 @@ class LiveAnswers:
         if self._on_screen:
             host_ns = shown.swap_ns + self._light_ns
         else:
-            host_ns = shown.draw_ns
+            host_ns = shown.moment_ns
         if attitude is not None and is_visible:
             q = attitude.q_icrs_to_cam
         else:
             q = None
-        self._frames.add(LitFrame(shown.number, host_ns, light_ns, q, shown.drawn.rate_cam_rad_s))
+        rate_rad_s = shown.drawn.rate_cam_rad_s
+        self._frames.add(LitFrame(shown.number, host_ns, light_ns, q, rate_rad_s, shown.fades))
 
     @contextmanager
     def running(self) -> Iterator[None]:

@@ -78,6 +78,9 @@ def test_an_acceptance_ends_in_a_page_tables_and_an_exit_code(folder: Path) -> N
         "Recovery": "not tested",
     }
     assert told["verdict"] == "not met" and told["cases"] == 24 + 8 * 4
+    together = {clause["capability"]: clause["together"] for clause in told["clauses"]}
+    # 8 of 8 cases without an attitude, at a confidence that three clauses and four levels share
+    assert together["Largest <rate>"] == "not met" and together["A right attitude"] == ""
     page = (folder / "out" / "accept.html").read_text()
     assert "Largest &lt;rate&gt;" in page and "A clause is not met" in page
     assert "Vacuum" in page and "not of a bench" in page and "varies scenario" in page
@@ -170,8 +173,6 @@ quantity = "availability"
 minimum = 0.9
 """
 
-FRAME_S = 0.01  # of a headless display
-
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("clock", ["host", "own"])
@@ -205,6 +206,6 @@ def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, c
     if clock == "own":
         assert time["verdict"] == "not tested" and "own clock" in time["why"]
     else:
-        # half a frame of 100 Hz, 5 ms, is the display's own, and on a busy machine a whole one
-        assert abs(time["value"] - 0.1) <= 0.01 + FRAME_S / 2
+        # within 10 %: frames that a busy machine misses without a screen add nothing
+        assert abs(time["value"] - 0.1) <= 0.01
         assert time["verdict"] == "not met"

@@ -134,6 +134,27 @@ def test_the_command_without_images_says_what_to_give(benches, tmp_path):
     assert "give --grab CMD or a camera, or --virtual TRUTH.toml" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        (("calibrate", "focus", "BENCH", "--grab", "true {output}"), "{pattern} in --grab"),
+        (("first-light", "BENCH", "-o", "OUT", "--grab", "true {output}"), "{pattern} in --grab"),
+        (("serve", "BENCH", "--frames", "1"), "run with --headless"),
+    ],
+)
+def test_a_machine_without_a_display_is_told_what_the_command_can_do_without_one(
+    benches, tmp_path, monkeypatch, words, advice
+):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    places = {"BENCH": tmp_path / "truth-1.0.toml", "OUT": tmp_path / "out"}
+    done = run_hilstar_here(*[places.get(word, word) for word in words])
+    assert done.returncode in {1, 3}  # 1: a step of first light that failed
+    assert "no display to open a window on; set DISPLAY, or " in done.stderr
+    assert advice in done.stderr
+    assert ("--headless" in done.stderr) == ("--headless" in advice)
+
+
 def test_a_curve_is_as_high_as_its_values():
     assert sparkline([3.0, 2.0, 1.0, 2.0, 3.0], 0.1) == "█▅▁▅█"
     assert sparkline([1.0, 1.01], 0.1) == "▁▂"

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from astropy.coordinates import GCRS, ITRS, CartesianRepresentation
 from astropy.time import Time, TimeDelta
-from astropy.utils import iers
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.entries import Stated
@@ -21,6 +20,7 @@ from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import Convention, Mounting
 from tests.support.commands import run_hilstar_here
 
+pytestmark = pytest.mark.usefixtures("iers_of_package")
 ORION = (0.6987226, 0.7135120, -0.0370377, 0.0362700)
 MOUNTING = (0.5, -0.5, -0.5, -0.5)
 PLACE_DEG, DATE = (47.0, 8.0), "2024-01-01T00:00:00"
@@ -31,13 +31,6 @@ SHOWN_DEG = 6e-5
 # Earth's third axis, from which the pole of rotation is 0.6 arcsec away at most: 7.3e-5 rad/s of
 # 3e-6 rad.
 EARTH_RAD, RATE_RAD_S = 1e-8, 2.2e-10
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _nothing_is_downloaded():
-    table = iers.IERS_A.read(iers.IERS_A_FILE)
-    with iers.conf.set_temp("auto_download", False), iers.earth_orientation_table.set(table):
-        yield
 
 
 def icrs_to_enu(seconds: float, kind: str = "enu") -> Rotation:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 
 from hilstar.instruments.study import bodies
 from hilstar.instruments.study.bodies import PHASES_DEG, QUICK_BENCHES, QUICK_RADII_PX, SCENES, run
+from tests.support.tables import csv_rows
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +18,7 @@ def bodies_study(tmp_path_factory):
     tables = {}
     for name in ("bodies_cost", "bodies_size", "bodies_limits"):
         assert (folder / f"{name}.png").stat().st_size > 20_000
-        with (folder / f"{name}.csv").open() as file:
-            tables[name] = list(csv.DictReader(file))
+        tables[name] = csv_rows(folder / f"{name}.csv")
     return lines, tables
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 
 from hilstar.instruments.study import economy
 from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES, run
 from hilstar.tracker.centroiders import FAMILY
+from tests.support.tables import csv_rows
 
 
 @pytest.fixture(scope="module")
@@ -17,8 +16,7 @@ def economy_study(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(economy, "QUICK_ROUNDS", 1)  # no claim here is of a time
         lines, _ = run(folder, quick=True)
-    with (folder / "economy.csv").open() as file:
-        return folder, lines, list(csv.DictReader(file))
+    return folder, lines, csv_rows(folder / "economy.csv")
 
 
 def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance(economy_study):

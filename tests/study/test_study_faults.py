@@ -4,14 +4,13 @@ with it.
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 
 from hilstar.instruments.study import faults
 from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS
 from hilstar.optics.layers.fault_kinds import KINDS
 from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 pytestmark = pytest.mark.study
 
@@ -23,16 +22,11 @@ def faults_study(tmp_path_factory):
     return folder, lines
 
 
-def table_rows(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
 def test_every_kind_but_a_dropped_frame_has_its_cost(faults_study):
     folder, findings = faults_study
     kinds = {table["kind"] for tables in CASES.values() for table in tables}
     assert kinds == set(KINDS) - {"drop"}  # which draws nothing
-    costs = table_rows(folder / "faults-cost.csv")
+    costs = csv_rows(folder / "faults-cost.csv")
     assert [(row["quantisation"], row["case"]) for row in costs] == [
         (q, case) for q in QUANTISATIONS for case in CASES
     ]
@@ -42,7 +36,7 @@ def test_every_kind_but_a_dropped_frame_has_its_cost(faults_study):
 
 def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(faults_study):
     folder, _ = faults_study
-    strays = table_rows(folder / "faults-stray.csv")
+    strays = csv_rows(folder / "faults-stray.csv")
     for quantisation in QUANTISATIONS:
         mine = {
             float(row["share_of_white"]): row

@@ -11,7 +11,8 @@ import pytest
 
 from hilstar.instruments.study import limits
 from hilstar.instruments.study.limits import StressLimit, limits_finding, run
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
 ROOM_STARS = 250_000  # stars of sigma 0.85 px fill a frame
@@ -24,7 +25,7 @@ HALF_SAMPLE = 0.5
 def limits_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("limits")
     lines = run(folder, quick=True)
-    return folder, lines, table(folder / "limits.csv")
+    return folder, lines, csv_rows(folder / "limits.csv")
 
 
 def limit_rows(rows, stress):

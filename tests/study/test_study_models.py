@@ -2,7 +2,6 @@
 its pictures not blank.
 """
 
-import csv
 import re
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
 from tests.support.commands import run_hilstar_here
+from tests.support.tables import csv_rows
 from tests.support.waiting import PATIENCE_S
 
 STEMS = (
@@ -74,8 +74,7 @@ def models_study(tmp_path_factory):
 
 def table_columns(path):
     """A table's columns by name: numbers where they are numbers."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(path)
 
     def numbers(texts):
         try:

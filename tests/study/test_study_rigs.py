@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.study import rigs
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 # An even error of a pixel's width: its rms is within 10 % of a twelfth's root, of 80 stars
 PIXEL_ARCSEC = 57.65109021605092e-3 / 350 * 206264.806 / math.sqrt(12)
@@ -27,7 +28,7 @@ GRID_PX = 1e-9
 def rigs_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rigs")
     lines = rigs.run(folder, quick=True)
-    return folder, lines, {row["figure"]: row for row in table(folder / "rigs.csv")}
+    return folder, lines, {row["figure"]: row for row in csv_rows(folder / "rigs.csv")}
 
 
 def figures(rigs_study, figure):

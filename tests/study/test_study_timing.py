@@ -23,7 +23,8 @@ from hilstar.instruments.study.timing import (
 )
 from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 GAIN = 20  # compensated against not: the issue's own figure
 RATE_DEG_S = QUICK_RATES_DEG_S[0]
@@ -108,7 +109,7 @@ def test_the_study_writes_a_chart_and_a_table(timing_study):
 def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(timing_study):
     rows = [
         {name: float(value) for name, value in row.items()}
-        for row in table(timing_study[0] / "stripes.csv")
+        for row in csv_rows(timing_study[0] / "stripes.csv")
     ]
     assert_drawn(timing_study[0] / "stripes.png")
     assert max(abs(row["light"] - row["foretold"]) for row in rows) < 1e-6
@@ -123,7 +124,7 @@ def test_a_tracker_sees_the_beat_that_is_foretold(timing_study):
     """Star by star, each on a row of its own phase; and of another phase it would not be."""
     rows = [
         {name: float(value) for name, value in row.items()}
-        for row in table(timing_study[0] / "beat.csv")
+        for row in csv_rows(timing_study[0] / "beat.csv")
     ]
     assert_drawn(timing_study[0] / "beat.png")
     for case in QUICK_CASES:

@@ -4,7 +4,6 @@ the front or says why not.
 
 from __future__ import annotations
 
-import csv
 import itertools
 
 import numpy as np
@@ -35,6 +34,7 @@ from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
 from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 NAMES = [
     "brightness",
@@ -63,8 +63,7 @@ def tradeoff_study(tmp_path_factory):
         patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)  # one round: no claim here is of a time
         patch.setattr(sweep, "MIN_ROUNDS", 1)
         lines, _ = tradeoff.run(folder, quick=True)
-    with (folder / "tradeoff.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(folder / "tradeoff.csv")
     return (
         folder,
         lines,

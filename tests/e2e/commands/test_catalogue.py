@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
+from tests.support.tables import csv_rows
 
 pytestmark = pytest.mark.e2e
 HEAD = "source_id,ra,dec,ref_epoch,pmra,pmdec,phot_g_mean_mag,bp_rp\n"
@@ -41,8 +41,7 @@ def test_the_table_s_star_is_in_the_frame_beside_hipparcos(stars_folder):
     assert done.returncode == 0, done.stderr
     assert "stars.csv: 1 stars of 2 rows, V and V-I from Gaia's G, BP and RP" in done.stderr
     assert "1 stars added to Hipparcos' 116812" in done.stderr
-    with (stars_folder / "t.csv").open() as file:
-        rows = {int(row["hip"]): row for row in csv.DictReader(file)}
+    rows = {int(row["hip"]): row for row in csv_rows(stars_folder / "t.csv")}
     assert {0, 26311} <= set(rows)  # Alnilam is Hipparcos'
     assert (rows[0]["name"], rows[26311]["name"]) == (f"Gaia DR3 {SOURCE}", "")
     # G - V of Riello et al. 2021, table C.2, at BP - RP = 0.42, by hand.

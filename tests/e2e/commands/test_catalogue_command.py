@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
+from tests.support.tables import csv_rows
 
 pytestmark = pytest.mark.e2e
 # design: names that other programs read.
@@ -65,8 +65,7 @@ def test_every_format_has_the_same_stars(faint_bench, tmp_path):
         )
         assert (done.returncode, done.stderr) == (0, "")
         assert json.loads(done.stdout)["epoch_jyear"] == 2030
-    with (tmp_path / "s.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(tmp_path / "s.csv")
     assert set(rows[0]) >= NAMES
     assert all(float(row["v_mag"]) <= 2 for row in rows)
     vega = next(row for row in rows if row["hip"] == "91262")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from PIL import Image
 
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.tables import csv_rows
 
 RATE = np.radians([0.3, -0.2, 2.0])
 
@@ -40,8 +40,7 @@ def replayed_log(bench: Path, rated: Path, output: Path, *options: str) -> list[
         "replay", bench, rated, "--headless", "--speed", "max", "-o", output, *options
     )
     assert result.returncode == 0, result.stderr
-    with (output / "frames.csv").open() as file:
-        return list(csv.DictReader(file))
+    return csv_rows(output / "frames.csv")
 
 
 def quaternion(row: dict[str, str]) -> list[float]:

@@ -4,7 +4,6 @@ simulated exposures.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 
@@ -38,6 +37,7 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
 from tests.support.psfs import coma, sampled
 from tests.support.psfs import gaussian as gaussian_light
+from tests.support.tables import csv_rows
 
 QUIET = DetectorSettings(gain_e_per_dn=0.3, full_well_e=1e6, bits=16)  # rounding: 0.0075 e-^2
 NOISY = DetectorSettings(
@@ -363,8 +363,7 @@ def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_fie
     found = json.loads(ran.stdout)
     tables = {}
     for name in ("noise", "stars", "nea"):
-        with (tmp_path / "out" / f"{name}.csv").open() as file:
-            tables[name] = list(csv.DictReader(file))
+        tables[name] = csv_rows(tmp_path / "out" / f"{name}.csv")
     assert list(tables["noise"][0])[: len(CONTRACT)] == CONTRACT
     assert list(tables["stars"][0])[:5] == ["hip", "name", "x_px", "y_px", "v_mag"]
     for name, rows in (("noise", found["rows"]), ("stars", found["stars"]), ("nea", found["nea"])):

@@ -4,8 +4,6 @@ others read them.
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pyarrow.parquet
 import pytest
@@ -30,6 +28,7 @@ from hilstar.sky.synthetic import colours
 from hilstar.sky.table_reader import G_LESS_I, G_LESS_V, GAIA_RANGE_MAG
 from tests.support.benches import bench_text
 from tests.support.claims import holds
+from tests.support.tables import csv_rows
 
 # Riello et al. 2021 (A&A 649, A3, table C.2) have 0.030 mag of scatter about G - V and 0.038 about
 # G - I of BP - RP. Measured: 0.010 and 0.029 mag by colour (median, 95 %), 0.015 and 0.033 by type,
@@ -154,8 +153,7 @@ def test_a_file_is_read_back_with_units_and_ucds(bright, tmp_path, ending):
             }
             assert header["EPOCH"] == 2030.0
     else:
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = csv_rows(path)
         values = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         units = described
     assert list(values) == list(bright.columns)
@@ -176,8 +174,7 @@ def test_a_type_with_a_comma_stays_in_its_field(catalogue_bench, tmp_path):
     made = bench_catalogue(catalogue_bench, 6.0, None)
     assert "C0,0 (F8pe)" in made.columns["spectral_type"].values  # HIP 77442
     write_catalogue(tmp_path / "stars.csv", made)
-    with (tmp_path / "stars.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(tmp_path / "stars.csv")
     for name in ("spectral_type", "variable", "double", "neighbour"):
         assert [row[name] for row in rows] == made.columns[name].values.tolist()
 

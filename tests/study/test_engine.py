@@ -26,7 +26,8 @@ from hilstar.instruments.study.engine import (
     row_panels,
     write_rows,
 )
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 
 @dataclass(frozen=True)
@@ -149,4 +150,4 @@ def test_the_example_of_the_engine_draws_a_legible_chart_and_its_table(tmp_path)
     result = doctest.DocTestRunner().run(example, out=printed.append)
     assert result.attempted == 9 and result.failed == 0, "".join(printed)
     assert_drawn(tmp_path / "cost.png")
-    assert [row["way"] for row in table(tmp_path / "cost.csv")] == ["round"] * 2 + ["exact"] * 2
+    assert [row["way"] for row in csv_rows(tmp_path / "cost.csv")] == ["round"] * 2 + ["exact"] * 2

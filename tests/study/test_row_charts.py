@@ -23,7 +23,7 @@ from hilstar.instruments.study.engine import (
     write_columns,
 )
 from hilstar.instruments.study.sweep import Load
-from tests.support.pictures import table
+from tests.support.tables import csv_rows
 
 BUSY = Load(1e3)
 
@@ -136,5 +136,5 @@ def test_curves_over_one_x_and_their_table(figure, tmp_path):
     assert [line.get_label() for line in first] == ["light", "dark"]
     assert second[0].get_color() == charts.RED
     write_columns(tmp_path / "x.csv", {"x_px": x, "twice": 2 * x})
-    rows = table(tmp_path / "x.csv")
+    rows = csv_rows(tmp_path / "x.csv")
     assert [(float(row["x_px"]), float(row["twice"])) for row in rows] == [(1, 2), (2, 4)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import signal
@@ -29,15 +28,11 @@ from tests.support.commands import (
     run_hilstar_here,
 )
 from tests.support.senders import free_port
+from tests.support.tables import csv_rows
 from tests.support.waiting import PATIENCE_S, wait_for
 
 ORION = ROOT / "configs" / "thesis-orion.toml"
 ALNILAM, BETELGEUSE, RIGEL, ALNITAK = 26311, 27989, 24436, 26727
-
-
-def read_truth(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +51,7 @@ def test_orion_is_the_right_way_up(orion):
     folder, _ = orion
     stars = {
         int(row["hip"]): (float(row["x_px"]), float(row["y_px"]))
-        for row in read_truth(folder / "o.csv")
+        for row in csv_rows(folder / "o.csv")
     }
     x, y = stars[ALNILAM]
     assert np.hypot(x - 511.5, y - 511.5) < 1.0  # Alnilam is in the middle
@@ -67,7 +62,7 @@ def test_orion_is_the_right_way_up(orion):
 
 def test_the_frame_s_files_agree_with_each_other(orion):
     folder, summary = orion
-    rows = read_truth(folder / "o.csv")
+    rows = csv_rows(folder / "o.csv")
     first = [
         "hip",
         "x_px",
@@ -130,7 +125,7 @@ def test_the_python_road_gives_the_command_s_frame(orion):
         frame = bench.frame(from_radec_roll_deg(84.057, -1.2, 0))
     assert np.array_equal(frame.linear, fits.getdata(folder / "o.fits"))
     assert np.array_equal(frame.codes, np.array(Image.open(folder / "o.png")))
-    assert frame.truth["hip"].tolist() == [int(r["hip"]) for r in read_truth(folder / "o.csv")]
+    assert frame.truth["hip"].tolist() == [int(r["hip"]) for r in csv_rows(folder / "o.csv")]
 
 
 def test_a_quaternion_and_its_negative_are_the_attitude_of_its_radec(orion, tmp_path):
@@ -170,7 +165,7 @@ def test_clipped_stars_are_counted_and_named(tmp_path, small_bench_file):
     )
     clipped = json.loads(result.stdout)["clipped"]
     assert {ALNILAM, ALNITAK} <= set(clipped)
-    marked = {int(r["hip"]) for r in read_truth(tmp_path / "t.csv") if r["clipped"] == "1"}
+    marked = {int(r["hip"]) for r in csv_rows(tmp_path / "t.csv") if r["clipped"] == "1"}
     assert marked == set(clipped)
 
 
@@ -185,7 +180,7 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
     )
     rates = {
         float(r["electrons_per_s"]) * 10 ** (0.4 * float(r["v_mag"]))
-        for r in read_truth(tmp_path / "t.csv")
+        for r in csv_rows(tmp_path / "t.csv")
     }
     assert max(rates) / min(rates) == pytest.approx(1, rel=1e-12)
 
@@ -395,7 +390,7 @@ def test_replay_writes_the_frames_of_a_log(tmp_path, small_bench_file):
     summary = json.loads(result.stdout)
     assert summary["frames"] == 13  # 0.2 s at 60 Hz, both ends included
     assert summary["missed_frames"] == summary["stale_frames"] == 0
-    table = read_truth(tmp_path / "out" / "frames.csv")
+    table = csv_rows(tmp_path / "out" / "frames.csv")
     assert len(table) == len(list((tmp_path / "out").glob("frame_*.png"))) == 13
     with hilstar.load(small_bench_file) as bench:
         for number, ra in ((0, 84.057), (6, 85.057), (12, 86.057)):

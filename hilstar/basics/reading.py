@@ -233,7 +233,7 @@ def named_bytes(path: Path, advice: str, limit_bytes: int) -> bytes:
     return content
 
 
-def open_named(path: Path, advice: str, limit_bytes: int) -> IO[bytes]:
+def open_named(path: Path, advice: str, limit_bytes: int) -> io.BufferedReader | io.BytesIO:
     """A file that a bench file names, open for reading: from memory where it can be kept, so that
     it is opened once. Raises InputError.
     """

@@ -274,9 +274,10 @@ def assert_overlay(page: Browser, before: str, same: bool) -> None:
     wait_for(lambda: (pixels(page, "overlay") == before) == same, f"the overlay as before: {same}")
 
 
-def test_every_overlay_can_be_switched_by_its_key_and_by_its_button(live):
+def test_every_overlay_can_be_switched_by_its_key_and_by_its_button(live, run):
+    run.stand_still()  # then all stars' places, which come beside pictures, are alike
+    await_attitude(live, run)
     ActionChains(live).send_keys("h").perform()
-    time.sleep(0.3)  # the truth of the picture that is held comes beside it
     for key, name in (
         ("n", "names"),
         ("m", "magnitudes"),

@@ -23,15 +23,6 @@ def round_bench(small_bench_file):
     return small_bench_file
 
 
-@pytest.fixture
-def no_opengl(tmp_path):
-    """A loader that finds a libEGL that it cannot load."""
-    folder = tmp_path / "broken"
-    folder.mkdir()
-    (folder / "libEGL.so.1").write_text("no library")
-    return {"LD_LIBRARY_PATH": str(folder)}
-
-
 def by(way: str, **more: str) -> dict[str, str]:
     return os.environ | {"HILSTAR_DRAW": way} | more
 

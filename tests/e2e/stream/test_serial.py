@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import os
 import signal
 import threading
@@ -26,7 +25,7 @@ from hilstar.server.send_log import BadCable, Faults, send, spin_samples
 from hilstar.server.sender import SerialSender
 from hilstar.server.serve import serve
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, sent
 from tests.support.live_runs import attitudes, median_age_ns, serve_until
 from tests.support.senders import packet
 from tests.support.servers import interrupted, listening, summary_of, until_said
@@ -56,16 +55,12 @@ def wire_file(tmp_path, cable):
     return path
 
 
-def sent(cable, *options: str) -> dict:
-    result = run_hilstar_here("send", "--to", f"serial:{cable.sender}@{BAUD}", "--json", *options)
-    assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout)
-
-
 def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(cable, wire_file):
     with listening(wire_file, "reading serial:") as process:
         process.shows()
-        told = sent(cable, "--spin", "z,1", "--rate", "200", "--count", "600")
+        told = sent(
+            f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "200", "--count", "600"
+        )
         process.has_received(600)
         summary = interrupted(process)
     assert told["sent"] == summary["packets"]["accepted"] == summary["packets"]["received"] == 600
@@ -82,7 +77,16 @@ def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(
 def test_lost_corrupted_and_reordered_packets_add_up(cable, wire_file):
     with listening(wire_file, "reading serial:") as process:
         faults = ["--lose", "10%", "--corrupt", "5%", "--reorder", "--jitter", "1", "--seed", "3"]
-        told = sent(cable, "--spin", "z,1", "--rate", "400", "--count", "800", *faults)
+        told = sent(
+            f"serial:{cable.sender}@{BAUD}",
+            "--spin",
+            "z,1",
+            "--rate",
+            "400",
+            "--count",
+            "800",
+            *faults,
+        )
         process.has_received(told["sent"])
         summary = interrupted(process)
     packets = summary["packets"]
@@ -165,7 +169,12 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path
     with listening(wire_file, "reading serial:") as process:
         process.shows()
         shown_s = time.monotonic()
-        assert sent(cable, "--spin", "z,1", "--rate", "100", "--count", "50")["sent"] == 50
+        assert (
+            sent(
+                f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "100", "--count", "50"
+            )["sent"]
+            == 50
+        )
         process.has_received(50)
         cable.pull()
         time.sleep(1.0)
@@ -175,7 +184,12 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path
             until_said(process, "is back")
             took_s = time.monotonic() - plugged_s
         assert took_s - waited.s < 1.0 + LATE_S, (took_s, waited.s)
-        assert sent(cable, "--spin", "z,1", "--rate", "100", "--count", "50")["sent"] == 50
+        assert (
+            sent(
+                f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "100", "--count", "50"
+            )["sent"]
+            == 50
+        )
         process.has_received(100)
         lasted_s = time.monotonic() - shown_s
         summary = interrupted(process)
@@ -199,7 +213,7 @@ def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_t
             for _ in range(50):
                 road.send_bytes(b"\x55" * 1000, 1.0)
                 time.sleep(0.002)
-        sent(cable, "--spin", "z,1", "--rate", "100", "--count", "20")
+        sent(f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "100", "--count", "20")
         process.has_accepted(20)
         summary = interrupted(process)
     assert summary["packets"]["refused_by"]["format"] == 1

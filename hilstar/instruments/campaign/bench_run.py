@@ -486,12 +486,16 @@ class BenchRun:
                 now.star_lists.judged.append(self._judged_stars(answer, judged.lit.q))
 
     def _judged_stars(self, answer: Answer, lit_q: FloatArray) -> StarResiduals:
-        """The stars of an answer against those that were lit at an attitude."""
-        assert self._bench is not None
-        tracker = self._bench.config.tracker
-        camera = tracker_camera(tracker, self._bench.file.folder)
-        faintest_e_per_s = self._bench.faintest_shown_e_per_s
-        lit = lit_at(lit_q, self._bench.stars, camera, faintest_e_per_s)
+        """The stars of an answer against those that were lit at an attitude: of the tracker's field
+        what the display covers.
+        """
+        bench = self._bench
+        assert bench is not None
+        tracker = bench.config.tracker
+        camera = tracker_camera(tracker, bench.file.folder)
+        lit = lit_at(lit_q, bench.stars, camera, bench.faintest_shown_e_per_s)
+        x_px, y_px = bench.camera.pixels_from(camera, lit.x_px, lit.y_px)
+        lit = lit.some(np.flatnonzero(bench.camera.contains_px(x_px, y_px)))
         return judge_stars(answer.centroids, lit, tracker.resolution_px)
 
     def _is_of(self, now: Tally, judged: Judged, answer: Answer) -> bool:

@@ -234,7 +234,9 @@ class Require(Table, frozen=True):
 
 class PlantedFaults(Table, frozen=True):
     """[planted]: what is wrong with the virtual tracker on purpose, so that a plan shows that it
-    finds it. Arcsec, deg/s about cam x, y, z; s; shares of frames.
+    finds it. Vectors are about cam x, y, z. `wrong` and `missing` are shares of frames,
+    `aberration`, `proper_motion` and `parallax` the shares that are left, `rate_scale` a share of
+    the rate, `star_colour` mag a mag of B-V, and `false_stars` a frame's.
     """
 
     bias_arcsec: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
@@ -265,7 +267,7 @@ class PlantedFaults(Table, frozen=True):
 
 
 class Plan(Table, frozen=True):
-    """A whole plan."""
+    """The plan of a campaign, with the tables of its file."""
 
     bench: Annotated[str, Meta(min_length=1)]
     seed: Annotated[int, Meta(ge=0, le=MAX_SEED)] = 0

@@ -103,8 +103,8 @@ def test_pixels_go_to_the_screen_as_the_image_does(flip_x, rotate_deg):
     assert np.array_equal(back, (x, y))
 
 
-def result(found=None, code=0, stderr="", memory_mb=500.0):
-    return CommandResult(code, 1.0, 1.0, memory_mb, json.dumps(found or {}), stderr)
+def result(found=None, code=0, stderr="", memory_mb=500.0, load=math.nan):
+    return CommandResult(code, 1.0, 1.0, memory_mb, json.dumps(found or {}), stderr, load)
 
 
 def session_of(**verdicts):
@@ -196,12 +196,12 @@ PASSED = {"passed": True, "reasons": []}
             {
                 FIRST_LIGHT: result(DONE),
                 VERIFY: result(PASSED),
-                SERVE: result({"missed_frames": 300}),
+                SERVE: result({"missed_frames": 300}, load=13.7),
                 ASSESS: result(code=2, stderr="hilstar: the run missed so many frames that 9"),
             },
             {},
             judge.BUSY,
-            "missed so many frames",
+            "missed so many frames that 9 (the machine's load was 13.7 on",
         ),
         (
             {

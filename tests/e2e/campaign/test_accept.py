@@ -78,6 +78,9 @@ def test_an_acceptance_ends_in_a_page_tables_and_an_exit_code(folder: Path) -> N
         "Recovery": "not tested",
     }
     assert told["verdict"] == "not met" and told["cases"] == 24 + 8 * 4
+    together = {clause["capability"]: clause["together"] for clause in told["clauses"]}
+    # 8 of 8 cases without an attitude, at a confidence that three clauses and four levels share
+    assert together["Largest <rate>"] == "not met" and together["A right attitude"] == ""
     page = (folder / "out" / "accept.html").read_text()
     assert "Largest &lt;rate&gt;" in page and "A clause is not met" in page
     assert "Vacuum" in page and "not of a bench" in page and "varies scenario" in page

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,7 +79,8 @@ FIRST_LIGHT, VERIFY, CERTIFY, SERVE, SEND, TRACKER, ASSESS = COMMANDS = (
 @dataclass(frozen=True)
 class CommandResult:
     """A command that has ended: exit code (None where it was stopped for its time), what it took
-    and printed.
+    and printed. `load` is the mean number of the machine's processes that wanted a core in the
+    minute before its end; NaN in files that do not have it.
     """
 
     code: int | None
@@ -87,6 +89,7 @@ class CommandResult:
     memory_mb: float
     stdout: str
     stderr: str
+    load: float = math.nan
 
     @property
     def found(self) -> dict[str, Any]:
@@ -383,10 +386,17 @@ def _afterwards(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
         # A tracker before stars so wide sees few of them, or none, and `verify` said so.
         return TOO_WIDE, reasons[0]
     if later == [ASSESS] and _is_short_of_frames(results):
-        return BUSY, results[ASSESS].last_line
+        return BUSY, results[ASSESS].last_line + _load_of(results[SERVE])
     if later:
         return LATER, "; ".join(f"{name}: {results[name].last_line}" for name in later)
     return (TOO_WIDE, reasons[0]) if reasons else None
+
+
+def _load_of(result: CommandResult) -> str:
+    """The machine's load at a command's end, in words; "" where it is not known."""
+    if math.isnan(result.load):
+        return ""
+    return f" (the machine's load was {result.load:.1f} on {os.cpu_count()} cores)"
 
 
 def _is_short_of_frames(results: Mapping[str, CommandResult]) -> bool:
@@ -465,6 +475,7 @@ def _live(results: Mapping[str, CommandResult]) -> dict[str, Any]:
     return {
         "serve_frames": served.get("frames"),
         "serve_missed": served.get("missed_frames"),
+        "serve_load": round(results[SERVE].load, 1) if SERVE in results else None,
         "tracker_answers": answered.get("answers"),
         "assess_bias_arcsec": None if bias is None else " ".join(f"{each:.3g}" for each in bias),
         "assess_availability": assessed.get("availability"),

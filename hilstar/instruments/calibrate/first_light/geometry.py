@@ -564,7 +564,10 @@ def _frames_of(
         paths.append(context.take(Pattern(f"frame_{first + frame:03}", codes)))
     size_px = context.file.config.tracker.resolution_px
     context.stage(f"measures the dots of {len(paths)} images")
-    return paths, measure_images(paths, dark, size_px, dot_sigma_px(context.file))
+    # the window by the bench file, as the dots were planned; the S-curve by the measured PSF
+    seen = replace(context.seen_screen, psf_sigma_px=context.psf_sigma_px)
+    sigma_px = dot_sigma_px(context.file)
+    return paths, measure_images(paths, dark, size_px, sigma_px, seen.dot_shape)
 
 
 def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:

@@ -18,6 +18,7 @@ from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.charts import write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.text_tables import read_rows
+from hilstar.instruments.calibrate.geometric.dot_shape import DotShape
 from hilstar.instruments.calibrate.geometric.observed import dot_centroids
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.config import Monitor
@@ -140,6 +141,15 @@ class SeenScreen:
         """The sigma of a dot in the tracker's image: the PSF's and a square's."""
         square_sigma_px = DOT_PX * self.tracker_px_a_monitor_px / math.sqrt(12)
         return math.hypot(self.psf_sigma_px, square_sigma_px)
+
+    @property
+    def dot_shape(self) -> DotShape:
+        """A dot in the tracker's image, as it is on the axis."""
+        side_px = DOT_PX * self.tracker_px_a_monitor_px
+        monitor_to_tracker = self.tracker.cam_to_image @ self.monitor.cam_to_image.T
+        right = monitor_to_tracker[:, 0]
+        turn_deg = math.degrees(math.atan2(right[1], right[0]))
+        return DotShape(self.psf_sigma_px, side_px, turn_deg)
 
     @property
     def turn_deg(self) -> float:

@@ -10,6 +10,7 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.instruments.campaign.acceptance_plan import CaseSet, plan_path, read_acceptance_plan
+from hilstar.instruments.campaign.acceptance_verdicts import ClauseVerdict
 from hilstar.instruments.campaign.plan import PlantedFaults
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from tests.support.acceptance import accepted, write_bench
@@ -273,6 +274,23 @@ def test_an_acceptance_goes_on_where_it_was_and_is_judged_again(tmp_path: Path) 
     found = accepted(tmp_path, text.replace("minimum = 0.9", "maximum = 0.5") + more)
     assert table.stat().st_mtime_ns == made_ns
     assert found["availability"].word == NOT_MET and found["aberration"].word == MET
+
+
+def test_one_clause_of_many_that_is_barely_not_met_may_be_chance(tmp_path: Path) -> None:
+    def judged(limit: float, others: int) -> ClauseVerdict:
+        text = f"[planted]\nmissing = 0.3\n{SETS['lost']}"
+        text += clause_text("no-attitude", limit, "lost", "maximum")
+        for k in range(others):
+            text += clause_text("availability", 0.1 + k / 1000, "lost", "minimum")
+        return accepted(tmp_path, text)["no-attitude"]
+
+    sure = judged(0.1, 40)
+    assert (sure.word, sure.together) == (NOT_MET, NOT_MET)
+    assert sure.verdict is not None and sure.verdict.low is not None
+    barely = 0.99 * sure.verdict.low
+    alone, of_many = judged(barely, 0), judged(barely, 40)
+    assert (alone.word, alone.together) == (NOT_MET, NOT_MET)
+    assert (of_many.word, of_many.together) == (NOT_MET, NOT_SHOWN)
 
 
 def test_a_plan_with_other_cases_does_not_go_on(tmp_path: Path) -> None:

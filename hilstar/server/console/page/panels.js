@@ -64,7 +64,7 @@ export function writeFocus(said, rows) {
   const [words, shade] = !known ? ["no figure", "warn"] : said.still ? judged : ["it moves", "bad"];
   write(byId("focus-state"), words);
   byId("focus-state").dataset.state = shade;
-  write(byId("focus-what"), said.what);
+  write(byId("focus-what"), `by ${said.what}`);
   write(byId("focus-now"), known ? withUnit(said.sigma_px, "px", 3) : NONE);
   write(byId("focus-error"), known ? `\u00b1 ${withUnit(said.error_px, "px", 3)}` : "");
   write(byId("focus-line"), said.line);

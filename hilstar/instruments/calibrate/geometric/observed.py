@@ -71,10 +71,10 @@ class Observed:
 
     def joined(self, other: "Observed") -> "Observed":
         """These centroids and others, of other frames."""
-        columns = []
+        joined: dict[str, Any] = {}
         for name in COLUMNS:
-            columns.append(np.concatenate([getattr(self, name), getattr(other, name)]))
-        return Observed(*columns, settings=self.settings)
+            joined[name] = np.concatenate([getattr(self, name), getattr(other, name)])
+        return replace(self, **joined)
 
     def without_s_curve(self, pose: int, shape: DotShape) -> "Observed":
         """The same centroids, those of a pose without the bias by a dot's place within a pixel,

@@ -7,8 +7,10 @@ import os
 import pytest
 
 from hilstar.basics.errors import MachineError
+from tests.support.benches import ROOT
 from tests.support.beside import astrometry_side, lost_side, pyxel_side, stellarium_side
 from tests.support.beside.steps import Beside
+from tests.support.pictures import table
 
 # float32 shares are within MAX_SHARE_ERROR (1e-7) by polynomial, and 1.2e-7 of rounding
 PIXEL_SHARE = 2.2e-7
@@ -28,6 +30,8 @@ IMAGE_ARCSEC = 1.0
 BENT_PX, FREE_PX = 2e-3, 0.1
 # LOST prints six digits: places are rounded evenly, and 364 of them tell their rms within 10 %
 DIGITS = 1.1
+# of a size on the page; sums of float32 have other last digits on another processor
+OF_THE_PAGE, LAST_DIGITS = 0.02, 1e-7
 # programs of minutes, or of an environment of their own
 on_demand = pytest.mark.skipif(
     "HILSTAR_BESIDE" not in os.environ, reason="runs on demand: HILSTAR_BESIDE=1"
@@ -40,12 +44,25 @@ STARS_ARCSEC, PLANETS_ARCSEC, PLANETS_MAG = 0.3, 1.0, 0.03
 CATALOGUE_ARCSEC = 1.0
 
 
+def assert_as_on_the_page(name: str, beside: Beside) -> None:
+    """The page's table has the sizes of this run, of the steps that it takes."""
+    rows = table(ROOT / "results" / f"beside_{name}.csv")
+    recorded = {(row["subject"], row["step"]): float(row["size"]) for row in rows}
+    for step in beside.steps:
+        wanted = recorded[step.subject, step.step]
+        assert step.size == pytest.approx(wanted, rel=OF_THE_PAGE, abs=LAST_DIGITS), step
+
+
 @pytest.fixture(scope="module")
 def galsim(tmp_path_factory) -> Beside:
     pytest.importorskip("galsim")
     from tests.support.beside import galsim_side
 
     return galsim_side.run(tmp_path_factory.mktemp("galsim"), quick=True)
+
+
+def test_galsim_s_table_on_the_page_is_of_this_run(galsim):
+    assert_as_on_the_page("galsim", galsim)
 
 
 def test_galsim_s_pixels_of_a_gaussian_are_hilstar_s(galsim):
@@ -107,6 +124,7 @@ def test_lost_s_generator_has_stars_where_hilstar_has_them():
     lost = Beside("LOST", "", "", tuple(lost_side.place_steps(places)))
     subject = lost_side.PLACES
     assert len(places.hr) == 182
+    assert_as_on_the_page("lost", lost)
     assert lost.size(subject, "by LOST's own") < DIGITS * lost.size(
         subject, "for comparison: the six digits"
     )

@@ -24,6 +24,7 @@ from hilstar.instruments.study.timing import (
 from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
 from tests.support.pictures import assert_drawn, table
+from tests.support.recorded import assert_recorded
 
 GAIN = 20  # compensated against not: the issue's own figure
 RATE_DEG_S = QUICK_RATES_DEG_S[0]
@@ -53,6 +54,11 @@ def study(tmp_path_factory):
 @pytest.fixture(scope="module")
 def outcomes(study):
     return {outcome.way: outcome for outcome in study[2]}
+
+
+def test_the_page_s_table_is_of_what_is_measured_now(study):
+    figures = ("rms_arcsec", "worst_arcsec")
+    assert_recorded(study[0] / "timing.csv", ("way", "rate_deg_s"), figures)
 
 
 def test_compensation_leaves_a_twentieth_of_the_error_at_most(outcomes):

@@ -8,7 +8,13 @@ import pytest
 
 from hilstar.basics.errors import MachineError
 from tests.support.benches import ROOT
-from tests.support.beside import astrometry_side, lost_side, pyxel_side, stellarium_side
+from tests.support.beside import (
+    astrometry_side,
+    lost_side,
+    pyxel_side,
+    satsim_side,
+    stellarium_side,
+)
 from tests.support.beside.steps import Beside
 from tests.support.pictures import table
 
@@ -38,6 +44,8 @@ on_demand = pytest.mark.skipif(
 )
 MEAN_DN, PATTERN = 0.25, 0.02  # of 250 000 pixels; Pyxel's means and scatters go to 0.06 and 0.5 %
 DARK = 1e-6  # one law, written twice
+# of what chance passes once in twenty runs; of SatSim's points, whose error falls with their square
+CHANCES, GRID_SHARE = 1.5, 1e-4
 # Hipparcos in both, by its steps; UT1 as IERS predicts it, planets by VSOP87 and by DE421
 STARS_ARCSEC, PLANETS_ARCSEC, PLANETS_MAG = 0.3, 1.0, 0.03
 # the Bright Star Catalogue's own errors, beside 0.32 arcsec of rounding
@@ -142,6 +150,19 @@ def test_pyxel_s_photon_transfer_is_hilstar_s_but_for_its_pattern(tmp_path):
     assert pyxel.size(pyxel_side.PRNU, "light, Pyxel's halved") < PATTERN
     assert pyxel.size(pyxel_side.PRNU, "scatter to Pyxel's doubled") < PATTERN
     assert pyxel.size("dark current, 233 to 300 K", "with the gap") < DARK
+
+
+@on_demand
+def test_satsim_s_photon_transfer_is_hilstar_s_but_for_its_well(tmp_path):
+    satsim = satsim_side.run(tmp_path)
+    assert satsim.size(satsim_side.MEAN, "half a DN for that") < MEAN_DN
+    sigma = satsim.size(satsim_side.VARIANCE, "one sigma")
+    assert satsim.size(satsim_side.VARIANCE, "as both come") < SIGMAS * sigma
+    chance = satsim.size(satsim_side.SHAPE, "by chance")
+    assert satsim.size(satsim_side.SHAPE, "with half a DN") < CHANCES * chance
+    assert satsim.size(satsim_side.SHAPE, "as both come") > CHANCES * chance
+    assert satsim.size(satsim_side.WELL, "without a bias") < MEAN_DN
+    assert satsim.size(satsim_side.STAR, "SatSim's grid of 45") < GRID_SHARE
 
 
 @on_demand

@@ -16,7 +16,7 @@ from tests.support.beside import (
     stellarium_side,
 )
 from tests.support.beside.steps import Beside
-from tests.support.pictures import table
+from tests.support.tables import csv_rows
 
 # float32 shares are within MAX_SHARE_ERROR (1e-7) by polynomial, and 1.2e-7 of rounding
 PIXEL_SHARE = 2.2e-7
@@ -54,7 +54,7 @@ CATALOGUE_ARCSEC = 1.0
 
 def assert_as_on_the_page(name: str, beside: Beside) -> None:
     """The page's table has the sizes of this run, of the steps that it takes."""
-    rows = table(ROOT / "results" / f"beside_{name}.csv")
+    rows = csv_rows(ROOT / "results" / f"beside_{name}.csv")
     recorded = {(row["subject"], row["step"]): float(row["size"]) for row in rows}
     for step in beside.steps:
         wanted = recorded[step.subject, step.step]

@@ -4,12 +4,12 @@ those files, and a test of a table's figures alone would not see that they are a
 
 from __future__ import annotations
 
-import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
 from tests.support.benches import ROOT
+from tests.support.tables import csv_rows
 
 WITHIN, SMALLEST = 0.02, 1e-9  # of a figure: other drivers round a few codes otherwise
 
@@ -31,8 +31,7 @@ def assert_recorded(measured: Path, keys: Sequence[str], figures: Sequence[str])
 
 def rows_of(path: Path, keys: Sequence[str]) -> list[dict[str, str]]:
     """The rows of a file, which has to have the keys."""
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(path)
     assert rows and set(keys) <= set(rows[0]), path
     return rows
 

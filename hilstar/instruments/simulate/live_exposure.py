@@ -40,8 +40,10 @@ from hilstar.sky.stars import split_by_rate
 from hilstar.tracker.centroids import (
     CentroidSettings,
     LocalBackground,
+    estimate_background,
     find_stars,
     noisiest_background,
+    star_widths,
 )
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified, identify
@@ -358,7 +360,10 @@ class LiveTracker(Closing):
         x_px = stars.x_px[good]
         y_px = stars.y_px[good]
         flux_e = stars.flux[good] * self._detector.settings.gain_e_per_dn
-        return FoundStars(x_px, y_px, flux_e, normalise(self.camera.rays(x_px, y_px)))
+        rays = normalise(self.camera.rays(x_px, y_px))
+        under = background or estimate_background(image)
+        widths_px = star_widths(image, under.level, x_px[:MAX_REPORTED], y_px[:MAX_REPORTED])
+        return FoundStars(x_px, y_px, flux_e, rays, widths_px)
 
     def reported_stars(self, solved: Solved) -> tuple[ReportedStar, ...]:
         """The brightest stars of an exposure, as a tracker reports them."""
@@ -372,7 +377,16 @@ class LiveTracker(Closing):
         for k in range(min(len(stars), MAX_REPORTED)):
             x_px, y_px = float(stars.x_px[k]), float(stars.y_px[k])
             flux_dn = float(stars.flux_e[k]) / gain
-            reported.append(ReportedStar(x_px, y_px, flux_dn, hip=hip.get(k) or None))
+            width_px = float(stars.width_px[k])
+            reported.append(
+                ReportedStar(
+                    x_px,
+                    y_px,
+                    flux_dn,
+                    hip=hip.get(k) or None,
+                    width_px=width_px if math.isfinite(width_px) else None,
+                )
+            )
         return tuple(reported)
 
     def _near(self, q_icrs_to_cam: FloatArray) -> tuple[IntArray, FloatArray]:

@@ -67,6 +67,12 @@ SETS = {
         'values = ["1906-01-01T00:00:00", "1946-04-01T00:00:00", "2006-07-01T00:00:00",'
         ' "2046-10-01T00:00:00"]\n'
     ),
+    "parallax": (
+        '[cases.parallax]\ncases = 80\nframes = 2\n[[cases.parallax.vary]]\nkey = "sky.epoch_utc"\n'
+        'values = ["2026-01-01T00:00:00", "2026-04-01T00:00:00", "2026-07-01T00:00:00",'
+        ' "2026-10-01T00:00:00"]\n[[cases.parallax.vary]]\nkey = "spacecraft.orbit"\n'
+        'values = ["geocentre"]\n'
+    ),
     "earth": (
         '[cases.earth]\ncases = 16\n[cases.earth.attitudes]\nkind = "body"\nbody = "earth"\n'
         '[cases.earth.sweep]\nkey = "limb_deg"\nstart = 45.0\nstop = -30.0\n'
@@ -103,6 +109,8 @@ FAULTS: dict[str, tuple[str, str, float, str]] = {
     "aberration": ("aberration", "aberration = 1.0", 1.0, "maximum"),
     "proper-motion": ("dates", "proper_motion = 1.0", 1.0, "maximum"),
     "catalogue-age": ("dates", "catalogue_age_yr = 100.0", 100.0, "maximum"),
+    # a whole parallax is under the noise of so few cases
+    "parallax": ("parallax", "parallax = 100.0", 100.0, "maximum"),
     "star-noise": ("stars", "star_noise_px = 0.3", 0.3, "maximum"),
     "star-fov-error": ("stars", "star_fov_px = 0.3", 0.3, "maximum"),
     "star-colour": ("stars", "star_colour = 0.1", 0.1, "maximum"),
@@ -302,6 +310,15 @@ def test_an_acceptance_goes_on_where_it_was_and_is_judged_again(tmp_path: Path) 
     found = accepted(tmp_path, text.replace("minimum = 0.9", "maximum = 0.5") + more)
     assert table.stat().st_mtime_ns == made_ns
     assert found["availability"].word == NOT_MET and found["aberration"].word == MET
+
+
+def test_an_uncorrected_aberration_is_no_parallax(tmp_path: Path) -> None:
+    """It turns with the seasons, too: a thousand times as far as a field's parallax."""
+    text = plan_of("parallax", 1.0, "aberration = 1.0")
+    found = accepted(tmp_path, text)["parallax"].verdict
+    assert found is not None and found.value is not None and found.high is not None
+    sigma = (found.high - found.value) / ONE_SIDED
+    assert found.value <= SIGMAS * sigma and sigma < 30.0
 
 
 def test_one_clause_of_many_that_is_barely_not_met_may_be_chance(tmp_path: Path) -> None:

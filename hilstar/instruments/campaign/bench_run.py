@@ -319,11 +319,11 @@ class BenchRun:
             light_ns = moment.light_if_begun_at(now_ns)
             view = self._view(light_ns)
             if view is None:
-                return loop.draw(moment.slot, 0, None, moment)
+                return loop.draw(moment.slot, 0, None, moment.lit_at(light_ns))
             attitude = Attitude(
                 view.q_icrs_to_cam, 0, False, rate_cam_rad_s=view.turn.rate_cam_rad_s
             )
-            return loop.draw(moment.slot, view.t_ns or 0, attitude, moment)
+            return loop.draw(moment.slot, view.t_ns or 0, attitude, moment.lit_at(light_ns))
 
         with stop_on_signal(loop.stop), loop.watch:
             bench.warm_up()
@@ -383,12 +383,13 @@ class BenchRun:
         attitude, on_screen, now = shown.attitude, shown.on_screen, self._now
         is_lit = attitude is not None and not on_screen.operator and not on_screen.hidden
         host_ns = (
-            shown.draw_ns if shown.predicted_swap_ns is None else shown.swap_ns + self._light_ns
+            shown.moment_ns if shown.predicted_swap_ns is None else shown.swap_ns + self._light_ns
         )
         q = attitude.q_icrs_to_cam if attitude is not None and is_lit else None
         number = self._base + shown.number
         self._next = number + 1
-        self._frames.add(LitFrame(number, host_ns, host_ns, q, shown.drawn.rate_cam_rad_s))
+        rate_rad_s = shown.drawn.rate_cam_rad_s
+        self._frames.add(LitFrame(number, host_ns, host_ns, q, rate_rad_s, shown.fades))
         self._shown_q = q if q is not None else self._shown_q
         if (
             now is not None

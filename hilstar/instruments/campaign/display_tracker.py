@@ -29,10 +29,10 @@ from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import before_detector, tracker_camera
 from hilstar.server.bench.config import GAUSSIAN, BenchConfig
 from hilstar.tracker.detector import Detector
+from hilstar.tracker.mosaic import uneven_dark_dn
 
 if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
-from hilstar.tracker.mosaic import uneven_dark_dn
 
 
 class DisplayTracker:

@@ -181,8 +181,6 @@ quantity = "availability"
 minimum = 0.9
 """
 
-FRAME_S = 0.01  # of a headless display
-
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("clock", ["host", "own"])
@@ -198,7 +196,9 @@ def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, c
     planted = replace(
         stub, now=now, wild=0.0, stamp_bias_s=0.1, latency_s=0.15, rate_bias_deg_s=(0.0, 0.03, 0.0)
     )
-    words = ("accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--headless", "--json")
+    words = ["accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--headless", "--json"]
+    # on a clock of its own the rates alone are judged, and half of the cases show them
+    words += ["--quick"] * (clock == "own")
     with answering(planted):
         done = run_hilstar_here(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -214,8 +214,8 @@ def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, c
     if clock == "own":
         assert time["verdict"] == "not tested" and "own clock" in time["why"]
     else:
-        # half a frame of 100 Hz, 5 ms, is the display's own, and on a busy machine a whole one
-        assert abs(time["value"] - 0.1) <= 0.01 + FRAME_S / 2
+        # within 10 %: frames that a busy machine misses without a screen add nothing
+        assert abs(time["value"] - 0.1) <= 0.01
         assert time["verdict"] == "not met"
 
 

@@ -487,7 +487,8 @@ def geometry(context: StepContext) -> StepOutcome:
     first = first_dots(context.seen_screen)
     paths, observed = _frames_of(context, first, 0, code, dark)
     rough = rough_geometry(context.file, first, observed)
-    second = plan_seen_dots(rough, FRAMES, lit_for(rough), np.random.default_rng(PLAN_SEED))
+    rng = np.random.default_rng(PLAN_SEED)
+    second = plan_seen_dots(rough, FRAMES, lit_for(rough), rng, beside=first)
     more_paths, more_seen = _frames_of(context, second, first.frames, code, dark)
     plan = joined(first, second)
     paths = [*paths, *more_paths]
@@ -564,7 +565,10 @@ def _frames_of(
         paths.append(context.take(Pattern(f"frame_{first + frame:03}", codes)))
     size_px = context.file.config.tracker.resolution_px
     context.stage(f"measures the dots of {len(paths)} images")
-    return paths, measure_images(paths, dark, size_px, dot_sigma_px(context.file))
+    # the window by the bench file, as the dots were planned; the S-curve by the measured PSF
+    seen = replace(context.seen_screen, psf_sigma_px=context.psf_sigma_px)
+    sigma_px = dot_sigma_px(context.file)
+    return paths, measure_images(paths, dark, size_px, sigma_px, seen.dot_shape)
 
 
 def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:

@@ -55,7 +55,8 @@ DEFAULT_NOISE_PX = 0.05
 # off by noise / sqrt(frames).
 MAX_MISFIT = 4.0
 # Windowed centroids of a Gaussian of 0.5 px are up to 0.009 px off by its place in a pixel, of
-# 0.44 px 0.018 px, of 0.37 px 0.038 px.
+# 0.44 px 0.018 px, of 0.37 px 0.038 px. That is taken off by the PSF that is stated or measured;
+# of one that is 15 % off a half stays.
 NARROW_DOT_PX = 0.5
 MISFIT_FLOOR_ARCSEC = 1.0
 ONE_POSE = (
@@ -130,8 +131,8 @@ class Calibrated:
     @property
     def held_out_noise_arcsec(self) -> float:
         """The rms that noise alone would give held-out dots."""
-        count = np.bincount(self.data.dot)
-        # of a dot's mean, along both axes
+        count = np.bincount(self.problem.sites(self.data))
+        # of the mean of a place's dots, along both axes
         share2 = 2 * np.mean(1 / count[count > 0])
         return float(np.sqrt(share2) * self.noise_arcsec)
 
@@ -163,7 +164,8 @@ def calibrate_files(
         observed_dots = read_observed(observed[0])
     else:
         resolution_px = config.tracker.resolution_px
-        observed_dots = measure_images(observed, dark, resolution_px, dot_sigma_px(file))
+        shape = seen_screen_of(file).dot_shape
+        observed_dots = measure_images(observed, dark, resolution_px, dot_sigma_px(file), shape)
     return calibrate_seen(file, dots, observed_dots, tracker_is_ideal=tracker_is_ideal)
 
 
@@ -183,7 +185,8 @@ def calibrate_seen(
             raise
         raise MisfitError(
             f"{error}, or dots of sigma {sigma_px:.2f} px lie within a tracker pixel, whose"
-            " centroids depend on where: defocus the tracker a little"
+            " centroids depend on where: write [tracker] psf_sigma_px as `hilstar calibrate focus`"
+            " measures it, or defocus the tracker a little"
         ) from error
 
 

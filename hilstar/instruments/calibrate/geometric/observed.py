@@ -16,6 +16,7 @@ from hilstar.basics.fits_headers import FitsImage, read_fits_image
 from hilstar.basics.image_files import ImageSizeError, is_fits, opened_picture
 from hilstar.basics.reading import read_bytes
 from hilstar.basics.text_tables import read_rows
+from hilstar.instruments.calibrate.geometric.dot_shape import DotShape, without_s_curve
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
 MAX_OBSERVED_BYTES = 100_000_000
@@ -103,8 +104,10 @@ def measure_images(
     dark: Path | None,
     resolution_px: tuple[int, int],
     dot_sigma_px: float = MIN_WINDOW_SIGMA_PX,
+    shape: DotShape | None = None,
 ) -> Observed:
-    """Centroids of all images, of dots of about `dot_sigma_px` in the tracker's image.
+    """Centroids of all images, of dots of about `dot_sigma_px` in the tracker's image, without the
+    S-curve of dots of a `shape` that is known.
 
     The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0.
     Raises InputError for an image that cannot be read, has another size than the tracker's, or is
@@ -127,6 +130,8 @@ def measure_images(
         np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*paths_of, strict=True)
     )
     x_px, y_px = (np.concatenate(part) for part in zip(*places, strict=True))
+    if shape is not None:
+        x_px, y_px = without_s_curve(x_px, y_px, shape, settings)
     return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)), edge_px=settings.radius_px)
 
 

@@ -238,32 +238,47 @@ class LineMap:
     def tests_of(self, mutant: Mutant) -> list[str]:
         """The tests that run a mutant's statement, fastest first; a file stands for all its tests.
 
-        What runs when its module is imported is run by each test of the module.
+        A module's constant is run by those that run a statement with its name, and what else runs
+        when the module is imported by each test of the module.
         """
         by_line = self.tests.get(mutant.path, {})
-        lines = statement_lines(ROOT / mutant.path, mutant.line)
         names: set[str] = set()
-        for line in lines or map(int, by_line):
+        for line in lines_that_need(ROOT / mutant.path, mutant.line) or map(int, by_line):
             names.update(by_line.get(str(line), []))
         return sorted(names, key=lambda name: self.seconds.get(name, 0.0))
 
 
-def statement_lines(path: Path, line: int) -> range | None:
-    """The lines of the innermost statement that has a line, without those of its body; None where
-    it runs when the module is imported.
+def lines_that_need(path: Path, line: int) -> set[int]:
+    """The lines of the innermost statement that has a line, without those of its body, or of all
+    statements of functions that name the constants that it sets; none where it is another that
+    runs when the module is imported.
     """
-    lines = range(line, line + 1)
-    is_in_function = False
-    for node in ast.walk(ast.parse(path.read_bytes())):  # outer ones first
-        if not isinstance(node, ast.stmt) or node.end_lineno is None:
-            continue
-        body = getattr(node, "body", [])
-        end = body[0].lineno if body else node.end_lineno + 1
-        if node.lineno <= line < end:
-            lines = range(node.lineno, end)
+    tree = ast.parse(path.read_bytes())
+    innermost: ast.stmt | None = None
+    in_functions: list[ast.stmt] = []
+    for node in ast.walk(tree):  # outer ones first
+        if isinstance(node, ast.stmt) and line in own_lines(node):
+            innermost = node
         if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            is_in_function |= end <= line <= node.end_lineno
-    return lines if is_in_function else None
+            for part in node.body:
+                in_functions += [each for each in ast.walk(part) if isinstance(each, ast.stmt)]
+    if innermost is None:
+        return set()
+    if innermost in in_functions:
+        return set(own_lines(innermost))
+    constants = {each.id for each in ast.walk(innermost) if isinstance(each, ast.Name)}
+    needing: set[int] = set()
+    for statement in in_functions:
+        named = {each.id for each in ast.walk(statement) if isinstance(each, ast.Name)}
+        if named & constants and innermost in tree.body:
+            needing.update(own_lines(statement))
+    return needing
+
+
+def own_lines(node: ast.stmt) -> range:
+    """The lines of a statement, without those of its body."""
+    body = getattr(node, "body", [])
+    return range(node.lineno, body[0].lineno if body else (node.end_lineno or node.lineno) + 1)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 
 from hilstar.basics import charts
 from tests.support.benches import ROOT
 from tests.support.beside.steps import COLUMNS, Beside, Step, write_beside
 from tests.support.figures import assert_legible
+from tests.support.tables import csv_rows
 
 RECORDED = sorted((ROOT / "results").glob("beside_*.csv"))
 
 
 def recorded_rows(path) -> tuple[Beside, str]:
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(path)
     steps = tuple(
         Step(row["subject"], row["unit"], row["step"], float(row["size"])) for row in rows
     )

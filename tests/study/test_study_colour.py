@@ -10,6 +10,7 @@ import pytest
 
 from hilstar.instruments.study import colour
 from hilstar.instruments.study.colour import MONO, PANELS, PUBLISHED_SUBTYPES, SENSORS, run
+from tests.support.claims import holds
 
 AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
 
@@ -87,5 +88,5 @@ def test_superpixels_have_less_bias_than_the_raw_mosaic_and_wide_stars_little(st
     assert all(
         rms["superpixel", *key] < off for (image, *key), off in rms.items() if image == "mosaic"
     )
-    assert rms["superpixel", "1.5", "3500.0"] < 0.005
-    assert rms["superpixel", "0.55", "3500.0"] > 0.05
+    holds("mosaic-sharp", rms["superpixel", "0.55", "3500.0"])
+    holds("mosaic-wide", rms["superpixel", "1.5", "3500.0"])

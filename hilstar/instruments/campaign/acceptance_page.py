@@ -251,14 +251,23 @@ def _measured(each: ClauseVerdict) -> str:
         for end in (STILL, NOT_EVEN):
             if end in verdict.method:
                 return f"{end} {_digits(verdict.value)} {each.unit}".rstrip()
-    low, high = _digits(verdict.low), _digits(verdict.high)
-    return f"{_digits(verdict.value)} ({low} to {high}) {each.unit}".rstrip()
+    interval = _interval(verdict.low, verdict.high)
+    return f"{_digits(verdict.value)} ({interval}) {each.unit}".rstrip()
 
 
-def _digits(value: float | None) -> str:
+def _interval(low: float | None, high: float | None) -> str:
+    """An interval, one of whose ends may be unknown."""
+    if low is not None and high is not None:
+        return f"{_digits(low)} to {_digits(high)}"
+    if low is not None:
+        return f"{_digits(low)} or more"
+    if high is not None:
+        return f"{_digits(high)} or less"
+    return "interval unknown"
+
+
+def _digits(value: float) -> str:
     """Three digits; large whole numbers without an exponent."""
-    if value is None:
-        return "unknown"
     if abs(value) >= 1000:
         return f"{float(f'{value:.3g}'):.0f}"
     return f"{value:.3g}"

@@ -11,6 +11,8 @@ of others: covariances are sums over cases (Liang and Zeger 1986), bootstraps dr
     aberration error = bias + share x the turn by v / c; a share of 1 leaves it all
     motion     error = bias + (share x years since the bench's date + age) x the turn in a year by
                the stars' proper motion; a share of 1 leaves the stars where they are
+    parallax   error = bias + share x the turn by the stars' parallax + (a nuisance) share x the
+               turn by v / c, which goes with the seasons, too
     stars      place error = a smooth map over the detector + noise; signal against B-V; a logistic
                curve of detection against V
 """
@@ -36,9 +38,14 @@ from hilstar.instruments.campaign.cases import (
     Q,
 )
 from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, drawn_limits
-from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, Require
+from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, PARALLAX, Require
 from hilstar.instruments.campaign.planted import aberration_rad
-from hilstar.instruments.campaign.star_motion import YEARLY_TURN, YEARS
+from hilstar.instruments.campaign.star_motion import (
+    OBSERVER_KM_S,
+    PARALLAX_TURN,
+    YEARLY_TURN,
+    YEARS,
+)
 from hilstar.optics.camera import field_terms
 
 MIN_CASES = 8
@@ -106,6 +113,8 @@ def answer_figure(
         return _aberration(require, cases)
     if quantity in MOTION_QUANTITIES:
         return _proper_motion(require, cases)
+    if quantity == PARALLAX:
+        return _parallax(require, cases)
     return _star_figure(require, cases, resolution_px, rng)
 
 
@@ -408,14 +417,20 @@ def _aberration(require: Require, cases: Columns) -> BoundedFigure:
         raise TooFewCases("cases at several velocities of the observer tell it", int(known.sum()))
     case = np.flatnonzero(known)
     _enough(case, "attitude")
-    turns = []
-    for k in case.tolist():
-        turn = aberration_rad(q[k], velocities[k])
-        turns.append(turn[:2])
-    predicted = ARCSEC_PER_RAD * np.array(turns)
+    predicted = _aberrations_arcsec(q[case], velocities[case])
     fit = _turn_fit(errors[case], predicted[:, :, None], case)
     method = "linear fit over the observer's velocity, Student's t"
     return _turn_figure(fit, 0, require, method)
+
+
+def _aberrations_arcsec(q: FloatArray, velocities_km_s: FloatArray) -> FloatArray:
+    """The turns (n, 2), cam, across, of attitudes (n, 4) that take the aberration of velocities
+    (n, 3), ICRS, for none.
+    """
+    turns = np.zeros((len(q), 2))
+    for k, velocity_km_s in enumerate(velocities_km_s):
+        turns[k] = aberration_rad(q[k], velocity_km_s)[:2]
+    return ARCSEC_PER_RAD * turns
 
 
 def _finite_rows(values: FloatArray) -> npt.NDArray[np.bool_]:
@@ -463,6 +478,28 @@ def _proper_motion(require: Require, cases: Columns) -> BoundedFigure:
     term = MOTION_QUANTITIES.index(require.quantity)
     method = "linear fit over the yearly turn of each field, Student's t"
     return _turn_figure(fit, term, require, method)
+
+
+# ---- parallax ----
+
+
+def _parallax(require: Require, cases: Columns) -> BoundedFigure:
+    """The share of the stars' parallax that is left in the attitude."""
+    errors = cases.vectors("error_{}_arcsec", "xyz")[:, :2]
+    parallax = cases.vectors(PARALLAX_TURN, "xy")
+    velocities = cases.vectors(OBSERVER_KM_S, "xyz")
+    if not np.isfinite(velocities).any():
+        raise TooFewCases("cases with an observer, such as [spacecraft] has, tell it", 0)
+    known = _finite_rows(errors) & _finite_rows(parallax) & _finite_rows(velocities)
+    case = np.flatnonzero(known)
+    _enough(case, "attitude")
+    turns = parallax[case]
+    q = cases.vectors("q{}", "wxyz")[case]
+    both = np.stack([turns, _aberrations_arcsec(q, velocities[case])], axis=2)
+    fit = _turn_fit(errors[case], both, case)
+    size_arcsec = math.sqrt(float((turns**2).sum(axis=1).mean()))
+    method = f"linear fit over turns of {size_arcsec:.2g} arcsec rms, Student's t"
+    return _turn_figure(fit, 0, require, method)
 
 
 # ---- single stars ----

@@ -6,12 +6,10 @@ Each figure has a one-sided limit on either side at the requirement's confidence
 shown**; a minimum the other way round. The limits:
 
 - rates by Clopper & Pearson (1934). Answers of one case go together, so their number is divided by
-  the design effect, the
-  variance between cases over the binomial one (Korn & Graubard 1998); where all or none are right,
-  cases are counted;
+  the design effect, the variance between cases over the binomial one (Korn & Graubard 1998); where
+  all or none are right, cases are counted;
 - quantiles (a time, or an error with `share`) by order statistics, free of any distribution. A case
-  that never had an attitude
-  has an infinite time;
+  that never had an attitude has an infinite time;
 - what answers carry beside the attitude as answer_figures.py has it;
 - a bias by Student's t, across the boresight the larger of x and y;
 - a sigma by chi-square where the errors pass for Gaussian (kurtosis at 1 %), else by the bootstrap

@@ -76,11 +76,13 @@ class RunBeforeSky:
     sending: threading.Event = field(default_factory=threading.Event)
     turning: threading.Event = field(default_factory=threading.Event)
     turned_rad: float = 0.0
+    packets: int = 0
 
     def stand_still(self) -> None:
         """Turn back to Orion, whose belt is in the middle, and no further."""
         self.turning.clear()
-        time.sleep(5 * PACKET_S)  # for the packet that is being made
+        made = self.packets + 1  # the one that is being made may turn
+        wait_for(lambda: self.packets > made, "two packets", PACKET_S)
         self.turned_rad = 0.0
 
     def q(self) -> tuple[float, float, float, float]:
@@ -104,6 +106,7 @@ def sky(folder: Path, *options: str) -> Iterator[RunBeforeSky]:
                 if shown.sending.is_set():
                     shown.turned_rad += TURN_RAD if shown.turning.is_set() else 0.0
                     sender.send(packet(next(numbers), time.monotonic_ns(), shown.q(), rate=None))
+                    shown.packets += 1
 
             with repeating(send, PACKET_S):
                 yield shown
@@ -150,6 +153,19 @@ def pictures_in_a_second(page: Browser) -> int:
     return page.run_async(COUNT_PICTURES)
 
 
+def await_attitude(page: Browser, run: RunBeforeSky) -> None:
+    """Until the page shows a sky that stands still: its numbers, and two pictures alike."""
+    ra_deg = hilstar.basics.rotation.to_radec_roll_deg(np.array(run.q()))[0]
+    page.until(f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {ra_deg}) < 1e-4")
+
+    def stands_still() -> bool:
+        first, shown = frame_on_page(page), pixels(page, "picture")
+        page.until(f"document.getElementById('picture').dataset.frame > {first}")
+        return pixels(page, "picture") == shown
+
+    wait_for(stands_still, "two pictures alike")
+
+
 def run_events(run: RunBeforeSky) -> list[EventRecord]:
     return read_events(run.folder / "run.mcap")
 
@@ -175,13 +191,7 @@ def test_single_pixels_have_the_codes_of_that_attitude(live, run):
     with hilstar.load(run.folder / "serve.toml") as bench:
         codes = bench.frame(np.array(run.q())).codes
     y, x = np.unravel_index(np.argmax(codes), codes.shape)
-    shown_deg = hilstar.basics.rotation.to_radec_roll_deg(np.array(run.q()))[0]
-    live.until(
-        f"Math.abs(parseFloat(document.getElementById('ra').textContent) - {shown_deg}) < 1e-4"
-    )
-    first = frame_on_page(live)
-    live.until(f"document.getElementById('picture').dataset.frame > {first}")
-    time.sleep(1)  # until the pictures that were on their way have come
+    await_attitude(live, run)
     ActionChains(live).send_keys("0", "h", "9").perform()
     ActionChains(live).move_to_element(live.find("#picture")).perform()
     live.until("document.getElementById('pixel').textContent.includes('code')")
@@ -202,14 +212,13 @@ TURNED_RAD = 0.02  # 34 px: pixels are 40 times as large, so that an unfollowed 
 
 def test_single_pixels_follow_their_star_until_a_person_moves_them(live, run):
     run.stand_still()
-    time.sleep(1)  # until the pictures that were on their way have come
+    await_attitude(live, run)
     ActionChains(live).send_keys("0", "9").perform()
     live.until("document.getElementById('picture-text').textContent.includes('follows')")
     followed = live.text("#picture-text").partition("follows ")[2]
     run.turned_rad = TURNED_RAD
-    first = frame_on_page(live)
-    time.sleep(1)
-    assert frame_on_page(live) > first and live.run(MIDDLE_LIT)
+    await_attitude(live, run)
+    assert live.run(MIDDLE_LIT)
     assert live.text("#picture-text").endswith(f"follows {followed}")
     live.find("#picture").click()
     ActionChains(live).send_keys(Keys.ARROW_RIGHT).perform()
@@ -265,9 +274,10 @@ def assert_overlay(page: Browser, before: str, same: bool) -> None:
     wait_for(lambda: (pixels(page, "overlay") == before) == same, f"the overlay as before: {same}")
 
 
-def test_every_overlay_can_be_switched_by_its_key_and_by_its_button(live):
+def test_every_overlay_can_be_switched_by_its_key_and_by_its_button(live, run):
+    run.stand_still()  # then all stars' places, which come beside pictures, are alike
+    await_attitude(live, run)
     ActionChains(live).send_keys("h").perform()
-    time.sleep(0.3)  # the truth of the picture that is held comes beside it
     for key, name in (
         ("n", "names"),
         ("m", "magnitudes"),

@@ -25,7 +25,7 @@ from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.config.hardware import Monitor
 from hilstar.server.bench.monitor import bench_calibration
-from tests.support.any_bench.draw import DrawnBench, true_light
+from tests.support.any_bench.draw import DrawnBench, Panel, true_light
 
 STEPS = (
     "orientation",
@@ -264,12 +264,18 @@ def comparisons(drawn: DrawnBench, folder: Path, steps: Mapping[str, Any]) -> di
     return compared
 
 
+def planted_black(panel: Panel) -> float:
+    """The light of code 0 relative to that of white above it, as `photometry` states it."""
+    light = true_light(panel)
+    return float(light[0] / (light[-1] - light[0]))
+
+
 def _response(drawn: DrawnBench, folder: Path, figures: Mapping[str, Any]) -> dict[str, Comparison]:
     """The response by its largest error in sigmas, decade by decade, and the black level."""
     bench = read_bench_file(folder / "bench.toml")
     response = bench_calibration(bench.config, bench.folder).response
     planted = true_light(drawn.panel)
-    black = float(planted[0] / planted[-1])
+    black = planted_black(drawn.panel)
     true = (planted - planted[0]) / (planted[-1] - planted[0])
     worst = Comparison(math.nan, 0.0)
     for decade in DECADES:

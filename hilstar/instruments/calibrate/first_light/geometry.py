@@ -487,7 +487,8 @@ def geometry(context: StepContext) -> StepOutcome:
     first = first_dots(context.seen_screen)
     paths, observed = _frames_of(context, first, 0, code, dark)
     rough = rough_geometry(context.file, first, observed)
-    second = plan_seen_dots(rough, FRAMES, lit_for(rough), np.random.default_rng(PLAN_SEED))
+    rng = np.random.default_rng(PLAN_SEED)
+    second = plan_seen_dots(rough, FRAMES, lit_for(rough), rng, beside=first)
     more_paths, more_seen = _frames_of(context, second, first.frames, code, dark)
     plan = joined(first, second)
     paths = [*paths, *more_paths]

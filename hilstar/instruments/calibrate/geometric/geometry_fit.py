@@ -131,8 +131,8 @@ class Calibrated:
     @property
     def held_out_noise_arcsec(self) -> float:
         """The rms that noise alone would give held-out dots."""
-        count = np.bincount(self.data.dot)
-        # of a dot's mean, along both axes
+        count = np.bincount(self.problem.sites(self.data))
+        # of the mean of a place's dots, along both axes
         share2 = 2 * np.mean(1 / count[count > 0])
         return float(np.sqrt(share2) * self.noise_arcsec)
 

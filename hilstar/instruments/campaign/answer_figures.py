@@ -38,7 +38,12 @@ from hilstar.instruments.campaign.cases import (
     STAR_LISTS,
     Q,
 )
-from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, drawn_limits
+from hilstar.instruments.campaign.figures import (
+    BoundedFigure,
+    TooFewCases,
+    drawn_limits,
+    lowest_size,
+)
 from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, PARALLAX, Require
 from hilstar.instruments.campaign.planted import aberration_rad
 from hilstar.instruments.campaign.star_motion import (
@@ -209,10 +214,11 @@ def _size(fits: list[CaseFit], column: int, confidence: float, method: str) -> B
     upper = stats.t.ppf(confidence, freedom)
     # Bonferroni: of several axes any one may be the larger
     doubt = (1 - confidence) / len(size)
-    lower = stats.t.ppf(1 - doubt, freedom)
-    lowest = size - lower * sigma
+    low = max(
+        lowest_size(*axis, doubt)
+        for axis in zip(size.tolist(), sigma.tolist(), freedom.tolist(), strict=True)
+    )
     highest = size + upper * sigma
-    low = max(float(lowest.max()), 0.0)
     high = float(highest.max())
     largest = float(size.max())
     return BoundedFigure(largest, low, high, fits[0].cases, method)

@@ -41,6 +41,7 @@ from hilstar.instruments.campaign.figures import (
     TooFewCases,
     clopper_pearson,
     drawn_limits,
+    lowest_size,
     quantile_limits,
     sigma_limits,
 )
@@ -450,10 +451,11 @@ def _bias(mean: FloatArray, sigma: FloatArray, n: int, confidence: float) -> Bou
     upper = stats.t.ppf(confidence, n - 1)
     # Bonferroni: of several axes any one may be the larger
     doubt = (1 - confidence) / len(size)
-    lower = stats.t.ppf(1 - doubt, n - 1)
-    lowest = size - lower * standard
+    low = max(
+        lowest_size(axis_size, axis_standard, n - 1, doubt)
+        for axis_size, axis_standard in zip(size.tolist(), standard.tolist(), strict=True)
+    )
     highest = size + upper * standard
-    low = max(float(lowest.max()), 0.0)
     high = float(highest.max())
     largest = float(size.max())
     return BoundedFigure(largest, low, high, n, "Student's t")

@@ -21,6 +21,7 @@ from hilstar.instruments.campaign.cases import (
     FRAME_RATES,
     STAR_LISTS,
 )
+from hilstar.instruments.campaign.figures import lowest_size
 from hilstar.instruments.campaign.plan import Require
 from hilstar.instruments.campaign.planted import aberration_rad
 from hilstar.instruments.campaign.requirements import (
@@ -42,6 +43,8 @@ COVERED, TRIES = 0.95, 200
 MIN_HELD = 180
 # binomial: of 1000 intervals at 95 %, 927 and fewer hold once in 1000
 HEAVY_TRIES, MIN_HEAVY_HELD = 1000, 928
+# three sigmas of a binomial count
+SIZE_TRIES, SIZE_BAND = 4000, 42
 # binomial: of 800 tries at 5 %, over 59 are met once in 1000
 JITTER_TRIES, MAX_JITTER_MET = 800, 59
 
@@ -154,6 +157,15 @@ def test_one_value_a_case_has_the_covariance_of_a_mean(rng: np.random.Generator)
     assert fit.value == pytest.approx([values.mean()])
     assert fit.covariance[0, 0] == pytest.approx(values.var(ddof=1) / 6)
     assert fit.freedom == pytest.approx([5.0])
+
+
+def test_the_size_of_nothing_is_shown_in_one_of_twenty(rng: np.random.Generator) -> None:
+    """A figure of 0 may be seen with either sign, and counts as shown by its size."""
+    seen = np.abs(rng.standard_normal(SIZE_TRIES))
+    shown = sum(lowest_size(size, 1.0, math.inf, 0.05) > 0 for size in seen.tolist())
+    assert abs(shown - 0.05 * SIZE_TRIES) <= SIZE_BAND
+    # far from 0 the other sign does not count: the limit is the one-sided one
+    assert lowest_size(10.0, 1.0, 20.0, 0.05) == pytest.approx(10 - stats.t.ppf(0.95, 20))
 
 
 def test_limits_hold_where_a_few_cases_weigh_most(rng: np.random.Generator) -> None:

@@ -20,6 +20,8 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 
+FAR_NS = 10**15  # 12 days: further frames weigh nothing, and differences of these are exact
+
 
 class FrameLight(NamedTuple):
     """When a frame is lit, host time, ns.
@@ -55,7 +57,7 @@ def lit_times_ns(
     counts for none.
     """
     rows = np.array([(frame.begin_ns, frame.whole_ns) for frame in frames], dtype=np.int64)
-    begins, wholes = np.clip(rows - begin_ns, -_FAR_NS, _FAR_NS).astype(np.float64).T
+    begins, wholes = np.clip(rows - begin_ns, -FAR_NS, FAR_NS).astype(np.float64).T
     length_ns = float(end_ns - begin_ns)
     from_ns = np.clip(wholes, 0.0, length_ns)
     ends = np.append(wholes[1:], float(gone_ns - begin_ns))
@@ -71,9 +73,6 @@ def lit_times_ns(
     lit_ns[:-1] -= passed_ns
     lit_ns[1:] += passed_ns
     return np.asarray(lit_ns)
-
-
-_FAR_NS = 10**15  # 12 days: further frames weigh nothing, and differences of these are exact
 
 
 def _risen_ns(t_ns: FloatArray, begins_ns: FloatArray, ends_ns: FloatArray) -> FloatArray:

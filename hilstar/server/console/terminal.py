@@ -119,6 +119,8 @@ def report(summary: "RunSummary", as_json: bool) -> None:
     packets = summary.packets
     stars = summary.stars_drawn
     clipped = summary.clipped
+    clipped_names = [*clipped.bodies]
+    clipped_names += [f"HIP {hip}" for hip in clipped.hip]
     refused = ", ".join(
         f"{reason} {count}" for reason, count in packets.refused_by.items() if count
     )
@@ -138,9 +140,7 @@ def report(summary: "RunSummary", as_json: bool) -> None:
         "attitude age": f"{spread(summary.attitude_age_ms)} ms (p50 / p99 / max) at render",
         "stars drawn": (
             f"{figure(stars.mean, 0)} mean, {stars.max} max, {clipped.max} clipped"
-            + "".join(
-                f" {name}" for name in [*clipped.bodies, *(f"HIP {hip}" for hip in clipped.hip)][:5]
-            )
+            + "".join(f" {name}" for name in clipped_names[:5])
         ),
         "packets": f"{packets.received} received, {packets.refused} refused{turned_away}{lost}",
     }

@@ -6,10 +6,6 @@ environment's PYXEL is that one's Python.
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,9 +14,9 @@ import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import two_digits
-from hilstar.basics.errors import MachineError
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import BOLTZMANN_EV_PER_K, DetectorSettings
+from tests.support.beside.own_python import images_by
 from tests.support.beside.steps import Beside, Step
 
 SCRIPT = Path(__file__).with_name("pyxel_run.py")
@@ -47,7 +43,7 @@ SECONDS = 1.0
 
 def run(folder: Path, *, quick: bool = False) -> Beside:
     """Run Pyxel's chain and hilstar's on the same levels. Raises MachineError without Pyxel."""
-    images = pyxel_images(folder)
+    images = images_by("Pyxel", "pyxel-sim", SCRIPT, SCENARIO, folder)
     steps = (*transfer_steps(images), *prnu_steps(images), *dark_steps(images))
     version = str(images["version"])
     beside = Beside("Pyxel", version, "", steps)
@@ -57,27 +53,6 @@ def run(folder: Path, *, quick: bool = False) -> Beside:
         " doubles the light"
     )
     return Beside("Pyxel", version, finding, steps)
-
-
-def pyxel_images(folder: Path) -> dict[str, FloatArray]:
-    """Pyxel's images of the scenario."""
-    python = os.environ.get("PYXEL", sys.executable)
-    scenario, images = folder / "pyxel.json", folder / "pyxel.npz"
-    scenario.write_text(json.dumps(SCENARIO))
-    told = subprocess.run(
-        [python, str(SCRIPT), str(scenario), str(images)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if told.returncode:
-        last = told.stderr.strip().splitlines()[-1]
-        raise MachineError(
-            f"Pyxel does not run ({last}); pip install pyxel-sim in an environment of its own, and"
-            " give its Python as the environment's PYXEL"
-        )
-    with np.load(images) as found:
-        return dict(found)
 
 
 def settings(**keys: Any) -> DetectorSettings:

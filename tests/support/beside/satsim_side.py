@@ -7,10 +7,6 @@ that one's Python.
 
 from __future__ import annotations
 
-import json
-import os
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,10 +16,10 @@ from scipy.stats import ks_2samp
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import two_digits
-from hilstar.basics.errors import MachineError
 from hilstar.optics.psf import GaussianPsf
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
+from tests.support.beside.own_python import images_by
 from tests.support.beside.steps import Beside, Step
 
 SCRIPT = Path(__file__).with_name("satsim_run.py")
@@ -51,7 +47,7 @@ CHANCE_95 = 1.59
 
 def run(folder: Path, *, quick: bool = False) -> Beside:
     """Run SatSim's chain and hilstar's on the same levels. Raises MachineError without SatSim."""
-    images = satsim_images(folder)
+    images = images_by("SatSim", "satsim", SCRIPT, SCENARIO, folder)
     steps = (*transfer_steps(images), *well_steps(images), *star_steps(images))
     version = str(images["version"])
     variance = two_digits(100 * Beside("", "", "", steps).size(VARIANCE, "as both come"))
@@ -60,27 +56,6 @@ def run(folder: Path, *, quick: bool = False) -> Beside:
         " full well"
     )
     return Beside("SatSim", version, finding, steps)
-
-
-def satsim_images(folder: Path) -> dict[str, FloatArray]:
-    """SatSim's images of the scenario."""
-    python = os.environ.get("SATSIM", sys.executable)
-    scenario, images = folder / "satsim.json", folder / "satsim.npz"
-    scenario.write_text(json.dumps(SCENARIO))
-    told = subprocess.run(
-        [python, str(SCRIPT), str(scenario), str(images)],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if told.returncode:
-        last = told.stderr.strip().splitlines()[-1]
-        raise MachineError(
-            f"SatSim does not run ({last}); pip install satsim in an environment of its own, and"
-            " give its Python as the environment's SATSIM"
-        )
-    with np.load(images) as found:
-        return dict(found)
 
 
 def exposed(level_e: float, offset_dn: float, rng: np.random.Generator) -> FloatArray:

@@ -12,6 +12,8 @@ limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
 certify.csv is `python tools/certify_coverage.py -o`, and intervals.csv is `python
 tools/interval_coverage.py -o`; no machine changes them.
 beside_*.csv are `python tools/beside.py NAME -o DIR`, and no machine changes them.
+any_bench.csv is the any_bench_outcomes.csv of `python tools/any_bench.py --benches 100 --seed 405
+-o DIR`; the load of the machine changes how many runs miss frames, and nothing else.
 confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine
 changes it.
 """
@@ -26,6 +28,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from hilstar.basics.charts import two_digits
+from hilstar.instruments.campaign.figures import clopper_pearson
 from hilstar.instruments.study import limits
 from hilstar.instruments.study.chain.answers import STEP_WORDS, Answer, Given, answer, scenes_of
 from hilstar.instruments.study.chain.measuring import CombinationRow, ErrorPart
@@ -35,6 +38,23 @@ ROOT = HERE.parent
 COUNTS = (100, 1000, 10_000, 50_000)
 OTHERS = ("numpy", "numba", "photutils", "galsim")
 TIMED_DEG_S = 2.0
+# As tools/any_bench.py names them, the best first; those that a person accepts are the first.
+GOOD_BENCH_OUTCOMES = (
+    "calibrated and verified",
+    "calibrated and verified, run missed frames",
+    "calibrated, star too wide",
+    "refused",
+)
+BENCH_OUTCOMES = (
+    *GOOD_BENCH_OUTCOMES,
+    "calibrated, not verified",
+    "step failed",
+    "failed later",
+    "over 2 GB",
+    "wrong figure",
+    "traceback",
+)
+MAX_BENCH_SIGMAS = 4.0
 
 
 def rows_of(name: str) -> list[dict[str, str]]:
@@ -576,7 +596,57 @@ def motion_table() -> str:
     return table(head, body)
 
 
+# of each end: 95 % in all
+INTERVAL_CONFIDENCE = 0.975
+BENCH_STEPS = {
+    "focus": "focus: PSF sigma",
+    "warm-up": "warm-up: drift",
+    "geometry": "geometry: places, rms",
+    "uniformity": "uniformity: light, rms",
+    "photometry": "photometry: worst of 1e-1, 1e-2, 1e-3 of white",
+    "black": "photometry: black level",
+    "scale": "scale: light of white",
+    "latency": "latency: the panel's delay",
+}
+
+
+def share_text(count: int, of: int) -> str:
+    """A share in per cent with its 95 % interval (Clopper and Pearson 1934)."""
+    low, high = clopper_pearson(count, of, INTERVAL_CONFIDENCE)
+    return f"{100 * count / of:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+
+
+def any_bench_table() -> str:
+    """How benches by chance ended, the best first, and how many ended well."""
+    rows = rows_of("any_bench.csv")
+    outcomes = [row["outcome"] for row in rows]
+    body = []
+    for outcome in BENCH_OUTCOMES:
+        count = outcomes.count(outcome)
+        if count:
+            body.append([outcome, str(count), share_text(count, len(rows))])
+    good = sum(outcome in GOOD_BENCH_OUTCOMES for outcome in outcomes)
+    body.append(["**calibrated, or refused for a reason**", str(good), share_text(good, len(rows))])
+    return table(["outcome", f"of {len(rows)} benches", "share, 95 %"], body)
+
+
+def any_bench_errors_table() -> str:
+    """Each step's figure against the plant, in its own errors."""
+    rows = rows_of("any_bench.csv")
+    body = []
+    for step, name in BENCH_STEPS.items():
+        sigmas = [float(row[f"{step}_sigmas"]) for row in rows if row[f"{step}_sigmas"]]
+        sizes = sorted(abs(value) for value in sigmas)
+        rms = math.sqrt(sum(value**2 for value in sizes) / len(sizes))
+        over = sum(value > MAX_BENCH_SIGMAS for value in sizes)
+        body.append([name, str(len(sizes)), f"{rms:.2f}", f"{sizes[-1]:.1f}", str(over)])
+    head = ["figure", "benches", "off by, rms of its errors", "largest", "over 4 errors"]
+    return table(head, body)
+
+
 TABLES = {
+    "any_bench": any_bench_table,
+    "any_bench_errors": any_bench_errors_table,
     **{f"beside_{name}": partial(beside_table, name) for name in BESIDE},
     "rigs": rigs_table,
     "answers": answers_table,

@@ -6,7 +6,7 @@ Each bench is drawn over what labs have, with a truth of which its bench file kn
 It goes through `first-light --virtual`, `verify`, `certify --quick`, 20 seconds of `serve
 --headless` with a stream,
 and `assess` of the virtual tracker's answers. DIR has a folder of each bench, any_bench.csv with a
-row of each, and the chart. The smallest benches come first. The same command goes on where it was
+row of each, any_bench_outcomes.csv with the columns that results/ keeps, and the chart. The smallest benches come first. The same command goes on where it was
 stopped; a larger N adds benches.
 """
 
@@ -39,6 +39,37 @@ from tests.support.any_bench.judge import (
 from tests.support.any_bench.run import LIMIT_S, run_bench
 
 HEAD, TABLE, CHART = "any_bench.json", "any_bench.csv", "any_bench"
+# What results/tables.py takes, without the words of each step: results/any_bench.csv.
+OUTCOME_TABLE = "any_bench_outcomes.csv"
+OUTCOME_COLUMNS = (
+    "bench",
+    "outcome",
+    "words",
+    "pixel_ratio",
+    "seen",
+    "panel_kind",
+    "panel_size_px",
+    "panel_pitch_um",
+    "panel_bits",
+    "panel_law",
+    "detector_size_px",
+    "detector_pitch_um",
+    "detector_focal_mm",
+    "detector_psf_px",
+    "collimator_mm",
+    "focus_sigmas",
+    "warm-up_sigmas",
+    "geometry_sigmas",
+    "uniformity_sigmas",
+    "photometry_sigmas",
+    "black_sigmas",
+    "scale_sigmas",
+    "latency_sigmas",
+    "first-light_cpu_s",
+    "memory_mb",
+    "serve_missed",
+    "serve_load",
+)
 COLOURS = {
     VERIFIED: GREEN,
     BUSY: GREEN,
@@ -96,6 +127,7 @@ def main() -> None:
         rows.append(row)
         rows.sort(key=lambda one: int(one["bench"]))
         write_table(output / TABLE, rows)
+        write_table(output / OUTCOME_TABLE, [outcome_row(row) for row in rows])
         print(f"{number:4}  {row['outcome']}: {row['words']}"[:200], flush=True)
     draw(output / CHART, rows, given.note)
     for outcome in OUTCOMES:
@@ -114,6 +146,15 @@ def check_head(path: Path, seed: int) -> None:
     if path.exists() and (its := json.loads(path.read_text())["seed"]) != seed:
         sys.exit(f"{path.parent}: its benches are of seed {its}; write --seed {its}, or another -o")
     path.write_text(json.dumps({"seed": seed}))
+
+
+def outcome_row(row: dict[str, Any]) -> dict[str, Any]:
+    """The row of a bench for results/, its figures to six digits."""
+    shown = {}
+    for column in OUTCOME_COLUMNS:
+        value = row.get(column)
+        shown[column] = f"{value:.6g}" if isinstance(value, float) else value
+    return shown
 
 
 def write_table(path: Path, rows: list[dict[str, Any]]) -> None:

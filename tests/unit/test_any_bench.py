@@ -41,6 +41,8 @@ from tests.support.any_bench.judge import (
 
 DRAWN = 60
 WIDE = "a star is 6.5 times as wide as the sky's (limit [verify] star_sigma_ratio = 2)"
+OFF = "centroids are 0.121 px off at 95 % (limit 0.1)"
+BY_CODES = "the codes alone cost 0.013 mag and 0.120 px at 95 %"
 # The plant is read back from files whose numbers are written in full.
 EXACT = 1e-6
 
@@ -171,6 +173,24 @@ PASSED = {"passed": True, "reasons": []}
             {
                 FIRST_LIGHT: result(session_of(verify="failed"), 1),
                 VERIFY: result({"reasons": [WIDE, "flux is off"]}),
+            },
+            {},
+            judge.FAILED,
+            "verify said so",
+        ),
+        (
+            {
+                FIRST_LIGHT: result(session_of(verify="failed"), 1),
+                VERIFY: result({"reasons": [OFF, BY_CODES, WIDE]}),
+            },
+            {},
+            judge.TOO_WIDE,
+            "star_sigma_ratio",
+        ),
+        (
+            {
+                FIRST_LIGHT: result(session_of(verify="failed"), 1),
+                VERIFY: result({"reasons": [OFF, WIDE]}),
             },
             {},
             judge.FAILED,

@@ -65,6 +65,8 @@ TOO_FEW_ANSWERS = (
     "answers fall into the run, and",
 )
 WIDE_STAR = "star_sigma_ratio"
+# Of a wide pixel the codes' own error is large in tracker pixels, and so is that of places.
+BY_CODES, OFF_PLACES = "the codes alone cost", "centroids are"
 FIRST_LIGHT, VERIFY, CERTIFY, SERVE, SEND, TRACKER, ASSESS = COMMANDS = (
     "first-light",
     "verify",
@@ -390,12 +392,13 @@ def _afterwards(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
     reasons = _reasons(results)
     if later == [ASSESS] and reasons:
         # A tracker before stars so wide sees few of them, or none, and `verify` said so.
-        return TOO_WIDE, reasons[0]
+        return TOO_WIDE, reasons[-1]
     if later == [ASSESS] and _is_short_of_frames(results):
         return BUSY, results[ASSESS].last_line + _load_of(results[SERVE])
     if later:
         return LATER, "; ".join(f"{name}: {results[name].last_line}" for name in later)
-    return (TOO_WIDE, reasons[0]) if reasons else None
+    # the last of them is the wide star, with what would do
+    return (TOO_WIDE, reasons[-1]) if reasons else None
 
 
 def _load_of(result: CommandResult) -> str:
@@ -419,8 +422,15 @@ def _reasons(results: Mapping[str, CommandResult]) -> list[str]:
 
 
 def only_wide(reasons: list[str]) -> bool:
-    """Whether all that is against a bench is its wide star, which was said before it was built."""
-    return bool(reasons) and all(WIDE_STAR in reason for reason in reasons)
+    """Whether all that is against a bench is its wide star, which was said before it was built,
+    and what codes do to one so wide.
+    """
+    others = [reason for reason in reasons if WIDE_STAR not in reason]
+    if not others:
+        return bool(reasons)
+    is_by_codes = any(BY_CODES in reason for reason in others)
+    is_known = all(BY_CODES in reason or reason.startswith(OFF_PLACES) for reason in others)
+    return len(others) < len(reasons) and is_by_codes and is_known
 
 
 def row_of(drawn: DrawnBench, folder: Path, results: Mapping[str, CommandResult]) -> dict[str, Any]:

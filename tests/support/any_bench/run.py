@@ -83,14 +83,14 @@ def _all_results(drawn: DrawnBench, folder: Path, limit_s: float) -> dict[str, C
     if not steps or any(verdict == "failed" for name, verdict in steps.items() if name != "verify"):
         return results
     results[VERIFY] = _result(folder, limit_s, VERIFY, "bench.toml", "--json")
-    shutil.rmtree(
-        folder / "certificate", ignore_errors=not (folder / RESULTS / f"{CERTIFY}.json").exists()
-    )
+    if not (folder / RESULTS / f"{CERTIFY}.json").exists():
+        shutil.rmtree(folder / "certificate", ignore_errors=True)
     results[CERTIFY] = _result(
         folder, limit_s, CERTIFY, "bench.toml", "-o", "certificate", *virtual, "--quick", "--json"
     )
     results |= _live_results(drawn, folder, limit_s)
-    if (folder / LEDGER).exists():
+    # The ledger of a bench that has ended is not kept, its result is.
+    if (folder / LEDGER).exists() or (folder / RESULTS / f"{ASSESS}.json").exists():
         results[ASSESS] = _result(folder, limit_s, ASSESS, LEDGER, "-o", "budget", "--json")
     return results
 

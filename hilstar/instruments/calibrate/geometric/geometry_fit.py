@@ -57,7 +57,7 @@ DEFAULT_NOISE_PX = 0.05
 MAX_MISFIT = 4.0
 # Windowed centroids of a Gaussian of 0.5 px are up to 0.009 px off by its place in a pixel, of
 # 0.44 px 0.018 px, of 0.37 px 0.038 px. That is taken off by the PSF that is stated or measured;
-# of one that is 15 % off a half stays.
+# of one that is 15 % off about a half stays.
 NARROW_DOT_PX = 0.5
 MISFIT_FLOOR_ARCSEC = 1.0
 ONE_POSE = (

@@ -506,7 +506,7 @@ def certify_table() -> str:
     return table(head, body)
 
 
-BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "stellarium")
+BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "satsim", "stellarium")
 
 
 def beside_table(name: str) -> str:

@@ -1,10 +1,11 @@
 """Count the verdicts of acceptances of a healthy virtual tracker, and how often intervals hold the
 truth.
 
-`python tools/accept_coverage.py RUNS -o FILE.csv [--seed S] [--bench FILE] [--plan FILE] [--whole]`
-runs the plan's acceptance RUNS times in this process, by the seeds from S on, with its cases of
---quick unless --whole. FILE.csv has a row for each clause of each run, written after the run; seeds
-that it has are left out, so the same command goes on where it was.
+`python tools/accept_coverage.py RUNS -o FILE.csv [--seed S] [--bench FILE] [--plan FILE] [--whole]
+[--keep DIR]` runs the plan's acceptance RUNS times in this process, by the seeds from S on, with
+its cases of --quick unless --whole. FILE.csv has a row for each clause of each run, written after
+the run; seeds that it has are left out, so the same command goes on where it was. DIR keeps the
+cases, so that another FILE.csv judges them again, as after a change of the figures.
 
 A healthy tracker's verdict is false where it is "not met". A harder count needs no limit: how often
 the whole interval lies beyond the truth (the tracker would be accused, were its limit the truth)
@@ -55,10 +56,11 @@ TRUTHS = {
     "aberration": 0.0,
     "proper-motion": 0.0,
     "catalogue-age": 0.0,
+    "parallax": 0.0,
     "star-colour": 0.0,
 }
 SIZES = ("bias",)  # a size of several axes, which runs do not tell by their mean
-SIGMAS = ("nea", "fov-error", "pixel-error", "rate-noise", "time-jitter", "star-noise")
+SIGMAS = ("nea", "rate-noise", "star-noise")
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +86,7 @@ def accepted(plan: Path, bench: Path, folder: Path, seed: int, whole: bool) -> l
     checked = read_acceptance_plan(seeded, bench, not whole, "tracker")
     acceptance = Acceptance(checked, bench, folder / "out", "centroids", 10.0)
     acceptance.check()
-    (folder / "out").mkdir()
+    (folder / "out").mkdir(exist_ok=True)
     return acceptance.verdicts(acceptance.run(run_here))
 
 
@@ -167,6 +169,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--bench", type=Path)
     parser.add_argument("--plan", type=Path, default=Path("ecss.toml"))
+    parser.add_argument("--keep", type=Path, help="a directory for the cases")
     parser.add_argument("--whole", action="store_true", help="all cases, not those of --quick")
     asked = parser.parse_args()
     output: Path = asked.output
@@ -182,6 +185,9 @@ def main() -> None:
         started_s = time.process_time()
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
+            if asked.keep is not None:
+                folder = asked.keep / f"seed-{seed}"
+                folder.mkdir(parents=True, exist_ok=True)
             bench = asked.bench or write_bench(folder)
             new = list(rows_of(seed, accepted(plan, bench, folder, seed, asked.whole)))
         with output.open("a", newline="") as file:

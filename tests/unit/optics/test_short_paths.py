@@ -22,6 +22,7 @@ from hilstar.optics.paths import (
     TRIED_AXES,
     Paths,
     ShortPaths,
+    _excess,
     _lens_table,
     _mapping,
     points_within,
@@ -226,3 +227,11 @@ def test_turns_about_every_axis_of_a_cube_are_tried():
     ways = [way for way in itertools.product((-1, 0, 1), repeat=3) if any(way)]
     tried = {way for axis in TRIED_AXES for way in (axis, tuple(-each for each in axis))}
     assert tried == set(ways)
+
+
+def test_the_error_that_is_tried_is_that_of_all_places_on_the_image():
+    """A parabola through the ends and the middle of an arc of 1.2 rad is far off; a straight way
+    of the smallest turn is not.
+    """
+    assert _excess(pinhole(200.0), 0.6, 3) > 10
+    assert _excess(pinhole(200.0), 1e-5, 3) < 1

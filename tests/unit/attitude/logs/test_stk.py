@@ -301,3 +301,15 @@ def test_a_sequence_that_is_none_is_refused(stk_log):
         ):
             stk_log(["0 1 2 3"], "AttitudeTimeEulerAngles", Sequence=sequence)
     assert "Sequence is missing" in refusal(stk_log, ["0 1 2 3"], "AttitudeTimeEulerAngles")
+
+
+@pytest.mark.parametrize(
+    ("form", "row", "scalar"),
+    [
+        ("AttitudeTimeQuaternions", "0 0 0 0 1", "scalar last (q1, q2, q3, q4)"),
+        ("AttitudeTimeQuatScalarFirst", "0 1 0 0 0", "scalar first"),
+    ],
+)
+def test_what_a_file_s_numbers_mean_is_said_by_its_form(stk_log, form, row, scalar):
+    found = stk_log([row, row.replace("0", "60", 1)], form)
+    assert found.conventions.scalar.startswith(scalar)

@@ -180,3 +180,11 @@ def test_another_kind_is_refused_for_its_crc_and_its_length():
     assert reason(whole[:-1]) == "format"
     assert reason(whole + b"\0") == "format"
     assert reason(bytes(36)) == "format"
+
+
+def test_a_packet_with_a_flipped_bit_tells_neither_what_was_sent_nor_of_no_attitude():
+    message = bytearray(packet())
+    message[20] ^= 1
+    event = decode(bytes(message))
+    assert event == Refusal("crc", event.detail)
+    assert (event.telling, event.unset) == (False, False)

@@ -573,29 +573,6 @@ def rigs_table() -> str:
     )
 
 
-def loop_table() -> str:
-    """What the demo's tracker has planted, and what is found of it."""
-    body = []
-    for row in rows_of("loop.csv"):
-        if row["run"] == "demo":
-            unit = row["unit"]
-            body.append([row["quantity"], f"{row['planted']} {unit}", f"{row['found']} {unit}"])
-    return table(["", "planted", "found"], body)
-
-
-def motion_table() -> str:
-    """The virtual tracker's own error by motion."""
-    body = []
-    for row in rows_of("motion.csv"):
-        rate_deg_s, scanout_ms = (float(row[name]) for name in ("rate_deg_s", "scanout_ms"))
-        motion = f"{rate_deg_s:g} deg/s" if rate_deg_s else "at rest"
-        lit = f"over {scanout_ms:.0f} ms" if scanout_ms else "at once"
-        x, y, z, mean = (figure(float(row[f"{name}_arcsec"])) for name in ("x", "y", "z", "mean_z"))
-        body.append([motion, lit, f"{x}, {y} arcsec", f"{z} arcsec", f"{mean} arcsec"])
-    head = ["motion", "rows are lit", "one sigma across", "about the boresight", "mean about it"]
-    return table(head, body)
-
-
 # of each end: 95 % in all
 INTERVAL_CONFIDENCE = 0.975
 BENCH_STEPS = {
@@ -641,6 +618,29 @@ def any_bench_errors_table() -> str:
         over = sum(value > MAX_BENCH_SIGMAS for value in sizes)
         body.append([name, str(len(sizes)), f"{rms:.2f}", f"{sizes[-1]:.1f}", str(over)])
     head = ["figure", "benches", "off by, rms of its errors", "largest", "over 4 errors"]
+    return table(head, body)
+
+
+def loop_table() -> str:
+    """What the demo's tracker has planted, and what is found of it."""
+    body = []
+    for row in rows_of("loop.csv"):
+        if row["run"] == "demo":
+            unit = row["unit"]
+            body.append([row["quantity"], f"{row['planted']} {unit}", f"{row['found']} {unit}"])
+    return table(["", "planted", "found"], body)
+
+
+def motion_table() -> str:
+    """The virtual tracker's own error by motion."""
+    body = []
+    for row in rows_of("motion.csv"):
+        rate_deg_s, scanout_ms = (float(row[name]) for name in ("rate_deg_s", "scanout_ms"))
+        motion = f"{rate_deg_s:g} deg/s" if rate_deg_s else "at rest"
+        lit = f"over {scanout_ms:.0f} ms" if scanout_ms else "at once"
+        x, y, z, mean = (figure(float(row[f"{name}_arcsec"])) for name in ("x", "y", "z", "mean_z"))
+        body.append([motion, lit, f"{x}, {y} arcsec", f"{z} arcsec", f"{mean} arcsec"])
+    head = ["motion", "rows are lit", "one sigma across", "about the boresight", "mean about it"]
     return table(head, body)
 
 

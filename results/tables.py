@@ -9,7 +9,8 @@ chain_budget.csv are written by `python tools/measure_answers.py`, and no machin
 loop.csv and motion.csv are `python tools/measure_loop.py`, and no machine changes motion.csv.
 rigs.csv is `hilstar study rigs -o DIR`, and no machine changes it.
 limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
-certify.csv is `python tools/certify_coverage.py -o`, which no machine changes.
+certify.csv is `python tools/certify_coverage.py -o`, and intervals.csv is `python
+tools/interval_coverage.py -o`; no machine changes them.
 beside_*.csv are `python tools/beside.py NAME -o DIR`, and no machine changes them.
 confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine
 changes it.
@@ -506,7 +507,17 @@ def certify_table() -> str:
     return table(head, body)
 
 
-BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "stellarium")
+def intervals_table() -> str:
+    """How often intervals of calibrations and assessments held the truth, by figure."""
+    body = []
+    for row in rows_of("intervals.csv"):
+        held, low, high = (float(row[f"{name}_percent"]) for name in ("held", "low", "high"))
+        share = f"{held:.1f} % ({low:.0f} to {high:.0f})"
+        body.append([f"`{row['kind']}`", row["figure"], row["trials"], share])
+    return table(["by", "interval of", "trials", "held the truth"], body)
+
+
+BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "satsim", "stellarium")
 
 
 def beside_table(name: str) -> str:
@@ -570,6 +581,7 @@ TABLES = {
     "rigs": rigs_table,
     "answers": answers_table,
     "certify": certify_table,
+    "intervals": intervals_table,
     "colour": colour_table,
     "colour_gamut": gamut_table,
     "colour_red": red_table,

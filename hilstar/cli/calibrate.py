@@ -367,6 +367,12 @@ def _focus_by_answers(
     from hilstar.instruments.calibrate.live_focus import follow_answers, headless_hold, still_sky
     from hilstar.server.answers.reader import open_answers
 
+    settings = file.config.answers
+    if settings is not None and settings.format in {"packet", "frame"}:
+        raise InputError(
+            f'--answers: [answers] format = "{settings.format}" carries no stars and so no widths;'
+            ' write "json" or a Python function, or give --grab CMD in place of it'
+        )
     q_icrs_to_cam = attitude_of("calibrate focus --answers", pointing, file.config.sky.epoch_jyear)
     with ExitStack() as stack:
         frames = None

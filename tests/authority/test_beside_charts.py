@@ -36,7 +36,15 @@ def test_a_recorded_run_is_written_as_it_was_and_its_chart_is_legible(path, tmp_
 
 def test_each_program_of_the_issue_has_a_recorded_run():
     programs = {recorded_rows(path)[0].program for path in RECORDED}
-    assert {"GalSim", "astrometry.net", "LOST", "Basilisk", "Pyxel", "Stellarium"} <= programs
+    assert {
+        "GalSim",
+        "astrometry.net",
+        "LOST",
+        "Basilisk",
+        "Pyxel",
+        "SatSim",
+        "Stellarium",
+    } <= programs
 
 
 def test_a_step_is_found_by_its_subject_and_first_words():

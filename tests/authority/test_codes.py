@@ -40,6 +40,7 @@ SRGB = srgb_response(8)
 LINEAR = table_response(8, np.linspace(0, 1, 256))
 STEP_E_PER_S = WHITE_E_PER_S / 255
 BETWEEN_STEPS, OVER_SIX_FRAMES = 42.5, 42.33
+OF_A_STEP = 0.02  # what a logarithm above and below 1 and the wings' cut differ by
 BEGINNINGS = 48  # of exposures, one frame after another: 49 152 of a field's stars
 # for the slopes of a fit; a hundredth of it changes no digit
 SLOPE_STEP_PX, FIT_ROUNDS = 1e-3, 3
@@ -151,13 +152,18 @@ def test_a_star_between_two_steps_is_half_a_step_off(field):
     """No codes of equal steps could do better."""
     panel = {"response": LINEAR, "rate_e_per_s": BETWEEN_STEPS * STEP_E_PER_S}
     off_mag = magnitudes_off(shown_light("exact", field, **panel), panel["rate_e_per_s"])
+    half_mag = 2.5 * np.log10(1 + 0.5 / BETWEEN_STEPS)
+    assert np.abs(off_mag) == pytest.approx(half_mag, rel=OF_A_STEP)
     holds("half-a-step", np.abs(off_mag).max())
 
 
 def test_over_six_frames_steps_are_shared(field):
     """A step over all frames of an exposure, wherever it begins."""
     panel = {"response": LINEAR, "rate_e_per_s": OVER_SIX_FRAMES * STEP_E_PER_S}
-    holds("step-of-six-frames", np.abs(exposures_mag(field, **panel)).max())
+    off_mag = np.abs(exposures_mag(field, **panel)).max()
+    step_mag = 2.5 * np.log10(1 + 1 / (6 * OVER_SIX_FRAMES))
+    assert off_mag < (1 + OF_A_STEP) * step_mag
+    holds("step-of-six-frames", off_mag)
 
 
 def test_the_worst_exposure_of_six_frames(field):

@@ -7,6 +7,7 @@ import pytest
 from hilstar.instruments.study import economy
 from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES, run
 from hilstar.tracker.centroiders import FAMILY
+from tests.support.recorded import assert_recorded
 from tests.support.tables import csv_rows
 
 
@@ -17,6 +18,12 @@ def economy_study(tmp_path_factory):
         patch.setattr(economy, "QUICK_ROUNDS", 1)  # no claim here is of a time
         lines, _ = run(folder, quick=True)
     return folder, lines, csv_rows(folder / "economy.csv")
+
+
+def test_the_page_s_errors_are_of_what_is_measured_now(economy_study):
+    figures = ("flux_max_mag", "claimed_mag", "claimed_px", *(f"max_px_{kind}" for kind in FAMILY))
+    keys = ("scene", "bits", "tolerance")
+    assert_recorded(economy_study[0] / "economy.csv", keys, figures)
 
 
 def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance(economy_study):

@@ -11,7 +11,9 @@ import pytest
 
 from hilstar.instruments.study import limits
 from hilstar.instruments.study.limits import StressLimit, limits_finding, run
+from tests.support.benches import ROOT
 from tests.support.pictures import assert_drawn
+from tests.support.recorded import assert_recorded
 from tests.support.tables import csv_rows
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
@@ -28,6 +30,13 @@ def limits_study(tmp_path_factory):
     return folder, lines, csv_rows(folder / "limits.csv")
 
 
+def test_the_page_s_table_is_of_what_is_measured_now(limits_study):
+    """Where a quick study has the same stress; the rest is finer."""
+    assert_recorded(
+        limits_study[0] / "limits.csv", ("method", "stress", "at"), ("error", "tolerance")
+    )
+
+
 def limit_rows(rows, stress):
     """The stress, the error, and where they meet, of one limit."""
     own = [row for row in rows if row["stress"] == stress]
@@ -38,9 +47,13 @@ def limit_rows(rows, stress):
 def test_the_place_where_a_method_leaves_its_tolerance_is_between_its_own_rows(limits_study):
     folder, lines, rows = limits_study
     assert_drawn(folder / "limits.png")
-    stresses = list(dict.fromkeys(row["stress"] for row in rows))
-    assert len(lines) == 1 + len(stresses) == 13
-    for stress in stresses:
+    assert len(lines) == 1 + len({row["stress"] for row in rows}) == 13
+    assert_meets_between_rows(rows)
+    assert_meets_between_rows(csv_rows(ROOT / "results" / "limits.csv"))
+
+
+def assert_meets_between_rows(rows):
+    for stress in dict.fromkeys(row["stress"] for row in rows):
         at, error, meets, tolerance = limit_rows(rows, stress)
         assert error[0] <= tolerance, f"{stress}: over the tolerance where it is easy"
         over = np.flatnonzero(error > tolerance)

@@ -24,6 +24,7 @@ from hilstar.instruments.study.timing import (
 from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
 from tests.support.pictures import assert_drawn
+from tests.support.recorded import assert_recorded
 from tests.support.tables import csv_rows
 
 GAIN = 20  # compensated against not: the issue's own figure
@@ -54,6 +55,11 @@ def timing_study(tmp_path_factory):
 @pytest.fixture(scope="module")
 def outcomes(timing_study):
     return {outcome.way: outcome for outcome in timing_study[2]}
+
+
+def test_the_page_s_table_is_of_what_is_measured_now(timing_study):
+    figures = ("rms_arcsec", "worst_arcsec")
+    assert_recorded(timing_study[0] / "timing.csv", ("way", "rate_deg_s"), figures)
 
 
 def test_compensation_leaves_a_twentieth_of_the_error_at_most(outcomes):

@@ -27,7 +27,8 @@ KEPT = 2000  # readings; the median streak and the curve are of these
 READ_NS = NS_PER_S // 2  # of answers in one figure
 MIN_WIDTHS = 3
 MEDIAN_ERROR = math.sqrt(math.pi / 2)  # of a median of normal values, over that of their mean
-NONE_AFTER = 10  # answers with stars, of which none has a width: this tracker reports none
+NONE_AFTER = 10  # answers of stars, of which none has a width: this tracker reports none
+NO_STARS = "the tracker reports no star"
 
 Source = Literal["images", "answers"]
 WHAT: dict[Source, str] = {"images": "PSF sigma", "answers": "star sigma"}
@@ -228,39 +229,50 @@ class AnswerWidths:
         self._widths_px: list[float] = []
         self._without = 0
         self._ever = False
+        self._has_seen = False  # a star, since the last reading
         self._first_ns: int | None = None
         self._begun_ns = 0
 
     @property
     def reports_none(self) -> bool:
-        """Whether none of the first NONE_AFTER answers with stars had a width."""
+        """Whether NONE_AFTER answers of stars came before any width."""
         return not self._ever and self._without >= NONE_AFTER
 
     def take(self, answer: Answer) -> FocusReading | None:
-        """Take an answer; the reading that it completes, or None. Nothing is read of a tracker
-        that reports no widths.
+        """Take an answer; the reading that it completes, or None.
+
+        A reading of no star has no figure. There is none of stars without widths.
         """
         widths_px = [star.width_px for star in answer.centroids if star.width_px is not None]
+        has_seen = bool(answer.centroids) or answer.q_icrs_to_cam is not None
         self._ever = self._ever or bool(widths_px)
-        if not self._ever:
-            self._without += bool(answer.centroids)
-            return None
+        self._without += has_seen and not widths_px
+        self._has_seen = self._has_seen or has_seen
+        self._widths_px += widths_px
         if self._first_ns is None:
             self._first_ns = self._begun_ns = answer.host_ns
-        self._widths_px += widths_px
         if answer.host_ns - self._begun_ns < READ_NS:
             return None
         self._begun_ns = answer.host_ns
-        t_s = (answer.host_ns - self._first_ns) / NS_PER_S
-        number = self.curve.count + 1
-        if len(self._widths_px) >= MIN_WIDTHS:
-            reading = FocusReading(number, t_s, 0, width_figure(self._widths_px))
-        else:
-            why = (
-                f"the tracker reports {len(self._widths_px)} widths of stars, {MIN_WIDTHS} at least"
-            )
-            reading = FocusReading(number, t_s, 0, None, f"{why} are needed")
+        reading = self._reading((answer.host_ns - self._first_ns) / NS_PER_S)
         self._widths_px = []
+        self._has_seen = False
+        if reading is None:
+            return None
         self.curve.add(reading)
-        self.state = self.curve.state()
+        if self._ever:
+            self.state = self.curve.state()
         return reading
+
+    def _reading(self, t_s: float) -> FocusReading | None:
+        """The reading of the widths so far; None of stars without widths."""
+        number = self.curve.count + 1
+        count = len(self._widths_px)
+        if count >= MIN_WIDTHS:
+            return FocusReading(number, t_s, 0, width_figure(self._widths_px))
+        if not self._has_seen:
+            return FocusReading(number, t_s, 0, None, NO_STARS)
+        if not self._ever:
+            return None
+        why = f"the tracker reports {count} widths of stars, {MIN_WIDTHS} at least are needed"
+        return FocusReading(number, t_s, 0, None, why)

@@ -60,6 +60,9 @@ fetch("/control/blank", request).then((answer) => done(answer.status));
 """
 # On request alone, and until it is ended.
 SCENARIO = '[[fault]]\nname = "ghost"\nkind = "false-star"\nradec_deg = [84.0, -1.0]\nv_mag = 2.0\n'
+HEARS_RUN = (
+    "document.body.dataset.silent === 'false' && document.getElementById('picture').dataset.frame"
+)
 ALL_DISABLED = (
     "[...document.querySelectorAll('.controls-panel :is(button, input, select)')].every((field) =>"
     " field.disabled)"
@@ -129,13 +132,11 @@ def run(tmp_path_factory) -> Iterator[RunBeforeSky]:
 
 @pytest.fixture
 def live(page, run) -> Browser:
-    """The page, green."""
+    """The page, with a picture: where frames are late it is not green, and shows all the same."""
     run.sending.set()
     run.turning.set()
     page.get(run.url)
-    page.until(
-        "document.body.dataset.ok === 'true' && document.getElementById('picture').dataset.frame"
-    )
+    page.until(HEARS_RUN)
     page.run("scrollTo(0, 0)")
     return page
 
@@ -379,6 +380,7 @@ new MutationObserver(() => {
 
 def red_after_stale_ms(page: Browser, run: RunBeforeSky) -> float:
     """How long after the run has found its attitude stale the page is red."""
+    page.until("document.body.dataset.ok === 'true'")
     page.run(RED_AFTER)
     silent_ns = time.monotonic_ns()
     run.sending.clear()
@@ -410,26 +412,30 @@ def events_of(run: RunBeforeSky, kind: str, count: int = 1) -> list[EventRecord]
     return [record for record in run_events(run) if record.kind == kind]
 
 
+def await_switch(page: Browser, name: str, on: bool) -> None:
+    """Until the run has it so, and its answer is told: a later one would stand over the next's."""
+    pressed = f"document.getElementById('control-{name}').getAttribute('aria-pressed')"
+    page.until(f"{pressed} === '{str(on).lower()}'")
+    told = f"{name.capitalize()} {'on' if on else 'off'}."
+    page.until(f"document.getElementById('control-said').textContent === '{told}'")
+
+
 def test_controls_act_and_the_ledger_says_who(live, run):
     live.run(HOLD_CONFIRMATION)
     name = live.find("#operator-name")
     name.clear()
     name.send_keys("Ada Løve", Keys.TAB)
     for control in ("crosshair", "grid", "patch", "pause"):
-        live.press(f"#control-{control}")
-        live.until(
-            f"document.getElementById('control-{control}').getAttribute('aria-pressed') === 'true'"
-        )
-        live.press(f"#control-{control}")
-        live.until(
-            f"document.getElementById('control-{control}').getAttribute('aria-pressed') === 'false'"
-        )
+        for on in (True, False):
+            live.press(f"#control-{control}")
+            await_switch(live, control, on)
     live.press("#control-blank")
     assert live.text("#control-blank") == "Press again: blank"
     live.press("#control-blank")
-    live.until("document.getElementById('control-blank').getAttribute('aria-pressed') === 'true'")
+    await_switch(live, "blank", True)
     live.until("document.getElementById('picture-operator').textContent.includes('blank')")
     live.press("#control-blank")
+    await_switch(live, "blank", False)
     live.find("#mark-text").send_keys("<b>shutter</b> open", Keys.ENTER)
     live.until("document.getElementById('control-said').textContent === 'Mark written.'")
     live.until("document.getElementById('events').textContent.includes('<b>shutter</b> open')")
@@ -500,7 +506,7 @@ def test_who_asks_for_less_motion_gets_fewer_pictures_and_no_transitions(page, r
 def test_without_control_the_page_only_shows(page, tmp_path):
     with sky(tmp_path) as shown:
         page.get(shown.url)
-        page.until("document.body.dataset.ok === 'true'")
+        page.until(HEARS_RUN)
         assert page.run(f"return {ALL_DISABLED}")
         assert (
             "--control" in page.text("#controls-note")

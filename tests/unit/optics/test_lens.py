@@ -132,3 +132,11 @@ def test_the_shader_s_map_of_a_lens_runs_from_edge_to_edge_of_the_image():
             lens = np.ravel(camera.tangents(*place))
             pinhole = np.ravel(PINHOLE.tangents(*place))
             np.testing.assert_allclose(shifts[row, column], lens - pinhole, rtol=1e-6)
+
+
+def test_a_lens_that_folds_inside_and_opens_again_at_the_edge_is_refused():
+    """r (1 - 260 r^2 + 26000 r^4) falls from r = 0.043 to 0.064: the zeros of 1 - 780 r^2 + 130000
+    r^4. The image reaches to 0.18.
+    """
+    lens = Lens((-260.0, 26_000.0, 0.0))
+    assert "folds" in refusal(bounded, replace(PINHOLE, lens=lens), MARGIN_PX)

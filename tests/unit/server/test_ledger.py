@@ -27,6 +27,7 @@ from hilstar.cli.options import parse_split
 from hilstar.server.bench.config import AttitudeSettings
 from hilstar.server.record.ledger import (
     MAX_WAITING_BYTES,
+    FloodFilter,
     Ledger,
     LedgerQueue,
     LedgerSwitch,
@@ -406,3 +407,11 @@ def test_refused_packets_are_counted_by_reason(tmp_path, kept_bench):
     assert len(whole) == 40
     assert counted == {"crc": 380, "norm": 80}
     assert max(len(each["raw"]) for each in whole) == 2048
+
+
+def test_a_flood_of_one_reason_leaves_the_first_packets_of_another():
+    flood = FloodFilter()
+    kept = [flood.keeps("packet", "crc", 0) for _ in range(100)]
+    assert sum(kept) == 20  # of a burst
+    assert flood.keeps("packet", "norm", 0)
+    assert flood.counted() == {("packet", "crc"): 80}

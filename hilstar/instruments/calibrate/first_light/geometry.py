@@ -496,7 +496,13 @@ def geometry(context: StepContext) -> StepOutcome:
     ideal = context.file.config.tracker.distortion is None
     centroids = observed.joined(more_seen)
     context.stage(f"fits lenses to {len(centroids)} centroids")
-    calibrated = calibrate_seen(context.file, plan, centroids, tracker_is_ideal=ideal)
+    calibrated = calibrate_seen(
+        context.file,
+        plan,
+        centroids,
+        tracker_is_ideal=ideal,
+        psf_sigma_px=context.agreed_psf_sigma_px,
+    )
     output = context.session / "geometry.toml"
     picture = context.session / "geometry.svg"
     write_calibrated(output, calibrated, picture, context.source.monitor)
@@ -565,10 +571,7 @@ def _frames_of(
         paths.append(context.take(Pattern(f"frame_{first + frame:03}", codes)))
     size_px = context.file.config.tracker.resolution_px
     context.stage(f"measures the dots of {len(paths)} images")
-    # the window by the bench file, as the dots were planned; the S-curve by the measured PSF
-    seen = replace(context.seen_screen, psf_sigma_px=context.psf_sigma_px)
-    sigma_px = dot_sigma_px(context.file)
-    return paths, measure_images(paths, dark, size_px, sigma_px, seen.dot_shape)
+    return paths, measure_images(paths, dark, size_px, dot_sigma_px(context.file))
 
 
 def _ends_of(found: Calibrated) -> tuple[FittedFigure, ...]:

@@ -20,6 +20,7 @@ from hilstar.basics.version import __version__
 from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.geometric import fit as fits
+from hilstar.instruments.calibrate.geometric.dot_shape import SMOOTH_PSF_PX
 from hilstar.instruments.calibrate.geometric.dots import MIN_DOTS, DotPlan, SeenScreen, read_plan
 from hilstar.instruments.calibrate.geometric.match import (
     FirstLook,
@@ -164,17 +165,27 @@ def calibrate_files(
         observed_dots = read_observed(observed[0])
     else:
         resolution_px = config.tracker.resolution_px
-        shape = seen_screen_of(file).dot_shape
-        observed_dots = measure_images(observed, dark, resolution_px, dot_sigma_px(file), shape)
+        observed_dots = measure_images(observed, dark, resolution_px, dot_sigma_px(file))
     return calibrate_seen(file, dots, observed_dots, tracker_is_ideal=tracker_is_ideal)
 
 
 def calibrate_seen(
-    file: BenchFile, plan: DotPlan, seen: Observed, *, tracker_is_ideal: bool
+    file: BenchFile,
+    plan: DotPlan,
+    seen: Observed,
+    *,
+    tracker_is_ideal: bool,
+    psf_sigma_px: float | None = None,
 ) -> Calibrated:
-    """Fit the geometry of a bench file to centroids of planned dots. Raises InputError."""
+    """Fit the geometry of a bench file to centroids of planned dots, seen through a PSF of this
+    sigma (default: the bench file's). Raises InputError.
+    """
     known = tracker_is_ideal or file.config.tracker.distortion is not None
     nominal = nominal_of(file)
+    if psf_sigma_px is None:
+        psf_sigma_px = psf_sigma_of(file)
+    if psf_sigma_px <= SMOOTH_PSF_PX:
+        seen = without_s_curves(plan, nominal, seen, psf_sigma_px)
     try:
         return calibrate_geometry(
             plan, nominal, seen, np.random.default_rng(SEED), tracker_known=known
@@ -237,6 +248,26 @@ def rough_geometry(file: BenchFile, plan: DotPlan, seen: Observed) -> SeenScreen
         raise _too_few(data)
     rough = fits.fit(problem, fits.Model(fits.RADIAL), 0, data).geometry
     return SeenScreen(rough.monitor, rough.tracker, is_sure=True, psf_sigma_px=psf_sigma_of(file))
+
+
+def without_s_curves(
+    plan: DotPlan, nominal: fits.Nominal, seen: Observed, psf_sigma_px: float
+) -> Observed:
+    """Centroids without the bias by a dot's place within a pixel, its side and turn by a first
+    fit. Raises InputError.
+    """
+    look = first_look(plan, nominal, seen, np.random.default_rng(SEED))
+    problem, data = matched(plan, nominal, seen, look)
+    if len(np.unique(data.dot)) < MIN_DOTS:
+        raise _too_few(data)
+    poses = len(look.q_poses)
+    rough = fits.fit(problem, fits.Model(fits.RADIAL, (), poses), 0, data).geometry
+    for pose, q_cam_to_pose in enumerate(rough.q_poses):
+        turned_axes = rough.tracker.cam_to_image @ to_matrix(q_cam_to_pose)
+        tracker = replace(rough.tracker, cam_to_image=turned_axes)
+        screen = SeenScreen(rough.monitor, tracker, is_sure=True, psf_sigma_px=psf_sigma_px)
+        seen = seen.without_s_curve(pose, screen.dot_shape)
+    return seen
 
 
 def _too_few(data: fits.MatchedDots) -> InputError:

@@ -46,7 +46,8 @@ class Observed:
     each.
 
     `sigma_px` (n,) is each one's own error where the table has it, else 1: only ratios count then.
-    Nearer than `edge_px` to the detector's edge no dot is measured: its window leaves the image.
+    `settings` are those that they were measured by, None for those of a table. No dot is measured
+    nearer to the detector's edge than `edge_px`: its window leaves the image.
     """
 
     frame: IntArray
@@ -54,7 +55,12 @@ class Observed:
     x_px: FloatArray
     y_px: FloatArray
     sigma_px: FloatArray
-    edge_px: float = 0.0
+    settings: CentroidSettings | None = None
+
+    @property
+    def edge_px(self) -> float:
+        """Half the side of the window that they were measured in, 0 for those of a table."""
+        return float(self.settings.radius_px) if self.settings is not None else 0.0
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -65,10 +71,24 @@ class Observed:
 
     def joined(self, other: "Observed") -> "Observed":
         """These centroids and others, of other frames."""
-        joined = {}
+        joined: dict[str, Any] = {}
         for name in COLUMNS:
             joined[name] = np.concatenate([getattr(self, name), getattr(other, name)])
-        return replace(self, **joined, edge_px=max(self.edge_px, other.edge_px))
+        return replace(self, **joined)
+
+    def without_s_curve(self, pose: int, shape: DotShape) -> "Observed":
+        """The same centroids, those of a pose without the bias by a dot's place within a pixel,
+        where its shape is known.
+        """
+        if self.settings is None:
+            return self
+        is_of_pose = self.pose == pose
+        x_px, y_px = without_s_curve(self.x_px, self.y_px, shape, self.settings)
+        return replace(
+            self,
+            x_px=np.where(is_of_pose, x_px, self.x_px),
+            y_px=np.where(is_of_pose, y_px, self.y_px),
+        )
 
 
 def read_observed(path: Path) -> Observed:
@@ -104,10 +124,8 @@ def measure_images(
     dark: Path | None,
     resolution_px: tuple[int, int],
     dot_sigma_px: float = MIN_WINDOW_SIGMA_PX,
-    shape: DotShape | None = None,
 ) -> Observed:
-    """Centroids of all images, of dots of about `dot_sigma_px` in the tracker's image, without the
-    S-curve of dots of a `shape` that is known.
+    """Centroids of all images, of dots of about `dot_sigma_px` in the tracker's image.
 
     The frame is the last number in a file's name, the pose that of `poseN` in its folder, else 0.
     Raises InputError for an image that cannot be read, has another size than the tracker's, or is
@@ -130,9 +148,7 @@ def measure_images(
         np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*paths_of, strict=True)
     )
     x_px, y_px = (np.concatenate(part) for part in zip(*places, strict=True))
-    if shape is not None:
-        x_px, y_px = without_s_curve(x_px, y_px, shape, settings)
-    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)), edge_px=settings.radius_px)
+    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)), settings)
 
 
 def dot_centroids(dot_sigma_px: float) -> CentroidSettings:

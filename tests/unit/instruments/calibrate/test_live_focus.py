@@ -237,6 +237,13 @@ def test_options_that_do_not_fit_are_refused(benches, tmp_path, words, said):
     assert_refused(run_hilstar_here("calibrate", "focus", bench, *words), 2, said)
 
 
+def test_a_format_that_carries_no_stars_is_refused(tmp_path):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text(TWIN) + ANSWERS.replace("PORT", "9").replace('"json"', '"packet"'))
+    done = run_hilstar_here("calibrate", "focus", bench, "--answers", *SKY)
+    assert_refused(done, 2, 'format = "packet" carries no stars', "--grab CMD")
+
+
 def test_silence_ends_after_a_while_and_says_whose():
     clock = FakeClock()
     source = SimpleNamespace(take=list, trouble=lambda: "", unread="the reader starts again")

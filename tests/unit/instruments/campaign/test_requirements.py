@@ -238,3 +238,20 @@ def test_a_limit_is_narrowed_by_what_the_bench_itself_could_have_made(axis, high
     found = judged_figure(require, figure, (3.0, 7.0))
     assert found.verdict == wanted
     assert found.margin == pytest.approx(10.0 - (3.0 if axis == "cross" else 7.0) - high)
+
+
+def test_the_benchs_guard_takes_off_the_margin_of_a_maximum_and_of_a_minimum():
+    most = Require(quantity="bias", maximum=10.0)
+    least = Require(quantity="availability", minimum=0.9)
+    figures = {
+        "cases": 50,
+        "value": 0.0,
+        "bound": 0.0,
+        "verdict": "met",
+        "more": None,
+        "method": "",
+    }
+    at_most = RequirementVerdict(most, **figures, low=6.0, high=8.0, guard=0.5)
+    at_least = RequirementVerdict(least, **figures, low=0.96, high=0.98, guard=0.02)
+    assert at_most.margin == pytest.approx(10.0 - 0.5 - 8.0)
+    assert at_least.margin == pytest.approx(0.96 - 0.9 - 0.02)

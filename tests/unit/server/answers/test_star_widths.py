@@ -71,10 +71,22 @@ def test_a_tracker_without_widths_is_known_after_some_answers_with_stars():
         assert not widths.reports_none
         assert widths.take(without) is None
     assert widths.reports_none and widths.state is None
+    # an attitude without stars, as in a packet, is one of stars whose widths are not reported
+    packets = AnswerWidths()
+    for _ in range(NONE_AFTER):
+        packets.take(Answer(0, b"", q_icrs_to_cam=np.array([1.0, 0.0, 0.0, 0.0])))
+    assert packets.reports_none
+
+
+def test_a_tracker_that_sees_no_star_says_so_and_is_waited_for(rng):
     lost = AnswerWidths()
-    for _ in range(3 * NONE_AFTER):
-        lost.take(Answer(0, b""))  # no star at all: that is no statement about widths
-    assert not lost.reports_none
+    readings = [lost.take(Answer(k * NS_PER_S // 10, b"")) for k in range(3 * NONE_AFTER)]
+    whys = [reading.why for reading in readings if reading is not None]
+    assert whys == ["the tracker reports no star"] * 5
+    assert not lost.reports_none and lost.state is None
+    for answer in answers_of([1.3] * 10, rng, first=3 * NONE_AFTER):
+        lost.take(answer)
+    assert lost.state.sigma_px == pytest.approx(1.3, abs=0.05)
 
 
 def test_answers_of_too_few_widths_have_no_figure_and_say_why(rng):

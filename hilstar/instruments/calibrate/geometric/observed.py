@@ -60,7 +60,9 @@ class Observed:
     @property
     def edge_px(self) -> float:
         """Half the side of the window that they were measured in, 0 for those of a table."""
-        return float(self.settings.radius_px) if self.settings is not None else 0.0
+        if self.settings is None:
+            return 0.0
+        return float(self.settings.radius_px)
 
     def __len__(self) -> int:
         return len(self.frame)

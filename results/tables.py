@@ -6,6 +6,7 @@ timing.csv and those of colour by `hilstar study NAME -o`, quantisation_time.csv
 by `hilstar study quantisation -o`. machine.txt says on which machine; bench_h100.csv on an NVIDIA
 H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200. chain.csv and
 chain_budget.csv are written by `python tools/measure_answers.py`, and no machine changes them.
+loop.csv and motion.csv are `python tools/measure_loop.py`, and no machine changes motion.csv.
 rigs.csv is `hilstar study rigs -o DIR`, and no machine changes it.
 limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
 certify.csv is `python tools/certify_coverage.py -o`, and intervals.csv is `python
@@ -516,7 +517,7 @@ def intervals_table() -> str:
     return table(["by", "interval of", "trials", "held the truth"], body)
 
 
-BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "stellarium")
+BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "satsim", "stellarium")
 
 
 def beside_table(name: str) -> str:
@@ -552,6 +553,29 @@ def rigs_table() -> str:
     )
 
 
+def loop_table() -> str:
+    """What the demo's tracker has planted, and what is found of it."""
+    body = []
+    for row in rows_of("loop.csv"):
+        if row["run"] == "demo":
+            unit = row["unit"]
+            body.append([row["quantity"], f"{row['planted']} {unit}", f"{row['found']} {unit}"])
+    return table(["", "planted", "found"], body)
+
+
+def motion_table() -> str:
+    """The virtual tracker's own error by motion."""
+    body = []
+    for row in rows_of("motion.csv"):
+        rate_deg_s, scanout_ms = (float(row[name]) for name in ("rate_deg_s", "scanout_ms"))
+        motion = f"{rate_deg_s:g} deg/s" if rate_deg_s else "at rest"
+        lit = f"over {scanout_ms:.0f} ms" if scanout_ms else "at once"
+        x, y, z, mean = (figure(float(row[f"{name}_arcsec"])) for name in ("x", "y", "z", "mean_z"))
+        body.append([motion, lit, f"{x}, {y} arcsec", f"{z} arcsec", f"{mean} arcsec"])
+    head = ["motion", "rows are lit", "one sigma across", "about the boresight", "mean about it"]
+    return table(head, body)
+
+
 TABLES = {
     **{f"beside_{name}": partial(beside_table, name) for name in BESIDE},
     "rigs": rigs_table,
@@ -575,6 +599,8 @@ TABLES = {
     "tradeoff": tradeoff_table,
     "economy": economy_table,
     "timing": timing_table,
+    "loop": loop_table,
+    "motion": motion_table,
 }
 
 

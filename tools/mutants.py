@@ -3,22 +3,34 @@ finds.
 
     python tools/mutants.py --mutants 60 --seed 1 -o DIR
     python tools/mutants.py --mutants 40 --near -o DIR
+    HILSTAR_LINE_MAP=MAP pytest -n0 -p tests.support.line_map
+    python tools/mutants.py --mutants 140 --seed 2 --by-lines MAP --near -o DIR
+    python tools/mutants.py --planted tools/planted_faults.toml --by-lines MAP --near -o DIR
 
 Each mutant is one change of one expression in a core room, in a copy of the checkout. DIR gets
 mutants.csv: the change, and the test that fails ("" where none does). A test counts that fails
 twice with the change and passes without it: what fails by the machine's load, or for what the copy
 lacks, is said and passed over. A run that is stopped goes on where it was. With --near only those
-of README's tests run whose files name the changed module or its room: a few seconds a mutant. Some
-mutants are no fault (a limit of memory that is one byte larger): the share that is found is a lower
-bound.
+of README's tests run whose files name the changed module or its room: a few seconds a mutant. With
+--by-lines those run that run the changed line, fastest first, and near ones (with --near) where
+none of them fails: tests in processes of their own are not in the map. --planted takes its changes
+from a file of faults that were thought of, and --rest the tests that README's command leaves out.
+Some mutants are no fault (a limit of memory that is one byte larger): the share that is found is a
+lower bound.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import contextlib
 import copy
 import csv
+import gc
+import importlib
+import itertools
+import json
+import multiprocessing
 import os
 import random
 import re
@@ -26,10 +38,18 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import partial
 from pathlib import Path
+
+# One process a core is enough, and threads would not survive a fork. Before NumPy is loaded.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import pytest
+
+sys.dont_write_bytecode = False  # else each run compiles what it imports
 
 ROOT = Path(__file__).parent.parent
 ROOMS = ("sky", "optics", "display", "attitude", "tracker", "server/loop.py")
@@ -48,6 +68,20 @@ FAILED = re.compile(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", re.MULTILINE)
 NOTHING_TO_RUN = 5  # pytest's exit code
 # the environment variables of tests/support/near_first.py
 NEAR, NEAR_ALONE = "HILSTAR_NEAR", "HILSTAR_NEAR_ALONE"
+
+# imported once for all runs
+LIBRARIES = (
+    *("astropy.coordinates", "astropy.table", "astropy.time", "astropy.wcs", "hypothesis"),
+    *("matplotlib.figure", "mcap.reader", "moderngl", "msgspec", "numpy.ma", "PIL.Image"),
+    *("rich.console", "scipy.integrate", "scipy.interpolate", "scipy.ndimage", "scipy.optimize"),
+    *("scipy.signal", "scipy.sparse.linalg", "scipy.spatial", "scipy.special", "scipy.stats"),
+    *("hypothesis.internal.observability", "skyfield.api", "typer", "xdist.plugin", "zmq"),
+)
+ALREADY_IMPORTED = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
+FORK = multiprocessing.get_context("fork")
+CHANGES = itertools.count(1)
+# the first test that fails, but for those that are named
+First = Callable[[Sequence[str]], str]
 
 COMPARED: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.LtE,
@@ -195,13 +229,76 @@ def copy_checkout(folder: Path) -> None:
 
 
 @dataclass(frozen=True, slots=True)
+class LineMap:
+    """What tests/support/line_map.py wrote: test functions by path and line, their seconds."""
+
+    seconds: dict[str, float]
+    tests: dict[str, dict[str, list[str]]]
+
+    def tests_of(self, mutant: Mutant) -> list[str]:
+        """The tests that run a mutant's statement, fastest first; a file stands for all its tests.
+
+        A module's constant is run by those that run a statement with its name, and what else runs
+        when the module is imported by each test of the module.
+        """
+        by_line = self.tests.get(mutant.path, {})
+        names: set[str] = set()
+        for line in lines_that_need(ROOT / mutant.path, mutant.line) or map(int, by_line):
+            names.update(by_line.get(str(line), []))
+        return sorted(names, key=lambda name: self.seconds.get(name, 0.0))
+
+
+def lines_that_need(path: Path, line: int) -> set[int]:
+    """The lines of the innermost statement that has a line, without those of its body, or of all
+    statements of functions that name the constants that it sets; none where it is another that
+    runs when the module is imported.
+    """
+    tree = ast.parse(path.read_bytes())
+    innermost: ast.stmt | None = None
+    in_functions: list[ast.stmt] = []
+    for node in ast.walk(tree):  # outer ones first
+        if isinstance(node, ast.stmt) and line in own_lines(node):
+            innermost = node
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            for part in node.body:
+                in_functions += [each for each in ast.walk(part) if isinstance(each, ast.stmt)]
+    if innermost is None:
+        return set()
+    if innermost in in_functions:
+        return set(own_lines(innermost))
+    constants = {each.id for each in ast.walk(innermost) if isinstance(each, ast.Name)}
+    needing: set[int] = set()
+    for statement in in_functions:
+        named = {each.id for each in ast.walk(statement) if isinstance(each, ast.Name)}
+        if named & constants and innermost in tree.body:
+            needing.update(own_lines(statement))
+    return needing
+
+
+def own_lines(node: ast.stmt) -> range:
+    """The lines of a statement, without those of its body."""
+    body = getattr(node, "body", [])
+    return range(node.lineno, body[0].lineno if body else (node.end_lineno or node.lineno) + 1)
+
+
+@dataclass(frozen=True, slots=True)
 class Suite:
     """README's tests in a copy of the checkout, nearest to a module first; `is_near`: the near
-    ones alone.
+    ones alone; `is_rest`: those that README's command leaves out.
     """
 
     checkout: Path
     is_near: bool
+    is_rest: bool
+
+    def first_of(self, tests: Sequence[str], passed_over: Sequence[str] = ()) -> str:
+        """As `first_failure`, of the tests that are named, in their order."""
+        chosen = [test for test in tests if test not in passed_over]
+        if not chosen:
+            return ""
+        names = self.checkout / "chosen_tests.txt"
+        names.write_text("\n".join(chosen), encoding="utf-8")
+        return self._pytest(["-x", *deselected(passed_over), f"@{names}"], {})
 
     def first_failure(self, module: str, passed_over: Sequence[str] = ()) -> str:
         """The first test that fails but for those `passed_over`, "" where none does.
@@ -209,9 +306,9 @@ class Suite:
         One that does not end is one that fails. HANGS where the tests together take too long;
         pytest's last line where no test is named.
         """
-        arguments = ["-x", "-p", "tests.support.near_first"]
-        for test in passed_over:
-            arguments += ["--deselect", test]
+        arguments = ["-x", "-p", "tests.support.near_first", *deselected(passed_over)]
+        if self.is_rest:
+            arguments.append("--rest")
         variables = {NEAR: module}
         if self.is_near:
             variables[NEAR_ALONE] = "1"
@@ -222,56 +319,82 @@ class Suite:
         return bool(self._pytest([test], {}))
 
     def _pytest(self, arguments: list[str], variables: dict[str, str]) -> str:
-        try:
-            run = subprocess.run(
-                [sys.executable, "-m", "pytest", "-v", "-n0", *STUCK_ENDS, *arguments],
-                cwd=self.checkout,
-                env=os.environ | {"PYTHONPATH": str(self.checkout)} | variables,
-                capture_output=True,
-                text=True,
-                timeout=MAX_RUN_S,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            return HANGS
-        if run.returncode in (0, NOTHING_TO_RUN):
+        with tempfile.TemporaryFile() as output:
+            options = ["-v", "-n0", *ALREADY_IMPORTED, *STUCK_ENDS, *arguments]
+            run = FORK.Process(target=self._run, args=(options, variables, output.fileno()))
+            run.start()
+            run.join(MAX_RUN_S)
+            if run.exitcode is None:
+                run.kill()
+                run.join()
+                return HANGS
+            output.seek(0)
+            text = output.read().decode(errors="replace")
+        if run.exitcode in (0, NOTHING_TO_RUN):
             return ""
-        failed = FAILED.search(run.stdout)
+        failed = FAILED.search(text)
         if failed is not None:
             return failed[1]
         # of a run that a stuck test ended, the name of that test
-        return (run.stdout or run.stderr or "no output").strip().splitlines()[-1].strip()
+        return (text or "no output").strip().splitlines()[-1].strip()
+
+    def _run(self, options: list[str], variables: dict[str, str], output: int) -> None:
+        """pytest in a process of its own, which begins with the libraries that are imported here:
+        that takes a third of a new one's time.
+        """
+        os.dup2(output, 1)
+        os.dup2(output, 2)
+        os.chdir(self.checkout)
+        os.environ |= {"PYTHONPATH": str(self.checkout)} | variables
+        sys.path[0] = str(self.checkout)
+        sys.exit(pytest.main(options))
 
 
-@contextmanager
+def deselected(tests: Sequence[str]) -> list[str]:
+    """pytest's options that leave tests out."""
+    options: list[str] = []
+    for test in tests:
+        options += ["--deselect", test]
+    return options
+
+
+@contextlib.contextmanager
 def planted(mutant: Mutant, checkout: Path) -> Iterator[None]:
     """The mutant in the copy, and afterwards the file as it was."""
     path = checkout / mutant.path
     source = path.read_bytes()
+    source_ns = path.stat().st_mtime_ns
     path.write_bytes(
         source[: mutant.start_byte] + mutant.after.encode() + source[mutant.end_byte :]
     )
+    # compiled modules are known by their source's size and time to the second
+    changed_ns = source_ns + next(CHANGES) * 1_000_000_000
+    os.utime(path, ns=(changed_ns, changed_ns))
     try:
         yield
     finally:
         path.write_bytes(source)
+        os.utime(path, ns=(source_ns, source_ns))
 
 
-def test_that_finds(mutant: Mutant, suite: Suite) -> str:
-    """The first test that fails by a mutant, "" where none does."""
-    module = mutant.path.removesuffix(".py").replace("/", ".")
+def test_that_finds(
+    mutant: Mutant, checkout: Path, fails: Callable[[str], bool], first: First
+) -> str:
+    """The first test that fails by a mutant, "" where none does; `first` names a test that fails
+    but for those passed over, `fails` runs one by itself.
+    """
     passed_over: list[str] = []
     while len(passed_over) < MAX_PASSED_OVER:
-        with planted(mutant, suite.checkout):
-            test = suite.first_failure(module, passed_over)
+        with planted(mutant, checkout):
+            test = first(passed_over)
             if not test:
                 return ""
             is_named = test.startswith("tests/")
-            fails_again = not is_named or suite.fails(test)
+            fails_again = not is_named or fails(test)
         if is_named:
-            fails_unchanged = suite.fails(test)
+            fails_unchanged = fails(test)
         else:
-            fails_unchanged = suite.first_failure(module, passed_over) == test
+            fails_unchanged = first(passed_over) == test
         if fails_again and not fails_unchanged:
             return test
         why = "fails without it, too" if fails_unchanged else "passes when it is run again"
@@ -282,12 +405,37 @@ def test_that_finds(mutant: Mutant, suite: Suite) -> str:
     return ""
 
 
-def outcome_of(mutant: Mutant, suite: Suite) -> Outcome:
+def outcome_of(mutant: Mutant, suite: Suite, line_map: LineMap | None) -> Outcome:
     """What the tests say of a mutant, and the time that it took."""
     begun_s = time.monotonic()
-    test = test_that_finds(mutant, suite)
+    module = mutant.path.removesuffix(".py").replace("/", ".")
+    test = ""
+    if line_map is not None:
+        tests = line_map.tests_of(mutant)
+        test = test_that_finds(mutant, suite.checkout, suite.fails, partial(suite.first_of, tests))
+    if not test and (line_map is None or suite.is_near):
+        first = partial(suite.first_failure, module)
+        test = test_that_finds(mutant, suite.checkout, suite.fails, first)
     wall_s = time.monotonic() - begun_s
     return Outcome(mutant.path, mutant.line, mutant.before, mutant.after, test, round(wall_s, 1))
+
+
+def planted_faults(file: Path) -> list[Mutant]:
+    """The faults of a file; ValueError where the text before a change is not once in its file."""
+    faults: list[Mutant] = []
+    for fault in tomllib.loads(file.read_text(encoding="utf-8"))["fault"]:
+        source = (ROOT / fault["path"]).read_bytes()
+        before = fault["before"].encode()
+        if source.count(before) != 1:
+            raise ValueError(
+                f"{fault['path']} has {source.count(before)} times {fault['before']!r}"
+            )
+        start_byte = source.index(before)
+        line = source.count(b"\n", 0, start_byte) + 1
+        end_byte = start_byte + len(before)
+        change = (fault["before"], fault["after"])
+        faults.append(Mutant(fault["path"], line, *change, start_byte, end_byte))
+    return faults
 
 
 def main() -> None:
@@ -298,22 +446,36 @@ def main() -> None:
     parser.add_argument(
         "--near", action="store_true", help="tests that name the module or its room"
     )
+    parser.add_argument("--by-lines", type=Path, metavar="MAP", help="tests that run the line")
+    parser.add_argument("--rest", action="store_true", help="what README's command leaves out")
+    parser.add_argument("--planted", type=Path, metavar="FILE", help="faults that are written down")
     parser.add_argument("-o", dest="output", type=Path, required=True)
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
     table = options.output / "mutants.csv"
+    line_map = None
+    if options.by_lines:
+        line_map = LineMap(**json.loads(options.by_lines.read_text(encoding="utf-8")))
+    if options.planted:
+        mutants = planted_faults(options.planted)
+    else:
+        mutants = drawn(options.mutants, options.seed)
     done = 0
     if table.exists():
         with table.open(encoding="utf-8") as rows:
             done = len(list(csv.DictReader(rows)))
     else:
         table.write_text(",".join(field.name for field in fields(Outcome)) + "\n", encoding="utf-8")
+    for name in LIBRARIES:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+    gc.freeze()
     with tempfile.TemporaryDirectory() as temporary:
         checkout = Path(temporary)
         copy_checkout(checkout)
-        suite = Suite(checkout, options.near)
-        for mutant in drawn(options.mutants, options.seed)[done:]:
-            outcome = outcome_of(mutant, suite)
+        suite = Suite(checkout, options.near, options.rest)
+        for mutant in mutants[done:]:
+            outcome = outcome_of(mutant, suite, line_map)
             with table.open("a", encoding="utf-8", newline="") as rows:
                 csv.writer(rows).writerow(asdict(outcome).values())
             print(outcome, flush=True)

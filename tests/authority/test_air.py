@@ -26,7 +26,7 @@ from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.site import Ground, site_glow_e_per_s_sr, site_refraction
 from hilstar.server.bench.star_light import bench_sources, bench_stars, site_air
 from hilstar.server.bench.star_rates import bench_channels
-from hilstar.sky.air import air_mass, extinction_curve, scintillation
+from hilstar.sky.air import SiteAir, air_mass, extinction_curve, scintillation
 from hilstar.sky.electrons import Photometry, library_electrons_per_s, load_library
 from hilstar.sky.spectrum import TEMPERATURE_SCALES, Curve
 from hilstar.sky.stars import unit_vectors_icrs
@@ -382,3 +382,24 @@ def test_without_a_stated_pressure_it_is_the_standard_one_of_the_height():
         site_refraction(structs.replace(site, pressure_hpa=hpa), optics)[0] for hpa in (880.0, None)
     )
     assert standard / stated == pytest.approx(877.16 / 880, rel=1e-3)
+
+
+def test_the_skys_glow_is_that_of_the_zenith_and_van_rhijns_with_the_airs_extinction():
+    """A layer at 130 km, seen at the zenith distance z: 1 / sqrt(1 - 0.96 sin(z)^2) of its light
+    (van Rhijn 1921; Krisciunas and Schaefer 1991, equations 3 and 4), behind as many air masses
+    more of 0.25 mag.
+    """
+    air = SiteAir(
+        up_at=lambda utc_ns: np.array([0.0, 0.0, 1.0]),
+        refraction_rad=(0.0, 0.0),
+        height_m=0.0,
+        aperture_mm=30.0,
+        dimming_mag=np.zeros((1, 2, 1)),
+        v_extinction_mag=0.25,
+        glow_e_per_s_sr=np.array([7.0, 9.0]),
+    )
+    directions = np.array([[0.0, 0.0, 1.0], [0.8, 0.0, 0.6], [0.8, 0.0, -0.6]])
+    masses = 1 / math.sqrt(1 - 0.96 * 0.64)
+    low = masses * 10 ** (-0.4 * 0.25 * (masses - 1))
+    wanted = np.outer([7.0, 9.0], [1.0, low, 0.0])
+    np.testing.assert_allclose(air.glow_at(directions, 0), wanted, rtol=1e-12)

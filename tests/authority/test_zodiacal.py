@@ -31,6 +31,7 @@ from hilstar.sky.zodiacal import (
     FAR_SLOPES,
     NEAR_SLOPES,
     Sunward,
+    TabledLight,
     ZodiacalLight,
     relative_spectrum,
     sunward,
@@ -311,3 +312,10 @@ def test_zodiacal_light_of_one_level_has_each_pixels_own_solid_angle(tmp_path):
             y_px,
         )
     assert background_e[0, 0] / background_e[511, 511] == pytest.approx(0.8688, abs=0.0005)
+
+
+def test_its_colour_changes_evenly_with_the_elongation_from_30_to_90_degrees():
+    seen = Sunward(np.array([0.0, 30.0, 60.0, 75.0, 90.0, 150.0]), np.zeros(6))
+    light = TabledLight(np.full(6, 2.0), np.ones(6, dtype=np.bool_))
+    rates = ZodiacalLight(near_e_per_s_sr=4.0, far_e_per_s_sr=8.0).electrons_per_s_sr(seen, light)
+    np.testing.assert_allclose(rates, 2 * np.array([4, 4, 6, 7, 8, 8]), rtol=1e-12)

@@ -147,10 +147,14 @@ def _refuse_few(
             " telemetry"
         )
     if free_count < MIN_ROWS:
+        longer = ""
+        if free_count:
+            times = math.ceil(10 * MIN_ROWS / free_count) / 10
+            longer = f"{times:g} times as long, "
         raise InputError(
             f"the run missed so many frames that {held_count} of {known_count} answers looked while"
-            f" one was held, and {MIN_ROWS} others are needed; give a run that keeps its refresh"
-            " rate, or a lower [monitor] refresh_hz"
+            f" one was held, and {MIN_ROWS} others are needed; run it {longer}on a machine with"
+            " less other work, or with a lower [monitor] refresh_hz"
         )
     if 2 * used_count <= free_count:
         raise InputError(

@@ -794,3 +794,11 @@ def test_what_was_queued_before_the_frames_teaches_nothing():
     told = run.receiver.clock_summary()
     assert told.offset_ms == pytest.approx(0.05, abs=0.001)
     assert QUEUED_NS < NS_PER_S
+
+
+def test_a_clock_that_agrees_for_half_a_second_is_not_believed_yet():
+    def make(t0: int) -> list[Arrival]:
+        ahead = Sender(offset_ns=NS_PER_S // 10).packets(t0, seconds(0, 2))
+        return ahead + Sender(first=2000).packets(t0, seconds(3, 3.5))
+
+    assert ReceiverRun(make, SHARED).events == {"clock-not-shared": 1}

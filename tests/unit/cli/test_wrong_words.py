@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import pytest
 
+from hilstar.cli import entry
+from hilstar.server import send_log
 from tests.support.benches import ROOT
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.senders import free_port
 
 BENCH = str(ROOT / "examples" / "bench.toml")
 MEANT = "84.057,-1.2,0, with commas and without spaces"
@@ -97,3 +100,29 @@ def test_a_wrong_value_is_answered_with_an_example(table, line, said, tmp_path):
     text = "\n".join(f"[{name}]\n" + "\n".join(lines) for name, lines in tables.items())
     (tmp_path / "bench.toml").write_text(text + "\n")
     assert_refused(run_hilstar_here("doctor", "bench.toml", cwd=tmp_path), 2, said)
+
+
+def test_too_little_memory_is_the_machine_s_fault_and_no_input_s(monkeypatch):
+    def without_memory(words):
+        raise MemoryError
+
+    monkeypatch.setattr(entry, "run", without_memory)
+    done = run_hilstar_here("doctor")
+    assert (done.returncode, done.stdout) == (3, "")
+    assert done.stderr == "hilstar: not enough memory for this; give smaller files or sizes\n"
+
+
+def test_send_s_jitter_is_milliseconds(monkeypatch):
+    given = []
+    made = send_log.Faults
+
+    def faults(*values):
+        given.append(values)
+        return made(*values)
+
+    monkeypatch.setattr(send_log, "Faults", faults)
+    words = ["--spin", "z,0", "--count", "1", "--wait", "0", "--lose", "25%", "--jitter", "2"]
+    assert (
+        run_hilstar_here("send", "--to", f"udp://127.0.0.1:{free_port()}", *words).returncode == 0
+    )
+    assert given == [(0.25, 0.0, 0.0, 0.002)]

@@ -188,3 +188,13 @@ def test_what_is_not_there_or_not_text_is_refused(tmp_path, write):
     assert "no light" in refusal(path)
     assert "add [weights]" in refusal(write(), bit_stealing=True)
     assert "the monitor has 10" in refusal("lcd-example", bits=10)
+
+
+@pytest.mark.parametrize(("bits", "can"), [(8, True), (13, True), (14, False)])
+def test_bits_are_stolen_up_to_13_bits(bits, can):
+    assert load_calibration("srgb", bits).can_steal_bits == can
+    if can:
+        load_calibration("srgb", bits, bit_stealing=True)
+    else:
+        with pytest.raises(InputError, match="at most 13 bits"):
+            load_calibration("srgb", bits, bit_stealing=True)

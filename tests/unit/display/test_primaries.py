@@ -7,7 +7,13 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.resources import resource_path
-from hilstar.display.primaries import channel_matrix, read_primaries
+from hilstar.display.primaries import (
+    MATCHING,
+    XY_NM,
+    _matching_function,
+    channel_matrix,
+    read_primaries,
+)
 from hilstar.sky.electrons import Optics
 from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 from tests.support.benches import bench_text
@@ -175,3 +181,26 @@ def test_primaries_in_another_unit_than_their_header_states_are_refused(tmp_path
         read_primaries(tmp_path / "primaries.csv")
     (tmp_path / "primaries.csv").write_text(f"wavelength_{unit},r,g,b\n{rows}")
     assert read_primaries(tmp_path / "primaries.csv")[0].wavelength_nm[2] == pytest.approx(380)
+
+
+# The CIE 1931 colour matching functions (2 degrees) of 400, 410, ... 700 nm, CIE 015.
+CIE_NM = np.arange(400.0, 701.0, 10.0)
+CIE_TABLE = """
+    .01431 .000396 .06785  .04351 .00121 .2074    .13438 .0040 .6456    .2839 .0116 1.3856
+    .34828 .0230 1.74706   .3362 .0380 1.77211    .2908 .0600 1.6692    .19536 .09098 1.28764
+    .09564 .13902 .81295   .03201 .20802 .46518   .0049 .3230 .2720     .0093 .5030 .1582
+    .06327 .7100 .07825    .1655 .8620 .04216     .2904 .9540 .0203     .43345 .99495 .00875
+    .5945 .9950 .0039      .7621 .9520 .0021      .9163 .8700 .00165    1.0263 .7570 .0011
+    1.0622 .6310 .0008     1.0026 .5030 .00034    .85445 .3810 .00019   .6424 .2650 .00005
+    .4479 .1750 .00002     .2835 .1070 0          .1649 .0610 0         .0874 .0320 0
+    .04677 .0170 0         .0227 .00821 0         .01136 .00410 0
+"""
+CIE_XYZ = np.array(CIE_TABLE.split(), dtype=float).reshape(-1, 3)
+# Sums of two or three Gaussians are 0.0138 off, in values up to 1.8.
+FIT_OFF = 0.015
+
+
+def test_the_colour_matching_functions_are_the_cie_s():
+    fitted = np.array([_matching_function(lobes) for lobes in MATCHING])
+    at_cie = fitted[:, np.isin(XY_NM, CIE_NM)]
+    np.testing.assert_allclose(at_cie.T, CIE_XYZ, rtol=0.0, atol=FIT_OFF)

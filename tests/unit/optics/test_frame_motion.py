@@ -229,3 +229,17 @@ def test_nodes_belong_to_what_of_a_path_lies_on_the_image():
 )
 def test_the_orientation_says_which_way_the_rows_go(orientation, down):
     assert orientation.down == down
+
+
+@pytest.mark.parametrize("rate_deg_s", [30.0, -30.0])
+def test_a_star_that_runs_with_the_rows_is_lit_for_longer_and_against_them_for_less(rate_deg_s):
+    """The panel, which crosses the rows in a frame, overtakes a star that falls by a share s of
+    them in a row's light: its row is lit for 1 / (1 - s) of that.
+    """
+    stars, at = stars_on([(160.0, 119.5)]), turn((rate_deg_s, 0.0, 0.0))
+    fall_px = place_px(stars, at, FRAME_S)[0, 1] - 119.5
+    assert abs(fall_px) > 40
+    sprites = swept(stars, at, Scan((0, 1), FRAME_S, FRAME_S))
+    lit = sprites.data["electrons_per_s"].sum()
+    # the way is even to the angle of the turn squared
+    assert lit == pytest.approx(1 / (1 - fall_px / 240), rel=1e-3)

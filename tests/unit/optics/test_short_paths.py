@@ -4,6 +4,7 @@ over the whole screen.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from hilstar.optics.paths import (
     LIMIT_PX,
     LIMIT_SHARE,
     TABLE_PX,
+    TRIED_AXES,
     Paths,
     ShortPaths,
     _lens_table,
@@ -217,3 +219,10 @@ def test_directions_beside_the_image_are_culled(rng):
     x, y = camera.project(around)
     seen = (np.abs(x - SCREEN[0]) < 960) & (np.abs(y - SCREEN[1]) < 540)
     assert 0 < seen.sum() <= len(kept) < 1.3 * seen.sum()
+
+
+def test_turns_about_every_axis_of_a_cube_are_tried():
+    """Through its 6 faces, 12 edges and 8 corners, of which opposite ones are one axis."""
+    ways = [way for way in itertools.product((-1, 0, 1), repeat=3) if any(way)]
+    tried = {way for axis in TRIED_AXES for way in (axis, tuple(-each for each in axis))}
+    assert tried == set(ways)

@@ -9,7 +9,16 @@ from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import GaussianPsf, pixel_shares
 from hilstar.optics.sprites import FrameLight
-from hilstar.optics.trails import Brush, Lit, Trails, TrailView, trails, with_trails
+from hilstar.optics.trails import (
+    SPACING_SIGMA,
+    Brush,
+    Lit,
+    Trails,
+    TrailView,
+    sprite_counts,
+    trails,
+    with_trails,
+)
 from hilstar.sky.bodies.passes import Cone
 from tests.support.satellites import element_set, satellite_sky
 from tests.support.stars import sprites_at
@@ -193,3 +202,27 @@ def test_beyond_what_an_image_may_cost_streaks_are_coarser_and_counted():
     fine, coarse = (trails(seen, view, lit, Brush(BRUSH.psf, most)) for most in (2000, 5))
     assert (len(coarse.sprites), coarse.sprites.capped, fine.sprites.capped) == (5, 1, 0)
     assert image_of(coarse.sprites).sum() == pytest.approx(image_of(fine.sprites).sum(), rel=0.02)
+
+
+class StraightPass:
+    """A satellite whose place runs evenly along x, from tangent -0.2 to 0.2 in a second."""
+
+    def __len__(self) -> int:
+        return 1
+
+    def directions(self, which, seconds, velocity_km_s=None):
+        tangent = -0.2 + 0.4 * seconds
+        rays = np.stack([tangent, np.zeros_like(tangent), np.ones_like(tangent)], axis=1)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def test_a_path_across_the_image_is_drawn_from_edge_to_edge():
+    """It has 1200 px, from 600 px before the principal point: the image's edges lie 80 px from
+    that, and half a footprint and a pixel outside them light still reaches the image.
+    """
+    view = TrailView(CAMERA, np.eye(3), np.zeros(3))
+    lit = Lit(np.zeros(1), 1.0)
+    (count,), (begin, end) = sprite_counts(StraightPass(), view, lit, BRUSH)
+    half_px = 80 + BRUSH.psf.footprint_px / 2 + 1
+    assert [begin[0], end[0]] == pytest.approx([0.5 - half_px / 1200, 0.5 + half_px / 1200])
+    assert count == 1 + np.floor(2 * half_px / SIGMA_PX[0] / SPACING_SIGMA)

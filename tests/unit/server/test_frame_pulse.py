@@ -191,3 +191,11 @@ def test_a_port_without_modem_lines_is_refused_in_a_line():
 def test_a_port_that_is_not_there_is_refused_in_a_line(port, said, refusal):
     with pytest.raises(refusal, match=rf"\[sync\] port = {port}: .*{said}"):
         RtsLine(port, True)
+
+
+def test_the_frames_that_have_a_pulse_are_the_multiples(kept):
+    with FramePulse(Line(), pulse_settings(every_frames=3), Notices()) as pulse:
+        pulsed_frames(pulse, 2, first=1)
+        assert pulse.summary().pulses + pulse.summary().skipped == 0
+        pulsed_frames(pulse, 1, first=3)
+        assert pulse.summary().pulses + pulse.summary().skipped == 1

@@ -55,3 +55,18 @@ def test_no_stars_and_one_star():
     alone = cell_grid(np.array([[0.0, 0.0, 1.0]]))
     assert alone.near(np.array([0.0, 0, 1]), 1e-9).tolist() == [0]
     assert alone.near(np.array([0.0, 0, -1]), 1.0).tolist() == []
+
+
+@pytest.mark.parametrize("cell_deg", [4.0, 60.0, 180.0])
+def test_every_star_within_reach_of_the_edges_planes_is_found_whatever_the_cells(rng, cell_deg):
+    vectors = rng.normal(size=(800, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    grid = cell_grid(vectors, cell_deg)
+    for reach_rad in (0.0, 0.02, 0.4, 1.3):
+        edges = rng.normal(size=(4, 3))
+        edges /= np.linalg.norm(edges, axis=1, keepdims=True)
+        is_wanted = (vectors @ edges.T >= -np.sin(reach_rad)).all(axis=1)
+        is_wanted &= vectors[:, 2] >= np.cos(1.5 + reach_rad)
+        wanted = np.flatnonzero(is_wanted)
+        found = grid.order[grid.near(np.array([0.0, 0.0, 1.0]), 1.5, edges, reach_rad)]
+        assert np.isin(wanted, found).all()

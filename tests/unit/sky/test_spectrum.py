@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from hilstar.basics.reading import warn_once
-from hilstar.sky.electrons import Optics, Photometry, tabulate
+from hilstar.sky.electrons import Optics, Photometry, band_mean, load_library, tabulate
+from hilstar.sky.spectral_types import DUST_EBV_MAG, bare_and_dusty
 from hilstar.sky.spectrum import (
     Curve,
     blackbody_exitance_w_m2_m,
@@ -164,3 +165,25 @@ def test_a_curve_that_is_none_or_may_mean_two_things_is_refused(tmp_path, text):
 def test_a_curve_that_is_neither_name_nor_file_is_refused(tmp_path):
     line = refusal(load_curve, "ccd48", "[tracker] quantum_efficiency", tmp_path)
     assert re.search(r"\[tracker\] quantum_efficiency = 'ccd48'.*\"ccd47-20\"", line)
+
+
+def test_dust_reddens_v_minus_i_as_schlafly_and_finkbeiner_have_it():
+    """2011, ApJ 737, 103, table 6, R = 3.1, Landolt's B, V and I: 3.626, 2.742 and 1.505. They
+    take their mean over spectra of a cool star, and the library has stars of all types.
+    """
+    library = bare_and_dusty()
+    bare_vi_mag, dusty_vi_mag = library.vi_mag.reshape(2, -1)
+    wanted = DUST_EBV_MAG * (2.742 - 1.505) / (3.626 - 2.742)
+    assert np.median(dusty_vi_mag - bare_vi_mag) == pytest.approx(wanted, rel=0.05)
+
+
+def test_photon_weighting_weighs_a_passband_by_the_wavelength():
+    """Straight lines between the samples of spectra and passband, summed up every 0.05 nm."""
+    library, v = load_library(), load_curve("johnson-v", "johnson-v")
+    nm = np.arange(v.wavelength_nm[0], v.wavelength_nm[-1] + 0.01, 0.05)
+    response = {"energy": v(nm), "photon": v(nm) * nm}
+    for star in (0, 50, 105):
+        spectrum = np.interp(nm, library.wavelength_nm, library.flux[star])
+        for weighting, weights in response.items():
+            wanted = np.trapezoid(spectrum * weights, nm) / np.trapezoid(weights, nm)
+            assert band_mean(library, v, weighting)[star] == pytest.approx(wanted, rel=1e-5)

@@ -637,3 +637,12 @@ def test_a_frame_transfer_smears_a_column_by_the_share_of_the_exposure_that_a_sh
     smeared_e = detector.collected_e(light_e, 0.1) - light_e
     np.testing.assert_allclose(smeared_e[:, 70], 2e-5 * 1e6)
     assert not np.delete(smeared_e, 70, axis=1).any()
+
+
+def test_a_dead_pixel_has_neither_light_nor_dark_current():
+    settings = DetectorSettings(dead_pixel_fraction=0.1, dark_e_per_s=50.0, dsnu_e_per_s=5.0)
+    detector = Detector(settings, SIZE_PX)
+    is_dead = detector.gain_map == 0
+    assert 0.05 < is_dead.mean() < 0.15
+    assert not detector.dark_map_e_per_s[is_dead].any()
+    assert (detector.dark_map_e_per_s[~is_dead] > 0).all()

@@ -149,3 +149,26 @@ def test_two_stars_tell_a_rotation_and_never_its_mirror(rng):
         known = normalise(rng.normal(size=(2, 3)))
         found = wahba(known @ to_matrix(q).T, known, np.array([1.0, 2.0]))
         assert angle_between_rad(found, q) < 1e-7
+
+
+def place_px(rays):
+    return rays[:, 0] / rays[:, 2] * FOCAL_PX + 511.5, rays[:, 1] / rays[:, 2] * FOCAL_PX + 511.5
+
+
+# The median star is 0.2 px off; the one star that is more so turns the solution by under 0.02 px.
+@pytest.mark.parametrize(("off_px", "is_left_out"), [(0.76, False), (0.84, True)])
+def test_a_star_over_four_times_the_median_off_is_left_out(off_px, is_left_out):
+    x, y = np.meshgrid(np.linspace(60.0, 960.0, 8), np.linspace(60.0, 960.0, 8))
+    x, y = x.ravel(), y.ravel()
+    known = normalise(np.stack([x - 511.5, y - 511.5, np.full(64, FOCAL_PX)], axis=1))
+    way = np.arange(64) + np.arange(64) // 8  # of neighbours in four directions
+    step = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[way % 4] * 0.2
+    step[27] *= off_px / 0.2
+    x, y = x + step[:, 0], y + step[:, 1]
+    rays = normalise(np.stack([x - 511.5, y - 511.5, np.full(64, FOCAL_PX)], axis=1))
+    found = FoundStars(x, y, np.full(64, 1e4), rays)
+    identified = identify(
+        found, np.array([1.0, 0.0, 0.0, 0.0]), lambda q: (np.arange(64), known), place_px
+    )
+    assert (27 not in identified.star) == is_left_out
+    assert len(identified.star) == 64 - is_left_out

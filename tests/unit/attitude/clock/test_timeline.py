@@ -364,3 +364,30 @@ def test_an_observer_s_place_does_not_go_across_a_jump():
     before = timeline.at(900_000_000_000)
     assert before is not None
     assert np.linalg.norm(before.place_km - orbiting(100).place_km) < 5e-5
+
+
+class WatchedLock:
+    is_held = False
+
+    def __enter__(self) -> None:
+        self.is_held = True
+
+    def __exit__(self, *_: object) -> None:
+        self.is_held = False
+
+
+def test_samples_are_added_under_a_lock():
+    """One thread adds times and samples, to two lists, while another reads both."""
+    lock = WatchedLock()
+
+    class Guarded(list):
+        def append(self, item):
+            assert lock.is_held
+            super().append(item)
+
+    timeline = Timeline(Policy(S, S))
+    timeline._lock, timeline._t_ns, timeline._samples = lock, Guarded(), Guarded()
+    for t_ns in (0, S):
+        timeline.add(AttitudeSample(t_ns, np.array([1.0, 0.0, 0.0, 0.0])))
+    assert timeline.at(S // 2) is not None
+    assert len(timeline) == 2

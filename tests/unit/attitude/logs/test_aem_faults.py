@@ -562,3 +562,13 @@ def test_an_empty_part_is_one_line_that_names_no_python(tmp_path, xml, part):
             assert not re.search(r"NoneType|__init__|attribute|Error\b|argument", line), line
         else:
             assert part == "header" and len(samples) == 3
+
+
+@pytest.mark.parametrize(
+    ("decimals", "ns"),
+    [("0000000004", 0), ("0000000005", 1), ("9999999995", 10**9), ("1234567891", 123_456_789)],
+)
+def test_an_epoch_is_rounded_to_the_nanosecond(decimals, ns):
+    day_ns = 86_400 * 10**9
+    assert aem_blocks.epoch_ns("", f"1970-01-02T00:00:00.{decimals}") == day_ns + ns
+    assert aem_blocks.epoch_ns("", f"1970-002T00:00:00.{decimals}Z") == day_ns + ns

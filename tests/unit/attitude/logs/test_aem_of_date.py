@@ -12,6 +12,7 @@ from astropy.time import Time
 from astropy.utils import iers
 from scipy.spatial.transform import Rotation
 
+from hilstar.attitude.logs.earth import _table
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import Mounting
@@ -150,3 +151,14 @@ def test_what_tells_no_utc_or_lies_beyond_the_table_is_said(tmp_path):
         " epoch)" in lines[0]
     )
     assert " at 2050-01-01T00:00:00 Alnilam" in lines[-1]
+
+
+def test_the_pole_and_ut1_of_2000_are_those_of_the_iers():
+    """EOP 14 C04 of 2000-01-01: 0.0433 and 0.3779 arcsec, and UT1 - UTC = 0.3555 s, with TAI - UTC
+    = 32 s. Final values of different series are 0.3 mas and 0.1 ms apart.
+    """
+    table = _table()
+    (at,) = np.flatnonzero(table.mjd == 51_544)
+    assert np.degrees(table.x_rad[at]) * 3600 == pytest.approx(0.0433, abs=5e-4)
+    assert np.degrees(table.y_rad[at]) * 3600 == pytest.approx(0.3779, abs=5e-4)
+    assert table.ut1_tai_s[at] + 32 == pytest.approx(0.3555, abs=2e-4)

@@ -142,3 +142,8 @@ def test_a_csv_with_t_ns_is_read_in_ns_and_says_so(tmp_path):
     assert result.returncode == 0
     assert "column t_ns is in ns: its numbers are multiplied by 1e-9, to be in s" in result.stderr
     assert [sample.t_ns for sample in read_log(path)] == [0, 1763800000123456789]
+
+
+def test_a_unit_that_no_rates_are_written_in_is_named_alone(tmp_path):
+    said, _ = notices(log_in_units(tmp_path, "csv", 60.0, 0.1, rates=True))
+    assert said.startswith("the rates do not fit the times: probably the times are in minutes;")

@@ -6,11 +6,20 @@ from __future__ import annotations
 
 import os
 import stat
+from pathlib import Path
 
 import pytest
 import zmq.auth
 
-from hilstar.attitude.wire.keys import AllowList, load_public, load_secret, make_keys
+from hilstar.attitude.wire.endpoint import Endpoint
+from hilstar.attitude.wire.keys import (
+    AllowList,
+    CurveKeys,
+    check_reach,
+    load_public,
+    load_secret,
+    make_keys,
+)
 from hilstar.basics.errors import InputError
 from tests.support.refusals import refusal
 
@@ -98,3 +107,28 @@ def test_what_is_no_key_file_gets_one_line(tmp_path, text):
     os.mkfifo(pipe)
     with pytest.raises(InputError, match=r"pipe\.key"):
         load_public(pipe)
+
+
+HERE, THERE = Endpoint("tcp://127.0.0.1:1", loopback=True), Endpoint("tcp://10.0.0.1:1", False)
+SECRET, SERVER, CLIENTS = Path("mine.key_secret"), Path("theirs.key"), Path("allowed")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "bind", "keys", "lacks"),
+    [
+        (HERE, True, CurveKeys(), None),
+        (THERE, True, CurveKeys(), "require CURVE keys"),
+        (THERE, False, CurveKeys(), "require CURVE keys"),
+        (HERE, True, CurveKeys(allowed_clients=CLIENTS), "curve_secret_key is missing"),
+        (THERE, True, CurveKeys(SECRET, SERVER), "binds requires allowed_clients"),
+        (THERE, False, CurveKeys(SECRET, None, CLIENTS), "connects requires curve_server_key"),
+        (THERE, True, CurveKeys(SECRET, None, CLIENTS), None),
+        (THERE, False, CurveKeys(SECRET, SERVER), None),
+    ],
+)
+def test_each_side_needs_its_own_keys_beyond_this_machine(endpoint, bind, keys, lacks):
+    if lacks is None:
+        check_reach(endpoint, "as written", bind=bind, keys=keys)
+        return
+    with pytest.raises(InputError, match=f"^as written: .*{lacks}"):
+        check_reach(endpoint, "as written", bind=bind, keys=keys)

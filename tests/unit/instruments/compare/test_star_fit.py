@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hilstar.display.render.reference import linear_image
-from hilstar.instruments.compare.star_fit import StarTemplates, describes
+from hilstar.instruments.compare.star_fit import StarTemplates, bright_pixels, describes
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import pack_sprites
@@ -45,3 +45,10 @@ def test_a_table_of_stars_a_few_pixels_away_is_that_of_another_sky(rng):
     assert describes(table, image)
     table["x_px"] += 12.0
     assert not describes(table, image)
+
+
+def test_bright_pixels_are_places_x_and_y_brightest_first():
+    image = np.zeros((20, 30))
+    image[4, 25], image[11, 7], image[11, 8] = 5.0, 9.0, 3.0
+    places = bright_pixels(image, np.full(image.shape, 1.0))
+    assert places.tolist() == [[7.0, 11.0], [25.0, 4.0]]

@@ -10,6 +10,7 @@ import pytest
 from hilstar.basics.errors import InputError
 from hilstar.optics.glass.codev_file import read_codev
 from tests.support.lenses import focal_length_mm, lit_share, real_rays, rms_radius_um, seq
+from tests.support.refusals import refusal
 
 FOCAL_MM, TOLERANCE_MM = 100.0308, 2e-4  # as in test_zemax_file.py
 LIT_TOLERANCE = 6e-3  # a grid of 160 rays across counts areas to 5 parts in 1000
@@ -211,3 +212,8 @@ def test_a_decentre_with_return_leaves_the_axis():
 def test_a_lens_is_the_same_in_every_encoding(encoding):
     lens = read_codev(seq().decode().encode(encoding))
     assert focal_length_mm(lens) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
+
+
+@pytest.mark.parametrize("words", ["CIR", "CIR 0", "CIR -2"])
+def test_an_aperture_without_a_size_is_refused(words):
+    assert "has no size; write its half-width" in refusal(read_codev, seq(more={1: [words]}))

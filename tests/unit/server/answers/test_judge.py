@@ -404,3 +404,10 @@ def test_answers_that_were_overtaken_are_counted_and_judged_and_a_clock_that_is_
         judge.judge(answer)
     figures = judge.figures(host_ns, {})
     assert figures.out_of_order == 3 and figures.wrong == 0
+
+
+@pytest.mark.parametrize(("stamp", "exposures"), [("start", 0.5), ("middle", 0.0), ("end", -0.5)])
+def test_the_middle_of_an_exposure_is_half_of_it_from_a_stamp_at_its_ends(stamp, exposures):
+    times = AnswerTimes(AnswerRules(0.2, stamp, "host"))
+    middle_ns, _ = times.middle(Answer(7 * NS_PER_S, b"", 5 * NS_PER_S))
+    assert middle_ns == 5 * NS_PER_S + round(exposures * 0.2 * NS_PER_S)

@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.basics.units import KM_PER_AU, LIGHT_KM_S
 from hilstar.sky.bodies.disc import Disc
-from hilstar.sky.bodies.earth_disc import DARK_V_MAG, earth_disc, earth_light
+from hilstar.sky.bodies.earth_disc import DARK_V_MAG, apparent_cone, earth_disc, earth_light
 from hilstar.sky.bodies.light import body_v_mag
 from hilstar.sky.bodies.orbit import TleOrbit
 from hilstar.sky.stars import aberrate
@@ -145,3 +145,9 @@ def test_the_earth_as_a_disc_and_as_a_point_is_at_one_place_though_stars_are_abe
     place, velocity = orbit.state(utc_ns(STATION_UTC) + t_ns)
     exact = earth_disc(-place, SUN_KM, velocity, 1.0)
     assert np.linalg.norm(exact.direction - earth.direction) / ARCSEC < 1e-3
+
+
+def test_from_below_the_ground_it_is_as_wide_as_from_a_kilometre_above_the_equator():
+    direction, distance_km = apparent_cone(np.array([0.0, 0.0, 6000.0]), np.zeros(3))
+    assert direction.tolist() == [0.0, 0.0, 1.0]
+    assert distance_km == pytest.approx(6378.1366 + 1.0, abs=1e-6)  # IERS 2010

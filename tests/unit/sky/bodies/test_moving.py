@@ -156,3 +156,11 @@ def test_an_orbit_that_has_ended_is_refused():
         InputError, match=r"station.tle: no orbit at 2009-09-20T00:00:00: .*; give newer elements"
     ):
         moving_sky("2009-09-20T00:00:00Z", orbit=orbit)
+
+
+@pytest.mark.parametrize(("share", "is_wider"), [(0.99, True), (1.01, False)])
+def test_the_discs_are_those_of_bodies_wider_than_asked(share, is_wider):
+    moving, _ = sky_of(("Moon",))
+    width_rad = moving.diameters_arcsec(0)["Moon"] * ARCSEC
+    discs = moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, share * width_rad, 0)
+    assert [disc.name for disc in discs] == ["Moon"] * is_wider

@@ -304,3 +304,12 @@ def test_keys_of_a_table_are_refused_for_hipparcos(tmp_path):
     beside = refusal(choose_catalog, TableChoice(with_hipparcos=True))
     dated = refusal(choose_catalog, TableChoice(epoch_jyear=2000.0))
     assert "[sky] with_hipparcos" in beside and "[sky] catalogue_epoch_jyear" in dated
+
+
+def test_b_and_v_give_b_minus_v(tmp_path):
+    path = tmp_path / "stars.csv"
+    path.write_text("ra_deg,dec_deg,v_mag,b_mag\n10,20,5.25,6.5\n30,-40,1.5,1.25\n")
+    catalog = read_stars(path)
+    order = np.argsort(catalog.v_mag)
+    np.testing.assert_allclose(catalog.v_mag[order], [1.5, 5.25], rtol=SAME)
+    np.testing.assert_allclose(catalog.bv_mag[order], [-0.25, 1.25], rtol=SAME)

@@ -9,6 +9,7 @@ import pytest
 
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
+from hilstar.attitude.logs.ros import _listed
 from tests.support.refusals import refusal
 from tests.support.sources import ros_bags
 from tests.support.sources.ros_bags import START_NS
@@ -182,3 +183,10 @@ REFUSED = [*FRAMES, *TOPICS_AND_BODIES, *TIMES, *QUATERNIONS, *TREES]
 def test_a_bag_is_refused_in_one_line(bag, sent, stated, words):
     line = refusal(open_log, bag(sent), Stated(**stated))
     assert re.search(words, line), line
+
+
+@pytest.mark.parametrize(
+    ("names", "text"), [([], ""), (["a", "b"], "a, b"), (["a", "b", "c"], "a, b, ...")]
+)
+def test_what_a_bag_has_is_listed_up_to_a_count(names, text):
+    assert _listed(names, 2, 400) == text

@@ -122,3 +122,12 @@ def test_a_wrong_scenario_is_refused_with_its_file_and_table(text, said):
     line = refusal(parse_scenario, FILE, text)
     assert line.startswith("faults.toml: ")
     assert said in line
+
+
+@pytest.mark.parametrize("keys", EACH_KIND, ids=lambda keys: keys["name"])
+def test_a_fault_is_a_value(keys):
+    """Views of faults are kept by them: equal ones have one hash, and none can be changed."""
+    fault = fault_of(keys)
+    assert hash(fault) == hash(fault_of(keys))
+    with pytest.raises(AttributeError):
+        fault.name = "another"

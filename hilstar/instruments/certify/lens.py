@@ -14,6 +14,7 @@ directions, which `[certify.tracker]` states.
 """
 
 import math
+import operator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,8 +45,12 @@ BESIDE_DEGREE = 3
 DEGREES = (7, 9, 11, 13)
 LONGEST = 1 / 2  # of structure, relative to the field
 # Tilt and centre replace each other and a turn along a bent valley, down which a fit by steps goes
-# far from what is true. They are in the linear fit, with the tilt's second order.
-BY_STEPS = tuple(name for name in fits.BROWN_CONRADY if not name.startswith(("centre", "tilt")))
+# far from what is true. Centre, and tilt where that leaves less, are in the linear fit alone.
+WITHOUT_CENTRE = tuple(name for name in fits.BROWN_CONRADY if not name.startswith("centre"))
+BY_STEPS = (
+    WITHOUT_CENTRE,
+    tuple(name for name in WITHOUT_CENTRE if not name.startswith("tilt")),
+)
 STILL = np.array([[1.0, 0.0, 0.0, 0.0]])  # the mount of the only image
 
 
@@ -122,15 +127,23 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
     )
     rays = monitor.rays(read.x_px, read.y_px)
     wanted = rays[:, :2] / rays[:, 2:]
-    lens = _fitted(geometry, flat, wanted, read, _thinned(usable))
-    shown = _tangents(lens.geometry.monitor, flat, wanted)
-    residual = seen_off - (shown - wanted) * ARCSEC_PER_RAD
-    usable = _tame(read, residual, usable, monitor.resolution_px)
+    thinned = _thinned(usable)
+    starts = []
+    for names in BY_STEPS:
+        lens = _fitted(geometry, flat, wanted, read, thinned, names)
+        shown = _tangents(lens.geometry.monitor, flat, wanted)
+        residual = seen_off - (shown - wanted) * ARCSEC_PER_RAD
+        tame = _tame(read, residual, usable, monitor.resolution_px)
+        of_lens, _ = _orthonormal(_lens_terms(lens, flat, wanted[tame]))
+        left, _ = _left_by(of_lens, residual[tame].T.ravel())
+        fitted = shown[tame] + (residual[tame] - left.T) / ARCSEC_PER_RAD
+        starts.append((float((left**2).mean()), lens, fitted, residual, tame))
+    _, lens, fitted, residual, usable = min(starts, key=operator.itemgetter(0))
     x = read.x_px[usable]
     y = read.y_px[usable]
     # Where the fit shows the dots: waves at the places as read would hold each dot's own noise, and
     # fit it.
-    phases = _phases(*geometry.tracker.places_px(*shown[usable].T))
+    phases = _phases(*geometry.tracker.places_px(*fitted.T))
     both_axes = residual[usable].T.ravel()
     for degree in (0, *DEGREES):
         terms = _terms(lens, flat, wanted[usable], (x, y), degree)
@@ -215,9 +228,16 @@ def _phases(x_px: FloatArray, y_px: FloatArray) -> FloatArray:
 
 
 def _fitted(
-    geometry: BenchGeometry, flat: Camera, wanted: FloatArray, read: DotReadings, usable: BoolArray
+    geometry: BenchGeometry,
+    flat: Camera,
+    wanted: FloatArray,
+    read: DotReadings,
+    usable: BoolArray,
+    names: tuple[str, ...],
 ) -> fits.Fit:
-    """The lens that turns directions of the bench file into those seen."""
+    """The lens that turns directions of the bench file into those seen, by the parameters named;
+    the others are 0.
+    """
     x, y = flat.places_px(*wanted[usable].T)
     count = len(x)
     none = np.zeros(count, dtype=np.intp)
@@ -227,8 +247,8 @@ def _fitted(
     nominal = fits.Nominal(flat, STILL[0], geometry.tracker)
     problem = fits.Problem(plan, nominal, STILL, EXPECTED_NOISE_PX)
     matched = fits.MatchedDots(observed, np.arange(count))
-    by_steps = fits.fit(problem, fits.Model(BY_STEPS), 0, matched)
-    number = dict(zip(BY_STEPS, by_steps.numbers, strict=True))
+    by_steps = fits.fit(problem, fits.Model(names), 0, matched)
+    number = dict(zip(names, by_steps.numbers, strict=True))
     numbers = np.array([number.get(name, 0.0) for name in fits.BROWN_CONRADY])
     return replace(by_steps, model=fits.Model(fits.BROWN_CONRADY), numbers=numbers)
 

@@ -115,7 +115,8 @@ class SkyFrame(Frame):
     `linear` is float32 (height, width), electrons per second, and `np.asarray(frame)` the same
     array; `light` has its channels (channels, height, width). `codes` are the code values that the
     monitor is given. `truth` is a structured array with a row for each star in view, the brightest
-    first. `q_icrs_to_cam` is the attitude and `t_ns` the moment for which bodies were placed.
+    first. `q_icrs_to_cam` is the attitude and `t_ns` the moment for which bodies were placed. A
+    pickled frame has all of these, but no bench.
 
     >>> with hilstar.load("bench.toml") as bench:
     ...     frame = bench.frame([0.6987226, 0.7135120, -0.0370377, 0.0362700])
@@ -128,8 +129,14 @@ class SkyFrame(Frame):
     @property
     def _bench(self) -> Bench:
         if self.bench is None:
-            raise InputError("frame: has no bench; take it of hilstar.load(...).frame(...)")
+            raise InputError(
+                "frame: has no bench, as one that was pickled; take it of"
+                " hilstar.load(...).frame(...)"
+            )
         return self.bench
+
+    def __getstate__(self) -> dict[str, Any]:
+        return super().__getstate__() | {"bench": None}
 
     def __array__(
         self, dtype: npt.DTypeLike | None = None, copy: bool | None = None

@@ -6,9 +6,11 @@ timing.csv and those of colour by `hilstar study NAME -o`, quantisation_time.csv
 by `hilstar study quantisation -o`. machine.txt says on which machine; bench_h100.csv on an NVIDIA
 H100, kinds_h200.csv by `python -m tests.benchmarks.bench_kinds` on an H200. chain.csv and
 chain_budget.csv are written by `python tools/measure_answers.py`, and no machine changes them.
+loop.csv and motion.csv are `python tools/measure_loop.py`, and no machine changes motion.csv.
 rigs.csv is `hilstar study rigs -o DIR`, and no machine changes it.
 limits.csv is `hilstar study limits -o DIR`, and no machine changes it.
-certify.csv is `python tools/certify_coverage.py -o`, which no machine changes.
+certify.csv is `python tools/certify_coverage.py -o`, and intervals.csv is `python
+tools/interval_coverage.py -o`; no machine changes them.
 beside_*.csv are `python tools/beside.py NAME -o DIR`, and no machine changes them.
 confronted.csv is `hilstar study confront` over the images that docs/confronted.md names; no machine
 changes it.
@@ -505,7 +507,17 @@ def certify_table() -> str:
     return table(head, body)
 
 
-BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "stellarium")
+def intervals_table() -> str:
+    """How often intervals of calibrations and assessments held the truth, by figure."""
+    body = []
+    for row in rows_of("intervals.csv"):
+        held, low, high = (float(row[f"{name}_percent"]) for name in ("held", "low", "high"))
+        share = f"{held:.1f} % ({low:.0f} to {high:.0f})"
+        body.append([f"`{row['kind']}`", row["figure"], row["trials"], share])
+    return table(["by", "interval of", "trials", "held the truth"], body)
+
+
+BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "satsim", "stellarium")
 
 
 def beside_table(name: str) -> str:
@@ -541,11 +553,35 @@ def rigs_table() -> str:
     )
 
 
+def loop_table() -> str:
+    """What the demo's tracker has planted, and what is found of it."""
+    body = []
+    for row in rows_of("loop.csv"):
+        if row["run"] == "demo":
+            unit = row["unit"]
+            body.append([row["quantity"], f"{row['planted']} {unit}", f"{row['found']} {unit}"])
+    return table(["", "planted", "found"], body)
+
+
+def motion_table() -> str:
+    """The virtual tracker's own error by motion."""
+    body = []
+    for row in rows_of("motion.csv"):
+        rate_deg_s, scanout_ms = (float(row[name]) for name in ("rate_deg_s", "scanout_ms"))
+        motion = f"{rate_deg_s:g} deg/s" if rate_deg_s else "at rest"
+        lit = f"over {scanout_ms:.0f} ms" if scanout_ms else "at once"
+        x, y, z, mean = (figure(float(row[f"{name}_arcsec"])) for name in ("x", "y", "z", "mean_z"))
+        body.append([motion, lit, f"{x}, {y} arcsec", f"{z} arcsec", f"{mean} arcsec"])
+    head = ["motion", "rows are lit", "one sigma across", "about the boresight", "mean about it"]
+    return table(head, body)
+
+
 TABLES = {
     **{f"beside_{name}": partial(beside_table, name) for name in BESIDE},
     "rigs": rigs_table,
     "answers": answers_table,
     "certify": certify_table,
+    "intervals": intervals_table,
     "colour": colour_table,
     "colour_gamut": gamut_table,
     "colour_red": red_table,
@@ -563,6 +599,8 @@ TABLES = {
     "tradeoff": tradeoff_table,
     "economy": economy_table,
     "timing": timing_table,
+    "loop": loop_table,
+    "motion": motion_table,
 }
 
 

@@ -24,6 +24,7 @@ PROGRAMS = {
     "lost": "UWCubeSat/lost, built, its folder as the environment's LOST",
     "basilisk": "",
     "pyxel": "pyxel-sim in an environment of its own, whose Python is the environment's PYXEL",
+    "satsim": "satsim in an environment of its own, whose Python is the environment's SATSIM",
     "stellarium": "Debian's stellarium, xvfb and xauth",
 }
 

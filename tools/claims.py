@@ -30,6 +30,7 @@ AT_MOST, ABOUT = "at most", "about"
 MIN_OUTSIDE_SHARE = 0.9  # of the rows that are neither times nor settings
 # A figure that is an upper limit is not told twice as large as what was measured.
 MIN_OF_LIMIT = 0.5
+MAX_MARGIN = 0.05  # of the figure: a wider scatter is a range, "LOW to HIGH"
 # A run that measures less than this of the last value measures something else.
 MIN_OF_LAST = 0.5
 MARK = re.compile(r"<!-- claim: ([\w.-]+) -->")
@@ -199,7 +200,7 @@ def page(root: Path = ROOT) -> str:
         f"{sum_of(claims)}. Besides, there are {others}.",
         "",
         "The test named fails where a measured value leaves the figure's last digit (a figure with"
-        " ≤ is an upper limit), `tests/docs/test_claims.py` where a page says another figure, or"
+        " ≤ is an upper limit; ± is the scatter between machines), `tests/docs/test_claims.py` where a page says another figure, or"
         " where the test does not use its oracle. *Last* is what it measured then.",
     ]
     for group in dict.fromkeys(claim.group for claim in claims):
@@ -228,7 +229,8 @@ def line(claim: Claim, places: list[str]) -> str:
         oracle += f" ({claim.why})"
     linked = ", ".join(link(place) for place in places)
     sense = "≤ " if claim.sense == AT_MOST and " to " not in claim.value else ""
-    cells = [f"{sense}{claim.figure()}", f"{of} ({linked})", oracle, claim.shares]
+    margin = f" ± {100 * claim.margin:g} %" if claim.margin else ""
+    cells = [f"{sense}{claim.figure()}{margin}", f"{of} ({linked})", oracle, claim.shares]
     cells += [test_of(claim.test), str(claim.last), claim.date.isoformat()]
     return f"| {' | '.join(cells)} |"
 

@@ -1,8 +1,8 @@
 """The pictures of docs/console.md: the page of a run, single pixels of it, and the run's report, in
 Debian's chromium.
 
-`python tools/make_screenshot.py` writes console.png, pixels.png, report.png and first-light.png
-into docs, and each again as NAME-light.png. The run goes by the clock, so that no two are alike.
+`python tools/make_screenshot.py` writes focus.png, console.png, pixels.png, report.png and
+first-light.png into docs, and each again as NAME-light.png. The run goes by the clock, so that no two are alike.
 The page is taken once it has been on time for a minute; on a machine that is too busy for that, the
 picture shows and says what was missed.
 """
@@ -27,12 +27,14 @@ sys.path.insert(0, str(DOCS.parent))
 from tests.support.browser import Browser, browser  # noqa: E402 - the checkout's own tests
 from tests.support.senders import free_port  # noqa: E402
 
-SIZE_PX = (1366, 1400)
+SIZE_PX, FOCUS_SIZE_PX = (1366, 1400), (800, 700)
 COLOURS = 256  # size of the palette
 CALM_S = 60.0  # within which a minute without a missed frame may come
 ON_TIME = "/fresh, frames on time/.test(document.getElementById('health-reasons').textContent)"
 HILSTAR = [sys.executable, "-m", "hilstar"]
 WARM_UP = "\n[certify.virtual]\ncold_percent = 4.0\nwarm_up_min = 4.0\n"
+RING_PX, AT_A_PLACE_S = (2.2, 1.7, 1.3, 1.0, 0.9, 1.1), 4
+PSF = "psf_sigma_px = [{0}, {0}]"
 SIRIUS = "101.287,-16.716,25"
 
 
@@ -122,6 +124,45 @@ def watch(page: Browser, folder: Path) -> None:
         run.terminate()
 
 
+def turn_the_ring(page: Browser, folder: Path) -> None:
+    """The focus by star widths that the virtual tracker's answers report, as its PSF changes."""
+    port = free_port()
+    feed = f"tcp://127.0.0.1:{free_port()}"
+    answers = (
+        f'[answers]\nsource = "udp"\nbind = "127.0.0.1:{port}"\nclock = "host"\nformat = "json"\n'
+    )
+    text = (DOCS.parent / "configs" / "demo.toml").read_text()
+    (folder / "ring.toml").write_text(text + answers)
+    words = ["calibrate", "focus", "ring.toml", "--answers", "--star", "Alnilam", "--headless"]
+    words += ["--feed", feed, "--console", "127.0.0.1:0"]
+    with subprocess.Popen(
+        [*HILSTAR, *words], cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    ) as run:
+        assert run.stderr is not None
+        page.get(
+            next(
+                found[1]
+                for line in run.stderr
+                if (found := re.search(r"page is at (http://\S+)", line))
+            )
+        )
+        for sigma_px in RING_PX:
+            place = folder / f"ring-{sigma_px}.toml"
+            place.write_text(text.replace(PSF.format(0.55), PSF.format(sigma_px)))
+            tracker = [
+                "tracker",
+                place.name,
+                "--watch",
+                feed,
+                "--answer",
+                f"udp://127.0.0.1:{port}",
+            ]
+            tracker += ["--format", "json", "--solver", "truth", "--duration", str(AT_A_PLACE_S)]
+            subprocess.run([*HILSTAR, *tracker], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+        keep_both(page, "#focus", "focus")
+        run.terminate()
+
+
 def first_light(page: Browser, folder: Path) -> None:
     """The page of a session before a monitor that warms up."""
     for name in ("demo.toml", "truth-example.toml"):
@@ -159,8 +200,10 @@ def take_session(page: Browser, path: Path) -> None:
 def main() -> None:
     """Watch a run, and look at its report; then bring up a bench."""
     with tempfile.TemporaryDirectory() as scratch, browser() as page:
-        page.size(*SIZE_PX)
         page.prefer(color_scheme="dark")
+        page.size(*FOCUS_SIZE_PX)
+        turn_the_ring(page, Path(scratch))
+        page.size(*SIZE_PX)
         watch(page, Path(scratch))
         subprocess.run(
             [*HILSTAR, "report", "run.mcap", "-o", "report"],

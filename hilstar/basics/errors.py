@@ -2,7 +2,8 @@
 takes a wrong word for.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 MAX_QUOTED_CHARACTERS = 120
 MAX_LINE_CHARACTERS = 1000
@@ -45,6 +46,19 @@ class MachineError(HilstarError):
     """
 
     exit_code = 3
+
+
+class NoDisplayError(MachineError):
+    """There is no display to open a window on; `without_display` adds what can be done then."""
+
+
+@contextmanager
+def without_display(advice: str) -> Iterator[None]:
+    """Adds what can be done without a display to the line of a machine that has none."""
+    try:
+        yield
+    except NoDisplayError as error:
+        raise NoDisplayError(f"{error}, or {advice}") from error
 
 
 class NotThereError(MachineError):

@@ -233,6 +233,19 @@ def named_bytes(path: Path, advice: str, limit_bytes: int) -> bytes:
     return content
 
 
+def open_named(path: Path, advice: str, limit_bytes: int) -> io.BufferedReader | io.BytesIO:
+    """A file that a bench file names, open for reading: from memory where it can be kept, so that
+    it is opened once. Raises InputError.
+    """
+    try:
+        is_kept = path.stat().st_size <= MAX_KEPT_BYTES
+    except (OSError, ValueError):
+        is_kept = False
+    if not is_kept or _settled_state(path) is None:
+        return open_regular(path, advice, limit_bytes)
+    return io.BytesIO(named_bytes(path, advice, limit_bytes))
+
+
 def named_text(path: Path, advice: str, limit_bytes: int) -> str:
     """The text of a file that a bench file names, as `read_text`. Raises InputError."""
     return as_text(path, named_bytes(path, advice, limit_bytes), advice)

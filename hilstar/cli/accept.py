@@ -1,5 +1,6 @@
 """hilstar accept: a tracker's whole acceptance, each capability with a verdict."""
 
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -48,6 +49,7 @@ def accept(options: AcceptOptions, cases: CaseOptions, display: DisplayOptions) 
         write_acceptance,
     )
     from hilstar.instruments.campaign.acceptance_plan import plan_path, read_acceptance_plan
+    from hilstar.instruments.campaign.pool import Pool
     from hilstar.instruments.campaign.requirements import NOT_MET
 
     check_directory("-o", options.output)
@@ -66,14 +68,22 @@ def accept(options: AcceptOptions, cases: CaseOptions, display: DisplayOptions) 
         return
     make_directory(options.output)
 
-    def run_missing(campaign: "Campaign", directory: "Directory", of: str) -> None:
-        say(f"hilstar: {of}: {campaign.cases} cases")
-        if not acceptance.on_bench:
-            run_cases(campaign, directory, None, processes, None)
-            return
-        show_cases(campaign, directory, display, None)
+    pool: Pool | None = None
 
-    results = acceptance.run(run_missing)
+    with ExitStack() as ending:
+
+        def run_missing(campaign: "Campaign", directory: "Directory", of: str) -> None:
+            nonlocal pool
+            say(f"hilstar: {of}: {campaign.cases} cases")
+            if acceptance.on_bench:
+                show_cases(campaign, directory, display, None)
+                return
+            if pool is None:
+                pool = ending.enter_context(Pool(campaign.job, campaign.identity, processes))
+            pool.turn_to(campaign.job, campaign.identity)
+            run_cases(campaign, directory, nullcontext(pool))
+
+        results = acceptance.run(run_missing)
     verdicts = acceptance.verdicts(results)
     rows = write_ledger(options.output / "ledger.csv", results)
     summary = write_acceptance(acceptance, results, verdicts, rows)

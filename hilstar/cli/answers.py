@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 SHOWN_WITHIN_S, PAGE_WITHIN_S = 2.0, 0.5
 MAX_STATE_BYTES = 1_000_000  # of a page's state; another program at its port may say more
 MAX_ROWS = 100_000  # the newest, in the JSON object
+WITHOUT_WIDTH = 4  # figures of a star whose width is not known
 ROW_KEYS = ("t_ns", "q_icrs_to_cam", "rate_cam_rad_s", "valid", "mode", "rms_arcsec", "centroids")
 
 
@@ -194,6 +195,9 @@ def _row(answer: "Answer") -> dict[str, Any]:
     """An answer by the keys of --json."""
     row = {name: getattr(answer, name) for name in ROW_KEYS}
     row["stars"] = answer.star_count
+    row["centroids"] = [
+        star[:WITHOUT_WIDTH] if star.width_px is None else star for star in answer.centroids
+    ]
     return row
 
 

@@ -4,9 +4,10 @@ by stars.
 
 import json
 import threading
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, suppress
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -44,10 +45,14 @@ from hilstar.cli.options import (
     seed_option,
     windowed_option,
 )
+from hilstar.cli.pointing import PointingOptions, attitude_of
+from hilstar.cli.running import PageOptions, page_listener
 from hilstar.server.console.terminal import busy, print_found, say
 
 if TYPE_CHECKING:
     from hilstar.display.identity import MonitorIdentity
+    from hilstar.instruments.calibrate.first_light.image_sources import Pattern
+    from hilstar.server.answers.star_widths import FocusReading
     from hilstar.server.bench.bench_file import BenchFile
 
 MAX_OFFSET_S = 4e9  # int64 nanoseconds hold that
@@ -237,46 +242,104 @@ class FocusOptions:
     virtual: Path | None = option(
         "TRUTH.toml", "Without hardware: a bench file that says how the bench really is."
     )
-    images: int | None = option("N", "End after so many images. [at Ctrl-C]", min=1)
+    answers: bool = switch(
+        "In place of images: the widths of stars that the tracker's answers ([answers]) report,"
+        " of a still sky at --radec, --star or --quaternion."
+    )
+    headless: bool = switch("With --answers: draw without a window, for --feed.")
+    images: int | None = option("N", "End after so many figures. [at Ctrl-C]", min=1)
     exposure: float | None = exposure_option()
     feed: str | None = option(
-        "ENDPOINT", "Hand the dots on to who watches there (tcp://127.0.0.1:5570)."
+        "ENDPOINT", "Hand the dots or the sky on to who watches there (tcp://127.0.0.1:5570)."
     )
     as_json: bool = json_option()
 
 
-def focus(options: FocusOptions) -> None:
-    """Measure the PSF's sigma in image after image while somebody turns the tracker's ring.
+def focus(options: FocusOptions, pointing: PointingOptions, page: PageOptions) -> None:
+    """Measure the PSF's sigma in image after image while somebody turns the tracker's ring, or the
+    widths of stars in its answers.
 
-    A line for each image has the figure, the best so far and a curve of the last 40; it says where
-    stars are drawn out or saturate the tracker. Ctrl-C ends it with the best. With --json there is
-    an object for each image, and one of the best at the end.
+    A line for each image, or for the answers of half a second, has the figure, the best so far and
+    a curve of the last 40; it says where stars are drawn out or saturate the tracker. --console
+    shows the same on a page. Ctrl-C ends it with the best. With --json there is an object for each
+    figure, and one of the best at the end.
     """
     from hilstar.basics.process.interrupts import stop_on_signal
-    from hilstar.instruments.calibrate.first_light.image_sources import NoImage, Stopped
-    from hilstar.instruments.calibrate.grabbed_dots import exposure_of
-    from hilstar.instruments.calibrate.live_focus import FocusCurve, focus_readings
+    from hilstar.server.answers.star_widths import WHAT, FocusCurve, FocusReading, figure_text
     from hilstar.server.bench.bench_file import read_bench_file
 
-    if (options.grab is None) == (options.virtual is None):
-        raise InputError("give --grab CMD or a camera, or --virtual TRUTH.toml: one of them")
+    _check_focus_source(options, pointing)
     file = read_bench_file(options.bench_file)
     check_files([options.virtual], [], file)
-    source_options = ImageOptions(grab=options.grab, virtual=options.virtual, dark=None, diode=None)
     stop = threading.Event()
-    curve = FocusCurve()
+    curve = FocusCurve("answers" if options.answers else "images")
+    with page_listener(page) as listener, stop_on_signal(stop), ExitStack() as stack:
+        shown = None
+        if listener is not None:
+            from hilstar.server.console.publisher import session_page
+
+            shown = stack.enter_context(session_page(listener, False, file, "calibrate focus"))
+
+        def take(reading: FocusReading) -> bool:
+            curve.add(reading)
+            if shown is not None:
+                shown.focus = curve.state()
+            print_found(options.as_json, reading, [curve.line()])
+            return stop.is_set() or reading.number == options.images
+
+        watch = None if shown is None else shown.show
+        if options.answers:
+            _focus_by_answers(file, options, pointing, take, stop, watch)
+        else:
+            _focus_by_images(file, options, take, stop, watch)
+    best = curve.best
+    if best is None or best.figure is None:
+        raise InputError(curve.why_none())
+    summary = {"best": best, "images": curve.count}
+    what = curve.source.removesuffix("s")
+    place = f"{what} {best.number} of {curve.count}, after {best.t_s:.0f} s"
+    line = f"best: {WHAT[curve.source]} {figure_text(best.figure)}: {place}"
+    print_found(options.as_json, summary, [line])
+
+
+def _check_focus_source(options: FocusOptions, pointing: PointingOptions) -> None:
+    """Refuse (InputError) options of `calibrate focus` that exclude each other."""
+    sources = [options.grab is not None, options.virtual is not None, options.answers]
+    if sum(sources) != 1:
+        raise InputError(
+            "give --grab CMD or a camera, or --virtual TRUTH.toml, or --answers: one of them"
+        )
+    if options.answers and options.exposure is not None:
+        raise InputError("--exposure: is for --grab; leave it out")
+    if not options.answers and pointing.given:
+        raise InputError("--radec, --star and --quaternion are for --answers; leave the sky out")
+    if not options.answers and options.headless:
+        raise InputError("--headless: is for --answers; leave it out")
+    if options.headless and options.feed is None:
+        raise InputError("--headless: nobody sees the sky; add --feed ENDPOINT, or leave it out")
+
+
+def _focus_by_images(
+    file: "BenchFile",
+    options: FocusOptions,
+    take: "Callable[[FocusReading], bool]",
+    stop: threading.Event,
+    watch: "Callable[[Pattern], None] | None",
+) -> None:
+    from hilstar.instruments.calibrate.first_light.image_sources import NoImage, Stopped
+    from hilstar.instruments.calibrate.grabbed_dots import exposure_of
+    from hilstar.instruments.calibrate.live_focus import focus_readings
+
+    source_options = ImageOptions(grab=options.grab, virtual=options.virtual, dark=None, diode=None)
     with (
         temporary_folder("focus") as folder,
         closing(image_source(file, source_options)) as source,
         handed_on(options.feed, source),
-        stop_on_signal(stop),
     ):
         exposure_s = exposure_of(file, source, options.exposure)
         try:
-            for reading in focus_readings(file, source, folder, exposure_s):
-                curve.add(reading)
-                print_found(options.as_json, reading, [curve.line()])
-                if stop.is_set() or reading.number == options.images:
+            for reading in focus_readings(file, source, folder, exposure_s, watch):
+                if take(reading):
                     break
         except Stopped:
             pass
@@ -284,13 +347,51 @@ def focus(options: FocusOptions) -> None:
             # Ctrl-C at a terminal ends the command of --grab, too.
             if not stop.is_set():
                 raise
-    best = curve.best
-    if best is None or best.figure is None:
-        raise InputError(curve.why_none())
-    summary = {"best": best, "images": len(curve.readings)}
-    sigma = f"{best.figure.psf_sigma_px:.3f} +- {best.figure.error_px:.3f} px"
-    place = f"image {best.number} of {len(curve.readings)}, after {best.t_s:.0f} s"
-    print_found(options.as_json, summary, [f"best: PSF sigma {sigma}: {place}"])
+
+
+def _focus_by_answers(
+    file: "BenchFile",
+    options: FocusOptions,
+    pointing: PointingOptions,
+    take: "Callable[[FocusReading], bool]",
+    stop: threading.Event,
+    watch: "Callable[[Pattern], None] | None",
+) -> None:
+    from hilstar.attitude.wire.shown_frames import FrameSender
+    from hilstar.basics.notices import Notices
+    from hilstar.instruments.calibrate.first_light.image_sources import (
+        PatternDisplay,
+        PatternFrames,
+        Stopped,
+    )
+    from hilstar.instruments.calibrate.live_focus import follow_answers, headless_hold, still_sky
+    from hilstar.server.answers.reader import open_answers
+
+    settings = file.config.answers
+    if settings is not None and settings.format in {"packet", "frame"}:
+        raise InputError(
+            f'--answers: [answers] format = "{settings.format}" carries no stars and so no widths;'
+            ' write "json" or a Python function, or give --grab CMD in place of it'
+        )
+    q_icrs_to_cam = attitude_of("calibrate focus --answers", pointing, file.config.sky.epoch_jyear)
+    with ExitStack() as stack:
+        frames = None
+        if options.feed is not None:
+            sender = stack.enter_context(FrameSender(options.feed))
+            frames = PatternFrames(sender)
+            say(f"frames: {sender.endpoint}")
+        source = stack.enter_context(open_answers(file.config, file.folder, Notices()))
+        sky = still_sky(file, q_icrs_to_cam)
+        if watch is not None:
+            watch(sky)
+        if options.headless:
+            hold = headless_hold(frames, file, sky)
+        else:
+            display = stack.enter_context(PatternDisplay())
+            display.frames = frames
+            hold = partial(display.show_until, file, sky)
+        with suppress(Stopped):
+            follow_answers(source, hold, take, stop.is_set)
 
 
 def _monitor_of(display: int | str, modes: tuple[str, ...] = ("",)) -> "MonitorIdentity | None":

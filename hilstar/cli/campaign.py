@@ -20,11 +20,16 @@ from hilstar.cli.running import DisplayOptions, PageOptions
 from hilstar.server.console.terminal import print_found, progress, say
 
 if TYPE_CHECKING:
-    from hilstar.instruments.campaign.cluster import Scheduler
+    from contextlib import AbstractContextManager
+
+    from hilstar.instruments.campaign.cluster import Cluster, Scheduler
+    from hilstar.instruments.campaign.pool import Pool
     from hilstar.instruments.campaign.run import Campaign
     from hilstar.instruments.campaign.store import Directory
     from hilstar.server.bench.bench_file import BenchFile
     from hilstar.server.console.listener import PageListener
+
+    Workers = AbstractContextManager[Pool | Cluster]
 
 CENTROIDS = "centroids"  # the solver without another one
 LINE_S = 10.0  # between lines of progress where stderr is no terminal
@@ -105,7 +110,7 @@ def campaign(
             with running.page_listener(page) as listener:
                 show_cases(this, directory, display, listener)
         elif not directory.table.exists():
-            run_cases(this, directory, cluster, cases.processes(), memory_bytes)
+            run_cases(this, directory, _workers(this, cluster, cases.processes(), memory_bytes))
         results = _results(this, directory)
     finally:
         directory.close()
@@ -253,16 +258,21 @@ def show_cases(
             raise KeyboardInterrupt
 
 
-def run_cases(
-    this: "Campaign",
-    directory: "Directory",
-    scheduler: "Scheduler | None",
-    workers: int,
-    memory_bytes: int | None,
-) -> None:
-    """Run the missing cases on a cluster or on this machine's cores."""
+def _workers(
+    this: "Campaign", scheduler: "Scheduler | None", workers: int, memory_bytes: int | None
+) -> "Workers":
+    """A cluster's workers, or this machine's cores."""
     from hilstar.instruments.campaign.pool import Pool
 
+    if scheduler is None:
+        return Pool(this.job, this.identity, workers, memory_bytes)
+    from hilstar.instruments.campaign.cluster import Cluster
+
+    return Cluster(scheduler, this.job, this.identity, say)
+
+
+def run_cases(this: "Campaign", directory: "Directory", opened: "Workers") -> None:
+    """Run the missing cases on workers, which a context manager opens and frees."""
     count = 0
     with telling(this.cases) as advance:
 
@@ -272,14 +282,8 @@ def run_cases(
             advance(done)
 
         try:
-            if scheduler is not None:
-                from hilstar.instruments.campaign.cluster import Cluster
-
-                with Cluster(scheduler, this.job, this.identity, say) as cluster:
-                    this.run(directory, cluster, on_done)
-            else:
-                with Pool(this.job, this.identity, workers, memory_bytes) as pool:
-                    this.run(directory, pool, on_done)
+            with opened as workers:
+                this.run(directory, workers, on_done)
         except KeyboardInterrupt:
             say(
                 f"hilstar: {count} of {this.cases} cases are done; the same command goes on from"

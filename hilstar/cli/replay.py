@@ -20,7 +20,7 @@ from hilstar.cli.options import (
     parse_split,
 )
 from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
-from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
+from hilstar.cli.shown_run import Followers, shown_run
 from hilstar.server.console.terminal import busy, say
 
 if TYPE_CHECKING:
@@ -57,13 +57,12 @@ def replay(
     from hilstar.server.console.publisher import RunDescription
     from hilstar.server.replay import FrameImages, Wanted, plan_play
     from hilstar.server.replay import replay as replay_log
-    from hilstar.server.serve import Outlet
 
     check_directory("-o", options.output)
     ledger = running.dated_ledger(run.ledger)
     check_ending("--ledger", ledger, MCAP)
     file = read_bench_file(options.bench_file)
-    faults = running.optional_scenario(run.scenario)
+    scenario = running.optional_scenario(run.scenario)
     table = None
     if options.output is not None:
         table = options.output / "frames.csv"
@@ -82,10 +81,18 @@ def replay(
         running.optional_pulse(file, notices) as pulse,
         running.shown_bench(file, display, timed=is_timed) as (bench, screen),
         FrameImages(options.output, bench) as record,
-        running.optional_ledger(ledger, bench, notices, run.overwrite, split) as run_ledger,
-        running.run_with_faults(bench, faults, notices, run_ledger, play.recording) as wrong,
-        running.optional_answers(bench, notices, run_ledger, screen) as answers,
-        running.optional_frames(display.feed, bench, screen) as watched,
+        shown_run(
+            bench,
+            screen,
+            run,
+            display,
+            notices,
+            ledger=ledger,
+            split=split,
+            scenario=scenario,
+            recording=play.recording,
+            pulse=pulse,
+        ) as shown,
     ):
         if play.span:
             say(play.span)
@@ -93,34 +100,13 @@ def replay(
         running.say_of_light(bench)
         if run.explain:
             running.explain_bench(bench, of_source=play.conventions.lines(stated.mounting))
-        # Before the run: what would do takes seconds, and a run that is stopped ends at once.
-        effort = running.effort_of_run(bench, run.explain, run.as_json)
-        renderer = bench.renderer.gl_renderer
-        refresh_hz = bench.config.monitor.refresh_hz
-        source = RunSource(
-            f"replaying {options.log}",
-            renderer,
-            refresh_hz,
-            play.frame_count,
-            running.forced_on(screen),
-        )
-        status = RunStatus(source, run_ledger)
+        effort = shown.effort()
         pace: Pace = "clock" if play.paced else "asked"
         description = RunDescription("replay", "log", str(options.log), pace)
-        parts = running.page_parts(bench, notices, run_ledger, screen, wrong, answers, split=split)
-        with (
-            on_terminal(status),
-            running.followed(
-                listener, page.control, description, parts, status, record, watched
-            ) as (
-                sink,
-                follower,
-                requests,
-            ),
+        followers = Followers(record, listener, page.control)
+        with shown.outlet(description, f"replaying {options.log}", play.frame_count, followers) as (
+            sink,
+            outlet,
         ):
-            outlet = Outlet(
-                screen, run_ledger, notices, None, follower, requests, wrong, pulse, answers
-            )
             summary = replay_log(bench, play, sink, outlet)
-        summary = replaced(summary, **effort)
-    running.end_of_run(summary, screen, run_ledger, notices, run.as_json, run.strict)
+    shown.end(replaced(summary, **effort))

@@ -3,7 +3,7 @@ and the end of a run.
 """
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import typer
 
-from hilstar.basics.errors import InputError, MachineError
+from hilstar.basics.errors import InputError, MachineError, without_display
 from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.programs import Service
 from hilstar.basics.units import NS_PER_S
@@ -168,13 +168,16 @@ def shown_bench(
         return
     from hilstar.server.screen.gate import open_screen
 
-    with open_screen(
-        file,
-        datetime.now(UTC).date(),
-        windowed=display.windowed,
-        force=display.force,
-        timed=timed,
-    ) as screen:
+    with ExitStack() as stack:
+        opened = open_screen(
+            file,
+            datetime.now(UTC).date(),
+            windowed=display.windowed,
+            force=display.force,
+            timed=timed,
+        )
+        with without_display("run with --headless"):
+            screen = stack.enter_context(opened)
         yield screen.bench, screen
 
 

@@ -20,7 +20,7 @@ from hilstar.cli import running
 from hilstar.cli.declare import option, struct
 from hilstar.cli.options import bench_argument, check_files, parse_split
 from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
-from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
+from hilstar.cli.shown_run import Followers, shown_run
 from hilstar.server.console.terminal import print_found, say, without_attitude
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from hilstar.server.bench.frame import Bench
     from hilstar.server.console.publisher import RunDescription
     from hilstar.server.heads import HeadsRun
+    from hilstar.server.loop import Limit
     from hilstar.server.open_link import AnyLink
     from hilstar.server.sync import BeatSummary
 
@@ -184,14 +185,28 @@ def serve(
         asked = heads_run(file, options, display, run, page)
         serve_heads(asked, page.console, run.overwrite, run.as_json)
         return
+    serve_bench(file, options, display, run, page, head.fed_by)
+
+
+def serve_bench(
+    file: "ReadFile",
+    options: ServeOptions,
+    display: DisplayOptions,
+    run: RunOptions,
+    page: ActingPageOptions,
+    fed_by: str | None,
+) -> None:
+    """Show the live attitude stream on the monitor of one bench; exit code 4 where no attitude
+    came.
+
+    `fed_by` as in `fed_link`; None for a bench with a source of its own.
+    """
     from hilstar.attitude.wire.source import Mounting
-    from hilstar.server.loop import Limit
-    from hilstar.server.serve import Outlet
     from hilstar.server.serve import serve as serve_stream
 
     ledger = running.dated_ledger(run.ledger)
     check_ending("--ledger", ledger, MCAP)
-    faults = running.optional_scenario(run.scenario)
+    scenario = running.optional_scenario(run.scenario)
     check_files([run.scenario], [], file, ledger, run.overwrite)
     split = parse_split(run.ledger_split)
     notices = Notices()
@@ -201,68 +216,57 @@ def serve(
     with (
         running.page_listener(page) as listener,
         running.scpi_listener(file, options.scpi, listener, page.token) as instrument,
-        _source(file, head.fed_by, notices) as link,
+        _source(file, fed_by, notices) as link,
         running.optional_pulse(file, notices) as pulse,
         running.shown_bench(file, display, timed=is_timed) as (bench, screen),
-        running.optional_ledger(ledger, bench, notices, run.overwrite, split) as run_ledger,
-        running.run_with_faults(bench, faults, notices, run_ledger) as wrong,
-        running.optional_answers(bench, notices, run_ledger, screen) as answers,
-        running.optional_frames(display.feed, bench, screen) as watched,
+        shown_run(
+            bench,
+            screen,
+            run,
+            display,
+            notices,
+            ledger=ledger,
+            split=split,
+            scenario=scenario,
+            pulse=pulse,
+        ) as shown,
     ):
         if run.explain:
             mounting = Mounting(file.config.tracker.q_body_to_cam)
             running.explain_bench(bench, of_source=link.conventions.lines(mounting))
         refresh_hz = bench.config.monitor.refresh_hz
-        slots: float = math.inf
-        if options.duration is not None:
-            slots = round(options.duration * refresh_hz)
-        limit = Limit(slots, options.frames or math.inf)
+        limit = _limit(options, refresh_hz)
         link.await_ready()
         say(f"{link.verb} {link.endpoint}, {refresh_hz:g} Hz, {bench.renderer.gl_renderer}")
-        # Before the run: what would do takes seconds, and a run that is stopped ends at once.
-        effort = running.effort_of_run(bench, run.explain, run.as_json)
+        effort = shown.effort()
         optics = running.say_seen(bench) | effort
         running.say_of_light(bench)
         beat: BeatSummary | UnsetType = UNSET
         if is_timed:
             beat = running.say_beat(bench, screen)
-        source = RunSource(
+        followers = Followers(None, listener, page.control, instrument)
+        with shown.outlet(
+            _described(file, link),
             link.endpoint,
-            bench.renderer.gl_renderer,
-            refresh_hz,
             limit.shortest,
-            running.forced_on(screen),
-        )
-        status = RunStatus(source, run_ledger)
-        parts = running.page_parts(bench, notices, run_ledger, screen, wrong, answers, split=split)
-        with (
-            on_terminal(status),
-            running.followed(
-                listener,
-                page.control,
-                _described(file, link),
-                parts,
-                status,
-                frames=watched,
-                scpi=instrument,
-            ) as fed,
-        ):
-            outlet = Outlet(
-                screen,
-                run_ledger,
-                notices,
-                tracker_pictures(link, bench, wrong),
-                *fed[1:],
-                wrong,
-                pulse,
-                answers,
-            )
-            summary = serve_stream(bench, link, limit, fed[0], outlet)
-    whole_summary = replaced(summary, beat=beat, **optics)
-    running.end_of_run(whole_summary, screen, run_ledger, notices, run.as_json, run.strict)
+            followers,
+            tracker_pictures(link, bench, shown.faults),
+        ) as (sink, outlet):
+            summary = serve_stream(bench, link, limit, sink, outlet)
+    shown.end(replaced(summary, beat=beat, **optics))
     if not summary.packets.accepted:
         say(without_attitude(link.endpoint, summary.packets, link.trouble))
         raise typer.Exit(NO_ATTITUDE)
+
+
+def _limit(options: ServeOptions, refresh_hz: float) -> "Limit":
+    """How long a run lasts by its options; without end where they do not say."""
+    from hilstar.server.loop import Limit
+
+    slots: float = math.inf
+    if options.duration is not None:
+        slots = round(options.duration * refresh_hz)
+    return Limit(slots, options.frames or math.inf)
 
 
 def heads_run(

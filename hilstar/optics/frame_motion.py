@@ -83,13 +83,7 @@ def swept_sprites(
     close = camera.in_view(image_directions, margin_px, turn.speed_rad_s * scan.longest_s)
     near = near[close]
     paths = _paths(image_directions[close], turn, scan, camera)
-    late_s = np.zeros(len(paths))  # how long after the middle row each star's own row lights up
-    for _ in range(2 if scan.scanout_s else 0):
-        # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5
-        # of it for 5 px in 1080 rows.
-        x_px, y_px = paths.places_px(EVERY, late_s)
-        late_s = scan.late_s(x_px, y_px, camera.resolution_px)
-    late_s = np.where(np.isfinite(late_s), late_s, 0.0)
+    late_s = _late_s(paths, scan, camera)
     begin_x, begin_y = paths.places_px(EVERY, late_s)
     end_x, end_y = paths.places_px(EVERY, late_s + scan.hold_s)
     chords = Chords(np.stack([begin_x, end_x]), np.stack([begin_y, end_y]))
@@ -97,16 +91,9 @@ def swept_sprites(
     # turn.
     length_px = np.nan_to_num(chords.length_sigma((1.0, 1.0)))
     bulge_px = paths.speed_rad_s * scan.hold_s * length_px
-    # From the first light of the row where a path begins until the row where it ends is written
-    # again: a star that falls by a share s of the rows that the panel lights meanwhile is overtaken
-    # by the panel hold / (1 - s) after the first.
-    span_s = np.zeros(len(late_s))
+    end_late_s = scan.late_s(end_x, end_y, camera.resolution_px)
+    span_s = _span_s(end_late_s - late_s, scan.hold_s)
     if scan.hold_s:
-        later_s = scan.late_s(end_x, end_y, camera.resolution_px) - late_s
-        share = later_s / scan.hold_s
-        share = np.where(np.isfinite(share), share, 0.0)
-        share = np.clip(share, -MAX_TURN_FIELD, MAX_TURN_FIELD)
-        span_s = scan.hold_s / (1 - share)
         chords = chords.to(span_s / scan.hold_s)
     # the part of each path, 0 to 1
     first, last = chords.on_image(camera.resolution_px, margin_px + bulge_px)
@@ -128,6 +115,34 @@ def swept_sprites(
     sprites = pack_sprites(x_px, y_px, light, star, camera.resolution_px, footprint_px)
     coarser = (wanted > 0) if is_slower else (counts < wanted)
     return replace(sprites, per_star=int(counts.max(initial=1)), capped=int(coarser.sum()))
+
+
+def _late_s(paths: Paths | ShortPaths, scan: Scan, camera: Camera) -> FloatArray:
+    """How long after the middle row the row lights up in which each path begins."""
+    late_s = np.zeros(len(paths))
+    if not scan.scanout_s:
+        return late_s
+    # Each pass leaves an error of the share of the frame that the star crosses meanwhile: 1e-5 of
+    # it for 5 px in 1080 rows.
+    for _ in range(2):
+        x_px, y_px = paths.places_px(EVERY, late_s)
+        late_s = scan.late_s(x_px, y_px, camera.resolution_px)
+    return np.where(np.isfinite(late_s), late_s, 0.0)
+
+
+def _span_s(later_s: FloatArray, hold_s: float) -> FloatArray:
+    """How long each star is lit: from the first light of the row where its path begins until the
+    row where it ends, which lights up `later_s` after the first, is written again.
+
+    A star that falls by a share s of the rows that the panel lights meanwhile is overtaken by the
+    panel hold / (1 - s) after the first.
+    """
+    if not hold_s:
+        return np.zeros(len(later_s))
+    share = later_s / hold_s
+    share = np.where(np.isfinite(share), share, 0.0)
+    share = np.clip(share, -MAX_TURN_FIELD, MAX_TURN_FIELD)
+    return np.asarray(hold_s / (1 - share))
 
 
 def _without_the_faintest(

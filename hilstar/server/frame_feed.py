@@ -37,8 +37,8 @@ class _Copied:
 class FrameFeed(Closing):
     """Hands on each frame that `see` is given, while somebody watches.
 
-    `swap_to_light_ns` is the time from a swap to the middle row's light. Without a screen that
-    holds it, a frame stands for the half refresh period before its moment and the one after it.
+    `swap_to_light_ns` is the time from a swap to the middle row's light. Without a screen a frame
+    is a sample at a moment (`FrameHead.moment_ns`).
     """
 
     def __init__(
@@ -55,11 +55,16 @@ class FrameFeed(Closing):
         self._made = 0
         self.watched = False
         self._half_period_ns = round(NS_PER_S / bench.config.monitor.refresh_hz / 2)
+        self._half_hold_ns = round(bench.scan.hold_s * NS_PER_S / 2)
+        self._before_ns: int | None = None  # the moment of the newest frame
         self._thread = threading.Thread(target=self._send, name="hilstar-frames", daemon=True)
         self._thread.start()
 
     def see(self, shown: Shown) -> None:
         """Take a frame. Called by the frame loop."""
+        moment_ns = self._moment_ns(shown)
+        before_ns = self._before_ns
+        self._before_ns = moment_ns
         if not self.watched:
             return
         levels = shown.drawn.levels
@@ -73,22 +78,35 @@ class FrameFeed(Closing):
             self._made += 1
             copied = _Copied(np.empty_like(levels))
         np.copyto(copied.levels, levels)
-        on_screen = shown.predicted_swap_ns is not None
+        if moment_ns is None:
+            lit_ns = shown.swap_ns + self._swap_to_light_ns()
+        elif before_ns is None or not shown.fades:
+            lit_ns = moment_ns - self._half_period_ns
+        else:
+            lit_ns = (before_ns + moment_ns) // 2
         copied.head = FrameHead(
             frame=shown.number,
-            lit_ns=(
-                shown.swap_ns + self._swap_to_light_ns()
-                if on_screen
-                else shown.draw_ns - self._half_period_ns
-            ),
+            lit_ns=lit_ns,
             width=levels.shape[1],
             height=levels.shape[0],
             bits=monitor.bits,
             q=self._attitude(shown),
             channels=1 if self._rgb is None and levels.ndim == 2 else 3,
             bench_sha256=self._bench.file.sha256,
+            moment_ns=moment_ns,
+            fades=shown.fades,
         )
         self._full.put(copied)
+
+    def _moment_ns(self, shown: Shown) -> int | None:
+        """The moment that a frame is a sample of: of one drawn in motion the middle of that. None
+        with a screen.
+        """
+        if shown.predicted_swap_ns is not None:
+            return None
+        if shown.drawn.rate_cam_rad_s is None:
+            return shown.moment_ns
+        return shown.moment_ns + self._half_hold_ns
 
     def _attitude(self, shown: Shown) -> tuple[float, float, float, float] | None:
         if shown.attitude is None:

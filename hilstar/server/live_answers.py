@@ -21,6 +21,7 @@ from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server.answers.answer import Answer, AnswerSource
 from hilstar.server.answers.judge import AnswerJudge, AnswerRules, Judged, TrackerFigures, unjudged
 from hilstar.server.answers.pairing import LitFrame, LitFrames
+from hilstar.server.answers.star_widths import AnswerWidths
 from hilstar.server.bench.frame import Bench
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger import LedgerSwitch
@@ -54,6 +55,7 @@ class LiveAnswers:
     ) -> None:
         self.figures = TrackerFigures()
         self.newest: Judged | None = None
+        self.widths = AnswerWidths()
         # called with new figures of a new answer
         self.heard: Callable[[LiveAnswers], None] = lambda answers: None
         # called with each, as it is judged
@@ -85,12 +87,13 @@ class LiveAnswers:
         if self._on_screen:
             host_ns = shown.swap_ns + self._light_ns
         else:
-            host_ns = shown.draw_ns
+            host_ns = shown.moment_ns
         if attitude is not None and is_visible:
             q = attitude.q_icrs_to_cam
         else:
             q = None
-        self._frames.add(LitFrame(shown.number, host_ns, light_ns, q, shown.drawn.rate_cam_rad_s))
+        rate_rad_s = shown.drawn.rate_cam_rad_s
+        self._frames.add(LitFrame(shown.number, host_ns, light_ns, q, rate_rad_s, shown.fades))
 
     @contextmanager
     def running(self) -> Iterator[None]:
@@ -170,6 +173,7 @@ class LiveAnswers:
 
     def _take(self, judged: Judged) -> None:
         self.newest = judged
+        self.widths.take(judged.answer)
         self._record(judged)
         if judged.verdict == "wrong":
             self._notices.tell(WRONG, wrong_line(judged))

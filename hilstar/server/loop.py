@@ -71,6 +71,7 @@ class FaultyFrames:
 
     def __init__(self, source: Callable[[int], tuple[Now, ...]], view: FaultView) -> None:
         self.dropped = self.frozen = 0
+        self.has_dropped = False  # since the last frame that was shown
         self.now: tuple[Now, ...] = ()  # faults of the last frame that was asked about
         self._source = source
         self._view = view
@@ -90,6 +91,7 @@ class FaultyFrames:
         if effects is None or self._held is None or not effects.drops(number):
             return False
         self.dropped += 1
+        self.has_dropped = True
         return True
 
     def attitude(
@@ -128,6 +130,7 @@ class FaultyFrames:
         """Remember a shown frame, and return its faults: of one that `stays` its first ones, and
         what freezes it now.
         """
+        self.has_dropped = False
         now = () if effects is None else effects.now
         if stays and self._held is not None:
             return (
@@ -233,6 +236,8 @@ class FrameLoop:
         if self._gives_up(number, moment):
             return None
         self.watch.enter("draw")
+        is_sample = moment.starts_ns is not None
+        stood = faults is not None and faults.has_dropped  # the frame before, as a fault has it
         drawn = self._bench.draw_sprites(light, number) if stays is None else stays
         now = (
             ()
@@ -257,6 +262,8 @@ class FrameLoop:
             missing=missing,
             on_screen=on_screen,
             faults=now,
+            light_ns=moment.light_ns,
+            fades=is_sample and not stood,
         )
         self._count(shown, on_screen)
         self.watch.enter("output")

@@ -7,7 +7,7 @@ for a run without a screen; `DisplayPacer` (`screen/screen.py`) follows a displa
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hilstar.attitude.clock.timeline import Attitude
@@ -42,6 +42,14 @@ class Moment:
             return host_ns
         return self.light_ns
 
+    def lit_at(self, light_ns: int) -> "Moment":
+        """The same moment, with when the frame's light leaves: the time of its attitude."""
+        return replace(self, light_ns=light_ns)
+
+    def lit_on_grid(self) -> "Moment":
+        """The same moment, of a log's frame: its time is the grid's, however late it is begun."""
+        return self if self.starts_ns is None else self.lit_at(self.starts_ns)
+
     @property
     def starts_ns(self) -> int | None:
         """When the frame starts where that is known before it is drawn: paced, and without a
@@ -73,7 +81,9 @@ class Shown:
     was to be swapped onto the screen and when it was; headless, with nothing predicted, when its
     levels were ready. `missed_before` counts the refresh periods just before it that had no frame
     of their own, and `marker` is the photodiode square's light, 0 or 1. `missing` is true where no
-    attitude has come yet; `attitude` is None too where an operator's key hides the sky.
+    attitude has come yet; `attitude` is None too where an operator's key hides the sky. `light_ns`
+    is the time of its attitude, None where that is `draw_ns`. `fades`: without a screen, paced, and
+    no fault dropped the frame before (see `light_times`).
     """
 
     number: int
@@ -90,6 +100,13 @@ class Shown:
     missing: bool = False
     on_screen: OnScreen = HEADLESS
     faults: tuple[Now, ...] = ()
+    light_ns: int | None = None
+    fades: bool = False
+
+    @property
+    def moment_ns(self) -> int:
+        """The host time of its attitude: of a frame without a screen, what it is a sample of."""
+        return self.draw_ns if self.light_ns is None else self.light_ns
 
 
 FrameSink = Callable[[Shown], None]

@@ -389,7 +389,7 @@ def replay(
             faults.recall(past)
         if play.wrong_sky.any:
             _recall_conditions(play.wrong_sky, past, outlet.notices)
-        shown = loop.draw(number, t_ns, attitude, moment)
+        shown = loop.draw(number, t_ns, attitude, moment.lit_on_grid())
         if shown is not None:
             outlet.record(bench, loop, shown, t_ns)
         return shown

@@ -178,8 +178,9 @@ def _serve_stream(
 
     def draw_slot(moment: Moment) -> Shown | None:
         receiver.tend()
-        t_ns = receiver.clock.to_sender_ns(moment.light_if_begun_at(clock.now_ns()))
-        shown = loop.draw(moment.slot, t_ns, timeline.at(t_ns), moment)
+        host_ns = moment.light_if_begun_at(clock.now_ns())
+        t_ns = receiver.clock.to_sender_ns(host_ns)
+        shown = loop.draw(moment.slot, t_ns, timeline.at(t_ns), moment.lit_at(host_ns))
         if shown is None:
             return None
         light_ns = t_ns - receiver.jumps.correction_ns  # by the sender's own clock

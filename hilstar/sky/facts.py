@@ -64,12 +64,18 @@ def _packaged() -> dict[str, npt.NDArray[Any]]:
     return facts
 
 
+@cache
+def _by_hip() -> npt.NDArray[np.intp]:
+    """The rows of the packaged catalogue in the order of their HIP numbers."""
+    return np.argsort(_packaged()["hip"])
+
+
 def facts_of(hip: npt.NDArray[np.int32]) -> dict[str, npt.NDArray[Any]]:
     """Hipparcos' facts of stars (n,) by their HIP numbers: NaN and empty text for those that it
     does not have.
     """
     facts = _packaged()
-    order = np.argsort(facts["hip"])
+    order = _by_hip()
     place = np.searchsorted(facts["hip"], hip, sorter=order)
     place = np.minimum(place, len(order) - 1)
     row = order[place]

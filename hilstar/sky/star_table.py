@@ -32,7 +32,7 @@ import numpy.typing as npt
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import HilstarError, InputError
 from hilstar.basics.files import make_directory, whole_file
-from hilstar.basics.reading import open_regular
+from hilstar.basics.reading import open_named, open_regular
 from hilstar.basics.units import plain_unit
 from hilstar.sky import table_reader
 from hilstar.sky.catalog import (
@@ -621,19 +621,26 @@ class Kept:
     doubts: tuple[str, ...] = ()
 
 
-_digests: dict[tuple[int, ...], str] = {}  # of files, by their states
+_digests: dict[tuple[int, ...] | None, str] = {}  # of files, by their states
 
 
 def file_sha256(path: Path, advice: str) -> str:
     """The SHA-256 of a file of at most MAX_TABLE_BYTES, computed once for each state of it.
     Raises InputError.
     """
-    with open_regular(path, advice, table_reader.MAX_TABLE_BYTES) as file:
-        status = os.fstat(file.fileno())
+    try:
+        status = path.stat()
+    except (OSError, ValueError):  # its reader says why
+        state = None
+    else:
         state = (status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
-        if state not in _digests:
-            _digests[state] = hashlib.file_digest(file, "sha256").hexdigest()
+    if state in _digests:
         return _digests[state]
+    with open_named(path, advice, table_reader.MAX_TABLE_BYTES) as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    if state is not None:
+        _digests[state] = digest
+    return digest
 
 
 def store_path(made_of: Sequence[str]) -> Path | None:
@@ -835,5 +842,5 @@ def table_facts(
 
 def _is_hip_main(path: Path) -> bool:
     """Whether a file begins as Hipparcos' main catalogue does."""
-    with open_regular(path, table_reader.FILE_WANTED, table_reader.MAX_TABLE_BYTES) as file:
+    with open_named(path, table_reader.FILE_WANTED, table_reader.MAX_TABLE_BYTES) as file:
         return file.read(2) == b"H|"

@@ -29,8 +29,8 @@ from hilstar.basics.image_files import ImageSizeError, is_fits, unpacked
 from hilstar.basics.reading import (
     HEAD_BYTES,
     kind_of,
-    open_regular,
-    read_bytes,
+    named_bytes,
+    open_named,
     wide_encoding,
 )
 from hilstar.basics.text_tables import NO_NUMBERS, TextTable, open_table
@@ -402,11 +402,11 @@ def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawT
     """Read the columns of a table of stars that have `roles`. Raises InputError for another
     file, or one that is too large.
     """
-    with open_regular(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
+    with open_named(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
         head = file.read(4096)
     kind = kind_of(head[:HEAD_BYTES])
     if kind == "a gzip file":
-        packed = read_bytes(path, FILE_WANTED, MAX_TABLE_BYTES)
+        packed = named_bytes(path, FILE_WANTED, MAX_TABLE_BYTES)
         if is_fits(packed):
             return _read_packed_fits(path, packed, roles)
     if kind is not None and kind != "a FITS file" and wide_encoding(head) is None:
@@ -416,6 +416,11 @@ def read_table(path: Path, roles: Mapping[str, tuple[str, ...]] = NAMES) -> RawT
         raise cannot_read(path, f"it is {kind}", advice)
     text = head.lstrip(b"\xef\xbb\xbf \r\n\t")
     if kind == "a FITS file":
+        # one in memory is not opened again; a larger one is not read as a whole
+        in_memory = open_named(path, FILE_WANTED, MAX_TABLE_BYTES)
+        if isinstance(in_memory, io.BytesIO):
+            return _read_fits(path, in_memory, roles)
+        in_memory.close()
         return _read_fits(path, path, roles)
     if text[:5] == b"<?xml" or text[:8].upper() == b"<VOTABLE":
         return _read_votable(path, roles)
@@ -483,14 +488,15 @@ def _read_votable(path: Path, roles: Mapping[str, tuple[str, ...]]) -> RawTable:
     if size_bytes > MAX_XML_BYTES:
         reason = f"a VOTable of {size_text(size_bytes)}, {size_text(MAX_XML_BYTES)} at most"
         raise cannot_read(path, reason, "give it as FITS")
-    if ELSEWHERE.search(path.read_bytes()):
+    content = named_bytes(path, FILE_WANTED, MAX_XML_BYTES)
+    if ELSEWHERE.search(content):
         raise cannot_read(
             path,
             "its data are in another file or at another place",
             "give a VOTable that holds them",
         )
     with _quiet(path):
-        table = votable.parse_single_table(path, verify="ignore")
+        table = votable.parse_single_table(io.BytesIO(content), verify="ignore")
         fields = {field.name: field for field in table.fields}
         layout = layout_of(path, list(fields), roles)
         _check_rows(path, len(table.array))
@@ -566,7 +572,7 @@ def _degrees(values: npt.NDArray[Any], mask: npt.NDArray[np.bool_], unit: str) -
 
 def _ecsv_units(path: Path) -> dict[str, str | None]:
     """The units of an ECSV's columns by its YAML head; nothing for other texts."""
-    with open_regular(path, FILE_WANTED) as file:
+    with open_named(path, FILE_WANTED, MAX_TABLE_BYTES) as file:
         head = file.read(MAX_HEAD_BYTES).decode("utf-8-sig", errors="replace")
     comments = []
     for line in head.splitlines():

@@ -4,7 +4,7 @@ space, and Wahba's problem.
 
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -50,14 +50,15 @@ def wahba(seen: FloatArray, known: FloatArray, weight: FloatArray) -> FloatArray
 
 @dataclass(frozen=True, slots=True)
 class FoundStars:
-    """Stars found in an image, brightest first: places (n,), px, signal (n,), e-, and directions
-    (n, 3), cam, unit.
+    """Stars found in an image, brightest first: places (n,), px, signal (n,), e-, directions
+    (n, 3), cam, unit, and the widths (m,), px, of the first m.
     """
 
     x_px: FloatArray
     y_px: FloatArray
     flux_e: FloatArray
     rays: FloatArray
+    width_px: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __len__(self) -> int:
         return len(self.x_px)

@@ -7,8 +7,16 @@ import os
 import pytest
 
 from hilstar.basics.errors import MachineError
-from tests.support.beside import astrometry_side, lost_side, pyxel_side, stellarium_side
+from tests.support.benches import ROOT
+from tests.support.beside import (
+    astrometry_side,
+    lost_side,
+    pyxel_side,
+    satsim_side,
+    stellarium_side,
+)
 from tests.support.beside.steps import Beside
+from tests.support.tables import csv_rows
 
 # float32 shares are within MAX_SHARE_ERROR (1e-7) by polynomial, and 1.2e-7 of rounding
 PIXEL_SHARE = 2.2e-7
@@ -28,16 +36,29 @@ IMAGE_ARCSEC = 1.0
 BENT_PX, FREE_PX = 2e-3, 0.1
 # LOST prints six digits: places are rounded evenly, and 364 of them tell their rms within 10 %
 DIGITS = 1.1
+# of a size on the page; sums of float32 have other last digits on another processor
+OF_THE_PAGE, LAST_DIGITS = 0.02, 1e-7
 # programs of minutes, or of an environment of their own
 on_demand = pytest.mark.skipif(
     "HILSTAR_BESIDE" not in os.environ, reason="runs on demand: HILSTAR_BESIDE=1"
 )
 MEAN_DN, PATTERN = 0.25, 0.02  # of 250 000 pixels; Pyxel's means and scatters go to 0.06 and 0.5 %
 DARK = 1e-6  # one law, written twice
+# of what chance passes once in twenty runs; of SatSim's points, whose error falls with their square
+CHANCES, GRID_SHARE = 1.5, 1e-4
 # Hipparcos in both, by its steps; UT1 as IERS predicts it, planets by VSOP87 and by DE421
 STARS_ARCSEC, PLANETS_ARCSEC, PLANETS_MAG = 0.3, 1.0, 0.03
 # the Bright Star Catalogue's own errors, beside 0.32 arcsec of rounding
 CATALOGUE_ARCSEC = 1.0
+
+
+def assert_as_on_the_page(name: str, beside: Beside) -> None:
+    """The page's table has the sizes of this run, of the steps that it takes."""
+    rows = csv_rows(ROOT / "results" / f"beside_{name}.csv")
+    recorded = {(row["subject"], row["step"]): float(row["size"]) for row in rows}
+    for step in beside.steps:
+        wanted = recorded[step.subject, step.step]
+        assert step.size == pytest.approx(wanted, rel=OF_THE_PAGE, abs=LAST_DIGITS), step
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +67,10 @@ def galsim(tmp_path_factory) -> Beside:
     from tests.support.beside import galsim_side
 
     return galsim_side.run(tmp_path_factory.mktemp("galsim"), quick=True)
+
+
+def test_galsim_s_table_on_the_page_is_of_this_run(galsim):
+    assert_as_on_the_page("galsim", galsim)
 
 
 def test_galsim_s_pixels_of_a_gaussian_are_hilstar_s(galsim):
@@ -107,6 +132,7 @@ def test_lost_s_generator_has_stars_where_hilstar_has_them():
     lost = Beside("LOST", "", "", tuple(lost_side.place_steps(places)))
     subject = lost_side.PLACES
     assert len(places.hr) == 182
+    assert_as_on_the_page("lost", lost)
     assert lost.size(subject, "by LOST's own") < DIGITS * lost.size(
         subject, "for comparison: the six digits"
     )
@@ -124,6 +150,19 @@ def test_pyxel_s_photon_transfer_is_hilstar_s_but_for_its_pattern(tmp_path):
     assert pyxel.size(pyxel_side.PRNU, "light, Pyxel's halved") < PATTERN
     assert pyxel.size(pyxel_side.PRNU, "scatter to Pyxel's doubled") < PATTERN
     assert pyxel.size("dark current, 233 to 300 K", "with the gap") < DARK
+
+
+@on_demand
+def test_satsim_s_photon_transfer_is_hilstar_s_but_for_its_well(tmp_path):
+    satsim = satsim_side.run(tmp_path)
+    assert satsim.size(satsim_side.MEAN, "half a DN for that") < MEAN_DN
+    sigma = satsim.size(satsim_side.VARIANCE, "one sigma")
+    assert satsim.size(satsim_side.VARIANCE, "as both come") < SIGMAS * sigma
+    chance = satsim.size(satsim_side.SHAPE, "by chance")
+    assert satsim.size(satsim_side.SHAPE, "with half a DN") < CHANCES * chance
+    assert satsim.size(satsim_side.SHAPE, "as both come") > CHANCES * chance
+    assert satsim.size(satsim_side.WELL, "without a bias") < MEAN_DN
+    assert satsim.size(satsim_side.STAR, "SatSim's grid of 45") < GRID_SHARE
 
 
 @on_demand

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 
 from hilstar.basics import charts
 from tests.support.benches import ROOT
 from tests.support.beside.steps import COLUMNS, Beside, Step, write_beside
 from tests.support.figures import assert_legible
+from tests.support.tables import csv_rows
 
 RECORDED = sorted((ROOT / "results").glob("beside_*.csv"))
 
 
 def recorded_rows(path) -> tuple[Beside, str]:
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(path)
     steps = tuple(
         Step(row["subject"], row["unit"], row["step"], float(row["size"])) for row in rows
     )
@@ -38,7 +36,15 @@ def test_a_recorded_run_is_written_as_it_was_and_its_chart_is_legible(path, tmp_
 
 def test_each_program_of_the_issue_has_a_recorded_run():
     programs = {recorded_rows(path)[0].program for path in RECORDED}
-    assert {"GalSim", "astrometry.net", "LOST", "Basilisk", "Pyxel", "Stellarium"} <= programs
+    assert {
+        "GalSim",
+        "astrometry.net",
+        "LOST",
+        "Basilisk",
+        "Pyxel",
+        "SatSim",
+        "Stellarium",
+    } <= programs
 
 
 def test_a_step_is_found_by_its_subject_and_first_words():

@@ -14,7 +14,7 @@ from scipy.special import ndtr
 
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
-from hilstar.display.response import srgb_response
+from hilstar.display.response import Response, srgb_response, table_response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import pack_sprites
 from tests.authority.test_effort import (
@@ -34,6 +34,14 @@ RATE_E_PER_S = WHITE_E_PER_S / PEAK_SHARE * 10 ** (-0.4 * MAG_UNDER_WHITE)
 # the usual tracker: its optics spread a monitor's pixel by so much, and its pixels are as wide
 BLUR_PX, TRACKER_PIXEL_PX = 0.62, 1.0
 SEEN_SIGMA_PX = float(np.sqrt(SIGMA_PX**2 + 1 / 6 + BLUR_PX**2))
+SRGB = srgb_response(8)
+# equal steps of light: a star of 42 of them and a half lies between two that can be shown, and one
+# of 42 and a third leaves most over six frames
+LINEAR = table_response(8, np.linspace(0, 1, 256))
+STEP_E_PER_S = WHITE_E_PER_S / 255
+BETWEEN_STEPS, OVER_SIX_FRAMES = 42.5, 42.33
+OF_A_STEP = 0.02  # what a logarithm above and below 1 and the wings' cut differ by
+BEGINNINGS = 48  # of exposures, one frame after another: 49 152 of a field's stars
 # for the slopes of a fit; a hundredth of it changes no digit
 SLOPE_STEP_PX, FIT_ROUNDS = 1e-3, 3
 
@@ -68,24 +76,31 @@ def field():
     return columns, rows, x, y
 
 
-def shown_light(method, field, frames=1, first=0):
-    """The mean light (n, side, side) of each star's square over frames of the real renderer."""
+def drawn_frames(method, field, frames, response: Response = SRGB, rate_e_per_s=RATE_E_PER_S):
+    """The light (n, side, side) of each star's square in frames of the real renderer."""
     columns, rows, x, y = field
     side = PHASES * STEP_PX
     psf = GaussianPsf((SIGMA_PX, SIGMA_PX))
-    target = Target((side, side), psf, srgb_response(8), WHITE_E_PER_S, method)
-    numbers, rates = np.arange(len(x)), np.full(len(x), RATE_E_PER_S)
+    target = Target((side, side), psf, response, WHITE_E_PER_S, method)
+    numbers, rates = np.arange(len(x)), np.full(len(x), rate_e_per_s)
     stars = pack_sprites(columns + x, rows + y, rates, numbers, (side, side), psf.footprint_px)
     near = np.arange(-HALF_PX, HALF_PX + 1)
     squares = rows[:, None, None] + near[:, None], columns[:, None, None] + near
-    shown = 0.0
     with Renderer(target) as renderer:
-        for frame in range(first + frames):
+        for frame in range(frames):
             renderer.draw(stars, frame)
-            if frame >= first:
-                light = light_of_codes(renderer.levels().astype(np.float64), 8, "srgb")
-                shown = shown + light[squares]
-    return WHITE_E_PER_S * shown / frames
+            levels = renderer.levels().astype(np.float64)
+            light = levels / response.white
+            if response is SRGB:
+                light = light_of_codes(levels, 8, "srgb")
+            yield WHITE_E_PER_S * light[squares]
+
+
+def shown_light(method, field, frames=1, first=0, **panel):
+    """The mean light (n, side, side) of each star's square over frames of the real renderer."""
+    drawn = drawn_frames(method, field, first + frames, **panel)
+    shown = sum(light for number, light in enumerate(drawn) if number >= first)
+    return shown / frames
 
 
 def places_off(shown, field, rng):
@@ -120,9 +135,9 @@ def test_a_star_six_magnitudes_under_white_keeps_its_light_and_its_place(method,
         holds("codes-exact-others", max(rms(off) for off in off_px.values()))
 
 
-def magnitudes_off(shown):
+def magnitudes_off(shown, rate_e_per_s=RATE_E_PER_S):
     """How far each star's light is off, mag (n,)."""
-    return 2.5 * np.log10(shown.sum(axis=(1, 2)) / RATE_E_PER_S)
+    return 2.5 * np.log10(shown.sum(axis=(1, 2)) / rate_e_per_s)
 
 
 def test_six_frames_of_temporal_make_up_for_each_other(field, rng):
@@ -131,3 +146,34 @@ def test_six_frames_of_temporal_make_up_for_each_other(field, rng):
     holds("codes-temporal-light", rms(magnitudes_off(shown)))
     for off in places_off(shown, field, rng).values():
         holds("codes-temporal-places", rms(off))
+
+
+def test_a_star_between_two_steps_is_half_a_step_off(field):
+    """No codes of equal steps could do better."""
+    panel = {"response": LINEAR, "rate_e_per_s": BETWEEN_STEPS * STEP_E_PER_S}
+    off_mag = magnitudes_off(shown_light("exact", field, **panel), panel["rate_e_per_s"])
+    half_mag = 2.5 * np.log10(1 + 0.5 / BETWEEN_STEPS)
+    assert np.abs(off_mag) == pytest.approx(half_mag, rel=OF_A_STEP)
+    holds("half-a-step", np.abs(off_mag).max())
+
+
+def test_over_six_frames_steps_are_shared(field):
+    """A step over all frames of an exposure, wherever it begins."""
+    panel = {"response": LINEAR, "rate_e_per_s": OVER_SIX_FRAMES * STEP_E_PER_S}
+    off_mag = np.abs(exposures_mag(field, **panel)).max()
+    step_mag = 2.5 * np.log10(1 + 1 / (6 * OVER_SIX_FRAMES))
+    assert off_mag < (1 + OF_A_STEP) * step_mag
+    holds("step-of-six-frames", off_mag)
+
+
+def test_the_worst_exposure_of_six_frames(field):
+    """At every phase, whichever frame it begins with."""
+    holds("temporal-worst-light", np.abs(exposures_mag(field)).max())
+
+
+def exposures_mag(field, rate_e_per_s=RATE_E_PER_S, response=SRGB):
+    """How far the light of exposures of six frames of `temporal` is off, mag (beginnings, n)."""
+    drawn = drawn_frames("temporal", field, BEGINNINGS + 5, response, rate_e_per_s)
+    of_frames = np.cumsum([light.sum(axis=(1, 2)) for light in drawn], axis=0)
+    whole = np.concatenate([np.zeros((1, of_frames.shape[1])), of_frames])
+    return 2.5 * np.log10((whole[6:] - whole[:-6]) / 6 / rate_e_per_s)

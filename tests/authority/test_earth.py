@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from astropy.coordinates import GCRS, ITRS, AltAz, CartesianRepresentation, EarthLocation, SkyCoord
 from astropy.time import Time
-from astropy.utils import iers
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.earth import (
@@ -27,6 +26,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import conjugate, multiply, to_matrix, to_rotation_vector
 from tests.support.claims import holds
 
+pytestmark = pytest.mark.usefixtures("iers_of_package")
 MAS = np.radians(1 / 3.6e6)
 # AltAz has the light's aberration of the Earth's turning (0.32 arcsec at the equator), which is no
 # part of an attitude.
@@ -49,14 +49,6 @@ DATES = [
     "2024-02-29T06:00:00.25",
     "2026-11-22T10:00:00",
 ]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _the_same_table():
-    """Astropy with the table of its package: nothing is downloaded."""
-    table = iers.IERS_A.read(iers.IERS_A_FILE)
-    with iers.conf.set_temp("auto_download", False), iers.earth_orientation_table.set(table):
-        yield
 
 
 def utc_array(text: str) -> np.ndarray:

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from astropy.coordinates import GCRS, ITRS, CartesianRepresentation
 from astropy.time import Time, TimeDelta
-from astropy.utils import iers
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.entries import Stated
@@ -21,6 +20,7 @@ from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.wire.source import Convention, Mounting
 from tests.support.commands import run_hilstar_here
 
+pytestmark = pytest.mark.usefixtures("iers_of_package")
 ORION = (0.6987226, 0.7135120, -0.0370377, 0.0362700)
 MOUNTING = (0.5, -0.5, -0.5, -0.5)
 PLACE_DEG, DATE = (47.0, 8.0), "2024-01-01T00:00:00"
@@ -31,13 +31,6 @@ SHOWN_DEG = 6e-5
 # Earth's third axis, from which the pole of rotation is 0.6 arcsec away at most: 7.3e-5 rad/s of
 # 3e-6 rad.
 EARTH_RAD, RATE_RAD_S = 1e-8, 2.2e-10
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _nothing_is_downloaded():
-    table = iers.IERS_A.read(iers.IERS_A_FILE)
-    with iers.conf.set_temp("auto_download", False), iers.earth_orientation_table.set(table):
-        yield
 
 
 def icrs_to_enu(seconds: float, kind: str = "enu") -> Rotation:
@@ -76,7 +69,7 @@ def boresight_deg(icrs_to_cam: Rotation) -> tuple[float, float]:
 
 
 @pytest.fixture(params=["csv", "jsonl"])
-def log(request, tmp_path):
+def level_log(request, tmp_path):
     path = tmp_path / f"body.{request.param}"
     rows = [f"{k},{','.join(map(str, ORION))}" for k in range(2)]
     objects = [json.dumps({"t_ns": k * 10**9, "q": ORION}) for k in range(2)]
@@ -86,18 +79,18 @@ def log(request, tmp_path):
     return path
 
 
-def test_a_log_of_the_body_looks_where_scipy_says(log):
+def test_a_log_of_the_body_looks_where_scipy_says(level_log):
     camera = Rotation.from_quat(MOUNTING, scalar_first=True) * Rotation.from_quat(
         ORION, scalar_first=True
     )
-    ra_deg, dec_deg = pointing(log, "--mounting", ",".join(map(str, MOUNTING)))
+    ra_deg, dec_deg = pointing(level_log, "--mounting", ",".join(map(str, MOUNTING)))
     assert (ra_deg, dec_deg) == pytest.approx(boresight_deg(camera), abs=SHOWN_DEG)
     assert (ra_deg, dec_deg) == pytest.approx((354.0570, 0.0), abs=SHOWN_DEG)
 
 
-def test_a_log_that_refers_to_east_north_up_looks_where_astropy_says(log):
+def test_a_log_that_refers_to_east_north_up_looks_where_astropy_says(level_log):
     camera = Rotation.from_quat(ORION, scalar_first=True) * icrs_to_enu(0.0)
-    ra_deg, dec_deg = pointing(log, "--reference", "enu", *LEVEL)
+    ra_deg, dec_deg = pointing(level_log, "--reference", "enu", *LEVEL)
     assert (ra_deg, dec_deg) == pytest.approx(boresight_deg(camera), abs=SHOWN_DEG)
     assert (ra_deg, dec_deg) == pytest.approx((280.0145, 41.4978), abs=SHOWN_DEG)
 

@@ -24,7 +24,7 @@ FAINTEST_V_MAG = 7.0
 
 
 @pytest.fixture(scope="module")
-def sky():
+def bright_sky():
     stars = load_catalog().brighter_than(FAINTEST_V_MAG)
     ra_rad, dec_rad = np.radians(stars.ra_deg), np.radians(stars.dec_deg)
     xy = [np.cos(dec_rad) * np.cos(ra_rad), np.cos(dec_rad) * np.sin(ra_rad)]
@@ -32,11 +32,11 @@ def sky():
 
 
 @pytest.fixture(scope="module")
-def field(sky):
+def slopes_in_field(bright_sky):
     """Slopes of the stars in the field (n, 2), right and down in the image, brightest first, and
     magnitudes.
     """
-    directions, v_mag = sky
+    directions, v_mag = bright_sky
     cam = directions @ to_matrix(from_radec_roll_deg(*RADEC_ROLL_DEG)).T
     slopes = cam[:, :2] / cam[:, 2:]
     edge = SIDE_PX / 2 / FOCAL_PX
@@ -49,15 +49,15 @@ def is_same_attitude(q, other):
     return min(np.abs(q - other).max(), np.abs(q + other).max()) < 1e-5
 
 
-def test_tetra3rs_answers_in_hilstars_convention(sky, field):
+def test_tetra3rs_answers_in_hilstars_convention(bright_sky, slopes_in_field):
     pytest.importorskip("tetra3rs")
-    slopes, v_mag = field
-    solver = LostInSpace(*sky, FOCAL_PX, (SIDE_PX, SIDE_PX))
+    slopes, v_mag = slopes_in_field
+    solver = LostInSpace(*bright_sky, FOCAL_PX, (SIDE_PX, SIDE_PX))
     q = solver.solve(slopes, 10 ** (-0.4 * v_mag))
     assert is_same_attitude(q, from_radec_roll_deg(*RADEC_ROLL_DEG))
 
 
-def test_ruststartracker_has_the_scalar_last_and_the_conjugate(sky, field):
+def test_ruststartracker_has_the_scalar_last_and_the_conjugate(bright_sky, slopes_in_field):
     solver = pytest.importorskip("ruststartracker")
     middle_px = (SIDE_PX - 1) / 2
     matrix = np.array([[FOCAL_PX, 0, middle_px], [0, FOCAL_PX, middle_px], [0, 0, 1.0]])
@@ -65,28 +65,28 @@ def test_ruststartracker_has_the_scalar_last_and_the_conjugate(sky, field):
         camera_matrix=matrix, cam_resolution=(SIDE_PX, SIDE_PX), dist_coefs=None
     )
     tracker = solver.StarTracker(
-        *(array.astype(np.float32) for array in sky),
+        *(array.astype(np.float32) for array in bright_sky),
         camera,
         inter_star_angle_tolerance=float(np.radians(0.02)),
         n_minimum_matches=5,
     )
-    rays = np.column_stack([field[0], np.ones(len(field[0]))])
+    rays = np.column_stack([slopes_in_field[0], np.ones(len(slopes_in_field[0]))])
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     x, y, z, w = tracker.process_observation_vectors(rays.astype(np.float32)).quat
     assert is_same_attitude(np.array([w, -x, -y, -z]), from_radec_roll_deg(*RADEC_ROLL_DEG))
 
 
-def test_cedar_answers_hilstars_roll(field):
+def test_cedar_answers_hilstars_roll(slopes_in_field):
     solver = pytest.importorskip("tetra3").Tetra3()
-    rows = field[0][:30, ::-1] * FOCAL_PX + SIDE_PX / 2
+    rows = slopes_in_field[0][:30, ::-1] * FOCAL_PX + SIDE_PX / 2
     answer = solver.solve_from_centroids(rows, (SIDE_PX, SIDE_PX), fov_estimate=FIELD_DEG)
     found_deg = [answer["RA"], answer["Dec"], answer["Roll"]]
     assert found_deg == pytest.approx(RADEC_ROLL_DEG, abs=0.002)
 
 
-def picture(field):
+def picture(slopes_in_field):
     """An image of 8 bits (rows from the top): a Gaussian of 1.2 px for each star of the field."""
-    slopes, v_mag = field
+    slopes, v_mag = slopes_in_field
     rows, columns = np.indices((SIDE_PX, SIDE_PX))
     image = np.zeros((SIDE_PX, SIDE_PX))
     for (right, down), v in zip(slopes, v_mag, strict=True):
@@ -102,12 +102,12 @@ def turned_deg(angle_deg, other_deg):
 
 
 @pytest.mark.skipif("LOST" not in os.environ, reason="runs on demand: LOST=the folder of a build")
-def test_lost_s_roll_is_minus_hilstar_s(field, tmp_path):
+def test_lost_s_roll_is_minus_hilstar_s(slopes_in_field, tmp_path):
     from PIL import Image
 
     lost = lost_side.lost_folder()
     subprocess.run(["./lost", *lost_side.DATABASE], cwd=lost, capture_output=True, check=True)
-    Image.fromarray(picture(field)).save(tmp_path / "sky.png")
+    Image.fromarray(picture(slopes_in_field)).save(tmp_path / "sky.png")
     words = ["./lost", "pipeline", "--png", str(tmp_path / "sky.png"), "--fov", f"{FIELD_DEG:g}"]
     words += ["--database", "stars.dat", "--centroid-algo", "cog", "--star-id-algo", "py"]
     words += ["--centroid-filter-brightest", "20", "--angular-tolerance", "0.05"]
@@ -121,12 +121,12 @@ def test_lost_s_roll_is_minus_hilstar_s(field, tmp_path):
     assert turned_deg(float(answer["roll"]), -roll_deg) < 0.1
 
 
-def test_astrometry_net_s_up_is_180_deg_minus_hilstar_s_roll(field, tmp_path):
+def test_astrometry_net_s_up_is_180_deg_minus_hilstar_s_roll(slopes_in_field, tmp_path):
     """Of a list of places whose y is down, as hilstar's images have it."""
     if shutil.which(astrometry_side.SOLVER) is None:
         pytest.skip("astrometry.net is not installed (apt-get install astrometry.net)")
     config = astrometry_side.make_index(tmp_path)
-    slopes, v_mag = field
+    slopes, v_mag = slopes_in_field
     x_px, y_px = (slopes * FOCAL_PX + (SIDE_PX + 1) / 2).T
     columns = {"X": x_px, "Y": y_px, "FLUX": 10 ** (-0.4 * v_mag)}
     Table(columns).write(tmp_path / "places.fits")
@@ -161,7 +161,7 @@ print(json.dumps({key: answer[key] for key in ("RA", "Dec", "Roll", "Matches")},
 
 
 @pytest.mark.skipif("TETRA3" not in os.environ, reason="runs on demand: TETRA3=ESA's folder")
-def test_esa_s_tetra3_answers_hilstar_s_roll(field, tmp_path):
+def test_esa_s_tetra3_answers_hilstar_s_roll(slopes_in_field, tmp_path):
     """Its catalogue is a file of the Bright Star Catalogue's form: here hilstar's own stars."""
     from PIL import Image
 
@@ -173,7 +173,7 @@ def test_esa_s_tetra3_answers_hilstar_s_roll(field, tmp_path):
     rows["mag"] = np.round(stars.v_mag * 100)
     catalogue = bytes(28) + rows.tobytes() + bytes((9110 - len(rows)) * rows.itemsize)
     (tmp_path / "tetra3" / "BSC5").write_bytes(catalogue)
-    Image.fromarray(picture(field)).save(tmp_path / "sky.png")
+    Image.fromarray(picture(slopes_in_field)).save(tmp_path / "sky.png")
     command = [sys.executable, "-c", ESA_SOLVER, str(tmp_path / "sky.png")]
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     done = subprocess.run(

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import datetime
 import json
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hilstar.display.window.output_settings import PITCH_TOLERANCE
@@ -35,7 +37,15 @@ from tools import claims as tool
 
 ROW = "star-places"
 # pages, tests, and the files that have what is given
-COPIED = ("docs/*.md", "tests/**/*.py", "hilstar/**/*.py", "tools/*.py", "configs/*.toml")
+COPIED = (
+    "docs/*.md",
+    "tests/**/*.py",
+    "hilstar/**/*.py",
+    "tools/*.py",
+    "configs/*.toml",
+    "configs/*.md",
+    "results/*.csv",
+)
 
 
 def test_each_figure_its_row_and_its_test_belong_together():
@@ -143,6 +153,8 @@ CALL = 'holds("star-places", error_mas.max())'
         ("docs/certify.md", "\n## ", "\nIt is 0.3 px off.\n\n## ", "0.3 px has no mark"),
         ("docs/certify.md", "0.2 %<!-- given", "0.3 %<!-- given", "has no 0.3 %"),
         ("docs/first-day.md", "0.05 mag<!-- given: ", "0.05 mag<!-- given: x/", "has no 0.05 mag"),
+        ("docs/first-day.md", "::UNSURE_MAG", "", "without a word of its line"),
+        ("docs/first-day.md", "::UNSURE_MAG", "::MIN_READINGS", "has no 0.05 mag beside"),
         ("claims.toml", TEST, "tests/authority/test_nothing.py", "does not exist"),
         ("claims.toml", "test_every_star_is", "test_every_star_was", "does not exist"),
         ("claims.toml", '["apply_space_motion"]', '["starpm"]', "does not use starpm"),
@@ -150,6 +162,7 @@ CALL = 'holds("star-places", error_mas.max())'
         ("claims.toml", 'oracle = "library"', 'oracle = "hope"', "the oracle is of no known kind"),
         ("claims.toml", 'value = "0.007"', 'value = "0.07"', "under half of 0.07 mas"),
         ("claims.toml", 'value = "0.007"', 'value = "0.005"', "out of"),
+        ("claims.toml", "margin = 0.05", "margin = 0.3", "the margin is over 0.05"),
         ("claims.toml", "the catalogue; no code", "nothing", "hilstar imports astropy too"),
         ("claims.toml", 'name = "limits"', 'name = "limit"', "no row of the table limits"),
         ("claims.toml", '"FRAME_ARCSEC"', '"SPIN_ARCSEC"', "does not use SPIN_ARCSEC"),
@@ -162,6 +175,36 @@ CALL = 'holds("star-places", error_mas.max())'
 def test_what_is_falsified_is_found(falsified, name, before, after, fault):
     found = faults(falsified(name, before, after))
     assert any(fault in one for one in found), found
+
+
+def other_digit(words: str, rng: np.random.Generator) -> str:
+    """A number with another last digit of its mantissa."""
+    mantissa, exponent, power = words.partition("e")
+    other = (int(mantissa[-1]) + rng.integers(1, 10)) % 10
+    return f"{mantissa[:-1]}{other}{exponent}{power}"
+
+
+def test_any_marked_figure_that_is_changed_is_found(rng):
+    """Each mark of each page in turn, by another digit of the number before it."""
+    claims, pages = tool.claims_of(), tool.pages_of()
+    known = {claim.id: claim for claim in claims}
+    for name, text in pages.items():
+        for mark in tool.MARK.finditer(text):
+            ends = known[mark[1]].value.rpartition(" to ")
+            at = text.rindex(ends[2], 0, mark.start())
+            changed = text[:at] + other_digit(ends[2], rng) + text[at + len(ends[2]) :]
+            found = support.faults_of_marks(claims, {name: changed})
+            assert any(mark[1] in one for one in found if name in one), (name, mark[1])
+
+
+def test_any_bound_that_is_loosened_is_found():
+    """Each row in turn, with a figure of twice the size, or a margin of its size."""
+    pages = tool.pages_of()
+    for claim in tool.claims_of():
+        ends = [2 * float(words.replace(" ", "")) for words in claim.value.split(" to ")]
+        twice = dataclasses.replace(claim, value=" to ".join(f"{end:g}" for end in ends))
+        assert any("the page has" in one for one in support.faults_of_marks([twice], pages))
+        assert support.faults_of_row(dataclasses.replace(claim, margin=1.0)), claim.id
 
 
 def test_too_few_oracles_outside_are_found(falsified):

@@ -42,7 +42,8 @@ LANGUAGES = {"console", "python", "toml", "json", "text", "c"}
 # of the attitude, a run's frames, a tracker's answers, and the operator's page
 DEFAULT_PORTS = ("5560", "5570", "5580", "8765")
 LISTEN = "0A"  # a state of /proc/net/tcp
-
+# Of a live run whose figures vary: a minute and a half has the same lines, and holds a worker up.
+MAX_DURATION_S = 25
 
 Ports = dict[str, str]
 
@@ -137,6 +138,9 @@ def type_in(block: Block, ports: Ports) -> None:
                 words += ["--to", f"tcp://127.0.0.1:{port}"]
             if words[0] == "hilstar" and words[-1] == "--console":
                 words.append(f"127.0.0.1:{ports['8765']}")
+            if block.figures_vary and "--duration" in words:
+                at = words.index("--duration") + 1
+                words[at] = str(min(float(words[at]), MAX_DURATION_S))
             # each worker is a process, which takes a second to start
             if words[:2] in (["hilstar", "campaign"], ["hilstar", "accept"]):
                 words += ["--workers", "1"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import re
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from tests.examples.support import EXAMPLES, commands, copied, section
 from tests.support.commands import run_hilstar_here
+from tests.support.tables import csv_rows
 from tests.support.waiting import PATIENCE_S
 
 STEP_S = 0.1
@@ -65,8 +65,7 @@ def test_replay_and_the_virtual_tracker_follow_it(tmp_path, monkeypatch):
     assert shape(replayed.stdout + exposed.stdout) == shape(shown)
 
     log = sample_rows()
-    with Path("slew-frames/frames.csv").open() as file:
-        frames = list(csv.DictReader(file))
+    frames = csv_rows(Path("slew-frames/frames.csv"))
     assert [float(frame["t_s"]) for frame in frames] == [2.0 * k for k in range(12)]
     for frame, sample in zip(frames, log[::20], strict=True):
         assert np.allclose(

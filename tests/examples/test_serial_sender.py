@@ -34,7 +34,7 @@ def cable(tmp_path) -> Iterator[Cable]:
 
 
 @pytest.fixture(scope="module")
-def sender(tmp_path_factory) -> Path:
+def uart(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("serial") / "serial_sender"
     command = [
         "gcc",
@@ -60,13 +60,13 @@ def sender_counts(output: str) -> dict[str, int]:
 
 
 def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(
-    tmp_path, cable, sender
+    tmp_path, cable, uart
 ):
     bench_file = tmp_path / "serial.toml"
     bench_file.write_text(
         f'{SMALL_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n'
     )
-    command = [str(sender), str(cable.sender), str(BAUD), "100", "1.5", "5", str(CLOCK_OFFSET_S)]
+    command = [str(uart), str(cable.sender), str(BAUD), "100", "1.5", "5", str(CLOCK_OFFSET_S)]
     with listening(bench_file, "reading serial:") as process:
         result = subprocess.run(
             command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
@@ -98,9 +98,9 @@ def listened(link: SerialLink, program: subprocess.Popen) -> list[tuple[int, obj
     return heard
 
 
-def test_the_sender_turns_as_its_rate_says_and_answers_on_its_own_clock(cable, sender):
+def test_the_sender_turns_as_its_rate_says_and_answers_on_its_own_clock(cable, uart):
     rate_rad_s = math.radians(20.0)
-    command = [str(sender), str(cable.sender), str(BAUD), "200", "0.5", "20", str(CLOCK_OFFSET_S)]
+    command = [str(uart), str(cable.sender), str(BAUD), "200", "0.5", "20", str(CLOCK_OFFSET_S)]
     with (
         SerialLink(str(cable.host), BAUD) as link,
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as program,
@@ -130,7 +130,7 @@ def test_the_sender_turns_as_its_rate_says_and_answers_on_its_own_clock(cable, s
     assert t1_ns <= reply.t2_ns - offset_ns <= reply.t3_ns - offset_ns <= t4_ns
 
 
-def test_the_sender_says_in_one_line_what_is_wrong(sender):
+def test_the_sender_says_in_one_line_what_is_wrong(uart):
     for arguments, code in (
         ([], 2),
         (["/dev/null", "115200", "1", "1", "x"], 2),
@@ -138,7 +138,7 @@ def test_the_sender_says_in_one_line_what_is_wrong(sender):
         (["/dev/null", "115200", "1", "1", "1"], 1),
     ):
         result = subprocess.run(
-            [str(sender), *arguments],
+            [str(uart), *arguments],
             capture_output=True,
             text=True,
             timeout=PATIENCE_S,

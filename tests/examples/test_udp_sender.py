@@ -28,7 +28,7 @@ STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow"
 
 
 @pytest.fixture(scope="module")
-def sender(tmp_path_factory) -> Path:
+def streamer(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("udp") / "udp_sender"
     compiler, *rest = commands("A C++ sender over UDP")[0]
     command = [compiler, *STRICT, *rest[:-1], target]
@@ -44,14 +44,14 @@ def sender(tmp_path_factory) -> Path:
     return target
 
 
-def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender):
+def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, streamer):
     address, port = "::1", free_port()
     bench = tmp_path / "udp.toml"
     bench.write_text(
         f'{SMALL_BENCH}\n[attitude]\nsource = "udp"\nbind = "{address}"\nport = {port}\n'
     )
     with listening(bench, "bound to") as process:
-        command = [sender, address, str(port), "100", str(STREAM_S), "5"]
+        command = [streamer, address, str(port), "100", str(STREAM_S), "5"]
         result = subprocess.run(
             command, capture_output=True, text=True, timeout=PATIENCE_S, check=True
         )
@@ -68,11 +68,11 @@ def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, sender):
     assert abs(summary["clock"]["offset_ms"]) <= summary["clock"]["uncertainty_ms"] + 1.0
 
 
-def test_the_sender_turns_as_its_rate_says(sender):
+def test_the_sender_turns_as_its_rate_says(streamer):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:
         end.bind(("127.0.0.1", 0))
         end.settimeout(PATIENCE_S)
-        command = [sender, "127.0.0.1", str(end.getsockname()[1]), "500", "0.1", "20"]
+        command = [streamer, "127.0.0.1", str(end.getsockname()[1]), "500", "0.1", "20"]
         subprocess.run(command, capture_output=True, timeout=PATIENCE_S, check=True)
         samples = [decode(end.recv(100)) for _ in range(50)]
     rate = np.radians([0.0, 0.0, 20.0])
@@ -87,14 +87,14 @@ def test_the_sender_turns_as_its_rate_says(sender):
         assert sample.rate_cam_rad_s.tolist() == [0.0, 0.0, float(np.float32(rate[2]))]
 
 
-def test_the_sender_says_in_one_line_what_is_wrong(sender):
+def test_the_sender_says_in_one_line_what_is_wrong(streamer):
     for arguments, code in (
         ([], 2),
         (["127.0.0.1", "9", "1", "1", "x"], 2),
         (["127.0.0.1", "no port", "1", "1", "1"], 1),
     ):
         result = subprocess.run(
-            [sender, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+            [streamer, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False
         )
         assert result.returncode == code
         assert len(result.stderr.splitlines()) == 1

@@ -50,7 +50,7 @@ FLUX_LIMIT, PIXEL_LIMIT = 0.01, 0.05
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory) -> Iterator[Bench]:
+def moon_bench(tmp_path_factory) -> Iterator[Bench]:
     file = tmp_path_factory.mktemp("discs") / "bench.toml"
     bodies = {"moon": True, "sun": True, "planets": True}
     tables = {
@@ -63,9 +63,9 @@ def bench(tmp_path_factory) -> Iterator[Bench]:
         yield opened
 
 
-def aim(bench: Bench, name: str, off_deg: float = 0.0) -> np.ndarray:
+def aim(moon_bench: Bench, name: str, off_deg: float = 0.0) -> np.ndarray:
     """The attitude with a body that far above the middle."""
-    stars = bench.seen(bench.stars, AT_START)
+    stars = moon_bench.seen(moon_bench.stars, AT_START)
     vector = stars.vectors[len(stars) - len(stars.bodies) + stars.bodies.index(name)]
     ra, dec = np.degrees(np.arctan2(vector[1], vector[0])), np.degrees(np.arcsin(vector[2]))
     return from_radec_roll_deg(ra, dec - off_deg, 0.0)
@@ -93,16 +93,16 @@ def disc_on_image(radius_px: float, phase_deg: float, at_px=(45.0, 41.0), name="
     return one.of_rate(1e8)
 
 
-def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(bench):
-    q = aim(bench, "Moon")
-    shot = bench.frame(q)
+def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(moon_bench):
+    q = aim(moon_bench, "Moon")
+    shot = moon_bench.frame(q)
     listed = set(shot.truth["hip"].tolist())
     assert not listed & set(BEEHIVE)
     with skyfield() as (scale, kernel):
         now = kernel["earth"].at(scale.utc(2026, 11, 29))
         moon = now.observe(kernel["moon"]).apparent()
         radius_deg = np.degrees(np.arcsin(1737.4 / moon.distance().km))
-        catalog = bench.stars.catalog
+        catalog = moon_bench.stars.catalog
         near = np.flatnonzero(
             (np.abs(catalog.dec_deg - 19.5) < 3)
             & (np.abs(catalog.ra_deg - 130) < 3)
@@ -115,37 +115,41 @@ def test_stars_behind_the_moon_are_neither_drawn_nor_in_the_table(bench):
     assert len(beside) > 5 and beside <= listed
     assert shot.truth["name"][0] == "Moon"
     assert shot.linear.sum() == pytest.approx(shot.truth["electrons_per_s"].sum(), rel=FLUX_LIMIT)
-    assert bench.losses_mag(shot)["Moon"] > 3
-    view, canvas = View(q), Canvas(bench.camera, GaussianPsf(SIGMA))
-    stars, layers = bench.seen(bench.stars, view), sky_layers(canvas, bench.sources)
+    assert moon_bench.losses_mag(shot)["Moon"] > 3
+    view, canvas = View(q), Canvas(moon_bench.camera, GaussianPsf(SIGMA))
+    stars, layers = moon_bench.seen(moon_bench.stars, view), sky_layers(canvas, moon_bench.sources)
     for seen, behind in ((layers, set()), (layers[:1], set(BEEHIVE))):
-        found = brightest_in_view(light_of(canvas, seen, stars, view), stars, bench.camera, q, 500)
+        found = brightest_in_view(
+            light_of(canvas, seen, stars, view), stars, moon_bench.camera, q, 500
+        )
         assert {star.hip for star in found} & set(BEEHIVE) == behind
 
 
-def test_the_moon_a_degree_beside_the_field_changes_nothing_and_half_of_it_is_half(bench):
+def test_the_moon_a_degree_beside_the_field_changes_nothing_and_half_of_it_is_half(moon_bench):
     half_deg = np.degrees(
-        np.arctan(bench.camera.resolution_px[1] / 2 / bench.camera.focal_length_px)
+        np.arctan(moon_bench.camera.resolution_px[1] / 2 / moon_bench.camera.focal_length_px)
     )
-    beside = bench.light(bench.view(aim(bench, "Moon", half_deg + 1.0)))
+    beside = moon_bench.light(moon_bench.view(aim(moon_bench, "Moon", half_deg + 1.0)))
     assert beside.extended == () and beside.over_white == ()
-    whole, half = (bench.frame(aim(bench, "Moon", off)) for off in (0.0, half_deg))
+    whole, half = (moon_bench.frame(aim(moon_bench, "Moon", off)) for off in (0.0, half_deg))
     named = {row["name"]: row for row in half.truth}
     assert named["Moon"]["clipped"] and named["Moon"]["y_px"] == pytest.approx(-0.5, abs=0.3)
     assert 0.2 < half.linear.sum() / whole.linear.sum() < 0.8
-    assert bench.losses_mag(half)["Moon"] == pytest.approx(bench.losses_mag(whole)["Moon"], abs=0.5)
+    assert moon_bench.losses_mag(half)["Moon"] == pytest.approx(
+        moon_bench.losses_mag(whole)["Moon"], abs=0.5
+    )
 
 
-def test_the_sun_in_the_field_is_white_finite_and_told_and_stars_keep_their_light(bench):
-    q = aim(bench, "Sun", 1.0)
-    shot = bench.frame(q)
+def test_the_sun_in_the_field_is_white_finite_and_told_and_stars_keep_their_light(moon_bench):
+    q = aim(moon_bench, "Sun", 1.0)
+    shot = moon_bench.frame(q)
     assert np.isfinite(shot.linear).all() and shot.linear.max() > 1e15
     assert (shot.levels == shot.levels.max()).sum() > 50
     row = shot.truth[shot.truth["name"] == "Sun"][0]
-    assert row["clipped"] and bench.losses_mag(shot)["Sun"] > 15
-    assert "Sun" in bench.draw(q).clipped_hip
-    sprites = bench.light(bench.view(q))
-    points = bench.sprites(q, bench.seen(bench.shown_stars, View(q)))
+    assert row["clipped"] and moon_bench.losses_mag(shot)["Sun"] > 15
+    assert "Sun" in moon_bench.draw(q).clipped_hip
+    sprites = moon_bench.light(moon_bench.view(q))
+    points = moon_bench.sprites(q, moon_bench.seen(moon_bench.shown_stars, View(q)))
     kept = np.isin(points.star, sprites.star)
     assert len(sprites) > 10 and np.array_equal(sprites.data, points.data[kept])
 
@@ -186,15 +190,15 @@ def test_a_disc_that_others_hide_as_a_whole_is_none():
         assert len(layer.on_image(AT_START)) == seen
 
 
-def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(bench):
-    q = aim(bench, "Moon")
-    layer = BodyLayer(bench.moving, Canvas(bench.camera, GaussianPsf(SIGMA)))
-    stars = bench.seen(bench.shown_stars, View(q))
-    points = bench.sprites(q, stars)
-    first = len(stars) - len(bench.moving.names)
-    moon = int(np.flatnonzero(points.star == first + bench.moving.names.index("Moon"))[0])
+def test_a_point_behind_a_disc_is_gone_and_one_before_it_stays(moon_bench):
+    q = aim(moon_bench, "Moon")
+    layer = BodyLayer(moon_bench.moving, Canvas(moon_bench.camera, GaussianPsf(SIGMA)))
+    stars = moon_bench.seen(moon_bench.shown_stars, View(q))
+    points = moon_bench.sprites(q, stars)
+    first = len(stars) - len(moon_bench.moving.names)
+    moon = int(np.flatnonzero(points.star == first + moon_bench.moving.names.index("Moon"))[0])
     (face,) = layer.on_image(View(q))
-    jupiter = first + bench.moving.names.index("Jupiter")
+    jupiter = first + moon_bench.moving.names.index("Jupiter")
     behind = replace(points, star=np.where(np.arange(len(points)) == moon, jupiter, points.star))
     stars.vectors[jupiter] = face.direction
     kept = layer.unhidden(behind, stars, [face], View(q)).star
@@ -313,19 +317,19 @@ def test_maps_of_discs_do_not_push_out_those_that_last(monkeypatch):
     assert len(uploaded) == 1 + 3 * 2 * 5
 
 
-def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(bench):
+def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(moon_bench):
     """A turn of 3 degrees/s, 17 ms for a row: 0.9 px of this screen; a star at the Moon's middle
     is the truth for its place.
     """
-    q, rate = aim(bench, "Moon"), np.array([0.0, np.radians(3.0), 0.0])
+    q, rate = aim(moon_bench, "Moon"), np.array([0.0, np.radians(3.0), 0.0])
     scan = Scan(scanout_s=1 / 60, hold_s=1 / 60)
-    layer = BodyLayer(bench.moving, bench.canvas)
-    stars = bench.seen(bench.shown_stars, View(q))
-    none = sprites_at(np.empty((0, 2)), np.empty(0), bench.psf.footprint_px)
+    layer = BodyLayer(moon_bench.moving, moon_bench.canvas)
+    stars = moon_bench.seen(moon_bench.shown_stars, View(q))
+    none = sprites_at(np.empty((0, 2)), np.empty(0), moon_bench.psf.footprint_px)
     middles = []
     for turn in (None, rate, 4 * rate):
-        bench.renderer.draw(layer.add(none, stars, View(q, turn, scan=scan)))
-        light = bench.renderer.linear().astype(float)
+        moon_bench.renderer.draw(layer.add(none, stars, View(q, turn, scan=scan)))
+        light = moon_bench.renderer.linear().astype(float)
         y, x = np.mgrid[: light.shape[0], : light.shape[1]]
         middles.append(
             (light.sum(), (light * x).sum() / light.sum(), (light * y).sum() / light.sum())
@@ -333,7 +337,9 @@ def test_a_disc_under_a_turn_keeps_its_light_and_lies_along_the_way_of_its_star(
     still, *turned = middles
     for times, (total, x, y) in zip((1, 4), turned, strict=True):
         assert total == pytest.approx(still[0], rel=FLUX_LIMIT)
-        way_px = times * np.radians(3.0) / 120 * bench.camera.focal_length_px  # in half the time
+        way_px = (
+            times * np.radians(3.0) / 120 * moon_bench.camera.focal_length_px
+        )  # in half the time
         assert abs(x - still[1]) == pytest.approx(way_px, abs=0.1)
         assert y == pytest.approx(still[2], abs=0.1)
 

@@ -27,7 +27,7 @@ T_NS = 0
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory) -> Iterator[Bench]:
+def leo_bench(tmp_path_factory) -> Iterator[Bench]:
     """Places come with the frame, so that each test can stand where its scene wants it."""
     file = tmp_path_factory.mktemp("earth") / "bench.toml"
     tables = {
@@ -59,30 +59,36 @@ def towards(direction: np.ndarray) -> np.ndarray:
     return from_radec_roll_deg(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 0.0)
 
 
-def body_direction(bench: Bench, name: str, place_km: np.ndarray) -> np.ndarray:
-    assert bench.moving is not None
-    found = bench.moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, 0.0, T_NS, np.zeros(3), place_km)
+def body_direction(leo_bench: Bench, name: str, place_km: np.ndarray) -> np.ndarray:
+    assert leo_bench.moving is not None
+    found = leo_bench.moving.discs(
+        np.array([0.0, 0.0, 1.0]), np.pi, 0.0, T_NS, np.zeros(3), place_km
+    )
     return next(disc.direction for disc in found if disc.name == name)
 
 
-def light_from(bench: Bench, direction: np.ndarray, place_km: np.ndarray) -> np.ndarray:
+def light_from(leo_bench: Bench, direction: np.ndarray, place_km: np.ndarray) -> np.ndarray:
     """The linear image about a direction from a place."""
-    sprites = bench.light(bench.view(towards(direction), None, T_NS, np.zeros(3), place_km))
-    levels = bench.draw_sprites(sprites).levels
-    linear = bench.renderer.linear().astype(float)
+    sprites = leo_bench.light(leo_bench.view(towards(direction), None, T_NS, np.zeros(3), place_km))
+    levels = leo_bench.draw_sprites(sprites).levels
+    linear = leo_bench.renderer.linear().astype(float)
     assert np.isfinite(linear).all()
-    assert (levels[linear > bench.flux_at_white_e_per_s] == bench.calibration.response.white).all()
+    assert (
+        levels[linear > leo_bench.flux_at_white_e_per_s] == leo_bench.calibration.response.white
+    ).all()
     return linear
 
 
-def test_a_star_fades_in_the_air_as_rays_do_and_is_gone_behind_the_ground(bench):
-    stars = bench.shown_stars
+def test_a_star_fades_in_the_air_as_rays_do_and_is_gone_behind_the_ground(leo_bench):
+    stars = leo_bench.shown_stars
     star = int(np.flatnonzero(stars.hip == ALNILAM)[0])
     direction, whole = stars.vectors[star], stars.electrons_per_s[star]
     shares = []
     for height_rad in np.linspace(-0.02, 0.03, 40):
         place = above(direction, height_rad, np.array([0.0, 0.3, 1.0]))
-        sprites = bench.light(bench.view(towards(direction), None, T_NS, np.zeros(3), place))
+        sprites = leo_bench.light(
+            leo_bench.view(towards(direction), None, T_NS, np.zeros(3), place)
+        )
         mine = sprites.data["electrons_per_s"][sprites.star == star].sum() / whole
         earth = Body(
             -place,
@@ -103,24 +109,27 @@ def test_a_star_fades_in_the_air_as_rays_do_and_is_gone_behind_the_ground(bench)
     assert (np.diff(shares) >= 0).all()
 
 
-def test_the_moon_sets_behind_the_earth(bench):
+def test_the_moon_sets_behind_the_earth(leo_bench):
     """Over the night side, so that nothing else has light there."""
-    side = -body_direction(bench, "Sun", np.array([0.0, 0.0, 7000.0]))
-    first = body_direction(bench, "Moon", np.array([0.0, 0.0, 7000.0]))
+    side = -body_direction(leo_bench, "Sun", np.array([0.0, 0.0, 7000.0]))
+    first = body_direction(leo_bench, "Moon", np.array([0.0, 0.0, 7000.0]))
     shares = []
     for height_deg in (-2.0, 0.2, 3.0):
         place = above(first, np.radians(height_deg), side)
-        moon = body_direction(bench, "Moon", place)  # parallax, up to a degree
+        moon = body_direction(leo_bench, "Moon", place)  # parallax, up to a degree
         place = above(moon, np.radians(height_deg), side)
-        moon = body_direction(bench, "Moon", place)
-        picture = light_from(bench, moon, place)
+        moon = body_direction(leo_bench, "Moon", place)
+        picture = light_from(leo_bench, moon, place)
         listed = [
             disc.name
-            for disc in bench.discs(bench.view(towards(moon), None, T_NS, np.zeros(3), place))
+            for disc in leo_bench.discs(
+                leo_bench.view(towards(moon), None, T_NS, np.zeros(3), place)
+            )
         ]
         assert ("Moon" in listed) == (height_deg > 0)
         faces = {
-            disc.name: disc for disc in bench.moving.discs(moon, 0.0, 0.0, T_NS, np.zeros(3), place)
+            disc.name: disc
+            for disc in leo_bench.moving.discs(moon, 0.0, 0.0, T_NS, np.zeros(3), place)
         }
         whole = faces["Moon"].normal_e_per_s_sr * faces["Moon"].law_integral_sr()
         y, x = np.mgrid[:240, :320]
@@ -131,10 +140,10 @@ def test_the_moon_sets_behind_the_earth(bench):
     assert shares[2] == pytest.approx(1.0, abs=FLUX_LIMIT)
 
 
-def test_the_sun_at_the_limb_is_cut_by_it_and_all_stays_finite(bench):
-    sun = body_direction(bench, "Sun", np.array([0.0, 0.0, 7000.0]))
+def test_the_sun_at_the_limb_is_cut_by_it_and_all_stays_finite(leo_bench):
+    sun = body_direction(leo_bench, "Sun", np.array([0.0, 0.0, 7000.0]))
     sums = [
-        light_from(bench, sun, above(sun, np.radians(h), np.array([0.3, 0.2, 1.0]))).sum()
+        light_from(leo_bench, sun, above(sun, np.radians(h), np.array([0.3, 0.2, 1.0]))).sum()
         for h in (-3.0, -0.1, 0.1, 3.0)
     ]
     assert (np.diff(sums) > 0).all()
@@ -142,13 +151,13 @@ def test_the_sun_at_the_limb_is_cut_by_it_and_all_stays_finite(bench):
     assert 0 < sums[1] < 0.6 * sums[-1]
 
 
-def test_from_low_above_the_day_side_the_earth_fills_the_field(bench):
-    sun = body_direction(bench, "Sun", np.array([0.0, 0.0, 7000.0]))
+def test_from_low_above_the_day_side_the_earth_fills_the_field(leo_bench):
+    sun = body_direction(leo_bench, "Sun", np.array([0.0, 0.0, 7000.0]))
     place = (EQUATOR_KM + ALTITUDE_KM) * sun
-    picture = light_from(bench, -sun, place)
-    assert (picture > bench.flux_at_white_e_per_s).all()
-    drawn = bench.draw_sprites(
-        bench.light(bench.view(towards(-sun), None, T_NS, np.zeros(3), place))
+    picture = light_from(leo_bench, -sun, place)
+    assert (picture > leo_bench.flux_at_white_e_per_s).all()
+    drawn = leo_bench.draw_sprites(
+        leo_bench.light(leo_bench.view(towards(-sun), None, T_NS, np.zeros(3), place))
     )
     assert drawn.star_count == 0
     assert drawn.clipped_hip == ("Earth",)

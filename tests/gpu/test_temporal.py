@@ -18,14 +18,9 @@ from hilstar.display.response import gamma_response, srgb_response, table_respon
 from hilstar.display.temporal import TemporalQuantiser
 from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf
-from hilstar.optics.sprites import pack_sprites
 from tests.support.centroiders import family_errors_px
+from tests.support.star_tiles import SIDE, SIGMA, SIZE, WHITE, flux_of, places, stars, tiles
 
-WHITE = 1e6
-SIGMA = (0.85, 0.85)
-TILE, SIDE = 22, 12
-SIZE = (TILE * SIDE, TILE * SIDE)
-SIX_MAG = WHITE * 10 ** (-0.4 * 6.0) / GaussianPsf(SIGMA).peak_share
 FRAMES = 6
 AIM_MAG, AIM_PX, OF_FEW = 0.003, 0.004, 1.15  # as in tests/unit/display/test_temporal.py
 # The shader sums in another order and knows erf to 4e-7: of two choices that are nearly as good it
@@ -33,32 +28,6 @@ AIM_MAG, AIM_PX, OF_FEW = 0.003, 0.004, 1.15  # as in tests/unit/display/test_te
 OTHER_PIXELS = 0.03
 LEFT = 0.02
 UNEVEN = np.random.default_rng(5).uniform(0.8, 1.2, SIZE[::-1]).astype(np.float32)
-
-
-def stars(x, y, flux, numbers=None):
-    numbers = np.arange(len(x)) if numbers is None else numbers
-    return pack_sprites(
-        x,
-        y,
-        np.broadcast_to(np.asarray(flux, float), x.shape),
-        numbers,
-        SIZE,
-        GaussianPsf(SIGMA).footprint_px,
-    )
-
-
-def places():
-    middle = (np.arange(SIDE) + 0.5) * TILE - 0.5 + (np.arange(SIDE) + 0.5) / SIDE - 0.5
-    return tuple(axis.ravel() for axis in np.meshgrid(middle, middle))
-
-
-def tiles(image):
-    return np.asarray(
-        image.reshape(SIDE, TILE, SIDE, TILE)
-        .transpose(0, 2, 1, 3)
-        .reshape(-1, TILE, TILE)[:, :-1, :-1],
-        float,
-    )
 
 
 def flux_mag(shown, wanted):
@@ -70,7 +39,7 @@ def flux_mag(shown, wanted):
 @pytest.mark.parametrize("make", [srgb_response, gamma_response])
 def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(make):
     target = Target(SIZE, GaussianPsf(SIGMA), make(8), WHITE, "temporal")
-    sprites = stars(*places(), SIX_MAG)
+    sprites = stars(*places(), flux_of(6.0))
     sky = tiles(linear_image(sprites, SIZE, GaussianPsf(SIGMA)))
     with Renderer(target) as gl:
         frames = []
@@ -134,7 +103,7 @@ def test_without_compute_shaders_it_is_numpy_s(monkeypatch):
     target = Target(SIZE, GaussianPsf(SIGMA), srgb_response(8), WHITE, "temporal")
     oracle, sprites = (
         TemporalQuantiser(target.panel(), SIZE, GaussianPsf(SIGMA)),
-        stars(*places(), SIX_MAG),
+        stars(*places(), flux_of(6.0)),
     )
     with Renderer(target) as gl:
         for frame in range(3):
@@ -156,7 +125,7 @@ def test_paths_keep_their_light_over_the_frames():
             sprites = stars(
                 np.repeat(x, 5) + at * np.cos(way),
                 np.repeat(y, 5) + at * np.sin(way),
-                SIX_MAG / 5,
+                flux_of(6.0) / 5,
                 numbers,
             )
             sprites = replace(sprites, per_star=5)

@@ -20,7 +20,7 @@ def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Screen]:
 
 
 @pytest.fixture
-def bench_file(tmp_path: Path) -> Path:
+def screen_file(tmp_path: Path) -> Path:
     """A bench whose monitor is the screen; `still.csv` beside it."""
     path = tmp_path / "bench.toml"
     path.write_text(SCREEN_BENCH)

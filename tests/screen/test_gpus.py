@@ -31,9 +31,9 @@ def test_doctor_names_the_gpu_of_a_window_and_the_headless_one(screen):
 
 
 def test_the_summary_and_the_ledger_have_the_gpu_that_drew_the_window(
-    softpipe_screen, bench_file: Path, tmp_path: Path
+    softpipe_screen, screen_file: Path, tmp_path: Path
 ):
-    bench_file.write_text(
+    screen_file.write_text(
         SCREEN_BENCH.replace("[640, 480]", "[160, 120]").replace(
             '"exact"', '"round"\ngpu = "llvmpipe"'
         )
@@ -42,7 +42,7 @@ def test_the_summary_and_the_ledger_have_the_gpu_that_drew_the_window(
     log = still_log(tmp_path / "second.csv", seconds=1)
     environment = softpipe_screen.env | {"GALLIUM_DRIVER": "softpipe"}
     ran = run_hilstar(
-        "replay", bench_file, log, "--json", "--windowed", "--ledger", ledger, env=environment
+        "replay", screen_file, log, "--json", "--windowed", "--ledger", ledger, env=environment
     )
     assert ran.returncode == 0, ran.stderr
     assert "softpipe draws this window" in ran.stderr

@@ -22,7 +22,7 @@ from hilstar.display.response import gamma_response
 from hilstar.display.window.this_monitor import edid_of_drm, identity_here
 from hilstar.server.console.run_status import RunSource, RunStatus
 from hilstar.server.record.ledger_records import EventRecord, run_records
-from tests.screen.test_monitors import bench
+from tests.screen.test_monitors import on_dummy
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
 from tests.support.forks import HILSTAR, Started
 from tests.support.ledgers import read_run
@@ -73,7 +73,7 @@ def measured_bench(
     q = np.array([1.0, 0, 0, 0])
     notes = Notes({}, ErrorTable(), MadeTable(when=str(when)), identity)
     write_geometry(folder / "geometry.toml", monitor_camera((640, 480), 57.65, 60.0, q), q, notes)
-    path = bench(folder, f"{NAMED}\n{keys}")
+    path = on_dummy(folder, f"{NAMED}\n{keys}")
     path.write_text(
         path.read_text().replace("[collimator]", '[collimator]\ngeometry = "geometry.toml"')
     )
@@ -274,7 +274,7 @@ def test_old_files_are_refused_by_their_date_and_undated_or_built_in_ones_are_no
         " whether this"
     )
     assert noticed.stdout.count(lacking) == 1
-    built_in = played(bench(tmp_path), "--force")
+    built_in = played(on_dummy(tmp_path), "--force")
     assert (
         built_in.returncode == 0 and built_in.stderr.count('"srgb" is built in: whether this') == 1
     )

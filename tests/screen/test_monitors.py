@@ -31,7 +31,7 @@ def server(tmp_path_factory) -> Iterator[Xorg]:
         yield running
 
 
-def bench(folder: Path, keys: str = 'display = "DUMMY0"') -> Path:
+def on_dummy(folder: Path, keys: str = 'display = "DUMMY0"') -> Path:
     path = folder / "bench.toml"
     path.write_text(SCREEN_BENCH.replace("[collimator]", f"refresh_hz = 60\n{keys}\n[collimator]"))
     still_log(folder / "still.csv")
@@ -82,7 +82,7 @@ def test_the_ramp_is_straight_while_the_bench_runs_and_given_back_after_a_signal
     server.xrandr("--output", "DUMMY0", "--gamma", OTHER_GAMMA)
     before = server.gamma("DUMMY0")
     assert before != (1.0, 1.0, 1.0)
-    with showing(server, bench(tmp_path)) as process:
+    with showing(server, on_dummy(tmp_path)) as process:
         assert server.gamma("DUMMY0") == (1.0, 1.0, 1.0)
         process.send_signal(how)
         out, err = process.communicate(timeout=PATIENCE_S)
@@ -93,7 +93,7 @@ def test_the_ramp_is_straight_while_the_bench_runs_and_given_back_after_a_signal
 
 
 def test_swaps_that_do_not_wait_for_a_known_refresh_are_refused(server, tmp_path):
-    path = bench(tmp_path)
+    path = on_dummy(tmp_path)
     result = run_hilstar("replay", path, tmp_path / "still.csv", env=server.env)
     assert result.returncode == 3, result.stderr
     assert (
@@ -111,7 +111,7 @@ def test_the_monitor_that_is_named_is_the_one_that_is_filled(server, tmp_path):
             c["detail"] for c in json.loads(listed.stdout)["checks"] if c["name"] == "display"
         )
         assert "DUMMY0, 640 x 480, 60 Hz" in detail and "DUMMY1, 800 x 600" in detail
-        path = bench(tmp_path, 'display = "dummy1"')
+        path = on_dummy(tmp_path, 'display = "dummy1"')
         path.write_text(
             path.read_text().replace("resolution_px = [640, 480]", "resolution_px = [800, 600]")
         )
@@ -122,7 +122,7 @@ def test_the_monitor_that_is_named_is_the_one_that_is_filled(server, tmp_path):
             "replay", path, tmp_path / "still.csv", "--force", "--stop", "0.2", env=server.env
         )
         assert "other displays, DUMMY0" in warned.stderr and "X screen of its own" in warned.stderr
-        wrong = bench(tmp_path, 'display = "DUMMY1"')
+        wrong = on_dummy(tmp_path, 'display = "DUMMY1"')
         result = run_hilstar("replay", wrong, tmp_path / "still.csv", env=server.env)
         assert result.returncode == 3
         assert "800 x 600" in result.stderr
@@ -136,7 +136,7 @@ def test_a_display_keeps_its_refresh_or_takes_the_bench_s_where_it_has_it(
 ):
     """Left to itself GLFW opens a window at the highest refresh that a display has."""
     assert server.refresh_hz("DUMMY0") == 59.94
-    path = bench(tmp_path)
+    path = on_dummy(tmp_path)
     path.write_text(path.read_text().replace("refresh_hz = 60", f"refresh_hz = {wanted_hz}"))
     with showing(server, path):
         assert server.refresh_hz("DUMMY0") == shown_hz
@@ -146,14 +146,14 @@ def test_a_display_keeps_its_refresh_or_takes_the_bench_s_where_it_has_it(
 def test_a_session_of_wayland_alone_is_refused_in_a_plain_line(server, tmp_path):
     env = {name: value for name, value in server.env.items() if name != "DISPLAY"}
     env |= {"WAYLAND_DISPLAY": "wayland-0", "XDG_SESSION_TYPE": "wayland"}
-    result = run_hilstar("replay", bench(tmp_path), tmp_path / "still.csv", env=env)
+    result = run_hilstar("replay", on_dummy(tmp_path), tmp_path / "still.csv", env=env)
     assert_refused(result, 3, "Wayland", "Xorg session", "--headless")
 
 
 def test_x11_is_used_where_the_session_says_wayland(server, tmp_path):
     env = server.env | {"XDG_SESSION_TYPE": "wayland", "WAYLAND_DISPLAY": "wayland-0"}
     result = run_hilstar(
-        "replay", bench(tmp_path), tmp_path / "still.csv", "--force", "--stop", "0.3", env=env
+        "replay", on_dummy(tmp_path), tmp_path / "still.csv", "--force", "--stop", "0.3", env=env
     )
     assert result.returncode == 0, result.stderr
 
@@ -161,7 +161,7 @@ def test_x11_is_used_where_the_session_says_wayland(server, tmp_path):
 def test_a_display_that_another_one_mirrors_is_refused(server, tmp_path):
     server.xrandr("--output", "DUMMY1", "--mode", "640x480", "--same-as", "DUMMY0")
     try:
-        result = run_hilstar("replay", bench(tmp_path), tmp_path / "still.csv", env=server.env)
+        result = run_hilstar("replay", on_dummy(tmp_path), tmp_path / "still.csv", env=server.env)
         assert result.returncode == 3
         assert "DUMMY1 mirrors this one" in result.stderr
     finally:
@@ -171,7 +171,7 @@ def test_a_display_that_another_one_mirrors_is_refused(server, tmp_path):
 def test_a_display_that_is_unplugged_and_returns_is_filled_again(server, tmp_path):
     server.xrandr("--output", "DUMMY1", "--mode", "640x480", "--right-of", "DUMMY0")
     try:
-        path = bench(tmp_path, 'display = "DUMMY1"')
+        path = on_dummy(tmp_path, 'display = "DUMMY1"')
         server.xrandr("--output", "DUMMY1", "--gamma", OTHER_GAMMA)
         with showing(server, path) as process:
             server.xrandr("--output", "DUMMY1", "--off")
@@ -226,7 +226,7 @@ def test_a_compositing_manager_is_refused(server, tmp_path):
         )
         x11.XSetSelectionOwner(client, x11.XInternAtom(client, b"_NET_WM_CM_S0", 0), window, 0)
         x11.XSync(client, 0)
-        result = run_hilstar("replay", bench(tmp_path), tmp_path / "still.csv", env=server.env)
+        result = run_hilstar("replay", on_dummy(tmp_path), tmp_path / "still.csv", env=server.env)
     finally:
         x11.XCloseDisplay(client)
     assert result.returncode == 3

@@ -39,18 +39,18 @@ def last_frame(ledger: Path) -> FrameRecord | None:
 
 @contextmanager
 def shown_with_ledger(
-    screen: Screen, bench_file: Path, *options: str
+    screen: Screen, screen_file: Path, *options: str
 ) -> Iterator[tuple[Shown, Client, Path]]:
-    ledger = bench_file.parent / "run.mcap"
+    ledger = screen_file.parent / "run.mcap"
     with (
-        Shown(screen, bench_file, "--ledger", str(ledger), *options) as shown,
+        Shown(screen, screen_file, "--ledger", str(ledger), *options) as shown,
         client(screen.display) as user,
     ):
         wait_for(lambda: last_frame(ledger) is not None)
         yield shown, user, ledger
 
 
-def test_each_key_is_in_the_frames_and_the_events_and_a_hidden_sky_is_none(screen, bench_file):
+def test_each_key_is_in_the_frames_and_the_events_and_a_hidden_sky_is_none(screen, screen_file):
     """Keys, what the frames then say, and whether they have an attitude."""
     steps = [
         ("b", "blank", False),
@@ -60,7 +60,7 @@ def test_each_key_is_in_the_frames_and_the_events_and_a_hidden_sky_is_none(scree
         ("c", "crosshair", True),
     ]
     steps += [("t", "crosshair, patch 0%", False), ("b", "blank, crosshair, patch 0%", False)]
-    with shown_with_ledger(screen, bench_file) as (shown, user, ledger):
+    with shown_with_ledger(screen, screen_file) as (shown, user, ledger):
         for key, operator, has_sky in steps:
             user.press(key)
             wait_for(lambda operator=operator: last_frame(ledger).operator == operator)
@@ -82,8 +82,8 @@ def test_each_key_is_in_the_frames_and_the_events_and_a_hidden_sky_is_none(scree
     assert summary["screen"]["hidden"] == {"frames": 0, "s": 0}
 
 
-def test_a_paused_attitude_grows_old(screen, bench_file):
-    with shown_with_ledger(screen, bench_file) as (shown, user, ledger):
+def test_a_paused_attitude_grows_old(screen, screen_file):
+    with shown_with_ledger(screen, screen_file) as (shown, user, ledger):
         user.press("space")
         wait_for(lambda: last_frame(ledger).operator == "pause")
         first = next(frame for frame in frame_records(ledger) if frame.operator)
@@ -121,8 +121,8 @@ def test_a_paused_attitude_grows_old(screen, bench_file):
         (lambda user: user.cover(640, 480), lambda user, made: user.uncover(made), "covered", []),
     ],
 )
-def test_a_window_that_is_not_seen_is_in_the_record(screen, bench_file, hide, show, why, options):
-    with shown_with_ledger(screen, bench_file, *options) as (shown, user, ledger):
+def test_a_window_that_is_not_seen_is_in_the_record(screen, screen_file, hide, show, why, options):
+    with shown_with_ledger(screen, screen_file, *options) as (shown, user, ledger):
         window = user.window()
         user.window = lambda: window  # whatever lies above it
         made = hide(user)
@@ -187,11 +187,11 @@ def test_the_status_says_what_the_screen_shows(screen, tmp_path):
     assert summary["screen"]["operator"]["frames"] > 0 < summary["screen"]["hidden"]["frames"]
 
 
-def test_b_blanks_a_patch_and_c_draws_the_crosshair_on_it(screen, bench_file):
-    codes = codes_of(bench_file)
+def test_b_blanks_a_patch_and_c_draws_the_crosshair_on_it(screen, screen_file):
+    codes = codes_of(screen_file)
     black = np.zeros_like(codes)
     cross = lines_over(black, "c") > 0
-    with Shown(screen, bench_file) as shown, client(screen.display) as user:
+    with Shown(screen, screen_file) as shown, client(screen.display) as user:
         assert (shown.wait_for(codes) == codes).all()
         for patch in (0, 64, 128, 191, 255):
             user.press("t")

@@ -15,7 +15,7 @@ from hilstar.display.window.output_settings import OutputState, findings
 from hilstar.display.window.randr import Randr, lit_outputs
 from hilstar.display.window.watch import PresentEvents, is_straight, presented_as
 from hilstar.server.record.ledger_records import EventRecord, run_records
-from tests.screen.test_monitors import bench, showing
+from tests.screen.test_monitors import on_dummy, showing
 from tests.support.commands import run_hilstar
 from tests.support.ledgers import read_run
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -112,7 +112,7 @@ def test_doctor_lists_outputs_with_their_properties_and_what_is_wrong(server):
 
 
 def test_a_wrong_setting_is_refused_and_with_force_only_told_and_recorded(server, tmp_path):
-    path, ledger = bench(tmp_path), tmp_path / "run.mcap"
+    path, ledger = on_dummy(tmp_path), tmp_path / "run.mcap"
     with (
         server.property("DUMMY0", "dithering mode", "auto"),
         server.property("DUMMY0", "TearFree", "on"),
@@ -140,7 +140,7 @@ def test_a_wrong_setting_is_refused_and_with_force_only_told_and_recorded(server
 
 
 def test_another_program_s_gamma_ramp_is_told_once_and_its_frames_are_counted(server, tmp_path):
-    path = bench(tmp_path)
+    path = on_dummy(tmp_path)
     with showing(server, path) as process:
         server.xrandr("--output", "DUMMY0", "--gamma", "1.7:1.4:1.2")
         wait_for(lambda: "gamma" in kinds(tmp_path / "run.mcap"))

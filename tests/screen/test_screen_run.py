@@ -35,7 +35,7 @@ ARCSEC_PER_RAD = 206_264.8
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> tuple[dict, Path]:
+def screen_run(tmp_path_factory) -> tuple[dict, Path]:
     """The demo's bench with more stars, on a virtual screen of its own."""
     folder = tmp_path_factory.mktemp("run")
     text = resource_path("configs", "demo.toml").read_text()
@@ -83,8 +83,8 @@ def run(tmp_path_factory) -> tuple[dict, Path]:
     return json.loads(done.stdout), ledger
 
 
-def test_every_refresh_period_is_a_frame_or_missed(run):
-    summary, ledger = run
+def test_every_refresh_period_is_a_frame_or_missed(screen_run):
+    summary, ledger = screen_run
     assert summary["frames"] + summary["missed_frames"] == DURATION_S * REFRESH_HZ
     frames = read_run(ledger).frames
     assert len(frames) == summary["frames"]
@@ -97,8 +97,8 @@ def test_every_refresh_period_is_a_frame_or_missed(run):
     assert summary["packets"]["refused"] == 0
 
 
-def test_each_frame_says_when_it_was_drawn_predicted_swapped_and_lit(run):
-    frames = read_run(run[1]).frames
+def test_each_frame_says_when_it_was_drawn_predicted_swapped_and_lit(screen_run):
+    frames = read_run(screen_run[1]).frames
     assert all(a.swap_ns < b.swap_ns for a, b in pairwise(frames))
     for frame in frames:
         assert frame.predicted_swap_ns is not None
@@ -110,8 +110,10 @@ def test_each_frame_says_when_it_was_drawn_predicted_swapped_and_lit(run):
             assert frame.prediction_ns > 0
 
 
-def test_what_was_drawn_is_where_the_packets_say_the_camera_is_when_the_middle_row_lights(run):
-    ledger = run[1]
+def test_what_was_drawn_is_where_the_packets_say_the_camera_is_when_the_middle_row_lights(
+    screen_run,
+):
+    ledger = screen_run[1]
     samples = read_log(ledger)
     times_ns = np.array([sample.t_ns for sample in samples])
     checked = 0
@@ -128,8 +130,8 @@ def test_what_was_drawn_is_where_the_packets_say_the_camera_is_when_the_middle_r
     assert checked > len(frames) / 2 > 2
 
 
-def test_the_report_says_it_on_one_page(run, tmp_path):
-    summary, ledger = run
+def test_the_report_says_it_on_one_page(screen_run, tmp_path):
+    summary, ledger = screen_run
     result = run_hilstar("report", ledger, "-o", tmp_path / "report", "--json")
     assert result.returncode == 0, result.stderr
     found = json.loads(result.stdout)
@@ -155,9 +157,9 @@ def test_the_report_says_it_on_one_page(run, tmp_path):
     assert "pacing jitter" in told.stdout and "age of the attitude at light" in told.stdout
 
 
-def test_paths_are_drawn_again_from_the_ledger(run, tmp_path):
+def test_paths_are_drawn_again_from_the_ledger(screen_run, tmp_path):
     """The moving stars of the run are no points, and not those of a run that stands still."""
-    ledger = run[1]
+    ledger = screen_run[1]
     bench = ledger.parent / "bench.toml"
     still = bench.parent / "still.toml"
     still.write_text(bench.read_text() + "motion_above_px = 1e6\n")

@@ -21,10 +21,10 @@ from tests.support.x11.events import client
 from tests.support.x11.screens import Screen, Shown, codes_of, lines_over, xvfb
 
 
-def test_the_screen_shows_the_codes_bit_for_bit(screen, bench_file):
-    codes = codes_of(bench_file)
+def test_the_screen_shows_the_codes_bit_for_bit(screen, screen_file):
+    codes = codes_of(screen_file)
     assert codes.max() > 50
-    with Shown(screen, bench_file) as shown:
+    with Shown(screen, screen_file) as shown:
         assert (shown.wait_for(codes) == codes).all()
         summary = shown.stop()
     assert summary["frames"] > 0
@@ -39,32 +39,32 @@ def test_the_screen_shows_the_codes_bit_for_bit(screen, bench_file):
         ("rotate_deg = 180", lambda codes: codes[::-1, ::-1]),
     ],
 )
-def test_optics_that_mirror_are_met_by_flips(screen, bench_file, keys, turned):
-    codes = codes_of(bench_file)
-    bench_file.write_text(SCREEN_BENCH.replace("[collimator]", f"{keys}\n[collimator]"))
-    with Shown(screen, bench_file) as shown:
+def test_optics_that_mirror_are_met_by_flips(screen, screen_file, keys, turned):
+    codes = codes_of(screen_file)
+    screen_file.write_text(SCREEN_BENCH.replace("[collimator]", f"{keys}\n[collimator]"))
+    with Shown(screen, screen_file) as shown:
         assert (shown.wait_for(turned(codes)) == turned(codes)).all()
 
 
-def test_a_portrait_bench_is_turned_onto_a_landscape_screen(screen, bench_file):
+def test_a_portrait_bench_is_turned_onto_a_landscape_screen(screen, screen_file):
     portrait = SCREEN_BENCH.replace("[640, 480]", "[480, 640]")
-    bench_file.write_text(portrait)
-    codes = np.rot90(codes_of(bench_file), k=-1)
-    bench_file.write_text(portrait.replace("[collimator]", "rotate_deg = 90\n[collimator]"))
-    with Shown(screen, bench_file) as shown:
+    screen_file.write_text(portrait)
+    codes = np.rot90(codes_of(screen_file), k=-1)
+    screen_file.write_text(portrait.replace("[collimator]", "rotate_deg = 90\n[collimator]"))
+    with Shown(screen, screen_file) as shown:
         assert (shown.wait_for(codes) == codes).all()
 
 
-def test_bit_stealing_reaches_the_screen(screen, bench_file):
-    bench_file.write_text(SCREEN_BENCH.replace('quantisation = "exact"', "bit_stealing = true"))
-    codes = codes_of(bench_file)
+def test_bit_stealing_reaches_the_screen(screen, screen_file):
+    screen_file.write_text(SCREEN_BENCH.replace('quantisation = "exact"', "bit_stealing = true"))
+    codes = codes_of(screen_file)
     assert (codes[..., 0] != codes[..., 2]).any()
-    with Shown(screen, bench_file) as shown:
+    with Shown(screen, screen_file) as shown:
         assert (shown.wait_for(codes) == codes).all()
 
 
 def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(
-    screen, bench_file, tmp_path
+    screen, screen_file, tmp_path
 ):
     folder = tmp_path
     rate = np.array([0.01, 0.02, 0.0])
@@ -75,7 +75,7 @@ def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(
     ledger = folder / "run.mcap"
     shown = run_hilstar(
         "replay",
-        bench_file,
+        screen_file,
         folder / "turn.csv",
         "-o",
         folder / "shown",
@@ -85,7 +85,7 @@ def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(
     )
     assert shown.returncode == 0, shown.stderr
     again = run_hilstar(
-        "replay", bench_file, ledger, "--headless", "--speed", "max", "-o", folder / "again"
+        "replay", screen_file, ledger, "--headless", "--speed", "max", "-o", folder / "again"
     )
     assert again.returncode == 0, again.stderr
     frames = list(frame_records(ledger))
@@ -99,9 +99,9 @@ def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(
         assert (one == other).all()
 
 
-def test_keys_show_the_grid_the_crosshair_a_patch_and_nothing_and_end_the_run(screen, bench_file):
-    codes = codes_of(bench_file)
-    with Shown(screen, bench_file) as shown, client(screen.display) as user:
+def test_keys_show_the_grid_the_crosshair_a_patch_and_nothing_and_end_the_run(screen, screen_file):
+    codes = codes_of(screen_file)
+    with Shown(screen, screen_file) as shown, client(screen.display) as user:
         assert (shown.wait_for(codes) == codes).all()
         for keys in ("g", "gc", "c", ""):
             wanted = lines_over(codes, keys)
@@ -120,11 +120,11 @@ def test_keys_show_the_grid_the_crosshair_a_patch_and_nothing_and_end_the_run(sc
     assert summary["frames"] > 0
 
 
-def test_the_window_s_close_button_ends_the_run_in_order(screen, bench_file):
-    codes = codes_of(bench_file)
-    ledger = bench_file.parent / "run.mcap"
+def test_the_window_s_close_button_ends_the_run_in_order(screen, screen_file):
+    codes = codes_of(screen_file)
+    ledger = screen_file.parent / "run.mcap"
     with (
-        Shown(screen, bench_file, "--ledger", str(ledger)) as shown,
+        Shown(screen, screen_file, "--ledger", str(ledger)) as shown,
         client(screen.display) as user,
     ):
         shown.wait_for(codes)
@@ -135,46 +135,46 @@ def test_the_window_s_close_button_ends_the_run_in_order(screen, bench_file):
 
 
 def refused_run(
-    screen: Screen, bench_file: Path, *options: str, display: str | None = None
+    screen: Screen, screen_file: Path, *options: str, display: str | None = None
 ) -> tuple[int, str]:
     env = screen.env if display is None else screen.env | {"DISPLAY": display}
-    result = run_hilstar("replay", bench_file, bench_file.parent / "still.csv", *options, env=env)
+    result = run_hilstar("replay", screen_file, screen_file.parent / "still.csv", *options, env=env)
     assert "Traceback" not in result.stderr
     return result.returncode, result.stderr
 
 
-def test_the_gate_refuses_a_display_of_another_size_and_force_is_logged(screen, bench_file):
-    bench_file.write_text(SCREEN_BENCH.replace("[640, 480]", "[800, 600]"))
-    code, said = refused_run(screen, bench_file)
+def test_the_gate_refuses_a_display_of_another_size_and_force_is_logged(screen, screen_file):
+    screen_file.write_text(SCREEN_BENCH.replace("[640, 480]", "[800, 600]"))
+    code, said = refused_run(screen, screen_file)
     assert code == 3
     assert "640 x 480" in said and "800 x 600" in said and "--force" in said
-    code, said = refused_run(screen, bench_file, "--force", "--stop", "0.2")
+    code, said = refused_run(screen, screen_file, "--force", "--stop", "0.2")
     assert code == 0
     assert "--force" in said
 
 
-def test_the_gate_refuses_8_bits_where_10_are_asked_for(screen, bench_file):
-    bench_file.write_text(SCREEN_BENCH.replace("[collimator]", "bits = 10\n[collimator]"))
-    code, said = refused_run(screen, bench_file)
+def test_the_gate_refuses_8_bits_where_10_are_asked_for(screen, screen_file):
+    screen_file.write_text(SCREEN_BENCH.replace("[collimator]", "bits = 10\n[collimator]"))
+    code, said = refused_run(screen, screen_file)
     assert code == 3
     assert "8 bits" in said and "10" in said
 
 
 def test_without_a_refresh_of_its_own_the_display_is_paced_by_software_and_that_is_said(
-    screen, bench_file
+    screen, screen_file
 ):
-    code, said = refused_run(screen, bench_file, "--stop", "0.3")
+    code, said = refused_run(screen, screen_file, "--stop", "0.3")
     assert code == 0
     assert "paced by software" in said
 
 
-def test_a_display_that_is_not_there_gets_one_line(screen, bench_file):
-    bench_file.write_text(SCREEN_BENCH.replace("[collimator]", 'display = "DELL"\n[collimator]'))
-    code, said = refused_run(screen, bench_file)
+def test_a_display_that_is_not_there_gets_one_line(screen, screen_file):
+    screen_file.write_text(SCREEN_BENCH.replace("[collimator]", 'display = "DELL"\n[collimator]'))
+    code, said = refused_run(screen, screen_file)
     assert code == 3
     assert "DELL" in said and "640 x 480" in said
-    bench_file.write_text(SCREEN_BENCH)
-    code, said = refused_run(screen, bench_file, display=":99999")
+    screen_file.write_text(SCREEN_BENCH)
+    code, said = refused_run(screen, screen_file, display=":99999")
     assert code == 3
     assert "--headless" in said
 
@@ -209,12 +209,12 @@ def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
     assert "code 255, channel w" in said
 
 
-def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, bench_file, tmp_path):
-    bench_file.write_text(SCREEN_BENCH.replace("[collimator]", "flip_x = true\n[collimator]"))
+def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, screen_file, tmp_path):
+    screen_file.write_text(SCREEN_BENCH.replace("[collimator]", "flip_x = true\n[collimator]"))
     command = [
         "calibrate",
         "dots",
-        str(bench_file),
+        str(screen_file),
         "-o",
         str(tmp_path / "plan"),
         "--frames",
@@ -266,13 +266,13 @@ def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, bench_file, 
     ],
 )
 def test_the_gate_reads_the_depth_and_every_code_of_what_is_drawn_on(tmp_path, depth, bits, words):
-    bench_file = tmp_path / "bench.toml"
-    bench_file.write_text(SCREEN_BENCH.replace("[collimator]", f"bits = {bits}\n[collimator]"))
+    screen_file = tmp_path / "bench.toml"
+    screen_file.write_text(SCREEN_BENCH.replace("[collimator]", f"bits = {bits}\n[collimator]"))
     still_log(tmp_path / "still.csv")
     with xvfb(tmp_path, f"640x480x{depth}") as screen:
-        code, said = refused_run(screen, bench_file, "--stop", "0.2")
+        code, said = refused_run(screen, screen_file, "--stop", "0.2")
         assert code == 3, said
-        _, forced = refused_run(screen, bench_file, "--force", "--stop", "0.2")
+        _, forced = refused_run(screen, screen_file, "--force", "--stop", "0.2")
     for word in words:
         assert word in forced
     assert ("codes are not drawn" in forced) == ((depth, bits) == (24, 10)), forced

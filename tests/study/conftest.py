@@ -10,11 +10,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from functools import wraps
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from hilstar.basics import charts
 from hilstar.instruments.study.sweep import Load, OtherWork
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @pytest.fixture(scope="package", autouse=True)
@@ -49,3 +53,11 @@ def every_chart_is_legible() -> Iterator[None]:
         # the figure's own: half the pixels, and texts are measured once
         patch.setattr(charts, "PNG_DPI", 100)
         yield
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that are saved, of which no file is written."""
+    saved: list[Figure] = []
+    monkeypatch.setattr(charts, "save", lambda drawn, path: saved.append(drawn))
+    return saved

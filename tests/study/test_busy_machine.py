@@ -63,6 +63,9 @@ def fewest_rounds(monkeypatch):
         (tradeoff, "QUICK_BUDGET_S", 0.0),
         (sweep, "MIN_ROUNDS", 1),
         (economy, "QUICK_ROUNDS", 1),
+        # and one scene on one panel: the study's own test has all of them
+        (economy, "SCENES", economy.SCENES[2:3]),
+        (economy, "BITS", (12,)),
         (bodies, "QUICK_ROUNDS", 1),
         (colour, "QUICK_ROUNDS", 1),
     ):

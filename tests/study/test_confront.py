@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +10,7 @@ from PIL import Image
 
 from tests.support.commands import run_hilstar_here
 from tests.support.planted_sky import SKY, Planted, photograph, write_bench
+from tests.support.tables import csv_rows
 
 pytestmark = pytest.mark.study
 
@@ -29,8 +29,7 @@ def test_a_set_has_a_row_and_a_page_for_each_camera_and_says_what_is_no_photogra
         "study", "confront", "--images", tmp_path / "set", "-o", tmp_path / "out", "--quick"
     )
     assert done.returncode == 0, done.stderr
-    with (tmp_path / "out" / "confront.csv").open(newline="") as file:
-        rows = {row["image"]: row for row in csv.DictReader(file)}
+    rows = {row["image"]: row for row in csv_rows(tmp_path / "out" / "confront.csv")}
     assert float(rows["a.png"]["rms_px"]) < 0.05
     assert int(rows["a.png"]["stars"]) > 20
     assert "is no image" in rows["b.png"]["refused"]

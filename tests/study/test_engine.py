@@ -26,7 +26,8 @@ from hilstar.instruments.study.engine import (
     row_panels,
     write_rows,
 )
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 
 @dataclass(frozen=True)
@@ -40,14 +41,6 @@ class WayError:
 
 DARK = WayError("b", 1.0, 0.0)
 ROWS = [WayError("a", 1.0, 2.5), WayError("b", 1.0, 0.5)]
-
-
-@pytest.fixture
-def figure(monkeypatch):
-    """The figures that are saved."""
-    saved = []
-    monkeypatch.setattr(charts, "save", lambda drawn, path: saved.append(drawn))
-    return saved
 
 
 @dataclass(frozen=True)
@@ -72,13 +65,13 @@ def test_a_row_within_a_row_stands_as_its_own_columns(tmp_path):
     assert (tmp_path / "x.csv").read_text() == "class,rms,largest,count\nG,0.5,2.0,7\n"
 
 
-def test_bars_stand_in_groups_with_a_bar_of_each_series(figure, tmp_path):
+def test_bars_stand_in_groups_with_a_bar_of_each_series(figures, tmp_path):
     bars = BarSpec(lambda row: f"{row.at:g}", "error", share=0.8, figures="%.1f")
     panel = PanelSpec(bars=bars, ylim=(0, 5), names=False)
     rows = [WayError(way, at, at + (way == "b")) for at in (1.0, 2.0) for way in ("a", "b")]
     spec = ChartSpec((panel,), lambda row: row.way, looks_of({"a": "first", "b": "second"}))
     draw_rows(tmp_path / "x", "A finding", spec, rows)
-    axes = figure[0].axes[0]
+    axes = figures[0].axes[0]
     places = [bar.get_x() + bar.get_width() / 2 for bar in axes.patches]
     assert places == pytest.approx([-0.2, 0.8, 0.2, 1.2])
     assert [bar.get_height() for bar in axes.patches] == [1.0, 2.0, 2.0, 3.0]
@@ -87,7 +80,7 @@ def test_bars_stand_in_groups_with_a_bar_of_each_series(figure, tmp_path):
     assert axes.get_ylim() == (0, 5)
 
 
-def test_dots_of_a_row_stand_on_a_line_of_its_own_the_first_on_top(figure, tmp_path):
+def test_dots_of_a_row_stand_on_a_line_of_its_own_the_first_on_top(figures, tmp_path):
     dots = DotsSpec(
         (
             ("at", SeriesLook("before", charts.ORANGE, "s", is_open=True)),
@@ -99,7 +92,7 @@ def test_dots_of_a_row_stand_on_a_line_of_its_own_the_first_on_top(figure, tmp_p
     )
     spec = ChartSpec((PanelSpec(dots=dots, names=False),), lambda row: row.way, {})
     draw_rows(tmp_path / "x", "A finding", spec, [DARK, *ROWS])
-    axes = figure[0].axes[0]
+    axes = figures[0].axes[0]
     first, second, before, after = axes.get_lines()
     assert first.get_xydata().tolist() == [[1.0, 0.0], [2.5, 0.0]]
     assert second.get_xydata().tolist() == [[1.0, 1.0], [0.5, 1.0]]
@@ -110,7 +103,7 @@ def test_dots_of_a_row_stand_on_a_line_of_its_own_the_first_on_top(figure, tmp_p
     assert [text.get_text() for text in axes.texts] == ["2.5 mag", "0.5 mag"]
 
 
-def test_keys_are_in_the_legend_alone_and_places_are_vertical(figure, tmp_path):
+def test_keys_are_in_the_legend_alone_and_places_are_vertical(figures, tmp_path):
     panel = PanelSpec(
         (LineSpec("at", "error", "", named=False),),
         keys=(SeriesLook("a key", charts.GREEN, "d"),),
@@ -119,26 +112,26 @@ def test_keys_are_in_the_legend_alone_and_places_are_vertical(figure, tmp_path):
     )
     looks = looks_of({"a": "first"})
     draw_rows(tmp_path / "x", "A finding", ChartSpec((panel,), lambda row: row.way, looks), ROWS)
-    points, key, limit = figure[0].axes[0].get_lines()
+    points, key, limit = figures[0].axes[0].get_lines()
     assert points.get_label() == HIDDEN and len(key.get_xydata()) == 0
     assert limit.get_xydata().tolist() == [[3.0, 0.0], [3.0, 1.0]]
-    texts = figure[0].axes[0].get_legend().get_texts()
+    texts = figures[0].axes[0].get_legend().get_texts()
     assert [text.get_text() for text in texts] == ["a key", "a limit"]
 
 
-def test_a_grid_that_is_not_full_has_no_axes_in_its_last_place(figure, tmp_path):
+def test_a_grid_that_is_not_full_has_no_axes_in_its_last_place(figures, tmp_path):
     panels = (PanelSpec((LineSpec("at", "error"),), names=False),) * 3
     spec = ChartSpec(panels, lambda row: row.way, looks_of({"a": "first"}), columns=2)
     with row_panels(tmp_path / "x", "A finding", spec, ROWS) as grid:
         assert len(grid) == 3
-    assert [axes.axison for axes in figure[0].axes] == [True, True, True, False]
+    assert [axes.axison for axes in figures[0].axes] == [True, True, True, False]
 
 
-def test_curves_have_the_styles_that_are_given(figure, tmp_path):
+def test_curves_have_the_styles_that_are_given(figures, tmp_path):
     x = np.array([1.0, 2.0])
     panel = CurvePanel(x, {"solid": x, "dotted": -x}, PanelSpec(), styles=("-", ":"))
     draw_curves(tmp_path / "x", "A finding", (panel,))
-    assert [line.get_linestyle() for line in figure[0].axes[0].get_lines()] == ["-", ":"]
+    assert [line.get_linestyle() for line in figures[0].axes[0].get_lines()] == ["-", ":"]
 
 
 def test_the_example_of_the_engine_draws_a_legible_chart_and_its_table(tmp_path):
@@ -149,4 +142,4 @@ def test_the_example_of_the_engine_draws_a_legible_chart_and_its_table(tmp_path)
     result = doctest.DocTestRunner().run(example, out=printed.append)
     assert result.attempted == 9 and result.failed == 0, "".join(printed)
     assert_drawn(tmp_path / "cost.png")
-    assert [row["way"] for row in table(tmp_path / "cost.csv")] == ["round"] * 2 + ["exact"] * 2
+    assert [row["way"] for row in csv_rows(tmp_path / "cost.csv")] == ["round"] * 2 + ["exact"] * 2

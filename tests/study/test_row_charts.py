@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pytest
 
 from hilstar.basics import charts
 from hilstar.instruments.study.engine import (
@@ -23,7 +22,7 @@ from hilstar.instruments.study.engine import (
     write_columns,
 )
 from hilstar.instruments.study.sweep import Load
-from tests.support.pictures import table
+from tests.support.tables import csv_rows
 
 BUSY = Load(1e3)
 
@@ -50,14 +49,6 @@ ROWS = [Planted("b", 1.0, 0.0), Planted("a", 1.0, 2.0), Planted("a", 10.0, np.in
 LAWS = [Law("a", 1.0, 2.5), Law("b", 1.0, 0.5)]
 
 
-@pytest.fixture
-def figure(monkeypatch):
-    """The figure that is saved last."""
-    saved = []
-    monkeypatch.setattr(charts, "save", lambda drawn, path: saved.append(drawn))
-    return saved
-
-
 def spec_of(*lines: LineSpec, **panel: object) -> ChartSpec:
     panels = (PanelSpec(lines, "error [px]", "age [ms]", **panel),)
     looks = looks_of({"a": "first", "b": "second"}, "os")
@@ -72,21 +63,21 @@ def lines_of(figure) -> list[tuple[str, str, str, list[list[float]]]]:
     ]
 
 
-def test_each_series_has_a_line_of_its_rows_in_the_order_of_looks(figure, tmp_path):
+def test_each_series_has_a_line_of_its_rows_in_the_order_of_looks(figures, tmp_path):
     draw_rows(tmp_path / "x", "A finding", spec_of(LineSpec("at", "error")), ROWS[:2])
-    assert lines_of(figure[0]) == [
+    assert lines_of(figures[0]) == [
         ("first", charts.SERIES[0], "o", [[1.0, 2.0]]),
         ("second", charts.SERIES[1], "s", [[1.0, 0.0]]),
     ]
-    assert figure[0].get_suptitle() == "A finding"
-    assert figure[0].axes[0].get_ylabel() == "Error [px]"
+    assert figures[0].get_suptitle() == "A finding"
+    assert figures[0].axes[0].get_ylabel() == "Error [px]"
 
 
-def test_a_measured_point_and_its_law_are_told_apart_by_their_type(figure, tmp_path):
+def test_a_measured_point_and_its_law_are_told_apart_by_their_type(figures, tmp_path):
     law = LineSpec("at", "error", of=Law)
     dots = LineSpec("at", "error", "", marker="x", named=False, of=Planted)
     draw_rows(tmp_path / "x", "A finding", spec_of(law, dots), [*LAWS, *ROWS[:2]])
-    drawn = [(label, marker, places[0][1]) for label, _, marker, places in lines_of(figure[0])]
+    drawn = [(label, marker, places[0][1]) for label, _, marker, places in lines_of(figures[0])]
     assert drawn == [
         ("first", "o", 2.5),
         (HIDDEN, "x", 2.0),
@@ -95,7 +86,7 @@ def test_a_measured_point_and_its_law_are_told_apart_by_their_type(figure, tmp_p
     ]
 
 
-def test_floors_gaps_and_conditions_are_of_the_rows(figure, tmp_path):
+def test_floors_gaps_and_conditions_are_of_the_rows(figures, tmp_path):
     spec = spec_of(
         LineSpec("at", at_least("error", 1e-3), where=lambda row: row.way == "b"),
         LineSpec(
@@ -109,32 +100,32 @@ def test_floors_gaps_and_conditions_are_of_the_rows(figure, tmp_path):
         xticks=(1, 10),
     )
     draw_rows(tmp_path / "x", "A finding", spec, ROWS)
-    (first, second, limit) = lines_of(figure[0])
+    (first, second, limit) = lines_of(figures[0])
     assert first[0] == "way a" and first[3][0] == [1.0, 2.0] and np.isnan(first[3][1][1])
     assert second[3] == [[1.0, 1e-3]]
     assert limit[0] == "limit" and limit[3] == [[0.0, 1.0], [1.0, 1.0]]
-    axes = figure[0].axes[0]
+    axes = figures[0].axes[0]
     assert axes.get_xscale() == axes.get_yscale() == "log"
     assert axes.get_xticks().tolist() == [1, 10]
 
 
-def test_a_busy_machine_is_told_in_the_note(figure, tmp_path):
+def test_a_busy_machine_is_told_in_the_note(figures, tmp_path):
     spec = spec_of(LineSpec("at", "error"))
     for load in (Load(), BUSY):
         draw_rows(tmp_path / "x", "A finding", spec, ROWS[:2], load)
-    idle, busy = (" ".join(drawn.get_supxlabel().split()) for drawn in figure)
+    idle, busy = (" ".join(drawn.get_supxlabel().split()) for drawn in figures)
     assert idle == "Of nothing."
     assert busy.startswith("Of nothing. A busy machine")
 
 
-def test_curves_over_one_x_and_their_table(figure, tmp_path):
+def test_curves_over_one_x_and_their_table(figures, tmp_path):
     x = np.array([1.0, 2.0])
     upper = CurvePanel(x, {"light": x, "dark": -x}, PanelSpec((), "light [1]"))
     lower = CurvePanel(x, {"twice": 2 * x}, PanelSpec((), "twice [1]", "x [px]"), (charts.RED,))
     draw_curves(tmp_path / "x", "A finding", (upper, lower), "Of nothing.")
-    first, second = (axes.get_lines() for axes in figure[0].axes)
+    first, second = (axes.get_lines() for axes in figures[0].axes)
     assert [line.get_label() for line in first] == ["light", "dark"]
     assert second[0].get_color() == charts.RED
     write_columns(tmp_path / "x.csv", {"x_px": x, "twice": 2 * x})
-    rows = table(tmp_path / "x.csv")
+    rows = csv_rows(tmp_path / "x.csv")
     assert [(float(row["x_px"]), float(row["twice"])) for row in rows] == [(1, 2), (2, 4)]

@@ -17,13 +17,14 @@ from scipy.special import erf
 from hilstar.instruments.study.stability import CaseFigures, FailureCase, image, recorded
 from hilstar.instruments.study.stability import run as stability
 from tests.support.commands import run_hilstar_here
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 CASES = 43
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def stability_study(tmp_path_factory):
     """The command's folder and output, and its cases."""
     folder, found = tmp_path_factory.mktemp("stability"), []
 
@@ -40,8 +41,8 @@ def study(tmp_path_factory):
 
 
 @pytest.mark.parametrize("number", range(CASES))
-def test_hilstar_is_right_where_the_method_named_there_is_not(study, number):
-    case = study[2][number]
+def test_hilstar_is_right_where_the_method_named_there_is_not(stability_study, number):
+    case = stability_study[2][number]
     assert case.right, case
     assert not case.figures.fault <= case.figures.tolerance, case
     assert all((case.case, case.method, case.fails, case.happens, case.why))
@@ -49,10 +50,10 @@ def test_hilstar_is_right_where_the_method_named_there_is_not(study, number):
     assert not theirs.right
 
 
-def test_the_table_has_every_case_and_the_curves_have_charts(study):
-    folder, printed, measured = study
+def test_the_table_has_every_case_and_the_curves_have_charts(stability_study):
+    folder, printed, measured = stability_study
     assert printed["right"] is True and len(printed["findings"]) == len(measured) == CASES
-    rows = table(folder / "stability.csv")
+    rows = csv_rows(folder / "stability.csv")
     assert [row["case"] for row in rows] == [case.case for case in measured]
     assert {
         case.case
@@ -70,7 +71,7 @@ def test_the_table_has_every_case_and_the_curves_have_charts(study):
         assert not float(row["its error"]) <= float(row["tolerance"])
     peaks = {
         float(row["sigma_px"]): float(row["sampled_peak_error"])
-        for row in table(folder / "narrow_stars.csv")
+        for row in csv_rows(folder / "narrow_stars.csv")
     }
     # a Gaussian's middle is over the mean of its pixel
     assert all(peak > 0.02 for peak in peaks.values())
@@ -79,7 +80,7 @@ def test_the_table_has_every_case_and_the_curves_have_charts(study):
     )
     for stem in ("narrow_stars", "weak_perspective", "popping", "turns"):
         assert_drawn(folder / f"{stem}.png")
-        assert len(table(folder / f"{stem}.csv")) > 25
+        assert len(csv_rows(folder / f"{stem}.csv")) > 25
 
 
 def test_what_is_no_number_is_not_right():
@@ -130,8 +131,8 @@ def test_the_polynomial_of_the_shader_is_the_shader_s():
     assert np.abs(image.erf_float32(x) - erf(x)).max() <= image.ERF_ERROR + 6e-8
 
 
-def test_the_chart_of_popping_shows_what_its_title_says(study):
-    rows = table(study[0] / "popping.csv")
+def test_the_chart_of_popping_shows_what_its_title_says(stability_study):
+    rows = csv_rows(stability_study[0] / "popping.csv")
     assert len(rows) == image.STEPS
     spread = {
         name: np.ptp([float(row[f"{name} [mag]"]) for row in rows])

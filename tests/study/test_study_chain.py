@@ -36,7 +36,8 @@ from tests.support.benches import ORION_Q
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
 from tests.support.glass import stack
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 SMALL = """
 [tracker]
@@ -91,7 +92,7 @@ def scene_of(parts, number: int) -> SceneMeasurement:
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def chain_study(tmp_path_factory):
     """What the command prints of the small bench, and the folder of its files."""
     folder = tmp_path_factory.mktemp("chain")
     (folder / "bench.toml").write_text(SMALL)
@@ -107,8 +108,8 @@ def study(tmp_path_factory):
     return json.loads(result.stdout), folder / "out"
 
 
-def test_the_front_is_what_anyone_finds_in_the_table(study):
-    rows = table(study[1] / "chain.csv")
+def test_the_front_is_what_anyone_finds_in_the_table(chain_study):
+    rows = csv_rows(chain_study[1] / "chain.csv")
     for scene in {row["scene"] for row in rows}:
         own = [row for row in rows if row["scene"] == scene]
         for error, column in (("error_arcsec", "on_front"), ("error_mag", "on_front_mag")):
@@ -121,9 +122,9 @@ def test_the_front_is_what_anyone_finds_in_the_table(study):
         assert 1 <= sum(row["on_front"] == "true" for row in own) < len(own)
 
 
-def test_auto_and_default_are_each_one_point_of_each_scene(study):
-    told, out = study
-    rows = table(out / "chain.csv")
+def test_auto_and_default_are_each_one_point_of_each_scene(chain_study):
+    told, out = chain_study
+    rows = csv_rows(out / "chain.csv")
     names = list(dict.fromkeys(row["scene"] for row in rows))
     assert names == ["average field", "dense field", "faint field", "1 deg/s", "10 deg/s"]
     for name in names:
@@ -194,8 +195,11 @@ def test_the_psf_of_a_glass_is_an_axis_of_the_chain(tmp_path, monkeypatch):
     assert glass_rows(bare, ChainScene("Orion", "", np.array(ORION_Q)), quick=True) == []
 
 
-def test_the_budget_adds_up_to_the_whole_error_of_auto(study):
-    rows, parts = table(study[1] / "chain.csv"), table(study[1] / "chain_budget.csv")
+def test_the_budget_adds_up_to_the_whole_error_of_auto(chain_study):
+    rows, parts = (
+        csv_rows(chain_study[1] / "chain.csv"),
+        csv_rows(chain_study[1] / "chain_budget.csv"),
+    )
     for scene in {part["scene"] for part in parts}:
         (auto,) = [row for row in rows if row["scene"] == scene and row["chosen"] == "auto"]
         for error in ("error_arcsec", "error_mag"):
@@ -211,7 +215,7 @@ def test_the_budget_adds_up_to_the_whole_error_of_auto(study):
         part["step"]: float(part["error_arcsec"]) for part in parts if part["scene"] == "1 deg/s"
     }
     assert turning["prediction"] > 0 and turning["refresh"] > 0
-    stages = table(study[1] / "chain_time.csv")
+    stages = csv_rows(chain_study[1] / "chain_time.csv")
     assert {stage["stage"] for stage in stages} == {
         "prediction",
         "sprites",
@@ -279,7 +283,7 @@ def test_a_star_that_is_lost_is_no_nearer_than_one_that_is_found_late(parts):
     )
 
 
-def test_a_long_exposure_is_said_to_be_measured_in_part(study, tmp_path):
+def test_a_long_exposure_is_said_to_be_measured_in_part(chain_study, tmp_path):
     with Parts(
         small_file(tmp_path, SMALL.replace("aperture_mm", "exposure_s = 3.5\naperture_mm"))
     ) as long:
@@ -287,9 +291,9 @@ def test_a_long_exposure_is_said_to_be_measured_in_part(study, tmp_path):
         seen = choices.exposure(long.own, 20)
     assert said == "exposures of 16 refreshes, 0.267 s, in the place of [tracker] exposure_s = 3.5"
     assert seen.length_s == pytest.approx(16 / 60)
-    told, out = study
+    told, out = chain_study
     assert not any("in the place of" in line for line in told["findings"])
-    assert {row["exposure_s"] for row in table(out / "chain.csv")} == {"0.1"}
+    assert {row["exposure_s"] for row in csv_rows(out / "chain.csv")} == {"0.1"}
 
 
 def combination_row(**figures) -> CombinationRow:
@@ -431,9 +435,9 @@ def test_a_bench_of_which_no_star_stays_in_view_is_refused(tmp_path):
     assert_refused(refused, 2, "no star stands alone in view")
 
 
-def test_the_study_ends_with_answers_from_its_own_rows(study):
-    told, out = study
-    rows, parts = table(out / "chain.csv"), table(out / "chain_budget.csv")
+def test_the_study_ends_with_answers_from_its_own_rows(chain_study):
+    told, out = chain_study
+    rows, parts = csv_rows(out / "chain.csv"), csv_rows(out / "chain_budget.csv")
     assert len(told["answers"]) >= 4
     still = [row for row in rows if row["scene"] == "average field" and row["sprite"] == "cut"]
     by_codes = {

@@ -9,7 +9,8 @@ from astropy.wcs import WCS
 
 from hilstar.sky.catalog import load_catalog
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 # The thesis's own figures: the hottest star of Orion (figure 5.5), the mean temperature before
 # Rosetta (figure 5.16).
@@ -45,7 +46,7 @@ def published(tmp_path_factory):
 
 
 def temperatures_k(folder, stem):
-    return np.array([float(row["temperature_k"]) for row in table(folder / f"{stem}.csv")])
+    return np.array([float(row["temperature_k"]) for row in csv_rows(folder / f"{stem}.csv")])
 
 
 def test_the_thesis_s_outputs_are_drawn_as_published_and_mended(published):
@@ -74,7 +75,7 @@ def test_the_published_figures_have_the_thesis_s_temperatures(published):
 
 def test_the_published_temperatures_are_equation_3_13(published):
     """Equation 3.13 written a second time, on the table's own B-V."""
-    rows = table(published[0] / "orion_as_published.csv")
+    rows = csv_rows(published[0] / "orion_as_published.csv")
     bv = np.array([float(row["bv"]) for row in rows])
     blue = 1079.20644 * np.exp(-bv / 0.09824) + 8180.59419
     red = 8906.09411 * np.exp(-bv / 1.59761) + 3.633
@@ -127,11 +128,13 @@ def test_rapp_of_a_bench_is_its_sensor_s(tmp_path):
         "study", "models", tmp_path / "bench.toml", "--radec", "120,-45,10", "-o", tmp_path / "out"
     )
     assert result.returncode == 0, result.stderr
-    rows = {float(row["temperature_k"]): row for row in table(tmp_path / "out" / "rapp_bench.csv")}
+    rows = {
+        float(row["temperature_k"]): row for row in csv_rows(tmp_path / "out" / "rapp_bench.csv")
+    }
     assert float(rows[9000.0]["rapp3_energy"]) == pytest.approx(1.055, abs=5e-4)
     assert float(rows[50_000.0]["rapp1_energy"]) == pytest.approx(1.02, abs=5e-3)
     assert_drawn(tmp_path / "out" / "rapp_bench.png")
-    stars = table(tmp_path / "out" / "rapp_stars.csv")
+    stars = csv_rows(tmp_path / "out" / "rapp_stars.csv")
     assert {row["field"] for row in stars} == {"orion", "lyra", "zeta_cas", "field"}
     cool = [float(row["rapp3"]) for row in stars if float(row["bv_mag"]) > 1.4]
     # of red stars the average model has too little light, by any sensor

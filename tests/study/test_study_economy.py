@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 
 from hilstar.instruments.study import economy
 from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES, run
 from hilstar.tracker.centroiders import FAMILY
+from tests.support.recorded import assert_recorded
+from tests.support.tables import csv_rows
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def economy_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("economy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(economy, "QUICK_ROUNDS", 1)  # no claim here is of a time
         lines, _ = run(folder, quick=True)
-    with (folder / "economy.csv").open() as file:
-        return folder, lines, list(csv.DictReader(file))
+    return folder, lines, csv_rows(folder / "economy.csv")
 
 
-def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance(study):
+def test_the_page_s_errors_are_of_what_is_measured_now(economy_study):
+    figures = ("flux_max_mag", "claimed_mag", "claimed_px", *(f"max_px_{kind}" for kind in FAMILY))
+    keys = ("scene", "bits", "tolerance")
+    assert_recorded(economy_study[0] / "economy.csv", keys, figures)
+
+
+def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance(economy_study):
     full, *autos = [
-        row for row in study[2] if (row["scene"], row["bits"]) == (SCENES[2].name, "12")
+        row for row in economy_study[2] if (row["scene"], row["bits"]) == (SCENES[2].name, "12")
     ]
     assert full["tolerance"] == "full" and full["quantisation"] == "exact"
     assert [row["tolerance"] for row in autos] == ["default", "0.1"]
@@ -40,8 +45,8 @@ def test_a_scene_that_needs_less_gets_it_and_stays_within_its_tolerance(study):
         )
 
 
-def test_what_is_within_by_the_plan_is_within_by_its_stars(study):
-    claimed = [row for row in study[2] if row["claimed_within"].lower() == "true"]
+def test_what_is_within_by_the_plan_is_within_by_its_stars(economy_study):
+    claimed = [row for row in economy_study[2] if row["claimed_within"].lower() == "true"]
     assert len(claimed) > 20
     for row in claimed:
         assert float(row["flux_max_mag"]) <= float(row["tolerance_mag"])
@@ -49,8 +54,8 @@ def test_what_is_within_by_the_plan_is_within_by_its_stars(study):
         assert float(row["claimed_mag"]) <= float(row["tolerance_mag"])
 
 
-def test_the_study_has_five_scenes_of_three_depths_at_two_tolerances(study):
-    folder, lines, rows = study
+def test_the_study_has_five_scenes_of_three_depths_at_two_tolerances(economy_study):
+    folder, lines, rows = economy_study
     assert len(rows) == len(SCENES) * len(BITS) * (1 + len(TOLERANCES)) == 45
     assert len([line for line in lines if " bits, " in line and "instead of" in line]) == 30
     assert (folder / "economy.png").stat().st_size > 20_000

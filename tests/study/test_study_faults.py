@@ -4,35 +4,29 @@ with it.
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 
 from hilstar.instruments.study import faults
 from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS
 from hilstar.optics.layers.fault_kinds import KINDS
 from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 pytestmark = pytest.mark.study
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def faults_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("faults")
     lines, _ = faults.run(folder, quick=True)
     return folder, lines
 
 
-def table_rows(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
-
-
-def test_every_kind_but_a_dropped_frame_has_its_cost(study):
-    folder, findings = study
+def test_every_kind_but_a_dropped_frame_has_its_cost(faults_study):
+    folder, findings = faults_study
     kinds = {table["kind"] for tables in CASES.values() for table in tables}
     assert kinds == set(KINDS) - {"drop"}  # which draws nothing
-    costs = table_rows(folder / "faults-cost.csv")
+    costs = csv_rows(folder / "faults-cost.csv")
     assert [(row["quantisation"], row["case"]) for row in costs] == [
         (q, case) for q in QUANTISATIONS for case in CASES
     ]
@@ -40,9 +34,9 @@ def test_every_kind_but_a_dropped_frame_has_its_cost(study):
     assert NOWHERE in CASES and len(findings) == 4
 
 
-def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(study):
-    folder, _ = study
-    strays = table_rows(folder / "faults-stray.csv")
+def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(faults_study):
+    folder, _ = faults_study
+    strays = csv_rows(folder / "faults-stray.csv")
     for quantisation in QUANTISATIONS:
         mine = {
             float(row["share_of_white"]): row
@@ -54,5 +48,5 @@ def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(study):
         assert int(mine[0.0]["stars"]) > 20
 
 
-def test_the_chart_is_a_picture(study):
-    assert_drawn(study[0] / "faults.png")
+def test_the_chart_is_a_picture(faults_study):
+    assert_drawn(faults_study[0] / "faults.png")

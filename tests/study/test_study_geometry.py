@@ -6,7 +6,8 @@ import csv
 
 import pytest
 
-from hilstar.instruments.study.geometry import FAIL_ARCSEC, MODELS, ideal_arcsec, run
+from hilstar.instruments.study.geometry import MODELS, ideal_arcsec, run
+from tests.support.claims import holds
 
 
 @pytest.fixture(scope="module")
@@ -32,10 +33,10 @@ def test_simple_lenses_fail_and_are_marked_and_the_full_model_does_not(study):
         for row in rows
         if row["noise_px"] == "0.02" and row["frames"] == "20"
     }
-    assert usual["a pinhole"] > 50 * FAIL_ARCSEC
-    assert usual["the same with a field of degree 4"] < 0.25
-    assert sum("FAILS" in line for line in lines) >= 2
     assert ideal_arcsec() > usual["a pinhole"]
+    holds("doublet-pinhole", usual["a pinhole"])
+    holds("doublet-fitted", usual["the same with a field of degree 4"])
+    assert sum("FAILS" in line for line in lines) >= 2
 
 
 def test_held_out_dots_rank_the_models_as_the_stars_do(study):

@@ -11,7 +11,10 @@ import pytest
 
 from hilstar.instruments.study import limits
 from hilstar.instruments.study.limits import StressLimit, limits_finding, run
-from tests.support.pictures import assert_drawn, table
+from tests.support.benches import ROOT
+from tests.support.pictures import assert_drawn
+from tests.support.recorded import assert_recorded
+from tests.support.tables import csv_rows
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
 ROOM_STARS = 250_000  # stars of sigma 0.85 px fill a frame
@@ -21,10 +24,17 @@ HALF_SAMPLE = 0.5
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def limits_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("limits")
     lines = run(folder, quick=True)
-    return folder, lines, table(folder / "limits.csv")
+    return folder, lines, csv_rows(folder / "limits.csv")
+
+
+def test_the_page_s_table_is_of_what_is_measured_now(limits_study):
+    """Where a quick study has the same stress; the rest is finer."""
+    assert_recorded(
+        limits_study[0] / "limits.csv", ("method", "stress", "at"), ("error", "tolerance")
+    )
 
 
 def limit_rows(rows, stress):
@@ -34,12 +44,16 @@ def limit_rows(rows, stress):
     return at, error, float(own[0]["meets"]), float(own[0]["tolerance"])
 
 
-def test_the_place_where_a_method_leaves_its_tolerance_is_between_its_own_rows(study):
-    folder, lines, rows = study
+def test_the_place_where_a_method_leaves_its_tolerance_is_between_its_own_rows(limits_study):
+    folder, lines, rows = limits_study
     assert_drawn(folder / "limits.png")
-    stresses = list(dict.fromkeys(row["stress"] for row in rows))
-    assert len(lines) == 1 + len(stresses) == 13
-    for stress in stresses:
+    assert len(lines) == 1 + len({row["stress"] for row in rows}) == 13
+    assert_meets_between_rows(rows)
+    assert_meets_between_rows(csv_rows(ROOT / "results" / "limits.csv"))
+
+
+def assert_meets_between_rows(rows):
+    for stress in dict.fromkeys(row["stress"] for row in rows):
         at, error, meets, tolerance = limit_rows(rows, stress)
         assert error[0] <= tolerance, f"{stress}: over the tolerance where it is easy"
         over = np.flatnonzero(error > tolerance)
@@ -50,8 +64,8 @@ def test_the_place_where_a_method_leaves_its_tolerance_is_between_its_own_rows(s
         assert min(before, after) <= meets <= max(before, after)
 
 
-def test_the_limits_are_those_that_hilstar_tells_elsewhere(study):
-    _, _, rows = study
+def test_the_limits_are_those_that_hilstar_tells_elsewhere(limits_study):
+    _, _, rows = limits_study
     stars, lost_mag, _, _ = limit_rows(rows, "stars in view")
     assert not lost_mag[stars < ROOM_STARS].any()
     assert (lost_mag[stars > 1.5 * ROOM_STARS] > 0).all()
@@ -68,11 +82,11 @@ def test_the_limits_are_those_that_hilstar_tells_elsewhere(study):
     assert error == pytest.approx(per_deg_s * at, rel=0.02)
 
 
-def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field(study):
+def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field(limits_study):
     """Along x the depth grows by x sin t, so a place x is off by x^2 t / f less what a rotation
     takes.
     """
-    _, _, rows = study
+    _, _, rows = limits_study
     at, error, _, _ = limit_rows(rows, limits.TILT)
     assert error[5] / at[5] == pytest.approx(error[0] / at[0], rel=0.01)
     widest_px = (959.5**2) * math.radians(at[0]) / (350e3 / 57.65)

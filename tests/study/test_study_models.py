@@ -2,7 +2,6 @@
 its pictures not blank.
 """
 
-import csv
 import re
 import subprocess
 import sys
@@ -26,6 +25,7 @@ from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
 from tests.support.commands import run_hilstar_here
+from tests.support.tables import csv_rows
 from tests.support.waiting import PATIENCE_S
 
 STEMS = (
@@ -65,7 +65,7 @@ TABLE_MAG_LIMIT = 2e-6
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def models_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("models")
     result = run_hilstar_here("study", "models", "-o", folder)
     assert result.returncode == 0, result.stderr
@@ -74,8 +74,7 @@ def study(tmp_path_factory):
 
 def table_columns(path):
     """A table's columns by name: numbers where they are numbers."""
-    with path.open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(path)
 
     def numbers(texts):
         try:
@@ -135,8 +134,8 @@ def rapp_by_quadrature(kelvin, sensor, power):
 
 @pytest.mark.parametrize("sensor", ["ccd47-20", "kai-4021"])
 @pytest.mark.parametrize(("weighting", "power"), [("energy", 0), ("photon", 1)])
-def test_rapp_is_what_equations_5_1_to_5_3_say(study, sensor, weighting, power):
-    table = table_columns(study[0] / f"rapp_{sensor}.csv")
+def test_rapp_is_what_equations_5_1_to_5_3_say(models_study, sensor, weighting, power):
+    table = table_columns(models_study[0] / f"rapp_{sensor}.csv")
     assert (np.diff(table["temperature_k"]) > 0).all()
     for kelvin in (3000.0, 5000.0, 50_000.0):
         row = np.flatnonzero(table["temperature_k"] == kelvin)[0]
@@ -146,13 +145,13 @@ def test_rapp_is_what_equations_5_1_to_5_3_say(study, sensor, weighting, power):
         )
 
 
-def test_rapp_is_one_where_both_models_are_the_same(study):
+def test_rapp_is_one_where_both_models_are_the_same(models_study):
     """RAPP1 at the reference's own temperature; and the thesis's '15 % up to 5 %' of hot stars
     on the CCD47-20.
     """
     ratios = rapp_ratios(np.array([9602.0]), study_optics("ccd47-20"), "energy")
     assert ratios[0, 0] == pytest.approx(1.0, rel=1e-9)
-    rows = table_columns(study[0] / "rapp_ccd47-20.csv")
+    rows = table_columns(models_study[0] / "rapp_ccd47-20.csv")
     kelvin, rapp3 = rows["temperature_k"], rows["rapp3_photon"]
     assert kelvin[0] == pytest.approx(3000) and kelvin[-1] == pytest.approx(50_000)
     assert np.interp(9000, kelvin, rapp3) == pytest.approx(0.85, abs=0.01)
@@ -165,8 +164,8 @@ def test_torres_gives_the_sun_its_temperature():
     assert torres2010_k(np.array([0.653]))[0] == pytest.approx(5772, rel=0.02)
 
 
-def test_the_zero_points_differ_by_a_third_of_a_magnitude(study):
-    table = table_columns(study[0] / "zero_points.csv")
+def test_the_zero_points_differ_by_a_third_of_a_magnitude(models_study):
+    table = table_columns(models_study[0] / "zero_points.csv")
     bolometric = [
         setting == ("iau-bolometric", "energy")
         for setting in zip(table["zero_point"], table["weighting"], strict=True)
@@ -174,8 +173,8 @@ def test_the_zero_points_differ_by_a_third_of_a_magnitude(study):
     assert table["mag_against_default"][bolometric] == pytest.approx([0.31, 0.31], abs=0.01)
 
 
-def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(study):
-    table, text = table_columns(study[0] / "spectra.csv"), study[1]["spectra"]
+def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(models_study):
+    table, text = table_columns(models_study[0] / "spectra.csv"), models_study[1]["spectra"]
     assert table["spectral_type"] == list(load_library().spectral_type)
     median = {}
     for name in ("pickles, leave-one-out", "black body, ballesteros2012"):
@@ -202,17 +201,17 @@ def test_a_held_out_star_is_not_in_its_own_table():
     assert held_out_errors(changed)[40] == pytest.approx((plain[40] + 1) / 10 - 1, rel=1e-9)
 
 
-def test_the_zero_point_costs_the_same_at_every_colour(study):
-    cost = table_columns(study[0] / "choices.csv")["zero_point_iau-bolometric_mag"]
+def test_the_zero_point_costs_the_same_at_every_colour(models_study):
+    cost = table_columns(models_study[0] / "choices.csv")["zero_point_iau-bolometric_mag"]
     assert cost.min() == pytest.approx(0.31, abs=0.01)
     assert cost.max() == pytest.approx(0.31, abs=0.01)
 
 
-def test_hot_stars_differ_as_the_thesis_says(study):
+def test_hot_stars_differ_as_the_thesis_says(models_study):
     """Section 5.4, CCD47-20: 'higher than 9000 K ... results that differ from 15 % up to 5 %'; 5
     % is passed at 25 000 K.
     """
-    table = table_columns(study[0] / "rapp_ccd47-20.csv")
+    table = table_columns(models_study[0] / "rapp_ccd47-20.csv")
     hot = table["temperature_k"] >= 9000
     off = 1 - table["rapp3_photon"][hot]
     assert off[0] == pytest.approx(0.15, abs=0.005)
@@ -225,8 +224,8 @@ def test_torres_agrees_with_pecaut_and_mamajek():
     assert torres2010_k(bv_mag) == pytest.approx(kelvin, rel=SCALES_AGREE)
 
 
-def test_the_source_s_step_is_in_the_table(study):
-    table = table_columns(study[0] / "temperature_scales.csv")
+def test_the_source_s_step_is_in_the_table(models_study):
+    table = table_columns(models_study[0] / "temperature_scales.csv")
     assert (table["bv_mag"][0], table["bv_mag"][-1]) == (-0.35, 1.8)
     zero = np.flatnonzero(table["bv_mag"] == 0)[0]
     step_k = table["wang2021_k"][zero] - table["wang2021_k"][zero - 1]
@@ -237,7 +236,7 @@ def test_the_source_s_step_is_in_the_table(study):
     assert table["ballesteros2012_percent"] == pytest.approx(100 * (ratio - 1), abs=1e-9)
 
 
-def test_the_bolometric_zero_point_is_as_faint_as_its_own_arithmetic(study):
+def test_the_bolometric_zero_point_is_as_faint_as_its_own_arithmetic(models_study):
     """2.518e-8 W/m2 over sigma T^4, times pi B through Johnson V, against 3.631e-9 erg/s/cm2/A
     (Bessell 1998).
     """
@@ -257,7 +256,7 @@ def test_the_bolometric_zero_point_is_as_faint_as_its_own_arithmetic(study):
     mean = integral(lambda nm: exitance(nm) * np.interp(nm, *johnson), johnson[0])
     mean /= integral(lambda nm: np.interp(nm, *johnson), johnson[0])
     faint_mag = -2.5 * np.log10(2.518021002e-8 / (sigma * REFERENCE_K**4) * mean / 3.631e-2)
-    table = table_columns(study[0] / "zero_points.csv")
+    table = table_columns(models_study[0] / "zero_points.csv")
     cost = table["mag_against_default"]
     for k, (zero, weighting) in enumerate(
         zip(table["zero_point"], table["weighting"], strict=True)
@@ -269,9 +268,9 @@ def test_the_bolometric_zero_point_is_as_faint_as_its_own_arithmetic(study):
     assert len(cost) == 8
 
 
-def test_choices_cost_what_a_bench_would_see(study):
+def test_choices_cost_what_a_bench_would_see(models_study):
     """The same stars through the tables that `hilstar frame` uses."""
-    table = table_columns(study[0] / "choices.csv")
+    table = table_columns(models_study[0] / "choices.csv")
     stars, optics = load_catalog().brighter_than(7.5), study_optics("ccd47-20")
     ones = np.zeros(len(stars))
     kelvin = electrons.star_temperatures_k(stars.bv_mag, "ballesteros2012")
@@ -283,7 +282,7 @@ def test_choices_cost_what_a_bench_would_see(study):
     found = [table[f"pickles_{name}_mag"][row] for name in ("p5", "median", "p95")]
     assert found == pytest.approx(np.percentile(mags, (5, 50, 95)), abs=TABLE_MAG_LIMIT)
     assert table["stars_in_window"][row] == near.sum()
-    rapp = table_columns(study[0] / "rapp_ccd47-20.csv")
+    rapp = table_columns(models_study[0] / "rapp_ccd47-20.csv")
     at = electrons.star_temperatures_k(np.array([1.0]), "ballesteros2012")
     ags_mag = 2.5 * np.log10(np.interp(at, rapp["temperature_k"], rapp["rapp3_energy"]))
     # straight lines between 400 points
@@ -302,8 +301,8 @@ def test_there_are_no_percentiles_where_stars_are_few():
 
 
 @pytest.mark.parametrize("sensor", HELD_OUT)
-def test_real_spectra_are_as_wrong_as_measured(study, sensor):
-    table = table_columns(study[0] / "spectra.csv")
+def test_real_spectra_are_as_wrong_as_measured(models_study, sensor):
+    table = table_columns(models_study[0] / "spectra.csv")
     assert len(table["spectral_type"]) == 106
     errors = np.abs(table[f"{sensor}: pickles, leave-one-out [%]"][table["vi_mag"] < 2.5])
     assert np.percentile(errors, (50, 95)) == pytest.approx(
@@ -311,8 +310,8 @@ def test_real_spectra_are_as_wrong_as_measured(study, sensor):
     )
 
 
-def test_titles_say_what_the_tables_hold(study):
-    folder, texts = study
+def test_titles_say_what_the_tables_hold(models_study):
+    folder, texts = models_study
     for sensor in ("ccd47-20", "kai-4021"):
         table = table_columns(folder / f"rapp_{sensor}.csv")
         at = dict(zip(table["temperature_k"], table["rapp3_energy"], strict=True))
@@ -349,8 +348,8 @@ def test_a_title_follows_its_data(tmp_path, monkeypatch):
     assert float(new) == pytest.approx(float(old) - 1, abs=0.011)  # two figures rounded at 0.01
 
 
-def test_the_thesis_s_tables_stand_beside_what_is_here(study):
-    folder, texts = study
+def test_the_thesis_s_tables_stand_beside_what_is_here(models_study):
+    folder, texts = models_study
     rows = table_columns(folder / "catalogue_errors.csv")
     here, thesis = (dict(zip(rows["what"], rows[name], strict=True)) for name in ("here", "thesis"))
     assert thesis["V from T"] == here["V from T"] == 409  # table 2.2
@@ -377,8 +376,8 @@ def test_the_thesis_s_tables_stand_beside_what_is_here(study):
     )
 
 
-def test_every_figure_is_drawn_and_found(study):
-    folder, texts = study
+def test_every_figure_is_drawn_and_found(models_study):
+    folder, texts = models_study
     table = table_columns(folder / "findings.csv")
     assert tuple(table["figure"]) == tuple(texts) == STEMS
     assert table["finding"] == list(texts.values())
@@ -411,11 +410,11 @@ def test_matplotlib_is_imported_by_a_drawing_and_pyplot_by_none():
     subprocess.run([sys.executable, "-c", code], check=True, timeout=PATIENCE_S)
 
 
-def test_the_stars_of_the_map_are_those_of_the_catalogue(study):
+def test_the_stars_of_the_map_are_those_of_the_catalogue(models_study):
     """Figure 2.2: each cell has its stars, counted here one by one; the whole sky has 41 253
     square degrees.
     """
-    table, catalog = table_columns(study[0] / "star_density.csv"), load_catalog()
+    table, catalog = table_columns(models_study[0] / "star_density.csv"), load_catalog()
     cell_deg2 = 41_252.96 / len(table["ra_deg"])
     assert table["stars_deg2"].sum() * cell_deg2 == pytest.approx(len(catalog), rel=1e-5)
     k = int(table["stars_deg2"].argmax())
@@ -427,11 +426,11 @@ def test_the_stars_of_the_map_are_those_of_the_catalogue(study):
     assert table["stars_deg2"][k] * cell_deg2 == pytest.approx(near.sum(), abs=0.5)
 
 
-def test_the_camera_s_frame_is_astropy_s_tangent_plane(study):
+def test_the_camera_s_frame_is_astropy_s_tangent_plane(models_study):
     """Figure 2.11: x and y over z are Astropy's tangent plane at the boresight, west and south
     of it.
     """
-    table = table_columns(study[0] / "frames.csv")
+    table = table_columns(models_study[0] / "frames.csv")
     plane = WCS(naxis=2)
     plane.wcs.ctype, plane.wcs.crval, plane.wcs.cdelt = (
         ["RA---TAN", "DEC--TAN"],
@@ -446,11 +445,11 @@ def test_the_camera_s_frame_is_astropy_s_tangent_plane(study):
     assert len(ra_deg) == 572
 
 
-def test_zodiacal_light_near_the_earth_has_its_magnitude(study):
+def test_zodiacal_light_near_the_earth_has_its_magnitude(models_study):
     """Figure 4.11: table 6.4's high zodiacal light is V = 22.1 through Johnson V, as the
     handbook says.
     """
-    table, (nm, response) = table_columns(study[0] / "backgrounds.csv"), curve("johnson-v")
+    table, (nm, response) = table_columns(models_study[0] / "backgrounds.csv"), curve("johnson-v")
     # W/m2/arcsec2/nm
     per_nm = table["zodiacal"] * 6.62607015e-34 * 299_792_458 / (table["wavelength_nm"] * 1e-9)
     weight = np.interp(table["wavelength_nm"], nm, response, left=0, right=0)
@@ -460,13 +459,13 @@ def test_zodiacal_light_near_the_earth_has_its_magnitude(study):
     assert np.isnan(table["ground"][-1]) and table["ground"][200] > table["zodiacal"][200]
 
 
-def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(study):
+def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(models_study):
     """Figures 3.1 and 2.13: both curves have one mean through V, or Vega's flux; Planck's law is
     written here.
     """
     nm, response = curve("johnson-v")
     for stem, star, kelvin in (("sun", "g2v", 5772.0), ("vega_logarithmic", "vega", 9602.0)):
-        table = table_columns(study[0] / f"{stem}.csv")
+        table = table_columns(models_study[0] / f"{stem}.csv")
         weight = np.interp(table["wavelength_nm"], nm, response, left=0, right=0)
         means = [
             np.trapezoid(table[name] * weight, table["wavelength_nm"])

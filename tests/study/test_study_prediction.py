@@ -23,7 +23,7 @@ from tests.support.pictures import assert_drawn
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def prediction_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("prediction")
     lines, _ = run(folder, quick=True)
     return folder, lines
@@ -40,10 +40,10 @@ def typed_rows(path, record):
 
 
 @pytest.fixture(scope="module")
-def outcomes(study):
+def outcomes(prediction_study):
     return {
         (o.method, o.rate_hz, o.latency_ms): o
-        for o in typed_rows(study[0] / "prediction.csv", PredictionOutcome)
+        for o in typed_rows(prediction_study[0] / "prediction.csv", PredictionOutcome)
     }
 
 
@@ -69,10 +69,10 @@ def test_a_rate_predicts_better_than_holding_and_worse_the_longer_it_has_to(outc
 
 
 @pytest.fixture(scope="module")
-def shaken(study):
+def shaken(prediction_study):
     return {
         (s.way, s.packets, s.jitter_hz): s
-        for s in typed_rows(study[0] / "prediction_jitter.csv", Shaken)
+        for s in typed_rows(prediction_study[0] / "prediction_jitter.csv", Shaken)
     }
 
 
@@ -88,7 +88,9 @@ def test_a_rate_amplifies_a_vibration_by_its_phase_over_the_age(shaken):
         )
 
 
-def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fast(study, shaken):
+def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fast(
+    prediction_study, shaken
+):
     for packets in ("with rates", "without rates"):
         for hz in (2.0, 5.0):
             assert shaken["auto", packets, hz].residual == pytest.approx(
@@ -101,11 +103,11 @@ def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fas
             )
         # sin x = x / 2: 15 Hz with rates
         assert 8 < crossing_hz(list(shaken.values()), packets, USUAL_HZ, USUAL_MS) < 16
-    assert study[1][-1].startswith("Of a vibration above 1")
+    assert prediction_study[1][-1].startswith("Of a vibration above 1")
 
 
-def test_the_study_writes_what_it_found(study, outcomes):
-    folder, lines = study
+def test_the_study_writes_what_it_found(prediction_study, outcomes):
+    folder, lines = prediction_study
     assert len(lines) == 1 + 5 + 1
     assert len(outcomes) == 5 * (len(RATES_HZ) + len(LATENCIES_MS) - 1)
     assert {ms for _, hz, ms in outcomes if hz == USUAL_HZ} == set(LATENCIES_MS)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pytest
 
@@ -13,6 +11,7 @@ from hilstar.instruments.study.codes import AIMS, BITS, WAYS
 from hilstar.instruments.study.quantisation import run
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 # Of the error of `round` that `exact` leaves, by each centroider: 0.18 to 0.48 on 8 x 8 phases, 64
 # stars.
@@ -45,8 +44,7 @@ def test_the_study_writes_charts_tables_and_findings(tmp_path):
         "over_frames.png",
     ):
         assert_drawn(tmp_path / name)
-    with (tmp_path / "quantisation.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(tmp_path / "quantisation.csv")
     assert len(rows) == len(BITS) * len(WAYS) * 5
     for bits, (aim_mag, limit) in AIMS.items():
         exact = [
@@ -65,10 +63,8 @@ def test_the_study_writes_charts_tables_and_findings(tmp_path):
     assert float(faint["exact"]["centroid_rms_px"]) == pytest.approx(
         np.sqrt(2) * float(faint["exact"]["axis_rms_px_moment"])
     )
-    with (tmp_path / "quantisation_time.csv").open() as file:
-        assert all(float(row["frame_ms"]) > 0 for row in csv.DictReader(file))
-    with (tmp_path / "over_frames.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    assert all(float(row["frame_ms"]) > 0 for row in csv_rows(tmp_path / "quantisation_time.csv"))
+    rows = csv_rows(tmp_path / "over_frames.csv")
     left = {(r["panel"], r["method"], r["frames"]): float(r["flux_rms_mag"]) for r in rows}
     for panel in dict.fromkeys(r["panel"] for r in rows):
         assert left[panel, "temporal", "6"] < left[panel, "temporal", "2"]

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.study import rigs
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 # An even error of a pixel's width: its rms is within 10 % of a twelfth's root, of 80 stars
 PIXEL_ARCSEC = 57.65109021605092e-3 / 350 * 206264.806 / math.sqrt(12)
@@ -24,43 +25,45 @@ GRID_PX = 1e-9
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def rigs_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("rigs")
     lines = rigs.run(folder, quick=True)
-    return folder, lines, {row["figure"]: row for row in table(folder / "rigs.csv")}
+    return folder, lines, {row["figure"]: row for row in csv_rows(folder / "rigs.csv")}
 
 
-def figures(study, figure):
-    row = study[2][figure]
+def figures(rigs_study, figure):
+    row = rigs_study[2][figure]
     return tuple(float(row[name]) for name in ("published", "predicted", "with_hilstar"))
 
 
-def test_one_pixel_a_star_leaves_a_pixel_s_own_error_and_hilstar_s_codes_a_hundredth(study):
-    folder, lines, rows = study
+def test_one_pixel_a_star_leaves_a_pixel_s_own_error_and_hilstar_s_codes_a_hundredth(rigs_study):
+    folder, lines, rows = rigs_study
     assert_drawn(folder / "rigs.png")
     assert len(lines) == 1 + len(rows)
-    published, predicted, after = figures(study, "places, one pixel a star")
+    published, predicted, after = figures(rigs_study, "places, one pixel a star")
     assert predicted == pytest.approx(PIXEL_ARCSEC, rel=EVEN)
     assert published == pytest.approx(PIXEL_ARCSEC, rel=EVEN)
     assert after < CODES_ARCSEC
-    assert figures(study, "light, hilstar's codes")[1] < CODES_MAG
+    assert figures(rigs_study, "light, hilstar's codes")[1] < CODES_MAG
 
 
-def test_one_light_of_a_star_predicts_all_static_scatters(study):
+def test_one_light_of_a_star_predicts_all_static_scatters(rigs_study):
     for name in rigs.SCATTER_ARCSEC:
         for what in ("about", "across"):
             fitted = " (fitted)" if (name, what) == (rigs.FITTED, "across") else ""
-            published, predicted, after = figures(study, f"static scatter {what}, {name}{fitted}")
+            published, predicted, after = figures(
+                rigs_study, f"static scatter {what}, {name}{fitted}"
+            )
             assert 1 / FACTOR < predicted / published < FACTOR
             # a display that stands still scatters nothing: it is the camera's own
             assert after == pytest.approx(predicted, rel=0.5)
-    assert figures(study, "constant error of an attitude, across")[1] > 1.0
-    assert figures(study, "constant error of an attitude, across")[2] < 0.05
+    assert figures(rigs_study, "constant error of an attitude, across")[1] > 1.0
+    assert figures(rigs_study, "constant error of an attitude, across")[2] < 0.05
 
 
-def test_pixels_explain_naples_s_tracking(study):
+def test_pixels_explain_naples_s_tracking(rigs_study):
     for what in ("about", "across"):
-        published, predicted, _ = figures(study, f"precision of tracking {what}")
+        published, predicted, _ = figures(rigs_study, f"precision of tracking {what}")
         assert published / 2 < predicted < published
 
 

@@ -23,7 +23,9 @@ from hilstar.instruments.study.timing import (
 )
 from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
-from tests.support.pictures import assert_drawn, table
+from tests.support.pictures import assert_drawn
+from tests.support.recorded import assert_recorded
+from tests.support.tables import csv_rows
 
 GAIN = 20  # compensated against not: the issue's own figure
 RATE_DEG_S = QUICK_RATES_DEG_S[0]
@@ -36,7 +38,7 @@ FRAME_ARCSEC = RATE_DEG_S * PERIOD_S * 3600
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def timing_study(tmp_path_factory):
     """The study's folder and findings, and what it measured."""
     folder, measured = tmp_path_factory.mktemp("timing"), []
 
@@ -51,8 +53,13 @@ def study(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def outcomes(study):
-    return {outcome.way: outcome for outcome in study[2]}
+def outcomes(timing_study):
+    return {outcome.way: outcome for outcome in timing_study[2]}
+
+
+def test_the_page_s_table_is_of_what_is_measured_now(timing_study):
+    figures = ("rms_arcsec", "worst_arcsec")
+    assert_recorded(timing_study[0] / "timing.csv", ("way", "rate_deg_s"), figures)
 
 
 def test_compensation_leaves_a_twentieth_of_the_error_at_most(outcomes):
@@ -98,19 +105,19 @@ def test_rows_share_an_exposure_among_the_frames_that_they_show():
     assert weights[2, -1] > 0
 
 
-def test_the_study_writes_a_chart_and_a_table(study):
-    folder, findings, _ = study
+def test_the_study_writes_a_chart_and_a_table(timing_study):
+    folder, findings, _ = timing_study
     assert len(findings) == 1 + len(WAYS) + 1 + len(QUICK_CASES) + 1
     assert_drawn(folder / "timing.png")
     assert len((folder / "timing.csv").read_text().splitlines()) == 1 + len(WAYS)
 
 
-def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(study):
+def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(timing_study):
     rows = [
         {name: float(value) for name, value in row.items()}
-        for row in table(study[0] / "stripes.csv")
+        for row in csv_rows(timing_study[0] / "stripes.csv")
     ]
-    assert_drawn(study[0] / "stripes.png")
+    assert_drawn(timing_study[0] / "stripes.png")
     assert max(abs(row["light"] - row["foretold"]) for row in rows) < 1e-6
     deep = [row["light"] for row in rows if row["refreshes"] == 2.4 and row["lit_ms"] == 4]
     assert max(deep) > 1.2 and min(deep) < 0.9
@@ -119,12 +126,13 @@ def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(study):
     )
 
 
-def test_a_tracker_sees_the_beat_that_is_foretold(study):
+def test_a_tracker_sees_the_beat_that_is_foretold(timing_study):
     """Star by star, each on a row of its own phase; and of another phase it would not be."""
     rows = [
-        {name: float(value) for name, value in row.items()} for row in table(study[0] / "beat.csv")
+        {name: float(value) for name, value in row.items()}
+        for row in csv_rows(timing_study[0] / "beat.csv")
     ]
-    assert_drawn(study[0] / "beat.png")
+    assert_drawn(timing_study[0] / "beat.png")
     for case in QUICK_CASES:
         mine = [row for row in rows if (row["refreshes"], row["lit"]) == (case.refreshes, case.lit)]
         assert len(mine) > 30

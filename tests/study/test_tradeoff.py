@@ -4,7 +4,6 @@ the front or says why not.
 
 from __future__ import annotations
 
-import csv
 import itertools
 
 import numpy as np
@@ -35,6 +34,7 @@ from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
 from tests.support.pictures import assert_drawn
+from tests.support.tables import csv_rows
 
 NAMES = [
     "brightness",
@@ -57,14 +57,13 @@ PROFILE_SHARE = 2e-7
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def tradeoff_study(tmp_path_factory):
     folder = tmp_path_factory.mktemp("tradeoff")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)  # one round: no claim here is of a time
         patch.setattr(sweep, "MIN_ROUNDS", 1)
         lines, _ = tradeoff.run(folder, quick=True)
-    with (folder / "tradeoff.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(folder / "tradeoff.csv")
     return (
         folder,
         lines,
@@ -76,8 +75,8 @@ def method_error(step, method):
     return float(step[method]["error"])
 
 
-def test_every_step_has_a_chart_a_table_and_one_default(study):
-    folder, lines, steps = study
+def test_every_step_has_a_chart_a_table_and_one_default(tradeoff_study):
+    folder, lines, steps = tradeoff_study
     for name in NAMES:
         assert_drawn(folder / f"tradeoff_{name}.png")
         assert any(line.startswith(f"{name}: ") for line in lines)
@@ -86,8 +85,8 @@ def test_every_step_has_a_chart_a_table_and_one_default(study):
         assert all(float(row["time_ms"]) > 0 for row in steps[name].values())
 
 
-def test_a_default_is_on_the_front_or_says_what_beats_it(study):
-    _, lines, steps = study
+def test_a_default_is_on_the_front_or_says_what_beats_it(tradeoff_study):
+    _, lines, steps = tradeoff_study
     for step in steps.values():
         default = next(row for row in step.values() if row["default"] == "True")
         assert (default["front"] == "True") == (default["beaten_by"] == "")
@@ -98,8 +97,8 @@ def test_a_default_is_on_the_front_or_says_what_beats_it(study):
             assert any(default["beaten_by"] in line for line in lines)
 
 
-def test_the_defaults_are_the_code_s_own(study):
-    steps = study[2]
+def test_the_defaults_are_the_code_s_own(tradeoff_study):
+    steps = tradeoff_study[2]
     default = {
         name: next(m for m, row in step.items() if row["default"] == "True")
         for name, step in steps.items()
@@ -116,7 +115,7 @@ def test_the_defaults_are_the_code_s_own(study):
     assert default["smear"].startswith("Gauss-Legendre by length")
 
 
-def test_what_is_exact_is_so_to_rounding(study):
+def test_what_is_exact_is_so_to_rounding(tradeoff_study):
     """Figures from each step's `floor`: float64 integrals, float32 sprites, extended precision."""
     floors = {
         "brightness": 5e-12,
@@ -127,14 +126,14 @@ def test_what_is_exact_is_so_to_rounding(study):
         "smear": 1e-7,
     }
     for name, floor in floors.items():
-        exact = [row for row in study[2][name].values() if row["exact"] == "True"]
+        exact = [row for row in tradeoff_study[2][name].values() if row["exact"] == "True"]
         assert len(exact) == 1 and float(exact[0]["error"]) <= floor
-    (exact,) = [row for row in study[2]["psf"].values() if row["exact"] == "True"]
+    (exact,) = [row for row in tradeoff_study[2]["psf"].values() if row["exact"] == "True"]
     assert float(exact["error"]) <= 1e-7 and float(exact["second"]) < 1e-12
 
 
-def test_the_defaults_keep_their_modules_promises(study):
-    steps = study[2]
+def test_the_defaults_keep_their_modules_promises(tradeoff_study):
+    steps = tradeoff_study[2]
     own = {
         name: next(row for row in step.values() if row["default"] == "True")
         for name, step in steps.items()
@@ -145,8 +144,8 @@ def test_the_defaults_keep_their_modules_promises(study):
     assert float(own["projection"]["error"]) < 6e-8  # half a step of float32 under 1, on both axes
 
 
-def test_less_is_worse(study):
-    steps = study[2]
+def test_less_is_worse(tradeoff_study):
+    steps = tradeoff_study[2]
 
     def falls(step, *methods):
         errors = [method_error(steps[step], method) for method in methods]

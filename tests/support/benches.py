@@ -24,14 +24,19 @@ _SMALL: dict[str, dict[str, object]] = {
 }
 
 
-def bench_text(*changes: Tables) -> str:
-    """The small bench as TOML, with other values and tables; a value of None takes a key away."""
+def bench_tables(*changes: Tables) -> dict[str, dict[str, object]]:
+    """The tables of the small bench, with other values and tables."""
     tables = {name: dict(keys) for name, keys in _SMALL.items()}
     for change in changes:
         for name, keys in change.items():
             tables.setdefault(name, {}).update(keys)
+    return tables
+
+
+def bench_text(*changes: Tables) -> str:
+    """The small bench as TOML, with other values and tables; a value of None takes a key away."""
     lines = []
-    for name, keys in tables.items():
+    for name, keys in bench_tables(*changes).items():
         lines.append(f"\n[{name}]")
         lines += [
             f"{key} = {json.dumps(value)}" for key, value in keys.items() if value is not None

@@ -52,6 +52,11 @@ DARK, LIGHT = 40, 200  # grey values that no theme is between
 class Browser(Chrome):
     """A browser with what the tests of pages need."""
 
+    def start_session(self, capabilities: dict[str, Any]) -> None:
+        """Begin, however long a busy machine takes to."""
+        self.command_executor.client_config.timeout = PATIENCE_S
+        super().start_session(capabilities)
+
     def size(self, width_px: int, height_px: int) -> None:
         """The size of the page's window, in CSS pixels, however small."""
         metrics = {"width": width_px, "height": height_px, "deviceScaleFactor": 1, "mobile": False}
@@ -97,8 +102,11 @@ class Browser(Chrome):
         return self.find_element(By.CSS_SELECTOR, selector)
 
     def press(self, selector: str) -> None:
-        """Click on an element, in the middle of the window."""
+        """Click on an element, in the middle of the window, once it takes clicks: a page that has
+        lost its run disables its controls until it is back.
+        """
         element = self.find(selector)
+        self.until(f"!document.querySelector('{selector}').disabled")
         self.run("arguments[0].scrollIntoView({ block: 'center' })", element)
         element.click()
 

@@ -26,6 +26,8 @@ from hilstar.basics.rotation import from_rotation_vector, multiply, propagate, t
 from hilstar.basics.units import ARCSEC_PER_RAD
 
 FOCAL_PX = 2000.0
+MIDDLE_PX = 511.5  # of a detector of 1024 x 1024
+HALF_FIELD = (0.15, 0.11)  # tangents, a little within the display of tests/support/benches.py
 WAVE_PX = 100.0  # of the field-of-view error
 FIRST_DIRECTION = np.array([0.163, 0.926, 0.342])  # RA 80, Dec 20: its phase is the pixel error's
 
@@ -53,6 +55,14 @@ class Planted:
     rate_bias_deg_s: tuple[float, float, float] | None = None
     stamp_bias_s: float = 0.0
     seed: int = 1
+    # a JSON list of stars that it reports, each x, y, z (ICRS, unit), V, B-V and e-/s, as far as
+    # they are within HALF_FIELD and `star_limit_v_mag`: places with noise, px, signals off by so
+    # much a magnitude of B-V, and false stars a frame
+    star_file: str = ""
+    star_noise_px: float = 0.0
+    star_colour: float = 0.0
+    star_limit_v_mag: float = 99.0
+    false_stars: float = 0.0
 
 
 def seen(
@@ -94,11 +104,32 @@ def error_arcsec(
     return error
 
 
+def reported_stars(
+    planted: Planted, stars: np.ndarray, q: np.ndarray, rng: np.random.Generator
+) -> list[list[float]]:
+    """The stars (n, 6) that it reports at an attitude: x, y, px, and signal."""
+    seen = stars[:, :3] @ to_matrix(q).T
+    x, y, z = seen.T
+    half_x, half_y = HALF_FIELD
+    inside = (z > 0) & (np.abs(x) < half_x * z) & (np.abs(y) < half_y * z)
+    inside &= stars[:, 3] <= planted.star_limit_v_mag
+    places = MIDDLE_PX + FOCAL_PX * seen[inside, :2] / seen[inside, 2:]
+    places = places + planted.star_noise_px * rng.standard_normal(places.shape)
+    signal = stars[inside, 5] * 10 ** (-0.4 * planted.star_colour * stars[inside, 4])
+    rows = np.column_stack([places, signal]).tolist()
+    for _ in range(rng.poisson(planted.false_stars)):
+        rows.append([*rng.uniform(0, 2 * MIDDLE_PX, 2).tolist(), 1000.0])
+    return rows
+
+
 def main() -> None:
     """Answer until standard input ends."""
     planted = Planted(**json.loads(sys.argv[1]))
     rng = np.random.default_rng((planted.seed, os.getpid()))
     line = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    stars = None
+    if planted.star_file:
+        stars = np.array(json.loads(Path(planted.star_file).read_text()))
     begun_ns, k, wild, known = time.monotonic_ns(), 0, [], []
     while not select.select([sys.stdin], [], [], 0)[0]:
         middle_ns = begun_ns + round(k / planted.answer_hz * 1e9)
@@ -125,6 +156,8 @@ def main() -> None:
                 rate = np.array(known[-1]["rate_cam_rad_s"]) + np.radians(planted.rate_bias_deg_s)
                 told["rate"] = rate.tolist()
             told["centroids"] = [[100.0 + 50 * star, 200.0, dn * (1 + star)] for star in range(7)]
+            if stars is not None:
+                told["centroids"] = reported_stars(planted, stars, found[1], rng)
         line.sendto(json.dumps(told).encode(), ("127.0.0.1", planted.port))
         k = max(k, int((time.monotonic_ns() - begun_ns) / 1e9 * planted.answer_hz))
     print(json.dumps(wild))

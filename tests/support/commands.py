@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import logging
 import os
 import signal
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TextIO
+from typing import Any, TextIO
 
 from hilstar.cli import run_command
 from hilstar.cli.entry import LOG_FORMAT
@@ -124,3 +125,10 @@ def assert_refused(result: subprocess.CompletedProcess[str], code: int, *words: 
     assert len(result.stderr.splitlines()) == 1, result.stderr
     for word in words:
         assert word in result.stderr
+
+
+def sent(to: str, *options: str) -> dict[str, Any]:
+    """What `hilstar send` says of packets that it sent there."""
+    result = run_hilstar_here("send", "--to", to, "--json", *options)
+    assert result.returncode == 0, result.stderr
+    return dict(json.loads(result.stdout))

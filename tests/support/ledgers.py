@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
+from mcap.reader import make_reader
 
 from hilstar.attitude.logs.mcap_log import read_messages
 from hilstar.server.record.ledger_records import (
@@ -47,3 +49,12 @@ def read_run(path: Path) -> Run:
 def read_events(path: Path) -> list[EventRecord]:
     """The events of a ledger, which may be growing."""
     return [msgspec.json.decode(data, type=EventRecord) for data in read_messages(path, "/event")]
+
+
+def messages_by_topic(path: Path) -> dict[str, list[dict]]:
+    """A ledger's messages, through MCAP's own reader."""
+    found: dict[str, list[dict]] = {}
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            found.setdefault(channel.topic, []).append(json.loads(message.data))
+    return found

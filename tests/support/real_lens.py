@@ -35,7 +35,7 @@ BENCH = bench_text(
 )
 
 
-def write_bench(folder: Path, text: str = BENCH) -> Path:
+def write_lens_bench(folder: Path, text: str = BENCH) -> Path:
     """A bench file and its geometry file, with a residual field of degree 5."""
     rng = np.random.default_rng(4)
     degree = np.add.outer(np.arange(6), np.arange(6))

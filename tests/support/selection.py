@@ -26,6 +26,8 @@ REASONS_BY_FOLDER = {
 # Functions that take over a stated time of CPU, all their cases together; tests/support/slow_tests.py
 # measures them and writes the file.
 SLOW = frozenset((TESTS / "slow.txt").read_text().split())
+SLOW_FILES = frozenset(function.partition("::")[0] for function in SLOW)
+TIMING_MARK = "mark.timing"
 LEFT_OUT = pytest.StashKey[dict[str, int]]()
 
 
@@ -61,6 +63,18 @@ def is_bare(config: pytest.Config) -> bool:
     return not (option.keyword or option.markexpr or option.lf or option.failedfirst)
 
 
+def holds_nothing_for(config: pytest.Config, path: Path) -> bool:
+    """Whether `--rest` or `--timing` takes no test of a file, so that it need not be imported."""
+    option = config.option
+    if option.all or not (option.rest or option.timing) or not path.name.startswith("test_"):
+        return False
+    if option.timing:
+        return "timing" not in path.relative_to(TESTS).parts and TIMING_MARK not in path.read_text()
+    folders = path.relative_to(TESTS).parts[:-1]
+    is_slow = path.relative_to(TESTS.parent).as_posix() in SLOW_FILES
+    return not is_slow and not REASONS_BY_FOLDER.keys() & set(folders)
+
+
 def select(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Take out of `items`, in place, what this command leaves out, and count it by reason."""
     option = config.option
@@ -82,7 +96,8 @@ def select(config: pytest.Config, items: list[pytest.Item]) -> None:
             chosen.append(item)
             continue
         left_out.append(item)
-        reasons[reason or "are run by the bare command"] += 1
+        if reason is not None:
+            reasons[reason] += 1
     items[:] = chosen
     config.hook.pytest_deselected(items=left_out)
     config.stash[LEFT_OUT] = dict(reasons)

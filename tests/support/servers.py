@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.support.benches import LIVE_BENCH, SMALL_BENCH, attitude_table
+from tests.support.benches import LIVE_BENCH, SMALL_BENCH, TWIN, attitude_table, bench_text
 from tests.support.forks import HILSTAR, Started
 from tests.support.senders import await_subscriber_of, free_port
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -232,3 +232,15 @@ def _can_connect(port: int) -> bool:
     with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port)):
         return True
     return False
+
+
+@contextmanager
+def sending_replay(folder: Path, log: Path) -> Iterator[tuple[Path, str]]:
+    """A replay of a log that sends its frames: its bench file, the twin's, and its endpoint."""
+    bench, endpoint = folder / "bench.toml", f"tcp://127.0.0.1:{free_port()}"
+    bench.write_text(bench_text(TWIN, {"render": {"quantisation": "round"}}))
+    command = [*HILSTAR, "replay", str(bench), str(log), "--headless", "--feed", endpoint]
+    with Started(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        yield bench, endpoint
+        process.terminate()
+        process.wait(PATIENCE_S)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import tomllib
 
 import numpy as np
@@ -205,3 +206,29 @@ def test_a_sender_takes_what_a_bench_takes():
         for wrong in ({"q_icrs_to_cam": [84, -1.2, 0]}, {"q_icrs_to_cam": BELT, "t_ns": 1.5}):
             with pytest.raises(hilstar.InputError):
                 sender.send(**wrong)
+
+
+def test_a_drawn_frame_is_one_line_and_can_be_pickled(bench):
+    drawn = bench.draw(BELT)
+    moving = bench.draw(BELT, rate_cam_rad_s=np.radians([0.0, 2.0, 0.0]))
+    assert repr(moving).endswith("clipped, drawn along a turn of 2 deg/s>")
+    assert repr(bench.draw(None)) == "<hilstar drawn frame: blank>"
+    drawn = bench.draw(BELT)
+    again = pickle.loads(pickle.dumps(drawn))
+    assert repr(again) == repr(drawn)
+    assert repr(drawn) == f"<hilstar drawn frame: {drawn.star_count} stars, 2 clipped>"
+    assert len(drawn.clipped_hip) == 2
+    levels = drawn.levels.copy()
+    bench.draw(None)
+    assert np.array_equal(again.levels, levels) and levels.any()
+    assert again.clipped_hip == drawn.clipped_hip
+
+
+def test_a_frame_can_be_pickled_without_its_bench(bench):
+    frame = bench.frame(BELT)
+    again = pickle.loads(pickle.dumps(frame))
+    assert np.array_equal(again.codes, frame.codes)
+    assert again.truth.tobytes() == frame.truth.tobytes()
+    assert repr(again) == repr(frame)
+    with pytest.raises(hilstar.InputError, match="was pickled"):
+        again.to_table()

@@ -42,7 +42,7 @@ def frame(bench):
 
 
 @pytest.fixture
-def sender():
+def opened_udp_sender():
     with hilstar.Sender(f"udp://127.0.0.1:{free_port()}") as opened:
         yield opened
 
@@ -163,24 +163,24 @@ def test_a_sender_that_cannot_be(mistake, said):
         mistake()
 
 
-def test_a_sender_used_wrongly(sender):
+def test_a_sender_used_wrongly(opened_udp_sender):
     with refused("timeout_s '3': write a number of seconds"):
-        sender.wait("3")
+        opened_udp_sender.wait("3")
     with refused("its norm|norm is 2"):
-        sender.send([1, 1, 1, 1])
-    sender.close()
+        opened_udp_sender.send([1, 1, 1, 1])
+    opened_udp_sender.close()
     with refused("send: the sender is closed"):
-        sender.send(Q)
+        opened_udp_sender.send(Q)
 
 
 def test_a_clock_in_seconds_is_refused_and_not_searched_for():
     """A fraction is in no range of whole numbers, which Python walks through to say so."""
     to = f"udp://127.0.0.1:{free_port()}"
     with (
-        hilstar.Sender(to, clock=lambda: 1.5) as sender,
+        hilstar.Sender(to, clock=lambda: 1.5) as opened_udp_sender,
         refused("clock 1.5: write whole nanoseconds"),
     ):
-        sender.send(Q)
+        opened_udp_sender.send(Q)
 
 
 @pytest.mark.parametrize(

@@ -3,17 +3,19 @@ one message of three parts.
 
 1. A JSON object: `frame` (the frame's number), `lit_ns` (when its light begins, in ns of this
    machine's `time.monotonic_ns()`: with a screen, when the middle row lights; without a screen,
-   half a refresh period before the time of `q`), `q` (q_icrs_to_cam, unit, scalar first; null for
+   midway between the moment before and its own), `q` (q_icrs_to_cam, unit, scalar first; null for
    a blank frame), `width` and `height` (px), `bits` of a code, `channels` (1, or 3 where the
-   primaries are driven apart), `bench_sha256`.
+   primaries are driven apart), `bench_sha256`, `moment_ns` (null with a screen; without one, the
+   moment of `q`), `fades` (whether, without a screen, light passes evenly from the frame before to
+   this one between their moments; else the one before stays lit until `lit_ns`).
 2. The flat indices of the lit pixels, row * width + column, in rising order: uint32,
    little-endian. All other pixels have code 0.
 3. The codes of these pixels, `channels` for each: uint8 up to 8 bits, else uint16, little-endian.
 
 A frame of stars has some thousand lit pixels of two million, so its message has 20 to 100 kB and
 needs no shared memory.
-A frame stays lit until the next one is. The sender queues few frames for each watcher: a slow
-watcher loses frames, and notices it by a gap in `frame`.
+With a screen a frame stays lit until the next one is. The sender queues few frames for each
+watcher: a slow watcher loses frames, and notices it by a gap in `frame`.
 """
 
 import contextlib
@@ -55,6 +57,8 @@ class FrameHead(msgspec.Struct, frozen=True):
     q: tuple[float, float, float, float] | None = None
     channels: int = 1
     bench_sha256: str = ""
+    moment_ns: int | None = None
+    fades: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -129,41 +129,15 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
     y = first_y + _nodes_px(height)
     places = np.stack(np.meshgrid(x, y), axis=-1)
     whole = _lattice(light, places.astype(np.float64), TILE_PX)
-    drawn = ~whole.is_beside
-    white = np.zeros_like(whole.is_face)
-    apart = white
-    if sure is not None:
-        smooth = whole.is_inside | whole.is_air
-        white, dark = sure.levels(whole.e_per_s, smooth)
-        apart = sure.apart((first_x, first_y), white.shape)
-        # A limb may bulge into a tile between its corners, but not without a corner of a tile
-        # beside it.
-        is_dark_around = _all(_all(np.pad(dark, 1, constant_values=True)))
-        is_black = dark & (smooth | is_dark_around)
-        drawn &= ~(apart & is_black)
+    drawn, white, apart = _ways(whole, (first_x, first_y), sure)
     disc = light.disc
     of_air = disc.distance_radii, disc.air_radii, disc.slant_depth, whole.spread
     inner = _inner(region, drawn)
     if inner is None:
-        return Tiles(
-            (first_x, first_y, 0, 0),
-            NOTHING,
-            NOTHING,
-            NOTHING,
-            NOTHING,
-            NOTHING,
-            NOTHING,
-            NOTHING,
-            of_air,
-        )
+        nothing = (NOTHING,) * 7
+        return Tiles((first_x, first_y, 0, 0), *nothing, of_air)
     drawn &= ~white
-    # Tiles at the edges in parts: in the linear image, for their sprites and rays are encoded tile
-    # by tile.
-    steps = np.arange(-FINE_PX, TILE_PX + FINE_PX + 1, FINE_PX)
-    parts = np.stack(np.meshgrid(steps, steps), axis=-1)
-    is_edge = drawn & ~whole.is_inside & ~whole.is_air
-    corners = whole.face[:-1, :-1, :2][is_edge]
-    fine = _lattice(light, corners[:, None, None] + parts, FINE_PX)
+    fine = _fine_lattice(light, whole, drawn)
     fine_white = np.zeros_like(fine.is_face)
     if sure is not None:
         fine_white, _ = sure.levels(fine.e_per_s, fine.is_inside | fine.is_air)
@@ -194,6 +168,38 @@ def disc_tiles(light: DiscLight, region: Rectangle, sure: Sure | None = None) ->
     )
 
 
+def _ways(
+    whole: _Lattice, corner_px: tuple[int, int], sure: Sure | None
+) -> tuple[BoolArray, BoolArray, BoolArray]:
+    """Which tiles (rows, columns) from a corner of the image on are drawn at all, which are white,
+    and which have no sprite's light, so that levels alone can be drawn.
+    """
+    drawn = ~whole.is_beside
+    if sure is None:
+        no_tile = np.zeros_like(whole.is_face)
+        return drawn, no_tile, no_tile
+    smooth = whole.is_inside | whole.is_air
+    white, dark = sure.levels(whole.e_per_s, smooth)
+    apart = sure.apart(corner_px, white.shape)
+    # A limb may bulge into a tile between its corners, but not without a corner of a tile beside
+    # it.
+    is_dark_around = _all(_all(np.pad(dark, 1, constant_values=True)))
+    is_black = dark & (smooth | is_dark_around)
+    return drawn & ~(apart & is_black), white, apart
+
+
+def _fine_lattice(light: DiscLight, whole: _Lattice, drawn: BoolArray) -> _Lattice:
+    """The lattices of the `drawn` tiles at edges, in parts.
+
+    They are drawn in the linear image, for their sprites and rays are encoded tile by tile.
+    """
+    steps = np.arange(-FINE_PX, TILE_PX + FINE_PX + 1, FINE_PX)
+    parts = np.stack(np.meshgrid(steps, steps), axis=-1)
+    is_edge = drawn & ~whole.is_inside & ~whole.is_air
+    corners = whole.face[:-1, :-1, :2][is_edge]
+    return _lattice(light, corners[:, None, None] + parts, FINE_PX)
+
+
 def _nodes_px(size_px: int) -> IntArray:
     """Nodes of tiles along an axis from a rectangle's first pixel, with a tile beyond both ends."""
     count = math.ceil(size_px / TILE_PX)
@@ -219,50 +225,30 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
     """
     disc = light.disc
     px_per_rad, *_ = light.camera.scales_px_rad()
-    reach_px = REACH_SIGMAS * max(light.psf.variance_px2) ** 0.5
     shape = places.shape[:-1]
-    distance = disc.distance_radii
     rays, sr = _rays(light, places.reshape(-1, 2))
     directions = rays @ light.icrs_to_image
     on_sphere = directions @ disc.to_sphere.T
     impact = disc.impact(directions).reshape(shape)
-    radiance = disc.radiance(directions)
-    face = (radiance * sr * light.times).reshape(shape)
-    # Corners so far away that neither the disc, its air nor the Gaussian reaches their tiles
-    x, y, z = on_sphere.T
-    angle_rad = np.arctan2(np.hypot(x, y), z).reshape(shape)
-    rim_radii = 1 + AIR_TOP * disc.air_radii
-    rim_rad = np.arcsin(min(1.0, rim_radii / distance))
-    diagonal_px = size_px * np.sqrt(2)
-    beside = _all(angle_rad > rim_rad + WIDER * (diagonal_px + reach_px) / px_per_rad)
-    # Tiles far enough within the limb, and off the terminator where that would be seen. A face's
-    # height over the plane of its limb goes as the root of 1 - impact^2, whose second derivative is
-    # its power -3/2.
-    inside = np.minimum(impact, 1.0)  # NaN stays
-    lit = face > 0
-    away_radii = np.sqrt(np.maximum(distance**2 - inside**2, 0.0))
-    radii_per_px = away_radii / px_per_rad
-    # the Gaussian's reach, radii
-    margin = reach_px * np.minimum(WIDER * radii_per_px, distance / px_per_rad)
-    largest = (disc.normal_e_per_s_sr * light.times * sr).reshape(shape)
-    bulge = (size_px * radii_per_px) ** 2 / 8 * largest
-    is_far_within = (impact < 1 - margin) & (radii_per_px * LARGE_PX < 1)
-    is_inside = _all(is_far_within) & ~beside
-    is_inside[..., 1:-1, 1:-1] &= _even(lit)
-    is_smooth = SMOOTH * face * (1 - inside**2) ** 1.5 >= bulge * lit
-    is_face = _all(is_smooth) & is_inside
+    electrons_per_radiance = sr * light.times
+    face = (disc.radiance(directions) * electrons_per_radiance).reshape(shape)
+    largest = (disc.normal_e_per_s_sr * electrons_per_radiance).reshape(shape)
+    beside = _beside(light, on_sphere.reshape(*shape, 3), size_px)
+    within = _Within.of(light, impact)
+    is_inside = _all(within.is_far) & ~beside
+    is_inside[..., 1:-1, 1:-1] &= _even(face > 0)
+    is_face = _all(within.is_smooth(face, largest, size_px)) & is_inside
     is_air = np.zeros_like(is_face)
     touched = np.zeros_like(face)
     hidden = np.zeros_like(face)
     spread = 0.0
-    if disc.air is not None and distance > 1:
-        touched_light = disc.touched_light(directions)
-        touched = (touched_light * sr * light.times).reshape(shape)
+    if disc.air is not None and disc.distance_radii > 1:
+        touched = (disc.touched_light(directions) * electrons_per_radiance).reshape(shape)
         height = np.maximum(impact - 1, 0.0) / disc.air_radii
         hidden = -np.expm1(-disc.slant_depth * np.exp(-height))
         spread, omitted = _spread_of_air(light, px_per_rad)
         if omitted < SPREAD:
-            is_air = _all(impact > 1 + margin) & ~beside
+            is_air = _all(impact > 1 + within.margin) & ~beside
             is_air[..., 1:-1, 1:-1] &= _even(touched > 0)
     cover = np.ones((*shape, 3))
     of_face = np.concatenate([places, face[..., None], cover], axis=-1)
@@ -280,6 +266,62 @@ def _lattice(light: DiscLight, places: FloatArray, size_px: int) -> _Lattice:
         is_beside=beside[inner],
         spread=spread,
     )
+
+
+def _reach_px(light: DiscLight) -> float:
+    """How far the Gaussian of a disc's PSF reaches."""
+    return float(REACH_SIGMAS * max(light.psf.variance_px2) ** 0.5)
+
+
+def _beside(light: DiscLight, on_sphere: FloatArray, size_px: int) -> BoolArray:
+    """Tiles of lattices whose corners are so far from the disc that neither it, its air nor the
+    Gaussian reaches them; `on_sphere` (..., rows, columns, 3) are rays to the corners.
+    """
+    disc = light.disc
+    px_per_rad, *_ = light.camera.scales_px_rad()
+    x, y, z = np.moveaxis(on_sphere, -1, 0)
+    angle_rad = np.arctan2(np.hypot(x, y), z)
+    rim_radii = 1 + AIR_TOP * disc.air_radii
+    rim_rad = np.arcsin(min(1.0, rim_radii / disc.distance_radii))
+    diagonal_px = size_px * np.sqrt(2)
+    reach_rad = (diagonal_px + _reach_px(light)) / px_per_rad
+    return _all(angle_rad > rim_rad + WIDER * reach_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class _Within:
+    """How far corners of tiles are within a disc's limb: their `impact`, radii, at most 1; radii of
+    the disc to a pixel there; the Gaussian's reach, radii; and which are so far within that one ray
+    does.
+    """
+
+    impact: FloatArray
+    radii_per_px: FloatArray
+    margin: FloatArray
+    is_far: BoolArray
+
+    @classmethod
+    def of(cls, light: DiscLight, impact: FloatArray) -> "_Within":
+        """The corners with an impact parameter each (..., rows, columns), radii."""
+        distance = light.disc.distance_radii
+        px_per_rad, *_ = light.camera.scales_px_rad()
+        inside = np.minimum(impact, 1.0)  # NaN stays
+        away_radii = np.sqrt(np.maximum(distance**2 - inside**2, 0.0))
+        radii_per_px = away_radii / px_per_rad
+        margin = _reach_px(light) * np.minimum(WIDER * radii_per_px, distance / px_per_rad)
+        is_far = (impact < 1 - margin) & (radii_per_px * LARGE_PX < 1)
+        return cls(inside, radii_per_px, margin, is_far)
+
+    def is_smooth(self, face: FloatArray, largest: FloatArray, size_px: int) -> BoolArray:
+        """Where linear light between corners is within SMOOTH, or dark; `face` is the light at the
+        corners, `largest` that of a face under the Sun.
+
+        A face's height over the plane of its limb goes as the root of 1 - impact^2, whose second
+        derivative is its power -3/2.
+        """
+        bulge = (size_px * self.radii_per_px) ** 2 / 8 * largest
+        is_lit = face > 0
+        return np.asarray(SMOOTH * face * (1 - self.impact**2) ** 1.5 >= bulge * is_lit)
 
 
 def _spread_of_air(light: DiscLight, px_per_rad: float) -> tuple[float, float]:

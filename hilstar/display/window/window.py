@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hilstar.basics.errors import MachineError, NotThereError, did_you_mean
+from hilstar.basics.errors import MachineError, NoDisplayError, NotThereError, did_you_mean
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.units import GL_VERSIONS, NS_PER_S
 from hilstar.display.window.awake import Awake
@@ -36,14 +36,14 @@ from hilstar.display.window.x11 import (
 TITLE = "hilstar"
 USUAL_REFRESH_HZ = 60
 GL_RENDERER = 0x1F01
-NO_DISPLAY = "no display to open a window on; set DISPLAY, or run with --headless"
+NO_DISPLAY = "no display to open a window on; set DISPLAY"
 DEAD_DISPLAY = (
-    "no X server answers there, or it does not let us in (XAUTHORITY); start it, set DISPLAY to one"
-    " that runs, or run with --headless"
+    "no X server answers there, or it does not let us in (XAUTHORITY); start it, or set DISPLAY"
+    " to one that runs"
 )
 WAYLAND = (
     "no X11 display: this session is Wayland's, where a program can neither time its frames nor set"
-    " the gamma ramp; use an Xorg session, or run with --headless"
+    " the gamma ramp; use an Xorg session"
 )
 log = logging.getLogger(__name__)
 
@@ -129,14 +129,14 @@ def _glfw() -> Any:
 
 
 def _start() -> None:
-    """Begin GLFW, on X11 alone. Raises MachineError without a display."""
+    """Begin GLFW, on X11 alone. Raises NoDisplayError without a display."""
     glfw.ERROR_REPORTING = "ignore"
     glfw.init_hint(glfw.PLATFORM, glfw.PLATFORM_X11)
     display = os.environ.get("DISPLAY")
     if not display:
-        raise MachineError(WAYLAND if os.environ.get("WAYLAND_DISPLAY") else NO_DISPLAY)
+        raise NoDisplayError(WAYLAND if os.environ.get("WAYLAND_DISPLAY") else NO_DISPLAY)
     if not glfw.init():
-        raise MachineError(f"DISPLAY={display}: {DEAD_DISPLAY}")
+        raise NoDisplayError(f"DISPLAY={display}: {DEAD_DISPLAY}")
 
 
 def _describe(index: int, monitor: Any) -> Display:
@@ -450,6 +450,9 @@ class Window(Closing):
         if self.gone is not None:
             return time.monotonic_ns()
         glfw.swap_buffers(self._window)
+        # Mesa takes the size of a window that is gone from memory that nobody has set, and crashes.
+        if self.gone is not None:
+            return time.monotonic_ns()
         return self._stamps.after_swap(wait)
 
     def look_at_events(self) -> None:

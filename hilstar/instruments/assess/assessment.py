@@ -218,7 +218,8 @@ class AssessSettings:
     """Where in an exposure times are stamped, their latency, s, and at how many attitudes the
     display is tested.
 
-    Without a `stamp` it is the bench file's for its own answers, and the middle for a file's.
+    Without a `stamp` the run's own answers are stamped as the bench file says, and those of a file
+    at the middle.
     """
 
     stamp: Stamp | None = None
@@ -349,8 +350,8 @@ class Assessment:
 
 
 class LedgerAnswers(NamedTuple):
-    """A ledger's own answers: where in an exposure their times are, and how far these are ahead of
-    the run's, as known live.
+    """A ledger's own answers, where in an exposure they are stamped, and how far the tracker's
+    clock is ahead of the run's, as it was known live.
 
     `centroids` are the stars that each of them holds. They are sorted by their times;
     `out_of_order` counts those that came after a later one. `clock_set` says that the tracker's
@@ -423,8 +424,8 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
 
 
 def _on_run_ns(records: Sequence[AnswerRecord]) -> IntArray:
-    """When each answer (n,) looked, on the run's clock, ns, as it was known live; of one not
-    judged by the others' delay.
+    """The time of each answer's exposure (n,) on the run's clock, ns, as it was known live; that of
+    an answer that was not judged follows from the delay of the others.
     """
     late_ns = []
     to_light_ns = []

@@ -222,7 +222,7 @@ class GlassCost:
     fov_arcsec: dict[str, Axes]
 
     def line(self) -> str:
-        """For a person."""
+        """The cost in one line of text."""
         total = self._across("total")
         distortion = self._across("without_distortion")
         colour = self._across("without_colour")
@@ -271,8 +271,8 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
 def seen_cost(
     file: BenchFile, q_icrs_to_cam: FloatArray, centroids: Sequence[Centroids]
 ) -> GlassCost | None:
-    """The same by the stars that answers name, [x_px, y_px, dn, hip], against the bench's camera at
-    their attitudes (n, 4).
+    """What the glass does to the stars that answers name, [x_px, y_px, dn, hip]: their places
+    against those of the bench's camera at attitudes (n, 4).
 
     The tracker's noise is in it. None for too few stars.
     """
@@ -315,8 +315,8 @@ def _cost(
     camera: Camera,
     fields: Sequence[tuple[npt.NDArray[np.void], FloatArray]],
 ) -> GlassCost | None:
-    """By stars of fields, rows of TRUTH_DTYPE, and errors of their places (n, 2), px; None for
-    too few stars.
+    """The cost by the stars of each field, rows of TRUTH_DTYPE, and the errors of their places
+    (n, 2), px; None for too few stars.
     """
     counts = [len(field_rows) for field_rows, _ in fields]
     if sum(counts) < MIN_SPLIT_STARS:

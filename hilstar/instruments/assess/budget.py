@@ -2,10 +2,12 @@
 intervals.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.special import stdtrit
 
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
@@ -26,6 +28,7 @@ from hilstar.server.record.commanded import Commanded
 BLOCKS, MIN_IN_BLOCK, DRAWS = 40, 5, 1000  # the bootstrap's blocks and draws
 COVERED = (2.5, 97.5)  # percent
 HALF_OF_95 = 1.96  # sigmas of a normal distribution
+ONE_SIDE_OF_95 = 0.975
 UNUSUAL_SIGMAS = 5.0
 # one sigma; a larger spread is no star tracker but another run with a similar motion
 MAX_SPREAD_ARCSEC = 600.0
@@ -144,10 +147,14 @@ def _refuse_few(
             " telemetry"
         )
     if free_count < MIN_ROWS:
+        longer = ""
+        if free_count:
+            times = math.ceil(10 * MIN_ROWS / free_count) / 10
+            longer = f"{times:g} times as long, "
         raise InputError(
             f"the run missed so many frames that {held_count} of {known_count} answers looked while"
-            f" one was held, and {MIN_ROWS} others are needed; give a run that keeps its refresh"
-            " rate, or a lower [monitor] refresh_hz"
+            f" one was held, and {MIN_ROWS} others are needed; run it {longer}on a machine with"
+            " less other work, or with a lower [monitor] refresh_hz"
         )
     if 2 * used_count <= free_count:
         raise InputError(
@@ -305,13 +312,24 @@ def intervals_of(
     spread = np.std(total, axis=0)
     if sigma_bias_arcsec is not None:
         spread = np.maximum(spread, sigma_bias_arcsec)
-    half_width = HALF_OF_95 * spread
+    # Few blocks scatter less about their own mean than about the truth: Student's t.
+    few = float(stdtrit(blocks - 1, ONE_SIDE_OF_95)) / HALF_OF_95
+    wider = few * math.sqrt(blocks / (blocks - 1))
+    half_width = HALF_OF_95 * wider * spread
     freedom = n - 1 - fov.freedom - pixel.freedom
-    noise = means(residual**2) * (n / max(freedom, 1.0))
+    drawn_noise = means(residual**2) * (n / max(freedom, 1.0))
+    middle = drawn_noise.mean(axis=0)
+    noise = np.maximum(middle + wider * (drawn_noise - middle), 0.0)
 
     def repeating(component: Component) -> FloatArray:
         noise_in_fit = component.freedom / n * noise
-        return np.maximum(means(component.fitted**2) - noise_in_fit, 0.0)
+        variance = means(component.fitted**2) - noise_in_fit
+        # The draws keep the fit as it is. Noise in it changes its mean square, a noncentral
+        # chi-square: by the fit's cross term with noise, and by the noise's own scatter.
+        size = np.maximum(variance.mean(axis=0), 0.0)
+        of_fit = 4 * size * middle / n + 2 * component.freedom * (middle / n) ** 2
+        variance += np.sqrt(of_fit) * rng.standard_normal(variance.shape)
+        return np.asarray(np.maximum(variance, 0.0))
 
     return Intervals(
         bias=np.stack([parts.mean - half_width, parts.mean + half_width]),

@@ -178,8 +178,8 @@ def _spread_at(
 
 
 def nearest_to_half(rotations: FloatArray) -> tuple[FloatArray, float]:
-    """The rotation among (n, 4) with half of all nearest to it, and the angle within which they
-    lie, rad.
+    """The rotation among (n, 4) about which half of all lie within the smallest angle, and that
+    angle, rad.
     """
     starts = rotations[spread_rows(len(rotations), STARTS)]
     cosine = np.abs(rotations @ starts.T)

@@ -1,158 +1,71 @@
-"""How sharp the tracker is while somebody turns its ring: a figure for each image, and the best so
-far.
+"""How sharp the tracker is while somebody turns its ring: a figure for each image, or for the
+answers of half a second, and the best so far.
 
-A figure is the PSF's sigma as the step `focus` fits it, of dots on the screen, so that the width of
-a monitor pixel is not taken for blur. Three things look like focus and are not:
+A figure of an image is the PSF's sigma as the step `focus` fits it, of dots on the screen, so that
+the width of a monitor pixel is not taken for blur. Three things look like focus and are not:
 
 - A dot that saturates the detector looks wider than it is: dots are dimmed, and that image has no
   figure.
 - A tracker that moves draws its stars out, all in one direction: an image whose stars are drawn out
   more than in the others is no best one.
 - Far from focus no dot stands out: the image has no figure, and its line says so.
+
+A figure of answers is the median of the widths that the tracker itself reports of a still sky's
+stars, the width of a star on the display included: where it is smallest is the same.
 """
 
 import itertools
 import math
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.instruments.calibrate.first_light.context import darker_code
 from hilstar.instruments.calibrate.first_light.focus import (
     Sharpness,
     first_dots,
     seen_sharpness,
 )
-from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, Pattern, black
+from hilstar.instruments.calibrate.first_light.image_sources import (
+    HANDED_ON_AGAIN_S,
+    ImageSource,
+    Pattern,
+    PatternFrames,
+    black,
+)
 from hilstar.instruments.calibrate.geometric.dots import dot_image
 from hilstar.instruments.calibrate.geometric.geometry_fit import seen_screen_of
 from hilstar.instruments.calibrate.grabbed_dots import is_too_bright
+from hilstar.server.answers.answer import AnswerSource
+from hilstar.server.answers.star_widths import AnswerWidths, FocusFigure, FocusReading
 from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.build import open_bench
 
-DARK, IMAGE = "dark", "focus_{:04}"
+DARK, IMAGE, SKY = "dark", "focus_{:04}", "still sky"
+SILENT_S = 30.0  # without an answer: a tracker may have to be started first
+POLL_S = 0.02
+SEE_ANSWERS = "look at `hilstar answers BENCH`"
+NO_WIDTHS = (
+    "the tracker's answers report no widths of stars; give --grab CMD in place of it, or add"
+    " width_px to its centroids"
+)
 IMAGES_KEPT = 2  # images on the disk at a time: somebody turns the ring for an hour
-SIGMAS_APART = 3.0  # by which a figure is worse than the best
-STREAK_SIGMAS = 1.0  # of the PSF: a streak so long widens the fitted sigma by 2 %
-STREAK_FACTOR = 1.5  # over the usual one: an astigmatic lens draws stars out in each image
 WINDOW_SIGMAS = 3.0  # about a dot, for its second moments
-BARS = "▁▂▃▄▅▆▇█"
-CURVE_WIDTH = 40
-
-
-@dataclass(frozen=True, slots=True)
-class FocusFigure:
-    """How sharp one image is: the PSF's sigma and its error, by so many dots, and how far its
-    stars are drawn out and in which direction (degrees from x to y), tracker px.
-    """
-
-    psf_sigma_px: float
-    error_px: float
-    dots: int
-    streak_px: float
-    streak_deg: float
-
-
-@dataclass(frozen=True, slots=True)
-class FocusReading:
-    """An image's number (from 1), when it came (s since the first), the code of its dots, and its
-    figure; without one, `why` says what is wrong.
-    """
-
-    number: int
-    t_s: float
-    code: int
-    figure: FocusFigure | None
-    why: str = ""
-
-
-@dataclass(slots=True)
-class FocusCurve:
-    """The readings so far, and the best of those that held still."""
-
-    readings: list[FocusReading] = field(default_factory=list)
-    best: FocusReading | None = None
-
-    def add(self, reading: FocusReading) -> None:
-        """Take a reading."""
-        self.readings.append(reading)
-        if reading.figure is None or self.is_drawn_out(reading.figure):
-            return
-        if self.best is None or reading.figure.psf_sigma_px < self._best_figure.psf_sigma_px:
-            self.best = reading
-
-    @property
-    def figures(self) -> list[FocusFigure]:
-        """The figures of the images that have one."""
-        return [reading.figure for reading in self.readings if reading.figure is not None]
-
-    @property
-    def _best_figure(self) -> FocusFigure:
-        assert self.best is not None and self.best.figure is not None
-        return self.best.figure
-
-    def is_drawn_out(self, figure: FocusFigure) -> bool:
-        """Whether an image's stars are drawn out more than a lens does it in all images."""
-        usual_px = float(np.median([other.streak_px for other in self.figures]))
-        limit_px = max(STREAK_SIGMAS * figure.psf_sigma_px, STREAK_FACTOR * usual_px)
-        return figure.streak_px > limit_px
-
-    def is_worse(self, figure: FocusFigure) -> bool:
-        """Whether an image is less sharp than the best one, beyond both errors."""
-        if self.best is None:
-            return False
-        apart_px = figure.psf_sigma_px - self._best_figure.psf_sigma_px
-        return apart_px > SIGMAS_APART * math.hypot(figure.error_px, self._best_figure.error_px)
-
-    def why_none(self) -> str:
-        """Why there is no best image."""
-        if not self.readings:
-            return "no image came"
-        if self.figures:
-            return "the tracker moved in each image; hold it still"
-        return self.readings[-1].why
-
-    def line(self) -> str:
-        """The newest reading beside the best, as a person at the ring reads it."""
-        reading = self.readings[-1]
-        if reading.figure is None:
-            return f"{reading.number:4}  {reading.why}"
-        figure = reading.figure
-        text = (
-            f"{reading.number:4}  PSF sigma {figure.psf_sigma_px:.3f} +- {figure.error_px:.3f} px"
-        )
-        if self.is_drawn_out(figure):
-            length = f"{figure.streak_px:.1f} px at {figure.streak_deg:.0f} deg"
-            return f"{text}; stars are drawn out {length}: hold the tracker still"
-        if self.best is None or self.best is reading:
-            text = f"{text}, the best so far"
-        elif self.is_worse(figure):
-            ago_s = reading.t_s - self.best.t_s
-            text = f"{text}, best {self._best_figure.psf_sigma_px:.3f} px {ago_s:.0f} s ago"
-        else:
-            text = f"{text}, as the best"
-        sigmas_px = [other.psf_sigma_px for other in self.figures]
-        return f"{text}  {sparkline(sigmas_px, SIGMAS_APART * figure.error_px)}"
-
-
-def sparkline(values: list[float], least_span: float) -> str:
-    """The last CURVE_WIDTH values as bars, the smallest the lowest; the highest bar is at least
-    `least_span` above it, so that noise is no curve.
-    """
-    shown = np.array(values[-CURVE_WIDTH:])
-    span = max(float(np.ptp(shown)), least_span)
-    heights = np.rint((shown - shown.min()) / span * (len(BARS) - 1)).astype(int)
-    return "".join(BARS[height] for height in heights)
 
 
 def focus_readings(
-    file: BenchFile, source: ImageSource, folder: Path, exposure_s: float
+    file: BenchFile,
+    source: ImageSource,
+    folder: Path,
+    exposure_s: float,
+    watch: Callable[[Pattern], None] | None = None,
 ) -> Iterator[FocusReading]:
-    """Show dots and measure image after image, without end.
+    """Show dots and measure image after image, without end; `watch` sees each new pattern.
 
     Raises InputError where the bench sees no dots or no code is dark enough, NoImage, and Stopped
     where the window is closed.
@@ -164,10 +77,14 @@ def focus_readings(
     dark_path = source.look(file, Pattern(DARK, black(screen_px)), folder / DARK, exposure_s)
     dark = source.pixels(dark_path, tracker.resolution_px)
     code = 2**file.config.monitor.bits - 1
+    watched = -1
     begin_s = time.monotonic()
     for number in itertools.count(1):
         name = IMAGE.format(number % IMAGES_KEPT)
         pattern = Pattern(name, dot_image(plan, 0, screen_px, code))
+        if watch is not None and code != watched:
+            watch(pattern)
+            watched = code
         path = source.look(file, pattern, folder / name, exposure_s)
         t_s = time.monotonic() - begin_s
         image = source.pixels(path, tracker.resolution_px)
@@ -184,6 +101,63 @@ def focus_readings(
             yield FocusReading(number, t_s, code, None, str(error))
             continue
         yield FocusReading(number, t_s, code, figure_of(light, sharp))
+
+
+def follow_answers(
+    source: AnswerSource,
+    hold: Callable[[Callable[[], bool]], None],
+    take: Callable[[FocusReading], bool],
+    stopped: Callable[[], bool],
+    clock: HostClock = HOST_CLOCK,
+) -> None:
+    """Hand the readings of the widths that a tracker's answers report to `take`, until it returns
+    true or the run is stopped; `hold` keeps a still sky on the display until what it is given is
+    true.
+
+    Raises InputError for a tracker that reports no widths, or that does not answer, and Stopped.
+    """
+    widths = AnswerWidths()
+    silent = clock.within(SILENT_S)
+
+    def is_over() -> bool:
+        nonlocal silent
+        over = stopped()
+        for answer in source.take():
+            silent = clock.within(SILENT_S)
+            reading = widths.take(answer)
+            over = over or (reading is not None and take(reading))
+        return over or widths.reports_none or silent.over
+
+    hold(is_over)
+    if widths.reports_none:
+        raise InputError(f"--answers: {NO_WIDTHS}")
+    if silent.over and not stopped():
+        trouble = source.trouble() or source.unread or "the line is silent"
+        raise InputError(f"--answers: no answer in {SILENT_S:g} s: {trouble}; {SEE_ANSWERS}")
+
+
+def headless_hold(
+    frames: PatternFrames | None, file: BenchFile, pattern: Pattern
+) -> Callable[[Callable[[], bool]], None]:
+    """Holds a pattern without a window: it is handed on again and again to those who watch."""
+
+    def hold(done: Callable[[], bool]) -> None:
+        sent_s = -math.inf
+        while not done():
+            now_s = time.monotonic()
+            if frames is not None and now_s - sent_s >= HANDED_ON_AGAIN_S:
+                frames.send(file, pattern.codes, time.monotonic_ns())
+                sent_s = now_s
+            time.sleep(POLL_S)
+
+    return hold
+
+
+def still_sky(file: BenchFile, q_icrs_to_cam: FloatArray) -> Pattern:
+    """The codes of the sky at an attitude (unit quaternion)."""
+    with open_bench(file) as bench:
+        levels = bench.draw(q_icrs_to_cam).levels
+        return Pattern(SKY, np.array(bench.code_values(levels), dtype=np.uint16))
 
 
 def figure_of(image: FloatArray, sharp: Sharpness) -> FocusFigure:

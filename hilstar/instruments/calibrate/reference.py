@@ -31,6 +31,7 @@ from hilstar.basics.text_tables import finite_numbers, read_rows
 from hilstar.basics.toml_tables import toml_text
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.optics.camera import Camera
+from hilstar.tracker.identify import wahba
 
 MAX_TABLE_BYTES = 10_000_000
 MAX_READINGS = 10_000
@@ -286,7 +287,7 @@ class _Unknowns:
                 dots.append((reading.direction, pointed))
             else:
                 faces.append((reading.direction, pointed))
-        return cls(readings, _wahba(dots), _wahba(faces), zeros, links)
+        return cls(readings, _turn(dots), _turn(faces), zeros, links)
 
     @property
     def count(self) -> int:
@@ -360,14 +361,10 @@ def _moved(direction: FloatArray, right_rad: float, up_rad: float) -> FloatArray
     return pointing(azimuth + right_rad / level, elevation + up_rad)
 
 
-def _wahba(pairs: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
+def _turn(pairs: list[tuple[FloatArray, FloatArray]]) -> FloatArray:
     """The rotation matrix (3, 3) from first to second directions."""
-    product = np.zeros((3, 3))
-    for before, after in pairs:
-        product = product + np.outer(after, before)
-    u, _, v = np.linalg.svd(product)
-    handedness = float(np.linalg.det(u) * np.linalg.det(v))
-    return np.asarray(u @ np.diag([1.0, 1.0, handedness]) @ v)
+    before, after = np.array(pairs).swapaxes(0, 1)
+    return to_matrix(wahba(after, before, np.ones(len(pairs))))
 
 
 def alignment_table(found: ReferenceFit, name: str, date: str) -> dict[str, Any]:

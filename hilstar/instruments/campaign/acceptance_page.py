@@ -44,11 +44,12 @@ from hilstar.server.bench.certificate_file import off_by
 PAGE_FILE, CSV_FILE, JSON_FILE = "accept.html", "acceptance.csv", "acceptance.json"
 HEADER = (
     *("capability", "requirement", "measured (interval)", "guard band", "margin", "verdict"),
-    *("cases", "to show it"),
+    *("cases", "what is open"),
 )
 CSV_COLUMNS = (
     *("capability", "of", "quantity", "axis", "condition", "limit", "side", "unit", "confidence"),
     *("value", "low", "high", "guard", "margin", "cases", "verdict", "more_cases", "why", "method"),
+    "together",
 )
 HEADLINES = {
     MET: "Every clause that was tested is met",
@@ -65,6 +66,13 @@ METHOD = (
     " met: the whole interval breaks the limit, widened by it. Not shown: neither. Margin: from the"
     " interval to the narrowed limit, negative beyond it."
 )
+TOGETHER = (
+    "That every clause is met holds at the clauses' confidence, however many there are, as each has"
+    " to be met (Berger 1982). One of many that is not met may be so by chance: it is judged again"
+    " with the doubt shared by all clauses (Bonferroni), and the last column says where it is not"
+    " shown then."
+)
+MAY_BE_CHANCE = "may be chance among so many clauses; more cases would tell"
 FAILED_HEADER = ("set of cases", "failed", "why")
 FAILED_CURE = "Mend what the reasons name, and accept again in another directory."
 GRID = 8  # arrows along each side of the map of place errors
@@ -159,6 +167,7 @@ def _clause(each: ClauseVerdict) -> dict[str, Any]:
         "confidence": clause.confidence,
         "verdict": each.word,
         "why": each.untested,
+        "together": each.together,
     }
     row |= dict.fromkeys(("value", "low", "high", "guard", "margin", "cases", "method"))
     row["more_cases"] = None
@@ -205,7 +214,11 @@ def lines_of(
 
 
 def _more(each: ClauseVerdict) -> str:
-    """What would show a clause that is not shown; "" for another."""
+    """What would show a clause that is not shown, and what one that is not met alone may be; ""
+    for another.
+    """
+    if each.together not in ("", NOT_MET):
+        return MAY_BE_CHANCE
     if each.word != NOT_SHOWN or each.verdict is None:
         return ""
     if each.verdict.more:
@@ -238,14 +251,23 @@ def _measured(each: ClauseVerdict) -> str:
         for end in (STILL, NOT_EVEN):
             if end in verdict.method:
                 return f"{end} {_digits(verdict.value)} {each.unit}".rstrip()
-    low, high = _digits(verdict.low), _digits(verdict.high)
-    return f"{_digits(verdict.value)} ({low} to {high}) {each.unit}".rstrip()
+    interval = _interval(verdict.low, verdict.high)
+    return f"{_digits(verdict.value)} ({interval}) {each.unit}".rstrip()
 
 
-def _digits(value: float | None) -> str:
+def _interval(low: float | None, high: float | None) -> str:
+    """An interval, one of whose ends may be unknown."""
+    if low is not None and high is not None:
+        return f"{_digits(low)} to {_digits(high)}"
+    if low is not None:
+        return f"{_digits(low)} or more"
+    if high is not None:
+        return f"{_digits(high)} or less"
+    return "interval unknown"
+
+
+def _digits(value: float) -> str:
     """Three digits; large whole numbers without an exponent."""
-    if value is None:
-        return "unknown"
     if abs(value) >= 1000:
         return f"{float(f'{value:.3g}'):.0f}"
     return f"{value:.3g}"
@@ -334,7 +356,7 @@ def _clauses(verdicts: list[ClauseVerdict]) -> Card:
         figures = (requirement, measured, guard, _margin(judged), verdict_chip(judged.word))
         rows.append((clause.capability, *figures, verdict.cases, _more(judged)))
         methods.append((clause.capability, clause.quantity, verdict.method))
-    texts = [table_of(rows, HEADER), paragraph(METHOD, "small")]
+    texts = [table_of(rows, HEADER), paragraph(METHOD, "small"), paragraph(TOGETHER, "small")]
     how = table_of(methods, ("capability", "quantity", "method"))
     cure = CURES.get(verdict_of(verdicts), "")
     return Card("Clauses", words=texts, cure=cure, details=[how])

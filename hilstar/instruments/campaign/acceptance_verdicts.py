@@ -20,12 +20,15 @@ LEDGER = "ledger.csv"
 
 @dataclass(frozen=True, slots=True)
 class ClauseVerdict:
-    """A clause with its verdict; `untested` says why it has none, "" where it has."""
+    """A clause with its verdict; `untested` says why it has none, "" where it has. `together` is
+    the verdict of a clause that is not met with the doubt shared by all clauses, "" of another.
+    """
 
     clause: ClauseTable
     verdict: RequirementVerdict | None
     unit: str
     untested: str = ""
+    together: str = ""
 
     @property
     def word(self) -> str:

@@ -2,7 +2,8 @@
 the aberration that a tracker leaves.
 
 Each is a linear fit or a mean over frames or stars, with the case as the unit that is independent
-of others: covariances are sums over cases (Liang and Zeger 1986), bootstraps draw cases.
+of others: covariances are sums over cases (Liang and Zeger 1986; Bell and McCaffrey 2002),
+bootstraps draw cases.
 
     rate       reported minus commanded = bias + scale x rate - lag x acceleration, by axis
     time       error = bias of each axis + (stamp's bias) x rate; what a late stamp adds is along
@@ -11,6 +12,8 @@ of others: covariances are sums over cases (Liang and Zeger 1986), bootstraps dr
     aberration error = bias + share x the turn by v / c; a share of 1 leaves it all
     motion     error = bias + (share x years since the bench's date + age) x the turn in a year by
                the stars' proper motion; a share of 1 leaves the stars where they are
+    parallax   error = bias + share x the turn by the stars' parallax + (a nuisance) share x the
+               turn by v / c, which goes with the seasons, too
     stars      place error = a smooth map over the detector + noise; signal against B-V; a logistic
                curve of detection against V
 """
@@ -35,10 +38,20 @@ from hilstar.instruments.campaign.cases import (
     STAR_LISTS,
     Q,
 )
-from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, drawn_limits
-from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, Require
+from hilstar.instruments.campaign.figures import (
+    BoundedFigure,
+    TooFewCases,
+    drawn_limits,
+    lowest_size,
+)
+from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, PARALLAX, Require
 from hilstar.instruments.campaign.planted import aberration_rad
-from hilstar.instruments.campaign.star_motion import YEARLY_TURN, YEARS
+from hilstar.instruments.campaign.star_motion import (
+    OBSERVER_KM_S,
+    PARALLAX_TURN,
+    YEARLY_TURN,
+    YEARS,
+)
 from hilstar.optics.camera import field_terms
 
 MIN_CASES = 8
@@ -58,29 +71,69 @@ SILENT = "the answers carry no {}"
 @dataclass(frozen=True, slots=True)
 class CaseFit:
     """A least-squares fit over rows of cases: coefficients (k,), their covariance (k, k) by cases,
-    the residuals (n,), and the number of cases.
+    the degrees of freedom of each variance (k,), the residuals (n,), and the number of cases.
     """
 
     value: FloatArray
     covariance: FloatArray
+    freedom: FloatArray
     residual: FloatArray
     cases: int
 
 
 def fit_by_cases(design: FloatArray, values: FloatArray, case: IntArray) -> CaseFit:
-    """Fit values (n,) by a design (n, k); rows of one `case` (n,) go together."""
-    inverse = np.linalg.pinv(design.T @ design)
+    """Fit values (n,) by a design (n, k); rows of one `case` (n,) go together.
+
+    A heavy case draws the fit to itself, and its residuals are too small: they are scaled up so
+    that errors of one size give an unbiased covariance. Few heavy cases tell a variance badly: its
+    degrees of freedom are those of the cases as they weigh (Bell and McCaffrey 2002).
+    """
+    inverse = np.asarray(np.linalg.pinv(design.T @ design), dtype=np.float64)
     value = inverse @ (design.T @ values)
     residual = values - design @ value
     number = _numbered(case)
     cases = int(number.max()) + 1
     terms = design.shape[1]
+    root = _square_root(inverse)
     score = np.zeros((cases, terms))
-    np.add.at(score, number, design * residual[:, None])
-    free = max(cases - terms, 1)
-    score_squares = score.T @ score
-    covariance = inverse @ score_squares @ inverse * cases / free
-    return CaseFit(value, covariance, residual, cases)
+    weight = np.zeros((cases, terms))  # of each case's errors in a coefficient, squared
+    shared = np.zeros((cases, terms, terms))  # what the fit itself takes of that
+    rows_by_case = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
+    for k, rows in enumerate(rows_by_case):
+        own = design[rows]
+        axes, pull, _ = np.linalg.svd(own @ root, full_matrices=False)
+        free = np.maximum(1 - pull**2, SMALL_SHARE)
+        # (1 - H)^-1/2 of the case's own part of the hat matrix H, less 1
+        scale = axes * (1 / np.sqrt(free) - 1)
+        score[k] = own.T @ (residual[rows] + scale @ (axes.T @ residual[rows]))
+        errors = own @ inverse
+        errors = errors + scale @ (axes.T @ errors)
+        weight[k] = (errors**2).sum(axis=0)
+        shared[k] = own.T @ errors
+    covariance = inverse @ score.T @ score @ inverse
+    freedom = np.zeros(terms)
+    for term in range(terms):
+        freedom[term] = _freedom(weight[:, term], shared[:, :, term], inverse)
+    return CaseFit(value, covariance, freedom, residual, cases)
+
+
+def _square_root(inverse: FloatArray) -> FloatArray:
+    """A root R (k, k) of a matrix R R^T that is positive, or nearly so."""
+    size, axes = np.linalg.eigh(inverse)
+    return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
+
+
+def _freedom(weight: FloatArray, shared: FloatArray, inverse: FloatArray) -> float:
+    """Satterthwaite's degrees of freedom, tr(B)^2 / tr(B^2), of B = diag(weight) - shared inverse
+    shared^T, over cases (n,) and (n, k).
+    """
+    own = np.einsum("gi,ij,gj->g", shared, inverse, shared)
+    product = inverse @ shared.T @ shared
+    trace = float(weight.sum() - np.trace(product))
+    square = float((weight**2).sum() - 2 * (weight * own).sum() + (product * product.T).sum())
+    if trace <= 0 or square <= 0:
+        return 1.0
+    return max(trace**2 / square, 1.0)
 
 
 def _numbered(case: IntArray) -> IntArray:
@@ -106,6 +159,8 @@ def answer_figure(
         return _aberration(require, cases)
     if quantity in MOTION_QUANTITIES:
         return _proper_motion(require, cases)
+    if quantity == PARALLAX:
+        return _parallax(require, cases)
     return _star_figure(require, cases, resolution_px, rng)
 
 
@@ -150,22 +205,23 @@ def _enough(case: IntArray, what: str) -> None:
         raise TooFewCases(why, cases, MIN_CASES - cases)
 
 
-def _size(
-    value: FloatArray, sigma: FloatArray, cases: int, confidence: float, method: str
-) -> BoundedFigure:
-    """The largest size of coefficients (k,) with its limits by Student's t."""
+def _size(fits: list[CaseFit], column: int, confidence: float, method: str) -> BoundedFigure:
+    """The largest size of a coefficient over fits, with its limits by Student's t."""
+    value = np.array([fit.value[column] for fit in fits])
+    sigma = np.sqrt([fit.covariance[column, column] for fit in fits])
+    freedom = np.array([fit.freedom[column] for fit in fits])
     size = np.abs(value)
-    freedom = max(cases - 2, 1)
-    upper = float(stats.t.ppf(confidence, freedom))
+    upper = stats.t.ppf(confidence, freedom)
     # Bonferroni: of several axes any one may be the larger
     doubt = (1 - confidence) / len(size)
-    lower = float(stats.t.ppf(1 - doubt, freedom))
-    lowest = size - lower * sigma
+    low = max(
+        lowest_size(*axis, doubt)
+        for axis in zip(size.tolist(), sigma.tolist(), freedom.tolist(), strict=True)
+    )
     highest = size + upper * sigma
-    low = max(float(lowest.max()), 0.0)
     high = float(highest.max())
     largest = float(size.max())
-    return BoundedFigure(largest, low, high, cases, method)
+    return BoundedFigure(largest, low, high, fits[0].cases, method)
 
 
 def _root_mean(
@@ -258,14 +314,7 @@ def _rate_figure(
     if quantity == "rate-lag" and not _varies(accelerations[:, axes]):
         raise TooFewCases("no case accelerates about that axis", fitted_cases)
     column = RATE_TERMS.index(quantity)
-    values = []
-    variances = []
-    for fit in fits:
-        values.append(fit.value[column])
-        variances.append(fit.covariance[column, column])
-    value = np.array(values)
-    sigma = np.sqrt(np.array(variances))
-    return _size(value, sigma, fitted_cases, require.confidence, "linear fit, Student's t")
+    return _size(fits, column, require.confidence, "linear fit, Student's t")
 
 
 def _varies(values: FloatArray) -> bool:
@@ -332,9 +381,7 @@ def _both_signs(rates_deg_s: FloatArray) -> bool:
 
 def _column_size(fit: CaseFit, column: int, require: Require, method: str) -> BoundedFigure:
     """The size of a coefficient of a fit, with its limits."""
-    value = fit.value[column : column + 1]
-    sigma = math.sqrt(float(fit.covariance[column, column]))
-    return _size(value, np.array([sigma]), fit.cases, require.confidence, method)
+    return _size([fit], column, require.confidence, method)
 
 
 def _jitter(
@@ -408,14 +455,20 @@ def _aberration(require: Require, cases: Columns) -> BoundedFigure:
         raise TooFewCases("cases at several velocities of the observer tell it", int(known.sum()))
     case = np.flatnonzero(known)
     _enough(case, "attitude")
-    turns = []
-    for k in case.tolist():
-        turn = aberration_rad(q[k], velocities[k])
-        turns.append(turn[:2])
-    predicted = ARCSEC_PER_RAD * np.array(turns)
+    predicted = _aberrations_arcsec(q[case], velocities[case])
     fit = _turn_fit(errors[case], predicted[:, :, None], case)
     method = "linear fit over the observer's velocity, Student's t"
     return _turn_figure(fit, 0, require, method)
+
+
+def _aberrations_arcsec(q: FloatArray, velocities_km_s: FloatArray) -> FloatArray:
+    """The turns (n, 2), cam, across, of attitudes (n, 4) that take the aberration of velocities
+    (n, 3), ICRS, for none.
+    """
+    turns = np.zeros((len(q), 2))
+    for k, velocity_km_s in enumerate(velocities_km_s):
+        turns[k] = aberration_rad(q[k], velocity_km_s)[:2]
+    return ARCSEC_PER_RAD * turns
 
 
 def _finite_rows(values: FloatArray) -> npt.NDArray[np.bool_]:
@@ -463,6 +516,28 @@ def _proper_motion(require: Require, cases: Columns) -> BoundedFigure:
     term = MOTION_QUANTITIES.index(require.quantity)
     method = "linear fit over the yearly turn of each field, Student's t"
     return _turn_figure(fit, term, require, method)
+
+
+# ---- parallax ----
+
+
+def _parallax(require: Require, cases: Columns) -> BoundedFigure:
+    """The share of the stars' parallax that is left in the attitude."""
+    errors = cases.vectors("error_{}_arcsec", "xyz")[:, :2]
+    parallax = cases.vectors(PARALLAX_TURN, "xy")
+    velocities = cases.vectors(OBSERVER_KM_S, "xyz")
+    if not np.isfinite(velocities).any():
+        raise TooFewCases("cases with an observer, such as [spacecraft] has, tell it", 0)
+    known = _finite_rows(errors) & _finite_rows(parallax) & _finite_rows(velocities)
+    case = np.flatnonzero(known)
+    _enough(case, "attitude")
+    turns = parallax[case]
+    q = cases.vectors("q{}", "wxyz")[case]
+    both = np.stack([turns, _aberrations_arcsec(q, velocities[case])], axis=2)
+    fit = _turn_fit(errors[case], both, case)
+    size_arcsec = math.sqrt(float((turns**2).sum(axis=1).mean()))
+    method = f"linear fit over turns of {size_arcsec:.2g} arcsec rms, Student's t"
+    return _turn_figure(fit, 0, require, method)
 
 
 # ---- single stars ----

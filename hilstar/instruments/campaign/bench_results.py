@@ -45,7 +45,7 @@ def bench_summary(table: Path) -> dict[str, Any]:
 
 
 def bench_lines(summary: dict[str, Any]) -> list[str]:
-    """The same on the terminal."""
+    """The lines of the summary on the terminal."""
     lines = []
     if summary["no_answer"]:
         lines.append(f"{summary['no_answer']} cases without an answer")

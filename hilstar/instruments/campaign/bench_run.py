@@ -4,13 +4,11 @@
 One process and one frame loop, which never waits for the tracker. Laws:
 
 1. The order of the cases is drawn from the seed. Those that need another renderer stand together. A
-   check case, always the same
-   attitude, comes before each `check_every` of them and at the end.
+   check case, always the same attitude, comes before each `check_every` of them and at the end.
 2. A case has its row once it is over, and not before: one that a kill interrupts is shown again, in
    its place in the order.
 3. An answer belongs to a case whose frames alone were lit over its exposure. Until a case's first
-   right answer, one that
-   fits the case before better than this one is late, and counts for neither.
+   right answer, one that fits the case before better than this one is late, and counts for neither.
 4. A tracker that falls silent within a case is waited for, up to `silent_s` after its last message.
    The case then begins again.
 """
@@ -88,8 +86,8 @@ Display = Callable[[BenchFile], AbstractContextManager[OpenDisplay]]
 
 
 class BenchOrder:
-    """The order in which cases (and, from `cases` on, check cases) are shown; `keys` are the
-    varied keys of the renderer.
+    """The order in which cases are shown, those of one renderer together; check cases have the
+    numbers from `cases` on.
     """
 
     def __init__(self, plan: Plan, cases: int, maker: CaseMaker, design: Design) -> None:
@@ -155,8 +153,8 @@ class BenchOrder:
 
 @dataclass(slots=True)
 class Tally:
-    """A case on the display, and its answers so far; times are of the host, ns. `begun_ns` None:
-    nothing is lit yet.
+    """A case on the display, and its answers so far. Times are the host's, ns; `begun_ns` is None
+    while nothing is lit.
     """
 
     case: Case
@@ -179,7 +177,7 @@ class Tally:
     star_lists: StarLists = field(default_factory=StarLists)
 
     def take(self, judged: Judged, right: bool, rate_rad_s: FloatArray) -> None:
-        """Take an answer into the case's figures; `rate_rad_s` is what its exposure turned at."""
+        """Take an answer into the case's figures; `rate_rad_s` (3,), cam, was commanded."""
         self.received += 1
         if judged.residual is None:
             return
@@ -321,11 +319,11 @@ class BenchRun:
             light_ns = moment.light_if_begun_at(now_ns)
             view = self._view(light_ns)
             if view is None:
-                return loop.draw(moment.slot, 0, None, moment)
+                return loop.draw(moment.slot, 0, None, moment.lit_at(light_ns))
             attitude = Attitude(
                 view.q_icrs_to_cam, 0, False, rate_cam_rad_s=view.turn.rate_cam_rad_s
             )
-            return loop.draw(moment.slot, view.t_ns or 0, attitude, moment)
+            return loop.draw(moment.slot, view.t_ns or 0, attitude, moment.lit_at(light_ns))
 
         with stop_on_signal(loop.stop), loop.watch:
             bench.warm_up()
@@ -385,12 +383,13 @@ class BenchRun:
         attitude, on_screen, now = shown.attitude, shown.on_screen, self._now
         is_lit = attitude is not None and not on_screen.operator and not on_screen.hidden
         host_ns = (
-            shown.draw_ns if shown.predicted_swap_ns is None else shown.swap_ns + self._light_ns
+            shown.moment_ns if shown.predicted_swap_ns is None else shown.swap_ns + self._light_ns
         )
         q = attitude.q_icrs_to_cam if attitude is not None and is_lit else None
         number = self._base + shown.number
         self._next = number + 1
-        self._frames.add(LitFrame(number, host_ns, host_ns, q, shown.drawn.rate_cam_rad_s))
+        rate_rad_s = shown.drawn.rate_cam_rad_s
+        self._frames.add(LitFrame(number, host_ns, host_ns, q, rate_rad_s, shown.fades))
         self._shown_q = q if q is not None else self._shown_q
         if (
             now is not None
@@ -486,12 +485,16 @@ class BenchRun:
                 now.star_lists.judged.append(self._judged_stars(answer, judged.lit.q))
 
     def _judged_stars(self, answer: Answer, lit_q: FloatArray) -> StarResiduals:
-        """The stars of an answer against those that were lit at an attitude."""
-        assert self._bench is not None
-        tracker = self._bench.config.tracker
-        camera = tracker_camera(tracker, self._bench.file.folder)
-        faintest_e_per_s = self._bench.faintest_shown_e_per_s
-        lit = lit_at(lit_q, self._bench.stars, camera, faintest_e_per_s)
+        """The stars of an answer against those that were lit at an attitude: of the tracker's field
+        what the display covers.
+        """
+        bench = self._bench
+        assert bench is not None
+        tracker = bench.config.tracker
+        camera = tracker_camera(tracker, bench.file.folder)
+        lit = lit_at(lit_q, bench.stars, camera, bench.faintest_shown_e_per_s)
+        x_px, y_px = bench.camera.pixels_from(camera, lit.x_px, lit.y_px)
+        lit = lit.some(np.flatnonzero(bench.camera.contains_px(x_px, y_px)))
         return judge_stars(answer.centroids, lit, tracker.resolution_px)
 
     def _is_of(self, now: Tally, judged: Judged, answer: Answer) -> bool:

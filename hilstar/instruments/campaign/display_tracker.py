@@ -3,6 +3,7 @@ to DN.
 """
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -30,6 +31,9 @@ from hilstar.server.bench.config import GAUSSIAN, BenchConfig
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.mosaic import uneven_dark_dn
 
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
+
 
 class DisplayTracker:
     """The bench's tracker before the bench's true display (`[verify] true_*`). Free it with
@@ -54,6 +58,11 @@ class DisplayTracker:
     def gl_renderer(self) -> str:
         """The name of the GL renderer, as the driver gives it."""
         return self._bench.renderer.gl_renderer
+
+    @property
+    def moving(self) -> "MovingSky | None":
+        """The bodies and the observer; None where the sky stands still."""
+        return self._bench.moving
 
     def change(self, file: BenchFile) -> None:
         """Switch to another bench file of the same folder, rebuilding only what changed."""

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
 from hilstar.basics.arrays import FloatArray
 
@@ -78,6 +78,24 @@ def sigma_limits(variance: float, freedom: float, confidence: float) -> tuple[fl
     low = squares / stats.chi2.ppf(confidence, freedom)
     high = squares / stats.chi2.ppf(1 - confidence, freedom)
     return math.sqrt(low), math.sqrt(high)
+
+
+def lowest_size(size: float, sigma: float, freedom: float, doubt: float) -> float:
+    """The lower limit of the size of a figure that may have either sign, seen at `size` with a
+    standard error `sigma` of so many degrees of freedom: a smaller one is seen so large with a
+    probability of `doubt` at most. 0 where a figure of 0 is.
+    """
+
+    def beyond(true: float) -> float:
+        as_large = stats.t.sf((size - true) / sigma, freedom)
+        as_large += stats.t.sf((size + true) / sigma, freedom)  # of the other sign
+        return float(as_large) - doubt
+
+    if sigma <= 0:
+        return size
+    if beyond(0.0) >= 0:
+        return 0.0
+    return float(optimize.brentq(beyond, 0.0, size))
 
 
 def drawn_limits(

@@ -96,6 +96,7 @@ Quantity = Literal[
     "aberration",
     "proper-motion",
     "catalogue-age",
+    "parallax",
     "star-noise",
     "star-fov-error",
     "star-colour",
@@ -109,6 +110,7 @@ WITH_AXIS = (*AXIS_QUANTITIES, *RATE_QUANTITIES)
 TIME_QUANTITIES = ("time-to-first-attitude", "recovery")
 SHARE_QUANTITIES = ("availability", "wrong-rate", "no-attitude", "false-attitude")
 MOTION_QUANTITIES = ("proper-motion", "catalogue-age")
+PARALLAX = "parallax"
 STAR_QUANTITIES = ("star-noise", "star-fov-error", "star-colour", "star-limit", "false-stars")
 # These take `share`: the quantile of so many cases.
 WITH_SHARE = ("fov-error", "pixel-error", "noise", "nea", *TIME_QUANTITIES)
@@ -116,13 +118,14 @@ QUANTITY_UNITS = dict.fromkeys(AXIS_QUANTITIES, "arcsec") | dict.fromkeys(TIME_Q
 QUANTITY_UNITS |= dict.fromkeys(SHARE_QUANTITIES, "")
 QUANTITY_UNITS |= {"rate-bias": "deg/s", "rate-noise": "deg/s", "rate-scale": "", "rate-lag": "s"}
 QUANTITY_UNITS |= {"time-bias": "s", "time-jitter": "s", "aberration": ""}
-QUANTITY_UNITS |= {"proper-motion": "", "catalogue-age": "yr"}
+QUANTITY_UNITS |= {"proper-motion": "", "catalogue-age": "yr", PARALLAX: ""}
 QUANTITY_UNITS |= {"star-noise": "px", "star-fov-error": "px", "star-colour": "mag/mag"}
 QUANTITY_UNITS |= {"star-limit": "mag", "false-stars": "a frame", "edge": ""}
 # The further columns that a quantity is found from.
 QUANTITY_COLUMNS: dict[str, Further] = {
     **dict.fromkeys(RATE_QUANTITIES, "rate"),
     **dict.fromkeys(("time-bias", "time-jitter", "aberration", *MOTION_QUANTITIES), "time"),
+    PARALLAX: "time",
     **dict.fromkeys(STAR_QUANTITIES, "stars"),
 }
 CONDITION = re.compile(
@@ -231,7 +234,9 @@ class Require(Table, frozen=True):
 
 class PlantedFaults(Table, frozen=True):
     """[planted]: what is wrong with the virtual tracker on purpose, so that a plan shows that it
-    finds it. Arcsec, deg/s about cam x, y, z; s; shares of frames.
+    finds it. Vectors are about cam x, y, z. `wrong` and `missing` are shares of frames,
+    `aberration`, `proper_motion` and `parallax` the shares that are left, `rate_scale` a share of
+    the rate, `star_colour` mag a mag of B-V, and `false_stars` a frame's.
     """
 
     bias_arcsec: tuple[Number, Number, Number] = (0.0, 0.0, 0.0)
@@ -253,6 +258,7 @@ class PlantedFaults(Table, frozen=True):
     aberration: Number = 0.0
     proper_motion: Number = 0.0
     catalogue_age_yr: Number = 0.0
+    parallax: Number = 0.0
     star_noise_px: Annotated[float, Meta(ge=0, le=100)] = 0.0
     star_fov_px: Annotated[float, Meta(ge=0, le=100)] = 0.0
     star_colour: Number = 0.0
@@ -261,7 +267,7 @@ class PlantedFaults(Table, frozen=True):
 
 
 class Plan(Table, frozen=True):
-    """A whole plan."""
+    """The plan of a campaign, with the tables of its file."""
 
     bench: Annotated[str, Meta(min_length=1)]
     seed: Annotated[int, Meta(ge=0, le=MAX_SEED)] = 0
@@ -546,11 +552,13 @@ class Parameter:
 
 def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
     """The plan's parameters, each tried in the bench file at its ends, with those before it that
-    have one value alone. Raises InputError as the file does.
+    have one value alone, or else with the first value of all before it: an orbit needs a date.
+    Raises InputError as the file does.
     """
     tables = parse_toml(file.path, file.text)
     parameter_list = []
     fixed: dict[str, Any] = {}
+    first: dict[str, Any] = {}
     for varied in plan.vary:
         parameter = _parameter(varied, file)
         ends = parameter.values or (parameter.value(0.0), parameter.value(1.0))
@@ -558,9 +566,14 @@ def parameters(plan: Plan, file: BenchFile) -> list[Parameter]:
             try:
                 _check_value(parameter, value, file, tables, fixed)
             except InputError as error:
-                raise InputError(f'[[vary]] key = "{shortened(varied.key)}": {error}') from error
+                try:
+                    _check_value(parameter, value, file, tables, first)
+                except InputError:
+                    named = f'[[vary]] key = "{shortened(varied.key)}"'
+                    raise InputError(f"{named}: {error}") from error
         if len(parameter.values) == 1:
             fixed[parameter.key] = parameter.values[0]
+        first[parameter.key] = ends[0]
         parameter_list.append(parameter)
     return parameter_list
 

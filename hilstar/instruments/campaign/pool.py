@@ -17,7 +17,8 @@ class Pool:
     """`count` processes for a job, at most as many as fit into `memory_bytes` with this one. Use it
     as a context manager.
 
-    A process that dies is replaced, and its cases are run again.
+    A process that dies is replaced, and its cases are run again. `turn_to` gives the same processes
+    another job, so that the campaigns of an acceptance read the catalogue once.
     """
 
     task_s = TASK_S
@@ -25,12 +26,18 @@ class Pool:
     def __init__(
         self, job: Job, identity: Identity, count: int, memory_bytes: int | None = None
     ) -> None:
+        self._job = job
         self._identity = identity
         self._count = count
         self._memory_bytes = memory_bytes
         self._processes = ProcessPool(_start_session, (job,), (HilstarError,))
         self._starts_lost = 0
         self._peak_bytes = 0
+
+    def turn_to(self, job: Job, identity: Identity) -> None:
+        """Take up another job on the same bench, once `run` has returned."""
+        self._job = job
+        self._identity = identity
 
     def run(self, backlog: Backlog, done: Done, lost: Lost) -> None:
         """Run all cases. `done` gets each task with its rows, `lost` a task whose worker died, and
@@ -65,7 +72,7 @@ class Pool:
             if worker.ready and worker.task is None:
                 task = backlog.take(len(workers))
                 if task is not None:
-                    worker.give(task, task.begin, task.points)
+                    worker.give(task, self._job, task.begin, task.points)
 
     def _allowed(self) -> int:
         """How many processes may run. With a memory budget it is one, until that one has
@@ -114,6 +121,24 @@ class Pool:
         self._processes.close()
 
 
-def _start_session(job: Job) -> tuple[Identity, Callable[[int, FloatArray], Answered]]:
-    session = Session(job)
-    return session.identity(), session.run
+class _Worker:
+    """A worker's session of the last job that it was given.
+
+    Another job needs no other look at the identity: the process, and with it program and libraries,
+    is the same, and the bench file, which chooses the renderer, too.
+    """
+
+    def __init__(self, job: Job) -> None:
+        self.session = Session(job)
+
+    def run(self, job: Job, begin: int, points: FloatArray) -> Answered:
+        """The rows of a job's cases from `begin` on at their points (n, dimensions)."""
+        if self.session.job != job:
+            self.session.close()
+            self.session = Session(job)
+        return self.session.run(begin, points)
+
+
+def _start_session(job: Job) -> tuple[Identity, Callable[[Job, int, FloatArray], Answered]]:
+    worker = _Worker(job)
+    return worker.session.identity(), worker.run

@@ -6,12 +6,10 @@ Each figure has a one-sided limit on either side at the requirement's confidence
 shown**; a minimum the other way round. The limits:
 
 - rates by Clopper & Pearson (1934). Answers of one case go together, so their number is divided by
-  the design effect, the
-  variance between cases over the binomial one (Korn & Graubard 1998); where all or none are right,
-  cases are counted;
+  the design effect, the variance between cases over the binomial one (Korn & Graubard 1998); where
+  all or none are right, cases are counted;
 - quantiles (a time, or an error with `share`) by order statistics, free of any distribution. A case
-  that never had an attitude
-  has an infinite time;
+  that never had an attitude has an infinite time;
 - what answers carry beside the attitude as answer_figures.py has it;
 - a bias by Student's t, across the boresight the larger of x and y;
 - a sigma by chi-square where the errors pass for Gaussian (kurtosis at 1 %), else by the bootstrap
@@ -43,6 +41,7 @@ from hilstar.instruments.campaign.figures import (
     TooFewCases,
     clopper_pearson,
     drawn_limits,
+    lowest_size,
     quantile_limits,
     sigma_limits,
 )
@@ -452,10 +451,11 @@ def _bias(mean: FloatArray, sigma: FloatArray, n: int, confidence: float) -> Bou
     upper = stats.t.ppf(confidence, n - 1)
     # Bonferroni: of several axes any one may be the larger
     doubt = (1 - confidence) / len(size)
-    lower = stats.t.ppf(1 - doubt, n - 1)
-    lowest = size - lower * standard
+    low = max(
+        lowest_size(axis_size, axis_standard, n - 1, doubt)
+        for axis_size, axis_standard in zip(size.tolist(), standard.tolist(), strict=True)
+    )
     highest = size + upper * standard
-    low = max(float(lowest.max()), 0.0)
     high = float(highest.max())
     largest = float(size.max())
     return BoundedFigure(largest, low, high, n, "Student's t")

@@ -133,7 +133,7 @@ class Session:
         )
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         conditions = CaseConditions(
-            np.array(tracker.config.sky.observer_velocity_km_s),
+            _velocity_km_s(tracker),
             acceleration_rad_s2,
             tracker.config.tracker.detector.false_stars,
             case.body_deg,
@@ -172,9 +172,11 @@ class Session:
         return tally.into(row)
 
     def _old_places_rad(self, case: Case, tracker: Imaging) -> FloatArray:
-        """The turn (3,), cam, that planted old places give a case."""
+        """The turn (3,), cam, that planted old places give a case, and places without parallax."""
         planted = self.plan.planted
-        if planted is None or not (planted.proper_motion or planted.catalogue_age_yr):
+        if planted is None:
+            return np.zeros(3)
+        if not (planted.proper_motion or planted.catalogue_age_yr or planted.parallax):
             return np.zeros(3)
         if self._motion is None:
             self._motion = StarMotion.of(self.maker.file)
@@ -184,7 +186,12 @@ class Session:
         scale = Scale(
             settings.focal_length_mm * 1e3 / settings.pixel_pitch_um, settings.resolution_px
         )
-        return old_yr * self._motion.whole_turn_rad(case.first.q_icrs_to_cam, scale)
+        q = case.first.q_icrs_to_cam
+        turn_rad = old_yr * self._motion.whole_turn_rad(q, scale)
+        if planted.parallax and tracker.moving is not None:
+            by_parallax = self._motion.by_parallax(tracker.moving)
+            turn_rad = turn_rad + planted.parallax * by_parallax.whole_turn_rad(q, scale)
+        return turn_rad
 
     def _at(self, file: BenchFile) -> Imaging:
         """The tracker, switched to a bench file; where that fails, the next case gets a new one."""
@@ -209,3 +216,10 @@ class Session:
         """Free the GL contexts."""
         if self._tracker is not None:
             self._tracker.close()
+
+
+def _velocity_km_s(tracker: Imaging) -> FloatArray:
+    """The velocity (3,) of the observer about the barycentre, ICRS."""
+    if tracker.moving is not None:
+        return tracker.moving.sight(0).view.velocity_km_s
+    return np.array(tracker.config.sky.observer_velocity_km_s)

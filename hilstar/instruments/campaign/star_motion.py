@@ -1,44 +1,57 @@
-"""How the proper motion of a field's stars turns the attitude of a tracker whose places are old.
+"""How the proper motion, or the parallax, of a field's stars turns the attitude of a tracker that
+does not follow it.
 
 Such a tracker takes stars that have moved for stars at their old places: its attitude is off by the
 turn that carries the old places onto the new ones, to the least squares. The turn is that of the
-field's BRIGHTEST stars, as a tracker takes them. Where a star is faster than MAX_ARCSEC_YR the turn
-hangs on whether the tracker takes that star, and is not known.
+field's BRIGHTEST stars, as a tracker takes them. Where a star moves by more than MAX_ARCSEC_YR in a
+year, or MAX_PARALLAX_ARCSEC, the turn hangs on whether the tracker takes that star, and is not
+known.
 """
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.reading import parse_toml
 from hilstar.basics.rotation import to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.case_table import VARY, Columns
-from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, Require
+from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, PARALLAX, Require, changed_bench
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.config.bench_config import jyear
-from hilstar.server.bench.star_light import catalogue_choice
+from hilstar.server.bench.star_light import bench_moving, catalogue_choice
 from hilstar.sky.star_table import choose_catalog
 from hilstar.sky.stars import unit_vectors_icrs
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.moving import MovingSky
 
 BRIGHTEST = 15
 MIN_STARS = 3
 MAX_ARCSEC_YR = 1.0
+MAX_PARALLAX_ARCSEC = 0.3
 # columns of a campaign's table that are found afterwards: years after the bench's date, and the
-# turn in one by the likely stars
+# turn in one by the likely stars; the turn by their parallax, and the observer's velocity
 YEARS, YEARLY_TURN = "years", "yearly_turn_{}_arcsec"
+PARALLAX_TURN, OBSERVER_KM_S = "parallax_turn_{}_arcsec", "observer_{}_km_s"
+OF_OBSERVER = ("sky", "spacecraft")  # tables of the bench file that place the observer
 
 
 @dataclass(frozen=True, slots=True)
 class StarMotion:
     """The stars of a bench, the brightest first: unit vectors (n, 3), ICRS, at the bench's date
-    `jyear`, and how these change in a year (n, 3).
+    `jyear`, how these change in a year (n, 3), their parallaxes (n,), and the largest change of a
+    star with which a field's turn is known.
     """
 
     jyear: float
     vectors: FloatArray
     yearly: FloatArray
+    parallax_mas: FloatArray
+    max_arcsec: float = MAX_ARCSEC_YR
 
     @classmethod
     def of(cls, file: BenchFile) -> "StarMotion":
@@ -50,7 +63,14 @@ class StarMotion:
         date = sky.epoch_jyear
         before = unit_vectors_icrs(catalog, date - 0.5)
         after = unit_vectors_icrs(catalog, date + 0.5)
-        return cls(date, unit_vectors_icrs(catalog, date), after - before)
+        vectors = unit_vectors_icrs(catalog, date)
+        return cls(date, vectors, after - before, catalog.parallax_mas)
+
+    def by_parallax(self, moving: "MovingSky") -> "StarMotion":
+        """The same stars, whose change (n, 3) is that by their parallax for an observer."""
+        infinitely_far = moving.stars_seen(self.vectors, np.zeros(len(self.vectors)))
+        shift = moving.stars_seen(self.vectors, self.parallax_mas) - infinitely_far
+        return replace(self, yearly=shift, max_arcsec=MAX_PARALLAX_ARCSEC)
 
     def in_field(self, q_icrs_to_cam: FloatArray, scale: Scale) -> IntArray:
         """The rows of the stars in the tracker's field, the brightest first."""
@@ -65,8 +85,8 @@ class StarMotion:
         return np.flatnonzero(inside)
 
     def turn_rad(self, q_icrs_to_cam: FloatArray, rows: IntArray) -> FloatArray:
-        """The rotation vector (3,), cam, of an attitude by places of these stars that are a year
-        old; zeros for fewer than MIN_STARS.
+        """The rotation vector (3,), cam, of an attitude by places of these stars from before the
+        change; zeros for fewer than MIN_STARS.
         """
         if len(rows) < MIN_STARS:
             return np.zeros(3)
@@ -82,25 +102,82 @@ class StarMotion:
         rows = self.in_field(q_icrs_to_cam, scale)[:BRIGHTEST]
         motion = np.linalg.norm(self.yearly[rows], axis=1)
         fastest = ARCSEC_PER_RAD * float(motion.max(initial=0.0))
-        if len(rows) < MIN_STARS or fastest > MAX_ARCSEC_YR:
+        if len(rows) < MIN_STARS or fastest > self.max_arcsec:
             return np.full(3, np.nan)
         return self.turn_rad(q_icrs_to_cam, rows)
 
 
 def with_motion(cases: Columns, requires: list[Require], file: BenchFile, scale: Scale) -> Columns:
-    """The cases with the columns YEARS and YEARLY_TURN where a requirement is found from them."""
-    if not {require.quantity for require in requires} & set(MOTION_QUANTITIES):
-        return cases
-    motion = StarMotion.of(file)
+    """The cases with the columns that a requirement of proper motion or parallax is found from."""
+    quantities = {require.quantity for require in requires}
+    numbers: dict[str, FloatArray] = {}
+    if quantities & {*MOTION_QUANTITIES, PARALLAX}:
+        motion = StarMotion.of(file)
+        if quantities & set(MOTION_QUANTITIES):
+            numbers |= _of_proper_motion(cases, motion, scale)
+        if PARALLAX in quantities:
+            numbers |= _of_parallax(cases, motion, file, scale)
+    return replace(cases, numbers=cases.numbers | numbers)
+
+
+def _of_proper_motion(cases: Columns, motion: StarMotion, scale: Scale) -> dict[str, FloatArray]:
+    """The columns YEARS and YEARLY_TURN."""
     q = cases.vectors("q{}", "wxyz")
     turns = np.zeros((len(q), 3))
     for case, attitude in enumerate(q):
         turns[case] = motion.likely_turn_rad(attitude, scale)
-    numbers = dict(cases.numbers)
+    numbers = _by_name(YEARLY_TURN, "xy", ARCSEC_PER_RAD * turns)
     numbers[YEARS] = _jyears(cases, motion.jyear) - motion.jyear
-    for k, axis in enumerate("xy"):
-        numbers[YEARLY_TURN.format(axis)] = ARCSEC_PER_RAD * turns[:, k]
-    return replace(cases, numbers=numbers)
+    return numbers
+
+
+def _of_parallax(
+    cases: Columns, motion: StarMotion, file: BenchFile, scale: Scale
+) -> dict[str, FloatArray]:
+    """The columns PARALLAX_TURN and OBSERVER_KM_S; NaN in cases without an observer."""
+    q = cases.vectors("q{}", "wxyz")
+    turns = np.full((len(q), 3), np.nan)
+    velocity = np.full((len(q), 3), np.nan)
+    by_observer: dict[tuple[tuple[str, Any], ...], list[int]] = {}
+    for case, values in enumerate(_observers(cases, file)):
+        by_observer.setdefault(tuple(values.items()), []).append(case)
+    tables = parse_toml(file.path, file.text)
+    for items, rows in by_observer.items():
+        config = changed_bench(file, tables, dict(items)).config
+        moving = bench_moving(config, file.folder)
+        if moving is None:
+            continue
+        by_parallax = motion.by_parallax(moving)
+        velocity[rows] = moving.sight(0).view.velocity_km_s
+        for case in rows:
+            turns[case] = by_parallax.likely_turn_rad(q[case], scale)
+    return _by_name(PARALLAX_TURN, "xy", ARCSEC_PER_RAD * turns) | _by_name(
+        OBSERVER_KM_S, "xyz", velocity
+    )
+
+
+def _by_name(form: str, axes: str, vectors: FloatArray) -> dict[str, FloatArray]:
+    """Vectors (n, 3) as a column for each of these axes."""
+    return {form.format(axis): vectors[:, k] for k, axis in enumerate(axes)}
+
+
+def _observers(cases: Columns, file: BenchFile) -> list[dict[str, Any]]:
+    """What each case varies of the keys that place the observer, as the bench file writes it."""
+    values: list[dict[str, Any]] = [{} for _ in cases.numbers["frames"]]
+    for name in cases.varied:
+        key = name.removeprefix(VARY)
+        if key.split(".")[0] not in OF_OBSERVER:
+            continue
+        column: Any = cases.texts.get(name)
+        if column is None:
+            column = cases.numbers[name].tolist()
+        present: Any = file.config
+        for part in key.split("."):
+            present = getattr(present, part, None)
+        for case, value in enumerate(column):
+            # a table has numbers for true and false
+            values[case][key] = bool(value) if isinstance(present, bool) else value
+    return values
 
 
 def _jyears(cases: Columns, usual: float) -> FloatArray:

@@ -4,8 +4,7 @@ the end.
 The journal appends each row as one line with its checksum, to one file per block of cases. Laws:
 
 1. A row counts as done once its line is written whole. A line that a kill, a full disk or a crash
-   cut off is dropped when
-   the journal is opened again, and its case is run again.
+   cut off is dropped when the journal is opened again, and its case is run again.
 2. A block's file is renamed when all its cases are in it; such a file is not read again before the
    end.
 3. One process writes at a time; it holds the lock of the campaign's directory.

@@ -130,7 +130,7 @@ class CaseTally:
         self._digest.update(np.ascontiguousarray(exposure.dn))
 
     def hear(self, exposure: Exposure, answer: SolverAnswer, end_s: float) -> None:
-        """Count the answer to an exposure that ends so long after the case's begin."""
+        """Count the answer to an exposure that ends `end_s` after the case's begin."""
         if answer.star_errors is not None:
             self.star_errors.append(answer.star_errors)
         if answer.stars is not None and "stars" in self.further:

@@ -6,10 +6,15 @@ file is right; its rotation is the tracker's alignment. A screen and a lens are 
 the size of a dot's noise that such a lens leaves is an error of the dots, as from the pattern of
 the tracker's pixels. It stays in no place that is stated, and counts by what the fit takes up of
 it. Structure that is larger is of the bench: polynomials follow it.
+
+Polynomials of third degree stand beside the lens's numbers, for lenses of another form. They also
+take up errors of dots that are smooth over a quarter of the field or more. So structure is told by
+what the lens alone leaves, up to half of the field. Longer errors are those of the tracker's own
+directions, which `[certify.tracker]` states.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,9 +39,13 @@ SAME = 1e-7  # relative size of a combination of parameters that no dot tells
 # relative to noise: larger structure is of the bench, and not an error of its dots
 DOT_VARIANCE = 4.0
 # Of polynomials beside the lens's numbers. Planted lenses in another form, with tilts of 1 degree,
-# are then within 0.0013 arcsec, with decentring of the fifth order; without that within 0.03.
+# are then within 0.0005 arcsec, with decentring of the fifth order.
 BESIDE_DEGREE = 3
 DEGREES = (7, 9, 11, 13)
+LONGEST = 1 / 2  # of structure, relative to the field
+# Tilt and centre replace each other and a turn along a bent valley, down which a fit by steps goes
+# far from what is true. They are in the linear fit, with the tilt's second order.
+BY_STEPS = tuple(name for name in fits.BROWN_CONRADY if not name.startswith(("centre", "tilt")))
 STILL = np.array([[1.0, 0.0, 0.0, 0.0]])  # the mount of the only image
 
 
@@ -124,25 +133,43 @@ def lens_fit(file: BenchFile, read: DotReadings, seen_off: FloatArray) -> LensFi
     phases = _phases(*geometry.tracker.places_px(*shown[usable].T))
     both_axes = residual[usable].T.ravel()
     for degree in (0, *DEGREES):
-        of_degree = _terms(lens, flat, wanted[usable], (x, y), degree)
-        terms = np.concatenate([of_degree, phases], axis=2).reshape(2 * len(x), -1)
-        scale = np.maximum(np.linalg.norm(terms, axis=0), TINY)
-        vectors, size, across = np.linalg.svd(terms / scale, full_matrices=False)
-        is_told = size > SAME * size[0]
-        told_vectors = vectors[:, is_told]
-        coefficients = told_vectors.T @ both_axes
-        rest = (both_axes - told_vectors @ coefficients).reshape(2, -1)
-        basis = told_vectors.reshape(2, len(x), -1)
-        structure = in_place(x, y, rest, basis)
-        dof = float(2 * len(x) - is_told.sum())
+        terms = _terms(lens, flat, wanted[usable], (x, y), degree)
+        vectors, mix = _orthonormal(np.concatenate([terms, phases], axis=2))
+        telling = vectors
+        if not degree:
+            of_lens = _lens_terms(lens, flat, wanted[usable])
+            telling, _ = _orthonormal(np.concatenate([of_lens, phases], axis=2))
+        structure = in_place(x, y, *_left_by(telling, both_axes), LONGEST)
+        rest, basis = _left_by(vectors, both_axes)
+        dof = float(rest.size - basis.shape[2])
         # By what the residuals show: the variance of a structure as long as the field is hardly
         # known.
         largest = (1 + DOT_VARIANCE) * structure.noise_variance
         if float((rest**2).sum()) / dof <= largest:
             break
-    mix = across[is_told].T / size[is_told] / scale[:, None]
+    coefficients = vectors.T @ both_axes
     cells = Cells(x, y)
     return LensFit(geometry, flat, lens, degree, mix, coefficients, basis, cells, structure, dof)
+
+
+def _orthonormal(terms: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """An orthonormal basis (2 n, k) of terms (2, n, p) over the dots, and what turns the terms into
+    it (p, k); combinations that no dot tells are in neither.
+    """
+    columns = terms.reshape(-1, terms.shape[2])
+    scale = np.maximum(np.linalg.norm(columns, axis=0), TINY)
+    vectors, size, across = np.linalg.svd(columns / scale, full_matrices=False)
+    is_told = size > SAME * size[0]
+    return vectors[:, is_told], across[is_told].T / size[is_told] / scale[:, None]
+
+
+def _left_by(vectors: FloatArray, both_axes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """What an orthonormal basis (2 n, k) leaves of values (2 n,), by axis (2, n), and the basis by
+    axis (2, n, k).
+    """
+    rest = both_axes - vectors @ (vectors.T @ both_axes)
+    by_axis = rest.reshape(2, -1)
+    return by_axis, vectors.reshape(*by_axis.shape, -1)
 
 
 def _thinned(usable: BoolArray) -> BoolArray:
@@ -200,7 +227,10 @@ def _fitted(
     nominal = fits.Nominal(flat, STILL[0], geometry.tracker)
     problem = fits.Problem(plan, nominal, STILL, EXPECTED_NOISE_PX)
     matched = fits.MatchedDots(observed, np.arange(count))
-    return fits.fit(problem, fits.Model(fits.BROWN_CONRADY), 0, matched)
+    by_steps = fits.fit(problem, fits.Model(BY_STEPS), 0, matched)
+    number = dict(zip(BY_STEPS, by_steps.numbers, strict=True))
+    numbers = np.array([number.get(name, 0.0) for name in fits.BROWN_CONRADY])
+    return replace(by_steps, model=fits.Model(fits.BROWN_CONRADY), numbers=numbers)
 
 
 def _tangents(fitted: Camera, flat: Camera, wanted: FloatArray) -> FloatArray:
@@ -224,6 +254,11 @@ def _terms(
     polynomials = np.stack([np.hstack([terms, nothing]), np.hstack([nothing, terms])])
     if degree:
         return polynomials
+    return np.concatenate([_lens_terms(fit, flat, wanted), polynomials], axis=2)
+
+
+def _lens_terms(fit: fits.Fit, flat: Camera, wanted: FloatArray) -> FloatArray:
+    """Slopes (2, n, terms) of places, arcsec, by the lens's numbers, decentring and tilt."""
     nominal = fits.Nominal(flat, STILL[0], flat)
     tangents = _tangents(fit.geometry.monitor, flat, wanted)
     shown = np.append(tangents, np.ones((len(wanted), 1)), axis=1)
@@ -237,7 +272,8 @@ def _terms(
         # A pixel that moves by the lens shows its direction elsewhere by the opposite.
         slope_px = (places(-step) - places(step)) / (2 * DERIVATIVE_STEP)
         columns.append(slope_px / flat.focal_length_px * ARCSEC_PER_RAD)
-    return np.concatenate([np.stack(columns, axis=2), polynomials, _decentring(wanted)], axis=2)
+    slopes = np.stack(columns, axis=2)
+    return np.concatenate([slopes, _decentring(wanted), _tilted(wanted)], axis=2)
 
 
 def _decentring(wanted: FloatArray) -> FloatArray:
@@ -251,3 +287,14 @@ def _decentring(wanted: FloatArray) -> FloatArray:
         terms[:, :, axis] = round_ * place * place[axis]
         terms[axis, :, 2 + axis] = round_**2
     return terms
+
+
+def _tilted(wanted: FloatArray) -> FloatArray:
+    """What a tilted screen does beside the slopes of tilt and focal length (2, n, 5), at directions
+    (n, 2): one scale along x and another along y, rows that lean, and the tilt's second order.
+    """
+    x, y = wanted.T / HALF_TANGENT
+    second_order = np.stack([x * x, x * y, y * y], axis=1)
+    along_x = np.column_stack([x, y, x[:, None] * second_order])
+    along_y = np.column_stack([-y, x, y[:, None] * second_order])
+    return np.stack([along_x, along_y])

@@ -59,6 +59,12 @@ def of_readings(
     )
     effects = [*_of_light(light, figures), *_of_evenness(read.even, even, form), _of_places(place)]
     effects += _of_structure(figures, read, place)
+    if file.config.certify.tracker.direction_expanded_arcsec is not None:
+        longest_px = float(place.structure.length[-1])
+        missing.append(
+            f"smooth errors of dots: over more than {longest_px:.0f} px, half of the field, they"
+            " look like the lens; [certify.tracker] direction_expanded_arcsec has to hold them"
+        )
     if len(read.delays_ms) > 1:
         effects += _of_delays(read.delays_ms)
     else:

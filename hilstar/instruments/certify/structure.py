@@ -25,6 +25,7 @@ from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 RATIOS = np.geomspace(1e-3, 3e3, 20)
 LENGTH_STEP = 1.6  # from one length to the next
 MAX_CELLS = 1000
+LONGEST = 1 / 4  # of a structure relative to the field: longer ones follow a fit's polynomials
 # share of cells that are filled in the rectangle by which structure is told; its least cells
 ENOUGH, MIN_CELLS = 0.97, 64
 MIN_FILLED = 0.5  # relative to a full cell: a cell with fewer readings is taken as empty
@@ -207,13 +208,14 @@ class Cells:
         self.filled: BoolArray = self.count >= MIN_FILLED * group**2
         self.typical = float(self.count[self.filled].mean())
 
-    def lengths(self) -> FloatArray:
-        """Lengths that the lattice can tell, px: from half of a cell to a quarter of its extent.
+    def lengths(self, longest: float) -> FloatArray:
+        """Lengths that the lattice can tell, px: from half of a cell to the share `longest` of its
+        extent.
 
         Structure that is longer follows the terms of a fit, and no residual tells it.
         """
         low = min(self.side) / 2
-        high = max(float(np.ptp(middles)) for middles in self.middle) / 4
+        high = longest * max(float(np.ptp(middles)) for middles in self.middle)
         steps = round(math.log(high / low) / math.log(LENGTH_STEP))
         return np.geomspace(low, high, max(steps, 1) + 1)
 
@@ -246,7 +248,7 @@ class Cells:
         """Values (cells, k) in the basis of rows and columns."""
         square = values.reshape(len(rows), len(columns), -1)
         half = np.tensordot(rows.T, square, axes=1)
-        return np.asarray(np.einsum("jc,rjk->rck", columns, half).reshape(self.size, -1))
+        return np.asarray((columns.T @ half).reshape(self.size, -1))
 
     def towards(self, x_px: FloatArray, y_px: FloatArray, length_px: float) -> FloatArray:
         """The correlation of places (n,) with cells' means (n, cells)."""
@@ -266,10 +268,14 @@ def _falling(apart_px: FloatArray, variance_px2: float) -> FloatArray:
 
 
 def in_place(
-    x_px: FloatArray, y_px: FloatArray, values: FloatArray, terms: FloatArray
+    x_px: FloatArray,
+    y_px: FloatArray,
+    values: FloatArray,
+    terms: FloatArray,
+    longest: float = LONGEST,
 ) -> Structure:
     """The structure in place of residuals (axes, n) at places (n,), whose fit has `terms` (axes,
-    n, p) common to all axes.
+    n, p) common to all axes; up to lengths of the share `longest` of their extent.
     """
     inside = _rectangle(x_px, y_px)
     cells = Cells(x_px[inside], y_px[inside])
@@ -280,7 +286,7 @@ def in_place(
     more_readings = len(cells.index) - int((cells.count > 0).sum())
     free = float(len(values) * more_readings)
     scale = math.sqrt(cells.typical)
-    lengths = cells.lengths()
+    lengths = cells.lengths(longest)
     empty = cells.empty()
     shape = of_terms.shape
     spreads = []

@@ -22,6 +22,8 @@ MAG = 2.5 / math.log(10)
 MAX_CORRECTION, STARS_FOR_CORRECTION, MIN_COLOURS_MAG = np.array([10.0, 30.0]), (15, 30), 0.2
 CORRECTION_PRIOR = np.array([3.0, 10.0])
 CORRECTION_ROUNDS, CORRECTION_STEP, CORRECTION_FLOOR_MAG, CORRECTION_HUBER = 8, 0.05, 0.05, 1.5
+# of a step, the largest that lessens the loss; and by how much less a further step has to make it
+CORRECTION_SHARES, CORRECTION_GAIN = (1.0, 0.4, 0.15, 0.05), 0.01
 NO_CORRECTION = (0.0, 0.0)
 FOLDS, GAIN = 5, 0.985
 BRIGHT_V_MAG = 6.5  # to which rms errors are stated
@@ -244,29 +246,29 @@ class _CorrectionLoss:
     weight: FloatArray
 
 
-def _correction(
-    stars: StarLight, magnitudes: Magnitudes, plain: FloatArray, use: BoolArray
-) -> Correction:
-    """Tilt and bow of the quantum efficiency by which stars of all colours fit best; beside them
-    the `plain` columns are fitted.
-    """
-    columns = plain.shape[1]
-    count = sum(int(use.sum()) >= stars_for + columns for stars_for in STARS_FOR_CORRECTION)
-    if not count or np.std(np.nan_to_num(stars.bv_mag[use])) < MIN_COLOURS_MAG:
-        return NO_CORRECTION
-    sigma = np.hypot(stars.sigma_mag, CORRECTION_FLOOR_MAG)[use]
-    target = stars.instrument_mag[use]
-    plain = plain[use]
+@dataclass(frozen=True, slots=True)
+class _CorrectionFit:
+    """What a correction is fitted to: `target` (n,) magnitudes of the used stars with one sigma,
+    `plain` columns (n, k) that are fitted beside it, and how many of tilt and bow are free.
 
-    def loss_of(values: FloatArray) -> _CorrectionLoss:
+    `magnitudes` gives those of the used stars with a correction.
+    """
+
+    target: FloatArray
+    sigma: FloatArray
+    plain: FloatArray
+    magnitudes: Magnitudes
+    free: int
+
+    def loss(self, values: FloatArray) -> _CorrectionLoss:
         """Huber's loss and a weak prior, with the plain columns' coefficients following."""
-        off = target - magnitudes(_pair(values))[use]
-        weights = np.ones(len(target))
+        off = self.target - self.magnitudes(_pair(values))
+        weights = np.ones(len(self.target))
         for _ in range(CORRECTION_ROUNDS):
             root = np.sqrt(weights)
-            design = plain * (root / sigma)[:, None]
-            coefficients = np.linalg.lstsq(design, off * root / sigma, rcond=None)[0]
-            residual = (off - plain @ coefficients) / sigma
+            design = self.plain * (root / self.sigma)[:, None]
+            coefficients = np.linalg.lstsq(design, off * root / self.sigma, rcond=None)[0]
+            residual = (off - self.plain @ coefficients) / self.sigma
             size = np.maximum(np.abs(residual), CORRECTION_HUBER)
             weights = np.minimum(1.0, CORRECTION_HUBER / size)
         size = np.abs(residual)
@@ -275,30 +277,49 @@ def _correction(
         prior = ((values / CORRECTION_PRIOR) ** 2).sum() / 2
         return _CorrectionLoss(float(huber.sum() + prior), residual, weights)
 
-    def step_from(values: FloatArray, loss: _CorrectionLoss) -> FloatArray:
+    def step(self, values: FloatArray, loss: _CorrectionLoss) -> FloatArray:
         """A Gauss-Newton step of tilt and bow (2,), by differences."""
-        base = magnitudes(_pair(values))[use]
-        slopes = [*plain.T]
-        for difference in CORRECTION_STEP * np.eye(2)[:count]:
-            moved = magnitudes(_pair(values + difference))[use]
+        free = self.free
+        columns = self.plain.shape[1]
+        base = self.magnitudes(_pair(values))
+        slopes = [*self.plain.T]
+        for difference in CORRECTION_STEP * np.eye(2)[:free]:
+            moved = self.magnitudes(_pair(values + difference))
             slopes.append((moved - base) / CORRECTION_STEP)
-        design = np.column_stack(slopes) / sigma[:, None]
+        design = np.column_stack(slopes) / self.sigma[:, None]
         prior = np.zeros(design.shape[1])
-        prior[columns:] = 1 / CORRECTION_PRIOR[:count] ** 2
+        prior[columns:] = 1 / CORRECTION_PRIOR[:free] ** 2
         downhill = design.T @ (loss.weight * loss.off)
-        downhill[columns:] -= values[:count] * prior[columns:]
+        downhill[columns:] -= values[:free] * prior[columns:]
         normal = design.T @ (loss.weight[:, None] * design)
         step = np.zeros(2)
-        step[:count] = np.linalg.solve(normal + np.diag(prior + 1e-9), downhill)[columns:]
+        step[:free] = np.linalg.solve(normal + np.diag(prior + 1e-9), downhill)[columns:]
         return step
 
+
+def _correction(
+    stars: StarLight, magnitudes: Magnitudes, plain: FloatArray, use: BoolArray
+) -> Correction:
+    """Tilt and bow of the quantum efficiency by which stars of all colours fit best; beside them
+    the `plain` columns are fitted.
+    """
+    columns = plain.shape[1]
+    free = sum(int(use.sum()) >= stars_for + columns for stars_for in STARS_FOR_CORRECTION)
+    if not free or np.std(np.nan_to_num(stars.bv_mag[use])) < MIN_COLOURS_MAG:
+        return NO_CORRECTION
+    sigma = np.hypot(stars.sigma_mag, CORRECTION_FLOOR_MAG)[use]
+
+    def used_magnitudes(correction: Correction) -> FloatArray:
+        return magnitudes(correction)[use]
+
+    fit = _CorrectionFit(stars.instrument_mag[use], sigma, plain[use], used_magnitudes, free)
     values: FloatArray = np.zeros(2)
-    best = loss_of(values)
+    best = fit.loss(values)
     for _ in range(CORRECTION_ROUNDS):
-        step = step_from(values, best)
-        for share in (1.0, 0.4, 0.15, 0.05):
+        step = fit.step(values, best)
+        for share in CORRECTION_SHARES:
             trial = np.clip(values + share * step, -MAX_CORRECTION, MAX_CORRECTION)
-            trial_loss = loss_of(trial)
+            trial_loss = fit.loss(trial)
             if trial_loss.value < best.value:
                 break
         else:
@@ -306,7 +327,7 @@ def _correction(
         gain = best.value - trial_loss.value
         values = trial
         best = trial_loss
-        if gain < 0.01:
+        if gain < CORRECTION_GAIN:
             break
     return _pair(values)
 

@@ -17,6 +17,7 @@ from hilstar.server.sender import PATIENCE_S, SerialSender, open_sender
 FORMATS = ("packet", "json")
 MAX_BABBLE_BYTES = 300  # between two answers
 STAR_DECIMALS = 4
+SIGNAL_PLACE = 3  # of a star: what is after it is left out where it is not known
 MODE_FLAGS = {
     TRACKING: protocol.ANSWER_TRACKING,
     LOST: protocol.ANSWER_LOST_IN_SPACE,
@@ -41,7 +42,7 @@ def json_answer(answer: Answer) -> bytes:
     fields["centroids"] = []
     for star in answer.centroids:
         numbers = [None if part is None else round(part, STAR_DECIMALS) for part in star]
-        if star.hip is None:
+        while len(numbers) > SIGNAL_PLACE and numbers[-1] is None:
             numbers.pop()
         fields["centroids"].append(numbers)
     return msgspec.json.encode(fields)

@@ -13,12 +13,13 @@ import numpy.typing as npt
 
 from hilstar.attitude.wire.source import Mounting
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.rotation import conjugate, from_matrix, multiply, to_rotation_vector
+from hilstar.basics.rotation import conjugate, multiply, to_rotation_vector
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.quantise import MASK_TURNS
 from hilstar.instruments.simulate.star_finder import Matched, crowded, shared, star_finder
 from hilstar.instruments.simulate.twin import Twin, TwinField
 from hilstar.server.bench.bench_file import HeadsFile
+from hilstar.tracker.identify import wahba
 
 MIN_STARS = 3  # for a solved attitude
 WIDER = 1.5
@@ -130,7 +131,7 @@ class _Head:
         """
         q_body_to_cam = self.mounting.q_body_to_cam
         # turns the camera's true axes into those solved
-        q_cam_to_solved = from_matrix(rotation_between(wanted, measured, weights))
+        q_cam_to_solved = wahba(measured, wanted, weights)
         q_icrs_to_cam = multiply(q_body_to_cam, q_icrs_to_body)
         q_icrs_to_solved = multiply(q_cam_to_solved, q_icrs_to_cam)
         return multiply(conjugate(q_body_to_cam), q_icrs_to_solved)
@@ -144,18 +145,6 @@ def _inside(
     across = (x_px > margin_px) & (x_px < width - 1 - margin_px)
     down = (y_px > margin_px) & (y_px < height - 1 - margin_px)
     return np.asarray(across & down)
-
-
-def rotation_between(before: FloatArray, after: FloatArray, weights: FloatArray) -> FloatArray:
-    """The rotation (3, 3) that takes unit vectors (n, 3) nearest to others: Wahba's problem by
-    Markley's SVD (1988).
-    """
-    weighted = weights[:, None] * after
-    u, _, vt = np.linalg.svd(weighted.T @ before)
-    # +1, or -1 where the product would be a reflection
-    handedness = np.linalg.det(u) * np.linalg.det(vt)
-    proper = np.diag([1.0, 1.0, handedness])
-    return np.asarray(u @ proper @ vt)
 
 
 def verify_heads(

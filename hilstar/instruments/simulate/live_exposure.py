@@ -32,6 +32,7 @@ from hilstar.instruments.simulate.simulator import TrackerBackground, detector_c
 from hilstar.instruments.simulate.twin import true_geometry, true_panel
 from hilstar.optics.layers.view import View
 from hilstar.server.answers.answer import ReportedStar
+from hilstar.server.answers.light_times import FrameLight, lit_times_ns, on_screen
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import tracker_camera
@@ -39,8 +40,10 @@ from hilstar.sky.stars import split_by_rate
 from hilstar.tracker.centroids import (
     CentroidSettings,
     LocalBackground,
+    estimate_background,
     find_stars,
     noisiest_background,
+    star_widths,
 )
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified, identify
@@ -81,8 +84,8 @@ class Exposed:
 
 
 class WatchedFrames:
-    """The newest frames of a display, each lit until the next; `light_of` gives a frame's
-    pixels' light (n, primaries).
+    """The newest frames of a display, each lit as `light_times` has it; `light_of` gives a
+    frame's pixels' light (n, primaries).
     """
 
     def __init__(self, light_of: Callable[[ShownFrame], FloatArray]) -> None:
@@ -107,23 +110,22 @@ class WatchedFrames:
 
     @property
     def newest_ns(self) -> int:
-        """When the newest frame was lit; 0 before any."""
+        """When the newest frame's light is whole; 0 before any."""
         if self._frames:
-            return self._frames[-1].head.lit_ns
+            return frame_light(self._frames[-1]).whole_ns
         return 0
 
     def exposed(self, begin_ns: int, end_ns: int) -> Exposed | None:
         """The mean of what was lit in a span; None where its beginning is not known."""
         frames = list(self._frames)
-        if not frames or frames[0].head.lit_ns > begin_ns:
+        frame_lights = [frame_light(frame) for frame in frames]
+        if not frames or frame_lights[0].whole_ns > begin_ns:
             return None
-        ends_ns = [frame.head.lit_ns for frame in frames[1:]] + [end_ns]
+        shares = lit_times_ns(frame_lights, begin_ns, end_ns, end_ns) / (end_ns - begin_ns)
         places: list[npt.NDArray[np.uint32]] = []
         lights: list[FloatArray] = []
         turns: list[tuple[FloatArray, float]] = []
-        for frame, until_ns in zip(frames, ends_ns, strict=True):
-            lit_ns = min(until_ns, end_ns) - max(frame.head.lit_ns, begin_ns)
-            share = lit_ns / (end_ns - begin_ns)
+        for frame, share in zip(frames, shares.tolist(), strict=True):
             if share <= 0:
                 continue
             places.append(frame.lit)
@@ -142,6 +144,14 @@ class WatchedFrames:
             frames=len(places),
             shown_share=sum((share for _, share in turns), 0.0),
         )
+
+
+def frame_light(frame: ShownFrame) -> FrameLight:
+    """When a frame is lit, as its message says."""
+    head = frame.head
+    if head.moment_ns is None:
+        return on_screen(head.lit_ns)
+    return FrameLight(head.lit_ns, head.moment_ns, head.fades)
 
 
 def _mean(turns: list[tuple[FloatArray, float]]) -> FloatArray | None:
@@ -350,7 +360,10 @@ class LiveTracker(Closing):
         x_px = stars.x_px[good]
         y_px = stars.y_px[good]
         flux_e = stars.flux[good] * self._detector.settings.gain_e_per_dn
-        return FoundStars(x_px, y_px, flux_e, normalise(self.camera.rays(x_px, y_px)))
+        rays = normalise(self.camera.rays(x_px, y_px))
+        under = background or estimate_background(image)
+        widths_px = star_widths(image, under.level, x_px[:MAX_REPORTED], y_px[:MAX_REPORTED])
+        return FoundStars(x_px, y_px, flux_e, rays, widths_px)
 
     def reported_stars(self, solved: Solved) -> tuple[ReportedStar, ...]:
         """The brightest stars of an exposure, as a tracker reports them."""
@@ -364,7 +377,16 @@ class LiveTracker(Closing):
         for k in range(min(len(stars), MAX_REPORTED)):
             x_px, y_px = float(stars.x_px[k]), float(stars.y_px[k])
             flux_dn = float(stars.flux_e[k]) / gain
-            reported.append(ReportedStar(x_px, y_px, flux_dn, hip=hip.get(k) or None))
+            width_px = float(stars.width_px[k])
+            reported.append(
+                ReportedStar(
+                    x_px,
+                    y_px,
+                    flux_dn,
+                    hip=hip.get(k) or None,
+                    width_px=width_px if math.isfinite(width_px) else None,
+                )
+            )
         return tuple(reported)
 
     def _near(self, q_icrs_to_cam: FloatArray) -> tuple[IntArray, FloatArray]:

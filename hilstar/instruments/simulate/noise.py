@@ -531,6 +531,84 @@ def _check_light(file: BenchFile, stars: Stars) -> None:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class _ByMagnitude:
+    """Stars of the Sun's colour, from bright to faint, in one background: electrons of each,
+    their noise, and the errors that centroiders reach.
+
+    `shown` picks the rows of noise.csv, which end where detection does. `reached_px` (FAMILY, n)
+    has errors along an axis of those rows.
+    """
+
+    star: NoisyStar
+    v_mag: FloatArray
+    star_e: FloatArray
+    background_e: FloatArray
+    noise: Table
+    shown: slice
+    reached_px: FloatArray
+
+    def nea_curves_arcsec(
+        self, turns: FloatArray, star_e: FloatArray, bounds: FloatArray
+    ) -> FloatArray:
+        """NEA (WHO, 2, n), arcsec, of a field's first 1, 2, ... n stars, by who finds them.
+
+        `bounds` (3, n) are those of `between`.
+        """
+        detection = bounds[2]
+        nea_by_finder = [nea_arcsec(turns, bounds[:2], detection)]
+        for kind_px in self.reached_px:
+            # what a centroider reaches is the same on both axes
+            sigma_px = _at_rates(star_e, self.noise[self.shown], kind_px)
+            nea_by_finder.append(nea_arcsec(turns, np.stack([sigma_px, sigma_px]), detection))
+        return np.stack(nea_by_finder)
+
+
+def _by_magnitude(
+    file: BenchFile,
+    fields: _Fields,
+    brightest_v_mag: float,
+    finder: CentroidSettings,
+    rng: np.random.Generator,
+) -> _ByMagnitude:
+    """The table of magnitudes, from the brightest star on, in the fields' median background."""
+    background_e = float(np.median(fields.background_e))
+    star = noisy_star(file, fields.last_background_e)
+    first_mag = math.floor(brightest_v_mag / STEP_MAG) * STEP_MAG
+    v_mag = first_mag + STEP_MAG / BETWEEN * np.arange(MAX_ROWS * BETWEEN + 1.0)
+    zero_e_per_s = float(star_rates(file.config, file.folder)(*SOLAR_STAR)[0])
+    star_e = zero_e_per_s * file.config.tracker.exposure_s * flux_ratio(v_mag)
+    under_e = np.full(len(v_mag), background_e)
+    noise = star.noise(star_e, under_e, finder)
+    detectable = noise["detection"][::BETWEEN] >= UNSEEN
+    shown = slice(0, int(detectable.sum()) * BETWEEN + 1, BETWEEN)
+    reached_px = _measured_by_rate(star, noise["star_e"][shown], background_e, finder, rng)
+    return _ByMagnitude(star, v_mag, star_e, under_e, noise, shown, reached_px)
+
+
+def _by_channel(
+    file: BenchFile, sky_e: FloatArray, table: _ByMagnitude, finder: CentroidSettings
+) -> tuple[dict[str, FloatArray], dict[str, dict[str, float]]]:
+    """The S/N of the shown stars in each channel of a mosaic, by column of noise.csv, and each
+    channel's share of a star and background; both empty without a mosaic.
+    """
+    snr_columns: dict[str, FloatArray] = {}
+    channels: dict[str, dict[str, float]] = {}
+    mosaic = table.star.mosaic
+    if mosaic is None:
+        return snr_columns, channels
+    star_e = table.star_e[table.shown]
+    background_e = table.background_e[table.shown]
+    for number, (name, share, sky) in enumerate(zip(CHANNELS, *mosaic, strict=True)):
+        alone = noisy_star(file, sky_e, number).noise(star_e, background_e, finder)
+        snr_columns[f"snr_{name}"] = alone["snr"]
+        channels[name] = {
+            "star_share": float(share),
+            "background_e_per_px": float(sky * background_e[0]),
+        }
+    return snr_columns, channels
+
+
 def noise_budget(
     file: BenchFile,
     q_icrs_to_cam: FloatArray | None,
@@ -548,35 +626,20 @@ def noise_budget(
     camera = tracker_camera(tracker, file.folder)
     stars = bench_stars(config, file.folder)
     _check_light(file, stars)
-    brightest = float(stars.v_mag.min())
+    brightest_v_mag = float(stars.v_mag.min())
     if q_icrs_to_cam is None:
         fields = _all_over_the_sky(file, stars, camera, rng)
     else:
         fields = _one_field(file, stars, camera, q_icrs_to_cam)
         if len(fields.stars[0]):
-            brightest = float(fields.stars[0]["v_mag"].min())
+            brightest_v_mag = float(fields.stars[0]["v_mag"].min())
     sky_e = fields.last_background_e
-    middle_e = float(np.median(fields.background_e))
-    star = noisy_star(file, sky_e)
-    first_mag = math.floor(brightest / STEP_MAG) * STEP_MAG
-    v_mag: FloatArray = first_mag + STEP_MAG / BETWEEN * np.arange(MAX_ROWS * BETWEEN + 1.0)
-    zero_e_per_s = float(star_rates(config, file.folder)(*SOLAR_STAR)[0])
-    all_e = zero_e_per_s * tracker.exposure_s * flux_ratio(v_mag)
-    under_e = np.full(len(v_mag), middle_e)
-    noise = star.noise(all_e, under_e, finder)
-    detectable = noise["detection"][::BETWEEN] >= UNSEEN
-    shown = slice(0, int(detectable.sum()) * BETWEEN + 1, BETWEEN)
-    measured = _measured_by_rate(star, noise["star_e"][shown], middle_e, finder, rng)
-    reached = {f"{kind}_px": sigma_px for kind, sigma_px in zip(FAMILY, measured, strict=True)}
-    channels = {}
-    if star.mosaic is not None:
-        for number, (name, share, sky) in enumerate(zip(CHANNELS, *star.mosaic, strict=True)):
-            alone = noisy_star(file, sky_e, number).noise(all_e[shown], under_e[shown], finder)
-            reached[f"snr_{name}"] = alone["snr"]
-            channels[name] = {
-                "star_share": float(share),
-                "background_e_per_px": float(sky * middle_e),
-            }
+    table = _by_magnitude(file, fields, brightest_v_mag, finder, rng)
+    noise = table.noise
+    snr_columns, channels = _by_channel(file, sky_e, table, finder)
+    reached = {
+        f"{kind}_px": sigma_px for kind, sigma_px in zip(FAMILY, table.reached_px, strict=True)
+    }
     listed = None
     counts: list[float] = []  # stars that are found in a field, on average
     curves: list[FloatArray] = []  # NEA of each field by who finds its stars: (WHO, 2, n)
@@ -585,32 +648,26 @@ def noise_budget(
         bounds = between(noise, star_e)
         if q_icrs_to_cam is not None:
             image_e = software_image(sky_e, tracker.detector)
-            field_noise = star.noise(star_e, _at_stars(image_e, field), finder)
+            field_noise = table.star.noise(star_e, _at_stars(image_e, field), finder)
             bounds = np.stack([field_noise[name] for name in BOUNDS_OF_PLACE])
             listed = _rows({name: field[name] for name in LISTED}, field_noise, {})
-        detection = bounds[2]
-        counts.append(float(detection.sum()))
+        counts.append(float(bounds[2].sum()))
         turns = turns_of(camera, field["x_px"], field["y_px"])
-        nea_by_finder = [nea_arcsec(turns, bounds[:2], detection)]
-        for kind_px in measured:
-            # what a centroider reaches is the same on both axes
-            sigma_px = _at_rates(star_e, noise[shown], kind_px)
-            nea_by_finder.append(nea_arcsec(turns, np.stack([sigma_px, sigma_px]), detection))
-        curves.append(np.stack(nea_by_finder))
+        curves.append(table.nea_curves_arcsec(turns, star_e, bounds))
     faintest_star_mag = math.ceil(stars.v_mag.max() / LIMIT_STEP_MAG) * LIMIT_STEP_MAG
     nea = _nea_rows(fields.stars, curves, min(config.sky.faintest_v_mag, faintest_star_mag))
     return NoiseBudget(
         threshold_sigma=finder.threshold_sigma,
         minimum_pixels=finder.minimum_pixels,
-        background_e_per_px=middle_e,
+        background_e_per_px=float(table.background_e[0]),
         centroider=config.verify.judge or USUAL,
         fields=len(fields.stars),
-        rows=_rows({"v_mag": v_mag[shown]}, noise[shown], reached),
+        rows=_rows({"v_mag": table.v_mag[table.shown]}, noise[table.shown], reached | snr_columns),
         stars=listed,
         nea=nea,
         nea_arcsec=_by_way(nea[-1]),
         channels=channels,
-        found_v_mag=float(np.interp(-HALF_FOUND, -noise["detection"], v_mag)),
+        found_v_mag=float(np.interp(-HALF_FOUND, -noise["detection"], table.v_mag)),
         found_stars=float(np.median(counts)),
         identified_share=float(np.mean(np.array(counts) >= IDENTIFIED)),
     )

@@ -2,8 +2,8 @@
 it answers over a link.
 
 An exposure is one of `exposure_s` every 1 / rate seconds. It is computed once a frame has come that
-was lit after its end, or GRACE_NS later. One that cannot begin in time, because those before it
-took too long, is passed over and counted.
+was lit after its end, or GRACE_PERIODS refreshes later. One that cannot begin in time, because
+those before it took too long, is passed over and counted.
 """
 
 import heapq
@@ -39,7 +39,8 @@ from hilstar.instruments.simulate.live_exposure import LOST, TRACKING, LiveTrack
 from hilstar.server.answers.answer import Answer
 from hilstar.server.gige.camera import GigECamera
 
-GRACE_NS = 50 * NS_PER_MS  # three refreshes at 60 Hz
+# An exposure's last frame may be late by some refreshes; a slow display has longer ones.
+GRACE_PERIODS, MIN_GRACE_NS = 3, 50 * NS_PER_MS
 SLICE_MS = 20
 # errors about the boresight are this many times those across it, as stars have a fifth of the lever
 ROLL = 4.0
@@ -178,6 +179,8 @@ class TrackerProcess:
         self._watch = watch
         self._planted = planted
         self._period_ns = round(NS_PER_S / rate_hz)
+        refresh_ns = NS_PER_S / tracker.config.monitor.refresh_hz
+        self._grace_ns = max(round(GRACE_PERIODS * refresh_ns), MIN_GRACE_NS)
         self._errors = PlantedErrors(planted, tracker.camera.focal_length_px, rng)
         self._waiting: list[tuple[int, int, Answer]] = []  # when it is due, ns, and its number
         self._host: HostClock = HOST_CLOCK
@@ -249,9 +252,9 @@ class TrackerProcess:
         while (
             not stop.is_set()
             and self._tracker.frames.newest_ns < end_ns
-            and self._host.now_ns() < end_ns + GRACE_NS
+            and self._host.now_ns() < end_ns + self._grace_ns
         ):
-            due_ns = min([end_ns + GRACE_NS, *(waiting[0] for waiting in self._waiting[:1])])
+            due_ns = min([end_ns + self._grace_ns, *(waiting[0] for waiting in self._waiting[:1])])
             self._take(min(SLICE_MS, max(1, math.ceil((due_ns - self._host.now_ns()) / NS_PER_MS))))
             self._put(send)
 

@@ -226,19 +226,8 @@ class Twin(Closing):
         panels = [self.true_panel]
         if self.differs:
             panels.append(self.bench.panel)
-        view = rolled(self._exposure_at(frame), self.config.tracker)
-        glow_e = self._mosaic.grey(self.glow_e_per_s) * exposure_s
-        lights: Sequence[Iterable[FloatArray | LitLight]]
-        if view.scan.scanout_s and exposure_s:
-            phase_s = self._phase_s(first_frame)
-            parts = []
-            for optics, panel in zip((self.true_optics, self.sky_optics), panels, strict=False):
-                parts.append(rolling_light(self.bench, optics.geometry, panel, view, phase_s))
-            lights = [light for light, _ in parts]
-            _, glow_share = parts[0]
-            glow_e = glow_e * glow_share
-        else:
-            lights = exposure_lights(self.bench, frame, first_frame, panels)
+        lights, glow_share = self._lights(frame, first_frame, panels)
+        glow_e = self._mosaic.grey(self.glow_e_per_s) * exposure_s * glow_share
         by_primary = self.true_optics.images_e_per_s(lights[0], self.primaries) * exposure_s
         pixels_e = self._mosaic.shown(by_primary)
         bayer = self._mosaic.bayer
@@ -251,10 +240,6 @@ class Twin(Closing):
         if self.differs:
             as_assumed = self.sky_optics.images_e_per_s(lights[1], self.primaries) * exposure_s
             assumed = self._found_in(self._mosaic.shown(as_assumed))
-        by_channel: tuple[tuple[FloatArray, FloatArray], ...] = ()
-        if (colours := self.bench.colours) is not None and not colours.mono:
-            shown_by_channel = np.tensordot(colours.by_primary, by_primary, 1)
-            by_channel = tuple(zip(shown_by_channel, skies, strict=True))
         icrs_to_cam = to_matrix(frame.q_icrs_to_cam)
         view = self.bench.view(frame.q_icrs_to_cam)
         discs = self.bench.discs(view)
@@ -280,8 +265,35 @@ class Twin(Closing):
             pixels_e=pixels_e,
             discs=tuple(hidden_cones),
             under_e=under_e,
-            by_channel=by_channel,
+            by_channel=self._by_channel(by_primary, skies),
         )
+
+    def _lights(
+        self, frame: Frame, first_frame: int, panels: Sequence[Panel]
+    ) -> tuple[Sequence[Iterable[FloatArray | LitLight]], FloatArray | float]:
+        """What each of `panels` lights during an exposure, and the share of the screen's glow that
+        reaches each row of the detector.
+        """
+        view = rolled(self._exposure_at(frame), self.config.tracker)
+        if not view.scan.scanout_s or not self.config.tracker.exposure_s:
+            return exposure_lights(self.bench, frame, first_frame, panels), 1.0
+        phase_s = self._phase_s(first_frame)
+        parts = []
+        for optics, panel in zip((self.true_optics, self.sky_optics), panels, strict=False):
+            parts.append(rolling_light(self.bench, optics.geometry, panel, view, phase_s))
+        lights = [light for light, _ in parts]
+        _, glow_share = parts[0]
+        return lights, glow_share
+
+    def _by_channel(
+        self, by_primary: FloatArray, skies: Sequence[FloatArray]
+    ) -> tuple[tuple[FloatArray, FloatArray], ...]:
+        """The display's image and the sky's of each channel of a tracker in colour; () of grey."""
+        colours = self.bench.colours
+        if colours is None or colours.mono:
+            return ()
+        shown_by_channel = np.tensordot(colours.by_primary, by_primary, 1)
+        return tuple(zip(shown_by_channel, skies, strict=True))
 
     def _found_in(self, pixels: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """The image in which the tracker's software finds stars, of the detector's pixels."""

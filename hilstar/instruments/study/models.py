@@ -780,27 +780,48 @@ def within_mag(bv: FloatArray, mag: FloatArray) -> tuple[float, float]:
     return half, most
 
 
-def temperature_scales(directory: Path) -> ChartFinding:
+@dataclass(frozen=True, slots=True)
+class ScaleErrors:
+    """Scales by name at B-V (n,): kelvin, their difference from Torres 2010's in percent, and that
+    of their electrons in mag. `within` has the half and the 95 % of Hipparcos's stars, mag.
+    """
+
+    bv: FloatArray
+    torres_k: FloatArray
+    kelvin: dict[str, FloatArray]
+    percent: dict[str, FloatArray]
+    mag: dict[str, FloatArray]
+    within: dict[str, tuple[float, float]]
+
+
+def scale_errors() -> ScaleErrors:
     """The scales that a bench file can choose, beside Torres 2010, and their error in electrons."""
     bv = np.union1d(SCALE_BV_MAG, -1e-9)  # both sides of wang2021's step
-    torres = torres2010_k(bv)
+    torres_k = torres2010_k(bv)
     kelvin = {SUPERGIANTS: torres2010_k(bv, supergiant=True)}
     for name, scale in TEMPERATURE_SCALES.items():
         kelvin[name] = scale(bv)
     optics = study_optics("ccd47-20")
-    base = dgs_electrons_per_s(torres, optics, Photometry())
+    base = dgs_electrons_per_s(torres_k, optics, Photometry())
     percent = {}
     mag = {}
     for name, scale_k in kelvin.items():
-        percent[name] = 100 * (scale_k / torres - 1)
+        percent[name] = 100 * (scale_k / torres_k - 1)
         electrons = dgs_electrons_per_s(scale_k, optics, Photometry())
         mag[name] = magnitude(electrons / base)
     within = {}
     for name in TEMPERATURE_SCALES:
         within[name] = within_mag(bv, mag[name])
-    zero = int(np.searchsorted(bv, 0.0))
-    before_step_k = kelvin["wang2021"][zero - 1]
-    step_k = before_step_k - kelvin["wang2021"][zero]
+    return ScaleErrors(bv, torres_k, kelvin, percent, mag, within)
+
+
+def temperature_scales(directory: Path) -> ChartFinding:
+    """The chart and the table of `scale_errors`, and what they say."""
+    errors = scale_errors()
+    within = errors.within
+    zero = int(np.searchsorted(errors.bv, 0.0))
+    before_step_k = errors.kelvin["wang2021"][zero - 1]
+    step_k = before_step_k - errors.kelvin["wang2021"][zero]
     with_most = names_with(within, "{half:.3f} ({most:.2f}) mag by {name}")
     step_percent = 100 * step_k / before_step_k
     text = (
@@ -812,6 +833,16 @@ def temperature_scales(directory: Path) -> ChartFinding:
         f"The scale wang2021 steps down by {step_k:.0f} K at B-V = 0; half of Hipparcos is within"
         f" {with_half} of Torres 2010"
     )
+    draw_scales(errors, directory / "temperature_scales", finding)
+    columns = {"bv_mag": errors.bv, "torres2010_k": errors.torres_k}
+    for unit, values in (("k", errors.kelvin), ("percent", errors.percent), ("mag", errors.mag)):
+        columns |= relabelled(values, {name: f"{name}_{unit}" for name in values})
+    write_columns(directory / "temperature_scales.csv", columns)
+    return ChartFinding("temperature_scales", text)
+
+
+def draw_scales(errors: ScaleErrors, stem: Path, title: str) -> None:
+    """Draw the scales, and their differences in percent and in electrons, below each other."""
     note = (
         "Torres 2010 (Flower 1996) for dwarfs and giants is the reference. Electrons: CCD47-20, +"
         " is fainter."
@@ -821,29 +852,22 @@ def temperature_scales(directory: Path) -> ChartFinding:
     below = PanelSpec(
         ylabel="difference in electrons [mag]", xlabel="B-V [mag]", levels=(ZERO_LINE,)
     )
-    labels = {name: name.replace(SUPERGIANTS, "Torres, supergiants") for name in kelvin}
+    labels = {name: name.replace(SUPERGIANTS, "Torres, supergiants") for name in errors.kelvin}
     mag_labels = dict(labels)
-    for name, (half, _) in within.items():
+    for name, (half, _) in errors.within.items():
         mag_labels[name] = f"{name}: half within {half:.3f}"
-    scales = {"Torres 2010": torres, **relabelled(kelvin, labels)}
-    percent_curves = relabelled(percent, labels)
-    mag_curves = relabelled(mag, mag_labels)
+    bv = errors.bv
+    scales = {"Torres 2010": errors.torres_k, **relabelled(errors.kelvin, labels)}
+    percent_curves = relabelled(errors.percent, labels)
+    mag_curves = relabelled(errors.mag, mag_labels)
     kelvin_colours = (INK, *SCALE_COLOURS)
     kelvin_styles = ("-", *SCALE_STYLES)
-    kelvin_panel = CurvePanel(bv, scales, above, kelvin_colours, styles=kelvin_styles)
-    percent_panel = CurvePanel(bv, percent_curves, middle, SCALE_COLOURS, styles=SCALE_STYLES)
-    mag_panel = CurvePanel(bv, mag_curves, below, SCALE_COLOURS, styles=SCALE_STYLES)
     panels = (
-        kelvin_panel,
-        percent_panel,
-        mag_panel,
+        CurvePanel(bv, scales, above, kelvin_colours, styles=kelvin_styles),
+        CurvePanel(bv, percent_curves, middle, SCALE_COLOURS, styles=SCALE_STYLES),
+        CurvePanel(bv, mag_curves, below, SCALE_COLOURS, styles=SCALE_STYLES),
     )
-    draw_curves(directory / "temperature_scales", finding, panels, note)
-    columns = {"bv_mag": bv, "torres2010_k": torres}
-    for unit, values in (("k", kelvin), ("percent", percent), ("mag", mag)):
-        columns |= relabelled(values, {name: f"{name}_{unit}" for name in values})
-    write_columns(directory / "temperature_scales.csv", columns)
-    return ChartFinding("temperature_scales", text)
+    draw_curves(stem, title, panels, note)
 
 
 def relabelled(

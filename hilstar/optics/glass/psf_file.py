@@ -456,6 +456,35 @@ def _parsed(hdus: "fits.HDUList") -> Glass:
     header = hdus[0].header
     basis = hdus[0].data
     table = hdus[POINTS].data
+    _check_layout(header, basis, table)
+    column = {name: np.asarray(table[name], dtype=np.float64) for name in (*AXES, *FACTS)}
+    weights = np.asarray(table["weights"], dtype=np.float64).reshape(len(table), -1)
+    if weights.shape[1] != len(basis) or not 1 <= len(table) <= MAX_IMAGES:
+        raise InputError(
+            f"{len(table)} points of {weights.shape[1]} weights and {len(basis)} basis images;"
+            " write one weight for each"
+        )
+    axes, place = _product(np.stack([column[name] for name in AXES], axis=1))
+    shape = tuple(len(axis) for axis in axes)
+    lateral_px = np.stack([column["lateral_x_px"], column["lateral_y_px"]], axis=1)
+    return Glass(
+        *axes,
+        basis=basis.astype(np.float32),
+        weights=_ordered(weights, place, shape),
+        illumination=_ordered(column["relative_illumination"], place, shape),
+        outside=_ordered(column["outside_share"], place, shape),
+        lateral_px=_ordered(lateral_px, place, shape),
+        per_px=header.get("OVERSAMP", 1),
+        pixel_integrated=header.get("PIXINT", False),
+        residual=float(header.get("RESIDUAL", 0.0)),
+        lens=_lens(header),
+        transmission=_transmission(hdus),
+        history=tuple(str(line) for line in header.get("HISTORY", ())),
+    )
+
+
+def _check_layout(header: "fits.Header", basis: Any, table: Any) -> None:
+    """Raise InputError where keys, columns or images are not those of this layout's version."""
     per_px = header.get("OVERSAMP", 1)
     integrated = header.get("PIXINT", False)
     if header.get("PSFVERS") != VERSION:
@@ -476,50 +505,29 @@ def _parsed(hdus: "fits.HDUList") -> Glass:
         raise InputError(
             "its first image is no cube of odd width and height; make it with `hilstar optics`"
         )
-    column = {name: np.asarray(table[name], dtype=np.float64) for name in (*AXES, *FACTS)}
-    weights = np.asarray(table["weights"], dtype=np.float64).reshape(len(table), -1)
-    if weights.shape[1] != len(basis) or not 1 <= len(table) <= MAX_IMAGES:
-        raise InputError(
-            f"{len(table)} points of {weights.shape[1]} weights and {len(basis)} basis images;"
-            " write one weight for each"
-        )
-    axes, place = _product(np.stack([column[name] for name in AXES], axis=1))
-    shape = tuple(len(axis) for axis in axes)
+
+
+def _lens(header: "fits.Header") -> Lens | None:
+    """The lens in a header's keys; None where all of them are 0."""
     numbers: list[Any] = [header.get(key, 0.0) for key in LENS_KEYS]
+    if not any(numbers):
+        return None
     k1, k2, k3, p1, p2 = numbers
-    if any(numbers):
-        lens = Lens((k1, k2, k3), (p1, p2))
-    else:
-        lens = None
-    transmission = None
-    if TRANSMISSION in hdus:
-        curve = [
-            np.asarray(hdus[TRANSMISSION].data[name], dtype=np.float64)
-            for name in ("wavelength_nm", "transmission")
-        ]
-        transmission = Curve(*curve)
-        if (
-            len(curve[0]) < 2
-            or not (np.diff(curve[0]) > 0).all()
-            or not ((curve[1] >= 0) & (curve[1] <= 1)).all()
-        ):
-            raise InputError(
-                f"the table {TRANSMISSION} has wavelengths that do not rise, or values beyond 0 to"
-                " 1; write those"
-            )
-    return Glass(
-        *axes,
-        basis=basis.astype(np.float32),
-        weights=_ordered(weights, place, shape),
-        illumination=_ordered(column["relative_illumination"], place, shape),
-        outside=_ordered(column["outside_share"], place, shape),
-        lateral_px=_ordered(
-            np.stack([column["lateral_x_px"], column["lateral_y_px"]], axis=1), place, shape
-        ),
-        per_px=per_px,
-        pixel_integrated=integrated,
-        residual=float(header.get("RESIDUAL", 0.0)),
-        lens=lens,
-        transmission=transmission,
-        history=tuple(str(line) for line in header.get("HISTORY", ())),
-    )
+    return Lens((k1, k2, k3), (p1, p2))
+
+
+def _transmission(hdus: "fits.HDUList") -> Curve | None:
+    """The table TRANSMISSION; None without one. Raises InputError for one that is no curve."""
+    if TRANSMISSION not in hdus:
+        return None
+    table = hdus[TRANSMISSION].data
+    wavelength_nm = np.asarray(table["wavelength_nm"], dtype=np.float64)
+    transmission = np.asarray(table["transmission"], dtype=np.float64)
+    is_rising = len(wavelength_nm) > 1 and (np.diff(wavelength_nm) > 0).all()
+    is_share = ((transmission >= 0) & (transmission <= 1)).all()
+    if not is_rising or not is_share:
+        raise InputError(
+            f"the table {TRANSMISSION} has wavelengths that do not rise, or values beyond 0 to"
+            " 1; write those"
+        )
+    return Curve(wavelength_nm, transmission)

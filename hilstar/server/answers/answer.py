@@ -15,13 +15,15 @@ JUMP_NS = NS_PER_S
 
 class ReportedStar(NamedTuple):
     """A star that the tracker reports: its centroid in the tracker's pixels, its signal `dn` in
-    digital numbers and its Hipparcos number `hip`, None where the tracker gives none.
+    digital numbers, its Hipparcos number `hip` and its width `width_px`, one sigma of its image,
+    None where the tracker gives none.
     """
 
     x_px: float
     y_px: float
     dn: float | None = None
     hip: int | None = None
+    width_px: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

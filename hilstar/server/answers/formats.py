@@ -45,6 +45,8 @@ MAX_KEPT_BYTES = 2 * MAX_FRAME_BYTES
 MAX_JSON_BYTES = 65_536  # with the centroids of a thousand stars
 # A number beyond its limit is dropped without refusing the answer; a longer mode is cut.
 MAX_STARS, MAX_HIP, MAX_MODE_CHARACTERS = 1_000_000, 2**31 - 1, 64
+MAX_WIDTH_PX = 1000.0
+STAR_BLANKS = (None,) * len(ReportedStar._fields)
 PAUSE_NS = NS_PER_S // 10  # after a longer silence on the line a new frame begins
 CCSDS_HEADER_BYTES, CCSDS_VERSION_MASK = 6, 0xE0
 SLIP_END, SLIP_ESC, SLIP_ESC_END, SLIP_ESC_ESC = b"\xc0", b"\xdb", b"\xdc", b"\xdd"
@@ -79,7 +81,7 @@ class JsonAnswer(msgspec.Struct, frozen=True):
     Python function gives it, and as the other formats are decoded to.
 
     `t_ns` is on the tracker's clock; `q` has the order and direction of `[answers] convention`;
-    `rate` is in rad/s; `centroids` are rows [x_px, y_px, dn, hip].
+    `rate` is in rad/s; `centroids` are rows [x_px, y_px, dn, hip, width_px].
     """
 
     t_ns: int | None = None
@@ -134,18 +136,20 @@ def answer_of(
 
 
 def reported_stars(rows: list[list[float | None]]) -> tuple[ReportedStar, ...]:
-    """The stars in rows [x_px, y_px, dn, hip], whose last two may be missing; rows without a finite
-    position are dropped.
+    """The stars in rows [x_px, y_px, dn, hip, width_px], whose last three may be missing; rows
+    without a finite position are dropped.
     """
     stars = []
     for row in rows:
-        x_px, y_px, dn, hip = [*row, None, None, None, None][:4]
-        if x_px is not None and y_px is not None and math.isfinite(x_px) and math.isfinite(y_px):
-            stars.append(
-                ReportedStar(
-                    x_px, y_px, dn, int(hip) if hip is not None and 0 < hip <= MAX_HIP else None
-                )
-            )
+        x_px, y_px, dn, hip, width_px = [*row, *STAR_BLANKS][: len(STAR_BLANKS)]
+        if x_px is None or y_px is None or not (math.isfinite(x_px) and math.isfinite(y_px)):
+            continue
+        number = None
+        if hip is not None and 0 < hip <= MAX_HIP:
+            number = int(hip)
+        if width_px is not None and not 0 < width_px <= MAX_WIDTH_PX:
+            width_px = None
+        stars.append(ReportedStar(x_px, y_px, dn, number, width_px))
     return tuple(stars)
 
 

@@ -18,6 +18,7 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.server.answers.light_times import FrameLight, lit_times_ns, on_screen, without_screen
 
 # Frames older than this are forgotten; an answer that arrives later is not compared.
 KEPT_NS = 20 * NS_PER_S
@@ -31,10 +32,11 @@ MAX_STEP_RAD = np.radians(2.0)
 
 class LitFrame(NamedTuple):
     """One displayed frame. Its light begins at `host_ns` on the host's clock and at `light_ns` on
-    the sender's clock, ns.
+    the sender's clock, ns; without a screen these are the moment of its attitude.
 
     `q` is the displayed q_icrs_to_cam (w, x, y, z), None where the frame shows no sky.
-    `rate_rad_s` (3,), rad/s, camera axes, is None unless the frame is drawn in motion.
+    `rate_rad_s` (3,), rad/s, camera axes, is None unless the frame is drawn in motion. `fades`: no
+    screen held the frame before (see `light_times`).
     """
 
     number: int
@@ -42,6 +44,7 @@ class LitFrame(NamedTuple):
     light_ns: int
     q: FloatArray | None
     rate_rad_s: FloatArray | None = None
+    fades: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,17 +65,17 @@ class Lit:
 class LitFrames:
     """The frames of the last KEPT_NS. One thread may add frames while another calls `over`.
 
-    A frame is lit until the next one; `period_ns` is the refresh period. `centred`: no screen holds
-    the frames, so each stands for one period centred on its moment. `hold_s` is how long a row of
-    the screen stays lit: a frame drawn in motion shows its mean attitude `hold_s` / 2 after its
-    begin.
+    `period_ns` is the refresh period. `centred`: no screen holds the frames (see `light_times`).
+    `hold_s` is how long a row of the screen stays lit: a frame drawn in motion shows its mean
+    attitude `hold_s` / 2 after its begin.
     """
 
     def __init__(self, period_ns: float, hold_s: float = 0.0, *, centred: bool = True) -> None:
         self.dark_ns = 0  # time without a sky since the start
         self._frames: deque[LitFrame] = deque(maxlen=max(16, int(KEPT_NS / period_ns)))
         self._hold_s = hold_s
-        self._early_ns = round(period_ns / 2) if centred else 0
+        self._centred = centred
+        self._early_ns = round(period_ns / 2)
 
     def add(self, frame: LitFrame) -> None:
         """Add the newest frame."""
@@ -93,39 +96,36 @@ class LitFrames:
         """
         frames = list(self._frames)
         first = len(frames) - 1
-        while first >= 0 and self._begin_ns(frames[first]) > start_ns:
+        while first >= 0 and self._light(frames[first]).whole_ns > start_ns:
             first -= 1
         if first < 0:
             return None
+        end_ns = max(end_ns, start_ns + 1)  # one of no length has the frames at its moment
         last = first
-        while last + 1 < len(frames) and self._begin_ns(frames[last + 1]) < end_ns:
+        while last + 1 < len(frames) and self._light(frames[last]).whole_ns < end_ns:
             last += 1
+        lights = [self._light(frame) for frame in frames[first : last + 1]]
+        gone_ns = lights[-1].whole_ns + MAX_HELD_NS
+        lit_ns = np.rint(lit_times_ns(lights, start_ns, end_ns, gone_ns))
         kept = []
-        lit_ns = []
-        whole_ns = 0
         for k in range(first, last + 1):
-            begin_ns = self._begin_ns(frames[k])
-            if k + 1 < len(frames):
-                gone_ns = self._begin_ns(frames[k + 1])
-            else:
-                gone_ns = begin_ns + MAX_HELD_NS
-            # An exposure of no length still has the frame at its moment: any weight will do.
-            if end_ns > start_ns:
-                overlap_ns = max(min(gone_ns, end_ns) - max(begin_ns, start_ns), 0)
-            else:
-                overlap_ns = 1
-            if frames[k].q is not None and overlap_ns:
+            if frames[k].q is not None and lit_ns[k - first]:
                 kept.append(k)
-                lit_ns.append(overlap_ns)
-                whole_ns += overlap_ns
-        if not kept or whole_ns < MIN_LIT_SHARE * (end_ns - start_ns):
+        kept_ns = lit_ns[np.array(kept, dtype=np.intp) - first]
+        if not kept or kept_ns.sum() < MIN_LIT_SHARE * (end_ns - start_ns):
             return None
-        return self._mean(
-            frames, kept, np.array(lit_ns, dtype=np.float64), (start_ns + end_ns) // 2
-        )
+        return self._mean(frames, kept, kept_ns, (start_ns + end_ns) // 2)
 
-    def _begin_ns(self, frame: LitFrame) -> int:
-        return frame.host_ns - (self._early_ns if frame.rate_rad_s is None else 0)
+    def _light(self, frame: LitFrame) -> FrameLight:
+        """When a frame is lit; one drawn in motion begins at its own moment, and is whole at that
+        of its mean attitude.
+        """
+        if not self._centred:
+            return on_screen(frame.host_ns)
+        if frame.rate_rad_s is None:
+            return without_screen(frame.host_ns, self._early_ns, frame.fades)
+        half_hold_ns = round(self._hold_s * NS_PER_S / 2)
+        return without_screen(frame.host_ns + half_hold_ns, half_hold_ns, frame.fades)
 
     def _mean(
         self, frames: list[LitFrame], kept: list[int], lit_ns: FloatArray, middle_ns: int

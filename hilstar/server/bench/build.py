@@ -8,12 +8,13 @@ import dataclasses
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from msgspec.structs import replace
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import Float32Array, FloatArray, IntArray
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.panel import Panel
@@ -42,7 +43,14 @@ from hilstar.server.bench.effort import (
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.monitor import bench_calibration, scan_of
 from hilstar.server.bench.primary_panels import bench_colours, primary_panels
-from hilstar.server.bench.scene import Display, path_of, plan_scene, scenes_of, turning_of
+from hilstar.server.bench.scene import (
+    Display,
+    Scene,
+    path_of,
+    plan_scene,
+    scenes_of,
+    turning_of,
+)
 from hilstar.server.bench.star_glass import star_glass
 from hilstar.server.bench.star_light import (
     bench_sources,
@@ -98,99 +106,133 @@ def assembled(
     InputError.
     """
     if context is not None:  # a window's context, which the window frees
-        return _assembled(file, stars, context, sources, timed, on_screen)
+        return _bench(_parts(file, stars, sources, context, on_screen), timed)
     context = headless_context(file.config.render.gpu)
     try:
-        return _assembled(file, stars, context, sources, timed, on_screen)
+        return _bench(_parts(file, stars, sources, context, on_screen), timed)
     except BaseException:
         if context is not None:
             context.release()
         raise
 
 
-def _assembled(
-    file: BenchFile,
-    stars: Stars,
-    context: Context | None,
-    sources: Sources,
-    timed: bool,
-    on_screen: bool,
-) -> Bench:
-    render = file.config.render
-    calibration = bench_calibration(file.config, file.folder)
-    camera = bench_camera(file.config, file.folder)
-    colours = bench_colours(file.config, file.folder, stars.catalog)
+@dataclass(frozen=True)
+class Parts:
+    """What a bench consists of with any effort: read from its files, and planned once.
+
+    `stars` have the light of the primaries where there are any. `spectra` gives stars' shares of
+    the PSF's wavelengths; None where the PSF is of one light.
+    """
+
+    file: BenchFile
+    stars: Stars
+    sources: Sources
+    display: Display
+    uniformity: Float32Array | None
+    colours: Colours | None
+    panels: tuple[Panel, ...]
+    scene: Scene
+    spectra: Callable[[Stars, IntArray], FloatArray] | None
+    planned: Effort
+
+    def with_effort(self, effort: Effort) -> Bench:
+        """The bench that draws with an effort, by a renderer of its own."""
+        file, scene, calibration = self.file, self.scene, self.display.calibration
+        codes = effort.quantisation
+        render = replace(
+            file.config.render, quantisation=codes, motion_above_px=effort.motion_above_px
+        )
+        config = replace(file.config, render=render)
+        faintest = QUANTISERS[codes].faintest_e_per_s(scene.light.panel, scene.psf)
+        shown, faint = split_by_rate(self.stars, faintest, self.display.drive)
+        return Bench(
+            file=file,
+            config=config,
+            effort=effort,
+            camera=self.display.camera,
+            scan=scan_of(config.monitor),
+            calibration=calibration,
+            uniformity=self.uniformity,
+            darkest=self.display.darkest,
+            flux_at_white_e_per_s=scene.white_e_per_s,
+            faintest_shown_e_per_s=faintest,
+            stars=self.seen_stars(self.stars),
+            shown_stars=self.seen_stars(shown),
+            faint_stars=faint,
+            sources=self.sources,
+            tracker_psf=before_detector(config, file.folder, self.display.camera),
+            spectra=self.spectra,
+            drawn=scene.choice,
+            renderer=open_backend(self.target(effort), self.display.context),
+            colours=self.colours,
+            panel=Panel(calibration.response, scene.white_e_per_s, self.uniformity, self.panels),
+        )
+
+    def target(self, effort: Effort) -> Target:
+        """What a renderer draws with an effort."""
+        target = Target(
+            resolution_px=self.file.config.monitor.resolution_px,
+            psf=self.scene.psf,
+            response=self.display.calibration.response,
+            flux_at_white_e_per_s=self.scene.white_e_per_s,
+            quantisation=effort.quantisation,
+            uniformity=self.uniformity,
+            sides=effort.sides,
+            seen=self.scene.light.seen,
+        )
+        colours = self.colours
+        if colours is None:
+            return target
+        together = colours.by_primary.T @ colours.by_primary
+        return dataclasses.replace(
+            target, primaries=self.panels, places_px=colours.places_px, together=together
+        )
+
+    def seen_stars(self, stars: Stars) -> Stars:
+        """Stars as a camera that moves with the bench's sources sees them, in its colours."""
+        seen = moved(stars, self.sources.moving)
+        if self.colours is None:
+            return seen
+        return self.colours.on(seen)
+
+
+def _parts(
+    file: BenchFile, stars: Stars, sources: Sources, context: Context | None, on_screen: bool
+) -> Parts:
+    config = file.config
+    calibration = bench_calibration(config, file.folder)
+    camera = bench_camera(config, file.folder)
+    colours = bench_colours(config, file.folder, stars.catalog)
     stars, drive = _in_colour(stars, colours)
-    uniformity = calibration.uniformity_map(file.config.monitor.resolution_px)
+    uniformity = calibration.uniformity_map(config.monitor.resolution_px)
     darkest = 1.0 if uniformity is None else float(uniformity.min())
     display = Display(
         calibration=calibration,
         camera=camera,
         context=context,
         drive=drive,
-        turning=turning_of(file.config, on_screen),
-        path_px=path_of(file.config, camera, on_screen),
+        turning=turning_of(config, on_screen),
+        path_px=path_of(config, camera, on_screen),
         darkest=darkest,
     )
-    scenes = scenes_of(file, stars, display)
-    (psf, drawn, white_e_per_s, light), planned = plan_scene(render, scenes)
+    scene, planned = plan_scene(config.render, scenes_of(file, stars, display))
     panels: tuple[Panel, ...] = ()
     if colours is not None:
-        panels = primary_panels(file, colours, white_e_per_s, uniformity)
-    glass = star_glass(file, psf)
+        panels = primary_panels(file, colours, scene.white_e_per_s, uniformity)
+    glass = star_glass(file, scene.psf)
     spectra = None if glass is None else glass.shares
+    return Parts(
+        file, stars, sources, display, uniformity, colours, panels, scene, spectra, planned
+    )
 
-    def bench_by(effort: Effort) -> Bench:
-        codes = effort.quantisation
-        chosen = replace(render, quantisation=codes, motion_above_px=effort.motion_above_px)
-        config = replace(file.config, render=chosen)
-        target = Target(
-            resolution_px=config.monitor.resolution_px,
-            psf=psf,
-            response=calibration.response,
-            flux_at_white_e_per_s=white_e_per_s,
-            quantisation=codes,
-            uniformity=uniformity,
-            sides=effort.sides,
-            seen=light.seen,
-        )
-        if colours is not None:
-            together = colours.by_primary.T @ colours.by_primary
-            target = dataclasses.replace(
-                target, primaries=panels, places_px=colours.places_px, together=together
-            )
-        faintest = QUANTISERS[codes].faintest_e_per_s(light.panel, psf)
-        shown, faint = split_by_rate(stars, faintest, drive)
-        return Bench(
-            file=file,
-            config=config,
-            effort=effort,
-            camera=camera,
-            scan=scan_of(config.monitor),
-            calibration=calibration,
-            uniformity=uniformity,
-            darkest=darkest,
-            flux_at_white_e_per_s=white_e_per_s,
-            faintest_shown_e_per_s=faintest,
-            stars=seen_with(stars),
-            shown_stars=seen_with(shown),
-            faint_stars=faint,
-            sources=sources,
-            tracker_psf=before_detector(config, file.folder, camera),
-            spectra=spectra,
-            drawn=drawn,
-            renderer=open_backend(target, context),
-            colours=colours,
-            panel=Panel(calibration.response, white_e_per_s, uniformity, panels),
-        )
 
-    def seen_with(some: Stars) -> Stars:
-        among = moved(some, sources.moving)
-        if colours is None:
-            return among
-        return colours.on(among)
-
-    bench = bench_by(planned)
+def _bench(parts: Parts, timed: bool) -> Bench:
+    """The bench with the planned effort; where a timed run's plan depends on what codes cost, with
+    the effort that this machine's own times allow.
+    """
+    planned, light = parts.planned, parts.scene.light
+    render = parts.file.config.render
+    bench = parts.with_effort(planned)
     if not timed or not planned.by_cost or render.codes_ms is not None:
         return bench
     # The one that is not taken stays in the GL context until that is freed.
@@ -199,7 +241,7 @@ def _assembled(
     def frame_ms(method: Quantisation, for_s: float) -> float:
         if method not in benches:
             by_method = replace(render, quantisation=method)
-            benches[method] = bench_by(plan_effort(by_method, light))
+            benches[method] = parts.with_effort(plan_effort(by_method, light))
         return timed_frame_ms(benches[method], for_s)
 
     limit_ms = IN_TIME_SHARE * light.refresh_ms

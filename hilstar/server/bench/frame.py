@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -84,8 +84,8 @@ class Frame:
     3). `rows` is a structured array of TRUTH_DTYPE, a row for each star whose
     sprite touches the monitor, and `star` (n,) the places of the same stars in the bench's,
     negative for light that a fault adds. `t_ns` is the moment for which bodies were placed. `truth`
-    is `rows` with the errors of
-    the stars, which `errors` reads when they are first asked for.
+    is `rows` with the errors of the stars, which `errors` reads when they are first asked for, or
+    when the frame is pickled.
     """
 
     q_icrs_to_cam: FloatArray
@@ -103,6 +103,9 @@ class Frame:
         brightest first.
         """
         return self.errors(self.rows)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"truth": self.truth, "errors": without_errors}
 
     @property
     def linear(self) -> Float32Array:

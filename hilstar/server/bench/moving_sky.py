@@ -5,6 +5,7 @@ wider than a point.
 import logging
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from hilstar.optics.camera import Camera
 from hilstar.optics.layers.view import POINT_PX
 from hilstar.server.bench.config import GEOCENTRE, SOURCE, BenchConfig
 from hilstar.server.bench.config.bench_config import DAY_NS, UNIX, epoch_utc_ns, from_source, jyear
+from hilstar.server.bench.config.sky import Bodies, SkySettings
 from hilstar.server.bench.site import Ground
 from hilstar.sky.bodies.kernel import Kernel
 from hilstar.sky.bodies.light import bodies_bv_mag, bodies_electrons_per_s
@@ -23,6 +25,9 @@ from hilstar.sky.bodies.orbit import TLE_ADVICE, Geocentre, Orbit, TleOrbit
 from hilstar.sky.bodies.shapes import EARTH
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.stars import total_and_colours
+
+if TYPE_CHECKING:
+    from hilstar.sky.bodies.passes import Satellites
 
 log = logging.getLogger(__name__)
 
@@ -54,7 +59,20 @@ def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) ->
         observer = Ground(config.site)
     elif orbit not in {GEOCENTRE, SOURCE}:
         observer = orbit_file(folder / orbit, utc_ns + start_ns, start_ns != 0)
-    sky, shown = config.sky, config.sky.bodies
+    bodies, v0_e_per_s = _body_light(config.sky, channels)
+    moving = MovingSky(Kernel(), observer, utc_ns, bodies, start_ns, unix)
+    if config.sky.bodies.satellites is not None:
+        moving.satellites = _satellites(
+            config.sky.bodies, folder, observer, (utc_ns, start_ns), v0_e_per_s
+        )
+    return moving
+
+
+def _body_light(sky: SkySettings, channels: Sequence[Optics]) -> tuple[BodyLight, float]:
+    """The light of the bodies that a bench file shows, and the electrons per second of V = 0 in the
+    Sun's colour, which is that of whatever sunlight falls on.
+    """
+    shown = sky.bodies
     asked = (
         ("Sun", shown.sun),
         (EARTH, shown.earth),
@@ -63,42 +81,48 @@ def moving_sky(config: BenchConfig, folder: Path, channels: Sequence[Optics]) ->
     )
     names = tuple(name for name, wanted in asked if wanted)
     photometry = Photometry(sky.zero_point, sky.passband_weighting)
-    lit = (*names, "Sun")  # and whatever sunlight falls on
-    rates, colours = total_and_colours(
-        np.stack(
-            [
-                bodies_electrons_per_s(lit, sky.brightness, optics, photometry)
-                for optics in channels
-            ],
-            axis=1,
-        )
-    )
+    lit = (*names, "Sun")
+    rates_by_channel = []
+    for optics in channels:
+        rates_by_channel.append(bodies_electrons_per_s(lit, sky.brightness, optics, photometry))
+    rates, colours = total_and_colours(np.stack(rates_by_channel, axis=1))
     shares = (None, None) if colours is None else (colours[:-1], colours[-1])
     bodies = BodyLight(names, bodies_bv_mag(names), rates[:-1], *shares)
-    moving = MovingSky(Kernel(), observer, utc_ns, bodies, start_ns, unix)
-    if shown.satellites is not None:
-        from hilstar.sky.bodies.passes import Satellites
-        from hilstar.sky.bodies.satellites import (
-            LIST_FORM,
-            TABLE_FORM,
-            brightness_of,
-            read_satellites,
-            read_table,
-        )
+    return bodies, float(rates[-1])
 
-        path, v0_e_per_s, rows = folder / shown.satellites, float(rates[-1]), {}
-        found = read_satellites(
-            named_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), utc_ns + start_ns
-        )
-        if shown.satellite_magnitudes is not None:
-            table = folder / shown.satellite_magnitudes
-            rows = read_table(named_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
-        brightness = brightness_of(found, rows, shown.satellite_standard_mag, v0_e_per_s)
-        satellites = moving.satellites = Satellites(found, brightness, v0_e_per_s, observer, utc_ns)
-        satellites.listed = sum(satellite.number in rows for satellite in found)
-        satellites.file = str(path)
-        satellites.place(utc_ns + start_ns)
-    return moving
+
+def _satellites(
+    shown: Bodies, folder: Path, observer: Orbit, dates_ns: tuple[int, int], v0_e_per_s: float
+) -> "Satellites":
+    """The satellites of a bench file's list, placed where they are at the start. Raises InputError
+    for a list or a table that cannot be used, MachineError where the extra is not installed.
+
+    `dates_ns` are the bench's UTC and how much later the start is.
+    """
+    from hilstar.sky.bodies.passes import Satellites
+    from hilstar.sky.bodies.satellites import (
+        LIST_FORM,
+        TABLE_FORM,
+        brightness_of,
+        read_satellites,
+        read_table,
+    )
+
+    assert shown.satellites is not None
+    path = folder / shown.satellites
+    utc_ns, later_ns = dates_ns
+    start_utc_ns = utc_ns + later_ns
+    listed = read_satellites(named_text(path, LIST_FORM, MAX_LIST_BYTES), str(path), start_utc_ns)
+    rows = {}
+    if shown.satellite_magnitudes is not None:
+        table = folder / shown.satellite_magnitudes
+        rows = read_table(named_text(table, TABLE_FORM, MAX_TABLE_BYTES), str(table))
+    brightness = brightness_of(listed, rows, shown.satellite_standard_mag, v0_e_per_s)
+    satellites = Satellites(listed, brightness, v0_e_per_s, observer, utc_ns)
+    satellites.listed = sum(satellite.number in rows for satellite in listed)
+    satellites.file = str(path)
+    satellites.place(start_utc_ns)
+    return satellites
 
 
 def orbit_file(path: Path, utc_ns: int, day: bool) -> Orbit:

@@ -10,6 +10,7 @@ import msgspec
 from msgspec import UNSET, UnsetType
 
 from hilstar.server.answers.judge import TrackerFigures
+from hilstar.server.answers.star_widths import FocusState
 from hilstar.server.console.page_figures import RunCounts
 
 # the WebSocket's subprotocols; the token follows the second
@@ -142,7 +143,7 @@ class SkyState(msgspec.Struct, frozen=True, kw_only=True):
     switches, `faults` the names of the faults that are on.
 
     `wrong_sky_s` is the total time with a wrong sky, s; `pointing` a line on where the first
-    attitude points.
+    attitude points; `focus` is None where neither images nor answers tell it.
     """
 
     attitude: ShownAttitude | None = None
@@ -156,6 +157,7 @@ class SkyState(msgspec.Struct, frozen=True, kw_only=True):
     wrong_sky: list[WrongCondition] = []
     wrong_sky_s: float = 0.0
     pointing: str = ""
+    focus: FocusState | None = None
 
 
 class PageState(SkyState, frozen=True, kw_only=True):
@@ -172,7 +174,8 @@ class ChartPoint(msgspec.Struct, kw_only=True):
     and the numbers of missed frames, refused packets and wrong answers.
 
     `t_s` is the time since the page's process began. `x_arcsec`, `y_arcsec` and `z_arcsec` are the
-    residual of the newest right answer since the previous point.
+    residual of the newest right answer since the previous point, `focus_px` the newest figure of
+    the focus.
     """
 
     t_s: float
@@ -186,6 +189,7 @@ class ChartPoint(msgspec.Struct, kw_only=True):
     x_arcsec: float | None = None
     y_arcsec: float | None = None
     z_arcsec: float | None = None
+    focus_px: float | None = None
 
     def take(self, key: str, value: float) -> None:
         """Set the time `key`, ms, to `value` if that is larger than the present one."""

@@ -24,6 +24,7 @@ from hilstar.basics.rotation import to_radec_roll_deg
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.basics.version import __version__
 from hilstar.optics.sprites import brightest
+from hilstar.server.answers.star_widths import FocusState
 from hilstar.server.bench.certificate_file import certificate_number
 from hilstar.server.bench.frame import Bench, aid_levels_of
 from hilstar.server.console import messages, protocol
@@ -220,6 +221,7 @@ class WatchedRun:
             ],
             wrong_sky_s=self._wrong_sky_s(tally.first_swap_ns),
             tracker=None if running.answers is None else running.answers.figures,
+            focus=None if running.answers is None else running.answers.widths.state,
         )
 
     def _wrong_sky_s(self, first_swap_ns: int | None) -> float:
@@ -530,6 +532,7 @@ class SessionPublisher:
         self.notices = _SessionNotices()
         self._failed: dict[str, str] = {}
         self._patterns = 0
+        self.focus: FocusState | None = None
 
     def show(self, pattern: ShownPattern) -> None:
         """Publish the pattern that the monitor shows now; a coloured one in grey, by the largest
@@ -566,12 +569,14 @@ class SessionPublisher:
         now_ns = time.monotonic_ns()
         failed = list(self._failed.values())
         shown = protocol.NewestFrame(number=self._patterns, missing=False, blank=False)
-        return messages.RunState(host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed)
+        return messages.RunState(
+            host_ns=now_ns, alive_ns=now_ns, frame=shown, failed=failed, focus=self.focus
+        )
 
     def do(self, order: messages.Order) -> messages.OrderAnswer:
         """Record a mark; a session refuses every other order (409)."""
         if order.name != "mark" or not order.text.strip():
-            line = "a session of first light takes marks with a text, and no other order"
+            line = "a session takes marks with a text, and no other order"
             return messages.OrderAnswer(id=order.id, status=409, line=line)
         self.notices.tell("mark", f"mark, by {one_line(order.who)}: {one_line(order.text)}")
         return messages.OrderAnswer(
@@ -581,9 +586,9 @@ class SessionPublisher:
 
 @contextmanager
 def session_page(
-    listener: PageListener, control: bool, file: "BenchFile"
+    listener: PageListener, control: bool, file: "BenchFile", command: str = "first-light"
 ) -> Iterator[SessionPublisher]:
-    """Serve the page of a first-light session during the `with` block; gives its publisher."""
+    """Serve the page of a session (`command`) during the `with` block; gives its publisher."""
     monitor = file.config.monitor
     width, height = monitor.resolution_px
     picture_bytes = width * height * CODE_BYTES
@@ -593,7 +598,7 @@ def session_page(
     setup = setup_for(
         listeners,
         control,
-        RunDescription("first-light", "session", "", "session"),
+        RunDescription(command, "session", "", "session"),
         file,
         picture_bytes,
     )

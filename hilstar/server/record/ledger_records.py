@@ -34,6 +34,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, cannot_read, printable
 from hilstar.basics.reading import NOT_JSON, parse_toml
 from hilstar.basics.units import MAX_SPEED_KM_S
+from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.answers.judge import Judged
 from hilstar.server.bench.config import BenchConfig
 from hilstar.server.bench.config.attitude import PACKET_SOURCES
@@ -193,7 +194,8 @@ class AnswerRecord(msgspec.Struct, kw_only=True):
     Host times, ns: `host_ns` of its last byte, `middle_ns` of its exposure's middle, as estimated
     on arrival. `t_ns` is the tracker's stamp on the tracker's clock, `light_ns` the exposure's
     middle on the sender's clock. `q` is q_icrs_to_cam (w, x, y, z), `rate` is in rad/s, camera
-    axes. `centroids` are [x_px, y_px, dn, hip]. `verdict` is "right", "wrong" (see `[answers]
+    axes. `centroids` are [x_px, y_px, dn, hip], `widths_px` the stars' widths in the same order,
+    none where the tracker reports none. `verdict` is "right", "wrong" (see `[answers]
     wrong_arcsec`), "invalid" (without an attitude), "unpaired" (no single sky was lit) or
     "unjudged" (compared with nothing; `middle_ns` may be `host_ns`).
 
@@ -211,6 +213,7 @@ class AnswerRecord(msgspec.Struct, kw_only=True):
     stars: Count | None = None
     rms_arcsec: float | None = None
     centroids: tuple[tuple[float, float, float | None, int | None], ...] = ()
+    widths_px: tuple[float | None, ...] = ()
     verdict: str = "unpaired"
     middle_ns: AnyNs = 0
     light_ns: AnyNs | None = None
@@ -333,6 +336,7 @@ def answer_record(judged: Judged) -> AnswerRecord:
         centroids=tuple(
             (star.x_px, star.y_px, star.dn, star.hip) for star in answer.centroids[:MAX_CENTROIDS]
         ),
+        widths_px=_widths(answer.centroids[:MAX_CENTROIDS]),
         verdict=judged.verdict,
         middle_ns=_within_64_bits(judged.middle_ns),
     )
@@ -343,6 +347,13 @@ def answer_record(judged: Judged) -> AnswerRecord:
         record.first_frame = lit.first
         record.last_frame = lit.last
     return record
+
+
+def _widths(stars: tuple[ReportedStar, ...]) -> tuple[float | None, ...]:
+    widths_px = tuple(star.width_px for star in stars)
+    if any(width_px is not None for width_px in widths_px):
+        return widths_px
+    return ()
 
 
 def _numbers(values: FloatArray | None) -> Any:

@@ -45,6 +45,9 @@ VRR_FRAMES = 5
 # periods after a swap: when the next frame is submitted, and the latest that it is shown with
 VRR_AT, VRR_UNDER = 1.5, 1.75
 UNPACED = 0.1  # share of the known period: swaps faster by more do not wait for it
+# A refresh that the system does not know is believed where at least this share of swaps is on it
+# within UNPACED: on a busy machine the median of swaps without any may lie on it by chance.
+MIN_ON_TIME = 0.5
 log = logging.getLogger(__name__)
 
 
@@ -261,7 +264,8 @@ def timing_of(periods_ms: FloatArray, monitor: Monitor, known_hz: float) -> Timi
     if known_hz:
         by_screen = period_ms >= 1000.0 / known_hz * (1 - UNPACED)
     else:
-        by_screen = on_time
+        share_on_time = np.mean(np.abs(periods_ms / wanted_ms - 1) < UNPACED)
+        by_screen = on_time and bool(share_on_time >= MIN_ON_TIME)
     dropped = periods_ms > DROPPED * wanted_ms
     if not dropped.all():
         error_ms = ERROR_OF_MEDIAN * float(np.std(periods_ms[~dropped])) / len(periods_ms) ** 0.5

@@ -233,11 +233,12 @@ class Screen:
             marker = marker_light(number, monitor.photodiode)
         else:
             marker = None
-        self._backend.present(
-            self.aids.overlay,
-            round(self.aids.patch_share * white),
-            (side_px, white * (marker or 0)),
-        )
+        if self.window.gone is None:
+            self._backend.present(
+                self.aids.overlay,
+                round(self.aids.patch_share * white),
+                (side_px, white * (marker or 0)),
+            )
         return marker
 
     def swap(self, timed: bool = True) -> int:

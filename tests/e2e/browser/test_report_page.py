@@ -106,7 +106,7 @@ def report_file(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def report(page, report_file) -> Browser:
+def sheet(page, report_file) -> Browser:
     page.get(report_file.as_uri())
     page.until("document.body.dataset.ready === 'true'")
     return page
@@ -118,9 +118,9 @@ def chart_aria(page: Browser, name: str) -> str:
     )
 
 
-def test_it_says_what_was_wrong_and_shows_the_whole_run(report):
+def test_it_says_what_was_wrong_and_shows_the_whole_run(sheet):
     text = {
-        name: report.text(f"#{name}")
+        name: sheet.text(f"#{name}")
         for name in ("health-headline", "health-reasons", "summary", "events", "refusals")
     }
     assert text["health-headline"] == "Sky was not right throughout"
@@ -130,13 +130,13 @@ def test_it_says_what_was_wrong_and_shows_the_whole_run(report):
     )
     assert "<img src=x onerror=alert(1)>" in text["events"]  # as text, never as a tag
     assert "format" in text["refusals"]
-    age = chart_aria(report, "age")
+    age = chart_aria(sheet, "age")
     assert "8.0 to 400.0" in age and "30 stale frames" in age
-    assert "2 missed" in chart_aria(report, "pacing")
+    assert "2 missed" in chart_aria(sheet, "pacing")
 
 
-def test_what_comes_once_a_second_is_a_line_in_a_short_run_too(report):
-    inked = report.run("""
+def test_what_comes_once_a_second_is_a_line_in_a_short_run_too(sheet):
+    inked = sheet.run("""
         const canvas = document.querySelector("#chart-packets canvas");
         const {width, height} = canvas;
         const {data} = canvas.getContext("2d").getImageData(0, 0, width, height);
@@ -157,118 +157,118 @@ def elements_shown(page: Browser, selector: str) -> int:
     )
 
 
-def test_on_paper_it_is_light_without_buttons_and_with_all_events(report):
-    report.prefer(color_scheme="dark")
+def test_on_paper_it_is_light_without_buttons_and_with_all_events(sheet):
+    sheet.prefer(color_scheme="dark")
     many = (
         "const list = document.getElementById('events');"
         " for (let k = 0; k < 100; k += 1) list.append(list.lastElementChild.cloneNode(true))"
     )
-    report.run(many)
+    sheet.run(many)
     pressed = "button:not(.pick), select, input"
-    assert elements_shown(report, pressed) > 10
-    chart_before = report.run("return document.querySelector('#chart-age canvas').toDataURL()")
-    report.paper()
-    ground, panel = report.run(
+    assert elements_shown(sheet, pressed) > 10
+    chart_before = sheet.run("return document.querySelector('#chart-age canvas').toDataURL()")
+    sheet.paper()
+    ground, panel = sheet.run(
         "const style = getComputedStyle(document.documentElement);"
         "return ['--ground', '--panel'].map((name) => style.getPropertyValue(name).trim())"
     )
     assert (ground, panel) == (colours_of("light")["ground"], colours_of("light")["panel"])
-    chart_now = report.run("return document.querySelector('#chart-age canvas').toDataURL()")
+    chart_now = sheet.run("return document.querySelector('#chart-age canvas').toDataURL()")
     assert chart_now != chart_before  # drawn again in the light colours
-    assert elements_shown(report, pressed) == 0
+    assert elements_shown(sheet, pressed) == 0
     cut = "const list = document.getElementById('events'); return list.scrollHeight - list.clientHeight"
-    assert report.run(cut) <= 1
-    assert elements_shown(report, "#events li") >= 102
-    report.screen()
-    report.prefer(color_scheme="dark")
-    report.until("document.documentElement.dataset.theme === 'dark'")
-    assert report.run(cut) > 1
+    assert sheet.run(cut) <= 1
+    assert elements_shown(sheet, "#events li") >= 102
+    sheet.screen()
+    sheet.prefer(color_scheme="dark")
+    sheet.until("document.documentElement.dataset.theme === 'dark'")
+    assert sheet.run(cut) > 1
 
 
-def test_events_are_a_list_whose_items_hold_buttons(report):
-    assert report.run("return document.querySelectorAll('#events > li[role]').length") == 0
-    assert report.run("return document.querySelectorAll('#events > li > button').length") >= 2
-    report.find("#events button").send_keys(Keys.ENTER)
-    assert report.text("#attitude-state").startswith("at ")
+def test_events_are_a_list_whose_items_hold_buttons(sheet):
+    assert sheet.run("return document.querySelectorAll('#events > li[role]').length") == 0
+    assert sheet.run("return document.querySelectorAll('#events > li > button').length") >= 2
+    sheet.find("#events button").send_keys(Keys.ENTER)
+    assert sheet.text("#attitude-state").startswith("at ")
 
 
-def test_the_trackers_residual_is_charted_with_its_faults_shaded_and_their_effect_said(report):
-    words = chart_aria(report, "residual")
+def test_the_trackers_residual_is_charted_with_its_faults_shaded_and_their_effect_said(sheet):
+    words = chart_aria(sheet, "residual")
     assert (
         "x 2.0 to 2.0" in words
         and "z 9.0 to 9.0" in words
         and "1 wrong" in words
         and "1 fault on" in words
     )
-    cells = [cell.text for cell in report.find_elements("css selector", "#fault-table td")]
+    cells = [cell.text for cell in sheet.find_elements("css selector", "#fault-table td")]
     assert cells[0] == "ghost" and cells[2] == "100.0 % / 0.0 % / 98.3 %" and cells[5] == "none"
     assert (
-        "100 ms" not in report.text("#fault-table")
-        and "tracker's answers" in report.text("#summary").lower()
+        "100 ms" not in sheet.text("#fault-table")
+        and "tracker's answers" in sheet.text("#summary").lower()
     )
 
 
-def test_a_drag_over_a_chart_looks_closer_and_every_chart_follows(report):
-    chart = report.find("#chart-age .plot")
+def test_a_drag_over_a_chart_looks_closer_and_every_chart_follows(sheet):
+    chart = sheet.find("#chart-age .plot")
     width = chart.size["width"]
-    ActionChains(report).move_to_element_with_offset(
+    ActionChains(sheet).move_to_element_with_offset(
         chart, -round(width * 0.3), 0
     ).click_and_hold().move_by_offset(round(width * 0.2), 0).release().perform()
-    assert "of 10.0" in report.text("#range-text")
-    assert "8.0 to 8.5" in chart_aria(report, "age") and "0 stale" in chart_aria(report, "age")
-    assert "0 missed" in chart_aria(report, "pacing")
-    report.find("#range-whole").click()
-    assert "400.0" in chart_aria(report, "age")
+    assert "of 10.0" in sheet.text("#range-text")
+    assert "8.0 to 8.5" in chart_aria(sheet, "age") and "0 stale" in chart_aria(sheet, "age")
+    assert "0 missed" in chart_aria(sheet, "pacing")
+    sheet.find("#range-whole").click()
+    assert "400.0" in chart_aria(sheet, "age")
 
 
-def test_what_is_under_the_pointer_is_said_and_forgotten(report):
-    chart = report.find("#chart-age .plot")
-    ActionChains(report).move_to_element(chart).perform()
-    report.until("document.querySelector('#chart-age .chart-text').textContent.startsWith('at 4')")
-    bars = report.find("#distributions .plot")
-    whole = report.text("#distributions .chart-text")
-    ActionChains(report).move_to_element(bars).perform()
-    report.until("document.querySelector('#chart-age .chart-text').textContent.startsWith('at 0')")
-    said = report.text("#distributions .chart-text")
+def test_what_is_under_the_pointer_is_said_and_forgotten(sheet):
+    chart = sheet.find("#chart-age .plot")
+    ActionChains(sheet).move_to_element(chart).perform()
+    sheet.until("document.querySelector('#chart-age .chart-text').textContent.startsWith('at 4')")
+    bars = sheet.find("#distributions .plot")
+    whole = sheet.text("#distributions .chart-text")
+    ActionChains(sheet).move_to_element(bars).perform()
+    sheet.until("document.querySelector('#chart-age .chart-text').textContent.startsWith('at 0')")
+    said = sheet.text("#distributions .chart-text")
     assert said != whole and said.endswith("frames")
 
 
-def test_by_keys_alone_a_chart_is_moved_over_the_run(report):
-    report.run("document.querySelector('#chart-age .plot').focus()")
+def test_by_keys_alone_a_chart_is_moved_over_the_run(sheet):
+    sheet.run("document.querySelector('#chart-age .plot').focus()")
     for keys in ("+", "+", Keys.ARROW_RIGHT, "-", Keys.ARROW_LEFT):
-        before = report.text("#range-text")
-        ActionChains(report).send_keys(keys).perform()
-        assert report.text("#range-text") != before
-    ActionChains(report).send_keys("0").perform()
-    assert "the whole run" in report.text("#range-text")
-    outline = report.run("return getComputedStyle(document.activeElement).outlineStyle")
+        before = sheet.text("#range-text")
+        ActionChains(sheet).send_keys(keys).perform()
+        assert sheet.text("#range-text") != before
+    ActionChains(sheet).send_keys("0").perform()
+    assert "the whole run" in sheet.text("#range-text")
+    outline = sheet.run("return getComputedStyle(document.activeElement).outlineStyle")
     assert outline == "solid"
 
 
-def test_an_event_leads_to_its_moment_and_to_the_picture_nearest_to_it(report, report_file):
-    report.run(
+def test_an_event_leads_to_its_moment_and_to_the_picture_nearest_to_it(sheet, report_file):
+    sheet.run(
         "[...document.querySelectorAll('#events li')].find((row) => row.dataset.kind ==="
         " 'stale').querySelector('button').click()"
     )
-    assert report.text("#attitude-state") == "at 5 s"
+    assert sheet.text("#attitude-state") == "at 5 s"
     pictures = run_data_of(report_file.read_text())["pictures"]
     nearest = min(pictures, key=lambda picture: abs(picture["t_s"] - 5.0))
-    report.until(f"document.getElementById('picture').dataset.frame === '{nearest['frame']}'")
-    assert report.text("#picture-badge") == "Stale attitude"
+    sheet.until(f"document.getElementById('picture').dataset.frame === '{nearest['frame']}'")
+    assert sheet.text("#picture-badge") == "Stale attitude"
 
 
-def test_single_pixels_show_the_codes_that_were_shown(report, report_file):
-    report.find("#zoom-pixels").click()
+def test_single_pixels_show_the_codes_that_were_shown(sheet, report_file):
+    sheet.find("#zoom-pixels").click()
     picture = next(one for one in run_data_of(report_file.read_text())["pictures"] if one["truth"])
     levels = levels_of(picture)
-    report.until("document.getElementById('picture-text').textContent.includes('4000')")
-    stage = report.find("#picture")
-    ActionChains(report).move_to_element(stage).perform()
+    sheet.until("document.getElementById('picture-text').textContent.includes('4000')")
+    stage = sheet.find("#picture")
+    ActionChains(sheet).move_to_element(stage).perform()
     y, x = np.unravel_index(np.argmax(levels), levels.shape)
-    assert report.text("#pixel") == f"({x}, {y}) px: code {levels.max()}"
-    ActionChains(report).move_by_offset(40, 0).perform()
-    assert report.text("#pixel") == f"({x + 1}, {y}) px: code {levels[y, x + 1]}"
+    assert sheet.text("#pixel") == f"({x}, {y}) px: code {levels.max()}"
+    ActionChains(sheet).move_by_offset(40, 0).perform()
+    assert sheet.text("#pixel") == f"({x + 1}, {y}) px: code {levels[y, x + 1]}"
 
 
-def test_it_fits_every_size_in_light_and_dark(report, tmp_path):
-    assert_fits_every_size_in_light_and_dark(report, tmp_path)
+def test_it_fits_every_size_in_light_and_dark(sheet, tmp_path):
+    assert_fits_every_size_in_light_and_dark(sheet, tmp_path)

@@ -52,7 +52,7 @@ EXACT_ARCSEC = 1e-3
 NOISE_ARCSEC = np.array([3.0, 3.0, 20.0])
 
 
-def bench_file(folder, name, true_q=TRUE_Q, **collimator):
+def true_q_bench(folder, name, true_q=TRUE_Q, **collimator):
     verify = {} if true_q is None else {"verify": {"true_q_cam_to_mon": true_q.tolist()}}
     path = folder / name
     path.write_text(
@@ -64,7 +64,7 @@ def bench_file(folder, name, true_q=TRUE_Q, **collimator):
 def bench_and_truth(folder, lens):
     """A bench file that is wrong about its alignment, and how the bench truly stands."""
     if lens is None:
-        path = bench_file(
+        path = true_q_bench(
             folder,
             "bench.toml",
             q_cam_to_mon=normalise(np.array([1.0, 0.0005, 0.001, 0.0])).tolist(),
@@ -81,7 +81,7 @@ def bench_and_truth(folder, lens):
         Notes({"k1": 0.01}, ErrorTable(rms_arcsec=0.1), MadeTable(when="2026-01-02", poses=2)),
     )
     write_geometry(folder / "truth.toml", camera, TRUE_Q, Notes({}, ErrorTable(), MadeTable()))
-    path = bench_file(folder, "bench.toml", None, geometry="lens.toml")
+    path = true_q_bench(folder, "bench.toml", None, geometry="lens.toml")
     tracker = tracker_camera(read_bench_file(path).config.tracker, folder)
     return path, BenchGeometry(load_geometry(folder / "truth.toml", (640, 480)), tracker)
 
@@ -109,7 +109,7 @@ def test_with_the_file_that_is_written_the_tracker_reports_what_is_commanded(tmp
         angle_between_rad(np.array(summary["q_cam_to_mon"]), TRUE_Q) * ARCSEC_PER_RAD < EXACT_ARCSEC
     )
     with hilstar.load(
-        bench_file(tmp_path, "aligned.toml", None, geometry="geometry.toml")
+        true_q_bench(tmp_path, "aligned.toml", None, geometry="geometry.toml")
     ) as bench:
         after = [reported(bench, true, q) for q in ATTITUDES]
     assert (
@@ -125,7 +125,7 @@ def test_with_the_file_that_is_written_the_tracker_reports_what_is_commanded(tmp
 
 
 def test_a_lens_that_the_bench_does_not_know_is_no_rotation_and_the_summary_says_so(tmp_path, rng):
-    path = bench_file(tmp_path, "bench.toml", None)
+    path = true_q_bench(tmp_path, "bench.toml", None)
     with hilstar.load(path) as bench:
         lens = Lens((0.6, 0.0, 0.0), (0.004, -0.002), (0.02, 0.0))
         true = BenchGeometry(
@@ -152,7 +152,7 @@ def test_a_lens_that_the_bench_does_not_know_is_no_rotation_and_the_summary_says
 def measured(tmp_path_factory):
     """A bench, and 300 pairs of which three are wild."""
     folder = tmp_path_factory.mktemp("alignment")
-    bench = bench_file(folder, "bench.toml", None)
+    bench = true_q_bench(folder, "bench.toml", None)
     rng = np.random.default_rng(8)
     commanded = normalise(rng.normal(size=(300, 4)))
     noise = from_rotation_vectors(rng.normal(size=(300, 3)) * NOISE_ARCSEC / ARCSEC_PER_RAD)
@@ -186,7 +186,7 @@ def run_of_a_slew(tmp_path_factory):
     clock is 0.04 s late.
     """
     folder = tmp_path_factory.mktemp("slew")
-    bench = bench_file(folder, "bench.toml", None)
+    bench = true_q_bench(folder, "bench.toml", None)
     rate = np.radians([0.3, -0.4, 0.1])
 
     def shown(t_s):

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import csv
 import json
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from hilstar.instruments.campaign.answer_figures import LIMIT_BIN_MAG
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.star_light import bench_stars
 from tests.e2e.campaign.test_bench import answering
 from tests.e2e.campaign.test_bench import write_bench as write_bench_of_stub
 from tests.support.acceptance import write_bench
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.benches import TWIN, bench_text
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
+from tests.support.forks import Started
+from tests.support.senders import free_port
 
 PLAN = """
 title = "Four clauses"
@@ -78,6 +86,9 @@ def test_an_acceptance_ends_in_a_page_tables_and_an_exit_code(folder: Path) -> N
         "Recovery": "not tested",
     }
     assert told["verdict"] == "not met" and told["cases"] == 24 + 8 * 4
+    together = {clause["capability"]: clause["together"] for clause in told["clauses"]}
+    # 8 of 8 cases without an attitude, at a confidence that three clauses and four levels share
+    assert together["Largest <rate>"] == "not met" and together["A right attitude"] == ""
     page = (folder / "out" / "accept.html").read_text()
     assert "Largest &lt;rate&gt;" in page and "A clause is not met" in page
     assert "Vacuum" in page and "not of a bench" in page and "varies scenario" in page
@@ -170,8 +181,6 @@ quantity = "availability"
 minimum = 0.9
 """
 
-FRAME_S = 0.01  # of a headless display
-
 
 @pytest.mark.e2e
 @pytest.mark.parametrize("clock", ["host", "own"])
@@ -187,7 +196,9 @@ def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, c
     planted = replace(
         stub, now=now, wild=0.0, stamp_bias_s=0.1, latency_s=0.15, rate_bias_deg_s=(0.0, 0.03, 0.0)
     )
-    words = ("accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--headless", "--json")
+    words = ["accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--headless", "--json"]
+    # on a clock of its own the rates alone are judged, and half of the cases show them
+    words += ["--quick"] * (clock == "own")
     with answering(planted):
         done = run_hilstar_here(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -203,6 +214,103 @@ def test_a_real_tracker_s_rates_and_stamps_are_judged_over_udp(tmp_path: Path, c
     if clock == "own":
         assert time["verdict"] == "not tested" and "own clock" in time["why"]
     else:
-        # half a frame of 100 Hz, 5 ms, is the display's own, and on a busy machine a whole one
-        assert abs(time["value"] - 0.1) <= 0.01 + FRAME_S / 2
+        # within 10 %: frames that a busy machine misses without a screen add nothing
+        assert abs(time["value"] - 0.1) <= 0.01
         assert time["verdict"] == "not met"
+
+
+STARS = """
+through = "bench"
+[cases.stars]
+cases = 16
+frames = 4
+timeout_s = 5.0
+"""
+# quantity, and a limit that the virtual tracker keeps: places, px; V and colour, mag; stars a frame
+STAR_LIMITS = {
+    "star-noise": "maximum = 0.3",
+    "star-fov-error": "maximum = 0.3",
+    "star-colour": "maximum = 0.3",
+    "star-limit": "minimum = 3.5",
+    "false-stars": "maximum = 1.0",
+}
+
+
+@pytest.mark.e2e
+def test_single_stars_of_the_virtual_tracker_before_the_display_are_judged(tmp_path: Path) -> None:
+    """hilstar tracker watches the display's frames, and tells its stars over UDP."""
+    answers, frames = free_port(), f"tcp://127.0.0.1:{free_port()}"
+    tables = {"source": "udp", "bind": f"127.0.0.1:{answers}", "format": "json", "clock": "host"}
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text(TWIN, {"render": {"quantisation": "round"}, "answers": tables}))
+    clauses = [
+        f'[[clause]]\ncapability = "{quantity}"\nof = "stars"\nquantity = "{quantity}"\n{limit}\n'
+        for quantity, limit in STAR_LIMITS.items()
+    ]
+    (tmp_path / "plan.toml").write_text(STARS + "".join(clauses))
+    told = ("--answer", f"udp://127.0.0.1:{answers}", "--format", "json", "--solver", "truth")
+    watcher = [*HILSTAR, "tracker", str(bench), "--watch", frames, *told]
+    words = ("accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--headless", "--json")
+    with Started(watcher, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
+        try:
+            done = run_hilstar_here(*words, "--feed", frames, cwd=tmp_path)
+        finally:
+            process.kill()
+    assert done.returncode == 0, done.stderr
+    judged = {clause["quantity"]: clause for clause in json.loads(done.stdout)["clauses"]}
+    values = {quantity: clause["value"] for quantity, clause in judged.items()}
+    assert {clause["verdict"] for clause in judged.values()} <= {"met", "not shown"}, values
+    assert judged["star-noise"]["verdict"] == judged["false-stars"]["verdict"] == "met", judged
+    # the display's stars end at V 5.5, and the tracker's faintest is a little brighter or that
+    assert 3.5 < values["star-limit"] <= 5.5 + LIMIT_BIN_MAG
+    assert 0.0 < values["star-noise"] < 0.3
+
+
+# found within 10 %, or three standard errors by the one-sided limits
+PLANTED_STARS = {
+    "star-noise": 0.3,
+    "star-colour": 0.1,
+    "star-limit": 4.5,
+    "false-stars": 2.0,
+}
+SHARE, TO_SIGMA = 0.1, 3 / 1.645
+
+
+@pytest.mark.e2e
+def test_planted_faults_of_single_stars_are_found_over_udp(tmp_path: Path) -> None:
+    """The stub's field is what the display shows, a third of its detector: stars beside that were
+    not lit, and count for nothing.
+    """
+    stub = write_bench_of_stub(tmp_path)
+    bench = read_bench_file(tmp_path / "bench.toml")
+    stars = bench_stars(bench.config, bench.folder)
+    columns = (stars.directions(np.arange(len(stars.v_mag))), stars.v_mag, stars.bv_mag)
+    rows = np.column_stack([*columns, stars.electrons_per_s])
+    (tmp_path / "stars.json").write_text(json.dumps(rows[rows[:, 3] < 6.5].tolist()))
+    clauses = [
+        f'[[clause]]\ncapability = "{quantity}"\nof = "stars"\nquantity = "{quantity}"\n'
+        + (f"minimum = {1.2 * size}\n" if quantity == "star-limit" else f"maximum = {size / 2}\n")
+        for quantity, size in PLANTED_STARS.items()
+    ]
+    (tmp_path / "plan.toml").write_text(STARS.replace("16", "40") + "".join(clauses))
+    planted = replace(
+        stub,
+        now=str(tmp_path / "out" / "stars" / "now.json"),
+        wild=0.0,
+        answer_hz=20.0,
+        star_file=str(tmp_path / "stars.json"),
+        star_noise_px=PLANTED_STARS["star-noise"],
+        star_colour=PLANTED_STARS["star-colour"],
+        star_limit_v_mag=PLANTED_STARS["star-limit"],
+        false_stars=PLANTED_STARS["false-stars"],
+    )
+    words = ("accept", "bench.toml", "--plan", "plan.toml", "-o", "out", "--headless", "--json")
+    with answering(planted):
+        done = run_hilstar_here(*words, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for clause in json.loads(done.stdout)["clauses"]:
+        size = PLANTED_STARS[clause["quantity"]]
+        error = abs(clause["value"] - size)
+        sigmas = max(clause["high"] - clause["value"], clause["value"] - clause["low"]) * TO_SIGMA
+        assert error <= max(SHARE * size, sigmas), clause
+        assert clause["verdict"] == "not met", clause

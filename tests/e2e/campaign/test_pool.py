@@ -31,16 +31,18 @@ OPTIONS = ("--solver", "python:sleepy:solve", "--json")
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def pool_folder(tmp_path: Path) -> Path:
     write_campaign(tmp_path)
     (tmp_path / "sleepy.py").write_text(SOLVER)
     return tmp_path
 
 
-def start(folder: Path, workers: int) -> subprocess.Popen[str]:
+def start(pool_folder: Path, workers: int) -> subprocess.Popen[str]:
     command = [*HILSTAR, "campaign", "plan.toml", "-o", "out", "--workers", str(workers), *OPTIONS]
     pipe = subprocess.PIPE
-    return Started(command, cwd=folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True)
+    return Started(
+        command, cwd=pool_folder, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
 
 
 def runs(pid: int) -> bool:
@@ -52,50 +54,50 @@ def runs(pid: int) -> bool:
 
 
 def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(
-    folder: Path,
+    pool_folder: Path,
 ) -> None:
     whole = run_hilstar_here(
-        "campaign", "plan.toml", "-o", "whole", "--workers", "2", *OPTIONS, cwd=folder
+        "campaign", "plan.toml", "-o", "whole", "--workers", "2", *OPTIONS, cwd=pool_folder
     )
     assert whole.returncode == 0, whole.stderr
     wanted = json.loads(whole.stdout)
 
-    (folder / "slow").touch()
-    stopped = start(folder, 1)  # Ctrl-C
-    wait_for(lambda: rows_so_far(folder) >= 3)
+    (pool_folder / "slow").touch()
+    stopped = start(pool_folder, 1)  # Ctrl-C
+    wait_for(lambda: rows_so_far(pool_folder) >= 3)
     stopped.send_signal(signal.SIGINT)
     _, err = stopped.communicate(timeout=PATIENCE_S)
     assert stopped.returncode == 130 and "the same command goes on" in err, err
-    after_stop = rows_so_far(folder)
+    after_stop = rows_so_far(pool_folder)
     assert 3 <= after_stop < 30
 
-    killed = start(folder, 2)  # a worker, then the driver itself
-    wait_for(lambda: rows_so_far(folder) > after_stop + 1)
-    second = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=folder)
+    killed = start(pool_folder, 2)  # a worker, then the driver itself
+    wait_for(lambda: rows_so_far(pool_folder) > after_stop + 1)
+    second = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=pool_folder)
     assert_refused(second, 2, "another campaign is running")
     victims = workers_of(killed)
     os.kill(victims[0], signal.SIGKILL)
-    after_kill = rows_so_far(folder)
-    wait_for(lambda: rows_so_far(folder) > after_kill + 2)
+    after_kill = rows_so_far(pool_folder)
+    wait_for(lambda: rows_so_far(pool_folder) > after_kill + 2)
     left = workers_of(killed)
     assert victims[0] not in left
     os.kill(killed.pid, signal.SIGKILL)
     killed.communicate()
     wait_for(lambda: not any(runs(pid) for pid in left), "workers outlive their driver")
-    after_both = rows_so_far(folder)
+    after_both = rows_so_far(pool_folder)
 
-    (folder / "slow").unlink()
+    (pool_folder / "slow").unlink()
     last = run_hilstar_here(
-        "campaign", "plan.toml", "-o", "out", "--workers", "1", *OPTIONS, cwd=folder
+        "campaign", "plan.toml", "-o", "out", "--workers", "1", *OPTIONS, cwd=pool_folder
     )
     assert last.returncode == 0, last.stderr
     summary = json.loads(last.stdout)
     assert after_both < 30 and summary["sha256"] == wanted["sha256"]
-    assert (folder / "out" / "cases.parquet").read_bytes() == (
-        folder / "whole" / "cases.parquet"
+    assert (pool_folder / "out" / "cases.parquet").read_bytes() == (
+        pool_folder / "whole" / "cases.parquet"
     ).read_bytes()
 
-    columns = read_columns(folder / "out" / "cases.parquet")
+    columns = read_columns(pool_folder / "out" / "cases.parquet")
     assert columns["case"] == list(range(30))
     failed = [
         why
@@ -112,19 +114,19 @@ def test_the_table_is_the_same_after_every_kind_of_end_and_with_cases_that_fail(
     )
 
 
-def test_another_plan_and_a_budget_that_is_too_small_are_refused(folder: Path) -> None:
+def test_another_plan_and_a_budget_that_is_too_small_are_refused(pool_folder: Path) -> None:
     short = run_hilstar_here(
-        "campaign", "plan.toml", "-o", "out", "--memory", "1MB", *OPTIONS[:2], cwd=folder
+        "campaign", "plan.toml", "-o", "out", "--memory", "1MB", *OPTIONS[:2], cwd=pool_folder
     )
     last = short.stderr.splitlines()[-1]  # a busy machine has told its progress before
     assert (
         (short.returncode, short.stdout) == (2, "") and "--memory" in last and "or more" in last
     ), short.stderr
-    before = rows_so_far(folder)
-    write_campaign(folder, seed=8)
-    other = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=folder)
+    before = rows_so_far(pool_folder)
+    write_campaign(pool_folder, seed=8)
+    other = run_hilstar_here("campaign", "plan.toml", "-o", "out", *OPTIONS[:2], cwd=pool_folder)
     assert_refused(other, 2, "seed was 7 and is 8")
-    assert rows_so_far(folder) == before == 1
+    assert rows_so_far(pool_folder) == before == 1
 
 
 REQUIRE = """

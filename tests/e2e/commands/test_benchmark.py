@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from dataclasses import replace
@@ -16,6 +15,7 @@ from hilstar.instruments.study.speed import benchmark
 from hilstar.instruments.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, numpy_linear, scene
 from hilstar.instruments.study.sweep import Load
 from tests.support.commands import assert_refused, run_hilstar_here, run_started
+from tests.support.tables import csv_rows
 
 Q = from_radec_roll_deg(*RADEC_ROLL_DEG)
 # A minimum needs no 30 rounds, and a start no second one.
@@ -135,8 +135,7 @@ def test_the_catalogue_is_filled_up_and_that_is_said(measured):
 
 def test_the_files_say_the_same(measured):
     result, folder = measured
-    with (folder / "bench.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(folder / "bench.csv")
     assert [float(row["median_ms"]) for row in rows] == [
         row["ms"]["median"] for row in result["rows"]
     ]
@@ -150,8 +149,7 @@ def test_the_virtual_tracker_is_timed_beside_its_peers(measured):
     assert {("hilstar", kind) for kind in ("exposure", "find_stars", "case", "verify")} | {
         ("numpy", "exposure")
     } <= kinds
-    with (folder / "tracker.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(folder / "tracker.csv")
     assert [float(row["median_ms"]) for row in rows] == [
         row["ms"]["median"] for row in result["tracker"]
     ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 
 import pytest
@@ -10,6 +9,7 @@ import pytest
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
+from tests.support.tables import csv_rows
 
 pytestmark = pytest.mark.e2e
 HEAD = "source_id,ra,dec,ref_epoch,pmra,pmdec,phot_g_mean_mag,bp_rp\n"
@@ -18,7 +18,7 @@ ROWS = f"{SOURCE},84.1233,-1.1122,2016.0,1.2,-3.4,7.31,0.42\n321648647810195008,
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def stars_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "stars.csv").write_text(HEAD + ROWS)
     keys = {"catalogue": "stars.csv", "with_hipparcos": True}
@@ -28,21 +28,20 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
-def test_the_table_s_star_is_in_the_frame_beside_hipparcos(folder):
+def test_the_table_s_star_is_in_the_frame_beside_hipparcos(stars_folder):
     done = run_hilstar_here(
         "frame",
-        folder / "bench.toml",
+        stars_folder / "bench.toml",
         "--radec",
         "84.057,-1.2,0",
         "--truth",
-        folder / "t.csv",
+        stars_folder / "t.csv",
         "--explain",
     )
     assert done.returncode == 0, done.stderr
     assert "stars.csv: 1 stars of 2 rows, V and V-I from Gaia's G, BP and RP" in done.stderr
     assert "1 stars added to Hipparcos' 116812" in done.stderr
-    with (folder / "t.csv").open() as file:
-        rows = {int(row["hip"]): row for row in csv.DictReader(file)}
+    rows = {int(row["hip"]): row for row in csv_rows(stars_folder / "t.csv")}
     assert {0, 26311} <= set(rows)  # Alnilam is Hipparcos'
     assert (rows[0]["name"], rows[26311]["name"]) == (f"Gaia DR3 {SOURCE}", "")
     # G - V of Riello et al. 2021, table C.2, at BP - RP = 0.42, by hand.
@@ -51,16 +50,16 @@ def test_the_table_s_star_is_in_the_frame_beside_hipparcos(folder):
     )
 
 
-def test_a_star_without_a_hip_number_clips_by_name(folder):
-    with (folder / "bench.toml").open("a") as file:
+def test_a_star_without_a_hip_number_clips_by_name(stars_folder):
+    with (stars_folder / "bench.toml").open("a") as file:
         file.write("[render]\nflux_at_white_e_per_s = 1000\n")
     done = run_hilstar_here(
         "frame",
-        folder / "bench.toml",
+        stars_folder / "bench.toml",
         "--radec",
         "84.057,-1.2,0",
         "--truth",
-        folder / "t.csv",
+        stars_folder / "t.csv",
         "--json",
     )
     summary = json.loads(done.stdout)
@@ -68,19 +67,24 @@ def test_a_star_without_a_hip_number_clips_by_name(folder):
     assert summary["clipped_mag"][f"Gaia DR3 {SOURCE}"] > 0
 
 
-def test_the_bench_s_hash_covers_the_table(folder):
-    before = read_bench_file(folder / "bench.toml").sha256
-    assert read_bench_file(folder / "bench.toml").sha256 == before
-    (folder / "stars.csv").write_text(HEAD + ROWS.replace("7.31", "7.32"))
-    assert read_bench_file(folder / "bench.toml").sha256 != before
+def test_the_bench_s_hash_covers_the_table(stars_folder):
+    before = read_bench_file(stars_folder / "bench.toml").sha256
+    assert read_bench_file(stars_folder / "bench.toml").sha256 == before
+    (stars_folder / "stars.csv").write_text(HEAD + ROWS.replace("7.31", "7.32"))
+    assert read_bench_file(stars_folder / "bench.toml").sha256 != before
 
 
-def test_a_table_that_cannot_be_used_is_one_line(folder):
-    (folder / "stars.csv").write_text("ra,dec,mass\n1,2,3\n")
+def test_a_table_that_cannot_be_used_is_one_line(stars_folder):
+    (stars_folder / "stars.csv").write_text("ra,dec,mass\n1,2,3\n")
     done = run_hilstar_here(
-        "frame", folder / "bench.toml", "--radec", "84.057,-1.2,0", "--truth", folder / "t.csv"
+        "frame",
+        stars_folder / "bench.toml",
+        "--radec",
+        "84.057,-1.2,0",
+        "--truth",
+        stars_folder / "t.csv",
     )
     assert done.returncode == 2
     assert "has no magnitude with a colour among its columns (ra, dec, mass)" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
-    assert not (folder / "t.csv").exists()
+    assert not (stars_folder / "t.csv").exists()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
+from tests.support.tables import csv_rows
 
 pytestmark = pytest.mark.e2e
 # design: names that other programs read.
@@ -41,20 +41,20 @@ NAMES = {
 
 
 @pytest.fixture
-def bench(tmp_path):
+def faint_bench(tmp_path):
     path = tmp_path / "bench.toml"
     path.write_text(bench_text({"collimator": {"focal_length_mm": 350}}))
     return path
 
 
-def test_every_format_has_the_same_stars(bench, tmp_path):
+def test_every_format_has_the_same_stars(faint_bench, tmp_path):
     from astropy.io import fits
     from astropy.table import Table
 
     for ending in ("csv", "fits", "vot", "parquet"):
         done = run_hilstar_here(
             "catalogue",
-            bench,
+            faint_bench,
             "-o",
             tmp_path / f"s.{ending}",
             "--faintest",
@@ -65,8 +65,7 @@ def test_every_format_has_the_same_stars(bench, tmp_path):
         )
         assert (done.returncode, done.stderr) == (0, "")
         assert json.loads(done.stdout)["epoch_jyear"] == 2030
-    with (tmp_path / "s.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(tmp_path / "s.csv")
     assert set(rows[0]) >= NAMES
     assert all(float(row["v_mag"]) <= 2 for row in rows)
     vega = next(row for row in rows if row["hip"] == "91262")
@@ -94,19 +93,19 @@ def test_every_format_has_the_same_stars(bench, tmp_path):
         (("-o", "s.csv", "--faintest", "-5"), "no star of the catalogue is brighter than V = -5"),
     ],
 )
-def test_bad_input_is_one_line(bench, tmp_path, monkeypatch, arguments, said):
+def test_bad_input_is_one_line(faint_bench, tmp_path, monkeypatch, arguments, said):
     monkeypatch.chdir(tmp_path)
-    done = run_hilstar_here("catalogue", bench, *arguments)
+    done = run_hilstar_here("catalogue", faint_bench, *arguments)
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_b_and_i_are_given_as_measured_beside_the_spectrum_s(bench, tmp_path):
+def test_b_and_i_are_given_as_measured_beside_the_spectrum_s(faint_bench, tmp_path):
     """`b_mag` is up to 4 mag from V + (B-V): its description says why, and both are given."""
     from astropy.io.votable import parse_single_table
 
-    done = run_hilstar_here("catalogue", bench, "-o", tmp_path / "s.vot", "--faintest", "6")
+    done = run_hilstar_here("catalogue", faint_bench, "-o", tmp_path / "s.vot", "--faintest", "6")
     assert done.returncode == 0, done.stderr
     table = parse_single_table(tmp_path / "s.vot")
     rows, words = table.array, {field.name: field.description for field in table.fields}

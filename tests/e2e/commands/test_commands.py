@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 import signal
@@ -29,15 +28,11 @@ from tests.support.commands import (
     run_hilstar_here,
 )
 from tests.support.senders import free_port
+from tests.support.tables import csv_rows
 from tests.support.waiting import PATIENCE_S, wait_for
 
 ORION = ROOT / "configs" / "thesis-orion.toml"
 ALNILAM, BETELGEUSE, RIGEL, ALNITAK = 26311, 27989, 24436, 26727
-
-
-def read_truth(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +51,7 @@ def test_orion_is_the_right_way_up(orion):
     folder, _ = orion
     stars = {
         int(row["hip"]): (float(row["x_px"]), float(row["y_px"]))
-        for row in read_truth(folder / "o.csv")
+        for row in csv_rows(folder / "o.csv")
     }
     x, y = stars[ALNILAM]
     assert np.hypot(x - 511.5, y - 511.5) < 1.0  # Alnilam is in the middle
@@ -67,7 +62,7 @@ def test_orion_is_the_right_way_up(orion):
 
 def test_the_frame_s_files_agree_with_each_other(orion):
     folder, summary = orion
-    rows = read_truth(folder / "o.csv")
+    rows = csv_rows(folder / "o.csv")
     first = [
         "hip",
         "x_px",
@@ -130,7 +125,7 @@ def test_the_python_road_gives_the_command_s_frame(orion):
         frame = bench.frame(from_radec_roll_deg(84.057, -1.2, 0))
     assert np.array_equal(frame.linear, fits.getdata(folder / "o.fits"))
     assert np.array_equal(frame.codes, np.array(Image.open(folder / "o.png")))
-    assert frame.truth["hip"].tolist() == [int(r["hip"]) for r in read_truth(folder / "o.csv")]
+    assert frame.truth["hip"].tolist() == [int(r["hip"]) for r in csv_rows(folder / "o.csv")]
 
 
 def test_a_quaternion_and_its_negative_are_the_attitude_of_its_radec(orion, tmp_path):
@@ -170,7 +165,7 @@ def test_clipped_stars_are_counted_and_named(tmp_path, small_bench_file):
     )
     clipped = json.loads(result.stdout)["clipped"]
     assert {ALNILAM, ALNITAK} <= set(clipped)
-    marked = {int(r["hip"]) for r in read_truth(tmp_path / "t.csv") if r["clipped"] == "1"}
+    marked = {int(r["hip"]) for r in csv_rows(tmp_path / "t.csv") if r["clipped"] == "1"}
     assert marked == set(clipped)
 
 
@@ -185,7 +180,7 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
     )
     rates = {
         float(r["electrons_per_s"]) * 10 ** (0.4 * float(r["v_mag"]))
-        for r in read_truth(tmp_path / "t.csv")
+        for r in csv_rows(tmp_path / "t.csv")
     }
     assert max(rates) / min(rates) == pytest.approx(1, rel=1e-12)
 
@@ -261,15 +256,6 @@ def test_a_log_with_nan_is_refused_with_its_line(tmp_path, small_bench_file):
     assert_refused(result, 2, "log.csv:3", "not finite")
 
 
-@pytest.fixture
-def no_opengl(tmp_path):
-    """An environment whose loader finds a libEGL that it cannot load."""
-    folder = tmp_path / "broken"
-    folder.mkdir()
-    (folder / "libEGL.so.1").write_text("no library")
-    return os.environ | {"LD_LIBRARY_PATH": str(folder)}
-
-
 def test_a_stream_without_opengl_gets_one_line_and_exit_code_3(
     small_bench_file, tmp_path, no_opengl
 ):
@@ -279,7 +265,9 @@ def test_a_stream_without_opengl_gets_one_line_and_exit_code_3(
         ("serve", small_bench_file, "--headless"),
     ):
         assert_refused(
-            run_hilstar(*words, env=no_opengl), 3, "apt-get install libegl1 libgl1-mesa-dri"
+            run_hilstar(*words, env=os.environ | no_opengl),
+            3,
+            "apt-get install libegl1 libgl1-mesa-dri",
         )
 
 
@@ -294,7 +282,10 @@ def test_without_opengl_numpy_draws_frame_and_simulate_as_opengl_does(
 ):
     small_bench_file.write_text(SMALL_BENCH + '[render]\nquantisation = "round"\n')
     drawn = {}
-    for name, run in (("gl", run_hilstar_here), ("numpy", partial(run_hilstar, env=no_opengl))):
+    for name, run in (
+        ("gl", run_hilstar_here),
+        ("numpy", partial(run_hilstar, env=os.environ | no_opengl)),
+    ):
         folder = tmp_path / name
         folder.mkdir()
         at = (small_bench_file, "--radec", "84.057,-1.2,0", "--json", "-o", folder / "image.fits")
@@ -318,7 +309,10 @@ def test_without_opengl_numpy_draws_frame_and_simulate_as_opengl_does(
 
 def test_without_opengl_verify_measures_the_same(small_bench_file, no_opengl):
     found = {}
-    for name, run in (("gl", run_hilstar_here), ("numpy", partial(run_hilstar, env=no_opengl))):
+    for name, run in (
+        ("gl", run_hilstar_here),
+        ("numpy", partial(run_hilstar, env=os.environ | no_opengl)),
+    ):
         done = run("verify", small_bench_file, "--fields", "2", "--json")
         assert done.returncode == 0, done.stderr
         found[name] = json.loads(done.stdout)
@@ -341,7 +335,7 @@ def test_where_numpy_draws_moderngl_is_not_imported(small_bench_file, tmp_path, 
     )
     done = subprocess.run(
         [sys.executable, "-c", script],
-        env=no_opengl,
+        env=os.environ | no_opengl,
         capture_output=True,
         text=True,
         timeout=PATIENCE_S,
@@ -351,7 +345,7 @@ def test_where_numpy_draws_moderngl_is_not_imported(small_bench_file, tmp_path, 
 
 
 def test_doctor_says_what_numpy_draws_where_opengl_is_missing(no_opengl):
-    done = run_hilstar("doctor", "--json", env=no_opengl)
+    done = run_hilstar("doctor", "--json", env=os.environ | no_opengl)
     assert done.returncode == 3
     check = next(check for check in json.loads(done.stdout)["checks"] if check["name"] == "opengl")
     assert not check["ok"]
@@ -395,7 +389,7 @@ def test_replay_writes_the_frames_of_a_log(tmp_path, small_bench_file):
     summary = json.loads(result.stdout)
     assert summary["frames"] == 13  # 0.2 s at 60 Hz, both ends included
     assert summary["missed_frames"] == summary["stale_frames"] == 0
-    table = read_truth(tmp_path / "out" / "frames.csv")
+    table = csv_rows(tmp_path / "out" / "frames.csv")
     assert len(table) == len(list((tmp_path / "out").glob("frame_*.png"))) == 13
     with hilstar.load(small_bench_file) as bench:
         for number, ra in ((0, 84.057), (6, 85.057), (12, 86.057)):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import os
 
@@ -16,6 +15,7 @@ from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import pack_sprites
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.tables import csv_rows
 
 SIGMA_PX = (0.85, 0.85)  # the bench's
 
@@ -43,8 +43,7 @@ def golden(tmp_path_factory):
 @pytest.fixture
 def faulty(golden, tmp_path):
     """The same with the star of HIP 26727 (Alnitak) dimmed by 0.05 mag, and Mintaka wiped out."""
-    with golden[1].open() as file:
-        stars = {int(row["hip"]): row for row in csv.DictReader(file)}
+    stars = {int(row["hip"]): row for row in csv_rows(golden[1])}
     alnitak, gone = stars[26727], stars[25930]
     with fits.open(golden[0]) as hdus:
         for star, less in ((alnitak, 1 - 10 ** (-0.4 * 0.05)), (gone, 1.0)):
@@ -113,8 +112,7 @@ def test_a_fault_is_told_named_and_drawn(golden, faulty, tmp_path):
     assert "HIP 25930 at" in result.stdout and "missing" in result.stdout
     pixels = np.array(Image.open(tmp_path / "out" / "compare.png").convert("L"))
     assert pixels.shape[0] > 500 and (pixels < 200).mean() > 0.005
-    with (tmp_path / "out" / "compare.csv").open() as file:
-        rows = {row["hip"]: row for row in csv.DictReader(file)}
+    rows = {row["hip"]: row for row in csv_rows(tmp_path / "out" / "compare.csv")}
     assert (rows["26727"]["kind"], rows["25930"]["kind"]) == ("changed", "missing")
     assert sum(row["kind"] != "same" for row in rows.values()) == 2
     page = (tmp_path / "out" / "compare.html").read_text()
@@ -146,8 +144,7 @@ def test_a_shift_of_the_whole_image_comes_first_and_in_few_lines(
     assert len(told.stdout.splitlines()) < 20
     with Image.open(out / "compare.png") as picture:
         assert picture.height > 500
-    with (out / "compare.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(out / "compare.csv")
     summary = json.loads(run_hilstar_here("compare", shifted, golden[0], "--json").stdout)
     assert summary["common"]["shift_px"] == pytest.approx([-0.75, 0.0], abs=1e-3)
     assert (

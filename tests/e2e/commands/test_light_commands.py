@@ -22,6 +22,7 @@ from hilstar.optics.psf import GaussianPsf, pixel_share
 from hilstar.server.bench.frame import clipping_hip
 from tests.support.benches import ROOT, SMALL_BENCH, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.tables import csv_rows
 
 EXACT = '[render]\nquantisation = "exact"\n'
 # 1 % noise on one reading: the response of the example comes back within 1 % at nearly every code,
@@ -86,8 +87,7 @@ def test_budget_writes_its_chart_and_table(tmp_path, small_bench_file):
     found = of_json("budget", small_bench_file, "-o", tmp_path / "out")
     assert found["method"] == "exact"
     assert found["within"]["0.05_mag"] >= 6
-    with (tmp_path / "out" / "budget.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == len(found["rows"])
+    assert len(csv_rows(tmp_path / "out" / "budget.csv")) == len(found["rows"])
     with Image.open(tmp_path / "out" / "budget.png") as picture:
         assert min(picture.size) > 500
     spoken = run_hilstar_here("budget", small_bench_file)
@@ -117,8 +117,7 @@ def test_budget_has_every_centroider_and_takes_the_bench_s_own(tmp_path, small_b
         row["axis_rms_px"] == fit["centroid_rms_px"] and len(set(row["axis_rms_px"].values())) == 6
     )
     assert row["centroid_rms_px"] == pytest.approx(math.sqrt(2) * row["axis_rms_px"]["fit"])
-    with (tmp_path / "out" / "budget.csv").open() as file:
-        written = list(csv.DictReader(file))[12]
+    written = csv_rows(tmp_path / "out" / "budget.csv")[12]
     assert float(written["axis_rms_px_box5"]) == pytest.approx(row["axis_rms_px"]["box5"])
     small_bench_file.write_text(small_bench_file.read_text() + '[verify]\ncentroider = "box5"\n')
     own, every = (
@@ -290,8 +289,7 @@ def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
         "calibrate", "plan", "-o", plan, "--headless", tmp_path / "patches", "--resolution", "64,48"
     )
     true = load_calibration("lcd-example", 8).response
-    with plan.open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(plan)
     assert len(rows) == planned["patches"]
     assert (
         len(list((tmp_path / "patches").glob("*.png"))) == len({row["code"] for row in rows}) >= 32
@@ -337,8 +335,7 @@ def test_the_commands_and_the_figures_of_the_calibration_page_are_true(tmp_path)
     assert planned.stdout.startswith(f"{patches} patches of {codes} codes in PLAN.csv")
     assert len(list((tmp_path / "PATCHES").glob("*.png"))) == int(codes)
     true = load_calibration("lcd-example", 8).response
-    with (tmp_path / "PLAN.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(tmp_path / "PLAN.csv")
     lines = [
         f"{row['order']},{row['code']},w,{float(true.black + true.light[int(row['code'])])!r}"
         for row in rows

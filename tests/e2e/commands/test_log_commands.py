@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 
@@ -12,12 +11,13 @@ from PIL import Image
 
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.tables import csv_rows
 
 RATE = np.radians([0.3, -0.2, 2.0])
 
 
 @pytest.fixture
-def log(tmp_path) -> Path:
+def rated(tmp_path) -> Path:
     """Two seconds at 10 Hz, in JSON lines with rates."""
     path = tmp_path / "log.jsonl"
     start = from_radec_roll_deg(84, -1, 0)
@@ -35,13 +35,12 @@ def log(tmp_path) -> Path:
     return path
 
 
-def replayed_log(bench: Path, log: Path, output: Path, *options: str) -> list[dict[str, str]]:
+def replayed_log(bench: Path, rated: Path, output: Path, *options: str) -> list[dict[str, str]]:
     result = run_hilstar_here(
-        "replay", bench, log, "--headless", "--speed", "max", "-o", output, *options
+        "replay", bench, rated, "--headless", "--speed", "max", "-o", output, *options
     )
     assert result.returncode == 0, result.stderr
-    with (output / "frames.csv").open() as file:
-        return list(csv.DictReader(file))
+    return csv_rows(output / "frames.csv")
 
 
 def quaternion(row: dict[str, str]) -> list[float]:
@@ -49,35 +48,43 @@ def quaternion(row: dict[str, str]) -> list[float]:
 
 
 @pytest.mark.parametrize("suffix", ["csv", "jsonl", "aem", "kvn", "xml", "mcap"])
-def test_every_form_of_a_log_replays_to_the_same_frames(tmp_path, small_bench_file, log, suffix):
+def test_every_form_of_a_log_replays_to_the_same_frames(tmp_path, small_bench_file, rated, suffix):
     other = tmp_path / f"other.{suffix}"
-    converted = run_hilstar_here("convert", log, other)
+    converted = run_hilstar_here("convert", rated, other)
     assert converted.returncode == 0, converted.stderr
     assert "21 attitudes" in converted.stdout
     ours, theirs = (
         replayed_log(small_bench_file, path, tmp_path / path.suffix, "--step", "0.25")
-        for path in (log, other)
+        for path in (rated, other)
     )
     assert len(ours) == len(theirs) == 9
     for a, b in zip(ours, theirs, strict=True):
         # AEM's rates come back through q and q_dot, to some 1e-15.
         assert quaternion(a) == pytest.approx(quaternion(b), abs=1e-13)
     frames = [
-        np.array(Image.open(tmp_path / path.suffix / "frame_000004.png")) for path in (log, other)
+        np.array(Image.open(tmp_path / path.suffix / "frame_000004.png")) for path in (rated, other)
     ]
     assert (frames[0] != frames[1]).mean() < 1e-4
     assert frames[0].max() > 50
 
 
-def test_a_replay_s_span_and_step_are_those_asked_for(tmp_path, small_bench_file, log):
+def test_a_replay_s_span_and_step_are_those_asked_for(tmp_path, small_bench_file, rated):
     rows = replayed_log(
-        small_bench_file, log, tmp_path / "out", "--start", "0.5", "--stop", "1.5", "--step", "0.1"
+        small_bench_file,
+        rated,
+        tmp_path / "out",
+        "--start",
+        "0.5",
+        "--stop",
+        "1.5",
+        "--step",
+        "0.1",
     )
     assert [float(row["t_s"]) for row in rows] == pytest.approx([1.5 + 0.1 * k for k in range(11)])
 
 
-def test_a_replay_at_four_times_the_speed_takes_a_quarter_of_the_time(small_bench_file, log):
-    result = run_hilstar("replay", small_bench_file, log, "--headless", "--speed", "4", "--json")
+def test_a_replay_at_four_times_the_speed_takes_a_quarter_of_the_time(small_bench_file, rated):
+    result = run_hilstar("replay", small_bench_file, rated, "--headless", "--speed", "4", "--json")
     summary = json.loads(result.stdout)
     assert summary["frames"] + summary["missed_frames"] == 31
     assert summary["duration_s"] == pytest.approx(0.5, abs=0.1)
@@ -95,23 +102,23 @@ def test_a_replay_at_four_times_the_speed_takes_a_quarter_of_the_time(small_benc
         (["--speed", "max", "--step", "1e-12"], "longer --step"),
     ],
 )
-def test_a_speed_or_span_that_gives_no_frame_gets_one_line(small_bench_file, log, options, said):
+def test_a_speed_or_span_that_gives_no_frame_gets_one_line(small_bench_file, rated, options, said):
     assert_refused(
-        run_hilstar_here("replay", small_bench_file, log, "--headless", *options), 2, said
+        run_hilstar_here("replay", small_bench_file, rated, "--headless", *options), 2, said
     )
 
 
-def test_convert_says_what_it_cannot(tmp_path, log):
-    assert_refused(run_hilstar_here("convert", log, tmp_path / "out.doc"), 2, ".csv", "out.doc")
+def test_convert_says_what_it_cannot(tmp_path, rated):
+    assert_refused(run_hilstar_here("convert", rated, tmp_path / "out.doc"), 2, ".csv", "out.doc")
     assert_refused(
         run_hilstar_here("convert", tmp_path / "none.csv", tmp_path / "out.csv"), 2, "none.csv"
     )
-    assert_refused(run_hilstar_here("convert", log, tmp_path / "no" / "out.csv"), 2, "out.csv")
+    assert_refused(run_hilstar_here("convert", rated, tmp_path / "no" / "out.csv"), 2, "out.csv")
 
 
-def test_convert_says_what_a_log_s_rates_and_digits_say_against_it(tmp_path, log):
-    turned = log.with_name("conjugates.jsonl")
-    rows = [json.loads(line) for line in log.read_text().splitlines()]
+def test_convert_says_what_a_log_s_rates_and_digits_say_against_it(tmp_path, rated):
+    turned = rated.with_name("conjugates.jsonl")
+    rows = [json.loads(line) for line in rated.read_text().splitlines()]
     for row in rows:
         row["q"] = [row["q"][0], *(-part for part in row["q"][1:])]
     turned.write_text("\n".join(map(json.dumps, rows)))
@@ -122,7 +129,7 @@ def test_convert_says_what_a_log_s_rates_and_digits_say_against_it(tmp_path, log
     turned.write_text("\n".join(map(json.dumps, rows)))
     told = run_hilstar_here("convert", turned, tmp_path / "out.csv").stderr
     assert "steps of 0.001" in told
-    assert run_hilstar_here("convert", log, tmp_path / "out.csv").stderr == ""
+    assert run_hilstar_here("convert", rated, tmp_path / "out.csv").stderr == ""
 
 
 def test_fault_options_stand_alone_or_take_a_share(tmp_path):

@@ -150,7 +150,7 @@ LOGS = {
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> Path:
+def self_check_bench(tmp_path: Path) -> Path:
     path = tmp_path / "mounted.toml"
     path.write_text(bench_text({"tracker": {"q_body_to_cam": MOUNTING}}))
     return path
@@ -178,11 +178,15 @@ def assert_alnilam_is_in_the_middle(told: dict) -> None:
 
 
 @pytest.mark.parametrize("form", LOGS)
-def test_a_log_of_the_self_check_s_attitude_looks_at_the_star_that_it_names(tmp_path, bench, form):
+def test_a_log_of_the_self_check_s_attitude_looks_at_the_star_that_it_names(
+    tmp_path, self_check_bench, form
+):
     write, label, stated = LOGS[form]
-    _, words, numbers = looked_at(write(tmp_path, [0.5, -0.5, 0.5, 0.5]), *stated, "--bench", bench)
+    _, words, numbers = looked_at(
+        write(tmp_path, [0.5, -0.5, 0.5, 0.5]), *stated, "--bench", self_check_bench
+    )
     assert words == label
-    told, _, _ = looked_at(write(tmp_path, numbers), *stated, "--bench", bench)
+    told, _, _ = looked_at(write(tmp_path, numbers), *stated, "--bench", self_check_bench)
     assert_alnilam_is_in_the_middle(told)
 
 

@@ -4,7 +4,6 @@ is refused.
 
 from __future__ import annotations
 
-import csv
 import json
 import sys
 from pathlib import Path
@@ -23,6 +22,7 @@ from tests.support.commands import run_hilstar_here
 from tests.support.skies import STATION_TLE, STATION_UTC, skyfield, utc_ns
 from tests.support.sources.aem_messages import kvn
 from tests.support.sources.oem_messages import oem, segment
+from tests.support.tables import csv_rows
 
 DATED = '[sky]\nepoch_utc = "2026-11-21T00:00:00Z"\n'
 BODIES = DATED + "[sky.bodies]\nplanets = true\nmoon = true\nsun = true\n"
@@ -38,8 +38,7 @@ def bodies_file(small_bench_file: Path) -> Path:
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    return csv_rows(path)
 
 
 def frame_of_radec(bench_file: Path, radec: str, *more: str) -> tuple[dict, list[dict[str, str]]]:

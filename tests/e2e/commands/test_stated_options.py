@@ -4,7 +4,6 @@ alike, or refused by name.
 
 from __future__ import annotations
 
-import csv
 import socket
 import struct
 
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.tables import csv_rows
 
 COMMANDS = ["attitude", "replay", "convert", "simulate", "send"]
 MOUNTING = (0.5, -0.5, -0.5, -0.5)
@@ -99,8 +99,7 @@ def test_each_command_uses_a_convention_and_a_mounting(tmp_path, files, command)
         assert "RA 84.0000, Dec -1.2000, roll 10.0000 deg" in result.stdout
     if command in {"replay", "convert"}:
         path = tmp_path / ("frames/frames.csv" if command == "replay" else "out.csv")
-        with path.open() as file:
-            rows = list(csv.DictReader(file))
+        rows = csv_rows(path)
         assert (
             max(off_camera_rad([row[name] for name in ("qw", "qx", "qy", "qz")]) for row in rows)
             < SAME_RAD

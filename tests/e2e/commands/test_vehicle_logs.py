@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -12,6 +10,7 @@ from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.sources import ros_bags
 from tests.support.sources.ros_bags import START_NS, Make, write_bag2
+from tests.support.tables import csv_rows
 
 RATE = np.radians([0.3, -0.2, 2.0])
 ORION = from_radec_roll_deg(84, -1, 0)
@@ -48,8 +47,7 @@ def test_a_bag_is_replayed_with_what_is_stated(tmp_path, small_bench_file, bag):
     assert result.returncode == 0, result.stderr
     assert "the reference is taken as the ICRS, as stated" in result.stderr
     assert "scalar last (x, y, z, w)" in result.stderr
-    with (tmp_path / "out" / "frames.csv").open() as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(tmp_path / "out" / "frames.csv")
     assert len(rows) == 5
     for k, row in enumerate(rows):
         found = Rotation.from_quat(

@@ -18,18 +18,9 @@ OTHER = 1e-4  # of lit pixels, whose light is within rounding of a threshold
 
 
 @pytest.fixture
-def bench_file(small_bench_file):
+def round_bench(small_bench_file):
     small_bench_file.write_text(SMALL_BENCH + '[render]\nquantisation = "round"\n')
     return small_bench_file
-
-
-@pytest.fixture
-def no_opengl(tmp_path):
-    """A loader that finds a libEGL that it cannot load."""
-    folder = tmp_path / "broken"
-    folder.mkdir()
-    (folder / "libEGL.so.1").write_text("no library")
-    return {"LD_LIBRARY_PATH": str(folder)}
 
 
 def by(way: str, **more: str) -> dict[str, str]:
@@ -37,16 +28,16 @@ def by(way: str, **more: str) -> dict[str, str]:
 
 
 @pytest.mark.parametrize("way", ["opengl", "CPU", "gl "])
-def test_another_word_is_refused_in_one_line(way, bench_file, tmp_path, no_opengl):
+def test_another_word_is_refused_in_one_line(way, round_bench, tmp_path, no_opengl):
     for environment in (by(way), by(way, **no_opengl)):
-        result = run_hilstar("frame", bench_file, *AT, "-o", tmp_path / "x.fits", env=environment)
+        result = run_hilstar("frame", round_bench, *AT, "-o", tmp_path / "x.fits", env=environment)
         assert_refused(result, 2, f"HILSTAR_DRAW={way}", "gl or cpu")
 
 
 def test_points_that_are_asked_for_need_opengl_and_the_processor_does_not(
-    bench_file, tmp_path, no_opengl
+    round_bench, tmp_path, no_opengl
 ):
-    words = ("frame", bench_file, *AT, "-o", tmp_path / "x.fits")
+    words = ("frame", round_bench, *AT, "-o", tmp_path / "x.fits")
     refused = run_hilstar(*words, env=by("gl", **no_opengl))
     assert_refused(refused, 3, "HILSTAR_DRAW=gl", "no OpenGL")
     drawn = run_hilstar(*words, env=by("cpu", **no_opengl))
@@ -54,16 +45,16 @@ def test_points_that_are_asked_for_need_opengl_and_the_processor_does_not(
 
 
 def test_both_ways_draw_the_same_codes_and_ledger_summary_and_doctor_say_which(
-    bench_file, tmp_path
+    round_bench, tmp_path
 ):
     log = still_log(tmp_path / "log.csv", seconds=1)
     codes, paths = {}, {}
     for way in ("gl", "cpu"):
         ledger, picture = tmp_path / f"{way}.mcap", tmp_path / f"{way}.png"
-        framed = run_hilstar("frame", bench_file, *AT, "--codes", picture, env=by(way))
+        framed = run_hilstar("frame", round_bench, *AT, "--codes", picture, env=by(way))
         assert framed.returncode == 0, framed.stderr
         codes[way] = np.array(Image.open(picture)).astype(int)
-        words = ("replay", bench_file, log, "--headless", "--speed", "max", "--json")
+        words = ("replay", round_bench, log, "--headless", "--speed", "max", "--json")
         played = run_hilstar(*words, "--ledger", ledger, env=by(way))
         assert played.returncode == 0, played.stderr
         paths[way] = json.loads(played.stdout)["render_path"]

@@ -29,7 +29,7 @@ STALE_S, SEEN_S = 0.25, 0.5
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def page_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("page")
     with bound(
         folder, "--console", "127.0.0.1:0", "--control", "--ledger", str(folder / "run.mcap")
@@ -38,12 +38,12 @@ def run(tmp_path_factory):
 
 
 @pytest.fixture
-def page(run) -> PageAddress:
-    return run[1]
+def page(page_run) -> PageAddress:
+    return page_run[1]
 
 
-def test_health_says_what_is_wrong_and_turns_within_half_a_second(run):
-    served, page, _ = run
+def test_health_says_what_is_wrong_and_turns_within_half_a_second(page_run):
+    served, page, _ = page_run
     wait_for(lambda: page.json("/health")["reasons"] == ["no attitude has come yet"], served.lines)
     with connected(served.port) as sender:
         for attempt in range(CHANCES):
@@ -65,8 +65,8 @@ def test_health_says_what_is_wrong_and_turns_within_half_a_second(run):
         assert page.health_is(False)
 
 
-def test_a_picture_has_the_stars_of_its_frame_where_the_truth_says(run):
-    served, page, _ = run
+def test_a_picture_has_the_stars_of_its_frame_where_the_truth_says(page_run):
+    served, page, _ = page_run
     with connected(served.port) as sender, talking(sender, q=ORION), live(page) as link:
         wait_for(lambda: page.health_is(True))
         link.want(picture=True, hz=10, grid=True)
@@ -88,8 +88,8 @@ def test_a_picture_has_the_stars_of_its_frame_where_the_truth_says(run):
     assert len(truth["grid"]) > 4 and all(len(line["px"]) > 1 for line in truth["grid"])
 
 
-def test_a_picture_is_the_run_s_own_and_moves_with_the_attitude(run):
-    served, page, _ = run
+def test_a_picture_is_the_run_s_own_and_moves_with_the_attitude(page_run):
+    served, page, _ = page_run
     with connected(served.port) as sender, live(page) as link:
         link.want(picture=True, hz=10)
         seen = []
@@ -110,8 +110,8 @@ def test_a_picture_is_the_run_s_own_and_moves_with_the_attitude(run):
     )
 
 
-def test_each_control_acts_on_the_next_frames_and_is_in_the_ledger_with_who(run):
-    served, page, folder = run
+def test_each_control_acts_on_the_next_frames_and_is_in_the_ledger_with_who(page_run):
+    served, page, folder = page_run
     with connected(served.port) as sender, talking(sender):
         wait_for(lambda: page.health_is(True))
         for name in ("blank", "pause", "patch", "crosshair", "grid"):
@@ -135,8 +135,8 @@ def test_each_control_acts_on_the_next_frames_and_is_in_the_ledger_with_who(run)
     assert {"blank", "pause", "patch 50%", "crosshair", "grid"} <= operators
 
 
-def test_a_blank_or_a_patch_is_what_the_picture_shows(run):
-    served, page, _ = run
+def test_a_blank_or_a_patch_is_what_the_picture_shows(page_run):
+    served, page, _ = page_run
     with connected(served.port) as sender, talking(sender), live(page) as link:
         wait_for(lambda: page.health_is(True))
         link.want(picture=True, hz=10)
@@ -151,8 +151,8 @@ def test_a_blank_or_a_patch_is_what_the_picture_shows(run):
             assert page.control(name, on=False)[0] == 200
 
 
-def test_a_ledger_is_ended_and_begun_while_the_run_goes_on(run):
-    _, page, folder = run
+def test_a_ledger_is_ended_and_begun_while_the_run_goes_on(page_run):
+    _, page, folder = page_run
     status, answer = page.control("ledger", on=False)
     assert status == 200 and "is whole" in answer["line"]
     assert page.json("/state")["state"]["ledger"] is None
@@ -192,8 +192,8 @@ def test_a_ledger_may_be_called_anything(tmp_path):
     )
 
 
-def test_a_page_killed_comes_back_by_itself_while_frames_go_on(run):
-    served, page, _ = run
+def test_a_page_killed_comes_back_by_itself_while_frames_go_on(page_run):
+    served, page, _ = page_run
     (first,) = children(served.process.pid, PAGE)
     wait_for(lambda: page.health_is(False))  # nobody sends
     wrong_since = page.json("/health")["since"]

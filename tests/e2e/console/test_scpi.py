@@ -90,15 +90,15 @@ def instrument(port: int) -> Iterator[Instrument]:
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory):
+def scpi_steered_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scpi")
     with scpi_run(folder, STEERED, "--ledger", str(folder / "run.mcap")) as (served, found):
         yield served, int(found[2])
 
 
 @pytest.fixture
-def stand(run):
-    with instrument(run[1]) as opened:
+def stand(scpi_steered_run):
+    with instrument(scpi_steered_run[1]) as opened:
         opened.write("*RST;*CLS")
         yield opened
 
@@ -118,7 +118,9 @@ def test_a_test_stand_meets_an_instrument(stand):
     assert int(stand.ask("FRAM:MISS?")) >= 0
 
 
-def test_an_attitude_that_is_set_is_shown_and_turns_at_the_rate_that_is_set(run, stand):
+def test_an_attitude_that_is_set_is_shown_and_turns_at_the_rate_that_is_set(
+    scpi_steered_run, stand
+):
     stand.write("SKY:ATT " + ",".join(map(str, ORION_Q)))
     assert stand.ask("*OPC?") == "1"
     shown = stand.numbers("SKY:ATT?")
@@ -135,10 +137,10 @@ def test_an_attitude_that_is_set_is_shown_and_turns_at_the_rate_that_is_set(run,
         -0.5, rel=1e-3
     )
     assert 0 < turn[1] < 0.5 * (lasted_s + 0.3)  # a state is written ten times a second
-    assert stand.errors() == [] and run[0].count("sender's clock") == 0
+    assert stand.errors() == [] and scpi_steered_run[0].count("sender's clock") == 0
 
 
-def test_orders_are_those_of_the_operator(run, stand):
+def test_orders_are_those_of_the_operator(scpi_steered_run, stand):
     stand.write("SKY:BLANK ON")
     assert stand.ask("SKY:BLAN?") == "1" and int(stand.ask("STAT:OPER:COND?")) & 2048
     stand.write("SKY:FAULT 'dark'")
@@ -150,7 +152,7 @@ def test_orders_are_those_of_the_operator(run, stand):
     assert stand.ask("LEDG:STAT?") == "0"
     stand.write("LEDG:STATE ON")
     assert stand.ask("LEDG:STAT?") == "1" and stand.errors() == []
-    assert run[0].count("blank on, by SCPI") == 1
+    assert scpi_steered_run[0].count("blank on, by SCPI") == 1
 
 
 def test_errors_are_the_standard_s_and_set_their_bits(stand):
@@ -167,8 +169,8 @@ def test_errors_are_the_standard_s_and_set_their_bits(stand):
     assert stand.ask("*STB?") == str(32 + 64) and stand.ask("*ESR?;*STB?") == f"{32 + 16 + 8};16"
 
 
-def test_what_is_no_scpi_neither_ends_it_nor_makes_it_grow(run):
-    served, port = run
+def test_what_is_no_scpi_neither_ends_it_nor_makes_it_grow(scpi_steered_run):
+    served, port = scpi_steered_run
     page = children(served.process.pid, "hilstar.server.console.server")[0]
     rng = np.random.default_rng(5025)
 
@@ -221,9 +223,9 @@ def test_what_is_no_scpi_neither_ends_it_nor_makes_it_grow(run):
         bytes.fromhex("16030100c8010000c40303"),
     ],
 )
-def test_a_browser_is_not_listened_to(run, stand, request_line):
+def test_a_browser_is_not_listened_to(scpi_steered_run, stand, request_line):
     with (
-        socket.create_connection(("127.0.0.1", run[1]), PATIENCE_S) as browser,
+        socket.create_connection(("127.0.0.1", scpi_steered_run[1]), PATIENCE_S) as browser,
         contextlib.suppress(OSError),
     ):
         for piece in (request_line[:7], request_line[7:], b"\nSKY:BLAN ON\nSKY:BLAN?\n"):

@@ -4,7 +4,6 @@ it.
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from pathlib import Path
@@ -19,6 +18,7 @@ from hilstar.instruments.simulate.twin import Twin
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.tables import csv_rows
 
 BENCH = bench_text(TWIN)
 FIELDS = "6"
@@ -225,8 +225,7 @@ def test_bit_stealing_with_another_monitor_s_primaries_is_still_measured(tmp_pat
 
 def test_charts_and_a_table_are_written(tmp_path):
     _, summary = verified(tmp_path, "", "-o", str(tmp_path / "out"))
-    with (tmp_path / "out" / "stars.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == summary["stars"]
+    assert len(csv_rows(tmp_path / "out" / "stars.csv")) == summary["stars"]
     for name in ("errors.png", "field.png"):
         with Image.open(tmp_path / "out" / name) as picture:
             assert min(picture.size) > 500

@@ -148,7 +148,7 @@ def test_tcp_connects_to_a_tracker_that_starts_later_and_asks_it(tmp_path):
             + b"\n"
         )
         (answer,) = gathered(source, 1)
-        assert tuple(answer.centroids[0]) == (1.0, 2.0, 3.0, 4)
+        assert tuple(answer.centroids[0]) == (1.0, 2.0, 3.0, 4, None)
         tracker.close()
 
 

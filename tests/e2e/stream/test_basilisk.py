@@ -7,16 +7,15 @@ from __future__ import annotations
 import json
 import signal
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
-from mcap.reader import make_reader
 from scipy.spatial.transform import Rotation, Slerp
 
 from tests.support.benches import bench_text
 from tests.support.claims import holds
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.ledgers import messages_by_topic
 from tests.support.senders import free_port, publisher
 from tests.support.servers import interrupted, listening, serving
 from tests.support.sources.basilisk import Truth, basilisk, rotation
@@ -39,15 +38,6 @@ SAMPLE_LIMIT_RAD = 1e-14
 # Differences of three attitudes h apart: the rate's second derivative (1e-5 rad/s^3 here) times h^2
 # / 3 is 1.3e-9 at 20 ms, and 3e-9 where a second message between them was lost.
 RATE_LIMIT_RAD_S = 1e-8
-
-
-def ledger_topics(path: Path) -> dict[str, list[dict]]:
-    """By topic, through MCAP's own reader."""
-    found: dict[str, list[dict]] = {}
-    with path.open("rb") as file:
-        for _, channel, message in make_reader(file).iter_messages():
-            found.setdefault(channel.topic, []).append(json.loads(message.data))
-    return found
 
 
 def star_errors_px(mine: Rotation, true: Rotation) -> np.ndarray:
@@ -75,7 +65,7 @@ def broadcast(tmp_path_factory) -> tuple[Truth, dict[str, list[dict]], dict]:
         time.sleep(SUBSCRIBED_S)
         simulation.run()
         summary = interrupted(served)
-    return Truth(folder), ledger_topics(folder / "run.mcap"), summary
+    return Truth(folder), messages_by_topic(folder / "run.mcap"), summary
 
 
 def test_every_sample_is_basilisk_s_own_attitude_through_the_mounting_and_the_shadow_switch(
@@ -139,7 +129,7 @@ def test_in_lockstep_every_step_is_one_frame(tmp_path):
     ):
         simulation.run()
         summary = interrupted(served)
-    truth, frames = Truth(tmp_path), ledger_topics(tmp_path / "run.mcap")["/frame"]
+    truth, frames = Truth(tmp_path), messages_by_topic(tmp_path / "run.mcap")["/frame"]
     assert [frame["t_ns"] for frame in frames] == [50_000_000 * k for k in range(1, 41)]
     assert summary["packets"]["received"] == summary["packets"]["accepted"] == 40
     for frame in frames:

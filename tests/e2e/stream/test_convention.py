@@ -36,7 +36,7 @@ def off_rad(q, wanted: Rotation) -> float:
 
 
 @pytest.fixture
-def run(tmp_path):
+def convention_run(tmp_path):
     """A ledger of a run, its bench file, and what the run said."""
     bench, ledger = tmp_path / "bench.toml", tmp_path / "run.mcap"
     with publisher() as (sender, port), talking(sender, 100.0, SENT):
@@ -53,8 +53,10 @@ def run(tmp_path):
     return bench, ledger
 
 
-def test_the_sky_is_the_cameras_and_the_ledger_keeps_the_bytes_with_their_convention(run):
-    _, ledger = run
+def test_the_sky_is_the_cameras_and_the_ledger_keeps_the_bytes_with_their_convention(
+    convention_run,
+):
+    _, ledger = convention_run
     shown = [record.q for record in frame_records(ledger) if record.q is not None]
     assert shown
     assert max(off_rad(q, TO_CAM * ICRS_TO_BODY) for q in shown) < SAME_RAD
@@ -77,8 +79,8 @@ def test_the_sky_is_the_cameras_and_the_ledger_keeps_the_bytes_with_their_conven
         assert off_rad(each["q"], TO_CAM * ICRS_TO_BODY) < SAME_RAD
 
 
-def test_a_replay_and_a_conversion_apply_it_no_second_time(tmp_path, run):
-    bench, ledger = run
+def test_a_replay_and_a_conversion_apply_it_no_second_time(tmp_path, convention_run):
+    bench, ledger = convention_run
     again = tmp_path / "again.mcap"
     result = run_hilstar_here(
         "replay", bench, ledger, "--headless", "--speed", "max", "--ledger", again
@@ -115,8 +117,8 @@ def test_a_replay_and_a_conversion_apply_it_no_second_time(tmp_path, run):
             )
 
 
-def test_a_live_stream_is_looked_at_by_its_bench_file(tmp_path, run):
-    bench, _ = run
+def test_a_live_stream_is_looked_at_by_its_bench_file(tmp_path, convention_run):
+    bench, _ = convention_run
     with publisher() as (sender, port), talking(sender, 100.0, SENT):
         text = LIVE_BENCH.replace("[tracker]", f"[tracker]\nq_body_to_cam = {list(MOUNTING)}")
         bench.write_text(text + attitude_table(port, CONVENTION))

@@ -32,9 +32,9 @@ def pulse_bench(tmp_path, port, **sync):
 
 
 @pytest.fixture
-def server():
-    with RtsServer() as server:
-        yield server
+def pulse_server():
+    with RtsServer() as pulse_server:
+        yield pulse_server
 
 
 def replayed_pulses(tmp_path, bench_file):
@@ -48,11 +48,11 @@ def replayed_pulses(tmp_path, bench_file):
 
 
 @pytest.mark.timing
-def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_path, server):
+def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_path, pulse_server):
     with CoreWaits(os.getpid()) as waited:
-        summary, _ = replayed_pulses(tmp_path, pulse_bench(tmp_path, server.url, pulse_ms=20))
-    told, pulses = summary["sync"], server.pulses()
-    assert told["port"] == server.url
+        summary, _ = replayed_pulses(tmp_path, pulse_bench(tmp_path, pulse_server.url, pulse_ms=20))
+    told, pulses = summary["sync"], pulse_server.pulses()
+    assert told["port"] == pulse_server.url
     assert (
         len(pulses) == told["pulses"]
         and told["pulses"] + told["skipped"] <= 1 + int(SECONDS * REFRESH_HZ) // EVERY
@@ -66,19 +66,21 @@ def test_the_far_port_sees_as_many_pulses_as_are_told_each_so_many_frames(tmp_pa
     off_ms = rises_ms - rises_ms[0] - np.round((rises_ms - rises_ms[0]) / APART_MS) * APART_MS
     assert np.abs(off_ms).max() < APART_MS / 4 + 1000 * waited.s, (off_ms, waited.s)
     assert told["jitter_ms"] <= told["max_delay_ms"]
-    assert server.line.edges[-1][1] is False
+    assert pulse_server.line.edges[-1][1] is False
 
 
-def test_a_port_that_is_cut_stops_no_frame(tmp_path, server):
+def test_a_port_that_is_cut_stops_no_frame(tmp_path, pulse_server):
     def cut():
         # the first is over for the run too, which waits for the server's word
-        while len(server.pulses()) < 2:
+        while len(pulse_server.pulses()) < 2:
             time.sleep(0.01)
-        server.cut()
+        pulse_server.cut()
 
     thread = threading.Thread(target=cut, daemon=True)
     thread.start()
-    summary, said = replayed_pulses(tmp_path, pulse_bench(tmp_path, f"{server.url}?timeout=0.3"))
+    summary, said = replayed_pulses(
+        tmp_path, pulse_bench(tmp_path, f"{pulse_server.url}?timeout=0.3")
+    )
     thread.join()
     assert summary["sync"]["lost"] == 1 and summary["sync"]["pulses"] >= 1
     assert summary["frames"] + summary["missed_frames"] >= int(SECONDS * REFRESH_HZ)

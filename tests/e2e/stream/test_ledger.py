@@ -25,6 +25,7 @@ from hilstar.server.record.ledger_records import drawable_frames
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.forks import Started
+from tests.support.ledgers import messages_by_topic
 from tests.support.pages import page_of
 from tests.support.senders import await_subscriber, connected, packet, publisher, talking
 from tests.support.servers import bound, serving, summary_of
@@ -49,15 +50,6 @@ def send_turn(sender, count: int) -> None:
         time.sleep(0.01)
 
 
-def messages(path: Path) -> dict[str, list[dict]]:
-    """By topic, through MCAP's own reader."""
-    found: dict[str, list[dict]] = {}
-    with path.open("rb") as file:
-        for _, channel, message in make_reader(file).iter_messages():
-            found.setdefault(channel.topic, []).append(json.loads(message.data))
-    return found
-
-
 def served_ledger(tmp_path, *options: str) -> tuple[Path, dict]:
     ledger = tmp_path / "run.mcap"
     with (
@@ -74,7 +66,7 @@ def served_ledger(tmp_path, *options: str) -> tuple[Path, dict]:
 def test_every_packet_and_every_frame_is_there(tmp_path):
     ledger, summary = served_ledger(tmp_path)
     assert summary["ledger"] == {"path": str(ledger), "failure": None, "unrecorded": 0}
-    found = messages(ledger)
+    found = messages_by_topic(ledger)
     assert len(found["/attitude"]) == summary["packets"]["received"] == 110
     assert sum(not each["accepted"] for each in found["/attitude"]) == 10
     refused = [each for each in found["/attitude"] if not each["accepted"]]
@@ -225,7 +217,7 @@ def test_a_ledger_that_is_deleted_is_said_everywhere_and_ends_the_run_with_1(tmp
         f"{ledger} was deleted while it was written",
     )
     assert told["unrecorded"] > 0
-    assert any(each["kind"] == "ledger-lost" for each in messages(following)["/event"])
+    assert any(each["kind"] == "ledger-lost" for each in messages_by_topic(following)["/event"])
     assert not ledger.exists()
 
 
@@ -295,7 +287,7 @@ def test_a_flood_of_wrong_packets_is_counted_and_the_ledger_stays_small(tmp_path
         process.has_received(1001)
         process.send_signal(signal.SIGINT)
         summary = summary_of(process, code=4)  # nothing right ever came
-    found = messages(ledger)
+    found = messages_by_topic(ledger)
     assert len(found["/attitude"]) < 40
     assert len(bytes.fromhex(found["/attitude"][0]["raw"])) == 1024
     counted = sum(each["count"] for each in found["/not_kept"] if each["kind"] == "packet")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import os
 import signal
 import threading
@@ -26,7 +25,7 @@ from hilstar.server.send_log import BadCable, Faults, send, spin_samples
 from hilstar.server.sender import SerialSender
 from hilstar.server.serve import serve
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, sent
 from tests.support.live_runs import attitudes, median_age_ns, serve_until
 from tests.support.senders import packet
 from tests.support.servers import interrupted, listening, summary_of, until_said
@@ -48,7 +47,7 @@ def cable(tmp_path) -> Iterator[Cable]:
 
 
 @pytest.fixture
-def bench_file(tmp_path, cable):
+def wire_file(tmp_path, cable):
     path = tmp_path / "serial.toml"
     path.write_text(
         f'{LIVE_BENCH}\n[attitude]\nsource = "serial"\nport = "{cable.host}"\nbaud = {BAUD}\n'
@@ -56,16 +55,12 @@ def bench_file(tmp_path, cable):
     return path
 
 
-def sent(cable, *options: str) -> dict:
-    result = run_hilstar_here("send", "--to", f"serial:{cable.sender}@{BAUD}", "--json", *options)
-    assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout)
-
-
-def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(cable, bench_file):
-    with listening(bench_file, "reading serial:") as process:
+def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(cable, wire_file):
+    with listening(wire_file, "reading serial:") as process:
         process.shows()
-        told = sent(cable, "--spin", "z,1", "--rate", "200", "--count", "600")
+        told = sent(
+            f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "200", "--count", "600"
+        )
         process.has_received(600)
         summary = interrupted(process)
     assert told["sent"] == summary["packets"]["accepted"] == summary["packets"]["received"] == 600
@@ -79,10 +74,19 @@ def test_two_hundred_a_second_arrive_none_lost_none_refused_and_both_sides_talk(
     assert summary["receive_latency_ms"]["p50"] is not None
 
 
-def test_lost_corrupted_and_reordered_packets_add_up(cable, bench_file):
-    with listening(bench_file, "reading serial:") as process:
+def test_lost_corrupted_and_reordered_packets_add_up(cable, wire_file):
+    with listening(wire_file, "reading serial:") as process:
         faults = ["--lose", "10%", "--corrupt", "5%", "--reorder", "--jitter", "1", "--seed", "3"]
-        told = sent(cable, "--spin", "z,1", "--rate", "400", "--count", "800", *faults)
+        told = sent(
+            f"serial:{cable.sender}@{BAUD}",
+            "--spin",
+            "z,1",
+            "--rate",
+            "400",
+            "--count",
+            "800",
+            *faults,
+        )
         process.has_received(told["sent"])
         summary = interrupted(process)
     packets = summary["packets"]
@@ -94,13 +98,13 @@ def test_lost_corrupted_and_reordered_packets_add_up(cable, bench_file):
     assert packets["accepted"] == packets["received"] - told["corrupted"] - told["reordered"]
 
 
-def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
+def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, wire_file):
     """A turn of 20 deg/s: every attitude drawn is that of its time, to what a packet's float32
     rate predicts in 100 ms.
     """
     rate = np.radians([0.0, 0.0, 20.0])
     with (
-        load(bench_file) as bench,
+        load(wire_file) as bench,
         SerialLink(str(cable.host), BAUD) as link,
         SerialSender(str(cable.sender), BAUD) as road,
     ):
@@ -130,12 +134,12 @@ def test_nothing_wrong_is_drawn_over_a_bad_cable(cable, bench_file):
     )
 
 
-def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(cable, bench_file):
+def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(cable, wire_file):
     """A second and a half of packets in the kernel's buffer and at the sender, which had to wait
     for room.
     """
     with (
-        load(bench_file) as bench,
+        load(wire_file) as bench,
         SerialLink(str(cable.host), BAUD) as link,
         SerialSender(str(cable.sender), BAUD) as road,
     ):
@@ -161,13 +165,16 @@ def test_a_line_that_filled_up_while_the_display_was_made_ready_misleads_nobody(
 
 
 @pytest.mark.timing
-def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(
-    tmp_path, cable, bench_file
-):
-    with listening(bench_file, "reading serial:") as process:
+def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(tmp_path, cable, wire_file):
+    with listening(wire_file, "reading serial:") as process:
         process.shows()
         shown_s = time.monotonic()
-        assert sent(cable, "--spin", "z,1", "--rate", "100", "--count", "50")["sent"] == 50
+        assert (
+            sent(
+                f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "100", "--count", "50"
+            )["sent"]
+            == 50
+        )
         process.has_received(50)
         cable.pull()
         time.sleep(1.0)
@@ -177,7 +184,12 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(
             until_said(process, "is back")
             took_s = time.monotonic() - plugged_s
         assert took_s - waited.s < 1.0 + LATE_S, (took_s, waited.s)
-        assert sent(cable, "--spin", "z,1", "--rate", "100", "--count", "50")["sent"] == 50
+        assert (
+            sent(
+                f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "100", "--count", "50"
+            )["sent"]
+            == 50
+        )
         process.has_received(100)
         lasted_s = time.monotonic() - shown_s
         summary = interrupted(process)
@@ -192,16 +204,16 @@ def test_a_device_that_goes_and_comes_back_is_picked_up_within_a_second(
 
 
 def test_a_line_of_garbage_without_an_end_is_one_refusal_and_the_next_frame_is_taken(
-    cable, bench_file
+    cable, wire_file
 ):
     # an answer would end the garbage
-    bench_file.write_text(bench_file.read_text() + "time_requests = false\n")
-    with listening(bench_file, "reading serial:") as process:
+    wire_file.write_text(wire_file.read_text() + "time_requests = false\n")
+    with listening(wire_file, "reading serial:") as process:
         with SerialSender(str(cable.sender), BAUD) as road:
             for _ in range(50):
                 road.send_bytes(b"\x55" * 1000, 1.0)
                 time.sleep(0.002)
-        sent(cable, "--spin", "z,1", "--rate", "100", "--count", "20")
+        sent(f"serial:{cable.sender}@{BAUD}", "--spin", "z,1", "--rate", "100", "--count", "20")
         process.has_accepted(20)
         summary = interrupted(process)
     assert summary["packets"]["refused_by"]["format"] == 1

@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import ROOT, TWIN, bench_text, still_log
 from tests.support.commands import HILSTAR
 from tests.support.forks import Started
 from tests.support.gige_client import GigEClient, opened, own_address
 from tests.support.senders import free_port
+from tests.support.servers import sending_replay
 from tests.support.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.e2e
@@ -54,19 +54,9 @@ print(json.dumps({
 @pytest.fixture(scope="module")
 def display(tmp_path_factory):
     """A replay of one attitude that sends its frames: the bench file, and the endpoint."""
-    folder, endpoint = tmp_path_factory.mktemp("display"), f"tcp://127.0.0.1:{free_port()}"
-    (folder / "bench.toml").write_text(bench_text(TWIN, {"render": {"quantisation": "round"}}))
-    q = ",".join(repr(float(part)) for part in from_radec_roll_deg(84.057, -1.2, 0.0))
-    (folder / "log.csv").write_text(f"t_s,qw,qx,qy,qz\n0,{q}\n600,{q}\n")
-    command = [*HILSTAR, "replay", folder / "bench.toml", folder / "log.csv", "--headless"]
-    with Started(
-        [*map(str, command), "--feed", endpoint],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    ) as process:
-        yield folder / "bench.toml", endpoint
-        process.terminate()
-        process.wait(PATIENCE_S)
+    folder = tmp_path_factory.mktemp("display")
+    with sending_replay(folder, still_log(folder / "log.csv", 600)) as sending:
+        yield sending
 
 
 def tracker_with_camera(display, *options):

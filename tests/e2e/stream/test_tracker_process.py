@@ -31,6 +31,7 @@ from tests.support.benches import ROOT, TWIN, bench_text
 from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
 from tests.support.forks import Started
 from tests.support.senders import free_port
+from tests.support.servers import sending_replay
 from tests.support.waiting import PATIENCE_S, wait_for
 
 pytestmark = pytest.mark.e2e
@@ -56,21 +57,9 @@ def turn_log(path, seconds=30.0):
 @pytest.fixture(scope="module")
 def display(tmp_path_factory):
     """A replay that sends its frames: the bench file, and the endpoint."""
-    folder, endpoint = tmp_path_factory.mktemp("display"), f"tcp://127.0.0.1:{free_port()}"
-    (folder / "bench.toml").write_text(bench_text(TWIN, {"render": {"quantisation": "round"}}))
-    command = [
-        *HILSTAR,
-        "replay",
-        str(folder / "bench.toml"),
-        str(turn_log(folder / "log.csv", 300.0)),
-        "--headless",
-    ]
-    with Started(
-        [*command, "--feed", endpoint], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    ) as process:
-        yield folder / "bench.toml", endpoint
-        process.terminate()
-        process.wait(PATIENCE_S)
+    folder = tmp_path_factory.mktemp("display")
+    with sending_replay(folder, turn_log(folder / "log.csv", 300.0)) as sending:
+        yield sending
 
 
 def tracker_of_display(display, *options):

@@ -27,7 +27,7 @@ from hilstar.server.send_log import BadCable, Faults, send, spin_samples
 from hilstar.server.sender import UdpSender
 from hilstar.server.serve import Outlet
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, sent
 from tests.support.forks import HILSTAR, Started
 from tests.support.live_runs import attitudes, serve_until
 from tests.support.senders import free_port, packet
@@ -46,12 +46,6 @@ def udp_bench(folder: Path, *lines: str) -> Path:
     path = folder / "udp.toml"
     path.write_text("\n".join([LIVE_BENCH, "[attitude]", 'source = "udp"', *lines, ""]))
     return path
-
-
-def sent(to: str, *options: str) -> dict:
-    result = run_hilstar_here("send", "--to", to, "--json", *options)
-    assert result.returncode == 0, result.stderr
-    return json.loads(result.stdout)
 
 
 def test_a_sender_over_ipv6_that_starts_first_waits_none_is_lost_and_both_sides_talk(tmp_path):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +25,7 @@ from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.config.hardware import Monitor
 from hilstar.server.bench.monitor import bench_calibration
-from tests.support.any_bench.draw import DrawnBench, true_light
+from tests.support.any_bench.draw import DrawnBench, Panel, true_light
 
 STEPS = (
     "orientation",
@@ -78,7 +79,8 @@ FIRST_LIGHT, VERIFY, CERTIFY, SERVE, SEND, TRACKER, ASSESS = COMMANDS = (
 @dataclass(frozen=True)
 class CommandResult:
     """A command that has ended: exit code (None where it was stopped for its time), what it took
-    and printed.
+    and printed. `load` is the mean number of the machine's processes that wanted a core in the
+    minute before its end; NaN in files that do not have it.
     """
 
     code: int | None
@@ -87,6 +89,7 @@ class CommandResult:
     memory_mb: float
     stdout: str
     stderr: str
+    load: float = math.nan
 
     @property
     def found(self) -> dict[str, Any]:
@@ -261,12 +264,18 @@ def comparisons(drawn: DrawnBench, folder: Path, steps: Mapping[str, Any]) -> di
     return compared
 
 
+def planted_black(panel: Panel) -> float:
+    """The light of code 0 relative to that of white above it, as `photometry` states it."""
+    light = true_light(panel)
+    return float(light[0] / (light[-1] - light[0]))
+
+
 def _response(drawn: DrawnBench, folder: Path, figures: Mapping[str, Any]) -> dict[str, Comparison]:
     """The response by its largest error in sigmas, decade by decade, and the black level."""
     bench = read_bench_file(folder / "bench.toml")
     response = bench_calibration(bench.config, bench.folder).response
     planted = true_light(drawn.panel)
-    black = float(planted[0] / planted[-1])
+    black = planted_black(drawn.panel)
     true = (planted - planted[0]) / (planted[-1] - planted[0])
     worst = Comparison(math.nan, 0.0)
     for decade in DECADES:
@@ -383,10 +392,17 @@ def _afterwards(results: Mapping[str, CommandResult]) -> tuple[str, str] | None:
         # A tracker before stars so wide sees few of them, or none, and `verify` said so.
         return TOO_WIDE, reasons[0]
     if later == [ASSESS] and _is_short_of_frames(results):
-        return BUSY, results[ASSESS].last_line
+        return BUSY, results[ASSESS].last_line + _load_of(results[SERVE])
     if later:
         return LATER, "; ".join(f"{name}: {results[name].last_line}" for name in later)
     return (TOO_WIDE, reasons[0]) if reasons else None
+
+
+def _load_of(result: CommandResult) -> str:
+    """The machine's load at a command's end, in words; "" where it is not known."""
+    if math.isnan(result.load):
+        return ""
+    return f" (the machine's load was {result.load:.1f} on {os.cpu_count()} cores)"
 
 
 def _is_short_of_frames(results: Mapping[str, CommandResult]) -> bool:
@@ -465,6 +481,7 @@ def _live(results: Mapping[str, CommandResult]) -> dict[str, Any]:
     return {
         "serve_frames": served.get("frames"),
         "serve_missed": served.get("missed_frames"),
+        "serve_load": round(results[SERVE].load, 1) if SERVE in results else None,
         "tracker_answers": answered.get("answers"),
         "assess_bias_arcsec": None if bias is None else " ".join(f"{each:.3g}" for each in bias),
         "assess_availability": assessed.get("availability"),

@@ -132,6 +132,7 @@ def _ended(folder: Path, limit_s: float, commands: dict[str, Sequence[str]]) -> 
                     memory_mb=used.ru_maxrss / MB,
                     stdout=(folder / f"{name}.out").read_text(errors="replace"),
                     stderr=(folder / f"{name}.err").read_text(errors="replace"),
+                    load=os.getloadavg()[0],
                 )
             elif time.monotonic() - started_s > limit_s:
                 stopped.add(name)

@@ -31,6 +31,7 @@ from hilstar.sky.electrons import VEGA_V0_W_M2_M, Optics, Photometry, dgs_electr
 from hilstar.sky.spectrum import blackbody_exitance_w_m2_m, load_curve
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
+from tests.support.benches import bench_tables
 from tests.support.beside.steps import Beside, Step
 
 GAUSSIAN, LIGHT = "PSF: Gaussian in pixels", "light: electrons of V = 0"
@@ -45,20 +46,7 @@ TIGHT = galsim.GSParams(
     stepk_minimum_hlr=30,
 )
 RADEC_ROLL_DEG = (84.057, -1.2, 20.0)
-BENCH: dict[str, dict[str, Any]] = {
-    "tracker": {
-        "aperture_mm": 30,
-        "focal_length_mm": 70,
-        "pixel_pitch_um": 13,
-        "resolution_px": [1024, 1024],
-        "quantum_efficiency": "ccd47-20",
-        "transmission": "n-bk7-10mm",
-        "psf_sigma_px": [SIGMA_PX, SIGMA_PX],
-        "exposure_s": 0.1,
-    },
-    "monitor": {"resolution_px": [320, 240], "pixel_pitch_um": 57.65},
-    "collimator": {"focal_length_mm": 60},
-}
+BENCH = bench_tables({"tracker": {"psf_sigma_px": [SIGMA_PX, SIGMA_PX], "exposure_s": 0.1}})
 # k1 to k3, and p1 and p2, of a strong lens: 6 px at the corner of 1024 x 1024
 RADIAL, TANGENTIAL = (-0.5, 0.3, 0.0), (4e-4, -3e-4)
 TEMPERATURES_K = (3000.0, 4500.0, 5772.0, 9602.0, 20_000.0)

@@ -115,12 +115,16 @@ class Shown:
         self._process.communicate()
 
     def wait_for(self, wanted: np.ndarray) -> np.ndarray:
-        """The screen, once it shows what is wanted; as it is when that takes too long."""
+        """The screen, once it shows what is wanted; as it is when that takes too long. An
+        AssertionError with what the run said where it has ended.
+        """
         deadline_s = time.monotonic() + PATIENCE_S
-        while time.monotonic() < deadline_s and self._process.poll() is None:
+        while time.monotonic() < deadline_s:
             pixels = self._screen.pixels()
             if pixels.shape == wanted.shape and (pixels == wanted).all():
                 return pixels
+            code = self._process.poll()
+            assert code is None, f"the run ended with {code}: {self._process.communicate()[1]}"
             time.sleep(0.05)
         return self._screen.pixels()
 

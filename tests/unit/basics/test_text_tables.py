@@ -28,7 +28,7 @@ def numbers(path, columns=COLUMNS):
 
 
 @pytest.fixture
-def table(tmp_path):
+def table_file(tmp_path):
     def write(text, encoding="utf-8"):
         path = tmp_path / "table.txt"
         path.write_bytes(text.encode(encoding))
@@ -73,18 +73,18 @@ def in_dialect(values, delimiter, header, end, decimal):
 
 @pytest.mark.parametrize("delimiter", DELIMITERS)
 @pytest.mark.parametrize("header", HEADERS)
-def test_a_table_reads_the_same_in_every_dialect(table, delimiter, header):
+def test_a_table_reads_the_same_in_every_dialect(table_file, delimiter, header):
     values = np.random.default_rng(5).uniform(-1000, 1000, (7, 2)).round(4)
     wanted = values * (1e-3, 1.0)
     for end, encoding, decimal in itertools.product(ENDS, ENCODINGS, ".,"):
         if decimal == delimiter:
             continue
-        path = table(in_dialect(values, delimiter, header, end, decimal), encoding)
+        path = table_file(in_dialect(values, delimiter, header, end, decimal), encoding)
         assert np.allclose(numbers(path), wanted, rtol=1e-15, atol=0), (end, encoding, decimal)
 
 
-def test_what_was_taken_is_said_once(table, caplog):
-    path = table("t_ms;x_px;note\n1,5;2,5;été\n2,5;3,5;x\n", "cp1252")
+def test_what_was_taken_is_said_once(table_file, caplog):
+    path = table_file("t_ms;x_px;note\n1,5;2,5;été\n2,5;3,5;x\n", "cp1252")
     assert numbers(path) == [[0.0015, 2.5], [0.0025, 3.5]]
     read_table_rows(path)
     lines = [record.getMessage().removeprefix(f"{path}: ") for record in caplog.records]
@@ -95,19 +95,19 @@ def test_what_was_taken_is_said_once(table, caplog):
     ]
 
 
-def test_excel_and_programs_write_tables_of_their_own(table):
-    assert numbers(table("sep=;\nt_s;x_px\n1;2\n")) == [[1, 2]]
-    assert numbers(table(";t_s;x_px\n0;1;2\n1;3;4\n")) == [[1, 2], [3, 4]]  # pandas' index
-    assert numbers(table("t_s,x_px,\n1,2\n3,4\n")) == [[1, 2], [3, 4]]
-    assert numbers(table("t_s,x_px\n1,2,\n3,4, \n")) == [[1, 2], [3, 4]]
-    assert numbers(table("x_px,t_s\n−1,\u00a02\n")) == [[2, -1]]
-    assert numbers(table('"t_s","x_px"\n"1","2"\n')) == [[1, 2]]
-    assert numbers(table("# t x_px\n% t_s, x_px\n1,2\n")) == [[1, 2]]
-    assert numbers(table("T_S,Time,x_px\n1,9,2\n")) == [[1, 2]]
+def test_excel_and_programs_write_tables_of_their_own(table_file):
+    assert numbers(table_file("sep=;\nt_s;x_px\n1;2\n")) == [[1, 2]]
+    assert numbers(table_file(";t_s;x_px\n0;1;2\n1;3;4\n")) == [[1, 2], [3, 4]]  # pandas' index
+    assert numbers(table_file("t_s,x_px,\n1,2\n3,4\n")) == [[1, 2], [3, 4]]
+    assert numbers(table_file("t_s,x_px\n1,2,\n3,4, \n")) == [[1, 2], [3, 4]]
+    assert numbers(table_file("x_px,t_s\n−1,\u00a02\n")) == [[2, -1]]
+    assert numbers(table_file('"t_s","x_px"\n"1","2"\n')) == [[1, 2]]
+    assert numbers(table_file("# t x_px\n% t_s, x_px\n1,2\n")) == [[1, 2]]
+    assert numbers(table_file("T_S,Time,x_px\n1,9,2\n")) == [[1, 2]]
 
 
-def test_lines_are_those_of_the_file(table):
-    path = table("# a\n\nt_s,x_px\n1,2\n\n# between\n3,4\n")
+def test_lines_are_those_of_the_file(table_file):
+    path = table_file("# a\n\nt_s,x_px\n1,2\n\n# between\n3,4\n")
     assert [line for line, _ in read_table_rows(path)] == [4, 7]
 
 
@@ -137,8 +137,8 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("text", REFUSED)
-def test_what_is_not_plain_is_refused_with_its_line(table, text):
-    path = table(text, "latin-1")
+def test_what_is_not_plain_is_refused_with_its_line(table_file, text):
+    path = table_file(text, "latin-1")
     line = refusal(read_table_rows, path)
     assert REFUSED[text] in line
     assert line.startswith(str(path))
@@ -155,14 +155,14 @@ CUT_ENDS = {
 
 
 @pytest.mark.parametrize("last", CUT_ENDS)
-def test_a_last_line_without_an_end_is_left_out_where_it_may_be_cut(table, last, caplog):
-    path = table(f"t_s,x_px\n0.5,0.1234567\n1.0,0.2345678\n{last}")
+def test_a_last_line_without_an_end_is_left_out_where_it_may_be_cut(table_file, last, caplog):
+    path = table_file(f"t_s,x_px\n0.5,0.1234567\n1.0,0.2345678\n{last}")
     read = read_table_rows(path, keep_cut=False)
     assert len(read) == 2 + CUT_ENDS[last]
     assert ("the last line has no line end" in caplog.text) is not CUT_ENDS[last]
 
 
-def test_whole_numbers_and_sharp_ones_at_the_end_are_known_to_be_whole(table):
+def test_whole_numbers_and_sharp_ones_at_the_end_are_known_to_be_whole(table_file):
     for others, last, whole in (
         (("57", "58"), "59", True),
         (("57", "58"), "5", False),
@@ -174,12 +174,13 @@ def test_whole_numbers_and_sharp_ones_at_the_end_are_known_to_be_whole(table):
     ):
         text = "".join(f"1,{other}\n" for other in others)
         assert (
-            len(read_table_rows(table(f"t_s,x_px\n{text}2,{last}"), keep_cut=False)) == 2 + whole
+            len(read_table_rows(table_file(f"t_s,x_px\n{text}2,{last}"), keep_cut=False))
+            == 2 + whole
         ), last
 
 
-def test_a_document_cut_off_is_read_and_said(table, caplog):
-    path = table("t_s,x_px\n1,0.25\n2,0.35\n3,0.4")
+def test_a_document_cut_off_is_read_and_said(table_file, caplog):
+    path = table_file("t_s,x_px\n1,0.25\n2,0.35\n3,0.4")
     assert len(read_table_rows(path)) == 3
     assert (
         f"{path}:4: the last line has no line end, and may be cut off: is the file whole?"
@@ -187,7 +188,7 @@ def test_a_document_cut_off_is_read_and_said(table, caplog):
     )
 
 
-def test_rows_that_do_not_hold_are_told_by_any_name(table):
+def test_rows_that_do_not_hold_are_told_by_any_name(table_file):
     for header, flags in (
         ("valid", "10"),
         ("is_valid", "TF"),
@@ -195,14 +196,14 @@ def test_rows_that_do_not_hold_are_told_by_any_name(table):
         ("lost", "01"),
         ("invalid", ("false", "true")),
     ):
-        path = table(f"t_s,{header}\n1,{flags[0]}\n2,{flags[1]}\n")
+        path = table_file(f"t_s,{header}\n1,{flags[0]}\n2,{flags[1]}\n")
         cells = [cells[1].lower() for _, cells in read_table_rows(path, ("t_s",), ("valid",))]
         assert [cell in {"1", "t", "y"} for cell in cells] == [True, False]
 
 
-def test_columns_know_their_names_and_units(table):
+def test_columns_know_their_names_and_units(table_file):
     with open_table(
-        table('ra (h),RA(ICRS),"flux [DN]",pmRA\nh,deg,DN,mas/yr\n1,2,3,4\n'), "", LIMIT
+        table_file('ra (h),RA(ICRS),"flux [DN]",pmRA\nh,deg,DN,mas/yr\n1,2,3,4\n'), "", LIMIT
     ) as opened:
         assert [(column.name, column.unit) for column in opened.columns] == [
             ("ra", "h"),
@@ -243,13 +244,13 @@ SAME = [[0.5, 10.25], [1.5, 11.25]]
 
 
 @pytest.mark.parametrize("comment", COMMENTS)
-def test_comments_of_every_style_are_passed_over(table, comment):
-    assert numbers(table(f"{comment}\n{PLAIN}")) == SAME
+def test_comments_of_every_style_are_passed_over(table_file, comment):
+    assert numbers(table_file(f"{comment}\n{PLAIN}")) == SAME
 
 
 @pytest.mark.parametrize("comment", COMMENTS[:-1])  # within a table of semicolons ; is a cell
-def test_comments_between_rows_are_passed_over(table, comment):
-    assert numbers(table(PLAIN.replace("1.5", f"{comment}\n1.5"))) == SAME
+def test_comments_between_rows_are_passed_over(table_file, comment):
+    assert numbers(table_file(PLAIN.replace("1.5", f"{comment}\n1.5"))) == SAME
 
 
 # What stands around a table, and what is said of it.
@@ -269,9 +270,9 @@ SURROUNDINGS = {
 
 
 @pytest.mark.parametrize("name", SURROUNDINGS)
-def test_what_stands_around_a_table_is_told_apart_from_it(table, name, caplog):
+def test_what_stands_around_a_table_is_told_apart_from_it(table_file, name, caplog):
     text, words = SURROUNDINGS[name]
-    assert numbers(table(text))[:2] == SAME
+    assert numbers(table_file(text))[:2] == SAME
     assert words in caplog.text
 
 
@@ -284,6 +285,6 @@ def test_what_stands_around_a_table_is_told_apart_from_it(table, name, caplog):
         ("t_s,x\n0,wide\n", r":1: column x has 'wide', which is no number px"),
     ],
 )
-def test_what_other_programs_make_of_a_table_is_refused_by_name(table, text, words):
+def test_what_other_programs_make_of_a_table_is_refused_by_name(table_file, text, words):
     with pytest.raises(InputError, match=words):
-        read_table_rows(table(text))
+        read_table_rows(table_file(text))

@@ -62,23 +62,23 @@ def test_keys_are_listed(tmp_path):
 
 
 @pytest.fixture
-def bench(tmp_path, monkeypatch):
+def service_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     monkeypatch.setattr("hilstar.cli.service.can_confine", lambda: True)
     (tmp_path / "room.toml").write_text(SMALL_BENCH)
     return tmp_path
 
 
-def test_a_service_is_its_unit_and_its_token(bench):
-    shown = told("service", "install", "room.toml", "--print", "--json", cwd=bench)
+def test_a_service_is_its_unit_and_its_token(service_folder):
+    shown = told("service", "install", "room.toml", "--print", "--json", cwd=service_folder)
     assert shown["written"] == []
     outside = ("--", "--console", "0.0.0.0:8765")
-    found = told("service", "install", "room.toml", "--json", *outside, cwd=bench)
+    found = told("service", "install", "room.toml", "--json", *outside, cwd=service_folder)
     assert found["service"] == "hilstar-room.service"
-    unit = bench / "config" / "systemd" / "user" / "hilstar-room.service"
+    unit = service_folder / "config" / "systemd" / "user" / "hilstar-room.service"
     assert found["written"] == [str(unit)] == [found["unit"]]
     assert found["text"] == unit.read_text()
     assert found["token_file"] == str(unit.with_suffix(".env"))
-    gone = told("service", "uninstall", "room", "--json", cwd=bench)
+    gone = told("service", "uninstall", "room", "--json", cwd=service_folder)
     assert gone == {"unit": str(unit), "stopped": False}
     assert not unit.exists()

@@ -17,7 +17,7 @@ from tests.support.waiting import PATIENCE_S
 
 
 @pytest.fixture
-def bench(tmp_path, monkeypatch):
+def service_bench(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
     monkeypatch.delenv("HILSTAR_TOKEN", raising=False)
     # as on a bench PC, whatever container this is
@@ -26,9 +26,9 @@ def bench(tmp_path, monkeypatch):
     return tmp_path / "room 7.toml"
 
 
-def install(bench, *words: str):
+def install(service_bench, *words: str):
     return run_hilstar_here(
-        "service", "install", bench, "--name", "room7", *words, cwd=bench.parent
+        "service", "install", service_bench, "--name", "room7", *words, cwd=service_bench.parent
     )
 
 
@@ -38,16 +38,16 @@ def keys_of(text: str) -> dict[str, str]:
     )
 
 
-def test_the_unit_serves_the_bench_and_is_watched_and_started_again(bench):
-    result = install(bench, "--", "--console", "--ledger", "a b$c%d-{utc}.mcap")
+def test_the_unit_serves_the_bench_and_is_watched_and_started_again(service_bench):
+    result = install(service_bench, "--", "--console", "--ledger", "a b$c%d-{utc}.mcap")
     assert result.returncode == 0, result.stderr
-    path = bench.parent / "config" / "systemd" / "user" / "hilstar-room7.service"
+    path = service_bench.parent / "config" / "systemd" / "user" / "hilstar-room7.service"
     assert result.stdout == f"{path}\n"
     keys = keys_of(path.read_text())
     # As systemd reads it: $$ is $, %% is %.
     words = shlex.split(keys["ExecStart"].replace("$$", "$").replace("%%", "%"))
     assert words[-5:] == [
-        str(bench),
+        str(service_bench),
         "--console",
         "127.0.0.1:8765",
         "--ledger",
@@ -55,13 +55,13 @@ def test_the_unit_serves_the_bench_and_is_watched_and_started_again(bench):
     ]
     assert (keys["Type"], keys["Restart"], keys["WatchdogSec"]) == ("notify", "always", "3")
     assert not path.with_suffix(".env").exists()
-    assert_refused(install(bench), 2, "hilstar-room7.service", "--overwrite")
-    assert install(bench, "--overwrite").returncode == 0
+    assert_refused(install(service_bench), 2, "hilstar-room7.service", "--overwrite")
+    assert install(service_bench, "--overwrite").returncode == 0
 
 
-def test_beyond_loopback_its_token_is_in_a_file_of_its_own(bench):
-    result = install(bench, "--", "--console", "0.0.0.0:8765")
-    tokens = bench.parent / "config" / "systemd" / "user" / "hilstar-room7.env"
+def test_beyond_loopback_its_token_is_in_a_file_of_its_own(service_bench):
+    result = install(service_bench, "--", "--console", "0.0.0.0:8765")
+    tokens = service_bench.parent / "config" / "systemd" / "user" / "hilstar-room7.env"
     assert str(tokens) in result.stderr and stat.S_IMODE(tokens.stat().st_mode) == 0o600
     token = tokens.read_text().removeprefix("HILSTAR_TOKEN=").strip()
     assert len(token) >= 40
@@ -78,12 +78,12 @@ def test_beyond_loopback_its_token_is_in_a_file_of_its_own(bench):
         (("--name", "../x"), "--name"),
     ],
 )
-def test_what_would_not_start_is_refused(bench, words, said):
-    assert_refused(install(bench, *words), 2, said)
+def test_what_would_not_start_is_refused(service_bench, words, said):
+    assert_refused(install(service_bench, *words), 2, said)
 
 
-def test_systemd_takes_the_unit(bench, tmp_path, monkeypatch):
-    assert install(bench, "--", "--console", "--ledger", "$x%y-{utc}.mcap").returncode == 0
+def test_systemd_takes_the_unit(service_bench, tmp_path, monkeypatch):
+    assert install(service_bench, "--", "--console", "--ledger", "$x%y-{utc}.mcap").returncode == 0
     analyze = shutil.which("systemd-analyze")
     if analyze is None:
         return
@@ -100,9 +100,9 @@ def test_systemd_takes_the_unit(bench, tmp_path, monkeypatch):
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="no systemd here")
-def test_the_unit_exposes_less_than_4_of_10(bench):
-    assert install(bench, "--", "--console").returncode == 0
-    path = bench.parent / "config" / "systemd" / "user" / "hilstar-room7.service"
+def test_the_unit_exposes_less_than_4_of_10(service_bench):
+    assert install(service_bench, "--", "--console").returncode == 0
+    path = service_bench.parent / "config" / "systemd" / "user" / "hilstar-room7.service"
     told = subprocess.run(
         ["systemd-analyze", "security", "--offline=true", "--no-pager", str(path)],
         capture_output=True,
@@ -115,8 +115,8 @@ def test_the_unit_exposes_less_than_4_of_10(bench):
     assert float(found[1]) < 4.0
 
 
-def test_the_unit_takes_nothing_that_a_run_needs(bench):
-    keys = keys_of(install(bench, "--print").stdout)
+def test_the_unit_takes_nothing_that_a_run_needs(service_bench):
+    keys = keys_of(install(service_bench, "--print").stdout)
     # Devices (GPU, serial ports), /tmp (the X server's socket), real-time priority, OpenGL's
     # compiler, ledgers anywhere.
     for key in (
@@ -132,9 +132,9 @@ def test_the_unit_takes_nothing_that_a_run_needs(bench):
     assert keys["NoNewPrivileges"] == "yes" and keys["CapabilityBoundingSet"] == ""
 
 
-def test_where_users_have_no_namespace_the_unit_asks_for_none(bench, monkeypatch):
+def test_where_users_have_no_namespace_the_unit_asks_for_none(service_bench, monkeypatch):
     monkeypatch.setattr("hilstar.cli.service.can_confine", lambda: False)
-    result = install(bench, "--print")
+    result = install(service_bench, "--print")
     assert "the unit keeps the capabilities" in result.stderr
     keys = keys_of(result.stdout)
     assert "PrivateUsers" not in keys and "CapabilityBoundingSet" not in keys
@@ -142,15 +142,15 @@ def test_where_users_have_no_namespace_the_unit_asks_for_none(bench, monkeypatch
 
 
 @pytest.mark.parametrize("name", ["room7", "hilstar-room7.service", "room7.toml"])
-def test_what_was_installed_can_be_uninstalled(bench, name, monkeypatch):
-    units = bench.parent / "config" / "systemd" / "user"
-    done = install(bench, "--", "--console", "0.0.0.0:8765")
+def test_what_was_installed_can_be_uninstalled(service_bench, name, monkeypatch):
+    units = service_bench.parent / "config" / "systemd" / "user"
+    done = install(service_bench, "--", "--console", "0.0.0.0:8765")
     assert f"loginctl enable-linger {getpass.getuser()}" in done.stderr
     (units / "mine.service").write_text("kept")
-    asked = bench.parent / "asked.txt"
-    (bench.parent / "systemctl").write_text(f"#!/bin/sh\necho $* >> '{asked}'\n")
-    (bench.parent / "systemctl").chmod(0o755)
-    monkeypatch.setenv("PATH", str(bench.parent), prepend=":")
+    asked = service_bench.parent / "asked.txt"
+    (service_bench.parent / "systemctl").write_text(f"#!/bin/sh\necho $* >> '{asked}'\n")
+    (service_bench.parent / "systemctl").chmod(0o755)
+    monkeypatch.setenv("PATH", str(service_bench.parent), prepend=":")
     assert_refused(
         run_hilstar_here("service", "uninstall", "other"),
         2,
@@ -167,9 +167,9 @@ def test_what_was_installed_can_be_uninstalled(bench, name, monkeypatch):
     assert_refused(run_hilstar_here("service", "uninstall", name), 2, "there is none")
 
 
-def test_without_systemd_uninstall_says_what_is_left_to_do(bench, monkeypatch):
-    assert install(bench).returncode == 0
-    monkeypatch.setenv("PATH", str(bench.parent))
+def test_without_systemd_uninstall_says_what_is_left_to_do(service_bench, monkeypatch):
+    assert install(service_bench).returncode == 0
+    monkeypatch.setenv("PATH", str(service_bench.parent))
     result = run_hilstar_here("service", "uninstall", "room7")
     assert result.returncode == 0
     assert "systemctl --user stop hilstar-room7.service" in result.stderr

@@ -19,13 +19,9 @@ from hilstar.display.temporal import (
     places_before,
 )
 from hilstar.optics.psf import GaussianPsf
-from hilstar.optics.sprites import pack_sprites
 from tests.support.centroiders import family_errors_px, moment
+from tests.support.star_tiles import SIDE, SIGMA, SIZE, TILE, WHITE, flux_of, places, stars, tiles
 
-WHITE = 1e6
-SIGMA = (0.85, 0.85)
-SIZE = (264, 264)
-TILE, SIDE = 22, 12  # px of a star's own, stars along a side
 FRAMES = 6
 # The aims, rms over all phases, for any six frames; on 24 x 24 phases the worst are off by 0.0013
 # mag and 0.0035 px (5 x 5).
@@ -41,38 +37,6 @@ ONE_STEP = 1.01
 
 def linear(bits):
     return table_response(bits, np.linspace(0, 1, 2**bits))
-
-
-def flux_of(mag):
-    return WHITE * 10 ** (-0.4 * np.asarray(mag)) / GaussianPsf(SIGMA).peak_share
-
-
-def places(shift_x=0.0, shift_y=0.0):
-    """A star at each of SIDE^2 sub-pixel phases, each in a tile of its own, moved by a shift."""
-    middle = (np.arange(SIDE) + 0.5) * TILE - 0.5 + (np.arange(SIDE) + 0.5) / SIDE - 0.5
-    x, y = (axis.ravel() for axis in np.meshgrid(middle, middle))
-    return x + shift_x, y + shift_y
-
-
-def stars(x, y, flux, numbers=None, size=SIZE):
-    numbers = np.arange(len(x)) if numbers is None else numbers
-    return pack_sprites(
-        x,
-        y,
-        np.broadcast_to(np.asarray(flux, float), x.shape),
-        numbers,
-        size,
-        GaussianPsf(SIGMA).footprint_px,
-    )
-
-
-def tiles(image):
-    return np.asarray(
-        image.reshape(SIDE, TILE, SIDE, TILE)
-        .transpose(0, 2, 1, 3)
-        .reshape(-1, TILE, TILE)[:, :-1, :-1],
-        float,
-    )
 
 
 def shown(panel, frames):

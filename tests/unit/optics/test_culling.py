@@ -28,7 +28,7 @@ COLUMNS = ("hip", "v_mag", "bv_mag", "temperature_k", "electrons_per_s", "row")
 
 
 @pytest.fixture(scope="module")
-def sky():
+def flat_sky():
     return stars_at(np.random.default_rng(3).normal(size=(STARS, 3)), np.ones(STARS))
 
 
@@ -48,9 +48,9 @@ def in_cells_of(stars, cell_deg: float):
 
 @pytest.mark.parametrize("focal_mm", [2000.0, 350.0, 60.0, 12.0, 3.0])  # fields of 3 to 174 degrees
 @pytest.mark.parametrize("cell_deg", [4.0, 45.0, 170.0])
-def test_no_star_on_the_image_is_lost(sky, focal_mm, cell_deg, rng):
+def test_no_star_on_the_image_is_lost(flat_sky, focal_mm, cell_deg, rng):
     camera = monitor_camera(SIZE, 57.65, focal_mm, IDENTITY)
-    stars = in_cells_of(sky, cell_deg)
+    stars = in_cells_of(flat_sky, cell_deg)
     for q in normalise(rng.normal(size=(6, 4))):
         for velocity in (None, FAST_KM_S):
             seen = stars.seen_at(velocity)
@@ -58,20 +58,20 @@ def test_no_star_on_the_image_is_lost(sky, focal_mm, cell_deg, rng):
             assert np.array_equal(found, seen_by_all(seen, to_matrix(q), camera))
 
 
-def test_the_sides_of_a_wide_image_are_left_out_of_its_circle(sky, rng):
+def test_the_sides_of_a_wide_image_are_left_out_of_its_circle(flat_sky, rng):
     """A circle around 16:9 has 1.85 times the image's area; with cells of 4 degrees about it,
     two thirds remain.
     """
     camera = monitor_camera(SIZE, 57.65, 200.0, IDENTITY)
     turn = to_matrix(normalise(rng.normal(size=4)))
     edges, radius_rad = camera.edges(6.0) @ turn, camera.field_radius_rad(6.0)
-    circle, image = sky.near(turn[2], radius_rad), sky.near(turn[2], radius_rad, edges)
+    circle, image = flat_sky.near(turn[2], radius_rad), flat_sky.near(turn[2], radius_rad, edges)
     assert np.isin(image, circle).all()
     assert len(image) < 0.75 * len(circle)
 
 
-def test_bodies_that_have_no_place_yet_are_not_found(sky):
-    nowhere = replace(sky.grid, centre=np.full_like(sky.grid.centre, np.nan))
+def test_bodies_that_have_no_place_yet_are_not_found(flat_sky):
+    nowhere = replace(flat_sky.grid, centre=np.full_like(flat_sky.grid.centre, np.nan))
     assert len(nowhere.near(np.array([0.0, 0.0, 1.0]), 1.0, np.eye(3))) == 0
 
 

@@ -17,7 +17,7 @@ INVERSE_PX = 1e-6
 MARGIN_PX = 20.0
 
 
-def field(rng, degree=5, px=0.4):
+def residual_field(rng, degree=5, px=0.4):
     count = (degree + 1) * (degree + 2) // 2
     return ResidualField.of_terms(rng.normal(0, px, count), rng.normal(0, px, count), degree, SIZE)
 
@@ -28,8 +28,8 @@ def lenses(rng):
         Lens((0.6, 0.0, 0.0)),
         Lens((-0.4, 0.1, 0.0), (1e-3, -2e-3)),
         Lens(tilt_rad=tilt),
-        Lens(field=field(rng)),
-        Lens((0.6, -0.5, 2.0), (-2e-3, 1e-3), tilt, field(rng)),
+        Lens(field=residual_field(rng)),
+        Lens((0.6, -0.5, 2.0), (-2e-3, 1e-3), tilt, residual_field(rng)),
     ]
 
 
@@ -74,7 +74,7 @@ def test_a_tilted_screen_is_what_tracing_rays_onto_the_tilted_plane_gives():
 
 
 def test_the_fields_terms_are_its_values(rng):
-    shift = field(rng)
+    shift = residual_field(rng)
     x, y = rng.uniform(0, SIZE[0], 50), rng.uniform(0, SIZE[1], 50)
     terms = field_terms(x, y, SIZE, 5)
     ones = ResidualField.of_terms(np.ones(terms.shape[1]), np.zeros(terms.shape[1]), 5, SIZE)

@@ -62,7 +62,7 @@ def records_of_a_run(seconds: float = 60.0) -> list[AnswerRecord | FaultRecord]:
 
 
 @pytest.fixture(scope="module")
-def ledger(tmp_path_factory) -> Path:
+def answers_ledger(tmp_path_factory) -> Path:
     times_s = np.arange(0.0, 60.0, 0.1)
     q = np.tile([1.0, 0.0, 0.0, 0.0], (len(times_s), 1))
     return write_ledger(
@@ -76,8 +76,8 @@ def test_a_run_without_answers_says_nothing_of_them(tmp_path):
     assert not summarise(figures_of(plain)).answers
 
 
-def test_a_fault_is_reported_with_the_answers_before_during_and_after_it(ledger):
-    found = summarise(figures_of(ledger)).answers
+def test_a_fault_is_reported_with_the_answers_before_during_and_after_it(answers_ledger):
+    found = summarise(figures_of(answers_ledger)).answers
     assert (found.wrong, found.invalid, found.unpaired) == (10, 80, 0)
     assert found.rate_hz == pytest.approx(1 / CYCLE_S, rel=2e-3)
     assert found.availability == pytest.approx(1 - 90 / found.answers, abs=2e-3)
@@ -101,13 +101,13 @@ def test_a_fault_is_reported_with_the_answers_before_during_and_after_it(ledger)
     assert fault.recovered_s == pytest.approx(BACK_S - FAULT_S[1], abs=CYCLE_S)
 
 
-def test_the_reports_page_and_text_have_the_answers(ledger, tmp_path):
-    run = run_hilstar_here("report", ledger, "-o", tmp_path, "--json")
+def test_the_reports_page_and_text_have_the_answers(answers_ledger, tmp_path):
+    run = run_hilstar_here("report", answers_ledger, "-o", tmp_path, "--json")
     assert run.returncode == 0, run.stderr
     told = json.loads(run.stdout)["answers"]
     assert told["faults"][0]["recovered_s"] == pytest.approx(2.0, abs=CYCLE_S)
     assert told == json.loads((tmp_path / "report.json").read_text())["answers"]
-    text = run_hilstar_here("report", ledger, "-o", tmp_path).stdout
+    text = run_hilstar_here("report", answers_ledger, "-o", tmp_path).stdout
     assert (
         "fault sunlit" in text
         and "first wrong after 2.0" in text

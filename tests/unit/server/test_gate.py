@@ -44,6 +44,23 @@ def test_the_screen_keeps_time_where_its_swaps_wait(monitor, period_ms, known_hz
     assert (timing.paced_by_screen, timing.waits) == (by_screen, waits)
 
 
+def test_swaps_of_a_busy_machine_are_no_refresh_though_their_median_lies_on_one(monitor, rng):
+    """A virtual screen's swaps, which wait for nothing: half as long to twice as long."""
+    busy_ms = PERIOD_MS * np.exp(rng.uniform(-np.log(2), np.log(2), GATE_FRAMES))
+    busy_ms *= PERIOD_MS / np.median(busy_ms)
+    timing = timing_of(busy_ms, monitor, 0.0)
+    assert not timing.paced_by_screen and timing.dropped > 2
+    assert list(faults(plain_window(), monitor, timing)) == []
+
+
+def test_a_refresh_that_the_system_does_not_know_is_kept_through_dropped_frames(monitor):
+    periods_ms = np.full(GATE_FRAMES, PERIOD_MS)
+    periods_ms[::3] = 2 * PERIOD_MS
+    timing = timing_of(periods_ms, monitor, 0.0)
+    assert timing.paced_by_screen
+    assert "dropped 40 of 120" in next(iter(faults(plain_window(), monitor, timing)))
+
+
 def test_intervals_of_more_than_a_period_and_a_half_are_dropped_frames(monitor):
     periods_ms = np.full(GATE_FRAMES, PERIOD_MS)
     periods_ms[[5, 50, 90]] = 2 * PERIOD_MS

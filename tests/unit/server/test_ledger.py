@@ -50,7 +50,7 @@ UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @pytest.fixture
-def bench(small_bench_file):
+def kept_bench(small_bench_file):
     return SimpleNamespace(
         file=SimpleNamespace(
             path=small_bench_file,
@@ -91,9 +91,9 @@ def read_topics(path):
     ]
 
 
-def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, bench):
+def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, kept_bench):
     path = tmp_path / "run.mcap"
-    with Ledger(path, bench, split=SplitLimits(bytes=1)) as ledger:
+    with Ledger(path, kept_bench, split=SplitLimits(bytes=1)) as ledger:
         keep(ledger, 0, 50)
         wait_for((tmp_path / "run.0001.mcap").exists, "the next file")
         keep(ledger, 50, 100)
@@ -115,9 +115,11 @@ def test_a_split_is_a_size_or_a_time():
         assert "--ledger-split" in refusal(parse_split, wrong)
 
 
-def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(tmp_path, bench):
+def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(
+    tmp_path, kept_bench
+):
     notices = Notices()
-    with Ledger(tmp_path / "run.mcap", bench, notices) as ledger:
+    with Ledger(tmp_path / "run.mcap", kept_bench, notices) as ledger:
         keep(ledger, 0, 10)
         wait_for(
             lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
@@ -186,9 +188,11 @@ def harm_until_said(path, harm, notices):
 @pytest.mark.parametrize(
     "harm", [delete, replace_by_another, cut_file, write_anew, write_longer, write_over]
 )
-def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, bench, harm, split):
+def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(
+    tmp_path, kept_bench, harm, split
+):
     notices, path = Notices(), tmp_path / "run.mcap"
-    with Ledger(path, bench, notices, split=split) as ledger:
+    with Ledger(path, kept_bench, notices, split=split) as ledger:
         keep(ledger, 0, 10)
         wait_for(lambda: len(list(drawable_frames(path))) == 10, "the first frames on the disk")
         if split.bytes == 1:
@@ -204,8 +208,8 @@ def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(tmp_path, b
     assert notices.counts()["ledger-lost"] == 1
 
 
-def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, bench):
-    with Ledger(tmp_path / "run.mcap", bench) as ledger:
+def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, kept_bench):
+    with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:
         keep(ledger, 0, 10)
         wait_for(
             lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
@@ -215,10 +219,10 @@ def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, bench):
     assert ledger.summary()["unrecorded"] >= 20
 
 
-def test_a_ledger_whose_folder_is_gone_is_said_and_the_run_goes_on(tmp_path, bench):
+def test_a_ledger_whose_folder_is_gone_is_said_and_the_run_goes_on(tmp_path, kept_bench):
     notices, folder = Notices(), tmp_path / "runs"
     folder.mkdir()
-    with Ledger(folder / "run.mcap", bench, notices) as ledger:
+    with Ledger(folder / "run.mcap", kept_bench, notices) as ledger:
         keep(ledger, 0, 10)
         wait_for(
             lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
@@ -232,9 +236,9 @@ def test_a_ledger_whose_folder_is_gone_is_said_and_the_run_goes_on(tmp_path, ben
     assert ledger.failure.endswith("run.mcap was deleted while it was written")
 
 
-def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, bench):
+def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, kept_bench):
     notices = Notices()
-    with Ledger(tmp_path / "run.mcap", bench, notices) as ledger:
+    with Ledger(tmp_path / "run.mcap", kept_bench, notices) as ledger:
         keep(ledger, 0, 10)
         (tmp_path / "link.mcap").hardlink_to(tmp_path / "run.mcap")
         (tmp_path / "run.mcap").touch()
@@ -245,9 +249,9 @@ def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, bench):
     assert [frame.frame for frame in drawable_frames(tmp_path / "moved.mcap")] == list(range(20))
 
 
-def test_a_ledger_begun_in_the_place_of_another_knows_the_faults_that_are_on(tmp_path, bench):
+def test_a_ledger_begun_in_the_place_of_another_knows_the_faults_that_are_on(tmp_path, kept_bench):
     notices, path = Notices(), tmp_path / "run.mcap"
-    with LedgerSwitch(Ledger(path, bench, notices)) as switch:
+    with LedgerSwitch(Ledger(path, kept_bench, notices)) as switch:
         for number, event in ((9, "scenario"), (0, "start"), (1, "start"), (0, "end")):
             record = {
                 "name": f"f{number}",
@@ -278,9 +282,9 @@ def test_what_waits_is_bounded_by_bytes_and_frames_go_first():
     assert backlog.put(QueueEntry("frame", 0, 0, bytes))
 
 
-def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, bench):
+def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, kept_bench):
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
-    with Ledger(tmp_path / "run.mcap", bench) as ledger:
+    with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:
         resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
         try:
             keep(ledger, 0, 10)
@@ -387,8 +391,8 @@ def test_a_report_s_memory_does_not_grow_with_the_run():
     assert begin[lost > 0] == pytest.approx(70_000 / 60, abs=1.1)
 
 
-def test_refused_packets_are_counted_by_reason(tmp_path, bench):
-    with Ledger(tmp_path / "run.mcap", bench) as ledger:
+def test_refused_packets_are_counted_by_reason(tmp_path, kept_bench):
+    with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:
         for k in range(500):
             ledger.packet(
                 1000 + k, b"x" * 5000, None, Refusal("crc" if k % 5 else "norm", "d" * 5000)

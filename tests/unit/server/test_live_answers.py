@@ -70,6 +70,22 @@ def second_of_frames(answers: LiveAnswers, **more) -> None:
         answers.frame(Shown(k, at_ns, attitude, DRAWN, draw_ns=at_ns, **more), at_ns + 5)
 
 
+def test_widths_of_stars_are_the_focus_and_stay_in_the_ledger():
+    source, kept, clock = Queued(), Kept(), FakeClock(NS_PER_S)
+    answers = LiveAnswers(BENCH, RULES, source, Notices(), kept, clock=clock)
+    stars = tuple(ReportedStar(9.0, 9.0, 300.0, None, width) for width in (1.2, 1.3, 1.4))
+    with answers.running():
+        second_of_frames(answers)
+        for at_ns in (NS_PER_S // 4, 3 * NS_PER_S // 4):
+            source.waiting.append(Answer(at_ns, b"\x01", at_ns, Q, centroids=stars))
+        wait_for(lambda: answers.widths.state)
+        source.waiting.append(Answer(NS_PER_S, b"\x01", NS_PER_S, Q, centroids=stars[:0]))
+        wait_for(lambda: len(kept.records) == 3)
+    state = answers.widths.state
+    assert (state.what, state.sigma_px, state.count) == ("star sigma", 1.3, 6)
+    assert [record.widths_px for record in kept.records] == [(1.2, 1.3, 1.4)] * 2 + [()]
+
+
 def test_answers_are_judged_recorded_and_told_beside_the_frames():
     source, kept, notices, clock = Queued(), Kept(), Notices(), FakeClock(NS_PER_S)
     answers = LiveAnswers(BENCH, RULES, source, notices, kept, clock=clock)

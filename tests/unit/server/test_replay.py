@@ -32,7 +32,7 @@ def config(tmp_path):
 
 
 @pytest.fixture
-def log(tmp_path):
+def roll_log(tmp_path):
     """Two seconds of a turn about the boresight at 0.1 rad/s, a sample each 0.1 s, which begins
     at 100 s of its clock.
     """
@@ -43,17 +43,17 @@ def log(tmp_path):
 
 
 @pytest.fixture
-def log_in_ms(log):
+def log_in_ms(roll_log):
     """The same with its times in ms, and rates that say so."""
-    rows = [line.split(",") for line in log.read_text().splitlines()[1:]]
+    rows = [line.split(",") for line in roll_log.read_text().splitlines()[1:]]
     lines = [",".join([str(1e3 * float(t)), *q, "0", "0", "-0.1"]) for t, *q in rows]
-    path = log.with_name("ms.csv")
+    path = roll_log.with_name("ms.csv")
     path.write_text("\n".join(["t_s,qw,qx,qy,qz,rx,ry,rz", *lines]) + "\n")
     return path
 
 
 @pytest.fixture
-def ledger(tmp_path, small_bench_file):
+def first_run(tmp_path, small_bench_file):
     return earlier_run(tmp_path / "run.mcap", small_bench_file)
 
 
@@ -97,8 +97,8 @@ def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
     return path
 
 
-def test_a_log_has_a_frame_each_refresh_period_from_its_first_sample_to_its_last(log, config):
-    play = plan_play(log, Wanted(), config)
+def test_a_log_has_a_frame_each_refresh_period_from_its_first_sample_to_its_last(roll_log, config):
+    play = plan_play(roll_log, Wanted(), config)
     assert play.paced and play.frame_count == 121 and play.packet_count == 21
     number, t_ns, attitude, _ = play.frame(60)
     assert (number, t_ns) == (60, 101_000_000_000)
@@ -106,14 +106,14 @@ def test_a_log_has_a_frame_each_refresh_period_from_its_first_sample_to_its_last
 
 
 @pytest.mark.parametrize(("speed", "frames"), [(2.0, 61), (0.5, 241), (MAX, 121)])
-def test_the_speed_stretches_the_log_and_max_draws_it_all_unpaced(log, config, speed, frames):
-    play = plan_play(log, Wanted(speed), config)
+def test_the_speed_stretches_the_log_and_max_draws_it_all_unpaced(roll_log, config, speed, frames):
+    play = plan_play(roll_log, Wanted(speed), config)
     assert play.frame_count == frames
     assert play.paced == (speed != MAX)
 
 
-def test_a_span_and_a_step_choose_the_frames(log, config):
-    play = plan_play(log, Wanted(MAX, start_s=0.5, stop_s=1.5, step_s=0.25), config)
+def test_a_span_and_a_step_choose_the_frames(roll_log, config):
+    play = plan_play(roll_log, Wanted(MAX, start_s=0.5, stop_s=1.5, step_s=0.25), config)
     assert [play.frame(k)[1] / 1e9 for k in range(play.frame_count)] == [
         100.5,
         100.75,
@@ -134,9 +134,9 @@ def test_a_span_and_a_step_choose_the_frames(log, config):
         (Wanted(step_s=1e-12), "frames"),
     ],
 )
-def test_a_replay_of_no_or_too_many_frames_is_refused(log, config, wanted, word):
+def test_a_replay_of_no_or_too_many_frames_is_refused(roll_log, config, wanted, word):
     with pytest.raises(InputError, match=word):
-        plan_play(log, wanted, config)
+        plan_play(roll_log, wanted, config)
 
 
 def test_a_log_that_turns_faster_than_the_bench_file_allows_is_refused_by_its_attitude(
@@ -149,9 +149,9 @@ def test_a_log_that_turns_faster_than_the_bench_file_allows_is_refused_by_its_at
 
 
 def test_an_earlier_run_is_replayed_frame_by_frame_with_its_own_numbers_and_attitudes(
-    ledger, config
+    first_run, config
 ):
-    play = plan_play(ledger, Wanted(MAX), config)
+    play = plan_play(first_run, Wanted(MAX), config)
     assert (play.frame_count, play.packet_count, play.paced, play.moving) == (10, 10, False, True)
     frames = [play.frame(k) for k in range(10)]
     assert [(frame.number, frame.t_ns) for frame in frames] == [(2 * k, 500 + k) for k in range(10)]
@@ -160,7 +160,7 @@ def test_an_earlier_run_is_replayed_frame_by_frame_with_its_own_numbers_and_atti
     assert frames[8][2].rate_cam_rad_s.tolist() == [0.0, 0.1, 0.0]
 
 
-def test_before_its_first_frame_a_ledger_s_frames_are_decoded_once(ledger, config, monkeypatch):
+def test_before_its_first_frame_a_ledger_s_frames_are_decoded_once(first_run, config, monkeypatch):
     decoded = Counter()
     read = ledger_records.read_messages
 
@@ -170,26 +170,26 @@ def test_before_its_first_frame_a_ledger_s_frames_are_decoded_once(ledger, confi
             yield message
 
     monkeypatch.setattr(ledger_records, "read_messages", counted)
-    play = plan_play(ledger, Wanted(speed=MAX), config)
+    play = plan_play(first_run, Wanted(speed=MAX), config)
     assert play.frame_count == 10
     # all ten are looked through, and the first is read again where they are played
     assert decoded[ledger_records.FRAME_TOPIC] == 10 + 1
 
 
-def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(ledger, config):
-    play = plan_play(ledger, Wanted(start_s=0.04, stop_s=0.08), config)
+def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(first_run, config):
+    play = plan_play(first_run, Wanted(start_s=0.04, stop_s=0.08), config)
     assert [play.frame(k)[0] for k in range(play.frame_count)] == [4, 6, 8]
     with pytest.raises(InputError, match="has no frame from"):
-        plan_play(ledger, Wanted(start_s=0.041, stop_s=0.042), config)
-    assert "frame by frame" in refusal(plan_play, ledger, Wanted(2.0), config)
+        plan_play(first_run, Wanted(start_s=0.041, stop_s=0.042), config)
+    assert "frame by frame" in refusal(plan_play, first_run, Wanted(2.0), config)
 
 
 def test_a_source_s_place_is_there_again_and_no_other_than_an_orbit_s(
-    ledger, config, tmp_path, small_bench_file
+    first_run, config, tmp_path, small_bench_file
 ):
     places = [
         frame[2].place_km
-        for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))
+        for frame in map(plan_play(first_run, Wanted(speed=MAX), config).frame, (5, 6))
     ]
     assert places[0] is None
     assert places[1].tolist() == [7000.0, 0.0, 1.0]
@@ -199,11 +199,11 @@ def test_a_source_s_place_is_there_again_and_no_other_than_an_orbit_s(
 
 
 def test_stars_that_were_aberrated_are_so_again_and_no_faster_than_a_spacecraft(
-    ledger, config, tmp_path, small_bench_file
+    first_run, config, tmp_path, small_bench_file
 ):
     velocities = [
         frame[2].velocity_km_s
-        for frame in map(plan_play(ledger, Wanted(speed=MAX), config).frame, (5, 6))
+        for frame in map(plan_play(first_run, Wanted(speed=MAX), config).frame, (5, 6))
     ]
     assert velocities[0] is None
     assert velocities[1].tolist() == [0.0, 7.5, 0.0]
@@ -212,9 +212,9 @@ def test_stars_that_were_aberrated_are_so_again_and_no_faster_than_a_spacecraft(
         plan_play(too_fast, Wanted(speed=MAX), config)
 
 
-def test_a_ledger_says_who_drew_it_and_a_log_does_not(ledger, log, config):
-    assert plan_play(ledger, Wanted(MAX), config).drawn_by == DrawnBy("none", "none", "NumPy")
-    assert plan_play(log, Wanted(MAX), config).drawn_by is None
+def test_a_ledger_says_who_drew_it_and_a_log_does_not(first_run, roll_log, config):
+    assert plan_play(first_run, Wanted(MAX), config).drawn_by == DrawnBy("none", "none", "NumPy")
+    assert plan_play(roll_log, Wanted(MAX), config).drawn_by is None
 
 
 def test_another_renderer_s_codes_may_be_others_and_the_same_one_s_may_not():

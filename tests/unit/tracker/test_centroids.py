@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from hilstar.tracker.centroids import (
     CentroidSettings,
@@ -11,6 +12,7 @@ from hilstar.tracker.centroids import (
     estimate_background,
     find_stars,
     noisiest_background,
+    star_widths,
 )
 
 SIZE_PX = 40
@@ -88,3 +90,30 @@ def test_a_star_is_at_the_edge_where_its_window_leaves_a_wide_or_a_tall_image(sh
         assert is_at_edge(x, middle_y) == (x in (2, width - 3))
     for y in (2, 3, height - 4, height - 3):
         assert is_at_edge(middle_x, y) == (y in (2, height - 3))
+
+
+# What pixels leave of a Gaussian's second moments, where they sample it well; narrower stars scatter
+# with their place in the pixel.
+WIDTH_PX, NARROW_WIDTH_PX = 2e-3, 0.02
+
+
+@pytest.mark.parametrize(
+    ("sigma_px", "tolerance_px"),
+    [(0.8, NARROW_WIDTH_PX), (1.0, WIDTH_PX), (1.4, WIDTH_PX), (2.5, WIDTH_PX), (4.0, WIDTH_PX)],
+)
+def test_a_star_s_width_is_its_sigma_with_that_of_a_pixel(rng, sigma_px, tolerance_px):
+    pixel = np.arange(SIZE_PX + 1) - 0.5
+    x_px, y_px = 19.5 + rng.uniform(0, 1, (2, 8))
+    for x, y in zip(x_px.tolist(), y_px.tolist(), strict=True):
+        across = np.diff(ndtr((pixel - x) / sigma_px))
+        down = np.diff(ndtr((pixel - y) / sigma_px))
+        image = 7.0 + 5e4 * down[:, None] * across
+        (width_px,) = star_widths(image, 7.0, np.array([x]), np.array([y]))
+        assert width_px == pytest.approx(np.sqrt(sigma_px**2 + 1 / 12), abs=tolerance_px)
+
+
+def test_a_place_without_a_star_has_no_width():
+    image = np.zeros((SIZE_PX, SIZE_PX))
+    image[20, 20] = -5.0
+    widths_px = star_widths(image, 0.0, np.array([20.0, 5.0]), np.array([20.0, 5.0]))
+    assert np.isnan(widths_px).all()

@@ -6,6 +6,7 @@ Before it the session's records: session.json, and the keys set in the bench fil
 
 import dataclasses
 import hashlib
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -62,6 +63,9 @@ INSTEAD_OF = {"flux_at_white_e_per_s": ("brightest_v_mag",)}
 # Figures of the step `orientation`: the monitor's camera as the figure was seen, with its
 # q_cam_to_mon.
 SEEN_FOCAL, SEEN_Q = "seen_focal_length_px", ("seen_qw", "seen_qx", "seen_qy", "seen_qz")
+# Errors of the measured PSF within which the bench file's stands, so that `calibrate geometric` has
+# the session's figures.
+PSF_AGREES_SIGMAS = 2.0
 MAX_FILL = 0.8  # relative to the tracker's range: brighter pixels are not trusted
 HOT_FILL = 0.5  # a pixel above this in the dark frame is hot, and is not used
 LIGHT_STEP = 4.0  # by which the light is lowered while a pattern is too bright
@@ -349,6 +353,17 @@ class StepContext:
         bench file's.
         """
         return float(self.known.get("focus.psf_sigma_px", np.mean(self.tracker_psf.width_px)))
+
+    @property
+    def agreed_psf_sigma_px(self) -> float:
+        """The bench file's sigma of the tracker's PSF, or that of the step `focus` where it
+        contradicts it.
+        """
+        stated_px = psf_sigma_of(self.file)
+        error_px = float(self.known.get("focus.psf_sigma_error_px", math.inf))
+        if abs(self.psf_sigma_px - stated_px) <= PSF_AGREES_SIGMAS * error_px:
+            return stated_px
+        return self.psf_sigma_px
 
     def names(self, table: str, key: str, path: Path) -> tuple[KeyChange, ...]:
         """The change of a key of the bench file that names a file of the session; none where it

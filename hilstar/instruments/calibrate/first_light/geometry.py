@@ -487,7 +487,8 @@ def geometry(context: StepContext) -> StepOutcome:
     first = first_dots(context.seen_screen)
     paths, observed = _frames_of(context, first, 0, code, dark)
     rough = rough_geometry(context.file, first, observed)
-    second = plan_seen_dots(rough, FRAMES, lit_for(rough), np.random.default_rng(PLAN_SEED))
+    rng = np.random.default_rng(PLAN_SEED)
+    second = plan_seen_dots(rough, FRAMES, lit_for(rough), rng, beside=first)
     more_paths, more_seen = _frames_of(context, second, first.frames, code, dark)
     plan = joined(first, second)
     paths = [*paths, *more_paths]
@@ -495,7 +496,13 @@ def geometry(context: StepContext) -> StepOutcome:
     ideal = context.file.config.tracker.distortion is None
     centroids = observed.joined(more_seen)
     context.stage(f"fits lenses to {len(centroids)} centroids")
-    calibrated = calibrate_seen(context.file, plan, centroids, tracker_is_ideal=ideal)
+    calibrated = calibrate_seen(
+        context.file,
+        plan,
+        centroids,
+        tracker_is_ideal=ideal,
+        psf_sigma_px=context.agreed_psf_sigma_px,
+    )
     output = context.session / "geometry.toml"
     picture = context.session / "geometry.svg"
     write_calibrated(output, calibrated, picture, context.source.monitor)

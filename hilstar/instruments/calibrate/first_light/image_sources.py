@@ -25,7 +25,14 @@ from msgspec.structs import replace
 
 from hilstar.attitude.wire.shown_frames import FrameHead, FrameSender, ShownFrame
 from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray, IntArray
-from hilstar.basics.errors import HilstarError, InputError, MachineError, shortened
+from hilstar.basics.errors import (
+    HilstarError,
+    InputError,
+    MachineError,
+    NoDisplayError,
+    shortened,
+    without_display,
+)
 from hilstar.basics.files import written
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.process.programs import MAX_OUTPUT_BYTES, Child
@@ -75,7 +82,7 @@ PATTERN_FILE = "pattern.png"
 KIND = "code"  # a square that toggles leaves pairs of frames open
 POLL_S = 0.02
 SETTLE_S = 0.25  # for a panel that is slow to change
-SHOW_YOURSELF = "or show the patterns yourself: name {pattern} in --grab"
+SHOW_YOURSELF = "show the patterns yourself: name {pattern} in --grab"
 # A pattern that stays is handed on again so often, for a watcher that came late.
 HANDED_ON_AGAIN_S = 0.5
 GRAB_TIMEOUT_S = 120.0
@@ -344,9 +351,11 @@ class PatternDisplay(Closing):
                 timing = pass_gate(screen, self.force)
                 self.forced += screen.forced
                 return timing
+        except NoDisplayError:
+            raise
         except MachineError as error:
             raise MachineError(
-                f"{str(error).removesuffix('; or add --force')}; {SHOW_YOURSELF}"
+                f"{str(error).removesuffix('; or add --force')}; or {SHOW_YOURSELF}"
             ) from error
 
     def show_until(
@@ -425,7 +434,9 @@ class PatternDisplay(Closing):
         leave_contexts()  # contexts made without a window since
         if self._window is None or self._screen_px != screen_px:
             self.close()
-            self._window = Window(WindowSettings(screen_px, monitor.bits, monitor.display))
+            settings = WindowSettings(screen_px, monitor.bits, monitor.display)
+            with without_display(SHOW_YOURSELF):
+                self._window = Window(settings)
             self._screen_px = screen_px
         self._window.make_current()
         return self._window

@@ -48,7 +48,8 @@ THRESHOLD_SIGMA = 8.0
 # noise of a star that can be read, and of one whose light is judged by itself
 READ_MAG, SURE_MAG = 0.1, 0.01
 SURE_STARS = 10  # the stars with the least noise that are judged where few are sure
-# times the threshold: a star whose peak should be so high and is not there is lost
+MIN_PIXELS = 2  # over the threshold: a hot pixel is no star
+# times the threshold: a star whose second pixel should be so bright and is not there is lost
 LOST_MARGIN = 3.0
 MOST = 0.5  # a share of the variance this large is named as its cause
 FAR = 3.0  # times their errors: more scatter than this has another cause
@@ -108,7 +109,7 @@ class StarSpot:
         """How stars are found and their places measured, in a window as wide as they are."""
         return CentroidSettings(
             THRESHOLD_SIGMA,
-            2,
+            MIN_PIXELS,
             window_sigma_px=max(1.0, self.mean_sigma_px),
             window_radius_px=self.radius_px,
             psf_sigma_px=self.sigma_px,
@@ -123,6 +124,16 @@ class StarSpot:
     def peak_share(self) -> float:
         """The share of a star's light in the pixel that it is in the middle of."""
         return self._share_within(0.5)
+
+    def second_share(self, place_px: FloatArray) -> FloatArray:
+        """The share (n,) of the light of stars at places (n, 2) in their second brightest pixel."""
+        off_px = np.abs(place_px - np.rint(place_px))
+        upper = ndtr((0.5 - off_px) / self.sigma_px)
+        inside = upper - ndtr((-0.5 - off_px) / self.sigma_px)
+        beside = ndtr((1.5 - off_px) / self.sigma_px) - upper
+        in_next_column = beside[:, 0] * inside[:, 1]
+        in_next_row = inside[:, 0] * beside[:, 1]
+        return np.asarray(np.maximum(in_next_column, in_next_row))
 
     def _share_within(self, half_px: float) -> float:
         """The share of a star's light in a square about it."""
@@ -622,8 +633,10 @@ def _compared(
         brighter = float(np.median(near_dn / expected_dn[near]))
     matched = near.copy()
     matched[near] = spot.light_noise_mag(near_dn, noise_dn) < READ_MAG
-    peak_sigmas = brighter * expected_dn * spot.peak_share / noise_dn
-    is_lost = ~near & (peak_sigmas > LOST_MARGIN * THRESHOLD_SIGMA)
+    # A star is found by MIN_PIXELS: one of sigma 0.4 px in the middle of a pixel has a seventh of
+    # that one's light in the next.
+    second_dn = brighter * expected_dn * spot.second_share(wanted.place_px)
+    is_lost = ~near & (second_dn > LOST_MARGIN * THRESHOLD_SIGMA * noise_dn)
     chosen = nearest[matched]
     dn = stars.flux[chosen] / spot.window_share
     shared = dataclasses.replace(spot, frames=images)

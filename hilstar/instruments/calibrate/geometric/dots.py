@@ -14,10 +14,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import BoolArray, FloatArray
+from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.charts import write_csv
 from hilstar.basics.errors import InputError
 from hilstar.basics.text_tables import read_rows
+from hilstar.instruments.calibrate.geometric.dot_shape import DotShape
 from hilstar.instruments.calibrate.geometric.observed import dot_centroids
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.config import Monitor
@@ -47,6 +48,8 @@ GRID = 65
 # places of the even sequence that are tried for each dot: the part seen may be a thin strip of its
 # box
 TRIED = 40
+# of the distance between dots: to those of another plan, between which there is less room
+TAKEN_SHARE = 0.6
 # in which the outermost place that is seen has a dot, so that no corner is extrapolated
 BORDER_DIRECTIONS = 8
 
@@ -65,6 +68,13 @@ class DotPlan:
     def frames(self) -> int:
         """Number of frames."""
         return int(self.lit.shape[1])
+
+    @property
+    def sites(self) -> IntArray:
+        """The first dot at each dot's place (n,): pixels of the detector do the same to both."""
+        places = np.stack([self.x_px, self.y_px], axis=1)
+        _, first, site = np.unique(places, axis=0, return_index=True, return_inverse=True)
+        return np.asarray(first[site.ravel()], dtype=np.intp)
 
     @property
     def extent_px(self) -> float:
@@ -140,6 +150,15 @@ class SeenScreen:
         """The sigma of a dot in the tracker's image: the PSF's and a square's."""
         square_sigma_px = DOT_PX * self.tracker_px_a_monitor_px / math.sqrt(12)
         return math.hypot(self.psf_sigma_px, square_sigma_px)
+
+    @property
+    def dot_shape(self) -> DotShape:
+        """A dot in the tracker's image, as it is on the axis."""
+        side_px = DOT_PX * self.tracker_px_a_monitor_px
+        monitor_to_tracker = self.tracker.cam_to_image @ self.monitor.cam_to_image.T
+        right = monitor_to_tracker[:, 0]
+        turn_deg = math.degrees(math.atan2(right[1], right[0]))
+        return DotShape(self.psf_sigma_px, side_px, turn_deg)
 
     @property
     def turn_deg(self) -> float:
@@ -238,10 +257,14 @@ def lit_for(seen: SeenScreen) -> int:
 
 
 def plan_seen_dots(
-    seen: SeenScreen, frames: int, dots_per_frame: int, rng: np.random.Generator
+    seen: SeenScreen,
+    frames: int,
+    dots_per_frame: int,
+    rng: np.random.Generator,
+    beside: DotPlan | None = None,
 ) -> DotPlan:
-    """Plan dots over the part of the screen that the tracker sees. Raises InputError where that
-    is impossible.
+    """Plan dots over the part of the screen that the tracker sees, between those of the plan
+    `beside`. Raises InputError where that is impossible.
     """
     count = dots_of_frames(frames, dots_per_frame)
     if count < MIN_DOTS:
@@ -250,13 +273,16 @@ def plan_seen_dots(
             " needed; write more --dots or --frames, or no --dots for as many as the field holds"
         )
     lit = _codes(count, frames, rng)
-    x_px, y_px = _seen_places(seen, count)
+    taken = np.empty((0, 2))
+    if beside is not None:
+        taken = np.stack([beside.x_px, beside.y_px], axis=1)
+    x_px, y_px = _seen_places(seen, count, taken)
     return DotPlan(x_px, y_px, lit[: len(x_px)])
 
 
-def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
-    """Whole pixels (n,) spread evenly over what is seen, the outermost first; at most `count`.
-    Raises InputError for few.
+def _seen_places(seen: SeenScreen, count: int, taken: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Whole pixels (n,) spread evenly over what is seen between those `taken` (m, 2), the
+    outermost first; at most `count`. Raises InputError for few.
     """
     low, high = seen.box()
     size = high - low
@@ -269,12 +295,14 @@ def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
     directions = circle / np.maximum(size, 1.0)
     seen_places = places[is_seen]
     outermost = seen_places[(seen_places @ directions.T).argmax(axis=0)]
-    chosen = np.unique(outermost, axis=0)[:count]
-    # Two dots at nearly one place would be taken for one dot that blinks both codes.
+    # Two dots at nearly one place would be taken for one dot that blinks both codes, and have the
+    # errors of the same pixels.
     area_px = float(np.prod(size)) * len(inside) / tried
     apart_px = 0.5 * math.sqrt(area_px / count)
-    dx_px, dy_px = (inside[:, None] - chosen[None]).transpose(2, 0, 1)
-    is_apart = np.hypot(dx_px, dy_px).min(axis=1) > apart_px
+    chosen = np.unique(outermost, axis=0)
+    chosen = chosen[_distances(chosen, taken) > TAKEN_SHARE * apart_px][:count]
+    is_apart = _distances(inside, chosen) > apart_px
+    is_apart &= _distances(inside, taken) > TAKEN_SHARE * apart_px
     chosen = np.concatenate([chosen, inside[is_apart]])[:count]
     if len(chosen) < MIN_DOTS:
         raise InputError(
@@ -282,6 +310,12 @@ def _seen_places(seen: SeenScreen, count: int) -> tuple[FloatArray, FloatArray]:
             " are needed: a shorter [tracker] or a longer [collimator] focal length shows it more"
         )
     return chosen[:, 0], chosen[:, 1]
+
+
+def _distances(places: FloatArray, others: FloatArray) -> FloatArray:
+    """The distance of each place (n, 2) to the nearest of others (m, 2), infinite without any."""
+    apart = places[:, None] - others[None]
+    return np.asarray(np.hypot(apart[..., 0], apart[..., 1]).min(axis=1, initial=np.inf))
 
 
 def _even(count: int) -> FloatArray:

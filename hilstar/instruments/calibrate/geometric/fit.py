@@ -195,6 +195,10 @@ class Problem:
         """Monitor pixels per tracker pixel, on the axis."""
         return self.nominal.monitor.focal_length_px / self.nominal.tracker.focal_length_px
 
+    def sites(self, data: MatchedDots) -> IntArray:
+        """The place of each centroid (n,), as the number of the first dot there."""
+        return self.plan.sites[data.dot]
+
 
 @dataclass(frozen=True, slots=True)
 class Fit:
@@ -470,7 +474,7 @@ def candidates(
         # A dot has two numbers of its own. Half as many are left over: a field of 55 numbers
         # followed 42 dots' own errors.
         has_centroids = 2 * len(data) >= CENTROIDS_PER_NUMBER * numbers
-        if has_centroids and len(np.unique(data.dot)) > numbers:
+        if has_centroids and len(np.unique(problem.sites(data))) > numbers:
             models.append(held_out(problem, name, model, degree, data))
         if len(models) > 4:
             third, second, last = (candidate.rms_arcsec for candidate in models[-3:])
@@ -482,14 +486,18 @@ def candidates(
 def held_out(
     problem: Problem, name: str, model: Model, degree: int, data: MatchedDots
 ) -> Candidate:
-    """The error of a model on each dot by a fit to the others, a fifth of the dots at a time."""
-    dots = np.unique(data.dot)
+    """The error of a model on each dot by a fit to the others, a fifth of the dots at a time.
+
+    Dots at one place are one: held out alone, its own error would be in the others.
+    """
+    site = problem.sites(data)
+    dots = np.unique(site)
     fold = np.zeros(int(dots.max()) + 1, dtype=np.intp)
     fold[dots] = np.arange(len(dots)) % FOLDS
     start = fit(problem, model, degree, data, min_gain=COMPARED_GAIN).numbers
     off_px = np.full((len(data), 2), np.nan)
     for k in range(FOLDS):
-        is_held_out = fold[data.dot] == k
+        is_held_out = fold[site] == k
         if is_held_out.any() and not is_held_out.all():
             others = data.at(np.flatnonzero(~is_held_out))
             tested = data.at(np.flatnonzero(is_held_out))
@@ -498,9 +506,9 @@ def held_out(
             off_px[is_held_out] = np.stack(fold_off_px, axis=1)
     known_px = np.nan_to_num(off_px, nan=np.inf)
     arcsec = known_px * ARCSEC_PER_RAD / problem.nominal.tracker.focal_length_px
-    count = np.bincount(data.dot, minlength=len(fold))[dots]
-    sum_x = np.bincount(data.dot, arcsec[:, 0], minlength=len(fold))[dots]
-    sum_y = np.bincount(data.dot, arcsec[:, 1], minlength=len(fold))[dots]
+    count = np.bincount(site, minlength=len(fold))[dots]
+    sum_x = np.bincount(site, arcsec[:, 0], minlength=len(fold))[dots]
+    sum_y = np.bincount(site, arcsec[:, 1], minlength=len(fold))[dots]
     means = np.stack([sum_x / count, sum_y / count], axis=1)
     return Candidate(name, model, degree, dots, means)
 
@@ -611,7 +619,7 @@ def _covariance_root(
     _, triangle = np.linalg.qr(np.vstack([rows, np.diag(prior)]))
     root = np.linalg.inv(triangle)
     residual_scatter = MAD_TO_SIGMA * float(np.median(residual))
-    scale = max(1.0, residual_scatter, _scatter_of_dots(data, off, numbers))
+    scale = max(1.0, residual_scatter, _scatter_of_dots(problem.sites(data), off, numbers))
     if not is_simpler:
         return np.asarray(scale * root)
     # One step of Gauss and Newton from the simple lens to the whole one, as one more error
@@ -655,13 +663,14 @@ def _seen_places(geometry: Geometry) -> tuple[FloatArray, FloatArray]:
     return x_px[on_screen], y_px[on_screen]
 
 
-def _scatter_of_dots(data: MatchedDots, off: FloatArray, numbers: int) -> float:
-    """The scatter of dots' mean residuals in sigmas of their noise, of a fit of so many numbers.
+def _scatter_of_dots(site: IntArray, off: FloatArray, numbers: int) -> float:
+    """The scatter of mean residuals of the dots at each site (n,) in sigmas of their noise, of a
+    fit of so many numbers.
 
     A dot is at one place in all its frames: what a detector's pixels do to it there is no average
     of the frames.
     """
-    dots, dot, count = np.unique(data.dot, return_inverse=True, return_counts=True)
+    dots, dot, count = np.unique(site, return_inverse=True, return_counts=True)
     x_off, y_off = np.split(off, 2)
     root_count = np.sqrt(count)
     x_means = np.bincount(dot, x_off) / root_count

@@ -20,6 +20,7 @@ from hilstar.basics.version import __version__
 from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
 from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.geometric import fit as fits
+from hilstar.instruments.calibrate.geometric.dot_shape import SMOOTH_PSF_PX
 from hilstar.instruments.calibrate.geometric.dots import MIN_DOTS, DotPlan, SeenScreen, read_plan
 from hilstar.instruments.calibrate.geometric.match import (
     FirstLook,
@@ -55,7 +56,8 @@ DEFAULT_NOISE_PX = 0.05
 # off by noise / sqrt(frames).
 MAX_MISFIT = 4.0
 # Windowed centroids of a Gaussian of 0.5 px are up to 0.009 px off by its place in a pixel, of
-# 0.44 px 0.018 px, of 0.37 px 0.038 px.
+# 0.44 px 0.018 px, of 0.37 px 0.038 px. That is taken off by the PSF that is stated or measured;
+# of one that is 15 % off a half stays.
 NARROW_DOT_PX = 0.5
 MISFIT_FLOOR_ARCSEC = 1.0
 ONE_POSE = (
@@ -130,8 +132,8 @@ class Calibrated:
     @property
     def held_out_noise_arcsec(self) -> float:
         """The rms that noise alone would give held-out dots."""
-        count = np.bincount(self.data.dot)
-        # of a dot's mean, along both axes
+        count = np.bincount(self.problem.sites(self.data))
+        # of the mean of a place's dots, along both axes
         share2 = 2 * np.mean(1 / count[count > 0])
         return float(np.sqrt(share2) * self.noise_arcsec)
 
@@ -168,11 +170,22 @@ def calibrate_files(
 
 
 def calibrate_seen(
-    file: BenchFile, plan: DotPlan, seen: Observed, *, tracker_is_ideal: bool
+    file: BenchFile,
+    plan: DotPlan,
+    seen: Observed,
+    *,
+    tracker_is_ideal: bool,
+    psf_sigma_px: float | None = None,
 ) -> Calibrated:
-    """Fit the geometry of a bench file to centroids of planned dots. Raises InputError."""
+    """Fit the geometry of a bench file to centroids of planned dots, seen through a PSF of this
+    sigma (default: the bench file's). Raises InputError.
+    """
     known = tracker_is_ideal or file.config.tracker.distortion is not None
     nominal = nominal_of(file)
+    if psf_sigma_px is None:
+        psf_sigma_px = psf_sigma_of(file)
+    if psf_sigma_px <= SMOOTH_PSF_PX:
+        seen = without_s_curves(plan, nominal, seen, psf_sigma_px)
     try:
         return calibrate_geometry(
             plan, nominal, seen, np.random.default_rng(SEED), tracker_known=known
@@ -183,7 +196,8 @@ def calibrate_seen(
             raise
         raise MisfitError(
             f"{error}, or dots of sigma {sigma_px:.2f} px lie within a tracker pixel, whose"
-            " centroids depend on where: defocus the tracker a little"
+            " centroids depend on where: write [tracker] psf_sigma_px as `hilstar calibrate focus`"
+            " measures it, or defocus the tracker a little"
         ) from error
 
 
@@ -234,6 +248,26 @@ def rough_geometry(file: BenchFile, plan: DotPlan, seen: Observed) -> SeenScreen
         raise _too_few(data)
     rough = fits.fit(problem, fits.Model(fits.RADIAL), 0, data).geometry
     return SeenScreen(rough.monitor, rough.tracker, is_sure=True, psf_sigma_px=psf_sigma_of(file))
+
+
+def without_s_curves(
+    plan: DotPlan, nominal: fits.Nominal, seen: Observed, psf_sigma_px: float
+) -> Observed:
+    """Centroids without the bias by a dot's place within a pixel, its side and turn by a first
+    fit. Raises InputError.
+    """
+    look = first_look(plan, nominal, seen, np.random.default_rng(SEED))
+    problem, data = matched(plan, nominal, seen, look)
+    if len(np.unique(data.dot)) < MIN_DOTS:
+        raise _too_few(data)
+    poses = len(look.q_poses)
+    rough = fits.fit(problem, fits.Model(fits.RADIAL, (), poses), 0, data).geometry
+    for pose, q_cam_to_pose in enumerate(rough.q_poses):
+        turned_axes = rough.tracker.cam_to_image @ to_matrix(q_cam_to_pose)
+        tracker = replace(rough.tracker, cam_to_image=turned_axes)
+        screen = SeenScreen(rough.monitor, tracker, is_sure=True, psf_sigma_px=psf_sigma_px)
+        seen = seen.without_s_curve(pose, screen.dot_shape)
+    return seen
 
 
 def _too_few(data: fits.MatchedDots) -> InputError:

@@ -16,6 +16,7 @@ from hilstar.basics.fits_headers import FitsImage, read_fits_image
 from hilstar.basics.image_files import ImageSizeError, is_fits, opened_picture
 from hilstar.basics.reading import read_bytes
 from hilstar.basics.text_tables import read_rows
+from hilstar.instruments.calibrate.geometric.dot_shape import DotShape, without_s_curve
 from hilstar.tracker.centroids import CentroidSettings, find_stars, noisiest_background
 
 MAX_OBSERVED_BYTES = 100_000_000
@@ -45,7 +46,8 @@ class Observed:
     each.
 
     `sigma_px` (n,) is each one's own error where the table has it, else 1: only ratios count then.
-    Nearer than `edge_px` to the detector's edge no dot is measured: its window leaves the image.
+    `settings` are those that they were measured by, None for those of a table. No dot is measured
+    nearer to the detector's edge than `edge_px`: its window leaves the image.
     """
 
     frame: IntArray
@@ -53,7 +55,12 @@ class Observed:
     x_px: FloatArray
     y_px: FloatArray
     sigma_px: FloatArray
-    edge_px: float = 0.0
+    settings: CentroidSettings | None = None
+
+    @property
+    def edge_px(self) -> float:
+        """Half the side of the window that they were measured in, 0 for those of a table."""
+        return float(self.settings.radius_px) if self.settings is not None else 0.0
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -64,10 +71,24 @@ class Observed:
 
     def joined(self, other: "Observed") -> "Observed":
         """These centroids and others, of other frames."""
-        joined = {}
+        joined: dict[str, Any] = {}
         for name in COLUMNS:
             joined[name] = np.concatenate([getattr(self, name), getattr(other, name)])
-        return replace(self, **joined, edge_px=max(self.edge_px, other.edge_px))
+        return replace(self, **joined)
+
+    def without_s_curve(self, pose: int, shape: DotShape) -> "Observed":
+        """The same centroids, those of a pose without the bias by a dot's place within a pixel,
+        where its shape is known.
+        """
+        if self.settings is None:
+            return self
+        is_of_pose = self.pose == pose
+        x_px, y_px = without_s_curve(self.x_px, self.y_px, shape, self.settings)
+        return replace(
+            self,
+            x_px=np.where(is_of_pose, x_px, self.x_px),
+            y_px=np.where(is_of_pose, y_px, self.y_px),
+        )
 
 
 def read_observed(path: Path) -> Observed:
@@ -127,7 +148,7 @@ def measure_images(
         np.repeat(np.array(part, dtype=np.intp), count) for part in zip(*paths_of, strict=True)
     )
     x_px, y_px = (np.concatenate(part) for part in zip(*places, strict=True))
-    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)), edge_px=settings.radius_px)
+    return Observed(frame_of, pose_of, x_px, y_px, np.ones(len(x_px)), settings)
 
 
 def dot_centroids(dot_sigma_px: float) -> CentroidSettings:

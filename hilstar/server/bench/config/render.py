@@ -10,7 +10,7 @@ from hilstar.server.bench.config.values import Magnitude, NotNegative, Positive,
 
 # White, where the file gives none. demo.toml, 200 random fields: the brightest code of 8 bits is
 # 100 in the median (38 with Sirius for white), `verify` sees flux 0.065 mag off at 95 % (0.41), and
-# 13 stars clip, one of them in 8 % of fields.
+# 13 stars clip, one of them in 5 % of fields.
 DEFAULT_BRIGHTEST_V_MAG = 1.5
 # The limits of [verify]. README's bench keeps them at 8 bits by `exact`: 0.022 mag and 0.088 px,
 # the worst star of its catalogue by the worst of six centroiders. At 12 bits `round` does: 0.019

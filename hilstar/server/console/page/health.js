@@ -9,11 +9,12 @@ const LATE = "what is shown is the right sky; its frames come too seldom";
 
 export class Health {
   constructor(link, onChange) {
-    Object.assign(this, { link, onChange, said: null, serverMs: NaN, saidAt: -Infinity, ok: null, lostUtc: null, bench: "", session: false, missed: 0, lately: 0 });
+    Object.assign(this, { link, onChange, said: null, serverMs: NaN, saidAt: -Infinity, ok: null, lostUtc: null, bench: "", session: false, focus: null, missed: 0, lately: 0 });
     setInterval(() => this.check(), CHECK_MS);
   }
 
-  hear({ utc, health, counts }) {
+  hear({ utc, health, counts, focus }) {
+    this.focus = focus;
     this.missed = counts?.missed ?? 0;
     this.said = health;
     this.serverMs = Date.parse(utc);
@@ -39,6 +40,7 @@ export class Health {
   }
 
   get wellSaid() {
+    if (this.session && this.focus) return "turn the ring until the figure is smallest";
     if (this.session) return "each step is told under Events";
     const many = (n) => `${n} ${n === 1 ? "frame" : "frames"} missed`;
     if (this.lately) return `attitude fresh; ${many(this.lately)} in the last minute`;

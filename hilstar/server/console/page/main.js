@@ -7,7 +7,7 @@ import { byId, clock, duration, write } from "./format.js";
 import { Health } from "./health.js";
 import { Link } from "./link.js";
 import { OVERLAYS, Overlays, pictureText, seenStars } from "./overlays.js";
-import { Rows, addEvent, writeAttitude, writeRefusals, writeTracker } from "./panels.js";
+import { Rows, addEvent, writeAttitude, writeFocus, writeRefusals, writeTracker } from "./panels.js";
 import { Picture } from "./picture.js";
 import { HISTORY_S, MESSAGE_KEYS } from "./protocol.js";
 import { Sky } from "./sky.js";
@@ -37,11 +37,13 @@ const controls = new Controls(link);
 const attitudeRows = new Rows(byId("attitude-rows"));
 const runRows = new Rows(byId("run-rows"));
 const trackerRows = new Rows(byId("tracker-rows"));
+const focusRows = new Rows(byId("focus-rows"));
 const charts = {
   age: new Chart(byId("chart-age"), { title: "Age of the attitude", unit: "ms", ink }),
   pacing: new Chart(byId("chart-pacing"), { title: "Pacing", unit: "ms", ink }),
   packets: new Chart(byId("chart-packets"), { title: "Packets", unit: "Hz", ink }),
   residual: new Chart(byId("chart-residual"), { title: "Residual of the tracker", unit: "arcsec", ink }),
+  focus: new Chart(byId("chart-focus"), { title: "Last minute", unit: "px", ink }),
 };
 
 function redraw(what) {
@@ -102,6 +104,8 @@ const HEARD = {
     writeFigures("run", said, runRows);
     writeRefusals(said.counts.refused);
     if (said.tracker) writeTracker(said.tracker, trackerRows);
+    byId("focus").hidden = !said.focus;
+    if (said.focus) writeFocus(said.focus, focusRows);
     controls.hear(said);
     tellFrame(said);
     moveSky(said.attitude);
@@ -211,6 +215,7 @@ function drawCharts() {
   charts.packets.set([series("packets", "packets_hz", "one", 1)], [{ name: "refused", ink: "bad", t, n: column("refused") }], span, 0);
   const axes = ["x", "y", "z"].map((axis, k) => series(axis, `${axis}_arcsec`, ["one", "two", "three"][k], 1));
   charts.residual.set(axes, [{ name: "wrong", ink: "bad", t, n: column("wrong") }], span, 0);
+  charts.focus.set([series("width", "focus_px", "one", 3)], [], span, 0);
   for (const chart of Object.values(charts)) chart.draw();
 }
 
@@ -221,7 +226,7 @@ const FRAME_STATES = [
 ];
 
 function tellFrame({ frame, operator }) {
-  const [, words, shade] = FRAME_STATES.find(([key]) => frame[key]) || ["", hello?.session ? "first light" : "fresh", "ok"];
+  const [, words, shade] = FRAME_STATES.find(([key]) => frame[key]) || ["", hello?.session ? hello.command.replace("hilstar ", "") : "fresh", "ok"];
   const chip = byId("attitude-state");
   write(chip, words);
   chip.dataset.state = shade;

@@ -2,7 +2,7 @@
 // as HTML.
 
 import { writeFigures } from "./figures.js";
-import { NONE, byId, clock, count, degreesMinutes, fixed, hours, make, signed, write } from "./format.js";
+import { NONE, byId, clock, count, degreesMinutes, fixed, hours, make, signed, withUnit, write } from "./format.js";
 import { KEPT_EVENTS } from "./protocol.js";
 
 // Rows of names and values that are made once and then only written into.
@@ -55,6 +55,21 @@ export function writeTracker(said, rows) {
     value.dataset.state = said.verdict === "wrong" ? "bad" : "";
   });
   writeFigures("tracker", { tracker: said }, rows);
+}
+
+// The newest figure of the focus, for somebody who turns the ring and looks from afar.
+export function writeFocus(said, rows) {
+  const known = said.sigma_px !== null;
+  const judged = said.worse ? ["less sharp", "warn"] : ["sharpest so far", "ok"];
+  const [words, shade] = !known ? ["no figure", "warn"] : said.still ? judged : ["it moves", "bad"];
+  write(byId("focus-state"), words);
+  byId("focus-state").dataset.state = shade;
+  write(byId("focus-what"), `by ${said.what}`);
+  write(byId("focus-now"), known ? withUnit(said.sigma_px, "px", 3) : NONE);
+  write(byId("focus-error"), known ? `\u00b1 ${withUnit(said.error_px, "px", 3)}` : "");
+  write(byId("focus-line"), said.line);
+  rows.set("Best", said.best_px === null ? NONE : `${withUnit(said.best_px, "px", 3)}, ${fixed(said.best_ago_s)}\u00a0s ago`);
+  rows.set("By", known ? `${count(said.count)} ${said.what === "star sigma" ? "widths" : "dots"}` : NONE);
 }
 
 // A bar for each reason, as long as its share of all refusals.

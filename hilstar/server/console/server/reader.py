@@ -33,6 +33,7 @@ MANY_MISSED_SHARE = 0.5  # share of the last second's frames
 MISSING = "frames are missing"
 HEADLINES = {True: "Sky is right", False: "Sky is not right"}
 SESSION_HEADLINES = {True: "First light goes on", False: "A step has failed"}
+FOCUS_HEADLINES = {True: "The focus is measured", False: "No focus is measured"}
 TICK_S = 0.1
 PACING_EACH_S = 1.0
 MIN_INTERVALS = 10
@@ -77,6 +78,8 @@ def judged(
     and the recent frames. For `pace` see `Setup`.
     """
     found = reasons(seen, now_ns, lately, refresh_hz, pace)
+    if pace == "session" and seen is not None and seen.focus is not None:
+        return SkyJudgement(found, FOCUS_HEADLINES[not found])
     if pace == "session":
         return SkyJudgement(found, SESSION_HEADLINES[not found])
     late = len(found) == 1 and found[0].startswith(MISSING)
@@ -204,6 +207,7 @@ class RunReader:
         self.answer: messages.NewAnswer | None = None
         self._answered: list[TrackerFigures] = []  # since the last point
         self._wrong = 0
+        self._focus_at = 0
         self._last: messages.FrameNumbers | None = None
         self._intervals_ms: deque[tuple[int, float]] = deque()
         self._received: deque[tuple[int, RunCounts]] = deque()  # over the last second
@@ -259,6 +263,10 @@ class RunReader:
             if figures.verdict == "right" and figures.residual_arcsec is not None:
                 point.x_arcsec, point.y_arcsec, point.z_arcsec = figures.residual_arcsec
         self._answered.clear()
+        focus = None if self.seen is None else self.seen.focus
+        if focus is not None and focus.number != self._focus_at:
+            self._focus_at = focus.number
+            point.focus_px = focus.sigma_px
         if self.seen is not None:
             self._received.append((now_ns, self.seen.counts))
             while len(self._received) > 1 and now_ns - self._received[0][0] > NS_PER_S:

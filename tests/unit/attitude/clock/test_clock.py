@@ -247,3 +247,11 @@ def test_a_sender_on_unix_time_keeps_its_nanoseconds():
     assert (
         clock.to_sender_ns(HOST0_NS + 99 * PERIOD_NS) == 1_700_000_000_000_000_001 + 99 * PERIOD_NS
     )
+
+
+def test_a_jump_of_two_milliseconds_is_taken_for_delay():
+    """The sky is late by as much: the turn in that time, at 1 deg/s."""
+    jump_ns = 2 * NS_PER_MS
+    run = ClockRun(lambda host_ns, k: host_ns - jump_ns * (k >= 3000))
+    late_ms = np.abs(run.error_ms[1000:]).max()
+    holds("small-jump", 3600 * late_ms / 1000)

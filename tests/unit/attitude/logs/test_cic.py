@@ -23,7 +23,7 @@ WHOLE = cic_text(ROWS)
 
 
 @pytest.fixture
-def log(tmp_path):
+def cic_log(tmp_path):
     def opened(text):
         path = tmp_path / "a.txt"
         path.write_text(text)
@@ -32,8 +32,8 @@ def log(tmp_path):
     return opened
 
 
-def test_the_real_part_comes_first_and_times_are_days_and_seconds(log):
-    found = log(WHOLE)
+def test_the_real_part_comes_first_and_times_are_days_and_seconds(cic_log):
+    found = cic_log(WHOLE)
     assert [sample.t_ns for sample in found.samples] == [DAY_NS, DAY_NS + 10_250_000_000]
     assert to_radec_roll_deg(found.samples[0].q_icrs_to_cam)[:2] == pytest.approx(
         (84.057, -1.2), abs=1e-5
@@ -45,10 +45,12 @@ def test_the_real_part_comes_first_and_times_are_days_and_seconds(log):
 @pytest.mark.parametrize("direction", ["A2B", "B2A"])
 @pytest.mark.parametrize("frame", ["EME2000", "ICRF", "ITRF", "TEME"])
 @pytest.mark.parametrize("scale", ["UTC", "TAI"])
-def test_attitudes_are_those_of_an_aem_of_the_same_numbers(tmp_path, log, direction, frame, scale):
+def test_attitudes_are_those_of_an_aem_of_the_same_numbers(
+    tmp_path, cic_log, direction, frame, scale
+):
     x, y, z, w = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_quat()
     meta = {"ATTITUDE_DIR": direction, "REF_FRAME_A": frame, "TIME_SYSTEM": scale}
-    found = log(cic_text([f"60310 {s} {w} {x} {y} {z}" for s in (0, 1)], **meta))
+    found = cic_log(cic_text([f"60310 {s} {w} {x} {y} {z}" for s in (0, 1)], **meta))
     (tmp_path / "b.aem").write_text(
         kvn(
             [f"2024-01-01T00:00:0{s} {x} {y} {z} {w}" for s in (0, 1)],
@@ -63,7 +65,7 @@ def test_attitudes_are_those_of_an_aem_of_the_same_numbers(tmp_path, log, direct
     assert found.conventions.scale == scale
 
 
-def test_what_writers_have_besides_is_read(log):
+def test_what_writers_have_besides_is_read(cic_log):
     text = cic_text(
         ROWS, QUATERNION_TYPE="FIRST", CENTER_NAME="EARTH", START_TIME="2024-01-01T00:00:00"
     )
@@ -78,8 +80,11 @@ def test_what_writers_have_besides_is_read(log):
         ),
     ]
     for other in others:
-        assert [sample.t_ns for sample in log(other).samples] == [DAY_NS, DAY_NS + 10_250_000_000]
-    unnamed = log(cic_text(ROWS, REF_FRAME_B="UNDEFINED"))
+        assert [sample.t_ns for sample in cic_log(other).samples] == [
+            DAY_NS,
+            DAY_NS + 10_250_000_000,
+        ]
+    unnamed = cic_log(cic_text(ROWS, REF_FRAME_B="UNDEFINED"))
     assert (
         dict(unnamed.told)["log-frame"]
         == "REF_FRAME_B = UNDEFINED is taken as the spacecraft's body"
@@ -91,19 +96,21 @@ def test_what_writers_have_besides_is_read(log):
     "comment",
     ["q1, q2, q3, q0 (real part)", "days (MJD), sec (UTC), Q1 Q2 Q3 QC", "x: q1 y: q2 z: q3 w: q4"],
 )
-def test_a_real_part_that_a_comment_has_last_is_read_there_and_that_is_said(log, stated, comment):
+def test_a_real_part_that_a_comment_has_last_is_read_there_and_that_is_said(
+    cic_log, stated, comment
+):
     w, x, y, z = ALNILAM.split()
     rows = [f"60310 {seconds} {x} {y} {z} {w}" for seconds in (0, 1)]
-    found = log(cic_text(rows, comment=comment, QUATERNION_TYPE=stated))
-    first = log(cic_text([f"60310 {seconds} {ALNILAM}" for seconds in (0, 1)]))
+    found = cic_log(cic_text(rows, comment=comment, QUATERNION_TYPE=stated))
+    first = cic_log(cic_text([f"60310 {seconds} {ALNILAM}" for seconds in (0, 1)]))
     for one, other in zip(found.samples, first.samples, strict=True):
         assert one.q_icrs_to_cam.tolist() == other.q_icrs_to_cam.tolist()
     assert "the real part is the last of four" in "".join(text for _, text in found.told)
 
 
-def test_several_segments_follow_each_other(log):
+def test_several_segments_follow_each_other(cic_log):
     second = cic_text([f"60311 0 {ALNILAM}"])
-    found = log(WHOLE + second[second.index("META_START") :])
+    found = cic_log(WHOLE + second[second.index("META_START") :])
     assert [sample.discontinuity for sample in found.samples] == [False, False, True]
     assert np.diff([sample.t_ns for sample in found.samples])[1] == 86_400 * 10**9 - 10_250_000_000
 
@@ -178,18 +185,18 @@ def test_several_segments_follow_each_other(log):
         (ALNILAM, "0.5 0.5 0.5 0.6", ":17: the quaternion's norm is 1.05357"),
     ],
 )
-def test_what_is_wrong_is_refused_by_name_and_line(log, old, new, words):
+def test_what_is_wrong_is_refused_by_name_and_line(cic_log, old, new, words):
     assert old in WHOLE
-    assert words in refusal(log, WHOLE.replace(old, new))
+    assert words in refusal(cic_log, WHOLE.replace(old, new))
 
 
 @pytest.mark.parametrize("text", [WHOLE.split("META_STOP", 1)[0], WHOLE.split("META_START", 1)[0]])
-def test_a_file_that_ends_before_its_data_is_refused(log, text):
+def test_a_file_that_ends_before_its_data_is_refused(cic_log, text):
     with pytest.raises(InputError, match=r"the file ends in its (metadata|header); is it cut off"):
-        log(text)
+        cic_log(text)
 
 
-def test_angles_are_refused_by_their_type_and_not_by_their_count(log):
+def test_angles_are_refused_by_their_type_and_not_by_their_count(cic_log):
     angles = WHOLE.replace("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = EULER_ANGLE")
     with pytest.raises(InputError, match=r":13: ATTITUDE_TYPE = EULER_ANGLE of a CIC AEM is not"):
-        log(angles.replace(ALNILAM, "10.0 20.0 30.0"))
+        cic_log(angles.replace(ALNILAM, "10.0 20.0 30.0"))

@@ -23,7 +23,7 @@ WRITTEN_RAD = 1e-7  # seven decimals of a quaternion
 
 
 @pytest.fixture
-def log(tmp_path):
+def csv_of(tmp_path):
     warn_once.cache_clear()
 
     def write(text, name="log.csv"):
@@ -65,23 +65,23 @@ CUTS = {
 
 
 @pytest.mark.parametrize("name", CUTS)
-def test_a_row_that_was_cut_off_is_left_out_and_said(log, name, caplog):
+def test_a_row_that_was_cut_off_is_left_out_and_said(csv_of, name, caplog):
     text, cut, count = CUTS[name]
-    path = log(text[:-cut])
+    path = csv_of(text[:-cut])
     found = open_log(path)
     assert len(found.samples) == count
     assert ("log-cut" in dict(found.told)) == (cut > 1)
     telemetry = read_telemetry(path)
     assert len(telemetry.t_ns) == count
     assert ("as of a file that was cut off" in caplog.text) == (cut > 1)
-    assert len(open_log(log(text)).samples) == len(text.splitlines()) - 1
+    assert len(open_log(csv_of(text)).samples) == len(text.splitlines()) - 1
 
 
-def test_the_attitude_at_the_end_of_a_cut_log_is_the_last_whole_one(log):
-    result = run_hilstar_here("attitude", log(slew()[:-6]), "--time", "5.8")
+def test_the_attitude_at_the_end_of_a_cut_log_is_the_last_whole_one(csv_of):
+    result = run_hilstar_here("attitude", csv_of(slew()[:-6]), "--time", "5.8")
     assert "RA 84.6371, Dec -1.1999, roll 0.0122 deg" in result.stdout
     assert "the last line has no line end" in result.stderr
-    assert run_hilstar_here("attitude", log(slew()[:-6]), "--time", "5.9").returncode == 2
+    assert run_hilstar_here("attitude", csv_of(slew()[:-6]), "--time", "5.9").returncode == 2
 
 
 def telemetry_text(header, good, bad, lost=LOST):
@@ -109,8 +109,10 @@ def telemetry_text(header, good, bad, lost=LOST):
         ("trackerLost", "0", "1", LOST),
     ],
 )
-def test_rows_that_the_log_marks_as_not_valid_are_left_out_and_said(log, header, good, bad, lost):
-    path = log(telemetry_text(header, good, bad, lost))
+def test_rows_that_the_log_marks_as_not_valid_are_left_out_and_said(
+    csv_of, header, good, bad, lost
+):
+    path = csv_of(telemetry_text(header, good, bad, lost))
     found = open_log(path)
     assert [round(sample.t_ns / 1e8) for sample in found.samples] == [0, 1, 2, 3, 6, 7, 8, 9]
     assert (
@@ -120,13 +122,13 @@ def test_rows_that_the_log_marks_as_not_valid_are_left_out_and_said(log, header,
     assert read_telemetry(path).valid.tolist() == [k not in (4, 5) for k in range(10)]
 
 
-def test_json_lines_that_say_they_are_not_valid_are_left_out_and_said(log):
+def test_json_lines_that_say_they_are_not_valid_are_left_out_and_said(csv_of):
     text = "".join(
         f'{{"t_ns": {k}, "q": [{LOST if k == 1 else Q}], "valid":'
         f" {'false' if k == 1 else 'true'}}}\n"
         for k in range(3)
     )
-    found = open_log(log(text))
+    found = open_log(csv_of(text))
     assert [sample.t_ns for sample in found.samples] == [0, 2]
     assert (
         dict(found.told)["log-valid"]
@@ -135,21 +137,21 @@ def test_json_lines_that_say_they_are_not_valid_are_left_out_and_said(log):
 
 
 @pytest.mark.parametrize("key", ["is_valid", "attitudeValid", "st_valid"])
-def test_json_says_what_holds_by_the_names_of_tables(log, key):
+def test_json_says_what_holds_by_the_names_of_tables(csv_of, key):
     rows = [f'{{"t_ns": {k}, "q": [{Q}], "{key}": {"false" if k else "true"}}}\n' for k in (0, 1)]
-    found = open_log(log("".join(rows)))
+    found = open_log(csv_of("".join(rows)))
     assert [sample.t_ns for sample in found.samples] == [0]
     assert "1 line is marked as not valid" in dict(found.told)["log-valid"]
 
 
 @pytest.mark.parametrize("q", ["null", "[null, null, null, null]", "[NaN, NaN, NaN, NaN]"])
-def test_json_without_a_quaternion_is_left_out_at_the_start_and_refused_later(log, q):
+def test_json_without_a_quaternion_is_left_out_at_the_start_and_refused_later(csv_of, q):
     blank, row = f'{{"t_ns": 0, "q": {q}}}\n', f'{{"t_ns": 5, "q": [{Q}]}}\n'
-    found = open_log(log(blank + row, "log.jsonl"))
+    found = open_log(csv_of(blank + row, "log.jsonl"))
     assert [sample.t_ns for sample in found.samples] == [5]
     assert "1 attitude is left out at the beginning" in dict(found.told)["log-start"]
     with pytest.raises(InputError, match=r"log\.jsonl:2: .*dropout"):
-        open_log(log(row + blank, "log.jsonl"))
+        open_log(csv_of(row + blank, "log.jsonl"))
 
 
 @pytest.mark.parametrize(
@@ -163,14 +165,14 @@ def test_json_without_a_quaternion_is_left_out_at_the_start_and_refused_later(lo
         ("error", "0", "1"),
     ],
 )
-def test_a_column_of_marks_that_is_not_used_is_named(log, header, good, bad):
-    found = open_log(log(telemetry_text(header, good, bad)))
+def test_a_column_of_marks_that_is_not_used_is_named(csv_of, header, good, bad):
+    found = open_log(csv_of(telemetry_text(header, good, bad)))
     assert f"column {header} is not used" in dict(found.told)["log-table"]
 
 
-def test_a_column_of_figures_is_no_mark(log):
+def test_a_column_of_figures_is_no_mark(csv_of):
     """An error in arcseconds marks no row."""
-    found = open_log(log(telemetry_text("pointing_error_arcsec", "2.5", "3.5")))
+    found = open_log(csv_of(telemetry_text("pointing_error_arcsec", "2.5", "3.5")))
     assert not found.told
 
 
@@ -188,8 +190,8 @@ DATES = [
 
 
 @pytest.mark.parametrize(("header", "written"), DATES)
-def test_dates_are_read_to_the_nanosecond_and_that_is_said(log, header, written):
-    path = log(f"{header},qw,qx,qy,qz\n{written},{Q}\n")
+def test_dates_are_read_to_the_nanosecond_and_that_is_said(csv_of, header, written):
+    path = csv_of(f"{header},qw,qx,qy,qz\n{written},{Q}\n")
     found = open_log(path)
     assert found.samples[0].t_ns == 1_704_067_200_500_000_000
     assert f"column {header} has dates" in dict(found.told)["log-table"]
@@ -209,9 +211,9 @@ def test_dates_are_read_to_the_nanosecond_and_that_is_said(log, header, written)
         ("time", "2460310.5"),
     ],
 )
-def test_a_time_that_may_be_another_is_refused_with_its_place(log, header, written):
+def test_a_time_that_may_be_another_is_refused_with_its_place(csv_of, header, written):
     with pytest.raises(InputError, match=r"log\.csv:[12]: .*write"):
-        open_log(log(f"{header},qw,qx,qy,qz\n{written},{Q}\n"))
+        open_log(csv_of(f"{header},qw,qx,qy,qz\n{written},{Q}\n"))
 
 
 # What programs write for a quaternion before their estimator runs.
@@ -220,23 +222,23 @@ NOTHING_YET += ("1.#QNAN", "?", ".", "", "0", "-0.0", "\\N")
 
 
 @pytest.mark.parametrize("word", NOTHING_YET)
-def test_rows_without_a_number_are_left_out_at_the_start_and_a_dropout_later(log, word):
+def test_rows_without_a_number_are_left_out_at_the_start_and_a_dropout_later(csv_of, word):
     blank = ",".join([word] * 4)
-    found = open_log(log(f"{HEAD}0.0,{blank}\n0.1,{blank}\n0.2,{Q}\n0.3,{Q}\n"))
+    found = open_log(csv_of(f"{HEAD}0.0,{blank}\n0.1,{blank}\n0.2,{Q}\n0.3,{Q}\n"))
     assert [sample.t_ns for sample in found.samples] == [200_000_000, 300_000_000]
     assert "2 attitudes are left out at the beginning" in dict(found.told)["log-start"]
     with pytest.raises(InputError, match=r"log\.csv:3: .*dropout"):
-        open_log(log(f"{HEAD}0.0,{Q}\n0.1,{blank}\n0.2,{Q}\n"))
+        open_log(csv_of(f"{HEAD}0.0,{Q}\n0.1,{blank}\n0.2,{Q}\n"))
 
 
 @pytest.mark.parametrize("word", ["1e999", "inf", "#VALUE!", "lost", "0_5", "0.5f", "0x1"])
-def test_words_that_are_no_blank_are_refused_with_their_line(log, word):
+def test_words_that_are_no_blank_are_refused_with_their_line(csv_of, word):
     with pytest.raises(InputError, match=r"log\.csv:2: "):
-        open_log(log(f"{HEAD}0.0,{','.join([word] * 4)}\n0.2,{Q}\n"))
+        open_log(csv_of(f"{HEAD}0.0,{','.join([word] * 4)}\n0.2,{Q}\n"))
 
 
-def test_dialects_of_a_log_are_read(log):
-    plain = open_log(log(HEAD + f"0,{Q}\n1,{OTHER}\n")).samples
+def test_dialects_of_a_log_are_read(csv_of):
+    plain = open_log(csv_of(HEAD + f"0,{Q}\n1,{OTHER}\n")).samples
     texts = (
         f"# t_s,qw,qx,qy,qz\n0,{Q}\n1,{OTHER}\n",
         f"{HEAD}0,{Q}\n1,{OTHER}\n".replace(",", ";"),
@@ -250,7 +252,7 @@ def test_dialects_of_a_log_are_read(log):
         f"{HEAD}0,{Q}\n1,{OTHER}\n".replace("-", "−"),
     )
     for text in texts:
-        samples = open_log(log(text)).samples
+        samples = open_log(csv_of(text)).samples
         assert [sample.t_ns for sample in samples] == [0, 10**9], text
         assert all(
             np.array_equal(a.q_icrs_to_cam, b.q_icrs_to_cam)
@@ -258,8 +260,8 @@ def test_dialects_of_a_log_are_read(log):
         ), text
 
 
-def test_rates_are_in_the_unit_of_their_columns_and_that_is_said(log):
-    found = open_log(log(f"t_s,qw,qx,qy,qz,rx [deg/s],ry_deg_s,rz (°/s)\n0,{Q},1,2,3\n"))
+def test_rates_are_in_the_unit_of_their_columns_and_that_is_said(csv_of):
+    found = open_log(csv_of(f"t_s,qw,qx,qy,qz,rx [deg/s],ry_deg_s,rz (°/s)\n0,{Q},1,2,3\n"))
     assert found.samples[0].rate_cam_rad_s == pytest.approx(np.radians([1, 2, 3]), rel=1e-12)
     assert (
         sum("deg/s" in line or "°/s" in line for kind, line in found.told if kind == "log-table")
@@ -298,5 +300,5 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("text", REFUSED)
-def test_a_log_that_may_mean_two_things_is_refused(log, text):
-    assert REFUSED[text] in refusal(open_log, log(text))
+def test_a_log_that_may_mean_two_things_is_refused(csv_of, text):
+    assert REFUSED[text] in refusal(open_log, csv_of(text))

@@ -34,7 +34,7 @@ AGI_MATRIX = (
 
 
 @pytest.fixture
-def log(tmp_path):
+def stk_log(tmp_path):
     def opened(rows, *arguments, **keywords):
         path = tmp_path / "a.a"
         path.write_text(stk_text(rows, *arguments, **keywords))
@@ -43,16 +43,18 @@ def log(tmp_path):
     return opened
 
 
-def body_turns(log):
+def body_turns(stk_log):
     """The rotations of components from the reference to the body."""
-    return Rotation.from_quat([sample.q_icrs_to_cam for sample in log.samples], scalar_first=True)
+    return Rotation.from_quat(
+        [sample.q_icrs_to_cam for sample in stk_log.samples], scalar_first=True
+    )
 
 
-def test_quaternions_are_the_conjugates_of_hilstars_scalar_last_or_first(log):
-    last = log([f"0.0 {ALNILAM}", f"10.5 {ALNILAM}"])
+def test_quaternions_are_the_conjugates_of_hilstars_scalar_last_or_first(stk_log):
+    last = stk_log([f"0.0 {ALNILAM}", f"10.5 {ALNILAM}"])
     assert [sample.t_ns for sample in last.samples] == [EPOCH_NS, EPOCH_NS + 10_500_000_000]
     x, y, z, w = ALNILAM.split()
-    first = log([f"0 {w} {x} {y} {z}"], "AttitudeTimeQuatScalarFirst")
+    first = stk_log([f"0 {w} {x} {y} {z}"], "AttitudeTimeQuatScalarFirst")
     for each in (last, first):
         ra_deg, dec_deg, roll_deg = to_radec_roll_deg(each.samples[0].q_icrs_to_cam)
         assert (ra_deg, dec_deg) == pytest.approx((84.057, -1.2), abs=1e-5)
@@ -60,8 +62,8 @@ def test_quaternions_are_the_conjugates_of_hilstars_scalar_last_or_first(log):
         assert each.conventions.of_body and each.conventions.scale == "UTC"
 
 
-def test_a_body_that_turns_by_agis_example_turns_as_its_rates_say(log):
-    spun = log(AGI_SPIN, "AttitudeTimeQuatAngVels")
+def test_a_body_that_turns_by_agis_example_turns_as_its_rates_say(stk_log):
+    spun = stk_log(AGI_SPIN, "AttitudeTimeQuatAngVels")
     about_z = body_turns(spun).as_rotvec()[:, 2]
     # components turn the other way
     assert about_z == pytest.approx(-np.radians([0, 60, 120]), abs=ROUNDING)
@@ -70,23 +72,25 @@ def test_a_body_that_turns_by_agis_example_turns_as_its_rates_say(log):
     assert not spun.joins().misfits
 
 
-def test_euler_angles_are_turns_of_the_axes_in_the_order_of_the_sequence(log):
+def test_euler_angles_are_turns_of_the_axes_in_the_order_of_the_sequence(stk_log):
     angles = [10.0, 20.0, 30.0]
     for sequence, axes in (("321", "ZYX"), ("313", "ZXZ"), ("123", "XYZ")):
         found = body_turns(
-            log([f"0 {' '.join(map(str, angles))}"], "AttitudeTimeEulerAngles", Sequence=sequence)
+            stk_log(
+                [f"0 {' '.join(map(str, angles))}"], "AttitudeTimeEulerAngles", Sequence=sequence
+            )
         )
         wanted = Rotation.from_euler(axes, angles, degrees=True).inv()
         assert (found[0] * wanted.inv()).magnitude() < ROUNDING
     # the second of AGI_SPIN
-    spun = body_turns(log(["0 60 0 0"], "AttitudeTimeEulerAngles", Sequence="313"))
+    spun = body_turns(stk_log(["0 60 0 0"], "AttitudeTimeEulerAngles", Sequence="313"))
     assert spun[0].as_rotvec()[2] == pytest.approx(-np.radians(60), abs=ROUNDING)
 
 
-def test_a_matrix_is_by_rows_from_the_axes_to_the_body(log):
+def test_a_matrix_is_by_rows_from_the_axes_to_the_body(stk_log):
     wanted = Rotation.from_matrix(np.array(AGI_MATRIX.split(), dtype=float).reshape(3, 3))
     for form, more in (("AttitudeTimeDCM", ""), ("AttitudeTimeDCMAngVels", " 0 0 6")):
-        found = log([f"0 {AGI_MATRIX}{more}"], form)
+        found = stk_log([f"0 {AGI_MATRIX}{more}"], form)
         assert (body_turns(found)[0] * wanted.inv()).magnitude() < ROUNDING
         assert (found.samples[0].rate_cam_rad_s is None) == (not more)
     third = "0.5773503 0.5773503 0.5773503"
@@ -99,12 +103,12 @@ def test_a_matrix_is_by_rows_from_the_axes_to_the_body(log):
         with pytest.raises(
             InputError, match=r"a\.a:9: the nine numbers are no rotation matrix by rows"
         ):
-            log([f"0 {matrix}"], "AttitudeTimeDCM")
+            stk_log([f"0 {matrix}"], "AttitudeTimeDCM")
 
 
-def test_axes_that_are_fixed_to_the_earth_turn_with_it(log):
-    fixed = log(AGI_SPIN, "AttitudeTimeQuatAngVels", CoordinateAxes="Fixed")
-    inertial = body_turns(log(AGI_SPIN, "AttitudeTimeQuatAngVels", CoordinateAxes="ICRF"))
+def test_axes_that_are_fixed_to_the_earth_turn_with_it(stk_log):
+    fixed = stk_log(AGI_SPIN, "AttitudeTimeQuatAngVels", CoordinateAxes="Fixed")
+    inertial = body_turns(stk_log(AGI_SPIN, "AttitudeTimeQuatAngVels", CoordinateAxes="ICRF"))
     t_ns = np.array([sample.t_ns for sample in fixed.samples])
     to_earth = Rotation.from_quat(q_icrs_to_itrs(t_ns), scalar_first=True)
     assert (body_turns(fixed) * (inertial * to_earth).inv()).magnitude().max() < ROUNDING
@@ -128,18 +132,18 @@ def test_axes_that_are_fixed_to_the_earth_turn_with_it(log):
         ({"ScenarioEpoch": "2025-01-01T00:00:00"}, ["1.5", "2"], [1.5, 2.0]),
     ],
 )
-def test_times_are_of_the_epoch_and_the_format(log, keywords, times, since_s):
-    found = log([f"{time} 0 0 0 1" for time in times], **keywords)
+def test_times_are_of_the_epoch_and_the_format(stk_log, keywords, times, since_s):
+    found = stk_log([f"{time} 0 0 0 1" for time in times], **keywords)
     assert [sample.t_ns - EPOCH_NS for sample in found.samples] == [int(s * 1e9) for s in since_s]
 
 
-def test_without_an_epoch_times_are_no_dates_and_what_moves_is_refused(log):
-    undated = log(["1 0 0 0 1", "2 0 0 0 1"], ScenarioEpoch=None)
+def test_without_an_epoch_times_are_no_dates_and_what_moves_is_refused(stk_log):
+    undated = stk_log(["1 0 0 0 1", "2 0 0 0 1"], ScenarioEpoch=None)
     assert [sample.t_ns for sample in undated.samples] == [10**9, 2 * 10**9]
     assert undated.conventions.scale is None
     assert "states no ScenarioEpoch" in dict(undated.told)["log-times"]
     with pytest.raises(InputError, match="states no ScenarioEpoch; write it as 1 Jan 2025"):
-        log(["1 0 0 0 1"], ScenarioEpoch=None, CoordinateAxes="Fixed")
+        stk_log(["1 0 0 0 1"], ScenarioEpoch=None, CoordinateAxes="Fixed")
 
 
 ROWS = [f"{k} 0 0 0 1" for k in range(3)]
@@ -272,31 +276,31 @@ def test_what_would_be_another_attitude_is_refused_by_name_and_line(tmp_path, ol
 
 
 @pytest.mark.parametrize("form", TYPES)
-def test_a_row_of_fewer_numbers_than_its_form_has_is_refused_by_its_line(log, form):
+def test_a_row_of_fewer_numbers_than_its_form_has_is_refused_by_its_line(stk_log, form):
     """A short row of a long form left a time and its other numbers, and so a traceback."""
     whole = COUNTS[form]
     for count in range(whole):
         row = " ".join(["0", *["0"] * count])
         with pytest.raises(InputError, match=f":10: .*: write a time and {whole} numbers for"):
-            log([row], form=form, Sequence="321")
+            stk_log([row], form=form, Sequence="321")
 
 
-def test_axes_of_another_body_are_refused_unless_they_are_inertial(log):
+def test_axes_of_another_body_are_refused_unless_they_are_inertial(stk_log):
     with pytest.raises(
         InputError,
         match=r"a\.a:7: CoordinateAxes fixed of CentralBody Mars are not read; write J2000",
     ):
-        log(ROWS, CentralBody="Mars", CoordinateAxes="Fixed")
-    assert len(log(ROWS, CentralBody="Mars").samples) == 3
+        stk_log(ROWS, CentralBody="Mars", CoordinateAxes="Fixed")
+    assert len(stk_log(ROWS, CentralBody="Mars").samples) == 3
 
 
-def test_a_sequence_that_is_none_is_refused(log):
+def test_a_sequence_that_is_none_is_refused(stk_log):
     for sequence in ("322", "421", "32"):
         with pytest.raises(
             InputError, match=rf"a\.a:8: Sequence is {sequence}; write three axes such as 321"
         ):
-            log(["0 1 2 3"], "AttitudeTimeEulerAngles", Sequence=sequence)
-    assert "Sequence is missing" in refusal(log, ["0 1 2 3"], "AttitudeTimeEulerAngles")
+            stk_log(["0 1 2 3"], "AttitudeTimeEulerAngles", Sequence=sequence)
+    assert "Sequence is missing" in refusal(stk_log, ["0 1 2 3"], "AttitudeTimeEulerAngles")
 
 
 @pytest.mark.parametrize(
@@ -306,6 +310,6 @@ def test_a_sequence_that_is_none_is_refused(log):
         ("AttitudeTimeQuatScalarFirst", "0 1 0 0 0", "scalar first"),
     ],
 )
-def test_what_a_file_s_numbers_mean_is_said_by_its_form(log, form, row, scalar):
-    found = log([row, row.replace("0", "60", 1)], form)
+def test_what_a_file_s_numbers_mean_is_said_by_its_form(stk_log, form, row, scalar):
+    found = stk_log([row, row.replace("0", "60", 1)], form)
     assert found.conventions.scalar.startswith(scalar)

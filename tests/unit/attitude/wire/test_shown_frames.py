@@ -95,28 +95,28 @@ class RawWatcher:
 
 
 @pytest.fixture
-def sender():
+def frame_sender():
     with closing(FrameSender("tcp://127.0.0.1:*")) as opened:
         yield opened
 
 
-def seen_by(watcher: FrameWatch, sender: FrameSender) -> None:
+def seen_by(watcher: FrameWatch, frame_sender: FrameSender) -> None:
     """Wait until a frame that the sender sends, while it believes to be watched, arrives."""
 
     def arrives() -> bool:
-        if sender.look():
-            sender.put_frame(FRAME)
+        if frame_sender.look():
+            frame_sender.put_frame(FRAME)
         return bool(watcher.frames(10))
 
     wait_for(arrives, "a frame")
 
 
-def settled(sender: FrameSender) -> None:
+def settled(frame_sender: FrameSender) -> None:
     """Wait until what was sent before has been read: a further watcher, which subscribes last,
     is seen, and leaves.
     """
-    with closing(FrameWatch(sender.endpoint)) as last:
-        seen_by(last, sender)
+    with closing(FrameWatch(frame_sender.endpoint)) as last:
+        seen_by(last, frame_sender)
 
 
 @pytest.mark.parametrize(
@@ -133,28 +133,28 @@ def settled(sender: FrameSender) -> None:
 )
 @pytest.mark.parametrize("crashes", [True, False])
 def test_a_watcher_goes_on_whatever_another_subscribes_to_and_however_it_leaves(
-    sender, said, crashes
+    frame_sender, said, crashes
 ):
-    with closing(FrameWatch(sender.endpoint)) as watcher:
-        seen_by(watcher, sender)
-        other = RawWatcher(sender.endpoint)
+    with closing(FrameWatch(frame_sender.endpoint)) as watcher:
+        seen_by(watcher, frame_sender)
+        other = RawWatcher(frame_sender.endpoint)
         other.says(*said)
-        settled(sender)
+        settled(frame_sender)
         if crashes:
             other.crash()
-        assert sender.look()
-        seen_by(watcher, sender)
+        assert frame_sender.look()
+        seen_by(watcher, frame_sender)
         other.crash()
-    wait_for(lambda: not sender.look(), "nobody watches any more")
+    wait_for(lambda: not frame_sender.look(), "nobody watches any more")
 
 
-def test_who_asks_for_another_topic_or_has_unsubscribed_does_not_watch(sender):
-    other = RawWatcher(sender.endpoint)
+def test_who_asks_for_another_topic_or_has_unsubscribed_does_not_watch(frame_sender):
+    other = RawWatcher(frame_sender.endpoint)
     other.says(b"\1other")
-    settled(sender)
-    wait_for(lambda: not sender.look(), "it does not watch")
+    settled(frame_sender)
+    wait_for(lambda: not frame_sender.look(), "it does not watch")
     other.says(b"\1{")
-    wait_for(sender.look, "it watches")
+    wait_for(frame_sender.look, "it watches")
     other.says(b"\0{")
-    wait_for(lambda: not sender.look(), "it has unsubscribed")
+    wait_for(lambda: not frame_sender.look(), "it has unsubscribed")
     other.crash()

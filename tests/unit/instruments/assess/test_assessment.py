@@ -502,6 +502,16 @@ def test_missed_frames_are_named_on_the_terminal_and_on_the_page(tmp_path: Path)
 
 def test_a_run_that_missed_too_many_frames_for_a_budget_is_refused(tmp_path: Path) -> None:
     ledger, telemetry, _ = missing_run(tmp_path, 1200, 5, seconds=30.0)
+    refused = run_hilstar_here("assess", ledger, telemetry, "-o", tmp_path / "other")
+    assert refused.returncode == 2, refused.stderr
+    counts = re.search(
+        r"the run missed so many frames that (\d+) of (\d+) answers looked while one was held, and"
+        r" 30 others are needed; run it ([0-9.]+) times as long,",
+        refused.stderr,
+    )
+    assert counts is not None, refused.stderr
+    free = int(counts[2]) - int(counts[1])
+    assert 30 <= free * float(counts[3]) < 30 + 0.1 * free
     check_refused(ledger, telemetry, "the run missed so many frames that")
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.assess.components import EDGES, _component, components_of
+from tests.support.claims import holds
 from tests.support.planted_tracker import SCALE, attitude, scalar_first, scan, star_px, waves
 
 # From 4000 answers the noise is known to 0.7 %, and a pixel error of 0.6 of it to 1.5 %. A star
@@ -15,6 +16,7 @@ from tests.support.planted_tracker import SCALE, attitude, scalar_first, scan, s
 # is found to 0.01 px blurs a saw's jump by as much: 1 % of its power, which is 2 % of the noise for
 # a saw of 1.5 of it.
 PIXEL_WITHIN, NOISE_WITHIN = 0.04, 0.05
+WIDE_SAW, WIDE_SAW_PX = 2.0, 100.0  # sigmas of the noise, and px of the field
 
 
 def saw(phase_px):
@@ -50,6 +52,17 @@ def test_a_pixel_error_that_jumps_from_pixel_to_pixel_is_recovered_whole(shape, 
     assert np.sqrt(found.pixel.variance[:2].mean()) == pytest.approx(size, rel=PIXEL_WITHIN)
     assert np.sqrt(found.noise_variance) == pytest.approx([1.0, 1.0, 1.0], rel=NOISE_WITHIN)
     assert found.pixel.detail.endswith(EDGES)
+
+
+def test_a_jump_between_wide_saws_counts_as_noise() -> None:
+    """Saws of 100 px of the field, twice the noise: sharper than the waves of the fit."""
+    rng = np.random.default_rng(2)
+    true = attitude(scan, np.arange(0.0, 600.0, 0.15))
+    error = WIDE_SAW * saws(star_px(true, true[0]) / WIDE_SAW_PX)
+    found = components_of(error + rng.normal(size=error.shape), scalar_first(true), SCALE)
+    size = np.sqrt(found.fov.variance[:2].mean())
+    holds("saw-lost", 100 * (1 - size / WIDE_SAW))
+    holds("saw-noise", 100 * (np.sqrt(found.noise_variance[:2].mean()) - 1))
 
 
 def test_smooth_waves_and_noise_alone_have_no_jumps() -> None:

@@ -4,12 +4,12 @@ what no rotation explains.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import (
     angle_between_rad,
     conjugate,
@@ -187,45 +187,40 @@ def test_a_late_clock_is_named_with_its_offset(rng):
     assert float(cause.split()[3]) == pytest.approx(0.05, abs=0.002)
 
 
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda c, t: (c, conjugate(t)), ("inverse", "-tx")),
-        (lambda c, t: (c, np.roll(t, -1, axis=1)), ("scalar last",)),
-        (lambda c, t: (c, np.roll(conjugate(t), -1, axis=1)), ("scalar last", "inverse")),
-        (lambda c, t: (c, t * [1, 1, -1, -1]), ("mirrored in x",)),
-        (lambda c, t: (c, t * [1, -1, -1, 1]), ("mirrored in z",)),
-        (lambda c, t: (conjugate(c), conjugate(t)), ("both", "inverse")),
-        (lambda c, t: (np.roll(c, -1, axis=1), np.roll(t, -1, axis=1)), ("both", "scalar last")),
-        (lambda c, t: (np.roll(c, -1, axis=1), t), ("commanded", "scalar last")),
-    ],
-)
-def test_another_convention_is_refused_with_its_cure(rng, change, words):
+def wild_half(rng: np.random.Generator, reported: np.ndarray) -> np.ndarray:
+    return np.concatenate([commanded_of(rng, 20), reported[20:]])
+
+
+TOP = from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]))  # a frame whose z is no boresight
+# What becomes of 40 commanded attitudes and of what a tracker reports of them.
+REFUSED = [
+    (lambda c, t: (c, conjugate(t)), ("inverse", "-tx")),
+    (lambda c, t: (c, np.roll(t, -1, axis=1)), ("scalar last",)),
+    (lambda c, t: (c, np.roll(conjugate(t), -1, axis=1)), ("scalar last", "inverse")),
+    (lambda c, t: (c, t * [1, 1, -1, -1]), ("mirrored in x",)),
+    (lambda c, t: (c, t * [1, -1, -1, 1]), ("mirrored in z",)),
+    (lambda c, t: (conjugate(c), conjugate(t)), ("both", "inverse")),
+    (lambda c, t: (np.roll(c, -1, axis=1), np.roll(t, -1, axis=1)), ("both", "scalar last")),
+    (lambda c, t: (np.roll(c, -1, axis=1), t), ("commanded", "scalar last")),
+    (lambda c, t: (c[[0] * 5], conjugate(t[[0] * 5])), ("inverse",)),
+    (lambda c, t: (c, wild_half(np.random.default_rng(2), t)), ("half or more",)),
+    (lambda c, t: (c, multiply(TOP, c)), ("90 degrees off the boresight",)),
+    (lambda c, t: (c[:2], c[:2]), ("2 pairs and 3 are needed",)),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), REFUSED, ids=["".join(row[1]) for row in REFUSED])
+def test_what_no_rotation_explains_is_refused_with_its_cure(rng, change, words):
     commanded = commanded_of(rng, 40)
-    with pytest.raises(InputError) as refusal:
-        align(pairs_of(*change(commanded, turned_by(rng, commanded))), CAMERA)
+    line = refusal(align, pairs_of(*change(commanded, turned_by(rng, commanded))), CAMERA)
     for word in words:
-        assert word in str(refusal.value)
+        assert word in line
 
 
-def test_the_inverse_of_one_attitude_is_refused_too(rng):
-    commanded = np.repeat(commanded_of(rng, 1), 5, axis=0)
-    with pytest.raises(InputError, match="inverse"):
-        align(pairs_of(commanded, conjugate(turned_by(rng, commanded))), CAMERA)
-
-
-def test_half_of_wild_ones_is_refused(rng):
-    commanded = commanded_of(rng, 40)
-    reported = turned_by(rng, commanded)
-    reported[:20] = commanded_of(rng, 20)
-    assert "half or more" in refusal(align, pairs_of(commanded, reported), CAMERA)
-
-
-def test_a_frame_whose_z_is_not_the_boresight_is_refused(rng):
-    commanded = commanded_of(rng, 40)
-    body = from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]))
-    with pytest.raises(InputError, match="90 degrees off the boresight"):
-        align(pairs_of(commanded, multiply(body, commanded)), CAMERA)
+def test_telemetry_columns_are_named_in_the_cure(rng):
+    commanded = commanded_of(rng, 10)
+    pairs = pairs_of(commanded, conjugate(turned_by(rng, commanded)))
+    assert "write qw,-qx,-qy,-qz" in refusal(align, replace(pairs, names=COMMANDED), CAMERA)
 
 
 def test_a_tracker_turned_by_half_a_turn_is_no_mistake(rng):
@@ -237,28 +232,11 @@ def test_a_tracker_turned_by_half_a_turn_is_no_mistake(rng):
     ) or found.rotation_arcsec[2] == pytest.approx(-np.pi * ARCSEC_PER_RAD, abs=EXACT_ARCSEC)
 
 
-def test_two_pairs_are_too_few(rng):
-    commanded = commanded_of(rng, 2)
-    assert "2 pairs and 3 are needed" in refusal(align, pairs_of(commanded, commanded), CAMERA)
-
-
 def test_repeats_are_of_one_attitude_whatever_their_sign(rng):
     attitudes = commanded_of(rng, 30)
     group = groups_of(np.concatenate([attitudes, -attitudes]))
     assert len(np.unique(group)) == 30
     assert (group[:30] == group[30:]).all()
-
-
-def test_telemetry_columns_are_named_in_the_cure(rng):
-    commanded = commanded_of(rng, 10)
-    pairs = Pairs(
-        Path("t.csv"),
-        np.arange(10),
-        commanded,
-        conjugate(turned_by(rng, commanded)),
-        names=COMMANDED,
-    )
-    assert "write qw,-qx,-qy,-qz" in refusal(align, pairs, CAMERA)
 
 
 def test_the_corrected_alignment_has_the_tracker_report_what_is_commanded(rng):

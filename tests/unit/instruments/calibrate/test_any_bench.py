@@ -38,6 +38,7 @@ from hilstar.instruments.calibrate.first_light.stars import (
     noise_words,
     place_reasons,
 )
+from hilstar.instruments.calibrate.geometric.dot_shape import DotShape, without_s_curve
 from hilstar.instruments.calibrate.geometric.dots import (
     DOT_PX,
     SeenScreen,
@@ -45,13 +46,21 @@ from hilstar.instruments.calibrate.geometric.dots import (
     lit_for,
     plan_seen_dots,
 )
+from hilstar.instruments.calibrate.geometric.fit import (
+    BROWN_CONRADY,
+    MatchedDots,
+    Model,
+    held_out,
+)
 from hilstar.instruments.calibrate.geometric.geometry_fit import (
     calibrate_seen,
+    matched,
     nominal_of,
     rough_geometry,
     seen_screen_of,
 )
-from hilstar.instruments.calibrate.geometric.observed import Observed
+from hilstar.instruments.calibrate.geometric.match import first_look
+from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids
 from hilstar.instruments.calibrate.scale import StarReading, scale_of
 from hilstar.instruments.certify.readings import dot_settings
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
@@ -126,8 +135,11 @@ def test_dots_stand_where_the_tracker_sees_the_screen_and_the_fit_is_right(tmp_p
     seen = observed(first, real, rng)
     rough = rough_geometry(file, first, seen)
     assert rough.shows(first.x_px, first.y_px).mean() > 0.9
-    second = plan_seen_dots(rough, 16, lit_for(rough), rng)
+    second = plan_seen_dots(rough, 16, lit_for(rough), rng, beside=first)
     assert real.shows(second.x_px, second.y_px).mean() > 0.95
+    from_first_px = np.hypot(second.x_px[:, None] - first.x_px, second.y_px[:, None] - first.y_px)
+    # half the distance between dots is 11 monitor px here, and 0.6 of that is kept
+    assert from_first_px.min() > 5
     found = calibrate_seen(
         file,
         joined(first, second),
@@ -143,6 +155,30 @@ def test_dots_stand_where_the_tracker_sees_the_screen_and_the_fit_is_right(tmp_p
     assert np.sqrt((off_arcsec**2).mean()) < PLACES_SIGMAS * noise_arcsec * math.sqrt(
         2 * 13 / (2 * len(found.data))
     )
+
+
+def test_dots_at_one_place_are_held_out_together(tmp_path):
+    """What the detector's pixels do to a dot was in its twin, so that fields of degree 7 followed
+    it, and held-out dots said that they were right.
+    """
+    file, rng = large_screen(tmp_path), np.random.default_rng(0)
+    real = true_geometry(file, 0.0)
+    plan = joined(*(plan_seen_dots(real, frames, 18, rng) for frames in (8, 16)))
+    assert np.array_equal(plan.sites[:48], np.arange(48))
+    assert plan.sites.max() == 47
+    seen = observed(plan, real, rng)
+    nominal = nominal_of(file)
+    problem, data = matched(plan, nominal, seen, first_look(plan, nominal, seen, rng))
+    own_px = rng.normal(0, 2 * NOISE_PX, (2, 48))[:, problem.sites(data)]
+    centroids = data.centroids
+    moved = replace(centroids, x_px=centroids.x_px + own_px[0], y_px=centroids.y_px + own_px[1])
+    lens = Model(BROWN_CONRADY)
+    plain, field = (
+        held_out(problem, "", lens, degree, MatchedDots(moved, data.dot)) for degree in (0, 6)
+    )
+    assert len(plain.off_arcsec) == 48
+    # 56 numbers more, of 96: what they follow in one dot throws its neighbours off
+    assert field.rms_arcsec > 2 * plain.rms_arcsec
 
 
 @pytest.mark.parametrize("share", [0.02, 0.3, 3.0])
@@ -350,6 +386,62 @@ def test_a_figure_that_is_turned_by_any_angle_is_seen_with_its_turn(turn_deg):
     found = see_figure(image, figure, geometry)
     assert (found.way == UPRIGHT) == (abs(turn_deg) < 45)
     assert abs(found.whole_turn_deg - turn_deg) < 4 * found.turn_error_deg < 4.0
+
+
+def narrow_dot(shape, place_px):
+    """A noiseless dot about the middle of 21 x 21 pixels, by sixty points a side."""
+    along = ((np.arange(60) + 0.5) / 60 - 0.5) * shape.side_px
+    right, down = np.meshgrid(along, along)
+    turn = math.radians(shape.turn_deg)
+    points_x = math.cos(turn) * right - math.sin(turn) * down + place_px[0]
+    points_y = math.sin(turn) * right + math.cos(turn) * down + place_px[1]
+    edges = np.arange(22) - 10.5
+    in_columns, in_rows = (
+        np.diff(ndtr((edges - points.reshape(-1, 1)) / shape.psf_sigma_px), axis=1)
+        for points in (points_x, points_y)
+    )
+    return 30_000 * in_rows.T @ in_columns / right.size
+
+
+@pytest.mark.parametrize(
+    ("side_px", "turn_deg", "biased_px"),
+    [(0.8, 0.7, 0.01), (0.8, 40.0, 0.01), (2.0, 15.0, 0.003), (4.0, 3.0, 0.001)],
+)
+def test_the_place_of_a_dot_within_a_pixel_does_not_move_its_centroid(side_px, turn_deg, biased_px):
+    """Dots of 0.8 px behind a PSF of 0.37 px were 0.016 px off, where noise made 0.001."""
+    shape, rng = DotShape(0.37, side_px, turn_deg), np.random.default_rng(8)
+    settings = dot_centroids(math.hypot(0.37, side_px / math.sqrt(12)))
+    true_px = rng.uniform(-0.5, 0.5, (40, 2))
+    found = [
+        find_stars(narrow_dot(shape, place_px), settings, noisiest_background(np.zeros((64, 64))))
+        for place_px in true_px
+    ]
+    x_px, y_px = (
+        np.array([getattr(dot, name)[0] - 10 for dot in found]) for name in ("x_px", "y_px")
+    )
+    biased = np.abs(np.stack([x_px, y_px], axis=1) - true_px)
+    assert biased.max() > biased_px
+    mended = np.abs(np.stack(without_s_curve(x_px, y_px, shape, settings), axis=1) - true_px)
+    # 24 places and cubic steps between: 1e-4 of the bias; 16 points a side instead of 60: 1e-5 px
+    assert mended.max() < 2e-5
+
+
+def test_a_dot_is_turned_as_the_screen_is_seen(tmp_path):
+    real = true_geometry(large_screen(tmp_path), 37.0)
+    assert real.dot_shape.turn_deg == pytest.approx(real.turn_deg, abs=1.0)
+    assert real.dot_shape.side_px == pytest.approx(DOT_PX * real.tracker_px_a_monitor_px)
+
+
+def test_a_sharp_star_is_missed_only_where_its_second_pixel_was_bright_enough():
+    """Nine stars of 0.39 px "are not there": each had one pixel over the threshold, as a hot one."""
+    spot, rng = StarSpot((0.39, 0.39), 2.0, 0.0, 3.0), np.random.default_rng(9)
+    for _ in range(5):
+        x_px, y_px = 120 + rng.uniform(-0.5, 0.5, 2)
+        light = narrow_dot(DotShape(0.39, 1e-6, 0.0), (x_px - 120, y_px - 120))
+        second = np.sort(light.ravel())[-2] / light.sum()
+        assert spot.second_share(np.array([[x_px, y_px]]))[0] == pytest.approx(second, rel=1e-6)
+    middle = spot.second_share(np.array([[7.0, 7.0]]))[0]
+    assert middle < 0.2 * spot.peak_share
 
 
 def wide_star(spot, dn, noise_dn, rng):

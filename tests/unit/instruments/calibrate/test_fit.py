@@ -305,28 +305,23 @@ def ramp(codes, bits=8, curve=CURVES["gamma"], repeats=3, black=1e-3):
 STEPS = [0, 1, *range(5, 256, 10)]
 
 
-@pytest.mark.parametrize(
-    ("codes", "words"),
-    [
-        (STEPS[1:], "code 0 is not measured"),
-        (STEPS[:-1], "white, code 255 of 8 bits, is not measured"),
-        ([0, 10, 20, 40, 80, 160, 255], "7 distinct codes; measure 10 or more"),
-    ],
-)
-def test_levels_that_are_missing_are_named(codes, words, tmp_path):
-    assert words in fit_refusal(write(tmp_path / "m.csv", ramp(codes)))
+UNFIT = [
+    (ramp(STEPS[1:]), "code 0 is not measured"),
+    (ramp(STEPS[:-1]), "white, code 255 of 8 bits, is not measured"),
+    (ramp([0, 10, 20, 40, 80, 160, 255]), "7 distinct codes; measure 10 or more"),
+    (ramp(STEPS, curve=lambda s: min(s**2.2, 0.8)), "saturated or the link clips"),
+    (
+        [(c, n, min(round(4000 * (v / 0.85)), 4095)) for c, n, v in ramp(STEPS)],
+        "codes 245 to 255 read the same",
+    ),
+    # light that falls beyond the noise
+    ([(c, n, v * (0.7 if c == 125 else 1)) for c, n, v in ramp(STEPS)], "code 115 to code 125"),
+]
 
 
-def test_a_saturated_instrument_is_named(tmp_path):
-    clipped = ramp(STEPS, curve=lambda s: min(s**2.2, 0.8))
-    assert "saturated or the link clips" in fit_refusal(write(tmp_path / "m.csv", clipped))
-    at_limit = [(c, "w", min(round(4000 * (v / 0.85)), 4095)) for c, _, v in ramp(STEPS)]
-    assert "codes 245 to 255 read the same" in fit_refusal(write(tmp_path / "m.csv", at_limit))
-
-
-def test_light_that_falls_beyond_the_noise_is_named(tmp_path):
-    rows = [(c, n, v * (0.7 if c == 125 else 1)) for c, n, v in ramp(STEPS)]
-    assert "from code 115 to code 125" in fit_refusal(write(tmp_path / "m.csv", rows))
+@pytest.mark.parametrize(("rows", "words"), UNFIT, ids=[words for _, words in UNFIT])
+def test_readings_that_make_no_response_are_refused_with_their_cause(rows, words, tmp_path):
+    assert words in fit_refusal(write(tmp_path / "m.csv", rows))
 
 
 def test_a_drift_is_refused_and_noise_is_not_taken_for_one(tmp_path, rng):

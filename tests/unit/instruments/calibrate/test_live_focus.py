@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import json
-from contextlib import ExitStack, closing
+import socket
+import threading
+from contextlib import ExitStack, closing, contextmanager, suppress
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
-from hilstar.instruments.calibrate.live_focus import FocusCurve, focus_readings, sparkline
+from hilstar.instruments.calibrate.live_focus import focus_readings, follow_answers
+from hilstar.server.answers.star_widths import FocusCurve, sparkline
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.fake_clock import FakeClock
+from tests.support.senders import free_port
 
 RING_PX = (3.0, 2.0, 1.4, 1.0, 0.8, 1.1, 1.6)  # sigma of the PSF as the ring is turned
 BEST = 5  # the image of the sharpest
@@ -134,6 +141,122 @@ def test_the_command_without_images_says_what_to_give(benches, tmp_path):
     assert "give --grab CMD or a camera, or --virtual TRUTH.toml" in done.stderr
 
 
+@pytest.mark.parametrize(
+    ("words", "advice"),
+    [
+        (("calibrate", "focus", "BENCH", "--grab", "true {output}"), "{pattern} in --grab"),
+        (("first-light", "BENCH", "-o", "OUT", "--grab", "true {output}"), "{pattern} in --grab"),
+        (("serve", "BENCH", "--frames", "1"), "run with --headless"),
+    ],
+)
+def test_a_machine_without_a_display_is_told_what_the_command_can_do_without_one(
+    benches, tmp_path, monkeypatch, words, advice
+):
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    places = {"BENCH": tmp_path / "truth-1.0.toml", "OUT": tmp_path / "out"}
+    done = run_hilstar_here(*[places.get(word, word) for word in words])
+    assert done.returncode in {1, 3}  # 1: a step of first light that failed
+    assert "no display to open a window on; set DISPLAY, or " in done.stderr
+    assert advice in done.stderr
+    assert ("--headless" in done.stderr) == ("--headless" in advice)
+
+
+ANSWERS = '[answers]\nsource = "udp"\nbind = "127.0.0.1:PORT"\nclock = "host"\nformat = "json"\n'
+SKY = ("--radec", "84,-1,0", "--headless", "--feed", "tcp://127.0.0.1:*")
+
+
+@contextmanager
+def a_tracker_that_answers(port, star):
+    """Twenty answers a second of five stars like `star`, until the block ends."""
+    over = threading.Event()
+    answer = json.dumps({"t_ns": 1, "centroids": [star] * 5}).encode()
+
+    def send():
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+            while not over.wait(0.05):
+                with suppress(OSError):  # nobody hears it yet
+                    line.sendto(answer, ("127.0.0.1", port))
+
+    thread = threading.Thread(target=send)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
+
+
+@pytest.fixture
+def answering_bench(tmp_path):
+    """A bench file whose tracker answers to a free port, and that port."""
+    port = free_port()
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(TWIN) + ANSWERS.replace("PORT", str(port)))
+    return path, port
+
+
+@pytest.mark.e2e
+def test_the_command_measures_the_focus_by_answers_widths(answering_bench):
+    bench, port = answering_bench
+    with a_tracker_that_answers(port, [30.0, 40.0, 900.0, None, 1.75]):
+        words = ("--answers", *SKY, "--images", "2", "--json")
+        done = run_hilstar_here("calibrate", "focus", bench, *words)
+    assert done.returncode == 0, done.stderr
+    *figures, last = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [figure["number"] for figure in figures] == [1, 2]
+    assert last["best"]["figure"]["psf_sigma_px"] == 1.75
+    assert last["best"]["figure"]["dots"] % 5 == 0
+
+
+@pytest.mark.e2e
+def test_a_tracker_whose_answers_have_no_widths_is_refused_in_one_line(answering_bench):
+    bench, port = answering_bench
+    with a_tracker_that_answers(port, [30.0, 40.0, 900.0, 26311]):
+        done = run_hilstar_here("calibrate", "focus", bench, "--answers", *SKY)
+    assert done.returncode == 2
+    *before, line = done.stderr.splitlines()
+    assert [each.partition(" ")[0] for each in before] == ["frames:"]
+    assert "--answers: the tracker's answers report no widths of stars; give --grab CMD" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--answers", "--virtual", "t.toml"), "one of them"),
+        (("--answers",), "--radec RA,DEC,ROLL"),
+        (("--answers", "--radec", "84,-1,0", "--headless"), "add --feed"),
+        (("--answers", "--radec", "84,-1,0", "--exposure", "1"), "--exposure"),
+        (("--virtual", "t.toml", "--radec", "84,-1,0"), "are for --answers"),
+        (("--virtual", "t.toml", "--headless"), "--headless"),
+        (("--answers", "--radec", "84,-1,0"), "has no [answers]"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(benches, tmp_path, words, said):
+    bench = tmp_path / "truth-1.0.toml"
+    assert_refused(run_hilstar_here("calibrate", "focus", bench, *words), 2, said)
+
+
+def test_a_format_that_carries_no_stars_is_refused(tmp_path):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text(TWIN) + ANSWERS.replace("PORT", "9").replace('"json"', '"packet"'))
+    done = run_hilstar_here("calibrate", "focus", bench, "--answers", *SKY)
+    assert_refused(done, 2, 'format = "packet" carries no stars', "--grab CMD")
+
+
+def test_silence_ends_after_a_while_and_says_whose():
+    clock = FakeClock()
+    source = SimpleNamespace(take=list, trouble=lambda: "", unread="the reader starts again")
+
+    def hold(done):
+        while not done():
+            clock.work(1e9)
+
+    with pytest.raises(InputError, match="no answer in 30 s: the reader starts again"):
+        follow_answers(source, hold, lambda reading: True, lambda: False, clock)
+
+
 def test_a_curve_is_as_high_as_its_values():
     assert sparkline([3.0, 2.0, 1.0, 2.0, 3.0], 0.1) == "█▅▁▅█"
     assert sparkline([1.0, 1.01], 0.1) == "▁▂"
+    assert sparkline([1.5, 1.5], 0.0) == "▁▁"

@@ -24,6 +24,7 @@ from hilstar.basics.rotation import (
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.reference import (
     FACES,
+    Reading,
     fit_reference,
     pointing,
     read_readings,
@@ -54,13 +55,13 @@ def angles_deg(direction: FloatArray) -> tuple[float, float]:
     return azimuth, math.degrees(math.asin(-direction[2]))
 
 
-def planted_cube_readings(
+def planted_cube(
     rng: np.random.Generator,
     noise_arcsec: float = NOISE_ARCSEC,
     stations: bool = True,
     repeats: int = 3,
     sigma: bool = False,
-) -> tuple[str, FloatArray]:
+) -> tuple[list[Reading], FloatArray]:
     """The readings of a display and a cube that stand by chance, and the rotation between them."""
     # mon looks along the horizon, and the cube is levelled to some degrees
     level = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
@@ -68,29 +69,47 @@ def planted_cube_readings(
     cube = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
     from_cube = random_rotation(rng, 0.05) @ cube
     zero_deg = float(rng.uniform(-180, 180)) if stations else 0.0
-    rows = []
+    readings: list[Reading] = []
 
-    def add(target: str, direction: FloatArray, station: str, more: str = ",,") -> None:
+    def add(
+        target: str, direction: FloatArray, station: str, known: FloatArray | None = None
+    ) -> None:
         for _ in range(repeats):
             azimuth, elevation = angles_deg(direction)
             azimuth -= zero_deg if station == "B" else 0.0
             azimuth += rng.normal() * noise_arcsec / 3600 / math.cos(math.radians(elevation))
             elevation += rng.normal() * noise_arcsec / 3600
-            stated = f"{noise_arcsec:g}" if sigma else ""
-            rows.append(f"{target},{azimuth:.9f},{elevation:.9f},{station},{stated},{more}")
+            stated = noise_arcsec if sigma else None
+            angles = math.radians(azimuth), math.radians(elevation)
+            line = len(readings) + 2
+            readings.append(Reading(line, target, station, *angles, stated, known))
 
     for dot in DOTS:
-        add("dot", from_mon @ np.array(dot) / np.linalg.norm(dot), "A", ",".join(map(str, dot)))
+        unit = np.array(dot) / np.linalg.norm(dot)
+        add("dot", from_mon @ unit, "A", unit)
     second = "B" if stations else "A"
     for face in ("+x", "-y"):
-        add(face, -from_cube @ FACES[face], second)
+        add(face, -from_cube @ FACES[face], second, -FACES[face])
     if stations:
         for link in (pointing(0.3, 0.02), pointing(2.0, -0.1)):
             name = f"link {link[0]:.1f}"
             add(name, link, "A")
             add(name, link, "B")
-    head = "target,azimuth_deg,elevation_deg,station,sigma_arcsec,mon_x,mon_y,mon_z"
-    return "\n".join([head, *rows]) + "\n", from_matrix(from_cube.T @ from_mon)
+    return readings, from_matrix(from_cube.T @ from_mon)
+
+
+def planted_cube_readings(rng: np.random.Generator, *settings: Any) -> tuple[str, FloatArray]:
+    """The table of a `planted_cube`, and its rotation."""
+    readings, true = planted_cube(rng, *settings)
+    rows = ["target,azimuth_deg,elevation_deg,station,sigma_arcsec,mon_x,mon_y,mon_z"]
+    for each in readings:
+        angles = f"{math.degrees(each.azimuth_rad):.9f},{math.degrees(each.elevation_rad):.9f}"
+        stated = "" if each.sigma_arcsec is None else f"{each.sigma_arcsec:g}"
+        place = ",,"
+        if each.target == "dot" and each.direction is not None:
+            place = ",".join(map(repr, each.direction.tolist()))
+        rows.append(f"{each.target},{angles},{each.station},{stated},{place}")
+    return "\n".join(rows) + "\n", true
 
 
 def fitted_reference(folder: Path, text: str) -> Any:
@@ -114,16 +133,14 @@ def test_a_rotation_is_found_exactly_without_noise(
 
 
 @pytest.mark.parametrize("sigma", [False, True])
-def test_the_intervals_of_1000_benches_hold(
-    tmp_path: Path, sigma: bool, rng: np.random.Generator
-) -> None:
+def test_the_intervals_of_1000_benches_hold(sigma: bool, rng: np.random.Generator) -> None:
     from scipy import stats
 
     held = np.zeros(3)
     small = []
     for _ in range(BENCHES):
-        text, true = planted_cube_readings(rng, stations=True, sigma=sigma)
-        found = fitted_reference(tmp_path, text)
+        readings, true = planted_cube(rng, sigma=sigma)
+        found = fit_reference(Path("readings.csv"), readings)
         k = 1.96 if found.dof is None else float(stats.t.ppf(0.975, found.dof))
         off = np.abs(axis_errors_arcsec(found.q_mon_to_reference, true))
         held += off <= k * np.array(found.sigma_arcsec)
@@ -136,7 +153,7 @@ def test_the_intervals_of_1000_benches_hold(
 def test_scatter_that_contradicts_the_stated_sigmas_counts(
     tmp_path: Path, rng: np.random.Generator
 ) -> None:
-    text, _ = planted_cube_readings(rng, 10.0, sigma=True)
+    text, _ = planted_cube_readings(rng, 10.0, True, 3, True)
     found = fitted_reference(tmp_path, text.replace(",10,", ",1,"))
     assert found.dof is not None and max(found.sigma_arcsec) > 3.0
 

@@ -4,12 +4,16 @@ not accused, and plans that are wrong are refused.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.instruments.campaign.acceptance_plan import CaseSet, plan_path, read_acceptance_plan
+from hilstar.instruments.campaign.acceptance_verdicts import ClauseVerdict
 from hilstar.instruments.campaign.plan import PlantedFaults
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from tests.support.acceptance import accepted, write_bench
@@ -63,6 +67,12 @@ SETS = {
         'values = ["1906-01-01T00:00:00", "1946-04-01T00:00:00", "2006-07-01T00:00:00",'
         ' "2046-10-01T00:00:00"]\n'
     ),
+    "parallax": (
+        '[cases.parallax]\ncases = 80\nframes = 2\n[[cases.parallax.vary]]\nkey = "sky.epoch_utc"\n'
+        'values = ["2026-01-01T00:00:00", "2026-04-01T00:00:00", "2026-07-01T00:00:00",'
+        ' "2026-10-01T00:00:00"]\n[[cases.parallax.vary]]\nkey = "spacecraft.orbit"\n'
+        'values = ["geocentre"]\n'
+    ),
     "earth": (
         '[cases.earth]\ncases = 16\n[cases.earth.attitudes]\nkind = "body"\nbody = "earth"\n'
         '[cases.earth.sweep]\nkey = "limb_deg"\nstart = 45.0\nstop = -30.0\n'
@@ -76,28 +86,31 @@ SETS = {
         'key = "tracker.detector.false_stars"\nstart = 1\nstop = 200\nscale = "log"\nwhole = true\n'
     ),
 }
+STAMPS = "stamp_bias_s = 0.02\nstamp_jitter_s = 0.02"
 # quantity (and axis, or the sweep): its cases, what is planted, its size, and the limit's side
 FAULTS: dict[str, tuple[str, str, float, str]] = {
-    "bias x": ("field", "bias_arcsec = [40.0, 0.0, 0.0]", 40.0, "maximum"),
-    "bias roll": ("field", "bias_arcsec = [0.0, 0.0, 300.0]", 300.0, "maximum"),
-    "nea cross": ("field", "noise_arcsec = [20.0, 20.0, 0.0]", 20.0, "maximum"),
-    "nea roll": ("field", "noise_arcsec = [0.0, 0.0, 100.0]", 100.0, "maximum"),
+    "bias x": ("field", "bias_arcsec = [40.0, 0.0, 300.0]", 40.0, "maximum"),
+    "bias roll": ("field", "bias_arcsec = [40.0, 0.0, 300.0]", 300.0, "maximum"),
+    "nea cross": ("field", "noise_arcsec = [20.0, 20.0, 100.0]", 20.0, "maximum"),
+    "nea roll": ("field", "noise_arcsec = [20.0, 20.0, 100.0]", 100.0, "maximum"),
     "availability": ("lost", "missing = 0.3", 0.7, "minimum"),
     "no-attitude": ("lost", "missing = 0.3", 0.3, "maximum"),
     "false-attitude": ("lost", "wrong = 0.3", 0.3, "maximum"),
     "wrong-rate": ("lost", "wrong = 0.3", 0.3, "maximum"),
     "time-to-first-attitude": ("lost", "acquisition_s = 0.5", 0.7, "maximum"),
     "recovery": ("recovery", "recovery_s = 0.5", 0.6, "maximum"),
-    "rate-bias x": ("slews", "rate_bias_deg_s = [0.02, 0.0, 0.0]", 0.02, "maximum"),
-    "rate-bias roll": ("slews", "rate_bias_deg_s = [0.0, 0.0, 0.1]", 0.1, "maximum"),
+    "rate-bias x": ("slews", "rate_bias_deg_s = [0.02, 0.0, 0.1]", 0.02, "maximum"),
+    "rate-bias roll": ("slews", "rate_bias_deg_s = [0.02, 0.0, 0.1]", 0.1, "maximum"),
     "rate-noise cross": ("slews", "rate_noise_deg_s = [0.05, 0.05, 0.05]", 0.05, "maximum"),
     "rate-scale cross": ("slews", "rate_scale = 0.05", 0.05, "maximum"),
     "rate-lag cross": ("slews", "rate_lag_s = 0.4", 0.5, "maximum"),
-    "time-bias": ("slews", "stamp_bias_s = 0.02", 0.02, "maximum"),
-    "time-jitter": ("slews", "stamp_jitter_s = 0.02", 0.02, "maximum"),
+    "time-bias": ("slews", STAMPS, 0.02, "maximum"),
+    "time-jitter": ("slews", STAMPS, 0.02, "maximum"),
     "aberration": ("aberration", "aberration = 1.0", 1.0, "maximum"),
     "proper-motion": ("dates", "proper_motion = 1.0", 1.0, "maximum"),
     "catalogue-age": ("dates", "catalogue_age_yr = 100.0", 100.0, "maximum"),
+    # a whole parallax is under the noise of so few cases
+    "parallax": ("parallax", "parallax = 100.0", 100.0, "maximum"),
     "star-noise": ("stars", "star_noise_px = 0.3", 0.3, "maximum"),
     "star-fov-error": ("stars", "star_fov_px = 0.3", 0.3, "maximum"),
     "star-colour": ("stars", "star_colour = 0.1", 0.1, "maximum"),
@@ -126,20 +139,44 @@ def clause_text(key: str, limit: float, of: str, side: str) -> str:
 
 def plan_of(key: str, factor: float, planted: str = "") -> str:
     """A plan of one clause, whose limit is `factor` times what is planted for it."""
+    table = f"[planted]\n{planted}\n" if planted else ""
+    return f"{table}{SETS[FAULTS[key][0]]}{clause_by(key, factor)}"
+
+
+def clause_by(key: str, factor: float) -> str:
     of, _, size, side = FAULTS[key]
     limit = size * factor
     if key == "availability":
         limit = min(limit, 0.95)
-    table = f"[planted]\n{planted}\n" if planted else ""
-    return f"{table}{SETS[of]}{clause_text(key, limit, of, side)}"
+    return clause_text(key, limit, of, side)
+
+
+@pytest.fixture(scope="module")
+def planted_verdicts(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Any]:
+    """The verdicts on the cases of a set with a planted fault: all clauses that find it judge one
+    run.
+    """
+
+    @functools.cache
+    def verdicts(of: str, planted: str) -> dict[str, ClauseVerdict]:
+        folder = tmp_path_factory.mktemp("planted")
+        (folder / "dark.toml").write_text(SCENARIO)
+        text = f"[planted]\n{planted}\n{SETS[of]}"
+        for key, (its_set, its_fault, _, side) in FAULTS.items():
+            if (its_set, its_fault) == (of, planted):
+                text += clause_by(key, 1.4 if side == "minimum" else 0.6)
+        return accepted(folder, text)
+
+    return verdicts
 
 
 @pytest.mark.parametrize("key", FAULTS)
-def test_a_planted_fault_is_found_by_its_clause(tmp_path: Path, key: str) -> None:
-    (tmp_path / "dark.toml").write_text(SCENARIO)
-    _, planted, size, side = FAULTS[key]
-    factor = 1.4 if side == "minimum" else 0.6
-    (found,) = accepted(tmp_path, plan_of(key, factor, planted)).values()
+def test_a_planted_fault_is_found_by_its_clause(
+    planted_verdicts: Callable[..., Any], key: str
+) -> None:
+    of, planted, size, _ = FAULTS[key]
+    verdicts = planted_verdicts(of, planted)
+    found = verdicts[key if key in verdicts else of]  # an edge is told by its set
     verdict = found.verdict
     assert verdict is not None, found.untested
     assert verdict.value is not None
@@ -273,6 +310,32 @@ def test_an_acceptance_goes_on_where_it_was_and_is_judged_again(tmp_path: Path) 
     found = accepted(tmp_path, text.replace("minimum = 0.9", "maximum = 0.5") + more)
     assert table.stat().st_mtime_ns == made_ns
     assert found["availability"].word == NOT_MET and found["aberration"].word == MET
+
+
+def test_an_uncorrected_aberration_is_no_parallax(tmp_path: Path) -> None:
+    """It turns with the seasons, too: a thousand times as far as a field's parallax."""
+    text = plan_of("parallax", 1.0, "aberration = 1.0")
+    found = accepted(tmp_path, text)["parallax"].verdict
+    assert found is not None and found.value is not None and found.high is not None
+    sigma = (found.high - found.value) / ONE_SIDED
+    assert found.value <= SIGMAS * sigma and sigma < 30.0
+
+
+def test_one_clause_of_many_that_is_barely_not_met_may_be_chance(tmp_path: Path) -> None:
+    def judged(limit: float, others: int) -> ClauseVerdict:
+        text = f"[planted]\nmissing = 0.3\n{SETS['lost']}"
+        text += clause_text("no-attitude", limit, "lost", "maximum")
+        for k in range(others):
+            text += clause_text("availability", 0.1 + k / 1000, "lost", "minimum")
+        return accepted(tmp_path, text)["no-attitude"]
+
+    sure = judged(0.1, 40)
+    assert (sure.word, sure.together) == (NOT_MET, NOT_MET)
+    assert sure.verdict is not None and sure.verdict.low is not None
+    barely = 0.99 * sure.verdict.low
+    alone, of_many = judged(barely, 0), judged(barely, 40)
+    assert (alone.word, alone.together) == (NOT_MET, NOT_MET)
+    assert (of_many.word, of_many.together) == (NOT_MET, NOT_SHOWN)
 
 
 def test_a_plan_with_other_cases_does_not_go_on(tmp_path: Path) -> None:

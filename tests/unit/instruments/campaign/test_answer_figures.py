@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.assess.places import Scale
@@ -20,6 +21,7 @@ from hilstar.instruments.campaign.cases import (
     FRAME_RATES,
     STAR_LISTS,
 )
+from hilstar.instruments.campaign.figures import lowest_size
 from hilstar.instruments.campaign.plan import Require
 from hilstar.instruments.campaign.planted import aberration_rad
 from hilstar.instruments.campaign.requirements import (
@@ -39,6 +41,10 @@ SHARE, SIGMAS = 0.1, 3.0
 COVERED, TRIES = 0.95, 200
 # binomial: of 200 intervals at 95 % each way, 180 and fewer hold once in 1000
 MIN_HELD = 180
+# binomial: of 1000 intervals at 95 %, 927 and fewer hold once in 1000
+HEAVY_TRIES, MIN_HEAVY_HELD = 1000, 928
+# three sigmas of a binomial count
+SIZE_TRIES, SIZE_BAND = 4000, 42
 # binomial: of 800 tries at 5 %, over 59 are met once in 1000
 JITTER_TRIES, MAX_JITTER_MET = 800, 59
 
@@ -150,6 +156,31 @@ def test_one_value_a_case_has_the_covariance_of_a_mean(rng: np.random.Generator)
     fit = fit_by_cases(np.ones((6, 1)), values, np.arange(6))
     assert fit.value == pytest.approx([values.mean()])
     assert fit.covariance[0, 0] == pytest.approx(values.var(ddof=1) / 6)
+    assert fit.freedom == pytest.approx([5.0])
+
+
+def test_the_size_of_nothing_is_shown_in_one_of_twenty(rng: np.random.Generator) -> None:
+    """A figure of 0 may be seen with either sign, and counts as shown by its size."""
+    seen = np.abs(rng.standard_normal(SIZE_TRIES))
+    shown = sum(lowest_size(size, 1.0, math.inf, 0.05) > 0 for size in seen.tolist())
+    assert abs(shown - 0.05 * SIZE_TRIES) <= SIZE_BAND
+    # far from 0 the other sign does not count: the limit is the one-sided one
+    assert lowest_size(10.0, 1.0, 20.0, 0.05) == pytest.approx(10 - stats.t.ppf(0.95, 20))
+
+
+def test_limits_hold_where_a_few_cases_weigh_most(rng: np.random.Generator) -> None:
+    """24 cases of two rows whose errors go together, by a column that is large in a few of them, as
+    the turn by parallax is.
+    """
+    held = 0
+    case = np.repeat(np.arange(24), 2)
+    for _ in range(HEAVY_TRIES):
+        column = rng.lognormal(0.0, 1.5, 24)[case] * rng.choice([-1, 1], 24)[case]
+        errors = rng.normal(size=24)[case] + 0.5 * rng.normal(size=48)
+        fit = fit_by_cases(np.stack([np.ones(48), column], axis=1), errors + 3 * column, case)
+        sigma = math.sqrt(fit.covariance[1, 1])
+        held += fit.value[1] - 3 <= stats.t.ppf(COVERED, fit.freedom[1]) * sigma
+    assert held >= MIN_HEAVY_HELD
 
 
 def test_a_late_stamp_and_a_slow_gyroscope_are_found_in_seconds(

@@ -14,7 +14,6 @@ from astropy.io import fits
 from astropy.time import Time
 from scipy.spatial.transform import Rotation
 
-from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.instruments.campaign.cases import CaseMaker
 from hilstar.instruments.campaign.job import Job, files_sha256
@@ -27,7 +26,6 @@ from hilstar.sky.bodies.shapes import EQUATOR_KM
 from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
 from tests.support.commands import run_hilstar_here
-from tests.support.refusals import refusal
 
 
 def cases_session(folder: Path, images: bool = False) -> Session:
@@ -254,19 +252,6 @@ def test_a_case_beside_the_earth_looks_at_its_angle_from_the_limb(
         off = np.arccos(-boresight @ place_km / np.linalg.norm(place_km))
         # the aberration by the orbit's velocity: 5 arcsec
         assert np.degrees(off) == pytest.approx(wanted_deg, abs=0.003)
-
-
-def test_a_body_has_an_angle_from_its_middle_or_from_its_limb(tmp_path: Path) -> None:
-    plan = write_campaign(
-        tmp_path, {"key": "body_deg", "values": [30.0]}, {"key": "limb_deg", "values": [30.0]}
-    )
-    with pytest.raises(InputError, match="are one angle"):
-        parse_plan(plan, plan.read_text())
-
-
-def test_a_body_that_the_bench_has_not_is_refused(tmp_path: Path) -> None:
-    assert "bench has none" in refusal(bodied, tmp_path, body="moon")
-    assert "go together" in refusal(bodied, tmp_path, body=None)
 
 
 def test_a_case_that_speeds_up_turns_as_its_rate_says(tmp_path: Path) -> None:

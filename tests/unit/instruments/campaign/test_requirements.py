@@ -5,7 +5,6 @@ at their stated confidence.
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +17,7 @@ from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import looking_q
 from hilstar.instruments.campaign.figures import BoundedFigure
-from hilstar.instruments.campaign.plan import Attitudes, Require, parse_plan
+from hilstar.instruments.campaign.plan import Attitudes, Require
 from hilstar.instruments.campaign.requirements import (
     MET,
     NOT_MET,
@@ -226,27 +225,6 @@ def test_a_condition_chooses_cases(rng: np.random.Generator) -> None:
         InputError, match=r"nonsense is no key that the plan varies \(rate_deg_s.across\)"
     ):
         requirement_verdict(cases, quantity="availability", minimum=0.9, condition="nonsense <= 1")
-
-
-@pytest.mark.parametrize(
-    ("keys", "words"),
-    [
-        ('quantity = "noise"', "either maximum or minimum"),
-        ('quantity = "noise"\nmaximum = 1\nminimum = 0', "either maximum or minimum"),
-        ('quantity = "speed"\nmaximum = 1', "speed"),
-        ('quantity = "availability"\nminimum = 95', "a share from 0 to 1"),
-        ('quantity = "availability"\nminimum = 0.9\naxis = "x"', "has no axis"),
-        ('quantity = "bias"\nmaximum = 3\nshare = 0.9', "leave share out"),
-        (
-            'quantity = "noise"\nmaximum = 3\ncondition = "fast"',
-            'write such as "rate_deg_s.across <= 0.5"',
-        ),
-        ('quantity = "noise"\nmaximum = 3\nconfidence = 95', "confidence"),
-    ],
-)
-def test_a_requirement_that_cannot_be_is_refused(keys: str, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        parse_plan(Path("plan.toml"), f'bench = "b.toml"\ncases = 9\n[[require]]\n{keys}\n')
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ SHARE_OF_BIAS = 0.1  # 2000 cases tell a sigma to 2 %; the growth along `a` make
 
 
 @pytest.fixture
-def table(tmp_path: Path, rng: np.random.Generator) -> Path:
+def cases_table(tmp_path: Path, rng: np.random.Generator) -> Path:
     """A table of cases with a bias, noise that grows with `a` and not with `b` or `word`, and
     forty wild answers.
     """
@@ -64,9 +64,9 @@ def table(tmp_path: Path, rng: np.random.Generator) -> Path:
     return tmp_path / "cases.parquet"
 
 
-def test_a_planted_budget_and_what_a_parameter_costs_are_found(table: Path) -> None:
+def test_a_planted_budget_and_what_a_parameter_costs_are_found(cases_table: Path) -> None:
     found = write_results(
-        table, read_bench_file(write_campaign(table.parent).parent / "bench.toml"), 1
+        cases_table, read_bench_file(write_campaign(cases_table.parent).parent / "bench.toml"), 1
     )
     # of its own stars, whatever was planted
     assert 0 < found["limit_arcsec"].cross < 1 < found["limit_arcsec"].roll < 100
@@ -78,20 +78,24 @@ def test_a_planted_budget_and_what_a_parameter_costs_are_found(table: Path) -> N
     assert found["wrong"] == CASES // 50 and found["availability"] == pytest.approx(0.98)
     assert any("too far apart" in note for note in found["notes"])  # of an all-sky plan
     assert "a costs the most of the error across" in found["findings"][0]
-    each = {cost.parameter: cost for cost in costs(read_cases(table)) if cost.measure == "roll"}
+    each = {
+        cost.parameter: cost for cost in costs(read_cases(cases_table)) if cost.measure == "roll"
+    }
     assert each["a"].sure and not each["b"].sure and not each["word"].sure
     assert each["a"].places[each["a"].worst] > 0.8
     assert each["a"].share > 3 * max(each["b"].share, each["word"].share)
-    header, *lines = (table.parent / "budget.csv").read_text().splitlines()
+    header, *lines = (cases_table.parent / "budget.csv").read_text().splitlines()
     assert header == "quantity,axis,value,unit,low_95,high_95" and lines[0].startswith("bias,x,")
-    assert len((table.parent / "sensitivity.csv").read_text().splitlines()) == 1 + 3 * 3
-    with Image.open(table.parent / "sensitivity_cross.png") as picture:
+    assert len((cases_table.parent / "sensitivity.csv").read_text().splitlines()) == 1 + 3 * 3
+    with Image.open(cases_table.parent / "sensitivity_cross.png") as picture:
         assert picture.width > 500 and len(picture.convert("L").getcolors() or range(300)) > 10
 
 
-def test_the_page_has_the_verdict_and_the_cost_of_each_parameter(table: Path) -> None:
-    write_results(table, read_bench_file(write_campaign(table.parent).parent / "bench.toml"), 1)
-    text = (table.parent / "campaign.html").read_text()
+def test_the_page_has_the_verdict_and_the_cost_of_each_parameter(cases_table: Path) -> None:
+    write_results(
+        cases_table, read_bench_file(write_campaign(cases_table.parent).parent / "bench.toml"), 1
+    )
+    text = (cases_table.parent / "campaign.html").read_text()
     assert 'data-state="bad"><div><strong>The tracker was right in 98 % of the frames' in text
     figures = re.findall('<p class="number" data-state=".*?">(.*?)<small>(.*?)</small>', text)
     assert ("40", "wrong answers") in figures

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
-from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.basics.units import ARCSEC_PER_RAD, KM_PER_AU
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.star_motion import BRIGHTEST, StarMotion, turn_of
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.star_light import bench_moving
 from tests.support.acceptance import write_bench
+from tests.support.claims import holds
 
+OBSERVER = {
+    "sky": {"epoch_utc": "2026-04-01T00:00:00Z"},
+    "spacecraft": {"orbit": "geocentre"},
+}
+FIELDS = 300
+NEAR_EDGE = 0.1  # share that uneven parallaxes lose to a turn about the boresight
 SCALE = Scale(1538.0, (256, 256))
 YEARS = 100.0
 
@@ -51,3 +62,33 @@ def test_a_field_with_a_fast_star_has_no_likely_turn(motion: StarMotion) -> None
     q = from_radec_roll_deg(316.7, 38.7, 0.0)
     assert np.isnan(motion.likely_turn_rad(q, SCALE)).all()
     assert np.isfinite(motion.whole_turn_rad(q, SCALE)).all()
+
+
+def test_a_field_turns_by_the_mean_parallax_of_its_stars(
+    tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """The stars of a field go together, against the observer's place: by their mean parallax times
+    its part across the boresight, AU, by a formula of its own.
+    """
+    file = read_bench_file(write_bench(tmp_path, **OBSERVER))
+    moving = bench_moving(file.config, file.folder)
+    assert moving is not None
+    motion = StarMotion.of(file).by_parallax(moving)
+    place_au = moving.sight(0).view.place_km / KM_PER_AU
+    turns_arcsec, means_arcsec = [], []
+    for _ in range(FIELDS):
+        q = Rotation.random(random_state=rng).as_quat(scalar_first=True)
+        turn = ARCSEC_PER_RAD * motion.likely_turn_rad(q, SCALE)
+        if not np.isfinite(turn).all():
+            continue
+        rows = motion.in_field(q, SCALE)[:BRIGHTEST]
+        mean_arcsec = np.maximum(motion.parallax_mas[rows], 0.0).mean() / 1000
+        across = (to_matrix(q) @ place_au)[:2]
+        means_arcsec.append(mean_arcsec * np.array([across[1], -across[0]]))
+        turns_arcsec.append(turn[:2])
+    assert len(turns_arcsec) > 0.9 * FIELDS
+    turns, means = np.array(turns_arcsec), np.array(means_arcsec)
+    # one for one, but for near stars at an edge of the field, which the turn takes for a roll in part
+    assert (turns * means).sum() / (means**2).sum() == pytest.approx(1.0, abs=NEAR_EDGE)
+    assert np.corrcoef(turns.ravel(), means.ravel())[0, 1] > 1 - NEAR_EDGE
+    holds("parallax-turn", math.sqrt((turns**2).sum(axis=1).mean()))

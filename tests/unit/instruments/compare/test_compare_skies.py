@@ -91,17 +91,17 @@ def benches(tmp_path_factory):
 
 
 @pytest.fixture
-def field(benches):
+def scene(benches):
     return Field(benches["default"])
 
 
-def test_an_unchanged_frame_is_the_same_sky(field):
-    comparison = assert_same_sky(field.frame(), field.golden)
+def test_an_unchanged_frame_is_the_same_sky(scene):
+    comparison = assert_same_sky(scene.frame(), scene.golden)
     summary = comparison.summary()
     assert summary["same"] and summary["missing"] == summary["extra"] == 0
     assert summary["flux_error_mag"]["max"] == summary["centroid_error_px"]["max"] == 0
     blended = sum(len(star.hip) - 1 for star in comparison.stars)
-    assert summary["stars"] + blended + summary["unmeasured"] == len(field.golden.truth)
+    assert summary["stars"] + blended + summary["unmeasured"] == len(scene.golden.truth)
 
 
 @pytest.mark.parametrize("sky", SKIES)
@@ -111,12 +111,12 @@ def test_another_driver_s_rounding_passes(benches, sky, ra_dec):
     with 680 stars in 320 x 240.
     """
     bench = benches[sky]
-    field = Field(bench, from_radec_roll_deg(*ra_dec, 0.0))
-    oracle = linear_image(field.sprites, bench.camera.resolution_px, bench.psf)
+    scene = Field(bench, from_radec_roll_deg(*ra_dec, 0.0))
+    oracle = linear_image(scene.sprites, bench.camera.resolution_px, bench.psf)
     for one, other in (
-        (field.golden, oracle),
-        (oracle, field.golden),
-        (field.golden.linear, oracle),
+        (scene.golden, oracle),
+        (oracle, scene.golden),
+        (scene.golden.linear, oracle),
     ):
         stars = assert_same_sky(one, other).stars
         assert np.mean([abs(star.flux_error_mag) < DRIVER_MAG for star in stars]) > DRIVER_SHARE
@@ -126,12 +126,12 @@ def test_another_driver_s_rounding_passes(benches, sky, ra_dec):
 
 
 @pytest.mark.parametrize("which", [0, 1, -1], ids=["faintest", "second faintest", "brightest"])
-def test_one_star_shifted_by_a_fiftieth_of_a_pixel_is_named(field, which):
-    k = field.inside()[which]
-    field.x_px[k] += 0.6 * FAULT_PX
-    field.y_px[k] -= 0.8 * FAULT_PX
-    (star,) = field.bad()
-    assert star.kind == "changed" and star.hip == (field.hip[k],)
+def test_one_star_shifted_by_a_fiftieth_of_a_pixel_is_named(scene, which):
+    k = scene.inside()[which]
+    scene.x_px[k] += 0.6 * FAULT_PX
+    scene.y_px[k] -= 0.8 * FAULT_PX
+    (star,) = scene.bad()
+    assert star.kind == "changed" and star.hip == (scene.hip[k],)
     assert (star.dx_px, star.dy_px) == pytest.approx(
         (0.6 * FAULT_PX, -0.8 * FAULT_PX), abs=MEASURED_PX
     )
@@ -139,59 +139,59 @@ def test_one_star_shifted_by_a_fiftieth_of_a_pixel_is_named(field, which):
 
 
 @pytest.mark.parametrize("which", [0, -1], ids=["faintest", "brightest"])
-def test_one_star_dimmed_by_a_hundredth_of_a_magnitude_is_named(field, which):
-    k = field.inside()[which]
-    field.flux[k] *= 10 ** (-0.4 * FAULT_MAG)
-    (star,) = field.bad()
-    assert star.kind == "changed" and star.hip == (field.hip[k],)
+def test_one_star_dimmed_by_a_hundredth_of_a_magnitude_is_named(scene, which):
+    k = scene.inside()[which]
+    scene.flux[k] *= 10 ** (-0.4 * FAULT_MAG)
+    (star,) = scene.bad()
+    assert star.kind == "changed" and star.hip == (scene.hip[k],)
     assert star.flux_error_mag == pytest.approx(FAULT_MAG, abs=MEASURED_MAG)
     assert star.centroid_error_px == pytest.approx(0, abs=MEASURED_PX)
 
 
-def test_a_star_gone_a_star_too_many_and_a_star_moved_are_told_apart(field):
-    gone, moved, far = field.inside()[:3]
-    field.flux[gone] = 0
-    field.x_px[moved] += 1.5
-    field.y_px[far] += 9
-    frame = field.frame()
+def test_a_star_gone_a_star_too_many_and_a_star_moved_are_told_apart(scene):
+    gone, moved, far = scene.inside()[:3]
+    scene.flux[gone] = 0
+    scene.x_px[moved] += 1.5
+    scene.y_px[far] += 9
+    frame = scene.frame()
     with pytest.raises(AssertionError) as failure:
-        assert_same_sky(frame, field.golden)
+        assert_same_sky(frame, scene.golden)
     lines = str(failure.value).splitlines()
     assert "Not the same sky" in lines[0] and "1 changed, 2 missing, 1 extra" in lines[0]
     assert len(lines) == 5
     for k in (gone, far):
         assert any(
-            line.startswith(f"HIP {field.hip[k]} at") and "missing" in line for line in lines[1:]
+            line.startswith(f"HIP {scene.hip[k]} at") and "missing" in line for line in lines[1:]
         )
-    assert f"star at ({field.x_px[far]:.1f}, {field.y_px[far]:.1f}): extra" in str(failure.value)
+    assert f"star at ({scene.x_px[far]:.1f}, {scene.y_px[far]:.1f}): extra" in str(failure.value)
     assert (
-        f"HIP {field.hip[moved]} at" in lines[4] and "1.5000 px (+1.5000, +0.0000) off" in lines[4]
+        f"HIP {scene.hip[moved]} at" in lines[4] and "1.5000 px (+1.5000, +0.0000) off" in lines[4]
     )
 
 
-def test_the_frame_s_own_table_names_a_star_that_the_golden_frame_lacks(field):
-    k = field.inside()[5]
-    frame = field.frame()
-    field.flux[k] = 0
-    golden = field.frame()
+def test_the_frame_s_own_table_names_a_star_that_the_golden_frame_lacks(scene):
+    k = scene.inside()[5]
+    frame = scene.frame()
+    scene.flux[k] = 0
+    golden = scene.frame()
     (star,) = compare(frame, golden.linear).bad
-    assert star.kind == "extra" and star.hip == (field.hip[k],)
+    assert star.kind == "extra" and star.hip == (scene.hip[k],)
     assert star.flux_e_per_s == pytest.approx(
-        frame.truth["electrons_per_s"][frame.truth["hip"] == field.hip[k]][0], rel=1e-3
+        frame.truth["electrons_per_s"][frame.truth["hip"] == scene.hip[k]][0], rel=1e-3
     )
 
 
-def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_is_named(field):
+def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_is_named(scene):
     """Also by more than any star is wide, where every star is missing from its place and extra
     in another.
     """
-    odd = field.inside()[-1]
+    odd = scene.inside()[-1]
     for right, down in ((-0.75, 0.0), (0.31, -0.02), (11.3, -4.6)):
-        field.x_px, field.y_px = field.x_px + right, field.y_px + down
-        field.flux[odd] *= 0.9
-        found = compare(field.frame(), field.golden)
-        field.x_px, field.y_px = field.x_px - right, field.y_px - down
-        field.flux[odd] /= 0.9
+        scene.x_px, scene.y_px = scene.x_px + right, scene.y_px + down
+        scene.flux[odd] *= 0.9
+        found = compare(scene.frame(), scene.golden)
+        scene.x_px, scene.y_px = scene.x_px - right, scene.y_px - down
+        scene.flux[odd] /= 0.9
         assert found.common is not None and not found.same
         assert found.common.shift_px == pytest.approx((right, down), abs=MEASURED_PX)
         assert (found.common.rotation_deg, found.common.scale_error, found.common.flux_mag) == (
@@ -199,7 +199,7 @@ def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_
             0,
             0,
         )
-        (named,) = [star for star in found.differing if star.hip == (int(field.hip[odd]),)]
+        (named,) = [star for star in found.differing if star.hip == (int(scene.hip[odd]),)]
         assert named.flux_error_mag == pytest.approx(2.5 * np.log10(1 / 0.9), abs=MEASURED_MAG)
         # Stars that share their light with a neighbour may be one star there and two here; in this
         # dense field a star that moves by many widths may come to lie on another one's old place,
@@ -208,14 +208,14 @@ def test_an_image_that_is_shifted_as_a_whole_is_said_to_be_and_only_who_differs_
         assert found.common.line().startswith(f"all shifted by ({right:.2f}, {down:.2f}) px; ")
 
 
-def test_a_turn_a_scale_and_a_dimming_of_all_are_told_apart(field):
-    width, height = field.bench.camera.resolution_px
-    x, y = field.x_px - (width - 1) / 2, field.y_px - (height - 1) / 2
+def test_a_turn_a_scale_and_a_dimming_of_all_are_told_apart(scene):
+    width, height = scene.bench.camera.resolution_px
+    x, y = scene.x_px - (width - 1) / 2, scene.y_px - (height - 1) / 2
     turn, scale = np.radians(0.05), 1.0005
-    field.x_px += scale * (x * np.cos(turn) - y * np.sin(turn)) - x
-    field.y_px += scale * (x * np.sin(turn) + y * np.cos(turn)) - y
-    field.flux *= 10 ** (-0.4 * 0.1)
-    common = compare(field.frame(), field.golden).common
+    scene.x_px += scale * (x * np.cos(turn) - y * np.sin(turn)) - x
+    scene.y_px += scale * (x * np.sin(turn) + y * np.cos(turn)) - y
+    scene.flux *= 10 ** (-0.4 * 0.1)
+    common = compare(scene.frame(), scene.golden).common
     assert common is not None
     assert common.shift_px == (0.0, 0.0)
     assert common.rotation_deg == pytest.approx(0.05, abs=1e-4)
@@ -224,11 +224,11 @@ def test_a_turn_a_scale_and_a_dimming_of_all_are_told_apart(field):
     assert "turned by +0.0500 deg" in common.line() and "dimmer by 0.10 mag" in common.line()
 
 
-def test_the_legend_counts_what_the_terminal_counts(field):
+def test_the_legend_counts_what_the_terminal_counts(scene):
     # Shifted as a whole, stars leave the image and come into it: they are common, and missing or
     # extra all the same.
-    field.x_px += 3.0
-    found = compare(field.frame(), field.golden)
+    scene.x_px += 3.0
+    found = compare(scene.frame(), scene.golden)
     assert found.common is not None
     assert found.summary()["missing"] > 0
     panel = ChartPanel(found, "mag")
@@ -238,22 +238,22 @@ def test_the_legend_counts_what_the_terminal_counts(field):
     assert len(panel.of("missing")) < found.summary()["missing"]
 
 
-def test_what_a_few_stars_do_is_not_common(field):
-    for k in field.inside()[-3:]:
-        field.x_px[k] += 0.5
-        field.flux[k] *= 0.8
-    found = compare(field.frame(), field.golden)
+def test_what_a_few_stars_do_is_not_common(scene):
+    for k in scene.inside()[-3:]:
+        scene.x_px[k] += 0.5
+        scene.flux[k] *= 0.8
+    found = compare(scene.frame(), scene.golden)
     assert found.common is None
     assert len(found.differing) == len(found.bad) == 3
-    other = field.bench.frame(from_radec_roll_deg(280, 35, 20))
-    assert compare(other, field.golden).common is None
-    assert compare(field.golden, field.golden).common is None
+    other = scene.bench.frame(from_radec_roll_deg(280, 35, 20))
+    assert compare(other, scene.golden).common is None
+    assert compare(scene.golden, scene.golden).common is None
 
 
-def test_of_another_sky_twenty_stars_are_told_and_the_rest_counted(field):
-    other = field.bench.frame(from_radec_roll_deg(280, 35, 20))
+def test_of_another_sky_twenty_stars_are_told_and_the_rest_counted(scene):
+    other = scene.bench.frame(from_radec_roll_deg(280, 35, 20))
     with pytest.raises(AssertionError) as failure:
-        assert_same_sky(other, field.golden.linear)
+        assert_same_sky(other, scene.golden.linear)
     assert len(str(failure.value).splitlines()) == 1 + MAX_LINES + 1
     assert str(failure.value).splitlines()[-1].startswith("and ")
 
@@ -299,17 +299,17 @@ def test_of_a_pair_only_the_star_that_changed_is_named(apart_px, ratio):
             )
 
 
-def test_a_blend_is_one_star_with_both_names(field):
+def test_a_blend_is_one_star_with_both_names(scene):
     """Two stars within a pixel: the fault of one is the blend's, by its share of the light."""
-    k, other = field.inside()[:2]
-    field.x_px[other], field.y_px[other] = field.x_px[k] + 0.4, field.y_px[k] - 0.3
-    golden = field.frame()
-    golden.truth["x_px"][golden.truth["hip"] == field.hip[other]] = field.x_px[other]
-    golden.truth["y_px"][golden.truth["hip"] == field.hip[other]] = field.y_px[other]
-    share = field.flux[k] / (field.flux[k] + field.flux[other])
-    field.flux[k] *= 10 ** (-0.4 * FAULT_MAG)
-    (star,) = compare(field.frame(), golden).bad
-    assert set(star.hip) == {field.hip[k], field.hip[other]}
+    k, other = scene.inside()[:2]
+    scene.x_px[other], scene.y_px[other] = scene.x_px[k] + 0.4, scene.y_px[k] - 0.3
+    golden = scene.frame()
+    golden.truth["x_px"][golden.truth["hip"] == scene.hip[other]] = scene.x_px[other]
+    golden.truth["y_px"][golden.truth["hip"] == scene.hip[other]] = scene.y_px[other]
+    share = scene.flux[k] / (scene.flux[k] + scene.flux[other])
+    scene.flux[k] *= 10 ** (-0.4 * FAULT_MAG)
+    (star,) = compare(scene.frame(), golden).bad
+    assert set(star.hip) == {scene.hip[k], scene.hip[other]}
     assert star.flux_error_mag == pytest.approx(FAULT_MAG * share, rel=0.1)
 
 
@@ -343,25 +343,25 @@ def test_the_sigma_is_that_of_the_stars(sigma_px, rng):
     assert star_psf(image.astype(float)).sigma_px == pytest.approx(sigma_px, rel=1e-3)
 
 
-def test_files_arrays_and_frames_are_one_sky(field, tmp_path):
-    write_frame_fits(tmp_path / "golden.fits", field.bench, field.golden)
-    write_truth_csv(tmp_path / "truth.csv", field.golden)
-    k = field.inside()[0]
-    field.x_px[k] += FAULT_PX
-    frame = field.frame()
+def test_files_arrays_and_frames_are_one_sky(scene, tmp_path):
+    write_frame_fits(tmp_path / "golden.fits", scene.bench, scene.golden)
+    write_truth_csv(tmp_path / "truth.csv", scene.golden)
+    k = scene.inside()[0]
+    scene.x_px[k] += FAULT_PX
+    frame = scene.frame()
     for golden, truth in (
         (str(tmp_path / "golden.fits"), tmp_path / "truth.csv"),
         (tmp_path / "golden.fits", None),
     ):
         (star,) = compare(frame.linear if truth else frame, golden, truth=truth).bad
-        assert star.hip == (field.hip[k],)
-    (star,) = compare(frame.linear, field.golden.linear).bad
+        assert star.hip == (scene.hip[k],)
+    (star,) = compare(frame.linear, scene.golden.linear).bad
     assert star.hip == () and star.name == f"star at ({star.x_px:.1f}, {star.y_px:.1f})"
-    assert_same_sky(frame, field.golden, centroid_px=1.5 * FAULT_PX)
+    assert_same_sky(frame, scene.golden, centroid_px=1.5 * FAULT_PX)
 
 
-def test_what_is_no_sky_is_refused(field):
-    golden = field.golden
+def test_what_is_no_sky_is_refused(scene):
+    golden = scene.golden
     nothing = np.zeros_like(golden.linear)
     broken = golden.linear.copy()
     broken[3, 3] = np.nan
@@ -380,7 +380,7 @@ def test_what_is_no_sky_is_refused(field):
         assert_same_sky(golden, golden, centroid_px=float("nan"))
     with pytest.raises(InputError, match="truth table"):
         assert_same_sky(
-            golden, golden, truth=field.bench.frame(from_radec_roll_deg(280, 35, 20)).truth
+            golden, golden, truth=scene.bench.frame(from_radec_roll_deg(280, 35, 20)).truth
         )
     with pytest.raises(AssertionError, match="missing"):
         assert_same_sky(nothing, golden)

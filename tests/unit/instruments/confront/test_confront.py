@@ -5,7 +5,6 @@ renderer.
 from __future__ import annotations
 
 import contextlib
-import csv
 import json
 import re
 import shutil
@@ -37,6 +36,7 @@ from tests.support.planted_sky import (
     write_bench,
 )
 from tests.support.skies import STATION_TLE, skyfield
+from tests.support.tables import csv_rows
 
 RAW = sorted((Path(__file__).parents[3] / "data" / "confront").glob("*.tiff"))
 RAW_BENCH = """[tracker]
@@ -70,11 +70,6 @@ def confronted(
         done = run_hilstar_here("confront", bench, *images, "-o", output, "--json", *options)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)  # type: ignore[no-any-return]
-
-
-def csv_rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="module")

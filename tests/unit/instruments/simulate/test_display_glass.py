@@ -51,7 +51,7 @@ CODES_PX = 0.01  # `exact` on 12 bits: measured 0.0034
 
 
 @pytest.fixture
-def bench(tmp_path):
+def relay_file(tmp_path):
     def make(*changes, scale=SCALE, relay_px=0.0, glass=None, **render):
         write_glass(tmp_path / "psf.fits", glass or glass_of(stack(**SMALL)))
         tables = {
@@ -68,9 +68,9 @@ def bench(tmp_path):
     return make
 
 
-def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(bench):
+def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(relay_file):
     # a star alone in each ninth of the field
-    file, q = bench(relay_px=RELAY_PX), from_radec_roll_deg(90.2, 22.3, 56)
+    file, q = relay_file(relay_px=RELAY_PX), from_radec_roll_deg(90.2, 22.3, 56)
     camera = tracker_camera(file.config.tracker, file.folder)
     with Simulator(file) as simulator:
         exposure = simulator.expose(simulator.view(q, np.zeros(3)), None)
@@ -112,25 +112,25 @@ def test_a_bare_detector_sees_what_the_tracker_would_all_over_the_field(bench):
     assert len(zones) == 9
 
 
-def test_points_beyond_a_lens_are_left_out(bench, tmp_path):
+def test_points_beyond_a_lens_are_left_out(relay_file, tmp_path):
     (tmp_path / "flight.toml").write_text("k1 = -0.1\n")
     glass = glass_of(stack(**SMALL))
     far = replace(glass, places_px=glass.places_px * [30.0, 1.0])
-    with open_bench(bench({"tracker": {"distortion": "flight.toml"}}, glass=far)) as shown:
+    with open_bench(relay_file({"tracker": {"distortion": "flight.toml"}}, glass=far)) as shown:
         assert 0 < len(shown.psf.field.places_px) < len(glass.places_px)
 
 
-def test_what_white_lacks_of_a_disc_is_known_beside_stars(bench):
+def test_what_white_lacks_of_a_disc_is_known_beside_stars(relay_file):
     sky = {"sky": {"epoch_utc": "2008-09-20T13:16:00Z"}, "sky.bodies": {"sun": True}}
-    with open_bench(bench(sky, scale=1.0)) as shown:
+    with open_bench(relay_file(sky, scale=1.0)) as shown:
         frame = shown.frame(from_radec_roll_deg(178.0, 0.9, 0.0))
         assert len(frame.truth) > 1
         assert shown.losses_mag(frame)["Sun"] > 15
 
 
-def test_both_backends_show_the_same_levels_by_place(bench):
+def test_both_backends_show_the_same_levels_by_place(relay_file):
     for quantisation in ("round", "exact"):
-        with open_bench(bench(scale=1.0, quantisation=quantisation)) as shown:
+        with open_bench(relay_file(scale=1.0, quantisation=quantisation)) as shown:
             sprites = shown.light(shown.view(np.array(ORION_Q)))
             oracle = NumpyBackend(shown.renderer.target)
             oracle.draw(sprites)
@@ -144,15 +144,17 @@ def test_both_backends_show_the_same_levels_by_place(bench):
             assert not np.array_equal(shown.renderer.levels(), oracle.levels())
 
 
-def test_a_gaussian_and_one_image_are_scaled_to_the_display(bench, tmp_path):
-    file = bench({"tracker": {"psf_sigma_px": [0.5, 0.7]}, "tracker.optics": {"psf": "gaussian"}})
+def test_a_gaussian_and_one_image_are_scaled_to_the_display(relay_file, tmp_path):
+    file = relay_file(
+        {"tracker": {"psf_sigma_px": [0.5, 0.7]}, "tracker.optics": {"psf": "gaussian"}}
+    )
     with open_bench(file) as shown:
         assert shown.psf.width_px == pytest.approx((0.5 * SCALE, 0.7 * SCALE))
         assert shown.tracker_psf.width_px[0] < 0.01
         blur = before_detector(
-            bench(relay_px=0.8, psf="gaussian").config, tmp_path, shown.camera
+            relay_file(relay_px=0.8, psf="gaussian").config, tmp_path, shown.camera
         ).width_px
-        own = tracker_psf(bench().config.tracker, tmp_path).width_px
+        own = tracker_psf(relay_file().config.tracker, tmp_path).width_px
     assert np.square(blur) - np.square(own) == pytest.approx((0.8 / SCALE) ** 2, rel=0.05)
     samples, per_px = regridded(
         sampled(coma(), 4, 7)[None] / 16, 4, np.array([[0.0, -SCALE], [SCALE, 0.0]])
@@ -164,7 +166,7 @@ def test_a_gaussian_and_one_image_are_scaled_to_the_display(bench, tmp_path):
     )  # the pixel is half as wide
 
 
-def test_the_least_that_the_tolerance_allows_is_drawn(bench):
+def test_the_least_that_the_tolerance_allows_is_drawn(relay_file):
     """A glass that is nearly the same everywhere takes one PSF, and with more tolerance a
     Gaussian, and says so.
     """
@@ -172,17 +174,17 @@ def test_the_least_that_the_tolerance_allows_is_drawn(bench):
     even = replace(
         even, images=np.tile(even.images[4], (9, 1, 1)), facts=np.tile([1.0, 0, 0, 0], (9, 1))
     )
-    file = bench(glass=glass_of(even))
+    file = relay_file(glass=glass_of(even))
     with open_bench(file) as shown:
         assert type(shown.psf) is SampledPsf and "one PSF for all stars" in drawn_line(shown)
         camera = shown.camera
-    asked = bench(glass=glass_of(even), effort="auto", tolerance_mag=0.2, tolerance_px=0.1)
+    asked = relay_file(glass=glass_of(even), effort="auto", tolerance_mag=0.2, tolerance_px=0.1)
     psf, choice = next(display_psfs(asked.config, asked.folder, camera))
     assert isinstance(psf, GaussianPsf) and choice.note == "more would gain no more than that"
 
 
-def test_more_components_are_nearer_to_the_whole(bench):
-    psf = tracker_psf(bench().config.tracker, bench().folder)
+def test_more_components_are_nearer_to_the_whole(relay_file):
+    psf = tracker_psf(relay_file().config.tracker, relay_file().folder)
     places = np.stack(np.meshgrid(*[np.linspace(10, SIDE_PX - 11, 4)] * 2), axis=-1).reshape(-1, 2)
     errors = {name: psf_errors(psf, make(), places) for name, make in candidates(psf)}
     px = [found.px for found in errors.values()]
@@ -202,21 +204,21 @@ def test_more_components_are_nearer_to_the_whole(bench):
     assert len(found.optics.basis) == 6 and "a basis of 3 would be" in choice.note
 
 
-def test_the_virtual_tracker_takes_the_least_too(bench, caplog):
+def test_the_virtual_tracker_takes_the_least_too(relay_file, caplog):
     tables = {"tracker": {"effort": "auto", "tolerance_mag": 0.05, "tolerance_px": 0.05}}
-    file = bench(tables)
+    file = relay_file(tables)
     found = tracker_psf(file.config.tracker, file.folder)
     assert 3 <= len(found.optics.basis) <= 12 and "[tracker] effort: PSF: a basis of" in caplog.text
     assert "a Gaussian would be" in caplog.text
-    loose = bench(
+    loose = relay_file(
         {"tracker": {"effort": "auto", "tolerance_mag": 2, "tolerance_px": 2}}
     ).config.tracker
     assert isinstance(tracker_psf(loose, file.folder), GaussianPsf)
     assert "a Gaussian" in caplog.text and "more would gain no more than that" in caplog.text
 
 
-def test_what_cannot_be_drawn_is_refused(bench, tmp_path):
-    bench(glass=glass_of(stack(**SMALL, integrated=True)))
+def test_what_cannot_be_drawn_is_refused(relay_file, tmp_path):
+    relay_file(glass=glass_of(stack(**SMALL, integrated=True)))
     result = run_hilstar_here(
         "frame", tmp_path / "bench.toml", "--radec", "84,-1,0", "-o", tmp_path / "x.fits"
     )
@@ -225,7 +227,9 @@ def test_what_cannot_be_drawn_is_refused(bench, tmp_path):
         '[render] psf = "tracker", with psf.fits: it has the tracker\'s pixel in it (PIXINT)'
         in result.stderr
     )
-    wide = bench({"tracker": {"psf_sigma_px": [0.5, 1.5]}, "tracker.optics": {"psf": "gaussian"}})
+    wide = relay_file(
+        {"tracker": {"psf_sigma_px": [0.5, 1.5]}, "tracker.optics": {"psf": "gaussian"}}
+    )
     camera = bench_camera(wide.config, wide.folder)
     camera = replace(camera, cam_to_image=np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]))
     with pytest.raises(InputError, match="oval and lies obliquely"):

@@ -52,7 +52,7 @@ usual_glass = cache(lambda: glass_of(stack()))
 
 
 @pytest.fixture
-def bench(tmp_path):
+def glass_file(tmp_path):
     say_once.cache_clear()
 
     def make(*changes, **glass):
@@ -68,8 +68,8 @@ def bench(tmp_path):
     return make
 
 
-def test_a_star_s_shares_are_its_spectrum_times_the_quantum_efficiency(bench):
-    file = bench()
+def test_a_star_s_shares_are_its_spectrum_times_the_quantum_efficiency(glass_file):
+    file = glass_file()
     psf = tracker_psf(file.config.tracker, file.folder)
     stars = bench_stars(file.config, file.folder)
     which = np.array([int(np.abs(stars.bv_mag - bv).argmin()) for bv in (-0.25, 0.0, 0.6, 1.6)])
@@ -85,8 +85,8 @@ def test_a_star_s_shares_are_its_spectrum_times_the_quantum_efficiency(bench):
 
 
 @pytest.mark.parametrize("spectrum", ["pickles", "mk"])
-def test_every_model_of_spectra_makes_red_stars_redder(bench, spectrum):
-    file = bench({"sky": {"spectrum": spectrum}})
+def test_every_model_of_spectra_makes_red_stars_redder(glass_file, spectrum):
+    file = glass_file({"sky": {"spectrum": spectrum}})
     stars = bench_stars(file.config, file.folder)
     which = np.array([int(np.abs(stars.bv_mag - bv).argmin()) for bv in (0.0, 1.5)])
     blue, red = StarGlass(file, tracker_psf(file.config.tracker, file.folder)).shares(stars, which)
@@ -99,8 +99,8 @@ def test_every_model_of_spectra_makes_red_stars_redder(bench, spectrum):
     assert added.sum() == pytest.approx(1)
 
 
-def test_the_virtual_tracker_draws_each_star_by_its_place_and_colour(bench):
-    with Simulator(bench({"sky": {"faintest_v_mag": 5}})) as simulator:
+def test_the_virtual_tracker_draws_each_star_by_its_place_and_colour(glass_file):
+    with Simulator(glass_file({"sky": {"faintest_v_mag": 5}})) as simulator:
         exposure = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
         shares = {}
         for row in exposure.truth:
@@ -132,9 +132,9 @@ def test_the_virtual_tracker_draws_each_star_by_its_place_and_colour(bench):
     assert checked > 8
 
 
-def test_smear_goes_along_with_it(bench):
+def test_smear_goes_along_with_it(glass_file):
     """The mean of an exposure that turns is that of many still ones: 64 of them."""
-    with Simulator(bench({"sky": {"faintest_v_mag": 5}})) as simulator:
+    with Simulator(glass_file({"sky": {"faintest_v_mag": 5}})) as simulator:
         rate = np.radians([1.0, 0.7, 0.0])
         turning = simulator.expose(simulator.view(np.array(ORION_Q), rate), None).mean_e
         still = np.zeros_like(turning)
@@ -149,11 +149,11 @@ def test_smear_goes_along_with_it(bench):
     assert np.abs(turning - still).max() < 2e-3 * turning.max()
 
 
-def test_the_monitor_s_light_goes_through_the_glass_by_place(bench):
+def test_the_monitor_s_light_goes_through_the_glass_by_place(glass_file):
     """A monitor pixel of 0.4 tracker pixels has the centroid of the mean PSF of its place, and
     is dimmed as that is.
     """
-    file = bench()
+    file = glass_file()
     tracker, psf = (
         tracker_camera(file.config.tracker, file.folder),
         tracker_psf(file.config.tracker, file.folder),
@@ -171,8 +171,8 @@ def test_the_monitor_s_light_goes_through_the_glass_by_place(bench):
     assert part[0] == pytest.approx(5e4 * dimmed, rel=1e-3)
 
 
-def test_a_campaign_varies_the_focus(bench, tmp_path):
-    bench({"tracker.detector": {"gain_e_per_dn": 5, "full_well_e": 70000}})
+def test_a_campaign_varies_the_focus(glass_file, tmp_path):
+    glass_file({"tracker.detector": {"gain_e_per_dn": 5, "full_well_e": 70000}})
     write_glass(tmp_path / "psf.fits", glass_of(stack(3, focuses_um=(0.0, 10.0))))
     (tmp_path / "plan.toml").write_text(
         plan_text(
@@ -191,13 +191,15 @@ def test_a_campaign_varies_the_focus(bench, tmp_path):
     assert rows[0]["bench_sha256"] != rows[1]["bench_sha256"]
 
 
-def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_none(bench, caplog):
+def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_none(
+    glass_file, caplog
+):
     lens, curve = Lens((0.05, 0.0, 0.0)), Curve(np.array([300.0, 1100.0]), np.array([0.5, 0.5]))
-    file = bench(lens=lens, transmission=curve)
+    file = glass_file(lens=lens, transmission=curve)
     assert tracker_camera(file.config.tracker, file.folder).lens.radial == (0.05, 0.0, 0.0)
     assert bench_optics(file.config.tracker, file.folder).transmission(np.array([550.0]))[0] == 0.5
     (file.folder / "flight.toml").write_text("k1 = 1.0\n")
-    own = bench(
+    own = glass_file(
         {"tracker": {"distortion": "flight.toml", "transmission": 0.7}},
         lens=lens,
         transmission=curve,
@@ -208,8 +210,8 @@ def test_a_bench_takes_distortion_and_transmission_of_its_glass_where_it_has_non
     assert "its transmission is not used" in caplog.text
 
 
-def test_what_the_file_does_not_cover_is_said(bench, caplog):
-    wide = bench(
+def test_what_the_file_does_not_cover_is_said(glass_file, caplog):
+    wide = glass_file(
         {"tracker": {"resolution_px": [300, SIDE_PX]}, "tracker.optics": {"focus_um": 7.0}}
     )
     assert isinstance(tracker_psf(wide.config.tracker, wide.folder), GlassPsf)
@@ -223,11 +225,11 @@ def test_what_the_file_does_not_cover_is_said(bench, caplog):
 
 
 @pytest.mark.parametrize("psf", ["glass", "gaussian"])
-def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(bench, psf):
+def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(glass_file, psf):
     """To 6e-3 px between the points of its file (measured 4.6e-3); the Gaussian sees the light
     beside it.
     """
-    file = bench() if psf == "glass" else None
+    file = glass_file() if psf == "glass" else None
     glass = tracker_psf(file.config.tracker, file.folder) if file else GaussianPsf((0.6, 0.7))
     rng = np.random.default_rng(3)
     places = rng.uniform(15, SIDE_PX - 15, (2, 40))
@@ -262,11 +264,11 @@ def test_a_fit_of_the_psf_that_it_is_told_finds_the_chief_ray(bench, psf):
         )
 
 
-def test_a_campaign_s_centroider_fits_the_psf_that_the_plan_tells_it(bench):
+def test_a_campaign_s_centroider_fits_the_psf_that_the_plan_tells_it(glass_file):
     """No noise: the right PSF finds stars to a DN's rounding, a wrong one does not, and a focus
     that is off costs more.
     """
-    file = bench()
+    file = glass_file()
     rms = {}
     with Simulator(file) as tracker:
         shot = tracker.expose(tracker.view(np.array(ORION_Q), np.zeros(3)), None)
@@ -298,13 +300,13 @@ def test_a_told_psf_without_its_centroider_is_refused(tmp_path):
             )
 
 
-def test_verify_names_the_glass_and_the_psf_centroider_mends_it(bench, tmp_path):
+def test_verify_names_the_glass_and_the_psf_centroider_mends_it(glass_file, tmp_path):
     """Coma and lateral colour of 0.3 px in the corners: a window has stars beside their chief
     rays.
     """
     found = {}
     for kind in ("window", "psf"):
-        bench(
+        glass_file(
             {
                 "verify": {"centroider": kind, "centroid_px": 0.05, "flux_mag": 0.5},
                 "sky": {"faintest_v_mag": 4.5},
@@ -323,11 +325,11 @@ def test_verify_names_the_glass_and_the_psf_centroider_mends_it(bench, tmp_path)
     assert "chief rays" not in mended
 
 
-def test_a_warmer_or_decentred_lens_moves_focus_scale_and_place(bench):
+def test_a_warmer_or_decentred_lens_moves_focus_scale_and_place(glass_file):
     """Through the keys' own coefficients; the flight software knows nothing of it, so its
     attitude is off by the decentring.
     """
-    still = bench()
+    still = glass_file()
     write_glass(still.folder / "psf.fits", glass_of(stack(3, focuses_um=(0.0, 10.0))))
     warm = {"temperature_k": 303.0, "focus_um_per_k": 0.6, "focal_length_ppm_per_k": 20.0}
     cameras, psfs = [], []

@@ -117,12 +117,12 @@ def test_json_says_what_is_known_and_nothing_else():
         "tracking",
         9,
         1.5,
-        (ReportedStar(1, 2, 3.00001, 7), ReportedStar(1, 2, 3)),
+        (ReportedStar(1, 2, 3.00001, 7), ReportedStar(1, 2, 3), ReportedStar(1, 2, 3, None, 1.5)),
     )
     assert (
         json_answer(whole)
         == b'{"t_ns":5,"valid":true,"mode":"tracking","stars":9,"q":[1.0,0.0,0.0,0.0],"rate":[0.0,0.0,0.0],"rms_arcsec":1.5,'
-        b'"centroids":[[1,2,3.0,7],[1,2,3]]}'
+        b'"centroids":[[1,2,3.0,7],[1,2,3],[1,2,3,null,1.5]]}'
     )
     assert (
         json_answer(Answer(0, b"", 5, valid=False, mode="lost", star_count=0))

@@ -35,7 +35,7 @@ BRIGHTEST = 5
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory):
+def curves(tmp_path_factory):
     made = tmp_path_factory.mktemp("mosaic")
     for name, value in PASSBANDS.items():
         rows = "\n".join(f"{nm:g},{v:.6f}" for nm, v in zip(NM, value, strict=True))
@@ -43,7 +43,7 @@ def folder(tmp_path_factory):
     return made
 
 
-def mosaic_bench(folder, bayer, *changes):
+def mosaic_bench(curves, bayer, *changes):
     keys = {
         "quantum_efficiency": None,
         "psf_sigma_px": [SIGMA_PX, SIGMA_PX],
@@ -59,7 +59,7 @@ def mosaic_bench(folder, bayer, *changes):
         **({} if bayer is None else {"bayer": bayer}),
     }
     sky = {"faintest_v_mag": 4.5, "spectrum": "blackbody"}
-    path = folder / f"{bayer}.toml"
+    path = curves / f"{bayer}.toml"
     path.write_text(
         bench_text({"tracker": keys, "tracker.detector": detector, "sky": sky}, *changes)
     )
@@ -69,12 +69,12 @@ def mosaic_bench(folder, bayer, *changes):
 @pytest.mark.gpu
 @pytest.mark.parametrize("bayer", PATTERNS)
 def test_planes_of_the_raw_mosaic_have_each_channels_electrons_of_a_quadrature(
-    folder, tmp_path, bayer
+    curves, tmp_path, bayer
 ):
     """Photometry of each plane by `sep`, found by the keywords that other programs read."""
     out = tmp_path / "raw.fits"
     run = run_hilstar_here(
-        "simulate", mosaic_bench(folder, bayer), "--radec", "86,3,0", "--noise", "none", "-o", out
+        "simulate", mosaic_bench(curves, bayer), "--radec", "86,3,0", "--noise", "none", "-o", out
     )
     assert run.returncode == 0, run.stderr
     with fits.open(out) as (image, table):
@@ -102,12 +102,12 @@ def test_planes_of_the_raw_mosaic_have_each_channels_electrons_of_a_quadrature(
 
 
 @pytest.mark.gpu
-def test_noise_comes_after_the_mosaic_and_zodiacal_light_has_each_channels_own(folder):
+def test_noise_comes_after_the_mosaic_and_zodiacal_light_has_each_channels_own(curves):
     sky = {
         "background": {"zodiacal_v_mag_arcsec2": 20.0},
         "tracker.detector": {"read_noise_e": 5.0},
     }
-    with Simulator(read_bench_file(mosaic_bench(folder, "rggb", sky))) as simulator:
+    with Simulator(read_bench_file(mosaic_bench(curves, "rggb", sky))) as simulator:
         view = simulator.view(np.array(ORION_Q), np.zeros(3))
         exposure = simulator.expose(view, np.random.default_rng(3))
         levels = [
@@ -129,14 +129,14 @@ def test_noise_comes_after_the_mosaic_and_zodiacal_light_has_each_channels_own(f
     assert np.abs(given - luminance(exposure.dn)).max() <= 0.5
 
 
-def before_display(folder, colour, **sky):
+def before_display(curves, colour, **sky):
     power = [
         np.exp(-(((NM - peak) / width) ** 2)) for peak, width in ((625, 40), (530, 45), (460, 30))
     ]
     lines = "".join(
         f"{nm:g},{r:.6g},{g:.6g},{b:.6g}\n" for nm, r, g, b in zip(NM, *power, strict=True)
     )
-    (folder / "oled.csv").write_text(f"wavelength_nm,r,g,b\n{lines}")
+    (curves / "oled.csv").write_text(f"wavelength_nm,r,g,b\n{lines}")
     tracker = {
         "focal_length_mm": 25,
         "resolution_px": [400, 400],
@@ -149,7 +149,7 @@ def before_display(folder, colour, **sky):
         "collimator": {"focal_length_mm": 120},
     }
     tables |= {"render": {"colour": colour, "quantisation": "exact", "brightest_v_mag": 0.0}}
-    return read_bench_file(mosaic_bench(folder, "rggb", tables, {"sky": sky}))
+    return read_bench_file(mosaic_bench(curves, "rggb", tables, {"sky": sky}))
 
 
 SHOWN = 0.02  # asked for: 2 % at 95 % of stars, of which these are the brightest
@@ -157,8 +157,8 @@ SHOWN = 0.02  # asked for: 2 % at 95 % of stars, of which these are the brightes
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("colour", ["star", "white"])
-def test_a_mosaic_before_the_display_has_each_stars_own_channels_or_whites(folder, colour):
-    display = DisplayTracker(before_display(folder, colour))
+def test_a_mosaic_before_the_display_has_each_stars_own_channels_or_whites(curves, colour):
+    display = DisplayTracker(before_display(curves, colour))
     exposure = display.expose(display_view(86.0, 3.0), None)
     display.close()
     off = []
@@ -175,8 +175,8 @@ def test_a_mosaic_before_the_display_has_each_stars_own_channels_or_whites(folde
 
 
 @pytest.mark.gpu
-def test_the_live_tracker_before_a_coloured_display_finds_its_attitude_in_superpixels(folder):
-    file = before_display(folder, "star", faintest_v_mag=5.5)
+def test_the_live_tracker_before_a_coloured_display_finds_its_attitude_in_superpixels(curves):
+    file = before_display(curves, "star", faintest_v_mag=5.5)
     with load(file.path) as bench, LiveTracker(file, np.random.default_rng(1)) as tracker:
         q = from_radec_roll_deg(86.0, 3.0, 0.0)
         codes = bench.frame(q).codes.reshape(-1, 3)
@@ -236,8 +236,8 @@ def test_a_mosaic_without_three_channels_is_refused_in_one_line(tmp_path, tables
     assert words in run.stderr
 
 
-def test_three_channels_without_a_mosaic_are_added_up_with_a_line(folder, caplog):
-    with Simulator(read_bench_file(mosaic_bench(folder, None))) as simulator:
+def test_three_channels_without_a_mosaic_are_added_up_with_a_line(curves, caplog):
+    with Simulator(read_bench_file(mosaic_bench(curves, None))) as simulator:
         exposure = simulator.expose(simulator.view(np.array(ORION_Q), np.zeros(3)), None)
     assert "without a mosaic: each pixel adds them up" in caplog.text
     row = exposure.truth[0]

@@ -4,7 +4,6 @@ simulated exposures.
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 
@@ -38,6 +37,7 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
 from tests.support.psfs import coma, sampled
 from tests.support.psfs import gaussian as gaussian_light
+from tests.support.tables import csv_rows
 
 QUIET = DetectorSettings(gain_e_per_dn=0.3, full_well_e=1e6, bits=16)  # rounding: 0.0075 e-^2
 NOISY = DetectorSettings(
@@ -326,7 +326,7 @@ CONTRACT += ["total_e", "snr", "detection", "bound_px"]
 
 
 @pytest.fixture
-def bench_file(tmp_path):
+def noisy_file(tmp_path):
     path = tmp_path / "bench.toml"
     detector = {
         "read_noise_e": 12,
@@ -345,13 +345,13 @@ def bench_file(tmp_path):
 
 
 def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_field(
-    bench_file, tmp_path, monkeypatch
+    noisy_file, tmp_path, monkeypatch
 ):
     drawn = []
     monkeypatch.setattr("hilstar.basics.charts.save", lambda figure, path: drawn.append(figure))
     ran = run_hilstar_here(
         "budget",
-        bench_file,
+        noisy_file,
         "--noise",
         "--radec",
         "84.057,-1.2,0",
@@ -363,8 +363,7 @@ def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_fie
     found = json.loads(ran.stdout)
     tables = {}
     for name in ("noise", "stars", "nea"):
-        with (tmp_path / "out" / f"{name}.csv").open() as file:
-            tables[name] = list(csv.DictReader(file))
+        tables[name] = csv_rows(tmp_path / "out" / f"{name}.csv")
     assert list(tables["noise"][0])[: len(CONTRACT)] == CONTRACT
     assert list(tables["stars"][0])[:5] == ["hip", "name", "x_px", "y_px", "v_mag"]
     for name, rows in (("noise", found["rows"]), ("stars", found["stars"]), ("nea", found["nea"])):
@@ -400,14 +399,14 @@ def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_fie
     assert len(drawn) == 1
 
 
-def test_budget_noise_without_a_field_has_the_median_of_fields_all_over_the_sky(bench_file):
-    spoken = run_hilstar_here("budget", bench_file, "--noise")
+def test_budget_noise_without_a_field_has_the_median_of_fields_all_over_the_sky(noisy_file):
+    spoken = run_hilstar_here("budget", noisy_file, "--noise")
     assert (
         spoken.returncode == 0
         and "NEA, limit" in spoken.stdout
         and "1 px above 5 sigma" in spoken.stdout
     )
-    assert spoken.stdout == run_hilstar_here("budget", bench_file, "--noise").stdout
+    assert spoken.stdout == run_hilstar_here("budget", noisy_file, "--noise").stdout
 
 
 def test_a_mosaics_channels_have_their_own_noise_and_its_superpixels_find_what_they_do(tmp_path):
@@ -465,27 +464,27 @@ def test_a_mosaics_channels_have_their_own_noise_and_its_superpixels_find_what_t
     )
 
 
-def test_a_field_without_stars_says_so(bench_file, tmp_path):
-    bench_file.write_text(
-        bench_file.read_text().replace("faintest_v_mag = 6.5", "faintest_v_mag = 1.0")
+def test_a_field_without_stars_says_so(noisy_file, tmp_path):
+    noisy_file.write_text(
+        noisy_file.read_text().replace("faintest_v_mag = 6.5", "faintest_v_mag = 1.0")
     )
     ran = run_hilstar_here(
-        "budget", bench_file, "--noise", "--radec", "190,27,0", "-o", tmp_path / "out"
+        "budget", noisy_file, "--noise", "--radec", "190,27,0", "-o", tmp_path / "out"
     )
     assert ran.returncode == 0 and "none: fewer than 2 stars with a place" in ran.stdout
     assert (tmp_path / "out" / "nea.csv").exists() and not (tmp_path / "out" / "nea.png").exists()
 
 
-def test_what_budget_has_no_use_for_is_refused(bench_file):
+def test_what_budget_has_no_use_for_is_refused(noisy_file):
     assert_refused(
-        run_hilstar_here("budget", bench_file, "--radec", "84,-1,0"), 2, "--radec", "add --noise"
+        run_hilstar_here("budget", noisy_file, "--radec", "84,-1,0"), 2, "--radec", "add --noise"
     )
     assert_refused(
-        run_hilstar_here("budget", bench_file, "--noise", "--centroider", "fit"),
+        run_hilstar_here("budget", noisy_file, "--noise", "--centroider", "fit"),
         2,
         "leave out --centroider",
     )
-    assert_refused(run_hilstar_here("budget", bench_file, "--noise", "--radec", "84"), 2, "--radec")
+    assert_refused(run_hilstar_here("budget", noisy_file, "--noise", "--radec", "84"), 2, "--radec")
 
 
 def test_the_pixels_response_adds_noise_in_proportion_to_it_and_to_the_light():

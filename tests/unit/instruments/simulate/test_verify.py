@@ -22,7 +22,7 @@ from tests.support.benches import TWIN, bench_text
 LENS_PX = 0.02
 
 
-def bench_file(directory: Path, verify_lines: str = "", **changes: object) -> Path:
+def twin_file(directory: Path, verify_lines: str = "", **changes: object) -> Path:
     """A bench of the twin with other exposure, monitor, bits, calibration or quantisation."""
     values = {
         "exposure_s": 0.1,
@@ -68,7 +68,7 @@ def test_levels_of_another_monitor_s_primaries_stand_where_the_assumed_ones_do()
 def test_all_methods_see_the_same_fields_whatever_noise_they_draw(tmp_path):
     places = []
     for method in ("round", "exact"):
-        verdict, _ = verified(bench_file(tmp_path, method=method), 2, np.random.default_rng(5))
+        verdict, _ = verified(twin_file(tmp_path, method=method), 2, np.random.default_rng(5))
         places.append({(s.hip, s.x_px) for s in verdict.errors.stars + verdict.errors.lost})
     assert len(places[0] & places[1]) > 0.8 * len(places[1]) > 0
 
@@ -79,7 +79,7 @@ def test_a_whole_cycle_of_temporal_is_better_than_one_frame_of_it(tmp_path):
     """
     errors = []
     for frames in (1, 8):
-        path = bench_file(tmp_path, method="temporal", exposure_s=frames / 60)
+        path = twin_file(tmp_path, method="temporal", exposure_s=frames / 60)
         _, summary = verified(path, 4, np.random.default_rng(3))
         errors.append((summary["flux_error_mag"]["rms"], summary["centroid_error_px"]["rms"]))
     assert errors[1][0] < errors[0][0] / 2
@@ -87,14 +87,14 @@ def test_a_whole_cycle_of_temporal_is_better_than_one_frame_of_it(tmp_path):
 
 
 def test_a_black_level_is_caught_on_a_screen_that_covers_a_fifth_of_the_detector(tmp_path):
-    path = bench_file(tmp_path, 'true_calibration = "lcd-example"\n', monitor_px=[160, 130], bits=8)
+    path = twin_file(tmp_path, 'true_calibration = "lcd-example"\n', monitor_px=[160, 130], bits=8)
     _, summary = verified(path, 1, np.random.default_rng(1))
     assert summary["black_e_per_s_px"]["seen"] > 1e3
     assert any("black" in reason for reason in summary["reasons"])
 
 
 def test_coarse_codes_are_blamed_on_the_codes_and_not_on_the_response(tmp_path):
-    path = bench_file(tmp_path, bits=8, method="round")
+    path = twin_file(tmp_path, bits=8, method="round")
     path.write_text(path.read_text().replace("[verify]", "brightest_v_mag = -2\n[verify]"))
     verdict, summary = verified(path, 3, np.random.default_rng(1))
     assert not verdict.passed
@@ -105,9 +105,9 @@ def test_coarse_codes_are_blamed_on_the_codes_and_not_on_the_response(tmp_path):
 
 def test_the_codes_alone_do_not_depend_on_what_the_monitor_really_is(tmp_path):
     """Wherever the same stars are measured, the codes on the assumed monitor cost them the same."""
-    right, _ = verified(bench_file(tmp_path), 4, np.random.default_rng(4))
+    right, _ = verified(twin_file(tmp_path), 4, np.random.default_rng(4))
     wrong, _ = verified(
-        bench_file(tmp_path, 'true_calibration = "gamma2.2"\n'), 4, np.random.default_rng(4)
+        twin_file(tmp_path, 'true_calibration = "gamma2.2"\n'), 4, np.random.default_rng(4)
     )
     assert not wrong.passed
     alone = {(s.hip, s.x_px): s.codes_px for s in right.errors.stars}
@@ -118,14 +118,14 @@ def test_the_codes_alone_do_not_depend_on_what_the_monitor_really_is(tmp_path):
 
 
 def test_a_field_without_stars_passes_nothing(tmp_path):
-    with Twin(read_bench_file(bench_file(tmp_path))) as twin:
+    with Twin(read_bench_file(twin_file(tmp_path))) as twin:
         verdict = judge(Comparison(twin).measured())
     assert not verdict.passed
     assert "no star could be measured" in verdict.reasons[0]
 
 
 def test_a_true_rotation_that_is_none_is_refused_with_the_file_s_name(tmp_path):
-    path = bench_file(tmp_path, "true_q_cam_to_mon = [0, 0, 0, 0]\n")
+    path = twin_file(tmp_path, "true_q_cam_to_mon = [0, 0, 0, 0]\n")
     assert read_config(path).verify.true_q_cam_to_mon == (0.0, 0.0, 0.0, 0.0)
     with pytest.raises(InputError, match=r"bench\.toml: \[verify\] true_q_cam_to_mon.*unit"):
         Twin(read_bench_file(path))
@@ -133,7 +133,7 @@ def test_a_true_rotation_that_is_none_is_refused_with_the_file_s_name(tmp_path):
 
 def test_a_bench_whose_geometry_is_as_assumed_has_its_own_camera(tmp_path):
     """That of its geometry file, too, which no key of [verify] describes."""
-    with Twin(read_bench_file(bench_file(tmp_path, 'true_mirror = "x"\n'))) as twin:
+    with Twin(read_bench_file(twin_file(tmp_path, 'true_mirror = "x"\n'))) as twin:
         true = true_geometry(twin.bench, twin.camera)
         assert true.monitor is twin.bench.camera
         assert true.mirror == "x"
@@ -146,7 +146,7 @@ def test_a_bench_that_draws_through_its_measured_lens_passes(tmp_path):
         " 2081.5\nprincipal_point_px = [241, 198.5]\nq_cam_to_mon = [0.99999, 0, 0, 0.00447]\nk1 ="
         " 0.6\np1 = 0.001\ntilt_deg = [0.8, -0.5]\n"
     )
-    path = bench_file(tmp_path)
+    path = twin_file(tmp_path)
     path.write_text(
         path.read_text().replace("[collimator]", '[collimator]\ngeometry = "geometry.toml"')
     )
@@ -157,10 +157,8 @@ def test_a_bench_that_draws_through_its_measured_lens_passes(tmp_path):
 
 
 def test_only_what_is_said_to_be_true_makes_a_twin_differ(tmp_path):
-    assert changed_keys(read_config(bench_file(tmp_path, "flux_mag = 0.2\n")).verify) == [
-        "flux_mag"
-    ]
-    assert changed_keys(read_config(bench_file(tmp_path, 'true_mirror = "x"\n')).verify) == [
+    assert changed_keys(read_config(twin_file(tmp_path, "flux_mag = 0.2\n")).verify) == ["flux_mag"]
+    assert changed_keys(read_config(twin_file(tmp_path, 'true_mirror = "x"\n')).verify) == [
         "true_mirror"
     ]
 
@@ -182,7 +180,7 @@ def test_what_is_proposed_for_coarse_codes_is_what_the_calibration_takes(
         ' = "monitor.csv"\n'
     )
     (tmp_path / "monitor.toml").write_text(f"[calibration]\n{head}")
-    path = bench_file(
+    path = twin_file(
         tmp_path, "centroid_px = 1e-4\n", bits=8, method="round", calibration="monitor.toml"
     )
     verdict, _ = verified(path, 2, np.random.default_rng(1))
@@ -207,7 +205,7 @@ def test_a_true_monitor_that_is_known_in_grey_alone_refuses_bit_stealing_too(tmp
     )
     (tmp_path / "monitor.toml").write_text(f"[calibration]\n{head}")
     lines = 'centroid_px = 1e-4\ntrue_calibration = "monitor.toml"\n'
-    path = bench_file(tmp_path, lines, bits=8, method="round", calibration="gamma2.2")
+    path = twin_file(tmp_path, lines, bits=8, method="round", calibration="gamma2.2")
     verdict, _ = verified(path, 2, np.random.default_rng(1))
     assert not any("bit_stealing" in reason for reason in verdict.reasons)
     assert any(reason.startswith("the codes alone") for reason in verdict.reasons)

@@ -265,8 +265,8 @@ def test_centroids_that_are_none_are_left_out():
     said = b'{"q":[1,0,0,0],"centroids":[[1.5,2.5,300,11767],[null,1],[3],[4,5]]}\n'
     (found,) = answers(decoder_of(format="json", fields=[]).feed(0, said))
     assert [tuple(star) for star in found.centroids] == [
-        (1.5, 2.5, 300.0, 11767),
-        (4.0, 5.0, None, None),
+        (1.5, 2.5, 300.0, 11767, None),
+        (4.0, 5.0, None, None, None),
     ]
 
 

@@ -4,8 +4,6 @@ others read them.
 
 from __future__ import annotations
 
-import csv
-
 import numpy as np
 import pyarrow.parquet
 import pytest
@@ -30,6 +28,7 @@ from hilstar.sky.synthetic import colours
 from hilstar.sky.table_reader import G_LESS_I, G_LESS_V, GAIA_RANGE_MAG
 from tests.support.benches import bench_text
 from tests.support.claims import holds
+from tests.support.tables import csv_rows
 
 # Riello et al. 2021 (A&A 649, A3, table C.2) have 0.030 mag of scatter about G - V and 0.038 about
 # G - I of BP - RP. Measured: 0.010 and 0.029 mag by colour (median, 95 %), 0.015 and 0.033 by type,
@@ -43,21 +42,21 @@ DIFFERENCE_LIMIT = 0.01  # of the derivative's step, 0.01 mag over which rates b
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory):
+def catalogue_bench(tmp_path_factory):
     path = tmp_path_factory.mktemp("catalogue") / "bench.toml"
     path.write_text(bench_text({"collimator": {"focal_length_mm": 350}, "sky": {"spectrum": "mk"}}))
     return read_bench_file(path)
 
 
 @pytest.fixture(scope="module")
-def bright(bench):
-    return bench_catalogue(bench, 3.0, 2030.0)
+def bright(catalogue_bench):
+    return bench_catalogue(catalogue_bench, 3.0, 2030.0)
 
 
 @pytest.mark.parametrize("spectrum", ["pickles", "mk"])
-def test_gaia_s_g_follows_the_published_relation(bench, spectrum):
+def test_gaia_s_g_follows_the_published_relation(catalogue_bench, spectrum):
     stars = load_catalog().brighter_than(5.0)
-    kind = star_kinds(bench.config, stars)
+    kind = star_kinds(catalogue_bench.config, stars)
     bp_rp = np.linspace(*GAIA_RANGE_MAG, 2000)
     g_less_v, v_less_i = (
         polyval(bp_rp, G_LESS_V),
@@ -72,9 +71,9 @@ def test_gaia_s_g_follows_the_published_relation(bench, spectrum):
     holds("gaia-g", np.percentile(off, 95))
 
 
-def test_b_is_that_of_ground_photometry(bench):
+def test_b_is_that_of_ground_photometry(catalogue_bench):
     stars = load_catalog().brighter_than(5.0)
-    kind, ground = star_kinds(bench.config, stars), errors_of(stars)["bv_source"] == b"G"
+    kind, ground = star_kinds(catalogue_bench.config, stars), errors_of(stars)["bv_source"] == b"G"
     found = colours("mk", "ballesteros2012", Photometry())["b"](stars.bv_mag, stars.vi_mag, kind)
     off = np.abs(found - stars.bv_mag)[ground & (stars.vi_mag < 2.0)]
     assert len(off) > 1000
@@ -99,14 +98,16 @@ def test_the_nearest_neighbour_is_that_of_all_distances():
 
 
 @pytest.mark.parametrize("spectrum", ["pickles", "mk"])
-def test_the_error_of_an_instrument_magnitude_is_that_of_small_steps(bench, spectrum):
+def test_the_error_of_an_instrument_magnitude_is_that_of_small_steps(catalogue_bench, spectrum):
     from msgspec.structs import replace
 
-    config = replace(bench.config, sky=replace(bench.config.sky, spectrum=spectrum))
+    config = replace(
+        catalogue_bench.config, sky=replace(catalogue_bench.config.sky, spectrum=spectrum)
+    )
     stars = load_catalog().brighter_than(3.0)
     facts, rates, kind = (
         errors_of(stars),
-        star_rates(config, bench.folder),
+        star_rates(config, catalogue_bench.folder),
         star_kinds(config, stars),
     )
     v, bv, vi = stars.v_mag, stars.bv_mag, stars.vi_mag
@@ -152,8 +153,7 @@ def test_a_file_is_read_back_with_units_and_ucds(bright, tmp_path, ending):
             }
             assert header["EPOCH"] == 2030.0
     else:
-        with path.open(newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = csv_rows(path)
         values = {name: np.array([row[name] for row in rows]) for name in rows[0]}
         units = described
     assert list(values) == list(bright.columns)
@@ -170,12 +170,11 @@ def test_a_file_is_read_back_with_units_and_ucds(bright, tmp_path, ending):
             ], name
 
 
-def test_a_type_with_a_comma_stays_in_its_field(bench, tmp_path):
-    made = bench_catalogue(bench, 6.0, None)
+def test_a_type_with_a_comma_stays_in_its_field(catalogue_bench, tmp_path):
+    made = bench_catalogue(catalogue_bench, 6.0, None)
     assert "C0,0 (F8pe)" in made.columns["spectral_type"].values  # HIP 77442
     write_catalogue(tmp_path / "stars.csv", made)
-    with (tmp_path / "stars.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
+    rows = csv_rows(tmp_path / "stars.csv")
     for name in ("spectral_type", "variable", "double", "neighbour"):
         assert [row[name] for row in rows] == made.columns[name].values.tolist()
 
@@ -261,7 +260,9 @@ TABLE_NAMES = {
 
 
 @pytest.mark.parametrize("ending", ["csv", "fits", "vot"])
-def test_a_table_s_own_errors_and_types_are_carried_as_hipparcos_s_are(bench, tmp_path, ending):
+def test_a_table_s_own_errors_and_types_are_carried_as_hipparcos_s_are(
+    catalogue_bench, tmp_path, ending
+):
     from astropy.table import Table
 
     stars = load_catalog().brighter_than(2.5)
@@ -296,7 +297,7 @@ def test_a_table_s_own_errors_and_types_are_carried_as_hipparcos_s_are(bench, tm
     own = read_bench_file(tmp_path / "bench.toml")
     found, wanted = (
         bench_catalogue(own, 2.5, 2030.0).columns,
-        bench_catalogue(bench, 2.5, 2030.0).columns,
+        bench_catalogue(catalogue_bench, 2.5, 2030.0).columns,
     )
     order, theirs = (
         np.lexsort((one["dec_deg"].values, one["v_mag"].values)) for one in (found, wanted)

@@ -26,6 +26,7 @@ from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.bench.star_rates import bench_channels, bench_optics, star_flux
 from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
+from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
 
 # A Gaussian passband each, in percent at 25 nm from 350 to 1000 nm; the red one sees the near
@@ -248,3 +249,22 @@ def test_a_tracker_has_one_quantum_efficiency_or_three(tmp_path, keys, words):
     path.write_text(bench_text({"tracker": keys}))
     with pytest.raises(InputError, match=words):
         read_bench_file(path)
+
+
+def test_light_without_a_colour_of_its_own_has_that_of_the_stars(curves):
+    """Of black bodies: the mean of a bench's stars beside that of one B-V, by the same trapezia."""
+    sky = {"sky": {"spectrum": "blackbody", "brightness": "dgs", "faintest_v_mag": 7.5}}
+    stars = bench_stars(read_bench_file(channels_bench(curves, "rgb", sky)).config, curves)
+    mean = stars.electrons_per_s @ stars.colours
+    for name, bv_mag in (("sun", 0.65), ("vega", 0.0), ("red", 1.5)):
+        own = np.array(integrals(ballesteros_k(bv_mag)))
+        off = mean / mean.sum() / (own / own.sum()) - 1
+        if name == "red":
+            holds("fault-blue", 1 + off[2])
+        else:
+            holds(f"fault-colour-{name}", 100 * np.abs(off).max())
+
+
+def ballesteros_k(bv_mag):
+    """Ballesteros 2012 (EPL 97, 34008), equation 14."""
+    return 4600 * (1 / (0.92 * bv_mag + 1.7) + 1 / (0.92 * bv_mag + 0.62))

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import shutil
 import sys
 from collections import Counter
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import pytest
+from astropy.io import fits
+from astropy.table import Table
+from astropy.wcs import WCS
 
 from hilstar.basics import reading
 from hilstar.server.bench.bench_file import read_bench_file
@@ -69,6 +74,56 @@ def test_a_command_opens_each_file_of_a_bench_once(bench, tmp_path):
     del named["sky.fits"]
     assert named == dict.fromkeys(named, 1)
     assert len(named) == 7
+
+
+TABLE = "ra_deg,dec_deg,v_mag,bv_mag\n84.05,-1.2,1.7,-0.2\n83.0,-0.3,2.2,-0.2\n85.2,-1.9,1.8,-0.2\n"
+
+
+def write_votable(path: Path) -> None:
+    table = Table.read(io.BytesIO(TABLE.encode()), format="ascii.csv")
+    table.write(path, format="votable")
+
+
+def write_fits_table(path: Path) -> None:
+    Table.read(io.BytesIO(TABLE.encode()), format="ascii.csv").write(path)
+
+
+CATALOGUES = {
+    "stars.csv": lambda path: path.write_text(TABLE),
+    "stars.fits": write_fits_table,
+    "stars.vot": write_votable,
+}
+
+
+def write_map(path: Path) -> None:
+    """A map of diffuse light, 2 by 2 degrees about Orion's belt."""
+    wcs = WCS(naxis=2)
+    wcs.wcs.ctype = ["RA---TAN", "DEC--TAN"]
+    wcs.wcs.crval, wcs.wcs.crpix, wcs.wcs.cdelt = [84.0, -1.0], [10.5, 10.5], [-0.1, 0.1]
+    light = fits.PrimaryHDU(np.full((20, 20), 22.0), wcs.to_header())
+    light.header["BUNIT"] = "mag/arcsec2"
+    light.writeto(path)
+
+
+@pytest.mark.parametrize("name", CATALOGUES)
+def test_a_catalogue_and_a_map_are_opened_once_before_they_are_in_the_cache(
+    tmp_path, monkeypatch, name
+):
+    monkeypatch.setattr(reading, "SETTLED_NS", 0)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    catalogue, diffuse = tmp_path / name, tmp_path / "map.fits"
+    CATALOGUES[name](catalogue)
+    write_map(diffuse)
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text({"sky": {"catalogue": name}, "sky.diffuse": {"map": "map.fits"}}))
+    words = ("frame", bench, "--radec", "84,-1,0", "-o", tmp_path / "sky.fits")
+    for first in (True, False):
+        with opened_files() as opened:
+            done = run_hilstar_here(*words)
+        assert done.returncode == 0, done.stderr
+        assert any((tmp_path / "cache").rglob("*.npz"))
+        most = int(first)  # the second command of this process still has them
+        assert (opened[str(catalogue)], opened[str(diffuse)]) == (most, most)
 
 
 def test_a_file_that_changed_is_read_anew(bench):

@@ -14,7 +14,7 @@ from hilstar.optics.frame_motion import CameraTurn, swept_sprites
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Scan
 from hilstar.server.bench.build import load
-from tests.support.real_lens import SIZE, true_places_px, write_bench
+from tests.support.real_lens import SIZE, true_places_px
 
 PLACE_PX = 1e-6
 FIELDS = 20
@@ -28,29 +28,16 @@ PATH_LIMIT = {(0.3, -0.5, 0.2): 0.2, (1.0, 0.8, -1.9): 1.0}
 SHARE_LIMIT = {(0.3, -0.5, 0.2): 3e-3, (1.0, 0.8, -1.9): 1e-2}
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("lens")
-    write_bench(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def bench(folder):
-    with load(folder / "bench.toml") as bench:
-        yield bench
-
-
 def random_attitude(rng):
     q = rng.normal(size=4)
     return q / np.linalg.norm(q)
 
 
-def test_no_star_is_lost_and_none_is_a_ghost(bench, folder, rng):
-    reach = bench.psf.footprint_px // 2
+def test_no_star_is_lost_and_none_is_a_ghost(lens_bench, lens_folder, rng):
+    reach = lens_bench.psf.footprint_px // 2
     for _ in range(FIELDS):
         q = random_attitude(rng)
-        x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
+        x, y = true_places_px(lens_folder, lens_bench.stars.vectors @ to_matrix(q).T)
         inside = (
             (x > -0.5 - reach + 1)
             & (x < SIZE[0] - 0.5 + reach - 1)
@@ -58,7 +45,7 @@ def test_no_star_is_lost_and_none_is_a_ghost(bench, folder, rng):
             & (y < SIZE[1] - 0.5 + reach - 1)
         )
         near = (x > -1 - reach) & (x < SIZE[0] + reach) & (y > -1 - reach) & (y < SIZE[1] + reach)
-        sprites = bench.sprites(q, bench.stars)
+        sprites = lens_bench.sprites(q, lens_bench.stars)
         assert (
             set(np.flatnonzero(inside)) <= set(sprites.star.tolist()) <= set(np.flatnonzero(near))
         )
@@ -68,42 +55,42 @@ def test_no_star_is_lost_and_none_is_a_ghost(bench, folder, rng):
         )
 
 
-def test_light_truth_and_clipping_are_at_the_bent_places(bench, folder, rng):
+def test_light_truth_and_clipping_are_at_the_bent_places(lens_bench, lens_folder, rng):
     q = random_attitude(rng)
-    frame = bench.frame(q)
-    x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
+    frame = lens_bench.frame(q)
+    x, y = true_places_px(lens_folder, lens_bench.stars.vectors @ to_matrix(q).T)
     star = np.flatnonzero((np.abs(x - 960) < 980) & (np.abs(y - 540) < 560))
     wanted = np.zeros(SIZE[::-1])
-    sx, sy = bench.config.render.sprite_sigma_px
+    sx, sy = lens_bench.config.render.sprite_sigma_px
     for k in star:
         share_x, share_y = (
             np.diff(ndtr((np.arange(size + 1) - 0.5 - place) / sigma))
             for size, place, sigma in ((SIZE[0], x[k], sx), (SIZE[1], y[k], sy))
         )
-        wanted += bench.stars.electrons_per_s[k] * np.outer(share_y, share_x)
+        wanted += lens_bench.stars.electrons_per_s[k] * np.outer(share_y, share_x)
     assert np.abs(frame.linear - wanted).max() < SIGMA_SUMS * wanted.max()
-    hip = {int(h): k for k, h in enumerate(bench.stars.hip)}
+    hip = {int(h): k for k, h in enumerate(lens_bench.stars.hip)}
     rows = np.array([hip[int(h)] for h in frame.truth["hip"]])
     assert np.hypot(frame.truth["x_px"] - x[rows], frame.truth["y_px"] - y[rows]).max() < PLACE_PX
     inside = (x[rows] > 3) & (x[rows] < SIZE[0] - 4) & (y[rows] > 3) & (y[rows] < SIZE[1] - 4)
     for row, k in zip(frame.truth[inside], rows[inside], strict=True):
         peak = wanted[round(y[k]), round(x[k])]
-        if not 0.98 < peak / bench.flux_at_white_e_per_s < 1.02:
-            assert row["clipped"] == (peak > bench.flux_at_white_e_per_s)
+        if not 0.98 < peak / lens_bench.flux_at_white_e_per_s < 1.02:
+            assert row["clipped"] == (peak > lens_bench.flux_at_white_e_per_s)
 
 
-def test_exact_codes_put_a_star_in_a_bent_corner_where_it_belongs(bench, folder, rng):
+def test_exact_codes_put_a_star_in_a_bent_corner_where_it_belongs(lens_bench, lens_folder, rng):
     """A code's light over a star's own pixels has its centroid, as far as the monitor's steps
     let it.
     """
     offs = []
     for _ in range(6):
         q = random_attitude(rng)
-        frame = bench.frame(q)
-        light = bench.panel.response.light[frame.levels]
-        x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
-        bright = bench.stars.electrons_per_s > 0.02 * bench.flux_at_white_e_per_s
-        bright &= bench.stars.electrons_per_s < bench.flux_at_white_e_per_s
+        frame = lens_bench.frame(q)
+        light = lens_bench.panel.response.light[frame.levels]
+        x, y = true_places_px(lens_folder, lens_bench.stars.vectors @ to_matrix(q).T)
+        bright = lens_bench.stars.electrons_per_s > 0.02 * lens_bench.flux_at_white_e_per_s
+        bright &= lens_bench.stars.electrons_per_s < lens_bench.flux_at_white_e_per_s
         corner = (
             (np.abs(x - 959.5) > 500)
             & (np.abs(y - 539.5) > 250)
@@ -127,21 +114,26 @@ def test_exact_codes_put_a_star_in_a_bent_corner_where_it_belongs(bench, folder,
 
 
 @pytest.mark.parametrize("rate", [(0.3, -0.5, 0.2), (1.0, 0.8, -1.9)], ids=["slew", "spin"])
-def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folder, rng, rate):
+def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(
+    lens_bench, lens_folder, rng, rate
+):
     """Each star's light on the screen, and its centroid, by small steps of time; none is lost
     that only cuts a corner.
     """
     q, rate = random_attitude(rng), np.array(rate)
-    found = bench.light(bench.view(q, rate))
-    scan = bench.scan
+    found = lens_bench.light(lens_bench.view(q, rate))
+    scan = lens_bench.scan
     near = np.flatnonzero(
-        (bench.shown_stars.vectors @ to_matrix(q).T)[:, 2] > np.cos(np.radians(25))
+        (lens_bench.shown_stars.vectors @ to_matrix(q).T)[:, 2] > np.cos(np.radians(25))
     )
-    stars, rates_e = bench.shown_stars.vectors[near], bench.shown_stars.electrons_per_s[near]
+    stars, rates_e = (
+        lens_bench.shown_stars.vectors[near],
+        lens_bench.shown_stars.electrons_per_s[near],
+    )
 
     def at(seconds):
         turned = to_matrix(propagate(q, rate, seconds))
-        return true_places_px(folder, stars @ turned.T)
+        return true_places_px(lens_folder, stars @ turned.T)
 
     times = np.linspace(-0.6, 0.6, 601) * scan.scanout_s
 
@@ -171,7 +163,7 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
             + np.cross(axis, cam) * np.sin(angle)
             + (cam @ axis)[:, None] * axis * (1 - np.cos(angle))
         )
-        x, y = true_places_px(folder, turned)
+        x, y = true_places_px(lens_folder, turned)
         on = (x > -0.5) & (x < SIZE[0] - 0.5) & (y > -0.5) & (y < SIZE[1] - 0.5)
         total[on] += np.column_stack([np.ones(on.sum()), x[on], y[on]]) / PATH_STEPS
     share, place_of = np.zeros(len(cam)), np.searchsorted(near, found.star)
@@ -190,16 +182,16 @@ def test_paths_are_those_of_the_bent_stars_while_their_rows_are_lit(bench, folde
         assert np.abs(off).max(initial=0) < PATH_LIMIT[tuple(rate)]
 
 
-def test_a_fast_star_that_cuts_a_corner_from_beyond_the_lens_to_beyond_it_is_drawn(bench):
+def test_a_fast_star_that_cuts_a_corner_from_beyond_the_lens_to_beyond_it_is_drawn(lens_bench):
     """The lens ends with the farthest corner, and a path between two places beyond it can still
     cross that corner.
     """
-    star, hold_s, camera = 100, 1 / 60, bench.camera
+    star, hold_s, camera = 100, 1 / 60, lens_bench.camera
     corners = np.array([[3.0, 3.0], [1916.0, 3.0], [3.0, 1076.0], [1916.0, 1076.0]])
     corner = corners[np.argmax(np.hypot(*camera.tangents(*corners.T)))]
     ray = camera.rays(*corner[:, None])[0]
     ray /= np.linalg.norm(ray)
-    from_star = bench.shown_stars.vectors[star]
+    from_star = lens_bench.shown_stars.vectors[star]
     q = np.concatenate([[1 + from_star @ ray], np.cross(from_star, ray)])
     q /= np.linalg.norm(q)
     outward = camera.cam_to_image.T @ [*(camera.cam_to_image @ ray)[:2], 0.0]
@@ -212,41 +204,41 @@ def test_a_fast_star_that_cuts_a_corner_from_beyond_the_lens_to_beyond_it_is_dra
             @ from_star
         )
         assert np.isnan(camera.project(seen[None])[0])
-    sigma_px = bench.config.render.sprite_sigma_px
+    sigma_px = lens_bench.config.render.sprite_sigma_px
     found = swept_sprites(
-        bench.shown_stars, turn, Scan((0, 1), 0.0, hold_s), camera, GaussianPsf(sigma_px)
+        lens_bench.shown_stars, turn, Scan((0, 1), 0.0, hold_s), camera, GaussianPsf(sigma_px)
     )
     assert (
         found.data["electrons_per_s"][found.star == star].sum()
-        > 0.01 * bench.shown_stars.electrons_per_s[star]
+        > 0.01 * lens_bench.shown_stars.electrons_per_s[star]
     )
 
 
-def test_the_crosshair_is_where_the_boresight_is_shown(bench, folder):
-    x, y = true_places_px(folder, np.array([[0.0, 0.0, 1.0]]))
-    assert bench.camera.boresight_px == pytest.approx((x[0], y[0]), abs=PLACE_PX)
+def test_the_crosshair_is_where_the_boresight_is_shown(lens_bench, lens_folder):
+    x, y = true_places_px(lens_folder, np.array([[0.0, 0.0, 1.0]]))
+    assert lens_bench.camera.boresight_px == pytest.approx((x[0], y[0]), abs=PLACE_PX)
     assert np.hypot(x[0] - 974.5, y[0] - 524.0) > 20  # the principal point is elsewhere
 
 
-def test_a_budget_counts_arcseconds_where_a_pixel_is_widest(bench, folder):
+def test_a_budget_counts_arcseconds_where_a_pixel_is_widest(lens_bench, lens_folder):
     """By differences: two directions a small angle apart, all ways, all over the screen."""
     rng, h = np.random.default_rng(8), 1e-6
     x, y = (
         part.ravel() for part in np.meshgrid(np.linspace(0, 1919, 33), np.linspace(0, 1079, 19))
     )
-    seen = bench.camera.rays(x, y)
+    seen = lens_bench.camera.rays(x, y)
     seen /= np.linalg.norm(seen, axis=1, keepdims=True)
     arcsec = []
     for _ in range(60):
         step = np.cross(seen, rng.normal(size=3))
         step /= np.linalg.norm(step, axis=1, keepdims=True)
-        x1, y1 = true_places_px(folder, seen + h * step)
+        x1, y1 = true_places_px(lens_folder, seen + h * step)
         arcsec.append(h / np.hypot(x1 - x, y1 - y) * 206264.806)
-    row = next(row for row in budget(bench).rows if row.centroid_max_px)
+    row = next(row for row in budget(lens_bench).rows if row.centroid_max_px)
     assert row.centroid_max_arcsec / row.centroid_max_px == pytest.approx(np.max(arcsec), rel=0.003)
 
 
-def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_path, rng):
+def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(lens_folder, tmp_path, rng):
     """Codes times the pixels' own light, down to 0.43 of the brightest, add up to the star where
     the lens has it.
     """
@@ -259,15 +251,15 @@ def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_p
         '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\nbits'
         ' = 10\nresponse = "r.csv"\n[uniformity]\nfile = "u.csv"\n'
     )
-    (tmp_path / "geometry.toml").write_text((folder / "geometry.toml").read_text())
+    (tmp_path / "geometry.toml").write_text((lens_folder / "geometry.toml").read_text())
     text = (
-        (folder / "bench.toml")
+        (lens_folder / "bench.toml")
         .read_text()
         .replace("[monitor]", '[monitor]\ncalibration = "c.toml"')
     )
     (tmp_path / "bench.toml").write_text(text)
     wrong = []
-    with load(tmp_path / "bench.toml") as bench:
+    with load(tmp_path / "bench.toml") as lens_bench:
         # The grid's numbers stand for the middles of the screen's quarters, beyond which its slope
         # goes on; the brightest is 1.
         s, t = ((np.arange(size) - (size / 4 - 0.5)) / (size / 2) for size in SIZE)
@@ -275,11 +267,11 @@ def test_a_bent_star_has_its_light_on_a_screen_that_is_not_uniform(folder, tmp_p
         across /= across.max()
         for _ in range(6):
             q = random_attitude(rng)
-            shown = light[bench.frame(q).levels] * across * bench.flux_at_white_e_per_s
-            x, y = true_places_px(folder, bench.stars.vectors @ to_matrix(q).T)
-            rate = bench.stars.electrons_per_s
-            good = (rate > 0.05 * bench.flux_at_white_e_per_s) & (
-                rate < bench.flux_at_white_e_per_s
+            shown = light[lens_bench.frame(q).levels] * across * lens_bench.flux_at_white_e_per_s
+            x, y = true_places_px(lens_folder, lens_bench.stars.vectors @ to_matrix(q).T)
+            rate = lens_bench.stars.electrons_per_s
+            good = (rate > 0.05 * lens_bench.flux_at_white_e_per_s) & (
+                rate < lens_bench.flux_at_white_e_per_s
             )
             good &= (np.abs(x - 959.5) < 940) & (np.abs(y - 539.5) < 520)
             for k in np.flatnonzero(good):

@@ -34,7 +34,7 @@ TABLE = "norad,standard_mag\n" + "".join(f"{10_000 + k},{3}\n" for k in range(60
 
 
 @pytest.fixture
-def bench_file(tmp_path, rng) -> Path:
+def tle_bench(tmp_path, rng) -> Path:
     (tmp_path / "tles.txt").write_text(
         some_orbits(rng, 60) + "OLD\n" + element_set(5, (10.0, 0.0, 0.0, 0.0), 0.001, 18.0)
     )
@@ -64,8 +64,8 @@ def brightest(bench: Bench, t_ns: int) -> tuple[str, tuple[float, float], float]
     return bench.moving.satellites.names[seen.index[k]], place, float(rates[k])
 
 
-def test_a_frame_its_truth_and_a_run_s_frame_have_the_same_satellite(bench_file):
-    with load(bench_file) as bench:
+def test_a_frame_its_truth_and_a_run_s_frame_have_the_same_satellite(tle_bench):
+    with load(tle_bench) as bench:
         t_ns = AT_S * S_NS
         name, place, rate = brightest(bench, t_ns)
         q = from_radec_roll_deg(*place, 20.0)
@@ -107,11 +107,11 @@ def fast_moment(bench: Bench) -> int:
     raise AssertionError("there is none")
 
 
-def test_a_camera_that_follows_a_satellite_has_it_as_a_point_and_stars_as_streaks(bench_file):
+def test_a_camera_that_follows_a_satellite_has_it_as_a_point_and_stars_as_streaks(tle_bench):
     """In the virtual tracker, over half a second; at rest it is the other way round, with the
     same light.
     """
-    with load(bench_file) as bench, Simulator(read_bench_file(bench_file)) as tracker:
+    with load(tle_bench) as bench, Simulator(read_bench_file(tle_bench)) as tracker:
         t_ns = fast_moment(bench)
         name, place, _ = brightest(bench, t_ns)
         q = from_radec_roll_deg(*place, 0.0)
@@ -136,20 +136,20 @@ def test_a_camera_that_follows_a_satellite_has_it_as_a_point_and_stars_as_streak
 SIZE_M = 20_000
 
 
-def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(bench_file):
+def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(tle_bench):
     """Against the same one as a point: the same light, half of it dark, its width that of its
     size and distance.
     """
-    with load(bench_file) as bench:
+    with load(tle_bench) as bench:
         t_ns = fast_moment(bench)
         name, place, _ = brightest(bench, t_ns)
         number = bench.moving.satellites._satellites[
             bench.moving.satellites.names.index(name)
         ].number
-    (bench_file.parent / "seen.csv").write_text(f"norad,standard_mag,size_m\n{number},3,{SIZE_M}\n")
-    bench_file.write_text(bench_file.read_text().replace("[sky]", "[sky]\nfaintest_v_mag = 2.5"))
+    (tle_bench.parent / "seen.csv").write_text(f"norad,standard_mag,size_m\n{number},3,{SIZE_M}\n")
+    tle_bench.write_text(tle_bench.read_text().replace("[sky]", "[sky]\nfaintest_v_mag = 2.5"))
     q = from_radec_roll_deg(*place, 0.0)
-    with load(bench_file) as bench:
+    with load(tle_bench) as bench:
         shot = bench.frame(q, t_ns=t_ns)
         (disc,) = bench.discs(bench.view(q, None, t_ns))
         assert disc.name == name
@@ -171,7 +171,7 @@ def test_one_with_a_size_is_a_disc_with_its_light_which_hides_stars(bench_file):
         assert (row["x_px"], row["y_px"]) == pytest.approx(
             (as_point["x_px"], as_point["y_px"]), abs=1.5
         )
-    with Simulator(read_bench_file(bench_file)) as tracker:
+    with Simulator(read_bench_file(tle_bench)) as tracker:
         found = tracker.expose(tracker.view(q, np.zeros(3), t_ns), None)
         (of_exposure,) = found.truth[found.truth["name"] == name]
         whole_e = found.mean_e.sum()
@@ -189,12 +189,12 @@ def test_stars_behind_a_disc_lose_the_share_of_the_time_in_which_it_is_before_th
     assert hidden(left, three, gone).star.tolist() == [1, 2]
 
 
-def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):
-    with load(bench_file) as bench:
+def test_frame_explains_them_and_attitude_and_verify_know_them(tle_bench):
+    with load(tle_bench) as bench:
         name, place, _ = brightest(bench, 0)
     radec = f"{place[0]:.5f},{place[1]:.5f},0"
     done = run_hilstar_here(
-        "frame", bench_file, "--radec", radec, "--truth", bench_file.parent / "t.csv", "--explain"
+        "frame", tle_bench, "--radec", radec, "--truth", tle_bench.parent / "t.csv", "--explain"
     )
     assert done.returncode == 0, done.stderr
     assert (
@@ -202,9 +202,9 @@ def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):
         " satellite_magnitudes" in done.stderr
     )
     assert done.stderr.count("OLD") == 1
-    assert name in (bench_file.parent / "t.csv").read_text()
-    assert run_hilstar_here("verify", bench_file, "--fields", "1", "--json").returncode == 0
-    budget = run_hilstar_here("budget", bench_file, "--json")
+    assert name in (tle_bench.parent / "t.csv").read_text()
+    assert run_hilstar_here("verify", tle_bench, "--fields", "1", "--json").returncode == 0
+    budget = run_hilstar_here("budget", tle_bench, "--json")
     assert budget.returncode == 0, budget.stderr
     # by stars: of satellites elsewhere no magnitude is known
     assert json.loads(budget.stdout)["clips_v_mag"] < 3
@@ -224,23 +224,23 @@ def test_frame_explains_them_and_attitude_and_verify_know_them(bench_file):
         ("seen.csv", None, "seen.csv: cannot be read"),
     ],
 )
-def test_a_wrong_file_is_one_line_and_exit_code_2(bench_file, named, text, said):
-    path = bench_file.parent / named
+def test_a_wrong_file_is_one_line_and_exit_code_2(tle_bench, named, text, said):
+    path = tle_bench.parent / named
     path.unlink()
     if text is not None:
         path.write_text(text)
     done = run_hilstar_here(
-        "frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv"
+        "frame", tle_bench, "--radec", "0,0,0", "--truth", tle_bench.parent / "t.csv"
     )
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_table_without_a_list_is_refused(bench_file):
-    bench_file.write_text(bench_file.read_text().replace("satellites =", "# satellites ="))
+def test_a_table_without_a_list_is_refused(tle_bench):
+    tle_bench.write_text(tle_bench.read_text().replace("satellites =", "# satellites ="))
     done = run_hilstar_here(
-        "frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv"
+        "frame", tle_bench, "--radec", "0,0,0", "--truth", tle_bench.parent / "t.csv"
     )
     assert done.returncode == 2
     assert (
@@ -248,36 +248,34 @@ def test_a_table_without_a_list_is_refused(bench_file):
     )
 
 
-def test_satellites_need_a_date(bench_file):
-    bench_file.write_text(bench_file.read_text().replace("epoch_utc", "# epoch_utc"))
+def test_satellites_need_a_date(tle_bench):
+    tle_bench.write_text(tle_bench.read_text().replace("epoch_utc", "# epoch_utc"))
     done = run_hilstar_here(
-        "frame", bench_file, "--radec", "0,0,0", "--truth", bench_file.parent / "t.csv"
+        "frame", tle_bench, "--radec", "0,0,0", "--truth", tle_bench.parent / "t.csv"
     )
     assert done.returncode == 2
     assert "need a date" in done.stderr
 
 
-def test_the_bench_s_hash_covers_both_files(bench_file):
-    hashes = {read_bench_file(bench_file).sha256}
+def test_the_bench_s_hash_covers_both_files(tle_bench):
+    hashes = {read_bench_file(tle_bench).sha256}
     for name in ("tles.txt", "seen.csv"):
-        path = bench_file.parent / name
+        path = tle_bench.parent / name
         path.write_text(path.read_text() + "\n")
-        hashes.add(read_bench_file(bench_file).sha256)
+        hashes.add(read_bench_file(tle_bench).sha256)
     assert len(hashes) == 3
 
 
-def test_a_tracker_before_the_display_sees_the_streak_that_one_before_the_sky_sees(bench_file):
+def test_a_tracker_before_the_display_sees_the_streak_that_one_before_the_sky_sees(tle_bench):
     """Frame by frame, each with the satellite's path while it is held; the small screen covers a
     part of the detector.
     """
-    with load(bench_file) as bench:
+    with load(tle_bench) as bench:
         t_ns = fast_moment(bench)
         name, place, _ = brightest(bench, t_ns)
-    text = bench_file.read_text().replace("[sky]", "[sky]\nfaintest_v_mag = 2.5")
-    bench_file.write_text(
-        text.replace("transmission", "psf_sigma_px = [1.0, 1.0]\ntransmission", 1)
-    )
-    q, file = from_radec_roll_deg(*place, 0.0), read_bench_file(bench_file)
+    text = tle_bench.read_text().replace("[sky]", "[sky]\nfaintest_v_mag = 2.5")
+    tle_bench.write_text(text.replace("transmission", "psf_sigma_px = [1.0, 1.0]\ntransmission", 1))
+    q, file = from_radec_roll_deg(*place, 0.0), read_bench_file(tle_bench)
     display = DisplayTracker(file)
     with Simulator(file) as tracker:
         of_sky, of_display = (

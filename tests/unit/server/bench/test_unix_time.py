@@ -29,7 +29,7 @@ LEAP = "2017-01-01T00:00:00"  # a second after 2016-12-31T23:59:60
 
 
 @pytest.fixture
-def bench_file(tmp_path) -> Path:
+def moon_file(tmp_path) -> Path:
     path = tmp_path / "bench.toml"
     path.write_text(bench_text(MOON))
     return path
@@ -49,18 +49,18 @@ def moon_km(sky, t_ns: int) -> np.ndarray:
     "utc",
     ["2016-12-31T12:00:00", "2016-12-31T23:59:59.5", LEAP, "2017-01-01T02:00:00.25", "2017-01-20"],
 )
-def test_before_and_after_a_leap_second_the_moon_is_where_its_utc_has_it(bench_file, started, utc):
-    file = dated(read_bench_file(bench_file), None, utc_ns(started))
+def test_before_and_after_a_leap_second_the_moon_is_where_its_utc_has_it(moon_file, started, utc):
+    file = dated(read_bench_file(moon_file), None, utc_ns(started))
     sky = bench_moving(file.config, file.folder)
     there, wanted = moon_km(sky, utc_ns(utc)), moon_km(moving_sky(utc_ns(utc), ("Moon",)), 0)
     assert np.linalg.norm(there - wanted) / np.linalg.norm(wanted) < LIMIT_ARCSEC * ARCSEC
 
 
-def test_a_second_that_unix_time_leaves_out_moves_the_moon_on(bench_file):
+def test_a_second_that_unix_time_leaves_out_moves_the_moon_on(moon_file):
     """Half a second before it and half a second after: two seconds; counted on from 1970 it
     would be late by 29.
     """
-    file = dated(read_bench_file(bench_file), None, utc_ns(LEAP) - DAY_NS)
+    file = dated(read_bench_file(moon_file), None, utc_ns(LEAP) - DAY_NS)
     sky, zero = bench_moving(file.config, file.folder), utc_ns(LEAP)
     half = 500_000_000
 
@@ -97,8 +97,8 @@ def test_satellites_are_where_sgp4_has_them_at_that_utc(tmp_path, rng):
     assert sky.satellites.place(now) == 3
 
 
-def test_stars_of_a_live_run_are_of_today(bench_file):
-    file = read_bench_file(bench_file)
+def test_stars_of_a_live_run_are_of_today(moon_file):
+    file = read_bench_file(moon_file)
     assert (
         abs(file.config.sky.epoch_jyear - (2000 + (time.time() / 86_400 - 10_957.5) / 365.25))
         < 0.01
@@ -106,17 +106,17 @@ def test_stars_of_a_live_run_are_of_today(bench_file):
     assert at_moment(file, None) is file
 
 
-def test_the_hash_of_a_bench_file_does_not_change_with_the_day(bench_file, monkeypatch):
-    first = read_bench_file(bench_file)
+def test_the_hash_of_a_bench_file_does_not_change_with_the_day(moon_file, monkeypatch):
+    first = read_bench_file(moon_file)
     monkeypatch.setattr(time, "time_ns", lambda: utc_ns("2031-05-05T00:00:00"))
-    later = read_bench_file(bench_file)
+    later = read_bench_file(moon_file)
     assert first.sha256 == later.sha256
     assert later.config.sky.epoch_jyear == pytest.approx(2031.34, abs=0.01)
 
 
-def test_a_log_in_another_scale_is_refused(bench_file):
+def test_a_log_in_another_scale_is_refused(moon_file):
     with pytest.raises(InputError, match='"unix": the times of this log are TAI; write "source"'):
-        dated(read_bench_file(bench_file), "TAI", 10**18)
+        dated(read_bench_file(moon_file), "TAI", 10**18)
 
 
 def test_a_log_in_utc_may_cross_a_leap_second(tmp_path):

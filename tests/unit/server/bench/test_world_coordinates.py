@@ -14,27 +14,13 @@ from astropy.wcs import WCS
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.optics.camera import Lens, ResidualField, bounded
-from hilstar.server.bench.build import load
 from hilstar.server.bench.frame_files import MAX_SIP_PX, world_coordinates, write_frame_fits
 from tests.support.claims import holds
-from tests.support.real_lens import SIZE, true_places_px, write_bench
+from tests.support.real_lens import SIZE, true_places_px
 
 ATTITUDES = [(84.0, -1.2, 30.0), (283.0, 89.2, -170.0), (359.9, -60.0, 100.0)]
 # The header's own figure is of 25 places along each side.
 BETWEEN_PLACES = 1.25
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("lens")
-    write_bench(folder)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def bench(folder):
-    with load(folder / "bench.toml") as bench:
-        yield bench
 
 
 def sky_of(camera, q, x_px, y_px):
@@ -51,14 +37,16 @@ def whole_screen():
 
 
 @pytest.mark.parametrize("radec_roll", ATTITUDES)
-def test_a_fits_file_of_a_bent_sky_is_read_within_what_it_says(bench, folder, tmp_path, radec_roll):
+def test_a_fits_file_of_a_bent_sky_is_read_within_what_it_says(
+    lens_bench, lens_folder, tmp_path, radec_roll
+):
     q = from_radec_roll_deg(*radec_roll)
-    write_frame_fits(tmp_path / "f.fits", bench, bench.frame(q))
+    write_frame_fits(tmp_path / "f.fits", lens_bench, lens_bench.frame(q))
     header = fits.getheader(tmp_path / "f.fits")
     assert (header["CTYPE1"], header["LENS"]) == ("RA---TAN-SIP", True)
     assert header["LENSERR"] < MAX_SIP_PX
-    ra_deg, dec_deg, cam = sky_of(bench.camera, q, *whole_screen())
-    true = np.column_stack(true_places_px(folder, cam))
+    ra_deg, dec_deg, cam = sky_of(lens_bench.camera, q, *whole_screen())
+    true = np.column_stack(true_places_px(lens_folder, cam))
     wcs = WCS(header)
     # SIP alone finds the pixel by iteration; the polynomials AP and BP do so at once.
     flat = np.column_stack(wcs.wcs_world2pix(ra_deg, dec_deg, 0)) - (wcs.wcs.crpix - 1)

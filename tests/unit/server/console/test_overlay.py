@@ -20,13 +20,15 @@ pytestmark = pytest.mark.gpu
 
 
 @pytest.fixture
-def bench(bench_with):
+def overlay_bench(bench_with):
     return bench_with()
 
 
-def test_truth_has_the_stars_of_the_frame_at_their_places(bench):
-    frame = bench.frame(ORION_Q)
-    told = msgspec.to_builtins(overlay_of(bench).truth(0, np.array(ORION_Q), (26311,)))["stars"]
+def test_truth_has_the_stars_of_the_frame_at_their_places(overlay_bench):
+    frame = overlay_bench.frame(ORION_Q)
+    told = msgspec.to_builtins(overlay_of(overlay_bench).truth(0, np.array(ORION_Q), (26311,)))[
+        "stars"
+    ]
     drawn = frame.truth[frame.truth["drawn"]]
     places = {int(row["hip"]): (row["x_px"], row["y_px"]) for row in drawn}
     inside = {
@@ -41,11 +43,11 @@ def test_truth_has_the_stars_of_the_frame_at_their_places(bench):
     assert told[0][4] == "ε Ori"
 
 
-def test_the_tracker_s_field_is_as_wide_as_its_focal_length_makes_it(bench):
+def test_the_tracker_s_field_is_as_wide_as_its_focal_length_makes_it(overlay_bench):
     """1024 pixels of 13 um at 70 mm, on a screen with 57.65 um at 60 mm: 1024 * 13 / 70 * 60 /
     57.65 px.
     """
-    outline = np.array(overlay_of(bench).truth(0, np.array(ORION_Q)).tracker_px)
+    outline = np.array(overlay_of(overlay_bench).truth(0, np.array(ORION_Q)).tracker_px)
     wanted_px = 1024 * 13 / 70 * 60 / 57.65
     assert np.ptp(outline, axis=0) == pytest.approx([wanted_px, wanted_px], abs=2 * ROUNDED_PX)
     assert (outline.min(axis=0) + outline.max(axis=0)) / 2 == pytest.approx(
@@ -57,14 +59,14 @@ def test_the_tracker_s_field_is_as_wide_as_its_focal_length_makes_it(bench):
     ("ra_deg", "dec_deg", "roll_deg"),
     [(84.057, -1.2, 0.0), (0.1, 60.0, 40.0), (200.0, 89.5, 10.0), (359.9, -90.0, 5.0)],
 )
-def test_each_line_of_the_grid_is_where_its_label_says(bench, ra_deg, dec_deg, roll_deg):
+def test_each_line_of_the_grid_is_where_its_label_says(overlay_bench, ra_deg, dec_deg, roll_deg):
     q = from_radec_roll_deg(ra_deg, dec_deg, roll_deg)
-    lines = msgspec.to_builtins(overlay_of(bench).truth(0, q))["grid"]
+    lines = msgspec.to_builtins(overlay_of(overlay_bench).truth(0, q))["grid"]
     kinds = {line["label"].split()[0] for line in lines}
     assert kinds == {"RA", "Dec"} and 6 <= len(lines) <= 80
     for line in lines:
         kind, text = line["label"].replace("\N{MINUS SIGN}", "-").rstrip("\N{DEGREE SIGN}").split()
-        x, y, z = (bench.camera.rays(*np.array(line["px"]).T) @ to_matrix(q)).T
+        x, y, z = (overlay_bench.camera.rays(*np.array(line["px"]).T) @ to_matrix(q)).T
         if kind == "Dec":
             off_deg = np.degrees(np.arctan2(z, np.hypot(x, y))) - float(text)
         else:
@@ -77,8 +79,8 @@ def test_each_line_of_the_grid_is_where_its_label_says(bench, ra_deg, dec_deg, r
         assert np.abs(off_deg).max() < LINE_DEG
 
 
-def test_the_sky_has_the_brightest_star_first_and_the_screen_s_corners(bench):
-    told = msgspec.to_builtins(overlay_of(bench).sky())
+def test_the_sky_has_the_brightest_star_first_and_the_screen_s_corners(overlay_bench):
+    told = msgspec.to_builtins(overlay_of(overlay_bench).sky())
     assert told["stars"][0][2:] == [-1.44, "α CMa"]  # Hipparcos' V of Sirius
     assert len(told["stars"]) > 2500  # Hipparcos has 2850 stars over V = 5.5
     corners = np.array(told["screen_cam"])

@@ -51,7 +51,7 @@ def frame_record(k: int, **more: object) -> FrameRecord:
 
 
 @pytest.fixture(scope="module")
-def run() -> RunFigures:
+def reported_run() -> RunFigures:
     figures = RunFigures(
         {
             "unix_ns": str(1_800_000_000 * 10**9),
@@ -69,8 +69,8 @@ def run() -> RunFigures:
     return figures
 
 
-def test_the_page_stands_alone_and_lets_nothing_else_in(run):
-    page = report_page(run_data("run.mcap", run, summarise(run)))
+def test_the_page_stands_alone_and_lets_nothing_else_in(reported_run):
+    page = report_page(run_data("run.mcap", reported_run, summarise(reported_run)))
     policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)
     script = re.search(r'<script type="module">(.*?)</script>', page, re.DOTALL)
     uplot = re.search(r"<script>(.*?)</script>", page, re.DOTALL)
@@ -108,8 +108,8 @@ def test_every_module_of_the_page_can_be_taken_into_it():
         assert not re.search(r"^(?:import|export)\b", one_script(path.stem), re.MULTILINE)
 
 
-def test_a_long_run_keeps_its_worst_frame_and_stays_small(run):
-    page = report_page(run_data("run.mcap", run, summarise(run)))
+def test_a_long_run_keeps_its_worst_frame_and_stays_small(reported_run):
+    page = report_page(run_data("run.mcap", reported_run, summarise(reported_run)))
     assert len(page) < MAX_PAGE_BYTES
     told = run_data_of(page)
     spans = told["spans"]
@@ -129,8 +129,8 @@ def test_a_long_run_keeps_its_worst_frame_and_stays_small(run):
     ]
 
 
-def test_packets_are_counted_at_their_time(run):
-    told = run_data("run.mcap", run, summarise(run))["packets"]
+def test_packets_are_counted_at_their_time(reported_run):
+    told = run_data("run.mcap", reported_run, summarise(reported_run))["packets"]
     *accepted, last = told["accepted_hz"]
     assert last is None  # the run ended before this bin did
     rate_hz = FRAMES / (told["t_s"][-1] + told["width_s"])

@@ -36,7 +36,7 @@ def attitude_of_frame(k: int) -> tuple[float, ...]:
 
 
 @pytest.fixture
-def ledger(bench_with, tmp_path) -> tuple[Path, Bench]:
+def pictures_ledger(bench_with, tmp_path) -> tuple[Path, Bench]:
     """40 frames of a turn, the first without an attitude."""
     bench = bench_with()
     with Ledger(tmp_path / "run.mcap", bench) as written:
@@ -50,8 +50,8 @@ def ledger(bench_with, tmp_path) -> tuple[Path, Bench]:
     return tmp_path / "run.mcap", bench
 
 
-def test_pictures_are_the_codes_of_the_run(ledger, tmp_path):
-    path, bench = ledger
+def test_pictures_are_the_codes_of_the_run(pictures_ledger, tmp_path):
+    path, bench = pictures_ledger
     report(path, tmp_path)
     data = run_data_of((tmp_path / "report.html").read_text())
     pictures = data["pictures"]
@@ -113,9 +113,9 @@ def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gon
 
 
 def test_of_a_ledger_that_was_cut_off_what_is_whole_is_reported_and_the_page_says_so(
-    ledger, tmp_path
+    pictures_ledger, tmp_path
 ):
-    path, _ = ledger
+    path, _ = pictures_ledger
     (tmp_path / "cut.mcap").write_bytes(path.read_bytes()[:-400])
     assert report(tmp_path / "cut.mcap", tmp_path).frames == 40
     data = run_data_of((tmp_path / "report.html").read_text())

@@ -4,6 +4,7 @@ terminal's status.
 
 from __future__ import annotations
 
+import time
 from types import SimpleNamespace
 
 import msgspec
@@ -13,6 +14,7 @@ import pytest
 from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.server.answers.judge import TrackerFigures
+from hilstar.server.answers.star_widths import FocusState
 from hilstar.server.console.messages import NewAnswer, RunState, Setup, SharedMemory
 from hilstar.server.console.overlay import overlay_of
 from hilstar.server.console.protocol import AttitudeSource, Hello
@@ -41,6 +43,32 @@ def put_answer(reader: RunReader, figures: TrackerFigures) -> None:
     reader._memory.answers.put(
         msgspec.json.encode(NewAnswer(figures, tuple(ORION_Q), [(1.0, 2.0)]))
     )
+
+
+def put_focus(reader: RunReader, focus: FocusState) -> None:
+    state = RunState(host_ns=time.monotonic_ns(), focus=focus)
+    reader._memory.states.put(msgspec.json.encode(state))
+    reader.look()
+
+
+def test_a_figure_of_the_focus_is_one_point_of_its_chart(reader):
+    put_focus(reader, FocusState(number=1, what="star sigma", sigma_px=1.25))
+    assert reader.points[-1].focus_px == 1.25
+    assert reader.state().focus.sigma_px == 1.25
+    reader.look()
+    assert reader.points[-1].focus_px is None  # the same figure makes no second point
+    put_focus(reader, FocusState(number=2, what="star sigma", line="no star"))
+    assert reader.points[-1].focus_px is None
+    put_focus(reader, FocusState(number=3, what="star sigma", sigma_px=1.5))
+    assert reader.points[-1].focus_px == 1.5
+
+
+def test_a_session_that_measures_the_focus_says_so(reader):
+    reader.setup.pace = "session"
+    reader.look()
+    assert reader.health_now().headline != "The focus is measured"
+    put_focus(reader, FocusState(number=1, what="PSF sigma", sigma_px=1.25))
+    assert reader.health_now().headline == "The focus is measured"
 
 
 def test_an_answer_is_read_once_and_makes_a_point_of_the_chart(reader):

@@ -71,7 +71,7 @@ turn_deg = [0, 0.5, 0]
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory):
+def replays(tmp_path_factory):
     path = tmp_path_factory.mktemp("faults") / "bench.toml"
     path.write_text(
         bench_text(
@@ -83,7 +83,7 @@ def bench(tmp_path_factory):
 
 
 @pytest.fixture
-def log(tmp_path):
+def slow_log(tmp_path):
     """A slow turn, so that a frame that stays is told from the next."""
     path = tmp_path / "log.csv"
     path.write_text(f"t_s,qw,qx,qy,qz\n5,{ATTITUDE}\n6,0.69872,0.71351,-0.03604,0.03729\n")
@@ -91,43 +91,45 @@ def log(tmp_path):
     return path
 
 
-def played(bench, log, ledger=None, scenario=None, notices=None):
+def played(replays, slow_log, ledger=None, scenario=None, notices=None):
     """The frames of a replay as fast as possible: codes by number, and the summary."""
     notices = notices or Notices()
     frames, codes = [], {}
-    kept = LedgerSwitch(None if ledger is None else Ledger(ledger, bench, notices))
-    faults = None if scenario is None else RunFaults(bench, scenario, notices, kept)
+    kept = LedgerSwitch(None if ledger is None else Ledger(ledger, replays, notices))
+    faults = None if scenario is None else RunFaults(replays, scenario, notices, kept)
 
     def sink(shown):
         frames.append(shown)
         codes[shown.number] = shown.drawn.levels.copy()
 
-    play = plan_play(log, Wanted(speed=float("inf")), bench.config)
-    summary = replay(bench, play, sink, Outlet(ledger=kept, notices=notices, faults=faults))
+    play = plan_play(slow_log, Wanted(speed=float("inf")), replays.config)
+    summary = replay(replays, play, sink, Outlet(ledger=kept, notices=notices, faults=faults))
     kept.end()
     return frames, codes, summary
 
 
-def test_a_scenario_is_replayed_from_its_ledger_code_for_code(bench, log, tmp_path):
+def test_a_scenario_is_replayed_from_its_ledger_code_for_code(replays, slow_log, tmp_path):
     scenario = parse_scenario(tmp_path / "faults.toml", SCENARIO)
-    frames, codes, summary = played(bench, log, tmp_path / "run.mcap", scenario)
+    frames, codes, summary = played(replays, slow_log, tmp_path / "run.mcap", scenario)
     assert summary.faults["started"] == dict.fromkeys([f.name for f in scenario.faults], 1)
     assert summary.faults["dropped_frames"] + len(frames) == 51
     assert 0 < summary.faults["dropped_frames"] < 5
-    _again, same, _ = played(bench, tmp_path / "run.mcap", tmp_path / "again.mcap")
+    _again, same, _ = played(replays, tmp_path / "run.mcap", tmp_path / "again.mcap")
     assert codes.keys() == same.keys()
     assert all(np.array_equal(codes[number], same[number]) for number in codes)
     # the ledger of a replay has the faults too
-    _third, last, told = played(bench, tmp_path / "again.mcap")
+    _third, last, told = played(replays, tmp_path / "again.mcap")
     assert all(np.array_equal(codes[number], last[number]) for number in codes)
     assert told.faults["recorded"] == summary.faults["started"]
 
 
-def test_the_same_scenario_twice_is_the_same_light_and_another_seed_is_not(bench, log, tmp_path):
+def test_the_same_scenario_twice_is_the_same_light_and_another_seed_is_not(
+    replays, slow_log, tmp_path
+):
     runs = [
         played(
-            bench,
-            log,
+            replays,
+            slow_log,
             scenario=parse_scenario(
                 tmp_path / "f.toml", SCENARIO.replace("seed = 1", f"seed = {seed}")
             ),
@@ -138,7 +140,7 @@ def test_the_same_scenario_twice_is_the_same_light_and_another_seed_is_not(bench
     assert any(not np.array_equal(runs[0][k], runs[2][k]) for k in runs[0].keys() & runs[2].keys())
 
 
-def test_a_frame_without_faults_is_that_of_a_run_without_a_scenario(log, tmp_path):
+def test_a_frame_without_faults_is_that_of_a_run_without_a_scenario(slow_log, tmp_path):
     """Not with `temporal`, whose stars make up for what the frames with faults left."""
     path = tmp_path / "bench.toml"
     path.write_text(
@@ -146,19 +148,19 @@ def test_a_frame_without_faults_is_that_of_a_run_without_a_scenario(log, tmp_pat
             {"monitor": {"refresh_hz": 50}, "render": {"quantisation": "exact", "motion": "on"}}
         )
     )
-    with hilstar.load(path) as bench:
+    with hilstar.load(path) as replays:
         frames, codes, _ = played(
-            bench, log, scenario=parse_scenario(tmp_path / "f.toml", SCENARIO)
+            replays, slow_log, scenario=parse_scenario(tmp_path / "f.toml", SCENARIO)
         )
-        _, plain, _ = played(bench, log)
+        _, plain, _ = played(replays, slow_log)
     free = [shown.number for shown in frames if not shown.faults]
     assert len(free) >= 3
     assert all(np.array_equal(codes[k], plain[k]) for k in free)
 
 
-def test_frames_freeze_and_blank_and_the_ledger_says_by_what(bench, log, tmp_path):
+def test_frames_freeze_and_blank_and_the_ledger_says_by_what(replays, slow_log, tmp_path):
     scenario = parse_scenario(tmp_path / "faults.toml", SCENARIO)
-    frames, codes, _ = played(bench, log, tmp_path / "run.mcap", scenario)
+    frames, codes, _ = played(replays, slow_log, tmp_path / "run.mcap", scenario)
     # what stands on the display grows older
     of = {shown.number: shown for shown in frames}
     for k in range(20, 25):
@@ -178,17 +180,21 @@ def test_frames_freeze_and_blank_and_the_ledger_says_by_what(bench, log, tmp_pat
     assert [number for number, faults in on.items() if ghost in faults] == list(range(2, 16))
 
 
-def test_a_map_that_has_changed_is_not_replayed_as_if_it_were_the_run_s(bench, log, tmp_path):
-    played(bench, log, tmp_path / "run.mcap", parse_scenario(tmp_path / "faults.toml", SCENARIO))
+def test_a_map_that_has_changed_is_not_replayed_as_if_it_were_the_run_s(
+    replays, slow_log, tmp_path
+):
+    played(
+        replays, slow_log, tmp_path / "run.mcap", parse_scenario(tmp_path / "faults.toml", SCENARIO)
+    )
     np.save(tmp_path / "stray.npy", np.ones((10, 10)))
     assert "is not the map that the run had" in refusal(read_recording, tmp_path / "run.mcap")
 
 
-def test_the_console_starts_a_fault_of_the_scenario_while_it_runs(bench, log, tmp_path):
+def test_the_console_starts_a_fault_of_the_scenario_while_it_runs(replays, slow_log, tmp_path):
     scenario = parse_scenario(tmp_path / "f.toml", '[[fault]]\nkind = "blank"\nname = "cover"')
     notices, heard = Notices(), []
     notices.listen(heard.append)
-    faults = RunFaults(bench, scenario, notices)
+    faults = RunFaults(replays, scenario, notices)
     codes = {}
 
     def sink(shown):
@@ -199,8 +205,8 @@ def test_the_console_starts_a_fault_of_the_scenario_while_it_runs(bench, log, tm
             faults.schedule.stop("cover", "Ada")
 
     replay(
-        bench,
-        plan_play(log, Wanted(speed=float("inf")), bench.config),
+        replays,
+        plan_play(slow_log, Wanted(speed=float("inf")), replays.config),
         sink,
         Outlet(notices=notices, faults=faults),
     )

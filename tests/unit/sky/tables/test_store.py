@@ -18,14 +18,14 @@ TEXT = "ra_deg,dec_deg,vmag,b-v\n1,2,3,0.1\n4,5,6,\n7,8,9,0.5\n"
 
 
 @pytest.fixture
-def table(tmp_path, monkeypatch):
+def stored_table(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     (tmp_path / "t.csv").write_text(TEXT)
     return tmp_path / "t.csv"
 
 
-def stored(table):
-    return sorted((table.parent / "cache" / "hilstar").glob("*"))
+def stored(stored_table):
+    return sorted((stored_table.parent / "cache" / "hilstar").glob("*"))
 
 
 def rewritten(path, **changes):
@@ -42,34 +42,35 @@ def is_same_catalogue(a, b):
     )
 
 
-def test_the_second_time_the_cache_is_read_and_says_the_same(table, caplog):
-    first = choose_catalog(TableChoice(table))
+def test_the_second_time_the_cache_is_read_and_says_the_same(stored_table, caplog):
+    first = choose_catalog(TableChoice(stored_table))
     assert "1 without a magnitude" in caplog.text
     caplog.clear()
-    (path,) = stored(table)
+    (path,) = stored(stored_table)
     rewritten(path, v_mag=np.array([1.0, 2.0]))
-    second = choose_catalog(TableChoice(table))
+    second = choose_catalog(TableChoice(stored_table))
     assert second.v_mag.tolist() == [1.0, 2.0]  # the cache's, which shows that it was read
     assert "1 without a magnitude" in caplog.text
     assert (second.notes, second.rows_read, second.designation) == (first.notes, 3, "t row")
 
 
-def test_another_content_epoch_or_company_is_another_catalogue(table):
-    choose_catalog(TableChoice(table))
-    choose_catalog(TableChoice(table, epoch_jyear=2000.0))
+def test_another_content_epoch_or_company_is_another_catalogue(stored_table):
+    choose_catalog(TableChoice(stored_table))
+    choose_catalog(TableChoice(stored_table, epoch_jyear=2000.0))
     assert (
-        len(choose_catalog(TableChoice(table, with_hipparcos=True, epoch_jyear=2000.0))) > 100_000
+        len(choose_catalog(TableChoice(stored_table, with_hipparcos=True, epoch_jyear=2000.0)))
+        > 100_000
     )
-    before = table.stat()
-    table.write_text(TEXT.replace("0.5", "0.7"))
-    os.utime(table, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
-    assert 0.7 in choose_catalog(TableChoice(table)).bv_mag
-    assert len(stored(table)) == 4
+    before = stored_table.stat()
+    stored_table.write_text(TEXT.replace("0.5", "0.7"))
+    os.utime(stored_table, ns=(before.st_atime_ns, before.st_mtime_ns + 1))
+    assert 0.7 in choose_catalog(TableChoice(stored_table)).bv_mag
+    assert len(stored(stored_table)) == 4
 
 
-def test_a_damaged_or_hostile_cache_is_made_anew(table):
-    whole = choose_catalog(TableChoice(table))
-    (path,) = stored(table)
+def test_a_damaged_or_hostile_cache_is_made_anew(stored_table):
+    whole = choose_catalog(TableChoice(stored_table))
+    (path,) = stored(stored_table)
     good = path.read_bytes()
 
     def objects():
@@ -95,7 +96,7 @@ def test_a_damaged_or_hostile_cache_is_made_anew(table):
     ]
     for k, harm in enumerate(damage):
         harm()
-        assert is_same_catalogue(choose_catalog(TableChoice(table)), whole), k
+        assert is_same_catalogue(choose_catalog(TableChoice(stored_table)), whole), k
         if path.is_file():
             assert path.read_bytes() == good, k
 
@@ -110,42 +111,42 @@ class Harm:
         return Path.touch, (self.path,)
 
 
-def test_nothing_in_a_cache_is_run(table, tmp_path):
-    choose_catalog(TableChoice(table))
-    (path,) = stored(table)
+def test_nothing_in_a_cache_is_run(stored_table, tmp_path):
+    choose_catalog(TableChoice(stored_table))
+    (path,) = stored(stored_table)
     rewritten(path, v_mag=np.array([Harm(tmp_path / "run"), None], dtype=object))
-    choose_catalog(TableChoice(table))
+    choose_catalog(TableChoice(stored_table))
     assert not (tmp_path / "run").exists()
 
 
-def test_nothing_depends_on_a_place_for_the_cache(table, monkeypatch, tmp_path):
+def test_nothing_depends_on_a_place_for_the_cache(stored_table, monkeypatch, tmp_path):
     (tmp_path / "file").write_text("no directory")
     for named in (str(tmp_path / "file"), "/proc/none", "relative"):
         monkeypatch.setenv("XDG_CACHE_HOME", named)
         monkeypatch.setenv("HOME", "/proc/none")
-        assert len(choose_catalog(TableChoice(table))) == 2
+        assert len(choose_catalog(TableChoice(stored_table))) == 2
     assert not (tmp_path / "relative").exists()
 
 
-def test_only_the_newest_files_are_kept(table):
+def test_only_the_newest_files_are_kept(stored_table):
     for k in range(KEPT_FILES + 2):
-        choose_catalog(TableChoice(table, epoch_jyear=2000.0 + k))
-    assert len(stored(table)) == KEPT_FILES
+        choose_catalog(TableChoice(stored_table, epoch_jyear=2000.0 + k))
+    assert len(stored(stored_table)) == KEPT_FILES
 
 
 @pytest.mark.e2e
-def test_two_processes_at_once_both_have_the_catalogue(table):
+def test_two_processes_at_once_both_have_the_catalogue(stored_table):
     program = (
         "import sys; from pathlib import Path; from hilstar.sky.star_table import *;"
         "print(len(choose_catalog(TableChoice(Path(sys.argv[1])))))"
     )
     runs = [
-        subprocess.Popen([sys.executable, "-c", program, table], stdout=subprocess.PIPE)
+        subprocess.Popen([sys.executable, "-c", program, stored_table], stdout=subprocess.PIPE)
         for _ in range(2)
     ]
     counts = [run.communicate(timeout=PATIENCE_S)[0].strip() for run in runs]
     assert counts == [b"2"] * 2
-    (path,) = stored(table)
+    (path,) = stored(stored_table)
     rewritten(path, v_mag=np.array([1.0, 2.0]))
     # what they left is whole
-    assert choose_catalog(TableChoice(table)).v_mag.tolist() == [1.0, 2.0]
+    assert choose_catalog(TableChoice(stored_table)).v_mag.tolist() == [1.0, 2.0]

@@ -54,7 +54,7 @@ def motion():
 
 
 @pytest.fixture
-def folder(tmp_path):
+def kernels_folder(tmp_path):
     ck.write_texts(tmp_path)
     return tmp_path
 
@@ -68,10 +68,10 @@ def seconds_of(found):
 
 @pytest.mark.parametrize("rates", [True, False])
 @pytest.mark.parametrize("kind", [1, 3])
-def test_instances_are_read_back_with_their_rates(folder, motion, kind, rates):
-    with ck.new_ck(folder / "a.bc") as handle:
+def test_instances_are_read_back_with_their_rates(kernels_folder, motion, kind, rates):
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, kind, motion, TIMES, rates=rates)
-    found, said = read_ck(folder / "a.bc")
+    found, said = read_ck(kernels_folder / "a.bc")
     assert said == {"structure": "-82000", "references": ["J2000"]}
     assert seconds_of(found).tolist() == TIMES.tolist()
     for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
@@ -107,9 +107,9 @@ def write_kind(path, motion, kind, subtype, rates):
     [(2, 0, True), (5, 0, True), (5, 1, False), (5, 2, True), (6, 0, True)],
 )
 def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(
-    folder, motion, kind, subtype, rates
+    kernels_folder, motion, kind, subtype, rates
 ):
-    path = folder / "a.bc"
+    path = kernels_folder / "a.bc"
     write_kind(path, motion, kind, subtype, rates)
     found, _ = read_ck(path)
     samples = [AttitudeSample(t, q, rate, 0, b) for t, q, rate, b in zip(found.t_ns.tolist(), found.q, found.rate, found.breaks, strict=True)]  # fmt: skip
@@ -117,7 +117,9 @@ def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(
     assert found.step_s is not None
     assert found.error_rad < BETWEEN_RAD
     rng = np.random.default_rng(kind)
-    with spiceypy.KernelPool([str(folder / name) for name in ("leap.tls", "clock.tsc", "a.bc")]):
+    with spiceypy.KernelPool(
+        [str(kernels_folder / name) for name in ("leap.tls", "clock.tsc", "a.bc")]
+    ):
         for second in rng.uniform(0.0, seconds_of(found)[-1], 60):
             matrix = spiceypy.ckgp(ck.BODY, second * ck.TICKS_PER_S, 0, "J2000")[0]
             shown = timeline.at(J2000_NS + round((ck.START_S + second) * NS_PER_S))
@@ -135,10 +137,10 @@ def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(
 OBLIQUITY_ARCSEC = 84381.448  # of J2000, IAU 1976: SPICE's ECLIPJ2000
 
 
-def test_the_ecliptic_is_turned_by_the_obliquity(folder, motion):
-    with ck.new_ck(folder / "a.bc") as handle:
+def test_the_ecliptic_is_turned_by_the_obliquity(kernels_folder, motion):
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, reference="ECLIPJ2000")
-    found, said = read_ck(folder / "a.bc")
+    found, said = read_ck(kernels_folder / "a.bc")
     assert said["references"] == ["ECLIPJ2000"]
     ecliptic_to_icrs = Rotation.from_euler("x", OBLIQUITY_ARCSEC / 3600, degrees=True)
     for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
@@ -149,18 +151,18 @@ def test_the_ecliptic_is_turned_by_the_obliquity(folder, motion):
 
 
 @pytest.mark.parametrize("reference", ["FK4", "GALACTIC", "PROBE_TABLE", "IAU_EARTH"])
-def test_other_frames_are_turned_as_spice_turns_vectors(folder, motion, reference):
-    ck.write_texts(folder, frames_tf=ck.frame_kernel(), earth_tpc=ck.EARTH)
+def test_other_frames_are_turned_as_spice_turns_vectors(kernels_folder, motion, reference):
+    ck.write_texts(kernels_folder, frames_tf=ck.frame_kernel(), earth_tpc=ck.EARTH)
     kernels = ("leap.tls", "clock.tsc", "frames.tf", "earth.tpc")
-    with ck.new_ck(folder / "a.bc") as handle:
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, reference="J2000")
     with (
-        ck.new_ck(folder / "b.bc") as handle,
-        spiceypy.KernelPool([str(folder / kernel) for kernel in kernels]),
+        ck.new_ck(kernels_folder / "b.bc") as handle,
+        spiceypy.KernelPool([str(kernels_folder / kernel) for kernel in kernels]),
     ):
         ck.write_segment(handle, 3, motion, TIMES, reference=reference)
-    found, _ = read_ck(folder / "b.bc", kernels=kernels)
-    with spiceypy.KernelPool([str(folder / kernel) for kernel in kernels]):
+    found, _ = read_ck(kernels_folder / "b.bc", kernels=kernels)
+    with spiceypy.KernelPool([str(kernels_folder / kernel) for kernel in kernels]):
         for second, q, rate in zip(TIMES, found.q, found.rate, strict=True):
             change = spiceypy.sxform("J2000", reference, ck.START_S + second)
             to_body = motion.turn(second).inv().as_matrix()
@@ -172,10 +174,10 @@ def test_other_frames_are_turned_as_spice_turns_vectors(folder, motion, referenc
             assert rate == pytest.approx(motion.rate(second) + to_body @ turning, abs=RATE_RAD_S)
 
 
-def test_the_rate_carries_the_attitude_on(folder, motion):
-    with ck.new_ck(folder / "a.bc") as handle:
+def test_the_rate_carries_the_attitude_on(kernels_folder, motion):
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, np.array([0.0, 1.0 / 1024]), reference="J2000")
-    found, _ = read_ck(folder / "a.bc")
+    found, _ = read_ck(kernels_folder / "a.bc")
     turned = to_matrix(found.q[1]) @ to_matrix(found.q[0]).T
     # v' = -w x v over h = 1e-3 s, by the mean rate: h^3 w^3 / 12 = 1e-14.
     by_rate = Rotation.from_rotvec(-found.rate.mean(axis=0) / 1024).as_matrix()
@@ -185,20 +187,22 @@ def test_the_rate_carries_the_attitude_on(folder, motion):
 # Coverage
 
 
-def test_the_attitude_is_held_between_intervals_of_interpolation(folder, motion):
-    with ck.new_ck(folder / "a.bc") as handle:
+def test_the_attitude_is_held_between_intervals_of_interpolation(kernels_folder, motion):
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, starts=[0.0, 2.0, 4.0])
-    found, _ = read_ck(folder / "a.bc")
+    found, _ = read_ck(kernels_folder / "a.bc")
     assert TIMES[found.breaks].tolist() == [2.0, 4.0]
     assert found.gaps_s == pytest.approx([0.25, 0.25], abs=1e-6)
 
 
-def test_segments_that_touch_join_where_they_agree_and_break_where_they_do_not(folder, motion):
+def test_segments_that_touch_join_where_they_agree_and_break_where_they_do_not(
+    kernels_folder, motion
+):
     other = ck.Motion(np.random.default_rng(5))
-    with ck.new_ck(folder / "a.bc") as handle:
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         for mover, times in ((motion, [0.0, 1.0, 2.0]), (motion, [2.0, 3.0]), (other, [3.0, 4.0])):
             ck.write_segment(handle, 3, mover, np.array(times))
-    found, _ = read_ck(folder / "a.bc")
+    found, _ = read_ck(kernels_folder / "a.bc")
     seconds = seconds_of(found)
     assert seconds == pytest.approx([0.0, 1.0, 2.0, 3.0, 3.0, 4.0], abs=1e-5)
     assert found.breaks.tolist() == [False] * 4 + [True, False]
@@ -208,12 +212,12 @@ def test_segments_that_touch_join_where_they_agree_and_break_where_they_do_not(f
     assert angle_between_rad(found.q[4], other.quaternion(3.0)) < 60 * MAS
 
 
-def test_the_later_segment_has_priority_where_two_overlap(folder, motion):
+def test_the_later_segment_has_priority_where_two_overlap(kernels_folder, motion):
     other = ck.Motion(np.random.default_rng(5))
-    with ck.new_ck(folder / "a.bc") as handle:
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, rates=False)
         ck.write_segment(handle, 3, other, np.array([2.0, 2.25, 2.5]))
-    found, _ = read_ck(folder / "a.bc")
+    found, _ = read_ck(kernels_folder / "a.bc")
     for second, q, rate in zip(seconds_of(found), found.q, found.rate, strict=True):
         inside = 2.0 <= second <= 2.5
         mover = other if inside else motion
@@ -222,21 +226,21 @@ def test_the_later_segment_has_priority_where_two_overlap(folder, motion):
     assert found.breaks.sum() == 2
 
 
-def test_a_long_pause_that_an_interval_covers_is_no_gap(folder, motion):
-    with ck.new_ck(folder / "a.bc") as handle:
+def test_a_long_pause_that_an_interval_covers_is_no_gap(kernels_folder, motion):
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, np.array([0.0, 0.25, 0.5, 0.75, 1.0, 5.0]), rates=False)
-    found, _ = read_ck(folder / "a.bc")
+    found, _ = read_ck(kernels_folder / "a.bc")
     samples = [AttitudeSample(t, q) for t, q in zip(found.t_ns.tolist(), found.q, strict=True)]
     assert not log_joins(samples).held_ns
     assert not found.breaks.any()
 
 
-def test_a_gap_of_the_later_segment_is_filled_by_the_earlier_one(folder, motion):
+def test_a_gap_of_the_later_segment_is_filled_by_the_earlier_one(kernels_folder, motion):
     other = ck.Motion(np.random.default_rng(5))
-    with ck.new_ck(folder / "a.bc") as handle:
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES, rates=False)
         ck.write_segment(handle, 3, other, np.array([1.0, 1.5, 3.0, 3.5]), starts=[1.0, 3.0])
-    found, _ = read_ck(folder / "a.bc")
+    found, _ = read_ck(kernels_folder / "a.bc")
     between = [
         q for second, q in zip(seconds_of(found), found.q, strict=True) if 1.6 < second < 2.9
     ]
@@ -246,47 +250,47 @@ def test_a_gap_of_the_later_segment_is_filled_by_the_earlier_one(folder, motion)
 
 
 @pytest.mark.parametrize(("kind", "count"), [(1, 101), (1, 250), (3, 101), (5, 101)])
-def test_a_segment_with_a_directory_is_read(folder, motion, kind, count):
+def test_a_segment_with_a_directory_is_read(kernels_folder, motion, kind, count):
     """From 101 records on a segment has a directory, which each type makes in its own way."""
     times = np.arange(count) * 0.25
-    with ck.new_ck(folder / "a.bc") as handle:
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, kind, motion, times)
-    found, _ = read_ck(folder / "a.bc")
+    found, _ = read_ck(kernels_folder / "a.bc")
     assert seconds_of(found)[[0, -1]] == pytest.approx(times[[0, -1]], abs=1e-6)
     assert angle_between_rad(found.q[-1], motion.quaternion(float(times[-1]))) < READ_BACK_RAD
 
 
-def test_functions_of_time_with_a_directory_are_read(folder, motion):
+def test_functions_of_time_with_a_directory_are_read(kernels_folder, motion):
     starts_s = [0.5 * k for k in range(101)]
     steps = [
         (start_s, start_s + 0.4, motion.turn(start_s), [0.0, 0.0, 0.1]) for start_s in starts_s
     ]
-    with ck.new_ck(folder / "a.bc") as handle:
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_type_2(handle, steps)
-    found, _ = read_ck(folder / "a.bc")
+    found, _ = read_ck(kernels_folder / "a.bc")
     assert len(found.gaps_s) == 100
 
 
 @pytest.mark.parametrize(("kind", "count"), [(1, 1), (3, 3), (5, 8)])
-def test_single_instants_are_read_and_held(folder, motion, kind, count):
+def test_single_instants_are_read_and_held(kernels_folder, motion, kind, count):
     """A CK that forbids interpolation begins an interval with each record."""
     times = np.arange(count) * 1.0
-    with ck.new_ck(folder / "a.bc") as handle:
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, kind, motion, times, starts=times)
-    found, _ = read_ck(folder / "a.bc")
+    found, _ = read_ck(kernels_folder / "a.bc")
     assert seconds_of(found) == pytest.approx(times, abs=1e-6)
     assert found.breaks[1:].all()
     for second, q in zip(times.tolist(), found.q, strict=True):
         assert angle_between_rad(q, motion.quaternion(second)) < READ_BACK_RAD
 
 
-def test_of_numbered_kernels_beside_the_ck_the_last_by_number_counts(folder, motion):
-    (folder / "clock.tsc").unlink()
+def test_of_numbered_kernels_beside_the_ck_the_last_by_number_counts(kernels_folder, motion):
+    (kernels_folder / "clock.tsc").unlink()
     for number, start_s in ((9, ck.START_S), (10, ck.START_S + 60.0)):
-        (folder / f"clock_{number}.tsc").write_text(ck.clock_kernel(start_s=start_s))
-    with ck.new_ck(folder / "a.bc") as handle:
+        (kernels_folder / f"clock_{number}.tsc").write_text(ck.clock_kernel(start_s=start_s))
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES)
-    log = open_log(folder / "a.bc")
+    log = open_log(kernels_folder / "a.bc")
     assert log.samples[0].t_ns == J2000_NS + round(ck.START_S + 60.0) * NS_PER_S
     line = (
         "kernels from beside the CK: leap.tls, clock_9.tsc, clock_10.tsc; where they differ, the"
@@ -298,17 +302,17 @@ def test_of_numbered_kernels_beside_the_ck_the_last_by_number_counts(folder, mot
 # The whole way: another process, the kernels beside the file, the mounting, names
 
 
-def test_a_ck_is_read_with_the_kernels_beside_it_and_the_mounting(folder, motion):
-    ck.write_texts(folder, frames_tf=ck.frame_kernel())
-    with ck.new_ck(folder / "a.bc") as handle:
+def test_a_ck_is_read_with_the_kernels_beside_it_and_the_mounting(kernels_folder, motion):
+    ck.write_texts(kernels_folder, frames_tf=ck.frame_kernel())
+    with ck.new_ck(kernels_folder / "a.bc") as handle:
         ck.write_segment(handle, 3, motion, TIMES)
         ck.write_segment(handle, 3, ck.Motion(np.random.default_rng(9)), TIMES, body=-82001)
     with pytest.raises(
         InputError, match=r"several structures, -82001, -82000 \(PROBE_BUS\); choose one: --body ID"
     ):
-        open_log(folder / "a.bc")
+        open_log(kernels_folder / "a.bc")
     mounting = Mounting((0.6, 0.0, 0.8, 0.0))
-    log = open_log(folder / "a.bc", Stated(mounting, body="PROBE_BUS"))
+    log = open_log(kernels_folder / "a.bc", Stated(mounting, body="PROBE_BUS"))
     to_cam = Rotation.from_quat([0.0, 0.8, 0.0, 0.6])
     for second, sample in zip(TIMES, log.samples, strict=True):
         camera = (to_cam * motion.turn(second).inv()).as_matrix()
@@ -326,17 +330,17 @@ def test_a_ck_is_read_with_the_kernels_beside_it_and_the_mounting(folder, motion
 
 
 def test_times_are_tdb_whatever_the_clock_counts_and_one_log_leaves_nothing_to_the_next(
-    folder, motion
+    kernels_folder, motion
 ):
     for name, system in (("tdb", 1), ("tt", 2)):
-        place = folder / name
+        place = kernels_folder / name
         place.mkdir()
         ck.write_texts(place, clock_tsc=ck.clock_kernel(system))
         with ck.new_ck(place / "a.bc") as handle:
             ck.write_segment(handle, 1, motion, TIMES)
-    tdb, tt = (open_log(folder / name / "a.bc").samples[0].t_ns for name in ("tdb", "tt"))
+    tdb, tt = (open_log(kernels_folder / name / "a.bc").samples[0].t_ns for name in ("tdb", "tt"))
     assert tdb == J2000_NS + 600_000_000 * NS_PER_S
-    with spiceypy.KernelPool([str(folder / "leap.tls")]):
+    with spiceypy.KernelPool([str(kernels_folder / "leap.tls")]):
         offset_s = spiceypy.unitim(ck.START_S, "TT", "TDB") - ck.START_S
         assert spiceypy.str2et("1970 JAN 01 00:00:00 TDB") == -J2000_NS / NS_PER_S
     assert abs(offset_s) > 1e-5  # so that the clocks differ

@@ -26,7 +26,7 @@ PX = 1e-4  # footprints' whole pixels and float32 fractions
 
 
 @pytest.fixture(scope="module")
-def bench(tmp_path_factory):
+def faulty(tmp_path_factory):
     path = tmp_path_factory.mktemp("faults") / "bench.toml"
     path.write_text(SMALL_BENCH)
     with hilstar.load(path) as opened:
@@ -34,19 +34,19 @@ def bench(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def plain(bench):
-    return bench.frame(ORION_Q)
+def calm(faulty):
+    return faulty.frame(ORION_Q)
 
 
-def frame_with_faults(bench, *tables, since_ns=0, share=1.0, folder=None, **more):
+def frame_with_faults(faulty, *tables, since_ns=0, share=1.0, folder=None, **more):
     """The frame with faults, and a table's own rows of the truth."""
     faults = [fault_of({"name": f"fault {k}", **table}) for k, table in enumerate(tables)]
     scenario = (
         Scenario(folder or ".", "", 7, tuple(faults), folder) if folder else Scenario(".", "", 7)
     )
-    view = display_view(bench, scenario)
+    view = display_view(faulty, scenario)
     now = [Now(k, view.prepare(fault), since_ns, share) for k, fault in enumerate(faults, start=1)]
-    frame = bench.frame(ORION_Q, faults=FaultLayer(view, tuple(now)), **more)
+    frame = faulty.frame(ORION_Q, faults=FaultLayer(view, tuple(now)), **more)
     return frame, frame.truth[np.char.startswith(frame.truth["name"], "fault")]
 
 
@@ -54,25 +54,26 @@ def total_light(frame):
     return frame.linear.sum(dtype=np.float64)
 
 
-def test_a_false_star_lies_where_a_real_star_of_its_place_would(bench, plain):
-    star = plain.truth[plain.truth["hip"] == 26727][0]
-    place = plain.star[plain.truth["hip"] == 26727][0]
+def test_a_false_star_lies_where_a_real_star_of_its_place_would(faulty, calm):
+    star = calm.truth[calm.truth["hip"] == 26727][0]
+    place = calm.star[calm.truth["hip"] == 26727][0]
     frame, rows = frame_with_faults(
-        bench, {"kind": "false-star", "icrs": bench.stars.vectors[place].tolist(), "electrons": 5e4}
+        faulty,
+        {"kind": "false-star", "icrs": faulty.stars.vectors[place].tolist(), "electrons": 5e4},
     )
     assert [(row["hip"], row["name"]) for row in rows] == [(0, "fault 0")]
     assert abs(rows["x_px"][0] - star["x_px"]) < PX and abs(rows["y_px"][0] - star["y_px"]) < PX
     assert rows["electrons_per_s"][0] == 5e4 / EXPOSURE_S
     # of 47e6 in float32
-    assert total_light(frame) - total_light(plain) == pytest.approx(5e4 / EXPOSURE_S, rel=2e-4)
+    assert total_light(frame) - total_light(calm) == pytest.approx(5e4 / EXPOSURE_S, rel=2e-4)
 
 
-def test_magnitude_and_electrons_are_one_light(bench):
+def test_magnitude_and_electrons_are_one_light(faulty):
     _, rows = frame_with_faults(
-        bench, {"kind": "false-star", "screen_px": [50, 60], "v_mag": 3.0, "bv_mag": 1.1}
+        faulty, {"kind": "false-star", "screen_px": [50, 60], "v_mag": 3.0, "bv_mag": 1.1}
     )
     _, again = frame_with_faults(
-        bench,
+        faulty,
         {
             "kind": "false-star",
             "screen_px": [50, 60],
@@ -84,7 +85,7 @@ def test_magnitude_and_electrons_are_one_light(bench):
     assert (rows["x_px"][0], rows["y_px"][0]) == (50, 60)
 
 
-def test_a_false_star_of_the_detector_moves_at_its_rate(bench):
+def test_a_false_star_of_the_detector_moves_at_its_rate(faulty):
     table = {
         "kind": "false-star",
         "tracker_px": [500, 520],
@@ -92,7 +93,7 @@ def test_a_false_star_of_the_detector_moves_at_its_rate(bench):
         "electrons": 1e4,
     }
     places = [
-        frame_with_faults(bench, table, since_ns=since_ns)[1][0] for since_ns in (0, 1_000_000_000)
+        frame_with_faults(faulty, table, since_ns=since_ns)[1][0] for since_ns in (0, 1_000_000_000)
     ]
     # 13 um behind 70 mm against 57.65 um behind 60 mm
     scale = (60 / 0.05765) / (70 / 0.013)
@@ -104,42 +105,40 @@ def test_a_false_star_of_the_detector_moves_at_its_rate(bench):
     )
 
 
-def test_a_star_that_is_gone_is_in_neither_image_nor_truth(bench, plain):
-    row = plain.truth[plain.truth["hip"] == 26727][0]
-    frame, _ = frame_with_faults(bench, {"kind": "star-gone", "star": "Alnitak"})
-    assert 26727 not in frame.truth["hip"] and len(frame.truth) == len(plain.truth) - 1
-    assert total_light(plain) - total_light(frame) == pytest.approx(
-        row["electrons_per_s"], rel=1e-5
-    )
-    half, _ = frame_with_faults(bench, {"kind": "star-gone", "hip": 26727}, share=0.5)
-    assert total_light(plain) - total_light(half) == pytest.approx(
+def test_a_star_that_is_gone_is_in_neither_image_nor_truth(faulty, calm):
+    row = calm.truth[calm.truth["hip"] == 26727][0]
+    frame, _ = frame_with_faults(faulty, {"kind": "star-gone", "star": "Alnitak"})
+    assert 26727 not in frame.truth["hip"] and len(frame.truth) == len(calm.truth) - 1
+    assert total_light(calm) - total_light(frame) == pytest.approx(row["electrons_per_s"], rel=1e-5)
+    half, _ = frame_with_faults(faulty, {"kind": "star-gone", "hip": 26727}, share=0.5)
+    assert total_light(calm) - total_light(half) == pytest.approx(
         row["electrons_per_s"] / 2, rel=1e-5
     )
 
 
-def test_a_flash_at_a_star_adds_to_its_light_at_its_place(bench, plain):
-    row = plain.truth[plain.truth["hip"] == 26727][0]
+def test_a_flash_at_a_star_adds_to_its_light_at_its_place(faulty, calm):
+    row = calm.truth[calm.truth["hip"] == 26727][0]
     _, rows = frame_with_faults(
-        bench, {"kind": "flash", "hip": 26727, "electrons": 1e5, "for_s": 0.2}
+        faulty, {"kind": "flash", "hip": 26727, "electrons": 1e5, "for_s": 0.2}
     )
     assert abs(rows["x_px"][0] - row["x_px"]) < PX and abs(rows["y_px"][0] - row["y_px"]) < PX
 
 
-def test_tracks_have_their_electrons_in_each_exposure_and_are_the_seed_s(bench, plain):
+def test_tracks_have_their_electrons_in_each_exposure_and_are_the_seed_s(faulty, calm):
     table = {"kind": "cosmic-rays", "number": 12, "electrons": 4000, "length_px": 9}
-    frame, rows = frame_with_faults(bench, table)
+    frame, rows = frame_with_faults(faulty, table)
     inside = (rows["x_px"] > 8) & (rows["x_px"] < 311) & (rows["y_px"] > 8) & (rows["y_px"] < 231)
     assert 0 < len(rows) <= 12 and inside.any()
-    assert total_light(frame) - total_light(plain) <= 12 * 4000 / EXPOSURE_S * (1 + 1e-3)
-    again, _ = frame_with_faults(bench, table)
-    later, other = frame_with_faults(bench, table, since_ns=150_000_000)
+    assert total_light(frame) - total_light(calm) <= 12 * 4000 / EXPOSURE_S * (1 + 1e-3)
+    again, _ = frame_with_faults(faulty, table)
+    later, other = frame_with_faults(faulty, table, since_ns=150_000_000)
     assert np.array_equal(frame.levels, again.levels)
     assert not np.array_equal(frame.linear, later.linear) and len(other)
 
 
-def test_a_gradient_has_its_light_in_a_tracker_pixel_at_the_bright_edge(bench, plain):
-    frame, _ = frame_with_faults(bench, {"kind": "gradient", "electrons_per_s": 100.0})
-    added = (frame.linear - plain.linear)[0]  # the first row has few stars
+def test_a_gradient_has_its_light_in_a_tracker_pixel_at_the_bright_edge(faulty, calm):
+    frame, _ = frame_with_faults(faulty, {"kind": "gradient", "electrons_per_s": 100.0})
+    added = (frame.linear - calm.linear)[0]  # the first row has few stars
     # A monitor pixel collects the light of as many tracker pixels as it covers.
     covered = (0.05765 / 60 / (0.013 / 70)) ** 2
     x_tracker = 511.5 + (np.arange(320) - 159.5) * np.sqrt(covered)
@@ -147,12 +146,12 @@ def test_a_gradient_has_its_light_in_a_tracker_pixel_at_the_bright_edge(bench, p
     assert np.median(np.abs(added - expected)) < 1e-3 * expected.max()
 
 
-def test_a_glow_off_the_field_falls_off_with_the_angle_from_it(bench, plain):
+def test_a_glow_off_the_field_falls_off_with_the_angle_from_it(faulty, calm):
     frame, _ = frame_with_faults(
-        bench,
+        faulty,
         {"kind": "glow", "tracker_px": [-700, 511.5], "electrons_per_s": 1000, "scale_deg": 2},
     )
-    row = (frame.linear - plain.linear)[119]
+    row = (frame.linear - calm.linear)[119]
     angle = np.arctan((511.5 + 700) * 0.013 / 70) - np.arctan(
         (159.5 - np.array([20, 300])) * 0.05765 / 60
     )
@@ -162,16 +161,16 @@ def test_a_glow_off_the_field_falls_off_with_the_angle_from_it(bench, plain):
 
 
 @pytest.mark.parametrize("ending", ["npy", "fits", "png"])
-def test_a_measured_map_covers_the_detector(bench, plain, tmp_path, ending):
+def test_a_measured_map_covers_the_detector(faulty, calm, tmp_path, ending):
     image = np.zeros((64, 64))
     image[20:40, 10:50] = 200
     path = tmp_path / f"stray.{ending}"
     write_image(path, image)
     frame, _ = frame_with_faults(
-        bench, {"kind": "light-map", "file": path.name, "electrons_per_s": 50}, folder=tmp_path
+        faulty, {"kind": "light-map", "file": path.name, "electrons_per_s": 50}, folder=tmp_path
     )
     covered = (0.05765 / 60 / (0.013 / 70)) ** 2
-    added = frame.linear - plain.linear
+    added = frame.linear - calm.linear
     # Tracker pixel (x, y) is 16 times the map's; rows 20 to 40 of 64 are tracker rows 320 to 640.
     assert np.median(added[110:125, 150:170]) == pytest.approx(50 * covered, rel=1e-3)
     assert np.median(added[:60]) == 0
@@ -189,25 +188,25 @@ def write_image(path, image):
         Image.fromarray(image.astype(np.uint8)).save(path)
 
 
-def test_a_blank_field_has_no_light_and_a_step_turns_the_attitude(bench):
+def test_a_blank_field_has_no_light_and_a_step_turns_the_attitude(faulty):
     frame, _ = frame_with_faults(
-        bench, {"kind": "blank"}, {"kind": "false-star", "screen_px": [5, 5], "electrons": 1e5}
+        faulty, {"kind": "blank"}, {"kind": "false-star", "screen_px": [5, 5], "electrons": 1e5}
     )
     assert not frame.linear.any() and not frame.levels.any() and not len(frame.truth)
-    stepped, _ = frame_with_faults(bench, {"kind": "attitude-step", "turn_arcsec": [0, 90, 0]})
+    stepped, _ = frame_with_faults(faulty, {"kind": "attitude-step", "turn_arcsec": [0, 90, 0]})
     turned = angle_between_rad(np.array(ORION_Q), stepped.q_icrs_to_cam) * ARCSEC_PER_RAD
     assert turned == pytest.approx(90, abs=1e-3)
 
 
-def test_dropped_frames_are_the_seed_s(bench):
-    view = display_view(bench, Scenario(".", "", 3))
+def test_dropped_frames_are_the_seed_s(faulty):
+    view = display_view(faulty, Scenario(".", "", 3))
     effects = FaultLayer(
         view, (Now(1, fault_of({"kind": "drop", "name": "loss", "share": 0.3}), 0),)
     )
     lost = [effects.drops(frame) for frame in range(500)]
     assert 0.22 < np.mean(lost) < 0.38  # 0.3, and 4 sigma of 500 draws
     assert lost == [
-        FaultLayer(display_view(bench, Scenario(".", "", 3)), effects.now).drops(frame)
+        FaultLayer(display_view(faulty, Scenario(".", "", 3)), effects.now).drops(frame)
         for frame in range(500)
     ]
 
@@ -220,9 +219,9 @@ def test_dropped_frames_are_the_seed_s(bench):
         ({"kind": "light-map", "file": "nothing.fits"}, "a message names no files"),
     ],
 )
-def test_what_this_bench_cannot_draw_is_refused(bench, table, said):
+def test_what_this_bench_cannot_draw_is_refused(faulty, table, said):
     with pytest.raises(InputError, match=said):
-        frame_with_faults(bench, table)
+        frame_with_faults(faulty, table)
 
 
 def cut_fits():
@@ -240,11 +239,11 @@ def cut_fits():
         (cut_fits(), "cannot be read"),
     ],
 )
-def test_a_map_that_is_no_image_is_refused(bench, tmp_path, content, said):
+def test_a_map_that_is_no_image_is_refused(faulty, tmp_path, content, said):
     (tmp_path / "stray.fits").write_bytes(content)
     with warnings.catch_warnings(record=True) as told, pytest.raises(InputError, match=said):
         warnings.simplefilter("always")
-        frame_with_faults(bench, {"kind": "light-map", "file": "stray.fits"}, folder=tmp_path)
+        frame_with_faults(faulty, {"kind": "light-map", "file": "stray.fits"}, folder=tmp_path)
     assert not told  # of a cut file one line is printed, not Astropy's besides
 
 
@@ -253,27 +252,27 @@ def test_a_body_that_is_gone_has_neither_disc_nor_row(tmp_path):
     path.write_text(
         bench_text({"sky": {"epoch_utc": "2026-11-21T00:00:00Z"}, "sky.bodies": {"moon": True}})
     )
-    with hilstar.load(path) as bench:
-        x, y, z = bench.seen(bench.stars, bench.view(ORION_Q, None, 0)).vectors[-1]
+    with hilstar.load(path) as faulty:
+        x, y, z = faulty.seen(faulty.stars, faulty.view(ORION_Q, None, 0)).vectors[-1]
         q = from_radec_roll_deg(np.degrees(np.arctan2(y, x)), np.degrees(np.arcsin(z)), 0.0)
-        there = bench.frame(q, t_ns=0)
-        view = display_view(bench)
+        there = faulty.frame(q, t_ns=0)
+        view = display_view(faulty)
         fault = view.prepare(fault_of({"kind": "star-gone", "name": "no Moon", "star": "Moon"}))
-        gone = bench.frame(q, t_ns=0, faults=FaultLayer(view, (Now(1, fault, 0),)))
+        gone = faulty.frame(q, t_ns=0, faults=FaultLayer(view, (Now(1, fault, 0),)))
     assert "Moon" in there.truth["name"] and "Moon" not in gone.truth["name"]
     assert gone.linear.max() < 1e-3 * there.linear.max()
 
 
-def test_a_false_star_over_white_is_named_with_its_loss(bench):
-    view = display_view(bench)
+def test_a_false_star_over_white_is_named_with_its_loss(faulty):
+    view = display_view(faulty)
     fault = view.prepare(
         fault_of(
             {"kind": "false-star", "name": "nova", "screen_px": [40, 50], "electrons_per_s": 1e8}
         )
     )
     effects = FaultLayer(view, (Now(1, fault, 0),))
-    frame = bench.frame(ORION_Q, faults=effects)
-    losses = bench.losses_mag(frame, effects)
+    frame = faulty.frame(ORION_Q, faults=effects)
+    losses = faulty.losses_mag(frame, effects)
     # A hundred million electrons a second against white, in each pixel of its own.
     assert frame.truth["clipped"][frame.truth["name"] == "nova"].all()
     assert 0.5 < losses["nova"] < 10

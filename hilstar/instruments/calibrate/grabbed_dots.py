@@ -10,6 +10,7 @@ from hilstar.basics.files import make_directory
 from hilstar.instruments.calibrate.first_light.context import HOT_FILL, darker_code
 from hilstar.instruments.calibrate.first_light.focus import DOT_FILL
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, Pattern, black
+from hilstar.instruments.calibrate.full_well import check_full_well
 from hilstar.instruments.calibrate.geometric.dots import DotPlan, dot_image, read_plan
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.tracker.settings import DetectorSettings
@@ -91,10 +92,13 @@ def _dots_of(file: BenchFile, dots: DotPlan, frame: int, code: int) -> Pattern:
 
 def is_too_bright(image: FloatArray, dark: FloatArray, detector: DetectorSettings) -> bool:
     """Whether dots in an image (h, w) are near the detector's saturation, hot pixels of the dark
-    frame (h, w) apart.
+    frame (h, w) apart. Raises InputError for an image that is cut off under it.
     """
     cold = dark < HOT_FILL * detector.saturation_dn
     peak_dn = float(image[cold].max(initial=0.0))
-    # Images of more bits than the bench file's detector has are of another one: nothing is known
-    # of its full well.
-    return DOT_FILL * detector.saturation_dn <= peak_dn < 2.0**detector.bits
+    if peak_dn >= 2.0**detector.bits:
+        # Images of more bits than the bench file's detector has are of another one: nothing is
+        # known of its full well.
+        return False
+    check_full_well(image, dark, detector)
+    return peak_dn >= DOT_FILL * detector.saturation_dn

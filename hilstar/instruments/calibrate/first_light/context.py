@@ -32,6 +32,7 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
     VirtualBench,
     black,
 )
+from hilstar.instruments.calibrate.full_well import check_full_well
 from hilstar.instruments.calibrate.geometric.dots import SeenScreen
 from hilstar.instruments.calibrate.geometric.geometry_fit import psf_sigma_of
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
@@ -423,7 +424,7 @@ class StepContext:
 
     def looked(self, path: Path, dark: FloatArray) -> DarkSubtracted:
         """An image of the tracker above its dark frame. Raises InputError for one that cannot be
-        read, or whose dark frame is saturated.
+        read, whose dark frame is saturated, or that is cut off under the stated saturation.
         """
         floor_dn = float(np.median(dark))
         if floor_dn > MAX_FILL * self.full_dn:
@@ -433,6 +434,7 @@ class StepContext:
                 " at the monitor's black level, and at other light"
             )
         pixels = self.pixels(path)
+        check_full_well(pixels, dark, self.detector)
         cold = dark < HOT_FILL * self.full_dn
         pixel_light = software_image(pixels, self.file.config.tracker.detector)
         return DarkSubtracted(

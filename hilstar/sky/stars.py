@@ -384,7 +384,9 @@ class CellGrid:
             return np.empty(0, dtype=np.intp)
         # one bound for all cells, then each hit cell's own
         widest_rad = math.acos(self.cos_radius.min())
-        farthest_rad = min(radius_rad + reach_rad + widest_rad, math.pi)
+        farthest_rad = radius_rad + reach_rad + widest_rad
+        if farthest_rad >= math.pi:  # to the other side of the sky
+            return self._stars(np.isfinite(self.centre[:, 0]).nonzero()[0])
         hit = (self.centre @ axis >= math.cos(farthest_rad)).nonzero()[0]
         centre = self.centre.take(hit, axis=0).T
         cos_radius = self.cos_radius.take(hit)

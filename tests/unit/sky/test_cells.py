@@ -28,6 +28,13 @@ def test_every_star_within_the_radius_is_found(vectors, rng):
             assert times_found.max() <= 1
 
 
+@pytest.mark.parametrize("reach_rad", [1.55, 2.0, 3.2, 7.0])
+def test_a_turn_beyond_the_other_side_of_the_sky_finds_all(vectors, reach_rad):
+    grid = cell_grid(vectors)
+    places = grid.near(np.array([0.6, 0.0, 0.8]), 1.6, reach_rad=reach_rad)
+    assert np.array_equal(places, np.arange(len(vectors)))
+
+
 def test_few_others_are_found(vectors):
     """The index earns its place: stars found lie within a cell's diagonal, and its margin, of
     the radius.

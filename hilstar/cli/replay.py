@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from msgspec.structs import replace as replaced
 
-from hilstar.basics.files import MCAP, check_directory, check_ending
+from hilstar.basics.files import check_directory
 from hilstar.basics.notices import Notices
 from hilstar.cli import running
 from hilstar.cli.completion import offered
@@ -14,13 +14,11 @@ from hilstar.cli.options import (
     LOG_HELP,
     LogStatements,
     bench_argument,
-    check_files,
     output_option,
     parse_speed,
-    parse_split,
 )
 from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
-from hilstar.cli.shown_run import Followers, shown_run
+from hilstar.cli.shown_run import Followers, run_files, shown_run
 from hilstar.server.console.terminal import busy, say
 
 if TYPE_CHECKING:
@@ -59,15 +57,11 @@ def replay(
     from hilstar.server.replay import replay as replay_log
 
     check_directory("-o", options.output)
-    ledger = running.dated_ledger(run.ledger)
-    check_ending("--ledger", ledger, MCAP)
     file = read_bench_file(options.bench_file)
-    scenario = running.optional_scenario(run.scenario)
     table = None
     if options.output is not None:
         table = options.output / "frames.csv"
-    check_files([options.log, run.scenario], [table], file, ledger, run.overwrite)
-    split = parse_split(run.ledger_split)
+    files = run_files(run, file, [options.log], [table])
     notices = Notices()
     stated = statements.stated(file.config)
     wanted = Wanted(parse_speed(options.speed), options.start, options.stop, options.step)
@@ -81,18 +75,7 @@ def replay(
         running.optional_pulse(file, notices) as pulse,
         running.shown_bench(file, display, timed=is_timed) as (bench, screen),
         FrameImages(options.output, bench) as record,
-        shown_run(
-            bench,
-            screen,
-            run,
-            display,
-            notices,
-            ledger=ledger,
-            split=split,
-            scenario=scenario,
-            recording=play.recording,
-            pulse=pulse,
-        ) as shown,
+        shown_run(bench, screen, run, display, notices, files, pulse, play.recording) as shown,
     ):
         if play.span:
             say(play.span)

@@ -13,14 +13,13 @@ from msgspec import UNSET, UnsetType
 from msgspec.structs import replace as replaced
 
 from hilstar.basics.errors import InputError
-from hilstar.basics.files import MCAP, check_ending
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import end_with_parent
 from hilstar.cli import running
 from hilstar.cli.declare import option, struct
-from hilstar.cli.options import bench_argument, check_files, parse_split
+from hilstar.cli.options import bench_argument
 from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
-from hilstar.cli.shown_run import Followers, shown_run
+from hilstar.cli.shown_run import Followers, run_files, shown_run
 from hilstar.server.console.terminal import print_found, say, without_attitude
 
 if TYPE_CHECKING:
@@ -204,11 +203,7 @@ def serve_bench(
     from hilstar.attitude.wire.source import Mounting
     from hilstar.server.serve import serve as serve_stream
 
-    ledger = running.dated_ledger(run.ledger)
-    check_ending("--ledger", ledger, MCAP)
-    scenario = running.optional_scenario(run.scenario)
-    check_files([run.scenario], [], file, ledger, run.overwrite)
-    split = parse_split(run.ledger_split)
+    files = run_files(run, file)
     notices = Notices()
     # In lockstep the simulation waits for each frame: no frame is late, and a run's codes are those
     # of any other machine.
@@ -219,17 +214,7 @@ def serve_bench(
         _source(file, fed_by, notices) as link,
         running.optional_pulse(file, notices) as pulse,
         running.shown_bench(file, display, timed=is_timed) as (bench, screen),
-        shown_run(
-            bench,
-            screen,
-            run,
-            display,
-            notices,
-            ledger=ledger,
-            split=split,
-            scenario=scenario,
-            pulse=pulse,
-        ) as shown,
+        shown_run(bench, screen, run, display, notices, files, pulse) as shown,
     ):
         if run.explain:
             mounting = Mounting(file.config.tracker.q_body_to_cam)

@@ -2,19 +2,22 @@
 the feed of frames and the pulse, and the outlet of their frames.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hilstar.basics.files import MCAP, check_ending
 from hilstar.basics.notices import Notices
 from hilstar.cli import running
+from hilstar.cli.options import check_files, parse_split
 from hilstar.cli.running import DisplayOptions, RunOptions
 from hilstar.server.console.run_status import RunSource, RunStatus, on_terminal
 
 if TYPE_CHECKING:
     from hilstar.attitude.wire.links import Pictures
+    from hilstar.server.bench.bench_file import BenchFile
     from hilstar.server.bench.frame import Bench
     from hilstar.server.bench.scenario import Scenario
     from hilstar.server.console.listener import PageListener
@@ -27,6 +30,33 @@ if TYPE_CHECKING:
     from hilstar.server.record.ledger import LedgerSwitch, SplitLimits
     from hilstar.server.serve import Outlet
     from hilstar.server.summary import RunSummary
+
+
+@dataclass(frozen=True)
+class RunFiles:
+    """The files of a run, checked: its ledger with what splits it, and its scenario; None for
+    none.
+    """
+
+    ledger: Path | None
+    split: "SplitLimits"
+    scenario: "Scenario | None"
+
+
+def run_files(
+    options: RunOptions,
+    file: "BenchFile",
+    inputs: Sequence[Path | None] = (),
+    outputs: Sequence[Path | None] = (),
+) -> RunFiles:
+    """The files that a run's options name, beside the command's own `inputs` and `outputs`. Raises
+    InputError for what cannot be read, and for a file that is written and read, or is there.
+    """
+    ledger = running.dated_ledger(options.ledger)
+    check_ending("--ledger", ledger, MCAP)
+    scenario = running.optional_scenario(options.scenario)
+    check_files([*inputs, options.scenario], outputs, file, ledger, options.overwrite)
+    return RunFiles(ledger, parse_split(options.ledger_split), scenario)
 
 
 @dataclass(frozen=True)
@@ -138,22 +168,19 @@ def shown_run(
     options: RunOptions,
     display: DisplayOptions,
     notices: Notices,
-    *,
-    ledger: Path | None,
-    split: "SplitLimits",
-    scenario: "Scenario | None" = None,
+    files: RunFiles,
+    pulse: "FramePulse | None",
     recording: "Recording | None" = None,
-    pulse: "FramePulse | None" = None,
 ) -> Iterator[ShownRun]:
     """The run of an open bench, as its options and its bench file ask for it. Raises InputError for
     what cannot be opened.
 
-    `ledger`, `split` and `scenario` are those that the options name, once they have been checked.
     `recording` is of the run that is replayed.
     """
+    split = files.split
     with (
-        running.optional_ledger(ledger, bench, notices, options.overwrite, split) as switch,
-        running.run_with_faults(bench, scenario, notices, switch, recording) as faults,
+        running.optional_ledger(files.ledger, bench, notices, options.overwrite, split) as switch,
+        running.run_with_faults(bench, files.scenario, notices, switch, recording) as faults,
         running.optional_answers(bench, notices, switch, screen) as answers,
         running.optional_frames(display.feed, bench, screen) as frames,
     ):

@@ -10,7 +10,7 @@ import time
 import zlib
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import zmq
 
@@ -137,3 +137,19 @@ def talking(sender: zmq.Socket, rate_hz: float = 200.0, q=ORION, first: int = 0)
         lambda: sender.send(packet(next(sequences), time.monotonic_ns(), q)), 1 / rate_hz
     ):
         yield
+
+
+ANSWER_S = 0.05  # from one answer to the next
+
+
+@contextmanager
+def answers_over_udp(port: int, answers: Iterator[bytes]) -> Iterator[None]:
+    """A tracker that sends one of `answers` each ANSWER_S to a port of this machine."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
+
+        def send() -> None:
+            with suppress(OSError):  # nobody hears it yet
+                line.sendto(next(answers), ("127.0.0.1", port))
+
+        with repeating(send, ANSWER_S):
+            yield

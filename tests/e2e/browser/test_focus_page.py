@@ -4,13 +4,12 @@ star widths that answers report.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
 import signal
-import socket
 import subprocess
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -20,7 +19,7 @@ from tests.support.benches import TWIN, bench_text
 from tests.support.browser import Browser, assert_fits_every_size_in_light_and_dark
 from tests.support.forks import HILSTAR, Started
 from tests.support.pages import page_of
-from tests.support.senders import free_port
+from tests.support.senders import answers_over_udp, free_port
 from tests.support.servers import Served
 
 pytestmark = pytest.mark.e2e
@@ -29,33 +28,13 @@ SHARP_PX, BLURRED_PX, ANSWERS = 1.0, 2.2, 60  # a turn of the ring there and bac
 FRINGE_PX = (-0.02, -0.01, 0.0, 0.01, 0.02)  # by which five stars' widths differ
 
 
-@contextmanager
-def ring_that_turns(port: int) -> Iterator[None]:
-    """A tracker whose answers report five stars, twenty times a second, while its ring is turned
-    back and forth.
-    """
-    over = threading.Event()
-
-    def send() -> None:
-        number = 0
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-            while not over.wait(0.05):
-                number += 1
-                share = 0.5 - 0.5 * math.cos(2 * math.pi * number / ANSWERS)
-                width_px = SHARP_PX + (BLURRED_PX - SHARP_PX) * share
-                stars = [[9, 9, 99, None, width_px + off_px] for off_px in FRINGE_PX]
-                try:
-                    line.sendto(json.dumps({"centroids": stars}).encode(), ("127.0.0.1", port))
-                except OSError:  # nobody hears it yet
-                    continue
-
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+def ring_that_turns() -> Iterator[bytes]:
+    """Answers that report five stars while the tracker's ring is turned back and forth."""
+    for number in itertools.count(1):
+        share = 0.5 - 0.5 * math.cos(2 * math.pi * number / ANSWERS)
+        width_px = SHARP_PX + (BLURRED_PX - SHARP_PX) * share
+        stars = [[9, 9, 99, None, width_px + off_px] for off_px in FRINGE_PX]
+        yield json.dumps({"centroids": stars}).encode()
 
 
 @contextmanager
@@ -82,7 +61,7 @@ def focus_page(page, tmp_path) -> Iterator[Browser]:
     bench = tmp_path / "bench.toml"
     bench.write_text(bench_text() + answers + 'format = "json"\n')
     words = ("--answers", "--star", "Alnilam", "--headless", "--feed", "tcp://127.0.0.1:*")
-    with ring_that_turns(port), page_of_focus(page, str(bench), *words):
+    with answers_over_udp(port, ring_that_turns()), page_of_focus(page, str(bench), *words):
         page.until("document.querySelector('#focus-rows dd').textContent.startsWith('1.0')")
         yield page
 

@@ -28,16 +28,15 @@ def stars_folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+def belt_frame(folder, *words):
+    """`hilstar frame` of Orion's belt, with its truth table."""
+    truth = folder / "t.csv"
+    bench = folder / "bench.toml"
+    return run_hilstar_here("frame", bench, "--radec", "84.057,-1.2,0", "--truth", truth, *words)
+
+
 def test_the_table_s_star_is_in_the_frame_beside_hipparcos(stars_folder):
-    done = run_hilstar_here(
-        "frame",
-        stars_folder / "bench.toml",
-        "--radec",
-        "84.057,-1.2,0",
-        "--truth",
-        stars_folder / "t.csv",
-        "--explain",
-    )
+    done = belt_frame(stars_folder, "--explain")
     assert done.returncode == 0, done.stderr
     assert "stars.csv: 1 stars of 2 rows, V and V-I from Gaia's G, BP and RP" in done.stderr
     assert "1 stars added to Hipparcos' 116812" in done.stderr
@@ -53,15 +52,7 @@ def test_the_table_s_star_is_in_the_frame_beside_hipparcos(stars_folder):
 def test_a_star_without_a_hip_number_clips_by_name(stars_folder):
     with (stars_folder / "bench.toml").open("a") as file:
         file.write("[render]\nflux_at_white_e_per_s = 1000\n")
-    done = run_hilstar_here(
-        "frame",
-        stars_folder / "bench.toml",
-        "--radec",
-        "84.057,-1.2,0",
-        "--truth",
-        stars_folder / "t.csv",
-        "--json",
-    )
+    done = belt_frame(stars_folder, "--json")
     summary = json.loads(done.stdout)
     assert {26311, f"Gaia DR3 {SOURCE}"} <= set(summary["clipped"])
     assert summary["clipped_mag"][f"Gaia DR3 {SOURCE}"] > 0
@@ -76,14 +67,7 @@ def test_the_bench_s_hash_covers_the_table(stars_folder):
 
 def test_a_table_that_cannot_be_used_is_one_line(stars_folder):
     (stars_folder / "stars.csv").write_text("ra,dec,mass\n1,2,3\n")
-    done = run_hilstar_here(
-        "frame",
-        stars_folder / "bench.toml",
-        "--radec",
-        "84.057,-1.2,0",
-        "--truth",
-        stars_folder / "t.csv",
-    )
+    done = belt_frame(stars_folder)
     assert done.returncode == 2
     assert "has no magnitude with a colour among its columns (ra, dec, mass)" in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-import socket
-import threading
-from contextlib import ExitStack, closing, contextmanager, suppress
+from contextlib import ExitStack, closing
 from types import SimpleNamespace
 
 import numpy as np
@@ -19,7 +18,7 @@ from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.fake_clock import FakeClock
-from tests.support.senders import free_port
+from tests.support.senders import answers_over_udp, free_port
 
 RING_PX = (3.0, 2.0, 1.4, 1.0, 0.8, 1.1, 1.6)  # sigma of the PSF as the ring is turned
 BEST = 5  # the image of the sharpest
@@ -166,25 +165,10 @@ ANSWERS = '[answers]\nsource = "udp"\nbind = "127.0.0.1:PORT"\nclock = "host"\nf
 SKY = ("--radec", "84,-1,0", "--headless", "--feed", "tcp://127.0.0.1:*")
 
 
-@contextmanager
 def a_tracker_that_answers(port, star):
     """Twenty answers a second of five stars like `star`, until the block ends."""
-    over = threading.Event()
     answer = json.dumps({"t_ns": 1, "centroids": [star] * 5}).encode()
-
-    def send():
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as line:
-            while not over.wait(0.05):
-                with suppress(OSError):  # nobody hears it yet
-                    line.sendto(answer, ("127.0.0.1", port))
-
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+    return answers_over_udp(port, itertools.repeat(answer))
 
 
 @pytest.fixture

@@ -14,9 +14,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.tracker.settings import DetectorSettings
 
-# relative to the saturation that is stated: a hot pixel in the dark frame, and levels at which the
-# statement itself holds
-HOT_SHARE, STATED_SHARE = 0.5, 0.9
+STATED_SHARE = 0.9  # of the stated saturation: from there on the statement itself holds
 # Bright pixels are those within 6 sigmas of their own shot noise under the brightest. Of an even
 # light 13 % of them are within a sixth of a sigma of their median; where the gain is stated 40
 # times too small, still less than three quarters.
@@ -25,35 +23,42 @@ MIN_ALIKE = 30  # pixels
 MIN_SIGMA_DN = 3.0  # under it a sixth of a sigma to either side is less than one level
 
 
-def cut_off_dn(image: FloatArray, dark: FloatArray, detector: DetectorSettings) -> float | None:
-    """The level at which an image (h, w), DN, is cut off under the stated saturation, by its dark
-    frame (h, w); None where its brightest pixels scatter as light does, or it cannot be told.
+def cut_off_dn(
+    light: FloatArray, dark: FloatArray, floor_dn: float, detector: DetectorSettings
+) -> float | None:
+    """The level at which an image is cut off under the stated saturation; None where its brightest
+    pixels scatter as light does, or it cannot be told.
+
+    `light` (n,), DN, are its pixels without the hot ones, `dark` (h, w) its dark frame, whose
+    median is `floor_dn`.
     """
-    light = image[dark < HOT_SHARE * detector.saturation_dn]
     top_dn = float(light.max(initial=0.0))
-    floor_dn = float(np.median(dark))
+    if top_dn >= STATED_SHARE * detector.saturation_dn:
+        return None
     sigma_dn = math.sqrt(max(top_dn - floor_dn, 0.0) / detector.gain_e_per_dn)
-    # an image without noise has no scatter to be missed
-    has_noise = float(dark.std()) > 0.0
-    is_stated = top_dn >= STATED_SHARE * detector.saturation_dn
-    if is_stated or not has_noise or sigma_dn < MIN_SIGMA_DN:
+    if sigma_dn < MIN_SIGMA_DN:
         return None
     bright = light[light > top_dn - BRIGHT_SIGMAS * sigma_dn]
     level_dn = float(np.median(bright))
     alike = int((np.abs(bright - level_dn) < ALIKE_SIGMAS * sigma_dn).sum())
     if alike < max(MIN_ALIKE, ALIKE_SHARE * len(bright)):
         return None
+    # an image without noise has no scatter to be missed
+    if not dark.std():
+        return None
     return level_dn
 
 
-def check_full_well(image: FloatArray, dark: FloatArray, detector: DetectorSettings) -> None:
-    """Refuse (InputError) an image (h, w), DN, that is cut off under the stated saturation, with
-    the full well that its level is.
+def check_full_well(
+    light: FloatArray, dark: FloatArray, floor_dn: float, detector: DetectorSettings
+) -> None:
+    """Refuse (InputError) an image that is cut off under the stated saturation, with the full well
+    that its level is; see `cut_off_dn`.
     """
-    level_dn = cut_off_dn(image, dark, detector)
+    level_dn = cut_off_dn(light, dark, floor_dn, detector)
     if level_dn is None:
         return
-    full_well_e = (level_dn - float(np.median(dark))) * detector.gain_e_per_dn
+    full_well_e = (level_dn - floor_dn) * detector.gain_e_per_dn
     rounded_e = float(f"{full_well_e:.3g}")
     raise InputError(
         f"the tracker's images are cut off at {level_dn:.0f} DN, and the bench file has them"

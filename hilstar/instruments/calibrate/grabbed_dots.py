@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import make_directory
@@ -94,11 +96,11 @@ def is_too_bright(image: FloatArray, dark: FloatArray, detector: DetectorSetting
     """Whether dots in an image (h, w) are near the detector's saturation, hot pixels of the dark
     frame (h, w) apart. Raises InputError for an image that is cut off under it.
     """
-    cold = dark < HOT_FILL * detector.saturation_dn
-    peak_dn = float(image[cold].max(initial=0.0))
+    light = image[dark < HOT_FILL * detector.saturation_dn]
+    peak_dn = float(light.max(initial=0.0))
     if peak_dn >= 2.0**detector.bits:
         # Images of more bits than the bench file's detector has are of another one: nothing is
         # known of its full well.
         return False
-    check_full_well(image, dark, detector)
+    check_full_well(light, dark, float(np.median(dark)), detector)
     return peak_dn >= DOT_FILL * detector.saturation_dn

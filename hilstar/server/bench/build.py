@@ -190,10 +190,10 @@ class Parts:
 
     def seen_stars(self, stars: Stars) -> Stars:
         """Stars as a camera that moves with the bench's sources sees them, in its colours."""
-        seen = moved(stars, self.sources.moving)
+        apparent = moved(stars, self.sources.moving)
         if self.colours is None:
-            return seen
-        return self.colours.on(seen)
+            return apparent
+        return self.colours.on(apparent)
 
 
 def _parts(

@@ -434,12 +434,11 @@ class StepContext:
                 " at the monitor's black level, and at other light"
             )
         pixels = self.pixels(path)
-        check_full_well(pixels, dark, self.detector)
-        cold = dark < HOT_FILL * self.full_dn
-        pixel_light = software_image(pixels, self.file.config.tracker.detector)
-        return DarkSubtracted(
-            path, pixel_light - dark, float(pixels[cold].max(initial=0.0)), floor_dn
-        )
+        light = pixels[dark < HOT_FILL * self.full_dn]
+        check_full_well(light, dark, floor_dn, self.detector)
+        pixel_light = software_image(pixels, self.detector)
+        raw_peak = float(light.max(initial=0.0))
+        return DarkSubtracted(path, pixel_light - dark, raw_peak, floor_dn)
 
     def read(self, path: Path) -> FloatArray:
         """An image of the tracker (h, w), DN, of a mosaic its superpixels."""

@@ -93,9 +93,9 @@ def _biases(shape: DotShape, settings: CentroidSettings) -> tuple[FloatArray, Fl
     tiles = shape.shares(place_px, place_px, half_px)
     image = tiles.transpose(0, 2, 1, 3).reshape(PHASES * tile_px, PHASES * tile_px)
     threshold = FAINTEST_SHARE / settings.threshold_sigma
-    found = find_stars(image, settings, LocalBackground(0.0, threshold))
-    column, x_in_tile_px = np.divmod(found.x_px + 0.5, tile_px)
-    row, y_in_tile_px = np.divmod(found.y_px + 0.5, tile_px)
+    centroids = find_stars(image, settings, LocalBackground(0.0, threshold))
+    column, x_in_tile_px = np.divmod(centroids.x_px + 0.5, tile_px)
+    row, y_in_tile_px = np.divmod(centroids.y_px + 0.5, tile_px)
     columns = column.astype(np.intp)
     rows = row.astype(np.intp)
     bias_x_px = np.zeros((PHASES, PHASES))

@@ -36,10 +36,10 @@ def test_a_full_well_that_is_less_than_stated_is_told_with_its_electrons():
     4.68 px instead of 4.21.
     """
     image, dark = exposed(replace(STATED, full_well_e=30_000.0), 100_000.0)
-    level_dn = cut_off_dn(image, dark, STATED)
+    level_dn = cut_off_dn(image.ravel(), dark, float(np.median(dark)), STATED)
     assert level_dn == pytest.approx(40 + 30_000 / 24, abs=1.5)
     with pytest.raises(InputError, match=r"cut off at 1290 DN, .* full_well_e = (29|30)\d{3}, or"):
-        check_full_well(image, dark, STATED)
+        check_full_well(image.ravel(), dark, float(np.median(dark)), STATED)
 
 
 @pytest.mark.parametrize("true_gain", [24.0, 2.4, 240.0])
@@ -48,19 +48,19 @@ def test_dots_that_scatter_as_light_does_are_not_cut_off(true_gain, share):
     """Also where the stated gain is ten times the true one, or a tenth."""
     true = replace(STATED, gain_e_per_dn=true_gain, full_well_e=2900 * true_gain)
     image, dark = exposed(true, share * true.full_well_e)
-    assert cut_off_dn(image, dark, STATED) is None
-    check_full_well(image, dark, STATED)
+    assert cut_off_dn(image.ravel(), dark, float(np.median(dark)), STATED) is None
+    check_full_well(image.ravel(), dark, float(np.median(dark)), STATED)
 
 
 def test_the_stated_full_well_is_no_surprise():
     image, dark = exposed(STATED, 200_000.0)
-    assert cut_off_dn(image, dark, STATED) is None
+    assert cut_off_dn(image.ravel(), dark, float(np.median(dark)), STATED) is None
 
 
 def test_an_image_without_noise_is_not_cut_off():
     image = np.zeros((50, 50))
     image[10:30, 10:30] = 1000.0
-    assert cut_off_dn(image, np.zeros_like(image), STATED) is None
+    assert cut_off_dn(image.ravel(), np.zeros_like(image), 0.0, STATED) is None
 
 
 @pytest.mark.parametrize(("wider", "is_refused"), [(0.9, False), (1.0, False), (1.11, True)])

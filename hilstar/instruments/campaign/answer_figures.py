@@ -27,9 +27,9 @@ from scipy import optimize, stats
 
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
+from hilstar.instruments.campaign.case_motion import AXES
 from hilstar.instruments.campaign.case_table import VARY, Columns
 from hilstar.instruments.campaign.cases import (
-    AXES,
     FALSE_STARS,
     FRAME_ERRORS,
     FRAME_RATE_ERRORS,

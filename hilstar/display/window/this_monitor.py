@@ -88,10 +88,17 @@ def _by_ddc(edid: bytes) -> dict[str, int]:
         ).stdout
     except (OSError, subprocess.TimeoutExpired):
         return {}
+    return ddc_settings(completed)
+
+
+def ddc_settings(printed: str) -> dict[str, int]:
+    """The settings that `ddcutil getvcp --terse` prints, by their keys; a line of another form says
+    none.
+    """
     settings = {}
     # VCP 10 C 40 100 (now, maximum); VCP 14 SNC x05; VCP C0 CNC x00 xff x04 xb0 (maximum, now)
     for code, kind, value_text in re.findall(
-        r"^VCP (10|12|14|C0) (C|SNC|CNC) ([\dx a-f]+)$", completed, re.MULTILINE
+        r"^VCP (10|12|14|C0) (C|SNC|CNC) ([\dx a-f]+)$", printed, re.MULTILINE
     ):
         values = value_text.split()
         with contextlib.suppress(ValueError):

@@ -94,6 +94,17 @@ def test_any_other_form_is_refused_in_one_short_line(text):
     assert "write " in refusal(parse_endpoint, text)
 
 
+@pytest.mark.parametrize("letter", ["a", "ä", "€"])
+def test_a_sockets_path_is_as_long_as_its_bytes(letter):
+    """sun_path of sockaddr_un has 108 bytes with the NUL behind it (unix(7))."""
+    count, rest = divmod(107 - len("/"), len(letter.encode()))
+    longest = "/" + letter * count + "a" * rest
+    with socket.socket(socket.AF_UNIX) as asker, pytest.raises(FileNotFoundError):
+        asker.connect(longest)  # the kernel takes it
+    assert str(parse_endpoint(f"ipc://{longest}").path) == longest
+    assert "at most 107 bytes" in refusal(parse_endpoint, f"ipc://{longest}a")
+
+
 def test_libzmq_gets_the_address_that_was_judged():
     """A name could be resolved to anything; leading zeros are octal to some."""
     assert parse_endpoint("tcp://localhost:05560").address == "tcp://127.0.0.1:5560"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from types import SimpleNamespace
 
 import msgspec
@@ -198,8 +199,10 @@ def test_a_reader_that_does_not_read_is_told_in_the_tracker_s_place():
     assert notices.counts() == {"answers-unread": 1, "answers-read": 1, "tracker-silent": 1}
 
 
-def test_an_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
-    """A sender whose clock is 7 s behind the host's."""
+def test_a_valid_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
+    """A sender whose clock is 7 s behind the host's. An answer without an attitude, or before that
+    clock is known, is not passed on.
+    """
     sent = []
     receiver = SimpleNamespace(
         clock_summary=lambda: SimpleNamespace(offset_ms=7000.0),
@@ -208,6 +211,10 @@ def test_an_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
     answer = Answer(20 * NS_PER_S, b"", None, np.array([1.0, 0.0, 0.0, 0.0]))
     serve._pass_on(receiver, iter([5]), answer, 12 * NS_PER_S)
     assert [(each.sequence, each.t_ns) for each in sent] == [(5, 5 * NS_PER_S)]
+    invalid = replace(answer, valid=False)
+    without_attitude = replace(answer, q_icrs_to_cam=None)
+    for other in (invalid, without_attitude):
+        serve._pass_on(receiver, iter([6]), other, 12 * NS_PER_S)
     receiver.clock_summary = lambda: SimpleNamespace(offset_ms=None)
     serve._pass_on(receiver, iter([6]), answer, 12 * NS_PER_S)
     assert len(sent) == 1

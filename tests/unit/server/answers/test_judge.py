@@ -244,6 +244,23 @@ def test_unix_stamps_are_taken_with_the_hosts_stated_error():
     )
 
 
+def test_the_host_s_unix_time_is_read_again_each_second():
+    """NTP moves it by 1 ms a second: an answer is at most a second's drift off."""
+    asked = []
+
+    def offset() -> UnixOffset:
+        asked.append(None)
+        return UnixOffset(-len(asked) * 1_000_000, 0)
+
+    times = AnswerTimes(AnswerRules(EXPOSURE_S, "middle", "unix"), offset)
+    middles_ms = []
+    for tenth in range(30):
+        host_ns = 7 * NS_PER_S + tenth * NS_PER_S // 10
+        middle_ns, _ = times.middle(Answer(host_ns, b"", 0))
+        middles_ms.append(middle_ns / 1_000_000)
+    assert middles_ms == [-1.0] * 10 + [-2.0] * 10 + [-3.0] * 10
+
+
 def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():
     frames = LitFrames(PERIOD_NS)
     judge, verdicts, k = AnswerJudge(AnswerRules(EXPOSURE_S), frames), [], 0

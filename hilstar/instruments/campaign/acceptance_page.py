@@ -25,6 +25,8 @@ from hilstar.basics.pages import (
     table_of,
 )
 from hilstar.basics.version import __version__
+from hilstar.instruments.assess.bounded_figures import TooFewCases, clopper_pearson, quantile_limits
+from hilstar.instruments.assess.star_figures import StarTable, place_map
 from hilstar.instruments.campaign.acceptance_verdicts import (
     LEDGER,
     NOT_TESTED,
@@ -32,8 +34,7 @@ from hilstar.instruments.campaign.acceptance_verdicts import (
     ClauseVerdict,
     SetResult,
 )
-from hilstar.instruments.campaign.answer_figures import StarTable, place_map
-from hilstar.instruments.campaign.figures import TooFewCases, clopper_pearson, quantile_limits
+from hilstar.instruments.campaign.answer_figures import star_table
 from hilstar.instruments.campaign.plan import STAR_QUANTITIES
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.requirements_page import STATES, signed_card, verdict_chip
@@ -453,7 +454,7 @@ def _star_card(acceptance: AcceptedBench, result: SetResult) -> Iterator[Card]:
     """Detection against magnitude, and the map of stars' place errors; none without stars."""
     assert result.cases is not None
     try:
-        stars = StarTable.of(result.cases)
+        stars = star_table(result.cases)
         offsets_px = place_map(stars, acceptance.scale.resolution_px, GRID)
     except TooFewCases:
         return

@@ -12,8 +12,9 @@ import pytest
 from scipy import stats
 
 from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.assess.bounded_figures import lowest_size
+from hilstar.instruments.assess.case_fits import fit_by_cases
 from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.campaign.answer_figures import fit_by_cases
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import (
     FRAME_ERRORS,
@@ -21,7 +22,6 @@ from hilstar.instruments.campaign.cases import (
     FRAME_RATES,
     STAR_LISTS,
 )
-from hilstar.instruments.campaign.figures import lowest_size
 from hilstar.instruments.campaign.plan import Require
 from hilstar.instruments.campaign.planted import aberration_rad
 from hilstar.instruments.campaign.requirements import (

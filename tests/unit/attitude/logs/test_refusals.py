@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -297,18 +298,26 @@ STK = [
     (stk_angles(None), "Sequence is missing"),
     *SHORT_ROWS,
 ]
-REFUSED = [
-    *(("CSV", *row) for row in CSV),
-    *(("JSON", *row) for row in JSON),
-    *(("CIC", *row) for row in CIC),
-    *(("STK", *row) for row in STK),
-]
 
 
-@pytest.mark.parametrize(
-    ("form", "text", "words"), REFUSED, ids=[f"{form} {words[:40]}" for form, _, words in REFUSED]
-)
-def test_a_log_that_is_wrong_is_refused_in_one_line_with_its_place(tmp_path, form, text, words):
-    path = tmp_path / form
+def assert_text_refused(path: Path, text: str, words: str) -> None:
+    """A text is refused as a log, with words; a character is a byte."""
     path.write_bytes(text.encode("latin-1"))
     assert_file_refused(open_log, path, words)
+
+
+TABLES, MESSAGES = [*CSV, *JSON], [*CIC, *STK]
+
+
+@pytest.mark.parametrize(("text", "words"), TABLES, ids=[words[:60] for _, words in TABLES])
+def test_a_table_or_json_that_is_no_log_is_refused_in_one_line_with_its_place(
+    tmp_path, text, words
+):
+    assert_text_refused(tmp_path / "log", text, words)
+
+
+@pytest.mark.parametrize(("text", "words"), MESSAGES, ids=[words[:60] for _, words in MESSAGES])
+def test_an_attitude_file_that_is_wrong_is_refused_in_one_line_with_its_place(
+    tmp_path, text, words
+):
+    assert_text_refused(tmp_path / "log", text, words)

@@ -341,7 +341,7 @@ class CaseMaker:
             discs = moving.discs(pole, math.pi, t_ns=t_ns)
             disc = next((disc for disc in discs if disc.name.lower() == attitudes.body), None)
         if disc is None:
-            key = attitudes.body
+            key = str(attitudes.body)
             if key not in SINGLE_BODIES:
                 key = "planets"
             raise InputError(

@@ -10,13 +10,11 @@ The physical order, which is the order of `Detector.expose`:
 
 Laws:
 1. What belongs to the device (PRNU, DSNU, hot and dead pixels, rows, columns) comes from
-   `device_seed`, each from its own
-   stream, so that one map does not change when another is switched on. What belongs to the frame
-   comes from the
-   generator that is passed in. Same seeds and same numpy: same image, bit for bit.
+   `device_seed`, each from its own stream, so that one map does not change when another is switched
+   on. What belongs to the frame comes from the generator that is passed in. Same seeds and same
+   numpy: same image, bit for bit.
 2. Photon and dark shot noise are one Poisson draw: the sum of two independent Poisson counts is
-   Poisson of the
-   summed mean, exactly, and one draw costs half of two.
+   Poisson of the summed mean, exactly, and one draw costs half of two.
 3. Quantisation noise is what rounding does. The thesis's added Gaussian (table 4.1) is off unless
    asked for.
 """

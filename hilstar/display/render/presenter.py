@@ -57,6 +57,15 @@ def checked_triples(bits: int) -> npt.NDArray[np.uint16]:
     return np.concatenate(parts).astype(np.uint16)
 
 
+def drawn_codes(read: bytes, screen_px: tuple[int, int], bits: int) -> npt.NDArray[np.float32]:
+    """The codes (height, width, 3), the top row first, of a buffer as GL reads it: float32 shares
+    of white, row by row from the bottom.
+    """
+    width, height = screen_px
+    shares = np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1]
+    return np.asarray(np.rint(shares * np.float32(2**bits - 1)))
+
+
 def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: int) -> str:
     """Which codes the back buffer has otherwise than they were drawn; "" where every code of grey
     and each primary is there.
@@ -78,9 +87,7 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
             # moderngl asks for an attachment, which a window's back buffer has not, and reads on
             _ = context.error
             texture.release()
-        # GL counts rows from the bottom
-        shares = np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1]
-        drawn = np.rint(shares * (2**bits - 1))
+        drawn = drawn_codes(read, screen_px, bits)
         differ = (drawn != part[levels]).any(axis=-1)
         changed = np.unique(levels[differ])
         if len(changed) and not wrong:

@@ -14,7 +14,7 @@ from hilstar.display.panel import Panel
 from hilstar.display.render.aids import CROSSHAIR, PATCH, lay_over
 from hilstar.display.render.context import check_limits
 from hilstar.display.render.light_units import DENSER_WINGS, MAX_SUM, LightUnits
-from hilstar.display.render.presenter import checked_triples
+from hilstar.display.render.presenter import checked_triples, drawn_codes
 from hilstar.display.response import gamma_response
 from hilstar.optics.psf import GaussianPsf
 from tests.support.refusals import refusal
@@ -107,3 +107,10 @@ def test_every_code_of_grey_and_of_each_primary_is_looked_at(bits):
     for mask in ((1, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1)):
         wanted = np.outer(codes, mask)
         assert {tuple(row) for row in wanted.tolist()} <= {tuple(row) for row in triples.tolist()}
+
+
+def test_a_buffer_is_read_from_its_bottom_row_and_compared_from_its_top():
+    """glReadPixels: the first row is the lowest, and each pixel has its colours side by side."""
+    codes = np.arange(2 * 3 * 3).reshape(3, 2, 3)  # three rows of two pixels
+    read = (codes / 255).astype(np.float32)[::-1].tobytes()
+    np.testing.assert_array_equal(drawn_codes(read, (2, 3), 8), codes)

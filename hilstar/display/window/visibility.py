@@ -15,6 +15,7 @@ from hilstar.display.window.x11 import INT, NUMBER, POINTER, Survival, load_libr
 VISIBILITY_CHANGES, STRUCTURE_CHANGES = 1 << 16, 1 << 17
 VISIBILITY_NOTIFY, DESTROY_NOTIFY, UNMAP_NOTIFY, MAP_NOTIFY = 15, 17, 18, 19
 COVERED = ("", "covered in part", "covered")  # by VisibilityNotify's state
+DPMS_ON = 0  # dpmsconst.h
 # interval of what sends no events: the position of a window's parents, and the display's sleep
 LOOK_AGAIN_S = 0.5
 
@@ -180,6 +181,13 @@ class Visibility:
         self._stop = self._stopped = -1
 
 
+def is_dark(is_enabled: bool, level: int) -> bool:
+    """Whether a display is dark by DPMS, at a level of dpmsconst.h: 0 is on, the others are not. A
+    level says nothing where DPMS is off.
+    """
+    return is_enabled and level != DPMS_ON
+
+
 def _ended(descriptor: int) -> bool:
     """Whether the far end of a connection is closed."""
     poll = select.poll()
@@ -208,6 +216,6 @@ def _sleep_of(connection: int) -> Any:
         level = ctypes.c_ushort()
         enabled = ctypes.c_ubyte()
         known = library.DPMSInfo(connection, ctypes.byref(level), ctypes.byref(enabled))
-        return bool(known and enabled.value and level.value)
+        return bool(known) and is_dark(bool(enabled.value), level.value)
 
     return asleep

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -262,7 +262,8 @@ class Window(Closing):
             return
         on_it = bool(glfw.get_window_monitor(self._window))
         monitor = _monitor_named(display.name)
-        if monitor is None and not self.lost:
+        change = change_of(monitor is not None, self.lost, on_it)
+        if change == "gone":
             self.lost = True
             self._ramp = None
             log.warning(
@@ -270,7 +271,7 @@ class Window(Closing):
                 " back",
                 display.name,
             )
-        elif monitor is not None and (self.lost or not on_it):
+        elif change == "back":
             width, height = display.resolution_px
             glfw.set_window_monitor(
                 self._window, monitor, 0, 0, width, height, display.refresh_hz or glfw.DONT_CARE
@@ -447,6 +448,15 @@ def _newest_window(width: int, height: int, monitor: Any) -> Any:
             if window := glfw.create_window(width, height, TITLE, monitor, None):
                 return window
     return None
+
+
+def change_of(is_there: bool, was_lost: bool, on_it: bool) -> Literal["gone", "back", ""]:
+    """What has happened to a window's display: it is "gone", or it is "back", so that the window
+    has to go there; "" for nothing. A window may be put elsewhere while its display stays.
+    """
+    if not is_there:
+        return "" if was_lost else "gone"
+    return "back" if was_lost or not on_it else ""
 
 
 def pressed_key(key: int, action: int) -> str:

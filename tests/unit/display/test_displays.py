@@ -11,7 +11,11 @@ import pytest
 
 from hilstar.display.window.displays import Display, display_of
 from hilstar.display.window.library import glfw
-from hilstar.display.window.window import pressed_key
+from hilstar.display.window.output_settings import OutputState
+from hilstar.display.window.this_monitor import identity_of
+from hilstar.display.window.visibility import is_dark
+from hilstar.display.window.window import change_of, pressed_key
+from tests.unit.server.test_machine_row import edid
 
 HD = (1920, 1080)
 
@@ -101,3 +105,44 @@ def test_a_display_is_mirrored_by_another_one_at_its_own_place_alone():
 def test_a_key_counts_once_when_it_goes_down_however_long_it_is_held(key, name):
     assert pressed_key(key, glfw.PRESS) == name
     assert pressed_key(key, glfw.REPEAT) == pressed_key(key, glfw.RELEASE) == ""
+
+
+@pytest.mark.parametrize(
+    ("is_there", "was_lost", "on_it", "change"),
+    [
+        (True, False, True, ""),
+        (True, False, False, "back"),  # a window that was put elsewhere meanwhile
+        (True, True, False, "back"),
+        (True, True, True, "back"),
+        (False, False, False, "gone"),
+        (False, False, True, "gone"),
+        (False, True, False, ""),  # it is told once
+    ],
+)
+def test_a_window_goes_back_to_its_display_wherever_it_was_put(is_there, was_lost, on_it, change):
+    assert change_of(is_there, was_lost, on_it) == change
+
+
+# dpmsconst.h: on, standby, suspend, off
+@pytest.mark.parametrize(("level", "is_so"), [(0, False), (1, True), (2, True), (3, True)])
+def test_a_display_is_dark_at_every_level_of_dpms_but_on(level, is_so):
+    assert is_dark(True, level) is is_so
+    assert not is_dark(False, level)
+
+
+def test_a_monitor_s_identity_has_what_x_says_and_the_kernel_s_edid_where_x_hides_it(tmp_path):
+    (tmp_path / "card0-DP-1").mkdir()
+    (tmp_path / "card0-DP-1" / "edid").write_bytes(edid("DELL U2412M"))
+    hidden = OutputState("DP-1", HD, refresh_hz=59.934)
+    shown = replace(hidden, edid=edid("DELL P2423D"), transform=(0.5, *hidden.transform[1:]))
+    names = {}
+    for output in (None, hidden, shown):
+        adds = {"XWayland": False, "a compositing manager": True}
+        now = identity_of(display(refresh_hz=60), output, b"", adds, tmp_path)
+        names[output] = now.model
+        assert (now.connector, now.bits, now.gamma_ramp) == ("DP-1", 8, "")
+        assert now.mode == f"1920x1080@{'60.00' if output is None else '59.93'}"
+        added = ("a compositing manager", "a transform")
+        assert now.window_system == (added if output is shown else added[:1])
+    assert names == {None: "DELL U2412M", hidden: "DELL U2412M", shown: "DELL P2423D"}
+    assert identity_of(display("VGA-1"), None, b"", {}, tmp_path).model == ""

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 
 import msgspec
 import numpy as np
+import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.basics.notices import Notices
@@ -90,8 +91,9 @@ def test_widths_of_stars_are_the_focus_and_stay_in_the_ledger():
 def test_answers_are_judged_recorded_and_told_beside_the_frames():
     source, kept, notices, clock = Queued(), Kept(), Notices(), FakeClock(NS_PER_S)
     answers = LiveAnswers(BENCH, RULES, source, notices, kept, clock=clock)
-    heard = []
+    heard, passed_on = [], []
     answers.heard = lambda live: heard.append(live.figures)
+    answers.passed_on = lambda answer, middle_ns: passed_on.append((answer.raw, middle_ns))
     at_ns = NS_PER_S // 2
     with answers.running():
         assert answers.figures.answers == 0 and answers.figures.silent == ""
@@ -113,6 +115,8 @@ def test_answers_are_judged_recorded_and_told_beside_the_frames():
         {"checksum": 2},
     )
     assert notices.counts() == {"wrong-answer": 1, "tracker-silent": 1}
+    # each is handed on as it was judged, whatever the verdict
+    assert passed_on == [(raw, at_ns) for raw in (b"\x01\xff", b"\x02", b"\x03")]
     right, wrong, invalid = kept.records
     assert (right.raw, right.verdict, right.stars, right.centroids) == (
         "01ff",
@@ -142,10 +146,11 @@ def test_answers_are_judged_recorded_and_told_beside_the_frames():
     assert types == {"integer", "string", "array", "boolean", "number"}
 
 
-def test_frames_that_an_operator_changed_are_no_sky_to_compare_with():
+@pytest.mark.parametrize("changed", [OnScreen(operator="grid"), OnScreen(hidden="minimised")])
+def test_frames_that_an_operator_changed_or_a_window_hides_are_no_sky_to_compare_with(changed):
     source = Queued()
     answers = LiveAnswers(BENCH, RULES, source, Notices(), Kept(), clock=FakeClock(NS_PER_S))
-    second_of_frames(answers, on_screen=OnScreen(operator="grid"))
+    second_of_frames(answers, on_screen=changed)
     source.waiting.append(Answer(NS_PER_S // 2, b"", NS_PER_S // 2, Q))
     with answers.running():
         wait_for(lambda: answers.figures.answers)

@@ -173,7 +173,8 @@ def add_stars(
         lit = judged.lit
         of_star = np.full(len(lit.x_px), float(case[k]))
         columns = (of_star, lit.x_px, lit.y_px, lit.v_mag, lit.bv)
-        parts.append(np.stack([*columns, judged.dx_px, judged.dy_px, judged.signal_mag], axis=1))
+        errors = (judged.dx_px, judged.dy_px, judged.signal_mag, lit.lit_mag)
+        parts.append(np.stack([*columns, *errors], axis=1))
         false[k] = judged.false
     number, *columns_of_stars = np.concatenate(parts).T
     further.stars = StarTable(number.astype(np.intp), *columns_of_stars)

@@ -42,6 +42,11 @@ class LitStars:
     bv: FloatArray
     electrons_per_s: FloatArray
 
+    @property
+    def lit_mag(self) -> FloatArray:
+        """The magnitude (n,) of each star's light, -2.5 log10 of its electrons per second."""
+        return magnitude(self.electrons_per_s)
+
     def some(self, chosen: IntArray) -> "LitStars":
         """The stars with the indices `chosen` (m,)."""
         parts = (self.x_px, self.y_px, self.v_mag, self.bv, self.electrons_per_s)

@@ -32,6 +32,12 @@ from hilstar.optics.camera import field_terms
 
 MAP_DEGREE = 5  # of the polynomials of a star's place error over the detector
 WILD_SIGMAS = 6.0
+WILD_SIGNALS = 4.0  # scatters from the fit: a star that saturates, or that another brightens
+SIGNAL_ROUNDS = 3
+LIGHT_DEGREE = 2  # of the signal's error over the magnitude of the light
+NO_SIGNAL = (
+    "the reported signals fall as the stars' light rises: give DN, or 10^(-0.4 m) of a magnitude m"
+)
 LIMIT_BIN_MAG = 0.05
 LIMIT_DRAWS = 200  # of the bootstrap of a detection curve
 MIN_SLOPE_MAG = 0.01  # width of a detection curve: a sharper one cannot be told from its bins
@@ -49,6 +55,7 @@ class StarTable:
     dx_px: FloatArray
     dy_px: FloatArray
     signal_mag: FloatArray
+    lit_mag: FloatArray
 
     @property
     def found(self) -> npt.NDArray[np.bool_]:
@@ -167,19 +174,40 @@ def _star_map(
 
 
 def _star_colour(found: StarTable, confidence: float) -> BoundedFigure:
-    """How a star's signal goes with its B-V, magnitudes a magnitude."""
+    """How a star's signal goes with its B-V, magnitudes a magnitude.
+
+    A signal that is not linear in the light, by saturation or a threshold, goes with B-V too: red
+    stars are not as bright as blue ones. So the magnitude of the light is fitted beside it.
+    """
     known = np.isfinite(found.signal_mag) & np.isfinite(found.bv)
     refuse_few(found.case[known], "stars' signal")
     signal = found.signal_mag[known]
-    off = np.abs(signal - np.median(signal))
-    middle = max(float(np.median(off)), 1e-9)
-    near = off <= WILD_SIGMAS * MAD_TO_SIGMA * middle
-    bv = found.bv[known][near]
-    case = found.case[known][near]
-    design = np.stack([np.ones(len(bv)), bv], axis=1)
-    fit = fit_by_cases(design, signal[near], case)
-    method = f"linear fit over B-V of {len(bv)} stars, Student's t"
+    lit = found.lit_mag[known]
+    if len(signal) > 2 and stats.spearmanr(signal + lit, lit).statistic < 0:
+        raise TooFewCases(NO_SIGNAL, 0)
+    bv = found.bv[known]
+    fainter = lit - np.median(lit)
+    terms = [np.ones(len(bv)), bv]
+    for power in range(1, LIGHT_DEGREE + 1):
+        terms.append(fainter**power)
+    design = np.stack(terms, axis=1)
+    near = _near(signal - np.median(signal), WILD_SIGMAS)
+    for _ in range(SIGNAL_ROUNDS):
+        solution = np.linalg.lstsq(design[near], signal[near], rcond=None)[0]
+        residual = signal - design @ solution
+        near = _near(residual, WILD_SIGNALS, residual[near])
+    fit = fit_by_cases(design[near], signal[near], found.case[known][near])
+    method = f"linear fit over B-V of {int(near.sum())} stars, Student's t"
     return largest_size([fit], 1, confidence, method)
+
+
+def _near(off: FloatArray, sigmas: float, usual: FloatArray | None = None) -> npt.NDArray[np.bool_]:
+    """Which values (n,) are within so many scatters of 0, by the median size of `usual` ones (by
+    default all).
+    """
+    middle = float(np.median(np.abs(off if usual is None else usual)))
+    within = np.abs(off) <= sigmas * MAD_TO_SIGMA * max(middle, 1e-9)
+    return np.asarray(within, dtype=np.bool_)
 
 
 def _star_limit(found: StarTable, confidence: float, rng: np.random.Generator) -> BoundedFigure:

@@ -45,9 +45,8 @@ from hilstar.optics.layers.view import View
 from hilstar.server.answers.answer import Answer, AnswerSource
 from hilstar.server.answers.judge import AnswerJudge, AnswerRules, Judged
 from hilstar.server.answers.pairing import LitFrame, LitFrames, residual_arcsec
-from hilstar.server.answers.stars import StarResiduals, judge_stars, lit_at
+from hilstar.server.answers.stars import ShownStars
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.fault_views import display_view
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.scenario import Timetable
@@ -237,7 +236,7 @@ class BenchRun:
         self._base = self._next = 0  # frame numbers go on from one renderer to the next
         self._frames: LitFrames | None = None
         self._judge: AnswerJudge | None = None
-        self._bench: Bench | None = None
+        self._shown_stars: ShownStars | None = None
         self._heard_ns: int | None = None
         self._refused = 0
         self._waiting = False
@@ -283,7 +282,7 @@ class BenchRun:
         if self._frames is None:
             self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
             self._judge = AnswerJudge(self._rules, self._frames)
-        self._bench = bench
+        self._shown_stars = ShownStars(bench)
         self._base = self._next
         self._light_ns = 0 if screen is None else screen.swap_to_light_ns
         self._file_sha256 = bench.file.sha256
@@ -480,20 +479,9 @@ class BenchRun:
             view = self._view(judged.middle_ns) or now.case.first
             now.take(judged, right, view.turn.rate_cam_rad_s)
             if right and "stars" in plan.columns and judged.lit is not None:
-                now.star_lists.judged.append(self._judged_stars(answer, judged.lit.q))
-
-    def _judged_stars(self, answer: Answer, lit_q: FloatArray) -> StarResiduals:
-        """The stars of an answer against those that were lit at an attitude: of the tracker's field
-        what the display covers.
-        """
-        bench = self._bench
-        assert bench is not None
-        tracker = bench.config.tracker
-        camera = tracker_camera(tracker, bench.file.folder)
-        lit = lit_at(lit_q, bench.stars, camera, bench.faintest_shown_e_per_s)
-        x_px, y_px = bench.camera.pixels_from(camera, lit.x_px, lit.y_px)
-        lit = lit.some(np.flatnonzero(bench.camera.contains_px(x_px, y_px)))
-        return judge_stars(answer.centroids, lit, tracker.resolution_px)
+                assert self._shown_stars is not None
+                residuals = self._shown_stars.judged(answer.centroids, judged.lit.q)
+                now.star_lists.judged.append(residuals)
 
     def _is_of(self, now: Tally, judged: Judged, answer: Answer) -> bool:
         """Whether an answer is of the case on the display; one of the case before that comes

@@ -135,7 +135,7 @@ FRAME_ERRORS = tuple(f"frame_error_{axis}_arcsec" for axis in AXES)
 FRAME_RATE_ERRORS = tuple(f"frame_rate_error_{axis}_deg_s" for axis in AXES)
 STAR_LISTS = (
     *("star_x_px", "star_y_px", "star_v_mag", "star_bv"),
-    *("star_dx_px", "star_dy_px", "star_signal_mag"),
+    *("star_dx_px", "star_dy_px", "star_signal_mag", "star_lit_mag"),
 )
 REPORTED_FRAMES, FALSE_STARS = "star_frames", "star_false"
 FURTHER: dict[Further, tuple[str, ...]] = {

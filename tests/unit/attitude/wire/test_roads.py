@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import time
 from collections.abc import Callable, Iterator
 from ipaddress import ip_address
 from pathlib import Path
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilstar.attitude.wire.apart import process_state, why_hung
 from hilstar.attitude.wire.apart_child import as_read
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
@@ -362,3 +364,43 @@ def test_of_what_was_read_together_only_what_woke_the_reader_did_not_wait(
     waited_ns = [0 if is_timely else 10 + k for k, is_timely in enumerate(timely)]
     assert [message.waited_ns for message in stamped] == waited_ns
     assert [message.parts for message in stamped] == [message.parts for message in taken]
+
+
+@pytest.mark.parametrize(
+    ("is_starting", "state", "silent_s", "used_s", "why"),
+    [
+        (True, "R", 31.0, 20.0, "no sign of life for 30 s"),  # it imports for too long
+        (True, "S", 31.0, 0.0, "no sign of life for 30 s"),
+        (False, "S", 0.5, 0.0, "no sign of life for 0.4 s"),  # it waits for what never comes
+        (False, "D", 0.5, 0.0, "no sign of life for 0.4 s"),
+        (False, "R", 0.5, 0.1, ""),  # it may be waiting for a core
+        (False, "R", 2.9, 0.9, ""),
+        (False, "R", 3.1, 0.1, "no sign of life for 3 s"),  # for ever
+        (False, "R", 1.5, 1.1, "it took 1.1 s of a core over one message, and did not return"),
+    ],
+)
+def test_a_silent_reader_is_ended_unless_it_waits_for_a_core(
+    is_starting, state, silent_s, used_s, why
+):
+    assert why_hung(is_starting, state, silent_s, used_s) == why
+
+
+def test_what_a_process_does_and_its_own_cpu_time_are_those_of_proc():
+    """proc(5): the state is the third word, utime and stime the 14th and 15th, those of its children
+    the two after; the second may have blanks and brackets.
+    """
+    words = [
+        "4711",
+        "(a) name (b)",
+        "S",
+        *map(str, range(4, 14)),
+        "250",
+        "50",
+        "7000",
+        "8000",
+        "20",
+    ]
+    assert process_state(" ".join(words)) == ("S", 300 / os.sysconf("SC_CLK_TCK"))
+    state, own_s = process_state(Path("/proc/self/stat").read_text())
+    assert state == "R"
+    assert own_s == pytest.approx(time.process_time(), abs=0.1)

@@ -22,8 +22,10 @@ from hilstar.cli.running import (
     PageOptions,
     end_of_run,
     page_listener,
+    say_beat,
     scpi_listener,
 )
+from hilstar.cli.tracker import open_camera, recorded
 from hilstar.instruments.calibrate import grabbed_dots
 from hilstar.instruments.calibrate.grabbed_dots import DotImages
 from hilstar.server.bench.bench_file import read_bench_file
@@ -168,3 +170,41 @@ def test_a_dark_frame_that_is_named_counts_in_place_of_the_one_that_was_taken(
 def test_images_of_dots_are_given_or_taken(tmp_path, given, options, words):
     with pytest.raises(InputError, match=words):
         dot_images(None, given, tmp_path, DotOptions(**options))
+
+
+def test_a_beat_is_with_the_refresh_that_was_measured_where_the_screen_paces(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"monitor": {"refresh_hz": 60.0}}))
+    bench = SimpleNamespace(config=read_bench_file(path).config)
+    paced, unpaced = (
+        SimpleNamespace(
+            clock=SimpleNamespace(paced_by_screen=paces, period_ns=16_000_000),
+            window=SimpleNamespace(modes_hz=()),
+        )
+        for paces in (True, False)
+    )
+    assert say_beat(bench, paced).refresh_hz == 62.5
+    assert say_beat(bench, unpaced).refresh_hz == 60.0
+    assert say_beat(bench, None).refresh_hz == 60.0
+
+
+def test_a_tracker_s_camera_that_others_reach_needs_to_know_whom_to_let_in(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    with (
+        pytest.raises(InputError, match="nothing says which may use it"),
+        open_camera("192.0.2.1", [], read_bench_file(path), 2.0),
+    ):
+        pass
+
+
+def test_an_answer_without_an_attitude_is_a_row_that_says_so(tmp_path):
+    path = tmp_path / "telemetry.csv"
+    with recorded(path) as row:
+        row(SimpleNamespace(t_ns=1_500_000_000, q_icrs_to_cam=None))
+        row(SimpleNamespace(t_ns=2_000_000_000, q_icrs_to_cam=(0.5, -0.5, 0.5, -0.5)))
+    assert path.read_text().splitlines() == [
+        "t_s,qw,qx,qy,qz,valid",
+        "1.500000000,,,,,0",
+        "2.000000000,0.5,-0.5,0.5,-0.5,1",
+    ]

@@ -220,21 +220,6 @@ def test_the_command_prints_a_table_that_a_bench_file_takes(
     assert_refused(run_hilstar_here(*words[:3], "-o", "a.csv", cwd=tmp_path), 2, ".toml")
 
 
-def test_a_bench_file_with_a_wrong_table_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "bench.toml"
-    for table, told in (
-        ("q_mon_to_reference = [1.0, 0.0, 0.0, 1.0]", "norm is 1.41421"),
-        (
-            "q_mon_to_reference = [1.0, 0.0, 0.0, 0.0]\n"
-            "covariance_arcsec2 = [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]]",
-            "no covariance",
-        ),
-    ):
-        path.write_text(f"{bench_text()}\n[alignment]\n{table}\n")
-        with pytest.raises(InputError, match=told):
-            read_bench_file(path)
-
-
 def test_the_table_keeps_what_was_found(tmp_path: Path, rng: np.random.Generator) -> None:
     found = fitted_reference(tmp_path, planted_cube_readings(rng)[0])
     path = tmp_path / "bench.toml"

@@ -5,6 +5,7 @@ The figures are those of an acceptance (docs/accept.md). The unit that is indepe
 one of STRETCHES stretches of the run.
 """
 
+import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -20,7 +21,12 @@ from hilstar.instruments.assess.case_fits import summed
 from hilstar.instruments.assess.figure_rows import COUNT, FigureRow
 from hilstar.instruments.assess.places import spread_rows
 from hilstar.instruments.assess.rate_figures import RateTable, rate_figure
-from hilstar.instruments.assess.star_figures import StarTable, false_stars, star_figure
+from hilstar.instruments.assess.star_figures import (
+    StarTable,
+    false_stars,
+    star_figure,
+    without_shifts,
+)
 from hilstar.instruments.assess.time_figures import stamp_jitter
 from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.answers.stars import ShownStars
@@ -102,7 +108,7 @@ def add_rates(
                 further.miss(name, axis, unit, few)
             else:
                 further.add(name, axis, unit, figure)
-    further.notes += _other_rates(rates_deg_s, reported_deg_s)
+    further.notes += other_rates(rates_deg_s, reported_deg_s)
 
 
 def stretches(count: int) -> IntArray:
@@ -110,7 +116,7 @@ def stretches(count: int) -> IntArray:
     return np.arange(count) * STRETCHES // max(count, 1)
 
 
-def _other_rates(rates_deg_s: FloatArray, reported_deg_s: FloatArray) -> Iterator[str]:
+def other_rates(rates_deg_s: FloatArray, reported_deg_s: FloatArray) -> Iterator[str]:
     """A note on reported rates (n, 3) that are the commanded ones in another unit, or turned."""
     known = np.isfinite(reported_deg_s).all(axis=1)
     rates = rates_deg_s[known]
@@ -165,19 +171,22 @@ def add_stars(
     if not len(rows):
         return
     rows = rows[spread_rows(len(rows), STAR_ANSWERS)]
-    case = stretches(len(rows))
     parts = []
     false = np.zeros(len(rows))
     for k, row in enumerate(rows.tolist()):
         judged = shown.judged(tuple(centroids[row]), found.commanded_q[row])
         lit = judged.lit
-        of_star = np.full(len(lit.x_px), float(case[k]))
-        columns = (of_star, lit.x_px, lit.y_px, lit.v_mag, lit.bv)
+        of_answer = np.full(len(lit.x_px), float(k))
+        columns = (of_answer, lit.x_px, lit.y_px, lit.v_mag, lit.bv)
         errors = (judged.dx_px, judged.dy_px, judged.signal_mag, lit.lit_mag)
         parts.append(np.stack([*columns, *errors], axis=1))
         false[k] = judged.false
+    case = stretches(len(rows))
     number, *columns_of_stars = np.concatenate(parts).T
-    further.stars = StarTable(number.astype(np.intp), *columns_of_stars)
+    answer = number.astype(np.intp)
+    further.stars = StarTable(case[answer], *columns_of_stars)
+    with contextlib.suppress(TooFewCases):  # too few for a map: no figure needs it then
+        further.stars = without_shifts(further.stars, answer, shown.size_px)
     for quantity, (name, unit) in STAR_NAMES.items():
         rng = np.random.default_rng(SEED)
         try:

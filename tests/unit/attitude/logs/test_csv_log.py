@@ -4,6 +4,8 @@ units, and what is refused.
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -302,3 +304,28 @@ REFUSED = {
 @pytest.mark.parametrize("text", REFUSED)
 def test_a_log_that_may_mean_two_things_is_refused(csv_of, text):
     assert REFUSED[text] in refusal(open_log, csv_of(text))
+
+
+def test_telemetry_has_the_rates_of_its_columns_in_their_unit(tmp_path: Path) -> None:
+    path = tmp_path / "telemetry.csv"
+    rows = ["0,1,0,0,0,1.8,0,-3.6,1", "1,1,0,0,0,,,,1", "2,0,0,0,0,9,9,9,0"]
+    header = "t_s,qw,qx,qy,qz,rx [deg/s],ry [deg/s],rz [deg/s],valid"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    rates = read_telemetry(path).rate_cam_rad_s
+    assert rates is not None
+    np.testing.assert_allclose(rates[0], np.radians([1.8, 0.0, -3.6]), rtol=1e-12)
+    assert np.isnan(rates[1:]).all()
+
+
+@pytest.mark.parametrize(
+    "header, row, told",
+    [
+        ("rx,ry", "0,0", "column rz is missing beside the others of a rate"),
+        ("rx,ry,rz", "0,,0", "leave all three blank where no rate is reported"),
+    ],
+)
+def test_half_a_rate_is_refused(tmp_path: Path, header: str, row: str, told: str) -> None:
+    path = tmp_path / "telemetry.csv"
+    path.write_text(f"t_s,qw,qx,qy,qz,{header}\n0,1,0,0,0,{row}\n")
+    with pytest.raises(InputError, match=told):
+        read_telemetry(path)

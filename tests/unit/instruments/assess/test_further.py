@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
 from hilstar.instruments.assess.assessment import Assessment, AssessSettings, assess_files
+from hilstar.instruments.assess.further import END, other_rates
+from hilstar.instruments.assess.star_figures import StarTable, star_figure, without_shifts
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.star_light import bench_stars
 from tests.support.benches import bench_text
@@ -86,8 +88,8 @@ def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_ledger(path, frames_s, frames_q, start_ns=0, bench=BENCH)
 
 
-def assessed(ledger: Path, factor: float = 1.0, sky: Sky | None = None) -> Assessment:
-    """An assessment of telemetry with planted errors, its rates times a factor."""
+def assessed(ledger: Path, sky: Sky) -> Assessment:
+    """An assessment of telemetry with planted errors."""
     rng = np.random.default_rng(5)
     t_s = np.arange(1.0, SECONDS - 1, ANSWER_S)
     true = attitude(motion, t_s)
@@ -101,9 +103,8 @@ def assessed(ledger: Path, factor: float = 1.0, sky: Sky | None = None) -> Asses
     for k, at_s in enumerate(t_s.tolist()):
         answer: dict[str, Any] = {"t_ns": round(at_s * 1e9), "q": q[k].tolist(), "valid": True}
         if k % 3:  # a tracker that has no rate in every third answer
-            answer["rate"] = (factor * rate[k]).tolist()
-        if sky is not None:
-            answer["centroids"] = sky.reported(true[k], rng)
+            answer["rate"] = rate[k].tolist()
+        answer["centroids"] = sky.reported(true[k], rng)
         lines.append(json.dumps(answer))
     telemetry = ledger.with_name("telemetry.jsonl")
     telemetry.write_text("\n".join(lines) + "\n")
@@ -111,7 +112,7 @@ def assessed(ledger: Path, factor: float = 1.0, sky: Sky | None = None) -> Asses
 
 
 def test_planted_rates_and_stars_come_out_of_telemetry(ledger: Path) -> None:
-    found = assessed(ledger, sky=Sky(ledger.parent))
+    found = assessed(ledger, Sky(ledger.parent))
     planted = {
         ("rate bias", "cross"): RATE_BIAS_DEG_S,
         ("rate bias", "roll"): 0.0,
@@ -140,7 +141,45 @@ def test_planted_rates_and_stars_come_out_of_telemetry(ledger: Path) -> None:
     assert {each["why"] for each in listed} == {""}
 
 
-@pytest.mark.parametrize("factor, told", [(180 / np.pi, "deg/s"), (-1.0, "x = -x, y = -y, z = -z")])
-def test_rates_of_another_convention_are_named(ledger: Path, factor: float, told: str) -> None:
-    found = assessed(ledger, factor)
-    assert any("the reported rates are" in note and told in note for note in found.notes)
+@pytest.mark.parametrize(
+    "factor, told",
+    [
+        (180 / np.pi, "deg/s"),
+        (np.pi / 180, "twice converted"),
+        (-1.0, "x = -x, y = -y, z = -z"),
+        (1.0, ""),
+        (1.05, ""),
+    ],
+)
+def test_rates_of_another_convention_are_named(
+    factor: float, told: str, rng: np.random.Generator
+) -> None:
+    rates_deg_s = np.degrees(rate_rad_s(np.arange(1.0, SECONDS, ANSWER_S)))
+    noise_deg_s = RATE_NOISE_DEG_S * rng.standard_normal(rates_deg_s.shape)
+    notes = list(other_rates(rates_deg_s, factor * rates_deg_s + factor * noise_deg_s))
+    assert len(notes) == bool(told)
+    assert all("the reported rates are" in note and told in note for note in notes)
+
+
+def test_axes_of_another_frame_are_named(rng: np.random.Generator) -> None:
+    """Rates about a body's axes, whose x is the camera's z."""
+    rates_deg_s = np.degrees(rate_rad_s(np.arange(1.0, SECONDS, ANSWER_S)))
+    (note,) = other_rates(rates_deg_s, rates_deg_s[:, [2, 0, 1]])
+    assert "x = +z, y = +x, z = +y" in note
+
+
+def test_a_shift_that_all_stars_share_is_not_a_stars_noise(rng: np.random.Generator) -> None:
+    """Answers of 20 stars each, which a time that is off moves by 2 px an axis, one sigma."""
+    answers, stars = 200, 20
+    answer = np.repeat(np.arange(answers), stars)
+    x_px, y_px = rng.uniform(0, SIDE_PX - 1, (2, len(answer)))
+    shift_px = rng.normal(0, 2.0, (2, answers))[:, answer]
+    dx_px, dy_px = shift_px + rng.normal(0, STAR_NOISE_PX, (2, len(answer)))
+    zeros = np.zeros(len(answer))
+    table = StarTable(answer, x_px, y_px, zeros, zeros, dx_px, dy_px, zeros, zeros)
+    resolution_px = (SIDE_PX, SIDE_PX)
+    free = without_shifts(table, answer, resolution_px)
+    figure = star_figure("star-noise", free, resolution_px, END, rng)
+    # of 8000 places a sigma is known to 0.8 %; four times that
+    assert figure.value == pytest.approx(STAR_NOISE_PX, rel=0.032)
+    assert figure.low <= STAR_NOISE_PX <= figure.high

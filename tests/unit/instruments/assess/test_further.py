@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
 from hilstar.instruments.assess.assessment import Assessment, AssessSettings, assess_files
-from hilstar.instruments.assess.further import END, other_rates
+from hilstar.instruments.assess.further import END, rate_notes
 from hilstar.instruments.assess.star_figures import StarTable, star_figure, without_shifts
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.star_light import bench_stars
@@ -135,37 +135,34 @@ def test_planted_rates_and_stars_come_out_of_telemetry(ledger: Path) -> None:
         assert row.value is not None and row.low_95 is not None and row.high_95 is not None, key
         sigma = (row.high_95 - row.low_95) / TO_SIGMA
         assert abs(row.value - planted[key]) <= max(SHARE * planted[key], SIGMAS * sigma), key
-    assert not any("rates" in note for note in found.notes)
+    assert not any("reported rates" in note for note in found.notes)
     listed = report.budget_of(found)["further"]
     assert [(each["quantity"], each["axis"]) for each in listed] == list(planted)
     assert {each["why"] for each in listed} == {""}
 
 
 @pytest.mark.parametrize(
-    "factor, told",
+    "factor, order, told",
     [
-        (180 / np.pi, "deg/s"),
-        (np.pi / 180, "twice converted"),
-        (-1.0, "x = -x, y = -y, z = -z"),
-        (1.0, ""),
-        (1.05, ""),
+        (180 / np.pi, (0, 1, 2), "they are in deg/s"),
+        (-1.0, (0, 1, 2), "they have the wrong sign"),
+        (1.0, (2, 0, 1), "their axes are in another order"),
+        (1.0, (0, 1, 2), ""),
+        (1.05, (0, 1, 2), ""),
     ],
 )
 def test_rates_of_another_convention_are_named(
-    factor: float, told: str, rng: np.random.Generator
+    factor: float, order: tuple[int, int, int], told: str, rng: np.random.Generator
 ) -> None:
-    rates_deg_s = np.degrees(rate_rad_s(np.arange(1.0, SECONDS, ANSWER_S)))
-    noise_deg_s = RATE_NOISE_DEG_S * rng.standard_normal(rates_deg_s.shape)
-    notes = list(other_rates(rates_deg_s, factor * rates_deg_s + factor * noise_deg_s))
+    t_s = np.arange(1.0, SECONDS / 2, ANSWER_S)
+    noise_rad = rng.normal(0, 2.0, (len(t_s), 3)) / ARCSEC_PER_RAD
+    q = scalar_first(Rotation.from_rotvec(noise_rad) * attitude(motion, t_s))
+    rates = rate_rad_s(t_s) + np.radians(RATE_NOISE_DEG_S) * rng.standard_normal((len(t_s), 3))
+    rates = factor * rates[:, order]
+    rates[::7] = np.nan
+    notes = list(rate_notes(np.rint(1e9 * t_s).astype(np.int64), q, rates))
     assert len(notes) == bool(told)
-    assert all("the reported rates are" in note and told in note for note in notes)
-
-
-def test_axes_of_another_frame_are_named(rng: np.random.Generator) -> None:
-    """Rates about a body's axes, whose x is the camera's z."""
-    rates_deg_s = np.degrees(rate_rad_s(np.arange(1.0, SECONDS, ANSWER_S)))
-    (note,) = other_rates(rates_deg_s, rates_deg_s[:, [2, 0, 1]])
-    assert "x = +z, y = +x, z = +y" in note
+    assert all("not the turn of the reported attitudes" in note and told in note for note in notes)
 
 
 def test_a_shift_that_all_stars_share_is_not_a_stars_noise(rng: np.random.Generator) -> None:

@@ -9,6 +9,7 @@ import pytest
 from hilstar.attitude.wire.endpoint import check_use, parse_endpoint
 from hilstar.attitude.wire.vizard import check_loopback
 from hilstar.basics.errors import InputError
+from tests.support.refusals import refusal
 
 LOOPBACK = (
     "tcp://127.0.0.1:5560",
@@ -41,6 +42,17 @@ def test_loopback_and_sockets_of_this_machine_need_no_keys(text):
 @pytest.mark.parametrize("text", BEYOND)
 def test_what_others_can_reach_is_never_taken_for_loopback(text):
     assert not parse_endpoint(text).loopback
+
+
+@pytest.mark.parametrize("letter", ["a", "ä", "€"])
+def test_a_sockets_path_is_as_long_as_its_bytes(letter):
+    """sun_path of sockaddr_un has 108 bytes with the NUL behind it (unix(7))."""
+    count, rest = divmod(107 - len("/"), len(letter.encode()))
+    longest = "/" + letter * count + "a" * rest
+    with socket.socket(socket.AF_UNIX) as asker, pytest.raises(FileNotFoundError):
+        asker.connect(longest)  # the kernel takes it
+    assert str(parse_endpoint(f"ipc://{longest}").path) == longest
+    assert "at most 107 bytes" in refusal(parse_endpoint, f"ipc://{longest}a")
 
 
 def test_libzmq_gets_the_address_that_was_judged():

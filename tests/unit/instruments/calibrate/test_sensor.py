@@ -14,7 +14,13 @@ from astropy.io import fits
 from PIL import Image
 
 from hilstar.basics.errors import InputError
-from hilstar.instruments.calibrate.sensor import import_emva, measure_sensor, write_sensor
+from hilstar.instruments.calibrate.sensor import (
+    _Figures,
+    _system_gain,
+    import_emva,
+    measure_sensor,
+    write_sensor,
+)
 from hilstar.server.bench.config import read_config
 from hilstar.server.bench.star_rates import bench_optics
 from hilstar.tracker.detector import Detector
@@ -293,3 +299,19 @@ def test_a_frame_with_a_damaged_header_is_refused_in_one_line(tmp_path, old, new
     with pytest.raises(InputError, match="frame_000") as refusal:
         measure_sensor(flats, darks)
     assert len(str(refusal.value).splitlines()) == 1
+
+
+def test_the_error_of_a_gain_is_the_scatter_of_sensors_that_are_alike(rng):
+    """400 sensors of 5 DN an electron: a variance of n pixels scatters by sqrt(2 / n)."""
+    pixels, sensors = 1000, 400
+    signal_dn = np.array([500.0, 2000.0, 6000.0])
+    gains, errors = [], []
+    for _ in range(sensors):
+        variance_dn2 = 5.0 * signal_dn * rng.chisquare(pixels, len(signal_dn)) / pixels
+        unit = _system_gain(signal_dn, variance_dn2, variance_dn2, pixels)
+        figures = _Figures(unit)
+        gains.append(figures.keys["gain_e_per_dn"])
+        errors.append(figures.sigmas["gain_e_per_dn"])
+    assert np.mean(gains) == pytest.approx(0.2, rel=SIGMAS * math.sqrt(2 / 3 / pixels / sensors))
+    # a standard deviation of n values is known to 1 / sqrt(2 n)
+    assert np.std(gains) == pytest.approx(np.mean(errors), rel=SIGMAS / math.sqrt(2 * sensors))

@@ -39,6 +39,7 @@ from hilstar.tracker.rounding import (
 )
 from tests.support.benches import TWIN, bench_text
 from tests.support.refusals import refusal
+from tests.support.tables import write_readings
 
 pytestmark = pytest.mark.usefixtures("without_charts")
 BITS, BLACK, POWER = 8, 1e-3, 2.35
@@ -195,11 +196,6 @@ def test_the_command_and_the_step_give_the_same_figures(tmp_path):
     assert np.array_equal(*responses)
 
 
-def write_rows(path, rows, header):
-    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
-    return path
-
-
 def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
     """Codes below half were read in a range whose ratio is known to 1 %; each reading repeats to
     0.1 %.
@@ -220,7 +216,7 @@ def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
             (code, "w", one, 0.001 * one + 1e-7, 0.01 * one * below)
             for code, one, below in zip(codes, value, faint, strict=True)
         ]
-        path = write_rows(tmp_path / "m.csv", rows, "code,channel,value,sigma,common_range")
+        path = write_readings(tmp_path / "m.csv", rows, "code,channel,value,sigma,common_range")
         fit = fit_channel(read_measurements(path), "w")
         code = 60
         ratios.append(
@@ -240,7 +236,7 @@ def test_levels_that_no_smooth_curve_meets_have_larger_errors(tmp_path):
     light = gamma_response(BITS, POWER).light[codes] * scatter
     rows = [(code, "w", one, 1e-4 * one + 1e-9) for code, one in zip(codes, light, strict=True)]
     fit = fit_channel(
-        read_measurements(write_rows(tmp_path / "m.csv", rows, "code,channel,value,sigma")), "w"
+        read_measurements(write_readings(tmp_path / "m.csv", rows, "code,channel,value,sigma")), "w"
     )
     codes = np.arange(40, 255)
     off = fit.light[codes] / gamma_response(BITS, POWER).light[codes] - 1

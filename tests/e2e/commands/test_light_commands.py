@@ -237,13 +237,7 @@ def test_a_monitor_that_is_30_percent_too_bright_is_found_by_the_tracker(
         assert bench.flux_at_white_e_per_s == found["flux_at_white_e_per_s"]
         assert bench.config.render.sprite_sigma_px == (0.9, 0.9)
     again = of_json(
-        "calibrate",
-        "scale",
-        tmp_path / "scaled.toml",
-        "--reading",
-        "26311,1000",
-        "-o",
-        tmp_path / "third.toml",
+        f"calibrate scale {tmp_path}/scaled.toml --reading 26311,1000 -o {tmp_path}/third.toml"
     )
     assert (tmp_path / "third.toml").read_text().count("flux_at_white_e_per_s") == 1
     assert again["assumed_e_per_s"] == found["flux_at_white_e_per_s"]
@@ -279,13 +273,8 @@ def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
         writer.writeheader()
         writer.writerows(rows)
     fitted = of_json(
-        "calibrate",
-        "photometric",
-        tmp_path / "measured.csv",
-        "-o",
-        tmp_path / "monitor.toml",
-        "--plot",
-        tmp_path / "fit.png",
+        f"calibrate photometric {tmp_path}/measured.csv -o {tmp_path}/monitor.toml --plot "
+        f"{tmp_path}/fit.png"
     )
     assert fitted["noise_relative"] == pytest.approx(0.01, rel=0.2)
     response = load_calibration(tmp_path / "monitor.toml", 8).response

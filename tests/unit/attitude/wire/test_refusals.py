@@ -14,7 +14,9 @@ from hilstar.attitude.wire.nasa42 import spacecraft_number
 from hilstar.attitude.wire.vizard import check_loopback
 from hilstar.server.bench.config.bench_config import parse_config
 from tests.support.benches import SMALL_BENCH
+from tests.support.commands import bounded_by
 from tests.support.refusals import assert_file_refused, refusal, says
+from tests.support.waiting import PATIENCE_S
 
 # Two places in one text, of which libzmq takes one.
 TWO_PLACES = ("tcp://127.0.0.1:0;10.0.0.1:5560", "tcp://127.0.0.1;10.0.0.1:5560")
@@ -108,4 +110,5 @@ def test_what_is_no_key_file_is_refused_in_one_line(tmp_path, text):
 
 def test_a_pipe_in_the_place_of_a_key_file_is_refused_in_one_line(tmp_path):
     os.mkfifo(tmp_path / "pipe.key")
-    assert_file_refused(load_public, tmp_path / "pipe.key", "")
+    with bounded_by(PATIENCE_S):  # whoever opens it waits for ever
+        assert_file_refused(load_public, tmp_path / "pipe.key", "")

@@ -5,7 +5,6 @@ so. What only a planted bench can show stands beside the plant: geometric, align
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from tests.support.benches import SMALL_BENCH, TWIN, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.planted_run import write_ledger
 from tests.support.refusals import assert_file_refused, refusal, says
+from tests.support.tables import readings_text
 
 STEPS = [0, 1, *range(5, 256, 10)]
 
@@ -36,11 +36,6 @@ def photometric(path: Path) -> None:
         calibrate_photometric(path, output)
     finally:
         assert not output.exists()
-
-
-def readings(rows: Iterable[tuple[object, ...]], header: str = "code,channel,value") -> str:
-    lines = [",".join(map(str, row)) for row in rows]
-    return "\n".join([header, *lines]) + "\n"
 
 
 def ramp(codes: list[int]) -> list[tuple[int, str, float]]:
@@ -85,17 +80,17 @@ MEASUREMENTS = [
     (f"{HEAD},exposure_s\n1,w,2,0\n", "exposure_s = 0"),
     (f"{HEAD},t_s\n1,w,2,\n2,w,2,1\n", "t_s is empty in some rows"),
     (f"{HEAD}\n1,r,2\n", "only channel r"),
-    (readings(ramp([0, 300])), "white, code 1023 of 10 bits"),
-    (readings(ramp(STEPS[1:])), "code 0 is not measured"),
-    (readings(ramp(STEPS[:-1])), "white, code 255 of 8 bits, is not measured"),
-    (readings(ramp([0, 10, 20, 40, 80, 160, 255])), "7 distinct codes; measure 10 or more"),
-    (readings(HELD), "saturated or the link clips"),
-    (readings(COUNTS), "codes 245 to 255 read the same"),
+    (readings_text(ramp([0, 300])), "white, code 1023 of 10 bits"),
+    (readings_text(ramp(STEPS[1:])), "code 0 is not measured"),
+    (readings_text(ramp(STEPS[:-1])), "white, code 255 of 8 bits, is not measured"),
+    (readings_text(ramp([0, 10, 20, 40, 80, 160, 255])), "7 distinct codes; measure 10 or more"),
+    (readings_text(HELD), "saturated or the link clips"),
+    (readings_text(COUNTS), "codes 245 to 255 read the same"),
     # light that falls beyond the noise
-    (readings(FALLING), "code 115 to code 125"),
-    (readings(DRIFTING), "light drifts by -"),
+    (readings_text(FALLING), "code 115 to code 125"),
+    (readings_text(DRIFTING), "light drifts by -"),
     # the same rows sorted, their times beside them
-    (readings(TIMED, f"{HEAD},t_s"), "light drifts by -"),
+    (readings_text(TIMED, f"{HEAD},t_s"), "light drifts by -"),
     ("\xff\xfe\x00", "not UTF-16 to its end"),
 ]
 SHEETS = [
@@ -156,7 +151,7 @@ def test_a_plan_that_was_not_filled_in_and_a_file_that_is_not_there_are_refused(
 
 def test_a_table_of_light_does_not_write_over_the_measurements(tmp_path):
     path = tmp_path / "monitor.csv"
-    path.write_text("\ufeff" + readings(ramp(STEPS)))  # a byte-order mark is no fault
+    path.write_text("\ufeff" + readings_text(ramp(STEPS)))  # a byte-order mark is no fault
     assert "written over" in refusal(photometric, path)
 
 

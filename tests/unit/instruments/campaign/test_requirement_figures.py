@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.campaign.case_table import Columns
-from hilstar.instruments.campaign.figures import (
+from hilstar.instruments.assess.bounded_figures import (
     clopper_pearson,
     drawn_limits,
     quantile_limits,
     sigma_limits,
 )
+from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.plan import Require
 from hilstar.instruments.campaign.requirements import (
     MET,

@@ -283,14 +283,7 @@ def test_frame_transfer_smears_each_column_by_its_light(tmp_path):
 def test_a_wrong_shutter_is_one_line(tmp_path, keys, said):
     (tmp_path / "bench.toml").write_text(bench_text({"tracker.detector": keys}))
     done = run_hilstar_here(
-        "simulate",
-        tmp_path / "bench.toml",
-        "--radec",
-        "84,0,0",
-        "--slew",
-        "2,0,0",
-        "--png",
-        tmp_path / "a.png",
+        f"simulate {tmp_path}/bench.toml --radec 84,0,0 --slew 2,0,0 --png {tmp_path}/a.png"
     )
     assert done.returncode == 2
     assert said in done.stderr

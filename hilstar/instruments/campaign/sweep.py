@@ -20,8 +20,8 @@ from msgspec import Meta
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.toml_tables import Table
+from hilstar.instruments.assess.bounded_figures import BoundedFigure, TooFewCases, clopper_pearson
 from hilstar.instruments.campaign.case_table import Columns
-from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, clopper_pearson
 from hilstar.instruments.campaign.plan import Number
 
 STILL, NOT_EVEN = "still answers at", "does not even answer at"

@@ -189,6 +189,7 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
     ("arguments", "words"),
     [
         (["frame", "none.toml", "--radec", "1,2,3", "-o", "x.fits"], ["none.toml", "No such file"]),
+        (["budget", "none.toml"], ["none.toml"]),
         (["frame", "BENCH", "-o", "x.fits"], ["--radec RA,DEC,ROLL", "--quaternion"]),
         (["frame", "BENCH", "--radec", "1,2", "-o", "x.fits"], ["--radec 1,2", "RA,DEC,ROLL"]),
         (["frame", "BENCH", "--radec", "1,95,0", "-o", "x.fits"], ["-90 to 90"]),

@@ -257,29 +257,6 @@ def test_readings_that_disagree_are_said_to(small_bench_file):
     assert "disagree" in result.stderr
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--reading", "26311"], "HIP,DN"),
-        (["--reading", "26311,-5"], "HIP,DN"),
-        (["--reading", "1,100"], "no such star"),
-        (["--reading", "26311,100", "--exposure", "0"], "--exposure"),
-        (["--reading", "26311,100", "-o", "/nowhere/x.toml"], "beside"),
-    ],
-)
-def test_a_scale_that_cannot_be_gets_one_line(small_bench_file, arguments, said):
-    assert_refused(run_hilstar_here("calibrate", "scale", small_bench_file, *arguments), 2, said)
-
-
-def test_a_star_that_clips_is_no_scale(small_bench_file):
-    small_bench_file.write_text(SMALL_BENCH + "[render]\nbrightest_v_mag = 3\n")
-    assert_refused(
-        run_hilstar_here("calibrate", "scale", small_bench_file, "--reading", "32349,100"),
-        2,
-        "clips",
-    )
-
-
 def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):
     """The example monitor, measured by its own plan with 1 % of noise, comes back; frames record
     its file's hash.
@@ -359,17 +336,3 @@ def test_the_words_of_a_calibration_say_what_to_write(tmp_path):
     assert result.returncode == 0, result.stderr
     assert 'calibration = "mon.toml"' in result.stdout
     assert "contrast 1 : " in result.stdout
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["calibrate", "photometric", "none.csv", "-o", "m.toml"], "none.csv"),
-        (["calibrate", "plan", "-o", "p.csv", "--channels", "x"], "channels"),
-        (["calibrate", "plan", "-o", "p.csv", "--resolution", "10"], "--resolution"),
-        (["calibrate", "plan", "-o", "no/p.csv"], "no/p.csv"),
-        (["budget", "none.toml"], "none.toml"),
-    ],
-)
-def test_what_cannot_be_done_gets_one_line(tmp_path, arguments, said):
-    assert_refused(run_hilstar_here(*arguments, cwd=tmp_path), 2, said)

@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilstar.attitude.wire.apart_child import as_read
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
-from hilstar.attitude.wire.roads import ANSWERS, ByteRoad
+from hilstar.attitude.wire.roads import ANSWERS, ByteRoad, RawMessage
 from hilstar.attitude.wire.serial_link import SerialRoad
 from hilstar.attitude.wire.tcp import ACCEPT_EACH_S, TOLD_S, TcpRoad
 from hilstar.attitude.wire.udp import UdpRoad
@@ -346,3 +347,18 @@ def test_a_tracker_over_zeromq_that_vanishes_is_told_as_the_tracker_and_not_as_t
         assert (road.openings, road.reconnects) == (2, 1)
     far.vanish()
     assert notices.counts() == {"answers-lost": 1, "answers-back": 1}
+
+
+@pytest.mark.parametrize(
+    ("count", "had_waited", "timely"),
+    [(0, False, []), (1, False, [True]), (3, False, [False, False, True]), (1, True, [False])],
+)
+def test_of_what_was_read_together_only_what_woke_the_reader_did_not_wait(
+    count, had_waited, timely
+):
+    taken = [RawMessage(1000 + k, [b"%d" % k]) for k in range(count)]
+    stamped = as_read(taken, had_waited, 990)
+    assert [message.timely for message in stamped] == timely
+    waited_ns = [0 if is_timely else 10 + k for k, is_timely in enumerate(timely)]
+    assert [message.waited_ns for message in stamped] == waited_ns
+    assert [message.parts for message in stamped] == [message.parts for message in taken]

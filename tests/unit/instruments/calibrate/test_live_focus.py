@@ -16,7 +16,7 @@ from hilstar.instruments.calibrate.live_focus import focus_readings, follow_answ
 from hilstar.server.answers.star_widths import FocusCurve, sparkline
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import run_hilstar_here
 from tests.support.fake_clock import FakeClock
 from tests.support.senders import answers_over_udp, free_port
 
@@ -134,12 +134,6 @@ def test_the_command_ends_with_the_best_image(benches, tmp_path):
     assert abs(best["psf_sigma_px"] - 1.4) < SURE_SIGMAS * best["error_px"]
 
 
-def test_the_command_without_images_says_what_to_give(benches, tmp_path):
-    done = run_hilstar_here("calibrate", "focus", tmp_path / "truth-1.0.toml")
-    assert done.returncode == 2
-    assert "give --grab CMD or a camera, or --virtual TRUTH.toml" in done.stderr
-
-
 @pytest.mark.parametrize(
     ("words", "advice"),
     [
@@ -202,30 +196,6 @@ def test_a_tracker_whose_answers_have_no_widths_is_refused_in_one_line(answering
     *before, line = done.stderr.splitlines()
     assert [each.partition(" ")[0] for each in before] == ["frames:"]
     assert "--answers: the tracker's answers report no widths of stars; give --grab CMD" in line
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (("--answers", "--virtual", "t.toml"), "one of them"),
-        (("--answers",), "--radec RA,DEC,ROLL"),
-        (("--answers", "--radec", "84,-1,0", "--headless"), "add --feed"),
-        (("--answers", "--radec", "84,-1,0", "--exposure", "1"), "--exposure"),
-        (("--virtual", "t.toml", "--radec", "84,-1,0"), "are for --answers"),
-        (("--virtual", "t.toml", "--headless"), "--headless"),
-        (("--answers", "--radec", "84,-1,0"), "has no [answers]"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(benches, tmp_path, words, said):
-    bench = tmp_path / "truth-1.0.toml"
-    assert_refused(run_hilstar_here("calibrate", "focus", bench, *words), 2, said)
-
-
-def test_a_format_that_carries_no_stars_is_refused(tmp_path):
-    bench = tmp_path / "bench.toml"
-    bench.write_text(bench_text(TWIN) + ANSWERS.replace("PORT", "9").replace('"json"', '"packet"'))
-    done = run_hilstar_here("calibrate", "focus", bench, "--answers", *SKY)
-    assert_refused(done, 2, 'format = "packet" carries no stars', "--grab CMD")
 
 
 def test_silence_ends_after_a_while_and_says_whose():

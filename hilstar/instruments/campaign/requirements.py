@@ -263,6 +263,9 @@ def _more(require: Require, figure: BoundedFigure) -> int | None:
         width = figure.high - figure.value
     else:
         width = figure.value - figure.low
+    # the end of a size that 0 cuts off says nothing of its error
+    if figure.low == 0:
+        width = max(width, figure.high - figure.value)
     if not away or not math.isfinite(width) or width <= 0:
         return None
     needed = math.ceil(figure.cases * (width / away) ** 2)

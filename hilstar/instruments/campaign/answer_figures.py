@@ -30,9 +30,9 @@ from hilstar.instruments.assess.case_fits import (
 from hilstar.instruments.assess.rate_figures import RateTable, rate_figure
 from hilstar.instruments.assess.star_figures import StarTable, false_stars, star_figure
 from hilstar.instruments.assess.time_figures import time_figure
+from hilstar.instruments.campaign.case_motion import AXES
 from hilstar.instruments.campaign.case_table import VARY, Columns
 from hilstar.instruments.campaign.cases import (
-    AXES,
     FALSE_STARS,
     FRAME_ERRORS,
     FRAME_RATE_ERRORS,

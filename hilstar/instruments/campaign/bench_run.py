@@ -35,7 +35,8 @@ from hilstar.basics.files import write_whole
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import stop_on_signal
 from hilstar.basics.units import NS_PER_S
-from hilstar.instruments.campaign.cases import AXES, Case, CaseMaker, Q, first_row
+from hilstar.instruments.campaign.case_motion import AXES, CaseMotion
+from hilstar.instruments.campaign.cases import Case, CaseMaker, Q, first_row
 from hilstar.instruments.campaign.plan import SCENARIO, Design, Plan
 from hilstar.instruments.campaign.store import Directory, Journal, Row
 from hilstar.instruments.campaign.tally import FrameLists, StarLists, spread_row
@@ -120,12 +121,8 @@ class BenchOrder:
         """The case of a number; a check case is the attitude of case 0, at rest."""
         if number < self.cases:
             return self.maker.case(number, self._design.points(number, number + 1)[0])
-        return Case(
-            number,
-            {},
-            0,
-            View.exposure(self._at_rest.q_icrs_to_cam, np.zeros(3), 0.0, self._at_rest.t_ns),
-        )
+        at_rest = CaseMotion(self._at_rest.q_icrs_to_cam, np.zeros(3))
+        return Case(number, {}, 0, at_rest.exposure(0.0, 0.0, self._at_rest.t_ns or 0), at_rest)
 
     def renderer(self, number: int) -> str:
         """What a case's renderer depends on, as a text that is the same for all cases of one
@@ -406,7 +403,8 @@ class BenchRun:
             }
             rate = first.turn.rate_cam_rad_s if attitude is None else attitude.rate_cam_rad_s
             now_table |= {"rate_cam_rad_s": None if rate is None else rate.tolist()}
-            now_table |= {"acceleration_cam_rad_s2": now.case.acceleration_rad_s2.tolist()}
+            acceleration_rad_s2 = now.case.motion.acceleration_at(0.0)
+            now_table |= {"acceleration_cam_rad_s2": acceleration_rad_s2.tolist()}
             write_whole(
                 self._now_path,
                 msgspec.json.encode(now_table | {"light_ns": host_ns, "begun_utc": now.begun_utc}),

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from hilstar.attitude.logs.json_lines import MAX_OBJECT_CHARACTERS
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.basics.errors import InputError
@@ -17,7 +16,6 @@ from hilstar.basics.reading import MAX_LINE_CHARACTERS
 ROWS: list[dict[str, Any]] = [
     {"t_ns": k * 10**7, "q": [0.5, -0.5, 0.5, 0.5], "note": 'a } " { [ \\'} for k in range(4)
 ]
-NOT_UNIT = {"t_ns": 10**9, "q": [1, 1, 0, 0]}
 
 
 @pytest.fixture
@@ -88,33 +86,6 @@ def test_an_attitude_is_left_out_however_its_program_writes_false(
     log = open_log(path)
     assert [sample.t_ns for sample in log.samples] == [ROWS[0]["t_ns"], ROWS[2]["t_ns"]]
     assert dict(log.told)["log-valid"].startswith("1 line is marked as not valid")
-
-
-REFUSED = {
-    lines([{**ROWS[0], "valid": "maybe"}]): ":1: valid is 'maybe'; write true or false",
-    lines([{**ROWS[0], "valid": None}]): ":1: valid is ",
-    json.dumps([*ROWS, NOT_UNIT]): ":1, object 5: the quaternion's norm is 1.41421",
-    json.dumps([*ROWS, NOT_UNIT], indent=0): ", object 5: the quaternion's norm is 1.41421",
-    lines(ROWS[:1])[:-30] + "\n" + lines(ROWS[1:]): ":1: ",
-    lines(ROWS[:1]) + "nonsense\n" + lines(ROWS[1:]): ":2: 'nonsense' is no JSON object; write",
-    "[[0, 1, 0, 0, 0],\n [1, 1, 0, 0, 0]]": "is no JSON object; write JSON lines, or an array",
-    json.dumps({"attitudes": ROWS}): ':1: key "t_ns" is there twice (an object without an end, or',
-    "{" * 3 * MAX_LINE_CHARACTERS: f":1: a JSON object of over {MAX_OBJECT_CHARACTERS} characters",
-    '{"a": "' + "x" * 3 * MAX_LINE_CHARACTERS: ":1: a JSON object of over",
-    "[]": ": contains no attitude",
-    "[" * MAX_LINE_CHARACTERS: ": contains no attitude",
-}
-
-
-@pytest.mark.parametrize("text", REFUSED, ids=range(len(REFUSED)))
-def test_what_is_no_attitude_is_refused_with_its_place(path: Path, text: str) -> None:
-    path.write_text(text)
-    with pytest.raises(InputError) as refusal:
-        open_log(path)
-    said = str(refusal.value)
-    assert said.startswith(f"{path}:")
-    assert REFUSED[text] in said
-    assert len(said.splitlines()) == 1
 
 
 def test_telemetry_has_the_stars_of_its_objects(tmp_path: Path) -> None:

@@ -4,11 +4,12 @@ what was not tested and why, and the ledger; the same as acceptance.csv and JSON
 
 import math
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
-from hilstar.basics.charts import BLUE, MUTED, panels_of, write_csv
+from hilstar.basics.charts import BLUE, MUTED, capital, panels_of, write_csv
 from hilstar.basics.files import write_whole
 from hilstar.basics.pages import (
     BAD,
@@ -59,7 +60,7 @@ HEADLINES = {
 }
 CURES = {
     NOT_MET: "Look at the ledger for the cases at fault, and change the tracker or the limit.",
-    NOT_SHOWN: "Run more cases: the table says how many would show it.",
+    NOT_SHOWN: "Run more cases: the table says how many would decide.",
 }
 METHOD = (
     "Each end of an interval is a one-sided limit at the clause's confidence. Met: the whole"
@@ -76,6 +77,7 @@ TOGETHER = (
 MAY_BE_CHANCE = "may be chance among so many clauses; more cases would tell"
 FAILED_HEADER = ("set of cases", "failed", "why")
 FAILED_CURE = "Mend what the reasons name, and accept again in another directory."
+QUICK = "a few cases for every clause (--quick), no acceptance"
 QUANTILES = (0.5, 0.9, 0.95, 0.99)
 MAX_ROWS = 5000  # of points in a chart
 EDGE_ALPHA = 0.15  # of the band that is an edge's interval
@@ -101,7 +103,7 @@ def write_acceptance(
     for card in _cards(acceptance, results, verdicts, rows):
         parts.append(card.html())
     title = f"{acceptance.plan.title}: {acceptance.file.path.name}"
-    page = page_of(title, _verdict(verdicts), parts)
+    page = page_of(title, _verdict(verdicts, acceptance.plan.quick), parts)
     write_whole(folder / PAGE_FILE, page)
     return summary
 
@@ -133,6 +135,8 @@ def summary_of(
     return {
         "title": plan.title,
         "plan": str(plan.path),
+        "plan_sha256": plan.sha256,
+        "quick": plan.quick,
         "bench": str(file.path),
         "bench_sha256": file.sha256,
         "through": plan.through,
@@ -222,7 +226,7 @@ def _more(each: ClauseVerdict) -> str:
     if each.word != NOT_SHOWN or each.verdict is None:
         return ""
     if each.verdict.more:
-        return f"about {each.verdict.more} more cases would show it"
+        return f"about {each.verdict.more} more cases would decide"
     return each.verdict.method if each.verdict.value is None else ""
 
 
@@ -285,15 +289,17 @@ def _margin(each: ClauseVerdict) -> str | None:
     return f"{_digits(verdict.margin)} {each.unit}".rstrip() + share
 
 
-def _verdict(verdicts: list[ClauseVerdict]) -> Verdict:
+def _verdict(verdicts: list[ClauseVerdict], quick: bool) -> Verdict:
     whole = verdict_of(verdicts)
     counts = []
     for word in (MET, NOT_MET, NOT_SHOWN, NOT_TESTED):
         count = sum(judged.word == word for judged in verdicts)
         if count:
             counts.append(f"{count} {word}")
-    counts_text = ", ".join(counts)
-    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(verdicts)}: {counts_text}.")
+    counts_text = f"Of {len(verdicts)}: {', '.join(counts)}."
+    if quick:
+        counts_text = f"{counts_text} {capital(QUICK)}."
+    return Verdict(STATES[whole], HEADLINES[whole], counts_text)
 
 
 def _counts(verdicts: list[ClauseVerdict]) -> Iterator[KeyFigure]:
@@ -483,7 +489,9 @@ def _about(acceptance: AcceptedBench, results: list[SetResult], rows: int) -> Ca
     file = acceptance.file
     ledger_sha256 = file_sha256(acceptance.directory / LEDGER)
     about: list[tuple[str, str]] = [
-        ("plan", str(plan.path)),
+        ("plan", f"{plan.path}, sha256 {plan.sha256}"),
+        ("judged", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
+        ("run of", QUICK if plan.quick else "all cases of the plan"),
         ("bench", f"{file.path}, sha256 {file.sha256}"),
         ("through", plan.through),
         ("solver", acceptance.solver_text),

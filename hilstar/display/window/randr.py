@@ -145,7 +145,9 @@ class _Transform(ctypes.Structure):  # XRRCrtcTransformAttributes
     )
 
 
-class _Gamma(ctypes.Structure):  # XRRCrtcGamma
+class GammaInfo(ctypes.Structure):
+    """XRRCrtcGamma of libXrandr."""
+
     _fields_ = (("size", INT), ("red", POINTER), ("green", POINTER), ("blue", POINTER))
 
 
@@ -223,9 +225,8 @@ class Randr(Closing):
                 if not crtc:
                     continue
                 crtc_gamma = self._xrandr.XRRGetCrtcGamma(self._display, crtc)
-                with self._got(_Gamma, self._xrandr.XRRFreeGamma, crtc_gamma) as gamma:
-                    parts = () if gamma is None else (gamma.red, gamma.green, gamma.blue)
-                    return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in parts)
+                with self._got(GammaInfo, self._xrandr.XRRFreeGamma, crtc_gamma) as gamma:
+                    return b"" if gamma is None else ramp_of(gamma)
         return b""
 
     def additions(self) -> dict[str, bool]:
@@ -389,6 +390,12 @@ def side_by_side(lit: list[OutputState], providers: tuple[str, ...]) -> list[Out
         others = tuple(other.name for other in lit if other.name != state.name)
         states.append(replace(state, others=others, providers=providers))
     return states
+
+
+def ramp_of(gamma: GammaInfo) -> bytes:
+    """A gamma ramp: 16 bits for each step of red, then green, then blue."""
+    parts = (gamma.red, gamma.green, gamma.blue)
+    return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in parts)
 
 
 def refresh_hz_of(mode: ModeInfo) -> float:

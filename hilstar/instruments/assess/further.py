@@ -5,13 +5,16 @@ The figures are those of an acceptance (docs/accept.md). The unit that is indepe
 one of STRETCHES stretches of the run.
 """
 
+import contextlib
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from hilstar.attitude.clock.rate_check import cause_in
 from hilstar.attitude.logs.telemetry import Telemetry
+from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.assess.bounded_figures import BoundedFigure, TooFewCases
@@ -20,7 +23,12 @@ from hilstar.instruments.assess.case_fits import summed
 from hilstar.instruments.assess.figure_rows import COUNT, FigureRow
 from hilstar.instruments.assess.places import spread_rows
 from hilstar.instruments.assess.rate_figures import RateTable, rate_figure
-from hilstar.instruments.assess.star_figures import StarTable, false_stars, star_figure
+from hilstar.instruments.assess.star_figures import (
+    StarTable,
+    false_stars,
+    star_figure,
+    without_shifts,
+)
 from hilstar.instruments.assess.time_figures import stamp_jitter
 from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.answers.stars import ShownStars
@@ -31,8 +39,6 @@ END = 0.975  # confidence of each end of a 95 % interval
 ACCELERATION_S = 0.1  # from either side of an answer to the rates that tell its acceleration
 STAR_ANSWERS = 2000  # whose stars are judged, spread evenly over the run
 SEED = 0
-# a reported rate of this many times the commanded one is in the other unit, or of the other frame
-DEG, NEAR = 180 / math.pi, 0.1
 AXES = {"cross": [0, 1], "roll": [2]}
 RATE_NAMES = {
     "rate-bias": ("rate bias", "deg/s"),
@@ -102,7 +108,7 @@ def add_rates(
                 further.miss(name, axis, unit, few)
             else:
                 further.add(name, axis, unit, figure)
-    further.notes += _other_rates(rates_deg_s, reported_deg_s)
+    further.notes += rate_notes(telemetry.t_ns[rows], telemetry.q[rows], reported[rows])
 
 
 def stretches(count: int) -> IntArray:
@@ -110,32 +116,16 @@ def stretches(count: int) -> IntArray:
     return np.arange(count) * STRETCHES // max(count, 1)
 
 
-def _other_rates(rates_deg_s: FloatArray, reported_deg_s: FloatArray) -> Iterator[str]:
-    """A note on reported rates (n, 3) that are the commanded ones in another unit, or turned."""
-    known = np.isfinite(reported_deg_s).all(axis=1)
-    rates = rates_deg_s[known]
-    # what each commanded axis becomes; where an axis does not turn, nothing tells it
-    if np.linalg.cond(rates.T @ rates) > 1e8:
-        return
-    matrix = np.linalg.lstsq(rates, reported_deg_s[known], rcond=None)[0].T
-    size = float(np.cbrt(abs(np.linalg.det(matrix))))
-    advice = "write the rate of cam with respect to icrs in cam axes, rad/s or the unit in its name"
-    for factor, unit in ((DEG, "deg/s"), (1 / DEG, "rad/s twice converted")):
-        if abs(size / factor - 1) < NEAR:
-            yield f"the reported rates are {size:.3g} times the commanded ones ({unit}?): {advice}"
-            return
-    turned = matrix / max(size, 1e-12)
-    if abs(size - 1) < NEAR and np.abs(turned - np.eye(3)).max() > 0.5:
-        axes = ", ".join(
-            f"{letter} = {_row(row)}" for letter, row in zip("xyz", turned, strict=True)
-        )
-        yield f"the reported rates are about other axes than the commanded ones ({axes}): {advice}"
-
-
-def _row(row: FloatArray) -> str:
-    """A row of a turned rate by its largest part."""
-    k = int(np.argmax(np.abs(row)))
-    return f"{'-' if row[k] < 0 else '+'}{'xyz'[k]}"
+def rate_notes(t_ns: IntArray, q: FloatArray, rates_rad_s: FloatArray) -> Iterator[str]:
+    """A note where reported rates (n, 3), NaN for none, are not the turn of their own attitudes
+    (n, 4): of another unit, sign or frame.
+    """
+    samples = []
+    for row in np.flatnonzero(np.isfinite(rates_rad_s).all(axis=1)).tolist():
+        samples.append(AttitudeSample(int(t_ns[row]), q[row], rates_rad_s[row]))
+    cause = cause_in(samples)
+    if cause is not None:
+        yield f"the reported rates are not the turn of the reported attitudes: {cause.text}"
 
 
 def add_jitter(further: FurtherFigures, found: DecomposedRun) -> None:
@@ -165,19 +155,22 @@ def add_stars(
     if not len(rows):
         return
     rows = rows[spread_rows(len(rows), STAR_ANSWERS)]
-    case = stretches(len(rows))
     parts = []
     false = np.zeros(len(rows))
     for k, row in enumerate(rows.tolist()):
         judged = shown.judged(tuple(centroids[row]), found.commanded_q[row])
         lit = judged.lit
-        of_star = np.full(len(lit.x_px), float(case[k]))
-        columns = (of_star, lit.x_px, lit.y_px, lit.v_mag, lit.bv)
+        of_answer = np.full(len(lit.x_px), float(k))
+        columns = (of_answer, lit.x_px, lit.y_px, lit.v_mag, lit.bv)
         errors = (judged.dx_px, judged.dy_px, judged.signal_mag, lit.lit_mag)
         parts.append(np.stack([*columns, *errors], axis=1))
         false[k] = judged.false
+    case = stretches(len(rows))
     number, *columns_of_stars = np.concatenate(parts).T
-    further.stars = StarTable(number.astype(np.intp), *columns_of_stars)
+    answer = number.astype(np.intp)
+    further.stars = StarTable(case[answer], *columns_of_stars)
+    with contextlib.suppress(TooFewCases):  # too few for a map: no figure needs it then
+        further.stars = without_shifts(further.stars, answer, shown.size_px)
     for quantity, (name, unit) in STAR_NAMES.items():
         rng = np.random.default_rng(SEED)
         try:

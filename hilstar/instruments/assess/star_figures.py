@@ -5,7 +5,7 @@ detection against V
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -38,6 +38,7 @@ LIGHT_DEGREE = 2  # of the signal's error over the magnitude of the light
 NO_SIGNAL = (
     "the reported signals fall as the stars' light rises: give DN, or 10^(-0.4 m) of a magnitude m"
 )
+SHIFT_ROUNDS = 3
 LIMIT_BIN_MAG = 0.05
 LIMIT_DRAWS = 200  # of the bootstrap of a detection curve
 MIN_SLOPE_MAG = 0.01  # width of a detection curve: a sharper one cannot be told from its bins
@@ -119,6 +120,33 @@ def place_map(found: StarTable, resolution_px: tuple[int, int], side: int) -> Pl
     offsets = offsets - offsets.mean(axis=0)
     dx_px, dy_px = offsets.T
     return PlaceOffsets(x_px, y_px, dx_px, dy_px)
+
+
+def without_shifts(stars: StarTable, frame: IntArray, resolution_px: tuple[int, int]) -> StarTable:
+    """The stars with places less the shift that those of one `frame` (n,) share about the map: it
+    is of the attitude and of the time at which the tracker looked. Raises TooFewCases.
+
+    What the shifts take of the scatter is given back.
+    """
+    found = np.flatnonzero(stars.found)
+    number = numbered(frame[found])
+    reported = summed(np.ones(len(found)), number)
+    offsets = np.stack([stars.dx_px, stars.dy_px], axis=1)
+    terms = field_terms(stars.x_px[found], stars.y_px[found], resolution_px, MAP_DEGREE)
+    raw = offsets[found]
+    shift = np.zeros((len(reported), 2))
+    for _ in range(SHIFT_ROUNDS):
+        offsets[found] = raw - shift[number]
+        table = replace(stars, dx_px=offsets[:, 0], dy_px=offsets[:, 1])
+        by_map = terms @ fitted_places(table, resolution_px).solution
+        left = raw - by_map
+        for axis in range(2):
+            shift[:, axis] = summed(left[:, axis], number) / reported
+    # of one star alone the shift takes all
+    shift[reported < 2] = 0.0
+    growth = np.sqrt(reported / np.maximum(reported - 1, 1.0))
+    offsets[found] = by_map + growth[number, None] * (left - shift[number])
+    return replace(stars, dx_px=offsets[:, 0], dy_px=offsets[:, 1])
 
 
 def _star_noise(

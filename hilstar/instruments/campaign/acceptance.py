@@ -132,7 +132,7 @@ class Acceptance(AcceptedBench):
         while (level := next_level(sweep, result.levels)) is not None:
             of_level = folder / f"level-{len(result.levels):02d}"
             cases = self._table(result, of_level, level, run_cases)
-            result.levels.append(counted(level, cases))
+            result.levels.append(counted(level, cases, sweep.star_v_mag))
 
     def _table(
         self, result: SetResult, folder: Path, level: float | None, run_cases: RunCases

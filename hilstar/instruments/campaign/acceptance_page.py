@@ -379,6 +379,8 @@ def _sweep_card(result: SetResult) -> Card:
     levels = list(levels_text(result.levels))
     at, share, ends = [], [], []
     for level, successes, cases in levels:
+        if not cases:
+            continue
         at.append(level)
         share.append(successes / cases)
         ends.append(clopper_pearson(successes, cases, 0.975))
@@ -386,7 +388,11 @@ def _sweep_card(result: SetResult) -> Card:
     unit = ""
     if sweep.unit:
         unit = f" [{sweep.unit}]"
-    with panels_of(f"Share of cases with an attitude against {sweep.key}") as (axes,):
+    kept = "an attitude"
+    if sweep.star_v_mag is not None:
+        kept = f"half of their stars to V {sweep.star_v_mag:g}"
+    finding = f"Share of cases with {kept} against {sweep.key}"
+    with panels_of(finding) as (axes,):
         axes.errorbar(at, share, yerr=bars, fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
         axes.axhline(sweep.share, linewidth=0.8, linestyle="--", color=MUTED)
         axes.set_ylim(-0.05, 1.05)
@@ -398,8 +404,7 @@ def _sweep_card(result: SetResult) -> Card:
     paragraphs = []
     if result.case_set.about:
         paragraphs.append(paragraph(result.case_set.about))
-    alt = f"share of cases with an attitude against {sweep.key}"
-    paragraphs.append(drawing_of(axes.figure, alt))
+    paragraphs.append(drawing_of(axes.figure, finding))
     return Card(f"Sweep: {result.case_set.name}", words=paragraphs, details=[table])
 
 

@@ -1,4 +1,4 @@
-"""How a case's sky moves: at a rate that may change, until the slew ends, and shaken by jitter."""
+"""How a case's sky moves: at a rate that may change, and shaken by jitter, until it stands."""
 
 import itertools
 import math
@@ -23,7 +23,7 @@ from hilstar.optics.layers.view import View
 AXES = ("x", "y", "z")
 ACROSS = "across"  # about an axis in the image plane that each case draws
 RATE, ACCELERATION, JITTER = "rate_deg_s", "acceleration_deg_s2", "jitter_arcsec"
-JITTER_HZ, SLEW_S = "jitter_hz", "slew_s"
+JITTER_HZ, MOTION_S = "jitter_hz", "motion_s"
 AXIS_STREAM = 2  # stream of a case's seed for the axis across the boresight and the jitter's phase
 MAX_STEP_S = 0.01  # of a turn that accelerates
 # Within an exposure a swing is drawn by straight pieces: a chord of a sixteenth of the period is
@@ -38,14 +38,14 @@ class CaseMotion:
     """The turn of cam with respect to icrs from a case's begin: attitude (4,), rate (3,), rad/s,
     and acceleration (3,), rad/s2, cam.
 
-    Both end after `slew_s`. Jitter turns cam about its own axes by `jitter_rad` (3,) times the sine
-    of `jitter_hz` from `phase_rad` on.
+    Jitter turns cam about its own axes by `jitter_rad` (3,) times the sine of `jitter_hz` from
+    `phase_rad` on. After `motion_s` cam stands.
     """
 
     q_icrs_to_cam: FloatArray
     rate_rad_s: FloatArray
     acceleration_rad_s2: FloatArray = field(default_factory=lambda: STILL)
-    slew_s: float = math.inf
+    motion_s: float = math.inf
     jitter_rad: FloatArray = field(default_factory=lambda: STILL)
     jitter_hz: float = 0.0
     phase_rad: float = 0.0
@@ -63,7 +63,7 @@ class CaseMotion:
             q_icrs_to_cam,
             np.radians(_vector(values, RATE, axis)),
             np.radians(_vector(values, ACCELERATION, axis)),
-            float(values.get(SLEW_S, math.inf)),
+            float(values.get(MOTION_S, math.inf)),
             _vector(values, JITTER, axis) / ARCSEC_PER_RAD,
             float(values.get(JITTER_HZ, 0.0)),
             rng.uniform(0.0, 2 * math.pi),
@@ -76,33 +76,25 @@ class CaseMotion:
 
     def at(self, seconds: float) -> CameraTurn:
         """The attitude and the rate so long after the case's begin."""
-        turn = self._slewed(seconds)
+        if seconds > self.motion_s:
+            return CameraTurn(self.at(self.motion_s).q_icrs_to_cam, STILL)
+        start = CameraTurn(self.q_icrs_to_cam, self.rate_rad_s)
+        q, rate_rad_s = accelerated(start, self.acceleration_rad_s2, seconds)
         if not self.jitter_rad.any():
-            return turn
+            return CameraTurn(q, rate_rad_s)
         phase_rad = self._swing_rad_s * seconds + self.phase_rad
         # components turn against the camera
         swing = from_rotation_vector(-self.jitter_rad * math.sin(phase_rad))
         swing_rate_rad_s = self.jitter_rad * self._swing_rad_s * math.cos(phase_rad)
-        q = multiply(swing, turn.q_icrs_to_cam)
-        return CameraTurn(q, to_matrix(swing) @ turn.rate_cam_rad_s + swing_rate_rad_s)
+        return CameraTurn(multiply(swing, q), to_matrix(swing) @ rate_rad_s + swing_rate_rad_s)
 
     def acceleration_at(self, seconds: float) -> FloatArray:
         """The acceleration (3,), rad/s2, so long after the case's begin."""
-        steady_rad_s2 = self.acceleration_rad_s2
-        if seconds > self.slew_s:
-            steady_rad_s2 = STILL
+        if seconds > self.motion_s:
+            return STILL
         phase_rad = self._swing_rad_s * seconds + self.phase_rad
-        return steady_rad_s2 - self.jitter_rad * self._swing_rad_s**2 * math.sin(phase_rad)
-
-    def _slewed(self, seconds: float) -> CameraTurn:
-        """The turn without jitter."""
-        slewing_s = min(seconds, self.slew_s)
-        q, rate_rad_s = accelerated(
-            CameraTurn(self.q_icrs_to_cam, self.rate_rad_s), self.acceleration_rad_s2, slewing_s
-        )
-        if seconds > self.slew_s:
-            rate_rad_s = STILL
-        return CameraTurn(q, rate_rad_s)
+        swing_rad_s2 = -self.jitter_rad * self._swing_rad_s**2 * math.sin(phase_rad)
+        return self.acceleration_rad_s2 + swing_rad_s2
 
     def exposure(self, seconds: float, exposure_s: float, t_ns: int) -> View:
         """The view of an exposure whose middle is so long after the case's begin, at `t_ns`: its
@@ -113,7 +105,7 @@ class CaseMotion:
 
     def pieces(self, seconds: float, exposure_s: float, t_ns: int) -> list[View]:
         """Views, one after the other, of an exposure whose middle is so long after the case's
-        begin, at `t_ns`, each at the mean rate of its part; one without jitter or a slew's end.
+        begin, at `t_ns`, each at the mean rate of its part; one without jitter or the motion's end.
         """
         edges_s = self._edges_s(seconds, exposure_s)
         if len(edges_s) <= 2:  # the mean rate of a constant acceleration is that of the middle
@@ -134,8 +126,8 @@ class CaseMotion:
         begin_s = seconds - exposure_s / 2
         end_s = seconds + exposure_s / 2
         edges = {begin_s, end_s}
-        if begin_s < self.slew_s < end_s:
-            edges.add(self.slew_s)
+        if begin_s < self.motion_s < end_s:
+            edges.add(self.motion_s)
         if self.jitter_rad.any():
             count = swing_pieces(exposure_s, self.jitter_hz)
             edges.update(np.linspace(begin_s, end_s, count + 1).tolist())

@@ -31,8 +31,8 @@ from hilstar.instruments.campaign.case_motion import (
     AXIS_STREAM,
     JITTER,
     JITTER_HZ,
+    MOTION_S,
     RATE,
-    SLEW_S,
     CaseMotion,
     by_axis,
     swing_pieces,
@@ -68,7 +68,7 @@ ON_BENCH = (
     "spacecraft",
     RATE,
     ACCELERATION,
-    SLEW_S,
+    MOTION_S,
     JITTER,
     JITTER_HZ,
     "time_s",
@@ -143,7 +143,7 @@ FURTHER: dict[Further, tuple[str, ...]] = {
     "time": (*FRAME_RATES, *FRAME_ERRORS),
     "stars": (REPORTED_FRAMES, FALSE_STARS, *STAR_LISTS),
 }
-RECOVERY = ("fault_end_s", "recovery_s")  # only in a plan that varies scenario or slew_s
+RECOVERY = ("fault_end_s", "recovery_s")  # only in a plan that varies scenario or motion_s
 CENTROIDS = (
     *("stars", "found", "matched", "false", "measured"),
     *("centroid_dx_px", "centroid_dy_px", "centroid_sigma_x_px", "centroid_sigma_y_px"),
@@ -298,10 +298,10 @@ class CaseMaker:
         return dataclasses.replace(scenario, faults=(*scenario.faults, glow))
 
     def fault_end_s(self, case: Case, length_s: float) -> float | None:
-        """When the case's slew or the last fault of its scenario ends, after the case's begin;
+        """When the case's motion or the last fault of its scenario ends, after the case's begin;
         None outside its `length_s`.
         """
-        end_s = case.motion.slew_s
+        end_s = case.motion.motion_s
         scenario = self.scenario(case)
         if scenario is not None and scenario.end_s:
             since_begin_ns = (case.first.t_ns or 0) - self.begin_ns
@@ -461,12 +461,12 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             raise InputError(
                 '[[vary]] key = "time_s": with a log the times are the log\'s; leave it out'
             )
-        if plan.through == "display" and table in (SCENARIO, STRAY, SLEW_S, JITTER, JITTER_HZ):
+        if plan.through == "display" and table in (SCENARIO, STRAY, MOTION_S, JITTER, JITTER_HZ):
             raise InputError(
                 f'[[vary]] key = "{parameter.key}": what changes within an exposure is of'
                 ' through = "tracker"; write that'
             )
-        if plan.attitudes.kind == "log" and table in (ACCELERATION, SLEW_S, JITTER, JITTER_HZ):
+        if plan.attitudes.kind == "log" and table in (ACCELERATION, MOTION_S, JITTER, JITTER_HZ):
             raise InputError(
                 f'[[vary]] key = "{parameter.key}": with a log the motion is the log\'s; leave it'
                 " out"
@@ -493,13 +493,13 @@ def _check_motion(plan: Plan, varied: list[Parameter], file: BenchFile) -> None:
             f'[[vary]] key = "{JITTER}.across" and "{JITTER_HZ}" go together; write both, or'
             " neither"
         )
-    if SLEW_S in by_key and SCENARIO in by_key:
+    if MOTION_S in by_key and SCENARIO in by_key:
         raise InputError(
-            f'[[vary]] key = "{SLEW_S}" and "{SCENARIO}": recovery counts from the end of either;'
+            f'[[vary]] key = "{MOTION_S}" and "{SCENARIO}": recovery counts from the end of either;'
             " leave one of them out"
         )
     # a rate's errors are fitted with one acceleration a case, which its row has by axis
-    fitted = [f"{ACCELERATION}.{ACROSS}", SLEW_S, *jitters]
+    fitted = [f"{ACCELERATION}.{ACROSS}", MOTION_S, *jitters]
     for key in fitted:
         if "rate" in plan.columns and key in by_key:
             raise InputError(
@@ -557,7 +557,7 @@ def columns(
     for parameter in parameters:
         varied[f"vary.{parameter.key}"] = value_kind(parameter)
     names = [*BEFORE, *varied, *AFTER]
-    if f"vary.{SCENARIO}" in varied or f"vary.{SLEW_S}" in varied:
+    if f"vary.{SCENARIO}" in varied or f"vary.{MOTION_S}" in varied:
         names += RECOVERY
     if with_centroids:
         names += CENTROIDS

@@ -58,7 +58,7 @@ Roll = Annotated[float, Meta(ge=-360, le=720)]
 OWN_KEYS = (
     *("rate_deg_s.x", "rate_deg_s.y", "rate_deg_s.z", "rate_deg_s.across"),
     *("acceleration_deg_s2.x", "acceleration_deg_s2.y", "acceleration_deg_s2.z"),
-    *("acceleration_deg_s2.across", "slew_s"),
+    *("acceleration_deg_s2.across", "motion_s"),
     *("jitter_arcsec.x", "jitter_arcsec.y", "jitter_arcsec.z", "jitter_arcsec.across"),
     *("jitter_hz",),
     *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
@@ -67,7 +67,7 @@ OWN_KEYS = (
 MAX_OWN = {
     "rate_deg_s": 360.0,
     "acceleration_deg_s2": 360.0,
-    "slew_s": 86400.0,
+    "motion_s": 86400.0,
     "jitter_arcsec": 36_000.0,
     "jitter_hz": 10_000.0,
     "misalignment_arcsec": 36_000.0,
@@ -78,7 +78,7 @@ MAX_OWN = {
     "noise_seed": 2.0**63 - 1,
 }
 WHOLE = ("noise_seed",)
-NOT_NEGATIVE = (*WHOLE, "slew_s", "jitter_hz")
+NOT_NEGATIVE = (*WHOLE, "motion_s", "jitter_hz")
 # Further columns of the table, lists of a value a frame or a star.
 Further = Literal["rate", "time", "stars"]
 # What [[require]] limits (ECSS-E-ST-60-20C), and its unit; those of an axis, arcsec, come first.

@@ -36,8 +36,9 @@ FALSE_DN = 1000.0  # signal of a planted false star
 @dataclass(frozen=True, slots=True)
 class CaseConditions:
     """What a case's planted faults depend on: the observer's velocity, km/s, ICRS, how the case
-    moves, the detector's false stars, the angle from a body (`Case.body_deg`), the end of the slew
-    or the last fault, s (None: none), and the turn (3,), rad, cam, by places of stars that are old.
+    moves, the detector's false stars, the angle from a body (`Case.body_deg`), the end of the
+    motion or of the last fault, s (None: none), and the turn (3,), rad, cam, by places of stars
+    that are old.
     """
 
     velocity_km_s: FloatArray

@@ -4,18 +4,31 @@ counts, when a reader is prompt, what nobody reads, and where users' modules com
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import os
+import signal
 import socket
 import sys
+import time
 from importlib.machinery import PathFinder
 
 import pytest
 
 from hilstar.basics.process import interrupts, scheduling
+from hilstar.basics.process.pool import ONE_THREAD, _for_children
 from hilstar.basics.process.programs import EACH_S, Service, sign_period_s
-from hilstar.basics.process.scheduling import HEAVY, LOOK_S, HostClock, PromptWhileLight
+from hilstar.basics.process.scheduling import (
+    HEAVY,
+    LOOK_S,
+    UNDISCIPLINED_NS,
+    BackOff,
+    HostClock,
+    PromptWhileLight,
+    steady_loop,
+)
 from hilstar.basics.process.user_code import UserCodeError, user_function
+from tests.support.fake_clock import FakeClock
 
 OWN, OTHER = 4711, 4712
 PATIENCE_S = 60.0
@@ -112,6 +125,75 @@ def test_a_reader_is_prompt_but_while_it_takes_much_of_a_core(monkeypatch):
     prompt.tend()
     assert policies[-1] == os.SCHED_OTHER
     assert len(policies) == 5
+
+
+class Libc:
+    """A C library whose adjtimex(2) tells an error, or fails."""
+
+    def __init__(self, maxerror_us: int | None) -> None:
+        self._maxerror_us = maxerror_us
+
+    def adjtimex(self, pointer: object) -> int:
+        timex = pointer._obj
+        assert timex.modes == 0  # nothing is set
+        if self._maxerror_us is None:
+            return -1
+        timex.maxerror = self._maxerror_us
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("maxerror_us", "error_ns"),
+    [(250, 250_000), (16_000_000, UNDISCIPLINED_NS), (None, UNDISCIPLINED_NS)],
+)
+def test_the_error_of_unix_time_is_the_kernel_s_in_microseconds(monkeypatch, maxerror_us, error_ns):
+    """adjtimex(2): maxerror is in microseconds, 16 s where nothing keeps the clock."""
+    monkeypatch.setattr(scheduling.ctypes, "CDLL", lambda name: Libc(maxerror_us))
+    found = HostClock().unix_offset()
+    assert found.error_ns == error_ns
+    assert abs(found.offset_ns - (time.monotonic_ns() - time.time_ns())) < 10**9
+
+
+@pytest.mark.parametrize("collecting", [True, False])
+def test_a_loop_leaves_the_collector_and_the_threads_turns_as_they_were(monkeypatch, collecting):
+    monkeypatch.setattr(scheduling, "raise_priority", lambda: "normal")
+    before_s = sys.getswitchinterval()
+    was_collecting = gc.isenabled()
+    try:
+        (gc.enable if collecting else gc.disable)()
+        with pytest.raises(KeyboardInterrupt), steady_loop() as priority:
+            assert (priority, gc.isenabled()) == ("normal", False)
+            assert sys.getswitchinterval() < before_s
+            raise KeyboardInterrupt
+        assert gc.isenabled() is collecting
+        assert sys.getswitchinterval() == before_s
+    finally:
+        (gc.enable if was_collecting else gc.disable)()
+
+
+def test_tries_come_at_once_and_then_twice_as_seldom_until_all_was_well():
+    clock = FakeClock()
+    again = BackOff(0.05, 0.3, clock)
+    assert again.over
+    waits_s = []
+    for anew in (True, False, False, False, False, True, False):
+        again.put_off(anew=anew)
+        waits_s.append(again.left_s)
+        clock.sleep(again.left_s)
+        assert again.over
+    assert waits_s == pytest.approx([0.05, 0.1, 0.2, 0.3, 0.3, 0.05, 0.1])
+
+
+def test_workers_have_one_thread_and_no_ctrl_c_and_their_owner_keeps_its_own(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, set())
+    with _for_children():
+        assert {os.environ[name] for name in ONE_THREAD} == {"1"}
+        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, set())
+    assert {name: os.environ.get(name) for name in ONE_THREAD} == before
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, set()) == mask
 
 
 def test_what_nobody_reads_takes_so_much_memory_and_is_counted_when_it_is_read(monkeypatch):

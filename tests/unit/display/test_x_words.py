@@ -13,7 +13,13 @@ import pytest
 
 from hilstar.display.window.awake import Blanking, SetAside
 from hilstar.display.window.output_settings import OutputState
-from hilstar.display.window.randr import ModeInfo, refresh_hz_of, side_by_side
+from hilstar.display.window.randr import (
+    GammaInfo,
+    ModeInfo,
+    ramp_of,
+    refresh_hz_of,
+    side_by_side,
+)
 from hilstar.display.window.this_monitor import ddc_settings, edid_of_drm
 from hilstar.display.window.visibility import ScreenArea, WindowView, off_place
 from hilstar.display.window.watch import is_foreign, shown_as
@@ -149,6 +155,12 @@ def ramp(gamma: float, steps: int = 256, gain: float = 1.0) -> bytes:
 )
 def test_a_ramp_is_anothers_where_it_is_neither_the_first_nor_straight(now, first, foreign):
     assert is_foreign(now, first) is foreign
+
+
+def test_a_ramp_is_every_step_of_red_then_of_green_then_of_blue():
+    curves = np.arange(12, dtype=np.uint16).reshape(3, 4)
+    made = GammaInfo(4, *(curve.ctypes.data for curve in curves))
+    assert ramp_of(made) == curves.tobytes()
 
 
 @pytest.mark.parametrize(

@@ -139,6 +139,21 @@ def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(
     assert [frame.frame for frame in drawable_frames(tmp_path / "run.mcap")] == list(range(10))
 
 
+def test_a_ledger_that_cannot_be_begun_leaves_nothing(tmp_path, kept_bench, monkeypatch):
+    """Neither a file that is half begun nor a descriptor of one."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ledger_module, "McapWriter", full)
+    open_files = len(list(Path("/proc/self/fd").iterdir()))
+    assert "choose another place for the ledger" in refusal(
+        Ledger, tmp_path / "run.mcap", kept_bench
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.toml"]
+    assert len(list(Path("/proc/self/fd").iterdir())) == open_files
+
+
 def disk_of(monkeypatch, free_bytes: int, total_bytes: int = 100_000_000_000) -> None:
     """A disk with so much free for a user, in blocks of 4 kB; root has 5 GB more, and files are
     read in pieces of 1 MB.

@@ -142,7 +142,7 @@ def test_a_part_has_its_own_first_frame_and_the_log_s_own_zero(roll_log, config)
 @pytest.mark.parametrize("steps", range(1, 20))
 def test_a_span_of_whole_steps_has_a_frame_at_its_end(roll_log, config, steps):
     """In binary 0.3 / 0.1 is less than 3."""
-    play = plan_play(roll_log, Wanted(MAX, 0.0, steps * 0.1, 0.1), config)
+    play = plan_play(roll_log, Wanted(MAX, 0.0, steps / 10, 0.1), config)
     assert play.frame_count == steps + 1
 
 

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 
 from hilstar.sky.air import AIR_MASSES, SiteAir
+from hilstar.sky.bodies.orbit import Geocentre
+from hilstar.sky.bodies.passes import Cone
+from tests.support.satellites import satellite_sky, some_orbits
 from tests.support.skies import moving_sky
 from tests.support.stars import stars_at
 
@@ -62,3 +65,27 @@ def test_a_moon_that_sets_is_seen_until_its_upper_limb_is_down(centre_deg, is_se
     moving.air = plain_air(np.sin(altitude) * moon.direction + np.cos(altitude) * level, (0.2,))
     found = moving.discs(moon.direction, 0.1)
     assert [disc.name for disc in found] == (["Moon"] if is_seen else [])
+
+
+@pytest.mark.parametrize("altitude_deg", [90.0, 30.0, 0.5, -0.5, -60.0])
+def test_a_satellite_is_seen_through_the_air_and_not_through_the_ground(altitude_deg):
+    """Two that are lit, of a list of 30: each at its own altitude over a horizon that is put there."""
+    sky = satellite_sky(some_orbits(np.random.default_rng(3), 30), Geocentre())
+    seen = sky.passing(Cone(np.array([0.0, 0.0, 1.0]), np.pi, 0.0), 0)
+    now = np.zeros(len(seen))
+    every = np.arange(len(seen))
+    bare = seen.rates_e_per_s(every, now, now)
+    brightest = int(np.argmax(bare))
+    towards = seen.directions(every, now)[brightest]
+    level = np.cross(towards, [0.0, 0.0, 1.0])
+    level /= np.linalg.norm(level)
+    altitude = np.radians(altitude_deg)
+    air = plain_air(np.sin(altitude) * towards + np.cos(altitude) * level, (0.2,))
+    through = seen.through(air, 0).rates_e_per_s(every, now, now)[brightest]
+    if altitude_deg < 0:
+        assert through == 0.0
+    else:
+        # Pickering 2002, whose air masses are Kasten and Young's within 1 % from the horizon up
+        masses = 1 / np.sin(np.radians(altitude_deg + 244 / (165 + 47 * altitude_deg**1.1)))
+        wanted_mag = 0.2 * masses
+        assert -2.5 * np.log10(through / bare[brightest]) == pytest.approx(wanted_mag, rel=0.02)

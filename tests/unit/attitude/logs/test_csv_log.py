@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -239,3 +241,28 @@ def test_rates_are_in_the_unit_of_their_columns_and_that_is_said(csv_of):
         sum("deg/s" in line or "°/s" in line for kind, line in found.told if kind == "log-table")
         == 3
     )
+
+
+def test_telemetry_has_the_rates_of_its_columns_in_their_unit(tmp_path: Path) -> None:
+    path = tmp_path / "telemetry.csv"
+    rows = ["0,1,0,0,0,1.8,0,-3.6,1", "1,1,0,0,0,,,,1", "2,0,0,0,0,9,9,9,0"]
+    header = "t_s,qw,qx,qy,qz,rx [deg/s],ry [deg/s],rz [deg/s],valid"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    rates = read_telemetry(path).rate_cam_rad_s
+    assert rates is not None
+    np.testing.assert_allclose(rates[0], np.radians([1.8, 0.0, -3.6]), rtol=1e-12)
+    assert np.isnan(rates[1:]).all()
+
+
+@pytest.mark.parametrize(
+    "header, row, told",
+    [
+        ("rx,ry", "0,0", "column rz is missing beside the others of a rate"),
+        ("rx,ry,rz", "0,,0", "leave all three blank where no rate is reported"),
+    ],
+)
+def test_half_a_rate_is_refused(tmp_path: Path, header: str, row: str, told: str) -> None:
+    path = tmp_path / "telemetry.csv"
+    path.write_text(f"t_s,qw,qx,qy,qz,{header}\n0,1,0,0,0,{row}\n")
+    with pytest.raises(InputError, match=told):
+        read_telemetry(path)

@@ -9,6 +9,8 @@ from typing import Any
 import pytest
 
 from hilstar.attitude.logs.log_file import open_log
+from hilstar.attitude.logs.telemetry import read_telemetry
+from hilstar.basics.errors import InputError
 from hilstar.basics.reading import MAX_LINE_CHARACTERS
 
 ROWS: list[dict[str, Any]] = [
@@ -84,3 +86,27 @@ def test_an_attitude_is_left_out_however_its_program_writes_false(
     log = open_log(path)
     assert [sample.t_ns for sample in log.samples] == [ROWS[0]["t_ns"], ROWS[2]["t_ns"]]
     assert dict(log.told)["log-valid"].startswith("1 line is marked as not valid")
+
+
+def test_telemetry_has_the_stars_of_its_objects(tmp_path: Path) -> None:
+    path = tmp_path / "telemetry.jsonl"
+    many = [[1.5, 2.5, 3.0, 26311, 0.7]] * 400  # an answer longer than a message with an attitude
+    lines = [
+        {"t_ns": 1, "q": [1, 0, 0, 0], "mode": "tracking", "centroids": [[5, 6, None], [7, 8]]},
+        {"t_ns": 2, "valid": False, "centroids": [[9, 9]]},
+        {"t_ns": 3, "q": [1, 0, 0, 0], "centroids": many},
+        {"t_ns": 4, "q": [1, 0, 0, 0], "rate": [0.1, 0.2, 0.3]},
+    ]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    telemetry = read_telemetry(path)
+    assert telemetry.t_ns.tolist() == [1, 3, 4]
+    assert list(telemetry.star_rows) == [[[5.0, 6.0, None], [7.0, 8.0]], many, []]
+    assert telemetry.rate_cam_rad_s is not None
+    assert telemetry.rate_cam_rad_s[2].tolist() == [0.1, 0.2, 0.3]
+
+
+def test_stars_of_another_form_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "telemetry.jsonl"
+    path.write_text('{"t_ns": 1, "q": [1, 0, 0, 0], "centroids": [["a", 2]]}\n')
+    with pytest.raises(InputError, match=r"telemetry.jsonl:1: .*write centroids as \[\[x_px"):
+        read_telemetry(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import socket
 
 import pytest
@@ -88,6 +89,18 @@ def test_a_bind_deletes_no_file_and_takes_no_socket_from_a_running_program(tmp_p
         server.listen()
         assert "running program" in refused(served)
         check_use(parse_endpoint(f"ipc://{served}"), "", bind=False)
+    with contextlib.ExitStack() as opened:
+        # one that has no time for more callers is no less a running program
+        server = opened.enter_context(socket.socket(socket.AF_UNIX))
+        busy = tmp_path / "busy"
+        server.bind(str(busy))
+        server.listen(0)
+        with pytest.raises(BlockingIOError):
+            for _ in range(100):
+                caller = opened.enter_context(socket.socket(socket.AF_UNIX))
+                caller.setblocking(False)
+                caller.connect(str(busy))
+        assert "running program" in refused(busy)
     with socket.socket(socket.AF_UNIX) as server:
         server.bind(str(stale))
     check_use(parse_endpoint(f"ipc://{stale}"), "", bind=True)

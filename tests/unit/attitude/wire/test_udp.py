@@ -20,6 +20,7 @@ from hilstar.attitude.wire.udp import (
     Credit,
     Datagrams,
     UdpLink,
+    UdpRoad,
     filter_program,
 )
 from hilstar.basics.notices import Notices
@@ -151,6 +152,42 @@ def test_a_datagram_came_after_the_last_look_that_found_none():
         (datagram,) = receiving.take(1)
     receiving.close()
     assert before_ns <= datagram.host_ns <= after_ns
+
+
+def test_what_the_kernel_drops_is_counted_once():
+    """The kernel's count grows for as long as the socket is open; it is looked at each second."""
+    clock = ChangedClock()
+    road = UdpRoad(ANYWHERE, AllowedSenders(["127.0.0.3"]), clock=clock)
+    place = ("127.0.0.1", int(road.endpoint.rpartition(":")[2]))
+    assert road._datagrams.keep_only(AllowedSenders(["127.0.0.3"]).networks)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listed,
+    ):
+        listed.bind(("127.0.0.3", 0))
+        for strangers, in_all in ((5, 5), (0, 5), (2, 7), (0, 7)):
+            for _ in range(strangers):
+                stranger.sendto(b"1", place)
+            listed.sendto(b"2", place)
+            clock.later_ns += 2 * NS_PER_S
+            assert [message.parts for message in road.taken(10_000)] == [[b"2"]]
+            assert road.link_counts.flooded == in_all
+    road.close()
+
+
+def test_a_datagram_goes_out_though_the_last_one_found_nobody():
+    """The kernel tells of the last refusal where the next one is sent, and sends nothing."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
+        closed.bind(("127.0.0.1", 0))
+        port = closed.getsockname()[1]
+    sender = Datagrams.connected("127.0.0.1", port)
+    assert sender.put(b"nobody is there")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.0.1", port))
+        opened.settimeout(10)
+        assert sender.put(b"somebody is")
+        assert opened.recv(99) == b"somebody is"
+    sender.close()
 
 
 def test_however_many_addresses_ask_each_is_judged_by_the_list():

@@ -15,6 +15,8 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
 from hilstar.instruments.assess.assessment import Assessment, AssessSettings, assess_files
+from hilstar.instruments.assess.further import END, rate_notes
+from hilstar.instruments.assess.star_figures import StarTable, star_figure, without_shifts
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.star_light import bench_stars
 from tests.support.benches import bench_text
@@ -86,8 +88,8 @@ def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_ledger(path, frames_s, frames_q, start_ns=0, bench=BENCH)
 
 
-def assessed(ledger: Path, factor: float = 1.0, sky: Sky | None = None) -> Assessment:
-    """An assessment of telemetry with planted errors, its rates times a factor."""
+def assessed(ledger: Path, sky: Sky) -> Assessment:
+    """An assessment of telemetry with planted errors."""
     rng = np.random.default_rng(5)
     t_s = np.arange(1.0, SECONDS - 1, ANSWER_S)
     true = attitude(motion, t_s)
@@ -101,9 +103,8 @@ def assessed(ledger: Path, factor: float = 1.0, sky: Sky | None = None) -> Asses
     for k, at_s in enumerate(t_s.tolist()):
         answer: dict[str, Any] = {"t_ns": round(at_s * 1e9), "q": q[k].tolist(), "valid": True}
         if k % 3:  # a tracker that has no rate in every third answer
-            answer["rate"] = (factor * rate[k]).tolist()
-        if sky is not None:
-            answer["centroids"] = sky.reported(true[k], rng)
+            answer["rate"] = rate[k].tolist()
+        answer["centroids"] = sky.reported(true[k], rng)
         lines.append(json.dumps(answer))
     telemetry = ledger.with_name("telemetry.jsonl")
     telemetry.write_text("\n".join(lines) + "\n")
@@ -111,7 +112,7 @@ def assessed(ledger: Path, factor: float = 1.0, sky: Sky | None = None) -> Asses
 
 
 def test_planted_rates_and_stars_come_out_of_telemetry(ledger: Path) -> None:
-    found = assessed(ledger, sky=Sky(ledger.parent))
+    found = assessed(ledger, Sky(ledger.parent))
     planted = {
         ("rate bias", "cross"): RATE_BIAS_DEG_S,
         ("rate bias", "roll"): 0.0,
@@ -134,13 +135,48 @@ def test_planted_rates_and_stars_come_out_of_telemetry(ledger: Path) -> None:
         assert row.value is not None and row.low_95 is not None and row.high_95 is not None, key
         sigma = (row.high_95 - row.low_95) / TO_SIGMA
         assert abs(row.value - planted[key]) <= max(SHARE * planted[key], SIGMAS * sigma), key
-    assert not any("rates" in note for note in found.notes)
+    assert not any("reported rates" in note for note in found.notes)
     listed = report.budget_of(found)["further"]
     assert [(each["quantity"], each["axis"]) for each in listed] == list(planted)
     assert {each["why"] for each in listed} == {""}
 
 
-@pytest.mark.parametrize("factor, told", [(180 / np.pi, "deg/s"), (-1.0, "x = -x, y = -y, z = -z")])
-def test_rates_of_another_convention_are_named(ledger: Path, factor: float, told: str) -> None:
-    found = assessed(ledger, factor)
-    assert any("the reported rates are" in note and told in note for note in found.notes)
+@pytest.mark.parametrize(
+    "factor, order, told",
+    [
+        (180 / np.pi, (0, 1, 2), "they are in deg/s"),
+        (-1.0, (0, 1, 2), "they have the wrong sign"),
+        (1.0, (2, 0, 1), "their axes are in another order"),
+        (1.0, (0, 1, 2), ""),
+        (1.05, (0, 1, 2), ""),
+    ],
+)
+def test_rates_of_another_convention_are_named(
+    factor: float, order: tuple[int, int, int], told: str, rng: np.random.Generator
+) -> None:
+    t_s = np.arange(1.0, SECONDS / 2, ANSWER_S)
+    noise_rad = rng.normal(0, 2.0, (len(t_s), 3)) / ARCSEC_PER_RAD
+    q = scalar_first(Rotation.from_rotvec(noise_rad) * attitude(motion, t_s))
+    rates = rate_rad_s(t_s) + np.radians(RATE_NOISE_DEG_S) * rng.standard_normal((len(t_s), 3))
+    rates = factor * rates[:, order]
+    rates[::7] = np.nan
+    notes = list(rate_notes(np.rint(1e9 * t_s).astype(np.int64), q, rates))
+    assert len(notes) == bool(told)
+    assert all("not the turn of the reported attitudes" in note and told in note for note in notes)
+
+
+def test_a_shift_that_all_stars_share_is_not_a_stars_noise(rng: np.random.Generator) -> None:
+    """Answers of 20 stars each, which a time that is off moves by 2 px an axis, one sigma."""
+    answers, stars = 200, 20
+    answer = np.repeat(np.arange(answers), stars)
+    x_px, y_px = rng.uniform(0, SIDE_PX - 1, (2, len(answer)))
+    shift_px = rng.normal(0, 2.0, (2, answers))[:, answer]
+    dx_px, dy_px = shift_px + rng.normal(0, STAR_NOISE_PX, (2, len(answer)))
+    zeros = np.zeros(len(answer))
+    table = StarTable(answer, x_px, y_px, zeros, zeros, dx_px, dy_px, zeros, zeros)
+    resolution_px = (SIDE_PX, SIDE_PX)
+    free = without_shifts(table, answer, resolution_px)
+    figure = star_figure("star-noise", free, resolution_px, END, rng)
+    # of 8000 places a sigma is known to 0.8 %; four times that
+    assert figure.value == pytest.approx(STAR_NOISE_PX, rel=0.032)
+    assert figure.low <= STAR_NOISE_PX <= figure.high

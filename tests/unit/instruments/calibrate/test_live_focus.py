@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate.first_light.focus import Sharpness
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
-from hilstar.instruments.calibrate.live_focus import focus_readings, follow_answers
+from hilstar.instruments.calibrate.live_focus import focus_readings, follow_answers, streak
 from hilstar.server.answers.star_widths import FocusCurve, sparkline
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
@@ -214,3 +215,33 @@ def test_a_curve_is_as_high_as_its_values():
     assert sparkline([3.0, 2.0, 1.0, 2.0, 3.0], 0.1) == "█▅▁▅█"
     assert sparkline([1.0, 1.01], 0.1) == "▁▂"
     assert sparkline([1.5, 1.5], 0.0) == "▁▁"
+
+
+def dragged_dots(length_px: float, angle_deg: float, sigma_px: float = 1.2):
+    """An image (80, 120) of Gaussian dots, each drawn out evenly, and the places of their middles."""
+    x_px = np.array([15.3, 40.0, 66.7, 100.45])
+    y_px = np.array([14.6, 60.2, 33.0, 48.55])
+    rows, columns = np.mgrid[:80, :120]
+    image = np.full(rows.shape, 7.0)
+    angle = np.radians(angle_deg)
+    for step in np.linspace(-0.5, 0.5, 41) * length_px:
+        for x, y in zip(x_px, y_px, strict=True):
+            across = columns - x - step * np.cos(angle)
+            down = rows - y - step * np.sin(angle)
+            image += np.exp(-(across**2 + down**2) / (2 * sigma_px**2)) / 41
+    sharp = Sharpness(x_px, y_px, np.full(4, sigma_px), 2 * sigma_px, 0.0, 0.0, 0.0)
+    return image, sharp
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 30.0, 90.0, 135.0])
+def test_a_streak_has_the_length_and_the_direction_of_the_motion(angle_deg):
+    """Wherever in their pixels dots are; a window of three sigmas cuts 1 % off."""
+    length_px, found_deg = streak(*dragged_dots(3.0, angle_deg))
+    assert length_px == pytest.approx(3.0, rel=0.03)
+    off_deg = (found_deg - angle_deg + 90) % 180 - 90
+    assert abs(off_deg) < 1.0
+
+
+def test_round_dots_are_no_streak_wherever_in_their_pixels_they_are():
+    length_px, _ = streak(*dragged_dots(0.0, 0.0))
+    assert length_px < 0.2

@@ -30,7 +30,13 @@ from hilstar.instruments.calibrate.photometric import calibrate_photometric, fit
 from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.tracker.rounding import before_adc_dn, cut_light, rounding_error, rounding_rms
+from hilstar.tracker.rounding import (
+    before_adc_dn,
+    cut_light,
+    mean_rounding_error,
+    rounding_error,
+    rounding_rms,
+)
 from tests.support.benches import TWIN, bench_text
 from tests.support.refusals import refusal
 from tests.support.tables import write_readings
@@ -42,6 +48,8 @@ BRIGHT_BLACK = 0.01  # its noise is about 0.1 % of it
 EDGE_FALL = 0.4  # of light from the middle of the screen to its corners
 EVEN_ERROR = 0.001  # of the map of it, relative
 SURE = 4.0  # sigmas: one figure in 16 000 is further off
+# of sums of 200 terms of order 1, and of sines of 8 x 40 turns, in double precision
+ROUNDING_DN = 1e-12
 # Root mean square of figures in their sigmas: 1 for honest errors. 12 figures give it to a fifth,
 # three times.
 MAX_RMS = 1.6
@@ -246,6 +254,17 @@ def test_rounding_is_that_of_levels_in_noise():
         )
     assert rounding_rms(0.0) == pytest.approx(1 / math.sqrt(12), rel=0.04)
     assert rounding_rms(0.6) < 1e-3
+
+
+def test_a_mean_over_pixels_is_that_of_each_pixel_s_own_rounding(rng):
+    """At each place of the dark level, with noise that the light of each pixel adds to."""
+    light_dn = rng.uniform(0.0, 40.0, 200)
+    noise_dn = np.sqrt(0.1**2 + 1e-3 * light_dn)
+    places_dn = np.arange(5) / 5
+    each_dn = rounding_error(places_dn[:, None] + light_dn, noise_dn)
+    mean_dn = mean_rounding_error(places_dn, light_dn, noise_dn)
+    assert mean_dn == pytest.approx(each_dn.mean(axis=1), abs=ROUNDING_DN)
+    assert np.abs(mean_dn).max() > 1e3 * ROUNDING_DN
 
 
 @pytest.mark.parametrize("noise_dn", [0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7])

@@ -26,6 +26,7 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.reference import (
     FACES,
     Reading,
+    _station_zeros,
     fit_reference,
     pointing,
     read_readings,
@@ -262,3 +263,44 @@ def test_stated_sigmas_stand_where_the_scatter_is_less(rng: np.random.Generator)
     # nine readings of dots and six of faces know a rotation better than one of them does
     assert (sigmas[2.0] > 2.0 / math.sqrt(15)).all()
     assert sigmas[4.0] == pytest.approx(2 * sigmas[2.0])
+
+
+def off_arcsec(readings: list[Reading], true: FloatArray) -> float:
+    """How far the fit of readings is from a planted rotation."""
+    found = fit_reference(Path("readings.csv"), readings)
+    turn = to_rotation_vector(multiply(found.q_mon_to_reference, conjugate(true)))
+    return float(np.linalg.norm(turn)) * ARCSEC_PER_RAD
+
+
+def test_an_azimuth_may_be_read_from_any_zero_and_past_a_whole_turn(
+    rng: np.random.Generator,
+) -> None:
+    """A theodolite counts from 0 to 360 degrees, or from -180; each station has its own zero."""
+    for _ in range(5):
+        readings, true = planted_cube(rng, 0.0, repeats=2)
+        assert off_arcsec(readings, true) < EXACT_ARCSEC
+        turned = [
+            replace(reading, azimuth_rad=reading.azimuth_rad + 2 * math.pi * (k % 3 - 1))
+            for k, reading in enumerate(readings)
+        ]
+        assert off_arcsec(turned, true) < EXACT_ARCSEC
+
+
+def test_a_station_s_zero_is_what_has_to_be_added_to_its_azimuths() -> None:
+    """B reads both links 0.3 rad higher than A does, and C 0.1 rad higher than B."""
+    readings = []
+    for station, off_rad, names in (("A", 0.0, "pq"), ("B", 0.3, "pqr"), ("C", 0.4, "r")):
+        for name in names:
+            azimuth_rad = {"p": 1.0, "q": 2.0, "r": 2.5}[name] + off_rad
+            readings.append(Reading(1, name, station, azimuth_rad, 0.0, None, None))
+    zeros = _station_zeros(Path("readings.csv"), readings)
+    assert zeros == pytest.approx({"A": 0.0, "B": -0.3, "C": -0.4})
+
+
+def test_a_covariance_is_about_the_axes_of_mon(rng: np.random.Generator) -> None:
+    """Dots within 4 degrees of the boresight tell the turn about it ten times worse than those
+    across it; it is level, and mon's z.
+    """
+    readings, _ = planted_cube(rng, stations=False, sigma=True)
+    x, y, z = fit_reference(Path("readings.csv"), readings).sigma_arcsec
+    assert z > 5 * max(x, y)

@@ -103,7 +103,7 @@ PLANS = [
 
 JITTER = {"key": "jitter_arcsec.across", "values": [10.0]}
 HZ = {"key": "jitter_hz", "values": [10.0]}
-SLEW = {"key": "slew_s", "values": [2.0]}
+SLEW = {"key": "motion_s", "values": [2.0]}
 PLANS += [
     (plan_text(JITTER), "go together"),
     (plan_text(HZ), "go together"),

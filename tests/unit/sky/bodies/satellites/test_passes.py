@@ -4,6 +4,8 @@ cannot be placed is said once.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -86,6 +88,20 @@ def test_whichever_way_time_goes_a_fixed_observer_misses_none_along_an_axis(step
         found += len(wanted)
         assert wanted <= near
     assert found > 5
+
+
+def test_after_a_look_for_bright_ones_a_look_for_faint_ones_finds_them(rng):
+    """As of a frame after an exposure, or the other way round."""
+    text = some_orbits(rng, 60)
+    sky, cone = satellite_sky(text, Geocentre()), Cone(NORTH, 1.0, 0.1)
+    (few, many) = (replace(cone, faintest_e_per_s=limit) for limit in (1e5, 0.0))
+    found = []
+    for one in (few, many, few, many):
+        seen = sky.passing(one, 0)
+        found.append(set() if seen is None else set(seen.index.tolist()))
+    fresh = satellite_sky(text, Geocentre()).passing(many, 0)
+    assert found[1] == found[3] == set(fresh.index.tolist())
+    assert found[0] == found[2] < found[1]
 
 
 def test_a_satellite_without_a_place_is_counted_at_each_moment_and_no_other_is():

@@ -422,20 +422,20 @@ def _sweep_card(result: SetResult, judged: ClauseVerdict) -> Card:
 
 def _edge_finding(sweep: SweepTable, judged: ClauseVerdict) -> str:
     """Up to where a sweep's cases are successes, in a line."""
-    kept = "An attitude"
+    success = "An attitude"
     if sweep.star_v_mag is not None:
-        kept = f"Half of the stars to V {sweep.star_v_mag:g}"
+        success = f"Half of the stars to V {sweep.star_v_mag:g}"
     edge = judged.verdict
     if edge is None or edge.value is None:
-        return f"{kept}: {judged.untested or 'no edge'}"
+        return f"{success}: {judged.untested or 'no edge'}"
     if STILL in edge.method:
-        return f"{kept} even at {_digits(edge.value)} {judged.unit}".rstrip()
+        return f"{success} even at {_digits(edge.value)} {judged.unit}".rstrip()
     if NOT_EVEN in edge.method:
-        return f"{kept} is not there even at {_digits(edge.value)} {judged.unit}".rstrip()
+        return f"{success} is not there even at {_digits(edge.value)} {judged.unit}".rstrip()
     way = "up to"
     if sweep.stop < sweep.start:
         way = "down to"
-    return f"{kept} {way} {_measured(judged)}"
+    return f"{success} {way} {_measured(judged)}"
 
 
 def _first_attitude(result: SetResult) -> Card:

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any, get_type_hints
 
 from hilstar.basics.charts import two_digits
-from hilstar.instruments.campaign.figures import clopper_pearson
+from hilstar.instruments.assess.bounded_figures import clopper_pearson
 from hilstar.instruments.study import limits
 from hilstar.instruments.study.chain.answers import STEP_WORDS, Answer, Given, answer, scenes_of
 from hilstar.instruments.study.chain.measuring import CombinationRow, ErrorPart

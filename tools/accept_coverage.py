@@ -30,10 +30,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from hilstar.instruments.assess.bounded_figures import clopper_pearson
 from hilstar.instruments.campaign.acceptance import Acceptance
 from hilstar.instruments.campaign.acceptance_plan import plan_path, read_acceptance_plan
 from hilstar.instruments.campaign.acceptance_verdicts import ClauseVerdict
-from hilstar.instruments.campaign.figures import clopper_pearson
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from tests.support.acceptance import run_here, write_bench
 

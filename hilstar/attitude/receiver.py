@@ -152,9 +152,10 @@ class BackChannel:
         """The exchange that a reply completes, its sender times made continuous; None for a
         reply to nothing.
         """
-        request = self._asked.pop(reply.sequence, None)
+        request = self._asked.get(reply.sequence)
         if request is None or request.t1_ns != reply.t1_ns:
             return None
+        del self._asked[reply.sequence]
         there_ns = self._link.wire_ns(request)
         back_ns = self._link.wire_ns(reply)
         return Exchange(

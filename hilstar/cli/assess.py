@@ -22,8 +22,8 @@ class AssessOptions:
     output: Path = output_option("DIR", "Directory for budget.html and its tables.")
     telemetry: Path | None = argument(
         "[TELEMETRY]",
-        "Its answers on its own clock: CSV t_s,qw,qx,qy,qz[,valid] (q_icrs_to_cam, scalar first),"
-        " AEM, MCAP; by default the answers in the ledger.",
+        "Its answers on its own clock: CSV t_s,qw,qx,qy,qz[,rx,ry,rz][,valid] (q_icrs_to_cam,"
+        " scalar first), JSON lines, AEM, MCAP; by default the answers in the ledger.",
         show_default=False,
     )
     stamp: Literal["start", "middle", "end"] | None = option(

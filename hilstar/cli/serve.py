@@ -3,6 +3,7 @@ per head beside one source.
 """
 
 import math
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -67,13 +68,20 @@ def serve_heads(asked: "HeadsRun", console: str | None, overwrite: bool, as_json
         if isinstance(summary, dict) and "verdict" in summary:
             lines.append(f"{'verdict':20s}{name}: {summary['verdict']['line']}")
     print_found(as_json, {"heads": head_summaries}, lines)
-    codes = [head["exit_code"] for head in head_summaries.values()]
-    if all(code == NO_ATTITUDE for code in codes):
-        raise typer.Exit(NO_ATTITUDE)
+    exit_code = _exit_code([head["exit_code"] for head in head_summaries.values()])
+    if exit_code:
+        raise typer.Exit(exit_code)
+
+
+def _exit_code(codes: Sequence[int]) -> int:
+    """The exit code of a run by those of its heads: that of the first that failed, else 4 where
+    none ever had an attitude.
+    """
     failures = [code for code in codes if code not in {0, NO_ATTITUDE}]
-    if failures:
-        # a head that a signal ended has a negative code, which is none of a command's
-        raise typer.Exit(failures[0] if 0 < failures[0] <= NO_ATTITUDE else 1)
+    if not failures:
+        return min(codes)
+    # a head that a signal ended has a negative code, which is none of a command's
+    return failures[0] if 0 < failures[0] < NO_ATTITUDE else 1
 
 
 def _head_line(name: str, head: dict[str, Any]) -> str:

@@ -96,7 +96,7 @@ def simulate(
         view = simulator.view(q, np.radians(rate_deg_s), t_ns)
         faults = None
         if wrong is not None:
-            faults = faulty_exposure(simulator, view, wrong, t_ns or 0)
+            faults = faulty_exposure(simulator, [view], wrong, t_ns or 0)
         exposure = simulator.expose(view, noise.rng(), faults=faults)
         if options.output is not None:
             files.write_exposure_fits(options.output, simulator, exposure, noise)

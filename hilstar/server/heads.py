@@ -27,6 +27,7 @@ from hilstar.attitude.wire.packet import TimeRequest
 from hilstar.attitude.wire.zmq_links import Feed
 from hilstar.basics.files import temporary_folder
 from hilstar.basics.process.interrupts import stop_on_signal
+from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff
 from hilstar.basics.reading import NOT_JSON
 from hilstar.basics.units import NS_PER_S
 from hilstar.server.bench.bench_file import HeadsFile
@@ -35,6 +36,7 @@ from hilstar.server.bench.config import BenchConfig
 STALLED_S = 3.0  # without a sign of life; it sends one each second
 STARTS_S = 60.0  # a head that has not begun by then is started again
 MIN_BACK_OFF_S, MAX_BACK_OFF_S = 0.2, 5.0
+STEADY_S = 50.0  # a head that ran for longer was well before it ended
 US_PER_S = 1_000_000
 MAX_LINE = 2000
 MAX_OUTPUT = 10_000_000  # bytes of a head's own summary
@@ -76,8 +78,7 @@ class HeadProcess:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.bind(self._address)
         self._socket.setblocking(False)
-        self._back_off_s = MIN_BACK_OFF_S
-        self._again_at_s = 0.0
+        self._again = BackOff(MIN_BACK_OFF_S, MAX_BACK_OFF_S, HOST_CLOCK)
         self._process: subprocess.Popen[bytes] | None = None
         self._readers: list[threading.Thread] = []
         self._ready = False
@@ -111,14 +112,16 @@ class HeadProcess:
             reader.start()
 
     def _pass_on(self, stream: IO[bytes]) -> None:
-        for line in iter(lambda: stream.readline(MAX_LINE), b""):
-            self._say(f"{self.name}: {line.decode(errors='replace').rstrip()}")
+        with stream:
+            for line in iter(lambda: stream.readline(MAX_LINE), b""):
+                self._say(f"{self.name}: {line.decode(errors='replace').rstrip()}")
 
     def _keep(self, stream: IO[bytes]) -> None:
-        self.output = stream.read(MAX_OUTPUT)
-        # further output is discarded, so that the head does not block on it
-        while stream.read(MAX_LINE):
-            pass
+        with stream:
+            self.output = stream.read(MAX_OUTPUT)
+            # further output is discarded, so that the head does not block on it
+            while stream.read(MAX_LINE):
+                pass
 
     def _drain(self) -> bool:
         heard = False
@@ -146,7 +149,7 @@ class HeadProcess:
             return False
         now_s = time.monotonic()
         if self._process is None:
-            if now_s >= self._again_at_s:
+            if self._again.over:
                 self.restarts += 1
                 self._begin()
             return True
@@ -181,9 +184,8 @@ class HeadProcess:
         return True
 
     def _wait_to_begin(self, now_s: float) -> None:
-        long_ago = now_s - self._begun_s > 10 * MAX_BACK_OFF_S
-        self._back_off_s = MIN_BACK_OFF_S if long_ago else min(2 * self._back_off_s, MAX_BACK_OFF_S)
-        self._process, self._again_at_s = None, now_s + self._back_off_s
+        self._process = None
+        self._again.put_off(anew=now_s - self._begun_s > STEADY_S)
 
     def _kill(self) -> None:
         if self._process is not None:
@@ -261,30 +263,32 @@ def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
 
 def _head(asked: HeadsRun, k: int, endpoint: str, folder: Path, say: Say) -> HeadProcess:
     name = asked.heads.names[k]
-    file = asked.heads.files[k]
 
     def command(number: int, drawn_s: float) -> list[str]:
-        made = [sys.executable, "-m", "hilstar", "serve", str(file.path), "--json"]
-        made += [
-            "--head-of",
-            str(asked.heads.path),
-            "--fed-by",
-            f"{endpoint},{os.getpid()}",
-            *asked.options,
-        ]
-        if asked.duration_s is not None:
-            made += ["--duration", f"{max(asked.duration_s - drawn_s, MIN_DURATION_S):.6g}"]
-        if asked.ledger is not None:
-            made += ["--ledger", str(head_ledger(asked.ledger, name, number))]
-        if asked.consoles:
-            made += ["--console", asked.consoles[k]]
-        return made
+        return head_command(asked, k, endpoint, number, drawn_s)
 
     if asked.token is None:
         secrets = {}
     else:
         secrets = {"HILSTAR_TOKEN": asked.token}
     return HeadProcess(name, command, say, folder / f"life-{k}", secrets)
+
+
+def head_command(asked: HeadsRun, k: int, endpoint: str, number: int, drawn_s: float) -> list[str]:
+    """The command of head `k`'s start `number`, fed by `endpoint`, `drawn_s` after it first drew:
+    a head that is started again runs for the rest of the duration, with a ledger of its own.
+    """
+    file = asked.heads.files[k]
+    words = [sys.executable, "-m", "hilstar", "serve", str(file.path), "--json"]
+    words += ["--head-of", str(asked.heads.path), "--fed-by", f"{endpoint},{os.getpid()}"]
+    words += asked.options
+    if asked.duration_s is not None:
+        words += ["--duration", f"{max(asked.duration_s - drawn_s, MIN_DURATION_S):.6g}"]
+    if asked.ledger is not None:
+        words += ["--ledger", str(head_ledger(asked.ledger, asked.heads.names[k], number))]
+    if asked.consoles:
+        words += ["--console", asked.consoles[k]]
+    return words
 
 
 def _hand_on(

@@ -183,7 +183,7 @@ def _serve_stream(
         shown = loop.draw(moment.slot, t_ns, timeline.at(t_ns), moment.lit_at(host_ns))
         if shown is None:
             return None
-        light_ns = t_ns - receiver.jumps.correction_ns  # by the sender's own clock
+        light_ns = receiver.jumps.sender_ns(t_ns)
         outlet.record(bench, loop, shown, light_ns)
         if link.two_way:
             receiver.back.post(

@@ -9,14 +9,12 @@ The physical order, which is the order of `Detector.expose`:
     -> + cosmic rays -> full well (and blooming) -> column pattern -> read noise -> ADC
 
 Laws:
-1. What belongs to the device (PRNU, DSNU, hot and dead pixels, columns) comes from `device_seed`,
-   each from its own
-   stream, so that one map does not change when another is switched on. What belongs to the frame
-   comes from the
-   generator that is passed in. Same seeds and same numpy: same image, bit for bit.
+1. What belongs to the device (PRNU, DSNU, hot and dead pixels, rows, columns) comes from
+   `device_seed`, each from its own stream, so that one map does not change when another is switched
+   on. What belongs to the frame comes from the generator that is passed in. Same seeds and same
+   numpy: same image, bit for bit.
 2. Photon and dark shot noise are one Poisson draw: the sum of two independent Poisson counts is
-   Poisson of the
-   summed mean, exactly, and one draw costs half of two.
+   Poisson of the summed mean, exactly, and one draw costs half of two.
 3. Quantisation noise is what rounding does. The thesis's added Gaussian (table 4.1) is off unless
    asked for.
 """
@@ -143,16 +141,24 @@ class Detector:
         self.settings = settings
         self.pixel_pitch_um = pixel_pitch_um
         self.shape = (height, width)
-        streams = map(np.random.default_rng, np.random.SeedSequence(settings.device_seed).spawn(7))
-        prnu, dsnu, hot, dead, column, column_dark, offset = streams
+        # a new map takes a new stream at the end: those of before stay as they were
+        seeds = np.random.SeedSequence(settings.device_seed).spawn(9)
+        streams = [np.random.default_rng(seed) for seed in seeds]
+        prnu, dsnu, hot, dead, column, column_dark, offset = streams[:7]
+        dead_rows, dead_columns = streams[7:]
         gain_map: ChargeArray = np.ones(self.shape)
         if settings.prnu:  # a map of ones needs no million draws
             gain_map = np.maximum(1.0 + settings.prnu * prnu.standard_normal(self.shape), 0.0)
         dark_map_e_per_s = _dark_map_e_per_s(settings, self.shape, dsnu, hot, column_dark)
-        if settings.dead_pixel_fraction:
-            alive = dead.random(self.shape) >= settings.dead_pixel_fraction
-            gain_map *= alive
-            dark_map_e_per_s *= alive
+        for share, shape, rng in (
+            (settings.dead_pixel_fraction, self.shape, dead),
+            (settings.dead_row_fraction, (height, 1), dead_rows),
+            (settings.dead_column_fraction, (1, width), dead_columns),
+        ):
+            if share:
+                is_alive = rng.random(shape) >= share
+                gain_map *= is_alive
+                dark_map_e_per_s *= is_alive
         kind = np.float64 if settings.noise_version == 1 else np.float32
         self.gain_map: ChargeArray = gain_map.astype(kind, copy=False)
         self.dark_map_e_per_s: ChargeArray = dark_map_e_per_s.astype(kind, copy=False)

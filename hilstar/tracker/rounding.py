@@ -25,7 +25,7 @@ VARIANCE_DN2 = 1 / 12
 # to this, their variance does not tell the noise before the ADC.
 AMBIGUOUS_DN2 = 1 / 4 + VARIANCE_DN2
 STEP_PHASES = 16  # places of a dark level between two steps
-PLACES_DN = np.arange(STEP_PHASES)[:, None] / STEP_PHASES
+PLACES_DN = np.arange(STEP_PHASES) / STEP_PHASES
 HARMONICS = np.arange(1, 9)  # of the sawtooth that rounding is: eight hold 93 % of its variance
 UNCUT_SIGMAS = 4.0  # of a dark level above code 0: what is cut off is under 1e-5 of the noise
 DITHERED_DN = 0.6  # of noise: the largest harmonic is then 3e-4 DN
@@ -52,10 +52,32 @@ def rounding_error(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:
     """
     total = np.zeros(np.broadcast_shapes(level_dn.shape, noise_dn.shape))
     for order in HARMONICS:
-        amplitude = (-1) ** order / (math.pi * order)
-        wave = amplitude * np.sin(2 * math.pi * order * level_dn)
+        wave = _amplitude_dn(order) * np.sin(2 * math.pi * order * level_dn)
         total += wave * _damping(order, noise_dn)
     return total
+
+
+def mean_rounding_error(
+    places_dn: FloatArray, light_dn: FloatArray, noise_dn: FloatArray
+) -> FloatArray:
+    """The mean (m,) over pixels of `rounding_error`, DN: light (n,) with noise (n,) on a dark level
+    at places (m,) between two steps.
+    """
+    total = np.zeros(len(places_dn))
+    for order in HARMONICS:
+        # sin(a + b) of a place and a pixel's light: sums over pixels are the same for all places
+        turns_rad = 2 * math.pi * order * light_dn
+        damping = _damping(order, noise_dn)
+        cosine = float((damping * np.cos(turns_rad)).mean())
+        sine = float((damping * np.sin(turns_rad)).mean())
+        place_rad = 2 * math.pi * order * places_dn
+        total += _amplitude_dn(order) * (np.sin(place_rad) * cosine + np.cos(place_rad) * sine)
+    return total
+
+
+def _amplitude_dn(order: np.intp) -> float:
+    """The amplitude of a harmonic of rounding's sawtooth."""
+    return float((-1) ** order / (math.pi * order))
 
 
 def _damping(order: IntArray | np.intp, noise_dn: FloatArray | float) -> FloatArray:
@@ -80,9 +102,8 @@ def rounded_light(light_dn: FloatArray, dark_noise_dn: float, dn_per_e: float) -
     if dark_noise_dn > DITHERED_DN:
         return np.zeros(STEP_PHASES)
     noise_dn = np.sqrt(dark_noise_dn**2 + dn_per_e * light_dn)
-    lit = rounding_error(PLACES_DN + light_dn, noise_dn)
-    dark = rounding_error(PLACES_DN, np.array(dark_noise_dn))
-    return np.asarray((lit - dark).mean(axis=1))
+    lit_dn = mean_rounding_error(PLACES_DN, light_dn, noise_dn)
+    return lit_dn - rounding_error(PLACES_DN, np.array(dark_noise_dn))
 
 
 def cut_mean_dn(level_dn: FloatArray, noise_dn: FloatArray) -> FloatArray:

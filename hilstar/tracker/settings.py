@@ -112,8 +112,8 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
         tuple[tuple[Share, Amount], ...], Meta(extra={"form": "[[share, e/s], ...]"})
     ] = ()
     prnu: Share = 0.0  #: Relative sigma of the gain map (PRNU), which is fixed for a device.
-    #: Seed of all that is fixed in a device: PRNU, DSNU, hot and dead pixels, columns. `--seed` is
-    #: the frame's.
+    #: Seed of all that is fixed in a device: PRNU, DSNU, hot and dead pixels, rows and columns.
+    #: `--seed` is the frame's.
     device_seed: Annotated[int, Meta(ge=0, le=2**63 - 1)] = 0
     #: `"cmos"` allows `column_noise_e`; a `"ccd"` has one amplifier.
     fixed_pattern: Literal["ccd", "cmos"] = "ccd"
@@ -137,6 +137,8 @@ class DetectorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, 
     #: Activation energy of that extra current; 0: it goes as the dark current does.
     hot_pixel_activation_ev: Annotated[float, Meta(ge=0, le=2)] = 0.0
     dead_pixel_fraction: Share = 0.0  #: Share of the pixels that give no electrons.
+    dead_row_fraction: Share = 0.0  #: Share of the rows that give no electrons, whole rows.
+    dead_column_fraction: Share = 0.0  #: Share of the columns that give no electrons.
     column_noise_e: Amount = 0.0  #: Sigma of a fixed offset of each column, for `cmos`.
     #: Sigma of a dark current that a column's pixels share, for `cmos`.
     column_dark_e_per_s: Amount = 0.0

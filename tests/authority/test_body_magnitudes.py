@@ -188,6 +188,15 @@ def test_the_moon_is_as_bright_as_in_allen_s_table_and_its_crescent_goes_as_the_
     assert dimmer == pytest.approx(2.5 * np.log10((20 / 5) ** 3), abs=1e-9)
 
 
+def test_a_new_moon_is_no_fainter_than_its_thinnest_crescent():
+    """Its law is of what is lit, which would be nothing: light without end in magnitudes."""
+    thinnest = moon_v_mag(1.0, 384_400.0, 179.7)
+    assert 5.0 < thinnest < 15.0
+    for phase_deg in (179.8, 179.99, 180.0):
+        assert moon_v_mag(1.0, 384_400.0, phase_deg) == pytest.approx(thinnest, abs=1e-6)
+    assert moon_v_mag(1.0, 384_400.0, 179.6) < thinnest
+
+
 def test_the_earth_is_as_bright_as_in_skyfield():
     for phase_deg in (0.0, 45.0, 90.0, 150.0, 170.0):
         theirs = magnitudelib._earth_magnitude(0.99, 0.0026, phase_deg)

@@ -21,7 +21,7 @@ from tests.authority.test_effort import (
     HALF_PX,
     centroids,
     light_of_codes,
-    seen_by_tracker,
+    tracker_views,
     true_stamps,
 )
 from tests.support.claims import holds
@@ -46,15 +46,14 @@ BEGINNINGS = 48  # of exposures, one frame after another: 49 152 of a field's st
 SLOPE_STEP_PX, FIT_ROUNDS = 1e-3, 3
 
 
-def fit_errors(seen, x, y, phases):
+def fit_errors(shown, x, y, views):
     """How far from the star itself a least-squares fit of light, x and y finds it (2, n), px."""
 
     def view(x_px, y_px):
-        stamps = true_stamps(x_px, y_px, SIGMA_PX)
-        return seen_by_tracker(stamps, phases, TRACKER_PIXEL_PX, BLUR_PX)[0].reshape(len(seen), -1)
+        return views.of(true_stamps(x_px, y_px, SIGMA_PX)).reshape(len(x_px), -1)
 
-    step, off = SLOPE_STEP_PX, np.zeros((2, len(seen)))
-    flat = seen.reshape(len(seen), -1)
+    step, off = SLOPE_STEP_PX, np.zeros((2, len(shown)))
+    flat = views.of(shown).reshape(len(shown), -1)
     for _ in range(FIT_ROUNDS):
         x_px, y_px = x + off[0], y + off[1]
         along_x = (view(x_px + step, y_px) - view(x_px - step, y_px)) / (2 * step)
@@ -108,11 +107,11 @@ def places_off(shown, field, rng):
     _, _, x, y = field
     wanted = RATE_E_PER_S * true_stamps(x, y, SIGMA_PX)
     at = rng.uniform(-0.5, 0.5, (2, len(x)))  # in the tracker's pixels
-    there, boxes = centroids(wanted, at, TRACKER_PIXEL_PX, BLUR_PX, SEEN_SIGMA_PX, None)
-    here, _ = centroids(shown, at, TRACKER_PIXEL_PX, BLUR_PX, SEEN_SIGMA_PX, boxes)
-    seen, _ = seen_by_tracker(shown, at, TRACKER_PIXEL_PX, BLUR_PX)
+    views = tracker_views(at, TRACKER_PIXEL_PX, BLUR_PX)
+    there, boxes = centroids(wanted, views, SEEN_SIGMA_PX, None)
+    here, _ = centroids(shown, views, SEEN_SIGMA_PX, boxes)
     off_px = {kind: place - there[kind] for kind, place in here.items()}
-    return off_px | {"fit": fit_errors(seen, x, y, at)}
+    return off_px | {"fit": fit_errors(shown, x, y, views)}
 
 
 def rms(values):

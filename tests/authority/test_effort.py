@@ -11,7 +11,7 @@ centroids are written here.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -87,67 +87,75 @@ def true_stamps(x, y, sigma):
     return down[:, :, None] * across[:, None, :]
 
 
-def seen_by_tracker(stamps, phases, pixel_px, blur_px):
-    """What pixels of a tracker collect of lit squares, and where those pixels are, monitor
-    pixels from the square's middle.
+@dataclass(frozen=True)
+class TrackerViews:
+    """The share of each lit square's columns, and rows, that pixels of a tracker collect
+    (n, side, lit side), and where those pixels are, monitor pixels from the squares' middle.
     """
+
+    columns: np.ndarray
+    rows: np.ndarray
+    places: tuple[np.ndarray, np.ndarray]
+
+    def of(self, stamps):
+        """What the pixels collect of lit squares (n, side, side)."""
+        return self.rows @ stamps @ self.columns.transpose(0, 2, 1)
+
+
+def tracker_views(phases, pixel_px, blur_px):
+    """The views of stars at phases (2, n) of a tracker's pixels."""
     reach = math.ceil(HALF_PX / pixel_px)
     side = 2 * HALF_PX + 1
     points = (np.arange(side * SUB) + 0.5) / SUB - 0.5 - HALF_PX
     views, places = [], []
     for phase in phases:
         middles = (np.arange(-reach, reach + 1) + phase[:, None]) * pixel_px
-        low, high = (
-            ndtr((middles[:, :, None] + way * pixel_px / 2 - points) / blur_px) for way in (-1, 1)
-        )
-        views.append((high - low).reshape(*middles.shape, side, SUB).mean(axis=3))
+        # a pixel ends where the next begins
+        edges = (np.arange(-reach, reach + 2) - 0.5 + phase[:, None]) * pixel_px
+        up_to = ndtr((edges[:, :, None] - points) / blur_px)
+        views.append(np.diff(up_to, axis=1).reshape(*middles.shape, side, SUB).mean(axis=3))
         places.append(middles)
-    columns, rows = views
-    return rows @ stamps @ columns.transpose(0, 2, 1), places
+    return TrackerViews(*views, tuple(places))
 
 
-def centroids(stamps, phases, pixel_px, blur_px, sigma_px, boxes):
+def centroids(stamps, views, sigma_px, boxes):
     """Centres of mass of all light, in 3 x 3 and 5 x 5 tracker pixels, and under a Gaussian that
     follows the star.
     """
     at = np.arange(-HALF_PX, HALF_PX + 1)
     light = stamps.sum(axis=(1, 2))
     found = {"moment": np.stack([stamps.sum(axis=1) @ at / light, stamps.sum(axis=2) @ at / light])}
-    seen, (x_at, y_at) = seen_by_tracker(stamps, phases, pixel_px, blur_px)
+    seen = views.of(stamps)
+    x_at, y_at = views.places
     if boxes is None:
         boxes = np.divmod(seen.reshape(len(seen), -1).argmax(axis=1), seen.shape[2])
     row, column = boxes
     for half in (1, 2):
         y, x = (np.arange(seen.shape[1]) - middle[:, None] for middle in (row, column))
-        part = seen * (np.abs(y) <= half)[:, :, None] * (np.abs(x) <= half)[:, None, :]
-        total = part.sum(axis=(1, 2))
-        found[f"box{2 * half + 1}"] = np.stack(
-            [
-                (part.sum(axis=1) * x_at).sum(axis=1) / total,
-                (part.sum(axis=2) * y_at).sum(axis=1) / total,
-            ]
-        )
+        found[f"box{2 * half + 1}"] = means(seen, np.abs(x) <= half, np.abs(y) <= half, x_at, y_at)
     place = found["box3"].copy()
     for _ in range(60):
         x, y = (
             np.exp(-((where - p[:, None]) ** 2) / (2 * sigma_px**2))
             for where, p in zip((x_at, y_at), place, strict=True)
         )
-        part = seen * y[:, :, None] * x[:, None, :]
-        total = part.sum(axis=(1, 2))
-        means = np.stack(
-            [
-                (part.sum(axis=1) * x_at).sum(axis=1) / total,
-                (part.sum(axis=2) * y_at).sum(axis=1) / total,
-            ]
-        )
-        place += 1.5 * (means - place)
+        place += 1.5 * (means(seen, x, y, x_at, y_at) - place)
     found["window"] = place
     return found, boxes
 
 
+def means(seen, x_weight, y_weight, x_at, y_at):
+    """The mean x and y (2, n) of light, weighted along each axis (n, side)."""
+    by_column = (y_weight[:, None, :] @ seen)[:, 0] * x_weight
+    by_row = (seen @ x_weight[:, :, None])[:, :, 0] * y_weight
+    total = by_column.sum(axis=1)
+    return np.stack([(by_column * x_at).sum(axis=1), (by_row * y_at).sum(axis=1)]) / total
+
+
 def swept_stamps(x, y, away, sigma):
     """The same of stars that move by `away` (2, n) px while their light lasts."""
+    if not np.any(away):
+        return true_stamps(x, y, sigma)
     moments = (np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5
     return sum(true_stamps(x + away[0] * at, y + away[1] * at, sigma) for at in moments) / MOMENTS
 
@@ -196,8 +204,9 @@ def worst_errors(bench, calibration, sigma, rng, path_px=0.0):
         wanted = some[:, None, None] * swept_stamps(x, y, away, sigma)
         flux_mag = max(flux_mag, np.abs(2.5 * np.log10(shown.sum(axis=(1, 2)) / some)).max())
         phases = rng.uniform(-0.5, 0.5, (2, columns.size))
-        there, boxes = centroids(wanted, phases, seen.pixel_px, seen.blur_px, sigma_px, None)
-        here, _ = centroids(shown, phases, seen.pixel_px, seen.blur_px, sigma_px, boxes)
+        views = tracker_views(phases, seen.pixel_px, seen.blur_px)
+        there, boxes = centroids(wanted, views, sigma_px, None)
+        here, _ = centroids(shown, views, sigma_px, boxes)
         for kind, place in here.items():
             off_px[kind] = max(off_px.get(kind, 0.0), np.hypot(*(place - there[kind])).max())
     return flux_mag, off_px
@@ -329,8 +338,9 @@ def test_the_claim_of_a_turn_too_slow_for_paths_is_what_its_frames_have(bits, tm
             )
             shown = image[rows[:, None, None] + near[:, None], columns[:, None, None] + near]
             phases = rng.uniform(-0.5, 0.5, (2, len(stars)))
-            there, boxes = centroids(wanted, phases, seen.pixel_px, seen.blur_px, sigma_px, None)
-            here, _ = centroids(shown, phases, seen.pixel_px, seen.blur_px, sigma_px, boxes)
+            views = tracker_views(phases, seen.pixel_px, seen.blur_px)
+            there, boxes = centroids(wanted, views, sigma_px, None)
+            here, _ = centroids(shown, views, sigma_px, boxes)
             for kind, place in here.items():
                 off_px = max(off_px, np.hypot(*(place - there[kind])).max())
         assert off_px <= bench.effort.error_px <= MOST * off_px

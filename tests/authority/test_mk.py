@@ -2,6 +2,8 @@
 that the choice did not use.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -194,6 +196,22 @@ def test_absolute_magnitude_tells_giants_from_dwarfs(bright, monkeypatch):
     for first, end, share in ((40, 50, 0.95), (50, 60, 0.985), (60, 70, 0.99)):
         kept = (known[:, 0] >= first) & (known[:, 0] < end) & np.isin(known[:, 1], (3.0, 5.0))
         assert ((told[kept] == 5) == (known[kept, 1] == 5)).mean() > share
+
+
+def test_a_parallax_counts_as_no_smaller_than_two_of_its_errors(bright):
+    """A star that none was measured of is at least so near; one whose own is larger keeps it."""
+    catalog = bright[0].taken(np.arange(0, len(bright[0]), 20))
+    sigma_mas = facts_of(catalog.hip)["sigma_parallax_mas"]
+
+    def types(parallax_mas):
+        every_mas = np.broadcast_to(parallax_mas, len(catalog))
+        return star_types(replace(catalog, parallax_mas=every_mas))
+
+    at_two = types(2 * sigma_mas)
+    for smaller in (0.0, -5.0, sigma_mas, 1.9 * sigma_mas):
+        np.testing.assert_array_equal(types(smaller), at_two)
+    for larger in (3 * sigma_mas, 10 * sigma_mas):
+        assert (types(larger) != at_two).any()
 
 
 def test_a_wrong_type_changes_the_rate(bright):

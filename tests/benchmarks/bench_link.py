@@ -89,17 +89,7 @@ def served(attitude: str, to: str, seconds: float, options: tuple[str, ...]) -> 
             process.stderr.readline()
             time.sleep(0.5)
             sent = run_hilstar(
-                "send",
-                "--spin",
-                "z,1",
-                "--rate",
-                str(RATE_HZ),
-                "--duration",
-                str(seconds),
-                "--json",
-                "--to",
-                to,
-                *options,
+                f"send --spin z,1 --rate {RATE_HZ} --duration {seconds} --json --to {to}", *options
             )
             return json.loads(sent.stdout), json.loads(process.communicate(timeout=60)[0])
 

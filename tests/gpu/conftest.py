@@ -4,11 +4,25 @@ machine's own.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 
+from hilstar.display.render.backend import Target
 from hilstar.display.render.context import gpus
 from hilstar.display.render.light_units import LightUnits
+from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.way import WAY_VARIABLE
+from hilstar.optics.psf import GaussianPsf
+
+
+@pytest.fixture(scope="module")
+def gl(request: pytest.FixtureRequest) -> Iterator[Renderer]:
+    """A renderer of the module's SIZE, px, and its PSF's SIGMA, which ends without a GL error."""
+    target = Target(request.module.SIZE, GaussianPsf(request.module.SIGMA))
+    with Renderer(target) as renderer:
+        yield renderer
+        assert renderer.gl_error() == "GL_NO_ERROR"
 
 
 @pytest.fixture

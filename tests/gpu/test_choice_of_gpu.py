@@ -32,6 +32,11 @@ def test_every_device_of_egl_is_listed_and_can_be_chosen_by_index_and_by_name(tm
                 assert bench.renderer.gl_renderer == chosen.renderer
 
 
+def test_the_index_after_the_last_is_no_gpu():
+    with pytest.raises(MachineError, match="no such GPU"):
+        create_context(len(gpus()))
+
+
 def test_without_a_key_egl_s_first_draws():
     context = create_context()
     assert context.info["GL_RENDERER"] == gpus()[0].renderer

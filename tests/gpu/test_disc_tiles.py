@@ -31,13 +31,6 @@ TILE_LIMIT = 2 * SMOOTH  # straight lines in place of the face's light, along bo
 assert SIZE[0] * SIZE[1] > MIN_TILED_PX
 
 
-@pytest.fixture(scope="module")
-def gl():
-    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as renderer:
-        yield renderer
-        assert renderer.gl_error() == "GL_NO_ERROR"
-
-
 def looking(
     distance_km: float,
     focal_px: float,

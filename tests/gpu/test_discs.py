@@ -32,13 +32,6 @@ SUM_LIMIT = 0.004  # of the face's integral: measured 0.26 % at 140 degrees
 EARTH_KM, AIR = 6378.137, (8.0, 0.097)
 
 
-@pytest.fixture(scope="module")
-def gl():
-    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as renderer:
-        yield renderer
-        assert renderer.gl_error() == "GL_NO_ERROR"
-
-
 def drawn_discs(gl, *lights) -> np.ndarray:
     none = sprites_at(np.empty((0, 2)), np.empty(0), gl.footprint_px)
     gl.draw(replace(none, extended=tuple(lights)))

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from hilstar.basics.units import KM_PER_AU
-from hilstar.display.render.renderer import Renderer
-from hilstar.display.render.target import Target
 from hilstar.optics.camera import Camera
 from hilstar.optics.extended import DiscView, Pose, disc_lights
 from hilstar.optics.psf import GaussianPsf
@@ -26,13 +24,6 @@ from tests.support.stars import sprites_at
 SIZE, SIGMA = (48, 44), (0.85, 0.85)
 MIDDLE_PX = (23.5, 21.5)
 PIXEL_LIMIT = 0.01  # of the brightest
-
-
-@pytest.fixture(scope="module")
-def gl():
-    with Renderer(Target(SIZE, GaussianPsf(SIGMA))) as renderer:
-        yield renderer
-        assert renderer.gl_error() == "GL_NO_ERROR"
 
 
 def drawn_earth(gl, disc: Disc, cam: Camera) -> np.ndarray:

@@ -19,7 +19,7 @@ from hilstar.display.calibration import CalibrationHead, NotesTable, write_calib
 from hilstar.display.geometry import ErrorTable, MadeTable, Notes, monitor_camera, write_geometry
 from hilstar.display.identity import MonitorIdentity
 from hilstar.display.response import gamma_response
-from hilstar.display.window.this_monitor import edid_of_drm, identity_here
+from hilstar.display.window.this_monitor import identity_here
 from hilstar.server.console.run_status import RunSource, RunStatus
 from hilstar.server.record.ledger_records import EventRecord, run_records
 from tests.screen.test_monitors import on_dummy
@@ -230,18 +230,6 @@ def test_calibrate_writes_the_monitor_that_this_machine_has(here, tmp_path):
     )
     # another display than the bench's
     assert "measured on" not in run_hilstar_here("calibrate", *alignment).stderr
-
-
-def test_the_kernel_is_asked_where_x_gives_no_edid(tmp_path):
-    for name, block in (
-        ("card0-DP-1", b""),
-        ("card0-HDMI-A-1", b"first"),
-        ("card1-HDMI-A-2", b"second"),
-    ):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "edid").write_bytes(block)
-    found = {name: edid_of_drm(name, tmp_path) for name in ("DP-1", "HDMI-A-1", "HDMI-2", "VGA-1")}
-    assert found == {"DP-1": b"", "HDMI-A-1": b"first", "HDMI-2": b"second", "VGA-1": b""}
 
 
 def test_a_forced_first_light_says_so_in_its_session_and_on_its_page(here, tmp_path):

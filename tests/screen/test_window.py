@@ -74,13 +74,7 @@ def test_a_moving_run_on_the_screen_is_drawn_again_bit_for_bit_without_one(
     (folder / "turn.csv").write_text("\n".join(["t_s,qw,qx,qy,qz", *lines]))
     ledger = folder / "run.mcap"
     shown = run_hilstar(
-        "replay",
-        screen_file,
-        folder / "turn.csv",
-        "-o",
-        folder / "shown",
-        "--ledger",
-        ledger,
+        f"replay {screen_file} {folder}/turn.csv -o {folder}/shown --ledger {ledger}",
         env=screen.env,
     )
     assert shown.returncode == 0, shown.stderr

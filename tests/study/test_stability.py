@@ -4,7 +4,6 @@ and a verdict can be wrong.
 
 from __future__ import annotations
 
-import json
 import math
 from contextlib import nullcontext
 from dataclasses import replace
@@ -16,33 +15,33 @@ from scipy.special import erf
 
 from hilstar.instruments.study.stability import CaseFigures, FailureCase, image, recorded
 from hilstar.instruments.study.stability import run as stability
-from tests.support.commands import run_hilstar_here
-from tests.support.pictures import assert_drawn
-from tests.support.tables import csv_rows
+from tests.support.studies import studied
 
 CASES = 43
+
+
+CURVES = ("narrow_stars", "weak_perspective", "popping", "turns")  # tables with a chart each
 
 
 @pytest.fixture(scope="module")
 def stability_study(tmp_path_factory):
     """The command's folder and output, and its cases."""
-    folder, found = tmp_path_factory.mktemp("stability"), []
+    cases = []
 
     def keep(directory):
-        found.extend(run(directory))
-        return found
+        cases.extend(run(directory))
+        return cases
 
     run = stability.run
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stability, "run", keep)
-        result = run_hilstar_here("study", "stability", "-o", folder, "--json")
-    assert result.returncode == 0, result.stderr
-    return folder, json.loads(result.stdout), found
+        found = studied("stability", tmp_path_factory, CURVES, "")
+    return found, cases
 
 
 @pytest.mark.parametrize("number", range(CASES))
 def test_hilstar_is_right_where_the_method_named_there_is_not(stability_study, number):
-    case = stability_study[2][number]
+    case = stability_study[1][number]
     assert case.right, case
     assert not case.figures.fault <= case.figures.tolerance, case
     assert all((case.case, case.method, case.fails, case.happens, case.why))
@@ -51,9 +50,9 @@ def test_hilstar_is_right_where_the_method_named_there_is_not(stability_study, n
 
 
 def test_the_table_has_every_case_and_the_curves_have_charts(stability_study):
-    folder, printed, measured = stability_study
-    assert printed["right"] is True and len(printed["findings"]) == len(measured) == CASES
-    rows = csv_rows(folder / "stability.csv")
+    found, measured = stability_study
+    assert found.right is True and len(found.findings) == len(measured) == CASES
+    rows = found.rows("stability")
     assert [row["case"] for row in rows] == [case.case for case in measured]
     assert {
         case.case
@@ -71,16 +70,14 @@ def test_the_table_has_every_case_and_the_curves_have_charts(stability_study):
         assert not float(row["its error"]) <= float(row["tolerance"])
     peaks = {
         float(row["sigma_px"]): float(row["sampled_peak_error"])
-        for row in csv_rows(folder / "narrow_stars.csv")
+        for row in found.rows("narrow_stars")
     }
     # a Gaussian's middle is over the mean of its pixel
     assert all(peak > 0.02 for peak in peaks.values())
     assert peaks[min(peaks, key=lambda sigma_px: abs(sigma_px - 0.85))] == pytest.approx(
         0.12, abs=0.02
     )
-    for stem in ("narrow_stars", "weak_perspective", "popping", "turns"):
-        assert_drawn(folder / f"{stem}.png")
-        assert len(csv_rows(folder / f"{stem}.csv")) > 25
+    assert all(len(found.rows(name)) > 25 for name in CURVES)
 
 
 def test_what_is_no_number_is_not_right():
@@ -132,7 +129,7 @@ def test_the_polynomial_of_the_shader_is_the_shader_s():
 
 
 def test_the_chart_of_popping_shows_what_its_title_says(stability_study):
-    rows = csv_rows(stability_study[0] / "popping.csv")
+    rows = stability_study[0].rows("popping")
     assert len(rows) == image.STEPS
     spread = {
         name: np.ptp([float(row[f"{name} [mag]"]) for row in rows])

@@ -5,25 +5,21 @@ from __future__ import annotations
 import pytest
 
 from hilstar.instruments.study import bodies
-from hilstar.instruments.study.bodies import PHASES_DEG, QUICK_BENCHES, QUICK_RADII_PX, SCENES, run
-from tests.support.tables import csv_rows
+from hilstar.instruments.study.bodies import PHASES_DEG, QUICK_BENCHES, QUICK_RADII_PX, SCENES
+from tests.support.studies import studied
+
+TABLES = ("bodies_cost", "bodies_size", "bodies_limits")  # and the charts of each
 
 
 @pytest.fixture(scope="module")
 def bodies_study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("bodies")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bodies, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        lines, _ = run(folder, quick=True)
-    tables = {}
-    for name in ("bodies_cost", "bodies_size", "bodies_limits"):
-        assert (folder / f"{name}.png").stat().st_size > 20_000
-        tables[name] = csv_rows(folder / f"{name}.csv")
-    return lines, tables
+        return studied("bodies", tmp_path_factory, TABLES)
 
 
 def test_each_scene_is_timed_against_the_same_frame_without_bodies(bodies_study):
-    rows = {row["scene"]: row for row in bodies_study[1]["bodies_cost"]}
+    rows = {row["scene"]: row for row in bodies_study.rows("bodies_cost")}
     assert list(rows) == [scene.name for scene in SCENES if scene.bench in QUICK_BENCHES]
     shown = {name: row["discs"].split() for name, row in rows.items() if row["discs"]}
     assert shown["Moon in view, 55 px"] == ["Moon"]
@@ -36,7 +32,7 @@ def test_each_scene_is_timed_against_the_same_frame_without_bodies(bodies_study)
 
 
 def test_discs_are_within_a_percent_and_a_tenth_of_a_pixel_and_a_point_is_not(bodies_study):
-    rows = bodies_study[1]["bodies_size"]
+    rows = bodies_study.rows("bodies_size")
     assert len(rows) == len(PHASES_DEG) * len(QUICK_RADII_PX)
     assert max(abs(float(row["flux_off"])) for row in rows) < 0.01
     limbs = [float(row["limb_off_px"]) for row in rows if row["limb_off_px"] != "nan"]
@@ -46,8 +42,7 @@ def test_discs_are_within_a_percent_and_a_tenth_of_a_pixel_and_a_point_is_not(bo
 
 
 def test_near_a_body_all_light_is_finite_and_what_is_over_white_is_white(bodies_study):
-    lines, tables = bodies_study
-    rows = tables["bodies_limits"]
+    lines, rows = bodies_study.findings, bodies_study.rows("bodies_limits")
     assert {row["body"] for row in rows} == {"Moon", "Sun", "Earth"}
     assert all(row["finite"] == row["white_is_white"] == "True" for row in rows)
     assert max(float(row["over_white_mag"]) for row in rows if row["body"] == "Sun") > 15

@@ -4,36 +4,29 @@ monitor can show is stated.
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 
 from hilstar.instruments.study import colour
-from hilstar.instruments.study.colour import MONO, PANELS, PUBLISHED_SUBTYPES, SENSORS, run
+from hilstar.instruments.study.colour import MONO, PANELS, PUBLISHED_SUBTYPES, SENSORS
 from tests.support.claims import holds
 from tests.support.recorded import assert_recorded
+from tests.support.studies import studied
 
 AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
 
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("colour")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(colour, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        run(folder, quick=True)
-
-    def rows(name):
-        with (folder / f"{name}.csv").open() as file:
-            return list(csv.DictReader(file))
-
-    return folder, rows
+        found = studied("colour", tmp_path_factory, {"colour"})
+    return found.folder, found.rows
 
 
 def test_codes_of_stars_own_mixtures_keep_every_channel_and_colour_before_a_bayer_tracker(study):
-    folder, rows = study
+    _, rows = study
     at = {(row["tracker"], row["colour"], row["method"]): row for row in rows("colour")}
-    assert len(at) == 12 and (folder / "colour.png").stat().st_size > 20_000
+    assert len(at) == 12
     star, white = (at["Bayer", colour, "exact"] for colour in ("star", "white"))
     assert float(star["subtypes"]) < AIM_SUBTYPES < PUBLISHED_SUBTYPES < float(white["subtypes"])
     assert float(star["channel"]) < AIM_PERCENT < float(white["channel"])

@@ -5,19 +5,18 @@ from __future__ import annotations
 import pytest
 
 from hilstar.instruments.study import economy
-from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES, run
+from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.recorded import assert_recorded
-from tests.support.tables import csv_rows
+from tests.support.studies import studied
 
 
 @pytest.fixture(scope="module")
 def economy_study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("economy")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(economy, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        lines, _ = run(folder, quick=True)
-    return folder, lines, csv_rows(folder / "economy.csv")
+        found = studied("economy", tmp_path_factory, {"economy"})
+    return found.folder, found.findings, found.rows("economy")
 
 
 def test_the_page_s_errors_are_of_what_is_measured_now(economy_study):
@@ -55,7 +54,6 @@ def test_what_is_within_by_the_plan_is_within_by_its_stars(economy_study):
 
 
 def test_the_study_has_five_scenes_of_three_depths_at_two_tolerances(economy_study):
-    folder, lines, rows = economy_study
+    _, lines, rows = economy_study
     assert len(rows) == len(SCENES) * len(BITS) * (1 + len(TOLERANCES)) == 45
     assert len([line for line in lines if " bits, " in line and "instead of" in line]) == 30
-    assert (folder / "economy.png").stat().st_size > 20_000

@@ -6,37 +6,31 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.instruments.study import faults
 from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS
 from hilstar.optics.layers.fault_kinds import KINDS
-from tests.support.pictures import assert_drawn
-from tests.support.tables import csv_rows
+from tests.support.studies import studied
 
 pytestmark = pytest.mark.study
 
 
 @pytest.fixture(scope="module")
 def faults_study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("faults")
-    lines, _ = faults.run(folder, quick=True)
-    return folder, lines
+    return studied("faults", tmp_path_factory, {"faults", "faults_cost"})
 
 
 def test_every_kind_but_a_dropped_frame_has_its_cost(faults_study):
-    folder, findings = faults_study
     kinds = {table["kind"] for tables in CASES.values() for table in tables}
     assert kinds == set(KINDS) - {"drop"}  # which draws nothing
-    costs = csv_rows(folder / "faults-cost.csv")
+    costs = faults_study.rows("faults-cost")
     assert [(row["quantisation"], row["case"]) for row in costs] == [
         (q, case) for q in QUANTISATIONS for case in CASES
     ]
     assert all(float(row["without_ms"]) > 0 for row in costs)
-    assert NOWHERE in CASES and len(findings) == 4
+    assert NOWHERE in CASES and len(faults_study.findings) == 4
 
 
 def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(faults_study):
-    folder, _ = faults_study
-    strays = csv_rows(folder / "faults-stray.csv")
+    strays = faults_study.rows("faults-stray")
     for quantisation in QUANTISATIONS:
         mine = {
             float(row["share_of_white"]): row
@@ -46,7 +40,3 @@ def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(faults_study):
         assert float(mine[1.0]["lost"]) == 1.0
         assert float(mine[0.0]["lost"]) < 0.05
         assert int(mine[0.0]["stars"]) > 20
-
-
-def test_the_chart_is_a_picture(faults_study):
-    assert_drawn(faults_study[0] / "faults.png")

@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-import csv
-
 import pytest
 
-from hilstar.instruments.study.geometry import MODELS, ideal_arcsec, run
+from hilstar.instruments.study.geometry import MODELS, ideal_arcsec
 from tests.support.claims import holds
+from tests.support.studies import studied
 
 
 @pytest.fixture(scope="module")
 def study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("geometry")
-    lines = run(folder, quick=True)
-    with (folder / "geometry.csv").open() as file:
-        return lines, list(csv.DictReader(file)), folder
+    found = studied("geometry", tmp_path_factory, {"geometry"})
+    return found.findings, found.rows("geometry")
 
 
 def test_each_model_is_charted_against_dots_and_noise(study):
-    _, rows, folder = study
+    _, rows = study
     assert {row["model"] for row in rows} == {model.name for model in MODELS}
     assert len({row["centroids"] for row in rows}) >= 2
     assert len({row["noise_px"] for row in rows}) >= 2
-    assert (folder / "geometry.png").stat().st_size > 20_000
 
 
 def test_simple_lenses_fail_and_are_marked_and_the_full_model_does_not(study):
-    lines, rows, _ = study
+    lines, rows = study
     usual = {
         row["model"]: float(row["stars_rms_arcsec"])
         for row in rows
@@ -40,7 +36,7 @@ def test_simple_lenses_fail_and_are_marked_and_the_full_model_does_not(study):
 
 
 def test_held_out_dots_rank_the_models_as_the_stars_do(study):
-    _, rows, _ = study
+    _, rows = study
     usual = [row for row in rows if row["noise_px"] == "0.02" and row["frames"] == "20"]
     by_dots = sorted(usual, key=lambda row: float(row["held_out_arcsec"]))
     by_stars = sorted(usual, key=lambda row: float(row["stars_rms_arcsec"]))
@@ -48,7 +44,7 @@ def test_held_out_dots_rank_the_models_as_the_stars_do(study):
 
 
 def test_errors_grow_with_noise(study):
-    _, rows, _ = study
+    _, rows = study
     same = [
         row for row in rows if row["frames"] == "20" and row["model"] == "Brown-Conrady with tilt"
     ]

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.study import limits
-from hilstar.instruments.study.limits import StressLimit, limits_finding, run
+from hilstar.instruments.study.limits import StressLimit, limits_finding
 from tests.support.benches import ROOT
-from tests.support.pictures import assert_drawn
 from tests.support.recorded import assert_recorded
+from tests.support.studies import studied
 from tests.support.tables import csv_rows
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
@@ -25,9 +25,8 @@ HALF_SAMPLE = 0.5
 
 @pytest.fixture(scope="module")
 def limits_study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("limits")
-    lines = run(folder, quick=True)
-    return folder, lines, csv_rows(folder / "limits.csv")
+    found = studied("limits", tmp_path_factory, {"limits"})
+    return found.folder, found.findings, found.rows("limits")
 
 
 def test_the_page_s_table_is_of_what_is_measured_now(limits_study):
@@ -45,8 +44,7 @@ def limit_rows(rows, stress):
 
 
 def test_the_place_where_a_method_leaves_its_tolerance_is_between_its_own_rows(limits_study):
-    folder, lines, rows = limits_study
-    assert_drawn(folder / "limits.png")
+    _, lines, rows = limits_study
     assert len(lines) == 1 + len({row["stress"] for row in rows}) == 13
     assert_meets_between_rows(rows)
     assert_meets_between_rows(csv_rows(ROOT / "results" / "limits.csv"))

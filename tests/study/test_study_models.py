@@ -24,7 +24,7 @@ from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
-from tests.support.commands import run_hilstar_here
+from tests.support.studies import studied
 from tests.support.tables import csv_rows
 from tests.support.waiting import PATIENCE_S
 
@@ -66,10 +66,8 @@ TABLE_MAG_LIMIT = 2e-6
 
 @pytest.fixture(scope="module")
 def models_study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("models")
-    result = run_hilstar_here("study", "models", "-o", folder)
-    assert result.returncode == 0, result.stderr
-    return folder, dict(line.split(": ", 1) for line in result.stdout.splitlines()[:-1])
+    found = studied("models", tmp_path_factory, STEMS, "")
+    return found.folder, dict(line.split(": ", 1) for line in found.findings)
 
 
 def table_columns(path):

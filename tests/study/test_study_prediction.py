@@ -16,17 +16,15 @@ from hilstar.instruments.study.prediction import (
     PredictionOutcome,
     Shaken,
     crossing_hz,
-    run,
 )
 from hilstar.instruments.study.predictors import SLEW_DEG, SLEW_S
-from tests.support.pictures import assert_drawn
+from tests.support.studies import studied
 
 
 @pytest.fixture(scope="module")
 def prediction_study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("prediction")
-    lines, _ = run(folder, quick=True)
-    return folder, lines
+    found = studied("prediction", tmp_path_factory, {"prediction", "prediction_jitter"})
+    return found.folder, found.findings
 
 
 def typed_rows(path, record):
@@ -107,10 +105,8 @@ def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fas
 
 
 def test_the_study_writes_what_it_found(prediction_study, outcomes):
-    folder, lines = prediction_study
-    assert len(lines) == 1 + 5 + 1
+    assert len(prediction_study[1]) == 1 + 5 + 1
     assert len(outcomes) == 5 * (len(RATES_HZ) + len(LATENCIES_MS) - 1)
     assert {ms for _, hz, ms in outcomes if hz == USUAL_HZ} == set(LATENCIES_MS)
     assert {hz for _, hz, ms in outcomes if ms == USUAL_MS} == set(RATES_HZ)
     assert all(outcome.attitude_us > 0 for outcome in outcomes.values())
-    assert_drawn(folder / "prediction.png")

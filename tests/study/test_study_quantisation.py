@@ -8,10 +8,8 @@ import pytest
 from hilstar.display.phases import USUAL_PSF, fainter, measure, phase_grid
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.study.codes import AIMS, BITS, WAYS
-from hilstar.instruments.study.quantisation import run
 from hilstar.tracker.centroiders import FAMILY
-from tests.support.pictures import assert_drawn
-from tests.support.tables import csv_rows
+from tests.support.studies import studied
 
 # Of the error of `round` that `exact` leaves, by each centroider: 0.18 to 0.48 on 8 x 8 phases, 64
 # stars.
@@ -34,17 +32,11 @@ def test_fainter_stars_have_less_light():
     assert ratio == pytest.approx(np.full(4, 0.01))
 
 
-def test_the_study_writes_charts_tables_and_findings(tmp_path):
-    findings, _ = run(tmp_path, quick=True)
-    assert len(findings) == len(BITS) + 3
-    for name in (
-        "quantisation.png",
-        "quantisation_centroiders.png",
-        "quantisation_time.png",
-        "over_frames.png",
-    ):
-        assert_drawn(tmp_path / name)
-    rows = csv_rows(tmp_path / "quantisation.csv")
+def test_codes_meet_their_aims_at_each_depth_and_over_frames(tmp_path_factory):
+    charts = {"quantisation", "quantisation_centroiders", "quantisation_time", "over_frames"}
+    found = studied("quantisation", tmp_path_factory, charts)
+    assert len(found.findings) == len(BITS) + 3
+    rows = found.rows("quantisation")
     assert len(rows) == len(BITS) * len(WAYS) * 5
     for bits, (aim_mag, limit) in AIMS.items():
         exact = [
@@ -63,8 +55,8 @@ def test_the_study_writes_charts_tables_and_findings(tmp_path):
     assert float(faint["exact"]["centroid_rms_px"]) == pytest.approx(
         np.sqrt(2) * float(faint["exact"]["axis_rms_px_moment"])
     )
-    assert all(float(row["frame_ms"]) > 0 for row in csv_rows(tmp_path / "quantisation_time.csv"))
-    rows = csv_rows(tmp_path / "over_frames.csv")
+    assert all(float(row["frame_ms"]) > 0 for row in found.rows("quantisation_time"))
+    rows = found.rows("over_frames")
     left = {(r["panel"], r["method"], r["frames"]): float(r["flux_rms_mag"]) for r in rows}
     for panel in dict.fromkeys(r["panel"] for r in rows):
         assert left[panel, "temporal", "6"] < left[panel, "temporal", "2"]

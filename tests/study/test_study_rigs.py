@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.study import rigs
-from tests.support.pictures import assert_drawn
-from tests.support.tables import csv_rows
+from tests.support.studies import studied
 
 # An even error of a pixel's width: its rms is within 10 % of a twelfth's root, of 80 stars
 PIXEL_ARCSEC = 57.65109021605092e-3 / 350 * 206264.806 / math.sqrt(12)
@@ -26,9 +25,8 @@ GRID_PX = 1e-9
 
 @pytest.fixture(scope="module")
 def rigs_study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("rigs")
-    lines = rigs.run(folder, quick=True)
-    return folder, lines, {row["figure"]: row for row in csv_rows(folder / "rigs.csv")}
+    found = studied("rigs", tmp_path_factory, {"rigs"})
+    return found.folder, found.findings, {row["figure"]: row for row in found.rows("rigs")}
 
 
 def figures(rigs_study, figure):
@@ -37,8 +35,7 @@ def figures(rigs_study, figure):
 
 
 def test_one_pixel_a_star_leaves_a_pixel_s_own_error_and_hilstar_s_codes_a_hundredth(rigs_study):
-    folder, lines, rows = rigs_study
-    assert_drawn(folder / "rigs.png")
+    _, lines, rows = rigs_study
     assert len(lines) == 1 + len(rows)
     published, predicted, after = figures(rigs_study, "places, one pixel a star")
     assert predicted == pytest.approx(PIXEL_ARCSEC, rel=EVEN)

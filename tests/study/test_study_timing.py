@@ -23,8 +23,8 @@ from hilstar.instruments.study.timing import (
 )
 from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
-from tests.support.pictures import assert_drawn
 from tests.support.recorded import assert_recorded
+from tests.support.studies import studied
 from tests.support.tables import csv_rows
 
 GAIN = 20  # compensated against not: the issue's own figure
@@ -40,7 +40,7 @@ FRAME_ARCSEC = RATE_DEG_S * PERIOD_S * 3600
 @pytest.fixture(scope="module")
 def timing_study(tmp_path_factory):
     """The study's folder and findings, and what it measured."""
-    folder, measured = tmp_path_factory.mktemp("timing"), []
+    measured = []
 
     def keep(quick):
         measured.extend(measure(quick))
@@ -48,8 +48,8 @@ def timing_study(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(timing, "measure", keep)
-        findings, _ = timing.run(folder, quick=True)
-    return folder, findings, measured
+        found = studied("timing", tmp_path_factory, {"timing", "stripes", "beat"})
+    return found.folder, found.findings, measured
 
 
 @pytest.fixture(scope="module")
@@ -105,10 +105,9 @@ def test_rows_share_an_exposure_among_the_frames_that_they_show():
     assert weights[2, -1] > 0
 
 
-def test_the_study_writes_a_chart_and_a_table(timing_study):
+def test_each_way_has_a_finding_and_a_row(timing_study):
     folder, findings, _ = timing_study
     assert len(findings) == 1 + len(WAYS) + 1 + len(QUICK_CASES) + 1
-    assert_drawn(folder / "timing.png")
     assert len((folder / "timing.csv").read_text().splitlines()) == 1 + len(WAYS)
 
 
@@ -117,7 +116,6 @@ def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(timing_stu
         {name: float(value) for name, value in row.items()}
         for row in csv_rows(timing_study[0] / "stripes.csv")
     ]
-    assert_drawn(timing_study[0] / "stripes.png")
     assert max(abs(row["light"] - row["foretold"]) for row in rows) < 1e-6
     deep = [row["light"] for row in rows if row["refreshes"] == 2.4 and row["lit_ms"] == 4]
     assert max(deep) > 1.2 and min(deep) < 0.9
@@ -132,7 +130,6 @@ def test_a_tracker_sees_the_beat_that_is_foretold(timing_study):
         {name: float(value) for name, value in row.items()}
         for row in csv_rows(timing_study[0] / "beat.csv")
     ]
-    assert_drawn(timing_study[0] / "beat.png")
     for case in QUICK_CASES:
         mine = [row for row in rows if (row["refreshes"], row["lit"]) == (case.refreshes, case.lit)]
         assert len(mine) > 30

@@ -33,8 +33,7 @@ from hilstar.optics.psf import MAX_CUT
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
-from tests.support.pictures import assert_drawn
-from tests.support.tables import csv_rows
+from tests.support.studies import studied
 
 NAMES = [
     "brightness",
@@ -58,15 +57,15 @@ PROFILE_SHARE = 2e-7
 
 @pytest.fixture(scope="module")
 def tradeoff_study(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("tradeoff")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)  # one round: no claim here is of a time
         patch.setattr(sweep, "MIN_ROUNDS", 1)
-        lines, _ = tradeoff.run(folder, quick=True)
-    rows = csv_rows(folder / "tradeoff.csv")
+        charts = {f"tradeoff_{name}" for name in NAMES}
+        found = studied("tradeoff", tmp_path_factory, charts)
+    rows = found.rows("tradeoff")
     return (
-        folder,
-        lines,
+        found.folder,
+        found.findings,
         {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES},
     )
 
@@ -76,9 +75,8 @@ def method_error(step, method):
 
 
 def test_every_step_has_a_chart_a_table_and_one_default(tradeoff_study):
-    folder, lines, steps = tradeoff_study
+    _, lines, steps = tradeoff_study
     for name in NAMES:
-        assert_drawn(folder / f"tradeoff_{name}.png")
         assert any(line.startswith(f"{name}: ") for line in lines)
         assert sum(row["default"] == "True" for row in steps[name].values()) == 1
         assert sum(line.startswith((" >", "*>")) for line in lines) == len(NAMES)

@@ -343,9 +343,12 @@ def reached(path: Path, name: str, root: Path) -> list[ast.AST]:
     """
     found: list[ast.AST] = []
     waiting, visited = [(path, name)], set()
+    defined: dict[Path, dict[str, ast.AST]] = {}
     while waiting:
         module, word = waiting.pop()
-        node = definitions(module).get(word)
+        if module not in defined:
+            defined[module] = definitions(module)
+        node = defined[module].get(word)
         if node is None or (module, word) in visited:
             continue
         visited.add((module, word))
@@ -359,6 +362,8 @@ def reached(path: Path, name: str, root: Path) -> list[ast.AST]:
     return found
 
 
+# A definition whose file is as it was is the same node: each is looked through once a process.
+@cache
 def names_of(node: ast.AST) -> set[str]:
     """The names that a definition uses, its arguments included, which may be fixtures."""
     nodes = list(ast.walk(node))
@@ -366,6 +371,7 @@ def names_of(node: ast.AST) -> set[str]:
     return used | {part.arg for part in nodes if isinstance(part, ast.arg)}
 
 
+@cache
 def words_of(node: ast.AST) -> list[str]:
     """Identifiers, texts and imported names in a definition."""
     found: list[str] = []
@@ -385,6 +391,7 @@ def words_of(node: ast.AST) -> list[str]:
     return found
 
 
+@cache
 def patterns_of(node: ast.AST) -> list[str]:
     """The texts with values in them (f"name-{bits}"), as regular expressions."""
     found = []
@@ -398,6 +405,7 @@ def patterns_of(node: ast.AST) -> list[str]:
     return found
 
 
+@cache
 def imports_of(node: ast.AST) -> set[str]:
     """The top-level packages that a definition imports."""
     found: set[str] = set()
@@ -411,6 +419,7 @@ def imports_of(node: ast.AST) -> set[str]:
     return found
 
 
+@cache
 def calls_of_holds(node: ast.AST) -> list[ast.Call]:
     """The calls of `holds` in a definition."""
     calls = [part for part in ast.walk(node) if isinstance(part, ast.Call)]
@@ -426,6 +435,7 @@ def is_constant(node: ast.expr) -> bool:
     return not any(isinstance(part, ast.Name) for part in ast.walk(node))
 
 
+@cache
 def own_bounds(node: ast.AST) -> bool:
     """Whether a test asserts another bound, a constant, of what it hands to `holds`."""
     given = {ast.dump(call.args[1]) for call in calls_of_holds(node)}

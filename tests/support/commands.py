@@ -9,6 +9,7 @@ import io
 import json
 import logging
 import os
+import shlex
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -28,9 +29,14 @@ def run_hilstar(
     env: dict[str, str] | None = None,
 ) -> subprocess.CompletedProcess[str]:
     """The command as a user runs it, in a process of its own, without the half second of its
-    imports (see `Started`).
+    imports (see `Started`). The words are those of `typed`.
     """
-    return run_started([*HILSTAR, *map(str, arguments)], cwd, timeout, env)
+    return run_started([*HILSTAR, *typed(*arguments)], cwd, timeout, env)
+
+
+def typed(line: str | Path, *others: str | Path) -> list[str]:
+    """The words of a command: a line as a shell splits it, and others, which stay whole."""
+    return [*shlex.split(str(line)), *map(str, others)]
 
 
 def run_started(
@@ -66,10 +72,10 @@ def run_hilstar_here(
     """The command line in this process: the same words, refusals and exit code, and milliseconds
     instead of a new process.
 
-    For what is said, written and returned. The process itself (streams, signals, the workers it
-    starts) is `run_hilstar`'s.
+    The words are those of `typed`. For what is said, written and returned. The process itself
+    (streams, signals, the workers it starts) is `run_hilstar`'s.
     """
-    words = [str(argument) for argument in arguments]
+    words = typed(*arguments)
     out, err = (
         io.TextIOWrapper(io.BytesIO(), "utf-8", "surrogateescape", write_through=True)
         for _ in range(2)

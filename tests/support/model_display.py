@@ -45,15 +45,17 @@ def plain_window(hz: float = 60.0, **changes: object) -> SimpleNamespace:
     return SimpleNamespace(**plain | changes)
 
 
-def model_screen(folder: Path, hz: float = 60, **display: object) -> tuple[Screen, ModelDisplay]:
+def model_screen(
+    folder: Path, hz: float = 60, monitor: str = "", **display: object
+) -> tuple[Screen, ModelDisplay]:
     """The small bench on a model display, before the gate: all but the window and what is drawn
-    on it is real.
+    on it is real. `monitor` are more keys of its monitor.
     """
     clock = FakeClock(FIRST_NS + 123_456)
     model = ModelDisplay(clock, round(1e9 / hz), **display)
     config = parse_config(
         folder / "bench.toml",
-        SMALL_BENCH.replace("[collimator]", f"refresh_hz = {hz}\n[collimator]"),
+        SMALL_BENCH.replace("[collimator]", f"refresh_hz = {hz}\n{monitor}[collimator]"),
     )
     bench = SimpleNamespace(
         config=config,

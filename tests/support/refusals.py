@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -23,3 +25,20 @@ def refusal(asked: Callable[..., object], *arguments: object, **options: object)
     with pytest.raises(InputError) as caught:
         asked(*arguments, **options)
     return line_of(caught.value)
+
+
+def says(line: str, words: str) -> bool:
+    """Whether a line has words, where `...` stands for any text between.
+
+    Words that begin with a colon are a place, `:17: ...`, and stand first in the line.
+    """
+    pattern = ".*".join(map(re.escape, words.split("...")))
+    find = re.match if words.startswith(":") else re.search
+    return find(pattern, line) is not None
+
+
+def assert_file_refused(read: Callable[[Path], object], path: Path, words: str) -> None:
+    """A file is refused in one line: its path, then the words."""
+    line = refusal(read, path)
+    assert line.startswith(str(path)), line
+    assert says(line.removeprefix(str(path)), words), line

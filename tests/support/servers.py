@@ -209,12 +209,18 @@ class Served:
 
 @contextmanager
 def bound(
-    tmp_path: Path, *options: str, attitude: str = "bind = true", files: int | None = None
+    tmp_path: Path,
+    *options: str,
+    attitude: str = "bind = true",
+    files: int | None = None,
+    text: str = LIVE_BENCH,
 ) -> Iterator[Served]:
-    """`hilstar serve` that binds, once its port answers; it may open so many `files`."""
+    """`hilstar serve` of a bench file's `text` that binds, once its port answers; it may open so
+    many `files`.
+    """
     port = free_port()
     bench = tmp_path / "serve.toml"
-    bench.write_text(LIVE_BENCH + attitude_table(port, attitude))
+    bench.write_text(text + attitude_table(port, attitude))
     command = [*HILSTAR, "serve", str(bench), "--headless", "--json", *options]
     if files is not None:
         command = ["sh", "-c", f'ulimit -n {files}; exec "$@"', "sh", *command]

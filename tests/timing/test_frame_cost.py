@@ -128,14 +128,7 @@ def test_a_run_with_such_turns_is_replayed_from_its_ledger_in_bounded_time(tmp_p
         process.send_signal(signal.SIGINT)
         served = summary_of(process)
     result = run_hilstar_here(
-        "replay",
-        tmp_path / "serve.toml",
-        ledger,
-        "--headless",
-        "--speed",
-        "max",
-        "--json",
-        timeout=PATIENCE_S,
+        f"replay {tmp_path}/serve.toml {ledger} --headless --speed max --json", timeout=PATIENCE_S
     )
     assert result.returncode == 0, result.stderr
     summary = json.loads(result.stdout)

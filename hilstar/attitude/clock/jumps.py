@@ -174,6 +174,10 @@ class JumpFilter:
         self._near_ns: int | None = None  # when the last one came that was neither late nor early
         self._shows_none = False  # t_ns itself advanced as usual where the samples in doubt began
 
+    def sender_ns(self, continuous_ns: int) -> int:
+        """The sender's own time, ns, of a continuous time."""
+        return continuous_ns - self.correction_ns
+
     @property
     def settled(self) -> bool:
         """True once the clock is known well enough to say that a message is early."""
@@ -350,6 +354,10 @@ class KnownClockFilter:
         self._told = False
         # since when, and by how much the quickest packet since then was late
         self._quickest: tuple[int, int] | None = None
+
+    def sender_ns(self, continuous_ns: int) -> int:
+        """The sender's own time, ns, of a continuous time: the same, as the clock is known."""
+        return continuous_ns
 
     def take(self, arrival: SampleArrival) -> list[SampleArrival]:
         """The sample itself, refused where its time is more than MAX_OFF_NS ahead of the

@@ -155,19 +155,9 @@ class CsvLog:
         return bool(cells) and all(cell in FLAGS for cell in cells)
 
     def _tell_rates(self) -> None:
-        headers = []
-        for column in self.table.columns:
-            if RATES_OF_OTHERS.fullmatch(plain_name(column.name)):
-                headers.append(column.header)
-        if len(headers) >= len(RATE_COLUMNS):
-            named = ", ".join(headers)
-            self.told.append(
-                (
-                    TABLE_KIND,
-                    f"columns {named} are not used: rates are named {','.join(RATE_COLUMNS)}, of"
-                    " cam with respect to icrs in cam axes, rad/s or the unit in their names",
-                )
-            )
+        notice = rates_of_others(self.table)
+        if notice:
+            self.told.append((TABLE_KIND, notice))
 
     def entries(self) -> Iterator[tuple[str, AttitudeSample | Refusal]]:
         """Each row's place in the file (":12"), and its attitude or why it is refused, in the
@@ -262,6 +252,23 @@ class CsvLog:
             text = cells[self._t.place].strip()[:MAX_QUOTED_CHARACTERS]
             return Refusal("format", f"t_s = {text} s does not fit 64 bits of ns; {UNITS_ADVICE}")
         return checked_sample(t_ns, q, rate, sequence, discontinuity)
+
+
+def rates_of_others(table: TextTable) -> str:
+    """A notice of columns that look like rates by another program's names, and are not used; "" for
+    none.
+    """
+    headers = []
+    for column in table.columns:
+        if RATES_OF_OTHERS.fullmatch(plain_name(column.name)):
+            headers.append(column.header)
+    if len(headers) < len(RATE_COLUMNS):
+        return ""
+    named = ", ".join(headers)
+    return (
+        f"columns {named} are not used: rates are named {','.join(RATE_COLUMNS)}, of cam with"
+        " respect to icrs in cam axes, rad/s or the unit in their names"
+    )
 
 
 def invalid_notice(count: int, what: str) -> tuple[str, str]:

@@ -28,11 +28,12 @@ from hilstar.attitude.logs.log_formats import (
     readable,
 )
 from hilstar.attitude.logs.packet_logs import LIKE_PACKETS, of_packets
-from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Event, Refusal, decode
-from hilstar.basics.errors import shortened
+from hilstar.attitude.wire.packet import JSON_FORM, AttitudeSample, Refusal, decode_json
+from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.reading import open_lines
 from hilstar.basics.text_tables import validity_of_name
 
+JSON_LINES = "JSON lines"  # the format's name
 JSON_KEYS = ('"t_ns"', '"q"', '"rate"', '"sequence"', '"discontinuity"')
 # Of a key that may say whether an attitude holds, by the words of text tables.
 VALIDITY_WORD = re.compile(r"valid|lost", re.IGNORECASE)
@@ -43,8 +44,13 @@ ARRAY_BEGINS = re.compile(r"\[(?:\{|\[|\]|$)")
 TOKEN = re.compile(r'"(?:[^"\\]|\\.)*"|[{}"]')
 # What may stand between objects.
 BETWEEN = re.compile(r"[\s,\[\]]*")
-MAX_OBJECT_CHARACTERS = 10_000
+MAX_OBJECT_CHARACTERS = 65_536  # an answer with the centroids of a thousand stars
+MAX_OBJECT_BYTES = 4 * MAX_OBJECT_CHARACTERS
 ADVICE = f"write JSON lines, or an array, of objects {JSON_FORM}"
+STARS_KEY = '"centroids"'
+STARS_ADVICE = (
+    "write centroids as [[x_px, y_px, dn, hip, width_px], ...], null for what is not known"
+)
 CUT_OBJECT = "the last object has no end, as of a file that was cut off, and is left out"
 NO_END = "the array has no ] at its end, as of a file that was cut off; what it has is read"
 
@@ -54,7 +60,7 @@ def read_json(path: Path, stated: Stated) -> Iterator[LogReading]:
     """The reading of JSON. Raises InputError."""
     with open_lines(path, readable(), MAX_LOG_BYTES, whole_lines=False) as pieces:
         notices: list[tuple[str, str]] = []
-        reading = of_packets(path, _read_objects(pieces, notices), "JSON lines", stated)
+        reading = of_packets(path, _read_objects(pieces, notices), JSON_LINES, stated)
         yield reading
         # Complete when the last object is read.
         reading.told.extend(notices)
@@ -67,9 +73,7 @@ def _read_objects(pieces: Iterable[str], told: list[tuple[str, str]]) -> Iterato
     invalid = 0
     objects = JsonObjects()
     for where, text in objects.split(pieces):
-        event: Event = _json_fault(text) or decode(text.encode())
-        if not isinstance(event, AttitudeSample | Refusal):
-            event = Refusal("format", f"is not an attitude; write {JSON_FORM}")
+        event = _json_fault(text) or decode_json(text.encode(), MAX_OBJECT_BYTES)
         if isinstance(event, Refusal) and "null" in text and _has_no_quaternion(text):
             # What has no number of JSON is null, as pandas writes NaN.
             event = replace(event, unset=True)
@@ -87,6 +91,32 @@ def _read_objects(pieces: Iterable[str], told: list[tuple[str, str]]) -> Iterato
         told.append((CUT_KIND, CUT_OBJECT))
     elif objects.depth > 0:
         told.append((CUT_KIND, NO_END))
+
+
+class JsonStars(msgspec.Struct, frozen=True):
+    """The stars of a tracker's answer in its JSON form, rows [x_px, y_px, dn, hip, width_px], and
+    its time.
+    """
+
+    t_ns: int
+    centroids: list[list[float | None]] = []
+
+
+def json_stars(path: Path) -> dict[int, list[list[float | None]]]:
+    """The stars of a log's objects that have any, by `t_ns`. Raises InputError for `centroids` of
+    another form.
+    """
+    stars: dict[int, list[list[float | None]]] = {}
+    with open_lines(path, readable(), MAX_LOG_BYTES, whole_lines=False) as pieces:
+        for where, text in JsonObjects().split(pieces):
+            if STARS_KEY not in text:
+                continue
+            try:
+                answer = msgspec.json.decode(text, type=JsonStars)
+            except msgspec.MsgspecError as error:
+                raise InputError(f"{path}{where}: {error}; {STARS_ADVICE}") from error
+            stars[answer.t_ns] = answer.centroids
+    return stars
 
 
 class JsonObjects:
@@ -229,9 +259,9 @@ def _begins(beginning: LogHead) -> bool:
 
 
 log_format = LogFormat(
-    "JSON lines",
+    JSON_LINES,
     read_json,
-    listed="JSON lines",
+    listed=JSON_LINES,
     uses=LIKE_PACKETS,
     begins=_begins,
     endings=(".jsonl", ".json"),

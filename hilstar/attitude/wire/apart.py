@@ -147,6 +147,31 @@ class RecordStream:
         del self._kept[:at]
 
 
+def process_state(stat: str) -> tuple[str, float]:
+    """What a process does ("R" runs or waits for a core), and its own CPU time, s, by its
+    /proc/PID/stat (proc(5)).
+    """
+    # the name, in brackets, may have blanks and brackets of its own
+    fields = stat.rpartition(")")[2].split()
+    user_ticks, system_ticks = int(fields[11]), int(fields[12])
+    return fields[0], (user_ticks + system_ticks) / TICKS_PER_S
+
+
+def why_hung(is_starting: bool, state: str, silent_s: float, used_s: float) -> str:
+    """Why a process that has been silent for longer than it may be hangs; "" where it may be
+    waiting for a core. `used_s` is the CPU time that it has taken since it should have spoken.
+    """
+    if is_starting:
+        return f"no sign of life for {STARTS_S:g} s"
+    if state != "R":
+        return f"no sign of life for {HUNG_S:g} s"
+    if used_s > LOOPS_S:
+        return f"it took {used_s:.1f} s of a core over one message, and did not return"
+    if silent_s > STALLED_S:
+        return f"no sign of life for {STALLED_S:g} s"
+    return ""
+
+
 class ReaderProcess:
     """Runs the process that reads a link: starts it, gives it its order, and restarts it where it
     ended or hangs.
@@ -257,17 +282,9 @@ class ReaderProcess:
         state, cpu_s = self._state()
         if math.isnan(self._busy_from_s):
             self._busy_from_s = cpu_s
-        used_s = cpu_s - self._busy_from_s
-        if not self._starting and state == "R" and used_s > LOOPS_S:
-            self._ended(f"it took {used_s:.1f} s of a core over one message, and did not return")
-        elif self._starting or state != "R" or self._silent_s > STALLED_S:
-            if self._starting:
-                limit_s = STARTS_S
-            elif state == "R":
-                limit_s = STALLED_S
-            else:
-                limit_s = HUNG_S
-            self._ended(f"no sign of life for {limit_s:g} s")
+        why = why_hung(self._starting, state, self._silent_s, cpu_s - self._busy_from_s)
+        if why:
+            self._ended(why)
 
     def _state(self) -> tuple[str, float]:
         """What Linux says that the process does ("R" runs or waits for a core), and its CPU
@@ -275,10 +292,7 @@ class ReaderProcess:
         """
         with contextlib.suppress(OSError, IndexError, ValueError):
             if self._process is not None:
-                fields = (
-                    Path(f"/proc/{self._process.pid}/stat").read_text().rpartition(")")[2].split()
-                )
-                return fields[0], (int(fields[11]) + int(fields[12])) / TICKS_PER_S
+                return process_state(Path(f"/proc/{self._process.pid}/stat").read_text())
         return "", 0.0
 
     @property

@@ -119,6 +119,17 @@ class _ForwardedNotices(Notices):
         self.tell(kind, detail, lasting=False)
 
 
+def as_read(taken: list[RawMessage], had_waited: bool, empty_ns: int) -> list[RawMessage]:
+    """Messages that were read together, as a process that slept until they came stamps them: the
+    newest woke it, and the others had to wait; all had to where one `had_waited` before.
+    """
+    last = len(taken) - 1
+    return [
+        message._replace(empty_ns=empty_ns, timely=k == last and not had_waited)
+        for k, message in enumerate(taken)
+    ]
+
+
 class _Reading:
     """An order that is carried out. Raises InputError where its socket cannot be opened."""
 
@@ -153,13 +164,8 @@ class _Reading:
             self._wire.put(Record(self._number, gone=error.strerror or str(error)))
             return
         self._notices.count()
-        for k, message in enumerate(taken):
-            # The newest of those that arrived while this process slept woke it; the others had to
-            # wait.
-            timely = not waits and k == len(taken) - 1
-            self._wire.put(
-                Record(self._number, message._replace(empty_ns=self._empty_ns, timely=timely))
-            )
+        for message in as_read(taken, waits, self._empty_ns):
+            self._wire.put(Record(self._number, message))
 
     def close(self) -> None:
         if self.link is not None:

@@ -224,7 +224,7 @@ def encode(packet: Packet) -> bytes:
 def decode(message: bytes) -> Event:
     """Decode one message: a packet's bytes, or an attitude as a JSON object."""
     if message[:1] == b"{" or message[:16].lstrip()[:1] == b"{":
-        return _decode_json(message)
+        return decode_json(message)
     return _decode_packet(message, MESSAGE_FORM)
 
 
@@ -357,11 +357,10 @@ def rate_refusal(sample: AttitudeSample, max_rate_rad_s: float) -> Refusal | Non
     )
 
 
-def _decode_json(message: bytes) -> AttitudeSample | Refusal:
-    if len(message) > MAX_JSON_BYTES:
-        return Refusal(
-            "format", f"more than {MAX_JSON_BYTES} bytes of JSON; send an attitude alone"
-        )
+def decode_json(message: bytes, max_bytes: int = MAX_JSON_BYTES) -> AttitudeSample | Refusal:
+    """Decode an attitude as a JSON object; other keys are not looked at."""
+    if len(message) > max_bytes:
+        return Refusal("format", f"more than {max_bytes} bytes of JSON; send an attitude alone")
     try:
         form = _json_decoder.decode(message)
     except (msgspec.MsgspecError, RecursionError, UnicodeDecodeError) as error:

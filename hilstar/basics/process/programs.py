@@ -130,11 +130,7 @@ class Service(Closing):
         self._alive = alive
         self._status = status
         self._address = environment.get("NOTIFY_SOCKET", "")
-        self._each_s = EACH_S
-        # where systemd watches it, half of what it waits
-        with contextlib.suppress(ValueError, KeyError):
-            if int(environment.get("WATCHDOG_PID", os.getpid())) == os.getpid():
-                self._each_s = min(int(environment["WATCHDOG_USEC"]) / US_PER_S / 2, EACH_S)
+        self._each_s = sign_period_s(environment, os.getpid())
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._socket.setblocking(False)
         self._stop = threading.Event()
@@ -169,3 +165,13 @@ class Service(Closing):
             self._thread.join()
             self._send("STOPPING=1")
         self._socket.close()
+
+
+def sign_period_s(environment: Mapping[str, str], process: int) -> float:
+    """How often a process of this number gives systemd a sign: each second, or where systemd
+    watches it, by half of what that waits (sd_watchdog_enabled(3)).
+    """
+    with contextlib.suppress(ValueError, KeyError):
+        if int(environment.get("WATCHDOG_PID", process)) == process:
+            return min(int(environment["WATCHDOG_USEC"]) / US_PER_S / 2, EACH_S)
+    return EACH_S

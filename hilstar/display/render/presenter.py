@@ -18,7 +18,7 @@ from hilstar.display.window.x11 import GL_LIBRARY, X11_LIBRARY
 GL_DITHER = 0x0BD0
 MAX_LEVELS = 2**16
 TRIPLES_UNIT = 3  # after the textures of three primaries' levels
-PRIMARIES = {"grey": (1, 1, 1), "red": (1, 0, 0), "green": (0, 1, 0), "blue": (0, 0, 1)}
+PRIMARIES = ((1, 1, 1), (1, 0, 0), (0, 1, 0), (0, 0, 1))  # grey, then red, green and blue
 
 
 def level_texture(
@@ -50,15 +50,29 @@ def window_context() -> moderngl.Context:
         ) from error
 
 
+def checked_triples(bits: int) -> npt.NDArray[np.uint16]:
+    """Every code of grey and of each primary alone, (n, 3)."""
+    codes = np.arange(2**bits, dtype=np.uint16)
+    parts = [np.outer(codes, primaries) for primaries in PRIMARIES]
+    return np.concatenate(parts).astype(np.uint16)
+
+
+def drawn_codes(read: bytes, screen_px: tuple[int, int], bits: int) -> npt.NDArray[np.float32]:
+    """The codes (height, width, 3), the top row first, of a buffer as GL reads it: float32 shares
+    of white, row by row from the bottom.
+    """
+    width, height = screen_px
+    shares = np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1]
+    return np.asarray(np.rint(shares * np.float32(2**bits - 1)))
+
+
 def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: int) -> str:
     """Which codes the back buffer has otherwise than they were drawn; "" where every code of grey
     and each primary is there.
 
     All are drawn side by side and read back. It overwrites the back buffer, and swaps nothing.
     """
-    codes = np.arange(2**bits, dtype=np.uint16)
-    parts = [np.outer(codes, primaries) for primaries in PRIMARIES.values()]
-    triples = np.concatenate(parts).astype(np.uint16)
+    triples = checked_triples(bits)
     width, height = screen_px
     pixels = np.arange(width * height, dtype=np.uint32)
     at_once = min(MAX_LEVELS, width * height)
@@ -73,9 +87,7 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
             # moderngl asks for an attachment, which a window's back buffer has not, and reads on
             _ = context.error
             texture.release()
-        # GL counts rows from the bottom
-        shares = np.frombuffer(read, dtype=np.float32).reshape(height, width, 3)[::-1]
-        drawn = np.rint(shares * codes[-1])
+        drawn = drawn_codes(read, screen_px, bits)
         differ = (drawn != part[levels]).any(axis=-1)
         changed = np.unique(levels[differ])
         if len(changed) and not wrong:

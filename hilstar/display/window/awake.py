@@ -59,7 +59,7 @@ class Awake:
         self._process.poll()  # the one that was begun ends at once, and leaves the other behind
 
 
-class _Blanking(NamedTuple):
+class Blanking(NamedTuple):
     """What an X server does when nobody types: after how many seconds, how, and whether monitors
     go to standby.
     """
@@ -72,7 +72,27 @@ class _Blanking(NamedTuple):
 
     @property
     def happens(self) -> bool:
+        """Whether a monitor goes dark by it: by the screen saver, or by standby."""
         return self.timeout_s != 0 or self.dpms
+
+
+class SetAside:
+    """The blanking that was set aside, for the time after."""
+
+    def __init__(self) -> None:
+        self._before: Blanking | None = None
+
+    def takes(self, now: Blanking) -> bool:
+        """Whether what is set now has to be set aside; it is then what comes back."""
+        if now.happens:
+            self._before = now
+        return now.happens
+
+    def to_restore(self, now: Blanking) -> Blanking | None:
+        """What comes back at the end; None for nothing, or where somebody has set blanking
+        again.
+        """
+        return None if now.happens else self._before
 
 
 class _Server:
@@ -91,7 +111,7 @@ class _Server:
         )
         self._has_dpms = bool(query and self._xext.DPMSCapable(self._display))
 
-    def blanking(self) -> _Blanking:
+    def blanking(self) -> Blanking:
         parts = [ctypes.c_int() for _ in range(4)]
         self._x11.XGetScreenSaver(self._display, *(ctypes.byref(part) for part in parts))
         level = ctypes.c_ushort()
@@ -99,9 +119,9 @@ class _Server:
         if self._has_dpms:
             self._xext.DPMSInfo(self._display, ctypes.byref(level), ctypes.byref(on))
         timeout_s, interval_s, prefer, allow = (part.value for part in parts)
-        return _Blanking(timeout_s, interval_s, prefer, allow, bool(on.value))
+        return Blanking(timeout_s, interval_s, prefer, allow, bool(on.value))
 
-    def prevent(self, found: _Blanking) -> None:
+    def prevent(self, found: Blanking) -> None:
         """Light what is dark, and keep it so."""
         if found.dpms:
             self._xext.DPMSForceLevel(self._display, DPMS_ON)
@@ -112,7 +132,7 @@ class _Server:
         )
         self._x11.XSync(self._display, 0)
 
-    def restore(self, before: _Blanking) -> None:
+    def restore(self, before: Blanking) -> None:
         self._x11.XSetScreenSaver(self._display, *before[:4])
         if before.dpms:
             self._xext.DPMSEnable(self._display)
@@ -122,19 +142,19 @@ class _Server:
 def _keep() -> None:
     """The process: from its first word on nothing blanks, until its stdin ends."""
     server = _Server()
-    before: _Blanking | None = None
+    aside = SetAside()
     is_reported = False
     while True:
         blanking = server.blanking()
-        if blanking.happens:
-            before = blanking
+        if aside.takes(blanking):
             server.prevent(blanking)
         if not is_reported:
             os.write(1, b".")
             is_reported = True
         if select.select([0], [], [], LOOK_S)[0]:
             break
-    if before is not None and not server.blanking().happens:
+    before = aside.to_restore(server.blanking())
+    if before is not None:
         server.restore(before)
 
 

@@ -72,8 +72,13 @@ XRANDR_FUNCTIONS: dict[str, tuple[Any, ...]] = {
 }
 
 
-# XRRModeInfo; of `sync` the third are a line's pixels, the last a frame's lines
-class _Mode(ctypes.Structure):
+# of `sync`: a line's pixels and a frame's lines, blank ones too
+H_TOTAL, V_TOTAL = 2, 6
+
+
+class ModeInfo(ctypes.Structure):
+    """XRRModeInfo of libXrandr."""
+
     _fields_ = (
         *(
             ("id", _Id),
@@ -95,7 +100,7 @@ class _Resources(ctypes.Structure):  # XRRScreenResources
             ("noutput", INT),
             ("outputs", _Ids),
         ),
-        *(("nmode", INT), ("modes", ctypes.POINTER(_Mode))),
+        *(("nmode", INT), ("modes", ctypes.POINTER(ModeInfo))),
     )
 
 
@@ -140,7 +145,9 @@ class _Transform(ctypes.Structure):  # XRRCrtcTransformAttributes
     )
 
 
-class _Gamma(ctypes.Structure):  # XRRCrtcGamma
+class GammaInfo(ctypes.Structure):
+    """XRRCrtcGamma of libXrandr."""
+
     _fields_ = (("size", INT), ("red", POINTER), ("green", POINTER), ("blue", POINTER))
 
 
@@ -205,12 +212,7 @@ class Randr(Closing):
                         state = self._state(resources, number, output, modes)
                 if state is not None:
                     lit.append(state)
-        providers = self._providers()
-        states: list[OutputState] = []
-        for state in lit:
-            others = tuple(other.name for other in lit if other.name != state.name)
-            states.append(replace(state, others=others, providers=providers))
-        return states
+        return side_by_side(lit, self._providers())
 
     def ramp(self, name: str) -> bytes:
         """The gamma ramp of an output: 16 bits for each step of red, then green, then blue; b""
@@ -223,9 +225,8 @@ class Randr(Closing):
                 if not crtc:
                     continue
                 crtc_gamma = self._xrandr.XRRGetCrtcGamma(self._display, crtc)
-                with self._got(_Gamma, self._xrandr.XRRFreeGamma, crtc_gamma) as gamma:
-                    parts = () if gamma is None else (gamma.red, gamma.green, gamma.blue)
-                    return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in parts)
+                with self._got(GammaInfo, self._xrandr.XRRFreeGamma, crtc_gamma) as gamma:
+                    return b"" if gamma is None else ramp_of(gamma)
         return b""
 
     def additions(self) -> dict[str, bool]:
@@ -236,7 +237,7 @@ class Randr(Closing):
         }
 
     def _state(
-        self, resources: Any, number: int, output: Any, modes: dict[int, _Mode]
+        self, resources: Any, number: int, output: Any, modes: dict[int, ModeInfo]
     ) -> OutputState | None:
         """An output that is lit; None where its CRTC shows no known mode."""
         crtc = self._xrandr.XRRGetCrtcInfo(self._display, ctypes.byref(resources), output.crtc)
@@ -245,7 +246,6 @@ class Randr(Closing):
                 return None
             mode = modes[now.mode]
             rotated = now.rotation != ROTATE_0
-            pixels = mode.sync[2] * mode.sync[6]
         properties = dict(self._properties(number))
         edid = properties.pop("EDID", b"")
         name = _name(output)
@@ -255,7 +255,7 @@ class Randr(Closing):
         return OutputState(
             name=name,
             mode_px=_size_px(mode),
-            refresh_hz=mode.dot_clock / pixels if pixels else 0.0,
+            refresh_hz=refresh_hz_of(mode),
             preferred_px=tuple(dict.fromkeys(preferred_px)),
             transform=self._transform(output.crtc),
             rotated=rotated,
@@ -381,6 +381,31 @@ class Randr(Closing):
             free(address)
 
 
+def side_by_side(lit: list[OutputState], providers: tuple[str, ...]) -> list[OutputState]:
+    """The outputs of a screen that are lit, each with the names of the others and of the screen's
+    GPUs.
+    """
+    states: list[OutputState] = []
+    for state in lit:
+        others = tuple(other.name for other in lit if other.name != state.name)
+        states.append(replace(state, others=others, providers=providers))
+    return states
+
+
+def ramp_of(gamma: GammaInfo) -> bytes:
+    """A gamma ramp: 16 bits for each step of red, then green, then blue."""
+    parts = (gamma.red, gamma.green, gamma.blue)
+    return b"".join(ctypes.string_at(part, 2 * gamma.size) for part in parts)
+
+
+def refresh_hz_of(mode: ModeInfo) -> float:
+    """The refresh rate of a mode: its dot clock over all its pixels, blank ones too; 0 where it
+    does not say these.
+    """
+    pixels = mode.sync[H_TOTAL] * mode.sync[V_TOTAL]
+    return mode.dot_clock / pixels if pixels else 0.0
+
+
 def output_named(name: str, survival: Survival | None = None) -> OutputState | None:
     """The output of that name; None where RandR does not have it."""
     try:
@@ -399,7 +424,7 @@ def lit_outputs() -> list[OutputState]:
         return []
 
 
-def _size_px(mode: _Mode) -> Pair:
+def _size_px(mode: ModeInfo) -> Pair:
     return mode.width, mode.height
 
 

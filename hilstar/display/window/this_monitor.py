@@ -12,7 +12,8 @@ import msgspec
 
 from hilstar.basics.errors import MachineError
 from hilstar.display.identity import STRAIGHT, MonitorIdentity, edid_identity, sha256_of
-from hilstar.display.window.output_settings import IDENTITY
+from hilstar.display.window.displays import Display
+from hilstar.display.window.output_settings import IDENTITY, OutputState
 from hilstar.display.window.randr import Randr
 from hilstar.display.window.watch import is_straight
 from hilstar.display.window.window import displays
@@ -31,19 +32,33 @@ def identity_here(wanted: int | str) -> MonitorIdentity | None:
         display = next(candidate for candidate in displays() if candidate.is_named(wanted))
     except (MachineError, StopIteration):
         return None
-    edid = b""
+    output = None
     ramp = b""
-    refresh_hz = float(display.refresh_hz)
-    adds = {}
+    adds: dict[str, bool] = {}
     with contextlib.suppress(OSError), Randr() as randr:
         ramp = randr.ramp(display.name)
         adds = randr.additions()
-        for state in randr.outputs():
-            if state.name == display.name:
-                edid = state.edid
-                refresh_hz = state.refresh_hz
-                adds["a transform"] = state.transform != IDENTITY
-    edid = edid or edid_of_drm(display.name)
+        output = next((state for state in randr.outputs() if state.name == display.name), None)
+    return identity_of(display, output, ramp, adds)
+
+
+def identity_of(
+    display: Display,
+    output: OutputState | None,
+    ramp: bytes,
+    adds: dict[str, bool],
+    drm: Path = DRM,
+) -> MonitorIdentity:
+    """The identity of a display whose output is so by RandR (None where that does not say), with a
+    gamma ramp (b"" for none), and what the window system may add, and whether it does.
+    """
+    edid = b""
+    refresh_hz = float(display.refresh_hz)
+    if output is not None:
+        edid = output.edid
+        refresh_hz = output.refresh_hz
+        adds = adds | {"a transform": output.transform != IDENTITY}
+    edid = edid or edid_of_drm(display.name, drm)
     width, height = display.resolution_px
     gamma_ramp = sha256_of(ramp)
     if ramp and is_straight(ramp):
@@ -88,10 +103,17 @@ def _by_ddc(edid: bytes) -> dict[str, int]:
         ).stdout
     except (OSError, subprocess.TimeoutExpired):
         return {}
+    return ddc_settings(completed)
+
+
+def ddc_settings(printed: str) -> dict[str, int]:
+    """The settings that `ddcutil getvcp --terse` prints, by their keys; a line of another form says
+    none.
+    """
     settings = {}
     # VCP 10 C 40 100 (now, maximum); VCP 14 SNC x05; VCP C0 CNC x00 xff x04 xb0 (maximum, now)
     for code, kind, value_text in re.findall(
-        r"^VCP (10|12|14|C0) (C|SNC|CNC) ([\dx a-f]+)$", completed, re.MULTILINE
+        r"^VCP (10|12|14|C0) (C|SNC|CNC) ([\dx a-f]+)$", printed, re.MULTILINE
     ):
         values = value_text.split()
         with contextlib.suppress(ValueError):

@@ -15,6 +15,7 @@ from hilstar.display.window.x11 import INT, NUMBER, POINTER, Survival, load_libr
 VISIBILITY_CHANGES, STRUCTURE_CHANGES = 1 << 16, 1 << 17
 VISIBILITY_NOTIFY, DESTROY_NOTIFY, UNMAP_NOTIFY, MAP_NOTIFY = 15, 17, 18, 19
 COVERED = ("", "covered in part", "covered")  # by VisibilityNotify's state
+DPMS_ON = 0  # dpmsconst.h
 # interval of what sends no events: the position of a window's parents, and the display's sleep
 LOOK_AGAIN_S = 0.5
 
@@ -39,6 +40,50 @@ class _Event(ctypes.Union):  # XEvent of Xlib
     _fields_ = (("visibility", _VisibilityEvent), ("pad", ctypes.c_long * 24))
 
 
+class WindowView:
+    """What events of the X server say of a window: whether it is on the screen, wholly seen, and
+    there at all. It begins as one that is seen.
+    """
+
+    def __init__(self) -> None:
+        self._covered = 0
+        self.is_mapped = True
+        self.is_there = True
+
+    def take(self, kind: int, state: int) -> None:
+        """Take an event of this type (X.h), with the state that one of visibility has."""
+        if kind == VISIBILITY_NOTIFY:
+            self._covered = state
+        elif kind in {MAP_NOTIFY, UNMAP_NOTIFY}:
+            self.is_mapped = kind == MAP_NOTIFY
+        elif kind == DESTROY_NOTIFY:
+            self.is_there = False
+
+    def why_hidden(self, misplaced: str, is_asleep: bool) -> str:
+        """Why the window is not wholly seen, "" where it is; `misplaced` says that of its
+        place.
+        """
+        if not self.is_mapped:
+            return "not on the screen"
+        # X11 also calls covered what is off the screen
+        covered = misplaced or COVERED[self._covered]
+        if covered:
+            return covered
+        return "on a display that sleeps" if is_asleep else ""
+
+
+def off_place(area: ScreenArea, wanted: ScreenArea | None, screen_px: tuple[int, int]) -> str:
+    """Why an area is not where it should be: the one that is wanted, or wholly on the screen where
+    none is; "" where it is.
+    """
+    if wanted is not None:
+        return "" if area == wanted else "moved off its display"
+    axes = zip(area.corner_px, area.size_px, screen_px, strict=True)
+    if all(at >= 0 and at + long <= end for at, long, end in axes):
+        return ""
+    return "off the screen, in part or wholly"
+
+
 class Visibility:
     """Watches one window, which has to fill `place` if given; `hidden` says why it is not wholly
     seen, "" where it is.
@@ -49,8 +94,7 @@ class Visibility:
         self._connection = connection
         self._window = window
         self.place = place
-        self._covered = 0
-        self._mapped = self._there = True
+        self._view = WindowView()
         self._asleep = _sleep_of(connection)
         self.hidden = ""
         self._stop, self._stopped = os.pipe()
@@ -79,25 +123,15 @@ class Visibility:
         the window or its server.
         """
         descriptor = self._x11.XConnectionNumber(self._connection)
-        while self._there:
-            off_place = self._off_place() if self._mapped else ""
+        view = self._view
+        while view.is_there:
+            misplaced = self._off_place() if view.is_mapped else ""
             while self._x11.XPending(self._connection) > 0:
                 event = _Event()
                 self._x11.XNextEvent(self._connection, ctypes.byref(event))
-                kind = event.visibility.type
-                if kind == VISIBILITY_NOTIFY:
-                    self._covered = event.visibility.state
-                elif kind in {MAP_NOTIFY, UNMAP_NOTIFY}:
-                    self._mapped = kind == MAP_NOTIFY
-                self._there = self._there and kind != DESTROY_NOTIFY
-            if self._there and not self._mapped:
-                self.hidden = "not on the screen"
-            elif self._there:  # X11 also calls covered what is off the screen
-                self.hidden = (
-                    off_place
-                    or COVERED[self._covered]
-                    or ("on a display that sleeps" if self._asleep() else "")
-                )
+                view.take(event.visibility.type, event.visibility.state)
+            if view.is_there:
+                self.hidden = view.why_hidden(misplaced, self._asleep())
             ready = select.select([descriptor, self._stop], [], [], LOOK_AGAIN_S)[0]
             # A readable connection without an event has ended.
             if self._stop in ready or (
@@ -119,17 +153,7 @@ class Visibility:
         if size is None or screen is None:
             return ""
         self._x11.XTranslateCoordinates(self._connection, self._window, root, 0, 0, *pointers)
-        corner = x.value, y.value
-        if self.place is not None:
-            if ScreenArea(corner, size) == self.place:
-                return ""
-            return "moved off its display"
-        inside = all(
-            at >= 0 and at + long <= end for at, long, end in zip(corner, size, screen, strict=True)
-        )
-        if inside:
-            return ""
-        return "off the screen, in part or wholly"
+        return off_place(ScreenArea((x.value, y.value), size), self.place, screen)
 
     def _geometry(self, drawable: int) -> tuple[int, int] | None:
         """The size of a window, px; None where it is gone."""
@@ -143,11 +167,25 @@ class Visibility:
         return width.value, height.value
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop watching. Twice does nothing."""
+        if self._stopped < 0:
+            return
         os.write(self._stopped, b"\0")
         self._thread.join(LOOK_AGAIN_S)
-        if not self._thread.is_alive() and self._there:
+        if self._thread.is_alive():
+            return
+        if self._view.is_there:
             self._x11.XCloseDisplay(self._connection)
+        os.close(self._stop)
+        os.close(self._stopped)
+        self._stop = self._stopped = -1
+
+
+def is_dark(is_enabled: bool, level: int) -> bool:
+    """Whether a display is dark by DPMS, at a level of dpmsconst.h: 0 is on, the others are not. A
+    level says nothing where DPMS is off.
+    """
+    return is_enabled and level != DPMS_ON
 
 
 def _ended(descriptor: int) -> bool:
@@ -178,6 +216,6 @@ def _sleep_of(connection: int) -> Any:
         level = ctypes.c_ushort()
         enabled = ctypes.c_ubyte()
         known = library.DPMSInfo(connection, ctypes.byref(level), ctypes.byref(enabled))
-        return bool(known and enabled.value and level.value)
+        return bool(known) and is_dark(bool(enabled.value), level.value)
 
     return asleep

@@ -22,6 +22,7 @@ COARSEST_BITS = 8
 XCB_LIBRARY, PRESENT_LIBRARY = "libxcb.so.1", "libxcb-present.so.0"
 GENERIC_EVENT, COMPLETE_NOTIFY, COMPLETE_MASK = 35, 1, 2  # xproto.h, present.h
 KIND_PIXMAP = 0
+EVENT_HEAD_BYTES = 12  # of the 32 of an event: all that says how a frame was shown
 MODES = ("copy", "flip", "skip", "copy")  # the last is a copy that a flip could have been
 UNKNOWN = "unknown"
 
@@ -54,6 +55,26 @@ def ramp_bits(parts: FloatArray) -> int:
         if np.all(np.abs(parts - rounded) * FULL_RAMP <= 1.0):
             return bits
     return RAMP_BITS
+
+
+def is_foreign(ramp: bytes, first: bytes) -> bool:
+    """Whether a gamma ramp is another program's: neither the one of the start nor straight; b"" is
+    none.
+    """
+    return bool(ramp) and ramp != first and not is_straight(ramp)
+
+
+def shown_as(event: bytes, opcode: int) -> str:
+    """How a frame was shown, "flip", "copy" or "skip", by an event of an XCB connection whose
+    Present has this opcode; "" for an event of anything else.
+    """
+    # response_type, extension, sequence (2), length (4), event_type (2), kind, mode
+    response, extension, event_type, kind, mode = (event[at] for at in (0, 1, 8, 10, 11))
+    is_present = response & 0x7F == GENERIC_EVENT and extension == opcode
+    is_complete = event_type == COMPLETE_NOTIFY and kind == KIND_PIXMAP
+    if is_present and is_complete and mode < len(MODES):
+        return MODES[mode]
+    return ""
 
 
 class PresentEvents:
@@ -99,14 +120,10 @@ class PresentEvents:
         """How each frame was shown that completed since the last call: "flip", "copy" or "skip"."""
         modes_shown = []
         while event := self._xcb.xcb_poll_for_event(self._connection):
-            # response_type, extension, sequence (2), length (4), event_type (2), kind, mode
-            head = ctypes.string_at(event, 12)
+            mode = shown_as(ctypes.string_at(event, EVENT_HEAD_BYTES), self._opcode)
             self._free(event)
-            response, extension, kind, mode = head[0], head[1], head[10], head[11]
-            is_present = response & 0x7F == GENERIC_EVENT and extension == self._opcode
-            is_complete = head[8] == COMPLETE_NOTIFY and kind == KIND_PIXMAP
-            if is_present and is_complete and mode < len(MODES):
-                modes_shown.append(MODES[mode])
+            if mode:
+                modes_shown.append(mode)
         return modes_shown
 
     def close(self) -> None:
@@ -148,7 +165,7 @@ class DisplayWatch:
     def _run(self) -> None:
         while not self._stop.wait(self._look_s):
             ramp = self._ramp()
-            self.ramp_changed = bool(ramp) and ramp != self._first and not is_straight(ramp)
+            self.ramp_changed = is_foreign(ramp, self._first)
             self._take_events()
 
     def _take_events(self) -> None:

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from hilstar.basics.errors import MachineError, NoDisplayError, NotThereError, d
 from hilstar.basics.process.closing import Closing
 from hilstar.basics.units import GL_VERSIONS, NS_PER_S
 from hilstar.display.window.awake import Awake
+from hilstar.display.window.displays import Display, display_of
 from hilstar.display.window.library import glfw
 from hilstar.display.window.output_settings import OutputState
 from hilstar.display.window.randr import output_named
@@ -46,42 +47,6 @@ WAYLAND = (
     " the gamma ramp; use an Xorg session"
 )
 log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Display:
-    """A monitor of this machine as the system describes it; `refresh_hz` is 0 where it does not say
-    (Xvfb).
-
-    `bits` per colour are those of its mode: the minimum of the three.
-    """
-
-    index: int
-    name: str
-    resolution_px: tuple[int, int]
-    refresh_hz: int
-    position_px: tuple[int, int]
-    size_mm: tuple[int, int]
-    scale: float
-    bits: int
-
-    def is_named(self, wanted: int | str) -> bool:
-        """Whether `[monitor] display` means it: its index, or a part of its name."""
-        return wanted == self.index or (
-            isinstance(wanted, str) and wanted.lower() in self.name.lower()
-        )
-
-    def line(self) -> str:
-        """The display for a person."""
-        width, height = self.resolution_px
-        if self.refresh_hz:
-            refresh = f"{self.refresh_hz} Hz"
-        else:
-            refresh = "refresh not known"
-        return (
-            f"{self.index}: {self.name}, {width} x {height}, {refresh}, {self.size_mm[0]} x"
-            f" {self.size_mm[1]} mm"
-        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,17 +106,13 @@ def _start() -> None:
 
 def _describe(index: int, monitor: Any) -> Display:
     """A monitor of GLFW's as it is now."""
-    mode = glfw.get_video_mode(monitor)
-    name = glfw.get_monitor_name(monitor)
-    return Display(
-        index=index,
-        name=name.decode() if isinstance(name, bytes) else str(name),
-        resolution_px=(int(mode.size.width), int(mode.size.height)),
-        refresh_hz=int(mode.refresh_rate),
-        position_px=_pair(glfw.get_monitor_pos(monitor)),
+    return display_of(
+        index,
+        glfw.get_monitor_name(monitor),
+        glfw.get_video_mode(monitor),
+        _pair(glfw.get_monitor_pos(monitor)),
         size_mm=_pair(glfw.get_monitor_physical_size(monitor)),
         scale=float(glfw.get_monitor_content_scale(monitor)[0]),
-        bits=int(min(mode.bits.red, mode.bits.green, mode.bits.blue)),
     )
 
 
@@ -199,9 +160,9 @@ class Window(Closing):
         if settings.display is not None:
             self.display, monitor = _find(settings.display)
             # Left to itself, GLFW switches a display to its highest refresh.
-            modes_hz = _modes_hz(self.display, monitor)
-            refresh_hz = _refresh_hint(settings.refresh_hz, modes_hz, self.display)
-            glfw.window_hint(glfw.REFRESH_RATE, refresh_hz)
+            modes_hz = self.display.rates_hz(glfw.get_video_modes(monitor))
+            refresh_hz = self.display.refresh_for(settings.refresh_hz, modes_hz)
+            glfw.window_hint(glfw.REFRESH_RATE, refresh_hz or glfw.DONT_CARE)
         for hint, value in (
             (glfw.OPENGL_PROFILE, glfw.OPENGL_CORE_PROFILE),
             (glfw.RESIZABLE, False),
@@ -301,7 +262,8 @@ class Window(Closing):
             return
         on_it = bool(glfw.get_window_monitor(self._window))
         monitor = _monitor_named(display.name)
-        if monitor is None and not self.lost:
+        change = change_of(monitor is not None, self.lost, on_it)
+        if change == "gone":
             self.lost = True
             self._ramp = None
             log.warning(
@@ -309,7 +271,7 @@ class Window(Closing):
                 " back",
                 display.name,
             )
-        elif monitor is not None and (self.lost or not on_it):
+        elif change == "back":
             width, height = display.resolution_px
             glfw.set_window_monitor(
                 self._window, monitor, 0, 0, width, height, display.refresh_hz or glfw.DONT_CARE
@@ -322,12 +284,8 @@ class Window(Closing):
 
     def _on_key(self, window: Any, key: int, scancode: int, action: int, mods: int) -> None:
         """Queue the name of a key that is pressed, not of one that repeats or is released."""
-        if action != glfw.PRESS:
-            return
-        name = {glfw.KEY_ESCAPE: "escape", glfw.KEY_SPACE: "space", glfw.KEY_F1: "f1"}.get(key)
-        if name is None and 0 < key < 128:
-            name = chr(key).lower()
-        if name is not None:
+        name = pressed_key(key, action)
+        if name:
             self.keys.append(name)
 
     def make_current(self) -> None:
@@ -392,11 +350,7 @@ class Window(Closing):
         """
         if self.display is None:
             return None
-        for display in _displays():
-            is_other = display.name != self.display.name
-            if is_other and display.position_px == self.display.position_px:
-                return display.name
-        return None
+        return self.display.mirrored_by(_displays())
 
     @property
     def modes_hz(self) -> tuple[int, ...]:
@@ -410,7 +364,7 @@ class Window(Closing):
             monitor = glfw.get_window_monitor(self._window)
         if not monitor or display is None:
             return ()
-        return _modes_hz(display, monitor)
+        return display.rates_hz(glfw.get_video_modes(monitor))
 
     @property
     def output(self) -> OutputState | None:
@@ -480,24 +434,6 @@ class Window(Closing):
         self._awake.close()  # after GLFW, which restores what it had found: no blanking
 
 
-def _modes_hz(display: Display, monitor: Any) -> tuple[int, ...]:
-    rates_hz = set()
-    for mode in glfw.get_video_modes(monitor):
-        if (mode.size.width, mode.size.height) == display.resolution_px:
-            rates_hz.add(int(mode.refresh_rate))
-    return tuple(sorted(rates_hz - {0}))
-
-
-def _refresh_hint(refresh_hz: float | None, modes_hz: tuple[int, ...], display: Display) -> int:
-    """The refresh to ask of GLFW, Hz: the one that is wanted where a mode has it, or else the one
-    that the display has now.
-    """
-    wanted_hz = round(refresh_hz or 0)
-    if wanted_hz in modes_hz:
-        return wanted_hz
-    return display.refresh_hz or int(glfw.DONT_CARE)
-
-
 def _newest_window(width: int, height: int, monitor: Any) -> Any:
     """A window with the newest OpenGL that its driver gives; None where it gives none of 3.3 or
     newer.
@@ -512,6 +448,27 @@ def _newest_window(width: int, height: int, monitor: Any) -> Any:
             if window := glfw.create_window(width, height, TITLE, monitor, None):
                 return window
     return None
+
+
+def change_of(is_there: bool, was_lost: bool, on_it: bool) -> Literal["gone", "back", ""]:
+    """What has happened to a window's display: it is "gone", or it is "back", so that the window
+    has to go there; "" for nothing. A window may be put elsewhere while its display stays.
+    """
+    if not is_there:
+        return "" if was_lost else "gone"
+    return "back" if was_lost or not on_it else ""
+
+
+def pressed_key(key: int, action: int) -> str:
+    """The name of a key that is pressed, by GLFW's numbers of key and action; "" for one that
+    repeats or is released, and for a key without a name.
+    """
+    if action != glfw.PRESS:
+        return ""
+    names = {glfw.KEY_ESCAPE: "escape", glfw.KEY_SPACE: "space", glfw.KEY_F1: "f1"}
+    if key in names:
+        return names[key]
+    return chr(key).lower() if 0 < key < 128 else ""
 
 
 def _monitor_named(name: str) -> Any:

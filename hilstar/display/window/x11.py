@@ -102,6 +102,11 @@ _ExitHandler = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p)
 _ErrorHandler = ctypes.CFUNCTYPE(ctypes.c_int, ctypes.c_void_p, ctypes.POINTER(_ErrorEvent))
 
 
+def is_end_of_window(code: int) -> bool:
+    """Whether an X error, of a request for the window, means that the window is gone."""
+    return code in {BAD_WINDOW, BAD_DRAWABLE} or code >= FIRST_EXTENSION_ERROR
+
+
 class Survival:
     """Xlib ends the process when the server or a window goes away; while this object lives, it
     calls `on_end(why)` instead.
@@ -117,8 +122,7 @@ class Survival:
         def error(display: int, event: Any) -> int:
             if display in self._undecided:
                 return 0
-            code = event.contents.error
-            if code in {BAD_WINDOW, BAD_DRAWABLE} or code >= FIRST_EXTENSION_ERROR:
+            if is_end_of_window(event.contents.error):
                 on_end(WINDOW_GONE)
             return 0
 

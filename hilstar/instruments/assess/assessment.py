@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hilstar.attitude.logs.telemetry import Telemetry, read_telemetry
+from hilstar.attitude.logs.telemetry import NO_RATE, Telemetry, read_telemetry
 from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.errors import HilstarError, InputError
 from hilstar.basics.rotation import (
@@ -46,12 +46,21 @@ from hilstar.instruments.assess.budget import (
 )
 from hilstar.instruments.assess.clock import CoarseClock, coarse_offset, speed_offsets
 from hilstar.instruments.assess.components import MIN_ROWS
+from hilstar.instruments.assess.further import (
+    FurtherFigures,
+    add_jitter,
+    add_rates,
+    add_stars,
+)
 from hilstar.instruments.assess.places import Scale, spread_rows
 from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs, refuse_conventions
-from hilstar.server.answers.answer import JUMP_NS
+from hilstar.server.answers.answer import JUMP_NS, ReportedStar
+from hilstar.server.answers.formats import reported_stars
 from hilstar.server.answers.judge import TO_MIDDLE, AnswerRules, Stamp
+from hilstar.server.answers.stars import ShownStars
 from hilstar.server.bench.alignment import Turned, cube_to_boresight
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.certificate_file import (
     Certificate,
     CubeToBoresight,
@@ -307,7 +316,8 @@ class Assessment:
     `limit_arcsec` is the smallest noise that the tracker's stars allow, None where the bench cannot
     be read.
 
-    `offset_s` is the tracker's clock minus the run's at the run's start.
+    `offset_s` is the tracker's clock minus the run's at the run's start. `further` are the figures
+    of what answers carry beside the attitude.
     """
 
     run: RunLedger
@@ -327,6 +337,7 @@ class Assessment:
     certificate: Certificate | None = None
     out_of_order: int = 0
     cube: CubeToBoresight | None = None
+    further: FurtherFigures = field(default_factory=FurtherFigures)
 
     def __repr__(self) -> str:
         across = self.noise_arcsec.cross
@@ -402,10 +413,12 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
     rising_ns, order = np.unique(t_ns, return_index=True)
     valid = []
     q = []
+    rates_rad_s = []
     centroids = []
     for k in order.tolist():
         record = records[k]
-        centroids.append(record.centroids)
+        centroids.append([ReportedStar(*star) for star in record.centroids])
+        rates_rad_s.append(record.rate or NO_RATE)
         if record.q is None:
             valid.append(False)
             q.append(NOT_SHOWN)
@@ -419,6 +432,7 @@ def read_answers(ledger: Path, stamp: Stamp) -> LedgerAnswers:
         np.array(valid, dtype=np.bool_),
         order + 1,
         of_lines=False,
+        rate_cam_rad_s=np.array(rates_rad_s, dtype=np.float64),
     )
     ahead_ns = int(np.median(t_ns - on_run_ns))
     return LedgerAnswers(telemetry, stamp, ahead_ns, centroids, overtaken, clock_set)
@@ -525,6 +539,9 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     right[valid[error_budget.held]] = True
     wrong = np.zeros(len(t_s), dtype=np.bool_)
     wrong[valid[error_budget.wrong]] = True
+    further = FurtherFigures()
+    add_rates(further, answers, run.commanded, error_budget)
+    add_jitter(further, error_budget)
     notes = _notes(run, error_budget, timed)
     rate_deg_s = np.degrees(np.linalg.norm(error_budget.rate_rad_s, axis=1))
     by_rate = _slices_by(rate_deg_s, error_budget)
@@ -534,10 +551,13 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     bench = BenchFigures()
     try:
         _look_at_bench(bench, run, error_budget, right_centroids, settings)
+        if right_centroids:
+            with open_bench(run.bench_file()) as opened:
+                add_stars(further, ShownStars(opened), right_centroids, error_budget)
     except HilstarError as refusal:
         bench.notes.append(
-            "neither the field's magnitude nor the display's own error could be found from the"
-            f" ledger: {refusal}"
+            "neither the field's magnitude nor the display's own error, nor single stars' figures,"
+            f" could be found from the ledger: {refusal}"
         )
     noise_arcsec, display_note = _without_display(error_budget, bench.display)
     return Assessment(
@@ -554,10 +574,11 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         by_rate=by_rate,
         by_magnitude=bench.by_magnitude,
         t_s=t_s,
-        notes=(*notes, *bench.notes, *display_note),
+        notes=(*notes, *further.notes, *bench.notes, *display_note),
         certificate=bench.certificate,
         out_of_order=timed.out_of_order,
         cube=bench.cube,
+        further=further,
     )
 
 
@@ -595,7 +616,8 @@ def _answers_of_file(run: RunLedger, path: Path, settings: AssessSettings) -> Ti
         base_ns = first_ns
     tau_s = _tau_s(run, answers, base_ns, stamp, settings)
     base_s = (base_ns - zero_ns) / NS_PER_S
-    return TimedAnswers(path, answers, tau_s, base_s, overlap)
+    centroids = [reported_stars(rows) for rows in answers.star_rows]
+    return TimedAnswers(path, answers, tau_s, base_s, overlap, centroids)
 
 
 def _tau_s(

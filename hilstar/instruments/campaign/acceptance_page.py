@@ -25,6 +25,8 @@ from hilstar.basics.pages import (
     table_of,
 )
 from hilstar.basics.version import __version__
+from hilstar.instruments.assess.bounded_figures import TooFewCases, clopper_pearson, quantile_limits
+from hilstar.instruments.assess.star_drawing import star_drawing
 from hilstar.instruments.campaign.acceptance_verdicts import (
     LEDGER,
     NOT_TESTED,
@@ -32,8 +34,7 @@ from hilstar.instruments.campaign.acceptance_verdicts import (
     ClauseVerdict,
     SetResult,
 )
-from hilstar.instruments.campaign.answer_figures import StarTable, place_map
-from hilstar.instruments.campaign.figures import TooFewCases, clopper_pearson, quantile_limits
+from hilstar.instruments.campaign.answer_figures import star_table
 from hilstar.instruments.campaign.plan import STAR_QUANTITIES
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.requirements_page import STATES, signed_card, verdict_chip
@@ -75,8 +76,6 @@ TOGETHER = (
 MAY_BE_CHANCE = "may be chance among so many clauses; more cases would tell"
 FAILED_HEADER = ("set of cases", "failed", "why")
 FAILED_CURE = "Mend what the reasons name, and accept again in another directory."
-GRID = 8  # arrows along each side of the map of place errors
-MAG_BINS = 12
 QUANTILES = (0.5, 0.9, 0.95, 0.99)
 MAX_ROWS = 5000  # of points in a chart
 
@@ -380,6 +379,8 @@ def _sweep_card(result: SetResult) -> Card:
     levels = list(levels_text(result.levels))
     at, share, ends = [], [], []
     for level, successes, cases in levels:
+        if not cases:
+            continue
         at.append(level)
         share.append(successes / cases)
         ends.append(clopper_pearson(successes, cases, 0.975))
@@ -387,7 +388,11 @@ def _sweep_card(result: SetResult) -> Card:
     unit = ""
     if sweep.unit:
         unit = f" [{sweep.unit}]"
-    with panels_of(f"Share of cases with an attitude against {sweep.key}") as (axes,):
+    kept = "an attitude"
+    if sweep.star_v_mag is not None:
+        kept = f"half of their stars to V {sweep.star_v_mag:g}"
+    finding = f"Share of cases with {kept} against {sweep.key}"
+    with panels_of(finding) as (axes,):
         axes.errorbar(at, share, yerr=bars, fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
         axes.axhline(sweep.share, linewidth=0.8, linestyle="--", color=MUTED)
         axes.set_ylim(-0.05, 1.05)
@@ -399,8 +404,7 @@ def _sweep_card(result: SetResult) -> Card:
     paragraphs = []
     if result.case_set.about:
         paragraphs.append(paragraph(result.case_set.about))
-    alt = f"share of cases with an attitude against {sweep.key}"
-    paragraphs.append(drawing_of(axes.figure, alt))
+    paragraphs.append(drawing_of(axes.figure, finding))
     return Card(f"Sweep: {result.case_set.name}", words=paragraphs, details=[table])
 
 
@@ -431,49 +435,13 @@ def _first_attitude(result: SetResult) -> Card:
     return Card(f"Time to the first attitude: {result.case_set.name}", words=paragraphs)
 
 
-def _detection(stars: StarTable) -> Iterator[tuple[float, float, float, float]]:
-    """Of bins of magnitude: middle, share of stars reported, and 95 % below and above that."""
-    brightest_mag = float(stars.v_mag.min())
-    faintest_mag = float(stars.v_mag.max())
-    edges = np.linspace(brightest_mag, faintest_mag + 1e-6, MAG_BINS + 1)
-    place = np.digitize(stars.v_mag, edges) - 1
-    for k in range(MAG_BINS):
-        in_bin = place == k
-        lit = int(in_bin.sum())
-        if not lit:
-            continue
-        reported = int((stars.found & in_bin).sum())
-        low, high = clopper_pearson(reported, lit, 0.975)
-        share = reported / lit
-        middle_mag = float(edges[k] + edges[k + 1]) / 2
-        yield middle_mag, share, share - low, high - share
-
-
 def _star_card(acceptance: AcceptedBench, result: SetResult) -> Iterator[Card]:
     """Detection against magnitude, and the map of stars' place errors; none without stars."""
     assert result.cases is not None
     try:
-        stars = StarTable.of(result.cases)
-        offsets_px = place_map(stars, acceptance.scale.resolution_px, GRID)
+        drawing = star_drawing(star_table(result.cases), acceptance.scale.resolution_px)
     except TooFewCases:
         return
-    bins = list(_detection(stars))
-    at, share, below, above = np.array(bins).T
-    distance_px = np.hypot(offsets_px.dx_px, offsets_px.dy_px)
-    largest_px = float(distance_px.max())
-    finding = f"Stars reported by magnitude; their places are off by at most {largest_px:.2g} px"
-    with panels_of(finding, 1, 2, share_x=False, height_inch=3.6) as (curve, right):
-        curve.errorbar(at, share, yerr=[below, above], fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
-        curve.set_ylim(-0.05, 1.05)
-        curve.set_xlabel("V [mag]")
-        curve.set_ylabel("share reported")
-        arrows = (offsets_px.x_px, offsets_px.y_px, offsets_px.dx_px, offsets_px.dy_px)
-        right.quiver(*arrows, angles="xy", color=BLUE)
-        right.set_xlabel("x [px]")
-        right.set_ylabel("y [px]")
-        right.invert_yaxis()
-        right.set_aspect("equal")
-    drawing = drawing_of(curve.figure, "detection against magnitude, and the map of place errors")
     yield Card(f"Single stars: {result.case_set.name}", words=[drawing])
 
 

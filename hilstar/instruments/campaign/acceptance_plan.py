@@ -196,6 +196,8 @@ def _sets(
             for clause in plan.clause
             if clause.of == name and clause.quantity in QUANTITY_COLUMNS
         }
+        if set_keys.sweep is not None and set_keys.sweep.star_v_mag is not None:
+            asked.add("stars")
         if asked:
             campaign["columns"] = sorted({*asked, *campaign.get("columns", [])})
         refused = ""

@@ -35,7 +35,8 @@ from hilstar.basics.files import write_whole
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import stop_on_signal
 from hilstar.basics.units import NS_PER_S
-from hilstar.instruments.campaign.cases import AXES, Case, CaseMaker, Q, first_row
+from hilstar.instruments.campaign.case_motion import AXES, CaseMotion
+from hilstar.instruments.campaign.cases import Case, CaseMaker, Q, first_row
 from hilstar.instruments.campaign.plan import SCENARIO, Design, Plan
 from hilstar.instruments.campaign.store import Directory, Journal, Row
 from hilstar.instruments.campaign.tally import FrameLists, StarLists, spread_row
@@ -44,9 +45,8 @@ from hilstar.optics.layers.view import View
 from hilstar.server.answers.answer import Answer, AnswerSource
 from hilstar.server.answers.judge import AnswerJudge, AnswerRules, Judged
 from hilstar.server.answers.pairing import LitFrame, LitFrames, residual_arcsec
-from hilstar.server.answers.stars import StarResiduals, judge_stars, lit_at
+from hilstar.server.answers.stars import ShownStars
 from hilstar.server.bench.bench_file import BenchFile
-from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.fault_views import display_view
 from hilstar.server.bench.frame import Bench
 from hilstar.server.bench.scenario import Timetable
@@ -121,12 +121,8 @@ class BenchOrder:
         """The case of a number; a check case is the attitude of case 0, at rest."""
         if number < self.cases:
             return self.maker.case(number, self._design.points(number, number + 1)[0])
-        return Case(
-            number,
-            {},
-            0,
-            View.exposure(self._at_rest.q_icrs_to_cam, np.zeros(3), 0.0, self._at_rest.t_ns),
-        )
+        at_rest = CaseMotion(self._at_rest.q_icrs_to_cam, np.zeros(3))
+        return Case(number, {}, 0, at_rest.exposure(0.0, 0.0, self._at_rest.t_ns or 0), at_rest)
 
     def renderer(self, number: int) -> str:
         """What a case's renderer depends on, as a text that is the same for all cases of one
@@ -240,7 +236,7 @@ class BenchRun:
         self._base = self._next = 0  # frame numbers go on from one renderer to the next
         self._frames: LitFrames | None = None
         self._judge: AnswerJudge | None = None
-        self._bench: Bench | None = None
+        self._shown_stars: ShownStars | None = None
         self._heard_ns: int | None = None
         self._refused = 0
         self._waiting = False
@@ -286,7 +282,7 @@ class BenchRun:
         if self._frames is None:
             self._frames = LitFrames(period_ns, bench.scan.hold_s, centred=screen is None)
             self._judge = AnswerJudge(self._rules, self._frames)
-        self._bench = bench
+        self._shown_stars = ShownStars(bench)
         self._base = self._next
         self._light_ns = 0 if screen is None else screen.swap_to_light_ns
         self._file_sha256 = bench.file.sha256
@@ -407,7 +403,8 @@ class BenchRun:
             }
             rate = first.turn.rate_cam_rad_s if attitude is None else attitude.rate_cam_rad_s
             now_table |= {"rate_cam_rad_s": None if rate is None else rate.tolist()}
-            now_table |= {"acceleration_cam_rad_s2": now.case.acceleration_rad_s2.tolist()}
+            acceleration_rad_s2 = now.case.motion.acceleration_at(0.0)
+            now_table |= {"acceleration_cam_rad_s2": acceleration_rad_s2.tolist()}
             write_whole(
                 self._now_path,
                 msgspec.json.encode(now_table | {"light_ns": host_ns, "begun_utc": now.begun_utc}),
@@ -482,20 +479,9 @@ class BenchRun:
             view = self._view(judged.middle_ns) or now.case.first
             now.take(judged, right, view.turn.rate_cam_rad_s)
             if right and "stars" in plan.columns and judged.lit is not None:
-                now.star_lists.judged.append(self._judged_stars(answer, judged.lit.q))
-
-    def _judged_stars(self, answer: Answer, lit_q: FloatArray) -> StarResiduals:
-        """The stars of an answer against those that were lit at an attitude: of the tracker's field
-        what the display covers.
-        """
-        bench = self._bench
-        assert bench is not None
-        tracker = bench.config.tracker
-        camera = tracker_camera(tracker, bench.file.folder)
-        lit = lit_at(lit_q, bench.stars, camera, bench.faintest_shown_e_per_s)
-        x_px, y_px = bench.camera.pixels_from(camera, lit.x_px, lit.y_px)
-        lit = lit.some(np.flatnonzero(bench.camera.contains_px(x_px, y_px)))
-        return judge_stars(answer.centroids, lit, tracker.resolution_px)
+                assert self._shown_stars is not None
+                residuals = self._shown_stars.judged(answer.centroids, judged.lit.q)
+                now.star_lists.judged.append(residuals)
 
     def _is_of(self, now: Tally, judged: Judged, answer: Answer) -> bool:
         """Whether an answer is of the case on the display; one of the case before that comes

@@ -21,10 +21,22 @@ from hilstar.basics.rotation import (
     from_rotation_vector,
     multiply,
     normalise,
-    propagate,
     to_radec_roll_deg,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.instruments.campaign.case_motion import (
+    ACCELERATION,
+    ACROSS,
+    AXES,
+    AXIS_STREAM,
+    JITTER,
+    JITTER_HZ,
+    MOTION_S,
+    RATE,
+    CaseMotion,
+    by_axis,
+    swing_pieces,
+)
 from hilstar.instruments.campaign.plan import (
     SCENARIO,
     Attitudes,
@@ -37,28 +49,28 @@ from hilstar.instruments.campaign.plan import (
 from hilstar.instruments.campaign.store import Row
 from hilstar.instruments.simulate.exposures import faulty_exposure, view_at
 from hilstar.instruments.simulate.simulator import FaultyExposure, Simulator
-from hilstar.optics.frame_motion import CameraTurn
 from hilstar.optics.layers.fault_kinds import Fault, fault_of
 from hilstar.optics.layers.view import View
 from hilstar.server.bench.bench_file import BenchFile, dated, stated_in
-from hilstar.server.bench.scenario import Scenario, read_scenario
+from hilstar.server.bench.scenario import NO_SCENARIO, Scenario, read_scenario
 from hilstar.server.bench.star_light import bench_moving
 
 if TYPE_CHECKING:
     from hilstar.sky.bodies.moving import MovingSky
 
 ATTITUDE_DIMENSIONS = {"all-sky": 3, "field": 3, "log": 1, "body": 3}
-MAX_STEP_S = 0.01  # of a turn that accelerates
 STRAY, STRAY_DEG, STRAY_FROM_S = "stray_e_per_px", 80.0, -1e5
-AXIS_STREAM = 2  # stream of a case's seed for the axis of a rate across the boresight
 SEED_BITS = 63  # a FITS header, a Parquet column of int64 and `simulate --seed` hold as many
 # what varies on a real bench
 ON_BENCH = (
     "sky",
     "render",
     "spacecraft",
-    "rate_deg_s",
-    "acceleration_deg_s2",
+    RATE,
+    ACCELERATION,
+    MOTION_S,
+    JITTER,
+    JITTER_HZ,
     "time_s",
     "scenario",
     "body_deg",
@@ -66,8 +78,10 @@ ON_BENCH = (
 )
 Kind = Literal["int64", "float64", "bool", "text", "floats"]
 
+SINGLE_BODIES = ("sun", "moon", "earth")  # that have keys of their own; planets share one
+MIN_FRAMES_A_SWING = 6  # of jitter on a display: fewer are steps of half an amplitude and more
+
 DONE, FAILED = "done", "failed"
-AXES = ("x", "y", "z")
 
 Q = ("qw", "qx", "qy", "qz")
 TEXTS = {"status", "why", "bench_sha256", "image_sha256", "image", "begun_utc"}
@@ -121,7 +135,7 @@ FRAME_ERRORS = tuple(f"frame_error_{axis}_arcsec" for axis in AXES)
 FRAME_RATE_ERRORS = tuple(f"frame_rate_error_{axis}_deg_s" for axis in AXES)
 STAR_LISTS = (
     *("star_x_px", "star_y_px", "star_v_mag", "star_bv"),
-    *("star_dx_px", "star_dy_px", "star_signal_mag"),
+    *("star_dx_px", "star_dy_px", "star_signal_mag", "star_lit_mag"),
 )
 REPORTED_FRAMES, FALSE_STARS = "star_frames", "star_false"
 FURTHER: dict[Further, tuple[str, ...]] = {
@@ -129,7 +143,7 @@ FURTHER: dict[Further, tuple[str, ...]] = {
     "time": (*FRAME_RATES, *FRAME_ERRORS),
     "stars": (REPORTED_FRAMES, FALSE_STARS, *STAR_LISTS),
 }
-RECOVERY = ("fault_end_s", "recovery_s")  # only in a plan that varies scenario
+RECOVERY = ("fault_end_s", "recovery_s")  # only in a plan that varies scenario or motion_s
 CENTROIDS = (
     *("stars", "found", "matched", "false", "measured"),
     *("centroid_dx_px", "centroid_dy_px", "centroid_sigma_x_px", "centroid_sigma_y_px"),
@@ -138,14 +152,15 @@ CENTROIDS = (
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """A case before its bench is made: its values by key, the seed of its noise, and the view of
-    its first exposure.
+    """A case before its bench is made: its values by key, the seed of its noise, the view of its
+    first exposure, and how it moves from there.
     """
 
     number: int
     values: dict[str, Any]
     noise_seed: int
     first: View
+    motion: CaseMotion
 
     @property
     def body_deg(self) -> float:
@@ -156,20 +171,6 @@ class Case:
         if limb_deg is None:
             return float(self.values.get("body_deg", 180.0))
         return float(limb_deg)
-
-    @property
-    def acceleration_rad_s2(self) -> FloatArray:
-        """The angular acceleration (3,), cam."""
-        return np.radians(_by_axis(self.values, "acceleration_deg_s2"))
-
-
-def _by_axis(values: dict[str, Any], key: str) -> list[float]:
-    """The values of a key's x, y and z; 0 where a case has none."""
-    axis_values = []
-    for axis in AXES:
-        value = values.get(f"{key}.{axis}", 0.0)
-        axis_values.append(float(value))
-    return axis_values
 
 
 @dataclass(frozen=True, slots=True)
@@ -226,8 +227,11 @@ class CaseMaker:
             sequence = np.random.SeedSequence((self.plan.seed, number))
             state = sequence.generate_state(1, np.uint64)
             seed = int(state[0]) >> 64 - SEED_BITS
-        first = self._first(number, look, values)
-        return Case(number, values, int(seed), first)
+        t_ns = self._begin_ns(look, values)
+        q = self._begin_q(look, values, t_ns)
+        rng = np.random.default_rng((self.plan.seed, number, AXIS_STREAM))
+        motion = CaseMotion.of(q, values, rng)
+        return Case(number, values, int(seed), motion.exposure(0.0, 0.0, t_ns), motion)
 
     def bench(self, case: Case) -> BenchFile:
         """The bench file with the case's values. Raises InputError where they do not go
@@ -236,9 +240,9 @@ class CaseMaker:
         file = changed_bench(self.file, self._tables, case.values)
         if self._log is not None:
             file = dated(file, self._log.scale, self._log.begin_ns)
-        turn_arcsec = _by_axis(case.values, "misalignment_arcsec")
-        if any(turn_arcsec):
-            return _misaligned(file, np.array(turn_arcsec))
+        turn_arcsec = by_axis(case.values, "misalignment_arcsec")
+        if turn_arcsec.any():
+            return _misaligned(file, turn_arcsec)
         return file
 
     def view(self, case: Case, frame: int, exposure_s: float) -> View:
@@ -258,27 +262,21 @@ class CaseMaker:
             if not any(key.startswith("rate_deg_s.") for key in case.values):
                 return along
             return View.exposure(along.q_icrs_to_cam, first.turn.rate_cam_rad_s, exposure_s, t_ns)
-        rate_rad_s = first.turn.rate_cam_rad_s
-        acceleration_rad_s2 = case.acceleration_rad_s2
-        step_s = step_ns / NS_PER_S
-        if acceleration_rad_s2.any():
-            q, rate_rad_s = accelerated(first.turn, acceleration_rad_s2, step_s)
-        elif step_ns:
-            q = propagate(first.q_icrs_to_cam, rate_rad_s, step_s)
-        else:
-            q = first.q_icrs_to_cam
-        t_ns = (first.t_ns or 0) + step_ns
-        return View.exposure(q, rate_rad_s, exposure_s, t_ns)
+        return case.motion.exposure(step_ns / NS_PER_S, exposure_s, (first.t_ns or 0) + step_ns)
 
     def faults(self, case: Case, view: View, simulator: Simulator) -> FaultyExposure | None:
-        """The faults of the case's scenario in an exposure, at the case's time or the log's
-        since its beginning.
+        """The exposure of a view by its pieces, with the faults of the case's scenario at the
+        case's time or the log's since its beginning; None where it is one piece without faults.
         """
         scenario = self.scenario(case)
-        if scenario is None:
+        views = [view]
+        t_ns = view.t_ns or 0
+        if self._log is None:
+            since_s = (t_ns - (case.first.t_ns or 0)) / NS_PER_S
+            views = case.motion.pieces(since_s, view.exposure_s, t_ns)
+        if scenario is None and len(views) == 1:
             return None
-        since_begin_ns = (view.t_ns or 0) - self.begin_ns
-        return faulty_exposure(simulator, view, scenario, since_begin_ns)
+        return faulty_exposure(simulator, views, scenario or NO_SCENARIO, t_ns - self.begin_ns)
 
     @property
     def begin_ns(self) -> int:
@@ -300,39 +298,32 @@ class CaseMaker:
         return dataclasses.replace(scenario, faults=(*scenario.faults, glow))
 
     def fault_end_s(self, case: Case, length_s: float) -> float | None:
-        """When the last fault of the case's scenario ends, after the case's begin; None outside
-        its `length_s`.
+        """When the case's motion or the last fault of its scenario ends, after the case's begin;
+        None outside its `length_s`.
         """
+        end_s = case.motion.motion_s
         scenario = self.scenario(case)
-        if scenario is None:
-            return None
-        since_begin_ns = (case.first.t_ns or 0) - self.begin_ns
-        end_s = scenario.end_s - since_begin_ns / NS_PER_S
+        if scenario is not None and scenario.end_s:
+            since_begin_ns = (case.first.t_ns or 0) - self.begin_ns
+            end_s = scenario.end_s - since_begin_ns / NS_PER_S
         if 0 < end_s <= length_s:
             return end_s
         return None
 
-    def _first(self, number: int, look: FloatArray, values: dict[str, Any]) -> View:
-        rate_rad_s = np.radians(_by_axis(values, "rate_deg_s"))
-        across_deg_s = float(values.get("rate_deg_s.across", 0.0))
-        across = math.radians(across_deg_s)
-        if across:
-            rng = np.random.default_rng((self.plan.seed, number, AXIS_STREAM))
-            angle_rad = rng.uniform(0.0, 2 * math.pi)
-            axis = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
-            rate_rad_s += across * axis
+    def _begin_ns(self, look: FloatArray, values: dict[str, Any]) -> int:
+        """The time of a case's first exposure: the case's own, or along the log."""
         if self._log is not None:
             begin_ns, end_ns = self._log.span_ns
-            t_ns = begin_ns + round(float(look[0]) * (end_ns - begin_ns))
-            along = view_at(self._log.timeline, self._log.span_ns, t_ns, 0.0)
-            return View.exposure(along.q_icrs_to_cam, rate_rad_s, 0.0, t_ns)
-        time_s = float(values.get("time_s", 0.0))
-        t_ns = round(time_s * NS_PER_S)
+            return begin_ns + round(float(look[0]) * (end_ns - begin_ns))
+        return round(float(values.get("time_s", 0.0)) * NS_PER_S)
+
+    def _begin_q(self, look: FloatArray, values: dict[str, Any], t_ns: int) -> FloatArray:
+        """The attitude `q_icrs_to_cam` (4,) with which a case begins."""
+        if self._log is not None:
+            return view_at(self._log.timeline, self._log.span_ns, t_ns, 0.0).q_icrs_to_cam
         if self.plan.attitudes.body is None:
-            q = looking_q(self.plan.attitudes, look)
-        else:
-            q = self._beside_body(self.plan.attitudes, look, values, t_ns)
-        return View.exposure(q, rate_rad_s, 0.0, t_ns)
+            return looking_q(self.plan.attitudes, look)
+        return self._beside_body(self.plan.attitudes, look, values, t_ns)
 
     def _beside_body(
         self, attitudes: Attitudes, look: FloatArray, values: dict[str, Any], t_ns: int
@@ -350,9 +341,12 @@ class CaseMaker:
             discs = moving.discs(pole, math.pi, t_ns=t_ns)
             disc = next((disc for disc in discs if disc.name.lower() == attitudes.body), None)
         if disc is None:
+            key = str(attitudes.body)
+            if key not in SINGLE_BODIES:
+                key = "planets"
             raise InputError(
                 f'[attitudes] body = "{attitudes.body}": the bench has none; write [sky] epoch_utc'
-                f" and [sky.bodies] {attitudes.body} = true, or vary sky.bodies.{attitudes.body}"
+                f" and [sky.bodies] {key} = true, or vary sky.bodies.{key}"
             )
         off_rad = math.radians(float(values.get("body_deg", 0.0)))
         limb_deg = values.get("limb_deg")
@@ -363,22 +357,6 @@ class CaseMaker:
         position_angle_rad = 2 * math.pi * float(look[0])
         roll_deg = _roll_deg(attitudes, float(look[2]))
         return beside_q(disc.direction, off_rad, position_angle_rad, roll_deg)
-
-
-def accelerated(
-    turn: CameraTurn, acceleration_rad_s2: FloatArray, seconds: float
-) -> tuple[FloatArray, FloatArray]:
-    """Attitude (4,) and rate (3,) after turning at a rate that changes at a constant rate, cam
-    components: the midpoint rule in steps of MAX_STEP_S.
-    """
-    q = turn.q_icrs_to_cam
-    steps = max(1, math.ceil(abs(seconds) / MAX_STEP_S))
-    step_s = seconds / steps
-    for step in range(steps):
-        middle_s = (step + 0.5) * step_s
-        rate_rad_s = turn.rate_cam_rad_s + acceleration_rad_s2 * middle_s
-        q = propagate(q, rate_rad_s, step_s)
-    return q, turn.rate_cam_rad_s + acceleration_rad_s2 * seconds
 
 
 def looking_q(attitudes: Attitudes, look: FloatArray) -> FloatArray:
@@ -458,7 +436,8 @@ def _misaligned(file: BenchFile, turn_arcsec: FloatArray) -> BenchFile:
 
 
 def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None:
-    """Refuse (InputError) parameters that would change nothing."""
+    """Refuse (InputError) parameters that would change nothing, or that cannot be shown."""
+    _check_motion(plan, varied, file)
     for parameter in varied:
         table = parameter.key.split(".")[0]
         if plan.through == "bench" and table not in ON_BENCH:
@@ -482,11 +461,12 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
             raise InputError(
                 '[[vary]] key = "time_s": with a log the times are the log\'s; leave it out'
             )
-        if plan.through == "display" and parameter.key in (SCENARIO, STRAY):
+        if plan.through == "display" and table in (SCENARIO, STRAY, MOTION_S, JITTER, JITTER_HZ):
             raise InputError(
-                f'[[vary]] key = "{parameter.key}": faults are of through = "tracker"; write that'
+                f'[[vary]] key = "{parameter.key}": what changes within an exposure is of'
+                ' through = "tracker"; write that'
             )
-        if plan.attitudes.kind == "log" and table == "acceleration_deg_s2":
+        if plan.attitudes.kind == "log" and table in (ACCELERATION, MOTION_S, JITTER, JITTER_HZ):
             raise InputError(
                 f'[[vary]] key = "{parameter.key}": with a log the motion is the log\'s; leave it'
                 " out"
@@ -502,6 +482,46 @@ def _check_through(plan: Plan, varied: list[Parameter], file: BenchFile) -> None
                 f'[[vary]] key = "{parameter.key}": the bench has a geometry file, whose own'
                 " alignment counts; vary verify.true_geometry over several files instead"
             )
+
+
+def _check_motion(plan: Plan, varied: list[Parameter], file: BenchFile) -> None:
+    """Refuse (InputError) motions that do not go together, or are too fast to be shown."""
+    by_key = {parameter.key: parameter for parameter in varied}
+    jitters = [key for key in by_key if key.split(".")[0] == JITTER]
+    if bool(jitters) != (JITTER_HZ in by_key):
+        raise InputError(
+            f'[[vary]] key = "{JITTER}.across" and "{JITTER_HZ}" go together; write both, or'
+            " neither"
+        )
+    if MOTION_S in by_key and SCENARIO in by_key:
+        raise InputError(
+            f'[[vary]] key = "{MOTION_S}" and "{SCENARIO}": recovery counts from the end of either;'
+            " leave one of them out"
+        )
+    # a rate's errors are fitted with one acceleration a case, which its row has by axis
+    fitted = [f"{ACCELERATION}.{ACROSS}", MOTION_S, *jitters]
+    for key in fitted:
+        if "rate" in plan.columns and key in by_key:
+            raise InputError(
+                f'[[vary]] key = "{key}": errors of the rate are not told in such cases; vary'
+                f" {ACCELERATION}.x, .y and .z, or write other cases for them"
+            )
+    if not jitters:
+        return
+    hz = by_key[JITTER_HZ]
+    fastest_hz = max(hz.values or (hz.maximum,))
+    if plan.through == "bench":
+        shown_hz = file.config.monitor.refresh_hz / MIN_FRAMES_A_SWING
+        if fastest_hz > shown_hz:
+            raise InputError(
+                f'[[vary]] key = "{JITTER_HZ}": {fastest_hz:g} Hz on a display of'
+                f" {file.config.monitor.refresh_hz:g} Hz; write at most {shown_hz:g}"
+            )
+        return
+    try:
+        swing_pieces(file.config.tracker.exposure_s, fastest_hz)
+    except InputError as error:
+        raise InputError(f'[[vary]] key = "{JITTER_HZ}": {error}') from error
 
 
 def bench_columns(
@@ -537,7 +557,7 @@ def columns(
     for parameter in parameters:
         varied[f"vary.{parameter.key}"] = value_kind(parameter)
     names = [*BEFORE, *varied, *AFTER]
-    if f"vary.{SCENARIO}" in varied:
+    if f"vary.{SCENARIO}" in varied or f"vary.{MOTION_S}" in varied:
         names += RECOVERY
     if with_centroids:
         names += CENTROIDS

@@ -58,12 +58,18 @@ Roll = Annotated[float, Meta(ge=-360, le=720)]
 OWN_KEYS = (
     *("rate_deg_s.x", "rate_deg_s.y", "rate_deg_s.z", "rate_deg_s.across"),
     *("acceleration_deg_s2.x", "acceleration_deg_s2.y", "acceleration_deg_s2.z"),
+    *("acceleration_deg_s2.across", "motion_s"),
+    *("jitter_arcsec.x", "jitter_arcsec.y", "jitter_arcsec.z", "jitter_arcsec.across"),
+    *("jitter_hz",),
     *("misalignment_arcsec.x", "misalignment_arcsec.y", "misalignment_arcsec.z"),
     *("time_s", "noise_seed", "scenario", "body_deg", "limb_deg", "stray_e_per_px"),
 )
 MAX_OWN = {
     "rate_deg_s": 360.0,
     "acceleration_deg_s2": 360.0,
+    "motion_s": 86400.0,
+    "jitter_arcsec": 36_000.0,
+    "jitter_hz": 10_000.0,
     "misalignment_arcsec": 36_000.0,
     "body_deg": 180.0,
     "limb_deg": 90.0,
@@ -72,6 +78,7 @@ MAX_OWN = {
     "noise_seed": 2.0**63 - 1,
 }
 WHOLE = ("noise_seed",)
+NOT_NEGATIVE = (*WHOLE, "motion_s", "jitter_hz")
 # Further columns of the table, lists of a value a frame or a star.
 Further = Literal["rate", "time", "stars"]
 # What [[require]] limits (ECSS-E-ST-60-20C), and its unit; those of an axis, arcsec, come first.
@@ -136,6 +143,18 @@ ATTITUDE_STREAM = 1  # stream of a case's seed for the attitudes of a grid
 SOBOL_BITS = 30
 MAX_HYPERCUBE_VALUES = 200_000_000  # 1.6 GB: a Latin hypercube is made as a whole
 TRACKER_PSF = "tracker"
+Body = Literal[
+    "sun",
+    "moon",
+    "earth",
+    "mercury",
+    "venus",
+    "mars",
+    "jupiter",
+    "saturn",
+    "uranus",
+    "neptune",
+]
 
 
 class Attitudes(Table, frozen=True):
@@ -145,7 +164,7 @@ class Attitudes(Table, frozen=True):
     """
 
     kind: Literal["all-sky", "field", "log", "body"] = "all-sky"
-    body: Literal["sun", "moon", "earth"] | None = None
+    body: Body | None = None
     radec_deg: tuple[Ra, Dec] | None = None
     radius_deg: Annotated[float, Meta(ge=0, le=180)] = 5.0
     roll_deg: tuple[Roll, Roll] = (0.0, 360.0)
@@ -368,8 +387,8 @@ def _check_attitudes(attitudes: Attitudes) -> None:
         raise InputError('[attitudes] kind = "log" needs log = "FILE"; add it')
     if (attitudes.kind == "body") != (attitudes.body is not None):
         raise InputError(
-            '[attitudes] kind = "body" and body = "sun", "moon" or "earth" go together; write both,'
-            " or neither"
+            '[attitudes] kind = "body" and body = "sun", "moon", "earth" or a planet go together;'
+            " write both, or neither"
         )
     if attitudes.kind != "field" and attitudes.radec_deg is not None:
         raise InputError(
@@ -635,7 +654,7 @@ def _check_value(
         return
     whole = parameter.key in WHOLE
     largest = MAX_OWN[parameter.key.split(".")[0]]
-    low = 0 if whole else -largest
+    low = 0 if parameter.key in NOT_NEGATIVE else -largest
     if (
         isinstance(value, bool)
         or not isinstance(value, int if whole else int | float)

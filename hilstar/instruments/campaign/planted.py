@@ -21,6 +21,7 @@ from hilstar.basics.rotation import (
     to_radec_roll_deg,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, LIGHT_KM_S
+from hilstar.instruments.campaign.case_motion import CaseMotion
 from hilstar.instruments.campaign.plan import PlantedFaults
 from hilstar.instruments.campaign.solver_answer import SolverAnswer
 from hilstar.instruments.simulate.simulator import Exposure
@@ -34,14 +35,14 @@ FALSE_DN = 1000.0  # signal of a planted false star
 
 @dataclass(frozen=True, slots=True)
 class CaseConditions:
-    """What a case's planted faults depend on: the observer's velocity, km/s, ICRS, the angular
-    acceleration, rad/s2, cam, the detector's false stars, the angle from a body (`Case.body_deg`),
-    the end of the last fault, s (None: none), and the turn (3,), rad, cam, by places of stars that
-    are old.
+    """What a case's planted faults depend on: the observer's velocity, km/s, ICRS, how the case
+    moves, the detector's false stars, the angle from a body (`Case.body_deg`), the end of the
+    motion or of the last fault, s (None: none), and the turn (3,), rad, cam, by places of stars
+    that are old.
     """
 
     velocity_km_s: FloatArray
-    acceleration_rad_s2: FloatArray
+    motion: CaseMotion
     false_stars: int = 0
     body_deg: float = 180.0
     fault_end_s: float | None = None
@@ -64,12 +65,12 @@ class CaseTracker:
         self._with_rate = with_rate
         self._last: deque[tuple[float, FloatArray]] = deque(maxlen=2)
 
-    def reported(self, solved: SolverAnswer, exposure: Exposure, middle_s: float) -> SolverAnswer:
-        """What the tracker reports of an exposure whose middle is `middle_s` after the case's
+    def reported(self, solved: SolverAnswer, exposure: Exposure, at_s: float) -> SolverAnswer:
+        """What the tracker reports of an exposure whose middle is `at_s` after the case's
         begin.
         """
-        answer = self._with_stars(self._with_own_rate(solved, middle_s), exposure)
-        why = self._silence(exposure, middle_s)
+        answer = self._with_stars(self._with_own_rate(solved, at_s), exposure)
+        why = self._silence(exposure, at_s)
         if why:
             return replace(answer, q_icrs_to_cam=None, why=why, rate_cam_rad_s=None)
         q = answer.q_icrs_to_cam
@@ -79,34 +80,35 @@ class CaseTracker:
         stamp_s = answer.stamp_s + planted.stamp_bias_s
         stamp_s += planted.stamp_jitter_s * float(self._rng.standard_normal())
         reported_q = self._turned(q)
-        rate_rad_s = self._rate(answer.rate_cam_rad_s)
+        rate_rad_s = self._rate(answer.rate_cam_rad_s, at_s)
         return replace(answer, q_icrs_to_cam=reported_q, rate_cam_rad_s=rate_rad_s, stamp_s=stamp_s)
 
-    def _with_own_rate(self, solved: SolverAnswer, middle_s: float) -> SolverAnswer:
+    def _with_own_rate(self, solved: SolverAnswer, at_s: float) -> SolverAnswer:
         q = solved.q_icrs_to_cam
         if q is None:
             return solved
-        self._last.append((middle_s, q))
+        self._last.append((at_s, q))
         if not self._with_rate or solved.rate_cam_rad_s is not None or len(self._last) < 2:
             return solved
         (before_s, before_q), (now_s, now_q) = self._last
         rate_rad_s = rate_between_rad_s(before_q, now_q, now_s - before_s)
         return replace(solved, rate_cam_rad_s=rate_rad_s)
 
-    def _silence(self, exposure: Exposure, middle_s: float) -> str:
+    def _silence(self, exposure: Exposure, at_s: float) -> str:
         """Why the tracker reports no attitude by a planted fault; "" where it reports one."""
         planted = self._planted
         conditions = self._conditions
         end_s = conditions.fault_end_s
+        lit_s = at_s + exposure.view.exposure_s / 2  # since the first exposure's begin
         since_s = math.inf
         if end_s is not None:
-            since_s = middle_s - end_s
+            since_s = at_s - end_s
         rate_rad_s = float(np.linalg.norm(exposure.view.turn.rate_cam_rad_s))
         rate_deg_s = math.degrees(rate_rad_s)
         fastest, most = planted.max_rate_deg_s, planted.max_false_stars
         silent = {
             "missing": self._rng.random() < planted.missing,
-            "acquisition_s": middle_s < planted.acquisition_s,
+            "acquisition_s": lit_s < planted.acquisition_s,
             "recovery_s": 0 <= since_s < planted.recovery_s,
             "max_rate_deg_s": fastest is not None and rate_deg_s > fastest,
             "max_false_stars": most is not None and conditions.false_stars > most,
@@ -131,13 +133,13 @@ class CaseTracker:
         error_rad = error_rad + self._conditions.old_places_rad
         return multiply(from_rotation_vector(error_rad), q)
 
-    def _rate(self, rate_rad_s: FloatArray | None) -> FloatArray | None:
+    def _rate(self, rate_rad_s: FloatArray | None, at_s: float) -> FloatArray | None:
         if rate_rad_s is None:
             return None
         planted = self._planted
         noise = planted.rate_noise_deg_s * self._rng.standard_normal(3)
         error_rad_s = np.radians(np.array(planted.rate_bias_deg_s) + noise)
-        error_rad_s -= planted.rate_lag_s * self._conditions.acceleration_rad_s2
+        error_rad_s -= planted.rate_lag_s * self._conditions.motion.acceleration_at(at_s)
         return np.asarray((1 + planted.rate_scale) * rate_rad_s + error_rad_s)
 
     def _with_stars(self, answer: SolverAnswer, exposure: Exposure) -> SolverAnswer:

@@ -31,12 +31,7 @@ from scipy import stats
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
-from hilstar.instruments.assess.budget import Decomposed, assess_cases
-from hilstar.instruments.assess.components import HARMONICS, SURE_OF_MANY, Component
-from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.campaign.answer_figures import answer_figure
-from hilstar.instruments.campaign.case_table import Columns
-from hilstar.instruments.campaign.figures import (
+from hilstar.instruments.assess.bounded_figures import (
     BoundedFigure,
     TooFewCases,
     clopper_pearson,
@@ -45,6 +40,11 @@ from hilstar.instruments.campaign.figures import (
     quantile_limits,
     sigma_limits,
 )
+from hilstar.instruments.assess.budget import Decomposed, assess_cases
+from hilstar.instruments.assess.components import HARMONICS, SURE_OF_MANY, Component
+from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.answer_figures import answer_figure
+from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.plan import (
     AXIS_QUANTITIES,
     QUANTITY_COLUMNS,

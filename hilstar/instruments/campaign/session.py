@@ -15,6 +15,7 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import HilstarError, InputError, MachineError, one_line
 from hilstar.basics.files import make_directory
+from hilstar.basics.units import NS_PER_S
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.cases import (
     Case,
@@ -123,18 +124,17 @@ class Session:
         exposure_s = tracker.config.tracker.exposure_s
         length_s = (self.plan.frames - 1) * self.plan.step_s + exposure_s
         fault_end_s = self.maker.fault_end_s(case, length_s)
-        acceleration_rad_s2 = case.acceleration_rad_s2
         tally = CaseTally(
             "stars" in self.columns,
             self.plan.wrong_above_arcsec,
+            lambda seconds: self.maker.after(case, round(seconds * NS_PER_S)).turn,
             fault_end_s,
             further=self.plan.columns,
-            acceleration_rad_s2=acceleration_rad_s2,
         )
         noise = FrameNoise(self.plan.noise, case.noise_seed)
         conditions = CaseConditions(
             _velocity_km_s(tracker),
-            acceleration_rad_s2,
+            case.motion,
             tracker.config.tracker.detector.false_stars,
             case.body_deg,
             fault_end_s,
@@ -164,9 +164,9 @@ class Session:
             tally.see(exposure)
             try:
                 solved = self._solver.solve(exposure, tracker)
-                begun_s = frame * self.plan.step_s
-                answer = reporter.reported(solved, exposure, begun_s + exposure_s / 2)
-                tally.hear(exposure, answer, begun_s + exposure_s)
+                at_s = frame * self.plan.step_s
+                answer = reporter.reported(solved, exposure, at_s)
+                tally.hear(exposure, answer, at_s)
             except SolverFault as error:
                 return failed(tally.into(row), one_line(str(error)))
         return tally.into(row)

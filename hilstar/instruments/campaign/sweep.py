@@ -2,8 +2,8 @@
 
 Both ends come first, then the middle of the widest gap, again and again: that in which the edge is,
 and those to the levels that show it. At each level so many cases are run. A case is a success where
-at least half of its frames have a right answer. The edge is where the share of successes falls
-below `share`.
+at least half of its frames have a right answer, or, with `star_v_mag`, where at least half of the
+stars up to that V are reported. The edge is where the share of successes falls below `share`.
 
 **Interval.** Successes are taken to become rarer along the sweep, and nothing else. The edge is
 beyond each level whose share is shown to be larger than `share`, and before each level whose share
@@ -20,11 +20,13 @@ from msgspec import Meta
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.toml_tables import Table
+from hilstar.instruments.assess.bounded_figures import BoundedFigure, TooFewCases, clopper_pearson
 from hilstar.instruments.campaign.case_table import Columns
-from hilstar.instruments.campaign.figures import BoundedFigure, TooFewCases, clopper_pearson
+from hilstar.instruments.campaign.cases import REPORTED_FRAMES
 from hilstar.instruments.campaign.plan import Number
 
 STILL, NOT_EVEN = "still answers at", "does not even answer at"
+STAR_V, STAR_DX = "star_v_mag", "star_dx_px"  # columns of a campaign's table
 ENDS = 2  # levels before the first middle
 LEVEL_CONFIDENCE = 0.95  # by which levels are chosen, whatever the clauses' own
 SAME_WIDTH = 1e-9  # gaps that differ by less are equally wide
@@ -42,6 +44,7 @@ class SweepTable(Table, frozen=True):
     rounds: Annotated[int, Meta(ge=1, le=20)] = 6
     share: Annotated[float, Meta(ge=0.01, le=0.99)] = 0.5
     whole: bool = False
+    star_v_mag: Annotated[float, Meta(ge=-30, le=30)] | None = None
     unit: Annotated[str, Meta(max_length=20)] = ""
 
     def check(self, where: str) -> None:
@@ -90,16 +93,34 @@ class LevelCount:
     @property
     def passed(self) -> bool:
         """Whether at least half were."""
-        return 2 * self.successes >= self.cases
+        return self.cases > 0 and 2 * self.successes >= self.cases
 
 
-def counted(level: float, cases: Columns) -> LevelCount:
-    """The successes among the cases of a level."""
+def counted(level: float, cases: Columns, star_v_mag: float | None = None) -> LevelCount:
+    """The successes among the cases of a level, by their attitudes, or by their stars up to a V."""
+    if star_v_mag is not None:
+        return _with_stars(level, cases, star_v_mag)
     numbers = cases.numbers
     right = np.nan_to_num(numbers["solved"]) - np.nan_to_num(numbers["wrong"])
     frames = np.nan_to_num(numbers["frames"])
     success = (frames > 0) & (2 * right >= frames)
     return LevelCount(level, int(success.sum()), len(success))
+
+
+def _with_stars(level: float, cases: Columns, star_v_mag: float) -> LevelCount:
+    """The cases of which half of the stars up to a V are reported. A case that lit no such star
+    does not count; one without a frame that reports stars is none.
+    """
+    successes = count = 0
+    silent = np.nan_to_num(cases.numbers[REPORTED_FRAMES]) == 0
+    of_cases = zip(silent.tolist(), cases.lists[STAR_V], cases.lists[STAR_DX], strict=True)
+    for is_silent, v_mag, dx_px in of_cases:
+        bright = v_mag <= star_v_mag
+        lit = int(bright.sum())
+        reported = int(np.isfinite(dx_px[bright]).sum())
+        count += is_silent or lit > 0
+        successes += lit > 0 and 2 * reported >= lit
+    return LevelCount(level, successes, count)
 
 
 def next_level(sweep: SweepTable, counts: list[LevelCount]) -> float | None:

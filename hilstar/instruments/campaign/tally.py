@@ -1,16 +1,17 @@
 """The tally of a case: its exposures and answers, and what of them its row has."""
 
 import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.rotation import conjugate, multiply, propagate, to_rotation_vector
+from hilstar.basics.rotation import conjugate, multiply, to_rotation_vector
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.campaign.case_motion import AXES
 from hilstar.instruments.campaign.cases import (
-    AXES,
     FALSE_STARS,
     FRAME_ERRORS,
     FRAME_RATE_ERRORS,
@@ -25,6 +26,7 @@ from hilstar.instruments.campaign.planted import lit_stars
 from hilstar.instruments.campaign.solver_answer import CentroidErrors, SolverAnswer
 from hilstar.instruments.campaign.store import Row
 from hilstar.instruments.simulate.simulator import Exposure
+from hilstar.optics.frame_motion import CameraTurn
 from hilstar.server.answers.stars import StarResiduals, judge_stars
 
 
@@ -107,6 +109,7 @@ class CaseTally:
 
     with_centroids: bool
     wrong_above_arcsec: float
+    turn_at: Callable[[float], CameraTurn]  # commanded, by the seconds after the case's begin
     fault_end_s: float | None = None
     first_attitude_s: float | None = None
     recovery_s: float | None = None
@@ -118,7 +121,6 @@ class CaseTally:
     wrong: int = 0
     first_q: FloatArray | None = None
     further: tuple[Further, ...] = ()
-    acceleration_rad_s2: FloatArray = field(default_factory=lambda: np.zeros(3))
     frames_told: FrameLists = field(default_factory=FrameLists)
     star_lists: StarLists = field(default_factory=StarLists)
     _digest: Any = field(default_factory=hashlib.sha256)
@@ -129,8 +131,10 @@ class CaseTally:
         self.stars_in_view += len(exposure.truth)
         self._digest.update(np.ascontiguousarray(exposure.dn))
 
-    def hear(self, exposure: Exposure, answer: SolverAnswer, end_s: float) -> None:
-        """Count the answer to an exposure that ends `end_s` after the case's begin."""
+    def hear(self, exposure: Exposure, answer: SolverAnswer, at_s: float) -> None:
+        """Count the answer to an exposure whose middle is `at_s` after the case's begin, which is
+        the middle of the first exposure.
+        """
         if answer.star_errors is not None:
             self.star_errors.append(answer.star_errors)
         if answer.stars is not None and "stars" in self.further:
@@ -140,29 +144,22 @@ class CaseTally:
         if answer.q_icrs_to_cam is None:
             self.why = self.why or answer.why
             return
-        turn = exposure.view.turn
-        commanded_q = turn.q_icrs_to_cam
-        rate_rad_s = turn.rate_cam_rad_s + answer.stamp_s * self.acceleration_rad_s2
         # an answer is of the time that its stamp says
-        if answer.stamp_s:
-            commanded_q = propagate(commanded_q, rate_rad_s, answer.stamp_s)
-        error = attitude_error_arcsec(commanded_q, answer.q_icrs_to_cam)
+        turn = self.turn_at(at_s + answer.stamp_s)
+        error = attitude_error_arcsec(turn.q_icrs_to_cam, answer.q_icrs_to_cam)
         if self.frames == 1:
             self.first_q = answer.q_icrs_to_cam
         if np.linalg.norm(error) > self.wrong_above_arcsec:
             self.wrong += 1
-        else:
-            self.errors_arcsec.append(error)
-            self.frames_told.add(rate_rad_s, error, answer.rate_cam_rad_s)
-            self.first_attitude_s = (
-                end_s if self.first_attitude_s is None else self.first_attitude_s
-            )
-            if (
-                self.fault_end_s is not None
-                and self.recovery_s is None
-                and end_s - exposure.view.exposure_s / 2 >= self.fault_end_s
-            ):
-                self.recovery_s = end_s - self.fault_end_s
+            return
+        self.errors_arcsec.append(error)
+        self.frames_told.add(turn.rate_cam_rad_s, error, answer.rate_cam_rad_s)
+        exposure_s = exposure.view.exposure_s
+        if self.first_attitude_s is None:
+            self.first_attitude_s = at_s + exposure_s
+        end_s = self.fault_end_s
+        if end_s is not None and self.recovery_s is None and at_s >= end_s:
+            self.recovery_s = at_s + exposure_s / 2 - end_s
 
     def into(self, row: Row) -> Row:
         """The case's row with its results. Errors are those of answers that are not wrong."""

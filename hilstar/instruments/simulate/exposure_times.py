@@ -69,7 +69,7 @@ class CameraExposures:
         self._rate_hz = 0.0
         self._free = FreeExposures(clock, begun_ns, NS_PER_S)
         self._trigger_ns: int | None = None
-        self._newest_ns = begun_ns
+        self._newest_ns: int | None = None  # when the last exposure began
         self._streamed = False
 
     def next_ns(self) -> int | None:
@@ -84,11 +84,13 @@ class CameraExposures:
         if not (wanted or self._always):
             self._streamed = False
             return None
-        # A stream begins when it is asked for, and a new rate from the moment it is set.
+        # A stream begins when it is asked for, and a new rate with the exposure after the last one.
         if camera.settings.rate_hz != self._rate_hz or (wanted and not self._streamed):
             self._rate_hz = camera.settings.rate_hz
-            begin_ns = max(self._newest_ns, camera.started_ns)
             period_ns = round(NS_PER_S / self._rate_hz)
+            begin_ns = max(self._begun_ns, camera.started_ns)
+            if self._newest_ns is not None and begin_ns <= self._newest_ns:
+                begin_ns = self._newest_ns + period_ns
             self._free = FreeExposures(self._clock, begin_ns, period_ns)
         self._streamed = wanted
         return self._free.next_ns()

@@ -1,6 +1,7 @@
 """Exposures of the virtual tracker along a log: their views, and the faults in them."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,11 +98,17 @@ class LogFaults:
 
 
 def faulty_exposure(
-    simulator: Simulator, view: View, scenario: Scenario, run_ns: int
+    simulator: Simulator, views: Sequence[View], scenario: Scenario, run_ns: int
 ) -> FaultyExposure:
-    """One exposure with a scenario's faults, its middle at `run_ns` of that. Raises InputError
-    (see `FaultView.prepare`).
+    """One exposure by the views of its pieces, one after the other, with the faults of a scenario;
+    its middle is at `run_ns` of that. Raises InputError (see `FaultView.prepare`).
     """
     faults = simulator_view(simulator, scenario)
     timetable = Timetable(scenario, faults.prepare, simulator.config.tracker.exposure_s)
-    return FaultyExposure(faults, pieces_of(view, run_ns, timetable))
+    half_lengths_ns = [round(view.exposure_s * NS_PER_S / 2) for view in views]
+    at_ns = run_ns - sum(half_lengths_ns)
+    pieces: list[ExposurePiece] = []
+    for view, half_ns in zip(views, half_lengths_ns, strict=True):
+        pieces += pieces_of(view, at_ns + half_ns, timetable)
+        at_ns += 2 * half_ns
+    return FaultyExposure(faults, pieces)

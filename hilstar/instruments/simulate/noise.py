@@ -350,6 +350,8 @@ def measured_px(
         blooming=False,
         hot_pixel_fraction=0.0,
         dead_pixel_fraction=0.0,
+        dead_row_fraction=0.0,
+        dead_column_fraction=0.0,
         false_stars=0,
         cosmic_rays_per_cm2_s=0.0,
     )

@@ -138,7 +138,6 @@ class PupilField:
     """
 
     def __init__(self, pupil: Pupil) -> None:
-        zernike = _poppy().zernike
         self._pupil = pupil
         self._amplitude = aperture(pupil)
         at = pupil_places(PUPIL)
@@ -149,7 +148,7 @@ class PupilField:
         self._zernikes: dict[int, FloatArray] = {}
         for term in pupil.terms:
             if term.kind == "zernike" and term.noll not in self._zernikes:
-                self._zernikes[term.noll] = zernike.zernike1(term.noll, **polar)
+                self._zernikes[term.noll] = _poppy().zernike.zernike1(term.noll, **polar)
 
     def __call__(self, off_px: FloatArray, nm: float, focus_um: float) -> FloatArray:
         """The field at a place, px from the image's middle. Raises InputError where its samples

@@ -135,9 +135,10 @@ class BodyLayer:
             distances_km = self._moving.distances_km(*view.observer)
             far_km = distances_km[which[point] - first]
         for disc in discs:
+            sine = math.sin(disc.radius_rad) * (1 + AIR_TOP * disc.air_radii)
             # more than a cosine rounds
-            reach_rad = disc.radius_rad * (1 + AIR_TOP * disc.air_radii) + 1e-7
-            near = directions @ disc.direction > np.cos(min(reach_rad, np.pi))
+            reach_rad = math.asin(min(1.0, sine)) + 1e-7
+            near = directions @ disc.direction > np.cos(reach_rad)
             near[point[far_km <= disc.distance_km]] = False  # itself among them
             near[satellite] = False
             behind = np.flatnonzero(near)

@@ -310,10 +310,10 @@ class FaultView:
             return np.empty(0, dtype=np.intp)
         key = (id(stars.hip), wanted)
         known = self._found.get(key)
-        # the array is kept, so that no other one has its id
-        if known is None or known[0] is not stars.hip:
+        if known is None:
             if len(self._found) >= KEPT_STARS:
                 self._found.clear()
+            # the array is kept, so that no other one has its id
             known = self._found[key] = (stars.hip, _places(stars, wanted))
         return known[1]
 

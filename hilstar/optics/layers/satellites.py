@@ -55,8 +55,8 @@ class SatelliteLayer:
         turn = view.turn
         if not view.exposed:
             turn, _ = slowed(turn, view.scan, canvas.camera)
-        # between the moment of the attitude and any light
-        longest_s = max(abs(view.begin_s), rows.longest_s)
+        # between the moment of the attitude and any light: an exposure begins by half of it before
+        longest_s = rows.longest_s
         margin_px = canvas.psf.footprint_px / 2 + 1
         reach_rad = canvas.camera.field_radius_rad(margin_px) + turn.speed_rad_s * longest_s
         passing = self._passing(view, reach_rad, longest_s)

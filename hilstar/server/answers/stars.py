@@ -6,7 +6,7 @@ of another.
 """
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,7 +17,11 @@ from hilstar.basics.rotation import to_matrix
 from hilstar.basics.units import magnitude
 from hilstar.optics.camera import Camera
 from hilstar.server.answers.answer import ReportedStar
+from hilstar.server.bench.cameras import tracker_camera
 from hilstar.sky.stars import Stars
+
+if TYPE_CHECKING:
+    from hilstar.server.bench.frame import Bench
 
 BoolArray = npt.NDArray[np.bool_]
 
@@ -37,6 +41,11 @@ class LitStars:
     v_mag: FloatArray
     bv: FloatArray
     electrons_per_s: FloatArray
+
+    @property
+    def lit_mag(self) -> FloatArray:
+        """The magnitude (n,) of each star's light, -2.5 log10 of its electrons per second."""
+        return magnitude(self.electrons_per_s)
 
     def some(self, chosen: IntArray) -> "LitStars":
         """The stars with the indices `chosen` (m,)."""
@@ -92,6 +101,28 @@ def lit_at(
     seen = near[inside]
     light = (stars.v_mag[seen], stars.bv_mag[seen], stars.electrons_per_s[seen])
     return LitStars(x_px[inside], y_px[inside], *light)
+
+
+class ShownStars:
+    """The stars that a bench shows to its tracker: of the tracker's field what the display covers.
+    `size_px` is the detector's (width, height).
+    """
+
+    def __init__(self, bench: "Bench") -> None:
+        self._stars = bench.stars
+        self._display = bench.camera
+        self._faintest_e_per_s = bench.faintest_shown_e_per_s
+        self._tracker = tracker_camera(bench.config.tracker, bench.file.folder)
+        self.size_px = self._tracker.resolution_px
+
+    def judged(
+        self, reported: tuple[ReportedStar, ...], q_icrs_to_cam: FloatArray
+    ) -> StarResiduals:
+        """Reported stars against those that are lit at an attitude (w, x, y, z)."""
+        lit = lit_at(q_icrs_to_cam, self._stars, self._tracker, self._faintest_e_per_s)
+        x_px, y_px = self._display.pixels_from(self._tracker, lit.x_px, lit.y_px)
+        covered = np.flatnonzero(self._display.contains_px(x_px, y_px))
+        return judge_stars(reported, lit.some(covered), self.size_px)
 
 
 def _stands_alone(lit: LitStars, size_px: tuple[int, int]) -> BoolArray:

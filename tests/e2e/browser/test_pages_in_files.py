@@ -27,15 +27,8 @@ def session(tmp_path_factory):
     (folder / "bench.toml").write_text(bench_text(TWIN))
     (folder / "truth.toml").write_text(bench_text(TWIN, {"monitor": {"flip_x": True}}) + WARM_UP)
     done = run_hilstar_here(
-        "first-light",
-        folder / "bench.toml",
-        "-o",
-        folder / "s",
-        "--virtual",
-        folder / "truth.toml",
-        "--patches",
-        0,
-        "--json",
+        f"first-light {folder}/bench.toml -o {folder}/s --virtual {folder}/truth.toml "
+        "--patches 0 --json"
     )
     assert done.returncode == 0, done.stderr
     return folder / "s" / "first-light.html", json.loads(done.stdout)["steps"]

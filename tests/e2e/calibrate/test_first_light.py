@@ -386,16 +386,7 @@ def test_the_truth_that_comes_with_hilstar_is_found(tmp_path):
     """
     shutil.copy(resource_path("configs", "demo.toml"), tmp_path / "bench.toml")
     result = run_hilstar_here(
-        "first-light",
-        "bench.toml",
-        "-o",
-        "s",
-        "--virtual",
-        "truth-example.toml",
-        "--patches",
-        60,
-        "--json",
-        cwd=tmp_path,
+        "first-light bench.toml -o s --virtual truth-example.toml --patches 60 --json", cwd=tmp_path
     )
     assert result.returncode == 0, result.stderr
     steps = steps_by_name(result)

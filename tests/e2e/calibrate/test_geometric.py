@@ -73,10 +73,7 @@ def fitted(session):
         "--json",
     )
     result = run_hilstar_here(
-        "calibrate",
-        "geometric",
-        session / "bench.toml",
-        session / "observed.csv",
+        f"calibrate geometric {session}/bench.toml {session}/observed.csv",
         *wanted,
         "--plot",
         session / "geometry.png",

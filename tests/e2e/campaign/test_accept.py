@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.instruments.campaign.answer_figures import LIMIT_BIN_MAG
+from hilstar.instruments.assess.star_figures import LIMIT_BIN_MAG
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.star_light import bench_stars
 from tests.e2e.campaign.test_bench import answering

@@ -45,6 +45,16 @@ def test_an_attitude_of_a_log_s_gap_is_said_to_be_held(tmp_path, small_bench_fil
     assert (between["held"], in_gap["held"]) == (False, True)
 
 
+def test_the_rate_between_a_log_s_samples_is_in_degrees_about_the_camera_s_axes(
+    tmp_path, small_bench_file
+):
+    # A sky that turns by -2 degrees about z as the camera sees it: the camera turns by 2.
+    turns = Rotation.from_euler("z", [[0.0], [-2.0]], degrees=True)
+    rows = [(float(t_s), q) for t_s, q in enumerate(turns.as_quat(scalar_first=True).tolist())]
+    found = told_attitude(log_of(tmp_path, rows), "--time", 0.5, "--bench", small_bench_file)
+    assert found["rate_deg_s"] == pytest.approx([0.0, 0.0, 2.0], abs=ROUNDING_DEG)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_boresight_and_stars_are_those_that_an_independent_rotation_finds(
     tmp_path, small_bench_file, seed

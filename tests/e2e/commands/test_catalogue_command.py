@@ -53,15 +53,7 @@ def test_every_format_has_the_same_stars(faint_bench, tmp_path):
 
     for ending in ("csv", "fits", "vot", "parquet"):
         done = run_hilstar_here(
-            "catalogue",
-            faint_bench,
-            "-o",
-            tmp_path / f"s.{ending}",
-            "--faintest",
-            "2",
-            "--epoch",
-            "2030",
-            "--json",
+            f"catalogue {faint_bench} -o {tmp_path}/s.{ending} --faintest 2 --epoch 2030 --json"
         )
         assert (done.returncode, done.stderr) == (0, "")
         assert json.loads(done.stdout)["epoch_jyear"] == 2030

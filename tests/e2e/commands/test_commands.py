@@ -155,13 +155,7 @@ def test_a_deep_monitor_s_codes_are_16_bit_and_left_aligned(tmp_path, small_benc
 def test_clipped_stars_are_counted_and_named(tmp_path, small_bench_file):
     small_bench_file.write_text(SMALL_BENCH + "[render]\nflux_at_white_e_per_s = 5e5\n")
     result = run_hilstar_here(
-        "frame",
-        small_bench_file,
-        "--radec",
-        "84.057,-1.2,0",
-        "--truth",
-        tmp_path / "t.csv",
-        "--json",
+        f"frame {small_bench_file} --radec 84.057,-1.2,0 --truth {tmp_path}/t.csv --json"
     )
     clipped = json.loads(result.stdout)["clipped"]
     assert {ALNILAM, ALNITAK} <= set(clipped)
@@ -185,69 +179,52 @@ def test_the_average_model_can_be_chosen(tmp_path, small_bench_file):
     assert max(rates) / min(rates) == pytest.approx(1, rel=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["frame", "none.toml", "--radec", "1,2,3", "-o", "x.fits"], ["none.toml", "No such file"]),
-        (["frame", "BENCH", "-o", "x.fits"], ["--radec RA,DEC,ROLL", "--quaternion"]),
-        (["frame", "BENCH", "--radec", "1,2", "-o", "x.fits"], ["--radec 1,2", "RA,DEC,ROLL"]),
-        (["frame", "BENCH", "--radec", "1,95,0", "-o", "x.fits"], ["-90 to 90"]),
-        (["frame", "BENCH", "--quaternion", "1,1,1,1", "-o", "x.fits"], ["norm is 2"]),
-        (["frame", "BENCH", "--quaternion", "nan,0,0,1", "-o", "x.fits"], ["finite"]),
-        (["frame", "BENCH", "--radec", "1,2,3"], ["no output", "-o OUT.fits"]),
-        (
-            ["frame", "BENCH", "--radec", "1,2,3", "-o", "none/x.fits"],
-            ["none/x.fits", "cannot be written"],
-        ),
-        (
-            ["frame", "BENCH", "--radec", "1,2,3", "-o", "x.png"],
-            ["-o x.png", "a FITS file is written there", "write x.fits"],
-        ),
-        (
-            ["frame", "BENCH", "--radec", "1,2,3", "--truth", "x.fits"],
-            ["--truth x.fits", "CSV", "write x.csv"],
-        ),
-        (
-            ["frame", "BENCH", "--radec", "1,2,3", "--codes", "x.jpg"],
-            ["--codes x.jpg", "PNG", "write x.png"],
-        ),
-        (
-            ["serve", "BENCH", "--headless", "--frames", "1", "--ledger", "run.csv"],
-            ["--ledger run.csv", "write run.mcap"],
-        ),
-        (
-            ["frame", "BENCH", "--radec", "1,2,3", "--truth", "none/x.csv"],
-            ["none/x.csv", "cannot be written"],
-        ),
-        (
-            ["frame", "BENCH", "--radec", "1,2,3", "--codes", "none/x.png"],
-            ["none/x.png", "cannot be written"],
-        ),
-        (["replay", "BENCH", "none.csv", "--headless"], ["none.csv", "No such file"]),
-        (["replay", "BENCH", "LOG", "--headless", "--speed", "fast"], ["fast", "realtime"]),
-        (["send"], ["LOG or --spin"]),
-        (["send", "--spin", "w,1"], ["AXIS,DEG_PER_S"]),
-        (["send", "--spin", "z,1", "--to", "localhost"], ["tcp://HOST:PORT"]),
-        (["send", "--spin", "z,1", "--to", "tcp://127.0.0.1:70000"], ["tcp://HOST:PORT"]),
-        (["send", "--spin", "z,1", "--rate", "0"], ["--rate 0"]),
-        (["nonsense"], ["nonsense", "--help"]),
-        (["frame", "BENCH", "--quaternion", "1e308,1e308,0,0", "-o", "x.fits"], ["its norm is"]),
-        (["serve", "BENCH", "--headless", "--duration", "inf"], ["--duration"]),
-        (["send", "--spin", "z,1e300"], ["AXIS,DEG_PER_S"]),
-        (["send", "--spin", "z,1", "--rate", "1e-300"], ["--rate"]),
-        (["send", "--spin", "z,1", "--wait", "inf"], ["--wait"]),
-        (["frame"], ["BENCH.toml"]),
-        (["serve", "BENCH", "--headless", "--duration", "x"], ["--duration", "number"]),
-        (["serve", "BENCH", "--unknown"], ["--unknown"]),
-    ],
-)
-def test_a_wrong_command_gets_one_line_and_exit_code_2(
-    tmp_path, small_bench_file, arguments, words
-):
+WRONG = [
+    ("frame none.toml --radec 1,2,3 -o x.fits", ("none.toml", "No such file")),
+    ("budget none.toml", ("none.toml",)),
+    ("frame bench.toml -o x.fits", ("--radec RA,DEC,ROLL", "--quaternion")),
+    ("frame bench.toml --radec 1,2 -o x.fits", ("--radec 1,2", "RA,DEC,ROLL")),
+    ("frame bench.toml --radec 1,95,0 -o x.fits", ("-90 to 90",)),
+    ("frame bench.toml --quaternion 1,1,1,1 -o x.fits", ("norm is 2",)),
+    ("frame bench.toml --quaternion nan,0,0,1 -o x.fits", ("finite",)),
+    ("frame bench.toml --radec 1,2,3", ("no output", "-o OUT.fits")),
+    ("frame bench.toml --radec 1,2,3 -o none/x.fits", ("none/x.fits", "cannot be written")),
+    (
+        "frame bench.toml --radec 1,2,3 -o x.png",
+        ("-o x.png", "a FITS file is written there", "write x.fits"),
+    ),
+    ("frame bench.toml --radec 1,2,3 --truth x.fits", ("--truth x.fits", "CSV", "write x.csv")),
+    ("frame bench.toml --radec 1,2,3 --codes x.jpg", ("--codes x.jpg", "PNG", "write x.png")),
+    (
+        "serve bench.toml --headless --frames 1 --ledger run.csv",
+        ("--ledger run.csv", "write run.mcap"),
+    ),
+    ("frame bench.toml --radec 1,2,3 --truth none/x.csv", ("none/x.csv", "cannot be written")),
+    ("frame bench.toml --radec 1,2,3 --codes none/x.png", ("none/x.png", "cannot be written")),
+    ("replay bench.toml none.csv --headless", ("none.csv", "No such file")),
+    ("replay bench.toml log.csv --headless --speed fast", ("fast", "realtime")),
+    ("send", ("LOG or --spin",)),
+    ("send --spin w,1", ("AXIS,DEG_PER_S",)),
+    ("send --spin z,1 --to localhost", ("tcp://HOST:PORT",)),
+    ("send --spin z,1 --to tcp://127.0.0.1:70000", ("tcp://HOST:PORT",)),
+    ("send --spin z,1 --rate 0", ("--rate 0",)),
+    ("nonsense", ("nonsense", "--help")),
+    ("frame bench.toml --quaternion 1e308,1e308,0,0 -o x.fits", ("its norm is",)),
+    ("serve bench.toml --headless --duration inf", ("--duration",)),
+    ("send --spin z,1e300", ("AXIS,DEG_PER_S",)),
+    ("send --spin z,1 --rate 1e-300", ("--rate",)),
+    ("send --spin z,1 --wait inf", ("--wait",)),
+    ("frame", ("BENCH.toml",)),
+    ("serve bench.toml --headless --duration x", ("--duration", "number")),
+    ("serve bench.toml --unknown", ("--unknown",)),
+]
+
+
+@pytest.mark.parametrize(("command", "words"), WRONG, ids=[command for command, _ in WRONG])
+def test_a_wrong_command_gets_one_line_and_exit_code_2(tmp_path, command, words):
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH)
     (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n0,1,0,0,0\n")
-    places = {"BENCH": small_bench_file, "LOG": tmp_path / "log.csv"}
-    result = run_hilstar_here(*(places.get(a, a) for a in arguments), cwd=tmp_path)
-    assert_refused(result, 2, *words)
+    assert_refused(run_hilstar_here(command, cwd=tmp_path), 2, *words)
 
 
 def test_a_log_with_nan_is_refused_with_its_line(tmp_path, small_bench_file):
@@ -375,15 +352,8 @@ def test_replay_writes_the_frames_of_a_log(tmp_path, small_bench_file):
         rows.append(",".join(map(repr, [k * 0.1, *map(float, q)])))
     (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
     result = run_hilstar_here(
-        "replay",
-        small_bench_file,
-        tmp_path / "log.csv",
-        "--headless",
-        "--speed",
-        "max",
-        "-o",
-        tmp_path / "out",
-        "--json",
+        f"replay {small_bench_file} {tmp_path}/log.csv --headless --speed max -o "
+        f"{tmp_path}/out --json"
     )
     assert result.returncode == 0, result.stderr
     summary = json.loads(result.stdout)

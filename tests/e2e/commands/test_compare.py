@@ -27,14 +27,7 @@ def golden(tmp_path_factory):
     (folder / "bench.toml").write_text(SMALL_BENCH)
     paths = folder / "golden.fits", folder / "golden.csv"
     result = run_hilstar_here(
-        "frame",
-        folder / "bench.toml",
-        "--radec",
-        "84.057,-1.2,0",
-        "-o",
-        paths[0],
-        "--truth",
-        paths[1],
+        f"frame {folder}/bench.toml --radec 84.057,-1.2,0 -o {paths[0]} --truth {paths[1]}"
     )
     assert result.returncode == 0, result.stderr
     return paths

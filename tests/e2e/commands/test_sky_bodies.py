@@ -44,15 +44,7 @@ def read_rows(path: Path) -> list[dict[str, str]]:
 def frame_of_radec(bench_file: Path, radec: str, *more: str) -> tuple[dict, list[dict[str, str]]]:
     folder = bench_file.parent
     done = run_hilstar_here(
-        "frame",
-        bench_file,
-        "--radec",
-        radec,
-        "--truth",
-        folder / "t.csv",
-        "-o",
-        folder / "f.fits",
-        "--json",
+        f"frame {bench_file} --radec {radec} --truth {folder}/t.csv -o {folder}/f.fits --json",
         *more,
     )
     assert done.returncode == 0, done.stderr
@@ -102,13 +94,8 @@ def test_the_sun_in_view_overflows_nothing(bodies_file):
     """
     for path, command in (("s.fits", ("simulate", "-o")), ("c.png", ("frame", "--codes"))):
         done = run_hilstar_here(
-            command[0],
-            bodies_file,
-            "--radec",
-            "236.056,-19.779,0",
-            command[1],
-            bodies_file.parent / path,
-            "--json",
+            f"{command[0]} {bodies_file} --radec 236.056,-19.779,0 {command[1]} "
+            f"{bodies_file.parent}/{path} --json"
         )
         assert done.returncode == 0, done.stderr
         assert "Sun" in json.loads(done.stdout)["clipped"]
@@ -163,15 +150,7 @@ def test_a_run_s_ledger_replays_bodies_bit_for_bit_and_summaries_name_what_clips
     (folder / "log.csv").write_text("\n".join(["t_s,qw,qx,qy,qz", *rows]) + "\n")
     more = ("--headless", "--speed", "max", "--json")
     first = run_hilstar_here(
-        "replay",
-        bodies_file,
-        folder / "log.csv",
-        "--step",
-        "60",
-        "--ledger",
-        folder / "run.mcap",
-        "-o",
-        folder / "a",
+        f"replay {bodies_file} {folder}/log.csv --step 60 --ledger {folder}/run.mcap -o {folder}/a",
         *more,
     )
     assert first.returncode == 0, first.stderr
@@ -384,16 +363,7 @@ def test_a_message_with_dates_is_replayed_on_them(bodies_file):
     bodies_file.write_text(bodies_file.read_text().replace("2026-11-21T00:00:00Z", "source"))
     log = moon_message(bodies_file.parent / "log.aem", "TAI")
     done = run_hilstar_here(
-        "replay",
-        bodies_file,
-        log,
-        "--headless",
-        "--speed",
-        "max",
-        "--step",
-        "30",
-        "--json",
-        "--explain",
+        f"replay {bodies_file} {log} --headless --speed max --step 30 --json --explain"
     )
     assert done.returncode == 0, done.stderr
     assert "Moon: 1897" in done.stderr

@@ -28,13 +28,7 @@ def map_files(tmp_path):
 
 def mapped_psf(folder, *options):
     return run_hilstar_here(
-        "optics",
-        "map",
-        folder / "stack.fits",
-        folder / "points.csv",
-        "-o",
-        folder / "psf.fits",
-        *options,
+        f"optics map {folder}/stack.fits {folder}/points.csv -o {folder}/psf.fits", *options
     )
 
 

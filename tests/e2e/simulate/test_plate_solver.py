@@ -109,14 +109,7 @@ def fields(tmp_path_factory) -> dict[str, list[np.ndarray]]:
     for attitude in ATTITUDES:
         radec = ",".join(map(str, attitude))
         result = run_hilstar_here(
-            "frame",
-            "bench.toml",
-            f"--radec={radec}",
-            "-o",
-            "f.fits",
-            "--codes",
-            "f.png",
-            cwd=folder,
+            f"frame bench.toml --radec={radec} -o f.fits --codes f.png", cwd=folder
         )
         assert result.returncode == 0, result.stderr
         images["linear"].append(fits.getdata(folder / "f.fits").astype(np.float64))

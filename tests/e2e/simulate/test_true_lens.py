@@ -115,14 +115,7 @@ def test_a_virtual_tracker_has_its_flight_model_in_truth_pixels_and_header(tmp_p
     ideal = tmp_path / "ideal" / "bench.toml"
     ideal.write_text(path.read_text())
     run_hilstar_here(
-        "simulate",
-        ideal,
-        "--radec",
-        "84.057,-1.2,0",
-        "--noise",
-        "none",
-        "-o",
-        tmp_path / "ideal.fits",
+        f"simulate {ideal} --radec 84.057,-1.2,0 --noise none -o {tmp_path}/ideal.fits"
     )
     plain = {row["hip"]: row for row in fits.getdata(tmp_path / "ideal.fits", 1)}
     focal_px = TRACKER_MM * 1e3 / PITCH_UM

@@ -230,6 +230,8 @@ time.sleep(60)
         assert process.stdout is not None
         child = int(process.stdout.readline())
         assert "wire.apart_child" in Path(f"/proc/{child}/cmdline").read_text()
+        # a terminal's Ctrl-C is for the process that shows stars, which then ends this one
+        assert os.getsid(child) == child
         process.kill()
     wait_for(lambda: not _lives(child), "it ends too")
 

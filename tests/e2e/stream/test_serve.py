@@ -189,16 +189,7 @@ def test_hilstar_send_is_heard_by_serve_that_binds(tmp_path):
     port = free_port()
     with serving(tmp_path, port, attitude="bind = true") as process:
         sent = run_hilstar(
-            "send",
-            "--spin",
-            "z,1.5",
-            "--rate",
-            "200",
-            "--count",
-            "300",
-            "--to",
-            f"tcp://127.0.0.1:{port}",
-            "--connect",
+            f"send --spin z,1.5 --rate 200 --count 300 --to tcp://127.0.0.1:{port} --connect"
         )
         assert sent.returncode == 0, sent.stderr
         assert "300 packets sent" in sent.stderr

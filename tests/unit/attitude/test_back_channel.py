@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import zmq
 
 from hilstar.attitude.clock.sender_clock import MIN_EXCHANGES, Exchange
 from hilstar.attitude.clock.timeline import Policy, Timeline
@@ -26,10 +27,14 @@ from hilstar.attitude.wire.packet import (
     Status,
     TimeReply,
     TimeRequest,
+    decode,
     encode,
 )
 from hilstar.attitude.wire.protocol import HEALTH_MISSED, HEALTH_REFUSED, HEALTH_STALE
+from hilstar.attitude.wire.zmq_links import ZmqLockstep
+from hilstar.basics.process.scheduling import HOST_CLOCK
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from tests.support.waiting import wait_for
 
 NOW_NS = 10**12
 SENDER_AHEAD_NS = 7 * NS_PER_S
@@ -124,6 +129,19 @@ def test_a_reply_completes_its_own_request_once_on_continuous_times():
     assert back.exchange(reply, t4_ns, 0) is None
 
 
+def test_a_reply_to_another_program_s_request_of_the_same_number_is_none():
+    """Two that ask one sender both count from 1, by clocks of their own."""
+    link = Wire()
+    back = BackChannel(link, Traffic(time_requests=True))
+    back.talk(NOW_NS, ask=True)
+    (request,) = link.sent
+    for t1_ns in (request.t1_ns + 1, request.t1_ns - NS_PER_S):
+        reply = TimeReply(request.sequence, t1_ns, 500, 600)
+        assert back.exchange(reply, request.t1_ns + NS_PER_S, 0) is None
+    own = TimeReply(request.sequence, request.t1_ns, 500, 600)
+    assert back.exchange(own, request.t1_ns + NS_PER_S, 0) is not None
+
+
 def test_a_request_of_the_sender_is_answered_with_its_own_time_and_the_arrival():
     link = Wire()
     BackChannel(link, QUIET, lambda: NOW_NS).answer(
@@ -174,3 +192,19 @@ def test_a_sender_that_answers_is_synchronised_within_what_the_summary_states():
     assert told.mode == "exchange"
     assert told.exchanges >= MIN_EXCHANGES
     assert told.offset_ms == pytest.approx(-SENDER_AHEAD_NS / NS_PER_MS, abs=told.uncertainty_ms)
+
+
+def test_in_lockstep_a_time_request_is_answered_with_when_it_came_and_when_the_answer_left():
+    """Both between the asker's own readings, in this order; it is no request for a frame."""
+    context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
+    with ZmqLockstep("tcp://127.0.0.1:*") as link, context.socket(zmq.REQ) as asker:
+        asker.setsockopt(zmq.LINGER, 0)
+        asker.connect(link.endpoint)
+        asked_ns = HOST_CLOCK.now_ns()
+        asker.send(encode(TimeRequest(3, 4)))
+        wait_for(lambda: link.receive(20) or asker.poll(0))
+        reply = decode(asker.recv())
+        assert isinstance(reply, TimeReply)
+        assert (reply.sequence, reply.t1_ns) == (3, 4)
+        assert asked_ns < reply.t2_ns < reply.t3_ns < HOST_CLOCK.now_ns()
+    context.term()

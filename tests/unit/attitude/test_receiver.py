@@ -802,3 +802,30 @@ def test_a_clock_that_agrees_for_half_a_second_is_not_believed_yet():
         return ahead + Sender(first=2000).packets(t0, seconds(3, 3.5))
 
     assert ReceiverRun(make, SHARED).events == {"clock-not-shared": 1}
+
+
+@pytest.mark.parametrize("late_s", [0.6, None], ids=["late", "lost"])
+@pytest.mark.parametrize("begins_s", [2.1, 2.4, 2.7, 3.0])
+def test_a_packet_is_told_as_lost_once_it_has_not_come_for_a_second(begins_s, late_s):
+    """Whenever it is late, between two looks or over one of them."""
+    clock = Clock()
+    arrivals = Sender().packets(clock.now_ns + LEAD_NS, seconds(0, 6, NS_PER_S // 20))
+    late = arrivals.pop(round(20 * begins_s))
+    if late_s is not None:
+        came = replace(late, host_ns=late.host_ns + round(late_s * NS_PER_S))
+        arrivals = sorted([*arrivals, came], key=lambda arrival: arrival.host_ns)
+    link = Script(arrivals, clock)
+    timeline = Timeline(Policy(STALE_AFTER_NS, STALE_AFTER_NS))
+    receiver = Receiver(link, timeline, notices=Notices(), now_ns=clock)
+    told: list[tuple[int, float]] = []
+    receiver.tell_lost = lambda count: told.append((count, clock.now_ns - late.host_ns))
+    receiver.learn()
+    while not link.done.is_set():
+        receiver.listen()
+    receiver.release()
+    if late_s is not None:
+        assert told == []
+    else:
+        ((count, after_ns),) = told
+        assert count == 1
+        assert NS_PER_S <= after_ns <= 2.2 * NS_PER_S

@@ -49,3 +49,12 @@ def test_what_lies_beyond_the_bins_is_counted_in_the_last():
         statistics.add(value)
     assert statistics.percentiles().max == 1e15
     assert statistics.percentile(50) == pytest.approx(1.0, rel=RELATIVE)
+
+
+def test_no_percentile_is_above_the_largest_value(rng):
+    """Which is exact, where a percentile is the middle of its bin."""
+    for value in [*rng.uniform(0.1, 100.0, 50), *-rng.uniform(0.1, 100.0, 50), 0.0]:
+        statistics = RunningStatistics()
+        for one in (value, value - 1e3):
+            statistics.add(one)
+        assert statistics.percentile(99) <= statistics.percentile(100) <= statistics.max == value

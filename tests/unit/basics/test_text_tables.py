@@ -12,7 +12,7 @@ import pytest
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import warn_once
 from hilstar.basics.text_tables import open_table, read_rows
-from hilstar.basics.units import factor, plain_unit
+from hilstar.basics.units import DIMENSIONS, factor, plain_unit
 from tests.support.refusals import refusal
 
 LIMIT = 1_000_000
@@ -231,6 +231,38 @@ def test_columns_know_their_names_and_units(table_file):
 )
 def test_units_as_people_spell_them(unit, wanted, size):
     assert float(factor(unit, wanted)) == pytest.approx(size, rel=1e-15)
+
+
+# in the first unit of each kind: the SI brochure's definitions, a Julian year apart, which is in both
+SIZES = {
+    **{"s": 1, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60, "h": 3600, "d": 86_400},
+    **{"nm": 1, "a": 0.1, "um": 1e3, "mm": 1e6, "cm": 1e7, "m": 1e9},
+    **{"deg": 1, "hourangle": 15, "rad": 180 / np.pi, "arcmin": 1 / 60, "arcsec": 1 / 3600},
+    **{"mas": 1 / 3.6e6, "uas": 1 / 3.6e9},
+    **{"rad/s": 1, "mrad/s": 1e-3, "urad/s": 1e-6, "rad/ms": 1e3, "rpm": 2 * np.pi / 60},
+    **{"deg/s": np.pi / 180, "mdeg/s": np.pi / 180e3, "deg/min": np.pi / 180 / 60},
+    **{"deg/h": np.pi / 180 / 3600, "arcmin/s": np.pi / 180 / 60},
+    "arcsec/s": np.pi / 180 / 3600,
+    **{"mas/yr": 1, "uas/yr": 1e-3, "arcsec/yr": 1e3, "arcmin/yr": 6e4, "deg/yr": 3.6e6},
+    **{"1": 1, "%": 1e-2, "permille": 1e-3, "px": 1, "mag": 1, "mmag": 1e-3},
+}
+
+
+def test_every_unit_has_its_size_by_the_si():
+    """Each spelling of a unit has the same one."""
+    seen = set()
+    for dimension in DIMENSIONS:
+        first = next(iter(dimension)).split()[0]
+        for spellings in dimension:
+            (name,) = [
+                name
+                for name in spellings.split()
+                if name in SIZES and (first, name) != ("deg", "h")
+            ]
+            seen.add(name)
+            for spelling in spellings.split():
+                assert float(factor(spelling, first)) == pytest.approx(SIZES[name], rel=1e-14)
+    assert seen == SIZES.keys()
 
 
 def test_units_of_another_kind_have_no_factor():

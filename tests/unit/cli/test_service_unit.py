@@ -38,14 +38,23 @@ def keys_of(text: str) -> dict[str, str]:
     )
 
 
+def as_systemd_reads(line: str) -> list[str]:
+    """The words of a command line of a unit, in which $$ is $ and %% is %; one alone stands for
+    something else.
+    """
+    single = line.replace("$$", "").replace("%%", "")
+    assert "$" not in single
+    assert "%" not in single
+    return shlex.split(line.replace("$$", "$").replace("%%", "%"))
+
+
 def test_the_unit_serves_the_bench_and_is_watched_and_started_again(service_bench):
     result = install(service_bench, "--", "--console", "--ledger", "a b$c%d-{utc}.mcap")
     assert result.returncode == 0, result.stderr
     path = service_bench.parent / "config" / "systemd" / "user" / "hilstar-room7.service"
     assert result.stdout == f"{path}\n"
     keys = keys_of(path.read_text())
-    # As systemd reads it: $$ is $, %% is %.
-    words = shlex.split(keys["ExecStart"].replace("$$", "$").replace("%%", "%"))
+    words = as_systemd_reads(keys["ExecStart"])
     assert words[-5:] == [
         str(service_bench),
         "--console",

@@ -112,6 +112,19 @@ def test_too_little_memory_is_the_machine_s_fault_and_no_input_s(monkeypatch):
     assert done.stderr == "hilstar: not enough memory for this; give smaller files or sizes\n"
 
 
+def test_a_file_that_went_away_is_named_in_one_line(monkeypatch, tmp_path):
+    def without_its_file(words):
+        (tmp_path / "gone").read_text()
+
+    monkeypatch.setattr(entry, "run", without_its_file)
+    done = run_hilstar_here("doctor")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        f"hilstar: {tmp_path}/gone: cannot be written or read (No such file or directory);"
+        " choose another place\n"
+    )
+
+
 def test_send_s_jitter_is_milliseconds(monkeypatch):
     given = []
     made = send_log.Faults

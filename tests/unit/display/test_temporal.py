@@ -248,3 +248,13 @@ def test_stars_over_each_other_are_right_together(rng):
         lit = sky.sum((1, 2)) > 0
         flux = 2.5 * np.log10(mean.sum((1, 2))[lit] / sky.sum((1, 2))[lit])
         assert np.sqrt(np.mean(flux**2)) < AIM_MAG
+
+
+def test_each_star_carries_over_so_many_of_its_own_largest_step():
+    """Of a dim pixel beside a bright one, and of a faint star's panel steps beside a bright one's."""
+    quantiser = TemporalQuantiser(Panel(linear(8), WHITE), SIZE, GaussianPsf(SIGMA))
+    steps = np.array([[1.0, 10.0, 0.5], [2.0, 5.0, 0.0]], dtype=np.float32)
+    error = np.array([[1e6, 1e6, 1e6], [-1e6, -1e6, -1e6], [3.0, 3.0, 3.0]], dtype=np.float32)
+    most = MAX_CARRIED_STEPS * np.array([2.0, 10.0, 0.5])
+    kept = quantiser._bounded(error, steps)
+    np.testing.assert_allclose(kept, [most, -most, np.minimum(3.0, most)], rtol=1e-6)

@@ -102,6 +102,15 @@ def test_other_stars_lights_observers_and_cameras_are_not_mistaken(dense_sky, rn
             assert_same_light(kept, make_sprites(stars, turn, seen_by, FOOTPRINT))
 
 
+def test_a_wider_margin_is_looked_through_anew(dense_sky):
+    """As by a PSF of a larger footprint on the same camera."""
+    camera, candidates, turn = camera_of(200.0), Candidates(), np.eye(3)
+    found = [len(candidates.near(dense_sky, turn, camera, px).star) for px in (6.0, 900.0, 6.0)]
+    fresh = [len(Candidates().near(dense_sky, turn, camera, px).star) for px in (6.0, 900.0)]
+    assert found == [fresh[0], fresh[1], fresh[0]]
+    assert fresh[1] > fresh[0]
+
+
 def test_bodies_that_move_in_the_arrays_are_looked_for_in_every_frame(dense_sky):
     camera, candidates, turn = camera_of(200.0), Candidates(), np.eye(3)
     bodies = with_bodies(dense_sky, ("Moon",), np.zeros(1))

@@ -20,6 +20,7 @@ from hilstar.optics.paths import (
     LIMIT_SHARE,
     TABLE_PX,
     TRIED_AXES,
+    Chords,
     Paths,
     ShortPaths,
     _excess,
@@ -235,3 +236,34 @@ def test_the_error_that_is_tried_is_that_of_all_places_on_the_image():
     """
     assert _excess(pinhole(200.0), 0.6, 3) > 10
     assert _excess(pinhole(200.0), 1e-5, 3) < 1
+
+
+NOWHERE = np.nan
+CHORDS_ON_IMAGE = {
+    "across": ([-60.0, 140.0], [20.0, 20.0], (0.25, 0.745)),
+    "down": ([30.0, 30.0], [-40.0, 160.0], (0.15, 0.545)),
+    "within": ([30.0, 40.0], [20.0, 25.0], (0.0, 1.0)),
+    "backwards": ([140.0, -60.0], [20.0, 20.0], (0.255, 0.75)),
+    "beside": ([-60.0, 140.0], [200.0, 200.0], None),
+    "at rest on it": ([30.0, 30.0], [20.0, 20.0], (0.0, 1.0)),
+    "at rest beside it": ([130.0, 130.0], [20.0, 20.0], None),
+    # which way it comes from behind is not known: it counts whole
+    "from behind the camera": ([NOWHERE, 40.0], [NOWHERE, 30.0], (0.0, 1.0)),
+    "to behind the camera": ([40.0, NOWHERE], [30.0, NOWHERE], (0.0, 1.0)),
+    "from behind to far beside": ([NOWHERE, 900.0], [NOWHERE, 30.0], None),
+    "behind the camera": ([NOWHERE, NOWHERE], [NOWHERE, NOWHERE], None),
+}
+
+
+@pytest.mark.parametrize("name", CHORDS_ON_IMAGE)
+def test_a_chord_is_drawn_where_it_is_on_the_image_or_beside_it_by_a_margin(name):
+    """Of an image of 80 x 60 px, whose edges lie half a pixel outside its outer pixels' middles,
+    and 9.5 px beside it: from -10 to 89 and to 69 px.
+    """
+    x_px, y_px, part = CHORDS_ON_IMAGE[name]
+    chords = Chords(np.array(x_px)[:, None], np.array(y_px)[:, None])
+    (begin,), (end,) = chords.on_image((80, 60), 9.5)
+    if part is None:
+        assert end <= begin
+    else:
+        assert (begin, end) == pytest.approx(part)

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from astropy import units
+from astropy.coordinates import get_sun
+from astropy.time import Time
 
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.optics.camera import Camera
@@ -15,12 +20,14 @@ from hilstar.optics.trails import (
     Lit,
     Trails,
     TrailView,
+    disc_of,
     sprite_counts,
     trails,
     with_trails,
 )
 from hilstar.sky.bodies.passes import Cone
 from tests.support.satellites import element_set, satellite_sky
+from tests.support.skies import STATION_UTC
 from tests.support.stars import sprites_at
 
 SIGMA_PX = (0.7, 0.9)
@@ -202,6 +209,22 @@ def test_beyond_what_an_image_may_cost_streaks_are_coarser_and_counted():
     fine, coarse = (trails(seen, view, lit, Brush(BRUSH.psf, most)) for most in (2000, 5))
     assert (len(coarse.sprites), coarse.sprites.capped, fine.sprites.capped) == (5, 1, 0)
     assert image_of(coarse.sprites).sum() == pytest.approx(image_of(fine.sprites).sum(), rel=0.02)
+    # beside three stars that are drawn coarser than they should be
+    stars = replace(
+        sprites_at(np.array([[5.0, 6.0]]), np.ones(1), BRUSH.psf.footprint_px), capped=3
+    )
+    assert [with_trails(stars, one, 100).capped for one in (fine, coarse)] == [3, 4]
+
+
+def test_the_sun_lights_a_satellite_s_disc_from_where_astropy_has_it():
+    sky, t_ns = lit_moment(LIST, "norad,size_m\n7,100\n")
+    seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns)
+    disc = disc_of(seen, "OTHER", 0.0, None)
+    utc = Time(STATION_UTC.removesuffix("Z"), scale="utc") + t_ns * 1e-9 * units.s
+    sun = get_sun(utc).cartesian.xyz.to_value("au")
+    # from the satellite within 10 arcsec; the Sun's aberration of 20 arcsec is in theirs
+    assert np.degrees(np.arccos(disc.sun @ sun / np.linalg.norm(sun))) < 0.01
+    assert disc.radius_rad == pytest.approx(0.05 / disc.distance_km)
 
 
 class StraightPass:

@@ -19,6 +19,7 @@ from hilstar.server.pacer import Moment, Shown
 from hilstar.server.screen.screen import DisplayPacer, DrawBudget, SwapClock
 from tests.support.benches import SMALL_BENCH
 from tests.support.fake_clock import FakeClock, WellGpu
+from tests.support.model_display import model_screen
 
 PERIOD_NS = 16_666_667
 FIRST_SWAP_NS = 1_000_000_000
@@ -200,6 +201,26 @@ def test_the_grid_follows_a_screen_that_runs_a_little_slower():
         clock.update(round(k * true_ns))
     assert clock.period_ns == pytest.approx(true_ns, rel=1e-6)
     assert clock.next_after(2000 * true_ns - 1e6) == pytest.approx(2000 * true_ns, abs=1000)
+
+
+def test_a_swap_some_periods_late_pulls_the_period_by_its_share_of_each():
+    """4 us over four periods are 1 us each, of which the loop takes 0.4 %; a tenth of all pulls
+    the phase.
+    """
+    clock = SwapClock(0, PERIOD_NS, True)
+    clock.update(4 * PERIOD_NS + 4000)
+    assert clock.period_ns == pytest.approx(PERIOD_NS + 4.0, abs=1e-6)
+    assert clock.next_after(4 * PERIOD_NS) == 4 * PERIOD_NS + 400
+
+
+def test_the_middle_row_lights_half_a_scan_out_and_the_panel_s_delay_after_the_swap(tmp_path):
+    screen, _ = model_screen(tmp_path, monitor="scanout_ms = 12.0\npanel_delay_ms = 3.0\n")
+    assert screen.swap_to_light_ns == 9_000_000
+    period_ns = round(screen.clock.period_ns)
+    # two frames held back are two refreshes later, however often that is said
+    for queued in (2, 2, 0):
+        screen.keep_ahead(1.0, queued)
+        assert screen.swap_to_light_ns == pytest.approx(9_000_000 + queued * period_ns, abs=2)
 
 
 def test_the_budget_is_a_period_until_frames_have_been_timed_and_then_passes_over_two_outliers():

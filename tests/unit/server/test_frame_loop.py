@@ -135,6 +135,17 @@ def test_no_two_frames_in_a_row_are_given_up(tmp_path):
     assert run.loop.tally.frames + run.loop.tally.missed_frames == 60
 
 
+def test_each_frame_says_how_many_slots_before_it_had_none_of_their_own(tmp_path, rng):
+    """Whatever they cost, given up or not, in a row or not: half of the frames take up to five
+    periods.
+    """
+    costs_periods = np.maximum(rng.uniform(-5, 5, 200), 0)
+    run = LoopRun(tmp_path, Limit(slots=200), lambda number: costs_periods[number] * PERIOD_NS)
+    assert run.loop.tally.given_up_frames > 10
+    without = np.diff(run.numbers) - 1
+    assert [frame.missed_before for frame in run.shown[1:]] == without.tolist()
+
+
 def test_a_run_ends_after_so_many_frames_whatever_was_missed(tmp_path):
     run = LoopRun(
         tmp_path, Limit(frames=10), lambda number: 1.5 * PERIOD_NS if number % 4 == 0 else 0

@@ -14,7 +14,7 @@ from hilstar.attitude.wire.serial_link import RtsLine
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.notices import Notices
 from hilstar.server.bench.config import SyncSettings
-from hilstar.server.frame_pulse import FramePulse
+from hilstar.server.frame_pulse import MIN_BACK_OFF_S, FramePulse
 from tests.support.rts_server import KeptLine
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -27,7 +27,7 @@ class Line(RtsLine):
     """RTS of a looped port in this process, that can be slow, and be lost."""
 
     def __init__(self, active_high=True):
-        self.kept, self.slow_s, self.gone = None, 0.0, False
+        self.kept, self.slow_s, self.gone, self.tries = None, 0.0, False, 0
         super().__init__("loop://", active_high)
 
     def set(self, active):
@@ -37,6 +37,7 @@ class Line(RtsLine):
         super().set(active)
 
     def open(self):
+        self.tries += 1
         if self.gone:
             raise OSError(2, "No such file or directory")
         super().open()
@@ -148,10 +149,14 @@ def test_a_line_that_is_lost_is_told_once_and_tried_until_it_is_back(kept):
     notices, line = Notices(), Line()
     with FramePulse(line, pulse_settings(), notices) as pulse:
         pulsed_frames(pulse, 2)
-        line.gone = True
+        line.gone, line.tries = True, 0
+        lost_s = time.monotonic()
         pulsed_frames(pulse, 10)
         wait_for(notices.counts, "the line is told to be lost")
         assert notices.counts() == {"sync-lost": 1}
+        # the pauses between tries double: 2^n - 1 of the first one are over before try n + 1
+        tries, gone_s = line.tries, time.monotonic() - lost_s
+        assert (2**tries - 1) * MIN_BACK_OFF_S <= gone_s
         line.gone = False
         deadline_s, number = time.monotonic() + PATIENCE_S, 12
         before = pulse.summary().pulses

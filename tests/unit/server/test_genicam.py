@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 import time
 from contextlib import closing
 
@@ -40,6 +41,11 @@ needs_aravis = pytest.mark.skipif(
     [
         (["Mono8", "Mono12", "Mono16"], 12, "Mono12"),
         (["Mono8", "Mono12Packed", "Mono12p"], 12, "Mono12Packed"),
+        (
+            ["Mono12p", "Mono12Packed", "Mono12"],
+            12,
+            "Mono12",
+        ),  # in whole bytes, whatever comes first
         (["Mono8", "Mono16"], 12, "Mono16"),
         (["Mono8", "Mono10"], 12, "Mono10"),
         (["RGB8", "BayerRG8", "BayerRG12"], 12, "BayerRG12"),
@@ -47,6 +53,35 @@ needs_aravis = pytest.mark.skipif(
 )
 def test_the_format_is_the_one_that_holds_the_detectors_bits(formats, bits, form):
     assert chosen_format(formats, bits) == form
+
+
+# A child that opens a camera of a test's own: it films two images of 2 rows of 3 pixels, 16 bits.
+FILMING = """
+import json, struct, sys
+print(json.dumps({"exposure_us": [10.0, 1e6]}), flush=True)
+for line in sys.stdin:
+    asked = json.loads(line)
+    first, last = asked["rows"] or (0, 2)
+    with open(asked["file"], "wb") as file:
+        for image in range(2):
+            for row in range(first, last):
+                file.write(struct.pack("<3H", *(1000 * image + 256 * row + k for k in range(3))))
+    answer = {"exposure_us": asked["exposure_us"], "format": "Mono16", "width": 3, "height": 2}
+    print(json.dumps(answer | {"frames": [[70, 5], [80, 16]], "incomplete": 1}), flush=True)
+"""
+
+
+@pytest.mark.parametrize(
+    ("rows", "codes"), [(None, [[0, 1, 2], [256, 257, 258]]), ((1, 2), [[256, 257, 258]])]
+)
+def test_a_film_of_two_bytes_a_pixel_is_the_rows_asked_for(monkeypatch, rows, codes):
+    monkeypatch.setattr(cameras, "child_command", lambda: [sys.executable, "-S", "-c", FILMING])
+    with GenicamCamera("") as camera:
+        film = camera.film(0.01, 0.1, rows)
+        images = np.array(film.dn)
+    np.testing.assert_array_equal(images, [codes, np.add(codes, 1000)])
+    assert (film.stamp_ns.tolist(), film.arrived_utc_ns.tolist()) == ([70, 80], [5, 16])
+    assert (film.exposure_s, film.incomplete) == (0.01, 1)
 
 
 def test_a_camera_of_colour_images_alone_is_refused():

@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import resource
 import shutil
 import time
 import zlib
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -25,12 +27,14 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.cli.options import parse_split
 from hilstar.server.bench.config import AttitudeSettings
+from hilstar.server.record import ledger as ledger_module
 from hilstar.server.record.ledger import (
     MAX_WAITING_BYTES,
     FloodFilter,
     Ledger,
     LedgerQueue,
     LedgerSwitch,
+    ProcessProbe,
     QueueEntry,
     SplitLimits,
 )
@@ -98,6 +102,7 @@ def test_a_ledger_goes_on_in_other_files_and_is_read_as_one(tmp_path, kept_bench
         wait_for((tmp_path / "run.0001.mcap").exists, "the next file")
         keep(ledger, 50, 100)
     assert len(parts_of(path)) >= 2
+    assert ledger.summary()["files"] == len(parts_of(path))
     assert [sample.sequence for sample in read_log(path)] == list(range(100))
     assert [frame.frame for frame in drawable_frames(path)] == list(range(100))
     assert [sample.sequence for sample in read_log(tmp_path / "run.0001.mcap")][-1] == 99 or len(
@@ -132,6 +137,77 @@ def test_a_disk_without_room_loses_frames_first_and_says_so_and_is_tried_again(
     assert ledger.summary()["unrecorded"] == 10
     assert [sample.sequence for sample in read_log(tmp_path / "run.mcap")] == list(range(20))
     assert [frame.frame for frame in drawable_frames(tmp_path / "run.mcap")] == list(range(10))
+
+
+def test_a_ledger_that_cannot_be_begun_leaves_nothing(tmp_path, kept_bench, monkeypatch):
+    """Neither a file that is half begun nor a descriptor of one."""
+
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(ledger_module, "McapWriter", full)
+    open_files = len(list(Path("/proc/self/fd").iterdir()))
+    assert "choose another place for the ledger" in refusal(
+        Ledger, tmp_path / "run.mcap", kept_bench
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["bench.toml"]
+    assert len(list(Path("/proc/self/fd").iterdir())) == open_files
+
+
+def disk_of(monkeypatch, free_bytes: int, total_bytes: int = 100_000_000_000) -> None:
+    """A disk with so much free for a user, in blocks of 4 kB; root has 5 GB more, and files are
+    read in pieces of 1 MB.
+    """
+    block = 4096
+    disk = SimpleNamespace(
+        f_frsize=block,
+        f_bsize=1 << 20,
+        f_blocks=total_bytes // block,
+        f_bavail=free_bytes // block,
+        f_bfree=(free_bytes + 5_000_000_000) // block,
+    )
+    monkeypatch.setattr(os, "fstatvfs", lambda fd: disk)
+
+
+def test_of_a_disk_that_fills_packets_have_the_last_64_mb_and_its_state_is_said(
+    tmp_path, kept_bench, monkeypatch
+):
+    monkeypatch.setattr(ledger_module, "EACH_S", 0.0)
+    disk_of(monkeypatch, 50_000_000_000)
+    notices, path = Notices(), tmp_path / "run.mcap"
+    with Ledger(path, kept_bench, notices) as ledger:
+        keep(ledger, 0, 10)
+        wait_for(lambda: len(list(drawable_frames(path))) == 10, "the first frames on the disk")
+        assert not notices.active
+        disk_of(monkeypatch, 9_900_000_000)
+        wait_for(lambda: notices.active, "a disk of which less than a tenth is free")
+        assert "disk-low" in notices.active and "ledger-thin" not in notices.active
+        disk_of(monkeypatch, 63_000_000)
+        wait_for(lambda: "ledger-thin" in notices.active)
+        keep(ledger, 10, 20)
+        wait_for(lambda: ledger.summary()["unrecorded"] == 10, "frames are not recorded")
+        disk_of(monkeypatch, 12_100_000_000)
+        wait_for(lambda: not notices.active, "there is room again")
+        keep(ledger, 20, 30)
+    assert [sample.sequence for sample in read_log(path)] == list(range(30))
+    assert [frame.frame for frame in drawable_frames(path)] == [*range(10), *range(20, 30)]
+    assert ledger.summary()["unrecorded"] == 10
+    assert notices.counts() == dict.fromkeys(
+        ("ledger-thin", "ledger-whole", "disk-low", "disk-well"), 1
+    )
+
+
+def test_a_process_s_memory_is_what_the_kernel_says_it_is():
+    """In kB of /proc/self/status, and not in pages; it may change between the two readings."""
+    probe = ProcessProbe()
+    cpu_s = time.process_time()
+    record = probe.record()
+    probe.close()
+    assert record is not None
+    status = Path("/proc/self/status").read_text()
+    (resident_kb,) = re.findall(r"VmRSS:\s+(\d+) kB", status)
+    assert record.resident_bytes == pytest.approx(1024 * int(resident_kb), rel=0.1)
+    assert cpu_s <= record.cpu_s <= time.process_time()
 
 
 def delete(path, _):

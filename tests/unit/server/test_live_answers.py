@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from types import SimpleNamespace
 
 import msgspec
 import numpy as np
+import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.basics.notices import Notices
@@ -89,8 +91,9 @@ def test_widths_of_stars_are_the_focus_and_stay_in_the_ledger():
 def test_answers_are_judged_recorded_and_told_beside_the_frames():
     source, kept, notices, clock = Queued(), Kept(), Notices(), FakeClock(NS_PER_S)
     answers = LiveAnswers(BENCH, RULES, source, notices, kept, clock=clock)
-    heard = []
+    heard, passed_on = [], []
     answers.heard = lambda live: heard.append(live.figures)
+    answers.passed_on = lambda answer, middle_ns: passed_on.append((answer.raw, middle_ns))
     at_ns = NS_PER_S // 2
     with answers.running():
         assert answers.figures.answers == 0 and answers.figures.silent == ""
@@ -112,6 +115,8 @@ def test_answers_are_judged_recorded_and_told_beside_the_frames():
         {"checksum": 2},
     )
     assert notices.counts() == {"wrong-answer": 1, "tracker-silent": 1}
+    # each is handed on as it was judged, whatever the verdict
+    assert passed_on == [(raw, at_ns) for raw in (b"\x01\xff", b"\x02", b"\x03")]
     right, wrong, invalid = kept.records
     assert (right.raw, right.verdict, right.stars, right.centroids) == (
         "01ff",
@@ -141,10 +146,11 @@ def test_answers_are_judged_recorded_and_told_beside_the_frames():
     assert types == {"integer", "string", "array", "boolean", "number"}
 
 
-def test_frames_that_an_operator_changed_are_no_sky_to_compare_with():
+@pytest.mark.parametrize("changed", [OnScreen(operator="grid"), OnScreen(hidden="minimised")])
+def test_frames_that_an_operator_changed_or_a_window_hides_are_no_sky_to_compare_with(changed):
     source = Queued()
     answers = LiveAnswers(BENCH, RULES, source, Notices(), Kept(), clock=FakeClock(NS_PER_S))
-    second_of_frames(answers, on_screen=OnScreen(operator="grid"))
+    second_of_frames(answers, on_screen=changed)
     source.waiting.append(Answer(NS_PER_S // 2, b"", NS_PER_S // 2, Q))
     with answers.running():
         wait_for(lambda: answers.figures.answers)
@@ -198,8 +204,10 @@ def test_a_reader_that_does_not_read_is_told_in_the_tracker_s_place():
     assert notices.counts() == {"answers-unread": 1, "answers-read": 1, "tracker-silent": 1}
 
 
-def test_an_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
-    """A sender whose clock is 7 s behind the host's."""
+def test_a_valid_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
+    """A sender whose clock is 7 s behind the host's. An answer without an attitude, or before that
+    clock is known, is not passed on.
+    """
     sent = []
     receiver = SimpleNamespace(
         clock_summary=lambda: SimpleNamespace(offset_ms=7000.0),
@@ -208,6 +216,10 @@ def test_an_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
     answer = Answer(20 * NS_PER_S, b"", None, np.array([1.0, 0.0, 0.0, 0.0]))
     serve._pass_on(receiver, iter([5]), answer, 12 * NS_PER_S)
     assert [(each.sequence, each.t_ns) for each in sent] == [(5, 5 * NS_PER_S)]
+    invalid = replace(answer, valid=False)
+    without_attitude = replace(answer, q_icrs_to_cam=None)
+    for other in (invalid, without_attitude):
+        serve._pass_on(receiver, iter([6]), other, 12 * NS_PER_S)
     receiver.clock_summary = lambda: SimpleNamespace(offset_ms=None)
     serve._pass_on(receiver, iter([6]), answer, 12 * NS_PER_S)
     assert len(sent) == 1

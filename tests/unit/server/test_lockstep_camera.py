@@ -11,7 +11,7 @@ import hilstar
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.server.loop import Limit
 from hilstar.server.serve import serve
-from tests.support.benches import SMALL_BENCH
+from tests.support.benches import bench_text
 
 
 class AskedForItsCamera:
@@ -27,14 +27,12 @@ class AskedForItsCamera:
 
 
 def test_a_simulation_s_camera_has_the_height_of_the_tracker_s_field(tmp_path):
-    """1024 rows of 13 um behind 70 mm: 10.86 degrees from edge to edge."""
+    """800 rows of 13 um behind 70 mm: 8.50 degrees from edge to edge, and more along a row."""
     path = tmp_path / "bench.toml"
-    path.write_text(SMALL_BENCH)
+    path.write_text(bench_text({"tracker": {"resolution_px": [1280, 800]}}))
     link = AskedForItsCamera()
     with hilstar.load(path) as bench:
-        tracker = bench.config.tracker
         serve(bench, link, Limit(frames=0))
-    height_mm = tracker.resolution_px[1] * tracker.pixel_pitch_um / 1000
-    wanted_deg = 2 * math.degrees(math.atan2(height_mm / 2, tracker.focal_length_mm))
+    wanted_deg = 2 * math.degrees(math.atan2(800 / 2 * 0.013, 70))
     assert link.camera.field_of_view_deg == pytest.approx(wanted_deg)
-    assert link.camera.resolution_px == tracker.resolution_px
+    assert link.camera.resolution_px == (1280, 800)

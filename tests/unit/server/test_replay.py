@@ -14,12 +14,22 @@ import pytest
 
 from hilstar.attitude.wire.packet import AttitudeSample, encode
 from hilstar.basics.errors import InputError
+from hilstar.basics.notices import Notices
+from hilstar.basics.wrong_sky import CLOCK, ENDS, RATES, WrongSky
 from hilstar.display.quantisers import QUANTISERS
 from hilstar.server.bench.config import AttitudeSettings, parse_config
 from hilstar.server.record import ledger_records
 from hilstar.server.record.ledger import Ledger
 from hilstar.server.record.ledger_records import FrameRecord
-from hilstar.server.replay import OTHER_CODES_BY_NUMPY, DrawnBy, Wanted, plan_play
+from hilstar.server.replay import (
+    OTHER_CODES_BY_NUMPY,
+    DrawnBy,
+    Wanted,
+    _recall_conditions,
+    plan_play,
+    replay,
+)
+from hilstar.server.serve import Outlet
 from tests.support.benches import SMALL_BENCH
 from tests.support.refusals import refusal
 
@@ -121,6 +131,49 @@ def test_a_span_and_a_step_choose_the_frames(roll_log, config):
         101.25,
         101.5,
     ]
+
+
+def test_a_part_has_its_own_first_frame_and_the_log_s_own_zero(roll_log, config):
+    """A scenario counts from the log's first sample, whichever part of it is shown."""
+    play = plan_play(roll_log, Wanted(start_s=0.5), config)
+    assert (play.first_ns, play.zero_ns) == (100_500_000_000, 100_000_000_000)
+
+
+@pytest.mark.parametrize("steps", range(1, 20))
+def test_a_span_of_whole_steps_has_a_frame_at_its_end(roll_log, config, steps):
+    """In binary 0.3 / 0.1 is less than 3."""
+    play = plan_play(roll_log, Wanted(MAX, 0.0, steps / 10, 0.1), config)
+    assert play.frame_count == steps + 1
+
+
+def test_a_stop_ends_a_replay_as_fast_as_possible(roll_log, bench_with):
+    bench = bench_with()
+    play = plan_play(roll_log, Wanted(MAX), bench.config)
+    runs, frames = [], []
+
+    def sink(shown):
+        frames.append(shown.number)
+        if shown.number == 3:
+            runs[0].loop.stop.set()
+
+    replay(bench, play, sink, Outlet(follower=runs.append))
+    assert frames == [0, 1, 2, 3]
+
+
+def test_a_wrong_sky_of_the_run_is_wrong_again_in_the_frames_that_had_it():
+    """Rates from 20 ms to 60 ms, a clock from 40 ms to 80 ms; an event is seen after it began."""
+    past = WrongSky()
+    past.see(RATES, "rates in deg/s", 30_000_000, since_ns=20_000_000)
+    past.see(CLOCK, "a clock ahead", 40_000_000)
+    past.see(ENDS[RATES], "", 60_000_000)
+    past.see(ENDS[CLOCK], "", 80_000_000)
+    notices, wrong = Notices(), []
+    for number in range(6):
+        at_ns = 20_000_000 * number
+        frame = FrameRecord(frame=number, t_ns=0, light_ns=0, draw_ns=at_ns, swap_ns=at_ns, q=None)
+        _recall_conditions(past, frame, notices)
+        wrong.append({condition.kind for condition in notices.wrong_sky.now()})
+    assert wrong == [set(), {RATES}, {RATES, CLOCK}, {CLOCK}, set(), set()]
 
 
 @pytest.mark.parametrize(

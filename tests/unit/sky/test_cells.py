@@ -7,6 +7,7 @@ import pytest
 
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.stars import CELL_DEG, PARTS, cell_grid, unit_vectors_icrs
+from tests.support.stars import stars_at
 
 
 @pytest.fixture(scope="module")
@@ -77,3 +78,20 @@ def test_every_star_within_reach_of_the_edges_planes_is_found_whatever_the_cells
         wanted = np.flatnonzero(is_wanted)
         found = grid.order[grid.near(np.array([0.0, 0.0, 1.0]), 1.5, edges, reach_rad)]
         assert np.isin(wanted, found).all()
+
+
+@pytest.mark.parametrize("speed_km_s", [30.0, 3000.0, 10_000.0])
+def test_an_observer_that_moves_fast_finds_every_star_that_is_seen_in_the_field(speed_km_s, rng):
+    """Ahead of it stars crowd: by aberration they come from 2 degrees outside at a thirtieth of the
+    speed of light.
+    """
+    at_rest = stars_at(rng.normal(size=(20_000, 3)), np.ones(20_000))
+    for _ in range(10):
+        ahead, axis = rng.normal(size=(2, 3))
+        velocity = speed_km_s * ahead / np.linalg.norm(ahead)
+        axis /= np.linalg.norm(axis)
+        stars = at_rest.seen_at(velocity)
+        seen = stars.directions(np.arange(len(stars)))
+        for radius_rad in (0.02, 0.3):
+            wanted = np.flatnonzero(seen @ axis >= np.cos(radius_rad))
+            assert np.isin(wanted, stars.near(axis, radius_rad)).all()

@@ -111,7 +111,16 @@ def test_a_curve_is_read_by_its_header_and_in_its_units(tmp_path, text, caplog):
     assert bool(caplog.text) == bool(CURVES[text])
 
 
+def test_a_curve_may_begin_below_what_a_tracker_sees_but_not_end_there(tmp_path):
+    (tmp_path / "qe.csv").write_text("wavelength_nm,value\n90,0\n100,0.1\n1100,0.2\n")
+    curve = load_curve("qe.csv", "[tracker] quantum_efficiency", tmp_path)
+    assert curve.wavelength_nm.tolist() == [90.0, 100.0, 1100.0]
+
+
 REFUSED = {
+    "wavelength_nm,value\n50,0.05\n99,0.01\n": (
+        "wavelengths from 50 to 99 nm by its column wavelength_nm, which no tracker sees"
+    ),
     "": "at least two rows",
     "wavelength_nm,value\n400,0.5\n": "at least two rows",
     "400,0.5\n300,0.5\n": "do not rise",

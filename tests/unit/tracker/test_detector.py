@@ -463,6 +463,21 @@ def test_dead_pixels_give_the_offset_and_hot_ones_their_share():
     assert (image[hot] - 2000.0).mean() == pytest.approx(5000.0, rel=SIGMAS / math.sqrt(hot.sum()))
 
 
+@pytest.mark.parametrize(("key", "across"), [("dead_row_fraction", 1), ("dead_column_fraction", 0)])
+def test_dead_rows_and_columns_are_whole_and_have_their_share(key, across):
+    live = DetectorSettings(gain_e_per_dn=1.0, bits=16, dark_e_per_s=50.0, prnu=0.01)
+    detector = Detector(replace(live, **{key: 0.2}), SIZE_PX)
+    image = detector.expose(flat_e(2000.0), 1.0, generator())
+    is_dead = (image == 0).any(axis=across)
+    lines = len(is_dead)
+    assert is_dead.sum() == pytest.approx(0.2 * lines, abs=SIGMAS * math.sqrt(0.2 * lines))
+    dead_lines = np.compress(is_dead, image, axis=1 - across)
+    assert not dead_lines.any()
+    live_lines = np.compress(~is_dead, detector.gain_map, axis=1 - across)
+    whole_lines = np.compress(~is_dead, Detector(live, SIZE_PX).gain_map, axis=1 - across)
+    np.testing.assert_array_equal(live_lines, whole_lines)
+
+
 def test_a_cmos_column_pattern_is_the_same_down_each_column():
     settings = DetectorSettings(
         gain_e_per_dn=0.1,

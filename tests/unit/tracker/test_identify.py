@@ -96,6 +96,19 @@ def test_noise_alone_is_no_attitude(sky, lost_in_space, rng):
     )
 
 
+@pytest.mark.parametrize(("right", "is_known"), [(5, False), (8, False), (15, True)])
+def test_half_of_what_is_found_has_to_be_the_catalogue_s(sky, rng, right, is_known):
+    """Of 20 spots in Orion: where fewer lie on stars, the others say that this is another field."""
+    q = np.array([0.6987226, 0.7135120, -0.0370377, 0.0362700])
+    seen = SeenSky(sky, q, rng, false=0)
+    wrong = 20 - right
+    x_px = np.append(seen.found.x_px[5 : 5 + right], rng.uniform(0, SIDE_PX, wrong))
+    y_px = np.append(seen.found.y_px[5 : 5 + right], rng.uniform(0, SIDE_PX, wrong))
+    rays = normalise(np.stack([x_px - 511.5, y_px - 511.5, np.full(20, FOCAL_PX)], axis=1))
+    known = identify(FoundStars(x_px, y_px, np.full(20, 1e5), rays), q, seen.near, seen.place)
+    assert (known is not None) is is_known
+
+
 @pytest.mark.parametrize("off_px", [0.5, 9.0])
 def test_an_expected_attitude_may_be_off_by_the_first_radius(sky, rng, off_px):
     q = normalise(rng.normal(size=4))

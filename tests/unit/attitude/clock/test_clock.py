@@ -97,6 +97,10 @@ def test_a_clock_that_jumps_is_carried_on_without_a_step(jump_ms):
     assert (run.accepted, run.refused) == (6000, 0)
     assert run.step_ms < 0.01
     assert np.abs(run.error_ms[200:] + MIN_DELAY_MS).max() < 0.01
+    # a moment's time by the sender's own clock, which has jumped
+    host_ns = HOST0_NS + 6000 * PERIOD_NS
+    own_ns = run.jumps.sender_ns(run.clock.to_sender_ns(host_ns))
+    assert (own_ns - host_ns) / NS_PER_MS == pytest.approx(jump_ms - MIN_DELAY_MS, abs=0.02)
 
 
 @pytest.mark.parametrize("ahead_s", [1, 3600, 10**9])

@@ -87,7 +87,7 @@ class ClockTruth:
         )
 
     def _compare(self, read_ns: int) -> None:
-        shown_ns = self.clock.to_sender_ns(read_ns) - self.jumps.correction_ns
+        shown_ns = self.jumps.sender_ns(self.clock.to_sender_ns(read_ns))
         told = self.clock.summary()
         self.host_ns.append(read_ns)
         self.error_ms.append((shown_ns - self.times(read_ns)) / NS_PER_MS)

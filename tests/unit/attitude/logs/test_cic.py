@@ -1,6 +1,4 @@
-"""CNES's CIC AEM, as the tools around VTS write it: the same attitudes as a CCSDS AEM, and what
-is refused.
-"""
+"""CNES's CIC AEM, as the tools around VTS write it: the same attitudes as a CCSDS AEM."""
 
 from __future__ import annotations
 
@@ -9,9 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.log_file import open_log
-from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_radec_roll_deg
-from tests.support.refusals import refusal
 from tests.support.sources.aem_messages import kvn
 from tests.support.sources.attitude_texts import cic_text
 
@@ -113,90 +109,3 @@ def test_several_segments_follow_each_other(cic_log):
     found = cic_log(WHOLE + second[second.index("META_START") :])
     assert [sample.discontinuity for sample in found.samples] == [False, False, True]
     assert np.diff([sample.t_ns for sample in found.samples])[1] == 86_400 * 10**9 - 10_250_000_000
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        (
-            "ATTITUDE_TYPE = QUATERNION",
-            "ATTITUDE_TYPE = EULER_ANGLE",
-            ":13: ATTITUDE_TYPE = EULER_ANGLE of a CIC AEM is not",
-        ),
-        (
-            "ATTITUDE_TYPE = QUATERNION",
-            "ATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = LAST",
-            ":14: QUATERNION_TYPE = LAST, where CIC has the real part first and writers differ",
-        ),
-        (
-            "ATTITUDE_TYPE = QUATERNION",
-            "ATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = LAST",
-            "add what its columns are: COMMENT q1, q2, q3, q0 (real part), or COMMENT q0 (real",
-        ),
-        (
-            "ATTITUDE_TYPE = QUATERNION",
-            "COMMENT q1 q2 q3 q0\nATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = FIRST",
-            ":15: QUATERNION_TYPE = FIRST, and a comment has the real part last",
-        ),
-        (
-            "ATTITUDE_TYPE = QUATERNION",
-            "ATTITUDE_TYPE = QUATERNION\nQUATERNION_TYPE = MIDDLE",
-            ":14: QUATERNION_TYPE = MIDDLE; write FIRST or LAST",
-        ),
-        (
-            "REF_FRAME_A = EME2000",
-            "REF_FRAME_A = LVLH",
-            "REF_FRAME_A = LVLH, REF_FRAME_B = SC_BODY_1; one must be",
-        ),
-        ("ATTITUDE_DIR = A2B", "", "ATTITUDE_DIR is missing in the metadata"),
-        ("ATTITUDE_DIR = A2B", "ATTITUDE_DIR = A2C", "ATTITUDE_DIR is A2C; write A2B or B2A"),
-        (
-            "ATTITUDE_DIR = A2B",
-            "ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A",
-            ":12: ATTITUDE_DIR appears twice",
-        ),
-        (
-            "ATTITUDE_DIR = A2B",
-            "ATTITUDE_DIRECTION = A2B",
-            ":11: ATTITUDE_DIRECTION is no keyword that is read here",
-        ),
-        ("CIC_AEM_VERS = 1.0", "CIC_AEM_VERS = 3.0", "CIC_AEM_VERS is 3.0; write 1.0 or 2.0"),
-        (
-            "60310 0.0",
-            "27028 0.0",
-            ":17: the day 27028 is no modified Julian day from 36115 (1957)",
-        ),
-        ("60310 0.0", "60310.5 0.0", ":17: the day 60310.5 is no whole number"),
-        ("60310 0.0", "60310 86401", ":17: 86401 are no seconds of a day"),
-        ("60310 0.0", "60310 -1", ":17: -1 are no seconds of a day"),
-        ("60310 0.0", "60310", "has 5 numbers; write the modified Julian day"),
-        (
-            "60310 0.0",
-            "60310 zero",
-            "write the modified Julian day, its seconds and the quaternion",
-        ),
-        ("60310 0.0", "60310 20", ":18: time does not increase"),
-        ("META_STOP", "", ":17: "),
-        (
-            "META_STOP",
-            "META_START",
-            ":15: META_START in the metadata; META_START and META_STOP take turns",
-        ),
-        (ALNILAM, "0.5 0.5 0.5 0.6", ":17: the quaternion's norm is 1.05357"),
-    ],
-)
-def test_what_is_wrong_is_refused_by_name_and_line(cic_log, old, new, words):
-    assert old in WHOLE
-    assert words in refusal(cic_log, WHOLE.replace(old, new))
-
-
-@pytest.mark.parametrize("text", [WHOLE.split("META_STOP", 1)[0], WHOLE.split("META_START", 1)[0]])
-def test_a_file_that_ends_before_its_data_is_refused(cic_log, text):
-    with pytest.raises(InputError, match=r"the file ends in its (metadata|header); is it cut off"):
-        cic_log(text)
-
-
-def test_angles_are_refused_by_their_type_and_not_by_their_count(cic_log):
-    angles = WHOLE.replace("ATTITUDE_TYPE = QUATERNION", "ATTITUDE_TYPE = EULER_ANGLE")
-    with pytest.raises(InputError, match=r":13: ATTITUDE_TYPE = EULER_ANGLE of a CIC AEM is not"):
-        cic_log(angles.replace(ALNILAM, "10.0 20.0 30.0"))

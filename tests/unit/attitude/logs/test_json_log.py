@@ -8,15 +8,14 @@ from typing import Any
 
 import pytest
 
-from hilstar.attitude.logs.json_lines import MAX_OBJECT_CHARACTERS
 from hilstar.attitude.logs.log_file import open_log
+from hilstar.attitude.logs.telemetry import read_telemetry
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import MAX_LINE_CHARACTERS
 
 ROWS: list[dict[str, Any]] = [
     {"t_ns": k * 10**7, "q": [0.5, -0.5, 0.5, 0.5], "note": 'a } " { [ \\'} for k in range(4)
 ]
-NOT_UNIT = {"t_ns": 10**9, "q": [1, 1, 0, 0]}
 
 
 @pytest.fixture
@@ -89,28 +88,25 @@ def test_an_attitude_is_left_out_however_its_program_writes_false(
     assert dict(log.told)["log-valid"].startswith("1 line is marked as not valid")
 
 
-REFUSED = {
-    lines([{**ROWS[0], "valid": "maybe"}]): ":1: valid is 'maybe'; write true or false",
-    lines([{**ROWS[0], "valid": None}]): ":1: valid is ",
-    json.dumps([*ROWS, NOT_UNIT]): ":1, object 5: the quaternion's norm is 1.41421",
-    json.dumps([*ROWS, NOT_UNIT], indent=0): ", object 5: the quaternion's norm is 1.41421",
-    lines(ROWS[:1])[:-30] + "\n" + lines(ROWS[1:]): ":1: ",
-    lines(ROWS[:1]) + "nonsense\n" + lines(ROWS[1:]): ":2: 'nonsense' is no JSON object; write",
-    "[[0, 1, 0, 0, 0],\n [1, 1, 0, 0, 0]]": "is no JSON object; write JSON lines, or an array",
-    json.dumps({"attitudes": ROWS}): ':1: key "t_ns" is there twice (an object without an end, or',
-    "{" * 3 * MAX_LINE_CHARACTERS: f":1: a JSON object of over {MAX_OBJECT_CHARACTERS} characters",
-    '{"a": "' + "x" * 3 * MAX_LINE_CHARACTERS: ":1: a JSON object of over",
-    "[]": ": contains no attitude",
-    "[" * MAX_LINE_CHARACTERS: ": contains no attitude",
-}
+def test_telemetry_has_the_stars_of_its_objects(tmp_path: Path) -> None:
+    path = tmp_path / "telemetry.jsonl"
+    many = [[1.5, 2.5, 3.0, 26311, 0.7]] * 400  # an answer longer than a message with an attitude
+    lines = [
+        {"t_ns": 1, "q": [1, 0, 0, 0], "mode": "tracking", "centroids": [[5, 6, None], [7, 8]]},
+        {"t_ns": 2, "valid": False, "centroids": [[9, 9]]},
+        {"t_ns": 3, "q": [1, 0, 0, 0], "centroids": many},
+        {"t_ns": 4, "q": [1, 0, 0, 0], "rate": [0.1, 0.2, 0.3]},
+    ]
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    telemetry = read_telemetry(path)
+    assert telemetry.t_ns.tolist() == [1, 3, 4]
+    assert list(telemetry.star_rows) == [[[5.0, 6.0, None], [7.0, 8.0]], many, []]
+    assert telemetry.rate_cam_rad_s is not None
+    assert telemetry.rate_cam_rad_s[2].tolist() == [0.1, 0.2, 0.3]
 
 
-@pytest.mark.parametrize("text", REFUSED, ids=range(len(REFUSED)))
-def test_what_is_no_attitude_is_refused_with_its_place(path: Path, text: str) -> None:
-    path.write_text(text)
-    with pytest.raises(InputError) as refusal:
-        open_log(path)
-    said = str(refusal.value)
-    assert said.startswith(f"{path}:")
-    assert REFUSED[text] in said
-    assert len(said.splitlines()) == 1
+def test_stars_of_another_form_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "telemetry.jsonl"
+    path.write_text('{"t_ns": 1, "q": [1, 0, 0, 0], "centroids": [["a", 2]]}\n')
+    with pytest.raises(InputError, match=r"telemetry.jsonl:1: .*write centroids as \[\[x_px"):
+        read_telemetry(path)

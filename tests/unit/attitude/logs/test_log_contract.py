@@ -101,6 +101,14 @@ def test_a_file_that_is_cut_anywhere_is_refused_in_one_line_or_gives_the_beginni
     assert_cuts_are_read(form.make(tmp_path), form, form.trials)
 
 
+@pytest.mark.parametrize("name", [*TEXTS, "an STK attitude file"])
+def test_a_text_that_is_cut_at_any_byte_is_refused_in_one_line_or_gives_the_beginning(
+    tmp_path, name
+):
+    path = FORMS[name].make(tmp_path)
+    assert_cuts_are_read(path, FORMS[name], len(path.read_bytes()))
+
+
 def spoil(path, form: LogFile, trials: int) -> None:
     """Spoil a file at random, and cut some of those."""
     samples = whole_samples(path, form)

@@ -81,12 +81,6 @@ def assert_same_samples(read, expected, rate_tolerance):
             assert error <= rate_tolerance * np.linalg.norm(other.rate_cam_rad_s)
 
 
-def log_refusal(path):
-    line = refusal(read_log, path)
-    assert line.startswith(str(path))
-    return line
-
-
 # Round trips
 
 
@@ -168,46 +162,6 @@ def test_csv_seconds_are_read_as_decimals_to_the_nearest_nanosecond(tmp_path, te
 def test_json_lines_may_begin_with_blank_lines(tmp_path):
     (tmp_path / "a.jsonl").write_text('\n  \n {"t_ns":5,"q":[1,0,0,0]}\n')
     assert read_log(tmp_path / "a.jsonl")[0].t_ns == 5
-
-
-@pytest.mark.parametrize(
-    ("text", "line", "word"),
-    [
-        ("", "", "no attitude"),
-        (HEAD, "", "no attitude"),
-        ("t_s,qw,qx,qy\n", ":1:", "qz"),
-        ("t_s,qw,qx,qy,qz,rx,rz\n", ":1:", "ry"),
-        (HEAD + "0,1,0,0,0\n1,nan,0,0,0\n", ":3:", "not finite"),
-        (HEAD + "nan,1,0,0,0\n", ":2:", "finite"),
-        (HEAD + "inf,1,0,0,0\n", ":2:", "finite"),
-        (HEAD + "0,1,0,0,0\n0,1,0,0,0\n", ":3:", "does not increase"),
-        (HEAD + "0,2,0,0,0\n", ":2:", "norm"),
-        (HEAD + "0,1,0,0\n", ":2:", "write finite numbers for t_s"),
-        (HEAD + "0,x,0,0,0\n", ":2:", "write finite numbers for t_s"),
-        (HEAD + "1e30,1,0,0,0\n", ":2:", "64 bits"),
-        (HEAD + "1e999999999,1,0,0,0\n", ":2:", "write finite numbers for t_s"),
-        (HEAD + "9223372036.854775808,1,0,0,0\n", ":2:", "64 bits"),
-        (FULL_HEAD + "0,1,0,0,0,1,,3,0,0\n", ":2:", "all of rx,ry,rz or none"),
-        (FULL_HEAD + "0,1,0,0,0,,,,1.5,0\n", ":2:", "whole number"),
-        (FULL_HEAD + "0,1,0,0,0,,,,1" + 30 * "0" + ",0\n", ":2:", "whole number"),
-        (FULL_HEAD + "0,1,0,0,0,,,,0,yes\n", ":2:", "0 or 1"),
-        (HEAD + 999 * "9" + ",y\n", ":2:", "write finite numbers for t_s"),
-        ('{"t_ns":1,"q":[1,0,0,0]}\n{"t_ns":2,"q":[NaN,0,0,0]}\n', ":2:", "NaN"),
-        ('{"t_ns":1,"q":[1,0,0,0]}\nnonsense\n', ":2:", "JSON"),
-        ('{"t_ns":1}\n', ":1:", "q"),
-        ("CCSDS_OEM_VERS = 2.0\n", "", "CCSDS_AEM_VERS is read"),
-        ("\n" * 5000 + "x\n", "", "t_s is missing"),
-        ("\xff\xfe", "", "contains no attitude"),  # UTF-16 of nothing
-        ("\x00\xff\xfe", "", "it is no text: line 1 has a byte 0x00"),
-    ],
-)
-def test_a_log_that_is_wrong_is_refused_with_its_line(tmp_path, text, line, word):
-    path = tmp_path / "log"
-    path.write_bytes(text.encode("latin-1"))
-    message = log_refusal(path)
-    assert f"{path}{line}" in message
-    assert word in message
-    assert len(message) < len(str(path)) + 300
 
 
 # Writing

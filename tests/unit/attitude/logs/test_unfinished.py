@@ -24,17 +24,6 @@ def test_blank_quaternions_at_the_beginning_are_left_out_with_a_notice(tmp_path)
     assert "t_ns 2000000000" in told.stdout
 
 
-def test_a_blank_quaternion_after_an_attitude_is_refused_as_a_dropout(tmp_path):
-    told = attitudes_of_text(tmp_path / "a.csv", f"t_s,qw,qx,qy,qz\n0,{ROW}\n1,,,,\n2,{ROW}\n")
-    assert told.returncode == 2
-    assert "a.csv:3" in told.stderr and "dropout" in told.stderr
-
-
-def test_a_row_with_a_part_of_a_quaternion_is_refused(tmp_path):
-    told = attitudes_of_text(tmp_path / "a.csv", "t_s,qw,qx,qy,qz\n0,1,,,\n")
-    assert told.returncode == 2 and "a.csv:2" in told.stderr
-
-
 @pytest.mark.parametrize(
     "names", ["wx,wy,wz", "omega_x,omega_y,omega_z", "p,q,r", "gyro_x,gyro_y,gyro_z"]
 )
@@ -65,9 +54,3 @@ def test_an_object_that_the_files_end_cuts_is_left_out_with_a_notice(tmp_path, t
     told = attitudes_of_text(tmp_path / "a.jsonl", text)
     assert told.returncode == 0
     assert "the last object has no end" in told.stderr
-
-
-def test_an_object_without_an_end_between_others_is_refused(tmp_path):
-    text = f'{OBJECT % 0}\n{{"t_ns":5,"q":[1,0,0,0]\n{OBJECT % 10**9}\n'
-    told = attitudes_of_text(tmp_path / "a.jsonl", text)
-    assert told.returncode == 2 and "a.jsonl:2" in told.stderr

@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import os
 import socket
+import time
 from collections.abc import Callable, Iterator
 from ipaddress import ip_address
 from pathlib import Path
@@ -14,9 +15,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilstar.attitude.wire.apart import (
+    ReaderProcess,
+    Record,
+    RecordStream,
+    pack,
+    process_state,
+    why_hung,
+)
+from hilstar.attitude.wire.apart_child import Wire, _ForwardedNotices, as_read
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
-from hilstar.attitude.wire.roads import ANSWERS, ByteRoad
+from hilstar.attitude.wire.roads import ANSWERS, MAX_READ_BYTES, ByteRoad, RawMessage
 from hilstar.attitude.wire.serial_link import SerialRoad
 from hilstar.attitude.wire.tcp import ACCEPT_EACH_S, TOLD_S, TcpRoad
 from hilstar.attitude.wire.udp import UdpRoad
@@ -346,3 +356,127 @@ def test_a_tracker_over_zeromq_that_vanishes_is_told_as_the_tracker_and_not_as_t
         assert (road.openings, road.reconnects) == (2, 1)
     far.vanish()
     assert notices.counts() == {"answers-lost": 1, "answers-back": 1}
+
+
+@pytest.mark.parametrize(
+    ("count", "had_waited", "timely"),
+    [(0, False, []), (1, False, [True]), (3, False, [False, False, True]), (1, True, [False])],
+)
+def test_of_what_was_read_together_only_what_woke_the_reader_did_not_wait(
+    count, had_waited, timely
+):
+    taken = [RawMessage(1000 + k, [b"%d" % k]) for k in range(count)]
+    stamped = as_read(taken, had_waited, 990)
+    assert [message.timely for message in stamped] == timely
+    waited_ns = [0 if is_timely else 10 + k for k, is_timely in enumerate(timely)]
+    assert [message.waited_ns for message in stamped] == waited_ns
+    assert [message.parts for message in stamped] == [message.parts for message in taken]
+
+
+@pytest.mark.parametrize(
+    ("is_starting", "state", "silent_s", "used_s", "why"),
+    [
+        (True, "R", 31.0, 20.0, "no sign of life for 30 s"),  # it imports for too long
+        (True, "S", 31.0, 0.0, "no sign of life for 30 s"),
+        (False, "S", 0.5, 0.0, "no sign of life for 0.4 s"),  # it waits for what never comes
+        (False, "D", 0.5, 0.0, "no sign of life for 0.4 s"),
+        (False, "R", 0.5, 0.1, ""),  # it may be waiting for a core
+        (False, "R", 2.9, 0.9, ""),
+        (False, "R", 3.1, 0.1, "no sign of life for 3 s"),  # for ever
+        (False, "R", 1.5, 1.1, "it took 1.1 s of a core over one message, and did not return"),
+    ],
+)
+def test_a_silent_reader_is_ended_unless_it_waits_for_a_core(
+    is_starting, state, silent_s, used_s, why
+):
+    assert why_hung(is_starting, state, silent_s, used_s) == why
+
+
+def test_what_a_process_does_and_its_own_cpu_time_are_those_of_proc():
+    """proc(5): the state is the third word, utime and stime the 14th and 15th, those of its children
+    the two after; the second may have blanks and brackets.
+    """
+    words = [
+        "4711",
+        "(a) name (b)",
+        "S",
+        *map(str, range(4, 14)),
+        "250",
+        "50",
+        "7000",
+        "8000",
+        "20",
+    ]
+    assert process_state(" ".join(words)) == ("S", 300 / os.sysconf("SC_CLK_TCK"))
+    state, own_s = process_state(Path("/proc/self/stat").read_text())
+    assert state == "R"
+    assert own_s == pytest.approx(time.process_time(), abs=0.1)
+
+
+def test_a_reader_that_fails_again_and_again_is_begun_anew_ever_more_seldom():
+    """One that says hello and ends; after a steady time it would be begun at once again."""
+    clock, notices = FakeClock(), Notices()
+    reader = ReaderProcess(notices, module="__hello__", clock=clock)
+    waits_s = []
+    while len(waits_s) < 4:
+        generation = reader.generation
+        wait_for(lambda: reader.wait(20) and not reader.take() and reader.trouble)
+        waits_s.append(reader._again.left_s)
+        assert "is being restarted" in reader.trouble
+        clock.sleep(waits_s[-1])
+        reader.wait(0)
+        assert reader.generation == generation + 1
+    reader.close()
+    assert waits_s == pytest.approx([0.05, 0.1, 0.2, 0.4])
+    assert notices.counts() == {"receiver-failed": 4}
+
+
+def test_what_another_order_brought_is_passed_over():
+    """A device that was let go may have sent something that is on its way."""
+    reader = ReaderProcess(Notices(), module="__hello__")
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        assert reader._wire is not None
+        reader._wire.close()
+        reader._wire = ours
+        for number in (1, 2):
+            reader.read(device=None)
+            assert reader._order.number == number
+        for order in (1, 2, 1, 0, 2):
+            theirs.sendall(pack(Record(order, RawMessage(order, [b"%d" % order]))))
+        assert [record.order for record in reader.take()] == [2, 2]
+        reader._wire = None
+    reader.close()
+
+
+def test_what_the_reader_counts_comes_once():
+    """As counts grow, by what they have grown since."""
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        notices = _ForwardedNotices(Wire(theirs), 3)
+        grown = []
+        for lost, flooded in ((1, 0), (1, 5), (1, 5), (2, 9)):
+            notices.link_counts.lost = lost
+            notices.link_counts.flooded = flooded
+            notices.count()
+            ours.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                grown += RecordStream().feed(ours.recv(9999))
+    assert [(one.counts.lost, one.counts.flooded) for one in grown] == [(1, 0), (0, 5), (1, 4)]
+
+
+def test_a_file_that_is_never_read_to_its_end_does_not_hide_the_one_in_its_place(tmp_path):
+    """It grows as fast as it is read; what was begun anew under its name is read from the next look
+    on, from its beginning.
+    """
+    path = tmp_path / "answers.txt"
+    path.write_bytes(b"")
+    with FileRoad(path) as road, path.open("ab") as growing:
+        growing.write(b"a" * (3 * MAX_READ_BYTES))
+        growing.flush()
+        path.rename(tmp_path / "old.txt")
+        path.write_bytes(b"anew")
+        (first,) = road.taken(0)
+        assert first.parts == [b"a" * MAX_READ_BYTES]
+        (second,) = road.taken(0)
+        assert second.parts == [b"anew"]

@@ -9,9 +9,13 @@ from contextlib import contextmanager
 
 import pytest
 
-from hilstar.attitude.wire.serial_link import SerialApart, SerialLink
+from hilstar.attitude.wire.likeness import MAX_LOOKED_AT
+from hilstar.attitude.wire.packet import Refusal
+from hilstar.attitude.wire.roads import RawMessage
+from hilstar.attitude.wire.serial_link import SerialApart, SerialDecoder, SerialLink
 from hilstar.basics.errors import InputError
 from hilstar.server.open_link import first_attitude
+from tests.support.senders import packet
 
 BAUD = 115_200
 WITHIN_S = 20.0
@@ -64,3 +68,13 @@ def test_a_silent_line_is_a_sender_that_did_not_start() -> None:
         pytest.raises(InputError, match="start the sender"),
     ):
         first_attitude(link, 0.2)
+
+
+def test_a_bare_packet_is_named_whatever_came_on_the_line_before() -> None:
+    """Its zeros cut it into frames that mean nothing: the newest bytes are looked at as they came."""
+    decoder = SerialDecoder()
+    decoder.whole(RawMessage(0, [b"\x01\x02\x00" * MAX_LOOKED_AT]))
+    *_, last = decoder.whole(RawMessage(1, [packet(1, 2) + b"\x05\x00"]))
+    event = decoder.event(last.parts[0])
+    assert isinstance(event, Refusal)
+    assert "a bare packet" in event.detail

@@ -4,7 +4,9 @@ loopback.
 
 from __future__ import annotations
 
+import ipaddress
 import socket
+import struct
 
 import pytest
 
@@ -18,10 +20,14 @@ from hilstar.attitude.wire.udp import (
     Credit,
     Datagrams,
     UdpLink,
+    UdpRoad,
+    filter_program,
 )
 from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import HostClock
 from hilstar.basics.units import NS_PER_S
 from tests.support.fake_clock import FakeClock
+from tests.support.refusals import refusal
 from tests.support.senders import packet
 
 ANYWHERE = bound_place("127.0.0.1:0", "", None)
@@ -45,6 +51,26 @@ def test_three_keys_say_one_place(bind, port, endpoint, place):
     assert str(bound_place(bind, port, endpoint)) == place
 
 
+@pytest.mark.parametrize(
+    ("bind", "port", "endpoint", "words"),
+    [
+        ("224.0.0.1:5560", "", None, "224.0.0.1 is not an address of one machine"),
+        ("[ff02::1]:5560", "", None, "ff02::1 is not an address of one machine"),
+        ("[::ffff:10.0.0.1]:5560", "", None, "is not an address of one machine"),
+        ("bench-pc:5560", "", None, "bench-pc is not an address of this machine"),
+        ("127.0.0.1:65536", "", None, "not a port"),
+        (None, 65536, None, "not a port"),
+        (None, "-1", None, "not a port"),
+        (None, "", "tcp://127.0.0.1:5560", "not a UDP endpoint"),
+        ("127.0.0.1:5560", 5561, None, "disagree"),
+        ("127.0.0.1", "", "udp://127.0.0.2:5560", "disagree"),
+        (False, "", None, "over UDP hilstar binds"),
+    ],
+)
+def test_what_is_no_place_of_this_machine_is_refused(bind, port, endpoint, words):
+    assert words in refusal(bound_place, bind, port, endpoint)
+
+
 def test_senders_are_admitted_by_address_and_network():
     assert AllowedSenders().admits("127.0.0.2") and AllowedSenders().admits("::1")
     assert not AllowedSenders().admits("10.0.0.1")
@@ -53,6 +79,115 @@ def test_senders_are_admitted_by_address_and_network():
         assert listed.admits(host), host
     for host in ("10.0.0.2", "127.0.0.1", "192.169.0.1", "::1", "fd00:0:0:1::1"):
         assert not listed.admits(host), host
+
+
+def ip_header(source: str, destination: str) -> bytes:
+    """An IP header: of version 4 (RFC 791, 3.1) or 6 (RFC 8200, 3)."""
+    packed = [ipaddress.ip_address(text).packed for text in (source, destination)]
+    if len(packed[0]) == 4:
+        return struct.pack(">BBHHHBBH4s4s", 0x45, 0, 28, 0, 0, 64, 17, 0, *packed)
+    return struct.pack(">IHBB16s16s", 6 << 28, 8, 17, 64, *packed)
+
+
+def admitted_by(program: bytes, header: bytes) -> bool:
+    """What classic BPF answers for a datagram: Linux's Documentation/networking/filter.rst, with
+    loads from SKF_NET_OFF on, which count from the IP header.
+    """
+    code = list(struct.iter_unpack("=HBBI", program))
+    accumulator = at = 0
+    while True:
+        operation, if_true, if_false, operand = code[at]
+        at += 1
+        if operation == 0x20:  # ld [k]
+            (accumulator,) = struct.unpack_from(">I", header, operand - 0xFFF00000)
+        elif operation == 0x54:  # and #k
+            accumulator &= operand
+        elif operation == 0x15:  # jeq #k
+            at += if_true if accumulator == operand else if_false
+        else:
+            assert operation == 0x06  # ret #k
+            return bool(operand)
+
+
+def test_the_kernel_s_filter_admits_the_senders_that_the_list_does():
+    """Of each IP version, by networks that end within a word, at its end and behind it."""
+    listed_texts = ["10.1.0.0/16", "192.168.7.64/27", "127.0.0.1"]
+    listed_texts += ["::1", "fd00:1:2:3::/64", "2001:db8::/33", "fe80::/10"]
+    networks = [ipaddress.ip_network(text) for text in listed_texts]
+    senders = ["10.1.255.0", "10.2.0.0", "192.168.7.95", "192.168.7.96", "127.0.0.1", "127.0.0.2"]
+    senders += ["::1", "::2", "1::1", "fd00:1:2:3::9", "fd00:1:2:4::9", "fd00:2:2:3::9"]
+    senders += ["2001:db8:7fff::", "2001:db8:8000::", "2001:db9::", "febf::1", "fec0::1"]
+    for text in senders:
+        sender = ipaddress.ip_address(text)
+        # the bench's own address is of no listed network, and is not looked at
+        header = ip_header(text, "203.0.113.9" if sender.version == 4 else "2001:4::9")
+        listed = any(sender in network for network in networks)
+        assert admitted_by(filter_program(networks, sender.version), header) is listed, text
+        assert not admitted_by(filter_program([], sender.version), header)
+
+
+class ChangedClock(HostClock):
+    """The host's clock some time later, beside a calendar that somebody has set back by an hour."""
+
+    later_ns = 0
+
+    def now_ns(self) -> int:
+        return super().now_ns() + self.later_ns
+
+    def monotonic_minus_realtime_ns(self) -> int:
+        return super().monotonic_minus_realtime_ns() - 3600 * NS_PER_S
+
+
+def test_a_datagram_came_after_the_last_look_that_found_none():
+    """However wrong the calendar, by which the kernel stamps it."""
+    clock = ChangedClock()
+    receiving = Datagrams.bound(ANYWHERE, clock)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        clock.later_ns = 1000 * NS_PER_S
+        before_ns = clock.now_ns()
+        assert not receiving.wait(0)
+        after_ns = clock.now_ns()
+        sender.sendto(b"1", ("127.0.0.1", receiving.port))
+        assert receiving.wait(10_000)
+        (datagram,) = receiving.take(1)
+    receiving.close()
+    assert before_ns <= datagram.host_ns <= after_ns
+
+
+def test_what_the_kernel_drops_is_counted_once():
+    """The kernel's count grows for as long as the socket is open; it is looked at each second."""
+    clock = ChangedClock()
+    road = UdpRoad(ANYWHERE, AllowedSenders(["127.0.0.3"]), clock=clock)
+    place = ("127.0.0.1", int(road.endpoint.rpartition(":")[2]))
+    assert road._datagrams.keep_only(AllowedSenders(["127.0.0.3"]).networks)
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listed,
+    ):
+        listed.bind(("127.0.0.3", 0))
+        for strangers, in_all in ((5, 5), (0, 5), (2, 7), (0, 7)):
+            for _ in range(strangers):
+                stranger.sendto(b"1", place)
+            listed.sendto(b"2", place)
+            clock.later_ns += 2 * NS_PER_S
+            assert [message.parts for message in road.taken(10_000)] == [[b"2"]]
+            assert road.link_counts.flooded == in_all
+    road.close()
+
+
+def test_a_datagram_goes_out_though_the_last_one_found_nobody():
+    """The kernel tells of the last refusal where the next one is sent, and sends nothing."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:
+        closed.bind(("127.0.0.1", 0))
+        port = closed.getsockname()[1]
+    sender = Datagrams.connected("127.0.0.1", port)
+    assert sender.put(b"nobody is there")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as opened:
+        opened.bind(("127.0.0.1", port))
+        opened.settimeout(10)
+        assert sender.put(b"somebody is")
+        assert opened.recv(99) == b"somebody is"
+    sender.close()
 
 
 def test_however_many_addresses_ask_each_is_judged_by_the_list():

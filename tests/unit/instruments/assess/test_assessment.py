@@ -82,7 +82,7 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(
         "wrong",
         "missed",
     ]
-    keys += ["out_of_order", "limit_arcsec"]
+    keys += ["out_of_order", "limit_arcsec", "further"]
     assert list(found) == keys
     assert list(found["clock"]) == ["offset_ms", "drift_ppm", "sigma_ms"]
     assert found["noise_arcsec"]["cross"] == pytest.approx(1.0, rel=0.1)

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hilstar.basics.rotation import (
     angle_between_rad,
@@ -28,7 +29,7 @@ from hilstar.instruments.calibrate.alignment import (
     remarks_of,
     residual_of,
 )
-from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs
+from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs, _angles_to
 from tests.support.refusals import refusal
 
 CAMERA = monitor_camera(
@@ -252,3 +253,16 @@ def test_the_residual_s_rms_has_the_freedom_that_the_rotation_took():
     off_rad = np.array([[1.0, -1.0, 2.0], [-1.0, 1.0, -2.0]]) / ARCSEC_PER_RAD
     found = residual_of(commanded, None, off_rad, commanded[0]).rms
     assert (found.cross, found.roll) == pytest.approx((np.sqrt(2), 2 * np.sqrt(2)))
+
+
+def test_the_angle_between_rotations_is_scipy_s_from_none_to_half_a_turn(rng):
+    """Of either sign of a quaternion; tiny ones are not lost in a cosine's rounding."""
+    axes = rng.normal(size=(60, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    angles = np.concatenate([np.geomspace(1e-9, 1e-2, 20), rng.uniform(0, np.pi, 40)])
+    start = Rotation.random(random_state=5)
+    turned = Rotation.from_rotvec(angles[:, None] * axes) * start
+    signs = rng.choice([-1.0, 1.0], 60)[:, None]
+    q = np.roll(start.as_quat(), 1)
+    found = _angles_to(signs * np.roll(turned.as_quat(), 1, axis=1), q)
+    assert found == pytest.approx(angles, rel=1e-6, abs=1e-15)

@@ -8,7 +8,6 @@ import time
 import numpy as np
 import pytest
 
-from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate.camera_edges import (
     begin_on_host,
     check_rate,
@@ -108,17 +107,8 @@ def test_the_square_is_the_largest_patch_that_blinks(rng):
     assert square.pixels[:, 8:20].all() and square.pixels.sum() == 144
 
 
-def test_images_in_which_nothing_blinks_are_refused(rng):
-    images = rng.integers(18, 26, (40, 48, 64)).astype(np.uint8)
-    with pytest.raises(InputError, match=r"nothing blinks.*point it at the square"):
-        find_square(film_of(images, np.arange(40), np.arange(40)))
-
-
-def test_a_camera_that_is_too_slow_is_refused_with_what_to_set():
-    begin_ns = 30_000_000 * np.arange(50)
-    check_rate(begin_ns, 0.004, 20.0)
-    with pytest.raises(InputError, match=r"every 30 ms.*every 16\.7 ms.*AcquisitionFrameRate"):
-        check_rate(begin_ns, 0.004, 60.0)
+def test_a_camera_that_is_fast_enough_is_taken():
+    check_rate(30_000_000 * np.arange(50), 0.004, 20.0)
 
 
 @needs_aravis
@@ -152,20 +142,3 @@ def test_a_camera_before_the_square_tells_the_latency(tmp_path):
     figures = json.loads(found.stdout)
     assert figures["edges"] > 40 and not figures["ambiguous"]
     assert figures["latency_ms"]["p50"] == pytest.approx(1e3 * LATENCY_S, abs=MAX_OFF_MS)
-
-
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("--grab", "take {output}"), "a command takes one image at a time; write genicam:NAME"),
-        (("--grab", "genicam:", "--edges", "e.csv"), "give the edges with one of"),
-        (("--edges", "e.csv", "--exposure", "0.1"), "--exposure: is for --grab"),
-        ((), "--grab genicam:NAME"),
-    ],
-)
-def test_options_that_do_not_fit_are_refused(tmp_path, words, says):
-    ledger = write_ledger(tmp_path / "run.mcap", np.arange(3.0), None)
-    (tmp_path / "e.csv").write_text("host_ns,level\n")
-    refused = run_hilstar_here("latency", ledger, *words, cwd=tmp_path)
-    assert refused.returncode == 2
-    assert says in refused.stderr and refused.stderr.count("\n") == 1

@@ -30,9 +30,16 @@ from hilstar.instruments.calibrate.photometric import calibrate_photometric, fit
 from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.tracker.rounding import before_adc_dn, cut_light, rounding_error, rounding_rms
+from hilstar.tracker.rounding import (
+    before_adc_dn,
+    cut_light,
+    mean_rounding_error,
+    rounding_error,
+    rounding_rms,
+)
 from tests.support.benches import TWIN, bench_text
 from tests.support.refusals import refusal
+from tests.support.tables import write_readings
 
 pytestmark = pytest.mark.usefixtures("without_charts")
 BITS, BLACK, POWER = 8, 1e-3, 2.35
@@ -41,6 +48,8 @@ BRIGHT_BLACK = 0.01  # its noise is about 0.1 % of it
 EDGE_FALL = 0.4  # of light from the middle of the screen to its corners
 EVEN_ERROR = 0.001  # of the map of it, relative
 SURE = 4.0  # sigmas: one figure in 16 000 is further off
+# of sums of 200 terms of order 1, and of sines of 8 x 40 turns, in double precision
+ROUNDING_DN = 1e-12
 # Root mean square of figures in their sigmas: 1 for honest errors. 12 figures give it to a fifth,
 # three times.
 MAX_RMS = 1.6
@@ -187,11 +196,6 @@ def test_the_command_and_the_step_give_the_same_figures(tmp_path):
     assert np.array_equal(*responses)
 
 
-def write_rows(path, rows, header):
-    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
-    return path
-
-
 def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
     """Codes below half were read in a range whose ratio is known to 1 %; each reading repeats to
     0.1 %.
@@ -212,7 +216,7 @@ def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
             (code, "w", one, 0.001 * one + 1e-7, 0.01 * one * below)
             for code, one, below in zip(codes, value, faint, strict=True)
         ]
-        path = write_rows(tmp_path / "m.csv", rows, "code,channel,value,sigma,common_range")
+        path = write_readings(tmp_path / "m.csv", rows, "code,channel,value,sigma,common_range")
         fit = fit_channel(read_measurements(path), "w")
         code = 60
         ratios.append(
@@ -232,7 +236,7 @@ def test_levels_that_no_smooth_curve_meets_have_larger_errors(tmp_path):
     light = gamma_response(BITS, POWER).light[codes] * scatter
     rows = [(code, "w", one, 1e-4 * one + 1e-9) for code, one in zip(codes, light, strict=True)]
     fit = fit_channel(
-        read_measurements(write_rows(tmp_path / "m.csv", rows, "code,channel,value,sigma")), "w"
+        read_measurements(write_readings(tmp_path / "m.csv", rows, "code,channel,value,sigma")), "w"
     )
     codes = np.arange(40, 255)
     off = fit.light[codes] / gamma_response(BITS, POWER).light[codes] - 1
@@ -250,6 +254,17 @@ def test_rounding_is_that_of_levels_in_noise():
         )
     assert rounding_rms(0.0) == pytest.approx(1 / math.sqrt(12), rel=0.04)
     assert rounding_rms(0.6) < 1e-3
+
+
+def test_a_mean_over_pixels_is_that_of_each_pixel_s_own_rounding(rng):
+    """At each place of the dark level, with noise that the light of each pixel adds to."""
+    light_dn = rng.uniform(0.0, 40.0, 200)
+    noise_dn = np.sqrt(0.1**2 + 1e-3 * light_dn)
+    places_dn = np.arange(5) / 5
+    each_dn = rounding_error(places_dn[:, None] + light_dn, noise_dn)
+    mean_dn = mean_rounding_error(places_dn, light_dn, noise_dn)
+    assert mean_dn == pytest.approx(each_dn.mean(axis=1), abs=ROUNDING_DN)
+    assert np.abs(mean_dn).max() > 1e3 * ROUNDING_DN
 
 
 @pytest.mark.parametrize("noise_dn", [0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.7])

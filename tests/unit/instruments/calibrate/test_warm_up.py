@@ -16,7 +16,6 @@ from hilstar.instruments.calibrate.warm_up import (
     watch_white,
 )
 from tests.support.fake_clock import FakeClock
-from tests.support.refusals import refusal
 
 CHANGE, TAU_S = 0.04, 200.0
 # its change in ten minutes is 0.2 % then
@@ -139,14 +138,12 @@ def test_white_is_watched_until_it_is_stable_on_the_given_clock() -> None:
     assert abs(found.stable_after_s - STABLE_S) < 3 * found.stable_after_error_s + 1
 
 
-def test_watching_ends_at_the_longest_time_and_refuses_a_dark_reading() -> None:
+def test_watching_ends_at_the_longest_time() -> None:
     clock = FakeClock()
     t_s, _ = watch_white(
         lambda: 1 + clock.now_ns() / 1e12, clock.now_ns, clock.sleep, longest_s=300.0
     )
     assert t_s[-1] == pytest.approx(300, abs=EVERY_S)
-    assert "white reads 0" in refusal(watch_white, lambda: 0.0, clock.now_ns, clock.sleep)
-    assert "12 or more" in refusal(judge_warm_up, np.arange(5.0), np.ones(5))
 
 
 @pytest.mark.parametrize("seed", range(8))

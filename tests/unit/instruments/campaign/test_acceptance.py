@@ -98,7 +98,7 @@ FAULTS: dict[str, tuple[str, str, float, str]] = {
     "false-attitude": ("lost", "wrong = 0.3", 0.3, "maximum"),
     "wrong-rate": ("lost", "wrong = 0.3", 0.3, "maximum"),
     "time-to-first-attitude": ("lost", "acquisition_s = 0.5", 0.7, "maximum"),
-    "recovery": ("recovery", "recovery_s = 0.5", 0.6, "maximum"),
+    "recovery": ("recovery", "recovery_s = 0.5", 0.55, "maximum"),
     "rate-bias x": ("slews", "rate_bias_deg_s = [0.02, 0.0, 0.1]", 0.02, "maximum"),
     "rate-bias roll": ("slews", "rate_bias_deg_s = [0.02, 0.0, 0.1]", 0.1, "maximum"),
     "rate-noise cross": ("slews", "rate_noise_deg_s = [0.05, 0.05, 0.05]", 0.05, "maximum"),
@@ -122,8 +122,8 @@ FAULTS: dict[str, tuple[str, str, float, str]] = {
     "false-stars edge": ("false-stars", "max_false_stars = 40", 40.0, "minimum"),
 }
 # A lag of 0.4 s is on top of the half step, 0.1 s, that a rate of two attitudes has; an attitude
-# comes with the first exposure (0.1 s) whose middle is over the planted time, of frames 0.2 s or
-# 0.1 s apart.
+# comes at the end of the first exposure (0.1 s) whose middle is over the planted time, of frames
+# 0.2 s or 0.1 s apart.
 
 
 def clause_text(key: str, limit: float, of: str, side: str) -> str:

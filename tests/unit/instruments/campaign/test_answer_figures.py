@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilstar.instruments.campaign.answer_figures import fit_by_cases
+from hilstar.instruments.assess.bounded_figures import lowest_size
+from hilstar.instruments.assess.case_fits import fit_by_cases
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import FRAME_RATE_ERRORS, FRAME_RATES
-from hilstar.instruments.campaign.figures import lowest_size
 from hilstar.instruments.campaign.plan import Require
 from hilstar.instruments.campaign.requirements import (
     MET,
@@ -59,11 +59,23 @@ PLANTED: dict[str, tuple[Any, Any, float]] = {
 }
 
 
-@pytest.mark.parametrize("quantity", PLANTED)
+LIMIT = "star-limit"  # its detection curves are drawn again and again: as long as all others
+
+
+@pytest.mark.parametrize("quantity", [name for name in PLANTED if name != LIMIT])
 def test_a_planted_error_is_found_and_judged(quantity: str, rng: np.random.Generator) -> None:
+    found_and_judged(quantity, rng)
+
+
+def test_a_planted_limit_of_magnitude_is_found_and_judged(rng: np.random.Generator) -> None:
+    found_and_judged(LIMIT, rng)
+
+
+def found_and_judged(quantity: str, rng: np.random.Generator) -> None:
+    """Whether a planted error is found, and its limit judged on both sides."""
     make, keys, size = PLANTED[quantity]
     cases = make(rng, **keys(size))
-    side = "minimum" if quantity == "star-limit" else "maximum"
+    side = "minimum" if quantity == LIMIT else "maximum"
     broken = size * (1.5 if side == "minimum" else 0.5)
     found = figure_verdict(cases, quantity, **{side: broken})
     assert found.value is not None and found.low is not None and found.high is not None
@@ -156,6 +168,24 @@ def test_a_jitter_at_its_limit_is_met_in_one_of_twenty(rng: np.random.Generator)
 
 def _axis(quantity: str) -> str | None:
     return "x" if quantity.startswith("rate-") else None
+
+
+def test_a_signal_that_is_not_linear_in_light_is_no_colour(rng: np.random.Generator) -> None:
+    """A signal that saturates by 0.1 mag at V 2, beside stars that are the bluer the brighter."""
+    cases = reported_stars(rng, 200)
+    for k, v_mag in enumerate(cases.lists["star_v_mag"]):
+        cases.lists["star_bv"][k] = 0.3 * v_mag + rng.uniform(-0.5, 0.5, len(v_mag))
+        cases.lists["star_signal_mag"][k] += 0.004 * np.maximum(7 - v_mag, 0) ** 2
+    found = figure_verdict(cases, "star-colour", maximum=0.01)
+    assert found.low == 0.0 and found.verdict == MET
+
+
+def test_magnitudes_in_the_place_of_signals_are_named(rng: np.random.Generator) -> None:
+    cases = reported_stars(rng)
+    for k, lit_mag in enumerate(cases.lists["star_lit_mag"]):
+        cases.lists["star_signal_mag"][k] = -2 * lit_mag
+    found = figure_verdict(cases, "star-colour", maximum=0.1)
+    assert found.value is None and "give DN, or 10^(-0.4 m)" in found.method
 
 
 def test_slews_of_one_sign_do_not_tell_a_stamp_from_a_bias(rng: np.random.Generator) -> None:

@@ -101,12 +101,34 @@ PLANS = [
 ]
 
 
+JITTER = {"key": "jitter_arcsec.across", "values": [10.0]}
+HZ = {"key": "jitter_hz", "values": [10.0]}
+SLEW = {"key": "motion_s", "values": [2.0]}
+PLANS += [
+    (plan_text(JITTER), "go together"),
+    (plan_text(HZ), "go together"),
+    (
+        plan_text(JITTER, HZ | {"values": [1e4]}),
+        "too fast for an exposure of 0.1 s; .* at most 250",
+    ),
+    (plan_text(JITTER, HZ | {"values": [-1.0]}), "a number from 0 to"),
+    (plan_text(JITTER, HZ, through="display"), "within an exposure"),
+    (plan_text(SLEW, through="display"), "within an exposure"),
+    (plan_text(JITTER, HZ | {"values": [20.0]}, through="bench"), "20 Hz on a display of 60 Hz"),
+    (plan_text(SLEW, {"key": "scenario", "values": [""]}), "leave one of them out"),
+    (plan_text(SLEW, columns=["rate"]), "errors of the rate are not told"),
+    (plan_text(JITTER, HZ, columns=["rate"]), "errors of the rate are not told"),
+    (looking(*SUN, kind="body", body="venus"), "sky.bodies.planets"),
+    (looking(*SUN, kind="body", body="pluto"), "pluto"),
+]
+
+
 def cases_of(plan: Path) -> CaseMaker:
     """The cases of a plan over its bench."""
     return CaseMaker(read_plan(plan), read_bench_file(plan.parent / "bench.toml"), plan.parent)
 
 
-@pytest.mark.parametrize(("text", "words"), PLANS, ids=[words for _, words in PLANS])
+@pytest.mark.parametrize(("text", "words"), PLANS)
 def test_what_is_no_plan_is_refused_in_one_line(tmp_path: Path, text: str, words: str) -> None:
     plan = write_campaign(tmp_path)
     plan.write_text(text)

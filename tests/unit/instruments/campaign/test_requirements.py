@@ -13,10 +13,10 @@ import pytest
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
+from hilstar.instruments.assess.bounded_figures import BoundedFigure
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import looking_q
-from hilstar.instruments.campaign.figures import BoundedFigure
 from hilstar.instruments.campaign.plan import Attitudes, Require
 from hilstar.instruments.campaign.requirements import (
     MET,

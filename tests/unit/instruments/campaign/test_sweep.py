@@ -7,7 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from hilstar.instruments.campaign.sweep import LevelCount, SweepTable, edge_figure, next_level
+from hilstar.instruments.campaign.case_table import Columns
+from hilstar.instruments.campaign.sweep import (
+    LevelCount,
+    SweepTable,
+    counted,
+    edge_figure,
+    next_level,
+)
 
 CASES = 16
 TRIES = 300
@@ -75,3 +82,18 @@ def test_a_whole_key_takes_whole_numbers_and_ends_between_two(rng: np.random.Gen
     assert len(counts) < sweep.levels
     found = edge_figure(sweep, counts, 0.95)
     assert (found.low, found.high) == (6.0, 7.0)
+
+
+def test_a_star_is_kept_where_half_of_the_bright_ones_are_reported() -> None:
+    """Of five cases: all reported, one of two, none, no bright star lit, no frame with stars."""
+    v_mag = [[2.0, 3.0, 6.0], [2.0, 3.0], [2.0], [6.0], []]
+    off_px = [[0.1, 0.2, np.nan], [0.1, np.nan], [np.nan], [0.1], []]
+    lists = {}
+    for name, values in (("star_v_mag", v_mag), ("star_dx_px", off_px)):
+        lists[name] = [np.array(row) for row in values]
+    numbers = {"star_frames": np.array([1.0, 1.0, 1.0, 1.0, np.nan])}
+    assert counted(7.0, Columns(5, numbers, {}, lists), 4.0) == LevelCount(7.0, 2, 4)
+
+
+def test_a_level_without_a_case_that_counts_does_not_pass() -> None:
+    assert not LevelCount(1.0, 0, 0).passed

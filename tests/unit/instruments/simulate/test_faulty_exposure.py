@@ -50,7 +50,7 @@ def simulator(tmp_path_factory):
 def exposed(simulator, text, at_s, rate=(0.0, 0.0, 0.0)):
     scenario = parse_scenario(simulator.file.path.with_name("faults.toml"), HEAD + text)
     view = simulator.view(np.array(ORION_Q), np.array(rate))
-    faults = faulty_exposure(simulator, view, scenario, round(at_s * NS_PER_S))
+    faults = faulty_exposure(simulator, [view], scenario, round(at_s * NS_PER_S))
     return simulator.expose(view, None, faults=faults), faults
 
 
@@ -150,7 +150,7 @@ def test_display_and_tracker_have_the_same_light_at_the_same_places(simulator, t
         ).truth
     view = simulator.view(np.array(ORION_Q), np.zeros(3))
     seen = simulator.expose(
-        view, None, faults=faulty_exposure(simulator, view, scenario, round(1.25 * NS_PER_S))
+        view, None, faults=faulty_exposure(simulator, [view], scenario, round(1.25 * NS_PER_S))
     ).truth
     config = simulator.config
     monitor, tracker = bench_camera(config, tmp_path), tracker_camera(config.tracker, tmp_path)

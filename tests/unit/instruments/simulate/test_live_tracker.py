@@ -10,12 +10,27 @@ import pytest
 from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import AnswerPacket, decode, encode
 from hilstar.attitude.wire.shown_frames import FrameHead, ShownFrame
-from hilstar.basics.rotation import conjugate, from_rotation_vector, multiply, to_rotation_vector
-from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.basics.rotation import (
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    propagate,
+    to_rotation_vector,
+)
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.simulate.answer_link import answer_packet, json_answer
-from hilstar.instruments.simulate.live_exposure import WatchedFrames, _levels_of
+from hilstar.instruments.simulate.live_exposure import (
+    Exposed,
+    LiveTracker,
+    Solved,
+    WatchedFrames,
+    _levels_of,
+)
 from hilstar.instruments.simulate.tracker_process import OwnClock, Planted, PlantedErrors
 from hilstar.server.answers.answer import Answer, ReportedStar
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.tracker.identify import FoundStars, Identified
+from tests.support.benches import bench_text
 
 PERIOD_NS = 100
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -72,6 +87,79 @@ def test_triples_of_codes_are_the_levels_that_made_them():
     rgb = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 1], [2, 1, 1]], dtype=np.uint16)
     assert _levels_of(rgb[[4, 0, 2, 3, 1]], rgb).tolist() == [4, 0, 2, 3, 1]
     assert _levels_of(np.array([[9, 9, 9]]), rgb).tolist() == [0]
+
+
+# A tracker of 64 px before a dark screen and a sky of 2000 e- a pixel in its own exposure: 1000 DN.
+GLOWING = {
+    "tracker": {"resolution_px": [64, 48], "exposure_s": 0.05},
+    "tracker.detector": {
+        **{"offset_dn": 100.0, "gain_e_per_dn": 2.0, "dark_e_per_s": 0.0, "dsnu_e_per_s": 0.0},
+        **{"dsnu_e": 0.0, "prnu": 0.0, "read_noise_e": 2.0, "bits": 16},
+    },
+    "monitor": {"resolution_px": [64, 48], "pixel_pitch_um": 57.65},
+    "sky": {"faintest_v_mag": 5.0},
+    "background": {"electrons_per_px": 2000.0},
+}
+# of the mean of 64 x 48 pixels: five standard deviations of its shot noise is far less
+LEVEL_ERROR = 0.01
+
+
+@pytest.fixture(scope="module")
+def live(tmp_path_factory):
+    path = tmp_path_factory.mktemp("live") / "bench.toml"
+    path.write_text(bench_text(GLOWING))
+    with LiveTracker(read_bench_file(path), np.random.default_rng(1)) as tracker:
+        yield tracker
+
+
+def level_dn(live: LiveTracker) -> float:
+    """The mean level above the offset of an exposure of a dark screen."""
+    dark = Exposed((0, 1), np.zeros(0, np.intp), np.zeros((0, 1)), None, 1, 1.0)
+    return float(live.expose(dark).mean()) - 100.0
+
+
+def test_a_client_s_exposure_and_gain_scale_what_a_pixel_collects(live):
+    """Twice the exposure collects twice as much; a gain of 20 dB is ten times in DN, as of a
+    voltage.
+    """
+    live.adjust(0.05, 0.0)
+    assert level_dn(live) == pytest.approx(1000.0, rel=LEVEL_ERROR)
+    live.adjust(0.1, 0.0)
+    assert level_dn(live) == pytest.approx(2000.0, rel=LEVEL_ERROR)
+    live.adjust(0.01, 20.0)
+    assert level_dn(live) == pytest.approx(2000.0, rel=LEVEL_ERROR)
+    live.adjust(0.05, 0.0)
+    assert level_dn(live) == pytest.approx(1000.0, rel=LEVEL_ERROR)
+
+
+def solved_at(at_ns: int, q: np.ndarray) -> Solved:
+    """An exposure about a moment with an attitude."""
+    lit = np.zeros(0, np.intp)
+    exposed = Exposed((at_ns - 5, at_ns + 5), lit, np.zeros((0, 1)), None, 1, 1.0)
+    none = np.zeros(0)
+    stars = FoundStars(none, none, none, np.zeros((0, 3)), none)
+    identified = Identified(q, np.zeros(0, np.intp), np.zeros(0, np.intp), 0.0)
+    return Solved(exposed, "tracking", stars, identified)
+
+
+def test_a_tracker_expects_where_its_last_two_attitudes_lead_and_nothing_after_five_seconds(live):
+    """A turn of 10 deg/s about y, at 10 Hz."""
+    rate = np.array([0.0, np.radians(10.0), 0.0])
+    live.lost_in_space = lambda stars, dn: None
+    try:
+        start = np.array([0.5, 0.5, -0.5, 0.5])
+        for tenth in (0, 1):
+            at_ns = tenth * NS_PER_S // 10
+            live._answered(solved_at(at_ns, propagate(start, rate, tenth / 10)))
+        assert live.rate_cam_rad_s() == pytest.approx(rate, abs=1e-9)
+        for tenths in (2, 5):
+            then = solved_at(tenths * NS_PER_S // 10, start).exposed
+            expected = live._expected(then)
+            off = multiply(expected, conjugate(propagate(start, rate, tenths / 10)))
+            assert np.abs(to_rotation_vector(off)).max() < 1e-9
+        assert live._expected(solved_at(6 * NS_PER_S, start).exposed) is None
+    finally:
+        live.lost_in_space = None
 
 
 def test_its_own_clock_is_off_and_drifts_and_is_turned_back():

@@ -350,14 +350,7 @@ def test_budget_noise_writes_a_row_for_each_magnitude_and_for_each_star_of_a_fie
     drawn = []
     monkeypatch.setattr("hilstar.basics.charts.save", lambda figure, path: drawn.append(figure))
     ran = run_hilstar_here(
-        "budget",
-        noisy_file,
-        "--noise",
-        "--radec",
-        "84.057,-1.2,0",
-        "-o",
-        tmp_path / "out",
-        "--json",
+        f"budget {noisy_file} --noise --radec 84.057,-1.2,0 -o {tmp_path}/out --json"
     )
     assert ran.returncode == 0, ran.stderr
     found = json.loads(ran.stdout)

@@ -283,14 +283,7 @@ def test_frame_transfer_smears_each_column_by_its_light(tmp_path):
 def test_a_wrong_shutter_is_one_line(tmp_path, keys, said):
     (tmp_path / "bench.toml").write_text(bench_text({"tracker.detector": keys}))
     done = run_hilstar_here(
-        "simulate",
-        tmp_path / "bench.toml",
-        "--radec",
-        "84,0,0",
-        "--slew",
-        "2,0,0",
-        "--png",
-        tmp_path / "a.png",
+        f"simulate {tmp_path}/bench.toml --radec 84,0,0 --slew 2,0,0 --png {tmp_path}/a.png"
     )
     assert done.returncode == 2
     assert said in done.stderr
@@ -306,3 +299,20 @@ def test_the_frames_of_an_exposure_of_whole_refreshes_have_all_of_its_light(hold
     screen_s, row_s = np.array([-0.0045, 0.0, 0.0045]), np.array([-0.01, 0.0031, 0.01])
     shares = sum(beat.shares(frame, screen_s, row_s) for frame in beat.frames)
     np.testing.assert_allclose(shares, 1.0, rtol=1e-12)
+
+
+@pytest.mark.parametrize("direction", ["down", "up"])
+def test_rows_are_exposed_in_the_order_that_the_bench_file_says_in_microseconds(
+    tmp_path, direction
+):
+    """100 rows of 40 us: the first and the last are exposed 3.96 ms apart, about the middle."""
+    path = tmp_path / "bench.toml"
+    detector = {"shutter": "rolling", "row_time_us": 40.0, "row_direction": direction}
+    path.write_text(
+        bench_text({"tracker": {"resolution_px": [80, 100]}, "tracker.detector": detector})
+    )
+    tracker = read_bench_file(path).config.tracker
+    view = rolled(View(IDENTITY, np.zeros(3)), tracker)
+    late_s = view.scan.late_s(np.array([3.0, 3.0, 70.0]), np.array([0.0, 99.0, 49.5]), (80, 100))
+    first_s = -99 / 2 * 40e-6 if direction == "down" else 99 / 2 * 40e-6
+    assert late_s == pytest.approx([first_s, -first_s, 0.0], abs=1e-9)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.optics.glass import zernike
-from hilstar.optics.glass.zernike import Pupil, aperture, diffracted
+from hilstar.optics.glass.zernike import Pupil, PupilField, Term, aperture, diffracted
 
 # the pupil's samples are finer at its edge; measured 2e-4
 AREA = 2e-3
@@ -40,3 +40,29 @@ def test_light_falls_by_the_fourth_power_of_the_cosine_of_the_field_angle(monkey
     stack = diffracted(Pupil(**FAST, points=2), per_px=16)
     assert set(stack.at[:, 0]) == {0.0, 2000.0}
     np.testing.assert_allclose(stack.facts[:, 0], np.cos(np.arctan(10.0 / 50.0)) ** 4)
+
+
+SEIDEL = {
+    "W020": lambda h, x, y: x**2 + y**2,
+    "W040": lambda h, x, y: (x**2 + y**2) ** 2,
+    "W131": lambda h, x, y: h * (x**2 + y**2) * y,
+    "W222": lambda h, x, y: h**2 * y**2,
+    "W220": lambda h, x, y: h**2 * (x**2 + y**2),
+}
+
+
+@pytest.mark.parametrize("kind", SEIDEL)
+@pytest.mark.parametrize("h", [0.25, 1.0])
+def test_a_wavefront_is_hopkins_s_of_its_coefficient(kind, h):
+    """W_klm h^k rho^l cos(phi)^m (Hopkins 1950), h the field over its edge, phi from the direction
+    of the field; a coefficient changes by `per_nm` for each nm over the reference's.
+    """
+    size = (1001, 1201)
+    term = Term(kind=kind, nm=90.0, per_nm=0.2)
+    pupil = Pupil(**FAST | {"resolution_px": size, "terms": (term,), "reference_nm": 500.0})
+    field = PupilField(pupil)(np.array([0.0, h * np.hypot(*size) / 2]), 550.0, 0.0)
+    at = zernike.pupil_places(zernike.PUPIL)
+    x, y = np.meshgrid(at, at)
+    lit = np.abs(field) > 0
+    wave_nm = (90.0 + 0.2 * 50.0) * SEIDEL[kind](h, x, y)[lit]
+    np.testing.assert_allclose(np.angle(field[lit]) * 550.0 / (2 * np.pi), wave_nm, atol=1e-9)

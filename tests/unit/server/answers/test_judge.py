@@ -244,6 +244,51 @@ def test_unix_stamps_are_taken_with_the_hosts_stated_error():
     )
 
 
+def test_of_more_answers_than_are_kept_those_of_the_last_ones_count(monkeypatch):
+    """Ten a second, of which the newest 60 are kept: every second one is right."""
+    monkeypatch.setattr(judge_module, "MAX_IN_WINDOW", 60)
+    frames = LitFrames(PERIOD_NS)
+    for k in range(20):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    for k in range(100):
+        valid = bool(k % 2)  # in a still sky each looks at the same moment
+        judge.judge(Answer(k * NS_PER_S // 10, b"", NS_PER_S // 5, START, valid=valid))
+    figures = judge.figures(99 * NS_PER_S // 10, {})
+    assert figures.rate_hz == pytest.approx(10.0)
+    # the last one is due half a cycle from now
+    assert figures.availability == pytest.approx(30 / 59, abs=1e-4)
+
+
+def test_no_answer_is_taken_to_have_come_before_its_exposure_had_ended():
+    """A tracker whose answers come 20 ms after the middle of an exposure of 100 ms, by a wrong
+    statement: the delay that its motion shows is not believed below 50 ms.
+    """
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S), lit_until(17.0))
+    for k in range(10, 160):
+        middle_s = k / ANSWER_HZ
+        host_ns = round((middle_s + 0.02) * NS_PER_S)
+        judge.judge(Answer(host_ns, b"", round(middle_s * NS_PER_S), attitude_at(middle_s)))
+    assert judge.times.delay_s == pytest.approx(EXPOSURE_S / 2)
+
+
+def test_the_host_s_unix_time_is_read_again_each_second():
+    """NTP moves it by 1 ms a second: an answer is at most a second's drift off."""
+    asked = []
+
+    def offset() -> UnixOffset:
+        asked.append(None)
+        return UnixOffset(-len(asked) * 1_000_000, 0)
+
+    times = AnswerTimes(AnswerRules(EXPOSURE_S, "middle", "unix"), offset)
+    middles_ms = []
+    for tenth in range(30):
+        host_ns = 7 * NS_PER_S + tenth * NS_PER_S // 10
+        middle_ns, _ = times.middle(Answer(host_ns, b"", 0))
+        middles_ms.append(middle_ns / 1_000_000)
+    assert middles_ms == [-1.0] * 10 + [-2.0] * 10 + [-3.0] * 10
+
+
 def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():
     frames = LitFrames(PERIOD_NS)
     judge, verdicts, k = AnswerJudge(AnswerRules(EXPOSURE_S), frames), [], 0

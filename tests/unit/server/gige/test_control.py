@@ -16,6 +16,7 @@ from hilstar.server.gige.description import describe
 from hilstar.server.gige.features import ADDRESSES, FEATURES, PIXEL_FORMATS
 from hilstar.server.gige.registers import (
     DESCRIPTION_AT,
+    HEARTBEAT_MS,
     CameraIdentity,
     CameraSettings,
     GvcpStatus,
@@ -101,6 +102,18 @@ def test_one_peer_controls_at_a_time_until_it_gives_back_or_falls_silent():
     assert first.write(PRIVILEGE, CONTROL) == GvcpStatus.ACCESS_DENIED
     first.now_ns = 6000 * NS_PER_MS
     assert first.write(PRIVILEGE, CONTROL) == 0
+    assert camera.take_events() == [Released(silent=True)]
+
+
+def test_a_controller_that_was_silent_for_too_long_does_not_get_its_privilege_back_by_speaking():
+    """Its stream has ended: what it writes next is refused, as anybody's."""
+    camera = channel()
+    asker = Asker(camera)
+    assert asker.write(PRIVILEGE, CONTROL) == GvcpStatus.SUCCESS
+    assert asker.write(STREAM_PORT, 5000) == GvcpStatus.SUCCESS
+    asker.now_ns = (asker.read(HEARTBEAT_MS) + 1) * NS_PER_MS
+    assert asker.write(STREAM_PORT, 5000) == GvcpStatus.ACCESS_DENIED
+    assert camera.destination is None
     assert camera.take_events() == [Released(silent=True)]
 
 

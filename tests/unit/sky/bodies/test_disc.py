@@ -119,6 +119,20 @@ def test_air_dims_what_is_behind_it_as_traced_rays_say(rng):
     assert np.count_nonzero((found > 0.05) & (found < 0.9)) > 20  # the shell is among the rays
 
 
+@pytest.mark.parametrize("polar", [0.7, 0.9, 1.0, 1.1])
+@pytest.mark.parametrize("distance", [2.0, 50.0])
+def test_no_part_of_a_limb_is_farther_from_the_middle_than_the_radius(polar, distance):
+    """Of a body seen across its axis the longer one reaches it."""
+    towards = np.array([1.0, 0.0, 0.0])
+    for pole in ([0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [1.0, 0.0, 0.0]):
+        one = Disc("x", towards, distance, 1.0, polar, np.array(pole), towards, "lambert")
+        limb_rad = np.arccos(np.clip(one.limb(360) @ towards, -1.0, 1.0))
+        assert limb_rad.max() < one.radius_rad + 1e-9
+        if pole[0] == 0.0 and distance == 50.0:
+            # a far body's limb is its cross-section: its longer half axis over its distance
+            assert limb_rad.max() == pytest.approx(max(1.0, polar) / distance, rel=1e-3)
+
+
 def test_a_sky_s_discs_are_those_in_reach_nearest_first_with_their_rate():
     moving = moving_sky(UTC)
     found = moving.discs(np.array([1.0, 0.0, 0.0]), np.pi)

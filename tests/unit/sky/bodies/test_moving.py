@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError, MachineError
-from hilstar.sky.bodies.kernel import Kernel
+from hilstar.basics.units import KM_PER_AU
+from hilstar.sky.bodies.kernel import Kernel, Viewpoint, apparent_stars
 from hilstar.sky.bodies.orbit import TleOrbit
 from hilstar.sky.stars import Stars
 from tests.support.refusals import refusal
@@ -53,6 +54,16 @@ def test_at_any_time_of_a_day_bodies_are_where_an_ephemeris_of_that_moment_has_t
         assert seen_arcsec(seen, then.sight(0).directions).max() < limit_arcsec
         fresh = then.among(stars_at(np.eye(3), np.ones(3)))
         assert np.abs(stars.v_mag - fresh.v_mag)[-len(ALL_BODIES) :].max() < MAGNITUDE_MAG
+
+
+def test_a_parallax_moves_a_star_away_from_where_the_observer_went_and_none_or_less_does_not():
+    """A tenth of an arcsecond, seen from an au beside the line of sight; the Sun is far off."""
+    place_km = np.array([KM_PER_AU, 0.0, 0.0])
+    view = Viewpoint(place_km, np.zeros(3), from_sun_km=np.array([0.0, 1e9 * KM_PER_AU, 0.0]))
+    ahead = np.tile([0.0, 1.0, 0.0], (4, 1))
+    seen = apparent_stars(ahead, np.array([100.0, 0.0, -100.0, np.nan]), view)
+    assert seen[0, 0] / ARCSEC == pytest.approx(-0.1, rel=1e-9)
+    assert (seen[1:, 0] == 0.0).all()
 
 
 def test_stars_follow_the_observer_s_velocity(rng):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,7 +15,10 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.optics.layers.fault_kinds import Now, fault_of
+from hilstar.optics.layers.fault_light import KEPT_BURSTS
 from hilstar.optics.layers.faults import FaultLayer
+from hilstar.optics.layers.star_layer import no_light
+from hilstar.optics.layers.view import View
 from hilstar.server.bench.fault_views import display_view
 from hilstar.server.bench.scenario import Scenario
 from tests.support.benches import ORION_Q, SMALL_BENCH, bench_text
@@ -134,6 +138,51 @@ def test_tracks_have_their_electrons_in_each_exposure_and_are_the_seed_s(faulty,
     later, other = frame_with_faults(faulty, table, since_ns=150_000_000)
     assert np.array_equal(frame.levels, again.levels)
     assert not np.array_equal(frame.linear, later.linear) and len(other)
+
+
+def test_tracks_of_long_runs_take_so_much_memory(faulty):
+    """A burst for hours is another one in each exposure."""
+    view = display_view(faulty, Scenario(".", "", 7))
+    table = {"kind": "cosmic-rays", "name": "rays", "number": 2, "electrons": 4000, "for_s": 1e6}
+    fault = view.prepare(fault_of(table))
+    for exposure in range(3 * KEPT_BURSTS):
+        since_ns = round(exposure * EXPOSURE_S * 1e9)
+        (chain,), lights = view.camera_points([Now(1, fault, since_ns)], None)
+        assert (chain.lines, len(lights)) == (2, 2)
+        assert len(view._tracks) <= KEPT_BURSTS
+
+
+def test_a_line_of_light_is_one_of_several_sprites_and_so_is_each_of_another_fault(faulty):
+    """Twelve tracks, a fifth of a detector long, and three more: a frame knows how many sprites
+    one has, by which it counts its stars.
+    """
+    view = display_view(faulty, Scenario(".", "", 7))
+    now = []
+    for k, number in enumerate((12, 3)):
+        table = {"kind": "cosmic-rays", "name": f"{k}", "number": number, "electrons": 4000}
+        fault = view.prepare(fault_of(table | {"length_px": 200, "for_s": 1.0}))
+        now.append(Now(k + 1, fault, 0))
+    empty = no_light(faulty.canvas.psf.footprint_px)
+    light = FaultLayer(view, tuple(now)).add(empty, faulty.stars, View(np.array(ORION_Q)))
+    stars, counts = np.unique(light.star, return_counts=True)
+    assert light.per_star == counts.max() > 5
+    assert light.star_count == len(stars)
+    names = {-1 - star: light.added[-1 - star].name for star in stars.tolist()}
+    assert {k: name for k, name in names.items() if k < 12} == dict.fromkeys(
+        [k for k in names if k < 12], "0"
+    )
+    assert {name for k, name in names.items() if k >= 12} == {"1"}
+
+
+def test_a_star_is_looked_for_among_the_stars_that_are_shown(faulty):
+    """Each time where a bench's arrays are others, though they lie at the same place in memory."""
+    view = display_view(faulty, Scenario(".", "", 7))
+    gone = [Now(1, fault_of({"kind": "star-gone", "name": "gone", "hip": 26727}), 0)]
+    for k in range(20):
+        others = replace(faulty.stars, hip=np.roll(faulty.stars.hip, k))
+        wanted = int(np.flatnonzero(others.hip == 26727)[0])
+        assert view.gone(gone, others) == [(wanted, 0.0)]
+        del others
 
 
 def test_a_gradient_has_its_light_in_a_tracker_pixel_at_the_bright_edge(faulty, calm):

@@ -4,7 +4,10 @@ cannot be placed is said once.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from hilstar.sky.bodies.orbit import Geocentre, TleOrbit
 from hilstar.sky.bodies.passes import OWN_KM, Cone
@@ -62,6 +65,57 @@ def test_whatever_turns_and_jumps_come_none_in_view_is_missed(rng):
         found += len(wanted)
         assert wanted <= near
     assert found > 20
+
+
+@pytest.mark.parametrize("step_s", [-300, -30])
+def test_whichever_way_time_goes_a_fixed_observer_misses_none_along_an_axis(step_s, rng):
+    """From the Earth's centre, which is where it was: neither its way nor the axis tells of the
+    jump.
+    """
+    text = some_orbits(rng, 100)
+    sky, cone = satellite_sky(text, Geocentre()), Cone(NORTH, 0.3, 0.1)
+    of_all = satellite_sky(text, Geocentre())
+    found = 0
+    for k in range(8):
+        t_ns = k * step_s * S_NS
+        seen = sky.passing(cone, t_ns)
+        near = set() if seen is None else set(seen.index.tolist())
+        everything = of_all.passing(EVERYWHERE, t_ns)
+        now = np.zeros(len(everything))
+        lit = everything.rates_e_per_s(np.arange(len(everything)), now, now) > 0
+        inside = everything.directions(slice(None), now) @ NORTH > np.cos(cone.radius_rad)
+        wanted = set(everything.index[lit & inside].tolist())
+        found += len(wanted)
+        assert wanted <= near
+    assert found > 5
+
+
+def test_after_a_look_for_bright_ones_a_look_for_faint_ones_finds_them(rng):
+    """As of a frame after an exposure, or the other way round."""
+    text = some_orbits(rng, 60)
+    sky, cone = satellite_sky(text, Geocentre()), Cone(NORTH, 1.0, 0.1)
+    (few, many) = (replace(cone, faintest_e_per_s=limit) for limit in (1e5, 0.0))
+    found = []
+    for one in (few, many, few, many):
+        seen = sky.passing(one, 0)
+        found.append(set() if seen is None else set(seen.index.tolist()))
+    fresh = satellite_sky(text, Geocentre()).passing(many, 0)
+    assert found[1] == found[3] == set(fresh.index.tolist())
+    assert found[0] == found[2] < found[1]
+
+
+def test_a_satellite_without_a_place_is_counted_at_each_moment_and_no_other_is():
+    """Orbits through the Earth: SGP4 has no place near their perigees (its error 6)."""
+    through = [element_set(k, (50.0, 0.0, 0.0, 20.0 * k), 0.6, 9.0) for k in range(1, 10)]
+    swarm = Swarm([one.satrec for one in read_satellites("".join(through), "f", START)])
+    lost = 0
+    for seconds in range(0, 9600, 20):
+        utc = START + seconds * S_NS
+        swarm.move_to(utc)
+        has_none = np.isnan(swarm.places_km(slice(None), utc)).any(axis=1)
+        assert ((swarm.error != 0) == has_none).all()
+        lost += int(has_none.sum())
+    assert 0 < lost < 480 * 9
 
 
 def test_a_moment_gives_the_same_light_whatever_came_before(rng):

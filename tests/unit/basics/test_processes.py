@@ -1,0 +1,240 @@
+"""Processes and clocks: when a sign of life goes to systemd, which of several readings of two clocks
+counts, when a reader is prompt, what nobody reads, and where users' modules come from.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib.util
+import os
+import signal
+import socket
+import sys
+import time
+from importlib.machinery import PathFinder
+
+import pytest
+
+from hilstar.basics.process import interrupts, scheduling
+from hilstar.basics.process.pool import ONE_THREAD, _for_children
+from hilstar.basics.process.programs import EACH_S, Service, sign_period_s
+from hilstar.basics.process.scheduling import (
+    HEAVY,
+    LOOK_S,
+    UNDISCIPLINED_NS,
+    BackOff,
+    HostClock,
+    PromptWhileLight,
+    steady_loop,
+)
+from hilstar.basics.process.user_code import UserCodeError, user_function
+from tests.support.fake_clock import FakeClock
+
+OWN, OTHER = 4711, 4712
+PATIENCE_S = 60.0
+
+
+@pytest.mark.parametrize(
+    ("environment", "period_s"),
+    [
+        ({}, EACH_S),
+        ({"WATCHDOG_USEC": "600000"}, 0.3),
+        ({"WATCHDOG_USEC": "600000", "WATCHDOG_PID": str(OWN)}, 0.3),
+        ({"WATCHDOG_USEC": "600000", "WATCHDOG_PID": str(OTHER)}, EACH_S),  # its parent's
+        ({"WATCHDOG_USEC": "60000000"}, EACH_S),
+        ({"WATCHDOG_USEC": "soon"}, EACH_S),
+        ({"WATCHDOG_USEC": "600000", "WATCHDOG_PID": ""}, EACH_S),
+    ],
+)
+def test_signs_go_to_systemd_twice_in_what_it_waits_for_this_process(environment, period_s):
+    """sd_watchdog_enabled(3): microseconds, and for WATCHDOG_PID alone; half of it is advised."""
+    assert sign_period_s(environment, OWN) == pytest.approx(period_s)
+
+
+def test_a_service_whose_work_hangs_gives_no_sign_until_it_goes_on(tmp_path):
+    asked = 0
+
+    def alive() -> bool:
+        nonlocal asked
+        asked += 1
+        return asked > 3
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(str(tmp_path / "notify"))
+        systemd.settimeout(PATIENCE_S)
+        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "20000"}
+        with Service(lambda: True, alive, lambda: "two\nlines", environment):
+            assert systemd.recv(999) == b"READY=1\nSTATUS=two lines"
+            assert systemd.recv(999) == b"WATCHDOG=1\nSTATUS=two lines"
+            assert asked > 3
+
+
+class ScriptedClock(HostClock):
+    """Gives its readings one after the other."""
+
+    def __init__(self, now_ns: list[int], realtime_ns: list[int]) -> None:
+        self._now_ns = iter(now_ns)
+        self._realtime_ns = iter(realtime_ns)
+
+    def now_ns(self) -> int:
+        return next(self._now_ns)
+
+    def realtime_ns(self) -> int:
+        return next(self._realtime_ns)
+
+
+@pytest.mark.parametrize(
+    ("now_ns", "realtime_ns", "offset_ns"),
+    [
+        # read at once: the calendar's clock was read in the middle of the other's two readings
+        ([1000, 1400], [10_000], 1200 - 10_000),
+        # an interruption in the first two tries, the third is quick
+        ([0, 90_000, 200_000, 350_000, 400_000, 400_200], [7, 8, 9], 400_100 - 9),
+        # all three are slow: the quickest counts, whichever it is
+        ([0, 90_000, 200_000, 230_000, 400_000, 490_000], [7, 8, 9], 215_000 - 8),
+        ([0, 30_000, 200_000, 260_000, 400_000, 490_000], [7, 8, 9], 15_000 - 7),
+    ],
+)
+def test_two_clocks_are_compared_by_the_quickest_of_three_readings(now_ns, realtime_ns, offset_ns):
+    assert ScriptedClock(now_ns, realtime_ns).monotonic_minus_realtime_ns() == offset_ns
+
+
+def test_a_reader_is_prompt_but_while_it_takes_much_of_a_core(monkeypatch):
+    """By what it took since the last look: one that has worked once is prompt again."""
+    policies: list[int] = []
+
+    def take(policy: int, priority: int) -> bool:
+        policies.append(policy)
+        return True
+
+    monkeypatch.setattr(scheduling, "_set_all_threads", take)
+    wall_s = cpu_s = 100.0
+    prompt = PromptWhileLight(lambda: wall_s, lambda: cpu_s)
+    looks = []
+    for share in (0.0, 0.9, HEAVY + 0.05, HEAVY - 0.05, 0.0, 0.9):
+        wall_s += 2 * LOOK_S
+        cpu_s += 2 * LOOK_S * share
+        prompt.tend()
+        looks.append(policies[-1])
+    assert looks == [os.SCHED_FIFO, *[os.SCHED_OTHER] * 2, *[os.SCHED_FIFO] * 2, os.SCHED_OTHER]
+    assert len(policies) == 4  # it is asked for where it changes
+    wall_s += LOOK_S / 2
+    prompt.tend()  # too soon to look again
+    prompt.give_up()
+    wall_s += 10 * LOOK_S
+    prompt.tend()
+    assert policies[-1] == os.SCHED_OTHER
+    assert len(policies) == 5
+
+
+class Libc:
+    """A C library whose adjtimex(2) tells an error, or fails."""
+
+    def __init__(self, maxerror_us: int | None) -> None:
+        self._maxerror_us = maxerror_us
+
+    def adjtimex(self, pointer: object) -> int:
+        timex = pointer._obj
+        assert timex.modes == 0  # nothing is set
+        if self._maxerror_us is None:
+            return -1
+        timex.maxerror = self._maxerror_us
+        return 0
+
+
+@pytest.mark.parametrize(
+    ("maxerror_us", "error_ns"),
+    [(250, 250_000), (16_000_000, UNDISCIPLINED_NS), (None, UNDISCIPLINED_NS)],
+)
+def test_the_error_of_unix_time_is_the_kernel_s_in_microseconds(monkeypatch, maxerror_us, error_ns):
+    """adjtimex(2): maxerror is in microseconds, 16 s where nothing keeps the clock."""
+    monkeypatch.setattr(scheduling.ctypes, "CDLL", lambda name: Libc(maxerror_us))
+    found = HostClock().unix_offset()
+    assert found.error_ns == error_ns
+    assert abs(found.offset_ns - (time.monotonic_ns() - time.time_ns())) < 10**9
+
+
+@pytest.mark.parametrize("collecting", [True, False])
+def test_a_loop_leaves_the_collector_and_the_threads_turns_as_they_were(monkeypatch, collecting):
+    monkeypatch.setattr(scheduling, "raise_priority", lambda: "normal")
+    before_s = sys.getswitchinterval()
+    was_collecting = gc.isenabled()
+    try:
+        (gc.enable if collecting else gc.disable)()
+        with pytest.raises(KeyboardInterrupt), steady_loop() as priority:
+            assert (priority, gc.isenabled()) == ("normal", False)
+            assert sys.getswitchinterval() < before_s
+            raise KeyboardInterrupt
+        assert gc.isenabled() is collecting
+        assert sys.getswitchinterval() == before_s
+    finally:
+        (gc.enable if was_collecting else gc.disable)()
+
+
+def test_tries_come_at_once_and_then_twice_as_seldom_until_all_was_well():
+    clock = FakeClock()
+    again = BackOff(0.05, 0.3, clock)
+    assert again.over
+    waits_s = []
+    for anew in (True, False, False, False, False, True, False):
+        again.put_off(anew=anew)
+        waits_s.append(again.left_s)
+        clock.sleep(again.left_s)
+        assert again.over
+    assert waits_s == pytest.approx([0.05, 0.1, 0.2, 0.3, 0.3, 0.05, 0.1])
+
+
+def test_workers_have_one_thread_and_no_ctrl_c_and_their_owner_keeps_its_own(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, set())
+    with _for_children():
+        assert {os.environ[name] for name in ONE_THREAD} == {"1"}
+        assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, set())
+    assert {name: os.environ.get(name) for name in ONE_THREAD} == before
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, set()) == mask
+
+
+def test_what_nobody_reads_takes_so_much_memory_and_is_counted_when_it_is_read(monkeypatch):
+    read_end, write_end = os.pipe()
+    monkeypatch.setattr(interrupts, "DESCRIPTOR", write_end)
+    monkeypatch.setattr(interrupts, "MAX_WAITING_BYTES", 1 << 18)
+    queued = interrupts._QueuedStderr()
+    line = b"x" * 999 + b"\n"
+    for _ in range(1000):  # a megabyte
+        assert queued.write(line) == len(line)
+        assert queued._waiting_bytes <= 1 << 18
+    text = b""
+    while b"lines were dropped" not in text:
+        text += os.read(read_end, 1 << 16)
+    dropped = int(text.split(b"hilstar: ")[1].split()[0])
+    # what the pipe holds, 64 KiB, was written before
+    assert 600 < dropped <= 1000 - (1 << 18) // len(line)
+    # every other line comes
+    while text.count(b"x\n") < 1000 - dropped:
+        text += os.read(read_end, 1 << 16)
+    assert text.count(b"lines were dropped") == 1
+    os.close(read_end)
+
+
+def test_a_user_s_module_is_the_one_beside_the_file_and_hides_no_installed_one(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (tmp_path / "of_this_bench.py").write_text(
+        "import its_neighbour\nlevel = its_neighbour.level\n"
+    )
+    (tmp_path / "its_neighbour.py").write_text("def level(): return 5\n")
+    (tmp_path / "cobs").mkdir()
+    (tmp_path / "cobs" / "__init__.py").write_text("")
+    for name in ("os", "pyclbr"):  # Python's own, loaded and not
+        (tmp_path / f"{name}.py").write_text("def system(): return 6\n")
+    assert user_function("python:of_this_bench:level", tmp_path)() == 5
+    installed = PathFinder.find_spec("cobs", sys.path)
+    assert installed is not None
+    assert not str(installed.origin).startswith(str(tmp_path))
+    assert importlib.util.find_spec("its_neighbour") is not None  # a lazy import finds it later
+    for function in ("os:system", "pyclbr:system", "subprocess:run", "of_this_bench", ""):
+        with pytest.raises(UserCodeError):
+            user_function(f"python:{function}", tmp_path)

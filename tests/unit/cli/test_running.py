@@ -1,0 +1,210 @@
+"""What a run ends with, and who is let into its page and its SCPI: as the commands decide it, with
+no run.
+"""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import typer
+from msgspec.structs import replace as replaced
+
+from hilstar.attitude.receiver import PacketCounts
+from hilstar.basics.errors import InputError, MachineError
+from hilstar.basics.notices import Notices
+from hilstar.cli import image_source
+from hilstar.cli.image_source import DotOptions, dot_images
+from hilstar.cli.running import (
+    ActingPageOptions,
+    PageOptions,
+    end_of_run,
+    page_listener,
+    say_beat,
+    scpi_listener,
+)
+from hilstar.cli.tracker import open_camera, recorded
+from hilstar.instruments.calibrate import grabbed_dots
+from hilstar.instruments.calibrate.grabbed_dots import DotImages
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.config import parse_config
+from hilstar.server.summary import RunTally, RunVerdict
+from hilstar.server.watchdog import GPU_LOST
+from tests.support.benches import SMALL_BENCH, bench_text
+
+RENDERER = SimpleNamespace(gl_renderer="none", gl_version="none", path="NumPy")
+TOKEN = "0123456789abcdef-0123"
+
+
+def ended(
+    frames: int = 10,
+    accepted: int = 5,
+    is_strict: bool = True,
+    failure: str | None = None,
+    gone: str | None = None,
+    gpu: str = "",
+    strict: bool = False,
+) -> int:
+    """The exit code of a run, 3 where it raises MachineError."""
+    tally = RunTally()
+    for _ in range(frames):
+        tally.add(1_000_000, None if not accepted else 0, 3, ())
+    tally.blank_frames = 0 if accepted else frames
+    summary = tally.summary(1.0, PacketCounts(received=accepted), RENDERER)
+    summary = replaced(summary, verdict=RunVerdict(is_strict, is_strict, 0.0, 0.0, ""))
+    notices = Notices()
+    if gpu:
+        notices.begin(GPU_LOST, gpu)
+    screen = SimpleNamespace(window=SimpleNamespace(gone=gone))
+    ledger = SimpleNamespace(last=None, failure=failure)
+    try:
+        end_of_run(summary, screen, ledger, notices, as_json=False, strict=strict)
+    except typer.Exit as exit_:
+        return exit_.exit_code
+    except MachineError as error:
+        return error.exit_code
+    return 0
+
+
+@pytest.mark.parametrize(
+    ("run", "exit_code"),
+    [
+        ({}, 0),
+        ({"is_strict": False}, 0),  # nobody asked
+        ({"strict": True}, 0),
+        ({"strict": True, "is_strict": False}, 1),
+        # a run without an attitude is code 4, the caller's
+        ({"strict": True, "is_strict": False, "accepted": 0}, 0),
+        ({"failure": "No space left on device"}, 1),
+        ({"gone": "its display was unplugged"}, 3),
+        ({"gpu": "the GPU was reset: the run ends"}, 3),
+        ({"gpu": "the GPU was reset: the run ends", "failure": "disk full"}, 3),
+    ],
+)
+def test_a_run_ends_with_the_code_of_what_became_of_it(run, exit_code, capsys):
+    assert ended(**run) == exit_code
+
+
+@pytest.fixture
+def listens(tmp_path):
+    """What a page and SCPI listen with, by their options; all are closed."""
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    file = read_bench_file(path)
+    with ExitStack() as stack:
+
+        def opened(page: PageOptions, scpi: str | None = "127.0.0.1:0"):
+            listener = stack.enter_context(page_listener(page))
+            return listener, stack.enter_context(scpi_listener(file, scpi, listener, page.token))
+
+        yield opened
+
+
+def test_scpi_has_the_token_that_its_page_has_and_else_that_of_the_command_line(listens):
+    page, scpi = listens(PageOptions(console="127.0.0.1:0", token=TOKEN))
+    assert (page.token, scpi.token) == (TOKEN, TOKEN)
+    alone, scpi = listens(PageOptions(token=TOKEN))
+    assert (alone, scpi.token, scpi.made) == (None, TOKEN, False)
+    page, scpi = listens(PageOptions(console="127.0.0.1:0"))
+    assert (page.token, scpi.token) == ("", "")  # this machine's users alone
+
+
+def test_beyond_this_machine_a_page_and_scpi_have_one_token_that_was_made(listens):
+    page, scpi = listens(PageOptions(console="0.0.0.0:0"), "0.0.0.0:0")
+    assert len(page.token) > 30
+    assert scpi.token == page.token
+    _, alone = listens(PageOptions(), "0.0.0.0:0")
+    assert len(alone.token) > 30
+    assert alone.made
+
+
+@pytest.mark.parametrize(
+    ("page", "words"),
+    [
+        (ActingPageOptions(control=True), "--control: is the page's"),
+        (PageOptions(console_name=["bench.lab"]), "--console-name: is the page's"),
+        (PageOptions(console="127.0.0.1:0", token="short"), "--token: write 16 to 200"),
+    ],
+)
+def test_what_is_a_page_s_needs_one(listens, page, words):
+    with pytest.raises(InputError, match=words):
+        listens(page)
+
+
+def test_a_bench_that_scpi_steers_needs_scpi(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"attitude": {"source": "scpi"}}))
+    with (
+        pytest.raises(InputError, match="needs SCPI; add --scpi"),
+        scpi_listener(read_bench_file(path), None, None, None),
+    ):
+        raise AssertionError("a source that nothing feeds is refused")
+
+
+@pytest.mark.parametrize(
+    ("named", "dark"), [(Path("mine.fits"), Path("mine.fits")), (None, Path("taken.fits"))]
+)
+def test_a_dark_frame_that_is_named_counts_in_place_of_the_one_that_was_taken(
+    tmp_path, monkeypatch, named, dark
+):
+    taken = DotImages([Path("0.fits")], Path("taken.fits"))
+    source = SimpleNamespace(close=lambda: None)
+    monkeypatch.setattr(grabbed_dots, "grab_dots", lambda *_, **__: taken)
+    monkeypatch.setattr(image_source, "real_source", lambda *_: source)
+    file = SimpleNamespace(config=parse_config(tmp_path / "bench.toml", SMALL_BENCH))
+    images = dot_images(file, [], tmp_path, DotOptions(grab="shoot {output}", dark=named))
+    assert images == DotImages([Path("0.fits")], dark)
+
+
+@pytest.mark.parametrize(
+    ("given", "options", "words"),
+    [
+        ([], {"exposure": 0.1}, "--exposure: is for --grab"),
+        ([], {"feed": "tcp://127.0.0.1:0"}, "--feed: is for --grab"),
+        ([], {}, "no image of the dots"),
+        ([Path("0.fits")], {"grab": "shoot {output}"}, "--grab takes the images"),
+    ],
+)
+def test_images_of_dots_are_given_or_taken(tmp_path, given, options, words):
+    with pytest.raises(InputError, match=words):
+        dot_images(None, given, tmp_path, DotOptions(**options))
+
+
+def test_a_beat_is_with_the_refresh_that_was_measured_where_the_screen_paces(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"monitor": {"refresh_hz": 60.0}}))
+    bench = SimpleNamespace(config=read_bench_file(path).config)
+    paced, unpaced = (
+        SimpleNamespace(
+            clock=SimpleNamespace(paced_by_screen=paces, period_ns=16_000_000),
+            window=SimpleNamespace(modes_hz=()),
+        )
+        for paces in (True, False)
+    )
+    assert say_beat(bench, paced).refresh_hz == 62.5
+    assert say_beat(bench, unpaced).refresh_hz == 60.0
+    assert say_beat(bench, None).refresh_hz == 60.0
+
+
+def test_a_tracker_s_camera_that_others_reach_needs_to_know_whom_to_let_in(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    with (
+        pytest.raises(InputError, match="nothing says which may use it"),
+        open_camera("192.0.2.1", [], read_bench_file(path), 2.0),
+    ):
+        pass
+
+
+def test_an_answer_without_an_attitude_is_a_row_that_says_so(tmp_path):
+    path = tmp_path / "telemetry.csv"
+    with recorded(path) as row:
+        row(SimpleNamespace(t_ns=1_500_000_000, q_icrs_to_cam=None))
+        row(SimpleNamespace(t_ns=2_000_000_000, q_icrs_to_cam=(0.5, -0.5, 0.5, -0.5)))
+    assert path.read_text().splitlines() == [
+        "t_s,qw,qx,qy,qz,valid",
+        "1.500000000,,,,,0",
+        "2.000000000,0.5,-0.5,0.5,-0.5,1",
+    ]

@@ -1,0 +1,327 @@
+"""What an X server, its drivers and a monitor say, byte for byte as their definitions have it, and
+what is made of it. No server is asked: tests/screen has real ones.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import struct
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilstar.display.window.awake import Blanking, SetAside
+from hilstar.display.window.output_settings import OutputState
+from hilstar.display.window.randr import (
+    GammaInfo,
+    ModeInfo,
+    ramp_of,
+    refresh_hz_of,
+    side_by_side,
+)
+from hilstar.display.window.this_monitor import ddc_settings, edid_of_drm
+from hilstar.display.window.visibility import ScreenArea, WindowView, off_place
+from hilstar.display.window.watch import is_foreign, shown_as
+from hilstar.display.window.x11 import (
+    CLOCK,
+    MAX_GAPS,
+    SYNC_EXTENSION,
+    SwapStamps,
+    SyncControl,
+    back_buffer,
+    is_end_of_window,
+)
+
+# X.h
+VISIBILITY_NOTIFY, DESTROY_NOTIFY, UNMAP_NOTIFY, MAP_NOTIFY, CONFIGURE_NOTIFY = 15, 17, 18, 19, 22
+UNOBSCURED, PARTIALLY_OBSCURED, FULLY_OBSCURED = 0, 1, 2
+SEEN = (VISIBILITY_NOTIFY, UNOBSCURED)
+COVERED = (VISIBILITY_NOTIFY, FULLY_OBSCURED)
+# Present's major opcode, which each server chooses
+OPCODE = 148
+# types of functions of OpenGL and of GLX_OML_sync_control
+GET_ATTACHMENT = ctypes.CFUNCTYPE(
+    None, ctypes.c_uint, ctypes.c_uint, ctypes.c_uint, ctypes.POINTER(ctypes.c_int)
+)
+GET_INTEGER = ctypes.CFUNCTYPE(None, ctypes.c_uint, ctypes.POINTER(ctypes.c_int))
+COUNTER = ctypes.POINTER(ctypes.c_int64)
+WAIT_FOR_SBC = ctypes.CFUNCTYPE(
+    ctypes.c_int, ctypes.c_void_p, ctypes.c_ulong, ctypes.c_int64, COUNTER, COUNTER, COUNTER
+)
+
+
+@pytest.mark.parametrize(
+    ("events", "hidden"),
+    [
+        ([], ""),
+        ([COVERED], "covered"),
+        ([(VISIBILITY_NOTIFY, PARTIALLY_OBSCURED)], "covered in part"),
+        ([COVERED, SEEN], ""),
+        ([(UNMAP_NOTIFY, 0)], "not on the screen"),
+        ([COVERED, (UNMAP_NOTIFY, 0), (MAP_NOTIFY, 0), SEEN], ""),
+        ([COVERED, (CONFIGURE_NOTIFY, UNOBSCURED)], "covered"),  # no event of visibility
+    ],
+)
+def test_a_window_is_hidden_as_the_last_events_of_its_kind_say(events, hidden):
+    view = WindowView()
+    for kind, state in events:
+        view.take(kind, state)
+    assert view.is_there
+    assert view.why_hidden("", is_asleep=False) == hidden
+
+
+def test_of_several_reasons_that_a_window_is_not_seen_the_widest_is_told():
+    view = WindowView()
+    assert view.why_hidden("", is_asleep=True) == "on a display that sleeps"
+    assert view.why_hidden("off the screen", is_asleep=True) == "off the screen"
+    view.take(*COVERED)
+    assert view.why_hidden("", is_asleep=True) == "covered"
+    assert view.why_hidden("off the screen", is_asleep=False) == "off the screen"
+    view.take(UNMAP_NOTIFY, 0)
+    assert view.why_hidden("off the screen", is_asleep=True) == "not on the screen"
+    view.take(DESTROY_NOTIFY, 0)
+    assert not view.is_there
+
+
+@pytest.mark.parametrize(
+    ("corner_px", "size_px", "is_seen"),
+    [
+        ((0, 0), (1920, 1080), True),  # it fills the screen to its last pixel
+        ((0, 0), (1921, 1080), False),
+        ((0, 0), (1920, 1081), False),
+        ((1, 0), (1920, 1080), False),
+        ((-1, 0), (640, 480), False),
+        ((0, -1), (640, 480), False),
+        ((1280, 600), (640, 480), True),
+        ((1281, 600), (640, 480), False),
+        ((1280, 601), (640, 480), False),
+    ],
+)
+def test_a_window_is_on_the_screen_where_all_of_its_pixels_are(corner_px, size_px, is_seen):
+    area = ScreenArea(corner_px, size_px)
+    assert (off_place(area, None, (1920, 1080)) == "") is is_seen
+    # one that has to fill a display is right there alone, wherever the screen ends
+    assert off_place(area, area, (1, 1)) == ""
+    moved = ScreenArea((corner_px[0] + 1, corner_px[1]), size_px)
+    assert off_place(moved, area, (1920, 1080)) == "moved off its display"
+
+
+def present_event(
+    mode: int, kind: int = 0, event_type: int = 1, opcode: int = OPCODE, response: int = 35
+) -> bytes:
+    """PresentCompleteNotify of presentproto 1.2, section 8: a generic event (35) of the extension,
+    of type 1, of a pixmap (0) or of a notice (1).
+    """
+    return struct.pack("<BBHIHBB20x", response, opcode, 7, 2, event_type, kind, mode)
+
+
+@pytest.mark.parametrize(
+    ("fields", "shown"),
+    [
+        ({"mode": 0}, "copy"),
+        ({"mode": 1}, "flip"),
+        ({"mode": 2}, "skip"),
+        ({"mode": 3}, "copy"),  # SuboptimalCopy
+        ({"mode": 1, "response": 35 | 0x80}, "flip"),  # one that a program sent
+        ({"mode": 4}, ""),
+        ({"mode": 1, "kind": 1}, ""),  # NotifyMSC: no frame of anybody's
+        ({"mode": 1, "event_type": 2}, ""),  # IdleNotify
+        ({"mode": 1, "opcode": OPCODE + 1}, ""),
+        ({"mode": 1, "response": 22}, ""),
+    ],
+)
+def test_a_frame_was_shown_as_presents_event_of_its_pixmap_says(fields, shown):
+    event = present_event(**fields)
+    assert len(event) == 32
+    assert shown_as(event, OPCODE) == shown
+
+
+def ramp(gamma: float, steps: int = 256, gain: float = 1.0) -> bytes:
+    curve = gain * np.linspace(0, 1, steps) ** gamma
+    return np.tile(np.rint(curve * 65535).astype(np.uint16), (3, 1)).tobytes()
+
+
+@pytest.mark.parametrize(
+    ("now", "first", "foreign"),
+    [
+        (ramp(1.0), ramp(1.0), False),
+        (ramp(1.4), ramp(1.0), True),
+        (ramp(1.0, gain=0.5), ramp(1.0), True),
+        (ramp(1.4), ramp(1.4), False),  # the display's own, which it does not let go
+        (ramp(1.0), ramp(1.4), False),  # straight, whoever set it
+        (b"", ramp(1.0), False),  # the output is dark
+    ],
+)
+def test_a_ramp_is_anothers_where_it_is_neither_the_first_nor_straight(now, first, foreign):
+    assert is_foreign(now, first) is foreign
+
+
+def test_a_ramp_is_every_step_of_red_then_of_green_then_of_blue():
+    curves = np.arange(12, dtype=np.uint16).reshape(3, 4)
+    made = GammaInfo(4, *(curve.ctypes.data for curve in curves))
+    assert ramp_of(made) == curves.tobytes()
+
+
+@pytest.mark.parametrize(
+    ("code", "ends"),
+    # X.h: BadValue, BadWindow, BadMatch, BadDrawable, BadAccess; from 128 on those of extensions
+    [(2, False), (3, True), (8, False), (9, True), (10, False), (127, False), (128, True)],
+)
+def test_errors_of_windows_drawables_and_extensions_are_the_windows_end(code, ends):
+    assert is_end_of_window(code) is ends
+
+
+# VESA DMT 1.13 and CEA-861: size, dot clock in Hz, a line's pixels, a frame's lines, and the refresh
+MODES = [
+    ((640, 480), 25_175_000, 800, 525, 59.940),
+    ((1920, 1080), 148_500_000, 2200, 1125, 60.000),
+    ((1920, 1200), 154_000_000, 2080, 1235, 59.950),
+    ((2560, 1440), 241_500_000, 2720, 1481, 59.951),
+]
+
+
+@pytest.mark.parametrize(("size", "dot_clock", "h_total", "v_total", "refresh_hz"), MODES)
+def test_a_modes_refresh_is_its_dot_clock_over_all_of_its_pixels(
+    size, dot_clock, h_total, v_total, refresh_hz
+):
+    width, height = size
+    # XRRModeInfo: begin, end and total of a line, its skew, begin, end and total of a frame
+    sync = (width + 16, width + 60, h_total, 0, height + 3, height + 8, v_total)
+    mode = ModeInfo(1, width, height, dot_clock, (ctypes.c_uint * 7)(*sync))
+    assert refresh_hz_of(mode) == pytest.approx(refresh_hz, abs=0.0006)  # three decimals
+    assert refresh_hz_of(ModeInfo(1, width, height, dot_clock)) == 0.0
+
+
+def test_each_lit_output_knows_the_others_and_not_itself():
+    lit = [OutputState(name, (640, 480)) for name in ("DP-1", "DP-2", "HDMI-1")]
+    states = side_by_side(lit, ("Intel", "NVIDIA"))
+    assert [state.others for state in states] == [
+        ("DP-2", "HDMI-1"),
+        ("DP-1", "HDMI-1"),
+        ("DP-1", "DP-2"),
+    ]
+    assert all(state.providers == ("Intel", "NVIDIA") for state in states)
+    (alone,) = side_by_side(lit[:1], ())
+    assert alone.others == ()
+
+
+def test_a_monitors_settings_are_what_it_has_now_and_not_what_it_can_have():
+    """The forms of `ddcutil getvcp --terse`: continuous (C), simple (SNC) and complex (CNC) values."""
+    printed = "VCP 10 C 40 100\nVCP 12 C 75 80\nVCP 14 SNC x05\nVCP C0 CNC x00 xff x04 xb0\n"
+    assert ddc_settings(printed) == {
+        "brightness": 40,
+        "contrast": 75,
+        "colour_preset": 5,
+        "hours": 0x04B0,
+    }
+    assert ddc_settings("VCP 10 ERR\nVCP 12 C 75 80\nVCP 60 SNC x0f\n") == {"contrast": 75}
+
+
+def test_the_kernels_edid_is_found_by_its_own_name_of_a_connector_and_by_xs(tmp_path):
+    for name, block in (
+        ("card0-DP-1", b""),
+        ("card0-HDMI-A-1", b"first"),
+        ("card1-HDMI-A-2", b"second"),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "edid").write_bytes(block)
+    names = ("DP-1", "HDMI-A-1", "HDMI-2", "VGA-1")
+    blocks = {name: edid_of_drm(name, tmp_path) for name in names}
+    assert blocks == {"DP-1": b"", "HDMI-A-1": b"first", "HDMI-2": b"second", "VGA-1": b""}
+
+
+@pytest.mark.parametrize(
+    ("timeout_s", "dpms", "happens"),
+    [(0, False, False), (600, False, True), (0, True, True), (600, True, True)],
+)
+def test_a_screen_goes_dark_by_its_saver_or_by_standby(timeout_s, dpms, happens):
+    set_before = Blanking(timeout_s, 600, 1, 1, dpms)
+    aside = SetAside()
+    assert aside.takes(set_before) is happens
+    nothing = Blanking(0, 600, 0, 1, False)
+    assert aside.to_restore(nothing) == (set_before if happens else None)
+
+
+def test_what_somebody_sets_meanwhile_comes_back_and_what_stands_at_the_end_stays():
+    nothing = Blanking(0, 600, 0, 1, False)
+    saver = Blanking(600, 600, 1, 1, False)
+    standby = Blanking(0, 600, 0, 1, True)
+    aside = SetAside()
+    assert [aside.takes(now) for now in (saver, nothing, standby, nothing)] == [
+        True,
+        False,
+        True,
+        False,
+    ]
+    assert aside.to_restore(nothing) == standby
+    assert aside.to_restore(saver) is None
+
+
+class Driver:
+    """A driver with GLX_OML_sync_control and framebuffers, called as its definitions say."""
+
+    def __init__(self, swap_us: int | None = None, sizes: tuple[int, int, int] = (8, 8, 8)) -> None:
+        self.swap_us = swap_us
+        self.sizes = dict(zip((0x8212, 0x8213, 0x8214), sizes, strict=True))  # glext.h
+        self._wait = WAIT_FOR_SBC(self._last_swap)
+        self._attachment = GET_ATTACHMENT(self._size)
+        self._integer = GET_INTEGER(self._samples)
+
+    def glXGetProcAddress(self, name: bytes) -> int:
+        assert name == b"glXWaitForSbcOML"
+        return self._address(self._wait)
+
+    def address_of(self, name: str) -> int:
+        functions = {
+            "glGetFramebufferAttachmentParameteriv": self._attachment,
+            "glGetIntegerv": self._integer,
+        }
+        return self._address(functions[name])
+
+    @staticmethod
+    def _address(function: object) -> int:
+        return ctypes.cast(function, ctypes.c_void_p).value or 0
+
+    def _last_swap(self, display, drawable, target, ust, msc, sbc) -> int:
+        if self.swap_us is None:
+            return 0
+        ust[0], msc[0], sbc[0] = self.swap_us, 3, 3
+        return 1
+
+    def _size(self, target, attachment, what, value) -> None:
+        value[0] = self.sizes[what]
+
+    def _samples(self, what, value) -> None:
+        assert what == 0x80A9  # GL_SAMPLES
+        value[0] = 4
+
+
+def test_the_time_of_a_swap_is_the_drivers_microseconds_in_nanoseconds():
+    """GLX_OML_sync_control: "UST is ... in microseconds"."""
+    assert SyncControl(Driver(1_234_567_891), 1, 2).swap_ns() == 1_234_567_891_000
+    assert SyncControl(Driver(None), 1, 2).swap_ns() is None
+
+
+@pytest.mark.parametrize("sizes", [(8, 8, 8), (2, 10, 10), (5, 6, 5), (11, 11, 10)])
+def test_a_back_buffer_is_as_deep_as_its_coarsest_colour(sizes):
+    found = back_buffer(Driver(sizes=sizes).address_of)
+    assert (found.bits, found.samples) == (min(sizes), 4)
+
+
+def test_gaps_between_a_drivers_times_are_counted_only_where_they_follow_one_another():
+    """A driver that misses all but one of many keeps its times; one that has none loses them."""
+    now_ns = 10**12
+    stamp_ns = now_ns - 1
+    rare = [*[None] * (MAX_GAPS - 1), stamp_ns]
+    none = [None] * MAX_GAPS
+    told_ns = iter([*rare * 3, *none, stamp_ns])
+    sync = SimpleNamespace(swap_ns=lambda: next(told_ns))
+    stamps = SwapStamps(sync, 16_666_667, lambda: now_ns)
+    for wanted_ns in rare * 3:
+        assert stamps.after_swap(lambda: None) == (wanted_ns or now_ns)
+    assert stamps.source == SYNC_EXTENSION.decode()
+    for _ in none:
+        assert stamps.after_swap(lambda: None) == now_ns
+    assert stamps.after_swap(lambda: None) == now_ns  # its stamp is not asked for any more
+    assert stamps.source == CLOCK

@@ -1,0 +1,147 @@
+"""The tracker's clock against the run's: a planted offset and drift come out with their signs, and
+their sigmas are those of errors by chance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.instruments.assess.clock import (
+    ClockFit,
+    ClockSolver,
+    coarse_offset,
+    honest,
+    speed_offsets,
+)
+from hilstar.instruments.assess.components import global_phases
+from hilstar.server.record.commanded import Commanded
+from tests.support.planted_tracker import SCALE, attitude, scalar_first
+
+ARCSEC_PER_RAD = 180 * 3600 / np.pi
+START_S, SECONDS, FRAME_S, ANSWER_S = 1000.0, 60.0, 0.05, 0.25
+BIAS_ARCSEC = np.array([30.0, -20.0, 60.0])
+OFFSET_S, DRIFT = 0.8, 5e-4  # of a minute: 30 ms
+NOISE_ARCSEC = 1.0
+# A cubic between frames 0.05 s apart leaves microarcseconds of these swings: 1e-7 s.
+EXACT_S, EXACT_ARCSEC = 1e-5, 0.01
+SIGMAS = 4.0
+MOST_WIDENED = 2.0  # by what parts of the field have of white noise by chance
+
+
+def swings(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Slews of both signs, up to 1 deg/s about each axis."""
+    turn = 2 * np.pi * (t_s - START_S)
+    return 84 + 3 * np.sin(turn / 19), 2 * np.sin(turn / 13 + 0.4), 5 * np.sin(turn / 31)
+
+
+RUN_S = START_S + np.arange(0.0, SECONDS + FRAME_S, FRAME_S)
+RUN = Commanded(RUN_S, scalar_first(attitude(swings, RUN_S)))
+
+
+def telemetry(
+    offset_s: float = OFFSET_S, drift: float = DRIFT, noise: FloatArray | float = 0.0
+) -> tuple[FloatArray, FloatArray]:
+    """Times and attitudes of a tracker whose clock is ahead by `offset_s` when the run begins, and
+    fast by `drift`: tau = t + o + d (t - t_0).
+    """
+    t_s = START_S + np.arange(1.0, SECONDS - 1.0, ANSWER_S)
+    error = (BIAS_ARCSEC + noise) / ARCSEC_PER_RAD * np.ones((len(t_s), 1))
+    q = scalar_first(Rotation.from_rotvec(error) * attitude(swings, t_s))
+    return t_s + offset_s + drift * (t_s - START_S), q
+
+
+def fitted(tau_s: FloatArray, q: FloatArray) -> ClockFit:
+    coarse = coarse_offset(RUN, tau_s, q)
+    assert coarse is not None
+    return ClockSolver(RUN, tau_s, q, SCALE).fit(coarse)
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "drift"), [(OFFSET_S, DRIFT), (-OFFSET_S, -DRIFT), (0.0, 0.0)]
+)
+def test_a_clock_s_offset_drift_and_bias_come_out_with_their_signs(offset_s, drift):
+    found = fitted(*telemetry(offset_s, drift))
+    assert found.offset_s == pytest.approx(offset_s, abs=EXACT_S)
+    assert found.drift * SECONDS == pytest.approx(drift * SECONDS, abs=EXACT_S)
+    bias = ARCSEC_PER_RAD * Rotation.from_quat(np.roll(found.rotation, -1)).as_rotvec()
+    assert bias == pytest.approx(BIAS_ARCSEC, abs=EXACT_ARCSEC)
+    assert np.abs(found.residual_arcsec[found.used]).max() < EXACT_ARCSEC
+    assert found.offset_told and found.drift_told
+
+
+def test_the_sigmas_of_a_clock_are_those_of_least_squares(rng):
+    """By the rates that SciPy's rotations have: white noise of an arcsec along each axis."""
+    tau_s, _ = telemetry()
+    found = fitted(*telemetry(noise=NOISE_ARCSEC * rng.standard_normal((len(tau_s), 3))))
+    t_s = (tau_s - OFFSET_S + DRIFT * START_S) / (1 + DRIFT)
+    step_s = 1e-3
+    turn = attitude(swings, t_s + step_s / 2) * attitude(swings, t_s - step_s / 2).inv()
+    rate_arcsec_s = ARCSEC_PER_RAD * turn.as_rotvec() / step_s
+    share = (t_s - START_S) / SECONDS
+    normal = np.zeros((5, 5))
+    for axis in range(3):
+        design = np.zeros((len(t_s), 5))
+        design[:, axis] = 1.0
+        design[:, 3] = rate_arcsec_s[:, axis]
+        design[:, 4] = rate_arcsec_s[:, axis] * share
+        normal += design.T @ design / NOISE_ARCSEC**2
+    sigma = np.sqrt(np.diag(np.linalg.inv(normal)))
+    # noise that is itself found is known to 1 / sqrt(2 n); parts of the field may widen it
+    least = 1 - SIGMAS / np.sqrt(2 * len(t_s))
+    assert least < found.sigma_offset_s / sigma[3] < MOST_WIDENED
+    assert least < found.sigma_drift * SECONDS / sigma[4] < MOST_WIDENED
+    assert abs(found.offset_s - OFFSET_S) < SIGMAS * found.sigma_offset_s
+    assert abs(found.drift - DRIFT) < SIGMAS * found.sigma_drift
+
+
+def test_wild_answers_are_in_no_fit(rng):
+    tau_s, q = telemetry()
+    wild = rng.choice(len(q), 40, replace=False)
+    q[wild] = scalar_first(Rotation.random(40, random_state=3))
+    found = fitted(tau_s, q)
+    assert not found.used[wild].any()
+    assert found.offset_s == pytest.approx(OFFSET_S, abs=EXACT_S)
+
+
+def test_a_coarse_offset_is_what_has_to_be_added_to_the_telemetry_s_times():
+    tau_s, q = telemetry(offset_s=7.3, drift=0.0)
+    coarse = coarse_offset(RUN, tau_s, q)
+    assert coarse is not None
+    # half of a second's turn is below what tells two offsets apart
+    assert coarse.offset_s == pytest.approx(-7.3, abs=0.1)
+    assert np.abs(speed_offsets(RUN, tau_s, q) + 7.3).min() < 0.6
+
+
+def test_parts_of_a_field_that_differ_widen_a_sigma_and_never_narrow_it(rng):
+    """Pulls that are the same in each of twenty parts, or that cancel in them."""
+    parts, answers = 20, 50
+    place = np.repeat(1000.0 * np.eye(6)[0] * np.arange(parts)[:, None], answers, axis=0)
+    own = rng.standard_normal(parts)
+    alike = np.repeat(own, answers)[:, None] * np.ones(5)
+    covariance = np.diag([1.0, 4.0, 1.0, 1.0, 9.0])
+    wide = honest(covariance, alike, place)
+    spread = answers * own
+    expected = ((spread - spread.mean()) ** 2).sum()
+    # a variance v grows to v^2 times the squares of the parts' pulls
+    assert np.diag(wide) == pytest.approx(np.diag(covariance) ** 2 * expected)
+    cancels = np.tile([1.0, -1.0], parts * answers // 2)[:, None] * np.ones(5)
+    assert honest(covariance, cancels, place) == pytest.approx(covariance)
+
+
+def test_the_phase_of_right_ascension_is_pixels_on_the_sky():
+    """At 60 degrees of declination a boresight moves by half of its right ascension."""
+    pixel_deg = np.degrees(1 / SCALE.focal_px)
+    ra = 84 + 2 * pixel_deg * np.arange(9.0)
+    q = scalar_first(attitude(lambda t: (ra, np.full(9, 60.0), np.zeros(9)), np.zeros(9)))
+    phases = {found.name: found for found in global_phases(np.zeros((9, 3)), q, SCALE)}
+    (name,) = [name for name in phases if "right ascension" in name]
+    place_px = phases[name].place_px
+    assert place_px[:, 0] - place_px[0, 0] == pytest.approx(np.arange(9.0), abs=1e-3)
+    assert np.ptp(place_px[:, 1]) < 1e-6
+    # as the star that stood on the boresight moves over the detector, but for its curve
+    first = phases["the phase of the first boresight"].place_px
+    moved = np.linalg.norm(first - first[0], axis=1)
+    assert moved == pytest.approx(np.arange(9.0), abs=0.01)

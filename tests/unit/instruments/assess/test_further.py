@@ -1,0 +1,182 @@
+"""What telemetry carries beside the attitude, judged against a run's ledger: planted errors of
+rates and of single stars come out, and rates in another convention are named.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.instruments.assess import report
+from hilstar.instruments.assess.assessment import Assessment, AssessSettings, assess_files
+from hilstar.instruments.assess.further import END, rate_notes
+from hilstar.instruments.assess.star_figures import StarTable, star_figure, without_shifts
+from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.bench.star_light import bench_stars
+from tests.support.benches import bench_text
+from tests.support.planted_run import write_ledger
+from tests.support.planted_tracker import attitude, scalar_first
+
+ARCSEC_PER_RAD = 180 * 3600 / np.pi
+SECONDS, FRAME_S, ANSWER_S = 120.0, 0.05, 0.2
+# a display that covers the whole field of a pinhole of 5000 px
+BENCH = bench_text({"tracker": {"focal_length_mm": 65, "pixel_pitch_um": 13}})
+FOCAL_PX, MIDDLE_PX, SIDE_PX = 5000.0, 511.5, 1024
+MARGIN_PX = 70.0  # of the detector's sides, which the display does not cover
+RATE_BIAS_DEG_S, RATE_SCALE, RATE_LAG_S, RATE_NOISE_DEG_S = 0.02, -0.03, 0.2, 0.005
+STAR_NOISE_PX, STAR_FIELD_PX, STAR_COLOUR, STAR_LIMIT_MAG = 0.1, 0.3, 0.1, 5.5
+FALSE_STARS, MAG_NOISE = 3.0, 0.02
+# found within 10 %, or within three standard errors where those are larger
+SHARE, SIGMAS = 0.1, 3.0
+TO_SIGMA = 2 * 1.96  # a 95 % interval's width
+
+
+def motion(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """A scan of two degrees to and fro, which rolls: up to 0.5 deg/s, 0.1 deg/s2."""
+    turn = 2 * np.pi * t_s
+    return 84 + 2 * np.sin(turn / 37), -1.2 + 2 * np.sin(turn / 27 + 0.4), 12 * np.sin(turn / 53)
+
+
+def rate_rad_s(t_s: FloatArray) -> FloatArray:
+    """The rate (n, 3), by v_cam' = -omega x v_cam and a central difference."""
+    step_s = 1e-3
+    turn = attitude(motion, t_s + step_s) * attitude(motion, t_s - step_s).inv()
+    return np.asarray(-turn.as_rotvec() / (2 * step_s))
+
+
+class Sky:
+    """The bench's stars as a pinhole sees them, written out here."""
+
+    def __init__(self, folder: Path) -> None:
+        file = bench_file_of(folder / "bench.toml", BENCH)
+        stars = bench_stars(file.config, folder)
+        bright = stars.v_mag < STAR_LIMIT_MAG + 1
+        self.vectors = stars.vectors[bright]
+        self.v_mag, self.bv_mag = stars.v_mag[bright], stars.bv_mag[bright]
+        self.electrons_per_s = stars.electrons_per_s[bright]
+
+    def reported(self, to_cam: Rotation, rng: np.random.Generator) -> list[list[float | None]]:
+        """What a tracker reports, every other star without its signal."""
+        x, y, z = to_cam.apply(self.vectors).T
+        place_px = MIDDLE_PX + FOCAL_PX * np.stack([x, y]) / np.where(z > 0.5, z, np.nan)
+        within = np.abs(place_px - MIDDLE_PX).max(axis=0) < SIDE_PX / 2 - MARGIN_PX
+        seen = np.flatnonzero(within & (self.v_mag < STAR_LIMIT_MAG))
+        error_px = np.sqrt(2) * STAR_FIELD_PX * np.sin(2 * np.pi * place_px[:, seen] / SIDE_PX)
+        error_px += STAR_NOISE_PX * rng.standard_normal(error_px.shape)
+        off_mag = STAR_COLOUR * self.bv_mag[seen] + MAG_NOISE * rng.standard_normal(len(seen))
+        dn = self.electrons_per_s[seen] * 10 ** (-0.4 * off_mag)
+        rows: list[list[float | None]] = []
+        for k, (x_px, y_px) in enumerate((place_px[:, seen] + error_px).T.tolist()):
+            rows.append([x_px, y_px, float(dn[k]) if k % 2 else None])
+        for _ in range(rng.poisson(FALSE_STARS)):
+            rows.append([*rng.uniform(2 * MARGIN_PX, SIDE_PX - 2 * MARGIN_PX, 2).tolist(), None])
+        return rows
+
+
+@pytest.fixture(scope="module")
+def ledger(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The ledger of a run along `motion`."""
+    frames_s = np.arange(0.0, SECONDS, FRAME_S)
+    frames_q = scalar_first(attitude(motion, frames_s))
+    path = tmp_path_factory.mktemp("further") / "run.mcap"
+    return write_ledger(path, frames_s, frames_q, start_ns=0, bench=BENCH)
+
+
+def assessed(ledger: Path, sky: Sky) -> Assessment:
+    """An assessment of telemetry with planted errors."""
+    rng = np.random.default_rng(5)
+    t_s = np.arange(1.0, SECONDS - 1, ANSWER_S)
+    true = attitude(motion, t_s)
+    noise_rad = rng.normal(0, 2.0, (len(t_s), 3)) / ARCSEC_PER_RAD
+    q = scalar_first(Rotation.from_rotvec(noise_rad) * true)
+    acceleration = (rate_rad_s(t_s + 0.01) - rate_rad_s(t_s - 0.01)) / 0.02
+    rate = (1 + RATE_SCALE) * rate_rad_s(t_s) - RATE_LAG_S * acceleration
+    rate += np.radians([RATE_BIAS_DEG_S, 0.0, 0.0])
+    rate += np.radians(RATE_NOISE_DEG_S) * rng.standard_normal(rate.shape)
+    lines = []
+    for k, at_s in enumerate(t_s.tolist()):
+        answer: dict[str, Any] = {"t_ns": round(at_s * 1e9), "q": q[k].tolist(), "valid": True}
+        if k % 3:  # a tracker that has no rate in every third answer
+            answer["rate"] = rate[k].tolist()
+        answer["centroids"] = sky.reported(true[k], rng)
+        lines.append(json.dumps(answer))
+    telemetry = ledger.with_name("telemetry.jsonl")
+    telemetry.write_text("\n".join(lines) + "\n")
+    return assess_files(ledger, telemetry, AssessSettings(display_attitudes=0))
+
+
+def test_planted_rates_and_stars_come_out_of_telemetry(ledger: Path) -> None:
+    found = assessed(ledger, Sky(ledger.parent))
+    planted = {
+        ("rate bias", "cross"): RATE_BIAS_DEG_S,
+        ("rate bias", "roll"): 0.0,
+        ("rate noise", "cross"): RATE_NOISE_DEG_S,
+        ("rate noise", "roll"): RATE_NOISE_DEG_S,
+        ("rate scale", "cross"): -RATE_SCALE,
+        ("rate scale", "roll"): -RATE_SCALE,
+        ("rate lag", "cross"): RATE_LAG_S,
+        ("rate lag", "roll"): RATE_LAG_S,
+        ("stamp jitter", ""): 0.0,
+        ("star noise", ""): STAR_NOISE_PX,
+        ("star field error", ""): STAR_FIELD_PX,
+        ("star colour", ""): STAR_COLOUR,
+        ("star limit", ""): STAR_LIMIT_MAG,
+        ("false stars a frame", ""): FALSE_STARS,
+    }
+    rows = {(row.quantity, row.axis): row for row in found.further.rows}
+    assert list(rows) == list(planted)
+    for key, row in rows.items():
+        assert row.value is not None and row.low_95 is not None and row.high_95 is not None, key
+        sigma = (row.high_95 - row.low_95) / TO_SIGMA
+        assert abs(row.value - planted[key]) <= max(SHARE * planted[key], SIGMAS * sigma), key
+    assert not any("reported rates" in note for note in found.notes)
+    listed = report.budget_of(found)["further"]
+    assert [(each["quantity"], each["axis"]) for each in listed] == list(planted)
+    assert {each["why"] for each in listed} == {""}
+
+
+@pytest.mark.parametrize(
+    "factor, order, told",
+    [
+        (180 / np.pi, (0, 1, 2), "they are in deg/s"),
+        (-1.0, (0, 1, 2), "they have the wrong sign"),
+        (1.0, (2, 0, 1), "their axes are in another order"),
+        (1.0, (0, 1, 2), ""),
+        (1.05, (0, 1, 2), ""),
+    ],
+)
+def test_rates_of_another_convention_are_named(
+    factor: float, order: tuple[int, int, int], told: str, rng: np.random.Generator
+) -> None:
+    t_s = np.arange(1.0, SECONDS / 2, ANSWER_S)
+    noise_rad = rng.normal(0, 2.0, (len(t_s), 3)) / ARCSEC_PER_RAD
+    q = scalar_first(Rotation.from_rotvec(noise_rad) * attitude(motion, t_s))
+    rates = rate_rad_s(t_s) + np.radians(RATE_NOISE_DEG_S) * rng.standard_normal((len(t_s), 3))
+    rates = factor * rates[:, order]
+    rates[::7] = np.nan
+    notes = list(rate_notes(np.rint(1e9 * t_s).astype(np.int64), q, rates))
+    assert len(notes) == bool(told)
+    assert all("not the turn of the reported attitudes" in note and told in note for note in notes)
+
+
+def test_a_shift_that_all_stars_share_is_not_a_stars_noise(rng: np.random.Generator) -> None:
+    """Answers of 20 stars each, which a time that is off moves by 2 px an axis, one sigma."""
+    answers, stars = 200, 20
+    answer = np.repeat(np.arange(answers), stars)
+    x_px, y_px = rng.uniform(0, SIDE_PX - 1, (2, len(answer)))
+    shift_px = rng.normal(0, 2.0, (2, answers))[:, answer]
+    dx_px, dy_px = shift_px + rng.normal(0, STAR_NOISE_PX, (2, len(answer)))
+    zeros = np.zeros(len(answer))
+    table = StarTable(answer, x_px, y_px, zeros, zeros, dx_px, dy_px, zeros, zeros)
+    resolution_px = (SIDE_PX, SIDE_PX)
+    free = without_shifts(table, answer, resolution_px)
+    figure = star_figure("star-noise", free, resolution_px, END, rng)
+    # of 8000 places a sigma is known to 0.8 %; four times that
+    assert figure.value == pytest.approx(STAR_NOISE_PX, rel=0.032)
+    assert figure.low <= STAR_NOISE_PX <= figure.high

@@ -1,0 +1,175 @@
+"""The figures that requirements limit, of cases few enough to count by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from hilstar.instruments.assess.bounded_figures import (
+    clopper_pearson,
+    drawn_limits,
+    quantile_limits,
+    sigma_limits,
+)
+from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign.case_table import Columns
+from hilstar.instruments.campaign.plan import Require
+from hilstar.instruments.campaign.requirements import (
+    MET,
+    NOT_MET,
+    NOT_SHOWN,
+    RequirementVerdict,
+    _bias,
+    verdicts_of,
+)
+
+SCALE = Scale(2000.0, (1024, 1024))
+FRAMES = 10
+# Of ten cases: frames with an attitude, and those of them that are wrong.
+SOLVED = np.array([10, 10, 9, 8, 10, 10, 10, 7, 10, 6], dtype=float)
+WRONG = np.array([0, 1, 0, 2, 0, 0, 3, 0, 0, 0], dtype=float)
+NEVER = math.nan
+TIMES_S = np.array([0.5, 0.1, 0.4, 0.2, 0.3, *(0.6 + 0.01 * np.arange(25))])
+
+
+def cases_of(**columns: np.ndarray) -> Columns:
+    """A table of cases with these columns."""
+    count = len(next(iter(columns.values())))
+    numbers = {"case": np.arange(count, dtype=float), "frames": np.full(count, float(FRAMES))}
+    return Columns(count, numbers | columns, {})
+
+
+def found(cases: Columns, quantity: str, **keys: object) -> RequirementVerdict:
+    return verdicts_of([Require(quantity=quantity, **keys)], cases, SCALE, 1)[0]  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("quantity", "keys", "value"),
+    [
+        ("availability", {"minimum": 0.5}, (90 - 6) / 100),
+        ("wrong-rate", {"maximum": 0.5}, 6 / 90),
+        ("false-attitude", {"maximum": 0.5}, 6 / 100),
+        ("no-attitude", {"maximum": 0.5}, 10 / 100),
+    ],
+)
+def test_a_share_is_what_is_counted_among_what_was_asked(quantity, keys, value):
+    verdict = found(cases_of(solved=SOLVED, wrong=WRONG), quantity, **keys)
+    assert verdict.value == pytest.approx(value)
+    assert verdict.low < value < verdict.high
+    # answers of a case go together: fewer independent ones than there are frames
+    counted = clopper_pearson(value * 100, 100, 0.95)
+    assert verdict.low <= counted[0]
+    assert verdict.high >= counted[1]
+
+
+def test_frames_of_a_case_that_all_go_together_count_as_one():
+    """Half of 20 cases have no attitude at all: as 10 of 20, and not as 100 of 200."""
+    solved = np.repeat([0.0, FRAMES], 10)
+    verdict = found(cases_of(solved=solved, wrong=np.zeros(20)), "no-attitude", maximum=0.9)
+    low, high = clopper_pearson(10, 20, 0.95)
+    assert (verdict.low, verdict.high) == pytest.approx((low, high), abs=0.01)
+
+
+@pytest.mark.parametrize(("share", "value"), [(0.5, 0.69), (0.1, 0.3), (1 / 30, 0.1), (0.9, 0.81)])
+def test_a_time_is_the_quantile_of_its_share_of_cases(share, value):
+    """Of 30 times in order the third is at a tenth of them, and the fifteenth at a half."""
+    verdict = found(
+        cases_of(first_attitude_s=TIMES_S), "time-to-first-attitude", maximum=9.0, share=share
+    )
+    assert verdict.value == pytest.approx(value)
+
+
+def test_a_case_that_never_had_an_attitude_is_later_than_all_others():
+    """Of 30 cases five never had one: half of them are in time as before, nine tenths are not."""
+    times_s = TIMES_S.copy()
+    times_s[:5] = NEVER
+    cases = cases_of(first_attitude_s=times_s)
+    median = found(cases, "time-to-first-attitude", maximum=2.0, share=0.5)
+    assert (median.value, median.verdict) == (pytest.approx(0.74), MET)
+    late = found(cases, "time-to-first-attitude", maximum=2.0, share=0.9)
+    assert (late.value, late.high) == (None, None)
+    assert late.verdict in (NOT_SHOWN, NOT_MET)
+
+
+def test_a_recovery_counts_where_a_fault_ended_and_else_says_so():
+    ended = np.where(np.arange(30) < 20, 4.0, np.nan)
+    cases = cases_of(recovery_s=TIMES_S, fault_end_s=ended)
+    assert found(cases, "recovery", maximum=9.0, share=1 / 20).value == pytest.approx(0.1)
+    none = cases_of(recovery_s=TIMES_S, fault_end_s=np.full(30, np.nan))
+    verdict = found(none, "recovery", maximum=9.0)
+    assert (verdict.value, verdict.verdict) == (None, NOT_SHOWN)
+    assert "no fault ended within a case" in verdict.words
+
+
+def test_the_noise_within_cases_is_pooled_by_their_freedom():
+    """3 arcsec of 10 answers, 1 arcsec of 4, a case without two: (9 x 9 + 3 x 1) / 12."""
+    scatter = np.array([3.0, 1.0, 50.0])
+    columns = {f"scatter_{axis}_arcsec": scatter for axis in "xyz"}
+    cases = cases_of(solved=np.array([10.0, 6.0, 1.0]), wrong=np.array([0.0, 2.0, 0.0]), **columns)
+    verdict = found(cases, "nea", maximum=9.0, axis="x")
+    assert verdict.value == pytest.approx(math.sqrt(84 / 12))
+    limits = sigma_limits(84 / 12, 12.0, 0.95)
+    assert (verdict.low, verdict.high) == pytest.approx(limits)
+    within = found(cases, "nea", maximum=9.0, axis="x", share=0.997)
+    assert within.value == pytest.approx(stats.norm.ppf(0.9985) * math.sqrt(84 / 12))
+
+
+def test_a_bias_of_one_axis_has_student_s_limits():
+    """5 +- 2 of 25 values: 5 +- 1.7109 x 0.4, where the other sign is out of reach."""
+    figure = _bias(np.array([-5.0]), np.array([2.0]), 25, 0.95)
+    assert figure.value == 5.0
+    assert figure.high == pytest.approx(5 + 1.7109 * 0.4, abs=1e-4)
+    assert figure.low == pytest.approx(5 - 1.7109 * 0.4, abs=1e-4)
+    # of two axes the larger counts, and any one of them may be it
+    two = _bias(np.array([-5.0, 1.0]), np.array([2.0, 2.0]), 25, 0.95)
+    assert two.value == 5.0
+    assert two.low == pytest.approx(5 - stats.t.ppf(0.975, 24) * 0.4, abs=1e-4)
+
+
+def test_a_sigma_s_limits_are_those_of_chi_square():
+    """Of 10 degrees of freedom 3.940 and 18.307 are the points of 5 and 95 %."""
+    low, high = sigma_limits(4.0, 10.0, 0.95)
+    assert low == pytest.approx(math.sqrt(40 / 18.307), rel=1e-4)
+    assert high == pytest.approx(math.sqrt(40 / 3.940), rel=1e-4)
+
+
+def test_a_quantile_s_limits_are_order_statistics():
+    """Of 59 values the largest is above the 95 % quantile at 95 %: 1 - 0.95^59; of 58 it is not."""
+    values = np.random.default_rng(1).permutation(np.arange(1.0, 60.0))
+    assert quantile_limits(values, 0.95, 0.95)[1] == 59.0
+    assert quantile_limits(values[values < 59], 0.95, 0.95)[1] == math.inf
+    # the median of 11: the third and the ninth are one-sided limits at 96.7 %
+    low, high = quantile_limits(np.arange(1.0, 12.0), 0.5, 0.95)
+    assert (low, high) == (3.0, 9.0)
+
+
+def test_a_bootstrap_keeps_what_goes_together_in_blocks(rng):
+    """Of 4000 values that are alike in runs of 20, 200 are independent: sqrt(20) times as wide."""
+    count = 4000
+    runs = np.repeat(rng.standard_normal(count // 20), 20)
+    apart = rng.standard_normal(count)
+    widths = []
+    for values in (runs, apart):
+        low, high = drawn_limits(values, np.ones(count), rng, 0.95)
+        widths.append(float(high - low) / values.std())
+    # of 1000 drawn a quantile of 5 % is known to some percent; and 200 blocks to 5 %
+    assert widths[1] == pytest.approx(2 * 1.645 / math.sqrt(count), rel=0.25)
+    assert widths[0] == pytest.approx(2 * 1.645 / math.sqrt(count / 20), rel=0.25)
+
+
+def test_a_verdict_s_words_say_the_limit_the_figure_and_what_would_decide():
+    cases = cases_of(solved=SOLVED, wrong=WRONG)
+    kept = found(cases, "availability", minimum=0.5)
+    assert kept.verdict == MET
+    assert f"met, 0.84 in 10 cases, not less than {kept.low:.4g} at 95 %" in kept.words
+    assert kept.margin == pytest.approx(kept.low - 0.5)
+    missed = found(cases, "availability", minimum=0.99)
+    assert missed.verdict == NOT_MET
+    assert f"not met, 0.84 in 10 cases, not more than {missed.high:.4g} at 95 %" in missed.words
+    assert missed.margin < 0
+    open_ = found(cases, "availability", minimum=0.83)
+    assert open_.verdict == NOT_SHOWN
+    assert f"about {open_.more} more cases would show it" in open_.words

@@ -1,0 +1,318 @@
+"""What a bench file states of its own errors, as it moves a certificate's figures: each by a closed
+form, on stars whose places a test chooses.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import from_rotation_vector, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.certify.effects import Effect
+from hilstar.instruments.certify.model import Deviations, Figures, ReferenceStar
+from hilstar.instruments.certify.read_effects import _of_delays
+from hilstar.instruments.certify.stated_effects import (
+    DRIFTS,
+    of_drift,
+    of_files,
+    of_settings,
+    of_warm_up,
+    stated_delay,
+)
+from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from tests.support.planted_certify import BENCH
+
+# The tracker of the planted bench: 512 px from its middle, 70 mm in pixels of 13 um.
+EDGE_TANGENT = 512 / (70 / 0.013)
+WIDTH_PX, HEIGHT_PX = 1920, 1080
+# Of each star: its place on the monitor, px, and the tangents of its direction, in edges of the
+# field. No two are alike along an axis, so that axes that are swapped show.
+PLACES = ((300.0, 200.0), (960.0, 100.0), (1500.0, 900.0), (700.0, 600.0))
+TANGENTS = ((0.0, 0.0), (0.6, -0.2), (-0.3, 0.8), (0.2, 0.5))
+COUNT = len(PLACES)
+SHARES = (0.7, 0.3)  # of a star's light, on pixels of two levels
+TURN_ARCSEC = (3.0, -5.0, 40.0)
+# A turn of 40 arcsec squared, over the field's edge, in arcsec: what first order leaves out.
+SECOND_ORDER_ARCSEC = 40**2 / ARCSEC_PER_RAD
+
+
+def bench(folder: Path, keys: str = "", calibration: str = "srgb", geometry: str = "") -> BenchFile:
+    """The planted bench with more keys."""
+    path = folder / "bench.toml"
+    text = BENCH.format(calibration=calibration, delay_ms=8.0, geometry=geometry, white=2.6e6)
+    path.write_text(text + keys)
+    return read_bench_file(path)
+
+
+def figures_of(file: BenchFile) -> Figures:
+    """The figures of the stars above, all of one field."""
+    stars = []
+    for number, ((x_px, y_px), tangent) in enumerate(zip(PLACES, TANGENTS, strict=True)):
+        direction = np.append(EDGE_TANGENT * np.array(tangent), 1.0)
+        stars.append(
+            ReferenceStar(
+                hip=number,
+                row=number,
+                v_mag=5.0,
+                b_v_mag=0.6,
+                field=0,
+                third=0,
+                x_px=x_px,
+                y_px=y_px,
+                direction=direction / np.linalg.norm(direction),
+                quantised_mag=0.0,
+                log_light=np.log([0.5, 0.1]),
+                share=np.array(SHARES),
+                pixel_px=np.zeros((2, 2), dtype=np.intp),
+            )
+        )
+    return Figures(file, stars)
+
+
+def by_name(effects: list[Effect]) -> dict[str, Effect]:
+    """Effects by the names of their inputs."""
+    return {effect.input.name: effect for effect in effects}
+
+
+@pytest.fixture
+def settings(tmp_path) -> dict[str, Effect]:
+    """The effects of a bench that states each error of [certify]."""
+    file = bench(
+        tmp_path,
+        """[certify]
+rate_deg_s = 0.5
+jitter_ms = 0.3
+clock_ms = 0.2
+temperature_k = 2.0
+flux_mag_per_k = 0.01
+place_arcsec_per_k = 0.4
+instrument = { name = "photometer", relative_expanded = 0.03, k = 3.0 }
+[certify.tracker]
+direction_expanded_arcsec = 1.0
+focal_expanded_relative = 4e-4
+distortion_expanded_arcsec = 6.0
+evenness_expanded_relative = 0.02
+linearity_expanded_relative = 0.01
+""",
+    )
+    missing: list[str] = []
+    effects = by_name(list(of_settings(file, figures_of(file), missing)))
+    assert missing == []
+    return effects
+
+
+def test_an_expanded_uncertainty_is_divided_by_its_factor(settings):
+    assert settings["instrument"].even == pytest.approx(np.full((1, COUNT), 0.01))
+    assert settings["tracker's linearity"].even == pytest.approx(np.full((1, COUNT), 0.005))
+    focal_arcsec = 2e-4 * ARCSEC_PER_RAD * EDGE_TANGENT * np.array(TANGENTS)
+    assert settings["tracker's focal length"].place == pytest.approx(focal_arcsec[None])
+    assert (settings["clock"].late, settings["prediction"].late) == ([0.2], [0.3])
+
+
+def test_a_range_of_temperatures_is_a_rectangle(settings):
+    kelvin = 2.0 / math.sqrt(3)
+    warmth = settings["temperature"]
+    # a change of 1 % is 0.010857 mag
+    assert warmth.even.sum(axis=0) == pytest.approx(0.01 * kelvin * math.log(10) / 2.5)
+    along, across = np.moveaxis(warmth.place, 2, 0)
+    assert along.sum(axis=0) == pytest.approx(0.4 * kelvin)
+    assert across.sum(axis=0) == pytest.approx(0.4 * kelvin)
+    assert not (along * across).any()  # two errors, each along its own axis
+
+
+def test_a_tracker_s_distortion_is_radial_and_grows_as_the_cube_to_what_is_stated_at_the_edge(
+    settings,
+):
+    (moved,) = settings["tracker's distortion"].place
+    tangents = np.array(TANGENTS)
+    radius = np.hypot(*tangents.T)
+    assert np.hypot(*moved.T) == pytest.approx(3.0 * radius**3)
+    assert (moved * tangents).sum(axis=1) == pytest.approx(3.0 * radius**4)
+
+
+def apart_squared() -> np.ndarray:
+    """The squares of how far stars are from each other, in edges of the field (n, n)."""
+    tangents = np.array(TANGENTS)
+    return np.asarray(((tangents[:, None] - tangents) ** 2).sum(axis=2))
+
+
+def test_a_tracker_s_errors_of_direction_and_evenness_are_alike_over_half_of_its_field(settings):
+    alike = np.exp(-apart_squared() / 2)
+    place = settings["tracker's lens"].place
+    for axis in (0, 1):
+        slopes = place[..., axis]
+        assert slopes.T @ slopes == pytest.approx(0.5**2 * alike, abs=1e-9)
+    assert not np.any(place[..., 0] * place[..., 1])
+    even = settings["tracker's evenness"].even
+    # relative to the middle, where the first star is
+    from_middle = even.T @ even
+    assert from_middle[0] == pytest.approx(np.zeros(COUNT), abs=1e-9)
+    assert np.diag(from_middle) == pytest.approx(2 * 0.01**2 * (1 - alike[0]), abs=1e-12)
+
+
+def test_a_warm_up_is_as_seen_or_else_as_stated_in_per_cent(tmp_path):
+    file = bench(tmp_path, "[certify]\nwarm_up_percent = 0.6\n")
+    stated_u = 0.006 / math.sqrt(3)
+    for change, u in ((None, stated_u), (0.001, 0.001 / math.sqrt(3))):
+        (effect,) = of_warm_up(file, COUNT, change, [])
+        assert effect.even == pytest.approx(np.full((1, COUNT), u))
+    missing: list[str] = []
+    assert list(of_warm_up(bench(tmp_path), COUNT, None, missing)) == []
+    assert missing[0].startswith("warm-up: ")
+
+
+def test_what_checks_saw_moves_what_each_of_them_is_of(tmp_path):
+    file = bench(tmp_path)
+    figures = figures_of(file)
+    largest = (0.5, 0.7, 1.1, 9.0, 30.0, 0.4)  # %, arcsec, arcsec, arcsec, ppm, ms
+    (drift,) = of_drift(figures, dict(zip(DRIFTS, largest, strict=True)), [])
+    tangents = EDGE_TANGENT * np.array(TANGENTS)
+    place = np.zeros((len(DRIFTS), COUNT, 2))
+    place[1, :, 0] = 0.7
+    place[2, :, 1] = 1.1
+    # a small turn about the boresight carries x to y, and y to -x
+    place[3] = 9.0 * np.stack([-tangents[:, 1], tangents[:, 0]], axis=1)
+    place[4] = 30e-6 * ARCSEC_PER_RAD * tangents
+    assert drift.place * math.sqrt(3) == pytest.approx(place)
+    assert drift.even[0] * math.sqrt(3) == pytest.approx(np.full(COUNT, 0.005))
+    assert not drift.even[1:].any()
+    assert drift.delay * math.sqrt(3) == pytest.approx([0, 0, 0, 0, 0, 0.4])
+
+
+def test_a_bench_that_states_nothing_says_what_is_not_assessed(tmp_path):
+    file = bench(tmp_path)
+    figures = figures_of(file)
+    value = Deviations(
+        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
+    )
+    missing: list[str] = []
+    assert list(of_files(file, figures, value, missing)) == []
+    assert list(of_settings(file, figures, missing)) == []
+    assert list(of_drift(figures, None, missing)) == []
+    subjects = {line.partition(":")[0] for line in missing}
+    assert subjects >= {
+        *("flux", "full scale", "evenness", "place and attitude", "latency", "vignetting"),
+        *("linearity", "absolute scale of the light", "temperature", "motion"),
+        "drift since the certificate",
+    }
+
+
+def test_a_stated_delay_is_an_effect_of_the_delay_alone(tmp_path):
+    (effect,) = stated_delay(bench(tmp_path, "[certify]\npanel_delay_u_ms = 0.2\n"), [])
+    assert effect.delay == [0.2]
+    assert (effect.late, effect.place, effect.even) == (None, None, None)
+
+
+def test_a_photodiode_s_edges_tell_their_mean_by_the_root_of_their_number(rng):
+    """White noise of 0.4 ms over 100 edges: 0.04 ms, known to 1 / sqrt(2 n)."""
+    count = 100
+    effects = by_name(list(_of_delays(8.0 + 0.4 * rng.standard_normal(count))))
+    (error_ms,) = effects["delay"].delay
+    assert error_ms == pytest.approx(0.04, rel=5 / math.sqrt(2 * count))
+
+
+GEOMETRY = f"""kind = "hilstar geometry 1"
+resolution_px = [{WIDTH_PX}, {HEIGHT_PX}]
+focal_length_px = 6071.0
+principal_point_px = [959.5, 539.5]
+q_cam_to_mon = [1.0, 0.0, 0.0, 0.0]
+[error]
+"""
+
+
+def of_geometry(folder: Path, error: str) -> dict[str, Effect]:
+    """The effects of a geometry file with a table [error]."""
+    (folder / "lens.toml").write_text(GEOMETRY + error)
+    file = bench(folder, geometry='geometry = "lens.toml"')
+    value = Deviations(
+        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
+    )
+    return by_name(list(of_files(file, figures_of(file), value, [])))
+
+
+def test_a_map_of_errors_is_read_where_each_star_is_half_of_its_square_along_each_axis(tmp_path):
+    """Its places are the screen's edges and what is between them: 1 + 3 of the way down + 2 of the
+    way along it.
+    """
+    rows = [[1.0 + 3 * down + 2 * along for along in (0.0, 0.5, 1.0)] for down in (0.0, 1.0)]
+    place = of_geometry(tmp_path, f"map_arcsec = {rows}\n")["geometry"].place
+    x_px, y_px = np.array(PLACES).T
+    known = 1 + 3 * (y_px + 0.5) / HEIGHT_PX + 2 * (x_px + 0.5) / WIDTH_PX
+    assert place.shape == (2, COUNT, 2)
+    for axis in (0, 1):
+        other = 1 - axis
+        assert place[axis, :, axis] == pytest.approx(known / math.sqrt(2))
+        assert not place[axis, :, other].any()
+
+
+def test_an_alignment_s_covariance_turns_the_sky_about_its_own_axes(tmp_path):
+    """In the middle of the field a turn about x moves a star along y, and one about y along x."""
+    error = "alignment_covariance_arcsec2 = [[4, 0, 0], [0, 9, 0], [0, 0, 100]]\n"
+    place = of_geometry(tmp_path, error)["alignment"].place
+    covariance = np.einsum("ksi,ksj->sij", place, place)
+    assert covariance[0] == pytest.approx(np.diag([9.0, 4.0]))
+    # a star beside the middle also goes round it, by as much as it is beside
+    u, v = EDGE_TANGENT * np.array(TANGENTS[1])
+    along = 9 * (1 + u**2) ** 2 + 4 * (u * v) ** 2 + 100 * v**2
+    assert covariance[1, 0, 0] == pytest.approx(along)
+
+
+def test_levels_of_a_calibration_move_the_light_that_stars_have_of_them(tmp_path):
+    """Level 0.5 is off by 2 %, level 0.1 by none; white is full scale, and has no error of its own."""
+    light = [0.01, 0.1, 0.5, 1.0]
+    table = "".join(f"{code},{(code / 255) ** 2.2!r}\n" for code in range(256))
+    (tmp_path / "light.csv").write_text("code,w\n" + table)
+    (tmp_path / "light.toml").write_text(
+        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\n'
+        f'bits = 8\nresponse = "light.csv"\n[errors]\nlight = {light}\n'
+        "off = [0.0, 0.0, 0.02, 0.0]\nrelative = [0.0, 0.03, 0.04, 0.0]\ndof = 20.0\n"
+    )
+    file = bench(tmp_path, calibration="light.toml")
+    figures = figures_of(file)
+    value = Deviations(
+        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
+    )
+    response = by_name(list(of_files(file, figures, value, [])))["response"]
+    assert np.exp(figures.log_light) == pytest.approx([0.1, 0.5])  # rising
+    assert value.levels[0] == pytest.approx([1.0, 1.02])
+    spread = np.sqrt((response.levels**2).sum(axis=0))
+    assert spread == pytest.approx([0.03, 0.04])
+
+
+def test_places_that_a_turn_moves_are_that_turn_of_the_attitude(tmp_path):
+    file = bench(tmp_path)
+    figures = figures_of(file)
+    (moved,) = figures.turned(np.array([TURN_ARCSEC]))
+    turn = to_matrix(from_rotation_vector(np.array(TURN_ARCSEC) / ARCSEC_PER_RAD))
+    rays = np.column_stack([EDGE_TANGENT * np.array(TANGENTS), np.ones(COUNT)]) @ turn.T
+    exact = ARCSEC_PER_RAD * (rays[:, :2] / rays[:, 2:] - EDGE_TANGENT * np.array(TANGENTS))
+    assert moved == pytest.approx(exact, abs=SECOND_ORDER_ARCSEC)
+    off = Deviations(
+        np.ones((1, 2)), np.zeros((1, COUNT)), moved[None], np.full(1, 8.0), np.zeros(1)
+    )
+    figure = dict(zip(figures.names, figures.of(off)[0].tolist(), strict=True))
+    for axis, arcsec in zip("xyz", TURN_ARCSEC, strict=True):
+        measured = figure[f"attitude_{axis}", -1, "arcsec"]
+        assert measured == pytest.approx(arcsec, abs=10 * SECOND_ORDER_ARCSEC)
+
+
+def test_dimmer_levels_and_places_add_up_in_magnitudes_and_late_light_lags(tmp_path):
+    """10 % less on the level of 70 % of a star's light, and 1 % less at its place; light 2 ms late
+    at 0.5 deg/s.
+    """
+    file = bench(tmp_path, "[certify]\nrate_deg_s = 0.5\n")
+    figures = figures_of(file)
+    levels = np.array([[1.0, 0.9]])  # rising: the brighter is the second
+    even = np.full((1, COUNT), -0.01)
+    off = Deviations(levels, even, np.zeros((1, COUNT, 2)), np.full(1, 9.5), np.full(1, 0.5))
+    figure = dict(zip(figures.names, figures.of(off)[0].tolist(), strict=True))
+    fainter_mag = -2.5 * math.log10(0.7 * 0.9 + 0.3) + 2.5 * math.log10(math.e) * 0.01
+    for star in range(COUNT):
+        assert figure["flux", star, "mag"] == pytest.approx(fainter_mag)
+        assert figure["place_along", star, "arcsec"] == pytest.approx(-0.5 * 3600 * 0.002)
+        assert figure["place_across", star, "arcsec"] == 0.0
+    assert figure["latency", 0, "ms"] == pytest.approx(9.5)

@@ -1,0 +1,70 @@
+"""Light of a shape, as a camera that turns has it and as it is moved by part of a pixel."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.optics.camera import Camera
+from hilstar.optics.extended import DiscView, LightMap, Pose, Shear, disc_lights, shifted
+from hilstar.optics.psf import GaussianPsf
+from hilstar.sky.bodies.disc import Disc
+
+SIZE_PX, MIDDLE_PX = (96, 80), (47.5, 39.5)
+CAMERA = Camera(SIZE_PX, 500.0, MIDDLE_PX, np.eye(3))
+PSF = GaussianPsf((0.8, 1.0))
+AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
+# A pixel lights up as late as its place in a camera at rest says: by 1.25 % of the move, at most
+# 0.7 px, it has moved on since.
+PLACE_PX = 0.01
+
+
+def centre_px(lights) -> np.ndarray:
+    """The centre of mass of maps of light, px."""
+    (light,) = lights
+    assert isinstance(light, LightMap)
+    rows, columns = np.indices(light.image.shape)
+    moments = [(light.image * axis).sum(dtype=float) for axis in (columns, rows)]
+    return np.array(moments) / light.image.sum(dtype=float) + light.corner_px
+
+
+def uniform_disc(at_px: tuple[float, float], radius_px: float = 2.0) -> Disc:
+    direction = CAMERA.rays(*np.array(at_px)[:, None])[0]
+    direction /= np.linalg.norm(direction)
+    distance = CAMERA.focal_length_px / radius_px
+    pole = np.array([0.0, 1.0, 0.0])
+    return Disc("x", direction, distance, 1.0, 1.0, pole, -direction, "uniform", 1e6)
+
+
+def test_a_pixel_lights_up_as_late_as_its_columns_and_rows_from_the_middle_say():
+    shear = Shear(np.zeros(3), (1e-3, 1e-5), MIDDLE_PX)
+    x_px, y_px = np.array([47.5, 57.5, 47.5]), np.array([39.5, 39.5, 49.5])
+    np.testing.assert_allclose(shear.late_s(x_px, y_px), [0.0, 1e-2, 1e-4])
+
+
+@pytest.mark.parametrize("s_per_px", [(0.0, 1e-4), (1e-4, 0.0), (0.0, -1e-4), (5e-5, 1e-4)])
+@pytest.mark.parametrize("at_px", [(20.0, 15.0), (70.0, 60.0), (25.0, 62.0)])
+def test_a_disc_of_a_turning_camera_is_where_it_was_when_its_own_pixels_lit_up(s_per_px, at_px):
+    """The exact turn from the moment of the attitude to that of the disc's place."""
+    rate_rad_s = np.array([0.2, -0.25, 0.1])
+    disc = uniform_disc(at_px)
+    view = DiscView(CAMERA, PSF, (Pose(np.eye(3)),), Shear(rate_rad_s, s_per_px, MIDDLE_PX))
+    place = np.array(at_px)
+    for _ in range(20):  # its place when it lights up, which depends on the place
+        late_s = float(np.dot(s_per_px, place - MIDDLE_PX))
+        turned = to_matrix(propagate(AT_REST, rate_rad_s, late_s)) @ disc.direction
+        place = np.concatenate(CAMERA.project(turned[None]))
+    assert 0.1 < np.hypot(*(place - at_px)) < 0.7
+    np.testing.assert_allclose(centre_px(disc_lights(disc, view, False)), place, atol=PLACE_PX)
+
+
+@pytest.mark.parametrize("by_px", [(0.25, 0.0), (0.0, 0.25), (-0.3, 0.4)])
+def test_a_map_moved_by_part_of_a_pixel_keeps_its_light_and_moves_its_middle(by_px):
+    view = DiscView(CAMERA, PSF, (Pose(np.eye(3)),))
+    (light,) = disc_lights(uniform_disc((30.0, 50.0)), view, True)
+    moved = shifted(light, *by_px)
+    assert moved.image.sum() == pytest.approx(light.image.sum(), rel=1e-3)
+    assert moved.cover.shape == moved.image.shape
+    np.testing.assert_allclose(centre_px([moved]), centre_px([light]) + by_px, atol=2e-3)
+    assert shifted(light, 0.0, 0.0) is light

@@ -1,0 +1,122 @@
+"""The processes of several heads: when one is begun again and when it has done, with which command;
+and what it said at its end.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from hilstar.server.bench.bench_file import read_heads
+from hilstar.server.heads import HeadProcess, HeadsRun, _told, head_command
+from tests.support.damage import NO_JSON
+from tests.support.heads import heads_file
+from tests.support.waiting import wait_for
+
+# What a head does as a service that draws: it says that it is ready.
+READY = (
+    "import os, socket;"
+    " socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM).sendto(b'READY=1', os.environ['NOTIFY_SOCKET']);"
+)
+
+
+@pytest.mark.parametrize("output", NO_JSON)
+def test_a_head_whose_output_is_no_json_has_no_summary(output):
+    assert _told(SimpleNamespace(output=output, code=-9, restarts=2)) == {
+        "exit_code": -9,
+        "restarts": 2,
+        "summary": None,
+    }
+
+
+def test_a_summary_is_told():
+    assert _told(SimpleNamespace(output=b'{"frames": 3}\n', code=0, restarts=0))["summary"] == {
+        "frames": 3
+    }
+
+
+def python(code: str) -> list[str]:
+    """A process that runs a line of Python, without what takes long to import."""
+    return [sys.executable, "-S", "-c", code]
+
+
+def ended(head: HeadProcess) -> tuple[int | None, int]:
+    """Tend a head until it has done; its exit code, and how often it was begun again."""
+    try:
+        wait_for(lambda: not head.tend(), "it has done", poll_s=0.01)
+    finally:
+        head.close(1.0)
+    return head.code, head.restarts
+
+
+@pytest.mark.parametrize(
+    ("first", "restarts", "said"),
+    [
+        # nothing was shown: no end in order
+        ("", 1, "head: its process ended (exit code 0); it is started again"),
+        ("import os; os.kill(os.getpid(), 9)", 1, "head: its process ended (signal 9)"),
+        (f"{READY} os._exit(77)", 1, "head: its process ended (exit code 77)"),
+    ],
+)
+def test_a_head_that_ends_in_no_order_is_begun_again(tmp_path, first, restarts, said):
+    lines: list[str] = []
+
+    def command(number: int, drawn_s: float) -> list[str]:
+        return python(f"{READY} print(7)") if number else python(first)
+
+    head = HeadProcess("head", command, lines.append, tmp_path / "life")
+    assert ended(head) == (0, restarts)
+    assert head.output == b"7\n"
+    assert said in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("code", "exit_code"), [("raise SystemExit(3)", 3), (f"{READY} raise SystemExit(1)", 1)]
+)
+def test_a_head_that_a_command_s_exit_code_ends_has_done(tmp_path, code, exit_code):
+    head = HeadProcess("head", lambda number, drawn_s: python(code), print, tmp_path / "life")
+    assert ended(head) == (exit_code, 0)
+
+
+def test_what_a_head_says_is_told_with_its_name_and_secrets_are_in_its_environment(tmp_path):
+    lines: list[str] = []
+    code = f"{READY} import sys; print(os.environ['HILSTAR_TOKEN'], file=sys.stderr)"
+    token = {"HILSTAR_TOKEN": "secret"}
+    head = HeadProcess(
+        "head", lambda number, drawn_s: python(code), lines.append, tmp_path / "life", token
+    )
+    assert ended(head) == (0, 0)
+    assert lines == ["head: secret"]
+    assert "HILSTAR_TOKEN" not in os.environ
+
+
+def test_a_head_begun_again_runs_for_the_rest_of_the_time_with_a_ledger_of_its_own(tmp_path):
+    heads = read_heads(heads_file(tmp_path, 5599))
+    pages = tuple(f"127.0.0.1:{9000 + k}" for k in range(3))
+    asked = HeadsRun(heads, ("--headless",), 60.0, tmp_path / "run.mcap", pages)
+
+    def words(number: int, drawn_s: float) -> dict[str, str]:
+        command = head_command(asked, 1, "ipc:///feed", number, drawn_s)
+        assert command[:6] == [
+            sys.executable,
+            "-m",
+            "hilstar",
+            "serve",
+            str(tmp_path / "b.toml"),
+            "--json",
+        ]
+        assert "--headless" in command
+        return dict(pairwise(command))
+
+    first, again, late = words(0, 0.0), words(2, 12.5), words(3, 61.0)
+    assert [each["--duration"] for each in (first, again, late)] == ["60", "47.5", "0.05"]
+    ledgers = [Path(each["--ledger"]).name for each in (first, again)]
+    assert ledgers == ["run.b.mcap", "run.b.again2.mcap"]
+    assert first["--console"] == "127.0.0.1:9001"
+    assert first["--head-of"] == str(heads.path)
+    assert first["--fed-by"] == f"ipc:///feed,{os.getpid()}"

@@ -1,0 +1,91 @@
+"""Air over a place, of stated extinction and without refraction: what it does to each channel of a
+tracker, and to a body on the horizon.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilstar.sky.air import AIR_MASSES, SiteAir
+from hilstar.sky.bodies.orbit import Geocentre
+from hilstar.sky.bodies.passes import Cone
+from tests.support.satellites import satellite_sky, some_orbits
+from tests.support.skies import moving_sky
+from tests.support.stars import stars_at
+
+# Kasten and Young 1989, at 90 and at 30 degrees of altitude
+ZENITH_MASSES, LOW_MASSES = 0.99971, 1.99429
+UTC = "2026-11-21T00:00:00Z"
+
+
+def plain_air(up: np.ndarray, mag_a_mass: tuple[float, ...], stars: int = 0) -> SiteAir:
+    """Air that dims every spectrum by so many magnitudes an air mass, one for each channel."""
+    dimming = np.array(mag_a_mass)[:, None, None] * AIR_MASSES[:, None]
+    return SiteAir(
+        up_at=lambda utc_ns: up,
+        refraction_rad=(0.0, 0.0),
+        height_m=0.0,
+        aperture_mm=30.0,
+        dimming_mag=np.broadcast_to(dimming, (len(mag_a_mass), len(AIR_MASSES), stars + 1)),
+    )
+
+
+def test_air_dims_each_channel_of_a_star_by_its_own_extinction():
+    """Pogson's law by channel: the blue one loses most, and a low star is redder."""
+    up = np.array([0.0, 0.0, 1.0])
+    directions = np.array([up, [np.sqrt(0.75), 0.0, 0.5]])
+    shares = np.array([[0.2, 0.5, 0.3], [0.1, 0.3, 0.6]])
+    mag_a_mass = (0.1, 0.2, 0.4)
+    stars = stars_at(directions, np.array([1000.0, 500.0]))
+    order = stars.row
+    stars = replace(stars, colours=shares[order])
+    seen = plain_air(up, mag_a_mass, len(stars)).over(stars, 0)
+    masses = np.array([ZENITH_MASSES, LOW_MASSES])[order]
+    through = 10 ** (-0.4 * np.outer(masses, mag_a_mass))
+    wanted = np.array([1000.0, 500.0])[order, None] * shares[order] * through
+    found = seen.electrons_per_s[:, None] * seen.colours
+    np.testing.assert_allclose(found, wanted, rtol=1e-5)  # the air masses' five digits
+    np.testing.assert_allclose(seen.colours.sum(axis=1), 1.0)
+
+
+@pytest.mark.parametrize(
+    ("centre_deg", "is_seen"), [(0.5, True), (0.1, True), (-0.1, True), (-0.2, True), (-0.4, False)]
+)
+def test_a_moon_that_sets_is_seen_until_its_upper_limb_is_down(centre_deg, is_seen):
+    """Of half a degree: without refraction its limb sets when its centre is 0.26 degrees down."""
+    moving = moving_sky(UTC, ("Moon",))
+    (moon,) = moving.discs(np.array([1.0, 0.0, 0.0]), np.pi)
+    assert 0.24 < np.degrees(moon.radius_rad) < 0.28
+    level = np.cross(moon.direction, [0.0, 0.0, 1.0])
+    level /= np.linalg.norm(level)
+    altitude = np.radians(centre_deg)
+    moving.air = plain_air(np.sin(altitude) * moon.direction + np.cos(altitude) * level, (0.2,))
+    found = moving.discs(moon.direction, 0.1)
+    assert [disc.name for disc in found] == (["Moon"] if is_seen else [])
+
+
+@pytest.mark.parametrize("altitude_deg", [90.0, 30.0, 0.5, -0.5, -60.0])
+def test_a_satellite_is_seen_through_the_air_and_not_through_the_ground(altitude_deg):
+    """Two that are lit, of a list of 30: each at its own altitude over a horizon that is put there."""
+    sky = satellite_sky(some_orbits(np.random.default_rng(3), 30), Geocentre())
+    seen = sky.passing(Cone(np.array([0.0, 0.0, 1.0]), np.pi, 0.0), 0)
+    now = np.zeros(len(seen))
+    every = np.arange(len(seen))
+    bare = seen.rates_e_per_s(every, now, now)
+    brightest = int(np.argmax(bare))
+    towards = seen.directions(every, now)[brightest]
+    level = np.cross(towards, [0.0, 0.0, 1.0])
+    level /= np.linalg.norm(level)
+    altitude = np.radians(altitude_deg)
+    air = plain_air(np.sin(altitude) * towards + np.cos(altitude) * level, (0.2,))
+    through = seen.through(air, 0).rates_e_per_s(every, now, now)[brightest]
+    if altitude_deg < 0:
+        assert through == 0.0
+    else:
+        # Pickering 2002, whose air masses are Kasten and Young's within 1 % from the horizon up
+        masses = 1 / np.sin(np.radians(altitude_deg + 244 / (165 + 47 * altitude_deg**1.1)))
+        wanted_mag = 0.2 * masses
+        assert -2.5 * np.log10(through / bare[brightest]) == pytest.approx(wanted_mag, rel=0.02)

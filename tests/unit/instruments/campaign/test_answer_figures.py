@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilstar.instruments.assess.bounded_figures import lowest_size
+from hilstar.instruments.assess.bounded_figures import BoundedFigure, lowest_size
 from hilstar.instruments.assess.case_fits import fit_by_cases
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import FRAME_RATE_ERRORS, FRAME_RATES
@@ -21,6 +21,7 @@ from hilstar.instruments.campaign.requirements import (
     NOT_MET,
     NOT_SHOWN,
     RequirementVerdict,
+    judged_figure,
     verdicts_of,
 )
 from tests.support.planted_answers import CASES, FRAMES, SCALE, answers, reported_stars
@@ -212,6 +213,32 @@ def test_slews_of_one_sign_do_not_tell_a_stamp_from_a_bias(rng: np.random.Genera
         cases.lists[name] = [np.abs(values) for values in cases.lists[name]]
     found = figure_verdict(cases, "time-bias", maximum=0.01)
     assert found.verdict == NOT_SHOWN and "both signs" in found.method
+
+
+@pytest.mark.parametrize(
+    "factor, told",
+    [(180 / math.pi, "as in deg/s"), (-1.0, "rad/s of the opposite sign"), (1e3, "as in mrad/s")],
+)
+def test_rates_in_another_unit_are_not_judged(
+    factor: float, told: str, rng: np.random.Generator
+) -> None:
+    cases = answers(rng)
+    for rates, errors in zip(FRAME_RATES, FRAME_RATE_ERRORS, strict=True):
+        for k, true in enumerate(cases.lists[rates]):
+            cases.lists[errors][k] = factor * (true + cases.lists[errors][k]) - true
+    for quantity in ("rate-bias", "rate-noise", "rate-scale"):
+        found = figure_verdict(cases, quantity, maximum=0.01)
+        assert found.value is None and found.more is None and told in found.method
+
+
+def test_a_figure_of_noise_wants_many_more_cases(rng: np.random.Generator) -> None:
+    """A size beyond the limit whose interval reaches from 0 far above: its lower side is cut off,
+    and says nothing of how few cases would do.
+    """
+    figure = BoundedFigure(3.42, 0.0, 60.7, 24, "")
+    found = judged_figure(Require(quantity="parallax", maximum=1.0), figure)
+    # the upper side is as wide as one sigma times so much: it shrinks by the root of the cases
+    assert found.more == math.ceil(24 * ((60.7 - 3.42) / 2.42) ** 2) - 24
 
 
 def test_answers_without_rates_or_stars_say_so(rng: np.random.Generator) -> None:

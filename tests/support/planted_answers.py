@@ -30,6 +30,7 @@ CASES, FRAMES = 60, 8
 RATE_NOISE_DEG_S = 0.01
 NOISE_ARCSEC = 2.0
 STARS = 30  # of a case
+INSIDE_PX = (8.0, 503.0)  # where stars stand, along each axis
 WILD_SIGMAS = 20.0
 
 
@@ -88,12 +89,17 @@ def reported_stars(rng: np.random.Generator, cases: int = CASES, **planted: Any)
     lists: dict[str, list[Any]] = {name: [] for name in STAR_LISTS}
     false = rng.poisson(planted.get("false", 0.2), cases)
     wild = planted.get("wild", 0.0)
+    near_px, far_px = INSIDE_PX
     for _ in range(cases):
         n = STARS
-        x, y = rng.uniform(8, 503, (2, n))
+        x, y = rng.uniform(*INSIDE_PX, (2, n))
         v_mag = rng.uniform(2, 7, n)
         bv = rng.uniform(-0.2, 1.8, n)
-        wave = math.sqrt(2) * planted.get("fov", 0.0) * np.sin(2 * np.pi * x / 512)
+        wave = (
+            math.sqrt(2)
+            * planted.get("fov", 0.0)
+            * np.sin(2 * np.pi * (x - near_px) / (far_px - near_px))
+        )
         noise = planted.get("noise", 0.1) * rng.standard_normal((2, n))
         noise = noise * (1 + WILD_SIGMAS * (rng.random(n) < wild))
         dx, dy = wave + noise

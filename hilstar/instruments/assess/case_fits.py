@@ -29,12 +29,16 @@ SILENT = "the answers carry no {}"
 class CaseFit:
     """A least-squares fit over rows of cases: coefficients (k,), their covariance (k, k) by cases,
     the degrees of freedom of each variance (k,), the residuals (n,), and the number of cases.
+
+    `even` (n,) are the residuals scaled up by what each case's own share in the fit took of them:
+    their mean square is that of the errors, whether or not those of a case go together.
     """
 
     value: FloatArray
     covariance: FloatArray
     freedom: FloatArray
     residual: FloatArray
+    even: FloatArray
     cases: int
 
 
@@ -55,6 +59,7 @@ def fit_by_cases(design: FloatArray, values: FloatArray, case: IntArray) -> Case
     score = np.zeros((cases, terms))
     weight = np.zeros((cases, terms))  # of each case's errors in a coefficient, squared
     shared = np.zeros((cases, terms, terms))  # what the fit itself takes of that
+    even = np.zeros_like(residual)
     rows_by_case = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
     for k, rows in enumerate(rows_by_case):
         own_design = design[rows]
@@ -62,7 +67,8 @@ def fit_by_cases(design: FloatArray, values: FloatArray, case: IntArray) -> Case
         free = np.maximum(1 - pull**2, SMALL_SHARE)
         # (1 - H)^-1/2 of the case's own part of the hat matrix H, less 1
         scale = axes * (1 / np.sqrt(free) - 1)
-        score[k] = own_design.T @ (residual[rows] + scale @ (axes.T @ residual[rows]))
+        even[rows] = residual[rows] + scale @ (axes.T @ residual[rows])
+        score[k] = own_design.T @ even[rows]
         errors = own_design @ inverse
         errors = errors + scale @ (axes.T @ errors)
         weight[k] = (errors**2).sum(axis=0)
@@ -71,7 +77,7 @@ def fit_by_cases(design: FloatArray, values: FloatArray, case: IntArray) -> Case
     freedom = np.zeros(terms)
     for term in range(terms):
         freedom[term] = _freedom(weight[:, term], shared[:, :, term], inverse)
-    return CaseFit(value, covariance, freedom, residual, cases)
+    return CaseFit(value, covariance, freedom, residual, even, cases)
 
 
 def _square_root(inverse: FloatArray) -> FloatArray:

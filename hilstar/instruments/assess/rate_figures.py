@@ -60,11 +60,9 @@ def rate_figure(
         fits.append(_rate_fit(errors[:, k], rates[:, k], accelerations[:, k], case))
     fitted_cases = fits[0].cases
     if quantity == RATE_NOISE:
-        residual = np.stack([fit.residual for fit in fits], axis=1)
-        rows = len(case)
-        freedom = max(rows - 3, 1) / rows
-        squares = (residual**2).mean(axis=1) / freedom
-        return root_mean(squares, np.ones(rows), case, confidence, rng)
+        noise = np.stack([fit.even for fit in fits], axis=1)
+        squares = (noise**2).mean(axis=1)
+        return root_mean(squares, np.ones(len(case)), case, confidence, rng)
     if quantity == "rate-scale" and not _varies(rates[:, axes]):
         raise TooFewCases("no case turns at several rates about that axis", fitted_cases)
     if quantity == "rate-lag" and not _varies(accelerations[:, axes]):

@@ -33,6 +33,7 @@ COVERED, TRIES = 0.95, 200
 MIN_HELD = 180
 # binomial: of 1000 intervals at 95 %, 927 and fewer hold once in 1000
 HEAVY_TRIES, MIN_HEAVY_HELD = 1000, 928
+SQUARE_TRIES = 400
 # three sigmas of a binomial count
 SIZE_TRIES, SIZE_BAND = 4000, 42
 # binomial: of 800 tries at 5 %, over 59 are met once in 1000
@@ -95,6 +96,23 @@ def test_one_value_a_case_has_the_covariance_of_a_mean(rng: np.random.Generator)
     assert fit.value == pytest.approx([values.mean()])
     assert fit.covariance[0, 0] == pytest.approx(values.var(ddof=1) / 6)
     assert fit.freedom == pytest.approx([5.0])
+
+
+@pytest.mark.parametrize("together", [0.0, 0.9])
+def test_the_mean_square_of_errors_is_found_whether_or_not_they_go_together(
+    rng: np.random.Generator, together: float
+) -> None:
+    """Twelve cases of eight rows and three terms: plain residuals lack 3 and 20 % of it."""
+    case = np.repeat(np.arange(12), 8)
+    squares = []
+    for _ in range(SQUARE_TRIES):
+        rates = rng.uniform(-1, 1, (12, 2))[case] + 0.1 * rng.standard_normal((96, 2))
+        lasting = math.sqrt(together) * rng.standard_normal(12)[case]
+        errors = lasting + math.sqrt(1 - together) * rng.standard_normal(96)
+        fit = fit_by_cases(np.column_stack([np.ones(96), rates]), errors, case)
+        squares.append(float((fit.even**2).mean()))
+    error = np.std(squares) / math.sqrt(SQUARE_TRIES)
+    assert math.fsum(squares) / SQUARE_TRIES == pytest.approx(1.0, abs=3 * error)
 
 
 def test_the_size_of_nothing_is_shown_in_one_of_twenty(rng: np.random.Generator) -> None:

@@ -8,7 +8,7 @@ one of STRETCHES stretches of the run.
 import contextlib
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from hilstar.instruments.assess.star_figures import (
     StarTable,
     false_stars,
     star_figure,
-    without_shifts,
+    without_turns,
 )
 from hilstar.instruments.assess.time_figures import stamp_jitter
 from hilstar.server.answers.answer import ReportedStar
@@ -170,11 +170,15 @@ def add_stars(
     answer = number.astype(np.intp)
     further.stars = StarTable(case[answer], *columns_of_stars)
     with contextlib.suppress(TooFewCases):  # too few for a map: no figure needs it then
-        further.stars = without_shifts(further.stars, answer, shown.size_px)
+        further.stars = without_turns(further.stars, answer, shown.size_px)
     for quantity, (name, unit) in STAR_NAMES.items():
         rng = np.random.default_rng(SEED)
+        stars = further.stars
+        if quantity == "star-colour":
+            # a run sees the same stars again and again: what one of them is off by is off always
+            stars = replace(stars, case=np.unique(stars.lit_mag, return_inverse=True)[1])
         try:
-            figure = star_figure(quantity, further.stars, shown.size_px, END, rng)
+            figure = star_figure(quantity, stars, shown.size_px, END, rng)
         except TooFewCases as few:
             further.miss(name, "", unit, few)
         else:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilstar.attitude.clock.rate_causes import UNITS
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.instruments.assess.bounded_figures import BoundedFigure, TooFewCases
 from hilstar.instruments.assess.case_fits import (
@@ -20,6 +21,7 @@ from hilstar.instruments.assess.case_fits import (
 
 RATE_TERMS = ("rate-bias", "rate-scale", "rate-lag")  # of the linear fit of a rate
 RATE_NOISE = "rate-noise"
+NEAR_SHARE = 0.1  # by which rates in another unit may be off
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,6 +52,7 @@ def rate_figure(
     rates = table.rates_deg_s[known]
     errors = table.errors_deg_s[known]
     accelerations = table.accelerations_deg_s2[known]
+    _refuse_other_units(rates, rates + errors)
     case = table.case[known]
     refuse_few(case, "rate")
     fits = []
@@ -68,6 +71,28 @@ def rate_figure(
         raise TooFewCases("no case accelerates about that axis", fitted_cases)
     column = RATE_TERMS.index(quantity)
     return largest_size(fits, column, confidence, "linear fit, Student's t")
+
+
+def _refuse_other_units(rates: FloatArray, reported: FloatArray) -> None:
+    """Refuse (TooFewCases) reported rates (n, 3) that are the commanded ones in another unit, or of
+    the opposite sign: no figure of theirs is the tracker's.
+    """
+    power = float((rates**2).sum())
+    if not power:
+        return
+    factor = float((rates * reported).sum()) / power
+    left = reported - factor * rates
+    if float((left**2).sum()) > NEAR_SHARE * float((reported**2).sum()):
+        return
+    for unit, size in (*UNITS.items(), ("rad/s", 1.0)):
+        sign = "" if factor > 0 else " of the opposite sign"
+        is_right = unit == "rad/s" and factor > 0
+        if not is_right and abs(abs(factor) / size - 1) < NEAR_SHARE:
+            raise TooFewCases(
+                f"the reported rates are {factor:.4g} times the commanded ones, as in {unit}{sign};"
+                " send the turn of cam with respect to icrs in cam axes, rad/s",
+                0,
+            )
 
 
 def _varies(values: FloatArray) -> bool:

@@ -38,7 +38,7 @@ LIGHT_DEGREE = 2  # of the signal's error over the magnitude of the light
 NO_SIGNAL = (
     "the reported signals fall as the stars' light rises: give DN, or 10^(-0.4 m) of a magnitude m"
 )
-SHIFT_ROUNDS = 3
+TURN_ROUNDS, FEW_TO_TURN = 3, 2
 LIMIT_BIN_MAG = 0.05
 LIMIT_DRAWS = 200  # of the bootstrap of a detection curve
 MIN_SLOPE_MAG = 0.01  # width of a detection curve: a sharper one cannot be told from its bins
@@ -122,31 +122,53 @@ def place_map(found: StarTable, resolution_px: tuple[int, int], side: int) -> Pl
     return PlaceOffsets(x_px, y_px, dx_px, dy_px)
 
 
-def without_shifts(stars: StarTable, frame: IntArray, resolution_px: tuple[int, int]) -> StarTable:
-    """The stars with places less the shift that those of one `frame` (n,) share about the map: it
-    is of the attitude and of the time at which the tracker looked. Raises TooFewCases.
+def without_turns(stars: StarTable, frame: IntArray, resolution_px: tuple[int, int]) -> StarTable:
+    """The stars with places less the shift and the roll that those of one `frame` (n,) share about
+    the map: they are of the attitude and of the time at which the tracker looked. Raises
+    TooFewCases.
 
-    What the shifts take of the scatter is given back.
+    What the turns take of the scatter is given back.
     """
     found = np.flatnonzero(stars.found)
     number = numbered(frame[found])
     reported = summed(np.ones(len(found)), number)
-    offsets = np.stack([stars.dx_px, stars.dy_px], axis=1)
+    places = np.stack([stars.x_px, stars.y_px], axis=1)[found]
     terms = field_terms(stars.x_px[found], stars.y_px[found], resolution_px, MAP_DEGREE)
+    offsets = np.stack([stars.dx_px, stars.dy_px], axis=1)
     raw = offsets[found]
-    shift = np.zeros((len(reported), 2))
-    for _ in range(SHIFT_ROUNDS):
-        offsets[found] = raw - shift[number]
+    turned = np.zeros_like(raw)
+    for _ in range(TURN_ROUNDS):
+        offsets[found] = raw - turned
         table = replace(stars, dx_px=offsets[:, 0], dy_px=offsets[:, 1])
         by_map = terms @ fitted_places(table, resolution_px).solution
-        left = raw - by_map
-        for axis in range(2):
-            shift[:, axis] = summed(left[:, axis], number) / reported
-    # of one star alone the shift takes all
-    shift[reported < 2] = 0.0
-    growth = np.sqrt(reported / np.maximum(reported - 1, 1.0))
-    offsets[found] = by_map + growth[number, None] * (left - shift[number])
+        turned = _turns_px(places, raw - by_map, number, reported)
+    # of an axis' places a turn takes one and a half
+    growth = np.sqrt(reported / np.maximum(reported - 1.5, 0.5))
+    offsets[found] = by_map + growth[number, None] * (raw - by_map - turned)
     return replace(stars, dx_px=offsets[:, 0], dy_px=offsets[:, 1])
+
+
+def _turns_px(
+    places: FloatArray, offsets: FloatArray, number: IntArray, reported: FloatArray
+) -> FloatArray:
+    """The part (n, 2) of offsets at places (n, 2), px, that the stars of one frame share: a shift
+    and a turn about their middle, to the least squares. `reported` counts each frame's stars; of
+    two or fewer nothing is taken.
+    """
+    shift = _means(offsets, number, reported)
+    x, y = (places - _means(places, number, reported)).T
+    across = np.stack([-y, x], axis=1)
+    moment = summed((across * (offsets - shift)).sum(axis=1), number)
+    angle_rad = moment / np.maximum(summed(x**2 + y**2, number), 1e-9)
+    turned = shift + angle_rad[number, None] * across
+    turned[reported[number] <= FEW_TO_TURN] = 0.0
+    return np.asarray(turned)
+
+
+def _means(values: FloatArray, number: IntArray, counts: FloatArray) -> FloatArray:
+    """The mean of values (n, 2) over those of the same number, for each (n, 2)."""
+    columns = [summed(column, number) / counts for column in values.T]
+    return np.stack(columns, axis=1)[number]
 
 
 def _star_noise(

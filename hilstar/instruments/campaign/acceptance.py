@@ -38,7 +38,7 @@ from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.star_motion import with_motion
 from hilstar.instruments.campaign.store import Directory, failures, require_parquet
-from hilstar.instruments.campaign.sweep import counted, edge_figure, next_level
+from hilstar.instruments.campaign.sweep import ENDS, counted, edge_figure, next_level
 
 PLAN_FILE = "plan.toml"
 TIMED_CASES = 2  # of a set, whose time tells that of all
@@ -95,21 +95,26 @@ class Acceptance(AcceptedBench):
             if case_set.refused:
                 continue
             sweep = case_set.sweep
-            # the middle of a sweep costs something between its ends
-            levels = (None,) if sweep is None else (sweep.start, sweep.stop)
+            # most levels of a sweep stand near its edge, whose cases cost more than its ends': the
+            # limb of the Earth is in their field
+            levels: dict[float | None, int] = {None: 1}
+            if sweep is not None:
+                middle = sweep.between(sweep.start, sweep.stop)
+                levels = {sweep.start: 1, sweep.stop: 1, middle: sweep.levels - ENDS}
             folder = self.directory / case_set.name
-            campaigns = []
+            campaigns = {}
             for level in levels:
                 begun_s = time.perf_counter()
-                campaigns.append(self.campaign(case_set, folder, level))
+                campaigns[level] = self.campaign(case_set, folder, level)
                 set_up_s = time.perf_counter() - begun_s  # the last has the catalogue in memory
-            run = 1 if sweep is None else sweep.levels
-            cases = campaigns[0].cases * run
+            first = next(iter(campaigns.values()))
+            run = sum(levels.values())
+            cases = first.cases * run
             if self.on_bench:
-                yield CostOfSet(case_set, cases, cases * campaigns[0].plan.limit_s)
+                yield CostOfSet(case_set, cases, cases * first.plan.limit_s)
                 continue
-            case_s = sum(_case_s(campaign) for campaign in campaigns) / len(campaigns)
-            seconds = cases * case_s / min(workers, cases) + run * set_up_s
+            all_s = sum(count * _case_s(campaigns[level]) for level, count in levels.items())
+            seconds = first.cases * all_s / min(workers, cases) + run * set_up_s
             yield CostOfSet(case_set, cases, seconds)
 
     def run(self, run_cases: RunCases) -> list[SetResult]:

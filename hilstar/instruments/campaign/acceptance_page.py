@@ -4,11 +4,12 @@ what was not tested and why, and the ledger; the same as acceptance.csv and JSON
 
 import math
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
 
-from hilstar.basics.charts import BLUE, MUTED, panels_of, write_csv
+from hilstar.basics.charts import BLUE, MUTED, capital, panels_of, write_csv
 from hilstar.basics.files import write_whole
 from hilstar.basics.pages import (
     BAD,
@@ -39,7 +40,7 @@ from hilstar.instruments.campaign.plan import STAR_QUANTITIES
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.requirements_page import STATES, signed_card, verdict_chip
 from hilstar.instruments.campaign.store import file_sha256
-from hilstar.instruments.campaign.sweep import NOT_EVEN, STILL, levels_text
+from hilstar.instruments.campaign.sweep import NOT_EVEN, STILL, SweepTable, levels_text
 from hilstar.server.bench.certificate_file import off_by
 
 PAGE_FILE, CSV_FILE, JSON_FILE = "accept.html", "acceptance.csv", "acceptance.json"
@@ -59,7 +60,7 @@ HEADLINES = {
 }
 CURES = {
     NOT_MET: "Look at the ledger for the cases at fault, and change the tracker or the limit.",
-    NOT_SHOWN: "Run more cases: the table says how many would show it.",
+    NOT_SHOWN: "Run more cases: the table says how many would decide.",
 }
 METHOD = (
     "Each end of an interval is a one-sided limit at the clause's confidence. Met: the whole"
@@ -76,8 +77,10 @@ TOGETHER = (
 MAY_BE_CHANCE = "may be chance among so many clauses; more cases would tell"
 FAILED_HEADER = ("set of cases", "failed", "why")
 FAILED_CURE = "Mend what the reasons name, and accept again in another directory."
+QUICK = "a few cases for every clause (--quick), no acceptance"
 QUANTILES = (0.5, 0.9, 0.95, 0.99)
 MAX_ROWS = 5000  # of points in a chart
+EDGE_ALPHA = 0.15  # of the band that is an edge's interval
 
 
 def write_acceptance(
@@ -100,7 +103,7 @@ def write_acceptance(
     for card in _cards(acceptance, results, verdicts, rows):
         parts.append(card.html())
     title = f"{acceptance.plan.title}: {acceptance.file.path.name}"
-    page = page_of(title, _verdict(verdicts), parts)
+    page = page_of(title, _verdict(verdicts, acceptance.plan.quick), parts)
     write_whole(folder / PAGE_FILE, page)
     return summary
 
@@ -132,6 +135,8 @@ def summary_of(
     return {
         "title": plan.title,
         "plan": str(plan.path),
+        "plan_sha256": plan.sha256,
+        "quick": plan.quick,
         "bench": str(file.path),
         "bench_sha256": file.sha256,
         "through": plan.through,
@@ -221,7 +226,7 @@ def _more(each: ClauseVerdict) -> str:
     if each.word != NOT_SHOWN or each.verdict is None:
         return ""
     if each.verdict.more:
-        return f"about {each.verdict.more} more cases would show it"
+        return f"about {each.verdict.more} more cases would decide"
     return each.verdict.method if each.verdict.value is None else ""
 
 
@@ -284,15 +289,17 @@ def _margin(each: ClauseVerdict) -> str | None:
     return f"{_digits(verdict.margin)} {each.unit}".rstrip() + share
 
 
-def _verdict(verdicts: list[ClauseVerdict]) -> Verdict:
+def _verdict(verdicts: list[ClauseVerdict], quick: bool) -> Verdict:
     whole = verdict_of(verdicts)
     counts = []
     for word in (MET, NOT_MET, NOT_SHOWN, NOT_TESTED):
         count = sum(judged.word == word for judged in verdicts)
         if count:
             counts.append(f"{count} {word}")
-    counts_text = ", ".join(counts)
-    return Verdict(STATES[whole], HEADLINES[whole], f"Of {len(verdicts)}: {counts_text}.")
+    counts_text = f"Of {len(verdicts)}: {', '.join(counts)}."
+    if quick:
+        counts_text = f"{counts_text} {capital(QUICK)}."
+    return Verdict(STATES[whole], HEADLINES[whole], counts_text)
 
 
 def _counts(verdicts: list[ClauseVerdict]) -> Iterator[KeyFigure]:
@@ -314,13 +321,18 @@ def _cards(
         yield Card("Failed cases", words=[table_of(failed, FAILED_HEADER)], cure=FAILED_CURE)
     for result in results:
         if result.levels:
-            yield _sweep_card(result)
+            yield _sweep_card(result, _judged_edge(verdicts, result))
         elif _asked(verdicts, result, ("time-to-first-attitude",)):
             yield _first_attitude(result)
         elif _asked(verdicts, result, STAR_QUANTITIES):
             yield from _star_card(acceptance, result)
     yield _about(acceptance, results, rows)
     yield signed_card()
+
+
+def _judged_edge(verdicts: list[ClauseVerdict], result: SetResult) -> ClauseVerdict:
+    """The first verdict on the edge of a sweep."""
+    return next(judged for judged in verdicts if judged.clause.of == result.case_set.name)
 
 
 def _failed_rows(result: SetResult) -> Iterator[tuple[str, int, str]]:
@@ -372,8 +384,8 @@ def _untested(acceptance: AcceptedBench, verdicts: list[ClauseVerdict]) -> Card:
     return Card("Not tested", words=[table_of(rows, ("capability", "why"))])
 
 
-def _sweep_card(result: SetResult) -> Card:
-    """The share of successes at each level of a sweep, with its interval."""
+def _sweep_card(result: SetResult, judged: ClauseVerdict) -> Card:
+    """The share of successes at each level of a sweep, with its interval, and the edge."""
     sweep = result.case_set.sweep
     assert sweep is not None
     levels = list(levels_text(result.levels))
@@ -388,11 +400,11 @@ def _sweep_card(result: SetResult) -> Card:
     unit = ""
     if sweep.unit:
         unit = f" [{sweep.unit}]"
-    kept = "an attitude"
-    if sweep.star_v_mag is not None:
-        kept = f"half of their stars to V {sweep.star_v_mag:g}"
-    finding = f"Share of cases with {kept} against {sweep.key}"
+    finding = _edge_finding(sweep, judged)
     with panels_of(finding) as (axes,):
+        edge = judged.verdict
+        if edge is not None and edge.low is not None and edge.high is not None:
+            axes.axvspan(edge.low, edge.high, color=BLUE, alpha=EDGE_ALPHA, linewidth=0)
         axes.errorbar(at, share, yerr=bars, fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
         axes.axhline(sweep.share, linewidth=0.8, linestyle="--", color=MUTED)
         axes.set_ylim(-0.05, 1.05)
@@ -405,7 +417,25 @@ def _sweep_card(result: SetResult) -> Card:
     if result.case_set.about:
         paragraphs.append(paragraph(result.case_set.about))
     paragraphs.append(drawing_of(axes.figure, finding))
-    return Card(f"Sweep: {result.case_set.name}", words=paragraphs, details=[table])
+    return Card(judged.clause.capability, words=paragraphs, details=[table])
+
+
+def _edge_finding(sweep: SweepTable, judged: ClauseVerdict) -> str:
+    """Up to where a sweep's cases are successes, in a line."""
+    kept = "An attitude"
+    if sweep.star_v_mag is not None:
+        kept = f"Half of the stars to V {sweep.star_v_mag:g}"
+    edge = judged.verdict
+    if edge is None or edge.value is None:
+        return f"{kept}: {judged.untested or 'no edge'}"
+    if STILL in edge.method:
+        return f"{kept} even at {_digits(edge.value)} {judged.unit}".rstrip()
+    if NOT_EVEN in edge.method:
+        return f"{kept} is not there even at {_digits(edge.value)} {judged.unit}".rstrip()
+    way = "up to"
+    if sweep.stop < sweep.start:
+        way = "down to"
+    return f"{kept} {way} {_measured(judged)}"
 
 
 def _first_attitude(result: SetResult) -> Card:
@@ -416,21 +446,24 @@ def _first_attitude(result: SetResult) -> Card:
     times = np.sort(np.where(np.isfinite(column), column, math.inf))
     count = len(times)
     rows = []
+    finding = "Half of the cases have no attitude"
     for share in QUANTILES:
         low, high = quantile_limits(times, share, 0.975)
         place = min(math.ceil(share * count), count) - 1
         value = float(times[place])
-        percent = 100 * share
-        rows.append((f"{percent:g} %", _seconds(value), _seconds(low), _seconds(high)))
+        percent = f"{100 * share:g} %"
+        rows.append((percent, _seconds(value), _seconds(low), _seconds(high)))
+        if math.isfinite(value):
+            finding = f"An attitude within {_seconds(value)} s in {percent} of cases"
     known = times[np.isfinite(times)]
     shares = np.arange(1, len(known) + 1) / count
-    with panels_of("Time to the first attitude") as (axes,):
+    with panels_of(finding) as (axes,):
         axes.step(known, shares, where="post", color=BLUE)
         axes.set_ylim(0, 1.05)
         axes.set_xlabel("time to the first attitude [s]")
         axes.set_ylabel("share of cases")
     header = ("share of cases", "within [s]", "from (95 %)", "to")
-    paragraphs = [drawing_of(axes.figure, "distribution of the time to the first attitude")]
+    paragraphs = [drawing_of(axes.figure, finding)]
     paragraphs.append(table_of(rows, header))
     return Card(f"Time to the first attitude: {result.case_set.name}", words=paragraphs)
 
@@ -456,7 +489,9 @@ def _about(acceptance: AcceptedBench, results: list[SetResult], rows: int) -> Ca
     file = acceptance.file
     ledger_sha256 = file_sha256(acceptance.directory / LEDGER)
     about: list[tuple[str, str]] = [
-        ("plan", str(plan.path)),
+        ("plan", f"{plan.path}, sha256 {plan.sha256}"),
+        ("judged", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
+        ("run of", QUICK if plan.quick else "all cases of the plan"),
         ("bench", f"{file.path}, sha256 {file.sha256}"),
         ("through", plan.through),
         ("solver", acceptance.solver_text),

@@ -10,6 +10,7 @@ name of its cases. `[[untested]]` says what no clause tests, and why.
 import copy
 import re
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -124,6 +125,12 @@ class AcceptancePlan:
     sets: tuple[CaseSet, ...]
     clauses: tuple[ClauseTable, ...]
     untested: tuple[UntestedTable, ...]
+    quick: bool = False
+
+    @property
+    def sha256(self) -> str:
+        """The SHA-256 of its text."""
+        return sha256(self.text.encode()).hexdigest()
 
     def clauses_of(self, name: str) -> list[ClauseTable]:
         """The clauses of a set of cases."""
@@ -174,6 +181,7 @@ def read_acceptance_plan(
         sets=tuple(case_set for case_set in sets if case_set.name in asked),
         clauses=tuple(plan.clause),
         untested=tuple(plan.untested),
+        quick=quick,
     )
 
 

@@ -117,7 +117,7 @@ class RequirementVerdict:
         if self.verdict != NOT_SHOWN:
             return verdict_text
         if self.more:
-            return f"{verdict_text}; about {self.more} more cases would show it"
+            return f"{verdict_text}; about {self.more} more cases would decide"
         return f"{verdict_text}; {self.method}"
 
 
@@ -263,6 +263,9 @@ def _more(require: Require, figure: BoundedFigure) -> int | None:
         width = figure.high - figure.value
     else:
         width = figure.value - figure.low
+        # of a size the interval ends at 0, which says nothing of its width
+        if figure.low == 0:
+            width = max(width, figure.high - figure.value)
     if not away or not math.isfinite(width) or width <= 0:
         return None
     needed = math.ceil(figure.cases * (width / away) ** 2)

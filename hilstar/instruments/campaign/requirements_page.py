@@ -63,7 +63,7 @@ HEADLINES = {
 CURES = {
     MET: "",
     NOT_MET: "Find what costs the most in sensitivity.csv, and change the tracker or the limit.",
-    NOT_SHOWN: "Run more cases: the table says how many would show it.",
+    NOT_SHOWN: "Run more cases: the table says how many would decide.",
 }
 HEADER = (
     "requirement",

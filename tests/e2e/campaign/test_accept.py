@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import subprocess
 from dataclasses import replace
@@ -86,6 +87,7 @@ def test_an_acceptance_ends_in_a_page_tables_and_an_exit_code(folder: Path) -> N
         "Recovery": "not tested",
     }
     assert told["verdict"] == "not met" and told["cases"] == 24 + 8 * 4
+    assert told["plan_sha256"] == hashlib.sha256(PLAN.encode()).hexdigest() and not told["quick"]
     together = {clause["capability"]: clause["together"] for clause in told["clauses"]}
     # 8 of 8 cases without an attitude, at a confidence that three clauses and four levels share
     assert together["Largest <rate>"] == "not met" and together["A right attitude"] == ""

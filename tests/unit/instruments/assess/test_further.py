@@ -16,7 +16,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
 from hilstar.instruments.assess.assessment import Assessment, AssessSettings, assess_files
 from hilstar.instruments.assess.further import END, rate_notes
-from hilstar.instruments.assess.star_figures import StarTable, star_figure, without_shifts
+from hilstar.instruments.assess.star_figures import StarTable, star_figure, without_turns
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.star_light import bench_stars
 from tests.support.benches import bench_text
@@ -165,17 +165,21 @@ def test_rates_of_another_convention_are_named(
     assert all("not the turn of the reported attitudes" in note and told in note for note in notes)
 
 
-def test_a_shift_that_all_stars_share_is_not_a_stars_noise(rng: np.random.Generator) -> None:
-    """Answers of 20 stars each, which a time that is off moves by 2 px an axis, one sigma."""
+def test_a_turn_that_all_stars_share_is_not_a_stars_noise(rng: np.random.Generator) -> None:
+    """Answers of 20 stars each, which a time that is off moves by 2 px an axis and rolls by 0.2
+    deg, one sigma.
+    """
     answers, stars = 200, 20
     answer = np.repeat(np.arange(answers), stars)
     x_px, y_px = rng.uniform(0, SIDE_PX - 1, (2, len(answer)))
     shift_px = rng.normal(0, 2.0, (2, answers))[:, answer]
+    roll_rad = rng.normal(0, np.radians(0.2), answers)[answer]
+    shift_px += roll_rad * np.stack([MIDDLE_PX - y_px, x_px - MIDDLE_PX])
     dx_px, dy_px = shift_px + rng.normal(0, STAR_NOISE_PX, (2, len(answer)))
     zeros = np.zeros(len(answer))
     table = StarTable(answer, x_px, y_px, zeros, zeros, dx_px, dy_px, zeros, zeros)
     resolution_px = (SIDE_PX, SIDE_PX)
-    free = without_shifts(table, answer, resolution_px)
+    free = without_turns(table, answer, resolution_px)
     figure = star_figure("star-noise", free, resolution_px, END, rng)
     # of 8000 places a sigma is known to 0.8 %; four times that
     assert figure.value == pytest.approx(STAR_NOISE_PX, rel=0.032)

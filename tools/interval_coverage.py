@@ -15,7 +15,9 @@ import sys
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,9 +34,22 @@ from hilstar.instruments.calibrate.latency import Paired, summarise
 from hilstar.instruments.calibrate.measurements import Measurements
 from hilstar.instruments.calibrate.photometric import errors_of, fit_channel
 from hilstar.instruments.calibrate.scale import scale_of
+from hilstar.instruments.campaign.case_table import Columns
+from hilstar.instruments.campaign.plan import Require
+from hilstar.instruments.campaign.requirements import verdicts_of
 from hilstar.server.bench.config import BenchConfig, read_config
 from hilstar.server.record.commanded import Commanded
-from tests.support.planted_tracker import ARCSEC_PER_RAD, ROLL, SCALE, Sizes, plant, scan
+from tests.support.planted_answers import SCALE as PLANTED_SCALE
+from tests.support.planted_answers import answers, old_places, reported_stars
+from tests.support.planted_tracker import (
+    ARCSEC_PER_RAD,
+    ROLL,
+    SCALE,
+    Motion,
+    Sizes,
+    plant,
+    scan,
+)
 from tests.support.planted_tracker import scalar_first as quaternions
 
 COVERAGE = 0.95
@@ -160,27 +175,161 @@ def cases(rng: np.random.Generator) -> Held:
     yield from assessed(found, bias, noise)
 
 
-RUN_S = 300.0
+RUN_S, ANSWER_HZ = 300.0, 10.0
 
 
 def run(rng: np.random.Generator) -> Held:
     """`assess` of a run of 3000 answers on a clock of their own; what repeats is counted too."""
-    sizes = Sizes(wild=5, offset_s=0.02)
-    planted = plant(scan, sizes, rng, seconds=RUN_S)
+    yield from of_run(scan, Sizes(wild=5, offset_s=0.02), RUN_S, ANSWER_HZ, rng)
+
+
+def of_run(
+    motion: Motion, sizes: Sizes, seconds: float, answer_hz: float, rng: np.random.Generator
+) -> Held:
+    """A run's figures: clock, bias, noise, and what repeats in the field and within a pixel."""
+    field = drawn_field(rng)
+    planted = plant(motion, sizes, rng, seconds=seconds, rate_hz=answer_hz, fov=field)
     commanded = Commanded(planted.frames_s, planted.frames_q)
     coarse = coarse_offset(commanded, planted.tau_s, planted.reported)
     assert coarse is not None
     found = assess_run(commanded, planted.tau_s, planted.reported, coarse, SCALE, rng)
+    clock = found.clock
+    if clock.offset_told:
+        yield "clock's offset", holds(clock.offset_s, sizes.offset_s, clock.sigma_offset_s)
+    if clock.drift_told:
+        yield "clock's drift", holds(1e6 * clock.drift, sizes.drift_ppm, 1e6 * clock.sigma_drift)
     low, high = found.intervals.noise
     yield "noise across", bool(low[0] <= sizes.noise <= high[0])
     yield "noise about the boresight", bool(low[1] <= ROLL * sizes.noise <= high[1])
     of_pixel = found.intervals.pixel
-    if found.pixel_arcsec.cross is not None:
+    if sizes.pixel and found.pixel_arcsec.cross is not None:
         yield "pixel error across", bool(of_pixel[0, 0] <= sizes.pixel <= of_pixel[1, 0])
-    if found.fov_arcsec.cross is not None:
-        of_field = found.intervals.fov
-        true = float(np.sqrt((planted.fov[:2] ** 2).mean()))
-        yield "field error across", bool(of_field[0, 0] <= true <= of_field[1, 0])
+    if found.fov_arcsec.cross is None:
+        return
+    of_field = found.intervals.fov
+    true = float(np.sqrt((planted.fov[:2] ** 2).mean()))
+    yield "field error across", bool(of_field[0, 0] <= true <= of_field[1, 0])
+    yield (
+        "field error about the boresight",
+        bool(of_field[0, 1] <= planted.fov[2] <= of_field[1, 1]),
+    )
+
+
+def drawn_field(rng: np.random.Generator) -> Callable[[np.ndarray], np.ndarray]:
+    """A field-of-view error (n, 3) of rms 1 over the sky, of 250 to 900 px a period."""
+    period_px = rng.uniform(250, 900)
+    phase = rng.uniform(0, 2 * np.pi, 3)
+
+    def field(place_px: np.ndarray) -> np.ndarray:
+        x, y = 2 * np.pi * place_px.T / period_px
+        angles = np.stack([x, y, (x + y) / 1.7], axis=1) + phase
+        return np.asarray(np.sqrt(2) * np.sin(angles))
+
+    return field
+
+
+def drawn_scan(rng: np.random.Generator) -> Motion:
+    """To and fro by 1 to 4 degrees in two axes of 150 to 600 s, with a slow roll."""
+    size_deg = rng.uniform(1, 4, 2)
+    period_s = rng.uniform(150, 600, 2)
+    phase = rng.uniform(0, 2 * np.pi, 3)
+
+    def motion(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        across = 2 * np.pi * t_s[:, None] / period_s + phase[:2]
+        ra_deg, dec_deg = (size_deg * np.sin(across)).T
+        roll_deg = 10 * np.sin(2 * np.pi * t_s / 603 + phase[2])
+        return 84 + ra_deg, dec_deg - 1.2, roll_deg
+
+    return motion
+
+
+def drawn_slews(rng: np.random.Generator) -> Motion:
+    """Slews of both signs over the same places, of 60 to 150 s there and back."""
+    size_deg = rng.uniform(1, 4, 2)
+    period_s = rng.uniform(60, 150)
+
+    def motion(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        ra_deg, dec_deg = size_deg[:, None] * np.sin(2 * np.pi * t_s / period_s)
+        return 84 + ra_deg, dec_deg - 1.2, np.zeros_like(t_s)
+
+    return motion
+
+
+def drawn_slew(rng: np.random.Generator) -> Motion:
+    """One slew of 0.01 to 0.1 deg/s, which comes back to no place."""
+    rate_deg_s = rng.uniform(0.01, 0.1) * rng.choice([-1.0, 1.0])
+    dec_deg = rng.uniform(-30, 30)
+
+    def motion(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return 84 + rate_deg_s * t_s, np.full_like(t_s, dec_deg), np.zeros_like(t_s)
+
+    return motion
+
+
+def of_minutes(
+    draw: Callable[[np.random.Generator], Motion], minutes: float, answer_hz: float
+) -> Callable[[np.random.Generator], Held]:
+    """Runs of a motion that is drawn, with a field-of-view error of 0.3 to 5 arcsec."""
+
+    def kind(rng: np.random.Generator) -> Held:
+        motion = draw(rng)
+        fov = float(rng.choice([0.3, 2.0, 5.0]))
+        sizes = Sizes(wild=5, offset_s=0.02, fov=fov, pixel=0.0)
+        yield from of_run(motion, sizes, 60 * minutes, answer_hz, rng)
+
+    return kind
+
+
+ONE_SIDE = (1 + COVERAGE) / 2  # of a clause's limits, which are one-sided
+
+
+@dataclass(frozen=True, slots=True)
+class PlantedClause:
+    """What makes the cases of a clause, the planted key, its size, and the clause's axis."""
+
+    make: Callable[..., Columns]
+    key: str
+    size: float
+    axis: str | None = None
+
+
+CLAUSES = {
+    "rate-noise": PlantedClause(answers, "rate_noise", 0.05, "x"),
+    "rate-scale": PlantedClause(answers, "rate_scale", 0.05, "x"),
+    "rate-lag": PlantedClause(answers, "rate_lag", 0.3, "x"),
+    "time-bias": PlantedClause(answers, "stamp_bias", 0.02),
+    "time-jitter": PlantedClause(answers, "stamp_jitter", 0.02),
+    "aberration": PlantedClause(answers, "aberration", 1.0),
+    "proper-motion": PlantedClause(old_places, "proper_motion", 1.0),
+    "catalogue-age": PlantedClause(old_places, "age", 5.0),
+    "parallax": PlantedClause(old_places, "parallax", 1.0),
+    "star-noise": PlantedClause(reported_stars, "noise", 0.3),
+    "star-fov-error": PlantedClause(reported_stars, "fov", 0.3),
+    "star-colour": PlantedClause(reported_stars, "colour", 0.1),
+    "star-limit": PlantedClause(reported_stars, "limit", 5.0),
+    "false-stars": PlantedClause(reported_stars, "false", 2.0),
+}
+
+
+def of_clauses(cases: int, **hard: float) -> Callable[[np.random.Generator], Held]:
+    """A clause's limits, each at 97.5 %, for so many cases and with what makes them hard."""
+
+    def kind(rng: np.random.Generator) -> Held:
+        for quantity, clause in CLAUSES.items():
+            size = clause.size
+            planted = clause.make(rng, cases, **{clause.key: size}, **hard)
+            side = "minimum" if quantity == "star-limit" else "maximum"
+            keys: dict[str, Any] = {side: size, "quantity": quantity, "axis": clause.axis}
+            require = Require(confidence=ONE_SIDE, **keys)
+            verdict = verdicts_of([require], planted, PLANTED_SCALE, 1)[0]
+            # a figure that is not told claims nothing
+            if verdict.value is None:
+                continue
+            low = -math.inf if verdict.low is None else verdict.low
+            high = math.inf if verdict.high is None else verdict.high
+            yield quantity, low <= size <= high
+
+    return kind
 
 
 KINDS: dict[str, Callable[[np.random.Generator], Held]] = {
@@ -190,6 +339,15 @@ KINDS: dict[str, Callable[[np.random.Generator], Held]] = {
     "calibrate photometric": response,
     "assess of cases": cases,
     "assess of a run": run,
+    "assess, scan of 5 min": of_minutes(drawn_scan, 5, ANSWER_HZ / 2),
+    "assess, scan of 15 min": of_minutes(drawn_scan, 15, ANSWER_HZ / 5),
+    "assess, scan of 60 min": of_minutes(drawn_scan, 60, ANSWER_HZ / 10),
+    "assess, slews of both signs, 5 min": of_minutes(drawn_slews, 5, ANSWER_HZ / 2),
+    "assess, one slew of 5 min": of_minutes(drawn_slew, 5, ANSWER_HZ / 2),
+    "clauses, 60 cases": of_clauses(60),
+    "clauses, 10 cases": of_clauses(10),
+    "clauses, frames of a case go together": of_clauses(30, together=0.5),
+    "clauses, 1 % far off": of_clauses(30, wild=0.01),
 }
 
 

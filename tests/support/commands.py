@@ -34,7 +34,7 @@ def run_hilstar(
     return run_started([*HILSTAR, *typed(*arguments)], cwd, timeout, env)
 
 
-def typed(line: str | Path, *others: str | Path) -> list[str]:
+def typed(line: str | Path = "", *others: str | Path) -> list[str]:
     """The words of a command: a line as a shell splits it, and others, which stay whole."""
     return [*shlex.split(str(line)), *map(str, others)]
 

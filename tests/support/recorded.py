@@ -5,7 +5,7 @@ those files, and a test of a table's figures alone would not see that they are a
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tests.support.benches import ROOT
@@ -27,6 +27,19 @@ def assert_recorded(measured: Path, keys: Sequence[str], figures: Sequence[str])
     for now, then in pairs:
         for figure in figures:
             assert is_near(now[figure], then[figure]), (measured.name, figure, now, then)
+
+
+def assert_row(name: str, keys: Mapping[str, object], figures: Mapping[str, float]) -> None:
+    """Fail unless a file of results/ has one row with these keys, and near figures in it."""
+    wanted = tuple(str(value) for value in keys.values())
+    matching = []
+    for row in rows_of(ROOT / "results" / name, list(keys)):
+        if key_of(row, list(keys)) == wanted:
+            matching.append(row)
+    assert len(matching) == 1, (name, wanted, len(matching))
+    for figure, now in figures.items():
+        then = matching[0][figure]
+        assert is_near(str(now), then), (name, figure, now, then)
 
 
 def rows_of(path: Path, keys: Sequence[str]) -> list[dict[str, str]]:

@@ -80,6 +80,7 @@ NEAR_AXES_RAD = np.radians(5.0)
 MIN_PAIRS = 8
 SEED = 0  # the bootstrap's seed: the same files give the same intervals
 SMALL = 0.3  # share of the noise above which the display's own error gets a note
+HIDDEN = 1.5  # upper end of an interval over the figure, from which on a note says what hides it
 BENT_ARCSEC = 0.1
 # noise that lasts for so many answers gets a note from this share of the variance on
 TOGETHER, SLOW_SHARE = 20, 0.1
@@ -826,6 +827,7 @@ def _notes(run: RunLedger, found: DecomposedRun, timed: TimedAnswers) -> list[st
             f" along the motion, and is taken to be {1e3 * clock.offset_s:.3g} ms beside the"
             " rough one"
         )
+    notes += _hidden_field(found)
     bent_arcsec = _bent_arcsec(found, run.config.tracker.exposure_s)
     if bent_arcsec >= BENT_ARCSEC:
         notes.append(
@@ -851,6 +853,24 @@ def _notes(run: RunLedger, found: DecomposedRun, timed: TimedAnswers) -> list[st
     if timed.clock_set:
         notes.append(CLOCK_SET)
     return notes
+
+
+def _hidden_field(found: DecomposedRun) -> Iterator[str]:
+    """Where a clock or a slow change in time hides the size of a field-of-view error, a note."""
+    size_arcsec = found.fov_arcsec.cross
+    if size_arcsec is None:
+        return
+    low_arcsec, high_arcsec = found.intervals.fov[:, 0].tolist()
+    if low_arcsec > 0 and high_arcsec < HIDDEN * size_arcsec:
+        return
+    shown = "is not shown"
+    if low_arcsec > 0:
+        shown = f"is at least {low_arcsec:.2g}"
+    yield (
+        f"the field-of-view error {shown} and at most {high_arcsec:.2g} arcsec across the"
+        " boresight: the tracker's clock, or a slow change in time, may look like the rest; come"
+        " back to the same places at other rates and times"
+    )
 
 
 def _bent_arcsec(found: DecomposedRun, exposure_s: float) -> float:

@@ -3,7 +3,7 @@ intervals.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -15,19 +15,30 @@ from hilstar.basics.rotation import conjugate, multiply, to_rotation_vector
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.instruments.assess.clock import (
     CUT_SIGMAS,
+    DRIFT_PRIOR,
     FLOOR_ARCSEC,
+    OFFSET_PRIOR_S,
     ClockFit,
     ClockSolver,
     CoarseClock,
     weights_of,
 )
 from hilstar.instruments.assess.components import MIN_ROWS, Component, Components, components_of
+from hilstar.instruments.assess.look_alikes import (
+    SLOW_WAVES,
+    LookAlikes,
+    clock_covariance,
+    slow_variance,
+    turns_of,
+    variance_about,
+)
 from hilstar.instruments.assess.places import Scale
 from hilstar.server.record.commanded import Commanded
 
 BLOCKS, MIN_IN_BLOCK, DRAWS = 40, 5, 1000  # the bootstrap's blocks and draws
 COVERED = (2.5, 97.5)  # percent
 HALF_OF_95 = 1.96  # sigmas of a normal distribution
+RADII, ANGLES = 40, 90  # clocks at which the field-of-view error is looked at
 ONE_SIDE_OF_95 = 0.975
 UNUSUAL_SIGMAS = 5.0
 # one sigma; a larger spread is no star tracker but another run with a similar motion
@@ -122,13 +133,42 @@ def assess_run(
     bias_arcsec = ARCSEC_PER_RAD * to_rotation_vector(clock.rotation)
     total_arcsec = clock.residual_arcsec + bias_arcsec
     right, parts = _right_answers(total_arcsec, moments.q, clock.used, scale)
-    intervals = intervals_of(parts, rng, clock.sigma_bias_arcsec)
+    look_alikes = _look_alikes(clock, parts, right, float(commanded.t_s[0]))
+    clock = _beside_field(clock, look_alikes)
+    intervals = intervals_of(parts, rng, clock.sigma_bias_arcsec, look_alikes)
     decomposed = _decomposed(parts, intervals, free, right, moments.q, moments.rate_rad_s)
     ingredients = vars(decomposed).copy()
     astray = held & _beyond_turn(clock, parts)
     ingredients["wrong"] = np.sort(np.append(decomposed.wrong, np.flatnonzero(astray)))
     held_rows = np.flatnonzero(held & ~astray)
     return DecomposedRun(**ingredients, clock=clock, held=held_rows)
+
+
+def _look_alikes(clock: ClockFit, parts: Components, right: IntArray, start_s: float) -> LookAlikes:
+    """What may be in the field's fit to the right answers (k,) without being of the field."""
+    elapsed_s = clock.t_s[right] - start_s
+    turn = turns_of(clock.moments.rate_rad_s[right], elapsed_s)
+    about_field = parts.left + parts.pixel.fitted
+    prior_sigma = np.array([OFFSET_PRIOR_S, DRIFT_PRIOR])
+    of_answer = variance_about(about_field, parts.bumps) / len(right)
+    of_fit = _of_fit(parts.fov.variance, parts.fov.freedom, of_answer)
+    shows = parts.fov.variance + HALF_OF_95 * np.sqrt(of_fit)
+    covariance = clock_covariance(turn, parts.bumps, about_field, shows, prior_sigma)
+    slow = np.zeros(3)
+    if parts.bumps is not None:
+        slow = slow_variance(elapsed_s, parts.bumps, about_field)
+    return LookAlikes(turn, covariance, slow)
+
+
+def _beside_field(clock: ClockFit, look_alikes: LookAlikes) -> ClockFit:
+    """The clock as well as it is known beside any error that repeats with the place."""
+    offset_s, drift = np.sqrt(np.diag(look_alikes.covariance)).tolist()
+    return replace(
+        clock,
+        sigma_offset_s=max(clock.sigma_offset_s, offset_s),
+        sigma_drift=max(clock.sigma_drift, drift),
+        sigma_bias_arcsec=np.hypot(clock.sigma_bias_arcsec, np.sqrt(look_alikes.bias_variance)),
+    )
 
 
 def _refuse_few(
@@ -282,13 +322,16 @@ def _told(part: Component) -> Axes:
 
 
 def intervals_of(
-    parts: Components, rng: np.random.Generator, sigma_bias_arcsec: FloatArray | None = None
+    parts: Components,
+    rng: np.random.Generator,
+    sigma_bias_arcsec: FloatArray | None = None,
+    look_alikes: LookAlikes | None = None,
 ) -> Intervals:
     """The intervals of components by the block bootstrap (Kuensch 1989): errors of neighbouring
     answers go together.
 
     `sigma_bias_arcsec` (3,) is the smallest uncertainty of the bias, where the clock was found
-    together with it.
+    together with it. With `look_alikes` the field-of-view error is that of the run's own places.
     """
     residual = parts.left
     fov = parts.fov
@@ -324,19 +367,71 @@ def intervals_of(
     def repeating(component: Component) -> FloatArray:
         noise_in_fit = component.freedom / n * noise
         variance = means(component.fitted**2) - noise_in_fit
-        # The draws keep the fit as it is. Noise in it changes its mean square, a noncentral
-        # chi-square: by the fit's cross term with noise, and by the noise's own scatter.
         size = np.maximum(variance.mean(axis=0), 0.0)
-        of_fit = 4 * size * middle / n + 2 * component.freedom * (middle / n) ** 2
+        of_fit = _of_fit(size, component.freedom, middle / n)
         variance += np.sqrt(of_fit) * rng.standard_normal(variance.shape)
         return np.asarray(np.maximum(variance, 0.0))
 
+    if look_alikes is None:
+        of_field = _covered(repeating(fov))
+    else:
+        of_field = _field_interval(fov, middle, look_alikes)
     return Intervals(
         bias=np.stack([parts.mean - half_width, parts.mean + half_width]),
-        fov=_covered(repeating(fov)),
+        fov=of_field,
         pixel=_covered(repeating(pixel)),
         noise=_covered(noise),
     )
+
+
+def _of_fit(size: FloatArray, freedom: float, of_answer: FloatArray) -> FloatArray:
+    """The variance (3,) that noise in a fit gives its mean square (3,), a noncentral chi-square: by
+    the fit's cross term with noise, and by the noise's own scatter. `of_answer` (3,) is the noise's
+    variance over the number of answers.
+    """
+    return 4 * size * of_answer + 2 * freedom * of_answer**2
+
+
+def _field_interval(
+    fov: Component, noise_variance: FloatArray, look_alikes: LookAlikes
+) -> FloatArray:
+    """The field-of-view error of a run's places, low and high, across and about (2, 2), arcsec.
+
+    Its mean square is a quadratic function of the clock's error. Its range over the clocks within
+    1.96 sigma is the profile likelihood's interval.
+    """
+    n = len(fov.fitted)
+    about = fov.fitted - fov.fitted.mean(axis=0)
+    turn = look_alikes.turn - look_alikes.turn.mean(axis=0)
+    root = np.linalg.cholesky(look_alikes.covariance)
+    slope = 2 * np.einsum("na,nai->ai", about, turn) @ root / n
+    bend = root.T @ (np.einsum("nai,naj->aij", turn, turn) / n) @ root
+    of_fit = _of_fit(fov.variance, fov.freedom, noise_variance / n)
+    ends = []
+    for axes in ([0, 1], [2]):
+        variance = float(fov.variance[axes].mean())
+        lower, higher = _range_in_disc(slope[axes].mean(axis=0), bend[axes].mean(axis=0))
+        fit = HALF_OF_95 * math.sqrt(float(of_fit[axes].sum())) / len(axes)
+        slow = float(look_alikes.slow_variance[axes].mean())
+        # a slow change adds its own power, and goes with or against the field's error by chance
+        by_chance = 2 * math.sqrt(variance * min(slow, variance) / SLOW_WAVES)
+        low = max(variance - math.hypot(lower, fit, by_chance) - slow, 0.0)
+        high = variance + math.hypot(higher, fit, by_chance)
+        ends.append((math.sqrt(low), math.sqrt(high)))
+    return np.array(ends).T
+
+
+def _range_in_disc(slope: FloatArray, bend: FloatArray) -> tuple[float, float]:
+    """How far slope x + x bend x goes below and above 0 within 1.96 of the origin, x (2,)."""
+    radius = np.linspace(0.0, HALF_OF_95, RADII)
+    angle = np.linspace(0.0, 2 * np.pi, ANGLES, endpoint=False)
+    around = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = (radius[:, None, None] * around).reshape(-1, 2)
+    lowest = -0.5 * np.linalg.pinv(bend, hermitian=True) @ slope
+    if np.linalg.norm(lowest) <= HALF_OF_95:
+        points = np.concatenate([points, lowest[None]])
+    value = points @ slope + np.einsum("ki,ij,kj->k", points, bend, points)
+    return -float(value.min()), float(value.max())
 
 
 def _covered(variance: FloatArray) -> FloatArray:

@@ -341,8 +341,9 @@ class ClockFit:
     of this sky.
 
     `offset_s` is the telemetry's time minus the run's at the run's start, `drift` the excess rate
-    of its clock, `sigma_*` one sigma. `residual_arcsec` (n, 3), cam, is the error beyond bias and
-    clock at the commanded `moments`; NaN where those are not known.
+    of its clock, `sigma_*` one sigma, `*_told` whether the motion determines it.
+    `residual_arcsec` (n, 3), cam, is the error beyond bias and clock at the commanded `moments`;
+    NaN where those are not known.
     """
 
     offset_s: float
@@ -355,16 +356,8 @@ class ClockFit:
     t_s: FloatArray
     residual_arcsec: FloatArray
     used: BoolArray
-
-    @property
-    def offset_told(self) -> bool:
-        """Whether the motion determines the offset."""
-        return self.sigma_offset_s < TOLD * OFFSET_PRIOR_S
-
-    @property
-    def drift_told(self) -> bool:
-        """Whether the motion determines the drift."""
-        return self.sigma_drift < TOLD * DRIFT_PRIOR
+    offset_told: bool
+    drift_told: bool
 
 
 class ClockSolver:
@@ -414,6 +407,8 @@ class ClockSolver:
             t_s=self.t_s,
             residual_arcsec=self.residual,
             used=used,
+            offset_told=bool(sigma[3] < TOLD * OFFSET_PRIOR_S),
+            drift_told=bool(sigma[4] < TOLD * DRIFT_PRIOR * self.span_s),
         )
 
     def _align(self, step: FloatArray | None = None) -> None:

@@ -105,7 +105,7 @@ class Component:
 @dataclass(frozen=True)
 class Components:
     """The parts of residuals (n, 3), arcsec: mean (3,), two parts that repeat, noise variance
-    (3,), the rest `left` (n, 3).
+    (3,), the rest `left` (n, 3); `bumps` are the functions that fitted the first.
     """
 
     mean: FloatArray
@@ -114,6 +114,7 @@ class Components:
     noise_variance: FloatArray
     left: FloatArray
     extent_px: float
+    bumps: Projector | None = None
 
 
 def components_of(
@@ -145,7 +146,7 @@ def components_of(
     residual = about - fov.fitted - pixel.fitted
     freedom = len(residual) - 1 - fov.freedom - pixel.freedom
     noise = (residual**2).sum(axis=0) / max(freedom, 1.0)
-    return Components(mean, fov, pixel, noise, residual, extent)
+    return Components(mean, fov, pixel, noise, residual, extent, bumps)
 
 
 def _component(functions: Projector, wanted: FloatArray, other_freedom: float) -> Component:

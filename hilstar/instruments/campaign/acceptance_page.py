@@ -41,7 +41,7 @@ from hilstar.instruments.campaign.plan import STAR_QUANTITIES
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
 from hilstar.instruments.campaign.requirements_page import STATES, signed_card, verdict_chip
 from hilstar.instruments.campaign.store import file_sha256
-from hilstar.instruments.campaign.sweep import NOT_EVEN, STILL, levels_text
+from hilstar.instruments.campaign.sweep import NOT_EVEN, STILL, SweepTable, levels_text
 from hilstar.server.bench.certificate_file import off_by
 
 PAGE_FILE, CSV_FILE, JSON_FILE = "accept.html", "acceptance.csv", "acceptance.json"
@@ -87,6 +87,7 @@ THROUGH = {
 QUICK = "a few cases for every clause (--quick), no acceptance"
 QUANTILES = (0.5, 0.9, 0.95, 0.99)
 MAX_ROWS = 5000  # of points in a chart
+EDGE_ALPHA = 0.15  # of the band that is an edge's interval
 
 
 def write_acceptance(
@@ -328,13 +329,18 @@ def _cards(
         yield Card("Failed cases", words=[table_of(failed, FAILED_HEADER)], cure=FAILED_CURE)
     for result in results:
         if result.levels:
-            yield _sweep_card(result)
+            yield _sweep_card(result, _judged_edge(verdicts, result))
         elif _asked(verdicts, result, ("time-to-first-attitude",)):
             yield _first_attitude(result)
         elif _asked(verdicts, result, STAR_QUANTITIES):
             yield from _star_card(acceptance, result)
     yield _about(acceptance, results, rows)
     yield signed_card()
+
+
+def _judged_edge(verdicts: list[ClauseVerdict], result: SetResult) -> ClauseVerdict:
+    """The first verdict on the edge of a sweep."""
+    return next(judged for judged in verdicts if judged.clause.of == result.case_set.name)
 
 
 def _failed_rows(result: SetResult) -> Iterator[tuple[str, int, str]]:
@@ -386,8 +392,8 @@ def _untested(acceptance: AcceptedBench, verdicts: list[ClauseVerdict]) -> Card:
     return Card("Not tested", words=[table_of(rows, ("capability", "why"))])
 
 
-def _sweep_card(result: SetResult) -> Card:
-    """The share of successes at each level of a sweep, with its interval."""
+def _sweep_card(result: SetResult, judged: ClauseVerdict) -> Card:
+    """The share of successes at each level of a sweep, with its interval, and the edge."""
     sweep = result.case_set.sweep
     assert sweep is not None
     levels = list(levels_text(result.levels))
@@ -402,11 +408,11 @@ def _sweep_card(result: SetResult) -> Card:
     unit = ""
     if sweep.unit:
         unit = f" [{sweep.unit}]"
-    kept = "an attitude"
-    if sweep.star_v_mag is not None:
-        kept = f"half of their stars to V {sweep.star_v_mag:g}"
-    finding = f"Share of cases with {kept} against {sweep.key}"
+    finding = _edge_finding(sweep, judged)
     with panels_of(finding) as (axes,):
+        edge = judged.verdict
+        if edge is not None and edge.low is not None and edge.high is not None:
+            axes.axvspan(edge.low, edge.high, color=BLUE, alpha=EDGE_ALPHA, linewidth=0)
         axes.errorbar(at, share, yerr=bars, fmt="o", capsize=3, color=BLUE, ecolor=MUTED)
         axes.axhline(sweep.share, linewidth=0.8, linestyle="--", color=MUTED)
         axes.set_ylim(-0.05, 1.05)
@@ -419,7 +425,25 @@ def _sweep_card(result: SetResult) -> Card:
     if result.case_set.about:
         paragraphs.append(paragraph(result.case_set.about))
     paragraphs.append(drawing_of(axes.figure, finding))
-    return Card(f"Sweep: {result.case_set.name}", words=paragraphs, details=[table])
+    return Card(judged.clause.capability, words=paragraphs, details=[table])
+
+
+def _edge_finding(sweep: SweepTable, judged: ClauseVerdict) -> str:
+    """Up to where a sweep's cases are successes, in a line."""
+    kept = "An attitude"
+    if sweep.star_v_mag is not None:
+        kept = f"Half of the stars to V {sweep.star_v_mag:g}"
+    edge = judged.verdict
+    if edge is None or edge.value is None:
+        return f"{kept}: {judged.untested or 'no edge'}"
+    if STILL in edge.method:
+        return f"{kept} even at {_digits(edge.value)} {judged.unit}".rstrip()
+    if NOT_EVEN in edge.method:
+        return f"{kept} is not there even at {_digits(edge.value)} {judged.unit}".rstrip()
+    way = "up to"
+    if sweep.stop < sweep.start:
+        way = "down to"
+    return f"{kept} {way} {_measured(judged)}"
 
 
 def _first_attitude(result: SetResult) -> Card:
@@ -430,21 +454,24 @@ def _first_attitude(result: SetResult) -> Card:
     times = np.sort(np.where(np.isfinite(column), column, math.inf))
     count = len(times)
     rows = []
+    finding = "Half of the cases have no attitude"
     for share in QUANTILES:
         low, high = quantile_limits(times, share, 0.975)
         place = min(math.ceil(share * count), count) - 1
         value = float(times[place])
-        percent = 100 * share
-        rows.append((f"{percent:g} %", _seconds(value), _seconds(low), _seconds(high)))
+        percent = f"{100 * share:g} %"
+        rows.append((percent, _seconds(value), _seconds(low), _seconds(high)))
+        if math.isfinite(value):
+            finding = f"An attitude within {_seconds(value)} s in {percent} of cases"
     known = times[np.isfinite(times)]
     shares = np.arange(1, len(known) + 1) / count
-    with panels_of("Time to the first attitude") as (axes,):
+    with panels_of(finding) as (axes,):
         axes.step(known, shares, where="post", color=BLUE)
         axes.set_ylim(0, 1.05)
         axes.set_xlabel("time to the first attitude [s]")
         axes.set_ylabel("share of cases")
     header = ("share of cases", "within [s]", "from (95 %)", "to")
-    paragraphs = [drawing_of(axes.figure, "distribution of the time to the first attitude")]
+    paragraphs = [drawing_of(axes.figure, finding)]
     paragraphs.append(table_of(rows, header))
     return Card(f"Time to the first attitude: {result.case_set.name}", words=paragraphs)
 

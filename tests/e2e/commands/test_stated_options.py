@@ -12,6 +12,7 @@ import pytest
 from astropy.io import fits
 from scipy.spatial.transform import Rotation
 
+from hilstar.attitude.logs.entries import OPTIONS
 from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -43,34 +44,14 @@ def files(tmp_path):
     return bench, log
 
 
-def words(command: str, files, tmp_path, port: int = 9) -> tuple[object, ...]:
+def line_of(command: str, files, tmp_path, port: int = 9) -> str:
     bench, log = files
     return {
-        "attitude": ("attitude", log),
-        "replay": (
-            "replay",
-            bench,
-            log,
-            "--headless",
-            "--speed",
-            "max",
-            "--step",
-            "1",
-            "-o",
-            tmp_path / "frames",
-        ),
-        "convert": ("convert", log, tmp_path / "out.csv"),
-        "simulate": (
-            "simulate",
-            bench,
-            "--log",
-            log,
-            "--frames",
-            "1",
-            "-o",
-            tmp_path / "exposures",
-        ),
-        "send": ("send", log, "--to", f"udp://127.0.0.1:{port}", "--wait", "0", "--count", "1"),
+        "attitude": f"attitude {log}",
+        "replay": f"replay {bench} {log} --headless --speed max --step 1 -o {tmp_path}/frames",
+        "convert": f"convert {log} {tmp_path}/out.csv",
+        "simulate": f"simulate {bench} --log {log} --frames 1 -o {tmp_path}/exposures",
+        "send": f"send {log} --to udp://127.0.0.1:{port} --wait 0 --count 1",
     }[command]
 
 
@@ -84,7 +65,7 @@ def test_each_command_uses_a_convention_and_a_mounting(tmp_path, files, command)
         receiver.bind(("127.0.0.1", 0))
         receiver.settimeout(30)
         result = run_hilstar_here(
-            *words(command, files, tmp_path, receiver.getsockname()[1]), *STATED
+            line_of(command, files, tmp_path, receiver.getsockname()[1]), *STATED
         )
         assert result.returncode == 0, result.stderr
         assert (
@@ -126,14 +107,14 @@ def test_each_command_uses_a_convention_and_a_mounting(tmp_path, files, command)
     ],
 )
 def test_each_command_refuses_by_name_what_is_not_used(tmp_path, files, command, option, value):
-    result = run_hilstar_here(*words(command, files, tmp_path), option, value)
+    result = run_hilstar_here(line_of(command, files, tmp_path), option, value)
     assert_refused(result, 2, option)
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_mounting_of_the_cameras_own_attitude_is_a_contradiction(tmp_path, files, command):
     stated = ("--mounting", "0.5,-0.5,-0.5,-0.5", "--convention", "frame=cam")
-    result = run_hilstar_here(*words(command, files, tmp_path), *stated)
+    result = run_hilstar_here(line_of(command, files, tmp_path), *stated)
     assert_refused(
         result,
         2,
@@ -143,21 +124,9 @@ def test_a_mounting_of_the_cameras_own_attitude_is_a_contradiction(tmp_path, fil
 
 def test_without_a_log_nothing_can_be_stated_of_one(files):
     bench, _ = files
-    for command in (
-        ("simulate", bench, "--radec", "84,-1,0", "--png", "a.png"),
-        ("send", "--spin", "z,1"),
-    ):
-        for option in (
-            "--kernel",
-            "--topic",
-            "--body",
-            "--reference",
-            "--epoch-utc",
-            "--place",
-            "--mounting",
-            "--convention",
-        ):
-            assert_refused(run_hilstar_here(*command, option, "x"), 2, f"{option} x: it is for")
+    for command in (f"simulate {bench} --radec 84,-1,0 --png a.png", "send --spin z,1"):
+        for option in OPTIONS.values():
+            assert_refused(run_hilstar_here(command, option, "x"), 2, f"{option} x: it is for")
 
 
 def test_the_convention_of_a_bench_file_holds_for_its_logs_and_the_command_line_takes_its_place(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import pytest
 
@@ -23,10 +25,12 @@ from hilstar.cli.options import (
     parse_spin,
     parse_split,
 )
-from hilstar.cli.serve import ServeOptions, _exit_code, _limit
+from hilstar.cli.serve import ServeOptions, _consoles, _exit_code, _limit
 from hilstar.cli.tracker import checked_rate, parse_silent
 from hilstar.instruments.calibrate.scale import StarReading
 from hilstar.server.bench.config import parse_config
+from hilstar.server.console import listener
+from hilstar.server.console.listener import ListenAddress
 from hilstar.server.record.ledger import SplitLimits
 from tests.support.benches import SMALL_BENCH
 from tests.support.refusals import refusal
@@ -189,3 +193,19 @@ def test_a_tracker_s_exposures_neither_overlap_nor_collect_nothing():
     assert "0.01 to 2.5 Hz" in refusal(checked_rate, 2.51, 0.4)
     assert "0.01 to" in refusal(checked_rate, 0.009, 0.4)
     assert "exposure_s = 0" in refusal(checked_rate, None, 0.0)
+
+
+def test_pages_of_heads_have_ports_one_after_another_or_each_the_system_s(monkeypatch):
+    tried = []
+
+    @contextmanager
+    def listens(address: ListenAddress, token: str | None) -> Iterator[None]:
+        tried.append((address.host, address.port, token))
+        yield
+
+    monkeypatch.setattr(listener, "PageListener", listens)
+    assert _consoles("[::1]:7000", "word", 3) == ("[::1]:7000", "[::1]:7001", "[::1]:7002")
+    assert tried == [("::1", port, "word") for port in (7000, 7001, 7002)]
+    assert _consoles("127.0.0.1:0", None, 2) == ("127.0.0.1:0",) * 2
+    assert _consoles(None, None, 2) == ()
+    assert "as many ports" in refusal(_consoles, "127.0.0.1:65535", None, 2)

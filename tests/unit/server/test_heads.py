@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from hilstar.server import heads
 from hilstar.server.bench.bench_file import read_heads
 from hilstar.server.heads import HeadProcess, HeadsRun, _told, head_command
 from tests.support.damage import NO_JSON
@@ -96,9 +97,9 @@ def test_what_a_head_says_is_told_with_its_name_and_secrets_are_in_its_environme
 
 
 def test_a_head_begun_again_runs_for_the_rest_of_the_time_with_a_ledger_of_its_own(tmp_path):
-    heads = read_heads(heads_file(tmp_path, 5599))
+    file = read_heads(heads_file(tmp_path, 5599))
     pages = tuple(f"127.0.0.1:{9000 + k}" for k in range(3))
-    asked = HeadsRun(heads, ("--headless",), 60.0, tmp_path / "run.mcap", pages)
+    asked = HeadsRun(file, ("--headless",), 60.0, tmp_path / "run.mcap", pages)
 
     def words(number: int, drawn_s: float) -> dict[str, str]:
         command = head_command(asked, 1, "ipc:///feed", number, drawn_s)
@@ -118,5 +119,32 @@ def test_a_head_begun_again_runs_for_the_rest_of_the_time_with_a_ledger_of_its_o
     ledgers = [Path(each["--ledger"]).name for each in (first, again)]
     assert ledgers == ["run.b.mcap", "run.b.again2.mcap"]
     assert first["--console"] == "127.0.0.1:9001"
-    assert first["--head-of"] == str(heads.path)
+    assert first["--head-of"] == str(file.path)
     assert first["--fed-by"] == f"ipc:///feed,{os.getpid()}"
+
+
+@pytest.mark.parametrize(("steady_s", "anew"), [(1000.0, False), (0.0, True)])
+def test_only_a_head_that_was_well_for_long_is_begun_again_after_the_shortest_pause(
+    tmp_path, monkeypatch, steady_s, anew
+):
+    pauses = []
+
+    class Noted:
+        """A pause that is over at once, with what it was asked for."""
+
+        over = True
+
+        def __init__(self, *limits: object) -> None:
+            pass
+
+        def put_off(self, *, anew: bool = False) -> None:
+            pauses.append(anew)
+
+    monkeypatch.setattr(heads, "BackOff", Noted)
+    monkeypatch.setattr(heads, "STEADY_S", steady_s)
+    codes = ["raise SystemExit(70)"] * 2 + ["raise SystemExit(1)"]
+    head = HeadProcess(
+        "head", lambda number, drawn_s: python(codes[number]), lambda line: None, tmp_path / "life"
+    )
+    assert ended(head) == (1, 2)
+    assert pauses == [anew] * 2

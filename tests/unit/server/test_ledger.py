@@ -485,6 +485,18 @@ def test_refused_packets_are_counted_by_reason(tmp_path, kept_bench):
     assert max(len(each["raw"]) for each in whole) == 2048
 
 
+def test_what_a_flood_left_out_is_counted_and_pulses_and_losses_are_no_messages(
+    tmp_path, kept_bench
+):
+    with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:
+        for _ in range(7):
+            ledger.pulse("sent")
+        ledger.lost(5)
+        ledger._filter.count("packet", "crc", 80)
+    assert ledger.summary()["only_counted"] == 80
+    assert ledger.summary()["unrecorded"] == 0
+
+
 def test_a_flood_of_one_reason_leaves_the_first_packets_of_another():
     flood = FloodFilter()
     kept = [flood.keeps("packet", "crc", 0) for _ in range(100)]

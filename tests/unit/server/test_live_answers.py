@@ -12,11 +12,11 @@ import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.basics.notices import Notices
-from hilstar.basics.units import NS_PER_S
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server import serve
 from hilstar.server.answers.answer import Answer, ReportedStar
 from hilstar.server.answers.judge import AnswerRules
-from hilstar.server.live_answers import MAX_JUDGED_HZ, LiveAnswers
+from hilstar.server.live_answers import MAX_JUDGED_HZ, LiveAnswers, wrong_line
 from hilstar.server.operator import OnScreen
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger_records import AnswerRecord, schema_of
@@ -223,3 +223,38 @@ def test_a_valid_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
     receiver.clock_summary = lambda: SimpleNamespace(offset_ms=None)
     serve._pass_on(receiver, iter([6]), answer, 12 * NS_PER_S)
     assert len(sent) == 1
+
+
+def test_a_frame_is_lit_a_swap_s_delay_after_its_swap_on_a_screen_and_else_at_its_moment():
+    shown = Shown(0, 1000, Attitude(Q, 0, False), DRAWN, draw_ns=1000, swap_ns=3000)
+    lit = []
+    for screen in (SimpleNamespace(swap_to_light_ns=700), None):
+        answers = LiveAnswers(
+            *(BENCH, RULES, Queued(), Notices(), Kept()), screen=screen, clock=FakeClock(NS_PER_S)
+        )
+        answers.frame(shown, 1005)
+        newest = answers._frames.newest
+        assert newest is not None
+        lit.append((newest.host_ns, newest.light_ns))
+    assert lit == [(3700, 1005), (1000, 1005)]
+
+
+def judged(residual_arcsec: tuple[float, float, float]) -> SimpleNamespace:
+    """An answer that was wrong, and came 250 ms after its frames."""
+    return SimpleNamespace(
+        residual=residual_arcsec,
+        lit=SimpleNamespace(first=7, last=9),
+        middle_ns=NS_PER_S,
+        answer=SimpleNamespace(host_ns=NS_PER_S + 250 * NS_PER_MS),
+    )
+
+
+def test_a_wrong_answer_is_off_by_arcsec_or_by_degrees_as_a_person_reads_it():
+    assert wrong_line(judged((300.0, 0.0, -400.0))) == (
+        "the tracker's answer is off by 500 arcsec (x 300, y 0, z -400) in frames 7 to 9,"
+        " 250 ms ago"
+    )
+    assert wrong_line(judged((10_800.0, 0.0, -14_400.0))) == (
+        "the tracker's answer is off by 5.00 deg (x 3.00, y 0.00, z -4.00) in frames 7 to 9,"
+        " 250 ms ago"
+    )

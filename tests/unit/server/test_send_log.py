@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import threading
+import time
 
 import numpy as np
 import pytest
 
-from hilstar.attitude.wire.packet import AttitudeSample, decode, encode
+from hilstar.attitude.wire.links import Arrival
+from hilstar.attitude.wire.packet import AttitudeSample, TimeReply, TimeRequest, decode, encode
 from hilstar.basics.rotation import (
     angle_between_rad,
     from_radec_roll_deg,
@@ -17,7 +19,9 @@ from hilstar.basics.rotation import (
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server import send_log
 from hilstar.server.send_log import BadCable, Faults, SendTally, log_samples, send, spin_samples
+from hilstar.server.sender import TwoWay
 from tests.support.fake_clock import FakeClock
+from tests.support.waiting import PATIENCE_S
 
 PACKETS = 2000
 # of a share of PACKETS: five standard deviations of the number that chance gives
@@ -120,6 +124,42 @@ def test_a_rate_between_two_of_a_log_is_between_theirs_and_none_crosses_a_break(
         assert rate[before_break] == pytest.approx([0.3, -0.6, 0.9])
     assert rate[6] == pytest.approx([3.0, 0.0, 0.0])
     assert [k for k, sample in enumerate(samples) if sample.discontinuity] == [6]
+
+
+def test_behind_a_gap_a_log_begins_anew_and_no_rate_crosses_it():
+    times_s = [0.0, 1.0, 2.0, 3.0, 60.0, 61.0, 62.0, 63.0]
+    samples = list(log_samples(turning(times_s, [None] * len(times_s)), None))
+    assert [k for k, sample in enumerate(samples) if sample.discontinuity] == [4]
+    without = [k for k, sample in enumerate(samples) if sample.rate_cam_rad_s is None]
+    assert without == [3, 7]
+
+
+def test_a_time_reply_has_when_its_request_came_and_when_the_reply_leaves():
+    """`receive` hands a request over 80 ms after it came."""
+    waits_ns, sent, replied = 80 * NS_PER_MS, [], threading.Event()
+
+    class End(TwoWay):
+        def receive(self, patience_ms: int) -> list[Arrival]:
+            if replied.is_set():
+                self._stop.wait(patience_ms / 1000)
+                return []
+            return [Arrival(time.monotonic_ns() - waits_ns, TimeRequest(3, 40))]
+
+        def send(self, packet: TimeReply) -> None:
+            sent.append(packet)
+            replied.set()
+
+        def close(self) -> None:
+            self._stop_listening()
+
+    own = FakeClock(5 * NS_PER_S)
+    with End() as end:
+        end._listen_to(end.receive, end.send, own.now_ns)
+        assert replied.wait(PATIENCE_S)
+    (reply,) = sent
+    assert (reply.sequence, reply.t1_ns, reply.t3_ns) == (3, 40, own.now_ns())
+    assert waits_ns <= reply.t3_ns - reply.t2_ns < waits_ns + 2 * NS_PER_S
+    assert end.requests == 1
 
 
 def test_jitter_delays_packets_and_not_the_time_of_their_attitudes(monkeypatch, rng):

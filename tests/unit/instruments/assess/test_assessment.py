@@ -101,6 +101,8 @@ def test_a_run_gives_the_budget_on_one_page_and_names_each_wrong_answer(
     due = (planted.tau_s[-1] - planted.tau_s[0]) / 0.1 + 1
     assert found["availability"] == pytest.approx((len(planted.tau_s) - 5) / due, abs=2e-3)
     text = (out / "budget.html").read_text()
+    # five minutes that come back to few places
+    assert "come back to the same places" in text
     titles = [
         "What the error is made of",
         "Answers over the run",

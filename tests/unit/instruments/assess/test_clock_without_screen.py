@@ -20,7 +20,9 @@ from tests.support.planted_tracker import attitude, scalar_first
 
 SECONDS, EXPOSURE_S, LATE_PERIODS = 60.0, 0.05, 0.8
 NOISE_ARCSEC, ANSWER_HZ = 0.5, 5.0
-SIGMAS = 4.0
+# Of what held frames are late by: frames that fade and frames that are held are then told apart.
+# The clock's own sigma has room for a field-of-view error, which this tracker does not have.
+SHARE, SIGMAS = 0.5, 3.0
 # The mean of a span of a turn that accelerates is not that of its middle; over the swings its part
 # that goes with the rate is below this.
 CURVED_MS = 0.01
@@ -69,6 +71,5 @@ def test_frames_that_are_late_at_random_are_no_bias_of_the_trackers_clock(
     late_s = ((gap_s**2).sum() / gap_s.sum() - 1 / refresh_hz) / 2
     expected_ms = 0.0 if fades else 1e3 * late_s
     off_ms = clock["offset_ms"] - expected_ms
+    assert abs(off_ms) < CURVED_MS + SHARE * 1e3 * late_s
     assert abs(off_ms) < CURVED_MS + SIGMAS * clock["sigma_ms"]
-    if not fades:
-        assert expected_ms > SIGMAS * clock["sigma_ms"] + CURVED_MS

@@ -4,7 +4,6 @@ so. What only a planted bench can show stands beside the plant: geometric, align
 
 from __future__ import annotations
 
-import shlex
 from functools import partial
 from pathlib import Path
 
@@ -247,7 +246,7 @@ def session(tmp_path_factory) -> Path:
 @pytest.mark.parametrize(("command", "words"), COMMANDS, ids=[command for command, _ in COMMANDS])
 def test_a_command_that_cannot_be_done_is_refused_with_exit_code_2(session, command, words):
     before = set(session.iterdir())
-    result = run_hilstar_here(*shlex.split(command), cwd=session)
+    result = run_hilstar_here(command, cwd=session)
     assert_refused(result, 2)
     assert says(result.stderr, words), result.stderr
     assert set(session.iterdir()) == before

@@ -11,19 +11,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.assess.bounded_figures import BoundedFigure, lowest_size
 from hilstar.instruments.assess.case_fits import fit_by_cases
-from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.case_table import Columns
-from hilstar.instruments.campaign.cases import (
-    FRAME_ERRORS,
-    FRAME_RATE_ERRORS,
-    FRAME_RATES,
-    STAR_LISTS,
-)
+from hilstar.instruments.campaign.cases import FRAME_RATE_ERRORS, FRAME_RATES
 from hilstar.instruments.campaign.plan import Require
-from hilstar.instruments.campaign.planted import aberration_rad
 from hilstar.instruments.campaign.requirements import (
     MET,
     NOT_MET,
@@ -32,11 +24,8 @@ from hilstar.instruments.campaign.requirements import (
     judged_figure,
     verdicts_of,
 )
+from tests.support.planted_answers import CASES, FRAMES, SCALE, answers, reported_stars
 
-SCALE = Scale(1500.0, (512, 512))
-CASES, FRAMES = 60, 8
-RATE_NOISE_DEG_S = 0.01
-NOISE_ARCSEC = 2.0
 # found within 10 %, or within three standard errors where those are larger
 SHARE, SIGMAS = 0.1, 3.0
 COVERED, TRIES = 0.95, 200
@@ -48,71 +37,6 @@ HEAVY_TRIES, MIN_HEAVY_HELD = 1000, 928
 SIZE_TRIES, SIZE_BAND = 4000, 42
 # binomial: of 800 tries at 5 %, over 59 are met once in 1000
 JITTER_TRIES, MAX_JITTER_MET = 800, 59
-
-
-def answers(rng: np.random.Generator, cases: int = CASES, **planted: Any) -> Columns:
-    """The answers of slews whose errors are planted: rates in deg/s, stamps in s, shares."""
-    rate = rng.uniform(-0.5, 0.5, (cases, 3))
-    acceleration = rng.uniform(-0.1, 0.1, (cases, 3))
-    bias = np.array(planted.get("rate_bias", (0.0, 0.0, 0.0)))
-    numbers: dict[str, Any] = {"case": np.arange(cases, dtype=float)}
-    numbers["frames"] = np.full(cases, float(FRAMES))
-    velocity = rng.uniform(-30, 30, (cases, 3))
-    q = np.array([from_radec_roll_deg(*rng.uniform(-80, 80, 3).tolist()) for _ in range(cases)])
-    off = np.zeros((cases, 3))
-    for k in range(cases):
-        off[k] = planted.get("aberration", 0.0) * aberration_rad(q[k], velocity[k])
-    error = np.degrees(off) * 3600 + NOISE_ARCSEC * rng.standard_normal((cases, 3))
-    for k, axis in enumerate("xyz"):
-        numbers[f"vary.acceleration_deg_s2.{axis}"] = acceleration[:, k]
-        numbers[f"vary.sky.observer_velocity_km_s.{k}"] = velocity[:, k]
-        numbers[f"error_{axis}_arcsec"] = error[:, k]
-    for k, name in enumerate(("qw", "qx", "qy", "qz")):
-        numbers[name] = q[:, k]
-    lists: dict[str, list[Any]] = {}
-    steps = 0.2 * np.arange(FRAMES)
-    noise = planted.get("rate_noise", RATE_NOISE_DEG_S)
-    delay = planted.get("stamp_bias", 0.0)
-    delay = delay + planted.get("stamp_jitter", 0.0) * rng.standard_normal((cases, FRAMES))
-    for k in range(3):
-        true = rate[:, k, None] + acceleration[:, k, None] * steps
-        told = bias[k] + planted.get("rate_scale", 0.0) * true
-        told = told - planted.get("rate_lag", 0.0) * acceleration[:, k, None]
-        told = told + noise * rng.standard_normal((cases, FRAMES))
-        of_stamp = 3600 * true * delay + 5.0 * (k + 1)
-        of_stamp = of_stamp + NOISE_ARCSEC * rng.standard_normal((cases, FRAMES))
-        lists[FRAME_RATES[k]] = list(true)
-        lists[FRAME_RATE_ERRORS[k]] = list(told)
-        lists[FRAME_ERRORS[k]] = list(of_stamp)
-    return Columns(cases, numbers, {}, lists)
-
-
-def reported_stars(rng: np.random.Generator, cases: int = CASES, **planted: Any) -> Columns:
-    """Reported stars with planted errors: px, magnitudes, and false stars a frame."""
-    lists: dict[str, list[Any]] = {name: [] for name in STAR_LISTS}
-    false = rng.poisson(planted.get("false", 0.2), cases)
-    for _ in range(cases):
-        n = 30
-        x, y = rng.uniform(8, 503, (2, n))
-        v_mag = rng.uniform(2, 7, n)
-        bv = rng.uniform(-0.2, 1.8, n)
-        wave = math.sqrt(2) * planted.get("fov", 0.0) * np.sin(2 * np.pi * x / 512)
-        dx = wave + planted.get("noise", 0.1) * rng.standard_normal(n)
-        dy = wave + planted.get("noise", 0.1) * rng.standard_normal(n)
-        signal = 3.0 + planted.get("colour", 0.0) * bv + 0.02 * rng.standard_normal(n)
-        seen = rng.random(n) < 1 / (1 + np.exp((v_mag - planted.get("limit", 5.5)) / 0.1))
-        for column in (dx, dy, signal):
-            column[~seen] = np.nan
-        columns = (x, y, v_mag, bv, dx, dy, signal, v_mag - 10.0)
-        for name, column in zip(STAR_LISTS, columns, strict=True):
-            lists[name].append(column)
-    numbers = {
-        "case": np.arange(cases, dtype=float),
-        "frames": np.ones(cases),
-        "star_frames": np.ones(cases),
-        "star_false": false.astype(float),
-    }
-    return Columns(cases, numbers, {}, lists)
 
 
 def figure_verdict(cases: Columns, quantity: str, **keys: Any) -> RequirementVerdict:

@@ -154,10 +154,11 @@ class HeadProcess:
                 self._begin()
             return True
         code = self._process.poll()
-        if code is not None:
-            return self._ended(code, now_s)
+        # after the look at its end: what it said until then is heard
         if self._drain():
             self._heard_s = now_s
+        if code is not None:
+            return self._ended(code, now_s)
         limit_s = STALLED_S if self._ready else STARTS_S
         if now_s - self._heard_s > limit_s:
             self._say(

@@ -279,16 +279,16 @@ def head_command(asked: HeadsRun, k: int, endpoint: str, number: int, drawn_s: f
     a head that is started again runs for the rest of the duration, with a ledger of its own.
     """
     file = asked.heads.files[k]
-    words = [sys.executable, "-m", "hilstar", "serve", str(file.path), "--json"]
-    words += ["--head-of", str(asked.heads.path), "--fed-by", f"{endpoint},{os.getpid()}"]
-    words += asked.options
+    command = [sys.executable, "-m", "hilstar", "serve", str(file.path), "--json"]
+    command += ["--head-of", str(asked.heads.path), "--fed-by", f"{endpoint},{os.getpid()}"]
+    command += asked.options
     if asked.duration_s is not None:
-        words += ["--duration", f"{max(asked.duration_s - drawn_s, MIN_DURATION_S):.6g}"]
+        command += ["--duration", f"{max(asked.duration_s - drawn_s, MIN_DURATION_S):.6g}"]
     if asked.ledger is not None:
-        words += ["--ledger", str(head_ledger(asked.ledger, asked.heads.names[k], number))]
+        command += ["--ledger", str(head_ledger(asked.ledger, asked.heads.names[k], number))]
     if asked.consoles:
-        words += ["--console", asked.consoles[k]]
-    return words
+        command += ["--console", asked.consoles[k]]
+    return command
 
 
 def _hand_on(

@@ -198,7 +198,7 @@ def _sums(stamps: FloatArray, rows: FloatArray, columns: FloatArray) -> FloatArr
     """The sums (n, j, k) of each square (n, side, side), weighted by the products of each of its
     `rows` (n, j, side) with each of its `columns` (n, side, k).
     """
-    return np.asarray(rows @ (stamps @ columns))
+    return np.asarray((rows @ stamps) @ columns)  # a fifth less time than columns first
 
 
 def _fit(stamps: FloatArray, sigma_px: Sigma, pixels: Pixels) -> Places:

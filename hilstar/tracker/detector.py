@@ -20,12 +20,13 @@ Laws:
 """
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from hilstar.basics.arrays import Float32Array, FloatArray
+from hilstar.basics.arrays import BoolArray, Float32Array, FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.tracker.frame_noise import Word64Array, draw_blocks, normal_pairs, poisson
 from hilstar.tracker.settings import MAX_E, DetectorSettings, PixelPitch, check_value
@@ -120,6 +121,23 @@ def false_stars_e(
     return image_e
 
 
+def _alive(
+    settings: DetectorSettings,
+    shape: tuple[int, int],
+    pixels: np.random.Generator,
+    rows: np.random.Generator,
+    columns: np.random.Generator,
+) -> Iterator[BoolArray]:
+    """Where pixels, rows and columns are not dead, each of shapes that go with `shape`."""
+    height, width = shape
+    if settings.dead_pixel_fraction:
+        yield pixels.random(shape) >= settings.dead_pixel_fraction
+    if settings.dead_row_fraction:
+        yield rows.random((height, 1)) >= settings.dead_row_fraction
+    if settings.dead_column_fraction:
+        yield columns.random(width) >= settings.dead_column_fraction
+
+
 class Detector:
     """One device: its settings, and its fixed maps, shape (height, width), made once."""
 
@@ -144,21 +162,14 @@ class Detector:
         # a new map takes a new stream at the end: those of before stay as they were
         seeds = np.random.SeedSequence(settings.device_seed).spawn(9)
         streams = [np.random.default_rng(seed) for seed in seeds]
-        prnu, dsnu, hot, dead, column, column_dark, offset = streams[:7]
-        dead_rows, dead_columns = streams[7:]
+        prnu, dsnu, hot, dead, column, column_dark, offset, dead_rows, dead_columns = streams
         gain_map: ChargeArray = np.ones(self.shape)
         if settings.prnu:  # a map of ones needs no million draws
             gain_map = np.maximum(1.0 + settings.prnu * prnu.standard_normal(self.shape), 0.0)
         dark_map_e_per_s = _dark_map_e_per_s(settings, self.shape, dsnu, hot, column_dark)
-        for share, shape, rng in (
-            (settings.dead_pixel_fraction, self.shape, dead),
-            (settings.dead_row_fraction, (height, 1), dead_rows),
-            (settings.dead_column_fraction, (1, width), dead_columns),
-        ):
-            if share:
-                is_alive = rng.random(shape) >= share
-                gain_map *= is_alive
-                dark_map_e_per_s *= is_alive
+        for is_alive in _alive(settings, self.shape, dead, dead_rows, dead_columns):
+            gain_map *= is_alive
+            dark_map_e_per_s *= is_alive
         kind = np.float64 if settings.noise_version == 1 else np.float32
         self.gain_map: ChargeArray = gain_map.astype(kind, copy=False)
         self.dark_map_e_per_s: ChargeArray = dark_map_e_per_s.astype(kind, copy=False)

@@ -127,32 +127,45 @@ class Judge:
         (n,), of that of the wanted stars.
         """
         light = self._light_of(shown)
+        unknown = tuple(kind for kind in kinds if kind not in self._places)
+        self._places |= self._places_by(self._wanted, unknown)
         off_px = {}
-        for kind in kinds:
-            if kind not in self._places:
-                self._places[kind] = self._places_of(self._wanted, kind)
-            error_px = self._places_of(shown, kind) - self._places[kind]
+        for kind, place_px in self._places_by(shown, kinds).items():
+            error_px = place_px - self._places[kind]
             off_px[kind] = np.where(light > 0, error_px, np.inf)
         flux_ratio = light / (share * self._light)
         return StarErrors(np.asarray(magnitude(flux_ratio)), off_px)
 
-    def _places_of(self, image: FloatArray, kind: Centroider) -> FloatArray:
-        """The x and y (2, n) of the stars by a centroider, monitor pixels, from the middle of the
+    def _places_by(
+        self, image: FloatArray, kinds: tuple[Centroider, ...]
+    ) -> dict[Centroider, FloatArray]:
+        """By centroider, the x and y (2, n) of the stars, monitor pixels, from the middle of the
         tracker's pixel in the middle (by `moment`, from the tile's first pixel).
         """
-        if kind == "moment":  # neither blur nor pixels change a first moment
-            tiles = self._tiles(image, self._tile)
-            at = np.arange(self._tile)
-            light = np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny)
-            x = tiles.sum(axis=1) @ at / light
-            y = tiles.sum(axis=2) @ at / light
-            return np.stack([x, y])
-        boxed = kind in BOXES
-        pixel_px = self._pixel_px if boxed else self._sampled_px
-        stamps = self._seen(image, pixel_px)
-        middles = self._middles(stamps, boxed)
-        places = star_places(stamps, kind, self._sigma_px, middles, self._box_share)
-        return np.stack(places) * pixel_px
+        places: dict[Centroider, FloatArray] = {}
+        stamps_by_px: dict[float, FloatArray] = {}
+        for kind in kinds:
+            if kind == "moment":  # neither blur nor pixels change a first moment
+                places[kind] = self._moments_of(image)
+                continue
+            boxed = kind in BOXES
+            pixel_px = self._pixel_px if boxed else self._sampled_px
+            if pixel_px not in stamps_by_px:
+                stamps_by_px[pixel_px] = self._seen(image, pixel_px)
+            stamps = stamps_by_px[pixel_px]
+            middles = self._middles(stamps, boxed)
+            at = star_places(stamps, kind, self._sigma_px, middles, self._box_share)
+            places[kind] = np.stack(at) * pixel_px
+        return places
+
+    def _moments_of(self, image: FloatArray) -> FloatArray:
+        """The first moments x and y (2, n) of the tiles, monitor pixels from their first one."""
+        tiles = self._tiles(image, self._tile)
+        at = np.arange(self._tile)
+        light = np.maximum(tiles.sum(axis=(1, 2)), np.finfo(float).tiny)
+        x = tiles.sum(axis=1) @ at / light
+        y = tiles.sum(axis=2) @ at / light
+        return np.stack([x, y])
 
     def _middles(self, stamps: FloatArray, boxed: bool) -> Pixels:
         """The pixels at which centroiders begin: a box at the brightest pixel of the wanted star,

@@ -74,6 +74,7 @@ XRANDR_FUNCTIONS: dict[str, tuple[Any, ...]] = {
 
 # of `sync`: a line's pixels and a frame's lines, blank ones too
 H_TOTAL, V_TOTAL = 2, 6
+RR_INTERLACE, RR_DOUBLE_SCAN = 0x10, 0x20  # randr.h: flags of a mode
 
 
 class ModeInfo(ctypes.Structure):
@@ -400,9 +401,14 @@ def ramp_of(gamma: GammaInfo) -> bytes:
 
 def refresh_hz_of(mode: ModeInfo) -> float:
     """The refresh rate of a mode: its dot clock over all its pixels, blank ones too; 0 where it
-    does not say these.
+    does not say these. Of interlaced modes that of their fields.
     """
-    pixels = mode.sync[H_TOTAL] * mode.sync[V_TOTAL]
+    lines = float(mode.sync[V_TOTAL])
+    if mode.flags & RR_INTERLACE:
+        lines /= 2
+    if mode.flags & RR_DOUBLE_SCAN:  # each line is drawn twice
+        lines *= 2
+    pixels = mode.sync[H_TOTAL] * lines
     return mode.dot_clock / pixels if pixels else 0.0
 
 

@@ -62,17 +62,17 @@ def fit_by_cases(design: FloatArray, values: FloatArray, case: IntArray) -> Case
     even = np.zeros_like(residual)
     rows_by_case = np.split(np.argsort(number, kind="stable"), np.cumsum(np.bincount(number))[:-1])
     for k, rows in enumerate(rows_by_case):
-        own = design[rows]
-        axes, pull, _ = np.linalg.svd(own @ root, full_matrices=False)
+        own_design = design[rows]
+        axes, pull, _ = np.linalg.svd(own_design @ root, full_matrices=False)
         free = np.maximum(1 - pull**2, SMALL_SHARE)
         # (1 - H)^-1/2 of the case's own part of the hat matrix H, less 1
         scale = axes * (1 / np.sqrt(free) - 1)
         even[rows] = residual[rows] + scale @ (axes.T @ residual[rows])
-        score[k] = own.T @ even[rows]
-        errors = own @ inverse
+        score[k] = own_design.T @ even[rows]
+        errors = own_design @ inverse
         errors = errors + scale @ (axes.T @ errors)
         weight[k] = (errors**2).sum(axis=0)
-        shared[k] = own.T @ errors
+        shared[k] = own_design.T @ errors
     covariance = inverse @ score.T @ score @ inverse
     freedom = np.zeros(terms)
     for term in range(terms):

@@ -123,6 +123,6 @@ def slow_variance(elapsed_s: FloatArray, bumps: Projector, left: FloatArray) -> 
     spread = taken @ inverse
     size = np.einsum("ia,ij,ja->a", coefficient, taken, coefficient)
     mixed = np.einsum("ia,ij,ja->a", coefficient, taken @ inverse @ taken, coefficient)
-    own = variance * float(np.trace(spread))
+    by_noise = variance * float(np.trace(spread))
     sigma = np.sqrt(2 * variance**2 * float(np.trace(spread @ spread)) + 4 * variance * mixed)
-    return np.asarray(size + own + SURE_SIGMAS * sigma)
+    return np.asarray(size + by_noise + SURE_SIGMAS * sigma)

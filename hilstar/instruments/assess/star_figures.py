@@ -233,7 +233,10 @@ def _star_colour(found: StarTable, confidence: float) -> BoundedFigure:
     refuse_few(found.case[known], "stars' signal")
     signal = found.signal_mag[known]
     lit = found.lit_mag[known]
-    if len(signal) > 2 and stats.spearmanr(signal + lit, lit).statistic < 0:
+    reported = signal + lit
+    # signals that are all alike, or of one light, have no rank
+    has_ranks = len(signal) > 2 and np.ptp(reported) > 0 and np.ptp(lit) > 0
+    if has_ranks and stats.spearmanr(reported, lit).statistic < 0:
         raise TooFewCases(NO_SIGNAL, 0)
     bv = found.bv[known]
     fainter = lit - np.median(lit)

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from msgspec import structs
 
 from hilstar.basics.charts import write_csv
@@ -38,7 +39,7 @@ from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.star_motion import with_motion
 from hilstar.instruments.campaign.store import Directory, failures, require_parquet
-from hilstar.instruments.campaign.sweep import ENDS, counted, edge_figure, next_level
+from hilstar.instruments.campaign.sweep import counted, edge_figure, next_level
 
 PLAN_FILE = "plan.toml"
 TIMED_CASES = 2  # of a set, whose time tells that of all
@@ -95,26 +96,29 @@ class Acceptance(AcceptedBench):
             if case_set.refused:
                 continue
             sweep = case_set.sweep
-            # most levels of a sweep stand near its edge, whose cases cost more than its ends': the
-            # limb of the Earth is in their field
-            levels: dict[float | None, int] = {None: 1}
+            levels: tuple[float | None, ...] = (None,)
+            run = 1
             if sweep is not None:
+                # an edge in the middle may cost more than either end: there the limb of the Earth
+                # is in the field
                 middle = sweep.between(sweep.start, sweep.stop)
-                levels = {sweep.start: 1, sweep.stop: 1, middle: sweep.levels - ENDS}
+                levels = (sweep.start, middle, sweep.stop)
+                run = sweep.levels
             folder = self.directory / case_set.name
-            campaigns = {}
+            campaigns = []
             for level in levels:
                 begun_s = time.perf_counter()
-                campaigns[level] = self.campaign(case_set, folder, level)
+                campaigns.append(self.campaign(case_set, folder, level))
                 set_up_s = time.perf_counter() - begun_s  # the last has the catalogue in memory
-            first = next(iter(campaigns.values()))
-            run = sum(levels.values())
-            cases = first.cases * run
+            of_level = campaigns[0].cases
+            cases = of_level * run
             if self.on_bench:
-                yield CostOfSet(case_set, cases, cases * first.plan.limit_s)
+                yield CostOfSet(case_set, cases, cases * campaigns[0].plan.limit_s)
                 continue
-            all_s = sum(count * _case_s(campaigns[level]) for level, count in levels.items())
-            seconds = first.cases * all_s / min(workers, cases) + run * set_up_s
+            times_s = np.array([_case_s(campaign) for campaign in campaigns])
+            case_s, warm_up_s = times_s.mean(axis=0).tolist()
+            level_s = of_level * case_s / min(workers, of_level) + warm_up_s + set_up_s
+            seconds = run * level_s
             yield CostOfSet(case_set, cases, seconds)
 
     def run(self, run_cases: RunCases) -> list[SetResult]:
@@ -245,19 +249,23 @@ def _unit(clause: ClauseTable, case_set: CaseSet) -> str:
     return clause.require.unit
 
 
-def _case_s(campaign: Campaign) -> float:
-    """The time of a case, s: the mean of the first TIMED_CASES, after one that warms up."""
+def _case_s(campaign: Campaign) -> tuple[float, float]:
+    """The time of a case, s: the mean of the first TIMED_CASES, after one that warms up; and how
+    much longer that one took, with its session.
+    """
     count = min(TIMED_CASES, campaign.cases)
     points = campaign.design.points(0, count)
+    opened_s = time.perf_counter()
     session = Session(campaign.job)
     try:
         session.row(0, points[0])
         begun_s = time.perf_counter()
         for number, point in enumerate(points):
             session.row(number, point)
-        return (time.perf_counter() - begun_s) / count
+        case_s = (time.perf_counter() - begun_s) / count
     finally:
         session.close()
+    return case_s, max(begun_s - opened_s - case_s, 0.0)
 
 
 def write_ledger(path: Path, results: list[SetResult]) -> int:

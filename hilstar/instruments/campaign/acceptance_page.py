@@ -28,6 +28,7 @@ from hilstar.basics.pages import (
 from hilstar.basics.version import __version__
 from hilstar.instruments.assess.bounded_figures import TooFewCases, clopper_pearson, quantile_limits
 from hilstar.instruments.assess.star_drawing import star_drawing
+from hilstar.instruments.campaign.acceptance_plan import AcceptancePlan
 from hilstar.instruments.campaign.acceptance_verdicts import (
     LEDGER,
     NOT_TESTED,
@@ -77,6 +78,12 @@ TOGETHER = (
 MAY_BE_CHANCE = "may be chance among so many clauses; more cases would tell"
 FAILED_HEADER = ("set of cases", "failed", "why")
 FAILED_CURE = "Mend what the reasons name, and accept again in another directory."
+# what was tested, by the plan's `through`
+THROUGH = {
+    "tracker": "the bench file's virtual tracker before the sky, no real one",
+    "display": "the bench file's virtual tracker before the display as simulated, no real one",
+    "bench": "the real tracker before the real display",
+}
 QUICK = "a few cases for every clause (--quick), no acceptance"
 QUANTILES = (0.5, 0.9, 0.95, 0.99)
 MAX_ROWS = 5000  # of points in a chart
@@ -103,7 +110,7 @@ def write_acceptance(
     for card in _cards(acceptance, results, verdicts, rows):
         parts.append(card.html())
     title = f"{acceptance.plan.title}: {acceptance.file.path.name}"
-    page = page_of(title, _verdict(verdicts, acceptance.plan.quick), parts)
+    page = page_of(title, _verdict(verdicts, acceptance.plan), parts)
     write_whole(folder / PAGE_FILE, page)
     return summary
 
@@ -289,7 +296,7 @@ def _margin(each: ClauseVerdict) -> str | None:
     return f"{_digits(verdict.margin)} {each.unit}".rstrip() + share
 
 
-def _verdict(verdicts: list[ClauseVerdict], quick: bool) -> Verdict:
+def _verdict(verdicts: list[ClauseVerdict], plan: AcceptancePlan) -> Verdict:
     whole = verdict_of(verdicts)
     counts = []
     for word in (MET, NOT_MET, NOT_SHOWN, NOT_TESTED):
@@ -297,7 +304,8 @@ def _verdict(verdicts: list[ClauseVerdict], quick: bool) -> Verdict:
         if count:
             counts.append(f"{count} {word}")
     counts_text = f"Of {len(verdicts)}: {', '.join(counts)}."
-    if quick:
+    counts_text = f"{counts_text} Tested: {THROUGH[plan.through]}."
+    if plan.quick:
         counts_text = f"{counts_text} {capital(QUICK)}."
     return Verdict(STATES[whole], HEADLINES[whole], counts_text)
 
@@ -422,20 +430,20 @@ def _sweep_card(result: SetResult, judged: ClauseVerdict) -> Card:
 
 def _edge_finding(sweep: SweepTable, judged: ClauseVerdict) -> str:
     """Up to where a sweep's cases are successes, in a line."""
-    kept = "An attitude"
+    success = "An attitude"
     if sweep.star_v_mag is not None:
-        kept = f"Half of the stars to V {sweep.star_v_mag:g}"
+        success = f"Half of the stars to V {sweep.star_v_mag:g}"
     edge = judged.verdict
     if edge is None or edge.value is None:
-        return f"{kept}: {judged.untested or 'no edge'}"
+        return f"{success}: {judged.untested or 'no edge'}"
     if STILL in edge.method:
-        return f"{kept} even at {_digits(edge.value)} {judged.unit}".rstrip()
+        return f"{success} even at {_digits(edge.value)} {judged.unit}".rstrip()
     if NOT_EVEN in edge.method:
-        return f"{kept} is not there even at {_digits(edge.value)} {judged.unit}".rstrip()
+        return f"{success} is not there even at {_digits(edge.value)} {judged.unit}".rstrip()
     way = "up to"
     if sweep.stop < sweep.start:
         way = "down to"
-    return f"{kept} {way} {_measured(judged)}"
+    return f"{success} {way} {_measured(judged)}"
 
 
 def _first_attitude(result: SetResult) -> Card:
@@ -493,7 +501,7 @@ def _about(acceptance: AcceptedBench, results: list[SetResult], rows: int) -> Ca
         ("judged", f"{datetime.now(UTC):%Y-%m-%d %H:%M} UTC"),
         ("run of", QUICK if plan.quick else "all cases of the plan"),
         ("bench", f"{file.path}, sha256 {file.sha256}"),
-        ("through", plan.through),
+        ("tested", THROUGH[plan.through]),
         ("solver", acceptance.solver_text),
         ("program", f"hilstar {__version__}"),
         ("ledger", f"{rows} cases in {LEDGER}, sha256 {ledger_sha256}"),

@@ -39,7 +39,7 @@ from hilstar.server.record.ledger import Ledger
 from hilstar.server.record.ledger_records import FrameRecord
 from tests.support.alignment import HEADER, reported, write_pairs
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, typed
 
 # 1020 arcsec across the boresight, 1815 about it
 TRUE_Q = normalise(np.array([1.0, 0.0021, -0.0013, 0.0044]))
@@ -219,16 +219,8 @@ def run_of_a_slew(tmp_path_factory):
 
 def test_a_ledger_says_what_was_commanded_at_the_moment_of_light(run_of_a_slew, tmp_path):
     bench, ledger, telemetry = run_of_a_slew
-    wanted = (
-        "calibrate",
-        "alignment",
-        bench,
-        telemetry,
-        "--ledger",
-        ledger,
-        "-o",
-        tmp_path / "g.toml",
-        "--json",
+    wanted = typed(
+        f"calibrate alignment {bench} {telemetry} --ledger {ledger} -o {tmp_path}/g.toml --json"
     )
     late, right = (
         json.loads(run_hilstar_here(*wanted, *more).stdout) for more in ((), ("--offset-s", "0.04"))
@@ -247,17 +239,9 @@ def test_a_ledger_that_was_cut_short_is_used_and_said_in_one_line(run_of_a_slew,
     bench, ledger, telemetry = run_of_a_slew
     cut, whole = tmp_path / "cut.mcap", ledger.read_bytes()
     cut.write_bytes(whole[:-50])  # what is whole is one chunk, of all frames
-    aligned = (
-        "calibrate",
-        "alignment",
-        bench,
-        telemetry,
-        "--ledger",
-        cut,
-        "-o",
-        tmp_path / "g.toml",
-        "--offset-s",
-        "0.04",
+    aligned = typed(
+        f"calibrate alignment {bench} {telemetry} --ledger {cut} -o {tmp_path}/g.toml "
+        "--offset-s 0.04"
     )
     for command in (aligned, ("report", cut, "-o", tmp_path / "report")):
         result = run_hilstar_here(*command, "--json")

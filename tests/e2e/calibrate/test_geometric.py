@@ -16,7 +16,7 @@ from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.geometric.dots import read_plan
 from hilstar.optics.camera import Camera
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, typed
 from tests.support.traced_bench import TracedBench, observed_dots
 
 BENCH = TracedBench()
@@ -64,14 +64,7 @@ def session(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def fitted(session):
-    wanted = (
-        "--plan",
-        session / "plan",
-        "-o",
-        session / "geometry.toml",
-        "--tracker-is-ideal",
-        "--json",
-    )
+    wanted = typed(f"--plan {session}/plan -o {session}/geometry.toml --tracker-is-ideal --json")
     result = run_hilstar_here(
         f"calibrate geometric {session}/bench.toml {session}/observed.csv",
         *wanted,

@@ -16,7 +16,7 @@ from scipy.special import ndtr
 
 from hilstar.instruments.calibrate.geometric.dots import read_plan
 from tests.e2e.calibrate.test_geometric import BENCH, FILE, STARS_ARCSEC, TRACKER, TRACKER_PX
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, typed
 
 SIGMA_PX, PEAK_DN, FLOOR_DN, NOISE_DN = 1.1, 9000.0, 400.0, 12.0
 HOT = 150  # pixels
@@ -71,14 +71,7 @@ def images_in(folder):
 
 
 def test_images_give_what_centroids_give(session):
-    wanted = (
-        "--plan",
-        session / "plan",
-        "-o",
-        session / "geometry.toml",
-        "--tracker-is-ideal",
-        "--json",
-    )
+    wanted = typed(f"--plan {session}/plan -o {session}/geometry.toml --tracker-is-ideal --json")
     result = run_hilstar_here(
         "calibrate",
         "geometric",

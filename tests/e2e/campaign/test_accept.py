@@ -93,6 +93,7 @@ def test_an_acceptance_ends_in_a_page_tables_and_an_exit_code(folder: Path) -> N
     assert together["Largest <rate>"] == "not met" and together["A right attitude"] == ""
     page = (folder / "out" / "accept.html").read_text()
     assert "Largest &lt;rate&gt;" in page and "A clause is not met" in page
+    assert "virtual tracker before the sky, no real one" in page and "--quick" not in page
     assert "Vacuum" in page and "not of a bench" in page and "varies scenario" in page
     with (folder / "out" / "ledger.csv").open() as file:
         rows = list(csv.DictReader(file))

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, typed
 from tests.support.sources import ros_bags
 from tests.support.sources.ros_bags import START_NS, Make, write_bag2
 from tests.support.tables import csv_rows
@@ -31,17 +31,8 @@ def bag(tmp_path):
 
 
 def test_a_bag_is_replayed_with_what_is_stated(tmp_path, small_bench_file, bag):
-    options = (
-        "--reference",
-        "icrs",
-        "--headless",
-        "--speed",
-        "max",
-        "--step",
-        "0.5",
-        "-o",
-        tmp_path / "out",
-        "--explain",
+    options = typed(
+        f"--reference icrs --headless --speed max --step 0.5 -o {tmp_path}/out --explain"
     )
     result = run_hilstar_here("replay", small_bench_file, bag, *options)
     assert result.returncode == 0, result.stderr

@@ -9,7 +9,7 @@ from PIL import Image
 
 import hilstar
 from tests.support.benches import ROOT, SMALL_BENCH, bench_text
-from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here, typed
 from tests.support.psfs import coma, sampled
 
 LYRA = ROOT / "configs" / "thesis-lyra.toml"
@@ -156,16 +156,7 @@ def test_a_log_is_simulated_over_all_cores(tmp_path):
     rows = ["t_s,qw,qx,qy,qz", "0,1,0,0,0", "1,0.99999,0.004,0,0.002"]
     (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
     (tmp_path / "bench.toml").write_text(SMALL_BENCH.replace("[1024, 1024]", "[128, 96]"))
-    command = (
-        "simulate",
-        tmp_path / "bench.toml",
-        "--log",
-        tmp_path / "log.csv",
-        "--frames",
-        "6",
-        "--seed",
-        "3",
-    )
+    command = typed(f"simulate {tmp_path}/bench.toml --log {tmp_path}/log.csv --frames 6 --seed 3")
     for folder in ("one", "two"):
         result = run_hilstar(*command, "-o", tmp_path / folder)
         assert result.returncode == 0, result.stderr

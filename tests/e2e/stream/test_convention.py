@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.server.record.ledger_records import frame_records
 from tests.support.benches import LIVE_BENCH, attitude_table
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, typed
 from tests.support.forks import HILSTAR
 from tests.support.heads import MOUNTINGS, heads_file
 from tests.support.senders import publisher, talking
@@ -153,12 +153,7 @@ def test_several_heads_have_one_body_whatever_its_convention_is_otherwise(tmp_pa
         )
         command = [
             *HILSTAR,
-            "serve",
-            str(path),
-            "--headless",
-            "--json",
-            "--ledger",
-            str(tmp_path / "run.mcap"),
+            *typed(f"serve {path} --headless --json --ledger {tmp_path}/run.mcap"),
         ]
         with Run(command) as process:
             wait_for(

@@ -13,7 +13,7 @@ import numpy as np
 
 from hilstar.basics.rotation import angle_between_rad, multiply
 from hilstar.server.record.ledger_records import frame_records
-from tests.support.commands import assert_refused, run_hilstar
+from tests.support.commands import assert_refused, run_hilstar, typed
 from tests.support.forks import HILSTAR, Started
 from tests.support.heads import MOUNTINGS, heads_file
 from tests.support.senders import free_port, publisher, talking
@@ -51,12 +51,7 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
         path = heads_file(tmp_path, port)
         command = [
             *HILSTAR,
-            "serve",
-            str(path),
-            "--headless",
-            "--json",
-            "--ledger",
-            str(tmp_path / "run.mcap"),
+            *typed(f"serve {path} --headless --json --ledger {tmp_path}/run.mcap"),
         ]
         with Started(command, stdout=subprocess.PIPE, stderr=said, text=True) as process:
             try:

@@ -23,7 +23,7 @@ from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from hilstar.basics.units import NS_PER_S
 from hilstar.server.record.ledger_records import drawable_frames
 from tests.support.benches import LIVE_BENCH, SMALL_BENCH
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, typed
 from tests.support.forks import Started
 from tests.support.ledgers import messages_by_topic
 from tests.support.pages import page_of
@@ -164,16 +164,7 @@ def test_a_full_disk_ends_the_ledger_and_not_the_display(tmp_path):
     bench = tmp_path / "bench.toml"
     with publisher() as (sender, port):
         bench.write_text(f'{LIVE_BENCH}\n[attitude]\nendpoint = "tcp://127.0.0.1:{port}"\n')
-        command = [
-            "serve",
-            str(bench),
-            "--headless",
-            "--json",
-            "--ledger",
-            str(ledger),
-            "--duration",
-            "2",
-        ]
+        command = typed(f"serve {bench} --headless --json --ledger {ledger} --duration 2")
         limited = (
             f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, ({LIMIT_BYTES},"
             f" {LIMIT_BYTES}))"
@@ -253,17 +244,10 @@ def test_no_output_is_written_over_an_input_or_an_older_run(tmp_path, small_benc
         ["replay", bench, log, *headless, "--ledger", run],
         ["convert", log, log],
         ["convert", log, run],
-        [
-            "serve",
-            bench,
-            "--headless",
-            "--duration",
-            "1",
-            "--ledger",
-            tmp_path / "other.mcap",
-            "--ledger-split",
-            "1 fortnight",
-        ],
+        typed(
+            f"serve {bench} --headless --duration 1 --ledger {tmp_path}/other.mcap "
+            "--ledger-split '1 fortnight'"
+        ),
     ):
         assert_refused(run_hilstar_here(*command), 2)
         assert {path: path.read_bytes() for path in before} == before, command

@@ -14,7 +14,7 @@ import pytest
 
 from hilstar.server.console import run_status
 from tests.support.benches import LIVE_BENCH, attitude_table, still_log
-from tests.support.commands import HILSTAR, run_hilstar_here
+from tests.support.commands import HILSTAR, run_hilstar_here, typed
 from tests.support.forks import Started
 from tests.support.senders import free_port, packet, publisher, talking
 from tests.support.servers import serving
@@ -49,11 +49,7 @@ def test_a_terminal_shows_the_attitude_and_turns_to_stale(tmp_path):
     with publisher() as (sender, port):
         command = [
             *HILSTAR,
-            "serve",
-            str(bench_for(tmp_path, port)),
-            "--headless",
-            "--ledger",
-            str(tmp_path / "run.mcap"),
+            *typed(f"serve {bench_for(tmp_path, port)} --headless --ledger {tmp_path}/run.mcap"),
         ]
         with Started(
             command, stdout=theirs, stderr=theirs, env={**os.environ, "COLUMNS": "120"}

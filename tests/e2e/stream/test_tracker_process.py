@@ -28,7 +28,7 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 from tests.support.benches import ROOT, TWIN, bench_text
-from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here
+from tests.support.commands import HILSTAR, assert_refused, run_hilstar_here, typed
 from tests.support.forks import Started
 from tests.support.senders import free_port
 from tests.support.servers import sending_replay
@@ -82,14 +82,7 @@ def test_lost_in_space_then_tracking_its_answers_are_the_attitude_that_was_lit_a
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as ear:
         ear.bind(("127.0.0.1", 0))
         ear.setblocking(False)
-        told = (
-            "--answer",
-            f"udp://127.0.0.1:{ear.getsockname()[1]}",
-            "--format",
-            "json",
-            "--duration",
-            3,
-        )
+        told = typed(f"--answer udp://127.0.0.1:{ear.getsockname()[1]} --format json --duration 3")
         planted = (
             "--bias",
             ",".join(map(str, BIAS)),
@@ -123,19 +116,7 @@ def test_lost_in_space_then_tracking_its_answers_are_the_attitude_that_was_lit_a
 def test_planted_silence_garbage_latency_and_wrong_answers_over_a_serial_line(display):
     ours, theirs = pty.openpty()
     tty.setraw(theirs)
-    planted = (
-        "--silent",
-        "1s@1s",
-        "--babble",
-        "--wrong",
-        "50%",
-        "--latency",
-        "0.5",
-        "--solver",
-        "truth",
-        "--seed",
-        2,
-    )
+    planted = typed("--silent 1s@1s --babble --wrong 50% --latency 0.5 --solver truth --seed 2")
     line = f"serial:{os.ttyname(theirs)}@921600"
     with tracker_of_display(
         display, "--answer", line, "--format", "json", "--duration", 3, *planted

@@ -27,7 +27,7 @@ from hilstar.server.send_log import BadCable, Faults, send, spin_samples
 from hilstar.server.sender import UdpSender
 from hilstar.server.serve import Outlet
 from tests.support.benches import LIVE_BENCH
-from tests.support.commands import assert_refused, run_hilstar_here, sent
+from tests.support.commands import assert_refused, run_hilstar_here, sent, typed
 from tests.support.forks import HILSTAR, Started
 from tests.support.live_runs import attitudes, serve_until
 from tests.support.senders import free_port, packet
@@ -50,17 +50,7 @@ def udp_bench(folder: Path, *lines: str) -> Path:
 
 def test_a_sender_over_ipv6_that_starts_first_waits_none_is_lost_and_both_sides_talk(tmp_path):
     port = free_port()
-    options = [
-        "--spin",
-        "z,1",
-        "--rate",
-        "200",
-        "--count",
-        "300",
-        "--to",
-        f"udp://[::1]:{port}",
-        "--json",
-    ]
+    options = typed(f"--spin z,1 --rate 200 --count 300 --to udp://[::1]:{port} --json")
     with Started(
         [*HILSTAR, "send", *options], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as sender:
@@ -226,15 +216,7 @@ def test_a_look_at_where_a_live_stream_points_answers_a_sender_that_waits(tmp_pa
     port = free_port()
     command = [
         *HILSTAR,
-        "send",
-        "--spin",
-        "z,0",
-        "--radec",
-        "30,40,50",
-        "--rate",
-        "50",
-        "--to",
-        f"udp://127.0.0.1:{port}",
+        *typed(f"send --spin z,0 --radec 30,40,50 --rate 50 --to udp://127.0.0.1:{port}"),
     ]
     with Started(command, stderr=subprocess.PIPE, text=True) as sender:
         try:

@@ -8,6 +8,7 @@ import contextlib
 import gc
 import importlib.util
 import os
+import resource
 import signal
 import socket
 import sys
@@ -108,6 +109,10 @@ def test_a_reader_is_prompt_but_while_it_takes_much_of_a_core(monkeypatch):
         policies.append(policy)
         return True
 
+    limits: list[tuple[int, tuple[int, int]]] = []
+    # this process keeps its own scheduling, and what it may ask for
+    monkeypatch.setattr(scheduling, "SCHED_SETATTR", {})
+    monkeypatch.setattr(scheduling.resource, "setrlimit", lambda *limit: limits.append(limit))
     monkeypatch.setattr(scheduling, "_set_all_threads", take)
     wall_s = cpu_s = 100.0
     prompt = PromptWhileLight(lambda: wall_s, lambda: cpu_s)
@@ -126,6 +131,7 @@ def test_a_reader_is_prompt_but_while_it_takes_much_of_a_core(monkeypatch):
     prompt.tend()
     assert policies[-1] == os.SCHED_OTHER
     assert len(policies) == 5
+    assert limits == [(resource.RLIMIT_RTPRIO, (0, 0))]  # nor can what it starts take it
 
 
 class Libc:
@@ -158,6 +164,7 @@ def test_the_error_of_unix_time_is_the_kernel_s_in_microseconds(monkeypatch, max
 @pytest.mark.parametrize("collecting", [True, False])
 def test_a_loop_leaves_the_collector_and_the_threads_turns_as_they_were(monkeypatch, collecting):
     monkeypatch.setattr(scheduling, "raise_priority", lambda: "normal")
+    monkeypatch.setattr(scheduling.gc, "collect", lambda: 0)  # of all that tests hold
     before_s = sys.getswitchinterval()
     was_collecting = gc.isenabled()
     try:

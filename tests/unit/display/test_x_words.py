@@ -172,23 +172,26 @@ def test_errors_of_windows_drawables_and_extensions_are_the_windows_end(code, en
     assert is_end_of_window(code) is ends
 
 
-# VESA DMT 1.13 and CEA-861: size, dot clock in Hz, a line's pixels, a frame's lines, and the refresh
+# VESA DMT 1.13, CEA-861 (1080i), and xorg's 320 x 240 of double scan: size, dot clock in Hz, a
+# line's pixels, a frame's lines, the flags of randr.h, and the refresh
 MODES = [
-    ((640, 480), 25_175_000, 800, 525, 59.940),
-    ((1920, 1080), 148_500_000, 2200, 1125, 60.000),
-    ((1920, 1200), 154_000_000, 2080, 1235, 59.950),
-    ((2560, 1440), 241_500_000, 2720, 1481, 59.951),
+    ((640, 480), 25_175_000, 800, 525, 0, 59.940),
+    ((1920, 1080), 148_500_000, 2200, 1125, 0, 60.000),
+    ((1920, 1200), 154_000_000, 2080, 1235, 0, 59.950),
+    ((2560, 1440), 241_500_000, 2720, 1481, 0, 59.951),
+    ((1920, 1080), 74_250_000, 2200, 1125, 0x10, 60.000),  # 1080i, fields
+    ((320, 240), 12_587_500, 400, 262, 0x20, 60.055),  # half of 640 x 480, each line twice
 ]
 
 
-@pytest.mark.parametrize(("size", "dot_clock", "h_total", "v_total", "refresh_hz"), MODES)
+@pytest.mark.parametrize(("size", "dot_clock", "h_total", "v_total", "flags", "refresh_hz"), MODES)
 def test_a_modes_refresh_is_its_dot_clock_over_all_of_its_pixels(
-    size, dot_clock, h_total, v_total, refresh_hz
+    size, dot_clock, h_total, v_total, flags, refresh_hz
 ):
     width, height = size
     # XRRModeInfo: begin, end and total of a line, its skew, begin, end and total of a frame
     sync = (width + 16, width + 60, h_total, 0, height + 3, height + 8, v_total)
-    mode = ModeInfo(1, width, height, dot_clock, (ctypes.c_uint * 7)(*sync))
+    mode = ModeInfo(1, width, height, dot_clock, (ctypes.c_uint * 7)(*sync), flags=flags)
     assert refresh_hz_of(mode) == pytest.approx(refresh_hz, abs=0.0006)  # three decimals
     assert refresh_hz_of(ModeInfo(1, width, height, dot_clock)) == 0.0
 

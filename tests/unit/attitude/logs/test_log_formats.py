@@ -15,7 +15,7 @@ from hilstar.attitude.logs import log_formats as formats
 from hilstar.attitude.logs.log_file import open_log, read_log, write_log
 from hilstar.basics import reading
 from hilstar.basics.errors import InputError, MachineError
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import run_hilstar_here, typed
 
 PYPROJECT = Path(hilstar.__file__).parents[1] / "pyproject.toml"
 OWN_NAMES = {
@@ -187,14 +187,7 @@ def test_the_way_to_bring_a_log_of_px4_gives_the_place_of_astropy(tmp_path):
     path.write_text(
         "t_s,qw,qx,qy,qz\n0.998,0.9553365,0.0,0.0,0.29552022\n1.098,0.9553365,0.0,0.0,0.29552022\n"
     )
-    stated = (
-        "--convention",
-        "frame=body,direction=cam_to_icrs",
-        "--reference",
-        "ned",
-        "--place",
-        "47,8,0",
-    )
+    stated = typed("--convention frame=body,direction=cam_to_icrs --reference ned --place 47,8,0")
     result = run_hilstar_here("attitude", path, *stated, "--epoch-utc", "2024-06-01T22:00:00")
     assert "RA 48.6736, Dec -47.0910, roll 304.52" in result.stdout, result.stderr
 

@@ -14,11 +14,18 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
-from hilstar.instruments.assess.assessment import Assessment, AssessSettings, assess_files
+from hilstar.instruments.assess.assessment import (
+    Assessment,
+    AssessSettings,
+    assess_files,
+    read_answers,
+)
 from hilstar.instruments.assess.further import END, rate_notes
 from hilstar.instruments.assess.star_figures import StarTable, star_figure, without_turns
+from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.star_light import bench_stars
+from hilstar.server.record.ledger_records import AnswerRecord
 from tests.support.benches import bench_text
 from tests.support.planted_run import write_ledger
 from tests.support.planted_tracker import attitude, scalar_first
@@ -184,3 +191,22 @@ def test_a_turn_that_all_stars_share_is_not_a_stars_noise(rng: np.random.Generat
     # of 8000 places a sigma is known to 0.8 %; four times that
     assert figure.value == pytest.approx(STAR_NOISE_PX, rel=0.032)
     assert figure.low <= STAR_NOISE_PX <= figure.high
+
+
+def test_a_ledger_s_own_answers_have_rates_and_stars(tmp_path: Path) -> None:
+    """Of two answers the first has neither."""
+    frames_s = np.arange(0.0, 2.0, 0.5)
+    frames_q = scalar_first(attitude(motion, frames_s))
+    q = tuple(frames_q[0].tolist())
+    plain = AnswerRecord(host_ns=1, raw="", t_ns=1, q=q, verdict="right")
+    whole = AnswerRecord(
+        host_ns=2, raw="", t_ns=2, q=q, verdict="right", rate=(0.1, 0.2, 0.3),
+        centroids=((1.0, 2.0, None, 26311),),
+    )  # fmt: skip
+    path = tmp_path / "run.mcap"
+    write_ledger(path, frames_s, frames_q, start_ns=0, records=[plain, whole])
+    told = read_answers(path, "middle")
+    assert told.telemetry.rate_cam_rad_s is not None
+    assert np.isnan(told.telemetry.rate_cam_rad_s[0]).all()
+    assert told.telemetry.rate_cam_rad_s[1].tolist() == [0.1, 0.2, 0.3]
+    assert list(told.centroids) == [[], [ReportedStar(1.0, 2.0, None, 26311)]]

@@ -172,4 +172,4 @@ def test_a_verdict_s_words_say_the_limit_the_figure_and_what_would_decide():
     assert missed.margin < 0
     open_ = found(cases, "availability", minimum=0.83)
     assert open_.verdict == NOT_SHOWN
-    assert f"about {open_.more} more cases would show it" in open_.words
+    assert f"about {open_.more} more cases would decide" in open_.words

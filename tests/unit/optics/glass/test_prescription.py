@@ -22,7 +22,7 @@ from hilstar.optics.glass.lens_data import FieldPoint
 from hilstar.optics.glass.psf_file import Glass, read_glass
 from hilstar.optics.glass.zemax_file import read_zemax
 from hilstar.server.bench.bench_file import read_bench_file
-from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here, typed
 from tests.support.lenses import SCHOTT, focal_length_mm, lit_share, rms_radius_um, seq, zmx
 from tests.support.refusals import refusal
 
@@ -201,18 +201,9 @@ def test_a_tilted_lens_is_what_rays_by_snell_s_law_are(tmp_path, monkeypatch):
     pytest.importorskip("optiland", reason=WHY_SKIPPED)
     monkeypatch.setattr(prescription, "POINTS", 3)
     monkeypatch.setattr(prescription, "GEOMETRIC_RAYS", 120)
-    options = [
-        "--pitch-um",
-        10,
-        "--resolution",
-        "401,301",
-        "--half-px",
-        60,
-        "--oversampling",
-        2,
-        "--focuses-um",
-        "-40,40",
-    ]
+    options = typed(
+        "--pitch-um 10 --resolution 401,301 --half-px 60 --oversampling 2 --focuses-um -40,40"
+    )
     result = run_hilstar_here(
         "optics", "lens", zemax(tmp_path), "-o", tmp_path / "psf.fits", *options
     )

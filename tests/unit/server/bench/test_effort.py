@@ -40,7 +40,7 @@ from hilstar.server.bench.least_psf import Choice
 from hilstar.server.bench.scene import turning_of
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.benches import SMALL_BENCH, bench_text
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import run_hilstar_here, typed
 
 SIGMA = (0.85, 0.85)
 ORION = from_radec_roll_deg(84, -1, 0)
@@ -365,15 +365,7 @@ def test_stars_that_show_nothing_are_null_in_json(bench_with):
 
 def test_explain_has_the_effort_in_its_json(tmp_path, small_bench_file):
     small_bench_file.write_text(small_bench_file.read_text() + '[render]\neffort = "auto"\n')
-    words = (
-        "frame",
-        small_bench_file,
-        "--radec",
-        "84,-1,0",
-        "--truth",
-        tmp_path / "t.csv",
-        "--json",
-    )
+    words = typed(f"frame {small_bench_file} --radec 84,-1,0 --truth {tmp_path}/t.csv --json")
     result = run_hilstar_here(*words, "--explain")
     assert result.returncode == 0, result.stderr
     assert "part " in result.stderr and "together" in result.stderr

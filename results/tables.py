@@ -55,6 +55,7 @@ BENCH_OUTCOMES = (
     "traceback",
 )
 MAX_BENCH_SIGMAS = 4.0
+CLAUSES = "clauses, "  # what the kinds of intervals.csv begin with that are of clauses
 
 
 def rows_of(name: str) -> list[dict[str, str]]:
@@ -531,10 +532,30 @@ def intervals_table() -> str:
     """How often intervals of calibrations and assessments held the truth, by figure."""
     body = []
     for row in rows_of("intervals.csv"):
-        held, low, high = (float(row[f"{name}_percent"]) for name in ("held", "low", "high"))
-        share = f"{held:.1f} % ({low:.0f} to {high:.0f})"
-        body.append([f"`{row['kind']}`", row["figure"], row["trials"], share])
+        if not row["kind"].startswith(CLAUSES):
+            body.append([f"`{row['kind']}`", row["figure"], row["trials"], share_held(row)])
     return table(["by", "interval of", "trials", "held the truth"], body)
+
+
+def clause_intervals_table() -> str:
+    """How often the intervals of clauses held the truth, by quantity and what makes it hard."""
+    shares: dict[str, dict[str, str]] = {}
+    heads: dict[str, str] = {}
+    for row in rows_of("intervals.csv"):
+        if row["kind"].startswith(CLAUSES):
+            kind = row["kind"].removeprefix(CLAUSES)
+            heads[kind] = f"{kind} ({row['trials']} trials)"
+            shares.setdefault(row["figure"], {})[kind] = share_held(row)
+    body = []
+    for quantity, by_kind in shares.items():
+        body.append([f"`{quantity}`", *(by_kind.get(kind, "") for kind in heads)])
+    return table(["quantity", *heads.values()], body)
+
+
+def share_held(row: dict[str, str]) -> str:
+    """The share of a row's intervals that held, with its interval."""
+    held, low, high = (float(row[f"{name}_percent"]) for name in ("held", "low", "high"))
+    return f"{held:.1f} % ({low:.0f} to {high:.0f})"
 
 
 BESIDE = ("galsim", "astrometry", "lost", "basilisk", "pyxel", "satsim", "stellarium")
@@ -652,6 +673,7 @@ TABLES = {
     "answers": answers_table,
     "certify": certify_table,
     "intervals": intervals_table,
+    "clause_intervals": clause_intervals_table,
     "colour": colour_table,
     "colour_gamut": gamut_table,
     "colour_red": red_table,

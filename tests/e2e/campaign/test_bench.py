@@ -62,9 +62,9 @@ def answering(planted: Planted) -> Iterator[subprocess.Popen[str]]:
 def test_the_planted_budget_of_500_cases_is_found_and_wild_answers_are_named(
     tmp_path: Path,
 ) -> None:
-    planted = replace(
-        write_bench(tmp_path, cases=500, check_every=100), drift_arcsec_s=0.02, dim_mag_s=0.002
-    )
+    bench = write_bench(tmp_path, cases=500, check_every=100)
+    # of 500 answers a hundredth is none once in 150 runs, three hundredths once in 4 million
+    planted = replace(bench, drift_arcsec_s=0.02, dim_mag_s=0.002, wild=0.03)
     with answering(planted) as tracker:
         result = run_hilstar_here(*COMMAND, cwd=tmp_path)
         assert result.returncode == 0, result.stderr

@@ -62,12 +62,13 @@ class Sizes:
     drift_ppm: float = 20.0
     offset_s: float = 0.0
     wild: int = 40
+    slow: float = 0.0  # of a change in time, as by warmth: up to a whole wave in the run
 
 
 @dataclass(frozen=True)
 class Planted:
     """A run and a tracker's telemetry, and what was planted in it; `fov` (3,) is the rms that
-    came of it.
+    came of it, and `slow` (3,) that of the change in time.
     """
 
     frames_s: FloatArray
@@ -77,6 +78,7 @@ class Planted:
     wild: IntArray
     bias: FloatArray
     fov: FloatArray
+    slow: FloatArray
 
 
 def star_px(rotation: Rotation, q_at: Rotation) -> FloatArray:
@@ -119,6 +121,13 @@ def waves(place_px: FloatArray) -> FloatArray:
     return np.sqrt(2 / 1.09) * np.stack(parts, axis=1)
 
 
+def slow_change(share: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """A change (n, 3) of rms about 1 over shares (n,) of a run: a half to a whole wave an axis."""
+    turns = rng.uniform(0.5, 1.0, 3)
+    phase = rng.uniform(0, 2 * np.pi, 3)
+    return np.sqrt(2) * np.sin(2 * np.pi * turns * share[:, None] + phase)
+
+
 def plant(
     motion: Motion,
     sizes: Sizes,
@@ -147,6 +156,10 @@ def plant(
             + sizes.noise * rng.normal(size=of_field.shape)
         )
     )
+    slow = np.zeros_like(error)
+    if sizes.slow:
+        slow = sizes.slow * scale * slow_change(t_s / seconds, rng)
+    error = error + slow
     reported = scalar_first(Rotation.from_rotvec(error / ARCSEC_PER_RAD) * true)
     wild = np.sort(rng.choice(len(t_s), sizes.wild, replace=False))
     reported[wild] = (
@@ -157,4 +170,5 @@ def plant(
     reported *= rng.choice([-1.0, 1.0], len(t_s))[:, None]
     tau_s = t_s * (1 + 1e-6 * sizes.drift_ppm) + sizes.offset_s
     frames_q = scalar_first(attitude(motion, frames_s))
-    return Planted(frames_s, frames_q, tau_s, reported, wild, bias, of_field.std(axis=0))
+    rms = of_field.std(axis=0), slow.std(axis=0)
+    return Planted(frames_s, frames_q, tau_s, reported, wild, bias, *rms)

@@ -11,7 +11,7 @@ PAGES = sorted(
     [
         *ROOT.glob("docs/*.md"),
         *ROOT.glob("*.md"),
-        *ROOT.glob("*/README.md"),
+        *ROOT.glob("[!.]*/README.md"),
         *ROOT.glob("configs/*.md"),
     ]
 )

@@ -52,7 +52,7 @@ MEANT = "84.057,-1.2,0, with commas and without spaces"
             "write --slew 0,1,0",
         ),
     ],
-    ids=lambda value: " ".join(value)[-40:] if isinstance(value, list) else None,
+    ids=lambda value: " ".join(value).replace(BENCH, "BENCH") if isinstance(value, list) else None,
 )
 def test_a_wrong_word_is_answered_with_the_right_one(words, said, tmp_path):
     assert_refused(run_hilstar_here(*words, cwd=tmp_path), 2, said)

@@ -42,6 +42,7 @@ from hilstar.instruments.campaign.store import Row
 from hilstar.instruments.campaign.tally import CaseTally
 from hilstar.instruments.simulate.pictures import write_exposure_fits
 from hilstar.instruments.simulate.simulator import FrameNoise, Simulator
+from hilstar.optics.frame_motion import CameraTurn
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 
 IMAGES = "images"
@@ -124,10 +125,15 @@ class Session:
         exposure_s = tracker.config.tracker.exposure_s
         length_s = (self.plan.frames - 1) * self.plan.step_s + exposure_s
         fault_end_s = self.maker.fault_end_s(case, length_s)
+
+        def commanded(seconds: float) -> CameraTurn:
+            # along a log the rate is the mean over the exposure
+            return self.maker.after(case, round(seconds * NS_PER_S), exposure_s).turn
+
         tally = CaseTally(
             "stars" in self.columns,
             self.plan.wrong_above_arcsec,
-            lambda seconds: self.maker.after(case, round(seconds * NS_PER_S)).turn,
+            commanded,
             fault_end_s,
             further=self.plan.columns,
         )

@@ -14,7 +14,7 @@ from astropy.io import fits
 from astropy.time import Time
 from scipy.spatial.transform import Rotation
 
-from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.instruments.campaign.cases import CaseMaker
 from hilstar.instruments.campaign.job import Job, files_sha256
 from hilstar.instruments.campaign.plan import Design, parse_plan
@@ -296,3 +296,33 @@ def test_stray_light_is_even_and_in_every_exposure(tmp_path: Path) -> None:
             # a glow of 80 degrees falls by 0.2 % to the corners, 3.4 degrees off
             assert corners_e == pytest.approx(wanted_e, rel=0.005)
     this.close()
+
+
+def test_frames_along_a_log_have_the_log_s_rate(tmp_path: Path) -> None:
+    """The commanded rate, of which a reported one's errors are counted, is the mean over the
+    exposure.
+    """
+    rate_deg_s = np.array([0.1, -0.05, 0.4])
+    begin = from_radec_roll_deg(84.0, 0.0, 0.0)
+    rows = []
+    for k in range(11):
+        w, x, y, z = propagate(begin, np.radians(rate_deg_s), 0.2 * k).tolist()
+        rows.append(f"{0.2 * k},{w},{x},{y},{z}")
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n" + "\n".join(rows) + "\n")
+    write_campaign(
+        tmp_path,
+        {"key": "tracker.psf_sigma_px", "minimum": 0.5, "maximum": 1.0},
+        attitudes={"kind": "log", "log": "log.csv"},
+        cases=2,
+        frames=2,
+        columns=["rate", "time"],
+    )
+    session = cases_session(tmp_path)
+    try:
+        for number, point in enumerate(points(session, 2)):
+            row = session.row(number, point)
+            for axis, axis_rate_deg_s in zip("xyz", rate_deg_s.tolist(), strict=True):
+                told = row[f"frame_rate_{axis}_deg_s"]
+                assert told == pytest.approx([axis_rate_deg_s] * 2, rel=1e-5)
+    finally:
+        session.close()

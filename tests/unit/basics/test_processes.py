@@ -161,6 +161,13 @@ def test_the_error_of_unix_time_is_the_kernel_s_in_microseconds(monkeypatch, max
     assert abs(found.offset_ns - (time.monotonic_ns() - time.time_ns())) < 10**9
 
 
+def test_the_time_asleep_is_what_one_clock_counts_and_the_other_does_not(monkeypatch):
+    """clock_gettime(2): CLOCK_BOOTTIME goes on while the machine sleeps, CLOCK_MONOTONIC stands."""
+    read_ns = {time.CLOCK_BOOTTIME: 90_000_000_007, time.CLOCK_MONOTONIC: 60_000_000_000}
+    monkeypatch.setattr(time, "clock_gettime_ns", read_ns.__getitem__)
+    assert HostClock().asleep_ns() == 30_000_000_007
+
+
 @pytest.mark.parametrize("collecting", [True, False])
 def test_a_loop_leaves_the_collector_and_the_threads_turns_as_they_were(monkeypatch, collecting):
     monkeypatch.setattr(scheduling, "raise_priority", lambda: "normal")

@@ -6,16 +6,15 @@ import pytest
 
 from hilstar.instruments.study import bodies
 from hilstar.instruments.study.bodies import PHASES_DEG, QUICK_BENCHES, QUICK_RADII_PX, SCENES
-from tests.support.studies import studied
 
 TABLES = ("bodies_cost", "bodies_size", "bodies_limits")  # and the charts of each
 
 
 @pytest.fixture(scope="module")
-def bodies_study(tmp_path_factory):
+def bodies_study(whole_study):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(bodies, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        return studied("bodies", tmp_path_factory, TABLES)
+        return whole_study("bodies", TABLES)
 
 
 def test_each_scene_is_timed_against_the_same_frame_without_bodies(bodies_study):

@@ -92,7 +92,7 @@ def scene_of(parts, number: int) -> SceneMeasurement:
 
 
 @pytest.fixture(scope="module")
-def chain_study(tmp_path_factory):
+def chain_study(tmp_path_factory, whole_study):
     """What the command prints of the small bench, and the folder of its files."""
     folder = tmp_path_factory.mktemp("chain")
     (folder / "bench.toml").write_text(SMALL)

@@ -10,16 +10,15 @@ from hilstar.instruments.study import colour
 from hilstar.instruments.study.colour import MONO, PANELS, PUBLISHED_SUBTYPES, SENSORS
 from tests.support.claims import holds
 from tests.support.recorded import assert_recorded
-from tests.support.studies import studied
 
 AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
+def study(whole_study):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(colour, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        found = studied("colour", tmp_path_factory, {"colour"})
+        found = whole_study("colour", {"colour"})
     return found.folder, found.rows
 
 

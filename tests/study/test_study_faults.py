@@ -8,14 +8,13 @@ import pytest
 
 from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS
 from hilstar.optics.layers.fault_kinds import KINDS
-from tests.support.studies import studied
 
 pytestmark = pytest.mark.study
 
 
 @pytest.fixture(scope="module")
-def faults_study(tmp_path_factory):
-    return studied("faults", tmp_path_factory, {"faults", "faults_cost"})
+def faults_study(whole_study):
+    return whole_study("faults", {"faults", "faults_cost"})
 
 
 def test_every_kind_but_a_dropped_frame_has_its_cost(faults_study):

@@ -13,7 +13,6 @@ from hilstar.instruments.study import limits
 from hilstar.instruments.study.limits import StressLimit, limits_finding
 from tests.support.benches import ROOT
 from tests.support.recorded import assert_recorded
-from tests.support.studies import studied
 from tests.support.tables import csv_rows
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
@@ -24,8 +23,8 @@ HALF_SAMPLE = 0.5
 
 
 @pytest.fixture(scope="module")
-def limits_study(tmp_path_factory):
-    found = studied("limits", tmp_path_factory, {"limits"})
+def limits_study(whole_study):
+    found = whole_study("limits", {"limits"})
     return found.folder, found.findings, found.rows("limits")
 
 

@@ -24,7 +24,6 @@ from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
-from tests.support.studies import studied
 from tests.support.tables import csv_rows
 from tests.support.waiting import PATIENCE_S
 
@@ -65,8 +64,8 @@ TABLE_MAG_LIMIT = 2e-6
 
 
 @pytest.fixture(scope="module")
-def models_study(tmp_path_factory):
-    found = studied("models", tmp_path_factory, STEMS, "")
+def models_study(whole_study):
+    found = whole_study("models", STEMS, "")
     return found.folder, dict(line.split(": ", 1) for line in found.findings)
 
 

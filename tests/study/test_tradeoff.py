@@ -33,7 +33,6 @@ from hilstar.optics.psf import MAX_CUT
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
-from tests.support.studies import studied
 
 NAMES = [
     "brightness",
@@ -56,12 +55,12 @@ PROFILE_SHARE = 2e-7
 
 
 @pytest.fixture(scope="module")
-def tradeoff_study(tmp_path_factory):
+def tradeoff_study(whole_study):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)  # one round: no claim here is of a time
         patch.setattr(sweep, "MIN_ROUNDS", 1)
         charts = {f"tradeoff_{name}" for name in NAMES}
-        found = studied("tradeoff", tmp_path_factory, charts)
+        found = whole_study("tradeoff", charts)
     rows = found.rows("tradeoff")
     return (
         found.folder,

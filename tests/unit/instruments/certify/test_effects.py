@@ -14,7 +14,7 @@ from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.certify.effects import Effect
 from hilstar.instruments.certify.model import Deviations, Figures, ReferenceStar
-from hilstar.instruments.certify.read_effects import _of_delays
+from hilstar.instruments.certify.read_effects import _of_delays, _places_in
 from hilstar.instruments.certify.stated_effects import (
     DRIFTS,
     of_drift,
@@ -316,3 +316,19 @@ def test_dimmer_levels_and_places_add_up_in_magnitudes_and_late_light_lags(tmp_p
         assert figure["place_along", star, "arcsec"] == pytest.approx(-0.5 * 3600 * 0.002)
         assert figure["place_across", star, "arcsec"] == 0.0
     assert figure["latency", 0, "ms"] == pytest.approx(9.5)
+
+
+@pytest.mark.parametrize("square", [(100, 40, 1), (100, 40, 2), (1500, 7, 301)])
+def test_places_in_a_square_are_even_over_its_pixels(square):
+    """From the first pixel's outer edge to the last one's: pixel k reaches from k - 0.5 to
+    k + 0.5, so that the mean place and its variance are those of an even square.
+    """
+    left, top, side = square
+    x_px, y_px = _places_in(square)
+    for places_px, first in ((x_px, left), (y_px, top)):
+        assert places_px.mean() == pytest.approx(first + (side - 1) / 2, abs=1e-9)
+        assert first - 0.5 < places_px.min() and places_px.max() < first + side - 0.5
+    # of n even steps over a side: side^2 / 12 less 1 / n^2 of it
+    steps = math.isqrt(len(x_px))
+    assert x_px.var() == pytest.approx(side**2 / 12 * (1 - 1 / steps**2), rel=1e-9)
+    assert (x_px @ y_px) / len(x_px) == pytest.approx(x_px.mean() * y_px.mean())

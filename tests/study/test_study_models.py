@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from astropy.wcs import WCS
 from PIL import Image
+from scipy import constants
 
 from hilstar.basics.charts import TITLE_COLUMNS, title_lines
 from hilstar.instruments.study.models import (
@@ -19,6 +20,7 @@ from hilstar.instruments.study.models import (
     zero_points,
 )
 from hilstar.instruments.study.rapp import rapp_ratios
+from hilstar.instruments.study.sky_figures import star_density
 from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
@@ -471,3 +473,35 @@ def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(models_study):
         assert means[0] == pytest.approx(means[1], rel=2e-3)
         shape = table["blackbody"] / planck(table["wavelength_nm"], kelvin)
         assert shape == pytest.approx(shape[0], rel=1e-6)
+
+
+def test_the_bolometric_zero_point_has_a_quarter_fewer_electrons_than_vega(tmp_path, figures):
+    """A magnitude of 0 is 2.518021e-8 W/m2 (IAU 2015, resolution B2), of which a black body of
+    9602 K has the share of Planck's law at V's 551 nm, in place of Vega's 3.631e-2 W/m2/m.
+    """
+    peak = constants.h * constants.c / (551e-9 * constants.k * REFERENCE_K)
+    exitance = 2 * np.pi * constants.h * constants.c**2 / 551e-9**5 / np.expm1(peak)
+    share = exitance / (constants.sigma * REFERENCE_K**4)
+    fainter_mag = -2.5 * np.log10(2.518021e-8 * share / 3.631e-2)
+    text = zero_points(tmp_path).text
+    percent, mag = re.search(r"(\d+) % \((\S+) mag\) fewer", text).groups()
+    # V is 90 nm wide, over which the spectrum is bent: 0.02 mag
+    assert float(mag) == pytest.approx(fainter_mag, abs=0.02)
+    assert float(percent) == pytest.approx(100 * (1 - 10 ** (-0.4 * float(mag))), abs=1)
+    assert len(figures) == 1
+
+
+def test_a_cell_of_the_map_stands_at_its_middle_and_has_its_stars(tmp_path, figures):
+    star_density(tmp_path)
+    catalog = load_catalog()
+    rows = csv_rows(tmp_path / "star_density.csv")
+    assert len(rows) == 36 * 18 and len(figures) == 1
+    sky_deg2 = 4 * np.pi * np.degrees(1) ** 2
+    height = np.sin(np.radians(catalog.dec_deg))
+    for row in rows[:: len(rows) // 12]:
+        across = np.abs(catalog.ra_deg - float(row["ra_deg"])) < 5
+        middle = np.sin(np.radians(float(row["dec_deg"])))
+        inside = across & (np.abs(height - middle) < 1 / 18)
+        density = inside.sum() / (sky_deg2 / len(rows))
+        # a star or two stand on an edge to within a rounding
+        assert float(row["stars_deg2"]) == pytest.approx(density, abs=2 * len(rows) / sky_deg2)

@@ -25,3 +25,11 @@ def test_one_lit_pixel_is_the_middle_of_its_light(size):
     column, row = face.image.places_px(face.middle)
     assert (column, row) == pytest.approx((5.0, 1.0), abs=ROUNDING_PX)
     assert math.acos(face.cos_radius) == pytest.approx(3 * CELL_PX * PX_RAD, rel=1e-6)
+
+
+def test_no_pixel_has_a_direction_beside_or_behind_the_plane():
+    ahead = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.3, 0.2, -1.0]])
+    image = TangentImage(np.zeros((5, 5), dtype=np.float32), np.eye(3), 100.0)
+    columns, rows = image.places_px(ahead)
+    assert (columns[0], rows[0]) == (2.0, 2.0)
+    assert np.isnan([columns[1:], rows[1:]]).all()

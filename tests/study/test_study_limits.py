@@ -9,11 +9,12 @@ import math
 import numpy as np
 import pytest
 
+from hilstar.basics.rotation import propagate
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.study import limits
 from hilstar.instruments.study.limits import StressLimit, limits_finding
 from tests.support.benches import ROOT
 from tests.support.recorded import assert_recorded
-from tests.support.studies import studied
 from tests.support.tables import csv_rows
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
@@ -24,8 +25,8 @@ HALF_SAMPLE = 0.5
 
 
 @pytest.fixture(scope="module")
-def limits_study(tmp_path_factory):
-    found = studied("limits", tmp_path_factory, {"limits"})
+def limits_study(whole_study):
+    found = whole_study("limits", {"limits"})
     return found.folder, found.findings, found.rows("limits")
 
 
@@ -109,3 +110,28 @@ def test_a_crossing_is_found_between_points_and_none_is_said_as_such():
     assert limits_finding([crossing, limit_of([0.0, 0.0, 0.0])]).startswith(
         "1 of 2 methods of hilstar leave their tolerance"
     )
+
+
+@pytest.mark.parametrize("power", [2, 3])
+def test_a_turn_is_foretold_along_a_straight_line_from_the_newest_packet(power):
+    """Of a turn a t^n the line from a packet at t0 is off by a (t^n - t0^n - n t0^(n-1) (t - t0));
+    packets come at 10 Hz, frames at 60 Hz from 1 s on.
+    """
+    size_rad = 1e-3
+
+    def attitude(t_ns: int) -> np.ndarray:
+        return propagate(limits.ORION, limits.Z, size_rad * (t_ns / NS_PER_S) ** power)
+
+    frames = np.arange(round(limits.SPAN_S * limits.REFRESH_HZ))
+    t = 1 + frames / limits.REFRESH_HZ
+    newest = 1 + frames // 6 / 10
+    line = newest**power + power * newest ** (power - 1) * (t - newest)
+    rms_arcsec = np.sqrt(np.mean((t**power - line) ** 2)) * size_rad * ARCSEC_PER_RAD
+    found_arcsec = limits.predicted_rms_arcsec(attitude, 10.0, 0.0)
+    # rates are differences over a millisecond at the most, and times whole ns: 1e-6 of the turn
+    assert found_arcsec == pytest.approx(rms_arcsec, rel=1e-5)
+    # a packet that is a period old is one that comes a period later
+    later = newest - 1 / 10
+    line = later**power + power * later ** (power - 1) * (t - later)
+    rms_arcsec = np.sqrt(np.mean((t**power - line) ** 2)) * size_rad * ARCSEC_PER_RAD
+    assert limits.predicted_rms_arcsec(attitude, 10.0, 100.0) == pytest.approx(rms_arcsec, rel=1e-5)

@@ -20,7 +20,7 @@ from hilstar.display.calibration import (
 )
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.response import gamma_response, srgb_response
-from hilstar.instruments.calibrate.first_light.context import StepContext
+from hilstar.instruments.calibrate.first_light.context import StepContext, darker_code
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
 from hilstar.instruments.calibrate.first_light.photometer import (
     Assumed,
@@ -190,6 +190,33 @@ def test_without_an_image_of_a_monitor_that_is_off_black_is_the_bench_files(tmp_
     found = read_patches(tmp_path, Camera(srgb_response(10).light, 20_000, unlit=False))
     assert not found.black_known
     assert found.light[0] == pytest.approx(0.0, abs=2.0)  # of 20 000: srgb has no black level
+
+
+def test_a_hot_pixel_of_the_dark_frame_makes_no_image_too_bright(tmp_path):
+    """It has 70 % of the range in the dark, and all of it with light: 0.8 of it is too bright."""
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
+    camera = Camera(srgb_response(10).light, 1.0)
+    context = StepContext(
+        read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path, camera, {}, {}, 96
+    )
+    dark = np.full((400, 400), FLOOR_DN)
+    dark[30, 40] = 0.7 * FULL_DN
+    lit = dark.copy()
+    lit[100, 200], lit[30, 40] = 0.75 * FULL_DN, 0.99 * FULL_DN
+    looked = context.looked(camera.save(tmp_path / "lit", lit), dark)
+    assert looked.raw_peak == pytest.approx(0.75 * FULL_DN, abs=0.5)  # as whole DN
+    assert looked.floor_dn == FLOOR_DN
+    assert not context.is_too_bright(looked)
+    lit[100, 200] = 0.85 * FULL_DN
+    assert context.is_too_bright(context.looked(camera.save(tmp_path / "lit", lit), dark))
+
+
+def test_a_darker_code_has_a_quarter_of_the_light_at_most_and_the_darkest_has_none():
+    """By a gamma of 2.2, as all monitors have about: the largest such code."""
+    for code in range(2, 1024):
+        lower = darker_code(code)
+        assert (lower / code) ** 2.2 <= 1 / 4 < ((lower + 1) / code) ** 2.2
+    assert "darkest code" in refusal(darker_code, 1)
 
 
 def test_a_plan_has_as_many_levels_as_its_patches_allow():

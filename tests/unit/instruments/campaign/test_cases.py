@@ -147,6 +147,30 @@ def test_the_display_shows_what_the_tracker_would_see_and_its_misalignment(tmp_p
     assert rows[0]["matched"] >= 5
 
 
+def test_a_misalignment_turns_a_mounting_that_is_turned_already_about_the_camera_s_own_axes(
+    tmp_path: Path,
+) -> None:
+    """Of a display on its side, what the camera's x axis turns is y and z of the camera, which are
+    others of the monitor.
+    """
+    write_campaign(tmp_path, {"key": "misalignment_arcsec.x", "values": [300.0]}, through="display")
+    path = tmp_path / "bench.toml"
+    mounting = Rotation.from_euler("z", 90, degrees=True)
+    x, y, z, w = mounting.as_quat().tolist()
+    path.write_text(
+        path.read_text().replace("[collimator]", f"[collimator]\nq_cam_to_mon = {[w, x, y, z]}")
+    )
+    plan = parse_plan(tmp_path / "plan.toml", (tmp_path / "plan.toml").read_text())
+    maker = CaseMaker(plan, read_bench_file(path), tmp_path)
+    file = maker.bench(maker.case(0, np.full(maker.attitude_dimensions + 1, 0.5)))
+    true = to_matrix(np.array(file.config.verify.true_q_cam_to_mon))
+    turn = np.radians(300 / 3600)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    # a rotation vector turns vectors by the right hand
+    about_x = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    assert true == pytest.approx(mounting.as_matrix() @ about_x, abs=1e-12)
+
+
 SCENARIO = """
 [[fault]]
 kind = "blank"

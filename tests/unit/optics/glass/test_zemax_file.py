@@ -25,7 +25,8 @@ def test_the_doublet_has_its_focal_length():
 
 
 @pytest.mark.parametrize(
-    ("unit", "mm"), [("MM", 1.0), ("IN", 25.4), ("CM", 10.0), ("METER", 1000.0), ("in", 25.4)]
+    ("unit", "mm"),
+    [("MM", 1.0), ("IN", 25.4), ("CM", 10.0), ("METER", 1000.0), ("M", 1000.0), ("in", 25.4)],
 )
 def test_units_are_scaled(unit, mm):
     """Lengths, curvatures, asphere terms and apertures of one lens are the same in every unit."""
@@ -145,10 +146,27 @@ def test_apertures_let_through_their_share(line, share):
     assert lit_share(read_zemax(zmx(more={1: [line]}))) == pytest.approx(share, abs=LIT_TOLERANCE)
 
 
-def test_a_moved_obstruction_is_moved():
-    lens = read_zemax(zmx(more={1: ["  OBSC 0 5 0", "  OBDC 12 0"]}))
+@pytest.mark.parametrize(
+    ("line", "centre_mm"),
+    [
+        ("  OBSC 0 5 0", (12.0, -3.0)),
+        ("  CLAP 0 5 0", (12.0, -3.0)),
+        ("  SQAP 5 5 0", (12.0, -3.0)),
+        ("  FLAP 0 5 0", (0.0, 0.0)),  # the surface's own edge
+    ],
+)
+def test_what_is_beside_the_vertex_is_there(line, centre_mm):
+    """Whether light passes changes at the edge, 5 mm from its centre to either side along x and
+    along y.
+    """
+    lens = read_zemax(zmx(more={1: [line, "  OBDC 12 -3"]}))
     (aperture,) = lens.surfaces[0].apertures
-    assert aperture.passes(0.0, 0.0) and not aperture.passes(9.0, 0.0)
+    within = aperture.passes(*centre_mm)
+    across = np.array([[-4.9, 4.9, 0, 0], [0, 0, -4.9, 4.9]])
+    x_mm, y_mm = np.array(centre_mm)[:, None] + across
+    assert (aperture.passes(x_mm, y_mm) == within).all()
+    x_mm, y_mm = np.array(centre_mm)[:, None] + across * (5.1 / 4.9)
+    assert (aperture.passes(x_mm, y_mm) != within).all()
 
 
 def test_the_editors_lists_behind_the_lens_are_passed_over():

@@ -1,8 +1,8 @@
 """Every chart that a study draws in these tests is looked at as it is saved, and saved as PNG
 alone.
 
-That a chart without an ending becomes a PNG and an SVG is held by test_study_charts.py; an SVG
-takes as long as its PNG.
+That a chart without an ending becomes a PNG and an SVG is held by tests/unit/basics/test_charts.py;
+an SVG takes as long as its PNG.
 """
 
 from __future__ import annotations

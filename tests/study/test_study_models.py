@@ -16,7 +16,6 @@ from hilstar.basics.charts import TITLE_COLUMNS, title_lines
 from hilstar.instruments.study.models import (
     choices_finding,
     running_percentiles,
-    torres2010_k,
     zero_points,
 )
 from hilstar.instruments.study.rapp import rapp_ratios
@@ -47,13 +46,6 @@ QUADRATURE_LIMIT = 1e-6
 HC_OVER_K_NM_K = 1.438776877e7
 REFERENCE_K = 9602.0
 BOLOMETRIC_MAG_LIMIT = 5e-4  # what three decimals of a magnitude hold
-
-# E. Mamajek's mean dwarf sequence, version 2022.04.16 (Pecaut & Mamajek 2013, ApJS 208, 9): B-V, K;
-# A0V, F0V, G2V, K0V, K5V.
-PECAUT_MAMAJEK = ((0.000, 9700), (0.295, 7220), (0.650, 5770), (0.816, 5270), (1.150, 4440))
-# Two calibrations of one quantity; the dwarfs' and giants' temperatures at one B-V differ by as
-# much. Measured: 2.2 %.
-SCALES_AGREE = 0.03
 
 # tests/authority/test_pickles.py holds the same: median and 95 % of the errors of held-out stars,
 # %, V-I < 2.5.
@@ -158,11 +150,6 @@ def test_rapp_is_one_where_both_models_are_the_same(models_study):
     assert rapp3[0] > 1.7
 
 
-def test_torres_gives_the_sun_its_temperature():
-    """B-V = 0.653 (Ramirez 2012): 5772 K (IAU 2015), within the relation's own 2 %."""
-    assert torres2010_k(np.array([0.653]))[0] == pytest.approx(5772, rel=0.02)
-
-
 def test_the_zero_points_differ_by_a_third_of_a_magnitude(models_study):
     table = table_columns(models_study[0] / "zero_points.csv")
     bolometric = [
@@ -216,11 +203,6 @@ def test_hot_stars_differ_as_the_thesis_says(models_study):
     assert off[0] == pytest.approx(0.15, abs=0.005)
     assert (np.diff(off) < 0).all()
     assert 0 < off[-1] < 0.05
-
-
-def test_torres_agrees_with_pecaut_and_mamajek():
-    bv_mag, kelvin = np.array(PECAUT_MAMAJEK).T
-    assert torres2010_k(bv_mag) == pytest.approx(kelvin, rel=SCALES_AGREE)
 
 
 def test_the_source_s_step_is_in_the_table(models_study):

@@ -45,6 +45,7 @@ from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
 from tests.support.refusals import refusal
+from tests.support.spectra import bump, write_channels, write_panel
 
 NO_TURN = np.array([1.0, 0.0, 0.0, 0.0])
 GEOMETRY = BenchGeometry(
@@ -367,17 +368,9 @@ def test_a_mosaic_before_a_coloured_panel_finds_the_response_of_each_primary(tmp
     """
     nm, powers = np.arange(400.0, 701.0, 10.0), {"r": 2.1, "g": 2.35, "b": 2.5}
     peaks = {"r": 620, "g": 540, "b": 460}
-    bumps = np.array([np.exp(-(((nm - peak) / 30) ** 2)) for peak in peaks.values()])
-    rows = "".join(
-        f"{at:g},{','.join(f'{x:.6f}' for x in three)}\n"
-        for at, three in zip(nm, bumps.T, strict=True)
-    )
-    (tmp_path / "panel.csv").write_text(f"wavelength_nm,r,g,b\n{rows}")
-    for name, one in zip(peaks, bumps, strict=True):
-        (tmp_path / f"{name}.csv").write_text(
-            "wavelength_nm,value\n"
-            + "".join(f"{a:g},{b:.6f}\n" for a, b in zip(nm, one, strict=True))
-        )
+    curves = {name: bump(peak, 30, nm) for name, peak in peaks.items()}
+    write_panel(tmp_path / "panel.csv", curves.values(), nm)
+    keys = write_channels(tmp_path, nm, curves)
     head = CalibrationHead(
         "photometric", "planted", "2026-11-22", "none", "relative", 8, "true-response.csv"
     )
@@ -387,9 +380,6 @@ def test_a_mosaic_before_a_coloured_panel_finds_the_response_of_each_primary(tmp
         for name, share in zip(powers, (0.3, 0.5, 0.2), strict=True)
     }
     write_calibration(tmp_path / "true-response.toml", head, columns, 0.0, NotesTable())
-    keys = {"quantum_efficiency": None} | {
-        f"quantum_efficiency_{name}": f"{name}.csv" for name in peaks
-    }
     bench = {
         "tracker": keys,
         "tracker.detector": {"bayer": "rggb", "gain_e_per_dn": 2.0, "bits": 16},

@@ -16,13 +16,13 @@ from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, Time
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.basics.rotation import propagate
 from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.compilers import STRICT, compiled
 from tests.support.servers import interrupted, listening
 from tests.support.waiting import PATIENCE_S
 from tests.support.wire.ptys import Cable
 
 EXAMPLES = ROOT / "examples"
 READ_S = 0.5  # until a busy machine has read what was sent
-STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic"]
 BAUD = 921_600
 CLOCK_OFFSET_S = 1000
 
@@ -36,21 +36,9 @@ def cable(tmp_path) -> Iterator[Cable]:
 @pytest.fixture(scope="module")
 def uart(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("serial") / "serial_sender"
-    command = [
-        "gcc",
-        "-std=c99",
-        "-D_POSIX_C_SOURCE=200809L",
-        "-O2",
-        *STRICT,
-        "-I",
-        ROOT / "firmware_protocol",
-    ]
-    command += [EXAMPLES / "serial_sender.c", "-lm", "-o", target]
-    result = subprocess.run(
-        command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert (result.returncode, result.stderr) == (0, "")
-    return target
+    compiler = ("gcc", "-std=c99", "-D_POSIX_C_SOURCE=200809L", "-O2", *STRICT)
+    header = ("-I", ROOT / "firmware_protocol")
+    return compiled(target, *compiler, *header, EXAMPLES / "serial_sender.c", "-lm")
 
 
 def sender_counts(output: str) -> dict[str, int]:

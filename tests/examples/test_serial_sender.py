@@ -22,7 +22,6 @@ from tests.support.waiting import PATIENCE_S
 from tests.support.wire.ptys import Cable
 
 EXAMPLES = ROOT / "examples"
-READ_S = 0.5  # until a busy machine has read what was sent
 BAUD = 921_600
 CLOCK_OFFSET_S = 1000
 
@@ -56,13 +55,14 @@ def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(
     )
     command = [str(uart), str(cable.sender), str(BAUD), "100", "1.5", "5", str(CLOCK_OFFSET_S)]
     with listening(bench_file, "reading serial:") as process:
+        process.shows()
         result = subprocess.run(
             command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
         )
         assert result.returncode == 0, result.stderr
-        time.sleep(READ_S)
+        counted = sender_counts(result.stdout)
+        process.has_received(counted["sent"])
         summary = interrupted(process)
-    counted = sender_counts(result.stdout)
     packets = summary["packets"]
     assert counted["sent"] == 150 == packets["received"] == packets["accepted"]
     assert packets["refused"] == 0

@@ -71,7 +71,7 @@ def test_a_bare_packet_is_named_whatever_came_on_the_line_before() -> None:
 @pytest.mark.parametrize("baud", [9600, 115_200])
 def test_a_line_s_time_is_that_of_its_first_bit(baud: int) -> None:
     """Ten bits a byte and the end of the line: a clock that stands says when the last has come."""
-    with line() as (master, name):
+    with serial_line() as (master, name):
         lines = read_lines(name, baud, 1.0, FakeClock(5 * NS_PER_S))
 
         def times_ns() -> dict[bytes, int]:

@@ -1,12 +1,8 @@
 """What is said of a serial line whose bytes are no packets."""
 
 import os
-import pty
 import time
-import tty
-from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 
 import pytest
 
@@ -19,27 +15,16 @@ from hilstar.basics.units import NS_PER_S
 from hilstar.server.open_link import first_attitude
 from tests.support.fake_clock import FakeClock
 from tests.support.senders import packet
+from tests.support.wire.ptys import serial_line
 
 BAUD = 115_200
 WITHIN_S = 20.0
 POLL_MS = 50
 
 
-@contextmanager
-def line() -> Iterator[tuple[int, str]]:
-    master, slave = pty.openpty()
-    tty.setraw(master)
-    tty.setraw(slave)
-    try:
-        yield master, os.ttyname(slave)
-    finally:
-        os.close(master)
-        os.close(slave)
-
-
 @pytest.mark.parametrize("kind", [SerialLink, SerialApart])
 def test_a_text_shorter_than_a_frame_is_told_as_text(kind: type[SerialLink]) -> None:
-    with line() as (master, name), kind(name, BAUD) as link:
+    with serial_line() as (master, name), kind(name, BAUD) as link:
         assert link.trouble == ""
         os.write(master, b"tick 12\r\n")
         end_s = time.monotonic() + WITHIN_S
@@ -50,7 +35,7 @@ def test_a_text_shorter_than_a_frame_is_told_as_text(kind: type[SerialLink]) -> 
 
 
 def test_the_wait_for_an_attitude_says_what_came_instead() -> None:
-    with line() as (master, name), SerialLink(name, BAUD) as link:
+    with serial_line() as (master, name), SerialLink(name, BAUD) as link:
         os.write(master, b"tick 12\r\n")
         with pytest.raises(InputError, match="text, 'tick 12") as refused:
             first_attitude(link, 0.5)
@@ -58,7 +43,7 @@ def test_the_wait_for_an_attitude_says_what_came_instead() -> None:
 
 
 def test_a_long_text_is_a_refused_message() -> None:
-    with line() as (master, name), SerialLink(name, BAUD) as link:
+    with serial_line() as (master, name), SerialLink(name, BAUD) as link:
         os.write(master, b"RA 84.057 Dec -1.200\r\n" * 20)
         with pytest.raises(InputError, match=r"no 0x00 within \d+ bytes: text, 'RA 84.057"):
             first_attitude(link, 0.5)
@@ -66,7 +51,7 @@ def test_a_long_text_is_a_refused_message() -> None:
 
 def test_a_silent_line_is_a_sender_that_did_not_start() -> None:
     with (
-        line() as (_, name),
+        serial_line() as (_, name),
         SerialLink(name, BAUD) as link,
         pytest.raises(InputError, match="start the sender"),
     ):
@@ -86,7 +71,7 @@ def test_a_bare_packet_is_named_whatever_came_on_the_line_before() -> None:
 @pytest.mark.parametrize("baud", [9600, 115_200])
 def test_a_line_s_time_is_that_of_its_first_bit(baud: int) -> None:
     """Ten bits a byte and the end of the line: a clock that stands says when the last has come."""
-    with line() as (master, name):
+    with serial_line() as (master, name):
         lines = read_lines(name, baud, 1.0, FakeClock(5 * NS_PER_S))
 
         def times_ns() -> dict[bytes, int]:

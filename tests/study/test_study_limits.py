@@ -8,6 +8,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from hilstar.basics.rotation import propagate
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
@@ -71,22 +72,45 @@ def test_the_limits_are_those_that_hilstar_tells_elsewhere(limits_study):
     vi_mag, off_mag, _, _ = limit_rows(rows, "V-I [mag]")
     assert (off_mag[vi_mag < RED_VI_MAG - 0.5] < RED_LIMIT_MAG).all()
     assert off_mag[vi_mag > RED_VI_MAG + 1.0].max() > 2 * RED_LIMIT_MAG
-    for stress in ("distance from the pole [deg]", "angle short of 90 deg [deg]"):
-        _, error, meets, tolerance = limit_rows(rows, stress)
-        assert math.isnan(meets) and (error < 1e-3 * tolerance).all()
-    # A turn's error over parted refreshes is f (1 - f) / 2 of a refresh over n + f refreshes
-    # (server/sync.py), to first order.
-    at, error, _, _ = limit_rows(rows, limits.TURN)
+
+
+@pytest.mark.parametrize("measured", [limits.poles, limits.wide_fields])
+def test_directions_and_attitudes_are_right_up_to_where_they_have_no_place(measured):
+    limit = measured()
+    assert math.isnan(limit.meets) and not limit.fails
+    assert (limit.error < 1e-3 * limit.tolerance).all()
+    assert limit.words.startswith("nowhere to ")
+
+
+def test_a_turn_over_parted_refreshes_is_off_by_their_part():
+    """By f (1 - f) / 2 of a refresh over n + f refreshes (server/sync.py), to first order."""
+    limit = limits.parted_refreshes()
     per_deg_s = 3600 / 60 * 0.3 * 0.7 / 2 / 6.3
-    assert error == pytest.approx(per_deg_s * at, rel=0.02)
+    assert limit.error == pytest.approx(per_deg_s * limit.at, rel=0.02)
+    assert limit.meets == pytest.approx(limits.TOLERANCE_ARCSEC / per_deg_s, rel=0.05)
 
 
-def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field(limits_study):
+def test_a_narrow_star_s_moment_is_drawn_to_the_middle_of_its_pixel():
+    """Of a star at p from a pixel's middle the pixels beside it have what lies beyond its edges:
+    their difference is the moment, where no light reaches further.
+    """
+    limit = limits.narrow_sprites()
+    phases_px = np.linspace(0, 0.5, 11)
+    for sigma_px, error_px in zip(limit.at[-6:], limit.error[-6:], strict=True):
+        beside = ndtr((phases_px - 0.5) / sigma_px) - ndtr(-(phases_px + 0.5) / sigma_px)
+        assert error_px == pytest.approx(np.abs(beside - phases_px).max(), abs=1e-6)
+    assert limit.error[0] < 1e-6
+    # the first harmonic of the pixels, exp(-2 pi^2 sigma^2) / pi, is most of a wider star's error
+    first_px = math.sqrt(-math.log(math.pi * limits.TOLERANCE_PX) / 2) / math.pi
+    assert limit.meets == pytest.approx(first_px, rel=0.02)
+
+
+def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field():
     """Along x the depth grows by x sin t, so a place x is off by x^2 t / f less what a rotation
     takes.
     """
-    _, _, rows = limits_study
-    at, error, _, _ = limit_rows(rows, limits.TILT)
+    limit = limits.tilted_screen()
+    at, error = limit.at, limit.error
     assert error[5] / at[5] == pytest.approx(error[0] / at[0], rel=0.01)
     widest_px = (959.5**2) * math.radians(at[0]) / (350e3 / 57.65)
     assert 0.1 * widest_px < error[0] < 0.6 * widest_px

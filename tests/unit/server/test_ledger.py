@@ -26,7 +26,6 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.cli.options import parse_split
-from hilstar.server.bench.config import AttitudeSettings
 from hilstar.server.record import ledger as ledger_module
 from hilstar.server.record.ledger import (
     MAX_WAITING_BYTES,
@@ -46,6 +45,7 @@ from hilstar.server.record.ledger_records import (
 )
 from hilstar.server.record.run_figures import RunFigures, figures_of, summarise
 from tests.support.full_disk import files_of_at_most
+from tests.support.ledgers import kept_bench
 from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
 
@@ -53,29 +53,9 @@ UNCERTIFIED = SimpleNamespace(certify=SimpleNamespace(certificate=None))
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-@pytest.fixture
-def kept_bench(small_bench_file):
-    return SimpleNamespace(
-        file=SimpleNamespace(
-            path=small_bench_file,
-            text=small_bench_file.read_text(),
-            sha256="0" * 64,
-            config=UNCERTIFIED,
-        ),
-        calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
-        output={},
-        renderer=SimpleNamespace(
-            gl_renderer="none",
-            gl_version="none",
-            path="NumPy",
-            target=SimpleNamespace(quantisation="exact"),
-        ),
-        config=SimpleNamespace(
-            render=SimpleNamespace(codes_ms=None),
-            attitude=AttitudeSettings(),
-            tracker=SimpleNamespace(q_body_to_cam=None),
-        ),
-    )
+@pytest.fixture(name="kept_bench")
+def bench_of_a_ledger(small_bench_file):
+    return kept_bench(small_bench_file)
 
 
 def keep(ledger: Ledger, first: int, last: int) -> None:

@@ -201,6 +201,23 @@ def test_a_scenario_is_varied_like_any_key_and_a_file_that_changes_is_another_ca
     assert files_sha256(this.plan, tmp_path) != before
 
 
+@pytest.mark.parametrize(("ends_s", "within"), [(0.55, True), (0.65, False)])
+def test_a_fault_that_ends_after_the_last_exposure_has_no_recovery(
+    tmp_path: Path, ends_s: float, within: bool
+) -> None:
+    """Three frames, 0.25 s apart, of 0.1 s: from the first one's begin to the last one's end are
+    0.6 s.
+    """
+    fault = SCENARIO.replace("at_s = 1.0", "at_s = 0.0").replace("for_s = 2.0", f"for_s = {ends_s}")
+    (tmp_path / "dark.toml").write_text(fault)
+    scenario = {"key": "scenario", "values": ["dark.toml"]}
+    write_campaign(tmp_path, scenario, cases=1, frames=3, step_s=0.25)
+    this = cases_session(tmp_path)
+    row = this.row(0, points(this, 1)[0])
+    this.close()
+    assert row["fault_end_s"] == (ends_s if within else None)
+
+
 def test_a_log_s_convention_and_mounting_are_the_bench_files(tmp_path: Path) -> None:
     """A body's attitude, sent from the body to the ICRS, scalar last: the case looks where the
     camera does.

@@ -152,6 +152,23 @@ def test_tiles_without_a_linear_image_have_its_levels(method, rng):
                 assert (gl.levels() == black).all()
 
 
+def test_levels_are_sure_by_the_pixels_that_need_the_least_and_the_most_light():
+    """Of an uneven panel black is sure below what lights the brightest one's first level, white above
+    what the dimmest one's needs.
+    """
+    uniformity = np.ones(SIZE[::-1], dtype=np.float32)
+    uniformity[3, 4], uniformity[5, 6] = 0.5, 1.25
+    sure = []
+    for each in (None, uniformity):
+        target = Target(SIZE, GaussianPsf(SIGMA), srgb_response(8), 1000.0, "round", each)
+        with Renderer(target) as gl:
+            sure.append(gl._sure(gl._by_pixel, None))
+    even, uneven = sure
+    assert even.white_e_per_s == 1000.0
+    assert uneven.dark_e_per_s == pytest.approx(0.5 * even.dark_e_per_s)
+    assert uneven.white_e_per_s == pytest.approx(1.25 * even.white_e_per_s)
+
+
 def test_most_of_a_full_field_is_linear_and_what_lies_beside_a_limb_is_not_drawn():
     whole = (0, 0, *SIZE)
     full = disc_tiles(SCENES["low orbit, full field"], whole)

@@ -182,6 +182,20 @@ def test_a_count_that_several_messages_have_is_one_sender_s(times):
     assert len(shown.arrivals) == 40 * times
 
 
+def test_counts_that_follow_no_other_are_shown_once_three_were_begun():
+    """A sender that writes anything for its count: its first message is shown at once, the next
+    two wait until the fourth, and no later one waits.
+    """
+    shown = Shown()
+    counts = np.random.default_rng(5).integers(U32, size=40).tolist()
+    waiting = []
+    for k, count in enumerate(counts):
+        shown.take(sample_message(count, HOST0_NS + k * PERIOD_NS))
+        waiting.append(k + 1 - len(shown.sequences))
+    assert waiting == [0, 1, 2] + [0] * 37
+    assert shown.sequences == counts and not shown.refused
+
+
 def test_uneven_times_are_one_sender_s_as_its_count_goes_on():
     """A sender on a busy machine: it stamps nothing for 80 ms, and then catches up at once."""
     shown, t_ns = Shown(), HOST0_NS

@@ -68,6 +68,13 @@ def test_the_rates_of_a_csv_name_the_unit_of_its_times(tmp_path, unit, unit_s, s
     assert "probably" not in rates, "one cause is named, not two"
 
 
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_a_csv_has_the_unit_that_its_column_s_name_states(tmp_path, unit):
+    path = tmp_path / "a.csv"
+    path.write_text(f"t_{unit},qw,qx,qy,qz\n0,1,0,0,0\n5,1,0,0,0\n")
+    assert open_log(path).conventions.time_unit == unit
+
+
 @pytest.mark.parametrize(("unit", "unit_s"), [("us", 1e-6), ("ms", 1e-3), ("100 ns", 1e-7)])
 def test_the_rates_of_json_lines_name_the_unit_of_their_times(tmp_path, unit, unit_s):
     said, _ = notices(log_in_units(tmp_path, "jsonl", unit_s, 0.02, rates=True))

@@ -86,11 +86,13 @@ def gaussians(x_px: np.ndarray, y_px: np.ndarray, light: np.ndarray) -> np.ndarr
 
 
 def moment_by_moment(
-    sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float
+    sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float, before: float = 0.5
 ) -> np.ndarray:
-    """The mean image, each moment from a pass of its own and an attitude of its own."""
+    """The mean image, each moment from a pass of its own and an attitude of its own; a share
+    `before` of the exposure is before the attitude.
+    """
     places, light = [], []
-    for seconds in ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5) * exposure_s:
+    for seconds in ((np.arange(MOMENTS) + 0.5) / MOMENTS - before) * exposure_s:
         seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns + round(seconds * 1e9))
         if seen is None:
             continue
@@ -135,9 +137,9 @@ def test_a_wide_satellite_has_the_light_of_all_its_moments_along_its_path(exposu
     seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).only(np.array([0]))
     q = looking_at(seen.directions(slice(None), np.zeros(1))[0])
     rate = np.radians((0.5, -1.0, 10.0))
-    lit = Lit(np.array([-exposure_s / 2]), exposure_s)
+    lit = Lit(np.array([-exposure_s / 8]), exposure_s)
     trail = disc_trail(seen, "wide", TrailView(CAMERA, to_matrix(q), rate), lit, BRUSH)
-    wanted = moment_by_moment(sky, t_ns, q, rate, exposure_s)
+    wanted = moment_by_moment(sky, t_ns, q, rate, exposure_s, 1 / 8)
     assert trail.electrons_per_s == pytest.approx(wanted.sum(), rel=1e-3)
     assert trail.shares.sum() == pytest.approx(1)
     assert len(trail.along) == len(trail.shares)

@@ -44,6 +44,8 @@ FLUX_LIMIT = 1e-5  # the midpoints of 400 moments, where the light changes; floa
 LIST = "OTHER\n" + element_set(7, (97.0, 252.0, 130.0, 322.0), 0.001, 15.0)
 NORTH = np.array([0.0, 0.0, 1.0])
 DISC_FLUX = 0.02  # a crescent by five rays across a pixel
+# of a crescent: the Sun's and the camera's aberration of 20 arcsec each, and a quadrature's share
+LAMBERT = 1e-3
 
 
 def looking_at(direction: np.ndarray) -> np.ndarray:
@@ -254,6 +256,27 @@ def test_the_sun_lights_a_satellite_s_disc_from_where_astropy_has_it():
     # from the satellite within 10 arcsec; the Sun's aberration of 20 arcsec is in theirs
     assert np.degrees(np.arccos(disc.sun @ sun / np.linalg.norm(sun))) < 0.01
     assert disc.radius_rad == pytest.approx(0.05 / disc.distance_km)
+
+
+def test_a_disc_s_brightest_pixel_is_its_own_light_over_the_disc():
+    """In a telescope, for an exposure in which it stands still. Of the light where the Sun is
+    overhead, a Lambert sphere's disc has 2 / (3 pi) (sin a + (pi - a) cos a) in the mean, a its
+    phase angle.
+    """
+    sky, t_ns = lit_moment(LIST, "norad,size_m\n7,100\n")
+    seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns)
+    direction = seen.directions(slice(None), np.zeros(1))[0]
+    telescope = Camera(SIZE_PX, 1e6, (79.5, 59.5), np.eye(3))
+    view = TrailView(telescope, to_matrix(looking_at(direction)), np.zeros(3))
+    exposure_s = 1e-6
+    trail = disc_trail(seen, "x", view, Lit(np.full(1, -exposure_s / 2), exposure_s), BRUSH)
+    radius_px = np.tan(trail.along[0].radius_rad) * telescope.focal_length_px
+    assert radius_px > 10
+    mean = trail.electrons_per_s / (np.pi * radius_px**2)
+    phase_rad = np.arccos(-trail.along[0].direction @ trail.along[0].sun)
+    lambert = np.sin(phase_rad) + (np.pi - phase_rad) * np.cos(phase_rad)
+    share = 2 / (3 * np.pi) * lambert
+    assert mean / trail.brightest_e_per_s == pytest.approx(share, rel=LAMBERT)
 
 
 class StraightPass:

@@ -50,7 +50,7 @@ def cosmic_rays_e(
     shape: tuple[int, int],
     exposure_s: float,
     rng: np.random.Generator,
-    pixel_pitch_um: float = DEFAULT_PITCH_UM,
+    pixel_pitch_um: float,
 ) -> FloatArray:
     """Electrons of one frame's cosmic rays, shape `shape`: straight tracks through RAY_DEPTH_UM of
     silicon.
@@ -195,7 +195,7 @@ class Detector:
         if settings.noise_version == 1:
             return self._expose_by_generator(light_e, exposure_s, rng)
         rays_e = None
-        if settings.cosmic_rays_per_cm2_s and exposure_s > 0:
+        if settings.cosmic_rays_per_cm2_s:
             rays_e = cosmic_rays_e(settings, self.shape, exposure_s, rng, self.pixel_pitch_um)
         codes = np.empty(self.shape, dtype=np.uint16)
         # charge spills over the whole frame: without blooming, parts need none of the others
@@ -242,7 +242,7 @@ class Detector:
         expected_e += self.dark_map_e_per_s * exposure_s
         self._check_largest(expected_e)
         collected_e = rng.poisson(expected_e).astype(np.float64)
-        if settings.cosmic_rays_per_cm2_s and exposure_s > 0:
+        if settings.cosmic_rays_per_cm2_s:
             collected_e += cosmic_rays_e(settings, self.shape, exposure_s, rng, self.pixel_pitch_um)
         well_e = self._fill_wells(collected_e)
         normal = None

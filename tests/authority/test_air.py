@@ -33,6 +33,7 @@ from hilstar.sky.stars import unit_vectors_icrs
 from tests.authority.integrals import integral, read
 from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
+from tests.support.spectra import write_curve
 
 BENCH = """[tracker]
 aperture_mm = 18.4
@@ -169,9 +170,7 @@ def test_extinction_is_that_of_each_stars_own_spectrum(masses: float):
 
 def test_extinction_of_a_black_body_is_its_integral(tmp_path):
     knots, mag = read_columns("extinction", 4)
-    (tmp_path / "k.csv").write_text(
-        "wavelength_nm,value\n" + "".join(f"{a},{b}\n" for a, b in zip(knots, mag, strict=True))
-    )
+    write_curve(tmp_path / "k.csv", knots, mag)
     file = site_bench(tmp_path, 'extinction = "k.csv"', 'spectrum = "blackbody"')
     nm, qe = read("ccd47-20")
     temperature_k = 7000.0

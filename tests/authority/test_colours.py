@@ -13,7 +13,7 @@ from hilstar import load
 from hilstar.optics.glass.psf_file import Stack, glass_of, write_glass
 from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
-from tests.unit.display.test_primaries import NM, PANELS, bump, written
+from tests.support.spectra import NM, PANELS, bump, channel_keys, write_curve, write_panel
 
 GRID_NM = np.arange(350.0, 1000.01, 0.5)
 SENSOR_NM = np.arange(350.0, 1001.0, 10.0)
@@ -50,26 +50,21 @@ LATERAL = 0.1  # of the sky's own, the issue's aim
 
 
 def saved(path, values):
-    rows = "\n".join(f"{nm:g},{value:.9f}" for nm, value in zip(SENSOR_NM, values, strict=True))
-    path.write_text(f"wavelength_nm,value\n{rows}\n")
-    return np.interp(GRID_NM, SENSOR_NM, values.round(9), left=0, right=0)
+    write_curve(path, SENSOR_NM, values)
+    return np.interp(GRID_NM, SENSOR_NM, values, left=0, right=0)
 
 
 def panel_bench(folder, panel, sensor, **render):
     """A bench of a panel and a sensor, and the sensor's curves (channels, n) on the grid."""
-    written(folder / "panel.csv", PANELS[panel])
-    names = (
-        {"quantum_efficiency": None}
-        if isinstance(sensor, dict)
-        else {"quantum_efficiency": "own.csv"}
-    )
+    write_panel(folder / "panel.csv", PANELS[panel])
     if isinstance(sensor, dict):
+        names = channel_keys(sensor)
         curves = [
             0.9 * saved(folder / f"{name}.csv", 0.9 * values) / 0.9
             for name, values in sensor.items()
         ]
-        names |= {f"quantum_efficiency_{name}": f"{name}.csv" for name in sensor}
     else:
+        names = {"quantum_efficiency": "own.csv"}
         curves = [saved(folder / "own.csv", 0.9 * sensor)]
     changes = {
         "tracker": names,

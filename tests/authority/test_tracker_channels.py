@@ -19,25 +19,26 @@ from hilstar.sky.spectrum import DATA_DIR, Curve, load_curve
 from tests.authority.integrals import read
 from tests.support.benches import ORION_Q, bench_text
 from tests.support.claims import holds
+from tests.support.spectra import bump, channel_keys, write_channels, write_curve
 
 NM = np.arange(350.0, 1051.0, 10.0)
 FINE_NM = np.arange(300.0, 1100.01, 0.25)
-
-
-def bump(middle_nm, width_nm):
-    return np.exp(-(((NM - middle_nm) / width_nm) ** 2))
 
 
 # Mosaics as data sheets draw them: narrow dyes behind an infrared cut; wide ones; dyes that all
 # pass the near infrared.
 CUT = 1 / (1 + np.exp((NM - 660) / 8))
 SENSORS = {
-    "cut": [0.75 * bump(600, 45) * CUT, 0.85 * bump(530, 45) * CUT, 0.7 * bump(460, 35) * CUT],
-    "wide": [0.6 * bump(620, 80), 0.7 * bump(540, 80), 0.6 * bump(460, 70)],
+    "cut": [
+        0.75 * bump(600, 45, NM) * CUT,
+        0.85 * bump(530, 45, NM) * CUT,
+        0.7 * bump(460, 35, NM) * CUT,
+    ],
+    "wide": [0.6 * bump(620, 80, NM), 0.7 * bump(540, 80, NM), 0.6 * bump(460, 70, NM)],
     "infrared": [
-        0.6 * bump(610, 50) + 0.3 * bump(850, 90),
-        0.7 * bump(535, 50) + 0.3 * bump(850, 80),
-        bump(460, 40) * 0.6 + 0.3 * bump(850, 75),
+        0.6 * bump(610, 50, NM) + 0.3 * bump(850, 90, NM),
+        0.7 * bump(535, 50, NM) + 0.3 * bump(850, 80, NM),
+        bump(460, 40, NM) * 0.6 + 0.3 * bump(850, 75, NM),
     ],
 }
 QUADRATURE = 1e-3  # asked for: 1 %; tables of rates are within 1e-6 of the Planck integral
@@ -47,29 +48,17 @@ BUDGET = 2e-3  # absolute: the library's own samples of 0.5 nm against interpola
 @pytest.fixture(scope="module", params=SENSORS)
 def sensor(request, tmp_path_factory):
     folder = tmp_path_factory.mktemp(request.param)
-    for name, value in zip("rgb", SENSORS[request.param], strict=True):
-        rows = "".join(f"{nm:g},{v:.6f}\n" for nm, v in zip(NM, value, strict=True))
-        (folder / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}")
-    rows = "".join(
-        f"{nm:g},{v:.6f}\n"
-        for nm, v in zip(NM, np.sum(SENSORS[request.param], axis=0) / 3, strict=True)
-    )
-    (folder / "mono.csv").write_text(f"wavelength_nm,value\n{rows}")
-    return folder, [
-        np.interp(FINE_NM, NM, value.round(6), left=0, right=0) for value in SENSORS[request.param]
-    ]
+    curves = SENSORS[request.param]
+    write_channels(folder, NM, dict(zip("rgb", curves, strict=True)))
+    write_curve(folder / "mono.csv", NM, np.sum(curves, axis=0) / 3)
+    return folder, [np.interp(FINE_NM, NM, value, left=0, right=0) for value in curves]
 
 
 def channel_bench(folder, mono, *changes):
-    keys = (
-        {"quantum_efficiency": "mono.csv"}
-        if mono
-        else {"quantum_efficiency": None, "quantum_efficiency_r": "r.csv"}
-    )
-    keys |= {} if mono else {"quantum_efficiency_g": "g.csv", "quantum_efficiency_b": "b.csv"}
-    detector = {"gain_e_per_dn": 1.0, "full_well_e": 1e9, "bits": 16} | (
-        {} if mono else {"bayer": "grbg"}
-    )
+    keys, detector = {"quantum_efficiency": "mono.csv"}, {}
+    if not mono:
+        keys, detector = channel_keys("rgb"), {"bayer": "grbg"}
+    detector |= {"gain_e_per_dn": 1.0, "full_well_e": 1e9, "bits": 16}
     sky = {"faintest_v_mag": 4.0, "spectrum": "blackbody"}
     path = folder / f"{'mono' if mono else 'bayer'}.toml"
     path.write_text(

@@ -20,6 +20,7 @@ from hilstar.sky.electrons import Optics, Photometry, zodiacal_electrons_per_s_a
 from hilstar.sky.spectrum import Curve
 from tests.authority.integrals import read, v_mean
 from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.spectra import write_curve
 
 # The limit.
 LIMIT = 1e-6
@@ -60,8 +61,7 @@ def test_twenty_random_stars_on_random_benches_are_right_in_absolute_electrons(t
     for number in range(20):
         knots = np.sort(rng.choice(np.arange(320, 1080, 20), size=8, replace=False)).astype(float)
         values = rng.uniform(0.05, 0.95, 8).round(3)
-        rows = "".join(f"{w:g},{v:g}\n" for w, v in zip(knots, values, strict=True))
-        (tmp_path / "qe.csv").write_text("wavelength_nm,value\n" + rows)
+        write_curve(tmp_path / "qe.csv", knots, values)
         aperture, transmission = rng.uniform(5, 100), round(float(rng.uniform(0.3, 1)), 3)
         text = SMALL_BENCH.replace('"ccd47-20"', '"qe.csv"').replace(
             '"n-bk7-10mm"', str(transmission)

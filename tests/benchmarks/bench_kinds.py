@@ -21,6 +21,7 @@ import numpy as np
 
 import hilstar
 from tests.support.benches import ROOT, Tables, bench_text
+from tests.support.spectra import bump, channel_keys, write_channels
 
 FIELD_MM = 100  # of a screen of 1920 pixels: 58 deg wide
 SIZES = {1920: 1080, 3840: 2160, 7680: 4320}
@@ -35,9 +36,7 @@ GLASS = "planar-1897.fits"
 KINDS: dict[str, Tables] = {
     "grey": {},
     "three primaries, mono": PANEL,
-    "three primaries, Bayer": (
-        PANEL | {"tracker": {f"quantum_efficiency_{c}": f"{c}.csv" for c in DYES_NM}}
-    ),
+    "three primaries, Bayer": (PANEL | {"tracker": channel_keys(DYES_NM)}),
     "glass": {"tracker.optics": {"psf": GLASS}, "render": {"psf": "tracker"}},
 }
 
@@ -52,15 +51,10 @@ def write_bench(folder: Path, kind: str, quantisation: str, width: int, faintest
         "collimator": {"focal_length_mm": FIELD_MM * scale},
         "render": {"quantisation": quantisation, "brightest_v_mag": 1.0},
     }
-    text = bench_text(tables, KINDS[kind])
-    if "Bayer" in kind:
-        text = "\n".join(
-            line for line in text.splitlines() if not line.startswith("quantum_efficiency =")
-        )
     path = folder / f"{kind}-{quantisation}-{width}-{faintest}.toml".replace(" ", "_").replace(
         ",", ""
     )
-    path.write_text(text)
+    path.write_text(bench_text(tables, KINDS[kind]))
     return path
 
 
@@ -77,12 +71,9 @@ def main() -> None:
         folder = Path(name)
         for file in (GLASS, "primaries-lcd.csv"):
             shutil.copy(ROOT / "configs" / file, folder)
-        for dye, nm in DYES_NM.items():
-            lines = (
-                f"{at},{0.55 * np.exp(-0.5 * ((at - nm) / 40) ** 2):.5f}"
-                for at in range(380, 721, 10)
-            )
-            (folder / f"{dye}.csv").write_text("wavelength_nm,value\n" + "\n".join(lines) + "\n")
+        at_nm = np.arange(380.0, 721.0, 10.0)
+        dyes = {dye: 0.55 * bump(nm, 57, at_nm) for dye, nm in DYES_NM.items()}
+        write_channels(folder, at_nm, dyes)
         for width in options.widths:
             for faintest in FAINTEST_V_MAG:
                 for quantisation in QUANTISATIONS:

@@ -10,6 +10,7 @@ import shutil
 from pathlib import Path
 
 from tests.support.benches import ROOT
+from tests.support.compilers import compiled
 
 EXAMPLES = ROOT / "examples"
 README = (EXAMPLES / "README.md").read_text()
@@ -34,3 +35,10 @@ def commands(heading: str) -> list[list[str]]:
     """The words of each line that a section gives to type."""
     (block,) = re.findall(r"(?s)```sh\n(.*?)```", section(heading))
     return [shlex.split(line.removesuffix(" &")) for line in block.splitlines()]
+
+
+def compiled_by_readme(words: list[str], target: Path, *more: str) -> Path:
+    """The program of a line of the README, `-o NAME` at its end, with more options; its path."""
+    compiler, *rest, flag, _ = words
+    assert flag == "-o"
+    return compiled(target, compiler, *more, *rest, cwd=EXAMPLES)

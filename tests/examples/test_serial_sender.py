@@ -16,13 +16,12 @@ from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeReply, Time
 from hilstar.attitude.wire.serial_link import SerialLink
 from hilstar.basics.rotation import propagate
 from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.compilers import STRICT, compiled
 from tests.support.servers import interrupted, listening
 from tests.support.waiting import PATIENCE_S
 from tests.support.wire.ptys import Cable
 
 EXAMPLES = ROOT / "examples"
-READ_S = 0.5  # until a busy machine has read what was sent
-STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic"]
 BAUD = 921_600
 CLOCK_OFFSET_S = 1000
 
@@ -36,21 +35,9 @@ def cable(tmp_path) -> Iterator[Cable]:
 @pytest.fixture(scope="module")
 def uart(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("serial") / "serial_sender"
-    command = [
-        "gcc",
-        "-std=c99",
-        "-D_POSIX_C_SOURCE=200809L",
-        "-O2",
-        *STRICT,
-        "-I",
-        ROOT / "firmware_protocol",
-    ]
-    command += [EXAMPLES / "serial_sender.c", "-lm", "-o", target]
-    result = subprocess.run(
-        command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert (result.returncode, result.stderr) == (0, "")
-    return target
+    compiler = ("gcc", "-std=c99", "-D_POSIX_C_SOURCE=200809L", "-O2", *STRICT)
+    header = ("-I", ROOT / "firmware_protocol")
+    return compiled(target, *compiler, *header, EXAMPLES / "serial_sender.c", "-lm")
 
 
 def sender_counts(output: str) -> dict[str, int]:
@@ -68,13 +55,14 @@ def test_the_sender_streams_into_hilstar_and_both_sides_know_each_other_s_clock(
     )
     command = [str(uart), str(cable.sender), str(BAUD), "100", "1.5", "5", str(CLOCK_OFFSET_S)]
     with listening(bench_file, "reading serial:") as process:
+        process.shows()
         result = subprocess.run(
             command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
         )
         assert result.returncode == 0, result.stderr
-        time.sleep(READ_S)
+        counted = sender_counts(result.stdout)
+        process.has_received(counted["sent"])
         summary = interrupted(process)
-    counted = sender_counts(result.stdout)
     packets = summary["packets"]
     assert counted["sent"] == 150 == packets["received"] == packets["accepted"]
     assert packets["refused"] == 0

@@ -13,27 +13,22 @@ from pathlib import Path
 import zmq
 
 from hilstar.attitude.wire.packet import AnswerPacket, decode
-from tests.examples.support import commands
+from tests.examples.support import commands, compiled_by_readme
 from tests.support.benches import ROOT, SMALL_BENCH
 from tests.support.commands import run_hilstar_here
+from tests.support.compilers import STRICT
 from tests.support.senders import free_port
 from tests.support.waiting import PATIENCE_S
 
 EXAMPLES = ROOT / "examples"
-STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic"]
 HEADING = "A tracker that answers"
 Q = (0.5, 0.5, -0.5, 0.5)
 
 
 def built(folder: Path, line: int) -> Path:
     """The program that the README's line builds, as strictly as compilers are."""
-    compiler, *rest = commands(HEADING)[line]
-    command = [compiler, *STRICT, *rest[:-1], folder / rest[-1]]
-    result = subprocess.run(
-        command, cwd=EXAMPLES, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert (result.returncode, result.stderr) == (0, "")
-    return folder / rest[-1]
+    words = commands(HEADING)[line]
+    return compiled_by_readme(words, folder / words[-1], *STRICT)
 
 
 def said_by(command: list) -> str:

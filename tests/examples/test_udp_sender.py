@@ -13,8 +13,9 @@ import pytest
 
 from hilstar.attitude.wire.packet import AttitudeSample, decode
 from hilstar.basics.rotation import propagate
-from tests.examples.support import commands
-from tests.support.benches import ROOT, SMALL_BENCH
+from tests.examples.support import commands, compiled_by_readme
+from tests.support.benches import SMALL_BENCH
+from tests.support.compilers import STRICT_CPP
 from tests.support.senders import free_port
 from tests.support.servers import interrupted, listening
 from tests.support.waiting import PATIENCE_S
@@ -23,25 +24,12 @@ from tests.support.waiting import PATIENCE_S
 # read, and answered late.
 STREAM_S = 5
 READ_S = 0.5  # until a busy machine has read what was sent
-# As strict as compilers are, besides what the README gives.
-STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic", "-Wconversion", "-Wshadow", "-fno-exceptions"]
 
 
 @pytest.fixture(scope="module")
 def streamer(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("udp") / "udp_sender"
-    compiler, *rest = commands("A C++ sender over UDP")[0]
-    command = [compiler, *STRICT, *rest[:-1], target]
-    result = subprocess.run(
-        command,
-        cwd=ROOT / "examples",
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE_S,
-        check=False,
-    )
-    assert (result.returncode, result.stderr) == (0, "")
-    return target
+    return compiled_by_readme(commands("A C++ sender over UDP")[0], target, *STRICT_CPP)
 
 
 def test_the_sender_streams_into_hilstar_and_both_sides_talk(tmp_path, streamer):

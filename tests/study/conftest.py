@@ -1,14 +1,14 @@
 """Every chart that a study draws in these tests is looked at as it is saved, and saved as PNG
 alone.
 
-That a chart without an ending becomes a PNG and an SVG is held by test_study_charts.py; an SVG
-takes as long as its PNG.
+That a chart without an ending becomes a PNG and an SVG is held by tests/unit/basics/test_charts.py;
+an SVG takes as long as its PNG.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import wraps
+from collections.abc import Callable, Iterator
+from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ import pytest
 
 from hilstar.basics import charts
 from hilstar.instruments.study.sweep import Load, OtherWork
+from tests.support.studies import Studied, studied
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -53,6 +54,14 @@ def every_chart_is_legible() -> Iterator[None]:
         # the figure's own: half the pixels, and texts are measured once
         patch.setattr(charts, "PNG_DPI", 100)
         yield
+
+
+@pytest.fixture(scope="session")
+def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Studied]:
+    """Runs a study by its command (see `studied`). README's command leaves out the tests that ask
+    for it, also by a fixture of theirs; a study's own functions are held by the others.
+    """
+    return partial(studied, tmp_path_factory)
 
 
 @pytest.fixture

@@ -95,7 +95,7 @@ def words_of(figure) -> list[str]:
     return words
 
 
-@pytest.mark.study
+@pytest.mark.usefixtures("whole_study")
 @pytest.mark.parametrize("study", sorted(study_command.TIMED))
 def test_a_study_of_times_declines_on_a_busy_machine(
     study, tmp_path, monkeypatch, fewest_rounds, drawn

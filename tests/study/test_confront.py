@@ -15,6 +15,7 @@ from tests.support.tables import csv_rows
 pytestmark = pytest.mark.study
 
 
+@pytest.mark.usefixtures("whole_study")
 def test_a_set_has_a_row_and_a_page_for_each_camera_and_says_what_is_no_photograph(
     tmp_path: Path,
 ) -> None:

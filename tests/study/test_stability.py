@@ -15,7 +15,6 @@ from scipy.special import erf
 
 from hilstar.instruments.study.stability import CaseFigures, FailureCase, image, recorded
 from hilstar.instruments.study.stability import run as stability
-from tests.support.studies import studied
 
 CASES = 43
 
@@ -24,7 +23,7 @@ CURVES = ("narrow_stars", "weak_perspective", "popping", "turns")  # tables with
 
 
 @pytest.fixture(scope="module")
-def stability_study(tmp_path_factory):
+def stability_study(whole_study):
     """The command's folder and output, and its cases."""
     cases = []
 
@@ -35,7 +34,7 @@ def stability_study(tmp_path_factory):
     run = stability.run
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stability, "run", keep)
-        found = studied("stability", tmp_path_factory, CURVES, "")
+        found = whole_study("stability", CURVES, "")
     return found, cases
 
 

@@ -92,7 +92,7 @@ def scene_of(parts, number: int) -> SceneMeasurement:
 
 
 @pytest.fixture(scope="module")
-def chain_study(tmp_path_factory):
+def chain_study(tmp_path_factory, whole_study):
     """What the command prints of the small bench, and the folder of its files."""
     folder = tmp_path_factory.mktemp("chain")
     (folder / "bench.toml").write_text(SMALL)
@@ -310,6 +310,23 @@ def combination_row(**figures) -> CombinationRow:
     return CombinationRow(
         **(known | words | {"on_front": "true", "on_front_mag": "true", "noise_ms": 0.01} | figures)
     )
+
+
+@pytest.mark.parametrize(
+    ("rival", "right"),
+    [
+        ({"time_ms": 5.0, "error_arcsec": 9.0}, True),  # faster, and less right
+        ({"time_ms": 4.97, "error_arcsec": 1.0}, True),  # within three sigmas of both medians
+        ({"time_ms": 4.9, "error_arcsec": 1.0}, False),
+        ({"time_ms": 1.0, "error_arcsec": 1.0, "bit_stealing": 2.0}, True),  # not effort's choice
+    ],
+)
+def test_auto_is_right_where_no_choice_of_its_own_is_better_beyond_the_noise(rival, right):
+    """Each median has a noise of 0.01 ms: three sigmas of their difference are 0.042 ms."""
+    auto = combination_row(chosen="auto", time_ms=5.0, error_arcsec=2.0)
+    alone = [auto, combination_row(time_ms=6.0, error_arcsec=3.0)]
+    assert run.is_right([alone])
+    assert run.is_right([alone, [auto, combination_row(**rival)]]) is right
 
 
 @pytest.mark.parametrize("place", [(0, 0), (-1, 0), (0, -1), (-1, -1)])

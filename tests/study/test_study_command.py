@@ -37,7 +37,7 @@ IMAGES = (".fits", "_without_noise.fits")
 
 
 @pytest.fixture(scope="module")
-def published(tmp_path_factory):
+def published(tmp_path_factory, whole_study):
     folder = tmp_path_factory.mktemp("outputs")
     result = run_hilstar_here("study", "outputs", "-o", folder)
     assert result.returncode == 0, result.stderr
@@ -103,6 +103,7 @@ def test_centres_are_astropy_s(published, name):
     assert int(on.sum()) == ON_IMAGE[name]
 
 
+@pytest.mark.usefixtures("whole_study")
 def test_a_bench_of_one_s_own_has_seven_outputs_in_four_fields(tmp_path):
     (tmp_path / "bench.toml").write_text(BENCH)
     result = run_hilstar(

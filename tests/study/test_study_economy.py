@@ -8,14 +8,13 @@ from hilstar.instruments.study import economy
 from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.recorded import assert_recorded
-from tests.support.studies import studied
 
 
 @pytest.fixture(scope="module")
-def economy_study(tmp_path_factory):
+def economy_study(whole_study):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(economy, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        found = studied("economy", tmp_path_factory, {"economy"})
+        found = whole_study("economy", {"economy"})
     return found.folder, found.findings, found.rows("economy")
 
 

@@ -6,12 +6,11 @@ import pytest
 
 from hilstar.instruments.study.geometry import MODELS, ideal_arcsec
 from tests.support.claims import holds
-from tests.support.studies import studied
 
 
 @pytest.fixture(scope="module")
-def study(tmp_path_factory):
-    found = studied("geometry", tmp_path_factory, {"geometry"})
+def study(whole_study):
+    found = whole_study("geometry", {"geometry"})
     return found.findings, found.rows("geometry")
 
 

@@ -18,12 +18,11 @@ from hilstar.instruments.study.prediction import (
     crossing_hz,
 )
 from hilstar.instruments.study.predictors import SLEW_DEG, SLEW_S
-from tests.support.studies import studied
 
 
 @pytest.fixture(scope="module")
-def prediction_study(tmp_path_factory):
-    found = studied("prediction", tmp_path_factory, {"prediction", "prediction_jitter"})
+def prediction_study(whole_study):
+    found = whole_study("prediction", {"prediction", "prediction_jitter"})
     return found.folder, found.findings
 
 

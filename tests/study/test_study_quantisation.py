@@ -9,7 +9,6 @@ from hilstar.display.phases import USUAL_PSF, fainter, measure, phase_grid
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.study.codes import AIMS, BITS, WAYS
 from hilstar.tracker.centroiders import FAMILY
-from tests.support.studies import studied
 
 # Of the error of `round` that `exact` leaves, by each centroider: 0.18 to 0.48 on 8 x 8 phases, 64
 # stars.
@@ -32,9 +31,9 @@ def test_fainter_stars_have_less_light():
     assert ratio == pytest.approx(np.full(4, 0.01))
 
 
-def test_codes_meet_their_aims_at_each_depth_and_over_frames(tmp_path_factory):
+def test_codes_meet_their_aims_at_each_depth_and_over_frames(whole_study):
     charts = {"quantisation", "quantisation_centroiders", "quantisation_time", "over_frames"}
-    found = studied("quantisation", tmp_path_factory, charts)
+    found = whole_study("quantisation", charts)
     assert len(found.findings) == len(BITS) + 3
     rows = found.rows("quantisation")
     assert len(rows) == len(BITS) * len(WAYS) * 5

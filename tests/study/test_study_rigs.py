@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.study import rigs
-from tests.support.studies import studied
 
 # An even error of a pixel's width: its rms is within 10 % of a twelfth's root, of 80 stars
 PIXEL_ARCSEC = 57.65109021605092e-3 / 350 * 206264.806 / math.sqrt(12)
@@ -24,8 +23,8 @@ GRID_PX = 1e-9
 
 
 @pytest.fixture(scope="module")
-def rigs_study(tmp_path_factory):
-    found = studied("rigs", tmp_path_factory, {"rigs"})
+def rigs_study(whole_study):
+    found = whole_study("rigs", {"rigs"})
     return found.folder, found.findings, {row["figure"]: row for row in found.rows("rigs")}
 
 

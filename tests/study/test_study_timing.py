@@ -24,7 +24,6 @@ from hilstar.instruments.study.timing import (
 from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
 from tests.support.recorded import assert_recorded
-from tests.support.studies import studied
 from tests.support.tables import csv_rows
 
 GAIN = 20  # compensated against not: the issue's own figure
@@ -38,7 +37,7 @@ FRAME_ARCSEC = RATE_DEG_S * PERIOD_S * 3600
 
 
 @pytest.fixture(scope="module")
-def timing_study(tmp_path_factory):
+def timing_study(whole_study):
     """The study's folder and findings, and what it measured."""
     measured = []
 
@@ -48,7 +47,7 @@ def timing_study(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(timing, "measure", keep)
-        found = studied("timing", tmp_path_factory, {"timing", "stripes", "beat"})
+        found = whole_study("timing", {"timing", "stripes", "beat"})
     return found.folder, found.findings, measured
 
 

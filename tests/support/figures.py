@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -46,6 +46,17 @@ DERIVED = {
 DRAWN_AS = (1.0, 1e2, 1e3, 1e-6)
 # of axes and of what a text beside it names
 PLAIN = {charts.INK, charts.MUTED, charts.GRID, charts.PAPER}
+
+
+def two_lines(spoil: Callable[[Axes], object] = lambda axes: None) -> Figure:
+    """A chart that is as it should be, after what a test does to it."""
+    with charts.panels_of("One line is twice the other", note="Of nothing.") as (axes,):
+        for name, k in (("once", 1), ("twice", 2)):
+            axes.plot([1, 10, 100], [k, 10 * k, 100 * k], label=name)
+        axes.set(xscale="log", yscale="log", xlabel="time [s]", ylabel="place [m]")
+        charts.label_ends(axes)
+        spoil(axes)
+    return axes.figure
 
 
 def assert_legible(figure: Figure, *, drawn: bool = False) -> None:

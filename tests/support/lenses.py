@@ -5,6 +5,7 @@ law in vectors.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import astuple, is_dataclass
 
 import numpy as np
 
@@ -84,6 +85,18 @@ def seq(
         ]
         lines += (more or {}).get(number, [])
     return "\n".join([*lines, "SI 0.0 0.0", "GO"]).encode()
+
+
+def numbers_of(part) -> list[float]:
+    """Every number that a lens states, or a part of it: its lengths are mm."""
+    if is_dataclass(part):
+        part = astuple(part)
+    if isinstance(part, (tuple, list, np.ndarray)):
+        numbers: list[float] = []
+        for inner in part:
+            numbers += numbers_of(inner)
+        return numbers
+    return [] if part is None or isinstance(part, str) else [float(part)]
 
 
 def index(glass, um: float) -> float:

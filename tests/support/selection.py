@@ -21,8 +21,9 @@ REASONS_BY_FOLDER = {
     "timing": TIMING_REASON,
     "screen": "need an X server",
     "browser": "need a browser",
-    "study": "run a whole study",
 }
+# a fixture of tests/study, for which or for a fixture with which a test asks that runs a study
+WHOLE_STUDY, WHOLE_STUDY_REASON = "whole_study", "run a whole study"
 # Functions that take over a stated time of CPU, all their cases together; tests/support/slow_tests.py
 # measures them and writes the file.
 SLOW = frozenset((TESTS / "slow.txt").read_text().split())
@@ -46,6 +47,8 @@ def reason_to_leave_out(item: pytest.Item) -> str | None:
     for folder in item.path.relative_to(TESTS).parts[:-1]:
         if folder in REASONS_BY_FOLDER:
             return REASONS_BY_FOLDER[folder]
+    if WHOLE_STUDY in getattr(item, "fixturenames", ()):
+        return WHOLE_STUDY_REASON
     if item.nodeid.partition("[")[0] in SLOW:
         return SLOW_REASON
     return None
@@ -72,7 +75,7 @@ def holds_nothing_for(config: pytest.Config, path: Path) -> bool:
         return "timing" not in path.relative_to(TESTS).parts and TIMING_MARK not in path.read_text()
     folders = path.relative_to(TESTS).parts[:-1]
     is_slow = path.relative_to(TESTS.parent).as_posix() in SLOW_FILES
-    return not is_slow and not REASONS_BY_FOLDER.keys() & set(folders)
+    return not is_slow and "study" not in folders and not REASONS_BY_FOLDER.keys() & set(folders)
 
 
 def select(config: pytest.Config, items: list[pytest.Item]) -> None:

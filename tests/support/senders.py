@@ -11,8 +11,10 @@ import zlib
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import zmq
+import zmq.auth
 
 from hilstar.basics.rotation import from_radec_roll_deg
 from tests.support.waiting import PATIENCE_S, repeating
@@ -114,13 +116,23 @@ def await_subscriber_of(port: int) -> None:
 
 @contextmanager
 def connected(
-    port: int, kind: int = zmq.PUB, patience_s: float = PATIENCE_S
+    port: int,
+    kind: int = zmq.PUB,
+    patience_s: float = PATIENCE_S,
+    keys: tuple[Path, Path] | None = None,
 ) -> Iterator[zmq.Socket]:
-    """A plain socket of that kind, connected."""
+    """A plain socket of that kind, connected; `keys` are two folders of `hilstar keys`, its own
+    and the server's.
+    """
     context = zmq.Context()
     end = context.socket(kind)
     end.setsockopt(zmq.LINGER, 0)
     end.setsockopt(zmq.RCVTIMEO, round(patience_s * 1000))
+    if keys is not None:
+        own, server = keys
+        secret = zmq.auth.load_certificate(own / "client.key_secret")
+        end.curve_publickey, end.curve_secretkey = secret
+        end.curve_serverkey, _ = zmq.auth.load_certificate(server / "server.key")
     end.connect(f"tcp://127.0.0.1:{port}")
     try:
         yield end

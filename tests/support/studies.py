@@ -37,8 +37,8 @@ class Studied:
 
 
 def studied(
-    name: str,
     directories: pytest.TempPathFactory,
+    name: str,
     charts: Collection[str],
     words: str = "--quick",
 ) -> Studied:

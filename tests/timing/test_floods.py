@@ -6,24 +6,19 @@ from __future__ import annotations
 
 import contextlib
 import itertools
-import json
 import resource
 import socket
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import zmq
-import zmq.auth
 
 from hilstar.attitude.wire.links import MAX_BURST, MAX_PACKETS_PER_S
-from tests.support.benches import LIVE_BENCH
-from tests.support.commands import assert_refused, run_hilstar_here, run_started
-from tests.support.senders import connected, packet
+from tests.support.commands import run_hilstar_here, run_started
+from tests.support.senders import connected, packet, talking
 from tests.support.servers import Served, bound
 from tests.support.waiting import PATIENCE_S, CoreWaits, missed_in, wait_for
 from tests.support.wire.zmtp import greeted, part
@@ -34,26 +29,10 @@ NOT_HEARD_S = 3.0  # what is not to come is waited for so long
 
 
 @contextmanager
-def sending(port: int, hz: float = 100.0) -> Iterator[None]:
-    """A sender of good packets in a thread, as long as this is open."""
-    stop = threading.Event()
-
-    def send() -> None:
-        with zmq.Context() as context, context.socket(zmq.PUB) as sender:
-            sender.setsockopt(zmq.LINGER, 0)
-            sender.connect(f"tcp://127.0.0.1:{port}")
-            sequence = 0
-            while not stop.wait(1 / hz):
-                sender.send(packet(sequence, time.monotonic_ns()))
-                sequence += 1
-
-    thread = threading.Thread(target=send)
-    thread.start()
-    try:
+def sending(port: int) -> Iterator[None]:
+    """A sender of good packets at 100 Hz, as long as this is open."""
+    with connected(port) as sender, talking(sender, 100.0):
         yield
-    finally:
-        stop.set()
-        thread.join()
 
 
 @pytest.mark.parametrize("size", [1, 100_000])
@@ -211,46 +190,9 @@ def _accepted_beside_long_messages(tmp_path) -> float:
     return summary["packets"]["accepted"] / sent
 
 
-def test_lockstep_survives_no_delimiter_dead_askers_and_endless_parts(tmp_path):
-    with bound(tmp_path, attitude="lockstep = true") as served:
-        with greeted(served.port, b"DEALER") as attacker:
-            attacker.sendall(part(b"no delimiter", more=False) * 10)
-        with greeted(served.port, b"REQ") as dead:
-            dead.sendall(part(b"", more=True) + part(packet(0, 0), more=False))
-        with greeted(served.port, b"REQ") as attacker, contextlib.suppress(OSError):
-            attacker.sendall(
-                part(b"", more=True) * 1000 + part(b"x", more=True) * 1000 + part(b"x", more=False)
-            )
-            served.await_line("more than 64 parts")
-        with connected(served.port, zmq.REQ) as asker:
-            asker.send(packet(1, 1))
-            assert len(asker.recv()) == 40
-        summary = served.summary()
-    assert summary["frames"] >= 1
-    assert summary["link"]["resets"] == 1
-
-
 def make_client(directory: Path) -> Path:
     assert run_hilstar_here("keys", "-o", directory).returncode == 0
     return directory
-
-
-@contextmanager
-def client(port: int, server: Path, own: Path | None) -> Iterator[zmq.Socket]:
-    context = zmq.Context()
-    sender = context.socket(zmq.PUB)
-    sender.setsockopt(zmq.LINGER, 0)
-    if own is not None:
-        sender.curve_publickey, sender.curve_secretkey = zmq.auth.load_certificate(
-            own / "client.key_secret"
-        )
-        sender.curve_serverkey = zmq.auth.load_certificate(server / "server.key")[0]
-    sender.connect(f"tcp://127.0.0.1:{port}")
-    try:
-        yield sender
-    finally:
-        sender.close()
-        context.term()
 
 
 def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_are_told(tmp_path):
@@ -265,7 +207,7 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
         """Whether the ledger's count of frames shows an attitude of this client: a fresh one is
         told on stderr.
         """
-        with client(served.port, mine, own) as sender:
+        with connected(served.port, keys=(own, mine)) as sender:
             told = len(served.lines)
             deadline_s = time.monotonic() + patience_s
             while time.monotonic() < deadline_s:
@@ -288,7 +230,7 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
         assert heard(served, late, 20_000)
         wait_for(lambda: sum("is stale" in line for line in list(served.lines)) >= 2)
         assert not heard(served, mine, 30_000, NOT_HEARD_S)
-        with client(served.port, mine, None):  # no keys at all
+        with connected(served.port):  # no keys at all
             rejected = sum("was rejected" in line for line in list(served.lines))
             wait_for(
                 lambda: (
@@ -299,67 +241,3 @@ def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_
         summary = served.summary()
     assert summary["link"]["rejected"] == summary["events"]["client-rejected"] >= 3
     assert any("its key is not among those allowed" in line for line in served.lines)
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "said"),
-    [
-        ("tcp://127.0.0.1:0;10.0.0.1:5560", "write tcp://HOST:PORT"),
-        ("tcp://localhost.evil:5560", "hilstar keys"),
-        ("tcp://127.0.0.1:*", "free port"),
-        ("inproc://attitude", "write tcp://HOST:PORT"),
-        ("ipc://relative", "absolute path"),
-    ],
-)
-def test_endpoints_that_libzmq_would_take_and_hilstar_does_not(tmp_path, endpoint, said):
-    bench = tmp_path / "bench.toml"
-    bench.write_text(f'{LIVE_BENCH}\n[attitude]\nendpoint = "{endpoint}"\n')
-    assert_refused(
-        run_hilstar_here("serve", bench, "--headless", "--duration", "1"), 2, endpoint, said
-    )
-    to = ("--to", endpoint, "--connect", "--spin", "z,1", "--count", "1", "--wait", "0")
-    assert_refused(run_hilstar_here("send", *to), 2, endpoint, said)
-
-
-def test_binding_a_file_deletes_nothing(tmp_path):
-    measured = tmp_path / "measured.csv"
-    measured.write_text("1,2,3\n")
-    bench = tmp_path / "bench.toml"
-    bench.write_text(f'{LIVE_BENCH}\n[attitude]\nbind = true\nendpoint = "ipc://{measured}"\n')
-    assert_refused(
-        run_hilstar_here("serve", bench, "--headless", "--duration", "1"),
-        2,
-        "measured.csv",
-        "not a socket",
-    )
-    assert_refused(
-        run_hilstar_here("send", "--spin", "z,1", "--to", f"ipc://{measured}"),
-        2,
-        "measured.csv",
-        "not a socket",
-    )
-    assert measured.read_text() == "1,2,3\n"
-
-
-def test_a_free_port_is_told(tmp_path):
-    sent = run_hilstar_here(
-        "send",
-        "--spin",
-        "z,1",
-        "--to",
-        "tcp://127.0.0.1:*",
-        "--count",
-        "1",
-        "--wait",
-        "0",
-        "--json",
-    )
-    endpoint = json.loads(sent.stdout)["link"]["endpoint"]
-    assert endpoint.startswith("tcp://127.0.0.1:")
-    assert int(endpoint.rpartition(":")[2]) > 0
-    assert endpoint in sent.stderr
-
-
-def test_keys_in_a_place_that_cannot_be_get_one_line(tmp_path):
-    assert_refused(run_hilstar_here("keys", "-o", tmp_path / ("k" * 300)), 2, "choose another")
-    assert_refused(run_hilstar_here("keys", "-o", "/proc/keys/here"), 2, "/proc/keys/here")

@@ -12,7 +12,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.certify.bench_readings import BesideRatio
 from hilstar.instruments.certify.budget import Input
 from hilstar.instruments.certify.effects import Effect, of_all_stars, root_mean_square
-from hilstar.instruments.certify.estimates import Evenness, LightDeviation
+from hilstar.instruments.certify.estimates import Evenness, LightDeviation, Surface
 from hilstar.instruments.certify.lens import LensFit, Places
 from hilstar.instruments.certify.model import Deviations, Figures
 from hilstar.instruments.certify.stated_effects import NEIGHBOURS, stated_delay
@@ -44,20 +44,19 @@ def of_readings(
         missing.append(NEIGHBOURS)
     light = read.light
     join = light.weights(figures.log_light)
-    even = _even_terms(figures, read)
-    form = _form(figures, read)
+    even = map_at(read.even.fit, read.light.square_px, figures.x_px, figures.y_px)
     place = read.place.at(figures.x_px, figures.y_px)
     delay_ms = file.config.monitor.panel_delay_ms
     if len(read.delays_ms) > 1:
         delay_ms = float(read.delays_ms.mean())
     value = Deviations(
         (join @ light.value)[None],
-        (even @ read.even.fit.value[:, 0] - form / 2)[None],
+        even.midway[None],
         place.value[None],
         np.array([delay_ms]),
         np.zeros(1),
     )
-    effects = [*_of_light(light, figures), *_of_evenness(read.even, even, form), _of_places(place)]
+    effects = [*_of_light(light, figures), *_of_evenness(read.even, even), _of_places(place)]
     effects += _of_structure(figures, read, place)
     if file.config.certify.tracker.direction_expanded_arcsec is not None:
         longest_px = float(place.structure.length[-1])
@@ -72,20 +71,33 @@ def of_readings(
     return value, effects
 
 
-def _even_terms(figures: Figures, read: Read) -> FloatArray:
-    """What the light map's terms add to the log light at stars (stars, terms), relative to the mean
-    of the square where light was read.
+@dataclass(frozen=True, slots=True)
+class MapAtStars:
+    """The map of a screen's log light at stars, relative to the mean of the square where light was
+    read: what its terms add (stars, terms), the smooth surface (stars,), and `form`, how far that
+    is from a map that is linear between its places (stars,).
     """
-    fit = read.even.fit
-    square = fit.terms(*_places_in(read.light.square_px))
-    return np.asarray(fit.terms(figures.x_px, figures.y_px) - square.mean(axis=0))
+
+    terms: FloatArray
+    smooth: FloatArray
+    form: FloatArray
+
+    @property
+    def midway(self) -> FloatArray:
+        """Half way from the smooth surface to the linear map."""
+        return np.asarray(self.smooth - self.form / 2)
 
 
-def _form(figures: Figures, read: Read) -> FloatArray:
-    """How far the light map at stars (stars,) is from one that is linear between its places."""
-    fit = read.even.fit
-    square = fit.bowed(*_places_in(read.light.square_px))
-    return np.asarray(fit.bowed(figures.x_px, figures.y_px) - square.mean())
+def map_at(
+    fit: Surface, square_px: tuple[int, int, int], x_px: FloatArray, y_px: FloatArray
+) -> MapAtStars:
+    """A surface's map at stars' pixels (stars,); `square_px` is left, top and side of the square
+    where light was read.
+    """
+    square = _places_in(square_px)
+    terms = fit.terms(x_px, y_px) - fit.terms(*square).mean(axis=0)
+    form = fit.bowed(x_px, y_px) - fit.bowed(*square).mean()
+    return MapAtStars(terms, terms @ fit.value[:, 0], form)
 
 
 def _places_in(square_px: tuple[int, int, int]) -> tuple[FloatArray, FloatArray]:
@@ -118,10 +130,8 @@ def _of_light(light: LightDeviation, figures: Figures) -> Iterator[Effect]:
     yield Effect(form, levels=bent[None])
 
 
-def _of_evenness(even: Evenness, terms: FloatArray, form: FloatArray) -> Iterator[Effect]:
-    """The effects of the noise of dots' light on the map's terms (stars, terms), and of the map's
-    form (stars,).
-    """
+def _of_evenness(even: Evenness, at_stars: MapAtStars) -> Iterator[Effect]:
+    """The effects of the noise of dots' light on the map's terms, and of the map's form."""
     noise = even.fit.noise
     factors = even.fit.factors
     if even.structure.total:
@@ -129,11 +139,11 @@ def _of_evenness(even: Evenness, terms: FloatArray, form: FloatArray) -> Iterato
         alone = math.sqrt(even.structure.noise_variance)
         factors = factors * alone / noise
         noise = alone
-    size = terms.shape[1]
+    size = at_stars.terms.shape[1]
     source = "light of dots"
     light = Input("evenness", "Student t", source, size, noise, "relative", even.fit.dof)
-    yield Effect(light, even=(terms @ factors).T)
-    half = np.abs(form) / 2 / RECTANGLE
+    yield Effect(light, even=(at_stars.terms @ factors).T)
+    half = np.abs(at_stars.form) / 2 / RECTANGLE
     source = "smooth, or linear between a map's places"
     error = root_mean_square(half)
     shape = Input("form of the light map", "rectangular", source, 1, error, "relative")

@@ -7,7 +7,7 @@ common in different parts of the sky.
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage
@@ -16,6 +16,7 @@ from hilstar.basics.arrays import BoolArray, FloatArray
 from hilstar.basics.units import MAD_TO_SIGMA
 
 PATTERN_CLIP = 4.0  # sigmas beyond which a pixel of one photograph does not count
+LEVELS = 16  # parts of an image by their light, each with a sigma of its own
 FOUND_SIGMAS = 4.0
 KINDS = ("response", "offsets_dn", "columns_dn", "rows_dn")
 NAMES = ("response of pixels", "offsets of pixels", "of columns", "of rows")
@@ -89,10 +90,17 @@ class FixedPattern:
 
 @dataclass(frozen=True, slots=True)
 class _Square:
-    """The square of a component, and one sigma of it."""
+    """The square of a component, one sigma of it by noise, for these elements, and one by the
+    scatter of elements, for others of their kind.
+    """
 
     value: float
     error: float
+    scatter: float
+
+    def less(self, pixels: "_Square", count: int) -> "_Square":
+        """A line's square without the share that `count` pixels' own patterns leave in its mean."""
+        return replace(self, value=self.value - pixels.value / count)
 
 
 def fixed_pattern(
@@ -107,15 +115,15 @@ def fixed_pattern(
     """
     pixels, shares, columns, rows, light, inverse = (_Pairs() for _ in range(6))
     for off, level, mask in photographs:
-        rms = math.sqrt(float((off[mask] ** 2).mean()))
-        is_quiet = np.abs(off) < PATTERN_CLIP * rms
-        use = mask & is_quiet & (level > 0)
+        use = _quiet(off, level, mask & (level > 0))
         off = np.where(use, off - off[use].mean(), 0.0)
         level = np.where(use, level, 1.0)
-        for axis, sums in ((0, columns), (1, rows)):
-            count = use.sum(axis=axis)
-            mean = off.sum(axis=axis) / np.maximum(count, 1)
-            sums.add(mean, count > use.shape[axis] / 4)
+        column_mean, is_column_known = _line_means(off, use, 0)
+        columns.add(column_mean, is_column_known)
+        rows.add(*_line_means(off, use, 1))
+        # a column's offset is no pixel's
+        off = off - column_mean
+        use = use & is_column_known
         # neighbours' differences: what is smooth is the sky's or the lens's
         off = (off[:, 1:] - off[:, :-1]) / math.sqrt(2)
         use = use[:, 1:] & use[:, :-1]
@@ -130,46 +138,48 @@ def fixed_pattern(
     width = use.shape[1] + 1
     both = pixels.mean()
     share = shares.mean()
-    column, row = _lines_alone(columns.mean(), rows.mean(), both.value, (height, width))
+    column = columns.mean().less(both, height)
+    row = rows.mean().less(both, width)
     lit = light.mean().value
     dim = inverse.mean().value
-    # columns' offsets are in the differences of neighbours, too
-    column_square = max(column.value, 0.0)
-    both_square = both.value - column_square
-    share_square = share.value - column_square * dim
-    # both = response^2 lit + offsets^2, share = response^2 + offsets^2 dim
+    # both = response^2 lit + offsets^2, share = response^2 + offsets^2 dim; they weigh pixels
+    # differently, and so scatter apart: products of neighbours' differences correlate by 1/4
+    both_scatter = both.scatter * math.sqrt(1.5)
+    share_scatter = share.scatter * math.sqrt(1.5)
     determinant = lit * dim - 1
-    response = _Square(
-        (both_square * dim - share_square) / determinant,
-        math.hypot(both.error * dim, share.error) / determinant,
+    response = (both.value * dim - share.value) / determinant
+    response_error = math.hypot(both_scatter * dim, share_scatter) / determinant
+    offset = (share.value * lit - both.value) / determinant
+    offset_error = math.hypot(share_scatter * lit, both_scatter) / determinant
+    if offset < FOUND_SIGMAS * offset_error:
+        response = both.value / lit
+        response_error = both.error / lit
+    return FixedPattern(
+        (response, offset, column.value, row.value),
+        (response_error, offset_error, column.scatter, row.scatter),
     )
-    offset = _Square(
-        (share_square * lit - both_square) / determinant,
-        math.hypot(share.error * lit, both.error) / determinant,
-    )
-    if offset.value < FOUND_SIGMAS * offset.error:
-        response = _Square(both_square / lit, both.error / lit)
-    components = (response, offset, column, row)
-    values = tuple(square.value for square in components)
-    errors = tuple(square.error for square in components)
-    return FixedPattern(values, errors)
 
 
-def _lines_alone(
-    columns: _Square, rows: _Square, both: float, size: tuple[int, int]
-) -> tuple[_Square, _Square]:
-    """Squares of columns and rows without the share that pixels' own patterns leave in their
-    means.
+def _quiet(off: FloatArray, level: FloatArray, mask: BoolArray) -> BoolArray:
+    """Pixels of a mask that are no further off than PATTERN_CLIP sigmas of those of their level.
 
-    `both` is the square of pixels and columns together, `size` (height, width).
+    One sigma of the whole image would leave out what a bright part has of response.
     """
-    height, width = size
-    column = (columns.value - both / height) / (1 - 1 / height)
-    pixel = max(both - column, 0.0)
-    row = rows.value - pixel / width
-    column_error = math.hypot(columns.error, math.sqrt(2 / width) * pixel / height)
-    row_error = math.hypot(rows.error, math.sqrt(2 / height) * pixel / width)
-    return _Square(column, column_error), _Square(row, row_error)
+    edges = np.quantile(level[mask], np.linspace(0, 1, LEVELS + 1)[1:-1])
+    part = np.searchsorted(edges, level[mask], side="right")
+    count = np.maximum(np.bincount(part, minlength=LEVELS), 1)
+    squares = np.bincount(part, off[mask] ** 2, minlength=LEVELS)
+    sigma = np.sqrt(squares / count)
+    use = mask.copy()
+    use[mask] = np.abs(off[mask]) < PATTERN_CLIP * sigma[part]
+    return use
+
+
+def _line_means(off: FloatArray, use: BoolArray, axis: int) -> tuple[FloatArray, BoolArray]:
+    """Means along an axis of the pixels in use, and whether a line has enough of them."""
+    count = use.sum(axis=axis)
+    mean = off.sum(axis=axis) / np.maximum(count, 1)
+    return mean, count > use.shape[axis] / 4
 
 
 class _Pairs:
@@ -191,12 +201,15 @@ class _Pairs:
         return float((self._count * (self._count - 1) / 2).sum())
 
     def mean(self) -> _Square:
-        """The mean product, with its error."""
+        """The mean product."""
+        pairs_of_each = self._count * (self._count - 1) / 2
         pairs = max(self.pairs, 1.0)
-        product = float((self._sum**2 - self._squares).sum()) / 2 / pairs
-        values = max(float(self._count.sum()), 1.0)
-        variance = float(self._squares.sum()) / values
-        return _Square(product, variance / math.sqrt(pairs))
+        products = (self._sum**2 - self._squares) / 2
+        mean = float(products.sum()) / pairs
+        variances = self._squares / np.maximum(self._count, 1)
+        error = math.sqrt(float((pairs_of_each * variances**2).sum())) / pairs
+        scatter = float(np.linalg.norm(products - mean * pairs_of_each)) / pairs
+        return _Square(mean, error, scatter)
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,7 +112,7 @@ def check_monitor(
     doubts = []
     for origin in origins:
         if origin.identity is not None and now is not None:
-            doubts = [now.doubt]
+            doubts.append(now.doubt)
             if origin.identity.brightness is not None and now.brightness is None:
                 doubts.append("the monitor's own settings cannot be read now (DDC/CI)")
             changes = ", ".join(differences(origin.identity, now))
@@ -137,7 +137,9 @@ def check_monitor(
         ]
     else:
         notice = []
-    return MonitorCheck(now, "; ".join(faults), "; ".join(filter(None, (*notice, *doubts))))
+    # what two files have in common is said once
+    lines = dict.fromkeys(filter(None, (*notice, *doubts)))
+    return MonitorCheck(now, "; ".join(faults), "; ".join(lines))
 
 
 def _date(when: str) -> datetime.date | None:

@@ -12,7 +12,6 @@ import socket
 import struct
 import threading
 import time
-import tty
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -30,6 +29,7 @@ from hilstar.server.bench.config import parse_config
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.wire.ptys import serial_line
 
 Q = (0.6, 0.0, 0.8, 0.0)
 PACKETS = [encode(AnswerPacket(k, 2, 10 + k, Q, stars=3)) for k in range(3)]
@@ -76,29 +76,23 @@ def assert_answers(found: list[Answer]) -> None:
 
 
 def test_a_serial_line_is_read_asked_and_comes_back(tmp_path):
-    master, slave = os.openpty()
-    tty.setraw(slave)
     port = tmp_path / "port"
-    port.symlink_to(os.ttyname(slave))
-    with reading(
-        tmp_path, f'source = "serial"\nport = "{port}"\npoll_hex = "55 AA"\npoll_hz = 50'
-    ) as source:
-        # What is written before the process has opened the port is flushed.
-        assert_answers(gathered(source, 3, lambda: os.write(master, STREAM)))
-        os.write(master, b"\x05nonsense\0")
-        wait_for(
-            lambda: source.take(20) == [] and source.refusals() == {"framing": 1}, "the refusal"
-        )
-        assert os.read(master, 2) == b"\x55\xaa"
-        os.close(slave)
-        os.close(master)
-        master, slave = os.openpty()
-        tty.setraw(slave)
+    keys = f'source = "serial"\nport = "{port}"\npoll_hex = "55 AA"\npoll_hz = 50'
+    with contextlib.ExitStack() as opened:
+        with serial_line() as (device, name):
+            port.symlink_to(name)
+            source = opened.enter_context(reading(tmp_path, keys))
+            # What is written before the process has opened the port is flushed.
+            assert_answers(gathered(source, 3, lambda: os.write(device, STREAM)))
+            os.write(device, b"\x05nonsense\0")
+            wait_for(
+                lambda: source.take(20) == [] and source.refusals() == {"framing": 1}, "the refusal"
+            )
+            assert os.read(device, 2) == b"\x55\xaa"
+        device, name = opened.enter_context(serial_line())
         port.unlink()
-        port.symlink_to(os.ttyname(slave))
-        assert_answers(gathered(source, 3, lambda: os.write(master, STREAM)))
-    os.close(slave)
-    os.close(master)
+        port.symlink_to(name)
+        assert_answers(gathered(source, 3, lambda: os.write(device, STREAM)))
 
 
 def test_udp_takes_each_datagram_from_who_may_send(tmp_path):
@@ -225,19 +219,18 @@ def reader_cpu_s(source: AnswersApart) -> float:
 
 
 def test_a_babbling_tracker_is_bounded_and_its_good_answers_still_come(tmp_path, rng):
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    with reading(tmp_path, f'source = "serial"\nport = "{os.ttyname(slave)}"') as source:
+    with (
+        serial_line() as (device, name),
+        reading(tmp_path, f'source = "serial"\nport = "{name}"') as source,
+    ):
         for _ in range(40):
-            os.write(master, rng.bytes(3000) + STREAM)
+            os.write(device, rng.bytes(3000) + STREAM)
         found = gathered(source, 100)
         assert all(np.array_equal(answer.q_icrs_to_cam, Q) for answer in found)
         wait_for(
             lambda: source.take(20) == [] and sum(source.refusals().values()) > 100, "refusals"
         )
         assert set(source.refusals()) <= {"framing", "crc", "format"}
-    os.close(slave)
-    os.close(master)
 
 
 def test_noise_in_which_a_frame_may_begin_at_every_byte_does_not_end_the_reader(tmp_path, rng):

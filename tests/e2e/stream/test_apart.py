@@ -41,6 +41,7 @@ from tests.support.forks import Started
 from tests.support.senders import connected, free_port, packet, publisher
 from tests.support.sources.nasa42 import message
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
+from tests.support.wire.ptys import serial_line
 
 HOLD_S = 0.5
 # A stamp that waits for the lock is late by the rest of the hold; a process that is merely woken
@@ -77,12 +78,8 @@ def zmq_road(kind=ZmqApart) -> Iterator[tuple]:
 
 @contextmanager
 def serial_road() -> Iterator[tuple]:
-    master, slave = os.openpty()
-    with contextlib.ExitStack() as stack:
-        stack.callback(os.close, master)
-        stack.callback(os.close, slave)
-        link = stack.enter_context(SerialApart(os.ttyname(slave), 921_600))
-        yield link, lambda k: os.write(master, cobs.encode(packet(k, time.monotonic_ns())) + b"\0")
+    with serial_line() as (device, name), SerialApart(name, 921_600) as link:
+        yield link, lambda k: os.write(device, cobs.encode(packet(k, time.monotonic_ns())) + b"\0")
 
 
 @contextmanager

@@ -6,12 +6,9 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import pty
 import subprocess
 import sys
 import time
-import tty
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +23,7 @@ from tests.support.pages import live, page_of
 from tests.support.servers import bound
 from tests.support.stub_tracker import Stub
 from tests.support.waiting import wait_for
+from tests.support.wire.ptys import serial_line
 
 pytestmark = pytest.mark.e2e
 SHOWN_WITHIN_S = 0.2
@@ -48,18 +46,6 @@ def stub_tracker(port: int, line: int, **planted: object) -> Iterator[subprocess
             yield process
         finally:
             process.kill()
-
-
-@contextlib.contextmanager
-def serial_line() -> Iterator[tuple[int, str]]:
-    """A pseudo-terminal: the tracker's end, and the name of the other."""
-    ours, theirs = pty.openpty()
-    tty.setraw(theirs)
-    try:
-        yield ours, os.ttyname(theirs)
-    finally:
-        os.close(ours)
-        os.close(theirs)
 
 
 def test_a_trackers_answers_are_judged_shown_and_recorded_while_it_answers(tmp_path: Path) -> None:

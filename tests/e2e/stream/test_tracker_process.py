@@ -6,12 +6,10 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import select
 import socket
 import subprocess
 import sys
-import tty
 from itertools import chain
 
 import numpy as np
@@ -33,6 +31,7 @@ from tests.support.forks import Started
 from tests.support.senders import free_port
 from tests.support.servers import sending_replay
 from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.wire.ptys import serial_line
 
 pytestmark = pytest.mark.e2e
 
@@ -114,18 +113,15 @@ def test_lost_in_space_then_tracking_its_answers_are_the_attitude_that_was_lit_a
 
 
 def test_planted_silence_garbage_latency_and_wrong_answers_over_a_serial_line(display):
-    ours, theirs = pty.openpty()
-    tty.setraw(theirs)
     planted = typed("--silent 1s@1s --babble --wrong 50% --latency 0.5 --solver truth --seed 2")
-    line = f"serial:{os.ttyname(theirs)}@921600"
-    with tracker_of_display(
-        display, "--answer", line, "--format", "json", "--duration", 3, *planted
-    ) as process:
-        heard = b""
-        while process.poll() is None or select.select([ours], [], [], 0)[0]:
-            if select.select([ours], [], [], 0.05)[0]:
-                heard += os.read(ours, 65536)
-        found = summary(process)
+    heard = b""
+    with serial_line() as (ours, name):
+        words = ("--answer", f"serial:{name}@921600", "--format", "json", "--duration", 3)
+        with tracker_of_display(display, *words, *planted) as process:
+            while process.poll() is None or select.select([ours], [], [], 0)[0]:
+                if select.select([ours], [], [], 0.05)[0]:
+                    heard += os.read(ours, 65536)
+            found = summary(process)
     assert found["wrong"] > 0.2 * found["valid"]
     assert found["latency_ms"]["p50"] >= 500
     assert 5 < found["answers"] < 30 - 8  # a second of ten answers is missing

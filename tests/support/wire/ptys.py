@@ -1,5 +1,5 @@
-"""A serial line without hardware: two real ptys whose masters are joined, so that both ends open
-a device.
+"""Serial lines without hardware: a pty, and two of them that are joined, so that both ends open a
+device.
 """
 
 from __future__ import annotations
@@ -9,11 +9,26 @@ import os
 import select
 import threading
 import tty
+from collections.abc import Iterator
 from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 from tests.support.waiting import real_time
+
+
+@contextlib.contextmanager
+def serial_line() -> Iterator[tuple[int, str]]:
+    """A line that stands for a device's: the device's end (a descriptor), and the name of the
+    port.
+    """
+    device, port = os.openpty()
+    tty.setraw(port)
+    try:
+        yield device, os.ttyname(port)
+    finally:
+        os.close(device)
+        os.close(port)
 
 
 class Cable:

@@ -9,8 +9,10 @@ import gc
 import importlib.util
 import os
 import resource
+import select
 import signal
 import socket
+import subprocess
 import sys
 import time
 from importlib.machinery import PathFinder
@@ -161,6 +163,13 @@ def test_the_error_of_unix_time_is_the_kernel_s_in_microseconds(monkeypatch, max
     assert abs(found.offset_ns - (time.monotonic_ns() - time.time_ns())) < 10**9
 
 
+def test_the_time_asleep_is_what_one_clock_counts_and_the_other_does_not(monkeypatch):
+    """clock_gettime(2): CLOCK_BOOTTIME goes on while the machine sleeps, CLOCK_MONOTONIC stands."""
+    read_ns = {time.CLOCK_BOOTTIME: 90_000_000_007, time.CLOCK_MONOTONIC: 60_000_000_000}
+    monkeypatch.setattr(time, "clock_gettime_ns", read_ns.__getitem__)
+    assert HostClock().asleep_ns() == 30_000_000_007
+
+
 @pytest.mark.parametrize("collecting", [True, False])
 def test_a_loop_leaves_the_collector_and_the_threads_turns_as_they_were(monkeypatch, collecting):
     monkeypatch.setattr(scheduling, "raise_priority", lambda: "normal")
@@ -252,3 +261,38 @@ def test_a_user_s_module_is_the_one_beside_the_file_and_hides_no_installed_one(
     for function in ("os:system", "pyclbr:system", "subprocess:run", "of_this_bench", ""):
         with pytest.raises(UserCodeError):
             user_function(f"python:{function}", tmp_path)
+
+
+PARENT_OF_ONE = """
+import os
+import sys
+import time
+from hilstar.basics.process.interrupts import end_with_parent
+
+pipe = int(sys.argv[1])
+parent = os.getpid()
+child = os.fork()
+if child == 0:
+    end_with_parent({parent})
+    os.write(pipe, b"goes on")
+    time.sleep(600)
+os.waitpid(child, 0)
+os.write(pipe, b"has ended")
+"""
+
+
+@pytest.mark.parametrize(("parent", "said"), [("parent", b"goes on"), ("1", b"has ended")])
+def test_a_process_ends_with_the_one_that_began_it_also_where_that_was_another(parent, said):
+    """The pipe's end is that of the last process that could write to it."""
+    reading, writing = os.pipe()
+    command = [sys.executable, "-c", PARENT_OF_ONE.format(parent=parent), str(writing)]
+    with subprocess.Popen(command, pass_fds=[writing]) as process:
+        os.close(writing)
+        try:
+            assert os.read(reading, 10) == said
+        finally:
+            process.kill()
+    is_read, *_ = select.select([reading], [], [], PATIENCE_S)
+    assert is_read, "the child goes on without its parent"
+    assert os.read(reading, 10) == b""
+    os.close(reading)

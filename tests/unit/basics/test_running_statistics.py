@@ -23,10 +23,17 @@ RELATIVE = STEP
     ],
     ids=["log", "both signs", "one value", "zero", "negative"],
 )
-def test_percentiles_are_those_of_the_values(values, rng):
+@pytest.mark.parametrize("batches", [0, 1, 7], ids=["by value", "at once", "in batches"])
+def test_percentiles_are_those_of_the_values(values, batches, rng):
     statistics = RunningStatistics()
-    for value in rng.permutation(values):
-        statistics.add(float(value))
+    drawn = rng.permutation(values)
+    if batches:
+        for batch in np.array_split(drawn, batches):
+            statistics.add_all(batch)
+    else:
+        for value in drawn:
+            statistics.add(float(value))
+    assert statistics.count == len(values)
     found = statistics.percentiles()
     for name, percent in (("p50", 50), ("p99", 99)):
         exact = np.percentile(values, percent, method="inverted_cdf")

@@ -18,34 +18,15 @@ from hilstar.sky.electrons import Optics
 from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
+from tests.support.spectra import NM, PANELS, bump, write_channels, write_panel
 
-NM = np.arange(380.0, 781.0, 5.0)
 GLASS = load_curve("n-bk7-10mm", "n-bk7-10mm")
 WHITE_E_PER_S = 3e5
 QUADRATURE = 1e-4
 
 
-def bump(middle_nm, width_nm, nm=NM):
-    return np.exp(-(((nm - middle_nm) / width_nm) ** 2))
-
-
-# Peaks in nm and 1/e half widths: as of a wide OLED, of an sRGB LCD whose red phosphor has two
-# peaks, and of lasers.
-PANELS = {
-    "oled": [bump(625, 40), bump(530, 45), 0.8 * bump(460, 30)],
-    "lcd": [bump(612, 12) + 0.6 * bump(645, 15), bump(540, 35), 1.2 * bump(450, 15)],
-    "laser": [bump(638, 4), bump(520, 6), 1.5 * bump(445, 4)],
-}
 PASSBANDS = {"r": (620.0, 50.0), "g": (540.0, 55.0), "b": (460.0, 45.0)}
 RGB_NM = np.arange(400.0, 721.0, 10.0)
-
-
-def written(path, spectra, nm=NM):
-    rows = "".join(
-        f"{nm_i:g},{r:.8g},{g:.8g},{b:.8g}\n" for nm_i, r, g, b in zip(nm, *spectra, strict=True)
-    )
-    path.write_text(f"wavelength_nm,r,g,b\n{rows}")
-    return path
 
 
 def optics_of(passbands):
@@ -62,7 +43,7 @@ def optics_of(passbands):
 @pytest.mark.parametrize("panel", PANELS)
 @pytest.mark.parametrize("passbands", [PASSBANDS, {"mono": None}], ids=["rgb", "mono"])
 def test_the_matrix_is_that_of_a_sum_over_a_fine_grid(tmp_path, panel, passbands):
-    primaries = read_primaries(written(tmp_path / "p.csv", PANELS[panel]))
+    primaries = read_primaries(write_panel(tmp_path / "p.csv", PANELS[panel]))
     channels = optics_of(passbands)
     found = channel_matrix(primaries, channels, WHITE_E_PER_S)
     nm = np.arange(350.0, 850.0, 0.002) + 0.001
@@ -88,7 +69,7 @@ def test_the_shipped_primaries_are_red_green_and_blue_to_a_mosaic(name):
 
 def test_a_primary_beyond_a_channels_passband_gives_it_nothing(tmp_path):
     primaries = read_primaries(
-        written(tmp_path / "p.csv", [bump(k, 10) * (abs(NM - k) < 50) for k in (650, 550, 450)])
+        write_panel(tmp_path / "p.csv", [bump(k, 10) * (abs(NM - k) < 50) for k in (650, 550, 450)])
     )
     channels = {"r": Optics(30.0, Curve(np.array([600.0, 700.0]), np.ones(2)), constant_curve(1.0))}
     (row,) = channel_matrix(primaries, channels, 1.0).e_per_s
@@ -105,7 +86,7 @@ def test_a_primary_beyond_a_channels_passband_gives_it_nothing(tmp_path):
 
 
 def test_channels_of_one_colour_have_no_condition_number(tmp_path):
-    primaries = read_primaries(written(tmp_path / "p.csv", PANELS["lcd"]))
+    primaries = read_primaries(write_panel(tmp_path / "p.csv", PANELS["lcd"]))
     assert (
         channel_matrix(
             primaries, optics_of({"r": None, "g": None, "b": PASSBANDS["b"]}), 1.0
@@ -136,17 +117,10 @@ def test_a_wrong_file_is_one_line(tmp_path, text, words):
 
 @pytest.mark.gpu
 def test_the_budget_of_a_bench_has_the_matrix_and_its_condition_number(tmp_path):
-    written(tmp_path / "p.csv", PANELS["oled"])
-    for name, passband in PASSBANDS.items():
-        rows = "".join(
-            f"{nm:g},{value:.8f}\n"
-            for nm, value in zip(RGB_NM, bump(*passband, RGB_NM), strict=True)
-        )
-        (tmp_path / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}")
+    write_panel(tmp_path / "p.csv", PANELS["oled"])
+    curves = {name: bump(*passband, RGB_NM) for name, passband in PASSBANDS.items()}
+    keys = write_channels(tmp_path, RGB_NM, curves)
     bench = tmp_path / "bench.toml"
-    keys = {"quantum_efficiency": None} | {
-        f"quantum_efficiency_{name}": f"{name}.csv" for name in PASSBANDS
-    }
     tables = {
         "monitor.primaries": {"file": "p.csv"},
         "render": {"quantisation": "round", "flux_at_white_e_per_s": 3e5},

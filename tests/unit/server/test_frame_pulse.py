@@ -4,7 +4,6 @@ costs the frames: nothing.
 
 from __future__ import annotations
 
-import os
 import time
 
 import pytest
@@ -17,6 +16,7 @@ from hilstar.server.bench.config import SyncSettings
 from hilstar.server.frame_pulse import MIN_BACK_OFF_S, FramePulse
 from tests.support.rts_server import KeptLine
 from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.wire.ptys import serial_line
 
 # Between frames here; a pulse is 1 ms. On a machine whose cores are busy a thread may be given none
 # for some of them.
@@ -173,16 +173,9 @@ def test_a_port_without_modem_lines_is_refused_in_a_line():
     """A pty has none: the kernel says so when RTS is set, which pyserial keeps to itself while
     it opens.
     """
-    ours, theirs = os.openpty()
-    try:
-        with pytest.raises(
-            InputError,
-            match=r"\[sync\] port = /dev/pts/\d+: has no line RTS .*write a serial port with modem",
-        ):
-            RtsLine(os.ttyname(theirs), True)
-    finally:
-        os.close(ours)
-        os.close(theirs)
+    said = r"\[sync\] port = /dev/pts/\d+: has no line RTS .*write a serial port with modem"
+    with serial_line() as (_, port), pytest.raises(InputError, match=said):
+        RtsLine(port, True)
 
 
 @pytest.mark.parametrize(

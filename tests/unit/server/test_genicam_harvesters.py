@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-import subprocess
 from contextlib import closing
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,6 +19,7 @@ from hilstar.server.genicam import camera as cameras
 from hilstar.server.genicam.camera import CameraError, GenicamCamera, list_cameras
 from tests.support.benches import TWIN, bench_text
 from tests.support.commands import run_hilstar_here
+from tests.support.compilers import compiled
 
 SOURCE = Path(__file__).parents[2] / "support" / "gentl_producer.c"
 COMPILE = ["gcc", "-Wall", "-Werror", "-shared", "-fPIC", "-pthread", "-fvisibility=hidden"]
@@ -34,7 +34,7 @@ needs_harvesters = pytest.mark.skipif(
 def built(tmp_path_factory):
     """The folder of the compiled producer."""
     folder = tmp_path_factory.mktemp("producer")
-    subprocess.run([*COMPILE, "-o", folder / "test.cti", SOURCE], check=True)
+    compiled(folder / "test.cti", *COMPILE, SOURCE)
     return folder
 
 

@@ -26,7 +26,6 @@ from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.cli.options import parse_split
-from hilstar.server.bench.config import AttitudeSettings
 from hilstar.server.record import ledger as ledger_module
 from hilstar.server.record.ledger import (
     MAX_WAITING_BYTES,
@@ -46,6 +45,7 @@ from hilstar.server.record.ledger_records import (
 )
 from hilstar.server.record.run_figures import RunFigures, figures_of, summarise
 from tests.support.full_disk import files_of_at_most
+from tests.support.ledgers import kept_bench
 from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
 
@@ -53,29 +53,9 @@ UNCERTIFIED = SimpleNamespace(certify=SimpleNamespace(certificate=None))
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-@pytest.fixture
-def kept_bench(small_bench_file):
-    return SimpleNamespace(
-        file=SimpleNamespace(
-            path=small_bench_file,
-            text=small_bench_file.read_text(),
-            sha256="0" * 64,
-            config=UNCERTIFIED,
-        ),
-        calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
-        output={},
-        renderer=SimpleNamespace(
-            gl_renderer="none",
-            gl_version="none",
-            path="NumPy",
-            target=SimpleNamespace(quantisation="exact"),
-        ),
-        config=SimpleNamespace(
-            render=SimpleNamespace(codes_ms=None),
-            attitude=AttitudeSettings(),
-            tracker=SimpleNamespace(q_body_to_cam=None),
-        ),
-    )
+@pytest.fixture(name="kept_bench")
+def bench_of_a_ledger(small_bench_file):
+    return kept_bench(small_bench_file)
 
 
 def keep(ledger: Ledger, first: int, last: int) -> None:
@@ -356,6 +336,27 @@ def test_what_waits_is_bounded_by_bytes_and_frames_go_first():
     assert 0 < frames < 50_000 and 0 < packets < 50_000
     assert sum(entry.size_bytes for entry in backlog.take()) <= MAX_WAITING_BYTES
     assert backlog.put(QueueEntry("frame", 0, 0, bytes))
+
+
+def test_what_a_full_queue_dropped_is_counted_once_by_kind():
+    backlog = LedgerQueue()
+    large = QueueEntry("packet", 0, 0, bytes, MAX_WAITING_BYTES + 1)
+    for entry in (large, large, QueueEntry("frame", 0, 0, bytes, MAX_WAITING_BYTES + 1)):
+        assert not backlog.put(entry)
+    assert backlog.dropped == 3
+    assert backlog.take_dropped() == {"packet": 2, "frame": 1}
+    assert (backlog.dropped, backlog.take_dropped()) == (0, {})
+
+
+def test_what_is_dropped_once_the_last_turn_is_written_is_unrecorded_too(
+    tmp_path, kept_bench, monkeypatch
+):
+    ledger = Ledger(tmp_path / "run.mcap", kept_bench)
+    keep(ledger, 0, 10)
+    ledger.close()
+    monkeypatch.setattr("hilstar.server.record.ledger.MAX_WAITING_BYTES", 0)
+    keep(ledger, 10, 13)
+    assert ledger.summary()["unrecorded"] == 6  # three packets and three frames
 
 
 def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, kept_bench):

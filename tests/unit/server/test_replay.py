@@ -7,7 +7,6 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.wrong_sky import CLOCK, ENDS, RATES, WrongSky
 from hilstar.display.quantisers import QUANTISERS
-from hilstar.server.bench.config import AttitudeSettings, parse_config
+from hilstar.server.bench.config import parse_config
 from hilstar.server.record import ledger_records
 from hilstar.server.record.ledger import Ledger
 from hilstar.server.record.ledger_records import FrameRecord
@@ -31,6 +30,7 @@ from hilstar.server.replay import (
 )
 from hilstar.server.serve import Outlet
 from tests.support.benches import SMALL_BENCH
+from tests.support.ledgers import kept_bench
 from tests.support.refusals import refusal
 
 MAX = math.inf
@@ -71,28 +71,7 @@ def earlier_run(path, small_bench_file, speed_km_s=0.0, away_km=0.0):
     """Ten frames, one each 20 ms, the fourth of them blank, the last four aberrated, the last
     two on paths.
     """
-    bench = SimpleNamespace(
-        file=SimpleNamespace(
-            path=small_bench_file,
-            text=SMALL_BENCH,
-            sha256="0" * 64,
-            config=SimpleNamespace(certify=SimpleNamespace(certificate=None)),
-        ),
-        calibration=SimpleNamespace(name="srgb", sha256="1" * 64),
-        output={},
-        renderer=SimpleNamespace(
-            gl_renderer="none",
-            gl_version="none",
-            path="NumPy",
-            target=SimpleNamespace(quantisation="exact"),
-        ),
-        config=SimpleNamespace(
-            render=SimpleNamespace(codes_ms=None),
-            attitude=AttitudeSettings(),
-            tracker=SimpleNamespace(q_body_to_cam=None),
-        ),
-    )
-    with Ledger(path, bench) as kept:
+    with Ledger(path, kept_bench(small_bench_file)) as kept:
         for k in range(10):
             sample = AttitudeSample(k, np.array([1.0, 0.0, 0.0, 0.0]), None, k)
             kept.packet(1000 + k, encode(sample), sample, None)
@@ -237,32 +216,22 @@ def test_a_part_of_an_earlier_run_is_chosen_by_when_its_frames_were_swapped(firs
     assert "frame by frame" in refusal(plan_play, first_run, Wanted(2.0), config)
 
 
-def test_a_source_s_place_is_there_again_and_no_other_than_an_orbit_s(
-    first_run, config, tmp_path, small_bench_file
+@pytest.mark.parametrize(
+    ("name", "kept", "planted", "words"),
+    [
+        ("place_km", [7000.0, 0.0, 1.0], {"away_km": 1e8}, "a place beyond 6000 to"),
+        ("velocity_km_s", [0.0, 7.5, 0.0], {"speed_km_s": 3e5}, "a velocity over 10000 km/s"),
+    ],
+)
+def test_a_path_is_there_again_and_no_other_than_a_spacecraft_s(
+    first_run, config, tmp_path, small_bench_file, name, kept, planted, words
 ):
-    places = [
-        frame[2].place_km
-        for frame in map(plan_play(first_run, Wanted(speed=MAX), config).frame, (5, 6))
-    ]
-    assert places[0] is None
-    assert places[1].tolist() == [7000.0, 0.0, 1.0]
-    far = earlier_run(tmp_path / "far.mcap", small_bench_file, away_km=1e8)
-    with pytest.raises(InputError, match="message 7 of /frame: a place beyond 6000 to"):
-        plan_play(far, Wanted(speed=MAX), config)
-
-
-def test_stars_that_were_aberrated_are_so_again_and_no_faster_than_a_spacecraft(
-    first_run, config, tmp_path, small_bench_file
-):
-    velocities = [
-        frame[2].velocity_km_s
-        for frame in map(plan_play(first_run, Wanted(speed=MAX), config).frame, (5, 6))
-    ]
-    assert velocities[0] is None
-    assert velocities[1].tolist() == [0.0, 7.5, 0.0]
-    too_fast = earlier_run(tmp_path / "fast.mcap", small_bench_file, speed_km_s=3e5)
-    with pytest.raises(InputError, match="message 7 of /frame: a velocity over 10000 km/s"):
-        plan_play(too_fast, Wanted(speed=MAX), config)
+    play = plan_play(first_run, Wanted(speed=MAX), config)
+    before, after = (getattr(play.frame(number)[2], name) for number in (5, 6))
+    assert before is None and after.tolist() == kept
+    wrong = earlier_run(tmp_path / "wrong.mcap", small_bench_file, **planted)
+    with pytest.raises(InputError, match=f"message 7 of /frame: {words}"):
+        plan_play(wrong, Wanted(speed=MAX), config)
 
 
 def test_a_ledger_says_who_drew_it_and_a_log_does_not(first_run, roll_log, config):

@@ -11,7 +11,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.timeline import Policy, Timeline, _Damping
+from hilstar.attitude.clock.timeline import MEMORY_S, Policy, Timeline, _Damping
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import (
@@ -27,6 +27,9 @@ from hilstar.instruments.study.prediction import shaken_error
 START = from_radec_roll_deg(84.057, -1.2, 10.0)
 TURN_RAD_S = np.radians([0.2, -1.0, 3.0])
 AGE_NS = 20 * NS_PER_MS
+UNIX_NS = 1_764_000_000 * NS_PER_S  # a sender's clock in 2025
+MEMORIES = 10  # of which the first samples, that had nothing so far behind them,
+MEMORY_LEFT = 1e-4  # are left: exp(-10)
 # Rounding of quaternions, 1e-16, over a step of 10 ms and twice as far ahead; and of t_ns.
 EXACT_ARCSEC = 1e-8
 AUTO, RATE = (
@@ -144,11 +147,33 @@ def test_jumps_and_gaps_begin_anew():
     assert all(after.t_ns > before.t_ns for before, after in pairwise(samples))
 
 
-def test_a_steady_turn_has_no_jitter_and_the_mean_of_equal_times_ahead_is_that_time():
+@pytest.mark.parametrize("steps_ahead", [0, 1, 3])
+def test_a_steady_turn_has_no_jitter_and_is_looked_at_as_far_ahead_as_frames_predict(steps_ahead):
     """Of a stream that nobody predicts yet, each sample is ahead of the one before by the step."""
-    damping = _Damping()
     step_ns = 10 * NS_PER_MS
-    for k in range(40):
+    damping = _Damping()
+    damping.usual_s = steps_ahead * step_ns / NS_PER_S
+    for k in range(round(MEMORIES * MEMORY_S * NS_PER_S / step_ns)):
         damped = damping.add(k * step_ns, (0.3, -0.2, 1.0), (3e-3, -2e-3, 0.01))
         assert damped.excess == pytest.approx((0, 0, 0), abs=1e-12)
-    assert damped.ahead_s == pytest.approx(step_ns / NS_PER_S, rel=1e-12)
+    ahead_s = max(steps_ahead, 1) * step_ns / NS_PER_S
+    assert damped.ahead_s == pytest.approx(ahead_s, rel=MEMORY_LEFT)
+
+
+@pytest.mark.parametrize("policy", [AUTO, RATE])
+def test_only_differences_of_the_senders_time_count(policy):
+    """A stream of any epoch is predicted to the last bit as one that begins at 0."""
+    rng = np.random.default_rng(2)
+    timelines = [Timeline(policy), Timeline(policy)]
+    for sample in steady(seconds=0.3):
+        rate = TURN_RAD_S + rng.normal(0, math.radians(0.1), 3)
+        predicted = []
+        for begin_ns, timeline in zip((0, UNIX_NS), timelines, strict=True):
+            t_ns = begin_ns + sample.t_ns
+            timeline.add(replace(sample, t_ns=t_ns, rate_cam_rad_s=rate))
+            attitude = timeline.at(t_ns + AGE_NS)
+            assert attitude is not None
+            between = timeline.at(t_ns - NS_PER_MS)
+            assert between is not None
+            predicted.append((attitude.q_icrs_to_cam, between.q_icrs_to_cam))
+        assert np.array_equal(*predicted)

@@ -22,6 +22,7 @@ from hilstar.server.open_link import open_link
 from tests.support.benches import SMALL_BENCH
 from tests.support.senders import free_port, packet
 from tests.support.waiting import PATIENCE_S
+from tests.support.wire.ptys import serial_line
 
 # Three products of float64 rotations; a packet's rate is float32.
 ROUNDING, RATE_ROUNDING = 1e-14, 1e-7
@@ -104,18 +105,13 @@ def test_a_packet_of_each_convention_over_udp_and_serial(convention):
         arrival = heard(link)
         assert arrival.raw == raw
         assert_is_truth(arrival.event)
-    master, slave = os.openpty()
-    try:
-        with open_link(
-            config_with(convention, f'source = "serial"\nport = "{os.ttyname(slave)}"'), None
-        ) as link:
-            os.write(master, b"\0" + cobs.encode(raw) + b"\0")
+    with serial_line() as (device, name):
+        config = config_with(convention, f'source = "serial"\nport = "{name}"')
+        with open_link(config, None) as link:
+            os.write(device, b"\0" + cobs.encode(raw) + b"\0")
             arrival = heard(link)
             assert cobs.decode(arrival.raw) == raw
             assert_is_truth(arrival.event)
-    finally:
-        os.close(master)
-        os.close(slave)
 
 
 @pytest.mark.parametrize("convention", CONVENTIONS, ids=str)

@@ -13,24 +13,14 @@ import pytest
 
 from hilstar.attitude.wire.packet import AttitudeSample, TimeReply, decode, encode, framed
 from tests.support.benches import ROOT
-from tests.support.waiting import PATIENCE_S
+from tests.support.compilers import STRICT_CPP, compiled
 
 FOLDER = ROOT / "firmware_protocol"
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())
 # What the types cannot hold: flags that nobody knows, and a rate that is not valid.
 UNHELD = {"all flags, known and unknown", "a rate that is not valid is not looked at"}
 ERRORS = {"format": -1, "crc": -2, "nan": -3, "norm": -4}
-COMPILER = [
-    "g++",
-    "-std=c++17",
-    "-Wall",
-    "-Wextra",
-    "-Werror",
-    "-pedantic",
-    "-Wconversion",
-    "-Wshadow",
-    "-fno-exceptions",
-]
+COMPILER = ["g++", "-std=c++17", *STRICT_CPP]
 SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 
 
@@ -38,12 +28,7 @@ SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
 def driver(tmp_path_factory) -> Path:
     target = tmp_path_factory.mktemp("cpp") / "driver"
     source = Path(__file__).parent / "cpp_driver.cpp"
-    command = [*COMPILER, *SANITIZERS, "-I", FOLDER, source, "-o", target]
-    result = subprocess.run(
-        command, capture_output=True, text=True, timeout=PATIENCE_S, check=False
-    )
-    assert (result.returncode, result.stderr) == (0, "")
-    return target
+    return compiled(target, *COMPILER, *SANITIZERS, "-I", FOLDER, source)
 
 
 def driven(driver: Path, lines: list[str]) -> list[list[str]]:

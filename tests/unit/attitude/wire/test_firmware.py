@@ -17,14 +17,15 @@ from cobs import cobs
 
 from hilstar.attitude.wire.packet import DELIMITER, MAX_FRAME_BYTES, TimeRequest, frame
 from tests.support.benches import ROOT
+from tests.support.compilers import STRICT, compiled
 from tests.support.waiting import PATIENCE_S
 
 FOLDER = ROOT / "firmware_protocol"
+HEADER = ("-I", FOLDER)
 VECTORS = json.loads((FOLDER / "vectors.json").read_text())
 ACCEPTED = [vector for vector in VECTORS if "refused" not in vector]
 REFUSED = [vector for vector in VECTORS if "refused" in vector]
 SIZES = {1: 64, 2: 20, 3: 36, 4: 40, 5: 68}
-STRICT = ["-Wall", "-Wextra", "-Werror", "-pedantic"]
 C99 = ["gcc", "-std=c99", *STRICT, "-Wconversion", "-Wshadow"]
 CPP = ["g++", "-x", "c++", *STRICT, "-Wconversion", "-Wshadow"]
 SANITIZED = [*C99, "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
@@ -55,14 +56,6 @@ int l(hilstar_decoder *decoder, uint8_t byte) { return hilstar_push(decoder, byt
 """
 
 
-def compiled(command: list[str], source: Path, target: Path, *more: str) -> Path:
-    line = [*command, "-I", str(FOLDER), str(source), "-o", str(target), *more]
-    result = subprocess.run(line, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
-    assert result.returncode == 0, result.stderr
-    assert result.stderr == ""
-    return target
-
-
 def driven(driver: Path, lines: list[str]) -> list[str]:
     """The driver's answers, one a line."""
     text = "".join(line + "\n" for line in lines)
@@ -77,7 +70,7 @@ def driven(driver: Path, lines: list[str]) -> list[str]:
 
 @pytest.fixture(scope="module")
 def sanitized(tmp_path_factory) -> Path:
-    return compiled(SANITIZED, DRIVER, tmp_path_factory.mktemp("firmware") / "sanitized")
+    return compiled(tmp_path_factory.mktemp("firmware") / "sanitized", *SANITIZED, *HEADER, DRIVER)
 
 
 @pytest.fixture(scope="module", params=["C99", "C++11", "C++20"])
@@ -85,7 +78,7 @@ def driver(request, tmp_path_factory, sanitized) -> Path:
     if request.param == "C99":
         return sanitized
     target = tmp_path_factory.mktemp("firmware") / request.param
-    return compiled([*CPP, f"-std={request.param.lower()}", "-O2"], DRIVER, target)
+    return compiled(target, *CPP, f"-std={request.param.lower()}", "-O2", *HEADER, DRIVER)
 
 
 def bits(vector: dict) -> list[int]:
@@ -315,7 +308,8 @@ def code_bytes(tmp_path: Path, compiler: list[str], size: str) -> int:
     """Code and constants of all the header's functions, compiled for size."""
     source = tmp_path / "every.c"
     source.write_text(EVERY_FUNCTION)
-    target = compiled([*compiler, "-std=c99", *STRICT, "-Os", "-c"], source, tmp_path / "every.o")
+    command = (*compiler, "-std=c99", *STRICT, "-Os", "-c", *HEADER, source)
+    target = compiled(tmp_path / "every.o", *command)
     table = subprocess.run(
         [size, str(target)], capture_output=True, text=True, timeout=PATIENCE_S, check=True
     ).stdout

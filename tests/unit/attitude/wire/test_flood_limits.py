@@ -7,7 +7,6 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-import tty
 from dataclasses import replace
 
 import numpy as np
@@ -38,6 +37,7 @@ from hilstar.basics.units import NS_PER_S
 from hilstar.server.sender import SerialSender
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import PATIENCE_S
+from tests.support.wire.ptys import serial_line
 from tests.support.wire.samples import sample
 
 GROWN_BYTES = 100_000_000
@@ -68,6 +68,16 @@ def test_a_burst_passes_and_a_flood_does_not():
     assert notices.counts() == {"flood": 1}
     clock.work(OVER_NS)
     assert gate.newest(burst, plain) == burst
+
+
+@pytest.mark.parametrize("sender", [0, 1, 2, 4, 253])
+@pytest.mark.parametrize("sequence", [0, 1, 2, 255, 256, 2**16, 2**32 - 1])
+def test_a_jump_is_seen_undecoded_whatever_else_a_frame_has(sender, sequence):
+    """COBS moves zeros: the bytes about the flags depend on what follows them."""
+    for jump in (False, True):
+        jumped = replace(sample(7), sequence=sequence, discontinuity=jump, sender=sender)
+        assert declares_discontinuity(encode(jumped)) == jump
+        assert frame_declares_discontinuity(framed(encode(jumped))[:-1]) == jump
 
 
 def test_the_newest_whole_jump_that_is_passed_over_is_taken_in_every_form():
@@ -101,39 +111,35 @@ def test_a_frame_of_which_the_end_comes_after_a_flood_is_taken():
 
 
 def test_a_line_of_short_junk_is_read_at_a_bounded_rate_and_a_good_frame_after_it_is_taken():
-    master, slave = os.openpty()
-    tty.setraw(slave)
-    os.set_blocking(master, False)
     clock = FakeClock()
-    with SerialLink(os.ttyname(slave), 921_600, clock=clock) as link:
+    with (
+        serial_line() as (device, name),
+        SerialLink(name, 921_600, clock=clock) as link,
+    ):
+        os.set_blocking(device, False)
         begin_ns, events, sent = clock.now_ns(), 0, 0
         while clock.now_ns() - begin_ns < NS_PER_S // 2 or link.link_counts.flooded <= 1000:
             with contextlib.suppress(BlockingIOError):
-                sent += os.write(master, b"\x55\0" * 2000)
+                sent += os.write(device, b"\x55\0" * 2000)
             events += len(link.receive(1))
             clock.work(NS_PER_S // 1000)
         assert sent > 2 * events
         assert events < MAX_BURST + MAX_PACKETS_PER_S * (clock.now_ns() - begin_ns) / NS_PER_S
         while link.receive(20):
             pass
-        os.write(master, FRAME)
+        os.write(device, FRAME)
         assert [type(arrival.event) for arrival in link.receive(1000)] == [AttitudeSample]
-    os.close(master)
-    os.close(slave)
 
 
 def test_a_line_that_is_not_read_blocks_neither_a_write_nor_the_end():
-    master, slave = os.openpty()
-    tty.setraw(slave)
     begin_s = time.monotonic()
-    with SerialSender(os.ttyname(slave), 921_600) as line:
-        while line.send_bytes(b"\x55" * 4096):
-            assert time.monotonic() - begin_s < PATIENCE_S
-        assert not line.send_bytes(b"\x55" * 4096)
-        end_s = time.monotonic()
-    assert time.monotonic() - end_s < PATIENCE_S
-    os.close(master)
-    os.close(slave)
+    with serial_line() as (_, name):
+        with SerialSender(name, 921_600) as line:
+            while line.send_bytes(b"\x55" * 4096):
+                assert time.monotonic() - begin_s < PATIENCE_S
+            assert not line.send_bytes(b"\x55" * 4096)
+            end_s = time.monotonic()
+        assert time.monotonic() - end_s < PATIENCE_S
 
 
 @pytest.mark.parametrize("kind", ["pipe", "file", "directory", "zero"])

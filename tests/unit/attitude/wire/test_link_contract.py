@@ -37,6 +37,7 @@ from hilstar.attitude.wire.packet import (
 from hilstar.attitude.wire.roads import LinkCounts, RawMessage
 from hilstar.attitude.wire.source import Mounting
 from hilstar.attitude.wire.udp import UdpLink
+from hilstar.attitude.wire.zmq_links import FedDecoder
 from hilstar.basics.notices import Notices
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import wait_for
@@ -318,6 +319,17 @@ def test_of_the_messages_in_a_chunk_only_the_last_may_not_have_waited():
         chunk = RawMessage(70, [b"ab"], 50, timely)
         waited_ns = [message.waited_ns for message in pieces(chunk, [b"a", b"b"])]
         assert waited_ns == [20, 0 if timely else 20]
+
+
+def test_a_fed_message_has_the_time_that_stands_before_it_and_any_other_its_own():
+    """A part before a packet that is no time of 64 bits, little-endian, is a sender's topic."""
+    packet = attitude_packet(3, jump=False)
+    fed = [(-700).to_bytes(8, "little", signed=True), packet]
+    others = [[packet], [b"topic", packet], [b"", packet], [*fed, packet]]
+    messages = [RawMessage(900, parts) for parts in (fed, *others)]
+    arrivals = FedDecoder().arrivals(messages)
+    assert [arrival.host_ns for arrival in arrivals] == [-700, 900, 900, 900, 900]
+    assert all(isinstance(arrival.event, AttitudeSample) for arrival in arrivals)
 
 
 @pytest.mark.parametrize("kind", [SerialFar, Nasa42Far], ids=["serial", "42"])

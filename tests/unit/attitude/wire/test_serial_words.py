@@ -1,42 +1,30 @@
 """What is said of a serial line whose bytes are no packets."""
 
 import os
-import pty
 import time
-import tty
-from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from hilstar.attitude.wire.likeness import MAX_LOOKED_AT
 from hilstar.attitude.wire.packet import Refusal
 from hilstar.attitude.wire.roads import RawMessage
-from hilstar.attitude.wire.serial_link import SerialApart, SerialDecoder, SerialLink
+from hilstar.attitude.wire.serial_link import SerialApart, SerialDecoder, SerialLink, read_lines
 from hilstar.basics.errors import InputError
+from hilstar.basics.units import NS_PER_S
 from hilstar.server.open_link import first_attitude
+from tests.support.fake_clock import FakeClock
 from tests.support.senders import packet
+from tests.support.wire.ptys import serial_line
 
 BAUD = 115_200
 WITHIN_S = 20.0
 POLL_MS = 50
 
 
-@contextmanager
-def line() -> Iterator[tuple[int, str]]:
-    master, slave = pty.openpty()
-    tty.setraw(master)
-    tty.setraw(slave)
-    try:
-        yield master, os.ttyname(slave)
-    finally:
-        os.close(master)
-        os.close(slave)
-
-
 @pytest.mark.parametrize("kind", [SerialLink, SerialApart])
 def test_a_text_shorter_than_a_frame_is_told_as_text(kind: type[SerialLink]) -> None:
-    with line() as (master, name), kind(name, BAUD) as link:
+    with serial_line() as (master, name), kind(name, BAUD) as link:
         assert link.trouble == ""
         os.write(master, b"tick 12\r\n")
         end_s = time.monotonic() + WITHIN_S
@@ -47,7 +35,7 @@ def test_a_text_shorter_than_a_frame_is_told_as_text(kind: type[SerialLink]) -> 
 
 
 def test_the_wait_for_an_attitude_says_what_came_instead() -> None:
-    with line() as (master, name), SerialLink(name, BAUD) as link:
+    with serial_line() as (master, name), SerialLink(name, BAUD) as link:
         os.write(master, b"tick 12\r\n")
         with pytest.raises(InputError, match="text, 'tick 12") as refused:
             first_attitude(link, 0.5)
@@ -55,7 +43,7 @@ def test_the_wait_for_an_attitude_says_what_came_instead() -> None:
 
 
 def test_a_long_text_is_a_refused_message() -> None:
-    with line() as (master, name), SerialLink(name, BAUD) as link:
+    with serial_line() as (master, name), SerialLink(name, BAUD) as link:
         os.write(master, b"RA 84.057 Dec -1.200\r\n" * 20)
         with pytest.raises(InputError, match=r"no 0x00 within \d+ bytes: text, 'RA 84.057"):
             first_attitude(link, 0.5)
@@ -63,7 +51,7 @@ def test_a_long_text_is_a_refused_message() -> None:
 
 def test_a_silent_line_is_a_sender_that_did_not_start() -> None:
     with (
-        line() as (_, name),
+        serial_line() as (_, name),
         SerialLink(name, BAUD) as link,
         pytest.raises(InputError, match="start the sender"),
     ):
@@ -78,3 +66,27 @@ def test_a_bare_packet_is_named_whatever_came_on_the_line_before() -> None:
     event = decoder.event(last.parts[0])
     assert isinstance(event, Refusal)
     assert "a bare packet" in event.detail
+
+
+@pytest.mark.parametrize("baud", [9600, 115_200])
+def test_a_line_s_time_is_that_of_its_first_bit(baud: int) -> None:
+    """Ten bits a byte and the end of the line: a clock that stands says when the last has come."""
+    with serial_line() as (master, name):
+        lines = read_lines(name, baud, 1.0, FakeClock(5 * NS_PER_S))
+
+        def times_ns() -> dict[bytes, int]:
+            came: dict[bytes, int] = {}
+            while not {b"", b"light 12"} <= came.keys():
+                host_ns, text = next(lines)
+                came[text] = host_ns
+            lines.close()
+            return came
+
+        with ThreadPoolExecutor(1) as pool:
+            reading = pool.submit(times_ns)
+            while not reading.done():  # what comes before the port is open is passed over
+                os.write(master, b"\nlight 12\n")
+                time.sleep(POLL_MS / 1000)
+    by_text = reading.result()
+    assert by_text[b"light 12"] == 5 * NS_PER_S - 9 * 10 * NS_PER_S // baud
+    assert by_text[b""] == 5 * NS_PER_S - 10 * NS_PER_S // baud

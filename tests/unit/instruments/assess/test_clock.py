@@ -115,6 +115,22 @@ def test_a_coarse_offset_is_what_has_to_be_added_to_the_telemetry_s_times():
     assert np.abs(speed_offsets(RUN, tau_s, q) + 7.3).min() < 0.6
 
 
+def test_few_answers_that_agree_better_do_not_outvote_many():
+    """A tracker on its side about the axis of a steady turn: at any offset its answers agree among
+    themselves, and at 45 s, where a quarter of them are compared, with the run besides.
+    """
+    rate_rad_s = np.radians(1.0)
+    t_s = START_S + np.arange(0.0, SECONDS, ANSWER_S)
+    turn_rad = rate_rad_s * (RUN_S - START_S)
+    run = Commanded(RUN_S, scalar_first(Rotation.from_rotvec(turn_rad[:, None] * [0, 0, 1])))
+    on_its_side_rad = rate_rad_s * (t_s - START_S) + np.radians(45.0)
+    q = scalar_first(Rotation.from_rotvec(on_its_side_rad[:, None] * [0, 0, 1]))
+    coarse = coarse_offset(run, t_s, q)
+    assert coarse is not None
+    assert coarse.compared >= 0.8 * len(t_s)
+    assert abs(coarse.offset_s) <= 0.2 * SECONDS
+
+
 def test_parts_of_a_field_that_differ_widen_a_sigma_and_never_narrow_it(rng):
     """Pulls that are the same in each of twenty parts, or that cancel in them."""
     parts, answers = 20, 50

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.interpolate import RegularGridInterpolator
 
 from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.certify.effects import Effect
+from hilstar.instruments.certify.estimates import surface
 from hilstar.instruments.certify.model import Deviations, Figures, ReferenceStar
-from hilstar.instruments.certify.read_effects import _of_delays
+from hilstar.instruments.certify.read_effects import _of_delays, _places_in, map_at
 from hilstar.instruments.certify.stated_effects import (
     DRIFTS,
     of_drift,
@@ -316,3 +318,50 @@ def test_dimmer_levels_and_places_add_up_in_magnitudes_and_late_light_lags(tmp_p
         assert figure["place_along", star, "arcsec"] == pytest.approx(-0.5 * 3600 * 0.002)
         assert figure["place_across", star, "arcsec"] == 0.0
     assert figure["latency", 0, "ms"] == pytest.approx(9.5)
+
+
+def falling_light(x_px, y_px):
+    """The log of a screen's light, which falls with the square of the distance from a corner."""
+    return -0.3 * (x_px / WIDTH_PX) ** 2 - 0.2 * (y_px / HEIGHT_PX) ** 2
+
+
+def test_the_light_at_a_star_is_half_way_between_a_smooth_screen_and_a_map_of_16_by_9_fields():
+    """Relative to the square where light was read; the map is SciPy's, linear between its
+    fields' middles.
+    """
+    x_px, y_px = (
+        grid.ravel() for grid in np.meshgrid(np.arange(60, 1900, 90), np.arange(40, 1060, 90))
+    )
+    dots = surface(x_px, y_px, falling_light(x_px, y_px)[:, None], (2,), (WIDTH_PX, HEIGHT_PX))
+    columns_px = (np.arange(16) + 0.5) * WIDTH_PX / 16 - 0.5
+    rows_px = (np.arange(9) + 0.5) * HEIGHT_PX / 9 - 0.5
+    fields = falling_light(columns_px[:, None], rows_px)
+    linear = RegularGridInterpolator((columns_px, rows_px), fields)
+    star_x_px, star_y_px = np.array(PLACES).T
+    left, top, side = 1100, 300, 70
+    square = np.meshgrid(left + np.arange(4.5, side, 10), top + np.arange(4.5, side, 10))
+
+    at_stars = map_at(dots, (left, top, side), star_x_px, star_y_px)
+
+    smooth = falling_light(star_x_px, star_y_px) - falling_light(*square).mean()
+    square_px = np.rint(np.array(square).reshape(2, -1).T)
+    of_map = linear(np.array(PLACES)) - linear(square_px).mean()
+    assert at_stars.smooth == pytest.approx(smooth, abs=1e-9)
+    assert np.abs(smooth - of_map).max() > 1e-4
+    assert at_stars.midway == pytest.approx((smooth + of_map) / 2, abs=1e-6)
+
+
+@pytest.mark.parametrize("square", [(100, 40, 1), (100, 40, 2), (1500, 7, 301)])
+def test_places_in_a_square_are_even_over_its_pixels(square):
+    """From the first pixel's outer edge to the last one's: pixel k reaches from k - 0.5 to
+    k + 0.5, so that the mean place and its variance are those of an even square.
+    """
+    left, top, side = square
+    x_px, y_px = _places_in(square)
+    for places_px, first in ((x_px, left), (y_px, top)):
+        assert places_px.mean() == pytest.approx(first + (side - 1) / 2, abs=1e-9)
+        assert first - 0.5 < places_px.min() and places_px.max() < first + side - 0.5
+    # of n even steps over a side: side^2 / 12 less 1 / n^2 of it
+    steps = math.isqrt(len(x_px))
+    assert x_px.var() == pytest.approx(side**2 / 12 * (1 - 1 / steps**2), rel=1e-9)
+    assert (x_px @ y_px) / len(x_px) == pytest.approx(x_px.mean() * y_px.mean())

@@ -23,6 +23,7 @@ from hilstar.tracker.settings import DetectorSettings
 from tests.support.benches import ORION_Q, bench_text
 from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
+from tests.support.spectra import bump, channel_keys, write_channels, write_panel
 from tests.unit.server.bench.test_channels import NM, PASSBANDS, integrals
 
 PATTERNS = ("rggb", "bggr", "grbg", "gbrg")
@@ -36,22 +37,14 @@ BRIGHTEST = 5
 
 @pytest.fixture(scope="module")
 def curves(tmp_path_factory):
-    made = tmp_path_factory.mktemp("mosaic")
-    for name, value in PASSBANDS.items():
-        rows = "\n".join(f"{nm:g},{v:.6f}" for nm, v in zip(NM, value, strict=True))
-        (made / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}\n")
-    return made
+    folder = tmp_path_factory.mktemp("mosaic")
+    write_channels(folder, NM, PASSBANDS)
+    return folder
 
 
 def mosaic_bench(curves, bayer, *changes):
-    keys = {
-        "quantum_efficiency": None,
-        "psf_sigma_px": [SIGMA_PX, SIGMA_PX],
-        "exposure_s": EXPOSURE_S,
-    }
-    keys |= {f"quantum_efficiency_{name}": f"{name}.csv" for name in "rgb"} | {
-        "resolution_px": [1024, 1024]
-    }
+    keys = channel_keys("rgb") | {"psf_sigma_px": [SIGMA_PX, SIGMA_PX], "exposure_s": EXPOSURE_S}
+    keys |= {"resolution_px": [1024, 1024]}
     detector = {
         "bits": 16,
         "gain_e_per_dn": GAIN,
@@ -130,13 +123,8 @@ def test_noise_comes_after_the_mosaic_and_zodiacal_light_has_each_channels_own(c
 
 
 def before_display(curves, colour, **sky):
-    power = [
-        np.exp(-(((NM - peak) / width) ** 2)) for peak, width in ((625, 40), (530, 45), (460, 30))
-    ]
-    lines = "".join(
-        f"{nm:g},{r:.6g},{g:.6g},{b:.6g}\n" for nm, r, g, b in zip(NM, *power, strict=True)
-    )
-    (curves / "oled.csv").write_text(f"wavelength_nm,r,g,b\n{lines}")
+    power = [bump(625, 40, NM), bump(530, 45, NM), bump(460, 30, NM)]
+    write_panel(curves / "oled.csv", power, NM)
     tracker = {
         "focal_length_mm": 25,
         "resolution_px": [400, 400],

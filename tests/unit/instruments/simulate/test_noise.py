@@ -37,6 +37,7 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
 from tests.support.psfs import coma, sampled
 from tests.support.psfs import gaussian as gaussian_light
+from tests.support.spectra import bump, write_channels
 from tests.support.tables import csv_rows
 
 QUIET = DetectorSettings(gain_e_per_dn=0.3, full_well_e=1e6, bits=16)  # rounding: 0.0075 e-^2
@@ -407,12 +408,8 @@ def test_a_mosaics_channels_have_their_own_noise_and_its_superpixels_find_what_t
     Gaussians' of width 0.55 px.
     """
     nm, peaks = np.arange(400.0, 721.0, 20.0), {"r": 620.0, "g": 540.0, "b": 460.0}
-    for name, peak in peaks.items():
-        rows = "".join(f"{at:g},{math.exp(-(((at - peak) / 60) ** 2)):.6f}\n" for at in nm)
-        (tmp_path / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}")
-    keys = {"quantum_efficiency": None} | {
-        f"quantum_efficiency_{name}": f"{name}.csv" for name in peaks
-    }
+    curves = {name: bump(peak, 60, nm) for name, peak in peaks.items()}
+    keys = write_channels(tmp_path, nm, curves)
     detector = {
         "bayer": "rggb",
         "read_noise_e": 9,

@@ -9,7 +9,14 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.optics.glass.codev_file import read_codev
-from tests.support.lenses import focal_length_mm, lit_share, real_rays, rms_radius_um, seq
+from tests.support.lenses import (
+    focal_length_mm,
+    lit_share,
+    numbers_of,
+    real_rays,
+    rms_radius_um,
+    seq,
+)
 from tests.support.refusals import refusal
 
 FOCAL_MM, TOLERANCE_MM = 100.0308, 2e-4  # as in test_zemax_file.py
@@ -35,6 +42,39 @@ def test_units_are_scaled(dim, mm):
     assert lens.pupil == pytest.approx(20)
     assert lens.surfaces[0].polynomial[3] == pytest.approx(-7e-7)
     assert lens.surfaces[0].apertures[0].half_mm[0] == pytest.approx(8)
+
+
+def seq_of_every_length(dim: str, mm: float, curvatures: bool) -> bytes:
+    """A .seq of each statement that is a length, or a power of one, in a unit of so many mm."""
+    first, second = (mm / 50, -mm / 80) if curvatures else (50 / mm, -80 / mm)
+    terms = "; ".join(f"{term} {1e-9 * mm ** (3 + 2 * k)!r}" for k, term in enumerate("ABCDEFGHJ"))
+    text = f"""RDM {"N" if curvatures else "Y"}
+DIM {dim}
+EPD {20 / mm!r}
+WL 550
+XIM 0 {2 / mm!r}
+YIM 0 {-3 / mm!r}
+SO 0 1e11
+S {first!r} {4 / mm!r} 1.5:60
+STO
+ASP; K -0.5
+{terms}
+CIR {10 / mm!r}; CIR OBS {1 / mm!r}
+ADX {0.5 / mm!r}; ADY {-0.25 / mm!r}
+S {second!r} {60 / mm!r}
+XDE {1.5 / mm!r}; YDE {-2.5 / mm!r}; ZDE {0.75 / mm!r}; ADE 10
+REX {8 / mm!r}; REY {7 / mm!r}
+SI 0 0"""
+    return text.encode()
+
+
+@pytest.mark.parametrize("curvatures", [False, True], ids=["radii", "curvatures"])
+@pytest.mark.parametrize(("dim", "mm"), [("C", 10.0), ("I", 25.4)])
+def test_every_length_of_a_lens_is_scaled(dim, mm, curvatures):
+    in_mm = numbers_of(read_codev(seq_of_every_length("M", 1.0, curvatures)))
+    assert {20.0, -3.0, 1e-9, 10.0, -0.25, 1.5, -2.5, 7.0} <= set(in_mm)
+    lens = read_codev(seq_of_every_length(dim, mm, curvatures))
+    assert numbers_of(lens) == pytest.approx(in_mm, rel=1e-12)
 
 
 def test_no_unit_is_mm_and_said():

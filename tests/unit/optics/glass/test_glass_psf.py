@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.optics.glass.glass_psf import GlassPsf, glass_psf
+from hilstar.optics.glass.glass_psf import MIN_WIDTH_PX, GlassPsf, _adaptive_spread, glass_psf
 from hilstar.optics.glass.psf_file import Stack, facts_of, glass_of
+from hilstar.optics.psf import PIXEL_VARIANCE
 from tests.support.claims import holds
 from tests.support.glass import HALF_PX, SIDE_PX, illumination, moments, profile, stack, truth
 
@@ -19,6 +20,8 @@ from tests.support.glass import HALF_PX, SIDE_PX, illumination, moments, profile
 # between them.
 FLUX, CENTROID_PX, SECOND = 1e-3, 3e-3, 1e-2
 MEAN = np.array([0.2, 0.3, 0.3, 0.2])
+# Each round halves the distance of 1 / w from 1 / s: after 20, w is within s^2 / 2^20 of s.
+SPREAD_PX2 = 1e-4
 
 
 def star_errors(psf: GlassPsf, x_px, y_px, shares, focus_um=0.0) -> np.ndarray:
@@ -203,3 +206,20 @@ def test_a_wider_glass_is_its_basis_blurred(glass):
     )
     assert after[3:] - before[3:] == pytest.approx([0.49, 0.49], abs=5e-3)
     assert after[:3] == pytest.approx(before[:3], abs=5e-4)
+
+
+def test_the_spread_of_a_gaussian_is_its_own_and_that_of_a_line_has_a_pixel_s_width():
+    """Beside a line's own variance s the smallest width l^2 is added in each round, which ends
+    where w = 2 s w / (s + w) + l^2.
+    """
+    y, x = np.mgrid[-20:21, -20:21].reshape(2, -1)
+    off = np.stack([x, y], axis=1).astype(np.float64)
+    own = np.array([[8.0, 1.6], [1.6, 3.0]])
+    light = np.exp(-0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(own), off))
+    assert _adaptive_spread(light, off) == pytest.approx(own, abs=SPREAD_PX2)
+    variance = 4.0
+    least = PIXEL_VARIANCE + MIN_WIDTH_PX**2
+    line = np.exp(-0.5 * x**2 / variance) * (y == 0)
+    half = (variance + least) / 2
+    long = half + np.sqrt(half**2 + variance * least)
+    assert _adaptive_spread(line, off) == pytest.approx(np.diag([long, least]), abs=SPREAD_PX2)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.optics.glass.zemax_file import read_zemax
-from tests.support.lenses import focal_length_mm, lit_share, zmx
+from tests.support.lenses import focal_length_mm, lit_share, numbers_of, zmx
 
 # of the doublet, by the own trace in `tests/support/lenses.py`; its maker states 100 mm
 FOCAL_MM = 100.0308
@@ -25,7 +25,8 @@ def test_the_doublet_has_its_focal_length():
 
 
 @pytest.mark.parametrize(
-    ("unit", "mm"), [("MM", 1.0), ("IN", 25.4), ("CM", 10.0), ("METER", 1000.0), ("in", 25.4)]
+    ("unit", "mm"),
+    [("MM", 1.0), ("IN", 25.4), ("CM", 10.0), ("METER", 1000.0), ("M", 1000.0), ("in", 25.4)],
 )
 def test_units_are_scaled(unit, mm):
     """Lengths, curvatures, asphere terms and apertures of one lens are the same in every unit."""
@@ -39,6 +40,63 @@ def test_units_are_scaled(unit, mm):
     assert lens.surfaces[0].polynomial[1] == pytest.approx(1e-3)
     assert lens.surfaces[0].polynomial[3] == pytest.approx(-7e-7)
     assert lens.surfaces[0].apertures[0].half_mm[0] == pytest.approx(8)
+
+
+def zmx_of_every_length(unit: str, mm: float) -> bytes:
+    """A .zmx of each statement that is a length, or a power of one, in a unit of so many mm."""
+    system = f"""MODE SEQ
+UNIT {unit} X W X CM MR CPMM
+FLOA
+FTYP 3 0 2 1 0 0 0
+XFLN 0 {2 / mm!r}
+YFLN 0 {-3 / mm!r}
+WAVM 1 0.55 1
+SURF 0
+  DISZ INFINITY
+SURF 1
+  STOP
+  TYPE EVENASPH
+  CURV {mm / 50!r}
+  CONI -0.5
+  PARM 1 {1e-3 * mm!r}
+  PARM 2 {2e-5 * mm**3!r}
+  PARM 8 {3e-19 * mm**15!r}
+  DIAM {11 / mm!r} 1
+  CLAP {1 / mm!r} {10 / mm!r}
+  OBDC {0.5 / mm!r} {-0.25 / mm!r}
+  DISZ {4 / mm!r}
+SURF 2
+  TYPE COORDBRK
+  PARM 1 {1.5 / mm!r}
+  PARM 2 {-2.5 / mm!r}
+  PARM 3 10
+  DISZ {7 / mm!r}
+SURF 3
+  TYPE ODDASPHE
+  CURV {-mm / 80!r}
+  PARM 1 0.01
+  PARM 2 {2e-4 * mm!r}
+  PARM 3 {3e-6 * mm**2!r}
+  PARM 8 {4e-16 * mm**7!r}
+  SPID {2 / mm!r} 3
+  ELOB {6 / mm!r} {5 / mm!r}
+  DISZ {9 / mm!r}
+SURF 4
+  TYPE PARAXIAL
+  PARM 1 {60 / mm!r}
+  SQAP {8 / mm!r} {7 / mm!r}
+  DISZ {60 / mm!r}
+SURF 5
+  TYPE STANDARD
+  DISZ 0"""
+    return system.encode()
+
+
+@pytest.mark.parametrize(("unit", "mm"), [("CM", 10.0), ("IN", 25.4), ("METER", 1000.0)])
+def test_every_length_of_a_lens_is_scaled(unit, mm):
+    in_mm = numbers_of(read_zemax(zmx_of_every_length("MM", 1.0)))
+    assert {22.0, 60.0, 2e-5, 3e-19, 0.01, 4e-16, -0.25, 8.0} <= set(in_mm)
+    assert numbers_of(read_zemax(zmx_of_every_length(unit, mm))) == pytest.approx(in_mm, rel=1e-12)
 
 
 @pytest.mark.parametrize("far", ["INFINITY", "1.0E+010", "1e10", "1E+13", "inf"])
@@ -88,10 +146,27 @@ def test_apertures_let_through_their_share(line, share):
     assert lit_share(read_zemax(zmx(more={1: [line]}))) == pytest.approx(share, abs=LIT_TOLERANCE)
 
 
-def test_a_moved_obstruction_is_moved():
-    lens = read_zemax(zmx(more={1: ["  OBSC 0 5 0", "  OBDC 12 0"]}))
+@pytest.mark.parametrize(
+    ("line", "centre_mm"),
+    [
+        ("  OBSC 0 5 0", (12.0, -3.0)),
+        ("  CLAP 0 5 0", (12.0, -3.0)),
+        ("  SQAP 5 5 0", (12.0, -3.0)),
+        ("  FLAP 0 5 0", (0.0, 0.0)),  # the surface's own edge
+    ],
+)
+def test_what_is_beside_the_vertex_is_there(line, centre_mm):
+    """Whether light passes changes at the edge, 5 mm from its centre to either side along x and
+    along y.
+    """
+    lens = read_zemax(zmx(more={1: [line, "  OBDC 12 -3"]}))
     (aperture,) = lens.surfaces[0].apertures
-    assert aperture.passes(0.0, 0.0) and not aperture.passes(9.0, 0.0)
+    within = aperture.passes(*centre_mm)
+    across = np.array([[-4.9, 4.9, 0, 0], [0, 0, -4.9, 4.9]])
+    x_mm, y_mm = np.array(centre_mm)[:, None] + across
+    assert (aperture.passes(x_mm, y_mm) == within).all()
+    x_mm, y_mm = np.array(centre_mm)[:, None] + across * (5.1 / 4.9)
+    assert (aperture.passes(x_mm, y_mm) != within).all()
 
 
 def test_the_editors_lists_behind_the_lens_are_passed_over():

@@ -34,65 +34,65 @@ def attitude_at(t_s: float) -> np.ndarray:
     return multiply(from_rotation_vector(turn), START)
 
 
+def lit_frame(number: int, q=None, late_ns: int = 0, rate=None) -> LitFrame:
+    """A frame of the run, lit so long after its swap: `q`, or the planted turn's attitude."""
+    swap_ns = number * PERIOD_NS
+    if q is None:
+        q = attitude_at(swap_ns / NS_PER_S)
+    return LitFrame(number, swap_ns, swap_ns + late_ns, q, rate)
+
+
+def lit_at_rest(frames: int) -> LitFrames:
+    """A still sky."""
+    lit = LitFrames(PERIOD_NS)
+    for k in range(frames):
+        lit.add(lit_frame(k, START))
+    return lit
+
+
 def lit_until(t_s: float, **keys) -> LitFrames:
     frames = LitFrames(PERIOD_NS, **keys)
     for k in range(int(t_s * 60)):
-        frames.add(
-            LitFrame(k, k * PERIOD_NS, k * PERIOD_NS + 7, attitude_at(k * PERIOD_NS / NS_PER_S))
-        )
+        frames.add(lit_frame(k, late_ns=7))
+    return frames
+
+
+STEADY_RAD_S = np.radians([0.2, -0.4, 1.0])
+# Frames stand for the time about their moment, and ends of the exposure cut two of them: within
+# 0.01 of a frame's turn of 60 arcsec.
+TURN_ARCSEC = 0.01 * 3600 / 60
+
+
+def lit_in_turn(frames: LitFrames, rate: np.ndarray, late_ns: int = 0, drawn=None) -> LitFrames:
+    """Two seconds of a steady turn, which are drawn with a rate or still."""
+    for k in range(120):
+        q = propagate(START, rate, k * PERIOD_NS / NS_PER_S)
+        frames.add(lit_frame(k, q, late_ns, drawn))
     return frames
 
 
 def test_the_lit_attitude_of_an_exposure_is_that_of_its_middle_for_a_steady_turn():
-    frames, rate = LitFrames(PERIOD_NS), np.radians([0.2, -0.4, 1.0])
-    for k in range(120):
-        frames.add(
-            LitFrame(
-                k,
-                k * PERIOD_NS,
-                k * PERIOD_NS + 7,
-                propagate(START, rate, k * PERIOD_NS / NS_PER_S),
-            )
-        )
-    lit = frames.over(round(1.0 * NS_PER_S), round(1.2 * NS_PER_S))
-    truth = propagate(START, rate, 1.1)
-    # Frames stand for the time about their moment, and ends of the exposure cut two of them: within
-    # 0.01 of a frame's turn.
-    assert np.abs(residual_arcsec(truth, lit.q)).max() < 0.01 * 3600 / 60
-    assert lit.rate_rad_s == pytest.approx(rate, rel=1e-3, abs=1e-7)
+    frames = lit_in_turn(LitFrames(PERIOD_NS), STEADY_RAD_S, late_ns=7)
+    lit = frames.over(NS_PER_S, round(1.2 * NS_PER_S))
+    truth = propagate(START, STEADY_RAD_S, 1.1)
+    assert np.abs(residual_arcsec(truth, lit.q)).max() < TURN_ARCSEC
+    assert lit.rate_rad_s == pytest.approx(STEADY_RAD_S, rel=1e-3, abs=1e-7)
     assert lit.light_ns == round(1.1 * NS_PER_S) + 7
     assert (lit.first, lit.last) == (60, 72)
 
 
-def test_a_screen_that_holds_still_frames_shows_them_half_a_frame_late():
-    frames, rate = LitFrames(PERIOD_NS, centred=False), np.radians([0.0, 1.0, 0.0])
-    for k in range(120):
-        frames.add(
-            LitFrame(
-                k, k * PERIOD_NS, k * PERIOD_NS, propagate(START, rate, k * PERIOD_NS / NS_PER_S)
-            )
-        )
+@pytest.mark.parametrize(
+    ("keys", "in_motion", "late_s"),
+    [({}, False, 0.5 / 60), ({"hold_s": 1 / 60}, True, 0.0)],
+    ids=["still frames are half a frame late", "frames drawn in motion are not"],
+)
+def test_a_screen_that_holds_frames_shows_the_middle_of_their_light(keys, in_motion, late_s):
+    rate = np.radians([0.0, 1.0, 0.0])
+    frames = LitFrames(PERIOD_NS, centred=in_motion, **keys)
+    lit_in_turn(frames, rate, drawn=rate if in_motion else None)
     lit = frames.over(NS_PER_S, round(1.2 * NS_PER_S))
-    assert (
-        np.abs(residual_arcsec(propagate(START, rate, 1.1 - 0.5 / 60), lit.q)).max()
-        < 0.01 * 3600 / 60
-    )
-
-
-def test_frames_drawn_in_motion_have_the_attitude_of_the_middle_of_their_light():
-    frames, rate = LitFrames(PERIOD_NS, hold_s=1 / 60, centred=True), np.radians([0.0, 1.0, 0.0])
-    for k in range(120):
-        frames.add(
-            LitFrame(
-                k,
-                k * PERIOD_NS,
-                k * PERIOD_NS,
-                propagate(START, rate, k * PERIOD_NS / NS_PER_S),
-                rate,
-            )
-        )
-    lit = frames.over(NS_PER_S, round(1.2 * NS_PER_S))
-    assert np.abs(residual_arcsec(propagate(START, rate, 1.1), lit.q)).max() < 0.01 * 3600 / 60
+    truth = propagate(START, rate, 1.1 - late_s)
+    assert np.abs(residual_arcsec(truth, lit.q)).max() < TURN_ARCSEC
 
 
 def test_an_exposure_of_a_dark_or_a_jumping_sky_has_no_attitude():
@@ -100,9 +100,7 @@ def test_an_exposure_of_a_dark_or_a_jumping_sky_has_no_attitude():
     away = from_rotation_vector(np.radians([0.0, 30.0, 0.0]))
     for k in range(60):
         dark.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, None if k > 30 else START))
-        jumping.add(
-            LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START if k < 30 else multiply(away, START))
-        )
+        jumping.add(lit_frame(k, START if k < 30 else multiply(away, START)))
     assert dark.over(0, NS_PER_S // 4) is not None
     assert dark.over(round(0.6 * NS_PER_S), round(0.9 * NS_PER_S)) is None
     assert dark.dark_ns == 28 * PERIOD_NS
@@ -129,9 +127,7 @@ def judged(
         middle_s = 0.2 + i / ANSWER_HZ
         host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
         while k * PERIOD_NS < host_ns:
-            frames.add(
-                LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude_at(k * PERIOD_NS / NS_PER_S))
-            )
+            frames.add(lit_frame(k))
             k += 1
         error = (BIAS_ARCSEC + NOISE_ARCSEC * rng.standard_normal(3)) / ARCSEC_PER_RAD
         if rng.random() < wild:
@@ -193,10 +189,7 @@ def test_a_silent_tracker_is_told_before_its_first_answer():
 
 def judged_at_rest(errors_arcsec, cycle_ns: int) -> AnswerJudge:
     """Answers of a tracker that looks at a still sky, each off by (3,), arcsec, one a cycle."""
-    frames = LitFrames(PERIOD_NS)
-    for k in range(120):
-        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
-    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), lit_at_rest(120))
     for k, error in enumerate(errors_arcsec):
         q = multiply(from_rotation_vector(np.asarray(error) / ARCSEC_PER_RAD), START)
         judge.judge(Answer(NS_PER_S + k * cycle_ns, b"", NS_PER_S, q))
@@ -220,14 +213,9 @@ def test_a_slow_tracker_is_silent_after_five_of_its_own_cycles():
 
 def test_of_more_answers_than_it_keeps_the_newest_count(monkeypatch):
     monkeypatch.setattr(judge_module, "MAX_IN_WINDOW", 100)
-    frames = LitFrames(PERIOD_NS)
-    for k in range(120):
-        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
-    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
-    for k in range(250):
-        error_rad = (1.0 if k < 150 else 2.0) / ARCSEC_PER_RAD
-        turned = multiply(from_rotation_vector(np.array([error_rad, 0.0, 0.0])), START)
-        judge.judge(Answer(NS_PER_S + k * 1_000_000, b"", NS_PER_S, turned))
+    errors_arcsec = np.zeros((250, 3))
+    errors_arcsec[:, 0] = np.where(np.arange(250) < 150, 1.0, 2.0)
+    judge = judged_at_rest(errors_arcsec, 1_000_000)
     figures = judge.figures(2 * NS_PER_S, {})
     assert figures.right == 250 and figures.rate_hz == pytest.approx(1000)
     assert figures.mean_arcsec == pytest.approx([2.0, 0.0, 0.0], abs=1e-3)
@@ -247,10 +235,7 @@ def test_unix_stamps_are_taken_with_the_hosts_stated_error():
 def test_of_more_answers_than_are_kept_those_of_the_last_ones_count(monkeypatch):
     """Ten a second, of which the newest 60 are kept: every second one is right."""
     monkeypatch.setattr(judge_module, "MAX_IN_WINDOW", 60)
-    frames = LitFrames(PERIOD_NS)
-    for k in range(20):
-        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
-    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), frames)
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S, clock="host"), lit_at_rest(20))
     for k in range(100):
         valid = bool(k % 2)  # in a still sky each looks at the same moment
         judge.judge(Answer(k * NS_PER_S // 10, b"", NS_PER_S // 5, START, valid=valid))
@@ -295,7 +280,7 @@ def test_a_trackers_clock_that_is_set_costs_three_answers_at_most():
     for i in range(200):
         middle_ns = NS_PER_S + i * NS_PER_S // 10
         while k * PERIOD_NS < middle_ns + NS_PER_S // 5:
-            frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, START))
+            frames.add(lit_frame(k, START))
             k += 1
         set_ns = 10**18 if 60 <= i < 120 else 0  # forward by thirty years, and back
         verdicts.append(
@@ -321,9 +306,7 @@ def spoilt(kind: str, seed: int) -> tuple[AnswerJudge, list]:
         middle_s = 0.2 + i / ANSWER_HZ
         host_ns = round((middle_s + LATENCY_S + rng.exponential(JITTER_S)) * NS_PER_S)
         while k * PERIOD_NS < host_ns:
-            frames.add(
-                LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, attitude_at(k * PERIOD_NS / NS_PER_S))
-            )
+            frames.add(lit_frame(k))
             k += 1
         error_arcsec = CROSS_ARCSEC * rng.standard_normal(3) * [1.0, 1.0, ROLL_RATIO]
         if kind == "early outlier" and i == 4:

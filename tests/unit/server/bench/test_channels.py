@@ -28,14 +28,15 @@ from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
 from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
+from tests.support.spectra import bump, channel_keys, write_channels
 
 # A Gaussian passband each, in percent at 25 nm from 350 to 1000 nm; the red one sees the near
 # infrared, as silicon does.
 NM = np.arange(350.0, 1001.0, 25.0)
 PASSBANDS = {
-    "r": 0.6 * np.exp(-(((NM - 620) / 50) ** 2)) + 0.2 * (NM > 800),
-    "g": 0.7 * np.exp(-(((NM - 540) / 55) ** 2)),
-    "b": 0.5 * np.exp(-(((NM - 460) / 45) ** 2)),
+    "r": 0.6 * bump(620, 50, NM) + 0.2 * (NM > 800),
+    "g": 0.7 * bump(540, 55, NM),
+    "b": 0.5 * bump(460, 45, NM),
 }
 # Products of two float32 factors and a sum of them in another order: a few steps of 6e-8, of the
 # brightest pixel.
@@ -46,20 +47,13 @@ QUADRATURE = 1e-3  # asked for; the table of the Planck curve is within 1e-6
 @pytest.fixture(scope="module")
 def curves(tmp_path_factory):
     folder = tmp_path_factory.mktemp("curves")
-    for name, value in PASSBANDS.items():
-        rows = "\n".join(f"{nm:g},{v:.6f}" for nm, v in zip(NM, value, strict=True))
-        (folder / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}\n")
+    write_channels(folder, NM, PASSBANDS)
     return folder
 
 
 def channels_bench(curves, channels, *changes):
-    keys = (
-        {"quantum_efficiency": f"{channels}.csv"}
-        if len(channels) == 1
-        else {"quantum_efficiency": None}
-    )
-    if len(channels) > 1:
-        keys |= {f"quantum_efficiency_{name}": f"{name}.csv" for name in channels}
+    alone = {"quantum_efficiency": f"{channels}.csv"}
+    keys = alone if len(channels) == 1 else channel_keys(channels)
     white = {"render": {"flux_at_white_e_per_s": 1e6, "quantisation": "round"}}
     path = curves / "bench.toml"
     path.write_text(bench_text({"tracker": keys}, white, *changes))

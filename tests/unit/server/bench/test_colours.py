@@ -26,10 +26,14 @@ from tests.support.benches import ORION_Q, TWIN, bench_text
 from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
 from tests.support.refusals import refusal
-from tests.unit.display.test_primaries import NM, PANELS, bump, written
+from tests.support.spectra import NM, PANELS, bump, channel_keys, write_channels, write_panel
 
 SENSOR_NM = np.arange(400.0, 721.0, 10.0)
-PASSBANDS = {"r": (620.0, 50.0), "g": (540.0, 55.0), "b": (460.0, 45.0)}
+PASSBANDS = {
+    "r": bump(620, 50, SENSOR_NM),
+    "g": bump(540, 55, SENSOR_NM),
+    "b": bump(460, 45, SENSOR_NM),
+}
 THIRD = 1 / 3
 STRIPES = {
     "rgb-stripe": [(-THIRD, 0), (0, 0), (THIRD, 0)],
@@ -42,17 +46,9 @@ UNCORRECTED_PX = 0.1
 
 
 def bench_path(folder, *changes, channels="rgb", panel="oled"):
-    written(folder / "panel.csv", PANELS[panel])
-    for name, passband in PASSBANDS.items():
-        rows = "".join(
-            f"{nm:g},{value:.8f}\n"
-            for nm, value in zip(SENSOR_NM, bump(*passband, SENSOR_NM), strict=True)
-        )
-        (folder / f"{name}.csv").write_text(f"wavelength_nm,value\n{rows}")
-    three = {"quantum_efficiency": None} | {
-        f"quantum_efficiency_{name}": f"{name}.csv" for name in channels
-    }
-    keys = three if len(channels) > 1 else {"quantum_efficiency": "ccd47-20"}
+    write_panel(folder / "panel.csv", PANELS[panel])
+    write_channels(folder, SENSOR_NM, PASSBANDS)
+    keys = channel_keys(channels) if len(channels) > 1 else {"quantum_efficiency": "ccd47-20"}
     tables = {
         "monitor.primaries": {"file": "panel.csv"},
         "render": {"colour": "star", "quantisation": "exact"},
@@ -397,7 +393,7 @@ def test_depth_is_bit_stealing_and_a_primary_beyond_the_tracker_is_refused(tmp_p
             codes = bench.frame(ORION_Q).codes
             assert bench.colours is None and codes.ndim == 3, name
     path = bench_path(tmp_path)
-    written(tmp_path / "panel.csv", [bump(760, 3), *PANELS["oled"][1:]])
+    write_panel(tmp_path / "panel.csv", [bump(760, 3), *PANELS["oled"][1:]])
     assert run_hilstar_here("frame", path, "--radec", "84,-1,0").returncode == 2
     with pytest.raises(
         InputError, match='the tracker sees nothing of the primary r; write colour = "white"'

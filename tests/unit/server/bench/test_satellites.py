@@ -21,7 +21,7 @@ from hilstar.server.bench.frame import Bench
 from hilstar.sky.bodies.disc import Disc
 from hilstar.sky.bodies.passes import Cone
 from tests.support.benches import bench_text
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.satellites import element_set, some_orbits
 from tests.support.skies import STATION_TLE, STATION_UTC
 from tests.support.stars import sprites_at
@@ -210,6 +210,11 @@ def test_frame_explains_them_and_attitude_and_verify_know_them(tle_bench):
     assert json.loads(budget.stdout)["clips_v_mag"] < 3
 
 
+def assert_frame_refused(bench, words):
+    done = run_hilstar_here("frame --radec 0,0,0", bench, "--truth", bench.parent / "t.csv")
+    assert_refused(done, 2, words)
+
+
 @pytest.mark.parametrize(
     ("named", "text", "said"),
     [
@@ -229,32 +234,19 @@ def test_a_wrong_file_is_one_line_and_exit_code_2(tle_bench, named, text, said):
     path.unlink()
     if text is not None:
         path.write_text(text)
-    done = run_hilstar_here(
-        "frame", tle_bench, "--radec", "0,0,0", "--truth", tle_bench.parent / "t.csv"
-    )
-    assert done.returncode == 2
-    assert said in done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
+    assert_frame_refused(tle_bench, said)
 
 
-def test_a_table_without_a_list_is_refused(tle_bench):
-    tle_bench.write_text(tle_bench.read_text().replace("satellites =", "# satellites ="))
-    done = run_hilstar_here(
-        "frame", tle_bench, "--radec", "0,0,0", "--truth", tle_bench.parent / "t.csv"
-    )
-    assert done.returncode == 2
-    assert (
-        'satellite_magnitudes is of no satellites; write satellites = "tles.txt" too' in done.stderr
-    )
-
-
-def test_satellites_need_a_date(tle_bench):
-    tle_bench.write_text(tle_bench.read_text().replace("epoch_utc", "# epoch_utc"))
-    done = run_hilstar_here(
-        "frame", tle_bench, "--radec", "0,0,0", "--truth", tle_bench.parent / "t.csv"
-    )
-    assert done.returncode == 2
-    assert "need a date" in done.stderr
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("satellites =", 'satellite_magnitudes is of no satellites; write satellites = "tles.txt"'),
+        ("epoch_utc", "need a date"),
+    ],
+)
+def test_a_table_without_a_list_and_satellites_without_a_date_are_refused(tle_bench, key, said):
+    tle_bench.write_text(tle_bench.read_text().replace(key, f"# {key}"))
+    assert_frame_refused(tle_bench, said)
 
 
 def test_the_bench_s_hash_covers_both_files(tle_bench):

@@ -30,16 +30,26 @@ def test_what_is_no_bag_is_refused(tmp_path, name, content, why):
         open_log(tmp_path / name)
 
 
-def test_a_message_that_is_cut_or_counts_in_billions_is_refused_with_its_number(tmp_path):
+CHANGED = "UPDATE messages SET data = ? WHERE id = 3"
+NO_POSE = "message 3 of /pose is no geometry_msgs/msg/PoseStamped"
+
+
+@pytest.mark.parametrize(
+    ("statement", "values", "words"),
+    [
+        (CHANGED, (b"",), NO_POSE),
+        (CHANGED, (b"\0\1\0\0",), NO_POSE),
+        (CHANGED, (b"\0\1\0\0" + b"\xff" * 60,), NO_POSE),
+        ("DELETE FROM messages", (), "has no message of /pose; record it, or choose another"),
+    ],
+    ids=["nothing", "cut", "counts in billions", "no message"],
+)
+def test_a_bag_whose_messages_are_no_poses_is_refused(tmp_path, statement, values, words):
     bag = write_bag2(tmp_path / "a", poses("jazzy")) / "a.db3"
-    for data in (b"", b"\0\1\0\0", b"\0\1\0\0" + b"\xff" * 60):
-        with sqlite3.connect(bag) as database:
-            database.execute("UPDATE messages SET data = ? WHERE id = 3", (data,))
-        database.close()
-        with pytest.raises(
-            InputError, match=r"message 3 of /pose is no geometry_msgs/msg/PoseStamped"
-        ):
-            open_log(bag)
+    with sqlite3.connect(bag) as database:
+        database.execute(statement, values)
+    database.close()
+    assert words in refusal(open_log, bag)
 
 
 @pytest.mark.parametrize(
@@ -56,17 +66,6 @@ def test_metadata_that_is_none_is_refused(tmp_path, text):
     bag = write_bag2(tmp_path / "a", poses("jazzy"))
     (bag / "metadata.yaml").write_text(text)
     assert "ros2 bag reindex" in refusal(open_log, bag)
-
-
-def test_a_topic_without_messages_is_refused(tmp_path):
-    bag = write_bag2(tmp_path / "a", poses("jazzy")) / "a.db3"
-    with sqlite3.connect(bag) as database:
-        database.execute("DELETE FROM messages")
-    database.close()
-    with pytest.raises(
-        InputError, match="has no message of /pose; record it, or choose another with --topic"
-    ):
-        open_log(bag)
 
 
 def test_without_rosbags_one_line_says_what_to_install(tmp_path, monkeypatch):

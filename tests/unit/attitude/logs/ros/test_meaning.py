@@ -206,42 +206,29 @@ def test_of_several_bodies_on_one_topic_one_is_chosen(bag):
     assert len(open_log(bag(sent), Stated(body="two")).samples) == 4
 
 
-def test_a_type_that_only_has_the_name_of_ross_own_is_refused(tmp_path):
+NUMBERS = "float64 w\nfloat64 x\nfloat64 y\nfloat64 z\n"
+OTHER_FIELDS = f"std_msgs/Header header\n{NUMBERS}"
+PART = "=" * 80 + "\nMSG: "
+OTHER_INNER = (
+    "std_msgs/Header header\ngeometry_msgs/Quaternion quaternion\n"
+    f"{PART}geometry_msgs/Quaternion\n{NUMBERS}"
+    f"{PART}std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
+    f"{PART}builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
+)
+
+
+@pytest.mark.parametrize("text", [OTHER_FIELDS, OTHER_INNER], ids=["its own", "its inner type's"])
+def test_a_type_that_only_has_the_name_of_ross_own_is_refused(tmp_path, text):
     from mcap.writer import Writer
 
+    kind = "geometry_msgs/msg/QuaternionStamped"
     with (tmp_path / "a.mcap").open("wb") as file:
         writer = Writer(file)
         writer.start(profile="ros2")
-        text = b"std_msgs/Header header\nfloat64 w\nfloat64 x\nfloat64 y\nfloat64 z\n"
-        schema = writer.register_schema("geometry_msgs/msg/QuaternionStamped", "ros2msg", text)
+        schema = writer.register_schema(kind, "ros2msg", text.encode())
         writer.add_message(writer.register_channel("/q", "cdr", schema), 0, b"\0\1\0\0", 0)
         writer.finish()
-    with pytest.raises(
-        InputError, match="/q: its geometry_msgs/msg/QuaternionStamped is not ROS's own"
-    ):
-        open_log(tmp_path / "a.mcap")
-
-
-def test_a_type_whose_inner_type_has_other_fields_is_refused(tmp_path):
-    from mcap.writer import Writer
-
-    inner = (
-        "=" * 80 + "\nMSG: geometry_msgs/Quaternion\nfloat64 w\nfloat64 x\nfloat64 y\nfloat64 z\n"
-    )
-    text = f"std_msgs/Header header\ngeometry_msgs/Quaternion quaternion\n{inner}" + "=" * 80
-    text += "\nMSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n" + "=" * 80
-    text += "\nMSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n"
-    with (tmp_path / "a.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start(profile="ros2")
-        schema = writer.register_schema(
-            "geometry_msgs/msg/QuaternionStamped", "ros2msg", text.encode()
-        )
-        writer.add_message(writer.register_channel("/q", "cdr", schema), 0, b"\0\1\0\0", 0)
-        writer.finish()
-    with pytest.raises(
-        InputError, match="/q: its geometry_msgs/msg/QuaternionStamped is not ROS's own"
-    ):
+    with pytest.raises(InputError, match=f"/q: its {kind} is not ROS's own"):
         open_log(tmp_path / "a.mcap")
 
 

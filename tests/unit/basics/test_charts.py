@@ -1,0 +1,97 @@
+"""Charts: their files, their colours on light and dark pages, their ticks and the names of lines."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+
+import pytest
+from matplotlib.figure import Figure
+
+from hilstar.basics import charts
+from tests.support.figures import two_lines
+from tests.support.pictures import assert_drawn
+
+
+def test_a_chart_is_written_for_light_and_dark_pages(tmp_path):
+    charts.save(two_lines(), tmp_path / "lines")
+    text = (tmp_path / "lines.svg").read_text()
+    light, dark = text.split("prefers-color-scheme: dark", 1)[0], text
+    used = set(re.findall(r"(?:fill|stroke): (#[0-9a-f]{6})", text.split("</style>", 1)[1]))
+    assert {charts.BLUE, charts.ORANGE, charts.INK, charts.PAPER} <= used <= set(charts.DARK)
+    for colour in used:
+        assert f'[style*="fill: {colour}"]{{fill:{charts.DARK[colour]}!important}}' in dark
+        assert charts.DARK[colour] not in light
+    assert "<dc:date>" not in text
+    charts.save(two_lines(), tmp_path / "lines.svg")
+    assert (tmp_path / "lines.svg").read_text() == text
+    assert_drawn(tmp_path / "lines.png")
+
+
+@pytest.mark.parametrize("paper", [charts.PAPER, charts.DARK[charts.PAPER]])
+def test_colours_stand_out_on_both_pages(paper):
+    """WCAG's contrast: 4.5 of text, which every colour may be."""
+
+    def light(colour: str) -> float:
+        parts = [int(colour[k : k + 2], 16) / 255 for k in (1, 3, 5)]
+        return sum(
+            w * (c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4)
+            for w, c in zip((0.2126, 0.7152, 0.0722), parts, strict=True)
+        )
+
+    for each, dark in charts.DARK.items():
+        if each not in (charts.GRID, charts.PAPER):
+            pair = sorted((light(each if paper == charts.PAPER else dark), light(paper)))
+            assert (pair[1] + 0.05) / (pair[0] + 0.05) >= 4.5, (each, paper)
+
+
+@pytest.mark.parametrize(
+    ("limits", "ticks"),
+    [
+        ((0.3, 21), [0.5, 1, 2, 5, 10, 20]),
+        ((0.03, 2000), [0.1, 1, 10, 100, 1000]),
+        ((0.0009, 0.7), [0.001, 0.003, 0.01, 0.03, 0.1, 0.3]),
+        ((0.026, 0.14), [0.03, 0.04, 0.05, 0.07, 0.1]),
+        ((1e-13, 10), [1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1]),
+    ],
+)
+def test_ticks_are_round_and_names_at_the_side_keep_apart(limits, ticks):
+    axes = Figure().subplots()
+    axes.set(xscale="log", xlim=limits)
+    charts.log_ticks(axes.xaxis, 9)
+    assert axes.get_xticks() == pytest.approx(ticks)
+    heights = charts.spread([0.9, 0.9, 0.89, 0.02, 0.01, 0.0], 0.05)
+    assert min(a - b for a, b in itertools.pairwise(heights)) == pytest.approx(0.05)
+    assert heights[-1] >= 0 and heights[0] <= 1
+
+
+def test_figures_of_an_axis_are_a_persons():
+    assert [charts.plain(v) for v in (3000, 0.5, 0.0001, 1e-5, 3e-6, 2e6, 0)] == [
+        *("3000", "0.5", "0.0001", "10⁻⁵", "3·10⁻⁶", "2·10⁶", "0")
+    ]
+    assert [charts.capital(text) for text in ("rate [Hz]", "x [px]", "V [mag]")] == [
+        "Rate [Hz]",
+        "x [px]",
+        "V [mag]",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "end"),
+    [
+        ([1, 2, 3], [4, 5, math.nan], (2, 5)),
+        ([1, 2, 3], [4, 5, math.inf], (2, 5)),
+        ([3, 2, 1], [4, 5, 6], (3, 4)),
+        ([1, 2, 9], [4, 5, 6], (2, 5)),
+    ],
+    ids=["no value", "infinite", "falling", "beyond the axis"],
+)
+def test_a_line_is_named_at_its_last_place_that_is_in_view(x, y, end):
+    with charts.panels_of("A line") as (axes,):
+        axes.plot(x, y, label="speed")
+        axes.set(xlim=(0, 4), ylim=(0, 10))
+        charts.label_ends(axes)
+    (name,) = axes.texts
+    assert (name.get_text(), name.xy) == ("speed", end)
+    assert name.xyann[1] == pytest.approx(end[1] / 10)

@@ -1,0 +1,137 @@
+"""The glass of a lens whose rays are a closed form, in place of those that optiland traces: an
+aplanat, which keeps Abbe's sine condition, so that its PSF is Airy's.
+
+Its light is even over direction cosines. A pupil that is cut to an ellipse, or is round at places
+that are unevenly far from each other, is as good as the circle of the same edge.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.special import j1
+
+from hilstar.basics.arrays import FloatArray
+from hilstar.optics.glass.prescription import Plate, traced
+
+FOCAL_MM, F_NUMBER, UM = 50.0, 4.0, 0.5
+NA = 1 / (2 * F_NUMBER)
+FIELD_TANGENT = 0.05
+PITCH_UM = 4.0
+# A circle that 96 cells count across: their edges' parts are known to an eighth of a cell.
+AIRY_OF_PEAK = 2e-3
+PLACE_PX = 1e-6  # Newton's rounds end at rounding
+MOMENT = 0.01  # the circle's edge, as above, squared; and shares of four samples
+
+
+class Aplanat:
+    """What the glass asks of an optic of optiland's. `crowding` puts the pupil's places nearer to
+    the middle; `cut` is the share of the pupil that is cut off along x and y.
+    """
+
+    def __init__(
+        self, max_field: float = 1.0, crowding: float = 0.0, cut: tuple[float, float] = (0.0, 0.0)
+    ) -> None:
+        self.crowding = crowding
+        self.object_surface = SimpleNamespace(is_infinite=True)
+        edge = SimpleNamespace(x=0.0, y=max_field, vx=cut[0], vy=cut[1])
+        self.fields = SimpleNamespace(max_field=max_field, fields=[edge])
+        wave = SimpleNamespace(value=UM)
+        self.wavelengths = SimpleNamespace(wavelengths=[wave])
+        self.primary_wavelength = UM
+        self.paraxial = SimpleNamespace(f2=lambda: FOCAL_MM, FNO=lambda: [F_NUMBER])
+        frame = SimpleNamespace(get_effective_transform=lambda: (np.zeros(3), np.eye(3)))
+        self.image_surface = SimpleNamespace(geometry=SimpleNamespace(cs=frame))
+        generator = SimpleNamespace(generate_rays=self.generate_rays)
+        self.ray_tracer = SimpleNamespace(ray_generator=generator)
+
+    def generate_rays(self, hx, hy, px, py, um):
+        """Rays that enter: parallel, from places in the plane of the pupil, mm."""
+        scale = FIELD_TANGENT if self.fields.max_field else 0.0
+        length = np.sqrt(1 + scale**2 * (hx**2 + hy**2))
+        radius = np.hypot(px, py)
+        at = FOCAL_MM * NA * ((1 - self.crowding) + self.crowding * radius**2)
+        return SimpleNamespace(
+            x=at * px, y=at * py, z=np.zeros_like(px),
+            L=scale * hx / length, M=scale * hy / length, N=1 / length,
+        )  # fmt: skip
+
+    def trace_generic(self, hx, hy, px, py, um):
+        """Rays at the image: all of a field in one point, in phase; those far beyond the pupil are
+        lost.
+        """
+        hx, hy, px, py = np.broadcast_arrays(hx, hy, px, py)
+        start = self.generate_rays(hx, hy, px, py, um)
+        is_lost = np.hypot(px, py) > 1.2
+        x = np.where(is_lost, np.nan, FOCAL_MM * start.L / start.N)
+        cos_x = start.L - start.x / FOCAL_MM
+        cos_y = start.M - start.y / FOCAL_MM
+        return SimpleNamespace(
+            x=x, y=FOCAL_MM * start.M / start.N, z=np.zeros_like(x),
+            L=cos_x, M=cos_y, N=np.sqrt(1 - cos_x**2 - cos_y**2),
+            opd=100.0 - start.L * start.x - start.M * start.y,
+            i=np.where(is_lost, 0.0, 1.0),
+        )  # fmt: skip
+
+
+def airy(stretch_x: float, stretch_y: float, off_mm: FloatArray) -> FloatArray:
+    """Airy's pattern, 1 at its peak, of a pupil that is stretched (Born and Wolf, 8.5.2)."""
+    x_mm, y_mm = np.meshgrid(off_mm * stretch_x, off_mm * stretch_y)
+    v = 2 * np.pi * NA / (UM * 1e-3) * np.hypot(x_mm, y_mm)
+    near = np.where(v == 0, 1.0, v)
+    return np.where(v == 0, 1.0, (2 * j1(near) / near) ** 2)
+
+
+@pytest.mark.parametrize(
+    ("crowding", "cut"),
+    [(0.0, (0.0, 0.0)), (0.3, (0.0, 0.0)), (0.0, (0.3, 0.0)), (0.0, (0.0, 0.2))],
+)
+def test_an_aplanat_s_psf_is_airys(crowding, cut):
+    """Its peak is pi NA^2 / lambda^2 of the light to an area, by the cut pupil's own area."""
+    per_px = 8
+    plate = Plate((9, 9), PITCH_UM, half_px=3)
+    glass = traced(Aplanat(0.0, crowding, cut), plate, per_px, 1e-6, "a closed form").glass
+    image = glass.images[0, 0, 0] * (1 - glass.outside[0, 0, 0])
+    side = image.shape[0]
+    step_mm = PITCH_UM * 1e-3 / per_px
+    wide, high = (1 - part for part in cut)
+    pattern = airy(wide, high, (np.arange(side) - side // 2) * step_mm)
+    peak = np.pi * wide * high * (NA * step_mm / (UM * 1e-3)) ** 2
+    assert image / peak == pytest.approx(pattern, abs=AIRY_OF_PEAK)
+
+
+def test_an_aplanat_has_a_pinhole_s_camera_and_an_even_field():
+    plate = Plate((401, 301), PITCH_UM, half_px=2)
+    made = traced(Aplanat(), plate, 2, 1e-3, "a closed form")
+    assert made.focal_length_mm == pytest.approx(FOCAL_MM, rel=1e-9)
+    assert (*made.glass.lens.radial, *made.glass.lens.tangential) == pytest.approx(
+        [0] * 5, abs=1e-6
+    )
+    assert made.glass.lateral_px == pytest.approx(0, abs=PLACE_PX)
+    corners = [[0, 0], [400, 0], [0, 300], [400, 300]]
+    assert set(map(tuple, corners)) <= set(map(tuple, made.glass.places_px.tolist()))
+    # the beam's area is the pupil's, seen at the field's angle
+    off_mm = (made.glass.places_px - [200, 150]) * PITCH_UM * 1e-3
+    cosine = 1 / np.sqrt(1 + (np.hypot(*off_mm.T) / FOCAL_MM) ** 2)
+    assert made.glass.illumination[:, 0, 0] == pytest.approx(cosine, rel=1e-6)
+
+
+@pytest.mark.parametrize("defocus_um", [-2000.0, 2000.0])
+def test_a_wide_image_is_the_cone_of_its_rays(defocus_um):
+    """Stamps of so many fringes are counted ray by ray: of rays even over direction cosines the
+    mean square of a tangent is -(NA^2 + log(1 - NA^2)) / NA^2, half of it along each axis.
+    """
+    plate = Plate((9, 9), 30.0, (defocus_um,), half_px=16)
+    glass = traced(Aplanat(0.0), plate, 1, 1e-6, "a closed form").glass
+    image = glass.images[0, 0, 0]
+    off_px = np.arange(33) - 16
+    tangent2 = -(NA**2 + np.log(1 - NA**2)) / NA**2
+    # light that is shared by two samples, evenly between them, is wider by 1/6 px^2
+    variance_px2 = tangent2 / 2 * (defocus_um / 30.0) ** 2 + 1 / 6
+    assert glass.outside == pytest.approx(0, abs=1e-9)
+    for axis in (0, 1):
+        line = image.sum(axis=axis)
+        assert line @ off_px == pytest.approx(0, abs=MOMENT)
+        assert line @ off_px**2 == pytest.approx(variance_px2, rel=MOMENT)

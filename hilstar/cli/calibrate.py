@@ -696,7 +696,7 @@ def scale(options: ScaleOptions) -> None:
     if scaled.relative_error is not None:
         lines.append("# and how well it is known, under [certify]:")
         lines.append(f"flux_at_white_relative = {scaled.relative_error:.3g}")
-        lines.append(f"flux_at_white_dof = {len(scaled.ratios) - 1}")
+        lines.append(f"flux_at_white_dof = {scaled.dof}")
     print_found(options.as_json, summary, lines)
 
 

@@ -50,7 +50,7 @@ def cosmic_rays_e(
     shape: tuple[int, int],
     exposure_s: float,
     rng: np.random.Generator,
-    pixel_pitch_um: float = DEFAULT_PITCH_UM,
+    pixel_pitch_um: float,
 ) -> FloatArray:
     """Electrons of one frame's cosmic rays, shape `shape`: straight tracks through RAY_DEPTH_UM of
     silicon.

@@ -11,6 +11,7 @@ from hilstar.basics.units import magnitude
 from hilstar.instruments.study.study_benches import held_out_by_type, held_out_errors
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.star_light import bench_stars
+from hilstar.sky import spectral_types
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import (
     VEGA_V0_W_M2_M,
@@ -24,6 +25,7 @@ from hilstar.sky.electrons import (
 from hilstar.sky.facts import facts_of
 from hilstar.sky.spectral_types import (
     DUST_EBV_MAG,
+    TypeTable,
     bare_and_dusty,
     fit_types,
     read_types,
@@ -244,6 +246,20 @@ def test_types_are_read(text, subclass, luminosity):
     assert read_types(np.array([text.encode()]))[0] == pytest.approx(
         [subclass, luminosity], nan_ok=True
     )
+
+
+def test_a_star_s_rate_does_not_depend_on_how_many_are_evaluated_at_once(monkeypatch, rng):
+    bv_mag, vi_mag = np.sort(rng.uniform(0.0, 2.0, (2, 30)))
+    kind = rng.uniform([10.0, 1.0], [60.0, 5.0], (30, 2))
+    by_colour = fit_table(bv_mag, vi_mag, rng.uniform(1.0, 2.0, 30))
+    spectra = np.column_stack([kind, vi_mag])
+    table = TypeTable(by_colour, rng.normal(size=4), spectra, rng.normal(size=30))
+    v_mag = rng.uniform(2.0, 8.0, 30)
+    at_once = table.electrons_per_s(v_mag, bv_mag, vi_mag, kind[::-1])
+    for count in (1, 4, 29):
+        monkeypatch.setattr(spectral_types, "BLOCK_STARS", count)
+        by_block = table.electrons_per_s(v_mag, bv_mag, vi_mag, kind[::-1])
+        assert by_block == pytest.approx(at_once, rel=1e-12)
 
 
 def test_without_type_or_v_i_the_rate_is_by_colour():

@@ -12,7 +12,15 @@ import pytest
 import hilstar.display.render.extended_drawing as layer
 from hilstar.basics.units import KM_PER_AU
 from hilstar.display.quantise import dither_levels, round_levels
-from hilstar.display.render.disc_tiles import MIN_TILED_PX, SMOOTH, disc_tiles
+from hilstar.display.render.disc_tiles import (
+    MIN_TILED_PX,
+    SMOOTH,
+    TILE_PX,
+    _nodes_px,
+    _rays,
+    _runs,
+    disc_tiles,
+)
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import srgb_response
@@ -28,6 +36,7 @@ SIZE, SIGMA = (300, 260), (0.85, 0.85)
 MIDDLE_PX = (149.5, 129.5)
 LENS = Lens(radial=(0.2, 0.05, 0.0), tangential=(1e-3, -2e-3))
 TILE_LIMIT = 2 * SMOOTH  # straight lines in place of the face's light, along both axes
+SLOPES = 1e-9  # of differences of places, px, over steps of 1e-5: rounding
 assert SIZE[0] * SIZE[1] > MIN_TILED_PX
 
 
@@ -143,6 +152,23 @@ def test_tiles_without_a_linear_image_have_its_levels(method, rng):
                 assert (gl.levels() == black).all()
 
 
+def test_levels_are_sure_by_the_pixels_that_need_the_least_and_the_most_light():
+    """Of an uneven panel black is sure below what lights the brightest one's first level, white above
+    what the dimmest one's needs.
+    """
+    uniformity = np.ones(SIZE[::-1], dtype=np.float32)
+    uniformity[3, 4], uniformity[5, 6] = 0.5, 1.25
+    sure = []
+    for each in (None, uniformity):
+        target = Target(SIZE, GaussianPsf(SIGMA), srgb_response(8), 1000.0, "round", each)
+        with Renderer(target) as gl:
+            sure.append(gl._sure(gl._by_pixel, None))
+    even, uneven = sure
+    assert even.white_e_per_s == 1000.0
+    assert uneven.dark_e_per_s == pytest.approx(0.5 * even.dark_e_per_s)
+    assert uneven.white_e_per_s == pytest.approx(1.25 * even.white_e_per_s)
+
+
 def test_most_of_a_full_field_is_linear_and_what_lies_beside_a_limb_is_not_drawn():
     whole = (0, 0, *SIZE)
     full = disc_tiles(SCENES["low orbit, full field"], whole)
@@ -152,3 +178,44 @@ def test_most_of_a_full_field_is_linear_and_what_lies_beside_a_limb_is_not_drawn
     assert beside is not None
     assert beside.region[2:] == (0, 0)
     assert disc_tiles(SCENES["low orbit, full field"], (0, 0, 100, 100)) is None
+
+
+@pytest.mark.parametrize("size_px", [1, TILE_PX, TILE_PX + 1, 1920])
+def test_nodes_are_a_tile_apart_with_a_tile_beyond_both_ends(size_px):
+    nodes = _nodes_px(size_px)
+    assert (np.diff(nodes) == TILE_PX).all()
+    assert nodes[0] == -TILE_PX
+    assert size_px + TILE_PX <= nodes[-1] < size_px + 2 * TILE_PX
+
+
+def test_a_place_in_pixels_edges_is_half_a_pixel_from_the_pixel_s_middle():
+    """The first pixel's own edge is 0. A pixel at 45 degrees has cos^3 of the solid angle of
+    one ahead.
+    """
+    focal_px = 100.0
+    light = looking(20_000.0, focal_px, 0.0, 0.0)
+    x_px, y_px = np.array(MIDDLE_PX) + 0.5
+    rays, pixel_sr = _rays(light, np.array([[x_px, y_px], [x_px + focal_px, y_px]]))
+    assert rays == pytest.approx(np.array([[0, 0, 1], [1, 0, 1]]), abs=1e-12)
+    assert pixel_sr * focal_px**2 == pytest.approx([1, np.sqrt(0.5) ** 3], rel=SLOPES)
+
+
+def test_runs_cover_each_tile_once_and_nothing_else(rng):
+    """Rows that differ, that are equal and next to each other, and equal ones with another row
+    between them.
+    """
+    tiles = rng.random((12, 7)) < 0.5
+    tiles[3:6] = tiles[2]
+    tiles[8] = False
+    tiles[9] = tiles[7] = [False, True, True, True, False, True, False]
+    x, y = 10 * np.arange(8), 100 * np.arange(13)
+    covered = np.zeros_like(tiles, dtype=int)
+    rectangles = _runs(x, y, tiles).reshape(-1, 6, 6)[..., :2]  # two triangles' corners each
+    for corners in rectangles:
+        left, top = corners.min(axis=0) // (10, 100)
+        right, bottom = corners.max(axis=0) // (10, 100)
+        covered[int(top) : int(bottom), int(left) : int(right)] += 1
+    assert (covered == tiles).all()
+    whole = _runs(x, y, np.ones_like(tiles))
+    assert len(whole) == 6
+    assert whole.max(axis=0)[:2].tolist() == [70, 1200]

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 
+from hilstar.instruments.study import sweep
 from hilstar.instruments.study.chain.run import headline
 from hilstar.instruments.study.speed.report import Aim, Machine, Result, lines
 from hilstar.instruments.study.sweep import BUSY_SHARE, NOT_JUDGED, Load, OtherWork
@@ -34,6 +35,19 @@ def test_what_this_process_does_itself_is_not_other_work():
     spent_s, passed_s = os.times().user - before.user, os.times().elapsed - before.elapsed
     # All of the machine less what this process had is the most that there can be of others.
     assert work.cores() <= CORES - spent_s / passed_s + 0.1
+
+
+def test_children_that_have_ended_are_not_others(tmp_path, monkeypatch):
+    """The machine's own count stands still here, so that all that changes is this process's."""
+    stat = tmp_path / "stat"
+    stat.write_text("cpu 1000000 0 0 0 0 0 0 0\n", encoding="ascii")
+    monkeypatch.setattr(sweep, "STAT", stat)
+    all_before_s, others_before_s = OtherWork._times_s()
+    code = "import time\nwhile time.process_time() < 0.2: pass"
+    subprocess.run([sys.executable, "-S", "-c", code], check=True)
+    all_s, others_s = OtherWork._times_s()
+    assert all_s == all_before_s
+    assert others_before_s - others_s >= 0.2
 
 
 def test_a_busy_machine_is_said_and_no_aim_is_judged():

@@ -5,7 +5,13 @@ from __future__ import annotations
 import pytest
 
 from hilstar.instruments.study import bodies
-from hilstar.instruments.study.bodies import PHASES_DEG, QUICK_BENCHES, QUICK_RADII_PX, SCENES
+from hilstar.instruments.study.bodies import (
+    PHASES_DEG,
+    QUICK_BENCHES,
+    QUICK_RADII_PX,
+    SCENES,
+    BodyCost,
+)
 
 TABLES = ("bodies_cost", "bodies_size", "bodies_limits")  # and the charts of each
 
@@ -46,3 +52,19 @@ def test_near_a_body_all_light_is_finite_and_what_is_over_white_is_white(bodies_
     assert all(row["finite"] == row["white_is_white"] == "True" for row in rows)
     assert max(float(row["over_white_mag"]) for row in rows if row["body"] == "Sun") > 15
     assert len(lines) == 3 and "NOT" not in lines[2]
+
+
+def test_unseen_bodies_cost_what_they_do_between_steps_of_the_orbit():
+    def cost(scene: str, cpu_ms: float, discs: str = "") -> BodyCost:
+        assert scene in {known.name for known in SCENES}
+        return BodyCost(scene, 9.0, 8.0, 1.0, cpu_ms, discs, 5)
+
+    costs = [
+        cost("planets, none in view", 0.4),
+        cost("Moon, not in view", 0.7),
+        cost("Moon in view, 55 px", 3.0, "Moon"),
+        cost("the same, at a step of the orbit", 20.0),
+    ]
+    assert bodies.unseen_ms(costs) == 0.7
+    assert "20 ms once in 2 s" not in bodies.cost_line(costs[:3])
+    assert "20.0 ms once in 2 s" in bodies.cost_line(costs)

@@ -312,6 +312,23 @@ def combination_row(**figures) -> CombinationRow:
     )
 
 
+@pytest.mark.parametrize(
+    ("rival", "right"),
+    [
+        ({"time_ms": 5.0, "error_arcsec": 9.0}, True),  # faster, and less right
+        ({"time_ms": 4.97, "error_arcsec": 1.0}, True),  # within three sigmas of both medians
+        ({"time_ms": 4.9, "error_arcsec": 1.0}, False),
+        ({"time_ms": 1.0, "error_arcsec": 1.0, "bit_stealing": 2.0}, True),  # not effort's choice
+    ],
+)
+def test_auto_is_right_where_no_choice_of_its_own_is_better_beyond_the_noise(rival, right):
+    """Each median has a noise of 0.01 ms: three sigmas of their difference are 0.042 ms."""
+    auto = combination_row(chosen="auto", time_ms=5.0, error_arcsec=2.0)
+    alone = [auto, combination_row(time_ms=6.0, error_arcsec=3.0)]
+    assert run.is_right([alone])
+    assert run.is_right([alone, [auto, combination_row(**rival)]]) is right
+
+
 @pytest.mark.parametrize("place", [(0, 0), (-1, 0), (0, -1), (-1, -1)])
 def test_the_chart_names_its_front_and_what_is_chosen(monkeypatch, tmp_path, place):
     """The slowest or fastest point, the worst or best of them, is the default, and the one

@@ -4,6 +4,7 @@ monitor can show is stated.
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from hilstar.instruments.study import colour
@@ -97,3 +98,18 @@ def test_superpixels_have_less_bias_than_the_raw_mosaic_and_wide_stars_little(st
     )
     holds("mosaic-sharp", rms["superpixel", "0.55", "3500.0"])
     holds("mosaic-wide", rms["superpixel", "1.5", "3500.0"])
+
+
+def test_a_star_s_class_is_that_of_its_own_spectrum(tmp_path):
+    """From O to M dwarfs and giants are ever redder, so that each class has a longer mean
+    wavelength than the one before, as a mono sensor sees it.
+    """
+    colour.write_spectra(tmp_path)
+    stars = colour.gamut_stars("sRGB LCD", colour.MONO_SENSOR, tmp_path)
+    rows = colour.class_rows("sRGB LCD", colour.MONO_SENSOR, stars)
+    mean_nm = [row.mean_nm for row in rows]
+    assert [row.class_ for row in rows] == list("OBAFGKM")
+    # O stars are few, and reddened by the dust of their birthplaces
+    assert mean_nm[1:] == sorted(mean_nm[1:])
+    assert min(np.diff(mean_nm[1:])) > 5
+    assert sum(row.stars for row in rows) <= len(stars.kinds)

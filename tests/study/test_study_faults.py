@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import pytest
 
-from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS
+from hilstar.instruments.study import faults
+from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS, Stray
 from hilstar.optics.layers.fault_kinds import KINDS
 
 pytestmark = pytest.mark.study
@@ -39,3 +40,19 @@ def test_stray_light_of_white_leaves_no_star_and_none_leaves_all(faults_study):
         assert float(mine[1.0]["lost"]) == 1.0
         assert float(mine[0.0]["lost"]) < 0.05
         assert int(mine[0.0]["stars"]) > 20
+
+
+def test_the_cost_of_a_fault_is_its_frame_less_the_same_frame_without_it(
+    bench_with, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(faults, "medians_ms", lambda works, rounds: {"with": 7.0, "without": 5.0})
+    cost = faults.cost_of(bench_with(), tmp_path, "blank", 1)
+    assert (cost.case, cost.frame_ms, cost.without_ms, cost.cost_ms) == ("blank", 7.0, 5.0, 2.0)
+
+
+def test_stray_light_spoils_from_the_least_share_beyond_which_stars_are_off():
+    off_mag = {0.0: 0.5, 0.01: 0.05, 0.03: 0.2, 0.1: 0.4}
+    strays = [Stray("round", share, 30, 0.0, mag, 0.0) for share, mag in off_mag.items()]
+    strays.append(Stray("exact", 0.01, 30, 0.0, 0.1, 0.0))
+    assert faults.spoilt_from(strays, "round") == 0.03
+    assert faults.spoilt_from(strays, "exact") is None

@@ -8,7 +8,10 @@ import math
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
+from hilstar.basics.rotation import propagate
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.study import limits
 from hilstar.instruments.study.limits import StressLimit, limits_finding
 from tests.support.benches import ROOT
@@ -69,22 +72,45 @@ def test_the_limits_are_those_that_hilstar_tells_elsewhere(limits_study):
     vi_mag, off_mag, _, _ = limit_rows(rows, "V-I [mag]")
     assert (off_mag[vi_mag < RED_VI_MAG - 0.5] < RED_LIMIT_MAG).all()
     assert off_mag[vi_mag > RED_VI_MAG + 1.0].max() > 2 * RED_LIMIT_MAG
-    for stress in ("distance from the pole [deg]", "angle short of 90 deg [deg]"):
-        _, error, meets, tolerance = limit_rows(rows, stress)
-        assert math.isnan(meets) and (error < 1e-3 * tolerance).all()
-    # A turn's error over parted refreshes is f (1 - f) / 2 of a refresh over n + f refreshes
-    # (server/sync.py), to first order.
-    at, error, _, _ = limit_rows(rows, limits.TURN)
+
+
+@pytest.mark.parametrize("measured", [limits.poles, limits.wide_fields])
+def test_directions_and_attitudes_are_right_up_to_where_they_have_no_place(measured):
+    limit = measured()
+    assert math.isnan(limit.meets) and not limit.fails
+    assert (limit.error < 1e-3 * limit.tolerance).all()
+    assert limit.words.startswith("nowhere to ")
+
+
+def test_a_turn_over_parted_refreshes_is_off_by_their_part():
+    """By f (1 - f) / 2 of a refresh over n + f refreshes (server/sync.py), to first order."""
+    limit = limits.parted_refreshes()
     per_deg_s = 3600 / 60 * 0.3 * 0.7 / 2 / 6.3
-    assert error == pytest.approx(per_deg_s * at, rel=0.02)
+    assert limit.error == pytest.approx(per_deg_s * limit.at, rel=0.02)
+    assert limit.meets == pytest.approx(limits.TOLERANCE_ARCSEC / per_deg_s, rel=0.05)
 
 
-def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field(limits_study):
+def test_a_narrow_star_s_moment_is_drawn_to_the_middle_of_its_pixel():
+    """Of a star at p from a pixel's middle the pixels beside it have what lies beyond its edges:
+    their difference is the moment, where no light reaches further.
+    """
+    limit = limits.narrow_sprites()
+    phases_px = np.linspace(0, 0.5, 11)
+    for sigma_px, error_px in zip(limit.at[-6:], limit.error[-6:], strict=True):
+        beside = ndtr((phases_px - 0.5) / sigma_px) - ndtr(-(phases_px + 0.5) / sigma_px)
+        assert error_px == pytest.approx(np.abs(beside - phases_px).max(), abs=1e-6)
+    assert limit.error[0] < 1e-6
+    # the first harmonic of the pixels, exp(-2 pi^2 sigma^2) / pi, is most of a wider star's error
+    first_px = math.sqrt(-math.log(math.pi * limits.TOLERANCE_PX) / 2) / math.pi
+    assert limit.meets == pytest.approx(first_px, rel=0.02)
+
+
+def test_a_pinhole_on_a_tilted_screen_is_off_by_the_square_of_the_field():
     """Along x the depth grows by x sin t, so a place x is off by x^2 t / f less what a rotation
     takes.
     """
-    _, _, rows = limits_study
-    at, error, _, _ = limit_rows(rows, limits.TILT)
+    limit = limits.tilted_screen()
+    at, error = limit.at, limit.error
     assert error[5] / at[5] == pytest.approx(error[0] / at[0], rel=0.01)
     widest_px = (959.5**2) * math.radians(at[0]) / (350e3 / 57.65)
     assert 0.1 * widest_px < error[0] < 0.6 * widest_px
@@ -108,3 +134,28 @@ def test_a_crossing_is_found_between_points_and_none_is_said_as_such():
     assert limits_finding([crossing, limit_of([0.0, 0.0, 0.0])]).startswith(
         "1 of 2 methods of hilstar leave their tolerance"
     )
+
+
+@pytest.mark.parametrize("power", [2, 3])
+def test_a_turn_is_foretold_along_a_straight_line_from_the_newest_packet(power):
+    """Of a turn a t^n the line from a packet at t0 is off by a (t^n - t0^n - n t0^(n-1) (t - t0));
+    packets come at 10 Hz, frames at 60 Hz from 1 s on.
+    """
+    size_rad = 1e-3
+
+    def attitude(t_ns: int) -> np.ndarray:
+        return propagate(limits.ORION, limits.Z, size_rad * (t_ns / NS_PER_S) ** power)
+
+    frames = np.arange(round(limits.SPAN_S * limits.REFRESH_HZ))
+    t = 1 + frames / limits.REFRESH_HZ
+    newest = 1 + frames // 6 / 10
+    line = newest**power + power * newest ** (power - 1) * (t - newest)
+    rms_arcsec = np.sqrt(np.mean((t**power - line) ** 2)) * size_rad * ARCSEC_PER_RAD
+    found_arcsec = limits.predicted_rms_arcsec(attitude, 10.0, 0.0)
+    # rates are differences over a millisecond at the most, and times whole ns: 1e-6 of the turn
+    assert found_arcsec == pytest.approx(rms_arcsec, rel=1e-5)
+    # a packet that is a period old is one that comes a period later
+    later = newest - 1 / 10
+    line = later**power + power * later ** (power - 1) * (t - later)
+    rms_arcsec = np.sqrt(np.mean((t**power - line) ** 2)) * size_rad * ARCSEC_PER_RAD
+    assert limits.predicted_rms_arcsec(attitude, 10.0, 100.0) == pytest.approx(rms_arcsec, rel=1e-5)

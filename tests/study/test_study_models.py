@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 from astropy.wcs import WCS
 from PIL import Image
+from scipy import constants
 
 from hilstar.basics.charts import TITLE_COLUMNS, title_lines
 from hilstar.instruments.study.models import (
     choices_finding,
     running_percentiles,
-    torres2010_k,
     zero_points,
 )
 from hilstar.instruments.study.rapp import rapp_ratios
+from hilstar.instruments.study.sky_figures import star_density
 from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
@@ -45,13 +46,6 @@ QUADRATURE_LIMIT = 1e-6
 HC_OVER_K_NM_K = 1.438776877e7
 REFERENCE_K = 9602.0
 BOLOMETRIC_MAG_LIMIT = 5e-4  # what three decimals of a magnitude hold
-
-# E. Mamajek's mean dwarf sequence, version 2022.04.16 (Pecaut & Mamajek 2013, ApJS 208, 9): B-V, K;
-# A0V, F0V, G2V, K0V, K5V.
-PECAUT_MAMAJEK = ((0.000, 9700), (0.295, 7220), (0.650, 5770), (0.816, 5270), (1.150, 4440))
-# Two calibrations of one quantity; the dwarfs' and giants' temperatures at one B-V differ by as
-# much. Measured: 2.2 %.
-SCALES_AGREE = 0.03
 
 # tests/authority/test_pickles.py holds the same: median and 95 % of the errors of held-out stars,
 # %, V-I < 2.5.
@@ -156,11 +150,6 @@ def test_rapp_is_one_where_both_models_are_the_same(models_study):
     assert rapp3[0] > 1.7
 
 
-def test_torres_gives_the_sun_its_temperature():
-    """B-V = 0.653 (Ramirez 2012): 5772 K (IAU 2015), within the relation's own 2 %."""
-    assert torres2010_k(np.array([0.653]))[0] == pytest.approx(5772, rel=0.02)
-
-
 def test_the_zero_points_differ_by_a_third_of_a_magnitude(models_study):
     table = table_columns(models_study[0] / "zero_points.csv")
     bolometric = [
@@ -214,11 +203,6 @@ def test_hot_stars_differ_as_the_thesis_says(models_study):
     assert off[0] == pytest.approx(0.15, abs=0.005)
     assert (np.diff(off) < 0).all()
     assert 0 < off[-1] < 0.05
-
-
-def test_torres_agrees_with_pecaut_and_mamajek():
-    bv_mag, kelvin = np.array(PECAUT_MAMAJEK).T
-    assert torres2010_k(bv_mag) == pytest.approx(kelvin, rel=SCALES_AGREE)
 
 
 def test_the_source_s_step_is_in_the_table(models_study):
@@ -471,3 +455,35 @@ def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(models_study):
         assert means[0] == pytest.approx(means[1], rel=2e-3)
         shape = table["blackbody"] / planck(table["wavelength_nm"], kelvin)
         assert shape == pytest.approx(shape[0], rel=1e-6)
+
+
+def test_the_bolometric_zero_point_has_a_quarter_fewer_electrons_than_vega(tmp_path, figures):
+    """A magnitude of 0 is 2.518021e-8 W/m2 (IAU 2015, resolution B2), of which a black body of
+    9602 K has the share of Planck's law at V's 551 nm, in place of Vega's 3.631e-2 W/m2/m.
+    """
+    peak = constants.h * constants.c / (551e-9 * constants.k * REFERENCE_K)
+    exitance = 2 * np.pi * constants.h * constants.c**2 / 551e-9**5 / np.expm1(peak)
+    share = exitance / (constants.sigma * REFERENCE_K**4)
+    fainter_mag = -2.5 * np.log10(2.518021e-8 * share / 3.631e-2)
+    text = zero_points(tmp_path).text
+    percent, mag = re.search(r"(\d+) % \((\S+) mag\) fewer", text).groups()
+    # V is 90 nm wide, over which the spectrum is bent: 0.02 mag
+    assert float(mag) == pytest.approx(fainter_mag, abs=0.02)
+    assert float(percent) == pytest.approx(100 * (1 - 10 ** (-0.4 * float(mag))), abs=1)
+    assert len(figures) == 1
+
+
+def test_a_cell_of_the_map_stands_at_its_middle_and_has_its_stars(tmp_path, figures):
+    star_density(tmp_path)
+    catalog = load_catalog()
+    rows = csv_rows(tmp_path / "star_density.csv")
+    assert len(rows) == 36 * 18 and len(figures) == 1
+    sky_deg2 = 4 * np.pi * np.degrees(1) ** 2
+    height = np.sin(np.radians(catalog.dec_deg))
+    for row in rows[:: len(rows) // 12]:
+        across = np.abs(catalog.ra_deg - float(row["ra_deg"])) < 5
+        middle = np.sin(np.radians(float(row["dec_deg"])))
+        inside = across & (np.abs(height - middle) < 1 / 18)
+        density = inside.sum() / (sky_deg2 / len(rows))
+        # a star or two stand on an edge to within a rounding
+        assert float(row["stars_deg2"]) == pytest.approx(density, abs=2 * len(rows) / sky_deg2)

@@ -17,7 +17,7 @@ from hilstar.instruments.study import sweep
 from hilstar.instruments.study.codes import star_field
 from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, in_turn, pareto_front
 from hilstar.instruments.study.tradeoff import run as tradeoff
-from hilstar.instruments.study.tradeoff.light import LIMITS_V_MAG, trapezoid
+from hilstar.instruments.study.tradeoff.light import LIMITS_V_MAG, gauss, shared_knots, trapezoid
 from hilstar.instruments.study.tradeoff.places import SPRITE_PSF
 from hilstar.instruments.study.tradeoff.run import STEPS
 from hilstar.instruments.study.trials import (
@@ -295,3 +295,20 @@ def test_a_title_says_a_time_as_it_is_drawn():
     """1196 ms were told as 1200 ms, beside a point that is drawn at 1196."""
     said = [ms_words(ms) for ms in (0.4567, 22.44, 999.4, 999.6, 1196.4)]
     assert said == ["0.457 ms", "22.4 ms", "999 ms", "1000 ms", "1196 ms"]
+
+
+def test_a_rule_reaches_over_all_that_curves_share():
+    """From the later first knot to the earlier last one, both included: a power of the wavelength
+    has its closed integral there.
+    """
+    curves = (
+        Curve(np.array([300.0, 400.0, 700.0]), np.ones(3)),
+        Curve(np.array([350.0, 500.0, 900.0]), np.ones(3)),
+    )
+    assert shared_knots(*curves).tolist() == [350.0, 400.0, 500.0, 700.0]
+    for power in (0, 1, 3):
+        closed = (700.0 ** (power + 1) - 350.0 ** (power + 1)) / (power + 1)
+        nm, weight_m = gauss(2, *curves)  # exact up to the third power
+        assert (nm**power) @ weight_m == pytest.approx(closed * 1e-9, rel=1e-12)
+        nm, weight_m = trapezoid(1.0, *curves)
+        assert (nm**power) @ weight_m == pytest.approx(closed * 1e-9, rel=1e-5)

@@ -79,7 +79,7 @@ def coarse_lines(samples: Sequence[AttitudeSample]) -> list[tuple[str, str]]:
         resolution.see(sample)
     if len(samples) < LOOKED_AT:
         resolution.decide()
-    return notices[:1]
+    return notices
 
 
 def _evidence(q: list[float], step: float) -> int | None:

@@ -483,8 +483,8 @@ class _Pending(NamedTuple):
 
 
 class McapWriter:
-    """Writes to a file descriptor that is open for writing and empty; closing it stays the
-    caller's. Raises OSError.
+    """Writes to a file descriptor that is open for appending (O_APPEND) and empty; closing it stays
+    the caller's. Raises OSError.
     """
 
     def __init__(
@@ -646,7 +646,6 @@ class McapWriter:
         except OSError:
             with contextlib.suppress(OSError):
                 os.ftruncate(self._fd, self.size_bytes)
-                os.lseek(self._fd, self.size_bytes, os.SEEK_SET)
             raise
         self.size_bytes += len(data)
         self.crc = zlib.crc32(data, self.crc)

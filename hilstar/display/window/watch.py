@@ -27,6 +27,11 @@ MODES = ("copy", "flip", "skip", "copy")  # the last is a copy that a flip could
 UNKNOWN = "unknown"
 
 
+def straight_ramp(steps: int) -> list[float]:
+    """One colour of the gamma ramp that changes nothing: values (steps,) evenly from 0 to 1."""
+    return list(np.linspace(0.0, 1.0, steps).tolist())
+
+
 def is_straight(ramp: bytes | FloatArray) -> bool:
     """Whether a gamma ramp is the identity, to half a code of its own depth.
 
@@ -40,7 +45,7 @@ def is_straight(ramp: bytes | FloatArray) -> bool:
         parts = ramp
     if not parts.size:
         return False
-    off = np.abs(parts - np.linspace(0, 1, parts.shape[1]))
+    off = np.abs(parts - straight_ramp(parts.shape[1]))
     # An entry of 16 bits is rounded itself.
     return bool(np.all(off <= 0.5 / (2 ** ramp_bits(parts) - 1) + 0.5 / FULL_RAMP))
 

@@ -23,7 +23,7 @@ from hilstar.display.window.library import glfw
 from hilstar.display.window.output_settings import OutputState
 from hilstar.display.window.randr import output_named
 from hilstar.display.window.visibility import ScreenArea, Visibility
-from hilstar.display.window.watch import DisplayWatch, is_straight
+from hilstar.display.window.watch import DisplayWatch, is_straight, straight_ramp
 from hilstar.display.window.x11 import (
     BackBuffer,
     Survival,
@@ -223,7 +223,7 @@ class Window(Closing):
         if not size:
             return
         self._ramp = (monitor, ([*ramp.red], [*ramp.green], [*ramp.blue]))
-        straight = [value / (size - 1) for value in range(size)]
+        straight = straight_ramp(size)
         identity: Any = (straight, straight, straight)
         glfw.set_gamma_ramp(monitor, identity)
         self.ramp_refused = not is_straight(np.array([*glfw.get_gamma_ramp(monitor)]))

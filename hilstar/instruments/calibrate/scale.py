@@ -59,6 +59,11 @@ class MeasuredScale:
         return float(np.sqrt(variance * count / (count - 1)))
 
     @property
+    def dof(self) -> int:
+        """The degrees of freedom of that error: readings less one."""
+        return len(self.ratios) - 1
+
+    @property
     def relative_error(self) -> float | None:
         """The relative standard error of the light of white, by the readings' scatter and noise;
         None for one.
@@ -143,7 +148,7 @@ def with_flux_at_white(file: BenchFile, found: MeasuredScale, output: Path) -> N
         text = with_key(
             text, "certify", "flux_at_white_relative", float(f"{found.relative_error:.3g}")
         )
-        text = with_key(text, "certify", "flux_at_white_dof", float(len(found.ratios) - 1))
+        text = with_key(text, "certify", "flux_at_white_dof", float(found.dof))
     write_whole(output, text)
     if read_config(output).render.flux_at_white_e_per_s != flux_at_white_e_per_s:
         raise InputError(

@@ -20,7 +20,7 @@ from hilstar.basics.rotation import (
     to_matrix,
     to_radec_roll_deg,
 )
-from hilstar.basics.units import ARCSEC_PER_RAD, LIGHT_KM_S
+from hilstar.basics.units import ARCSEC_PER_RAD, LIGHT_KM_S, flux_ratio
 from hilstar.instruments.campaign.case_motion import CaseMotion
 from hilstar.instruments.campaign.plan import PlantedFaults
 from hilstar.instruments.campaign.solver_answer import SolverAnswer
@@ -164,7 +164,7 @@ class CaseTracker:
             dn = star.dn
             if dn is not None and len(matched):
                 bv = float(match.lit.bv[matched[0]])
-                dn *= 10 ** (-0.4 * planted.star_colour * bv)
+                dn *= flux_ratio(planted.star_colour * bv)
             x_px = star.x_px + float(noise_px[0]) + wave_x_px
             y_px = star.y_px + float(noise_px[1]) + wave_y_px
             stars.append(ReportedStar(x_px, y_px, dn, star.hip))

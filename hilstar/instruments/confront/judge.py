@@ -323,12 +323,8 @@ class Judge:
         exposure = simulator.expose(view, None)
         # the file's quantum efficiency and exposure stand for one zero point, this photograph's air
         # for another
-        offsets_mag = session.light.offsets_mag
-        if session.fixed:
-            file_mag = self._own_mag
-        else:
-            file_mag = offsets_mag.mean()
-        air_share = 10 ** (-0.4 * (offsets_mag[number] - file_mag))
+        file_mag = self._own_mag if session.fixed else None
+        air_share = session.light.shares(file_mag)[number]
         return np.asarray(exposure.mean_e / session.pixels.gain_e_per_dn * air_share)
 
     def _expected(self, number: int) -> Expected:
@@ -366,6 +362,7 @@ class Judge:
         source_tree = cKDTree(shot.sources.places_px)
         in_middle = within_image(expected.x_px, expected.y_px, shot.photo.size_px, 2 * MATCH_PX)
         noise_dn = math.sqrt(self._pixel_variance(shot) * NEFF_PX)
+        above_dn = shot.above_dn
         for star in expected.star[expected.dn > EXPECTED_SNR * noise_dn].tolist():
             k = place[star]
             x = expected.x_px[k]
@@ -375,11 +372,7 @@ class Judge:
             if source_tree.query([x, y])[0] <= 2 * MATCH_PX:
                 continue
             # its light may be part of a larger source
-            column = round(x)
-            row = round(y)
-            box = np.s_[row - 2 : row + 3, column - 2 : column + 3]
-            light_dn = (shot.photo.dn[box] - shot.level.level[box]).sum()
-            if light_dn < expected.dn[k] / 2:
+            if light_at(above_dn, x, y) < expected.dn[k] / 2:
                 yield star
 
     def _pixel_variance(self, shot: Shot) -> float:
@@ -516,6 +509,15 @@ class Judge:
         information = max(float((motion**2).sum()), 1e-12)
         years = float((motion * off_px / sigma_px).sum()) / information
         return DatedBy(years, information**-0.5)
+
+
+def light_at(above_dn: FloatArray, x_px: float, y_px: float) -> float:
+    """The light, DN, of the 5 x 5 pixels about a place in an image (height, width) above its
+    background.
+    """
+    column = round(x_px)
+    row = round(y_px)
+    return float(above_dn[row - 2 : row + 3, column - 2 : column + 3].sum())
 
 
 def _places_by_star(expected: Expected) -> dict[int, int]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
-from hilstar.basics.units import MAD_TO_SIGMA
+from hilstar.basics.units import MAD_TO_SIGMA, flux_ratio
 from hilstar.instruments.confront.star_psf import MEAN_BV_MAG
 
 MAG = 2.5 / math.log(10)
@@ -101,7 +101,15 @@ class LightFit:
     def illumination(self, radius2: FloatArray) -> FloatArray:
         """Light relative to the axis at squares of radii."""
         a, b = self.vignetting_mag
-        return np.asarray(10 ** (-0.4 * (a * radius2 + b * radius2**2)))
+        return np.asarray(flux_ratio(a * radius2 + b * radius2**2))
+
+    def shares(self, offset_mag: float | None = None) -> FloatArray:
+        """Light of each photograph (images,) relative to one of an offset, by default to one of the
+        mean offset.
+        """
+        if offset_mag is None:
+            offset_mag = float(self.offsets_mag.mean())
+        return np.asarray(flux_ratio(self.offsets_mag - offset_mag))
 
 
 def join_light(parts: Sequence[StarLight]) -> StarLight:
@@ -229,7 +237,7 @@ def _trusted(stars: StarLight, ones: FloatArray) -> BoolArray:
     if not bright.any():
         return clean
     zero_points = _robust(ones, stars.instrument_mag - stars.v_mag, stars.sigma_mag, bright)
-    expected_dn = 10 ** (-0.4 * (stars.v_mag + ones @ zero_points.values))
+    expected_dn = flux_ratio(stars.v_mag + ones @ zero_points.values)
     minimum_dn = TRUSTED_SNR * np.median(stars.sigma_dn[bright])
     is_trusted = clean & (expected_dn > minimum_dn)
     if is_trusted.sum() >= MIN_STARS:

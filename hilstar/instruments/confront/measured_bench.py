@@ -15,6 +15,7 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.files import write_whole
 from hilstar.basics.reading import MAX_TOML_BYTES, parse_toml, read_text
+from hilstar.basics.units import flux_ratio
 from hilstar.instruments.confront.background import FixedPattern
 from hilstar.instruments.confront.light import NO_CORRECTION, LightFit
 from hilstar.instruments.confront.photon_transfer import PixelFit
@@ -158,7 +159,8 @@ def _tracker(session: Session, given: dict[str, Any], exposure_s: float) -> dict
         "distortion": NAMES[1],
     }
     if tracker.frame_hz is not None:
-        table["frame_hz"] = tracker.frame_hz
+        # the photographs' exposure may be longer than the period that was given
+        table["frame_hz"] = min(tracker.frame_hz, 1 / exposure_s)
     table["optics"] = {"psf": NAMES[3]}
     table["detector"] = _detector(session, given.get("detector", {}))
     return table
@@ -295,7 +297,7 @@ def _write_efficiency(path: Path, session: Session) -> _Exposure:
         curve = Curve(np.array([300.0, 1100.0]), np.full(2, curve.value[0]))
     exposure_s = session.shots[0].photo.exposure_s or tracker.exposure_s or 1.0
     offset_mag = float(session.light.offsets_mag.mean())
-    ratio = session.pixels.gain_e_per_dn * 10 ** (-0.4 * offset_mag) / exposure_s
+    ratio = session.pixels.gain_e_per_dn * flux_ratio(offset_mag) / exposure_s
     largest = max(float(curve.value.max()), 1e-9)
     share = min(ratio, 1.0 / largest)
     lines = ["wavelength_nm,value\n"]

@@ -206,7 +206,7 @@ class Session:
         mag = tracker_mag + self.plane_mag(number, columns) + air_mag
         radius2 = radius2_of(self.camera.camera, x_px, y_px)
         shade = light.illumination(radius2)
-        dn = 10 ** (-0.4 * (mag + light.offsets_mag[number]))
+        dn = flux_ratio(mag + light.offsets_mag[number])
         return np.asarray(dn * shade)
 
 

@@ -70,12 +70,11 @@ def optic_of(lens: LensPrescription) -> tuple[Any, tuple[str, ...]]:
     from optiland.optic import Optic
 
     optic = Optic()
-    notes: list[str] = []
+    files, notes = glass_files(lens)
     optic.surfaces.add(index=0, radius=np.inf, thickness=np.inf)
     has_stop = any(surface.is_stop for surface in lens.surfaces)
-    for number, surface in enumerate(lens.surfaces, 1):
-        material, note = _material(surface, lens.wavelengths_um)
-        notes += note
+    for number, (surface, file) in enumerate(zip(lens.surfaces, files, strict=True), 1):
+        material = _material(surface.glass, file)
         is_stop = surface.is_stop or (not has_stop and number == 1)
         optic.surfaces.add(index=number, material=material, is_stop=is_stop, **_geometry(surface))
     optic.set_aperture(aperture_type=PUPIL_NAMES[lens.pupil_kind], value=lens.pupil)
@@ -84,7 +83,40 @@ def optic_of(lens: LensPrescription) -> tuple[Any, tuple[str, ...]]:
         optic.fields.add(x=point.x, y=point.y)
     for number, um in enumerate(lens.wavelengths_um):
         optic.wavelengths.add(value=um, is_primary=number == lens.primary)
-    return optic, tuple(dict.fromkeys(notes))
+    return optic, notes
+
+
+def glass_files(lens: LensPrescription) -> tuple[list[GlassFile | None], tuple[str, ...]]:
+    """The material in optiland's database behind each surface of a lens, None for air, a mirror and
+    an index of its own; and notes for the user on how glasses were read, each once.
+
+    Raises InputError as `optic_of` does.
+    """
+    files: list[GlassFile | None] = []
+    notes: list[str] = []
+    for surface in lens.surfaces:
+        glass = surface.glass
+        if glass.is_mirror or glass.is_air or glass.index_d is not None:
+            files.append(None)
+            continue
+        file, more = find_glass(glass, surface.label)
+        _check_wavelengths(file, surface, lens.wavelengths_um)
+        files.append(file)
+        notes += more
+    return files, tuple(dict.fromkeys(notes))
+
+
+def _check_wavelengths(
+    file: GlassFile, surface: LensSurface, wavelengths_um: Sequence[float]
+) -> None:
+    """Raise InputError for a glass that is not known at a wavelength of the lens."""
+    for um in wavelengths_um:
+        if not file.shortest_um <= um <= file.longest_um:
+            raise InputError(
+                f"{surface.label}: {surface.glass.name} is known from {file.shortest_um:g} to"
+                f" {file.longest_um:g} um, and the lens is for {um:g} um; write a wavelength"
+                " within, or another glass"
+            )
 
 
 def _geometry(surface: LensSurface) -> dict[str, Any]:
@@ -181,29 +213,18 @@ def _mask(apertures: Sequence[Aperture]) -> Any:
     return Mask()
 
 
-def _material(surface: LensSurface, wavelengths_um: Sequence[float]) -> tuple[Any, list[str]]:
-    """optiland's material behind a surface, and notes for the user on how it was read. Raises
-    InputError for an unknown glass, or one that is not known at a wavelength of the lens.
-    """
-    glass = surface.glass
+def _material(glass: Glass, file: GlassFile | None) -> Any:
+    """optiland's material of a glass, whose file is that of `glass_files`."""
     if glass.is_mirror:
-        return "mirror", []
-    if glass.is_air:
-        return "air", []
+        return "mirror"
     if glass.index_d is not None:
-        return _model(glass), []
-    file, notes = find_glass(glass, surface.label)
-    for um in wavelengths_um:
-        if not file.shortest_um <= um <= file.longest_um:
-            raise InputError(
-                f"{surface.label}: {glass.name} is known from {file.shortest_um:g} to"
-                f" {file.longest_um:g} um, and the lens is for {um:g} um; write a wavelength"
-                " within, or another glass"
-            )
+        return _model(glass)
+    if file is None:
+        return "air"
     from optiland.materials.material_file import MaterialFile
 
     folder = resources.files("optiland.database").joinpath("data-nk")
-    return MaterialFile(str(Path(str(folder)) / file.filename)), notes
+    return MaterialFile(str(Path(str(folder)) / file.filename))
 
 
 def _model(glass: Glass) -> Any:

@@ -17,7 +17,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import write_csv
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.files import STDOUT, whole_file
-from hilstar.basics.units import ARCSEC_PER_RAD, magnitude
+from hilstar.basics.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.star_light import catalogue_choice
 from hilstar.server.bench.star_rates import StarRates, bench_optics, star_kinds, star_rates
@@ -261,7 +261,7 @@ def _company(
 ) -> Values:
     stars = every.taken(rows)
     difference = facts["difference_hp_mag"]
-    ratio = 10 ** (-0.4 * difference)  # the fainter component's light to the brighter's
+    ratio = flux_ratio(difference)  # the fainter component's light to the brighter's
     brighter = stars.v_mag + 2.5 * np.log10(1 + ratio)
     neighbour, arcsec = nearest_neighbours(every, rows, epoch_jyear)
     names = [every.name(k) for k in neighbour.tolist()]

@@ -15,6 +15,7 @@ import msgspec
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
+from hilstar.basics.units import flux_ratio
 from hilstar.display.calibration import load_calibration
 from hilstar.display.response import Response
 from hilstar.optics.psf import GaussianPsf
@@ -171,7 +172,7 @@ class _Trials:
         given = trial.render.flux_at_white_e_per_s
         for mag in BRIGHTER_MAG:
             if given is not None:
-                value = float(f"{given * 10 ** (-0.4 * mag):.{DIGITS}g}")
+                value = float(f"{given * flux_ratio(mag):.{DIGITS}g}")
                 yield trial.rendered("flux_at_white_e_per_s", value)
                 continue
             value = (trial.render.brightest_v_mag or 0.0) + mag

@@ -104,21 +104,21 @@ class QueueEntry:
 
 class LedgerQueue:
     """The messages that wait for the writer, in order of arrival, limited in bytes. Never waits
-    for the disk. When it is full, frames are dropped before packets; `dropped` counts by kind.
+    for the disk. When it is full, frames are dropped before packets, and counted by kind.
     """
 
     def __init__(self) -> None:
-        self.dropped: Counter[str] = Counter()
+        self._dropped: Counter[str] = Counter()
         self._entries: list[QueueEntry] = []
         self._bytes = 0
         self._lock = threading.Lock()
 
     def put(self, entry: QueueEntry) -> bool:
-        """Queue an entry and return True; without room count it in `dropped` and return False."""
+        """Queue an entry and return True; without room count it as dropped and return False."""
         room = MAX_WAITING_BYTES * (FRAMES_SHARE if entry.kind == "frame" else 1)
         with self._lock:
             if self._bytes + entry.size_bytes > room:
-                self.dropped[entry.kind] += 1
+                self._dropped[entry.kind] += 1
                 return False
             self._entries.append(entry)
             self._bytes += entry.size_bytes
@@ -131,6 +131,18 @@ class LedgerQueue:
             self._entries = []
             self._bytes = 0
         return taken
+
+    def take_dropped(self) -> Counter[str]:
+        """Remove and return the counts by kind of what was dropped."""
+        with self._lock:
+            dropped = self._dropped
+            self._dropped = Counter()
+        return dropped
+
+    @property
+    def dropped(self) -> int:
+        """How many entries were dropped since their counts were taken."""
+        return self._dropped.total()
 
 
 Counted = Kind | Literal["pulse", "lost"]  # pulses and lost packets are only counted
@@ -433,8 +445,7 @@ class Ledger(Closing):
     def _each_second(self) -> None:
         """Record the counts and the process, and check the disk."""
         now_ns = time.monotonic_ns()
-        dropped, self._queue.dropped = self._queue.dropped, type(self._queue.dropped)()
-        for kind, number in dropped.items():
+        for kind, number in self._queue.take_dropped().items():
             self._lose(kind, number)
         for (kind, reason), number in self._filter.counted().items():
             # The summary counts what a flood left out; pulses and lost packets have no message.
@@ -605,11 +616,10 @@ class Ledger(Closing):
         messages (`unrecorded`), of messages of a flood that were `only_counted`, and of its
         `files`, where there are several.
         """
-        lost = self._lost + sum(self._queue.dropped.values())
         told: dict[str, str | int | None] = {
             "path": str(self.path),
             "failure": self.failure,
-            "unrecorded": lost,
+            "unrecorded": self._lost + self._queue.dropped,
         }
         if self._counted:
             told["only_counted"] = self._counted

@@ -5,13 +5,15 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
-from hilstar.instruments.study.speed import benchmark
+from hilstar.instruments.study.speed import benchmark, tracker
 from hilstar.instruments.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, numpy_linear, scene
 from hilstar.instruments.study.sweep import Load
 from tests.support.commands import assert_refused, run_hilstar_here, run_started
@@ -231,3 +233,22 @@ def test_slow_works_take_fewer_turns_evenly(monkeypatch):
         "slowest": 1,
     }
     assert taken[3:] == ["fast", "fast", "slow"] * 4
+
+
+def test_a_timed_tracker_is_freed_where_its_campaign_cannot_begin(monkeypatch):
+    freed = []
+
+    class Exposing:
+        """The works of a tracker whose session is refused."""
+
+        def __init__(self, file, folder):
+            self.simulator = SimpleNamespace(close=lambda: freed.append(folder))
+
+        def session(self):
+            raise InputError("its bench is another one's")
+
+    monkeypatch.setattr(tracker, "Exposing", Exposing)
+    with pytest.raises(InputError):
+        tracker.tracker_rows(1, 0.0)
+    assert len(freed) == 1
+    assert not freed[0].exists()

@@ -16,6 +16,7 @@ import pytest
 from hilstar.server import demo
 from hilstar.server.bench.config.attitude import AttitudeSettings
 from hilstar.server.bench.frame import Bench
+from hilstar.server.watchdog import GPU_LOST
 from tests.support.commands import HILSTAR, run_hilstar_here
 from tests.support.forks import Started
 from tests.support.pages import live, page_of, picture_of
@@ -162,3 +163,17 @@ def test_with_a_tracker_the_loop_is_closed_and_its_budget_stands_beside_what_was
         )
     assert {"field-of-view error across", "pixel error across", "wrong answers"} <= found.keys()
     assert (tmp_path / "demo" / "budget.html").stat().st_size > 10_000
+
+
+def test_a_demo_whose_gpu_was_lost_ends_with_exit_code_3(tmp_path, monkeypatch, bench_with):
+    bench = bench_with()
+
+    def lost(directory, seconds, shows, watching):
+        with watching(bench, "tcp://127.0.0.1:5599") as (_, outlet):
+            outlet.notices.begin(GPU_LOST, "the GPU was lost")
+        raise AssertionError("the demo went on")
+
+    monkeypatch.setattr(demo, "run_demo", lost)
+    result = run_demo(tmp_path)
+    assert (result.returncode, result.stdout) == (3, "")
+    assert "hilstar: the GPU was lost; begin it again" in result.stderr

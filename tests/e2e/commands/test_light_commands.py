@@ -19,6 +19,7 @@ import hilstar
 from hilstar.display.calibration import load_calibration
 from hilstar.instruments.simulate.budget import budget, zero_point_mag
 from hilstar.optics.psf import GaussianPsf, pixel_share
+from hilstar.server.bench.config import read_config
 from hilstar.server.bench.frame import clipping_hip
 from tests.support.benches import ROOT, SMALL_BENCH, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -244,11 +245,14 @@ def test_a_monitor_that_is_30_percent_too_bright_is_found_by_the_tracker(
 
 
 def test_readings_that_disagree_are_said_to(small_bench_file):
-    result = run_hilstar_here(
-        "calibrate", "scale", small_bench_file, "--reading", "26311,1000", "--reading", "26727,3000"
-    )
+    words = ("--reading", "26311,1000", "--reading", "26727,3000", "--reading", "25930,900")
+    scaled = small_bench_file.with_name("scaled.toml")
+    result = run_hilstar_here("calibrate", "scale", small_bench_file, *words, "-o", scaled)
     assert result.returncode == 0
     assert "disagree" in result.stderr
+    # three readings leave two degrees of freedom, as they are printed and as they are written
+    assert "flux_at_white_dof = 2\n" in result.stdout
+    assert read_config(scaled).certify.flux_at_white_dof == 2
 
 
 def test_plan_measure_fit_and_show_go_round(tmp_path, small_bench_file, rng):

@@ -16,6 +16,7 @@ from hilstar.server.record.ledger_records import frame_records
 from tests.support.commands import assert_refused, run_hilstar, typed
 from tests.support.forks import HILSTAR, Started
 from tests.support.heads import MOUNTINGS, heads_file
+from tests.support.pages import gone
 from tests.support.senders import free_port, publisher, talking
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.x11.screens import recorded
@@ -104,8 +105,10 @@ def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):
         with Started(command, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
             try:
                 wait_for(lambda: lines.read_text().count("the first attitude has come") == 3)
+                heads = children(process.pid).values()
             finally:
                 process.kill()
+        wait_for(lambda: all(map(gone, heads)), "the heads end with their run")
         assert list(place.glob("hilstar-head*"))
         ended = run_hilstar(*command[3:], "--duration", "0.5", env=environment)
         assert ended.returncode in {0, 4}, ended.stderr

@@ -9,8 +9,10 @@ import gc
 import importlib.util
 import os
 import resource
+import select
 import signal
 import socket
+import subprocess
 import sys
 import time
 from importlib.machinery import PathFinder
@@ -259,3 +261,38 @@ def test_a_user_s_module_is_the_one_beside_the_file_and_hides_no_installed_one(
     for function in ("os:system", "pyclbr:system", "subprocess:run", "of_this_bench", ""):
         with pytest.raises(UserCodeError):
             user_function(f"python:{function}", tmp_path)
+
+
+PARENT_OF_ONE = """
+import os
+import sys
+import time
+from hilstar.basics.process.interrupts import end_with_parent
+
+pipe = int(sys.argv[1])
+parent = os.getpid()
+child = os.fork()
+if child == 0:
+    end_with_parent({parent})
+    os.write(pipe, b"goes on")
+    time.sleep(600)
+os.waitpid(child, 0)
+os.write(pipe, b"has ended")
+"""
+
+
+@pytest.mark.parametrize(("parent", "said"), [("parent", b"goes on"), ("1", b"has ended")])
+def test_a_process_ends_with_the_one_that_began_it_also_where_that_was_another(parent, said):
+    """The pipe's end is that of the last process that could write to it."""
+    reading, writing = os.pipe()
+    command = [sys.executable, "-c", PARENT_OF_ONE.format(parent=parent), str(writing)]
+    with subprocess.Popen(command, pass_fds=[writing]) as process:
+        os.close(writing)
+        try:
+            assert os.read(reading, 10) == said
+        finally:
+            process.kill()
+    is_read, *_ = select.select([reading], [], [], PATIENCE_S)
+    assert is_read, "the child goes on without its parent"
+    assert os.read(reading, 10) == b""
+    os.close(reading)

@@ -11,7 +11,15 @@ from pathlib import Path
 import pytest
 
 from hilstar.basics.errors import InputError, one_line, shortened
-from hilstar.basics.reading import MAGIC, exists, open_lines, open_regular, read_bytes, read_text
+from hilstar.basics.reading import (
+    CHUNK_BYTES,
+    MAGIC,
+    exists,
+    open_lines,
+    open_regular,
+    read_bytes,
+    read_text,
+)
 from tests.support.refusals import refusal
 
 ADVICE = "give a file of text"
@@ -75,6 +83,19 @@ def test_the_first_byte_that_is_not_utf_8_is_named(tmp_path):
     for mark in (b"", b"\xef\xbb\xbf"):
         path.write_bytes(mark + b"abc\xe9 xx")
         assert f"byte {len(mark) + 3} is 0xe9" in text_refusal(path)
+
+
+@pytest.mark.parametrize("before", [0, 1, 2])
+def test_a_byte_that_is_not_utf_8_is_named_by_its_place_in_a_large_file_too(tmp_path, before):
+    """A character of three bytes may lie across the pieces in which the file is looked at."""
+    text = "a" * (CHUNK_BYTES - before) + "\N{EURO SIGN}" + "b" * 10
+    path = tmp_path / "large"
+    path.write_bytes(text.encode() + b"\xff")
+    place = CHUNK_BYTES - before + 3 + 10
+    assert f"byte {place} is 0xff" in text_refusal(path, 2 * CHUNK_BYTES)
+    path.write_bytes(text.encode()[: CHUNK_BYTES - before + 2] + b"b")
+    place = CHUNK_BYTES - before
+    assert f"byte {place} is 0xe2" in text_refusal(path, 2 * CHUNK_BYTES)
 
 
 def test_lines_come_one_by_one_and_as_the_file_has_them(tmp_path):

@@ -209,3 +209,5 @@ def test_pages_of_heads_have_ports_one_after_another_or_each_the_system_s(monkey
     assert _consoles("127.0.0.1:0", None, 2) == ("127.0.0.1:0",) * 2
     assert _consoles(None, None, 2) == ()
     assert "as many ports" in refusal(_consoles, "127.0.0.1:65535", None, 2)
+    # the last port there is
+    assert _consoles("127.0.0.1:65535", None, 1) == ("127.0.0.1:65535",)

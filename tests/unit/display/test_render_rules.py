@@ -12,7 +12,8 @@ import pytest
 
 from hilstar.display.panel import Panel
 from hilstar.display.render.aids import CROSSHAIR, PATCH, lay_over
-from hilstar.display.render.context import check_limits
+from hilstar.display.render.context import check_limits, draws_by_cpu
+from hilstar.display.render.encoder import MEETING_WINGS, lit_sides
 from hilstar.display.render.light_units import DENSER_WINGS, MAX_SUM, LightUnits
 from hilstar.display.render.presenter import checked_triples, drawn_codes
 from hilstar.display.response import gamma_response
@@ -39,6 +40,43 @@ def test_the_dimmest_pixel_sets_what_lights_one_and_the_brightest_what_white_is(
     assert uneven.lit_e_per_s == pytest.approx(0.5 * plain.lit_e_per_s)
     assert uneven.most_e_per_s == pytest.approx(1.25 * WHITE_E_PER_S)
     assert plain.most_e_per_s == WHITE_E_PER_S
+
+
+def test_a_star_is_cut_by_what_lights_the_pixel_that_needs_least():
+    """Half the light lights a pixel whose white is half: there a star's wings light up farther out."""
+    uniformity = np.ones(SIZE_PX[::-1], dtype=np.float32)
+    uniformity[3, 4], uniformity[5, 6] = 0.5, 1.25
+    plain, uneven = (
+        lit_sides(Panel(gamma_response(8, 2.2), WHITE_E_PER_S, each), 0.01, PSF)
+        for each in (None, uniformity)
+    )
+    assert [side.side_px for side in uneven] == [side.side_px for side in plain]
+    half = [0.5 * side.below_e_per_s for side in plain]
+    assert [side.below_e_per_s for side in uneven] == pytest.approx(half)
+    # at the first rate not to be cut, the brightest pixel outside has a wing's light
+    for side in plain:
+        outside_e_per_s = side.below_e_per_s * PSF.outside_share(side.side_px)
+        assert outside_e_per_s == pytest.approx(0.01 / MEETING_WINGS)
+
+
+@pytest.mark.parametrize(
+    ("renderer", "by_itself"),
+    [
+        ("llvmpipe (LLVM 15.0.6, 256 bits)", True),
+        ("zink Vulkan 1.3(llvmpipe (LLVM 15.0.6, 256 bits))", True),
+        ("softpipe", True),
+        ("NVIDIA H200/PCIe/SSE2", False),
+        ("Mesa Intel(R) UHD Graphics 630 (CFL GT2)", False),
+    ],
+)
+def test_stars_are_drawn_by_the_cpu_where_opengl_is_a_processor_s_too(
+    monkeypatch, renderer, by_itself
+):
+    """HILSTAR_DRAW, where it is set, says otherwise."""
+    gl = SimpleNamespace(info={"GL_RENDERER": renderer})
+    for wanted, by_cpu in (("", by_itself), ("cpu", True), ("gl", False)):
+        monkeypatch.setenv("HILSTAR_DRAW", wanted)
+        assert draws_by_cpu(gl) == by_cpu
 
 
 @pytest.mark.parametrize("count", [1, 1000, 20_000])

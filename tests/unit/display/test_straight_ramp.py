@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.display.window.watch import is_straight, ramp_bits
+from hilstar.display.window.watch import is_straight, ramp_bits, straight_ramp
 
 
 def entries(curve: np.ndarray, bits: int) -> np.ndarray:
@@ -25,6 +25,16 @@ def three(column: np.ndarray) -> bytes:
 @pytest.mark.parametrize("bits", [8, 10, 12, 16])
 def test_the_identity_is_straight_at_each_depth_and_size(steps, bits):
     assert is_straight(three(entries(np.linspace(0, 1, steps), bits)))
+
+
+@pytest.mark.parametrize("steps", [2, 256, 1024, 4096])
+def test_the_ramp_that_is_set_ends_at_full_light_and_rises_evenly(steps):
+    ramp = np.array(straight_ramp(steps))
+    assert (ramp[0], ramp[-1]) == (0.0, 1.0)
+    assert ramp * (steps - 1) == pytest.approx(np.arange(steps), abs=1e-9)
+    assert is_straight(np.tile(ramp, (3, 1)))
+    if steps > 2:
+        assert not is_straight(np.tile(ramp * (1 - 1 / steps), (3, 1)))  # white a step too dark
 
 
 @pytest.mark.parametrize("steps", [256, 1024, 4096])

@@ -70,6 +70,19 @@ def test_the_sides_of_a_wide_image_are_left_out_of_its_circle(flat_sky, rng):
     assert len(image) < 0.75 * len(circle)
 
 
+@pytest.mark.parametrize("middle_px", [(959.5, 539.5), (1200.0, 300.0), (-50.0, 700.0)])
+@pytest.mark.parametrize("margin_px", [0.0, 6.0])
+def test_the_field_s_radius_is_the_angle_to_the_farthest_corner(middle_px, margin_px):
+    """Pixels' middles have whole numbers: the image ends half a pixel beyond them."""
+    camera = Camera(SIZE, 2000.0, middle_px, np.eye(3))
+    left = -0.5 - margin_px
+    right, bottom = np.array(SIZE) - 0.5 + margin_px
+    x_px, y_px = np.meshgrid([left, right], [left, bottom])
+    corners = camera.rays(x_px.ravel(), y_px.ravel())
+    cosines = corners[:, 2] / np.linalg.norm(corners, axis=1)
+    assert camera.field_radius_rad(margin_px) == pytest.approx(np.arccos(cosines).max(), rel=1e-12)
+
+
 def test_bodies_that_have_no_place_yet_are_not_found(flat_sky):
     nowhere = replace(flat_sky.grid, centre=np.full_like(flat_sky.grid.centre, np.nan))
     assert len(nowhere.near(np.array([0.0, 0.0, 1.0]), 1.0, np.eye(3))) == 0

@@ -12,8 +12,10 @@ from hilstar.display.render.reference import linear_image
 from hilstar.optics import exposure_motion as smear
 from hilstar.optics.exposure_motion import MIDDLE_S, Motion, smeared_sprites
 from hilstar.optics.psf import MAX_CUT, GaussianPsf
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import join_sprites, make_sprites
 from tests.support.stars import stars_at
+from tests.support.turned_cameras import turned_attitude, turned_cameras
 
 IDENTITY = np.array([1.0, 0, 0, 0])
 SIZE = (320, 240)
@@ -21,6 +23,7 @@ CAMERA = monitor_camera(SIZE, 13.0, 70.0, IDENTITY)
 # The module's promise: 1e-6 of a star's flux in any pixel, and the footprints' cut.
 PIXEL_LIMIT = 1e-6 + MAX_CUT
 SIGMA = (0.85, 0.6)
+AXES_PX = 1e-8  # rounding of a few rotations more, at 1000 px from the axis
 
 
 def motion(rate_deg_s, exposure_s=1.0, radec=(84.0, -1.0, 20.0)) -> Motion:
@@ -56,6 +59,22 @@ def brute_force(stars, at: Motion, steps: int) -> np.ndarray:
         )
         / steps
     )
+
+
+@pytest.mark.parametrize("scan", [Scan(), Scan((0, 1), 0.05)], ids=["at once", "rolling"])
+def test_an_exposure_does_not_depend_on_the_axes_in_which_its_turn_is_told(scan, rng):
+    """Attitude, rate and mounting in axes that are turned draw the same paths."""
+    at = motion((0.1, -0.2, 3.0))
+    stars, psf = star_on((200.3, 90.6), at), GaussianPsf(SIGMA)
+    drawn = smeared_sprites(stars, at, CAMERA, psf, scan)
+    assert len(drawn) > 1
+    for turned, camera in turned_cameras(CAMERA, rng):
+        rate = turned.apply(at.rate_cam_rad_s)
+        other = Motion(turned_attitude(turned, at.q_icrs_to_cam), rate, at.exposure_s)
+        again = smeared_sprites(stars, other, camera, psf, scan)
+        assert np.stack([again.x_px, again.y_px]) == pytest.approx(
+            np.stack([drawn.x_px, drawn.y_px]), abs=AXES_PX
+        )
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,16 @@ import pytest
 
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.optics.camera import Camera
-from hilstar.optics.extended import DiscView, LightMap, Pose, Shear, disc_lights, shifted
+from hilstar.optics.extended import (
+    SMALL_SIGMAS,
+    DiscLight,
+    DiscView,
+    LightMap,
+    Pose,
+    Shear,
+    disc_lights,
+    shifted,
+)
 from hilstar.optics.psf import GaussianPsf
 from hilstar.sky.bodies.disc import Disc
 
@@ -41,6 +50,21 @@ def test_a_pixel_lights_up_as_late_as_its_columns_and_rows_from_the_middle_say()
     shear = Shear(np.zeros(3), (1e-3, 1e-5), MIDDLE_PX)
     x_px, y_px = np.array([47.5, 57.5, 47.5]), np.array([39.5, 39.5, 49.5])
     np.testing.assert_allclose(shear.late_s(x_px, y_px), [0.0, 1e-2, 1e-4])
+
+
+@pytest.mark.parametrize("sigma_px", [(0.5, 0.5), (0.5, 2.0), (2.0, 0.5)])
+@pytest.mark.parametrize(("share", "kind"), [(0.98, LightMap), (1.02, DiscLight)])
+def test_a_disc_is_small_where_its_radius_is_under_so_many_of_the_wider_sigma(
+    sigma_px, share, kind
+):
+    """A small one is drawn as its blurred map, a larger one as itself. A pixel's own width adds
+    to sigma, 1/12 px^2.
+    """
+    psf = GaussianPsf(sigma_px)
+    widest_px = np.sqrt(max(sigma_px) ** 2 + 1 / 12)
+    disc = uniform_disc(MIDDLE_PX, share * SMALL_SIGMAS * widest_px)
+    (light,) = disc_lights(disc, DiscView(CAMERA, psf, (Pose(np.eye(3)),), None), False)
+    assert isinstance(light, kind)
 
 
 @pytest.mark.parametrize("s_per_px", [(0.0, 1e-4), (1e-4, 0.0), (0.0, -1e-4), (5e-5, 1e-4)])

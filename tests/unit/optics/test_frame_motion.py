@@ -15,6 +15,7 @@ from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Orientation, Scan
 from hilstar.optics.sprites import clipped_sprites, make_sprites
 from tests.support.stars import stars_at
+from tests.support.turned_cameras import turned_attitude, turned_cameras
 
 SIZE = (320, 240)
 CAMERA = monitor_camera(SIZE, 13.0, 70.0, np.array([1.0, 0, 0, 0]))
@@ -26,6 +27,7 @@ PIXEL_LIMIT = 1e-3  # of a star's flux: what the module's node counts promise
 # Two passes leave (px crossed / rows)^2 of the scan-out, here (8 / 240)^2 of at most 8 px.
 ROW_LIMIT_PX = 0.01
 EXACT_PX = 1e-9
+AXES_PX = 1e-8  # rounding of a few rotations more, at 1000 px from the axis
 
 
 def stars_on(pixels):
@@ -68,6 +70,23 @@ def test_each_star_is_where_it_is_when_its_own_row_lights(down, axis, sign, rows
         assert found[k] == pytest.approx(place_px(stars, at, late_s)[k], abs=ROW_LIMIT_PX)
     moved = np.abs(found - place_px(stars, at, 0.0)).max()
     assert moved > 0.5  # the middle row's moment would be wrong by so much
+
+
+@pytest.mark.parametrize("scanout_s", [0.0, 0.9 * FRAME_S])
+def test_a_frame_does_not_depend_on_the_axes_in_which_its_turn_is_told(scanout_s, rng):
+    """Attitude, rate and mounting in axes that are turned draw the same paths."""
+    scan = Scan((0, 1), scanout_s, FRAME_S)
+    stars, at = stars_on(PIXELS), turn((0.5, -2.0, 6.0))
+    drawn = swept(stars, at, scan)
+    assert len(drawn) > len(PIXELS)
+    for turned, camera in turned_cameras(CAMERA, rng):
+        rate = turned.apply(at.rate_cam_rad_s)
+        other = CameraTurn(turned_attitude(turned, at.q_icrs_to_cam), rate)
+        again = swept_sprites(stars, other, scan, camera, GaussianPsf(SIGMA))
+        assert again.star.tolist() == drawn.star.tolist()
+        assert np.stack([again.x_px, again.y_px]) == pytest.approx(
+            np.stack([drawn.x_px, drawn.y_px]), abs=AXES_PX
+        )
 
 
 @pytest.mark.parametrize("rate", [(0.05, 0, 0), (1.0, 0.3, 0), (2.0, -2.0, 20.0), (30.0, 10.0, 0)])

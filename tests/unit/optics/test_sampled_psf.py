@@ -150,6 +150,20 @@ def test_footprint_and_reach_hold_what_they_say(profile, half_px):
     assert np.pi * np.sqrt(x2 * y2) * np.log(100 * factor) < psf.footprint_px**2
 
 
+@pytest.mark.parametrize("rows", [1, -1], ids=["as it is", "upside down"])
+@pytest.mark.parametrize("columns", [1, -1], ids=["as it is", "mirrored"])
+def test_what_a_footprint_cuts_is_that_of_the_worst_corner_of_a_pixel(rows, columns):
+    """By quadrature of a tail towards each side, whose samples hold 1 - 1e-6 of its light."""
+    psf = SampledPsf(sampled(coma(), 5, 8)[::rows, ::columns], 5)
+    for size_px in (3, 5, 7):
+        pixel = np.arange(size_px) - size_px // 2
+        kept = []
+        for x, y in product((-0.5, 0.5), (-0.5, 0.5)):
+            kept.append(in_pixels(coma(), columns * (pixel - x), rows * (pixel - y), 6).sum())
+        assert psf.cut_share(size_px) == pytest.approx(1 - min(kept), rel=0.01)
+    assert psf.footprint_px == SampledPsf(sampled(coma(), 5, 8), 5).footprint_px
+
+
 def test_the_chief_ray_stays_in_the_middle():
     """The centroid of a coma is its own, and so not at the star's place."""
     psf = SampledPsf(sampled(coma(), 5, 7), 5)

@@ -18,9 +18,9 @@ from hilstar.optics.psf import (
     pixel_shares,
     share_polynomial,
 )
-from hilstar.optics.sprites import clipped_sprites, make_sprites
+from hilstar.optics.sprites import by_primary, clipped_sprites, make_sprites
 from hilstar.sky.stars import Stars
-from tests.support.stars import stars_at
+from tests.support.stars import sprites_at, stars_at
 
 IDENTITY = np.array([1.0, 0, 0, 0])
 SIGMA = (0.85, 0.85)
@@ -103,6 +103,22 @@ def test_sprites_are_whole_pixels_and_fractions(footprint, rng):
     restored = sprites.data["pixel"] + fraction.astype(np.float64)
     # float32 of a number below 1: 6e-8.
     assert np.abs(restored - truth).max() < 6e-8
+
+
+@pytest.mark.parametrize("footprint", [9, 10])
+def test_a_primary_s_sprites_are_listed_where_they_are_drawn(footprint, rng):
+    """Its light lies a third of a pixel to a side: it is drawn as far to the other."""
+    at_px = rng.uniform(10.0, 90.0, (50, 2))
+    sprites = sprites_at(at_px, np.ones(50), footprint)
+    places_px = np.array([[-1 / 3, 0.25], [0.0, 0.0], [1 / 3, -0.75]])
+    for k, place_px in enumerate(places_px):
+        drawn = by_primary(sprites, places_px, k)
+        listed = np.column_stack([drawn.x_px, drawn.y_px])
+        assert listed == pytest.approx(at_px - place_px, abs=1e-12)
+        fraction_px = drawn.data["fraction_px"]
+        assert drawn.data["pixel"] + fraction_px == pytest.approx(listed, abs=1e-6)  # float32
+        low = -0.5 if footprint % 2 else 0.0
+        assert ((fraction_px >= low) & (fraction_px <= low + 1)).all()
 
 
 @pytest.mark.parametrize("footprint", [9, 10])

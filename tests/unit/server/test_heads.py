@@ -6,7 +6,8 @@ from __future__ import annotations
 
 import os
 import sys
-from itertools import pairwise
+import threading
+from itertools import count, pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -14,7 +15,7 @@ import pytest
 
 from hilstar.server import heads
 from hilstar.server.bench.bench_file import read_heads
-from hilstar.server.heads import HeadProcess, HeadsRun, _told, head_command
+from hilstar.server.heads import HeadProcess, HeadsRun, _hand_on, _told, head_command
 from tests.support.damage import NO_JSON
 from tests.support.heads import heads_file
 from tests.support.waiting import wait_for
@@ -148,3 +149,46 @@ def test_only_a_head_that_was_well_for_long_is_begun_again_after_the_shortest_pa
     )
     assert ended(head) == (1, 2)
     assert pauses == [anew] * 2
+
+
+class Source:
+    """A link that has something at each look, and does not speak back."""
+
+    two_way = False
+
+    def __init__(self) -> None:
+        self.arrivals = (SimpleNamespace(event=number) for number in count())
+
+    def receive(self, timeout_ms: int) -> list[SimpleNamespace]:
+        return [next(self.arrivals)]
+
+    def send(self, packet: object) -> None:
+        """Nobody listens."""
+
+
+class Tended:
+    """A head that has something to do for so many looks; `left` are those that are yet to come."""
+
+    def __init__(self, looks: int) -> None:
+        self.left = looks
+
+    def tend(self) -> bool:
+        self.left -= 1
+        return self.left > 0
+
+
+def test_heads_are_fed_until_the_last_of_them_has_done(monkeypatch):
+    monkeypatch.setattr(heads, "TEND_NS", -1)  # at each look
+    given: list[int] = []
+    feed = SimpleNamespace(give=lambda arrival: given.append(arrival.event))
+    early, late = Tended(1), Tended(5)
+    _hand_on(Source(), feed, [early, late], threading.Event())
+    assert late.left == 0
+    assert given == [0, 1, 2, 3, 4]
+
+
+def test_a_signal_ends_the_feeding_of_heads_that_have_more_to_do():
+    stop = threading.Event()
+    feed = SimpleNamespace(give=lambda arrival: stop.set())
+    _hand_on(Source(), feed, [Tended(10**9)], stop)
+    assert stop.is_set()

@@ -338,6 +338,27 @@ def test_what_waits_is_bounded_by_bytes_and_frames_go_first():
     assert backlog.put(QueueEntry("frame", 0, 0, bytes))
 
 
+def test_what_a_full_queue_dropped_is_counted_once_by_kind():
+    backlog = LedgerQueue()
+    large = QueueEntry("packet", 0, 0, bytes, MAX_WAITING_BYTES + 1)
+    for entry in (large, large, QueueEntry("frame", 0, 0, bytes, MAX_WAITING_BYTES + 1)):
+        assert not backlog.put(entry)
+    assert backlog.dropped == 3
+    assert backlog.take_dropped() == {"packet": 2, "frame": 1}
+    assert (backlog.dropped, backlog.take_dropped()) == (0, {})
+
+
+def test_what_is_dropped_once_the_last_turn_is_written_is_unrecorded_too(
+    tmp_path, kept_bench, monkeypatch
+):
+    ledger = Ledger(tmp_path / "run.mcap", kept_bench)
+    keep(ledger, 0, 10)
+    ledger.close()
+    monkeypatch.setattr("hilstar.server.record.ledger.MAX_WAITING_BYTES", 0)
+    keep(ledger, 10, 13)
+    assert ledger.summary()["unrecorded"] == 6  # three packets and three frames
+
+
 def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, kept_bench):
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:

@@ -47,11 +47,12 @@ class Sender:
 
     endpoint = "tcp://nowhere"
 
-    def __init__(self) -> None:
+    def __init__(self, watches: bool = True) -> None:
         self.frames: SimpleQueue = SimpleQueue()
+        self.watches = watches
 
     def look(self) -> bool:
-        return True
+        return self.watches
 
     def put_frame(self, frame) -> None:
         self.frames.put(frame)
@@ -181,6 +182,26 @@ def test_a_dropped_frame_leaves_the_one_before_on_the_display(tmp_path, rng):
     # 60 exposures at random phases: the spread of a phase's error, at most 1/8 of (2/60)^2 / 0.1 s
     for late_s in run.biases_s(0.1, rng):
         assert late_s == pytest.approx(0.5 / 60, abs=4 * 1.4e-3 / np.sqrt(60))
+
+
+def test_the_first_frame_of_a_watcher_is_dated_by_the_one_before_it(tmp_path):
+    """Its light begins to pass half way between the two moments, whoever saw the earlier one."""
+    clock = FakeClock()
+    bench = BusyBench(tmp_path, clock, 60.0, lambda: 0.0, "off")
+    drawn = bench.draw_sprites(None, 0)
+    moments_ns = [10**9, 2 * 10**9, 9 * 10**9, 9_016_000_000]
+    shown = [
+        Shown(k, t_ns, None, drawn, light_ns=t_ns, fades=True) for k, t_ns in enumerate(moments_ns)
+    ]
+    sender = Sender(watches=False)
+    with FrameFeed(sender, bench) as feed:
+        for frame in shown[:3]:
+            feed.see(frame)
+        sender.watches = True
+        wait_for(lambda: feed.watched)
+        feed.see(shown[3])
+        head = sender.frames.get(timeout=TIMEOUT_S).head
+    assert (head.frame, head.lit_ns) == (3, (moments_ns[2] + moments_ns[3]) // 2)
 
 
 def test_on_a_screen_a_frame_is_lit_until_the_next_begins():

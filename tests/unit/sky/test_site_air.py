@@ -12,6 +12,7 @@ import pytest
 from hilstar.sky.air import AIR_MASSES, SiteAir
 from hilstar.sky.bodies.orbit import Geocentre
 from hilstar.sky.bodies.passes import Cone
+from hilstar.sky.stars import AirAbove
 from tests.support.satellites import satellite_sky, some_orbits
 from tests.support.skies import moving_sky
 from tests.support.stars import stars_at
@@ -49,6 +50,39 @@ def test_air_dims_each_channel_of_a_star_by_its_own_extinction():
     found = seen.electrons_per_s[:, None] * seen.colours
     np.testing.assert_allclose(found, wanted, rtol=1e-5)  # the air masses' five digits
     np.testing.assert_allclose(seen.colours.sum(axis=1), 1.0)
+
+
+# of one step of Newton's, in this air, down to 20 degrees of altitude: 3.9e-9 rad measured
+BENT_RAD = 1e-8
+
+
+@pytest.mark.parametrize("velocity_km_s", [None, (20.0, -21.0, 7.0)], ids=["at rest", "moving"])
+def test_the_air_bends_what_the_observer_sees_by_a_tan_z_and_b_tan_3_z(velocity_km_s):
+    """Aberration first, which turns stars by up to 20 arcsec, then refraction: z the zenith distance
+    as it is seen.
+    """
+    up = np.array([2.0, -1.0, 2.0]) / 3
+    level = np.array([1.0, 2.0, 0.0]) / np.sqrt(5)
+    z_rad = np.radians([0.0, 20.0, 45.0, 60.0, 70.0])[:, None]
+    stars = stars_at(np.cos(z_rad) * up + np.sin(z_rad) * level, np.ones(len(z_rad)))
+    if velocity_km_s is not None:
+        stars = replace(stars, velocity_km_s=np.array(velocity_km_s))
+    every = np.arange(len(stars))
+    outside = stars.directions(every)
+    a_rad, b_rad = 2.9e-4, -3.3e-7
+    seen = replace(stars, air=AirAbove(up, (a_rad, b_rad))).directions(every)
+    outside_z_rad, seen_z_rad = (np.arctan2(*_across_and_up(v, up)) for v in (outside, seen))
+    tangent = np.tan(seen_z_rad)
+    bent_rad = a_rad * tangent + b_rad * tangent**3
+    assert outside_z_rad - seen_z_rad == pytest.approx(bent_rad, abs=BENT_RAD)
+    assert np.linalg.norm(seen, axis=1) == pytest.approx(1, abs=1e-12)
+    # towards the zenith, and not to a side
+    sideways = np.cross(outside, up)
+    assert np.einsum("ij,ij->i", sideways, seen) == pytest.approx(0, abs=1e-12)
+
+
+def _across_and_up(vectors: np.ndarray, up: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.linalg.norm(np.cross(vectors, up), axis=1), vectors @ up
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,20 @@ from hilstar.sky.spectrum import (
     load_curve,
     temperature_ballesteros2012_k,
     temperature_wang2021_k,
+    torres2010_k,
 )
 from tests.support.refusals import refusal
+
+# E. Mamajek's mean dwarf sequence, version 2022.04.16 (Pecaut & Mamajek 2013, ApJS 208, 9): B-V, K;
+# A0V, F0V, G2V, K0V, K5V.
+PECAUT_MAMAJEK = ((0.000, 9700), (0.295, 7220), (0.650, 5770), (0.816, 5270), (1.150, 4440))
+# Two calibrations of one quantity; the dwarfs' and giants' temperatures at one B-V differ by as
+# much. Measured: 2.2 %.
+SCALES_AGREE = 0.03
+# Two supergiants: Deneb (Schiller and Przybilla 2008) and gamma Cygni (Gray 2010). B-V is that of
+# Hipparcos; dust makes it 0.05 mag too red, which is 5 % of a temperature.
+SUPERGIANTS = ((0.092, 8525), (0.673, 5790))
+SUPERGIANTS_AGREE = 0.05
 
 
 def test_a_black_body_neither_overflows_nor_turns_negative():
@@ -37,6 +49,18 @@ def test_the_source_s_temperature_scale_jumps_at_zero_and_the_default_does_not()
     assert np.diff(temperature_ballesteros2012_k(around))[0] == pytest.approx(0, abs=1e-4)
     # the Sun, Ballesteros 2012
     assert temperature_ballesteros2012_k(np.array([0.65]))[0] == pytest.approx(5778, abs=40)
+
+
+def test_torres_gives_the_sun_its_temperature():
+    """B-V = 0.653 (Ramirez 2012): 5772 K (IAU 2015), within the relation's own 2 %."""
+    assert torres2010_k(np.array([0.653]))[0] == pytest.approx(5772, rel=0.02)
+
+
+def test_torres_agrees_with_pecaut_and_mamajek_and_with_supergiants_spectra():
+    bv_mag, kelvin = np.array(PECAUT_MAMAJEK).T
+    assert torres2010_k(bv_mag) == pytest.approx(kelvin, rel=SCALES_AGREE)
+    bv_mag, kelvin = np.array(SUPERGIANTS).T
+    assert torres2010_k(bv_mag, supergiant=True) == pytest.approx(kelvin, rel=SUPERGIANTS_AGREE)
 
 
 def test_temperature_scales_are_finite_over_every_colour_of_the_catalogue():

@@ -95,3 +95,27 @@ def test_a_star_s_shares_change_with_its_place_as_their_slopes_say():
     before, slopes = _profile(at, places, sigma_px).swapaxes(0, 1)
     after, _ = _profile(at, places + step_px, sigma_px).swapaxes(0, 1)
     assert slopes == pytest.approx((after - before) / step_px, abs=step_px)
+
+
+@pytest.mark.parametrize("kind", ["box3", "box5"])
+@pytest.mark.parametrize(
+    ("stated", "x_px", "y_px"),
+    [
+        ({}, (0.1 - 0.05) / 1.18, 0.03 / 1.18),  # by a fiftieth
+        ({"box_share": 0.0}, (0.1 - 0.05) / 1.18, 0.03 / 1.18),
+        ({"box_share": 0.04}, (0.1 - 0.05) / 1.15, 0.0),
+        ({"box_share": 0.07}, 0.1 / 1.1, 0.0),
+        ({"box_share": 0.2}, 0.0, 0.0),
+    ],
+)
+def test_a_box_s_pixels_count_from_the_stated_share_of_its_brightest_on(kind, stated, x_px, y_px):
+    """Four pixels of 1, 0.1 right of it, 0.05 left and 0.03 below, with a brighter one beside the
+    box: the mean of those that count.
+    """
+    star = np.zeros((1, 11, 11))
+    star[0, 5, 4:7] = 0.05, 1.0, 0.1
+    star[0, 6, 5] = 0.03
+    star[0, 5, 9] = 3.0
+    middle = np.array([5]), np.array([5])
+    x, y = star_places(1e4 * star, kind, SIGMA, middle, **stated)
+    assert (x[0], y[0]) == pytest.approx((x_px, y_px), abs=1e-12)

@@ -492,6 +492,12 @@ def test_a_cmos_column_pattern_is_the_same_down_each_column():
     assert image[0].std() * 0.1 == pytest.approx(20.0, rel=SIGMAS / math.sqrt(2 * 2000))
 
 
+def test_a_pixel_is_the_ccd47_20_s_where_no_pitch_is_stated():
+    """Teledyne e2v's data sheet: an image area of 13.3 x 13.3 mm, of 1024 x 1024 pixels."""
+    device = Detector(DetectorSettings(), (4, 4))
+    assert device.pixel_pitch_um * 1024 == pytest.approx(13_300, abs=50)
+
+
 def test_cosmic_rays_come_at_their_rate_and_leave_their_charge():
     settings = DetectorSettings(cosmic_rays_per_cm2_s=1000.0)
     shape, expected = (512, 512), 1000.0 * 0.512**2

@@ -159,7 +159,6 @@ class StarSpot:
         `noise_dn` in a pixel.
         """
         shares, _ = self._shares
-        shares, _ = self._shares
         light = np.maximum(dn, 1e-9)
         window_dn = light * self.window_share
         photon_dn2 = window_dn / (self.gain_e_per_dn * self.frames)

@@ -449,10 +449,7 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     sigma_px, period, reach = _spacing(context)
     dark_path = context.dark()
     dark = context.read(dark_path)
-    bad = dark > HOT_FILL * context.full_dn
-    # a dot that reaches the detector's edge has lost light
-    bad[[0, -1]] = True
-    bad[:, [0, -1]] = True
+    bad = unusable_pixels(dark, context.full_dn)
     # their first dots' places; shifts are in half periods
     half_period = period // 2
     lattices = []
@@ -482,6 +479,16 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     noise = math.sqrt(sum_dn2 / dn**2 + response2)
     seen_dots = DotLight(column[lit], row[lit], light[lit], MAG_PER_RELATIVE * noise)
     return seen_dots, (dark_path, *(looked.path for looked in looks))
+
+
+def unusable_pixels(dark: FloatArray, full_dn: float) -> BoolArray:
+    """Pixels (height, width) by whose light no dot is whole: hot ones in a dark frame, and the
+    detector's outermost ones, beyond which a dot has lost light.
+    """
+    bad = dark > HOT_FILL * full_dn
+    bad[[0, -1]] = True
+    bad[:, [0, -1]] = True
+    return np.asarray(bad)
 
 
 def _shown(firsts: list[int], period: int, code: int, resolution_px: tuple[int, int]) -> CodeImage:

@@ -224,6 +224,12 @@ def headline(rows: Sequence[CombinationRow], load: Load) -> str:
     )
 
 
+def is_right(scenes: Sequence[Sequence[CombinationRow]]) -> bool:
+    """Whether in no scene a choice that effort may take beats `auto` beyond the noise."""
+    beyond = [beating(rows, as_filed=True)[0] for rows in scenes]
+    return not any(beyond)
+
+
 def standing(rows: Sequence[CombinationRow]) -> str:
     """Whether `auto` is on the front, in words; if not, what beats it and why effort does not take
     that.
@@ -579,8 +585,8 @@ def run(
     lines += unmeasured
     if glass:
         lines.append(glass_line(glass))
-    right = not any(beating(result.rows, as_filed=True)[0] for result in results)
-    return ChainStudy([*lines, *notes], None if load.busy else right, answers)
+    right = None if load.busy else is_right([result.rows for result in results])
+    return ChainStudy([*lines, *notes], right, answers)
 
 
 def write_chain(

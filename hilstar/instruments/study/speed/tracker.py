@@ -8,6 +8,7 @@ the finders of photutils and sep on hilstar's own DN.
 
 import os
 from collections.abc import Callable
+from contextlib import ExitStack, closing
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -124,9 +125,11 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
     unset = [name for name in OWN_THREADS if name not in os.environ]
     file = read_bench_file(resource_path("configs", "demo.toml"))
     skipped: list[Skipped] = []
-    with TemporaryDirectory() as folder:
+    with ExitStack() as stack:
+        folder = stack.enter_context(TemporaryDirectory())
         exposing = Exposing(file, Path(folder))
-        session = exposing.session()
+        stack.callback(exposing.simulator.close)
+        session = stack.enter_context(closing(exposing.session()))
         dimensions = len(session.maker.parameters) + session.maker.attitude_dimensions
         points = np.random.default_rng(SEED).uniform(size=(rounds + 1, dimensions))
 
@@ -164,8 +167,6 @@ def tracker_rows(rounds: int, budget_s: float) -> tuple[list[MethodTiming], list
         times = in_turn(by_name, rounds, budget_s)
         width, height = file.config.tracker.resolution_px
         cell = Cell(width, height, len(exposing.exposure.truth))
-        session.close()
-        exposing.simulator.close()
     for name in unset:  # a campaign's worker sets them for its process
         os.environ.pop(name, None)
     rows = []

@@ -110,6 +110,21 @@ def test_one_packet_far_ahead_is_refused_and_changes_nothing(ahead_s):
     assert np.abs(run.error_ms[200:] + MIN_DELAY_MS).max() < 0.005
 
 
+@pytest.mark.parametrize(("uneven_ms", "jumps"), [(1.9, 1), (2.1, 0)])
+def test_messages_within_two_milliseconds_of_each_other_agree_on_a_jump(uneven_ms, jumps):
+    """Of a line whose delays were even, after a jump by 50 ms every other message is later."""
+    jumped_at = 600
+
+    def delay(rng: np.random.Generator, k: int) -> float:
+        is_later = k > jumped_at and k % 2
+        return 1e6 + (uneven_ms * NS_PER_MS if is_later else 0.0)
+
+    def sender_ns(host_ns: int, k: int) -> int:
+        return host_ns - (50 * NS_PER_MS if k >= jumped_at else 0)
+
+    assert ClockRun(sender_ns, delay, jumped_at + 30).jumps.jumps == jumps
+
+
 def test_a_queue_that_drains_is_no_jump():
     """60 packets held back for 300 ms and let go at once."""
 

@@ -200,6 +200,20 @@ def test_the_blend_is_c2_at_its_samples():
         assert np.abs(left - right).max() < 2e-2
 
 
+@pytest.mark.parametrize(("later_ns", "is_blended"), [(0, True), (1, False)])
+def test_a_gap_as_long_as_stale_after_is_blended_and_a_longer_one_takes_the_shorter_way(
+    later_ns, is_blended
+):
+    """A blend begins with the sample's own rate, SLERP with that of the whole turn."""
+    own_rate, still = np.array([0.0, 0.0, 0.2]), np.array([1.0, 0.0, 0.0, 0.0])
+    last = AttitudeSample(250 * MS + later_ns, still, own_rate)
+    timeline = filled(AttitudeSample(0, still, own_rate), last, stale_after_ms=250)
+    attitude = timeline.at(0)
+    assert attitude is not None
+    wanted = own_rate if is_blended else np.zeros(3)
+    assert attitude.rate_cam_rad_s == pytest.approx(wanted, abs=1e-12)
+
+
 def test_a_log_backwards_is_the_same_curve():
     forward = swinging(100, rate=True)
     end = 4000

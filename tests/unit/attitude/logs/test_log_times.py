@@ -9,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.log_file import open_log, read_log
+from hilstar.attitude.logs.log_times import span_line
+from hilstar.attitude.wire.packet import AttitudeSample
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import run_hilstar_here
 from tests.support.sources.aem_messages import kvn
@@ -64,6 +66,13 @@ def test_the_rates_of_a_csv_name_the_unit_of_its_times(tmp_path, unit, unit_s, s
     assert said.startswith(f"the rates do not fit the times: probably the times are in {unit}")
     assert said.endswith("; the format has s")
     assert "probably" not in rates, "one cause is named, not two"
+
+
+@pytest.mark.parametrize("unit", ["s", "ms", "us", "ns"])
+def test_a_csv_has_the_unit_that_its_column_s_name_states(tmp_path, unit):
+    path = tmp_path / "a.csv"
+    path.write_text(f"t_{unit},qw,qx,qy,qz\n0,1,0,0,0\n5,1,0,0,0\n")
+    assert open_log(path).conventions.time_unit == unit
 
 
 @pytest.mark.parametrize(("unit", "unit_s"), [("us", 1e-6), ("ms", 1e-3), ("100 ns", 1e-7)])
@@ -133,6 +142,19 @@ def test_a_replay_says_how_long_its_log_is(tmp_path):
     result = run_hilstar_here("replay", bench, log, "--headless", "--speed", "max", "--step", "0.5")
     assert "the log is 0.98 s long: 50 attitudes, a step of 0.02 s (median)\n" in result.stderr
     assert "which is" not in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("t_s", "words"),
+    [
+        ((7,), "the log is a single attitude"),
+        ((7, 9), "the log is 2 s long: 2 attitudes, a step of 2 s (median)"),
+        ((7, 9, 10, 20), "the log is 13 s long: 4 attitudes, a step of 2 s (median)"),
+    ],
+)
+def test_a_log_s_length_is_from_its_first_attitude_to_its_last(t_s, words):
+    q = np.array([1.0, 0, 0, 0])
+    assert span_line([AttitudeSample(second * 10**9, q) for second in t_s]) == words
 
 
 def test_a_csv_with_t_ns_is_read_in_ns_and_says_so(tmp_path):

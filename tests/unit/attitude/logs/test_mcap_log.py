@@ -8,16 +8,18 @@ import json
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import Writer
+from mcap.writer import CompressionType, Writer
 
 from hilstar.attitude.logs import mcap_log
 from hilstar.attitude.logs.log_file import read_log, write_log
 from hilstar.attitude.logs.mcap_log import (
     ATTITUDE_SCHEMA,
     ATTITUDE_TOPIC,
+    FREE_BYTES,
     attitude_message,
     log_time_ns,
     read_attitudes,
+    records_of,
     refused_message,
     register_attitudes,
 )
@@ -145,6 +147,21 @@ def test_a_file_that_has_no_end_is_said_in_one_line_and_a_whole_one_in_none(tmp_
     assert 0 < len(list(read_attitudes(path))) < 40
     (line,) = caplog.messages
     assert line.startswith(f"{path} has no end")
+
+
+def test_what_all_chunks_unpack_to_is_bounded_and_not_each_alone(tmp_path):
+    """Nothing but blanks packs to a ten-thousandth: two such chunks are too much for their file."""
+    file = io.BytesIO()
+    writer = Writer(file, chunk_size=1, compression=CompressionType.ZSTD)
+    writer.start()
+    attitudes = register_attitudes(writer)
+    for t_ns in range(2):
+        writer.add_message(attitudes, t_ns, b" " * (FREE_BYTES * 2 // 3), t_ns)
+    writer.finish()
+    (tmp_path / "blank.mcap").write_bytes(file.getvalue())
+    assert len(file.getvalue()) < FREE_BYTES / 1000
+    said = refusal(lambda path: list(records_of(path)), tmp_path / "blank.mcap")
+    assert "unpacks to more than 100 times its size" in said
 
 
 def test_what_is_no_mcap_file_is_called_so(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from tests.support.log_files import FILES, QUATERNIONS, TURNS, ledger
 from tests.support.sources.aem_messages import kvn
 
 ROUNDING = 1e-14  # of four products of unit quaternions
+SEVEN_DECIMALS_RAD = 2e-7  # half a last digit in each of four components, twice as an angle
 MOUNTING = (0.5, -0.5, -0.5, -0.5)
 STATEMENTS = {
     "mounting": Mounting(MOUNTING, by_option=True),
@@ -214,3 +216,25 @@ def test_a_log_with_a_convention_of_its_own_is_told_no_statement_that_it_refuses
         "convention =" not in told["convention-wrong"]
         and "--convention" not in told["convention-wrong"]
     )
+
+
+@pytest.mark.parametrize("reference", ["icrs", "enu", "ned"])
+@pytest.mark.parametrize("scalar", ["first", "last"])
+@pytest.mark.parametrize("direction", ["icrs_to_cam", "cam_to_icrs"])
+def test_the_check_value_of_a_log_is_read_as_the_attitude_that_it_is_told_for(
+    tmp_path, reference, scalar, direction
+):
+    """What the log has to say at its first time, for Orion in the middle, brings Orion there."""
+    stated = Stated(convention=Convention(scalar=scalar, direction=direction), reference=reference)
+    if reference != "icrs":
+        stated = replace(stated, place=(47.0, 8.0, 400.0), epoch_utc="2026-11-21T06:00:00")
+    path = tmp_path / "a.csv"
+    head = "t_s,qw,qx,qy,qz"
+    path.write_text(f"{head}\n1.5,{','.join(map(repr, QUATERNIONS[0].tolist()))}\n")
+    q_orion = Rotation.from_quat([0.6987226, 0.7135120, -0.0370377, 0.0362700], scalar_first=True)
+    text = open_log(path, stated).conventions.written(q_orion.as_quat(scalar_first=True))
+    numbers = re.findall(r"-?\d+\.\d+", text)
+    assert numbers[4:] in ([], ["1.500000000"])
+    path.write_text(f"{head}\n1.5,{','.join(numbers[:4])}\n")
+    found = Rotation.from_quat(attitudes_of_log(path, stated)[0], scalar_first=True)
+    assert (found * q_orion.inv()).magnitude() < SEVEN_DECIMALS_RAD

@@ -70,6 +70,16 @@ def test_a_burst_passes_and_a_flood_does_not():
     assert gate.newest(burst, plain) == burst
 
 
+@pytest.mark.parametrize("sender", [0, 1, 2, 4, 253])
+@pytest.mark.parametrize("sequence", [0, 1, 2, 255, 256, 2**16, 2**32 - 1])
+def test_a_jump_is_seen_undecoded_whatever_else_a_frame_has(sender, sequence):
+    """COBS moves zeros: the bytes about the flags depend on what follows them."""
+    for jump in (False, True):
+        jumped = replace(sample(7), sequence=sequence, discontinuity=jump, sender=sender)
+        assert declares_discontinuity(encode(jumped)) == jump
+        assert frame_declares_discontinuity(framed(encode(jumped))[:-1]) == jump
+
+
 def test_the_newest_whole_jump_that_is_passed_over_is_taken_in_every_form():
     """Of two that declare one and were passed over; a third is damaged."""
     samples = [replace(sample(7), sequence=k, discontinuity=k in JUMPED) for k in range(COUNT)]

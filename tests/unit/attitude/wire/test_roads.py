@@ -5,6 +5,7 @@ taken again.
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import socket
 import time
@@ -309,6 +310,35 @@ def lost_road(
             stack.enter_context(socket.create_server(place))
 
         yield road, come_back
+
+
+def test_a_port_that_is_lost_at_a_write_is_let_go_by_the_process_that_reads_it(
+    tmp_path, monkeypatch
+):
+    """Else it would stay open and locked, and could not be opened again."""
+
+    def unplugged(*_: object) -> int:
+        raise OSError(errno.EIO, "unplugged")
+
+    far = SerialFar(tmp_path, apart=True)
+    with far.link(Notices()) as link:
+        port = os.ttyname(far._slave)
+        files = Path(f"/proc/{link._road._reader._process.pid}/fd")
+
+        def is_held() -> bool:
+            held = []
+            for file in files.iterdir():
+                with contextlib.suppress(FileNotFoundError):  # closed since
+                    held.append(str(file.readlink()))
+            return port in held
+
+        wait_for(lambda: not link.receive(SOON_MS) and is_held(), "the process to read")
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "write", unplugged)
+            assert not link.send_bytes(b"?")
+        assert link.link_counts.lost == 1
+        wait_for(lambda: not is_held(), "the process to let go")
+    far.vanish()
 
 
 def test_a_tracker_that_is_asked_over_udp_is_the_only_one_that_is_heard():

@@ -2,15 +2,18 @@
 
 import os
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
 from hilstar.attitude.wire.likeness import MAX_LOOKED_AT
 from hilstar.attitude.wire.packet import Refusal
 from hilstar.attitude.wire.roads import RawMessage
-from hilstar.attitude.wire.serial_link import SerialApart, SerialDecoder, SerialLink
+from hilstar.attitude.wire.serial_link import SerialApart, SerialDecoder, SerialLink, read_lines
 from hilstar.basics.errors import InputError
+from hilstar.basics.units import NS_PER_S
 from hilstar.server.open_link import first_attitude
+from tests.support.fake_clock import FakeClock
 from tests.support.senders import packet
 from tests.support.wire.ptys import serial_line
 
@@ -63,3 +66,27 @@ def test_a_bare_packet_is_named_whatever_came_on_the_line_before() -> None:
     event = decoder.event(last.parts[0])
     assert isinstance(event, Refusal)
     assert "a bare packet" in event.detail
+
+
+@pytest.mark.parametrize("baud", [9600, 115_200])
+def test_a_line_s_time_is_that_of_its_first_bit(baud: int) -> None:
+    """Ten bits a byte and the end of the line: a clock that stands says when the last has come."""
+    with serial_line() as (master, name):
+        lines = read_lines(name, baud, 1.0, FakeClock(5 * NS_PER_S))
+
+        def times_ns() -> dict[bytes, int]:
+            came: dict[bytes, int] = {}
+            while not {b"", b"light 12"} <= came.keys():
+                host_ns, text = next(lines)
+                came[text] = host_ns
+            lines.close()
+            return came
+
+        with ThreadPoolExecutor(1) as pool:
+            reading = pool.submit(times_ns)
+            while not reading.done():  # what comes before the port is open is passed over
+                os.write(master, b"\nlight 12\n")
+                time.sleep(POLL_MS / 1000)
+    by_text = reading.result()
+    assert by_text[b"light 12"] == 5 * NS_PER_S - 9 * 10 * NS_PER_S // baud
+    assert by_text[b""] == 5 * NS_PER_S - 10 * NS_PER_S // baud

@@ -98,6 +98,17 @@ def test_what_is_no_zeromq_is_named(answer: bytes, words: str) -> None:
     assert words in trouble
 
 
+def test_a_connection_without_a_handshake_is_counted_as_rejected_and_as_none_that_was_made() -> (
+    None
+):
+    with plain_peer(b"HTTP/1.0 400 Bad Request\r\n\r\n") as endpoint, ZmqReceiver(endpoint) as link:
+        end_s = time.monotonic() + WITHIN_S
+        while not link.link_counts.rejected and time.monotonic() < end_s:
+            link.receive(POLL_MS)
+        assert link.link_counts.rejected
+        assert (link.link_counts.connections, link.link_counts.lost) == (0, 0)
+
+
 def test_a_sender_is_no_trouble_and_nobody_is_neither() -> None:
     with zmq_peer(zmq.PUB) as endpoint, ZmqReceiver(endpoint) as link:
         end_s = time.monotonic() + WITHIN_S

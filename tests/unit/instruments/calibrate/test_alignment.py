@@ -29,7 +29,7 @@ from hilstar.instruments.calibrate.alignment import (
     remarks_of,
     residual_of,
 )
-from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs, _angles_to
+from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs, RotationFit, _angles_to
 from tests.support.refusals import refusal
 
 CAMERA = monitor_camera(
@@ -266,3 +266,24 @@ def test_the_angle_between_rotations_is_scipy_s_from_none_to_half_a_turn(rng):
     q = np.roll(start.as_quat(), 1)
     found = _angles_to(signs * np.roll(turned.as_quat(), 1, axis=1), q)
     assert found == pytest.approx(angles, rel=1e-6, abs=1e-15)
+
+
+def test_a_mean_s_covariance_is_that_of_independent_groups(rng):
+    """Of n pairs the sum of squares over n (n - 1); of groups that share an error, of their sums."""
+    residual_rad = 1e-5 * rng.standard_normal((12, 3))
+    fit = RotationFit(np.array([1.0, 0.0, 0.0, 0.0]), residual_rad, np.ones(12))
+    alone, dof = fit.covariance_rad2(np.arange(12))
+    assert alone == pytest.approx(residual_rad.T @ residual_rad / (12 * 11))
+    assert dof == 11
+    group = np.repeat(np.arange(4), 3)
+    sums = residual_rad.reshape(4, 3, 3).sum(axis=1)
+    together, dof = fit.covariance_rad2(group)
+    assert together == pytest.approx(sums.T @ sums * 4 / 3 / 12**2)
+    assert dof == 3
+    # all of one attitude count as independent, and a wild one not at all
+    weight = np.ones(12)
+    weight[5] = 0.0
+    used = np.delete(residual_rad, 5, axis=0)
+    one, dof = RotationFit(fit.q, residual_rad, weight).covariance_rad2(np.zeros(12, dtype=int))
+    assert one == pytest.approx(used.T @ used / (11 * 10))
+    assert dof == 10

@@ -4,6 +4,8 @@ them and of stars.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -20,7 +22,7 @@ from hilstar.display.calibration import (
 )
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.response import gamma_response, srgb_response
-from hilstar.instruments.calibrate.first_light.context import StepContext
+from hilstar.instruments.calibrate.first_light.context import StepContext, darker_code
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
 from hilstar.instruments.calibrate.first_light.photometer import (
     Assumed,
@@ -29,6 +31,8 @@ from hilstar.instruments.calibrate.first_light.photometer import (
     peak_shares,
 )
 from hilstar.instruments.calibrate.first_light.photometry import (
+    _judged,
+    _response_figures,
     exponent,
     photometry,
     plan_for,
@@ -191,6 +195,96 @@ def test_without_an_image_of_a_monitor_that_is_off_black_is_the_bench_files(tmp_
     found = read_patches(tmp_path, Camera(srgb_response(10).light, 20_000, unlit=False))
     assert not found.black_known
     assert found.light[0] == pytest.approx(0.0, abs=2.0)  # of 20 000: srgb has no black level
+
+
+MAG_A_PERCENT = 0.01 * 2.5 / np.log(10)
+
+
+def response_figures(p95_percent=0.5, p95_sigmas=1.0, ratios=(1.0,), sigmas=(0.5,), black=False):
+    """The figures of a response of gamma 2.4 where the bench file has 2.2, by readings whose links
+    have these ratios.
+    """
+    holdout = {"p95_percent": p95_percent, "rms_mag": 0.002, "max_mag": 0.01}
+    holdout["p95_sigmas"] = p95_sigmas
+    fitted = {
+        "channels": {"w": {"holdout": holdout}},
+        "drift_percent": None,
+        "noise_relative": 0.003,
+        "codes": 12,
+        "error_percent": {"1e-0": 0.1, "1e-3": 0.9},
+    }
+    links = [SimpleNamespace(ratio=r, sigmas=s) for r, s in zip(ratios, sigmas, strict=True)]
+    readings = SimpleNamespace(links=links, black_known=black, patches=[0] * 24, exposure_s=0.2)
+    responses = (gamma_response(10, 2.2), gamma_response(10, 2.4))
+    return _response_figures(SimpleNamespace(truth=None), readings, fitted, responses, 1e-5)
+
+
+def test_figures_of_a_response_are_in_their_units():
+    figures = response_figures(p95_percent=2.0, ratios=(1.01, 0.98), sigmas=(2.0, 1.0), black=True)
+    assert figures["held_out_p95_mag"] == pytest.approx(2 * MAG_A_PERCENT)
+    assert figures["noise_percent"] == pytest.approx(0.3)
+    assert figures["error_at_1e-3_percent"] == 0.9
+    assert figures["links_max_mag"] == pytest.approx(-2.5 * np.log10(0.98))
+    assert (figures["links"], figures["links_max_sigmas"]) == ("1.0100, 0.9800", 2.0)
+    assert figures["gamma"] == pytest.approx(2.4, abs=1e-6)
+    assert figures["gamma_in_bench_file"] == pytest.approx(2.2, abs=1e-6)
+    # at a thousandth of white by gamma 2.4 the signal is 0.056, which 2.2 has 0.2 powers brighter
+    assert figures["bench_file_off_max_mag"] == pytest.approx(0.2 / 2.4 * 7.5, abs=0.02)
+    assert (figures["black_level_measured"], figures["patches"]) == ("yes", 24)
+    assert np.isnan(figures["drift_percent"])
+
+
+@pytest.mark.parametrize(
+    ("changes", "verdict", "words"),
+    [
+        ({}, "done", "held-out levels 0.0020 mag rms"),
+        # [verify] flux_mag is 0.05 mag: 5 % beyond noise is more, 4 % and what noise explains not
+        ({"p95_percent": 5.0, "p95_sigmas": 4.0}, "failed", "do not make one smooth response"),
+        ({"p95_percent": 4.0, "p95_sigmas": 4.0}, "done", ""),
+        ({"p95_percent": 5.0, "p95_sigmas": 2.5}, "done", ""),
+        ({"ratios": (0.95,), "sigmas": (4.0,)}, "failed", "dense and sparse dots"),
+        ({"ratios": (1.05,), "sigmas": (4.0,)}, "failed", "dense and sparse dots"),
+        ({"ratios": (0.95,), "sigmas": (2.5,)}, "done", ""),
+    ],
+)
+def test_a_response_is_refused_beyond_its_limit_and_its_noise(tmp_path, changes, verdict, words):
+    bench = bench_text(TWIN, {"verify": {"flux_mag": 0.05}})
+    (tmp_path / "bench.toml").write_text(bench)
+    camera = Camera(srgb_response(10).light, 1.0)
+    context = StepContext(
+        read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path, camera, {}, {}, 96
+    )
+    outcome = _judged(context, response_figures(**changes), (), ())
+    assert outcome.verdict == verdict
+    assert words in outcome.line
+    assert bool(outcome.changes) == (verdict == "done")
+
+
+def test_a_hot_pixel_of_the_dark_frame_makes_no_image_too_bright(tmp_path):
+    """It has 70 % of the range in the dark, and all of it with light: 0.8 of it is too bright."""
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
+    camera = Camera(srgb_response(10).light, 1.0)
+    context = StepContext(
+        read_bench_file(tmp_path / "bench.toml"), tmp_path, tmp_path, camera, {}, {}, 96
+    )
+    dark = np.full((400, 400), FLOOR_DN)
+    dark[30, 40] = 0.7 * FULL_DN
+    lit = dark.copy()
+    lit[100, 200], lit[30, 40] = 0.75 * FULL_DN, 0.99 * FULL_DN
+    looked = context.looked(camera.save(tmp_path / "lit", lit), dark)
+    assert looked.raw_peak == pytest.approx(0.75 * FULL_DN, abs=0.5)  # as whole DN
+    assert looked.floor_dn == FLOOR_DN
+    assert not context.is_too_bright(looked)
+    lit[100, 200] = 0.85 * FULL_DN
+    assert context.is_too_bright(context.looked(camera.save(tmp_path / "lit", lit), dark))
+
+
+def test_a_darker_code_has_a_quarter_of_the_light_at_most_and_the_darkest_has_none():
+    """By a gamma of 2.2, as all monitors have about: the largest such code."""
+    for code in range(2, 1024):
+        lower = darker_code(code)
+        assert (lower / code) ** 2.2 <= 1 / 4 < ((lower + 1) / code) ** 2.2
+    assert "darkest code" in refusal(darker_code, 1)
 
 
 def test_a_plan_has_as_many_levels_as_its_patches_allow():

@@ -15,8 +15,10 @@ from hilstar.instruments.calibrate.first_light.photometry import photometry
 from hilstar.instruments.calibrate.first_light.stars import scale, verify
 from hilstar.instruments.calibrate.first_light.uniformity import (
     DotLight,
+    LatticeSums,
     map_of,
     uniformity,
+    unusable_pixels,
     warm_up,
 )
 from hilstar.server.bench.bench_file import read_bench_file
@@ -221,3 +223,47 @@ def test_white_is_watched_in_a_code_that_does_not_saturate(tmp_path):
     folder = uneven_bench(tmp_path, None)
     found = did(folder, warm_up, known={"focus.dot_code": 1023}, watched_s=600.0)
     assert found.verdict == "done", found.line
+
+
+def test_the_detector_s_edge_and_hot_pixels_make_no_dot_whole():
+    """In an image that is not square, so that rows and columns show."""
+    dark = np.zeros((4, 6))
+    dark[1, 2], dark[2, 3] = 60.0, 40.0
+    bad = unusable_pixels(dark, 100.0)
+    inner = np.array([[False, True, False, False], [False, False, False, False]])
+    assert np.array_equal(bad[1:-1, 1:-1], inner)
+    assert bad.sum() == 24 - 8 + 1
+
+
+WIDE, HIGH = 61, 43  # of a screen, px
+PERIOD, REACH = 10, 2.1
+
+
+@pytest.mark.parametrize(("first", "columns", "rows"), [((5, 5), 6, 4), ((10, 1), 5, 5)])
+def test_dots_of_a_lattice_are_those_that_the_screen_has_whole(first, columns, rows):
+    """Dots are 3 px wide: one whose middle is the screen's last pixel but one is the last that is
+    whole. A tracker's pixel looks at each of the screen's, beyond it, too.
+    """
+    lattice = LatticeSums(np.array(first), PERIOD, REACH, np.array([WIDE, HIGH]))
+    y, x = np.mgrid[-20.0 : HIGH + 20, -20.0 : WIDE + 20]
+    looked_at = np.stack([x.ravel(), y.ravel()])
+    light = 1000 * y.ravel() + x.ravel()
+    lattice.add(looked_at, light, np.zeros(len(light), dtype=bool))
+    dots = lattice.whole()
+    middle_x = first[0] + PERIOD * np.arange(columns)
+    middle_y = first[1] + PERIOD * np.arange(rows)
+    assert middle_x[-1] + 1 <= WIDE - 1 < middle_x[-1] + PERIOD + 1
+    assert middle_y[-1] + 1 <= HIGH - 1 < middle_y[-1] + PERIOD + 1
+    assert np.unique(dots.column).tolist() == middle_x.tolist()
+    assert np.unique(dots.row).tolist() == middle_y.tolist()
+    assert len(dots.light) == columns * rows
+    # 13 pixels are within 2.1 px of a middle, and their mean is it
+    assert dots.light == pytest.approx(13 * (1000 * dots.row + dots.column))
+
+
+def test_a_dot_with_a_bad_pixel_in_reach_is_not_whole():
+    lattice = LatticeSums(np.array([5, 5]), PERIOD, REACH, np.array([WIDE, HIGH]))
+    places = np.array([[15.0, 25.0, 25.0], [5.0, 5.0, 7.0]])
+    lattice.add(places, np.ones(3), np.array([False, False, True]))
+    dots = lattice.whole()
+    assert (dots.column.tolist(), dots.row.tolist(), dots.light.tolist()) == ([15], [5], [1.0])

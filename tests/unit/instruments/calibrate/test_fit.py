@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from hilstar.display.calibration import load_calibration, primary_responses
+from hilstar.display.calibration import load_calibration, primary_responses, read_toml
 from hilstar.display.response import srgb_light
 from hilstar.instruments.calibrate.measurements import drift_over_run, read_measurements
 from hilstar.instruments.calibrate.photometric import (
@@ -334,3 +334,12 @@ def test_the_black_level_is_as_well_known_as_white_is(tmp_path, rng):
         fit = fit_channel(read_measurements(write_readings(tmp_path / "read.csv", rows)), "w")
         sigmas.append((fit.black / fit.white - black) * fit.white / fit.black_error)
     assert 0.7 < np.sqrt(np.mean(np.square(sigmas))) < 1.4
+
+
+def test_a_calibration_has_as_many_degrees_of_freedom_as_readings_less_one_a_level(tmp_path, rng):
+    """Of each level's readings its mean takes one."""
+    path = measure_plan(tmp_path / "m.csv", CURVES["srgb"], rng, black=1e-3, repeats=4)
+    calibrate_photometric(path, tmp_path / "monitor.toml")
+    readings = read_measurements(path).code
+    errors = read_toml(tmp_path / "monitor.toml").errors
+    assert errors.dof == len(readings) - len(np.unique(readings))

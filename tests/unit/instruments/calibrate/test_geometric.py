@@ -23,7 +23,7 @@ from hilstar.instruments.calibrate.geometric.geometry_fit import (
     calibrate_seen,
     lines_of,
 )
-from hilstar.instruments.calibrate.geometric.match import decode
+from hilstar.instruments.calibrate.geometric.match import ORDERS, decode
 from hilstar.instruments.calibrate.geometric.observed import Observed
 from hilstar.optics.camera import Camera, Lens, bounded
 from hilstar.server.bench.bench_file import bench_file_of
@@ -316,3 +316,18 @@ def test_a_tracker_that_sees_part_of_the_screen_gets_its_own_field_right_and_no_
     assert errors.max() < 3.0  # NaN would fail: every place of the tracker's field is known
     far = np.tan(2 * monitor.field_radius_rad(0.0))
     assert np.isnan(monitor.places_px(np.array([far]), np.array([0.0]))[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("order", "number_of"),
+    [
+        ("in reverse order", lambda frame: 19 - frame),
+        ("numbered from 1", lambda frame: frame + 1),
+        ("one frame late", lambda frame: (frame + 1) % 20),
+        ("one frame early", lambda frame: (frame - 1) % 20),
+    ],
+)
+def test_an_order_of_frames_is_undone_by_its_cure(order, number_of):
+    """`number_of` says under which number the plan's frame comes."""
+    frames = np.arange(20)
+    assert np.array_equal(ORDERS[order](number_of(frames), 20), frames)

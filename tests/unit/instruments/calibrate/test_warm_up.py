@@ -174,3 +174,16 @@ def test_a_reading_stands_in_the_middle_of_the_time_that_it_takes() -> None:
     t_s, _ = watch_white(read, clock.now_ns, clock.sleep, 400.0)
     assert t_s[0] == pytest.approx(2.0)
     assert np.diff(t_s).max() < 30.0
+
+
+def test_a_drift_beyond_the_limit_is_stable_by_no_law_that_is_as_likely() -> None:
+    """0.25 % in ten minutes, watched for three: an exponential that ends soon is then as likely as
+    the line. White is called stable at 95 %, once in 40 times of this; 60 have 1.5, and 3 sigma are
+    3.6.
+    """
+    t_s = np.arange(20) * EVERY_S
+    stable = 0
+    for seed in range(60):
+        scattered = 1 + 2e-4 * np.random.default_rng(seed).standard_normal(20)
+        stable += judge_warm_up(t_s, (1 - 0.0025 / 600 * t_s) * scattered).is_stable
+    assert stable <= 5

@@ -147,6 +147,30 @@ def test_the_display_shows_what_the_tracker_would_see_and_its_misalignment(tmp_p
     assert rows[0]["matched"] >= 5
 
 
+def test_a_misalignment_turns_a_mounting_that_is_turned_already_about_the_camera_s_own_axes(
+    tmp_path: Path,
+) -> None:
+    """Of a display on its side, what the camera's x axis turns is y and z of the camera, which are
+    others of the monitor.
+    """
+    write_campaign(tmp_path, {"key": "misalignment_arcsec.x", "values": [300.0]}, through="display")
+    path = tmp_path / "bench.toml"
+    mounting = Rotation.from_euler("z", 90, degrees=True)
+    x, y, z, w = mounting.as_quat().tolist()
+    path.write_text(
+        path.read_text().replace("[collimator]", f"[collimator]\nq_cam_to_mon = {[w, x, y, z]}")
+    )
+    plan = parse_plan(tmp_path / "plan.toml", (tmp_path / "plan.toml").read_text())
+    maker = CaseMaker(plan, read_bench_file(path), tmp_path)
+    file = maker.bench(maker.case(0, np.full(maker.attitude_dimensions + 1, 0.5)))
+    true = to_matrix(np.array(file.config.verify.true_q_cam_to_mon))
+    turn = np.radians(300 / 3600)
+    cosine, sine = np.cos(turn), np.sin(turn)
+    # a rotation vector turns vectors by the right hand
+    about_x = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
+    assert true == pytest.approx(mounting.as_matrix() @ about_x, abs=1e-12)
+
+
 SCENARIO = """
 [[fault]]
 kind = "blank"
@@ -175,6 +199,23 @@ def test_a_scenario_is_varied_like_any_key_and_a_file_that_changes_is_another_ca
     before = files_sha256(this.plan, tmp_path)
     (tmp_path / "dark.toml").write_text(SCENARIO + "# another\n")
     assert files_sha256(this.plan, tmp_path) != before
+
+
+@pytest.mark.parametrize(("ends_s", "within"), [(0.55, True), (0.65, False)])
+def test_a_fault_that_ends_after_the_last_exposure_has_no_recovery(
+    tmp_path: Path, ends_s: float, within: bool
+) -> None:
+    """Three frames, 0.25 s apart, of 0.1 s: from the first one's begin to the last one's end are
+    0.6 s.
+    """
+    fault = SCENARIO.replace("at_s = 1.0", "at_s = 0.0").replace("for_s = 2.0", f"for_s = {ends_s}")
+    (tmp_path / "dark.toml").write_text(fault)
+    scenario = {"key": "scenario", "values": ["dark.toml"]}
+    write_campaign(tmp_path, scenario, cases=1, frames=3, step_s=0.25)
+    this = cases_session(tmp_path)
+    row = this.row(0, points(this, 1)[0])
+    this.close()
+    assert row["fault_end_s"] == (ends_s if within else None)
 
 
 def test_a_log_s_convention_and_mounting_are_the_bench_files(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.certify.effects import Effect
 from hilstar.instruments.certify.estimates import surface
 from hilstar.instruments.certify.model import Deviations, Figures, ReferenceStar
-from hilstar.instruments.certify.read_effects import _of_delays, map_at
+from hilstar.instruments.certify.read_effects import _of_delays, _places_in, map_at
 from hilstar.instruments.certify.stated_effects import (
     DRIFTS,
     of_drift,
@@ -349,3 +349,19 @@ def test_the_light_at_a_star_is_half_way_between_a_smooth_screen_and_a_map_of_16
     assert at_stars.smooth == pytest.approx(smooth, abs=1e-9)
     assert np.abs(smooth - of_map).max() > 1e-4
     assert at_stars.midway == pytest.approx((smooth + of_map) / 2, abs=1e-6)
+
+
+@pytest.mark.parametrize("square", [(100, 40, 1), (100, 40, 2), (1500, 7, 301)])
+def test_places_in_a_square_are_even_over_its_pixels(square):
+    """From the first pixel's outer edge to the last one's: pixel k reaches from k - 0.5 to
+    k + 0.5, so that the mean place and its variance are those of an even square.
+    """
+    left, top, side = square
+    x_px, y_px = _places_in(square)
+    for places_px, first in ((x_px, left), (y_px, top)):
+        assert places_px.mean() == pytest.approx(first + (side - 1) / 2, abs=1e-9)
+        assert first - 0.5 < places_px.min() and places_px.max() < first + side - 0.5
+    # of n even steps over a side: side^2 / 12 less 1 / n^2 of it
+    steps = math.isqrt(len(x_px))
+    assert x_px.var() == pytest.approx(side**2 / 12 * (1 - 1 / steps**2), rel=1e-9)
+    assert (x_px @ y_px) / len(x_px) == pytest.approx(x_px.mean() * y_px.mean())

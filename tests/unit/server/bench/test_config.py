@@ -6,7 +6,8 @@ import pytest
 
 from hilstar.server.bench.config import read_config
 from hilstar.server.bench.star_rates import bench_optics
-from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.benches import ROOT, SMALL_BENCH, bench_text
+from tests.support.refusals import refusal
 
 # The bench file of the design's section 5, every key given (the values that choose between words:
 # the first).
@@ -100,3 +101,14 @@ def test_the_fill_factor_takes_its_share_of_every_electron(tmp_path):
     path.write_text(WHOLE.replace("[tracker.detector]", "[tracker.detector]\nfill_factor = 0.4"))
     open_part = bench_optics(read_config(path).tracker, tmp_path).quantum_efficiency
     assert (open_part.value == plain.value * 0.4).all()
+
+
+@pytest.mark.parametrize("table", ["tracker", "monitor"])
+def test_the_largest_image_is_the_one_that_a_refusal_advises(tmp_path, table):
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({table: {"resolution_px": [8192, 8193]}}))
+    line = refusal(read_config, path)
+    assert f"[{table}] resolution_px = [8192, 8193]" in line
+    assert "such as [8192, 8192]" in line
+    path.write_text(bench_text({table: {"resolution_px": [8192, 8192]}}))
+    assert getattr(read_config(path), table).resolution_px == (8192, 8192)

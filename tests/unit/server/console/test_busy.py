@@ -116,3 +116,14 @@ def test_a_terminal_that_cannot_erase_gets_no_bar(on_terminal, monkeypatch):
     with busy("computing", after_s=0.0), progress("sending", 3):
         time.sleep(SOON_S)
     assert terminal.getvalue() == ""
+
+
+def test_a_bar_has_the_steps_that_are_done_however_often_it_is_told(on_terminal):
+    terminal = on_terminal()
+    with progress("sending", 10) as advance:
+        for done in (1, 2, 5):
+            advance(done)
+    assert " 5/10" in terminal.getvalue()
+    with progress("waiting", float("inf")) as advance:
+        advance(3)
+    assert "m3/?" in terminal.getvalue()

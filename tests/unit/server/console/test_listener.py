@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+
 import pytest
 
 from hilstar.cli.options import with_values
@@ -99,3 +101,34 @@ def test_console_may_stand_alone_before_other_words():
         "host.lab:99999",
     ):
         assert with_values(["serve", "--console", value]) == ["serve", "--console", value]
+
+
+LOOPBACK = ListenAddress("127.0.0.1", 0)
+
+
+@pytest.mark.parametrize("name", ["stars.lab", "stars.lab:8443", "a", "LAB-7"])
+def test_a_proxy_s_name_is_one_as_browsers_have_it(name):
+    with PageListener(LOOPBACK, names=(name,)) as listener:
+        assert listener.names == (name,)
+
+
+@pytest.mark.parametrize(
+    "name", ["", "stars.lab/page", "http://stars.lab", "stars lab", "-x", "stars.lab:", "a..b"]
+)
+def test_what_browsers_have_as_no_name_is_refused(name):
+    assert "--console-name" in refusal(lambda: PageListener(LOOPBACK, names=(name,)))
+
+
+@pytest.mark.parametrize("token", ["short", "x" * 201, "has a space, is long", "a" * 20 + "\n"])
+def test_a_token_that_needs_escapes_or_is_guessed_is_refused(token):
+    assert "--token" in refusal(lambda: PageListener(LOOPBACK, token))
+
+
+def test_a_port_that_is_taken_is_refused_and_a_page_s_own_name_is_in_lower_case():
+    with PageListener(LOOPBACK) as first:
+        taken = ListenAddress("127.0.0.1", first.port)
+        assert "cannot listen there" in refusal(lambda: PageListener(taken))
+        assert first.hosts == sorted({"localhost", "127.0.0.1", "[::1]"})
+    with PageListener(ListenAddress("0.0.0.0", 0)) as listener:
+        assert socket.gethostname().lower() in listener.hosts
+        assert listener.hosts == [name.lower() for name in listener.hosts]

@@ -66,6 +66,20 @@ def test_images_arrive_bit_for_bit_with_their_times():
         assert made.counts.dropped == 0
 
 
+def test_an_image_is_stamped_by_the_camera_s_own_clock():
+    """A clock that is 7 s behind and fast by a thousandth."""
+
+    def own_ns(host_ns: int) -> int:
+        return host_ns + host_ns // 1000 - 7_000_000_000
+
+    dn = np.zeros((SIDE_PX, SIDE_PX), np.uint16)
+    with served_camera() as made, streaming(made) as client:
+        made.own_ns = own_ns
+        begin_ns = time.monotonic_ns()
+        made.take(dn, begin_ns)
+        assert client.image(SIDE_PX, SIDE_PX)[1] == own_ns(begin_ns)
+
+
 def test_a_lost_packet_is_sent_again():
     dn = np.arange(SIDE_PX * SIDE_PX, dtype=np.uint16).reshape(SIDE_PX, SIDE_PX) % 4096
     with served_camera() as made, streaming(made) as client:

@@ -18,6 +18,8 @@ FAR = 1e6
 CLOSED_LIMIT = 1e-4  # the quadrature itself: measured 3e-5
 MEAN_LIMIT = 5e-3  # three sigma of the mean over RAYS random ones
 RAYS = 100_000
+# 20 arcsec between where the Moon is seen and where it is, in a law of 0.02 to a degree of phase
+ABERRATION = 1.2e-4
 # of the air's transmission: heights above a stretched sphere, not above the spheroid
 AIR_LIMIT = 0.02
 
@@ -131,6 +133,29 @@ def test_no_part_of_a_limb_is_farther_from_the_middle_than_the_radius(polar, dis
         if pole[0] == 0.0 and distance == 50.0:
             # a far body's limb is its cross-section: its longer half axis over its distance
             assert limb_rad.max() == pytest.approx(max(1.0, polar) / distance, rel=1e-3)
+
+
+def test_the_moon_s_law_is_of_its_phase_and_a_planet_s_is_lambert_s():
+    """McEwen (1996, LPSC XXVII): L = 1 - 0.019 g + 2.42e-4 g^2 - 1.46e-6 g^3, g the phase, deg."""
+    discs = {one.name: one for one in moving_sky(UTC).discs(np.array([1.0, 0.0, 0.0]), np.pi)}
+    moon = discs["Moon"]
+    g = np.degrees(np.arccos(-moon.direction @ moon.sun))
+    mcewen = 1 - 0.019 * g + 2.42e-4 * g**2 - 1.46e-6 * g**3
+    assert 0.1 < mcewen < 0.9
+    assert moon.lunar_share == pytest.approx(mcewen, abs=ABERRATION)
+    assert {discs[name].law for name in discs if name not in ("Sun", "Moon")} == {"lambert"}
+
+
+def test_distances_are_from_the_observer_s_place():
+    """40 000 km towards the Moon. An observer whose speed is not stated is at rest."""
+    moving = moving_sky(UTC)
+    at_centre = moving.distances_km(place_km=np.zeros(3))
+    moon = moving.names.index("Moon")
+    towards = next(one for one in moving.discs(np.array([1.0, 0, 0]), np.pi) if one.name == "Moon")
+    nearer = moving.distances_km(place_km=4e4 * towards.direction)
+    assert at_centre[moon] - nearer[moon] == pytest.approx(4e4, rel=1e-4)
+    at_rest = moving.distances_km(None, np.zeros(3), 4e4 * towards.direction)
+    assert np.array_equal(nearer, at_rest)
 
 
 def test_a_sky_s_discs_are_those_in_reach_nearest_first_with_their_rate():

@@ -4,19 +4,27 @@ SPICE, in frames of all kinds.
 
 from __future__ import annotations
 
+from functools import partial
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import spiceypy
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.clock.timeline import Policy
-from hilstar.attitude.logs.ck_spice import answer
+from hilstar.attitude.logs.ck_spice import Segment, _attitudes, _Piece, _Structure, answer
 from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.attitude.wire.source import Mounting
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import angle_between_rad, from_matrix, to_matrix
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    from_matrix,
+    from_rotation_vectors,
+    to_matrix,
+)
 from hilstar.basics.units import NS_PER_S
 from tests.support.claims import holds
 from tests.support.sources import spice_kernels as ck
@@ -346,3 +354,37 @@ def test_times_are_tdb_whatever_the_clock_counts_and_one_log_leaves_nothing_to_t
     assert abs(offset_s) > 1e-5  # so that the clocks differ
     assert (tt - tdb) / NS_PER_S == pytest.approx(offset_s, abs=3e-7)
     assert spiceypy.ktotal("ALL") == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "has_rate", "whose"),
+    [(2, True, "own"), (5, True, "own"), (3, True, "own"), (2, False, "turn"), (5, False, "turn"),
+     (3, False, "none")],
+)  # fmt: skip
+def test_a_function_of_time_without_rates_has_those_of_its_turn(kind, has_rate, whose):
+    """A turn about z by 0.01 t^2, ticks of a second: differences to second order are exact. The
+    segment's own rates are others, and are kept; attitudes between which nothing is stated have
+    none.
+    """
+    own = np.array([0.1, -0.2, 0.3])
+    structure = SimpleNamespace(
+        t_s=float,
+        t_ns=lambda tick: round(tick * NS_PER_S),
+        q_icrs_to_body=lambda tick: from_rotation_vectors(np.array([[0, 0, 0.01 * tick**2]]))[0],
+    )
+    structure.attitude = lambda tick, rates: (
+        structure.q_icrs_to_body(tick),
+        own if rates else None,
+    )
+    structure.rate_by_difference = partial(_Structure.rate_by_difference, structure)
+    piece = _Piece(Segment(1, 0.0, 8.0, -1000, 1, kind, has_rate, 1, 2), 0.0, 8.0, np.array([4.0]))
+    ticks = np.array([0.0, 4.0, 8.0])
+    t_ns, q, rates = _attitudes(structure, piece, ticks)
+    assert t_ns.tolist() == [0, 4 * NS_PER_S, 8 * NS_PER_S]
+    assert q[1] == pytest.approx(structure.q_icrs_to_body(4.0), abs=1e-15)
+    wanted = {
+        "own": np.tile(own, (3, 1)),
+        "turn": np.outer(0.02 * ticks, [0, 0, -1]),
+        "none": np.full((3, 3), np.nan),
+    }
+    assert rates == pytest.approx(wanted[whose], abs=RATE_RAD_S, nan_ok=True)

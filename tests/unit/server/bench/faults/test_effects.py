@@ -14,14 +14,16 @@ import hilstar
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.layers.fault_kinds import Now, fault_of
-from hilstar.optics.layers.fault_light import KEPT_BURSTS
+from hilstar.optics.layers.fault_light import KEPT_BURSTS, FaultView
 from hilstar.optics.layers.faults import FaultLayer
 from hilstar.optics.layers.star_layer import no_light
 from hilstar.optics.layers.view import View
 from hilstar.server.bench.fault_views import display_view
 from hilstar.server.bench.scenario import Scenario
 from tests.support.benches import ORION_Q, SMALL_BENCH, bench_text
+from tests.support.refusals import refusal
 
 # The linear image is float32 and a footprint cuts 1e-6 of a star (scene.psf.MAX_CUT).
 LIGHT_SHARE = 2e-6
@@ -70,6 +72,21 @@ def test_a_false_star_lies_where_a_real_star_of_its_place_would(faulty, calm):
     assert rows["electrons_per_s"][0] == 5e4 / EXPOSURE_S
     # of 47e6 in float32
     assert total_light(frame) - total_light(calm) == pytest.approx(5e4 / EXPOSURE_S, rel=2e-4)
+
+
+@pytest.mark.parametrize("key", ["tracker_px", "screen_px"])
+def test_a_place_to_which_the_lens_sends_no_light_is_refused_by_its_key(faulty, key):
+    """Both lenses have no direction farther than 100 px from the middle."""
+    lens = Lens(max_tangent=0.1)
+    camera = Camera((400, 400), 1000.0, (200.0, 200.0), np.eye(3), lens)
+    own = display_view(faulty, Scenario(".", "", 7)).by
+    view = FaultView(replace(own, tracker=camera, monitor=camera))
+    table = {"kind": "false-star", "name": "ghost", "electrons": 5e4}
+    assert view.prepare(fault_of({**table, key: [250.0, 200.0]}))
+    line = refusal(view.prepare, fault_of({**table, key: [350.0, 200.0]}))
+    assert line.startswith(
+        f"{key} = [350.0, 200.0]: the lens has no direction there; write a place"
+    )
 
 
 def test_magnitude_and_electrons_are_one_light(faulty):

@@ -74,6 +74,25 @@ def test_the_first_frame_is_the_zero_unless_it_is_said():
     assert said.at(7_000_000_000)
 
 
+def test_a_fault_that_was_stopped_stays_on_once_it_is_started_again():
+    schedule, heard = schedule_of(false_star("ghost"))
+    for first in (0, 4):
+        schedule.start("ghost", "console")
+        assert faults_by_frame(schedule, 3, first) == [[("ghost", 1.0)]] * 3
+        schedule.stop("ghost", "console")
+        assert faults_by_frame(schedule, 1, first + 3) == [[]]
+    assert [(c.what, c.number) for c in heard] == [
+        ("start", 1),
+        ("end", 1),
+        ("start", 2),
+        ("end", 2),
+    ]
+    # while it is on once more, it cannot be started twice
+    schedule.start("ghost", "console")
+    faults_by_frame(schedule, 1, 8)
+    assert "is on already" in refusal(schedule.start, "ghost", "console")
+
+
 def test_the_console_starts_and_stops_a_fault_of_the_scenario_by_name():
     schedule, heard = schedule_of(blank("cover"), false_star("ghost"))
     assert schedule.names() == ["cover", "ghost"]

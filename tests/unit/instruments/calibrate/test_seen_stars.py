@@ -1,0 +1,182 @@
+"""What first light reads of a star's image and of several images of one pattern: shares of light,
+noise, scatter and areas, each against a closed form or planted noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import erf, ndtr
+
+from hilstar.display.geometry import monitor_camera
+from hilstar.instruments.calibrate.first_light.photometer import PixelScatter, Range, monitor_area
+from hilstar.instruments.calibrate.first_light.seen_stars import (
+    Beyond,
+    Scatter,
+    StarSpot,
+    StarsSeen,
+)
+from hilstar.instruments.calibrate.first_light.stars import frames_for, place_reasons
+from hilstar.instruments.calibrate.plan import Patch
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+
+WIDE = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=0.0, electronics_dn=0.0)
+MAG_A_RELATIVE = 2.5 / np.log(10)
+
+
+def test_shares_of_a_star_are_the_gaussian_s():
+    half_px = WIDE.radius_px + 0.5
+    for share, half in ((WIDE.window_share, half_px), (WIDE.peak_share, 0.5)):
+        closed = erf(half / 0.9 / np.sqrt(2)) * erf(half / 1.4 / np.sqrt(2))
+        assert share == pytest.approx(closed, rel=1e-12)
+    assert WIDE.mean_sigma_px**2 == pytest.approx(0.9 * 1.4)
+
+
+@pytest.mark.parametrize("place_px", [(7.0, 9.0), (7.3, 9.1), (6.9, 8.6), (7.45, 9.49)])
+def test_the_second_pixel_of_a_star_is_the_brighter_of_its_neighbours(place_px):
+    pixels = np.arange(20.0)
+    axes = []
+    for place, sigma in zip(place_px, WIDE.sigma_px, strict=True):
+        axes.append(ndtr((pixels + 0.5 - place) / sigma) - ndtr((pixels - 0.5 - place) / sigma))
+    second = np.sort(np.outer(*axes).ravel())[-2]
+    assert WIDE.second_share(np.array([place_px]))[0] == pytest.approx(second, rel=1e-9)
+
+
+def test_light_is_as_noisy_as_its_photons_and_its_window_s_background():
+    """Of N electrons in the window 1 / sqrt(N); of k pixels of noise s, s sqrt(k) over the light."""
+    dn = np.array([1e5, 4e5])
+    window_dn = dn * WIDE.window_share
+    photons = MAG_A_RELATIVE / np.sqrt(4.0 * window_dn)
+    # a thousandth: the ADC's rounding, 1 DN / sqrt(12) a pixel
+    assert WIDE.light_noise_mag(dn, 1e-3) == pytest.approx(photons, rel=0.02)
+    pixels = (2 * WIDE.radius_px + 1) ** 2
+    faint_dn = np.array([2000.0])
+    background = MAG_A_RELATIVE * 60.0 * np.sqrt(pixels) / (faint_dn * WIDE.window_share)
+    assert WIDE.light_noise_mag(faint_dn, 60.0) == pytest.approx(background, rel=0.01)
+    # the mean of nine frames has a third of the photons' noise
+    nine = StarSpot((0.9, 1.4), 4.0, 0.0, 0.0, frames=9)
+    assert nine.light_noise_mag(dn, 1e-3)[1] == pytest.approx(photons[1] / 3, rel=0.05)
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.05])
+def test_a_scatter_beyond_noise_is_between_its_bounds(rng, scatter):
+    """Each bound is missed in one of 20 trials: of 300 in 15, and five sigmas are 19. The mean
+    square comes out right.
+    """
+    over = under = 0
+    squares = []
+    for _ in range(300):
+        noise = rng.uniform(0.03, 0.06, 300)
+        beyond = Beyond.of(np.hypot(scatter, noise) * rng.standard_normal(300), noise)
+        over += beyond.high < scatter
+        under += beyond.low > scatter
+        squares.append(beyond.sigma**2)
+    assert over <= 34
+    assert under <= 34
+    if scatter:
+        assert np.mean(squares) == pytest.approx(scatter**2, rel=0.03)
+        assert min(over, under) > 0
+
+
+def seen(rng, *, place_noise_px=0.01, off_px=0.0, count: int = 200, frames: int = 4) -> StarsSeen:
+    """Stars all over the screen, off by an error beside the noise of their places, rms."""
+    noise_px = np.full(count, place_noise_px)
+    residual_px = rng.standard_normal((count, 2))
+    residual_px *= np.hypot(off_px, place_noise_px) / np.sqrt((residual_px**2).mean())
+    return StarsSeen(
+        hip=np.arange(count, dtype=np.int32),
+        place_px=np.zeros((count, 2)),
+        residual_px=residual_px,
+        place_noise_px=noise_px,
+        dn=np.ones(count),
+        e_per_s=np.exp(rng.uniform(0, 5, count)),
+        noise_mag=np.full(count, 0.01),
+        rounding_mag=np.zeros((count, 1)),
+        screen=rng.uniform(-1, 1, (count, 2)),
+        codes_mag=np.zeros(count),
+        lost=0,
+        frames=frames,
+        images=(),
+    )
+
+
+def test_what_follows_place_or_light_is_told_apart(rng):
+    stars = seen(rng)
+    used = np.ones(200, dtype=bool)
+    noise = 0.01 * rng.standard_normal(200)
+    by_place = stars.scatter(0.3 * stars.screen[:, 0] + noise, used)
+    by_light = stars.scatter(0.1 * np.log(stars.e_per_s) + noise + 7.0, used)
+    neither = stars.scatter(0.2 * rng.standard_normal(200), used)
+    assert "follows the place on the screen" in by_place.finding
+    assert by_place.by_place > 0.95
+    assert by_place.by_light < 0.2
+    assert "follows the light asked for" in by_light.finding
+    assert by_light.by_light > 0.95
+    assert by_light.by_place < 0.2
+    assert "follows neither" in neither.finding
+    assert stars.scatter(noise + 7.0, used).finding == ""
+    # what the codes are known to cost is no scatter
+    codes_mag = 0.3 * rng.standard_normal(200)
+    object.__setattr__(stars, "codes_mag", codes_mag)
+    assert stars.scatter(codes_mag + noise, used).finding == ""
+    assert Scatter(0.031, 0.01, 0.0, 0.0).finding != "" == Scatter(0.029, 0.01, 0.0, 0.0).finding
+
+
+def test_places_are_refused_by_what_is_sure_and_frames_asked_for_by_what_is_not(rng):
+    limit_px = 0.1
+    sure = seen(rng, off_px=0.2)
+    assert "run the geometry again" in place_reasons(sure, limit_px)[0]
+    assert frames_for(sure, limit_px) == 4
+    well = seen(rng, off_px=0.0)
+    assert place_reasons(well, limit_px) == []
+    doubtful = seen(rng, place_noise_px=0.3, count=40)
+    frames = frames_for(doubtful, limit_px)
+    assert frames > 4
+    assert f"--average {frames}" in place_reasons(doubtful, limit_px)[0]
+
+
+def test_images_of_one_pattern_tell_noise_and_dn_an_electron(rng):
+    """Dark images of 3 DN, and light of 0.25 DN an electron, over 60 x 50 pixels."""
+    scatter = PixelScatter(default_dn_per_e=0.7)
+    assert scatter.dn_per_e == 0.7
+    lit, black, at = Patch(200, "w"), Patch(0, "w"), Range(2, 1)
+    size = (50, 60)
+    for _ in range(40):
+        scatter.add(black, at, 30 + rng.normal(0, 3.0, size))
+        light = 0.25 * rng.poisson(800.0, size)
+        scatter.add(lit, at, 30 + rng.normal(0, 3.0, size) + light)
+    pixels = size[0] * size[1]
+    # of 39 differences of 3000 pixels: 0.4 %, and five sigmas
+    assert scatter.dark_dn2(1) == pytest.approx(pixels * 9.0, rel=0.02)
+    assert scatter.dark_dn2(4) == scatter.dark_dn2(1)  # of an exposure that was not taken
+    assert scatter.dark_sum_dn(1) == pytest.approx(30 * pixels, rel=0.01)
+    assert scatter.dn_per_e == pytest.approx(0.25, rel=0.03)
+    light_dn = 200.0 * pixels
+    assert scatter.sum_dn2(light_dn, 1) == pytest.approx(
+        0.25 * light_dn + 2 * 9.0 * pixels, rel=0.03
+    )
+    assert scatter.sum_dn2(-5.0, 1, blacks=0.0) == scatter.dark_dn2(1)
+
+
+def test_a_part_of_an_image_sees_its_area_of_the_screen():
+    """A pixel's side on the screen is the ratio of the focal lengths; beyond its edge is none."""
+    upright = np.array([1.0, 0.0, 0.0, 0.0])
+    geometry = BenchGeometry(
+        monitor_camera((640, 480), 50.0, 100.0, upright),
+        monitor_camera((400, 300), 10.0, 30.0, upright),
+    )
+    # 2000 px to a focal length of the monitor's, 3000 px of the tracker's
+    pixel_px2 = (2000 / 3000) ** 2
+    rows, columns = slice(140, 160), slice(150, 190)
+    assert monitor_area(geometry, rows, columns) == pytest.approx(20 * 40 * pixel_px2)
+    even = np.full((480, 640), 0.5, dtype=np.float32)
+    even[:, 320:] = 0.25
+    # the middle of the screen is the tracker's column 199.5
+    halves = slice(180, 220)
+    assert monitor_area(geometry, rows, halves, even) == pytest.approx(
+        20 * 40 * pixel_px2 * 0.375, rel=0.02
+    )
+    narrow = BenchGeometry(monitor_camera((60, 480), 50.0, 100.0, upright), geometry.tracker)
+    whole = monitor_area(narrow, rows, slice(0, 400))
+    # 60 columns of the screen, to a pixel of the tracker at each side
+    assert whole == pytest.approx(60 * 20 * 2000 / 3000, abs=2 * 20 * pixel_px2)

@@ -1,0 +1,244 @@
+"""The camera of photographs by the places of their stars, the attitude of one of which nothing is
+known, and what a photograph's stars and sources say of clouds: each planted in closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from hilstar.basics.rotation import from_matrix, from_rotation_vector, multiply, to_matrix
+from hilstar.instruments.confront.camera_fit import (
+    CameraFit,
+    Places,
+    Pointing,
+    fit_camera,
+    refracted,
+    with_values,
+)
+from hilstar.instruments.confront.judge import _dim_regions, _Explanation
+from hilstar.instruments.confront.lost_in_space import SourceField, nearest_once, solve_lost
+from hilstar.optics.camera import Camera, Lens
+from tests.support.planted_sky import rotation_of
+from tests.unit.instruments.confront.test_parts import row_of
+
+WIDE_PX, HIGH_PX = SIZE_PX = (640, 480)
+FOCAL_PX, K1, CENTRE_PX = 1500.0, 0.3, (326.0, 234.0)
+NOISE_PX = 0.02
+POINTINGS_DEG = ((40.0, 20.0, 10.0), (43.0, 24.0, -60.0), (38.0, 17.0, 130.0))
+ARCSEC = np.radians(1 / 3600)
+
+
+def seen_px(cam: np.ndarray) -> np.ndarray:
+    """Places (n, 2) of directions (n, 3) through the planted lens: a radial law of the tangents."""
+    tangents = cam[:, :2] / cam[:, 2:]
+    squares = (tangents**2).sum(axis=1, keepdims=True)
+    return np.array(CENTRE_PX) + FOCAL_PX * tangents * (1 + K1 * squares)
+
+
+def photographed(rng, pointing_deg, stars: int = 40) -> tuple[np.ndarray, Places]:
+    """The turn of a photograph, ICRS to cam, and stars all over it, to NOISE_PX."""
+    turn = rotation_of(*pointing_deg)
+    tangents = rng.uniform([-0.2, -0.15], [0.2, 0.15], (stars, 2))
+    cam = np.column_stack([tangents, np.ones(stars)])
+    cam /= np.linalg.norm(cam, axis=1, keepdims=True)
+    x_px, y_px = (seen_px(cam) + NOISE_PX * rng.standard_normal((stars, 2))).T
+    return turn, Places(x_px, y_px, np.full(stars, NOISE_PX), cam @ turn)
+
+
+def fitted(rng, base: Camera, *, fixed: bool) -> tuple[CameraFit, list[np.ndarray], list[Places]]:
+    """The camera by all photographs, whose attitudes begin a tenth of a degree off."""
+    turns, photographs, pointings = [], [], []
+    for pointing_deg in POINTINGS_DEG:
+        turn, places = photographed(rng, pointing_deg)
+        off = from_rotation_vector(np.radians([0.06, -0.08, 0.1]))
+        turns.append(turn)
+        photographs.append(places)
+        # an air that bends nothing: refraction is not looked for
+        air = SimpleNamespace(bent=lambda vectors: vectors)
+        pointings.append(Pointing(multiply(off, from_matrix(turn)), air=air))
+    return fit_camera(base, pointings, photographs, fixed=fixed, last=True), turns, photographs
+
+
+def test_a_planted_camera_and_its_attitudes_come_back(rng):
+    """Of 120 stars to 0.02 px: five sigmas of each figure by the fit's own errors."""
+    base = Camera(SIZE_PX, 1.03 * FOCAL_PX, (319.5, 239.5), np.eye(3))
+    fit, turns, photographs = fitted(rng, base, fixed=False)
+    assert fit.model.startswith("k1")
+    camera = fit.camera
+    assert camera.focal_length_px == pytest.approx(
+        FOCAL_PX, abs=5 * FOCAL_PX * fit.sigma["log_focal"]
+    )
+    assert 0 < fit.sigma["log_focal"] < 1e-3
+    assert camera.lens.radial[0] == pytest.approx(K1, abs=5 * fit.sigma["k1"])
+    for found, true, name in zip(
+        camera.principal_point_px, CENTRE_PX, ("centre_x", "centre_y"), strict=True
+    ):
+        assert found == pytest.approx(true, abs=5 * fit.sigma[name])
+    for off_px in fit.residuals_px(photographs):
+        assert off_px.std() == pytest.approx(NOISE_PX, rel=0.3)
+    for pointing, turn in zip(fit.pointings, turns, strict=True):
+        # the principal point's error turns the boresight with it: the middle of the image stays
+        ray = camera.rays(np.array([319.5]), np.array([239.5])) @ to_matrix(pointing.q_icrs_to_cam)
+        true_px = seen_px(ray / np.linalg.norm(ray) @ turn.T)
+        assert true_px[0] == pytest.approx([319.5, 239.5], abs=0.05)
+
+
+def test_a_camera_that_is_fixed_keeps_its_lens_and_finds_its_attitudes(rng):
+    base = Camera(SIZE_PX, FOCAL_PX, CENTRE_PX, np.eye(3), lens=Lens((K1, 0.0, 0.0)))
+    fit, turns, _ = fitted(rng, base, fixed=True)
+    assert (fit.camera.focal_length_px, fit.camera.principal_point_px) == (FOCAL_PX, CENTRE_PX)
+    for pointing, turn in zip(fit.pointings, turns, strict=True):
+        error = to_matrix(pointing.q_icrs_to_cam) @ turn.T
+        off_rad = np.array([error[2, 1] - error[1, 2], error[0, 2] - error[2, 0]]) / 2
+        # 40 stars of 0.02 px: 0.003 px of 1500 px, and five sigmas
+        assert np.abs(off_rad).max() < 5 * NOISE_PX / np.sqrt(40) / FOCAL_PX
+
+
+def test_values_count_from_the_camera_s_own_focal_length_and_point():
+    base = Camera(SIZE_PX, 1000.0, (300.0, 200.0), np.eye(3), lens=Lens((0.1, 0.2, 0.0), (0.01, 0)))
+    changed = with_values(base, {"log_focal": np.log(1.1), "centre_y": -3.0, "k2": 0.5})
+    assert changed.focal_length_px == pytest.approx(1100.0)
+    assert changed.principal_point_px == (300.0, 197.0)
+    assert (changed.lens.radial, changed.lens.tangential) == ((0.1, 0.5, 0.0), (0.01, 0))
+    assert with_values(base, {}).lens == base.lens
+
+
+@pytest.mark.parametrize("zenith_deg", [20.0, 45.0, 60.0])
+def test_air_lifts_a_star_by_58_arcsec_times_the_tangent_of_its_zenith_distance(zenith_deg):
+    """The boresight, with the zenith along the image's x."""
+    zenith = np.array([[np.tan(np.radians(zenith_deg)), 0.0]])
+    bent = refracted(np.array([[0.0, 0.0, 1.0]]), zenith)
+    lifted_arcsec = np.arctan2(bent[0, 0], bent[0, 2]) / ARCSEC
+    # 58.3 arcsec (Saastamoinen's first term), whose second is a thousandth of it here
+    assert lifted_arcsec == pytest.approx(58.3 * np.tan(np.radians(zenith_deg)), rel=5e-3)
+    assert bent[0, 1] == 0.0
+
+
+def sky_of(rng, count: int = 300) -> np.ndarray:
+    """Stars evenly over a cap about a direction, ICRS."""
+    middle = rotation_of(40.0, 20.0, 0.0)
+    tangents = rng.uniform(-0.4, 0.4, (count, 2))
+    cam = np.column_stack([tangents, np.ones(count)])
+    return (cam / np.linalg.norm(cam, axis=1, keepdims=True)) @ middle
+
+
+@pytest.mark.parametrize("scale", [1.0, 1.15])
+def test_an_attitude_is_found_of_a_field_whose_scale_is_known_to_a_fifth(rng, scale):
+    vectors = sky_of(rng)
+    turn = rotation_of(40.0, 20.0, 77.0)
+    cam = vectors @ turn.T
+    places_px = FOCAL_PX * cam[:, :2] / cam[:, 2:]
+    inside = (np.abs(places_px) < [WIDE_PX / 2, HIGH_PX / 2]).all(axis=1)
+    sources_px = places_px[inside] + 0.1 * rng.standard_normal((inside.sum(), 2))
+    field = SourceField(np.delete(sources_px, 3, axis=0), WIDE_PX, HIGH_PX)
+    found = solve_lost(field, scale * FOCAL_PX, vectors, np.array(turn[2]))
+    assert found.focal_length_px == pytest.approx(FOCAL_PX, rel=1e-3)
+    error = to_matrix(found.q_icrs_to_cam) @ turn.T
+    assert np.abs(error - np.eye(3)).max() < 1e-3
+    rows = np.delete(np.flatnonzero(inside), 3)
+    assert np.array_equal(rows[found.source], found.star)
+    # mirrored, it is no part of this sky
+    mirrored = replace(field, places_px=field.places_px * np.array([-1, 1]))
+    assert solve_lost(mirrored, scale * FOCAL_PX, vectors, np.array(turn[2])) is None
+
+
+def test_a_source_is_the_brightest_of_its_stars_alone():
+    """Stars are in the order of their light; a source beyond the radius is none's."""
+    tree = cKDTree(np.array([[10.0, 0.0], [0.0, 0.0], [30.0, 0.0]]))
+    stars = np.array([[0.4, 0.0], [0.1, 0.0], [13.0, 0.0], [9.5, 0.5]])
+    star, source = nearest_once(tree, stars, 2.0)
+    assert (star.tolist(), source.tolist()) == ([0, 3], [1, 0])
+
+
+def at(x_px: float, y_px: float, off_mag: float = 0.0, **changes):
+    """A star at a place, fainter than predicted."""
+    dn = 100 * 10 ** (-0.4 * off_mag)
+    return row_of(dn, x_predicted_px=x_px, y_predicted_px=y_px, sigma_dn=0.5, **changes)
+
+
+def test_a_cloud_dims_the_part_of_an_image_that_it_covers():
+    """Four by four stars in each of four by four cells; the cell of the lower left is covered."""
+    rows = []
+    for y_px in np.arange(15.0, HIGH_PX, 30.0):
+        for x_px in np.arange(20.0, WIDE_PX, 40.0):
+            covered = x_px < WIDE_PX / 4 and y_px > 3 * HIGH_PX / 4
+            scatter = 0.02 * (-1) ** round(x_px / 40 + y_px / 30)
+            rows.append(at(x_px, y_px, 0.8 * covered + scatter))
+    words, is_dim = _dim_regions(rows, SIZE_PX)
+    assert len(words) == 1
+    assert words[0].startswith("lower left: 0 of 16 stars are missing, those seen 0.80 mag")
+    assert is_dim(at(100.0, 470.0, 0.8))
+    assert not is_dim(at(100.0, 470.0, 0.02))
+    assert not is_dim(at(600.0, 10.0, 0.8))
+    assert _dim_regions([row for row in rows if row.off_mag < 0.5], SIZE_PX)[0] == []
+
+
+def test_missing_stars_tell_of_an_obstacle():
+    gone = {"flags": ("missing",)}
+    rows = [at(600.0, 20.0, **gone), at(610.0, 30.0, **gone), at(620.0, 40.0), at(20.0, 20.0)]
+    assert _dim_regions(rows, SIZE_PX)[0] == [
+        "upper right: 2 of 3 stars are missing, those seen 0.00 mag too faint: cloud, an obstacle,"
+        " or vignetting"
+    ]
+
+
+def explained(**changes) -> str:
+    """What a source at (35, 12) is, in an image of 50 x 30 pixels with nothing that explains it."""
+    source = {
+        "x_px": np.array([35.0]),
+        "y_px": np.array([12.0]),
+        "snr": np.array([20.0]),
+        "length_px": np.array([3.0]),
+        "trail": np.array([False]),
+        "single": np.array([False]),
+    }
+    source |= changes.pop("source", {})
+    places_px = np.column_stack([source["x_px"], source["y_px"]])
+    sky = SimpleNamespace(name=lambda star: f"star {star}")
+    shot = SimpleNamespace(sources=SimpleNamespace(**source, places_px=places_px), sky=sky)
+    parts = {
+        "shot": shot,
+        "expected": None,
+        "tree": None,
+        "planets": {},
+        "satellites": {},
+        "near_saturated": lambda x_px, y_px: False,
+        "hot": np.zeros((30, 50), dtype=bool),
+        "light_sigma": np.zeros((30, 50)),
+        "pixel_dn": 1.0,
+        "focal_length_px": 1000.0,
+    }
+    return _Explanation(**(parts | changes)).of(0)
+
+
+def image_with(value) -> np.ndarray:
+    """An image that has a value in the source's pixel alone, row 12 and column 35."""
+    image = np.zeros((30, 50), dtype=type(value))
+    image[12, 35] = value
+    return image
+
+
+def test_what_explains_a_source_is_looked_for_at_its_own_row_and_column():
+    assert explained() == ""
+    assert explained(hot=image_with(True)) == "a hot pixel"
+    assert explained(light_sigma=image_with(6.0)) == "light of a bright star"
+    assert explained(light_sigma=image_with(4.0)) == ""  # a quarter of the source's 20 is 5
+    assert explained(source={"single": np.array([True])}).startswith("one pixel: hot")
+    assert explained(near_saturated=lambda x_px, y_px: (x_px, y_px) == (35.0, 12.0)) == (
+        "light of a bright star"
+    )
+    # 3 px, or 3 arcmin of 1000 px, which are 0.9
+    assert explained(planets={"Mars": (37.0, 13.0)}) == "Mars"
+    assert explained(planets={"Mars": (38.0, 13.0)}) == ""
+
+
+def test_a_trail_has_the_name_of_a_satellite_within_its_length_and_two_tenths_of_a_degree():
+    trail = {"trail": np.array([True]), "length_px": np.array([8.0])}
+    # 4 px and 0.2 deg of 1000 px, 3.5 px
+    assert explained(source=trail, satellites={"ISS": (42.0, 12.0)}) == "ISS, 8 px long"
+    assert explained(source=trail, satellites={"ISS": (43.0, 12.0)}) == "a trail, 8 px long"

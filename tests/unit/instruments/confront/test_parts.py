@@ -1,0 +1,275 @@
+"""The parts of a confrontation, each against a closed form: the PSF and its derivatives, stars that
+are measured by it, the light of several photographs, and what of a scatter is told apart.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from hilstar.instruments.confront.excess import Part, _by_law, _rest, _taken
+from hilstar.instruments.confront.judge import StarRow, light_at
+from hilstar.instruments.confront.light import LightFit, StarLight, fit_light, with_extinction
+from hilstar.instruments.confront.session import _apart, _middles, within_image
+from hilstar.instruments.confront.star_psf import (
+    HALF,
+    StarPsf,
+    cut_stamps,
+    field_terms,
+    measure,
+)
+
+WIDE_PX, HIGH_PX = SIZE_PX = (640, 480)
+MIDDLE_PX = (319.5, 239.5)  # pixel (0, 0) is the centre of the top-left one
+PSF = StarPsf(
+    covariance=np.array(
+        [[0.9, 0.2, 0.1, -0.05, 0.03, 0.02], [0.7, 0.1, 0, 0, 0, 0], [0.1] + [0] * 5]
+    ),
+    colour=0.1,
+    wing_share=0.1,
+    wing_sigma_px=2.5,
+    size_px=SIZE_PX,
+)
+# By central differences of 1e-5: their own error is 1e-10 of the function and 1e-11 by rounding.
+STEP, SLOPE_ERROR = 1e-5, 1e-8
+GAIN = 0.8
+MAG_A_RELATIVE = 2.5 / math.log(10)
+
+
+def test_field_terms_are_about_the_middle_of_the_image():
+    half = math.hypot(*SIZE_PX) / 2
+    x_px = np.array([MIDDLE_PX[0], -0.5, WIDE_PX - 0.5, MIDDLE_PX[0]])
+    y_px = np.array([MIDDLE_PX[1], MIDDLE_PX[1], MIDDLE_PX[1], HIGH_PX - 0.5])
+    u, v = WIDE_PX / 2 / half, HIGH_PX / 2 / half
+    assert field_terms(x_px, y_px, SIZE_PX) == pytest.approx(
+        np.array(
+            [
+                [1, 0, 0, 0, 0, 0],
+                [1, u * u, -u, 0, u * u, 0],
+                [1, u * u, u, 0, u * u, 0],
+                [1, v * v, 0, v, -v * v, 0],
+            ]
+        )
+    )
+
+
+def offsets_px(x_px: float, y_px: float) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets of a stamp's columns and rows from a star in it, px, (1, side) each."""
+    reach = np.arange(-HALF, HALF + 1.0)
+    return reach[None] - x_px, reach[None] - y_px
+
+
+def test_a_psf_s_slopes_are_those_of_its_shares():
+    place = np.array([100.0]), np.array([400.0])
+    core = PSF.core(*place, np.array([1.2]))
+
+    def shares(x=0.2, y=-0.3, core=core, psf=PSF):
+        return psf.on_pixels(*offsets_px(x, y), core)[0]
+
+    share, by_x, by_y = PSF.on_pixels(*offsets_px(0.2, -0.3), core)
+    assert by_x == pytest.approx(
+        (shares(x=0.2 + STEP) - shares(x=0.2 - STEP)) / (2 * STEP), abs=SLOPE_ERROR
+    )
+    assert by_y == pytest.approx(
+        (shares(y=-0.3 + STEP) - shares(y=-0.3 - STEP)) / (2 * STEP), abs=SLOPE_ERROR
+    )
+    same, by_shape = PSF.by_shape(*offsets_px(0.2, -0.3), core)
+    assert same == pytest.approx(share)
+    for k in range(3):
+        step = STEP * np.eye(3)[k]
+        numeric = (shares(core=core + step) - shares(core=core - step)) / (2 * STEP)
+        assert by_shape[k] == pytest.approx(numeric, abs=SLOPE_ERROR)
+    for k, name in enumerate(("wing_share", "wing_sigma_px"), start=3):
+        more = replace(PSF, **{name: getattr(PSF, name) + STEP})
+        less = replace(PSF, **{name: getattr(PSF, name) - STEP})
+        numeric = (shares(psf=more) - shares(psf=less)) / (2 * STEP)
+        assert by_shape[k] == pytest.approx(numeric, abs=SLOPE_ERROR)
+
+
+def test_stars_are_measured_where_they_stand_with_their_light_over_any_level():
+    """A Gaussian of 1 and 1.3 px, by the normal distribution's integral, in an image that is not
+    square.
+    """
+    sigma_x, sigma_y, level_dn = 1.0, 1.3, 3.0
+    places_px = np.array([[40.3, 20.8], [90.0, 12.5], [15.6, 33.1]])
+    flux_dn = np.array([5000.0, 800.0, 20_000.0])
+    x, y = np.arange(120.0), np.arange(50.0)
+    image = np.full((50, 120), level_dn)
+    for (x_px, y_px), dn in zip(places_px, flux_dn, strict=True):
+        across = ndtr((x + 0.5 - x_px) / sigma_x) - ndtr((x - 0.5 - x_px) / sigma_x)
+        down = ndtr((y + 0.5 - y_px) / sigma_y) - ndtr((y - 0.5 - y_px) / sigma_y)
+        image += dn * np.outer(down, across)
+    covariance = np.array([[sigma_x**2], [sigma_y**2], [0.0]])
+    psf = StarPsf(covariance, 0.0, 0.0, 2.0, (120, 50))
+    start_px = places_px + np.array([0.4, -0.3])
+    stamps = cut_stamps(image, np.ones_like(image), *start_px.T, np.zeros(3))
+    measured = measure(stamps, psf, *start_px.T, GAIN)
+    # quadrature in a pixel is right to 1e-3 of its light
+    assert measured.places_px == pytest.approx(places_px, abs=2e-3)
+    assert measured.dn == pytest.approx(flux_dn, rel=2e-3)
+    # centres of gravity of 5 x 5 pixels lose what lies beyond: they start within a third of a pixel
+    assert np.column_stack(_middles(stamps)) == pytest.approx(places_px, abs=0.34)
+
+
+def test_places_are_within_the_outermost_pixels_centres():
+    x = np.array([0.0, 2.1, WIDE_PX - 3.1, WIDE_PX - 2.9, np.nan, 5.0])
+    y = np.array([5.0, 5.0, 5.0, 5.0, 5.0, HIGH_PX - 2.9])
+    assert within_image(x, y, SIZE_PX, 2.0).tolist() == [False, True, True, False, False, False]
+
+
+def stars_of(rng: np.random.Generator, offsets_mag, vignetting_mag) -> StarLight:
+    """Stars of V = 2 to 6 on several photographs, with noise of a thousandth."""
+    count = 60 * len(offsets_mag)
+    image = np.repeat(np.arange(len(offsets_mag)), 60)
+    v_mag = rng.uniform(2, 6, count)
+    radius2 = rng.uniform(0, 1, count)
+    a, b = vignetting_mag
+    mag = v_mag + np.array(offsets_mag)[image] + a * radius2 + b * radius2**2
+    dn = 10 ** (-0.4 * mag) * (1 + 1e-3 * rng.standard_normal(count))
+    every = np.ones(count, dtype=bool)
+    plane = np.zeros(count, dtype=np.intp)
+    return StarLight(image, dn, 1e-3 * dn, v_mag, np.zeros(count), radius2, every, plane)
+
+
+OFFSETS_MAG, VIGNETTING_MAG = (-12.0, -11.4, -11.9), (0.3, 0.2)
+# 60 stars of 0.001 mag each, and four columns that share them
+LIGHT_ERROR_MAG = 0.002
+
+
+def test_the_light_of_photographs_is_their_offsets_and_one_vignetting(rng):
+    stars = stars_of(rng, OFFSETS_MAG, VIGNETTING_MAG)
+    fit = fit_light(stars, 3, lambda correction: stars.v_mag)
+    assert fit.offsets_mag == pytest.approx(OFFSETS_MAG, abs=LIGHT_ERROR_MAG)
+    shade = fit.illumination(np.array([0.0, 0.5, 1.0]))
+    assert -2.5 * np.log10(shade) == pytest.approx([0, 0.2, 0.5], abs=LIGHT_ERROR_MAG)
+    assert fit.linearity == pytest.approx(1, abs=LIGHT_ERROR_MAG)
+    # the third photograph has less light than the first by 0.1 mag
+    shares = fit.shares()
+    assert shares[2] / shares[0] == pytest.approx(10**-0.04, rel=LIGHT_ERROR_MAG)
+    assert shares[0] > shares[2] > shares[1]
+    assert np.log10(shares).sum() == pytest.approx(0, abs=1e-12)
+    assert fit.shares(-12.0)[0] == pytest.approx(1, rel=2 * LIGHT_ERROR_MAG)
+
+
+def test_a_camera_that_is_held_leaves_its_vignetting_out_of_the_offsets(rng):
+    stars = stars_of(rng, OFFSETS_MAG, VIGNETTING_MAG)
+    held = LightFit(np.zeros(1), VIGNETTING_MAG, (0.0, 0.0), 12.0, 0.0, 1.0)
+    fit = fit_light(stars, 3, lambda correction: stars.v_mag, held)
+    assert fit.offsets_mag == pytest.approx(OFFSETS_MAG, abs=LIGHT_ERROR_MAG)
+    assert (fit.vignetting_mag, fit.zero_point_mag) == (VIGNETTING_MAG, 12.0)
+    # what each star should have, without its photograph's offset
+    assert fit.mag + fit.offsets_mag[stars.image] == pytest.approx(
+        stars.instrument_mag, abs=5 * LIGHT_ERROR_MAG
+    )
+
+
+def test_extinction_is_what_offsets_grow_by_with_an_air_mass(rng):
+    masses, mag_a_mass = (1.0, 1.4, 2.0), 0.21
+    stars = stars_of(rng, tuple(-12 + mag_a_mass * mass for mass in masses), (0.0, 0.0))
+    fit = fit_light(stars, 3, lambda correction: stars.v_mag)
+    told = with_extinction(fit, stars, masses, known=False)
+    assert told.extinction_mag == pytest.approx(mag_a_mass, abs=2 * LIGHT_ERROR_MAG)
+    assert "extinction_mag_per_air_mass" in told.sigma
+    beyond = with_extinction(fit, stars, masses, known=True)
+    assert "extinction_beyond_table_mag_per_air_mass" in beyond.sigma
+    # masses that are alike, or not known, tell none
+    for few in ((1.0, 1.1, 1.2), (1.0, None, 2.0)):
+        assert with_extinction(fit, stars, few, known=False).extinction_mag is None
+
+
+def test_photographs_of_one_sky_tell_no_pattern_of_the_pixels():
+    """The third is of the first one's sky, however far the second is."""
+    off_rad = 20 / 3000  # 20 px of a focal length of 3000 px
+    away = np.array([math.sin(off_rad), 0.0, math.cos(off_rad)])
+    here = np.array([0.0, 0.0, 1.0])
+    shots = []
+    for boresight in (here, away, here, away):
+        pointing = SimpleNamespace(boresight=boresight)
+        shots.append(SimpleNamespace(pointing=pointing, focal_length_px=3000.0))
+    assert _apart(shots) == [0, 1]
+
+
+def test_the_light_at_a_place_is_of_its_row_and_column():
+    image = np.zeros((20, 50))
+    image[6:11, 33:38] = 2.0
+    image[5], image[:, 32] = 100.0, 100.0
+    assert light_at(image, 35.4, 7.6) == 25 * 2.0
+
+
+def row_of(dn: float, **changes) -> StarRow:
+    row = StarRow(
+        star=1,
+        hip=1,
+        name="",
+        x_px=10.5,
+        y_px=20.0,
+        x_predicted_px=10.0,
+        y_predicted_px=20.25,
+        dn=dn,
+        sigma_dn=1.0,
+        dn_predicted=100.0,
+        v_mag=4.0,
+        b_v_mag=0.6,
+        flags=(),
+    )
+    return replace(row, **changes)
+
+
+def test_a_star_with_less_light_than_predicted_is_fainter():
+    row = row_of(50.0)
+    assert row.off_mag == pytest.approx(2.5 * math.log10(2))
+    assert row.off_px == (0.5, -0.25)
+    assert row.counted
+    assert math.isnan(row_of(-3.0).off_mag)
+    for change in (
+        {"dn": -3.0},
+        {"v_mag": 6.6},
+        {"flags": ("saturated",)},
+        {"flags": ("dim region",)},
+    ):
+        assert not replace(row, **change).counted
+    assert replace(row, flags=("variable",)).counted
+
+
+def session_of(masses, height_m: float | None):
+    """What Young's law is asked for: 30 mm, 0.5 s, at a height."""
+    tracker = SimpleNamespace(aperture_mm=30.0, exposure_s=0.5)
+    site = None if height_m is None else SimpleNamespace(height_m=height_m)
+    config = SimpleNamespace(tracker=tracker, site=site)
+    return SimpleNamespace(
+        file=SimpleNamespace(config=config), light=SimpleNamespace(masses=masses)
+    )
+
+
+@pytest.mark.parametrize(("height_m", "down"), [(None, 1.0), (0.0, 1.0), (8000.0, math.exp(-1))])
+def test_scintillation_by_law_is_youngs_in_magnitudes(height_m, down):
+    """Young 1967: 0.09 D^(-2/3) X^1.75 exp(-h / 8 km) / sqrt(2 t) of the light, D in cm."""
+    part = _by_law(session_of((1.0, 2.0, None), height_m))
+    relative = 0.09 * 3 ** (-2 / 3) * 1.5**1.75 * down
+    assert part.rms == pytest.approx(MAG_A_RELATIVE * relative, rel=1e-12)
+
+
+def test_scintillation_without_an_air_mass_is_not_known():
+    part = _by_law(session_of((None, None), 0.0))
+    assert math.isnan(part.rms)
+    rest = _rest(0.25, [Part("a", 0.3, ""), Part("b", 0.0, ""), part])
+    assert rest.rms == pytest.approx(0.4)
+    assert _rest(0.01, [Part("a", 0.3, "")]).rms == 0.0
+
+
+def test_what_columns_take_is_their_own_and_not_that_of_chance(rng):
+    """A sine of amplitude 0.2 has a mean square of 0.02; random columns take none on average."""
+    count = 4000
+    phase = rng.uniform(0, 2 * np.pi, count)
+    columns = np.column_stack([np.cos(phase), np.sin(phase)])
+    noise = 0.1 * rng.standard_normal(count)
+    # of the mean square: noise times the wave, 2 x 0.1 x 0.14 over the root of the count
+    assert _taken(columns, 0.2 * np.sin(phase + 1) + noise + 7.0) == pytest.approx(0.02, abs=0.002)
+    taken = [_taken(rng.standard_normal((40, 10)), rng.standard_normal(40)) for _ in range(200)]
+    # 10 of 39 degrees of freedom would be 0.26 of 1; what is cut at 0 leaves a part of its spread
+    assert np.mean(taken) < 0.08

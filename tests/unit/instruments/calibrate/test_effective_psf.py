@@ -4,8 +4,6 @@ sides, their cut-outs and scatter, and where a glass has its centroids.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -30,6 +28,8 @@ from hilstar.instruments.calibrate.effective_psf import (
     dots_of_image,
 )
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX
+from hilstar.instruments.calibrate.geometric.fit import MatchedDots
+from hilstar.instruments.calibrate.geometric.observed import Observed
 
 ROUNDING = 1e-9  # of sums of a few thousand doubles
 SIDE_PX = 0.8
@@ -94,6 +94,12 @@ def test_a_spline_s_rows_go_down_and_its_columns_across():
     np.testing.assert_allclose(beside[0], np.repeat(offsets.T, 5, axis=1), atol=1e-6)
 
 
+def matched(x_px: np.ndarray, y_px: np.ndarray, dot: np.ndarray) -> MatchedDots:
+    """Centroids of dots in one image."""
+    none = np.zeros(len(dot), dtype=np.intp)
+    return MatchedDots(Observed(none, none, x_px, y_px, np.ones(len(dot))), dot)
+
+
 @pytest.mark.parametrize(
     "matrix",
     [
@@ -106,19 +112,10 @@ def test_a_spline_s_rows_go_down_and_its_columns_across():
 def test_a_dot_s_side_is_the_root_of_its_map_s_area(matrix, count, rng):
     x_px, y_px = rng.uniform(0, 200, size=(2, count))
     tracker_px = np.array(matrix) @ np.stack([x_px, y_px])
-    centroids = SimpleNamespace(x_px=tracker_px[0], y_px=tracker_px[1])
     dot = rng.permutation(count)
     inverse = np.argsort(dot)
-
-    class Data:
-        def __init__(self) -> None:
-            self.centroids = centroids
-            self.dot = dot
-
-        def __len__(self) -> int:
-            return count
-
-    sides_px = _dot_sides(Data(), x_px[inverse], y_px[inverse])
+    data = matched(*tracker_px, dot)
+    sides_px = _dot_sides(data, x_px[inverse], y_px[inverse])
     wanted_px = DOT_PX * np.sqrt(abs(np.linalg.det(matrix)))
     np.testing.assert_allclose(sides_px, wanted_px, rtol=1e-6)
 
@@ -128,14 +125,7 @@ def test_a_dot_s_side_grows_with_the_field_s_own_scale(rng):
     # monitor px by tracker px: d(x)/du = 1 + u / 200, d(y)/dv = 1
     x_px = u + u**2 / 400
 
-    class Data:
-        centroids = SimpleNamespace(x_px=u, y_px=v)
-        dot = np.arange(80)
-
-        def __len__(self) -> int:
-            return 80
-
-    sides_px = _dot_sides(Data(), x_px, v)
+    sides_px = _dot_sides(matched(u, v, np.arange(80)), x_px, v)
     np.testing.assert_allclose(sides_px, DOT_PX / np.sqrt(1 + u / 200), rtol=1e-6)
 
 

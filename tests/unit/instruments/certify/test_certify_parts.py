@@ -12,7 +12,9 @@ import pytest
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
-from hilstar.instruments.certify import lens
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.calibrate.geometric import fit as fits
+from hilstar.instruments.certify import estimates, lens
 from hilstar.instruments.certify.budget import Input
 from hilstar.instruments.certify.certificate import _contributions, _input_row, _judged, _place_of
 from hilstar.instruments.certify.estimates import (
@@ -31,6 +33,7 @@ from hilstar.instruments.certify.structure import (
     _rectangle,
     lasting_root,
 )
+from hilstar.optics.camera import Camera
 
 SIZE_PX = (1920, 1080)
 ROUNDING = 1e-9
@@ -374,3 +377,37 @@ def test_a_thousand_dots_are_all_over_the_field():
     assert not thinned[:300].any()
     few = np.arange(900) % 2 == 0
     np.testing.assert_array_equal(lens._thinned(few), few)
+
+
+@pytest.mark.parametrize("number", range(len(fits.BROWN_CONRADY)))
+def test_a_lens_s_slopes_are_how_far_a_number_moves_the_directions_it_shows(number):
+    """A ray of the lens that has the number, less one of the lens that has not."""
+    flat = Camera((800, 600), 4000.0, (399.5, 299.5), np.eye(3))
+    nominal = fits.Nominal(flat, lens.STILL[0], flat)
+    model = fits.Model(fits.BROWN_CONRADY)
+    numbers = np.zeros(model.size)
+    fitted = fits.Fit(model, 0, numbers, fits.geometry_of(model, nominal, lens.STILL, numbers))
+    slopes = lens._lens_terms(fitted, flat, TANGENTS)[:, :, number]
+    step = np.zeros(model.size)
+    step[number] = 1e-3
+    moved = []
+    for sign in (1, -1):
+        camera = fits.geometry_of(model, nominal, lens.STILL, sign * step).monitor
+        moved.append(lens._tangents(camera, flat, TANGENTS))
+    wanted = (moved[0] - moved[1]).T / 2e-3 * ARCSEC_PER_RAD
+    # second order in a step of either, and 1e-9 of a place by rounding
+    largest = np.abs(wanted).max()
+    assert largest > 0
+    np.testing.assert_allclose(slopes, wanted, atol=0.01 * largest)
+
+
+def test_a_square_s_evenness_is_the_mean_of_its_rows_and_columns(monkeypatch):
+    even = np.arange(40.0).reshape(5, 8)
+    calibration = SimpleNamespace(uniformity_map=lambda size: even)
+    monkeypatch.setattr(estimates, "bench_calibration", lambda config, folder: calibration)
+    monitor = SimpleNamespace(resolution_px=(8, 5))
+    file = SimpleNamespace(config=SimpleNamespace(monitor=monitor), folder=None)
+    # rows 1 and 2, columns 4 and 5
+    assert estimates._evenness_in(file, (4, 1, 2)) == (12 + 13 + 20 + 21) / 4
+    calibration.uniformity_map = lambda size: None
+    assert estimates._evenness_in(file, (4, 1, 2)) == 1.0

@@ -298,7 +298,9 @@ def _serialised(data: bytes) -> Likeness | None:
     """
     if len(data) > 2 and data[0] == 0x80 and data[1] in PICKLE_PROTOCOLS:
         return Likeness("a Python pickle", "send json.dumps of the object")
-    if b"t_ns" in data and LEADING_TEXT.fullmatch(data) is None:
+    # No binary form begins with a letter or a bracket and is UTF-8 to its end.
+    is_text = LEADING_TEXT.match(data) is not None and _is_utf8(data)
+    if b"t_ns" in data and not is_text:
         return Likeness(
             "an object in a binary form, such as MessagePack or CBOR", "send it as JSON text"
         )

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize, stats
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray, IntArray
 
 MAX_BLOCKS, DRAWS = 200, 1000  # the bootstrap's
+MIN_ERROR_SHARE = 1e-3  # of a standard error that a draw of nearly equal cases has at least
+SMALL_SHARE = 1e-3  # of a sum that all cases but a heavy one have
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,13 +104,51 @@ def drawn_limits(
     sums: FloatArray, weights: FloatArray, rng: np.random.Generator, confidence: float
 ) -> FloatArray:
     """The limits (2,) of sum over weight of cases (n,), by the bootstrap over blocks of them."""
-    cases = len(sums)
-    blocks = min(MAX_BLOCKS, cases)
-    block = np.arange(cases) * blocks // cases
-    total = np.bincount(block, sums, blocks)
-    weight = np.bincount(block, weights, blocks)
-    drawn = rng.integers(0, blocks, (DRAWS, blocks))
+    total, weight, drawn = _drawn_blocks(sums, weights, rng)
     drawn_total = total[drawn].sum(axis=1)
     drawn_weight = weight[drawn].sum(axis=1)
     ratio = drawn_total / np.maximum(drawn_weight, 1e-300)
     return np.asarray(np.quantile(ratio, [1 - confidence, confidence]))
+
+
+def studentized_limits(
+    sums: FloatArray, weights: FloatArray, rng: np.random.Generator, confidence: float
+) -> tuple[float, float]:
+    """The limits of sum over weight of cases (n,), by the bootstrap-t over blocks of them (Hall
+    1988).
+
+    Of cases that differ, as noise by the field's stars does, a few heavy ones set both the figure
+    and its standard error: without one both are too small. So each draw is off by so many of its
+    own standard errors, and the upper end is the longer one.
+    """
+    total, weight, drawn = _drawn_blocks(sums, weights, rng)
+    value, error = ratios(total[None], weight[None])
+    drawn_value, drawn_error = ratios(total[drawn], weight[drawn])
+    off = (drawn_value - value) / np.maximum(drawn_error, MIN_ERROR_SHARE * error)
+    least, most = np.quantile(off, [1 - confidence, confidence])
+    return float(value[0] - most * error[0]), float(value[0] - least * error[0])
+
+
+def _drawn_blocks(
+    sums: FloatArray, weights: FloatArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Sums and weights of blocks (b,) of cases (n,), and the blocks (draws, b) that are drawn."""
+    cases = len(sums)
+    blocks = min(MAX_BLOCKS, cases)
+    block = np.arange(cases) * blocks // cases
+    total = np.asarray(np.bincount(block, sums, blocks), dtype=np.float64)
+    weight = np.asarray(np.bincount(block, weights, blocks), dtype=np.float64)
+    drawn = rng.integers(0, blocks, (DRAWS, blocks))
+    return total, weight, np.asarray(drawn, dtype=np.intp)
+
+
+def ratios(sums: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The ratio (m,) of sums to weights (m, n), and its standard error: a heavy case draws the
+    ratio to itself, so its residual counts more (MacKinnon and White 1985, HC3).
+    """
+    whole = weights.sum(axis=1, keepdims=True)
+    ratio = sums.sum(axis=1, keepdims=True) / np.maximum(whole, 1e-300)
+    left = np.maximum(1 - weights / np.maximum(whole, 1e-300), SMALL_SHARE)
+    residual = (sums - weights * ratio) / left
+    error = np.sqrt((residual**2).sum(axis=1)) / np.maximum(whole[:, 0], 1e-300)
+    return ratio[:, 0], error

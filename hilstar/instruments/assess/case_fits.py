@@ -13,15 +13,17 @@ from scipy import stats
 
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.instruments.assess.bounded_figures import (
+    SMALL_SHARE,
     BoundedFigure,
     TooFewCases,
-    drawn_limits,
     lowest_size,
+    ratios,
+    studentized_limits,
 )
 
 MIN_CASES = 8
 MAX_EXPONENT = 50.0
-SMALL_SHARE = 1e-3  # of a sum that all cases but a heavy one have
+HEAVY_SHARE = 0.25  # of the squares: a case that has more says that few cases are too few
 SILENT = "the answers carry no {}"
 
 
@@ -140,24 +142,26 @@ def root_mean(
     case: IntArray,
     confidence: float,
     rng: np.random.Generator,
-    method: str = "bootstrap over cases",
+    method: str = "bootstrap-t over cases",
 ) -> BoundedFigure:
-    """The root of the sum of squares (n,) over that of weights (n,), by the bootstrap over cases;
+    """The root of the sum of squares (n,) over that of weights (n,), by the bootstrap-t over cases;
     squares may be below 0.
     """
     number = numbered(case)
     sums = summed(squares, number)
     whole = summed(weights, number)
-    c = confidence
-    low, high = drawn_limits(sums, whole, rng, c).tolist()
+    low, high = studentized_limits(sums, whole, rng, confidence)
     variance = float(sums.sum() / whole.sum())
-    # few cases draw limits that are too narrow: by their scatter and Student's t they are wider,
-    # and skew, as a variance is
+    # few cases draw too little of the scatter: the limits are at least those by Student's t, of
+    # which the upper one is skew, as a variance is
     if variance > 0 and len(sums) > 1:
-        wide = _spread(sums, whole, c)
+        wide = _spread(sums, whole, confidence)
         exponent = min(wide / variance, MAX_EXPONENT)
         high = max(high, variance * math.exp(exponent))
         low = min(low, variance - wide)
+    heaviest = float(sums.max() / sums.sum())
+    if sums.min() >= 0 and heaviest > HEAVY_SHARE:
+        method += f"; one case has {heaviest:.0%} of the squares, and more cases would tell"
     value = root_of(variance)
     lower = min(root_of(low), value)
     upper = max(root_of(high), value)
@@ -170,22 +174,15 @@ def root_of(variance: float) -> float:
 
 
 def _spread(sums: FloatArray, whole: FloatArray, confidence: float) -> float:
-    """How far the sum of `sums` (n,) over that of `whole` (n,) may be off, by the cases' scatter.
-
-    A heavy case draws the ratio to itself, so its residual counts more (MacKinnon and White 1985,
-    HC3), and fewer cases tell the scatter (Satterthwaite).
+    """How far the sum of `sums` (n,) over that of `whole` (n,) may be off, by the cases' scatter:
+    fewer cases tell it worse (Satterthwaite).
     """
-    total = whole.sum()
-    share = whole / total
-    residual = sums - whole * sums.sum() / total
-    off = residual / np.maximum(1 - share, SMALL_SHARE)
-    squares = share**2
+    squares = (whole / whole.sum()) ** 2
     fourths = squares**2
     effective_cases = float(squares.sum() ** 2 / fourths.sum())
     freedom = max(effective_cases - 1, 1.0)
-    off_square = float((off**2).sum())
-    sigma = math.sqrt(off_square) / float(total)
-    return float(stats.t.ppf(confidence, freedom)) * sigma
+    _, error = ratios(sums[None], whole[None])
+    return float(stats.t.ppf(confidence, freedom) * error[0])
 
 
 def summed(values: FloatArray, number: IntArray) -> FloatArray:

@@ -22,7 +22,7 @@ from hilstar.instruments.assess.budget import DecomposedRun
 from hilstar.instruments.assess.case_fits import summed
 from hilstar.instruments.assess.figure_rows import COUNT, FigureRow
 from hilstar.instruments.assess.places import spread_rows
-from hilstar.instruments.assess.rate_figures import RateTable, rate_figure
+from hilstar.instruments.assess.rate_figures import LEFT_OUT, RateTable, rate_figure
 from hilstar.instruments.assess.star_figures import (
     StarTable,
     false_stars,
@@ -108,6 +108,8 @@ def add_rates(
                 further.miss(name, axis, unit, few)
             else:
                 further.add(name, axis, unit, figure)
+                if LEFT_OUT in figure.method:
+                    further.notes.append(f"{name}, {axis}: {figure.method}")
     further.notes += rate_notes(telemetry.t_ns[rows], telemetry.q[rows], reported[rows])
 
 

@@ -3,12 +3,14 @@
 reported minus commanded = bias + scale x rate - lag x acceleration + noise
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.attitude.clock.rate_causes import UNITS
 from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.basics.units import MAD_TO_SIGMA
 from hilstar.instruments.assess.bounded_figures import BoundedFigure, TooFewCases
 from hilstar.instruments.assess.case_fits import (
     SILENT,
@@ -21,6 +23,11 @@ from hilstar.instruments.assess.case_fits import (
 
 RATE_TERMS = ("rate-bias", "rate-scale", "rate-lag")  # of the linear fit of a rate
 RATE_NOISE = "rate-noise"
+WILD_SIGMAS = 8.0  # of a rate's noise; as of an attitude's
+WILD_SHARE = 0.04  # of rates that may be left out: one case of 25
+WILD_ROUNDS = 3
+SMALL_DEG_S = 1e-9
+LEFT_OUT = f"left out, beyond {WILD_SIGMAS:g} sigmas"
 NEAR_SHARE = 0.1  # by which rates in another unit may be off
 
 
@@ -35,6 +42,25 @@ class RateTable:
     errors_deg_s: FloatArray
     accelerations_deg_s2: FloatArray
 
+    def some(self, chosen: npt.NDArray[np.bool_]) -> "RateTable":
+        """The chosen (n,) rows alone."""
+        return RateTable(
+            self.case[chosen],
+            self.rates_deg_s[chosen],
+            self.errors_deg_s[chosen],
+            self.accelerations_deg_s2[chosen],
+        )
+
+    def fits(self, axes: list[int]) -> list[CaseFit]:
+        """The fit of the errors about each of these axes, with terms in the order of RATE_TERMS."""
+        ones = np.ones(len(self.case))
+        fits = []
+        for k in axes:
+            columns = [ones, self.rates_deg_s[:, k], -self.accelerations_deg_s2[:, k]]
+            design = np.stack(columns, axis=1)
+            fits.append(fit_by_cases(design, self.errors_deg_s[:, k], self.case))
+        return fits
+
 
 def rate_figure(
     quantity: str,
@@ -46,29 +72,57 @@ def rate_figure(
     """A figure of the reported rate about these axes, of several the larger one. Raises
     TooFewCases.
     """
-    known = np.isfinite(table.errors_deg_s).all(axis=1)
+    known = np.asarray(np.isfinite(table.errors_deg_s).all(axis=1), dtype=np.bool_)
     if not known.any():
         raise TooFewCases(SILENT.format("rate"), 0)
-    rates = table.rates_deg_s[known]
-    errors = table.errors_deg_s[known]
-    accelerations = table.accelerations_deg_s2[known]
-    _refuse_other_units(rates, rates + errors)
-    case = table.case[known]
-    refuse_few(case, "rate")
-    fits = []
-    for k in axes:
-        fits.append(_rate_fit(errors[:, k], rates[:, k], accelerations[:, k], case))
-    fitted_cases = fits[0].cases
+    told = table.some(known)
+    _refuse_other_units(told.rates_deg_s, told.rates_deg_s + told.errors_deg_s)
+    refuse_few(told.case, "rate")
     if quantity == RATE_NOISE:
-        noise = np.stack([fit.even for fit in fits], axis=1)
-        squares = (noise**2).mean(axis=1)
-        return root_mean(squares, np.ones(len(case)), case, confidence, rng)
-    if quantity == "rate-scale" and not _varies(rates[:, axes]):
+        return _rate_noise(told, axes, confidence, rng)
+    fits = told.fits(axes)
+    fitted_cases = fits[0].cases
+    if quantity == "rate-scale" and not _varies(told.rates_deg_s[:, axes]):
         raise TooFewCases("no case turns at several rates about that axis", fitted_cases)
-    if quantity == "rate-lag" and not _varies(accelerations[:, axes]):
+    if quantity == "rate-lag" and not _varies(told.accelerations_deg_s2[:, axes]):
         raise TooFewCases("no case accelerates about that axis", fitted_cases)
     column = RATE_TERMS.index(quantity)
     return largest_size(fits, column, confidence, "linear fit, Student's t")
+
+
+def _rate_noise(
+    table: RateTable, axes: list[int], confidence: float, rng: np.random.Generator
+) -> BoundedFigure:
+    """The noise of the reported rate about its fit.
+
+    A field of a few stars close together tells a turn many times worse than most do, and is rare:
+    so few cases never tell how often. Its rates count as wild, and the method says how many.
+    """
+    residual = np.stack([fit.residual for fit in table.fits(axes)], axis=1)
+    near = _near_rates(residual)
+    kept = table.some(near)
+    noise = np.stack([fit.even for fit in kept.fits(axes)], axis=1)
+    squares = (noise**2).mean(axis=1)
+    figure = root_mean(squares, np.ones(len(squares)), kept.case, confidence, rng)
+    wild = int((~near).sum())
+    if not wild:
+        return figure
+    return replace(figure, method=f"{figure.method}; {wild} of {len(near)} rates {LEFT_OUT}")
+
+
+def _near_rates(residual: FloatArray) -> npt.NDArray[np.bool_]:
+    """Which residuals (n, k) are within WILD_SIGMAS scatters about every axis. All are where more
+    than WILD_SHARE are beyond: so many are no outliers, but what the tracker does.
+    """
+    size = np.abs(residual)
+    near = np.ones(len(residual), dtype=np.bool_)
+    for _ in range(WILD_ROUNDS):
+        scatter = MAD_TO_SIGMA * np.median(size[near], axis=0)
+        within = size <= WILD_SIGMAS * np.maximum(scatter, SMALL_DEG_S)
+        near = np.asarray(within.all(axis=1), dtype=np.bool_)
+    if 1 - near.mean() > WILD_SHARE:
+        near[:] = True
+    return near
 
 
 def _refuse_other_units(rates: FloatArray, reported: FloatArray) -> None:
@@ -96,12 +150,3 @@ def _refuse_other_units(rates: FloatArray, reported: FloatArray) -> None:
 def _varies(values: FloatArray) -> bool:
     """Whether every column of values (n, k) has more than one value."""
     return bool(np.ptp(values, axis=0).all())
-
-
-def _rate_fit(
-    error: FloatArray, rate: FloatArray, acceleration: FloatArray, case: IntArray
-) -> CaseFit:
-    # the terms in the order of RATE_TERMS
-    ones = np.ones(len(rate))
-    design = np.stack([ones, rate, -acceleration], axis=1)
-    return fit_by_cases(design, error, case)

@@ -20,6 +20,7 @@ from hilstar.instruments.assess.bounded_figures import (
 )
 from hilstar.instruments.assess.case_fits import (
     SILENT,
+    CaseFit,
     fit_by_cases,
     largest_size,
     numbered,
@@ -67,13 +68,19 @@ class StarTable:
 @dataclass(frozen=True, slots=True)
 class PlaceFit:
     """The map of stars' place errors: polynomials (terms, 2), the stars in it (n,) by their case,
-    their errors by the map and the residuals (n, 2), px.
+    their terms (n, terms) and errors (n, 2), px.
     """
 
     solution: FloatArray
     case: IntArray
-    fitted_px: FloatArray
-    residual_px: FloatArray
+    terms: FloatArray
+    offsets_px: FloatArray
+
+    def by_cases(self) -> list[CaseFit]:
+        """The same fit of each axis, with the case as the unit that is independent of others: at
+        rest a star's error comes again in each frame.
+        """
+        return [fit_by_cases(self.terms, axis, self.case) for axis in self.offsets_px.T]
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +110,7 @@ def fitted_places(stars: StarTable, resolution_px: tuple[int, int]) -> PlaceFit:
         spread = MAD_TO_SIGMA * np.median(distance[near], axis=0)
         close = distance <= WILD_SIGMAS * np.maximum(spread, 1e-9)
         near = np.asarray(close.all(axis=1), dtype=np.bool_)
-    fitted = terms[near] @ solution
-    case = stars.case[reported][near]
-    return PlaceFit(solution, case, fitted, residual[near])
+    return PlaceFit(solution, stars.case[reported][near], terms[near], offsets[near])
 
 
 def place_map(found: StarTable, resolution_px: tuple[int, int], side: int) -> PlaceOffsets:
@@ -180,8 +185,8 @@ def _star_noise(
     """The noise of stars' places about their map, px an axis."""
     fit = fitted_places(found, resolution_px)
     count = len(fit.case)
-    freedom = count - len(fit.solution)
-    squares = (fit.residual_px**2).mean(axis=1) * count / freedom
+    even_px = np.stack([axis.even for axis in fit.by_cases()], axis=1)
+    squares = (even_px**2).mean(axis=1)
     return root_mean(squares, np.ones(count), fit.case, confidence, rng, _map_method(count))
 
 
@@ -198,24 +203,22 @@ def _star_map(
     """The rms of the map of stars' places, px an axis."""
     fit = fitted_places(found, resolution_px)
     count = len(fit.case)
-    terms = len(fit.solution)
-    residual_square = float((fit.residual_px**2).sum())
-    variance = residual_square / (2 * (count - terms))
-    fitted = fit.fitted_px - fit.fitted_px.mean(axis=0)
-    # what the noise alone puts into so many terms
-    taken = variance * (terms - 1) / count
+    free = len(fit.solution) - 1
+    middled = fit.terms - fit.terms.mean(axis=0)
+    fitted = middled @ fit.solution
+    # what the noise alone puts into so many terms, and the spread of that
+    gram = middled.T @ middled / count
+    put = [gram @ axis.covariance for axis in fit.by_cases()]
+    taken = float(np.mean([np.trace(power) for power in put]))
+    spread = math.sqrt(2 * sum(float((power * power.T).sum()) for power in put)) / len(put)
     number = numbered(fit.case)
     squares = (fitted**2).mean(axis=1)
     sums = summed(squares, number)
     counts = summed(np.ones(count), number)
     low, high = drawn_limits(sums, counts, rng, confidence).tolist()
     power = float(sums.sum() / counts.sum()) - taken
-    # the spread of the fit's own power by noise: each term has one degree of freedom an axis
-    free = 2 * (terms - 1)
-    sigmas = float(stats.norm.ppf(confidence))
-    hidden = sigmas * taken * math.sqrt(2 / free)
-    mixed = max(power, 0.0) * variance / (2 * count)
-    hidden += 2 * math.sqrt(mixed)
+    mixed = max(power, 0.0) * taken / (2 * free)
+    hidden = float(stats.norm.ppf(confidence)) * spread + 2 * math.sqrt(mixed)
     upper = max(high - taken, power) + hidden
     lower = min(low - taken, power) - hidden
     return BoundedFigure(

@@ -90,7 +90,7 @@ def stamp_jitter(
     normal_square = normal**2
     square = (across**2).sum(axis=1)
     excess = (parallel**2 - normal_square) / _fitted_share(square)
-    method = "excess of the error along slews over that across them, bootstrap over cases"
+    method = "excess of the error along slews over that across them, bootstrap-t over cases"
     variance = float(normal_square.mean())
     weights = _jitter_weights(excess, square, variance)
     return root_mean(excess * weights, square * weights, slewing, confidence, rng, method)

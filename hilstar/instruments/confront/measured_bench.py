@@ -158,7 +158,8 @@ def _tracker(session: Session, given: dict[str, Any], exposure_s: float) -> dict
         "distortion": NAMES[1],
     }
     if tracker.frame_hz is not None:
-        table["frame_hz"] = tracker.frame_hz
+        # the photographs' exposure may be longer than the period that was given
+        table["frame_hz"] = min(tracker.frame_hz, 1 / exposure_s)
     table["optics"] = {"psf": NAMES[3]}
     table["detector"] = _detector(session, given.get("detector", {}))
     return table

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.display.calibration import load_calibration
+from hilstar.display.calibration import load_calibration, read_toml, with_uniformity
 from tools import make_lcd_example
 
 HEAD = """[calibration]
@@ -108,6 +108,32 @@ def test_uniformity_is_bilinear_between_the_middles_of_its_fields(write):
     # the grid is a plane: -0.2 and -0.4 a field
     plane = np.add.outer([0, -0.2, -0.4, -0.6], [0, -0.1, -0.2, -0.3]) + 1.15
     assert light == pytest.approx(plane / plane.max(), rel=1e-6)
+
+
+NOISE = "[weights]\nr = 2\ng = 5\nb = 1\n[noise]\nrelative = 0.013\n"
+
+
+@pytest.mark.parametrize("source", ["gamma2.2", "grey", "rgb"])
+def test_a_calibration_with_another_grid_of_light_is_else_as_it_was(write, tmp_path, source):
+    """A grid of two columns and three rows, rows from the top; without one the light is even."""
+    if source != "gamma2.2":
+        source = write(HEAD + NOISE, TABLE if source == "grey" else RGB)
+    before = load_calibration(source, 2)
+    grid = np.array([[1.0, 0.8], [0.9, 0.7], [0.6, 0.5]])
+    path = tmp_path / "even" / "other.toml"
+    path.parent.mkdir()
+    for relative in (0.02, None):
+        files = with_uniformity(source, 2, path, grid, when="2026-11-29", relative=relative)
+        names = ["other.toml", "other.csv", "other-uniformity.csv"]
+        assert [file.name for file in files] == names
+        after = load_calibration(path, 2)
+        assert after.uniformity_map((2, 3)) == pytest.approx(grid, abs=1e-6)
+        assert read_toml(path).uniformity.relative == relative
+        assert after.response.light == pytest.approx(before.response.light, rel=1e-6)
+        assert after.weights == pytest.approx(before.weights, rel=1e-6)
+        assert after.noise == pytest.approx(before.noise, rel=1e-6)
+    assert with_uniformity(source, 2, path, None, when="2026-11-29") == files[:2]
+    assert load_calibration(path, 2).uniformity_map((2, 3)) is None
 
 
 def test_the_hash_covers_every_file(write, tmp_path):

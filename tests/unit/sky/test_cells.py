@@ -29,6 +29,28 @@ def test_every_star_within_the_radius_is_found(vectors, rng):
             assert times_found.max() <= 1
 
 
+@pytest.mark.parametrize("cell_deg", [CELL_DEG, 60.0, 360.0])
+@pytest.mark.parametrize("reach_rad", [0.0, 0.1])
+def test_every_star_within_the_sides_of_an_image_is_found(rng, cell_deg, reach_rad):
+    """Few stars in cells wider than a plane bounds, too: such a cell's middle may be far behind
+    a side that a star of it is within.
+    """
+    for _ in range(300):
+        vectors = rng.normal(size=(6, 3))
+        vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+        grid = cell_grid(vectors, cell_deg)
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        # the sides of a square image of half a radian to either side, and the circle about it
+        half = np.tan(0.5)
+        edges = np.array([[1, 0, half], [-1, 0, half], [0, 1, half], [0, -1, half]])
+        edges = edges / np.hypot(1, half) @ turn
+        radius_rad = np.arctan(half * np.sqrt(2))
+        is_within = (vectors @ edges.T >= -np.sin(reach_rad)).all(axis=1)
+        is_within &= vectors @ turn[2] >= np.cos(radius_rad + reach_rad)
+        found = grid.order[grid.near(turn[2], radius_rad, edges, reach_rad)]
+        assert np.isin(np.flatnonzero(is_within), found).all()
+
+
 @pytest.mark.parametrize("reach_rad", [1.55, 2.0, 3.2, 7.0])
 def test_a_turn_beyond_the_other_side_of_the_sky_finds_all(vectors, reach_rad):
     grid = cell_grid(vectors)

@@ -10,7 +10,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.rate_causes import OFTEN_OFF, OTHER_AXES, ReadAs
+from hilstar.attitude.clock.rate_causes import (
+    LAG_STEPS_S,
+    OFTEN_OFF,
+    OTHER_AXES,
+    ReadAs,
+    lag_of,
+    stretch_of,
+)
 from hilstar.attitude.clock.rate_check import RIGHT, WRONG, RateCheck
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray
@@ -319,6 +326,22 @@ def test_a_lag_is_named_before_rates_are_only_called_far_off(hz, late_s):
     """At 0.4 s of a swing of 2 s every rate is off by more than half: that alone says little."""
     check, _, _ = watched(swing(late_s, hz))
     assert abs(check.cause.lag_s - late_s) < LAG_WITHIN_S
+
+
+@pytest.mark.parametrize("late_s", [-0.3, -0.1, 0.06, 0.2])
+def test_the_lag_of_rates_is_positive_where_they_are_late(late_s):
+    """A swing about x of 1.7 s: rates of the moment `late_s` before, in stretches of 0.1 s."""
+    at_s = np.arange(0, 4.2, 0.02)
+    angle_rad = 0.1 * np.sin(3.7 * at_s)
+    rate_rad_s = 0.37 * np.cos(3.7 * (at_s - late_s))
+    axis = np.array([1.0, 0.0, 0.0])
+    q = multiply(from_rotation_vectors(-angle_rad[:, None] * axis), START)
+    sent = samples(np.rint(at_s * 1e9).astype(int), q, rate_rad_s[:, None] * axis)
+    stretches = [stretch_of(sent[k : k + 6]) for k in range(0, len(sent) - 6, 5)]
+    lag = lag_of([stretch for stretch in stretches if stretch is not None])
+    assert lag is not None and lag.is_off
+    assert lag.lag_s == pytest.approx(late_s, abs=LAG_STEPS_S[1])
+    assert lag.lag_text == f"{abs(late_s) * 1e3:.0f} ms {'late' if late_s > 0 else 'early'}"
 
 
 def tumbling(late_s: Callable[[FloatArray], FloatArray], seconds: float = 12.0, hz: float = 50.0):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.senders import ESTABLISHED_AFTER, MIN_RUN, Senders
+from hilstar.attitude.clock.senders import ESTABLISHED_AFTER, MIN_RUN, OTHER_LIFE_NS, Senders
 from hilstar.attitude.clock.stages import StreamState
 from hilstar.attitude.wire.links import Arrival, SampleArrival
 from hilstar.attitude.wire.packet import U32, AttitudeSample
@@ -104,6 +105,63 @@ def test_hostile_messages_beside_a_sender_are_never_shown_and_cost_it_none(kind,
             shown.expire(now_ns)
     assert [arrival.event.q_icrs_to_cam is ORION for arrival in shown.arrivals] == [True] * good
     assert len(shown.refused) >= (good - ESTABLISHED_AFTER - 2) * at_once
+
+
+FIRST, OTHER = 5, 9
+NAMES = {
+    "number": "showing number 5, refusing number 9",
+    "port": "showing the one at ::1 port 5, refusing the one at ::1 port 9",
+}
+
+
+def message_of(who: int, by: str, sequence: int, host_ns: int, waited_ns: int = 0) -> SampleArrival:
+    """A message of a sender that is known by its number, or by its address."""
+    plain = sample_message(sequence, host_ns - waited_ns, host_ns)
+    if by == "port":
+        return replace(plain, address=("::1", who), waited_ns=waited_ns)
+    return replace(plain, event=replace(plain.event, sender=who), waited_ns=waited_ns)
+
+
+@pytest.mark.parametrize("by", NAMES)
+def test_of_two_named_senders_the_first_is_shown_and_the_other_told_while_it_speaks(by):
+    shown = Shown()
+    for k in range(40):
+        host_ns = HOST0_NS + k * PERIOD_NS
+        shown.take(message_of(FIRST, by, k, host_ns))
+        if k >= 20:
+            shown.take(message_of(OTHER, by, 700 + k, host_ns + PERIOD_NS // 2))
+        assert bool(shown.notices.active) == (k > 20)
+    assert shown.sequences == list(range(40))
+    assert shown.refused == [(700 + k, "source") for k in range(20, 40)]
+    (told,) = shown.notices.lasting.values()
+    assert NAMES[by] in told
+    last_ns = HOST0_NS + 39 * PERIOD_NS + PERIOD_NS // 2
+    for later_ns in (-1, 0):  # it counts as there for OTHER_LIFE_NS
+        shown.take(message_of(FIRST, by, 40 + later_ns + 1, last_ns + OTHER_LIFE_NS + later_ns))
+        assert bool(shown.notices.active) == (later_ns < 0)
+
+
+@pytest.mark.parametrize("by", NAMES)
+@pytest.mark.parametrize(
+    ("silent_ns", "waited_ns", "is_shown"),
+    [
+        (STALE_AFTER_NS, 0, False),
+        (STALE_AFTER_NS + 1, 0, True),
+        (STALE_AFTER_NS + 1, 1, False),  # the first may have spoken until then, unread
+        (STALE_AFTER_NS + 2, 1, True),
+    ],
+)
+def test_another_named_sender_is_shown_once_the_first_is_silent(by, silent_ns, waited_ns, is_shown):
+    shown = Shown()
+    for k in range(20):
+        shown.take(message_of(FIRST, by, k, HOST0_NS + k * PERIOD_NS))
+    host_ns = HOST0_NS + 19 * PERIOD_NS + silent_ns
+    shown.take(message_of(OTHER, by, 700, host_ns, waited_ns))
+    assert shown.sequences == [*range(20), *[700] * is_shown]
+    assert shown.refused == [(700, "source")] * (not is_shown)
+    # then the other way round
+    shown.take(message_of(FIRST, by, 20, host_ns + PERIOD_NS))
+    assert (shown.sequences[-1] == 20) == (not is_shown)
 
 
 def test_a_stray_message_is_refused_when_the_sender_goes_on_and_is_no_second_sender():

@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import os
 import stat
+from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zmq.auth
@@ -20,6 +22,7 @@ from hilstar.attitude.wire.keys import (
     load_secret,
     make_keys,
 )
+from hilstar.attitude.wire.zmq_links import ZmqSender
 from tests.support.refusals import refusal
 
 
@@ -109,3 +112,20 @@ SECRET, SERVER, CLIENTS = Path("mine.key_secret"), Path("theirs.key"), Path("all
 )
 def test_each_side_reaches_beyond_this_machine_with_its_own_keys(endpoint, bind, keys):
     check_reach(endpoint, "as written", bind=bind, keys=keys)
+
+
+def test_who_binds_is_the_server_of_its_keys_and_who_connects_knows_the_server_s(tmp_path):
+    make_keys(tmp_path)
+    server = CurveKeys(tmp_path / "server.key_secret", None, tmp_path / "allowed_clients")
+    client = CurveKeys(tmp_path / "client.key_secret", tmp_path / "server.key")
+    configured = []
+    for bind, keys in ((True, server), (False, client)):
+        with closing(ZmqSender("tcp://127.0.0.1:9", bind=bind, keys=keys)) as sender:
+            made = SimpleNamespace(setsockopt=lambda option, value: None)
+            sender._configure(made)
+            configured.append(vars(made))
+    of_server, of_client = configured
+    assert of_server["curve_server"] is True and "curve_serverkey" not in of_server
+    assert of_client["curve_serverkey"] == of_server["curve_publickey"]
+    assert "curve_server" not in of_client
+    assert of_client["curve_publickey"] != of_server["curve_publickey"]

@@ -105,6 +105,14 @@ MESSAGES = {
     "topic before JSON": (b'attitude {"t_ns": 1, "q": [1,0,0,0]}', "a part of its own"),
     "JSON array": (b'[{"t_ns": 1, "q": [1,0,0,0]}]', "one object for each attitude"),
     "pickle": (pickle.dumps({"t_ns": 1, "q": list(Q)}), "a Python pickle"),
+    "JSON array with a name": (
+        '[{"t_ns": 1, "q": [1,0,0,0], "of": "Münster"}]'.encode(),
+        "one object for each attitude",
+    ),
+    "topic before JSON with a name": (
+        'star {"t_ns": 1, "q": [1,0,0,0], "of": "Münster"}'.encode(),
+        "send a topic as a part of its own",
+    ),
     "MessagePack": (b"\x82\xa4t_ns\x01\xa1q\x94\x01\x00\x00\x00", "such as MessagePack"),
     "HTTP request": (b"POST /attitude HTTP/1.1\r\nHost: bench\r\n\r\n", "HTTP"),
     "HTTP answer": (b"HTTP/1.0 400 Bad Request\r\n\r\n", "HTTP"),

@@ -148,6 +148,28 @@ def test_a_watcher_goes_on_whatever_another_subscribes_to_and_however_it_leaves(
     wait_for(lambda: not frame_sender.look(), "nobody watches any more")
 
 
+@pytest.mark.parametrize(
+    ("said", "watching"),
+    [
+        ([(7, b"\1{")], {7}),
+        ([(7, b"\1"), (8, b'\1{"frame":5')], {7, 8}),  # all messages; frames of one kind
+        ([(7, b"\1{"), (7, b"\0{")], set()),
+        ([(7, b"\1{"), (7, b"\1"), (7, b"\0{")], {7}),
+        ([(7, b"\1{"), (8, b"\0{")], {7}),  # of another connection, which had none
+        ([(7, b"\1{"), (7, b"\0")], {7}),
+        ([(7, b"\1other"), (8, b"\2{")], set()),
+    ],
+)
+def test_each_connection_watches_from_its_subscription_to_its_own_end_of_it(
+    frame_sender, monkeypatch, said, watching
+):
+    frame_sender.look()
+    monkeypatch.setattr(type(frame_sender._keeper), "is_open", lambda keeper, file: True)
+    for file, message in said:
+        frame_sender._take_subscription(file, message)
+    assert set(frame_sender._topics) == watching
+
+
 def test_who_asks_for_another_topic_or_has_unsubscribed_does_not_watch(frame_sender):
     other = RawWatcher(frame_sender.endpoint)
     other.says(b"\1other")

@@ -11,7 +11,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilstar.instruments.assess.bounded_figures import BoundedFigure, lowest_size
+from hilstar.instruments.assess.bounded_figures import (
+    BoundedFigure,
+    drawn_limits,
+    lowest_size,
+    studentized_limits,
+)
 from hilstar.instruments.assess.case_fits import fit_by_cases
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import FRAME_RATE_ERRORS, FRAME_RATES
@@ -24,7 +29,14 @@ from hilstar.instruments.campaign.requirements import (
     judged_figure,
     verdicts_of,
 )
-from tests.support.planted_answers import CASES, FRAMES, SCALE, answers, reported_stars
+from tests.support.planted_answers import (
+    CASES,
+    FRAMES,
+    SCALE,
+    WILD_SIGMAS,
+    answers,
+    reported_stars,
+)
 
 # found within 10 %, or within three standard errors where those are larger
 SHARE, SIGMAS = 0.1, 3.0
@@ -34,6 +46,9 @@ MIN_HELD = 180
 # binomial: of 1000 intervals at 95 %, 927 and fewer hold once in 1000
 HEAVY_TRIES, MIN_HEAVY_HELD = 1000, 928
 SQUARE_TRIES = 400
+# sigma of the logarithm of a case's variance; binomial: of 200 limits at 92 %, 28 and more are
+# before the truth once in 300
+SKEW, MAX_BEFORE = 0.8, 28
 # three sigmas of a binomial count
 SIZE_TRIES, SIZE_BAND = 4000, 42
 # binomial: of 800 tries at 5 %, over 59 are met once in 1000
@@ -187,6 +202,58 @@ def test_a_jitter_at_its_limit_is_met_in_one_of_twenty(rng: np.random.Generator)
 
 def _axis(quantity: str) -> str | None:
     return "x" if quantity.startswith("rate-") else None
+
+
+@pytest.mark.parametrize(("wild", "is_left_out"), [(0.01, True), (0.1, False)])
+def test_few_wild_rates_are_left_out_by_name_and_many_are_noise(
+    wild: float, is_left_out: bool, rng: np.random.Generator
+) -> None:
+    """Of 3360 rates some 34, or 336, are 20 sigmas off: of these the variance is 41 times as large."""
+    noise = 0.05
+    cases = answers(rng, 140, rate_noise=noise, wild=wild)
+    judged = figure_verdict(cases, "rate-noise", maximum=1.0, axis="cross")
+    assert judged.value is not None
+    assert ("rates left out" in judged.method) == is_left_out
+    true = noise if is_left_out else noise * math.sqrt(1 + WILD_SIGMAS**2 * wild)
+    # the wild ones' number and squares are known to 1 / sqrt(120) and worse
+    assert judged.value == pytest.approx(true, rel=SHARE if is_left_out else 2 * SHARE)
+
+
+def test_the_noise_of_stars_that_come_again_in_each_frame_is_whole(
+    rng: np.random.Generator,
+) -> None:
+    """At rest a star is off by the same in every frame: the map's 21 terms take as much of four
+    frames' stars as of one's, which is 21 of 10 x 30.
+    """
+    noise, tries = 0.1, 40
+    squares = []
+    for _ in range(tries):
+        once = reported_stars(rng, 10, noise=noise, limit=9.0)
+        lists = {}
+        for name, values in once.lists.items():
+            lists[name] = [np.tile(own, 4) for own in values]
+        again = Columns(10, once.numbers, {}, lists)
+        judged = figure_verdict(again, "star-noise", maximum=1.0)
+        assert judged.value is not None
+        squares.append(judged.value**2)
+    # three sigmas of a mean square of 40 x 600 errors, each four times; the map's terms, taken as
+    # if of 1200 stars, would leave it 5 % too small
+    assert np.mean(squares) == pytest.approx(noise**2, rel=0.029)
+
+
+def test_the_upper_end_of_a_noise_that_differs_by_case_is_before_the_truth_less_often(
+    rng: np.random.Generator,
+) -> None:
+    """Variances of cases as fields' stars make them: lognormal, of 24 cases."""
+    true = math.exp(0.5 * SKEW**2)
+    before = {"percentile": 0, "bootstrap-t": 0}
+    for _ in range(TRIES):
+        own = np.exp(SKEW * rng.standard_normal(24))
+        _, percentile = drawn_limits(own, np.ones(24), rng, COVERED)
+        _, studentized = studentized_limits(own, np.ones(24), rng, COVERED)
+        before["percentile"] += int(percentile < true)
+        before["bootstrap-t"] += int(studentized < true)
+    assert before["bootstrap-t"] <= MAX_BEFORE < before["percentile"]
 
 
 def test_a_signal_that_is_not_linear_in_light_is_no_colour(rng: np.random.Generator) -> None:

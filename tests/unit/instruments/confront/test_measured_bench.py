@@ -1,321 +1,219 @@
-"""What a confrontation makes of photographs before and after its fits, each against a closed form:
-places and levels, and the camera that it writes and reads back.
-"""
+"""The bench file that photographs give of a tracker, against the figures of a made session."""
 
 from __future__ import annotations
 
-import json
 import math
+import tomllib
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.special import ndtr
 
-from hilstar.basics.reading import parse_toml
-from hilstar.instruments.confront import session as sessions
 from hilstar.instruments.confront.background import FixedPattern
-from hilstar.instruments.confront.images import Photograph
-from hilstar.instruments.confront.light import LightFit
+from hilstar.instruments.confront.light import NO_CORRECTION, LightFit
 from hilstar.instruments.confront.measured_bench import (
-    FILLED,
-    PER_PX,
-    SCREEN_PITCH_UM,
-    SCREEN_PX,
-    _absolute,
-    _collimator_mm,
-    _detector,
-    _fitted,
-    _toml,
-    _write_efficiency,
-    _written_model,
     fixed_camera,
     read_tracker_file,
-    vignetting_of,
+    write_tracker,
 )
 from hilstar.instruments.confront.photon_transfer import PixelFit
-from hilstar.instruments.confront.session import (
-    PIVOT_NM,
-    _channel_mag,
-    _field,
-    _linear,
-    _middles,
-    _reach_px,
-    corrected,
-    radius2_of,
-)
-from hilstar.instruments.confront.star_psf import HALF, Stamps
-from hilstar.optics.camera import Camera
-from hilstar.server.bench.bench_file import BenchFile, bench_file_of
-from hilstar.sky.spectrum import Curve
+from hilstar.instruments.confront.star_psf import StarPsf
+from hilstar.optics.camera import Camera, Lens
 
-TRACKER = """
+GIVEN = """
 [tracker]
 aperture_mm = 20.0
-focal_length_mm = 40.0
-pixel_pitch_um = 10.0
-resolution_px = [800, 600]
+focal_length_mm = 19.0
+pixel_pitch_um = 5.0
+resolution_px = [1280, 960]
 quantum_efficiency = 0.5
+transmission = 0.8
 exposure_s = 0.2
+frame_hz = 4.0
 [tracker.detector]
-gain_e_per_dn = 4.0
-full_well_e = 16000.0
-bits = 12
-read_noise_e = 30.0
-offset_dn = 60.0
-prnu = 0.02
+read_noise_e = 3.0
 """
-PLACEHOLDERS = (
-    "[monitor]\nresolution_px = [1920, 1080]\npixel_pitch_um = 265.5\n[collimator]\nfocal_length_mm"
-    " = 1000.0\n"
+SCREEN = """
+[monitor]
+resolution_px = [2560, 1440]
+pixel_pitch_um = 233.0
+[collimator]
+focal_length_mm = 800.0
+"""
+SIZE_PX = (640, 480)  # a mosaic's plane: its pixels are twice as wide
+CAMERA = Camera(
+    SIZE_PX, 1950.0, (321.5, 236.25), np.eye(3), Lens((0.21, -0.4, 0.0), (1.5e-3, -2e-3))
 )
-CAMERA = Camera((800, 600), 4000.0, (410.0, 290.0), np.eye(3))
-MAG_A_FACTOR_2 = 2.5 * math.log10(2)
+GAIN, PEDESTAL_DN, LEVEL_DN, FULL_DN = 0.4, 60.0, 110.0, 4095
+PSF = StarPsf(np.array([[0.81], [0.49], [0.1]]), 0.03, 0.05, 2.5, SIZE_PX)
+PIXELS = PixelFit(
+    gain_e_per_dn=GAIN,
+    pedestal_dn=PEDESTAL_DN,
+    read_noise_e=4.0,
+    step_dn=1.0,
+    sigma={"gain_e_per_dn": 0.01},
+    points=np.empty((0, 2)),
+    pattern=FixedPattern((0.01**2, 5.0**2, 0.0, 0.0), (1e-9, 1e-9, 1.0, 1.0)),
+    gain_told=True,
+)
+# of two photographs; their mean is 1 mag less light than the tracker's keys give
+LIGHT = LightFit(np.array([0.7, 1.3]), (0.2, 0.1), NO_CORRECTION, 20.0, 0.1, 1.0)
 
 
-def bench(folder, text: str = TRACKER, more: str = "") -> BenchFile:
-    """A bench whose screen is of no account."""
-    return bench_file_of(folder / "bench.toml", f"{text}{more}\n{PLACEHOLDERS}")
+def session_of(tmp_path, given=GIVEN, *, exposure_s=0.5, t_ns=None, **changed):
+    (tmp_path / "given").mkdir(exist_ok=True)
+    path = tmp_path / "given" / "bench.toml"
+    path.write_text(given)
+    file, has_screen = read_tracker_file(path)
+    shots = []
+    for name, level_dn in (("a.png", LEVEL_DN - 10), ("b.png", LEVEL_DN + 10)):
+        photo = SimpleNamespace(name=name, t_ns=t_ns, full_dn=FULL_DN, exposure_s=exposure_s)
+        level = SimpleNamespace(level=np.full((4, 4), level_dn))
+        sky = SimpleNamespace(epoch_jyear=2020.1234567, velocity_km_s=np.array([1.0, -29.0, 2.0]))
+        shots.append(SimpleNamespace(photo=photo, level=level, sky=sky))
+    fit = SimpleNamespace(camera=CAMERA, sigma={"k1": 0.0031}, model="focal length and lens")
+    parts = {"file": file, "shots": shots, "camera": fit, "pixels": PIXELS, "psf": PSF}
+    parts |= {"light": LIGHT, "air": None, "power": 1.0, **changed}
+    return SimpleNamespace(**parts), has_screen
 
 
-def photograph(dn: np.ndarray, full_dn: float = 4095.0, step_dn: float = 1.0) -> Photograph:
-    """A photograph of these levels."""
-    return Photograph("photo.fits", dn, step_dn, full_dn, exposure_s=0.5)
+def written(tmp_path, *args, **changed):
+    session, has_screen = session_of(tmp_path, *args, **changed)
+    folder = tmp_path / "out"
+    folder.mkdir(exist_ok=True)
+    path = write_tracker(folder, session, has_screen)
+    return path, tomllib.loads(path.read_text())
 
 
-def pixels(**changes) -> PixelFit:
-    """A detector of 2 e- a DN above 100 DN."""
-    made = PixelFit(2.0, 100.0, 6.0, 1.0, {}, np.empty((0, 2)), gain_told=True)
-    return replace(made, **changes)
+def test_the_tracker_is_the_fitted_one_in_the_pixels_of_its_plane(tmp_path):
+    path, tables = written(tmp_path)
+    tracker = tables["tracker"]
+    assert tracker["pixel_pitch_um"] == 10.0
+    assert tracker["focal_length_mm"] == pytest.approx(19.5)
+    assert tracker["resolution_px"] == list(SIZE_PX)
+    assert tracker["principal_point_px"] == [321.5, 236.25]
+    assert tracker["aperture_mm"] == 20.0
+    distortion = (path.parent / "tracker_distortion.toml").read_text()
+    assert tomllib.loads(distortion) == {"k1": 0.21, "k2": -0.4, "p1": 1.5e-3, "p2": -2e-3}
+    assert "k1 = 0.21  # +- 0.0031\n" in distortion
 
 
-def stamps_of(places_px: np.ndarray, sigma_x_px: float, sigma_y_px: float) -> Stamps:
-    """Gaussians of 1000 DN, integrated over pixels by erf."""
-    reach = np.arange(-HALF, HALF + 1)
-    middle = np.rint(places_px)
-    values = []
-    for off_x, off_y in places_px - middle:
-        across = np.diff(ndtr((np.append(reach, HALF + 1) - 0.5 - off_x) / sigma_x_px))
-        down = np.diff(ndtr((np.append(reach, HALF + 1) - 0.5 - off_y) / sigma_y_px))
-        values.append(1000 * np.outer(down, across))
-    images = np.array(values)
-    return Stamps(images, np.ones_like(images), *middle.T, np.full(len(values), 0.65))
+@pytest.mark.parametrize(("exposure_s", "frame_hz"), [(0.1, 4.0), (0.5, 2.0), (0.7, 1 / 0.7)])
+def test_frames_follow_as_given_or_one_exposure_after_the_other(tmp_path, exposure_s, frame_hz):
+    path, tables = written(tmp_path, exposure_s=exposure_s)
+    assert tables["tracker"]["frame_hz"] == frame_hz
+    read_tracker_file(path)  # which refuses exposures that overlap
 
 
-def test_a_centre_of_gravity_is_along_its_own_axis():
-    places_px = np.array([[100.2, 50.0], [200.0, 80.3], [300.4, 20.7]])
-    x_px, y_px = _middles(stamps_of(places_px, 0.6, 0.6))
-    # what of a Gaussian is outside of 5 x 5 pixels pulls the centre back: by 0.05 px at most
-    np.testing.assert_allclose(x_px, places_px[:, 0], atol=0.05)
-    np.testing.assert_allclose(y_px, places_px[:, 1], atol=0.05)
-
-
-def test_sources_are_from_the_middle_of_the_image():
-    sources = SimpleNamespace(x_px=np.array([399.5, 0.0, 799.0]), y_px=np.array([299.5, 0.0, 9.0]))
-    field = _field(sources, np.array([True, True, False]), photograph(np.zeros((600, 800))))
-    np.testing.assert_array_equal(field.places_px, [[0.0, 0.0], [-399.5, -299.5]])
-    assert (field.width_px, field.height_px) == (800, 600)
-
-
-def test_radii_are_from_the_principal_point_in_half_diagonals():
-    # half of the diagonal of 800 x 600 px is 500 px
-    x_px = np.array([410.0, 410.0 + 500.0, 410.0 + 30.0])
-    y_px = np.array([290.0, 290.0, 290.0 - 40.0])
-    np.testing.assert_allclose(radius2_of(CAMERA, x_px, y_px), [0.0, 1.0, 0.01])
-
-
-def test_places_reach_as_far_as_95_percent_of_them_from_the_principal_point():
-    angle = np.linspace(0, 2 * math.pi, 100, endpoint=False)
-    radius_px = np.where(np.arange(100) < 96, 200.0, 390.0)
-    x_px = 410 + radius_px * np.cos(angle)
-    y_px = 290 + radius_px * np.sin(angle)
-    places = sessions.Places(x_px, y_px, np.ones(100), np.zeros((100, 3)))
-    assert _reach_px(CAMERA, places) == pytest.approx(200.0)
-    none = sessions.Places(np.empty(0), np.empty(0), np.empty(0), np.empty((0, 3)))
-    assert _reach_px(CAMERA, none) == 0.0
-
-
-def test_levels_of_a_power_are_light_again_and_full_scale_stays(monkeypatch):
-    monkeypatch.setattr(sessions, "sky_level", lambda dn, step_dn: ("level", step_dn))
-    power = 0.5
-    light = np.array([[0.0, 0.01, 0.01], [0.01, 0.25, 1.0]])
-    coded = photograph(4095 * light**power, step_dn=2.0)
-    shot = sessions.Shot(coded, None, None, None, None, 1.0, None, np.empty(0))
-    linear = _linear(shot, coded, power)
-    np.testing.assert_allclose(linear.photo.dn, 4095 * light)
-    # d(light) / d(code) at the sky's: light = code^2, and its code is a tenth
-    assert linear.photo.step_dn == pytest.approx(2.0 * 2 * 0.1)
-    assert linear.level == ("level", linear.photo.step_dn)
-
-
-def test_an_efficiency_bends_about_550_nm_by_squares_of_the_logarithm():
-    curve = Curve(np.array([400.0, 550.0, 700.0]), np.array([0.3, 0.4, 0.2]))
-    tilt, bow = 0.5, -0.8
-    bent = corrected(curve, (tilt, bow))
-    assert bent(np.array([PIVOT_NM]))[0] == pytest.approx(0.4)
-    for nm, value in ((400.0, 0.3), (700.0, 0.2)):
-        x = math.log(nm / 550.0)
-        wanted = value * math.exp(tilt * x + bow * x * x)
-        assert bent(np.array([nm]))[0] == pytest.approx(wanted, rel=1e-4)
-    steep = corrected(curve, (9.0, 0.0))
-    assert steep.value.max() == pytest.approx(1.0)
-    # as a whole: the ratio of two wavelengths stays
-    ratio = steep(np.array([700.0]))[0] / steep(np.array([550.0]))[0]
-    assert ratio == pytest.approx(0.5 * (700 / 550) ** 9, rel=1e-3)
-    assert corrected(curve, (0.0, 0.0)) is curve
-
-
-def test_a_channel_of_a_third_of_the_light_is_fainter_by_it(tmp_path):
-    text = TRACKER.replace(
-        "quantum_efficiency = 0.5",
-        "quantum_efficiency_r = 0.2\nquantum_efficiency_g = 0.3\nquantum_efficiency_b = 0.6",
-    )
-    file = bench(tmp_path, text)
-    columns = np.array([[5.0, 3.0], [0.6, 0.0], [0.7, 0.0]])
-    whole = {plane: _channel_mag(file, plane, columns) for plane in ("r", "g1", "g2", "b", "")}
-    fainter = 2.5 * math.log10(1.5)
-    np.testing.assert_allclose(whole["r"] - whole["g1"], fainter, atol=1e-6)
-    np.testing.assert_allclose(whole["g2"] - whole["b"], MAG_A_FACTOR_2, atol=1e-6)
-    np.testing.assert_array_equal(whole[""], 0.0)
-    grey = bench(tmp_path)
-    np.testing.assert_array_equal(_channel_mag(grey, "r", columns), 0.0)
-
-
-@pytest.mark.parametrize("step_dn", [1.0, 4.0])
-def test_a_fixed_camera_is_that_of_its_file(tmp_path, step_dn):
-    fixed = fixed_camera(bench(tmp_path, TRACKER), step_dn)
-    assert fixed.camera.focal_length_px == pytest.approx(4000.0)
-    assert (fixed.pixels.gain_e_per_dn, fixed.pixels.pedestal_dn) == (4.0, 60.0)
-    # a pixel's variance at a level, steps of the file included, is the detector's own: read noise
-    # and a twelfth of a DN^2, photons, and response
-    light_dn = 500.0
-    if step_dn == 1.0:
-        assert fixed.pixels.read_noise_e == pytest.approx(30.0)
-    read_dn2 = (30.0 / 4) ** 2
-    variance = read_dn2 + 1 / 12 + light_dn / 4 + (0.02 * light_dn) ** 2
-    seen = fixed.pixels.variance_dn2(np.array([60.0 + light_dn]))[0]
-    assert seen == pytest.approx(variance)
-
-
-def session_of(file: BenchFile, fitted: PixelFit, photo: Photograph, offset_mag: float = 0.0):
-    """As much of a session as the writers of a bench's parts ask for."""
-    light = LightFit(np.full(2, offset_mag), (0.0, 0.0), (0.0, 0.0), 0.0, 0.0, 1.0)
-    shots = (SimpleNamespace(photo=photo),)
-    camera = SimpleNamespace(camera=CAMERA)
-    return SimpleNamespace(file=file, pixels=fitted, shots=shots, light=light, camera=camera)
-
-
-@pytest.mark.parametrize(("full_dn", "bits"), [(4095.0, 12), (4096.0, 13), (255.0, 8), (65535, 16)])
-def test_a_detector_is_written_in_electrons_above_its_pedestal(tmp_path, full_dn, bits):
-    pattern = FixedPattern((0.03**2, 0.5**2, 0.0, 0.0), (0.0,) * 4)
-    made = pixels(step_dn=4.0, pattern=pattern)
-    photo = photograph(np.zeros((2, 2)), full_dn)
-    detector = _detector(session_of(bench(tmp_path), made, photo), {})
-    assert detector["bits"] == bits
-    assert detector["full_well_e"] == pytest.approx((full_dn - 100) * 2)
-    assert detector["offset_dn"] == 100.0
-    # steps of 4 DN where a detector's are of 1: (16 - 1) / 12 DN^2
-    assert detector["read_noise_e"] == pytest.approx(math.sqrt(36 + 15 / 12 * 4))
-    assert detector["prnu"] == pytest.approx(0.03)
-    assert detector["dsnu_e"] == pytest.approx(1.0)
-    unknown = session_of(bench(tmp_path), replace(made, gain_told=False), photo)
-    assert "gain_e_per_dn" not in _detector(unknown, {})
-    assert _detector(unknown, {"gain_e_per_dn": 2.0})["gain_e_per_dn"] == 2.0
-
-
-def test_a_collimator_fills_the_nearer_edge_of_the_screen(tmp_path):
-    session = session_of(bench(tmp_path), pixels(), photograph(np.zeros((2, 2))))
-    collimator_mm = _collimator_mm(session)
-    filled = []
-    for screen_px, tracker_px in zip(SCREEN_PX, (800, 600), strict=True):
-        screen_mm = screen_px * SCREEN_PITCH_UM / 1000
-        filled.append(collimator_mm * tracker_px / 4000.0 / screen_mm)
-    # the field is within the screen, and fills it along one axis
-    assert max(filled) == pytest.approx(FILLED)
-
-
-@pytest.mark.parametrize("light", [0.5, 3.0])
-def test_efficiency_times_exposure_is_the_light_that_came(tmp_path, light):
-    """`light` times what aperture, 0.5 of efficiency and 0.5 s give: an efficiency of 1 at most."""
-    exposure_s = 0.5
-    # DN of a star are 10^-0.4 of its magnitude and the offset: 2 e- each
-    offset_mag = -2.5 * math.log10(light * exposure_s / 2.0)
-    photo = photograph(np.zeros((2, 2)))
-    session = session_of(bench(tmp_path), pixels(), photo, offset_mag)
-    path = tmp_path / "qe.csv"
-    exposure = _write_efficiency(path, session)
-    nm, value = np.loadtxt(path, delimiter=",", skiprows=1).T
-    np.testing.assert_allclose(value * exposure.exposure_s, 0.5 * light * exposure_s, rtol=1e-6)
-    assert value.max() <= 1.0
-    assert exposure.factor == pytest.approx(max(1.0, 0.5 * light))
-    assert np.ptp(nm) > 0
-
-
-def test_a_psf_s_samples_are_fitted_by_their_own_axes():
-    reach = np.arange(-6 * PER_PX, 6 * PER_PX + 1) / PER_PX
-    sigma_x_px, sigma_y_px = 1.3, 0.8
-    image = np.exp(-0.5 * (reach / sigma_x_px) ** 2) * np.exp(
-        -0.5 * (reach[:, None] / sigma_y_px) ** 2
-    )
-    image /= image.sum()
-    psf = _fitted(image[None], PER_PX, np.array([[400.0, 300.0]]), (800, 600))
-    core = psf.core(np.array([400.0]), np.array([300.0]), np.array([0.65]))[0]
-    share = 1 - psf.wing_share
-    wing_px2 = psf.wing_share * psf.wing_sigma_px**2
-    variances_px2 = share * core[:2] + wing_px2
-    np.testing.assert_allclose(variances_px2, [sigma_x_px**2, sigma_y_px**2], rtol=0.02)
-
-
-def test_vignetting_is_what_dims_the_corners():
-    r2 = np.array([0.0, 0.25, 0.64, 1.0])
-    a_mag, b_mag = 0.3, 0.2
-    illumination = 10 ** (-0.4 * (a_mag * r2 + b_mag * r2**2))
-    assert vignetting_of(illumination, r2) == pytest.approx((a_mag, b_mag))
-    assert vignetting_of(illumination[:2], r2[:2]) == (0.0, 0.0)
-
-
-def test_numbers_in_a_file_s_history_are_the_model_s_whatever_line_they_are_cut_in():
-    numbers = {
-        "covariance": [[1.0], [2.0], [0.1]],
-        "colour": 0.3,
-        "wing": [0.2, 3.0],
-        "vignetting": [0.4, -0.1],
+def test_the_detector_and_the_background_are_in_electrons(tmp_path):
+    _, tables = written(tmp_path)
+    detector = tables["tracker"]["detector"]
+    assert detector == {
+        "gain_e_per_dn": GAIN,
+        "full_well_e": pytest.approx((FULL_DN - PEDESTAL_DN) * GAIN),
+        "bits": 12,
+        "offset_dn": PEDESTAL_DN,
+        "read_noise_e": pytest.approx(4.0),
+        "prnu": pytest.approx(0.01),
+        "dsnu_e": pytest.approx(5.0 * GAIN),
     }
-    text = json.dumps(numbers)
-    history = ["PSF of photographs", f"confront: {text[:31]}", f"confront: {text[31:]}", "another"]
-    psf, vignetting_mag = _written_model(history, (800, 600))
-    assert vignetting_mag == (0.4, -0.1)
-    assert psf.covariance.tolist() == numbers["covariance"]
-    assert (psf.colour, psf.wing_share, psf.wing_sigma_px) == (0.3, 0.2, 3.0)
-    assert psf.size_px == (800, 600)
-    assert _written_model(history[:1], (800, 600)) is None
-    assert _written_model(history[:2], (800, 600)) is None
+    light_e = (LEVEL_DN - PEDESTAL_DN) * GAIN
+    assert tables["background"]["electrons_per_px"] == pytest.approx(light_e)
 
 
-def test_tables_are_read_back_as_they_were_with_their_files_wherever_they_lie(tmp_path):
-    (tmp_path / "here.csv").touch()
-    tables = {
-        "tracker": {
-            "aperture_mm": 20.0,
-            "transmission": "here.csv",
-            "optics": {"psf": "x", "map": "here.csv"},
-            "resolution_px": [8, 6],
-        },
-        "sky": {"catalogue": "hipparcos", "bodies": True, "file": "missing.csv"},
+def test_steps_of_several_dn_are_noise_to_a_detector_of_steps_of_one(tmp_path):
+    _, tables = written(tmp_path, pixels=replace(PIXELS, step_dn=16.0))
+    rounding_dn = math.sqrt((16**2 - 1) / 12)
+    noise_e = tables["tracker"]["detector"]["read_noise_e"]
+    assert noise_e == pytest.approx(math.hypot(4.0, rounding_dn * GAIN))
+
+
+@pytest.mark.parametrize(("line", "is_written"), [("", False), ("gain_e_per_dn = 0.9\n", True)])
+def test_a_gain_that_nobody_told_is_no_key(tmp_path, line, is_written):
+    _, tables = written(tmp_path, GIVEN + line, pixels=replace(PIXELS, gain_told=False))
+    assert ("gain_e_per_dn" in tables["tracker"]["detector"]) == is_written
+
+
+def table_of(path):
+    return np.loadtxt(path.parent / "tracker_qe.csv", delimiter=",", skiprows=1)
+
+
+def test_the_efficiency_gives_the_light_that_came(tmp_path):
+    """DN of the mean offset times the gain, over what the keys give in a second."""
+    path, tables = written(tmp_path)
+    share = GAIN * 10**-0.4 / 0.5
+    assert tables["tracker"]["exposure_s"] == pytest.approx(0.5)
+    assert table_of(path) == pytest.approx(np.array([[300, 0.5 * share], [1100, 0.5 * share]]))
+    assert "Aperture and exposure are those that were given.\n" in path.read_text()
+
+
+def test_more_light_than_an_efficiency_of_one_gives_is_a_longer_exposure(tmp_path):
+    light = replace(LIGHT, offsets_mag=np.array([-2.0, -3.0]))
+    path, tables = written(tmp_path, light=light, exposure_s=None)
+    times = GAIN * 10 / 0.2 * 0.5  # 2.5 mag more, of the file's own exposure
+    assert table_of(path)[:, 1] == pytest.approx(1.0)
+    assert tables["tracker"]["exposure_s"] == pytest.approx(0.2 * times)
+    assert f"exposure_s is {times:.3g} times it" in path.read_text()
+
+
+def test_a_screen_that_is_not_given_fills_the_field(tmp_path):
+    """19.5 mm by pixels of 10 um: 0.164 along 320 px. A collimator whose screen's half width of
+    254.88 mm has that tangent, or whose half height of 143.37 mm has 240 px's, which is less.
+    """
+    path, tables = written(tmp_path)
+    by_height_mm = 540 * 0.2655 / (240 / 1950)
+    assert by_height_mm < 960 * 0.2655 / (320 / 1950)
+    assert tables["collimator"]["focal_length_mm"] == round(0.95 * by_height_mm, 1)
+    assert tables["monitor"] == {"resolution_px": [1920, 1080], "pixel_pitch_um": 265.5}
+    assert "write your own" in path.read_text()
+    path, tables = written(tmp_path, GIVEN + SCREEN)
+    assert tables["collimator"] == {"focal_length_mm": 800.0}
+    assert tables["monitor"]["resolution_px"] == [2560, 1440]
+    assert "write your own" not in path.read_text()
+
+
+def test_the_sky_is_of_the_photograph_s_date(tmp_path):
+    _, tables = written(tmp_path)
+    assert tables["sky"] == {
+        "epoch_jyear": 2020.123457,
+        "observer_velocity_km_s": [1.0, -29.0, 2.0],
+        "faintest_v_mag": 10.0,
     }
-    absolute = _absolute(tables, tmp_path)
-    there = str((tmp_path / "here.csv").resolve())
-    assert absolute["tracker"]["transmission"] == absolute["tracker"]["optics"]["map"] == there
-    assert absolute["sky"] == tables["sky"]
-    path = tmp_path / "written.toml"
-    assert parse_toml(path, "\n".join(_toml(absolute))) == absolute
+    bodies = """[sky]
+epoch_utc = "2019-05-05T00:00:00Z"
+faintest_v_mag = 7.0
+bodies = {planets = true}
+"""
+    _, tables = written(tmp_path, GIVEN + bodies)
+    assert tables["sky"]["epoch_utc"] == "2019-05-05T00:00:00Z"
+    _, tables = written(tmp_path, GIVEN + bodies, t_ns=1_577_836_800_123_456_789)
+    kept = {"bodies": {"planets": True}, "faintest_v_mag": 7.0}
+    assert tables["sky"] == {"epoch_utc": "2020-01-01T00:00:00.123Z", **kept}
 
 
-@pytest.mark.parametrize("has_screen", [False, True])
-def test_a_file_of_a_tracker_alone_gets_a_screen_and_says_so(tmp_path, has_screen):
-    path = tmp_path / "tracker.toml"
-    path.write_text(TRACKER + (PLACEHOLDERS if has_screen else ""))
-    file, with_screen = read_tracker_file(path)
-    assert with_screen is has_screen
-    assert file.config.tracker.focal_length_mm == 40.0
+def test_a_named_file_is_found_from_wherever_the_new_one_lies(tmp_path):
+    (tmp_path / "given").mkdir()
+    through = tmp_path / "given" / "glass.csv"
+    through.write_text("wavelength_nm,value\n300,0.8\n1100,0.8\n")
+    given = GIVEN.replace("transmission = 0.8", 'transmission = "glass.csv"')
+    _, tables = written(tmp_path, given)
+    assert tables["tracker"]["transmission"] == str(through)
+
+
+def test_what_was_written_is_the_camera_that_photographs_are_held_against(tmp_path):
+    path, _ = written(tmp_path)
+    file, has_screen = read_tracker_file(path)
+    assert has_screen
+    held = fixed_camera(file, 1.0)
+    assert held.camera.focal_length_px == pytest.approx(1950.0)
+    assert held.camera.principal_point_px == (321.5, 236.25)
+    assert held.psf.covariance == pytest.approx(PSF.covariance)
+    shape = (held.psf.colour, held.psf.wing_share, held.psf.wing_sigma_px)
+    assert shape == (0.03, 0.05, 2.5)
+    assert held.light.vignetting_mag == (0.2, 0.1)
+    assert held.pixels.gain_e_per_dn == GAIN
+    assert held.pixels.pattern.rms[0] == pytest.approx(0.01)
+    # 2 DN's steps have a variance of 4/12 DN^2, of which 1/12 is the detector's own
+    coarse = fixed_camera(file, 2.0)
+    assert coarse.pixels.read_noise_e**2 == pytest.approx(16.0 - GAIN**2 / 4)

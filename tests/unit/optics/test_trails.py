@@ -11,6 +11,7 @@ from astropy.coordinates import get_sun
 from astropy.time import Time
 
 from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.display.render.reference import extended_image
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import GaussianPsf, pixel_shares
 from hilstar.optics.sprites import FrameLight
@@ -42,6 +43,7 @@ FLUX_LIMIT = 1e-5  # the midpoints of 400 moments, where the light changes; floa
 # One over the poles, which crosses the station's path
 LIST = "OTHER\n" + element_set(7, (97.0, 252.0, 130.0, 322.0), 0.001, 15.0)
 NORTH = np.array([0.0, 0.0, 1.0])
+DISC_FLUX = 0.02  # a crescent by five rays across a pixel
 # of a crescent: the Sun's and the camera's aberration of 20 arcsec each, and a quadrature's share
 LAMBERT = 1e-3
 
@@ -86,11 +88,13 @@ def gaussians(x_px: np.ndarray, y_px: np.ndarray, light: np.ndarray) -> np.ndarr
 
 
 def moment_by_moment(
-    sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float
+    sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float, before: float = 0.5
 ) -> np.ndarray:
-    """The mean image, each moment from a pass of its own and an attitude of its own."""
+    """The mean image, each moment from a pass of its own and an attitude of its own; a share
+    `before` of the exposure is before the attitude.
+    """
     places, light = [], []
-    for seconds in ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5) * exposure_s:
+    for seconds in ((np.arange(MOMENTS) + 0.5) / MOMENTS - before) * exposure_s:
         seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns + round(seconds * 1e9))
         if seen is None:
             continue
@@ -124,6 +128,30 @@ def test_a_streak_is_the_light_of_all_its_moments(rate_deg_s, exposure_s):
     assert image_of(found.sprites).sum() == pytest.approx(total, rel=5e-4)
     assert np.abs(image_of(found.sprites) - wanted).max() < PIXEL_LIMIT * total
     assert np.allclose(to_matrix(q) @ found.middle[0], [0, 0, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("exposure_s", [1e-3, 0.4])
+def test_a_wide_satellite_has_the_light_of_all_its_moments_along_its_path(exposure_s):
+    """Of 4 km: discs, one after the other, whose light is the streak's and lies no farther from it
+    than their radius.
+    """
+    sky, t_ns = lit_moment(LIST, "norad,size_m\n7,4000\n")
+    seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).only(np.array([0]))
+    q = looking_at(seen.directions(slice(None), np.zeros(1))[0])
+    rate = np.radians((0.5, -1.0, 10.0))
+    lit = Lit(np.array([-exposure_s / 8]), exposure_s)
+    trail = disc_trail(seen, "wide", TrailView(CAMERA, to_matrix(q), rate), lit, BRUSH)
+    wanted = moment_by_moment(sky, t_ns, q, rate, exposure_s, 1 / 8)
+    assert trail.electrons_per_s == pytest.approx(wanted.sum(), rel=1e-3)
+    assert trail.shares.sum() == pytest.approx(1)
+    assert len(trail.along) == len(trail.shares)
+    assert (len(trail.along) > 1) == (exposure_s > 0.1)
+    image = extended_image(trail.lights, SIZE_PX)
+    assert image.sum() == pytest.approx(wanted.sum(), rel=DISC_FLUX)
+    path = np.argwhere(wanted > 1e-3 * wanted.max())
+    light = np.argwhere(image > 1e-3 * image.max())
+    away_px = np.linalg.norm(light[:, None] - path, axis=2).min(axis=1)
+    assert away_px.max() < trail.along[0].radius_rad * CAMERA.focal_length_px + 4 * max(SIGMA_PX)
 
 
 def test_its_length_is_its_own_rate_against_the_camera_s():

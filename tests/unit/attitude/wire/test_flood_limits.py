@@ -6,12 +6,15 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
+import zmq
 
+from hilstar.attitude.wire import zmq_socket
 from hilstar.attitude.wire.links import (
     MAX_BURST,
     MAX_PACKETS_PER_S,
@@ -30,13 +33,13 @@ from hilstar.attitude.wire.packet import (
 )
 from hilstar.attitude.wire.roads import PAUSE_S, LinkCounts, RawMessage
 from hilstar.attitude.wire.serial_link import SerialLink
-from hilstar.attitude.wire.zmq_socket import LOOK_S, _MemoryWatch
+from hilstar.attitude.wire.zmq_socket import LOOK_S, _Doorkeeper, _MemoryWatch
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_S
 from hilstar.server.sender import SerialSender
 from tests.support.fake_clock import FakeClock
-from tests.support.waiting import PATIENCE_S
+from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.wire.ptys import serial_line
 from tests.support.wire.samples import sample
 
@@ -171,3 +174,37 @@ def test_memory_that_is_used_is_seen_at_most_every_look():
     clock.sleep(LOOK_S)
     assert watch.grown_bytes() == pytest.approx(kept.nbytes, rel=0.1)
     watch.close()
+
+
+def test_connections_over_the_limit_are_ended_unless_their_descriptor_is_another_s(monkeypatch):
+    """Real sockets, of which one is kept; the last one's descriptor is of another port by now."""
+    monkeypatch.setattr(zmq_socket, "MAX_CONNECTIONS", 1)
+    counts = LinkCounts()
+    told = zmq_socket.ConnectionsTold(lambda: None, lambda why: None)
+    with contextlib.ExitStack() as opened:
+        context = opened.enter_context(zmq.Context())
+        watched = opened.enter_context(context.socket(zmq.SUB))
+        keeper = _Doorkeeper(watched, look=None, counts=counts, told=told, notices=Notices())
+        ours, another_s = (
+            opened.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(2)
+        )
+        keeper.place = ours.getsockname()[1]
+        peers = []
+        for server in (ours, ours, another_s):
+            peer = opened.enter_context(socket.create_connection(server.getsockname()))
+            accepted = opened.enter_context(server.accept()[0])
+            keeper._open[accepted.fileno()] = "a peer"
+            peer.setblocking(False)
+            peers.append(peer)
+        keeper._shut_newest()
+        wait_for(lambda: is_ended(peers[1]), "the second is over the limit")
+        assert [is_ended(peer) for peer in peers] == [False, True, False]
+        assert counts.refused == 2
+        keeper.close()
+
+
+def is_ended(peer: socket.socket) -> bool:
+    try:
+        return peer.recv(1) == b""
+    except BlockingIOError:
+        return False

@@ -23,7 +23,6 @@ from hilstar.instruments.confront.session import FixedCamera, Session, corrected
 from hilstar.instruments.confront.star_psf import (
     HALF,
     MEAN_BV_MAG,
-    STAMP_PX,
     Stamps,
     StarPsf,
     fit_psf,
@@ -386,14 +385,21 @@ def _psf_of(file: BenchFile) -> tuple[StarPsf, tuple[float, float]]:
     focus = int(np.abs(glass.focuses_um - tracker.optics.focus_um).argmin())
     images = glass.images[:, :, focus].mean(axis=1)
     illumination = glass.illumination[:, :, focus].mean(axis=1)
-    shade_mag = np.log10(np.maximum(illumination, 1e-3)) * -2.5
     r2 = radius2_of(tracker_camera(tracker, file.folder), *glass.places_px.T)
-    vignetting_mag = (0.0, 0.0)
-    if len(r2) > 2:
-        design = np.column_stack([r2, r2**2])
-        a, b = np.linalg.lstsq(design, shade_mag, rcond=None)[0].tolist()
-        vignetting_mag = (a, b)
-    return _fitted(images, glass.per_px, glass.places_px, size_px), vignetting_mag
+    fitted = _fitted(images, glass.per_px, glass.places_px, size_px)
+    return fitted, vignetting_of(illumination, r2)
+
+
+def vignetting_of(illumination: FloatArray, radius2: FloatArray) -> tuple[float, float]:
+    """The vignetting (mag at r^2 and at r^4 = 1) of light relative to the axis (n,), at squares of
+    radii (n,); none by fewer than three.
+    """
+    if len(radius2) < 3:
+        return 0.0, 0.0
+    shade_mag = np.log10(np.maximum(illumination, 1e-3)) * -2.5
+    design = np.column_stack([radius2, radius2**2])
+    a, b = np.linalg.lstsq(design, shade_mag, rcond=None)[0].tolist()
+    return a, b
 
 
 def _written_model(
@@ -425,13 +431,14 @@ def _fitted(
     as stars of 1e6 DN.
     """
     count, side, _ = images.shape
-    values = np.zeros((count, STAMP_PX, STAMP_PX))
-    offsets = np.rint((np.arange(side) - side // 2) / per_px).astype(np.intp)
-    is_near = np.abs(offsets) <= HALF
-    pixel = offsets[is_near] + HALF
-    for stamp, image in zip(values, images, strict=True):
-        near_samples = image[np.ix_(is_near, is_near)]
-        np.add.at(stamp, (pixel[:, None], pixel[None, :]), near_samples)
+    step_px = 1 / per_px
+    offset_px = (np.arange(side) - side // 2) * step_px
+    pixel_px = np.arange(-HALF, HALF + 1)[:, None]
+    # a sample on the edge of two pixels is of both, half of it each
+    first_px = np.maximum(offset_px - step_px / 2, pixel_px - 0.5)
+    last_px = np.minimum(offset_px + step_px / 2, pixel_px + 0.5)
+    share = np.maximum(last_px - first_px, 0) / step_px
+    values = share @ images @ share.T
     columns, rows = np.rint(places_px).T
     bv_mag = np.full(count, MEAN_BV_MAG)
     stamps = Stamps(1e6 * values, np.full_like(values, 1.0), columns, rows, bv_mag)

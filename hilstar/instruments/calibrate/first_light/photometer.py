@@ -518,7 +518,6 @@ class Photometer:
         links = [self._link(pair) for pair in pairs]
         lit = _lit(planned, chosen, blacks, sums)
         values = self._values(planned, lit, blacks[1], self._factors(links))
-        values = self._values(planned, lit, blacks[1], self._factors(links))
         of_ratios = self._of_ratios(values.light, lit, links)
         of_rounding = self._of_rounding(values, lit, pairs, links)
         causes = [of_ratios, of_rounding]
@@ -871,7 +870,6 @@ class Photometer:
         """The noise of a pixel before the ADC, DN, by the variance of the field's sum and that
         sum.
         """
-        detector = self.context.detector
         detector = self.context.detector
         pixels = self.field.tracker_px
         # How far a level is above the offset, rounding tells to half a step.

@@ -67,3 +67,18 @@ def test_a_budget_s_arcseconds_are_those_where_a_pixel_is_widest():
     assert row.centroid_max_arcsec == pytest.approx(206264.8 * 0.01 / 1000, rel=1e-5)
     assert row.centroid_rms_px == pytest.approx(math.sqrt(2) * 0.005)
     assert row.v_mag == 4.0
+
+
+def test_a_tilt_is_told_in_degrees_and_a_distortion_in_pixels():
+    """From the limit on; a tilt of 0.5 deg about x, and of -1 deg about y."""
+    tilt_rad = (math.radians(0.5), math.radians(-1.0))
+    assert geometry_reasons(tilt_rad=tilt_rad, tilt_px=0.99 * LIMIT_PX) == []
+    (tilted,) = geometry_reasons(tilt_rad=tilt_rad, tilt_px=0.37)
+    assert "tilted by (+0.50, -1.00) deg" in tilted
+    assert "0.37 px" in tilted
+    (distorted,) = geometry_reasons(k1=-0.0123, distortion_px=2.5)
+    assert "distorts by 2.50 px (k1 -0.0123)" in distorted
+    (left,) = geometry_reasons(left_px=0.44)
+    assert "leaves 0.44 px at 95 %" in left
+    (shifted,) = geometry_reasons(offset_px=(-0.3, 0.5))
+    assert "shifted by (-0.30, +0.50) px" in shifted

@@ -1,0 +1,282 @@
+"""The parts of an effective PSF, each against a closed form: its Gaussian and its spline, the dots'
+sides, their cut-outs and scatter, and where a glass has its centroids.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate.effective_psf import (
+    KNOT_PX,
+    MAX_HALF_PX,
+    POINTS,
+    QUANTISED_DN2,
+    Dots,
+    Effective,
+    _dot_sides,
+    _functions,
+    _glass,
+    _half_px,
+    _is_alone,
+    _knots,
+    _placed,
+    _Places,
+    _variance,
+    dots_of_image,
+)
+from hilstar.instruments.calibrate.geometric.dots import DOT_PX
+from hilstar.instruments.calibrate.geometric.fit import MatchedDots
+from hilstar.instruments.calibrate.geometric.observed import Observed
+
+ROUNDING = 1e-9  # of sums of a few thousand doubles
+SIDE_PX = 0.8
+MIDDLE_PX = np.array([50.0, 40.0])
+
+
+def effective(covariance, knots_px=(), spline=None) -> Effective:
+    """A PSF about the middle of a field of 100 px."""
+    if spline is None:
+        spline = np.zeros((0, 0, 0))
+    return Effective(MIDDLE_PX, 50.0, np.array(covariance), np.array(knots_px), spline)
+
+
+def reach(half_px: int, count: int = 1) -> np.ndarray:
+    """Offsets of pixels (count, side)."""
+    return np.tile(np.arange(-half_px, half_px + 1.0), (count, 1))
+
+
+def test_a_gaussian_of_a_place_has_the_variance_of_its_polynomials():
+    model = effective([[1.0, 0.5, 0.0], [0.4, 0.0, 0.0], [0.0, 0.2, 0.0]])
+    x_px = np.array([50.0, 75.0, 50.0])
+    y_px = np.array([40.0, 40.0, 90.0])
+    offsets = reach(12, 3)
+    shares = model.of(x_px, y_px, (offsets, offsets), np.full(3, SIDE_PX))
+    light = shares.sum(axis=(1, 2))
+    np.testing.assert_allclose(light, 1.0, atol=ROUNDING)
+    # a pixel and a dot are squares: each adds a twelfth of its area
+    squares_px2 = (1 + SIDE_PX**2) / 12
+    across = shares.sum(axis=1) @ offsets[0] ** 2 - squares_px2
+    down = shares.sum(axis=2) @ offsets[0] ** 2 - squares_px2
+    # the variance of a Gaussian's samples is that of the Gaussian to exp(-2 pi^2 sigma^2)
+    aliased_px2 = 2e-3
+    np.testing.assert_allclose(across, [1.0, 1.2, 1.0], atol=aliased_px2)
+    np.testing.assert_allclose(down, [0.5, 0.5, 0.7], atol=aliased_px2)
+
+
+@pytest.mark.parametrize("side_px", [0.0, 0.8, 1.7])
+def test_a_spline_s_functions_add_up_to_polynomials(side_px):
+    knots_px = KNOT_PX * np.arange(-16, 17)
+    offsets = np.linspace(-2.0, 2.0, 9)[None]
+    side = np.array([side_px])
+    functions = _functions(knots_px, offsets, side)[0]
+    # cubic B-splines of step h: sums over knots are 1, x and x^2 + h^2 / 3; a square's mean of x^2
+    # is a twelfth of its side's square more
+    square_px2 = offsets[0] ** 2 + KNOT_PX**2 / 3 + side_px**2 / 12
+    tolerance = 1e-6  # a side of 0 is taken as one of 0.001 px
+    np.testing.assert_allclose(functions.sum(axis=1), 1.0, atol=tolerance)
+    np.testing.assert_allclose(functions @ knots_px, offsets[0], atol=tolerance)
+    np.testing.assert_allclose(functions @ knots_px**2, square_px2, atol=tolerance)
+
+
+def test_a_spline_s_rows_go_down_and_its_columns_across():
+    knots_px = KNOT_PX * np.arange(-12, 13)
+    # coefficients that are their row's place give the place down
+    spline = np.repeat(knots_px[:, None], len(knots_px), axis=1)[None]
+    model = effective([[1.0, 1.0, 0.0]], knots_px, spline)
+    plain = effective([[1.0, 1.0, 0.0]])
+    offsets = reach(2)
+    place = np.array([50.0]), np.array([40.0])
+    side = np.array([SIDE_PX])
+    beside = model.of(*place, (offsets, offsets), side) - plain.of(*place, (offsets, offsets), side)
+    np.testing.assert_allclose(beside[0], np.repeat(offsets.T, 5, axis=1), atol=1e-6)
+
+
+def matched(x_px: np.ndarray, y_px: np.ndarray, dot: np.ndarray) -> MatchedDots:
+    """Centroids of dots in one image."""
+    none = np.zeros(len(dot), dtype=np.intp)
+    return MatchedDots(Observed(none, none, x_px, y_px, np.ones(len(dot))), dot)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        [[2.0, 0.0], [0.0, 0.5]],
+        [[0.0, -2.0], [2.0, 0.0]],
+        [[1.5, 0.7], [-0.3, 0.9]],
+    ],
+)
+@pytest.mark.parametrize("count", [20, 60])
+def test_a_dot_s_side_is_the_root_of_its_map_s_area(matrix, count, rng):
+    x_px, y_px = rng.uniform(0, 200, size=(2, count))
+    tracker_px = np.array(matrix) @ np.stack([x_px, y_px])
+    dot = rng.permutation(count)
+    inverse = np.argsort(dot)
+    data = matched(*tracker_px, dot)
+    sides_px = _dot_sides(data, x_px[inverse], y_px[inverse])
+    wanted_px = DOT_PX * np.sqrt(abs(np.linalg.det(matrix)))
+    np.testing.assert_allclose(sides_px, wanted_px, rtol=1e-6)
+
+
+def test_a_dot_s_side_grows_with_the_field_s_own_scale(rng):
+    u, v = rng.uniform(-100, 100, size=(2, 80))
+    # monitor px by tracker px: d(x)/du = 1 + u / 200, d(y)/dv = 1
+    x_px = u + u**2 / 400
+
+    sides_px = _dot_sides(matched(u, v, np.arange(80)), x_px, v)
+    np.testing.assert_allclose(sides_px, DOT_PX / np.sqrt(1 + u / 200), rtol=1e-6)
+
+
+def test_a_cut_out_is_about_its_dot_and_has_nothing_beyond_an_edge():
+    row, column = np.indices((60, 80), dtype=float)
+    image = 1000 * row + column
+    x_px = np.array([30.4, 79.0])
+    y_px = np.array([20.6, 0.0])
+    places = _Places.of(x_px, y_px, np.ones(2))
+    inner, corner = places.cutouts(image, np.array([0, 1]))
+    side = np.arange(-MAX_HALF_PX, MAX_HALF_PX + 1)
+    np.testing.assert_array_equal(inner, 1000 * (21 + side[:, None]) + 30 + side)
+    assert np.isnan(corner[:MAX_HALF_PX]).all()
+    assert np.isnan(corner[:, MAX_HALF_PX + 1 :]).all()
+    np.testing.assert_array_equal(
+        corner[MAX_HALF_PX:, : MAX_HALF_PX + 1],
+        1000 * np.arange(MAX_HALF_PX + 1)[:, None] + 79 + side[: MAX_HALF_PX + 1],
+    )
+
+
+def test_dots_are_alone_where_no_square_reaches_another():
+    wide_px = 2.0 * MAX_HALF_PX
+    x_px = np.array([0.0, wide_px + 0.1, 0.0, 200.0, 200.0 + wide_px - 0.1, 500.0])
+    y_px = np.array([0.0, 0.0, wide_px + 0.1, 0.0, wide_px - 0.1, 0.0])
+    assert _is_alone(x_px, y_px).tolist() == [True, True, True, False, False, True]
+    assert _is_alone(np.array([3.0]), np.array([4.0])).tolist() == [True]
+
+
+def test_pixels_scatter_by_their_light_as_the_frames_of_a_dot_do():
+    light = np.linspace(0, 400, 25 * 9).reshape(9, 5, 5)
+    mean = light + 7.0
+    frames = np.full(9, 4.0)
+    frames[0] = 1.0  # one frame tells no scatter
+    level = np.median(mean)
+    # the scatter of n frames about their mean is short by (n - 1) / n
+    truth = 3.0 + 0.25 * np.clip(mean - level, 0, None)
+    variance = _variance(mean, truth * 3 / 4, frames)
+    dim = truth[(mean - level) < np.median((mean - level)[1:]) + 0.1 * np.ptp(mean[1:])]
+    bright = mean > level + 100
+    # the floor is the mean of the dim ones: below a tenth of the range, 0.25 * 40 DN over it
+    assert 3.0 <= variance.min() <= dim.max()
+    np.testing.assert_allclose(variance[bright], truth[bright], rtol=0.02)
+    alone = _variance(mean, np.zeros_like(mean), np.ones(9))
+    edge = np.concatenate([mean[:, 0].ravel(), mean[:, -1].ravel()])
+    np.testing.assert_allclose(alone, edge.var() + QUANTISED_DN2)
+
+
+def gaussian_image(x_px, y_px, sigma_px: float, flux: float) -> np.ndarray:
+    """Light of Gaussians integrated over pixels (200, 300), by erf."""
+    image = np.zeros((200, 300))
+    for x, y in zip(x_px, y_px, strict=True):
+        across = np.diff(ndtr((np.arange(301) - 0.5 - x) / sigma_px))
+        down = np.diff(ndtr((np.arange(201) - 0.5 - y) / sigma_px))
+        image += flux * np.outer(down, across)
+    return image
+
+
+def field_of_dots(flux: float = 1e4) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Light of dots 40 px apart, and their places, all at other places within a pixel."""
+    grid_x, grid_y = np.meshgrid(np.arange(20, 290, 40.0), np.arange(20, 190, 40.0))
+    x_px = grid_x.ravel() + np.linspace(-0.4, 0.4, grid_x.size)
+    y_px = grid_y.ravel() + np.linspace(0.3, -0.3, grid_x.size)
+    return gaussian_image(x_px, y_px, 1.0, flux), x_px, y_px
+
+
+def test_dots_of_an_image_are_as_wide_as_their_light_and_the_edge_cuts_none():
+    image, x_px, y_px = field_of_dots()
+    near_edge = np.append(x_px, 295.0), np.append(y_px, 100.0)
+    dots = dots_of_image(image, *near_edge, SIDE_PX)
+    assert len(dots.x_px) == len(x_px)
+    half_px = dots.images.shape[1] // 2
+    # a pixel 4 px away has 2.9e-5 of the light, under 3e-4 of the middle's 0.147; one 3 px away
+    # 1.0e-3: two pixels more
+    assert half_px == 5
+    across, down = dots.offsets
+    k = 7
+    shares = np.outer(
+        ndtr(down[k] + 0.5) - ndtr(down[k] - 0.5), ndtr(across[k] + 0.5) - ndtr(across[k] - 0.5)
+    )
+    np.testing.assert_allclose(dots.images[k], 1e4 * shares, atol=1e-6)
+    with pytest.raises(InputError, match="0 dots stand alone"):
+        dots_of_image(image, x_px[0] + np.arange(9), np.full(9, y_px[0]), SIDE_PX)
+
+
+def test_the_mean_of_frames_is_as_noisy_as_their_number_says(rng):
+    image, x_px, y_px = field_of_dots()
+    dots = dots_of_image(image + rng.normal(0, 2.0, image.shape), x_px, y_px, SIDE_PX)
+    # one frame: the noise of the squares' edges, and what the codes round
+    assert float(dots.variance.mean()) == pytest.approx(4.0 + QUANTISED_DN2, rel=0.1)
+
+
+def test_a_square_ends_two_pixels_beyond_the_last_light():
+    images = np.zeros((3, 25, 25))
+    images[:, 12 - 5 : 12 + 6, 12 - 5 : 12 + 6] = 10.0
+    none = np.zeros(3)
+    middle = np.zeros(3, dtype=np.intp)
+    dots = Dots(images, np.full_like(images, 1e-4), middle, middle, none, none, none)
+    assert _half_px(dots) == 7
+
+
+@pytest.mark.parametrize(("half_px", "side_px", "last_px"), [(6, 1.0, 5.0), (4, 0.0, 3.5)])
+def test_a_spline_s_knots_end_where_their_functions_do_at_the_image_s_edge(
+    half_px, side_px, last_px
+):
+    side = 2 * half_px + 1
+    images = np.zeros((3, side, side))
+    none = np.zeros(3)
+    middle = np.zeros(3, dtype=np.intp)
+    dots = Dots(images, images, middle, middle, none, none, np.full(3, side_px))
+    knots_px = _knots(dots)
+    # half of the image's side, less the dot's and two steps of a function
+    assert knots_px[-1] == last_px
+    np.testing.assert_allclose(np.diff(knots_px), KNOT_PX)
+    np.testing.assert_allclose(knots_px, -knots_px[::-1])
+
+
+def test_dots_are_moved_to_where_their_light_is_with_flux_and_background():
+    image, x_px, y_px = field_of_dots()
+    off_px = 0.05
+    dots = dots_of_image(image + 30.0, x_px + off_px, y_px - 2 * off_px, 0.0)
+    model = effective([[1.0, 1.0, 0.0]])
+    placed, _, amplitudes = _placed(model, dots)
+    # Newton's one step leaves the square of the way
+    np.testing.assert_allclose(placed.x_px, x_px, atol=3 * off_px**2)
+    np.testing.assert_allclose(placed.y_px, y_px, atol=3 * (2 * off_px) ** 2)
+    np.testing.assert_allclose(amplitudes[:, 0], 1e4, rtol=2 * off_px**2 + 0.02)
+    np.testing.assert_allclose(amplitudes[:, 1], 30.0, atol=5.0)
+
+
+def test_a_glass_has_its_centroids_in_the_middle_wherever_the_model_has_them():
+    knots_px = KNOT_PX * np.arange(-6, 7)
+    spline = np.zeros((1, len(knots_px), len(knots_px)))
+    spline[0, 8, 3] = 0.05  # light 1 px down and 1.5 px left of the middle
+    model = effective([[0.6, 0.8, 0.0]], knots_px, spline)
+    place_px = np.array([[10.0, 5.0], [90.0, 75.0]])
+    per_px = 4
+    glass = _glass(model, place_px, 5, per_px)
+    assert len(glass.places_px) == POINTS**2
+    np.testing.assert_allclose(glass.places_px.min(axis=0), place_px[0])
+    np.testing.assert_allclose(glass.places_px.max(axis=0), place_px[1])
+    image = glass.images[0, 0, 0]
+    steps_px = (np.arange(image.shape[0]) - image.shape[0] // 2) / per_px
+    light = image.sum()
+    assert image.sum(axis=0) @ steps_px / light == pytest.approx(0.0, abs=2e-3)
+    assert image.sum(axis=1) @ steps_px / light == pytest.approx(0.0, abs=2e-3)
+    # of two parts d apart: w (1 - w) ((1 - 2 w) d^3 + 3 d (their variances' difference))
+    spline_light = 0.05 * KNOT_PX**2
+    w = spline_light / (1 + spline_light)
+    for axis, off_px, variance_px2 in ((0, -1.5, 0.6), (1, 1.0, 0.8)):
+        # the Gaussian is integrated over pixels, the spline is what pixels get
+        wider_px2 = KNOT_PX**2 / 3 - variance_px2 - 1 / 12
+        third_px3 = w * (1 - w) * ((1 - 2 * w) * off_px**3 + 3 * off_px * wider_px2)
+        seen_px3 = image.sum(axis=axis) @ steps_px**3 / light
+        assert seen_px3 == pytest.approx(third_px3, rel=0.05)

@@ -1,0 +1,263 @@
+"""The parts of first light's steps on stars and on the screen's evenness, each against a closed
+form: shares, scatter, errors of full scale, verdicts, and maps of light.
+"""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.special import ndtr
+
+from hilstar.display.calibration import weights_of_grid
+from hilstar.instruments.calibrate.first_light.seen_stars import (
+    StarSpot,
+    _explained,
+    _is_in_image,
+    _is_inside,
+)
+from hilstar.instruments.calibrate.first_light.stars import (
+    LOST_SHARE,
+    SYSTEMATIC_MAG,
+    _contradictions,
+    _scale_error_mag,
+    _scale_trend,
+    _star_reasons,
+    trend,
+)
+from hilstar.instruments.calibrate.first_light.uniformity import (
+    JOINED,
+    DotLight,
+    UniformityMap,
+    _design,
+    _fitted,
+    _is_surely_larger,
+    _not_negative,
+    _shown,
+    _smoothness,
+)
+from hilstar.instruments.calibrate.scale import MeasuredScale
+from hilstar.optics.camera import Camera
+
+MAG_A_RELATIVE = 2.5 / math.log(10)
+SPOT = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=0.05, electronics_dn=0.0)
+
+
+def test_places_are_inside_by_more_than_the_margin_from_the_outermost_pixels():
+    # of 100 x 50 px, 10 px within the pixels 0 and 99, 0 and 49
+    places_px = np.array([[10.1, 10.1], [88.9, 38.9], [9.9, 20], [89.1, 20], [20, 9.9], [20, 39.1]])
+    assert _is_inside(places_px, (100, 50), 10.0).tolist() == [True, True] + [False] * 4
+
+
+def test_directions_are_in_an_image_where_they_are_projected_into_it():
+    camera = Camera((100, 50), 200.0, (49.5, 24.5), np.eye(3))
+    tangent = np.array([[0.0, 0.0], [0.19, 0.0], [0.21, 0.0], [0.0, 0.06], [0.0, 0.09]])
+    in_cam = np.append(tangent, np.ones((5, 1)), axis=1)
+    assert _is_in_image(camera, in_cam, 10.0).tolist() == [True, True, False, True, False]
+
+
+def test_shapes_without_a_share_explain_nothing_on_the_mean(rng):
+    shares = []
+    for _ in range(400):
+        off = rng.normal(size=12)
+        shares.append(_explained(off, rng.normal(size=12), rng.normal(size=12)))
+    # of R^2 by chance, without its correction 2 / 11; its scatter is 0.15, over the root of 400
+    assert np.mean(shares) == pytest.approx(0.0, abs=4 * 0.15 / 20)
+    x = np.linspace(-1, 1, 12)
+    assert _explained(3 + 2 * x, x) == pytest.approx(1.0)
+    assert _explained(np.ones(12), x) == 0.0
+    assert _explained(np.array([1.0, 2.0]), np.array([1.0, 2.0])) == 0.0
+
+
+def window_sums(place_px: tuple[float, float], spot: StarSpot) -> tuple[np.ndarray, np.ndarray]:
+    """A star's shares in the window about the origin (k, k), and the pixels' offsets."""
+    reach = np.arange(-spot.radius_px, spot.radius_px + 1.0)
+    axes = []
+    for place, sigma in zip(place_px, spot.sigma_px, strict=True):
+        axes.append(ndtr((reach + 0.5 - place) / sigma) - ndtr((reach - 0.5 - place) / sigma))
+    across, down = axes
+    return np.outer(down, across), reach
+
+
+@pytest.mark.parametrize("part", ["background", "photons", "response"])
+def test_a_place_is_as_noisy_as_its_window_s_first_moment(part):
+    """The moment along x of light w times a pixel's noise, over its slope by the star's place: by a
+    step of the place.
+    """
+    prnu = 0.05 if part == "response" else 0.0
+    spot = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=prnu, electronics_dn=0.0)
+    dn, noise_dn = 1e4, 7.0 if part == "background" else 0.0
+    shares, reach = window_sums((0.0, 0.0), spot)
+    sigma = spot.settings.window_sigma_px
+    window = np.exp(-(reach**2 + reach[:, None] ** 2) / (2 * sigma**2))
+    pull = window * reach
+    variance = {
+        "background": noise_dn**2 * np.ones_like(shares),
+        "photons": dn * shares / 4.0,
+        "response": (prnu * dn * shares) ** 2 + dn * shares / 4.0,
+    }[part]
+    if part == "background":
+        variance = variance + dn * shares / 4.0
+    # a window that follows the star sees the moment of a star off its middle
+    slope = float((shares * window * (1 - reach**2 / sigma**2)).sum())
+    step_px = 1e-4
+    moved = []
+    for off_px in (step_px, -step_px):
+        there, _ = window_sums((off_px, 0.0), spot)
+        moved.append(float((there * pull).sum()))
+    by_step = (moved[0] - moved[1]) / (2 * step_px)
+    wanted_px = math.sqrt(float((pull**2 * variance).sum())) / (dn * slope)
+    assert spot.place_noise_px(np.array([dn]), noise_dn)[0] == pytest.approx(wanted_px)
+    # the slope is that of light moving under a window at rest, to what light is at its edge
+    assert slope == pytest.approx(by_step, rel=0.1)
+
+
+def test_a_response_s_noise_is_of_each_pixel_s_own_light():
+    dn = np.array([1e7])
+    shares, _ = window_sums((0.0, 0.0), SPOT)
+    # of 10^7 DN, photons are a 3e4th and PRNU of 5 % the rest
+    wanted = MAG_A_RELATIVE * 0.05 * math.sqrt(float((shares**2).sum())) / SPOT.window_share
+    assert SPOT.light_noise_mag(dn, 0.0)[0] == pytest.approx(wanted, rel=1e-3)
+
+
+def scale_of_stars(weights, relative_error=0.003) -> MeasuredScale:
+    """A scale by stars of these weights."""
+    values = {"weights": np.array(weights), "relative_error": relative_error}
+    return SimpleNamespace(**values)
+
+
+def test_full_scale_is_as_sure_as_readings_sessions_and_the_adc_together():
+    # by phase the weighted means of the stars: 0.01 and -0.02 mag
+    rounding_mag = np.array([[0.01, -0.05], [0.01, -0.01]])
+    rounding = math.sqrt((0.01**2 + 0.02**2) / 2)
+    error_mag = _scale_error_mag(scale_of_stars([1.0, 3.0]), rounding_mag)
+    readings_mag = 0.003 * MAG_A_RELATIVE
+    assert error_mag == pytest.approx(math.hypot(readings_mag, SYSTEMATIC_MAG, rounding))
+    none = _scale_error_mag(scale_of_stars([1.0, 1.0], None), np.zeros((2, 2)))
+    assert none == pytest.approx(SYSTEMATIC_MAG)
+
+
+def test_a_trend_is_what_a_line_over_the_logarithm_changes_between_its_ends(rng):
+    e_per_s = np.geomspace(100.0, 1e4, 30)
+    noise = rng.normal(0, 0.02, 30)
+    line = stats.linregress(np.log(e_per_s), noise)
+    span = math.log(100)
+    trend_mag, error_mag = trend(e_per_s, noise)
+    assert trend_mag == pytest.approx(line.slope * span)
+    assert error_mag == pytest.approx(line.stderr * span)
+    weights = rng.uniform(1, 4, 30)
+    slope = np.polyfit(np.log(e_per_s), noise, 1, w=np.sqrt(weights))[0]
+    used = np.ones(30, dtype=bool)
+    rounding_mag = np.column_stack([0.1 * np.log(e_per_s), -0.1 * np.log(e_per_s)])
+    seen = SimpleNamespace(e_per_s=e_per_s, rounding_mag=rounding_mag)
+    trend_mag, with_rounding_mag = _scale_trend(seen, used, noise, weights)
+    assert trend_mag == pytest.approx(slope * span)
+    alone_mag = trend(e_per_s, noise, np.sqrt(weights))[1]
+    assert with_rounding_mag == pytest.approx(math.hypot(alone_mag, 0.1 * span))
+
+
+@pytest.mark.parametrize(
+    ("figures", "is_scattered", "words"),
+    [
+        ({"stars": 90, "lost": 10}, False, []),
+        ({"stars": 89, "lost": 11}, False, ["11 bright stars are not there"]),
+        ({"stars": 9, "lost": 0, "flux_beyond_noise_p95_mag": 0.06}, False, ["0.060 mag off"]),
+        ({"stars": 9, "lost": 0, "flux_beyond_noise_p95_mag": 0.06}, True, []),
+        ({"stars": 9, "lost": 0, "flux_zero_point_mag": -0.06}, True, ["-0.060 mag off"]),
+        ({"stars": 9, "lost": 0, "flux_zero_point_mag": 0.04}, False, []),
+    ],
+)
+def test_stars_that_miss_a_limit_are_a_reason_each(figures, is_scattered, words):
+    verify = SimpleNamespace(flux_mag=0.05)
+    context = SimpleNamespace(file=SimpleNamespace(config=SimpleNamespace(verify=verify)))
+    reasons = _star_reasons(context, figures, is_scattered=is_scattered)
+    assert len(reasons) == len(words)
+    for reason, word in zip(reasons, words, strict=True):
+        assert word in reason
+    assert LOST_SHARE == 0.1
+
+
+def test_a_scale_that_stars_contradict_says_by_how_much():
+    assert _contradictions(0.01, 0.01, 0.001) == []
+    (scattered,) = _contradictions(0.9, 0.001, 0.001)
+    assert "disagree by 0.900 mag" in scattered
+    (noisy,) = _contradictions(0.01, 0.01, 0.9)
+    assert "too noisy" in noisy
+
+
+def dots(count: int, rng, size_px=(160, 90)) -> DotLight:
+    """Dots at random pixels."""
+    x = rng.integers(0, size_px[0], count)
+    y = rng.integers(0, size_px[1], count)
+    return DotLight(x, y, np.ones(count), 0.001)
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 4), (3, 5)])
+def test_a_map_s_weights_are_those_that_draw_it(shape, rng):
+    at = dots(60, rng)
+    rows, columns = shape
+    field = rng.uniform(0.5, 1, shape)
+    image = weights_of_grid(90, rows) @ field @ weights_of_grid(160, columns).T
+    np.testing.assert_allclose(_design(at, shape, (160, 90)) @ field.ravel(), image[at.y, at.x])
+
+
+def test_neighbouring_fields_are_joined_once_each():
+    penalty = _smoothness((2, 3))
+    field = np.array([[1.0, 4.0, 9.0], [1.0, 2.0, 0.0]])
+    squares = 3**2 + 5**2 + 1**2 + 2**2 + 0**2 + 2**2 + 9**2
+    assert field.ravel() @ penalty @ field.ravel() == pytest.approx(JOINED * squares)
+    assert not penalty.sum(axis=0).any()
+
+
+def test_a_field_without_dots_follows_its_neighbours_and_none_is_dark(rng):
+    at = dots(200, rng)
+    left = at.x < 40
+    at = DotLight(at.x[left], at.y[left], at.light[left], 0.001)
+    light = 0.8 + 0.001 * at.x
+    field = _fitted(light, _design(at, (2, 4), (160, 90)), (2, 4)).reshape(2, 4)
+    # fields' middles are 20, 60, 100 and 140 px; those beyond the dots are as the last one known
+    np.testing.assert_allclose(field[:, 0], 0.82, atol=0.005)
+    np.testing.assert_allclose(field[:, 3], field[:, 2], atol=0.005)
+    assert field.min() >= light.min() / 2
+
+
+@pytest.mark.parametrize(("square", "error"), [(0.5, 0.2), (0.1, 0.4), (-0.6, 0.3), (0.0, 1.0)])
+def test_a_square_that_cannot_be_negative_is_the_mean_of_a_cut_normal(square, error):
+    cut = stats.truncnorm((0 - square) / error, math.inf, loc=square, scale=error)
+    assert _not_negative(square, error) == pytest.approx(cut.mean(), rel=1e-9)
+    assert _not_negative(square, 0.0) == max(square, 0.0)
+
+
+def test_a_map_is_surely_worse_from_two_standard_errors_on(rng):
+    others = rng.uniform(size=100)
+    noise = rng.normal(size=100)
+    noise -= noise.mean()
+    noise /= noise.std()
+    # the mean's standard error is a tenth
+    assert _is_surely_larger(others + noise + 0.21, others)
+    assert not _is_surely_larger(others + noise + 0.19, others)
+
+
+def test_a_map_s_figures_are_of_the_dots_that_are_used():
+    light = np.array([1.0, 0.8, 0.5, 9.0])
+    used = np.array([True, True, True, False])
+    made = UniformityMap(np.ones((2, 2)), light, 0.05, 1e-9, used, 0.01, 0.02)
+    assert made.darkest_of_brightest == 0.5
+    assert made.rms_mag == pytest.approx(np.std(2.5 * np.log10(light[:3])))
+    # held-out dots differ by 0.05 mag: 0.03 by noise, 0.01 by the fit, the rest by its form
+    form_mag = math.sqrt(0.05**2 - 0.03**2 - 0.01**2)
+    assert made.error_mag(0.03) == pytest.approx(math.hypot(0.01, form_mag), rel=1e-4)
+    # a finer map that shows more counts where that is larger
+    assert made.error_mag(0.049) == pytest.approx(math.hypot(0.01, 0.02), rel=1e-3)
+
+
+def test_dots_shown_are_squares_about_their_lattice():
+    codes = _shown([4, 6], 8, 200, (40, 30))
+    rows, columns = np.nonzero(codes)
+    # three pixels wide about every eighth, from the first on
+    assert set(columns.tolist()) == {x + off for x in (4, 12, 20, 28, 36) for off in (-1, 0, 1)}
+    assert set(rows.tolist()) == {y + off for y in (6, 14, 22) for off in (-1, 0, 1)} | {29}
+    assert set(codes[codes > 0].tolist()) == {200}

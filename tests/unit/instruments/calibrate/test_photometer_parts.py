@@ -1,0 +1,288 @@
+"""The parts of the tracker as a photometer, each against a closed form: lattices, ranges, the light
+between black images, and the error of a ratio of ranges.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.stats import norm
+
+from hilstar.basics.errors import InputError
+from hilstar.display.geometry import monitor_camera
+from hilstar.instruments.calibrate.first_light.photometer import (
+    APART_TRACKER_PX,
+    BLACK,
+    FAINT_DN,
+    LONGER,
+    SHARE,
+    DotField,
+    LatticeRatio,
+    Photometer,
+    PixelScatter,
+    Range,
+    _between,
+    _first_px,
+    _lit,
+    _Pair,
+    _passes,
+    _Reading,
+    field_for,
+    lattice_profile,
+    peak_shares,
+)
+from hilstar.instruments.calibrate.plan import Patch
+from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+PIXELS = 50 * 60
+EXPOSURE_S = 0.5
+
+
+def geometry(ratio: float = 1.5) -> BenchGeometry:
+    """A monitor of 640 x 480 px, before a tracker of 400 x 300 px with `ratio` px to each."""
+    return BenchGeometry(
+        monitor_camera((640, 480), 50.0, 100.0, UPRIGHT),
+        monitor_camera((400, 300), 50.0 / (2 * ratio), 50.0, UPRIGHT),
+    )
+
+
+def photometer(**changes) -> Photometer:
+    """A photometer without a bench: lattices of 1 to 8 px on 64 x 64 px, black images of known
+    noise.
+    """
+    made = object.__new__(Photometer)
+    made.field = DotField(0, 0, 64, slice(0, 50), slice(0, 60), monitor_px=1000.0)
+    made.periods = (1, 2, 4, 8)
+    made.exposure_s = EXPOSURE_S
+    made.longest_s = 10.0
+    made.assumed = SimpleNamespace(light={"r": None, "g": None})
+    made.scatter = PixelScatter(default_dn_per_e=0.25)
+    source = SimpleNamespace(sets_exposure=True)
+    made.context = SimpleNamespace(full_dn=4000.0, source=source)
+    for name, value in changes.items():
+        setattr(made, name, value)
+    return made
+
+
+def scatter_of(dark_dn2: dict[int, float]) -> PixelScatter:
+    """Black images whose sums have these variances, by how many times longer they are exposed."""
+    scatter = PixelScatter(default_dn_per_e=0.25)
+    for times, variance in dark_dn2.items():
+        # two images whose pixels differ by +-d: d^2 / 2 of variance in each
+        off = np.sqrt(2 * variance / PIXELS)
+        scatter.add(BLACK, Range(1, times), np.zeros((50, 60)))
+        scatter.add(BLACK, Range(1, times), np.full((50, 60), off))
+    return scatter
+
+
+@pytest.mark.parametrize(
+    ("middle_px", "size_px", "square_px", "first_px"),
+    [
+        (319.5, 640, 100, 270),  # pixels 270 to 369: their middle is 319.5
+        (100.0, 640, 21, 90),
+        (10.0, 640, 100, 0),
+        (630.0, 640, 100, 540),
+        (float("nan"), 640, 100, 270),
+    ],
+)
+def test_a_square_is_about_its_middle_and_on_the_screen(middle_px, size_px, square_px, first_px):
+    assert _first_px(middle_px, size_px, square_px) == first_px
+
+
+def test_a_field_of_lattices_is_of_whole_cells_about_the_middle_of_what_is_seen():
+    ratio, sigma_px = 1.5, 1.0
+    field, periods = field_for(geometry(ratio), sigma_px)
+    sparsest = 8  # the power of 2 from APART_TRACKER_PX / ratio = 5.3 px on
+    assert periods == (1, 2, 4, 8)
+    assert periods[-1] >= APART_TRACKER_PX / ratio > periods[-2]
+    # half of the smaller side: the tracker's 300 px of 1.5 a monitor pixel
+    assert field.side == SHARE * 300 / ratio // sparsest * sparsest
+    assert (field.left + (field.side - 1) / 2, field.top + (field.side - 1) / 2) == pytest.approx(
+        (319.5, 239.5)
+    )
+    columns_px = field.columns.stop - field.columns.start
+    assert (field.columns.start + field.columns.stop - 1) / 2 == pytest.approx(199.5, abs=0.51)
+    # six sigmas of a dot and three pixels at each side
+    wings_px = 2 * (3 + 6 * np.hypot(sigma_px, ratio / np.sqrt(12)))
+    # both ends are whole pixels: one more than their distance, and up to one more at each
+    assert 1 <= columns_px - ((field.side - 1) * ratio + wings_px) <= 3
+    assert field.monitor_px == pytest.approx(field.tracker_px / ratio**2, rel=1e-6)
+    even = np.full((480, 640), 0.5, dtype=np.float32)
+    dimmed, _ = field_for(geometry(ratio), sigma_px, even)
+    assert dimmed.monitor_px == pytest.approx(field.monitor_px, rel=1e-6)
+    with pytest.raises(InputError, match="sees too little of the monitor"):
+        field_for(geometry(40.0), sigma_px)
+
+
+@pytest.mark.parametrize("period", [1, 2, 4, 8])
+def test_a_lattice_lights_one_pixel_in_the_middle_of_each_cell(period):
+    field = DotField(16, 8, 64, slice(0, 1), slice(0, 1), 1.0)
+    codes = field.lattice((100, 90), period, Patch(200, "w"))
+    rows, columns = np.nonzero(codes if codes.ndim == 2 else codes.any(axis=-1))
+    assert len(rows) == field.lit(period) == (64 / period) ** 2
+    np.testing.assert_array_equal(np.unique(np.diff(np.unique(columns))), [period])
+    assert columns.min() == 16 + period // 2
+    assert rows.min() == 8 + period // 2
+    assert columns.max() < 16 + 64
+    assert rows.max() < 8 + 64
+
+
+@pytest.mark.parametrize("period", [1, 2, 4, 16])
+def test_light_between_a_lattice_s_dots_is_the_sum_of_all_of_them(period):
+    ratio, sigma_px = 1.5, 0.9
+    profile = lattice_profile(period, ratio, sigma_px)
+    step_px = period * ratio
+    # a monitor pixel is a square: its variance is a twelfth of its area
+    spread_px = np.sqrt(sigma_px**2 + ratio**2 / 12)
+    place_px = np.linspace(-step_px / 2, step_px / 2, len(profile))
+    dots_px = step_px * np.arange(-40, 41)
+    edge = place_px[:, None] - dots_px
+    light = norm.cdf(edge + 0.5, scale=spread_px) - norm.cdf(edge - 0.5, scale=spread_px)
+    np.testing.assert_allclose(profile, light.sum(axis=1), rtol=1e-7)
+    # whatever the place, a cell's light is one dot's: the mean over a cell
+    mean = np.trapezoid(profile, place_px) / step_px
+    assert mean == pytest.approx(1 / step_px, rel=0.01)
+    assert peak_shares((period,), ratio, sigma_px)[0] == pytest.approx(profile.max() ** 2)
+
+
+def test_black_between_two_images_is_read_by_the_time_between_them():
+    orders = np.array([0, 10, 14])
+    black = np.array([100.0, 120.0, 116.0])
+    # value, and the variance of (1 - s) a + s b
+    assert _between(5, orders, black) == pytest.approx((110.0, 0.5))
+    assert _between(2, orders, black) == pytest.approx((104.0, 0.64 + 0.04))
+    assert _between(13, orders, black) == pytest.approx((117.0, 1 / 16 + 9 / 16))
+    assert _between(20, orders, black) == pytest.approx((116.0, 1.0))
+    assert _between(3, orders[:1], black) == (100.0, 1.0)
+
+
+def test_a_lit_patch_is_above_the_black_of_its_own_exposure():
+    planned = [Patch(0, "w"), Patch(9, "w"), Patch(200, "w"), Patch(0, "w")]
+    chosen = {planned[1]: Range(1, 4), planned[2]: Range(8)}
+    blacks = {1: np.array([10.0, 16.0]), 4: np.array([40.0, 46.0])}
+    lit = _lit(planned, chosen, blacks, {1: 142.0, 2: 1014.0})
+    assert lit[1].light_dn == pytest.approx(142.0 - 42.0)
+    assert lit[2].light_dn == pytest.approx(1014.0 - 14.0)
+    assert lit[1].blacks == lit[2].blacks == pytest.approx(5 / 9)
+    assert lit[1].at == Range(1, 4)
+
+
+@pytest.mark.parametrize(
+    ("peaks_dn", "sets_exposure", "wanted"),
+    [
+        # half of 4000 DN is the most; the densest that holds it
+        ((8000.0, 4000.0, 2000.0, 1500.0), True, Range(4)),
+        ((9000.0, 8000.0, 7000.0, 6000.0), True, Range(8)),
+        ((1000.0, 300.0, 100.0, 50.0), True, Range(1)),
+        # 0.5 s, 2 s and 8 s: a faint one longer, until its peak is FAINT_DN
+        ((FAINT_DN / LONGER, 1.0, 1.0, 1.0), True, Range(1, 4)),
+        ((FAINT_DN / LONGER - 0.1, 1.0, 1.0, 1.0), True, Range(1, 16)),
+        # 32 s are over 10 s
+        ((0.1, 0.1, 0.1, 0.1), True, Range(1, 16)),
+        ((0.1, 0.1, 0.1, 0.1), False, Range(1)),
+    ],
+)
+def test_a_range_is_the_densest_that_holds_and_longer_where_that_is_faint(
+    peaks_dn, sets_exposure, wanted
+):
+    made = photometer()
+    made.context.source.sets_exposure = sets_exposure
+    assert made._range(np.array(peaks_dn)) == wanted
+
+
+def test_a_pixel_s_light_is_the_sum_over_dots_exposures_and_ratios():
+    made = photometer()
+    made.scatter = scatter_of({1: 0.0, 4: 0.0})
+    patch = Patch(7, "r")
+    reading = _Reading(patch, Range(2, 4), 4096.0, 1.0)
+    factor = 1.02
+    made._rounded = lambda at, light_dn: np.zeros(16)
+    blacks = np.array([100.0, 130.0])
+    planned = [Patch(0, "r"), patch, Patch(0, "r")]
+    values = made._values(planned, {1: reading}, blacks, {("r", Range(2, 4)): factor})
+    # 32 x 32 dots, four exposures of half a second
+    per_dn = 1 / (1024 * 4 * EXPOSURE_S * factor)
+    assert values.light[1] == pytest.approx(4096 * per_dn)
+    assert values.per_dn[1] == pytest.approx(per_dn)
+    # of 4096 DN with 0.25 DN an electron
+    assert values.sigma[1] == pytest.approx(32.0 * per_dn)
+    # black is over 1000 monitor pixels, and about its own mean
+    assert values.light[[0, 2]] == pytest.approx(np.array([-15, 15]) / 1000 / EXPOSURE_S)
+
+
+@pytest.mark.parametrize("pairs", [1, 4])
+def test_a_ratio_is_as_sure_as_its_sums_and_their_number(pairs):
+    made = photometer()
+    made.scatter = scatter_of({1: 200.0, 4: 800.0})
+    light_dn = (4000.0, 1000.0)
+    ratios = (0.9,) * pairs
+    photons = 0.25 / 4000 + 0.25 / 1000
+    apart = _Pair(Patch(9, "r"), Range(1, 4), Range(1), light_dn, ratios)
+    # each sum has its own noise and that of its own black image
+    variance = photons + 2 * 800 / 4000**2 + 2 * 200 / 1000**2
+    assert made._link(apart).error == pytest.approx(0.9 * np.sqrt(variance / pairs))
+    alike = _Pair(Patch(9, "r"), Range(1), Range(2), light_dn, ratios)
+    # one black image under both: its noise goes with 1 / more - 1 / less
+    shared = 200 * (1 / 4000 - 1 / 1000) ** 2
+    variance = photons + 200 / 4000**2 + 200 / 1000**2 + shared
+    link = made._link(alike)
+    assert link.error == pytest.approx(0.9 * np.sqrt(variance / pairs))
+    assert (link.dense, link.sparse, link.times) == (1, 2, (1, 1))
+    assert link.sigmas == pytest.approx(0.1 / link.error)
+
+
+def test_black_noise_is_of_its_own_exposure_and_else_of_any():
+    scatter = scatter_of({1: 200.0, 4: 800.0})
+    assert scatter.dark_dn2(1) == pytest.approx(200.0)
+    assert scatter.dark_dn2(4) == pytest.approx(800.0)
+    assert scatter.dark_dn2(16) == pytest.approx(500.0)
+    assert PixelScatter(1.0).dark_dn2(1) == 0.0
+
+
+def ratio_of(channel: str, dense: Range, sparse: Range, ratio: float) -> LatticeRatio:
+    """A ratio of two ranges, known to a hundredth of it."""
+    return LatticeRatio(
+        patch=Patch(50, channel),
+        dense=dense.period,
+        sparse=sparse.period,
+        ratio=ratio,
+        error=ratio / 100,
+        times=(dense.times, sparse.times),
+    )
+
+
+def test_ranges_are_tied_to_the_sparsest_lattice_link_by_link():
+    made = photometer()
+    links = [
+        ratio_of("r", Range(1, 4), Range(1), 0.5),
+        ratio_of("r", Range(1), Range(8), 0.8),
+        ratio_of("g", Range(2), Range(8), 0.9),
+    ]
+    factors = made._factors(links)
+    assert factors["r", Range(8)] == factors["g", Range(8)] == 1.0
+    assert factors["r", Range(1)] == pytest.approx(0.8)
+    assert factors["r", Range(1, 4)] == pytest.approx(0.4)
+    assert factors["g", Range(2)] == pytest.approx(0.9)
+    lit = {
+        0: _Reading(Patch(3, "r"), Range(1, 4), 1.0, 1.0),
+        1: _Reading(Patch(40, "r"), Range(1), 1.0, 1.0),
+        2: _Reading(Patch(200, "r"), Range(8), 1.0, 1.0),
+        3: _Reading(Patch(40, "g"), Range(2), 1.0, 1.0),
+    }
+    light = np.array([1.0, 10.0, 100.0, 20.0])
+    # by one sigma of a ratio, a hundredth, all light below it falls by a hundredth
+    effects = made._of_ratios(light, lit, links)
+    wanted = [[-0.01, -0.01, 0], [0, -0.1, 0], [0, 0, 0], [0, 0, -0.2]]
+    np.testing.assert_allclose(effects, wanted, atol=1e-12)
+
+
+def test_light_passes_the_ratios_of_its_own_channel_from_its_range_on():
+    link = ratio_of("r", Range(2), Range(8), 0.8)
+    assert _passes(Patch(9, "r"), Range(2), link)
+    assert _passes(Patch(9, "r"), Range(1), link)
+    assert _passes(Patch(9, "r"), Range(4, 4), link)  # exposed longer: fainter light
+    assert not _passes(Patch(9, "r"), Range(4), link)
+    assert not _passes(Patch(9, "g"), Range(1), link)

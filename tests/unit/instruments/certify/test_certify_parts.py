@@ -1,0 +1,413 @@
+"""The parts of a certificate, each against a closed form: its figures and verdicts, light by code,
+a lens's terms, and the correlation of what a fit leaves.
+"""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.interpolate import CubicSpline
+
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.calibrate.geometric import fit as fits
+from hilstar.instruments.certify import estimates, lens
+from hilstar.instruments.certify.budget import Input
+from hilstar.instruments.certify.certificate import _contributions, _input_row, _judged, _place_of
+from hilstar.instruments.certify.estimates import (
+    LightDeviation,
+    Surface,
+    _above_black,
+    _fit_without_wild,
+    _is_better,
+    _scatter,
+)
+from hilstar.instruments.certify.structure import (
+    MIN_CELLS,
+    Cells,
+    Spread,
+    Structure,
+    _rectangle,
+    lasting_root,
+)
+from hilstar.optics.camera import Camera
+
+SIZE_PX = (1920, 1080)
+ROUNDING = 1e-9
+
+
+def budget_input(name: str, dof: float = math.inf) -> Input:
+    """An input of a standard uncertainty of 0.25 mag."""
+    return Input(name, "normal", "stated", 1, 0.25, "mag", dof)
+
+
+def certified(decision: str, delay_ms: float = 0.0, **limits):
+    """The settings of [certify] and a panel's stated delay, as a figure's verdict asks for them."""
+    none = dict.fromkeys(
+        ("max_flux_mag", "max_place_arcsec", "max_attitude_arcsec", "max_roll_arcsec")
+    )
+    certify = SimpleNamespace(**{**none, "max_latency_ms": None, **limits}, decision=decision)
+    monitor = SimpleNamespace(panel_delay_ms=delay_ms)
+    return SimpleNamespace(config=SimpleNamespace(certify=certify, monitor=monitor))
+
+
+@pytest.mark.parametrize(
+    ("decision", "value", "interval", "conforms"),
+    [
+        ("guarded", 0.0, (-0.09, 0.09), True),
+        ("guarded", 0.0, (-0.11, 0.09), False),
+        ("guarded", 0.0, (-0.09, 0.11), False),
+        ("guarded", 0.2, (0.11, 0.3), False),
+        ("simple", 0.09, (-0.3, 0.3), True),
+        ("simple", -0.11, (-0.11, 0.0), False),
+    ],
+)
+def test_a_figure_conforms_where_all_of_its_interval_or_its_value_alone_does(
+    decision, value, interval, conforms
+):
+    file = certified(decision, max_flux_mag=0.1)
+    assert _judged(file, "flux", value, interval) == (0.1, conforms)
+    assert _judged(file, "attitude_z", value, interval) == (None, None)
+
+
+def test_a_latency_s_limit_is_about_the_stated_delay_and_a_roll_has_its_own():
+    file = certified(
+        "guarded", 8.0, max_latency_ms=1.0, max_attitude_arcsec=2.0, max_roll_arcsec=30.0
+    )
+    assert _judged(file, "latency", 8.5, (7.1, 8.9)) == (1.0, True)
+    assert _judged(file, "latency", 0.0, (-0.5, 0.5)) == (1.0, False)
+    assert _judged(file, "attitude_x", 0.0, (-3.0, 3.0)) == (2.0, False)
+    assert _judged(file, "attitude_z", 0.0, (-3.0, 3.0)) == (30.0, True)
+
+
+def test_contributions_are_shares_of_the_variance_with_the_largest_first():
+    inputs = [budget_input("small"), budget_input("none"), budget_input("large")]
+    small, large = 3.0, 4.0
+    parts = _contributions(inputs, np.array([small, 0.0, large]))
+    assert [part.input for part in parts] == ["large", "small"]
+    assert [part.share for part in parts] == [16 / 25, 9 / 25]
+    assert [part.standard_uncertainty for part in parts] == [large, small]
+
+
+def test_an_input_s_freedom_is_written_where_it_is_finite():
+    assert _input_row(budget_input("a", 7.0)).dof == 7.0
+    assert _input_row(budget_input("a")).dof is None
+    assert _input_row(budget_input("a")).standard_uncertainty == 0.25
+
+
+def test_a_figure_s_field_counts_from_0_and_its_star_has_its_own():
+    star = SimpleNamespace(hip=71, field=2, third=1)
+    budget = SimpleNamespace(figures=SimpleNamespace(stars=[None, star]))
+    assert _place_of(budget, "flux", 1) == (71, 2, "middle third")
+    assert _place_of(budget, "attitude_x", -1) == (None, 0, "field 0")
+    assert _place_of(budget, "attitude_z", -3) == (None, 2, "field 2")
+    assert _place_of(budget, "latency", 0) == (None, None, "screen")
+
+
+def deviation(value: np.ndarray, sigma: float = 1e-6) -> LightDeviation:
+    """Light by codes at steps of 0.2 in its log, with the same noise for each."""
+    count = len(value)
+    none = np.zeros((count, 0))
+    nothing = Structure(np.ones(1), np.zeros(1), 1.0, math.inf)
+    return LightDeviation(
+        log_light=0.2 * np.arange(count) - 0.2 * (count - 1),
+        value=value,
+        factors=sigma * np.eye(count),
+        dof=30.0,
+        noise=sigma,
+        dark_factors=none,
+        dark_dof=5.0,
+        dark=0.0,
+        lasting_factors=none,
+        lasting=nothing,
+        square_px=(0, 0, 1),
+        common_factors=none,
+        beside=None,
+    )
+
+
+def test_a_deviation_of_light_is_a_natural_spline_that_is_held_beyond_its_ends(rng):
+    read = deviation(rng.normal(1.0, 0.1, 12))
+    at = np.array([-5.0, read.log_light[0], -1.23, -0.51, 0.0, 3.0])
+    spline = CubicSpline(read.log_light, read.value, bc_type="natural")
+    held = spline(np.clip(at, read.log_light[0], 0.0))
+    np.testing.assert_allclose(read.weights(at) @ read.value, held, atol=ROUNDING)
+    bent = held - np.interp(at, read.log_light, read.value)
+    np.testing.assert_allclose(read.bent(at), bent, atol=ROUNDING)
+
+
+def test_codes_on_a_line_foretell_each_other():
+    read = deviation(np.linspace(0.9, 1.1, 10))
+    gaps = read._gaps() @ read.value
+    np.testing.assert_allclose(gaps[1:-1], 0.0, atol=ROUNDING)
+    np.testing.assert_allclose(gaps[[0, -1]], [0.9, 1.1], atol=ROUNDING)
+    assert not read.rough(np.array([-0.3, -1.1])).any()
+
+
+def test_codes_that_are_off_by_themselves_say_how_far(rng):
+    off = 0.01
+    signs = rng.choice([-1.0, 1.0], 40)
+    read = deviation(1.0 + off * signs)
+    between = 0.5 * (read.log_light[1:] + read.log_light[:-1])[10:30]
+    rough = read.rough(between)
+    # one sigma of a code, and what the spline through such codes adds
+    assert off < float(np.median(rough)) < 2.5 * off
+    assert not read.rough(read.log_light).any()
+    # noise that explains it all leaves nothing
+    assert not deviation(1.0 + off * signs, sigma=off).rough(between).any()
+
+
+def test_lit_codes_are_above_black_and_a_scatter_is_by_its_freedom():
+    rows = np.array([[1.0, 2.0], [4.0, 9.0], [5.0, 5.0], [77.0, 77.0]])
+    np.testing.assert_array_equal(_above_black(rows, 3), [[3.0, 7.0], [4.0, 3.0]])
+    assert _scatter(np.array([1.0, -2.0, 2.0]), 2.0) == pytest.approx(math.sqrt(9 / 2))
+
+
+@pytest.mark.parametrize(("more", "dof"), [(2, 40.0), (5, 90.0)])
+def test_a_finer_fit_is_better_from_the_thousandth_of_f_on(more, dof):
+    limit = stats.f.isf(0.001, more, dof)
+    squares = dof * (1.0 + limit * np.array([0.98, 1.02]) * more / dof)
+    assert not _is_better(squares[0], dof + more, dof, dof)
+    assert _is_better(squares[1], dof + more, dof, dof)
+    assert not _is_better(squares[1], dof, dof, dof)
+
+
+def test_a_wild_value_is_left_out_and_noise_of_one_has_the_fit_s_covariance(rng):
+    x = np.linspace(-1, 1, 60)
+    terms = np.column_stack([np.ones(60), x])
+    values = (terms @ [2.0, 3.0] + rng.normal(0, 0.01, 60))[:, None]
+    values[17] += 5.0
+    solution, root, usable = _fit_without_wild(terms, values, np.ones(60, dtype=bool))
+    assert np.flatnonzero(~usable).tolist() == [17]
+    # sigma / sqrt(n), and over the rms of x: five of them
+    assert solution[:, 0] == pytest.approx([2.0, 3.0], abs=5 * 0.01 / math.sqrt(60 / 3))
+    covariance = np.linalg.inv(terms[usable].T @ terms[usable])
+    np.testing.assert_allclose(root @ root.T, covariance, rtol=1e-9)
+
+
+def test_a_surface_s_bow_is_nothing_at_a_field_s_middle_and_a_parabola_s_between_them():
+    """Of T2 = 2 u^2 - 1, linear between nodes a step apart: short of it by the product of the
+    distances to both, twice.
+    """
+    value = np.zeros((6, 1))
+    # terms of degree 2 in rows of the columns' degree: 1, y, y^2, x, xy, x^2
+    value[5] = 1.0
+    surface = Surface(2, SIZE_PX, value, np.eye(6), 10.0, 1.0)
+    step_px = SIZE_PX[0] / 16
+    # 120 px to a field: pixels 60 and 899 are half a pixel beside a middle
+    x_px = np.array([60.0, 119.0, 899.0, 1700.0])
+    y_px = np.full(4, 540.0)
+    middle = step_px * (np.floor((x_px + 0.5) / step_px - 0.5) + 0.5) - 0.5
+    off_px = x_px - middle
+    half_px = SIZE_PX[0] / 2
+    wanted = -2 * off_px * (step_px - off_px) / half_px**2
+    np.testing.assert_allclose(surface.bowed(x_px, y_px), wanted, atol=1e-9)
+
+
+def test_a_structure_s_length_is_the_mean_by_its_variances():
+    structure = Structure(np.array([1.0, 5.0, 9.0]), np.array([3.0, 0.0, 1.0]), 0.5, 9.0)
+    assert structure.total == 4.0
+    assert structure.mean_length == pytest.approx((3 * 1 + 9) / 4)
+    assert list(structure.parts()) == [(1.0, 3.0), (9.0, 1.0)]
+
+
+@pytest.mark.parametrize("ratio", [0.0, 0.4, 30.0])
+def test_a_restricted_likelihood_is_that_of_contrasts(ratio, rng):
+    """Patterson and Thompson: the density of what no term explains, whatever basis spans it."""
+    count, terms = 12, 3
+    eigen = rng.uniform(0, 5, count)
+    design = rng.normal(size=(count, terms))
+    value = rng.normal(size=count)
+    contrasts = np.linalg.svd(design)[0][:, terms:]
+    free = count - terms
+
+    def by_contrasts(at: float) -> tuple[float, float]:
+        covariance = contrasts.T @ np.diag(1 + at * eigen) @ contrasts
+        left = contrasts.T @ value
+        unexplained = left @ np.linalg.solve(covariance, left)
+        log_size = np.linalg.slogdet(covariance)[1]
+        return -0.5 * (log_size + free * math.log(unexplained)), unexplained / free
+
+    spread = Spread(eigen, value, design)
+    likelihood, noise = spread.likelihood(ratio)
+    at_zero, _ = spread.likelihood(0.0)
+    wanted, wanted_noise = by_contrasts(ratio)
+    assert noise == pytest.approx(wanted_noise)
+    # up to a constant of the terms, the same for all ratios
+    assert likelihood - at_zero == pytest.approx(wanted - by_contrasts(0.0)[0], abs=1e-9)
+
+
+def test_what_lasts_falls_by_e_in_its_time():
+    structure = Structure(np.array([2.0, 8.0]), np.array([3.0, 1.0]), 1.0, 9.0)
+    t = np.array([0.0, 2.0, 8.0])
+    root = lasting_root(t, structure)
+    covariance = root @ root.T
+    apart = np.abs(t[:, None] - t)
+    wanted = 3 * np.exp(-apart / 2) + np.exp(-apart / 8)
+    np.testing.assert_allclose(covariance, wanted, atol=ROUNDING)
+    none = Structure(np.array([2.0]), np.zeros(1), 1.0, 9.0)
+    assert lasting_root(t, none).shape == (3, 0)
+
+
+def lattice(columns: int, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Readings on a lattice of 10 px across and 20 px down."""
+    x_px, y_px = np.meshgrid(10.0 * np.arange(columns), 20.0 * np.arange(rows))
+    return x_px.ravel(), y_px.ravel()
+
+
+def test_cells_are_rows_of_columns_about_their_readings():
+    x_px, y_px = lattice(7, 5)
+    cells = Cells(x_px, y_px)
+    assert (len(cells.middle[0]), len(cells.middle[1])) == (5, 7)
+    np.testing.assert_array_equal(cells.index, np.arange(35))
+    np.testing.assert_allclose(cells.middle[1], 10.0 * np.arange(7))
+    assert cells.side == [20.0, 10.0]
+    np.testing.assert_allclose(cells.means(x_px), x_px)
+    # over 1000 readings: four to a cell, about their middle
+    x_px, y_px = lattice(60, 60)
+    grouped = Cells(x_px, y_px)
+    assert grouped.count.tolist() == [4] * 900
+    np.testing.assert_allclose(grouped.middle[1], 5.0 + 20.0 * np.arange(30))
+    row, column = np.divmod(np.arange(900), 30)
+    np.testing.assert_allclose(grouped.means(x_px), 5.0 + 20.0 * column)
+    np.testing.assert_allclose(grouped.means(y_px), 10.0 + 40.0 * row)
+    assert grouped.lengths(0.25)[[0, -1]] == pytest.approx([10.0, 0.25 * 40 * 29])
+
+
+def test_cells_correlate_as_the_means_over_them_do():
+    """Means over a square of a field that falls as exp(-d^2 / 2 L^2): by numbers, to the second
+    order of the square over L.
+    """
+    x_px, y_px = lattice(4, 3)
+    cells = Cells(x_px, y_px)
+    length_px = 25.0
+    eigen, rows, columns = cells.basis(length_px)
+    vectors = np.kron(rows, columns)
+    correlation = (vectors * eigen) @ vectors.T
+    fine = (np.arange(20) - 9.5) / 20
+    points = []
+    for side, middle in zip((20.0, 10.0), cells.middle, strict=True):
+        points.append(middle[:, None] + side * fine)
+    means = []
+    crossed = []
+    at_px = (np.array([13.0]), np.array([21.0]))
+    for axis, place_px in ((0, at_px[1]), (1, at_px[0])):
+        apart = points[axis][:, :, None, None] - points[axis]
+        means.append(np.exp(-(apart**2) / (2 * length_px**2)).mean(axis=(1, 3)))
+        off = place_px[:, None, None] - points[axis]
+        crossed.append(np.exp(-(off**2) / (2 * length_px**2)).mean(axis=2))
+    fourth_order = (20 / length_px) ** 4 / 100
+    np.testing.assert_allclose(correlation, np.kron(*means), atol=fourth_order)
+    towards = cells.towards(*at_px, length_px)
+    np.testing.assert_allclose(towards, np.kron(*crossed), atol=fourth_order)
+    values = np.arange(24.0).reshape(12, 2)
+    turned = cells.turned(rows, columns, values)
+    np.testing.assert_allclose(turned, vectors.T @ values, atol=ROUNDING)
+
+
+def test_a_rectangle_leaves_the_empty_corner_out():
+    x_px, y_px = lattice(12, 12)
+    assert _rectangle(x_px, y_px).all()
+    # a field without its two last rows but for a single reading
+    kept = (y_px < 200) | (x_px == 50)
+    inside = _rectangle(x_px[kept], y_px[kept])
+    np.testing.assert_array_equal(inside, y_px[kept] < 200)
+    assert inside.sum() > MIN_CELLS
+
+
+TANGENTS = np.array([[0.05, 0.02], [-0.08, 0.03], [0.01, -0.09], [0.1, 0.1]])
+
+
+def test_decentring_of_the_fifth_order_is_the_gradient_of_its_own_power():
+    """r^4 along an axis and r^2 times the place: together, five of it and four of the other, the
+    gradient of r^4 x.
+    """
+    u, v = TANGENTS.T / 0.1
+    r2 = u**2 + v**2
+    terms = lens._decentring(TANGENTS)
+    gradient = terms[:, :, 2] + 4 * terms[:, :, 0]
+    np.testing.assert_allclose(gradient, [r2**2 + 4 * r2 * u * u, 4 * r2 * u * v])
+    gradient = terms[:, :, 3] + 4 * terms[:, :, 1]
+    np.testing.assert_allclose(gradient, [4 * r2 * u * v, r2**2 + 4 * r2 * v * v])
+
+
+def test_a_tilted_screen_s_terms_are_scales_lean_and_a_perspective_s_second_order():
+    u, v = TANGENTS.T / 0.1
+    terms = lens._tilted(TANGENTS)
+    np.testing.assert_allclose(terms[:, :, 0], [u, -v])
+    np.testing.assert_allclose(terms[:, :, 1], [v, u])
+    # a perspective moves a place along itself
+    for number, factor in enumerate((u * u, u * v, v * v)):
+        np.testing.assert_allclose(terms[:, :, 2 + number], [u * factor, v * factor])
+
+
+def test_waves_of_a_tracker_s_pixels_come_back_after_one_pixel():
+    place_px = np.array([10.0, 10.25, 11.0, 12.5])
+    waves = lens._phases(place_px, place_px[::-1])
+    np.testing.assert_allclose(waves[0, :, 0], [0, 1, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(waves[0, :, 1], [1, 0, 1, -1], atol=1e-12)
+    np.testing.assert_allclose(waves[1, ::-1, 2:], waves[0, :, :2], atol=1e-12)
+    assert not waves[0, :, 2:].any()
+    assert not waves[1, :, :2].any()
+
+
+def test_an_orthonormal_basis_leaves_nothing_of_its_terms_and_forgets_what_repeats(rng):
+    terms = rng.normal(size=(2, 15, 4)) * [1.0, 1e4, 1e-6, 1.0]
+    terms[:, :, 3] = terms[:, :, 0] - 1e-4 * terms[:, :, 1]
+    vectors, mix = lens._orthonormal(terms)
+    assert vectors.shape == (30, 3)
+    np.testing.assert_allclose(vectors.T @ vectors, np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(terms.reshape(30, 4) @ mix, vectors, atol=1e-6)
+    left, by_axis = lens._left_by(vectors, terms.reshape(30, 4) @ [1.0, 2e-4, 3e6, 0.5])
+    np.testing.assert_allclose(left, 0.0, atol=1e-9)
+    assert left.shape == (2, 15)
+    np.testing.assert_array_equal(by_axis[1], vectors[15:])
+
+
+def test_a_thousand_dots_are_all_over_the_field():
+    usable = np.ones(4500, dtype=bool)
+    usable[:300] = False
+    thinned = lens._thinned(usable)
+    places = np.flatnonzero(thinned)
+    assert places[0] == 300
+    assert set(np.diff(places).tolist()) == {4}
+    assert not thinned[:300].any()
+    few = np.arange(900) % 2 == 0
+    np.testing.assert_array_equal(lens._thinned(few), few)
+
+
+@pytest.mark.parametrize("number", range(len(fits.BROWN_CONRADY)))
+def test_a_lens_s_slopes_are_how_far_a_number_moves_the_directions_it_shows(number):
+    """A ray of the lens that has the number, less one of the lens that has not."""
+    flat = Camera((800, 600), 4000.0, (399.5, 299.5), np.eye(3))
+    nominal = fits.Nominal(flat, lens.STILL[0], flat)
+    model = fits.Model(fits.BROWN_CONRADY)
+    numbers = np.zeros(model.size)
+    fitted = fits.Fit(model, 0, numbers, fits.geometry_of(model, nominal, lens.STILL, numbers))
+    slopes = lens._lens_terms(fitted, flat, TANGENTS)[:, :, number]
+    step = np.zeros(model.size)
+    step[number] = 1e-3
+    moved = []
+    for sign in (1, -1):
+        camera = fits.geometry_of(model, nominal, lens.STILL, sign * step).monitor
+        moved.append(lens._tangents(camera, flat, TANGENTS))
+    wanted = (moved[0] - moved[1]).T / 2e-3 * ARCSEC_PER_RAD
+    # second order in a step of either, and 1e-9 of a place by rounding
+    largest = np.abs(wanted).max()
+    assert largest > 0
+    np.testing.assert_allclose(slopes, wanted, atol=0.01 * largest)
+
+
+def test_a_square_s_evenness_is_the_mean_of_its_rows_and_columns(monkeypatch):
+    even = np.arange(40.0).reshape(5, 8)
+    calibration = SimpleNamespace(uniformity_map=lambda size: even)
+    monkeypatch.setattr(estimates, "bench_calibration", lambda config, folder: calibration)
+    monitor = SimpleNamespace(resolution_px=(8, 5))
+    file = SimpleNamespace(config=SimpleNamespace(monitor=monitor), folder=None)
+    # rows 1 and 2, columns 4 and 5
+    assert estimates._evenness_in(file, (4, 1, 2)) == (12 + 13 + 20 + 21) / 4
+    calibration.uniformity_map = lambda size: None
+    assert estimates._evenness_in(file, (4, 1, 2)) == 1.0

@@ -1,0 +1,288 @@
+"""What a confrontation makes of photographs before and after its fits, each against a closed form:
+places and levels, and the camera that it writes and reads back.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from hilstar.basics.reading import parse_toml
+from hilstar.instruments.confront import session as sessions
+from hilstar.instruments.confront.background import FixedPattern
+from hilstar.instruments.confront.images import Photograph
+from hilstar.instruments.confront.light import LightFit
+from hilstar.instruments.confront.measured_bench import (
+    PER_PX,
+    _absolute,
+    _detector,
+    _fitted,
+    _toml,
+    _written_model,
+    fixed_camera,
+    read_tracker_file,
+    vignetting_of,
+)
+from hilstar.instruments.confront.photon_transfer import PixelFit
+from hilstar.instruments.confront.session import (
+    PIVOT_NM,
+    _channel_mag,
+    _field,
+    _linear,
+    _middles,
+    _reach_px,
+    corrected,
+    radius2_of,
+)
+from hilstar.instruments.confront.star_psf import HALF, Stamps
+from hilstar.optics.camera import Camera
+from hilstar.server.bench.bench_file import BenchFile, bench_file_of
+from hilstar.sky.spectrum import Curve
+
+TRACKER = """
+[tracker]
+aperture_mm = 20.0
+focal_length_mm = 40.0
+pixel_pitch_um = 10.0
+resolution_px = [800, 600]
+quantum_efficiency = 0.5
+exposure_s = 0.2
+[tracker.detector]
+gain_e_per_dn = 4.0
+full_well_e = 16000.0
+bits = 12
+read_noise_e = 30.0
+offset_dn = 60.0
+prnu = 0.02
+"""
+PLACEHOLDERS = (
+    "[monitor]\nresolution_px = [1920, 1080]\npixel_pitch_um = 265.5\n[collimator]\nfocal_length_mm"
+    " = 1000.0\n"
+)
+CAMERA = Camera((800, 600), 4000.0, (410.0, 290.0), np.eye(3))
+MAG_A_FACTOR_2 = 2.5 * math.log10(2)
+
+
+def bench(folder, text: str = TRACKER, more: str = "") -> BenchFile:
+    """A bench whose screen is of no account."""
+    return bench_file_of(folder / "bench.toml", f"{text}{more}\n{PLACEHOLDERS}")
+
+
+def photograph(dn: np.ndarray, full_dn: float = 4095.0, step_dn: float = 1.0) -> Photograph:
+    """A photograph of these levels."""
+    return Photograph("photo.fits", dn, step_dn, full_dn, exposure_s=0.5)
+
+
+def pixels(**changes) -> PixelFit:
+    """A detector of 2 e- a DN above 100 DN."""
+    made = PixelFit(2.0, 100.0, 6.0, 1.0, {}, np.empty((0, 2)), gain_told=True)
+    return replace(made, **changes)
+
+
+def stamps_of(places_px: np.ndarray, sigma_x_px: float, sigma_y_px: float) -> Stamps:
+    """Gaussians of 1000 DN, integrated over pixels by erf."""
+    reach = np.arange(-HALF, HALF + 1)
+    middle = np.rint(places_px)
+    values = []
+    for off_x, off_y in places_px - middle:
+        across = np.diff(ndtr((np.append(reach, HALF + 1) - 0.5 - off_x) / sigma_x_px))
+        down = np.diff(ndtr((np.append(reach, HALF + 1) - 0.5 - off_y) / sigma_y_px))
+        values.append(1000 * np.outer(down, across))
+    images = np.array(values)
+    return Stamps(images, np.ones_like(images), *middle.T, np.full(len(values), 0.65))
+
+
+def test_a_centre_of_gravity_is_along_its_own_axis():
+    places_px = np.array([[100.2, 50.0], [200.0, 80.3], [300.4, 20.7]])
+    x_px, y_px = _middles(stamps_of(places_px, 0.6, 0.6))
+    # what of a Gaussian is outside of 5 x 5 pixels pulls the centre back: by 0.05 px at most
+    np.testing.assert_allclose(x_px, places_px[:, 0], atol=0.05)
+    np.testing.assert_allclose(y_px, places_px[:, 1], atol=0.05)
+
+
+def test_sources_are_from_the_middle_of_the_image():
+    sources = SimpleNamespace(x_px=np.array([399.5, 0.0, 799.0]), y_px=np.array([299.5, 0.0, 9.0]))
+    field = _field(sources, np.array([True, True, False]), photograph(np.zeros((600, 800))))
+    np.testing.assert_array_equal(field.places_px, [[0.0, 0.0], [-399.5, -299.5]])
+    assert (field.width_px, field.height_px) == (800, 600)
+
+
+def test_radii_are_from_the_principal_point_in_half_diagonals():
+    # half of the diagonal of 800 x 600 px is 500 px
+    x_px = np.array([410.0, 410.0 + 500.0, 410.0 + 30.0])
+    y_px = np.array([290.0, 290.0, 290.0 - 40.0])
+    np.testing.assert_allclose(radius2_of(CAMERA, x_px, y_px), [0.0, 1.0, 0.01])
+
+
+def test_places_reach_as_far_as_95_percent_of_them_from_the_principal_point():
+    angle = np.linspace(0, 2 * math.pi, 100, endpoint=False)
+    radius_px = np.where(np.arange(100) < 96, 200.0, 390.0)
+    x_px = 410 + radius_px * np.cos(angle)
+    y_px = 290 + radius_px * np.sin(angle)
+    places = sessions.Places(x_px, y_px, np.ones(100), np.zeros((100, 3)))
+    assert _reach_px(CAMERA, places) == pytest.approx(200.0)
+    none = sessions.Places(np.empty(0), np.empty(0), np.empty(0), np.empty((0, 3)))
+    assert _reach_px(CAMERA, none) == 0.0
+
+
+def test_levels_of_a_power_are_light_again_and_full_scale_stays(monkeypatch):
+    monkeypatch.setattr(sessions, "sky_level", lambda dn, step_dn: ("level", step_dn))
+    power = 0.5
+    light = np.array([[0.0, 0.01, 0.01], [0.01, 0.25, 1.0]])
+    coded = photograph(4095 * light**power, step_dn=2.0)
+    shot = sessions.Shot(coded, None, None, None, None, 1.0, None, np.empty(0))
+    linear = _linear(shot, coded, power)
+    np.testing.assert_allclose(linear.photo.dn, 4095 * light)
+    # d(light) / d(code) at the sky's: light = code^2, and its code is a tenth
+    assert linear.photo.step_dn == pytest.approx(2.0 * 2 * 0.1)
+    assert linear.level == ("level", linear.photo.step_dn)
+
+
+def test_an_efficiency_bends_about_550_nm_by_squares_of_the_logarithm():
+    curve = Curve(np.array([400.0, 550.0, 700.0]), np.array([0.3, 0.4, 0.2]))
+    tilt, bow = 0.5, -0.8
+    bent = corrected(curve, (tilt, bow))
+    assert bent(np.array([PIVOT_NM]))[0] == pytest.approx(0.4)
+    for nm, value in ((400.0, 0.3), (700.0, 0.2)):
+        x = math.log(nm / 550.0)
+        wanted = value * math.exp(tilt * x + bow * x * x)
+        assert bent(np.array([nm]))[0] == pytest.approx(wanted, rel=1e-4)
+    steep = corrected(curve, (9.0, 0.0))
+    assert steep.value.max() == pytest.approx(1.0)
+    # as a whole: the ratio of two wavelengths stays
+    ratio = steep(np.array([700.0]))[0] / steep(np.array([550.0]))[0]
+    assert ratio == pytest.approx(0.5 * (700 / 550) ** 9, rel=1e-3)
+    assert corrected(curve, (0.0, 0.0)) is curve
+
+
+def test_a_channel_of_a_third_of_the_light_is_fainter_by_it(tmp_path):
+    text = TRACKER.replace(
+        "quantum_efficiency = 0.5",
+        "quantum_efficiency_r = 0.2\nquantum_efficiency_g = 0.3\nquantum_efficiency_b = 0.6",
+    )
+    file = bench(tmp_path, text)
+    columns = np.array([[5.0, 3.0], [0.6, 0.0], [0.7, 0.0]])
+    whole = {plane: _channel_mag(file, plane, columns) for plane in ("r", "g1", "g2", "b", "")}
+    fainter = 2.5 * math.log10(1.5)
+    np.testing.assert_allclose(whole["r"] - whole["g1"], fainter, atol=1e-6)
+    np.testing.assert_allclose(whole["g2"] - whole["b"], MAG_A_FACTOR_2, atol=1e-6)
+    np.testing.assert_array_equal(whole[""], 0.0)
+    grey = bench(tmp_path)
+    np.testing.assert_array_equal(_channel_mag(grey, "r", columns), 0.0)
+
+
+@pytest.mark.parametrize("step_dn", [1.0, 4.0])
+def test_a_fixed_camera_is_that_of_its_file(tmp_path, step_dn):
+    fixed = fixed_camera(bench(tmp_path, TRACKER), step_dn)
+    assert fixed.camera.focal_length_px == pytest.approx(4000.0)
+    assert (fixed.pixels.gain_e_per_dn, fixed.pixels.pedestal_dn) == (4.0, 60.0)
+    # a pixel's variance at a level, steps of the file included, is the detector's own: read noise
+    # and a twelfth of a DN^2, photons, and response
+    light_dn = 500.0
+    if step_dn == 1.0:
+        assert fixed.pixels.read_noise_e == pytest.approx(30.0)
+    read_dn2 = (30.0 / 4) ** 2
+    variance = read_dn2 + 1 / 12 + light_dn / 4 + (0.02 * light_dn) ** 2
+    seen = fixed.pixels.variance_dn2(np.array([60.0 + light_dn]))[0]
+    assert seen == pytest.approx(variance)
+
+
+def session_of(file: BenchFile, fitted: PixelFit, photo: Photograph, offset_mag: float = 0.0):
+    """As much of a session as the writers of a bench's parts ask for."""
+    light = LightFit(np.full(2, offset_mag), (0.0, 0.0), (0.0, 0.0), 0.0, 0.0, 1.0)
+    shots = (SimpleNamespace(photo=photo),)
+    camera = SimpleNamespace(camera=CAMERA)
+    return SimpleNamespace(file=file, pixels=fitted, shots=shots, light=light, camera=camera)
+
+
+@pytest.mark.parametrize(("full_dn", "bits"), [(4095.0, 12), (4096.0, 13), (255.0, 8), (65535, 16)])
+def test_a_detector_is_written_in_electrons_above_its_pedestal(tmp_path, full_dn, bits):
+    pattern = FixedPattern((0.03**2, 0.5**2, 0.0, 0.0), (0.0,) * 4)
+    made = pixels(step_dn=4.0, pattern=pattern)
+    photo = photograph(np.zeros((2, 2)), full_dn)
+    detector = _detector(session_of(bench(tmp_path), made, photo), {})
+    assert detector["bits"] == bits
+    assert detector["full_well_e"] == pytest.approx((full_dn - 100) * 2)
+    assert detector["offset_dn"] == 100.0
+    # steps of 4 DN where a detector's are of 1: (16 - 1) / 12 DN^2
+    assert detector["read_noise_e"] == pytest.approx(math.sqrt(36 + 15 / 12 * 4))
+    assert detector["prnu"] == pytest.approx(0.03)
+    assert detector["dsnu_e"] == pytest.approx(1.0)
+    unknown = session_of(bench(tmp_path), replace(made, gain_told=False), photo)
+    assert "gain_e_per_dn" not in _detector(unknown, {})
+    assert _detector(unknown, {"gain_e_per_dn": 2.0})["gain_e_per_dn"] == 2.0
+
+
+def test_a_psf_s_samples_are_fitted_by_their_own_axes():
+    reach = np.arange(-6 * PER_PX, 6 * PER_PX + 1) / PER_PX
+    sigma_x_px, sigma_y_px = 1.3, 0.8
+    image = np.exp(-0.5 * (reach / sigma_x_px) ** 2) * np.exp(
+        -0.5 * (reach[:, None] / sigma_y_px) ** 2
+    )
+    image /= image.sum()
+    psf = _fitted(image[None], PER_PX, np.array([[400.0, 300.0]]), (800, 600))
+    core = psf.core(np.array([400.0]), np.array([300.0]), np.array([0.65]))[0]
+    share = 1 - psf.wing_share
+    wing_px2 = psf.wing_share * psf.wing_sigma_px**2
+    variances_px2 = share * core[:2] + wing_px2
+    np.testing.assert_allclose(variances_px2, [sigma_x_px**2, sigma_y_px**2], rtol=0.02)
+
+
+def test_vignetting_is_what_dims_the_corners():
+    r2 = np.array([0.0, 0.25, 0.64, 1.0])
+    a_mag, b_mag = 0.3, 0.2
+    illumination = 10 ** (-0.4 * (a_mag * r2 + b_mag * r2**2))
+    assert vignetting_of(illumination, r2) == pytest.approx((a_mag, b_mag))
+    assert vignetting_of(illumination[:2], r2[:2]) == (0.0, 0.0)
+
+
+def test_numbers_in_a_file_s_history_are_the_model_s_whatever_line_they_are_cut_in():
+    numbers = {
+        "covariance": [[1.0], [2.0], [0.1]],
+        "colour": 0.3,
+        "wing": [0.2, 3.0],
+        "vignetting": [0.4, -0.1],
+    }
+    text = json.dumps(numbers)
+    history = ["PSF of photographs", f"confront: {text[:31]}", f"confront: {text[31:]}", "another"]
+    psf, vignetting_mag = _written_model(history, (800, 600))
+    assert vignetting_mag == (0.4, -0.1)
+    assert psf.covariance.tolist() == numbers["covariance"]
+    assert (psf.colour, psf.wing_share, psf.wing_sigma_px) == (0.3, 0.2, 3.0)
+    assert psf.size_px == (800, 600)
+    assert _written_model(history[:1], (800, 600)) is None
+    assert _written_model(history[:2], (800, 600)) is None
+
+
+def test_tables_are_read_back_as_they_were_with_their_files_wherever_they_lie(tmp_path):
+    (tmp_path / "here.csv").touch()
+    tables = {
+        "tracker": {
+            "aperture_mm": 20.0,
+            "transmission": "here.csv",
+            "optics": {"psf": "x", "map": "here.csv"},
+            "resolution_px": [8, 6],
+        },
+        "sky": {"catalogue": "hipparcos", "bodies": True, "file": "missing.csv"},
+    }
+    absolute = _absolute(tables, tmp_path)
+    there = str((tmp_path / "here.csv").resolve())
+    assert absolute["tracker"]["transmission"] == absolute["tracker"]["optics"]["map"] == there
+    assert absolute["sky"] == tables["sky"]
+    path = tmp_path / "written.toml"
+    assert parse_toml(path, "\n".join(_toml(absolute))) == absolute
+
+
+@pytest.mark.parametrize("has_screen", [False, True])
+def test_a_file_of_a_tracker_alone_gets_a_screen_and_says_so(tmp_path, has_screen):
+    path = tmp_path / "tracker.toml"
+    path.write_text(TRACKER + (PLACEHOLDERS if has_screen else ""))
+    file, with_screen = read_tracker_file(path)
+    assert with_screen is has_screen
+    assert file.config.tracker.focal_length_mm == 40.0

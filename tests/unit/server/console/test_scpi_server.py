@@ -29,6 +29,7 @@ from hilstar.server.console.messages import (
 )
 from hilstar.server.console.page_figures import RunCounts
 from hilstar.server.console.protocol import LedgerState, NewestFrame, ShownAttitude
+from hilstar.server.console.scpi import MAX_ERRORS
 from hilstar.server.console.server import scpi_server
 from hilstar.server.console.server.scpi_server import (
     ALIVE_NS,
@@ -102,9 +103,12 @@ class Bench:
 
     def errors(self, client: Connection | None = None) -> list[int]:
         """The numbers of the errors in a connection's queue, which this empties."""
-        numbers = []
-        while (text := self.says("SYST:ERR?", client)) and not text.startswith("0,"):
-            numbers.append(int(text.partition(",")[0]))
+        numbers: list[int] = []
+        for _ in range(MAX_ERRORS + 1):
+            number = int(self.says("SYST:ERR?", client).partition(",")[0])
+            if not number:
+                break
+            numbers.append(number)
         return numbers
 
     def sent(self) -> list[AttitudeSample]:

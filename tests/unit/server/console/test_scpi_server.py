@@ -273,10 +273,11 @@ def test_a_setting_is_shown_by_a_frame_of_its_attitude_and_a_later_state(bench):
     assert not bench.server.pending()
     bench.says("SKY:ATT 1,0,0,0")
     assert bench.server.pending()
-    bench.run()
+    bench.run(host_ns=START_NS + NS_PER_S)
     # a swap after the setting, of an attitude from before it
     newest_frame(bench, draw_ns=START_NS + 9, swap_ns=START_NS + 9, age_ns=10)
     assert bench.server.pending()
+    bench.run(host_ns=START_NS)
     newest_frame(bench, draw_ns=START_NS + 1, swap_ns=START_NS + 10, age_ns=10)
     assert bench.server.pending()  # the state is of before it
     bench.run(host_ns=START_NS + MARGIN_NS)

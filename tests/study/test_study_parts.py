@@ -26,8 +26,11 @@ from hilstar.display.response import Levels, gamma_response
 from hilstar.instruments.study import (
     bodies,
     codes,
+    colour,
     faults,
     geometry,
+    limits,
+    models,
     predictors,
     rigs,
     sky_figures,
@@ -330,3 +333,31 @@ def test_a_field_is_from_edge_to_edge_of_its_outermost_pixels():
     camera = Camera((800, 600), 1000.0, (399.5, 299.5), np.eye(3))
     wanted = 2 * math.degrees(math.atan(0.4)), 2 * math.degrees(math.atan(0.3))
     assert _field_deg(camera) == pytest.approx(wanted)
+
+
+def test_a_vibration_s_prediction_is_off_by_what_its_rate_leaves(monkeypatch):
+    """Of A sin(w t), 20 to 30 ms after a sample with its rate: A |exp(i w s) - 1 - i w s| / 2^0.5."""
+    monkeypatch.setattr(limits, "SPAN_S", 1.0)
+    limit = limits.vibrations(quick=True)
+    slow = limit.at < 4.0
+    assert slow.sum() >= 2
+    for hz, error_arcsec in zip(limit.at[slow], limit.error[slow], strict=True):
+        after_s = np.linspace(0.020, 0.030, 50)
+        phase = 2 * math.pi * hz * after_s
+        left = np.abs(np.exp(1j * phase) - 1 - 1j * phase)
+        wanted_arcsec = limits.VIBRATION_ARCSEC * math.sqrt(np.mean(left**2) / 2)
+        # over some cycles, not whole ones
+        assert 0.5 < error_arcsec / wanted_arcsec < 2
+
+
+def test_the_bolometric_zero_point_makes_stars_a_third_of_a_magnitude_fainter():
+    """A body of 9602 K has V = 0.307 by it, by SciPy's quadrature (claims.toml, zero-point)."""
+    costs_mag = models.choice_costs_mag(
+        np.array([0.0, 0.6]), study_benches.study_optics("ccd47-20")
+    )
+    assert costs_mag["zero point iau-bolometric"] == pytest.approx(np.full(2, 0.307), abs=1e-3)
+
+
+def test_a_distance_is_of_both_coordinates():
+    places_px = np.array([[3.0, 0.0], [4.0, 5.0]])
+    assert colour.distance_rms_px(places_px) == pytest.approx(5.0)

@@ -230,7 +230,7 @@ def copy_checkout(folder: Path) -> None:
 
 @dataclass(frozen=True, slots=True)
 class LineMap:
-    """What tests/support/line_map.py wrote: test functions by path and line, their seconds."""
+    """What tests/support/line_map.py wrote: tests by path and line, and seconds by test and file."""
 
     seconds: dict[str, float]
     tests: dict[str, dict[str, list[str]]]

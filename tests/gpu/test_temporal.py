@@ -9,6 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilstar.display.balance import SUMS
+from hilstar.display.exact import Left
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import shown_light
 from hilstar.display.render.reference import linear_image
@@ -54,6 +56,21 @@ def test_over_any_six_frames_every_centroider_finds_the_light_and_the_place(make
             mean = np.tensordot(weights, np.stack(frames[first : first + FRAMES + 1]), 1) / FRAMES
             assert flux_mag(mean, sky) < AIM_MAG
             assert max(family_errors_px(mean, sky, SIGMA[0]).values()) < OF_FEW * AIM_PX
+
+
+def test_errors_that_are_set_are_those_of_the_next_frame_s_beginning(rng):
+    """As a sequence that goes on elsewhere hands them over: each star's own."""
+    target = Target((40, 30), GaussianPsf(SIGMA), srgb_response(8), WHITE, "temporal")
+    error = rng.normal(size=(SUMS, 7)).astype(np.float32)
+    with Renderer(target) as gl:
+        gl.draw(stars(np.array([20.0]), np.array([15.0]), np.array([1e5])), 0)
+        gl.levels()
+        with gl.context:
+            assert gl._exact_pass.left.star.tolist() == [0]
+            gl._exact_pass.left = Left(np.arange(7) * 3, error)
+            left = gl._exact_pass.left
+    assert left.star.tolist() == [0, 3, 6, 9, 12, 15, 18]
+    assert np.array_equal(left.error, error)
 
 
 @pytest.mark.parametrize("uniformity", [None, UNEVEN], ids=["even", "uneven"])

@@ -1,9 +1,9 @@
 """A plugin of pytest that writes which tests run each line, for tools/mutants.py --by-lines:
 `-n0 -p tests.support.line_map`, the file to write in HILSTAR_LINE_MAP. It needs `coverage`.
 
-The file is JSON: `seconds` of each test function, all its cases together, and `tests` by path and
-line. What a fixture of a file or wider runs counts for its whole file. What tests run in other
-processes is not in it.
+The file is JSON: `seconds` of each test function, all its cases together, and of each file, and
+`tests` by path and line. What a fixture of a file or wider runs counts for its whole file. What
+tests run in other processes is not in it.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     try:
         return (yield)
     finally:
-        SECONDS[function] += time.monotonic() - begun_s
+        passed_s = time.monotonic() - begun_s
+        SECONDS[function] += passed_s
+        SECONDS[function.partition("::")[0]] += passed_s
         COVERAGE.switch_context("")
 
 

@@ -8,7 +8,13 @@ from pathlib import Path
 
 from hilstar.instruments.study import codes, colour, rigs
 from hilstar.instruments.study.chain.choices import Parts, five_scenes
-from hilstar.instruments.study.chain.measuring import Rounds, SceneMeasurement
+from hilstar.instruments.study.chain.measuring import (
+    RSS,
+    WHOLE,
+    Rounds,
+    SceneMeasurement,
+    error_budget,
+)
 from hilstar.instruments.study.chain.tracker import StudyTracker
 from hilstar.instruments.study.tradeoff.light import brightness
 from tests.support.recorded import assert_row
@@ -55,8 +61,14 @@ def test_the_errors_of_the_chosen_chain_are_those_recorded() -> None:
         measurement = SceneMeasurement(parts, tracker, scene, Rounds())
         chosen = measurement.marks.auto
         error = measurement.error(chosen)
+        budget = error_budget(measurement, chosen)
     keys = {"scene": scene.name, "bits": BITS, "chosen": "auto"}
     assert_row("chain.csv", keys, asdict(error))
+    assert [part.step for part in budget][-2:] == [RSS, WHOLE]
+    for part in budget:
+        keys = {"bits": BITS, "scene": scene.name, "chosen": "auto", "step": part.step}
+        figures = {"error_arcsec": part.error_arcsec, "error_mag": part.error_mag}
+        assert_row("chain_budget.csv", keys, figures)
 
 
 def test_the_errors_of_a_choice_of_colour_are_those_recorded(tmp_path: Path) -> None:

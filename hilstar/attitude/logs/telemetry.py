@@ -1,5 +1,6 @@
 """A tracker's telemetry: CSV with every row that it has, valid or not, or a log of attitudes
-(AEM, MCAP, JSON lines). JSON lines may have the stars that it reports, as its answers have them.
+(AEM, MCAP, JSON lines). JSON lines may have the stars that it reports, as its answers have them,
+and CSV has them as columns.
 """
 
 import math
@@ -15,6 +16,7 @@ from hilstar.attitude.logs.json_lines import JSON_LINES, json_stars
 from hilstar.attitude.logs.log_file import read_log
 from hilstar.attitude.logs.log_formats import format_of
 from hilstar.attitude.logs.log_times import ns_of_seconds
+from hilstar.attitude.logs.star_columns import StarColumns
 from hilstar.attitude.wire.protocol import NORM_TOLERANCE
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError, shortened
@@ -109,7 +111,10 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
     valid: list[bool] = []
     line: list[int] = []
     rates_rad_s: list[list[float]] = []
-    for number, cells in _rows(path):
+    star_rows: list[list[list[float | None]]] = []
+    for row in _answers(path):
+        number, cells = row.line, row.cells
+        star_rows.append(row.stars)
         t_ns.append(_time(path, number, cells[0]))
         if rising and len(t_ns) > 1 and t_ns[-1] <= t_ns[-2]:
             fault = f"t_s = {shortened(cells[0])} after {t_ns[-2] / NS_PER_S:.9g}"
@@ -125,6 +130,8 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
             raise InputError(f"{path}: more than {MAX_ROWS} rows; give a shorter recording")
     attitudes = np.array(q).reshape(len(q), 4)
     flags = np.array(valid, dtype=np.bool_)
+    if not any(star_rows):
+        star_rows = []
     attitudes[flags] = normalise(attitudes[flags])
     return Telemetry(
         path,
@@ -133,11 +140,44 @@ def _read_csv(path: Path, rising: bool) -> Telemetry:
         flags,
         np.array(line, dtype=np.intp),
         rate_cam_rad_s=np.array(rates_rad_s).reshape(len(q), 3),
+        star_rows=star_rows,
     )
 
 
-def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """Line numbers with the cells of COLUMNS, of the flag and of RATE_COLUMNS ("": not there).
+@dataclass(frozen=True, slots=True)
+class TelemetryRow:
+    """A row of a table: its line, the cells of COLUMNS, of the flag and of RATE_COLUMNS ("": not
+    there), and its stars; `has_one_star` where the table has one star in each row.
+    """
+
+    line: int
+    cells: list[str]
+    stars: list[list[float | None]]
+    has_one_star: bool
+
+
+def _answers(path: Path) -> Iterator[TelemetryRow]:
+    """The rows of a table's answers: of one star a row those of one time together. Raises
+    InputError where their attitudes differ.
+    """
+    answer: TelemetryRow | None = None
+    for row in _rows(path):
+        is_same = row.has_one_star and answer is not None and row.cells[0] == answer.cells[0]
+        if answer is None or not is_same:
+            if answer is not None:
+                yield answer
+            answer = row
+            continue
+        if row.cells != answer.cells:
+            fault = f"another attitude at t_s = {shortened(row.cells[0])}"
+            raise InputError(f"{path}:{row.line}: {fault}; repeat the answer beside each star")
+        answer.stars.extend(row.stars)
+    if answer is not None:
+        yield answer
+
+
+def _rows(path: Path) -> Iterator[TelemetryRow]:
+    """The rows of a table.
 
     What was taken that is not plainly stated is logged as a warning. Raises InputError for a column
     that is missing or there twice, and for one or two columns of a rate.
@@ -153,9 +193,12 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
         others = rates_of_others(table)
         if others and not any(rates):
             table.notices.append(others)
+        star_columns = StarColumns(table)
         table.warn()
         for line, cells in table.rows(keep_cut=False):
-            yield line, [table.cell(cells, chosen) for chosen in (*places, flag, *rates)]
+            answer = [table.cell(cells, chosen) for chosen in (*places, flag, *rates)]
+            stars = star_columns.of_row(path, line, cells)
+            yield TelemetryRow(line, answer, stars, star_columns.one_a_row)
         if table.is_cut:
             warn_once(f"{path}: {CUT}")
 

@@ -205,7 +205,8 @@ class Acceptance(AcceptedBench):
         else:
             arcsec, seconds = self.own_error
             seed = self.plan.seed
-            cases = with_motion(result.cases, requires, self.file, self.scale)
+            through = self.plan.through
+            cases = with_motion(result.cases, requires, self.file, self.scale, through)
             verdicts = verdicts_of(requires, cases, self.scale, seed, arcsec, seconds)
         return [
             self._told(clause, verdict, unit)

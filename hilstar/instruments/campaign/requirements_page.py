@@ -106,7 +106,7 @@ def write_requirements(
     bench_arcsec = None
     if certificate is not None:
         bench_arcsec = certificate.attitude_arcsec
-    cases = with_motion(cases, plan.require, file, scale)
+    cases = with_motion(cases, plan.require, file, scale, plan.through)
     verdicts = verdicts_of(plan.require, cases, scale, plan.seed, bench_arcsec)
     rows = []
     for verdict in verdicts:

@@ -1,6 +1,8 @@
 """How the proper motion, or the parallax, of a field's stars turns the attitude of a tracker that
 does not follow it.
 
+Before a display the field is the part of it that the display covers: a tracker sees no other star.
+
 Such a tracker takes stars that have moved for stars at their old places: its attitude is off by the
 turn that carries the old places onto the new ones, to the least squares. The turn is that of the
 field's BRIGHTEST stars, as a tracker takes them. Where a star moves by more than MAX_ARCSEC_YR in a
@@ -20,7 +22,9 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.case_table import VARY, Columns
 from hilstar.instruments.campaign.plan import MOTION_QUANTITIES, PARALLAX, Require, changed_bench
+from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.cameras import bench_camera
 from hilstar.server.bench.config.bench_config import jyear
 from hilstar.server.bench.star_light import bench_moving, catalogue_choice
 from hilstar.sky.star_table import choose_catalog
@@ -43,8 +47,8 @@ OF_OBSERVER = ("sky", "spacecraft")  # tables of the bench file that place the o
 @dataclass(frozen=True, slots=True)
 class StarMotion:
     """The stars of a bench, the brightest first: unit vectors (n, 3), ICRS, at the bench's date
-    `jyear`, how these change in a year (n, 3), their parallaxes (n,), and the largest change of a
-    star with which a field's turn is known.
+    `jyear`, how these change in a year (n, 3), their parallaxes (n,), the largest change of a star
+    with which a field's turn is known, and the display before the tracker, if there is one.
     """
 
     jyear: float
@@ -52,10 +56,13 @@ class StarMotion:
     yearly: FloatArray
     parallax_mas: FloatArray
     max_arcsec: float = MAX_ARCSEC_YR
+    display: Camera | None = None
 
     @classmethod
-    def of(cls, file: BenchFile) -> "StarMotion":
-        """The stars of a bench file. Raises InputError as its catalogue does."""
+    def of(cls, file: BenchFile, display: Camera | None = None) -> "StarMotion":
+        """The stars of a bench file, seen on its display or in the sky. Raises InputError as its
+        catalogue does.
+        """
         sky = file.config.sky
         catalog = choose_catalog(catalogue_choice(file.config, file.folder))
         catalog = catalog.brighter_than(sky.faintest_v_mag)
@@ -64,7 +71,8 @@ class StarMotion:
         before = unit_vectors_icrs(catalog, date - 0.5)
         after = unit_vectors_icrs(catalog, date + 0.5)
         vectors = unit_vectors_icrs(catalog, date)
-        return cls(date, vectors, after - before, catalog.parallax_mas)
+        yearly = after - before
+        return cls(date, vectors, yearly, catalog.parallax_mas, display=display)
 
     def by_parallax(self, moving: "MovingSky") -> "StarMotion":
         """The same stars, whose change (n, 3) is that by their parallax for an observer."""
@@ -82,6 +90,9 @@ class StarMotion:
         inside = depth > 0
         inside &= np.abs(seen_cam[:, 0]) < half_x * depth
         inside &= np.abs(seen_cam[:, 1]) < half_y * depth
+        if self.display is not None:
+            x_px, y_px = self.display.project(seen_cam @ self.display.cam_to_image.T)
+            inside &= self.display.contains_px(x_px, y_px)
         return np.flatnonzero(inside)
 
     def turn_rad(self, q_icrs_to_cam: FloatArray, rows: IntArray) -> FloatArray:
@@ -107,12 +118,19 @@ class StarMotion:
         return self.turn_rad(q_icrs_to_cam, rows)
 
 
-def with_motion(cases: Columns, requires: list[Require], file: BenchFile, scale: Scale) -> Columns:
-    """The cases with the columns that a requirement of proper motion or parallax is found from."""
+def with_motion(
+    cases: Columns, requires: list[Require], file: BenchFile, scale: Scale, through: str
+) -> Columns:
+    """The cases with the columns that a requirement of proper motion or parallax is found from;
+    `through` is the plan's: "tracker", or "display" or "bench", where the display bounds the field.
+    """
     quantities = {require.quantity for require in requires}
     numbers: dict[str, FloatArray] = {}
     if quantities & {*MOTION_QUANTITIES, PARALLAX}:
-        motion = StarMotion.of(file)
+        display = None
+        if through != "tracker":
+            display = bench_camera(file.config, file.folder)
+        motion = StarMotion.of(file, display)
         if quantities & set(MOTION_QUANTITIES):
             numbers |= _of_proper_motion(cases, motion, scale)
         if PARALLAX in quantities:

@@ -286,7 +286,9 @@ def _by_law(session: Session) -> Part:
     """Scintillation by Young's law of aperture, exposure and air mass; NaN without an air mass."""
     tracker = session.file.config.tracker
     masses = [air_mass for air_mass in session.light.masses if air_mass is not None]
-    if not masses or tracker.exposure_s <= 0:
+    exposures_s = [shot.photo.exposure_s for shot in session.shots if shot.photo.exposure_s]
+    exposure_s = float(np.mean(exposures_s or [tracker.exposure_s]))
+    if not masses or exposure_s <= 0:
         return Part(
             LAW,
             math.nan,
@@ -298,10 +300,10 @@ def _by_law(session: Session) -> Part:
     height_m = 0.0
     if site is not None:
         height_m = site.height_m
-    sigma = young(tracker.aperture_mm, np.array([mass]), height_m, tracker.exposure_s)
+    sigma = young(tracker.aperture_mm, np.array([mass]), height_m, exposure_s)
     how = (
         f"Young's law at {height_m:g} m: air mass {mass:.2f}, {tracker.aperture_mm:g} mm and"
-        f" {tracker.exposure_s:g} s; not measured, as no star is in two photographs: it is in what"
+        f" {exposure_s:g} s; not measured, as no star is in two photographs: it is in what"
         " is unexplained"
     )
     return Part(LAW, MAG * float(sigma[0]), how)

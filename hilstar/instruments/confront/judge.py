@@ -42,7 +42,9 @@ HALO_PX = 15.0  # about a saturated star, sources are its own light
 LIT_SIGMA, MASK_PX, MAX_CHI = 0.1, 5, 5.0
 CELLS = 4
 DIM_MAG, DIM_STARS, DIM_SIGMAS = 0.25, 2, 4.0
-HOT_SIGMAS, HOT_SHARE, HOT_LIGHT = 6.0, 0.75, 0.5
+HOT_SIGMAS, HOT_SHARE = 6.0, 0.75
+# of a hot pixel's light that its eight neighbours may have, where stars moved and where not
+HOT_LIGHT, ALONE_LIGHT = 0.5, 0.1
 MOVED_PX = 5.0  # by which stars move between photographs that tell them from hot pixels
 # Hipparcos is complete to 7.3 + 1.1 |sin b| for late types (ESA SP-1200 vol. 1, 1.1). Over the last
 # magnitude before it, its own stars grow by 0.477, 0.458 and 0.434 dex a magnitude for |sin b|
@@ -207,34 +209,17 @@ class Judge:
         exposure_s = max(config.tracker.exposure_s, 1e-12)
         gain_e_per_dn = config.tracker.detector.gain_e_per_dn
         self._own_mag = -2.5 * math.log10(exposure_s / gain_e_per_dn)
-        self.hot, self.dead = self._defects()
+        above_sigmas = (self._above_sigmas(shot) for shot in session.shots)
+        self.hot, self.dead = defects(above_sigmas, self._moved_px() >= MOVED_PX)
 
     def close(self) -> None:
         """Free the simulator's context."""
         self._simulator.close()
 
-    def _defects(self) -> tuple[BoolArray, BoolArray]:
-        """Pixels (height, width) that are bright, or dark, in nearly all of several photographs
-        whose stars moved.
-        """
-        session = self.session
-        height, width = session.shots[0].photo.dn.shape
-        bright_counts = np.zeros((height, width), dtype=np.int16)
-        dark_counts = np.zeros((height, width), dtype=np.int16)
-        for shot in session.shots:
-            noise_dn = np.sqrt(session.pixels.variance_dn2(shot.level.level))
-            sigmas = shot.above_dn / noise_dn
-            # the sum of the eight neighbours: a star's light is there too
-            around = ndimage.uniform_filter(sigmas, 3) * 9 - sigmas
-            is_alone = around < HOT_LIGHT * np.abs(sigmas) + 3 * math.sqrt(8)
-            bright_counts += (sigmas > HOT_SIGMAS) & is_alone
-            dark_counts += sigmas < -HOT_SIGMAS
-        # stars that did not move may have one pixel in each photograph, too: of these, pixels
-        # that share nothing at all with their neighbours
-        if self._moved_px() < MOVED_PX:
-            bright_counts *= around < 0.1 * np.abs(sigmas) + 2 * math.sqrt(8)
-        minimum = max(1, math.ceil(HOT_SHARE * len(session.shots)))
-        return bright_counts >= minimum, dark_counts >= minimum
+    def _above_sigmas(self, shot: Shot) -> FloatArray:
+        """A photograph above its background, in sigmas of its pixels' noise."""
+        noise_dn = np.sqrt(self.session.pixels.variance_dn2(shot.level.level))
+        return np.asarray(shot.above_dn / noise_dn)
 
     def _moved_px(self) -> float:
         """How far apart boresights of the photographs are along an axis of the sky, px."""
@@ -509,6 +494,27 @@ class Judge:
         information = max(float((motion**2).sum()), 1e-12)
         years = float((motion * off_px / sigma_px).sum()) / information
         return DatedBy(years, information**-0.5)
+
+
+def defects(photographs: Iterable[FloatArray], have_moved: bool) -> tuple[BoolArray, BoolArray]:
+    """Pixels (height, width) that are bright, or dark, in nearly all of several photographs, each
+    above its background in sigmas; `have_moved` is whether their stars are on other pixels in each.
+    """
+    # stars that did not move may have one pixel in each photograph, too: of these, pixels that
+    # share nothing at all with their neighbours
+    share, unsure = (HOT_LIGHT, 3.0) if have_moved else (ALONE_LIGHT, 2.0)
+    bright_counts: IntArray = np.zeros(1, dtype=np.int64)
+    dark_counts: IntArray = np.zeros(1, dtype=np.int64)
+    count = 0
+    for sigmas in photographs:
+        count += 1
+        # the sum of the eight neighbours: a star's light is there too
+        around = ndimage.uniform_filter(sigmas, 3) * 9 - sigmas
+        is_alone = around < share * np.abs(sigmas) + unsure * math.sqrt(8)
+        bright_counts = bright_counts + ((sigmas > HOT_SIGMAS) & is_alone)
+        dark_counts = dark_counts + (sigmas < -HOT_SIGMAS)
+    minimum = max(1, math.ceil(HOT_SHARE * count))
+    return bright_counts >= minimum, dark_counts >= minimum
 
 
 def light_at(above_dn: FloatArray, x_px: float, y_px: float) -> float:

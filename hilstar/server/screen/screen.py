@@ -174,7 +174,7 @@ class Screen:
         self.output: OutputState | None = None
         self.forced: list[str] = []
         self.aids = Aids()
-        self.swap_to_light_ns = round(
+        self._flip_to_light_ns = round(
             (bench.scan.scanout_s / 2 * 1e3 + monitor.panel_delay_ms) * NS_PER_MS
         )
         self.keep_time(1000.0 / monitor.refresh_hz, False, time.monotonic_ns())
@@ -207,8 +207,12 @@ class Screen:
         for a refresh each.
         """
         self.budget = DrawBudget(self.clock.period_ns, guard_ms * NS_PER_MS)
-        self.swap_to_light_ns += round((queued - self.queued) * self.clock.period_ns)
         self.queued = queued
+
+    @property
+    def swap_to_light_ns(self) -> int:
+        """The time from a swap to the middle row's first light."""
+        return self._flip_to_light_ns + round(self.queued * self.clock.period_ns)
 
     @property
     def closing(self) -> bool:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import pytest
 
+from hilstar.server import doctor
 from tests.support.any_bench.draw import drawn_bench, write_bench
 from tests.support.any_bench.judge import (
     FIRST_LIGHT,
@@ -43,6 +44,12 @@ SHARP, SHARP_ARCSEC = 21, 0.1
 MEASURED = {"focus", "geometry", "uniformity", "photometry", "scale"}
 
 
+@pytest.fixture
+def without_cameras(monkeypatch):
+    """No bench here has one, and looking for one takes a second: tests/screen does."""
+    monkeypatch.setattr(doctor, "child_command", lambda: None)
+
+
 def results_of(bench, folder, commands):
     """What the commands of a bench print, by their names."""
     write_bench(bench, folder)
@@ -58,7 +65,7 @@ def results_of(bench, folder, commands):
 
 
 @pytest.mark.e2e
-@pytest.mark.usefixtures("without_charts")
+@pytest.mark.usefixtures("without_charts", "without_cameras")
 @pytest.mark.parametrize("number", NUMBERS)
 def test_a_bench_by_chance_is_calibrated_and_each_figure_is_within_its_error(tmp_path, number):
     bench = drawn_bench(SEED, number)
@@ -71,7 +78,7 @@ def test_a_bench_by_chance_is_calibrated_and_each_figure_is_within_its_error(tmp
 
 
 @pytest.mark.e2e
-@pytest.mark.usefixtures("without_charts")
+@pytest.mark.usefixtures("without_charts", "without_cameras")
 @pytest.mark.parametrize("number", SMALL_NUMBERS)
 def test_each_figure_of_a_small_bench_is_within_its_error(tmp_path, number):
     bench = drawn_bench(SMALL_SEED, number, is_small=True)

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.display.render.reference import extended_image
 from hilstar.optics.camera import Camera
 from hilstar.optics.extended import (
     SMALL_SIGMAS,
     DiscLight,
     DiscView,
+    GlowLight,
     LightMap,
     Pose,
     Shear,
@@ -27,6 +29,8 @@ AT_REST = np.array([1.0, 0.0, 0.0, 0.0])
 # A pixel lights up as late as its place in a camera at rest says: by 1.25 % of the move, at most
 # 0.7 px, it has moved on since.
 PLACE_PX = 0.01
+# the square of half a pixel to the scale, 26 px, times half of the exponent: 6.5e-4
+HALF_A_PIXEL = 1e-3
 
 
 def centre_px(lights) -> np.ndarray:
@@ -92,3 +96,20 @@ def test_a_map_moved_by_part_of_a_pixel_keeps_its_light_and_moves_its_middle(by_
     assert moved.cover.shape == moved.image.shape
     np.testing.assert_allclose(centre_px([moved]), centre_px([light]) + by_px, atol=2e-3)
     assert shifted(light, 0.0, 0.0) is light
+
+
+@pytest.mark.parametrize("exponent", [1.0, 2.0, 3.5])
+def test_a_glow_falls_by_its_angle_from_its_direction_also_from_beside_the_image(exponent):
+    """At the scale it has 2^(-exponent / 2) of its peak."""
+    for middle_deg in (0.0, 40.0):  # the second is beside the field of 11 degrees
+        middle_rad = np.radians(middle_deg)
+        direction = np.array([np.sin(middle_rad), 0.0, np.cos(middle_rad)])
+        scale_rad = np.radians(3.0)
+        glow = GlowLight(direction, 5e3, scale_rad, exponent, CAMERA)
+        image = extended_image((glow,), SIZE_PX)
+        x_px = np.arange(SIZE_PX[0])
+        away_rad = middle_rad - np.arctan((x_px - MIDDLE_PX[0]) / CAMERA.focal_length_px)
+        # between the two rows in the middle, half a pixel from the plane of the direction
+        along = image[39:41].mean(axis=0)
+        wanted = 5e3 * (1 + (away_rad / scale_rad) ** 2) ** (-exponent / 2)
+        assert along == pytest.approx(wanted, rel=HALF_A_PIXEL)

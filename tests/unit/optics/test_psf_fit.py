@@ -14,11 +14,13 @@ from hilstar.optics.psf_fit import (
     PointImages,
     cell_quadrature,
     fit_each,
+    node_count,
     over_field,
     place_terms,
 )
 
 OFFSETS_PX = np.arange(-9.0, 10.0)
+NODES_LIMIT = 1.5e-7  # of a peak, as stated beside NODES_FROM
 # Nine nodes of Gauss over a pixel, two sigmas wide at the narrowest here.
 SHARE_LIMIT = 1e-9
 # The middles of 40 x 40 parts of a pixel: the midpoint rule is right to h^2 / 24 of the curvature,
@@ -150,3 +152,17 @@ def test_a_field_is_found_beside_a_dot_with_a_neighbour(rng):
     off, off_plain = (np.abs(found - coefficients).max() for found in (robust, plain))
     assert off < 1e-3
     assert off_plain > 10 * off
+
+
+@pytest.mark.parametrize("sigma_cells", [0.0, 0.45, 0.69, 0.7, 1.0, 1.99, 2.0, 30.0])
+def test_a_cell_s_light_is_a_gaussian_s_by_few_nodes(sigma_cells):
+    """Against the normal distribution; a sigma of 0 has its nodes, too."""
+    nodes, weights = cell_quadrature(0.0, node_count(sigma_cells))
+    assert weights.sum() == pytest.approx(1, abs=1e-12)
+    if not sigma_cells:
+        return
+    places = np.linspace(-3, 3, 13) * sigma_cells
+    density = np.exp(-0.5 * ((places[:, None] + nodes) / sigma_cells) ** 2) @ weights
+    light = ndtr((places + 0.5) / sigma_cells) - ndtr((places - 0.5) / sigma_cells)
+    light *= sigma_cells * np.sqrt(2 * np.pi)  # of a peak of 1
+    assert density == pytest.approx(light, abs=NODES_LIMIT)

@@ -11,6 +11,7 @@ from astropy.coordinates import get_sun
 from astropy.time import Time
 
 from hilstar.basics.rotation import propagate, to_matrix
+from hilstar.display.render.reference import extended_image
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import GaussianPsf, pixel_shares
 from hilstar.optics.sprites import FrameLight
@@ -21,6 +22,7 @@ from hilstar.optics.trails import (
     Trails,
     TrailView,
     disc_of,
+    disc_trail,
     sprite_counts,
     trails,
     with_trails,
@@ -41,6 +43,9 @@ FLUX_LIMIT = 1e-5  # the midpoints of 400 moments, where the light changes; floa
 # One over the poles, which crosses the station's path
 LIST = "OTHER\n" + element_set(7, (97.0, 252.0, 130.0, 322.0), 0.001, 15.0)
 NORTH = np.array([0.0, 0.0, 1.0])
+DISC_FLUX = 0.02  # a crescent by five rays across a pixel
+# of a crescent: the Sun's and the camera's aberration of 20 arcsec each, and a quadrature's share
+LAMBERT = 1e-3
 
 
 def looking_at(direction: np.ndarray) -> np.ndarray:
@@ -83,11 +88,13 @@ def gaussians(x_px: np.ndarray, y_px: np.ndarray, light: np.ndarray) -> np.ndarr
 
 
 def moment_by_moment(
-    sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float
+    sky, t_ns: int, q: np.ndarray, rate: np.ndarray, exposure_s: float, before: float = 0.5
 ) -> np.ndarray:
-    """The mean image, each moment from a pass of its own and an attitude of its own."""
+    """The mean image, each moment from a pass of its own and an attitude of its own; a share
+    `before` of the exposure is before the attitude.
+    """
     places, light = [], []
-    for seconds in ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5) * exposure_s:
+    for seconds in ((np.arange(MOMENTS) + 0.5) / MOMENTS - before) * exposure_s:
         seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns + round(seconds * 1e9))
         if seen is None:
             continue
@@ -121,6 +128,30 @@ def test_a_streak_is_the_light_of_all_its_moments(rate_deg_s, exposure_s):
     assert image_of(found.sprites).sum() == pytest.approx(total, rel=5e-4)
     assert np.abs(image_of(found.sprites) - wanted).max() < PIXEL_LIMIT * total
     assert np.allclose(to_matrix(q) @ found.middle[0], [0, 0, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize("exposure_s", [1e-3, 0.4])
+def test_a_wide_satellite_has_the_light_of_all_its_moments_along_its_path(exposure_s):
+    """Of 4 km: discs, one after the other, whose light is the streak's and lies no farther from it
+    than their radius.
+    """
+    sky, t_ns = lit_moment(LIST, "norad,size_m\n7,4000\n")
+    seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).only(np.array([0]))
+    q = looking_at(seen.directions(slice(None), np.zeros(1))[0])
+    rate = np.radians((0.5, -1.0, 10.0))
+    lit = Lit(np.array([-exposure_s / 8]), exposure_s)
+    trail = disc_trail(seen, "wide", TrailView(CAMERA, to_matrix(q), rate), lit, BRUSH)
+    wanted = moment_by_moment(sky, t_ns, q, rate, exposure_s, 1 / 8)
+    assert trail.electrons_per_s == pytest.approx(wanted.sum(), rel=1e-3)
+    assert trail.shares.sum() == pytest.approx(1)
+    assert len(trail.along) == len(trail.shares)
+    assert (len(trail.along) > 1) == (exposure_s > 0.1)
+    image = extended_image(trail.lights, SIZE_PX)
+    assert image.sum() == pytest.approx(wanted.sum(), rel=DISC_FLUX)
+    path = np.argwhere(wanted > 1e-3 * wanted.max())
+    light = np.argwhere(image > 1e-3 * image.max())
+    away_px = np.linalg.norm(light[:, None] - path, axis=2).min(axis=1)
+    assert away_px.max() < trail.along[0].radius_rad * CAMERA.focal_length_px + 4 * max(SIGMA_PX)
 
 
 def test_its_length_is_its_own_rate_against_the_camera_s():
@@ -225,6 +256,27 @@ def test_the_sun_lights_a_satellite_s_disc_from_where_astropy_has_it():
     # from the satellite within 10 arcsec; the Sun's aberration of 20 arcsec is in theirs
     assert np.degrees(np.arccos(disc.sun @ sun / np.linalg.norm(sun))) < 0.01
     assert disc.radius_rad == pytest.approx(0.05 / disc.distance_km)
+
+
+def test_a_disc_s_brightest_pixel_is_its_own_light_over_the_disc():
+    """In a telescope, for an exposure in which it stands still. Of the light where the Sun is
+    overhead, a Lambert sphere's disc has 2 / (3 pi) (sin a + (pi - a) cos a) in the mean, a its
+    phase angle.
+    """
+    sky, t_ns = lit_moment(LIST, "norad,size_m\n7,100\n")
+    seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns)
+    direction = seen.directions(slice(None), np.zeros(1))[0]
+    telescope = Camera(SIZE_PX, 1e6, (79.5, 59.5), np.eye(3))
+    view = TrailView(telescope, to_matrix(looking_at(direction)), np.zeros(3))
+    exposure_s = 1e-6
+    trail = disc_trail(seen, "x", view, Lit(np.full(1, -exposure_s / 2), exposure_s), BRUSH)
+    radius_px = np.tan(trail.along[0].radius_rad) * telescope.focal_length_px
+    assert radius_px > 10
+    mean = trail.electrons_per_s / (np.pi * radius_px**2)
+    phase_rad = np.arccos(-trail.along[0].direction @ trail.along[0].sun)
+    lambert = np.sin(phase_rad) + (np.pi - phase_rad) * np.cos(phase_rad)
+    share = 2 / (3 * np.pi) * lambert
+    assert mean / trail.brightest_e_per_s == pytest.approx(share, rel=LAMBERT)
 
 
 class StraightPass:

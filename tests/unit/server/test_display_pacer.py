@@ -221,6 +221,9 @@ def test_the_middle_row_lights_half_a_scan_out_and_the_panel_s_delay_after_the_s
     for queued in (2, 2, 0):
         screen.keep_ahead(1.0, queued)
         assert screen.swap_to_light_ns == pytest.approx(9_000_000 + queued * period_ns, abs=2)
+    screen.keep_ahead(1.0, 2)
+    screen.keep_time(screen.clock.period_ns / 1e6, True, 0)
+    assert screen.swap_to_light_ns == 9_000_000
 
 
 def test_the_budget_is_a_period_until_frames_have_been_timed_and_then_passes_over_two_outliers():

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import json
+import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -266,3 +269,75 @@ def test_half_a_rate_is_refused(tmp_path: Path, header: str, row: str, told: str
     path.write_text(f"t_s,qw,qx,qy,qz,{header}\n0,1,0,0,0,{row}\n")
     with pytest.raises(InputError, match=told):
         read_telemetry(path)
+
+
+# one answer of two stars, one of one, one of none, as JSON lines, as columns and as a row a star
+STARS = [
+    [[10.0, 20.5, 100.0, 26311.0, 0.9], [30.0, 40.0, None, None, None]],
+    [[31.0, 41.0, 7.0, None, None]],
+    [],
+]
+STAR_FORMS = {
+    "stars.jsonl": "".join(
+        f'{{"t_ns": {k * 10**8}, "q": [{Q}], "valid": true, "centroids": {json.dumps(stars)}}}\n'
+        for k, stars in enumerate(STARS)
+    ),
+    "columns.csv": (
+        "t_s,qw,qx,qy,qz,star1_x_px,star1_y_px,star1_dn,star1_hip,star1_width_px"
+        ",star2_x,star2_y [px],star2_flux\n"
+        f"0,{Q},10,20.5,100,26311,0.9,30,40,\n0.1,{Q},,,,,,31,41,7\n0.2,{Q},,,,,,,,\n"
+    ),
+    "rows.csv": (
+        "t_s,qw,qx,qy,qz,star_x_px,star_y_px,star_dn,star_hip,star_width_px\n"
+        f"0,{Q},10,20.5,100,26311,0.9\n0,{Q},30,40,,,\n0.1,{Q},31,41,7,,\n0.2,{Q},,,,,\n"
+    ),
+    "other_names.csv": (
+        "t_s,qw,qx,qy,qz,centroid_1_x,centroid_1_y,centroid_1_dn,centroid_1_hip,centroid_1_width"
+        ",centroid_2_x,centroid_2_y,centroid_2_mag\n"
+        f"0,{Q},10,20.5,100,26311,0.9,30,40,\n0.1,{Q},,,,,,31,41,{-2.5 * math.log10(7)!r}\n"
+        f"0.2,{Q},,,,,,,,\n"
+    ),
+}
+
+
+@pytest.mark.parametrize("name", STAR_FORMS)
+def test_a_tracker_s_stars_are_the_same_in_every_form_of_telemetry(csv_of, name):
+    telemetry = read_telemetry(csv_of(STAR_FORMS[name], name))
+    assert telemetry.t_ns.tolist() == [0, 10**8, 2 * 10**8]
+    for row, stars in zip(telemetry.star_rows, STARS, strict=True):
+        told = np.array(row, dtype=np.float64)  # NaN for None
+        np.testing.assert_allclose(told, np.array(stars, dtype=np.float64), rtol=1e-12)
+
+
+def test_telemetry_without_stars_has_no_rows_of_them(csv_of):
+    text = f"t_s,qw,qx,qy,qz,star_counts,star_mag\n0,{Q},9,5.5\n0.1,{Q},8,5.4\n"
+    assert not read_telemetry(csv_of(text)).star_rows
+
+
+@pytest.mark.parametrize(
+    ("columns", "cells", "fault"),
+    [
+        ("star1_x_px", "1", "of star1 both x and y are needed"),
+        ("star1_x,star1_y", "1,", ":2: star1_y_px = '' is not a finite number; leave the cells"),
+        ("star1_x,star1_y,star1_dn", "1,2,bright", "star1_dn = 'bright' is not a finite number"),
+        (
+            "star1_x,star1_y,star1_dn,star1_mag",
+            "1,2,3,4",
+            "star1 has several signals; keep one of dn",
+        ),
+        ("star1_x,star1_y,star1_mag", "1,2,-9999", "star1_mag = -9999 is no magnitude"),
+        ("star1_x,star1_y,star1_dn,star1_flux", "1,2,3,4", "star1 has several signals"),
+        ("star1_x,star1_y,centroid1_x,centroid1_y", "1,2,3,4", "two names of one star"),
+        ("star_x,star_y,star1_x,star1_y", "1,2,3,4", "one star a row beside numbered ones"),
+    ],
+)
+def test_columns_of_stars_that_mean_two_things_are_refused(csv_of, columns, cells, fault):
+    text = f"t_s,qw,qx,qy,qz,{columns}\n0,{Q},{cells}\n"
+    with pytest.raises(InputError, match=re.escape(fault)):
+        read_telemetry(csv_of(text))
+
+
+def test_two_attitudes_at_one_time_of_a_row_a_star_are_refused(csv_of):
+    text = f"t_s,qw,qx,qy,qz,star_x,star_y\n0,{Q},1,2\n0,{OTHER},3,4\n"
+    with pytest.raises(InputError, match=":3: another attitude at t_s = 0; repeat the answer"):
+        read_telemetry(csv_of(text))

@@ -120,6 +120,9 @@ MESSAGES = {
     "TLS, kind and version alone": (b"\x16\x03\x01", "TLS"),
     "ZeroMQ": (b"\xff" + bytes(8) + b"\x7f\x03\x00NULL", "ZeroMQ"),
     "NMEA": (b"$GPGGA,123519,4807.038,N*47\r\n", "NMEA"),
+    "MAVLink 1": (b"\xfe\x09" + bytes(15), "a MAVLink frame"),
+    "MAVLink 2": (b"\xfd\x09" + bytes(19), "a MAVLink frame"),
+    "MAVLink 2, signed": (b"\xfd\x09\x01" + bytes(31), "a MAVLink frame"),
     "UBX": (b"\xb5\x62\x01\x07\x5c\x00", "UBX"),
     "COBS in a datagram": (
         frame(AttitudeSample(1, np.array([1.0, 0, 0, 0]))),

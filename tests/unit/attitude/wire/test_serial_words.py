@@ -9,7 +9,13 @@ import pytest
 from hilstar.attitude.wire.likeness import MAX_LOOKED_AT
 from hilstar.attitude.wire.packet import Refusal
 from hilstar.attitude.wire.roads import RawMessage
-from hilstar.attitude.wire.serial_link import SerialApart, SerialDecoder, SerialLink, read_lines
+from hilstar.attitude.wire.serial_link import (
+    DRAIN_LOOK_S,
+    SerialApart,
+    SerialDecoder,
+    SerialLink,
+    read_lines,
+)
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import NS_PER_S
 from hilstar.server.open_link import first_attitude
@@ -90,3 +96,36 @@ def test_a_line_s_time_is_that_of_its_first_bit(baud: int) -> None:
     by_text = reading.result()
     assert by_text[b"light 12"] == 5 * NS_PER_S - 9 * 10 * NS_PER_S // baud
     assert by_text[b""] == 5 * NS_PER_S - 10 * NS_PER_S // baud
+
+
+class Draining:
+    """A port that has sent `bytes_each` more of its bytes at each look."""
+
+    def __init__(self, waiting: int, bytes_each: int) -> None:
+        self.waiting = waiting
+        self.bytes_each = bytes_each
+        self.dropped = 0
+
+    @property
+    def out_waiting(self) -> int:
+        self.waiting = max(0, self.waiting - self.bytes_each)
+        return self.waiting
+
+    def reset_output_buffer(self) -> None:
+        self.dropped += self.waiting
+        self.waiting = 0
+
+
+@pytest.mark.parametrize(("bytes_each", "looks", "dropped"), [(30, 9, 0), (0, 100, 300)])
+def test_what_is_sent_leaves_before_the_end_unless_the_line_stalls(bytes_each, looks, dropped):
+    """300 bytes, of which the tenth look finds none; a line that stalls loses them after 0.5 s."""
+    clock = FakeClock()
+    with serial_line() as (_, name), SerialLink(name, BAUD, clock=clock) as link:
+        device = Draining(300, bytes_each)
+        own, link._road._device = link._road._device, device
+        clock.slept_s.clear()
+        link._road.drain()
+        link._road._device = own
+    assert (device.waiting, device.dropped) == (0, dropped)
+    assert clock.slept_s[:looks] == [DRAIN_LOOK_S] * looks
+    assert sum(clock.slept_s) == pytest.approx(looks * DRAIN_LOOK_S, abs=2 * DRAIN_LOOK_S)

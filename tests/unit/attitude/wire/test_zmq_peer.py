@@ -9,8 +9,12 @@ from collections.abc import Iterator
 import pytest
 import zmq
 
+from hilstar.attitude.wire import zmq_peer as zmq_peer_module
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
+from hilstar.attitude.wire.zmq_peer import PeerLook
 from hilstar.basics.notices import Notices
+from tests.support.fake_clock import FakeClock
+from tests.support.waiting import wait_for
 
 WITHIN_S = 20.0  # a silent peer takes 3 s; a busy machine is slower
 POLL_MS = 50
@@ -138,3 +142,27 @@ def test_another_type_of_socket_that_connects_to_ours_is_rejected_in_words() -> 
             link.receive(POLL_MS)
             assert link.trouble == ""
     assert "another type of ZeroMQ socket" in notices.latest("client-rejected")
+
+
+def test_a_peer_is_looked_at_once_in_five_seconds_and_told_once(monkeypatch) -> None:
+    """However often it rejects us: each look is a connection of its own."""
+    looked: list[str] = []
+
+    def answer_of(address: str) -> bytes:
+        looked.append(address)
+        return b"220 bench FTP server ready\r\n"
+
+    monkeypatch.setattr(zmq_peer_module, "answer_of", answer_of)
+    clock = FakeClock()
+    look = PeerLook("tcp://127.0.0.1:9", "SUB", False, clock)
+    told: list[str] = []
+    for tenths in range(121):
+        before = len(looked)
+        look.begin()
+        if tenths % 50 == 0:
+            wait_for(lambda before=before: len(looked) > before and look._found, "the look")
+        told += [line for line in [look.take()] if line]
+        assert len(looked) == 1 + tenths // 50
+        clock.work(0.1e9)
+    assert len(told) == 1
+    assert "220 bench" in told[0]

@@ -12,8 +12,17 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, KM_PER_AU
 from hilstar.instruments.assess.places import Scale
-from hilstar.instruments.campaign.star_motion import BRIGHTEST, StarMotion, turn_of
+from hilstar.instruments.campaign.case_table import Columns
+from hilstar.instruments.campaign.plan import Require
+from hilstar.instruments.campaign.star_motion import (
+    BRIGHTEST,
+    YEARLY_TURN,
+    StarMotion,
+    turn_of,
+    with_motion,
+)
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.cameras import bench_camera
 from hilstar.server.bench.star_light import bench_moving
 from tests.support.acceptance import write_bench
 from tests.support.claims import holds
@@ -62,6 +71,31 @@ def test_a_field_with_a_fast_star_has_no_likely_turn(motion: StarMotion) -> None
     q = from_radec_roll_deg(316.7, 38.7, 0.0)
     assert np.isnan(motion.likely_turn_rad(q, SCALE)).all()
     assert np.isfinite(motion.whole_turn_rad(q, SCALE)).all()
+
+
+@pytest.mark.parametrize(("through", "is_bounded"), [("tracker", False), ("bench", True)])
+def test_before_a_display_the_stars_are_those_that_it_covers(
+    through: str, is_bounded: bool, tmp_path: Path, rng: np.random.Generator
+) -> None:
+    """A display of 320 x 240 pixels of 57.65 um behind 150 mm covers half of a field of 9.5 deg."""
+    file = read_bench_file(write_bench(tmp_path, collimator={"focal_length_mm": 150}))
+    display = bench_camera(file.config, file.folder)
+    bounded, whole = StarMotion.of(file, display), StarMotion.of(file)
+    q = Rotation.random(20, random_state=rng).as_quat(scalar_first=True)
+    half = 0.05765 / 150 * np.array([160.0, 120.0])
+    turns = []
+    for attitude in q:
+        all_rows = whole.in_field(attitude, SCALE)
+        seen = whole.vectors[all_rows] @ to_matrix(attitude).T
+        covered = (np.abs(seen[:, :2]) < half * seen[:, 2:]).all(axis=1)
+        assert bounded.in_field(attitude, SCALE).tolist() == all_rows[covered].tolist()
+        expected = bounded if is_bounded else whole
+        turns.append(ARCSEC_PER_RAD * expected.likely_turn_rad(attitude, SCALE)[:2])
+    numbers = {name: q[:, k] for k, name in enumerate(("qw", "qx", "qy", "qz"))}
+    cases = Columns(len(q), numbers | {"frames": np.ones(len(q))}, {})
+    require = Require(quantity="catalogue-age", maximum=1.0)
+    with_turns = with_motion(cases, [require], file, SCALE, through)
+    np.testing.assert_allclose(with_turns.vectors(YEARLY_TURN, "xy"), np.array(turns), rtol=1e-9)
 
 
 def test_a_field_turns_by_the_mean_parallax_of_its_stars(

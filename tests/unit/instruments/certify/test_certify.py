@@ -9,12 +9,14 @@ import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 from astropy.io import fits
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.instruments.certify.assembly import DOT_IMAGES, reference_stars
@@ -26,7 +28,7 @@ from hilstar.instruments.certify.lens import lens_fit
 from hilstar.instruments.certify.model import Figures, true_deviations
 from hilstar.instruments.certify.readings import VirtualReader, dot_places, light_in_squares
 from hilstar.instruments.certify.structure import in_place
-from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.record.ledger_records import read_head
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -182,13 +184,18 @@ def test_structure_is_found_where_it_is_and_not_where_it_is_not() -> None:
 IN_PHASE = (29, 66, 72, 85)
 
 
-@pytest.mark.parametrize("number", IN_PHASE)
-def test_waves_of_the_trackers_pixels_do_not_fit_the_noise_of_dots(tmp_path, number: int) -> None:
-    path = tmp_path / "bench.toml"
+def plain_bench(folder: Path) -> BenchFile:
+    """A bench of an sRGB monitor and a lens without errors."""
+    path = folder / "bench.toml"
     path.write_text(
         BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
     )
-    file = read_bench_file(path)
+    return read_bench_file(path)
+
+
+@pytest.mark.parametrize("number", IN_PHASE)
+def test_waves_of_the_trackers_pixels_do_not_fit_the_noise_of_dots(tmp_path, number: int) -> None:
+    file = plain_bench(tmp_path)
     one = supposed(np.random.default_rng((32, number)))
     x_px, y_px = dot_places(geometry_of(file))
     dots = PlantedReader(one, np.random.default_rng((32, number, 2))).dots(x_px, y_px, DOT_IMAGES)
@@ -268,49 +275,15 @@ def test_a_reading_of_a_lattice_with_few_dots_weighs_by_its_own_noise(tmp_path) 
     """White of a sparse lattice is ten times as noisy as other codes: its interval is its own,
     and theirs are not wider.
     """
-    path = tmp_path / "bench.toml"
-    path.write_text(
-        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
-    )
-    file = read_bench_file(path)
-    codes = np.array(
-        [
-            0,
-            255,
-            40,
-            80,
-            120,
-            160,
-            200,
-            0,
-            255,
-            40,
-            80,
-            120,
-            160,
-            200,
-            0,
-            255,
-            40,
-            80,
-            120,
-            160,
-            200,
-            0,
-        ]
-    )
+    file = plain_bench(tmp_path)
+    codes = np.array([*[0, 255, 40, 80, 120, 160, 200] * 3, 0])
     shape = np.where(codes == 255, 10.0, 1.0)
     rng = np.random.default_rng(4)
     light = (grey_response(file).light[codes] + 1e-3) * 1e6
-    noisy = light * (
-        1
-        + 1e-4
-        * shape
-        * np.where(codes > 0, rng.standard_normal(len(codes)), 0.01 * rng.standard_normal())
-    )
-    deviation = light_deviation(
-        file, LightReadings(codes, noisy, np.zeros(len(codes)), noise=shape * light)
-    )
+    drawn = np.where(codes > 0, rng.standard_normal(len(codes)), 0.01 * rng.standard_normal())
+    noisy = light * (1 + 1e-4 * shape * drawn)
+    readings = LightReadings(codes, noisy, np.zeros(len(codes)), noise=shape * light)
+    deviation = light_deviation(file, readings)
     sigma = np.linalg.norm(deviation.factors, axis=1) / deviation.value
     assert 5 < sigma[-1] / np.median(sigma[:-1]) < 20
 
@@ -319,11 +292,7 @@ def test_a_faint_code_that_reads_below_black_does_not_undo_the_others(tmp_path) 
     """Its light, and so its noise by its light, was 0, and all scatters became infinite: "white
     reads no light above black".
     """
-    path = tmp_path / "bench.toml"
-    path.write_text(
-        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
-    )
-    file = read_bench_file(path)
+    file = plain_bench(tmp_path)
     lit = [1, 20, 40, 80, 120, 160, 200, 255]
     codes = np.array([0, *lit, 0, *lit, 0, *lit, 0])
     rng = np.random.default_rng(4)
@@ -340,44 +309,41 @@ def test_a_faint_code_that_reads_below_black_does_not_undo_the_others(tmp_path) 
     assert deviation.noise == pytest.approx(1e-4, rel=0.5)
 
 
+LIT = [1, 20, 80, 160, 255]
+LIT_TWICE = np.array([0, *LIT, 0, *LIT, 0, 0])
+
+
+def twice_read(file: BenchFile) -> FloatArray:
+    """LIT_TWICE as read above a black of 1000 e-/s: two readings differ by 2e-6, those of black
+    by 2 e-/s.
+    """
+    light = 1e3 + grey_response(file).light[LIT_TWICE] * WHITE_E_PER_S
+    light[LIT_TWICE == 0] += [1.0, -1.0, 1.0, -1.0]
+    is_lit = LIT_TWICE > 1
+    light[is_lit] *= 1 + 1e-6 * np.resize([1, -1], int(is_lit.sum()))
+    return light
+
+
 def test_of_two_readings_of_a_faint_code_the_darker_counts_as_much(tmp_path) -> None:
-    path = tmp_path / "bench.toml"
-    path.write_text(
-        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
-    )
-    file = read_bench_file(path)
-    lit = [1, 20, 80, 160, 255]
-    codes = np.array([0, *lit, 0, *lit, 0, 0])
-    light = 1e3 + grey_response(file).light[codes] * WHITE_E_PER_S
-    light[codes == 0] += [1.0, -1.0, 1.0, -1.0]
-    faint = codes == 1
+    file = plain_bench(tmp_path)
+    light, faint = twice_read(file), LIT_TWICE == 1
     true = float(light[faint][0]) - 1e3
     light[faint] += true / 2 * np.array([1, -1])
-    light[codes > 1] *= 1 + 1e-6 * np.resize([1, -1], int((codes > 1).sum()))
     noise = np.where(faint, true, 1e-5 * light)
-    deviation = light_deviation(
-        file, LightReadings(codes, light, np.zeros(len(codes)), noise=noise)
-    )
+    readings = LightReadings(LIT_TWICE, light, np.zeros(len(light)), noise=noise)
+    deviation = light_deviation(file, readings)
     assert deviation.value[0] == pytest.approx(1, abs=1e-4)
 
 
 def test_what_readings_share_is_no_larger_where_a_faint_code_reads_nothing(tmp_path) -> None:
     """Relative to a reading of no light it was a billion times too large, and so all intervals."""
-    path = tmp_path / "bench.toml"
-    path.write_text(
-        BENCH.format(calibration="srgb", delay_ms=DELAY_MS, geometry="", white=WHITE_E_PER_S)
-    )
-    file = read_bench_file(path)
-    lit = [1, 20, 80, 160, 255]
-    codes = np.array([0, *lit, 0, *lit, 0, 0])
-    light = 1e3 + grey_response(file).light[codes] * WHITE_E_PER_S
-    light[codes == 0] += [1.0, -1.0, 1.0, -1.0]
-    light[codes == 1] = [999.0, 1001.0]
-    light[codes > 1] *= 1 + 1e-6 * np.resize([1, -1], int((codes > 1).sum()))
-    shared_e_per_s = np.where(codes == 0, 0.0, 2.0)[:, None]
-    readings = LightReadings(codes, light, np.zeros(len(codes)), common=shared_e_per_s)
+    file = plain_bench(tmp_path)
+    light = twice_read(file)
+    light[LIT_TWICE == 1] = [999.0, 1001.0]
+    shared_e_per_s = np.where(LIT_TWICE == 0, 0.0, 2.0)[:, None]
+    readings = LightReadings(LIT_TWICE, light, np.zeros(len(light)), common=shared_e_per_s)
     deviation = light_deviation(file, readings)
-    expected = grey_response(file).light[lit] * WHITE_E_PER_S
+    expected = grey_response(file).light[LIT] * WHITE_E_PER_S
     assert deviation.common_factors[:, 0] == pytest.approx(2.0 / expected)
 
 

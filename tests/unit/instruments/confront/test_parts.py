@@ -13,7 +13,7 @@ import pytest
 from scipy.special import ndtr
 
 from hilstar.instruments.confront.excess import Part, _by_law, _rest, _taken
-from hilstar.instruments.confront.judge import StarRow, light_at
+from hilstar.instruments.confront.judge import StarRow, defects, light_at
 from hilstar.instruments.confront.light import LightFit, StarLight, fit_light, with_extinction
 from hilstar.instruments.confront.session import _apart, _middles, within_image
 from hilstar.instruments.confront.star_psf import (
@@ -236,13 +236,14 @@ def test_a_star_with_less_light_than_predicted_is_fainter():
     assert replace(row, flags=("variable",)).counted
 
 
-def session_of(masses, height_m: float | None):
-    """What Young's law is asked for: 30 mm, 0.5 s, at a height."""
+def session_of(masses, height_m: float | None, exposures_s=(None,)):
+    """What Young's law is asked for: 30 mm, 0.5 s, at a height, and photographs' exposures."""
+    shots = [SimpleNamespace(photo=SimpleNamespace(exposure_s=each)) for each in exposures_s]
     tracker = SimpleNamespace(aperture_mm=30.0, exposure_s=0.5)
     site = None if height_m is None else SimpleNamespace(height_m=height_m)
     config = SimpleNamespace(tracker=tracker, site=site)
     return SimpleNamespace(
-        file=SimpleNamespace(config=config), light=SimpleNamespace(masses=masses)
+        file=SimpleNamespace(config=config), light=SimpleNamespace(masses=masses), shots=shots
     )
 
 
@@ -252,6 +253,12 @@ def test_scintillation_by_law_is_youngs_in_magnitudes(height_m, down):
     part = _by_law(session_of((1.0, 2.0, None), height_m))
     relative = 0.09 * 3 ** (-2 / 3) * 1.5**1.75 * down
     assert part.rms == pytest.approx(MAG_A_RELATIVE * relative, rel=1e-12)
+
+
+def test_scintillation_is_that_of_the_photographs_exposure_where_they_state_one():
+    stated = _by_law(session_of((1.0,), None, exposures_s=(2.0, None, 2.0)))
+    assert stated.rms == pytest.approx(_by_law(session_of((1.0,), None)).rms / 2)
+    assert "2 s" in stated.how
 
 
 def test_scintillation_without_an_air_mass_is_not_known():
@@ -273,3 +280,35 @@ def test_what_columns_take_is_their_own_and_not_that_of_chance(rng):
     taken = [_taken(rng.standard_normal((40, 10)), rng.standard_normal(40)) for _ in range(200)]
     # 10 of 39 degrees of freedom would be 0.26 of 1; what is cut at 0 leaves a part of its spread
     assert np.mean(taken) < 0.08
+
+
+def test_pixels_that_are_bright_or_dark_in_all_photographs_are_defects_and_stars_are_not():
+    """A star has a third of its peak beside it; one that a sharp lens has on one pixel moves on."""
+    photographs = []
+    for number in range(4):
+        sigmas = np.zeros((20, 24))
+        sigmas[3, 5] = 50.0  # hot
+        sigmas[15, 2] = -8.0  # dead
+        sigmas[9:12, 8:11] = 20.0
+        sigmas[10, 9] = 60.0
+        sigmas[6, 12 + 2 * number] = 40.0
+        sigmas[17, 20] = 30.0 * (number != 0)  # hot in three of four
+        sigmas[1, 20] = 30.0 * (number > 1)
+        photographs.append(sigmas)
+    hot, dead = defects(photographs, have_moved=True)
+    assert np.argwhere(hot).tolist() == [[3, 5], [17, 20]]
+    assert np.argwhere(dead).tolist() == [[15, 2]]
+
+
+def test_where_stars_stand_still_a_hot_pixel_shares_nothing_in_any_photograph():
+    """A star of which a fifth is beside its pixel is hot where stars moved, and none where not,
+    whichever photograph is the last.
+    """
+    star = np.zeros((9, 9))
+    star[4, 4], star[4, 5] = 100.0, 20.0
+    alone = np.zeros((9, 9))
+    alone[4, 4] = 100.0
+    assert defects([star, star], have_moved=True)[0][4, 4]
+    for photographs in ([star, alone], [alone, star]):
+        assert not defects(photographs, have_moved=False)[0].any()
+    assert defects([alone, alone], have_moved=False)[0][4, 4]

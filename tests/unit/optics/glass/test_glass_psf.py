@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.optics.glass.glass_psf import MIN_WIDTH_PX, GlassPsf, _adaptive_spread, glass_psf
+from hilstar.optics.glass.glass_psf import (
+    MIN_WIDTH_PX,
+    GlassPsf,
+    _adaptive_spread,
+    glass_psf,
+    regridded,
+)
 from hilstar.optics.glass.psf_file import Stack, facts_of, glass_of
 from hilstar.optics.psf import PIXEL_VARIANCE
 from tests.support.claims import holds
@@ -22,6 +28,9 @@ FLUX, CENTROID_PX, SECOND = 1e-3, 3e-3, 1e-2
 MEAN = np.array([0.2, 0.3, 0.3, 0.2])
 # Each round halves the distance of 1 / w from 1 / s: after 20, w is within s^2 / 2^20 of s.
 SPREAD_PX2 = 1e-4
+REGRIDDED = (
+    1e-4  # light, px and px2: a spline through six samples a pixel, and five sigmas of wings
+)
 
 
 def star_errors(psf: GlassPsf, x_px, y_px, shares, focus_um=0.0) -> np.ndarray:
@@ -223,3 +232,30 @@ def test_the_spread_of_a_gaussian_is_its_own_and_that_of_a_line_has_a_pixel_s_wi
     half = (variance + least) / 2
     long = half + np.sqrt(half**2 + variance * least)
     assert _adaptive_spread(line, off) == pytest.approx(np.diag([long, least]), abs=SPREAD_PX2)
+
+
+TURN = np.array([[0.8, -0.6], [0.6, 0.8]])
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [np.eye(2), 0.4 * np.eye(2), 1.7 * TURN, np.diag([-1.0, 1.0]), np.diag([1.3, 0.7]) @ TURN],
+    ids=["as it is", "smaller", "turned", "mirrored", "sheared"],
+)
+def test_a_psf_in_other_pixels_has_its_light_and_its_moments_by_the_matrix(matrix):
+    """A Gaussian beside its chief ray: mean and variances follow the offsets."""
+    per_px, mean_px, sigma_px = 6, np.array([0.3, -0.2]), np.array([0.8, 0.5])
+    x, y = np.meshgrid(np.arange(-29, 30) / per_px, np.arange(-27, 28) / per_px)
+    away = (np.stack([x, y], axis=-1) - mean_px) / sigma_px
+    image = np.exp(-(away**2).sum(axis=-1) / 2)
+    (found,), new_per_px = regridded(image[None] / image.sum(), per_px, matrix)
+    height, width = found.shape
+    across = (np.arange(width) - width // 2) / new_per_px
+    down = (np.arange(height) - height // 2) / new_per_px
+    places = np.stack(np.meshgrid(across, down), axis=-1)
+    assert found.sum() == pytest.approx(1, abs=REGRIDDED)
+    at = np.einsum("yx,yxk->k", found, places)
+    assert at == pytest.approx(matrix @ mean_px, abs=REGRIDDED)
+    spread = np.einsum("yx,yxj,yxk->jk", found, places - at, places - at)
+    assert spread == pytest.approx(matrix @ np.diag(sigma_px**2) @ matrix.T, abs=REGRIDDED)
+    assert new_per_px >= per_px / np.sqrt(abs(np.linalg.det(matrix)))

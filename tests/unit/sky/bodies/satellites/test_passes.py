@@ -41,6 +41,20 @@ def test_between_sgp4s_moments_cubics_are_within_half_a_metre_in_low_orbits(rng)
         assert np.allclose(later, swarm.places_km(slice(None), utc, 0.5), rtol=0, atol=1e-9)
 
 
+def test_the_observer_moves_as_its_orbit_while_an_exposure_lasts(rng):
+    """A fall about a point: the Earth's flattening pulls by up to 3 J2 = 0.0033 of that besides."""
+    orbit = TleOrbit(STATION_TLE, "station.tle")
+    seen = satellite_sky(some_orbits(rng, 5)).passing(EVERYWHERE, 0)
+    for seconds in (-10, -3, 3, 10):
+        a, b, c, d = seen.observer_km
+        place_km = a + seconds * (b + seconds * (c + seconds * d))
+        exact_km, _ = orbit.state(START + seconds * S_NS)
+        flattening_km = 3.3e-3 * np.linalg.norm(c) * seconds**2
+        fourth_order_km = 5e-6
+        off_km = np.linalg.norm(place_km - exact_km)
+        assert off_km < flattening_km + fourth_order_km
+
+
 def test_whatever_turns_and_jumps_come_none_in_view_is_missed(rng):
     """Against a look at all of them at each moment; slow turns, jumps of attitude and of time,
     short and long exposures.

@@ -482,7 +482,7 @@ def half_level_px(profile: FloatArray, steps: FloatArray) -> FloatArray:
     low = profile[rows, first]
     fall = high - low
     above_level = high - level[:, 0]
-    share = above_level / fall
+    share = np.divide(above_level, fall, out=np.zeros_like(fall), where=fall > 0)
     step_px = steps[1] - steps[0]
     place = steps[first - 1] + step_px * share
     falls = below.any(axis=1)

@@ -22,8 +22,10 @@ from hilstar.instruments.calibrate.effective_psf import (
     _half_px,
     _is_alone,
     _knots,
+    _of_frames,
     _placed,
     _Places,
+    _Sums,
     _variance,
     dots_of_image,
 )
@@ -210,11 +212,19 @@ def test_dots_of_an_image_are_as_wide_as_their_light_and_the_edge_cuts_none():
         dots_of_image(image, x_px[0] + np.arange(9), np.full(9, y_px[0]), SIDE_PX)
 
 
-def test_the_mean_of_frames_is_as_noisy_as_their_number_says(rng):
+@pytest.mark.parametrize("frames", [1, 4, 9])
+def test_the_mean_of_frames_is_as_noisy_as_their_number_says(frames, rng):
     image, x_px, y_px = field_of_dots()
-    dots = dots_of_image(image + rng.normal(0, 2.0, image.shape), x_px, y_px, SIDE_PX)
-    # one frame: the noise of the squares' edges, and what the codes round
-    assert float(dots.variance.mean()) == pytest.approx(4.0 + QUANTISED_DN2, rel=0.1)
+    places = _Places.of(x_px, y_px, np.full(len(x_px), SIDE_PX))
+    sums = _Sums.none(len(x_px))
+    every = np.arange(len(x_px))
+    for _ in range(frames):
+        frame = image + rng.normal(0, 2.0, image.shape)
+        sums.add(every, places.cutouts(frame, every))
+    dots = _of_frames(sums, places)
+    # one frame tells its noise by the squares' edges, and what the codes round beside it
+    one_dn2 = 4.0 if frames > 1 else 4.0 + QUANTISED_DN2
+    assert float(dots.variance.mean()) == pytest.approx(one_dn2 / frames, rel=0.1)
 
 
 def test_a_square_ends_two_pixels_beyond_the_last_light():

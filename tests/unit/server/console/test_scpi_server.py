@@ -29,6 +29,7 @@ from hilstar.server.console.messages import (
 )
 from hilstar.server.console.page_figures import RunCounts
 from hilstar.server.console.protocol import LedgerState, NewestFrame, ShownAttitude
+from hilstar.server.console.scpi import MAX_ERRORS
 from hilstar.server.console.server import scpi_server
 from hilstar.server.console.server.scpi_server import (
     ALIVE_NS,
@@ -102,9 +103,12 @@ class Bench:
 
     def errors(self, client: Connection | None = None) -> list[int]:
         """The numbers of the errors in a connection's queue, which this empties."""
-        numbers = []
-        while (text := self.says("SYST:ERR?", client)) and not text.startswith("0,"):
-            numbers.append(int(text.partition(",")[0]))
+        numbers: list[int] = []
+        for _ in range(MAX_ERRORS + 1):
+            number = int(self.says("SYST:ERR?", client).partition(",")[0])
+            if not number:
+                break
+            numbers.append(number)
         return numbers
 
     def sent(self) -> list[AttitudeSample]:
@@ -269,10 +273,11 @@ def test_a_setting_is_shown_by_a_frame_of_its_attitude_and_a_later_state(bench):
     assert not bench.server.pending()
     bench.says("SKY:ATT 1,0,0,0")
     assert bench.server.pending()
-    bench.run()
+    bench.run(host_ns=START_NS + NS_PER_S)
     # a swap after the setting, of an attitude from before it
     newest_frame(bench, draw_ns=START_NS + 9, swap_ns=START_NS + 9, age_ns=10)
     assert bench.server.pending()
+    bench.run(host_ns=START_NS)
     newest_frame(bench, draw_ns=START_NS + 1, swap_ns=START_NS + 10, age_ns=10)
     assert bench.server.pending()  # the state is of before it
     bench.run(host_ns=START_NS + MARGIN_NS)

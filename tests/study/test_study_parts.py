@@ -1,0 +1,363 @@
+"""The functions that studies measure by, each against a closed form, without a study: centroids and
+attitudes of rigs, light over frames, predictors, lone stars, rays through a lens, and limbs.
+"""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.constants import c, h
+from scipy.special import ndtr, ndtri
+
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    from_rotation_vector,
+    propagate,
+    to_matrix,
+    to_radec_roll_deg,
+)
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.display.panel import Panel
+from hilstar.display.response import Levels, gamma_response
+from hilstar.instruments.study import (
+    bodies,
+    codes,
+    colour,
+    faults,
+    geometry,
+    limits,
+    models,
+    predictors,
+    rigs,
+    sky_figures,
+    study_benches,
+)
+from hilstar.instruments.study.economy import EffortComparison
+from hilstar.instruments.study.outputs import _field_deg, thesis_total_e
+from hilstar.instruments.study.prediction import auto_times
+from hilstar.instruments.study.sweep import beaten_by
+from hilstar.instruments.study.timing import stripe_depth
+from hilstar.optics.camera import Camera
+
+ROUNDING = 1e-9
+NEAR = predictors.NEAR
+
+
+def star_image(x_px: float, y_px: float, sigma_px: float, size_px=(640, 480)) -> np.ndarray:
+    """A star of 1000 DN, integrated over pixels by erf, on no background."""
+    across = np.diff(ndtr((np.arange(size_px[0] + 1) - 0.5 - x_px) / sigma_px))
+    down = np.diff(ndtr((np.arange(size_px[1] + 1) - 0.5 - y_px) / sigma_px))
+    return 1000 * np.outer(down, across)
+
+
+def test_a_centre_of_mass_is_along_its_own_axis():
+    image = star_image(100.3, 49.8, 0.7)
+    x_px, y_px = rigs.centre_of_mass(image, np.array([100]), np.array([50]))
+    # a Gaussian of 0.7 px has 1e-5 of its light beyond 3 px
+    assert (x_px[0], y_px[0]) == pytest.approx((100.3, 49.8), abs=1e-3)
+
+
+def test_a_parabola_s_top_is_that_of_a_sampled_gaussian_s_logarithm():
+    at = np.arange(-2, 3)
+    lines = np.exp(-((at - 0.37) ** 2) / (2 * 0.8**2))[None, None, :] * [[[50.0], [200.0], [90.0]]]
+    assert rigs._vertex(lines)[0] == pytest.approx(0.37)
+    # light without a top, and light whose top is beyond the pixels
+    rising = np.exp(at / 2 + at**2)[None, None, :]
+    assert rigs._vertex(rising)[0] == 0.0
+    beyond = np.exp(-((at - 7.0) ** 2) / 200)[None, None, :]
+    assert rigs._vertex(beyond)[0] == 2.0
+
+
+def test_a_star_is_found_in_its_own_column_and_row_away_from_the_edge():
+    image = np.full((480, 640), rigs.DARK_DN)
+    image += star_image(300.2, 100.4, 1.0) + star_image(3.0, 200.0, 1.0)
+    columns, rows = rigs.found_stars(image)
+    assert (columns.tolist(), rows.tolist()) == ([300], [100])
+
+
+def rig_field(turn_rad=(0.0, 0.0, 0.0)) -> tuple[rigs.RigField, np.ndarray]:
+    """Stars of a grid, and their places (2, n), px, for a camera that is turned."""
+    x, y = np.meshgrid(np.linspace(-0.08, 0.08, 5), np.linspace(-0.05, 0.05, 4))
+    directions = np.column_stack([x.ravel(), y.ravel(), np.ones(20)])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    principal = np.array(rigs.PRINCIPAL_PX)[:, None]
+    at_rest = rigs.FOCAL_PX * (directions[:, :2] / directions[:, 2:]).T + principal
+    turned = directions @ to_matrix(from_rotation_vector(np.array(turn_rad))).T
+    places = rigs.FOCAL_PX * (turned[:, :2] / turned[:, 2:]).T + principal
+    return rigs.RigField(directions, at_rest, at_rest), places
+
+
+def test_an_attitude_s_error_is_the_turn_of_its_stars():
+    turn_arcsec = np.array([6.0, -9.0, 30.0])
+    field, places_px = rig_field(turn_arcsec / ARCSEC_PER_RAD)
+    about, x, y = rigs.attitude_error(field, *places_px)
+    # its sign is the solver's; its size and axes are the turn's, to the second order
+    sign = math.copysign(1, about) * math.copysign(1, turn_arcsec[2])
+    assert sign * np.array([x, y, about]) == pytest.approx(turn_arcsec, abs=0.01)
+    # a centroid of no star does not count
+    stray = np.column_stack([places_px, [[20.0], [20.0]]])
+    assert rigs.attitude_error(field, *stray) == pytest.approx([about, x, y], abs=1e-6)
+    assert rigs.attitude_error(field, *places_px[:, :2]) is None
+
+
+def test_attitudes_are_even_over_the_sky():
+    declinations_deg = [to_radec_roll_deg(q)[1] for q in rigs.attitudes(600)]
+    sines = np.sin(np.radians(declinations_deg))
+    # of an even sine: mean 0, and square a third; 4 of its sigmas
+    assert np.mean(sines) == pytest.approx(0, abs=4 * math.sqrt(1 / 3 / 600))
+    assert np.mean(sines**2) == pytest.approx(1 / 3, abs=4 * math.sqrt(4 / 45 / 600))
+
+
+def test_pixels_turn_an_attitude_by_their_error_over_the_root_of_the_stars(monkeypatch):
+    monkeypatch.setattr(rigs, "TRIALS", 300)
+    pixel_arcsec, stars = 30.0, 25
+    about, across = rigs.pixel_attitudes_arcsec(stars, (10.0, 10.0), pixel_arcsec)
+    one_arcsec = pixel_arcsec / math.sqrt(12)
+    # about the boresight by the stars' distances: a side of 2 a has a mean square of 2 a^2 / 3
+    lever = math.sqrt(2 / 3) * math.tan(math.radians(5))
+    assert across == pytest.approx(one_arcsec / math.sqrt(stars), rel=0.1)
+    assert about == pytest.approx(one_arcsec / math.sqrt(stars) / lever, rel=0.1)
+
+
+def test_light_adds_up_over_frames_and_within_one():
+    panel = Panel(gamma_response(8), 100.0)
+    shown = [np.array([[255]]), np.array([[0]]), np.array([[255]])]
+    to_frame = codes.light_to_frames(lambda k: Levels(shown[k]), panel, (1, 1), 3)
+    assert to_frame[:, 0, 0] == pytest.approx([0.0, 100.0, 100.0, 200.0])
+    assert codes.light_until(to_frame, 0.25)[0, 0] == pytest.approx(25.0)
+    assert codes.light_until(to_frame, 2.75)[0, 0] == pytest.approx(175.0)
+    assert codes.light_until(to_frame, 1.0)[0, 0] == pytest.approx(100.0)
+
+
+def test_jitter_is_the_amplitudes_that_are_stated():
+    still = predictors.shaken(predictors.ORION, 0.0)
+    off_rad = []
+    for t_s in np.linspace(0, 1, 400):
+        q = predictors.shaken(predictors.ORION, float(t_s))
+        off_rad.append(angle_between_rad(predictors.ORION, q))
+    # three sines on each of three axes, half of each one's square on average
+    squares_arcsec2 = 3 * sum(size**2 / 2 for size, _ in predictors.JITTER)
+    rms_arcsec = math.sqrt(np.mean(np.square(off_rad))) * ARCSEC_PER_RAD
+    assert rms_arcsec == pytest.approx(math.sqrt(squares_arcsec2), rel=0.05)
+    assert angle_between_rad(still, predictors.ORION) > 0
+
+
+def test_a_movement_s_samples_end_with_the_newest_at_its_rate():
+    movement = predictors.Movement(predictors.ORION, 0.5, packet_hz=50, shaken=False)
+    samples = movement.samples(1_234_000_000)
+    assert [sample.t_ns for sample in samples] == [1_160_000_000 + 20_000_000 * k for k in range(4)]
+    turn_rad = angle_between_rad(samples[0].q_icrs_to_cam, samples[-1].q_icrs_to_cam)
+    assert turn_rad == pytest.approx(math.radians(0.5) * 0.06, rel=1e-6)
+    rate_rad_s = predictors.rate_of(movement.at, 10**9)
+    assert rate_rad_s == pytest.approx(math.radians(0.5) * predictors.AXIS, rel=1e-6)
+    rest = predictors.Movement(predictors.ORION, 0.0)
+    assert rest.at(10**9) is rest.q_icrs_to_cam
+
+
+def spinning_up(t_ns: int) -> AttitudeSample:
+    """A camera whose turn about x speeds up by 0.02 rad/s^2."""
+    t_s = t_ns / NS_PER_S
+    q = propagate(predictors.ORION, np.array([0.01 * t_s**2, 0.0, 0.0]), 1.0)
+    return AttitudeSample(t_ns, q, np.array([0.02 * t_s, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize("load", [predictors._accelerated, predictors._spline])
+def test_a_constant_acceleration_is_predicted_whole(load):
+    step_ns = 50_000_000
+    samples = [spinning_up(k * step_ns) for k in range(NEAR)]
+    ahead_ns = samples[-1].t_ns + 3 * step_ns
+    predicted = load(samples)(ahead_ns)
+    assert angle_between_rad(predicted, spinning_up(ahead_ns).q_icrs_to_cam) < 1e-7
+
+
+def lone(x_px, y_px, light, star=None, margin_px=5.0, max_share=0.01, size_px=(100, 60)):
+    """The lone stars of sprites, each with its window."""
+    data = np.zeros(len(x_px), dtype=[("electrons_per_s", "f8")])
+    data["electrons_per_s"] = light
+    star = np.arange(len(x_px)) if star is None else np.array(star)
+    sprites = SimpleNamespace(data=data, star=star)
+    isolation = study_benches.Isolation(margin_px, max_share)
+    places = np.array(x_px, dtype=float), np.array(y_px, dtype=float)
+    return list(study_benches.lone_windows(sprites, *places, size_px, isolation))
+
+
+def test_a_star_is_alone_where_others_add_less_than_a_share_of_its_light():
+    (only,) = lone([50], [30], [10.0])
+    assert only == (0, (slice(25, 36), slice(45, 56)))
+    # a bright star, one of a hundredth of it within twice the margin, and one beyond
+    found = lone([50, 59, 75], [30, 30, 30], [1000.0, 10.0, 500.0])
+    assert [star for star, _ in found] == [0, 2]
+    assert [star for star, _ in lone([50, 59], [30, 30], [1000.0, 10.1])] == []
+    # two sprites of one star are no others to each other
+    (moved,) = lone([50, 56], [30, 32], [5.0, 5.0], star=[3, 3])
+    assert moved == (3, (slice(25, 38), slice(45, 62)))
+
+
+@pytest.mark.parametrize(
+    ("x_px", "y_px", "is_whole"),
+    [(5, 5, True), (94, 54, True), (4.9, 30, False), (94.1, 30, False), (50, 54.1, False)],
+)
+def test_a_lone_star_s_window_is_whole_on_the_image(x_px, y_px, is_whole):
+    assert bool(lone([x_px], [y_px], [1.0])) is is_whole
+
+
+def test_windows_are_in_the_middle_of_equal_squares():
+    image = np.arange(200.0).reshape(10, 20)
+    windows = [(slice(2, 5), slice(3, 8)), (slice(0, 1), slice(0, 1))]
+    stamps = study_benches.squares(image, windows)
+    assert stamps.shape == (2, 5, 5)
+    np.testing.assert_array_equal(stamps[0, 1:4], image[2:5, 3:8])
+    assert stamps[1, 2, 2] == image[0, 0]
+    assert stamps.sum() == pytest.approx(image[2:5, 3:8].sum() + image[0, 0])
+
+
+def test_a_star_s_error_is_its_light_in_magnitudes_and_its_way_in_pixels():
+    true = np.zeros((20, 30))
+    true[8, 12] = 100.0
+    shown = np.zeros((20, 30))
+    shown[8, 12] = shown[8, 18] = shown[12, 12] = 10.0
+    window = (slice(5, 15), slice(10, 20))
+    assert study_benches.centroid_px(shown, window) == pytest.approx((14.0, 28 / 3))
+    error = study_benches.star_error(shown, true, window)
+    assert error.flux_mag == pytest.approx(-2.5 * math.log10(0.3))
+    assert error.centroid_px == pytest.approx(math.hypot(2, 4 / 3))
+    dark = study_benches.star_error(np.zeros((20, 30)), true, window)
+    assert math.isnan(dark.centroid_px)
+
+
+def test_stars_that_show_nothing_are_as_far_off_as_a_study_counts():
+    data = np.zeros(2, dtype=[("electrons_per_s", "f8")])
+    data["electrons_per_s"] = [100.0, 50.0]
+    places = np.array([30.0, 100.0]), np.array([30.0, 60.0])
+    sprites = SimpleNamespace(data=data, star=np.arange(2), x_px=places[0], y_px=places[1])
+    image = np.zeros((120, 160))
+    image[30, 30] = 80.0
+    errors_mag = faults.light_errors_mag(sprites, image, (160, 120))
+    assert errors_mag == pytest.approx([-2.5 * math.log10(0.8), faults.NOTHING_MAG])
+
+
+def test_a_method_is_beaten_by_one_that_is_better_in_one_and_no_worse_in_the_other():
+    errors, times_ms = (1.0, 1.0, 2.0, 0.5), (3.0, 3.0, 4.0, 9.0)
+    beaten = beaten_by(errors, times_ms)
+    assert np.argwhere(beaten).tolist() == [[2, 0], [2, 1]]
+
+
+def test_equation_2_3_gives_the_check_values_of_its_quaternions():
+    """q_icrs_to_cam of (283.021, 35.349, 30) deg, and of the origin."""
+    for radec_roll_deg, q in (
+        ((0.0, 0.0, 0.0), (0.5, 0.5, -0.5, 0.5)),
+        ((283.021, 35.349, 30.0), (0.3257559, -0.0677680, -0.4540152, 0.8265354)),
+    ):
+        matrix = sky_figures.equation_2_3(*radec_roll_deg)
+        np.testing.assert_allclose(matrix.T, to_matrix(np.array(q)), atol=1e-6)
+
+
+def test_light_is_photons_of_its_wavelength():
+    photons = sky_figures._photons_of(np.ones_like(sky_figures.SHOWN_NM))
+    at_nm = float(sky_figures.SHOWN_NM[40])
+    # of 1 W/m2/m: 1e-9 W/m2 to a nanometre, h c / lambda each
+    assert photons[40] == pytest.approx(1e-9 / (h * c / (at_nm * 1e-9)), rel=1e-6)
+
+
+@pytest.mark.parametrize("radius", [50.0, -80.0])
+@pytest.mark.parametrize("ratio", [1 / 1.5168, 1.5168])
+def test_a_ray_meets_the_near_side_of_a_sphere_and_bends_by_snell(radius, ratio, rng):
+    at = np.column_stack([rng.uniform(-6, 6, (20, 2)), np.full(20, -30.0)])
+    ray = np.column_stack([rng.uniform(-0.1, 0.1, (20, 2)), np.ones(20)])
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    hit, behind = geometry._refracted(at, ray, radius, ratio)
+    centre = np.array([0, 0, radius])
+    np.testing.assert_allclose(np.linalg.norm(hit - centre, axis=1), abs(radius))
+    # about the vertex: a sphere's sag of 15 mm is under 2.5 mm
+    assert np.abs(hit[:, 2]).max() < 2.5
+    np.testing.assert_allclose(np.cross(hit - at, ray), 0, atol=1e-9)
+    normal = (hit - centre) / radius
+    np.testing.assert_allclose(np.linalg.norm(behind, axis=1), 1.0)
+    np.testing.assert_allclose(
+        np.cross(behind, normal), ratio * np.cross(ray, normal), atol=ROUNDING
+    )
+    assert (behind[:, 2] > 0).all()
+
+
+def test_a_limb_is_where_light_has_fallen_to_half_of_the_inside():
+    steps = np.linspace(-3.0, 3.0, 241)
+    edge_px = np.array([-1.234, 0.0, 0.4567])
+    sigma_px = 0.6
+    profile = 8 * ndtr((edge_px[:, None] - steps) / sigma_px)
+    profile = np.vstack([profile, np.full(241, 8.0)])
+    places = bodies.half_level_px(profile, steps)
+    # half of what 3 px inside has; linear between steps of 0.025 px
+    half = ndtr((edge_px + 3) / sigma_px) / 2
+    np.testing.assert_allclose(places[:3], edge_px - sigma_px * ndtri(half), atol=1e-4)
+    assert math.isnan(places[3])
+    edges = bodies.edges_in_sigmas(3, np.array([1.0, 2.5]), 0.5)
+    np.testing.assert_allclose(edges, [[-3, -1, 1, 3], [-6, -4, -2, 0]])
+
+
+def test_stripes_are_told_apart_by_whole_refreshes():
+    points = []
+    for refreshes, light in ((2.0, 1.01), (2.0, 0.97), (2.5, 1.2), (2.5, 0.9)):
+        points.append(SimpleNamespace(refreshes=refreshes, light=light))
+    assert stripe_depth(points, True) == pytest.approx(0.03)
+    assert stripe_depth(points, False) == pytest.approx(0.2)
+
+
+def test_auto_is_held_against_the_better_of_both(monkeypatch):
+    rows = []
+    for way, residual in (("rate", 2.0), ("newest", 8.0), ("auto", 3.0)):
+        row = SimpleNamespace(way=way, residual=residual, packets="p", jitter_hz=1.0)
+        row.packet_hz, row.age_ms = 100, 20.0
+        rows.append(row)
+    monkeypatch.setattr("hilstar.instruments.study.prediction.is_usual", lambda hz, ms: True)
+    assert auto_times(rows) == pytest.approx(1.5)
+
+
+def test_a_speed_up_is_the_full_time_over_auto_s():
+    made = SimpleNamespace(full=SimpleNamespace(frame_ms=12.0), auto=SimpleNamespace(frame_ms=3.0))
+    assert EffortComparison.speed_up.fget(made) == 4.0
+
+
+def test_a_thesis_s_noise_is_of_its_exposure():
+    detector = SimpleNamespace(
+        prnu=0.01, dsnu_e_per_s=8.0, dark_e_per_s=20.0, adc_noise_e=3.0, read_noise_e=4.0
+    )
+    # 1000 e-, 20 * 0.5, 1000 * 0.01 + 8 * 0.5, 9 + 16
+    assert thesis_total_e(detector, 1000.0, 0.5) == pytest.approx(math.sqrt(1000 + 10 + 14 + 25))
+
+
+def test_a_field_is_from_edge_to_edge_of_its_outermost_pixels():
+    camera = Camera((800, 600), 1000.0, (399.5, 299.5), np.eye(3))
+    wanted = 2 * math.degrees(math.atan(0.4)), 2 * math.degrees(math.atan(0.3))
+    assert _field_deg(camera) == pytest.approx(wanted)
+
+
+def test_a_vibration_s_prediction_is_off_by_what_its_rate_leaves(monkeypatch):
+    """Of A sin(w t), 20 to 30 ms after a sample with its rate: A |exp(i w s) - 1 - i w s| / 2^0.5."""
+    monkeypatch.setattr(limits, "SPAN_S", 1.0)
+    limit = limits.vibrations(quick=True)
+    slow = limit.at < 4.0
+    assert slow.sum() >= 2
+    for hz, error_arcsec in zip(limit.at[slow], limit.error[slow], strict=True):
+        after_s = np.linspace(0.020, 0.030, 50)
+        phase = 2 * math.pi * hz * after_s
+        left = np.abs(np.exp(1j * phase) - 1 - 1j * phase)
+        wanted_arcsec = limits.VIBRATION_ARCSEC * math.sqrt(np.mean(left**2) / 2)
+        # over some cycles, not whole ones
+        assert 0.5 < error_arcsec / wanted_arcsec < 2
+
+
+def test_the_bolometric_zero_point_makes_stars_a_third_of_a_magnitude_fainter():
+    """A body of 9602 K has V = 0.307 by it, by SciPy's quadrature (claims.toml, zero-point)."""
+    costs_mag = models.choice_costs_mag(
+        np.array([0.0, 0.6]), study_benches.study_optics("ccd47-20")
+    )
+    assert costs_mag["zero point iau-bolometric"] == pytest.approx(np.full(2, 0.307), abs=1e-3)
+
+
+def test_a_distance_is_of_both_coordinates():
+    places_px = np.array([[3.0, 0.0], [4.0, 5.0]])
+    assert colour.distance_rms_px(places_px) == pytest.approx(5.0)

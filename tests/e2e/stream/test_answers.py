@@ -45,20 +45,26 @@ def reading(folder: Path, keys: str, notices: Notices | None = None) -> Iterator
 
 
 def gathered(
-    source: AnswersApart, count: int, again: Callable[[], object] = lambda: None
+    source: AnswersApart, count: int, again: Callable[[], object] | None = None
 ) -> list[Answer]:
-    """So many answers; `again` sends where what was sent may have been lost before the road
-    stood.
+    """So many answers; `again` sends them all, while some are missing: what was sent before the
+    road stood is lost, which may be only the first of them. Then each counts once, by its time.
     """
     found: list[Answer] = []
 
     def enough() -> bool:
-        if not found:
+        if again is not None:
             again()
-        found.extend(source.take(50))
+        known_ns = {answer.t_ns for answer in found}
+        for answer in source.take(50):
+            if again is None or answer.t_ns not in known_ns:
+                known_ns.add(answer.t_ns)
+                found.append(answer)
         return len(found) >= count
 
     wait_for(enough, "answers")
+    if again is not None:
+        found.sort(key=lambda answer: answer.t_ns or 0)
     return found
 
 

@@ -104,8 +104,10 @@ def pytest_testnodedown(node: WorkerController) -> None:
 
 def pytest_collection_finish() -> None:
     """The garbage collector passes over what collecting 11 000 tests has made: each of its rounds
-    would take 0.15 s, and one before it 0.6 s, for the same 392 MB.
+    would take 0.15 s. One before it takes 0.6 s: without it, sockets of a session that has ended
+    are told as unclosed.
     """
+    gc.collect()
     gc.freeze()
     gc.enable()
 

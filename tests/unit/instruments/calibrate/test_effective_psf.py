@@ -20,6 +20,7 @@ from hilstar.instruments.calibrate.effective_psf import (
     _functions,
     _glass,
     _half_px,
+    _held_out,
     _is_alone,
     _knots,
     _of_frames,
@@ -290,3 +291,17 @@ def test_a_glass_has_its_centroids_in_the_middle_wherever_the_model_has_them():
         third_px3 = w * (1 - w) * ((1 - 2 * w) * off_px**3 + 3 * off_px * wider_px2)
         seen_px3 = image.sum(axis=axis) @ steps_px**3 / light
         assert seen_px3 == pytest.approx(third_px3, rel=0.05)
+
+
+def test_dots_are_held_against_a_model_of_the_others_alone():
+    image, x_px, y_px = field_of_dots()
+    dots = dots_of_image(image, x_px, y_px, 0.0)
+    fold = np.arange(len(x_px)) % 4
+    # all are of 1 px^2, and those of the first fold are said to be of 2
+    covariance = np.tile([1.0, 1.0, 0.0], (len(x_px), 1))
+    covariance[fold == 0, :2] = 2.0
+    held = _held_out(effective(np.zeros((1, 3))), dots, covariance, fold, 0)
+    assert held.name == "Gaussian"
+    is_first = fold == 0
+    # a model of the others is right, and one that has the first is not
+    assert held.chi2[is_first].max() < 1e-3 * held.chi2[~is_first].min()

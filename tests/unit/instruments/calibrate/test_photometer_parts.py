@@ -286,3 +286,21 @@ def test_light_passes_the_ratios_of_its_own_channel_from_its_range_on():
     assert _passes(Patch(9, "r"), Range(4, 4), link)  # exposed longer: fainter light
     assert not _passes(Patch(9, "r"), Range(4), link)
     assert not _passes(Patch(9, "g"), Range(1), link)
+
+
+def test_black_is_as_noisy_as_its_images_over_the_field_s_pixels():
+    made = photometer(scatter=scatter_of({1: 400.0}))
+    planned = [Patch(0, "w"), Patch(0, "w")]
+    values = made._values(planned, {}, np.array([5.0, 5.0]), {})
+    # 20 DN over 1000 monitor pixels and half a second
+    assert values.sigma == pytest.approx(20 / 1000 / EXPOSURE_S)
+    assert values.light.tolist() == [0.0, 0.0]
+
+
+def test_a_patch_s_peaks_are_white_s_on_the_sparsest_lattice_by_light_and_share():
+    made = photometer(shares=np.array([0.9, 0.6, 0.4, 0.3]))
+    made.assumed = SimpleNamespace(light={"w": np.array([0.0, 0.25, 1.0])})
+    peaks = made._peaks([Patch(0, "w"), Patch(1, "w"), Patch(2, "w")], 1200.0)
+    assert list(peaks) == [Patch(1, "w"), Patch(2, "w")]
+    np.testing.assert_allclose(peaks[Patch(2, "w")], [3600, 2400, 1600, 1200])
+    np.testing.assert_allclose(peaks[Patch(1, "w")], [900, 600, 400, 300])

@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.geometric import fit as fits
 from hilstar.instruments.certify import estimates, lens
+from hilstar.instruments.certify.bench_readings import LightReadings
 from hilstar.instruments.certify.budget import Input
 from hilstar.instruments.certify.certificate import _contributions, _input_row, _judged, _place_of
 from hilstar.instruments.certify.estimates import (
@@ -23,6 +24,7 @@ from hilstar.instruments.certify.estimates import (
     _above_black,
     _fit_without_wild,
     _is_better,
+    _LightFit,
     _scatter,
 )
 from hilstar.instruments.certify.structure import (
@@ -447,3 +449,18 @@ def test_evenness_scatters_by_what_a_fit_to_dots_leaves_of_a_screen_s_structure(
     factors = even.scatter(star_x, star_y, shares)
     # a dot stands for its cell of 40 px, whose mean correlates less: (40 / 60)^2 / 12, squared
     np.testing.assert_allclose(factors.T @ factors, covariance, rtol=0.05)
+
+
+def test_black_and_light_scatter_by_their_own_readings():
+    codes = np.array([0] * 4 + [50, 100, 150, 200, 255] * 2)
+    bright = 1000.0 * np.array([1, 2, 3, 4, 5])
+    light = np.concatenate([[1.0, 2.0, 3.0, 6.0], 1.01 * bright, 0.99 * bright])
+    read = LightReadings(codes, light, np.zeros(14))
+    fit = _LightFit(read)
+    # of 1, 2, 3 and 6 about 3, with a freedom of 3
+    assert fit.floor == pytest.approx(math.sqrt(14 / 3))
+    assert (fit.dark_dof, fit.light_dof) == (pytest.approx(3), pytest.approx(5))
+    # 1 % to each side, ten of them with a freedom of five, relative to the light above black
+    relative = 0.01 * bright / (bright - 3.0)
+    assert fit.noise == pytest.approx(math.sqrt(2 * (relative**2).sum() / 5))
+    np.testing.assert_allclose(fit.solution[:6], [3.0, *bright])

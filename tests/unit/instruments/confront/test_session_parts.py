@@ -39,6 +39,7 @@ from hilstar.instruments.confront.session import (
     _linear,
     _middles,
     _reach_px,
+    _seen_at,
     _why_not,
     check_focus,
     corrected,
@@ -339,3 +340,13 @@ def test_a_photograph_without_an_attitude_says_what_is_seen(monkeypatch, sources
         assert "near --radec" in near
         monkeypatch.setattr(sessions, "_solve", lambda *field_and_sky: "an attitude")
         assert "is mirrored" in _why_not(field, CAMERA, None, sources, points, None)
+
+
+def test_stars_are_first_seen_at_their_sources():
+    sources = SimpleNamespace(x_px=np.array([1.0, 2.0, 3.0]), y_px=np.array([10.0, 20.0, 30.0]))
+    sky = SimpleNamespace(vectors=np.eye(3))
+    shot = SimpleNamespace(sources=sources, sky=sky)
+    places = _seen_at(shot, np.array([2, 0]), np.array([1, 2]))
+    assert places.x_px.tolist() == [2.0, 3.0]
+    assert places.y_px.tolist() == [20.0, 30.0]
+    np.testing.assert_array_equal(places.vectors, np.eye(3)[[2, 0]])

@@ -361,3 +361,9 @@ def test_the_bolometric_zero_point_makes_stars_a_third_of_a_magnitude_fainter():
 def test_a_distance_is_of_both_coordinates():
     places_px = np.array([[3.0, 0.0], [4.0, 5.0]])
     assert colour.distance_rms_px(places_px) == pytest.approx(5.0)
+
+
+def test_a_psf_s_fit_is_about_its_own_background():
+    image = star_image(100.3, 49.8, rigs.PSF_SIGMA_PX) + rigs.DARK_DN
+    x_px, y_px = rigs.psf_fit(image, np.array([100]), np.array([50]))
+    assert (x_px[0], y_px[0]) == pytest.approx((100.3, 49.8), abs=1e-3)

@@ -239,12 +239,7 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
     point_rows = np.flatnonzero(points)
     source = point_rows[solution.source]
     brightest = np.sort(source)[:BRIGHTEST]
-    wide_px = float(np.median(sources.fwhm_px[brightest]))
-    if wide_px > WIDE_PX:
-        raise InputError(
-            f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in"
-            " focus"
-        )
+    check_focus(photo, sources.fwhm_px[brightest])
     return Shot(
         photo=photo,
         level=level,
@@ -255,6 +250,16 @@ def open_shot(file: BenchFile, photo: Photograph, base: Camera, start: FloatArra
         matched=replace(solution, source=source),
         star=np.empty(0, dtype=np.intp),
     )
+
+
+def check_focus(photo: Photograph, fwhm_px: FloatArray) -> None:
+    """Raises InputError for a photograph whose brightest stars (n,) are WIDE_PX wide and more."""
+    wide_px = float(np.median(fwhm_px))
+    if wide_px > WIDE_PX:
+        raise InputError(
+            f"{photo.path}: its stars are {wide_px:.0f} px wide; focus the lens, or give a frame in"
+            " focus"
+        )
 
 
 def _field(sources: FoundSources, points: BoolArray, photo: Photograph) -> SourceField:

@@ -4,6 +4,8 @@ sides, their cut-outs and scatter, and where a glass has its centroids.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -20,11 +22,13 @@ from hilstar.instruments.calibrate.effective_psf import (
     _functions,
     _glass,
     _half_px,
+    _held_out,
     _is_alone,
     _knots,
     _of_frames,
     _placed,
     _Places,
+    _spline,
     _Sums,
     _variance,
     dots_of_image,
@@ -290,3 +294,37 @@ def test_a_glass_has_its_centroids_in_the_middle_wherever_the_model_has_them():
         third_px3 = w * (1 - w) * ((1 - 2 * w) * off_px**3 + 3 * off_px * wider_px2)
         seen_px3 = image.sum(axis=axis) @ steps_px**3 / light
         assert seen_px3 == pytest.approx(third_px3, rel=0.05)
+
+
+def test_dots_are_held_against_a_model_of_the_others_alone():
+    image, x_px, y_px = field_of_dots()
+    dots = dots_of_image(image, x_px, y_px, 0.0)
+    fold = np.arange(len(x_px)) % 4
+    # all are of 1 px^2, and those of the first fold are said to be of 2
+    covariance = np.tile([1.0, 1.0, 0.0], (len(x_px), 1))
+    covariance[fold == 0, :2] = 2.0
+    held = _held_out(effective(np.zeros((1, 3))), dots, covariance, fold, 0)
+    assert held.name == "Gaussian"
+    is_first = fold == 0
+    # a model of the others is right, and one that has the first is not
+    assert held.chi2[is_first].max() < 1e-3 * held.chi2[~is_first].min()
+
+
+@pytest.mark.parametrize("noise_dn", [0.5, 2.0])
+def test_a_spline_follows_light_beside_the_gaussian_where_it_is_over_the_noise(noise_dn):
+    image, x_px, y_px = field_of_dots()
+    ghost = gaussian_image(x_px + 2, y_px, 0.7, 400.0)
+    dots = dots_of_image(image + ghost, x_px, y_px, 0.0)
+    dots = replace(dots, variance=np.full_like(dots.images, noise_dn**2))
+    knots_px = _knots(dots)
+    gaussian = effective([[1.0, 1.0, 0.0]], knots_px)
+    amplitudes = np.column_stack([np.full(len(x_px), 1e4), np.zeros(len(x_px))])
+    spline = _spline(gaussian, dots, amplitudes, 1)
+    model = replace(gaussian, spline=spline)
+    beside = model.of(dots.x_px, dots.y_px, dots.offsets, dots.side_px)
+    beside -= gaussian.of(dots.x_px, dots.y_px, dots.offsets, dots.side_px)
+    # 4 % of the light, 2 px to the right; to the image's edge it has most of it
+    assert beside.sum(axis=(1, 2)) == pytest.approx(np.full(len(x_px), 0.04), rel=0.05)
+    across_px = dots.offsets[0]
+    middle_px = (beside.sum(axis=1) * across_px).sum(axis=1) / beside.sum(axis=(1, 2))
+    assert middle_px == pytest.approx(np.full(len(x_px), 2.0), abs=0.1)

@@ -23,6 +23,7 @@ from hilstar.instruments.calibrate.first_light.stars import (
     LOST_SHARE,
     SYSTEMATIC_MAG,
     _contradictions,
+    _place_figures,
     _scale_error_mag,
     _scale_trend,
     _star_reasons,
@@ -35,6 +36,7 @@ from hilstar.instruments.calibrate.first_light.uniformity import (
     _design,
     _fitted,
     _is_surely_larger,
+    _Maps,
     _not_negative,
     _shown,
     _smoothness,
@@ -261,3 +263,36 @@ def test_dots_shown_are_squares_about_their_lattice():
     assert set(columns.tolist()) == {x + off for x in (4, 12, 20, 28, 36) for off in (-1, 0, 1)}
     assert set(rows.tolist()) == {y + off for y in (6, 14, 22) for off in (-1, 0, 1)} | {29}
     assert set(codes[codes > 0].tolist()) == {200}
+
+
+def test_dots_determine_a_map_s_fields_where_each_has_many(rng):
+    at = dots(3000, rng)
+    maps = _Maps.of(at, np.ones(3000), (160, 90))
+    for place, (rows, columns) in enumerate(maps.shapes[:3]):
+        # of a thousandth's weight on a join: 3 dots of 3000 at most
+        assert maps.freedom(place) == pytest.approx(rows * columns, rel=1e-3)
+    few = _Maps.of(DotLight(at.x[:6], at.y[:6], at.light[:6], 0.1), np.ones(6), (160, 90))
+    assert few.shapes == [(1, 1)]
+
+
+def test_places_are_off_by_their_distance_in_pixels_and_in_arcsec():
+    residual_px = np.array([[0.3, 0.4], [0.0, -1.0], [0.0, 0.0], [1.2, 0.5]])
+    seen = SimpleNamespace(
+        residual_px=residual_px,
+        place_noise_px=np.full(4, 0.2),
+        beyond_px=SimpleNamespace(sigma=0.5, high=0.9),
+        lost=3,
+        frames=2,
+    )
+    tracker = SimpleNamespace(focal_length_px=5000.0)
+    context = SimpleNamespace(geometry=lambda: SimpleNamespace(tracker=tracker))
+    figures = _place_figures(context, seen)
+    rms_px = math.sqrt((0.25 + 1 + 1.69) / 4)
+    assert figures["star_rms_px"] == pytest.approx(rms_px)
+    assert figures["star_rms_arcsec"] == pytest.approx(rms_px / 5000 * 206264.806)
+    assert (figures["star_max_px"], figures["lost"]) == (pytest.approx(1.3), 3)
+    # two axes: the root of 2, and the 95 % of a Rayleigh distribution
+    assert figures["star_noise_px"] == pytest.approx(0.2 * math.sqrt(2))
+    p95 = stats.rayleigh.ppf(0.95)
+    assert figures["star_beyond_noise_p95_px"] == pytest.approx(0.5 * p95, rel=1e-4)
+    assert figures["star_beyond_noise_max_px"] == pytest.approx(0.9 * p95, rel=1e-4)

@@ -4,6 +4,7 @@ between black images, and the error of a ratio of ranges.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -29,6 +30,7 @@ from hilstar.instruments.calibrate.first_light.photometer import (
     _Pair,
     _passes,
     _Reading,
+    _Values,
     field_for,
     lattice_profile,
     peak_shares,
@@ -286,3 +288,64 @@ def test_light_passes_the_ratios_of_its_own_channel_from_its_range_on():
     assert _passes(Patch(9, "r"), Range(4, 4), link)  # exposed longer: fainter light
     assert not _passes(Patch(9, "r"), Range(4), link)
     assert not _passes(Patch(9, "g"), Range(1), link)
+
+
+def test_black_is_as_noisy_as_its_images_over_the_field_s_pixels():
+    made = photometer(scatter=scatter_of({1: 400.0}))
+    planned = [Patch(0, "w"), Patch(0, "w")]
+    values = made._values(planned, {}, np.array([5.0, 5.0]), {})
+    # 20 DN over 1000 monitor pixels and half a second
+    assert values.sigma == pytest.approx(20 / 1000 / EXPOSURE_S)
+    assert values.light.tolist() == [0.0, 0.0]
+
+
+def test_a_patch_s_peaks_are_white_s_on_the_sparsest_lattice_by_light_and_share():
+    made = photometer(shares=np.array([0.9, 0.6, 0.4, 0.3]))
+    made.assumed = SimpleNamespace(light={"w": np.array([0.0, 0.25, 1.0])})
+    peaks = made._peaks([Patch(0, "w"), Patch(1, "w"), Patch(2, "w")], 1200.0)
+    assert list(peaks) == [Patch(1, "w"), Patch(2, "w")]
+    np.testing.assert_allclose(peaks[Patch(2, "w")], [3600, 2400, 1600, 1200])
+    np.testing.assert_allclose(peaks[Patch(1, "w")], [900, 600, 400, 300])
+
+
+def with_detector(noise_e: float, offset_dn: float) -> Photometer:
+    """A photometer before a detector of 4 e- a DN, whose black pixels are at `offset_dn`."""
+    made = photometer(ratio=1.5)
+    detector = SimpleNamespace(electronics_e=noise_e, gain_e_per_dn=4.0, offset_dn=offset_dn)
+    made.context.detector = detector
+    made.profiles = {period: lattice_profile(period, 1.5, 0.9) for period in made.periods}
+    made.scatter = PixelScatter(default_dn_per_e=0.25)
+    made.scatter.add(BLACK, Range(1), np.full((50, 60), offset_dn))
+    return made
+
+
+def test_what_the_adc_cuts_at_0_goes_by_a_dot_s_own_light():
+    made = with_detector(8.0, 0.0)
+    wide = with_detector(8.0, 0.0)
+    wide.field = replace(made.field, side=128)
+    light_dn = 2000.0
+    for at in (Range(4), Range(8)):
+        cut_dn = made._cut_dn(at, light_dn)
+        assert cut_dn != pytest.approx(0.0, abs=1.0)
+        # four times as many dots of the same light
+        assert wide._cut_dn(at, 4 * light_dn) == pytest.approx(4 * cut_dn)
+        assert wide._rounded(at, 4 * light_dn) == pytest.approx(4 * made._rounded(at, light_dn))
+    # an offset of 20 sigmas is never cut
+    safe = with_detector(8.0, 40.0)
+    assert safe._cut_dn(Range(4), light_dn) == pytest.approx(0.0, abs=1e-6)
+
+
+def test_rounding_of_both_sums_of_a_ratio_is_taken_off_one_another():
+    made = photometer()
+    pair = _Pair(Patch(9, "r"), Range(1), Range(2), (1000.0, 1000.0), (1.0,))
+    made._rounded = lambda at, light_dn: np.full(16, 30.0)
+    link = ratio_of("r", Range(1), Range(2), 1.0)
+    lit = {0: _Reading(Patch(3, "r"), Range(1), 500.0, 1.0)}
+    values = _Values(np.array([5.0]), np.array([1e-6]), np.array([0.01]))
+    modes = made._of_rounding(values, lit, [pair], [link])
+    # the same share of both sums leaves the ratio as it is: the reading's own rounding alone
+    np.testing.assert_allclose((modes**2).sum(), (30.0 * 0.01) ** 2, rtol=1e-6)
+    made._rounded = lambda at, light_dn: np.full(16, 30.0 if at == Range(1) else 0.0)
+    modes = made._of_rounding(values, lit, [pair], [link])
+    # 3 % of the ratio, of which the light loses 3 %: 0.3 less 0.15 DN/s
+    np.testing.assert_allclose((modes**2).sum(), (0.3 - 0.15) ** 2, rtol=1e-6)

@@ -15,6 +15,7 @@ from scipy.interpolate import CubicSpline
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.geometric import fit as fits
 from hilstar.instruments.certify import estimates, lens
+from hilstar.instruments.certify.bench_readings import LightReadings
 from hilstar.instruments.certify.budget import Input
 from hilstar.instruments.certify.certificate import _contributions, _input_row, _judged, _place_of
 from hilstar.instruments.certify.estimates import (
@@ -23,13 +24,16 @@ from hilstar.instruments.certify.estimates import (
     _above_black,
     _fit_without_wild,
     _is_better,
+    _LightFit,
     _scatter,
 )
 from hilstar.instruments.certify.structure import (
     MIN_CELLS,
+    RATIOS,
     Cells,
     Spread,
     Structure,
+    _finer,
     _rectangle,
     lasting_root,
 )
@@ -411,3 +415,52 @@ def test_a_square_s_evenness_is_the_mean_of_its_rows_and_columns(monkeypatch):
     assert estimates._evenness_in(file, (4, 1, 2)) == (12 + 13 + 20 + 21) / 4
     calibration.uniformity_map = lambda size: None
     assert estimates._evenness_in(file, (4, 1, 2)) == 1.0
+
+
+def test_a_finer_grid_has_both_ends_and_no_larger_step():
+    for values, step in ((RATIOS, 1.12), (np.array([3.0, 10.0]), 1.08)):
+        finer = _finer(values, step)
+        assert (finer[0], finer[-1]) == pytest.approx((values[0], values[-1]))
+        ratios = finer[1:] / finer[:-1]
+        assert ratios.max() <= step
+        assert np.ptp(ratios) < 1e-9
+
+
+def test_evenness_scatters_by_what_a_fit_to_dots_leaves_of_a_screen_s_structure():
+    """Of a field with K = exp(-d^2 / 2 L^2), stars less the fit to dots: K, less twice what is
+    common to both, and the fit's own.
+    """
+    x_px, y_px = lattice(12, 9)
+    x_px = 400 + 4 * x_px
+    y_px = 300 + 2 * y_px
+    nothing = Structure(np.array([150.0, 60.0]), np.array([2.0, 0.5]), 1.0, 9.0)
+    fit = Surface(1, SIZE_PX, np.zeros((3, 1)), np.eye(3), 10.0, 1.0)
+    terms = fit.terms(x_px, y_px)
+    solve = np.linalg.pinv(terms)
+    even = estimates.Evenness(fit, Cells(x_px, y_px), solve, nothing)
+    star_x, star_y = np.array([500.0, 700.0, 650.0]), np.array([350.0, 420.0, 520.0])
+    shares = np.array([[0.5, 0.5, 0.0], [0.0, 0.0, 1.0]])
+    covariance = np.zeros((2, 2))
+    all_x, all_y = np.append(star_x, x_px), np.append(star_y, y_px)
+    weights = np.hstack([shares, -shares @ fit.terms(star_x, star_y) @ solve])
+    for length, variance in nothing.parts():
+        apart = (all_x[:, None] - all_x) ** 2 + (all_y[:, None] - all_y) ** 2
+        covariance += variance * weights @ np.exp(-apart / (2 * length**2)) @ weights.T
+    factors = even.scatter(star_x, star_y, shares)
+    # a dot stands for its cell of 40 px, whose mean correlates less: (40 / 60)^2 / 12, squared
+    np.testing.assert_allclose(factors.T @ factors, covariance, rtol=0.05)
+
+
+def test_black_and_light_scatter_by_their_own_readings():
+    codes = np.array([0] * 4 + [50, 100, 150, 200, 255] * 2)
+    bright = 1000.0 * np.array([1, 2, 3, 4, 5])
+    light = np.concatenate([[1.0, 2.0, 3.0, 6.0], 1.01 * bright, 0.99 * bright])
+    read = LightReadings(codes, light, np.zeros(14))
+    fit = _LightFit(read)
+    # of 1, 2, 3 and 6 about 3, with a freedom of 3
+    assert fit.floor == pytest.approx(math.sqrt(14 / 3))
+    assert (fit.dark_dof, fit.light_dof) == (pytest.approx(3), pytest.approx(5))
+    # 1 % to each side, ten of them with a freedom of five, relative to the light above black
+    relative = 0.01 * bright / (bright - 3.0)
+    assert fit.noise == pytest.approx(math.sqrt(2 * (relative**2).sum() / 5))
+    np.testing.assert_allclose(fit.solution[:6], [3.0, *bright])

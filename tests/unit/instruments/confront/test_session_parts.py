@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.reading import parse_toml
 from hilstar.instruments.confront import session as sessions
 from hilstar.instruments.confront.background import FixedPattern
@@ -32,11 +33,15 @@ from hilstar.instruments.confront.measured_bench import (
 from hilstar.instruments.confront.photon_transfer import PixelFit
 from hilstar.instruments.confront.session import (
     PIVOT_NM,
+    WIDE_PX,
     _channel_mag,
     _field,
     _linear,
     _middles,
     _reach_px,
+    _seen_at,
+    _why_not,
+    check_focus,
     corrected,
     radius2_of,
 )
@@ -286,3 +291,62 @@ def test_a_file_of_a_tracker_alone_gets_a_screen_and_says_so(tmp_path, has_scree
     file, with_screen = read_tracker_file(path)
     assert with_screen is has_screen
     assert file.config.tracker.focal_length_mm == 40.0
+
+
+def test_stars_that_are_wide_are_out_of_focus_by_their_median():
+    photo = photograph(np.zeros((2, 2)))
+    check_focus(photo, np.array([WIDE_PX - 0.1, 2.0, 90.0]))
+    with pytest.raises(InputError, match=r"photo\.fits: its stars are .* px wide; focus"):
+        check_focus(photo, np.array([WIDE_PX + 0.1, 2.0, 90.0]))
+
+
+def sources_of(length_px: float, width_px: float, trails: int, fwhm_px: float = 3.0):
+    """Twenty sources, of which so many are trails of 80 px."""
+    trail = np.arange(20) < trails
+    return SimpleNamespace(
+        length_px=np.where(trail, 80.0, length_px),
+        width_px=np.full(20, width_px),
+        fwhm_px=np.full(20, fwhm_px),
+        trail=trail,
+    )
+
+
+@pytest.mark.parametrize(
+    ("sources", "words"),
+    [
+        (sources_of(3.0, 2.0, 15), "trails of about 80 px"),
+        (sources_of(40.0, 4.0, 0), "trails of about 40 px"),
+        (sources_of(40.0, 38.0, 0, 39.0), "sources are 39 px wide"),
+        (sources_of(3.0, 2.0, 0), "no part of the sky fits them at 11.4 deg of width"),
+    ],
+)
+def test_a_photograph_without_an_attitude_says_what_is_seen(monkeypatch, sources, words):
+    tried = []
+
+    def solved(field, base, sky, start):
+        tried.append(field.places_px)
+
+    monkeypatch.setattr(sessions, "_solve", solved)
+    points = ~sources.trail
+    places_px = np.array([[3.0, 4.0], [-5.0, 7.0]])
+    field = sessions.SourceField(places_px, 800, 600)
+    said = _why_not(field, CAMERA, None, sources, points, None)
+    assert words in said
+    if "sky fits" in words:
+        assert "--radec" in said
+        (mirrored,) = tried
+        np.testing.assert_array_equal(mirrored, [[-3.0, 4.0], [5.0, 7.0]])
+        near = _why_not(field, CAMERA, None, sources, points, np.array([1.0, 0, 0, 0]))
+        assert "near --radec" in near
+        monkeypatch.setattr(sessions, "_solve", lambda *field_and_sky: "an attitude")
+        assert "is mirrored" in _why_not(field, CAMERA, None, sources, points, None)
+
+
+def test_stars_are_first_seen_at_their_sources():
+    sources = SimpleNamespace(x_px=np.array([1.0, 2.0, 3.0]), y_px=np.array([10.0, 20.0, 30.0]))
+    sky = SimpleNamespace(vectors=np.eye(3))
+    shot = SimpleNamespace(sources=sources, sky=sky)
+    places = _seen_at(shot, np.array([2, 0]), np.array([1, 2]))
+    assert places.x_px.tolist() == [2.0, 3.0]
+    assert places.y_px.tolist() == [20.0, 30.0]
+    np.testing.assert_array_equal(places.vectors, np.eye(3)[[2, 0]])

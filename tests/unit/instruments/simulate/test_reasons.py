@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from hilstar.instruments.simulate import budget
-from hilstar.instruments.verify.verdict import _black, _geometry
+from hilstar.instruments.verify.verdict import _black, _floor, _geometry
 
 LIMIT_PX = 0.1
 RIGHT = {
@@ -82,3 +83,27 @@ def test_a_tilt_is_told_in_degrees_and_a_distortion_in_pixels():
     assert "leaves 0.44 px at 95 %" in left
     (shifted,) = geometry_reasons(offset_px=(-0.3, 0.5))
     assert "shifted by (-0.30, +0.50) px" in shifted
+
+
+@pytest.mark.parametrize(
+    ("floor_px", "floor_mag", "glass_px", "glass_mag", "is_glass"),
+    [
+        (0.3, 0.0, 0.2, 0.0, True),
+        (0.3, 0.0, 0.1, 0.0, False),  # under half of it
+        (0.3, 0.0, 0.0, 0.9, False),  # vignetting moves no star
+        (0.0, 0.3, 0.0, 0.2, True),
+        (0.0, 0.3, 0.9, 0.1, False),
+    ],
+)
+def test_a_glass_is_named_where_it_makes_most_of_what_is_off(
+    floor_px, floor_mag, glass_px, glass_mag, is_glass
+):
+    verify = SimpleNamespace(flux_mag=0.05, centroid_px=LIMIT_PX, centroider="window")
+    glass = SimpleNamespace(px=glass_px, mag=glass_mag)
+    measured = SimpleNamespace(config=SimpleNamespace(verify=verify), glass=glass)
+    figures = {"floor_mag": np.full(9, -floor_mag), "floor_px": np.full(9, floor_px)}
+    (reason,) = _floor(measured, SimpleNamespace(of=figures.__getitem__))
+    assert ("beside their chief rays" in reason) is is_glass
+    figures["floor_mag"] = np.full(9, 0.049)
+    figures["floor_px"] = np.full(9, 0.99 * LIMIT_PX)
+    assert _floor(measured, SimpleNamespace(of=figures.__getitem__)) == []

@@ -19,6 +19,7 @@ from hilstar.basics.text_tables import (
     is_no_number,
     plain_name,
 )
+from hilstar.basics.units import flux_ratio
 
 PARTS = ("x_px", "y_px", "dn", "hip", "width_px")  # of a star, in the order of its row
 MAGNITUDE, MAX_MAGNITUDE = "mag", 100.0
@@ -76,7 +77,7 @@ class StarColumns:
                 if abs(magnitude) > MAX_MAGNITUDE:
                     fault = f"{magnitude_name} = {magnitude:g} is no magnitude"
                     raise InputError(f"{path}:{line}: {fault}; {ADVICE}")
-                star[2] = 10 ** (-0.4 * magnitude)
+                star[2] = flux_ratio(magnitude)
             stars.append(star)
         return stars
 

@@ -123,6 +123,8 @@ def studentized_limits(
     """
     total, weight, drawn = _drawn_blocks(sums, weights, rng)
     value, error = ratios(total[None], weight[None])
+    if not error[0]:  # cases that are all alike, as of a tracker without noise
+        return float(value[0]), float(value[0])
     drawn_value, drawn_error = ratios(total[drawn], weight[drawn])
     off = (drawn_value - value) / np.maximum(drawn_error, MIN_ERROR_SHARE * error)
     least, most = np.quantile(off, [1 - confidence, confidence])

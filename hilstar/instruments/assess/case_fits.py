@@ -159,9 +159,10 @@ def root_mean(
         exponent = min(wide / variance, MAX_EXPONENT)
         high = max(high, variance * math.exp(exponent))
         low = min(low, variance - wide)
-    heaviest = float(sums.max() / sums.sum())
-    if sums.min() >= 0 and heaviest > HEAVY_SHARE:
-        method += f"; one case has {heaviest:.0%} of the squares, and more cases would tell"
+    heaviest = float(sums.max())
+    if sums.min() >= 0 and heaviest > HEAVY_SHARE * sums.sum():
+        share = heaviest / sums.sum()
+        method += f"; one case has {share:.0%} of the squares, and more cases would tell"
     value = root_of(variance)
     lower = min(root_of(low), value)
     upper = max(root_of(high), value)

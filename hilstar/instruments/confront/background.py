@@ -17,6 +17,7 @@ from hilstar.basics.units import MAD_TO_SIGMA
 
 PATTERN_CLIP = 4.0  # sigmas beyond which a pixel of one photograph does not count
 LEVELS = 16  # parts of an image by their light, each with a sigma of its own
+SAME_LEVEL = 1e-9  # relative variance of light that rounding alone makes
 FOUND_SIGMAS = 4.0
 KINDS = ("response", "offsets_dn", "columns_dn", "rows_dn")
 NAMES = ("response of pixels", "offsets of pixels", "of columns", "of rows")
@@ -115,7 +116,10 @@ def fixed_pattern(
     """
     pixels, shares, columns, rows, light, inverse = (_Pairs() for _ in range(6))
     for off, level, mask in photographs:
-        use = _quiet(off, level, mask & (level > 0))
+        is_lit = mask & (level > 0)
+        if not is_lit.any():
+            continue
+        use = _quiet(off, level, is_lit)
         off = np.where(use, off - off[use].mean(), 0.0)
         level = np.where(use, level, 1.0)
         column_mean, is_column_known = _line_means(off, use, 0)
@@ -147,13 +151,15 @@ def fixed_pattern(
     both_scatter = both.scatter * math.sqrt(1.5)
     share_scatter = share.scatter * math.sqrt(1.5)
     determinant = lit * dim - 1
-    response = (both.value * dim - share.value) / determinant
-    response_error = math.hypot(both_scatter * dim, share_scatter) / determinant
-    offset = (share.value * lit - both.value) / determinant
-    offset_error = math.hypot(share_scatter * lit, both_scatter) / determinant
-    if offset < FOUND_SIGMAS * offset_error:
-        response = both.value / lit
-        response_error = both.error / lit
+    response = both.value / lit
+    response_error = both.error / lit
+    offset, offset_error = 0.0, math.inf
+    if determinant > SAME_LEVEL:
+        offset = (share.value * lit - both.value) / determinant
+        offset_error = math.hypot(share_scatter * lit, both_scatter) / determinant
+    if offset >= FOUND_SIGMAS * offset_error:
+        response = (both.value * dim - share.value) / determinant
+        response_error = math.hypot(both_scatter * dim, share_scatter) / determinant
     return FixedPattern(
         (response, offset, column.value, row.value),
         (response_error, offset_error, column.scatter, row.scatter),
@@ -171,7 +177,7 @@ def _quiet(off: FloatArray, level: FloatArray, mask: BoolArray) -> BoolArray:
     squares = np.bincount(part, off[mask] ** 2, minlength=LEVELS)
     sigma = np.sqrt(squares / count)
     use = mask.copy()
-    use[mask] = np.abs(off[mask]) < PATTERN_CLIP * sigma[part]
+    use[mask] = np.abs(off[mask]) <= PATTERN_CLIP * sigma[part]
     return use
 
 

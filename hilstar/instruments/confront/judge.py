@@ -502,7 +502,10 @@ def defects(photographs: Iterable[FloatArray], have_moved: bool) -> tuple[BoolAr
     """
     # stars that did not move may have one pixel in each photograph, too: of these, pixels that
     # share nothing at all with their neighbours
-    share, unsure = (HOT_LIGHT, 3.0) if have_moved else (ALONE_LIGHT, 2.0)
+    if have_moved:
+        share, unsure = HOT_LIGHT, 3.0
+    else:
+        share, unsure = ALONE_LIGHT, 2.0
     bright_counts: IntArray = np.zeros(1, dtype=np.int64)
     dark_counts: IntArray = np.zeros(1, dtype=np.int64)
     count = 0

@@ -17,7 +17,7 @@ from hilstar.instruments.assess.bounded_figures import (
     lowest_size,
     studentized_limits,
 )
-from hilstar.instruments.assess.case_fits import fit_by_cases
+from hilstar.instruments.assess.case_fits import fit_by_cases, root_mean
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.cases import FRAME_RATE_ERRORS, FRAME_RATES
 from hilstar.instruments.campaign.plan import Require
@@ -315,3 +315,30 @@ def test_answers_without_rates_or_stars_say_so(rng: np.random.Generator) -> None
     found = figure_verdict(cases, "rate-bias", maximum=0.01)
     assert found.value is None and found.more is None and "no rate" in found.method
     assert "no single stars" in figure_verdict(answers(rng), "star-noise", maximum=0.1).method
+
+
+@pytest.mark.parametrize(
+    ("squares", "value", "high"),
+    [
+        (np.zeros(80), 0.0, 0.0),
+        (np.full(80, 4.0), 2.0, 2.0),
+        (np.tile([1.0, -1.0], 40), 0.0, 0.0),  # excesses that cancel in each case
+    ],
+    ids=["none", "alike", "cancel"],
+)
+def test_noise_that_is_alike_in_every_case_has_limits_without_width(
+    squares: np.ndarray, value: float, high: float, rng: np.random.Generator
+) -> None:
+    """A tracker without noise got limits that are no numbers."""
+    case = np.repeat(np.arange(20), 4)
+    figure = root_mean(squares, np.ones(80), case, 0.975, rng)
+    assert figure.value == pytest.approx(value, abs=1e-12)
+    assert figure.high == pytest.approx(high, abs=1e-12)
+    assert figure.low <= figure.value
+    assert "one case" not in figure.method
+
+
+def test_a_case_that_has_most_of_the_squares_is_named(rng: np.random.Generator) -> None:
+    squares = np.append(60.0, np.ones(79))
+    figure = root_mean(squares, np.ones(80), np.repeat(np.arange(20), 4), 0.975, rng)
+    assert "one case has 45% of the squares" in figure.method  # 63 of 139

@@ -170,6 +170,31 @@ def test_each_part_of_a_fixed_pattern_is_told_from_the_others(rng, planted):
     assert pattern.variance_dn2(light_dn) == pytest.approx(variance_dn2)
 
 
+def test_one_level_has_all_pattern_as_response_and_what_no_noise_is_is_none(rng):
+    """Light that is the same to the last bit in all photographs tells no offsets."""
+    level_dn = np.full(PATTERN_SHAPE, 700.0)
+    every = np.ones(PATTERN_SHAPE, dtype=bool)
+    shares = 0.01 * rng.standard_normal(PATTERN_SHAPE)
+    images = []
+    for _ in range(4):
+        off_dn = shares * level_dn + NOISE_DN * rng.standard_normal(PATTERN_SHAPE)
+        images.append((off_dn, level_dn, every))
+    pattern = fixed_pattern(images)
+    assert pattern.rms == pytest.approx((0.01, 0, 0, 0), rel=DRAWN)
+    assert "offsets of pixels" not in pattern.words()
+    quiet = fixed_pattern([(np.zeros(PATTERN_SHAPE), level_dn, every)] * 3)
+    assert quiet.rms == (0, 0, 0, 0)
+
+
+def test_a_photograph_that_is_all_sources_has_no_pattern(rng):
+    two = list(pattern_photographs(rng, 0.01, 0, 0, 0))[:2]
+    off_dn, level_dn, every = two[0]
+    covered = (off_dn, level_dn, ~every)
+    assert fixed_pattern([covered, covered, covered]) is None
+    with_it = fixed_pattern([covered, *two])
+    assert with_it == fixed_pattern(two)
+
+
 def test_a_fixed_pattern_s_words_have_each_part_in_its_unit():
     pattern = FixedPattern((1e-4, 144.0, 0.0, 9.0), (1e-6, 2.4, 2.0, np.inf))
     assert pattern.words() == (

@@ -24,7 +24,10 @@ from hilstar.basics.units import flux_ratio
 PARTS = ("x_px", "y_px", "dn", "hip", "width_px")  # of a star, in the order of its row
 MAGNITUDE, MAX_MAGNITUDE = "mag", 100.0
 SIGNALS = ("dn", "flux", "adu", "counts", "signal", "intensity")  # what people call DN
-PLACE_COLUMN = re.compile(r"(star|centroid)_?(\d*)_[xy](?:_px)?")
+# a place in another unit is refused; another ending, such as _sigma, is no place
+PLACE_COLUMN = re.compile(
+    r"(star|centroid)_?(\d*)_[xy](?:_(px|m|mm|um|rad|mrad|deg|arcmin|arcsec))?"
+)
 ADVICE = "leave the cells of a star blank where an answer has none"
 
 
@@ -40,8 +43,9 @@ class StarGroup:
 class StarColumns:
     """The columns of stars of a table. `one_a_row` is True where each row has one star.
 
-    Raises InputError for a star with one of x and y alone or with a signal and a magnitude, for two
-    names of one, and for numbered stars beside unnumbered ones.
+    Raises InputError for a star with one of x and y alone or with a signal and a magnitude, for a
+    place in another unit than pixels, for two names of one star, and for numbered stars beside
+    unnumbered ones.
     """
 
     def __init__(self, table: TextTable) -> None:
@@ -90,11 +94,17 @@ def _known(path: Path, line: int, name: str, text: str) -> float | None:
 
 
 def _words(table: TextTable) -> Iterator[tuple[str, str]]:
-    """The word and the number, "" for one a row, of each star whose place a table has."""
+    """The word and the number, "" for one a row, of each star whose place a table has. Raises
+    InputError for a place that is not in pixels.
+    """
     for column in table.columns:
         match = PLACE_COLUMN.fullmatch(plain_name(column.name))
-        if match is not None:
-            yield match[1], match[2]
+        if match is None:
+            continue
+        if match[3] not in (None, "px"):
+            fault = f"column {column.header} is in {match[3]!r}, and px is wanted"
+            raise table.refusal(table.header_line, fault)
+        yield match[1], match[2]
 
 
 def _group_of(table: TextTable, word: str, number: str) -> StarGroup:

@@ -318,6 +318,8 @@ def test_telemetry_without_stars_has_no_rows_of_them(csv_of):
     ("columns", "cells", "fault"),
     [
         ("star1_x_px", "1", "of star1 both x and y are needed"),
+        ("star1_x_um,star1_y_um", "1,2", "column star1_x_um is in 'um', and px is wanted"),
+        ("star_x [mm],star_y [mm]", "1,2", "column star_x [mm] is in 'mm', and px is wanted"),
         ("star1_x,star1_y", "1,", ":2: star1_y_px = '' is not a finite number; leave the cells"),
         ("star1_x,star1_y,star1_dn", "1,2,bright", "star1_dn = 'bright' is not a finite number"),
         (

@@ -5,9 +5,11 @@ finds.
     python tools/mutants.py --mutants 40 --near -o DIR
     HILSTAR_LINE_MAP=MAP pytest -n0 -p tests.support.line_map
     python tools/mutants.py --mutants 140 --seed 2 --by-lines MAP --near -o DIR
+    python tools/mutants.py --mutants 40 --rooms attitude/logs server/loop.py -o DIR
     python tools/mutants.py --planted tools/planted_faults.toml --by-lines MAP --near -o DIR
 
-Each mutant is one change of one expression in a core room, in a copy of the checkout. DIR gets
+Each mutant is one change in a core room, or in those of --rooms, in a copy of the checkout: one
+expression, one call or one check that is left out, or two arguments that are swapped. DIR gets
 mutants.csv: the change, and the test that fails ("" where none does). A test counts that fails
 twice with the change and passes without it: what fails by the machine's load, or for what the copy
 lacks, is said and passed over. A run that is stopped goes on where it was. With --near only those
@@ -55,6 +57,8 @@ ROOT = Path(__file__).parent.parent
 ROOMS = ("sky", "optics", "display", "attitude", "tracker", "server/loop.py")
 # A mutant that never ends is found, too: an unchanged checkout takes a tenth of it when idle.
 MAX_RUN_S = 1800
+# The tests of a line that are run: few faults that the fastest pass are found by slower ones.
+MAX_TESTS_OF_LINE_S = 30.0
 HANGS = "it does not end"
 # a test that takes longer waits for what never comes, and ends the run (pytest 9.0 or newer)
 STUCK_S = 60
@@ -132,6 +136,8 @@ class Outcome:
 def changed(node: ast.AST) -> ast.AST | None:
     """The node with one fault; None where it is of no kind that is changed."""
     mutant = copy.deepcopy(node)
+    if isinstance(mutant, ast.stmt):
+        return changed_statement(mutant)
     match mutant:
         case ast.Compare(ops=[comparison]) if type(comparison) in COMPARED:
             mutant.ops = [COMPARED[type(comparison)]()]
@@ -139,8 +145,6 @@ def changed(node: ast.AST) -> ast.AST | None:
             is_text = isinstance(left, (ast.Constant, ast.JoinedStr)) and not _is_number(left)
             if is_text:
                 return None
-            mutant.op = COMPUTED[type(operator)]()
-        case ast.AugAssign(op=operator) if type(operator) in COMPUTED:
             mutant.op = COMPUTED[type(operator)]()
         case ast.BoolOp(op=ast.And()):
             mutant.op = ast.Or()
@@ -150,11 +154,24 @@ def changed(node: ast.AST) -> ast.AST | None:
             return operand
         case ast.Constant(value=bool() | int() | float() as value):
             mutant.value = other_number(value)
-        case ast.Expr(value=ast.Call()):
-            return ast.Pass()
+        case ast.Call(args=[ast.Name() as first, ast.Name() as second, *others]):
+            mutant.args = [second, first, *others]
         case _:
             return None
     return mutant
+
+
+def changed_statement(mutant: ast.stmt) -> ast.stmt | None:
+    """The statement with one fault, changed in place; None as above."""
+    match mutant:
+        case ast.AugAssign(op=operator) if type(operator) in COMPUTED:
+            mutant.op = COMPUTED[type(operator)]()
+            return mutant
+        case ast.Expr(value=ast.Call()):
+            return ast.Pass()
+        case ast.If(body=[ast.Raise() | ast.Return() | ast.Continue()], orelse=[]):
+            return ast.Pass()
+    return None
 
 
 def other_number(value: bool | int | float) -> bool | int | float:
@@ -209,15 +226,15 @@ def mutants_of(path: Path) -> list[Mutant]:
     return mutants
 
 
-def drawn(count: int, seed: int) -> list[Mutant]:
-    """Mutants by chance, each of a core room's as probable as any other."""
+def drawn(count: int, seed: int, rooms: Sequence[str]) -> list[Mutant]:
+    """Mutants by chance, each of the rooms' as probable as any other."""
     mutants: list[Mutant] = []
-    for room in ROOMS:
+    for room in rooms:
         place = ROOT / "hilstar" / room
         for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
             mutants += mutants_of(path)
     print(f"{len(mutants)} mutants in all", flush=True)
-    return random.Random(seed).sample(mutants, count)
+    return random.Random(seed).sample(mutants, min(count, len(mutants)))
 
 
 def copy_checkout(folder: Path) -> None:
@@ -245,7 +262,15 @@ class LineMap:
         names: set[str] = set()
         for line in lines_that_need(ROOT / mutant.path, mutant.line) or map(int, by_line):
             names.update(by_line.get(str(line), []))
-        return sorted(names, key=lambda name: self.seconds.get(name, 0.0))
+        fastest_first = sorted(names, key=lambda name: self.seconds.get(name, 0.0))
+        chosen: list[str] = []
+        total_s = 0.0
+        for name in fastest_first:
+            total_s += self.seconds.get(name, 0.0)
+            if chosen and total_s > MAX_TESTS_OF_LINE_S:
+                break
+            chosen.append(name)
+        return chosen
 
 
 def lines_that_need(path: Path, line: int) -> set[int]:
@@ -444,6 +469,9 @@ def main() -> None:
     parser.add_argument("--mutants", type=int, default=60)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument(
+        "--rooms", nargs="+", default=ROOMS, metavar="PATH", help="folders and files of hilstar/"
+    )
+    parser.add_argument(
         "--near", action="store_true", help="tests that name the module or its room"
     )
     parser.add_argument("--by-lines", type=Path, metavar="MAP", help="tests that run the line")
@@ -459,7 +487,7 @@ def main() -> None:
     if options.planted:
         mutants = planted_faults(options.planted)
     else:
-        mutants = drawn(options.mutants, options.seed)
+        mutants = drawn(options.mutants, options.seed, options.rooms)
     done = 0
     if table.exists():
         with table.open(encoding="utf-8") as rows:

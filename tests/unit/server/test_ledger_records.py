@@ -41,9 +41,7 @@ MIN_NS, MAX_NS = -(2**63), 2**63 - 1
 
 def drawn(rate=RATE) -> SimpleNamespace:
     """What was drawn in a frame."""
-    return SimpleNamespace(
-        star_count=31, clipped_hip=(7, 8, "Moon"), capped=5, rate_cam_rad_s=rate
-    )
+    return SimpleNamespace(star_count=31, clipped_hip=(7, 8, "Moon"), capped=5, rate_cam_rad_s=rate)
 
 
 def test_a_frame_s_record_has_each_of_its_figures():

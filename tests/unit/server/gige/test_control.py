@@ -117,6 +117,25 @@ def test_a_controller_that_was_silent_for_too_long_does_not_get_its_privilege_ba
     assert camera.take_events() == [Released(silent=True)]
 
 
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_controller_that_is_gone_leaves_nothing_of_its_stream_to_the_next(silent):
+    """Neither its port nor its address: no image goes where the next one listens for another."""
+    camera = channel()
+    first, second = Asker(camera), Asker(camera, OTHER)
+    first.write(PRIVILEGE, CONTROL)
+    first.write(STREAM_ADDRESS, HERE)
+    first.write(STREAM_PORT, 5123)
+    if silent:
+        second.now_ns = (first.read(HEARTBEAT_MS) + 1) * NS_PER_MS
+    else:
+        first.write(PRIVILEGE, 0)
+    assert second.write(PRIVILEGE, CONTROL) == 0
+    assert camera.destination is None
+    assert (second.read(STREAM_PORT), second.read(STREAM_ADDRESS)) == (0, 0)
+    assert second.write(STREAM_PORT, 6000) == 0
+    assert camera.destination == (OTHER[0], 6000)
+
+
 def test_images_go_to_the_controllers_own_address_alone():
     camera = channel()
     client = Asker(camera)

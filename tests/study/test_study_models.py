@@ -12,13 +12,16 @@ from astropy.wcs import WCS
 from PIL import Image
 from scipy import constants
 
+from hilstar.basics import charts
 from hilstar.basics.charts import TITLE_COLUMNS, title_lines
 from hilstar.instruments.study.models import (
+    FIGURES,
     choices_finding,
     running_percentiles,
+    spectra,
     zero_points,
 )
-from hilstar.instruments.study.rapp import rapp_ratios
+from hilstar.instruments.study.rapp import SENSORS, rapp, rapp_ratios
 from hilstar.instruments.study.sky_figures import star_density
 from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.sky import electrons
@@ -58,9 +61,23 @@ TABLE_MAG_LIMIT = 2e-6
 
 
 @pytest.fixture(scope="module")
-def models_study(whole_study):
+def whole_models(whole_study):
     found = whole_study("models", STEMS, "")
     return found.folder, dict(line.split(": ", 1) for line in found.findings)
+
+
+@pytest.fixture(scope="module")
+def models_study(tmp_path_factory):
+    """The tables of every figure but `spectra`, which takes most of the study's time, and what they
+    say; no chart is laid out or written.
+    """
+    folder = tmp_path_factory.mktemp("models")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(charts, "finish", lambda figure: None)
+        patch.setattr(charts, "save", lambda figure, path: None)
+        findings = [rapp(folder, sensor) for sensor in SENSORS]
+        findings += [figure(folder) for figure in FIGURES if figure is not spectra]
+    return folder, {finding.figure: finding.text for finding in findings}
 
 
 def table_columns(path):
@@ -159,8 +176,8 @@ def test_the_zero_points_differ_by_a_third_of_a_magnitude(models_study):
     assert table["mag_against_default"][bolometric] == pytest.approx([0.31, 0.31], abs=0.01)
 
 
-def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(models_study):
-    table, text = table_columns(models_study[0] / "spectra.csv"), models_study[1]["spectra"]
+def test_real_spectra_beat_black_bodies_in_the_chart_as_in_the_table(whole_models):
+    table, text = table_columns(whole_models[0] / "spectra.csv"), whole_models[1]["spectra"]
     assert table["spectral_type"] == list(load_library().spectral_type)
     median = {}
     for name in ("pickles, leave-one-out", "black body, ballesteros2012"):
@@ -263,9 +280,9 @@ def test_choices_cost_what_a_bench_would_see(models_study):
     found = [table[f"pickles_{name}_mag"][row] for name in ("p5", "median", "p95")]
     assert found == pytest.approx(np.percentile(mags, (5, 50, 95)), abs=TABLE_MAG_LIMIT)
     assert table["stars_in_window"][row] == near.sum()
-    rapp = table_columns(models_study[0] / "rapp_ccd47-20.csv")
+    ratios = table_columns(models_study[0] / "rapp_ccd47-20.csv")
     at = electrons.star_temperatures_k(np.array([1.0]), "ballesteros2012")
-    ags_mag = 2.5 * np.log10(np.interp(at, rapp["temperature_k"], rapp["rapp3_energy"]))
+    ags_mag = 2.5 * np.log10(np.interp(at, ratios["temperature_k"], ratios["rapp3_energy"]))
     # straight lines between 400 points
     assert table["brightness_ags_mag"][row] == pytest.approx(ags_mag[0], abs=1e-4)
 
@@ -282,8 +299,8 @@ def test_there_are_no_percentiles_where_stars_are_few():
 
 
 @pytest.mark.parametrize("sensor", HELD_OUT)
-def test_real_spectra_are_as_wrong_as_measured(models_study, sensor):
-    table = table_columns(models_study[0] / "spectra.csv")
+def test_real_spectra_are_as_wrong_as_measured(whole_models, sensor):
+    table = table_columns(whole_models[0] / "spectra.csv")
     assert len(table["spectral_type"]) == 106
     errors = np.abs(table[f"{sensor}: pickles, leave-one-out [%]"][table["vi_mag"] < 2.5])
     assert np.percentile(errors, (50, 95)) == pytest.approx(
@@ -313,6 +330,10 @@ def test_titles_say_what_the_tables_hold(models_study):
         "zero changes most: half of Hipparcos to V = 7.5 by 0.31 mag and more; a twentieth are"
         " changed most by ags, by 0.32 mag"
     )
+
+
+def test_the_title_of_spectra_says_what_its_table_holds(whole_models):
+    folder, texts = whole_models
     table = table_columns(folder / "spectra.csv")
     for name in ("pickles, leave-one-out", "black body, ballesteros2012"):
         errors = np.abs(table[f"kai-4021: {name} [%]"][table["vi_mag"] < 2.5])
@@ -357,8 +378,8 @@ def test_the_thesis_s_tables_stand_beside_what_is_here(models_study):
     )
 
 
-def test_every_figure_is_drawn_and_found(models_study):
-    folder, texts = models_study
+def test_every_figure_is_drawn_and_found(whole_models):
+    folder, texts = whole_models
     table = table_columns(folder / "findings.csv")
     assert tuple(table["figure"]) == tuple(texts) == STEMS
     assert table["finding"] == list(texts.values())

@@ -12,7 +12,6 @@ from astropy.wcs import WCS
 from PIL import Image
 from scipy import constants
 
-from hilstar.basics import charts
 from hilstar.basics.charts import TITLE_COLUMNS, title_lines
 from hilstar.instruments.study.models import (
     FIGURES,
@@ -28,6 +27,7 @@ from hilstar.sky import electrons
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.spectrum import DATA_DIR
+from tests.support.studies import undrawn
 from tests.support.tables import csv_rows
 from tests.support.waiting import PATIENCE_S
 
@@ -69,12 +69,10 @@ def whole_models(whole_study):
 @pytest.fixture(scope="module")
 def models_study(tmp_path_factory):
     """The tables of every figure but `spectra`, which takes most of the study's time, and what they
-    say; no chart is laid out or written.
+    say.
     """
     folder = tmp_path_factory.mktemp("models")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(charts, "finish", lambda figure: None)
-        patch.setattr(charts, "save", lambda figure, path: None)
+    with undrawn():
         findings = [rapp(folder, sensor) for sensor in SENSORS]
         findings += [figure(folder) for figure in FIGURES if figure is not spectra]
     return folder, {finding.figure: finding.text for finding in findings}

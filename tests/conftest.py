@@ -73,7 +73,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(MARKERS[folder])
         if folder == "timing":
             item.add_marker("timing")
-        if item.nodeid.partition("[")[0] in selection.SLOW:
+        if selection.is_slow(item.nodeid):
             item.add_marker("slow")
     selection.select(config, items)
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import erf, ndtr
 
 from hilstar.display.geometry import monitor_camera
@@ -21,10 +22,12 @@ from hilstar.instruments.calibrate.first_light.seen_stars import (
     StarSpot,
     StarsSeen,
     _codes_mag,
+    _fields,
 )
 from hilstar.instruments.calibrate.first_light.stars import frames_for, place_reasons
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from tests.support.closed_camera import AXIS_PX, DETECTOR_PX, ClosedCamera, closed_context
 
 WIDE = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=0.0, electronics_dn=0.0)
 MAG_A_RELATIVE = 2.5 / np.log(10)
@@ -226,3 +229,46 @@ def test_as_many_frames_are_asked_for_as_bring_the_doubt_to_the_limit(frames):
         assert asked == max(wanted, frames + 1)
     sure = SimpleNamespace(sigma=0.01, low=0.0, high=0.04)
     assert frames_for(SimpleNamespace(beyond_px=sure, frames=frames), 0.1) == frames
+
+
+def test_fields_have_the_most_stars_that_both_tracker_and_screen_have(tmp_path, rng):
+    """Of a screen that covers a fifth of the tracker's field; all stars are alike."""
+    screen = {
+        "monitor": {"resolution_px": [64, 60]},
+        "collimator": {"principal_point_px": [30.0, 32.0]},
+    }
+    context = closed_context(tmp_path, ClosedCamera(), screen)
+    vectors = rng.normal(size=(9000, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    stars = SimpleNamespace(
+        electrons_per_s=np.full(9000, 20_000.0),
+        row=np.arange(9000),
+        directions=lambda chosen: vectors[chosen],
+    )
+    bench = SimpleNamespace(
+        stars=stars,
+        psf=SimpleNamespace(peak_share=0.3),
+        flux_at_white_e_per_s=1e6,
+        camera=context.real_geometry().monitor,
+    )
+    spot = StarSpot((0.9, 0.9), 4.0, 0.0, 0.0)
+    fields = _fields(bench, context, spot, noise_dn=2.0)
+    assert len(fields) >= 3
+    counts = []
+    for q in fields:
+        x, y, z = Rotation.from_quat(q, scalar_first=True).as_matrix() @ vectors.T
+        ahead = z > 0
+        right, down = x[ahead] / z[ahead], y[ahead] / z[ahead]
+        inside = np.ones(len(right), dtype=bool)
+        for axis_px, focal_px, size_px, margin_px in (
+            (AXIS_PX, 10e3 / 13, DETECTOR_PX, spot.radius_px + 12),
+            ((30.0, 32.0), 40e3 / 57.65, (64, 60), 12),
+        ):
+            column = axis_px[0] + focal_px * right
+            row = axis_px[1] + focal_px * down
+            inside &= (column > margin_px) & (column < size_px[0] - margin_px)
+            inside &= (row > margin_px) & (row < size_px[1] - margin_px)
+        counts.append(int(inside.sum()))
+    assert counts == sorted(counts, reverse=True)
+    # the screen has 3.3 x 3.0 degrees without its margins: 2 stars on average
+    assert counts[0] >= 4

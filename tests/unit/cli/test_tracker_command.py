@@ -93,13 +93,6 @@ def parts(monkeypatch: pytest.MonkeyPatch) -> Iterator[Parts]:
     assert made["frames"].closed and made["live"].closed
 
 
-def _Counts(images: int) -> Any:
-    from hilstar.server.gige.camera import CameraCounts
-    from hilstar.server.gige.control import ControlCounts
-
-    return CameraCounts(images=images) if images == 3 else ControlCounts(commands=images)
-
-
 def tracker(folder: Path, *words: str) -> Any:
     """The command's end, before frames from tcp://x:1."""
     changes = {"tracker": {"exposure_s": 0.05, "resolution_px": [900, 600]}}

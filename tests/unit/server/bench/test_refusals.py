@@ -53,6 +53,22 @@ def answers(**keys: str) -> str:
     return "\n".join(["[answers]", *(f"{key} = {value}" for key, value in known.items())])
 
 
+QUATERNION = """{name = "qw", at = 4, type = "f32be"}, {name = "qx", at = 8, type = "f32be"},
+ {name = "qy", at = 12, type = "f32be"}, {name = "qz", at = 16, type = "f32be"}"""
+
+
+def frames(*fields: str, **keys: str) -> str:
+    """Answers in frames of 32 bytes, with fields beside the quaternion's."""
+    numbers = ", ".join([QUATERNION, *(f"{{{field}}}" for field in fields)])
+    known = {"format": '"frame"', "framing": '"fixed"', "length": "32", "fields": f"[{numbers}]"}
+    return more(answers(**(known | keys)))
+
+
+def number(name: str, at: int, kind: str, rest: str = "") -> str:
+    """A field of a frame."""
+    return f'name = "{name}", at = {at}, type = "{kind}"{rest}'
+
+
 REFUSED = [
     *((without(key), f"[tracker] the key {key} is missing") for key in NEEDED),
     (
@@ -198,6 +214,45 @@ REFUSED = [
     (more(answers(source='"tcp"')), "needs connect or listen, one of them"),
     (more(answers(source='"zmq"', bind='"127.0.0.1:7"')), 'is for source = "udp"; write true'),
     (more(answers(poll_hex='"00"')), "poll_hex over UDP needs connect"),
+    # the frames that they come in
+    (frames(framing='"sync"'), 'framing = "sync" needs sync_hex'),
+    (frames(sync_hex='"1ACF"'), "no other has it"),
+    (more(answers(format='"frame"')), "needs framing"),
+    (frames(length='{at = 2, type = "u8"}'), "needs length, in bytes"),
+    (
+        more(answers(format='"frame"', framing='"sync"', sync_hex='"1A"')),
+        'framing = "sync" needs length',
+    ),
+    (
+        frames(framing='"sync"', sync_hex='"1A"', length='{at = 2, type = "i16be"}'),
+        'length = { type = "i16be" }',
+    ),
+    (frames(fields=f"[{QUATERNION.replace('qy', 'qx')}]"), 'fields has name = "qx" twice'),
+    (frames(fields=f"[{QUATERNION.splitlines()[0][:-1]}]"), "fields lacks qy, qz"),
+    (frames(convention='{scalar = "last"}'), "fields says by the name qw"),
+    (frames(number("wx", 20, "f32be")), "one or two of wx, wy, wz"),
+    (frames(number("wz", 20, "f32be"), number("wy", 24, "f32be")), "one or two of wx, wy, wz"),
+    (frames(number("t_ns", 20, "u32be"), number("t_s", 24, "u16be")), "t_ns beside t_s or t_sub"),
+    (frames(number("t_ns", 20, "u32be"), number("t_sub", 24, "u8")), "t_ns beside t_s or t_sub"),
+    (frames(number("mode", 20, "u12be")), 'mode has type = "u12be"'),
+    (frames(number("mode", 20, "f16be")), 'mode has type = "f16be"'),
+    (frames(number("mode", 20, "i8", ", mask = 3")), "mode has a mask, which is for u8 to u64"),
+    (frames(number("t_ns", 25, "u64le")), "t_ns ends with byte 32, and length = 32"),
+    (frames(number("t_s", 20, "u16le", ", scale = 0")), "t_s has scale = 0"),
+    (more(answers(framing='"slip"')), 'framing is for format = "frame"; remove it'),
+    (more(answers(checksum='"crc32"')), 'checksum is for format = "frame"; remove it'),
+    (more(answers(format='"xml"')), 'format = "xml"; "packet", "json", "frame" or'),
+    # where they come from
+    (more(answers(path='"t.bin"')), 'path is for source = "file"; remove it (source = "udp")'),
+    (
+        more(answers(source='"tcp"', listen='"127.0.0.1:7000"', connect='"h:1"')),
+        "needs connect or listen, one of them",
+    ),
+    (more(answers(source='"serial"', port="7000")), 'source = "serial" needs port'),
+    (
+        more(answers(connect='"h:1"', poll_hex=f'"{"00" * 5000}"')),
+        "write what one question is",
+    ),
     ("x = " + "[" * 5000, ""),
     ("x = " + "[" * 900 + "]" * 900, ""),
     ("[" + ".".join(["a"] * 2000) + "]", ""),
@@ -238,6 +293,11 @@ READ = [
     more(answers(connect='"host:65535"')),
     more(answers(connect='"[::1]:7000"', poll_hex='"00ff"')),
     more(answers(format='"python:m:f"', trust='["mine"]')),
+    frames(),
+    frames(number("t_ns", 24, "u64le"), number("valid", 20, "u8", ", mask = 3")),
+    frames(number("t_s", 20, "u16le", ", scale = -0.5"), number("t_sub", 22, "u24be")),
+    frames(*(number(name, 20 + 4 * k, "f32be") for k, name in enumerate(("wx", "wy", "wz")))),
+    frames(framing='"sync"', sync_hex='"1A CF"', length='{at = 2, type = "u16le", add = -4}'),
     more(answers(source='"serial"', port='"/dev/ttyUSB0"')),
     more(answers(source='"file"', path='"tracker.bin"')),
     more(answers(source='"tcp"', listen='"127.0.0.1:7000"')),

@@ -185,6 +185,10 @@ def test_it_is_described_with_its_inputs_outputs_and_what_they_begin_as(model):
         "frame", "health", "statuses", "answers", "answered_q_w", "answered_q_x", "answered_q_y",
         "answered_q_z", "answered_t_s",
     ]  # fmt: skip
+    said = {node.get("name"): node.get("description") for node in root.iter("ScalarVariable")}
+    assert said["t_s"].startswith("s: time of the attitude")
+    assert {said[name] for name in ("q_w", "q_z")} == {"q_icrs_to_cam, scalar first, Hamilton"}
+    assert said["rate_z"].startswith("rad/s")
     outputs, unknown = (
         root.find("ModelStructure/Outputs"),
         root.find("ModelStructure/InitialUnknowns"),

@@ -37,6 +37,7 @@ from tests.support.waiting import wait_for
 
 SIDE_PX = 256
 FIRE = 1 << 31
+STREAM_SOURCE_PORT = 0x0D1C  # the standard's SCSP0
 
 
 @contextlib.contextmanager
@@ -67,6 +68,7 @@ def streaming(made: GigECamera) -> Iterator[GigEClient]:
 def test_images_arrive_bit_for_bit_with_their_times():
     rng = np.random.default_rng(3)
     with served_camera() as made, streaming(made) as client:
+        source_port = client.read(STREAM_SOURCE_PORT)
         for k in range(5):
             dn = rng.integers(0, 4096, (SIDE_PX, SIDE_PX), dtype=np.uint16)
             begin_ns = time.monotonic_ns()
@@ -74,7 +76,9 @@ def test_images_arrive_bit_for_bit_with_their_times():
             number, stamp_ns, image = client.image(SIDE_PX, SIDE_PX)
             assert (number, stamp_ns) == (k + 1, begin_ns)
             np.testing.assert_array_equal(image, dn)
-        wait_for(lambda: made.counts.images == 5, "the last image is counted")
+        made.take(dn, time.monotonic_ns())
+        assert client.stream.recvfrom(65536)[1] == (made.address, source_port)
+        wait_for(lambda: made.counts.images == 6, "the last image is counted")
         assert made.counts.dropped == 0
 
 
@@ -214,9 +218,10 @@ def test_another_clients_address_is_refused_over_the_wire():
         assert client.write(STREAM_ADDRESS, elsewhere) == 0x8006
 
 
-def test_a_client_that_is_not_allowed_is_never_answered():
+def test_a_client_that_is_not_allowed_is_never_answered_and_told_of_once():
+    notices = Notices()
     with (
-        served_camera(allow=("127.0.9.9",)) as made,
+        served_camera(allow=("127.0.9.9",), notices=notices) as made,
         GigEClient(made.address, own="127.0.9.9") as friend,  # type: ignore[attr-defined]
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
     ):
@@ -227,6 +232,8 @@ def test_a_client_that_is_not_allowed_is_never_answered():
         stranger.setblocking(False)
         with pytest.raises(BlockingIOError):
             stranger.recv(2048)
+        assert notices.lasting.keys() == {"camera-sender-not-allowed"}
+        assert "from 127.0.0.1 are dropped" in notices.lasting["camera-sender-not-allowed"]
 
 
 def test_hostile_clients_leave_the_controller_its_images():

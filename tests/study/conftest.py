@@ -16,7 +16,7 @@ import pytest
 
 from hilstar.basics import charts
 from hilstar.instruments.study.sweep import Load, OtherWork
-from tests.support.studies import Studied, studied
+from tests.support.studies import SmallRun, Studied, studied
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,4 +69,22 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     """The figures that are saved, of which no file is written."""
     saved: list[Figure] = []
     monkeypatch.setattr(charts, "save", lambda drawn, path: saved.append(drawn))
+    return saved
+
+
+@pytest.fixture
+def small_run(tmp_path: Path, figures_by_stem: dict[str, Figure]) -> Callable[..., SmallRun]:
+    """Runs a study's own function, which takes a folder first, in this process."""
+
+    def run(work: Callable[..., object], *arguments: object) -> SmallRun:
+        return SmallRun(tmp_path, work(tmp_path, *arguments), figures_by_stem)
+
+    return run
+
+
+@pytest.fixture
+def figures_by_stem(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
+    """The figures that are saved by the stem of their files, of which none is written."""
+    saved: dict[str, Figure] = {}
+    monkeypatch.setattr(charts, "save", lambda drawn, path: saved.update({path.name: drawn}))
     return saved

@@ -72,19 +72,18 @@ def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
     return saved
 
 
-@pytest.fixture
-def small_run(tmp_path: Path, figures_by_stem: dict[str, Figure]) -> Callable[..., SmallRun]:
-    """Runs a study's own function, which takes a folder first, in this process."""
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SmallRun]:
+    """Runs a study's own function, which takes a folder first, in this process; what makes it
+    small is patched by the test.
+    """
 
     def run(work: Callable[..., object], *arguments: object) -> SmallRun:
-        return SmallRun(tmp_path, work(tmp_path, *arguments), figures_by_stem)
+        folder = tmp_path_factory.mktemp("small")
+        saved: dict[str, Figure] = {}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(charts, "save", lambda drawn, path: saved.update({path.name: drawn}))
+            told = work(folder, *arguments)
+        return SmallRun(folder, told, saved)
 
     return run
-
-
-@pytest.fixture
-def figures_by_stem(monkeypatch: pytest.MonkeyPatch) -> dict[str, Figure]:
-    """The figures that are saved by the stem of their files, of which none is written."""
-    saved: dict[str, Figure] = {}
-    monkeypatch.setattr(charts, "save", lambda drawn, path: saved.update({path.name: drawn}))
-    return saved

@@ -64,14 +64,6 @@ def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Studi
     return partial(studied, tmp_path_factory)
 
 
-@pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The figures that are saved, of which no file is written."""
-    saved: list[Figure] = []
-    monkeypatch.setattr(charts, "save", lambda drawn, path: saved.append(drawn))
-    return saved
-
-
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SmallRun]:
     """Runs a study's own function, which takes a folder first, in this process; what makes it

@@ -77,6 +77,30 @@ def test_statuses_leave_at_their_rate_and_only_the_newest():
     )
 
 
+def test_statuses_keep_their_rate_where_no_look_is_at_their_time():
+    """Looks every 7 ms, of which few fall on a tenth of a second: the next status is due by the
+    last one's own time. After a pause of a second they go on, one at a time.
+    """
+    link = Wire()
+    back = BackChannel(link, Traffic(status_hz=10))
+    sent_ns = []
+    looks_ns = [
+        *range(0, 10 * NS_PER_S, 7 * NS_PER_MS),
+        *range(11 * NS_PER_S, 12 * NS_PER_S, NS_PER_MS),
+    ]
+    for k, after_ns in enumerate(looks_ns):
+        back.post(status(k))
+        before = len(link.sent)
+        back.talk(NOW_NS + after_ns, ask=False)
+        assert len(link.sent) - before <= 1
+        sent_ns += [after_ns] * (len(link.sent) - before)
+    steady = [after_ns for after_ns in sent_ns if after_ns < 10 * NS_PER_S]
+    assert len(steady) == 100
+    late_ns = np.array(steady) - np.arange(100) * NS_PER_S // 10
+    assert ((late_ns >= 0) & (late_ns < 7 * NS_PER_MS)).all()
+    assert len(sent_ns) - len(steady) == 10
+
+
 def test_a_status_that_never_left_hands_on_what_is_told_once():
     link = Wire()
     back = BackChannel(link, Traffic(status_hz=10))

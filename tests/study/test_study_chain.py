@@ -10,6 +10,7 @@ import os
 import re
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ import pytest
 from hilstar.basics import charts
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from hilstar.display.quantise import shown_light
+from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.instruments.study import predictors
 from hilstar.instruments.study.chain import answers, choices, measuring, run
 from hilstar.instruments.study.chain import glass as chain_glass
@@ -754,3 +756,52 @@ def test_each_chain_is_timed_in_each_round_and_one_by_its_stages():
     visits = measuring.MIN_ROUNDS * measuring.FRAMES_A_VISIT
     for chain, taken in zip(chains, times, strict=True):
         assert (taken.time_ms, taken.cpu_ms, taken.frames) == (chain.ms, 2 * chain.ms, visits)
+
+
+def test_a_psf_that_is_a_pixel_off_and_three_percent_too_bright_is_told_so(tmp_path, monkeypatch):
+    """Against the whole one, here a Gaussian of 1.2 px, by the tracker's own centroider."""
+    sigma_px, side = 1.2, 15
+    at = np.arange(side) - side // 2
+
+    def stamps(x_off_px, y_off_px):
+        across = np.exp(-((at - x_off_px[:, None]) ** 2) / (2 * sigma_px**2))
+        down = np.exp(-((at - y_off_px[:, None]) ** 2) / (2 * sigma_px**2))
+        light = down[:, :, None] * across[:, None, :] / (2 * math.pi * sigma_px**2)
+        light[0] = 0.0  # a star in a dark corner is not judged
+        return light
+
+    def unreduced(x_px, y_px, shares):
+        assert len(shares) == len(x_px)
+        return stamps(x_px - np.floor(x_px + 0.5), y_px - np.floor(y_px + 0.5))
+
+    def told(psf, corner, told_side, shares):
+        assert told_side == side and len(corner[0]) == len(corner[1]) == len(shares)
+        return lambda x_px, y_px: psf(stamps(x_px, y_px))
+
+    def glass(file, psf):
+        return SimpleNamespace(shares_of=lambda stars, hip: np.ones((len(hip), 1)))
+
+    monkeypatch.setattr(chain_glass, "told_psf", told)
+    monkeypatch.setattr(chain_glass, "StarGlass", glass)
+    whole = SimpleNamespace(footprint_px=side, width_px=(sigma_px, sigma_px), unreduced=unreduced)
+    psfs = {
+        "whole": lambda light: light,
+        "right": lambda light: 1.03 * np.roll(light, 1, axis=2),
+        "down": lambda light: 0.98 * np.roll(light, 2, axis=1),
+    }
+    with Simulator(small_file(tmp_path)) as tracker:
+        scene = ChainScene("Orion", "", np.array(ORION_Q))
+        errors = chain_glass._errors(tracker, whole, psfs, scene)
+        in_view = len(chain_glass.field_stars(tracker.stars, tracker.camera, scene.q_icrs_to_cam))
+        monkeypatch.setattr(chain_glass, "MIN_STARS", in_view)
+        assert chain_glass._errors(tracker, whole, psfs, scene) == {}
+        monkeypatch.setattr(chain_glass, "MIN_STARS", in_view - 1)
+        assert chain_glass._errors(tracker, whole, psfs, scene) == errors
+    arcsec_per_px = math.atan(13e-3 / 70) * ARCSEC_PER_RAD
+    assert {error.stars for error in errors.values()} == {in_view - 1}
+    for name, off_px, percent in (("whole", 0, 0), ("right", 1, 3), ("down", 2, 2)):
+        error = errors[name]
+        # a window's edge sees a rolled star's wings otherwise
+        assert error.error_arcsec == pytest.approx(off_px * arcsec_per_px, rel=0.02, abs=1e-6)
+        assert error.error_percent == pytest.approx(percent, rel=1e-3, abs=1e-6)
+        assert error.worst_percent == pytest.approx(percent, rel=1e-3, abs=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from hilstar.instruments.study import economy
@@ -56,3 +57,40 @@ def test_the_study_has_five_scenes_of_three_depths_at_two_tolerances(economy_stu
     _, lines, rows = economy_study
     assert len(rows) == len(SCENES) * len(BITS) * (1 + len(TOLERANCES)) == 45
     assert len([line for line in lines if " bits, " in line and "instead of" in line]) == 30
+
+
+def test_two_small_scenes_have_the_recorded_errors_and_their_chart(small_run):
+    """At rest and turning, at 8 bits."""
+    scenes = SCENES[0], SCENES[4]
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (("SCENES", scenes), ("BITS", (8,)), ("QUICK_ROUNDS", 1)):
+            patch.setattr(economy, name, value)
+        run = small_run(economy.run, True)
+    figures = ("stars", "flux_max_mag", "centroid_max_px", "claimed_mag", "claimed_px")
+    figures += ("tolerance_mag", "tolerance_px", "measured_stars", "quantisation")
+    figures += ("claimed_within", *(f"max_px_{kind}" for kind in FAMILY))
+    assert_recorded(run.folder / "economy.csv", ("scene", "bits", "tolerance"), figures)
+    rows = run.rows("economy")
+    assert [row["scene"] for row in rows] == 3 * [scenes[0].name] + 3 * [scenes[1].name]
+    # bars of both tolerances in both scenes: full over auto, and the error over its limit
+    for panel, heights in enumerate(("speed", "error")):
+        containers = run.charts["economy"].axes[panel].containers
+        for tolerance, bars in zip(TOLERANCES, containers, strict=True):
+            wanted = []
+            for full, *autos in (rows[:3], rows[3:]):
+                (auto,) = (row for row in autos if row["tolerance"] == tolerance.name)
+                if heights == "speed":
+                    wanted.append(float(full["frame_ms"]) / float(auto["frame_ms"]))
+                else:
+                    worst_px = max(float(auto[f"max_px_{kind}"]) for kind in FAMILY)
+                    mag = float(auto["flux_max_mag"])
+                    wanted.append(max(mag / tolerance.mag, worst_px / tolerance.px))
+            np.testing.assert_allclose([bar.get_height() for bar in bars], wanted)
+    lines = run.told[0]
+    assert len(lines) == 4 + 1
+    for line, row in zip(lines, [*rows[1:3], *rows[4:6]], strict=False):
+        assert line.startswith(f"{row['scene']}, 8 bits, {float(row['tolerance_mag']):g} mag and")
+        assert (
+            f"errors of {row['measured_stars']} stars {float(row['flux_max_mag']):.4f} mag" in line
+        )
+        assert f"({float(row['max_px_fit']):.4f} by a PSF fit), within the tolerance" in line

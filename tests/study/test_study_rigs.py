@@ -101,16 +101,16 @@ def test_a_scatter_falls_with_light_and_is_largest_about_the_boresight():
     field = rigs.rig_field()
     faint, bright = (
         rigs.scatter_arcsec(field, field.pixel_px, star_dn, exposures=8)
-        for star_dn in (60.0, 400.0)
+        for star_dn in (60.0, 200.0)
     )
     assert list(faint) == list(rigs.SCATTER_ARCSEC)
     for name in faint:
         about, *across = bright[name]
         assert about > 3 * max(across)
     assert (bright["network"] < faint["network"]).all()
-    # seven times the light, against noise that is mostly of reading and background
+    # three times the light, against noise that is mostly of reading and background
     ratio = np.mean(faint["network"] / bright["network"])
-    assert 2.5 < ratio < 12
+    assert 1.5 < ratio < 6
 
 
 def test_a_pixel_a_star_leaves_its_own_error_and_codes_less():

@@ -175,8 +175,9 @@ def test_the_thesis_s_noise_is_printed_as_its_sum():
         prnu=0.02, dsnu_e_per_s=7.0, dark_e_per_s=203.0, gain_e_per_dn=6.0, read_noise_e=9.0
     )
     total = thesis_total_e(detector, 1000.0, 0.5)
-    # of the ADC's steps a twelfth of their square
-    assert total == pytest.approx(math.sqrt(1000 + 101.5 + 20 + 3.5 + 36 / 12 + 81))
+    # of the ADC a twelfth of its step's square, by the full well over its codes
+    step_e = detector.full_well_e / 2**detector.bits
+    assert total == pytest.approx(math.sqrt(1000 + 101.5 + 20 + 3.5 + step_e**2 / 12 + 81))
 
 
 def outcome(**changes: object) -> EffortOutcome:

@@ -323,3 +323,14 @@ def test_the_cure_of_an_orientation_makes_the_image_upright(tmp_path, turns, is_
     better = camera.seen(cured(file, words), codes)
     np.testing.assert_array_equal(better, codes)
     _refuse_orientation(nominal, homography(u, v, 500 * u + 47.5, 500 * v + 47.5))
+
+
+def test_dots_closer_than_a_link_are_not_taken_for_one(rng):
+    """Two pixels and a half apart, at less than a tenth of that of noise."""
+    x, y = (part.ravel() for part in np.meshgrid(np.arange(6) * 1.25, np.arange(5) * 1.25))
+    plan = DotPlan(x, y, plan_dots((300, 200), 16, 14, rng).lit[:30])
+    assert len(plan.lit) == 30
+    found = decode(plan, codes_seen(plan, rng))
+    assert found.dot.tolist() == list(range(30))
+    np.testing.assert_allclose(found.x_px, 2 * x + 30, atol=0.2)
+    np.testing.assert_allclose(found.y_px, 2 * y - 10, atol=0.2)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
 from hilstar.display.render.context import create_context
-from hilstar.display.render.driver import Driver
+from hilstar.display.render.driver import Driver, sleep_in_waits
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import gamma_response
@@ -85,3 +87,12 @@ def test_a_byte_of_each_table_is_noticed(quantisation):
                 data[-1] ^= 1
                 table.write(bytes(data))
             assert renderer.changed_tables() == number
+
+
+def test_nvidia_s_driver_sleeps_while_it_waits_unless_the_user_says_otherwise(monkeypatch):
+    monkeypatch.delenv("__GL_YIELD", raising=False)
+    sleep_in_waits()
+    assert os.environ["__GL_YIELD"] == "USLEEP"
+    monkeypatch.setenv("__GL_YIELD", "NOTHING")
+    sleep_in_waits()
+    assert os.environ["__GL_YIELD"] == "NOTHING"

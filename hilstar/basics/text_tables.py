@@ -25,6 +25,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import date, time, timedelta
 from decimal import Decimal, InvalidOperation
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -600,13 +601,15 @@ def table_of(path: Path, advice: str, lines: Iterator[str]) -> TextTable:
     `advice`.
     """
     comments, sample, number, delimiter = _head(path, advice, lines)
-    title = _title_lines(sample)
+    # Each of the first lines is tried as the header, with those below it: none is split twice.
+    counts_of = cache(line_counts)
+    title = _title_lines(sample, counts_of)
     number = number + title
     sample = sample[title:]
     following = itertools.chain(sample, lines)
     if not sample:
         return TextTable(path, advice, [], ",", number, following, header=False)
-    delimiter = delimiter or delimiter_of(sample)
+    delimiter = delimiter or delimiter_of(sample, counts_of)
     header = split(sample[0], delimiter)
     table = TextTable(path, advice, [], delimiter, number, following, header_line=number)
     if title:
@@ -659,18 +662,38 @@ def _are_numbered(rows: Sequence[list[str]], count: int) -> bool:
     return first in (0, 1) and numbers == [str(first + k) for k in range(len(numbers))]
 
 
-def _title_lines(sample: Sequence[str]) -> int:
+class LineCounts(NamedTuple):
+    """Of a line that is split: its cells, those that are filled, and those that are numbers."""
+
+    cells: int
+    filled: int
+    numbers: int
+
+
+CountsOf = Callable[[str, str], LineCounts]
+
+
+def line_counts(line: str, delimiter: str) -> LineCounts:
+    """The counts of a line's cells with a delimiter between them."""
+    cells = split(line, delimiter)
+    filled = list(filter(None, cells))
+    return LineCounts(len(cells), len(filled), sum(map(is_number, filled)))
+
+
+def _title_lines(sample: Sequence[str], counts_of: CountsOf) -> int:
     """How many lines stand above the header, which has as many cells as the first row: one of
     numbers alone or, where no row is, one with a number.
     """
-    return _lines_above(sample, all) or _lines_above(sample, any)
+    return _lines_above(sample, all, counts_of) or _lines_above(sample, any, counts_of)
 
 
-def _lines_above(sample: Sequence[str], which: Callable[[Iterable[bool]], bool]) -> int:
+def _lines_above(
+    sample: Sequence[str], which: Callable[[Iterable[bool]], bool], counts_of: CountsOf
+) -> int:
     for place, line in enumerate(sample[:MAX_TITLE_LINES]):
         if not line.strip() or _is_comment(line):
             continue
-        delimiter = delimiter_of(sample[place:])
+        delimiter = delimiter_of(sample[place:], counts_of)
         row = split(line, delimiter)
         numbers = [is_number(cell) or (which is all and is_no_number(cell)) for cell in row]
         if len(row) < 2 or not which(numbers):
@@ -733,7 +756,7 @@ def split(line: str, delimiter: str) -> list[str]:
     return [cell.strip() for cell in cells]
 
 
-def delimiter_of(lines: Sequence[str]) -> str:
+def delimiter_of(lines: Sequence[str], counts_of: CountsOf) -> str:
     """What stands between the cells of a table's first lines, a header or a row before the
     others.
     """
@@ -741,14 +764,14 @@ def delimiter_of(lines: Sequence[str]) -> str:
     best_rank = (0, 0.0, 0)
     rows = [line for line in lines if line.strip() and not _is_comment(line)]
     for delimiter in DELIMITERS:
-        cells = [split(line, delimiter) for line in rows]
-        count = len(cells[0])
+        counts = [counts_of(line, delimiter) for line in rows]
+        count = counts[0].cells
         if count < 2:
             continue
-        alike = [row for row in cells if len(row) == count]
-        filled = list(filter(None, itertools.chain.from_iterable(alike)))
-        numbers = sum(map(is_number, filled))
-        rank = (len(alike), numbers / max(len(filled), 1), count)
+        alike = [row for row in counts if row.cells == count]
+        filled = sum(row.filled for row in alike)
+        numbers = sum(row.numbers for row in alike)
+        rank = (len(alike), numbers / max(filled, 1), count)
         if rank > best_rank:
             best = delimiter
             best_rank = rank

@@ -4,6 +4,7 @@ geometric calibration.
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -195,7 +196,7 @@ def load_notes(path: Path) -> Notes:
     """The notes of a geometry file. Raises InputError."""
     geometry: GeometryFile = _read(path, GeometryFile, ADVICE)
     return Notes(
-        geometry.sigma,
+        dict(geometry.sigma),
         geometry.error or ErrorTable(),
         geometry.made or MadeTable(),
         geometry.monitor_identity,
@@ -204,7 +205,14 @@ def load_notes(path: Path) -> Notes:
 
 def _read(path: Path, form: type[LensTable], advice: str) -> Any:
     """A file as a `form`. Raises InputError, which ends with `advice`."""
-    table = parse_toml(path, named_text(path, advice, MAX_FILE_BYTES))
+    return _parsed(path, named_text(path, advice, MAX_FILE_BYTES), form, advice)
+
+
+# A session assembles its bench many times, and a file's [field] takes longer to parse than the rest
+# of a bench to read.
+@lru_cache(maxsize=8)
+def _parsed(path: Path, text: str, form: type[LensTable], advice: str) -> Any:
+    table = parse_toml(path, text)
     try:
         return msgspec.convert(table, form)
     except msgspec.ValidationError as error:

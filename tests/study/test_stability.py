@@ -385,3 +385,34 @@ def test_the_chart_of_popping_has_each_way_s_light_in_magnitudes(tmp_path, monke
     np.testing.assert_allclose(millionths.get_ydata(), 1e6 * table["linear image [mag]"])
     # codes hold the light that is asked for: no share of it is the scale's
     assert np.abs(table["codes, exact [mag]"]).max() < 0.1
+
+
+def test_a_study_has_the_recorded_cases_about_those_that_draw(tmp_path, monkeypatch):
+    """In the order of the chain, with a verdict each; then a chart of each kind of curve."""
+    drawn = (image.no_stars, image.wide_star)
+    monkeypatch.setattr(image, "DRAWN", drawn)
+    curves = []
+    for name in ("narrow_sigmas", "weak_perspectives", "ripples", "turns"):
+        monkeypatch.setattr(
+            stability, name, lambda folder, name=name: curves.append((folder, name))
+        )
+    cases = stability.run(tmp_path)
+    assert curves == [
+        (tmp_path, name) for name in ("narrow_sigmas", "weak_perspectives", "ripples", "turns")
+    ]
+    first, last = recorded("catalogue_and_geometry"), recorded("detector_and_attitude")
+    known = [case.case for case in (*first, image.no_stars(), image.wide_star(), *last)]
+    assert [case.case for case in cases] == known
+    assert [case.case for case in cases[len(first) : len(first) + 2]] == [
+        "no star in view",
+        "sigma 20 px",
+    ]
+    rows = csv_rows(tmp_path / "stability.csv")
+    assert [row["case"] for row in rows] == [case.case for case in cases]
+    for row, case in zip(rows, cases, strict=True):
+        assert row["verdict"] == "right" and row["failing method"] == case.method
+        assert (row["its failure"], row["what happens"]) == (case.fails, case.happens)
+        assert float(row["error"]) == case.figures.error
+        assert float(row["tolerance"]) == case.figures.tolerance
+    wrong = FailureCase("c", "m", "f", "h", "w", CaseFigures(2.0, 3.0, 1.0))
+    assert wrong.row() == ("c", "WRONG", "m", "f", "h", "w", 2.0, 3.0, 1.0)

@@ -805,3 +805,65 @@ def test_a_psf_that_is_a_pixel_off_and_three_percent_too_bright_is_told_so(tmp_p
         assert error.error_arcsec == pytest.approx(off_px * arcsec_per_px, rel=0.02, abs=1e-6)
         assert error.error_percent == pytest.approx(percent, rel=1e-3, abs=1e-6)
         assert error.worst_percent == pytest.approx(percent, rel=1e-3, abs=1e-6)
+
+
+def glass_row(psf, error_arcsec, time_ms, **figures):
+    known = {field.name: 1.0 for field in fields(chain_glass.GlassRow)}
+    words = {"scene": "dense field", "stars": 30, "on_front": "false", "chosen": ""}
+    known |= words | {"psf": psf, "error_arcsec": error_arcsec, "time_ms": time_ms}
+    return chain_glass.GlassRow(**(known | figures))
+
+
+def test_the_psfs_of_a_glass_are_told_and_drawn_by_their_error_and_time():
+    rows = [
+        glass_row("a Gaussian", 12.0, 2.0, error_percent=3.0, noise_ms=0.5),
+        glass_row("a basis of 6", 0.125, 9.0, error_percent=0.4, chosen="auto", on_front="true"),
+        glass_row("the whole", 0.0, 40.0, error_percent=0.2, on_front="true"),
+    ]
+    line = chain_glass.glass_line(rows)
+    assert line.startswith(
+        "PSF of the tracker's glass, dense field, 30 stars: a Gaussian: 12 arcsec"
+    )
+    assert "a basis of 6 (auto): 0.12 arcsec, 0.4 %, 9 ms" in line
+    with charts.panels_of("A finding", 2, share_x=False) as (place, light):
+        draw_glass(place, light, rows)
+    colours = [chain_glass.colour_of(row) for row in rows]
+    assert colours == [charts.INK, charts.RED, charts.BLUE]
+    for axes, wanted in ((place, [12.0, 0.125, 0.125]), (light, [3.0, 0.4, 0.2])):
+        drawn = set()
+        for drawn_line in axes.get_lines():
+            drawn.update(zip(*map(np.ravel, drawn_line.get_data()), strict=True))
+        for row, error in zip(rows, wanted, strict=True):
+            # an error of 0 stands at the smallest other one, on a logarithmic axis
+            assert (row.time_ms, error) in drawn
+    assert "30 stars" in place.get_title() + place.get_title(loc="left")
+
+
+def test_what_depth_and_bit_stealing_bring_is_said_by_the_rows():
+    load = answers.Load()
+    deep = combination_row(faintest_v_mag=9.0, bit_stealing="false", error_arcsec=0.4, time_ms=2.0)
+    assert "9 was measured alone" in answers.depth_line([deep])
+    shallow = combination_row(faintest_v_mag=8.0, lost=3, stars=20, error_arcsec=0.6)
+    line = answers.depth_line([deep, shallow])
+    assert "keep faintest_v_mag = 9" in line and "loses 3 of 20 stars" in line
+    whole = replace(shallow, lost=0)
+    assert "faintest_v_mag = 8 is enough; it loses none of 20" in answers.depth_line([deep, whole])
+    assert "not on this panel" in answers.stealing_line([deep], deep, load)
+    stolen = replace(deep, bit_stealing="true", error_arcsec=0.1, time_ms=3.0)
+    line = answers.stealing_line([deep, stolen], deep, load)
+    assert line.endswith("takes 0.4 arcsec to 0.1 in 1.50 of the time, with exact")
+    same = replace(stolen, error_arcsec=0.39)
+    assert "brings nothing at rest" in answers.stealing_line([deep, same], deep, load)
+    assert "of the time" not in answers.stealing_line([deep, stolen], deep, answers.Load(1e3))
+
+
+def test_errors_without_times_are_those_of_every_choice(parts):
+    scene = scene_of(parts, 0)
+    chosen = [scene.marks.auto, scene.marks.default]
+    scene.combinations = list(dict.fromkeys(chosen))
+    rows = scene.untimed()
+    assert len(rows) == len(scene.combinations)
+    for row, combination in zip(rows, scene.combinations, strict=True):
+        assert math.isnan(row.time_ms) and row.frames == 0
+        assert row.error_arcsec == scene.error(combination).error_arcsec
+        assert row.sprite == combination.sprite

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from hilstar.instruments.study import economy
 from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES
+from hilstar.instruments.study.study_benches import LoneErrors, StarError
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.recorded import assert_recorded
 
@@ -94,3 +97,38 @@ def test_two_small_scenes_have_the_recorded_errors_and_their_chart(small_run):
             f"errors of {row['measured_stars']} stars {float(row['flux_max_mag']):.4f} mag" in line
         )
         assert f"({float(row['max_px_fit']):.4f} by a PSF fit), within the tolerance" in line
+
+
+def test_an_outcome_has_the_worst_star_of_either_sign_and_the_median_time(monkeypatch):
+    stars = (StarError(-0.03, 0.2), StarError(0.01, 0.5), StarError(0.02, 0.1))
+    off_px = {}
+    for number, kind in enumerate(FAMILY):
+        off_px[kind] = np.array([[3.0, 0.0, 1.0], [-4.0, 2.0, 1.0]]) * (number + 1) / 100
+    monkeypatch.setattr(economy, "lone_errors", lambda *_: LoneErrors(stars, off_px))
+    asked = []
+
+    def draw(q, number, rate):
+        asked.append((q.tolist(), number, rate.tolist()))
+        return SimpleNamespace(levels="levels", star_count=77)
+
+    render = SimpleNamespace(quantisation="exact")
+    bench = SimpleNamespace(
+        draw=draw,
+        config=SimpleNamespace(monitor=SimpleNamespace(bits=10), render=render),
+        effort=SimpleNamespace(error_mag=0.04, error_px=0.08, within=False),
+    )
+    scene = SCENES[4]
+    times = [(9.0, 2.0), (1.0, 8.0), (4.0, 3.0)]
+    found = economy.outcome(scene, "0.1", bench, times)
+    assert (found.frame_ms, found.cpu_ms) == (4.0, 3.0)
+    assert (found.flux_max_mag, found.centroid_max_px) == (0.03, 0.5)
+    assert (found.claimed_mag, found.claimed_px, found.claimed_within) == (0.04, 0.08, False)
+    assert (found.stars, found.measured_stars, found.bits) == (77, 3, 10)
+    assert (found.tolerance, found.tolerance_mag, found.tolerance_px) == ("0.1", 0.1, 0.1)
+    for number, kind in enumerate(FAMILY):
+        assert getattr(found, f"max_px_{kind}") == pytest.approx(0.05 * (number + 1))
+    assert found.worst_px == pytest.approx(0.05 * len(FAMILY))
+    assert found.share == pytest.approx(0.5 * len(FAMILY)) and not found.within
+    assert asked == [(scene.turn.q_icrs_to_cam.tolist(), 0, np.radians([0.6, 0.8, 0.0]).tolist())]
+    # full effort has the default's tolerance
+    assert economy.outcome(scene, "full", bench, times).tolerance_mag == economy.DEFAULT.mag

@@ -29,6 +29,7 @@ from hilstar.instruments.study.rapp import SENSORS, rapp, rapp_ratios
 from hilstar.instruments.study.sky_figures import star_density
 from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.sky import electrons
+from hilstar.sky.air import NIGHT_SKY
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.facts import facts_of
@@ -481,6 +482,10 @@ def test_zodiacal_light_near_the_earth_has_its_magnitude(made):
     assert v_mag == pytest.approx(22.1, abs=0.03)
     assert table["earthshine_24_deg"] == pytest.approx(2 * table["earthshine_38_deg"])
     assert np.isnan(table["ground"][-1]) and table["ground"][200] > table["zodiacal"][200]
+    # known where its spectrum is, both ends included
+    night_nm = np.loadtxt(NIGHT_SKY, delimiter=",", comments=("#", "w"))[:, 0]
+    known = (table["wavelength_nm"] >= night_nm[0]) & (table["wavelength_nm"] <= night_nm[-1])
+    assert np.isfinite(table["ground"]).tolist() == known.tolist()
 
 
 def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(made):

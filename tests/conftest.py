@@ -9,6 +9,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 # A worker fills its core: threads of BLAS that wait for another make small products slow. Before
 # NumPy is loaded.
@@ -33,6 +34,9 @@ import hilstar
 from hilstar.instruments.study.sweep import OtherWork
 from tests.support import leftovers, selection
 from tests.support.benches import SMALL_BENCH
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # A shell ignores SIGINT for what it runs with `&`, and what ignores it hands that on: a test's
 # Ctrl-C would reach nobody.
@@ -69,7 +73,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(MARKERS[folder])
         if folder == "timing":
             item.add_marker("timing")
-        if item.nodeid.partition("[")[0] in selection.SLOW:
+        if selection.is_slow(item.nodeid):
             item.add_marker("slow")
     selection.select(config, items)
 
@@ -173,6 +177,16 @@ def without_charts(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(charts, "finish", lambda figure: None)
     monkeypatch.setattr(charts, "svg", lambda figure: "<svg></svg>")
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
+    """The figures that are saved, of which no file is written."""
+    from hilstar.basics import charts
+
+    saved: list[Figure] = []
+    monkeypatch.setattr(charts, "save", lambda drawn, path: saved.append(drawn))
+    return saved
 
 
 @pytest.fixture

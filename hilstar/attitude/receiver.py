@@ -455,7 +455,8 @@ class Receiver:
         self.counts.lost = self._losses.lost
         if self.jumps.jumps > self._jumps_told:
             self._jumps_told = self.jumps.jumps
-            total_s = self.jumps.correction_ns / NS_PER_S
+            # what makes its times continuous is the jump, the other way
+            total_s = -self.jumps.correction_ns / NS_PER_S
             self._notices.tell(
                 "jump",
                 f"the sender's clock jumped, by {total_s:.3f} s in all so far; its stream"

@@ -10,16 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from hilstar.basics import charts
 from hilstar.instruments.study.sweep import Load, OtherWork
 from tests.support.studies import Studied, studied
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 @pytest.fixture(scope="package", autouse=True)
@@ -62,11 +58,3 @@ def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Studi
     for it, also by a fixture of theirs; a study's own functions are held by the others.
     """
     return partial(studied, tmp_path_factory)
-
-
-@pytest.fixture
-def figures(monkeypatch: pytest.MonkeyPatch) -> list[Figure]:
-    """The figures that are saved, of which no file is written."""
-    saved: list[Figure] = []
-    monkeypatch.setattr(charts, "save", lambda drawn, path: saved.append(drawn))
-    return saved

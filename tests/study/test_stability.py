@@ -15,6 +15,7 @@ from scipy.special import erf
 
 from hilstar.instruments.study.stability import CaseFigures, FailureCase, image, recorded
 from hilstar.instruments.study.stability import run as stability
+from tests.support.tables import csv_rows
 
 CASES = 43
 
@@ -39,8 +40,23 @@ def stability_study(whole_study):
 
 
 @pytest.mark.parametrize("number", range(CASES))
-def test_hilstar_is_right_where_the_method_named_there_is_not(stability_study, number):
-    case = stability_study[1][number]
+def test_each_case_of_the_command_is_right(stability_study, number):
+    assert_right_where_the_other_is_not(stability_study[1][number])
+
+
+@pytest.mark.parametrize("measure", image.DRAWN, ids=lambda measure: measure.__name__)
+def test_hilstar_is_right_where_the_method_named_there_is_not(measure):
+    assert_right_where_the_other_is_not(measure())
+
+
+def test_what_was_recorded_is_right_where_the_other_is_not():
+    cases = [*recorded("catalogue_and_geometry"), *recorded("detector_and_attitude")]
+    assert len(cases) == CASES - len(image.DRAWN)
+    for case in cases:
+        assert_right_where_the_other_is_not(case)
+
+
+def assert_right_where_the_other_is_not(case):
     assert case.right, case
     assert not case.figures.fault <= case.figures.tolerance, case
     assert all((case.case, case.method, case.fails, case.happens, case.why))
@@ -77,6 +93,39 @@ def test_the_table_has_every_case_and_the_curves_have_charts(stability_study):
         0.12, abs=0.02
     )
     assert all(len(found.rows(name)) > 25 for name in CURVES)
+
+
+def test_the_curves_say_what_their_tables_hold(tmp_path, monkeypatch):
+    """Of methods that fail: sampling a narrow star, one depth for all stars, and half a turn."""
+    findings = {}
+    monkeypatch.setattr(
+        stability,
+        "draw_curves",
+        lambda path, finding, panels, note="": findings.update({path.stem: finding}),
+    )
+    for draw in (stability.narrow_sigmas, stability.weak_perspectives, stability.turns):
+        draw(tmp_path)
+    narrow = csv_rows(tmp_path / "narrow_stars.csv")
+    sigmas = np.array([float(row["sigma_px"]) for row in narrow])
+    peaks = np.array([float(row["sampled_peak_error"]) for row in narrow])
+    # a Gaussian at a pixel's middle over its mean there, as its curvature makes it for wide stars
+    wide = sigmas > 1.2
+    np.testing.assert_allclose(peaks[wide], 1 / (12 * sigmas[wide] ** 2), rtol=0.1)
+    nearer = [
+        abs(float(row["sampled_centroid_error_px"])) < abs(float(row["centroid_error_px"]))
+        for row in narrow
+    ]
+    first = nearer.index(True)
+    assert findings["narrow_stars"].startswith(f"From sigma {sigmas[first]:.2f} px on")
+    assert f"{100 * peaks[first]:.0f} % too bright" in findings["narrow_stars"]
+    # one depth for all: the cosine of the field angle is left out, f tan a (1 - cos a)
+    weak = csv_rows(tmp_path / "weak_perspective.csv")
+    angle, off_px = (np.array([float(row[name]) for row in weak]) for name in list(weak[0])[:2])
+    assert f"off by {abs(np.interp(10, angle, off_px)):.0f} px" in findings["weak_perspective"]
+    share = abs(np.interp(5, angle, off_px) / np.interp(10, angle, off_px))
+    assert f"by {share:.2f} of that at five" in findings["weak_perspective"]
+    turns = csv_rows(tmp_path / "turns.csv")
+    assert len(turns) > 25 and "half a turn" in findings["turns"]
 
 
 def test_what_is_no_number_is_not_right():

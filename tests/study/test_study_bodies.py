@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 
 from hilstar.instruments.study import bodies
@@ -12,6 +15,8 @@ from hilstar.instruments.study.bodies import (
     SCENES,
     BodyCost,
 )
+from hilstar.instruments.study.sweep import Spent
+from hilstar.optics.camera import Camera
 
 TABLES = ("bodies_cost", "bodies_size", "bodies_limits")  # and the charts of each
 
@@ -68,3 +73,50 @@ def test_unseen_bodies_cost_what_they_do_between_steps_of_the_orbit():
     assert bodies.unseen_ms(costs) == 0.7
     assert "20 ms once in 2 s" not in bodies.cost_line(costs[:3])
     assert "20.0 ms once in 2 s" in bodies.cost_line(costs)
+
+
+@pytest.mark.parametrize(("radius_px", "phase_deg"), [(0.4, 0.0), (6.0, 0.0), (6.0, 60.0)])
+def test_a_disc_is_drawn_as_rays_have_it(radius_px, phase_deg):
+    found = bodies.exactness(radius_px, phase_deg)
+    assert (found.body, found.radius_px, found.phase_deg) == ("Moon", radius_px, phase_deg)
+    assert abs(found.flux_off) < 0.01
+    assert found.middle_off_px < 0.05
+    if radius_px > 1:
+        assert found.limb_off_px < 0.1
+        assert found.point_pixel_off > 10 * found.pixel_off
+    else:
+        assert np.isnan(found.limb_off_px)
+
+
+def test_a_full_moon_s_traced_light_is_its_rate_in_its_circle():
+    """A million electrons a second; a disc of one brightness near its middle."""
+    disc = bodies.moon(6.0, 0.0)
+    camera = Camera((31, 31), bodies.FOCAL_PX, (15.0, 15.0), np.eye(3))
+    image = bodies.traced(disc, camera)
+    assert image.sum() == pytest.approx(1e6, rel=5e-3)
+    y, x = np.indices(image.shape)
+    middle = [15 + at for at in bodies.MIDDLE_PX]
+    assert (image * x).sum() / image.sum() == pytest.approx(middle[0], abs=0.02)
+    assert (image * y).sum() / image.sum() == pytest.approx(middle[1], abs=0.02)
+    reach = np.hypot(x - middle[0], y - middle[1])
+    assert image[reach > 6 + 5 * max(bodies.SIGMA_PX)].max() < 1e-3 * image.max()
+    # half of its light is lost at quarter phase and more, as less of it is lit
+    half = bodies.moon(6.0, 90.0)
+    lit = bodies.traced(replace(half, normal_e_per_s_sr=disc.normal_e_per_s_sr), camera)
+    assert lit.sum() < 0.5 * image.sum()
+
+
+def test_a_level_is_crossed_between_its_steps():
+    steps = np.linspace(-3.0, 3.0, 7)
+    profile = np.array(
+        [
+            [8.0, 8.0, 8.0, 6.0, 2.0, 0.0, 0.0],  # half of 8 lies midway from 0 to 1
+            [4.0, 4.0, 1.0, 0.0, 0.0, 0.0, 0.0],  # two thirds of the way from -2 to -1
+            [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0],
+        ]
+    )
+    found = bodies.half_level_px(profile, steps)
+    assert found[:2] == pytest.approx([0.5, -2 + 2 / 3])
+    assert np.isnan(found[2])
+    shortest = bodies.shortest([Spent(3.0, 9.0), Spent(4.0, 7.0)])
+    assert shortest == (3.0, 7.0)

@@ -16,6 +16,7 @@ from hilstar.instruments.study import limits
 from hilstar.instruments.study.limits import StressLimit, limits_finding
 from tests.support.benches import ROOT
 from tests.support.recorded import assert_recorded
+from tests.support.studies import undrawn
 from tests.support.tables import csv_rows
 
 # Of hilstar's own claims: docs/where-it-fails.md and the modules' own.
@@ -25,10 +26,16 @@ RED_LIMIT_MAG = 0.026  # 2.4 % of a signal
 HALF_SAMPLE = 0.5
 
 
+def test_the_command_draws_one_chart(whole_study):
+    assert len(whole_study("limits", {"limits"}).findings) == 13
+
+
 @pytest.fixture(scope="module")
-def limits_study(whole_study):
-    found = whole_study("limits", {"limits"})
-    return found.folder, found.findings, found.rows("limits")
+def limits_study(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("limits")
+    with undrawn():
+        lines = limits.run(folder, quick=True)
+    return folder, lines, csv_rows(folder / "limits.csv")
 
 
 def test_the_page_s_table_is_of_what_is_measured_now(limits_study):

@@ -72,3 +72,55 @@ def test_a_gaussian_on_no_background_is_found_exactly_by_its_grid():
     assert inside.min() > 1.0  # nothing is cut at 1
     assert found_x[0] == pytest.approx(x, abs=GRID_PX)
     assert found_y[0] == pytest.approx(y, abs=GRID_PX)
+
+
+def test_the_rig_s_field_is_a_pinhole_s_before_whole_pixels_of_its_panel():
+    """The celestial pole, by the camera's own focal length; each star in the middle of a pixel."""
+    field = rigs.rig_field()
+    slopes = (field.directions[:, :2] / field.directions[:, 2:]).T
+    middle_px = np.array(rigs.PRINCIPAL_PX)[:, None]
+    np.testing.assert_allclose(field.true_px, rigs.FOCAL_PX * slopes + middle_px, rtol=1e-12)
+    pixel_px = rigs.FOCAL_PX * rigs.PIXEL_MM / rigs.LENS_MM
+    off = (field.pixel_px - field.true_px) / pixel_px
+    assert (np.abs(off) <= 0.5 + 1e-9).all()
+    # an even error: its rms is a twelfth's root
+    assert np.sqrt((off**2).mean()) == pytest.approx(math.sqrt(1 / 12), rel=0.35)
+    # each place is the middle of a pixel of the panel, whose middle is between two
+    panel = (field.pixel_px - middle_px) / pixel_px
+    np.testing.assert_allclose(panel - np.floor(panel), 0.5, atol=1e-6)
+    width, height = rigs.CAMERA_PX
+    assert (field.pixel_px > rigs.EDGE_PX).all()
+    assert (field.pixel_px[0] < width - rigs.EDGE_PX).all()
+    assert (field.pixel_px[1] < height - rigs.EDGE_PX).all()
+    assert np.linalg.norm(field.directions, axis=1) == pytest.approx(1.0)
+    assert field.directions.shape[0] == field.true_px.shape[1] > 5
+
+
+def test_a_scatter_falls_with_light_and_is_largest_about_the_boresight():
+    """About it the lever is the stars' distance from it, across it the focal length."""
+    field = rigs.rig_field()
+    faint, bright = (
+        rigs.scatter_arcsec(field, field.pixel_px, star_dn, exposures=8)
+        for star_dn in (60.0, 400.0)
+    )
+    assert list(faint) == list(rigs.SCATTER_ARCSEC)
+    for name in faint:
+        about, *across = bright[name]
+        assert about > 3 * max(across)
+    assert (bright["network"] < faint["network"]).all()
+    # seven times the light, against noise that is mostly of reading and background
+    ratio = np.mean(faint["network"] / bright["network"])
+    assert 2.5 < ratio < 12
+
+
+def test_a_pixel_a_star_leaves_its_own_error_and_codes_less():
+    rounded, placed, light = rigs.place_rows(2)
+    assert rounded.predicted == pytest.approx(PIXEL_ARCSEC, rel=0.15)
+    assert rounded.with_hilstar == placed.predicted < 2 * CODES_ARCSEC
+    assert light.predicted < 2 * CODES_MAG
+    assert rounded.difference == pytest.approx(rounded.published - rounded.predicted)
+    assert [row.unit for row in (rounded, placed, light)] == [
+        "arcsec rms an axis",
+        "arcsec rms an axis",
+        "mag rms",
+    ]

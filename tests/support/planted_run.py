@@ -35,6 +35,28 @@ def write_ledger(
 
     The sender's clock is the host's; `markers` are the photodiode square's levels, and `records` are written among the frames by their host time.
     """
+    written: list[AnswerRecord | FaultRecord | FrameRecord] = []
+    waiting = sorted(records, key=lambda each: each.host_ns, reverse=True)
+    for number, t_s in enumerate(frames_s.tolist()):
+        t_ns = start_ns + round(t_s * NS_PER_S)
+        q = None if frames_q is None else tuple(frames_q[number].tolist())
+        while waiting and waiting[-1].host_ns <= t_ns:
+            written.append(waiting.pop())
+        record = FrameRecord(
+            frame=number, t_ns=t_ns, light_ns=t_ns, draw_ns=t_ns, swap_ns=t_ns, q=q
+        )
+        record.missed_before = missed_before[number] if missed_before else 0
+        record.marker = markers[number] if markers else None
+        written.append(record)
+    return write_records(path, written, bench)
+
+
+def write_records(
+    path: Path,
+    records: Sequence[AnswerRecord | FaultRecord | FrameRecord],
+    bench: str = SMALL_BENCH,
+) -> Path:
+    """A ledger of these records, in their order."""
     head = {
         "bench_text": bench,
         "bench_file": str(path.parent / "bench.toml"),
@@ -42,24 +64,13 @@ def write_ledger(
     }
     with path.open("wb") as file:
         writer = McapWriter(file.fileno(), TOPICS, RUN_METADATA, head)
-        waiting = sorted(records, key=lambda each: each.host_ns, reverse=True)
-        for number, t_s in enumerate(frames_s.tolist()):
-            t_ns = start_ns + round(t_s * NS_PER_S)
-            q = None if frames_q is None else tuple(frames_q[number].tolist())
-            while waiting and waiting[-1].host_ns <= t_ns:
-                one = waiting.pop()
-                writer.add(
-                    "answer" if isinstance(one, AnswerRecord) else "fault",
-                    one.host_ns,
-                    msgspec.json.encode(one),
-                    0,
-                )
-            record = FrameRecord(
-                frame=number, t_ns=t_ns, light_ns=t_ns, draw_ns=t_ns, swap_ns=t_ns, q=q
-            )
-            record.missed_before = missed_before[number] if missed_before else 0
-            record.marker = markers[number] if markers else None
-            writer.add("frame", t_ns, msgspec.json.encode(record), number)
+        for one in records:
+            data = msgspec.json.encode(one)
+            if isinstance(one, FrameRecord):
+                writer.add("frame", one.swap_ns, data, one.frame)
+            else:
+                kind = "answer" if isinstance(one, AnswerRecord) else "fault"
+                writer.add(kind, one.host_ns, data, 0)
         writer.flush()
         writer.finish()
         os.fsync(file.fileno())

@@ -6,13 +6,14 @@ import numpy as np
 
 from hilstar.sky.bodies.moving import MovingSky
 from hilstar.sky.bodies.orbit import Orbit, TleOrbit
-from hilstar.sky.bodies.passes import Satellites
+from hilstar.sky.bodies.passes import Cone, Pass, Satellites
 from hilstar.sky.bodies.satellites import brightness_of, read_satellites, read_table
 from tests.support.skies import STATION_TLE, STATION_UTC, moving_sky, utc_ns
 
 EPOCH = "08264.51782528"  # the station's
 V0_E_PER_S = 1e7
 DEFAULT_MAG = 6.0
+NORTH = np.array([0.0, 0.0, 1.0])
 
 
 def with_checksum(line: str) -> str:
@@ -64,3 +65,27 @@ def satellite_sky(
     sky = moving_sky(utc, (), orbit=orbit)
     sky.satellites = Satellites(found, brightness, V0_E_PER_S, orbit, start)
     return sky
+
+
+def looking_at(direction: np.ndarray) -> np.ndarray:
+    """The quaternion of a camera with its axis there."""
+    half = np.array([0.0, 0.0, 1.0]) + direction
+    half /= np.linalg.norm(half)
+    # Half a turn about the middle of both takes one to the other.
+    return np.array([0.0, *half])
+
+
+def lit_moment(text: str, table: str = "norad\n") -> tuple[MovingSky, int]:
+    """A sky, and a moment at which its satellite is lit and within 2000 km."""
+    sky = satellite_sky(text, table=table)
+    for seconds in range(0, 86_400, 20):
+        seen = sky.passing(Cone(NORTH, np.pi, 0.0), seconds * 10**9)
+        if seen is not None and np.linalg.norm(seen.seen_km[0, 0]) < 2000 and rate_now(seen) > 0:
+            return sky, seconds * 10**9
+    raise AssertionError("it never is")
+
+
+def rate_now(seen: Pass) -> float:
+    """The electron rate of a pass's first satellite at its moment."""
+    zero = np.zeros(1)
+    return float(seen.rates_e_per_s(np.array([0]), zero, zero)[0])

@@ -2,8 +2,9 @@
 
 Laws. The bare command holds each room's claims in three minutes of two idle cores. It leaves out
 what needs more than README installs for it (an X server, a browser), what claims a time, and what
-takes longest, and counts these by reason. Tests that are asked for by a path, `-k` or `-m` are all
-run, and so are all by `--all`. What `--all` adds is `--rest`, beside each other, and `--timing`,
+takes longest, and counts these by reason; of a function that takes long only as it has many cases
+it runs some. Tests that are asked for by a path, `-k` or `-m` are all run, and so are all by
+`--all`. What `--all` adds is `--rest`, beside each other, and `--timing`,
 one at a time.
 """
 
@@ -24,9 +25,27 @@ REASONS_BY_FOLDER = {
 }
 # a fixture of tests/study, for which or for a fixture with which a test asks that runs a study
 WHOLE_STUDY, WHOLE_STUDY_REASON = "whole_study", "run a whole study"
+CASE_INDENT = "  "
+
+
+def slow_functions(text: str) -> dict[str, frozenset[str]]:
+    """The functions that tests/slow.txt names, and of each the cases, as `[4.0]`, that the bare
+    command runs all the same: they stand below it, indented.
+    """
+    kept: dict[str, set[str]] = {}
+    function = ""
+    for line in text.splitlines():
+        if line.startswith(CASE_INDENT):
+            kept[function].add(line.removeprefix(CASE_INDENT))
+        else:
+            function = line
+            kept[function] = set()
+    return {function: frozenset(cases) for function, cases in kept.items()}
+
+
 # Functions that take over a stated time of CPU, all their cases together; tests/support/slow_tests.py
 # measures them and writes the file.
-SLOW = frozenset((TESTS / "slow.txt").read_text().split())
+SLOW = slow_functions((TESTS / "slow.txt").read_text(encoding="utf-8"))
 SLOW_FILES = frozenset(function.partition("::")[0] for function in SLOW)
 TIMING_MARK = "mark.timing"
 LEFT_OUT = pytest.StashKey[dict[str, int]]()
@@ -40,6 +59,12 @@ def add_options(parser: pytest.Parser) -> None:
     group.addoption("--timing", action="store_true", help="what claims a time: use it with -n0")
 
 
+def is_slow(nodeid: str) -> bool:
+    """Whether a test is left out as it takes long."""
+    function, bracket, case = nodeid.partition("[")
+    return function in SLOW and bracket + case not in SLOW[function]
+
+
 def reason_to_leave_out(item: pytest.Item) -> str | None:
     """Why the bare command does not run a test; None if it does."""
     if item.get_closest_marker("timing") is not None:
@@ -49,7 +74,7 @@ def reason_to_leave_out(item: pytest.Item) -> str | None:
             return REASONS_BY_FOLDER[folder]
     if WHOLE_STUDY in getattr(item, "fixturenames", ()):
         return WHOLE_STUDY_REASON
-    if item.nodeid.partition("[")[0] in SLOW:
+    if is_slow(item.nodeid):
         return SLOW_REASON
     return None
 

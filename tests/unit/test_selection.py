@@ -5,7 +5,8 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from tests.support.selection import SLOW, TESTS, holds_nothing_for
+from tests.support.selection import SLOW, TESTS, holds_nothing_for, is_slow, slow_functions
+from tests.support.slow_tests import KEPT_CPU_S, kept_cases
 
 
 def test_each_slow_test_is_there():
@@ -42,3 +43,19 @@ def test_a_file_is_imported_for_the_tests_that_are_asked_for():
     assert imported() == imported(all=True) == [True] * 4
     assert imported(rest=True)[:3] == [False, True, True]
     assert imported(timing=True) == [False, False, False, True]
+
+
+def test_a_slow_function_s_cases_that_stand_below_it_are_not_left_out():
+    kept = slow_functions("a.py::one\n  [x-1.0]\n  [two words]\nb.py::other\n")
+    assert kept == {"a.py::one": {"[x-1.0]", "[two words]"}, "b.py::other": set()}
+    function, cases = next((name, cases) for name, cases in SLOW.items() if cases)
+    assert is_slow(function)
+    assert is_slow(f"{function}[no such case]")
+    assert not any(is_slow(function + case) for case in cases)
+
+
+def test_of_a_slow_function_the_longest_cases_that_fit_are_kept():
+    cases = {"[a]": 0.5, "[b]": 0.15, "[c]": 0.1, "[d]": 0.04, "[e]": 0.02}
+    assert KEPT_CPU_S == 0.2
+    assert kept_cases(cases) == {"[b]", "[d]"}
+    assert kept_cases({"": 0.9}) == set()

@@ -80,9 +80,10 @@ def changed_codes(context: moderngl.Context, screen_px: tuple[int, int], bits: i
     first = ""
     for part in np.array_split(triples, math.ceil(len(triples) / at_once)):
         levels = (pixels % len(part)).astype(np.uint16).reshape(height, width)
+        texture = level_texture(context, levels)
+        Presenter(texture, ScreenView(screen_px, screen_px, bits, triples=part)).present()
+        # not around those: where a headless context's inner block ends, none is current
         with context:
-            texture = level_texture(context, levels)
-            Presenter(texture, ScreenView(screen_px, screen_px, bits, triples=part)).present()
             read = context.screen.read(viewport=(0, 0, width, height), components=3, dtype="f4")
             # moderngl asks for an attachment, which a window's back buffer has not, and reads on
             _ = context.error

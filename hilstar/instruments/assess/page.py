@@ -50,6 +50,7 @@ from hilstar.instruments.assess.report import (
 from hilstar.instruments.assess.star_drawing import star_drawing
 
 AVAILABLE = 0.99  # a smaller availability is a warning
+MAX_PERCENT = 99.9  # of fewer than all answers: in three digits more are 100
 MAX_POINTS = 4000
 MAX_ROWS = 200
 WRONG_HEIGHT = 0.96  # of the marks of wrong answers, in the panel
@@ -134,7 +135,7 @@ def _percent(found: Assessment) -> str:
     lock = found.lock
     if lock.right >= lock.due:
         return "100 %"
-    percent = min(100 * lock.availability, 99.99)
+    percent = min(100 * lock.availability, MAX_PERCENT)
     return f"{percent:.3g} %"
 
 

@@ -77,6 +77,30 @@ def test_statuses_leave_at_their_rate_and_only_the_newest():
     )
 
 
+def test_statuses_keep_their_rate_where_no_look_is_at_their_time():
+    """Looks every 7 ms, of which few fall on a tenth of a second: the next status is due by the
+    last one's own time. After a pause of a second they go on, one at a time.
+    """
+    link = Wire()
+    back = BackChannel(link, Traffic(status_hz=10))
+    sent_ns = []
+    looks_ns = [
+        *range(0, 10 * NS_PER_S, 7 * NS_PER_MS),
+        *range(11 * NS_PER_S, 12 * NS_PER_S, NS_PER_MS),
+    ]
+    for k, after_ns in enumerate(looks_ns):
+        back.post(status(k))
+        before = len(link.sent)
+        back.talk(NOW_NS + after_ns, ask=False)
+        assert len(link.sent) - before <= 1
+        sent_ns += [after_ns] * (len(link.sent) - before)
+    steady = [after_ns for after_ns in sent_ns if after_ns < 10 * NS_PER_S]
+    assert len(steady) == 100
+    late_ns = np.array(steady) - np.arange(100) * NS_PER_S // 10
+    assert ((late_ns >= 0) & (late_ns < 7 * NS_PER_MS)).all()
+    assert len(sent_ns) - len(steady) == 10
+
+
 def test_a_status_that_never_left_hands_on_what_is_told_once():
     link = Wire()
     back = BackChannel(link, Traffic(status_hz=10))
@@ -208,3 +232,23 @@ def test_in_lockstep_a_time_request_is_answered_with_when_it_came_and_when_the_a
         assert (reply.sequence, reply.t1_ns) == (3, 4)
         assert asked_ns < reply.t2_ns < reply.t3_ns < HOST_CLOCK.now_ns()
     context.term()
+
+
+def test_statuses_and_requests_go_to_the_sender_that_is_shown():
+    """Of several senders at one port; of a link with one peer, to that."""
+    link = Wire()
+    back = BackChannel(link, Traffic(status_hz=10, time_requests=True))
+    sent: dict[str, list[Packet]] = {"first": [], "second": []}
+    sample = AttitudeSample(0, np.array([1.0, 0.0, 0.0, 0.0]), None, 0)
+    back.follow(Arrival(NOW_NS, sample))
+    back.post(status(1))
+    back.talk(NOW_NS, ask=False)
+    assert link.sent == [status(1)]
+    for k, name in enumerate(("first", "second"), start=1):
+        back.follow(Arrival(NOW_NS, sample, back=sent[name].append))
+        back.post(status(k))
+        back.talk(NOW_NS + k * NS_PER_S, ask=True)
+        kinds = [type(packet) for packet in sent[name]]
+        assert kinds == [TimeRequest, Status]
+        assert sent[name][1] == status(k)
+    assert len(link.sent) == 1

@@ -4,6 +4,7 @@ simulated: known exactly.
 
 from __future__ import annotations
 
+import re
 import threading
 import time
 from collections.abc import Callable
@@ -17,7 +18,7 @@ import pytest
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.receiver import QUEUED_NS, Receiver, Traffic
 from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import AttitudeSample, Packet, encode
+from hilstar.attitude.wire.packet import AttitudeSample, Packet, Status, encode
 from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
@@ -829,3 +830,60 @@ def test_a_packet_is_told_as_lost_once_it_has_not_come_for_a_second(begins_s, la
         ((count, after_ns),) = told
         assert count == 1
         assert NS_PER_S <= after_ns <= 2.2 * NS_PER_S
+
+
+def paced(t0: int, pace: float, until_s: float = 8.0) -> list[Arrival]:
+    """A sender whose clock runs at so many times real time."""
+    arrivals = []
+    for k, after_ns in enumerate(seconds(0, until_s)):
+        sample = AttitudeSample(t0 + round(pace * after_ns), ORION, np.zeros(3), k)
+        arrivals.append(Arrival(t0 + after_ns + 50_000, sample, encode(sample)))
+    return arrivals
+
+
+@pytest.mark.parametrize(("pace", "kind"), [(0.8, "source-slow"), (1.4, "source-fast")])
+def test_a_clock_of_another_pace_is_named_with_its_pace(pace, kind):
+    run = ReceiverRun(lambda t0: paced(t0, pace))
+    (notice,) = [each for each in run.told if each.kind.startswith("source-")]
+    assert notice.kind == kind
+    words = re.fullmatch(
+        r"t_ns runs at (\S+) times real time; it is followed in small steps(.*)", notice.detail
+    )
+    assert float(words[1]) == pytest.approx(pace, rel=0.05)
+    assert ("slow clock" in words[2]) == (pace < 1)
+
+
+def test_a_jump_of_the_sender_s_clock_is_told_with_all_that_it_jumped_so_far():
+    """By 2 s and then by 1.5 s: their sum stands in the second line and in the offset."""
+    jumps_ns = (2 * NS_PER_S, 3 * NS_PER_S // 2)
+
+    def make(t0: int) -> list[Arrival]:
+        arrivals = []
+        for k, begin_s in enumerate((0, 4, 8)):
+            sender = Sender(first=800 * k, offset_ns=sum(jumps_ns[:k]))
+            arrivals += sender.packets(t0, seconds(begin_s, begin_s + 4))
+        return arrivals
+
+    run = ReceiverRun(make)
+    told = [notice.detail for notice in run.told if notice.kind == "jump"]
+    assert [re.search(r"by (\S+) s in all", line)[1] for line in told] == ["2.000", "3.500"]
+    summary = run.receiver.clock_summary()
+    assert summary.jumps == 2
+    # host minus sender; 50 us is the way
+    assert summary.offset_ms == pytest.approx(-3500 + 0.05, abs=0.2)
+
+
+def test_the_sender_that_is_shown_is_the_one_that_is_answered():
+    """Two at one port: the first is shown, and statuses go to it alone."""
+    answered: dict[int, list[Packet]] = {1: [], 2: []}
+
+    def make(t0: int) -> list[Arrival]:
+        arrivals = Sender(number=1).packets(t0, seconds(0, 2))
+        arrivals += Sender(q=LYRA, number=2).packets(t0 + NS_PER_MS, seconds(1, 2))
+        return [replace(each, back=answered[each.event.sender].append) for each in arrivals]
+
+    run = ReceiverRun(make, traffic=Traffic(status_hz=10), two_way=True)
+    run.receiver.back.post(Status(0, 1, 1, 0, 0, 0, 0))
+    run.receiver.back.talk(run.link.clock.now_ns + NS_PER_S, ask=False)
+    assert [type(packet) for packet in answered[1]] == [Status]
+    assert answered[2] == []

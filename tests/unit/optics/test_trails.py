@@ -28,7 +28,7 @@ from hilstar.optics.trails import (
     with_trails,
 )
 from hilstar.sky.bodies.passes import Cone
-from tests.support.satellites import element_set, satellite_sky
+from tests.support.satellites import element_set, lit_moment, looking_at, rate_now
 from tests.support.skies import STATION_UTC
 from tests.support.stars import sprites_at
 
@@ -46,29 +46,6 @@ NORTH = np.array([0.0, 0.0, 1.0])
 DISC_FLUX = 0.02  # a crescent by five rays across a pixel
 # of a crescent: the Sun's and the camera's aberration of 20 arcsec each, and a quadrature's share
 LAMBERT = 1e-3
-
-
-def looking_at(direction: np.ndarray) -> np.ndarray:
-    """The quaternion of a camera with its axis there."""
-    half = np.array([0.0, 0.0, 1.0]) + direction
-    half /= np.linalg.norm(half)
-    # Half a turn about the middle of both takes one to the other.
-    return np.array([0.0, *half])
-
-
-def lit_moment(text: str, table: str = "norad\n") -> tuple[object, int]:
-    """A sky, and a moment at which its satellite is lit and within 2000 km."""
-    sky = satellite_sky(text, table=table)
-    for seconds in range(0, 86_400, 20):
-        seen = sky.passing(Cone(NORTH, np.pi, 0.0), seconds * 10**9)
-        if seen is not None and np.linalg.norm(seen.seen_km[0, 0]) < 2000 and rate_now(seen) > 0:
-            return sky, seconds * 10**9
-    raise AssertionError("it never is")
-
-
-def rate_now(seen) -> float:
-    zero = np.zeros(1)
-    return float(seen.rates_e_per_s(np.array([0]), zero, zero)[0])
 
 
 def is_lit(sky, seconds: int) -> bool:

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.server.record.answer_figures import AnswerTally
-from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord
+from hilstar.server.record.answer_figures import AnswerSpan, AnswerTally, answer_rows
+from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
 from hilstar.server.record.run_figures import figures_of, summarise
 from tests.support.commands import run_hilstar_here
 from tests.support.planted_run import NS_PER_S, write_ledger
@@ -169,3 +169,179 @@ def test_three_sigma_is_that_of_a_sample():
 def test_answers_of_no_sky_are_not_due():
     found = tallied("rrrruurrrw").report(START_NS)
     assert found.availability == pytest.approx(7 / 8)
+
+
+def fault_record(at_s: float, event: str, number: int, name: str) -> FaultRecord:
+    """An event of a fault."""
+    return FaultRecord(
+        host_ns=START_NS + round(at_s * NS_PER_S),
+        event=event,
+        number=number,
+        name=name,
+        kind="flash",
+        who="file",
+        t_ns=0,
+        table="",
+    )
+
+
+# of each second: its verdict, and its error about x, y and z where it was compared
+BY_SECOND = {
+    0: ("right", (1.0, 2.0, 10.0)),
+    1: ("right", (3.0, -2.0, 30.0)),
+    2: ("right", (2.0, 4.0, -10.0)),
+    3: ("wrong", (3000.0, 4000.0, 0.0)),
+    4: ("invalid", None),
+    5: ("right", (0.0, 1.0, 20.0)),
+    6: ("right", (5.0, 2.0, 40.0)),
+    7: ("unpaired", None),
+    8: ("wrong", (0.0, 8000.0, 0.0)),
+    9: ("right", (1.0, 0.0, 0.0)),
+}
+
+
+def judged_run(*faults: FaultRecord, late_ms: int = 250) -> AnswerTally:
+    """The answers of BY_SECOND, each a quarter of a second late, and one that was not judged; the
+    tracker's stamps of the seconds 5 and 6 are swapped.
+    """
+    tally = AnswerTally()
+    events = [(fault.host_ns, fault) for fault in faults]
+    for second, (verdict, residual) in BY_SECOND.items():
+        middle_ns = START_NS + second * NS_PER_S
+        record = AnswerRecord(
+            host_ns=middle_ns + late_ms * 1_000_000,
+            raw="01",
+            t_ns={5: 600, 6: 500}.get(second, 100 * second),
+            middle_ns=middle_ns,
+            verdict=verdict,
+            residual_arcsec=residual,
+        )
+        events.append((middle_ns, record))
+    flood = AnswerRecord(host_ns=START_NS + 4 * NS_PER_S, raw="01", verdict="unjudged")
+    flood.middle_ns = flood.host_ns
+    events.append((flood.host_ns, flood))
+    for _, record in sorted(events, key=lambda event: event[0]):
+        if isinstance(record, FaultRecord):
+            tally.fault(record)
+        else:
+            tally.answer(record)
+    return tally
+
+
+def test_a_run_s_answers_have_these_figures():
+    tally = judged_run()
+    found = tally.report(START_NS)
+    counts = (found.answers, found.right, found.wrong, found.invalid, found.unpaired)
+    assert counts == (11, 6, 2, 1, 1)
+    assert (found.unjudged, found.out_of_order) == (1, 1)
+    assert found.rate_hz == pytest.approx(1.0, rel=2e-3)
+    assert found.latency_ms.max == 250.0
+    assert found.availability == pytest.approx(6 / 9, abs=1e-4)  # ten were due, one of no sky
+    right = np.array([error for verdict, error in BY_SECOND.values() if verdict == "right"])
+    assert found.mean_arcsec == pytest.approx(right.mean(axis=0), abs=1e-3)
+    assert found.rms_arcsec == pytest.approx(np.sqrt((right**2).mean(axis=0)), abs=1e-3)
+    assert found.sigma3_arcsec == pytest.approx(3 * right.std(axis=0, ddof=1), abs=1e-3)
+    assert [(at_ns - START_NS) / NS_PER_S for at_ns in tally.wrong_ns] == [3, 8]
+
+
+def test_a_fault_s_spans_are_cut_where_the_run_begins_and_ends():
+    """From 2.5 s to 5.7 s of a run whose answers stand for 0 to 10 s."""
+    tally = judged_run(fault_record(2.5, "start", 1, "flash"), fault_record(5.7, "end", 1, "flash"))
+    (fault,) = tally.report(START_NS).faults
+    one = {"rms_arcsec": None, "largest_arcsec": None}
+    assert (fault.start_s, fault.end_s, fault.kind) == (2.5, 5.7, "flash")
+    before = [BY_SECOND[second][1] for second in (0, 1, 2)]
+    assert fault.before == AnswerSpan(
+        length_s=2.5,
+        right=3,
+        wrong=0,
+        invalid=0,
+        availability=1.0,
+        **one
+        | {
+            "rms_arcsec": np.sqrt(np.square(before).mean(axis=0)).round(3).tolist(),
+            "largest_arcsec": round(float(np.linalg.norm(before[1])), 3),
+        },
+    )
+    assert fault.during == AnswerSpan(
+        length_s=3.2,
+        right=1,
+        wrong=1,
+        invalid=1,
+        availability=round(1 / 3, 4),
+        rms_arcsec=[0.0, 1.0, 20.0],
+        largest_arcsec=5000.0,
+    )
+    after = np.array([BY_SECOND[second][1] for second in (6, 9)])
+    assert fault.after == AnswerSpan(
+        length_s=pytest.approx(4.3, abs=2e-3),
+        right=2,
+        wrong=1,
+        invalid=0,
+        availability=0.5,  # four were due
+        rms_arcsec=np.sqrt((after**2).mean(axis=0)).round(3).tolist(),
+        largest_arcsec=8000.0,
+    )
+    assert (fault.first_wrong_s, fault.recovered_s) == (0.5, 0.0)
+
+
+def test_a_fault_that_does_not_end_has_nothing_after_it():
+    tally = judged_run(fault_record(6.5, "start", 2, "haze"))
+    (fault,) = tally.report(START_NS).faults
+    assert (fault.end_s, fault.recovered_s) == (None, None)
+    assert fault.during.length_s == pytest.approx(3.5, abs=2e-3)
+    assert (fault.during.right, fault.during.wrong, fault.first_wrong_s) == (1, 1, 1.5)
+    assert (fault.after.length_s, fault.after.right, fault.after.availability) == (0.0, 0, None)
+
+
+def test_a_wrong_answer_after_the_recovery_is_not_the_fault_s():
+    tally = judged_run(fault_record(4.2, "start", 1, "a"), fault_record(4.6, "end", 1, "a"))
+    (fault,) = tally.report(START_NS).faults
+    assert (fault.first_wrong_s, fault.recovered_s) == (None, pytest.approx(0.4))
+
+
+def test_the_faults_of_a_replayed_run_are_on_as_its_frames_say():
+    """They stand before the ledger's begin; two overlap."""
+    tally = AnswerTally(begun_ns=START_NS)
+    for number, name in ((1, "haze"), (2, "flash")):
+        tally.fault(fault_record(-100.0, "start", number, name))
+        tally.fault(fault_record(-50.0, "end", number, name))
+    on_by_second = {2: (1,), 3: (1, 2), 4: (1, 2), 5: (2,), 6: (), 7: ()}
+    for second in range(10):
+        at_ns = START_NS + second * NS_PER_S
+        faults = on_by_second.get(second, ())
+        record = FrameRecord(frame=second, t_ns=0, light_ns=0, draw_ns=0, swap_ns=at_ns - 1)
+        record.faults = faults
+        tally.frame(record)
+        verdict = "wrong" if 2 in faults else "right"
+        tally.answer(AnswerRecord(host_ns=at_ns, raw="", middle_ns=at_ns, verdict=verdict))
+    found = {fault.name: fault for fault in tally.report(START_NS).faults}
+    spans = {name: (fault.start_s, fault.end_s) for name, fault in found.items()}
+    assert spans == {
+        "haze": (pytest.approx(2.0), pytest.approx(5.0)),
+        "flash": (pytest.approx(3.0), pytest.approx(6.0)),
+    }
+    assert (found["haze"].during.right, found["haze"].during.wrong) == (1, 2)
+    assert (found["flash"].before.right, found["flash"].during.wrong) == (3, 3)
+    assert found["flash"].after.right == 4
+
+
+def test_the_rows_of_a_report_say_the_answers_figures():
+    tally = judged_run(
+        fault_record(2.5, "start", 1, "flash"),
+        fault_record(5.7, "end", 1, "flash"),
+        fault_record(9.5, "start", 2, "haze"),
+    )
+    rows = dict(answer_rows(tally.report(START_NS)))
+    assert rows["tracker's answers"] == (
+        "11: 6 right, 2 wrong, 1 without an attitude, 1 of no sky, 1 not judged; 1 came out of"
+        " order"
+    )
+    assert rows["tracker's availability"].startswith("66.7 %, ")
+    assert rows["residual x, y, z, rms"] == "2.6 2.2 22.7 arcsec; mean 2.0 1.2 15.0"
+    assert rows["fault flash"] == (
+        "before 100.0 %, 2.2 2.8 19.1 arcsec; during 33.3 %, 0.0 1.0 20.0 arcsec; after 50.0 %,"
+        " 3.6 1.4 28.3 arcsec; first wrong after 0.50 s; recovered in 0.00 s"
+    )
+    assert rows["fault haze"].endswith("after -, - arcsec; none wrong; not recovered")
+    assert answer_rows(None) == []

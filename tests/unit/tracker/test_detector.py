@@ -4,6 +4,7 @@ wrong.
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -94,6 +95,33 @@ def test_another_device_seed_changes_every_map():
         # Two continuous draws agree nowhere but on the few pixels that are dead, or cut at no dark,
         # in both.
         assert (getattr(one, name) == getattr(other, name)).mean() < 0.01
+
+
+ONE_MAP = {
+    "prnu": ("gain_map", {"prnu": 0.01}),
+    "dsnu": ("dark_map_e_per_s", {"dsnu_e_per_s": 10.0}),
+    "offset": ("offset_map_e", {"dsnu_e": 5.0}),
+    "columns": ("column_e", {"column_noise_e": 5.0}),
+    "dark columns": ("dark_map_e_per_s", {"column_dark_e_per_s": 10.0}),
+    "hot": ("dark_map_e_per_s", {"hot_pixel_fraction": 0.5}),
+    "dead": ("gain_map", {"dead_pixel_fraction": 0.5}),
+    "dead rows": ("gain_map", {"dead_row_fraction": 0.5}),
+    "dead columns": ("gain_map", {"dead_column_fraction": 0.5}),
+}
+
+
+@pytest.mark.parametrize("pair", list(itertools.combinations(ONE_MAP, 2)), ids=" and ".join)
+def test_the_maps_of_two_defects_have_nothing_in_common(pair):
+    """A stream of random numbers that two defects share makes one the other's picture."""
+    cmos = DetectorSettings(fixed_pattern="cmos", dark_e_per_s=1e4)
+    begins = []
+    for defect in pair:
+        name, setting = ONE_MAP[defect]
+        values = getattr(Detector(replace(cmos, **setting), SIZE_PX), name)
+        along = values[:, 0] if defect == "dead rows" else values.ravel()
+        begins.append(along[: SHAPE[0]])
+    correlation = stats.spearmanr(*begins).statistic
+    assert abs(correlation) < SIGMAS / math.sqrt(SHAPE[0])
 
 
 def test_switching_one_defect_on_leaves_the_other_maps_as_they_were():

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hilstar.basics.arrays import FloatArray
+from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.charts import DARK, ORANGE, TEXT_PT, chart
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import make_directory
@@ -105,8 +105,9 @@ SQUARE_NAMES = ("corner", "right", "below")
 @dataclass(frozen=True, slots=True)
 class OrientationFigure:
     """An asymmetric figure: three squares of different sizes, at a corner, to its right and below
-    it. `x_px` and `y_px` (3,) are their middles, `side_px` is the side of the smallest, and
-    `reach_px` is half the distance between the corner and the next square; all in monitor pixels.
+    it. `x_px` and `y_px` (3,) are their middles as they are drawn, `side_px` is the side of the
+    smallest, and `reach_px` is about half the distance between the corner and the next square; all
+    in monitor pixels.
     """
 
     x_px: FloatArray
@@ -118,11 +119,17 @@ class OrientationFigure:
         """The pattern `name` with the figure on black, its squares at `code`."""
         codes = black(resolution_px)
         for x, y, sides in zip(self.x_px, self.y_px, SQUARES, strict=True):
-            half = self.side_px * sides / 2
-            rows = slice(round(y - half), round(y + half))
-            columns = slice(round(x - half), round(x + half))
-            codes[rows, columns] = code
+            size = self.side_px * sides
+            row = round(y - (size - 1) / 2)
+            column = round(x - (size - 1) / 2)
+            codes[row : row + size, column : column + size] = code
         return Pattern(name, codes)
+
+    @property
+    def axes_px(self) -> FloatArray:
+        """From the corner to the square at its right and to that below it: columns (2, 2)."""
+        corner, right, below = np.stack([self.x_px, self.y_px], axis=1)
+        return np.column_stack([right - corner, below - corner])
 
 
 def figure_for(geometry: BenchGeometry) -> OrientationFigure:
@@ -155,7 +162,14 @@ def figure_for(geometry: BenchGeometry) -> OrientationFigure:
         middle_y = (height - 1) / 2
     x_px = middle_x + reach * np.array([-1.0, 1.0, -1.0])
     y_px = middle_y + reach * np.array([-1.0, -1.0, 1.0])
-    return OrientationFigure(x_px, y_px, side, reach)
+    sizes = side * np.array(SQUARES)
+    return OrientationFigure(_whole(x_px, sizes), _whole(y_px, sizes), side, reach)
+
+
+def _whole(middles_px: FloatArray, sizes: IntArray) -> FloatArray:
+    """The middles (n,) nearest to these of squares of whole pixels, `sizes` (n,)."""
+    half = (sizes - 1) / 2
+    return np.asarray(np.rint(middles_px - half) + half)
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +254,9 @@ def see_figure(image: FloatArray, figure: OrientationFigure, geometry: BenchGeom
     shown_x, shown_y = geometry.to_monitor(x_px, y_px)
     corner, right, below = np.stack([shown_x, shown_y], axis=1)
     side_px = 2 * figure.reach_px
-    figure_px = np.column_stack([right - corner, below - corner]) / side_px
+    shown_axes_px = np.column_stack([right - corner, below - corner])
+    # as seen over as drawn
+    figure_px = shown_axes_px @ np.linalg.inv(figure.axes_px)
     scale = float(np.sqrt(abs(np.linalg.det(figure_px))))
     if not 1 / MAX_SCALE < scale < MAX_SCALE:
         raise InputError(

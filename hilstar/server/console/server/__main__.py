@@ -141,10 +141,14 @@ async def show(room: PicturePacker, reader: RunReader, pages: OpenPages) -> None
 
 
 async def run(
-    setup: Setup, memory: SharedMemory, channel: OrderChannel, page_fd: int, scpi_fd: int
+    setup: Setup,
+    memory: SharedMemory,
+    channel: OrderChannel,
+    page_listener: socket.socket | None,
+    scpi_listener: socket.socket | None,
 ) -> None:
-    """Serve the page and SCPI (file descriptors of their listeners, -1 for none) until the run
-    ends. Raises what ends a server before.
+    """Serve the page and SCPI at their listeners (None for none) until the run ends. Raises what
+    ends a server before.
     """
     scene: OverlayScene | None = pickle.loads(setup.scene) if setup.scene else None
     reader = RunReader(memory, setup)
@@ -168,23 +172,27 @@ async def run(
         ws_per_message_deflate=False,
     )
     works: list[Coroutine[Any, Any, None]] = [tick(reader, memory, pages)]
-    if page_fd >= 0:
+    if page_listener is not None:
         works += [
-            Server(config).serve([socket.socket(fileno=page_fd)]),
+            Server(config).serve([page_listener]),
             show(PicturePacker(memory, scene), reader, pages),
         ]
-    if setup.scpi is not None:
-        works.append(
-            ScpiServer(setup.scpi, reader, memory, channel.give).serve(
-                socket.socket(fileno=scpi_fd)
-            )
-        )
+    if setup.scpi is not None and scpi_listener is not None:
+        scpi = ScpiServer(setup.scpi, reader, memory, channel.give)
+        works.append(scpi.serve(scpi_listener))
     tasks = [asyncio.create_task(work) for work in works]
     ended = asyncio.create_task(channel.listen())
     done, _ = await asyncio.wait([ended, *tasks], return_when=asyncio.FIRST_COMPLETED)
     if ended not in done:
         done.pop().result()  # raises the error that ended the task
     await pages.close_all(GOING_AWAY)
+
+
+def listener_of(fd: int) -> socket.socket | None:
+    """The listener of a file descriptor; None for -1."""
+    if fd < 0:
+        return None
+    return socket.socket(fileno=fd)
 
 
 def main() -> None:
@@ -202,9 +210,8 @@ def main() -> None:
     memory = SharedMemory(board_fd, setup.picture_bytes)
     code = 0
     try:
-        asyncio.run(
-            run(setup, memory, OrderChannel(socket.socket(fileno=wire_fd)), page_fd, scpi_fd)
-        )
+        channel = OrderChannel(socket.socket(fileno=wire_fd))
+        asyncio.run(run(setup, memory, channel, listener_of(page_fd), listener_of(scpi_fd)))
     except Exception as error:  # after any error the run starts the page again
         print(
             one_line(f"hilstar: the operator's page failed ({type(error).__name__}: {error})"),

@@ -178,6 +178,18 @@ def test_a_simulation_with_long_steps_is_not_held_for_long() -> None:
     assert opening.passed([], 6 + MAX_HELD_NS) == [only]
 
 
+def test_what_is_held_back_waits_by_the_first_one_s_arrival() -> None:
+    """And what is no attitude passes at once."""
+    opening = Opening()
+    first, second = (
+        Arrival(host_ns, taken(viz_message(spacecraft=[craft()]))) for host_ns in (5, MAX_HELD_NS)
+    )
+    refused = Arrival(7, Refusal("format", "none"))
+    assert opening.passed([first, refused], 5) == [refused]
+    assert opening.passed([second], MAX_HELD_NS) == []
+    assert opening.passed([], 6 + MAX_HELD_NS) == [first, second]
+
+
 def test_no_rate_across_a_silence_a_jump_or_a_restart() -> None:
     k = [0, 1, 2, 20, 21, 22, 5, 6, 7]
     known = [rate is not None for rate in rates_of_body([STEP_NS * each for each in k])]

@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
+import numpy as np
 import pytest
+from astropy.io import fits
 
+from hilstar.optics.glass import psf_file
 from hilstar.optics.glass.codev_file import read_codev
+from hilstar.optics.glass.maps import glass_of_map
+from hilstar.optics.glass.prescription import Plate, glass_of_prescription
+from hilstar.optics.glass.psf_file import glass_of, read_glass, write_glass
 from hilstar.optics.glass.zemax_file import read_zemax
+from hilstar.sky.spectrum import Curve
+from tests.support.glass import stack
 from tests.support.lenses import seq, zmx
 from tests.support.refusals import refusal
 
@@ -89,6 +98,11 @@ ZEMAX = [
     (cut_off("DISZ 2.5"), CUT_OFF),
     (cut_off("SURF 2"), CUT_OFF),
     (bytes(range(256)) * 20, ""),
+    (b"VERS 140124 258 36214\r\nMODE SEQ\r\n", "it has no SURF"),
+    (zmx("ENPD 20", "PWAV 2"), "PWAV names wavelength 2 of 1; write one that there is"),
+    (zmx("ENPD 20", "PWAV 0"), "PWAV names wavelength 0 of 1"),
+    (zmx("FLOA", more={1: ["  CURV 0.01"]}).replace(b"  STOP\r\n", b""), "no surface says STOP"),
+    (zmx(more={2: ["  STOP"]}), "it has two stops; write one"),
 ]
 CODEV = [
     (seq("DIM F"), "DIM is F; write M"),
@@ -125,11 +139,141 @@ CODEV = [
         "its wavelength is 0.000587562 um",
     ),
     (seq().replace(b"NBK7_SCHOTT", b"5168:64.2"), "has the glass 5168:64.2; write n:V"),
+    (seq(far="900.0"), "its object is near"),
+    (seq().replace(b"\nSI 0.0 0.0", b""), r"it has no image surface \(SI\)"),
+    (seq().replace(b"\nSO 0.0 0.1e14", b""), r"it has no object surface \(SO\)"),
+    (seq().replace(b"WL 587.5618\n", b""), r"it has no wavelengths \(WL\)"),
+    (seq().replace(b"REF 1", b"REF 2"), "REF names wavelength 2 of 1; write one that there is"),
 ]
 REFUSED = [
     *((read_zemax, text, words) for text, words in ZEMAX),
     *((read_codev, text, words) for text, words in CODEV),
 ]
+
+
+LENS = read_zemax(zmx())
+LACKING = [
+    ({"surfaces": LENS.surfaces[-1:]}, "it has no surfaces between object and image"),
+    ({"wavelengths_um": ()}, "it has no wavelength above 0"),
+    ({"wavelengths_um": (0.5, 0.0)}, "it has no wavelength above 0"),
+    ({"wavelengths_um": (0.5, 80.0)}, "its wavelength is 80 um: is it in another unit"),
+    ({"primary": 1}, "its primary wavelength is number 2 of 1"),
+    ({"primary": -1}, "its primary wavelength is number 0 of 1"),
+    ({"pupil": 0.0}, "it has no aperture above 0"),
+    ({"surfaces": tuple(replace(each, is_stop=True) for each in LENS.surfaces)}, "two stops"),
+]
+
+
+@pytest.mark.parametrize(("changes", "words"), LACKING, ids=[words for _, words in LACKING])
+def test_a_lens_that_cannot_be_traced_says_what_it_lacks(changes, words):
+    assert LENS.check() is LENS
+    assert words in refusal(replace(LENS, **changes).check)
+
+
+@pytest.mark.parametrize("name", ["lens.txt", "lens.zmx.bak", "lens"])
+def test_a_file_of_another_name_is_no_lens(tmp_path, name):
+    (tmp_path / name).write_bytes(zmx())
+    plate = Plate((64, 64), 10.0)
+    line = refusal(glass_of_prescription, tmp_path / name, plate, None, 1e-3)
+    assert "no lens file by its name" in line
+
+
+def test_what_a_lens_file_lacks_is_said_with_its_name_before_optiland_is_asked_for(tmp_path):
+    (tmp_path / "lens.zmx").write_bytes(zmx("ENPD 0"))
+    plate = Plate((64, 64), 10.0)
+    line = refusal(glass_of_prescription, tmp_path / "lens.zmx", plate, None, 1e-3)
+    assert line.startswith(f"{tmp_path / 'lens.zmx'}: it has no aperture above 0")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"no FITS at all", "not a FITS image"),
+        (np.zeros(5), "an array of 1 axes"),
+        (np.zeros((2, 3, 5, 5)), "an array of 4 axes"),
+    ],
+    ids=["text", "a line", "four axes"],
+)
+def test_a_stack_of_a_map_is_images(tmp_path, content, words):
+    path = tmp_path / "stack.fits"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    else:
+        fits.writeto(path, content)
+    (tmp_path / "points.csv").write_text("x_px,y_px\n1,2\n")
+    line = refusal(glass_of_map, path, tmp_path / "points.csv", 3, False, 1e-3)
+    assert line.startswith(f"{path}: ")
+    assert words in line
+
+
+GLASS = glass_of(stack(2, (450.0, 650.0)))
+
+
+def changed(tmp_path, spoil) -> str:
+    """Why the file of a glass is refused once `spoil` has changed its parts."""
+    path = tmp_path / "glass.fits"
+    write_glass(path, replace(GLASS, transmission=Curve(np.array([400.0, 700.0]), np.ones(2))))
+    with fits.open(path, mode="update") as hdus:
+        spoil(hdus)
+    return refusal(read_glass, path).removeprefix(f"{path}: ")
+
+
+def put(unit: str | int, column: str, place, value):
+    def spoil(hdus):
+        hdus[unit].data[column][place] = value
+
+    return spoil
+
+
+SPOILT = [
+    (put("POINTS", "x_px", 0, np.nan), "x_px, y_px or focus_um is not finite"),
+    (put("POINTS", "weights", (0, 0), np.inf), "a place, a focus, a weight or a sample is not fin"),
+    (put("POINTS", "weights", (0, 0), 0.5), "the PSF at (0, 0) px, 450 nm sums to "),
+    (put("POINTS", "lateral_x_px", 0, np.nan), "a place, a focus, a weight or a sample is not fin"),
+    (put("POINTS", "outside_share", 0, 1.0), "outside_share is not within 0 to 1"),
+    (put("POINTS", "relative_illumination", 0, -0.1), "relative_illumination is not within 0 to 2"),
+    (put("POINTS", "wavelength_nm", 0, np.nan), "the point (0, 0) px has 0 images of 450 nm"),
+    (put("TRANSMISSION", "wavelength_nm", 1, 300.0), "the table TRANSMISSION has wavelengths that"),
+    (put("TRANSMISSION", "transmission", 1, 1.1), "the table TRANSMISSION has wavelengths that do"),
+    (put("TRANSMISSION", "transmission", 0, -0.1), "the table TRANSMISSION has wavelengths that d"),
+    (lambda hdus: hdus[0].header.set("PSFVERS", 99), "PSFVERS is 99, and this hilstar reads"),
+    (lambda hdus: hdus[0].header.set("OVERSAMP", 2.5), "OVERSAMP is 2.5 and PIXINT False"),
+    (lambda hdus: hdus[0].header.set("PIXINT", 1), "OVERSAMP is 4 and PIXINT 1"),
+    (lambda hdus: hdus[0].header.set("OVERSAMP", 0), "PSFs of 0 samples a pixel"),
+    (
+        lambda hdus: setattr(hdus[0], "data", hdus[0].data[:, :, :-1]),
+        "its first image is no cube of odd width and height",
+    ),
+    (
+        lambda hdus: setattr(hdus[0], "data", hdus[0].data[:-1]),
+        "write one weight for each",
+    ),
+    (
+        lambda hdus: setattr(hdus[0], "data", np.roll(hdus[0].data, 27, axis=2)),
+        "put the chief ray there",
+    ),
+]
+
+
+@pytest.mark.parametrize(("spoil", "words"), SPOILT, ids=[words for _, words in SPOILT])
+def test_a_file_of_a_glass_that_was_changed_is_refused(tmp_path, spoil, words):
+    assert words in changed(tmp_path, spoil)
+
+
+def test_points_with_and_without_a_wavelength_are_no_glass():
+    """One point of two images, so that each has its own place among the wavelengths."""
+    plain = stack(1, (450.0, 650.0))
+    at = plain.at.copy()
+    at[1, 2] = np.nan
+    line = refusal(glass_of, replace(plain, at=at))
+    assert line.startswith("some points have a wavelength and others none")
+
+
+def test_more_images_than_a_glass_may_have_are_refused(monkeypatch):
+    monkeypatch.setattr(psf_file, "MAX_IMAGES", 3)
+    line = refusal(glass_of, stack(2, (550.0,)))
+    assert line == "4 images; write 1 to 3"
+    glass_of(stack(1, (450.0, 550.0, 650.0)))
 
 
 @pytest.mark.parametrize(

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -90,3 +93,62 @@ def test_a_bench_without_the_table_has_none(tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     path.write_text(bench_text())
     assert cube_to_boresight(read_bench_file(path), None) is None
+
+
+DIAGONAL = np.diag([4.0, 4.0, 9.0])
+HALF_OF_95 = 1.959964
+ROUND = 2.4477468  # of a circle of sigma 1 at 95 %: the root of chi-square of two, 5.99146
+OF_FIVE = 2.5705818 / HALF_OF_95  # Student's t of five readings over a normal one, at 95 %
+
+
+@pytest.mark.parametrize(
+    ("keys", "is_certified", "is_turned", "across", "about", "without"),
+    [
+        ("", True, True, 4 + 2.25 + 4, 9 + 4 + 36, []),
+        ("", True, False, 4 + 2.25, 9 + 4, ["bias"]),
+        ("", False, True, 4 + 4, 9 + 36, ["certificate"]),
+        ("dof = 5", False, False, 4 * OF_FIVE**2, 9 * OF_FIVE**2, ["certificate", "bias"]),
+        ("dof = 5", True, True, 4 * OF_FIVE**2 + 6.25, 9 * OF_FIVE**2 + 40, []),
+    ],
+)
+def test_each_part_of_the_uncertainty_adds_its_variance(
+    tmp_path: Path,
+    keys: str,
+    is_certified: bool,
+    is_turned: bool,
+    across: float,
+    about: float,
+    without: list[str],
+) -> None:
+    path = tmp_path / "bench.toml"
+    table = ["[alignment]", 'name = "cube"', "q_mon_to_reference = [0.5, 0.5, -0.5, 0.5]", keys]
+    table.append(f"covariance_arcsec2 = {DIAGONAL.tolist()}")
+    path.write_text(bench_text() + "\n".join(table) + "\n")
+    certificate = SimpleNamespace(attitude_arcsec=(HALF_OF_95 * 1.5, HALF_OF_95 * 2))
+    turned = Turned(np.zeros(3), HALF_OF_95 * np.array([2.0, 2.0, 6.0]))
+    found = cube_to_boresight(
+        read_bench_file(path),
+        certificate if is_certified else None,
+        turned if is_turned else None,
+    )
+    assert found is not None
+    assert found.cross_arcsec == pytest.approx(ROUND * np.sqrt(across), rel=1e-5)
+    assert found.roll_arcsec == pytest.approx(HALF_OF_95 * np.sqrt(about), rel=1e-6)
+    assert len(found.without) == len(without)
+    assert all(word in part for word, part in zip(without, found.without, strict=True))
+    assert found.reference == "cube"
+    assert found.q_tracker_to_reference == pytest.approx((0.5, 0.5, -0.5, 0.5))
+
+
+def test_the_attitude_of_the_tracker_in_the_reference_has_no_negative_scalar(
+    tmp_path: Path,
+) -> None:
+    file = aligned_bench(tmp_path)
+    flipped = (-Q_MON_TO_REFERENCE).tolist()
+    alignment = msgspec.structs.replace(file.config.alignment, q_mon_to_reference=tuple(flipped))
+    other = replace(file, config=msgspec.structs.replace(file.config, alignment=alignment))
+    wanted = multiply(Q_MON_TO_REFERENCE, Q_CAM_TO_MON)
+    for each in (file, other):
+        found = cube_to_boresight(each, None)
+        assert found is not None
+        assert found.q_tracker_to_reference == pytest.approx(tuple(wanted), abs=1e-12)

@@ -51,6 +51,8 @@ def test_a_run_that_goes_well_has_no_reason():
         ),
         ({"frame": STALE, "attitude": None}, "the attitude is stale"),
         ({"alive_ns": 0}, "being prepared"),
+        ({"alive_ns": 0, "frame": NewestFrame()}, "being prepared"),
+        ({"gamma": "another program changed the ramp"}, "another program changed the ramp"),
         ({"alive_ns": NOW - S}, "the frame loop has hung for 1.0 s"),
         ({"host_ns": NOW - S, "alive_ns": NOW - S}, "silent for 1.0 s"),
         ({"display_lost": "the window went away"}, "the display is lost: the window went away"),

@@ -41,7 +41,7 @@ def page(
 
     async def send(message) -> None:
         if sent is not None:
-            sent.append(message.get("text") or message.get("bytes"))
+            sent.append(message.get("text") or message.get("bytes") or message["code"])
 
     dropped: list[bool] = []
     line = SimpleNamespace(is_read=is_read, drop=lambda: dropped.append(True), dropped=dropped)
@@ -180,3 +180,59 @@ def test_texts_are_sent_in_order_before_the_newest_picture_with_its_marks(grid):
 
     asyncio.run(serve())
     assert sent == ["first", "second", "grid" if grid else "bare", b"codes"]
+
+
+def test_at_the_end_of_a_run_each_page_gets_the_close_code_of_its_end():
+    async def serve(sent: list[list]) -> None:
+        opened = OpenPages()
+        following = [asyncio.create_task(opened.follow(page(sent=each))) for each in sent]
+        await asyncio.sleep(0)
+        await opened.close_all(1001)
+        for task in following:
+            task.cancel()
+        await asyncio.gather(*following, return_exceptions=True)
+        assert len(opened) == 0
+
+    sent: list[list] = [[], []]
+    asyncio.run(serve(sent))
+    assert sent == [[1001], [1001]]
+
+
+def test_a_page_that_gives_way_gets_its_code_once_and_is_told_nothing_more():
+    sent: list = []
+
+    async def serve() -> None:
+        opened = OpenPages()
+        shown = page(sent=sent)
+        following = asyncio.create_task(opened.follow(shown))
+        await asyncio.sleep(0)
+        shown.close(GIVES_WAY)
+        shown.tell("too late")
+        await following
+        assert len(opened) == 0
+
+    asyncio.run(serve())
+    assert sent == [GIVES_WAY]
+
+
+def test_the_rate_of_pictures_is_that_of_the_page_that_wants_most():
+    async def serve() -> list[float]:
+        opened = OpenPages()
+        assert opened.picture_hz == 0.0
+        pages = [page() for _ in range(3)]
+        for each, hz in zip(pages, (2.0, 5.0, 40.0), strict=True):
+            each.want = PageWants(picture=True, hz=hz)
+        following = [asyncio.create_task(opened.follow(each)) for each in pages[:2]]
+        await asyncio.sleep(0)
+        rates_hz = [opened.picture_hz]
+        following.append(asyncio.create_task(opened.follow(pages[2])))
+        await asyncio.sleep(0)
+        rates_hz.append(opened.picture_hz)
+        pages[1].want = pages[2].want = PageWants()
+        rates_hz.append(opened.picture_hz)
+        for task in following:
+            task.cancel()
+        await asyncio.gather(*following, return_exceptions=True)
+        return rates_hz
+
+    assert asyncio.run(serve()) == [5.0, 10.0, 2.0]

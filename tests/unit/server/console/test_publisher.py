@@ -8,37 +8,61 @@ import math
 import threading
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
+from hilstar.attitude.clock.sender_clock import ClockSummary
 from hilstar.attitude.clock.timeline import Attitude
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
+from hilstar.basics.wrong_sky import ENDS, RATES
+from hilstar.display.render.aids import GRID
+from hilstar.server.answers.answer import ReportedStar
+from hilstar.server.answers.judge import TrackerFigures
+from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.console import publisher
 from hilstar.server.console.messages import (
     FRAME,
     PICTURE,
     PICTURE_HEAD_BYTES,
     SPRITE,
+    NewAnswer,
     Order,
     PictureHead,
     PictureRequest,
+    ScpiSetup,
     SharedMemory,
 )
+from hilstar.server.console.page_process import Listeners
+from hilstar.server.console.protocol import (
+    AttitudeSource,
+    LedgerState,
+    ShownClock,
+    WrongCondition,
+)
 from hilstar.server.console.publisher import (
+    LEDGER_TROUBLES,
+    MAX_CLIPPED,
     FramePublisher,
     OrderHandler,
     PageParts,
+    RunDescription,
     SessionPublisher,
+    WatchedRun,
     _attitude,
+    setup_for,
 )
-from hilstar.server.operator import SwitchRequests
+from hilstar.server.operator import GAMMA, Aids, OnScreen, SwitchRequests
 from hilstar.server.pacer import Shown
+from hilstar.server.pointing import POINTING
 from hilstar.server.record.ledger import LedgerSwitch
+from hilstar.server.record.ledger_records import MAX_CENTROIDS
 from hilstar.server.summary import RunTally
+from tests.support.benches import bench_text
 
 WIDTH, HEIGHT = 6, 4
 Q = from_radec_roll_deg(84.057, -1.2, 30.0)
@@ -319,3 +343,147 @@ def test_a_session_shows_what_fits_and_takes_marks_alone(memory):
     assert told[-1] == ("mark", "mark, by ann: lamp on")
     for name, text in (("mark", " "), ("blank", "")):
         assert session.do(Order(id=3, name=name, who="ann", text=text)).status == 409
+
+
+def watched_run(feed, tmp_path, **parts) -> WatchedRun:
+    """What a page's process is told of a run whose clock, ledger, screen and faults are stated."""
+    aids = Aids()
+    aids.toggle("grid")
+    watch = SimpleNamespace(alive_ns=4321)
+    pacer = SimpleNamespace(operator=SimpleNamespace(aids=aids))
+    tally = RunTally()
+    tally.missed_frames, tally.stale_frames, tally.given_up_frames = 3, 2, 1
+    tally.first_swap_ns = 0
+    counts = PacketCounts(received=9, lost=4)
+    counts.refused_by["crc"] = 2
+    clock = ClockSummary("exchange", offset_ms=-5.5, drift_ppm=12.0, uncertainty_ms=0.25)
+    figures, widths = TrackerFigures(right=8), SimpleNamespace(state=None)
+    answers = SimpleNamespace(figures=figures, widths=widths, newest=None)
+    loop = SimpleNamespace(tally=tally, watch=watch, pacer=pacer)
+    feed.follow(SimpleNamespace(loop=loop, packets=counts, clock=lambda: clock, answers=answers))
+    ledger = SimpleNamespace(path=tmp_path / "run.mcap", size_bytes=77)
+    known = {
+        "bench": None,
+        "notices": Notices(),
+        "ledger": SimpleNamespace(current=ledger),
+        "make_ledger": None,
+        "screen": SimpleNamespace(window=SimpleNamespace(gone=None), forced=["a", "b"]),
+        "faults": SimpleNamespace(on=lambda: ["flash"]),
+    }
+    return WatchedRun(feed, PageParts(**(known | parts)))
+
+
+def test_the_state_of_a_run_has_what_each_of_its_parts_says(feed, tmp_path):
+    run = watched_run(feed, tmp_path)
+    drawn = SimpleNamespace(star_count=31, clipped_hip=tuple(range(MAX_CLIPPED + 5)), sprites=None)
+    feed.see(Shown(70, 0, TURNING, drawn, stale=True, on_screen=OnScreen("grid", "covered")))
+    state = run.now()
+    assert (state.alive_ns, state.overlay, state.operator_text) == (4321, GRID, "grid")
+    assert state.operator["grid"] and not state.operator["blank"]
+    frame = state.frame
+    assert (frame.number, frame.stars, frame.stale, frame.blank) == (70, 31, True, False)
+    assert frame.clipped == list(range(MAX_CLIPPED)) and not frame.missing
+    assert state.attitude is not None and state.attitude.age_ms == 7.5
+    assert state.clock == ShownClock(
+        offset_ms=-5.5, sigma_ms=0.25, drift_ppm=12.0, synchronised=True, mode="exchange"
+    )
+    counts = state.counts
+    assert (counts.missed, counts.stale, counts.given_up) == (3, 2, 1)
+    assert (counts.received, counts.accepted, counts.lost) == (9, 7, 4)
+    assert counts.refused == {"crc": 2}
+    assert (state.hidden, state.forced, state.faults) == ("covered", "a; b", ["flash"])
+    assert (state.display_lost, state.gamma, state.pointing) == ("", "", "")
+    assert state.ledger == LedgerState(str(tmp_path / "run.mcap"), 77)
+    assert state.tracker == TrackerFigures(right=8)
+    assert (state.wrong_sky, state.wrong_sky_s) == ([], 0.0)
+
+
+def test_what_is_wrong_with_a_run_stays_in_its_state_while_it_lasts(feed, tmp_path):
+    notices = Notices()
+    gone = SimpleNamespace(window=SimpleNamespace(gone="the window went away"), forced=[])
+    run = watched_run(feed, tmp_path, notices=notices, screen=gone)
+    notices.begin(GAMMA, "the ramp is bent")
+    notices.begin(POINTING, "points at Orion")
+    notices.begin(RATES, "twice as fast")
+    for kind, _ in LEDGER_TROUBLES.items():
+        notices.begin(kind, kind)
+    state = run.now()
+    assert (state.gamma, state.pointing) == ("the ramp is bent", "points at Orion")
+    assert state.display_lost == "the window went away"
+    assert state.wrong_sky == [WrongCondition(RATES, "twice as fast")]
+    assert state.wrong_sky_s >= 0.0
+    assert state.ledger is not None
+    assert state.ledger.failing.split("; ") == list(LEDGER_TROUBLES.values())
+    notices.end(GAMMA, "gamma-straight", "")
+    notices.end(RATES, ENDS[RATES], "")
+    state = run.now()
+    assert (state.gamma, state.wrong_sky) == ("", [])
+
+
+def test_before_a_run_is_followed_its_ledger_alone_is_known(memory, tmp_path):
+    state = watched_run(FramePublisher(memory), tmp_path)
+    state._feed.running = None
+    assert state.now().ledger is not None and state.now().alive_ns == 0
+
+
+@pytest.mark.parametrize(("mode", "is_known"), [("none", None), ("one-way", False), ("unix", True)])
+def test_a_clock_that_is_not_compared_is_none(feed, tmp_path, mode, is_known):
+    run = watched_run(feed, tmp_path)
+    feed.running.clock = lambda: ClockSummary(mode, 1.0, 2.0, 3.0)
+    clock = run.now().clock
+    assert (None if clock is None else clock.synchronised) is is_known
+
+
+def test_an_answer_is_published_with_what_was_lit_and_its_stars(memory, feed):
+    stars = tuple(ReportedStar(k + 0.126, k, 300.0) for k in range(MAX_CENTROIDS + 3))
+    lit = SimpleNamespace(q=np.array([0.5, 0.5, 0.5, -0.5]))
+    newest = SimpleNamespace(lit=lit, answer=SimpleNamespace(centroids=stars))
+    figures = TrackerFigures(right=3)
+    answers = SimpleNamespace(heard=None, newest=newest, figures=figures)
+    feed.follow(SimpleNamespace(answers=answers))
+    answers.heard(answers)
+    answers.newest = None
+    answers.heard(answers)
+    first, second = (
+        msgspec.json.decode(data, type=NewAnswer) for _, data in memory.answers.after(0)
+    )
+    assert first.figures == second.figures == figures
+    assert first.q_lit == (0.5, 0.5, 0.5, -0.5) and second.q_lit is None
+    assert first.centroids[:2] == [(0.13, 0.0), (1.13, 1.0)]
+    assert (len(first.centroids), second.centroids) == (MAX_CENTROIDS, [])
+
+
+def test_the_settings_of_a_page_are_those_of_its_bench_and_its_listeners(tmp_path):
+    changes = {"monitor": {"bits": 10, "refresh_hz": 75.0}, "attitude": {"max_rate_deg_s": 12.0}}
+    file = bench_file_of(tmp_path / "my.toml", bench_text(changes))
+    page = SimpleNamespace(
+        hosts=["a"], names=["Sky.Lab"], any_address=True, port=77, token="page's"
+    )
+    scpi = SimpleNamespace(token="scpi's")
+    told = RunDescription("serve", "udp", "udp://*:5560", "asked", steer_port=99)
+    setup = setup_for(Listeners(page, scpi), True, told, file, 1234)
+    hello = setup.hello
+    assert (hello.command, hello.bench, hello.bits, hello.white_level) == (
+        "hilstar serve",
+        "my.toml",
+        10,
+        1023,
+    )
+    assert (hello.refresh_hz, hello.resolution_px, hello.control) == (75.0, (320, 240), True)
+    assert (setup.hosts, setup.names, setup.any_address) == (["a"], ["sky.lab"], True)
+    assert (setup.port, setup.token, setup.pace, setup.picture_bytes) == (
+        77,
+        "page's",
+        "asked",
+        1234,
+    )
+    assert setup.source == AttitudeSource("udp", "udp://*:5560")
+    assert setup.scpi == ScpiSetup("scpi's", "udp", 99, 12.0)
+    alone = setup_for(Listeners(None, scpi), False, told, file, 1)
+    assert (alone.port, alone.token, alone.any_address, alone.hello.control) == (
+        0,
+        "",
+        False,
+        False,
+    )
+    assert setup_for(Listeners(page, None), True, told, file, 1).scpi is None

@@ -41,6 +41,7 @@ from hilstar.server.console.server.scpi_server import (
     Peers,
     ScpiServer,
 )
+from tests.support.waiting import PATIENCE_S
 
 START_NS = 10**15
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -453,3 +454,139 @@ def test_the_one_that_is_silent_longest_gives_way():
     assert late not in peers.strangers
     peers.leave(late)
     assert late not in peers.controllers
+
+
+def test_a_controller_s_turn_is_twice_a_stranger_s_and_strangers_wait_for_each_other(monkeypatch):
+    """A stranger's turn comes 5 ms after the one before, whoever's that was."""
+    now_s = 100.0
+    slept_s: list[float] = []
+
+    async def sleep(seconds: float) -> None:
+        nonlocal now_s
+        slept_s.append(seconds)
+        now_s += max(seconds, 0.0)
+
+    async def take_turns() -> list[int]:
+        asyncio.get_running_loop().time = lambda: now_s
+        turns = scpi_server.Turns()
+        return [await turns.await_turn(stranger) for stranger in (False, True, True, False, True)]
+
+    monkeypatch.setattr(scpi_server.asyncio, "sleep", sleep)
+    assert asyncio.run(take_turns()) == [8, 4, 4, 8, 4]
+    controller_s, first_s, *later_s = slept_s
+    assert controller_s == scpi_server.TURN_S and first_s <= 0.0
+    after_controller_s = scpi_server.STRANGERS_S - scpi_server.TURN_S
+    assert later_s == pytest.approx(
+        [scpi_server.STRANGERS_S, scpi_server.TURN_S, after_controller_s], abs=1e-9
+    )
+
+
+def test_a_connection_waits_for_a_turn_as_what_it_is(benches):
+    bench = benches(None, token="open")
+    waited: list[bool] = []
+
+    async def await_turn(stranger: bool) -> int:
+        waited.append(stranger)
+        return 3
+
+    bench.server.turns = SimpleNamespace(await_turn=await_turn)
+    # a line and its two queries are three units
+    assert bench.says("*IDN?;SYST:VERS?").endswith(";1999.0")
+    assert waited == [True]
+    bench.says('SYST:AUTH "open"')
+    bench.says("*CLS")
+    assert waited == [True, True, False]
+
+
+def test_a_connection_that_ends_leaves_its_place():
+    peers = Peers()
+    clients = [Peer(f"10.0.0.{k}") for k in range(3)]
+    for client in clients:
+        peers.enter(client, SimpleNamespace(transport=None))
+    peers.promote(clients[1])
+    peers.leave(clients[0])
+    peers.leave(clients[1])
+    peers.leave(clients[1])
+    assert (list(peers.controllers), list(peers.strangers)) == ([], [clients[2]])
+    # one that has ended is promoted to nothing
+    peers.promote(clients[0])
+    assert list(peers.controllers) == []
+
+
+def talked(bench: Bench, *lines: bytes) -> bytes:
+    """What comes back over TCP until the server closes, or this side is done."""
+
+    async def talk() -> bytes:
+        listener = socket.create_server(("127.0.0.1", 0))
+        serving = asyncio.create_task(bench.server.serve(listener))
+        incoming, outgoing = await asyncio.open_connection(*listener.getsockname())
+        for line in lines:
+            outgoing.write(line)
+            await outgoing.drain()
+        outgoing.write_eof()
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                told = await incoming.read()
+                while bench.server.peers.strangers.keys() - {bench.client}:
+                    await asyncio.sleep(0)
+        except ConnectionResetError:
+            told = b"reset"
+        outgoing.close()
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        return told
+
+    return asyncio.run(talk())
+
+
+def test_lines_over_tcp_are_answered_one_by_one_however_they_are_cut(benches):
+    bench = benches(None)
+    bench.run()
+    told = talked(bench, b"*IDN?;SYST:VE", b"RS?\nSKY:BLAN?\r\n*CLS\n", b"FRAM:MISS?\n")
+    first, *rest = told.decode().splitlines()
+    assert first.startswith("hilstar,") and first.endswith(";1999.0")
+    assert rest == ["0", "7"]
+
+
+def test_who_guesses_tokens_is_closed_after_five(benches):
+    bench = benches(None, token="right")
+    wrong = b'SYST:AUTH "wrong"\n'
+    told = talked(bench, wrong * 4 + b"*IDN?\n" + wrong + b"*IDN?\n")
+    assert told.count(b"hilstar,") == 1
+
+
+def test_a_browser_s_request_gets_no_answer(benches):
+    bench = benches(None)
+    told = talked(bench, b"GET / HTTP/1.1\r\nHost: x\r\n\r\n*IDN?\n")
+    assert told in {b"", b"reset"}
+    assert not bench.server.peers.controllers
+
+
+def test_attitudes_are_sent_again_and_again_while_a_server_serves(benches, receiver):
+    bench = benches(receiver)
+    bench.says("SKY:ATT 1,0,0,0")
+
+    async def serve() -> list[int]:
+        listener = socket.create_server(("127.0.0.1", 0))
+        serving = asyncio.create_task(bench.server.serve(listener))
+        sequences: list[int] = []
+        async with asyncio.timeout(PATIENCE_S):
+            while len(sequences) < 4:
+                sequences += [sample.sequence for sample in bench.sent()]
+                await asyncio.sleep(0.001)
+        serving.cancel()
+        await asyncio.gather(serving, return_exceptions=True)
+        return sequences
+
+    assert asyncio.run(serve())[:4] == [0, 1, 2, 3]
+
+
+def test_a_frame_that_is_missed_is_in_the_register_until_the_next_look(bench):
+    bench.run(counts=RunCounts(missed=7))
+    bench.server._look()
+    bench.says("STAT:QUES:EVEN?")  # read, and cleared
+    bench.run(counts=RunCounts(missed=9))
+    bench.server._look()
+    assert int(bench.says("STAT:QUES:EVEN?")) & MISSED_BIT
+    bench.server._look()
+    assert not int(bench.says("STAT:QUES:EVEN?")) & MISSED_BIT

@@ -347,3 +347,19 @@ def test_a_table_s_own_errors_stand_in_the_place_of_hipparcos(tmp_path):
     gaia_table().write(plain)
     assert table_facts(TableChoice(plain), stars, before) is before
     assert table_facts(TableChoice(), stars, before) is before
+
+
+def test_a_star_without_a_colour_has_both_its_magnitudes_from_the_next_columns(tmp_path):
+    """V alone gives no spectrum: Gaia's magnitudes then give V and colour together, as for a star
+    that has no V at all. A star with V and B-V keeps them, whatever Gaia says.
+    """
+    head = "ra_deg,dec_deg,vmag,b-v,g_mag,bp_rp\n"
+    rows = ["10,20,4.0,0.3,9.0,1.5", "30,40,4.0,,7.0,1.1", "50,60,,,7.0,1.1", "70,80,,0.2,7.0,1.1"]
+    (tmp_path / "both.csv").write_text(head + "\n".join(rows) + "\n")
+    stars = read_stars(tmp_path / "both.csv")
+    order = np.argsort(stars.ra_deg)
+    v_mag, bv_mag = stars.v_mag[order], stars.bv_mag[order]
+    assert (v_mag[0], bv_mag[0]) == pytest.approx((4.0, 0.3))
+    assert v_mag[1] != pytest.approx(4.0, abs=0.5)
+    assert v_mag[1:] == pytest.approx(np.full(3, v_mag[2]))
+    assert bv_mag[1:] == pytest.approx(np.full(3, bv_mag[2]))

@@ -63,13 +63,14 @@ def test_the_figures_of_the_paper_s_own_program(name, sun_au, distance_au, phase
     ) == pytest.approx(v_mag, abs=PRINTED_MAG)
 
 
-def test_planets_on_200_dates_are_as_bright_as_in_skyfield(rng):
+@pytest.mark.parametrize("count", [10, 200])
+def test_planets_on_random_dates_are_as_bright_as_in_skyfield(rng, count):
     """Its formulas by the true distances from the Sun, which its own call takes at the
     barycentre.
     """
     functions = {name: getattr(magnitudelib, f"_{name.lower()}_magnitude") for name in PLANETS}
     poles = {"Saturn": magnitudelib._SATURN_POLE, "Uranus": magnitudelib._URANUS_POLE}
-    for utc in random_utcs_ns(rng, 200):
+    for utc in random_utcs_ns(rng, count):
         seen = moving_sky(utc).sight(0)
         jyear = 1970 + utc / 31_557_600e9
         for name in PLANETS:
@@ -243,3 +244,15 @@ def test_rates_by_the_paper_s_other_photometric_system_are_the_same(sensor, monk
     monkeypatch.setattr(light, "ALBEDOS", SLOAN_ALBEDOS)
     theirs = bodies_electrons_per_s(PLANETS, "dgs", optics, Photometry())
     holds("body-colours", np.abs(2.5 * np.log10(ours / theirs)).max())
+
+
+@pytest.mark.parametrize(
+    ("jyear", "v_mag"),
+    [(1950.0, -6.89), (1980.0, -6.89), (1990.0, -6.944), (2000.4, -7.0), (2040.0, -7.0)],
+)
+def test_neptune_brightened_from_1980_to_2000(jyear, v_mag):
+    """Mallama and Hilton 2018, section 4.7, at unit distances: 0.0054 mag a year, to the -7.00 of
+    after 2000.
+    """
+    vectors = seen_at_phase(1.0, 1.0, 0.0)
+    assert body_v_mag("Neptune", *vectors, jyear) == pytest.approx(v_mag, abs=1e-9)

@@ -20,6 +20,9 @@ from hilstar.instruments.study.prediction import (
     PredictionOutcome,
     Shaken,
     crossing_hz,
+    shaken_finding,
+    shaken_rows,
+    slew_outcomes,
 )
 from hilstar.instruments.study.predictors import (
     NEAR,
@@ -29,9 +32,11 @@ from hilstar.instruments.study.predictors import (
     slew_attitude,
 )
 
+SLEW_PART_S = 2.0  # a tenth of the swing, from its fastest on
+
 
 @pytest.fixture(scope="module")
-def prediction_study(whole_study):
+def whole_prediction(whole_study):
     found = whole_study("prediction", {"prediction", "prediction_jitter"})
     return found.folder, found.findings
 
@@ -46,12 +51,13 @@ def typed_rows(path, record):
         ]
 
 
+def by_cell(outcomes):
+    return {(o.method, o.rate_hz, o.latency_ms): o for o in outcomes}
+
+
 @pytest.fixture(scope="module")
-def outcomes(prediction_study):
-    return {
-        (o.method, o.rate_hz, o.latency_ms): o
-        for o in typed_rows(prediction_study[0] / "prediction.csv", PredictionOutcome)
-    }
+def outcomes():
+    return by_cell(slew_outcomes(SLEW_PART_S))
 
 
 def test_holding_costs_the_rate_times_the_age(outcomes):
@@ -76,11 +82,8 @@ def test_a_rate_predicts_better_than_holding_and_worse_the_longer_it_has_to(outc
 
 
 @pytest.fixture(scope="module")
-def shaken(prediction_study):
-    return {
-        (s.way, s.packets, s.jitter_hz): s
-        for s in typed_rows(prediction_study[0] / "prediction_jitter.csv", Shaken)
-    }
+def shaken():
+    return {(s.way, s.packets, s.jitter_hz): s for s in shaken_rows(quick=True)}
 
 
 def test_a_rate_amplifies_a_vibration_by_its_phase_over_the_age(shaken):
@@ -95,9 +98,7 @@ def test_a_rate_amplifies_a_vibration_by_its_phase_over_the_age(shaken):
         )
 
 
-def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fast(
-    prediction_study, shaken
-):
+def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fast(shaken):
     for packets in ("with rates", "without rates"):
         for hz in (2.0, 5.0):
             assert shaken["auto", packets, hz].residual == pytest.approx(
@@ -110,11 +111,14 @@ def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fas
             )
         # sin x = x / 2: 15 Hz with rates
         assert 8 < crossing_hz(list(shaken.values()), packets, USUAL_HZ, USUAL_MS) < 16
-    assert prediction_study[1][-1].startswith("Of a vibration above 1")
+    assert shaken_finding(list(shaken.values())).startswith("Of a vibration above 1")
 
 
-def test_the_study_writes_what_it_found(prediction_study, outcomes):
-    assert len(prediction_study[1]) == 1 + 5 + 1
+def test_the_study_writes_what_it_found(whole_prediction):
+    folder, lines = whole_prediction
+    outcomes = by_cell(typed_rows(folder / "prediction.csv", PredictionOutcome))
+    assert len(typed_rows(folder / "prediction_jitter.csv", Shaken)) > 20
+    assert len(lines) == 1 + 5 + 1
     assert len(outcomes) == 5 * (len(RATES_HZ) + len(LATENCIES_MS) - 1)
     assert {ms for _, hz, ms in outcomes if hz == USUAL_HZ} == set(LATENCIES_MS)
     assert {hz for _, hz, ms in outcomes if ms == USUAL_MS} == set(RATES_HZ)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from html.parser import HTMLParser
+from pathlib import Path
 
 import pytest
 from matplotlib.figure import Figure
@@ -69,14 +70,15 @@ def card_lines(page: str) -> dict[str, list[str]]:
 
 @contextmanager
 def drawn_figures() -> Iterator[list[Figure]]:
-    """The figures that pages draw, neither laid out nor written: that takes a second of each."""
+    """The figures of pages and charts, neither laid out nor written: that takes a second each."""
     drawn: list[Figure] = []
 
-    def kept(figure: Figure) -> str:
+    def kept(figure: Figure, path: Path | None = None) -> str:
         drawn.append(figure)
         return "<svg/>"
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(pages, "svg", kept)
+        patch.setattr(charts, "save", kept)
         patch.setattr(charts, "finish", lambda figure: None)
         yield drawn

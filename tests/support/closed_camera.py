@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 from scipy.special import ndtr
 
 from hilstar.basics.arrays import FloatArray
@@ -103,7 +104,7 @@ class ClosedCamera(ImageSource):
 
     `white_dn_per_s` is the light of a pixel at white, all over the detector; `black` is relative to
     that. `at_time` is what white is at a time, s, `mounted` how a screen's rows and columns are
-    seen. `taken` has what was looked at.
+    seen. `taken` has what was looked at; with `saves` images are files that others read, too.
     """
 
     response: FloatArray = field(default_factory=lambda: power_of(2.2))
@@ -114,6 +115,7 @@ class ClosedCamera(ImageSource):
     sets_exposure: bool = True
     at_time: Callable[[float], float] = lambda t_s: 1.0
     mounted: Callable[[CodeImage], CodeImage] = upright
+    saves: bool = False
     now_s: float = 0.0
     taken: list[tuple[str, float]] = field(default_factory=list)
     images: dict[Path, FloatArray] = field(default_factory=dict)
@@ -127,8 +129,12 @@ class ClosedCamera(ImageSource):
         photons = rng.poisson(mean_dn * GAIN_E_PER_DN) / GAIN_E_PER_DN
         read_dn = rng.normal(OFFSET_DN, READ_DN, mean_dn.shape)
         path = stem.with_name(stem.name + ".png")
-        path.touch()
-        self.images[path] = np.clip(np.rint(photons + read_dn), 0, FULL_DN)
+        image = np.clip(np.rint(photons + read_dn), 0, FULL_DN)
+        if self.saves:
+            Image.fromarray(image.astype(np.uint16)).save(path)
+        else:
+            path.touch()
+        self.images[path] = image
         return path
 
     def look(self, file: BenchFile, pattern: Pattern, stem: Path, exposure_s: float) -> Path:

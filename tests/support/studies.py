@@ -44,10 +44,10 @@ class Studied:
 def studied(
     directories: pytest.TempPathFactory,
     name: str,
-    charts: Collection[str],
+    known_charts: Collection[str],
     words: str = "--quick",
 ) -> Studied:
-    """Run `hilstar study NAME` and hold it to the contract; `charts` are the names of its own."""
+    """Run `hilstar study NAME` and hold it to the contract; `known_charts` are the names of its own."""
     folder = directories.mktemp(name)
     line = f"study {name} {words} -o {folder} --json"
     result = run_hilstar_here(line, timeout=LIMIT_S)
@@ -57,7 +57,7 @@ def studied(
     assert any(told["findings"])  # a blank one parts their groups
     assert not any("\n" in line for line in told["findings"])
     drawn = {path.stem for path in folder.glob("*.png")}
-    assert drawn == set(charts), drawn
+    assert drawn == set(known_charts), drawn
     for path in folder.glob("*.png"):
         assert_drawn(path)
     tables = sorted(folder.glob("*.csv"))

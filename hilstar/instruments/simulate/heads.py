@@ -86,8 +86,9 @@ class _Head:
         # Linear light places all stars alike; codes place bright stars better.
         alike = np.ones(len(stars))
         light = head_field.truth["electrons_per_s"][stars].astype(np.float64)
-        linear = self._body(q_icrs_to_body, self._solved_from(sky, stars), wanted, alike)
-        codes = self._body(q_icrs_to_body, self._solved_from(shown, stars), wanted, light)
+        attitudes = (self.mounting.q_body_to_cam, q_icrs_to_body)
+        linear = body_attitude(*attitudes, self._solved_from(sky, stars), wanted, alike)
+        codes = body_attitude(*attitudes, self._solved_from(shown, stars), wanted, light)
         return linear, codes
 
     def _usable(self, head_field: TwinField, sky: Matched, shown: Matched) -> npt.NDArray[np.bool_]:
@@ -119,22 +120,22 @@ class _Head:
         source = matched.index[stars]
         return self._directions(matched.found.x_px[source], matched.found.y_px[source])
 
-    def _body(
-        self,
-        q_icrs_to_body: FloatArray,
-        measured: FloatArray,
-        wanted: FloatArray,
-        weights: FloatArray,
-    ) -> FloatArray:
-        """The body's attitude (4,) by directions measured, where stars of the true attitude have
-        those wanted, (n, 3) each.
-        """
-        q_body_to_cam = self.mounting.q_body_to_cam
-        # turns the camera's true axes into those solved
-        q_cam_to_solved = wahba(measured, wanted, weights)
-        q_icrs_to_cam = multiply(q_body_to_cam, q_icrs_to_body)
-        q_icrs_to_solved = multiply(q_cam_to_solved, q_icrs_to_cam)
-        return multiply(conjugate(q_body_to_cam), q_icrs_to_solved)
+
+def body_attitude(
+    q_body_to_cam: FloatArray,
+    q_icrs_to_body: FloatArray,
+    measured: FloatArray,
+    wanted: FloatArray,
+    weights: FloatArray,
+) -> FloatArray:
+    """The body's attitude (4,) by directions that a head measured, where stars of the true attitude
+    have those wanted, cam, (n, 3) each.
+    """
+    # turns the camera's true axes into those solved
+    q_cam_to_solved = wahba(measured, wanted, weights)
+    q_icrs_to_cam = multiply(q_body_to_cam, q_icrs_to_body)
+    q_icrs_to_solved = multiply(q_cam_to_solved, q_icrs_to_cam)
+    return multiply(conjugate(q_body_to_cam), q_icrs_to_solved)
 
 
 def _inside(

@@ -249,6 +249,8 @@ class TrackerProcess:
 
     def _await(self, end_ns: int, send: Send | None, stop: threading.Event) -> None:
         """Take frames until one was lit after an exposure's end, or none comes any more."""
+        # those that came while the exposure before was solved, however late it is now
+        self._take(0)
         while (
             not stop.is_set()
             and self._tracker.frames.newest_ns < end_ns

@@ -232,3 +232,23 @@ def test_in_lockstep_a_time_request_is_answered_with_when_it_came_and_when_the_a
         assert (reply.sequence, reply.t1_ns) == (3, 4)
         assert asked_ns < reply.t2_ns < reply.t3_ns < HOST_CLOCK.now_ns()
     context.term()
+
+
+def test_statuses_and_requests_go_to_the_sender_that_is_shown():
+    """Of several senders at one port; of a link with one peer, to that."""
+    link = Wire()
+    back = BackChannel(link, Traffic(status_hz=10, time_requests=True))
+    sent: dict[str, list[Packet]] = {"first": [], "second": []}
+    sample = AttitudeSample(0, np.array([1.0, 0.0, 0.0, 0.0]), None, 0)
+    back.follow(Arrival(NOW_NS, sample))
+    back.post(status(1))
+    back.talk(NOW_NS, ask=False)
+    assert link.sent == [status(1)]
+    for k, name in enumerate(("first", "second"), start=1):
+        back.follow(Arrival(NOW_NS, sample, back=sent[name].append))
+        back.post(status(k))
+        back.talk(NOW_NS + k * NS_PER_S, ask=True)
+        kinds = [type(packet) for packet in sent[name]]
+        assert kinds == [TimeRequest, Status]
+        assert sent[name][1] == status(k)
+    assert len(link.sent) == 1

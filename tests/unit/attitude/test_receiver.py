@@ -18,7 +18,7 @@ import pytest
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.receiver import QUEUED_NS, Receiver, Traffic
 from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import AttitudeSample, Packet, encode
+from hilstar.attitude.wire.packet import AttitudeSample, Packet, Status, encode
 from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
@@ -871,3 +871,19 @@ def test_a_jump_of_the_sender_s_clock_is_told_with_all_that_it_jumped_so_far():
     assert summary.jumps == 2
     # host minus sender; 50 us is the way
     assert summary.offset_ms == pytest.approx(-3500 + 0.05, abs=0.2)
+
+
+def test_the_sender_that_is_shown_is_the_one_that_is_answered():
+    """Two at one port: the first is shown, and statuses go to it alone."""
+    answered: dict[int, list[Packet]] = {1: [], 2: []}
+
+    def make(t0: int) -> list[Arrival]:
+        arrivals = Sender(number=1).packets(t0, seconds(0, 2))
+        arrivals += Sender(q=LYRA, number=2).packets(t0 + NS_PER_MS, seconds(1, 2))
+        return [replace(each, back=answered[each.event.sender].append) for each in arrivals]
+
+    run = ReceiverRun(make, traffic=Traffic(status_hz=10), two_way=True)
+    run.receiver.back.post(Status(0, 1, 1, 0, 0, 0, 0))
+    run.receiver.back.talk(run.link.clock.now_ns + NS_PER_S, ask=False)
+    assert [type(packet) for packet in answered[1]] == [Status]
+    assert answered[2] == []

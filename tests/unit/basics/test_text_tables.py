@@ -5,13 +5,14 @@ refused or said.
 from __future__ import annotations
 
 import itertools
+from decimal import Decimal
 
 import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import warn_once
-from hilstar.basics.text_tables import open_table, read_rows
+from hilstar.basics.text_tables import open_table, read_rows, seconds_of_date
 from hilstar.basics.units import DIMENSIONS, factor, plain_unit
 from tests.support.refusals import refusal
 
@@ -320,3 +321,28 @@ def test_what_stands_around_a_table_is_told_apart_from_it(table_file, name, capl
 def test_what_other_programs_make_of_a_table_is_refused_by_name(table_file, text, words):
     with pytest.raises(InputError, match=words):
         read_table_rows(table_file(text))
+
+
+@pytest.mark.parametrize(
+    ("text", "moment"),
+    [
+        ("2008-09-20T12:25:40.104192", "2008-09-20T12:25:40.104192"),
+        ("2008-264T12:25:40.104192Z", "2008-09-20T12:25:40.104192"),
+        ("2008-001 00:00:00", "2008-01-01T00:00:00"),
+        ("2008-366T23:59:59.", "2008-12-31T23:59:59"),
+        ("1969:365T23:59:58", "1969-12-31T23:59:58"),
+        ("2026/032:06:07:08 UTC", "2026-02-01T06:07:08"),
+        ("2026-03-01T00:30:00+02:00", "2026-02-28T22:30:00"),
+        ("2026-02-28T22:30:00-0330", "2026-03-01T02:00:00"),
+    ],
+)
+def test_a_date_is_seconds_since_1970_with_its_digits(text, moment):
+    wanted_ns = int(np.datetime64(moment, "ns").astype(np.int64))
+    assert Decimal(seconds_of_date(text)) * 10**9 == wanted_ns
+
+
+@pytest.mark.parametrize(
+    "text", ["2007-366T00:00:00", "2008-000T00:00:00", "2008-02-30T00:00:00", "2008-01-01T24:00:00"]
+)
+def test_what_is_no_date_stays_as_it_is(text):
+    assert seconds_of_date(text) == text

@@ -8,11 +8,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilstar.basics.rotation import from_rotation_vector, to_matrix
+from hilstar.display.render.reference import linear_image
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.bodies import BodyLayer
+from hilstar.optics.layers.layers import light_of
+from hilstar.optics.layers.star_layer import StarLayer
 from hilstar.optics.layers.truth import sprite_truth
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.scan import Scan
 from hilstar.optics.sprites import join_sprites
 from hilstar.sky.bodies.disc import Air, Disc
 from hilstar.sky.stars import Stars, with_bodies
@@ -58,6 +63,86 @@ def test_stars_beside_a_limb_are_dimmed_by_the_air_to_its_top():
     assert 0.9 < wanted[3] < wanted[4] < 0.999  # the air's upper parts do dim
     # what lets through under half a percent is not drawn at all
     np.testing.assert_allclose(shown, np.where(wanted < 0.005, 0.0, wanted), rtol=2e-3)
+
+
+MOUNTED = to_matrix(from_rotation_vector(np.array([0.03, -0.02, 0.7])))
+WIDE = Camera((90, 60), 400.0, (40.0, 33.5), MOUNTED)
+TURN = np.radians((1.5, -2.0, 6.0))
+# radius^2 / 2 of the focal length by perspective, and a quadrature's share of the path
+SAME_PLACE_PX = 0.05
+# A star that falls by a share of the rows meanwhile is lit until its own is written again.
+ROW_SHARE = 0.03
+ROWS = [(0, 1), (0, -1), (1, 0), (-1, 0)]
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        *[View(AT_START.q_icrs_to_cam, TURN, scan=Scan(down, 0.1, 0.02)) for down in ROWS],
+        View(AT_START.q_icrs_to_cam, TURN, scan=Scan(hold_s=0.2)),
+        View.exposure(AT_START.q_icrs_to_cam, TURN, 0.2),
+        View(AT_START.q_icrs_to_cam, None, scan=Scan(hold_s=0.2)),
+    ],
+    ids=["down", "up", "right", "left", "held", "exposed", "still"],
+)
+def test_a_disc_goes_where_a_star_in_its_middle_goes(view):
+    """A face of 4 px under the Sun and a star, by a camera that turns: row after row in each
+    direction of a screen's rows, held, in an exposure, and at rest. Each has its middle of light
+    at the same place, off the middle of an image that is not square.
+    """
+    canvas = Canvas(WIDE, GaussianPsf((0.8, 1.0)))
+    towards = MOUNTED.T @ np.array([0.06, -0.045, 1.0])
+    towards /= np.linalg.norm(towards)
+    face = Disc(
+        "Moon", towards, 100.0, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), -towards, "lambert"
+    ).of_rate(1e6)
+    stars = stars_at(towards[None], np.full(1, 1e6))
+    images = []
+    for sky, layers in (
+        (stars, [StarLayer(canvas)]),
+        (
+            with_bodies(stars, ("Moon",), np.zeros(1)),
+            [BodyLayer(SimpleNamespace(names=("Moon",), discs=lambda *_: [face]), canvas)],
+        ),
+    ):
+        light = light_of(canvas, layers, sky, view)
+        images.append(linear_image(light, WIDE.resolution_px, canvas.psf))
+    y, x = np.indices(images[0].shape)
+    middles = [(image * [x, y]).sum(axis=(1, 2)) / image.sum() for image in images]
+    assert images[1].sum() == pytest.approx(images[0].sum(), rel=ROW_SHARE)
+    assert middles[1] == pytest.approx(middles[0], abs=SAME_PLACE_PX)
+    # and as wide along its way, but for the face's own width
+    spread = [
+        (image * (x - middle[0]) ** 2).sum() / image.sum()
+        for image, middle in zip(images, middles, strict=True)
+    ]
+    assert 0 < spread[1] - spread[0] < 8.0
+
+
+def test_what_a_disc_hides_is_farther_than_it():
+    """A body as a point behind a disc, at its distance but for a kilometre, and before it."""
+    canvas = Canvas(WIDE, GaussianPsf((0.8, 1.0)))
+    face = Disc("Moon", AHEAD, 1000.0, 20.0, 20.0, np.array([0.0, 1.0, 0.0]), -AHEAD, "lambert")
+    stars = with_bodies(stars_at(AHEAD[None], np.ones(1)), ("Moon", "Mars"), np.zeros(2))
+    stars.vectors[1:] = AHEAD
+    light = replace(sprites_at(np.full((3, 2), 40.0), np.ones(3), FOOTPRINT), star=np.arange(3))
+    for far_km, shown in ((1001.0, []), (999.0, [2])):
+        moving = SimpleNamespace(
+            names=("Moon", "Mars"),
+            distances_km=lambda *_, far_km=far_km: np.array([1000.0, far_km]),
+        )
+        left = BodyLayer(moving, canvas).unhidden(light, stars, [face], AT_START)
+        assert left.star.tolist() == shown
+
+
+def test_a_streak_is_listed_in_the_middle_of_its_light():
+    """Three sprites of 1, 2 and 5 parts of the light, along a line that is not an axis."""
+    stars = stars_at(np.eye(3), np.ones(3))
+    places = np.array([[10.0, 4.0], [20.0, 6.0], [40.0, 9.0]])
+    light = replace(sprites_at(places, np.array([1.0, 2.0, 5.0]), FOOTPRINT), star=np.full(3, 2))
+    rows, star = sprite_truth(stars, replace(light, per_star=3), np.empty(0, dtype=np.intp))
+    assert star.tolist() == [2]
+    assert (rows["x_px"][0], rows["y_px"][0]) == pytest.approx((250 / 8, 61 / 8), rel=1e-6)
 
 
 @pytest.mark.parametrize("clipping", [[], [2], [0, 1], [4]])

@@ -60,14 +60,19 @@ def screen(focal_px: float, principal_px: tuple[float, float], turned_rad: float
     )
 
 
-def test_a_place_in_another_camera_is_by_its_focal_length_middle_and_turn():
-    """Twice the focal length: half of the tracker's pixels along each side."""
-    camera = screen(200.0, (20.0, 30.0), np.pi / 2)
+@pytest.mark.parametrize("turned_deg", [0.0, 30.0, 90.0, -140.0])
+def test_a_place_in_another_camera_is_by_its_focal_length_middle_and_turn(turned_deg):
+    """Twice the focal length: half of the tracker's pixels along each side. The camera's x axis
+    lies `turned_deg` from the tracker's, towards y.
+    """
+    turned_rad = np.radians(turned_deg)
+    camera = screen(200.0, (20.0, 30.0), turned_rad)
     x_px, y_px, area = pixels_in(camera, TRACKER)
     y, x = np.mgrid[0:48, 0:64]
-    # a quarter turn takes cam x to image y
-    assert x_px == pytest.approx(19.5 + (y - 30.0) / 2, abs=1e-9)
-    assert y_px == pytest.approx(14.5 - (x - 20.0) / 2, abs=1e-9)
+    cosine, sine = np.cos(turned_rad), np.sin(turned_rad)
+    # what the camera has at an angle, the tracker has less of the turn
+    assert x_px == pytest.approx(19.5 + ((x - 20.0) * cosine + (y - 30.0) * sine) / 2, abs=1e-9)
+    assert y_px == pytest.approx(14.5 + ((y - 30.0) * cosine - (x - 20.0) * sine) / 2, abs=1e-9)
     assert area == pytest.approx(np.full((48, 64), 0.25), abs=1e-9)
 
 

@@ -39,10 +39,17 @@ def dipole_map(path: Path, letter: str, ordering: str, nside: int = 16) -> NDArr
     return np.array(at.icrs.cartesian.xyz)
 
 
-def assert_dipole(faces: tuple[TangentImage, ...], place: NDArray[np.float64]) -> None:
-    """Each pixel within a face's edge has the light of its direction, and all six are there."""
+def assert_dipole(
+    faces: tuple[TangentImage, ...], place: NDArray[np.float64], nside: int = 16
+) -> None:
+    """Each pixel within a face's edge has the light of its direction, and all six are there, as
+    fine as the map at least.
+    """
     assert len(faces) == 6
+    px_rad = np.sqrt(4 * np.pi / (12 * nside**2))
     for face in faces:
+        assert 1 / px_rad <= face.px_per_tangent < 2 / px_rad
+        assert face.max_tangent == 1.0
         side = len(face.image)
         at = (np.arange(side) - (side - 1) / 2) / face.px_per_tangent
         v, u = np.meshgrid(at, at, indexing="ij")

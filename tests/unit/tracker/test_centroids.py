@@ -126,3 +126,20 @@ def test_a_place_without_a_star_has_no_width():
     image[20, 20] = -5.0
     widths_px = star_widths(image, 0.0, np.array([20.0, 5.0]), np.array([20.0, 5.0]))
     assert np.isnan(widths_px).all()
+
+
+@pytest.mark.parametrize("aside_px", [(3, 0), (0, 3), (-3, 0), (0, -3), (3, -3)])
+def test_a_plain_window_that_walks_off_leaves_the_blob_s_own_place(aside_px):
+    """Along one axis or both: from star to brighter star, 3 px apart, a window of 4 px about the
+    first is 6 px off; about the second it ends on the third, which is within its window.
+    """
+    image = np.zeros((SIZE_PX, SIZE_PX))
+    places = np.array([20, 18]) + np.outer(np.arange(3), aside_px)
+    for (x, y), peak in zip(places, (30.0, 900.0, 27000.0), strict=True):
+        image[y, x] = peak
+    settings = CentroidSettings(window="plain", window_radius_px=4)
+    found = find_stars(image, settings, BACKGROUND)
+    order = np.argsort(found.peak)
+    at_px = np.column_stack([found.x_px, found.y_px])[order]
+    assert at_px[0] == pytest.approx(places[0], abs=SAME_PX)
+    assert at_px[1:] == pytest.approx(places[[2, 2]], abs=0.2)

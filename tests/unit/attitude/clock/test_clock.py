@@ -274,3 +274,52 @@ def test_a_jump_of_two_milliseconds_is_taken_for_delay():
     run = ClockRun(lambda host_ns, k: host_ns - jump_ns * (k >= 3000))
     late_ms = np.abs(run.error_ms[1000:]).max()
     holds("small-jump", 3600 * late_ms / 1000)
+
+
+# The sender runs 7 s ahead; the request takes 3 ms, the sender 40 ms, the reply 5 ms.
+THERE_NS, HELD_NS, BACK_NS, AHEAD_NS = 3 * NS_PER_MS, 40 * NS_PER_MS, 5 * NS_PER_MS, 7 * NS_PER_S
+
+
+def exchange_of(there_ns: int = 0, back_ns: int = 0, **changes: int) -> Exchange:
+    """The exchange of these times, of which some are changed by so much."""
+    t1_ns = HOST0_NS
+    t2_ns = t1_ns + THERE_NS + AHEAD_NS
+    t3_ns = t2_ns + HELD_NS
+    times = {"t1_ns": t1_ns, "t2_ns": t2_ns, "t3_ns": t3_ns, "t4_ns": t3_ns - AHEAD_NS + BACK_NS}
+    for name, by_ns in changes.items():
+        times[name] += by_ns
+    return Exchange(**times, there_ns=there_ns, back_ns=back_ns)
+
+
+def test_an_exchange_s_delay_and_offset_leave_out_the_sender_s_own_time():
+    """RFC 5905: delta = (t4 - t1) - (t3 - t2), theta = ((t2 - t1) + (t3 - t4)) / 2, here from the
+    sender to the host.
+    """
+    one = exchange_of()
+    assert one.delay_ns == THERE_NS + BACK_NS
+    assert one.offset_ns(0) == -AHEAD_NS + (BACK_NS - THERE_NS) / 2
+    assert one.offset_ns(-AHEAD_NS) == (BACK_NS - THERE_NS) / 2
+    # the wire's own times are known: what they differ by is no offset
+    assert exchange_of(NS_PER_MS, 3 * NS_PER_MS).offset_ns(0) == -AHEAD_NS
+    # but where both took less than the wire would, it is no wire
+    assert exchange_of(5 * NS_PER_MS, 9 * NS_PER_MS).offset_ns(0) == one.offset_ns(0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "is_possible"),
+    [
+        ({}, True),
+        ({"t3_ns": -HELD_NS}, True),
+        ({"t3_ns": -HELD_NS - 1, "t4_ns": -HELD_NS}, False),
+        ({"t4_ns": -THERE_NS - BACK_NS}, True),
+        ({"t4_ns": -THERE_NS - BACK_NS - 1}, False),
+    ],
+)
+def test_a_reply_leaves_after_its_request_came_and_arrives_after_it_left(changes, is_possible):
+    assert exchange_of(**changes).possible is is_possible
+    clock = SenderClock()
+    for _ in range(MIN_EXCHANGES):
+        clock.exchange(exchange_of(**changes))
+    summary = clock.summary()
+    assert (summary.mode == "exchange") is is_possible
+    assert summary.exchanges == MIN_EXCHANGES * is_possible

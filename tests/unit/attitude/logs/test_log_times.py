@@ -169,3 +169,23 @@ def test_a_csv_with_t_ns_is_read_in_ns_and_says_so(tmp_path):
 def test_a_unit_that_no_rates_are_written_in_is_named_alone(tmp_path):
     said, _ = notices(log_in_units(tmp_path, "csv", 60.0, 0.1, rates=True))
     assert said.startswith("the rates do not fit the times: probably the times are in minutes;")
+
+
+@pytest.mark.parametrize(
+    ("kind", "unit_s", "scale", "words"),
+    [
+        ("csv", 1.0, 1e3, "the rates are in mrad/s"),
+        ("csv", 1.0, 1e-3, ""),
+        ("jsonl", 1e-9, 1e-3, "the times are in us, or the rates are in rad/ms"),
+        ("jsonl", 1e-9, 1e3, ""),
+    ],
+)
+def test_rates_of_another_unit_are_named_in_each_format_s_unit(
+    tmp_path, kind, unit_s, scale, words
+):
+    """A step of 5 ms: of times in us it would be 5 s, which a log may have, too."""
+    said, _ = notices(log_in_units(tmp_path, kind, unit_s, 0.005, rates=True, scale=scale))
+    if words:
+        assert f"probably {words};" in said
+    else:
+        assert "rates are in" not in said

@@ -302,6 +302,22 @@ def test_steps_run_once_and_again_when_asked_or_when_what_they_depend_on_changes
     assert counted.runs == ["first", "second"]
 
 
+def test_a_step_runs_again_where_a_key_that_it_set_is_changed_by_hand(counted, tmp_path):
+    """And no step before it: to them a later step's keys are nothing."""
+    counted.go(tmp_path)
+    file = tmp_path / "bench.toml"
+    text = file.read_text()
+    assert "flip_x = true" in text
+    file.write_text(text.replace("flip_x = true", "flip_x = false"))
+    counted.go(tmp_path)
+    # `second` depends on the whole of [monitor], and on what `first` set there
+    assert counted.runs == ["first"]
+    assert file.read_text() == text
+    file.write_text(text.replace("flip_x = true", "flip_x = true\nflip_y = true"))
+    counted.go(tmp_path)
+    assert counted.runs == ["first", "second"]
+
+
 def test_a_session_knows_the_beat_by_what_it_has_seen_of_the_display(counted, tmp_path):
     tables = {
         "tracker": {"exposure_s": 0.04},

@@ -5,21 +5,31 @@ measures, writes and sets in the bench file is what was planted.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hilstar.display.calibration import load_calibration, read_toml, with_uniformity
 from hilstar.display.response import srgb_response
-from hilstar.instruments.calibrate.first_light.context import StepOutcome, with_changes
-from hilstar.instruments.calibrate.first_light.focus import focus
-from hilstar.instruments.calibrate.first_light.geometry import orientation
+from hilstar.instruments.calibrate.first_light.context import StepOutcome, rewrite, with_changes
+from hilstar.instruments.calibrate.first_light.focus import first_dots, focus
+from hilstar.instruments.calibrate.first_light.geometry import geometry, orientation
+from hilstar.instruments.calibrate.first_light.image_sources import DiodeRecording
 from hilstar.instruments.calibrate.first_light.photometer import Assumed, Photometer, Readings
 from hilstar.instruments.calibrate.first_light.photometry import photometry
+from hilstar.instruments.calibrate.first_light.session import display, latency
 from hilstar.instruments.calibrate.first_light.stars import scale, verify
 from hilstar.instruments.calibrate.first_light.uniformity import uniformity, warm_up
+from hilstar.instruments.calibrate.geometric.dots import write_plan
+from hilstar.instruments.calibrate.grabbed_dots import grab_dots
+from hilstar.instruments.calibrate.latency import edges_of
 from hilstar.instruments.calibrate.measurements import read_measurements
 from hilstar.instruments.calibrate.plan import Patch
+from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.cameras import bench_camera
+from hilstar.server.screen.screen import marker_light
 from hilstar.tracker.rounding import rounding_rms
 from tests.support.closed_camera import (
     AXIS_PX,
@@ -39,10 +49,12 @@ from tests.support.closed_camera import (
     closed_context,
     power_of,
 )
+from tests.support.refusals import refusal
 
 pytestmark = pytest.mark.usefixtures("without_charts")
 SURE = 4.0  # sigmas: one figure in 16 000 is further off
 MAG_A_RELATIVE = 2.5 / math.log(10)
+ARCSEC_PER_RAD = 206264.806
 WHITE = 2**BITS - 1
 BLACK = 1e-3
 # light of white at which the bench file's exposure is too long for one pixel
@@ -404,8 +416,6 @@ def test_stars_say_what_white_is_worth(tmp_path, share):
     rows = np.loadtxt(tmp_path / "readings.csv", delimiter=",", skiprows=1)
     assert len(rows) == figures["stars"]
     # the same stars by their catalogue's light, each in the noise that its row states
-    from hilstar.server.bench.build import open_bench
-
     with open_bench(context.file) as bench:
         place = {hip: k for k, hip in enumerate(bench.stars.hip.tolist())}
         rates = bench.stars.electrons_per_s[[place[hip] for hip in rows[:, 0].astype(int)]]
@@ -421,7 +431,7 @@ def test_stars_that_stand_where_the_sky_has_them_pass_and_dim_ones_do_not(tmp_pa
     assert passed.verdict == "done", passed.line
     assert passed.figures["lost"] == 0
     assert passed.figures["star_rms_px"] < 2 * passed.figures["star_noise_px"]
-    arcsec_a_px = 13 / 10e3 * 206264.806
+    arcsec_a_px = 13 / 10e3 * ARCSEC_PER_RAD
     assert passed.number.value == pytest.approx(passed.figures["star_rms_px"] * arcsec_a_px)
     assert passed.number.error == pytest.approx(
         passed.number.value / math.sqrt(4 * passed.figures["stars"])
@@ -452,3 +462,156 @@ def test_the_detector_of_the_closed_camera_is_as_its_bench_file_says(tmp_path):
     assert dark.mean() == pytest.approx(OFFSET_DN, abs=0.1)
     assert dark.std() == pytest.approx(math.hypot(1.5, 1 / math.sqrt(12)), rel=0.05)
     assert context.detector.electronics_e == pytest.approx(1.5 * GAIN_E_PER_DN, rel=0.05)
+
+
+def test_the_geometry_is_where_the_camera_has_the_screen(tmp_path):
+    """The bench file has the lens's axis a pixel and more beside, and its focal length 0.75 % too
+    long; dots say where each pixel of the screen is seen.
+    """
+    camera = ClosedCamera(srgb_response(BITS).light, 25_000.0, saves=True)
+    filed = {"collimator": {"principal_point_px": [51.2, 54.0], "focal_length_mm": 40.3}}
+    context = closed_context(tmp_path, camera, filed, known={"focus.dot_code": 1000})
+    outcome = geometry(context)
+    assert outcome.verdict == "done", outcome.line
+    (change,) = outcome.changes
+    assert (change.table, change.key, change.after) == ("collimator", "geometry", "geometry.toml")
+    file = rewrite(context.file, outcome.changes)
+    found = bench_camera(file.config, file.folder)
+    x, y = np.meshgrid(np.linspace(2, 98, 9), np.linspace(22, 92, 7))
+    rays = found.rays(x.ravel(), y.ravel())
+    tangents = (rays[:, :2] / rays[:, 2:]).T
+    focal_px = 40e3 / 57.65
+    true = np.stack([x.ravel() - SCREEN_AXIS_PX[0], y.ravel() - SCREEN_AXIS_PX[1]]) / focal_px
+    off_arcsec = np.hypot(*(tangents - true)) * ARCSEC_PER_RAD
+    figures = outcome.figures
+    # a pixel of the screen has 297 arcsec
+    assert np.sqrt((off_arcsec**2).mean()) < 2 * figures["error_rms_arcsec"] < 3.0
+    assert off_arcsec.max() < 3.0
+    # of 0.005 px of noise in a centroid, the error of one that was held out
+    noise_arcsec = figures["noise_px"] * 13 / 10e3 * ARCSEC_PER_RAD
+    assert 0.5 * noise_arcsec < figures["held_out_rms_arcsec"] < 3 * noise_arcsec
+    assert figures["centroids_lost"] == figures["centroids_false"] == 0
+    assert 0.8 * figures["dots_planned"] < figures["dots_recognised"] <= figures["dots_planned"]
+    assert (tmp_path / "images" / "plan.csv") in outcome.files
+    frames = [name for name, _ in camera.taken if name.startswith("frame_")]
+    assert frames == [f"frame_{number:03}" for number in range(8 + 16)]
+
+
+@dataclass
+class Watched(ClosedCamera):
+    """A camera beside a photodiode, whose square lights so long after its swap."""
+
+    delay_ms: float = 0.0
+
+    def diode(self, file, seconds):
+        """300 swaps at the file's rate; the square changes every third frame."""
+        rng = np.random.default_rng(7)
+        period_ns = 1e9 / file.config.monitor.refresh_hz
+        level = np.array([marker_light(frame, "code") for frame in range(300)])
+        swap_ns = 10**9 + np.round(np.arange(300) * period_ns).astype(np.int64)
+        shown = edges_of(swap_ns, level)
+        late_ns = np.round(1e6 * (self.delay_ms + rng.normal(0, 0.1, len(level))))
+        seen = edges_of(swap_ns + late_ns.astype(np.int64), level)
+        return DiodeRecording(shown, seen)
+
+
+@pytest.mark.parametrize(("filed_ms", "is_changed"), [(2.0, True), (6.5, False)])
+def test_a_panel_s_delay_is_what_the_scan_out_leaves_of_the_diode_s(tmp_path, filed_ms, is_changed):
+    """The square of 24 px stands at the foot of 120 columns of a screen on its side, whose scan
+    takes 10 ms: its middle lights 9 ms after the first.
+    """
+    monitor = {
+        "resolution_px": [120, 96],
+        "rotate_deg": 90,
+        "photodiode_px": 24,
+        "refresh_hz": 60.0,
+        "scanout_ms": 10.0,
+        "panel_delay_ms": filed_ms,
+    }
+    context = closed_context(tmp_path, Watched(delay_ms=15.5), {"monitor": monitor})
+    outcome = latency(context)
+    assert outcome.verdict == "done", outcome.line
+    figures = outcome.figures
+    assert figures["swap_to_square_ms"] == pytest.approx(9.0)
+    error_ms = figures["error_ms"]
+    # of a median of 0.1 ms over so many edges
+    assert error_ms == pytest.approx(1.2533 * 0.1 / math.sqrt(figures["edges"]), rel=0.3)
+    assert figures["panel_delay_ms"] == pytest.approx(6.5, abs=SURE * error_ms)
+    assert figures["swap_to_light_p50_ms"] == pytest.approx(15.5, abs=SURE * error_ms)
+    assert figures["jitter_ms"] == pytest.approx(0.1, rel=0.2)
+    assert figures["rise_ms"] == pytest.approx(15.5, abs=0.1)
+    assert figures["edges_without_a_frame"] == 0
+    changes = {(change.table, change.key): change.after for change in outcome.changes}
+    if is_changed:
+        assert changes == {
+            ("monitor", "panel_delay_ms"): figures["panel_delay_ms"],
+            ("certify", "panel_delay_u_ms"): pytest.approx(error_ms, rel=0.01),
+        }
+    else:
+        assert changes == {}
+    early = closed_context(tmp_path, Watched(delay_ms=7.0), {"monitor": monitor})
+    assert "before the scan-out could reach it" in refusal(latency, early)
+    bare = closed_context(tmp_path, ClosedCamera(), {"monitor": monitor})
+    assert latency(bare).verdict == "skipped"
+    none = closed_context(tmp_path, Watched(), {"monitor": monitor | {"photodiode_px": 0}})
+    assert "photodiode_px is 0" in latency(none).line
+
+
+@pytest.mark.parametrize("is_paced", [True, False])
+def test_a_display_is_timed_by_its_own_frames(tmp_path, is_paced):
+    camera = ClosedCamera()
+    timing = SimpleNamespace(
+        period_ms=12.5,
+        period_error_ms=0.003,
+        dropped=2,
+        paced_by_screen=is_paced,
+        modes_hz=[60, 80],
+    )
+    camera.gate = lambda file: timing
+    camera.forced = ["another rate"]
+    outcome = display(closed_context(tmp_path, camera))
+    assert outcome.line.startswith("a frame every 12.500 ms, 2 dropped")
+    assert outcome.line.endswith("; forced: another rate")
+    assert ("paced by software" in outcome.line) == (not is_paced)
+    rate = {"refresh_hz": 80.0} if is_paced else {}
+    assert outcome.figures == {"period_ms": 12.5, "dropped": 2, "modes_hz": "60 80"} | rate
+    assert (outcome.number.value, outcome.number.error) == (12.5, 0.003)
+    blind = display(closed_context(tmp_path, ClosedCamera()))
+    assert (blind.verdict, blind.line) == (
+        "skipped",
+        "no display of this program's own (closed camera)",
+    )
+
+
+def test_dots_are_grabbed_in_the_brightest_code_that_does_not_saturate(tmp_path):
+    camera = ClosedCamera(power_of(2.2), 100_000.0, saves=True)
+    context = closed_context(tmp_path, camera)
+    plan = first_dots(context.seen_screen)
+    (tmp_path / "dots").mkdir()
+    write_plan(tmp_path / "dots" / "plan.csv", plan)
+    told: list[str] = []
+    found = grab_dots(
+        context.file, camera, tmp_path / "dots", None, overwrite=False, tell=told.append
+    )
+    names = [path.stem for path in found.images]
+    assert names == [f"frame_{number:03}" for number in range(plan.frames)]
+    assert found.dark.stem == "dark"
+    assert {exposure_s for _, exposure_s in camera.taken} == {EXPOSURE_S}
+    peaks = [float(camera.images[path].max()) for path in found.images]
+    # about a quarter of the light less each time, until the first frame's dots fill 0.6 at most
+    assert 0.1 * FULL_DN < peaks[0] < 0.6 * FULL_DN
+    saturated = [line for line in told if "saturate the tracker" in line]
+    assert len(saturated) == len(camera.taken) - plan.frames - 1 > 0
+    assert told[-1] == f"frame_{plan.frames - 1:03}: image {plan.frames} of {plan.frames}"
+    again = (context.file, camera, tmp_path / "dots", None)
+    assert "has images" in refusal(grab_dots, *again, overwrite=False, tell=told.append)
+    longer = grab_dots(
+        context.file, camera, tmp_path / "dots", 0.02, overwrite=True, tell=told.append
+    )
+    assert camera.taken[-1][1] == 0.02
+    assert len(longer.images) == plan.frames
+    camera.sets_exposure = False
+    words = refusal(
+        grab_dots, context.file, camera, tmp_path / "dots", 0.02, overwrite=True, tell=told.append
+    )
+    assert "--exposure" in words

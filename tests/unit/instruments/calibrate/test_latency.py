@@ -6,10 +6,23 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.calibrate import latency
-from hilstar.instruments.calibrate.latency import Edges, Paired, pair, summarise
+from hilstar.instruments.calibrate.latency import (
+    Edges,
+    Paired,
+    edges_of,
+    latency_lines,
+    nearest_of,
+    pair,
+    read_edges,
+    save_edges,
+    summarise,
+    swap_to_square_ms,
+    write_panel_delay,
+)
 from hilstar.server.bench.config import parse_config
 from hilstar.server.screen.screen import marker_light
-from tests.support.benches import SMALL_BENCH
+from tests.support.benches import SMALL_BENCH, bench_text
+from tests.support.refusals import refusal
 
 PERIOD_NS = 1e9 / 60
 
@@ -63,3 +76,104 @@ def test_a_device_s_own_times_are_microseconds_of_a_clock_of_its_own(monkeypatch
     edges = latency.capture_edges("/dev/none", 115200, 2.0)
     np.testing.assert_allclose(edges.host_ns - true_ns, 1_000_000, atol=100_000)
     assert edges.level.tolist() == [0, 1] * 20
+
+
+EDGES = Edges(np.arange(30) * 40_000_000 + 7, np.arange(30) % 2)
+
+
+def test_edges_are_read_as_they_are_written(tmp_path):
+    save_edges(tmp_path / "edges.csv", EDGES)
+    found = read_edges(tmp_path / "edges.csv")
+    assert found.host_ns.tolist() == EDGES.host_ns.tolist()
+    assert found.level.tolist() == EDGES.level.tolist()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda text: "\n".join(text.splitlines()[:20]), "at least 20 edges are needed"),
+        (lambda text: text.replace(",1", ",2"), "each of level 0 or 1"),
+        (lambda text: text.replace("7,0", "7.5,0"), "not a file of edges"),
+        (lambda text: text + f"{2**63},1\n", "not a file of edges"),
+    ],
+)
+def test_a_file_of_other_edges_is_refused(tmp_path, change, words):
+    path = tmp_path / "edges.csv"
+    save_edges(path, EDGES)
+    path.write_text(change(path.read_text()))
+    assert words in refusal(read_edges, path)
+
+
+def test_the_changes_of_a_square_are_the_swaps_at_which_its_level_differs():
+    swap_ns = np.array([10, 20, 30, 40, 50])
+    shown = edges_of(swap_ns, np.array([1, 1, 0, 0, 1]))
+    assert (shown.host_ns.tolist(), shown.level.tolist()) == ([30, 50], [0, 1])
+
+
+def test_a_moment_is_matched_with_the_nearest_on_either_side():
+    moments = np.array([100, 200, 400])
+    wanted = np.array([-5.0, 149.0, 151.0, 299.0, 301.0, 900.0])
+    assert nearest_of(moments, wanted).tolist() == [100, 100, 200, 200, 400, 400]
+
+
+def test_a_square_that_toggles_is_ambiguous_by_pairs_of_frames(rng):
+    """And edges of another run are none of this one's."""
+    swap_ns = np.round(np.arange(200) * PERIOD_NS).astype(np.int64)
+    shown = Edges(swap_ns, np.arange(200) % 2)
+    seen = Edges(swap_ns + 21_000_000, shown.level)
+    paired = pair(seen, shown, PERIOD_NS)
+    assert paired.ambiguous
+    latency_ms = paired.latency_ns / 1e6
+    # the shortest: 21 ms by whole pairs of 33.3 ms less
+    assert np.ptp(latency_ms) < 1e-6
+    assert (latency_ms[0] - 21) % (2e-6 * PERIOD_NS) == pytest.approx(0, abs=1e-6)
+    later = Edges(seen.host_ns + 10**12, seen.level)
+    assert "of 0 edges fit" in refusal(pair, later, shown, PERIOD_NS)
+    chance = Edges(np.sort(rng.integers(0, swap_ns[-1], 200)), rng.integers(0, 2, 200))
+    assert "during the run" in refusal(pair, chance, shown, PERIOD_NS / 20)
+
+
+@pytest.mark.parametrize(
+    ("rotate_deg", "share"), [(0, 1 - 12 / 240), (180, 1 - 12 / 240), (90, 1 - 12 / 320)]
+)
+def test_a_square_s_middle_is_half_its_side_above_the_foot(tmp_path, rotate_deg, share):
+    """Of a screen of 320 x 240 px, whose scan of 8 ms runs along the image's width where it stands
+    on its side.
+    """
+    monitor = {"photodiode_px": 24, "scanout_ms": 8.0, "rotate_deg": rotate_deg}
+    config = parse_config(tmp_path / "bench.toml", bench_text({"monitor": monitor}))
+    assert swap_to_square_ms(config.monitor) == pytest.approx(8.0 * share)
+
+
+def test_a_measured_delay_is_written_with_its_error_and_the_rest_stays(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH + "# a word\n")
+    write_panel_delay(path, 6.12345, 0.012345)
+    config = parse_config(path, path.read_text())
+    assert config.monitor.panel_delay_ms == 6.123
+    assert config.certify.panel_delay_u_ms == 0.0123
+    assert "# a word" in path.read_text()
+    before = path.read_text()
+    assert "2.50 ms before the scan-out" in refusal(write_panel_delay, path, -2.5, 0.1)
+    assert path.read_text() == before
+
+
+def test_the_lines_have_the_figures(tmp_path):
+    config = parse_config(tmp_path / "bench.toml", SMALL_BENCH)
+    level = np.array([1, 0, 1, 0, 1])
+    paired = Paired(np.where(level, 20e6, 23e6), level, unmatched=4, ambiguous=True)
+    lines = latency_lines(summarise(paired, config))
+    text = {line[:24].strip(): line[24:] for line in lines}
+    assert text["edges"] == "5 paired, 4 without a frame"
+    assert text["swap to light"] == "20.00 / 20.00 / 23.00 ms (p1 / p50 / p99)"
+    assert text["rise, fall"] == "20.00, 23.00 ms (medians)"
+    # three at 20 ms and two at 23
+    jitter_ms = 3 * np.sqrt(0.6 * 0.4)
+    assert text["jitter"] == f"{jitter_ms:.3f} ms (standard deviation)"
+    error_ms = 1.2533 * jitter_ms / np.sqrt(5)
+    assert text["panel_delay_ms"] == f"{20 - 1e3 / 60:.3f} +- {error_ms:.3f}"
+    assert "whole pairs of frames" in text["note"]
+    rises = Paired(np.full(5, 20e6), np.ones(5, dtype=int), 0, ambiguous=False)
+    text = {line[:24].strip(): line[24:] for line in latency_lines(summarise(rises, config))}
+    assert text["rise, fall"] == "20.00, - ms (medians)"
+    assert "note" not in text

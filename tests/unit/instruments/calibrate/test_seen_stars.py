@@ -4,21 +4,30 @@ noise, scatter and areas, each against a closed form or planted noise.
 
 from __future__ import annotations
 
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import erf, ndtr
 
 from hilstar.display.geometry import monitor_camera
+from hilstar.display.panel import Panel
+from hilstar.display.response import Levels, table_response
 from hilstar.instruments.calibrate.first_light.photometer import PixelScatter, Range, monitor_area
 from hilstar.instruments.calibrate.first_light.seen_stars import (
     Beyond,
     Scatter,
     StarSpot,
     StarsSeen,
+    _codes_mag,
+    _fields,
 )
 from hilstar.instruments.calibrate.first_light.stars import frames_for, place_reasons
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from tests.support.closed_camera import AXIS_PX, DETECTOR_PX, ClosedCamera, closed_context
 
 WIDE = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=0.0, electronics_dn=0.0)
 MAG_A_RELATIVE = 2.5 / np.log(10)
@@ -180,3 +189,86 @@ def test_a_part_of_an_image_sees_its_area_of_the_screen():
     whole = monitor_area(narrow, rows, slice(0, 400))
     # 60 columns of the screen, to a pixel of the tracker at each side
     assert whole == pytest.approx(60 * 20 * 2000 / 3000, abs=2 * 20 * pixel_px2)
+
+
+def test_codes_are_summed_over_the_tracker_s_window_on_the_monitor():
+    """Two pixels of the monitor to one of the tracker's, and a window of 9: 19 pixels. The light
+    asked for is even, and what is shown stands in the outermost ring of those alone.
+    """
+    spot = StarSpot((0.7, 0.9), 4.0, 0.0, 0.0)
+    assert spot.radius_px == 4
+    levels = np.zeros((60, 80), dtype=np.uint16)
+    x, y = 50, 25
+    levels[y - 9 : y + 10, x - 9 : x + 10] = 3
+    levels[y - 8 : y + 9, x - 8 : x + 9] = 0
+    cameras = [SimpleNamespace(focal_length_px=f) for f in (1600.0, 800.0)]
+    geometry = SimpleNamespace(monitor=cameras[0], tracker=cameras[1])
+    context = SimpleNamespace(geometry=lambda: geometry)
+    bench = SimpleNamespace(panel=Panel(table_response(2, np.array([0.0, 0.1, 0.4, 1.0])), 7.0))
+    frame = SimpleNamespace(linear=np.ones((60, 80), dtype=np.float32))
+    places = np.array([[50.2, 24.9], [10.0, 50.0]])
+    both = (Levels(levels), Levels(np.zeros_like(levels)))
+    (off_mag, dark_mag) = _codes_mag(bench, context, frame, both, places, spot)
+    ring = 19**2 - 17**2
+    # in one of two frames, of white's 7 electrons per second
+    assert off_mag == pytest.approx(-2.5 * np.log10(7.0 * ring / 2 / 19**2))
+    assert dark_mag == 0.0  # such a star is not shown
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_as_many_frames_are_asked_for_as_bring_the_doubt_to_the_limit(frames):
+    """The doubt of a scatter's square shrinks with the number of frames."""
+    p95_of_two = 2.4477
+    for sigma_px, high_px in ((0.02, 0.09), (0.0, 0.3), (0.038, 0.06)):
+        beyond = SimpleNamespace(sigma=sigma_px, low=0.0, high=high_px)
+        limit_px = 0.1
+        limit = limit_px / p95_of_two
+        room = max(limit**2 - sigma_px**2, limit**2 / 4)
+        wanted = math.ceil(frames * (high_px**2 - sigma_px**2) / room)
+        asked = frames_for(SimpleNamespace(beyond_px=beyond, frames=frames), limit_px)
+        assert asked == max(wanted, frames + 1)
+    sure = SimpleNamespace(sigma=0.01, low=0.0, high=0.04)
+    assert frames_for(SimpleNamespace(beyond_px=sure, frames=frames), 0.1) == frames
+
+
+def test_fields_have_the_most_stars_that_both_tracker_and_screen_have(tmp_path, rng):
+    """Of a screen that covers a fifth of the tracker's field; all stars are alike."""
+    screen = {
+        "monitor": {"resolution_px": [64, 60]},
+        "collimator": {"principal_point_px": [30.0, 32.0]},
+    }
+    context = closed_context(tmp_path, ClosedCamera(), screen)
+    vectors = rng.normal(size=(9000, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    stars = SimpleNamespace(
+        electrons_per_s=np.full(9000, 20_000.0),
+        row=np.arange(9000),
+        directions=lambda chosen: vectors[chosen],
+    )
+    bench = SimpleNamespace(
+        stars=stars,
+        psf=SimpleNamespace(peak_share=0.3),
+        flux_at_white_e_per_s=1e6,
+        camera=context.real_geometry().monitor,
+    )
+    spot = StarSpot((0.9, 0.9), 4.0, 0.0, 0.0)
+    fields = _fields(bench, context, spot, noise_dn=2.0)
+    assert len(fields) >= 3
+    counts = []
+    for q in fields:
+        x, y, z = Rotation.from_quat(q, scalar_first=True).as_matrix() @ vectors.T
+        ahead = z > 0
+        right, down = x[ahead] / z[ahead], y[ahead] / z[ahead]
+        inside = np.ones(len(right), dtype=bool)
+        for axis_px, focal_px, size_px, margin_px in (
+            (AXIS_PX, 10e3 / 13, DETECTOR_PX, spot.radius_px + 12),
+            ((30.0, 32.0), 40e3 / 57.65, (64, 60), 12),
+        ):
+            column = axis_px[0] + focal_px * right
+            row = axis_px[1] + focal_px * down
+            inside &= (column > margin_px) & (column < size_px[0] - margin_px)
+            inside &= (row > margin_px) & (row < size_px[1] - margin_px)
+        counts.append(int(inside.sum()))
+    assert counts == sorted(counts, reverse=True)
+    # the screen has 3.3 x 3.0 degrees without its margins: 2 stars on average
+    assert counts[0] >= 4

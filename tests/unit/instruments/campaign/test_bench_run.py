@@ -4,10 +4,13 @@ whose an answer is, and what a tracker that falls silent is waited for.
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import math
 from pathlib import Path
 from types import SimpleNamespace
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -19,7 +22,7 @@ from hilstar.instruments.campaign.bench_run import NO_ANSWER, BenchOrder, BenchR
 from hilstar.instruments.campaign.cases import CaseMaker, bench_columns
 from hilstar.instruments.campaign.plan import Design, parse_plan
 from hilstar.instruments.campaign.store import Directory
-from hilstar.server.answers.answer import Answer
+from hilstar.server.answers.answer import Answer, ReportedStar
 from hilstar.server.answers.judge import AnswerJudge, AnswerRules
 from hilstar.server.answers.pairing import LitFrames
 from hilstar.server.bench.bench_file import read_bench_file
@@ -207,3 +210,98 @@ def test_an_answer_of_the_case_before_is_late_and_counts_for_neither(cases):
     first, second = cases.rows()
     assert (first["late"], second["late"]) == (0, 1)
     assert (second["received"], second["wrong"]) == (1, 0)
+
+
+def lit_at(cases, swap_ns: int, predicted: bool, **on_screen) -> Shown:
+    """A frame of the case on the display as a screen shows it, or as a headless run does."""
+    attitude = Attitude(cases.shown, 0, False, rate_cam_rad_s=np.array([0.1, -0.2, 0.3]))
+    drawn = SimpleNamespace(rate_cam_rad_s=None)
+    keys = {"predicted_swap_ns": swap_ns, "swap_ns": swap_ns} if predicted else {}
+    return Shown(
+        cases.number, 0, attitude, drawn, light_ns=cases.now_ns, fades=True, **keys, **on_screen
+    )
+
+
+@pytest.mark.parametrize("predicted", [True, False])
+def test_a_case_begins_with_the_light_of_its_first_frame_on_a_screen_after_its_swap(
+    cases, predicted
+):
+    cases.run._light_ns = 7_000_000
+    cases.begin(1)
+    swap_ns = START_NS + 50_000_000
+    cases.now_ns = swap_ns
+    cases.run._lit(lit_at(cases, swap_ns, predicted))
+    now = cases.run._now
+    assert now.begun_ns == swap_ns + 7_000_000 * predicted
+    told = json.loads((cases.directory.path / "now.json").read_text())
+    assert told["light_ns"] == now.begun_ns
+    assert (told["case"], told["order"]) == (1, 1)
+    assert told["q_icrs_to_cam"] == cases.shown.tolist()
+    assert told["rate_cam_rad_s"] == [0.1, -0.2, 0.3]
+    assert told["begun_utc"] == now.begun_utc
+    # the next frame begins nothing
+    cases.number += 1
+    cases.run._lit(lit_at(cases, swap_ns + FRAME_NS, predicted))
+    assert now.begun_ns == swap_ns + 7_000_000 * predicted
+
+
+def test_a_frame_that_an_operator_changed_begins_no_case(cases):
+    cases.begin(0)
+    on_screen = SimpleNamespace(operator=True, hidden=False)
+    cases.run._lit(lit_at(cases, START_NS, True, on_screen=on_screen))
+    assert cases.run._now.begun_ns is None
+    on_screen = SimpleNamespace(operator=False, hidden=True)
+    cases.run._lit(lit_at(cases, START_NS, True, on_screen=on_screen))
+    assert cases.run._now.begun_ns is None
+
+
+def test_a_row_has_what_was_counted_of_its_case(cases):
+    """A wrong answer, then a right one: of the first is the row's attitude, of the second its
+    error.
+    """
+    cases.run._plan = msgspec.structs.replace(cases.run._plan, answers=2)
+    cases.run._file_sha256 = "abc"
+    cases.begin(2)
+    cases.pass_s(0.3)
+    cases.answer(cases.shown, off_arcsec=3600.0 * 20)
+    cases.pass_s(0.2)
+    right = cases.shown
+    cases.answer(right, off_arcsec=-30.0)
+    cases.pass_s(0.02)
+    (row,) = cases.rows()
+    assert (row["case"], row["order"], row["run"], row["bench_sha256"]) == (2, 2, 1, "abc")
+    assert (row["received"], row["solved"], row["wrong"], row["late"]) == (2, 2, 1, 0)
+    assert row["frames"] == 2
+    assert row["wrong_deg"] == pytest.approx(20.0, abs=1e-6)
+    assert row["error_x_arcsec"] == pytest.approx(-30.0, abs=1e-6)
+    assert row["first_attitude_s"] == pytest.approx(0.49, abs=0.011)
+    assert row["stars"] == 7.0
+    assert [row[f"lit_q{axis}"] for axis in "wxyz"] == pytest.approx(right.tolist())
+    turn = from_rotation_vector(np.array([np.radians(20.0), 0.0, 0.0]))
+    first = [row[f"solved_q{axis}"] for axis in "wxyz"]
+    assert first == pytest.approx(multiply(turn, right).tolist())
+    assert row["begun_utc"].endswith("Z")
+
+
+def test_a_signal_is_the_light_of_the_brightest_five_stars_and_black_ones_are_none(cases):
+    stars = [ReportedStar(1.0, 2.0, dn) for dn in (5.0, 100.0, 20.0, None, 0.0, 40.0, 10.0, 30.0)]
+    cases.begin(0)
+    cases.pass_s(0.3)
+    cases.answer(cases.shown)
+    cases.tracker.answers[0] = dataclasses.replace(cases.tracker.answers[0], centroids=stars)
+    cases.pass_s(0.02)
+    (row,) = cases.rows()
+    assert row["signal_mag"] == pytest.approx(-2.5 * math.log10(100 + 40 + 30 + 20 + 10))
+
+
+def test_a_display_is_dark_between_cases_and_a_run_that_goes_on_is_the_next(cases):
+    cases.begin(0)
+    cases.pass_s(0.3)
+    cases.answer(cases.shown)
+    cases.pass_s(0.01)
+    assert cases.run._now is None
+    blank_ns = round(cases.run._plan.blank_s * NS_PER_S)
+    assert cases.run._dark_until_ns == cases.now_ns + blank_ns
+    assert cases.run._view(cases.now_ns) is None
+    runs = (cases.directory.path / "runs.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in runs] == ["run", "1"]

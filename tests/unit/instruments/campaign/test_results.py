@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.instruments.assess.budget import Axes
+from hilstar.instruments.campaign import results
 from hilstar.instruments.campaign.case_table import Columns, read_cases
 from hilstar.instruments.campaign.results import costs, write_results
 from hilstar.instruments.campaign.store import schema_of, write_table
@@ -127,3 +131,157 @@ def test_a_large_table_is_read_in_part(tmp_path: Path) -> None:
     )
     part = read_cases(tmp_path / "t.parquet", 10)
     assert part.cases == 100 and len(part.numbers["case"]) == 10
+
+
+def columns_of(**numbers: list[float]) -> Columns:
+    """Cases with these columns of numbers."""
+    columns = {name: np.array(values, dtype=float) for name, values in numbers.items()}
+    return Columns(len(next(iter(columns.values()))), columns, {})
+
+
+def vectors_of(form: str, names: str, rows: np.ndarray) -> dict[str, list[float]]:
+    """Columns by the parts of rows (n, k)."""
+    columns = {}
+    for name, column in zip(names, rows.T.tolist(), strict=True):
+        columns[form.format(name)] = column
+    return columns
+
+
+def test_a_centroider_s_figures_are_weighed_by_its_stars() -> None:
+    """Cases of 3 and 9 stars with an error of 0.1 and 0.5 px: their mean is 0.4, the spread about
+    it that within the cases and that between them. One star alone tells no spread.
+    """
+    numbers = columns_of(
+        measured=[3, 9, 1],
+        centroid_dx_px=[0.1, 0.5, 99.0],
+        centroid_dy_px=[-0.2, -0.2, 99.0],
+        centroid_sigma_x_px=[0.3, 0.3, 99.0],
+        centroid_sigma_y_px=[0.1, 0.2, 99.0],
+        matched=[3, 8, math.nan],
+        stars=[5, 10, 5],
+        false=[1, 2, 0],
+        frames=[2, 2, 2],
+    )
+    found = results._centroids(numbers)
+    between = 0.25 * 0.1**2 + 0.75 * 0.5**2 - 0.4**2
+    assert found == pytest.approx(
+        {
+            "bias_x_px": 0.4,
+            "bias_y_px": -0.2,
+            "sigma_x_px": math.sqrt(0.3**2 + between),
+            "sigma_y_px": math.sqrt(0.25 * 0.1**2 + 0.75 * 0.2**2),
+            "found_share": 11 / 20,
+            "false_a_frame": 3 / 6,
+        }
+    )
+    assert results._centroids(columns_of(measured=[1.0])) is None
+    assert results._centroids(columns_of(frames=[1.0])) is None
+
+
+def test_an_answer_is_its_error_on_what_was_lit_where_that_is_known() -> None:
+    """A case that was lit a degree from where it was commanded, and one of which that is not
+    known.
+    """
+    commanded = np.array([from_radec_roll_deg(10.0, 20.0, 30.0)] * 3)
+    lit = commanded.copy()
+    lit[0] = from_radec_roll_deg(11.0, 20.0, 30.0)
+    lit[1] = np.nan
+    solved = np.full((3, 4), np.nan)
+    solved[2] = from_radec_roll_deg(40.0, 0.0, 0.0)
+    error_arcsec = np.array([[30.0, -20.0, 100.0], [1.0, 2.0, 3.0], [np.nan, 1.0, 1.0]])
+    columns = vectors_of("q{}", "wxyz", commanded) | vectors_of("solved_q{}", "wxyz", solved)
+    columns |= vectors_of("lit_q{}", "wxyz", lit)
+    columns |= vectors_of("error_{}_arcsec", "xyz", error_arcsec)
+    at, reported = results.attitudes_of(columns_of(**columns))
+    assert at[0] == pytest.approx(lit[0])
+    assert at[1] == pytest.approx(commanded[1])
+    for k in range(2):
+        off = (
+            Rotation.from_quat(np.roll(reported[k], -1))
+            * Rotation.from_quat(np.roll(at[k], -1)).inv()
+        )
+        assert off.as_rotvec(degrees=True) * 3600 == pytest.approx(error_arcsec[k])
+    assert reported[2] == pytest.approx(solved[2])
+
+
+def test_the_scatter_within_cases_is_that_of_those_with_several_frames() -> None:
+    scatter = np.array([[3.0, 4.0, 20.0], [np.nan] * 3, [1.0, 2.0, 10.0]])
+    found = results._scatter_arcsec(columns_of(**vectors_of("scatter_{}_arcsec", "xyz", scatter)))
+    assert found is not None
+    assert found.cross == pytest.approx(math.sqrt((5.0 + 10.0) / 2))
+    assert found.roll == pytest.approx(math.sqrt(250.0))
+    alone = columns_of(**vectors_of("scatter_{}_arcsec", "xyz", np.full((2, 3), np.nan)))
+    assert results._scatter_arcsec(alone) is None
+
+
+def test_the_lines_of_a_summary_say_each_figure_of_it() -> None:
+    centroids = {"bias_x_px": 9.0, "bias_y_px": 8.0, "sigma_x_px": 0.125, "sigma_y_px": 0.25}
+    centroids |= {"found_share": 0.75, "false_a_frame": 0.5}
+    summary = {
+        "cases": 40,
+        "table": "cases.parquet",
+        "sha256": "abc",
+        "failed_because": {f"reason {k}": 10 - k for k in range(6)},
+        "availability": 0.875,
+        "wrong": 3,
+        "bias_arcsec": [1.5, -2.5, 30.0],
+        "fov_arcsec": Axes(0.5, None),
+        "pixel_arcsec": Axes(0.25, 1.25),
+        "noise_arcsec": Axes(2.0, 8.0),
+        "scatter_arcsec": Axes(1.0, 4.0),
+        "centroids": centroids,
+        "limit_arcsec": Axes(0.125, 0.375),
+        "notes": ("a note",),
+        "findings": ["a finding"],
+    }
+    lines = [" ".join(line.split()) for line in results.lines_of(summary)]
+    assert lines == [
+        "40 cases in cases.parquet, sha256 abc",
+        *(f"{10 - k} failed: reason {k}" for k in range(5)),
+        "availability 87.5 %, 3 wrong answers",
+        "bias 1.5, -2.5, 30 arcsec about x, y, z",
+        "field-of-view error 0.5 arcsec cross, -",
+        "pixel error 0.25 arcsec cross, 1.25 arcsec roll",
+        "noise 2 arcsec cross, 8 arcsec roll",
+        "noise within a case 1 arcsec cross, 4 arcsec roll",
+        "centroids 0.125, 0.25 px one sigma, 75 % of stars found, 0.5 false a frame",
+        "limit of its stars 0.125 arcsec across, 0.375 about the boresight (Cramer-Rao, one"
+        " exposure at rest)",
+        "a note",
+        "a finding",
+    ]
+    rows = list(results.budget_rows(summary, None))
+    assert [(row.quantity, row.axis, row.value) for row in rows][9:13] == [
+        ("noise within a case", "cross", 1.0),
+        ("noise within a case", "roll", 4.0),
+        ("limit of the tracker's stars", "cross", 0.125),
+        ("limit of the tracker's stars", "roll", 0.375),
+    ]
+    units = {row.quantity: (row.value, row.unit) for row in rows if "centroids" in row.quantity}
+    assert units["centroids: sigma_y_px"] == (0.25, "px")
+    assert units["centroids: found_share"] == (0.75, "1")
+
+
+def test_a_case_s_measures_are_about_the_median_and_count_what_is_missing() -> None:
+    rng = np.random.default_rng(1)
+    count = 16
+    errors = [*rng.normal(0, 1, (count, 3)), 5.0, -7.0, 40.0]
+    centroid = {
+        "centroid_dx_px": [3.0] * count,
+        "centroid_dy_px": [1.0] * count,
+        "centroid_sigma_x_px": [2.0] * count,
+        "centroid_sigma_y_px": [0.0] * count,
+    }
+    cases = columns_of(
+        **vectors_of("error_{}_arcsec", "xyz", errors),
+        **centroid,
+        solved=[8.0] * count,
+        wrong=[3.0] * count,
+        frames=[10.0] * count,
+    )
+    found = {measure.name: measure for measure in results.measures(cases)}
+    x, y, z = (errors - np.median(errors, axis=0)).T
+    assert found["cross"].values == pytest.approx(np.sqrt((x**2 + y**2) / 2))
+    assert found["roll"].values == pytest.approx(np.abs(z))
+    assert found["centroid"].values == pytest.approx(np.full(count, math.sqrt(7.0)))
+    assert found["unanswered"].values == pytest.approx(np.full(count, 0.5))

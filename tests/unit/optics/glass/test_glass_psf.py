@@ -26,6 +26,7 @@ from tests.support.glass import HALF_PX, SIDE_PX, illumination, moments, profile
 # between them.
 FLUX, CENTROID_PX, SECOND = 1e-3, 3e-3, 1e-2
 MEAN = np.array([0.2, 0.3, 0.3, 0.2])
+PIXELS_PX = 2.3e-3  # exp(-2 (pi s)^2) / pi of s = 0.5 px: what pixels move a Gaussian's centroid
 # Each round halves the distance of 1 / w from 1 / s: after 20, w is within s^2 / 2^20 of s.
 SPREAD_PX2 = 1e-4
 REGRIDDED = (
@@ -162,6 +163,36 @@ def test_light_outside_the_stamps_is_missing_from_a_star(glass):
         0.97 * full.stamps_at(*at, MEAN, np.ones(1)).sum(), rel=1e-5
     )
     assert psf.centroids_px(*at, MEAN)[2] == pytest.approx(full.centroids_px(*at, MEAN)[2])
+
+
+def test_the_centroid_is_that_of_the_light_within_the_images(glass, rng):
+    """Each wavelength has another share outside, at each point another light: what is said is
+    the middle of what is drawn.
+    """
+    shape = glass.outside.shape
+    outside = rng.uniform(0.0, 0.6, shape)
+    uneven = replace(glass, outside=outside, illumination=rng.uniform(0.4, 1.0, shape))
+    psf = glass_psf(uneven, 0.0, MEAN)
+    size_px = (SIDE_PX, SIDE_PX)
+    for x_px, y_px in ((230.3, 40.8), (20.6, 200.4)):
+        at = np.array([x_px]), np.array([y_px])
+        image = psf.image(*at, MEAN, np.array([1e4]), size_px).astype(float)
+        x, y, _ = psf.centroids_px(*at, MEAN)
+        found = np.arange(SIDE_PX) @ image.sum(axis=0), np.arange(SIDE_PX) @ image.sum(axis=1)
+        assert found[0] / image.sum() == pytest.approx(x[0], abs=PIXELS_PX)
+        assert found[1] / image.sum() == pytest.approx(y[0], abs=PIXELS_PX)
+
+
+def test_the_exact_stamps_of_a_glass_are_those_that_are_drawn(glass, rng):
+    x_px, y_px = rng.uniform(0, SIDE_PX - 1, (2, 6))
+    psf = glass_psf(glass, 4.0, MEAN)
+    shares = rng.dirichlet(np.ones(4), 6)
+    drawn = psf.stamps_at(x_px, y_px, shares)
+    assert np.abs(psf.unreduced(x_px, y_px, shares) - drawn).max() < FLUX
+    # the brightest pixel of any star in the middle of its own, and no brighter than it says
+    middles = np.rint(np.concatenate([x_px, [127.0]])), np.rint(np.concatenate([y_px, [128.0]]))
+    brightest = psf.stamps_at(*middles, np.eye(4)[np.arange(7) % 4]).max()
+    assert 0.5 * psf.peak_share < brightest <= psf.peak_share * (1 + FLUX)
 
 
 def test_a_corner_that_is_vignetted_whole_is_dark(glass):

@@ -22,7 +22,7 @@ FIELD_TANGENT = 0.05
 PITCH_UM = 4.0
 # A circle that 96 cells count across: their edges' parts are known to an eighth of a cell.
 AIRY_OF_PEAK = 2e-3
-PLACE_PX = 1e-6  # Newton's rounds end at rounding
+MOVED_PX = 1e-5  # slopes by differences of a ray's places; Newton's rounds end at rounding
 MOMENT = 0.01  # the circle's edge, as above, squared; and shares of four samples
 
 
@@ -103,13 +103,17 @@ def test_an_aplanat_s_psf_is_airys(crowding, cut):
 
 
 def test_an_aplanat_has_a_pinhole_s_camera_and_an_even_field():
-    plate = Plate((401, 301), PITCH_UM, half_px=2)
+    focus_um = 8.0
+    plate = Plate((401, 301), PITCH_UM, (focus_um,), half_px=2)
     made = traced(Aplanat(), plate, 2, 1e-3, "a closed form")
     assert made.focal_length_mm == pytest.approx(FOCAL_MM, rel=1e-9)
     assert (*made.glass.lens.radial, *made.glass.lens.tangential) == pytest.approx(
         [0] * 5, abs=1e-6
     )
-    assert made.glass.lateral_px == pytest.approx(0, abs=PLACE_PX)
+    # at a focus of z a chief ray is farther from the middle by z / f of its place
+    moved_px = (made.glass.places_px - [200, 150]) * focus_um * 1e-3 / FOCAL_MM
+    assert np.abs(moved_px).max() == pytest.approx(0.032)
+    assert made.glass.lateral_px[:, 0, 0] == pytest.approx(moved_px, abs=MOVED_PX)
     corners = [[0, 0], [400, 0], [0, 300], [400, 300]]
     assert set(map(tuple, corners)) <= set(map(tuple, made.glass.places_px.tolist()))
     # the beam's area is the pupil's, seen at the field's angle

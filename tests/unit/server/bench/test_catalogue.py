@@ -315,3 +315,66 @@ def test_a_table_s_own_errors_and_types_are_carried_as_hipparcos_s_are(
         == wanted["spectral_type"].values[theirs].tolist()
     )
     assert set(found["v_source"].values.tolist()) == {"U"}
+
+
+# the columns that are a catalogue's own figures, at its own epoch, and where those stand
+OF_CATALOGUE = {
+    "hip": "hip", "ra_deg": "ra_deg", "dec_deg": "dec_deg", "pm_ra_mas_yr": "pm_ra_cosdec_mas_yr",
+    "pm_dec_mas_yr": "pm_dec_mas_yr", "parallax_mas": "parallax_mas", "v_mag": "v_mag",
+    "b_v_mag": "bv_mag", "v_i_mag": "vi_mag", "range_mag": "range_mag", "period_d": "period_d",
+}  # fmt: skip
+OF_FACTS = {
+    "sigma_ra_mas": "sigma_ra_mas", "sigma_dec_mas": "sigma_dec_mas",
+    "sigma_pm_ra_mas_yr": "sigma_pm_ra_mas_yr", "sigma_pm_dec_mas_yr": "sigma_pm_dec_mas_yr",
+    "sigma_parallax_mas": "sigma_parallax_mas", "ra_dec_correlation": "ra_dec_correlation",
+    "sigma_b_v_mag": "sigma_bv_mag", "sigma_v_i_mag": "sigma_vi_mag",
+}  # fmt: skip
+ROUNDED = 1e-6  # of a figure in single precision, and of places with their decimals
+
+
+def test_each_column_of_the_catalogue_s_own_figures_has_its_own(catalogue_bench):
+    own = bench_catalogue(catalogue_bench, 2.5, 1991.25)
+    stars = load_catalog().brighter_than(2.5)
+    stars = stars.taken(np.argsort(stars.v_mag, kind="stable"))
+    facts = errors_of(stars)
+    assert len(own) == len(stars) > 80
+    sources = [(OF_CATALOGUE, lambda name: getattr(stars, name)), (OF_FACTS, facts.__getitem__)]
+    for names, source in sources:
+        for column, name in names.items():
+            wanted = np.asarray(source(name), dtype=float)
+            assert len(np.unique(wanted)) > 5, name  # no column stands for another by chance
+            found = np.asarray(own.columns[column].values, dtype=float)
+            np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=ROUNDED, err_msg=column)
+    v = own.columns["v_mag"].values
+    for column, colour, sign in (
+        ("b_measured_mag", "b_v_mag", 1),
+        ("i_measured_mag", "v_i_mag", -1),
+    ):
+        wanted = v + sign * own.columns[colour].values
+        np.testing.assert_allclose(own.columns[column].values, wanted, atol=ROUNDED)
+    # absolute magnitudes are those of 10 pc, of parallaxes of five sigmas and more
+    parallax = own.columns["parallax_mas"].values
+    modulus = 5 * np.log10(1000 / parallax / 10)
+    is_sure = parallax > 5 * own.columns["sigma_parallax_mas"].values
+    for column, apparent in (
+        ("absolute_mag", "v_mag"),
+        ("absolute_bolometric_mag", "bolometric_mag"),
+    ):
+        found = own.columns[column].values
+        assert np.isfinite(found[is_sure]).all()
+        known = np.isfinite(found)
+        wanted = own.columns[apparent].values - modulus
+        np.testing.assert_allclose(found[known], wanted[known], atol=ROUNDED)
+
+
+def test_a_brighter_limit_is_the_command_s_and_the_file_s_where_it_gives_none(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"sky": {"faintest_v_mag": 1.25, "epoch_jyear": 2010.0}}))
+    file = read_bench_file(path)
+    own = bench_catalogue(file, None, None)
+    assert own.epoch_jyear == 2010.0
+    v = own.columns["v_mag"].values
+    assert (np.diff(v) >= 0).all()
+    assert v.max() <= 1.25 and len(own) == len(load_catalog().brighter_than(1.25))
+    brighter = bench_catalogue(file, 0.5, 2020.0)
+    assert brighter.columns["v_mag"].values.max() <= 0.5 and brighter.epoch_jyear == 2020.0

@@ -75,7 +75,7 @@ def certificate(**changes: Any) -> Certificate:
         "ambient": "",
         "traceability": "",
         "instrument": {},
-        "decision": "guarded",
+        "decision": "guard-band",
         "conforms": None,
         "trials": 0,
         "two_digits_stand": True,

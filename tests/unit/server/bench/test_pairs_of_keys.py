@@ -8,8 +8,9 @@ from types import SimpleNamespace
 
 import pytest
 
+from hilstar.server.bench import would_do as keys_that_would_do
 from hilstar.server.bench.config import RenderSettings
-from hilstar.server.bench.would_do import _smallest_pair, _Trial
+from hilstar.server.bench.would_do import MAX_PAIRS, _smallest_pair, _Trial, would_do
 
 VALUES = (1, 2, 3, 4)
 
@@ -54,3 +55,63 @@ def test_a_pair_has_the_least_of_the_dearer_key_and_then_of_the_cheaper(within, 
 
 def test_two_ways_to_change_one_key_are_no_pair():
     assert _smallest_pair(KnownTrials(lambda a, b: True), cheaper, cheaper) is None
+
+
+class KnownBench:
+    """Trials of so many keys, "a" on, the cheapest first; `within` says of their values, by the
+    key, whether they do. A key at 4 leaves 1 mag, at 0 5 mag.
+    """
+
+    def __init__(self, monkeypatch, count: int, within) -> None:
+        monkeypatch.setattr(keys_that_would_do, "_Trials", lambda bench: self)
+        self.start = _Trial(RenderSettings(), 8, 7.0)
+        self._names = "abcdefg"[:count]
+        self._within = within
+        self.ways = [self._way(name) for name in self._names]
+
+    @staticmethod
+    def _way(name: str):
+        def way(trial):
+            for value in VALUES:
+                yield trial.but(name, value)
+
+        return way
+
+    def effort(self, trial):
+        values = dict.fromkeys(self._names, 0)
+        values |= {change.key: change.value for change in trial.changes}
+        error_mag = 5.0 - sum(values.values())
+        is_within = self._within(values)
+        return SimpleNamespace(within=is_within, error_mag=error_mag, error_px=-error_mag)
+
+    def found(self) -> list[dict[str, int]]:
+        """What would do, by the keys of each remedy; its errors are the trial's."""
+        remedies = would_do(SimpleNamespace(effort=SimpleNamespace(within=False)))
+        for remedy in remedies:
+            total = sum(change.value for change in remedy.changes)
+            assert (remedy.error_mag, remedy.error_px) == (5.0 - total, total - 5.0)
+        return [{change.key: change.value for change in remedy.changes} for remedy in remedies]
+
+
+def test_each_key_that_does_alone_is_told_with_its_smallest_change(monkeypatch):
+    bench = KnownBench(monkeypatch, 3, lambda values: values["a"] >= 3 or values["c"] >= 2)
+    assert bench.found() == [{"a": 3}, {"c": 2}]
+
+
+def test_where_none_does_alone_the_cheapest_pairs_are_told_by_their_dearer_key(monkeypatch):
+    """Of four keys any two do that sum up to five."""
+    bench = KnownBench(monkeypatch, 4, lambda values: sum(values.values()) >= 5)
+    pairs = bench.found()
+    assert [set(pair) for pair in pairs] == [{"a", "b"}, {"a", "c"}, {"b", "c"}]
+    assert len(pairs) == MAX_PAIRS
+    # least of the dearer one with any of the cheaper, and then of the cheaper
+    assert pairs == [{"a": 4, "b": 1}, {"a": 4, "c": 1}, {"b": 4, "c": 1}]
+
+
+def test_where_no_pair_does_each_key_s_largest_change_is_told(monkeypatch):
+    bench = KnownBench(monkeypatch, 3, lambda values: False)
+    assert bench.found() == [{"a": 4}, {"b": 4}, {"c": 4}]
+
+
+def test_a_bench_that_is_within_needs_nothing():
+    assert would_do(SimpleNamespace(effort=SimpleNamespace(within=True))) == []

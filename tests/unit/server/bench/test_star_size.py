@@ -7,8 +7,11 @@ from __future__ import annotations
 import json
 import math
 
+import numpy as np
 import pytest
+from scipy.stats import norm
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
 from hilstar.server.bench.cameras import bench_camera, fields_of_view
 from hilstar.server.bench.star_size import FINEST, PANELS, star_size
@@ -166,3 +169,47 @@ def test_verify_does_not_pass_a_bench_whose_star_is_too_wide(tmp_path):
     )
     allowed = run_hilstar_here("verify", "bench.toml", "--fields", 1, "--json", cwd=tmp_path)
     assert not any("star_sigma_ratio" in reason for reason in json.loads(allowed.stdout)["reasons"])
+
+
+def light_by_pixel(sprite_px: float, lens_px: float, ratio: float) -> FloatArray:
+    """The light of a star's row of tracker pixels, along one axis: a Gaussian summed up in monitor
+    pixels, each an even bar of `ratio` tracker pixels, through a Gaussian lens.
+    """
+    monitor = np.arange(-12, 13)
+    weights = norm.cdf(monitor + 0.5, 0, sprite_px) - norm.cdf(monitor - 0.5, 0, sprite_px)
+    half = round(13 * ratio + 8 * lens_px) + 2
+    pixels = np.arange(-half, half + 1)
+
+    def until(edge_px: FloatArray) -> FloatArray:
+        """The integral of a normal distribution's integral."""
+        return edge_px * norm.cdf(edge_px, 0, lens_px) + lens_px**2 * norm.pdf(edge_px, 0, lens_px)
+
+    off_px = pixels[:, None] - ratio * monitor
+    bar = until(off_px + 0.5 + ratio / 2) - until(off_px - 0.5 + ratio / 2)
+    bar -= until(off_px + 0.5 - ratio / 2) - until(off_px - 0.5 - ratio / 2)
+    return bar @ weights / ratio
+
+
+# the light of monitor pixels under 1e-4 of the brightest is left out, and squares are summed up
+# at points: both together move no figure by more
+SUMMED = 0.01
+
+
+@pytest.mark.parametrize("ratio", [0.7, 2.6, 7.3, 1.6 * FINEST])
+def test_an_oval_star_is_as_bright_and_as_large_as_its_integral_says(tmp_path, ratio):
+    sprite_px, lens_px = (0.9, 0.55), (0.8, 0.45)
+    # of the bench that has one tracker pixel to a monitor pixel
+    at_mm = 60 * (57.65 / 60) / (13 / 70) / ratio
+    found = size(
+        tmp_path,
+        {"render": {"sprite_sigma_px": list(sprite_px)}, "collimator": {"focal_length_mm": at_mm}},
+        {"tracker": {"psf_sigma_px": list(lens_px), "resolution_px": [64, 64]}},
+    )
+    x, y = (light_by_pixel(*sigmas, ratio) for sigmas in zip(sprite_px, lens_px, strict=True))
+    assert x.sum() == pytest.approx(1.0) and y.sum() == pytest.approx(1.0)
+    assert found.shared_px == pytest.approx(1 / ((x**2).sum() * (y**2).sum()), rel=SUMMED)
+    sky = [norm.cdf(np.arange(-5.5, 6.5), 0, sigma_px) for sigma_px in lens_px]
+    sky_x, sky_y = (np.diff(edges) for edges in sky)
+    loss_mag = -2.5 * math.log10(x.max() * y.max() / (sky_x.max() * sky_y.max()))
+    assert found.peak_loss_mag == pytest.approx(loss_mag, abs=1.0857 * SUMMED)
+    assert found.sky_shared_px == pytest.approx(1 / ((sky_x**2).sum() * (sky_y**2).sum()), rel=1e-3)

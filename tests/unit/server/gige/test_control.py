@@ -117,6 +117,25 @@ def test_a_controller_that_was_silent_for_too_long_does_not_get_its_privilege_ba
     assert camera.take_events() == [Released(silent=True)]
 
 
+@pytest.mark.parametrize("silent", [False, True])
+def test_a_controller_that_is_gone_leaves_nothing_of_its_stream_to_the_next(silent):
+    """Neither its port nor its address: no image goes where the next one listens for another."""
+    camera = channel()
+    first, second = Asker(camera), Asker(camera, OTHER)
+    first.write(PRIVILEGE, CONTROL)
+    first.write(STREAM_ADDRESS, HERE)
+    first.write(STREAM_PORT, 5123)
+    if silent:
+        second.now_ns = (first.read(HEARTBEAT_MS) + 1) * NS_PER_MS
+    else:
+        first.write(PRIVILEGE, 0)
+    assert second.write(PRIVILEGE, CONTROL) == 0
+    assert camera.destination is None
+    assert (second.read(STREAM_PORT), second.read(STREAM_ADDRESS)) == (0, 0)
+    assert second.write(STREAM_PORT, 6000) == 0
+    assert camera.destination == (OTHER[0], 6000)
+
+
 def test_images_go_to_the_controllers_own_address_alone():
     camera = channel()
     client = Asker(camera)
@@ -303,3 +322,123 @@ def test_whatever_comes_nothing_is_raised_and_images_go_to_the_controller_alone(
         settings_now = camera.registers.settings
         assert 0 < settings_now.exposure_s <= 60 and 0 <= settings_now.gain_db <= 24
         assert settings_now.rate_hz * settings_now.exposure_s <= 1 + 1e-5
+
+
+DENIED, WRONG = GvcpStatus.WRITE_PROTECT, GvcpStatus.INVALID_PARAMETER
+NAME, TIME_CONTROL, TIME_HIGH, TIME_LOW = 0x00E8, 0x0944, 0x0948, 0x094C
+
+
+@pytest.mark.parametrize(
+    ("address", "value", "status", "kept"),
+    [
+        (HEARTBEAT_MS, 499, WRONG, 3000),
+        (HEARTBEAT_MS, 500, 0, 500),
+        (PACKET_BYTES, 575, WRONG, 1500),
+        (PACKET_BYTES, 576, 0, 576),
+        (PACKET_BYTES, 9000, 0, 9000),
+        (PACKET_BYTES, 9001, WRONG, 1500),
+        # that it may not be fragmented is kept, that one is fired is not
+        (PACKET_BYTES, 1 << 31 | 1 << 30 | 1 << 29 | 8192, 0, 1 << 30 | 8192),
+        (0x0048, 7, DENIED, int.from_bytes(b"hils", "big")),
+        (0x0934, 0, DENIED, 1 << 31 | 1 << 30 | 0b111),
+        (0x000C, 1, DENIED, int(IDENTITY.address)),
+        (DESCRIPTION_AT, 0, DENIED, int.from_bytes(b"<?xm", "big")),
+    ],
+)
+def test_a_register_of_the_standard_takes_what_the_standard_allows(address, value, status, kept):
+    asker = Asker(channel())
+    asker.write(PRIVILEGE, CONTROL)
+    assert asker.write(address, value) == status
+    assert asker.read(address) == kept
+
+
+@pytest.mark.parametrize(
+    ("address", "status"),
+    [(0x9000_0000, GvcpStatus.INVALID_ADDRESS), (HEARTBEAT_MS + 2, GvcpStatus.BAD_ALIGNMENT)],
+)
+def test_a_place_that_is_no_register_is_neither_read_nor_written(address, status):
+    asker = Asker(channel())
+    asker.write(PRIVILEGE, CONTROL)
+    assert asker.write(address, 1) == status
+    assert asker.ask(READ, struct.pack(">I", address))[0] == status
+
+
+def test_the_camera_s_time_is_latched_in_two_words_and_never_set_back():
+    camera = channel()
+    asker = Asker(camera)
+    asker.write(PRIVILEGE, CONTROL)
+    camera.registers.time_ns = 0x0123_4567_89AB_CDEF
+    assert (asker.read(TIME_HIGH), asker.read(TIME_LOW)) == (0, 0)
+    assert asker.write(TIME_CONTROL, 2) == 0
+    camera.registers.time_ns += 10**12
+    assert (asker.read(TIME_HIGH), asker.read(TIME_LOW)) == (0x0123_4567, 0x89AB_CDEF)
+    for value in (0, 1, 3):
+        assert asker.write(TIME_CONTROL, value) == WRONG
+    assert asker.read(TIME_LOW) == 0x89AB_CDEF
+    assert (asker.read(0x093C), asker.read(0x0940)) == (0, 10**9)  # ticks a second
+
+
+def test_a_user_s_name_is_kept_to_its_length_and_a_shorter_one_clears_it():
+    asker = Asker(channel())
+    asker.write(PRIVILEGE, CONTROL)
+
+    def named(name: bytes) -> int:
+        return asker.ask(0x0086, struct.pack(">I", NAME) + name)[0]
+
+    def shown() -> bytes:
+        _, body = asker.ask(READ_MEMORY, struct.pack(">IHH", NAME, 0, 16))
+        return body[4:]
+
+    assert named(b"sixteen letters!") == 0
+    assert shown() == b"sixteen letters!"
+    assert named(b"bench 7\0") == 0
+    assert shown() == b"bench 7".ljust(16, b"\0")
+    assert named(b"seventeen letters!!!") == WRONG
+    assert shown() == b"bench 7".ljust(16, b"\0")
+
+
+@pytest.mark.parametrize(
+    ("bits", "pixel_format", "payload_bytes"),
+    [(8, "Mono8", 65 * 47), (16, "Mono16", 2 * 65 * 47), (12, "Mono8", 65 * 47)],
+)
+def test_an_image_s_bytes_are_those_of_its_format(bits, pixel_format, payload_bytes):
+    camera = CameraSettings(65, 47, bits, exposure_s=0.05, rate_hz=10.0, pixel_format=pixel_format)
+    assert camera.payload_bytes == payload_bytes
+
+
+def test_a_packed_image_of_an_odd_count_ends_in_a_whole_triple():
+    camera = CameraSettings(65, 47, 12, exposure_s=0.05, rate_hz=10.0)
+    camera.pixel_format = next(
+        name for name, form in PIXEL_FORMATS.items() if form.stored_bits == 12 and form.bits == 12
+    )
+    assert camera.payload_bytes == 3 * (65 * 47 + 1) // 2
+
+
+@pytest.mark.parametrize(
+    ("bits", "formats"),
+    [(8, ["Mono8", "Mono16"]), (12, ["Mono12", "Mono12Packed", "Mono16", "Mono8"])],
+)
+def test_a_detector_s_own_format_is_the_first(bits, formats):
+    camera = CameraSettings(64, 48, bits, exposure_s=0.05, rate_hz=10.0)
+    assert sorted(camera.pixel_formats()) == sorted(formats)
+    assert PIXEL_FORMATS[camera.pixel_format].bits == bits
+
+
+@pytest.mark.parametrize(
+    ("address", "mask"), [("127.0.0.2", 0xFF00_0000), ("10.1.2.3", 0xFFFF_FF00)]
+)
+def test_a_camera_says_its_address_its_network_and_where_it_is_described(address, mask):
+    identity = CameraIdentity(ipaddress.IPv4Address(address), "m" * 40, "v", "serial 7")
+    camera = CameraSettings(64, 48, 12, exposure_s=0.05, rate_hz=10.0)
+    description = describe(identity.model, camera)
+    registers = Registers(identity, camera, description)
+    assert registers.word(0x0024) == int(identity.address)
+    assert registers.word(0x000C) == int(identity.address)
+    assert registers.word(0x0034) == mask
+    # the last byte of a text stays 0
+    assert registers.read(0x0068, 32) == b"m" * 31 + b"\0"
+    assert registers.read(0x00D8, 16) == b"serial 7".ljust(16, b"\0")
+    url = registers.read(0x0200, 512).rstrip(b"\0").decode()
+    assert url == f"Local:hilstar.xml;{DESCRIPTION_AT:X};{len(description):X}"
+    whole = registers.read(DESCRIPTION_AT, len(description) // 4 * 4)
+    assert whole == description[: len(whole)]

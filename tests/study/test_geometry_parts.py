@@ -1,0 +1,118 @@
+"""The traced bench and the planted dots of the study of geometric calibration, by closed forms."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilstar.instruments.study.geometry import (
+    SIZES,
+    USUAL_NOISE_PX,
+    USUAL_SIZE,
+    DotFaults,
+    Frames,
+    TracedBench,
+    frames_of,
+    observed_dots,
+    turned,
+)
+
+SIZE_PX = (400, 300)
+UPRIGHT = {
+    "lens_tilt_deg": (0.0, 0.0),
+    "lens_shift_mm": (0.0, 0.0),
+    "screen_tilt_deg": (0.0, 0.0, 0.0),
+    "screen_shift_mm": (0.0, 0.0),
+}
+
+
+def test_a_turn_is_about_x_then_y_then_z():
+    assert turned(90, 0) @ [0, 1, 0] == pytest.approx([0, 0, 1])
+    assert turned(0, 90) @ [0, 0, 1] == pytest.approx([1, 0, 0])
+    assert turned(0, 0, 90) @ [1, 0, 0] == pytest.approx([0, 1, 0])
+    # about x first: z goes to -y, which a turn about z then takes to x
+    assert turned(90, 0, 90) @ [0, 0, 1] == pytest.approx([1, 0, 0])
+
+
+@pytest.mark.parametrize("focal_mm", [350.0, 200.0])
+def test_an_upright_doublet_has_its_focal_length_and_its_axis_in_the_middle(focal_mm):
+    bench = TracedBench(focal_mm=focal_mm, to_lens_mm=60.0, **UPRIGHT)
+    slope = 1e-4
+    x, y = bench.places_px(np.array([[0.0, 0.0, 1.0], [slope, 0.0, 1.0], [0.0, slope, 1.0]]))
+    assert (x[0], y[0]) == pytest.approx((959.5, 539.5), abs=1e-6)
+    # a design of thin glass: the focal length is a percent off at most, and alike along both axes
+    focal_px = focal_mm / bench.pitch_mm
+    assert (x[1] - x[0]) / slope == pytest.approx(focal_px, rel=0.02)
+    assert y[2] - y[0] == pytest.approx(x[1] - x[0], rel=1e-9)
+
+
+def test_a_screen_that_is_moved_moves_the_image_the_other_way():
+    direction = np.array([[0.0, 0.0, 1.0]])
+    x, y = TracedBench(**UPRIGHT).places_px(direction)
+    shifted = TracedBench(**UPRIGHT | {"screen_shift_mm": (0.5, -0.3)})
+    moved_x, moved_y = shifted.places_px(direction)
+    assert (moved_x - x)[0] == pytest.approx(-0.5 / shifted.pitch_mm)
+    assert (moved_y - y)[0] == pytest.approx(0.3 / shifted.pitch_mm)
+    # the screen turned about z turns the image the other way
+    turn = TracedBench(**UPRIGHT | {"screen_tilt_deg": (0.0, 0.0, 2.0)})
+    at = np.array([[0.01, 0.0, 1.0]])
+    straight_x, _ = TracedBench(**UPRIGHT).places_px(at)
+    x, y = turn.places_px(at)
+    reach_px = straight_x[0] - 959.5
+    assert x[0] - 959.5 == pytest.approx(reach_px * np.cos(np.radians(2)))
+    assert y[0] - 539.5 == pytest.approx(-reach_px * np.sin(np.radians(2)))
+
+
+def test_directions_are_those_whose_rays_meet_the_pixels():
+    bench = TracedBench()
+    x, y = (part.ravel() for part in np.meshgrid([0.0, 700.0, 1919.0], [0.0, 400.0, 1079.0]))
+    found_x, found_y = bench.places_px(bench.directions(x, y))
+    np.testing.assert_allclose(found_x, x, atol=1e-6)
+    np.testing.assert_allclose(found_y, y, atol=1e-6)
+
+
+def plan_of(count: int, frames: int) -> SimpleNamespace:
+    """Dots that are lit in every other frame, in turn."""
+    lit = (np.arange(count)[:, None] + np.arange(frames)) % 2 == 0
+    return SimpleNamespace(frames=frames, lit=lit)
+
+
+def test_planted_dots_are_seen_in_their_frames_with_their_noise(rng):
+    x, y = rng.uniform(1, 398, 900), rng.uniform(1, 298, 900)
+    x[0], y[1] = 400.0, -1.0  # beyond the edge
+    plan = plan_of(900, 4)
+    exact = observed_dots(plan, x, y, SIZE_PX, DotFaults(0.0, 0.0, 0.0), rng)
+    for frame in range(4):
+        of_frame = exact.frame == frame
+        dots = np.flatnonzero(plan.lit[:, frame])
+        dots = dots[dots > 1]
+        np.testing.assert_array_equal(exact.x_px[of_frame], x[dots])
+        np.testing.assert_array_equal(exact.y_px[of_frame], y[dots])
+    noisy = observed_dots(plan, x, y, SIZE_PX, DotFaults(0.3, 0.0, 0.0), rng)
+    off = np.concatenate([noisy.x_px - exact.x_px, noisy.y_px - exact.y_px])
+    assert off.std() == pytest.approx(0.3, rel=0.06)
+    assert off.mean() == pytest.approx(0.0, abs=0.02)
+    fewer = observed_dots(plan, x, y, SIZE_PX, DotFaults(0.0, 0.2, 0.1), rng)
+    total = len(exact.x_px)
+    known = set(zip(exact.x_px.tolist(), exact.y_px.tolist(), strict=True))
+    true = [place in known for place in zip(fewer.x_px.tolist(), fewer.y_px.tolist(), strict=True)]
+    assert sum(true) == pytest.approx(0.8 * total, abs=4 * np.sqrt(0.16 * total))
+    false_mean = 0.1 * 0.8 * total
+    assert len(true) - sum(true) == pytest.approx(false_mean, abs=4 * np.sqrt(false_mean))
+    # false ones are anywhere on the detector, whose sides differ
+    false = ~np.array(true)
+    assert 300 < fewer.x_px[false].max() < 400 and fewer.y_px[false].max() < 300
+
+
+def test_frames_vary_in_number_or_in_noise():
+    found = frames_of(quick=False)
+    assert found == sorted(set(found))
+    assert {(each.count, each.dots) for each in found if each.noise_px == USUAL_NOISE_PX} == set(
+        SIZES
+    )
+    others = [each for each in found if each.noise_px != USUAL_NOISE_PX]
+    assert {(each.count, each.dots) for each in others} == {USUAL_SIZE}
+    assert Frames(*USUAL_SIZE, USUAL_NOISE_PX) in frames_of(quick=True)
+    assert len(frames_of(quick=True)) < len(found)

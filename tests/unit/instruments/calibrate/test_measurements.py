@@ -1,0 +1,74 @@
+"""Measured patches: a row's light, errors and time by its own exposure, and levels of repeats."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from hilstar.instruments.calibrate.measurements import (
+    check_drift,
+    drift_over_run,
+    group_levels,
+    read_measurements,
+)
+
+TABLE = """code,channel,value,exposure_s,sigma,common_1,common_2,t_s
+0,w,2,0.5,0.1,0.02,0.2,10
+100,w,30,0.25,0.4,0.1,-0.3,12
+100,w,34,0.25,0.3,0.3,-0.1,20
+255,w,80,0.1,0.8,0.5,0.4,40
+"""
+
+
+def table_of(folder, text):
+    path = folder / "measured.csv"
+    path.write_text(text)
+    return path
+
+
+def test_light_and_its_errors_are_of_a_row_s_own_exposure(tmp_path):
+    measured = read_measurements(table_of(tmp_path, TABLE))
+    assert (measured.bits, measured.code.tolist()) == (8, [0, 100, 100, 255])
+    np.testing.assert_allclose(measured.value, [4.0, 120.0, 136.0, 800.0])
+    np.testing.assert_allclose(measured.sigma, [0.2, 1.6, 1.2, 8.0])
+    np.testing.assert_allclose(measured.common, [[0.04, 0.4], [0.4, -1.2], [1.2, -0.4], [5.0, 4.0]])
+    assert measured.time.tolist() == [10.0, 12.0, 20.0, 40.0]
+    levels = group_levels(measured, "w")
+    np.testing.assert_allclose(levels.mean, [4.0, 128.0, 800.0])
+    assert levels.count.tolist() == [1, 2, 1]
+    # the error of a mean of two is of their mean variance; what they share does not shrink
+    np.testing.assert_allclose(levels.stated, [0.2, math.sqrt((1.6**2 + 1.2**2) / 2 / 2), 8.0])
+    np.testing.assert_allclose(levels.common, [[0.04, 0.4], [0.8, -0.8], [5.0, 4.0]])
+    plain = read_measurements(table_of(tmp_path, "code,channel,value\n0,w,1\n700,w,9\n"))
+    assert (plain.bits, plain.value.tolist(), plain.time.tolist()) == (10, [1.0, 9.0], [0.0, 1.0])
+    assert not plain.sigma.any()
+
+
+# a drift of 0.5 % and more, beyond its noise, is refused
+@pytest.mark.parametrize(("per_s", "is_refused"), [(0.0, False), (-1e-4, True), (2e-3, True)])
+def test_a_drift_is_the_trend_of_repeats_over_the_whole_run(tmp_path, rng, per_s, is_refused):
+    """Two codes in two channels, in turn, at uneven times; black, whose noise is another, counts
+    for nothing.
+    """
+    times = np.sort(rng.uniform(0, 100, 24))
+    rows = []
+    for number, t_s in enumerate(times.tolist()):
+        code, channel, light = ((200, "r", 50.0), (255, "g", 90.0), (0, "w", 0.1))[number % 3]
+        value = light * math.exp(per_s * t_s) * (1 + 1e-4 * rng.normal())
+        if not code:
+            value = light * rng.uniform(0.5, 2)
+        rows.append(f"{code},{channel},{value!r},{t_s}")
+    text = "\n".join(["code,channel,value,t_s", *rows]) + "\n"
+    measured = read_measurements(table_of(tmp_path, text))
+    drift, error = drift_over_run(measured)
+    span_s = times[-1] - times[0]
+    assert drift == pytest.approx(per_s * span_s, abs=4 * error)
+    # 16 lit readings of 1e-4 each, spread evenly over the run
+    assert error == pytest.approx(1e-4 / math.sqrt(16) * math.sqrt(12), rel=0.5)
+    if is_refused:
+        with pytest.raises(Exception, match="light drifts by"):
+            check_drift(measured)
+    else:
+        assert check_drift(measured) == drift

@@ -1,0 +1,142 @@
+"""What `hilstar budget` prints of a budget whose numbers all differ."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilstar.display.primaries import ChannelMatrix
+from hilstar.instruments.simulate.budget import (
+    LightBudget,
+    MagnitudeRow,
+    NotDrawn,
+    budget_lines,
+    out_of_gamut,
+)
+from hilstar.server.bench.star_size import StarSize
+from hilstar.tracker.centroiders import FAMILY
+
+STAR = StarSize(1.0, 0.5, 1.5, 2.0, 1.25, 13.5, 4.5, None)
+
+
+def a_budget(**keys: Any) -> LightBudget:
+    """A budget of two magnitudes, at the fainter of which nothing is found."""
+    kinds = {kind: 0.01 * (k + 1) for k, kind in enumerate(FAMILY)}
+    none = dict.fromkeys(FAMILY)
+    rows = [
+        MagnitudeRow(3.25, 2.0, 0.0125, 0.0375, 0.0625, 0.125, 4.75, kinds),
+        MagnitudeRow(9.5, 8.25, None, None, None, None, None, none),
+    ]
+    facts: dict[str, Any] = {
+        "method": "exact",
+        "bits": 10,
+        "clips_v_mag": 1.25,
+        "clips_v_mag_at_best": 0.5,
+        "nothing_v_mag": 8.75,
+        "range_mag": 7.5,
+        "within": {"0.05_mag": 4.5, "0.1_px": None},
+        "clipped_hip": [32349],
+        "left_out": NotDrawn(17, 2.5e-4),
+        "black_e_per_s_px": 12.345,
+        "rows": rows,
+        "centroider": "window",
+        "centroid_rms_px": kinds,
+        "primaries": None,
+        "near_infrared": [],
+        "out_of_gamut": None,
+        "star": STAR,
+    }
+    return LightBudget(**(facts | keys))
+
+
+def lines_of(budget: LightBudget) -> list[str]:
+    return [" ".join(line.split()) for line in budget_lines(budget)]
+
+
+def test_a_budget_s_lines_have_each_figure_once() -> None:
+    lines = lines_of(a_budget())
+    assert lines[:5] == [
+        "method exact, 10 bits",
+        "clips at V = 1.25 in the middle of a pixel, 0.50 on a corner",
+        "shows nothing from V = 8.75, a range of 7.5 mag",
+        "below full scale 4.5 mag within 0.05 mag, - mag within 0.1 px",
+        "centroider window, in the tracker's pixels after its blur",
+    ]
+    assert [f"{kind} {0.01 * (k + 1):.4f}" in lines[5] for k, kind in enumerate(FAMILY)] == [
+        True for _ in FAMILY
+    ]
+    assert lines[6:10] == [
+        "clipped stars HIP 32349",
+        "not drawn 17 stars, too faint: 2.50e-04 of all light",
+        "black 12.35 e-/s in a monitor pixel",
+        f"in the tracker {STAR.line()}",
+    ]
+    assert lines[10:] == [
+        "",
+        "V flux rms max mag centroid rms max px max arcsec",
+        "3.25 0.0125 0.0375 0.0625 0.1250 4.75",
+        "9.50 - - - - -",
+    ]
+
+
+def test_a_budget_of_all_centroiders_has_a_column_for_each() -> None:
+    lines = lines_of(a_budget(centroider="all"))
+    assert lines[-3] == f"V flux rms max mag {' '.join(FAMILY)} max px"
+    kinds = " ".join(f"{0.01 * (k + 1):.4f}" for k in range(len(FAMILY)))
+    assert lines[-2] == f"3.25 0.0125 0.0375 {kinds} 0.1250"
+    assert lines[-1].count("-") == len(FAMILY) + 3
+
+
+@pytest.mark.parametrize(
+    ("channels", "what"), [(("one",), "mean wavelength"), (("r", "b"), "electrons by channel")]
+)
+def test_primaries_are_told_by_channel_and_what_they_cannot_show(channels, what) -> None:
+    rates = np.array([[1.0, 20.0, 300.0], [4.0, 50.0, 600.0]])[: len(channels)]
+    matrix = ChannelMatrix(channels, rates, 12.5)
+    red = [
+        {"channel": "all", "from_nm": 700.4, "by_class": {"B": 0.125, "M": 0.5}},
+        {"channel": "b", "from_nm": 650.0, "by_class": {"B": 0.25, "M": 0.75}},
+    ]
+    lines = lines_of(a_budget(primaries=matrix, out_of_gamut=0.0625, near_infrared=red))
+    after = lines[10 : 14 + len(channels)]
+    assert after[0] == f"out of gamut 6.25% of stars, whose {what} the primaries cannot show"
+    assert after[1].startswith("condition number 12.50, electrons of each channel")
+    for k, channel in enumerate(channels):
+        r, g, b = rates[k].tolist()
+        expected = f"r {r:.4g} e-/s, g {g:.4g} e-/s, b {b:.4g} e-/s"
+        assert after[2 + k].replace("red", "r").replace("green", "g").replace("blue", "b") == (
+            f"{channel} {expected}"
+        )
+    assert after[-2:] == [
+        "from 700 nm, % of e- B 12.5 M 50.0",
+        "from 650 nm, % of e- B 25.0 M 75.0 b",
+    ]
+
+
+def test_stars_out_of_gamut_are_those_that_are_not_in_it() -> None:
+    class Colours:
+        """Of four stars the first alone is in the primaries' gamut."""
+
+        def wanted(self, stars: Any, rows: np.ndarray) -> np.ndarray:
+            return 10.0 * rows
+
+        def shares_of(self, stars: Any, rows: np.ndarray) -> np.ndarray:
+            return rows + 1.0
+
+        def off(self, wanted: np.ndarray, shares: np.ndarray) -> np.ndarray:
+            return wanted - shares
+
+        def in_gamut(self, off: np.ndarray) -> np.ndarray:
+            return np.asarray(off < 0)
+
+    class Bench:
+        colours: Any = Colours()
+
+        class stars:
+            rates_e_per_s = np.zeros(4)
+
+    assert out_of_gamut(Bench()) == pytest.approx(0.75)  # type: ignore[arg-type]
+    Bench.colours = None
+    assert out_of_gamut(Bench()) is None  # type: ignore[arg-type]

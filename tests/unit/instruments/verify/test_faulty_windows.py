@@ -1,0 +1,112 @@
+"""A fault's window on the tracker's image, and what is taken of it: planted images, no bench."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilstar.instruments.verify.faulty_fields import (
+    FaultSeen,
+    FaultyFields,
+    _middle,
+    _Shot,
+    fault_lines,
+)
+from hilstar.optics.layers.fault_kinds import KINDS
+
+SIZE_PX = (120, 80)
+
+
+def fields_of(place: tuple[float, float] | None) -> FaultyFields:
+    """Faults at a place of a detector of 120 x 80 px, before a PSF that is wider along y."""
+    made = object.__new__(FaultyFields)
+    made._twin = SimpleNamespace(camera=SimpleNamespace(resolution_px=SIZE_PX))
+    made._finder = SimpleNamespace(psf=SimpleNamespace(width_px=(0.8, 1.4)))
+    made._place_px = lambda fault, frame: None if place is None else np.array(place)
+    return made
+
+
+def test_a_window_is_six_sigmas_about_its_place_and_whole_on_the_detector():
+    """Six of 1.4 px, to whole pixels, and one more: 10 px."""
+    fields = fields_of(None)
+    rows, columns = fields._window(np.array([30.4, 50.6]))
+    assert (rows.start, rows.stop, columns.start, columns.stop) == (41, 62, 20, 41)
+    for place, is_whole in (
+        ((10.0, 10.0), True),
+        ((9.9, 40.0), False),
+        ((40.0, 9.9), False),
+        ((109.9, 69.9), True),
+        ((110.0, 40.0), False),
+        ((40.0, 70.0), False),
+    ):
+        assert fields._whole(np.array(place)) is is_whole
+
+
+def shots(asked: np.ndarray, shown: np.ndarray) -> tuple[_Shot, _Shot]:
+    """A field without a fault, and with one that adds these."""
+    plain = np.full(SIZE_PX[::-1], 100.0)
+    faulty = plain.copy(), plain.copy()
+    faulty[0][:] += asked
+    faulty[1][:] += shown
+    return _Shot(plain, plain + 7.0, "plain"), _Shot(faulty[0], faulty[1] + 7.0, "faulty")
+
+
+POINT = KINDS["false-star"](name="ghost", radec_deg=(1.0, 2.0), electrons=5.0)
+GLOW = KINDS["glow"](name="sun", icrs=(0.0, 0.6, 0.8), electrons_per_s=8.0, scale_deg=4.0)
+
+
+def test_a_point_of_light_is_what_it_adds_in_its_window():
+    asked = np.zeros(SIZE_PX[::-1])
+    shown = np.zeros(SIZE_PX[::-1])
+    asked[50, 30], shown[50, 31] = 1000.0, 600.0
+    shown[52, 31] = 200.0
+    shown[5, 100] = 5e4  # another star's twinkle, far from it
+    seen = fields_of((30.0, 50.0))._compared(POINT, *shots(asked, shown))
+    assert (seen.asked_e, seen.seen_e) == pytest.approx((1000.0, 800.0))
+    assert seen.flux_mag == pytest.approx(-2.5 * math.log10(0.8))
+    # a quarter of its light stands two rows further down
+    assert seen.off_px == pytest.approx(math.hypot(1.0, 0.5))
+    beside = fields_of((5.0, 50.0))._compared(POINT, *shots(asked, shown))
+    assert (
+        beside.note
+        == fields_of(None)._compared(POINT, *shots(asked, shown)).note
+        == "not on the tracker's image"
+    )
+
+
+def test_a_glow_is_what_it_adds_to_the_whole_image():
+    asked = np.linspace(0.0, 2.0, SIZE_PX[0]) * np.ones(SIZE_PX[::-1])
+    seen = fields_of(None)._compared(GLOW, *shots(asked, 1.1 * asked))
+    assert seen.asked_e == pytest.approx(asked.sum())
+    assert seen.flux_mag == pytest.approx(-2.5 * math.log10(1.1))
+    assert seen.off_px is None
+    nothing = fields_of(None)._compared(GLOW, *shots(0 * asked, 0 * asked))
+    assert (nothing.asked_e, nothing.note) == (0.0, "not on the tracker's image")
+    dark = fields_of(None)._compared(GLOW, *shots(asked, 0 * asked))
+    assert dark.flux_mag is None
+
+
+def test_a_middle_is_x_then_y():
+    light = np.zeros((5, 9))
+    light[1, 6], light[3, 6] = 1.0, 3.0
+    assert _middle(light).tolist() == [6.0, 2.5]
+
+
+def test_each_fault_has_a_line_of_its_figures():
+    lines = fault_lines(
+        [
+            FaultSeen("ghost", "false-star", 1000.0, 800.0, 0.2423, 0.5),
+            FaultSeen("loss", "drop", note="of the run's frames"),
+            FaultSeen("step", "attitude-step", off_px=0.0123),
+            FaultSeen("none", "attitude-step"),
+        ]
+    )
+    assert [" ".join(line.split()) for line in lines] == [
+        "fault ghost (false-star): 1000 e- asked for, 800 seen, +0.2423 mag, 0.5000 px off",
+        "fault loss (drop): of the run's frames",
+        "fault step (attitude-step): 0.0123 px off",
+        "fault none (attitude-step): nothing was found",
+    ]

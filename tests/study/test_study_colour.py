@@ -13,8 +13,20 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from hilstar.display.response import srgb_response
 from hilstar.instruments.study import colour
-from hilstar.instruments.study.colour import MONO, PANELS, PUBLISHED_SUBTYPES, SENSORS
+from hilstar.instruments.study.colour import (
+    MONO,
+    NM,
+    PANELS,
+    PUBLISHED_SUBTYPES,
+    SENSORS,
+    class_rows,
+    curve_of,
+    light_by_primary,
+    write_spectrum,
+)
+from hilstar.sky.spectral_types import LETTERS
 from tests.support.claims import holds
 from tests.support.recorded import assert_recorded, assert_row
 
@@ -232,28 +244,6 @@ def test_the_chart_of_choices_has_a_point_of_each(figures, tmp_path):
             assert (fill == "none") == (row.method == "round")
 
 
-def test_a_frame_s_light_by_primary_is_its_codes_by_each_channel():
-    """Levels by channel, levels of a response that steals bits, and grey ones."""
-    rgb = np.array([[0, 0, 0], [255, 0, 255], [10, 20, 30]])
-    light = colour.srgb_response(8).light
-
-    def bench(table):
-        response = SimpleNamespace(rgb=table)
-        calibration = SimpleNamespace(response=response)
-        config = SimpleNamespace(monitor=SimpleNamespace(bits=8))
-        return SimpleNamespace(calibration=calibration, config=config)
-
-    by_channel = np.array([[[1, 2, 3], [255, 0, 0]]])
-    np.testing.assert_array_equal(
-        colour.light_by_primary(bench(None), by_channel), light[by_channel]
-    )
-    grey = np.array([[0, 255, 17]])
-    shown = colour.light_by_primary(bench(None), grey)
-    np.testing.assert_array_equal(shown, np.stack([light[grey]] * 3, axis=2))
-    stolen = colour.light_by_primary(bench(rgb), np.array([[2, 1]]))
-    np.testing.assert_array_equal(stolen, [[light[[10, 20, 30]], light[[255, 0, 255]]]])
-
-
 def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, monkeypatch):
     """The share of red light by class and the mosaic are measured here; the other parts planted."""
     gamut = [colour.GamutRow("OLED", "a", 1.0, 0.5, 0.25, 0.75, 3.0, 2.0, 9.0)]
@@ -300,3 +290,58 @@ def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, mo
     for line, row in zip(findings[2:], quoted, strict=True):
         star = f"a star of 1 px, {float(row['temperature_k']):g} K"
         assert line == f"{star}, is {float(row['rms_px']):.3f} px off rms in a {row['image']}"
+
+
+def test_a_dye_falls_to_one_over_e_at_its_half_width():
+    curve = curve_of(((600.0, 40.0, 0.5), (850.0, 20.0, 0.2)))
+    at = dict(zip(NM.tolist(), curve.tolist(), strict=True))
+    assert at[600.0] == pytest.approx(0.5)
+    assert at[640.0] == at[560.0] == pytest.approx(0.5 / np.e)
+    assert at[870.0] == pytest.approx(0.2 / np.e, rel=1e-6)
+
+
+def test_a_spectrum_s_file_has_its_columns(tmp_path):
+    write_spectrum(
+        tmp_path / "s.csv", "nm,a,b", np.array([400.0, 402.0]), np.array([1.0, 0.25]), NM[:2]
+    )
+    lines = (tmp_path / "s.csv").read_text().splitlines()
+    assert lines == ["nm,a,b", "400,1,380", "402,0.25,382"]
+
+
+@pytest.mark.parametrize("kind", ["triples", "grey", "stealing"])
+def test_light_by_primary_is_each_one_s_own_code(kind):
+    """Relative to its own white, by sRGB; grey has all three alike."""
+    srgb = srgb_response(8)
+    triples = np.array([[[10, 20, 30], [255, 0, 128]]], dtype=np.uint16)
+    levels, rgb = triples, None
+    if kind == "grey":
+        levels = np.array([[7, 200]], dtype=np.uint16)
+        triples = np.repeat(levels[..., None], 3, axis=2)
+    if kind == "stealing":
+        rgb = triples[0]
+        levels = np.array([[0, 1]], dtype=np.uint16)
+    bench = SimpleNamespace(
+        config=SimpleNamespace(monitor=SimpleNamespace(bits=8)),
+        calibration=SimpleNamespace(response=SimpleNamespace(rgb=rgb)),
+    )
+    np.testing.assert_array_equal(light_by_primary(bench, levels), srgb.light[triples])
+
+
+def test_a_class_s_figures_are_of_its_own_stars():
+    """Of stars O, B, A, F, G, K and M in turn, two of each."""
+    count = len(LETTERS)
+    kinds = np.tile(np.arange(count, dtype=float), 2)
+    figure = np.arange(2.0 * count)
+    stars = SimpleNamespace(
+        kinds=kinds,
+        wanted=np.stack([500 + figure, figure], axis=1),
+        off=figure,
+        subtypes=2 * figure,
+        subtypes_white=3 * figure,
+    )
+    rows = class_rows("panel", "sensor", stars)
+    assert [row.class_ for row in rows] == list(LETTERS)
+    for place, row in enumerate(rows):
+        mean = place + count / 2
+        assert (row.stars, row.off_nm, row.mean_nm) == (2, mean, 500 + mean)
+        assert (row.subtypes, row.subtypes_white) == (2 * mean, 3 * mean)

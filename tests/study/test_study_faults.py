@@ -177,3 +177,15 @@ def test_a_small_study_of_faults_draws_its_rows(small_run):
         np.testing.assert_allclose(drawn["without"], [float(row["without_ms"]) for row in own])
         np.testing.assert_allclose(drawn["with the fault"], [float(row["frame_ms"]) for row in own])
     assert len(run.told[0]) == 4
+
+
+def test_even_light_of_white_leaves_no_star_and_none_leaves_all_of_a_small_bench(bench_with):
+    bench = bench_with("[sky]\nfaintest_v_mag = 6.0\n")
+    clear = faults.stray_light(bench, 0.0)
+    assert (clear.quantisation, clear.share_of_white) == (bench.config.render.quantisation, 0.0)
+    assert clear.stars > 3 and clear.lost < 0.5
+    white = faults.stray_light(bench, 1.0)
+    assert (white.stars, white.lost) == (clear.stars, 1.0)
+    some = faults.stray_light(bench, 0.2)
+    assert clear.median_mag <= some.median_mag < white.median_mag
+    assert clear.p95_mag <= some.p95_mag

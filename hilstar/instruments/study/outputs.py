@@ -301,7 +301,7 @@ def _zoom(scene: OutputScene, outputs: Outputs) -> tuple[str, tuple[float, float
         stars = stars[stars["hip"] == scene.zoom_hip]
     if not len(stars):
         height, width = outputs.noisy.dn.shape
-        middle_px = (width / 2, height / 2)
+        middle_px = ((width - 1) / 2, (height - 1) / 2)
         return "the middle", middle_px
     star = stars[0]
     if star["hip"] > 0:

@@ -175,9 +175,15 @@ def test_of_one_pose_the_file_holds_both_lenses_only_where_the_tracker_s_is_not_
     found = calibrate_geometry(
         plan, nominal, observed_dots(BENCH, plan, tracker, rng), rng, tracker_known=True
     )
-    (note,) = (line for line in lines_of(found) if line.startswith("one pose"))
+    lines = lines_of(found)
+    (note,) = (line for line in lines if line.startswith("one pose"))
     assert ("this file holds both" in note) == (lens is None)
     assert ("holds the collimator alone" in note) == (lens is not None)
+    error, chosen = found.uncertainty, found.chosen
+    for name, each in (("a star's place", error), ("held-out dots", chosen)):
+        (line,) = (line for line in lines if line.startswith(name))
+        assert f"{each.rms_arcsec:.3f} arcsec rms, {each.max_arcsec:.3f} max" in line
+        assert each.max_arcsec > each.rms_arcsec
 
 
 def test_the_codes_alone_name_every_dot(rng):

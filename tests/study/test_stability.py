@@ -49,6 +49,23 @@ def test_hilstar_is_right_where_the_method_named_there_is_not(measure):
     assert_right_where_the_other_is_not(measure())
 
 
+def test_a_wide_star_s_light_is_said_by_how_much_it_is_off():
+    case = image.wide_star()
+    peak, light = case.happens.split(" of the peak; the star's flux off by ")
+    assert float(peak) == pytest.approx(case.figures.error, rel=0.5)
+    assert abs(float(light)) < 1e-4
+
+
+def test_stars_stand_in_the_middles_of_their_own_parts():
+    x_px, y_px = image.middles()
+    number = np.arange(image.COUNT)
+    middle_px = (number + 0.5) * image.TILE_PX - 0.5
+    # each at another phase of a pixel
+    assert len(set((x_px[: image.COUNT] % 1).round(6).tolist())) == image.COUNT
+    for place, wanted in ((x_px, np.tile(middle_px, image.COUNT)), (y_px, np.repeat(middle_px, 8))):
+        np.testing.assert_allclose(place, wanted, atol=0.5)
+
+
 def test_what_was_recorded_is_right_where_the_other_is_not():
     cases = [*recorded("catalogue_and_geometry"), *recorded("detector_and_attitude")]
     assert len(cases) == CASES - len(image.DRAWN)

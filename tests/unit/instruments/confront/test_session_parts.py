@@ -17,7 +17,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.reading import parse_toml
 from hilstar.instruments.confront import session as sessions
 from hilstar.instruments.confront.background import FixedPattern
-from hilstar.instruments.confront.images import Photograph
+from hilstar.instruments.confront.images import Photograph, _planes
 from hilstar.instruments.confront.light import LightFit
 from hilstar.instruments.confront.measured_bench import (
     PER_PX,
@@ -31,6 +31,7 @@ from hilstar.instruments.confront.measured_bench import (
     vignetting_of,
 )
 from hilstar.instruments.confront.photon_transfer import PixelFit
+from hilstar.instruments.confront.run import _base
 from hilstar.instruments.confront.session import (
     PIVOT_NM,
     WIDE_PX,
@@ -350,3 +351,27 @@ def test_stars_are_first_seen_at_their_sources():
     assert places.x_px.tolist() == [2.0, 3.0]
     assert places.y_px.tolist() == [20.0, 30.0]
     np.testing.assert_array_equal(places.vectors, np.eye(3)[[2, 0]])
+
+
+def test_a_camera_is_guessed_of_the_photographs_own_size(tmp_path) -> None:
+    """The bench file's where they have its pixels; of a mosaic's planes half as long in pixels."""
+    file = bench(tmp_path)
+    whole = _base(file, [photograph(np.zeros((600, 800)))])
+    assert whole.focal_length_px == pytest.approx(4000.0)
+    assert whole.principal_point_px == (399.5, 299.5)
+    half = _base(file, [photograph(np.zeros((300, 400)))] * 2)
+    assert half.resolution_px == (400, 300)
+    assert half.focal_length_px == pytest.approx(2000.0)
+    assert half.principal_point_px == (199.5, 149.5)
+    with pytest.raises(InputError, match="have different sizes"):
+        _base(file, [photograph(np.zeros((300, 400))), photograph(np.zeros((400, 300)))])
+
+
+def test_planes_of_a_mosaic_are_every_second_pixel_by_their_letters() -> None:
+    dn = np.arange(24.0).reshape(4, 6)
+    planes = {plane.plane: plane.dn for plane in _planes(photograph(dn), "GRBG")}
+    assert list(planes) == ["g1", "r", "b", "g2"]
+    assert planes["g1"].tolist() == [[0, 2, 4], [12, 14, 16]]
+    assert planes["r"].tolist() == [[1, 3, 5], [13, 15, 17]]
+    assert planes["b"].tolist() == [[6, 8, 10], [18, 20, 22]]
+    assert planes["g2"].tolist() == [[7, 9, 11], [19, 21, 23]]

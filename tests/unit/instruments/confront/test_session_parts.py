@@ -41,6 +41,7 @@ from hilstar.instruments.confront.session import (
     _middles,
     _reach_px,
     _seen_at,
+    _star_light,
     _why_not,
     check_focus,
     corrected,
@@ -375,3 +376,30 @@ def test_planes_of_a_mosaic_are_every_second_pixel_by_their_letters() -> None:
     assert planes["r"].tolist() == [[1, 3, 5], [13, 15, 17]]
     assert planes["b"].tolist() == [[6, 8, 10], [18, 20, 22]]
     assert planes["g2"].tolist() == [[7, 9, 11], [19, 21, 23]]
+
+
+def test_stars_of_all_photographs_are_in_one_row_each_with_its_image_and_plane() -> None:
+    """Of a mosaic's red and second green planes, and of an image of one plane."""
+    shots = []
+    for number, plane in enumerate(("r", "g2", "")):
+        star = np.array([number, 2])
+        found = SimpleNamespace(
+            dn=np.array([10.0, 20.0]) + number,
+            sigma_dn=np.array([1.0, 2.0]) + number,
+            x_px=np.array([410.0, 410.0 + 300 * number]),
+            y_px=np.array([290.0, 690.0]),
+        )
+        sky = SimpleNamespace(v_mag=np.array([1.0, 2.0, 3.0]), bv_mag=np.array([0.1, 0.2, 0.3]))
+        photo = SimpleNamespace(plane=plane)
+        clean = np.array([True, number == 1])
+        shots.append(SimpleNamespace(found=found, sky=sky, photo=photo, star=star, clean=clean))
+    light = _star_light(shots, CAMERA)  # type: ignore[arg-type]
+    assert light.image.tolist() == [0, 0, 1, 1, 2, 2]
+    assert light.plane.tolist() == [1, 1, 2, 2, 0, 0]
+    assert light.dn.tolist() == [10.0, 20.0, 11.0, 21.0, 12.0, 22.0]
+    assert light.sigma_dn.tolist() == [1.0, 2.0, 2.0, 3.0, 3.0, 4.0]
+    assert light.v_mag.tolist() == [1.0, 3.0, 2.0, 3.0, 3.0, 3.0]
+    assert light.bv_mag.tolist() == [0.1, 0.3, 0.2, 0.3, 0.3, 0.3]
+    assert light.clean.tolist() == [True, False, True, True, True, False]
+    # half of the diagonal of 800 x 600 px is 500 px
+    assert light.radius2 == pytest.approx([0.0, 0.64, 0.0, 1.0, 0.0, 2.08])

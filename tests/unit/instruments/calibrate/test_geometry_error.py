@@ -177,3 +177,62 @@ def test_no_dot_is_planned_whose_window_leaves_the_image(tmp_path, psf_sigma_px)
     reach = dot_centroids(seen.dot_sigma_px).radius_px
     assert min(x.min(), y.min()) >= reach
     assert max(x.max(), y.max()) <= 255 - reach
+
+
+def test_each_number_s_stated_error_is_that_of_fits_of_many_noises(tmp_path):
+    """Neither less nor more: of the whole lens's numbers, and over the field."""
+    file, seen = tilted_screen(tmp_path)
+    fits, sigmas, over_field = [], [], []
+    for seed in range(SEEDS):
+        problem, data = dots_of(file, seen, seed, 0.05)
+        found = fit(problem, Model(BROWN_CONRADY), 0, data)
+        stated = uncertainty_of(problem, found, data)
+        whole = dict(zip(found.model.names, found.numbers, strict=False))
+        fits.append([geometric_fit.STEPS[name] * number for name, number in whole.items()])
+        sigmas.append([stated.sigma[name] for name in whole])
+        over_field.append(field_error_arcsec(found.geometry, seen) / stated.rms_arcsec)
+    sigmas_off = np.array(fits) / np.array(sigmas)
+    # every truth here is 0
+    rms = np.sqrt((sigmas_off**2).mean())
+    assert 0.6 < rms < MAX_RMS_SIGMAS
+    assert 0.6 < np.sqrt(np.mean(np.square(over_field))) < MAX_RMS_SIGMAS
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_slopes_of_places_are_what_a_step_moves(tmp_path, degree):
+    problem, data = dots_of(*tilted_screen(tmp_path, tilt_deg=1.0), 3, 0.01)
+    found = fit(problem, Model(BROWN_CONRADY), degree, data)
+    x_px, y_px = np.array([30.0, 500.0, 320.0]), np.array([20.0, 300.0, 100.0])
+    along_x, along_y = geometric_fit._slopes_of_places(problem, found, x_px, y_px)
+    size = found.model.size
+    assert along_x.shape == along_y.shape == (3, size + (degree and (degree + 1) * (degree + 2)))
+    directions = found.geometry.monitor.rays(x_px, y_px)
+    for number in range(size):
+        places = []
+        for sign in (-1, 1):
+            step = np.zeros(size)
+            step[number] = sign * 1e-3
+            numbers = found.numbers[:size] + step
+            moved = geometric_fit.geometry_of(
+                found.model, problem.nominal, problem.q_poses, numbers
+            ).monitor
+            lens = dataclasses.replace(moved.lens, field=found.geometry.monitor.lens.field)
+            moved = dataclasses.replace(moved, lens=lens)
+            places.append(np.stack(moved.project(directions @ moved.cam_to_image.T)))
+        by_step = (places[1] - places[0]) / 2e-3
+        np.testing.assert_allclose([along_x[:, number], along_y[:, number]], by_step, atol=2e-3)
+
+
+def test_scatter_of_dots_is_of_their_means_in_sigmas_of_these(rng):
+    """Dots of 1 to 9 frames, each off by its noise, and then by one twice as large as all its
+    frames' mean leaves.
+    """
+    count = rng.integers(1, 10, 4000)
+    site = np.repeat(np.arange(4000), count)
+    off = rng.normal(size=(2, len(site)))
+    scatter = geometric_fit._scatter_of_dots(site, off.ravel(), 0)
+    assert scatter == pytest.approx(1.0, rel=0.05)
+    off += (2 / np.sqrt(count) * rng.normal(size=(2, 4000)))[:, site]
+    assert geometric_fit._scatter_of_dots(site, off.ravel(), 0) == pytest.approx(5**0.5, rel=0.05)
+    few = geometric_fit._scatter_of_dots(site, off.ravel(), 6000)
+    assert few == pytest.approx((5 * 8000 / 2000) ** 0.5, rel=0.05)

@@ -72,3 +72,24 @@ def test_a_drift_is_the_trend_of_repeats_over_the_whole_run(tmp_path, rng, per_s
             check_drift(measured)
     else:
         assert check_drift(measured) == drift
+
+
+def test_what_repeats_scatter_is_beyond_their_stated_errors(tmp_path, rng):
+    """Readings of 1 % of noise and of stated errors of 0.6 %, whose levels scatter by both."""
+    rows = ["code,channel,value,sigma"]
+    for code in (0, 50, 100, 150, 200, 255):
+        light = 1e-3 if code == 0 else float(code)
+        for _ in range(80):
+            value = light * (1 + 0.01 * rng.normal() + 0.006 * rng.normal())
+            rows.append(f"{code},w,{value!r},{0.006 * light!r}")
+    measured = read_measurements(table_of(tmp_path, "\n".join(rows) + "\n"))
+    levels = group_levels(measured, "w")
+    assert levels.relative_noise == pytest.approx(0.01, rel=0.15)
+    assert levels.additive_noise == 0.0
+    # stated errors that are all there is leave no other
+    quiet = []
+    for row in rows[1:]:
+        code, channel, value, sigma = row.split(",")
+        quiet.append(",".join((code, channel, value, repr(10 * float(sigma)))))
+    over = read_measurements(table_of(tmp_path, "\n".join([rows[0], *quiet]) + "\n"))
+    assert group_levels(over, "w").relative_noise == 0.0

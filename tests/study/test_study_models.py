@@ -758,3 +758,21 @@ def test_black_bodies_are_as_wrong_as_recorded(monkeypatch):
     np.testing.assert_allclose(
         rows["ccd47-20", models.BODY].percent, 100 * (body / real - 1), atol=1e-3
     )
+
+
+def test_a_study_s_findings_are_of_its_figures_in_their_order(tmp_path, monkeypatch):
+    def figure(name):
+        return lambda folder: models.ChartFinding(name, f"{name} in {folder.name}")
+
+    def of_sensor(folder, sensor):
+        return models.ChartFinding(f"rapp_{sensor}", folder.name)
+
+    monkeypatch.setattr(models, "FIGURES", (figure("b"), figure("a")))
+    monkeypatch.setattr(models, "rapp", of_sensor)
+    found = models.run(tmp_path)
+    names = ["rapp_ccd47-20", "rapp_kai-4021", "b", "a"]
+    assert [finding.figure for finding in found] == names
+    rows = csv_rows(tmp_path / "findings.csv")
+    assert [(row["figure"], row["finding"]) for row in rows] == [
+        (finding.figure, finding.text) for finding in found
+    ]

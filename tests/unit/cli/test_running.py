@@ -30,6 +30,7 @@ from hilstar.cli.running import (
     say_beat,
     scpi_listener,
 )
+from hilstar.cli.shown_run import run_files
 from hilstar.cli.tracker import open_camera, recorded
 from hilstar.instruments.calibrate import grabbed_dots
 from hilstar.instruments.calibrate.grabbed_dots import DotImages
@@ -310,3 +311,20 @@ def test_a_ledger_s_name_has_the_time_of_its_start_where_it_asks_for_it():
     name = dated_ledger(Path("a/run-{utc}.mcap")).name
     stamp = datetime.strptime(name, "run-%Y%m%dT%H%M%SZ.mcap").replace(tzinfo=UTC)
     assert before <= stamp <= datetime.now(UTC)
+
+
+def test_the_files_of_a_run_are_read_or_written_and_never_both(tmp_path):
+    (tmp_path / "bench.toml").write_text(SMALL_BENCH)
+    file = read_bench_file(tmp_path / "bench.toml")
+    scenario, log = tmp_path / "scenario.toml", tmp_path / "log.csv"
+    scenario.write_text(SCENARIO)
+    ledger = tmp_path / "run.mcap"
+    options = SimpleNamespace(ledger=ledger, scenario=scenario, overwrite=False, ledger_split=None)
+    found = run_files(options, file, [log], [tmp_path / "out.csv"])
+    assert found.ledger == ledger and len(found.scenario.faults) == 2
+    for inputs, output in (([log], log), ([], scenario), ([], file.path), ([], ledger)):
+        with pytest.raises(InputError):
+            run_files(options, file, inputs, [output])
+    ledger.write_bytes(b"a run")
+    with pytest.raises(InputError, match=r"run\.mcap"):
+        run_files(options, file)

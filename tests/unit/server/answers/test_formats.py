@@ -155,6 +155,16 @@ def test_however_a_stream_is_cut_the_answers_are_the_same(name, rng):
     assert [answer.t_ns for answer in bits] == whole
 
 
+def test_of_damaged_frames_in_a_row_each_is_refused_once_and_whole():
+    """Without sync bytes each byte of them is tried as a frame's first, in silence."""
+    keys, framed_as = FRAMINGS["fixed"]
+    good = [framed_as(body_of(seconds=k)) for k in range(4)]
+    damaged = [frame[:20] + bytes([frame[20] ^ 0x55]) + frame[21:] for frame in good]
+    found = decoder_of(**keys).feed(5, b"".join([*damaged, good[3]]))
+    assert [each.raw for each in found] == [*damaged, good[3]]
+    assert len(answers(found)) == 1 and answers(found)[0] is found[-1]
+
+
 @pytest.mark.parametrize("name", FRAMINGS)
 def test_no_damaged_frame_is_taken_for_an_answer(name, rng):
     """Some 100 000 mutated bytes of each framing: a wrong answer would need a CRC-16 that is

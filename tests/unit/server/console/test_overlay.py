@@ -86,3 +86,13 @@ def test_the_sky_has_the_brightest_star_first_and_the_screen_s_corners(overlay_b
     corners = np.array(told["screen_cam"])
     half = np.arctan(np.hypot(160, 120) * 57.65e-6 / 60e-3)
     assert np.arccos(corners[:, 2]) == pytest.approx(half, abs=1e-5)
+
+
+def test_bodies_are_on_the_map_apart_from_stars(bench_with):
+    """Sun, Moon and planets, each by its name; none of them is a star of it."""
+    keys = '[sky]\nepoch_utc = "2026-11-29T00:00:00Z"\n[sky.bodies]\nmoon = true\nplanets = true\n'
+    told = overlay_of(bench_with(keys)).sky()
+    names = [place.label for place in told.moving]
+    assert {"Moon", "Venus", "Mars", "Jupiter", "Saturn"} <= set(names)
+    assert names[:2] == ["Moon", "Venus"]  # the brightest first
+    assert not {place.label for place in told.stars} & set(names)

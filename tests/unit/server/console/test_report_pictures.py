@@ -110,6 +110,11 @@ def test_a_bench_that_has_changed_since_draws_with_a_caution_and_one_that_is_gon
     none = run_pictures(figures, tmp_path / "run.mcap")
     assert none["pictures"] == [] and "bench.toml" in none["no_pictures"]
     assert none["sky"].stars[0].label == "α CMa"
+    there = tmp_path / "there" / "bench.toml"
+    gone = run_pictures(
+        RunFigures({"bench_text": "[monitor]\n", "bench_file": str(there)}), tmp_path / "run.mcap"
+    )
+    assert str(there) in gone["no_pictures"]
 
 
 def test_of_a_ledger_that_was_cut_off_what_is_whole_is_reported_and_the_page_says_so(

@@ -40,7 +40,7 @@ from hilstar.instruments.study import (
 from hilstar.instruments.study.economy import EffortComparison
 from hilstar.instruments.study.outputs import _field_deg, thesis_total_e
 from hilstar.instruments.study.prediction import auto_times
-from hilstar.instruments.study.sweep import beaten_by
+from hilstar.instruments.study.sweep import Spent, beaten_by, spent
 from hilstar.instruments.study.timing import stripe_depth
 from hilstar.optics.camera import Camera
 from hilstar.optics.frame_motion import CameraTurn
@@ -436,3 +436,15 @@ def test_a_field_s_stars_are_off_by_their_way_to_their_pixels(wide_bench):
     assert np.abs(off_px).max() <= 0.5
     places = np.stack([sprites.x_px, sprites.y_px])[:, inside]
     np.testing.assert_allclose((places + off_px) % 1 % 1, 0, atol=1e-9)
+
+
+def test_a_work_s_time_is_milliseconds_of_the_wall_and_of_the_processor(monkeypatch):
+    clocks = {"wall_s": 10.0, "cpu_s": 3.0}
+
+    def work():
+        clocks["wall_s"] += 0.25
+        clocks["cpu_s"] += 0.125
+
+    monkeypatch.setattr("time.perf_counter", lambda: clocks["wall_s"])
+    monkeypatch.setattr("time.process_time", lambda: clocks["cpu_s"])
+    assert spent(work) == Spent(250.0, 125.0)

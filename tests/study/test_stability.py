@@ -49,6 +49,36 @@ def test_each_case_of_the_command_is_right(stability_study, number):
     assert_right_where_the_other_is_not(stability_study[1][number])
 
 
+def test_a_wide_star_s_light_is_said_by_how_much_it_is_off():
+    case = image.wide_star()
+    peak, light = case.happens.split(" of the peak; the star's flux off by ")
+    assert float(peak) == pytest.approx(case.figures.error, rel=0.5)
+    assert abs(float(light)) < 1e-4
+
+
+def test_light_by_index_is_that_of_stars_apart_and_of_the_last_of_those_at_one_place():
+    on = image.target(image.SIGMA_PX, (64, 48))
+    first = image.one_star(15.3, 20.8, on, 100.0)
+    second = image.one_star(45.6, 31.1, on, 50.0)
+    both = image.join_sprites([first, second], first.footprint_px)
+    wanted = image.linear_image(both, on.resolution_px, on.psf)
+    np.testing.assert_allclose(
+        image.indexed_light(both, (64, 48)), wanted, atol=1e-4 * wanted.max()
+    )
+    at_one = image.join_sprites([first, image.one_star(15.3, 20.8, on, 7.0)], first.footprint_px)
+    assert image.indexed_light(at_one, (64, 48)).sum() == pytest.approx(7.0, rel=1e-4)
+
+
+def test_stars_stand_in_the_middles_of_their_own_parts():
+    x_px, y_px = image.middles()
+    number = np.arange(image.COUNT)
+    middle_px = (number + 0.5) * image.TILE_PX - 0.5
+    # each at another phase of a pixel
+    assert len(set((x_px[: image.COUNT] % 1).round(6).tolist())) == image.COUNT
+    for place, wanted in ((x_px, np.tile(middle_px, image.COUNT)), (y_px, np.repeat(middle_px, 8))):
+        np.testing.assert_allclose(place, wanted, atol=0.5)
+
+
 def test_what_was_recorded_is_right_where_the_other_is_not():
     cases = [*recorded("catalogue_and_geometry"), *recorded("detector_and_attitude")]
     assert len(cases) == CASES - len(image.DRAWN)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,7 +30,13 @@ from hilstar.instruments.study.tradeoff.light import (
     shared_knots,
     trapezoid,
 )
-from hilstar.instruments.study.tradeoff.places import SPRITE_PSF
+from hilstar.instruments.study.tradeoff.places import (
+    EVENLY,
+    EXACT_NODES,
+    GAUSS,
+    SPRITE_PSF,
+    smear_methods,
+)
 from hilstar.instruments.study.tradeoff.run import STEPS
 from hilstar.instruments.study.trials import (
     Figure,
@@ -439,3 +446,20 @@ def test_a_rule_reaches_over_all_that_curves_share():
         assert (nm**power) @ weight_m == pytest.approx(closed * 1e-9, rel=1e-12)
         nm, weight_m = trapezoid(1.0, *curves)
         assert (nm**power) @ weight_m == pytest.approx(closed * 1e-9, rel=1e-5)
+
+
+def test_sprites_of_a_path_stand_about_its_middle_and_share_its_light():
+    drawn = []
+    bench = SimpleNamespace(chain=lambda at, share, stars: drawn.append((at, share)))
+    methods = smear_methods(bench)
+    for method in methods.values():
+        method(None)
+    counts = [len(at) for at, _ in drawn]
+    assert sorted(counts) == sorted((*GAUSS, EXACT_NODES, *EVENLY))
+    for at, share in drawn:
+        assert share.sum() == pytest.approx(1.0)
+        assert share @ at == pytest.approx(0.0, abs=1e-12)
+        # of a path from -1/2 to 1/2, all but what so many sprites leave out
+        spread = share @ at**2
+        even = (1 - 1 / len(at) ** 2) / 12
+        assert spread == pytest.approx(even if np.ptp(share) == 0 else 1 / 12, rel=1e-9)

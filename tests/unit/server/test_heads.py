@@ -13,6 +13,7 @@ from contextlib import nullcontext
 from itertools import count, pairwise
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -218,6 +219,14 @@ def test_a_run_of_heads_is_what_each_said_and_what_came_in_went_on_but_for_a_que
         made.append(words[1:])
         return python(ends[int(str(words[1]))])
 
+    begun: list[HeadProcess] = []
+
+    class Noted(HeadProcess):
+        def __init__(self, *given: Any) -> None:
+            super().__init__(*given)
+            begun.append(self)
+
+    monkeypatch.setattr(heads, "HeadProcess", Noted)
     monkeypatch.setattr(heads, "head_command", command)
     feed = SimpleNamespace(given=[], give=lambda arrival: feed.given.append(arrival.event))
     monkeypatch.setattr(heads, "Feed", lambda endpoint: nullcontext(feed))
@@ -238,7 +247,7 @@ def test_a_run_of_heads_is_what_each_said_and_what_came_in_went_on_but_for_a_que
                     SimpleNamespace(event=event, host_ns=5, peer=None, back=None)
                     for event in events
                 ]
-            if "c: waits" in said and self.looks > 40:
+            if "c: waits" in said and None not in (head.code for head in begun[:2]):
                 os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(0.01)
             return []
@@ -270,12 +279,13 @@ def test_a_head_without_a_sign_of_life_is_killed_and_begun_again(tmp_path, monke
     monkeypatch.setattr(heads, "STARTS_S", 60.0)
     waits = f"{READY} import time; time.sleep(60)"
     lines: list[str] = []
-    head = HeadProcess(
-        "head",
-        lambda number, drawn_s: python(f"{READY} print(5)" if number else waits),
-        lines.append,
-        tmp_path / "life",
-    )
+
+    def command(number: int, drawn_s: float) -> list[str]:
+        if number:
+            monkeypatch.setattr(heads, "STALLED_S", 60.0)
+        return python(f"{READY} print(5)" if number else waits)
+
+    head = HeadProcess("head", command, lines.append, tmp_path / "life")
     assert ended(head) == (0, 1)
     assert head.output == b"5\n" and len(lines) == 1
     assert lines[0].startswith("head: no frame for 0.") and "it is started again" in lines[0]

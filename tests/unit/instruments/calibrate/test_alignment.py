@@ -20,7 +20,7 @@ from hilstar.basics.rotation import (
     normalise,
     to_rotation_vector,
 )
-from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.alignment import (
     align,
@@ -29,7 +29,13 @@ from hilstar.instruments.calibrate.alignment import (
     remarks_of,
     residual_of,
 )
-from hilstar.instruments.calibrate.attitude_pairs import COMMANDED, Pairs, RotationFit, _angles_to
+from hilstar.instruments.calibrate.attitude_pairs import (
+    COMMANDED,
+    Pairs,
+    RotationFit,
+    _angles_to,
+    _weights,
+)
 from tests.support.refusals import refusal
 
 CAMERA = monitor_camera(
@@ -287,3 +293,23 @@ def test_a_mean_s_covariance_is_that_of_independent_groups(rng):
     one, dof = RotationFit(fit.q, residual_rad, weight).covariance_rad2(np.zeros(12, dtype=int))
     assert one == pytest.approx(used.T @ used / (11 * 10))
     assert dof == 10
+
+
+def test_pairs_weigh_by_their_own_residuals_across_and_about_the_boresight():
+    """In the medians of those near, about the boresight ten times as wide: half a cut of each
+    weighs as half a cut across, a far one not.
+    """
+    unit = np.array([[1.0, 1.0, 10.0]]) * 1e-4 / MAD_TO_SIGMA
+    signs = np.array([[1, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]])
+    usual = np.repeat(signs, 6, axis=0) * unit
+    more = np.array([[2e-4, 0, 0], [0, 2e-4, 0], [0, 0, 2e-3], [0, 0, 4.1e-3], [0, 0, 0]])
+    residual = np.concatenate([usual, more])
+    near = np.ones(len(residual), dtype=bool)
+    near[-1] = False
+    weights = _weights(residual, near, 4.0)
+    half = (1 - 0.25) ** 2
+    np.testing.assert_allclose(weights[-5:], [half, half, half, 0.0, 0.0], rtol=1e-9)
+    # three squares of a sigma's share each
+    np.testing.assert_allclose(weights[:-5], (1 - 3 / MAD_TO_SIGMA**2 / 16) ** 2, rtol=1e-9)
+    # where all are beyond the cut, all those that are near count
+    np.testing.assert_array_equal(_weights(residual, near, 1e-3), near.astype(float))

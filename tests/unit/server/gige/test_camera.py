@@ -232,6 +232,7 @@ def test_a_client_that_is_not_allowed_is_never_answered_and_told_of_once():
         stranger.setblocking(False)
         with pytest.raises(BlockingIOError):
             stranger.recv(2048)
+        wait_for(lambda: notices.lasting, "it is told")
         assert notices.lasting.keys() == {"camera-sender-not-allowed"}
         assert "from 127.0.0.1 are dropped" in notices.lasting["camera-sender-not-allowed"]
 

@@ -266,3 +266,19 @@ def test_a_level_is_crossed_between_its_steps():
     assert np.isnan(found[2])
     shortest = bodies.shortest([Spent(3.0, 9.0), Spent(4.0, 7.0)])
     assert shortest == (3.0, 7.0)
+
+
+def test_each_bench_has_the_bodies_of_its_name():
+    planets = {"Mercury", "Venus", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune"}
+    wanted = {
+        "nothing": set(),
+        "observer": set(),
+        "planets": planets,
+        "Sun": {"Sun"},
+        "all": {*planets, "Moon", "Sun", "Earth"},
+    }
+    with bodies.opened(tuple(wanted)) as opened:
+        for name, known in wanted.items():
+            moving = opened[name].moving
+            shown = set() if moving is None else set(moving.names)
+            assert shown == known, name

@@ -200,3 +200,15 @@ def test_a_quick_study_s_table_chart_and_lines_are_those_of_its_limits(small):
         assert f"({stress}): " in run.told[1 + panel]
         assert run.told[1 + panel].startswith(axes.get_title(loc="left"))
     assert len(run.told) == 13 and run.told[0] == run.title("limits")
+
+
+@pytest.mark.parametrize("measured", [limits.coarse_codes, limits.faint_stars])
+def test_codes_leave_their_tolerance_where_the_whole_study_has_it(measured):
+    limit = measured(quick=False)
+    then = []
+    for row in csv_rows(ROOT / "results" / "limits.csv"):
+        if row["stress"] == limit.stress:
+            then.append((float(row["at"]), float(row["error"])))
+    at, error = np.array(then).T
+    assert limit.at.tolist() == at.tolist()
+    np.testing.assert_allclose(limit.error, error, rtol=0.02)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from contextlib import ExitStack
 from types import SimpleNamespace
 
@@ -81,15 +82,35 @@ def tradeoff_study(whole_study):
 
 
 @pytest.fixture(scope="module")
-def steps():
-    """The methods of each step by name, as they are before they are timed."""
-    planned = {}
+def planned():
+    """Each step by name, as it is before it is timed."""
+    found = {}
     for plan in STEPS:
         with ExitStack() as stack:
             step = plan(stack, True)
-        planned[step.name] = {trial.method: trial for trial in step.trials}
-    assert list(planned) == NAMES
-    return planned
+        found[step.name] = step
+    assert list(found) == NAMES
+    return found
+
+
+@pytest.fixture(scope="module")
+def steps(planned):
+    """The methods of each step by name."""
+    return {name: {trial.method: trial for trial in step.trials} for name, step in planned.items()}
+
+
+def test_sampling_at_pixel_centres_spoils_a_middle_pixel_and_a_narrow_star_s_flux(planned):
+    """A wide star's by its height over its integral, a narrow one's by the first term of Poisson's
+    sum.
+    """
+    (sigma_px,) = set(SPRITE_PSF.width_px)
+    of_pixel = math.erf(0.5 / math.sqrt(2) / sigma_px) ** 2
+    percent = 100 * (1 / (2 * math.pi * sigma_px**2) / of_pixel - 1)
+    term = 2 * math.exp(-2 * math.pi**2 * 0.4**2)
+    found = re.search(r"is (\d+) % too bright, .* off by ([\d.]+) mag", planned["psf"].remark)
+    assert found is not None
+    assert int(found[1]) == pytest.approx(percent, abs=0.51)
+    assert float(found[2]) == pytest.approx(-5 * math.log10(1 - term), abs=0.006)
 
 
 def default_of(step):

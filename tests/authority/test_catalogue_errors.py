@@ -12,7 +12,7 @@ from hilstar.basics.units import flux_ratio
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Optics, Photometry
 from hilstar.sky.facts import MOTION, facts_of, motion_at
-from hilstar.sky.spectrum import Curve, constant_curve, load_curve
+from hilstar.sky.spectrum import DATA_DIR, Curve, constant_curve, load_curve
 from hilstar.sky.synthetic import ab_electrons_per_s, colours, vega_electrons_per_s
 from tests.support.claims import holds
 
@@ -28,6 +28,7 @@ CALSPEC_VEGA_E_PER_S, BINNED_LIMIT = 2.5016e7, 3e-4
 # Sun: IAU 2015 zero point and nominal luminosity, V = -26.76 (Torres 2010). G2V of the library is
 # within 0.05 mag of its BC.
 SUN_BC_MAG, BC_LIMIT_MAG = -0.072, 0.05
+TABLE_MAG = 1e-3  # steps of 0.02 nm of a passband that ends in corners, and the table's own 1e-4
 
 
 def star_pm(start, years, parallax_arcsec):
@@ -119,3 +120,50 @@ def test_the_sun_s_bolometric_correction():
     assert colour(np.array([0.653]), np.array([0.702]), None)[0] == pytest.approx(
         SUN_BC_MAG, abs=BC_LIMIT_MAG
     )
+
+
+def planck(nm: np.ndarray, kelvin: float) -> np.ndarray:
+    """A black body's exitance, W/m2/m (CODATA 2018)."""
+    metre = nm * 1e-9
+    h, c, k = 6.62607015e-34, 299_792_458.0, 1.380649e-23
+    return 2 * np.pi * h * c**2 / metre**5 / np.expm1(h * c / (metre * k * kelvin))
+
+
+def kelvin_of(bv_mag: float) -> float:
+    """Ballesteros 2012, equation 14."""
+    return 4600 * (1 / (0.92 * bv_mag + 1.7) + 1 / (0.92 * bv_mag + 0.62))
+
+
+def mean_through(name: str, kelvin: float, photons: bool = False) -> float:
+    """The mean of a black body through a passband's file, its rows joined by straight lines."""
+    lines = (DATA_DIR / f"{name}.csv").read_text().splitlines()
+    rows = np.array([line.split(",") for line in lines if line[0].isdigit()], dtype=float)
+    nm = np.linspace(rows[0, 0], rows[-1, 0], 20_001)
+    response = np.interp(nm, *rows.T) * (nm if photons else 1.0)
+    return np.trapezoid(planck(nm, kelvin) * response) / np.trapezoid(response)
+
+
+@pytest.mark.parametrize("bv_mag", [-0.2, 0.65, 1.5])
+def test_a_black_body_has_its_colours_in_each_band(bv_mag):
+    """Bessell 1998, table A2: magnitude 0 in W/m2/m. Gaia's G is Vega's, and counts photons."""
+    kelvin = kelvin_of(bv_mag)
+    by_band = colours("blackbody", "ballesteros2012", Photometry())
+    v_mean = mean_through("johnson-v", kelvin) / 3.631e-2
+    zeros = {"u": 4.175e-2, "b": 6.32e-2, "r": 2.177e-2, "i": 1.126e-2}
+
+    def colour(name: str) -> float:
+        return float(by_band[name](np.array([bv_mag]), np.array([np.nan]), None)[0])
+
+    for band, zero in zeros.items():
+        ratio = mean_through(f"bessell-{band}", kelvin) / zero / v_mean
+        assert colour(band) == pytest.approx(-2.5 * np.log10(ratio), abs=TABLE_MAG)
+    # Vega's own G is 0: two black bodies differ in it by their light alone
+    both_k = kelvin, kelvin_of(0.0)
+    in_g = [mean_through("gaia-g", k, photons=True) / mean_through("johnson-v", k) for k in both_k]
+    white = float(by_band["g"](np.zeros(1), np.array([np.nan]), None)[0])
+    wanted_mag = -2.5 * np.log10(in_g[0] / in_g[1])
+    assert colour("g") - white == pytest.approx(wanted_mag, abs=TABLE_MAG)
+    assert white == pytest.approx(0.0, abs=0.1)
+    whole = 5.670374419e-8 * kelvin**4 / 2.518021002e-8
+    bolometric_mag = -2.5 * np.log10(whole / v_mean)
+    assert colour("bolometric") == pytest.approx(bolometric_mag, abs=TABLE_MAG)

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import os
+
 import numpy as np
 import pytest
 
+from hilstar.basics.errors import GpuError
+from hilstar.basics.units import NS_PER_S
 from hilstar.display.render.context import create_context
-from hilstar.display.render.driver import Driver
+from hilstar.display.render.driver import (
+    GL_TIMEOUT_EXPIRED,
+    GL_WAIT_FAILED,
+    Driver,
+    sleep_in_waits,
+)
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import gamma_response
@@ -85,3 +94,43 @@ def test_a_byte_of_each_table_is_noticed(quantisation):
                 data[-1] ^= 1
                 table.write(bytes(data))
             assert renderer.changed_tables() == number
+
+
+def test_nvidia_s_driver_sleeps_while_it_waits_unless_the_user_says_otherwise(monkeypatch):
+    monkeypatch.delenv("__GL_YIELD", raising=False)
+    sleep_in_waits()
+    assert os.environ["__GL_YIELD"] == "USLEEP"
+    monkeypatch.setenv("__GL_YIELD", "NOTHING")
+    sleep_in_waits()
+    assert os.environ["__GL_YIELD"] == "NOTHING"
+
+
+def test_a_driver_that_is_not_well_is_an_error_that_says_what_it_reports(context):
+    driver = Driver(context)
+    driver.check()
+    context.enable_direct(NO_SUCH_CAPABILITY)
+    with pytest.raises(
+        GpuError, match="the GL driver reports GL_INVALID_ENUM; begin the run again"
+    ):
+        driver.check()
+    driver.check()
+
+
+@pytest.mark.parametrize(
+    ("result", "words"),
+    [(GL_TIMEOUT_EXPIRED, "has not finished a frame for 10 s"), (GL_WAIT_FAILED, "cannot wait")],
+)
+def test_a_gpu_that_does_not_finish_or_cannot_be_waited_for_is_an_error(context, result, words):
+    """As many slices of a tenth of a second are waited for as make 10 s, and none after a failure."""
+    driver = Driver(context)
+    slices_ns = []
+
+    def wait(fence: int, flags: int, timeout_ns: int) -> int:
+        slices_ns.append(timeout_ns)
+        return result
+
+    driver._ask = driver._wait = wait
+    with pytest.raises(GpuError, match=words):
+        driver.wait()
+    waited_ns = 10 * NS_PER_S if result == GL_TIMEOUT_EXPIRED else 0
+    assert sum(slices_ns) == waited_ns

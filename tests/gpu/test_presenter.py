@@ -11,13 +11,21 @@ import numpy as np
 import pytest
 
 from hilstar.display.quantise import Panel
-from hilstar.display.render.aids import BLANK, CROSSHAIR, GRID, GRID_PX, LINE_SHARE, PATCH
+from hilstar.display.render.aids import (
+    BLANK,
+    CROSSHAIR,
+    GRID,
+    GRID_PX,
+    LINE_SHARE,
+    PATCH,
+    AidLevels,
+)
 from hilstar.display.render.backend import ScreenView, Target
 from hilstar.display.render.context import create_context
 from hilstar.display.render.numpy_backend import NumpyBackend, open_backend
 from hilstar.display.render.presenter import Presenter, changed_codes, level_texture
 from hilstar.display.render.renderer import Renderer
-from hilstar.display.response import srgb_response
+from hilstar.display.response import bit_stealing_response, srgb_response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Orientation
 from tests.support.stars import sprites_at
@@ -239,3 +247,25 @@ def test_primaries_apart_are_presented_in_their_own_colours(rng):
             others = [colour for colour in range(3) if colour != k]
             assert shown[y, x, k] > 100
             assert not shown[y - 4 : y + 5, x - 4 : x + 5, others].any()
+
+
+@pytest.mark.parametrize("overlay", AIDS)
+def test_aids_in_levels_are_those_in_codes(overlay, rng):
+    """For a run without a screen: where level k is code k, and a patch of a third of white."""
+    levels = levels_of(rng)
+    aids = AidLevels(srgb_response(8), 8, (150, 100))
+    shown = aids.laid_over(levels, overlay, PATCH_CODE / 255)
+    view = ScreenView(SIZE, SIZE, 8, cross_px=CROSS_PX)
+    assert (shown == wanted_codes(levels[..., None], view, overlay)[..., 0]).all()
+    assert (shown is levels) == (overlay == 0)
+
+
+def test_a_patch_of_stolen_bits_is_the_level_whose_codes_are_nearest():
+    grey = srgb_response(8)
+    stolen = bit_stealing_response((grey, grey, grey), (0.2126, 0.7152, 0.0722))
+    levels = np.zeros(SIZE[::-1], dtype=np.uint16)
+    shown = AidLevels(stolen, 8, (150, 100)).laid_over(levels, PATCH, PATCH_CODE / 255)
+    assert (stolen.rgb[shown] == PATCH_CODE).all()
+    lines = AidLevels(stolen, 8, (150, 100)).laid_over(levels, CROSSHAIR, 0.0)
+    assert (stolen.rgb[lines[0, 150]] == LINE).all()
+    assert (lines > 0).sum() == sum(SIZE) - 1

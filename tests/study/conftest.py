@@ -10,12 +10,16 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from functools import partial, wraps
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 
 from hilstar.basics import charts
 from hilstar.instruments.study.sweep import Load, OtherWork
-from tests.support.studies import Studied, studied
+from tests.support.studies import SmallRun, Studied, studied
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @pytest.fixture(scope="package", autouse=True)
@@ -58,3 +62,20 @@ def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Studi
     for it, also by a fixture of theirs; a study's own functions are held by the others.
     """
     return partial(studied, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SmallRun]:
+    """Runs a study's own function, which takes a folder first, in this process; what makes it
+    small is patched by the test.
+    """
+
+    def run(work: Callable[..., object], *arguments: object) -> SmallRun:
+        folder = tmp_path_factory.mktemp("small")
+        saved: dict[str, Figure] = {}
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(charts, "save", lambda drawn, path: saved.update({path.name: drawn}))
+            told = work(folder, *arguments)
+        return SmallRun(folder, told, saved)
+
+    return run

@@ -5,6 +5,7 @@ and a verdict can be wrong.
 from __future__ import annotations
 
 import math
+import re
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -13,8 +14,12 @@ import numpy as np
 import pytest
 from scipy.special import erf
 
+from hilstar.basics import charts
+from hilstar.basics.charts import two_digits
+from hilstar.display.response import table_response
 from hilstar.instruments.study.stability import CaseFigures, FailureCase, image, recorded
 from hilstar.instruments.study.stability import run as stability
+from hilstar.optics.sprites import pack_sprites
 from tests.support.tables import csv_rows
 
 CASES = 43
@@ -214,3 +219,230 @@ def test_the_chart_of_popping_shows_what_its_title_says(stability_study):
         for name in ("linear image", "codes, exact", "codes, round")
     }
     assert spread["linear image"] <= image.RIPPLE < spread["codes, exact"] < spread["codes, round"]
+
+
+# The failing method's error by a closed form, and how near it comes to that.
+FAULTS = (
+    # the Gaussian's value at its middle, for a light of 1
+    (image.narrow_star, 1 / (2 * math.pi * 0.1**2) - 1, 1e-3),
+    # a half float near 1 is off by 2^-12 at the most, a share by as much, over the peak's two
+    (image.wide_star, 2**-12 * math.sqrt(2 * math.pi) * 20, 0.05),
+    # a floor in all pixels but those within 4.6 px of the star
+    (image.floored_wings, 1e-7 * (512**2 - math.pi * 4.6**2), 1e-3),
+    (image.absurd_sigmas, 1.0, 1e-6),
+    (image.star_on_pixel_edge, 0.5, 1e-6),
+    (image.star_on_image_edge, 0.5, 1e-3),
+    # each pixel keeps one of the n stars on it, of a Poisson mean of 10 or 11 px squared
+    (image.many_stars, 1 - (1003 / 10.5) ** 2 / 1e5, 0.02),
+    (image.flux_range, 1.0, 1e-6),
+    # the first harmonic of pixels, 2 exp(-2 pi^2 sigma^2), both ways on both axes
+    (image.popping, 8 * math.exp(-2 * math.pi**2 * 0.5**2), 0.05),
+    # all that is over white
+    (image.spilled_beside, 1.0, 1e-3),
+    (image.spilled_everywhere, 1.0, 1e-3),
+)
+
+
+@pytest.mark.parametrize(
+    ("visit", "fault", "within"), FAULTS, ids=lambda value: getattr(value, "__name__", "")
+)
+def test_a_failing_method_is_off_by_what_its_own_arithmetic_says(visit, fault, within):
+    case = visit()
+    assert case.right, case
+    assert case.figures.fault == pytest.approx(fault, rel=within)
+    assert case.figures.tolerance < 0.01
+
+
+@pytest.mark.parametrize(
+    "visit",
+    [*image.CODES, image.negative_wings, image.no_stars],
+    ids=lambda visit: visit.__name__,
+)
+def test_exact_codes_and_light_are_right_where_the_usual_ways_are_not(visit):
+    case = visit()
+    assert case.right, case
+    assert not case.figures.fault <= case.figures.tolerance
+    assert case.figures.tolerance <= 1.0
+
+
+def test_a_case_says_its_own_figures():
+    """Each in words: how much light too large sigmas lose, and how far stars are moved."""
+    refused = image.absurd_sigmas()
+    inside = math.erf(255 / 2 / 60 / math.sqrt(2)) ** 2
+    assert f"{100 * (1 - inside):.1f} % and 100.00000 %" in refused.fails
+    assert refused.happens.count("px") >= 2 and refused.figures.error == 0.0
+    flux = image.flux_range()
+    # a step of 16 bits of the brightest pixel, 4.4e-3 of its star, in up to 121 pixels
+    assert re.search(r"off by \de-0[456] and 1e\+00", flux.fails)
+    assert "adds 2.6 % to each star" in image.floored_wings().fails
+    assert image.no_stars().fails.startswith("100 %")
+    assert image.narrow_star().fails.startswith("flux off by up to 1492 %")
+
+
+def test_a_star_crosses_the_image_along_a_straight_line():
+    on = image.target(image.SIGMA_PX, image.MOVING_PX)
+    places = np.array([(s.x_px[0], s.y_px[0]) for s in image.moving_star(on, 5.0)])
+    assert len(places) == image.STEPS
+    shares = np.linspace(0, 1, image.STEPS)
+    # from the image's middle, to the right and up; the tangent of 0.03 degrees is its angle
+    np.testing.assert_allclose(places[:, 0], 15.5 + 3.0 * shares, atol=1e-5)
+    np.testing.assert_allclose(places[:, 1], 15.5 - 1.7 * shares, atol=1e-5)
+
+
+def test_diffusion_hands_on_by_floyd_and_steinberg_s_sixteenths():
+    """Of a pixel of twice white one white is over, which its neighbours have: 7, 3, 5, 1; each
+    shows it to half a step of 255, and hands on what is left.
+    """
+    response = table_response(8, np.linspace(0, 1, 256))
+    linear = np.zeros((3, 5))
+    linear[0, 2] = 2.0
+    shown = image.diffused_light(linear, response)
+    wanted = np.array([[0, 0, 1, 7 / 16, 0], [0, 3 / 16, 5 / 16, 1 / 16, 0], [0] * 5])
+    np.testing.assert_allclose(shown, wanted, atol=2 / 255)
+
+
+def test_a_repeated_index_keeps_one_star_of_a_pixel():
+    on = image.target(image.SIGMA_PX, (64, 48))
+    side_px = on.psf.footprint_px
+    x_px, y_px = np.array([20.2, 20.2, 45.7]), np.array([11.6, 11.6, 30.1])
+    sprites = pack_sprites(x_px, y_px, np.array([5.0, 2.0, 3.0]), np.arange(3), (64, 48), side_px)
+    light = image.indexed_light(sprites, (64, 48))
+    assert light.shape == (48, 64)
+    # the second of two stars on one place, and one alone
+    assert light.sum() == pytest.approx(2.0 + 3.0, rel=1e-5)
+    assert np.unravel_index(light.argmax(), light.shape) == (30, 46)
+
+
+def drawn_by(maker, folder, monkeypatch):
+    """The one chart of a function that writes into a folder, with its columns by name."""
+    saved = []
+    monkeypatch.setattr(charts, "save", lambda figure, path: saved.append((figure, path)))
+    maker(folder)
+    ((figure, path),) = saved
+    rows = csv_rows(folder / f"{path.name}.csv")
+    columns = [np.array([float(row[name]) for row in rows]) for name in rows[0]]
+    return figure, dict(zip(rows[0], columns, strict=True))
+
+
+def test_sampling_s_errors_by_sigma_are_those_of_a_gaussian(tmp_path, monkeypatch):
+    """Sampled at 21 places within a pixel: its sum by the Gaussian's harmonics, its middle against
+    the integral by erf; hilstar's light and middle are right to float32.
+    """
+    figure, table = drawn_by(stability.narrow_sigmas, tmp_path, monkeypatch)
+    sigma = table["sigma_px"]
+    assert (sigma[0], sigma[-1], len(sigma)) == pytest.approx((0.1, 2.0, 27))
+    orders = np.arange(1, 12)[:, None]
+    comb = 1 + 2 * np.exp(-2 * (math.pi * orders * sigma) ** 2).sum(axis=0)
+    at_middle = comb**2 - 1
+    between = (1 + 2 * ((-1.0) ** orders * np.exp(-2 * (math.pi * orders * sigma) ** 2)).sum(0)) * (
+        comb
+    ) - 1
+    largest = np.maximum(np.abs(at_middle), np.abs(between))
+    np.testing.assert_allclose(table["sampled_flux_error"], largest, rtol=1e-4, atol=1e-7)
+    assert table["flux_error"].max() <= image.FLUX_ERROR
+    assert np.abs(table["peak_error"]).max() < 2e-5
+    # its middle over the mean of the pixel around it, at any place
+    middle = 1 / (2 * math.pi * sigma**2) / erf(0.5 / sigma / math.sqrt(2)) ** 2 - 1
+    assert (np.abs(table["sampled_peak_error"]) > 0.99 * middle).all()
+    harmonic = np.exp(-2 * math.pi**2 * sigma**2) / math.pi
+    wide = (sigma > 0.3) & (sigma < 0.6)
+    np.testing.assert_allclose(table["centroid_error_px"][wide], harmonic[wide], rtol=0.03)
+    lines = [line.get_ydata() for axes in figure.axes for line in axes.get_lines()]
+    for name in stability.NARROW_COLUMNS:
+        assert any(np.array_equal(np.abs(table[name]), line) for line in lines)
+
+
+def test_the_sigma_from_which_sampling_is_nearer_is_the_first_of_its_kind():
+    names = stability.NARROW_COLUMNS
+    columns = {name: np.zeros(4) for name in names}
+    columns["centroid_error_px"] = np.array([0.1, 0.02, 0.003, 0.001])
+    columns["sampled_centroid_error_px"] = np.array([0.3, 0.05, 0.002, 1e-4])
+    columns["sampled_peak_error"] = np.array([9.0, 0.5, -0.12, 0.03])
+    text = stability.narrow_finding(np.array([0.1, 0.3, 0.85, 2.0]), columns)
+    assert text.startswith("From sigma 0.85 px on")
+    assert "(0.002 px, integrated 0.003)" in text and text.endswith("12 % too faint")
+    columns["sampled_centroid_error_px"][:] = 1.0
+    text = stability.narrow_finding(np.array([0.1, 0.3, 0.85, 2.0]), columns)
+    assert text.endswith("at every sigma to 2 px")
+
+
+def test_one_depth_for_all_is_off_by_the_tangent_less_the_sine(tmp_path, monkeypatch):
+    figure, table = drawn_by(stability.weak_perspectives, tmp_path, monkeypatch)
+    angle = np.radians(table["field_angle_deg"])
+    off_px = 350e3 / 57.65 * (np.tan(angle) - np.sin(angle))
+    np.testing.assert_allclose(np.abs(table["error_px"]), off_px, rtol=1e-6)
+    ten, five = np.radians((10.0, 5.0))
+    ten_px = 350e3 / 57.65 * (math.tan(ten) - math.sin(ten))
+    share = (math.tan(five) - math.sin(five)) / (math.tan(ten) - math.sin(ten))
+    # where sin(10 degrees) is the tangent
+    ten_arcsec = (ten - math.atan(math.sin(ten))) * 206_264.8
+    title = " ".join(figure.get_suptitle().replace("\N{NO-BREAK SPACE}", " ").split())
+    assert f"off by {ten_px:.0f} px or {ten_arcsec:.0f} arcsec ten degrees" in title
+    assert f"by {share:.2f} of that at five" in title
+    (upper,), (lower,) = (axes.get_lines() for axes in figure.axes)
+    np.testing.assert_array_equal(upper.get_ydata(), np.abs(table["error_px"]))
+    np.testing.assert_array_equal(lower.get_ydata(), np.abs(table["error_arcsec"]))
+
+
+def test_a_turn_between_samples_is_drawn_by_its_way(tmp_path, monkeypatch):
+    figure, table = drawn_by(stability.turns, tmp_path, monkeypatch)
+    turn_deg, line, slerp, rated = table.values()
+    assert (slerp[turn_deg < 180] < 1e-3).all() and (slerp[turn_deg > 185] > 1e5).all()
+    assert f"within {two_digits(rated.max())} arcsec" in figure.get_suptitle().replace("\n", " ")
+    drawn = [curve.get_ydata() for curve in figure.axes[0].get_lines()[:3]]
+    for wanted, curve in zip((line, slerp, rated), drawn, strict=True):
+        np.testing.assert_array_equal(curve, np.maximum(wanted, 1e-12))
+
+
+def test_the_chart_of_popping_has_each_way_s_light_in_magnitudes(tmp_path, monkeypatch):
+    monkeypatch.setattr(image, "STEPS", 31)
+    image.moving_code_fluxes.cache_clear()
+    try:
+        figure, table = drawn_by(stability.ripples, tmp_path, monkeypatch)
+    finally:
+        image.moving_code_fluxes.cache_clear()
+    np.testing.assert_allclose(table["x_px"], np.linspace(0, 3, 31))
+    spread = {name: np.ptp(values) for name, values in table.items()}
+    # two axes of a first harmonic of 2 exp(-2 pi^2 / 4), in magnitudes, at chance places
+    largest = 2 * 2.5 / math.log(10) * 4 * math.exp(-(math.pi**2) / 2)
+    assert 0.5 * largest < spread["point sampled, sigma 0.5 px [mag]"] < 1.01 * largest
+    assert spread["linear image [mag]"] < image.RIPPLE < spread["codes, exact [mag]"]
+    assert spread["codes, exact [mag]"] < 0.5 * spread["codes, round [mag]"]
+    title = figure.get_suptitle().replace("\n", " ").replace("\N{NO-BREAK SPACE}", " ")
+    assert f"by {spread['codes, exact [mag]']:.3f} mag with exact" in title
+    assert f"by {spread['codes, round [mag]']:.3f} mag with rounded" in title
+    (millionths,) = figure.axes[1].get_lines()
+    np.testing.assert_allclose(millionths.get_ydata(), 1e6 * table["linear image [mag]"])
+    # codes hold the light that is asked for: no share of it is the scale's
+    assert np.abs(table["codes, exact [mag]"]).max() < 0.1
+
+
+def test_a_study_has_the_recorded_cases_about_those_that_draw(tmp_path, monkeypatch):
+    """In the order of the chain, with a verdict each; then a chart of each kind of curve."""
+    drawn = (image.no_stars, image.wide_star)
+    monkeypatch.setattr(image, "DRAWN", drawn)
+    curves = []
+    for name in ("narrow_sigmas", "weak_perspectives", "ripples", "turns"):
+        monkeypatch.setattr(
+            stability, name, lambda folder, name=name: curves.append((folder, name))
+        )
+    cases = stability.run(tmp_path)
+    assert curves == [
+        (tmp_path, name) for name in ("narrow_sigmas", "weak_perspectives", "ripples", "turns")
+    ]
+    first, last = recorded("catalogue_and_geometry"), recorded("detector_and_attitude")
+    known = [case.case for case in (*first, image.no_stars(), image.wide_star(), *last)]
+    assert [case.case for case in cases] == known
+    assert [case.case for case in cases[len(first) : len(first) + 2]] == [
+        "no star in view",
+        "sigma 20 px",
+    ]
+    rows = csv_rows(tmp_path / "stability.csv")
+    assert [row["case"] for row in rows] == [case.case for case in cases]
+    for row, case in zip(rows, cases, strict=True):
+        assert row["verdict"] == "right" and row["failing method"] == case.method
+        assert (row["its failure"], row["what happens"]) == (case.fails, case.happens)
+        assert float(row["error"]) == case.figures.error
+        assert float(row["tolerance"]) == case.figures.tolerance
+    wrong = FailureCase("c", "m", "f", "h", "w", CaseFigures(2.0, 3.0, 1.0))
+    assert wrong.row() == ("c", "WRONG", "m", "f", "h", "w", 2.0, 3.0, 1.0)

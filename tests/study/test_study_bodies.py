@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
 
 import numpy as np
 import pytest
 
+from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.study import bodies
 from hilstar.instruments.study.bodies import (
     PHASES_DEG,
@@ -75,35 +76,161 @@ def test_unseen_bodies_cost_what_they_do_between_steps_of_the_orbit():
     assert "20.0 ms once in 2 s" in bodies.cost_line(costs)
 
 
-@pytest.mark.parametrize(("radius_px", "phase_deg"), [(0.4, 0.0), (6.0, 0.0), (6.0, 60.0)])
-def test_a_disc_is_drawn_as_rays_have_it(radius_px, phase_deg):
-    found = bodies.exactness(radius_px, phase_deg)
-    assert (found.body, found.radius_px, found.phase_deg) == ("Moon", radius_px, phase_deg)
-    assert abs(found.flux_off) < 0.01
-    assert found.middle_off_px < 0.05
-    if radius_px > 1:
-        assert found.limb_off_px < 0.1
-        assert found.point_pixel_off > 10 * found.pixel_off
+NORTH = np.array([0.0, 0.0, 1.0])
+
+
+def camera_of(radius_px):
+    """The study's camera about a disc, and the middle of its image."""
+    half = int(np.ceil(radius_px)) + bodies.MARGIN_PX
+    side_px = 2 * half + 1
+    return Camera((side_px, side_px), bodies.FOCAL_PX, (half, half), np.eye(3)), half
+
+
+@pytest.mark.parametrize(("radius_px", "phase_deg"), [(3.0, 0.0), (6.0, 60.0), (6.0, 150.0)])
+def test_a_traced_moon_has_its_light_at_its_place_and_towards_the_sun(radius_px, phase_deg):
+    disc = bodies.moon(radius_px, phase_deg)
+    assert disc.radius_rad == pytest.approx(radius_px / 6000, rel=1e-6)
+    # the phase is the angle at the Moon between the Sun and the camera
+    assert -disc.direction @ disc.sun == pytest.approx(math.cos(math.radians(phase_deg)))
+    camera, half = camera_of(radius_px)
+    truth = bodies.traced(disc, camera)
+    # of a million electrons a second none is over the margin; rays on a lattice: 1e-3
+    assert truth.sum() == pytest.approx(1e6, rel=2e-3)
+    rows, columns = np.indices(truth.shape)
+    middle = np.array([(truth * columns).sum(), (truth * rows).sum()]) / truth.sum()
+    off_px = middle - (half + 0.2, half - 0.3)
+    sun_px = disc.sun[:2] / np.linalg.norm(disc.sun[:2]) if phase_deg else np.zeros(2)
+    if not phase_deg:
+        np.testing.assert_allclose(off_px, 0, atol=1e-3)
+        assert np.abs(bodies.edges_px(truth, radius_px, 0.0)).max() < 0.5
+        return
+    # along the Sun's direction alone, further where less is lit
+    assert np.linalg.norm(off_px) == pytest.approx(off_px @ sun_px, rel=1e-3)
+    share = (off_px @ sun_px) / radius_px
+    low, high = {60.0: (0.1, 0.5), 150.0: (0.7, 1.0)}[phase_deg]
+    assert low < share < high
+
+
+@pytest.mark.parametrize(("radius_px", "phase_deg"), [(0.05, 60.0), (2.0, 120.0), (6.0, 60.0)])
+def test_a_disc_is_drawn_as_its_rays_and_a_point_is_not_a_disc(radius_px, phase_deg):
+    size = bodies.exactness(radius_px, phase_deg)
+    assert (size.body, size.radius_px, size.phase_deg) == ("Moon", radius_px, phase_deg)
+    assert abs(size.flux_off) < 0.01 and size.middle_off_px < 0.02
+    assert 0 < size.pixel_off < 0.02
+    if radius_px < 0.1:
+        # smaller than DISC_PX it is drawn as the point
+        assert size.point_pixel_off < 0.02
     else:
-        assert np.isnan(found.limb_off_px)
+        assert size.point_pixel_off > 0.1
+    assert math.isnan(size.limb_off_px) == (radius_px < 4)
+    assert not size.limb_off_px > 0.1
 
 
-def test_a_full_moon_s_traced_light_is_its_rate_in_its_circle():
-    """A million electrons a second; a disc of one brightness near its middle."""
-    disc = bodies.moon(6.0, 0.0)
-    camera = Camera((31, 31), bodies.FOCAL_PX, (15.0, 15.0), np.eye(3))
-    image = bodies.traced(disc, camera)
-    assert image.sum() == pytest.approx(1e6, rel=5e-3)
-    y, x = np.indices(image.shape)
-    middle = [15 + at for at in bodies.MIDDLE_PX]
-    assert (image * x).sum() / image.sum() == pytest.approx(middle[0], abs=0.02)
-    assert (image * y).sum() / image.sum() == pytest.approx(middle[1], abs=0.02)
-    reach = np.hypot(x - middle[0], y - middle[1])
-    assert image[reach > 6 + 5 * max(bodies.SIGMA_PX)].max() < 1e-3 * image.max()
-    # half of its light is lost at quarter phase and more, as less of it is lit
-    half = bodies.moon(6.0, 90.0)
-    lit = bodies.traced(replace(half, normal_e_per_s_sr=disc.normal_e_per_s_sr), camera)
-    assert lit.sum() < 0.5 * image.sum()
+@pytest.fixture(scope="module")
+def benches():
+    with bodies.opened(("nothing", "Moon", "Earth")) as opened:
+        yield opened
+
+
+def disc_of(bench, name, t_ns):
+    (disc,) = (d for d in bench.moving.discs(NORTH, np.pi, 0.0, t_ns) if d.name == name)
+    return disc
+
+
+@pytest.mark.parametrize("off_deg", [0.0, 0.5, 40.0])
+def test_the_moon_is_aimed_at_by_its_middle_and_along_declination(benches, off_deg):
+    q = bodies.attitude(benches["Moon"], "Moon", off_deg, 0)
+    boresight, moon = to_matrix(q)[2], disc_of(benches["Moon"], "Moon", 0).direction
+    assert math.degrees(math.acos(min(boresight @ moon, 1.0))) == pytest.approx(off_deg, abs=2e-6)
+    # towards the equator and beyond, on the meridian
+    across = np.cross(moon, NORTH)
+    assert boresight @ across == pytest.approx(0, abs=1e-9)
+    assert (boresight[2] - moon[2]) * np.sign(moon[2]) <= 1e-12
+
+
+@pytest.mark.parametrize("off_deg", [8.0, 0.0, -20.0])
+def test_the_earth_is_aimed_at_by_its_lit_limb(benches, off_deg):
+    t_ns = bodies.DAY_SIDE_NS
+    q = bodies.attitude(benches["Earth"], "Earth", off_deg, t_ns)
+    boresight, earth = to_matrix(q)[2], disc_of(benches["Earth"], "Earth", t_ns)
+    angle_deg = math.degrees(math.acos(boresight @ earth.direction))
+    assert angle_deg == pytest.approx(math.degrees(earth.radius_rad) + off_deg, abs=1e-6)
+    # from the Earth's centre towards the Sun, in their plane
+    across = np.cross(earth.direction, earth.sun)
+    assert boresight @ across == pytest.approx(0, abs=1e-9)
+    assert (boresight - (boresight @ earth.direction) * earth.direction) @ earth.sun > 0
+
+
+def test_a_frame_with_a_body_is_timed_beside_the_same_without(benches, monkeypatch):
+    """The first bench's frames are those without bodies; of some the fastest counts, each time by
+    itself.
+    """
+    spent = {"nothing": [(5.0, 9.0), (4.0, 8.0)], "bodies": [(7.0, 20.0), (8.0, 12.0)]}
+    seen = []
+
+    def in_turn(works, rounds):
+        seen.extend(work(1) for work in works.values())
+        return {name: [bodies.Spent(*times) for times in spent[name]] for name in works}
+
+    monkeypatch.setattr(bodies, "in_turn", in_turn)
+    scene = next(scene for scene in SCENES if scene.name == "Moon in view, 55 px")
+    cost = bodies.measure_cost(benches, scene, 2)
+    without, shown = seen
+    assert shown.sum() > without.sum() > 0
+    assert (cost.frame_ms, cost.without_ms, cost.cost_ms, cost.cpu_ms) == (7.0, 4.0, 3.0, 4.0)
+    assert (cost.scene, cost.discs) == (scene.name, "Moon")
+    near = bodies.approach(benches, "Moon", 0.5, 2)
+    assert (near.frame_ms, near.cpu_ms, near.without_ms) == (7.0, 12.0, 4.0)
+    assert (near.body, near.off_deg) == ("Moon", 0.5)
+    assert near.finite and near.white_is_white and near.stars > 0
+    # a full Moon of V = -12.7 over 2400 px is 8 mag over the peak of a star of V = 2, a fifth of it
+    assert 4 < near.over_white_mag < 9
+    assert bodies.approach(benches, "Moon", 40.0, 1).over_white_mag < 3
+
+
+def test_a_small_study_of_bodies_draws_its_rows(small_run):
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (
+            ("QUICK_ROUNDS", 1),
+            ("QUICK_BENCHES", ("nothing", "Moon")),
+            ("QUICK_DEG", {"Moon": (40.0, 0.5)}),
+            ("QUICK_RADII_PX", (0.1, 4.0)),
+            ("PHASES_DEG", (0.0, 60.0)),
+        ):
+            patch.setattr(bodies, name, value)
+        run = small_run(bodies.run, True)
+    sizes, nears = run.rows("bodies_size"), run.rows("bodies_limits")
+    assert [(row["phase_deg"], row["radius_px"]) for row in sizes] == [
+        ("0.0", "0.1"),
+        ("0.0", "4.0"),
+        ("60.0", "0.1"),
+        ("60.0", "4.0"),
+    ]
+    for panel, columns in enumerate(
+        [("flux_off",), ("limb_off_px", "middle_off_px"), ("pixel_off", "point_pixel_off")]
+    ):
+        drawn = [(x, y) for _, x, y in run.lines("bodies_size", panel)]
+        for phase in ("0.0", "60.0"):
+            own = [row for row in sizes if row["phase_deg"] == phase]
+            for column in columns:
+                wanted = [max(abs(float(row[column])), 1e-6) for row in own]
+                assert any(x == [0.1, 4.0] and np.array_equal(y, wanted, True) for x, y in drawn)
+    for panel, column in enumerate(("cpu_ms", "over_white_mag")):
+        drawn = [(x, y) for _, x, y in run.lines("bodies_limits", panel)]
+        assert ([40.0, 0.5], [float(row[column]) for row in nears]) in drawn
+    cost, size, limit = run.told[0]
+    largest = max(abs(float(row["flux_off"])) for row in sizes)
+    limb_px = max(float(row["limb_off_px"]) for row in sizes if row["limb_off_px"] != "nan")
+    assert f"within {100 * largest:.2g} % and their limb within {limb_px:.3f} px" in size
+    assert size.startswith("discs of 0.1 to 4 px") and size[1:] == run.title("bodies_size")[1:]
+    slowest = max(nears, key=lambda row: float(row["cpu_ms"]))
+    assert f"{float(slowest['cpu_ms']):.0f} ms of processor time a frame (Moon at" in limit
+    assert limit.endswith("finite, and white where it is over white")
+    (axes,) = run.charts["bodies_cost"].axes
+    costs = run.rows("bodies_cost")
+    widths = [max(float(row["cpu_ms"]), 0.0) for row in costs]
+    np.testing.assert_allclose([bar.get_width() for bar in axes.patches], widths, atol=0.006)
+    assert "the dearest:" in cost
 
 
 def test_a_level_is_crossed_between_its_steps():

@@ -10,12 +10,15 @@ import os
 import re
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hilstar.basics import charts
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
+from hilstar.display.quantise import shown_light
+from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.instruments.study import predictors
 from hilstar.instruments.study.chain import answers, choices, measuring, run
 from hilstar.instruments.study.chain import glass as chain_glass
@@ -108,8 +111,28 @@ def chain_study(tmp_path_factory, whole_study):
     return json.loads(result.stdout), folder / "out"
 
 
-def test_the_front_is_what_anyone_finds_in_the_table(chain_study):
-    rows = csv_rows(chain_study[1] / "chain.csv")
+@pytest.fixture(scope="module")
+def small_chain(small_run, tmp_path_factory):
+    """The study of the small bench's average field and slow turn, one round of each combination."""
+    file = small_file(tmp_path_factory.mktemp("bench"))
+
+    def two(own):
+        average, _, _, slow, _ = five_scenes(own)
+        return average, slow
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(measuring, "MIN_ROUNDS", 1)
+        patch.setattr(measuring, "FRAMES_A_VISIT", 1)
+        patch.setattr(run, "QUICK", Rounds(exposures=1, time_s=0.0))
+        patch.setattr(run, "five_scenes", two)
+        done = []
+        found = small_run(lambda folder: run.run(file, folder, True, done.append))
+    assert done == [1, 2]
+    return found
+
+
+def test_the_front_is_what_anyone_finds_in_the_table(small_chain):
+    rows = small_chain.rows("chain")
     for scene in {row["scene"] for row in rows}:
         own = [row for row in rows if row["scene"] == scene]
         for error, column in (("error_arcsec", "on_front"), ("error_mag", "on_front_mag")):
@@ -195,11 +218,8 @@ def test_the_psf_of_a_glass_is_an_axis_of_the_chain(tmp_path, monkeypatch):
     assert glass_rows(bare, ChainScene("Orion", "", np.array(ORION_Q)), quick=True) == []
 
 
-def test_the_budget_adds_up_to_the_whole_error_of_auto(chain_study):
-    rows, parts = (
-        csv_rows(chain_study[1] / "chain.csv"),
-        csv_rows(chain_study[1] / "chain_budget.csv"),
-    )
+def test_the_budget_adds_up_to_the_whole_error_of_auto(small_chain):
+    rows, parts = small_chain.rows("chain"), small_chain.rows("chain_budget")
     for scene in {part["scene"] for part in parts}:
         (auto,) = [row for row in rows if row["scene"] == scene and row["chosen"] == "auto"]
         for error in ("error_arcsec", "error_mag"):
@@ -215,7 +235,7 @@ def test_the_budget_adds_up_to_the_whole_error_of_auto(chain_study):
         part["step"]: float(part["error_arcsec"]) for part in parts if part["scene"] == "1 deg/s"
     }
     assert turning["prediction"] > 0 and turning["refresh"] > 0
-    stages = csv_rows(chain_study[1] / "chain_time.csv")
+    stages = small_chain.rows("chain_time")
     assert {stage["stage"] for stage in stages} == {
         "prediction",
         "sprites",
@@ -452,10 +472,10 @@ def test_a_bench_of_which_no_star_stays_in_view_is_refused(tmp_path):
     assert_refused(refused, 2, "no star stands alone in view")
 
 
-def test_the_study_ends_with_answers_from_its_own_rows(chain_study):
-    told, out = chain_study
-    rows, parts = csv_rows(out / "chain.csv"), csv_rows(out / "chain_budget.csv")
-    assert len(told["answers"]) >= 4
+def test_the_study_ends_with_answers_from_its_own_rows(small_chain):
+    rows, parts = small_chain.rows("chain"), small_chain.rows("chain_budget")
+    lines = small_chain.told.answers
+    assert len(lines) >= 4
     still = [row for row in rows if row["scene"] == "average field" and row["sprite"] == "cut"]
     by_codes = {
         (row["quantisation"], row["bit_stealing"]): row
@@ -466,10 +486,8 @@ def test_the_study_ends_with_answers_from_its_own_rows(chain_study):
         charts.two_digits(float(by_codes["exact", flag]["error_arcsec"]))
         for flag in ("false", "true")
     )
-    assert told["answers"][0].startswith(
-        f'at rest on 8 bits: set quantisation = "exact", {exact} arcsec'
-    )
-    assert f"takes {exact} arcsec to {stealing}" in told["answers"][1]
+    assert lines[0].startswith(f'at rest on 8 bits: set quantisation = "exact", {exact} arcsec')
+    assert f"takes {exact} arcsec to {stealing}" in lines[1]
     of_turn = {
         part["step"]: float(part["error_arcsec"]) for part in parts if part["scene"] == "1 deg/s"
     }
@@ -477,11 +495,11 @@ def test_the_study_ends_with_answers_from_its_own_rows(chain_study):
     del of_turn["rss"]
     largest = max(of_turn, key=of_turn.get)
     words = answers.STEP_WORDS.get(largest, largest)
-    assert told["answers"][2].startswith(
+    assert lines[2].startswith(
         f"from 1 deg/s on {words} is the largest part ({charts.two_digits(of_turn[largest])}"
     )
-    assert f"of {whole} arcsec)" in told["answers"][2]
-    assert told["answers"][-1].startswith("depth: ")
+    assert f"of {whole} arcsec)" in lines[2]
+    assert lines[-1].startswith("depth: ")
 
 
 def answered(given: answers.Given, rate_deg_s: float = 0.0, **errors: float) -> CombinationRow:
@@ -558,3 +576,294 @@ def test_each_turn_is_named_from_which_another_step_is_most_of_the_error():
         "2 of 2.5 arcsec): send rates (by the packets' rates 1, by two samples 2 arcsec)"
         in lines[0]
     )
+
+
+def number_of(row, name):
+    return float(row[name])
+
+
+def test_a_scene_is_told_and_drawn_by_its_own_rows(small_chain):
+    """Its line by the row of auto, its panel by all rows, its bars by the parts of auto's error."""
+    rows, parts = small_chain.rows("chain"), small_chain.rows("chain_budget")
+    stages = small_chain.rows("chain_time")
+    lines = small_chain.told.lines
+    for panel, scene in enumerate(("average field", "1 deg/s")):
+        own = [row for row in rows if row["scene"] == scene]
+        (auto,) = (row for row in own if "auto" in row["chosen"].split())
+        assert {row["stars"] for row in own} == {auto["stars"]} and int(auto["stars"]) > 10
+        error, mag = number_of(auto, "error_arcsec"), number_of(auto, "error_mag")
+        steps = {part["step"]: part for part in parts if part["scene"] == scene}
+        largest = max(
+            (part for step, part in steps.items() if step not in ("rss", "whole")),
+            key=lambda part: number_of(part, "error_arcsec"),
+        )
+        times = {
+            stage["stage"]: number_of(stage, "time_ms")
+            for stage in stages
+            if stage["scene"] == scene
+        }
+        longest = max(times, key=times.get)
+        line = lines[panel]
+        assert line.startswith(f"{scene}: auto (exact, cut sprites")
+        assert (
+            f") is {error:.3g} arcsec and {mag:.2g} mag off over {auto['stars']} stars, in" in line
+        )
+        assert f"error: {largest['step']} {number_of(largest, 'error_arcsec'):.2g} arcsec" in line
+        assert line.endswith(f"time: {longest} {times[longest] / sum(times.values()):.0%}")
+        assert ("paths, rate" in line) == (scene == "1 deg/s")
+        # every combination stands at its time and error
+        places = set()
+        for _, x, y in small_chain.lines("chain", panel):
+            places.update(zip(x, y, strict=True))
+        for row in own:
+            assert (number_of(row, "time_ms"), number_of(row, "error_arcsec")) in places
+        for column, name in enumerate(("error_arcsec", "error_mag")):
+            axes = small_chain.charts["chain_budget"].axes[3 * panel + column]
+            widths = [bar.get_width() for bar in axes.patches]
+            shown = [number_of(part, name) for step, part in steps.items() if step != "rss"]
+            assert set(widths) <= set(shown) and steps["whole"] and max(shown) in widths
+        axes = small_chain.charts["chain_budget"].axes[3 * panel + 2]
+        assert [bar.get_width() for bar in axes.patches] == list(times.values())
+    assert small_chain.told.right in (True, False)
+    assert lines[2].startswith("times on ")
+
+
+def test_every_star_of_a_turning_field_has_the_turn_s_own_time(small_chain):
+    """Columns that are the bench's and the scene's, and those that a choice alone can change."""
+    rows = small_chain.rows("chain")
+    for row in rows:
+        rate = 1.0 if row["scene"] == "1 deg/s" else 0.0
+        assert number_of(row, "rate_deg_s") == rate and row["bits"] == "8"
+        assert number_of(row, "exposure_s") == 0.1
+        assert (row["frames"], row["noise_ms"]) == ("1", "0.0")
+        sides = [int(side) for side in row["sprite_px"].split(" to ")]
+        assert sides == sorted(sides)
+        if row["sprite"] == "full":
+            assert len(sides) == 1
+        else:
+            assert sides[-1] <= 10
+        held = row["prediction"] == "held"
+        assert not held or rate
+        if held and row["faintest_v_mag"] == "9.0":
+            # 1 deg/s for 15 ms and more of age and scan-out
+            assert number_of(row, "error_arcsec") > 50
+            # a pointing error across the boresight, of the turn's axis off it
+            assert number_of(row, "attitude_arcsec") == pytest.approx(140, rel=0.2)
+        elif not held and row["smear"] == "point" and rate:
+            # half a frame at 1 deg/s
+            assert number_of(row, "attitude_arcsec") == pytest.approx(30, rel=0.2)
+        elif not held:
+            assert number_of(row, "attitude_arcsec") < 5
+    for scene in ("average field", "1 deg/s"):
+        filed = [row for row in rows if row["scene"] == scene and row["as_filed"] == "true"]
+        assert len(filed) == 1
+
+
+def test_a_frame_s_light_is_that_of_its_codes_on_its_own_pixels(tmp_path):
+    """Of a panel whose pixels differ, too."""
+    text = SMALL.replace("[monitor]", '[monitor]\ncalibration = "lcd-example"')
+    with Parts(small_file(tmp_path, text)) as uneven:
+        combination = ChainCombination("exact", False, uneven.faintest_v_mag, "full")
+        movement = predictors.Movement(five_scenes(uneven.own)[0].q_icrs_to_cam, 0.0)
+        chain = measuring.DrawingChain(combination, uneven.bench(combination), movement)
+        panel = chain.bench.panel
+        assert panel.uniformity is not None and np.ptp(panel.uniformity) > 0.01
+        light_ns = NS_PER_S
+        place, light = chain.lit(7, light_ns)
+        attitude = chain.attitude(light_ns)
+        levels = chain.bench.draw(attitude.q_icrs_to_cam, 7).levels
+        wanted = shown_light(levels, panel).ravel()
+        assert len(place) > 100
+        np.testing.assert_allclose(light, wanted[place], rtol=1e-6)
+        assert wanted.sum() == pytest.approx(light.sum(), rel=1e-6)
+
+
+def test_why_auto_takes_no_better_choice_is_said_for_each_difference():
+    own = combination_row(bit_stealing="false", faintest_v_mag=9.0)
+    for changes, words in (
+        ({"bit_stealing": "true"}, "bit stealing is the bench file's choice"),
+        ({"prediction": "two samples"}, "prediction by two samples is the sender's choice"),
+        ({"faintest_v_mag": 8.0}, "the catalogue's depth is the bench file's choice"),
+        ({"quantisation": "temporal"}, "temporal is right over an exposure"),
+        ({"quantisation": "round"}, "effort compares exact and round by their worst star"),
+        ({"sprite": "coarse"}, "coarse sprites are beyond the tolerance"),
+        ({"sprite": "full"}, "cut sprites save nothing here"),
+        ({"smear": "point"}, "points instead of paths"),
+    ):
+        other = replace(own, **changes)
+        said = run.why_not(own, other)
+        assert said.startswith(words) and ";" not in said
+        both = run.why_not(own, replace(other, roll_arcsec=3.0))
+        assert both == said
+    held = replace(own, prediction="held")
+    assert (
+        run.why_not(held, own) == "[attitude] max_extrapolation_ms = 0 is the bench file's choice"
+    )
+    assert run.why_not(replace(own, sprite="coarse"), replace(own, sprite="coarse")) == ""
+
+
+def test_what_beats_auto_is_the_nearest_of_those_beyond_the_noise():
+    auto = combination_row(chosen="auto", time_ms=5.0, error_arcsec=2.0, bit_stealing="false")
+    slower = combination_row(time_ms=9.0, error_arcsec=1.0)
+    assert run.standing([auto, slower]) == "on the front"
+    within = combination_row(time_ms=4.99, error_arcsec=1.5, bit_stealing="false")
+    text = run.standing([auto, slower, within])
+    assert text.startswith("on the front within the noise: exact, cut sprites is 1.5 arcsec off")
+    assert "0.01 ms faster (noise 0.014 ms)" in text
+    stolen = combination_row(time_ms=2.0, error_arcsec=0.5, bit_stealing="true")
+    worse = combination_row(time_ms=1.0, error_arcsec=0.9, bit_stealing="true")
+    text = run.standing([auto, stolen, worse])
+    assert text.startswith("not on the front: exact with bit stealing, cut sprites is 0.5 arcsec")
+    assert "3 ms faster" in text and text.endswith("; on the front of what effort may choose")
+    assert run.standing([auto, stolen, within]).endswith("may choose, within the noise")
+    free = combination_row(time_ms=3.0, error_arcsec=1.9, bit_stealing="false", sprite="full")
+    text = run.standing([auto, stolen, free])
+    assert "; nor of what effort may choose: exact, full sprites is 1.9 arcsec off" in text
+    assert run.standing([auto, free]).count("not on the front") == 1
+    assert "nor of" not in run.standing([auto, free])
+
+
+def test_times_are_medians_and_quartiles_and_know_their_noise():
+    """Of a normal distribution the median of n is known to 1.2533 sigma / n^0.5."""
+    taken = np.array([[4.0, 40.0], [1.0, 10.0], [2.0, 30.0], [3.0, 20.0], [10.0, 0.0]])
+    times = measuring.times_of(taken)
+    assert (times.time_ms, times.iqr_ms, times.cpu_ms, times.frames) == (3.0, 2.0, 20.0, 5)
+    assert times.noise_ms == pytest.approx(1.2533 * 2 / 1.349 / math.sqrt(5), abs=1e-4)
+    assert measuring.noise_ends_ms(4.0, 1.0) == (3.0, 5.0)
+    assert measuring.noise_ends_ms(4.0, 3.0) == (2.0, 7.0)
+    assert measuring.rms_of_known([3.0, math.nan, 4.0]) == pytest.approx(math.sqrt(12.5))
+    assert math.isnan(measuring.rms_of_known([math.nan]))
+    assert measuring.rounded(0.0123456) == 0.01235 and math.isnan(measuring.rounded(math.nan))
+
+
+def test_each_chain_is_timed_in_each_round_and_one_by_its_stages():
+    """After a frame that does not count; the rounds end with the time, but not before two."""
+
+    class Chain:
+        def __init__(self, ms):
+            self.ms, self.frames = ms, 0
+
+        def frame_ms(self):
+            self.frames += 1
+            return (self.ms if self.frames > 1 else 1e9), 2 * self.ms
+
+        def stages_ms(self):
+            return (self.ms, 2.0, 3.0, 4.0)
+
+    chains = [Chain(1.0), Chain(5.0), Chain(9.0)]
+    times, stages = measuring.timed(chains, 0.0, 1)
+    assert stages == [5.0, 2.0, 3.0, 4.0]
+    visits = measuring.MIN_ROUNDS * measuring.FRAMES_A_VISIT
+    for chain, taken in zip(chains, times, strict=True):
+        assert (taken.time_ms, taken.cpu_ms, taken.frames) == (chain.ms, 2 * chain.ms, visits)
+
+
+def test_a_psf_that_is_a_pixel_off_and_three_percent_too_bright_is_told_so(tmp_path, monkeypatch):
+    """Against the whole one, here a Gaussian of 1.2 px, by the tracker's own centroider."""
+    sigma_px, side = 1.2, 15
+    at = np.arange(side) - side // 2
+
+    def stamps(x_off_px, y_off_px):
+        across = np.exp(-((at - x_off_px[:, None]) ** 2) / (2 * sigma_px**2))
+        down = np.exp(-((at - y_off_px[:, None]) ** 2) / (2 * sigma_px**2))
+        light = down[:, :, None] * across[:, None, :] / (2 * math.pi * sigma_px**2)
+        light[0] = 0.0  # a star in a dark corner is not judged
+        return light
+
+    def unreduced(x_px, y_px, shares):
+        assert len(shares) == len(x_px)
+        return stamps(x_px - np.floor(x_px + 0.5), y_px - np.floor(y_px + 0.5))
+
+    def told(psf, corner, told_side, shares):
+        assert told_side == side and len(corner[0]) == len(corner[1]) == len(shares)
+        return lambda x_px, y_px: psf(stamps(x_px, y_px))
+
+    def glass(file, psf):
+        return SimpleNamespace(shares_of=lambda stars, hip: np.ones((len(hip), 1)))
+
+    monkeypatch.setattr(chain_glass, "told_psf", told)
+    monkeypatch.setattr(chain_glass, "StarGlass", glass)
+    whole = SimpleNamespace(footprint_px=side, width_px=(sigma_px, sigma_px), unreduced=unreduced)
+    psfs = {
+        "whole": lambda light: light,
+        "right": lambda light: 1.03 * np.roll(light, 1, axis=2),
+        "down": lambda light: 0.98 * np.roll(light, 2, axis=1),
+    }
+    with Simulator(small_file(tmp_path)) as tracker:
+        scene = ChainScene("Orion", "", np.array(ORION_Q))
+        errors = chain_glass._errors(tracker, whole, psfs, scene)
+        in_view = len(chain_glass.field_stars(tracker.stars, tracker.camera, scene.q_icrs_to_cam))
+        monkeypatch.setattr(chain_glass, "MIN_STARS", in_view)
+        assert chain_glass._errors(tracker, whole, psfs, scene) == {}
+        monkeypatch.setattr(chain_glass, "MIN_STARS", in_view - 1)
+        assert chain_glass._errors(tracker, whole, psfs, scene) == errors
+    arcsec_per_px = math.atan(13e-3 / 70) * ARCSEC_PER_RAD
+    assert {error.stars for error in errors.values()} == {in_view - 1}
+    for name, off_px, percent in (("whole", 0, 0), ("right", 1, 3), ("down", 2, 2)):
+        error = errors[name]
+        # a window's edge sees a rolled star's wings otherwise
+        assert error.error_arcsec == pytest.approx(off_px * arcsec_per_px, rel=0.02, abs=1e-6)
+        assert error.error_percent == pytest.approx(percent, rel=1e-3, abs=1e-6)
+        assert error.worst_percent == pytest.approx(percent, rel=1e-3, abs=1e-6)
+
+
+def glass_row(psf, error_arcsec, time_ms, **figures):
+    known = {field.name: 1.0 for field in fields(chain_glass.GlassRow)}
+    words = {"scene": "dense field", "stars": 30, "on_front": "false", "chosen": ""}
+    known |= words | {"psf": psf, "error_arcsec": error_arcsec, "time_ms": time_ms}
+    return chain_glass.GlassRow(**(known | figures))
+
+
+def test_the_psfs_of_a_glass_are_told_and_drawn_by_their_error_and_time():
+    rows = [
+        glass_row("a Gaussian", 12.0, 2.0, error_percent=3.0, noise_ms=0.5),
+        glass_row("a basis of 6", 0.125, 9.0, error_percent=0.4, chosen="auto", on_front="true"),
+        glass_row("the whole", 0.0, 40.0, error_percent=0.2, on_front="true"),
+    ]
+    line = chain_glass.glass_line(rows)
+    assert line.startswith(
+        "PSF of the tracker's glass, dense field, 30 stars: a Gaussian: 12 arcsec"
+    )
+    assert "a basis of 6 (auto): 0.12 arcsec, 0.4 %, 9 ms" in line
+    with charts.panels_of("A finding", 2, share_x=False) as (place, light):
+        draw_glass(place, light, rows)
+    colours = [chain_glass.colour_of(row) for row in rows]
+    assert colours == [charts.INK, charts.RED, charts.BLUE]
+    for axes, wanted in ((place, [12.0, 0.125, 0.125]), (light, [3.0, 0.4, 0.2])):
+        drawn = set()
+        for drawn_line in axes.get_lines():
+            drawn.update(zip(*map(np.ravel, drawn_line.get_data()), strict=True))
+        for row, error in zip(rows, wanted, strict=True):
+            # an error of 0 stands at the smallest other one, on a logarithmic axis
+            assert (row.time_ms, error) in drawn
+    assert "30 stars" in place.get_title() + place.get_title(loc="left")
+
+
+def test_what_depth_and_bit_stealing_bring_is_said_by_the_rows():
+    load = answers.Load()
+    deep = combination_row(faintest_v_mag=9.0, bit_stealing="false", error_arcsec=0.4, time_ms=2.0)
+    assert "9 was measured alone" in answers.depth_line([deep])
+    shallow = combination_row(faintest_v_mag=8.0, lost=3, stars=20, error_arcsec=0.6)
+    line = answers.depth_line([deep, shallow])
+    assert "keep faintest_v_mag = 9" in line and "loses 3 of 20 stars" in line
+    whole = replace(shallow, lost=0)
+    assert "faintest_v_mag = 8 is enough; it loses none of 20" in answers.depth_line([deep, whole])
+    assert "not on this panel" in answers.stealing_line([deep], deep, load)
+    stolen = replace(deep, bit_stealing="true", error_arcsec=0.1, time_ms=3.0)
+    line = answers.stealing_line([deep, stolen], deep, load)
+    assert line.endswith("takes 0.4 arcsec to 0.1 in 1.50 of the time, with exact")
+    same = replace(stolen, error_arcsec=0.39)
+    assert "brings nothing at rest" in answers.stealing_line([deep, same], deep, load)
+    assert "of the time" not in answers.stealing_line([deep, stolen], deep, answers.Load(1e3))
+
+
+def test_errors_without_times_are_those_of_every_choice(parts):
+    scene = scene_of(parts, 0)
+    chosen = [scene.marks.auto, scene.marks.default]
+    scene.combinations = list(dict.fromkeys(chosen))
+    rows = scene.untimed()
+    assert len(rows) == len(scene.combinations)
+    for row, combination in zip(rows, scene.combinations, strict=True):
+        assert math.isnan(row.time_ms) and row.frames == 0
+        assert row.error_arcsec == scene.error(combination).error_arcsec
+        assert row.sprite == combination.sprite

@@ -4,10 +4,14 @@ monitor can show is stated.
 
 from __future__ import annotations
 
+import itertools
+import math
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from hilstar.display.response import srgb_response
 from hilstar.instruments.study import colour
@@ -24,7 +28,7 @@ from hilstar.instruments.study.colour import (
 )
 from hilstar.sky.spectral_types import LETTERS
 from tests.support.claims import holds
-from tests.support.recorded import assert_recorded
+from tests.support.recorded import assert_recorded, assert_row
 
 AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
 
@@ -127,6 +131,139 @@ def test_a_star_s_class_is_that_of_its_own_spectrum(tmp_path):
     assert mean_nm[1:] == sorted(mean_nm[1:])
     assert min(np.diff(mean_nm[1:])) > 5
     assert sum(row.stars for row in rows) <= len(stars.kinds)
+
+
+def test_the_places_of_a_mosaic_s_stars_are_those_recorded(tmp_path):
+    colour.write_spectra(tmp_path)
+    tracker = colour.file_of(tmp_path, "OLED", colour.TRACKERS["Bayer"]).config.tracker
+    rows = list(colour.study_mosaic(colour.bench_channels(tracker, tmp_path)))
+    assert len(rows) == 4 * 3 * 2
+    for row in rows:
+        keys = {"sigma_px": row.sigma_px, "temperature_k": row.temperature_k, "image": row.image}
+        assert_row("colour_mosaic.csv", keys, {"rms_px": row.rms_px, "max_px": row.max_px})
+
+
+def test_a_mosaic_s_stars_stand_in_tiles_row_by_row():
+    side, tile = colour.PHASES, colour.TILE_PX
+    x_px, y_px = np.full(side**2, 10.0), np.full(side**2, 13.0)
+    x_px[1], y_px[side] = 11.3, 9.4
+    image = colour.mosaic_image(0.8, x_px, y_px)
+    assert image.shape == (side * tile, side * tile)
+    at = np.arange(tile)
+
+    def wanted(x, y):
+        across = ndtr((at + 0.5 - x) / 0.8) - ndtr((at - 0.5 - x) / 0.8)
+        down = ndtr((at + 0.5 - y) / 0.8) - ndtr((at - 0.5 - y) / 0.8)
+        return np.outer(down, across)
+
+    np.testing.assert_allclose(image[:tile, tile : 2 * tile], wanted(11.3, 13.0), atol=1e-9)
+    np.testing.assert_allclose(image[tile : 2 * tile, :tile], wanted(10.0, 9.4), atol=1e-9)
+
+
+def test_a_star_s_shift_by_its_colour_is_against_the_sun_s_at_the_same_place():
+    """By a lens that moves a star to the right by its red share, and up by half of its blue."""
+
+    def centroids_px(x_px, y_px, spectra):
+        red, blue = np.broadcast_to(spectra, (len(x_px), 2)).T
+        return x_px + 0.01 * x_px * red, y_px - 0.5 * blue, red + blue
+
+    psf = SimpleNamespace(centroids_px=centroids_px)
+    places_px = np.array([[100.0, 200.0, 50.0], [7.0, 8.0, 9.0]])
+    spectra = np.array([[1.0, 0.0], [0.5, 0.5], [0.0, 1.0]])
+    moved = colour.moved_px(psf, places_px, spectra, 1)
+    np.testing.assert_allclose(moved, [[0.5, 0.0, -0.25], [0.25, 0.0, -0.25]], atol=1e-12)
+    nm = np.array([[450.0], [600.0], [700.0]])
+    np.testing.assert_allclose(colour.linear_px(nm, 1), [[-1.5, 0.0, 1.0]])
+    row = colour.lateral_colour("a lens", "OLED", "white", moved, moved * 1.5)
+    size_px = math.sqrt((0.25 + 0.0625 + 0.0625 + 0.0625) / 3)
+    assert asdict(row) == pytest.approx(
+        {
+            **{"lens": "a lens", "panel": "OLED", "colour": "white"},
+            **{"sky_px": size_px, "off_px": size_px / 2, "off_share": 0.5},
+        }
+    )
+
+
+def test_the_colours_that_one_panel_shows_are_those_recorded(tmp_path, monkeypatch):
+    monkeypatch.setattr(colour, "PANELS", {"OLED": PANELS["OLED"]})
+    colour.write_spectra(tmp_path)
+    rows, by_class = colour.study_gamut(tmp_path)
+    assert [row.sensor for row in rows] == [*MONO, *SENSORS]
+    for row in rows:
+        figures = asdict(row)
+        keys = {name: figures.pop(name) for name in ("panel", "sensor")}
+        figures = {name: figures[name] for name in ("out_share", "subtypes", "subtypes_white")}
+        assert_row("colour_gamut.csv", keys, figures | {"off_median": row.off_median})
+    assert len(by_class) == 7 * len(MONO)
+    for row in by_class:
+        keys = {"panel": row.panel, "sensor": row.sensor, "class": row.class_}
+        figures = {"off_nm": row.off_nm, "subtypes": row.subtypes, "mean_nm": row.mean_nm}
+        assert_row("colour_class.csv", keys, figures | {"stars": row.stars})
+
+
+def test_the_lens_of_1897_moves_white_as_the_sky_and_a_star_s_own_mixture_little(
+    tmp_path, monkeypatch
+):
+    """White is one spectrum for all stars, so it is off by all of the sky's own shift; each star's
+    own mixture has its mean wavelength.
+    """
+    monkeypatch.setattr(colour, "PANELS", {"OLED": PANELS["OLED"], "laser": PANELS["laser"]})
+    monkeypatch.setattr(colour, "FAINTEST_V_MAG", 2.0)
+    colour.write_spectra(tmp_path)
+    rows = {(row.lens, row.colour): row for row in colour.study_lateral(tmp_path)}
+    assert {row.panel for row in rows.values()} == {"OLED"}  # a laser's blue is blocked
+    for lens in ("planar-1897", "linear"):
+        assert rows[lens, "white"].off_share == pytest.approx(1.0)
+        assert rows[lens, "white"].sky_px == rows[lens, "star"].sky_px > 1e-3
+    assert rows["planar-1897", "star"].off_share < 0.1
+    assert rows["linear", "star"].off_share < 1e-5
+
+
+def test_the_chart_of_choices_has_a_point_of_each(figures, tmp_path):
+    rows = []
+    for number, (tracker, ink, method) in enumerate(
+        itertools.product(colour.MARKERS, colour.INKS, colour.METHODS), start=1
+    ):
+        errors = (number + 0.25, 1.0, number / 1e3, 2.0, number / 1e2)
+        rows.append(colour.ColourChoice(tracker, ink, method, 9, 3.0, 2.0 + number, *errors))
+    text = colour.draw(tmp_path / "colour", rows, colour.Load())
+    subtypes = {(row.tracker, row.colour, row.method): row.subtypes for row in rows}
+    star, white = (subtypes["Bayer", ink, "exact"] for ink in ("star", "white"))
+    assert f"mixture is {star:.2g} subtypes off before a Bayer tracker, white {white:.0f}" in text
+    (figure,) = figures
+    for axes, column in zip(figure.axes, ("subtypes", "mag", "px"), strict=True):
+        drawn = {}
+        for line in axes.get_lines():
+            if len(line.get_xdata()) == 1 and np.isfinite(line.get_xdata()).all():
+                (x,), (y,) = line.get_data()
+                drawn[x] = y, line.get_marker(), line.get_markerfacecolor()
+        for row in rows:
+            y, marker, fill = drawn[row.cpu_ms]
+            assert y == getattr(row, column)
+            assert marker == colour.MARKERS[row.tracker]
+            assert (fill == "none") == (row.method == "round")
+
+
+def test_a_frame_s_light_by_primary_is_its_codes_by_each_channel():
+    """Levels by channel, levels of a response that steals bits, and grey ones."""
+    rgb = np.array([[0, 0, 0], [255, 0, 255], [10, 20, 30]])
+    light = colour.srgb_response(8).light
+
+    def bench(table):
+        response = SimpleNamespace(rgb=table)
+        calibration = SimpleNamespace(response=response)
+        config = SimpleNamespace(monitor=SimpleNamespace(bits=8))
+        return SimpleNamespace(calibration=calibration, config=config)
+
+    by_channel = np.array([[[1, 2, 3], [255, 0, 0]]])
+    np.testing.assert_array_equal(
+        colour.light_by_primary(bench(None), by_channel), light[by_channel]
+    )
+    grey = np.array([[0, 255, 17]])
+    shown = colour.light_by_primary(bench(None), grey)
+    np.testing.assert_array_equal(shown, np.stack([light[grey]] * 3, axis=2))
+    stolen = colour.light_by_primary(bench(rgb), np.array([[2, 1]]))
+    np.testing.assert_array_equal(stolen, [[light[[10, 20, 30]], light[[255, 0, 255]]]])
 
 
 def test_a_dye_falls_to_one_over_e_at_its_half_width():

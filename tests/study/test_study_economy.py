@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
+import numpy as np
 import pytest
 
 from hilstar.instruments.study import economy
 from hilstar.instruments.study.economy import BITS, SCENES, TOLERANCES
+from hilstar.instruments.study.study_benches import LoneErrors, StarError
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.recorded import assert_recorded
 
@@ -56,3 +60,75 @@ def test_the_study_has_five_scenes_of_three_depths_at_two_tolerances(economy_stu
     _, lines, rows = economy_study
     assert len(rows) == len(SCENES) * len(BITS) * (1 + len(TOLERANCES)) == 45
     assert len([line for line in lines if " bits, " in line and "instead of" in line]) == 30
+
+
+def test_two_small_scenes_have_the_recorded_errors_and_their_chart(small_run):
+    """At rest and turning, at 8 bits."""
+    scenes = SCENES[0], SCENES[4]
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (("SCENES", scenes), ("BITS", (8,)), ("QUICK_ROUNDS", 1)):
+            patch.setattr(economy, name, value)
+        run = small_run(economy.run, True)
+    figures = ("stars", "flux_max_mag", "centroid_max_px", "claimed_mag", "claimed_px")
+    figures += ("tolerance_mag", "tolerance_px", "measured_stars", "quantisation")
+    figures += ("claimed_within", *(f"max_px_{kind}" for kind in FAMILY))
+    assert_recorded(run.folder / "economy.csv", ("scene", "bits", "tolerance"), figures)
+    rows = run.rows("economy")
+    assert [row["scene"] for row in rows] == 3 * [scenes[0].name] + 3 * [scenes[1].name]
+    # bars of both tolerances in both scenes: full over auto, and the error over its limit
+    for panel, heights in enumerate(("speed", "error")):
+        containers = run.charts["economy"].axes[panel].containers
+        for tolerance, bars in zip(TOLERANCES, containers, strict=True):
+            wanted = []
+            for full, *autos in (rows[:3], rows[3:]):
+                (auto,) = (row for row in autos if row["tolerance"] == tolerance.name)
+                if heights == "speed":
+                    wanted.append(float(full["frame_ms"]) / float(auto["frame_ms"]))
+                else:
+                    worst_px = max(float(auto[f"max_px_{kind}"]) for kind in FAMILY)
+                    mag = float(auto["flux_max_mag"])
+                    wanted.append(max(mag / tolerance.mag, worst_px / tolerance.px))
+            np.testing.assert_allclose([bar.get_height() for bar in bars], wanted)
+    lines = run.told[0]
+    assert len(lines) == 4 + 1
+    for line, row in zip(lines, [*rows[1:3], *rows[4:6]], strict=False):
+        assert line.startswith(f"{row['scene']}, 8 bits, {float(row['tolerance_mag']):g} mag and")
+        assert (
+            f"errors of {row['measured_stars']} stars {float(row['flux_max_mag']):.4f} mag" in line
+        )
+        assert f"({float(row['max_px_fit']):.4f} by a PSF fit), within the tolerance" in line
+
+
+def test_an_outcome_has_the_worst_star_of_either_sign_and_the_median_time(monkeypatch):
+    stars = (StarError(-0.03, 0.2), StarError(0.01, 0.5), StarError(0.02, 0.1))
+    off_px = {}
+    for number, kind in enumerate(FAMILY):
+        off_px[kind] = np.array([[3.0, 0.0, 1.0], [-4.0, 2.0, 1.0]]) * (number + 1) / 100
+    monkeypatch.setattr(economy, "lone_errors", lambda *_: LoneErrors(stars, off_px))
+    asked = []
+
+    def draw(q, number, rate):
+        asked.append((q.tolist(), number, rate.tolist()))
+        return SimpleNamespace(levels="levels", star_count=77)
+
+    render = SimpleNamespace(quantisation="exact")
+    bench = SimpleNamespace(
+        draw=draw,
+        config=SimpleNamespace(monitor=SimpleNamespace(bits=10), render=render),
+        effort=SimpleNamespace(error_mag=0.04, error_px=0.08, within=False),
+    )
+    scene = SCENES[4]
+    times = [(9.0, 2.0), (1.0, 8.0), (4.0, 3.0)]
+    found = economy.outcome(scene, "0.1", bench, times)
+    assert (found.frame_ms, found.cpu_ms) == (4.0, 3.0)
+    assert (found.flux_max_mag, found.centroid_max_px) == (0.03, 0.5)
+    assert (found.claimed_mag, found.claimed_px, found.claimed_within) == (0.04, 0.08, False)
+    assert (found.stars, found.measured_stars, found.bits) == (77, 3, 10)
+    assert (found.tolerance, found.tolerance_mag, found.tolerance_px) == ("0.1", 0.1, 0.1)
+    for number, kind in enumerate(FAMILY):
+        assert getattr(found, f"max_px_{kind}") == pytest.approx(0.05 * (number + 1))
+    assert found.worst_px == pytest.approx(0.05 * len(FAMILY))
+    assert found.share == pytest.approx(0.5 * len(FAMILY)) and not found.within
+    assert asked == [(scene.turn.q_icrs_to_cam.tolist(), 0, np.radians([0.6, 0.8, 0.0]).tolist())]
+    # full effort has the default's tolerance
+    assert economy.outcome(scene, "full", bench, times).tolerance_mag == economy.DEFAULT.mag

@@ -7,7 +7,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.basics.rotation import angle_between_rad
+from hilstar.basics.rotation import angle_between_rad, propagate
+from hilstar.display.quantise import shown_light
 from hilstar.instruments.study import faults
 from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS, Stray
 from hilstar.optics.layers.fault_kinds import KINDS
@@ -60,11 +61,126 @@ def test_stray_light_spoils_from_the_least_share_beyond_which_stars_are_off():
     assert faults.spoilt_from(strays, "exact") is None
 
 
-SMALL = "[sky]\nfaintest_v_mag = 6.0\n"
+@pytest.fixture(scope="module")
+def panel(tmp_path_factory):
+    """The study's own bench with exact codes, and its folder."""
+    folder = tmp_path_factory.mktemp("panel")
+    with faults.bench_of(folder, "exact") as bench:
+        yield bench, folder
+
+
+def shown(panel, case, frame=0):
+    """The light of a frame of a case with its faults, and without."""
+    bench, folder = panel
+    frames = faults.CaseFrames(bench, folder, case)
+    without = shown_light(frames.without(frame), bench.panel).copy()
+    return shown_light(frames.with_faults(frame), bench.panel).copy(), without
+
+
+def test_each_fault_changes_the_frame_as_its_kind_says(panel):
+    """What is added or lost, in electrons a second; codes are within a percent of what they show."""
+    bench, _ = panel
+    vega_e_per_s = {}
+    for mag in (2.0, 4.0):
+        near = np.argsort(np.abs(bench.stars.v_mag - mag))[:5]
+        own = bench.stars.electrons_per_s[near] * 10 ** (0.4 * (bench.stars.v_mag[near] - mag))
+        vega_e_per_s[mag] = np.median(own)
+    for case in ("false star, on the sky", "false star, moving", "64 false stars"):
+        faulty, without = shown(panel, case)
+        added = (faulty - without).sum()
+        count, mag = (64, 4.0) if case.startswith("64") else (1, 2.0)
+        # of other colours up to a third more or less; white clips none of them here by half
+        assert 0.4 < added / (count * vega_e_per_s[mag]) < 2.0, case
+    faulty, without = shown(panel, "star gone")
+    (row,) = np.flatnonzero(bench.stars.hip == 26311)
+    lost = without - faulty
+    # white clips it; nothing else goes, but for codes of its neighbours
+    assert 0.01 < lost.sum() / bench.stars.electrons_per_s[row] < 1.01
+    y_px, x_px = np.nonzero(lost)
+    assert np.ptp(x_px) < 40 and np.ptp(y_px) < 40
+    assert not shown(panel, "blank")[0].any()
+    for case in ("40 tracks of 12 px", "400 tracks of 25 px", "flash at a star", "gradient"):
+        faulty, without = shown(panel, case)
+        assert (faulty - without).sum() > 0.01 * without.sum(), case
+    faulty, without = shown(panel, NOWHERE)
+    np.testing.assert_array_equal(faulty, without)
+
+
+def test_a_frozen_frame_is_the_one_before_and_a_wrong_attitude_is_half_a_degree_off(panel):
+    bench, folder = panel
+    frames = faults.CaseFrames(bench, folder, "frozen")
+    first = frames.without(0).copy()
+    np.testing.assert_array_equal(frames.with_faults(30), first)
+    assert (frames.without(30) != first).any()
+    # turned about y by half a degree: along x, or the one way or the other
+    frames = faults.CaseFrames(bench, folder, "wrong attitude")
+    turned = frames.with_faults(0).copy()
+    same = []
+    for half_deg in (-0.5, 0.5):
+        q = propagate(faults.FIELD, np.radians([0.0, half_deg, 0.0]), 1.0)
+        same.append(np.mean(bench.draw(q).levels == turned))
+    assert max(same) > 0.9999 > min(same)
+
+
+def test_the_slew_turns_by_its_rate_from_frame_to_frame():
+    rate_rad_s = np.linalg.norm(faults.SLEW_RAD_S)
+    off_rad = angle_between_rad(faults.attitude_of(0), faults.attitude_of(90))
+    assert off_rad == pytest.approx(rate_rad_s * 90 / faults.REFRESH_HZ)
+
+
+def test_stars_over_stray_light_are_measured_without_it(panel):
+    """What a star adds to the codes is its own light, to the half steps of its pixels; over white
+    nothing is to be added.
+    """
+    none, little, white = (faults.stray_light(panel[0], share) for share in (0.0, 0.01, 1.0))
+    assert none.stars == little.stars == white.stars > 100
+    assert none.median_mag < 0.01 and none.p95_mag < 0.05 and none.lost == 0.0
+    assert little.median_mag < 0.02 and little.p95_mag < 0.1
+    assert (white.median_mag, white.p95_mag, white.lost) == (99.0, 99.0, 1.0)
+    assert (little.quantisation, little.share_of_white) == ("exact", 0.01)
+
+
+def test_a_small_study_of_faults_draws_its_rows(small_run):
+    cases = {case: CASES[case] for case in (NOWHERE, "false star, on the sky", "blank")}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in (
+            ("CASES", cases),
+            ("QUICK_ROUNDS", 1),
+            ("QUICK_SHARES", (0.0, 0.02, 1.0)),
+        ):
+            patch.setattr(faults, name, value)
+        run = small_run(faults.run, True)
+    costs, strays = run.rows("faults-cost"), run.rows("faults-stray")
+    assert [(row["quantisation"], row["case"]) for row in costs] == [
+        (name, case) for name in QUANTISATIONS for case in cases
+    ]
+    for row in costs:
+        frame_ms, without_ms = float(row["frame_ms"]), float(row["without_ms"])
+        assert float(row["cost_ms"]) == pytest.approx(frame_ms - without_ms)
+    lines = run.lines("faults", 0)
+    for name in QUANTISATIONS:
+        own = [
+            row for row in strays if row["quantisation"] == name and row["share_of_white"] != "0.0"
+        ]
+        for column in ("p95_mag", "median_mag"):
+            # what shows nothing has no point
+            wanted = [float(row[column]) for row in own if float(row[column]) < 99]
+            drawn = [np.array(y)[np.isfinite(y)].tolist() for _, x, y in lines if len(x) == 2]
+            assert any(
+                np.isclose(y[: len(wanted)], wanted).all() for y in drawn if len(y) >= len(wanted)
+            )
+        spoilt = min(float(row["share_of_white"]) for row in own if float(row["p95_mag"]) > 0.1)
+        assert f"from {spoilt:g} of white on with {name}" in run.title("faults")
+    for panel, name in enumerate(QUANTISATIONS):
+        own = [row for row in costs if row["quantisation"] == name]
+        drawn = {label: x for label, x, _ in run.lines("faults_cost", panel)}
+        np.testing.assert_allclose(drawn["without"], [float(row["without_ms"]) for row in own])
+        np.testing.assert_allclose(drawn["with the fault"], [float(row["frame_ms"]) for row in own])
+    assert len(run.told[0]) == 4
 
 
 def test_even_light_of_white_leaves_no_star_and_none_leaves_all_of_a_small_bench(bench_with):
-    bench = bench_with(SMALL)
+    bench = bench_with("[sky]\nfaintest_v_mag = 6.0\n")
     clear = faults.stray_light(bench, 0.0)
     assert (clear.quantisation, clear.share_of_white) == (bench.config.render.quantisation, 0.0)
     assert clear.stars > 3 and clear.lost < 0.5
@@ -73,26 +189,3 @@ def test_even_light_of_white_leaves_no_star_and_none_leaves_all_of_a_small_bench
     some = faults.stray_light(bench, 0.2)
     assert clear.median_mag <= some.median_mag < white.median_mag
     assert clear.p95_mag <= some.p95_mag
-
-
-@pytest.mark.parametrize("case", ["blank", "frozen", "star gone", "gradient", "wrong attitude"])
-def test_a_case_s_frames_differ_from_those_without_it_as_its_fault_says(bench_with, tmp_path, case):
-    frames = faults.CaseFrames(bench_with(SMALL), tmp_path, case)
-    plain = frames.without(3).copy()
-    assert plain.any()
-    shown = frames.with_faults(3).copy()
-    if case == "frozen":
-        # the frame that was drawn last stays
-        np.testing.assert_array_equal(shown, plain)
-    elif case == "blank":
-        assert not shown.any()
-    elif case == "gradient":
-        assert (shown > 0).mean() > (plain > 0).mean()
-    else:
-        assert (shown != plain).any()
-
-
-def test_the_slew_turns_from_frame_to_frame_by_its_rate():
-    turned_rad = angle_between_rad(faults.attitude_of(0), faults.attitude_of(30))
-    rate = np.linalg.norm(faults.SLEW_RAD_S)
-    assert turned_rad == pytest.approx(rate * 30 / faults.REFRESH_HZ)

@@ -166,3 +166,37 @@ def test_a_turn_is_foretold_along_a_straight_line_from_the_newest_packet(power):
     line = later**power + power * later ** (power - 1) * (t - later)
     rms_arcsec = np.sqrt(np.mean((t**power - line) ** 2)) * size_rad * ARCSEC_PER_RAD
     assert limits.predicted_rms_arcsec(attitude, 10.0, 100.0) == pytest.approx(rms_arcsec, rel=1e-5)
+
+
+def test_a_quick_study_s_table_chart_and_lines_are_those_of_its_limits(small_run):
+    """Beside the recorded rows of a whole study, where both have the same stress."""
+    run = small_run(limits.run, True)
+    assert_recorded(run.folder / "limits.csv", ("method", "stress", "at"), ("error", "tolerance"))
+    rows = run.rows("limits")
+    assert_meets_between_rows(rows)
+    stresses = list(dict.fromkeys(row["stress"] for row in rows))
+    recorded = csv_rows(ROOT / "results" / "limits.csv")
+    assert stresses == list(dict.fromkeys(row["stress"] for row in recorded))
+    then = {(row["stress"], row["at"]) for row in recorded}
+    for panel, stress in enumerate(stresses):
+        at, error, meets, tolerance = limit_rows(rows, stress)
+        # the ends of every stress are the same, quick or not, but for the coarsest depth
+        ends = {(row["stress"], row["at"]) for row in rows if row["stress"] == stress} & then
+        assert len(ends) >= 2
+        axes = run.charts["limits"].axes[panel]
+        (_, x, y), (_, _, level), *met = run.lines("limits", panel)
+        assert (x, level) == (at.tolist(), [tolerance, tolerance])
+        assert y == np.maximum(error, limits.SMALLEST).tolist()
+        assert axes.xaxis_inverted() == (at[0] > at[-1])
+        assert axes.get_yscale() == "log"
+        ratio = max(at) / abs(min(at)) if min(at) else 0.0
+        assert (axes.get_xscale() == "log") == (ratio > limits.LOG_FROM)
+        if math.isnan(meets):
+            assert not met
+            assert "nowhere to" in run.told[1 + panel]
+        else:
+            assert met == [("_meets", [meets], [tolerance])]
+            assert limits.two_digits(meets) in run.told[1 + panel]
+        assert f"({stress}): " in run.told[1 + panel]
+        assert run.told[1 + panel].startswith(axes.get_title(loc="left"))
+    assert len(run.told) == 13 and run.told[0] == run.title("limits")

@@ -29,6 +29,7 @@ from hilstar.instruments.study.rapp import SENSORS, rapp, rapp_ratios
 from hilstar.instruments.study.sky_figures import star_density
 from hilstar.instruments.study.study_benches import held_out_errors, study_optics
 from hilstar.sky import electrons
+from hilstar.sky.air import NIGHT_SKY
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.electrons import Photometry, load_library, tabulate, tabulate_pickles
 from hilstar.sky.facts import facts_of
@@ -481,6 +482,10 @@ def test_zodiacal_light_near_the_earth_has_its_magnitude(made):
     assert v_mag == pytest.approx(22.1, abs=0.03)
     assert table["earthshine_24_deg"] == pytest.approx(2 * table["earthshine_38_deg"])
     assert np.isnan(table["ground"][-1]) and table["ground"][200] > table["zodiacal"][200]
+    # known where its spectrum is, both ends included
+    night_nm = np.loadtxt(NIGHT_SKY, delimiter=",", comments=("#", "w"))[:, 0]
+    known = (table["wavelength_nm"] >= night_nm[0]) & (table["wavelength_nm"] <= night_nm[-1])
+    assert np.isfinite(table["ground"]).tolist() == known.tolist()
 
 
 def test_the_sun_s_type_and_vega_stand_beside_their_black_bodies(made):
@@ -682,3 +687,74 @@ def test_every_curve_of_a_chart_is_a_column_of_its_table(made, stem):
     assert len(drawn) == len(columns)
     for column in columns:
         assert any(np.array_equal(column, curve, equal_nan=True) for curve in drawn)
+
+
+def test_the_chart_of_spectra_says_what_half_and_95_percent_of_stars_are_within(
+    tmp_path, figures, monkeypatch
+):
+    library = load_library()
+    late = (library.vi_mag >= 2.5) & [name.endswith("III") for name in library.spectral_type]
+    sure = library.vi_mag < 2.5
+    assert late.sum() > 3
+
+    def real(count):
+        return np.where(late, -200.0, np.linspace(-3, 1, count))
+
+    def body(count):
+        return np.where(late, 900.0, np.linspace(-40, 10, count))
+
+    def by_type(count):
+        return np.where(late, 5.0, np.linspace(-2, 8, count))
+
+    rows = []
+    for sensor, factor in (("ccd47-20", 1.0), ("kai-4021", 2.0)):
+        for method, planted in (
+            (models.HELD_OUT, real),
+            (models.BY_TYPE, by_type),
+            ("black body, wang2021", body),
+            (models.BODY, body),
+        ):
+            percent = factor * planted(len(library.vi_mag))
+            rows.append(models.SpectrumErrors(sensor, method, percent))
+    monkeypatch.setattr(models, "spectrum_errors", lambda: rows)
+    text = models.spectra(tmp_path).text
+    half, most = np.percentile(np.abs(real(106))[sure], (50, 95))
+    body_half, body_most = np.percentile(np.abs(body(106))[sure], (50, 95))
+    assert (
+        f"CCD47-20 {half:.1f} % ({most:.1f} %) by real spectra and V-I, {body_half:.1f} %" in text
+    )
+    assert f"{2 * half:.1f} % ({2 * most:.1f} %) by real spectra" in text
+    type_most = np.percentile(np.abs(by_type(106))[sure], 95)
+    assert f"CCD47-20 200 % by V-I, 5.0 % by MK type (others {type_most:.1f} %)" in text
+    (figure,) = figures
+    title = " ".join(figure.get_suptitle().replace("\N{NO-BREAK SPACE}", " ").split())
+    assert f"within {2 * most:.1f} % for 95 % of stars" in title
+    assert f"by B-V within {2 * body_most:.0f} %" in title
+    for axes, factor in zip(figure.axes, (1.0, 2.0), strict=True):
+        by_label = {line.get_label(): line for line in axes.get_lines()}
+        np.testing.assert_array_equal(by_label[models.HELD_OUT].get_xdata(), library.vi_mag)
+        np.testing.assert_array_equal(by_label[models.HELD_OUT].get_ydata(), factor * real(106))
+        np.testing.assert_array_equal(by_label[models.BODY].get_ydata(), factor * body(106))
+    table = table_columns(tmp_path / "spectra.csv")
+    assert table["spectral_type"] == list(library.spectral_type)
+    np.testing.assert_allclose(table[f"kai-4021: {models.BY_TYPE} [%]"], 2 * by_type(106))
+
+
+def test_black_bodies_are_as_wrong_as_recorded(monkeypatch):
+    """Real spectra by colour within 0.79 and 2.42 % on the CCD47-20 (tests/authority); by type they
+    are another test's, and none here.
+    """
+    monkeypatch.setattr(models, "held_out_by_type", lambda rates: np.arange(2.0 * 106))
+    rows = {(row.sensor, row.method): row for row in models.spectrum_errors()}
+    sure = load_library().vi_mag < 2.5
+    for sensor, figures in HELD_OUT.items():
+        within = rows[sensor, models.HELD_OUT].within(sure)
+        assert within == pytest.approx(figures, abs=HUNDREDTH_OF_A_PERCENT)
+        assert rows[sensor, models.BY_TYPE].percent.tolist() == (100 * np.arange(106.0)).tolist()
+    optics = study_optics("ccd47-20")
+    real = electrons.library_electrons_per_s(load_library(), optics, Photometry())
+    kelvin = electrons.star_temperatures_k(load_library().bv_mag, "ballesteros2012")
+    body = tabulate("dgs", optics, Photometry()).electrons_per_s(np.zeros(106), kelvin)
+    np.testing.assert_allclose(
+        rows["ccd47-20", models.BODY].percent, 100 * (body / real - 1), atol=1e-3
+    )

@@ -22,6 +22,7 @@ from hilstar.basics.rotation import (
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.display.panel import Panel
+from hilstar.display.quantise import shown_light
 from hilstar.display.response import Levels, gamma_response
 from hilstar.instruments.study import (
     bodies,
@@ -42,6 +43,8 @@ from hilstar.instruments.study.prediction import auto_times
 from hilstar.instruments.study.sweep import beaten_by
 from hilstar.instruments.study.timing import stripe_depth
 from hilstar.optics.camera import Camera
+from hilstar.optics.frame_motion import CameraTurn
+from tests.support.benches import ORION_Q
 
 ROUNDING = 1e-9
 NEAR = predictors.NEAR
@@ -367,3 +370,69 @@ def test_a_psf_s_fit_is_about_its_own_background():
     image = star_image(100.3, 49.8, rigs.PSF_SIGMA_PX) + rigs.DARK_DN
     x_px, y_px = rigs.psf_fit(image, np.array([100]), np.array([50]))
     assert (x_px[0], y_px[0]) == pytest.approx((100.3, 49.8), abs=1e-3)
+
+
+@pytest.fixture(scope="module")
+def wide_bench(tmp_path_factory):
+    """Stars to V = 6.5 on a wide panel, of which some are over white."""
+    tables = {
+        "tracker": {"resolution_px": (1024, 1024)},
+        "sky": {"faintest_v_mag": 6.5},
+        "monitor": {"resolution_px": (800, 500), "pixel_pitch_um": 150.0, "bits": 8},
+        "collimator": {"focal_length_mm": 350},
+        "render": {"quantisation": "exact", "brightest_v_mag": 3.0},
+    }
+    path = tmp_path_factory.mktemp("wide") / "bench.toml"
+    with study_benches.study_bench(path, tables) as bench:
+        yield bench
+
+
+def test_lone_stars_are_those_of_a_frame_that_do_not_clip(wide_bench):
+    """Each found by hand: whole on the panel with 7 px around it, no other within twice that, and
+    no brighter than twice white in one pixel; its light in the codes against its own.
+    """
+    bench = wide_bench
+    turn = CameraTurn(np.array(ORION_Q), np.zeros(3))
+    levels = bench.draw(turn.q_icrs_to_cam).levels
+    errors = study_benches.lone_errors(bench, turn, levels)
+    sprites = study_benches.turning_sprites(bench, turn)
+    rates = sprites.data["electrons_per_s"]
+    shown = shown_light(levels, bench.panel)
+    wanted_mag = []
+    clipping = 0
+    for x, y, rate in zip(sprites.x_px, sprites.y_px, rates, strict=True):
+        if min(x, y, 799 - x, 499 - y) < 7:
+            continue
+        near = np.maximum(np.abs(sprites.x_px - x), np.abs(sprites.y_px - y)) < 14
+        if rates[near].sum() - rate > 2e-4 * rate:
+            continue
+        if rate > 2 * bench.flux_at_white_e_per_s:
+            clipping += 1
+            continue
+        part = shown[int(y - 7) : int(y + 7) + 1, int(x - 7) : int(x + 7) + 1]
+        wanted_mag.append(-2.5 * math.log10(part.sum() / rate))
+    assert len(wanted_mag) > 20 and clipping > 0
+    found_mag = sorted(star.flux_mag for star in errors.stars)
+    # a millionth of a star is beyond its sprite
+    assert found_mag == pytest.approx(sorted(wanted_mag), abs=1e-5)
+    for off_px in errors.off_px.values():
+        assert off_px.shape == (2, len(wanted_mag))
+        assert np.hypot(*off_px).max() < 0.2
+    # shown somewhere else, all are off by that
+    moved = levels.copy()
+    moved[:, 1:] = levels[:, :-1]
+    off_px = study_benches.lone_errors(bench, turn, moved).off_px["fit"]
+    assert np.median(off_px[0]) == pytest.approx(1.0, abs=0.05)
+    assert np.median(np.abs(off_px[1])) < 0.05
+
+
+def test_a_field_s_stars_are_off_by_their_way_to_their_pixels(wide_bench):
+    turn = CameraTurn(np.array(ORION_Q), np.zeros(3))
+    off_px = rigs.pixel_errors(wide_bench, turn)
+    sprites = study_benches.turning_sprites(wide_bench, turn)
+    inside = (sprites.x_px > -0.5) & (sprites.x_px < 799.5)
+    inside &= (sprites.y_px > -0.5) & (sprites.y_px < 499.5)
+    assert off_px.shape == (2, inside.sum()) and (~inside).sum() > 0
+    assert np.abs(off_px).max() <= 0.5
+    places = np.stack([sprites.x_px, sprites.y_px])[:, inside]
+    np.testing.assert_allclose((places + off_px) % 1 % 1, 0, atol=1e-9)

@@ -6,8 +6,12 @@ import csv
 import math
 from typing import get_type_hints
 
+import numpy as np
 import pytest
 
+from hilstar.basics.rotation import angle_between_rad, propagate
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.instruments.study import prediction
 from hilstar.instruments.study.prediction import (
     LATENCIES_MS,
     RATES_HZ,
@@ -20,7 +24,13 @@ from hilstar.instruments.study.prediction import (
     shaken_rows,
     slew_outcomes,
 )
-from hilstar.instruments.study.predictors import SLEW_DEG, SLEW_S
+from hilstar.instruments.study.predictors import (
+    NEAR,
+    SLEW_DEG,
+    SLEW_S,
+    rate_of,
+    slew_attitude,
+)
 
 SLEW_PART_S = 2.0  # a tenth of the swing, from its fastest on
 
@@ -113,3 +123,108 @@ def test_the_study_writes_what_it_found(whole_prediction):
     assert {ms for _, hz, ms in outcomes if hz == USUAL_HZ} == set(LATENCIES_MS)
     assert {hz for _, hz, ms in outcomes if ms == USUAL_MS} == set(RATES_HZ)
     assert all(outcome.attitude_us > 0 for outcome in outcomes.values())
+
+
+SPAN_S = 1.5
+PATH = "linear, by the sample's rate"
+
+
+def foretold_arcsec(packet_hz: int, latency_ms: int, by_rate: bool) -> list[float]:
+    """The errors of the newest packet that has arrived, turned on by its rate or not, in frames at
+    60 Hz from the first that NEAR packets and one more have reached.
+    """
+    step_ns = NS_PER_S / packet_hz
+    last_ns = math.ceil(SPAN_S * packet_hz) * step_ns
+    errors = []
+    frame = 0
+    while frame * NS_PER_S / 60 < last_ns:
+        t_ns = round(frame * NS_PER_S / 60)
+        frame += 1
+        arrived_ns = t_ns - latency_ms * 1_000_000
+        if arrived_ns < NEAR * step_ns:
+            continue
+        newest_ns = round(arrived_ns // step_ns * step_ns)
+        q = slew_attitude(newest_ns)
+        if by_rate:
+            q = propagate(q, rate_of(slew_attitude, newest_ns), (t_ns - newest_ns) / NS_PER_S)
+        errors.append(angle_between_rad(q, slew_attitude(t_ns)) * ARCSEC_PER_RAD)
+    return errors
+
+
+def test_a_small_study_is_off_by_what_its_packets_leave(small_run, monkeypatch):
+    """Each packet as old as its latency and up to a period more; the last frame may be one."""
+    monkeypatch.setattr(prediction, "QUICK_SPAN_S", SPAN_S)
+    monkeypatch.setattr(prediction, "LATENCIES_MS", (5, 20, 100))
+    monkeypatch.setattr(prediction, "RATES_HZ", (10, 100))
+    monkeypatch.setattr(prediction, "QUICK_SHAKEN_HZ", (5, 10, 20))
+    monkeypatch.setattr(prediction, "TIMED", 3)
+    run = small_run(prediction.run, True)
+    rows = {}
+    for row in typed_rows(run.folder / "prediction.csv", PredictionOutcome):
+        rows[row.method, row.rate_hz, row.latency_ms] = row
+    cells = [(10, 20), (100, 5), (100, 20), (100, 100)]
+    assert list(dict.fromkeys(key[1:] for key in rows)) == cells
+    assert len(rows) == 5 * len(cells)
+    for hz, ms in cells:
+        for method, by_rate in (("hold", False), (PATH, True)):
+            wanted = np.array(foretold_arcsec(hz, ms, by_rate))
+            row = rows[method, hz, ms]
+            # a frame more or less at the end
+            rms_arcsec = math.sqrt(np.mean(wanted**2))
+            assert row.rms_arcsec == pytest.approx(rms_arcsec, rel=0.03)
+            assert row.worst_arcsec == pytest.approx(wanted.max(), rel=1e-3)
+            assert row.attitude_us > 0
+    # what is drawn, and what is told
+    drawn = {label: (x, y) for label, x, y in run.lines("prediction", 0)}
+    for method in ("hold", PATH):
+        (label,) = (label for label in drawn if label.startswith(method))
+        wanted = [rows[method, 100, ms].rms_arcsec for ms in (5, 20, 100)]
+        assert drawn[label] == ([5, 20, 100], wanted)
+    drawn = {label: (x, y) for label, x, y in run.lines("prediction", 1)}
+    assert drawn[PATH] == ([10, 100], [rows[PATH, hz, 20].rms_arcsec for hz in (10, 100)])
+    held_arcsec = rows["hold", 100, 20].rms_arcsec
+    by_rate_arcsec = rows[PATH, 100, 20].rms_arcsec
+    assert f"off by {by_rate_arcsec:.2g} arcsec rms, holding the sample by {held_arcsec:.3g}" in (
+        run.title("prediction")
+    )
+    findings, _ = run.told
+    assert findings[0] == run.title("prediction") and len(findings) == 1 + 5 + 1
+    assert findings[1].startswith(f"hold: {held_arcsec:.3g} arcsec rms, ")
+    jitter = typed_rows(run.folder / "prediction_jitter.csv", Shaken)
+    assert len(jitter) == 2 * 3 * 3
+    for panel, (packets, share) in enumerate(
+        [("with rates", "residual"), ("without rates", "residual"), ("with rates", "gain")]
+    ):
+        drawn = {label: (x, y) for label, x, y in run.lines("prediction_jitter", panel)}
+        for way in ("rate", "auto", "newest"):
+            own = [row for row in jitter if (row.way, row.packets) == (way, packets)]
+            assert drawn[way] == ([5, 10, 20], [getattr(row, share) for row in own])
+    above_hz = [
+        crossing_hz(jitter, packets, 100, 20) for packets in ("with rates", "without rates")
+    ]
+    assert f"above {above_hz[0]:.0f} Hz ({above_hz[1]:.0f} without rates)" in findings[-1]
+
+
+@pytest.mark.parametrize(("packet_hz", "age_ms"), [(100, 20), (50, 20), (200, 10)])
+def test_a_vibration_is_shown_by_the_age_of_its_packets(packet_hz, age_ms):
+    """As 1 + i x by a rate, and as it was by the newest, where it is exp(i x), for x = 2 pi f age."""
+    hz = 7.0
+    ages_s = np.linspace(-0.5, 0.5, 41) / packet_hz + age_ms / 1e3
+    x = math.tau * hz * ages_s
+    residual, gain = prediction.shaken_error("rate", hz, packet_hz, age_ms, True)
+    assert gain == pytest.approx(abs(np.mean((1 + 1j * x) * np.exp(-1j * x))), rel=0.01)
+    left = np.abs(1 + 1j * x - np.exp(1j * x))
+    assert residual == pytest.approx(math.sqrt(np.mean(left**2)), rel=0.05)
+    residual, gain = prediction.shaken_error("newest", hz, packet_hz, age_ms, False)
+    assert residual == pytest.approx(math.sqrt(np.mean((2 * np.sin(x / 2)) ** 2)), rel=0.05)
+    assert gain == pytest.approx(abs(np.mean(np.exp(-1j * x))), rel=0.01)
+
+
+def test_a_crossing_is_where_the_logarithms_of_frequencies_are_parted_by_the_errors():
+    rows = []
+    for hz, by_rate, newest in ((2.0, 0.1, 0.4), (8.0, 0.5, 0.8), (32.0, 3.0, 1.2)):
+        for way, residual in (("rate", by_rate), ("newest", newest), ("auto", 0.0)):
+            rows.append(Shaken(way, "p", 100, 20, hz, 1.0, residual))
+    # from 0.3 under to 1.8 over
+    assert crossing_hz(rows, "p", 100, 20) == pytest.approx(8 * 4 ** (0.3 / 2.1))
+    assert crossing_hz(rows[:6], "p", 100, 20) == math.inf

@@ -15,15 +15,23 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import angle_between_rad
+from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study import sweep
 from hilstar.instruments.study.codes import star_field
-from hilstar.instruments.study.predictors import slew_attitude
+from hilstar.instruments.study.predictors import predictors, slew_attitude, slew_sample
 from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, in_turn, pareto_front
+from hilstar.instruments.study.tradeoff import places
 from hilstar.instruments.study.tradeoff import run as tradeoff
-from hilstar.instruments.study.tradeoff.light import LIMITS_V_MAG, gauss, shared_knots, trapezoid
+from hilstar.instruments.study.tradeoff.light import (
+    LIMITS_V_MAG,
+    gauss,
+    sampled_flux,
+    shared_knots,
+    trapezoid,
+)
 from hilstar.instruments.study.tradeoff.places import (
     EVENLY,
     EXACT_NODES,
@@ -45,6 +53,8 @@ from hilstar.optics.psf import MAX_CUT
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
+from tests.support.benches import ROOT
+from tests.support.tables import csv_rows
 
 NAMES = [
     "brightness",
@@ -57,6 +67,7 @@ NAMES = [
     "psf",
     "quantisation",
 ]
+PX = 57.65e-3 / 350  # the tangent of a pixel of the demo's monitor
 # A relative error in magnitudes: 2.5 / ln 10.
 MAG_PER_SHARE = 1.0858
 # Of the brightest star, in a pixel that holds 0.44 of it along each axis. The exp erf: two edges of
@@ -67,18 +78,131 @@ PROFILE_SHARE = 2e-7
 
 
 @pytest.fixture(scope="module")
-def tradeoff_study(whole_study):
+def small(small_run):
+    """Every step with one round; of those that draw at chance, fewer places than the page's."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)  # one round: no claim here is of a time
+        patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)  # no claim here is of a time
         patch.setattr(sweep, "MIN_ROUNDS", 1)
-        charts = {f"tradeoff_{name}" for name in NAMES}
-        found = whole_study("tradeoff", charts)
-    rows = found.rows("tradeoff")
-    return (
-        found.folder,
-        found.findings,
-        {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES},
-    )
+        return small_run(tradeoff.run, True)
+
+
+@pytest.fixture(scope="module")
+def tradeoff_study(small):
+    rows = small.rows("tradeoff")
+    lines, _ = small.told
+    steps = {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES}
+    return small.folder, lines, steps
+
+
+def test_the_command_writes_every_step(whole_study):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)
+        patch.setattr(sweep, "MIN_ROUNDS", 1)
+        found = whole_study("tradeoff", {f"tradeoff_{name}" for name in NAMES})
+    assert {row["step"] for row in found.rows("tradeoff")} == set(NAMES)
+
+
+@pytest.mark.parametrize("name", ["brightness", "spectrum", "depth", "psf", "quantisation"])
+def test_the_errors_of_a_step_without_chance_are_those_recorded(tradeoff_study, name):
+    """Of the whole study, to what drivers round otherwise: 2 %, or some of float32's steps."""
+    then = {}
+    for row in csv_rows(ROOT / "results" / "tradeoff.csv"):
+        if row["step"] == name:
+            then[row["method"]] = row
+    now = tradeoff_study[2][name]
+    assert set(now) == set(then)
+    for method, row in now.items():
+        # of mag or px; of light lost, %
+        for error in ("error", "second"):
+            wanted = float(then[method][error])
+            assert float(row[error]) == pytest.approx(wanted, rel=0.02, abs=5e-7), (method, error)
+        for same in ("error_unit", "second_unit", "error_is", "second_is", "default", "exact"):
+            assert row[same] == then[method][same], (method, same)
+
+
+def test_cells_that_are_smaller_are_tested_less_in_vain(tradeoff_study):
+    """A scan tests all stars but those in view; cells those within their own radius, too."""
+    step = tradeoff_study[2]["culling"]
+    vain = {method: float(row["second"]) for method, row in step.items()}
+    assert vain["scan, every star projected"] == vain["scan of angles"]
+    cells = [vain[f"cells of {size} deg"] for size in (1, 2, 3, 4, 6, 10, 20)]
+    assert cells == sorted(cells) and cells[-1] < 0.1 * vain["scan, every star projected"]
+    missed = {method: float(row["error"]) for method, row in step.items()}
+    assert missed["cells of 10 deg, by centres only"] > 100
+    assert all(missed[method] == 0 for method in missed if "centres" not in method)
+    # the sprites in view of 10 fields are of 17.9 x 10.2 degrees and 5 px on each side
+    in_view = (116_812 - vain["scan of angles"]) / 116_812
+    share = 4 * math.asin(math.sin(math.atan(963.5 * PX)) * math.sin(math.atan(543.5 * PX)))
+    assert in_view == pytest.approx(share / (4 * math.pi), rel=0.25)
+
+
+def test_a_place_is_known_to_the_steps_of_its_format(tradeoff_study):
+    """Half a step of float32 at 1024 to 2048 px is 6.1e-5 px along each axis; of float64 a few of
+    2.3e-13.
+    """
+    step = tradeoff_study[2]["projection"]
+    worst = {method: float(row["error"]) for method, row in step.items()}
+    rms = {method: float(row["second"]) for method, row in step.items()}
+    assert 3e-5 < worst["float64, place in float32"] <= math.sqrt(2) * 6.2e-5
+    # evenly in a step of each octave, mostly 512 to 1024 px and more
+    assert rms["float64, place in float32"] == pytest.approx(3e-5, rel=0.5)
+    assert worst["float32 throughout"] > 2 * worst["float64, place in float32"]
+    assert worst["float32 throughout"] < 2e-3
+    assert 1e-14 < worst["float64, place in float64"] < 5e-12
+    assert 1e-8 < worst["float64, whole pixel + float32 fraction"] < 6e-8
+    assert all(rms[method] <= worst[method] for method in rms)
+
+
+def test_a_prediction_s_errors_are_those_of_its_samples():
+    """Of a hold at 20 Hz: the turn since the newest sample, in frames at 60 Hz."""
+    samples = [slew_sample(k * 50_000_000) for k in range(30)]
+    hold, *_, blend = predictors()
+    errors = places.prediction_errors(hold, samples)
+    wanted = []
+    for frame in range(9, 87):  # between the samples 3 and 29, the last one's frame not
+        t_ns = round(frame * NS_PER_S / 60)
+        newest_ns = frame // 3 * 50_000_000
+        off_rad = angle_between_rad(slew_attitude(t_ns), slew_attitude(newest_ns))
+        wanted.append(off_rad * ARCSEC_PER_RAD)
+    np.testing.assert_allclose(errors, wanted, rtol=1e-6, atol=1e-9)
+    # one that waits lies between two samples: the cubic of a swing of 20 s is 1e-3 of a hold
+    assert max(places.prediction_errors(blend, samples)) < 0.2 * max(errors)
+
+
+def test_the_smear_s_stars_are_even_over_the_detector_in_the_middle_of_the_exposure():
+    bench = places.smear_bench()
+    side = bench.side_px
+    stars = bench.grid_stars(4)
+    x_px, y_px = bench.places_px(stars, np.array([-0.5, 0.0, 0.5]))
+    wanted = (np.arange(4) + 0.5) * side / 4 - 0.5
+    # in cells of the sky, in no order of the detector's
+    middles = {(round(x, 6), round(y, 6)) for x, y in zip(x_px[1], y_px[1], strict=True)}
+    assert middles == set(itertools.product(wanted.tolist(), repeat=2))
+    assert stars.electrons_per_s.tolist() == [1.0] * 16
+    # over the exposure the middle moves across by a turn about y, up by one about x (0.7 deg/s)
+    tracker = places.demo_config().tracker
+    turn_px = math.radians(0.7) * tracker.exposure_s * bench.camera.focal_length_px
+    across_px, down_px = x_px[2] - x_px[0], y_px[2] - y_px[0]
+    assert abs(across_px.mean()) == pytest.approx(turn_px, rel=0.1)
+    assert abs(down_px.mean()) == pytest.approx(turn_px, rel=0.1)
+    lengths_px = np.hypot(across_px, down_px)
+    assert places.path_words(bench, stars) == f"{lengths_px.min():.0f} to {lengths_px.max():.0f} px"
+    # shares of light along the path, whole in all
+    for sprites_of in places.smear_methods(bench).values():
+        data = sprites_of(stars).data
+        assert data["electrons_per_s"].sum() == pytest.approx(16.0, rel=1e-5)
+
+
+def test_a_method_s_distance_is_of_both_axes_and_of_stars_that_are_seen():
+    off_px = np.array([[3.0, 4.0], [np.nan, np.nan], [0.0, 1.0]], dtype=np.longdouble)
+    assert places.worst_and_rms_px(off_px) == pytest.approx((5.0, math.sqrt(13)))
+
+
+def test_a_narrow_star_s_samples_ripple_by_its_first_harmonic():
+    phases_px = np.array([0.0, 0.25, 0.5])
+    sums = sampled_flux(phases_px)
+    first = 2 * math.exp(-2 * (math.pi * 0.4) ** 2)
+    np.testing.assert_allclose(sums, 1 + first * np.cos(2 * math.pi * phases_px), atol=1e-5)
 
 
 @pytest.fixture(scope="module")

@@ -51,6 +51,10 @@ SMALL_BENCH = bench_text()
 # milliseconds.
 LIVE_BENCH = bench_text({"render": {"quantisation": "round"}})
 
+# Lines of [attitude] and [render] for stars that move within a frame: of exact codes a turn costs
+# more.
+MOVING = '[render]\nmotion = "on"\nquantisation = "round"\n'
+
 # The size of the X servers of tests/support/x11/screens.py. On a busy machine `auto` might choose
 # other codes than `frame`.
 SCREEN_BENCH = bench_text(

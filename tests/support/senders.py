@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import socket
 import struct
@@ -31,6 +32,18 @@ def packet(sequence: int, t_ns: int, q=(0.5, 0.5, -0.5, 0.5), rate=(0.0, 0.0, 0.
         "<BBHIq4d3f", 1, 1, rate is not None, sequence, t_ns, *q, *(rate or (0.0, 0.0, 0.0))
     )
     return body + struct.pack("<I", zlib.crc32(body))
+
+
+def send_attitudes(sender, attitudes, hz: float) -> None:
+    """Attitudes one after the other, each a quaternion and its rate, JSON where that is None."""
+    start_ns = time.monotonic_ns()
+    for k, (q, rate) in enumerate(attitudes):
+        due_ns = start_ns + round(k * 1e9 / hz)
+        time.sleep(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
+        if rate is None:
+            sender.send(json.dumps({"t_ns": due_ns, "q": q, "sequence": k}).encode())
+        else:
+            sender.send(packet(k, due_ns, q, rate))
 
 
 # Ports under those that the system gives to whoever asks for any; each process of tests begins

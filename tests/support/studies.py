@@ -8,17 +8,22 @@ each is saved (tests/study/conftest.py).
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pytest
 
 from hilstar.basics import charts
 from tests.support.commands import run_hilstar_here
 from tests.support.pictures import assert_drawn
 from tests.support.tables import csv_rows
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 LIMIT_S = 3600  # minutes of work, on a machine whose other work takes most of it
 
@@ -76,3 +81,31 @@ def studied(
         assert all(rows[0]), path
         assert all(None not in row and None not in row.values() for row in rows), path
     return Studied(folder, told["findings"], told["right"])
+
+
+@dataclass(frozen=True)
+class SmallRun:
+    """What a study's own function wrote and returned at a small size, in this process; its charts
+    by their stems, of which no file is saved.
+    """
+
+    folder: Path
+    told: Any
+    charts: Mapping[str, Figure]
+
+    def rows(self, table: str) -> list[dict[str, str]]:
+        """The rows of a table, by its name without an ending."""
+        return csv_rows(self.folder / f"{table}.csv")
+
+    def title(self, stem: str) -> str:
+        """The title of a chart, in one line."""
+        title = self.charts[stem].get_suptitle()
+        return " ".join(title.replace("\N{NO-BREAK SPACE}", " ").split())
+
+    def lines(self, stem: str, panel: int) -> list[tuple[str, list[float], list[float]]]:
+        """Label, x and y of each line of a chart's panel."""
+        lines = []
+        for line in self.charts[stem].axes[panel].get_lines():
+            x, y = (np.asarray(values, dtype=float).tolist() for values in line.get_data())
+            lines.append((str(line.get_label()), x, y))
+        return lines

@@ -1,19 +1,16 @@
-"""What one packet can ask of a frame: turns of 1 to 900 rad/s and retargets in a live stream,
-and in a replayed log.
-"""
+"""What one packet can ask of a frame: turns of 1 to 900 rad/s and retargets in a live stream."""
 
 from __future__ import annotations
 
 import json
 import math
 import signal
-import threading
 import time
 
 import pytest
 
-from tests.support.commands import assert_refused, run_hilstar_here
-from tests.support.senders import packet, publisher
+from tests.support.benches import MOVING
+from tests.support.senders import publisher, send_attitudes
 from tests.support.servers import serving, summary_of
 from tests.support.waiting import PATIENCE_S, CoreWaits, missed_in
 
@@ -21,21 +18,6 @@ RATES_RAD_S = (1.0, 10.0, 57.0, 200.0, 900.0)
 # A frame of the small bench takes 1 ms; one of 10 rad/s took 1500 ms and more. The margin is for
 # busy machines.
 MAX_FRAME_MS = 400.0
-MOVING = '[render]\nmotion = "on"\nquantisation = "round"\n'  # of exact codes a turn costs more
-
-
-def send_attitudes(sender, attitudes, hz: float) -> None:
-    start_ns = time.monotonic_ns()
-    for k, (q, rate) in enumerate(attitudes):
-        due_ns = start_ns + round(k * 1e9 / hz)
-        time.sleep(max(0.0, (due_ns - time.monotonic_ns()) / 1e9))
-        sender.send(attitude_packet(k, due_ns, q, rate))
-
-
-def attitude_packet(k, t_ns, q, rate) -> bytes:
-    if rate is not None:
-        return packet(k, t_ns, q, rate)
-    return json.dumps({"t_ns": t_ns, "q": q, "sequence": k}).encode()
 
 
 def turned_q(degrees: float) -> tuple[float, ...]:
@@ -100,56 +82,3 @@ def test_a_sender_without_rates_that_retargets_stops_no_frame(tmp_path, degrees)
     assert took_s - waited.s < 10
     assert summary["frame_ms"]["max"] < MAX_FRAME_MS + 1000 * waited.s, (summary, waited.s)
     assert summary["capped"] == 0
-
-
-def test_a_log_whose_rate_is_too_fast_is_refused_with_its_attitude(small_bench_file, tmp_path):
-    log = tmp_path / "log.csv"
-    rows = [f"{k / 10},1,0,0,0,0,0,{57.3 if k == 3 else 0}" for k in range(10)]
-    log.write_text("\n".join(["t_s,qw,qx,qy,qz,rx,ry,rz", *rows]) + "\n")
-    result = run_hilstar_here(
-        "replay", small_bench_file, log, "--headless", "--speed", "max", "--json"
-    )
-    assert_refused(result, 2, str(log), "attitude 4", "max_rate_deg_s = 60", "rad/s")
-
-
-def test_a_run_with_such_turns_is_replayed_from_its_ledger_in_bounded_time(tmp_path):
-    ledger = tmp_path / "run.mcap"
-    attitude = f"max_rate_deg_s = 1e6\n{MOVING}"
-    with (
-        publisher() as (sender, port),
-        serving(tmp_path, port, "--ledger", str(ledger), attitude=attitude) as process,
-    ):
-        process.shows()
-        send_attitudes(
-            sender, [((0.5, 0.5, -0.5, 0.5), (900.0, 0.0, -900.0)) for _ in range(100)], 100
-        )
-        process.has_received(100)
-        process.shows(60)
-        process.send_signal(signal.SIGINT)
-        served = summary_of(process)
-    result = run_hilstar_here(
-        f"replay {tmp_path}/serve.toml {ledger} --headless --speed max --json", timeout=PATIENCE_S
-    )
-    assert result.returncode == 0, result.stderr
-    summary = json.loads(result.stdout)
-    assert (summary["frames"], summary["capped"]) == (served["frames"], served["capped"])
-    assert summary["capped"] > 0
-
-
-def test_a_frame_that_hangs_is_told_with_its_stage():
-    """The loop's own thread stands still; the watchdog's does not."""
-    from hilstar.basics.notices import Notices
-    from hilstar.server.watchdog import FrameWatch
-
-    notices, told = Notices(), threading.Event()
-    lines: list[str] = []
-    notices.listen(lambda notice: (lines.append(notice.detail), told.set()))
-    with FrameWatch(1e9 / 60, notices) as watch:
-        watch.begin(7)
-        watch.enter("swap")
-        assert told.wait(PATIENCE_S)
-        watch.end(timed=True)
-    assert "frame 7 hangs in its stage swap" in lines[0]
-    assert "frame 7 took" in lines[-1]
-    assert "sprites" in lines[-1]
-    assert notices.counts() == {"frame-stuck": 1, "frame-late": 1}

@@ -15,10 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.instruments.calibrate.latency import Edges, read_edges, save_edges
-from hilstar.server.screen.screen import CODE, CODE_BITS, marker_light
+from hilstar.server.screen.screen import marker_light
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
-from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.commands import run_hilstar, run_hilstar_here
 from tests.support.forks import HILSTAR, Started
 from tests.support.ledgers import read_run
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time, real_time, wait_for
@@ -162,34 +161,3 @@ def test_a_square_that_toggles_is_known_but_for_pairs_of_frames_and_a_device_s_o
         marker_light(frame.frame, "toggle") for frame in run.frames
     ]
     assert run.process and run.process[0].resident_bytes > 1e6
-
-
-def test_the_code_says_which_frame_by_any_seven():
-    windows = {tuple(CODE[(k + j) % len(CODE)] for j in range(CODE_BITS)) for k in range(len(CODE))}
-    assert len(windows) == len(CODE) == 127
-
-
-def test_what_is_wrong_is_said_in_one_line(tmp_path, small_bench_file):
-    edges = tmp_path / "edges.csv"
-    save_edges(edges, Edges(np.arange(30) * 10**7, np.arange(30) % 2))
-    assert len(read_edges(edges).host_ns) == 30
-    ledger = tmp_path / "run.mcap"
-    log = tmp_path / "log.csv"
-    log.write_text(f"t_s,qw,qx,qy,qz\n0,{ATTITUDE}\n0.1,{ATTITUDE}\n")
-    run_hilstar_here(
-        "replay", small_bench_file, log, "--headless", "--speed", "max", "--ledger", ledger
-    )
-    assert_refused(run_hilstar_here("latency", ledger, "--edges", edges), 2, "photodiode_px")
-    assert_refused(run_hilstar_here("latency", ledger), 2, "--edges", "--diode")
-    assert_refused(run_hilstar_here("latency", edges, "--edges", edges), 2, "edges.csv")
-    assert_refused(run_hilstar_here("latency", ledger, "--edges", log), 2, "host_ns")
-    assert_refused(
-        run_hilstar_here("latency", ledger, "--diode", "serial:/dev/nothing@9600"),
-        3,
-        "/dev/nothing",
-    )
-    assert_refused(run_hilstar_here("latency", ledger, "--diode", "tcp://x"), 2, "--diode")
-    assert_refused(run_hilstar_here("report", log, "-o", tmp_path / "r"), 2, "log.csv")
-    assert_refused(
-        run_hilstar_here("report", tmp_path / "no.mcap", "-o", tmp_path / "r"), 2, "no.mcap"
-    )

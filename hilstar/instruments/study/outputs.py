@@ -261,12 +261,7 @@ def _draw_property(axes: "Axes", values: FloatArray, name: str, unit: str) -> No
 def _draw_images(panels: "list[Axes]", scene: OutputScene, outputs: Outputs) -> None:
     """The images without and with noise, each with its zoom, and beside them scale and camera."""
     star, (x_px, y_px) = _zoom(scene, outputs)
-    low, high = np.percentile(outputs.noisy.dn, STRETCH_PERCENT)
-    sky_noise_dn = outputs.noise_e / outputs.gain_e_per_dn
-    noise_dn = max(sky_noise_dn, 0.1)
-    lowest = low + MIN_SIGMAS * noise_dn
-    highest = low + MAX_SIGMAS * noise_dn
-    high = float(np.clip(high, lowest, highest))
+    low, high = stretch_dn(outputs)
     images = (outputs.clean, outputs.clean, outputs.noisy, outputs.noisy)
     titles = ("Without noise", f"The same, {star}", "With noise", f"The same, {star}")
     drawn = [panels[0], panels[1], panels[3], panels[4]]
@@ -285,6 +280,18 @@ def _draw_images(panels: "list[Axes]", scene: OutputScene, outputs: Outputs) -> 
     scale.figure.colorbar(
         image, ax=scale, label="Signal [DN]", orientation="horizontal", location="top", fraction=0.5
     )
+
+
+def stretch_dn(outputs: Outputs) -> tuple[float, float]:
+    """The DN that are black and white in all images: by the noisy one's pixels, within limits by
+    the sky's noise.
+    """
+    low, high = np.percentile(outputs.noisy.dn, STRETCH_PERCENT).tolist()
+    sky_noise_dn = outputs.noise_e / outputs.gain_e_per_dn
+    noise_dn = max(sky_noise_dn, 0.1)
+    lowest = low + MIN_SIGMAS * noise_dn
+    highest = low + MAX_SIGMAS * noise_dn
+    return low, float(np.clip(high, lowest, highest))
 
 
 def _zoom(scene: OutputScene, outputs: Outputs) -> tuple[str, tuple[float, float]]:

@@ -443,11 +443,19 @@ def fitted_light_dn(field: RigField, exposures: int) -> float:
     for star_dn in LIGHTS_DN:
         scatter = scatter_arcsec(field, field.pixel_px, star_dn, exposures)
         by_light.append(across_rms(scatter[FITTED]))
-    published = across_rms(SCATTER_ARCSEC[FITTED])
-    # np.interp wants what it looks up in to rise; scatter falls with light.
-    rising = np.log(by_light)[::-1]
-    rising_lights = np.log(LIGHTS_DN)[::-1]
-    light = np.interp(np.log(published), rising, rising_lights)
+    return light_of_scatter(across_rms(SCATTER_ARCSEC[FITTED]), LIGHTS_DN, by_light)
+
+
+def light_of_scatter(
+    arcsec: float, lights_dn: Sequence[float], scatters_arcsec: Sequence[float]
+) -> float:
+    """The light of a star, DN, that scatters by `arcsec`, between lights (n,) and their scatters
+    (n,), which fall; both by their logarithms.
+    """
+    # np.interp wants what it looks up in to rise.
+    rising = np.log(scatters_arcsec)[::-1]
+    rising_lights = np.log(lights_dn)[::-1]
+    light = np.interp(np.log(arcsec), rising, rising_lights)
     return float(np.exp(light))
 
 

@@ -331,8 +331,8 @@ def fault_of(table: Any) -> Fault:
             kind_text = f"kind = {shortened(repr(kind))}"
         raise InputError(f"{kind_text}; {did_you_mean(kind, KINDS)}write one of {', '.join(KINDS)}")
     made = KINDS[kind]
-    _check_finite(keys)
     try:
+        _check_finite(keys)
         fault = msgspec.convert(keys, made)
     except RecursionError as error:
         raise InputError(f"its values are nested too deep; see {REFERENCE}") from error

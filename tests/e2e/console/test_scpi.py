@@ -348,7 +348,8 @@ def test_beyond_this_machine_it_asks_for_the_token(tmp_path):
         stand.write('SYST:AUTH "guess"')
         assert stand.errors() == [-203]
         stand.write(f'SYST:AUTH "{found[3]}";:SKY:ATT 1,0,0,0')
-        assert stand.errors() == [] and stand.numbers("SKY:ATT?") == pytest.approx([1, 0, 0, 0])
+        assert stand.errors() == [] and stand.ask("*OPC?") == "1"
+        assert stand.numbers("SKY:ATT?") == pytest.approx([1, 0, 0, 0])
 
 
 @pytest.mark.parametrize(

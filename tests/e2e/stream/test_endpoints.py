@@ -1,14 +1,24 @@
-"""Endpoints and keys of the commands: what libzmq would take and hilstar does not is one line."""
+"""Endpoints and keys of the commands: what libzmq would take and hilstar does not is one line, and
+whose keys are let in.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
+import time
 from pathlib import Path
 
 import pytest
+import zmq
 
 from tests.support.benches import LIVE_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
+from tests.support.senders import connected, packet, talking
+from tests.support.servers import Served, bound
+from tests.support.waiting import wait_for
+from tests.support.wire.zmtp import greeted, part
 
 # What every command refuses, and the words that say so.
 NO_ENDPOINTS = {
@@ -88,3 +98,81 @@ def test_a_free_port_is_told():
     assert endpoint.startswith("tcp://127.0.0.1:")
     assert int(endpoint.rpartition(":")[2]) > 0
     assert endpoint in sent.stderr
+
+
+def test_a_message_of_a_million_parts_is_dropped_before_it_is_a_list(tmp_path):
+    with (
+        bound(tmp_path) as served,
+        connected(served.port) as sender,
+        talking(sender, 100.0),
+    ):
+        served.await_line("the first attitude")
+        before_mb = served.used_mb()
+        with greeted(served.port) as attacker, contextlib.suppress(OSError):
+            attacker.sendall(part(bytes(1), more=True) * 1_000_000 + part(b"end", more=False))
+            served.await_line("more than 10000 parts")
+        wait_for(lambda: served.used_mb() < before_mb + 128, "the memory is given back")
+        summary = served.summary()
+    assert summary["link"]["resets"] == 1
+
+
+def make_client(directory: Path) -> Path:
+    assert run_hilstar_here("keys", "-o", directory).returncode == 0
+    return directory
+
+
+FRESH = ("first attitude", "fresh again")
+
+
+def await_heard(served: Served, own: Path, server: Path, first: int) -> None:
+    """Wait until packets of a client, with numbers from `first` on, are told as fresh."""
+    with connected(served.port, keys=(own, server)) as sender:
+        told = len(served.lines)
+        numbers = itertools.count(first)
+
+        def is_heard() -> bool:
+            sender.send(packet(next(numbers), time.monotonic_ns()))
+            return any(words in line for line in served.lines[told:] for words in FRESH)
+
+        wait_for(is_heard, served.lines, 0.01)
+
+
+def assert_rejected(served: Served, own: Path, server: Path, first: int) -> None:
+    """The client's own socket learns that its key is not let in, and no packet of it is heard."""
+    with connected(served.port, keys=(own, server)) as sender:
+        told = len(served.lines)
+        numbers = itertools.count(first)
+        with sender.get_monitor_socket(zmq.EVENT_HANDSHAKE_FAILED_AUTH) as events:
+
+            def is_rejected() -> bool:
+                sender.send(packet(next(numbers), time.monotonic_ns()))
+                return bool(events.poll(10))
+
+            wait_for(is_rejected, served.lines, 0.0)
+            sender.disable_monitor()
+    assert not any(words in line for line in served.lines[told:] for words in FRESH)
+
+
+def test_clients_are_let_in_and_locked_out_without_a_restart_and_those_rejected_are_told(tmp_path):
+    mine, late = make_client(tmp_path / "mine"), make_client(tmp_path / "late")
+    allowed = mine / "allowed_clients"
+    keys = (
+        'bind = true\ncurve_secret_key = "mine/server.key_secret"\nallowed_clients ='
+        ' "mine/allowed_clients"'
+    )
+
+    with bound(tmp_path, attitude=keys) as served:
+        await_heard(served, mine, mine, 0)
+        served.await_line("stale")
+        assert_rejected(served, late, mine, 10_000)
+        (allowed / "late.key").write_bytes((late / "client.key").read_bytes())
+        (allowed / "client.key").unlink()
+        await_heard(served, late, mine, 20_000)
+        wait_for(lambda: served.count("is stale") >= 2)
+        assert_rejected(served, mine, mine, 30_000)
+        with connected(served.port):  # no keys at all
+            rejected = served.count("was rejected")
+            wait_for(lambda: served.count("was rejected") > rejected or rejected >= 3)
+        summary = served.summary()
+    assert summary["link"]["rejected"] == summary["events"]["client-rejected"] >= 3
+    assert any("its key is not among those allowed" in line for line in served.lines)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -24,11 +25,20 @@ from hilstar.server.bench.build import load
 from hilstar.server.pacer import Shown
 from hilstar.server.record.ledger_records import EventRecord
 from hilstar.server.run_progress import Running
+from tests.support.benches import MOVING
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.live_runs import serve_until
 from tests.support.pages import page_of
-from tests.support.senders import ORION, connected, free_port, packet, publisher
-from tests.support.servers import bound, serving, until_said
-from tests.support.waiting import repeating, wait_for
+from tests.support.senders import (
+    ORION,
+    connected,
+    free_port,
+    packet,
+    publisher,
+    send_attitudes,
+)
+from tests.support.servers import bound, serving, summary_of, until_said
+from tests.support.waiting import PATIENCE_S, repeating, wait_for
 
 pytestmark = pytest.mark.e2e
 TURN_DEG_S = 0.5
@@ -184,3 +194,37 @@ def test_in_lockstep_it_is_told_though_no_rate_is_drawn_by(tmp_path):
             " nothing is drawn",
         )
         process.kill()
+
+
+def test_a_run_with_turns_of_900_rad_s_is_replayed_from_its_ledger(tmp_path):
+    ledger = tmp_path / "run.mcap"
+    attitude = f"max_rate_deg_s = 1e6\n{MOVING}"
+    with (
+        publisher() as (sender, port),
+        serving(tmp_path, port, "--ledger", str(ledger), attitude=attitude) as process,
+    ):
+        process.shows()
+        send_attitudes(
+            sender, [((0.5, 0.5, -0.5, 0.5), (900.0, 0.0, -900.0)) for _ in range(100)], 100
+        )
+        process.has_received(100)
+        process.shows(60)
+        process.send_signal(signal.SIGINT)
+        served = summary_of(process)
+    result = run_hilstar_here(
+        f"replay {tmp_path}/serve.toml {ledger} --headless --speed max --json", timeout=PATIENCE_S
+    )
+    assert result.returncode == 0, result.stderr
+    summary = json.loads(result.stdout)
+    assert (summary["frames"], summary["capped"]) == (served["frames"], served["capped"])
+    assert summary["capped"] > 0
+
+
+def test_a_log_whose_rate_is_too_fast_is_refused_with_its_attitude(small_bench_file, tmp_path):
+    log = tmp_path / "log.csv"
+    rows = [f"{k / 10},1,0,0,0,0,0,{57.3 if k == 3 else 0}" for k in range(10)]
+    log.write_text("\n".join(["t_s,qw,qx,qy,qz,rx,ry,rz", *rows]) + "\n")
+    result = run_hilstar_here(
+        "replay", small_bench_file, log, "--headless", "--speed", "max", "--json"
+    )
+    assert_refused(result, 2, str(log), "attitude 4", "max_rate_deg_s = 60", "rad/s")

@@ -887,3 +887,26 @@ def test_the_sender_that_is_shown_is_the_one_that_is_answered():
     run.receiver.back.talk(run.link.clock.now_ns + NS_PER_S, ask=False)
     assert [type(packet) for packet in answered[1]] == [Status]
     assert answered[2] == []
+
+
+class SlowLink(Script):
+    """A link that is being read for a while, as a busy one is."""
+
+    def receive(self, timeout_ms: int) -> list[Arrival]:
+        self.done.set()
+        time.sleep(0.2)
+        return []
+
+
+def test_a_receiver_that_is_closed_has_left_its_link():
+    """Whoever closes it closes the link next: nothing may still read it."""
+    clock = Clock()
+    link = SlowLink([], clock)
+    timeline = Timeline(Policy(STALE_AFTER_NS, STALE_AFTER_NS))
+    before = set(threading.enumerate())
+    receiver = Receiver(link, timeline, Traffic(), notices=Notices(), now_ns=clock)
+    receiver.start()
+    assert link.done.wait(PATIENCE_S)
+    (thread,) = set(threading.enumerate()) - before
+    receiver.close()
+    assert not thread.is_alive()

@@ -4,7 +4,8 @@ no run.
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,13 +16,17 @@ from msgspec.structs import replace as replaced
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.notices import Notices
-from hilstar.cli import image_source
+from hilstar.cli import image_source, running
 from hilstar.cli.image_source import DotOptions, dot_images
 from hilstar.cli.running import (
     ActingPageOptions,
     PageOptions,
+    dated_ledger,
     end_of_run,
+    followed,
+    optional_scenario,
     page_listener,
+    run_with_faults,
     say_beat,
     scpi_listener,
 )
@@ -30,6 +35,7 @@ from hilstar.instruments.calibrate import grabbed_dots
 from hilstar.instruments.calibrate.grabbed_dots import DotImages
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.config import parse_config
+from hilstar.server.bench.scenario import NO_SCENARIO
 from hilstar.server.summary import RunTally, RunVerdict
 from hilstar.server.watchdog import GPU_LOST
 from tests.support.benches import SMALL_BENCH, bench_text
@@ -208,3 +214,99 @@ def test_an_answer_without_an_attitude_is_a_row_that_says_so(tmp_path):
         "1.500000000,,,,,0",
         "2.000000000,0.5,-0.5,0.5,-0.5,1",
     ]
+
+
+SCENARIO = (
+    '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 0.5\nfor_s = 0.1\n'
+    '[[fault]]\nkind = "freeze"\nname = "stuck"\n'
+)
+
+
+def of_run(config: str = "") -> tuple[SimpleNamespace, Notices, SimpleNamespace]:
+    """A bench of 50 Hz, as far as faults ask for it, a run's notices and its ledger."""
+    bench = SimpleNamespace(
+        config=parse_config(Path("bench.toml"), SMALL_BENCH + config),
+        file=SimpleNamespace(folder=Path(), path=Path("bench.toml")),
+        scan=SimpleNamespace(period_ns=20_000_000),
+    )
+    return bench, Notices(), SimpleNamespace(fault=lambda record: None)
+
+
+def test_a_run_has_the_faults_of_its_scenario_its_stream_or_its_recording(
+    tmp_path, capsys, monkeypatch
+):
+    made: list[tuple[object, ...]] = []
+    listening = SimpleNamespace(endpoint=None)
+
+    class Faults:
+        def __init__(self, *given: object) -> None:
+            made.append(given)
+
+        def listening(self, settings: object, folder: Path):
+            return nullcontext(listening.endpoint)
+
+    monkeypatch.setattr("hilstar.server.faults.RunFaults", Faults)
+    path = tmp_path / "scenario.toml"
+    path.write_text(SCENARIO)
+    scenario = optional_scenario(path)
+    assert optional_scenario(None) is None
+    of = of_run()
+    with run_with_faults(of[0], None, *of[1:]) as none:
+        assert none is None and not made
+    with run_with_faults(of[0], scenario, *of[1:]) as faults:
+        assert isinstance(faults, Faults)
+        assert made == [(of[0], scenario, *of[1:])]
+    assert capsys.readouterr().err == f"{path}: 2 faults, 1 of them at their time\n"
+    listening.endpoint = "tcp://127.0.0.1:7002"
+    of = of_run('[faults]\nendpoint = "tcp://127.0.0.1:7002"\n')
+    with run_with_faults(of[0], None, *of[1:]):
+        assert made[1][1] is NO_SCENARIO
+    assert capsys.readouterr().err == "faults: tcp://127.0.0.1:7002\n"
+
+
+def test_a_replay_has_the_faults_of_its_run_and_no_other(tmp_path, monkeypatch):
+    monkeypatch.setattr("hilstar.server.faults.ReplayedFaults", lambda *given: given)
+    path = tmp_path / "scenario.toml"
+    path.write_text(SCENARIO)
+    of = of_run()
+    recording = SimpleNamespace(faults=["one"])
+    with run_with_faults(of[0], None, *of[1:], recording) as faults:
+        assert faults == (of[0], recording, of[2])
+    with (
+        pytest.raises(InputError, match="faults of its own"),
+        run_with_faults(of[0], optional_scenario(path), *of[1:], recording),
+    ):
+        pass
+    with run_with_faults(of[0], None, *of[1:], SimpleNamespace(faults=[])) as faults:
+        assert faults is None
+
+
+def test_what_follows_a_run_has_each_frame_in_its_order(monkeypatch):
+    """The record first, as it is what a failure leaves; then the status, then who watches."""
+    monkeypatch.setattr(running, "Service", lambda *_: nullcontext())
+    seen: list[str] = []
+
+    def sink(name: str):
+        return lambda shown: seen.append(f"{name} {shown}")
+
+    status = SimpleNamespace(see=sink("status"), follow="follows", begun=0, alive=0, line=0)
+    frames = SimpleNamespace(see=sink("frames"))
+    description = SimpleNamespace(command="demo")
+    with followed(None, False, description, None, status, sink("record"), frames) as what:
+        what[0]("1st")
+        what[0]("2nd")
+        assert what[1:] == ("follows", None)
+    assert seen == [
+        f"{name} {k}" for k in ("1st", "2nd") for name in ("record", "status", "frames")
+    ]
+    with followed(None, False, description, None, status) as what:
+        assert what[0] is status.see
+
+
+def test_a_ledger_s_name_has_the_time_of_its_start_where_it_asks_for_it():
+    assert dated_ledger(None) is None
+    assert dated_ledger(Path("a/run.mcap")) == Path("a/run.mcap")
+    before = datetime.now(UTC).replace(microsecond=0)
+    name = dated_ledger(Path("a/run-{utc}.mcap")).name
+    stamp = datetime.strptime(name, "run-%Y%m%dT%H%M%SZ.mcap").replace(tzinfo=UTC)
+    assert before <= stamp <= datetime.now(UTC)

@@ -4,6 +4,7 @@ what is made of it. No server is asked: tests/screen has real ones.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import struct
 from types import SimpleNamespace
@@ -11,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilstar.display.window import randr
 from hilstar.display.window.awake import Blanking, SetAside
 from hilstar.display.window.output_settings import OutputState
 from hilstar.display.window.randr import (
@@ -328,3 +330,23 @@ def test_gaps_between_a_drivers_times_are_counted_only_where_they_follow_one_ano
         assert stamps.after_swap(lambda: None) == now_ns
     assert stamps.after_swap(lambda: None) == now_ns  # its stamp is not asked for any more
     assert stamps.source == CLOCK
+
+
+def test_an_output_is_found_by_its_whole_name_and_none_without_a_server(monkeypatch):
+    outputs = [OutputState(name, (640, 480)) for name in ("HDMI-10", "HDMI-1", "DP-1")]
+
+    @contextlib.contextmanager
+    def of_server(survival=None):
+        yield SimpleNamespace(outputs=lambda: outputs)
+
+    monkeypatch.setattr(randr, "Randr", of_server)
+    assert randr.output_named("HDMI-1") is outputs[1]
+    assert randr.output_named("HDMI") is None
+    assert randr.lit_outputs() == outputs
+
+    def of_none(survival=None):
+        raise OSError("no server")
+
+    monkeypatch.setattr(randr, "Randr", of_none)
+    assert randr.output_named("HDMI-1") is None
+    assert randr.lit_outputs() == []

@@ -144,3 +144,18 @@ FAULTS = [
 @pytest.mark.parametrize(("table", "words"), FAULTS, ids=[words for _, words in FAULTS])
 def test_what_is_no_fault_is_refused(table, words):
     assert says(refusal(fault_of, table), words)
+
+
+def test_a_fault_that_is_nested_without_end_is_refused():
+    inner: list[object] = []
+    for _ in range(3000):
+        inner = [inner]
+    table = {"kind": "light-map", "name": "a", "file": "m", "electrons": inner}
+    assert says(refusal(fault_of, table), "its values are nested too deep")
+
+
+@pytest.mark.parametrize("name", ["", " a", "a ", "a\n", "a\x07"])
+def test_a_fault_has_a_name_that_can_be_printed(name):
+    assert fault_of({"kind": "blank", "name": "a b"}).name == "a b"
+    assert "name" in refusal(fault_of, {"kind": "blank", "name": name})
+    assert "the key name is missing" in refusal(fault_of, {"kind": "blank"})

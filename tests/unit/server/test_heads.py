@@ -5,14 +5,18 @@ and what it said at its end.
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import threading
+import time
+from contextlib import nullcontext
 from itertools import count, pairwise
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
+from hilstar.attitude.wire.packet import TimeRequest
 from hilstar.server import heads
 from hilstar.server.bench.bench_file import read_heads
 from hilstar.server.heads import HeadProcess, HeadsRun, _hand_on, _told, head_command
@@ -192,3 +196,95 @@ def test_a_signal_ends_the_feeding_of_heads_that_have_more_to_do():
     feed = SimpleNamespace(give=lambda arrival: stop.set())
     _hand_on(Source(), feed, [Tended(10**9)], stop)
     assert stop.is_set()
+
+
+def test_a_run_of_heads_is_what_each_said_and_what_came_in_went_on_but_for_a_question(
+    tmp_path, monkeypatch
+):
+    """The first two end by themselves, in order and by an error that no restart mends; the third
+    waits for Ctrl-C, which a signal to this run is to it.
+    """
+    file = read_heads(heads_file(tmp_path, 5599))
+    asked = HeadsRun(file, (), None, None, ("a:1", "b:1", "c:1"), "token")
+    ends = [
+        f"{READY} print(len(os.environ['HILSTAR_TOKEN']))",
+        f"{READY} print('no JSON'); raise SystemExit(4)",
+        f"{READY} import time, signal; signal.signal(2, lambda *_: (print(3), os._exit(0)));"
+        " print('waits', file=__import__('sys').stderr, flush=True); time.sleep(60)",
+    ]
+    made: list[tuple[object, ...]] = []
+
+    def command(*words: object) -> list[str]:
+        made.append(words[1:])
+        return python(ends[int(str(words[1]))])
+
+    monkeypatch.setattr(heads, "head_command", command)
+    feed = SimpleNamespace(given=[], give=lambda arrival: feed.given.append(arrival.event))
+    monkeypatch.setattr(heads, "Feed", lambda endpoint: nullcontext(feed))
+    said: list[str] = []
+    answered: list[object] = []
+
+    class Link(Source):
+        """Asks for the time, and gives two attitudes and a signal once the third head waits."""
+
+        two_way = True
+        looks = 0
+
+        def receive(self, timeout_ms: int) -> list[SimpleNamespace]:
+            self.looks += 1
+            if self.looks == 1:
+                events = ["first", TimeRequest(7, 11), "second"]
+                return [
+                    SimpleNamespace(event=event, host_ns=5, peer=None, back=None)
+                    for event in events
+                ]
+            if "c: waits" in said and self.looks > 40:
+                os.kill(os.getpid(), signal.SIGTERM)
+            time.sleep(0.01)
+            return []
+
+        def send(self, packet: object, *_: object) -> None:
+            answered.append(packet)
+
+    told = heads.run_heads(asked, Link(), said.append)
+    assert feed.given == ["first", "second"]
+    assert [(reply.sequence, reply.t1_ns) for reply in answered] == [(7, 11)]
+    assert list(told) == list(file.names)
+    assert [each["exit_code"] for each in told.values()] == [0, 4, 0]
+    assert [each["restarts"] for each in told.values()] == [0, 0, 0]
+    assert [each["summary"] for each in told.values()] == [5, None, 3]
+    assert [words[0] for words in made] == [0, 1, 2]
+    assert len({words[1] for words in made}) == 1
+
+
+def test_the_common_source_gives_the_body_s_attitude(tmp_path):
+    file = read_heads(heads_file(tmp_path, 5599))
+    config = heads.source_config(file)
+    assert config.tracker.q_body_to_cam == (1.0, 0.0, 0.0, 0.0)
+    assert config.attitude == file.files[0].config.attitude
+
+
+def test_a_head_without_a_sign_of_life_is_killed_and_begun_again(tmp_path, monkeypatch):
+    """Before it drew it has longer than after."""
+    monkeypatch.setattr(heads, "STALLED_S", 0.1)
+    monkeypatch.setattr(heads, "STARTS_S", 60.0)
+    waits = f"{READY} import time; time.sleep(60)"
+    lines: list[str] = []
+    head = HeadProcess(
+        "head",
+        lambda number, drawn_s: python(f"{READY} print(5)" if number else waits),
+        lines.append,
+        tmp_path / "life",
+    )
+    assert ended(head) == (0, 1)
+    assert head.output == b"5\n" and len(lines) == 1
+    assert lines[0].startswith("head: no frame for 0.") and "it is started again" in lines[0]
+
+
+def test_a_head_that_does_not_end_in_time_is_killed(tmp_path):
+    code = f"import signal; signal.signal(2, signal.SIG_IGN); {READY} import time; time.sleep(60)"
+    head = HeadProcess("head", lambda number, drawn_s: python(code), print, tmp_path / "life")
+    wait_for(lambda: head.tend() and head.drawn_s > 0, "it draws", poll_s=0.01)
+    head.interrupt()
+    head.close(0.1)
+    assert head.code == -signal.SIGKILL

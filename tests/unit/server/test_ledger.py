@@ -24,7 +24,7 @@ from hilstar.attitude.logs.log_file import read_log
 from hilstar.attitude.logs.mcap_log import parts_of, read_chunks
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, encode
 from hilstar.basics.errors import InputError
-from hilstar.basics.notices import Notices
+from hilstar.basics.notices import Notice, Notices
 from hilstar.cli.options import parse_split
 from hilstar.server.record import ledger as ledger_module
 from hilstar.server.record.ledger import (
@@ -39,6 +39,7 @@ from hilstar.server.record.ledger import (
 )
 from hilstar.server.record.ledger_records import (
     FAULT_TOPIC,
+    AnswerRecord,
     FaultRecord,
     FrameRecord,
     drawable_frames,
@@ -357,6 +358,75 @@ def test_what_is_dropped_once_the_last_turn_is_written_is_unrecorded_too(
     monkeypatch.setattr("hilstar.server.record.ledger.MAX_WAITING_BYTES", 0)
     keep(ledger, 10, 13)
     assert ledger.summary()["unrecorded"] == 6  # three packets and three frames
+
+
+def test_what_had_no_room_is_counted_in_the_ledger_by_its_kind(tmp_path, kept_bench, monkeypatch):
+    """A fault is counted as an event: a replay would lack either."""
+    ledger = Ledger(tmp_path / "run.mcap", kept_bench)
+    with monkeypatch.context() as full:
+        full.setattr(ledger_module, "MAX_WAITING_BYTES", 0)
+        keep(ledger, 0, 3)
+        ledger.frame(FrameRecord(frame=9, t_ns=9, light_ns=9, draw_ns=9, swap_ns=9))
+        ledger.answer(AnswerRecord(host_ns=5, raw=""))
+        ledger.notice(Notice.now("mark", "a mark"))
+        ledger.fault(
+            FaultRecord(
+                host_ns=1, event="start", number=1, name="f", kind="blank", who="", t_ns=0, table=""
+            )
+        )
+    ledger.close()
+    counted = {
+        (each["kind"], each["reason"]): each["count"]
+        for each in map(json.loads, of_topic(tmp_path / "run.mcap", "/not_kept"))
+    }
+    assert counted == {
+        ("packet", "no room"): 3,
+        ("frame", "no room"): 4,
+        ("answer", "no room"): 1,
+        ("event", "no room"): 2,
+    }
+    # they are lost, and no flood
+    assert ledger.summary()["unrecorded"] == 10 and "only_counted" not in ledger.summary()
+
+
+def of_topic(path: Path, wanted: str) -> list[bytes]:
+    """The messages of a topic of a ledger."""
+    return [data for topic, data in read_topics(path) if topic == wanted]
+
+
+def test_a_disk_that_takes_nothing_is_told_by_the_frames_and_its_return_by_the_writer(
+    tmp_path, kept_bench, monkeypatch
+):
+    notices = Notices()
+    told: list[str] = []
+    notices.listen(lambda notice: told.append(notice.kind))
+    with Ledger(tmp_path / "run.mcap", kept_bench, notices) as ledger:
+        keep(ledger, 0, 1)
+        assert "ledger-stalled" not in notices.active
+        with monkeypatch.context() as slow:
+            slow.setattr(ledger_module, "STALLED_S", -1.0)  # any time is too long
+            keep(ledger, 1, 2)
+            assert "ledger-stalled" in notices.active
+        wait_for(lambda: "ledger-stalled" not in notices.active)
+    assert told.count("ledger-stalled") == told.count("ledger-back") == 1
+
+
+def test_a_split_ledger_that_cannot_go_on_elsewhere_stays_and_says_so(
+    tmp_path, kept_bench, monkeypatch
+):
+    """Its next part's name is taken by a folder."""
+    notices = Notices()
+    told: list[str] = []
+    notices.listen(lambda notice: told.append(notice.kind))
+    (tmp_path / "run.0001.mcap").mkdir()
+    split = SplitLimits(bytes=1.0)
+    with Ledger(tmp_path / "run.mcap", kept_bench, notices, split=split) as ledger:
+        keep(ledger, 0, 5)
+        wait_for(lambda: "ledger-split-failed" in told)
+        keep(ledger, 5, 8)
+    assert "files" not in ledger.summary() and ledger.summary()["unrecorded"] == 0
+    frames = [json.loads(data)["frame"] for data in of_topic(tmp_path / "run.mcap", "/frame")]
+    assert frames == list(range(8))
 
 
 def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, kept_bench):

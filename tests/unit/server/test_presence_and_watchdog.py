@@ -93,7 +93,10 @@ def test_a_frame_that_hangs_is_told_once_with_its_stage_while_it_hangs():
         watch.enter("swap")
         clock.work(2e9)
         assert told.wait(PATIENCE_S)
-    assert lines == ["frame 7 hangs in its stage swap since 2.0 s"]
+        watch.end(timed=True)
+    assert lines[0] == "frame 7 hangs in its stage swap since 2.0 s"
+    assert len(lines) == 2 and "frame 7 took" in lines[1]
+    assert notices.counts() == {"frame-stuck": 1, "frame-late": 1}
 
 
 class SleepingClock(FakeClock):

@@ -173,7 +173,9 @@ def test_jitter_delays_packets_and_not_the_time_of_their_attitudes(monkeypatch, 
     )
     start_ns = clock.ns
     samples = itertools.islice(spin_samples(RATE, 100.0, (0.0, 0.0, 0.0)), 200)
-    send(cable, samples, threading.Event(), sender=9)
+    told: list[int] = []
+    send(cable, samples, threading.Event(), sender=9, on_sent=told.append)
+    assert told == list(range(1, 201))
     stamps_ns = np.array([sample.t_ns for _, sample in left])
     assert (stamps_ns - start_ns == np.arange(200) * 10 * NS_PER_MS).all()
     late_ns = np.array([host_ns for host_ns, _ in left]) - stamps_ns

@@ -221,3 +221,24 @@ def test_noise_version_1_draws_as_numpy_does():
 if __name__ == "__main__":
     for mean in MEANS_E:
         print(f"{mean:8g} e-  {poisson_errors(mean)}")
+
+
+@pytest.mark.parametrize("few_are", ["dark", "faint", "bright", "both"])
+def test_a_pixel_s_count_is_by_its_own_mean_and_number_whatever_stands_beside_it(few_are, rng):
+    """Means below and above where the table ends, and none; mixed so that few or most are large:
+    a pixel alone has the same count.
+    """
+    faint, bright = rng.uniform(0.01, 5.0, 4000), rng.uniform(200.0, 5e4, 4000)
+    share = {"dark": 0.4, "faint": 0.2, "bright": 0.8, "both": 0.5}[few_are]
+    mean_e = np.where(rng.uniform(size=4000) < share, faint, bright).astype(np.float32)
+    if few_are == "dark":
+        mean_e[rng.uniform(size=4000) < 0.7] = 0.0
+    number = rng.normal(size=4000).astype(np.float32)
+    # the smallest mean beside which a count is made says how far an expansion has to go
+    counts = poisson(mean_e, number, 0.0)
+    assert (counts[mean_e == 0] == 0).all()
+    order = rng.permutation(4000)
+    assert (poisson(mean_e[order], number[order], 0.0) == counts[order]).all()
+    for k in range(0, 4000, 97):
+        alone = poisson(mean_e[k : k + 1], number[k : k + 1], 0.0)
+        assert alone[0] == counts[k]

@@ -29,6 +29,7 @@ from tests.support import centroiders as outside
 
 SIGMA = (0.85, 0.85)
 COUNT, FINE, FAR_PX = 5, 40, 8
+SHIFT_PX = 1e-6  # an iteration ends at 1e-7 px or so
 # Samples of 1/40 px: their light is within 1e-4 of the integral, and a place within 1e-4 px.
 SAMPLED_PX = 2e-4
 WINGS = 1e-6  # of a star's light are cut by its footprint
@@ -162,3 +163,25 @@ def test_the_grid_s_image_is_the_oracle_s():
         assert tile == GaussianPsf(sigma_px).footprint_px + MARGIN_PX
         oracle = linear_image(sprites, (COUNT * tile, COUNT * tile), GaussianPsf(sigma_px))
         assert phase_image(sprites, GaussianPsf(sigma_px)) == pytest.approx(oracle, abs=1e-14)
+
+
+def test_errors_are_the_same_wherever_stars_lie_in_their_squares_and_turn_with_them():
+    """Moved 5 rows up and 4 columns right in the square; and with rows for columns."""
+    seen = Seen(0.62, 1.0)
+    wanted, shown, tile = codes("round", 5.0, seen)
+    shown_tiles, wanted_tiles = tiles_of(shown, tile), tiles_of(wanted, tile)
+
+    def errors(rows: tuple[int, int], columns: tuple[int, int], turned: bool = False) -> dict:
+        pad = ((0, 0), rows, columns)
+        squares = [np.pad(tiles, pad) for tiles in (shown_tiles, wanted_tiles)]
+        if turned:
+            squares = [square.transpose(0, 2, 1) for square in squares]
+        sigma_px = SIGMA[::-1] if turned else SIGMA
+        return stamp_errors(*squares, sigma_px, seen.blur_px, seen.pixel_px)
+
+    middle = errors((8, 9), (8, 9))
+    moved = errors((3, 14), (12, 5))
+    turned = errors((8, 9), (8, 9), turned=True)
+    for kind in FAMILY:
+        assert moved[kind] == pytest.approx(middle[kind], abs=SHIFT_PX), kind
+        assert turned[kind][::-1] == pytest.approx(middle[kind], abs=SHIFT_PX), kind

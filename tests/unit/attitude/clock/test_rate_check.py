@@ -4,6 +4,7 @@ is never called wrong.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -15,6 +16,8 @@ from hilstar.attitude.clock.rate_causes import (
     OFTEN_OFF,
     OTHER_AXES,
     ReadAs,
+    Stretch,
+    cause_of,
     lag_of,
     stretch_of,
 )
@@ -27,7 +30,9 @@ from hilstar.basics.rotation import (
     from_radec_roll_deg,
     from_rotation_vectors,
     multiply,
+    propagate,
     rotate,
+    to_matrix,
 )
 from hilstar.basics.units import NS_PER_S
 from hilstar.basics.wrong_sky import CONVENTION
@@ -451,3 +456,80 @@ def test_a_source_with_a_convention_of_its_own_is_told_no_key():
         check.see(sample)
     assert "[attitude] convention" not in notices.lasting[CONVENTION]
     assert "look at what the simulator puts into its quaternion" in notices.lasting[CONVENTION]
+
+
+SIGNED_AXES = [
+    (order, signs)
+    for order in itertools.permutations(range(3))
+    for signs in itertools.product((1, -1), repeat=3)
+]
+
+
+def turning(sent: np.ndarray, rng: np.random.Generator) -> list[Stretch]:
+    """Five seconds of 40 Hz, each about another axis at 4 deg/s; `sent` (3, 3) makes the rates that
+    are sent of the camera's own.
+    """
+    stretches = []
+    q = from_radec_roll_deg(84.0, -1.2, 10.0)
+    for second in range(5):
+        rate = rng.normal(size=3)
+        rate *= np.radians(4.0) / np.linalg.norm(rate)
+        samples = []
+        for k in range(40):
+            t_ns = second * NS_PER_S + k * NS_PER_S // 40
+            samples.append(AttitudeSample(t_ns, propagate(q, rate, k / 40), sent @ rate, k))
+        q = samples[-1].q_icrs_to_cam
+        stretch = stretch_of(samples)
+        assert stretch is not None
+        stretch.is_off = True
+        stretches.append(stretch)
+    return stretches
+
+
+@pytest.mark.parametrize("unit", ["", " and in deg/s"])
+def test_every_order_and_sign_of_axes_is_named_as_it_is_sent(unit, rng):
+    """48 of them: which of the camera's axes is sent as x, as y and as z, and with which sign."""
+    size = np.degrees(1.0) if unit else 1.0
+    for order, signs in SIGNED_AXES:
+        sent = np.zeros((3, 3))
+        sent[range(3), order] = signs  # the k-th number sent is the camera's axis order[k]
+        # another reading of the quaternions turns some of them, too
+        cause = cause_of(turning(sent * size, rng), 1.0, others=())
+        if order == (0, 1, 2) and sum(signs) == 3:
+            assert (cause is None) == (not unit)
+            assert cause is None or cause.text == "they are in deg/s; send rad/s"
+            continue
+        if order == (0, 1, 2) and sum(signs) == -3:
+            assert cause.text.startswith(f"they have the wrong sign{unit}; send the turn")
+            continue
+        names = [
+            ("" if sign > 0 else "-") + "xyz"[axis] for axis, sign in zip(order, signs, strict=True)
+        ]
+        assert cause.text.endswith(
+            f"{unit}: the camera's ({', '.join(names)}) is sent as (x, y, z)"
+        )
+        assert ("another order" in cause.text) == (order != (0, 1, 2))
+        assert cause.mends @ sent * size == pytest.approx(np.eye(3), abs=1e-12)
+        assert cause.scale == pytest.approx(1 / size)
+
+
+@pytest.mark.parametrize("size", [1.0, np.degrees(1.0)])
+def test_rates_in_icrs_are_named_with_their_unit(size, rng):
+    """The camera's rates, turned into the sky's axes at each sample."""
+    stretches = []
+    q = from_radec_roll_deg(84.0, -1.2, 10.0)
+    for second in range(5):
+        rate = rng.normal(size=3)
+        rate *= np.radians(4.0) / np.linalg.norm(rate)
+        samples = []
+        for k in range(40):
+            now = propagate(q, rate, k / 40)
+            in_icrs = size * (to_matrix(now).T @ rate)
+            samples.append(AttitudeSample(second * NS_PER_S + k * NS_PER_S // 40, now, in_icrs, k))
+        q = samples[-1].q_icrs_to_cam
+        stretches.append(stretch_of(samples))
+        stretches[-1].is_off = True
+    words = ", in deg/s" if size > 1 else ""
+    assert cause_of(stretches, 1.0).text == (
+        f"they have ICRS components{words}; send the camera's, rad/s"
+    )

@@ -129,3 +129,37 @@ def test_who_binds_is_the_server_of_its_keys_and_who_connects_knows_the_server_s
     assert of_client["curve_serverkey"] == of_server["curve_publickey"]
     assert "curve_server" not in of_client
     assert of_client["curve_publickey"] != of_server["curve_publickey"]
+
+
+def test_a_public_key_is_no_secret_one_and_no_text_is_a_key(tmp_path):
+    make_keys(tmp_path)
+    public, secret = load_secret(tmp_path / "server.key_secret")
+    assert public == load_public(tmp_path / "server.key")
+    assert secret != public
+    line = refusal(load_secret, tmp_path / "server.key")
+    assert line.startswith(f"{tmp_path / 'server.key'}: contains no secret key; ")
+    (tmp_path / "text.key").write_text("not a key")
+    assert "not a key file" in refusal(load_public, tmp_path / "text.key")
+    short = (tmp_path / "server.key").read_text().replace(public.decode(), public.decode()[:35])
+    (tmp_path / "short.key").write_text(short)
+    assert "a key is 40 characters of Z85" in refusal(load_public, tmp_path / "short.key")
+    assert "no such key file" in refusal(load_public, tmp_path / "none.key")
+
+
+def test_a_secret_key_that_others_may_read_is_told(tmp_path, caplog):
+    make_keys(tmp_path)
+    path = tmp_path / "client.key_secret"
+    load_secret(path)
+    assert caplog.text == ""
+    for mode in (0o640, 0o604):
+        caplog.clear()
+        path.chmod(mode)
+        load_secret(path)
+        assert f"readable by other users (mode {mode:03o}); run chmod 600" in caplog.text
+
+
+def test_an_allow_list_without_a_key_is_refused(tmp_path):
+    (tmp_path / "allowed").mkdir()
+    (tmp_path / "allowed" / "notes.txt").write_text("keys come here")
+    line = refusal(AllowList, tmp_path / "allowed")
+    assert line.startswith(f"{tmp_path / 'allowed'}: allowed_clients contains no *.key file")

@@ -11,7 +11,7 @@ import zmq
 
 from hilstar.attitude.wire import zmq_peer as zmq_peer_module
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
-from hilstar.attitude.wire.zmq_peer import PeerLook
+from hilstar.attitude.wire.zmq_peer import PeerLook, answer_of, peer_trouble
 from hilstar.basics.notices import Notices
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import wait_for
@@ -166,3 +166,61 @@ def test_a_peer_is_looked_at_once_in_five_seconds_and_told_once(monkeypatch) -> 
         clock.work(0.1e9)
     assert len(told) == 1
     assert "220 bench" in told[0]
+
+
+def greeting(mechanism: str, socket_type: str = "") -> bytes:
+    """ZMTP 3.1's greeting of 64 bytes, and the READY command of a socket of this type."""
+    first = b"\xff" + bytes(8) + b"\x7f" + b"\x03\x01" + mechanism.encode().ljust(20, b"\0")
+    ready = b""
+    if socket_type:
+        name = socket_type.encode()
+        ready = b"\x04\x1b\x05READY\x0bSocket-Type" + len(name).to_bytes(4, "big") + name
+    return first.ljust(64, b"\0") + ready
+
+
+PLACE = "tcp://10.0.0.1:5560"
+PEERS = [
+    (None, "SUB", False, ""),
+    (b"", "SUB", False, "says nothing, so it is no ZeroMQ; give the place of a PUB socket"),
+    (b"", "REP", False, "give the place of a REQ socket"),
+    (b"HTTP/1.1 400 Bad Request", "SUB", False, "no ZeroMQ answers there, but "),
+    (greeting("NULL")[:63], "SUB", False, "no ZeroMQ answers there, but "),
+    (greeting("NULL"), "SUB", False, ""),
+    (greeting("NULL", "PUB"), "SUB", False, ""),
+    (greeting("NULL", "XPUB"), "SUB", False, ""),
+    (
+        greeting("NULL", "REP"),
+        "SUB",
+        False,
+        "a REP socket is there, and ours is SUB; let the other",
+    ),
+    (greeting("NULL", "DEALER"), "REP", False, ""),
+    (greeting("NULL", "PUB"), "REP", False, "a PUB socket is there, and ours is REP; let the othe"),
+    (greeting("NULL", "SUB"), "XPUB", False, ""),
+    (greeting("CURVE"), "SUB", False, "it asks for keys (CURVE), and we have none; give curve_sec"),
+    (greeting("NULL", "PUB"), "SUB", True, "it has no keys, and we have; give it keys"),
+    (greeting("CURVE"), "SUB", True, "the other side rejected us: check its allowed_clients"),
+    (greeting("GSSAPI"), "SUB", False, "it asks for GSSAPI; hilstar has CURVE keys, or none"),
+    (greeting("PLAIN"), "SUB", True, "it asks for PLAIN; hilstar has CURVE keys, or none"),
+]
+
+
+@pytest.mark.parametrize(("answer", "kind", "keys", "words"), PEERS, ids=range(len(PEERS)))
+def test_what_answers_at_a_place_is_named_by_its_greeting(answer, kind, keys, words):
+    line = peer_trouble(PLACE, answer, kind, keys)
+    if not words:
+        assert line == ""
+    else:
+        assert words in line
+        assert line.startswith(f"{PLACE}: ") or line.startswith("the other side")
+
+
+def test_a_socket_in_the_file_system_is_asked_as_a_port_is(tmp_path):
+    with zmq.Context() as context, context.socket(zmq.PUB) as made:
+        made.linger = 0
+        made.bind(f"ipc://{tmp_path}/feed")
+        answer = answer_of(f"ipc://{tmp_path}/feed")
+        assert answer is not None
+        assert peer_trouble(PLACE, answer, "SUB", False) == ""
+        assert "a PUB socket is there, and ours is REP" in peer_trouble(PLACE, answer, "REP", False)
+    assert answer_of(f"ipc://{tmp_path}/none", 1.0) is None

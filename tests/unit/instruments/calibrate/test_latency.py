@@ -20,8 +20,9 @@ from hilstar.instruments.calibrate.latency import (
     write_panel_delay,
 )
 from hilstar.server.bench.config import parse_config
-from hilstar.server.screen.screen import marker_light
-from tests.support.benches import SMALL_BENCH, bench_text
+from hilstar.server.screen.screen import CODE, CODE_BITS, marker_light
+from tests.support.benches import ATTITUDE, SMALL_BENCH, bench_text
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.refusals import refusal
 
 PERIOD_NS = 1e9 / 60
@@ -177,3 +178,34 @@ def test_the_lines_have_the_figures(tmp_path):
     text = {line[:24].strip(): line[24:] for line in latency_lines(summarise(rises, config))}
     assert text["rise, fall"] == "20.00, - ms (medians)"
     assert "note" not in text
+
+
+def test_the_code_says_which_frame_by_any_seven():
+    windows = {tuple(CODE[(k + j) % len(CODE)] for j in range(CODE_BITS)) for k in range(len(CODE))}
+    assert len(windows) == len(CODE) == 127
+
+
+def test_what_is_wrong_is_said_in_one_line(tmp_path, small_bench_file):
+    edges = tmp_path / "edges.csv"
+    save_edges(edges, Edges(np.arange(30) * 10**7, np.arange(30) % 2))
+    assert len(read_edges(edges).host_ns) == 30
+    ledger = tmp_path / "run.mcap"
+    log = tmp_path / "log.csv"
+    log.write_text(f"t_s,qw,qx,qy,qz\n0,{ATTITUDE}\n0.1,{ATTITUDE}\n")
+    run_hilstar_here(
+        "replay", small_bench_file, log, "--headless", "--speed", "max", "--ledger", ledger
+    )
+    assert_refused(run_hilstar_here("latency", ledger, "--edges", edges), 2, "photodiode_px")
+    assert_refused(run_hilstar_here("latency", ledger), 2, "--edges", "--diode")
+    assert_refused(run_hilstar_here("latency", edges, "--edges", edges), 2, "edges.csv")
+    assert_refused(run_hilstar_here("latency", ledger, "--edges", log), 2, "host_ns")
+    assert_refused(
+        run_hilstar_here("latency", ledger, "--diode", "serial:/dev/nothing@9600"),
+        3,
+        "/dev/nothing",
+    )
+    assert_refused(run_hilstar_here("latency", ledger, "--diode", "tcp://x"), 2, "--diode")
+    assert_refused(run_hilstar_here("report", log, "-o", tmp_path / "r"), 2, "log.csv")
+    assert_refused(
+        run_hilstar_here("report", tmp_path / "no.mcap", "-o", tmp_path / "r"), 2, "no.mcap"
+    )

@@ -6,19 +6,27 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from hilstar.basics.errors import InputError
+from hilstar.instruments.campaign import acceptance
+from hilstar.instruments.campaign.acceptance import Acceptance
 from hilstar.instruments.campaign.acceptance_plan import CaseSet, plan_path, read_acceptance_plan
-from hilstar.instruments.campaign.acceptance_verdicts import ClauseVerdict
+from hilstar.instruments.campaign.acceptance_verdicts import ClauseVerdict, SetResult
 from hilstar.instruments.campaign.plan import PlantedFaults
 from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
+from hilstar.instruments.campaign.store import failures
+from hilstar.instruments.campaign.sweep import SweepTable
 from tests.support.acceptance import accepted, write_bench
 from tests.support.benches import ROOT
 from tests.support.refusals import refusal
+from tests.support.tables import csv_rows
 
 # found within 10 %, or within three standard errors where those are larger
 SHARE, SIGMAS = 0.1, 3.0
@@ -342,3 +350,70 @@ def test_a_plan_with_other_cases_does_not_go_on(tmp_path: Path) -> None:
     accepted(tmp_path, ONE)
     with pytest.raises(InputError, match="the plan's cases was 60 and is 61"):
         accepted(tmp_path, ONE.replace("cases = 60", "cases = 61"))
+
+
+def test_a_plan_s_time_is_that_of_its_cases_on_their_workers_and_of_what_opens_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A case takes 3 s at a sweep's start, 6 s in its middle and 9 s at its end, and a session 1 s;
+    eight levels of 16 cases on 4 workers take 8 (16 x 6 / 4 + 1) s.
+    """
+    plan = tmp_path / "plan.toml"
+    clauses = "".join(
+        f'[[clause]]\ncapability = "{of}"\nof = "{of}"\nquantity = "{quantity}"\n{limit}\n'
+        for of, quantity, limit in (
+            ("field", "availability", "minimum = 0.5"),
+            ("rate-limit", "edge", "minimum = 0.2"),
+        )
+    )
+    plan.write_text(SETS["field"] + SETS["rate-limit"] + clauses)
+    bench = write_bench(tmp_path)
+    checked = read_acceptance_plan(plan, bench, False, None)
+    made = Acceptance(checked, bench, tmp_path / "out", "centroids", 10.0)
+    at_s = iter([(2.0, 5.0), (3.0, 0.5), (6.0, 1.0), (9.0, 1.5)])
+    monkeypatch.setattr(acceptance, "_case_s", lambda campaign: next(at_s))
+    field, sweep = made.costs(4)
+    assert (field.case_set.name, field.cases) == ("field", 60)
+    assert field.seconds == pytest.approx(60 * 2 / 4 + 5, abs=5)
+    levels = 2 + 7
+    assert (sweep.case_set.name, sweep.cases) == ("rate-limit", levels * 16)
+    assert sweep.seconds == pytest.approx(levels * (16 * 6 / 4 + 1), abs=10)
+    made.sets = tuple(replace(case_set, refused="no GPU") for case_set in made.sets)
+    assert list(made.costs(4)) == []
+
+
+def test_a_ledger_has_a_row_for_each_case_of_each_set_with_the_level_of_its_sweep(
+    tmp_path: Path,
+) -> None:
+    sweep = SweepTable(key="k", start=1.0, stop=9.0)
+    results = [
+        SetResult(CaseSet("plain", "", {}, None)),
+        SetResult(CaseSet("swept", "", {}, sweep)),
+    ]
+    expected = []
+    plain, swept = results
+    folders = ((plain, None), (swept, 2.5), (swept, 7.0))
+    for number, (result, level) in enumerate(folders):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        result.folders.append(folder)
+        table: dict[str, list[Any]] = {
+            "case": [0, 1],
+            "status": ["done", "failed"],
+            "why": ["", "x"],
+        }
+        table |= {"error_x_arcsec": [1.5 + number, None], "solved": [3, 0]}
+        if level is not None:
+            table["vary.k"] = [level, level]
+        pq.write_table(pa.table(table), folder / "cases.parquet")
+        text = "" if level is None else f"{level}"
+        expected += [
+            (result.case_set.name, text, "0", "done", "", "3", f"{1.5 + number:g}"),
+            (result.case_set.name, text, "1", "failed", "x", "0", ""),
+        ]
+    assert acceptance.write_ledger(tmp_path / "ledger.csv", results) == len(expected)
+    rows = csv_rows(tmp_path / "ledger.csv")
+    names = ("set", "level", "case", "status", "why", "solved", "error_x_arcsec")
+    assert [tuple(row[name] for name in names) for row in rows] == expected
+    assert {row["ra_deg"] for row in rows} == {""}
+    assert failures(tmp_path / "2" / "cases.parquet") == {"x": 1}

@@ -305,3 +305,18 @@ def test_a_display_is_dark_between_cases_and_a_run_that_goes_on_is_the_next(case
     assert cases.run._view(cases.now_ns) is None
     runs = (cases.directory.path / "runs.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in runs] == ["run", "1"]
+
+
+def test_an_exposure_that_began_before_a_case_s_last_row_was_lit_is_not_its_own(cases):
+    """A screen that takes 0.12 s from its middle row to its last: an exposure of 0.1 s whose middle
+    is at 0.15 s began at 0.1 s.
+    """
+    cases.run._last_row_ns = 120_000_000
+    cases.begin(0)
+    cases.pass_s(0.16)
+    cases.answer(cases.shown)
+    cases.pass_s(0.02)
+    assert cases.run._now.received == 0
+    cases.answer(cases.shown)
+    cases.pass_s(0.02)
+    assert cases.rows()[0]["received"] == 1

@@ -265,7 +265,7 @@ def test_the_lines_of_a_summary_say_each_figure_of_it() -> None:
 def test_a_case_s_measures_are_about_the_median_and_count_what_is_missing() -> None:
     rng = np.random.default_rng(1)
     count = 16
-    errors = [*rng.normal(0, 1, (count, 3)), 5.0, -7.0, 40.0]
+    errors = rng.normal([5.0, -7.0, 40.0], 1, (count, 3))
     centroid = {
         "centroid_dx_px": [3.0] * count,
         "centroid_dy_px": [1.0] * count,

@@ -13,10 +13,12 @@ import pytest
 
 from hilstar.basics.rotation import from_radec_roll_deg, from_rotation_vector, multiply
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.campaign import solvers
 from hilstar.instruments.campaign.plan import Centroiding
 from hilstar.instruments.campaign.solvers import SolverFault, choose_solver, printed_attitude
 from hilstar.instruments.campaign.tally import attitude_error_arcsec
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
+from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import ROOT
 from tests.support.campaigns import write_campaign
@@ -173,3 +175,32 @@ def test_a_solver_that_keeps_printing_is_ended_at_the_bound_with_its_children(
         lambda: not child.exists() or child.read_text().rpartition(")")[2].split()[0] == "Z",
         "the solver's child to end",
     )
+
+
+def test_an_answer_of_several_parts_has_each_of_them() -> None:
+    told = {
+        "q": [0.5, -0.5, 0.5, 0.5],
+        "rate": [0.1, -0.2, 0.3],
+        "stamp_s": -0.25,
+        "centroids": [[1.0, 2.0, 3.0, 4.0], [5.0, 6.0]],
+    }
+    answer = solvers.whole_answer(told, "the solver")
+    assert answer.q_icrs_to_cam is not None
+    assert answer.rate_cam_rad_s is not None
+    assert answer.q_icrs_to_cam.tolist() == [0.5, -0.5, 0.5, 0.5]
+    assert answer.rate_cam_rad_s.tolist() == [0.1, -0.2, 0.3]
+    assert answer.stamp_s == -0.25
+    assert answer.stars == (ReportedStar(1.0, 2.0, 3.0, 4), ReportedStar(5.0, 6.0))
+    blind = solvers.whole_answer({"centroids": []}, "the solver")
+    assert (blind.q_icrs_to_cam, blind.why) == (None, "the solver found no attitude")
+    assert blind.stars == ()
+    alone = solvers.whole_answer({"q": [1.0, 0.0, 0.0, 0.0]}, "the solver")
+    assert (alone.rate_cam_rad_s, alone.stamp_s, alone.stars) == (None, 0.0, None)
+
+
+@pytest.mark.parametrize(
+    "told", [{"q": [1.0, 0.0]}, {"q": [2.0, 0.0, 0.0, 0.0]}, {"rate": "fast"}, {"centroids": [1.0]}]
+)
+def test_an_answer_that_is_none_is_the_solver_s_fault(told: dict[str, object]) -> None:
+    with pytest.raises(SolverFault, match=r"^the solver"):
+        solvers.whole_answer(told, "the solver")

@@ -5,6 +5,8 @@ a lens's terms, and the correlation of what a fit leaves.
 from __future__ import annotations
 
 import math
+from hashlib import sha256
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +19,13 @@ from hilstar.instruments.calibrate.geometric import fit as fits
 from hilstar.instruments.certify import estimates, lens
 from hilstar.instruments.certify.bench_readings import LightReadings
 from hilstar.instruments.certify.budget import Input
-from hilstar.instruments.certify.certificate import _contributions, _input_row, _judged, _place_of
+from hilstar.instruments.certify.certificate import (
+    _contributions,
+    _input_row,
+    _judged,
+    _place_of,
+    files_of,
+)
 from hilstar.instruments.certify.estimates import (
     LightDeviation,
     Surface,
@@ -464,3 +472,37 @@ def test_black_and_light_scatter_by_their_own_readings():
     relative = 0.01 * bright / (bright - 3.0)
     assert fit.noise == pytest.approx(math.sqrt(2 * (relative**2).sum() / 5))
     np.testing.assert_allclose(fit.solution[:6], [3.0, *bright])
+
+
+def test_a_certificate_has_the_hashes_of_the_bench_s_files_and_of_those_that_they_name(
+    tmp_path: Path,
+) -> None:
+    """Of a name that is built in, or of no file, it has none."""
+    folder = tmp_path / "light"
+    folder.mkdir()
+    files = {
+        "light/monitor.toml": '[calibration]\nresponse = "r.csv"\n[uniformity]\nfile = "u.csv"\n',
+        "light/r.csv": "code,w\n0,0\n",
+        "light/u.csv": "1,1\n",
+        "qe.csv": "wavelength_nm,qe\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    tracker = SimpleNamespace(
+        distortion=None,
+        optics=SimpleNamespace(psf=None),
+        quantum_efficiencies={"quantum_efficiency": "qe.csv"},
+        transmission=0.9,
+    )
+    config = SimpleNamespace(
+        monitor=SimpleNamespace(calibration="light/monitor.toml"),
+        collimator=SimpleNamespace(geometry="missing.toml"),
+        tracker=tracker,
+        sky=SimpleNamespace(catalogue="srgb"),
+    )
+    bench = SimpleNamespace(
+        path=tmp_path / "bench.toml", text="a bench", folder=tmp_path, config=config
+    )
+    expected = {name: sha256(text.encode()).hexdigest() for name, text in files.items()}
+    expected["bench.toml"] = sha256(b"a bench").hexdigest()
+    assert files_of(bench) == expected  # type: ignore[arg-type]

@@ -13,6 +13,8 @@ from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import to_matrix
+from hilstar.instruments.simulate import noise
 from hilstar.instruments.simulate.noise import (
     NoiseBudget,
     NoisyStar,
@@ -27,11 +29,12 @@ from hilstar.instruments.simulate.noise import (
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import GaussianPsf, SampledPsf
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.star_light import bench_stars
 from hilstar.tracker.centroids import CentroidSettings, find_stars
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.mosaic import in_pixels, luminance
 from hilstar.tracker.settings import DetectorSettings
-from tests.support.benches import bench_text
+from tests.support.benches import ORION_Q, bench_text
 from tests.support.claims import holds
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.figures import assert_legible
@@ -487,3 +490,80 @@ def test_the_pixels_response_adds_noise_in_proportion_to_it_and_to_the_light():
     assert found[0] == 0
     assert 0.2 * 0.001 * 2e4 < found[2] < 0.001 * 2e4
     assert found[2] == pytest.approx(2 * found[1], rel=0.01)
+
+
+RGGB = DetectorSettings(gain_e_per_dn=1.0, bits=16, read_noise_e=5.0, bayer="rggb")
+ALIKE = np.ones((2, 3))
+
+
+def test_a_mosaic_whose_channels_are_alike_has_a_grey_detector_s_bounds():
+    star = NoisyStar(GaussianPsf((0.9, 1.3)), RGGB, 1.0, 3, ALIKE)
+    grey = NoisyStar(GaussianPsf((0.9, 1.3)), replace(RGGB, bayer=None), 1.0, 3)
+    found, expected = one(star, 2000.0, 30.0), one(grey, 2000.0, 30.0)
+    for name in ("total_e", "snr", "bound_x_px", "bound_y_px", "bound_flux_e", "effective_px"):
+        np.testing.assert_allclose(found[name], expected[name], rtol=1e-9)
+
+
+def test_each_pixel_of_a_mosaic_has_its_channel_s_share_for_a_star_on_any_of_its_four():
+    """A star that is red alone before a sky that is blue alone: of four places one is red."""
+    shares = np.array([[4.0, 0.0, 0.0], [0.0, 0.0, 4.0]])
+    star = NoisyStar(GaussianPsf((0.9, 0.9)), RGGB, 1.0, 2, shares)
+    side = star.side_px
+    by_place = star.shares.reshape(4, 4, side, side)
+    whole = star.stamps(*np.array([[-0.25, -0.25, 0.25, 0.25], [-0.25, 0.25, -0.25, 0.25]]))
+    for number, (down, right) in enumerate(((0, 0), (0, 1), (1, 0), (1, 1))):
+        rows, columns = np.mgrid[down : down + side, right : right + side]
+        is_red = (rows % 2 == 0) & (columns % 2 == 0)
+        is_blue = (rows % 2 == 1) & (columns % 2 == 1)
+        np.testing.assert_allclose(by_place[number], 4 * whole * is_red, atol=1e-12)
+        sky = star._sky.reshape(4, -1, side, side)[number]
+        assert (sky == 4.0 * is_blue).all()
+    # over all places within four pixels a star keeps its light
+    assert by_place.sum(axis=(2, 3)).mean() == pytest.approx(whole.sum(axis=(1, 2)).mean())
+
+
+def test_superpixels_find_bright_stars_and_no_faint_ones():
+    star = NoisyStar(GaussianPsf((0.9, 0.9)), RGGB, 1.0, 3, ALIKE)
+    finder = CentroidSettings(5.0, 3)
+    detection = [one(star, light_e, 30.0, finder)["detection"][0] for light_e in (1.0, 200.0, 1e5)]
+    assert detection[0] < 1e-3
+    assert detection[0] < detection[1] < detection[2]
+    assert detection[2] == pytest.approx(1.0, abs=1e-6)
+
+
+def test_a_field_s_budget_is_of_its_own_stars_in_the_light_behind_each(tmp_path, monkeypatch):
+    """A tracker of 300 x 200 px on Orion's belt: every star of the field by a pinhole."""
+    monkeypatch.setattr(noise, "TRIALS", 4)
+    tracker = {"resolution_px": [300, 200], "focal_length_mm": 20, "transmission": None}
+    path = tmp_path / "bench.toml"
+    changes = {"tracker": tracker, "sky": {"faintest_v_mag": 7.0}}
+    path.write_text(bench_text(changes, {"background": {"electrons_per_px": 50.0}}))
+    file = read_bench_file(path)
+    finder = CentroidSettings()
+    found = noise.noise_budget(file, np.array(ORION_Q), finder, np.random.default_rng(1))
+    stars = bench_stars(file.config, tmp_path)
+    x, y, z = to_matrix(np.array(ORION_Q)) @ stars.vectors.T
+    focal_px = 20e3 / 13
+    ahead = np.where(z > 0, z, np.nan)
+    x_px, y_px = 149.5 + focal_px * x / ahead, 99.5 + focal_px * y / ahead
+    inside = (np.rint(x_px) >= 0) & (np.rint(x_px) < 300)
+    inside &= (np.rint(y_px) >= 0) & (np.rint(y_px) < 200)
+    assert found.stars is not None
+    listed = {row["hip"]: row for row in found.stars}
+    hips = stars.catalog.hip[stars.row]
+    assert set(listed) == set(hips[inside].tolist())
+    for star in np.flatnonzero(inside):
+        row = listed[int(hips[star])]
+        assert (row["x_px"], row["y_px"]) == pytest.approx((x_px[star], y_px[star]), abs=1e-3)
+        assert row["v_mag"] == pytest.approx(stars.v_mag[star], abs=1e-3)
+        electrons = stars.electrons_per_s[star] * file.config.tracker.exposure_s
+        assert row["star_e"] == pytest.approx(electrons, rel=1e-5)
+    assert found.background_e_per_px == pytest.approx(50.0)
+    assert found.fields == 1
+    assert found.found_stars == pytest.approx(sum(row["detection"] for row in found.stars))
+    assert found.identified_share == 1.0
+    # the magnitude of which half are found
+    below = [row for row in found.rows if row["detection"] > 0.5]
+    above = [row for row in found.rows if row["detection"] < 0.5]
+    assert below[-1]["v_mag"] <= found.found_v_mag <= above[0]["v_mag"]
+    assert found.rows[0]["v_mag"] <= stars.v_mag[inside].min() < found.rows[0]["v_mag"] + 1

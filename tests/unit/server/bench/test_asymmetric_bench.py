@@ -10,12 +10,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import to_matrix
-from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.psf import GaussianPsf, SampledPsf
 from hilstar.server.answers.stars import lit_at
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.server.bench.build import open_bench
@@ -30,6 +31,7 @@ from hilstar.server.bench.cameras import (
 from hilstar.server.bench.frame import Bench, aid_levels_of
 from hilstar.server.bench.scene import seen_by
 from tests.support.benches import bench_text
+from tests.support.psfs import coma, sampled
 
 # about an oblique axis: the monitor stands rolled by two degrees, and beside the axis
 TURN = Rotation.from_rotvec(np.radians([0.4, -0.7, 2.0]))
@@ -189,6 +191,41 @@ def test_a_tracker_s_oval_psf_is_oval_the_same_way_on_the_display(tmp_path: Path
         assert isinstance(psf, GaussianPsf)
         wanted = [0.9 * ratio, 0.5 * ratio][:: -1 if quarters % 2 else 1]
         assert psf.sigma_px == pytest.approx(wanted, rel=1e-3)
+
+
+def middle_and_spread(samples: FloatArray, per_px: int) -> tuple[FloatArray, FloatArray]:
+    """The centroid of an image of a PSF from its middle, x and y in px, and its covariance, px2."""
+    weight = samples / samples.sum()
+    y, x = np.indices(samples.shape)
+    places = np.stack([x, y], axis=-1) / per_px - (np.array(samples.shape[::-1]) // 2) / per_px
+    middle = np.einsum("yx,yxk->k", weight, places)
+    off = places - middle
+    return middle, np.einsum("yx,yxk,yxl->kl", weight, off, off)
+
+
+def test_a_tracker_s_coma_points_the_way_that_the_display_is_turned(tmp_path: Path) -> None:
+    """Its tail is to one side: an image is turned and scaled with the places of stars."""
+    samples = sampled(coma(0.9), 4, 9)
+    hdu = fits.PrimaryHDU(samples)
+    hdu.header["OVERSAMP"] = 4
+    hdu.writeto(tmp_path / "psf.fits")
+    turn = Rotation.from_euler("z", 33, degrees=True)
+    keys = {
+        "tracker": {"psf_sigma_px": None},
+        "tracker.optics": {"psf": "psf.fits"},
+        "collimator": {"q_cam_to_mon": quaternion_of(turn), "focal_length_mm": 611.0},
+        "render": {"psf": "tracker"},
+    }
+    file = bench_file(tmp_path, keys)
+    psf = display_psf(file.config, tmp_path, bench_camera(file.config, tmp_path))
+    assert isinstance(psf, SampledPsf)
+    ratio = (611.0 / PITCH_UM) / (TRACKER_MM / TRACKER_UM)
+    onto = ratio * turn.as_matrix()[:2, :2]
+    middle, spread = middle_and_spread(samples, 4)
+    assert np.hypot(*middle) > 0.2
+    shown_middle, shown_spread = middle_and_spread(psf.samples, psf.per_px)
+    np.testing.assert_allclose(shown_middle, onto @ middle, atol=0.01)
+    np.testing.assert_allclose(shown_spread, onto @ spread @ onto.T, rtol=0.03, atol=0.03)
 
 
 def test_a_collimator_s_blur_is_added_to_both_axes_of_the_tracker_s(tmp_path: Path) -> None:

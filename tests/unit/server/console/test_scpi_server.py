@@ -29,7 +29,7 @@ from hilstar.server.console.messages import (
 )
 from hilstar.server.console.page_figures import RunCounts
 from hilstar.server.console.protocol import LedgerState, NewestFrame, ShownAttitude
-from hilstar.server.console.scpi import MAX_ERRORS
+from hilstar.server.console.scpi import MAX_ERRORS, MAX_LINE_BYTES
 from hilstar.server.console.server import scpi_server
 from hilstar.server.console.server.scpi_server import (
     ALIVE_NS,
@@ -360,6 +360,32 @@ def test_an_order_that_is_refused_has_its_standard_error(bench, status, number):
     assert bench.errors() == [number]
 
 
+@pytest.mark.parametrize(
+    ("line", "number"),
+    [
+        ("SYST:AUTH token", -104),
+        ("SKY:FAUL dust", -104),
+        ('SKY:BLAN "ON"', -158),
+        ("SKY:BLAN PERHAPS", -224),
+        ("SKY:FAUL", -109),
+        ('SKY:FAUL "dust",ON,OFF', -108),
+        ("SKY:BLAN", -109),
+        ("SKY:ATT 1,0,0", -109),
+        ("SKY:ATT 1,0,0,0,0", -108),
+        ("SKY:ATT 2,0,0,0", -222),
+        ("SKY:RATE 0,0,20.1", -222),
+        ("SKY:RATE 0,0,1 V", -131),
+        ("SKY:NOWH", -113),
+        (None, -363),  # a line that was too long
+    ],
+)
+def test_what_is_wrong_in_a_line_is_its_standard_error_and_does_nothing(bench, line, number):
+    bench.run()
+    bench.says(line)
+    assert bench.errors() == [number]
+    assert bench.orders == [] and bench.sent() == []
+
+
 def test_queries_answer_by_the_run_s_state(bench):
     attitude = ShownAttitude(
         q=(0.5, 0.5, -0.5, 0.5),
@@ -546,6 +572,15 @@ def test_lines_over_tcp_are_answered_one_by_one_however_they_are_cut(benches):
     first, *rest = told.decode().splitlines()
     assert first.startswith("hilstar,") and first.endswith(";1999.0")
     assert rest == ["0", "7"]
+
+
+def test_a_line_that_is_too_long_is_an_error_and_the_next_is_answered(benches):
+    bench = benches(None)
+    bench.run()
+    told = talked(bench, b"*IDN? " + b"x" * MAX_LINE_BYTES + b"\nSYST:ERR?\nSYST:ERR?\n")
+    error, none = told.decode().splitlines()
+    assert error.startswith("-363,") and str(MAX_LINE_BYTES) in error
+    assert none.startswith("0,")
 
 
 def test_who_guesses_tokens_is_closed_after_five(benches):

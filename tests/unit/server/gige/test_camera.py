@@ -9,6 +9,8 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,10 +18,14 @@ import pytest
 from hilstar.attitude.wire.endpoint import AllowedSenders
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import HOST_CLOCK
 from hilstar.server.gige.camera import GigECamera, camera_address
 from hilstar.server.gige.registers import CameraIdentity, CameraSettings
 from tests.support.gige_client import (
+    CONTROL,
     DISCOVER,
+    PACKET_BYTES,
+    PRIVILEGE,
     RESEND,
     STREAM_ADDRESS,
     GigEClient,
@@ -30,14 +36,21 @@ from tests.support.refusals import refusal
 from tests.support.waiting import wait_for
 
 SIDE_PX = 256
+FIRE = 1 << 31
+STREAM_SOURCE_PORT = 0x0D1C  # the standard's SCSP0
 
 
 @contextlib.contextmanager
-def served_camera(allow: tuple[str, ...] = (), rate_hz: float = 50.0) -> Iterator[GigECamera]:
+def served_camera(
+    allow: tuple[str, ...] = (),
+    rate_hz: float = 50.0,
+    notices: Notices | None = None,
+    clock: Any = HOST_CLOCK,
+) -> Iterator[GigECamera]:
     address = own_address()
     identity = CameraIdentity(ipaddress.IPv4Address(address), "virtual tracker", "1", "abc")
     settings = CameraSettings(SIDE_PX, SIDE_PX, 12, 0.01, rate_hz)
-    with GigECamera(identity, settings, AllowedSenders(allow), Notices()) as made:
+    with GigECamera(identity, settings, AllowedSenders(allow), notices or Notices(), clock) as made:
         made.address = address  # type: ignore[attr-defined]
         yield made
 
@@ -55,6 +68,7 @@ def streaming(made: GigECamera) -> Iterator[GigEClient]:
 def test_images_arrive_bit_for_bit_with_their_times():
     rng = np.random.default_rng(3)
     with served_camera() as made, streaming(made) as client:
+        source_port = client.read(STREAM_SOURCE_PORT)
         for k in range(5):
             dn = rng.integers(0, 4096, (SIDE_PX, SIDE_PX), dtype=np.uint16)
             begin_ns = time.monotonic_ns()
@@ -62,7 +76,9 @@ def test_images_arrive_bit_for_bit_with_their_times():
             number, stamp_ns, image = client.image(SIDE_PX, SIDE_PX)
             assert (number, stamp_ns) == (k + 1, begin_ns)
             np.testing.assert_array_equal(image, dn)
-        wait_for(lambda: made.counts.images == 5, "the last image is counted")
+        made.take(dn, time.monotonic_ns())
+        assert client.stream.recvfrom(65536)[1] == (made.address, source_port)
+        wait_for(lambda: made.counts.images == 6, "the last image is counted")
         assert made.counts.dropped == 0
 
 
@@ -111,15 +127,101 @@ def test_a_single_frame_is_one_and_an_exposure_begun_before_the_start_is_none():
         assert not made.wanted
 
 
+def test_as_many_images_are_sent_as_were_asked_for_and_a_new_start_gives_as_many_again():
+    dn = np.zeros((SIDE_PX, SIDE_PX), np.uint16)
+    with served_camera() as made, GigEClient(made.address) as client:  # type: ignore[attr-defined]
+        client.describe()
+        client.control()
+        assert client.set("AcquisitionMode", 2) == client.set("AcquisitionFrameCount", 3) == 0
+        for start in range(2):
+            client.set("AcquisitionStart", 1)
+            wait_for(lambda: made.wanted, "the camera streams")
+            for value in range(5):
+                made.take(dn + value, time.monotonic_ns())
+            images = [client.image(SIDE_PX, SIDE_PX) for _ in range(3)]
+            assert [number for number, _, _ in images] == [3 * start + k for k in (1, 2, 3)]
+            assert [image.max() for _, _, image in images] == [0, 1, 2]
+            assert not made.wanted
+        wait_for(lambda: made.counts.images == 6, "the last image is counted")
+
+
+def test_triggers_begin_exposures_in_their_order_and_none_before_a_start():
+    with served_camera() as made, streaming(made) as client:
+        assert client.set("TriggerSoftware", 1) == 0  # free-running: it begins nothing
+        assert client.set("TriggerMode", 1) == 0
+        begun_ns = time.monotonic_ns()
+        for _ in range(3):
+            assert client.set("TriggerSoftware", 1) == 0
+        client.read(PRIVILEGE)  # what was asked for before is then done
+        assert made.counts.triggers == 3
+        first_ns, second_ns = made.trigger_ns(), made.trigger_ns()
+        assert begun_ns <= first_ns <= second_ns <= time.monotonic_ns()
+        client.set("AcquisitionStop", 1)
+        client.set("TriggerSoftware", 1)
+        client.set("AcquisitionStart", 1)
+        client.read(PRIVILEGE)
+        assert made.counts.triggers == 3 and made.trigger_ns() is None
+        client.set("TriggerSoftware", 1)
+        client.read(PRIVILEGE)
+        assert made.counts.triggers == 4 and made.trigger_ns() >= made.started_ns
+
+
+@pytest.mark.parametrize("packet_bytes", [576, 1500, 9000])
+def test_a_client_that_tries_a_size_gets_one_packet_of_it(packet_bytes):
+    """With its headers of IP and UDP, 28 bytes; the stream's own size is then this one."""
+    with served_camera() as made, streaming(made) as client:
+        assert client.write(PACKET_BYTES, FIRE | packet_bytes) == 0
+        assert len(client.stream.recv(65536)) == packet_bytes - 28
+        assert client.read(PACKET_BYTES) & 0xFFFF == packet_bytes
+        made.take(np.zeros((SIDE_PX, SIDE_PX), np.uint16), time.monotonic_ns())
+        _, _, packets = client.block()
+        sizes = {len(packet) for packet in packets.values()}
+        assert max(sizes) == packet_bytes - 28 - 8
+
+
+def test_a_client_that_falls_silent_is_let_go_and_the_next_begins_anew():
+    notices = Notices()
+    ahead_ns = [0]
+    clock = SimpleNamespace(now_ns=lambda: time.monotonic_ns() + ahead_ns[0])
+    with served_camera(notices=notices, clock=clock) as made, streaming(made) as client:
+        ahead_ns[0] = 3_100_000_000
+        wait_for(lambda: not made.settings.streaming, "it is let go")
+        assert not made.wanted
+        wait_for(lambda: notices.counts().get("camera") == 1, "it is told")
+        made.take(np.zeros((SIDE_PX, SIDE_PX), np.uint16), clock.now_ns())
+        with GigEClient(made.address) as other:  # type: ignore[attr-defined]
+            assert other.control() == 0
+            assert client.write(PRIVILEGE, CONTROL) == 0x8006
+        assert made.counts.images == 0
+
+
+def test_only_the_newest_images_are_sent_again():
+    """Eight are kept."""
+    dn = np.zeros((SIDE_PX, SIDE_PX), np.uint16)
+    with served_camera() as made, streaming(made) as client:
+        for _ in range(9):
+            made.take(dn, time.monotonic_ns())
+            client.block()
+        for number, status in ((1, 0x800C), (2, 0)):
+            body = struct.pack(">HHII", 0, number, 0, 0)
+            client.socket.sendto(
+                command(RESEND, body, 999 + number, flags=0), (client.address, 3956)
+            )
+            answer = client.stream.recv(65536)
+            assert struct.unpack(">HH", answer[:4]) == (status, number)
+        wait_for(lambda: made.counts.resent == 1, "the one that was sent again is counted")
+
+
 def test_another_clients_address_is_refused_over_the_wire():
     with served_camera() as made, streaming(made) as client:
         elsewhere = int(ipaddress.IPv4Address("127.0.0.9"))
         assert client.write(STREAM_ADDRESS, elsewhere) == 0x8006
 
 
-def test_a_client_that_is_not_allowed_is_never_answered():
+def test_a_client_that_is_not_allowed_is_never_answered_and_told_of_once():
+    notices = Notices()
     with (
-        served_camera(allow=("127.0.9.9",)) as made,
+        served_camera(allow=("127.0.9.9",), notices=notices) as made,
         GigEClient(made.address, own="127.0.9.9") as friend,  # type: ignore[attr-defined]
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger,
     ):
@@ -130,6 +232,8 @@ def test_a_client_that_is_not_allowed_is_never_answered():
         stranger.setblocking(False)
         with pytest.raises(BlockingIOError):
             stranger.recv(2048)
+        assert notices.lasting.keys() == {"camera-sender-not-allowed"}
+        assert "from 127.0.0.1 are dropped" in notices.lasting["camera-sender-not-allowed"]
 
 
 def test_hostile_clients_leave_the_controller_its_images():

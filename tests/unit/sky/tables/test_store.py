@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from hilstar.sky.catalog import column_names
-from hilstar.sky.star_table import KEPT_FILES, TableChoice, choose_catalog
+from hilstar.sky.star_table import KEPT_FILES, TableChoice, choose_catalog, kept
 from tests.support.waiting import PATIENCE_S
 
 TEXT = "ra_deg,dec_deg,vmag,b-v\n1,2,3,0.1\n4,5,6,\n7,8,9,0.5\n"
@@ -150,3 +150,16 @@ def test_two_processes_at_once_both_have_the_catalogue(stored_table):
     rewritten(path, v_mag=np.array([1.0, 2.0]))
     # what they left is whole
     assert choose_catalog(TableChoice(stored_table)).v_mag.tolist() == [1.0, 2.0]
+
+
+def test_a_cache_of_another_user_and_one_that_unfolds_are_not_read(stored_table, monkeypatch):
+    choose_catalog(TableChoice(stored_table))
+    (path,) = stored(stored_table)
+    assert kept(path) is not None
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "getuid", lambda: path.stat().st_uid + 1)
+        assert kept(path) is None
+    with np.load(path) as packed:
+        np.savez_compressed(path.with_suffix(""), **packed)
+    assert kept(path) is None
+    assert kept(path.with_name("none.npz")) is None

@@ -11,7 +11,8 @@ import pytest
 from astropy.table import MaskedColumn, Table
 
 from hilstar.sky.catalog import load_catalog
-from hilstar.sky.star_table import TableChoice, choose_catalog
+from hilstar.sky.facts import errors_of
+from hilstar.sky.star_table import TableChoice, choose_catalog, table_facts
 from hilstar.sky.table_reader import from_gaia
 from tests.support.refusals import refusal
 
@@ -313,3 +314,36 @@ def test_b_and_v_give_b_minus_v(tmp_path):
     order = np.argsort(catalog.v_mag)
     np.testing.assert_allclose(catalog.v_mag[order], [1.5, 5.25], rtol=SAME)
     np.testing.assert_allclose(catalog.bv_mag[order], [-0.25, 1.25], rtol=SAME)
+
+
+def test_a_table_s_own_errors_stand_in_the_place_of_hipparcos(tmp_path):
+    """Each star has its own row's, in whatever order the catalogue has them; what the table does
+    not say stays unknown, and a cell without a figure is none.
+    """
+    path = tmp_path / "stars.ecsv"
+    table = gaia_table()
+    table["ra_error"] = np.array([0.1, 0.2, 0.3, 0.4, 0.5]) * u.mas
+    table["dec_error"] = np.array([1.0, 2.0, 3.0, 4.0, 5.0]) * u.mas
+    table["parallax_error"] = MaskedColumn(
+        [6.0, 7.0, 0.0, 9.0, 1.0], mask=[0, 0, 1, 0, 0], unit=u.mas
+    )
+    table.write(path)
+    choice = TableChoice(path)
+    stars = choose_catalog(choice)
+    order = np.array([2, 0, 1])
+    stars = stars.taken(order)
+    rows = [table["source_id"].tolist().index(number) for number in stars.identifier.tolist()]
+    assert len(set(rows)) == 3
+    before = errors_of(stars)
+    assert np.isnan(before["sigma_ra_mas"]).all()
+    facts = table_facts(choice, stars, before)
+    assert facts["sigma_ra_mas"] == pytest.approx([0.1 * (k + 1) for k in rows])
+    assert facts["sigma_dec_mas"] == pytest.approx([1.0 + k for k in rows])
+    wanted = [np.nan if k == 2 else [6.0, 7.0, 0.0, 9.0][k] for k in rows]
+    assert facts["sigma_parallax_mas"] == pytest.approx(wanted, nan_ok=True)
+    assert np.isnan(facts["sigma_pm_ra_mas_yr"]).all()
+    assert set(facts) == set(before)
+    plain = tmp_path / "plain.ecsv"
+    gaia_table().write(plain)
+    assert table_facts(TableChoice(plain), stars, before) is before
+    assert table_facts(TableChoice(), stars, before) is before

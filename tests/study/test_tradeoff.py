@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
+from contextlib import ExitStack
 from types import SimpleNamespace
 
 import numpy as np
@@ -21,7 +23,7 @@ from hilstar.instruments.study import sweep
 from hilstar.instruments.study.codes import star_field
 from hilstar.instruments.study.predictors import predictors, slew_attitude, slew_sample
 from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, in_turn, pareto_front
-from hilstar.instruments.study.tradeoff import places
+from hilstar.instruments.study.tradeoff import light, places
 from hilstar.instruments.study.tradeoff import run as tradeoff
 from hilstar.instruments.study.tradeoff.light import (
     LIMITS_V_MAG,
@@ -205,6 +207,22 @@ def test_a_narrow_star_s_samples_ripple_by_its_first_harmonic():
 
 def method_error(step, method):
     return float(step[method]["error"])
+
+
+def test_sampling_at_pixel_centres_spoils_a_middle_pixel_and_a_narrow_star_s_flux():
+    """A wide star's by its height over its integral, a narrow one's by the first term of Poisson's
+    sum.
+    """
+    (sigma_px,) = set(SPRITE_PSF.width_px)
+    of_pixel = math.erf(0.5 / math.sqrt(2) / sigma_px) ** 2
+    percent = 100 * (1 / (2 * math.pi * sigma_px**2) / of_pixel - 1)
+    term = 2 * math.exp(-2 * math.pi**2 * 0.4**2)
+    with ExitStack() as stack:
+        step = light.psf(stack, True)
+    found = re.search(r"is (\d+) % too bright, .* off by ([\d.]+) mag", step.remark)
+    assert found is not None
+    assert int(found[1]) == pytest.approx(percent, abs=0.51)
+    assert float(found[2]) == pytest.approx(-5 * math.log10(1 - term), abs=0.006)
 
 
 def test_every_step_has_a_chart_a_table_and_one_default(tradeoff_study):

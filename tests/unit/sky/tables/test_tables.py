@@ -146,6 +146,16 @@ def test_units_are_the_table_s(tmp_path):
     assert catalog.vi_mag[order] == pytest.approx([0.6, np.nan], nan_ok=True)
 
 
+def test_a_known_name_goes_before_a_name_with_a_unit_in_whatever_order_they_stand(tmp_path):
+    names = ("ra", "ra_hours", "dec", "vmag", "b-v")
+    values = dict(zip(names, (90.0, 3.0, 10.0, 5.0, 0.5), strict=True))
+    for order in (names, names[::-1]):
+        path = tmp_path / f"{order[0]}.csv"
+        row = [str(values[name]) for name in order]
+        path.write_text(f"{','.join(order)}\n{','.join(row)}\n")
+        assert read_stars(path).ra_deg.tolist() == [90.0]
+
+
 def test_stars_of_hipparcos_in_its_own_columns_are_hipparcos(tmp_path):
     packaged = load_catalog().brighter_than(2.0)
     table = Table(

@@ -142,15 +142,14 @@ class Notices:
     def sum_up(self) -> None:
         """Say, at a run's end, how many there were of each kind that was only counted."""
         with self._lock:
-            unsaid = {kind: known.unsaid for kind, known in self._kinds.items() if known.unsaid}
-            for known in self._kinds.values():
+            kind_counts = []
+            for kind, known in self._kinds.items():
+                if known.unsaid:
+                    unsaid = f"{known.unsaid} of them not said"
+                    kind_counts.append(f"{kind} {self._counts[kind]} ({unsaid})")
                 known.unsaid = 0
-        if unsaid:
-            kind_counts = ", ".join(
-                f"{kind} {self._counts[kind]} ({count} of them not said)"
-                for kind, count in unsaid.items()
-            )
-            log.warning("%s", at_now(f"events in all: {kind_counts}"))
+        if kind_counts:
+            log.warning("%s", at_now(f"events in all: {', '.join(kind_counts)}"))
 
     def _hand_on(self, notice: Notice) -> None:
         for listener in self._listeners:

@@ -35,6 +35,9 @@ NODES_A_SIGMA = 5.0
 WHOLE = 0.999
 MAX_NODES = 64  # enough for a Gaussian ten times as wide along one axis as along the other
 MIN_NODES = 10  # 1e-4 of the light
+# of a difference by which an image's speed is known
+STEP_S = 1e-4
+MAX_SHARE = 0.5  # of the rows, by which a disc moves meanwhile: as far as a star does
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -297,6 +300,24 @@ def _seen(light: DiscLight, directions: FloatArray) -> FloatArray:
     return np.asarray(image_directions - late_s[:, None] * turned)
 
 
+def _stretch(light: DiscLight, directions: FloatArray) -> FloatArray:
+    """How many times as large as at rest the image about directions (n, 3), ICRS, is: what moves
+    by a share s of the rows that light up meanwhile is lit in 1 / (1 - s) of them.
+    """
+    shear = light.shear
+    if shear is None:
+        return np.ones(len(directions))
+    image_directions = directions @ light.icrs_to_image.T
+    turned = np.cross(shear.rate_image_rad_s, image_directions)
+    x_px, y_px = light.camera.project(image_directions)
+    later_x_px, later_y_px = light.camera.project(image_directions - STEP_S * turned)
+    s_per_column, s_per_row = shear.s_per_px
+    right_px_s = (later_x_px - x_px) / STEP_S
+    down_px_s = (later_y_px - y_px) / STEP_S
+    share = np.nan_to_num(s_per_column * right_px_s + s_per_row * down_px_s)
+    return np.asarray(1 / (1 - np.clip(share, -MAX_SHARE, MAX_SHARE)))
+
+
 def _disc_map(light: DiscLight, nodes: int) -> LightMap | None:
     """The sum of the disc's places, each spread as a star is; its air, if any, is too thin to be
     seen.
@@ -345,6 +366,7 @@ class FacePlaces(NamedTuple):
 def _places(light: DiscLight, disc: Disc, nodes: int) -> FacePlaces:
     """The places of a disc's face that have a pixel, and their light."""
     directions, law_sr = disc.points(nodes)
+    law_sr = law_sr * _stretch(light, directions)
     x_px, y_px = light.camera.project(_seen(light, directions))
     known = np.isfinite(x_px)
     if known.all():

@@ -23,10 +23,11 @@ from hilstar.server.bench.config import read_config
 from hilstar.server.bench.scenario import parse_scenario
 from tests.docs.pages import Block, blocks_of, differs
 from tests.support.benches import ROOT, SMALL_BENCH
+from tests.support.commands import run_started
 from tests.support.forks import Started
 from tests.support.readme import plain_pytest
 from tests.support.senders import free_port
-from tests.support.waiting import PATIENCE_S, wait_for
+from tests.support.waiting import wait_for
 
 DOCS = sorted((ROOT / "docs").glob("*.md"))
 PAGES = [
@@ -168,14 +169,9 @@ def hilstar(words: list[str]) -> str:
 def other_program(words: list[str]) -> str:
     """What another program prints; `python` is this one."""
     command = [sys.executable, *words[1:]] if words[0] == "python" else words
-    return subprocess.run(
-        command,
-        stdout=subprocess.PIPE,
-        text=True,
-        check=True,
-        timeout=PATIENCE_S,
-        env=plain_pytest(Path()),
-    ).stdout
+    ended = run_started(command, env=plain_pytest(Path()))
+    assert ended.returncode == 0, (shlex.join(words), ended.stdout, ended.stderr)
+    return ended.stdout
 
 
 @contextlib.contextmanager

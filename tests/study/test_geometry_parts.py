@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.study import geometry
 from hilstar.instruments.study.geometry import (
     SIZES,
     USUAL_NOISE_PX,
@@ -18,6 +21,7 @@ from hilstar.instruments.study.geometry import (
     observed_dots,
     turned,
 )
+from hilstar.optics.camera import Camera
 
 SIZE_PX = (400, 300)
 UPRIGHT = {
@@ -116,3 +120,14 @@ def test_frames_vary_in_number_or_in_noise():
     assert {(each.count, each.dots) for each in others} == {USUAL_SIZE}
     assert Frames(*USUAL_SIZE, USUAL_NOISE_PX) in frames_of(quick=True)
     assert len(frames_of(quick=True)) < len(found)
+
+
+def test_a_star_s_error_is_how_far_it_is_shown_from_its_traced_place(monkeypatch):
+    """A camera whose principal point is 3 px to the right and 4 px down of the traced one's."""
+    true = Camera(SIZE_PX, 1000.0, (199.5, 149.5), np.eye(3))
+    off = replace(true, principal_point_px=(202.5, 153.5))
+    traced = SimpleNamespace(resolution_px=SIZE_PX, directions=true.rays)
+    monkeypatch.setattr(geometry, "BENCH", traced)
+    errors_arcsec = geometry._star_errors(SimpleNamespace(monitor=off))
+    assert len(errors_arcsec) == geometry.STARS
+    np.testing.assert_allclose(errors_arcsec, 5 * ARCSEC_PER_RAD / 1000, rtol=1e-9)

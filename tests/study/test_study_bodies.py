@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -233,6 +234,24 @@ def test_a_small_study_of_bodies_draws_its_rows(small_run):
     assert "the dearest:" in cost
 
 
+def test_a_full_moon_s_traced_light_is_its_rate_in_its_circle():
+    """A million electrons a second; a disc of one brightness near its middle."""
+    disc = bodies.moon(6.0, 0.0)
+    camera = Camera((31, 31), bodies.FOCAL_PX, (15.0, 15.0), np.eye(3))
+    image = bodies.traced(disc, camera)
+    assert image.sum() == pytest.approx(1e6, rel=5e-3)
+    y, x = np.indices(image.shape)
+    middle = [15 + at for at in bodies.MIDDLE_PX]
+    assert (image * x).sum() / image.sum() == pytest.approx(middle[0], abs=0.02)
+    assert (image * y).sum() / image.sum() == pytest.approx(middle[1], abs=0.02)
+    reach = np.hypot(x - middle[0], y - middle[1])
+    assert image[reach > 6 + 5 * max(bodies.SIGMA_PX)].max() < 1e-3 * image.max()
+    # half of its light is lost at quarter phase and more, as less of it is lit
+    half = bodies.moon(6.0, 90.0)
+    lit = bodies.traced(replace(half, normal_e_per_s_sr=disc.normal_e_per_s_sr), camera)
+    assert lit.sum() < 0.5 * image.sum()
+
+
 def test_a_level_is_crossed_between_its_steps():
     steps = np.linspace(-3.0, 3.0, 7)
     profile = np.array(
@@ -247,3 +266,19 @@ def test_a_level_is_crossed_between_its_steps():
     assert np.isnan(found[2])
     shortest = bodies.shortest([Spent(3.0, 9.0), Spent(4.0, 7.0)])
     assert shortest == (3.0, 7.0)
+
+
+def test_each_bench_has_the_bodies_of_its_name():
+    planets = {"Mercury", "Venus", "Mars", "Jupiter", "Saturn", "Uranus", "Neptune"}
+    wanted = {
+        "nothing": set(),
+        "observer": set(),
+        "planets": planets,
+        "Sun": {"Sun"},
+        "all": {*planets, "Moon", "Sun", "Earth"},
+    }
+    with bodies.opened(tuple(wanted)) as opened:
+        for name, known in wanted.items():
+            moving = opened[name].moving
+            shown = set() if moving is None else set(moving.names)
+            assert shown == known, name

@@ -867,3 +867,18 @@ def test_errors_without_times_are_those_of_every_choice(parts):
         assert math.isnan(row.time_ms) and row.frames == 0
         assert row.error_arcsec == scene.error(combination).error_arcsec
         assert row.sprite == combination.sprite
+
+
+def test_a_panel_names_the_scenes_whose_error_is_alike(figures, tmp_path):
+    rows = []
+    for scene, arcsec in (("average field", 0.23), ("dense field", 0.235), ("faint field", 9.0)):
+        rows.append(combination_row(scene=scene, error_arcsec=arcsec, chosen="auto", stars=12))
+        rows.append(combination_row(scene=scene, error_arcsec=3 * arcsec, time_ms=2.0, stars=12))
+    run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
+    (figure,) = figures
+    titles = [axes.get_title(loc="left") for axes in figure.axes]
+    assert titles == [
+        "Average field, 12 stars (the same in: dense field)",
+        "Faint field, 12 stars",
+    ]
+    assert "The line is the front" in " ".join(figure.get_supxlabel().split())

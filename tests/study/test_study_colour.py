@@ -244,26 +244,52 @@ def test_the_chart_of_choices_has_a_point_of_each(figures, tmp_path):
             assert (fill == "none") == (row.method == "round")
 
 
-def test_a_frame_s_light_by_primary_is_its_codes_by_each_channel():
-    """Levels by channel, levels of a response that steals bits, and grey ones."""
-    rgb = np.array([[0, 0, 0], [255, 0, 255], [10, 20, 30]])
-    light = colour.srgb_response(8).light
+def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, monkeypatch):
+    """The share of red light by class and the mosaic are measured here; the other parts planted."""
+    gamut = [colour.GamutRow("OLED", "a", 1.0, 0.5, 0.25, 0.75, 3.0, 2.0, 9.0)]
+    by_class = [colour.GamutClass("OLED", "a", "G", 7, 550.0, 2.0, 1.0, 8.0)]
+    lateral = [colour.LateralColour("planar-1897", "OLED", "star", 0.02, 0.001, 0.05)]
+    choices = []
+    for number, (tracker, ink, method) in enumerate(
+        itertools.product(colour.QUICK_TRACKERS, colour.INKS, colour.METHODS), start=1
+    ):
+        choices.append(
+            colour.ColourChoice(tracker, ink, method, 9, 3.0, 2.0 + number, number, 1, 1, 1, 1)
+        )
+    asked = []
 
-    def bench(table):
-        response = SimpleNamespace(rgb=table)
-        calibration = SimpleNamespace(response=response)
-        config = SimpleNamespace(monitor=SimpleNamespace(bits=8))
-        return SimpleNamespace(calibration=calibration, config=config)
+    def study_choices(folder, trackers, fields, rounds):
+        asked.append((dict(trackers), fields, rounds))
+        return choices
 
-    by_channel = np.array([[[1, 2, 3], [255, 0, 0]]])
-    np.testing.assert_array_equal(
-        colour.light_by_primary(bench(None), by_channel), light[by_channel]
-    )
-    grey = np.array([[0, 255, 17]])
-    shown = colour.light_by_primary(bench(None), grey)
-    np.testing.assert_array_equal(shown, np.stack([light[grey]] * 3, axis=2))
-    stolen = colour.light_by_primary(bench(rgb), np.array([[2, 1]]))
-    np.testing.assert_array_equal(stolen, [[light[[10, 20, 30]], light[[255, 0, 255]]]])
+    monkeypatch.setattr(colour, "study_gamut", lambda folder: (gamut, by_class))
+    monkeypatch.setattr(colour, "study_lateral", lambda folder: lateral)
+    monkeypatch.setattr(colour, "study_choices", study_choices)
+    run = small_run(colour.run, True)
+    quick = {"mono": "ccd47-20", "Bayer": "Bayer, wide dyes"}
+    assert asked == [(quick, colour.QUICK_FIELDS, colour.QUICK_ROUNDS)]
+    for name, rows in (
+        ("colour", choices),
+        ("colour_gamut", gamut),
+        ("colour_class", by_class),
+        ("colour_lateral", lateral),
+    ):
+        written = run.rows(name)
+        assert len(written) == len(rows)
+        for row, planted in zip(written, rows, strict=True):
+            assert list(row.values()) == [str(value) for value in asdict(planted).values()]
+    assert "class" in run.rows("colour_class")[0]
+    assert_recorded(run.folder / "colour_red.csv", ("sensor",), tuple("OBAFGKM"))
+    keys = ("sigma_px", "temperature_k", "image")
+    assert_recorded(run.folder / "colour_mosaic.csv", keys, ("rms_px", "max_px"))
+    findings = run.told[0]
+    assert findings[0] == run.title("colour")
+    assert findings[1] == "lateral colour of planar-1897 by star on OLED: off by 5% of the sky's"
+    quoted = [row for row in run.rows("colour_mosaic") if row["sigma_px"] == "1.0"]
+    assert len(findings) == 2 + len(quoted) == 8
+    for line, row in zip(findings[2:], quoted, strict=True):
+        star = f"a star of 1 px, {float(row['temperature_k']):g} K"
+        assert line == f"{star}, is {float(row['rms_px']):.3f} px off rms in a {row['image']}"
 
 
 def test_a_dye_falls_to_one_over_e_at_its_half_width():

@@ -176,6 +176,8 @@ def test_a_small_study_of_faults_draws_its_rows(small_run):
         drawn = {label: x for label, x, _ in run.lines("faults_cost", panel)}
         np.testing.assert_allclose(drawn["without"], [float(row["without_ms"]) for row in own])
         np.testing.assert_allclose(drawn["with the fault"], [float(row["frame_ms"]) for row in own])
+    first = run.charts["faults_cost"].axes[0]
+    assert [text.get_text() for text in first.get_yticklabels()] == list(cases)
     assert len(run.told[0]) == 4
 
 

@@ -758,3 +758,40 @@ def test_black_bodies_are_as_wrong_as_recorded(monkeypatch):
     np.testing.assert_allclose(
         rows["ccd47-20", models.BODY].percent, 100 * (body / real - 1), atol=1e-3
     )
+
+
+def test_a_study_s_findings_are_of_its_figures_in_their_order(tmp_path, monkeypatch):
+    def figure(name):
+        return lambda folder: models.ChartFinding(name, f"{name} in {folder.name}")
+
+    def of_sensor(folder, sensor):
+        return models.ChartFinding(f"rapp_{sensor}", folder.name)
+
+    monkeypatch.setattr(models, "FIGURES", (figure("b"), figure("a")))
+    monkeypatch.setattr(models, "rapp", of_sensor)
+    found = models.run(tmp_path)
+    names = ["rapp_ccd47-20", "rapp_kai-4021", "b", "a"]
+    assert [finding.figure for finding in found] == names
+    rows = csv_rows(tmp_path / "findings.csv")
+    assert [(row["figure"], row["finding"]) for row in rows] == [
+        (finding.figure, finding.text) for finding in found
+    ]
+
+
+def test_a_star_s_electrons_are_planck_s_through_30_mm_of_glass_and_the_ccd(made):
+    """Thesis eq. 3.1 at V = 0 and 9602 K: pi/4 D^2 times 3.631e-2 W/m2/m through Johnson V, by
+    h c / lambda each, the quantum efficiency and 10 mm of N-BK7.
+    """
+    qe, glass, johnson = curve("ccd47-20"), curve("n-bk7-10mm"), curve("johnson-v")
+    knots_nm = np.union1d(qe[0], glass[0])
+    knots_nm = knots_nm[(knots_nm >= qe[0][0]) & (knots_nm <= qe[0][-1])]
+    in_v = integral(lambda nm: planck(nm, REFERENCE_K) * np.interp(nm, *johnson), johnson[0])
+    in_v /= integral(lambda nm: np.interp(nm, *johnson), johnson[0])
+    seen = integral(
+        lambda nm: planck(nm, REFERENCE_K) * np.interp(nm, *qe) * np.interp(nm, *glass) * nm,
+        knots_nm,
+    )
+    # nm twice: of the wavelength, and of its interval
+    per_m2 = 3.631e-2 * seen / in_v * 1e-18 / (constants.h * constants.c)
+    table = made("zero_points").table("zero_points")
+    assert table["electrons_per_s"][0] == pytest.approx(np.pi / 4 * 0.03**2 * per_m2, rel=1e-6)

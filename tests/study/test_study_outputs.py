@@ -65,6 +65,12 @@ def test_each_field_has_its_files_and_one_of_one_s_own_is_the_last(scenes):
     assert names | {f"{stem}{end}" for stem in scenes.charts for end in (".png", ".svg")} == wanted
     assert [line.partition(":")[0] for line in scenes.told] == ["zeta_cas", "field"]
     assert scenes.title("field").startswith("RA 84, Dec -1.2, roll 30°, own.toml: ")
+    for stem, line in zip(scenes.charts, scenes.told, strict=True):
+        # those whose centre is on the image, as the line counts them
+        on_image, saturated = re.search(r": (\d+) stars.*; (\d+) stars saturated", line).groups()
+        count = saturated if int(saturated) else "none"
+        assert f": {on_image} stars, {count} saturated; hottest" in scenes.title(stem)
+    assert "more whose light reaches" in scenes.told[0]
 
 
 def test_images_without_and_with_noise_are_of_one_sky(scenes):
@@ -177,7 +183,7 @@ def test_a_zoom_is_about_its_star_or_the_brightest_or_the_middle():
     for hip, wanted in (
         (None, ("Moon", (10.0, 20.0))),
         (9, ("HIP 9", (30.0, 40.0))),
-        (7, ("the middle", (30.0, 50.0))),
+        (7, ("the middle", (29.5, 49.5))),
     ):
         scene = outputs.OutputScene("s", "t", fields_of(None)[0], hip)
         assert outputs._zoom(scene, shown) == wanted

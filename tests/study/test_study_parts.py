@@ -28,6 +28,7 @@ from hilstar.instruments.study import (
     bodies,
     codes,
     colour,
+    economy,
     faults,
     geometry,
     limits,
@@ -36,15 +37,17 @@ from hilstar.instruments.study import (
     rigs,
     sky_figures,
     study_benches,
+    timing,
 )
 from hilstar.instruments.study.economy import EffortComparison
 from hilstar.instruments.study.outputs import _field_deg, thesis_total_e
 from hilstar.instruments.study.prediction import auto_times
-from hilstar.instruments.study.sweep import beaten_by
+from hilstar.instruments.study.sweep import Spent, beaten_by, spent
 from hilstar.instruments.study.timing import stripe_depth
 from hilstar.optics.camera import Camera
 from hilstar.optics.frame_motion import CameraTurn
-from tests.support.benches import ORION_Q
+from tests.support.benches import ORION_Q, ROOT
+from tests.support.tables import csv_rows
 
 ROUNDING = 1e-9
 NEAR = predictors.NEAR
@@ -436,3 +439,43 @@ def test_a_field_s_stars_are_off_by_their_way_to_their_pixels(wide_bench):
     assert np.abs(off_px).max() <= 0.5
     places = np.stack([sprites.x_px, sprites.y_px])[:, inside]
     np.testing.assert_allclose((places + off_px) % 1 % 1, 0, atol=1e-9)
+
+
+def test_a_work_s_time_is_milliseconds_of_the_wall_and_of_the_processor(monkeypatch):
+    clocks = {"wall_s": 10.0, "cpu_s": 3.0}
+
+    def work():
+        clocks["wall_s"] += 0.25
+        clocks["cpu_s"] += 0.125
+
+    monkeypatch.setattr("time.perf_counter", lambda: clocks["wall_s"])
+    monkeypatch.setattr("time.process_time", lambda: clocks["cpu_s"])
+    assert spent(work) == Spent(250.0, 125.0)
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "wanted"),
+    [
+        ("timing", "rate_deg_s", timing.RATES_DEG_S),
+        ("timing", "way", tuple(timing.WAYS)),
+        ("stripes", "lit_ms", tuple({case.lit_ms for case in timing.STRIPE_CASES})),
+        ("stripes", "refreshes", tuple({case.refreshes for case in timing.STRIPE_CASES})),
+        ("economy", "bits", economy.BITS),
+        ("economy", "scene", tuple(scene.name for scene in economy.SCENES)),
+        ("economy", "tolerance_mag", tuple({limit.mag for limit in economy.TOLERANCES})),
+        ("over_frames", "frames", codes.FRAMES),
+        ("over_frames", "panel", tuple(panel.name for panel in codes.frames_panels())),
+        ("colour_gamut", "panel", tuple(colour.PANELS)),
+        ("colour_mosaic", "sigma_px", colour.SIGMAS_PX),
+        ("colour_mosaic", "temperature_k", colour.STARS_K),
+        ("colour", "tracker", tuple(colour.TRACKERS)),
+        ("rigs", "rig", (rigs.LASSI, rigs.NAPLES, rigs.P13)),
+    ],
+)
+def test_a_page_s_table_has_every_case_of_its_study(table, column, wanted):
+    """What a whole study varies, which the small runs of these tests do not."""
+    recorded = {row[column] for row in csv_rows(ROOT / "results" / f"{table}.csv")}
+    if isinstance(wanted[0], str):
+        assert recorded == set(wanted)
+    else:
+        assert sorted(map(float, recorded)) == pytest.approx(sorted(wanted))

@@ -179,3 +179,38 @@ def test_a_small_study_has_each_published_figure_beside_its_prediction(small_run
     np.testing.assert_allclose(
         drawn["with hilstar's codes"], [now[figure][1] for figure in figures]
     )
+
+
+def test_the_light_of_a_star_is_that_at_which_its_own_pixel_scatters_as_published(monkeypatch):
+    """Of a planted scatter of 300 over the light, across the boresight, by the fitted centroider."""
+    field = rigs.rig_field()
+
+    def scatter_arcsec(seen, places_px, star_dn, exposures):
+        assert (seen, exposures) == (field, 7)
+        np.testing.assert_array_equal(places_px, field.pixel_px)
+        across = np.array([1.0, 300.0 / star_dn, 300.0 / star_dn])
+        return {"network": across / 9, "Gaussian grid": across, "centre of mass": across * 9}
+
+    monkeypatch.setattr(rigs, "scatter_arcsec", scatter_arcsec)
+    published_arcsec = math.sqrt((6.31878699**2 + 13.00288255**2) / 2)
+    light_dn = rigs.fitted_light_dn(field, 7)
+    # no more than the faintest of the lights that are tried
+    assert light_dn == pytest.approx(max(300.0 / published_arcsec, 34.0))
+    monkeypatch.setattr(rigs, "LIGHTS_DN", (10.0, 20.0, 90.0))
+    assert rigs.fitted_light_dn(field, 7) == pytest.approx(300.0 / published_arcsec)
+
+
+def test_a_star_s_corner_is_its_area_s_middle_rounded_down():
+    """Of areas of two by two and of three by three, one lit as the threshold, one of three pixels
+    and one at the edge of what is read.
+    """
+    width, height = rigs.CAMERA_PX
+    image = np.full((height, width), rigs.DARK_DN)
+    lit = rigs.DARK_DN + rigs.THRESHOLD_DN + 0.1
+    image[100:102, 51:53] = lit
+    image[200:203, 70:73] = [[lit, lit, lit], [lit, 1000.0, lit], [lit, lit, 5000.0]]
+    image[300:304, 80:84] = rigs.DARK_DN + rigs.THRESHOLD_DN
+    image[50, 40:43] = lit
+    image[101:103, width - rigs.EDGE_PX : width - rigs.EDGE_PX + 2] = lit
+    columns, rows = rigs.found_stars(image)
+    assert (columns.tolist(), rows.tolist()) == ([51, 71], [100, 201])

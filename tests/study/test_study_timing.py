@@ -14,18 +14,12 @@ from hilstar.instruments.study.timing import (
     QUICK_CASES,
     QUICK_RATES_DEG_S,
     WAYS,
-    BeatPoint,
     ScanningPanel,
-    StripeCase,
-    StripePoint,
     TimingSky,
     compare,
     frame_weights,
     measure,
-    measure_beat,
     slew,
-    stripe_depth,
-    stripe_points,
 )
 from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
@@ -71,8 +65,8 @@ def test_the_command_draws_its_three_charts(whole_study):
 
 
 @pytest.fixture(scope="module")
-def outcomes():
-    return {outcome.way: outcome for outcome in measure(quick=True)}
+def outcomes(timing_study):
+    return {outcome.way: outcome for outcome in timing_study[2]}
 
 
 def test_the_page_s_table_is_of_what_is_measured_now(timing_study):
@@ -129,68 +123,37 @@ def test_each_way_has_a_finding_and_a_row(timing_study):
     assert len((folder / "timing.csv").read_text().splitlines()) == 1 + len(WAYS)
 
 
-def assert_stripes_are_foretold(points):
-    """As foretold, and none where exposures are whole refreshes."""
-    assert points
-    assert max(abs(point.light - point.foretold) for point in points) < 1e-6
-    for point in points:
-        if point.refreshes == 2 or point.lit_ms > 16:
-            assert point.light == pytest.approx(1.0, abs=1e-6)
-
-
-def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold():
-    """2.4 refreshes of 4 ms of light: a row sees three flashes or two, of 2.4 on average."""
-    points = stripe_points(StripeCase(2.4, 4.0))
-    assert_stripes_are_foretold(points)
-    light = [point.light for point in points]
-    assert max(light) == pytest.approx(3 / 2.4, abs=1e-6)
-    assert min(light) == pytest.approx(2 / 2.4, abs=1e-6)
-    assert max(light) > 1.2 and min(light) < 0.9
-    depth = stripe_depth(points, whole=False)
-    assert depth == pytest.approx(max(abs(each - 1) for each in light))
-    assert stripe_depth(points, whole=True) == 0.0
-
-
-def test_the_command_s_stripes_are_those_that_are_foretold(timing_study):
-    rows = csv_rows(timing_study[0] / "stripes.csv")
-    points = []
-    for row in rows:
-        figures = {name: float(value) for name, value in row.items()}
-        points.append(StripePoint(**figures))
-    assert_stripes_are_foretold(points)
-    assert {(point.refreshes, point.lit_ms) for point in points} > {(2.0, 4.0), (2.4, 4.0)}
-
-
-def assert_beat_is_foretold(case, points):
-    assert len(points) > 30
-    off = np.array([point.off_arcsec - point.foretold_arcsec for point in points])
-    assert np.sqrt(np.mean(off**2)) < CODES_ARCSEC
-    assert max(abs(point.light_mag - point.foretold_mag) for point in points) < CODES_MAG
-    later = seen_at(
-        Exposures(60.0, case.refreshes * PERIOD_S, lit_s=case.lit * PERIOD_S),
-        np.array([point.phase + 0.4 for point in points]),
+def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(timing_study):
+    rows = [
+        {name: float(value) for name, value in row.items()}
+        for row in csv_rows(timing_study[0] / "stripes.csv")
+    ]
+    assert max(abs(row["light"] - row["foretold"]) for row in rows) < 1e-6
+    deep = [row["light"] for row in rows if row["refreshes"] == 2.4 and row["lit_ms"] == 4]
+    assert max(deep) > 1.2 and min(deep) < 0.9
+    assert all(
+        abs(row["light"] - 1) < 1e-6 for row in rows if row["refreshes"] == 2 or row["lit_ms"] > 16
     )
-    wrong = np.array([point.off_arcsec for point in points]) - later.off_s * ARCSEC_PER_DEG
-    assert case == QUICK_CASES[0] or np.sqrt(np.mean(wrong**2)) > 2 * CODES_ARCSEC
 
 
-def test_a_tracker_sees_the_beat_that_is_foretold(monkeypatch):
+def test_a_tracker_sees_the_beat_that_is_foretold(timing_study):
     """Star by star, each on a row of its own phase; and of another phase it would not be."""
-    case = QUICK_CASES[-1]
-    monkeypatch.setattr(timing, "QUICK_CASES", (case,))
-    assert_beat_is_foretold(case, measure_beat(quick=True))
-
-
-def test_the_command_s_beats_are_those_that_are_foretold(timing_study):
-    rows = csv_rows(timing_study[0] / "beat.csv")
-    points = []
-    for row in rows:
-        points.append(BeatPoint(**{name: float(value) for name, value in row.items()}))
+    rows = [
+        {name: float(value) for name, value in row.items()}
+        for row in csv_rows(timing_study[0] / "beat.csv")
+    ]
     for case in QUICK_CASES:
-        mine = [
-            point for point in points if (point.refreshes, point.lit) == (case.refreshes, case.lit)
-        ]
-        assert_beat_is_foretold(case, mine)
+        mine = [row for row in rows if (row["refreshes"], row["lit"]) == (case.refreshes, case.lit)]
+        assert len(mine) > 30
+        off = np.array([row["off_arcsec"] - row["foretold_arcsec"] for row in mine])
+        assert np.sqrt(np.mean(off**2)) < CODES_ARCSEC
+        assert max(abs(row["light_mag"] - row["foretold_mag"]) for row in mine) < CODES_MAG
+        later = seen_at(
+            Exposures(60.0, case.refreshes * PERIOD_S, lit_s=case.lit * PERIOD_S),
+            np.array([row["phase"] + 0.4 for row in mine]),
+        )
+        wrong = np.array([row["off_arcsec"] for row in mine]) - later.off_s * ARCSEC_PER_DEG
+        assert case == QUICK_CASES[0] or np.sqrt(np.mean(wrong**2)) > 2 * CODES_ARCSEC
 
 
 def test_an_angle_on_the_tracker_is_that_of_its_own_lens(outcomes):

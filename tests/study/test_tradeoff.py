@@ -6,7 +6,9 @@ from __future__ import annotations
 
 import itertools
 import math
+import re
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -21,7 +23,7 @@ from hilstar.instruments.study import sweep
 from hilstar.instruments.study.codes import star_field
 from hilstar.instruments.study.predictors import predictors, slew_attitude, slew_sample
 from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, in_turn, pareto_front
-from hilstar.instruments.study.tradeoff import places
+from hilstar.instruments.study.tradeoff import light, places
 from hilstar.instruments.study.tradeoff import run as tradeoff
 from hilstar.instruments.study.tradeoff.light import (
     LIMITS_V_MAG,
@@ -30,7 +32,13 @@ from hilstar.instruments.study.tradeoff.light import (
     shared_knots,
     trapezoid,
 )
-from hilstar.instruments.study.tradeoff.places import SPRITE_PSF
+from hilstar.instruments.study.tradeoff.places import (
+    EVENLY,
+    EXACT_NODES,
+    GAUSS,
+    SPRITE_PSF,
+    smear_methods,
+)
 from hilstar.instruments.study.tradeoff.run import STEPS
 from hilstar.instruments.study.trials import (
     Figure,
@@ -197,21 +205,24 @@ def test_a_narrow_star_s_samples_ripple_by_its_first_harmonic():
     np.testing.assert_allclose(sums, 1 + first * np.cos(2 * math.pi * phases_px), atol=1e-5)
 
 
-@pytest.fixture(scope="module")
-def steps():
-    """The methods of each step by name, as they are before they are timed."""
-    planned = {}
-    for plan in STEPS:
-        with ExitStack() as stack:
-            step = plan(stack, True)
-        planned[step.name] = {trial.method: trial for trial in step.trials}
-    assert list(planned) == NAMES
-    return planned
+def method_error(step, method):
+    return float(step[method]["error"])
 
 
-def default_of(step):
-    (default,) = [trial for trial in step.values() if trial.is_default]
-    return default
+def test_sampling_at_pixel_centres_spoils_a_middle_pixel_and_a_narrow_star_s_flux():
+    """A wide star's by its height over its integral, a narrow one's by the first term of Poisson's
+    sum.
+    """
+    (sigma_px,) = set(SPRITE_PSF.width_px)
+    of_pixel = math.erf(0.5 / math.sqrt(2) / sigma_px) ** 2
+    percent = 100 * (1 / (2 * math.pi * sigma_px**2) / of_pixel - 1)
+    term = 2 * math.exp(-2 * math.pi**2 * 0.4**2)
+    with ExitStack() as stack:
+        step = light.psf(stack, True)
+    found = re.search(r"is (\d+) % too bright, .* off by ([\d.]+) mag", step.remark)
+    assert found is not None
+    assert int(found[1]) == pytest.approx(percent, abs=0.51)
+    assert float(found[2]) == pytest.approx(-5 * math.log10(1 - term), abs=0.006)
 
 
 def test_every_step_has_a_chart_a_table_and_one_default(tradeoff_study):
@@ -235,8 +246,12 @@ def test_a_default_is_on_the_front_or_says_what_beats_it(tradeoff_study):
             assert any(default["beaten_by"] in line for line in lines)
 
 
-def test_the_defaults_are_the_code_s_own(steps):
-    default = {name: default_of(step).method for name, step in steps.items()}
+def test_the_defaults_are_the_code_s_own(tradeoff_study):
+    steps = tradeoff_study[2]
+    default = {
+        name: next(m for m, row in step.items() if row["default"] == "True")
+        for name, step in steps.items()
+    }
     assert default["brightness"] == f"table over 1/T, degree {TABLE_DEGREE}"
     assert default["culling"] == f"cells of {CELL_DEG:g} deg"
     assert default["projection"].endswith("whole pixel + float32 fraction")
@@ -249,7 +264,7 @@ def test_the_defaults_are_the_code_s_own(steps):
     assert default["smear"].startswith("Gauss-Legendre by length")
 
 
-def test_what_is_exact_is_so_to_rounding(steps):
+def test_what_is_exact_is_so_to_rounding(tradeoff_study):
     """Figures from each step's `floor`: float64 integrals, float32 sprites, extended precision."""
     floors = {
         "brightness": 5e-12,
@@ -260,23 +275,29 @@ def test_what_is_exact_is_so_to_rounding(steps):
         "smear": 1e-7,
     }
     for name, floor in floors.items():
-        (exact,) = [trial for trial in steps[name].values() if trial.is_exact]
-        assert exact.error <= floor
-    (exact,) = [trial for trial in steps["psf"].values() if trial.is_exact]
-    assert exact.error <= 1e-7 and exact.second < 1e-12
+        exact = [row for row in tradeoff_study[2][name].values() if row["exact"] == "True"]
+        assert len(exact) == 1 and float(exact[0]["error"]) <= floor
+    (exact,) = [row for row in tradeoff_study[2]["psf"].values() if row["exact"] == "True"]
+    assert float(exact["error"]) <= 1e-7 and float(exact["second"]) < 1e-12
 
 
-def test_the_defaults_keep_their_modules_promises(steps):
-    error = {name: default_of(step).error for name, step in steps.items()}
-    assert error["psf"] <= MAX_CUT * MAG_PER_SHARE
-    assert error["smear"] <= 1e-6  # scene/exposure_motion.py
-    assert error["culling"] == 0
-    assert error["projection"] < 6e-8  # half a step of float32 under 1, on both axes
+def test_the_defaults_keep_their_modules_promises(tradeoff_study):
+    steps = tradeoff_study[2]
+    own = {
+        name: next(row for row in step.values() if row["default"] == "True")
+        for name, step in steps.items()
+    }
+    assert float(own["psf"]["error"]) <= MAX_CUT * MAG_PER_SHARE
+    assert float(own["smear"]["error"]) <= 1e-6  # scene/exposure_motion.py
+    assert float(own["culling"]["error"]) == 0
+    assert float(own["projection"]["error"]) < 6e-8  # half a step of float32 under 1, on both axes
 
 
-def test_less_is_worse(steps):
+def test_less_is_worse(tradeoff_study):
+    steps = tradeoff_study[2]
+
     def falls(step, *methods):
-        errors = [steps[step][method].error for method in methods]
+        errors = [method_error(steps[step], method) for method in methods]
         assert all(worse > better for worse, better in itertools.pairwise(errors)), (
             methods,
             errors,
@@ -318,31 +339,6 @@ def test_less_is_worse(steps):
     )
     falls("smear", *(f"evenly in time, {n}" for n in (4, 8, 16, 32, 64)), "Gauss-Legendre, 24")
     falls("quantisation", "round", "exact", "exact, bit stealing")
-
-
-def test_what_is_wrong_is_wrong_by_as_much_as_it_should_be(steps):
-    """Second figures, and errors that physics gives."""
-    culling = steps["culling"]
-    # every star is tested, of 116 812
-    scan = culling["scan, every star projected"]
-    assert scan.second == culling["scan of angles"].second
-    assert 0.98 < scan.second / 116_812 < 1
-    tested = [culling[f"cells of {deg:g} deg"].second for deg in (2, 4, 10, 20)]
-    assert tested == sorted(tested) and tested[-1] < 0.1 * scan.second
-    # places up to 2000 px: float32's step there is 1.2e-4, whose half is the worst along an axis
-    worst = steps["projection"]["float64, place in float32"].error
-    assert worst == pytest.approx(math.hypot(2**-14, 2**-15), rel=0.3)
-    # held from one sample to the next, 50 ms later, whose turn in between is the most of the slew's
-    hold = steps["prediction"]["hold"]
-    samples = [slew_attitude(k * 50_000_000) for k in range(201)]
-    turned = [angle_between_rad(a, b) for a, b in itertools.pairwise(samples)]
-    # frames are at most two thirds of that after a sample
-    assert hold.error == pytest.approx(max(turned) * 206264.806 * 2 / 3, rel=0.02)
-    assert 0.5 * hold.error < hold.second < 0.7 * hold.error
-    # so many impulses on a path: the centre is right whatever their number
-    smear = steps["smear"]
-    for name in ("evenly in time, 16", "Gauss-Legendre, 32"):
-        assert smear[name].second < 0.02
 
 
 def test_the_front_is_what_nothing_beats():
@@ -468,3 +464,20 @@ def test_a_rule_reaches_over_all_that_curves_share():
         assert (nm**power) @ weight_m == pytest.approx(closed * 1e-9, rel=1e-12)
         nm, weight_m = trapezoid(1.0, *curves)
         assert (nm**power) @ weight_m == pytest.approx(closed * 1e-9, rel=1e-5)
+
+
+def test_sprites_of_a_path_stand_about_its_middle_and_share_its_light():
+    drawn = []
+    bench = SimpleNamespace(chain=lambda at, share, stars: drawn.append((at, share)))
+    methods = smear_methods(bench)
+    for method in methods.values():
+        method(None)
+    counts = [len(at) for at, _ in drawn]
+    assert sorted(counts) == sorted((*GAUSS, EXACT_NODES, *EVENLY))
+    for at, share in drawn:
+        assert share.sum() == pytest.approx(1.0)
+        assert share @ at == pytest.approx(0.0, abs=1e-12)
+        # of a path from -1/2 to 1/2, all but what so many sprites leave out
+        spread = share @ at**2
+        even = (1 - 1 / len(at) ** 2) / 12
+        assert spread == pytest.approx(even if np.ptp(share) == 0 else 1 / 12, rel=1e-9)

@@ -88,7 +88,9 @@ def is_bare(config: pytest.Config) -> bool:
     option = config.option
     if config.args_source is pytest.Config.ArgsSource.ARGS:
         return False
-    return not (option.keyword or option.markexpr or option.lf or option.failedfirst)
+    # without pytest's cache (-p no:cacheprovider) there are no options for what failed
+    has_failed_ones = getattr(option, "lf", False) or getattr(option, "failedfirst", False)
+    return not (option.keyword or option.markexpr or has_failed_ones)
 
 
 def holds_nothing_for(config: pytest.Config, path: Path) -> bool:

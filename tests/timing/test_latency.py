@@ -30,7 +30,7 @@ from tests.support.x11.screens import Screen, xvfb
 MIN_EDGES, MAX_UNMATCHED = 60, 0.05  # share of the edges
 MEDIAN_MS = 2.0
 ADDED_MS = 40.0
-WATCHED_S = 4  # some 120 edges of the code
+WATCHED_S = 3  # some 90 edges of the code
 DEVICE_MS = 0.5  # of the same edges, a few more or less
 PERIOD_NS = 1e9 / 60
 STEADY_NS = 1e6  # by which the pairing takes latencies together

@@ -5,7 +5,16 @@ from __future__ import annotations
 from types import SimpleNamespace
 from typing import Any
 
-from tests.support.selection import SLOW, TESTS, holds_nothing_for, is_slow, slow_functions
+import pytest
+
+from tests.support.selection import (
+    SLOW,
+    TESTS,
+    holds_nothing_for,
+    is_bare,
+    is_slow,
+    slow_functions,
+)
 from tests.support.slow_tests import KEPT_CPU_S, kept_cases
 
 
@@ -59,3 +68,14 @@ def test_of_a_slow_function_the_longest_cases_that_fit_are_kept():
     assert KEPT_CPU_S == 0.2
     assert kept_cases(cases) == {"[b]", "[d]"}
     assert kept_cases({"": 0.9}) == set()
+
+
+@pytest.mark.parametrize(
+    ("more", "bare"),
+    [({}, True), ({"lf": False, "failedfirst": False}, True), ({"lf": True}, False)],
+    ids=["no cache", "nothing asked", "what failed"],
+)
+def test_a_command_is_bare_with_and_without_pytest_s_cache(more, bare):
+    option = SimpleNamespace(keyword="", markexpr="", **more)
+    config: Any = SimpleNamespace(option=option, args_source=pytest.Config.ArgsSource.TESTPATHS)
+    assert is_bare(config) == bare

@@ -164,7 +164,8 @@ def align(pairs: Pairs, camera: Camera) -> Aligned:
         rate_rad_s = pairs.rate_rad_s[used]
     covariance, dof = fit.covariance_rad2(groups_of(pairs.commanded))
     commanded = pairs.commanded[used]
-    residual = residual_of(commanded, rate_rad_s, fit.residual_rad[used], fit.q)
+    place = np.linspace(-0.5, 0.5, len(pairs))[used]
+    residual = residual_of(commanded, rate_rad_s, fit.residual_rad[used], fit.q, place)
     q_nominal = from_matrix(camera.cam_to_image)
     wild = tuple(pairs.line[~used].tolist())
     return Aligned(
@@ -201,9 +202,15 @@ def groups_of(commanded: FloatArray) -> IntArray:
 
 
 def residual_of(
-    commanded: FloatArray, rate_rad_s: FloatArray | None, residual_rad: FloatArray, q: FloatArray
+    commanded: FloatArray,
+    rate_rad_s: FloatArray | None,
+    residual_rad: FloatArray,
+    q: FloatArray,
+    place: FloatArray,
 ) -> Residual:
-    """Judge the residuals (n, 3), rad, of pairs without wild ones; `q` is the fitted rotation."""
+    """Judge the residuals (n, 3), rad, of pairs without wild ones; `q` is the fitted rotation,
+    and `place` (n,) each pair's from the first row, -0.5, to the last, 0.5, of all.
+    """
     group = groups_of(commanded)
     attitudes = int(group.max()) + 1
     cross = residual_rad[:, :2]
@@ -221,7 +228,7 @@ def residual_of(
         repeat=repeat,
         unexplained=unexplained,
         attitudes=attitudes,
-        causes=_causes(commanded, rate_rad_s, residual_rad, q, group),
+        causes=_causes(commanded, rate_rad_s, residual_rad, q, group, place),
     )
 
 
@@ -260,6 +267,7 @@ def _causes(
     residual_rad: FloatArray,
     q: FloatArray,
     group: IntArray,
+    place: FloatArray,
 ) -> tuple[str, ...]:
     """Causes that explain most of the residual: a turned reference frame, a clock's offset, a
     drift.
@@ -267,7 +275,6 @@ def _causes(
     They are fitted to the mean of each attitude's pairs, so that an attitude counts once however
     often it was repeated.
     """
-    row = np.linspace(-0.5, 0.5, len(group))[:, None]
     if group.max() == 0:
         group = np.arange(len(group))
     if group.max() + 1 < MIN_ATTITUDES:
@@ -291,7 +298,7 @@ def _causes(
             causes.append(
                 f"times that are {late[0]:+.4f} s off explain most of it: add that to --offset-s"
             )
-    along = _means(row, group)
+    along = _means(place[:, None], group)
     drift = _explained(means, along[:, :, None] * np.eye(3))
     if drift is not None:
         size = ARCSEC_PER_RAD * float(np.linalg.norm(drift))

@@ -142,7 +142,8 @@ class LedgerQueue:
     @property
     def dropped(self) -> int:
         """How many entries were dropped since their counts were taken."""
-        return self._dropped.total()
+        with self._lock:
+            return self._dropped.total()
 
 
 Counted = Kind | Literal["pulse", "lost"]  # pulses and lost packets are only counted

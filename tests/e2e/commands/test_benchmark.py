@@ -12,10 +12,11 @@ import pytest
 from PIL import Image
 
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.instruments.study.speed import benchmark, tracker
 from hilstar.instruments.study.speed.benchmark import RADEC_ROLL_DEG, STAGES, numpy_linear, scene
 from hilstar.instruments.study.sweep import Load
+from hilstar.optics.sprites import pack_sprites
 from tests.support.commands import assert_refused, run_hilstar_here, run_started
 from tests.support.tables import csv_rows
 
@@ -252,3 +253,39 @@ def test_a_timed_tracker_is_freed_where_its_campaign_cannot_begin(monkeypatch):
         tracker.tracker_rows(1, 0.0)
     assert len(freed) == 1
     assert not freed[0].exists()
+
+
+def test_random_stars_end_with_the_last_that_is_wanted_in_view(bench_with):
+    """By any chance: as many in view as are wanted, the last of all among them, unit vectors."""
+    bench = bench_with()
+    camera, side_px = bench.camera, bench.psf.footprint_px
+    icrs_to_image = camera.cam_to_image @ to_matrix(Q)
+    for seed in range(12):
+        vectors = benchmark._directions(bench, Q, 5, np.random.default_rng(seed))
+        np.testing.assert_allclose(np.linalg.norm(vectors, axis=1), 1.0)
+        x_px, y_px = camera.project(vectors @ icrs_to_image.T)
+        width, height = camera.resolution_px
+        margin_px = side_px / 2 + 1
+        near = (x_px > -margin_px) & (x_px < width - 1 + margin_px)
+        near &= (y_px > -margin_px) & (y_px < height - 1 + margin_px)
+        # within a pixel of the edge of its sprite a star may be in view or not
+        assert near.sum() >= 5 and near[-1]
+        sure = (x_px > 0) & (x_px < width - 1) & (y_px > 0) & (y_px < height - 1)
+        assert sure.sum() <= 5
+
+
+def test_the_plain_loop_that_is_compiled_draws_the_same_stars(rng):
+    """On an image that is no square, with sigmas that differ, over its edges."""
+    x_px, y_px = rng.uniform(-3, 43, 30), rng.uniform(-3, 27, 30)
+    flux = rng.uniform(1, 9, 30)
+    sprites = pack_sprites(x_px, y_px, flux, np.arange(30), (40, 24), 9)
+    sigma_px = (0.7, 1.1)
+    wanted = numpy_linear(sprites, sigma_px, (24, 40))
+    image = np.zeros((24, 40))
+    first = sprites.data["pixel"] - 4
+    centre_px = np.stack([sprites.x_px, sprites.y_px])
+    scale = 1 / (np.array(sigma_px) * np.sqrt(2))
+    light = sprites.data["electrons_per_s"]
+    benchmark._add_stars(image, first, centre_px, light, scale, 9)
+    np.testing.assert_allclose(image, wanted, atol=1e-5)
+    assert wanted.sum() > 50

@@ -21,6 +21,7 @@ from hilstar.attitude.receiver import (
 )
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import (
+    AnswerPacket,
     AttitudeSample,
     Event,
     Packet,
@@ -252,3 +253,18 @@ def test_statuses_and_requests_go_to_the_sender_that_is_shown():
         assert kinds == [TimeRequest, Status]
         assert sent[name][1] == status(k)
     assert len(link.sent) == 1
+
+
+def test_answers_are_passed_on_in_their_order_and_each_once():
+    link = Wire()
+    back = BackChannel(link, Traffic())
+    answers = [
+        AnswerPacket(0, k, k, np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3), k) for k in range(3)
+    ]
+    for answer in answers[:2]:
+        back.pass_on(answer)
+    back.talk(NOW_NS, ask=False)
+    assert link.sent == answers[:2]
+    back.pass_on(answers[2])
+    back.talk(NOW_NS, ask=False)
+    assert link.sent == answers

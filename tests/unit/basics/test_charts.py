@@ -6,6 +6,7 @@ import itertools
 import math
 import re
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
@@ -95,3 +96,19 @@ def test_a_line_is_named_at_its_last_place_that_is_in_view(x, y, end):
     (name,) = axes.texts
     assert (name.get_text(), name.xy) == ("speed", end)
     assert name.xyann[1] == pytest.approx(end[1] / 10)
+
+
+def test_names_at_the_side_stand_in_the_order_of_their_lines():
+    """Three of five lines end nearly at one height: their names are moved apart, none past
+    another.
+    """
+    ends = {"e": 0.1, "b": 0.50, "a": 0.51, "d": 0.52, "c": 0.9}
+    with charts.panels_of("Five lines") as (axes,):
+        for name, end in ends.items():
+            axes.plot([0, 1], [0.5, end], label=name)
+        axes.set(xlim=(0, 1), ylim=(0, 1))
+        charts.label_ends(axes)
+    heights = {text.get_text(): text.xyann[1] for text in axes.texts}
+    assert sorted(heights, key=heights.__getitem__) == sorted(ends, key=ends.__getitem__)
+    assert (np.diff(sorted(heights.values())) > 0.01).all()
+    assert heights["e"] == pytest.approx(0.1)

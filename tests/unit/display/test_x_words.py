@@ -28,7 +28,10 @@ from hilstar.display.window.watch import is_foreign, shown_as
 from hilstar.display.window.x11 import (
     CLOCK,
     MAX_GAPS,
+    SERVER_GONE,
     SYNC_EXTENSION,
+    WINDOW_GONE,
+    Survival,
     SwapStamps,
     SyncControl,
     back_buffer,
@@ -172,6 +175,39 @@ def test_a_ramp_is_every_step_of_red_then_of_green_then_of_blue():
 )
 def test_errors_of_windows_drawables_and_extensions_are_the_windows_end(code, ends):
     assert is_end_of_window(code) is ends
+
+
+def test_an_x_error_ends_the_run_unless_its_connection_says_nothing_of_the_window(monkeypatch):
+    handlers = []
+
+    def take(handler):
+        handlers.append(handler)
+
+    # Xlib calls what these two are given: once for a lost server, and once for each error
+    library = SimpleNamespace(
+        XSetIOErrorHandler=take,
+        XSetErrorHandler=take,
+    )
+    monkeypatch.setattr(ctypes, "CDLL", lambda name: library)
+    ends: list[str] = []
+    survival = Survival(ends.append)
+    window, outputs = 0x10, 0x20
+    survival.cover(window)
+    survival.cover(outputs, decides=False)
+    lost_server, error = handlers
+    event_kind = error._argtypes_[1]._type_
+
+    def fail(connection: int, code: int) -> None:
+        error(connection, ctypes.pointer(event_kind(error=code)))
+
+    bad_value, bad_window = 2, 3  # X.h
+    fail(outputs, bad_window)
+    fail(window, bad_value)
+    assert ends == []
+    fail(window, bad_window)
+    assert ends == [WINDOW_GONE]
+    lost_server(window)
+    assert ends == [WINDOW_GONE, SERVER_GONE]
 
 
 # VESA DMT 1.13, CEA-861 (1080i), and xorg's 320 x 240 of double scan: size, dot clock in Hz, a

@@ -121,3 +121,15 @@ def test_bodies_that_move_in_the_arrays_are_looked_for_in_every_frame(dense_sky)
         kept = make_sprites(bodies, turn, camera, FOOTPRINT, candidates)
         assert_same_light(kept, make_sprites(bodies, turn, camera, FOOTPRINT))
         assert (len(dense_sky) in kept.star) == (x < 0.1)
+
+
+def test_half_a_turn_about_any_axis_is_looked_at_anew(rng):
+    """Of two attitudes half a turn apart the chord is 1, which rounding passes in one of six."""
+    stars = stars_at(rng.normal(size=(50, 3)), np.ones(50))
+    camera, candidates = camera_of(12.0), Candidates()
+    q = IDENTITY
+    for _ in range(60):
+        axis = rng.normal(size=3)
+        q = propagate(q, axis / np.linalg.norm(axis), np.pi)
+        kept = make_sprites(stars, to_matrix(q), camera, FOOTPRINT, candidates)
+        assert_same_light(kept, make_sprites(stars, to_matrix(q), camera, FOOTPRINT))

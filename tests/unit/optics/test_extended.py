@@ -113,3 +113,28 @@ def test_a_glow_falls_by_its_angle_from_its_direction_also_from_beside_the_image
         along = image[39:41].mean(axis=0)
         wanted = 5e3 * (1 + (away_rad / scale_rad) ** 2) ** (-exponent / 2)
         assert along == pytest.approx(wanted, rel=HALF_A_PIXEL)
+
+
+@pytest.mark.parametrize("down", [1, -1])
+@pytest.mark.parametrize("axis", [0, 1], ids=["along rows", "along columns"])
+def test_a_small_disc_that_moves_with_the_rows_has_the_light_of_those_it_meets_and_hides_all(
+    axis, down
+):
+    """It crosses 3 % of the lines that light up meanwhile: with them it is lit in 1 / 0.97 of them,
+    against them in 1 / 1.03. Its middle hides what is behind as a whole: the Sun may be there.
+    """
+    px_s, share = 150.0, 0.03
+    rate = np.zeros(3)
+    # a turn about y takes what is seen to the left, one about x down
+    rate[1 - axis] = (-1 if axis == 0 else 1) * px_s / CAMERA.focal_length_px
+    s_per_px = [0.0, 0.0]
+    s_per_px[axis] = down * share / px_s
+    shear = Shear(rate, tuple(s_per_px), MIDDLE_PX)
+    disc = uniform_disc(MIDDLE_PX, 5.0).of_rate(1e6)
+    (light,) = disc_lights(disc, DiscView(CAMERA, PSF, (Pose(np.eye(3)),), shear), covers=True)
+    assert isinstance(light, LightMap)
+    assert light.image.sum(dtype=float) == pytest.approx(1e6 / (1 - down * share), rel=2e-3)
+    y, x = np.indices(light.cover.shape)
+    off_px = np.hypot(x + light.corner_px[0] - MIDDLE_PX[0], y + light.corner_px[1] - MIDDLE_PX[1])
+    assert (light.cover[off_px < 1.5] == 1).all()
+    assert light.cover.sum() == pytest.approx(np.pi * 25 / (1 - down * share), rel=0.01)

@@ -37,3 +37,11 @@ def test_a_quaternion_that_is_not_of_length_one_is_refused(tmp_path, q):
 
 def test_a_file_of_another_monitor_is_refused(tmp_path):
     assert "640 x 480" in refusal(load_geometry, geometry_file(tmp_path), (640, 481))
+
+
+def test_a_file_that_was_written_again_is_read_again(tmp_path):
+    """One path, two texts: what was parsed before is of the first alone."""
+    first = load_geometry(geometry_file(tmp_path), SIZE)
+    again = load_geometry(geometry_file(tmp_path, "max_field_deg = 5.0"), SIZE)
+    assert first.lens.max_tangent == math.inf
+    assert again.lens.max_tangent == pytest.approx(math.tan(math.radians(5.0)))

@@ -70,8 +70,9 @@ WIDE = Camera((90, 60), 400.0, (40.0, 33.5), MOUNTED)
 TURN = np.radians((1.5, -2.0, 6.0))
 # radius^2 / 2 of the focal length by perspective, and a quadrature's share of the path
 SAME_PLACE_PX = 0.05
-# A star that falls by a share of the rows meanwhile is lit until its own is written again.
-ROW_SHARE = 0.03
+# A star and a disc that fall by a share s of the rows meanwhile are lit until theirs are written
+# again, 1 / (1 - s): s is up to 0.03 here, and known to its square.
+ROW_SHARE = 2e-3
 ROWS = [(0, 1), (0, -1), (1, 0), (-1, 0)]
 
 

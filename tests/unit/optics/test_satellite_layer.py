@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from hilstar.basics.rotation import from_rotation_vector, propagate, to_matrix
 from hilstar.display.render.reference import extended_image, linear_image
 from hilstar.optics.camera import Camera
-from hilstar.optics.layers.layers import light_of, seen_in, sky_layers
+from hilstar.optics.layers.layers import Sources, light_of, seen_in, sky_layers
 from hilstar.optics.layers.satellites import SatelliteLayer
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import GaussianPsf
@@ -140,6 +140,12 @@ def test_satellites_fainter_than_the_faintest_are_neither_drawn_nor_written():
     assert len(one.light(view, 0.99 * rate)[0])
     light, _ = one.light(view, 1.01 * rate)
     assert len(light) == 0
+    # as a bench builds its layers
+    canvas = Canvas(CAMERA, PSF)
+    for share, is_drawn in ((0.99, True), (1.01, False)):
+        stars = seen_in(view, one.stars, one.sky)
+        layers = sky_layers(canvas, Sources(one.sky), share * rate, paths=False)
+        assert (3 in light_of(canvas, layers, stars, view).star) is is_drawn
     away = View.exposure(looking_at(-one.direction(0.0)), RATE, 0.05, one.t_ns)
     assert len(one.light(away)[0]) == 0
 

@@ -390,7 +390,7 @@ class WatchedLock:
         self.is_held = False
 
 
-def test_samples_are_added_under_a_lock():
+def test_samples_are_added_dropped_and_read_under_a_lock():
     """One thread adds times and samples, to two lists, while another reads both."""
     lock = WatchedLock()
 
@@ -399,9 +399,19 @@ def test_samples_are_added_under_a_lock():
             assert lock.is_held
             super().append(item)
 
-    timeline = Timeline(Policy(S, S))
+        def __getitem__(self, place):
+            # the thread that adds may look at its own newest sample
+            assert lock.is_held or place == -1
+            return super().__getitem__(place)
+
+        def __delitem__(self, place):
+            assert lock.is_held
+            super().__delitem__(place)
+
+    capacity = 4
+    timeline = Timeline(Policy(S, S), capacity)
     timeline._lock, timeline._t_ns, timeline._samples = lock, Guarded(), Guarded()
-    for t_ns in (0, S):
-        timeline.add(AttitudeSample(t_ns, np.array([1.0, 0.0, 0.0, 0.0])))
-    assert timeline.at(S // 2) is not None
-    assert len(timeline) == 2
+    for number in range(2 * capacity + 1):
+        timeline.add(AttitudeSample(number * S, np.array([1.0, 0.0, 0.0, 0.0])))
+    assert timeline.at(2 * capacity * S - S // 2) is not None
+    assert len(timeline) == capacity + 1

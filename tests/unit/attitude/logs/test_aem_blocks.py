@@ -107,6 +107,14 @@ def which_at(samples, second):
         # taken.
         ([([30, 50], {}), ([0, 20, 40], {})], {29: 1, 31: 0, 49: 0}),
         ([([0, 20], {}), ([0, 20], {})], {1: 1, 19: 1}),
+        # USEABLE times beside all of a segment's own: it is useable nowhere.
+        ([([0, 20, 40], useable(50, 59)), ([25, 45], {})], {24: 0, 26: 1, 44: 1}),
+        ([([0, 20, 40], {}), ([25, 45], useable(0, 10))], {24: 0, 26: 0, 39: 0, 41: 1}),
+        # The first goes on behind one that lies within it, until a third begins.
+        (
+            [([0, 20, 40], {}), ([10, 15], {}), ([30, 50], {})],
+            {9: 0, 12: 1, 16: 0, 29: 0, 31: 2, 49: 2},
+        ),
         # One attitude alone has no duration, and is left out within another segment.
         ([([0, 20], {}), ([10], {})], {9: 0, 11: 0}),
     ],
@@ -123,7 +131,7 @@ def test_segments_that_overlap_are_read_by_their_useable_times_then_the_later_on
     for second, number in wanted.items():
         assert which_at(log.samples, second) == pytest.approx(number, abs=1e-9), (second, number)
     [notice] = [line for kind, line in log.told if kind == "aem-overlap"]
-    assert "2 segments overlap" in notice and "USEABLE" in notice
+    assert f"{len(segments)} segments overlap" in notice and "USEABLE" in notice
     changes = sum(before != after for before, after in pairwise(wanted.values()))
     assert sum(sample.discontinuity for sample in log.samples) == changes
 

@@ -22,7 +22,14 @@ from hilstar.attitude.wire.packet import (
     decode,
     encode,
 )
-from hilstar.attitude.wire.zmq_links import FedDecoder, Feed, ZmqLockstep, ZmqReceiver
+from hilstar.attitude.wire.zmq_links import (
+    MAX_SUBSCRIPTION_BYTES,
+    FedDecoder,
+    Feed,
+    ZmqLockstep,
+    ZmqReceiver,
+    ZmqSender,
+)
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import wait_for
 
@@ -130,3 +137,27 @@ def test_a_feed_hands_on_what_is_no_attitude_as_it_came(tmp_path: Path) -> None:
         wait_for(is_here, "what the feed hands on")
     assert came[0].raw == b"nonsense"
     assert isinstance(came[0].event, Refusal)
+
+
+def test_a_subscription_is_short_and_who_sends_another_is_disconnected(tmp_path: Path) -> None:
+    """A subscriber's topic is all that a sender reads; a megabyte of it would fill its memory."""
+    endpoint = f"ipc://{tmp_path}/feed"
+    with ZmqSender(endpoint) as sender, zmq.Context() as context:
+        with context.socket(zmq.SUB) as usual:
+            usual.setsockopt(zmq.SUBSCRIBE, b"x" * (MAX_SUBSCRIPTION_BYTES // 2))
+            usual.connect(endpoint)
+            assert sender.wait_for_listener(LATE_MS / 1000)
+        with context.socket(zmq.SUB) as long:
+            long.linger = 0
+            monitor = long.get_monitor_socket(zmq.EVENT_DISCONNECTED)
+            monitor.setsockopt(zmq.RCVTIMEO, LATE_MS)
+            long.setsockopt(zmq.SUBSCRIBE, b"x" * (4 * MAX_SUBSCRIPTION_BYTES))
+            long.connect(endpoint)
+
+            def is_dropped() -> bool:
+                sender.put(b"")
+                return monitor.poll(SOON_MS) != 0
+
+            wait_for(is_dropped, "the end of the connection")
+            long.disable_monitor()
+            monitor.close()

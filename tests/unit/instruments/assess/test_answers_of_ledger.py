@@ -17,6 +17,7 @@ from hilstar.basics.rotation import to_rotation_vector
 from hilstar.instruments.assess import assessment
 from hilstar.instruments.assess.assessment import (
     CLOCK_SET,
+    AssessSettings,
     RunLedger,
     TimedAnswers,
     matched,
@@ -32,7 +33,7 @@ from hilstar.server.record.ledger_records import AnswerRecord
 from tests.support.assessments import a_budget, a_run, an_assessment
 from tests.support.benches import bench_text
 from tests.support.glass import SIDE_PX, stack
-from tests.support.planted_run import NS_PER_S, write_ledger, write_run
+from tests.support.planted_run import NS_PER_S, write_ledger, write_run, write_telemetry
 from tests.support.planted_tracker import Planted, Sizes, attitude, plant, scalar_first, scan
 
 FRAMES_S = np.arange(0.0, 10.0, 0.5)
@@ -270,3 +271,23 @@ def test_what_a_file_of_a_psf_costs_is_split_by_place_and_colour(tmp_path: Path)
     assert px["without_both"] < px["without_colour"] < px["total"]
     plain = bench_text({"tracker": tracker})
     assert glass_cost(bench_file_of(tmp_path / "bench.toml", plain), q) is None
+
+
+@pytest.mark.parametrize(
+    ("ahead_s", "overlap"),
+    [(0.0, True), (50.0, True), (-50.0, True), (70.0, False), (-70.0, False)],
+)
+def test_a_file_s_times_count_from_the_run_s_zero_where_they_meet_it(
+    short, tmp_path: Path, ahead_s: float, overlap: bool
+) -> None:
+    """A run of a minute, and answers from 0.3 s on; of an exposure's start, late by 0.25 s."""
+    run, planted, _ = short
+    path = write_telemetry(tmp_path / "t.csv", planted.tau_s, planted.reported, 5.0 + ahead_s)
+    settings = AssessSettings(stamp="start", latency_s=0.25)
+    timed = assessment._answers_of_file(run, path, settings)
+    assert timed.overlap is overlap
+    first_s = float(planted.tau_s[0]) + ahead_s
+    assert timed.base_s == pytest.approx(0.0 if overlap else first_s)
+    middle_s = run.config.tracker.exposure_s / 2 - 0.25
+    expected = planted.tau_s + ahead_s - timed.base_s + middle_s
+    assert timed.tau_s == pytest.approx(expected, abs=1e-6)

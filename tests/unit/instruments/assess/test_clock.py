@@ -10,11 +10,14 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess.clock import (
+    CUT_SIGMAS,
+    FLOOR_ARCSEC,
     ClockFit,
     ClockSolver,
     coarse_offset,
     honest,
     speed_offsets,
+    weights_of,
 )
 from hilstar.instruments.assess.components import global_phases
 from hilstar.server.record.commanded import Commanded
@@ -161,3 +164,17 @@ def test_the_phase_of_right_ascension_is_pixels_on_the_sky():
     first = phases["the phase of the first boresight"].place_px
     moved = np.linalg.norm(first - first[0], axis=1)
     assert moved == pytest.approx(np.arange(9.0), abs=0.01)
+
+
+def test_answers_weigh_by_tukey_s_biweight_of_their_own_scatter() -> None:
+    """Of residuals of -2 to 2 about x, four times that about y and none about z; one is far off."""
+    x = np.array([-2.0, -1.0, 0.0, 1.0, 2.0, 1e4])
+    residual = np.stack([x, 4 * x, np.zeros(6)], axis=1)
+    sigma, weight = weights_of(residual)
+    # the median is 0.5, and the deviations' 1.5
+    expected = 1.4826 * np.array([1.5, 6.0])
+    assert sigma[:2] == pytest.approx(expected, rel=1e-3)
+    assert sigma[2] == FLOOR_ARCSEC
+    squared = 2 * ((x - 0.5) / expected[0]) ** 2
+    assert weight[:5] == pytest.approx((1 - squared[:5] / CUT_SIGMAS**2) ** 2, rel=1e-3)
+    assert weight[5] == 0.0

@@ -6,8 +6,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
-from hilstar.instruments.assess.components import EDGES, _component, components_of
+from hilstar.instruments.assess.components import EDGES, LOCAL, _component, components_of
 from tests.support.claims import holds
 from tests.support.planted_tracker import SCALE, attitude, scalar_first, scan, star_px, waves
 
@@ -101,3 +102,35 @@ def test_the_noise_of_few_answers_has_the_freedom_that_is_left_by_the_fits() -> 
         error = np.random.default_rng(seed).normal(size=(len(true), 3))
         found.append(components_of(error, scalar_first(true), SCALE).noise_variance)
     assert np.mean(found) == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize("shape", [saws, steps])
+def test_jumps_within_a_pixel_are_found_of_a_thousand_answers(shape) -> None:
+    """Of three times the noise, which a thousand answers know to 2 %: within three of it."""
+    rng = np.random.default_rng(2)
+    true = attitude(scan, np.arange(0.0, 600.0, 0.6))
+    error = 3.0 * shape(star_px(true, true[0]))
+    found = components_of(error + rng.normal(size=error.shape), scalar_first(true), SCALE)
+    assert np.sqrt(found.pixel.variance) == pytest.approx([3.0] * 3, rel=0.06)
+    assert np.sqrt(found.noise_variance) == pytest.approx([1.0] * 3, rel=0.07)
+    assert found.pixel.detail.endswith(EDGES)
+
+
+def test_fields_on_two_sides_of_the_sky_have_phases_of_their_own() -> None:
+    """No direction is before both; what is found, what repeats over the field and the rest make up
+    the whole.
+    """
+    rng = np.random.default_rng(2)
+    t_s = np.arange(0.0, 600.0, 0.5)
+    here = attitude(scan, t_s)
+    ra_deg, dec_deg, roll_deg = scan(t_s)
+    there = attitude(lambda t: (ra_deg + 180, dec_deg + 10, roll_deg), t_s)
+    places = np.concatenate([star_px(here, here[0]), star_px(there, there[len(t_s) // 2])])
+    error = 2.0 * waves(places)
+    both = Rotation.concatenate([here, there])
+    found = components_of(error + rng.normal(size=error.shape), scalar_first(both), SCALE)
+    assert found.pixel.detail.startswith(LOCAL)
+    assert (found.pixel.variance > 0.3).all()
+    whole = found.pixel.variance + found.fov.variance + found.noise_variance
+    # 2400 answers know a variance to 3 %, and errors that noise adds to by chance to as much
+    assert whole == pytest.approx((error**2).mean(axis=0) + 1, rel=0.1)

@@ -8,11 +8,13 @@ import itertools
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
+from hilstar.basics.errors import InputError
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.geometric.dots import (
     DOT_PX,
@@ -38,7 +40,7 @@ from hilstar.instruments.calibrate.geometric.match import (
     mapped,
     refuse_motion,
 )
-from hilstar.instruments.calibrate.geometric.observed import Observed
+from hilstar.instruments.calibrate.geometric.observed import Observed, numbered
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from tests.support.benches import bench_text
@@ -334,3 +336,17 @@ def test_dots_closer_than_a_link_are_not_taken_for_one(rng):
     assert found.dot.tolist() == list(range(30))
     np.testing.assert_allclose(found.x_px, 2 * x + 30, atol=0.2)
     np.testing.assert_allclose(found.y_px, 2 * y - 10, atol=0.2)
+
+
+def test_images_are_known_by_the_last_number_of_their_names_and_their_folder_s_pose():
+    paths = [Path(name) for name in ("a/x2_003.png", "pose_2/7.png", "POSE1/f12b.png", "f0.png")]
+    found = numbered(paths)
+    assert found == dict(zip(((3, 0), (7, 2), (12, 1), (0, 0)), paths, strict=True))
+    assert numbered([Path("1000000.png")]) == {(10**6, 0): Path("1000000.png")}
+    for names, why in (
+        (["dark.png"], "dark.png: its name has no frame number"),
+        (["1000001.png"], "no frame number"),
+        (["a/3.png", "b/03.png"], "b/03.png: is frame 3 of pose 0, and so is a/3.png"),
+    ):
+        with pytest.raises(InputError, match=re.escape(why)):
+            numbered([Path(name) for name in names])

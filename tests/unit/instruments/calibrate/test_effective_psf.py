@@ -328,3 +328,20 @@ def test_a_spline_follows_light_beside_the_gaussian_where_it_is_over_the_noise(n
     across_px = dots.offsets[0]
     middle_px = (beside.sum(axis=1) * across_px).sum(axis=1) / beside.sum(axis=(1, 2))
     assert middle_px == pytest.approx(np.full(len(x_px), 2.0), abs=0.1)
+
+
+def test_errors_of_dots_that_are_held_out_are_beside_their_brightest_pixels():
+    """Of a model that is 1.3 px^2 wide before dots of 1: by its share of a pixel and theirs."""
+    image, x_px, y_px = field_of_dots()
+    dots = dots_of_image(image, x_px, y_px, 0.0)
+    dots = replace(dots, variance=np.full_like(dots.images, 9.0))
+    covariance = np.tile([1.3, 1.3, 0.0], (len(x_px), 1))
+    held = _held_out(effective([[1.3, 1.3, 0.0]]), dots, covariance, np.arange(len(x_px)) % 4, 0)
+    _, shares, amplitudes = _placed(effective([[1.3, 1.3, 0.0]]), dots)
+    flux, background = amplitudes.T[:, :, None, None]
+    off = dots.images - background - flux * shares
+    brightest = (flux * shares).max(axis=(1, 2))
+    np.testing.assert_allclose(held.chi2, (off**2).mean(axis=(1, 2)) / 9, rtol=0.02)
+    rms = np.sqrt(np.mean((off**2).mean(axis=(1, 2)) / brightest**2))
+    assert held.rms == pytest.approx(rms, rel=0.01)
+    assert held.noise == pytest.approx(3 * np.sqrt(np.mean(brightest**-2.0)), rel=0.01)

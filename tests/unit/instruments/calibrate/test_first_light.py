@@ -14,6 +14,8 @@ from scipy.special import ndtr
 
 from hilstar.basics.errors import InputError
 from hilstar.display.geometry import monitor_camera
+from hilstar.display.window import window as windows
+from hilstar.instruments.calibrate.first_light import image_sources
 from hilstar.instruments.calibrate.first_light import session as sessions
 from hilstar.instruments.calibrate.first_light.context import KeyChange, StepOutcome, rewrite
 from hilstar.instruments.calibrate.first_light.focus import sharpness
@@ -32,6 +34,7 @@ from hilstar.instruments.calibrate.first_light.image_sources import (
     ImageSource,
     NoImage,
     Pattern,
+    PatternDisplay,
     black,
     off_screen,
     on_screen,
@@ -187,6 +190,47 @@ def test_sharpness_is_the_sigma_of_the_psf(sigma_px):
         )
         image += 30_000 * np.outer(down, across)
     holds("first-light-psf", abs(sharpness(image, side).psf_sigma_px - sigma_px))
+
+
+class RecordedWindow:
+    """A window that lists itself as the open one, and leaves the list when it is closed."""
+
+    opened: list[RecordedWindow]
+
+    def __init__(self, settings: windows.WindowSettings) -> None:
+        self.settings = settings
+        self.opened.append(self)
+
+    def make_current(self) -> None:
+        """Nothing is drawn."""
+
+    def close(self) -> None:
+        self.opened.remove(self)
+
+
+def test_patterns_have_a_window_of_their_own_screen_s_size_and_keep_it_while_that_stays(
+    tmp_path, monkeypatch
+):
+    monkeypatch.setattr(windows, "Window", RecordedWindow)
+    # other tests of this process draw on: no window takes their context's place
+    monkeypatch.setattr(image_sources, "leave_contexts", lambda: None)
+    RecordedWindow.opened = []
+    screens = [
+        ({}, (320, 240)),
+        ({"rotate_deg": 180}, (320, 240)),
+        ({"rotate_deg": 90}, (240, 320)),
+        ({"resolution_px": [640, 480]}, (640, 480)),
+    ]
+    with PatternDisplay() as shown:
+        window_of_size: dict[tuple[int, int], RecordedWindow] = {}
+        for keys, size_px in screens:
+            path = tmp_path / "bench.toml"
+            path.write_text(bench_text({"monitor": keys}))
+            window = shown._window_for(read_bench_file(path))
+            assert window is window_of_size.setdefault(size_px, window)
+            assert RecordedWindow.opened == [window]
+            assert window.settings.resolution_px == size_px
+    assert RecordedWindow.opened == []
 
 
 def grabbed(tmp_path, command):

@@ -311,6 +311,16 @@ def test_a_trend_is_over_the_whole_range_and_has_its_error():
     assert error == pytest.approx(0.01 / np.sqrt(200) * np.sqrt(12), rel=0.2)
 
 
+def test_a_trend_s_error_is_that_of_its_stars_weights(rng):
+    """Half the stars a thousandth as sure as the others, whose light scatters alike."""
+    along = rng.uniform(4, 6, 400)
+    sigma = np.where(np.arange(400) % 2, 0.01, 10.0)
+    off = 0.1 * along + rng.normal(0, 0.01, 400)
+    found, error = trend(10**along, off, 1 / sigma)
+    assert found == pytest.approx(0.1 * np.ptp(along), abs=4 * error)
+    assert error == pytest.approx(0.01 / np.sqrt(200) * np.sqrt(12), rel=0.25)
+
+
 def on_the_twin(tmp_path, step, bench, truth, patches=72):
     """What a step comes to on a bench that is truly another."""
     (tmp_path / "bench.toml").write_text(bench_text(TWIN, bench))

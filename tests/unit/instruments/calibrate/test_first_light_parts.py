@@ -13,6 +13,7 @@ from scipy import stats
 from scipy.special import ndtr
 
 from hilstar.display.calibration import weights_of_grid
+from hilstar.instruments.calibrate.first_light.context import FittedFigure
 from hilstar.instruments.calibrate.first_light.seen_stars import (
     StarSpot,
     _explained,
@@ -296,3 +297,17 @@ def test_places_are_off_by_their_distance_in_pixels_and_in_arcsec():
     p95 = stats.rayleigh.ppf(0.95)
     assert figures["star_beyond_noise_p95_px"] == pytest.approx(0.5 * p95, rel=1e-4)
     assert figures["star_beyond_noise_max_px"] == pytest.approx(0.9 * p95, rel=1e-4)
+
+
+@pytest.mark.parametrize(("low", "high"), [(-4.0, 10.0), (2.0, 5.0)])
+def test_a_figure_is_at_an_end_within_a_thousandth_of_that(low, high):
+    for value, is_at_end in (
+        (low, True),
+        (low + 0.9e-3 * abs(low), True),
+        (low + 1.1e-3 * abs(low), False),
+        ((low + high) / 2, False),
+        (high - 1.1e-3 * high, False),
+        (high - 0.9e-3 * high, True),
+        (high, True),
+    ):
+        assert FittedFigure("power", value, low, high).is_at_end == is_at_end

@@ -12,8 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import monitor_camera
+from hilstar.instruments.calibrate.geometric import geometry_fit
 from hilstar.instruments.calibrate.geometric.dots import DotPlan, plan_dots, read_plan, write_plan
 from hilstar.instruments.calibrate.geometric.fit import Nominal
 from hilstar.instruments.calibrate.geometric.geometry_fit import (
@@ -175,9 +177,15 @@ def test_of_one_pose_the_file_holds_both_lenses_only_where_the_tracker_s_is_not_
     found = calibrate_geometry(
         plan, nominal, observed_dots(BENCH, plan, tracker, rng), rng, tracker_known=True
     )
-    (note,) = (line for line in lines_of(found) if line.startswith("one pose"))
+    lines = lines_of(found)
+    (note,) = (line for line in lines if line.startswith("one pose"))
     assert ("this file holds both" in note) == (lens is None)
     assert ("holds the collimator alone" in note) == (lens is not None)
+    error, chosen = found.uncertainty, found.chosen
+    for name, each in (("a star's place", error), ("held-out dots", chosen)):
+        (line,) = (line for line in lines if line.startswith(name))
+        assert f"{each.rms_arcsec:.3f} arcsec rms, {each.max_arcsec:.3f} max" in line
+        assert each.max_arcsec > each.rms_arcsec
 
 
 def test_the_codes_alone_name_every_dot(rng):
@@ -331,3 +339,24 @@ def test_an_order_of_frames_is_undone_by_its_cure(order, number_of):
     """`number_of` says under which number the plan's frame comes."""
     frames = np.arange(20)
     assert np.array_equal(ORDERS[order](number_of(frames), 20), frames)
+
+
+@pytest.mark.parametrize("step", ["rough", "without S-curves", "whole"])
+def test_eleven_dots_are_too_few_for_each_step_of_a_fit(step, tmp_path, rng):
+    plan = plan_of(*FEW[:2])
+    seen = observed_dots(BENCH, plan, TRACKER, rng, 0.02)
+    known = decode(plan, seen)
+    kept = np.linspace(0, len(known.dot) - 1, 11).astype(int)
+    x_px, y_px = known.x_px[kept], known.y_px[kept]
+    off_px = np.hypot(seen.x_px[:, None] - x_px, seen.y_px[:, None] - y_px).min(axis=1)
+    few = seen.at(np.flatnonzero(off_px < 1.0))
+    with pytest.raises(InputError, match="11 dots were recognised and 12 are needed"):
+        if step == "whole":
+            calibrate_geometry(plan, nominal_of(BENCH), few, rng, tracker_known=True)
+        elif step == "rough":
+            file = bench_file_of(tmp_path / "bench.toml", bench_text())
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(geometry_fit, "nominal_of", lambda file: nominal_of(BENCH))
+                geometry_fit.rough_geometry(file, plan, few)
+        else:
+            geometry_fit.without_s_curves(plan, nominal_of(BENCH), few, 1.0)

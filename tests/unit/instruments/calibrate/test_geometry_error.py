@@ -236,3 +236,29 @@ def test_scatter_of_dots_is_of_their_means_in_sigmas_of_these(rng):
     assert geometric_fit._scatter_of_dots(site, off.ravel(), 0) == pytest.approx(5**0.5, rel=0.05)
     few = geometric_fit._scatter_of_dots(site, off.ravel(), 6000)
     assert few == pytest.approx((5 * 8000 / 2000) ** 0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("degree", [0, 3])
+def test_slopes_of_a_fit_of_three_poses_are_what_a_step_of_each_number_moves(tmp_path, degree):
+    problem, data = dots_of(*tilted_screen(tmp_path), 3, 0.01)
+    seen = data.centroids
+    pose = np.arange(len(seen)) % 3
+    three = dataclasses.replace(seen, pose=pose)
+    aligned = np.tile([1.0, 0.0, 0.0, 0.0], (3, 1))
+    problem = dataclasses.replace(problem, q_poses=aligned)
+    model = Model(BROWN_CONRADY, tuple(geometric_fit.TRACKER_STEPS), 3)
+    loss = geometric_fit._Loss(problem, model, degree, MatchedDots(three, data.dot))
+    numbers = np.zeros(model.size + (degree and (degree + 1) * (degree + 2)))
+    slopes = loss.slopes(numbers, loss.residuals(numbers))
+    assert slopes.shape == (2 * len(seen), len(numbers))
+    first_pose = len(model.names) + len(model.tracker_names)
+    for number in range(len(numbers)):
+        step = np.zeros(len(numbers))
+        step[number] = 1e-3
+        moved = (loss.residuals(step) - loss.residuals(-step)) / 2e-3
+        scale = np.abs(moved).max()
+        np.testing.assert_allclose(slopes[:, number], moved, atol=0.02 * scale)
+        if first_pose <= number < model.size:
+            # a pose turns its own centroids alone
+            its = np.tile(pose == 1 + (number - first_pose) // 3, 2)
+            assert scale > 0 and not slopes[~its, number].any()

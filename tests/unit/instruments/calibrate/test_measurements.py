@@ -93,3 +93,13 @@ def test_what_repeats_scatter_is_beyond_their_stated_errors(tmp_path, rng):
         quiet.append(",".join((code, channel, value, repr(10 * float(sigma)))))
     over = read_measurements(table_of(tmp_path, "\n".join([rows[0], *quiet]) + "\n"))
     assert group_levels(over, "w").relative_noise == 0.0
+
+
+def test_stated_errors_are_taken_from_what_two_repeats_scatter(tmp_path):
+    """Each code read twice, 2 % apart, by 1 % of stated error: one degree of freedom each."""
+    rows = ["code,channel,value,sigma", *["0,w,0.001,0.00001"] * 2]
+    for code in range(20, 260, 20):
+        for off in (-0.01, 0.01):
+            rows.append(f"{min(code, 255)},w,{code * (1 + off)!r},{0.01 * code!r}")
+    measured = read_measurements(table_of(tmp_path, "\n".join(rows) + "\n"))
+    assert group_levels(measured, "w").relative_noise == pytest.approx(0.01)

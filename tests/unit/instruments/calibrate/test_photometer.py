@@ -226,6 +226,23 @@ def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
 
 
+def test_a_cause_that_scales_all_light_alike_leaves_each_level_as_well_known(tmp_path):
+    """Light is relative to white, of which such a cause takes the same share."""
+    codes = np.arange(0, 256, 15)
+    light = gamma_response(BITS, POWER).light[codes]
+    level_errors = []
+    for name, share in (("alone", 0.0), ("scaled", 0.01)):
+        rows = [
+            (code, "w", one, 1e-3 * one + 1e-9, share * one)
+            for code, one in zip(codes.tolist(), light.tolist(), strict=True)
+        ]
+        path = write_readings(tmp_path / f"{name}.csv", rows, "code,channel,value,sigma,common_1")
+        level_errors.append(fit_channel(read_measurements(path), "w").level_error)
+    alone, scaled = level_errors
+    # a share of 0.01 beside the levels' 0.001 would make them ten times as large
+    np.testing.assert_allclose(scaled, alone, rtol=0.05)
+
+
 def test_levels_that_no_smooth_curve_meets_have_larger_errors(tmp_path):
     """Stated errors of 0.01 % and a scatter of 0.5 %: the errors grow by what the levels are
     off.

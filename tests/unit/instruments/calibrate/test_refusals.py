@@ -79,6 +79,7 @@ MEASUREMENTS = [
     (f"{HEAD},exposure_s\n1,w,2,0\n", "exposure_s = 0"),
     (f"{HEAD},t_s\n1,w,2,\n2,w,2,1\n", "t_s is empty in some rows"),
     (f"{HEAD}\n1,r,2\n", "only channel r"),
+    (f"{HEAD}\n1,w,2\n1,r,2\n", "measure w alone, or all of r, g and b"),
     (readings_text(ramp([0, 300])), "white, code 1023 of 10 bits"),
     (readings_text(ramp(STEPS[1:])), "code 0 is not measured"),
     (readings_text(ramp(STEPS[:-1])), "white, code 255 of 8 bits, is not measured"),

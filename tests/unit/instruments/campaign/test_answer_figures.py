@@ -4,6 +4,7 @@ found, and intervals hold at their stated confidence.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -29,12 +30,14 @@ from hilstar.instruments.campaign.requirements import (
     judged_figure,
     verdicts_of,
 )
+from hilstar.instruments.campaign.star_motion import YEARS
 from tests.support.planted_answers import (
     CASES,
     FRAMES,
     SCALE,
     WILD_SIGMAS,
     answers,
+    old_places,
     reported_stars,
 )
 
@@ -342,3 +345,35 @@ def test_a_case_that_has_most_of_the_squares_is_named(rng: np.random.Generator) 
     squares = np.append(60.0, np.ones(79))
     figure = root_mean(squares, np.ones(80), np.repeat(np.arange(20), 4), 0.975, rng)
     assert "one case has 45% of the squares" in figure.method  # 63 of 139
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_old_places_are_told_by_their_age_at_the_date_and_by_what_is_left_of_their_motion(
+    sign: float, rng: np.random.Generator
+) -> None:
+    """Of stars that follow a third of their motion, 12 years old at the bench's date; or of a
+    parallax of which a half is left.
+    """
+    planted = {"proper_motion": sign * 0.3, "age": 12.0}
+    cases = old_places(rng, **planted)
+    motion = figure_verdict(cases, "proper-motion", maximum=1.0)
+    age = figure_verdict(cases, "catalogue-age", maximum=100.0)
+    assert_found(motion, 0.3)
+    assert_found(age, 12.0)
+    assert_found(figure_verdict(old_places(rng, parallax=sign * 0.5), "parallax", maximum=1.0), 0.5)
+
+
+def assert_found(verdict: RequirementVerdict, value: float) -> None:
+    """Within four standard errors, which are small: a term's size has no sign."""
+    assert verdict.value is not None and verdict.low is not None and verdict.high is not None
+    sigma = (verdict.high - verdict.low) / (2 * stats.norm.isf(1 - COVERED))
+    assert abs(verdict.value - value) < 4 * sigma < 0.2 * value
+
+
+def test_places_of_one_date_tell_no_motion(rng: np.random.Generator) -> None:
+    cases = old_places(rng, age=12.0)
+    numbers = cases.numbers | {YEARS: np.full(cases.cases, 3.0)}
+    one_date = dataclasses.replace(cases, numbers=numbers)
+    verdict = figure_verdict(one_date, "proper-motion", maximum=1.0)
+    assert (verdict.value, verdict.method) == (None, "cases at several dates tell it")
+    assert figure_verdict(one_date, "catalogue-age", maximum=100.0).value is not None

@@ -188,3 +188,16 @@ def test_without_check_cases_there_are_the_cases_alone_and_renderers_stand_toget
     assert changes == len(set(renderers)) - 1 > 0
     for renderer, number, _ in turns:
         assert renderer == f"[{order.case(number).values[key]}]"
+
+
+def test_cases_of_one_scenario_stand_together(tmp_path: Path) -> None:
+    (tmp_path / "dark.toml").write_text(
+        '[[fault]]\nname = "dark"\nkind = "blank"\nat_s = 0.5\nfor_s = 0.5\n'
+    )
+    order = order_of(tmp_path, {"key": "scenario", "values": ["", "dark.toml"]})
+    renderers = [renderer for renderer, _, _ in order.turns()]
+    assert len(set(renderers)) == 2
+    changes = sum(renderers[k] != renderers[k - 1] for k in range(1, CASES))
+    assert changes == 1
+    for renderer, number, _ in order.turns():
+        assert ("dark.toml" in renderer) == ("dark.toml" in str(order.case(number).values))

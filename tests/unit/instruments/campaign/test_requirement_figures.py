@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from scipy import stats
 
 from hilstar.instruments.assess.bounded_figures import (
+    TooFewCases,
     clopper_pearson,
     drawn_limits,
     quantile_limits,
     sigma_limits,
 )
+from hilstar.instruments.assess.budget import Decomposed
+from hilstar.instruments.assess.components import Component
 from hilstar.instruments.assess.places import Scale
+from hilstar.instruments.campaign import requirements
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.plan import Require
 from hilstar.instruments.campaign.requirements import (
@@ -25,6 +30,7 @@ from hilstar.instruments.campaign.requirements import (
     _bias,
     verdicts_of,
 )
+from tests.support.assessments import a_budget
 
 SCALE = Scale(2000.0, (1024, 1024))
 FRAMES = 10
@@ -173,3 +179,83 @@ def test_a_verdict_s_words_say_the_limit_the_figure_and_what_would_decide():
     open_ = found(cases, "availability", minimum=0.83)
     assert open_.verdict == NOT_SHOWN
     assert f"about {open_.more} more cases would decide" in open_.words
+
+
+def parts_of(rng: np.random.Generator, count: int = 400) -> Decomposed:
+    """A budget of so many answers: noise of 2 and 3 arcsec across and 10 about, a wave of 4 about y
+    that took 20 numbers, and no pixel error.
+    """
+    found = a_budget()
+    left = np.array([2.0, 3.0, 10.0]) * rng.standard_normal((count, 3))
+    wave = np.zeros((count, 3))
+    wave[:, 1] = 4 * math.sqrt(2) * np.sin(np.arange(count))
+    components = replace(
+        found.components,
+        mean=np.array([1.0, -7.0, 30.0]),
+        left=left,
+        noise_variance=np.array([4.0, 9.0, 100.0]),
+        fov=Component(np.array([0.0, 16.0, 0.0]), wave, 20.0),
+        pixel=Component(np.zeros(3), np.zeros((count, 3)), 0.0),
+    )
+    return replace(found, components=components, row=np.arange(count))
+
+
+def figure_of(parts: Decomposed, quantity: str, axes: list[int], **keys: object):
+    require = Require(quantity=quantity, maximum=1.0, **keys)  # type: ignore[arg-type]
+    return requirements._of_parts(parts, axes, require, np.random.default_rng(1))
+
+
+def test_parts_of_a_budget_are_the_figures_that_requirements_limit(rng):
+    """Of 400 answers of which 21 numbers are taken; the wave's power is over both axes."""
+    parts = parts_of(rng)
+    left = parts.components.left
+    spread = math.sqrt(400 / 379)
+    for axes in ([0, 1], [1], [2]):
+        noise = figure_of(parts, "noise", axes)
+        assert noise.value == pytest.approx(spread * math.sqrt((left[:, axes] ** 2).mean()))
+        ends = np.sqrt(379 * len(axes) / stats.chi2.isf([0.05, 0.95], 379 * len(axes)))
+        assert (noise.low, noise.high) == pytest.approx(tuple(noise.value * ends), rel=0.02)
+    fov = figure_of(parts, "fov-error", [0, 1])
+    assert fov.value == pytest.approx(math.sqrt(8.0))
+    assert 0.8 * fov.value < fov.low < fov.value < fov.high < 1.2 * fov.value
+    bias = figure_of(parts, "bias", [0, 1])
+    total = left + parts.components.fov.fitted
+    upper = stats.t.ppf(0.95, 399) * total[:, :2].std(axis=0, ddof=1) / 20
+    assert bias.value == 7.0
+    assert bias.high == pytest.approx(7.0 + upper[1])
+    assert figure_of(parts, "bias", [2]).value == 30.0
+
+
+def test_a_share_of_noise_is_its_quantile_and_of_a_part_that_of_its_own_shape(rng):
+    parts = parts_of(rng)
+    sizes = math.sqrt(400 / 379) * np.abs(parts.components.left[:, [0, 1]]).ravel()
+    noise = figure_of(parts, "noise", [0, 1], share=0.9)
+    assert noise.value == pytest.approx(np.quantile(sizes, 0.9), rel=0.02)
+    fov = figure_of(parts, "fov-error", [1], share=0.9)
+    # a wave is within sqrt(2) sin(0.9 pi / 2) sigmas for 90 % of its time
+    assert fov.value == pytest.approx(4 * math.sqrt(2) * math.sin(0.45 * math.pi), rel=0.02)
+
+
+def test_a_part_that_was_not_found_may_be_what_its_search_would_have_missed(rng):
+    parts = parts_of(rng)
+    pixel = figure_of(parts, "pixel-error", [0, 1])
+    assert (pixel.value, pixel.low) == (0.0, 0.0)
+    assert 0 < pixel.high < 2.0
+    assert pixel.method == "what the search for it would have missed"
+    fewer = figure_of(parts_of(rng, 100), "pixel-error", [0, 1])
+    assert fewer.high == pytest.approx(2 * pixel.high, rel=0.01)
+    missing = replace(parts.components.pixel, reason="no motion")
+    still = replace(parts, components=replace(parts.components, pixel=missing))
+    with pytest.raises(TooFewCases, match="no motion"):
+        figure_of(still, "pixel-error", [0, 1])
+
+
+def test_noise_with_tails_has_the_limits_of_a_bootstrap(rng):
+    parts = parts_of(rng)
+    wild = parts.components.left * (1 + 9 * (rng.random((400, 1)) < 0.05))
+    tailed = replace(parts, components=replace(parts.components, left=wild))
+    noise = figure_of(tailed, "noise", [0, 1])
+    assert noise.method == "bootstrap, not Gaussian"
+    gaussian = figure_of(parts, "noise", [0, 1])
+    assert noise.high / noise.low > 2 * gaussian.high / gaussian.low - 1
+    assert noise.low < noise.value < noise.high

@@ -240,6 +240,33 @@ def test_a_limit_is_narrowed_by_what_the_bench_itself_could_have_made(axis, high
     assert found.margin == pytest.approx(10.0 - (3.0 if axis == "cross" else 7.0) - high)
 
 
+@pytest.mark.parametrize(
+    ("axis", "low", "wanted"),
+    [("cross", 12.9, NOT_SHOWN), ("cross", 13.1, NOT_MET), ("roll", 16.9, NOT_SHOWN)],
+)
+def test_what_the_bench_itself_could_have_made_is_not_held_against_the_tracker(axis, low, wanted):
+    """Over a limit of 10 arcsec 3 across the boresight may be the bench's, and 7 about it."""
+    require = Require(quantity="bias", axis=axis, maximum=10.0)
+    figure = BoundedFigure(18.0, low, 20.0, 50, "planted")
+    assert judged_figure(require, figure, (3.0, 7.0)).verdict == wanted
+
+
+@pytest.mark.parametrize(
+    ("low_s", "high_s", "wanted"),
+    [
+        (0.1, 0.5, MET),
+        (0.1, 0.7, NOT_SHOWN),
+        (1.3, 1.9, NOT_SHOWN),
+        (1.5, 1.9, NOT_MET),
+    ],
+)
+def test_the_benchs_own_time_guards_a_time_s_limit_on_both_sides(low_s, high_s, wanted):
+    """Of a limit of 1 s 0.4 s are the bench's."""
+    require = Require(quantity="time-bias", maximum=1.0)
+    figure = BoundedFigure((low_s + high_s) / 2, low_s, high_s, 50, "planted")
+    assert judged_figure(require, figure, bench_s=0.4).verdict == wanted
+
+
 def test_the_benchs_guard_takes_off_the_margin_of_a_maximum_and_of_a_minimum():
     most = Require(quantity="bias", maximum=10.0)
     least = Require(quantity="availability", minimum=0.9)

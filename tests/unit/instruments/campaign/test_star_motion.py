@@ -126,3 +126,16 @@ def test_a_field_turns_by_the_mean_parallax_of_its_stars(
     assert (turns * means).sum() / (means**2).sum() == pytest.approx(1.0, abs=NEAR_EDGE)
     assert np.corrcoef(turns.ravel(), means.ravel())[0, 1] > 1 - NEAR_EDGE
     holds("parallax-turn", math.sqrt((turns**2).sum(axis=1).mean()))
+
+
+def test_a_field_s_stars_are_those_within_half_of_each_side_of_the_detector() -> None:
+    """A detector of 800 x 500 px and 1000 px of focal length: tangents of 0.4 and 0.25."""
+    tangents = np.array([[0.39, 0.24], [-0.39, -0.24], [0.41, 0.0], [0.0, 0.26], [-0.41, 0.1]])
+    ahead = np.column_stack([tangents, np.ones(len(tangents))])
+    vectors = np.concatenate([ahead, -ahead[:1]])
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    zeros = np.zeros(len(vectors))
+    q = from_radec_roll_deg(40.0, 20.0, 70.0)
+    stars = StarMotion(2026.0, vectors @ to_matrix(q), np.zeros_like(vectors), zeros)
+    assert stars.in_field(q, Scale(1000.0, (800, 500))).tolist() == [0, 1]
+    assert stars.in_field(q, Scale(1000.0, (500, 800))).tolist() == [3]

@@ -97,3 +97,18 @@ def test_a_star_is_kept_where_half_of_the_bright_ones_are_reported() -> None:
 
 def test_a_level_without_a_case_that_counts_does_not_pass() -> None:
     assert not LevelCount(1.0, 0, 0).passed
+
+
+def test_a_case_is_a_success_where_half_of_its_frames_are_right() -> None:
+    """Wrong attitudes are none; a case without a frame is no success."""
+    frames = np.array([4.0, 4.0, 4.0, 5.0, 0.0, np.nan, 4.0])
+    solved = np.array([2.0, 1.0, 4.0, 2.0, 0.0, np.nan, np.nan])
+    wrong = np.array([0.0, 0.0, 3.0, 0.0, 0.0, np.nan, 0.0])
+    numbers = {"frames": frames, "solved": solved, "wrong": wrong}
+    count = counted(2.5, Columns(len(frames), numbers, {}))
+    assert (count.level, count.successes, count.cases) == (2.5, 1, 7)
+    assert [LevelCount(1.0, *pair).passed for pair in ((2, 4), (1, 4), (0, 0))] == [
+        True,
+        False,
+        False,
+    ]

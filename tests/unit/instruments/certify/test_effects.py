@@ -365,3 +365,34 @@ def test_places_in_a_square_are_even_over_its_pixels(square):
     steps = math.isqrt(len(x_px))
     assert x_px.var() == pytest.approx(side**2 / 12 * (1 - 1 / steps**2), rel=1e-9)
     assert (x_px @ y_px) / len(x_px) == pytest.approx(x_px.mean() * y_px.mean())
+
+
+def test_fields_of_a_light_map_are_each_off_by_themselves_and_stars_share_them(tmp_path):
+    """Three fields along and two down, each known to 2 %: a star has what linear weights give it of
+    the four about it, which go on beyond the outermost.
+    """
+    table = "".join(f"{code},{(code / 255) ** 2.2!r}\n" for code in range(256))
+    (tmp_path / "light.csv").write_text("code,w\n" + table)
+    (tmp_path / "even.csv").write_text("1.0,0.98,0.9\n0.97,1.0,0.95\n")
+    (tmp_path / "light.toml").write_text(
+        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\n'
+        'bits = 8\nresponse = "light.csv"\n[uniformity]\nfile = "even.csv"\nrelative = 0.02\n'
+    )
+    file = bench(tmp_path, calibration="light.toml")
+    value = Deviations(
+        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
+    )
+    even = by_name(list(of_files(file, figures_of(file), value, [])))["evenness"]
+    columns = (np.arange(3) + 0.5) * WIDTH_PX / 3 - 0.5
+    rows = (np.arange(2) + 0.5) * HEIGHT_PX / 2 - 0.5
+    weights = np.zeros((COUNT, 6))
+    for field in range(6):
+        unit = np.zeros(6)
+        unit[field] = 1.0
+        map_of = RegularGridInterpolator(
+            (rows, columns), unit.reshape(2, 3), bounds_error=False, fill_value=None
+        )
+        weights[:, field] = [map_of((y, x)).item() for x, y in PLACES]
+    covariance = even.even.T @ even.even
+    assert covariance == pytest.approx(0.02**2 * weights @ weights.T)
+    assert even.input.standard == 0.02

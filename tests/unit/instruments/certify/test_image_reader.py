@@ -12,6 +12,7 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
+from hilstar.instruments.certify import readings
 from hilstar.instruments.certify.readings import ImageReader, dot_places, geometry_of
 from hilstar.server.bench.bench_file import read_bench_file
 
@@ -110,7 +111,13 @@ def test_a_photodiode_sees_the_true_delay(reader: ImageReader) -> None:
     assert delays_ms.mean() == pytest.approx(TRUE_DELAY_MS, abs=0.1)
 
 
-def test_dots_that_stand_elsewhere_are_refused(reader: ImageReader) -> None:
+def test_too_few_dots_and_those_that_stand_elsewhere_are_refused(
+    reader: ImageReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
     x_px, y_px = dot_places(geometry_of(reader.file))
-    with pytest.raises(InputError, match=r"^\d+ dots are (in the image|where the bench file)"):
+    with pytest.raises(InputError, match=r"^20 dots are in the image and 60 are needed"):
         reader.dots(x_px[:20], y_px[:20], 1)
+    # none is within a millionth of a pixel
+    monkeypatch.setattr(readings, "APART_TRACKER_PX", 2e-6)
+    with pytest.raises(InputError, match=r"^0 dots are where the bench file has them"):
+        reader.dots(x_px, y_px, 1)

@@ -16,6 +16,7 @@ from hilstar.instruments.confront.camera_fit import (
     CameraFit,
     Places,
     Pointing,
+    _with_zenith,
     fit_camera,
     refracted,
     with_values,
@@ -242,3 +243,24 @@ def test_a_trail_has_the_name_of_a_satellite_within_its_length_and_two_tenths_of
     # 4 px and 0.2 deg of 1000 px, 3.5 px
     assert explained(source=trail, satellites={"ISS": (42.0, 12.0)}) == "ISS, 8 px long"
     assert explained(source=trail, satellites={"ISS": (43.0, 12.0)}) == "a trail, 8 px long"
+
+
+@pytest.mark.parametrize("tangents", [(1.2, 0.7), (-0.4, 1.5), (0.9, -1.1)])
+def test_a_zenith_is_told_by_how_the_air_squeezes_a_field(rng, tangents):
+    """Directions are drawn towards the zenith by 58.3 arcsec times the tangent of their distance
+    from it; of its sign a wide field tells what is of third order.
+    """
+    zenith = np.append(tangents, 1.0) / np.linalg.norm([*tangents, 1.0])
+    across = rng.uniform([-0.4, -0.3], [0.4, 0.3], (200, 2))
+    cam = np.column_stack([across, np.ones(len(across))])
+    cam /= np.linalg.norm(cam, axis=1, keepdims=True)
+    bent = cam + 58.3 * ARCSEC * (zenith / (cam @ zenith)[:, None] - cam)
+    camera = Camera(SIZE_PX, FOCAL_PX, CENTRE_PX, np.eye(3))
+    x_px, y_px = (np.array(CENTRE_PX) + FOCAL_PX * bent[:, :2] / bent[:, 2:]).T
+    turn = rotation_of(*POINTINGS_DEG[0])
+    places = Places(x_px, y_px, np.full(len(x_px), 1e-4), cam @ turn)
+    found = _with_zenith(camera, Pointing(from_matrix(turn)), places, 1e-4)
+    assert found.zenith == pytest.approx(tangents, rel=0.03, abs=0.03)
+    # the attitude is that without air
+    error = to_matrix(found.q_icrs_to_cam) @ turn.T
+    assert np.abs(error - np.eye(3)).max() < 3 * ARCSEC

@@ -14,7 +14,13 @@ from scipy.special import ndtr
 
 from hilstar.instruments.confront.excess import Part, _by_law, _rest, _taken
 from hilstar.instruments.confront.judge import StarRow, defects, light_at
-from hilstar.instruments.confront.light import LightFit, StarLight, fit_light, with_extinction
+from hilstar.instruments.confront.light import (
+    MEAN_BV_MAG,
+    LightFit,
+    StarLight,
+    fit_light,
+    with_extinction,
+)
 from hilstar.instruments.confront.session import _apart, _middles, within_image
 from hilstar.instruments.confront.star_psf import (
     HALF,
@@ -312,3 +318,22 @@ def test_where_stars_stand_still_a_hot_pixel_shares_nothing_in_any_photograph():
     for photographs in ([star, alone], [alone, star]):
         assert not defects(photographs, have_moved=False)[0].any()
     assert defects([alone, alone], have_moved=False)[0][4, 4]
+
+
+def test_planes_of_a_mosaic_have_a_colour_each(rng):
+    """Red stars are brighter to red by 0.2 mag a mag of B-V, and fainter to blue by 0.3; green is
+    the tracker's own.
+    """
+    planes = (1, 2, 3)
+    colours_mag = np.array([-0.2, 0.0, 0.3])
+    stars = stars_of(rng, OFFSETS_MAG, (0.0, 0.0))
+    bv_mag = rng.uniform(-0.2, 1.6, len(stars.v_mag))
+    about_mean = bv_mag - MEAN_BV_MAG
+    plane = np.array(planes)[stars.image]
+    dn = stars.dn * 10 ** (-0.4 * colours_mag[stars.image] * about_mean)
+    stars = replace(stars, bv_mag=bv_mag, plane=plane, dn=dn, sigma_dn=1e-3 * dn)
+    fit = fit_light(stars, 3, lambda correction: stars.v_mag)
+    assert fit.colours == pytest.approx(colours_mag, abs=2 * LIGHT_ERROR_MAG)
+    expected = dict(zip("rgb", colours_mag.tolist(), strict=True))
+    assert fit.colour_terms == pytest.approx(expected, abs=2 * LIGHT_ERROR_MAG)
+    assert fit.offsets_mag == pytest.approx(OFFSETS_MAG, abs=LIGHT_ERROR_MAG)

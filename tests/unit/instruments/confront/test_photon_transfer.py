@@ -10,6 +10,7 @@ import pytest
 from hilstar.instruments.confront.background import FixedPattern, fixed_pattern, sky_level
 from hilstar.instruments.confront.photon_transfer import (
     _median_error,
+    fit_pedestal,
     fit_pixels,
     transfer_points,
 )
@@ -200,3 +201,47 @@ def test_a_fixed_pattern_s_words_have_each_part_in_its_unit():
     assert pattern.words() == (
         "response of pixels 1 +- 0.005 %, offsets of pixels 12 +- 0.1 DN, of columns under 2 DN"
     )
+
+
+PEDESTAL_DN = 100.0
+
+
+def skies(factors, slopes) -> tuple[list[np.ndarray], np.ndarray]:
+    """One shade over the image, darker at its corners, times each sky's light and slope, above a
+    pedestal; and the places of its blocks.
+    """
+    x, y = (part.ravel() / 12 - 0.5 for part in np.meshgrid(np.arange(13), np.arange(13)))
+    shade = 300 * (1 - 0.5 * (x**2 + 0.6 * y**2))
+    levels = []
+    for factor, (along, down) in zip(factors, slopes, strict=True):
+        levels.append(PEDESTAL_DN + factor * shade * np.exp(along * x + down * y))
+    return levels, np.column_stack([x, y])
+
+
+def test_skies_of_one_shade_tell_the_level_without_light():
+    factors = (1.0, 2.5, 4.0)
+    found = fit_pedestal(*skies(factors, ((0.1, -0.2), (-0.15, 0.05), (0.0, 0.1))))
+    assert found is not None
+    level_dn, sigma_dn = found
+    assert level_dn == pytest.approx(PEDESTAL_DN, abs=0.5)
+    # a hundredth of the darkest sky where photographs without one agree
+    assert sigma_dn == pytest.approx(0.01 * 400, rel=0.3)
+    two = fit_pedestal(*skies(factors[:2], ((0.1, -0.2), (-0.15, 0.05))))
+    assert two is not None
+    assert two == pytest.approx((PEDESTAL_DN, PEDESTAL_DN / 2), abs=0.5)
+
+
+def test_skies_that_are_alike_or_single_tell_none():
+    assert fit_pedestal(*skies((1.0, 1.1), ((0.1, 0.0), (0.0, 0.1)))) is None
+    assert fit_pedestal(*skies((1.0,), ((0.1, 0.0),))) is None
+
+
+def test_a_background_without_a_free_part_has_the_bench_file_s_detector():
+    bench = DetectorSettings(gain_e_per_dn=3.0, read_noise_e=12.0, offset_dn=40.0)
+    nothing = FixedPattern((0.0,) * 4, (0.0,) * 4)
+    for pedestal, offset_dn in ((None, 40.0), ((55.0, 1.0), 55.0)):
+        found = fit_pixels(np.empty((0, 2)), 1.0, pedestal, bench, nothing)
+        assert (found.gain_e_per_dn, found.read_noise_e) == (3.0, 12.0)
+        assert found.pedestal_dn == offset_dn
+        assert "no part of the background is free of sources" in found.notes[0]
+        assert not found.gain_told

@@ -17,7 +17,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.reading import parse_toml
 from hilstar.instruments.confront import session as sessions
 from hilstar.instruments.confront.background import FixedPattern
-from hilstar.instruments.confront.images import Photograph
+from hilstar.instruments.confront.images import Photograph, _planes
 from hilstar.instruments.confront.light import LightFit
 from hilstar.instruments.confront.measured_bench import (
     PER_PX,
@@ -31,6 +31,7 @@ from hilstar.instruments.confront.measured_bench import (
     vignetting_of,
 )
 from hilstar.instruments.confront.photon_transfer import PixelFit
+from hilstar.instruments.confront.run import _base
 from hilstar.instruments.confront.session import (
     PIVOT_NM,
     WIDE_PX,
@@ -40,6 +41,7 @@ from hilstar.instruments.confront.session import (
     _middles,
     _reach_px,
     _seen_at,
+    _star_light,
     _why_not,
     check_focus,
     corrected,
@@ -350,3 +352,54 @@ def test_stars_are_first_seen_at_their_sources():
     assert places.x_px.tolist() == [2.0, 3.0]
     assert places.y_px.tolist() == [20.0, 30.0]
     np.testing.assert_array_equal(places.vectors, np.eye(3)[[2, 0]])
+
+
+def test_a_camera_is_guessed_of_the_photographs_own_size(tmp_path) -> None:
+    """The bench file's where they have its pixels; of a mosaic's planes half as long in pixels."""
+    file = bench(tmp_path)
+    whole = _base(file, [photograph(np.zeros((600, 800)))])
+    assert whole.focal_length_px == pytest.approx(4000.0)
+    assert whole.principal_point_px == (399.5, 299.5)
+    half = _base(file, [photograph(np.zeros((300, 400)))] * 2)
+    assert half.resolution_px == (400, 300)
+    assert half.focal_length_px == pytest.approx(2000.0)
+    assert half.principal_point_px == (199.5, 149.5)
+    with pytest.raises(InputError, match="have different sizes"):
+        _base(file, [photograph(np.zeros((300, 400))), photograph(np.zeros((400, 300)))])
+
+
+def test_planes_of_a_mosaic_are_every_second_pixel_by_their_letters() -> None:
+    dn = np.arange(24.0).reshape(4, 6)
+    planes = {plane.plane: plane.dn for plane in _planes(photograph(dn), "GRBG")}
+    assert list(planes) == ["g1", "r", "b", "g2"]
+    assert planes["g1"].tolist() == [[0, 2, 4], [12, 14, 16]]
+    assert planes["r"].tolist() == [[1, 3, 5], [13, 15, 17]]
+    assert planes["b"].tolist() == [[6, 8, 10], [18, 20, 22]]
+    assert planes["g2"].tolist() == [[7, 9, 11], [19, 21, 23]]
+
+
+def test_stars_of_all_photographs_are_in_one_row_each_with_its_image_and_plane() -> None:
+    """Of a mosaic's red and second green planes, and of an image of one plane."""
+    shots = []
+    for number, plane in enumerate(("r", "g2", "")):
+        star = np.array([number, 2])
+        found = SimpleNamespace(
+            dn=np.array([10.0, 20.0]) + number,
+            sigma_dn=np.array([1.0, 2.0]) + number,
+            x_px=np.array([410.0, 410.0 + 300 * number]),
+            y_px=np.array([290.0, 690.0]),
+        )
+        sky = SimpleNamespace(v_mag=np.array([1.0, 2.0, 3.0]), bv_mag=np.array([0.1, 0.2, 0.3]))
+        photo = SimpleNamespace(plane=plane)
+        clean = np.array([True, number == 1])
+        shots.append(SimpleNamespace(found=found, sky=sky, photo=photo, star=star, clean=clean))
+    light = _star_light(shots, CAMERA)  # type: ignore[arg-type]
+    assert light.image.tolist() == [0, 0, 1, 1, 2, 2]
+    assert light.plane.tolist() == [1, 1, 2, 2, 0, 0]
+    assert light.dn.tolist() == [10.0, 20.0, 11.0, 21.0, 12.0, 22.0]
+    assert light.sigma_dn.tolist() == [1.0, 2.0, 2.0, 3.0, 3.0, 4.0]
+    assert light.v_mag.tolist() == [1.0, 3.0, 2.0, 3.0, 3.0, 3.0]
+    assert light.bv_mag.tolist() == [0.1, 0.3, 0.2, 0.3, 0.3, 0.3]
+    assert light.clean.tolist() == [True, False, True, True, True, False]
+    # half of the diagonal of 800 x 600 px is 500 px
+    assert light.radius2 == pytest.approx([0.0, 0.64, 0.0, 1.0, 0.0, 2.08])

@@ -5,7 +5,7 @@ another renderer planted is what the camera, the prediction and the tables say.
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,9 +14,11 @@ from PIL import Image
 
 from hilstar.attitude.logs.earth import q_icrs_to_enu
 from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import conjugate, rotate, to_matrix
 from hilstar.instruments.confront import page
 from hilstar.instruments.confront import run as confront_run
+from hilstar.instruments.confront import session as sessions
 from hilstar.instruments.confront.judge import Verdict
 from hilstar.instruments.confront.page import Pictures
 from hilstar.instruments.confront.report import Confronted
@@ -246,3 +248,21 @@ def test_the_page_and_the_tracker_file_are_written_beside_the_tables(night: Nigh
         assert shot.photo.path.name in text
     assert json.loads(json.dumps(night.found.figures)) == night.found.figures
     assert any(line.startswith("lens: ") for line in night.found.lines)
+
+
+def test_a_photograph_with_an_attitude_is_taken_though_its_corners_are_dark(
+    night: Night, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sessions, "is_round", lambda dn: True)
+    session = night.session
+    photo = session.shots[0].photo
+    shot = sessions.open_shot(session.file, photo, session.camera.camera, None)
+    first = session.camera.pointings[0].boresight
+    # before the principal point, 6.5 px beside the middle, is fitted
+    assert shot.pointing.boresight @ first > np.cos(np.radians(0.3))
+    blank = replace(photo, dn=np.full_like(photo.dn, 500.0) + np.arange(WIDTH) % 2)
+    with pytest.raises(InputError, match="an all-sky lens"):
+        sessions.open_shot(session.file, blank, session.camera.camera, None)
+    monkeypatch.setattr(sessions, "is_round", lambda dn: False)
+    with pytest.raises(InputError, match="0 sources stand out of its noise"):
+        sessions.open_shot(session.file, blank, session.camera.camera, None)

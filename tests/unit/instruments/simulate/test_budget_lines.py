@@ -14,9 +14,13 @@ from hilstar.instruments.simulate.budget import (
     NotDrawn,
     budget_lines,
     out_of_gamut,
+    red_shares,
 )
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.star_rates import bench_optics
 from hilstar.server.bench.star_size import StarSize
 from hilstar.tracker.centroiders import FAMILY
+from tests.support.benches import SMALL_BENCH
 
 STAR = StarSize(1.0, 0.5, 1.5, 2.0, 1.25, 13.5, 4.5, None)
 
@@ -140,3 +144,18 @@ def test_stars_out_of_gamut_are_those_that_are_not_in_it() -> None:
     assert out_of_gamut(Bench()) == pytest.approx(0.75)  # type: ignore[arg-type]
     Bench.colours = None
     assert out_of_gamut(Bench()) is None  # type: ignore[arg-type]
+
+
+def test_shares_of_red_light_fall_with_the_wavelength_and_rise_with_redder_stars(tmp_path) -> None:
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    file = read_bench_file(path)
+    optics = bench_optics(file.config.tracker, tmp_path)
+    rows = red_shares({"one": optics}, [650.0, 800.0])
+    assert [(row["channel"], row["from_nm"]) for row in rows] == [("all", 650.0), ("all", 800.0)]
+    near, far = (row["by_class"] for row in rows)
+    assert all(0 < far[kind] < near[kind] < 1 for kind in near)
+    assert list(near.values()) == sorted(near.values())
+    two = red_shares({"a": optics, "b": optics}, [650.0])
+    assert [row["channel"] for row in two] == ["all", "a", "b"]
+    assert two[1]["by_class"] == pytest.approx(near)

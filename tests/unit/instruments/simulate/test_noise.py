@@ -562,6 +562,9 @@ def test_a_field_s_budget_is_of_its_own_stars_in_the_light_behind_each(tmp_path,
     assert found.fields == 1
     assert found.found_stars == pytest.approx(sum(row["detection"] for row in found.stars))
     assert found.identified_share == 1.0
+    assert found.nea_arcsec["limit"]["across"] == found.nea[-1]["limit_across_arcsec"]
+    assert found.nea_arcsec["limit"]["about"] == found.nea[-1]["limit_about_arcsec"]
+    assert len(found.nea) > 2
     # the magnitude of which half are found
     below = [row for row in found.rows if row["detection"] > 0.5]
     above = [row for row in found.rows if row["detection"] < 0.5]

@@ -257,3 +257,16 @@ def test_a_lens_is_the_same_in_every_encoding(encoding):
 @pytest.mark.parametrize("words", ["CIR", "CIR 0", "CIR -2"])
 def test_an_aperture_without_a_size_is_refused(words):
     assert "has no size; write its half-width" in refusal(read_codev, seq(more={1: [words]}))
+
+
+def test_a_field_s_pupil_is_cut_by_what_is_above_and_below_along_each_axis():
+    """VU and VL are the parts cut off at the upper and the lower edge, of the half width: what
+    is left is narrower by half of both, and its middle is moved away from the larger.
+    """
+    lens = read_codev(
+        seq("XAN 0 0", "YAN 0 1", "VUX 0.0 0.2", "VLX 0.0 0.1", "VUY 0.0 0.3", "VLY 0.0 0.5")
+    )
+    axis, edge = lens.fields
+    assert (*axis.compression, *axis.shift) == (0, 0, 0, 0)
+    assert edge.compression == pytest.approx((0.15, 0.4))
+    assert edge.shift == pytest.approx((-0.05, 0.1))

@@ -42,6 +42,25 @@ def test_every_format_of_a_detector_gives_its_dn_back(bits):
         np.testing.assert_array_equal(values.reshape(dn.shape), expected)
 
 
+# EMVA's list of PFNC values; the packed ones are GigE Vision's
+PFNC = {
+    "Mono8": 0x01080001,
+    "Mono10": 0x01100003,
+    "Mono10Packed": 0x010C0004,
+    "Mono12": 0x01100005,
+    "Mono12Packed": 0x010C0006,
+    "Mono14": 0x01100025,
+    "Mono16": 0x01100007,
+}
+
+
+def test_a_pixel_format_s_number_is_the_convention_s_and_has_the_bits_that_a_pixel_takes():
+    numbers = {name: form.number for name, form in PIXEL_FORMATS.items()}
+    assert numbers == PFNC
+    for form in PIXEL_FORMATS.values():
+        assert form.number >> 16 & 0xFF == form.stored_bits
+
+
 def test_an_odd_number_of_packed_pixels_takes_whole_bytes():
     dn = RNG.integers(0, 4096, (3, 5), dtype=np.uint16)
     camera = CameraSettings(5, 3, 12, 0.1, 1.0, pixel_format="Mono12Packed")

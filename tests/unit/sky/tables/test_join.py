@@ -92,6 +92,7 @@ def test_a_star_off_its_place_is_the_same_where_its_magnitude_is():
     [
         ({"dec_deg": 0.01}, "Hipparcos has 0% at their place"),
         ({"v_mag": 0.05}, "its V differs by +0.050 mag"),
+        ({"v_mag": -0.05}, "its V differs by -0.050 mag"),
     ],
 )
 def test_an_overlap_that_does_not_fit_is_said(change, words):

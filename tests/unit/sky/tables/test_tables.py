@@ -146,6 +146,16 @@ def test_units_are_the_table_s(tmp_path):
     assert catalog.vi_mag[order] == pytest.approx([0.6, np.nan], nan_ok=True)
 
 
+def test_a_known_name_goes_before_a_name_with_a_unit_in_whatever_order_they_stand(tmp_path):
+    names = ("ra", "ra_hours", "dec", "vmag", "b-v")
+    values = dict(zip(names, (90.0, 3.0, 10.0, 5.0, 0.5), strict=True))
+    for order in (names, names[::-1]):
+        path = tmp_path / f"{order[0]}.csv"
+        row = [str(values[name]) for name in order]
+        path.write_text(f"{','.join(order)}\n{','.join(row)}\n")
+        assert read_stars(path).ra_deg.tolist() == [90.0]
+
+
 def test_stars_of_hipparcos_in_its_own_columns_are_hipparcos(tmp_path):
     packaged = load_catalog().brighter_than(2.0)
     table = Table(
@@ -347,3 +357,19 @@ def test_a_table_s_own_errors_stand_in_the_place_of_hipparcos(tmp_path):
     gaia_table().write(plain)
     assert table_facts(TableChoice(plain), stars, before) is before
     assert table_facts(TableChoice(), stars, before) is before
+
+
+def test_a_star_without_a_colour_has_both_its_magnitudes_from_the_next_columns(tmp_path):
+    """V alone gives no spectrum: Gaia's magnitudes then give V and colour together, as for a star
+    that has no V at all. A star with V and B-V keeps them, whatever Gaia says.
+    """
+    head = "ra_deg,dec_deg,vmag,b-v,g_mag,bp_rp\n"
+    rows = ["10,20,4.0,0.3,9.0,1.5", "30,40,4.0,,7.0,1.1", "50,60,,,7.0,1.1", "70,80,,0.2,7.0,1.1"]
+    (tmp_path / "both.csv").write_text(head + "\n".join(rows) + "\n")
+    stars = read_stars(tmp_path / "both.csv")
+    order = np.argsort(stars.ra_deg)
+    v_mag, bv_mag = stars.v_mag[order], stars.bv_mag[order]
+    assert (v_mag[0], bv_mag[0]) == pytest.approx((4.0, 0.3))
+    assert v_mag[1] != pytest.approx(4.0, abs=0.5)
+    assert v_mag[1:] == pytest.approx(np.full(3, v_mag[2]))
+    assert bv_mag[1:] == pytest.approx(np.full(3, bv_mag[2]))

@@ -18,9 +18,11 @@ from hilstar.attitude.logs.earth import (
 )
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
+from hilstar.attitude.logs.ros import named
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_radec_roll_deg
+from tests.support.refusals import refusal
 from tests.support.sources import ros_bags
 from tests.support.sources.ros_bags import START_NS
 from tests.support.sources.ros_poses import (
@@ -263,3 +265,26 @@ def test_a_simulated_clock_may_begin_at_zero(bag):
     log = open_log(bag(sent))
     assert [sample.t_ns for sample in log.samples] == [0, 10**8, 2 * 10**8]
     assert log.conventions.time == "header.stamp: seconds of a simulated clock"
+
+
+@pytest.mark.parametrize(
+    ("reference", "frame", "kind"),
+    [
+        (None, None, None),
+        ("map", "map", None),
+        ("icrs", None, "icrs"),
+        ("ICRS", None, "icrs"),
+        ("map=ICRS", "map", "icrs"),
+        ("map=icrs", "map", "icrs"),
+        ("a=b=Icrs", "a=b", "icrs"),
+        ("=icrs", None, "icrs"),
+    ],
+)
+def test_a_reference_names_a_frame_its_axes_or_both_in_any_case(reference, frame, kind):
+    assert named(reference) == (frame, kind)
+
+
+@pytest.mark.parametrize("reference", ["map=", "map=north", "icrs=map"])
+def test_axes_that_are_none_are_refused(reference):
+    line = refusal(named, reference)
+    assert line.startswith(f"--reference {reference}: the axes of ")

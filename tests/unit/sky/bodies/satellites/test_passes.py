@@ -240,3 +240,35 @@ def test_an_observer_whose_state_comes_with_the_frame_sees_the_same(rng):
     )
     # none behind the Earth
     assert len(satellite_sky(text, Geocentre()).passing(EVERYWHERE, 777 * S_NS)) > len(ours)
+
+
+def test_a_satellite_that_meets_the_observer_is_in_the_cone_that_it_flies_into():
+    """On the observer's own orbit the other way round, 15 km/s: 28 s before they pass each other it
+    is ahead, and within the half minute of an exposure behind.
+    """
+    other_way = element_set(9, (180 - 51.6416, 247.4627 - 180, 30.0, 100.0), 0.0006, 15.72)
+    sky = satellite_sky("MET\n" + other_way)
+    every = Cone(np.array([0.0, 0.0, 1.0]), np.pi, 0.0)
+    half_s = 30
+
+    def seen_km(second: float) -> np.ndarray | None:
+        seen = sky.passing(every, round(second * 1e9))
+        return None if seen is None else seen.seen_km[0, 0]
+
+    def range_km(second: float) -> float:
+        seen = seen_km(second)
+        return np.inf if seen is None else float(np.linalg.norm(seen))
+
+    near_s = min(range(0, 6000, 20), key=range_km)
+    meets_s = min(range(near_s - 20, near_s + 21), key=range_km)
+    assert range_km(meets_s) < 100
+    before = seen_km(meets_s - 28)
+    after = seen_km(meets_s + 2)
+    assert np.linalg.norm(before) > 12 * 28
+    axis = after / np.linalg.norm(after)
+    assert before @ axis < 0  # it is still on the other side
+    cone = Cone(axis, 0.01, float(half_s))
+    # a search of its own, that has kept nothing
+    asked = satellite_sky("MET\n" + other_way).passing(cone, (meets_s - 28) * 10**9)
+    assert asked is not None
+    assert asked.index.tolist() == [0]

@@ -334,7 +334,7 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
     best = min((reach for reach, _ in cures), default=np.inf)
     cure = next((cure for reach, cure in cures if reach <= SIMPLER * best), "")
     is_clearly_better = spread > CLEARLY_RAD and CLEARLY * best < spread
-    if cure and (not agrees or out_of_view or is_clearly_better):
+    if cure and (not agrees or is_clearly_better):
         raise InputError(
             f"{pairs.source}: no one rotation leads from the commanded to the reported attitudes;"
             f" {cure}"
@@ -347,10 +347,12 @@ def refuse_conventions(pairs: Pairs, field_radius_rad: float) -> None:
         )
     if out_of_view:
         off_deg = np.degrees(_boresight_rad(rotation))
+        advice = "write them for cam axes (z boresight, x right, y down)"
+        if cure:
+            advice = f"{advice}, or {cure}"
         raise InputError(
             f"{pairs.source}: the z axis of the reported attitudes is {off_deg:.3g} degrees off the"
-            " boresight, and the screen would be out of view; write them for cam axes (z boresight,"
-            " x right, y down)"
+            f" boresight, and the screen would be out of view; {advice}"
         )
 
 

@@ -226,6 +226,20 @@ def test_what_no_rotation_explains_is_refused_with_its_cure(rng, change, words):
         assert word in line
 
 
+@pytest.mark.parametrize("axis", np.eye(3)[:2], ids=["x", "y"])
+@pytest.mark.parametrize("angle_deg", [12.0, -40.0, 90.0])
+@pytest.mark.parametrize("attitudes", [1, 40])
+def test_one_rotation_that_turns_the_screen_out_of_view_is_said_with_its_angle(
+    rng, axis, angle_deg, attitudes
+):
+    """Of one attitude, another convention may lead to it, too: that is no more than another cure."""
+    commanded = np.resize(commanded_of(rng, attitudes), (40, 4))
+    turned = multiply(from_rotation_vector(np.radians(angle_deg) * axis), commanded)
+    line = refusal(align, pairs_of(commanded, turned), CAMERA)
+    assert f"{abs(angle_deg):.3g} degrees off the boresight" in line
+    assert "no one rotation" not in line
+
+
 def test_telemetry_columns_are_named_in_the_cure(rng):
     commanded = commanded_of(rng, 10)
     pairs = pairs_of(commanded, conjugate(turned_by(rng, commanded)))

@@ -143,12 +143,18 @@ def test_each_part_of_the_uncertainty_adds_its_variance(
 def test_the_attitude_of_the_tracker_in_the_reference_has_no_negative_scalar(
     tmp_path: Path,
 ) -> None:
+    """Whatever the signs of its vector, and of what the bench file has."""
     file = aligned_bench(tmp_path)
-    flipped = (-Q_MON_TO_REFERENCE).tolist()
-    alignment = msgspec.structs.replace(file.config.alignment, q_mon_to_reference=tuple(flipped))
-    other = replace(file, config=msgspec.structs.replace(file.config, alignment=alignment))
-    wanted = multiply(Q_MON_TO_REFERENCE, Q_CAM_TO_MON)
-    for each in (file, other):
-        found = cube_to_boresight(each, None)
-        assert found is not None
-        assert found.q_tracker_to_reference == pytest.approx(tuple(wanted), abs=1e-12)
+    for mounting in (Q_MON_TO_REFERENCE, (0.8, -0.6, 0.0, 0.0), (0.1, 0.7, -0.1, 0.7)):
+        for sign in (1.0, -1.0):
+            q = sign * np.array(mounting)
+            alignment = msgspec.structs.replace(
+                file.config.alignment, q_mon_to_reference=tuple(q.tolist())
+            )
+            config = msgspec.structs.replace(file.config, alignment=alignment)
+            found = cube_to_boresight(replace(file, config=config), None)
+            assert found is not None
+            wanted = multiply(q, Q_CAM_TO_MON)
+            assert found.q_tracker_to_reference == pytest.approx(
+                tuple(wanted * np.sign(wanted[0])), abs=1e-12
+            )

@@ -181,7 +181,9 @@ def test_an_x_error_ends_the_run_unless_its_connection_says_nothing_of_the_windo
     handlers = []
 
     def take(handler):
+        """Xlib gives the handler that it had."""
         handlers.append(handler)
+        return f"before {len(handlers)}"
 
     # Xlib calls what these two are given: once for a lost server, and once for each error
     library = SimpleNamespace(
@@ -208,6 +210,8 @@ def test_an_x_error_ends_the_run_unless_its_connection_says_nothing_of_the_windo
     assert ends == [WINDOW_GONE]
     lost_server(window)
     assert ends == [WINDOW_GONE, SERVER_GONE]
+    survival.close()
+    assert handlers[2:] == ["before 1", "before 2"]
 
 
 # VESA DMT 1.13, CEA-861 (1080i), and xorg's 320 x 240 of double scan: size, dot clock in Hz, a

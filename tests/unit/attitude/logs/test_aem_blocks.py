@@ -143,6 +143,9 @@ def test_useable_times_of_segments_that_do_not_overlap_change_nothing(tmp_path):
     log = open_log(tmp_path / "log")
     assert len(log.samples) == 5
     assert "aem-overlap" not in dict(log.told)
+    # nor do two that share an epoch overlap
+    (tmp_path / "log").write_text(overlapping(([0, 20], {}), ([20, 40], {})))
+    assert "aem-overlap" not in dict(open_log(tmp_path / "log").told)
 
 
 def test_comments_may_stand_anywhere(tmp_path):

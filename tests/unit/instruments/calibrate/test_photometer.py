@@ -243,6 +243,27 @@ def test_a_cause_that_scales_all_light_alike_leaves_each_level_as_well_known(tmp
     np.testing.assert_allclose(scaled, alone, rtol=0.05)
 
 
+@pytest.mark.parametrize("black_sigma", [1e-9, 1e-4])
+def test_a_level_s_errors_are_its_own_the_black_s_and_the_share_that_it_has_in_the_fit(
+    tmp_path, black_sigma
+):
+    """Stated readings of a curve without scatter: the levels' shares in a linear fit sum to its
+    parameters.
+    """
+    relative = 1e-3
+    codes = np.arange(0, 256, 15)
+    light = gamma_response(BITS, POWER).light[codes]
+    sigma = np.where(codes > 0, relative * light, black_sigma)
+    rows = list(zip(codes.tolist(), ["w"] * len(codes), light + BLACK, sigma, strict=True))
+    path = write_readings(tmp_path / "m.csv", rows, "code,channel,value,sigma")
+    fit = fit_channel(read_measurements(path), "w")
+    np.testing.assert_allclose(
+        fit.level_error, np.hypot(relative, black_sigma / light[1:]), rtol=1e-3
+    )
+    share = 1 - (relative / fit.residual_error) ** 2
+    assert share.sum() == pytest.approx(fit.parameters, abs=1e-2)
+
+
 def test_levels_that_no_smooth_curve_meets_have_larger_errors(tmp_path):
     """Stated errors of 0.01 % and a scatter of 0.5 %: the errors grow by what the levels are
     off.
@@ -258,6 +279,9 @@ def test_levels_that_no_smooth_curve_meets_have_larger_errors(tmp_path):
     codes = np.arange(40, 255)
     off = fit.light[codes] / gamma_response(BITS, POWER).light[codes] - 1
     assert fit.lack_of_fit > 10
+    # means of two readings of 0.01 %, as far as levels are off the fit
+    alone = 1e-4 / math.sqrt(2)
+    np.testing.assert_allclose(fit.level_error, fit.lack_of_fit * alone, rtol=0.05)
     assert np.abs(off / fit.error[codes]).max() < SURE
 
 

@@ -94,6 +94,17 @@ def test_a_frame_its_truth_and_a_run_s_frame_have_the_same_satellite(tle_bench):
         )
 
 
+@pytest.mark.parametrize(("share", "is_drawn"), [(0.99, True), (1.01, False)])
+def test_a_run_s_frame_has_no_satellite_fainter_than_the_monitor_shows(tle_bench, share, is_drawn):
+    with load(tle_bench) as bench:
+        t_ns = AT_S * S_NS
+        name, place, rate = brightest(bench, t_ns)
+        view = bench.view(from_radec_roll_deg(*place, 20.0), None, t_ns)
+        of_monitor = replace(bench, faintest_shown_e_per_s=share * rate)
+        drawn = np.unique(of_monitor.light(view).star)
+        assert (name in bench.shown_stars.names(drawn)) is is_drawn
+
+
 def fast_moment(bench: Bench) -> int:
     """A time at which a lit satellite is faster than half a degree a second."""
     for t_ns in range(0, 20_000 * S_NS, 40 * S_NS):

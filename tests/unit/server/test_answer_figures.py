@@ -183,6 +183,12 @@ def test_no_more_answers_are_available_than_are_due(repeated, availability):
     )
 
 
+def test_answers_with_one_error_have_no_sigma():
+    """Whose squares are by rounding less than their mean's: 3.7 three times."""
+    found = tallied("rrr", np.full((3, 3), 3.7)).report(START_NS)
+    assert found.sigma3_arcsec == [0.0, 0.0, 0.0]
+
+
 def test_answers_of_no_sky_are_not_due():
     found = tallied("rrrruurrrw").report(START_NS)
     assert found.availability == pytest.approx(7 / 8)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.jumps import JumpFilter
+from hilstar.attitude.clock.jumps import JumpFilter, clock_named
 from hilstar.attitude.clock.sender_clock import (
     EXCHANGE_LIFE_NS,
     LOCAL_DELAY_NS,
@@ -315,6 +315,57 @@ def test_the_uncertainty_of_a_stream_is_by_its_delays_above_the_line(late_us, un
         clock.observe(host_ns + SLOT_NS, host_ns + SLOT_NS)
     known_us = clock.summary().uncertainty_ms * 1000
     assert known_us == pytest.approx(uncertainty_us + LOCAL_DELAY_NS / 1000)
+
+
+@pytest.mark.parametrize("by_us", [-400, 400])
+def test_exchanges_that_show_no_drift_yet_may_part_as_their_last_two_did(by_us):
+    """Offsets of 0, 0 and d: two thirds of d above their mean, half a delay, and d once more."""
+    clock = SenderClock()
+    way_ns = NS_PER_MS // 2
+    for k, offset_us in enumerate((0, 0, by_us)):
+        host_ns = HOST0_NS + k * NS_PER_S // 2
+        t_ns = host_ns + offset_us * 1000
+        clock.exchange(Exchange(host_ns - way_ns, t_ns, t_ns, host_ns + way_ns))
+    summary = clock.summary()
+    assert summary.mode == "exchange"
+    assert summary.uncertainty_ms == pytest.approx(0.5 + 0.4 * 5 / 3)
+
+
+@pytest.mark.parametrize(
+    ("way_us", "later_us", "counts"),
+    [(0, 90, True), (0, 110, False), (500, 240, True), (500, 260, False)],
+)
+def test_an_exchange_counts_that_takes_a_quarter_or_a_tenth_of_a_ms_more(way_us, later_us, counts):
+    """The third of three is later on its way there, by which its offset is off by half."""
+    clock = SenderClock()
+    for k, later in enumerate((0, 0, later_us)):
+        t1_ns = HOST0_NS + k * NS_PER_S // 2
+        t2_ns = t1_ns + (way_us + later) * 1000
+        clock.exchange(Exchange(t1_ns, t2_ns, t2_ns, t2_ns + way_us * 1000))
+    off_us = later_us / 2 / 3 if counts else 0.0
+    assert clock.summary().offset_ms == pytest.approx(-off_us / 1000, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("behind_s", "name"),
+    [
+        (-37.9, "TAI"),
+        (-36.1, "TAI"),
+        (-38.1, None),
+        (-35.9, None),
+        (5.5 * 3600, "the local time of a zone 5.5 h west of UTC"),
+        (-5.5 * 3600, "the local time of a zone 5.5 h east of UTC"),
+        (14 * 3600 + 0.9, "the local time of a zone 14 h west of UTC"),
+        (-14 * 3600 - 0.9, "the local time of a zone 14 h east of UTC"),
+        (3600 + 1.1, None),
+        (3600 - 1.1, None),
+        (14.25 * 3600, None),
+        (-14.25 * 3600, None),
+        (0.0, None),
+    ],
+)
+def test_a_clock_is_named_within_a_second_of_one_that_is_known(behind_s, name):
+    assert clock_named(round(behind_s * NS_PER_S)) == name
 
 
 @pytest.mark.parametrize("by_ms", [-3, 3])

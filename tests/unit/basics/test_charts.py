@@ -71,6 +71,9 @@ def test_figures_of_an_axis_are_a_persons():
     assert [charts.plain(v) for v in (3000, 0.5, 0.0001, 1e-5, 3e-6, 2e6, 0)] == [
         *("3000", "0.5", "0.0001", "10⁻⁵", "3·10⁻⁶", "2·10⁶", "0")
     ]
+    assert [charts.plain(v) for v in (-3000, -0.0001, -3e-6, -2e6)] == [
+        *("-3000", "-0.0001", "-3·10⁻⁶", "-2·10⁶")
+    ]
     assert [charts.capital(text) for text in ("rate [Hz]", "x [px]", "V [mag]")] == [
         "Rate [Hz]",
         "x [px]",

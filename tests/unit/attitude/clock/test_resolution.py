@@ -70,6 +70,13 @@ def test_components_of_one_size_show_as_much_as_one_whatever_their_signs(steps, 
     assert _evidence(q.tolist(), 0.01) is None
 
 
+@pytest.mark.parametrize("steps", [(57, 57, 57, 7), (58, 58, 58, 11)])
+def test_steps_whose_norm_is_off_by_a_hundredth_are_no_sender_s(steps):
+    """Their quaternion would be refused, which is unit within a thousandth."""
+    q = np.array(steps) / np.linalg.norm(steps)
+    assert _evidence(q.tolist(), 0.01) is None
+
+
 @pytest.mark.parametrize(
     "q", [(1.0, 0.0, 0.0, 0.0), (0.5, 0.5, -0.5, 0.5), (0.6, 0.8, 0.0, 0.0), (0.1, 0.7, 0.5, 0.5)]
 )

@@ -104,6 +104,7 @@ def test_every_single_bit_error_is_refused():
         (packet(q=(float("inf"), 0, 0, 1)), "nan"),
         (packet(rate=(float("nan"), 0, 0)), "nan"),
         (packet(q=(1.0011, 0, 0, 0)), "norm"),
+        (packet(q=(0.9989, 0, 0, 0)), "norm"),
         (packet(q=(0, 0, 0, 0)), "norm"),
         (packet(version=2), "format"),
         (packet(kind=2), "format"),
@@ -127,8 +128,9 @@ def test_what_is_no_attitude_is_refused_with_its_reason(message, expected):
     assert reason(message) == expected
 
 
-def test_a_norm_within_a_thousandth_is_taken_and_mended():
-    sample = decode(packet(q=(1.0009, 0, 0, 0)))
+@pytest.mark.parametrize("norm", [0.9991, 1.0009])
+def test_a_norm_within_a_thousandth_is_taken_and_mended(norm):
+    sample = decode(packet(q=(norm, 0, 0, 0)))
     assert isinstance(sample, AttitudeSample)
     assert sample.q_icrs_to_cam.tolist() == [1, 0, 0, 0]
 

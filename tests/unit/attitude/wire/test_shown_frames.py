@@ -47,6 +47,7 @@ def test_a_frame_comes_back_as_it_was_shown(bits, channels, largest):
         # index 14 is outside
         lambda parts: [parts[0].replace(b'"width":5', b'"width":4'), *parts[1:]],
         lambda parts: [parts[0].replace(b"1.0,", b"1.1,"), *parts[1:]],
+        lambda parts: [parts[0].replace(b"1.0,", b"0.9,"), *parts[1:]],
         lambda parts: [parts[0], parts[1][::-1], parts[2]],
         lambda parts: [parts[0], parts[1][:-1], parts[2]],
         lambda parts: [parts[0], parts[1], parts[2] + b"\1"],

@@ -278,6 +278,7 @@ def test_a_split_finds_what_was_put_together() -> None:
         ([], "has no row"),
         (["1,nan,0,0,1,1"], "qw = 'nan' is not a finite number"),
         (["1,2,0,0,1,1"], "norm of qw,qx,qy,qz is 2.23607"),
+        (["1,0.5,0,0,0,1"], "norm of qw,qx,qy,qz is 0.5"),
         (["2,1,0,0,0,1", "1,1,0,0,0,1"], "time does not increase"),
         (["1,1,0,0,0,0"], "none of them valid"),
         (["1,1,0,0,0,2"], "valid = '2'"),

@@ -227,10 +227,15 @@ def test_what_cannot_be_drawn_is_refused(relay_file, tmp_path):
         '[render] psf = "tracker", with psf.fits: it has the tracker\'s pixel in it (PIXINT)'
         in result.stderr
     )
+
+
+@pytest.mark.parametrize("sine", [0.6, -0.6])
+def test_an_oval_gaussian_that_lies_obliquely_is_refused_whichever_way_it_leans(relay_file, sine):
     wide = relay_file(
         {"tracker": {"psf_sigma_px": [0.5, 1.5]}, "tracker.optics": {"psf": "gaussian"}}
     )
     camera = bench_camera(wide.config, wide.folder)
-    camera = replace(camera, cam_to_image=np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]]))
+    turn = np.array([[0.8, -sine, 0], [sine, 0.8, 0], [0, 0, 1]])
+    camera = replace(camera, cam_to_image=turn)
     with pytest.raises(InputError, match="oval and lies obliquely"):
         next(display_psfs(wide.config, wide.folder, camera))

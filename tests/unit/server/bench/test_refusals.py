@@ -99,6 +99,7 @@ REFUSED = [
     (other_text("[tracker]", "x = 1\n[tracker]"), "unknown key x; known are tracker, monitor"),
     (other_text("[tracker]", "[tracker"), "not TOML"),
     (more("q_cam_to_mon = [1,1,0,0]"), "q_cam_to_mon: its norm is 1.41421"),
+    (more("q_cam_to_mon = [0.5,0.5,0,0]"), "q_cam_to_mon: its norm is 0.707107"),
     (
         more('[sky]\ntemperature = "hot"'),
         '[sky] temperature = "hot"; "ballesteros2012" or "wang2021" is wanted',
@@ -189,8 +190,10 @@ REFUSED = [
     (more(aligned([[4, 1, 0], [2, 2, 0], [0, 0, 9]])), "is no covariance"),
     (more(aligned([[4, 0, 0], [0, 2, 0], [7, 0, 9]])), "is no covariance"),
     (more(aligned([[4, 3, 0], [3, 2, 0], [0, 0, 9]])), "is no covariance"),
+    (more(aligned([[4, -3, 0], [-3, 2, 0], [0, 0, 9]])), "is no covariance"),
     (more(aligned([[4, 0, 0], [0, -2, 0], [0, 0, 9]])), "a variance is below 0"),
     (more("[alignment]\nq_mon_to_reference = [1, 1, 0, 0]"), "its norm is 1.41421"),
+    (more("[alignment]\nq_mon_to_reference = [0.5, 0.5, 0, 0]"), "its norm is 0.707107"),
     # SCPI's attitudes, and who may send
     (more('[attitude]\nsource = "scpi"\nport = 5560'), 'port: source = "scpi" has none'),
     (

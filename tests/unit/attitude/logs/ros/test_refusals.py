@@ -148,6 +148,11 @@ TREES = [
         "the transform base -> cam has a quaternion whose norm is off by 1",
     ),
     (
+        [fixed_transform("base", "cam", (0.5, 0, 0, 0)), *tree([("icrs", "base", rotations(3))])],
+        {"body": "cam"},
+        "the transform base -> cam has a quaternion whose norm is off by 0.5",
+    ),
+    (
         CHAIN,
         ICRS,
         "several transforms of tf could be meant: map -> odom, odom -> base; choose with --body",

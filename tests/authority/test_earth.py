@@ -169,6 +169,16 @@ def test_beyond_the_table_the_user_is_told_by_how_much():
     )
     assert line is not None
     assert "beyond it UT1 is guessed" in line
+    end = np.datetime64(line.split(" to ")[1][:10])
+    for days, years in ((1, 1.0), (300, 1.0), (3653, 10.0)):
+        begin_ns, end_ns = (
+            int(day.astype("datetime64[ns]").astype(np.int64)) for day in (end, end + days)
+        )
+        line = beyond_table(begin_ns, end_ns)
+        assert line is not None
+        off_arcsec = float(line.split("turned by ")[1].split()[0])
+        # UT1 parts from UTC by 1.1 s a year, and 1 s is 15.041 arcsec
+        assert off_arcsec == pytest.approx(15.041 * 1.1 * years, abs=0.5 + 15.041 * 1.1 / 365.25)
     assert np.isfinite(q_icrs_to_itrs(utc_array("2060-01-01T00:00:00"))).all()
 
 

@@ -158,7 +158,7 @@ class OneWayFilter:
         uncertainty_ns = math.inf
         last = above[-RECENT_SLOTS:]
         if len(last) == RECENT_SLOTS:
-            rise = max(0.0, last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)
+            rise = (last[-1] - last[0]) * 2 / (RECENT_SLOTS - 1)
             uncertainty_ns = float(max(np.median(above), last.max(), last[-1] + rise))
         self.line = _OffsetLine(newest.host_ns, newest.offset_ns + level, drift, uncertainty_ns)
 
@@ -178,8 +178,7 @@ def _supporting_slope(x: FloatArray, y: FloatArray) -> float:
             hull.pop()
         hull.append(c)
     right = int(np.searchsorted(x[hull], x.mean()))
-    a = hull[max(right - 1, 0)]
-    b = hull[max(right, 1)]
+    a, b = hull[right - 1 : right + 1]
     slope = float((y[b] - y[a]) / (x[b] - x[a]))
     return slope if abs(slope) <= MAX_DRIFT else 0.0
 

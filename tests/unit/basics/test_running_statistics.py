@@ -17,11 +17,12 @@ RELATIVE = STEP
     [
         np.geomspace(0.01, 50, 5000),
         np.linspace(-3, 5, 5001),
+        np.linspace(-5, 3, 5001),
         np.full(10, 16.7),
         np.array([0.0, 1e-9]),
         np.array([-2.5]),
     ],
-    ids=["log", "both signs", "one value", "zero", "negative"],
+    ids=["log", "both signs", "negative median", "one value", "zero", "negative"],
 )
 @pytest.mark.parametrize("batches", [0, 1, 7], ids=["by value", "at once", "in batches"])
 def test_percentiles_are_those_of_the_values(values, batches, rng):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilstar.server.record.answer_figures import AnswerSpan, AnswerTally, answer_rows
+from hilstar.server.record.answer_figures import AnswerSpan, AnswerTally, SpanTally, answer_rows
 from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
 from hilstar.server.record.run_figures import figures_of, summarise
 from tests.support.commands import run_hilstar_here
@@ -164,6 +164,29 @@ def test_three_sigma_is_that_of_a_sample():
     found = tallied("rrrr", residuals).report(START_NS)
     assert found.sigma3_arcsec == pytest.approx(3 * residuals.std(axis=0, ddof=1), abs=2e-3)
     assert found.rms_arcsec == pytest.approx(np.sqrt((residuals**2).mean(axis=0)), abs=2e-3)
+
+
+@pytest.mark.parametrize(("repeated", "availability"), [(0, 1.0), (3, 1.0)])
+def test_no_more_answers_are_available_than_are_due(repeated, availability):
+    """Ten answers a second, the last ones twice: ten cycles have eleven answers."""
+    tally = AnswerTally()
+    whole = SpanTally()
+    for k in [*range(11), *[10] * repeated]:
+        at_ns = START_NS + round(k * CYCLE_S * NS_PER_S)
+        record = AnswerRecord(host_ns=at_ns, raw="01", middle_ns=at_ns, verdict="right")
+        tally.answer(record)
+        whole.add(record)
+    assert tally.report(START_NS).availability == availability
+    assert whole.span(11 * CYCLE_S, CYCLE_S).availability == availability
+    assert whole.span(22 * CYCLE_S, CYCLE_S).availability == pytest.approx(
+        (11 + repeated) / 22, abs=1e-4
+    )
+
+
+def test_answers_with_one_error_have_no_sigma():
+    """Whose squares are by rounding less than their mean's: 3.7 three times."""
+    found = tallied("rrr", np.full((3, 3), 3.7)).report(START_NS)
+    assert found.sigma3_arcsec == [0.0, 0.0, 0.0]
 
 
 def test_answers_of_no_sky_are_not_due():

@@ -37,6 +37,11 @@ def monitor(tmp_path):
         (0.4, 60.0, False, False),  # swaps that do not wait
         (PERIOD_MS, 0.0, True, True),
         (0.4, 0.0, False, True),  # no refresh at all, as a virtual screen's
+        # the bench file's refresh within REFRESH_TOLERANCE, faster and slower
+        (PERIOD_MS * 0.991, 0.0, True, True),
+        (PERIOD_MS * 1.009, 0.0, True, True),
+        (PERIOD_MS * 0.989, 0.0, False, True),
+        (PERIOD_MS * 1.011, 0.0, False, True),
     ],
 )
 def test_the_screen_keeps_time_where_its_swaps_wait(monitor, period_ms, known_hz, by_screen, waits):
@@ -94,6 +99,7 @@ def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
         ),
         ({"back_buffer": BackBuffer(8, 4)}, GOOD, "4 samples a pixel"),
         ({}, Timing(PERIOD_MS * 1.02, 0, True), "58.82 Hz and the bench file says 60"),
+        ({}, Timing(PERIOD_MS * 0.98, 0, True), "61.22 Hz and the bench file says 60"),
         ({}, Timing(0.4, 0, False, waits=False), "switch vertical sync on"),
     ],
 )

@@ -7,17 +7,21 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.jumps import JumpFilter
+from hilstar.attitude.clock.jumps import JumpFilter, clock_named
 from hilstar.attitude.clock.sender_clock import (
     EXCHANGE_LIFE_NS,
+    LOCAL_DELAY_NS,
+    MAX_DRIFT,
     MIN_EXCHANGES,
     SLEW,
+    SLOT_NS,
     Exchange,
     SenderClock,
 )
 from hilstar.attitude.clock.stages import StreamState
 from hilstar.attitude.wire.links import Arrival
 from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.basics.process.scheduling import UnixOffset
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from tests.support.claims import holds
 
@@ -248,6 +252,130 @@ def test_a_correction_enters_without_a_step():
     steps = np.diff(shown)
     assert np.abs(steps[250:] - PERIOD_NS).max() <= SLEW * PERIOD_NS + 1
     assert shown[-1] == pytest.approx(HOST0_NS + 1199 * PERIOD_NS, abs=1e3)
+
+
+@pytest.mark.parametrize("by_ms", [-60, -40, -5, 5, 40, 60])
+def test_a_clock_that_is_set_is_followed_at_most_by_slew_below_50_ms_and_else_at_once(by_ms):
+    """Packets without a delay and exchanges twice a second, of a sender that is set by `by_ms`
+    after 4 s.
+    """
+    clock = SenderClock()
+    shown = []
+    for k in range(2200):
+        host_ns = HOST0_NS + k * PERIOD_NS
+        t_ns = host_ns + (by_ms * NS_PER_MS if k >= 800 else 0)
+        clock.observe(t_ns, host_ns)
+        if k % 100 == 0:
+            clock.exchange(Exchange(host_ns, t_ns, t_ns, host_ns))
+        shown.append(clock.to_sender_ns(host_ns))
+    assert shown[799] == HOST0_NS + 799 * PERIOD_NS
+    assert shown[-1] == t_ns
+    step_ns = np.diff(shown) - PERIOD_NS
+    fast_ns = step_ns[np.abs(step_ns) > SLEW * PERIOD_NS + 1]
+    assert fast_ns.tolist() == ([by_ms * NS_PER_MS] if abs(by_ms) > 50 else [])
+
+
+@pytest.mark.parametrize("by_exchanges", [True, False])
+@pytest.mark.parametrize("ppm", [-2100, -1900, 1900, 2100])
+def test_a_drift_over_two_thousandths_is_none(ppm, by_exchanges):
+    """Exchanges take 0.5 ms each way: by less than that a sender's clock was not set."""
+    clock = SenderClock()
+    way_ns = NS_PER_MS // 2
+    for k in range(40):
+        host_ns = HOST0_NS + k * NS_PER_S // 4
+        t_ns = host_ns + k * NS_PER_S // 4 * ppm // 10**6
+        if by_exchanges:
+            clock.exchange(Exchange(host_ns - way_ns, t_ns, t_ns, host_ns + way_ns))
+        else:
+            clock.observe(t_ns, host_ns)
+    expected_ppm = ppm if abs(ppm) <= MAX_DRIFT * 1e6 else 0.0
+    assert clock.summary().drift_ppm == pytest.approx(expected_ppm, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("late_us", "uncertainty_us"),
+    [
+        ([0, 100, 200, 400], 400 + 400 * 2 / 3),  # may rise on for two slots
+        ([400, 200, 100, 0], 400),
+        ([0, 300, 100, 0], 300),
+        ([500] * 5 + [0] * 4, 500),  # the median of all slots
+        ([0, 0, 0, 0, *[300] * 8], 300),  # the newest eight are all later
+    ],
+)
+def test_the_uncertainty_of_a_stream_is_by_its_delays_above_the_line(late_us, uncertainty_us):
+    """One message in each slot of 250 ms, those after the first four all in the next slot where
+    they are late; then one that makes the clock look at them.
+    """
+    clock = SenderClock()
+    host_ns = HOST0_NS
+    for k, late in enumerate(late_us):
+        host_ns += 10 * NS_PER_MS if len(late_us) > 9 and k > 4 else SLOT_NS
+        clock.observe(host_ns - late * 1000, host_ns)
+    if len(late_us) <= 9:
+        clock.observe(host_ns + SLOT_NS, host_ns + SLOT_NS)
+    known_us = clock.summary().uncertainty_ms * 1000
+    assert known_us == pytest.approx(uncertainty_us + LOCAL_DELAY_NS / 1000)
+
+
+@pytest.mark.parametrize("by_us", [-400, 400])
+def test_exchanges_that_show_no_drift_yet_may_part_as_their_last_two_did(by_us):
+    """Offsets of 0, 0 and d: two thirds of d above their mean, half a delay, and d once more."""
+    clock = SenderClock()
+    way_ns = NS_PER_MS // 2
+    for k, offset_us in enumerate((0, 0, by_us)):
+        host_ns = HOST0_NS + k * NS_PER_S // 2
+        t_ns = host_ns + offset_us * 1000
+        clock.exchange(Exchange(host_ns - way_ns, t_ns, t_ns, host_ns + way_ns))
+    summary = clock.summary()
+    assert summary.mode == "exchange"
+    assert summary.uncertainty_ms == pytest.approx(0.5 + 0.4 * 5 / 3)
+
+
+@pytest.mark.parametrize(
+    ("way_us", "later_us", "counts"),
+    [(0, 90, True), (0, 110, False), (500, 240, True), (500, 260, False)],
+)
+def test_an_exchange_counts_that_takes_a_quarter_or_a_tenth_of_a_ms_more(way_us, later_us, counts):
+    """The third of three is later on its way there, by which its offset is off by half."""
+    clock = SenderClock()
+    for k, later in enumerate((0, 0, later_us)):
+        t1_ns = HOST0_NS + k * NS_PER_S // 2
+        t2_ns = t1_ns + (way_us + later) * 1000
+        clock.exchange(Exchange(t1_ns, t2_ns, t2_ns, t2_ns + way_us * 1000))
+    off_us = later_us / 2 / 3 if counts else 0.0
+    assert clock.summary().offset_ms == pytest.approx(-off_us / 1000, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("behind_s", "name"),
+    [
+        (-37.9, "TAI"),
+        (-36.1, "TAI"),
+        (-38.1, None),
+        (-35.9, None),
+        (5.5 * 3600, "the local time of a zone 5.5 h west of UTC"),
+        (-5.5 * 3600, "the local time of a zone 5.5 h east of UTC"),
+        (14 * 3600 + 0.9, "the local time of a zone 14 h west of UTC"),
+        (-14 * 3600 - 0.9, "the local time of a zone 14 h east of UTC"),
+        (3600 + 1.1, None),
+        (3600 - 1.1, None),
+        (14.25 * 3600, None),
+        (-14.25 * 3600, None),
+        (0.0, None),
+    ],
+)
+def test_a_clock_is_named_within_a_second_of_one_that_is_known(behind_s, name):
+    assert clock_named(round(behind_s * NS_PER_S)) == name
+
+
+@pytest.mark.parametrize("by_ms", [-3, 3])
+def test_what_a_frame_was_off_adds_to_the_uncertainty(by_ms):
+    clock = SenderClock(UnixOffset(7 * NS_PER_S, 500_000), "unix")
+    clock.to_sender_ns(HOST0_NS)
+    clock.know(UnixOffset(7 * NS_PER_S + by_ms * NS_PER_MS, 500_000))
+    assert clock.summary().uncertainty_ms == pytest.approx(0.5 + 3)
+    clock.to_sender_ns(HOST0_NS + PERIOD_NS)
+    assert clock.summary().uncertainty_ms == pytest.approx(0.5)
 
 
 def test_before_any_message_sender_time_is_host_time():

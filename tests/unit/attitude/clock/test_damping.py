@@ -160,6 +160,36 @@ def test_a_steady_turn_has_no_jitter_and_is_looked_at_as_far_ahead_as_frames_pre
     assert damped.ahead_s == pytest.approx(ahead_s, rel=MEMORY_LEFT)
 
 
+@pytest.mark.parametrize(("goes_on_by", "share"), [(-1.0, 1.0), (2.0, 0.0)])
+def test_no_more_than_the_jitter_is_held_back_and_nothing_is_added(goes_on_by, share):
+    """Where a sample's jitter goes on the other way, and where it goes on twice as large."""
+    step_s = 0.01
+    damping = _Damping()
+    rates = np.random.default_rng(3).uniform(-1e-3, 1e-3, (200, 3))
+    turns = np.roll(rates, 1, axis=0) * goes_on_by * step_s
+    for k, (rate, turn) in enumerate(zip(rates.tolist(), turns.tolist(), strict=True)):
+        damped = damping.add(round(k * step_s * NS_PER_S), tuple(rate), tuple(turn))
+    jitter = damping._seen[-1].jitter
+    assert damped.excess == pytest.approx([share * part for part in jitter], abs=1e-15)
+    assert min(map(abs, jitter)) > 1e-5
+
+
+def test_a_beginning_turn_is_held_back_by_three_sigma_either_way():
+    """Noise and its mirror image, which a turn that is a hundred times as fast ends."""
+    rates = np.random.default_rng(4).uniform(-1e-3, 1e-3, (200, 3))
+    rates[-1] = [0.1, -0.1, 0.1]
+    held_back = []
+    for mirrored in (rates, -rates):
+        damping = _Damping()
+        for k, rate in enumerate(mirrored.tolist()):
+            damped = damping.add(k * 10 * NS_PER_MS, tuple(rate), (0.0, 0.0, 0.0))
+        held_back.append(damped.excess)
+    assert held_back[0] == tuple(-part for part in held_back[1])
+    assert np.sign(held_back[0]).tolist() == [1, -1, 1]
+    sigma = 1e-3 / math.sqrt(3)  # of the uniform noise; of 200 samples within a fifth
+    assert np.abs(held_back[0]) == pytest.approx(3 * sigma, rel=0.2)
+
+
 @pytest.mark.parametrize("policy", [AUTO, RATE])
 def test_only_differences_of_the_senders_time_count(policy):
     """A stream of any epoch is predicted to the last bit as one that begins at 0."""

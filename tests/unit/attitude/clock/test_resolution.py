@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.attitude.clock.resolution import COARSE, Resolution, coarse_lines
+from hilstar.attitude.clock.resolution import COARSE, Resolution, _evidence, coarse_lines
 from hilstar.attitude.wire.packet import AttitudeSample, checked_sample
 from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, propagate
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
@@ -57,6 +57,17 @@ def test_a_rounded_attitude_at_rest_is_told_and_a_sender_is_told_of_once():
 )
 def test_fine_quaternions_are_not_told(rounded):
     assert coarse_lines(rounded_turn(rounded)) == []
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1, 1), (1, -1, 1, -1), (-1, 1, -1, 1), (-1, -1, -1, -1)])
+@pytest.mark.parametrize(
+    ("steps", "evidence"), [((16, 16, 16, 96), 1), ((20, 20, 33, 90), 2), ((12, 30, 35, 88), 3)]
+)
+def test_components_of_one_size_show_as_much_as_one_whatever_their_signs(steps, evidence, signs):
+    q = np.array(steps) * np.array(signs) / np.linalg.norm(steps)
+    assert _evidence(q.tolist(), 0.01) == evidence
+    q[1] += 1e-4
+    assert _evidence(q.tolist(), 0.01) is None
 
 
 @pytest.mark.parametrize(

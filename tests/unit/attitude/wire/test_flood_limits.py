@@ -73,6 +73,24 @@ def test_a_burst_passes_and_a_flood_does_not():
     assert gate.newest(burst, plain) == burst
 
 
+def test_a_long_silence_lets_no_more_than_one_burst_pass():
+    clock = FakeClock()
+    gate = FloodGate(LinkCounts(), Notices(), clock)
+    clock.work(10 * NS_PER_S)
+    waiting = [RawMessage(k, [b""]) for k in range(COUNT)]
+    assert gate.newest(waiting, plain) == waiting[-MAX_BURST:]
+
+
+def test_a_jump_that_is_taken_anyway_is_not_taken_twice_where_few_are_passed_over():
+    clock, counts = FakeClock(), LinkCounts()
+    gate = FloodGate(counts, Notices(), clock)
+    gate.newest([RawMessage(k, [b""]) for k in range(MAX_BURST)], plain)
+    clock.work(2.5 / MAX_PACKETS_PER_S * NS_PER_S)
+    waiting = [RawMessage(k, [b"jump" if k == 4 else b""]) for k in range(5)]
+    assert gate.newest(waiting, bool) == waiting[3:]
+    assert counts.flooded == 3
+
+
 @pytest.mark.parametrize("sender", [0, 1, 2, 4, 253])
 @pytest.mark.parametrize("sequence", [0, 1, 2, 255, 256, 2**16, 2**32 - 1])
 def test_a_jump_is_seen_undecoded_whatever_else_a_frame_has(sender, sequence):

@@ -79,6 +79,13 @@ def test_each_line_of_the_grid_is_where_its_label_says(overlay_bench, ra_deg, de
         assert np.abs(off_deg).max() < LINE_DEG
 
 
+@pytest.mark.parametrize("dec_deg", [-87.0, 87.0])
+def test_a_grid_with_a_pole_in_it_has_right_ascensions_all_around(overlay_bench, dec_deg):
+    lines = overlay_of(overlay_bench).truth(0, from_radec_roll_deg(40.0, dec_deg, 0.0)).grid
+    labels = {line.label for line in lines if line.label.startswith("RA")}
+    assert labels == {f"RA {ra}\N{DEGREE SIGN}" for ra in range(0, 360, 30)}
+
+
 def test_the_sky_has_the_brightest_star_first_and_the_screen_s_corners(overlay_bench):
     told = msgspec.to_builtins(overlay_of(overlay_bench).sky())
     assert told["stars"][0][2:] == [-1.44, "α CMa"]  # Hipparcos' V of Sirius

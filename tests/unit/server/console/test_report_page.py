@@ -258,6 +258,15 @@ def test_bins_keep_every_count_whatever_the_times():
     assert (rates_hz * bins.width_ns / 1e9).sum() == pytest.approx(5)
 
 
+def test_a_time_before_the_first_one_counts_in_the_first_bin():
+    bins = TimeBins(1, capacity=8)
+    for at_ns in (5 * 10**9, 0, 49 * 10**8, 6 * 10**9):
+        bins.add(np.array([at_ns]), np.array([0]))
+    begin_s, rates_hz = bins.rates_hz(0)
+    assert begin_s.tolist() == [5.0, 6.0]
+    assert rates_hz.ravel().tolist() == [3.0, 1.0]
+
+
 def test_a_steady_stream_has_a_steady_rate_however_long_it_lasts():
     bins = TimeBins(1, capacity=8)
     for second in range(200):

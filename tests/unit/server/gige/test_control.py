@@ -171,6 +171,17 @@ def test_packets_are_sent_again_for_the_controller_alone():
     assert camera.take_events() == [Resend(5, 3, 9)]
 
 
+@pytest.mark.parametrize(
+    ("last", "sent"), [(4097, 4097), (4098, 4098), (4099, 4098), (0xFF_FFFF, 4098)]
+)
+def test_one_request_has_4096_packets_at_most(last, sent):
+    camera = channel()
+    Asker(camera).write(PRIVILEGE, CONTROL)
+    body = struct.pack(">HHII", 0, 5, 3, last)
+    assert camera.receive(command(RESEND, body, 9, flags=0), CLIENT, 0) is None
+    assert camera.take_events() == [Resend(5, 3, sent)]
+
+
 def test_packets_are_sent_again_to_the_socket_that_takes_the_images():
     """Aravis asks from it, and not from the one that controls."""
     camera = channel()

@@ -9,7 +9,7 @@ finds.
     python tools/mutants.py --planted tools/planted_faults.toml --by-lines MAP --near -o DIR
 
 Each mutant is one change in a core room, or in those of --rooms, in a copy of the checkout: one
-expression, one call or one check that is left out, or two arguments that are swapped. DIR gets
+expression, one call, check or limit that is left out, or two arguments that are swapped. DIR gets
 mutants.csv: the change, and the test that fails ("" where none does). A test counts that fails
 twice with the change and passes without it: what fails by the machine's load, or for what the copy
 lacks, is said and passed over. A run that is stopped goes on where it was. With --near only those
@@ -107,6 +107,9 @@ COMPUTED: dict[type[ast.operator], type[ast.operator]] = {
     ast.FloorDiv: ast.Mult,
     ast.Pow: ast.Mult,
 }
+# what gives its argument without its sign, and its first one within limits
+SIGNLESS = frozenset({"abs", "np.abs"})
+LIMITING = frozenset({"max", "min", "np.clip", "np.fmax", "np.fmin", "np.maximum", "np.minimum"})
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,11 +157,24 @@ def changed(node: ast.AST) -> ast.AST | None:
             return operand
         case ast.Constant(value=bool() | int() | float() as value):
             mutant.value = other_number(value)
-        case ast.Call(args=[ast.Name() as first, ast.Name() as second, *others]):
-            mutant.args = [second, first, *others]
+        case ast.Call():
+            return changed_call(mutant)
         case _:
             return None
     return mutant
+
+
+def changed_call(mutant: ast.Call) -> ast.expr | None:
+    """A call without its limit or with two arguments swapped, in place; None as above."""
+    match mutant:
+        case ast.Call(func=called, args=[size]) if ast.unparse(called) in SIGNLESS:
+            return size
+        case ast.Call(func=called, args=[size, _, *_]) if ast.unparse(called) in LIMITING:
+            return size
+        case ast.Call(args=[ast.Name() as first, ast.Name() as second, *others]):
+            mutant.args = [second, first, *others]
+            return mutant
+    return None
 
 
 def changed_statement(mutant: ast.stmt) -> ast.stmt | None:

@@ -202,8 +202,7 @@ class SiteAir:
         steradian; none below ground.
         """
         sine = directions @ self.above(utc_ns).up
-        level = np.maximum(sine, 0.0)
-        masses = 1 / np.sqrt(1 - VAN_RHIJN * (1 - level**2))
+        masses = 1 / np.sqrt(1 - VAN_RHIJN * (1 - sine**2))
         # relative to the zenith, whose light is dimmed by one air mass
         dimming = flux_ratio(self.v_extinction_mag * (masses - 1))
         relative = masses * dimming * (sine > 0)

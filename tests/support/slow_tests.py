@@ -4,7 +4,8 @@
 
 A function is slow when all its cases together take over MAX_CPU_S, and until they take under
 BACK_CPU_S: one machine measures twice what another does. The bare command `pytest` leaves it out,
-but for the cases that fit in KEPT_CPU_S, the longest first: the quickest may be an empty one. A folder's fixture is charged to the first test that asks for it. `--from` reads a run that was
+but for the cases that fit in KEPT_CPU_S, the longest first: the quickest may be an empty one. A
+folder's fixture is charged to the first test that asks for it. `--from` reads a run that was
 measured before; functions that it has not keep what stands there.
 """
 

@@ -226,7 +226,7 @@ def judged_figure(
     elif missed:
         verdict = NOT_MET
     else:
-        more = _more(require, figure)
+        more = _more(require, figure, bench_error)
     bound = low
     if maximum != missed:
         bound = high
@@ -251,14 +251,14 @@ def _finite(value: float) -> float | None:
     return None
 
 
-def _more(require: Require, figure: BoundedFigure) -> int | None:
+def _more(require: Require, figure: BoundedFigure, bench_error: float) -> int | None:
     """How many more cases would decide, if the figure stays as it is; None where no number of
-    cases would.
+    cases would: a figure as near to its limit as the bench's own error stays there.
     """
     if figure.rate is not None:
         return _more_of_rate(require, figure.rate, figure.cases)
     limit = require.limit
-    away = abs(limit - figure.value)
+    away = abs(limit - figure.value) - bench_error
     if limit > figure.value:
         width = figure.high - figure.value
     else:
@@ -266,7 +266,7 @@ def _more(require: Require, figure: BoundedFigure) -> int | None:
         # of a size the interval ends at 0, which says nothing of its width
         if figure.low == 0:
             width = max(width, figure.high - figure.value)
-    if not away or not math.isfinite(width) or width <= 0:
+    if away <= 0 or not math.isfinite(width) or width <= 0:
         return None
     needed = math.ceil(figure.cases * (width / away) ** 2)
     more = needed - figure.cases

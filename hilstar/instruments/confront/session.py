@@ -380,15 +380,24 @@ def run_session(
         log_linearity = math.log(max(trial.light.linearity, 0.1))
         if abs(log_linearity) < LINEAR_DONE:
             return fit(trial.shots, power=power)
-        slope = (log_linearity - before[1]) / (log_undone - before[0])
-        if slope < 0:
-            step = -log_linearity / slope
-        else:
-            # a secant that noise turned leads away from the root: by the first step's rule
-            step = log_linearity
-        before = (log_undone, log_linearity)
-        log_undone += min(max(step, -MAX_TONE_STEP), MAX_TONE_STEP)
+        at = (log_undone, log_linearity)
+        log_undone += _tone_step(before, at)
+        before = at
     return session  # no power makes it linear: its figures say so
+
+
+def _tone_step(before: tuple[float, float], at: tuple[float, float]) -> float:
+    """The step of the power's logarithm by two trials, each that logarithm and the one of the
+    linearity that it left: at most MAX_TONE_STEP to either side.
+    """
+    log_undone, log_linearity = at
+    slope = (log_linearity - before[1]) / (log_undone - before[0])
+    if slope < 0:
+        step = -log_linearity / slope
+    else:
+        # a secant that noise turned leads away from the root: by the first step's rule
+        step = log_linearity
+    return min(max(step, -MAX_TONE_STEP), MAX_TONE_STEP)
 
 
 @dataclass(frozen=True, slots=True)

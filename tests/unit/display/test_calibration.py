@@ -113,6 +113,17 @@ def test_uniformity_is_bilinear_between_the_middles_of_its_fields(write):
 NOISE = "[weights]\nr = 2\ng = 5\nb = 1\n[noise]\nrelative = 0.013\n"
 
 
+def test_uniformity_that_falls_steeply_ends_at_half_its_darkest_field(write):
+    """0.01 in a field next to 1: the same slope would be below 0 in the half field to the edge."""
+    path = write(HEAD + '[uniformity]\nfile = "grid.csv"\n', grid="1.0,0.01\n")
+    light = load_calibration(path, 2).uniformity_map((8, 2))
+    field = (np.arange(8) + 0.5) / 4 - 0.5
+    line = 1.0 - 0.99 * field
+    assert line.min() < -0.3
+    expected = np.where(line > 0.005, line, 0.005)
+    assert light == pytest.approx(np.tile(expected / line.max(), (2, 1)), rel=1e-6)
+
+
 @pytest.mark.parametrize("source", ["gamma2.2", "grey", "rgb"])
 def test_a_calibration_with_another_grid_of_light_is_else_as_it_was(write, tmp_path, source):
     """A grid of two columns and three rows, rows from the top; without one the light is even."""

@@ -98,6 +98,9 @@ def test_max_bpc_is_compared_with_the_bench_s_bits():
             True,
         ),
         ({"transform": (1.25, 0, 0, 0, 1.25, 0, 0, 0, 1)}, "--transform none", True),
+        # a smaller scale, and a shift to the left: both below the identity
+        ({"transform": (0.8, 0, 0, 0, 0.8, 0, 0, 0, 1)}, "--transform none", True),
+        ({"transform": (1, 0, -40, 0, 1, 0, 0, 0, 1)}, "--transform none", True),
         ({"rotated": True}, "--rotate normal", False),
         ({"providers": ("Intel", "NVIDIA-0")}, "2 GPUs (Intel, NVIDIA-0)", False),
     ],
@@ -120,6 +123,8 @@ def test_a_plain_output_has_no_findings_nor_one_without_a_preferred_mode():
         (edid((598, 336)), 311.5, False),
         (edid((598, 336)), 303.0, False),  # within 3 %
         (edid((598, 336)), 277.0, True),
+        (edid((598, 336)), 320.0, False),
+        (edid((598, 336)), 350.0, True),
         (edid((16, 9)), 312.0, False),  # an aspect ratio: centimetres are taken
         (edid((16, 9)), 306.0, False),
         (edid((16, 9)), 277.0, True),

@@ -33,6 +33,10 @@ GEOMETRIES = [
         ": q_cam_to_mon: its norm is",
     ),
     (
+        GEOMETRY.replace("q_cam_to_mon = [1.0, 0.0", "q_cam_to_mon = [0.9, 0.0"),
+        ": q_cam_to_mon: its norm is 0.9; ",
+    ),
+    (
         GEOMETRY + FIELD.format("[[0.1, 0.2]]", "[[0.1, 0.2]]"),
         ": [field] has no two squares of one s",
     ),

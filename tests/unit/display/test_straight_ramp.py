@@ -55,3 +55,11 @@ def test_a_coarse_table_that_rounds_a_small_gamma_away_is_straight():
 def test_the_depth_is_the_coarsest_that_holds_each_entry():
     for bits in (8, 10, 12):
         assert ramp_bits(entries(np.linspace(0, 1, 4096), bits)[None] / 65535) == bits
+
+
+@pytest.mark.parametrize("off", [-300, -3, 3, 300])
+def test_one_entry_above_or_below_a_coarse_grid_makes_it_a_finer_one(off):
+    """Of 8 bits, whose codes are 257 of 65 535 apart; rounding to 16 bits takes at most 1."""
+    column = entries(np.linspace(0, 1, 1024), 8).astype(float)
+    column[500] += off
+    assert ramp_bits(column[None] / 65535) > 8

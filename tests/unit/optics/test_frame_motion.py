@@ -262,3 +262,20 @@ def test_a_star_that_runs_with_the_rows_is_lit_for_longer_and_against_them_for_l
     lit = sprites.data["electrons_per_s"].sum()
     # the way is even to the angle of the turn squared
     assert lit == pytest.approx(1 / (1 - fall_px / 240), rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("down", "rows", "sign"),
+    [((0, 1), 30, 1), ((0, -1), 30, -1), ((1, 0), 40, 1), ((-1, 0), 40, -1)],
+    ids=["down", "up", "to the right", "to the left"],
+)
+def test_a_pixel_beside_the_image_lights_up_with_its_nearest_row(down, rows, sign):
+    """0.2 s for all rows, half of it before the middle one: beyond the first and the last row it
+    does not go on.
+    """
+    row = np.array([-500.0, -3.0, -0.5, 0.0, 7.0, rows - 1.0, rows - 0.5, rows + 3.0, 900.0])
+    elsewhere = np.full(len(row), 5.0)
+    x_px, y_px = (row, elsewhere) if down[0] else (elsewhere, row)
+    late_s = Scan(down, scanout_s=0.2).late_s(x_px, y_px, (40, 30))
+    share = (np.array([-0.5, -0.5, -0.5, 0.0, 7.0, rows - 1.0, *[rows - 0.5] * 3]) + 0.5) / rows
+    assert late_s == pytest.approx(sign * 0.2 * (share - 0.5), abs=1e-12)

@@ -165,3 +165,24 @@ def test_an_image_without_a_star_has_no_rows():
     stars = stars_at(np.eye(3), np.ones(3))
     rows, star = sprite_truth(stars, join_sprites([], FOOTPRINT), np.empty(0, dtype=np.intp))
     assert (len(rows), len(star)) == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("white_e_per_s", "hold_s", "largest_e_per_s"),
+    [
+        (np.inf, 0.01, 20_000.0),
+        (np.inf, 0.1, 2000.0),
+        (np.inf, 0.0, 200.0),  # a second, where light comes at once
+        (1500.0, 0.1, 1500.0),
+        (1500.0, 0.2, 1000.0),
+        (1500.0, 0.0, 200.0),
+        (150.0, 0.0, 150.0),
+    ],
+)
+def test_a_pixel_shows_at_most_its_white_or_its_full_well_in_an_exposure(
+    white_e_per_s, hold_s, largest_e_per_s
+):
+    """A full well of 200 electrons."""
+    canvas = replace(CANVAS, white_e_per_s=white_e_per_s, full_e=200.0)
+    view = replace(AT_START, scan=Scan(hold_s=hold_s))
+    assert canvas.white_in(view) == pytest.approx(largest_e_per_s)

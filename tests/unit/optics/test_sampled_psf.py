@@ -229,3 +229,17 @@ def test_negative_lobes_become_black_and_many_are_refused():
 def test_what_is_no_psf_is_refused(samples, per_px, integrated, match):
     with pytest.raises(InputError, match=match):
         SampledPsf(samples, per_px, integrated)
+
+
+@pytest.mark.parametrize("is_tall", [False, True])
+def test_light_outside_a_square_is_that_along_the_wider_axis(is_tall):
+    """A Gaussian of 1.5 by 0.5 px: 5 px hold 1.67 and 5 of its sigmas."""
+    offset_px = np.arange(-32, 33) / 4
+    across = np.exp(-0.5 * (offset_px / 1.5) ** 2)
+    down = np.exp(-0.5 * (offset_px / 0.5) ** 2)
+    image = np.outer(down, across)
+    if is_tall:
+        image = image.T
+    outside = SampledPsf(image, 4).outside_share(5)
+    exact = GaussianPsf((1.5, 0.5)).outside_share(5)
+    assert outside == pytest.approx(exact, rel=0.01)

@@ -50,6 +50,19 @@ def test_a_gradient_rises_along_its_direction_to_the_outer_corner(towards_deg, c
         assert np.unravel_index(image.argmax(), image.shape) == corner
 
 
+def test_a_gradient_is_dark_beyond_its_dark_corner_and_goes_on_beyond_the_bright_one():
+    """A screen that shows twice as much as the detector has, each of whose pixels covers four of
+    its own. A gradient to the left is 1 at the detector's left edge and 0 at its right one.
+    """
+    camera = screen(50.0, (31.5, 23.5))
+    image = gradient_image(gradient(180.0), camera, TRACKER)
+    x_px = 19.5 + 2 * (np.arange(64) - 31.5)
+    rise = 0.5 - (x_px - 19.5) / 40
+    assert rise.min() < -0.2 and rise.max() > 1.2
+    light = 4 * np.where(rise > 0, rise, 0.0)
+    assert image == pytest.approx(np.tile(light, (48, 1)), abs=4 * SPLINE)
+
+
 def screen(focal_px: float, principal_px: tuple[float, float], turned_rad: float = 0.0) -> Camera:
     """A camera of 64 x 48 px that looks along the tracker's axis, turned about it."""
     return Camera(
@@ -74,6 +87,24 @@ def test_a_place_in_another_camera_is_by_its_focal_length_middle_and_turn(turned
     assert x_px == pytest.approx(19.5 + ((x - 20.0) * cosine + (y - 30.0) * sine) / 2, abs=1e-9)
     assert y_px == pytest.approx(14.5 + ((y - 30.0) * cosine - (x - 20.0) * sine) / 2, abs=1e-9)
     assert area == pytest.approx(np.full((48, 64), 0.25), abs=1e-9)
+
+
+@pytest.mark.parametrize("seen_by", [(-1.0, 1.0, 1.0), (1.0, -1.0, 1.0)])
+@pytest.mark.parametrize("turned_deg", [0.0, -40.0])
+def test_a_mirrored_screen_has_the_same_light_the_other_way_round(seen_by, turned_deg):
+    """Across or down, and also where a part of the screen is nowhere on the detector. Its middle
+    is the principal point.
+    """
+    aside = to_matrix(from_rotation_vector(np.radians([0.0, turned_deg, 0.0])))
+    middle_px = (29.5, 19.5)
+    plain = Camera((60, 40), 14.0, middle_px, aside)
+    mirrored = Camera((60, 40), 14.0, middle_px, np.diag(seen_by) @ aside)
+    axis = 1 if seen_by[0] < 0 else 0
+    values = np.arange(1.0, 1201.0).reshape(30, 40)
+    image = map_image(values, MAP, mirrored, TRACKER)
+    assert image.max() > 0 and image.min() == 0
+    same = map_image(values, MAP, plain, TRACKER)
+    assert np.flip(image, axis) == pytest.approx(same, rel=1e-5)
 
 
 def test_a_map_over_another_detector_keeps_its_light_and_its_places():

@@ -429,12 +429,9 @@ def scale(context: StepContext) -> StepOutcome:
     outcome = StepOutcome(
         "done", line, figures, (picture, readings, *stars_seen.images), (picture,), number=number
     )
-    contradictions = _contradictions(star_scale.scatter_mag, scatter.error_mag, error_mag)
-    if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * trend_error_mag):
-        contradictions.append(
-            f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +-"
-            f" {trend_error_mag:.3f} mag"
-        )
+    contradictions = _contradictions(
+        (star_scale.scatter_mag, scatter.error_mag), (trend_mag, trend_error_mag), error_mag
+    )
     if contradictions:
         why = (
             "the response is not as the bench file has it (photometry), or the background is not"
@@ -482,13 +479,24 @@ def _scale_trend(
     return trend_mag, math.hypot(error_mag, rounding_mag)
 
 
-def _contradictions(scatter_mag: float, scatter_error_mag: float, error_mag: float) -> list[str]:
-    """What speaks against a scale that stars agree on."""
+def _contradictions(
+    scatter: tuple[float, float], trend_over_light: tuple[float, float], error_mag: float
+) -> list[str]:
+    """What speaks against a scale that stars agree on: their scatter and their trend over light,
+    mag, each with its error, and the scale's own error.
+    """
+    scatter_mag, scatter_error_mag = scatter
+    trend_mag, trend_error_mag = trend_over_light
     contradictions = []
     if scatter_mag > max(UNSURE_MAG, FAR * scatter_error_mag):
         contradictions.append(f"they disagree by {scatter_mag:.3f} mag")
     if error_mag > UNSURE_MAG:
         contradictions.append("they are too noisy: write a longer [tracker] exposure_s")
+    if abs(trend_mag) > max(UNSURE_MAG, AGREE_SIGMAS * trend_error_mag):
+        contradictions.append(
+            f"from the faintest to the brightest it changes by {abs(trend_mag):.3f} +-"
+            f" {trend_error_mag:.3f} mag"
+        )
     return contradictions
 
 

@@ -5,6 +5,8 @@ rates and of single stars come out, and rates in another convention are named.
 from __future__ import annotations
 
 import json
+import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,10 @@ from hilstar.instruments.assess.assessment import (
     assess_files,
     read_answers,
 )
+from hilstar.instruments.assess.bounded_figures import TooFewCases
 from hilstar.instruments.assess.further import END, rate_notes
-from hilstar.instruments.assess.star_figures import StarTable, star_figure, without_turns
+from hilstar.instruments.assess.rate_figures import _near_rates, _refuse_other_units
+from hilstar.instruments.assess.star_figures import StarTable, _near, star_figure, without_turns
 from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.star_light import bench_stars
@@ -170,6 +174,47 @@ def test_rates_of_another_convention_are_named(
     notes = list(rate_notes(np.rint(1e9 * t_s).astype(np.int64), q, rates))
     assert len(notes) == bool(told)
     assert all("not the turn of the reported attitudes" in note and told in note for note in notes)
+
+
+# Within a tenth of a unit's factor, of either sign.
+@pytest.mark.parametrize(
+    ("factor", "words"),
+    [
+        (1.0, ""),
+        (0.5, ""),
+        (-0.5, ""),
+        (-1.0, "as in rad/s of the opposite sign"),
+        (-1.09, "as in rad/s of the opposite sign"),
+        (-1.11, ""),
+        (1.09 * math.degrees(1), "as in deg/s;"),
+        (0.91 * math.degrees(1), "as in deg/s;"),
+        (1.11 * math.degrees(1), ""),
+        (-math.degrees(1), "as in deg/s of the opposite sign"),
+        (-1e3, "as in mrad/s of the opposite sign"),
+    ],
+)
+def test_rates_in_another_unit_are_refused_whatever_their_sign(factor, words, rng):
+    rates = rng.normal(0, 0.01, (50, 3))
+    if not words:
+        _refuse_other_units(rates, factor * rates)
+        return
+    with pytest.raises(TooFewCases, match=re.escape(words)):
+        _refuse_other_units(rates, factor * rates)
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_wild_value_is_wild_on_either_side_and_wherever_the_others_are(sign):
+    """Of sizes 1 the scatter is 1.4826; eight of them are 11.86, five 7.41."""
+    rates = sign * np.ones((60, 2))
+    rates[3, 0] = 11.8 * sign
+    rates[4, 1] = -11.9 * sign
+    rates[5, 0] = 11.9 * sign
+    assert np.flatnonzero(~_near_rates(rates)).tolist() == [4, 5]
+    rates[:9, 0] = 99.0 * sign
+    assert _near_rates(rates).all()  # 15 % are what the tracker does
+    stars = sign * np.array([1.0, 1.0, 1.0, 7.4, 7.5, -7.4, -7.5])
+    assert _near(stars, 5.0, stars[:3]).tolist() == [True] * 4 + [False, True, False]
+    assert _near(stars[:5], 5.0).tolist() == [True] * 4 + [False]
 
 
 def test_a_turn_that_all_stars_share_is_not_a_stars_noise(rng: np.random.Generator) -> None:

@@ -13,6 +13,7 @@ from scipy import stats
 from scipy.special import ndtr
 
 from hilstar.display.calibration import weights_of_grid
+from hilstar.instruments.calibrate.first_light import context
 from hilstar.instruments.calibrate.first_light.context import FittedFigure
 from hilstar.instruments.calibrate.first_light.seen_stars import (
     StarSpot,
@@ -183,12 +184,44 @@ def test_stars_that_miss_a_limit_are_a_reason_each(figures, is_scattered, words)
     assert LOST_SHARE == 0.1
 
 
-def test_a_scale_that_stars_contradict_says_by_how_much():
-    assert _contradictions(0.01, 0.01, 0.001) == []
-    (scattered,) = _contradictions(0.9, 0.001, 0.001)
-    assert "disagree by 0.900 mag" in scattered
-    (noisy,) = _contradictions(0.01, 0.01, 0.9)
-    assert "too noisy" in noisy
+# Limits of 0.05 mag, and of three errors where those are more.
+@pytest.mark.parametrize(
+    ("scatter", "over_light", "error_mag", "words"),
+    [
+        ((0.01, 0.01), (0.01, 0.01), 0.001, []),
+        ((0.049, 0.001), (0.049, 0.001), 0.049, []),
+        ((0.9, 0.001), (0.0, 0.0), 0.001, ["disagree by 0.900 mag"]),
+        ((0.29, 0.1), (0.0, 0.0), 0.001, []),
+        ((0.31, 0.1), (0.0, 0.0), 0.001, ["disagree by 0.310 mag"]),
+        ((0.01, 0.01), (0.0, 0.0), 0.9, ["too noisy"]),
+        ((0.01, 0.01), (0.051, 0.01), 0.001, ["changes by 0.051 +- 0.010 mag"]),
+        ((0.01, 0.01), (-0.051, 0.01), 0.001, ["changes by 0.051 +- 0.010 mag"]),
+        ((0.01, 0.01), (0.29, 0.1), 0.001, []),
+        ((0.01, 0.01), (-0.29, 0.1), 0.001, []),
+        ((0.01, 0.01), (-0.31, 0.1), 0.001, ["changes by 0.310 +- 0.100 mag"]),
+        ((0.9, 0.01), (0.9, 0.1), 0.9, ["disagree", "too noisy", "changes by 0.900"]),
+    ],
+)
+def test_a_scale_that_stars_contradict_says_by_how_much(scatter, over_light, error_mag, words):
+    contradictions = _contradictions(scatter, over_light, error_mag)
+    assert len(contradictions) == len(words)
+    for contradiction, word in zip(contradictions, words, strict=True):
+        assert word in contradiction
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_the_psf_of_the_focus_counts_where_it_contradicts_the_bench_file(monkeypatch, sign):
+    """Within two of its errors it is the bench file's, narrower or wider; unmeasured, too."""
+    monkeypatch.setattr(context, "psf_sigma_of", lambda file: 1.0)
+
+    def agreed_px(measured_px: float, **known: float) -> float:
+        step = SimpleNamespace(file=None, psf_sigma_px=measured_px, known=known)
+        return context.StepContext.agreed_psf_sigma_px.fget(step)
+
+    error = {"focus.psf_sigma_error_px": 0.1}
+    assert agreed_px(1 + 0.19 * sign, **error) == 1.0
+    assert agreed_px(1 + 0.21 * sign, **error) == 1 + 0.21 * sign
+    assert agreed_px(1 + 0.9 * sign) == 1.0
 
 
 def dots(count: int, rng, size_px=(160, 90)) -> DotLight:

@@ -5,6 +5,7 @@ noise, scatter and areas, each against a closed form or planted noise.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -129,6 +130,23 @@ def test_what_follows_place_or_light_is_told_apart(rng):
     object.__setattr__(stars, "codes_mag", codes_mag)
     assert stars.scatter(codes_mag + noise, used).finding == ""
     assert Scatter(0.031, 0.01, 0.0, 0.0).finding != "" == Scatter(0.029, 0.01, 0.0, 0.0).finding
+
+
+# Under 0.01 mag; of fewer than ten such stars the ten with the least noise, under 0.1 mag.
+@pytest.mark.parametrize(
+    ("noise_mag", "sure"),
+    [
+        ([0.002, 0.009, 0.005], [True, True, True]),
+        ([0.002, 0.05, 0.09], [True, True, True]),
+        ([0.002, 0.05, 0.11], [True, True, False]),
+        ([0.2, 0.3], [False, False]),
+        ([0.001] * 10 + [0.009, 0.011], [True] * 11 + [False]),
+        ([0.03] * 9 + [0.05, 0.04], [True] * 9 + [False, True]),
+    ],
+)
+def test_stars_are_sure_by_their_noise_or_by_being_the_few_with_the_least(rng, noise_mag, sure):
+    stars = replace(seen(rng, count=len(sure)), noise_mag=np.array(noise_mag))
+    assert stars.sure.tolist() == sure
 
 
 def test_places_are_refused_by_what_is_sure_and_frames_asked_for_by_what_is_not(rng):

@@ -286,6 +286,32 @@ def test_symbols_and_units_of_a_sheet_are_read_as_people_spell_them(tmp_path, ro
     assert [nm for nm, _ in sensor.efficiency] == ([530] if "530" in rows else [])
 
 
+# What was converted may be rounded: by 5 %, to either side.
+@pytest.mark.parametrize(
+    ("rows", "is_alike"),
+    [
+        ("K,0.25,DN/e-\n1/K,4.19,e-/DN", True),
+        ("K,0.25,DN/e-\n1/K,3.81,e-/DN", True),
+        ("K,0.25,DN/e-\n1/K,4.21,e-/DN", False),
+        ("K,0.25,DN/e-\n1/K,3.79,e-/DN", False),
+        ("K,0.25,DN/e-\nK,0.2501,DN/e-", False),
+        ("K,0.25,DN/e-\nK,0.2499,DN/e-", False),
+        ("K,0.25,DN/e-\nsigma_d,2.6,e-\nsigma_d,0.68,DN", True),
+        ("K,0.25,DN/e-\nsigma_d,2.6,e-\nsigma_d,0.62,DN", True),
+        ("K,0.25,DN/e-\nsigma_d,2.6,e-\nsigma_d,0.69,DN", False),
+        ("K,0.25,DN/e-\nsigma_d,2.6,e-\nsigma_d,0.61,DN", False),
+    ],
+)
+def test_two_values_of_a_quantity_are_one_or_refused(tmp_path, rows, is_alike):
+    sheet = tmp_path / "sheet.csv"
+    sheet.write_text(f"quantity,value,unit\n{rows}\n")
+    if is_alike:
+        assert import_emva(sheet).keys["gain_e_per_dn"] == pytest.approx(4)
+        return
+    with pytest.raises(InputError, match="leave one of them"):
+        import_emva(sheet)
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
     [(b"BITPIX  ", b"????????"), (b"NAXIS2  ", b"????????"), (b"EXPTIME = ", b"EXPTIME = ?")],

@@ -15,9 +15,9 @@ from astropy.time import Time
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
-from hilstar.instruments.campaign.cases import CaseMaker
+from hilstar.instruments.campaign.cases import CaseMaker, value_kind
 from hilstar.instruments.campaign.job import Job, files_sha256
-from hilstar.instruments.campaign.plan import Design, parse_plan
+from hilstar.instruments.campaign.plan import Design, Parameter, parse_plan
 from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import read_bench_file
@@ -367,3 +367,18 @@ def test_frames_along_a_log_have_the_log_s_rate(tmp_path: Path) -> None:
                 assert told == pytest.approx([axis_rate_deg_s] * 2, rel=1e-5)
     finally:
         session.close()
+
+
+@pytest.mark.parametrize(
+    ("values", "kind"),
+    [
+        ((2**63 - 1, -(2**63 - 1)), "int64"),
+        ((1, 2**63), "float64"),
+        ((1, -(2**63) - 1), "float64"),
+        ((True, False), "bool"),
+        ((1, 0.5), "float64"),
+        ((1, "round"), "text"),
+    ],
+)
+def test_whole_values_are_whole_numbers_where_they_have_64_bits(values, kind) -> None:
+    assert value_kind(Parameter("key", values)) == kind

@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 from hilstar.instruments.assess.bounded_figures import (
+    BoundedFigure,
     TooFewCases,
     clopper_pearson,
     drawn_limits,
@@ -179,6 +180,28 @@ def test_a_verdict_s_words_say_the_limit_the_figure_and_what_would_decide():
     open_ = found(cases, "availability", minimum=0.83)
     assert open_.verdict == NOT_SHOWN
     assert f"about {open_.more} more cases would decide" in open_.words
+
+
+# An interval of +-1 about the figure in 100 cases, a limit of 10: (1 / away)^2 times the cases.
+@pytest.mark.parametrize(
+    ("value", "bench_arcsec", "more"),
+    [
+        (9.5, 0.0, 300),
+        (10.5, 0.0, 300),
+        (10.0, 0.0, None),
+        (9.0 + 1e-9, 0.0, 1),
+        (7.5, 2.0, 300),
+        (12.5, 2.0, 300),
+        (8.5, 2.0, None),
+        (11.5, 2.0, None),
+    ],
+)
+def test_what_would_decide_is_more_cases_but_within_the_bench_s_error(value, bench_arcsec, more):
+    """The bench's error is taken off the limit, and more cases make it no smaller."""
+    figure = BoundedFigure(value, value - 1, value + 1, 100, "")
+    require = Require(quantity="bias", maximum=10.0, axis="cross")
+    verdict = requirements.judged_figure(require, figure, (bench_arcsec, bench_arcsec))
+    assert (verdict.verdict, verdict.more) == (NOT_SHOWN, more)
 
 
 def parts_of(rng: np.random.Generator, count: int = 400) -> Decomposed:

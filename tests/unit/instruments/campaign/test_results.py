@@ -285,3 +285,18 @@ def test_a_case_s_measures_are_about_the_median_and_count_what_is_missing() -> N
     assert found["roll"].values == pytest.approx(np.abs(z))
     assert found["centroid"].values == pytest.approx(np.full(count, math.sqrt(7.0)))
     assert found["unanswered"].values == pytest.approx(np.full(count, 0.5))
+
+
+def test_cases_without_a_frame_have_no_share_and_no_error() -> None:
+    """A count of 0 or unknown counts as 1: nothing was answered, and nothing was asked."""
+    none = np.array([0.0, math.nan])
+    assert results._ratio(none, none) == 0.0
+    assert results._ratio(np.array([2.0, 1.0]), np.array([3.0, 1.0])) == pytest.approx(0.75)
+    cases = columns_of(
+        **vectors_of("error_{}_arcsec", "xyz", np.ones((16, 3))),
+        solved=[0.0] * 8 + [1.0] * 8,
+        wrong=[0.0] * 16,
+        frames=[0.0] * 4 + [math.nan] * 4 + [2.0] * 8,
+    )
+    by_name = {measure.name: measure for measure in results.measures(cases)}
+    assert by_name["unanswered"].values.tolist() == [1.0] * 8 + [0.5] * 8

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from hilstar.basics.errors import InputError
 from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.sweep import (
     LevelCount,
@@ -112,3 +113,26 @@ def test_a_case_is_a_success_where_half_of_its_frames_are_right() -> None:
         False,
         False,
     ]
+
+
+@pytest.mark.parametrize(
+    ("start", "stop", "scale", "is_taken"),
+    [
+        (1.0, 2.0, "log", True),
+        (2.0, 1.0, "log", True),
+        (1.0, 0.0, "log", False),
+        (0.0, 1.0, "log", False),
+        (1.0, -2.0, "log", False),
+        (-2.0, 1.0, "log", False),
+        (1.0, -2.0, "linear", True),
+        (-2.0, 1.0, "linear", True),
+        (1.0, 1.0, "linear", False),
+    ],
+)
+def test_a_sweep_by_factors_has_both_ends_above_0(start, stop, scale, is_taken) -> None:
+    sweep = SweepTable(key="key", start=start, stop=stop, scale=scale)
+    if is_taken:
+        sweep.check("set")
+        return
+    with pytest.raises(InputError, match=r"^set: "):
+        sweep.check("set")

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from hilstar.display.render.reference import linear_image
-from hilstar.instruments.compare.star_fit import StarTemplates, bright_pixels, describes
+from hilstar.instruments.compare.star_fit import (
+    StarTemplates,
+    blend_distance_px,
+    bright_pixels,
+    describes,
+    nameless_seeds,
+)
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import pack_sprites
@@ -52,3 +59,17 @@ def test_bright_pixels_are_places_x_and_y_brightest_first():
     image[4, 25], image[11, 7], image[11, 8] = 5.0, 9.0, 3.0
     places = bright_pixels(image, np.full(image.shape, 1.0))
     assert places.tolist() == [[7.0, 11.0], [25.0, 4.0]]
+
+
+# 1.5 sigmas of the wider axis, and never under 1.25 px
+@pytest.mark.parametrize(
+    ("width_px", "distance_px"),
+    [((0.5, 0.6), 1.25), ((0.9, 0.5), 1.35), ((0.5, 0.9), 1.35), ((2.0, 2.0), 3.0)],
+)
+def test_two_stars_are_one_blend_by_the_psf_s_width(width_px, distance_px):
+    psf = GaussianPsf(width_px)
+    assert blend_distance_px(psf) == pytest.approx(distance_px)
+    places_px = np.array([[10.0, 10.0], [10.0 + 0.99 * distance_px, 10.0]])
+    assert len(nameless_seeds(places_px, psf).places_px) == 1
+    places_px[1, 0] = 10.0 + 1.01 * distance_px
+    assert len(nameless_seeds(places_px, psf).places_px) == 2

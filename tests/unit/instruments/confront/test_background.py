@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -170,3 +172,16 @@ def test_sky_beyond_the_clip_is_a_star_s(rng):
     dn[::3, ::3] += 20 * CLIP * NOISE_DN
     level = sky_level(dn, STEP_DN).level
     assert np.mean(level) == pytest.approx(100.0, abs=5 * NOISE_DN / np.sqrt(dn.size))
+
+
+@pytest.mark.parametrize(("length_px", "half_px"), [(100.0, 50), (160.0, 80), (400.0, 80)])
+def test_what_is_left_out_about_a_long_source_is_bounded(length_px, half_px):
+    """A trail across the whole image leaves the rest of it."""
+    dark = np.zeros((300, 300))
+    trail = SimpleNamespace(
+        x_px=np.array([150.0]), y_px=np.array([140.0]), length_px=np.array([length_px])
+    )
+    mask = source_mask(trail, dark, 2)
+    y, x = np.indices(dark.shape)
+    reach_px = half_px + 2
+    assert np.array_equal(mask, (abs(y - 140) <= reach_px) & (abs(x - 150) <= reach_px))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from hilstar.instruments.confront import judge
 from hilstar.instruments.confront.excess import Part, _by_law, _rest, _taken
 from hilstar.instruments.confront.judge import StarRow, defects, light_at
 from hilstar.instruments.confront.light import (
@@ -337,3 +338,20 @@ def test_planes_of_a_mosaic_have_a_colour_each(rng):
     expected = dict(zip("rgb", colours_mag.tolist(), strict=True))
     assert fit.colour_terms == pytest.approx(expected, abs=2 * LIGHT_ERROR_MAG)
     assert fit.offsets_mag == pytest.approx(OFFSETS_MAG, abs=LIGHT_ERROR_MAG)
+
+
+# Hipparcos is complete to V = 7.3 + 1.1 |sin b| (ESA SP-1200): as deep at either galactic pole.
+@pytest.mark.parametrize(
+    ("latitude_deg", "complete_v_mag"), [(90.0, 8.4), (-90.0, 8.4), (30.0, 7.85), (-30.0, 7.85)]
+)
+def test_a_catalogue_is_complete_by_the_latitude_s_size(latitude_deg, complete_v_mag):
+    pole = judge.GALACTIC_POLE
+    on_equator = np.cross(pole, [0.0, 0.0, 1.0])
+    on_equator /= np.linalg.norm(on_equator)
+    latitude = math.radians(latitude_deg)
+    boresight = math.sin(latitude) * pole + math.cos(latitude) * on_equator
+    shot = SimpleNamespace(clean=np.zeros(3, dtype=bool))
+    camera = SimpleNamespace(pointings=[SimpleNamespace(boresight=boresight)])
+    judging = SimpleNamespace(session=SimpleNamespace(shots=[shot], camera=camera))
+    fainter = judge.Judge._fainter(judging, 0, None)
+    assert fainter.complete_v_mag == pytest.approx(complete_v_mag, abs=1e-5)  # of the pole's digits

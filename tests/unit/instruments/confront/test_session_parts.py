@@ -33,6 +33,7 @@ from hilstar.instruments.confront.measured_bench import (
 from hilstar.instruments.confront.photon_transfer import PixelFit
 from hilstar.instruments.confront.run import _base
 from hilstar.instruments.confront.session import (
+    MAX_TONE_STEP,
     PIVOT_NM,
     WIDE_PX,
     _channel_mag,
@@ -42,6 +43,7 @@ from hilstar.instruments.confront.session import (
     _reach_px,
     _seen_at,
     _star_light,
+    _tone_step,
     _why_not,
     check_focus,
     corrected,
@@ -403,3 +405,16 @@ def test_stars_of_all_photographs_are_in_one_row_each_with_its_image_and_plane()
     assert light.clean.tolist() == [True, False, True, True, True, False]
     # half of the diagonal of 800 x 600 px is 500 px
     assert light.radius2 == pytest.approx([0.0, 0.64, 0.0, 1.0, 0.0, 2.08])
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+def test_a_step_of_the_power_is_a_secant_s_within_its_limit(sign):
+    """Slopes of -1 and -0.01 lead to the root; one of 1 and more leads away from it."""
+    secant = _tone_step((0.0, 0.3 * sign), (0.2 * sign, 0.1 * sign))
+    assert secant == pytest.approx(0.1 * sign)
+    far = _tone_step((0.0, 0.3 * sign), (0.1 * sign, 0.299 * sign))
+    assert far == MAX_TONE_STEP * sign
+    turned = _tone_step((0.0, 0.1 * sign), (0.1 * sign, 0.2 * sign))
+    assert turned == pytest.approx(0.2 * sign)
+    far_turned = _tone_step((0.0, 0.1 * sign), (0.1 * sign, 9.0 * sign))
+    assert far_turned == MAX_TONE_STEP * sign

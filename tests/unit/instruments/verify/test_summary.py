@@ -14,6 +14,7 @@ import pytest
 from hilstar.basics.error_spread import ErrorSpread
 from hilstar.instruments.verify.measure import (
     Comparison,
+    GeometryFit,
     GlowFit,
     MatchTally,
     Measured,
@@ -21,7 +22,7 @@ from hilstar.instruments.verify.measure import (
     glass_effect,
 )
 from hilstar.instruments.verify.summary import summarise, summary_lines, write_report
-from hilstar.instruments.verify.verdict import judge
+from hilstar.instruments.verify.verdict import _geometry, judge
 from hilstar.server.bench.star_size import StarSize
 from tests.support.tables import csv_rows
 
@@ -243,6 +244,43 @@ def test_each_channel_is_compared_in_the_squares_of_its_stars():
     (first,), (second,) = made.tally.channels_mag
     assert first == pytest.approx(-2.5 * math.log10(0.8), abs=ROUNDING)
     assert second == pytest.approx(2.5 * math.log10(1.1), abs=ROUNDING)
+
+
+# Of 100 x 90 px the corner is 67.3 px from the middle: 0.5 px there are 0.743 %, and 0.426 deg.
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize(
+    ("off", "reason"),
+    [
+        ({"scale_error": 0.0074}, ""),
+        ({"scale_error": 0.0075}, "the plate scale is {}0.75% off"),
+        ({"rotation_rad": 0.0074}, ""),
+        ({"rotation_rad": 0.0075}, "the field is turned by {}0.430 deg"),
+        ({"offset_px": (0.49, 0.0)}, ""),
+        ({"offset_px": (0.51, 0.0)}, "the field is shifted by ({}0.51, +0.00) px"),
+        ({"offset_px": (0.0, 0.51)}, "the field is shifted by (+0.00, {}0.51) px"),
+    ],
+)
+def test_a_geometry_is_off_beyond_the_limit_to_either_side(sign, off, reason):
+    exact = GeometryFit(0.0, 0.0, (0.0, 0.0), (0.0, 0.0), 0.0, 0.0, 0.0, 0.0, 0.0)
+    signed = {}
+    for name, value in off.items():
+        signed[name] = sign * value if name != "offset_px" else tuple(sign * np.array(value) + 0.0)
+    errors = SimpleNamespace(geometry=replace(exact, **signed))
+    reasons = _geometry(measured(), errors)
+    assert len(reasons) == bool(reason)
+    for words in reasons:
+        assert words.startswith(reason.format("+" if sign > 0 else "-"))
+
+
+def test_a_glass_that_brightens_is_as_far_off_as_one_that_dims():
+    stars = [star(1, (4.0, 10.0, 20.0) + (0.0,) * 7)]
+    for light in (0.5, 2.0):
+        glass = SimpleNamespace(
+            by_colour=True,
+            mean_shares=None,
+            centroids_px=lambda x, y, shares, light=light: (x, y, np.array([light])),
+        )
+        assert glass_effect(glass, stars).mag == pytest.approx(2.5 * math.log10(2))
 
 
 def test_a_glass_is_off_its_chief_rays_and_vignettes_at_95_percent():

@@ -149,7 +149,7 @@ def test_the_aperture_is_as_stated(system, kind, pupil):
     assert (lens.pupil_kind, lens.pupil) == (kind, pytest.approx(pupil))
 
 
-@pytest.mark.parametrize("far", ["1e10", "1e11", "0.1e14", "INF", "993938392063.0"])
+@pytest.mark.parametrize("far", ["1e10", "1e11", "0.1e14", "INF", "993938392063.0", "-1e10"])
 def test_a_far_object_is_at_infinity(far):
     assert focal_length_mm(read_codev(seq(far=far))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
 
@@ -257,6 +257,19 @@ def test_a_lens_is_the_same_in_every_encoding(encoding):
 @pytest.mark.parametrize("words", ["CIR", "CIR 0", "CIR -2"])
 def test_an_aperture_without_a_size_is_refused(words):
     assert "has no size; write its half-width" in refusal(read_codev, seq(more={1: [words]}))
+
+
+@pytest.mark.parametrize(
+    ("x_deg", "y_deg", "wanted"),
+    [
+        ("0 1 -2", "0", [(0, 0), (1, 0), (-2, 0)]),
+        ("0", "0 1 -2", [(0, 0), (0, 1), (0, -2)]),
+        ("0.5", "-1", [(0.5, -1)]),
+    ],
+)
+def test_fields_are_as_many_as_are_listed_on_either_axis(x_deg, y_deg, wanted):
+    lens = read_codev(seq(f"XAN {x_deg}", f"YAN {y_deg}"))
+    assert [(point.x, point.y) for point in lens.fields] == wanted
 
 
 def test_a_field_s_pupil_is_cut_by_what_is_above_and_below_along_each_axis():

@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 from hilstar.optics.glass import zernike
-from hilstar.optics.glass.zernike import Pupil, PupilField, Term, aperture, diffracted
+from hilstar.optics.glass.zernike import (
+    MAX_STEP_WAVES,
+    PUPIL,
+    Pupil,
+    PupilField,
+    Term,
+    aperture,
+    diffracted,
+)
+from tests.support.refusals import refusal
 
 # the pupil's samples are finer at its edge; measured 2e-4
 AREA = 2e-3
@@ -66,3 +75,24 @@ def test_a_wavefront_is_hopkins_s_of_its_coefficient(kind, h):
     lit = np.abs(field) > 0
     wave_nm = (90.0 + 0.2 * 50.0) * SEIDEL[kind](h, x, y)[lit]
     np.testing.assert_allclose(np.angle(field[lit]) * 550.0 / (2 * np.pi), wave_nm, atol=1e-9)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("along", [(1.0, 0.0), (0.0, 1.0)], ids=["right", "down"])
+def test_a_wavefront_too_steep_for_the_pupil_s_samples_is_refused_either_way(sign, along):
+    """Coma at the field's edge, rho^2 y: along the field it changes by at most 3 of its
+    coefficient a radius, all one way, and by a third of that across.
+    """
+    waves_a_coefficient = 3 * 2 / PUPIL  # from one sample to the next
+    size = (1001, 1201)
+    edge_px = np.array(along) * np.hypot(*size) / 2
+
+    def field_of(step_waves: float):
+        nm = sign * step_waves / waves_a_coefficient * 550.0
+        pupil = Pupil(**FAST | {"resolution_px": size, "terms": (Term(kind="W131", nm=nm),)})
+        return PupilField(pupil)
+
+    line = refusal(field_of(1.2 * MAX_STEP_WAVES), edge_px, 550.0, 0.0)
+    assert "waves from one of 256 pupil samples to the next" in line
+    field = field_of(0.9 * MAX_STEP_WAVES)(edge_px, 550.0, 0.0)
+    assert np.isfinite(field).all()

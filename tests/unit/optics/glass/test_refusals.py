@@ -50,6 +50,10 @@ ZEMAX = [
         r"surface 1 \(line \d+\) has a radius of 61.47 mm, and the pupil is 200 mm wide",
     ),
     (
+        zmx("ENPD 200", surfaces=((-61.47, 6.0, "N-BK7"), (44.64, 95.0, ""))),
+        r"surface 1 \(line \d+\) has a radius of -61.47 mm, and the pupil is 200 mm wide",
+    ),
+    (
         zmx_surface("USAP lens.uda"),
         r"line \d+: USAP at surface 1 is an aperture of a shape of its own",
     ),
@@ -109,6 +113,15 @@ CODEV = [
     (
         seq("RDM").replace(b"RDM\n", b""),
         r"surface 1 \(line \d+\) has 61.47, which without RDM is a curvature.*write RDM Y",
+    ),
+    (
+        seq("RDM", surfaces=((-61.47, 6.0, "N-BK7"), (44.64, 95.0, ""))).replace(b"RDM\n", b""),
+        r"surface 1 \(line \d+\) has -61.47, which without RDM is a curvature",
+    ),
+    (
+        # the way to a mirror's image is negative
+        seq("RDM", surfaces=((0.5, -100.0, ""),)).replace(b"RDM\n", b""),
+        r"surface 1 \(line \d+\) has 0.5, which without RDM is a curvature",
     ),
     (seq_surface("CYL"), "CYL at surface 1"),
     (seq_surface("DIF DOE"), "DIF at surface 1"),
@@ -225,10 +238,18 @@ def put(unit: str | int, column: str, place, value):
     return spoil
 
 
+def rolled(samples: int, axis: int):
+    def spoil(hdus):
+        hdus[0].data = np.roll(hdus[0].data, samples, axis)
+
+    return spoil
+
+
 SPOILT = [
     (put("POINTS", "x_px", 0, np.nan), "x_px, y_px or focus_um is not finite"),
     (put("POINTS", "weights", (0, 0), np.inf), "a place, a focus, a weight or a sample is not fin"),
     (put("POINTS", "weights", (0, 0), 0.5), "the PSF at (0, 0) px, 450 nm sums to "),
+    (put("POINTS", "weights", (0, 0), 1.5), "the PSF at (0, 0) px, 450 nm sums to "),
     (put("POINTS", "lateral_x_px", 0, np.nan), "a place, a focus, a weight or a sample is not fin"),
     (put("POINTS", "outside_share", 0, 1.0), "outside_share is not within 0 to 1"),
     (put("POINTS", "relative_illumination", 0, -0.1), "relative_illumination is not within 0 to 2"),
@@ -248,10 +269,10 @@ SPOILT = [
         lambda hdus: setattr(hdus[0], "data", hdus[0].data[:-1]),
         "write one weight for each",
     ),
-    (
-        lambda hdus: setattr(hdus[0], "data", np.roll(hdus[0].data, 27, axis=2)),
-        "put the chief ray there",
-    ),
+    (rolled(27, axis=2), "put the chief ray there"),
+    (rolled(-27, axis=2), "put the chief ray there"),
+    (rolled(27, axis=1), "put the chief ray there"),
+    (rolled(-27, axis=1), "put the chief ray there"),
 ]
 
 

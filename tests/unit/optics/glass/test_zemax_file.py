@@ -99,7 +99,7 @@ def test_every_length_of_a_lens_is_scaled(unit, mm):
     assert numbers_of(read_zemax(zmx_of_every_length(unit, mm))) == pytest.approx(in_mm, rel=1e-12)
 
 
-@pytest.mark.parametrize("far", ["INFINITY", "1.0E+010", "1e10", "1E+13", "inf"])
+@pytest.mark.parametrize("far", ["INFINITY", "1.0E+010", "1e10", "1E+13", "inf", "-1e10"])
 def test_a_far_object_is_at_infinity(far):
     assert focal_length_mm(read_zemax(zmx(far=far))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
 
@@ -125,6 +125,23 @@ def test_the_aperture_is_as_stated(lines, kind, pupil):
 def test_one_field_on_the_axis_is_one_field():
     lens = read_zemax(zmx().replace(b"FTYP 0 0 2 1", b"FTYP 0 0 1 1"))
     assert [(point.x, point.y) for point in lens.fields] == [(0.0, 0.0)]
+
+
+@pytest.mark.parametrize(
+    ("count", "x_deg", "y_deg", "wanted"),
+    [
+        (3, "0 1 -2", "0 0 0", [(0, 0), (1, 0), (-2, 0)]),
+        (3, "0 0 0", "0 1 -2", [(0, 0), (0, 1), (0, -2)]),
+        (3, "0", "0 1 -2", [(0, 0), (0, 1), (0, -2)]),
+        (3, "0 1 -2", "0", [(0, 0), (1, 0), (-2, 0)]),
+        (2, "0 1 -2", "0 0 0", [(0, 0), (1, 0)]),  # there is room for one more
+        (5, "0 1 -2", "0 0 0", [(0, 0), (1, 0), (-2, 0)]),  # more than there are
+        (0, "0 1", "0 0", [(0, 0), (1, 0)]),
+    ],
+)
+def test_fields_are_as_many_as_counted_and_listed_on_either_axis(count, x_deg, y_deg, wanted):
+    text = zmx(f"FTYP 0 0 {count} 1", "ENPD 20", f"XFLN {x_deg}", f"YFLN {y_deg}")
+    assert [(point.x, point.y) for point in read_zemax(text).fields] == wanted
 
 
 @pytest.mark.parametrize(

@@ -63,12 +63,13 @@ def test_segments_are_not_joined_and_covariances_and_accelerations_are_passed_ov
         assert orbit.state(t_ns)[0] == pytest.approx(STATION.state(t_ns)[0], abs=PLACE_KM)
 
 
-def test_beyond_its_epochs_the_last_place_is_held_and_told_once(caplog):
+@pytest.mark.parametrize(("beyond_s", "end_s"), [((1201, 9000), 1200), ((-1, -9000), 0)])
+def test_beyond_its_epochs_the_nearest_place_is_held_and_told_once(caplog, beyond_s, end_s):
     orbit = station(oem(segment(MINUTES)))
     with caplog.at_level(logging.WARNING):
-        late = [orbit.state(START_NS + s * NS)[0] for s in (1201, 9000)]
-    assert late[0] == pytest.approx(STATION.state(START_NS + 1200 * NS)[0], abs=PLACE_KM)
-    assert late[1].tolist() == late[0].tolist()
+        beyond = [orbit.state(START_NS + s * NS)[0] for s in beyond_s]
+    assert beyond[0] == pytest.approx(STATION.state(START_NS + end_s * NS)[0], abs=PLACE_KM)
+    assert beyond[1].tolist() == beyond[0].tolist()
     assert len(caplog.records) == 1 and "is held" in caplog.text
 
 
@@ -140,6 +141,18 @@ ROW = next(line for line in GOOD.splitlines() if line.startswith("2008"))
         ),
         (
             GOOD.replace(ROW, ROW.split(" ")[0] + " 7000e3 0 0 0 7.5e3 0"),
+            "write km from the Earth's centre",
+        ),
+        (
+            GOOD.replace(ROW, ROW.split(" ")[0] + " -7000e6 0 0 0 7.5 0"),
+            "write km from the Earth's centre",
+        ),
+        (
+            GOOD.replace(ROW, ROW.split(" ")[0] + " 7000 0 0 0 -7.5e3 0"),
+            "write km from the Earth's centre",
+        ),
+        (
+            GOOD.replace(ROW, ROW.split(" ")[0] + " 7000 0 0 0 7.5e3 0"),
             "write km from the Earth's centre",
         ),
         (GOOD[: GOOD.index("META_STOP")], "ends in the metadata"),

@@ -198,11 +198,12 @@ def test_decayed_satellites_are_left_out_with_one_line_and_the_others_stay(rng, 
     assert "LOST 0" in caplog.text
 
 
-def test_elements_of_another_month_are_warned_of_once(caplog):
+@pytest.mark.parametrize("way", [1, -1], ids=["after the elements", "before them"])
+def test_elements_of_another_month_are_warned_of_once(caplog, way):
     """At the moment at which they are used, not at that of the start."""
     sky = satellite_sky(some_orbits(np.random.default_rng(1), 4), Geocentre())
     for days in (0, 13, 40, 50, 0):
-        sky.passing(EVERYWHERE, days * 86_400 * S_NS)
+        sky.passing(EVERYWHERE, way * days * 86_400 * S_NS)
         assert len(caplog.records) == (days >= 40 or bool(caplog.records))
     assert len(caplog.records) == 1
     assert "4 of 4 satellites are more than 14 days from the sky's date (40 at most)" in caplog.text

@@ -309,9 +309,8 @@ def temperature_ballesteros2012_k(bv_mag: FloatArray) -> FloatArray:
 
 def temperature_wang2021_k(bv_mag: FloatArray) -> FloatArray:
     """Colour temperature from B-V, thesis eq. 3.13: jumps from 9260 K to 8910 K at B-V = 0."""
-    # The branch not taken is held at its own edge: exp(-BV/0.098) overflows for no star then.
-    hot = 1079.20644 * np.exp(-np.minimum(bv_mag, 0.0) / 0.09824) + 8180.59419
-    cool = 8906.09411 * np.exp(-np.maximum(bv_mag, 0.0) / 1.59761) + 3.633
+    hot = 1079.20644 * np.exp(-bv_mag / 0.09824) + 8180.59419
+    cool = 8906.09411 * np.exp(-bv_mag / 1.59761) + 3.633
     return np.where(bv_mag < 0, hot, cool)
 
 

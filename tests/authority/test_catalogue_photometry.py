@@ -64,11 +64,20 @@ def test_tycho_s_relation_is_the_published_one():
     )
 
 
-def test_beyond_its_range_tycho_s_relation_goes_on_without_a_step():
-    edge = np.array([2.0, 2.0 + 1e-9, 3.0])
-    v, bv = from_tycho(10 + edge, np.full(3, 10.0))
+@pytest.mark.parametrize(("edge_mag", "way"), [(2.0, 1), (-0.25, -1)], ids=["red", "blue"])
+def test_beyond_its_range_tycho_s_relation_goes_on_without_a_step(edge_mag, way):
+    colour = edge_mag + way * np.array([0.0, 1e-9, 1.0])
+    v, bv = from_tycho(10 + colour, np.full(3, 10.0))
     assert v == pytest.approx(np.full(3, v[0]), abs=1e-9)
-    assert np.diff(bv) == pytest.approx([0, 1], abs=1e-8)
+    assert np.diff(bv) == pytest.approx([0, way], abs=1e-8)
+
+
+@pytest.mark.parametrize(("edge_mag", "way"), [(4.5, 1), (-0.5, -1)], ids=["red", "blue"])
+def test_beyond_its_range_gaia_s_relation_is_that_of_its_end(edge_mag, way):
+    """Polynomials of up to the third power, which run away from what they were fitted to."""
+    v, vi = from_gaia(np.full(3, 10.0), edge_mag + way * np.array([0.0, 0.1, 3.0]))
+    assert v == pytest.approx(np.full(3, v[0]), abs=1e-12)
+    assert vi == pytest.approx(np.full(3, vi[0]), abs=1e-12)
 
 
 def test_gaia_magnitudes_become_those_of_the_spectra():

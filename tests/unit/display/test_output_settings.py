@@ -143,7 +143,9 @@ def test_the_size_by_the_edid_is_compared_with_the_bench_s_pitch(block, pitch_um
 
 def test_the_size_in_mm_is_that_of_the_first_detailed_timing():
     assert size_mm_of(edid((598, 336))) == (598, 336)
-    assert size_mm_of(edid((16, 9))) is None
+    assert size_mm_of(edid((21, 21))) == (21, 21)
+    for aspect in ((16, 9), (21, 9), (9, 21), (20, 20)):
+        assert size_mm_of(edid(aspect)) is None
     assert size_mm_of(b"") is None
 
 

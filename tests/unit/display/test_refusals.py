@@ -143,3 +143,15 @@ def test_the_way_of_drawing_is_one_of_two_words(monkeypatch, word, way):
     monkeypatch.setenv(WAY_VARIABLE, "GPU")
     with pytest.raises(InputError, match="GPU: no way to draw stars; write gl or cpu"):
         wanted_way()
+
+
+def test_a_spectrometer_s_noise_below_0_is_no_light(tmp_path):
+    """A dark band of -0.2 is that of a primary without light there."""
+    noisy = [[-0.2 if power == 0 else power for power in sample] for sample in COLOURS]
+    (tmp_path / "noisy.ccss").write_text(ccss(noisy))
+    (tmp_path / "plain.ccss").write_text(ccss(COLOURS))
+    nm = np.array([400.0, 500.0, 600.0, 700.0])
+    of_noisy = [curve(nm) for curve in read_ccss(tmp_path / "noisy.ccss")]
+    of_plain = [curve(nm) for curve in read_ccss(tmp_path / "plain.ccss")]
+    assert np.array(of_noisy) == pytest.approx(np.array(of_plain))
+    assert np.min(of_noisy) == 0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from hilstar.optics import psf_fit
 from hilstar.optics.psf_fit import (
     PixelGaussians,
     PointGaussians,
@@ -166,3 +167,13 @@ def test_a_cell_s_light_is_a_gaussian_s_by_few_nodes(sigma_cells):
     light = ndtr((places + 0.5) / sigma_cells) - ndtr((places - 0.5) / sigma_cells)
     light *= sigma_cells * np.sqrt(2 * np.pi)  # of a peak of 1
     assert density == pytest.approx(light, abs=NODES_LIMIT)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_covariance_is_kept_to_that_of_a_gaussian_either_way(sign):
+    """Axes of 2 and 1 px: a covariance of 2 px^2 would be a line."""
+    wanted = np.array([[4.0, 1.0, sign * 1.5], [4.0, 1.0, sign * 3.0], [-1.0, 4.0, 0.0]])
+    kept = psf_fit.bounded(wanted)
+    assert kept[0] == pytest.approx(wanted[0])
+    assert kept[1] == pytest.approx([4.0, 1.0, sign * 2.0 * psf_fit.MAX_CORRELATION])
+    assert kept[2] == pytest.approx([psf_fit.MIN_VARIANCE_PX2, 4.0, 0.0])

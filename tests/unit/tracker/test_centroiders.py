@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.tracker.centroiders import Centroider, _profile, brightest, star_places
+from hilstar.tracker.centroiders import Centroider, _profile, brightest, psf_places, star_places
 
 SIGMA = (1.05, 0.95)
 # Of Gaussians integrated over pixels: sampling's own errors; a box of 5 x 5 cuts wings, one of 3 x
@@ -59,6 +59,17 @@ def test_noise_alone_and_clipped_stars_keep_every_place_finite(rng):
     ):
         for kind in get_args(Centroider):
             assert np.isfinite(star_places(np.maximum(images, 0), kind, SIGMA)).all()
+
+
+@pytest.mark.parametrize("place_px", [(1.2, 0.0), (-1.2, 0.0), (0.0, 1.2), (0.0, -1.2)])
+def test_a_star_that_is_off_along_one_axis_alone_is_followed_to_its_place(place_px):
+    """Four of the longest steps from its square's middle; none along the other axis, which does not
+    end the fit.
+    """
+    stamp = gaussian_images(np.array(place_px)[:, None])
+    middle = (np.zeros(1), np.zeros(1))
+    x, y = psf_places(stamp, lambda *places: gaussian_images(np.stack(places)), middle)
+    assert (x[0], y[0]) == pytest.approx(place_px, abs=BIAS_PX["psf"])
 
 
 HOSTILE = {

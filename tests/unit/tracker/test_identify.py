@@ -5,6 +5,7 @@ the truth.
 from __future__ import annotations
 
 import builtins
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -185,3 +186,30 @@ def test_a_star_over_four_times_the_median_off_is_left_out(off_px, is_left_out):
     )
     assert (27 not in identified.star) == is_left_out
     assert len(identified.star) == 64 - is_left_out
+
+
+def test_where_the_catalogue_has_few_stars_more_spots_do_not_count_against_it(sky, rng):
+    """Twelve stars of it among some hundred spots: all twelve are there."""
+    q = np.array([0.6987226, 0.7135120, -0.0370377, 0.0362700])
+    seen = SeenSky(sky, q, rng, false=60)
+    place_px = seen.place(seen.vectors @ to_matrix(q).T)
+    with np.errstate(invalid="ignore"):
+        on_image = (np.abs(place_px[0] - 511.5) < 450) & (np.abs(place_px[1] - 511.5) < 450)
+    few = seen.vectors[np.flatnonzero(on_image)[5:17]]
+    assert len(few) == 12 and len(seen.found) > 60
+    known = identify(seen.found, q, lambda q: (np.arange(12), few), seen.place)
+    assert known is not None
+    assert angle_between_rad(known.q_icrs_to_cam, q) < LIMIT_RAD * np.sqrt(2)
+
+
+@pytest.mark.parametrize("flux_e", [0.0, -40.0])
+def test_a_spot_without_light_counts_for_nothing_and_turns_nothing(sky, rng, flux_e):
+    """A level that is a little too high leaves the faintest spots none."""
+    q = normalise(rng.normal(size=4))
+    seen = SeenSky(sky, q, rng, false=0)
+    flux = seen.found.flux_e.copy()
+    flux[-2:] = flux_e
+    found = replace(seen.found, flux_e=flux)
+    known = identify(found, q, seen.near, seen.place)
+    assert known is not None
+    assert angle_between_rad(known.q_icrs_to_cam, q) < LIMIT_RAD

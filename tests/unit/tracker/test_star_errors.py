@@ -24,7 +24,7 @@ from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.tracker.centroiders import FAMILY
-from hilstar.tracker.star_errors import GOLDEN, Judge, stamp_errors
+from hilstar.tracker.star_errors import GOLDEN, Judge, StarErrors, stamp_errors
 from tests.support import centroiders as outside
 
 SIGMA = (0.85, 0.85)
@@ -185,3 +185,9 @@ def test_errors_are_the_same_wherever_stars_lie_in_their_squares_and_turn_with_t
     for kind in FAMILY:
         assert moved[kind] == pytest.approx(middle[kind], abs=SHIFT_PX), kind
         assert turned[kind][::-1] == pytest.approx(middle[kind], abs=SHIFT_PX), kind
+
+
+@pytest.mark.parametrize("sign", [1, -1], ids=["too faint", "too bright"])
+def test_the_largest_flux_error_is_the_largest_either_way(sign):
+    errors = StarErrors(np.array([0.02, -0.01, 0.3 * sign]), {})
+    assert errors.flux_max_mag == pytest.approx(0.3)

@@ -87,6 +87,27 @@ def test_a_star_off_its_place_is_the_same_where_its_magnitude_is():
     assert len(join(hipparcos, shifted(vega, 0, 6.0, 3.0)).catalog) == len(hipparcos) + 1
 
 
+def test_a_brighter_star_near_another_s_place_is_one_of_its_own():
+    """0.3 mag either way are errors of a magnitude; 3 mag are another star."""
+    hipparcos = load_catalog()
+    vega = moved_catalogue(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
+    assert len(join(hipparcos, shifted(vega, 0, 6.0, -0.3)).catalog) == len(hipparcos)
+    assert len(join(hipparcos, shifted(vega, 0, 6.0, -3.0)).catalog) == len(hipparcos) + 1
+
+
+@pytest.mark.parametrize("sign", [1, -1], ids=["fainter", "brighter"])
+def test_an_overlap_s_differences_are_said_by_their_size(sign):
+    """Of single constant stars 0.03 mag off three are 2 mag off."""
+    hipparcos = load_catalog()
+    bright = hipparcos.brighter_than(5.0)
+    plain = (bright.variable == b"") & (bright.multiple == b"")
+    table = moved_catalogue(bright.taken(plain), 2016.0, sign * 0.03)
+    v_mag = table.v_mag.copy()
+    v_mag[[5, 50, 100]] += sign * 2.0
+    line = join(hipparcos, replace(table, v_mag=v_mag)).line
+    assert f"{sign * 0.03:+.3f} mag in the median (0.030 at 95 %, 3 by more than 1)" in line
+
+
 @pytest.mark.parametrize(
     ("change", "words"),
     [

@@ -157,6 +157,12 @@ PLACES_REFUSED = {
         "radians, hours or degrees? give the column its unit",
     ),
     "west": ("raj2000,dej2000", np.radians(RA) - 3, np.radians(DEC), "radians, hours or degrees?"),
+    "one southern field": (
+        "ra,dec",
+        [1.0, 2.0, 3.0, 4.0, 5.0, 6.0],
+        [-78.0, -76.0, -75.0, -77.0, -79.0, -76.5],
+        "so it is in hours, or of one field in degrees; give the column its unit: ra_deg",
+    ),
     "degrees as radians": (
         "rarad,derad",
         RA,

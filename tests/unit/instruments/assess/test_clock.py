@@ -14,6 +14,7 @@ from hilstar.instruments.assess.clock import (
     FLOOR_ARCSEC,
     ClockFit,
     ClockSolver,
+    _correlation,
     coarse_offset,
     honest,
     speed_offsets,
@@ -178,3 +179,17 @@ def test_answers_weigh_by_tukey_s_biweight_of_their_own_scatter() -> None:
     squared = 2 * ((x - 0.5) / expected[0]) ** 2
     assert weight[:5] == pytest.approx((1 - squared[:5] / CUT_SIGMAS**2) ** 2, rel=1e-3)
     assert weight[5] == 0.0
+
+
+@pytest.mark.parametrize(("bins", "fewest"), [(200, 20), (40, 8)])
+def test_speeds_that_mirror_each_other_or_hardly_overlap_tell_nothing(bins, fewest, rng):
+    """A tenth of the shorter recording, and eight bins, have to be common to both."""
+    speed = rng.uniform(0.5, 1.5, bins)
+    alike, lag = _correlation(speed, speed)
+    # a correlation of 1 - 1e-9
+    assert alike[lag == 0] == pytest.approx(-bins * np.log(2e-9), rel=1e-6)
+    mirrored, _ = _correlation(speed, 2.0 - speed)
+    assert mirrored[lag == 0] == 0.0
+    common = bins - np.abs(lag)
+    assert not alike[common < fewest].any()
+    assert alike[(common >= fewest) & (common < 2 * fewest)].any()

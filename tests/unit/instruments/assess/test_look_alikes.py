@@ -10,8 +10,11 @@ from scipy import sparse
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.assess.budget import _field_interval
+from hilstar.instruments.assess.components import Component
 from hilstar.instruments.assess.look_alikes import (
     SLOW_WAVES,
+    LookAlikes,
     clock_covariance,
     slow_variance,
     turns_of,
@@ -114,3 +117,16 @@ def test_the_field_error_of_five_minutes_is_in_its_interval() -> None:
             held[figure].append(holds)
     for figure in ("field error across", "field error about the boresight", "clock's offset"):
         assert len(held[figure]) == RUNS and sum(held[figure]) >= MIN_RUNS_HELD, figure
+
+
+@pytest.mark.parametrize(
+    ("slow", "low", "high"), [(0.0, 100.0, 100.0), (4.0, 76.0, 120.0), (100.0, 0.0, 200.0)]
+)
+def test_a_field_error_s_interval_ends_at_0_where_a_slow_change_could_be_all_of_it(slow, low, high):
+    """Of 100 arcsec^2 by a clock that is known: less s + sqrt(100 s), and more by that root."""
+    still = np.zeros((5, 3))
+    fov = Component(np.full(3, 100.0), still, 0.0)
+    look_alikes = LookAlikes(np.zeros((5, 3, 2)), np.eye(2), np.full(3, slow))
+    ends = _field_interval(fov, np.zeros(3), look_alikes)
+    wanted = np.sqrt([[low, low], [high, high]])
+    np.testing.assert_allclose(ends, wanted, rtol=1e-12, atol=1e-9)

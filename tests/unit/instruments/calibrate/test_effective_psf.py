@@ -345,3 +345,14 @@ def test_errors_of_dots_that_are_held_out_are_beside_their_brightest_pixels():
     rms = np.sqrt(np.mean((off**2).mean(axis=(1, 2)) / brightest**2))
     assert held.rms == pytest.approx(rms, rel=0.01)
     assert held.noise == pytest.approx(3 * np.sqrt(np.mean(brightest**-2.0)), rel=0.01)
+
+
+@pytest.mark.parametrize("slope_dn", [0.3, 0.0, -0.1])
+def test_a_variance_grows_with_light_or_is_the_dark_s(slope_dn):
+    """Of four frames: 4/3 of their spread. Light that has less noise than none has no law."""
+    mean = np.full((1, 5, 5), 7.0)
+    mean[0, 2, 1:4] += [10.0, 20.0, 15.0]
+    light = mean - 7.0
+    spread = 0.75 * (3.0 + slope_dn * light)
+    expected = 3.0 + max(slope_dn, 0.0) * light
+    np.testing.assert_allclose(_variance(mean, spread, np.array([4.0])), expected, rtol=1e-12)

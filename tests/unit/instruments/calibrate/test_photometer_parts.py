@@ -119,6 +119,26 @@ def test_a_field_of_lattices_is_of_whole_cells_about_the_middle_of_what_is_seen(
         field_for(geometry(40.0), sigma_px)
 
 
+# Half of the smallest side, in whole cells: of the monitor, upright or not, or of the tracker; and
+# at most 200 px of the tracker.
+@pytest.mark.parametrize(
+    ("monitor_px", "tracker_px", "ratio", "side_px"),
+    [
+        ((640, 480), (4000, 3000), 0.5, 240),
+        ((480, 640), (4000, 3000), 0.5, 240),
+        ((640, 480), (150, 3000), 0.5, 144),
+        ((640, 480), (4000, 150), 0.5, 144),
+        ((640, 480), (4000, 3000), 1.5, 128),
+    ],
+)
+def test_a_field_is_half_of_the_smallest_side(monitor_px, tracker_px, ratio, side_px):
+    bench = geometry(ratio)
+    monitor = replace(bench.monitor, resolution_px=monitor_px)
+    tracker = replace(bench.tracker, resolution_px=tracker_px)
+    field, _ = field_for(replace(bench, monitor=monitor, tracker=tracker), 1.0)
+    assert field.side == side_px
+
+
 @pytest.mark.parametrize("period", [1, 2, 4, 8])
 def test_a_lattice_lights_one_pixel_in_the_middle_of_each_cell(period):
     field = DotField(16, 8, 64, slice(0, 1), slice(0, 1), 1.0)

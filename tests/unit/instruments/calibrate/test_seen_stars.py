@@ -132,6 +132,14 @@ def test_what_follows_place_or_light_is_told_apart(rng):
     assert Scatter(0.031, 0.01, 0.0, 0.0).finding != "" == Scatter(0.029, 0.01, 0.0, 0.0).finding
 
 
+@pytest.mark.parametrize(
+    ("sigma_px", "radius_px"),
+    [((0.5, 0.6), 4), ((1.3, 1.3), 4), ((1.4, 1.0), 5), ((1.0, 1.4), 5), ((2.1, 0.5), 7)],
+)
+def test_a_window_is_three_sigmas_of_the_wider_axis_and_four_pixels_or_more(sigma_px, radius_px):
+    assert StarSpot(sigma_px, 4.0, 0.0, 0.0).radius_px == radius_px
+
+
 # Under 0.01 mag; of fewer than ten such stars the ten with the least noise, under 0.1 mag.
 @pytest.mark.parametrize(
     ("noise_mag", "sure"),

@@ -3,11 +3,13 @@ the stated errors hold.
 """
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hilstar.basics.arrays import FloatArray
+from hilstar.instruments.calibrate.first_light.uniformity import _warm_up_truth
 from hilstar.instruments.calibrate.warm_up import (
     MAX_TAU,
     STABLE,
@@ -187,3 +189,22 @@ def test_a_drift_beyond_the_limit_is_stable_by_no_law_that_is_as_likely() -> Non
         scattered = 1 + 2e-4 * np.random.default_rng(seed).standard_normal(20)
         stable += judge_warm_up(t_s, (1 - 0.0025 / 600 * t_s) * scattered).is_stable
     assert stable <= 5
+
+
+@pytest.mark.parametrize("cold_percent", [4.0, -4.0])
+@pytest.mark.parametrize(("ended_s", "last_s"), [(40.0, 40.0), (100.0, 40.0), (9000.0, 40.0)])
+def test_a_planted_warm_up_is_stable_by_its_size_and_never_before_the_watch(
+    cold_percent, ended_s, last_s
+):
+    """`ended_s` of the monitor's time are `last_s` of the watch's."""
+    virtual = SimpleNamespace(
+        warm_up_min=TAU_S / 60, cold_percent=cold_percent, drift_percent_per_h=0.0
+    )
+    truth = SimpleNamespace(config=SimpleNamespace(certify=SimpleNamespace(virtual=virtual)))
+    planted = _warm_up_truth(truth, SimpleNamespace(limit=STABLE), ended_s, last_s)
+    stable_s = STABLE_S - (ended_s - last_s)
+    if ended_s > STABLE_S:
+        stable_s = 0.0
+    assert planted["truth_stable_after_s"] == pytest.approx(stable_s)
+    drift_percent_per_s = cold_percent / TAU_S * math.exp(-ended_s / TAU_S)
+    assert planted["truth_drift_percent_per_h"] == pytest.approx(3600 * drift_percent_per_s)

@@ -14,6 +14,7 @@ import pytest
 from scipy import stats
 from scipy.interpolate import CubicSpline
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.geometric import fit as fits
 from hilstar.instruments.certify import estimates, lens
@@ -472,6 +473,15 @@ def test_black_and_light_scatter_by_their_own_readings():
     relative = 0.01 * bright / (bright - 3.0)
     assert fit.noise == pytest.approx(math.sqrt(2 * (relative**2).sum() / 5))
     np.testing.assert_allclose(fit.solution[:6], [3.0, *bright])
+
+
+@pytest.mark.parametrize(("dark", "lit"), [(1, 3), (6, 1)])
+def test_black_and_light_are_both_read_more_than_once(dark, lit):
+    """The scatter of the one says nothing of the other's."""
+    codes = np.array([0] * dark + [50, 100, 150, 200, 255] * lit)
+    light = 10.0 * codes + np.arange(len(codes))
+    with pytest.raises(InputError, match="white and black are read too seldom"):
+        _LightFit(LightReadings(codes, light, np.zeros(len(codes))))
 
 
 def test_a_certificate_has_the_hashes_of_the_bench_s_files_and_of_those_that_they_name(

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import ipaddress
+import socket
 import subprocess
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 
@@ -73,15 +71,32 @@ def fake_camera() -> Iterator[str]:
     It takes no address but an interface's own: tests of one machine wait for one another.
     """
     address = "127.0.0.1"
-    with (Path(tempfile.gettempdir()) / "hilstar-fake-camera.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        with subprocess.Popen(
+    with (
+        alone_on_this_machine("fake-camera"),
+        subprocess.Popen(
             [SYSTEM_PYTHON, "-c", FAKE, address], stdout=subprocess.PIPE, text=True
-        ) as process:
+        ) as process,
+    ):
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().strip() == "running"
+            yield address
+        finally:
+            process.kill()
+            process.wait(PATIENCE_S)
+
+
+@contextlib.contextmanager
+def alone_on_this_machine(name: str) -> Iterator[None]:
+    """Wait until no other process is within this, of whatever user: a file in /tmp is its maker's.
+
+    A name of the kernel's, which goes with the process that has it.
+    """
+    with socket.socket(socket.AF_UNIX) as lock:
+        while True:
             try:
-                assert process.stdout is not None
-                assert process.stdout.readline().strip() == "running"
-                yield address
-            finally:
-                process.kill()
-                process.wait(PATIENCE_S)
+                lock.bind(f"\0hilstar-test-{name}")
+                break
+            except OSError:
+                time.sleep(0.05)
+        yield

@@ -40,7 +40,9 @@ def others() -> dict[str, Path]:
     least = (int(floor[1]), int(floor[2]))
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv"))
     named = {path: path.name.removeprefix("python") for path in Path("/usr/bin").glob("python3.*")}
-    named |= {path: path.parents[1].name for path in pyenv.glob("versions/*/bin/python")}
+    # another user's, as `su` leaves it in the environment, cannot be read
+    if os.access(pyenv, os.X_OK):
+        named |= {path: path.parents[1].name for path in pyenv.glob("versions/*/bin/python")}
     found: dict[tuple[int, ...], tuple[tuple[int, ...], Path]] = {}
     for path, version in named.items():
         if re.fullmatch(r"\d+\.\d+(\.\d+)?", version) is None:

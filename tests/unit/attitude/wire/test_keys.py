@@ -24,6 +24,7 @@ from hilstar.attitude.wire.keys import (
 )
 from hilstar.attitude.wire.zmq_links import ZmqSender
 from tests.support.refusals import refusal
+from tests.support.senders import free_port
 
 
 def test_a_secret_key_is_its_owner_s_alone_before_anything_else_happens_to_it(
@@ -120,7 +121,8 @@ def test_who_binds_is_the_server_of_its_keys_and_who_connects_knows_the_server_s
     client = CurveKeys(tmp_path / "client.key_secret", tmp_path / "server.key")
     configured = []
     for bind, keys in ((True, server), (False, client)):
-        with closing(ZmqSender("tcp://127.0.0.1:9", bind=bind, keys=keys)) as sender:
+        endpoint = f"tcp://127.0.0.1:{free_port()}"
+        with closing(ZmqSender(endpoint, bind=bind, keys=keys)) as sender:
             made = SimpleNamespace(setsockopt=lambda option, value: None)
             sender._configure(made)
             configured.append(vars(made))

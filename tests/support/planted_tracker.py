@@ -46,6 +46,13 @@ def attitude(motion: Motion, t_s: FloatArray) -> Rotation:
     return from_cam.inv()
 
 
+def rate_rad_s(motion: Motion, t_s: FloatArray) -> FloatArray:
+    """The rate of a motion (n, 3), cam, by v_cam' = -omega x v_cam and a central difference."""
+    step_s = 1e-3
+    turn = attitude(motion, t_s + step_s) * attitude(motion, t_s - step_s).inv()
+    return np.asarray(-turn.as_rotvec() / (2 * step_s))
+
+
 def scalar_first(rotation: Rotation) -> FloatArray:
     """Quaternions (n, 4), w first."""
     return np.roll(rotation.as_quat(), 1, axis=1)

@@ -32,7 +32,7 @@ from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.record.ledger_records import AnswerRecord
 from tests.support.benches import bench_text
 from tests.support.planted_run import write_ledger
-from tests.support.planted_tracker import attitude, scalar_first
+from tests.support.planted_tracker import attitude, rate_rad_s, scalar_first
 
 ARCSEC_PER_RAD = 180 * 3600 / np.pi
 SECONDS, FRAME_S, ANSWER_S = 120.0, 0.05, 0.2
@@ -52,13 +52,6 @@ def motion(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A scan of two degrees to and fro, which rolls: up to 0.5 deg/s, 0.1 deg/s2."""
     turn = 2 * np.pi * t_s
     return 84 + 2 * np.sin(turn / 37), -1.2 + 2 * np.sin(turn / 27 + 0.4), 12 * np.sin(turn / 53)
-
-
-def rate_rad_s(t_s: FloatArray) -> FloatArray:
-    """The rate (n, 3), by v_cam' = -omega x v_cam and a central difference."""
-    step_s = 1e-3
-    turn = attitude(motion, t_s + step_s) * attitude(motion, t_s - step_s).inv()
-    return np.asarray(-turn.as_rotvec() / (2 * step_s))
 
 
 class Sky:
@@ -106,8 +99,8 @@ def assessed(ledger: Path, sky: Sky) -> Assessment:
     true = attitude(motion, t_s)
     noise_rad = rng.normal(0, 2.0, (len(t_s), 3)) / ARCSEC_PER_RAD
     q = scalar_first(Rotation.from_rotvec(noise_rad) * true)
-    acceleration = (rate_rad_s(t_s + 0.01) - rate_rad_s(t_s - 0.01)) / 0.02
-    rate = (1 + RATE_SCALE) * rate_rad_s(t_s) - RATE_LAG_S * acceleration
+    acceleration = (rate_rad_s(motion, t_s + 0.01) - rate_rad_s(motion, t_s - 0.01)) / 0.02
+    rate = (1 + RATE_SCALE) * rate_rad_s(motion, t_s) - RATE_LAG_S * acceleration
     rate += np.radians([RATE_BIAS_DEG_S, 0.0, 0.0])
     rate += np.radians(RATE_NOISE_DEG_S) * rng.standard_normal(rate.shape)
     lines = []
@@ -168,7 +161,9 @@ def test_rates_of_another_convention_are_named(
     t_s = np.arange(1.0, SECONDS / 2, ANSWER_S)
     noise_rad = rng.normal(0, 2.0, (len(t_s), 3)) / ARCSEC_PER_RAD
     q = scalar_first(Rotation.from_rotvec(noise_rad) * attitude(motion, t_s))
-    rates = rate_rad_s(t_s) + np.radians(RATE_NOISE_DEG_S) * rng.standard_normal((len(t_s), 3))
+    rates = rate_rad_s(motion, t_s) + np.radians(RATE_NOISE_DEG_S) * rng.standard_normal(
+        (len(t_s), 3)
+    )
     rates = factor * rates[:, order]
     rates[::7] = np.nan
     notes = list(rate_notes(np.rint(1e9 * t_s).astype(np.int64), q, rates))

@@ -21,7 +21,7 @@ from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.record.ledger_records import AnswerRecord
 from tests.support.benches import bench_text
 from tests.support.planted_run import NS_PER_S, write_ledger
-from tests.support.planted_tracker import attitude, scalar_first
+from tests.support.planted_tracker import attitude, rate_rad_s, scalar_first
 
 ARCSEC_PER_RAD = 180 * 3600 / np.pi
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 1200, 700, 5000.0
@@ -59,13 +59,6 @@ def motion(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Two degrees to and fro, which rolls: up to 1.5 deg/s."""
     turn = 2 * np.pi * t_s
     return 84 + 2 * np.sin(turn / 12.3), -1.2 + 2 * np.sin(turn / 9 + 0.4), 12 * np.sin(turn / 17.7)
-
-
-def rate_rad_s(t_s: FloatArray) -> FloatArray:
-    """The rate (n, 3), by v_cam' = -omega x v_cam and a central difference."""
-    step_s = 1e-3
-    turn = attitude(motion, t_s + step_s) * attitude(motion, t_s - step_s).inv()
-    return np.asarray(-turn.as_rotvec() / (2 * step_s))
 
 
 @dataclass(frozen=True)
@@ -124,8 +117,8 @@ def planted_run(folder: Path) -> Planted:
     for k, off_deg in WILD.items():
         wild = Rotation.from_rotvec([[np.radians(off_deg), 0, 0]])
         q[k] = scalar_first(wild * mounted[k])[0]
-    acceleration = (rate_rad_s(t_s + 0.01) - rate_rad_s(t_s - 0.01)) / 0.02
-    rates = (1 + RATE_SCALE) * rate_rad_s(t_s) - RATE_LAG_S * acceleration
+    acceleration = (rate_rad_s(motion, t_s + 0.01) - rate_rad_s(motion, t_s - 0.01)) / 0.02
+    rates = (1 + RATE_SCALE) * rate_rad_s(motion, t_s) - RATE_LAG_S * acceleration
     rates += np.radians([RATE_BIAS_DEG_S, 0.0, 0.0])
     rates += np.radians(RATE_NOISE_DEG_S) * rng.standard_normal(rates.shape)
     records = []
@@ -263,7 +256,7 @@ def test_a_silence_loses_the_lock_and_wrong_answers_are_outages(run) -> None:
 def test_slices_are_of_the_rates_and_of_the_field_s_own_light(run) -> None:
     planted, found = run
     t_s = all_s()[right_answers()]
-    rates_deg_s = np.degrees(np.linalg.norm(rate_rad_s(t_s), axis=1))
+    rates_deg_s = np.degrees(np.linalg.norm(rate_rad_s(motion, t_s), axis=1))
     field_mag = []
     for to_cam in attitude(motion, t_s):
         sky = planted.sky

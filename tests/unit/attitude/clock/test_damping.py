@@ -174,6 +174,30 @@ def test_no_more_than_the_jitter_is_held_back_and_nothing_is_added(goes_on_by, s
     assert min(map(abs, jitter)) > 1e-5
 
 
+def test_what_is_held_back_goes_with_the_square_of_the_prediction_up_to_the_usual_one(rng):
+    """1 - sin(x) / x of a vibration: x^2 / 6 for a small x."""
+    timeline = Timeline(AUTO)
+    usual_ns, step_ns = 40 * NS_PER_MS, 10 * NS_PER_MS
+    q = START
+    for k in range(200):
+        rate = TURN_RAD_S + rng.normal(0, math.radians(0.1), 3)
+        assert timeline.add(AttitudeSample(k * step_ns, q, rate)) is None
+        q = propagate(q, TURN_RAD_S, step_ns / NS_PER_S)
+        timeline.at(k * step_ns + usual_ns)
+    newest_ns = 199 * step_ns
+    held_back = [
+        rate - timeline.at(newest_ns + share * usual_ns // 4).rate_cam_rad_s
+        for share in (0, 1, 2, 4, 6)
+    ]
+    nothing, quarter, half, whole, more = held_back
+    assert np.abs(whole).min() > math.radians(1e-3)
+    assert nothing == pytest.approx([0, 0, 0], abs=1e-15)
+    assert half == pytest.approx(4 * quarter)
+    # how far ahead samples were looked at is their own mean
+    assert quarter == pytest.approx(whole / 16, rel=0.1)
+    assert more == pytest.approx(whole, rel=1e-2)
+
+
 def test_a_beginning_turn_is_held_back_by_three_sigma_either_way():
     """Noise and its mirror image, which a turn that is a hundred times as fast ends."""
     rates = np.random.default_rng(4).uniform(-1e-3, 1e-3, (200, 3))

@@ -196,6 +196,23 @@ def test_the_blend_s_error_falls_with_the_third_power_of_the_step_and_more():
     assert wide / narrow > 2**3
 
 
+def test_the_rate_within_a_blend_is_that_of_the_turn_there():
+    """About one axis under a constant acceleration, both samples' rates lead to it exactly."""
+    axis, rate_rad_s, bend_rad_s2 = np.array([0.48, -0.6, 0.64]), 0.02, 0.05
+
+    def sample(t_s: float) -> AttitudeSample:
+        turned_rad = rate_rad_s * t_s + bend_rad_s2 * t_s**2 / 2
+        q = propagate(START, axis * turned_rad, 1.0)
+        return AttitudeSample(round(t_s * 1e9), q, axis * (rate_rad_s + bend_rad_s2 * t_s))
+
+    samples = [sample(t_s) for t_s in (0.0, 0.1, 0.3, 0.4)]
+    timeline = filled(*samples, stale_after_ms=1000)
+    for t_s in (0.02, 0.1, 0.15, 0.2, 0.27, 0.3, 0.38):
+        attitude = timeline.at(round(t_s * 1e9))
+        assert attitude.rate_cam_rad_s == pytest.approx(sample(t_s).rate_cam_rad_s, abs=1e-12)
+        assert angle_between_rad(attitude.q_icrs_to_cam, sample(t_s).q_icrs_to_cam) < EXACT_RAD
+
+
 def test_the_blend_is_c2_at_its_samples():
     """Rate and acceleration from both sides of a sample, by differences over 1 ms, agree to the
     differences' own error.

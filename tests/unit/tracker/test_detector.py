@@ -263,6 +263,12 @@ def test_the_noiseless_dark_is_that_of_the_temperature():
     assert image[0, 0] == round(dark_e / settings.gain_e_per_dn + settings.offset_dn) != 0
 
 
+def test_a_half_goes_to_the_even_code():
+    detector = Detector(DetectorSettings(gain_e_per_dn=2.0, offset_dn=0.0), (4, 1))
+    codes = detector.expose_noiseless(np.array([[1.0, 3.0, 5.0, 6.0]]), 1.0)
+    assert codes.tolist() == [[0, 2, 2, 3]]
+
+
 def test_noisy_frames_scatter_around_the_noiseless_one():
     settings = DetectorSettings(
         gain_e_per_dn=2.0, offset_dn=50.0, read_noise_e=6.0, dark_e_per_s=100.0

@@ -513,6 +513,8 @@ def test_fields_of_so_many_stars_that_exact_would_be_late_stay_with_round_and_sa
     # `round` would be late, too
     assert planned(render_settings(), replace(crowded, refresh_hz=90.0)).quantisation == "exact"
     assert planned(render_settings(quantisation="exact"), crowded).quantisation == "exact"
+    slow = planned(render_settings(quantisation="exact", codes_ms=(99.4, 150.4)), crowded)
+    assert "exact takes 150 ms of 16.7 (round 99)" in part(slow, "codes").note
     assert (
         "9 ms of 16.7"
         in part(planned(render_settings(quantisation="exact"), crowded), "codes").note

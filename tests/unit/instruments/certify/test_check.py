@@ -16,6 +16,7 @@ from scipy.stats import f, t
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.certify.bench_readings import geometry_of
 from hilstar.instruments.certify.check import (
     TOLERANCES,
     CheckFigure,
@@ -252,6 +253,37 @@ def test_a_bench_file_s_own_readings_have_no_noise(bench: BenchFile) -> None:
     assert set(readings.dot_light) == {1.0}
     assert readings.delay_ms == pytest.approx(DELAY_MS)
     assert readings.delay_u_ms == pytest.approx(0.0, abs=1e-9)
+    shown_px = geometry_of(bench).to_tracker(np.array(readings.x_px), np.array(readings.y_px))
+    seen_px = np.stack([readings.seen_x_px, readings.seen_y_px])
+    assert seen_px == pytest.approx(np.stack(shown_px), abs=1e-5)  # five digits are kept
+
+
+class EdgesAlone(PlantedReader):
+    """A photodiode that saw these edges, ms."""
+
+    edges_ms = np.zeros(0)
+
+    def delays_ms(self) -> np.ndarray:
+        return self.edges_ms
+
+
+@pytest.mark.parametrize(
+    ("edges_ms", "told"),
+    [((), (None, 0.0, 0)), ((8.0,), (None, 0.0, 0)), ((8.0, 9.0, 8.5, 8.5), (8.5, 0.2041, 3))],
+)
+def test_a_mean_delay_is_as_sure_as_its_edges_are_many(bench: BenchFile, edges_ms, told) -> None:
+    """Of 8, 9 and twice 8.5 ms the scatter is sqrt(1/6), and that of their mean half of it."""
+    reader = EdgesAlone(quiet_truth(), np.random.default_rng(2))
+    reader.edges_ms = np.array(edges_ms)
+    readings = take_check(bench, reader)
+    found = (readings.delay_ms, readings.delay_u_ms, readings.delay_dof)
+    assert found == pytest.approx(told, abs=1e-4)
+    figures = {figure.quantity: figure for figure in compare(bench, readings, readings)}
+    assert ("latency" in figures) == (readings.delay_ms is not None)
+    if "latency" in figures:
+        u_ms = figures["latency"].standard_uncertainty
+        assert u_ms == pytest.approx(math.sqrt(2 / 24))
+        assert figures["latency"].dof == 3
 
 
 def change(quantity: str, value: float, in_tolerance: bool) -> CheckFigure:

@@ -19,7 +19,11 @@ from hilstar.instruments.assess.case_fits import (
     root_mean,
 )
 from hilstar.instruments.assess.rate_figures import RATE_NOISE, RateTable, rate_figure
-from hilstar.instruments.assess.time_figures import stamp_jitter, time_figure
+from hilstar.instruments.assess.time_figures import (
+    _jitter_weights,
+    stamp_jitter,
+    time_figure,
+)
 
 CONFIDENCE = 0.95
 
@@ -201,3 +205,17 @@ def jitter_square(residual: FloatArray, rates: FloatArray) -> float:
         residual, rates, np.arange(len(rates)), CONFIDENCE, np.random.default_rng(1)
     )
     return figure.value**2
+
+
+def test_slews_weigh_by_how_well_they_tell_a_jitter():
+    """The variance of an excess is that of two squares, along the slew and across it. Without a
+    jitter, as far as its excess is 0 or less, fast slews count by their squares; beside a large
+    one every slew tells the same.
+    """
+    square = np.array([1.0, 4.0, 100.0])
+    none = _jitter_weights(np.array([-1.0, 0.5, -2.0]), square, 3.0)
+    assert none / none[0] == pytest.approx(square)
+    large = _jitter_weights(1e4 * square, square, 3.0)
+    assert large / large[0] == pytest.approx(1 / square, rel=1e-3)
+    even = _jitter_weights(2.0 * square, square, 3.0)
+    assert even == pytest.approx(square / ((3 + 2 * square) ** 2 + 3.0**2))

@@ -5,6 +5,7 @@ is no square, limits of a map and of a detection curve.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -142,3 +143,21 @@ def test_a_sharp_limit_is_where_the_last_star_was_reported(limit_mag, rng):
     assert blind.half_seen(np.array([1])) == pytest.approx(2.025, abs=0.06)
     all_seen = half_seen(bins.middle_mag, bins.lit[0], bins.lit[0])
     assert all_seen == pytest.approx(6.975, abs=1e-9)
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.1])
+def test_a_colour_is_told_beside_a_signal_that_bends_with_the_light(colour, rng):
+    """Stars that are the redder the further they are from V 5, by signals that are too: 0.1 mag at
+    two magnitudes.
+    """
+    count = 600
+    v_mag = rng.uniform(3, 7, count)
+    bv = 0.2 * (v_mag - 5) ** 2 + 0.1 * rng.standard_normal(count)
+    signal_mag = 0.025 * (v_mag - 5) ** 2 + colour * bv + 0.02 * rng.standard_normal(count)
+    none = np.zeros((2, count))
+    stars = table(np.arange(count) // 10, places_in(count, rng), none, v_mag)
+    stars = replace(stars, bv=bv, signal_mag=signal_mag)
+    figure = star_figure("star-colour", stars, SIZE_PX, CONFIDENCE, rng)
+    # 0.02 mag over a colour's own 0.1 and the root of 600
+    assert figure.value == pytest.approx(colour, abs=4 * 0.2 / math.sqrt(count))
+    assert (figure.low > 0) == (colour > 0)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib.util
+import multiprocessing
 import os
 import resource
 import select
@@ -14,13 +15,15 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from importlib.machinery import PathFinder
+from types import SimpleNamespace
 
 import pytest
 
 from hilstar.basics.process import interrupts, scheduling
-from hilstar.basics.process.pool import ONE_THREAD, _for_children
+from hilstar.basics.process.pool import ONE_THREAD, ProcessPool, WorkerProcess, _for_children
 from hilstar.basics.process.programs import EACH_S, Service, sign_period_s
 from hilstar.basics.process.scheduling import (
     HEAVY,
@@ -213,6 +216,24 @@ def test_workers_have_one_thread_and_no_ctrl_c_and_their_owner_keeps_its_own(mon
     assert signal.pthread_sigmask(signal.SIG_BLOCK, set()) == mask
 
 
+def test_an_answer_of_a_worker_that_has_died_since_is_still_heard():
+    here, there = multiprocessing.Pipe()
+    reading, writing = os.pipe()
+    ended = SimpleNamespace(
+        sentinel=reading, exitcode=-9, join=lambda seconds: None, is_alive=lambda: False
+    )
+    pool = ProcessPool(int, (), ())
+    worker = WorkerProcess(ended, here)
+    pool.workers.append(worker)
+    there.send(("answer", 5))
+    there.close()
+    os.close(writing)
+    news = [next(pool.heard()) for _ in range(2)]
+    assert [(one.kind, one.said) for one in news] == [("answer", 5), ("died", -9)]
+    assert worker.ready and pool.workers == []
+    os.close(reading)
+
+
 def test_what_nobody_reads_takes_so_much_memory_and_is_counted_when_it_is_read(monkeypatch):
     read_end, write_end = os.pipe()
     os.set_blocking(write_end, False)
@@ -261,6 +282,52 @@ def test_a_user_s_module_is_the_one_beside_the_file_and_hides_no_installed_one(
     for function in ("os:system", "pyclbr:system", "subprocess:run", "of_this_bench", ""):
         with pytest.raises(UserCodeError):
             user_function(f"python:{function}", tmp_path)
+
+
+@pytest.fixture
+def ending(monkeypatch):
+    """The state of a command's end, as if its handlers were installed."""
+    made = interrupts._Ending()
+    made.guard = 0
+    monkeypatch.setattr(interrupts, "_ending", made)
+    return made
+
+
+def test_a_stop_that_opens_after_a_signal_is_set_at_once(ending):
+    ending.signal = signal.SIGTERM
+    stop = threading.Event()
+    with interrupts.stop_on_signal(stop):
+        assert stop.is_set()
+    assert ending.stops == []
+    assert (interrupts.caught(), interrupts.exit_code()) == ("SIGTERM", 128 + 15)
+
+
+def test_a_program_that_uses_a_stop_has_its_own_handlers_again(ending):
+    ending.guard = None
+    before = [signal.getsignal(number) for number in interrupts.ENDING]
+    for _ in range(2):  # a signal of the first time is none of the second
+        stop = threading.Event()
+        with interrupts.stop_on_signal(stop):
+            assert not stop.is_set()
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop.wait(PATIENCE_S)
+        assert [signal.getsignal(number) for number in interrupts.ENDING] == before
+    assert interrupts.exit_code() == 128 + 15
+    ending.signal = None
+    assert (interrupts.caught(), interrupts.exit_code()) == (None, 128 + 2)
+
+
+def test_a_signal_that_comes_while_it_is_held_raises_at_the_end(ending):
+    done = []
+    with pytest.raises(KeyboardInterrupt), interrupts.held():
+        with interrupts.held():
+            interrupts._handle(signal.SIGINT, None)
+            done.append("inner")
+        done.append("outer")
+    assert done == ["inner", "outer"] and ending.holds == 0
+    with interrupts.held():  # the end is under way
+        done.append("again")
+    assert interrupts.caught() == "SIGINT"
 
 
 PARENT_OF_ONE = """

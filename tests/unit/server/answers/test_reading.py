@@ -162,6 +162,11 @@ def test_of_a_flood_of_bytes_a_burst_is_read_and_then_so_many_a_second():
     (refused,) = [each for each in link.take() if FLOOD in each.refused]
     left_bytes = MAX_BURST_BYTES - burst * PIECE_BYTES + MAX_BYTES_PER_S / 10
     assert refused.refused[FLOOD] == 40 - int(left_bytes // PIECE_BYTES)
+    # a line that was idle for a minute has saved up no more than a burst
+    link.road._chunks = [[noise * (burst + 9)]]
+    link.clock.work(60 * NS_PER_S)
+    (refused,) = [each for each in link.take() if FLOOD in each.refused]
+    assert refused.refused[FLOOD] == 9
 
 
 def test_a_message_is_decoded_whole_and_a_stream_in_pieces():

@@ -23,6 +23,7 @@ from hilstar.server.answers.reader import (
     MAX_ANSWERS_PER_S,
     MAX_BURST_BYTES,
     MAX_BYTES_PER_S,
+    MAX_DETAILS,
     MAX_WORK_S,
     PIECE_BYTES,
     WORK_SHARE,
@@ -31,6 +32,7 @@ from hilstar.server.answers.reader import (
     ReadPlan,
     handed_over,
     live_answers,
+    newest_details,
     recorded_answers,
 )
 from tests.support.fake_clock import FakeClock
@@ -124,6 +126,13 @@ def test_refusals_are_counted_by_reason_with_the_newest_example():
     assert sum(refused.refused.values()) == 3 and set(refused.details) == set(refused.refused)
     assert refused.answer is None and FLOOD not in refused.refused
     assert link.clock.slept_s == [0.0]
+
+
+def test_of_many_reasons_the_examples_of_the_newest_are_kept():
+    many = {str(k): f"of {k}" for k in range(MAX_DETAILS)}
+    kept = newest_details(many, {"new": "a new one", "3": "another of 3"})
+    assert list(kept) == [str(k) for k in range(1, MAX_DETAILS) if k != 3] + ["new", "3"]
+    assert (kept["3"], kept["4"]) == ("another of 3", "of 4")
 
 
 def test_a_fault_of_the_line_is_told_when_it_changes():

@@ -384,3 +384,22 @@ def test_what_is_no_sky_is_refused(scene):
         )
     with pytest.raises(AssertionError, match="missing"):
         assert_same_sky(nothing, golden)
+
+
+def test_cubes_are_compared_by_their_sum_and_each_channel_by_itself():
+    """A star that red has lost and blue has won is the same star in their sum."""
+    x, y = np.array([20.2, 60.4, 100.7, 50.1]), np.array([30.3, 80.1, 40.8, 20.6])
+    shares = np.array([[1.0, 2.0, 3.0, 1.5], [3.0, 1.0, 0.5, 2.0], [2.0, 2.5, 1.0, 1.0]])
+    golden = np.stack([grid(x, y, 1e5 * flux) for flux in shares])
+    moved = shares.copy()
+    moved[0, 1] -= 0.5
+    moved[2, 1] += 0.5
+    frame = np.stack([grid(x, y, 1e5 * flux) for flux in moved])
+    found = compare(frame, golden)
+    assert found.bad == [] and not found.same
+    light = sorted(star.flux_e_per_s for star in found.stars)
+    assert light == pytest.approx(sorted(1e5 * shares.sum(axis=0)), rel=1e-4)
+    errors_mag = {name: -2.5 * np.log10(1 + off) for name, off in (("r", -0.25), ("b", 0.2))}
+    for name, channel in found.channels.items():
+        off = [star.flux_error_mag for star in channel.bad]
+        assert off == pytest.approx([errors_mag[name]] if name in errors_mag else [], abs=1e-4)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.simulate import budget
-from hilstar.instruments.verify.verdict import _black, _floor, _geometry
+from hilstar.instruments.verify.verdict import CURE, _black, _floor, _geometry, _lost
 
 LIMIT_PX = 0.1
 RIGHT = {
@@ -107,3 +107,37 @@ def test_a_glass_is_named_where_it_makes_most_of_what_is_off(
     figures["floor_mag"] = np.full(9, 0.049)
     figures["floor_px"] = np.full(9, 0.99 * LIMIT_PX)
     assert _floor(measured, SimpleNamespace(of=figures.__getitem__)) == []
+
+
+@pytest.mark.parametrize("centroider", ["window", "psf"])
+def test_a_glass_is_cured_by_a_centroider_that_fits_it_where_there_is_another(centroider):
+    verify = SimpleNamespace(flux_mag=0.05, centroid_px=LIMIT_PX, centroider=centroider)
+    glass = SimpleNamespace(px=0.4, mag=0.0)
+    measured = SimpleNamespace(config=SimpleNamespace(verify=verify), glass=glass)
+    figures = {"floor_mag": np.zeros(9), "floor_px": np.full(9, 0.5)}
+    (reason,) = _floor(measured, SimpleNamespace(of=figures.__getitem__))
+    assert reason.endswith(CURE) == (centroider == "window")
+
+
+@pytest.mark.parametrize(
+    ("vanished", "mirrored", "words"),
+    [
+        (0, {}, "look at focal lengths"),
+        (20, {}, "look at focal lengths"),
+        (21, {}, "too faint to be seen"),
+        # of 100 that were looked for, however many are lost
+        (21, {"x": 50}, "too faint to be seen"),
+        (21, {"x": 51}, "51 are where a mirrored screen with its columns reversed"),
+        (0, {"x": 3, "swap": 60}, "60 are where a mirrored screen with its axes swapped"),
+    ],
+)
+def test_lost_stars_have_the_cause_of_most_of_them(vanished, mirrored, words):
+    tally = SimpleNamespace(vanished=vanished, mirrored=mirrored)
+    config = SimpleNamespace(verify=SimpleNamespace(lost_share=0.4))
+    measured = SimpleNamespace(tally=tally, config=config)
+    (reason,) = _lost(measured, SimpleNamespace(lost=[None] * 41, looked_for=100))
+    assert reason.startswith("41 of 100 stars are not where the sky has them (limit 40.0%): ")
+    if vanished > 0 and not mirrored:
+        assert (vanished > 0.5 * 41) == ("too faint" in reason)
+    assert words in reason
+    assert _lost(measured, SimpleNamespace(lost=[None] * 40, looked_for=100)) == []

@@ -8,12 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import hilstar
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.compare import MAX_LINES, assert_same_sky, compare
+from hilstar.instruments.compare.compare_skies import read_frame_fits
 from hilstar.instruments.compare.report import ChartPanel
 from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG
 from hilstar.instruments.compare.star_fit import star_psf
@@ -22,6 +24,7 @@ from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import pack_sprites
 from hilstar.server.bench.frame_files import write_frame_fits, write_truth_csv
 from tests.support.benches import SMALL_BENCH
+from tests.support.refusals import assert_file_refused
 
 ORION = from_radec_roll_deg(84.057, -1.2, 0.0)
 FAULT_MAG, FAULT_PX = 0.01, 0.02  # the smallest that must be seen
@@ -384,6 +387,32 @@ def test_what_is_no_sky_is_refused(scene):
         )
     with pytest.raises(AssertionError, match="missing"):
         assert_same_sky(nothing, golden)
+
+
+@pytest.mark.parametrize(
+    ("unit", "value", "words"),
+    [
+        ("electron/s", -1e29, ""),
+        ("adu", 1.0, "not a linear image in electron/s (BUNIT is 'adu')"),
+        (None, 1.0, "(BUNIT is None)"),
+        ("electron/s", 2e30, "a pixel has more than 1e+30 electron/s"),
+        ("electron/s", -2e30, "a pixel has more than 1e+30 electron/s"),
+    ],
+)
+def test_a_frame_is_electrons_per_second_of_a_size_that_can_be_squared(
+    tmp_path, unit, value, words
+):
+    image = np.zeros((3, 4), dtype=np.float32)
+    image[1, 2] = value
+    hdu = fits.PrimaryHDU(image)
+    if unit is not None:
+        hdu.header["BUNIT"] = unit
+    path = tmp_path / "frame.fits"
+    hdu.writeto(path)
+    if words:
+        assert_file_refused(read_frame_fits, path, words)
+    else:
+        np.testing.assert_array_equal(read_frame_fits(path), image)
 
 
 def test_cubes_are_compared_by_their_sum_and_each_channel_by_itself():

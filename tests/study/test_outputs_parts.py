@@ -30,7 +30,6 @@ from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.tracker.settings import DetectorSettings
 from tests.support.benches import bench_text
-from tests.support.studies import undrawn
 from tests.support.tables import csv_rows
 
 SIZE_PX = (120, 90)
@@ -55,19 +54,19 @@ def bench(tmp_path_factory):
     return read_bench_file(path)
 
 
-def test_a_bench_s_outputs_are_its_exposures_and_their_stars(bench, tmp_path):
-    with undrawn():
-        lines = outputs.run(tmp_path, bench, OWN)
+def test_a_bench_s_outputs_are_its_exposures_and_their_stars(bench, small_run):
+    run = small_run(outputs.run, bench, OWN)
+    lines, folder = run.told, run.folder
     assert [line.split(":")[0] for line in lines] == ["orion", "lyra", "zeta_cas", "field"]
     names = output_files(fields_of(OWN))
     assert {name for name in names if name.endswith((".csv", ".fits"))} == {
-        path.name for path in tmp_path.iterdir()
+        path.name for path in folder.iterdir()
     }
     for field, line in zip(fields_of(OWN), lines, strict=True):
-        rows = csv_rows(tmp_path / f"{field.stem}.csv")
-        with fits.open(tmp_path / f"{field.stem}.fits") as opened:
+        rows = csv_rows(folder / f"{field.stem}.csv")
+        with fits.open(folder / f"{field.stem}.fits") as opened:
             noisy = opened[0].data.astype(float)
-        with fits.open(tmp_path / f"{field.stem}_without_noise.fits") as opened:
+        with fits.open(folder / f"{field.stem}_without_noise.fits") as opened:
             clean = opened[0].data.astype(float)
         assert noisy.shape == clean.shape == SIZE_PX[::-1]
         difference = noisy - clean
@@ -89,14 +88,14 @@ def test_a_bench_s_outputs_are_its_exposures_and_their_stars(bench, tmp_path):
         assert near.max() == clean.max()
 
 
-def test_rapp_of_a_bench_s_stars_is_of_those_on_its_image(bench, tmp_path):
-    with undrawn():
-        findings = rapp.bench_rapp(tmp_path, bench, OWN)
+def test_rapp_of_a_bench_s_stars_is_of_those_on_its_image(bench, small_run):
+    run = small_run(rapp.bench_rapp, bench, OWN)
+    findings, folder = run.told, run.folder
     assert [finding.figure for finding in findings] == ["rapp_bench", *["rapp_stars"] * 4]
-    table = np.genfromtxt(tmp_path / "rapp_bench.csv", delimiter=",", names=True)
+    table = np.genfromtxt(folder / "rapp_bench.csv", delimiter=",", names=True)
     at_3000 = table["rapp3_energy"][table["temperature_k"] == 3000][0]
     assert f"3000 K gives {at_3000:.2f} times" in findings[0].text
-    rows = csv_rows(tmp_path / "rapp_stars.csv")
+    rows = csv_rows(folder / "rapp_stars.csv")
     stars = rapp.bench_stars(bench.config, bench.folder)
     for field in fields_of(OWN):
         to_cam = to_matrix(from_radec_roll_deg(*field.radec_roll_deg))

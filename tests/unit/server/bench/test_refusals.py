@@ -106,6 +106,11 @@ REFUSED = [
     ),
     (more("[sky]\nobserver_velocity_km_s = [3e5, 0, 0]"), "not slower than light"),
     (
+        # a spacecraft of 10 000 km/s besides
+        more('[attitude]\nsource = "vizard"\n[sky]\nobserver_velocity_km_s = [0, 2.9e5, 0]'),
+        "not slower than light",
+    ),
+    (
         more("[background]\nelectrons_per_px = 1\nzodiacal_v_mag_arcsec2 = 22"),
         "write one of them",
     ),

@@ -390,3 +390,12 @@ def test_a_wide_disc_s_light_is_by_the_solid_angle_of_its_rays(monkeypatch):
     disc = bodies.moon(6.0, 0.0)
     camera = Camera((31, 31), 20.0, (15.0, 15.0), np.eye(3))
     assert bodies.traced(disc, camera).sum() == pytest.approx(1e6, rel=5e-3)
+
+
+@pytest.mark.parametrize("phase_deg", [60.0, 90.0])
+def test_a_limb_is_sought_on_the_side_of_the_sun(phase_deg):
+    """There light falls within half a pixel of the true edge, on the other side before it."""
+    camera, _ = camera_of(12.0)
+    truth = bodies.traced(bodies.moon(12.0, phase_deg), camera)
+    edges_px = bodies.edges_px(truth, 12.0, phase_deg)
+    assert len(edges_px) == bodies.PLACES and np.abs(edges_px).max() < 0.5

@@ -55,6 +55,22 @@ def test_the_measure_finds_the_error_that_was_put_in():
     assert np.isinf(nothing.flux_max_mag) and np.isinf(nothing.centroid_rms_px)
 
 
+def test_a_timed_field_has_three_times_as_many_stars_in_each_magnitude_as_in_the_one_before():
+    """Over eight of them under a white peak, all over the frame."""
+    field = codes.star_field((1000, 200), 10)
+    peaks = field.data["electrons_per_s"] * USUAL_PSF.peak_share
+    mags = -2.5 * np.log10(peaks)
+    assert len(mags) == codes.STARS and mags.min() >= 0 and mags.max() < 8.001
+    # of 10^(m / 2) evenly
+    for limit in (6.0, 7.0, 7.5):
+        share = (10 ** (limit / 2) - 1) / (10**4 - 1)
+        sigma = math.sqrt(share * (1 - share) / codes.STARS)
+        assert (mags < limit).mean() == pytest.approx(share, abs=4 * sigma)
+    for places, side_px in ((field.x_px, 1000), (field.y_px, 200)):
+        assert places.min() < 0.02 * side_px and places.max() > 0.98 * side_px
+        assert places.mean() == pytest.approx(side_px / 2, rel=0.08)
+
+
 def test_fainter_stars_have_less_light():
     sprites, _ = phase_grid(2)
     ratio = fainter(sprites, 5.0).data["electrons_per_s"] / sprites.data["electrons_per_s"]

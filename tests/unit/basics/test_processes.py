@@ -58,7 +58,10 @@ def test_signs_go_to_systemd_twice_in_what_it_waits_for_this_process(environment
     assert sign_period_s(environment, OWN) == pytest.approx(period_s)
 
 
-def test_a_service_whose_work_hangs_gives_no_sign_until_it_goes_on(tmp_path):
+@pytest.mark.parametrize("is_abstract", [False, True])
+def test_a_service_whose_work_hangs_gives_no_sign_until_it_goes_on(tmp_path, is_abstract):
+    """sd_notify(3): @ stands for the zero that an abstract socket's name begins with."""
+    address = f"@hilstar-{tmp_path}" if is_abstract else str(tmp_path / "notify")
     asked = 0
 
     def alive() -> bool:
@@ -67,9 +70,9 @@ def test_a_service_whose_work_hangs_gives_no_sign_until_it_goes_on(tmp_path):
         return asked > 3
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
-        systemd.bind(str(tmp_path / "notify"))
+        systemd.bind(address.replace("@", "\0"))
         systemd.settimeout(PATIENCE_S)
-        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "20000"}
+        environment = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "20000"}
         with Service(lambda: True, alive, lambda: "two\nlines", environment):
             assert systemd.recv(999) == b"READY=1\nSTATUS=two lines"
             assert systemd.recv(999) == b"WATCHDOG=1\nSTATUS=two lines"
@@ -191,12 +194,13 @@ def test_a_loop_leaves_the_collector_and_the_threads_turns_as_they_were(monkeypa
         (gc.enable if was_collecting else gc.disable)()
 
 
-def test_tries_come_at_once_and_then_twice_as_seldom_until_all_was_well():
+@pytest.mark.parametrize("first_anew", [True, False])
+def test_tries_come_at_once_and_then_twice_as_seldom_until_all_was_well(first_anew):
     clock = FakeClock()
     again = BackOff(0.05, 0.3, clock)
     assert again.over
     waits_s = []
-    for anew in (True, False, False, False, False, True, False):
+    for anew in (first_anew, False, False, False, False, True, False):
         again.put_off(anew=anew)
         waits_s.append(again.left_s)
         clock.sleep(again.left_s)

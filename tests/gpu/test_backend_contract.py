@@ -141,6 +141,7 @@ def test_a_sequence_that_begins_anew_is_that_of_a_new_backend(make):
     levels(backend, [2, 3])
     carried_on = levels(backend, [4, 5, 6])
     assert any((mine != other).any() for mine, other in zip(carried_on, new, strict=True))
+    assert (levels(backend, [6])[0] == new[0]).all()  # the last number does not rise, either
     for begin_anew in (lambda: None, backend.begin_anew, backend.forget_images):
         begin_anew()
         again = levels(backend, [4, 5, 6])  # 4 is below the last number

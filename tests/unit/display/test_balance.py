@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm, truncnorm
 
-from hilstar.display.balance import Balance, Seen
+from hilstar.display.balance import Balance, Seen, Weights
 from hilstar.optics.psf import GaussianPsf
 
 BLUR_PX = 0.6
@@ -35,3 +35,10 @@ def test_a_centre_of_mass_follows_its_box_as_a_truncated_gaussian_s_mean_does(si
         means = [truncnorm.mean(off - half, off + half) for off in (-step, step)]
         wanted.append((means[1] - means[0]) / (2 * step))
     assert balance.follows(side) == pytest.approx(wanted, rel=1e-5)
+
+
+def test_the_window_is_as_wide_as_the_star_and_some_of_the_blur_along_either_axis():
+    balance = Balance(GaussianPsf((0.85, 0.5)), Seen(2.0), Weights(window_blurs=0.5))
+    # the variances of the Gaussian, of a pixel, and half of the blur's
+    wanted = np.sqrt([0.85**2 + 1 / 12 + 2.0, 0.5**2 + 1 / 12 + 2.0])
+    assert balance.window_px == pytest.approx(wanted)

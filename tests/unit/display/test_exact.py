@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,7 @@ from hilstar.display.footprints import FootprintMap, star_losses_mag
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import round_levels, shown_light
 from hilstar.display.render.reference import linear_image
-from hilstar.display.response import gamma_response, srgb_response
+from hilstar.display.response import Levels, gamma_response, srgb_response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import FrameLight, pack_sprites
 from tests.support.centroiders import family_errors_px
@@ -183,6 +184,68 @@ def test_along_a_path_the_light_is_handed_on():
     assert np.abs(chosen[0]).max() < 0.01
 
 
+GAP_PX = 8.3
+
+
+def path_of(rates, down: bool) -> tuple[FrameLight, tuple[int, int]]:
+    """Paths side by side, of sprites with these rates (paths, sprites) GAP_PX apart, whose
+    footprints do not touch; and the image that holds them.
+    """
+    paths, count = rates.shape
+    along = np.tile(10 + GAP_PX * np.arange(count), paths)
+    across = np.repeat(12.3 + 20.17 * np.arange(paths), count)
+    wide, long = 20 * paths + 12, math.ceil(GAP_PX * count) + 20
+    size = (wide, long) if down else (long, wide)
+    x, y = (across, along) if down else (along, across)
+    star = np.repeat(np.arange(paths), count)
+    return replace(sprites_at(x, y, rates.ravel(), size), star=star, per_star=count), size
+
+
+@pytest.mark.parametrize("down", [False, True])
+def test_what_a_path_s_sprites_leave_does_not_add_up_along_it(down, rng):
+    """Six paths of 30 faint sprites: all light but half a step, and its first moment about the
+    path's end, of which one sprite leaves half a step times the way to the next, and some of its
+    own pixels' moments.
+    """
+    panel = Panel(srgb_response(8), WHITE)
+    step = panel.response.light[1] * WHITE
+    rates = rng.uniform(3, 9, (6, 30)) * step
+    sprites, size = path_of(rates, down)
+    wanted = linear_image(sprites, size, GaussianPsf(SIGMA))
+    off = (shown_light(exact(sprites, panel, size), panel) - wanted) / step
+    if down:
+        off = off.T
+    to_end_px = np.arange(off.shape[1]) - (10 + GAP_PX * 29)
+    by_path = [off[20 * k + 2 : 20 * k + 22] for k in range(6)]
+    assert max(abs(part.sum()) for part in by_path) <= 0.5 * EXCESS
+    assert max(abs((part @ to_end_px).sum()) for part in by_path) < GAP_PX
+
+
+def test_a_long_path_is_begun_anew_after_32_sprites():
+    """As two paths, of 32 and of 3: each long enough that all near pixels are chosen."""
+    panel = Panel(srgb_response(8), WHITE)
+    rates = flux_of(2.0) * np.linspace(0.5, 1.0, 35)[None]
+    whole, size = path_of(rates, down=False)
+    parted = replace(whole, star=np.arange(35) // 32, per_star=32)
+    levels = exact(whole, panel, size)
+    assert np.array_equal(levels, exact(parted, panel, size))
+    sooner = replace(whole, star=np.arange(35) // 31, per_star=31)
+    assert not np.array_equal(levels, exact(sooner, panel, size))
+
+
+def test_no_floor_remains_of_the_frame_before():
+    """Light of 3 levels all over the image, with a star; then the star alone, then nothing."""
+    panel = Panel(srgb_response(8), WHITE)
+    quantiser = ExactQuantiser(panel, FIELD, GaussianPsf(SIGMA))
+    star = sprites_at([30.3], [40.4], flux_of(2.0))
+    alone = exact(star, panel)
+    floor = Levels(np.full(FIELD[::-1], 3, np.uint8))
+    assert (quantiser.levels(star, floor) >= 3).all()
+    assert np.array_equal(quantiser.levels(star), alone)
+    quantiser.levels(star, floor)
+    assert quantiser.levels(None).max() == 0
+
+
 def errors_of_tiles(levels, wanted, panel, tile):
     light, x, y = sums(wanted, tile)
     shown, shown_x, shown_y = sums(shown_light(levels, panel), tile)
@@ -230,6 +293,12 @@ def test_a_star_under_half_a_step_shows_nothing_and_one_of_a_step_one_code():
     levels = exact(sprites, panel)
     assert levels.sum() == 2
     assert levels[61, 60] == levels[80, 100] == 1
+    # half of the first of unlike steps, too, whatever the PSF
+    power_law = Panel(gamma_response(8), WHITE)
+    for of_panel in (panel, power_law):
+        first_step = float(of_panel.response.light[1]) * WHITE
+        faintest = ExactQuantiser.faintest_e_per_s(of_panel, GaussianPsf(SIGMA))
+        assert faintest == pytest.approx(first_step / 2)
 
 
 def test_a_star_over_white_stays_white_and_its_neighbours_bring_no_more():

@@ -10,14 +10,22 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilstar.basics.units import COMPUTE_VERSION
+from hilstar.display.exact import ExactQuantiser, Turn
 from hilstar.display.panel import Panel
-from hilstar.display.render.aids import CROSSHAIR, PATCH, lay_over
+from hilstar.display.render.aids import CROSSHAIR, GRID, PATCH, AidLevels, lay_over
+from hilstar.display.render.apart import ApartBackend
+from hilstar.display.render.backend import ScreenView, as_maps, level_cost
 from hilstar.display.render.context import check_limits, draws_by_cpu
 from hilstar.display.render.encoder import MEETING_WINGS, lit_sides
 from hilstar.display.render.light_units import DENSER_WINGS, MAX_SUM, LightUnits
+from hilstar.display.render.numpy_backend import NumpyBackend
 from hilstar.display.render.presenter import checked_triples, drawn_codes
-from hilstar.display.response import gamma_response
+from hilstar.display.render.target import SpriteSide, Target
+from hilstar.display.response import Levels, gamma_response
+from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.scan import Orientation
 from tests.support.refusals import refusal
 from tests.support.stars import sprites_at
 
@@ -110,6 +118,26 @@ def test_the_wings_of_an_image_that_footprints_cover_end_farther_out():
     assert reach[1] == pytest.approx(DENSER_WINGS * reach[0])
 
 
+def test_a_star_over_white_needs_no_coarser_unit_than_one_of_white():
+    """No pixel is asked for more; a star a million times as bright would else be in no unit."""
+    light = units()
+    white = WHITE_E_PER_S / PSF.peak_share
+    stars = sprites_at(np.full((3, 2), 20.0), np.array([white, white / 2, 1.0]), PSF.footprint_px)
+    over = sprites_at(np.full((3, 2), 20.0), np.array([1e6 * white, white / 2, 1.0]), 10)
+    assert light.unit_for(over) == light.unit_for(stars)
+    assert light.fine_unit_for(over) == light.fine_unit_for(stars) < light.unit_for(stars)
+
+
+def test_a_sprite_of_a_path_reaches_as_far_as_its_whole_star():
+    light = units()
+    sprites = sprites_at(np.full((2, 2), 20.0), np.ones(2), PSF.footprint_px)
+    path = replace(sprites, per_star=7)
+    for alone in (False, True):
+        assert light.reach_per_e(path, alone) == pytest.approx(
+            7 * light.reach_per_e(sprites, alone)
+        )
+
+
 @pytest.mark.parametrize(("patch", "lines"), [(0, 96), (95, 96), (96, 0), (97, 0), (255, 0)])
 def test_on_a_patch_as_bright_as_a_line_lines_are_dark(patch, lines):
     levels = np.full((6, 8), 50, dtype=np.uint8)
@@ -117,6 +145,168 @@ def test_on_a_patch_as_bright_as_a_line_lines_are_dark(patch, lines):
     assert (levels[2] == lines).all()
     assert (levels[:, 3] == lines).all()
     assert levels[0, 0] == patch
+
+
+@pytest.mark.parametrize(("bits", "white", "line"), [(8, 255, 96), (10, 1023, 385)])
+def test_aids_lie_over_a_copy_in_codes_of_the_monitor_s_depth(bits, white, line):
+    """Lines of 96 / 255 of white, rounded down; a patch of a share of white, to the nearest; a
+    grid every 100 px from the crosshair.
+    """
+    aids = AidLevels(gamma_response(bits, 2.2), bits, (30, 10))
+    levels = Levels(np.full((40, 240), 5, np.uint16))
+    assert aids.laid_over(levels, 0, 1.0) is levels
+    for share, code in ((1.0, white), (0.25, round(white / 4))):
+        assert (aids.laid_over(levels, PATCH, share) == code).all()
+    gridded = aids.laid_over(levels, GRID, 0.0)
+    is_line = np.zeros(levels.shape, bool)
+    is_line[10] = is_line[:, [30, 130, 230]] = True
+    assert np.array_equal(gridded, np.where(is_line, line, 5))
+    assert (levels == 5).all()
+
+
+@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
+@pytest.mark.parametrize(("flip_x", "flip_y"), [(False, False), (True, False), (False, True)])
+def test_a_frame_lies_on_the_screen_as_it_is_mounted_with_its_aids(quarter_turns, flip_x, flip_y):
+    """Each pixel's code where `Orientation` has the pixel, the crosshair in 10 bits through its
+    own, and the marker in the screen's lower left corner, whichever way the image lies.
+    """
+    turned = Orientation(flip_x, flip_y, quarter_turns)
+    size, screen = (12, 7), turned.screen_px((12, 7))
+    backend = NumpyBackend(Target(size, PSF, gamma_response(10, 2.2), WHITE_E_PER_S))
+    backend.draw(sprites_at(np.array([[3.2, 5.1]]), np.array([2e3]), PSF.footprint_px))
+    backend.show_on(ScreenView(size, screen, 10, turned, (9.4, 2.0)))
+    backend.present(CROSSHAIR, 0, (2, 700))
+    codes = backend.levels().astype(int).copy()
+    codes[2] = np.maximum(codes[2], 385)  # int(1023 * 96 / 255)
+    codes[:, 9] = np.maximum(codes[:, 9], 385)
+    rows, columns = (axis.ravel() for axis in np.indices(codes.shape))
+    x, y = turned.to_screen(columns, rows, size)
+    wanted = np.zeros(screen[::-1], int)
+    wanted[y, x] = codes.ravel()
+    wanted[-2:, :2] = 700
+    assert np.array_equal(backend.back_buffer, np.stack([wanted] * 3, axis=-1))
+
+
+def test_a_primary_s_target_is_a_grey_monitor_whose_sides_are_by_its_own_light():
+    """A star of white's rate has a fifth of it in a primary that is a fifth of white."""
+    response = gamma_response(8, 2.2)
+    uniformity = np.full(SIZE_PX[::-1], 0.9, np.float32)
+    panels = tuple(Panel(response, share * 1000.0, uniformity) for share in (0.3, 0.5, 0.2))
+    target = Target(
+        SIZE_PX,
+        PSF,
+        response,
+        1000.0,
+        "exact",
+        sides=(SpriteSide(50.0, 8), SpriteSide(10.0, 6)),
+        primaries=panels,
+    )
+    turn = Turn((0.5,), True)
+    blue = target.of_primary(2, turn)
+    sides = [(side.below_e_per_s, side.side_px) for side in blue.sides]
+    assert sides == [(pytest.approx(10.0), 8), (pytest.approx(2.0), 6)]
+    assert (blue.flux_at_white_e_per_s, blue.quantisation) == (200.0, "exact")
+    assert blue.uniformity is uniformity
+    assert (blue.turn, blue.primaries) == (turn, ())
+
+
+class KeptPanel:
+    """A panel's backend that keeps the names of what it is asked for; its level is its number."""
+
+    def __init__(self, number: int, target: Target) -> None:
+        self.number = number
+        self.target = target
+        self.calls: list[str] = []
+        self.shown: tuple[object, ...] = ()
+        self.gl_renderer = self.gl_version = self.path = "kept"
+        self.context = None
+
+    def __getattr__(self, name: str):
+        return lambda *arguments: self.calls.append(name)
+
+    def levels(self) -> Levels:
+        return Levels(np.full((2, 3), self.number, np.uint8))
+
+    def changed_tables(self) -> int:
+        return self.number
+
+    def show_on(self, view, beside=()) -> None:
+        self.shown = tuple(beside)
+
+
+def test_what_is_asked_of_three_primaries_is_asked_of_each_or_of_the_screen_s_first():
+    """Red, green and blue in this order, whichever chooses its levels first."""
+    response = gamma_response(8, 2.2)
+    panels = tuple(Panel(response, 1000.0 * share) for share in (0.3, 0.5, 0.2))
+    target = Target(
+        SIZE_PX, PSF, response, 1000.0, "exact", primaries=panels, together=np.ones((3, 3))
+    )
+    opened: list[KeptPanel] = []
+
+    def open_panel(panel: Target, before) -> KeptPanel:
+        number = round(10 * panel.flux_at_white_e_per_s / 1000.0)
+        opened.append(KeptPanel(number, panel))
+        assert [panel.number for panel in before] == [5, 3][: len(before)]
+        return opened[-1]
+
+    backend = ApartBackend(target, open_panel)
+    assert [panel.number for panel in opened] == [5, 3, 2]
+    assert backend.levels()[0, 0].tolist() == [3, 5, 2]
+    assert backend.changed_tables() == 10
+    backend.show_on(None)
+    green, red, blue = opened
+    assert (red.shown, green.shown, blue.shown) == ((green, blue), (), ())
+    for name in ("begin_anew", "forget_images", "remember_tables"):
+        getattr(backend, name)()
+        assert [panel.calls[-1:] for panel in opened] == [[name]] * 3
+    backend.draw(None, 4)
+    assert [panel.calls[-1] for panel in opened] == ["draw"] * 3
+    for name in ("present", "take_back_buffer", "changed_codes", "fault", "finish", "close"):
+        getattr(backend, name)()
+        assert [panel.calls[-1] for panel in opened] == ["draw", name, "draw"]
+
+
+def test_stars_of_a_psf_that_varies_become_a_map_after_all_other_light():
+    """By its own rule for images; those of one PSF, and those without spectra, stay sprites."""
+    image = np.arange(12, dtype=np.float32).reshape(3, 4)
+
+    def image_of(x_px, y_px, spectra, rates, resolution_px) -> np.ndarray:
+        assert resolution_px == (4, 3)
+        return image * rates.sum()
+
+    varies = SimpleNamespace(by_colour=True, image=image_of)
+    target = SimpleNamespace(psf=varies, resolution_px=(4, 3))
+    before = LightMap(np.ones((3, 4), np.float32))
+    stars = sprites_at(np.ones((2, 2)), np.array([2.0, 3.0]), 9)
+    light = replace(stars, extended=(before,), spectra=np.ones((2, 1)))
+    drawn = as_maps(light, target)
+    assert len(drawn) == 0
+    kept, made = drawn.extended
+    assert kept is before
+    assert np.array_equal(made.image, 5 * image)
+    assert not made.lasting
+    assert as_maps(replace(light, spectra=None), target).extended == (before,)
+    varies.by_colour = False
+    assert as_maps(light, target) is light
+
+
+def test_where_numpy_draws_a_bench_is_planned_as_for_a_usual_opengl():
+    old = SimpleNamespace(version_code=330)
+    by_compute = ExactQuantiser.cost(PSF, COMPUTE_VERSION)
+    assert level_cost(ExactQuantiser, PSF) == by_compute
+    assert level_cost(ExactQuantiser, PSF, old) == ExactQuantiser.cost(PSF, 330) != by_compute
+
+
+def test_a_path_s_sprites_have_the_side_of_their_whole_star():
+    """Of four sprites a fourth of the light each, on a monitor so dim that all light lights it."""
+    sides = (SpriteSide(100.0, 6), SpriteSide(10.0, 4))
+    backend = NumpyBackend(
+        Target(SIZE_PX, PSF, gamma_response(8, 2.2), 0.01, "dither", sides=sides)
+    )
+    for rate, side_px in ((104.0, 10), (96.0, 6), (12.0, 6), (8.0, 4)):
+        path = sprites_at(np.full((4, 2), 20.5), np.full(4, rate / 4), PSF.footprint_px)
+        backend.draw(replace(path, per_star=4))
+        assert np.count_nonzero(backend.levels().any(axis=0)) == side_px
 
 
 def described_gl(texture: int = 4096, viewport: tuple[int, int] = (8192, 4000), points: float = 12):

@@ -199,6 +199,16 @@ def test_a_slow_turn_is_drawn_whole_and_none_is_capped(rng):
     assert sprites.capped == 0
 
 
+def test_a_star_whose_path_is_of_a_slower_turn_is_counted_though_it_has_all_its_nodes():
+    """A wide star's path over half of the field's radius has fewer nodes than a path may have."""
+    stars, scan = stars_on([(160.0, 120.0)]), Scan(hold_s=FRAME_S)
+    wide = GaussianPsf((3.0, 3.0))
+    for rate_deg_s, capped in ((900.0, 1), (40.0, 0)):
+        sprites = swept_sprites(stars, turn((rate_deg_s, 0.0, 0.0)), scan, CAMERA, wide)
+        assert 1 < sprites.per_star < MAX_NODES
+        assert sprites.capped == capped
+
+
 def test_a_path_that_is_too_coarse_still_has_all_its_light_in_its_middle(rng):
     """1000 stars in view at 20 deg/s: 50 px each, of which a share of EXTRA_SPRITES is drawn."""
     inside = rng.uniform((110, 90), (210, 150), size=(1000, 2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.display.geometry import monitor_camera
+from hilstar.optics.camera import Camera
+from hilstar.optics.extended import GlowLight, LightMap
 from hilstar.optics.psf import (
     MAX_CUT,
     MAX_SHARE_ERROR,
@@ -18,8 +21,8 @@ from hilstar.optics.psf import (
     pixel_shares,
     share_polynomial,
 )
-from hilstar.optics.sprites import by_primary, clipped_sprites, make_sprites
-from hilstar.sky.stars import Stars
+from hilstar.optics.sprites import AddedLight, by_primary, by_share, clipped_sprites, make_sprites
+from hilstar.sky.stars import BV_MAG, Stars, with_bodies
 from tests.support.stars import sprites_at, stars_at
 
 IDENTITY = np.array([1.0, 0, 0, 0])
@@ -147,6 +150,27 @@ def test_an_image_turned_to_the_pole_has_polaris_where_it_belongs():
         assert sprites.y_px[0] == pytest.approx(499.5 - 2000 * np.tan(np.radians(1.0)), abs=1e-8)
 
 
+def test_a_star_clips_by_the_white_of_the_pixel_that_it_is_on(rng):
+    """One in each tile of 20 px, at its own phase, on a monitor whose corners are as dark as 0.3
+    of its brightest pixel.
+    """
+    psf = GaussianPsf((0.85, 0.6))
+    columns, rows = np.meshgrid(np.arange(10, 100, 20), np.arange(10, 80, 20))
+    middles = np.stack([columns.ravel(), rows.ravel()], axis=1)
+    pixels = middles + rng.uniform(-0.5, 0.5, middles.shape)
+    uniformity = rng.uniform(0.3, 1.0, (80, 100)).astype(np.float32)
+    nearest = np.rint(pixels).astype(int)
+    white = 7.0 * uniformity[nearest[:, 1], nearest[:, 0]]
+    off = nearest - pixels
+    own = pixel_shares(off[:, 0], 0.85) * pixel_shares(off[:, 1], 0.6)
+    over = np.arange(len(pixels)) % 2 == 0
+    lights = white / own * np.where(over, 1.01, 0.99)
+    stars = sprites_at(pixels, lights, psf.footprint_px)
+    darkest = float(uniformity.min())
+    clipped = clipped_sprites(stars, psf, 7.0, (100, 80), uniformity, darkest)
+    assert clipped.tolist() == np.flatnonzero(over).tolist()
+
+
 def test_a_star_is_clipped_when_its_peak_is_over_white():
     camera = monitor_camera((64, 48), 10.0, 50.0, IDENTITY)
     white = GaussianPsf(SIGMA).peak_share
@@ -157,6 +181,55 @@ def test_a_star_is_clipped_when_its_peak_is_over_white():
     clipped = stars.hip[sprites.star[clipped_sprites(sprites, GaussianPsf(SIGMA), white, (64, 48))]]
     # 0 is white itself; 1 is over it; 2 and 3 are over it together.
     assert sorted(clipped.tolist()) == [1, 2, 3]
+
+
+def test_all_light_is_divided_among_channels_by_its_own_star_body_or_colour():
+    """Two stars, two bodies, and lights of faults of B-V 0.5 and -0.25, in three channels; what has
+    no colour has the mean of the stars by their light.
+    """
+    two_stars = stars_at(np.eye(3)[:2], np.array([1.0, 3.0]))
+    stars = with_bodies(two_stars, ("Moon", "Mars"), np.zeros(2))
+    shares = np.array([[0.6, 0.3, 0.1], [0.2, 0.2, 0.6], [0.5, 0.4, 0.1], [0.1, 0.7, 0.2]])
+    by_bv = np.stack([0.3 - 0.1 * BV_MAG, 0.3 + 0.02 * BV_MAG, 0.4 + 0.08 * BV_MAG], axis=1)
+    bluer = np.array([0.325, 0.295, 0.38])
+    redder = np.array([0.25, 0.31, 0.44])
+    mean = (shares[0] + 3 * shares[1]) / 4
+    image = np.ones((4, 4), np.float32)
+    camera = Camera((64, 48), 100.0, (31.5, 23.5), np.eye(3))
+    lights = (
+        LightMap(image, name="Mars"),
+        LightMap(image, times=2.0, name="Moon"),
+        LightMap(image, bv_mag=0.5),
+        LightMap(image),
+        GlowLight(np.array([0.0, 0.0, 1.0]), 4.0, 0.1, 2.0, camera, bv_mag=-0.25),
+    )
+    rates = np.array([8.0, 4.0, 2.0, 16.0, 1.0])
+    sprites = replace(
+        sprites_at(np.arange(10.0).reshape(5, 2), rates, 9),
+        star=np.array([1, -2, 3, -1, 0]),
+        added=(AddedLight("redder", 1.0, 0.5, 16.0), AddedLight("bluer", 1.0, -0.25, 4.0)),
+        extended=lights,
+    )
+
+    def of_sprites(by_bv: np.ndarray | None) -> np.ndarray:
+        parts = by_share(sprites, stars, shares, by_bv)
+        return np.stack([part.data["electrons_per_s"] / rates for part in parts], axis=1)
+
+    def of_lights(by_bv: np.ndarray | None) -> np.ndarray:
+        rows = []
+        for part in by_share(sprites, stars, shares, by_bv):
+            *maps, glow = part.extended
+            rows.append([*(light.times for light in maps), glow.peak_e_per_s])
+        return np.array(rows).T
+
+    by_colour = np.stack([shares[1], bluer, shares[3], redder, shares[0]])
+    assert of_sprites(by_bv) == pytest.approx(by_colour, rel=1e-6)  # float32
+    without = np.stack([shares[1], mean, shares[3], mean, shares[0]])
+    assert of_sprites(None) == pytest.approx(without, rel=1e-6)
+    wide = np.stack([shares[3], 2 * shares[2], redder, mean, 4 * bluer])
+    assert of_lights(by_bv) == pytest.approx(wide)
+    wide_without = np.stack([shares[3], 2 * shares[2], mean, mean, 4 * mean])
+    assert of_lights(None) == pytest.approx(wide_without)
 
 
 @pytest.mark.parametrize("sigma", [0.5, 0.55, 0.7, 0.85, 1.3, 3.0, 20.0])

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.polynomial import Polynomial
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.display.geometry import monitor_camera
@@ -18,14 +19,18 @@ from hilstar.optics.frame_motion import CameraTurn, swept_sprites
 from hilstar.optics.paths import (
     LIMIT_PX,
     LIMIT_SHARE,
+    MAX_NODES,
     TABLE_PX,
     TRIED_AXES,
     Chords,
+    LensTable,
     Paths,
     ShortPaths,
     _excess,
     _lens_table,
     _mapping,
+    bend_px,
+    node_counts,
     points_within,
 )
 from hilstar.optics.psf import GaussianPsf
@@ -131,12 +136,13 @@ def test_the_limit_is_where_it_fails(points, camera):
     """
     turns = np.geomspace(1e-5, 0.1, 400)
     longest = max(turn for turn in turns if (points_within(camera, turn) or 9) <= points)
-    worst = 0.0
-    for axis in AXES:
-        off, places, length = off_px(camera, axis, 2 * longest, points)
-        allowed = np.maximum(LIMIT_PX, LIMIT_SHARE * length)
-        worst = max(worst, float((off / allowed)[on_screen(places)].max()))
-    assert worst > 1
+    for times, is_too_far, axes in ((2, True, AXES), (1, False, AXES[1:2])):
+        worst = 0.0
+        for axis in axes:
+            off, places, length = off_px(camera, axis, times * longest, points)
+            allowed = BETWEEN_THE_TRIED * np.maximum(LIMIT_PX, LIMIT_SHARE * length)
+            worst = max(worst, float((off / allowed)[on_screen(places)].max()))
+        assert (worst > 1) == is_too_far
 
 
 def test_a_turn_too_long_for_a_few_points_has_exact_paths():
@@ -267,3 +273,60 @@ def test_a_chord_is_drawn_where_it_is_on_the_image_or_beside_it_by_a_margin(name
         assert end <= begin
     else:
         assert (begin, end) == pytest.approx(part)
+
+
+def test_a_direction_s_tangents_turn_by_their_first_and_second_difference(rng):
+    """Of exact places by a pinhole of focal length 1, 0.1 s to either side; the next terms of the
+    differences are 1e-4 of these.
+    """
+    camera = replace(pinhole(200.0), focal_length_px=1.0, principal_point_px=(0.0, 0.0))
+    seen = np.column_stack([rng.uniform(-0.5, 0.5, (20, 2)), np.ones(20)])
+    paths = Paths(seen, np.array([0.03, -0.05, 0.08]), camera)
+    seconds, unit_s = rng.uniform(-1.0, 1.0, 20), 0.1
+    before, now, after = (
+        np.stack(paths.places_px(slice(None), seconds + step)) for step in (-unit_s, 0.0, unit_s)
+    )
+    at, first, second = paths.tangents_at(seconds, unit_s)
+    assert at == pytest.approx(now, abs=1e-14)
+    assert first == pytest.approx((after - before) / 2, rel=1e-3, abs=1e-6)
+    assert second == pytest.approx((after + before) / 2 - now, rel=1e-3, abs=1e-8)
+
+
+def test_a_lens_s_table_turns_a_path_of_tangents_into_one_of_pixels(rng):
+    """The polynomial about the nearest node, of 5 x 4 of them 0.1 apart, by tangents that are
+    polynomials of time; beyond the table that of its edge.
+    """
+    terms = rng.normal(size=(6, 2, 20))
+    table = LensTable(np.array([[-0.2], [-0.15]]), 10.0, (5, 4), terms)
+    at = np.stack([rng.uniform(-0.3, 0.3, 30), rng.uniform(-0.25, 0.25, 30)])
+    by = rng.normal(0, 0.1, (2, 30))
+    bend = rng.normal(0, 0.1, (2, 30))
+    found = table.along(at, by, bend)
+    for k in range(30):
+        column = int(np.clip(np.rint((at[0, k] + 0.2) * 10), 0, 4))
+        row = int(np.clip(np.rint((at[1, k] + 0.15) * 10), 0, 3))
+        u = Polynomial([(at[0, k] + 0.2) * 10 - column, by[0, k] * 10, bend[0, k] * 10])
+        v = Polynomial([(at[1, k] + 0.15) * 10 - row, by[1, k] * 10, bend[1, k] * 10])
+        for axis in (0, 1):
+            place, by_u, by_v, uu, uv, vv = terms[:, axis, 5 * row + column]
+            whole = place + by_u * u + by_v * v + uu * u * u + uv * u * v + vv * v * v
+            assert found[:, axis, k] == pytest.approx(whole.coef[:3])
+
+
+def test_a_path_has_nodes_by_its_length_and_all_where_that_is_not_known():
+    lengths = np.array([0.0, 0.29, 0.31, 1.0, 10.1, np.nan, np.inf])
+    counts = node_counts(lengths, 0.6, 1, 0.3)
+    assert counts[:5].tolist() == [1, 1, 2, 2, 8]
+    assert (counts[5:] >= MAX_NODES).all()
+
+
+def test_a_lens_bends_the_most_where_its_distortion_is_largest():
+    """k1 r^2 of the direction's own place, farthest out on the image; the principal point is not
+    in its middle. A pinhole bends nothing.
+    """
+    camera = replace(pinhole(350.0), principal_point_px=(700.0, 600.0))
+    lens = bounded(replace(camera, lens=Lens((0.5, 0.0, 0.0))), MARGIN_PX)
+    u, v = lens.tangents(np.array([SIZE[0] - 0.5]), np.array([-0.5]))
+    corner_px = camera.focal_length_px * 0.5 * np.hypot(u, v) ** 3
+    assert bend_px(lens) == pytest.approx(float(corner_px[0]))
+    assert bend_px(camera) == 0

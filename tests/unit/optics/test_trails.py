@@ -13,20 +13,24 @@ from astropy.time import Time
 from hilstar.basics.rotation import propagate, to_matrix
 from hilstar.display.render.reference import extended_image
 from hilstar.optics.camera import Camera
+from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf, pixel_shares
 from hilstar.optics.sprites import FrameLight
 from hilstar.optics.trails import (
     SPACING_SIGMA,
     Brush,
+    DiscTrail,
     Lit,
     Trails,
     TrailView,
     disc_of,
     disc_trail,
+    hidden,
     sprite_counts,
     trails,
     with_trails,
 )
+from hilstar.sky.bodies.disc import Disc
 from hilstar.sky.bodies.passes import Cone
 from tests.support.satellites import element_set, lit_moment, looking_at, rate_now
 from tests.support.skies import STATION_UTC
@@ -278,3 +282,115 @@ def test_a_path_across_the_image_is_drawn_from_edge_to_edge():
     half_px = 80 + BRUSH.psf.footprint_px / 2 + 1
     assert [begin[0], end[0]] == pytest.approx([0.5 - half_px / 1200, 0.5 + half_px / 1200])
     assert count == 1 + np.floor(2 * half_px / SIGMA_PX[0] / SPACING_SIGMA)
+
+
+class BentPass(StraightPass):
+    """As StraightPass, along y an arc that bulges to the principal point from 0.1 above it."""
+
+    def directions(self, which, seconds, velocity_km_s=None):
+        tangent = -0.2 + 0.4 * seconds
+        height = -0.1 + 0.4 * seconds * (1 - seconds)
+        rays = np.stack([tangent, height, np.ones_like(tangent)], axis=1)
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def test_a_path_that_bulges_into_the_image_is_drawn_though_its_ends_line_misses_it():
+    """300 px above the principal point at its ends, and through it in its middle: the line between
+    the ends passes 240 px above the image.
+    """
+    view = TrailView(CAMERA, np.eye(3), np.zeros(3))
+    lit = Lit(np.zeros(1), 1.0)
+    (bent,), _ = sprite_counts(BentPass(), view, lit, BRUSH)
+    assert bent > 0
+
+
+class StillPass:
+    """Satellites that stand at tangents along x, and move by up to 0.01 rad/s."""
+
+    def __init__(self, tangents: np.ndarray) -> None:
+        self._rays = np.stack([tangents, np.zeros_like(tangents), np.ones_like(tangents)], axis=1)
+
+    def __len__(self) -> int:
+        return len(self._rays)
+
+    def directions(self, which, seconds, velocity_km_s=None):
+        return self._rays / np.linalg.norm(self._rays, axis=1, keepdims=True)
+
+    def speeds_rad_s(self):
+        return np.linspace(0.0, 0.01, len(self))
+
+
+@pytest.mark.parametrize(
+    ("turning_rad_s", "reach_rad"), [((0.0, 0.0, 0.0), 0.005), ((0.0, -0.02, 0.0), 0.015)]
+)
+def test_what_comes_into_view_by_its_own_way_or_the_camera_s_is_in_reach(turning_rad_s, reach_rad):
+    """In half a second, at 0.01 rad/s and the camera's rate: 0.9 of that beside the image's edge,
+    at 80 px of 3000, on either side; 0.2 rad beside it nothing comes in.
+    """
+    edge = 80 / 3000
+    near = edge + 0.9 * reach_rad
+    tangents = np.array([-0.2, -near, 0.0, near, 0.2])
+    view = TrailView(CAMERA, np.eye(3), np.array(turning_rad_s))
+    assert view.in_reach(StillPass(tangents), 0.5, 0.0).tolist() == [1, 2, 3]
+
+
+@pytest.mark.parametrize(("share", "is_drawn"), [(0.99, True), (1.01, False)])
+def test_a_satellite_under_the_faintest_rate_is_left_out(share, is_drawn):
+    sky, t_ns = lit_moment(LIST)
+    q = looking_at(
+        sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).directions(slice(None), np.zeros(1))[0]
+    )
+    seen = sky.passing(Cone(to_matrix(q)[2], 0.5, 0.01), t_ns)
+    view = TrailView(CAMERA, to_matrix(q), np.zeros(3))
+    lit = Lit(np.full(len(seen), -0.005), 0.01)
+    rate = float(trails(seen, view, lit, BRUSH).electrons_per_s[0])
+    drawn = trails(seen, view, lit, BRUSH, share * rate)
+    assert (len(drawn.index), len(drawn.sprites) > 0) == (int(is_drawn), is_drawn)
+
+
+def test_a_star_behind_a_disc_loses_the_share_of_the_time_of_each_place_that_hides_it():
+    """Of two places of a disc of 1 mrad, which have a quarter and a half of the time: within the
+    first, the second, both, and a tenth beyond the one's limb and the other's.
+    """
+
+    def disc_at(x: float) -> Disc:
+        direction = np.array([x, 0.0, 1.0]) / np.hypot(x, 1.0)
+        return Disc("x", direction, 1000.0, 1.0, 1.0, NORTH, NORTH, "lambert")
+
+    trail = DiscTrail(
+        index=0,
+        electrons_per_s=1.0,
+        middle=NORTH,
+        along=(disc_at(0.0), disc_at(1.2e-3)),
+        shares=np.array([0.25, 0.5]),
+        lights=(),
+        brightest_e_per_s=1.0,
+    )
+    x = np.array([-0.9e-3, 2.1e-3, 0.6e-3, -1.1e-3, 2.3e-3])
+    directions = np.stack([x, np.zeros(5), np.ones(5)], axis=1)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    stars = sprites_at(np.arange(10.0).reshape(5, 2), np.full(5, 8.0), BRUSH.psf.footprint_px)
+    left = hidden(stars, directions, trail)
+    assert left.data["electrons_per_s"].tolist() == [6.0, 4.0, 2.0, 8.0, 8.0]
+    assert left.star.tolist() == [0, 1, 2, 3, 4]
+    whole = replace(trail, shares=np.array([1.0, 0.5]))
+    assert hidden(stars, directions, whole).star.tolist() == [1, 3, 4]
+
+
+def test_the_places_of_a_disc_hide_together_what_the_one_in_the_middle_hides():
+    """A disc of some 20 px along 40 px of the image, before an even light of 1."""
+    sky, t_ns = lit_moment(LIST, "norad,size_m\n7,12000\n")
+    seen = sky.passing(Cone(NORTH, np.pi, 0.0), t_ns).only(np.array([0]))
+    q = looking_at(seen.directions(slice(None), np.zeros(1))[0])
+    view = TrailView(CAMERA, to_matrix(q), np.array([0.0, 0.1, 0.0]))
+    lit = Lit(np.array([-0.07]), 0.14)
+    trail = disc_trail(seen, "wide", view, lit, Brush(BRUSH.psf, 2000, poses=5))
+    assert len(trail.along) == 5
+    (covering,) = (light for light in trail.lights if getattr(light, "covers", False))
+    even = LightMap(np.ones(SIZE_PX[::-1], np.float32))
+    covered = 1 - extended_image((even, covering), SIZE_PX)
+    x_px, y_px = (float(place[0]) for place in view.places_px(seen, slice(None), np.zeros(1)))
+    rows, columns = np.indices(covered.shape)
+    # the disc's edge by five rays a pixel
+    assert (covered * columns).sum() / covered.sum() == pytest.approx(x_px, abs=0.05)
+    assert (covered * rows).sum() / covered.sum() == pytest.approx(y_px, abs=0.05)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +24,8 @@ from hilstar.basics.rotation import (
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.alignment import (
+    AxesArcsec,
+    Residual,
     align,
     corrected,
     groups_of,
@@ -329,3 +332,23 @@ def test_pairs_weigh_by_their_own_residuals_across_and_about_the_boresight():
     np.testing.assert_allclose(weights[:-5], (1 - 3 / MAD_TO_SIGMA**2 / 16) ** 2, rtol=1e-9)
     # where all are beyond the cut, all those that are near count
     np.testing.assert_array_equal(_weights(residual, near, 1e-3), near.astype(float))
+
+
+@pytest.mark.parametrize(
+    ("cross", "roll", "words"),
+    [
+        (12.5, 0.0, "12.5 arcsec rms across the boresight"),
+        (0.0, 70.0, "70 arcsec rms about the boresight"),
+        (12.5, 70.0, "12.5 arcsec rms across the boresight and 70 arcsec rms about the boresight"),
+    ],
+)
+def test_what_a_rotation_does_not_explain_is_said_across_and_about_the_boresight(
+    cross, roll, words
+):
+    some = AxesArcsec(1.0, 2.0)
+    residual = Residual(some, some, AxesArcsec(cross, roll), 8, ("a cause",))
+    remark, cause = remarks_of(SimpleNamespace(residual=residual))
+    assert remark.startswith(f"a rotation does not explain {words}: calibrate the geometry")
+    assert cause == "a cause"
+    explained = Residual(some, some, AxesArcsec(0.0, 0.0), 8, ())
+    assert remarks_of(SimpleNamespace(residual=explained)) == ()

@@ -21,6 +21,7 @@ from hilstar.instruments.calibrate.first_light.photometer import (
     SHARE,
     DotField,
     LatticeRatio,
+    Look,
     Photometer,
     PixelScatter,
     Range,
@@ -369,3 +370,36 @@ def test_rounding_of_both_sums_of_a_ratio_is_taken_off_one_another():
     modes = made._of_rounding(values, lit, [pair], [link])
     # 3 % of the ratio, of which the light loses 3 %: 0.3 less 0.15 DN/s
     np.testing.assert_allclose((modes**2).sum(), (0.3 - 0.15) ** 2, rtol=1e-6)
+
+
+def test_a_code_brighter_than_stated_is_read_shorter_and_then_on_the_next_lattice():
+    """Until it does not saturate; once read, it stays where it is."""
+    made = photometer()
+    taken = []
+
+    def look(name, at, patch):
+        taken.append((name, at))
+        is_bright = at.times > 1 or at.period < 4 or len(taken) > 7
+        return Look(100.0 * at.period, 0.81 if is_bright else 0.8)
+
+    made._look = look
+    patch = Patch(9, "w")
+    chosen = {patch: Range(1, 4)}
+    blacks, sums = made._sums([Patch(0, "w"), patch, Patch(0, "w"), patch], chosen)
+    black = [Range(1), Range(1, 4)]
+    tried = [Range(1, 4), Range(1), Range(2), Range(4)]
+    assert [at for _, at in taken] == [*black, *tried, *black, Range(4)]
+    assert [name for name, _ in taken[2:6]] == [f"patch_001_{at.period}" for at in tried]
+    assert sums == {1: 400.0, 3: 400.0}
+    assert chosen == {patch: Range(4)}
+    assert {times: sums.tolist() for times, sums in blacks.items()} == dict.fromkeys(
+        (1, 4), [100.0] * 2
+    )
+
+
+def test_a_ratio_is_said_with_each_lattice_s_own_exposure():
+    link = ratio_of("g", Range(1, 4), Range(2), 0.98765)
+    said = "a pixel of every 1, exposed 4 times longer is 0.98765 +- 0.00988 times one of every 2"
+    assert link.words == f"code 50 of g: {said}"
+    sparse = ratio_of("r", Range(1, 16), Range(1, 4), 1.0).words
+    assert sparse.endswith("one of every 1, exposed 4 times longer")

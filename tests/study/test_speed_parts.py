@@ -5,6 +5,7 @@ how the virtual tracker's works are ordered.
 from __future__ import annotations
 
 import os
+import sys
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -283,3 +284,87 @@ def test_noise_by_numpy_is_of_the_detector_s_own_figures():
     assert dn[0].mean() == pytest.approx(100.0, rel=0.01)
     # and a twelfth by rounding
     assert dn[0].std() == pytest.approx(((400 + 400) / 16 + 1 / 12) ** 0.5, rel=0.03)
+
+
+def test_a_scene_keeps_the_brightest_in_view_and_fills_up_with_faint_ones(bench_with, rng):
+    """All over a cap half as wide again as the field; columns stay with their stars."""
+    bench = bench_with()
+    q = benchmark.from_radec_roll_deg(*benchmark.RADEC_ROLL_DEG)
+    every = bench.shown_stars
+    visible = bench.sprites(q, every).star
+    by_light = every.v_mag[visible].argsort()
+    few = benchmark.scene(bench, every, q, 5, rng).stars
+    shown = few.hip[bench.sprites(q, few).star]
+    assert set(shown.tolist()) == set(every.hip[visible[by_light[:5]]].tolist())
+    vectors = dict(zip(every.hip.tolist(), every.vectors.tolist(), strict=True))
+    for hip, vector, v_mag in zip(few.hip.tolist(), few.vectors.tolist(), few.v_mag, strict=True):
+        assert vectors[hip] == vector
+        assert every.v_mag[every.hip == hip][0] == v_mag
+    many = benchmark.scene(bench, every, q, 2000, rng).stars
+    known = {tuple(vector) for vector in every.vectors.tolist()}
+    is_random = np.array([tuple(vector) not in known for vector in many.vectors.tolist()])
+    assert (~is_random).sum() == len(every)
+    # as bright as the fainter half of the sky
+    assert many.v_mag[is_random].min() >= np.median(every.v_mag)
+    assert len(np.unique(many.hip[is_random])) > 10
+    boresight = benchmark.to_matrix(q)[2]
+    angles_rad = np.arccos(many.vectors[is_random] @ boresight)
+    field_rad = bench.camera.field_radius_rad(bench.psf.footprint_px)
+    assert angles_rad.max() == pytest.approx(1.5 * field_rad, rel=0.02)
+
+
+def test_a_stage_is_culling_then_projecting_then_drawing(monkeypatch):
+    """In 1, 2 and 4 ms, of which the drawing's are its own stages'."""
+    now_ms = [0.0]
+    monkeypatch.setattr(benchmark.time, "perf_counter", lambda: now_ms[0] * 1e-3)
+
+    def takes(ms, result=None):
+        now_ms[0] += ms
+        return result
+
+    measurement = bare_cell(Result(MACHINE))
+    measurement.stage_ms = {}
+    measurement.icrs_to_image = np.eye(3)
+    near = (np.arange(2), np.zeros((3, 2)), np.ones(2))
+    measurement.candidates = SimpleNamespace(near=lambda *asked: takes(1, near))
+    camera = SimpleNamespace(project=lambda rays: takes(2, (np.zeros(2), np.zeros(2))))
+    camera.resolution_px = (40, 30)
+    measurement.bench = SimpleNamespace(shown_stars=None, camera=camera)
+    measurement.staged = SimpleNamespace(
+        footprint_px=8,
+        draw=lambda sprites: takes(4),
+        levels=lambda: takes(9),
+        stage_ms={"splat": 4.0, "read_back": 9.0},
+    )
+    for _ in range(2):
+        measurement._draw_stages()
+    assert measurement.stage_ms == {
+        "cull": pytest.approx([1.0, 1.0]),
+        "project": pytest.approx([2.0, 2.0]),
+        "splat": [4.0, 4.0],
+        "read_back": [9.0, 9.0],
+    }
+
+
+def test_a_fresh_process_s_figures_are_medians_of_the_reference_size():
+    result = Result(MACHINE)
+    for size, import_ms in ((SMALL, 9e9), (FULL_HD, 300.0), (FULL_HD, 100.0), (FULL_HD, 150.0)):
+        result.startup.append(ProcessStart(*size, import_ms, import_ms / 10, import_ms / 100))
+    benchmark.tell_starts(result, (SMALL, FULL_HD))
+    assert (result.import_ms, result.first_frame_ms, result.memory_mb) == (150.0, 15.0, 1.5)
+    benchmark.tell_starts(result, (SMALL,))
+    assert result.import_ms == 9e9
+
+
+def test_the_loop_that_is_compiled_is_given_its_stamps_and_sigmas(monkeypatch, rng):
+    """Beside NumPy's image, of sigmas that differ and over the edges."""
+    compiled = SimpleNamespace(njit=lambda function: function)
+    monkeypatch.setitem(sys.modules, "numba", compiled)
+    x_px, y_px = rng.uniform(-3, 43, 30), rng.uniform(-3, 27, 30)
+    for footprint_px in (8, 9):
+        sprites = benchmark.pack_sprites(
+            x_px, y_px, rng.uniform(1, 9, 30), np.arange(30), (40, 24), footprint_px
+        )
+        drawn = benchmark._make_numba()(sprites, (0.7, 1.1), (24, 40))
+        wanted = benchmark.numpy_linear(sprites, (0.7, 1.1), (24, 40))
+        np.testing.assert_allclose(drawn, wanted, atol=1e-5)

@@ -320,3 +320,30 @@ def test_an_exposure_that_began_before_a_case_s_last_row_was_lit_is_not_its_own(
     cases.answer(cases.shown)
     cases.pass_s(0.02)
     assert cases.rows()[0]["received"] == 1
+
+
+def test_an_answer_that_fits_its_own_case_better_is_not_that_of_the_case_before(cases):
+    """The case before stood 100 arcsec beside this one: both would be right."""
+    cases.begin(0)
+    cases.pass_s(0.3)
+    turn = from_rotation_vector(np.array([100.0, 0.0, 0.0]) / ARCSEC_PER_RAD)
+    cases.run._before_q = multiply(turn, cases.shown)
+    cases.answer(cases.shown, off_arcsec=60.0)
+    cases.pass_s(0.02)
+    assert cases.run._now.late == 1
+    cases.answer(cases.shown, off_arcsec=40.0)
+    cases.pass_s(0.02)
+    (row,) = cases.rows()
+    assert (row["received"], row["late"], row["wrong"]) == (1, 1, 0)
+
+
+def test_a_first_attitude_is_that_of_the_first_right_answer_and_stays(cases):
+    cases.run._plan = msgspec.structs.replace(cases.run._plan, answers=3)
+    cases.begin(0)
+    for seconds, off_arcsec in ((0.2, 36_000.0), (0.2, 10.0), (0.2, -20.0)):
+        cases.pass_s(seconds)
+        cases.answer(cases.shown, off_arcsec=off_arcsec)
+    cases.pass_s(0.02)
+    (row,) = cases.rows()
+    assert (row["received"], row["wrong"]) == (3, 1)
+    assert row["first_attitude_s"] == pytest.approx(0.39, abs=0.011)

@@ -101,6 +101,20 @@ def test_a_tracker_is_silent_beyond_each_of_its_limits():
         assert (rate == "planted: max_rate_deg_s") is beyond
 
 
+def test_planted_rates_are_scaled_biased_and_late():
+    """A rate that lags by 0.5 s under 0.2 deg/s2 is 0.1 deg/s short of it."""
+    acceleration = np.radians([0.2, 0.0, -0.4])
+    motion = CaseMotion(START_Q, RATE_RAD_S, acceleration)
+    conditions = CaseConditions(np.zeros(3), motion)
+    this = tracker(
+        conditions=conditions, rate_lag_s=0.5, rate_scale=0.02, rate_bias_deg_s=(0.1, -0.2, 0.3)
+    )
+    answer = SolverAnswer(START_Q, rate_cam_rad_s=RATE_RAD_S)
+    told = this.reported(answer, exposure(), 1.0).rate_cam_rad_s
+    wanted = 1.02 * RATE_RAD_S + np.radians([0.1, -0.2, 0.3]) - 0.5 * acceleration
+    assert told == pytest.approx(wanted)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_an_aberration_that_is_left_is_the_turn_of_the_field_s_stars(seed):
     """Stars' directions with v / c added to them, laid onto the true ones by Wahba's problem: of a

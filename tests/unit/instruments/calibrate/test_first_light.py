@@ -266,6 +266,7 @@ def test_a_command_is_told_the_exposure_and_must_write_a_new_image(tmp_path):
             "no camera on bus 3",
         ),
         ("true {pattern} {output}", "wrote no image"),
+        ("touch {output} {pattern}", "wrote no image"),
         ("sh -c 'yes {pattern} {output} >&2'", "printed more than 4 MB"),
         ("no-such-command-here {pattern} {output}", "cannot be run"),
         ("cp {pattern} here.png", "has no {output}"),

@@ -344,3 +344,14 @@ def test_a_figure_is_at_an_end_within_a_thousandth_of_that(low, high):
         (high, True),
     ):
         assert FittedFigure("power", value, low, high).is_at_end == is_at_end
+
+
+@pytest.mark.parametrize(("rms_mag", "is_even"), [(0.0019, True), (0.0021, False)])
+def test_light_is_even_where_it_varies_by_less_than_a_star_s_error(rms_mag, is_even):
+    """Of a map of six fields; one of a single field always is."""
+    fields = 10 ** (-0.4 * rms_mag * np.array([-1.0, 1.0, -1.0, 1.0]))
+    used = np.ones(4, dtype=bool)
+    of_six = UniformityMap(np.ones((2, 3)), fields, 0.0, 0.0, used, 0.0, 0.0)
+    assert of_six.rms_mag == pytest.approx(rms_mag)
+    assert of_six.is_even == is_even
+    assert UniformityMap(np.ones((1, 1)), fields**9, 0.0, 0.0, used, 0.0, 0.0).is_even

@@ -11,8 +11,10 @@ import pytest
 from scipy.special import ndtr
 
 from hilstar.instruments.calibrate.first_light.focus import (
+    ROUNDS,
     SIGMAS_PX,
     DotNoise,
+    Sharpness,
     _alone,
     _amplitudes,
     _Dots,
@@ -23,6 +25,7 @@ from hilstar.instruments.calibrate.first_light.focus import (
     _slopes,
     _stepped,
     _weights,
+    why_blurred,
 )
 
 HALF = 6
@@ -151,3 +154,33 @@ def test_each_dot_has_its_own_sigma_and_a_wild_one_is_told():
     wanted_px = SIGMA_PX + 0.002 * (np.arange(count) - 4)
     # one step of Newton's: the square of a hundredth
     np.testing.assert_allclose(sigmas_px[is_tame], wanted_px[is_tame], atol=2e-4)
+
+
+# Of pixels that are seen 1.5 px wide; the bench file states 0.8 px of PSF.
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, ""),
+        ({"has_settled": False}, f"has not settled in {ROUNDS} rounds"),
+        # 3 % wider and four errors of a third of the dot's: 1.545 + 4 * 0.02
+        ({"dot_side_px": 3 * 1.624, "dot_side_error_px": 0.06}, ""),
+        ({"dot_side_px": 3 * 1.626, "dot_side_error_px": 0.06}, "as wide as monitor pixels"),
+        ({"psf_sigma_error_px": 0.159}, ""),
+        ({"psf_sigma_error_px": 0.161}, "cannot be told from a monitor pixel of 1.50 px"),
+        # 30 % wider than stated, and a tenth of a pixel: 1.14 px
+        ({"psf_sigma_px": 1.139}, ""),
+        ({"psf_sigma_px": 1.141}, "turn the focus"),
+        ({"psf_sigma_px": 0.2}, ""),
+    ],
+)
+def test_a_focus_is_blamed_beyond_what_its_errors_explain(changes, words):
+    none = np.zeros(0)
+    figures = {
+        "psf_sigma_px": 0.8,
+        "psf_sigma_error_px": 0.01,
+        "dot_side_px": 4.5,
+        "dot_side_error_px": 0.0,
+    }
+    failure = why_blurred(Sharpness(none, none, none, **figures | changes), 0.8, 1.5)
+    assert bool(failure) == bool(words)
+    assert words in failure

@@ -9,10 +9,14 @@ import math
 
 import numpy as np
 import pytest
+from matplotlib.quiver import Quiver
+from PIL import Image
 
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import load_notes
+from hilstar.instruments.calibrate.first_light.geometry import _ends_of, _geometry_figures
 from hilstar.instruments.calibrate.geometric import fit as geometric_fit
+from hilstar.instruments.calibrate.geometric.dot_shape import DotShape
 from hilstar.instruments.calibrate.geometric.dots import SeenScreen, lit_for, plan_seen_dots
 from hilstar.instruments.calibrate.geometric.fit import (
     BROWN_CONRADY,
@@ -32,12 +36,18 @@ from hilstar.instruments.calibrate.geometric.fit import (
 from hilstar.instruments.calibrate.geometric.geometry_fit import (
     ROUND,
     Calibrated,
+    bounded_to_field,
+    draw_geometry,
     lines_of,
     nominal_of,
     summary_of,
     write_calibrated,
 )
-from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids
+from hilstar.instruments.calibrate.geometric.observed import (
+    Observed,
+    dot_centroids,
+    measure_images,
+)
 from hilstar.optics.camera import Lens
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
@@ -333,6 +343,34 @@ def calibrated(folder, *, tracker_known: bool) -> Calibrated:
     )
 
 
+def assert_reported(found: Calibrated, summary: dict) -> None:
+    """The figures of first light's step, and which of them are at an end."""
+    figures = _geometry_figures(found)
+    counts = summary["centroids"]
+    assert (figures["centroids_lost"], figures["centroids_false"]) == (counts["lost"], 4)
+    assert (figures["dots_planned"], figures["dots_recognised"]) == (
+        len(found.plan),
+        len(np.unique(found.data.dot)),
+    )
+    for place, error in (("held_out", summary["held_out"]), ("error", summary["error"])):
+        for name in ("rms_arcsec", "max_arcsec"):
+            assert figures[f"{place}_{name}"] == error[name]
+    for name, parameter in summary["parameters"].items():
+        if name.startswith("rotation"):
+            assert name not in figures
+        else:
+            assert figures[name] == parameter["value"]
+    assert figures["notes"] == ("; ".join(summary["notes"]) or "none")
+    tilts = [summary["parameters"][f"tilt_{axis}_deg"]["value"] for axis in "xy"]
+    wanted = [
+        (f"tilt_{axis}_deg", tilt, -60.0, 60.0) for axis, tilt in zip("xy", tilts, strict=True)
+    ]
+    # held-out dots are two hundred times their noise off
+    assert _ends_of(found) == (*wanted, ("the degree of the lens's field", 0, -1.0, 7))
+    fine = dataclasses.replace(found, chosen=candidate("fine", np.full((2, 2), 1e-3)))
+    assert _ends_of(fine) == tuple(wanted)
+
+
 OFF = (("pinhole", 4.0), ("pinhole + k1", 2.0))
 
 
@@ -399,7 +437,76 @@ def test_the_figures_of_a_geometry_are_the_fit_s_wherever_they_stand(tmp_path, t
     map_arcsec = np.nan_to_num(uncertainty.map_arcsec, nan=-1.0)
     np.testing.assert_allclose(of_file.map_arcsec, map_arcsec, atol=1e-4)
     np.testing.assert_allclose(of_file.modes_arcsec, uncertainty.modes_arcsec, rtol=1e-4)
+    assert_reported(found, summary)
     lines = "\n".join(lines_of(found))
     lost = summary["centroids"]["lost"]
     assert f"{matched} matched, {lost} lost, 4 false" in lines
     assert f"1.581 arcsec rms, 2.000 max; noise: {held_out['noise_arcsec']:.3f}" in lines
+
+
+@pytest.mark.parametrize("size_px", [(120, 60), (60, 120), (256, 256)])
+def test_a_lens_is_known_to_a_hundredth_beyond_the_farthest_corner_of_the_field(tmp_path, size_px):
+    """Of a pinhole before a tracker that sees a part of the screen; all of it, and it has no end."""
+    problem, data = dots_of(*tilted_screen(tmp_path), 3, 0.02)
+    found = fit(problem, Model(PINHOLE), 0, data, min_gain=1.0)
+    tracker = found.geometry.tracker
+    middle_px = tuple((side - 1) / 2 for side in size_px)
+    seen = dataclasses.replace(tracker, resolution_px=size_px, principal_point_px=middle_px)
+    geometry = dataclasses.replace(found.geometry, tracker=seen)
+    bounded = bounded_to_field(problem, dataclasses.replace(found, geometry=geometry))
+    if size_px == (256, 256):
+        assert bounded.geometry is geometry
+    else:
+        # the fit turns and shifts it by far less than a thousandth
+        reach = math.hypot(*size_px) / 2 / tracker.focal_length_px
+        assert bounded.geometry.monitor.lens.max_tangent == pytest.approx(1.01 * reach, rel=2e-3)
+
+
+def test_residuals_are_drawn_as_the_mean_of_a_dot_s_centroids(tmp_path, figures):
+    found = calibrated(tmp_path, tracker_known=True)
+    draw_geometry(tmp_path / "geometry", found)
+    places, residuals = figures[0].axes[:2]
+    (arrows,) = (drawn for drawn in residuals.collections if isinstance(drawn, Quiver))
+    right_px, down_px = geometric_fit.residuals_px(found.problem, found.fit.geometry, found.data)
+    dots = np.unique(found.data.dot)
+    means = [[part[found.data.dot == dot].mean() for dot in dots] for part in (right_px, down_px)]
+    np.testing.assert_allclose([arrows.U, arrows.V], means, atol=1e-12)
+    np.testing.assert_allclose([arrows.X, arrows.Y], [found.plan.x_px[dots], found.plan.y_px[dots]])
+    # down the screen is down the picture
+    assert places.images[0].get_extent() == [-0.5, 639.5, 359.5, -0.5]
+    assert residuals.get_ylim() == (359.5, -0.5)
+    np.testing.assert_array_equal(places.images[0].get_array(), found.uncertainty.map_arcsec)
+
+
+def test_only_centroids_of_a_pose_are_freed_of_its_dots_s_curve(rng):
+    """Of narrow dots, and not of those whose PSF or side is wide."""
+    x_px, y_px = rng.uniform(20, 40, (2, 30))
+    pose = np.arange(30) % 3
+    settings = dot_centroids(1.5)
+    seen = Observed(np.zeros(30, np.intp), pose, x_px, y_px, np.ones(30), settings)
+    freed = seen.without_s_curve(1, DotShape(0.4, 2.0, 10.0))
+    is_moved = (np.abs(freed.x_px - x_px) > 1e-6) & (np.abs(freed.y_px - y_px) > 1e-6)
+    np.testing.assert_array_equal(is_moved, pose == 1)
+    np.testing.assert_array_equal(freed.x_px[pose != 1], x_px[pose != 1])
+    np.testing.assert_array_equal(freed.y_px[pose != 1], y_px[pose != 1])
+    for wide in (DotShape(0.81, 2.0, 10.0), DotShape(0.4, 8.1, 10.0)):
+        same = seen.without_s_curve(1, wide)
+        np.testing.assert_array_equal([same.x_px, same.y_px], [x_px, y_px])
+    # nothing is known of how a table's were measured
+    table = dataclasses.replace(seen, settings=None)
+    assert table.without_s_curve(1, DotShape(0.4, 2.0, 10.0)) is table
+
+
+def test_dots_that_the_image_s_edge_cuts_are_not_measured(tmp_path):
+    """Of Gaussians of 1.5 px, the second within its window of the left edge."""
+    y, x = np.mgrid[:60, :80]
+    image = np.full((60, 80), 40.0)
+    for x_px, y_px in ((40.3, 30.6), (2.0, 20.0), (60.0, 50.2)):
+        image += 800 * np.exp(-((x - x_px) ** 2 + (y - y_px) ** 2) / (2 * 1.5**2))
+    path = tmp_path / "frame_3.png"
+    Image.fromarray(np.rint(image).astype(np.uint16)).save(path)
+    seen = measure_images([path], None, (80, 60))
+    assert seen.frame.tolist() == [3, 3]
+    np.testing.assert_allclose(np.sort(seen.x_px), [40.3, 60.0], atol=0.05)
+    np.testing.assert_allclose(np.sort(seen.y_px), [30.6, 50.2], atol=0.05)
+    assert seen.edge_px == dot_centroids(1.5).radius_px

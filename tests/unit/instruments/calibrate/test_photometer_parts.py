@@ -395,3 +395,11 @@ def test_a_code_brighter_than_stated_is_read_shorter_and_then_on_the_next_lattic
     assert {times: sums.tolist() for times, sums in blacks.items()} == dict.fromkeys(
         (1, 4), [100.0] * 2
     )
+
+
+def test_a_ratio_is_said_with_each_lattice_s_own_exposure():
+    link = ratio_of("g", Range(1, 4), Range(2), 0.98765)
+    said = "a pixel of every 1, exposed 4 times longer is 0.98765 +- 0.00988 times one of every 2"
+    assert link.words == f"code 50 of g: {said}"
+    sparse = ratio_of("r", Range(1, 16), Range(1, 4), 1.0).words
+    assert sparse.endswith("one of every 1, exposed 4 times longer")

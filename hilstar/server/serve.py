@@ -31,6 +31,7 @@ from hilstar.basics.process.interrupts import stop_on_signal
 from hilstar.basics.running_statistics import RunningStatistics
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server.answers.answer import Answer
+from hilstar.server.bench.config import AttitudeSettings
 from hilstar.server.bench.frame import Bench, aid_levels_of
 from hilstar.server.faults import AnyFaults
 from hilstar.server.frame_pulse import FramePulse
@@ -150,13 +151,20 @@ def _read_as(bench: Bench, link: AnyLink) -> ReadAs:
     )
 
 
+def traffic_of(settings: AttitudeSettings) -> Traffic:
+    """What goes back to the sender by the bench file; a clock that is known needs no requests."""
+    if settings.source == "scpi":
+        return Traffic(settings.status_hz, clock="shared")
+    asks = settings.time_requests and settings.clock == "estimated"
+    return Traffic(settings.status_hz, asks, settings.clock)
+
+
 def _serve_stream(
     bench: Bench, link: StreamLink, limit: Limit, loop: FrameLoop, outlet: Outlet
 ) -> RunSummary:
     settings, clock = bench.config.attitude, loop.pacer.clock
     timeline = Timeline(policy_of(settings))
-    kept = "shared" if settings.source == "scpi" else settings.clock
-    traffic = Traffic(settings.status_hz, settings.time_requests and kept == "estimated", kept)
+    traffic = traffic_of(settings)
     receiver = Receiver(
         link,
         timeline,

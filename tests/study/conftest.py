@@ -66,14 +66,15 @@ def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Studi
 
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SmallRun]:
-    """Runs a study's own function, which takes a folder first, in this process; what makes it
-    small is patched by the test.
+    """Runs a study's own function, which takes a folder first, in this process; its charts are
+    neither laid out nor written. What makes it small is patched by the test.
     """
 
     def run(work: Callable[..., object], *arguments: object) -> SmallRun:
         folder = tmp_path_factory.mktemp("small")
         saved: dict[str, Figure] = {}
         with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(charts, "finish", lambda drawn: None)
             patch.setattr(charts, "save", lambda drawn, path: saved.update({path.name: drawn}))
             told = work(folder, *arguments)
         return SmallRun(folder, told, saved)

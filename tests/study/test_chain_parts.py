@@ -5,18 +5,32 @@ rows.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics import charts
+from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import angle_between_rad, from_rotation_vector, propagate, to_matrix
 from hilstar.instruments.study.chain import answers, choices, measuring, run
 from hilstar.instruments.study.chain.measuring import CombinationRow, ErrorPart, StageTime
-from hilstar.instruments.study.chain.tracker import LOST_MAG, MeasuredStars, StarJudge, off, within
+from hilstar.instruments.study.chain.tracker import (
+    LOST_MAG,
+    MeasuredStars,
+    Off,
+    StarJudge,
+    attitude_off_arcsec,
+    off,
+    within,
+)
+from hilstar.instruments.study.predictors import Movement, attitude_at
 from hilstar.instruments.study.sweep import Load, Spent
 from hilstar.optics.scan import Scan
+from hilstar.server.bench.config import AttitudeSettings
+from tests.support.tables import csv_rows
 
 PERIOD_S = 1 / 50
 SIZE_PX = (6, 4)
@@ -28,6 +42,66 @@ def bench_of(scan: Scan, exposure_s: float) -> SimpleNamespace:
     monitor = SimpleNamespace(refresh_hz=1 / PERIOD_S)
     config = SimpleNamespace(monitor=monitor, tracker=SimpleNamespace(exposure_s=exposure_s))
     return SimpleNamespace(config=config, scan=scan, camera=SimpleNamespace(resolution_px=SIZE_PX))
+
+
+def turn_ahead_deg(prediction: choices.Prediction, ahead_ms: float) -> float:
+    """The turn since the newest of two samples, 10 ms and 20 ms later, whose rates are thrice that
+    of their attitudes: 1 deg/s about z.
+    """
+    samples = []
+    for t_ns in (0, 10_000_000):
+        q = propagate(np.array([1.0, 0, 0, 0]), np.array([0, 0, math.radians(1.0)]), t_ns * 1e-9)
+        samples.append(AttitudeSample(t_ns, q, np.array([0, 0, math.radians(3.0)])))
+    settings = AttitudeSettings(max_extrapolation_ms=ahead_ms)
+    timeline = choices.filled_timeline(samples, prediction, settings)
+    shown = attitude_at(timeline, 30_000_000).q_icrs_to_cam
+    return math.degrees(angle_between_rad(shown, samples[-1].q_icrs_to_cam))
+
+
+@pytest.mark.parametrize("ahead_ms", [0.0, 500.0])
+def test_an_attitude_is_held_carried_on_by_its_rate_or_by_the_last_two(ahead_ms):
+    """Also for a bench that predicts nothing itself: the study tries each way."""
+    turns_deg = {way: turn_ahead_deg(way, ahead_ms) for way in choices.PREDICTIONS}
+    wanted = {"rate": 0.06, "two samples": 0.02, "held": 0.0}
+    assert turns_deg == pytest.approx(wanted, rel=1e-3, abs=1e-6)
+
+
+def test_an_exposure_before_a_fast_panel_begins_within_a_refresh():
+    """Of 2 ms: 3.7 ms are 1.7 ms of the second one."""
+    bench = bench_of(Scan((0, 1), 0.0, 0.0), 0.1)
+    bench.config.monitor.refresh_hz = 500.0
+    assert choices.exposure(bench, 10).begin_s == pytest.approx(10 / 500 + 0.0017)
+
+
+class Sky:
+    """A bench's sky by the number of a field: the rates of its stars, none where none are stated."""
+
+    def __init__(self, rates_by_field: dict[int, list[float]], others: list[float]) -> None:
+        self.rates_by_field = rates_by_field
+        self.others = others
+        self.seen: list[np.ndarray] = []
+        self.file = SimpleNamespace(path="bench.toml")
+
+    def sprites(self, q: np.ndarray) -> SimpleNamespace:
+        rates = self.rates_by_field.get(len(self.seen), self.others)
+        self.seen.append(q)
+        return SimpleNamespace(data={"electrons_per_s": np.array(rates)})
+
+
+def test_the_scenes_are_the_median_the_densest_and_the_faintest_of_the_fields():
+    """Three fields of a median of five stars, empty ones apart; the faintest of those with three
+    or more.
+    """
+    five = [90.0, 2.0, 2.0, 2.0, 2.0]
+    rates_by_field = {3: five, 40: [70.0] * 20, 60: [9.0, 2.0], 90: [20.0, 1.0, 1.0], 91: five}
+    sky = Sky(rates_by_field, [])
+    average, dense, faint, slow, fast = choices.five_scenes(sky)
+    assert len(sky.seen) == choices.FIELDS
+    for scene, field in ((average, 3), (dense, 40), (faint, 90), (slow, 3), (fast, 3)):
+        np.testing.assert_array_equal(scene.q_icrs_to_cam, sky.seen[field])
+    assert [scene.rate_deg_s for scene in (average, dense, faint, slow, fast)] == [0, 0, 0, 1, 10]
+    with pytest.raises(InputError, match=r"bench\.toml: \[sky\] leaves no star"):
+        choices.five_scenes(Sky({}, []))
 
 
 @pytest.mark.parametrize("hold_s", [0.0, 0.004, PERIOD_S], ids=["flash", "short", "whole"])
@@ -95,6 +169,8 @@ def test_each_combination_is_measured_once(turns, can_steal, count):
     assert {row.faintest_v_mag for row in found} == {7.5, 6.5}
     shallow = [row for row in found if row.faintest_v_mag == 6.5]
     assert {row.sprite for row in shallow} == {"cut"}
+    # the bench's own depth is drawn by all codes, the shallower one by the two that are answers
+    assert {row.quantisation for row in shallow} == {"round", "exact"}
     crude = [row for row in found if row.smear == "point" or row.prediction != "rate"]
     assert all(row.sprite == "cut" for row in crude)
     assert bool(crude) == turns
@@ -115,6 +191,192 @@ def test_stars_are_off_by_their_angle_and_light_and_lost_ones_by_all():
     assert found.arcsec == pytest.approx([30.0, 0.0, 77.0], abs=1e-6)
     assert found.mag == pytest.approx([-2.5 * math.log10(0.9), 0.0, LOST_MAG])
     assert found.lost.tolist() == [False, False, True]
+    # a star that is lost in the sky itself, and shown
+    unseen = off(judge, wanted, shown)
+    assert unseen.lost.tolist() == [False, False, True]
+    assert (unseen.arcsec[2], unseen.mag[2]) == (77.0, LOST_MAG)
+
+
+def test_an_attitude_is_off_by_the_turn_of_its_stars_and_two_are_enough():
+    turn_arcsec = np.array([3.0, -4.0, 60.0])
+    turn = to_matrix(from_rotation_vector(turn_arcsec / 206264.806))
+    stars = np.array([[0.03, 0.01, 1.0], [-0.02, 0.03, 1.0], [0.01, -0.04, 1.0]])
+    stars /= np.linalg.norm(stars, axis=1, keepdims=True)
+    light = np.ones(3)
+    wanted = MeasuredStars(stars, light)
+    for lost in ((), (1,)):
+        shown = stars @ turn.T
+        shown[list(lost)] = np.nan
+        found = attitude_off_arcsec(MeasuredStars(shown, light), wanted)
+        assert found == pytest.approx((5.0, 60.0), rel=1e-3)
+    shown[0] = np.nan
+    assert all(
+        math.isnan(turn) for turn in attitude_off_arcsec(MeasuredStars(shown, light), wanted)
+    )
+
+
+@pytest.fixture
+def planted_scene(monkeypatch):
+    """A scene of three exposures whose stars are off by planted errors, whatever is drawn; with
+    the movement and the exposure that each judge was made of.
+    """
+    made = []
+
+    class Judge:
+        def __init__(self, tracker, movement, seen):
+            self.movement, self.seen, self.sky = movement, seen, "sky"
+            made.append(self)
+
+        def __len__(self):
+            return 2
+
+        def measure(self, image_e):
+            return made.index(self)
+
+    nan = math.nan
+    offs = [
+        Off(np.array([3.0, 77.0]), np.array([0.2, 1.0]), np.array([False, True])),
+        Off(np.array([4.0, 0.0]), np.array([0.3, 0.1]), np.array([False, False])),
+        Off(np.array([77.0, 77.0]), np.array([1.0, 1.0]), np.array([True, True])),
+    ]
+    turns = [(3.0, 1.0), (4.0, nan), (nan, 7.0)]
+    monkeypatch.setattr(measuring, "StarJudge", Judge)
+    monkeypatch.setattr(measuring, "off", lambda judge, shown, sky: offs[shown])
+    monkeypatch.setattr(measuring, "attitude_off_arcsec", lambda shown, sky: turns[shown])
+    monkeypatch.setattr(measuring.DrawingChain, "exposed", lambda chain, seen: seen)
+    monkeypatch.setattr(measuring.DrawingChain, "sprite_px", lambda chain: "9")
+    bench = bench_of(Scan((0, 1), 0.0, 0.0), 0.1)
+    bench.config.monitor.bits = 10
+
+    def marks(movement):
+        other = replace(CUT, quantisation="round")
+        return choices.Marks(replace(CUT, sprite="full"), CUT, other)
+
+    parts = SimpleNamespace(
+        own=bench, can_steal_bits=False, faintest_v_mag=7.5, marks=marks, bench=lambda chosen: bench
+    )
+    camera = SimpleNamespace(focal_length_px=5000.0)
+    tracker = SimpleNamespace(camera=camera, image_e=lambda light, seen: light)
+
+    def scene(rate_deg_s):
+        of = choices.ChainScene("s", "why", np.array([1.0, 0, 0, 0]), rate_deg_s)
+        return measuring.SceneMeasurement(parts, tracker, of, measuring.Rounds()), list(made)
+
+    return scene
+
+
+CUT = choices.ChainCombination("exact", False, 7.5, "cut")
+
+
+def test_exposures_begin_at_their_own_frames_and_at_rest_at_other_places(planted_scene):
+    """3.37 and 4.71 px of the tracker further, by its own focal length."""
+    for rate_deg_s, step_px in ((0.0, math.hypot(3.37, 4.71)), (1.0, 0.0)):
+        scene, judges = planted_scene(rate_deg_s)
+        begins_s = [judge.seen.begin_s for judge in judges[-3:]]
+        wanted_s = [number * PERIOD_S + 0.0037 for number in (20, 151, 325)]
+        assert begins_s == pytest.approx(wanted_s)
+        turned_px = []
+        for judge in judges[-3:]:
+            turn_rad = angle_between_rad(
+                judges[-3].movement.q_icrs_to_cam, judge.movement.q_icrs_to_cam
+            )
+            turned_px.append(5000 * turn_rad)
+        assert turned_px == pytest.approx([0.0, step_px, 2 * step_px], abs=1e-6)
+        assert scene.star_count == 6
+
+
+def test_a_row_is_of_all_exposures_and_has_its_own_marks(planted_scene):
+    scene, _ = planted_scene(0.0)
+    error = scene.error(CUT)
+    assert (error.stars, error.lost) == (6, 3)
+    arcsec = math.sqrt((9 + 16 + 3 * 77**2) / 6)
+    assert error.error_arcsec == pytest.approx(arcsec, rel=1e-3)
+    assert error.error_mag == pytest.approx(math.sqrt((0.04 + 0.09 + 0.01 + 3) / 6), rel=1e-3)
+    assert error.attitude_arcsec == pytest.approx(math.sqrt(12.5), rel=1e-3)
+    assert error.roll_arcsec == pytest.approx(5.0)
+    rows = {
+        (row.quantisation, row.sprite): row for row in scene.untimed() if row.faintest_v_mag == 7.5
+    }
+    marks = {
+        key: (row.chosen, row.as_filed)
+        for key, row in rows.items()
+        if row.chosen or row.as_filed == "true"
+    }
+    assert marks == {
+        ("exact", "full"): ("default", "false"),
+        ("exact", "cut"): ("auto", "false"),
+        ("round", "cut"): ("", "true"),
+    }
+    first = rows["exact", "cut"]
+    assert (first.exposure_s, first.bits, first.bit_stealing, first.scene) == (
+        0.1,
+        10,
+        "false",
+        "s",
+    )
+
+
+def test_a_still_frame_stands_for_all_unless_its_codes_change():
+    seen = SimpleNamespace(at_rest=lambda *_: "first", mean=lambda *_: "all")
+    bench = SimpleNamespace(camera=SimpleNamespace(resolution_px=SIZE_PX))
+    exposed = {}
+    for rate_deg_s in (0.0, 1.0):
+        movement = Movement(np.array([1.0, 0, 0, 0]), rate_deg_s)
+        for method in choices.QUANTISATIONS:
+            chain = measuring.DrawingChain(replace(CUT, quantisation=method), bench, movement)
+            exposed[rate_deg_s, method] = chain.exposed(seen)
+    assert {key for key, of in exposed.items() if of == "first"} == {
+        (0.0, "round"),
+        (0.0, "dither"),
+        (0.0, "exact"),
+    }
+
+
+def test_the_sides_of_sprites_are_from_the_smallest_to_the_largest():
+    def sides(*sides_px):
+        target = SimpleNamespace(sides=[SimpleNamespace(side_px=side) for side in sides_px])
+        renderer, psf = SimpleNamespace(target=target), SimpleNamespace(footprint_px=11)
+        bench = SimpleNamespace(renderer=renderer, psf=psf)
+        return measuring.DrawingChain(CUT, bench, None).sprite_px()
+
+    assert [sides(8, 6, 10), sides(8, 8), sides()] == ["6 to 10", "8", "11"]
+
+
+def test_the_stages_of_a_frame_are_its_own_and_each_frame_has_another_attitude(monkeypatch):
+    """Prediction takes 1 ms, sprites 2, codes 4 with the wait for the GPU, reading back 8."""
+    now_ms = [0.0]
+    monkeypatch.setattr(measuring.time, "perf_counter", lambda: now_ms[0] * 1e-3)
+    attitudes = []
+
+    def takes(ms, result=None):
+        now_ms[0] += ms
+        return result
+
+    def predicted(timeline, light_ns):
+        attitudes.append((timeline, light_ns))
+        return takes(1, SimpleNamespace(q_icrs_to_cam=None, rate_cam_rad_s=None))
+
+    class Drawn:
+        levels = property(lambda drawn: takes(8))
+
+    bench = bench_of(Scan((0, 1), 0.0, 0.0), 0.1)
+    bench.view = lambda q, rate: None
+    bench.light = lambda view: takes(2)
+    bench.draw_sprites = lambda sprites, number: takes(3, Drawn())
+    bench.renderer = SimpleNamespace(finish=lambda: takes(1))
+    monkeypatch.setattr(measuring, "attitude_at", predicted)
+    monkeypatch.setattr(measuring.DrawingChain, "timeline", lambda chain, movement, ns: movement)
+    chain = measuring.DrawingChain(CUT, bench, Movement(np.array([1.0, 0, 0, 0]), 0.0))
+    for _ in range(3):
+        assert chain.stages_ms() == pytest.approx((1.0, 2.0, 4.0, 8.0))
+    light_ns = [ns for _, ns in attitudes]
+    assert np.diff(light_ns).tolist() == [20_000_000] * 2
+    turns_rad = []
+    for movement, _ in attitudes:
+        turns_rad.append(angle_between_rad(np.array([1.0, 0, 0, 0]), movement.q_icrs_to_cam))
+    # 1e-7 rad about two axes, a frame; an angle of 1e-7 rad is known to a few per cent
+    wanted_rad = math.sqrt(2) * 1e-7 * np.arange(1, 4)
+    np.testing.assert_allclose(turns_rad, wanted_rad, rtol=0.1)
 
 
 def test_places_are_within_a_margin_of_an_image_s_last_pixels():
@@ -299,6 +561,11 @@ def test_tables_and_charts_of_scenes_are_of_their_rows(tmp_path, figures):
     assert axes.get_title(loc="left") == "Average field, 30 stars"
     points = {tuple(line.get_xydata()[0]) for line in axes.get_lines() if line.get_marker() == "o"}
     assert points == {(2.0, 3.0), (4.0, 9.0), (5.0, 1.0)}
+    rings = {}
+    for line in axes.get_lines():
+        if line.get_marker() == "o" and line.get_markerfacecolor() == "none":
+            rings[line.get_markeredgecolor()] = tuple(line.get_xydata()[0])
+    assert rings == {charts.RED: (5.0, 1.0), charts.INK: (2.0, 3.0)}
     place, light, times = budget.axes
     bars = [[bar.get_width() for bar in of.patches] for of in (place, light, times)]
     assert bars == [[0.2, 0.7, 0.75], [0.03, 0.01, 0.033], [1.0, 3.0]]
@@ -323,7 +590,7 @@ def test_a_shallower_catalogue_is_judged_by_its_best_row():
 def test_bit_stealing_is_worth_what_it_takes_off_the_error():
     plain = row(quantisation="round", error_arcsec=1.0, time_ms=4.0)
     stealing = row(bit_stealing="true", error_arcsec=0.5, time_ms=6.0)
-    worse = row(bit_stealing="true", error_arcsec=0.95, time_ms=6.0)
+    worse = row(bit_stealing="true", error_arcsec=0.95, error_mag=0.001, time_ms=6.0)
     assert answers.stealing_line([plain, stealing, worse], plain, Load()) == (
         "bit stealing, if the primaries are known in the tracker's colours: takes"
         f" {charts.two_digits(1.0)} arcsec to {charts.two_digits(0.5)} in 1.50 of the time, with"
@@ -335,3 +602,135 @@ def test_bit_stealing_is_worth_what_it_takes_off_the_error():
     assert answers.rest_lines([plain, row(error_arcsec=0.2)], Load())[0].startswith(
         'at rest on 8 bits: set quantisation = "exact", 0.2 arcsec (round: 1 in 0.80 of the time)'
     )
+
+
+def test_answers_are_whole_choices_of_what_the_sender_gives():
+    """Neither coarse nor full sprites, nor points; rates are used where they come, and only there."""
+    turning = row(rate_deg_s=1.0)
+    rows = [
+        turning,
+        replace(turning, prediction="two samples"),
+        replace(turning, prediction="held"),
+    ]
+    rows += [replace(turning, sprite="coarse"), replace(turning, sprite="full")]
+    rows += [replace(turning, smear="point"), replace(turning, faintest_v_mag=6.5)]
+    rows.append(replace(turning, quantisation="temporal"))
+    by_given = {}
+    for rates in (True, False):
+        chosen = answers.allowed(rows, answers.Given(primaries=True, rates=rates))
+        assert {(each.sprite, each.smear, each.quantisation) for each in chosen} == {
+            ("cut", "path", "exact")
+        }
+        by_given[rates] = [each.prediction for each in chosen]
+    assert by_given == {True: ["rate"], False: ["two samples", "held"]}
+
+
+def test_an_answer_s_light_is_held_against_rows_that_are_as_near():
+    """A row far off in place is no measure of light."""
+    near = row(quantisation="round", error_arcsec=1.0, error_mag=0.02)
+    far = row(error_arcsec=9.0, error_mag=0.001)
+    assert answers.simplest([near, far]) is near
+
+
+def test_a_prediction_s_error_is_that_of_its_best_codes():
+    rows = []
+    for prediction, quantisation, arcsec in (
+        *(("rate", "round", 3.0), ("rate", "exact", 2.0), ("rate", "temporal", 0.1)),
+        *(("two samples", "exact", 1.0), ("two samples", "round", 1.5), ("held", "exact", 70.0)),
+    ):
+        changes = {"prediction": prediction, "quantisation": quantisation}
+        rows.append(row(rate_deg_s=1.0, error_arcsec=arcsec, **changes))
+    rows.append(row(prediction="held", faintest_v_mag=6.5, error_arcsec=0.1))
+    rows.append(row(prediction="held", bit_stealing="true", error_arcsec=0.1))
+    assert answers.prediction_words(rows) == (
+        "send no rates, which carry such a vibration on (by the packets' rates 2, by two samples 1,"
+        " the newest attitude held 70 arcsec)"
+    )
+
+
+def test_the_title_says_in_how_many_scenes_auto_is_on_the_front():
+    beaten = row(scene="1 deg/s", time_ms=1.0, error_arcsec=0.1)
+    rows = [AUTO, replace(AUTO, scene="dense field"), replace(AUTO, scene="1 deg/s"), beaten]
+    title = run.headline(rows, Load())
+    assert title.endswith("or within its noise, in 2 of 3 scenes, not in 1 deg/s")
+    assert run.headline(rows[:3], Load()).endswith("in 3 of 3 scenes")
+    assert "2 of 3" not in run.headline(rows, Load(1e3))
+
+
+def test_points_are_named_on_the_front_where_they_are_a_tenth_better_and_once_a_code_beside_it():
+    rows = [
+        row(quantisation="round", error_arcsec=9.0, on_front="true"),
+        row(quantisation="round", error_arcsec=8.2, on_front="true", faintest_v_mag=6.5),
+        row(quantisation="exact", error_arcsec=8.0, on_front="true", bit_stealing="true"),
+        row(quantisation="dither", error_arcsec=30.0, rate_deg_s=1.0, smear="point"),
+        row(quantisation="dither", error_arcsec=20.0, rate_deg_s=1.0, prediction="held"),
+        replace(AUTO, error_arcsec=1.0, time_ms=12.0, on_front="true"),
+        row(quantisation="temporal", error_arcsec=40.0, chosen="default"),
+    ]
+    at = [(each.time_ms, each.error_arcsec) for each in rows]
+    assert [(name, place[1], colour) for name, place, colour in run.side_names(rows, at)] == [
+        ("round", 9.0, charts.PURPLE),
+        ("exact + bit stealing", 8.0, charts.BLUE),
+        ("auto: 1 arcsec, 12 ms", 1.0, charts.RED),
+        ("default: 40 arcsec, 5 ms", 40.0, charts.INK),
+        ("dither, paths held", 20.0, charts.ORANGE),
+        ("temporal", 40.0, charts.GREEN),
+    ]
+    assert run.short_words(rows[3], AUTO) == "dither, points by rate"
+    assert run.short_words(rows[1], AUTO) == "round, fewer stars"
+
+
+def test_an_error_of_nothing_stands_far_below_the_smallest(tmp_path, figures):
+    """On a logarithmic axis: a thousandth of it."""
+    rows = [AUTO, row(error_arcsec=0.0, time_ms=9.0)]
+    run.draw(tmp_path / "c", rows, "A finding", "a machine", [])
+    drawn = set()
+    for line in figures[0].axes[0].get_lines():
+        drawn.update(line.get_ydata())
+    assert min(drawn) == pytest.approx(1e-3) and max(drawn) == 1.0
+
+
+@dataclass(frozen=True)
+class SimpleGlass:
+    """A row of a glass."""
+
+    psf: str
+    error_arcsec: float
+
+
+def test_a_busy_machine_s_tables_have_no_front_and_no_verdict(tmp_path, monkeypatch):
+    for name in ("draw", "draw_budget"):
+        monkeypatch.setattr(run, name, lambda *drawn: None)
+    beaten = [AUTO, row(time_ms=1.0, error_arcsec=0.1)]
+    result = run.SceneResult(run.rows_of(beaten), BUDGET[:4], STAGES)
+    assert run.verdict([result], Load()) is False
+    assert run.verdict([result], Load(1e3)) is None
+    run.write_chain(tmp_path, [result], [], ["of nothing"], Load(1e3))
+    fronts = {
+        (row["on_front"], row["on_front_mag"], row["on_front_as_filed"])
+        for row in csv_rows(tmp_path / "chain.csv")
+    }
+    assert fronts == {("", "", "")}
+    glass = [SimpleGlass("a Gaussian", 2.0), SimpleGlass("a basis of 6", 0.5)]
+    run.write_chain(tmp_path, [result], glass, ["of nothing"], Load())
+    psfs = [(row["psf"], row["error_arcsec"]) for row in csv_rows(tmp_path / "chain_psf.csv")]
+    assert psfs == [("a Gaussian", "2.0"), ("a basis of 6", "0.5")]
+    assert {row["on_front"] for row in csv_rows(tmp_path / "chain.csv")} == {"true", "false"}
+
+
+def test_steps_that_change_nothing_are_named_and_not_drawn(tmp_path, figures):
+    """One that changes light alone is drawn."""
+    scene = "average field"
+    budget = [
+        ErrorPart(scene, "auto", "depth", 0.0, 0.03),
+        ErrorPart(scene, "auto", "smear", 0.0, 0.0),
+        ErrorPart(scene, "auto", "codes", 0.7, 0.01),
+        ErrorPart(scene, "auto", "prediction", 0.0, 0.0),
+        ErrorPart(scene, "auto", "whole", 0.75, 0.033),
+    ]
+    run.draw_budget(tmp_path / "b", [AUTO], budget, STAGES, Load())
+    place, light, _ = figures[0].axes
+    assert [bar.get_width() for bar in place.patches] == [0.0, 0.7, 0.75]
+    assert [bar.get_width() for bar in light.patches] == [0.03, 0.01, 0.033]
+    note = " ".join(figures[0].get_supxlabel().split())
+    assert note.endswith("; smear and prediction change nothing here.")

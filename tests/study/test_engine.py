@@ -101,19 +101,23 @@ def test_dots_of_a_row_stand_on_a_line_of_its_own_the_first_on_top(figures, tmp_
     assert [label.get_text() for label in axes.get_yticklabels()] == ["a", "b"]
     assert axes.yaxis_inverted() and axes.get_xscale() == "log"
     assert [text.get_text() for text in axes.texts] == ["2.5 mag", "0.5 mag"]
+    # beside each first point
+    assert [text.xy for text in axes.texts] == [(1.0, 0), (1.0, 1)]
 
 
 def test_keys_are_in_the_legend_alone_and_places_are_vertical(figures, tmp_path):
     panel = PanelSpec(
-        (LineSpec("at", "error", "", named=False),),
+        (LineSpec("at", "error", "", marker="", named=False, label=lambda row: row.way),),
         keys=(SeriesLook("a key", charts.GREEN, "d"),),
         places=(LevelLine(3.0, "a limit"),),
         legend={},
     )
-    looks = looks_of({"a": "first"})
+    looks = looks_of({"a": "first"}, "o")
     draw_rows(tmp_path / "x", "A finding", ChartSpec((panel,), lambda row: row.way, looks), ROWS)
     points, key, limit = figures[0].axes[0].get_lines()
     assert points.get_label() == HIDDEN and len(key.get_xydata()) == 0
+    # a line's own marker, though it is none, replaces that of its series
+    assert (points.get_marker(), key.get_marker()) == ("", "d")
     assert limit.get_xydata().tolist() == [[3.0, 0.0], [3.0, 1.0]]
     texts = figures[0].axes[0].get_legend().get_texts()
     assert [text.get_text() for text in texts] == ["a key", "a limit"]
@@ -132,6 +136,46 @@ def test_curves_have_the_styles_that_are_given(figures, tmp_path):
     panel = CurvePanel(x, {"solid": x, "dotted": -x}, PanelSpec(), styles=("-", ":"))
     draw_curves(tmp_path / "x", "A finding", (panel,))
     assert [line.get_linestyle() for line in figures[0].axes[0].get_lines()] == ["-", ":"]
+
+
+def test_a_panel_s_limits_margins_and_scales_are_its_own_axes(figures, tmp_path):
+    line = (LineSpec("at", "error", named=False),)
+    panels = (
+        PanelSpec(line, xlim=(0.5, 7.0), ylim=(-3.0, 4.0)),
+        PanelSpec(line, from_zero=True, margins=(0.5, 0.25)),
+        PanelSpec(line, scales=("symlog", "log")),
+    )
+    looks = looks_of({"a": "first", "b": "second"})
+    layout = {"share_x": False}
+    spec = ChartSpec(panels, lambda row: row.way, looks, layout=layout)
+    rows = [WayError("a", 1.0, 2.0), WayError("a", 3.0, 6.0)]
+    draw_rows(tmp_path / "x", "A finding", spec, rows)
+    limited, margined, scaled = figures[0].axes
+    assert (limited.get_xlim(), limited.get_ylim()) == ((0.5, 7.0), (-3.0, 4.0))
+    # half of 2 beyond either end, and a quarter of 4 above
+    assert margined.get_xlim() == pytest.approx((0.0, 4.0))
+    assert margined.get_ylim() == pytest.approx((0.0, 7.0))
+    assert (scaled.get_xscale(), scaled.get_yscale()) == ("symlog", "log")
+    assert scaled.xaxis.get_transform().linthresh == 1.0
+
+
+def test_curves_share_an_axis_where_they_have_one_x(figures, tmp_path):
+    x = np.array([1.0, 2.0])
+    for second_x, is_shared in ((x, True), (10 * x, False)):
+        first = CurvePanel(x, {"first": x}, PanelSpec(names=False))
+        second = CurvePanel(second_x, {"second": x}, PanelSpec(names=False))
+        draw_curves(tmp_path / "x", "A finding", (first, second))
+        upper, lower = figures[-1].axes
+        assert (upper.get_xlim() == lower.get_xlim()) is is_shared
+
+
+def test_a_size_is_drawn_at_its_floor_where_it_is_smaller_whatever_its_sign():
+    sized = engine.at_least("error", 0.1)
+    sizes = [sized(WayError("a", 1.0, error)) for error in (-3.0, -0.05, 0.0, 0.2)]
+    assert sizes == [3.0, 0.1, 0.1, 0.2]
+    below = engine.finite("error", 2.0)
+    drawn = [below(WayError("a", 1.0, error)) for error in (1.9, 2.0, -7.0)]
+    assert drawn[::2] == [1.9, -7.0] and np.isnan(drawn[1])
 
 
 def test_the_example_of_the_engine_draws_a_legible_chart_and_its_table(tmp_path):

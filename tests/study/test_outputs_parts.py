@@ -30,7 +30,6 @@ from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.tracker.settings import DetectorSettings
 from tests.support.benches import bench_text
-from tests.support.studies import undrawn
 from tests.support.tables import csv_rows
 
 SIZE_PX = (120, 90)
@@ -55,19 +54,19 @@ def bench(tmp_path_factory):
     return read_bench_file(path)
 
 
-def test_a_bench_s_outputs_are_its_exposures_and_their_stars(bench, tmp_path):
-    with undrawn():
-        lines = outputs.run(tmp_path, bench, OWN)
+def test_a_bench_s_outputs_are_its_exposures_and_their_stars(bench, small_run):
+    run = small_run(outputs.run, bench, OWN)
+    lines, folder = run.told, run.folder
     assert [line.split(":")[0] for line in lines] == ["orion", "lyra", "zeta_cas", "field"]
     names = output_files(fields_of(OWN))
     assert {name for name in names if name.endswith((".csv", ".fits"))} == {
-        path.name for path in tmp_path.iterdir()
+        path.name for path in folder.iterdir()
     }
     for field, line in zip(fields_of(OWN), lines, strict=True):
-        rows = csv_rows(tmp_path / f"{field.stem}.csv")
-        with fits.open(tmp_path / f"{field.stem}.fits") as opened:
+        rows = csv_rows(folder / f"{field.stem}.csv")
+        with fits.open(folder / f"{field.stem}.fits") as opened:
             noisy = opened[0].data.astype(float)
-        with fits.open(tmp_path / f"{field.stem}_without_noise.fits") as opened:
+        with fits.open(folder / f"{field.stem}_without_noise.fits") as opened:
             clean = opened[0].data.astype(float)
         assert noisy.shape == clean.shape == SIZE_PX[::-1]
         difference = noisy - clean
@@ -89,14 +88,14 @@ def test_a_bench_s_outputs_are_its_exposures_and_their_stars(bench, tmp_path):
         assert near.max() == clean.max()
 
 
-def test_rapp_of_a_bench_s_stars_is_of_those_on_its_image(bench, tmp_path):
-    with undrawn():
-        findings = rapp.bench_rapp(tmp_path, bench, OWN)
+def test_rapp_of_a_bench_s_stars_is_of_those_on_its_image(bench, small_run):
+    run = small_run(rapp.bench_rapp, bench, OWN)
+    findings, folder = run.told, run.folder
     assert [finding.figure for finding in findings] == ["rapp_bench", *["rapp_stars"] * 4]
-    table = np.genfromtxt(tmp_path / "rapp_bench.csv", delimiter=",", names=True)
+    table = np.genfromtxt(folder / "rapp_bench.csv", delimiter=",", names=True)
     at_3000 = table["rapp3_energy"][table["temperature_k"] == 3000][0]
     assert f"3000 K gives {at_3000:.2f} times" in findings[0].text
-    rows = csv_rows(tmp_path / "rapp_stars.csv")
+    rows = csv_rows(folder / "rapp_stars.csv")
     stars = rapp.bench_stars(bench.config, bench.folder)
     for field in fields_of(OWN):
         to_cam = to_matrix(from_radec_roll_deg(*field.radec_roll_deg))
@@ -108,10 +107,36 @@ def test_rapp_of_a_bench_s_stars_is_of_those_on_its_image(bench, tmp_path):
         assert {int(each["hip"]) for each in own} == set(stars.hip[inside].tolist())
         ratios = [float(each["rapp3"]) for each in own]
         assert all(0.5 < ratio < 5 for ratio in ratios)
+    named = zip(fields_of(OWN), findings[1:], strict=True)
+    for field, finding in named:
+        own = [float(each["rapp3"]) for each in rows if each["field"] == field.stem]
+        low, middle, high = np.percentile(own, (5, 50, 95))
+        assert finding.text == (
+            f"RAPP3 of the stars of {field.name}: {len(own)} stars, median {middle:.2f}, 90 % from"
+            f" {low:.2f} to {high:.2f}"
+        )
     # red stars have more light in a sensor that sees to 1050 nm
     bv = np.array([float(each["bv_mag"]) for each in rows])
     ratio = np.array([float(each["rapp3"]) for each in rows])
     assert np.median(ratio[bv > 1.0]) > np.median(ratio[bv < 0.2])
+
+
+def test_a_bench_s_ratios_are_by_its_own_weighting(tmp_path, small_run):
+    path = tmp_path / "photons.toml"
+    tables = {**BENCH, "sky": {"faintest_v_mag": 3.0, "passband_weighting": "photon"}}
+    path.write_text(bench_text(tables))
+    run = small_run(rapp.bench_rapp, read_bench_file(path))
+    table = np.genfromtxt(run.folder / "rapp_bench.csv", delimiter=",", names=True)
+    at = dict(zip(table["temperature_k"].tolist(), table["rapp3_photon"].tolist(), strict=True))
+    assert run.told[0].text == (
+        f"By photons.toml a black body of 3000 K gives {at[3000]:.2f} times the electrons of the"
+        f" average model, one of 5000 K {at[5000]:.2f}, 9000 K {at[9000]:.2f}, 50000 K"
+        f" {at[50_000]:.2f}"
+    )
+    by_energy = table["rapp3_energy"][table["temperature_k"] == 3000][0]
+    assert abs(by_energy / at[3000] - 1) > 0.01
+    (electrons,) = (y for label, _, y in run.lines("rapp_bench", 0) if label == "electrons")
+    np.testing.assert_array_equal(electrons, table["rapp3_photon"])
 
 
 def truth_of(*stars: tuple[int, str, float, float, float, bool]) -> np.ndarray:
@@ -208,6 +233,8 @@ def test_effort_is_within_where_light_and_each_centroider_are():
     assert (within.worst_px, within.share, within.within) == (0.06, pytest.approx(0.6), True)
     assert outcome(flux_max_mag=0.04).share == pytest.approx(0.8)
     assert not outcome(max_px_wide=0.11).within
+    # at the tolerance it is within
+    assert outcome(max_px_wide=0.1).share == 1.0 and outcome(max_px_wide=0.1).within
     assert not outcome(flux_max_mag=0.051).within
 
 

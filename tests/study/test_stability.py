@@ -427,3 +427,167 @@ def test_a_study_has_the_recorded_cases_about_those_that_draw(tmp_path, monkeypa
         assert float(row["tolerance"]) == case.figures.tolerance
     wrong = FailureCase("c", "m", "f", "h", "w", CaseFigures(2.0, 3.0, 1.0))
     assert wrong.row() == ("c", "WRONG", "m", "f", "h", "w", 2.0, 3.0, 1.0)
+
+
+def test_a_star_s_shares_are_along_its_own_axes():
+    """Of sigmas and places that differ by axis, on an image that is no square: sampled, in half
+    floats and in the nearest pixel.
+    """
+    on = image.Target((40, 30), image.GaussianPsf((0.8, 1.7)))
+    sprites = image.one_star(12.3, 20.1, on, 5.0)
+    columns, rows = np.arange(40) - 12.3, np.arange(30) - 20.1
+    middle = np.exp(-0.5 * ((columns / 0.8) ** 2 + (rows[:, None] / 1.7) ** 2))
+    wanted = 5 * middle / (2 * math.pi * 0.8 * 1.7)
+    np.testing.assert_allclose(image.point_sampled(on, sprites), wanted, rtol=1e-5, atol=1e-12)
+    exact = image.linear_image(sprites, (40, 30), on.psf)
+    # a share is half of a difference of two numbers near 1, each known to 2^-12
+    halves = image.half_float(on, sprites)
+    np.testing.assert_allclose(halves, exact, atol=3 * 5 * 2**-12)
+    assert np.abs(halves - exact).max() > 1e-5
+    np.testing.assert_allclose(image.bare_polynomial(on, sprites), exact, atol=1e-5)
+    nearest = image.nearest_pixel(on, sprites)
+    assert (nearest[20, 12], nearest.sum()) == (pytest.approx(5.0), pytest.approx(5.0))
+
+
+def test_a_star_s_largest_errors_are_those_of_either_sign():
+    """Of planted images: 3 % too much light, 5 % too little a pixel to the left, and a middle of 60 %."""
+    on = image.target(image.SIGMA_PX)
+
+    def draw(sprites):
+        drawn = image.linear_image(sprites, on.resolution_px, on.psf)
+        phase = sprites.x_px[0] - image.MIDDLE_PX
+        if phase < -0.2:
+            return 1.03 * drawn
+        if phase < 0.0:
+            return 0.95 * np.roll(drawn, -1, axis=1)
+        drawn[image.MIDDLE_PX, image.MIDDLE_PX] *= 0.6 if phase < 0.2 else 1.0
+        return drawn
+
+    errors = image.star_errors(draw, on, np.array([-0.3, -0.1, 0.1, 0.3]))
+    assert errors.centroid_px == pytest.approx(1.0, abs=1e-4)
+    peak_share = image.pixel_shares(np.array([0.1]), image.SIGMA_PX)[0]
+    peak_share *= image.pixel_shares(np.zeros(1), image.SIGMA_PX)[0]
+    assert errors.flux == pytest.approx(0.4 * peak_share, rel=1e-3)
+    # the middle has 95 % of the light of its neighbour, 1.1 px from the star
+    beside, own = image.pixel_shares(np.array([1.1, 0.1]), image.SIGMA_PX)
+    assert errors.peak == pytest.approx(0.95 * beside / own - 1, rel=1e-4)
+    brighter = image.star_errors(lambda s: 1.03 * draw(s), on, np.array([-0.3]))
+    assert (brighter.flux, brighter.peak) == pytest.approx((1.03**2 - 1,) * 2, rel=1e-3)
+
+
+def test_a_ripple_is_the_range_of_light_by_its_mean_and_in_magnitudes():
+    fluxes = np.array([1.0, 0.8, 1.3, 0.9])
+    assert image.ripple(fluxes) == pytest.approx(0.5)
+    assert image.ripple_mag(fluxes) == pytest.approx(2.5 * math.log10(1.3 / 0.8))
+
+
+def test_a_panel_s_wanted_light_is_what_each_of_its_pixels_can_show():
+    """White at most, times the pixel's own light."""
+    scene = image.uneven_panel()
+    bright = replace(scene, sprites=image.lone_stars(-3.0, scene.panel.response).sprites)
+    uniformity = scene.panel.uniformity
+    wanted = bright.wanted()
+    over = bright.linear() > 1.4
+    assert over.sum() > 100
+    np.testing.assert_allclose(wanted[over], uniformity[over])
+    under = bright.linear() < 0.3
+    np.testing.assert_allclose(wanted[under], bright.linear()[under])
+    # 30 % fainter half a screen's side from the middle, and 5 % by chance
+    y, x = np.mgrid[: image.SIDE_PX, : image.SIDE_PX] / image.SIDE_PX - 0.5
+    noise = uniformity - (1 - 0.3 * np.hypot(x, y))
+    assert noise.std() == pytest.approx(0.05, rel=0.02) and abs(noise.mean()) < 1e-3
+    for part in (np.s_[:40, :40], np.s_[-40:, -40:], np.s_[:40, -40:]):
+        assert abs(noise[part].mean()) < 0.006  # 4 of its sigmas
+
+
+def test_the_error_of_groups_is_in_the_smallest_steps_of_their_own_light():
+    """A step too much in each of a group's nine pixels, and dark parts that do not count."""
+    response = table_response(4, np.array([0.0, 0.01, 0.05, *np.linspace(0.1, 1.0, 13)]))
+    scene = image.lone_stars(0.0, response)
+    parts = scene.sprites
+    only = image.CodeScene(
+        image.join_sprites([first_of(parts, 1)], parts.footprint_px), 0.85, scene.panel
+    )
+    wanted = only.wanted()
+    codes = np.zeros((image.SIDE_PX, image.SIDE_PX), dtype=np.uint16)
+    row, column = np.unravel_index(wanted.argmax(), wanted.shape)
+    codes[row - 1 : row + 2, column - 1 : column + 2] = 1
+    codes[0, -1] = 3  # in a part without a star
+    steps = (9 * 0.01 - wanted.sum()) / 0.01
+    assert image.error_steps(image.Levels(codes), only) == pytest.approx(abs(steps), rel=1e-4)
+    light = np.zeros((image.SIDE_PX, image.SIDE_PX))
+    light[30, 100] = 7.0
+    by_part = image.light_by_part(light)
+    assert by_part[30 // image.TILE_PX, 100 // image.TILE_PX] == by_part.sum() == 7.0
+
+
+def first_of(sprites, count):
+    """The first of some sprites."""
+    columns = {name: getattr(sprites, name)[:count] for name in ("data", "star", "x_px", "y_px")}
+    return replace(sprites, **columns)
+
+
+def test_neighbours_are_at_their_distance_in_all_directions_each_with_its_light():
+    scene = image.neighbours((2.0, 4.5), 3.0)
+    count = image.COUNT**2
+    x_px, y_px = scene.sprites.x_px, scene.sprites.y_px
+    first = np.argsort(scene.sprites.star)  # as they were given
+    x_px, y_px = x_px[first], y_px[first]
+    light = scene.sprites.data["electrons_per_s"][first]
+    across_px, down_px = x_px[count:] - x_px[:count], y_px[count:] - y_px[:count]
+    np.testing.assert_allclose(np.hypot(across_px, down_px), 3.0, atol=1e-5)
+    angles = np.unwrap(np.arctan2(down_px, across_px))
+    np.testing.assert_allclose(np.diff(angles), 2 * math.pi / count, atol=1e-4)
+    np.testing.assert_allclose(light[:count] / light[count:], 10 ** (0.4 * 2.5), rtol=1e-5)
+    assert scene.stars == 2
+
+
+def test_stars_half_off_are_on_every_edge_at_every_phase():
+    sprites = image.half_off().sprites
+    last = image.SIDE_PX - 1
+    x_px, y_px = sprites.x_px, sprites.y_px
+    for across, along in ((x_px, y_px), (last - x_px, y_px), (y_px, x_px), (last - y_px, x_px)):
+        near = across < 1.0
+        # about the first pixel's outer edge, -0.5: six places from -1 to 0 evenly
+        inside = near & (along > 10) & (along < last - 10)
+        places = np.sort(across[inside])
+        np.testing.assert_allclose(places, (np.arange(6) + 0.5) / 6 - 1, atol=1e-5)
+
+
+def test_a_case_is_judged_by_its_largest_figure():
+    """A refusal by what would be cut at the worst, a crowd's by its worst pixel, too, a range's by
+    both stars, and spilled light by the panel's largest step.
+    """
+    assert image.absurd_sigmas().figures.fault == pytest.approx(1.0, abs=1e-6)
+    flux = image.flux_range().figures
+    assert flux.fault == pytest.approx(1.0, abs=1e-6)
+    spilled = image.spilled_everywhere().figures
+    response = image.srgb_response(8)
+    assert spilled.tolerance == pytest.approx(np.diff(response.light).max())
+    assert image.coded_neighbours().figures.tolerance == pytest.approx(1.0)
+    assert image.coded_coarse().figures.tolerance == pytest.approx(0.5)
+    assert image.no_stars().figures.error == 0.0
+
+
+def test_codes_are_judged_on_the_panels_that_their_cases_name(monkeypatch):
+    """Bits, and magnitudes under the star whose peak is white."""
+    scenes = {}
+
+    def judged(case, scene, *given, **more):
+        scenes[case] = scene
+
+    monkeypatch.setattr(image, "judged", judged)
+    for visit in image.CODES:
+        visit()
+    said = {}
+    for case, scene in scenes.items():
+        light = scene.sprites.data["electrons_per_s"] * scene.psf.peak_share
+        said[case] = scene.panel.response.bits, round(float(-2.5 * np.log10(light.max())), 3)
+    assert said == {
+        "stars half off the screen, 6 mag under white on 8 bits": (8, 6.0),
+        "two stars 1 px apart, 6 mag under white": (8, 6.0),
+        "codes of stars of sigma 0.3 px, 3 mag under white": (8, 3.0),
+        "pixels 5 % apart, stars 6 mag under white": (8, 6.0),
+        "a panel of 2 bits, stars whose peak is white": (2, 0.0),
+        "a panel of 16 bits, stars 10 mag under white": (16, 10.0),
+    }

@@ -16,12 +16,14 @@ import numpy as np
 import pytest
 
 from hilstar.basics import charts
+from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, NS_PER_S
 from hilstar.display.quantise import shown_light
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.instruments.study import predictors
 from hilstar.instruments.study.chain import answers, choices, measuring, run
 from hilstar.instruments.study.chain import glass as chain_glass
+from hilstar.instruments.study.chain import tracker as chain_tracker
 from hilstar.instruments.study.chain.choices import (
     ChainCombination,
     ChainScene,
@@ -120,14 +122,18 @@ def small_chain(small_run, tmp_path_factory):
         average, _, _, slow, _ = five_scenes(own)
         return average, slow
 
+    in_glass = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(measuring, "MIN_ROUNDS", 1)
         patch.setattr(measuring, "FRAMES_A_VISIT", 1)
         patch.setattr(run, "QUICK", Rounds(exposures=1, time_s=0.0))
         patch.setattr(run, "five_scenes", two)
+        patch.setattr(run, "glass_rows", lambda file, scene, quick: in_glass.append(scene) or [])
         done = []
         found = small_run(lambda folder: run.run(file, folder, True, done.append))
     assert done == [1, 2]
+    # the second scene is the densest field
+    assert [scene.name for scene in in_glass] == ["1 deg/s"]
     return found
 
 
@@ -740,15 +746,19 @@ def test_each_chain_is_timed_in_each_round_and_one_by_its_stages():
     """After a frame that does not count; the rounds end with the time, but not before two."""
 
     class Chain:
+        last = None
+
         def __init__(self, ms):
-            self.ms, self.frames = ms, 0
+            self.ms, self.staged = ms, 0
 
         def frame_ms(self):
-            self.frames += 1
-            return (self.ms if self.frames > 1 else 1e9), 2 * self.ms
+            # the first after another chain's fills caches
+            is_first, Chain.last = Chain.last is not self, self
+            return (1e9 if is_first else self.ms), 2 * self.ms
 
         def stages_ms(self):
-            return (self.ms, 2.0, 3.0, 4.0)
+            self.staged += 1
+            return (self.ms, 2.0, 3.0, 1e9 if self.staged == 1 else 4.0)
 
     chains = [Chain(1.0), Chain(5.0), Chain(9.0)]
     times, stages = measuring.timed(chains, 0.0, 1)
@@ -882,3 +892,77 @@ def test_a_panel_names_the_scenes_whose_error_is_alike(figures, tmp_path):
         "Faint field, 12 stars",
     ]
     assert "The line is the front" in " ".join(figure.get_supxlabel().split())
+
+
+def test_sprites_are_whole_cut_within_the_bench_s_tolerance_or_within_ten_times_that(parts):
+    keys = {}
+    for sprite in choices.SPRITES:
+        chosen = ChainCombination("round", False, parts[0].faintest_v_mag, sprite)
+        render = parts[0].bench(chosen).config.render
+        keys[sprite] = (render.effort, render.tolerance_mag, render.tolerance_px)
+    depth = parts[0].faintest_v_mag - 1
+    for method in ("round", "exact"):
+        shallow = parts[0].bench(ChainCombination(method, False, depth, "cut"))
+        assert shallow.config.render.quantisation == method
+        assert shallow.shown_stars.v_mag.max() <= depth
+    assert keys["full"][0] == "full"
+    assert keys["cut"] == ("auto", 0.01, 0.05)
+    assert keys["coarse"] == ("auto", pytest.approx(0.1), pytest.approx(0.5))
+
+
+@pytest.mark.parametrize(
+    ("keys", "prediction", "default"),
+    [
+        ("[attitude]\nmax_extrapolation_ms = 0\n", "held", "path"),
+        ('motion = "off"\n', "rate", "point"),
+    ],
+)
+def test_a_bench_that_predicts_or_moves_nothing_draws_points(tmp_path, keys, prediction, default):
+    """In a turn; hilstar's default predicts. A catalogue ends with its faintest star."""
+    text = SMALL.replace("= 9\n", "= 6.007\n") + keys
+    with Parts(small_file(tmp_path, text)) as held:
+        assert held.faintest_v_mag == held.own.stars.v_mag.max().round(2) <= 6.0
+        turning = held.marks(predictors.Movement(np.array(ORION_Q), 1.0))
+        still = held.marks(predictors.Movement(np.array(ORION_Q), 0.0))
+    ways = {(mark.prediction, mark.smear) for mark in (turning.auto, turning.as_filed)}
+    assert ways == {(prediction, "point")}
+    assert (turning.default.prediction, turning.default.smear) == ("rate", default)
+    assert {still.auto.prediction, still.as_filed.prediction} == {"rate"}
+
+
+def test_a_star_on_a_path_is_found_with_a_tenth_of_its_light(parts):
+    scene = scene_of(parts, 4)
+    (judge,) = scene.judges
+    tracker = scene.tracker
+    seen_e = tracker.image_e(
+        chain_tracker.sky_light(tracker.bench, judge.movement, judge.seen), judge.seen
+    )
+    assert not judge.measure(0.12 * seen_e).lost.any()
+    assert judge.measure(0.08 * seen_e).lost.all()
+    # its path over the exposure and the largest delay before and after it
+    late_s = lead_ns(tracker.bench.config) / NS_PER_S + 1 / judge.movement.packet_hz
+    path_arcsec = 10.0 * 3600 * (judge.seen.length_s + 2 * late_s)
+    assert judge.lost_arcsec == pytest.approx(path_arcsec, rel=1e-6)
+
+
+def test_no_star_is_judged_that_clips_or_shows_less_than_half_a_step(parts):
+    """Alnilam (V = 1.7) is over white, and alone."""
+    benches, tracker = parts
+    scene = ChainScene("Alnilam", "", from_radec_roll_deg(84.05, -1.2, 0.0))
+    movement = predictors.Movement(scene.q_icrs_to_cam, 0.0)
+    judge = chain_tracker.StarJudge(tracker, movement, choices.exposure(benches.own, 20))
+    white = benches.own.flux_at_white_e_per_s * benches.own.darkest
+    rates = judge.sky.light_e / judge.seen.length_s
+    peaks = rates * benches.own.psf.peak_share / white
+    first_step = benches.own.calibration.response.light[1]
+    assert len(judge) > 10 and peaks.max() < 1.05
+    assert (rates / white).min() > 0.9 * first_step / 2
+
+
+def test_points_that_are_drawn_for_paths_are_charged_to_smear_alone(parts, monkeypatch):
+    monkeypatch.setattr(predictors, "JITTER", ())
+    scene = scene_of(parts, 4)
+    budget = error_budget(scene, replace(scene.marks.auto, smear="point"))
+    by_step = {part.step: part.error_arcsec for part in budget}
+    assert by_step["smear"] > 100 and by_step["depth"] < 0.01 * by_step["smear"]
+    assert by_step["codes"] < 0.1 * by_step["smear"]

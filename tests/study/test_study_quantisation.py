@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import fields, replace
 from itertools import product
 
 import numpy as np
 import pytest
 
+from hilstar.basics import charts
 from hilstar.display.phases import USUAL_PSF, fainter, measure, phase_grid
 from hilstar.display.render.reference import linear_image
+from hilstar.instruments.study import codes, quantisation
 from hilstar.instruments.study.codes import (
     AIMS,
     BITS,
@@ -20,14 +23,21 @@ from hilstar.instruments.study.codes import (
 )
 from hilstar.instruments.study.engine import write_rows
 from hilstar.instruments.study.quantisation import (
+    TimedWay,
     WayErrors,
     centroider_errors,
     centroiders_line,
+    draw_each,
+    draw_magnitudes,
+    draw_times,
     faintest,
     largest_words,
     summary,
+    timed_ways,
+    times_line,
     way_errors,
 )
+from hilstar.instruments.study.sweep import Load
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.tables import csv_rows
 
@@ -44,6 +54,22 @@ def test_the_measure_finds_the_error_that_was_put_in():
     assert (errors.centroid_rms_px, errors.centroid_max_px) == pytest.approx((1, 1), abs=1e-4)
     nothing = measure(image, np.zeros_like(image), tile)
     assert np.isinf(nothing.flux_max_mag) and np.isinf(nothing.centroid_rms_px)
+
+
+def test_a_timed_field_has_three_times_as_many_stars_in_each_magnitude_as_in_the_one_before():
+    """Over eight of them under a white peak, all over the frame."""
+    field = codes.star_field((1000, 200), 10)
+    peaks = field.data["electrons_per_s"] * USUAL_PSF.peak_share
+    mags = -2.5 * np.log10(peaks)
+    assert len(mags) == codes.STARS and mags.min() >= 0 and mags.max() < 8.001
+    # of 10^(m / 2) evenly
+    for limit in (6.0, 7.0, 7.5):
+        share = (10 ** (limit / 2) - 1) / (10**4 - 1)
+        sigma = math.sqrt(share * (1 - share) / codes.STARS)
+        assert (mags < limit).mean() == pytest.approx(share, abs=4 * sigma)
+    for places, side_px in ((field.x_px, 1000), (field.y_px, 200)):
+        assert places.min() < 0.02 * side_px and places.max() > 0.98 * side_px
+        assert places.mean() == pytest.approx(side_px / 2, rel=0.08)
 
 
 def test_fainter_stars_have_less_light():
@@ -115,6 +141,141 @@ def test_the_faint_end_is_the_first_magnitude_at_it():
     assert faintest([WayErrors(8, "exact", 20.0, None), *made], 10, "exact") is made[1]
 
 
+def test_a_whole_study_has_quarters_of_a_magnitude_beyond_every_aim(monkeypatch):
+    asked = []
+
+    def planted(bits, way, phases, mags):
+        asked.append((bits, way.name, phases, list(mags)))
+        return mags
+
+    monkeypatch.setattr(codes, "code_errors", planted)
+    monkeypatch.setattr(codes, "error_figures", lambda errors: errors)
+    rows = way_errors(quick=False)
+    assert [(bits, name) for bits, name, *_ in asked] == list(
+        product(BITS, (way.name for way in WAYS))
+    )
+    quarters = [k / 4 for k in range(41)]
+    assert all(phases == 32 and mags == quarters for *_, phases, mags in asked)
+    assert all(row.mag_under_white == row.figures for row in rows)
+
+
+def timed_way(bits, method, frame_ms, **figures):
+    known = {field.name: 1.0 for field in fields(codes.ErrorFigures)}
+    return TimedWay(bits, method, frame_ms, 6.0, codes.ErrorFigures(**(known | figures)))
+
+
+def test_times_are_told_of_the_middle_panel_without_bit_stealing():
+    timed = []
+    for bits in BITS:
+        for number, way in enumerate(WAYS):
+            timed.append(timed_way(bits, way.name, bits + number / 10))
+    assert times_line(timed) == (
+        "1000 stars, 1920 x 1080, 10 bits, from light to levels in memory: round 10.0 ms, dither"
+        " 10.1 ms, temporal 10.2 ms, exact 10.3 ms"
+    )
+
+
+def test_each_way_is_timed_by_its_own_codes_and_has_its_faint_end_s_errors(rows, monkeypatch):
+    """On a small frame: its panel, its method, and frames that go on."""
+    monkeypatch.setattr(codes, "FRAME_PX", (48, 40))
+    monkeypatch.setattr(codes, "BITS", (8, 12))
+    drawn = {}
+    whole = quantisation.Renderer
+
+    class Seen(whole):
+        def __init__(self, target):
+            super().__init__(target)
+            self.frames = drawn.setdefault(id(target), (target, []))[1]
+
+        def draw(self, sprites, frame=0):
+            self.frames.append(frame)
+            super().draw(sprites, frame)
+
+    monkeypatch.setattr(quantisation, "Renderer", Seen)
+    timed = timed_ways(rows, 2)
+    keys = [(row.bits, row.method) for row in timed]
+    assert keys == list(product((8, 12), (way.name for way in WAYS)))
+    for row in timed:
+        limit_mag = AIMS[row.bits][1]
+        assert row.mag_under_white == limit_mag and row.frame_ms > 0
+        assert row.figures is faintest(rows, row.bits, row.method).figures
+    for (target, frames), (bits, name) in zip(drawn.values(), keys, strict=True):
+        way = next(way for way in WAYS if way.name == name)
+        assert (target.quantisation, target.response.bits) == (way.method, bits)
+        # a panel whose channels are stolen has more levels than codes
+        assert (len(target.response.light) > 2**bits) is way.stealing
+        assert frames == [0, 1, 2]
+
+
+def test_errors_are_drawn_by_their_panel_and_way_with_their_aim(rows, small_run):
+    dark = replace(rows[0].figures, flux_max_mag=math.inf, max_px_fit=0.0)
+    rows = [replace(rows[0], figures=dark), *rows[1:]]
+    run = small_run(lambda folder: draw_magnitudes(folder / "m", rows))
+    figure = run.charts["m"]
+    exact, rounded = (largest_words(rows, 10, method) for method in ("exact", "round"))
+    assert run.title("m") == (
+        f"On 10 bits every star to 8 magnitudes under white is within {exact} with exact,"
+        f" {rounded} with round"
+    )
+    for number, bits in enumerate(BITS):
+        aim_mag, limit_mag = AIMS[bits]
+        for axes, error, aim in zip(
+            figure.axes[2 * number : 2 * number + 2],
+            ("flux_max_mag", "max_px_fit"),
+            (aim_mag, 0.01),
+            strict=True,
+        ):
+            lines = list(axes.get_lines())
+            assert lines.pop().get_xydata().tolist() == [
+                [0, aim],
+                [limit_mag, aim],
+                [limit_mag, 1e-5],
+            ]
+            assert len(lines) == len(WAYS)
+            wanted = {}
+            for way in WAYS:
+                own = [row for row in rows if (row.bits, row.method) == (bits, way.name)]
+                y = [getattr(row.figures, error) for row in own]
+                # a star that shows nothing is a gap, and an error of 0 stands at the floor
+                y = [max(size, 1e-5) if math.isfinite(size) else math.nan for size in y]
+                wanted[way.colour, ":" if way.stealing else "-"] = y
+            for line in lines:
+                y = wanted.pop((line.get_color(), line.get_linestyle()))
+                np.testing.assert_array_equal(line.get_ydata(), y)
+
+
+def test_errors_of_each_centroider_and_against_time_are_drawn_by_their_panel(rows, small_run):
+    table = centroider_errors(rows)
+    timed = []
+    for bits, way in product(BITS, WAYS):
+        figures_of = faintest(rows, bits, way.name).figures
+        timed.append(TimedWay(bits, way.name, bits * 1.5, 6.0, figures_of))
+    run = small_run(lambda folder: draw_each(folder / "e", table))
+    each = run.charts["e"]
+    shares = [row.share for row in table]
+    left = f"exact leaves {min(shares):.2f} to {max(shares):.2f} of the error"
+    assert left in run.title("e")
+    for axes, bits in zip(each.axes, BITS, strict=True):
+        own = [row for row in table if row.bits == bits]
+        round_line, exact_line = axes.get_lines()[-2:]
+        assert round_line.get_xdata().tolist() == [row.round_px for row in own]
+        assert exact_line.get_xdata().tolist() == [row.exact_px for row in own]
+        assert [text.get_text() for text in axes.texts] == [f"{row.share:.2f}" for row in own]
+    run = small_run(lambda folder: draw_times(folder / "t", timed, Load()))
+    times = run.charts["t"]
+    assert "exact takes 15.0 ms and round 15.0 ms, on 10 bits" in run.title("t")
+    for axes, of in (
+        (times.axes[0], lambda row: row.figures.flux_rms_mag),
+        # along two axes
+        (times.axes[1], lambda row: math.sqrt(2) * row.figures.axis_rms_px_fit),
+    ):
+        places = sorted((line.get_marker(), *line.get_xydata()[0]) for line in axes.get_lines())
+        markers = dict(zip(BITS, "os^", strict=True))
+        wanted = sorted((markers[row.bits], row.frame_ms, of(row)) for row in timed)
+        assert [place[0] for place in places] == [place[0] for place in wanted]
+        np.testing.assert_allclose([p[1:] for p in places], [w[1:] for w in wanted])
+
+
 def test_errors_fall_with_the_frames_of_an_exposure():
     panels = {panel.name: panel for panel in frames_panels()}
     for name in ("sRGB, 8 bits", "1 bit"):
@@ -133,3 +294,31 @@ def test_errors_fall_with_the_frames_of_an_exposure():
     assert srgb.steps == pytest.approx(star / first_step, rel=1e-6)
     assert steps_words(srgb) == f"sRGB, 8 bits: {srgb.steps:.1f} steps"
     assert steps_words(replace(srgb, steps=100.4)) == "sRGB, 8 bits: 100 steps"
+
+
+def test_errors_over_frames_are_drawn_solid_by_temporal_and_dotted_by_dither(small_run):
+    rows = []
+    for number, panel in enumerate(("coarse", "fine"), start=1):
+        for method, times in (("temporal", 1.0), ("dither", 3.0)):
+            for frames in (2, 6):
+                mag = 0.1 * number * times / frames
+                rows.append(
+                    codes.OverFrames(panel, 6.0, 50.0 * number, method, frames, mag, 0, 0, mag / 2)
+                )
+    run = small_run(lambda folder: codes.draw(folder / "o", rows))
+    assert run.title("o") == (
+        "Over any 6 frames temporal places stars within 0.0083 px rms on coarse, and within 0.017 px"
+        " on fine"
+    )
+    for axes, error in zip(run.charts["o"].axes, ("flux_rms_mag", "axis_rms_px_fit"), strict=True):
+        drawn = {}
+        for line in axes.get_lines():
+            drawn[line.get_color(), line.get_linestyle()] = list(line.get_ydata())
+        assert len(drawn) == 4
+        for number, panel in enumerate(("coarse", "fine")):
+            for method, style in (("temporal", "-"), ("dither", ":")):
+                own = [row for row in rows if (row.panel, row.method) == (panel, method)]
+                wanted = [getattr(row, error) for row in own]
+                assert drawn[charts.SERIES[number], style] == wanted
+    labels = {line.get_label() for line in run.charts["o"].axes[0].get_lines()}
+    assert {"coarse: 50.0 steps", "fine: 100 steps"} < labels

@@ -8,21 +8,23 @@ import itertools
 import math
 import re
 from contextlib import ExitStack
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hilstar.basics import charts
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import angle_between_rad
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
-from hilstar.instruments.study import sweep
+from hilstar.instruments.study import sweep, trials
 from hilstar.instruments.study.codes import star_field
 from hilstar.instruments.study.predictors import predictors, slew_attitude, slew_sample
-from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, in_turn, pareto_front
+from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, Load, in_turn, pareto_front
 from hilstar.instruments.study.tradeoff import light, places
 from hilstar.instruments.study.tradeoff import run as tradeoff
 from hilstar.instruments.study.tradeoff.light import (
@@ -167,6 +169,111 @@ def test_a_prediction_s_errors_are_those_of_its_samples():
     np.testing.assert_allclose(errors, wanted, rtol=1e-6, atol=1e-9)
     # one that waits lies between two samples: the cubic of a swing of 20 s is 1e-3 of a hold
     assert max(places.prediction_errors(blend, samples)) < 0.2 * max(errors)
+
+
+def test_predictions_are_told_by_their_worst_and_rms_and_timed_after_the_last_sample_but_one(
+    tradeoff_study, monkeypatch
+):
+    samples = [slew_sample(k * 50_000_000) for k in range(200)]
+    steps = tradeoff_study[2]["prediction"]
+    for predictor in predictors()[:2]:
+        errors = places.prediction_errors(predictor, samples)
+        row = steps[predictor.name]
+        assert float(row["error"]) == pytest.approx(max(errors))
+        assert float(row["second"]) == pytest.approx(math.sqrt(np.mean(np.square(errors))))
+    timed = []
+    monkeypatch.setattr(places, "slew_sample", lambda t_ns: samples[t_ns // 50_000_000])
+    monkeypatch.setattr(places, "prediction_errors", lambda predictor, samples: [1.0])
+    monkeypatch.setattr(places, "attitudes_at", lambda attitude_at, times: timed.append(times))
+    with ExitStack() as stack:
+        for trial in places.prediction(stack, True).trials:
+            trial.work()
+    for times_ns in timed:
+        assert len(times_ns) == 60
+        assert (times_ns[0], times_ns[-1]) == (samples[-2].t_ns, samples[-1].t_ns)
+
+
+def test_extended_precision_knows_places_between_those_of_float64():
+    camera = places.ideal_monitor(places.demo_config())
+    (turn,) = places.random_turns(1, camera)
+    assert len(places.random_turns(5, camera)) == 5
+    stars = places.stars_to(4.0)
+    near = stars.vectors[stars.grid.near(turn[2], 0.1)]
+    exact = places.EXACT.places_px(near, turn, camera)
+    assert np.isfinite(exact).all() and len(exact) > 5
+    assert (exact != exact.astype(np.float64)).mean() > 0.9
+
+
+def test_a_step_s_cells_are_its_own_and_have_no_front_on_a_busy_machine(small_run, monkeypatch):
+    """The study is as busy as its busiest step."""
+    trial = Trial("a method", 0.5, 2.0, list, True, False, {"max_px_fit": 0.25})
+    trial = replace(trial, time_ms=3.0, quartiles_ms=(2.0, 7.0), on_front=True, beaten="why")
+    step = Trials("psf", "sums", Figure("error", "mag"), Figure("rms", "px"), "", [trial])
+    cells = tradeoff.cells_of_trial(step, trial)
+    assert {name: cells.pop(name) for name in tradeoff.MORE_COLUMNS if name != "max_px_fit"} == {
+        name: "" for name in tradeoff.MORE_COLUMNS if name != "max_px_fit"
+    }
+    assert cells == {
+        "step": "psf",
+        "work": "sums",
+        "method": "a method",
+        "error": 0.5,
+        "error_unit": "mag",
+        "error_is": "error",
+        "second": 2.0,
+        "second_unit": "px",
+        "second_is": "rms",
+        "time_ms": 3.0,
+        "quartile_1_ms": 2.0,
+        "quartile_3_ms": 7.0,
+        "default": True,
+        "exact": False,
+        "front": True,
+        "beaten_by": "why",
+        "max_px_fit": 0.25,
+    }
+    loads = {"first": Load(), "busy": Load(1e3), "last": Load(1e-3)}
+    steps = {name: replace(step, name=name, load=load) for name, load in loads.items()}
+    plans = [lambda stack, quick, name=name: steps[name] for name in loads]
+    monkeypatch.setattr(tradeoff, "STEPS", tuple(plans))
+    monkeypatch.setattr(tradeoff, "measured", lambda step, budget_s: step)
+    run = small_run(tradeoff.run, True)
+    fronts = {row["step"]: row["front"] for row in run.rows("tradeoff")}
+    assert fronts == {"first": "True", "busy": "", "last": "True"}
+    lines, right = run.told
+    assert right is None and lines[-1] == Load(1e3).caution
+    assert set(run.charts) == {f"tradeoff_{name}" for name in loads}
+
+
+def test_codes_that_are_timed_are_those_of_one_frame_after_the_other(monkeypatch):
+    drawn = []
+
+    class Planted:
+        footprint_px = 10
+
+        def __init__(self, target):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *raised):
+            pass
+
+        def draw(self, field, number):
+            drawn.append(number)
+
+        def levels(self):
+            return None
+
+    errors = SimpleNamespace(flux_max_mag=0.1, max_px=lambda kind: 0.2)
+    monkeypatch.setattr(light, "Renderer", Planted)
+    monkeypatch.setattr(light, "code_errors", lambda *asked: [errors])
+    with ExitStack() as stack:
+        trial, *_ = light.quantisation(stack, True).trials
+        for _ in range(3):
+            trial.work()
+    assert drawn == [0, 1, 2]
 
 
 def test_the_smear_s_stars_are_even_over_the_detector_in_the_middle_of_the_exposure():
@@ -387,6 +494,143 @@ def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(c
         beaten.default.beaten == "'fast and rough' is no worse and takes 75 % less time; it is tidy"
     )
     assert any(beaten.default.beaten in line for line in table_lines(beaten))
+
+
+def test_what_beats_a_default_is_the_fastest_that_does_and_on_a_busy_machine_nothing(
+    clock, monkeypatch
+):
+    step = three_methods(clock, 4.0, floor=1.0)
+    step = replace(step, trials=[*step.trials, Trial("rough", 0.2, 0.0, clock(2.0))])
+    beaten = measured(step, 0.02)
+    assert [trial.method for trial in beaten.trials] == [
+        "fast and rough",
+        "rough",
+        "own",
+        "slow and rough",
+    ]
+    assert beaten.default.beaten.startswith("'fast and rough' is no worse")
+    monkeypatch.setattr(sweep.OtherWork, "load", lambda self: Load(1e3))
+    busy = measured(step, 0.02)
+    assert not any(trial.on_front or trial.beaten for trial in busy.trials)
+    assert f"   {sweep.NOT_JUDGED}" in table_lines(busy)
+
+
+def test_a_step_s_works_share_its_budget_and_its_floor_is_drawn_where_one_is_below(
+    clock, monkeypatch, small_run
+):
+    asked = []
+    turns = trials.in_turn
+
+    def in_turn(works, rounds, share_s):
+        asked.append((list(works), rounds, share_s))
+        return turns(works, 1, share_s)
+
+    monkeypatch.setattr(trials, "in_turn", in_turn)
+    step = measured(three_methods(clock, 4.0), 0.6)
+    assert asked == [(["fast and rough", "own", "slow and rough"], MAX_ROUNDS, pytest.approx(0.2))]
+    for floor, is_drawn in ((5e-3, True), (1e-3, False)):
+        floored = replace(step, error=Figure("error", "px", floor))
+        run = small_run(lambda folder, step=floored: draw_trials(folder / "t", step, "here"))
+        levels = [y for _, x, y in run.lines("t", 0) if x == [0.0, 1.0]]
+        assert levels == ([[floor, floor]] if is_drawn else [])
+        assert run.title("t") == charts.capital(trials.finding(floored))
+
+
+def test_a_time_s_quartiles_are_of_the_wall_and_say_where_methods_overlap():
+    taken = [sweep.Spent(wall, 1e3) for wall in (9.0, 1.0, 3.0, 5.0, 7.0)]
+    assert trials.quartiles_ms(taken) == (3.0, 5.0, 7.0)
+    default = Trial("own", 0.1, 0.0, list, time_ms=10.0, quartiles_ms=(8.0, 13.0))
+    for third_ms, end in ((7.9, "takes 40 % less time"), (8.0, "quartiles of both overlap")):
+        best = Trial("best", 0.1, 0.0, list, time_ms=6.0, quartiles_ms=(5.0, third_ms))
+        words = trials.beaten_words(default, best)
+        assert words.startswith("'best' is no worse and takes 40 % less time")
+        assert words.endswith(end)
+
+
+def planted_trials(floor: float = 0.01, unit: str = "mag", **changes: object) -> Trials:
+    """Three methods on the front but for the second, which is the default."""
+    methods = [
+        Trial("fast", 0.5, 2.0, list, time_ms=1.0, quartiles_ms=(0.9, 1.3), on_front=True),
+        Trial("own", 0.5, 3.0, list, is_default=True, time_ms=20.0, quartiles_ms=(19.0, 22.0)),
+        Trial("the sum", 0.001, 0.0, list, is_exact=True, time_ms=1500.0, on_front=True),
+    ]
+    methods[1] = replace(methods[1], **changes)
+    step = Trials(
+        "psf", "the sum of it", Figure("error", unit, floor), Figure("rms", "px"), "", methods
+    )
+    return replace(step, remark="a caution")
+
+
+def test_a_step_s_table_title_and_note_are_whole():
+    step = planted_trials(beaten="'fast' is no worse")
+    assert table_lines(step) == [
+        "",
+        "psf: the sum of it",
+        "   method   error [mag]   rms [px]   ms",
+        "*  fast             0.5          2  1",
+        " > own              0.5          3  20",
+        "*  the sum        0.001          0  1.5e+03",
+        "   the default: 'fast' is no worse",
+        "   a caution",
+    ]
+    title = "PSF: 'own' is off by 0.5 mag in 20 ms; 'the sum' takes 1500 ms"
+    assert trials.finding(step) == title
+    at_floor = planted_trials(error=0.01, on_front=True)
+    assert trials.finding(at_floor).startswith("PSF: 'own' has no error in 20 ms")
+    above = planted_trials(error=0.0101, unit="1")
+    assert trials.finding(above).startswith("PSF: 'own' is off by 0.01 in 20 ms")
+    busy = replace(step, load=Load(1e3))
+    assert trials.finding(busy) == f"PSF: 'own' is off by 0.5 mag; {sweep.NOT_JUDGED}"
+    assert trials.trials_note(step, "A machine") == (
+        "The sum of it. Blue: the front, which nothing else is as right and as fast as. Ring:"
+        " hilstar's default. Bars: quartiles. Dotted: 0.01 mag, no error below it. A machine."
+    )
+    assert "Dotted" not in trials.trials_note(planted_trials(floor=0.0), "A machine")
+    assert "front" not in trials.trials_note(busy, "A machine")
+
+
+def test_a_step_s_points_are_ringed_by_default_and_blue_on_the_front():
+    points = trials.front_points(planted_trials())
+    drawn = [(point.place, point.colour, point.on_front, point.rings) for point in points]
+    assert drawn == [
+        ((1.0, 0.5), charts.BLUE, True, ()),
+        ((20.0, 0.5), charts.MUTED, False, (charts.RED,)),
+        # an error below the floor is drawn there
+        ((1500.0, 0.01), charts.BLUE, True, ()),
+    ]
+    assert points[1].ends_ms == (19.0, 22.0)
+    # the largest error first, the faster of two alike before the other
+    names = [(name, colour) for name, _, colour in trials.side_names(planted_trials())]
+    assert names == [("fast", charts.BLUE), ("own", charts.RED), ("the sum", charts.BLUE)]
+    # a default alone on the front has the colour of its name
+    alone = planted_trials(on_front=True)
+    alone = replace(
+        alone, trials=[replace(trial, on_front=trial.is_default) for trial in alone.trials]
+    )
+    assert [point.colour for point in trials.front_points(alone)] == [
+        charts.MUTED,
+        charts.RED,
+        charts.MUTED,
+    ]
+
+
+def test_a_front_of_two_points_is_a_step_and_every_ring_is_drawn():
+    points = trials.front_points(planted_trials())
+    with charts.panels_of("A finding") as (axes,):
+        trials.draw_front(axes, points, trials.TRIALS_LOOK)
+        lines = axes.get_lines()
+        steps = [line for line in lines if line.get_drawstyle() == "steps-post"]
+        rings = [line for line in lines if line.get_markerfacecolor() == "none"]
+        scales = axes.get_xscale(), axes.get_yscale()
+        alone = len(axes.get_lines())
+        trials.draw_front(axes, points[:2], trials.TRIALS_LOOK)
+        added = axes.get_lines()[alone:]
+    assert scales == ("log", "log")
+    (front,) = steps
+    assert front.get_xydata().tolist() == [[1.0, 0.5], [1500.0, 0.01]]
+    (ring,) = rings
+    assert (ring.get_xydata().tolist(), ring.get_markeredgecolor()) == ([[20.0, 0.5]], charts.RED)
+    assert not [line for line in added if line.get_drawstyle() == "steps-post"]
 
 
 def test_every_round_has_every_work_and_slow_works_drop_out(clock):

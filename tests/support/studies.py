@@ -8,8 +8,7 @@ each is saved (tests/study/conftest.py).
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pytest
 
-from hilstar.basics import charts
 from tests.support.commands import run_hilstar_here
 from tests.support.pictures import assert_drawn
 from tests.support.tables import csv_rows
@@ -41,17 +39,6 @@ class Studied:
     def rows(self, table: str) -> list[dict[str, str]]:
         """The rows of a table, by its name without an ending."""
         return csv_rows(self.folder / f"{table}.csv")
-
-
-@contextmanager
-def undrawn() -> Iterator[None]:
-    """Charts are neither laid out nor written: for tests of a study's tables alone, which README's
-    command runs.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(charts, "finish", lambda figure: None)
-        patch.setattr(charts, "save", lambda figure, path: None)
-        yield
 
 
 def studied(
@@ -86,7 +73,7 @@ def studied(
 @dataclass(frozen=True)
 class SmallRun:
     """What a study's own function wrote and returned at a small size, in this process; its charts
-    by their stems, of which no file is saved.
+    by their stems, which are not laid out, and of which no file is saved.
     """
 
     folder: Path

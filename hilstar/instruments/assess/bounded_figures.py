@@ -62,10 +62,6 @@ def quantile_limits(values: FloatArray, share: float, confidence: float) -> tupl
     # the smallest k with P(count <= k) >= confidence
     upper = int(stats.binom.ppf(confidence, n, share))
     lower = int(stats.binom.ppf(1 - confidence, n, share))
-    if lower > 0:
-        below = float(stats.binom.cdf(lower - 1, n, share))
-        if below > 1 - confidence:
-            lower -= 1
     low, high = -math.inf, math.inf
     if lower > 0:
         low = float(ordered[lower - 1])

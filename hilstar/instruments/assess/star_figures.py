@@ -118,7 +118,10 @@ def place_map(found: StarTable, resolution_px: tuple[int, int], side: int) -> Pl
     fit = fitted_places(found, resolution_px)
     width, height = resolution_px
     centres = np.arange(side) + 0.5
-    columns_px, rows_px = np.meshgrid(centres * width / side, centres * height / side)
+    # the first pixel's middle is 0
+    along_px = centres * width / side - 0.5
+    down_px = centres * height / side - 0.5
+    columns_px, rows_px = np.meshgrid(along_px, down_px)
     x_px, y_px = columns_px.ravel(), rows_px.ravel()
     terms = field_terms(x_px, y_px, resolution_px, MAP_DEGREE)
     offsets = terms @ fit.solution
@@ -147,8 +150,10 @@ def without_turns(stars: StarTable, frame: IntArray, resolution_px: tuple[int, i
         table = replace(stars, dx_px=offsets[:, 0], dy_px=offsets[:, 1])
         by_map = terms @ fitted_places(table, resolution_px).solution
         turned = _turns_px(places, raw - by_map, number, reported)
-    # of an axis' places a turn takes one and a half
-    growth = np.sqrt(reported / np.maximum(reported - 1.5, 0.5))
+    # of an axis' places a turn takes one and a half, where there is one
+    is_turned = reported > FEW_TO_TURN
+    growth = np.ones(len(reported))
+    growth[is_turned] = np.sqrt(reported[is_turned] / (reported[is_turned] - 1.5))
     offsets[found] = by_map + growth[number, None] * (raw - by_map - turned)
     return replace(stars, dx_px=offsets[:, 0], dy_px=offsets[:, 1])
 
@@ -266,34 +271,56 @@ def _near(off: FloatArray, sigmas: float, usual: FloatArray | None = None) -> np
     return np.asarray(within, dtype=np.bool_)
 
 
+@dataclass(frozen=True, slots=True)
+class DetectionBins:
+    """Stars by their V: the middles of bins (b,), and how many stars of each case were lit and were
+    reported in each bin (cases, b).
+    """
+
+    middle_mag: FloatArray
+    lit: IntArray
+    reported: IntArray
+
+    @classmethod
+    def of(cls, stars: StarTable) -> "DetectionBins":
+        """Those of a table, from the bin of its brightest star to that of its faintest."""
+        place = np.floor(stars.v_mag / LIMIT_BIN_MAG).astype(np.int64)
+        first = int(place.min())
+        bins = int(place.max()) - first + 1
+        number = numbered(stars.case)
+        cases = int(number.max()) + 1
+        shape = (cases, bins)
+        size = cases * bins
+        index = number * bins + place - first
+        lit = np.bincount(index, minlength=size).reshape(shape)
+        reported = np.bincount(index[stars.found], minlength=size).reshape(shape)
+        middles = np.arange(bins) + first + 0.5
+        return cls(np.asarray(middles * LIMIT_BIN_MAG, dtype=np.float64), lit, reported)
+
+    def half_seen(self, chosen: IntArray | None = None) -> float:
+        """The V at which half of the stars are reported, of all cases, or of chosen ones."""
+        rows = slice(None) if chosen is None else chosen
+        return half_seen(
+            self.middle_mag, self.reported[rows].sum(axis=0), self.lit[rows].sum(axis=0)
+        )
+
+
 def _star_limit(found: StarTable, confidence: float, rng: np.random.Generator) -> BoundedFigure:
     """The V at which half of the stars are reported."""
     refuse_few(found.case, "single stars")
-    place = np.floor(found.v_mag / LIMIT_BIN_MAG).astype(np.int64)
-    first = int(place.min())
-    bins = int(place.max()) - first + 1
-    number = numbered(found.case)
-    cases = int(number.max()) + 1
-    shape = (cases, bins)
-    size = cases * bins
-    index = number * bins + place - first
-    lit = np.bincount(index, minlength=size).reshape(shape)
-    reported = np.bincount(index[found.found], minlength=size).reshape(shape)
-    middles = np.arange(bins) + first + 0.5
-    middle_mag = np.asarray(middles * LIMIT_BIN_MAG, dtype=np.float64)
-    value = half_seen(middle_mag, reported.sum(axis=0), lit.sum(axis=0))
+    counts = DetectionBins.of(found)
+    cases = len(counts.lit)
+    value = counts.half_seen()
     drawn = []
     for _ in range(LIMIT_DRAWS):
         chosen = rng.integers(0, cases, cases)
-        drawn_reported = reported[chosen].sum(axis=0)
-        drawn_lit = lit[chosen].sum(axis=0)
-        drawn.append(half_seen(middle_mag, drawn_reported, drawn_lit))
+        drawn.append(counts.half_seen(chosen))
     low, high = np.quantile(drawn, [1 - confidence, confidence])
     # a curve that is sharper than a bin is known to within one
     low = min(float(low), value) - LIMIT_BIN_MAG / 2
     high = max(float(high), value) + LIMIT_BIN_MAG / 2
-    method = f"logistic curve over {int(lit.sum())} stars, bootstrap over cases"
-    if high >= middle_mag[-1]:
+    method = f"logistic curve over {int(counts.lit.sum())} stars, bootstrap over cases"
+    if high >= counts.middle_mag[-1]:
         high = math.inf
         method += "; sky.faintest_v_mag bounds it"
     return BoundedFigure(value, low, high, cases, method)

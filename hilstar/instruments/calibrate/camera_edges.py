@@ -6,6 +6,7 @@ middle between them.
 """
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,13 +46,7 @@ def film_edges(
     The camera's own delay, from the end of an exposure to its first byte here, stays in the times.
     Raises InputError where nothing blinks or the camera is too slow, MachineError.
     """
-    names = camera.about["formats"]
-    formats = [name for name in names if _is_plain(name)]
-    if not formats:
-        raise InputError(
-            f"the camera has no format of whole bytes of grey or Bayer: {', '.join(names)}"
-        )
-    camera.set({"PixelFormat": min(formats, key=_bits_of)})
+    camera.set({"PixelFormat": format_of_fewest_bits(camera.about["formats"])})
     if exposure_s is None:
         exposure_s = EXPOSURE_REFRESHES / refresh_hz
     square = find_square(camera.film(exposure_s, LOOK_S))
@@ -77,6 +72,18 @@ def film_edges(
             " write a longer --duration"
         )
     return Edges(edges_ns, np.concatenate(levels))
+
+
+def format_of_fewest_bits(names: Sequence[str]) -> str:
+    """Of a camera's pixel formats the one of whole bytes with the fewest bits. Raises InputError
+    where there is none.
+    """
+    formats = [name for name in names if _is_plain(name)]
+    if not formats:
+        raise InputError(
+            f"the camera has no format of whole bytes of grey or Bayer: {', '.join(names)}"
+        )
+    return min(formats, key=_bits_of)
 
 
 def _is_plain(name: str) -> bool:

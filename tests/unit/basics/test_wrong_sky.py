@@ -35,6 +35,31 @@ def test_conditions_that_overlap_count_once_and_each_for_itself():
     ]
 
 
+def test_a_condition_within_another_neither_adds_to_it_nor_ends_it():
+    sky = WrongSky()
+    sky.see(RATES, "", 10 * S)
+    sky.see(CONVENTION, "", 12 * S)
+    sky.see(ENDS[CONVENTION], "", 14 * S)
+    sky.see(ENDS[RATES], "", 20 * S)
+    assert sky.spans_ns() == [(10 * S, 20 * S)]
+    assert sky.total(0, 40 * S).seconds == 10.0
+
+
+def test_a_condition_is_told_by_its_first_line_and_the_oldest_comes_first():
+    sky = WrongSky()
+    sky.see(RATES, "by a factor", 10 * S)
+    sky.see(RATES, "by another", 11 * S)
+    sky.see(CONVENTION, "turned", 12 * S, since_ns=9 * S)
+    assert [(one.kind, one.text) for one in sky.now()] == [
+        (CONVENTION, "turned"),
+        (RATES, "by a factor"),
+    ]
+    sky.see(ENDS[RATES], "", 13 * S)
+    sky.see(RATES, "by a third", 20 * S)
+    assert (RATES, "by a factor") in sky.at(21 * S)
+    assert [one.text for one in sky.total(0, 30 * S).conditions] == ["by a factor", "turned"]
+
+
 def test_other_events_and_ends_of_nothing_change_nothing():
     sky = WrongSky()
     sky.see("stale", "", S)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ class SlowBench:
     """
 
     effort = SimpleNamespace(is_chosen=True, claimed_turn_deg_s=1.0)
+    capped: ClassVar[dict[int, int]] = {}  # stars with coarser paths, by the frame's number
 
     def __init__(self, tmp_path, clock: FakeClock, cost, more: str = "") -> None:
         self.config = parse_config(tmp_path / "bench.toml", SMALL_BENCH + more)
@@ -50,7 +52,10 @@ class SlowBench:
     def draw_sprites(self, sprites, number):
         self._clock.work(1e6)
         return SimpleNamespace(
-            levels=None, star_count=0 if sprites is None else 7, clipped_hip=(), capped=0
+            levels=None,
+            star_count=0 if sprites is None else 7,
+            clipped_hip=(),
+            capped=self.capped.get(number, 0),
         )
 
 
@@ -128,6 +133,13 @@ def test_a_turn_beyond_what_effort_claims_is_told_once(tmp_path, turn_deg_s, tol
         assert run.loop.notices.counts().get("beyond-claim", 0) == count
 
 
+def test_frames_with_coarser_paths_are_counted_and_the_first_is_told(tmp_path, monkeypatch):
+    monkeypatch.setattr(SlowBench, "capped", {2: 3, 4: 5})
+    run = LoopRun(tmp_path, Limit(slots=6))
+    assert run.loop.tally.capped_frames == 2
+    assert run.loop.notices.counts()["capped"] == 1
+
+
 def test_no_two_frames_in_a_row_are_given_up(tmp_path):
     run = LoopRun(tmp_path, Limit(slots=60), lambda number: 3.5 * PERIOD_NS)
     begun = len(run.shown) + run.loop.tally.given_up_frames
@@ -203,6 +215,18 @@ def test_a_stale_attitude_is_held_or_blank_as_the_bench_file_says(tmp_path, on_s
     )
     assert [frame.attitude is None for frame in run.shown] == [blank] * 3
     assert run.loop.tally.stale_frames == 3
+
+
+def test_a_paused_sky_stays_while_the_link_is_stale(tmp_path):
+    clock = FakeClock()
+    bench = SlowBench(tmp_path, clock, lambda number: 0, '[attitude]\non_stale = "blank"\n')
+    loop = FrameLoop(bench, pacer=Pacer(PERIOD_NS, clock))
+    blank = []
+    for attitude, paused in ((STILL, False), (OLD, True), (OLD, False)):
+        loop.pacer.operator.aids.set("pause", paused)
+        shown = loop.draw(0, 0, attitude)
+        blank.append((shown.stale, shown.attitude is None))
+    assert blank == [(False, False), (True, False), (True, True)]
 
 
 def test_without_an_attitude_a_frame_is_blank_and_says_so(tmp_path):

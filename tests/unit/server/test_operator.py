@@ -83,13 +83,17 @@ def test_each_change_of_keys_and_window_is_told_once(aids):
 
 def test_changed_and_hidden_frames_are_counted_with_their_time(aids):
     operator = Operator(aids, Notices())
-    for k, on_screen in enumerate(
-        [OnScreen(), OnScreen("grid"), OnScreen("grid", "covered"), OnScreen()]
+    for swap_ms, on_screen in (
+        (500, OnScreen("blank")),  # the run's first
+        (520, OnScreen()),
+        (530, OnScreen("grid")),
+        (570, OnScreen("grid", "covered")),
+        (690, OnScreen()),
     ):
-        operator.count(on_screen, 20 * MS * k)
+        operator.count(on_screen, swap_ms * MS)
     assert operator.summary() == {
-        "operator": {"frames": 2, "s": pytest.approx(0.04)},
-        "hidden": {"frames": 1, "s": pytest.approx(0.02)},
+        "operator": {"frames": 3, "s": pytest.approx(0.05)},
+        "hidden": {"frames": 1, "s": pytest.approx(0.04)},
     }
 
 

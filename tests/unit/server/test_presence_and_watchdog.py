@@ -72,11 +72,17 @@ def test_a_late_frame_is_told_with_its_stages_at_most_once_a_second(told):
     assert len(lines) == 2
 
 
-@pytest.mark.parametrize(("took_ns", "timed"), [(45e6, True), (3e9, False)])
-def test_neither_a_frame_of_three_periods_nor_one_without_a_moment_is_late(told, took_ns, timed):
+@pytest.mark.parametrize(
+    ("took_ns", "refresh_hz", "timed"),
+    [(45e6, 60, True), (3e9, 60, False), (45e6, 240, True), (140e6, 20, True)],
+)
+def test_neither_a_frame_of_three_periods_nor_one_without_a_moment_is_late(
+    told, took_ns, refresh_hz, timed
+):
+    """Nor one of under 50 ms where three periods are shorter."""
     notices, lines = told
     clock = FakeClock()
-    watch = FrameWatch(PERIOD_NS, notices, clock)
+    watch = FrameWatch(1e9 / refresh_hz, notices, clock)
     watch.begin(0)
     clock.work(took_ns)
     watch.end(timed)

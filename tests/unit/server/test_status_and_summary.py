@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.clock.timeline import Attitude, StaleGate
-from hilstar.attitude.receiver import PacketCounts
+from hilstar.attitude.receiver import PacketCounts, Traffic
 from hilstar.attitude.wire import protocol
 from hilstar.basics.notices import Notices
+from hilstar.server.bench.config import AttitudeSettings
 from hilstar.server.operator import OnScreen
 from hilstar.server.pacer import Shown
-from hilstar.server.serve import StatusMaker
+from hilstar.server.serve import StatusMaker, traffic_of
 from hilstar.server.summary import RunTally, SwapTally
 
 FRESH = Attitude(np.array([1.0, 0.0, 0.0, 0.0]), 5_000_000, False, sequence=42)
@@ -68,6 +69,27 @@ def test_without_an_attitude_its_age_is_minus_one(loop):
     status = StatusMaker().status(shown_frame(None, missing=True), 0, loop, PacketCounts(), False)
     assert (status.attitude_age_ns, status.attitude_sequence) == (-1, 0)
     assert status.health == protocol.HEALTH_NO_ATTITUDE | protocol.HEALTH_BLANK
+
+
+def test_an_attitude_that_was_there_and_is_stale_has_come(loop):
+    """The timeline has none where its clock was set back to before the first."""
+    loop.gate.stale = True
+    status = StatusMaker().status(shown_frame(None, missing=True), 0, loop, PacketCounts(), False)
+    assert status.health == protocol.HEALTH_STALE | protocol.HEALTH_BLANK
+
+
+@pytest.mark.parametrize(
+    ("keys", "wanted"),
+    [
+        ({"status_hz": 7.0}, Traffic(7.0, True, "estimated")),
+        ({"time_requests": False}, Traffic(10.0, False, "estimated")),
+        ({"clock": "shared"}, Traffic(10.0, False, "shared")),
+        ({"clock": "unix", "status_hz": 0.0}, Traffic(0.0, False, "unix")),
+        ({"source": "scpi"}, Traffic(10.0, False, "shared")),
+    ],
+)
+def test_a_sender_whose_clock_is_known_is_asked_for_no_time(keys, wanted):
+    assert traffic_of(AttitudeSettings(**keys)) == wanted
 
 
 def test_missed_frames_and_refused_packets_are_told_once_each_time(loop):

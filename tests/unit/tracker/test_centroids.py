@@ -143,3 +143,22 @@ def test_a_plain_window_that_walks_off_leaves_the_blob_s_own_place(aside_px):
     at_px = np.column_stack([found.x_px, found.y_px])[order]
     assert at_px[0] == pytest.approx(places[0], abs=SAME_PX)
     assert at_px[1:] == pytest.approx(places[[2, 2]], abs=0.2)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float64])
+def test_the_level_of_an_even_count_of_pixels_is_the_mean_of_the_middle_two(dtype):
+    image = np.repeat(np.array([[10], [20]], dtype), 4, axis=1)
+    assert noisiest_background(image).level == 15.0
+
+
+@pytest.mark.parametrize(("value", "stars"), [(15, 0), (16, 1)])
+def test_a_pixel_of_whole_numbers_on_the_threshold_is_no_star(value, stars):
+    image = np.full((SIZE_PX, SIZE_PX), 10, np.uint16)
+    image[20, 20] = value
+    settings = CentroidSettings(threshold_sigma=5.0, minimum_pixels=1)
+    assert len(find_stars(image, settings, LocalBackground(10.0, 1.0))) == stars
+
+
+def test_a_star_as_wide_as_the_window_has_no_width():
+    flat = np.ones((SIZE_PX, SIZE_PX))
+    assert np.isnan(star_widths(flat, 0.0, np.array([20.0]), np.array([20.0])))

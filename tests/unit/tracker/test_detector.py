@@ -256,6 +256,19 @@ def test_noiseless_is_the_rounded_mean_without_fixed_pattern():
     np.testing.assert_array_equal(detector.expose_noiseless(image_e, 2.0), expected)
 
 
+def test_the_noiseless_dark_is_that_of_the_temperature():
+    settings = DetectorSettings(dark_e_per_s=400.0, dark_law="ccd47-20", temperature_k=280.0)
+    image = Detector(settings, SIZE_PX).expose_noiseless(flat_e(0.0), 10.0)
+    dark_e = 4000.0 * e2v_dark("ccd47-20", 280.0) / e2v_dark("ccd47-20", 293.0)
+    assert image[0, 0] == round(dark_e / settings.gain_e_per_dn + settings.offset_dn) != 0
+
+
+def test_a_half_goes_to_the_even_code():
+    detector = Detector(DetectorSettings(gain_e_per_dn=2.0, offset_dn=0.0), (4, 1))
+    codes = detector.expose_noiseless(np.array([[1.0, 3.0, 5.0, 6.0]]), 1.0)
+    assert codes.tolist() == [[0, 2, 2, 3]]
+
+
 def test_noisy_frames_scatter_around_the_noiseless_one():
     settings = DetectorSettings(
         gain_e_per_dn=2.0, offset_dn=50.0, read_noise_e=6.0, dark_e_per_s=100.0
@@ -543,6 +556,17 @@ def test_cosmic_rays_come_at_their_rate_and_leave_their_charge():
     )
 
 
+def test_a_ray_longer_than_the_sensor_leaves_what_its_way_across_is_worth():
+    """On a pixel of half a micrometre: no way across from within is longer than sqrt 2 of it, and
+    the sine of a ray's slope, of the square root's law, is a half in the mean of its inverse.
+    """
+    rays, pitch_um = 1000.0, 0.5
+    settings = DetectorSettings(cosmic_rays_per_cm2_s=1e6)
+    seconds = rays / (1e6 * (pitch_um * 1e-4) ** 2)
+    image_e = cosmic_rays_e(settings, (1, 1), seconds, generator(), pixel_pitch_um=pitch_um)
+    assert image_e.sum() < rays * math.sqrt(2) * pitch_um * RAY_E_PER_UM * 2
+
+
 def test_cosmic_rays_reach_the_frame_and_are_off_by_default():
     with_rays = DetectorSettings(cosmic_rays_per_cm2_s=1000.0, gain_e_per_dn=1.0, bits=16)
     assert Detector(with_rays, SIZE_PX).expose(flat_e(0.0), 1.0, generator()).max() > 1000
@@ -564,6 +588,12 @@ def test_false_stars_bring_their_light_and_move_from_frame_to_frame():
     # A star between four pixels gives each less than a quarter of it, 0.4655^2 = 0.2167: 541 e-,
     # with 23 e- of noise.
     assert frame.max() > 540 - SIGMAS * 23
+
+
+def test_false_stars_lie_on_the_pixels_from_edge_to_edge():
+    """All but the light of those within a sigma or so of an edge falls on a lone pixel."""
+    settings = DetectorSettings(false_stars=400, false_star_e_per_s=1.0, false_star_sigma_px=0.1)
+    assert 320 < false_stars_e(settings, (1, 1), 1.0, generator()).sum() < 360
 
 
 def test_blooming_keeps_the_charge_within_its_column():

@@ -176,6 +176,16 @@ def test_one_seed_gives_one_frame_on_any_number_of_threads(monkeypatch):
     assert (detector.expose(mean_e, 1.0, np.random.default_rng(3)) != frames[0]).mean() > 0.9
 
 
+def test_one_thread_is_this_one(monkeypatch):
+    def refuse(threads):
+        raise AssertionError(threads)
+
+    monkeypatch.setattr(frame_noise, "ThreadPoolExecutor", refuse)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    detector = Detector(DetectorSettings(read_noise_e=5.0), (40, 700))
+    assert detector.expose(np.zeros((700, 40)), 1.0, np.random.default_rng(2)).any()
+
+
 def test_words_repeat_nowhere_in_a_frame():
     seen = []
     draw_blocks(

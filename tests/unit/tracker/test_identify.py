@@ -5,7 +5,10 @@ the truth.
 from __future__ import annotations
 
 import builtins
+import sys
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +23,7 @@ from hilstar.basics.rotation import (
 )
 from hilstar.sky.catalog import load_catalog
 from hilstar.sky.stars import unit_vectors_icrs
-from hilstar.tracker.identify import FoundStars, LostInSpace, identify, wahba
+from hilstar.tracker.identify import GAIA_RECORD, FoundStars, LostInSpace, identify, wahba
 
 FOCAL_PX, SIDE_PX = 5384.6, 1024
 ARCSEC = np.pi / 180 / 3600
@@ -186,6 +189,69 @@ def test_a_star_over_four_times_the_median_off_is_left_out(off_px, is_left_out):
     )
     assert (27 not in identified.star) == is_left_out
     assert len(identified.star) == 64 - is_left_out
+
+
+def grid():
+    """Places of 64 stars, 130 px apart, and their directions as seen by a camera that is level."""
+    x, y = np.meshgrid(np.linspace(60.0, 960.0, 8), np.linspace(60.0, 960.0, 8))
+    x, y = x.ravel(), y.ravel()
+    return x, y, rays_of(x, y)
+
+
+def rays_of(x, y):
+    return normalise(np.stack([x - 511.5, y - 511.5, np.full(len(x), FOCAL_PX)], axis=1))
+
+
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def test_of_two_stars_near_one_find_the_brightest_has_it():
+    x, y, known = grid()
+    known = np.concatenate([known, rays_of(x[27:30] + 0.2, y[27:30])])
+    found = FoundStars(x, y, np.full(64, 1e4), known[:64])
+    identified = identify(found, LEVEL, lambda q: (np.arange(67), known), place_px)
+    assert (identified.found == identified.star).all() and len(identified.star) == 64
+
+
+def test_a_false_star_before_the_others_does_not_tell_how_they_all_moved():
+    """The brightest find is 6 px off its star, and all others are 5 px off where it is expected."""
+    x, y, known = grid()
+    x = x + np.where(np.arange(64) == 0, 1.0, -5.0)
+    found = FoundStars(x, y, np.full(64, 1e4), rays_of(x, y))
+    identified = identify(found, LEVEL, lambda q: (np.arange(64), known), place_px)
+    assert identified is not None and list(identified.star) == list(range(1, 64))
+
+
+def test_bright_stars_count_as_their_floor_and_faint_ones_by_their_light():
+    """Half are without shot noise, half have three times the floor's variance by theirs: these
+    count a quarter, and their 0.05 px turn all by a fifth of that.
+    """
+    x, y, known = grid()
+    faint = np.arange(64) % 2 == 1
+    x = x + np.where(faint, 0.05, 0.0)
+    flux_e = np.where(faint, 0.4 / (3 * 0.02**2), 1e15)
+    found = FoundStars(x, y, flux_e, rays_of(x, y))
+    identified = identify(found, LEVEL, lambda q: (np.arange(64), known), place_px)
+    assert len(identified.star) == 64
+    moved_px, _ = place_px(known @ to_matrix(identified.q_icrs_to_cam).T)
+    assert np.mean(moved_px - grid()[0]) == pytest.approx(0.01, rel=0.02)
+
+
+def test_the_database_is_of_the_field_s_width_and_of_all_stars(monkeypatch):
+    made = {}
+
+    def generate(path, **options):
+        made.update(options, rows=(Path(path).stat().st_size - 16) // GAIA_RECORD.itemsize)
+
+    fake = SimpleNamespace(
+        SolveResult=tuple,
+        CameraModel=SimpleNamespace,
+        SolverDatabase=SimpleNamespace(generate_from_gaia=generate),
+    )
+    monkeypatch.setitem(sys.modules, "tetra3rs", fake)
+    LostInSpace(np.eye(3), np.array([5.0, 2.0, 6.5]), 1000.0, (2000, 1000))
+    assert made["min_fov_deg"] < 90.0 < made["max_fov_deg"] < 95.0
+    assert (made["star_max_magnitude"], made["rows"]) == (6.5, 3)
 
 
 def test_where_the_catalogue_has_few_stars_more_spots_do_not_count_against_it(sky, rng):

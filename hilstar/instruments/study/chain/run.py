@@ -585,8 +585,14 @@ def run(
     lines += unmeasured
     if glass:
         lines.append(glass_line(glass))
-    right = None if load.busy else is_right([result.rows for result in results])
-    return ChainStudy([*lines, *notes], right, answers)
+    return ChainStudy([*lines, *notes], verdict(results, load), answers)
+
+
+def verdict(results: Sequence[SceneResult], load: Load) -> bool | None:
+    """Whether `auto` is right in every scene; None on a busy machine."""
+    if load.busy:
+        return None
+    return is_right([result.rows for result in results])
 
 
 def write_chain(

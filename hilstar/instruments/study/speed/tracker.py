@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+import numpy.typing as npt
 
 from hilstar.basics.resources import resource_path
 from hilstar.basics.rotation import from_radec_roll_deg
@@ -53,15 +54,14 @@ class Exposing:
         """A whole exposure of hilstar's."""
         self.simulator.expose(self.view, self.rng)
 
-    def numpy_noise(self) -> None:
-        """NumPy's own draws: Poisson, normal read noise, DN."""
+    def numpy_noise(self) -> npt.NDArray[np.uint16]:
+        """NumPy's own draws: Poisson, normal read noise; DN (h, w)."""
         mean_e = self.exposure.mean_e
         charge = self.rng.poisson(mean_e) + self.rng.normal(
             0.0, self.detector.read_noise_e, mean_e.shape
         )
-        np.clip(np.rint(charge / self.detector.gain_e_per_dn), 0, 2**self.detector.bits - 1).astype(
-            np.uint16
-        )
+        dn = np.rint(charge / self.detector.gain_e_per_dn)
+        return np.clip(dn, 0, 2**self.detector.bits - 1).astype(np.uint16)
 
     def galsim_noise(self) -> Work:
         """GalSim's CCD noise on the same image. Raises ImportError."""

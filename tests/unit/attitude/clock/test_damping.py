@@ -140,6 +140,26 @@ def test_a_slew_that_begins_is_followed_though_jitter_was_damped_before_it():
     assert worst[0] < worst[1] + 3 / math.sqrt(2) * amplitude_arcsec_s * AGE_NS / NS_PER_S
 
 
+@pytest.mark.parametrize("change", ["none", "jump", "gap", "known acceleration"])
+def test_after_a_jump_a_gap_or_with_an_acceleration_a_rate_is_taken_as_it_is(rng, change):
+    """Across a gap a sample's jitter says nothing of how the camera turned."""
+    timeline = Timeline(AUTO)
+    step_ns = 10 * NS_PER_MS
+    for k in range(100):
+        rate = TURN_RAD_S + rng.normal(0, math.radians(0.1), 3)
+        assert timeline.add(AttitudeSample(k * step_ns, START, rate)) is None
+        timeline.at(k * step_ns + 2 * step_ns)
+    newest_ns = 99 * step_ns + (251 * NS_PER_MS if change == "gap" else step_ns)
+    own_rad_s = TURN_RAD_S + math.radians(0.1)
+    newest = AttitudeSample(newest_ns, START, own_rad_s, discontinuity=change == "jump")
+    if change == "known acceleration":
+        newest = replace(newest, acceleration_cam_rad_s2=np.zeros(3))
+    assert timeline.add(newest) is None
+    predicted_rad_s = timeline.at(newest_ns + 2 * step_ns).rate_cam_rad_s
+    is_own = np.abs(predicted_rad_s - own_rad_s).max() < 1e-12
+    assert is_own == (change != "none")
+
+
 def test_jumps_and_gaps_begin_anew():
     samples = steady()
     jumps = [replace(s, discontinuity=k == 250) for k, s in enumerate(samples)]
@@ -147,16 +167,22 @@ def test_jumps_and_gaps_begin_anew():
     assert all(after.t_ns > before.t_ns for before, after in pairwise(samples))
 
 
-@pytest.mark.parametrize("steps_ahead", [0, 1, 3])
-def test_a_steady_turn_has_no_jitter_and_is_looked_at_as_far_ahead_as_frames_predict(steps_ahead):
-    """Of a stream that nobody predicts yet, each sample is ahead of the one before by the step."""
+@pytest.mark.parametrize(
+    ("usual_steps", "steps_ahead"), [(0, 1), (1, 1), (2.4, 2), (2.6, 3), (3, 3)]
+)
+def test_a_steady_turn_has_no_jitter_and_is_looked_at_as_far_ahead_as_frames_predict(
+    usual_steps, steps_ahead
+):
+    """Of a stream that nobody predicts yet, each sample is ahead of the one before by the step; else
+    by the number of steps that is nearest.
+    """
     step_ns = 10 * NS_PER_MS
     damping = _Damping()
-    damping.usual_s = steps_ahead * step_ns / NS_PER_S
+    damping.usual_s = usual_steps * step_ns / NS_PER_S
     for k in range(round(MEMORIES * MEMORY_S * NS_PER_S / step_ns)):
         damped = damping.add(k * step_ns, (0.3, -0.2, 1.0), (3e-3, -2e-3, 0.01))
         assert damped.excess == pytest.approx((0, 0, 0), abs=1e-12)
-    ahead_s = max(steps_ahead, 1) * step_ns / NS_PER_S
+    ahead_s = steps_ahead * step_ns / NS_PER_S
     assert damped.ahead_s == pytest.approx(ahead_s, rel=MEMORY_LEFT)
 
 
@@ -172,6 +198,30 @@ def test_no_more_than_the_jitter_is_held_back_and_nothing_is_added(goes_on_by, s
     jitter = damping._seen[-1].jitter
     assert damped.excess == pytest.approx([share * part for part in jitter], abs=1e-15)
     assert min(map(abs, jitter)) > 1e-5
+
+
+def test_what_is_held_back_goes_with_the_square_of_the_prediction_up_to_the_usual_one(rng):
+    """1 - sin(x) / x of a vibration: x^2 / 6 for a small x."""
+    timeline = Timeline(AUTO)
+    usual_ns, step_ns = 40 * NS_PER_MS, 10 * NS_PER_MS
+    q = START
+    for k in range(200):
+        rate = TURN_RAD_S + rng.normal(0, math.radians(0.1), 3)
+        assert timeline.add(AttitudeSample(k * step_ns, q, rate)) is None
+        q = propagate(q, TURN_RAD_S, step_ns / NS_PER_S)
+        timeline.at(k * step_ns + usual_ns)
+    newest_ns = 199 * step_ns
+    held_back = [
+        rate - timeline.at(newest_ns + share * usual_ns // 4).rate_cam_rad_s
+        for share in (0, 1, 2, 4, 6)
+    ]
+    nothing, quarter, half, whole, more = held_back
+    assert np.abs(whole).min() > math.radians(1e-3)
+    assert nothing == pytest.approx([0, 0, 0], abs=1e-15)
+    assert half == pytest.approx(4 * quarter)
+    # how far ahead samples were looked at is their own mean
+    assert quarter == pytest.approx(whole / 16, rel=0.1)
+    assert more == pytest.approx(whole, rel=1e-2)
 
 
 def test_a_beginning_turn_is_held_back_by_three_sigma_either_way():

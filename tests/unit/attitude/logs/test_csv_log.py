@@ -146,6 +146,19 @@ def test_json_says_what_holds_by_the_names_of_tables(csv_of, key):
     assert "1 line is marked as not valid" in dict(found.told)["log-valid"]
 
 
+@pytest.mark.parametrize("key", ["st_lost", "invalid"])
+def test_json_says_what_does_not_hold_by_the_names_of_tables(csv_of, key):
+    rows = [f'{{"t_ns": {k}, "q": [{Q}], "{key}": {"true" if k else "false"}}}\n' for k in (0, 1)]
+    found = open_log(csv_of("".join(rows)))
+    assert [sample.t_ns for sample in found.samples] == [0]
+
+
+def test_null_in_one_number_of_a_quaternion_is_no_attitude_that_is_missing(csv_of):
+    path = csv_of(f'{{"t_ns": 0, "q": [1, 0, null, 0]}}\n{{"t_ns": 5, "q": [{Q}]}}\n', "log.jsonl")
+    with pytest.raises(InputError, match=":1: "):
+        open_log(path)
+
+
 @pytest.mark.parametrize("q", ["null", "[null, null, null, null]", "[NaN, NaN, NaN, NaN]"])
 def test_json_without_a_quaternion_is_left_out_at_the_start(csv_of, q):
     blank, row = f'{{"t_ns": 0, "q": {q}}}\n', f'{{"t_ns": 5, "q": [{Q}]}}\n'
@@ -307,6 +320,20 @@ def test_a_tracker_s_stars_are_the_same_in_every_form_of_telemetry(csv_of, name)
     for row, stars in zip(telemetry.star_rows, STARS, strict=True):
         told = np.array(row, dtype=np.float64)  # NaN for None
         np.testing.assert_allclose(told, np.array(stars, dtype=np.float64), rtol=1e-12)
+
+
+def test_a_row_s_stars_are_in_the_order_of_their_numbers(csv_of):
+    """The tenth is no second one."""
+    columns = ",".join(f"star{number}_x,star{number}_y" for number in (10, 2, 1))
+    telemetry = read_telemetry(csv_of(f"t_s,qw,qx,qy,qz,{columns}\n0,{Q},10,0,2,0,1,0\n"))
+    assert [star[0] for star in telemetry.star_rows[0]] == [1.0, 2.0, 10.0]
+
+
+@pytest.mark.parametrize("magnitude", [-99.9, 99.9])
+def test_a_magnitude_may_be_of_either_sign(csv_of, magnitude):
+    text = f"t_s,qw,qx,qy,qz,star1_x,star1_y,star1_mag\n0,{Q},1,2,{magnitude}\n"
+    star = read_telemetry(csv_of(text)).star_rows[0][0]
+    assert star[2] == pytest.approx(10 ** (-0.4 * magnitude))
 
 
 def test_telemetry_without_stars_has_no_rows_of_them(csv_of):

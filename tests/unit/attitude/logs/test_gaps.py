@@ -138,6 +138,26 @@ def test_a_gap_that_the_rates_on_both_sides_explain_is_blended():
     assert [kind for kind, _ in log_joins(other).told] == ["log-gap", "log-rates"]
 
 
+# Of 0.2 rad in a gap of 100 s, and of 1 mrad between two samples: over a gap a rate is asked more.
+@pytest.mark.parametrize(
+    ("off", "told"),
+    [(0.015, []), (0.03, ["log-gap"]), (0.24, ["log-gap"]), (0.27, ["log-gap", "log-rates"])],
+)
+def test_rates_may_be_off_by_a_fifth_of_the_turn_and_over_a_gap_by_a_fiftieth(off, told):
+    times = [*np.arange(0, 10, 0.5), *np.arange(110, 120, 0.5)]
+    samples = coning_samples(times, spin=0.002, nutation=0.0)
+    rate = samples[0].rate_cam_rad_s * (1 + off)
+    samples = [replace(sample, rate_cam_rad_s=rate) for sample in samples]
+    assert [kind for kind, _ in log_joins(samples).told] == told
+
+
+def test_a_discontinuity_with_rates_of_another_turn_is_no_misfit():
+    samples = coning_samples(np.arange(0, 10, 0.5))
+    samples[7:] = [replace(sample, q_icrs_to_cam=START) for sample in samples[7:8]]
+    samples[7] = replace(samples[7], discontinuity=True)
+    assert log_joins(samples).told == []
+
+
 def test_rates_that_do_not_fit_the_attitudes_are_not_used_and_told():
     """Two samples at rest but for a rate that each claims: the way between is the straight one."""
     samples = [AttitudeSample(k * S // 2, START, np.array([0.0, 0.0, 2.0])) for k in range(4)]

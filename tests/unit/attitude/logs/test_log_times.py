@@ -9,8 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.log_file import open_log, read_log
-from hilstar.attitude.logs.log_times import span_line
+from hilstar.attitude.logs.log_times import span_line, time_notices
 from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.basics.rotation import from_rotation_vector
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import run_hilstar_here
 from tests.support.sources.aem_messages import kvn
@@ -189,3 +190,18 @@ def test_rates_of_another_unit_are_named_in_each_format_s_unit(
         assert f"probably {words};" in said
     else:
         assert "rates are in" not in said
+
+
+# The turn by rates about z is 1000 times the quaternions', about an axis that is inclined so far.
+@pytest.mark.parametrize(("inclined_deg", "is_named"), [(8.0, True), (15.0, False)])
+def test_rates_about_another_axis_say_nothing_of_the_times(inclined_deg, is_named):
+    axis = np.array([np.sin(np.radians(inclined_deg)), 0.0, np.cos(np.radians(inclined_deg))])
+    samples = [
+        AttitudeSample(
+            k * 10**9,
+            from_rotation_vector(-axis * 1e-4 * k),
+            np.array([0.0, 0.0, 0.1]),
+        )
+        for k in range(10)
+    ]
+    assert bool(time_notices(samples, "s")) is is_named

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from hilstar.attitude.wire.packet import (
     MAX_FRAME_BYTES,
+    MAX_KEPT_BYTES,
     AttitudeSample,
     Refusal,
     StreamDecoder,
@@ -59,6 +60,14 @@ def test_any_cut_gives_the_same_events(parts, cuts):
     whole = described(fed(StreamDecoder(), [stream]))
     assert described(fed(StreamDecoder(), chunks)) == whole
     assert described(fed(StreamDecoder(), [bytes([byte]) for byte in stream])) == whole
+
+
+def test_garbage_of_every_length_gives_one_event_of_bounded_bytes_however_it_is_cut():
+    for size in range(1, MAX_KEPT_BYTES + 4):
+        stream = b"\0" + b"\x05" * size + b"\0" + GOOD
+        whole = described(fed(StreamDecoder(), [stream]))
+        assert [len(raw) for _, raw in whole[:-1]] == [min(size, MAX_KEPT_BYTES + 1)]
+        assert described(fed(StreamDecoder(), [bytes([byte]) for byte in stream])) == whole
 
 
 @settings(max_examples=300, deadline=None)

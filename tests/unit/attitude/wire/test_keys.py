@@ -42,11 +42,12 @@ def test_a_secret_key_is_its_owner_s_alone_before_anything_else_happens_to_it(
         return paths
 
     monkeypatch.setattr(zmq.auth, "create_certificates", spy)
-    before = os.umask(0)
+    before = os.umask(0o002)
     try:
         written = make_keys(tmp_path / "keys")
     finally:
-        os.umask(before)
+        left = os.umask(before)
+    assert left == 0o002
     assert seen == [0o600, 0o600]
     for path in written:
         assert path.exists()

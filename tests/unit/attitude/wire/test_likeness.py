@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from cobs import cobs, cobsr
 
-from hilstar.attitude.wire.likeness import MAX_LOOKED_AT, likeness
+from hilstar.attitude.wire.likeness import MAX_LOOKED_AT, likeness, unframed_packet
 from hilstar.attitude.wire.packet import (
     AttitudeSample,
     Refusal,
@@ -20,6 +20,8 @@ from hilstar.attitude.wire.packet import (
 )
 
 Q = (0.6987226, 0.7135120, -0.0370377, 0.0362700)
+# without any of these the other three are no unit quaternion
+HALVES = (0.5, -0.5, 0.5, -0.5)
 FIELDS = "BBHIq4d3f"
 LITTLE = struct.pack("<" + FIELDS, 1, 1, 1, 7, 123456789, *Q, 0.0, 0.0, 0.0)
 BIG = struct.pack(">" + FIELDS, 1, 1, 1, 7, 123456789, *Q, 0.0, 0.0, 0.0)
@@ -118,6 +120,12 @@ MESSAGES = {
     "HTTP answer": (b"HTTP/1.0 400 Bad Request\r\n\r\n", "HTTP"),
     "TLS": (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc", "TLS"),
     "TLS, kind and version alone": (b"\x16\x03\x01", "TLS"),
+    "TLS 1.2": (b"\x17\x03\x03\x00\x20", "TLS"),
+    "TLS 1.3 as its drafts had it": (b"\x14\x03\x04\x00\x01\x01", "TLS"),
+    "no TLS of this version": (b"\x16\x03\x05\x00\x01", "binary, 16 03 05 00 01"),
+    "no kind of TLS record": (b"\x18\x03\x01\x00\x01", "binary, 18 03 01 00 01"),
+    "six letters before binary": (b"hello!\x01\x02", "text before binary, 'hello!'"),
+    "five letters before binary": (b"hello\x01\x02", "binary, 68 65 6c 6c 6f 01 02"),
     "ZeroMQ": (b"\xff" + bytes(8) + b"\x7f\x03\x00NULL", "ZeroMQ"),
     "NMEA": (b"$GPGGA,123519,4807.038,N*47\r\n", "NMEA"),
     "MAVLink 1": (b"\xfe\x09" + bytes(15), "a MAVLink frame"),
@@ -129,7 +137,12 @@ MESSAGES = {
         "as on a serial line",
     ),
     "quaternion": (struct.pack("<4d", *Q), "a bare quaternion of little-endian"),
-    "time and quaternion": (struct.pack(">q4d", 5, *Q), "a bare quaternion of big-endian"),
+    "time and quaternion": (struct.pack(">q4d", 5, *HALVES), "a bare quaternion of big-endian"),
+    "quaternion and rate": (struct.pack("<7d", *HALVES, 1, 2, 3), "a bare quaternion of little"),
+    "time, quaternion and rate": (
+        struct.pack("<q7d", 5, *HALVES, 1, 2, 3),
+        "a bare quaternion of little-endian",
+    ),
 }
 
 
@@ -139,6 +152,21 @@ def test_a_message_that_is_something_else_is_named(message: bytes, words: str) -
     assert isinstance(event, Refusal)
     assert event.telling
     assert words in event.detail
+
+
+def test_a_packet_outside_any_frame_is_named_by_what_stands_around_it() -> None:
+    packet = LITTLE + little(zlib.crc32(LITTLE))
+    named = {
+        packet: "a bare packet",
+        b"\xc0" + packet + b"\xc0": "a packet in SLIP",
+        b"\x05" + packet: "a bare packet",
+        b"\xc0\x05" + packet: "a bare packet",
+    }
+    for data, what in named.items():
+        found = unframed_packet(data)
+        assert found is not None
+        assert found.what == what
+    assert unframed_packet(packet[:-1]) is None
 
 
 LINES = {

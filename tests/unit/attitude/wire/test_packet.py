@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.wire.packet import (
+    MAX_JSON_BYTES,
     AttitudeSample,
     Refusal,
     Status,
@@ -144,6 +145,30 @@ def test_the_json_form_is_understood():
     bare = decode(b' {"t_ns": 5, "q": [1, 0, 0, 0], "note": "extra keys are no harm"}')
     assert isinstance(bare, AttitudeSample)
     assert bare.rate_cam_rad_s is None
+
+
+def test_json_of_the_largest_size_is_taken_and_a_byte_more_is_not():
+    whole = b'{"t_ns": 5, "q": [1, 0, 0, 0]}'.ljust(MAX_JSON_BYTES)
+    assert isinstance(decode(whole), AttitudeSample)
+    longer = decode(whole + b" ")
+    assert longer == Refusal(
+        "format", f"more than {MAX_JSON_BYTES} bytes of JSON; send an attitude alone"
+    )
+
+
+@pytest.mark.parametrize(
+    ("q", "unset"),
+    [
+        ("[NaN, NaN, NaN, NaN]", True),
+        ("[0, 0, 0, 0]", True),
+        ("[Infinity, 0, 0, 1]", False),
+        ("[0, 0, 0, 0.5]", False),
+    ],
+)
+def test_zeros_and_nan_are_an_estimator_s_that_has_not_run_and_nothing_else_is(q, unset):
+    event = decode(f'{{"t_ns": 1, "q": {q}}}'.encode())
+    assert isinstance(event, Refusal)
+    assert event.unset == unset
 
 
 def test_no_bytes_raise(rng):

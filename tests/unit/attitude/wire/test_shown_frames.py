@@ -49,6 +49,7 @@ def test_a_frame_comes_back_as_it_was_shown(bits, channels, largest):
         lambda parts: [parts[0].replace(b"1.0,", b"1.1,"), *parts[1:]],
         lambda parts: [parts[0].replace(b"1.0,", b"0.9,"), *parts[1:]],
         lambda parts: [parts[0], parts[1][::-1], parts[2]],
+        lambda parts: [parts[0], parts[1][:4] * 2, parts[2]],  # one pixel twice
         lambda parts: [parts[0], parts[1][:-1], parts[2]],
         lambda parts: [parts[0], parts[1], parts[2] + b"\1"],
         lambda parts: [parts[0].replace(b'"channels":1', b'"channels":3'), *parts[1:]],
@@ -169,6 +170,16 @@ def test_each_connection_watches_from_its_subscription_to_its_own_end_of_it(
     for file, message in said:
         frame_sender._take_subscription(file, message)
     assert set(frame_sender._topics) == watching
+
+
+def test_what_is_no_frame_is_counted_with_what_is_wrong_with_the_last(frame_sender):
+    with closing(FrameWatch(frame_sender.endpoint)) as watcher:
+        seen_by(watcher, frame_sender)
+        for parts in ([b'{"frame":1}'], [b'{"frame":2}', b"", b""], [b'{"frame":3']):
+            frame_sender._ready().send_multipart(parts)
+        wait_for(lambda: watcher.frames(10) or watcher.refused == 3, "three that are no frames")
+        assert watcher.why_refused == read_frame([b'{"frame":3'])
+        seen_by(watcher, frame_sender)
 
 
 def test_who_asks_for_another_topic_or_has_unsubscribed_does_not_watch(frame_sender):

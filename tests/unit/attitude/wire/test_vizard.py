@@ -79,9 +79,11 @@ def test_an_mrp_and_its_shadow_are_the_frame_s_turn_and_the_mounting_comes_after
 
 
 def test_time_and_number_are_the_simulation_s() -> None:
-    sample = taken(viz_message(123_456_789_012.0, [craft()], frame=2**32 + 5))
-    assert isinstance(sample, AttitudeSample)
-    assert (sample.t_ns, sample.sequence, sample.rate_cam_rad_s) == (123_456_789_012, 5, None)
+    """The time, a float64, is told to the nearest ns."""
+    for off_ns, t_ns in ((0.0, 123_456_789_012), (0.75, 123_456_789_013), (-0.75, 123_456_789_011)):
+        sample = taken(viz_message(123_456_789_012.0 + off_ns, [craft()], frame=2**32 + 5))
+        assert isinstance(sample, AttitudeSample)
+        assert (sample.t_ns, sample.sequence, sample.rate_cam_rad_s) == (t_ns, 5, None)
 
 
 def test_the_self_check_points_where_it_says() -> None:
@@ -94,6 +96,17 @@ def test_the_self_check_points_where_it_says() -> None:
     assert to_radec_roll_deg(sample.q_icrs_to_cam)[:2] == pytest.approx(
         CHECK_RADEC_DEG, abs=DIGITS_DEG
     )
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_attitude_of_either_sign_is_written_as_the_shorter_set(
+    rng: np.random.Generator, sign: float
+) -> None:
+    for turn in Rotation.random(5, rng=rng):
+        q = sign * turn.as_quat(canonical=True, scalar_first=True)
+        words = re.findall(r"-?[0-9.]+", CONVENTIONS.written(q))
+        # SciPy's parameters turn a vector, Basilisk's a frame
+        assert [float(word) for word in words] == pytest.approx(turn.inv().as_mrp(), abs=1e-7)
 
 
 # Rates
@@ -195,6 +208,23 @@ def test_no_rate_across_a_silence_a_jump_or_a_restart() -> None:
     known = [rate is not None for rate in rates_of_body([STEP_NS * each for each in k])]
     assert known == [False, False, True, False, False, True, False, False, True]
     assert rates_of_body([STEP_NS * each for each in range(4)], max_rate_rad_s=0.05) == [None] * 4
+
+
+@pytest.mark.parametrize(("second_rad_s", "is_known"), [(0.85, True), (0.91, False)])
+def test_a_rate_that_exceeds_the_limit_where_it_is_carried_on_is_none(
+    second_rad_s: float, is_known: bool
+) -> None:
+    """From means of 0.7 and of the second: 0.925 and 1.015 rad/s at the end, of 1 that may be."""
+    turns_rad = np.cumsum([0.0, 0.7, second_rad_s]) * STEP_NS / NS_PER_S
+    rates = DifferenceRates(STEP_NS, 1.0)
+    for k, turn_rad in enumerate(turns_rad):
+        q = Rotation.from_rotvec([0, 0, -turn_rad]).as_quat(scalar_first=True)
+        sample = rates.moving(AttitudeSample(k * STEP_NS, q))
+    assert (sample.rate_cam_rad_s is not None) == is_known
+    if is_known:
+        step_s = STEP_NS / NS_PER_S
+        assert sample.rate_cam_rad_s == pytest.approx([0, 0, 0.925], abs=1e-10)
+        assert sample.acceleration_cam_rad_s2 == pytest.approx([0, 0, 0.15 / step_s], abs=1e-8)
 
 
 # Which spacecraft
@@ -475,15 +505,19 @@ def test_each_request_has_one_answer_whatever_it_asks() -> None:
         link.show_camera(
             TrackerCamera(np.array([1.0, 0.0, 0.0, 0.0]), (100, 100), 10.0), lambda sample: b"png"
         )
-        update = viz_message(spacecraft=[craft()])
+        camera = {"cameraID": 7, "fieldOfView": 20.0, "resolution": [100, 100]}
+        update = viz_message(spacecraft=[craft()], cameras=[camera])
         for request, answer in (
             ([b"PING"], [b"PONG"]),
             ([b"REQUEST_IMAGE_7"], [b"\0\0\0\0", b""]),
             ([b"SIM_UPDATE", b"", b"", update], [b"OK"]),
             ([b"REQUEST_IMAGE_7"], [b"\0\0\0\3", b"png"]),
+            ([b"REQUEST_IMAGE_7"], [b"\0\0\0\3", b"png"]),
             ([b"SIM_UPDATE", b"", b"", update[:-3]], [b"ERROR"]),
-            ([b"SIM_UPDATE"], [b"ERROR"]),
             ([b"REQUEST_INPUT"], [b"VIZARD_INPUT", b""]),
+            ([b"REQUEST_IMAGE_7"], [b"\0\0\0\0", b""]),
+            ([b"SIM_UPDATE", b"", b"", update], [b"OK"]),
+            ([b"SIM_UPDATE"], [b"ERROR"]),
             ([b"REQUEST_IMAGE_7"], [b"\0\0\0\0", b""]),
             ([b"REQUEST_IMAGE_seven"], [b"ERROR"]),
             ([b"anything", b"else"], [b"ERROR"]),
@@ -499,4 +533,4 @@ def test_each_request_has_one_answer_whatever_it_asks() -> None:
                 )
             assert basilisk.poll(PATIENCE_S * 1000), request
             assert basilisk.recv_multipart() == answer
-    assert notices.counts()["unknown-request"] == 3
+    assert notices.counts() == {"unknown-request": 3, "other-camera": 1}

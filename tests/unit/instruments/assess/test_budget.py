@@ -6,8 +6,15 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.instruments.assess.budget import DecomposedRun, assess_cases, assess_run
-from hilstar.instruments.assess.clock import coarse_offset
+from hilstar.basics.rotation import from_rotation_vector, multiply
+from hilstar.instruments.assess.budget import (
+    DecomposedRun,
+    assess_cases,
+    assess_run,
+    intervals_of,
+)
+from hilstar.instruments.assess.clock import ClockSolver, coarse_offset
+from hilstar.instruments.assess.components import NOTHING, Component, Components
 from hilstar.server.record.commanded import Commanded
 from tests.support.planted_tracker import (
     ARCSEC_PER_RAD,
@@ -121,12 +128,45 @@ def test_cases_all_over_the_sky_have_a_bias_and_noise_and_no_place_that_repeats(
     reported = scalar_first(Rotation.from_rotvec(error / ARCSEC_PER_RAD) * truth)
     reported[::50] = np.nan
     reported[7] = commanded[8]
+    commanded[13] = np.nan
     found = assess_cases(commanded, reported, SCALE, rng)
     # 4 sigma about the boresight
     np.testing.assert_allclose(found.bias_arcsec, [3.0, -4.0, 30.0], atol=1.5)
     assert found.noise_arcsec.roll == pytest.approx(8.0, rel=0.15)
     assert found.fov_arcsec.cross is None
     assert found.wrong.tolist() == [7]
+    assert found.row.tolist() == [k for k in range(500) if k % 50 and k not in (7, 13)]
+
+
+def test_a_bias_of_two_blocks_has_the_interval_of_student_s_t_with_one_freedom(rng) -> None:
+    """Ten answers make two blocks, with means a and b: 12.706 |a - b| / 2 to either side."""
+    left = np.repeat([[1.0, -3.0, 0.5], [-1.0, 3.0, -0.5]], 5, axis=0)
+    nothing = Component(NOTHING, np.zeros_like(left), 0.0)
+    mean = np.array([10.0, 20.0, 30.0])
+    parts = Components(mean, nothing, nothing, np.ones(3), left, 0.0)
+    low, high = intervals_of(parts, rng).bias
+    assert (low + high) / 2 == pytest.approx(mean)
+    # a standard deviation of 1000 draws
+    assert (high - low) / 2 == pytest.approx(12.706 * np.array([1.0, 3.0, 0.5]), rel=0.1)
+
+
+def test_answers_while_a_frame_was_held_are_in_no_figure_and_wrong_only_beyond_its_turn() -> None:
+    """The field's turn while a frame was held for 0.4 s is not five degrees."""
+    planted = plant(scan, Sizes(fov=0.0, pixel=0.0, wild=0), np.random.default_rng(5), seconds=24.0)
+    held_s = planted.frames_s[0] + np.array([[8.0, 8.4], [16.0, 16.4]])
+    commanded = Commanded(planted.frames_s, planted.frames_q, held_s, np.array([0.4, 0.4]))
+    coarse = coarse_offset(commanded, planted.tau_s, planted.reported)
+    assert coarse is not None
+    reported = planted.reported.copy()
+    plain = ClockSolver(commanded, planted.tau_s, reported, SCALE).fit(coarse)
+    is_held = plain.moments.held_s > 0
+    astray = int(np.flatnonzero(is_held)[2])
+    reported[astray] = multiply(from_rotation_vector(np.radians([0, 5.0, 0])), reported[astray])
+    found = assess_run(commanded, planted.tau_s, reported, coarse, SCALE, np.random.default_rng(1))
+    assert is_held.sum() > 4
+    assert found.wrong.tolist() == [astray]
+    assert found.held.tolist() == [k for k in np.flatnonzero(is_held).tolist() if k != astray]
+    assert not is_held[found.row].any()
 
 
 def test_few_answers_and_wild_ones_are_refused() -> None:

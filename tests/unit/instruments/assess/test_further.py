@@ -7,7 +7,9 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,13 +25,22 @@ from hilstar.instruments.assess.assessment import (
     read_answers,
 )
 from hilstar.instruments.assess.bounded_figures import TooFewCases
-from hilstar.instruments.assess.further import END, rate_notes
+from hilstar.instruments.assess.components import Component
+from hilstar.instruments.assess.further import (
+    END,
+    FurtherFigures,
+    add_jitter,
+    add_stars,
+    rate_notes,
+)
 from hilstar.instruments.assess.rate_figures import _near_rates, _refuse_other_units
 from hilstar.instruments.assess.star_figures import StarTable, _near, star_figure, without_turns
 from hilstar.server.answers.answer import ReportedStar
+from hilstar.server.answers.stars import LitStars, StarResiduals
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.record.ledger_records import AnswerRecord
+from tests.support.assessments import a_budget
 from tests.support.benches import bench_text
 from tests.support.planted_run import write_ledger
 from tests.support.planted_tracker import attitude, rate_rad_s, scalar_first
@@ -250,3 +261,66 @@ def test_a_ledger_s_own_answers_have_rates_and_stars(tmp_path: Path) -> None:
     assert np.isnan(told.telemetry.rate_cam_rad_s[0]).all()
     assert told.telemetry.rate_cam_rad_s[1].tolist() == [0.1, 0.2, 0.3]
     assert list(told.centroids) == [[], [ReportedStar(1.0, 2.0, None, 26311)]]
+
+
+def slewing(count: int, taken: float) -> Any:
+    """A budget of answers in slews along x and y of both signs, with residuals along them alone, of
+    which a fit of the field took so many numbers.
+    """
+    found = a_budget()
+    sense = np.tile([1.0, -1.0], count // 2)
+    rate_rad_s = np.radians([0.3, -0.4, 0.0]) * sense[:, None]
+    late_s = 0.01 * np.sqrt(2) * np.sin(np.arange(count))
+    left = ARCSEC_PER_RAD * rate_rad_s * late_s[:, None]
+    none = np.zeros_like(left)
+    components = replace(
+        found.components,
+        left=left,
+        fov=Component(np.zeros(3), none, taken),
+        pixel=Component(np.zeros(3), none, 0.0),
+    )
+    return replace(found, components=components, rate_rad_s=rate_rad_s, row=np.arange(count))
+
+
+def test_a_stamp_s_jitter_has_back_what_the_budget_s_fits_took() -> None:
+    """10 ms of 400 answers; where a field took 99 numbers, as of 300."""
+    values = []
+    for taken in (0.0, 99.0):
+        further = FurtherFigures()
+        add_jitter(further, slewing(400, taken))
+        (row,) = further.rows
+        assert (row.quantity, row.axis, row.unit) == ("stamp jitter", "", "s")
+        values.append(row.value)
+    # what the fit of bias and stamp takes of 400 is 3 / n, and is given back here, too
+    assert values[0] == pytest.approx(0.01, rel=0.01)
+    assert values[1] / values[0] == pytest.approx(math.sqrt(399 / 300))
+
+
+def test_false_stars_are_counted_by_answers_that_have_stars() -> None:
+    """Three of them in every other of 160 answers, whose 20 stars are judged at their own
+    attitudes.
+    """
+    count = 160
+    rng = np.random.default_rng(4)
+    q = rng.normal(size=(count, 4))
+    asked = []
+
+    def judged(reported: Any, attitude_q: FloatArray) -> StarResiduals:
+        asked.append((reported[0].hip, attitude_q.tolist()))
+        x_px, y_px = rng.uniform(0, [[1199], [699]], (2, 20))
+        lit = LitStars(x_px, y_px, np.full(20, 4.0), np.full(20, 0.5), np.full(20, 1e4))
+        return StarResiduals(lit, *rng.normal(0, 0.1, (2, 20)), np.zeros(20), false=3)
+
+    centroids = [[ReportedStar(1.0, 2.0, None, k)] if k % 2 else [] for k in range(count)]
+    further = FurtherFigures()
+    found = replace(a_budget(), commanded_q=q)
+    add_stars(further, SimpleNamespace(judged=judged, size_px=(1200, 700)), centroids, found)  # type: ignore[arg-type]
+    assert asked == [(k, q[k].tolist()) for k in range(1, count, 2)]
+    rows = {row.quantity: row for row in further.rows}
+    row = rows["false stars a frame"]
+    assert (row.value, row.unit) == (3.0, "a frame")
+    # of 240 in all: 3 +- 1.96 sqrt(240) / 80
+    half = 1.96 * math.sqrt(240) / 80
+    assert (row.low_95, row.high_95) == pytest.approx((3 - half, 3 + half), abs=0.05)
+    assert rows["star noise"].value == pytest.approx(0.1, rel=0.1)
+    assert further.stars is not None and len(set(further.stars.case.tolist())) == 40

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +11,8 @@ from scipy import sparse
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.units import ARCSEC_PER_RAD
-from hilstar.instruments.assess.budget import _field_interval
-from hilstar.instruments.assess.components import Component
+from hilstar.instruments.assess.budget import _beside_field, _field_interval, _look_alikes
+from hilstar.instruments.assess.components import Component, Components
 from hilstar.instruments.assess.look_alikes import (
     SLOW_WAVES,
     LookAlikes,
@@ -19,7 +20,8 @@ from hilstar.instruments.assess.look_alikes import (
     slow_variance,
     turns_of,
 )
-from hilstar.instruments.assess.places import Projector
+from hilstar.instruments.assess.places import Projector, Scale, places_of
+from tests.support.assessments import a_clock
 from tools.interval_coverage import KINDS
 
 ANSWERS, BUMPS, SECONDS = 600, 12, 300.0
@@ -130,3 +132,101 @@ def test_a_field_error_s_interval_ends_at_0_where_a_slow_change_could_be_all_of_
     ends = _field_interval(fov, np.zeros(3), look_alikes)
     wanted = np.sqrt([[low, low], [high, high]])
     np.testing.assert_allclose(ends, wanted, rtol=1e-12, atol=1e-9)
+
+
+@pytest.mark.parametrize("clock_sigmas", [0.5, 1.5])
+def test_a_field_s_error_that_goes_with_the_rate_may_all_be_the_clock_s(clock_sigmas):
+    """An error of c omega about x, and a clock known to sigma: c - x sigma is as likely for any x
+    up to 1.96.
+    """
+    rate = np.array([1.0, -2.0, 4.0, -3.0])
+    turn = np.zeros((4, 3, 2))
+    turn[:, 0, 0] = rate
+    sigma_s = 0.02
+    late_s = clock_sigmas * sigma_s
+    fitted = np.zeros((4, 3))
+    fitted[:, 0] = late_s * rate
+    fov = Component((fitted**2).mean(axis=0), fitted, 0.0)
+    look_alikes = LookAlikes(turn, np.diag([sigma_s**2, 1e-30]), np.zeros(3))
+    low, high = _field_interval(fov, np.zeros(3), look_alikes)[:, 0]
+    rms_of_1_s = np.sqrt((rate**2).mean() / 2)  # of two axes, of which one turns
+    assert low == pytest.approx(0.0, abs=1e-6)
+    assert high == pytest.approx(rms_of_1_s * (late_s + 1.96 * sigma_s))
+
+
+def test_a_clock_is_no_better_known_than_its_fit_and_what_looks_like_it_say():
+    """Offset, drift and bias, each where the one and where the other is the larger."""
+    fit = a_clock()  # known to 0.1 ms, 2 ppm and an arcsec
+    mean = np.array([[3e4, 1e6], [0.0, 0.0], [-1e4, 4e5]])
+    turn = mean + np.array([-2.0, -1.0, 0.0, 1.0, 2.0])[:, None, None] * [1e3, 1e4]
+    for offset_s, drift in ((1e-5, 5e-6), (4e-4, 1e-6)):
+        together = 0.5 * offset_s * drift
+        covariance = np.array([[offset_s**2, together], [together, drift**2]])
+        found = _beside_field(fit, LookAlikes(turn, covariance, np.zeros(3)))
+        assert found.sigma_offset_s == pytest.approx(max(offset_s, 1e-4))
+        assert found.sigma_drift == pytest.approx(max(drift, 2e-6))
+        of_clock = np.diag(mean @ covariance @ mean.T)
+        assert found.sigma_bias_arcsec == pytest.approx(np.sqrt(1 + of_clock))
+        assert found.offset_s == fit.offset_s
+
+
+def test_a_pixel_error_is_noise_beside_a_clock(rng: np.random.Generator) -> None:
+    """Without bumps of the field: the sigma of an offset is that of least squares about a bias, by
+    what is left and what repeats within a pixel together.
+    """
+    rate_rad_s = rng.normal(0, 1e-3, (ANSWERS, 3))
+    left = rng.standard_normal((ANSWERS, 3))
+    fitted = 3.0 * np.sqrt(2) * np.sin(np.arange(ANSWERS) * 2.1)[:, None] * np.ones(3)
+    nothing = np.zeros(3)
+    parts = Components(
+        nothing,
+        Component(nothing, np.zeros_like(left), 0.0, reason="no places"),
+        Component(np.full(3, 9.0), fitted, 2.0),
+        np.ones(3),
+        left,
+        0.0,
+    )
+    clock = SimpleNamespace(t_s=swing() + 7.0, moments=SimpleNamespace(rate_rad_s=rate_rad_s))
+    look_alikes = _look_alikes(clock, parts, np.arange(ANSWERS), 7.0)  # type: ignore[arg-type]
+    turned = ARCSEC_PER_RAD * (rate_rad_s - rate_rad_s.mean(axis=0))
+    share = swing() / SECONDS - 0.5
+    information = float((turned**2).sum()) / 10.0
+    # beside a drift, whose columns are nearly apart from the offset's in the middle of the run
+    of_middle = look_alikes.covariance[0, 0]
+    both = 1 / information * (1 + 0.25 / float((share**2).mean()))
+    # stretches of the run may widen it by chance
+    assert both / 1.3 < of_middle < 2.25 * both
+    assert not look_alikes.slow_variance.any()
+
+
+def test_errors_that_last_widen_a_clock_s_sigma_by_how_stretches_differ(rng: np.random.Generator):
+    """Errors that are the same over each fortieth of a run, along the turn: as of forty answers."""
+    rate_rad_s = np.zeros((ANSWERS, 3))
+    rate_rad_s[:, 0] = 1e-3 * np.tile([1.0, -1.0], ANSWERS // 2)
+    turn = turns_of(rate_rad_s, swing())
+    own = np.repeat(rng.choice([-1.0, 1.0], 40), ANSWERS // 40)
+    left = np.zeros((ANSWERS, 3))
+    left[:, 0] = own * np.tile([1.0, -1.0], ANSWERS // 2)
+    left[:, 1:] = rng.standard_normal((ANSWERS, 2))
+    known = clock_covariance(turn, None, left, WIDE_ARCSEC2, np.array([10.0, 1e-12]))
+    white_s = 1 / (ARCSEC_PER_RAD * 1e-3 * np.sqrt(ANSWERS))
+    assert np.sqrt(known[0, 0]) == pytest.approx(white_s * np.sqrt(ANSWERS / 40), rel=0.02)
+
+
+def test_a_place_moves_as_far_as_the_field_does_on_the_detector():
+    """On 1200 by 700 pixels a star is usually 0.3 of 700 from the boresight: a roll moves it by so
+    much of an arc.
+    """
+    scale = Scale(5000.0, (1200, 700))
+    assert scale.roll_px == pytest.approx(210.0)
+    assert scale.pixel_arcsec == pytest.approx(41.253, abs=1e-3)
+    angle_rad = 1e-3
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    rolled = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    panned = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+    tipped = np.array([[1.0, 0.0, 0.0], [0.0, cosine, sine], [0.0, -sine, cosine]])
+    start, *moved = places_of(np.stack([np.eye(3), rolled, panned, tipped]), 5000.0, scale.roll_px)
+    assert start.tolist() == [0.0, 0.0, 5000.0, 210.0, 0.0, 0.0]
+    # of an x axis that goes along with a turn about y, and not with one about itself
+    distance_px = [float(np.linalg.norm(place - start)) for place in moved]
+    assert distance_px == pytest.approx([0.21, np.hypot(5.0, 0.21), 5.0], rel=1e-4)

@@ -13,6 +13,7 @@ from hilstar.instruments.calibrate.camera_edges import (
     check_rate,
     edges_in,
     find_square,
+    format_of_fewest_bits,
 )
 from hilstar.server.genicam.camera import Film, has_aravis
 from hilstar.server.gige.registers import CameraSettings
@@ -21,6 +22,7 @@ from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
 from tests.support.gige_cameras import running_camera
 from tests.support.planted_run import write_ledger
+from tests.support.refusals import refusal
 
 needs_aravis = pytest.mark.skipif(
     not has_aravis(), reason="Aravis is not installed (gir1.2-aravis-0.8, python3-gi)"
@@ -142,3 +144,11 @@ def test_a_camera_before_the_square_tells_the_latency(tmp_path):
     figures = json.loads(found.stdout)
     assert figures["edges"] > 40 and not figures["ambiguous"]
     assert figures["latency_ms"]["p50"] == pytest.approx(1e3 * LATENCY_S, abs=MAX_OFF_MS)
+
+
+def test_a_square_is_filmed_in_the_format_of_whole_bytes_with_the_fewest_bits():
+    """A packed one is none of whole bytes."""
+    assert format_of_fewest_bits(["Mono12", "Mono8", "BayerRG10"]) == "Mono8"
+    assert format_of_fewest_bits(["Mono8p", "Mono12Packed", "BayerRG10"]) == "BayerRG10"
+    words = refusal(format_of_fewest_bits, ["Mono12Packed", "RGB8"])
+    assert words.endswith("whole bytes of grey or Bayer: Mono12Packed, RGB8")

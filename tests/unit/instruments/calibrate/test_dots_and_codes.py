@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilstar.basics.errors import InputError
 from hilstar.display.geometry import monitor_camera
@@ -29,18 +30,26 @@ from hilstar.instruments.calibrate.geometric.dots import (
     lit_for,
     plan_dots,
     plan_seen_dots,
+    read_plan,
 )
 from hilstar.instruments.calibrate.geometric.fit import MatchedDots, Nominal
+from hilstar.instruments.calibrate.geometric.geometry_fit import calibrate_files
 from hilstar.instruments.calibrate.geometric.match import (
     _nearest,
     _refuse_orientation,
     decode,
+    first_look,
     frame_shifts,
     homography,
     mapped,
     refuse_motion,
 )
-from hilstar.instruments.calibrate.geometric.observed import Observed, numbered
+from hilstar.instruments.calibrate.geometric.observed import (
+    Observed,
+    numbered,
+    read_image,
+    read_observed,
+)
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from tests.support.benches import bench_text
@@ -350,3 +359,78 @@ def test_images_are_known_by_the_last_number_of_their_names_and_their_folder_s_p
     ):
         with pytest.raises(InputError, match=re.escape(why)):
             numbered([Path(name) for name in names])
+
+
+@pytest.mark.parametrize("disordered", [0, 1])
+def test_frames_in_disorder_are_named_with_their_pose_but_the_first(disordered, rng):
+    plan = plan_dots((300, 200), 16, 20, rng)
+    poses = []
+    for pose in range(2):
+        seen = codes_seen(plan, rng)
+        if pose == disordered:
+            seen = replace(seen, frame=15 - seen.frame)
+        poses.append(replace(seen, pose=np.full(len(seen), pose)))
+    lens = Camera((640, 480), 2000.0, (319.5, 239.5), np.eye(3))
+    words = refusal(first_look, plan, Nominal(lens, UPRIGHT, lens), poses[0].joined(poses[1]), rng)
+    beginning = "pose 1: " if disordered else ""
+    assert words.startswith(f"{beginning}the frames are in reverse order")
+
+
+def test_an_image_of_another_size_is_refused_by_both_sizes(tmp_path):
+    path = tmp_path / "frame_0.png"
+    codes = np.arange(24, dtype=np.uint8).reshape(4, 6)
+    Image.fromarray(codes).save(path)
+    np.testing.assert_array_equal(read_image(path, (6, 4)), codes)
+    wanted = "is 6 x 4 px, and [tracker] resolution_px is 8 x 5"
+    assert wanted in refusal(read_image, path, (8, 5))
+    assert "is 6 x 4 px" in refusal(read_image, path, (4, 6))
+
+
+HEAD = "frame,x_px,y_px,sigma_px,pose\n"
+
+
+def test_centroids_of_a_table_are_those_of_its_rows(tmp_path):
+    path = tmp_path / "dots.csv"
+    path.write_text(HEAD + "3,1.5,-2.5,0.25,1\n0,7,8,,\n")
+    seen = read_observed(path)
+    assert (seen.frame.tolist(), seen.pose.tolist()) == ([3, 0], [1, 0])
+    assert (seen.x_px.tolist(), seen.y_px.tolist()) == ([1.5, 7.0], [-2.5, 8.0])
+    assert (seen.sigma_px.tolist(), seen.edge_px) == ([0.25, 1.0], 0.0)
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        *("-1,1,2,1,0", "1000000,1,2,1,0", "0.5,1,2,1,0", "0,nan,2,1,0", "0,1,inf,1,0"),
+        *("0,1,2,0,0", "0,1,2,-1,0", "0,1,2,inf,0", "0,1,2,1,-1", "0,1,2,1,1000"),
+    ],
+)
+def test_a_row_that_is_no_centroid_is_refused_with_its_line(tmp_path, row):
+    path = tmp_path / "dots.csv"
+    path.write_text(HEAD + "0,1,2,1,0\n" + row + "\n")
+    words = refusal(read_observed, path)
+    assert words.startswith(f"{path}:3: {row!r}; a frame from 0, finite x_px and y_px, sigma_px")
+
+
+@pytest.mark.parametrize(
+    ("x_px", "y_px", "is_beyond"),
+    [(95, 119, False), (96, 119, True), (95, 120, True), (40, 30, False)],
+)
+def test_a_plan_of_a_larger_screen_is_refused_before_its_images(tmp_path, x_px, y_px, is_beyond):
+    """Of a screen that is higher than it is wide."""
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(CLOSED, {"monitor": {"resolution_px": [96, 120]}}))
+    plan = tmp_path / "plan.csv"
+    plan.write_text(f"frame,dot,x_px,y_px\n0,0,10,10\n1,1,{x_px},{y_px}\n")
+    missing = [tmp_path / "none.csv"]
+    file = read_bench_file(path)
+    words = refusal(calibrate_files, file, missing, plan, None, tracker_is_ideal=True)
+    off = f"{plan}: has dots off this monitor of 96 x 120 px"
+    assert words.startswith(off if is_beyond else f"{missing[0]}: ")
+
+
+@pytest.mark.parametrize("place", ["12,20", "10,25"])
+def test_a_dot_at_two_places_is_refused_whichever_axis_it_moves_along(tmp_path, place):
+    plan = tmp_path / "plan.csv"
+    plan.write_text(f"frame,dot,x_px,y_px\n0,3,10,20\n1,3,10,20\n2,3,{place}\n")
+    assert refusal(read_plan, plan).startswith(f"{plan}: dot 3 is at two places")

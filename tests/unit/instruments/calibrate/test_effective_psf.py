@@ -11,6 +11,7 @@ import pytest
 from scipy.special import ndtr
 
 from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate import effective_psf
 from hilstar.instruments.calibrate.effective_psf import (
     KNOT_PX,
     MAX_HALF_PX,
@@ -18,6 +19,7 @@ from hilstar.instruments.calibrate.effective_psf import (
     QUANTISED_DN2,
     Dots,
     Effective,
+    HeldOut,
     _dot_sides,
     _functions,
     _glass,
@@ -32,6 +34,7 @@ from hilstar.instruments.calibrate.effective_psf import (
     _Sums,
     _variance,
     dots_of_image,
+    fit_effective,
 )
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX
 from hilstar.instruments.calibrate.geometric.fit import MatchedDots
@@ -179,12 +182,12 @@ def test_pixels_scatter_by_their_light_as_the_frames_of_a_dot_do():
     np.testing.assert_allclose(alone, edge.var() + QUANTISED_DN2)
 
 
-def gaussian_image(x_px, y_px, sigma_px: float, flux: float) -> np.ndarray:
-    """Light of Gaussians integrated over pixels (200, 300), by erf."""
+def gaussian_image(x_px, y_px, sigma_px: float, flux: float, oval: float = 1.0) -> np.ndarray:
+    """Light of Gaussians integrated over pixels (200, 300), by erf; `oval` times as high as wide."""
     image = np.zeros((200, 300))
     for x, y in zip(x_px, y_px, strict=True):
         across = np.diff(ndtr((np.arange(301) - 0.5 - x) / sigma_px))
-        down = np.diff(ndtr((np.arange(201) - 0.5 - y) / sigma_px))
+        down = np.diff(ndtr((np.arange(201) - 0.5 - y) / (oval * sigma_px)))
         image += flux * np.outer(down, across)
     return image
 
@@ -356,3 +359,39 @@ def test_a_variance_grows_with_light_or_is_the_dark_s(slope_dn):
     spread = 0.75 * (3.0 + slope_dn * light)
     expected = 3.0 + max(slope_dn, 0.0) * light
     np.testing.assert_allclose(_variance(mean, spread, np.array([4.0])), expected, rtol=1e-12)
+
+
+def test_few_dots_have_the_side_of_a_linear_map_whatever_their_noise(rng):
+    """A cubic of ten terms would follow the noise of eleven dots."""
+    x_px, y_px = rng.uniform(0, 200, size=(2, 11))
+    noise_px = rng.normal(0, 0.3, size=(2, 11))
+    data = matched(2 * x_px + noise_px[0], 2 * y_px + noise_px[1], np.arange(11))
+    # a slope of eleven dots over 400 px is known to 0.3 px / 115 px / sqrt(11)
+    np.testing.assert_allclose(_dot_sides(data, x_px, y_px), 2 * DOT_PX, rtol=0.01)
+
+
+@pytest.mark.parametrize(("gain", "asks"), [(0.2, False), (0.4, True), (-0.4, False)])
+def test_more_than_a_gaussian_is_asked_for_beyond_three_standard_errors(monkeypatch, gain, asks):
+    """Of 35 dots whose chi squares differ by 0.6 from dot to dot: 0.1 of their mean."""
+    x_px, y_px = field_of_dots()[1:]
+    image = gaussian_image(x_px, y_px, 1.0, 1e4, oval=1.3)
+    dots = dots_of_image(image, x_px, y_px, 0.0)
+    off = np.linspace(-1, 1, len(x_px))
+    off *= 0.6 / off.std(ddof=1)
+
+    def held(start, dots, covariance, fold, count):
+        """The linear spline is the best, by `gain`."""
+        chi2 = np.full(len(fold), 2.0)
+        if count:
+            chi2 = chi2 - gain - off * np.sqrt(len(fold) / 36) + 0.05 * abs(count - 3)
+        return HeldOut(effective_psf.MODEL_NAMES[count], 0.1, 0.1, chi2)
+
+    monkeypatch.setattr(effective_psf, "_held_out", held)
+    found = fit_effective(dots, 1)
+    assert found.asks_for_more == asks
+    wanted = "spline, linear over the field" if asks else "Gaussian"
+    assert found.chosen.name == wanted
+    assert len(found.models) == 4
+    # a Gaussian is fitted to light that is one: 1 px wide and 1.3 px high
+    assert found.sigma_px == pytest.approx((1.0, 1.3), abs=0.02)
+    assert (found.dots, found.half_px) == (len(x_px), dots.images.shape[1] // 2)

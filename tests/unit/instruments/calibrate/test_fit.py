@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -11,6 +13,7 @@ from hilstar.display.response import srgb_light
 from hilstar.instruments.calibrate.measurements import drift_over_run, read_measurements
 from hilstar.instruments.calibrate.photometric import (
     Provenance,
+    _additivity,
     calibrate_photometric,
     draw_calibration,
     fit_channel,
@@ -343,3 +346,25 @@ def test_a_calibration_has_as_many_degrees_of_freedom_as_readings_less_one_a_lev
     readings = read_measurements(path).code
     errors = read_toml(tmp_path / "monitor.toml").errors
     assert errors.dof == len(readings) - len(np.unique(readings))
+
+
+def test_additivity_is_as_sure_as_its_primaries_by_their_light_and_white(tmp_path):
+    """Linear channels of 20, 50 and 30 units before a white of 80: at all codes a quarter more."""
+    light = np.linspace(0, 1, 1001)
+    fits = {}
+    whites = {"w": (80.0, 0.01, 0.0), "r": (20.0, 0.03, 0.04), "g": (50.0, 0.0, 0.02)}
+    for name, (white, own, of_white) in (whites | {"b": (30.0, 0.05, 0.0)}).items():
+        error = np.full(1001, own)
+        levels = SimpleNamespace(mean=np.array([white]))
+        levels.standard_error = lambda noise, by=of_white * white: np.array([by])
+        fits[name] = SimpleNamespace(
+            light=light, white=white, error=error, levels=levels, noise_relative=0.0
+        )
+    found = _additivity(fits)
+    assert found["additivity_percent"] == pytest.approx(25.0)
+    names = [f"1e-{decade}" for decade in range(4)]
+    assert found["crosstalk_percent"] == pytest.approx(dict.fromkeys(names, 25.0))
+    # each relative error by its share of the sum, and white's own
+    squares = (0.2 * 0.05) ** 2 + (0.5 * 0.02) ** 2 + (0.3 * 0.05) ** 2 + 0.01**2
+    error_percent = 100 * squares**0.5
+    assert found["crosstalk_error_percent"] == pytest.approx(dict.fromkeys(names, error_percent))

@@ -209,3 +209,17 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path, small_bench_file):
     assert_refused(
         run_hilstar_here("report", tmp_path / "no.mcap", "-o", tmp_path / "r"), 2, "no.mcap"
     )
+
+
+def test_edges_of_which_some_have_no_time_of_the_device_s_are_those_of_their_arrival(monkeypatch):
+    """And lines that are no edges are passed over."""
+    lines = [(1000 * k, f"{k % 2},{k}".encode()) for k in range(20)]
+    lines[7] = (7000, b"1")
+    noise = [(5, b"2,1"), (6, b"hello"), (7, b"1,-3"), (8, b"")]
+    monkeypatch.setattr(latency, "read_lines", lambda *_: [*noise, *lines])
+    edges = latency.capture_edges("/dev/none", 115200, 2.0)
+    assert edges.host_ns.tolist() == [1000 * k for k in range(20)]
+    assert edges.level.tolist() == [0, 1] * 10
+    monkeypatch.setattr(latency, "read_lines", lambda *_: lines[1:])
+    words = refusal(latency.capture_edges, "/dev/none", 115200, 2.0)
+    assert words.startswith("serial:/dev/none@115200: 19 edges came, and at least 20 are needed")

@@ -14,6 +14,7 @@ from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate.first_light.focus import Sharpness
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
 from hilstar.instruments.calibrate.live_focus import focus_readings, follow_answers, streak
+from hilstar.server.answers.answer import Answer
 from hilstar.server.answers.star_widths import FocusCurve, sparkline
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
@@ -209,6 +210,28 @@ def test_silence_ends_after_a_while_and_says_whose():
 
     with pytest.raises(InputError, match="no answer in 30 s: the reader starts again"):
         follow_answers(source, hold, lambda reading: True, lambda: False, clock)
+
+
+def test_silence_counts_from_the_last_answer():
+    """One each 25 s for 100 s, of no star; the line is silent after that."""
+    clock = FakeClock()
+    begun_ns = clock.ns
+    times_ns = [begun_ns + 25 * k * 10**9 for k in range(5)]
+
+    def take():
+        due = [at for at in times_ns if at <= clock.ns]
+        del times_ns[: len(due)]
+        return [Answer(at, b"") for at in due]
+
+    source = SimpleNamespace(take=take, trouble=lambda: "unplugged", unread="")
+
+    def hold(done):
+        while not done():
+            clock.work(1e9)
+
+    with pytest.raises(InputError, match="no answer in 30 s: unplugged"):
+        follow_answers(source, hold, lambda reading: False, lambda: False, clock)
+    assert (clock.ns - begun_ns) / 1e9 == pytest.approx(130, abs=2)
 
 
 def test_a_curve_is_as_high_as_its_values():

@@ -103,3 +103,22 @@ def test_stated_errors_are_taken_from_what_two_repeats_scatter(tmp_path):
             rows.append(f"{min(code, 255)},w,{code * (1 + off)!r},{0.01 * code!r}")
     measured = read_measurements(table_of(tmp_path, "\n".join(rows) + "\n"))
     assert group_levels(measured, "w").relative_noise == pytest.approx(0.01)
+
+
+def test_a_floor_beside_relative_noise_is_what_faint_levels_scatter_beyond_it(tmp_path, rng):
+    """5 % of each reading, and 6 units of all: faint levels of 60 units scatter by 6.7."""
+    rows = ["code,channel,value"]
+    for code, light in zip(range(0, 120, 10), (*[60.0] * 5, *[6e4] * 7), strict=True):
+        scatter = 0.05 * light * rng.normal(size=400) + 6.0 * rng.normal(size=400)
+        for value in (light + scatter).tolist():
+            rows.append(f"{code},w,{value!r}")
+    levels = group_levels(read_measurements(table_of(tmp_path, "\n".join(rows) + "\n")), "w")
+    # the scatter of 2000 readings is known to 1.6 %
+    assert levels.additive_noise == pytest.approx(6.0, rel=0.07)
+    assert levels.relative_noise == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_cause_without_a_value_in_a_row_does_nothing_to_it(tmp_path):
+    text = "code,channel,value,common_1,common_2\n0,w,1,,0.5\n9,w,5,0.25,\n"
+    measured = read_measurements(table_of(tmp_path, text))
+    assert measured.common.tolist() == [[0.0, 0.5], [0.25, 0.0]]

@@ -4,6 +4,7 @@ between black images, and the error of a ratio of ranges.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -21,6 +22,7 @@ from hilstar.instruments.calibrate.first_light.photometer import (
     SHARE,
     DotField,
     LatticeRatio,
+    Look,
     Photometer,
     PixelScatter,
     Range,
@@ -369,3 +371,60 @@ def test_rounding_of_both_sums_of_a_ratio_is_taken_off_one_another():
     modes = made._of_rounding(values, lit, [pair], [link])
     # 3 % of the ratio, of which the light loses 3 %: 0.3 less 0.15 DN/s
     np.testing.assert_allclose((modes**2).sum(), (0.3 - 0.15) ** 2, rtol=1e-6)
+
+
+def test_a_code_brighter_than_stated_is_read_shorter_and_then_on_the_next_lattice():
+    """Until it does not saturate; once read, it stays where it is."""
+    made = photometer()
+    taken = []
+
+    def look(name, at, patch):
+        taken.append((name, at))
+        is_bright = at.times > 1 or at.period < 4 or len(taken) > 7
+        return Look(100.0 * at.period, 0.81 if is_bright else 0.8)
+
+    made._look = look
+    patch = Patch(9, "w")
+    chosen = {patch: Range(1, 4)}
+    blacks, sums = made._sums([Patch(0, "w"), patch, Patch(0, "w"), patch], chosen)
+    black = [Range(1), Range(1, 4)]
+    tried = [Range(1, 4), Range(1), Range(2), Range(4)]
+    assert [at for _, at in taken] == [*black, *tried, *black, Range(4)]
+    assert [name for name, _ in taken[2:6]] == [f"patch_001_{at.period}" for at in tried]
+    assert sums == {1: 400.0, 3: 400.0}
+    assert chosen == {patch: Range(4)}
+    assert {times: sums.tolist() for times, sums in blacks.items()} == dict.fromkeys(
+        (1, 4), [100.0] * 2
+    )
+
+
+def test_a_ratio_is_said_with_each_lattice_s_own_exposure():
+    link = ratio_of("g", Range(1, 4), Range(2), 0.98765)
+    said = "a pixel of every 1, exposed 4 times longer is 0.98765 +- 0.00988 times one of every 2"
+    assert link.words == f"code 50 of g: {said}"
+    sparse = ratio_of("r", Range(1, 16), Range(1, 4), 1.0).words
+    assert sparse.endswith("one of every 1, exposed 4 times longer")
+
+
+@pytest.mark.parametrize("even_relative", [0.0, 0.1])
+def test_black_is_the_mean_of_two_screens_over_one_that_is_off(even_relative):
+    """Screens of 100 DN a pixel that differ by 2 DN, and 60 DN without glow; no rounding."""
+    made = photometer(_even_relative=even_relative, images=[], _dark_screen="first")
+    parts = {"first": np.full((50, 60), 99.0), "again": np.full((50, 60), 101.0)}
+    parts["unlit"] = np.full((50, 60), 60.0)
+    made._part = parts.__getitem__
+    made._black_screen = lambda number: f"black {number}"
+    made._noise_dn = lambda variance_dn2, sum_dn: 50.0
+    made.context.unlit = lambda: "unlit"
+    made.context.take = {"black 1": "again"}.__getitem__
+    made.context.exposure_s = 0.2
+    light, error = made._with_black([], np.array([3.0, 7.0]))
+    seconds = 1000.0 * 0.2
+    more_dn = 40.0 * PIXELS
+    np.testing.assert_allclose(light, np.array([3.0, 7.0]) + more_dn / seconds)
+    screens_dn2 = 2.0**2 * PIXELS / 2
+    # of the mean of two, and of one whose glow has no shot noise: more than there is
+    variance = screens_dn2 / 2 + max(screens_dn2 - 0.25 * more_dn, 0.0)
+    variance += (even_relative * more_dn) ** 2
+    assert error == pytest.approx(math.sqrt(variance) / seconds, rel=1e-6)
+    assert made.images == ["again", "unlit"]

@@ -30,6 +30,7 @@ from hilstar.instruments.calibrate.reference import (
     fit_reference,
     pointing,
     read_readings,
+    summary_of,
     toml_of,
 )
 from hilstar.server.bench.bench_file import read_bench_file
@@ -245,9 +246,18 @@ def test_an_azimuth_counts_by_the_circle_that_it_moves_on(rng: np.random.Generat
     for k, (along, up) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1))):
         angles = 1.0 + along * off_rad, math.radians(60.0) + up * off_rad
         readings.append(Reading(100 + k, "lamp", "A", *angles, None, None))
-    residual = fit_reference(Path("readings.csv"), readings).residual_arcsec[-4:]
+    found = fit_reference(Path("readings.csv"), readings)
+    residual = found.residual_arcsec[-4:]
     wanted = [[5.0, 0.0], [-5.0, 0.0], [0.0, 10.0], [0.0, -10.0]]
     assert residual == pytest.approx(np.array(wanted), abs=EXACT_ARCSEC)
+    summary = summary_of(found)
+    assert summary["readings"] == len(readings)
+    # along either axis
+    assert summary["worst_arcsec"] == pytest.approx(10.0, abs=EXACT_ARCSEC)
+    assert summary["worst_line"] in (102, 103)
+    squares = 2 * 5.0**2 + 2 * 10.0**2
+    rms_arcsec = math.sqrt(squares / (2 * len(readings)))
+    assert summary["residual_rms_arcsec"] == pytest.approx(rms_arcsec, rel=1e-3)
 
 
 def test_stated_sigmas_stand_where_the_scatter_is_less(rng: np.random.Generator) -> None:

@@ -8,6 +8,7 @@ import logging
 import math
 import os
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,8 +17,10 @@ from hilstar.display.calibration import with_uniformity
 from hilstar.display.quantise import LitLight
 from hilstar.instruments.calibrate.first_light.image_sources import (
     ByHand,
+    GrabCamera,
     MaskImages,
     Pattern,
+    PatternFrames,
     VirtualBench,
     mean_light,
     off_screen,
@@ -349,3 +352,69 @@ def test_a_person_may_press_a_key_that_has_a_meaning(tmp_path, caplog):
     os.utime(tmp_path / "figure.png", (before_s, before_s))
     found = by_hand(Display()).look_or_key(file, pattern, tmp_path / "figure", keys)
     assert found == tmp_path / "figure.png"
+
+
+def test_each_primary_s_light_is_relative_to_white_of_all_of_them():
+    """Whites of 20, 50 and 30 e-/s, of 100 together."""
+    signal = np.linspace(0, 1, 4)
+    whites = (20.0, 50.0, 30.0)
+    primaries = []
+    for power, white in zip((1.0, 2.0, 3.0), whites, strict=True):
+        response = SimpleNamespace(light=signal**power)
+        primaries.append(SimpleNamespace(response=response, flux_at_white_e_per_s=white))
+    made = object.__new__(VirtualBench)
+    made._panel = SimpleNamespace(primaries=primaries, flux_at_white_e_per_s=100.0)
+    made._primaries_seen = (None,) * 3
+    place = np.array([5, 9])
+    lights = made._lights(place, np.array([[3, 1, 2], [0, 3, 1]]))
+    wanted = [[0.2, 0.0], [0.5 / 9, 0.5], [0.3 * 8 / 27, 0.3 / 27]]
+    for light, e_per_s in zip(lights, wanted, strict=True):
+        assert light.place.tolist() == [5, 9]
+        assert light.e_per_s.tolist() == pytest.approx(e_per_s)
+
+
+class Watchers:
+    """Somebody who watches, or nobody."""
+
+    def __init__(self):
+        self.frames, self.is_there = [], True
+
+    def look(self):
+        return self.is_there
+
+    def put_frame(self, frame):
+        self.frames.append(frame)
+
+
+def test_patterns_are_handed_on_one_after_another_where_somebody_watches():
+    watchers = Watchers()
+    frames = PatternFrames(watchers)
+    monitor = SimpleNamespace(bits=BITS)
+    file = SimpleNamespace(config=SimpleNamespace(monitor=monitor), sha256="5" * 64)
+    grey = np.zeros((3, 5), dtype=np.uint16)
+    grey[1, 2] = 700
+    colour = np.zeros((3, 5, 3), dtype=np.uint16)
+    colour[2, 4] = [1, 2, 3]
+    for is_there, codes, lit_ns in ((True, grey, 7), (False, grey, 8), (True, colour, 9)):
+        watchers.is_there = is_there
+        frames.send(file, codes, lit_ns)
+    first, second = watchers.frames
+    for frame, number, lit_ns, channels in ((first, 1, 7, 1), (second, 2, 9, 3)):
+        head = frame.head
+        assert (head.frame, head.lit_ns, head.channels) == (number, lit_ns, channels)
+        assert (head.width, head.height, head.bits) == (5, 3, BITS)
+        assert head.bench_sha256 == "5" * 64
+    assert (first.lit.tolist(), first.codes.tolist()) == ([7], [700])
+    assert (second.lit.tolist(), second.codes.tolist()) == ([14], [[1, 2, 3]])
+
+
+def test_a_camera_s_black_images_are_said_once_of_lit_patterns_and_once_of_black_ones(caplog):
+    camera = object.__new__(GrabCamera)
+    camera._told_black = set()
+    black = SimpleNamespace(dn=np.zeros((2, 3), dtype=np.uint16))
+    grey = SimpleNamespace(dn=np.eye(2, 3, dtype=np.uint16))
+    for image, is_lit in ((grey, True), (black, True), (black, True), (black, False)):
+        camera._tell_black(image, "frame_0", lit=is_lit)
+    lens_cap, black_level = caplog.messages
+    assert lens_cap.startswith("frame_0: every pixel is 0; look at the lens cap")
+    assert "a black level above 0" in black_level

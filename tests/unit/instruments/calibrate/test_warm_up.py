@@ -208,3 +208,17 @@ def test_a_planted_warm_up_is_stable_by_its_size_and_never_before_the_watch(
     assert planted["truth_stable_after_s"] == pytest.approx(stable_s)
     drift_percent_per_s = cold_percent / TAU_S * math.exp(-ended_s / TAU_S)
     assert planted["truth_drift_percent_per_h"] == pytest.approx(3600 * drift_percent_per_s)
+
+
+@pytest.mark.parametrize(
+    ("law", "stable_after_s", "words"),
+    [
+        ("exponential", 900.0, "wait until then, and watch it again"),
+        ("exponential", math.inf, "watch it for longer (--warm-up)"),
+        # a line within the limit whose noise hides it
+        ("line", 0.0, "watch it for longer (--warm-up)"),
+        ("none", math.inf, "watch it for longer (--warm-up)"),
+    ],
+)
+def test_only_an_exponential_says_until_when_to_wait(law, stable_after_s, words):
+    assert WarmUp(law, False, STABLE, stable_after_s=stable_after_s).cure.startswith(words)

@@ -378,6 +378,11 @@ def test_a_plan_s_time_is_that_of_its_cases_on_their_workers_and_of_what_opens_t
     levels = 2 + 7
     assert (sweep.case_set.name, sweep.cases) == ("rate-limit", levels * 16)
     assert sweep.seconds == pytest.approx(levels * (16 * 6 / 4 + 1), abs=10)
+    # of more workers than cases some have nothing to do
+    at_s = iter([(2000.0, 500.0), (3e3, 0.0), (3e3, 0.0), (3e3, 0.0)])
+    field, sweep = made.costs(100)
+    assert field.seconds == pytest.approx(2500, abs=5)
+    assert sweep.seconds == pytest.approx(levels * 3e3, abs=45)
     made.sets = tuple(replace(case_set, refused="no GPU") for case_set in made.sets)
     assert list(made.costs(4)) == []
 
@@ -402,13 +407,13 @@ def test_a_ledger_has_a_row_for_each_case_of_each_set_with_the_level_of_its_swee
             "status": ["done", "failed"],
             "why": ["", "x"],
         }
-        table |= {"error_x_arcsec": [1.5 + number, None], "solved": [3, 0]}
+        table |= {"error_x_arcsec": [1.23456789 + number, None], "solved": [3, 0]}
         if level is not None:
             table["vary.k"] = [level, level]
         pq.write_table(pa.table(table), folder / "cases.parquet")
         text = "" if level is None else f"{level}"
         expected += [
-            (result.case_set.name, text, "0", "done", "", "3", f"{1.5 + number:g}"),
+            (result.case_set.name, text, "0", "done", "", "3", f"{1.23456789 + number:.9g}"),
             (result.case_set.name, text, "1", "failed", "x", "0", ""),
         ]
     assert acceptance.write_ledger(tmp_path / "ledger.csv", results) == len(expected)

@@ -73,11 +73,13 @@ def test_a_share_is_what_is_counted_among_what_was_asked(quantity, keys, value):
 
 
 def test_frames_of_a_case_that_all_go_together_count_as_one():
-    """Half of 20 cases have no attitude at all: as 10 of 20, and not as 100 of 200."""
+    """Half of 20 cases have no attitude at all: not as 100 of 200, but as a variance between cases
+    of 19 degrees of freedom has it.
+    """
     solved = np.repeat([0.0, FRAMES], 10)
     verdict = found(cases_of(solved=solved, wrong=np.zeros(20)), "no-attitude", maximum=0.9)
-    low, high = clopper_pearson(10, 20, 0.95)
-    assert (verdict.low, verdict.high) == pytest.approx((low, high), abs=0.01)
+    assert (verdict.low, verdict.high) == pytest.approx(clopper_pearson(9.5, 19, 0.95))
+    assert "design effect 10.5" in verdict.method
 
 
 @pytest.mark.parametrize(("share", "value"), [(0.5, 0.69), (0.1, 0.3), (1 / 30, 0.1), (0.9, 0.81)])
@@ -120,6 +122,7 @@ def test_the_noise_within_cases_is_pooled_by_their_freedom():
     assert verdict.value == pytest.approx(math.sqrt(84 / 12))
     limits = sigma_limits(84 / 12, 12.0, 0.95)
     assert (verdict.low, verdict.high) == pytest.approx(limits)
+    assert verdict.cases == 2
     within = found(cases, "nea", maximum=9.0, axis="x", share=0.997)
     assert within.value == pytest.approx(stats.norm.ppf(0.9985) * math.sqrt(84 / 12))
 
@@ -282,3 +285,51 @@ def test_noise_with_tails_has_the_limits_of_a_bootstrap(rng):
     gaussian = figure_of(parts, "noise", [0, 1])
     assert noise.high / noise.low > 2 * gaussian.high / gaussian.low - 1
     assert noise.low < noise.value < noise.high
+
+
+def test_a_part_is_as_sure_as_the_noise_in_its_fit_makes_it(rng):
+    """Of fits that are alike in every answer a bootstrap has no width: what is left is the scatter
+    of a noncentral chi-square, of 20 numbers an axis.
+    """
+    parts = parts_of(rng)
+    count, freedom, noise = 400, 20.0, 4.0
+    for axes, size in (([0], 3.0), ([0, 1], 3.0)):
+        fitted = np.zeros((count, 3))
+        fitted[:, axes] = size * np.where(np.arange(count) % 2, 1.0, -1.0)[:, None]
+        variance = size**2 - freedom / count * noise
+        fov = Component(np.full(3, variance), fitted, freedom)
+        components = replace(parts.components, fov=fov, noise_variance=np.full(3, noise))
+        figure = figure_of(replace(parts, components=components), "fov-error", axes)
+        values = count * len(axes)
+        chi_square = stats.ncx2(freedom * len(axes), values * variance / noise)
+        hidden = stats.norm.ppf(0.95) * chi_square.std() * noise / values
+        assert figure.value == pytest.approx(math.sqrt(variance))
+        assert figure.low == pytest.approx(math.sqrt(variance - hidden))
+        assert figure.high == pytest.approx(math.sqrt(variance + hidden))
+
+
+@pytest.mark.parametrize(
+    ("value", "axis", "told"),
+    [
+        (4.0, "cross", "1.5 arcsec taken off for the bench, which could have made 38 % of it"),
+        (1.0, "cross", "1.5 arcsec taken off for the bench, which could have made 100 % of it"),
+        (40.0, "roll", "10 arcsec taken off for the bench, which could have made 25 % of it"),
+        (0.0, "z", "10 arcsec taken off for the bench, which could have made all of it"),
+    ],
+)
+def test_a_verdict_says_how_much_of_an_error_the_bench_could_have_made(value, axis, told):
+    figure = BoundedFigure(value, value, value, 100, "planted")
+    require = Require(quantity="bias", maximum=90.0, axis=axis)
+    assert requirements.judged_figure(require, figure, (1.5, 10.0)).method == f"planted; {told}"
+    least = Require(quantity="availability", minimum=0.1)
+    assert requirements.judged_figure(least, figure, (1.5, 10.0)).method == "planted"
+
+
+@pytest.mark.parametrize(("count", "judged"), [(20, 20), (21, 11), (39, 20), (41, 14)])
+def test_of_too_many_cases_some_are_judged_spread_over_all(count, judged, monkeypatch):
+    monkeypatch.setattr(requirements, "MAX_FITTED_CASES", 20)
+    solved = np.full(count, float(FRAMES))
+    solved[0] = 0.0
+    verdict = found(cases_of(solved=solved, wrong=np.zeros(count)), "availability", minimum=0.5)
+    assert verdict.cases == judged
+    assert verdict.value == pytest.approx(1 - 1 / judged)

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 from scipy import stats
 
-from hilstar.instruments.certify.budget import Input, by_trials, first_order
+from hilstar.instruments.certify.budget import (
+    BudgetTrials,
+    Combined,
+    Input,
+    by_trials,
+    first_order,
+    why_they_differ,
+)
 
 DRAWS = 100_000
 # a standard deviation of n draws is known to 1 / sqrt(2 n), of a normal one; five of these
@@ -35,3 +43,38 @@ def test_trials_leave_a_fortieth_at_either_side(rng):
     found = by_trials(lambda z: z[0], [Input("x", "normal", "", 1, 1.0, "px")], rng, 200_000)
     limit = float(stats.norm.ppf(0.975))
     assert (found.lower[0], found.upper[0]) == pytest.approx((-limit, limit), abs=TAIL_ERROR)
+
+
+NORMAL = Input("steady", "normal", "", 1, 1.0, "px")
+FLAT = Input("flat", "rectangular", "", 1, 1.0, "px")
+PEAKED = Input("peaked", "triangular", "", 1, 1.0, "px")
+FEW = Input("few", "Student t", "", 1, 1.0, "px", 4.0)
+
+
+# Of a figure of 10 +- 2 to first order, whose trials end there: 5 % of the half width is 0.1.
+@pytest.mark.parametrize(
+    ("ends", "parts", "why"),
+    [
+        ((8.09, 11.91), {FLAT: 1.0}, ""),
+        ((7.91, 12.09), {FLAT: 1.0}, ""),
+        ((8.11, 11.89), {FLAT: 1.0}, "the largest input (flat) is rectangular, whose tails"),
+        ((7.89, 12.11), {NORMAL: 0.7, PEAKED: 0.72}, "the largest input (peaked) is triangular"),
+        # half of the variance is not most of it
+        ((7.89, 12.11), {NORMAL: 0.7, FLAT: 0.7}, "over the inputs' range"),
+        ((7.89, 12.11), {NORMAL: 0.68, PEAKED: 0.69, FEW: 0.2}, "few readings (few): Welch"),
+        # a Student's t of less than one per cent of the variance tells nothing
+        ((7.89, 12.11), {NORMAL: 1.0, FEW: 0.09}, "the model is not linear over the inputs' range"),
+        ((8.5, 12.5), {FLAT: 1.0}, "its interval is not even about the value"),
+        ((8.0, 12.11), {NORMAL: 1.0}, "the model is not linear over the inputs' range"),
+        ((7.89, 12.0), {NORMAL: 1.0}, "the model is not linear over the inputs' range"),
+    ],
+)
+def test_why_two_ways_of_an_interval_differ(ends, parts, why):
+    contribution = np.array([[0.0, *parts.values()]])
+    number = np.array([10.0]), np.array([1.0]), np.array([math.inf])
+    combined = Combined(*number, np.array([8.0]), np.array([12.0]), contribution)
+    one = np.ones(1)
+    drawn = BudgetTrials(one, one, np.array(ends[:1]), np.array(ends[1:]), 9, True)
+    unused = Input("unused", "triangular", "", 1, 1.0, "px", 2.0)
+    said = why_they_differ(combined, drawn, [unused, *parts], 0)
+    assert why in said and bool(said) == bool(why)

@@ -15,6 +15,8 @@ import pytest
 from scipy.stats import f, t
 
 from hilstar.basics.errors import InputError
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.certify.bench_readings import geometry_of
 from hilstar.instruments.certify.check import (
     TOLERANCES,
     CheckFigure,
@@ -40,6 +42,9 @@ from tests.support.tables import csv_rows
 PROBABILITY = 1e-4
 # A change of 0.2 % is told to a fiftieth of it, by what is of second order in it.
 SECOND_ORDER = 0.02
+# The noise of 2000 numbers is known to 1 / sqrt(2 n): three of these. What a pixel is off the middle
+# is 1 % less at the edge of the field.
+NOISE_ERROR = 0.06
 
 
 @pytest.mark.parametrize("dof", [3.0, 20.0, 1e6])
@@ -60,6 +65,92 @@ def test_a_root_mean_square_is_told_by_f():
     assert _Change("psf", limit, 0.3, 40.0, 12.0).judged(PROBABILITY).threshold == pytest.approx(
         limit
     )
+
+
+def scattered(light: np.ndarray, relative: float, black_off: float) -> np.ndarray:
+    """Three readings of each code's light (k,), (k, 3), of a relative scatter and one in black."""
+    spread = relative * light
+    spread[0] = black_off
+    return np.asarray(light[:, None] + spread[:, None] * [-1.0, 0.0, 1.0])
+
+
+@pytest.mark.parametrize("floor", [0.0, 40.0])
+def test_a_change_of_light_is_as_sure_as_three_readings_of_each_code(
+    bench: BenchFile, floor: float
+) -> None:
+    """The scatter of each code is 0.3 %, that of black has a floor besides, e-/s: what is added to
+    the variance of the three faintest codes by which the floor is known is a third of black's.
+    """
+    relative = 0.003
+    codes = np.array([0, 15, 20, 27, 37, 50, 68, 90, 120, 160, 205, 255])
+    light = 1e6 * (codes / 255) ** 2.2 + 3000.0
+    black_off = math.hypot(relative * light[0], floor)
+    readings = msgspec.structs.replace(
+        readings_of(bench, quiet_truth()),
+        code=np.repeat(codes, 3).tolist(),
+        light=scattered(light, relative, black_off).ravel().tolist(),
+    )
+
+    found = {figure.quantity: figure for figure in compare(bench, readings, readings)}
+
+    floor_variance = floor**2 / 3
+    log_code = np.log(codes[1:] / 255)
+    variance = 2 / 3 * (relative**2 + floor_variance / light**2)
+    weights = 1 / variance[1:]
+    middle = float(np.average(log_code, weights=weights))
+    slope_weight = float(weights @ (log_code - middle) ** 2)
+    wanted = {
+        "brightness": 100 / math.sqrt(weights.sum()),
+        "gamma": 1 / math.sqrt(slope_weight),
+        "black": 100 * light[0] / light[-1] * math.sqrt(variance[0]),
+        "response_rest": 100 * math.sqrt(float(variance[1:].mean()) * 9 / 11),
+    }
+    for quantity, u in wanted.items():
+        assert found[quantity].standard_uncertainty == pytest.approx(u, rel=1e-3), quantity
+        assert found[quantity].value == pytest.approx(0.0, abs=1e-9)
+    # seven codes are brighter than the fifth, each three times in both checks
+    assert {found[quantity].dof for quantity in wanted} == {7 * 2 * 2}
+
+
+def test_a_change_of_geometry_is_as_sure_as_its_dots_are_many(bench: BenchFile) -> None:
+    """Dots of one check have noise of 0.01 px and 0.1 % of light. A shift is known as their mean, a
+    turn and a scale as by the squares of their distances, and of a cubic's ten terms an axis what
+    those four leave. Of a pixel of 13 um at 70 mm.
+    """
+    was = readings_of(bench, quiet_truth())
+    count = len(was.x_px)
+    drawn = np.random.default_rng(8)
+    moved_x, moved_y, brighter = drawn.standard_normal((3, count))
+    now = msgspec.structs.replace(
+        was,
+        seen_x_px=(np.array(was.seen_x_px) + 0.01 * moved_x).tolist(),
+        seen_y_px=(np.array(was.seen_y_px) + 0.01 * moved_y).tolist(),
+        dot_light=(np.array(was.dot_light) * (1 + 1e-3 * brighter)).tolist(),
+        psf_u_px=4 * was.psf_px / 100,
+    )
+    was = msgspec.structs.replace(was, psf_u_px=3 * was.psf_px / 100)
+
+    found = {figure.quantity: figure for figure in compare(bench, was, now)}
+
+    noise_arcsec = 0.01 * 0.013 / 70 * ARCSEC_PER_RAD
+    u, v = np.array(was.x_px) - 959.5, np.array(was.y_px) - 539.5
+    tangents = np.stack([u - u.mean(), v - v.mean()]) * 0.05765 / 350
+    about = math.sqrt(float((tangents**2).sum()))
+    wanted = {
+        "shift_x": noise_arcsec / math.sqrt(count),
+        "shift_y": noise_arcsec / math.sqrt(count),
+        "rotation": noise_arcsec / about,
+        "scale": 1e6 / ARCSEC_PER_RAD * noise_arcsec / about,
+        "geometry_rest": noise_arcsec * math.sqrt(16 / (2 * count)),
+        "evenness": 0.1 * math.sqrt(9 / count),
+        "psf": 5.0,
+    }
+    for quantity, u_wanted in wanted.items():
+        u_found = found[quantity].standard_uncertainty
+        assert u_found == pytest.approx(u_wanted, rel=NOISE_ERROR), quantity
+        assert abs(found[quantity].value) < 4 * u_found
+    assert found["shift_x"].dof == 2 * (count - 10)
+    assert found["evenness"].dof == count - 10
 
 
 @pytest.fixture(scope="module")
@@ -162,6 +253,37 @@ def test_a_bench_file_s_own_readings_have_no_noise(bench: BenchFile) -> None:
     assert set(readings.dot_light) == {1.0}
     assert readings.delay_ms == pytest.approx(DELAY_MS)
     assert readings.delay_u_ms == pytest.approx(0.0, abs=1e-9)
+    shown_px = geometry_of(bench).to_tracker(np.array(readings.x_px), np.array(readings.y_px))
+    seen_px = np.stack([readings.seen_x_px, readings.seen_y_px])
+    assert seen_px == pytest.approx(np.stack(shown_px), abs=1e-5)  # five digits are kept
+
+
+class EdgesAlone(PlantedReader):
+    """A photodiode that saw these edges, ms."""
+
+    edges_ms = np.zeros(0)
+
+    def delays_ms(self) -> np.ndarray:
+        return self.edges_ms
+
+
+@pytest.mark.parametrize(
+    ("edges_ms", "told"),
+    [((), (None, 0.0, 0)), ((8.0,), (None, 0.0, 0)), ((8.0, 9.0, 8.5, 8.5), (8.5, 0.2041, 3))],
+)
+def test_a_mean_delay_is_as_sure_as_its_edges_are_many(bench: BenchFile, edges_ms, told) -> None:
+    """Of 8, 9 and twice 8.5 ms the scatter is sqrt(1/6), and that of their mean half of it."""
+    reader = EdgesAlone(quiet_truth(), np.random.default_rng(2))
+    reader.edges_ms = np.array(edges_ms)
+    readings = take_check(bench, reader)
+    found = (readings.delay_ms, readings.delay_u_ms, readings.delay_dof)
+    assert found == pytest.approx(told, abs=1e-4)
+    figures = {figure.quantity: figure for figure in compare(bench, readings, readings)}
+    assert ("latency" in figures) == (readings.delay_ms is not None)
+    if "latency" in figures:
+        u_ms = figures["latency"].standard_uncertainty
+        assert u_ms == pytest.approx(math.sqrt(2 / 24))
+        assert figures["latency"].dof == 3
 
 
 def change(quantity: str, value: float, in_tolerance: bool) -> CheckFigure:

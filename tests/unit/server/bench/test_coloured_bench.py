@@ -103,3 +103,18 @@ def test_a_star_clips_where_one_of_its_primaries_is_over_white(coloured) -> None
             near = (np.hypot(x - row["x_px"], y - row["y_px"]) < 10)[..., None]
             lacks = 1 - (light * near).sum() / row["electrons_per_s"]
             assert row["clipped"] == (lacks > 0.004)
+
+
+def test_a_red_star_is_drawn_where_its_red_alone_lights_a_pixel(coloured) -> None:
+    """A white star of as much light would be too faint."""
+    with coloured() as bench:
+        red = bench.stars.v_mag.round(1).tolist().index(2.0)
+        shares = bench.colours.shares_of(bench.stars, np.array([red]))
+        (drive,) = (shares / bench.colours.of_white).max(axis=1)
+        of_white = bench.faintest_shown_e_per_s / bench.flux_at_white_e_per_s
+        red_e_per_s = float(bench.stars.electrons_per_s[red])
+    for factor, shown in ((1 + 0.5 * (drive - 1), True), (1.05 * drive, False)):
+        keys = {"brightest_v_mag": None, "flux_at_white_e_per_s": factor * red_e_per_s / of_white}
+        with coloured({"render": keys}) as bench:
+            assert (2.0 in bench.shown_stars.v_mag.round(1)) is shown
+            assert (2.0 in bench.faint_stars.v_mag.round(1)) is not shown

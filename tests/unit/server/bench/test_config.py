@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import pytest
+from astropy.time import Time
+from msgspec.structs import replace
 
-from hilstar.server.bench.config import read_config
+from hilstar.server.bench.config import AttitudeSettings, parse_config, read_config
+from hilstar.server.bench.config.bench_config import sky_jd
 from hilstar.server.bench.star_rates import bench_optics
 from tests.support.benches import ROOT, SMALL_BENCH, bench_text
 from tests.support.refusals import refusal
@@ -112,3 +115,55 @@ def test_the_largest_image_is_the_one_that_a_refusal_advises(tmp_path, table):
     assert "such as [8192, 8192]" in line
     path.write_text(bench_text({table: {"resolution_px": [8192, 8192]}}))
     assert getattr(read_config(path), table).resolution_px == (8192, 8192)
+
+
+@pytest.mark.parametrize(
+    ("exposure_s", "render", "frames"),
+    [
+        (0.041, {}, 2),
+        (0.043, {}, 3),  # to the nearest
+        (0.002, {}, 1),
+        (1.0, {}, 16),  # no more are judged
+        (1.0, {"quantisation": "temporal", "cycle_frames": 5}, 5),
+    ],
+)
+def test_an_exposure_is_judged_by_its_frames(tmp_path, exposure_s, render, frames):
+    changes = {"tracker": {"exposure_s": exposure_s}, "render": render}
+    config = parse_config(tmp_path / "bench.toml", bench_text(changes))
+    assert config.exposure_frames == frames
+
+
+@pytest.mark.parametrize(
+    ("sky", "t_s", "utc"),
+    [
+        ({"epoch_utc": "2026-11-21T18:00:00Z"}, 3600.0, "2026-11-21T19:00:00"),
+        ({"epoch_utc": "2026-11-21T18:00:00Z"}, -86_400.0, "2026-11-20T18:00:00"),
+        ({"epoch_utc": "unix"}, 1e9, "2001-09-09T01:46:40"),
+        ({"epoch_jyear": 2000.0}, None, "2000-01-01T12:00:00"),
+        ({"epoch_jyear": 2008.0}, None, "2008-01-01T12:00:00"),
+    ],
+)
+def test_a_moment_s_julian_date_counts_from_the_bench_s_own(tmp_path, sky, t_s, utc):
+    config = parse_config(tmp_path / "bench.toml", bench_text({"sky": sky}))
+    t_ns = None if t_s is None else round(t_s * 1e9)
+    # a Julian date in a float is right to 40 us
+    assert sky_jd(config, t_ns) == pytest.approx(Time(utc, scale="utc").jd, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("source", "lockstep", "port"),
+    [
+        ("zmq", False, 5560),
+        ("zmq", True, 5560),
+        ("vizard", False, 5570),  # Basilisk's vizInterface: its broadcast, and its live stream
+        ("vizard", True, 5556),
+        ("42", False, 10001),  # 42's Inp_IPC.txt
+        ("42", True, 10001),
+        ("udp", False, None),
+        ("serial", False, None),
+    ],
+)
+def test_a_source_without_an_endpoint_is_where_its_simulator_usually_is(source, lockstep, port):
+    settings = AttitudeSettings(source=source, lockstep=lockstep)
+    assert settings.address == ("" if port is None else f"tcp://127.0.0.1:{port}")
+    assert replace(settings, endpoint="ipc:///a").address == "ipc:///a"

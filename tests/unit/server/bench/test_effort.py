@@ -11,8 +11,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.display.balance import Seen
+from hilstar.display.quantise import LevelCost
 from hilstar.display.render.backend import level_cost
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
@@ -25,6 +26,7 @@ from hilstar.server.bench.build import (
     open_bench,
     timed_frame_ms,
 )
+from hilstar.server.bench.cameras import bench_camera
 from hilstar.server.bench.config import RenderSettings
 from hilstar.server.bench.effort import (
     Effort,
@@ -37,7 +39,7 @@ from hilstar.server.bench.effort import (
 )
 from hilstar.server.bench.effort_report import effort_keys, effort_lines
 from hilstar.server.bench.least_psf import Choice
-from hilstar.server.bench.scene import turning_of
+from hilstar.server.bench.scene import Display, scenes_of, turning_of
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import run_hilstar_here, typed
@@ -116,6 +118,22 @@ def test_the_cheapest_of_all_combinations_within_is_taken():
     assert tried > 20
 
 
+@pytest.mark.parametrize(
+    ("bits", "tolerance_px", "codes"), [(12, 0.02, "round"), (14, 0.01, "exact")]
+)
+def test_a_moving_scene_is_within_where_its_parts_together_can_be(bits, tolerance_px, codes):
+    """Codes take six tenths of the tolerance or one, and paths most of the rest; the sprites are as
+    the codes light pixels, whoever chose those.
+    """
+    moving = replace(light_range(bits, 6.0), turning=2 / 3, sky_share=0.1)
+    limits = {"tolerance_mag": 0.05, "tolerance_px": tolerance_px}
+    taken = planned(render_settings(**limits), moving)
+    assert taken.within and taken.quantisation == codes
+    assert taken.error_px > 0.7 * tolerance_px
+    fixed = planned(render_settings(**limits, quantisation=codes), moving)
+    assert fixed.taken.sprites == taken.taken.sprites
+
+
 def test_a_scene_at_rest_asks_nothing_of_paths():
     """0.01 px were charged at rest, too."""
     asked, sky = render_settings(tolerance_mag=0.1, tolerance_px=0.1), light_range(12, 6.0)
@@ -138,6 +156,27 @@ def test_paths_are_charged_where_frames_may_turn(motion, on_screen, turns, small
     scan_s, hold_s = (config.monitor.panel_scanout_ms, config.monitor.panel_hold_ms)
     wanted = scan_s / (scan_s + 2 * hold_s) if turns else None
     assert turning_of(config, on_screen) == pytest.approx(wanted)
+
+
+def test_a_screen_s_share_of_the_sky_is_its_solid_angle_over_the_sphere_s(tmp_path):
+    """Of 320 x 240 pixels of 57.65 um behind 60 mm, about a pixel's own in the middle."""
+    file = bench_file_of(
+        tmp_path / "bench.toml", f"{SMALL_BENCH}[render]\nflux_at_white_e_per_s = 1e6\n"
+    )
+    camera = bench_camera(file.config, file.folder)
+    display = Display(
+        calibration=SimpleNamespace(response=None),
+        camera=camera,
+        context=None,
+        drive=1.0,
+        turning=None,
+        path_px=0.0,
+        darkest=0.5,
+    )
+    scene = next(scenes_of(file, SimpleNamespace(electrons_per_s=None), display))
+    wanted = 320 * 240 * (0.05765 / 60) ** 2 / (4 * np.pi)
+    assert scene.light.sky_share == pytest.approx(wanted, rel=1e-3)
+    assert (scene.white_e_per_s, scene.light.white_e_per_s) == (1e6, 0.5e6)
 
 
 def test_a_psf_in_place_of_a_glass_shares_the_tolerance():
@@ -210,6 +249,36 @@ def test_the_tracker_s_own_centroider_and_pixels_judge_codes():
     assert len({round(rounded[kind, 1.0].place_px, 12) for kind in FAMILY}) == 6
 
 
+@pytest.mark.parametrize(
+    ("tolerance_mag", "tolerance_px"), [(9.0, 1e-3), (1e-3, 9.0), (0.05, 1e-3)]
+)
+def test_where_nothing_is_within_sprites_add_a_hundredth_of_the_tolerance(
+    tolerance_mag, tolerance_px
+):
+    """Of the light's and of the place's, or are whole."""
+    asked = render_settings(
+        quantisation="round", tolerance_mag=tolerance_mag, tolerance_px=tolerance_px
+    )
+    effort = planned(asked, light_range(8, 6.0))
+    sprites = effort.taken.sprites.choice
+    assert not effort.within
+    assert sprites.error_px <= 0.01 * tolerance_px
+    assert sprites.error_mag <= max(0.01 * tolerance_mag, 1.09e-6)  # whole: 1e-6 of its light
+
+
+def test_stars_too_faint_to_light_a_pixel_are_counted_with_their_light():
+    cost = LevelCost(a_star_ms=0.004, why="")
+    sky = replace(light_range(8, 12.0), sky_share=0.1, cost=lambda method, psf: cost)
+    depth = part(planned(render_settings(quantisation="round"), sky), "depth")
+    limit = float(depth.choice.removeprefix("from ").removesuffix(" electrons/s on"))
+    rates = sky.rates_e_per_s
+    dark = rates < limit
+    share = rates[dark].sum() / rates.sum()
+    assert 5 < dark.sum() < 45
+    assert depth.note == f"{dark.sum()} of 50 stars light no pixel, {share:.2%} of all light"
+    assert depth.saved_ms == pytest.approx(0.1 * dark.sum() * 0.004)
+
+
 def test_what_the_file_asks_for_is_not_overruled():
     assert (
         planned(
@@ -231,6 +300,22 @@ def test_sprites_are_as_small_as_the_tolerance_lets_them_be():
     full = GaussianPsf(SIGMA).footprint_px
     assert (wide.sides[0].below_e_per_s, wide.sides[0].side_px) == (pytest.approx(3e38), full)
     assert narrow.sides[0].side_px < full and narrow.within
+
+
+def test_small_sprites_save_the_pixels_that_the_catalogue_s_stars_do_not_need():
+    """A star has the side of the last entry whose rate it is under."""
+    sky = replace(light_range(8, 9.0), sky_share=0.1)
+    asked = render_settings(quantisation="exact", tolerance_mag=0.2, tolerance_px=0.2)
+    effort = planned(asked, sky)
+    assert len(effort.sides) > 2
+    area_px = []
+    for rate in sky.rates_e_per_s:
+        sides = [side.side_px for side in effort.sides if rate < side.below_e_per_s]
+        area_px.append(sides[-1] ** 2)
+    assert len(set(area_px)) > 2
+    sprites = effort.taken.sprites.choice
+    share = np.mean(area_px) / GaussianPsf(SIGMA).footprint_px ** 2
+    assert sprites.ms / (sprites.ms + sprites.saved_ms) == pytest.approx(share)
 
 
 @pytest.mark.parametrize("size", [4, 6, 8, 5, 7])
@@ -450,6 +535,8 @@ def test_fields_of_so_many_stars_that_exact_would_be_late_stay_with_round_and_sa
     # `round` would be late, too
     assert planned(render_settings(), replace(crowded, refresh_hz=90.0)).quantisation == "exact"
     assert planned(render_settings(quantisation="exact"), crowded).quantisation == "exact"
+    slow = planned(render_settings(quantisation="exact", codes_ms=(99.4, 150.4)), crowded)
+    assert "exact takes 150 ms of 16.7 (round 99)" in part(slow, "codes").note
     assert (
         "9 ms of 16.7"
         in part(planned(render_settings(quantisation="exact"), crowded), "codes").note
@@ -545,6 +632,46 @@ def test_frames_are_timed_for_no_longer_than_asked(small_bench_file):
     with load(small_bench_file) as bench:
         assert timed_frame_ms(bench, 0.1, now_ns) == 30.0
     assert len(looks) == 6  # the begin, two frames, and the look that ends it
+
+
+class TimedBench:
+    """Draws each of the six fields in so many ms, by the round; notes what it is asked for."""
+
+    def __init__(self, *rounds_ms: list[float]) -> None:
+        self.asked: list[str] = []
+        self.fields: list[np.ndarray] = []
+        self.ns = 0
+        self.renderer = SimpleNamespace(
+            finish=self._finish, begin_anew=lambda: self.asked.append("anew")
+        )
+        self._costs_ms = [ms for round_ms in rounds_ms for ms in round_ms]
+
+    def warm_up(self) -> None:
+        self.asked.append("warm-up")
+        self.ns += 10**12
+
+    def draw(self, q_icrs_to_cam, number, rate_cam_rad_s) -> None:
+        assert np.linalg.norm(rate_cam_rad_s) == pytest.approx(math.radians(1))
+        self.asked.append("draw")
+        self.fields.append(q_icrs_to_cam)
+
+    def _finish(self) -> None:
+        self.ns += round(self._costs_ms[len(self.fields) - 1] * 1e6)
+
+
+def test_a_frame_s_time_is_the_mean_of_its_fields_fastest_ones():
+    """Of six fields all over the sky, before a run whose first frame is drawn anew."""
+    cold, warm, hot = ([base + k for k in range(6)] for base in (20.0, 10.0, 30.0))
+    bench = TimedBench(cold, warm, hot)
+    for_s = sum(cold + warm + hot[:5]) * 1e-3 - 1e-6
+    assert timed_frame_ms(bench, for_s, lambda: bench.ns) == pytest.approx(12.5)
+    assert bench.asked == ["warm-up", *["draw"] * 17, "anew"]
+    boresights = np.array([to_matrix(q)[2] for q in bench.fields[:6]])
+    # every two are 90 or 180 deg apart
+    assert (
+        np.abs(boresights @ boresights.T).round(9).tolist()
+        == np.kron(np.eye(3), np.ones((2, 2)))[np.ix_(*[[0, 2, 1, 3, 4, 5]] * 2)].tolist()
+    )
 
 
 def test_a_timed_bench_has_measured_codes_and_any_other_has_not(small_bench_file):

@@ -16,7 +16,8 @@ from astropy.table import Table
 from astropy.wcs import WCS
 
 from hilstar.basics import reading
-from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
+from hilstar.server.bench.build import open_bench
 from tests.support.benches import ROOT, bench_text
 from tests.support.commands import run_hilstar_here
 
@@ -74,6 +75,15 @@ def test_a_command_opens_each_file_of_a_bench_once(bench, tmp_path):
     del named["sky.fits"]
     assert named == dict.fromkeys(named, 1)
     assert len(named) == 7
+
+
+def test_a_screen_s_darkest_place_is_that_of_its_uneven_light(tmp_path):
+    for name in ("lcd-example.toml", "lcd-example.csv", "lcd-example-uniformity.csv"):
+        shutil.copy(DISPLAY_DATA / name, tmp_path / name)
+    changes = {"monitor": {"calibration": "lcd-example.toml"}, "render": {"quantisation": "round"}}
+    with open_bench(bench_file_of(tmp_path / "bench.toml", bench_text(changes))) as bench:
+        assert bench.darkest == bench.uniformity.min()
+        assert bench.darkest < bench.uniformity.mean() < bench.uniformity.max() == 1.0
 
 
 TABLE = "ra_deg,dec_deg,v_mag,bv_mag\n84.05,-1.2,1.7,-0.2\n83.0,-0.3,2.2,-0.2\n85.2,-1.9,1.8,-0.2\n"

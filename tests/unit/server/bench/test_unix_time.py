@@ -7,9 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.time import Time
 
 from hilstar.basics.errors import InputError
 from hilstar.server.bench.bench_file import at_moment, dated, read_bench_file
+from hilstar.server.bench.config import parse_config
+from hilstar.server.bench.config.bench_config import with_dates
 from hilstar.server.bench.star_light import bench_moving
 from tests.support.benches import bench_text
 from tests.support.satellites import some_orbits
@@ -128,3 +131,21 @@ def test_a_log_in_utc_may_cross_a_leap_second(tmp_path):
     assert (
         np.linalg.norm(moon_km(sky, utc) - wanted) / np.linalg.norm(wanted) < LIMIT_ARCSEC * ARCSEC
     )
+
+
+@pytest.mark.parametrize(
+    ("scale", "ahead_s"),
+    # by IERS Bulletin C 69: TAI - UTC is 37 s; GPS = TAI - 19 s, TT = TAI + 32.184 s
+    [("UTC", 0.0), ("TAI", 37.0), ("GPS", 18.0), ("TT", 69.184), ("TDB", 69.184)],
+)
+def test_a_log_s_dates_are_utc_by_the_leap_seconds_of_its_day(scale, ahead_s):
+    """Stars stand where they are at the beginning of the UTC's day."""
+    sky = {"sky": {"epoch_utc": "source"}}
+    config = parse_config(Path("bench.toml"), bench_text(sky))
+    first_ns = utc_ns("2026-11-21T00:00:30") + round(ahead_s * 1e9)
+    for later_ns in (0, DAY_NS // 2):
+        dates = with_dates(config, scale, first_ns + later_ns).sky
+        zero = 0 if dates.epoch_utc == "unix" else utc_ns(dates.epoch_utc)
+        assert zero == -round(ahead_s * 1e9)
+        day = Time("2026-11-21", scale="utc").jyear
+        assert dates.epoch_jyear == pytest.approx(day, abs=1e-5)  # minutes; TT is 69 s ahead

@@ -93,3 +93,16 @@ def test_a_step_turns_the_attitude_and_the_rate_s_axes(frames):
     before_icrs = to_matrix(Q).T @ RATE
     after_icrs = to_matrix(shown.q_icrs_to_cam).T @ shown.rate_cam_rad_s
     assert after_icrs == pytest.approx(before_icrs, abs=ROUNDING)
+
+
+def test_a_frame_that_stays_has_the_faults_it_was_drawn_with_and_what_freezes_it_now(frames):
+    def names(effects: FaultLayer, *, stays: bool) -> list[str]:
+        return [now.fault.name for now in frames.shown(effects, DRAWN, None, 0, stays)]
+
+    assert names(on("freeze", "attitude-step"), stays=False) == ["freeze 1", "attitude-step 2"]
+    # a fault of light that begins meanwhile changes nothing of what is on the display
+    for effects in (on("freeze"), on("blank", "drop", "freeze")):
+        freeze = f"freeze {len(effects.now)}"
+        assert names(effects, stays=True) == ["attitude-step 2", freeze]
+    assert names(on("blank"), stays=False) == ["blank 1"]
+    assert names(on("freeze"), stays=True) == ["blank 1", "freeze 1"]

@@ -5,6 +5,8 @@ what is wrong.
 from __future__ import annotations
 
 import re
+import socket
+from contextlib import closing
 from itertools import pairwise
 
 import numpy as np
@@ -13,18 +15,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from hilstar.attitude.wire.endpoint import parse_endpoint
 from hilstar.attitude.wire.nasa42 import (
     CONVENTIONS,
     END,
     MAX_MESSAGE_BYTES,
     MessageReader,
     MessageSplitter,
+    Nasa42Lockstep,
     spacecraft_number,
 )
-from hilstar.attitude.wire.packet import AttitudeSample, Refusal
+from hilstar.attitude.wire.packet import AttitudeSample, Refusal, Status
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
 from hilstar.basics.rotation import to_radec_roll_deg
 from tests.support.sources.nasa42 import BEGIN_NS, STREAM_2024, STREAM_2025, message, report
+from tests.support.waiting import PATIENCE_S, wait_for
 
 # 42 writes thirteen significant digits: four components off by 5e-13 turn a unit vector by 2e-12 at
 # most.
@@ -170,6 +175,45 @@ def test_a_wrong_message_is_refused_by_reason_and_the_next_is_read(was, becomes,
     assert (wrong.reason if isinstance(wrong, Refusal) else None) == reason
     assert isinstance(good, AttitudeSample)
     assert good.sequence == 2
+
+
+@pytest.mark.parametrize(
+    ("written", "date", "ns"),
+    [
+        ("2024-099-00:00:01.5", "2024-04-08T00:00:01", 500_000_000),
+        ("2024-366-23:59:59.000000001", "2024-12-31T23:59:59", 1),
+        ("2016-366-23:59:60.25", "2017-01-01T00:00:00", 250_000_000),
+        ("2023-001-01:02:03", "2023-01-01T01:02:03", 0),
+        ("2000-060-12:34:56.0123456789", "2000-02-29T12:34:56", 12_345_678),
+    ],
+)
+def test_a_time_is_that_of_its_day_of_the_year_and_each_digit_counts(written, date, ns):
+    (sample,) = attitudes_of_stream(GOOD.replace("2024-099-00:00:01.5", written).encode())
+    assert isinstance(sample, AttitudeSample)
+    assert sample.t_ns == int(np.datetime64(date, "ns").astype(np.int64)) + ns
+
+
+def test_in_lockstep_each_message_is_acknowledged_once_its_own_frame_is_shown():
+    reader = MessageReader(0, Mounting())
+    with (
+        Nasa42Lockstep("tcp://127.0.0.1:*", reader, bind=True) as link,
+        closing(socket.socket()) as simulator,
+    ):
+        place = parse_endpoint(link.endpoint).address
+        simulator.connect(("127.0.0.1", int(place.rpartition(":")[2])))
+        simulator.settimeout(PATIENCE_S)
+        simulator.sendall(GOOD.encode() * 2)
+        arrivals = []
+
+        def arrives() -> bool:
+            arrivals.append(link.receive(10))
+            return arrivals[-1] is not None
+
+        for number in (1, 2):
+            wait_for(arrives, "a message")
+            assert arrivals[-1].event.sequence == number
+            link.answer(Status(0, 0, 0, 0, 0, 0, 0), 0, None)
+            assert simulator.recv(64) == b"Ack\n"
 
 
 def test_a_message_without_an_end_costs_its_bound_and_no_more():

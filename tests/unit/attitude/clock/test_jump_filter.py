@@ -1,0 +1,112 @@
+"""What a jump filter decides of a few messages, whose times are whole milliseconds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.attitude.clock.jumps import (
+    MAX_DOUBT_NS,
+    MAX_FOUND_LATE_NS,
+    TRUSTED_WAIT_NS,
+    JumpFilter,
+)
+from hilstar.attitude.clock.sender_clock import Exchange, SenderClock
+from hilstar.attitude.clock.stages import StreamState
+from hilstar.attitude.wire.links import Arrival, SampleArrival
+from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.basics.units import NS_PER_MS, NS_PER_S
+
+HOST0_NS = 10**12
+PERIOD_NS = 5 * NS_PER_MS
+SETTLED = 600  # messages, three seconds
+Q = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def arrival(k: int, late_ns: int = 0, jump_ns: int = 0, waited_ns: int = 0) -> SampleArrival:
+    """The k-th message of an even stream, whose sender's clock is back by `jump_ns`."""
+    sent_ns = HOST0_NS + k * PERIOD_NS
+    return Arrival(
+        sent_ns + late_ns, AttitudeSample(sent_ns - jump_ns, Q, None, k), waited_ns=waited_ns
+    )
+
+
+@pytest.fixture
+def clock() -> SenderClock:
+    """That which the filter teaches."""
+    return SenderClock()
+
+
+@pytest.fixture
+def settled(clock) -> JumpFilter:
+    """A filter that has taken an even stream, without any delay."""
+    jumps = JumpFilter(clock, StreamState())
+    for k in range(SETTLED):
+        (accepted,) = jumps.take(arrival(k))
+        assert accepted.refusal is None
+    assert jumps.settled
+    return jumps
+
+
+@pytest.mark.parametrize("jump_ms", [2000, -2000])
+def test_a_clock_that_jumped_goes_on_where_the_earliest_of_three_says(settled, jump_ms):
+    jump_ns = jump_ms * NS_PER_MS
+    uneven_ns = [NS_PER_MS, 0, NS_PER_MS // 2]
+    decided = []
+    for k, late_ns in enumerate(uneven_ns, SETTLED):
+        decided += settled.take(arrival(k, late_ns, jump_ns))
+    assert settled.jumps == 1
+    assert settled.correction_ns == jump_ns
+    assert [each.event.t_ns for each in decided] == [
+        HOST0_NS + k * PERIOD_NS for k in range(SETTLED, SETTLED + 3)
+    ]
+    assert settled.sender_ns(HOST0_NS) == HOST0_NS - jump_ns
+
+
+def test_samples_in_doubt_are_let_go_when_nothing_has_followed_the_last(settled):
+    jump_ns = 2 * NS_PER_S
+    first, second = arrival(SETTLED, jump_ns=jump_ns), arrival(SETTLED + 20, jump_ns=jump_ns)
+    assert [*settled.take(first), *settled.take(second)] == []
+    assert settled.expire(first.host_ns + MAX_DOUBT_NS + 1) == []
+    assert settled.expire(second.host_ns + MAX_DOUBT_NS) == []
+    released = settled.expire(second.host_ns + MAX_DOUBT_NS + 1)
+    assert [each.event.sequence for each in released] == [SETTLED, SETTLED + 20]
+    assert settled.jumps == 0
+
+
+@pytest.mark.parametrize(("waited_ms", "is_doubted"), [(1500, False), (1400, True)])
+def test_a_message_may_be_late_by_as_long_as_it_waited(settled, waited_ms, is_doubted):
+    late = arrival(SETTLED, 1500 * NS_PER_MS, waited_ns=waited_ms * NS_PER_MS)
+    assert settled.take(late) == ([] if is_doubted else [late])
+    assert settled.expire(late.host_ns + MAX_DOUBT_NS + 1) == ([late] if is_doubted else [])
+
+
+@pytest.mark.parametrize(("waited_ns", "teaches"), [(TRUSTED_WAIT_NS, True), (2 * 10**6, False)])
+def test_a_message_teaches_the_clock_where_it_waited_no_longer_than_a_millisecond(
+    clock, settled, waited_ns, teaches
+):
+    early = arrival(SETTLED, -NS_PER_MS, waited_ns=waited_ns)
+    assert settled.take(early) == [early]
+    late_ns = clock.late_ns(early.event.t_ns, early.host_ns)
+    assert late_ns == (0 if teaches else -NS_PER_MS)
+
+
+def test_before_a_clock_is_settled_a_message_may_be_a_second_early():
+    for early_ns, is_doubted in ((MAX_FOUND_LATE_NS, False), (MAX_FOUND_LATE_NS + 1, True)):
+        jumps = JumpFilter(SenderClock(), StreamState())
+        jumps.take(arrival(0, late_ns=2 * NS_PER_S))
+        early = arrival(0, late_ns=2 * NS_PER_S - early_ns)
+        assert (jumps.take(early) == []) == is_doubted
+
+
+def test_lateness_is_against_the_arrivals_whatever_exchanges_say():
+    """Exchanges put the offset 2 ms below the line of the arrivals, which are all as late."""
+    clock = SenderClock()
+    late_ns = 2 * NS_PER_MS
+    for k in range(40):
+        host_ns = HOST0_NS + k * NS_PER_S // 4
+        clock.observe(host_ns - late_ns, host_ns)
+        clock.exchange(Exchange(host_ns, host_ns, host_ns, host_ns))
+    assert clock.synchronised
+    assert clock.latency_ns(host_ns - late_ns, host_ns) == late_ns
+    assert clock.late_ns(host_ns - late_ns, host_ns) == 0

@@ -1,0 +1,153 @@
+"""How an acceptance judges cases that are there: verdicts shared by all clauses, what is not tested
+and why, and failures over all levels of a sweep. No case is run.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from hilstar.instruments.assess.bounded_figures import clopper_pearson
+from hilstar.instruments.campaign.acceptance import PLAN_FILE, Acceptance
+from hilstar.instruments.campaign.acceptance_plan import read_acceptance_plan
+from hilstar.instruments.campaign.acceptance_verdicts import ClauseVerdict, SetResult
+from hilstar.instruments.campaign.case_table import Columns
+from hilstar.instruments.campaign.requirements import MET, NOT_MET, NOT_SHOWN
+from hilstar.instruments.campaign.run import Campaign
+from hilstar.instruments.campaign.store import Directory
+from tests.support.acceptance import write_bench
+from tests.support.planted_answers import answers
+
+CASES, SILENT = 60, 20  # of which so many have no attitude
+LOST = "[cases.lost]\ncases = 60\n"
+
+
+def clause(quantity: str, limit: str, of: str = "lost") -> str:
+    return f'[[clause]]\ncapability = "x"\nof = "{of}"\nquantity = "{quantity}"\n{limit}\n'
+
+
+def acceptance_of(folder: Path, text: str) -> Acceptance:
+    bench = write_bench(folder)
+    plan = folder / "plan.toml"
+    plan.write_text(text)
+    checked = read_acceptance_plan(plan, bench, False, None)
+    return Acceptance(checked, bench, folder / "out", "centroids", 10.0)
+
+
+def judged(folder: Path, text: str, cases: Columns) -> list[ClauseVerdict]:
+    """The verdicts on the cases of a plan's only set."""
+    acceptance = acceptance_of(folder, text)
+    (case_set,) = acceptance.sets
+    return acceptance.verdicts([SetResult(case_set, cases)])
+
+
+def lost_cases() -> Columns:
+    solved = np.ones(CASES)
+    solved[:SILENT] = 0.0
+    numbers = {"case": np.arange(float(CASES)), "frames": np.ones(CASES)}
+    return Columns(CASES, numbers | {"solved": solved, "wrong": np.zeros(CASES)}, {})
+
+
+@pytest.mark.parametrize(("others", "together"), [(0, NOT_MET), (2, NOT_MET), (3, NOT_SHOWN)])
+def test_a_clause_that_is_not_met_is_judged_again_with_its_part_of_the_doubt(
+    tmp_path: Path, others: int, together: str
+) -> None:
+    """No attitude in 20 of 60 cases: over the limit with a third of 5 % of doubt, not with a
+    quarter.
+    """
+    lows = [clopper_pearson(SILENT, CASES, 1 - 0.05 / part)[0] for part in (3, 4)]
+    text = LOST + clause("no-attitude", f"maximum = {sum(lows) / 2!r}")
+    # 40 of 60 are surely more than these
+    text += "".join(clause("availability", f"minimum = 0.{k + 1}") for k in range(others))
+    found, *more = judged(tmp_path, text, lost_cases())
+    assert (found.word, found.together) == (NOT_MET, together)
+    assert {(each.word, each.together) for each in more} <= {(MET, "")}
+
+
+def test_a_clause_that_more_cases_would_decide_is_tested_and_one_without_its_column_is_not(
+    tmp_path: Path,
+) -> None:
+    cases = answers(np.random.default_rng(4), 7)  # eight cases tell a stamp
+    text = LOST + clause("time-bias", "maximum = 1.0") + clause("recovery", "maximum = 1.0")
+    few, none = judged(tmp_path, text, cases)
+    assert few.verdict is not None and few.verdict.more == 1
+    assert (few.word, few.untested, few.unit) == (NOT_SHOWN, "", "s")
+    assert none.verdict is None
+    assert (none.word, none.unit) == ("not tested", "s")
+    assert none.untested.startswith("recovery_s: the table has no such column")
+
+
+@pytest.mark.parametrize(
+    ("clock", "stamp", "tells"),
+    [
+        ("unix", "middle", True),
+        ("host", "start", True),
+        ("own", "middle", False),
+        ("unix", "arrival", False),
+        ("own", "arrival", False),
+        (None, None, False),
+    ],
+)
+def test_stamps_of_an_own_clock_or_of_arrivals_tell_no_time_of_measurement(
+    tmp_path: Path, clock: str | None, stamp: str | None, tells: bool
+) -> None:
+    acceptance = acceptance_of(tmp_path, LOST + clause("time-bias", "maximum = 1.0"))
+    answer_keys = None if clock is None else SimpleNamespace(clock=clock, stamp=stamp)
+    config = SimpleNamespace(answers=answer_keys, tracker=acceptance.file.config.tracker)
+    acceptance.file = SimpleNamespace(config=config)  # type: ignore[assignment]
+    acceptance.on_bench = True
+    (case_set,) = acceptance.sets
+    cases = answers(np.random.default_rng(4))
+    (found,) = acceptance.verdicts([SetResult(case_set, cases)])
+    assert (found.word == MET) == tells
+    assert ("the stamps are of the tracker's own clock" in found.untested) == (not tells)
+
+
+def test_failures_of_all_levels_of_a_sweep_count_together_and_each_level_has_its_folder(
+    tmp_path: Path,
+) -> None:
+    """A tracker that answers up to 2 deg/s; of each level's 16 cases one fails."""
+    acceptance = acceptance_of(
+        tmp_path,
+        "[cases.limit]\ncases = 16\n[cases.limit.sweep]\n"
+        'key = "rate_deg_s.across"\nstart = 1.0\nstop = 5.0\nrounds = 2\n'
+        + clause("edge", "minimum = 1.5", "limit"),
+    )
+    ran = []
+
+    def run_cases(campaign: Campaign, directory: Directory, of: str) -> None:
+        level = float(of.rpartition(" ")[2])
+        ran.append(of)
+        table: dict[str, list[Any]] = {
+            "case": list(range(16)),
+            "status": ["failed", *["done"] * 15],
+            "why": ["lens cap", *[""] * 15],
+            "frames": [1] * 16,
+            "solved": [int(level <= 2.0)] * 16,
+            "wrong": [0] * 16,
+        }
+        pq.write_table(pa.table(table), directory.table)
+
+    (tmp_path / "out").mkdir()
+    (result,) = acceptance.run(run_cases)
+    levels = [count.level for count in result.levels]
+    assert levels == [1.0, 5.0, 3.0, 2.0]
+    assert ran == [f"limit at {level:.4g}" for level in levels]
+    assert result.failed == {"lens cap": 4}
+    names = [folder.name for folder in result.folders]
+    assert names == ["level-00", "level-01", "level-02", "level-03"]
+    assert (tmp_path / "out" / PLAN_FILE).read_text() == acceptance.plan.text
+    # and again: nothing is run, and the same is read
+    (again,) = acceptance.run(run_cases)
+    assert len(ran) == 4
+    assert (again.levels, again.failed) == (result.levels, result.failed)
+    (verdict,) = acceptance.verdicts([result])
+    assert verdict.verdict is not None
+    assert (verdict.verdict.value, verdict.verdict.low) == (2.5, 2.0)
+    assert (verdict.word, verdict.unit) == (MET, "")

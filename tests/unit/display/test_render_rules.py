@@ -13,14 +13,17 @@ import pytest
 from hilstar.basics.units import COMPUTE_VERSION
 from hilstar.display.exact import ExactQuantiser, Turn
 from hilstar.display.panel import Panel
+from hilstar.display.quantise import round_levels
 from hilstar.display.render.aids import CROSSHAIR, GRID, PATCH, AidLevels, lay_over
 from hilstar.display.render.apart import ApartBackend
 from hilstar.display.render.backend import ScreenView, as_maps, level_cost
 from hilstar.display.render.context import check_limits, draws_by_cpu
+from hilstar.display.render.cpu_stars import CpuStars
 from hilstar.display.render.encoder import MEETING_WINGS, lit_sides
 from hilstar.display.render.light_units import DENSER_WINGS, MAX_SUM, LightUnits
 from hilstar.display.render.numpy_backend import NumpyBackend
 from hilstar.display.render.presenter import checked_triples, drawn_codes
+from hilstar.display.render.reference import linear_image
 from hilstar.display.render.target import SpriteSide, Target
 from hilstar.display.response import Levels, gamma_response
 from hilstar.optics.extended import LightMap
@@ -32,6 +35,8 @@ from tests.support.stars import sprites_at
 SIZE_PX = (64, 48)
 PSF = GaussianPsf((0.85, 0.85))
 WHITE_E_PER_S = 1000.0
+# lit pixels whose light is so near to a threshold that its rounding to units passes it; measured 4e-3
+UNITS = 1e-2
 
 
 def units(uniformity: np.ndarray | None = None) -> LightUnits:
@@ -295,6 +300,49 @@ def test_where_numpy_draws_a_bench_is_planned_as_for_a_usual_opengl():
     by_compute = ExactQuantiser.cost(PSF, COMPUTE_VERSION)
     assert level_cost(ExactQuantiser, PSF) == by_compute
     assert level_cost(ExactQuantiser, PSF, old) == ExactQuantiser.cost(PSF, 330) != by_compute
+
+
+@pytest.mark.parametrize("sigma_px", [(0.85, 0.85), (0.6, 0.75)], ids=["even", "odd"])
+@pytest.mark.parametrize("rate", [400.0, 8000.0])
+def test_stars_on_any_pixel_of_an_image_s_edges_have_the_levels_of_their_light(sigma_px, rate):
+    """One to a row or a column of tiles, moved by a third of a pixel from one to the next, across
+    the left and right edges, then the upper and lower ones.
+    """
+    psf = GaussianPsf(sigma_px)
+    assert psf.footprint_px % 2 == (sigma_px[0] != 0.85)
+    across = np.concatenate([np.arange(-7, 7, 1 / 3), 25 + np.arange(-7, 7, 1 / 3)])
+    along = 10 + 19 * np.arange(len(across)) + np.linspace(-0.5, 0.5, len(across))
+    long_px = 19 * len(across) + 3
+    for size, places in (
+        ((25, long_px), np.stack([across, along], axis=1)),
+        ((long_px, 25), np.stack([along, across], axis=1)),
+    ):
+        stars = sprites_at(places, np.full(len(places), rate), psf.footprint_px)
+        backend = NumpyBackend(Target(size, psf, gamma_response(8, 2.2), WHITE_E_PER_S))
+        backend.draw(stars)
+        linear = linear_image(stars, size, psf).astype(np.float32)
+        wanted = round_levels(linear, backend.target.panel())
+        assert np.count_nonzero(wanted) > 500
+        off = backend.levels().astype(int) - wanted
+        # light in whole units, to either side of a threshold
+        assert np.count_nonzero(off) <= UNITS * np.count_nonzero(wanted)
+        assert np.abs(off).max() <= 1
+        # nothing stays where the last frame was
+        backend.draw(None)
+        assert not backend.levels().any()
+
+
+def test_a_thousand_stars_in_a_pixel_have_their_light_though_each_is_rounded(rng):
+    """To whole units, half of one off at most and none of it to one side: 5 sigmas of the sum."""
+    stars = sprites_at(rng.uniform(20, 21, (1000, 2)), rng.uniform(0.2, 0.4, 1000), 10)
+    target = Target(SIZE_PX, PSF, gamma_response(8, 2.2), WHITE_E_PER_S)
+    light = LightUnits(target.panel(), SIZE_PX, PSF)
+    unit_e_per_s = light.unit_for(stars)
+    cpu = CpuStars(light, np.zeros(SIZE_PX[::-1], np.uint8), sums := np.zeros(64 * 48, np.int32))
+    cpu.lay(None)
+    cpu.add(stars, unit_e_per_s)
+    off = sums.reshape(48, 64)[20, 20] - linear_image(stars, SIZE_PX, PSF)[20, 20] / unit_e_per_s
+    assert abs(off) < 5 * np.sqrt(1000 / 12) + 1
 
 
 def test_a_path_s_sprites_have_the_side_of_their_whole_star():

@@ -523,3 +523,23 @@ def test_a_study_takes_what_it_uses_and_nothing_else(
         refuse_unused(options, pointing)  # type: ignore[arg-type]
     else:
         assert words in refusal(refuse_unused, options, pointing)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ([], "give the edges with one of --edges"),
+        (["--edges", "e.csv", "--diode", "serial:/dev/x@9600"], "give the edges with one of"),
+        (["--edges", "e.csv", "--grab", "genicam:S"], "give the edges with one of --edges"),
+        (["--edges", "e.csv", "--exposure", "0.01"], "--exposure: is for --grab; leave it out"),
+        (["--edges", "out/latency.png", "-o", "out"], "out/latency.png"),
+    ],
+)
+def test_a_latency_has_one_source_of_edges_and_overwrites_none(
+    tmp_path: Path, words: list[str], line: str
+) -> None:
+    (tmp_path / "out").mkdir()
+    for name in ("run.mcap", "e.csv", "out/latency.png"):
+        (tmp_path / name).write_bytes(b"")
+    refused = run_hilstar_here("latency", "run.mcap", *words, cwd=tmp_path)
+    assert refused.returncode == 2 and line in refused.stderr

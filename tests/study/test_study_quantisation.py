@@ -212,6 +212,11 @@ def test_errors_are_drawn_by_their_panel_and_way_with_their_aim(rows, small_run)
     rows = [replace(rows[0], figures=dark), *rows[1:]]
     run = small_run(lambda folder: draw_magnitudes(folder / "m", rows))
     figure = run.charts["m"]
+    exact, rounded = (largest_words(rows, 10, method) for method in ("exact", "round"))
+    assert run.title("m") == (
+        f"On 10 bits every star to 8 magnitudes under white is within {exact} with exact,"
+        f" {rounded} with round"
+    )
     for number, bits in enumerate(BITS):
         aim_mag, limit_mag = AIMS[bits]
         for axes, error, aim in zip(

@@ -14,6 +14,7 @@ import pytest
 from hilstar.display.calibration import load_calibration, read_toml, with_uniformity
 from hilstar.display.response import srgb_response
 from hilstar.instruments.calibrate.first_light import stars
+from hilstar.instruments.calibrate.first_light import uniformity as uniformities
 from hilstar.instruments.calibrate.first_light.context import StepOutcome, rewrite, with_changes
 from hilstar.instruments.calibrate.first_light.focus import first_dots, focus
 from hilstar.instruments.calibrate.first_light.geometry import geometry, orientation
@@ -121,6 +122,11 @@ def test_readings_are_in_their_file_as_they_are(tmp_path):
     np.testing.assert_allclose(measured.sigma, readings.sigma, rtol=1e-4)
     np.testing.assert_allclose(measured.common, readings.common, rtol=1e-4)
     assert measured.code.tolist() == [0, 300, WHITE, 700, 0]
+    lines = (tmp_path / "measured.csv").read_text().splitlines()
+    rows = [line.split(",")[:3] for line in lines if not line.startswith("#")]
+    codes = ["0", "300", str(WHITE), "700", "0"]
+    assert rows[0] == ["order", "code", "channel"]
+    assert rows[1:] == [[str(order), code, "w"] for order, code in enumerate(codes, start=1)]
 
 
 def test_primaries_are_read_apart_and_black_is_of_all_of_them(tmp_path):
@@ -707,3 +713,24 @@ def test_a_response_from_pixel_to_pixel_is_averaged_over_a_dot(tmp_path):
     response = 0.06 / math.sqrt(4 * math.pi * sigma2_px2)
     added = math.sqrt(noise_mag[0.06] ** 2 - noise_mag[0.0] ** 2) / MAG_A_RELATIVE
     assert added == pytest.approx(response, rel=1e-6)
+
+
+def test_a_dot_is_as_noisy_as_its_photons_and_all_pixels_in_its_reach(tmp_path, monkeypatch):
+    """Half of the noise is that of the background: of 100 DN in a pixel."""
+    noise_mag = {}
+    background = SimpleNamespace(noise=0.0)
+    monkeypatch.setattr(uniformities, "noisiest_background", lambda image: background)
+    camera = ClosedCamera(srgb_response(BITS).light)
+    context = closed_context(tmp_path, camera, known=dict(FOCUSED))
+    for noise_dn in (0.0, 100.0):
+        background.noise = noise_dn
+        dots, _ = see_dots(context)
+        noise_mag[noise_dn] = dots.noise_mag
+    dn = float(np.median(dots.light))
+    photons_mag = MAG_A_RELATIVE / math.sqrt(dn * GAIN_E_PER_DN)
+    # of other images, with photons of their own
+    assert noise_mag[0.0] == pytest.approx(photons_mag, rel=1e-3)
+    reach_px = uniformities._spacing(context).reach * RATIO
+    added_mag = math.sqrt(noise_mag[100.0] ** 2 - photons_mag**2)
+    wanted_mag = MAG_A_RELATIVE * 100 * math.sqrt(math.pi) * reach_px / dn
+    assert added_mag == pytest.approx(wanted_mag, rel=1e-3)

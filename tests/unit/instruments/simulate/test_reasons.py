@@ -199,3 +199,44 @@ def test_light_is_off_from_star_to_star_and_in_common_beyond_what_codes_make(
         assert expected in reason
     if words == ["flux is 0.100 mag off at 95 % (limit 0.05)"]:
         assert reasons == words
+
+
+def test_a_budget_s_reach_ends_before_the_first_magnitude_beyond_the_limit():
+    rows = [SimpleNamespace(below_white_mag=mag) for mag in (0.0, 0.5, 1.0, 1.5)]
+    for errors, within in (
+        ([0.01, 0.02, 0.021, 0.001], 0.5),
+        ([0.01, 0.01, 0.01, 0.02], 1.5),
+        ([0.01, None, 0.01, 0.01], 0.0),
+        ([0.03, 0.01, 0.01, 0.01], None),
+        ([None, 0.01, 0.01, 0.01], None),
+    ):
+        assert budget._last_within(rows, errors, 0.02) == within
+
+
+def test_stars_too_faint_to_be_drawn_have_their_share_of_all_light_but_a_body_s():
+    """Of 900, 70, 20 and 10 e-/s, the second driven twice and the fourth three times as bright."""
+    bench = SimpleNamespace(
+        stars=SimpleNamespace(
+            rates_e_per_s=np.array([900.0, 70.0, 20.0, 10.0]),
+            electrons_per_s=np.array([900.0, 70.0, 20.0, 10.0, 1e9]),
+        ),
+        drive=np.array([1.0, 2.0, 1.0, 3.0, 1.0]),
+        faintest_shown_e_per_s=30.0,
+    )
+    missing = budget.not_drawn(bench)
+    assert (missing.stars, missing.flux_share) == (1, pytest.approx(0.02))
+
+
+def test_the_zero_point_is_that_of_stars_of_the_sun_s_colour():
+    """Of 1000 e-/s at V = 4 three are of B-V 0.56 to 0.74, and red ones are twice as bright."""
+    stars = SimpleNamespace(
+        rates_e_per_s=np.array([1000.0, 100.0, 10.0, 2000.0, 5.0]),
+        v_mag=np.array([4.0, 6.5, 9.0, 4.0, 4.0]),
+        bv_mag=np.array([0.56, 0.65, 0.74, 1.5, 0.5]),
+    )
+    assert budget.zero_point_mag(SimpleNamespace(stars=stars)) == pytest.approx(11.5)
+    stars.bv_mag = np.array([1.4, 1.5, 1.9, 1.5, 1.2])
+    # none is as near as a tenth: the nearest
+    assert budget.zero_point_mag(SimpleNamespace(stars=stars)) == pytest.approx(
+        4 + 2.5 * math.log10(5)
+    )

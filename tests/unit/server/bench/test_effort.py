@@ -26,6 +26,7 @@ from hilstar.server.bench.build import (
     open_bench,
     timed_frame_ms,
 )
+from hilstar.server.bench.cameras import bench_camera
 from hilstar.server.bench.config import RenderSettings
 from hilstar.server.bench.effort import (
     Effort,
@@ -38,7 +39,7 @@ from hilstar.server.bench.effort import (
 )
 from hilstar.server.bench.effort_report import effort_keys, effort_lines
 from hilstar.server.bench.least_psf import Choice
-from hilstar.server.bench.scene import turning_of
+from hilstar.server.bench.scene import Display, scenes_of, turning_of
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import run_hilstar_here, typed
@@ -155,6 +156,27 @@ def test_paths_are_charged_where_frames_may_turn(motion, on_screen, turns, small
     scan_s, hold_s = (config.monitor.panel_scanout_ms, config.monitor.panel_hold_ms)
     wanted = scan_s / (scan_s + 2 * hold_s) if turns else None
     assert turning_of(config, on_screen) == pytest.approx(wanted)
+
+
+def test_a_screen_s_share_of_the_sky_is_its_solid_angle_over_the_sphere_s(tmp_path):
+    """Of 320 x 240 pixels of 57.65 um behind 60 mm, about a pixel's own in the middle."""
+    file = bench_file_of(
+        tmp_path / "bench.toml", f"{SMALL_BENCH}[render]\nflux_at_white_e_per_s = 1e6\n"
+    )
+    camera = bench_camera(file.config, file.folder)
+    display = Display(
+        calibration=SimpleNamespace(response=None),
+        camera=camera,
+        context=None,
+        drive=1.0,
+        turning=None,
+        path_px=0.0,
+        darkest=0.5,
+    )
+    scene = next(scenes_of(file, SimpleNamespace(electrons_per_s=None), display))
+    wanted = 320 * 240 * (0.05765 / 60) ** 2 / (4 * np.pi)
+    assert scene.light.sky_share == pytest.approx(wanted, rel=1e-3)
+    assert (scene.white_e_per_s, scene.light.white_e_per_s) == (1e6, 0.5e6)
 
 
 def test_a_psf_in_place_of_a_glass_shares_the_tolerance():

@@ -535,6 +535,36 @@ def test_what_another_order_brought_is_passed_over():
     reader.close()
 
 
+def test_the_time_in_which_this_process_was_stopped_is_no_silence_of_the_reader(monkeypatch):
+    """A minute counts as a tenth of a second; four more in which it says nothing are too many."""
+    clock, notices = FakeClock(), Notices()
+    reader = ReaderProcess(notices, module="__hello__", clock=clock)
+    monkeypatch.setattr(reader, "_state", lambda: ("S", 0.0))
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        assert reader._wire is not None
+        reader._wire.close()
+        reader._wire = ours
+        theirs.sendall(pack(Record()))
+        assert reader.wait(1000) and reader.take() == []  # a sign of life
+        clock.sleep(60.0)
+        assert not reader.wait(0) and reader.trouble == ""
+        for _ in range(3):
+            clock.sleep(0.1)
+            reader.wait(0)
+        assert notices.counts() == {}
+        theirs.sendall(pack(Record()))  # what it says ends a silence
+        assert reader.wait(1000) and reader.take() == []
+        for _ in range(4):
+            clock.sleep(0.1)
+            reader.wait(0)
+        assert notices.counts() == {}
+        clock.sleep(0.1)
+        reader.wait(0)
+        assert notices.counts() == {"receiver-failed": 1}
+    reader.close()
+
+
 def test_what_the_reader_counts_comes_once():
     """As counts grow, by what they have grown since."""
     ours, theirs = socket.socketpair()

@@ -6,7 +6,7 @@ import pytest
 import zmq
 
 from hilstar.attitude.wire import zmq_socket
-from hilstar.attitude.wire.zmq_socket import MAX_GROWTH_BYTES, MAX_PARTS, ZmqSocket
+from hilstar.attitude.wire.zmq_socket import MAX_GROWTH_BYTES, MAX_PARTS, ZmqReply, ZmqSocket
 from hilstar.basics.notices import Notices
 
 WAIT_MS = 20_000
@@ -55,6 +55,10 @@ def test_what_this_process_took_before_the_link_was_used_is_not_the_link_s(tmp_p
     monkeypatch.setattr(zmq_socket._MemoryWatch, "_used_bytes", lambda watch: used_bytes)
     monkeypatch.setattr(zmq_socket, "LOOK_S", 0.0)
     monkeypatch.setattr(zmq_socket, "FREED_WITHIN_S", 0.0)
+    with ZmqReply(f"ipc://{tmp_path}/open") as open_from_its_begin_on:
+        used_bytes += 2 * MAX_GROWTH_BYTES
+        assert not open_from_its_begin_on.wait_for_message(0)
+        assert open_from_its_begin_on.link_counts.resets == 0
     with ZmqSocket(zmq.PULL, f"ipc://{tmp_path}/s") as link:
         used_bytes += 2 * MAX_GROWTH_BYTES
         link.wait_for_message(0)

@@ -181,6 +181,7 @@ def test_one_thread_is_this_one(monkeypatch):
         raise AssertionError(threads)
 
     monkeypatch.setattr(frame_noise, "ThreadPoolExecutor", refuse)
+    monkeypatch.setattr(frame_noise.os, "sched_getaffinity", lambda process: {0, 1, 2, 3})
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     detector = Detector(DetectorSettings(read_noise_e=5.0), (40, 700))
     assert detector.expose(np.zeros((700, 40)), 1.0, np.random.default_rng(2)).any()

@@ -389,13 +389,13 @@ def test_a_tile_has_a_sprite_s_light_where_its_square_touches_it(rng):
     corner_px, shape = (-32 + 7, 13), (5, 7)
     for reach_px in (3, 40):
         sprites_px = rng.integers((-60, -40), (300, 260), (6, 2))
-        found = Sure(1.0, 2.0, sprites_px, reach_px).apart(corner_px, shape)
+        is_apart = Sure(1.0, 2.0, sprites_px, reach_px).apart(corner_px, shape)
         rows, columns = np.indices((5 * TILE_PX, 7 * TILE_PX))
         is_lit = np.zeros(rows.shape, bool)
         for x, y in sprites_px - corner_px:
             is_lit |= (np.abs(columns - x) <= reach_px) & (np.abs(rows - y) <= reach_px)
         by_tile = is_lit.reshape(5, TILE_PX, 7, TILE_PX).any(axis=(1, 3))
-        assert np.array_equal(found, ~by_tile)
+        assert np.array_equal(is_apart, ~by_tile)
 
 
 def test_a_thousand_stars_in_a_pixel_have_their_light_though_each_is_rounded(rng):

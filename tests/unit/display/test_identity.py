@@ -213,3 +213,9 @@ def test_a_monitor_is_doubted_by_its_maker_or_by_its_edid():
     assert nameless.doubt.startswith("EDID unreadable: the monitor is told apart by connector")
     named = MonitorIdentity(maker="DEL", edid_sha256="a" * 64, connector="DP-2")
     assert named.doubt.endswith("another one of its kind on DP-2 passes for it")
+
+
+def test_two_monitors_of_a_kind_without_a_number_are_not_the_same():
+    numberless = msgspec.structs.replace(THIS, serial="")
+    other = msgspec.structs.replace(numberless, edid_sha256="b" * 64)
+    assert list(differences(numberless, other)) == ["another monitor"]

@@ -111,6 +111,8 @@ def test_a_window_is_on_the_screen_where_all_of_its_pixels_are(corner_px, size_p
     assert off_place(area, area, (1, 1)) == ""
     moved = ScreenArea((corner_px[0] + 1, corner_px[1]), size_px)
     assert off_place(moved, area, (1920, 1080)) == "moved off its display"
+    larger = ScreenArea(corner_px, (size_px[0], size_px[1] + 1))
+    assert off_place(area, larger, (1920, 1080)) == "moved off its display"
 
 
 def present_event(

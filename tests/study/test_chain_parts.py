@@ -728,8 +728,15 @@ def test_steps_that_change_nothing_are_named_and_not_drawn(tmp_path, figures):
         ErrorPart(scene, "auto", "prediction", 0.0, 0.0),
         ErrorPart(scene, "auto", "whole", 0.75, 0.033),
     ]
-    run.draw_budget(tmp_path / "b", [AUTO], budget, STAGES, Load())
-    place, light, _ = figures[0].axes
+    turning = replace(AUTO, scene="1 deg/s", rate_deg_s=1.0)
+    more = [replace(part, scene="1 deg/s", error_arcsec=2 * part.error_arcsec) for part in budget]
+    stages = [*STAGES, StageTime("1 deg/s", "auto", "sprites", 7.0)]
+    run.draw_budget(tmp_path / "b", [AUTO, turning], [*budget, *more], stages, Load())
+    place, light, times, turning_place, _, turning_times = figures[0].axes
+    # each scene's own parts and stages
+    assert [bar.get_width() for bar in turning_place.patches] == [0.0, 1.4, 1.5]
+    assert [bar.get_width() for bar in times.patches] == [1.0, 3.0]
+    assert [bar.get_width() for bar in turning_times.patches] == [7.0]
     assert [bar.get_width() for bar in place.patches] == [0.0, 0.7, 0.75]
     assert [bar.get_width() for bar in light.patches] == [0.03, 0.01, 0.033]
     note = " ".join(figures[0].get_supxlabel().split())

@@ -368,3 +368,58 @@ def test_the_loop_that_is_compiled_is_given_its_stamps_and_sigmas(monkeypatch, r
         drawn = benchmark._make_numba()(sprites, (0.7, 1.1), (24, 40))
         wanted = benchmark.numpy_linear(sprites, (0.7, 1.1), (24, 40))
         np.testing.assert_allclose(drawn, wanted, atol=1e-5)
+
+
+def test_a_method_agrees_by_its_largest_difference_as_a_share_of_our_brightest_pixel(bench_with):
+    """Of images that are half as bright and a quarter brighter; every kind of hilstar's is timed."""
+    bench = bench_with()
+    q = benchmark.from_radec_roll_deg(*benchmark.RADEC_ROLL_DEG)
+    cell = report.Cell(*bench.camera.resolution_px, len(bench.sprites(q)))
+    assert cell.stars > 3
+    result = Result(MACHINE)
+
+    def times(factor):
+        return lambda *asked: factor * benchmark.numpy_linear(*asked)
+
+    with benchmark.CellMeasurement(bench, q, cell, result) as measurement:
+        measurement.measure({"dim": times(0.5), "bright": times(1.25)}, 1, 60.0)
+    worst = {row.method: row.worst_of_peak for row in result.agreement}
+    # the GPU's erf and float32 sums: 1e-5
+    assert worst == pytest.approx({"dim": 0.5, "bright": 0.25}, abs=2e-5)
+    kinds = [(row.method, row.kind) for row in result.rows]
+    assert kinds[:3] == [("hilstar", kind) for kind in report.OF_AN_IMAGE]
+    assert kinds[-2:] == [("dim", "linear_only"), ("bright", "linear_only")]
+    assert {"cull", "project"} < {kind for _, kind in kinds}
+    assert all(row.ms.min > 0 for row in result.rows) and len(result.python_ms) == 1
+
+
+def test_a_plan_is_measured_on_its_own_file_cell_by_cell(small_bench_file, monkeypatch, rng):
+    """Fresh processes are planted, and peers are not asked for."""
+    started = []
+
+    def fresh_start(path, q, size):
+        started.append((path, size))
+        return ProcessStart(*size, 10.0 * len(started), 20.0, 30.0)
+
+    methods = {"numpy": benchmark.numpy_linear}, {"galsim": "not installed"}
+    monkeypatch.setattr(benchmark, "other_methods", lambda: methods)
+    monkeypatch.setattr(benchmark, "fresh_start", fresh_start)
+    file = benchmark.read_bench_file(small_bench_file)
+    size = file.config.monitor.resolution_px
+    plan = benchmark.BenchmarkPlan((size,), (3, 2000), 1, 60.0, 3, 0, file)
+    cells = []
+    result = benchmark.run(plan, rng, cells.append)
+    assert cells == [1, 2] and started == [(file.path, size)] * 3
+    assert (result.import_ms, result.first_frame_ms, result.memory_mb) == (20.0, 20.0, 30.0)
+    few, many = result.scenes
+    assert (few.stars, few.catalogue, few.random) == (3, 3, 0)
+    assert many.catalogue + many.random == 2000 and many.random > 1000
+    assert {(row.size, row.stars) for row in result.rows} == {(size, 3), (size, 2000)}
+    assert list(result.does) == ["numpy"] and result.tracker == []
+    assert [(row.method, row.why) for row in result.skipped] == [("galsim", "not installed")]
+    assert result.gl_renderer and result.machine.cores == len(os.sched_getaffinity(0))
+    whats = [aim.what for aim in result.aims]
+    assert whats == [
+        f"turning by 10 deg/s, {count} stars, {size[0]} x {size[1]}, 2 still frames"
+        for count in (3, 2000)
+    ]

@@ -26,7 +26,7 @@ from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
 from hilstar.cli.send import heard
 from hilstar.cli.send import tell as tell_sent
 from hilstar.cli.serve import ServeOptions, heads_run
-from hilstar.cli.study import study_lines
+from hilstar.cli.study import refuse_unused, study_lines
 from hilstar.cli.tracker import TrackerOptions, checked_rate, parse_silent, planted_errors, recorded
 from hilstar.instruments.assess import assessment
 from hilstar.instruments.calibrate import camera_edges, effective_psf
@@ -37,6 +37,7 @@ from hilstar.server.answers.answer import Answer
 from hilstar.server.heads import HeadsRun
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
+from tests.support.refusals import refusal
 
 Q = np.array([0.5, -0.5, 0.5, -0.5])
 
@@ -493,3 +494,52 @@ def test_what_is_given_as_an_option_of_a_run_is_an_option_of_the_real_command() 
     ):
         assert names <= set(options.__dataclass_fields__), options
     assert math.isfinite(WRONG)
+
+
+@pytest.mark.parametrize(
+    ("what", "given", "words"),
+    [
+        ("chain", {}, "is of a bench"),
+        ("chain", {"bench": Path("b.toml")}, None),
+        ("models", {"bench": Path("b.toml"), "radec": "1,2,3"}, None),
+        ("timing", {"bench": Path("b.toml")}, "has benches of its own; leave out b.toml"),
+        ("timing", {"star": "Vega"}, "has fields of its own; leave out --star"),
+        ("chain", {"bench": Path("b.toml"), "radec": "1,2,3"}, "leave out --radec"),
+        ("outputs", {"radec": "1,2,3"}, "a field is seen by a bench"),
+        ("confront", {}, "is of photographs; add --images DIR"),
+        ("confront", {"images": Path("d")}, None),
+        ("timing", {"images": Path("d")}, "has no photographs; leave out --images"),
+        ("chain", {"bench": Path("b.toml"), "images": Path("d")}, "leave out --images"),
+        ("geometry", {}, None),
+    ],
+)
+def test_a_study_takes_what_it_uses_and_nothing_else(
+    what: str, given: dict[str, Any], words: str | None
+) -> None:
+    known = dict.fromkeys(("bench", "images", "radec", "star")) | given
+    options = SimpleNamespace(what=what, bench=known["bench"], images=known["images"])
+    pointing = SimpleNamespace(radec=known["radec"], star=known["star"])
+    if words is None:
+        refuse_unused(options, pointing)  # type: ignore[arg-type]
+    else:
+        assert words in refusal(refuse_unused, options, pointing)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ([], "give the edges with one of --edges"),
+        (["--edges", "e.csv", "--diode", "serial:/dev/x@9600"], "give the edges with one of"),
+        (["--edges", "e.csv", "--grab", "genicam:S"], "give the edges with one of --edges"),
+        (["--edges", "e.csv", "--exposure", "0.01"], "--exposure: is for --grab; leave it out"),
+        (["--edges", "out/latency.png", "-o", "out"], "out/latency.png"),
+    ],
+)
+def test_a_latency_has_one_source_of_edges_and_overwrites_none(
+    tmp_path: Path, words: list[str], line: str
+) -> None:
+    (tmp_path / "out").mkdir()
+    for name in ("run.mcap", "e.csv", "out/latency.png"):
+        (tmp_path / name).write_bytes(b"")
+    refused = run_hilstar_here("latency", "run.mcap", *words, cwd=tmp_path)
+    assert refused.returncode == 2 and line in refused.stderr

@@ -20,7 +20,7 @@ from hilstar.cli import demo as demo_command
 from hilstar.cli import serve as serve_command
 from hilstar.cli import tracker as tracker_command
 from hilstar.cli.accept import _print_costs
-from hilstar.cli.campaign import telling
+from hilstar.cli.campaign import _scheduler, telling
 from hilstar.cli.demo import FOV_ARCSEC, PIXEL_ARCSEC, WRONG, TrackerBeside
 from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
 from hilstar.cli.send import heard
@@ -543,3 +543,29 @@ def test_a_latency_has_one_source_of_edges_and_overwrites_none(
         (tmp_path / name).write_bytes(b"")
     refused = run_hilstar_here("latency", "run.mcap", *words, cwd=tmp_path)
     assert refused.returncode == 2 and line in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "workers", "memory", "key", "words"),
+    [
+        ("tcp://127.0.0.1:1", 4, None, None, "leave out --workers and --memory"),
+        ("tcp://127.0.0.1:1", None, "4GB", None, "leave out --workers and --memory"),
+        (None, 4, "4GB", Path("k.pem"), "is for a cluster"),
+        (None, 4, "4GB", None, None),
+    ],
+)
+def test_a_cluster_has_its_own_workers(
+    scheduler: str | None,
+    workers: int | None,
+    memory: str | None,
+    key: Path | None,
+    words: str | None,
+) -> None:
+    options = SimpleNamespace(
+        scheduler=scheduler, memory=memory, tls_ca_file=None, tls_cert=None, tls_key=key
+    )
+    cases = SimpleNamespace(workers=workers)
+    if words is None:
+        assert _scheduler(options, cases) is None  # type: ignore[arg-type]
+    else:
+        assert words in refusal(_scheduler, options, cases)

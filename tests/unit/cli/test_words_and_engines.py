@@ -31,6 +31,9 @@ from hilstar.cli.tracker import TrackerOptions, checked_rate, parse_silent, plan
 from hilstar.instruments.assess import assessment
 from hilstar.instruments.calibrate import camera_edges, effective_psf
 from hilstar.instruments.calibrate import latency as by_diode
+from hilstar.instruments.campaign import acceptance as acceptance_engine
+from hilstar.instruments.campaign import acceptance_page, acceptance_plan
+from hilstar.instruments.campaign.requirements import NOT_MET
 from hilstar.instruments.simulate import heads as twin_heads
 from hilstar.instruments.simulate.tracker_process import SILENT_AFTER_S, Planted
 from hilstar.server.answers.answer import Answer
@@ -569,3 +572,32 @@ def test_a_cluster_has_its_own_workers(
         assert _scheduler(options, cases) is None  # type: ignore[arg-type]
     else:
         assert words in refusal(_scheduler, options, cases)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words", "code"),
+    [
+        (NOT_MET, [], 0),
+        (NOT_MET, ["--strict"], 1),
+        ("met", ["--strict"], 0),
+        ("not shown", ["--strict"], 0),
+    ],
+)
+def test_an_acceptance_that_is_not_met_is_an_error_where_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdict: str, words: list[str], code: int
+) -> None:
+    accepted = SimpleNamespace(
+        on_bench=False,
+        check=lambda: None,
+        run=lambda missing: [],
+        verdicts=lambda results: [verdict],
+    )
+    monkeypatch.setattr(acceptance_plan, "read_acceptance_plan", lambda *_: None)
+    monkeypatch.setattr(acceptance_engine, "Acceptance", lambda *_: accepted)
+    monkeypatch.setattr(acceptance_engine, "write_ledger", lambda path, results: 0)
+    monkeypatch.setattr(acceptance_page, "write_acceptance", lambda *_: {})
+    monkeypatch.setattr(acceptance_page, "lines_of", lambda *_: ["a line"])
+    monkeypatch.setattr(acceptance_page, "verdict_of", lambda verdicts: verdicts[0])
+    done = run_hilstar_here("accept", "bench.toml", "-o", "out", *words, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (code, "")
+    assert done.stdout.splitlines()[0] == "a line"

@@ -178,6 +178,8 @@ def test_a_run_s_duration_is_refresh_periods(options, slots, frames):
         ((4, 0), 0),  # one head had an attitude
         ((4, 4), 4),
         ((0, 3), 3),
+        ((2, 3), 2),
+        ((3, 0, 1), 3),
         ((2, 4), 2),
         ((0, -9), 1),  # a signal is none of a command's codes
         ((77, 0), 1),

@@ -76,7 +76,7 @@ COMMANDS = {
         "compare a.fits b.fits --json",
         "compare a.fits a.fits",
     ],
-    "frames of other benches": [
+    "other_benches": [
         f"frame {ROOT}/configs/microdisplay.toml --star Vega --explain",
         f"frame {ROOT}/configs/rosetta-navcam.toml --star Sirius,40 --explain --json",
         f"frame {ROOT}/configs/thesis-orion.toml --radec 5h36m14s,-1d12m,0 --explain",

@@ -693,6 +693,11 @@ def test_the_catalogue_s_errors_are_of_its_bright_stars_and_its_maps_of_their_ce
         # 40 to 45 degrees, sine of the declination 1/18 to 2/18
         cell = (catalog.ra_deg // 5 == 8) & (np.sin(np.radians(catalog.dec_deg)) * 18 // 1 == 1)
         assert medians[19, 8] == pytest.approx(np.median(facts[name][cell]))
+        # 200 to 205 degrees, near the southern pole: cells are of equal areas
+        cell = (catalog.ra_deg // 5 == 40) & (np.sin(np.radians(catalog.dec_deg)) < -17 / 18)
+        assert cell.sum() > 5
+        assert medians[0, 40] == pytest.approx(np.median(facts[name][cell]))
+        assert np.isfinite(medians).all()
 
 
 @pytest.mark.parametrize(

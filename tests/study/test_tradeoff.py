@@ -199,6 +199,9 @@ def test_extended_precision_knows_places_between_those_of_float64():
     assert len(places.random_turns(5, camera)) == 5
     stars = places.stars_to(4.0)
     near = stars.vectors[stars.grid.near(turn[2], 0.1)]
+    # a cell that is taken for its centre has no radius
+    grid = places.in_cells(stars, 10.0, by_centres=True).grid
+    assert (set(grid.cos_radius.tolist()), set(grid.sin_radius.tolist())) == ({1.0}, {0.0})
     exact = places.EXACT.places_px(near, turn, camera)
     assert np.isfinite(exact).all() and len(exact) > 5
     assert (exact != exact.astype(np.float64)).mean() > 0.9
@@ -513,6 +516,27 @@ def test_what_beats_a_default_is_the_fastest_that_does_and_on_a_busy_machine_not
     busy = measured(step, 0.02)
     assert not any(trial.on_front or trial.beaten for trial in busy.trials)
     assert f"   {sweep.NOT_JUDGED}" in table_lines(busy)
+
+
+def test_a_step_s_works_share_its_budget_and_its_floor_is_drawn_where_one_is_below(
+    clock, monkeypatch, small_run
+):
+    asked = []
+    turns = trials.in_turn
+
+    def in_turn(works, rounds, share_s):
+        asked.append((list(works), rounds, share_s))
+        return turns(works, 1, share_s)
+
+    monkeypatch.setattr(trials, "in_turn", in_turn)
+    step = measured(three_methods(clock, 4.0), 0.6)
+    assert asked == [(["fast and rough", "own", "slow and rough"], MAX_ROUNDS, pytest.approx(0.2))]
+    for floor, is_drawn in ((5e-3, True), (1e-3, False)):
+        floored = replace(step, error=Figure("error", "px", floor))
+        run = small_run(lambda folder, step=floored: draw_trials(folder / "t", step, "here"))
+        levels = [y for _, x, y in run.lines("t", 0) if x == [0.0, 1.0]]
+        assert levels == ([[floor, floor]] if is_drawn else [])
+        assert run.title("t") == charts.capital(trials.finding(floored))
 
 
 def test_a_time_s_quartiles_are_of_the_wall_and_say_where_methods_overlap():

@@ -189,3 +189,27 @@ def test_a_file_that_was_just_written_is_read_again(tmp_path, monkeypatch, age_s
     assert (named_bytes(path, ADVICE, 3) is named_bytes(path, ADVICE, 3)) is is_kept
     with pytest.raises(InputError, match="at most 2 bytes are read"):
         named_bytes(path, ADVICE, 2)
+
+
+@pytest.mark.parametrize(
+    ("whole_lines", "text", "pieces"),
+    [
+        (True, "123456789\n1\n", ["123456789\n", "1\n"]),
+        (False, "123456789\n1\n", ["123456789\n", "1\n"]),
+        (False, "1234567890\n1", ["1234567890", "\n", "1"]),
+        (True, "1234567890\n", None),
+        (True, "1\n1234567890", None),
+    ],
+)
+def test_a_line_is_as_long_as_the_limit_with_its_end(
+    tmp_path, monkeypatch, whole_lines, text, pieces
+):
+    monkeypatch.setattr(reading, "MAX_LINE_CHARACTERS", 10)
+    path = tmp_path / "lines.txt"
+    path.write_text(text)
+    with open_lines(path, ADVICE, 100, whole_lines) as lines:
+        if pieces is not None:
+            assert list(lines) == pieces
+            return
+        with pytest.raises(InputError, match=r":\d: the line has 10 characters or more"):
+            list(lines)

@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from hilstar.optics.camera import Camera
+from hilstar.optics.extended import LightMap
 from hilstar.optics.layers import fault_light
 from hilstar.optics.layers.fault_kinds import CosmicRays, Gradient, Now, fault_of
 from hilstar.optics.layers.fault_light import FaultCamera, FaultView, Lines, tracks
-from hilstar.optics.layers.star_layer import StarLayer
-from hilstar.optics.layers.view import Canvas
+from hilstar.optics.layers.faults import FaultLayer
+from hilstar.optics.layers.star_layer import StarLayer, no_light
+from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Scan
 from hilstar.sky.stars import with_bodies
@@ -215,3 +217,48 @@ def test_a_point_that_is_given_by_a_star_is_where_that_star_is_or_refused():
     no_exposure = FaultView(replace(view.by, exposure_s=0.0))
     said = refusal(no_exposure.prepare, fault_of({"kind": "gradient", "name": "x", "electrons": 1}))
     assert said.startswith("electrons: [tracker] exposure_s is 0")
+
+
+def test_each_sprite_of_faults_is_of_the_light_whose_name_it_has():
+    """Two tracks, and two false stars that stand on the sky."""
+    view = view_of()
+    tables = (
+        {"kind": "false-star", "name": "right", "icrs": [0.05, 0.0, 0.99874922], "electrons": 10},
+        {"kind": "false-star", "name": "below", "icrs": [0.0, 0.05, 0.99874922], "electrons": 20},
+        RAYS | {"number": 2, "length_px": 0.0},
+    )
+    now = [Now(k, view.prepare(fault_of(table)), 0) for k, table in enumerate(tables, 1)]
+    attitude = View(np.array([1.0, 0.0, 0.0, 0.0]))
+    before = replace(no_light(PSF.footprint_px), rate_cam_rad_s=np.ones(3))
+    light = FaultLayer(view, tuple(now)).add(before, view.by.stars, attitude)
+    placed = {}
+    for star, x_px, y_px, rate in zip(
+        light.star, light.x_px, light.y_px, light.data["electrons_per_s"], strict=True
+    ):
+        added = light.added[-1 - star]
+        assert rate == pytest.approx(added.electrons_per_s)
+        placed[added.name] = (x_px, y_px, rate)
+    offset_px = 1000 * 0.05 / 0.99874922
+    assert placed["right"] == pytest.approx((159.5 + offset_px, 119.5, 40.0))
+    assert placed["below"] == pytest.approx((159.5, 119.5 + offset_px, 80.0))
+    # a blank frame's camera turns as before
+    blank = Now(9, fault_of({"kind": "blank", "name": "dark"}), 0)
+    dark = FaultLayer(view, (*now, blank)).add(before, view.by.stars, attitude)
+    assert (len(dark), dark.added) == (0, ())
+    assert dark.rate_cam_rad_s is before.rate_cam_rad_s
+
+
+@pytest.mark.parametrize(("share", "left"), [(1.0, ("Mars",)), (0.25, ("Moon", "Mars"))])
+def test_a_body_that_is_gone_takes_its_share_of_its_disc_and_its_name_with_it(share, left):
+    """Its map stays, for what is behind it stays hidden."""
+    view = view_of()
+    image = np.ones((2, 2), np.float32)
+    maps = tuple(LightMap(image, times=2.0, name=name) for name in ("Moon", "Mars", ""))
+    names = ("Moon", "Mars")
+    before = replace(no_light(5), extended=maps, discs=names, over_white=names)
+    gone = Now(1, fault_of({"kind": "star-gone", "name": "gone", "star": "Moon"}), 0, share)
+    light = FaultLayer(view, (gone,)).add(
+        before, view.by.stars, View(np.array([1.0, 0.0, 0.0, 0.0]))
+    )
+    assert [part.times for part in light.extended] == [2 * (1 - share), 2.0, 2.0]
+    assert (light.discs, light.over_white) == (left, left)

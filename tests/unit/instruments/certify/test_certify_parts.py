@@ -16,8 +16,9 @@ from scipy.interpolate import CubicSpline
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.geometric import fit as fits
-from hilstar.instruments.certify import estimates, lens
+from hilstar.instruments.certify import certificate, estimates, lens
 from hilstar.instruments.certify.bench_readings import LightReadings
 from hilstar.instruments.certify.budget import BudgetTrials, Combined, Input
 from hilstar.instruments.certify.certificate import (
@@ -25,6 +26,7 @@ from hilstar.instruments.certify.certificate import (
     _figures,
     _input_row,
     _judged,
+    _monitor,
     _place_of,
     files_of,
 )
@@ -119,6 +121,22 @@ def test_a_figure_s_field_counts_from_0_and_its_star_has_its_own():
     assert _place_of(budget, "attitude_x", -1) == (None, 0, "field 0")
     assert _place_of(budget, "attitude_z", -3) == (None, 2, "field 2")
     assert _place_of(budget, "latency", 0) == (None, None, "screen")
+
+
+def test_a_certificate_s_monitor_is_the_one_that_was_read_or_else_of_its_files(monkeypatch):
+    """Of two files the second has an identity."""
+    filed = MonitorIdentity(maker="DEL", serial="filed")
+    origins = [SimpleNamespace(identity=None), SimpleNamespace(identity=filed)]
+    monkeypatch.setattr(certificate, "measured_on", lambda file: iter(origins))
+    monitor = SimpleNamespace(resolution_px=(1920, 1080), refresh_hz=60.0, calibration="srgb")
+    file = SimpleNamespace(config=SimpleNamespace(monitor=monitor))
+    read = MonitorIdentity(maker="DEL", serial="read")
+    facts = {"resolution_px": [1920, 1080], "refresh_hz": 60.0, "calibration": "srgb"}
+    for now, serial in ((read, "read"), (None, "filed")):
+        told = _monitor(file, now)  # type: ignore[arg-type]
+        assert told == facts | {"identity": {"maker": "DEL", "serial": serial}}
+    origins.clear()
+    assert _monitor(file, None)["identity"] == {}  # type: ignore[arg-type]
 
 
 def test_each_figure_has_its_own_numbers_and_a_truth_where_there_is_one():

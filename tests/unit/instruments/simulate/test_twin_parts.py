@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from hilstar.display.panel import Panel
 from hilstar.display.quantise import LitLight
 from hilstar.display.response import Response
 from hilstar.instruments.calibrate.effective_psf import _rms
@@ -99,3 +100,22 @@ def test_a_common_move_is_told_beyond_what_a_star_may_be_off(rng, move_px, is_to
 
 def test_an_rms_is_the_root_of_the_mean_of_squares():
     assert _rms(np.array([3.0, -4.0, 0.0, 0.0])) == 2.5
+
+
+@pytest.mark.parametrize(("true_e_per_s", "white_e_per_s"), [(None, 100.0), (80.0, 80.0)])
+def test_a_true_white_is_that_of_all_primaries(true_e_per_s, white_e_per_s):
+    response = Response(8, np.array([0.0, 0.4, 1.0]), np.array([0.2, 0.7]))
+    primaries = tuple(Panel(response, white) for white in (30.0, 60.0, 10.0))
+    bench = SimpleNamespace(
+        config=SimpleNamespace(
+            verify=SimpleNamespace(true_flux_at_white_e_per_s=true_e_per_s, true_calibration=None)
+        ),
+        flux_at_white_e_per_s=100.0,
+        panel=Panel(response, 100.0, primaries=primaries),
+        calibration=SimpleNamespace(response=response),
+        uniformity=None,
+    )
+    panel = twin.true_panel(bench)
+    assert panel.flux_at_white_e_per_s == white_e_per_s
+    parts = [primary.flux_at_white_e_per_s for primary in panel.primaries]
+    assert parts == pytest.approx([share * white_e_per_s for share in (0.3, 0.6, 0.1)])

@@ -11,7 +11,12 @@ import pytest
 
 from hilstar.basics.rotation import from_rotation_vector
 from hilstar.instruments.calibrate.attitude_pairs import _boresight_rad
-from hilstar.instruments.calibrate.geometric.fit import HUBER, _Loss
+from hilstar.instruments.calibrate.camera_edges import check_rate
+from hilstar.instruments.calibrate.first_light.uniformity import _White
+from hilstar.instruments.calibrate.geometric import fit as geometric_fit
+from hilstar.instruments.calibrate.geometric import match
+from hilstar.instruments.calibrate.geometric.fit import HUBER, _Loss, residuals_sigma
+from hilstar.instruments.calibrate.geometric.match import MAX_CHANCE, MIN_MOTION_PX, MOTION_NOISE
 from hilstar.instruments.calibrate.latency import Edges, pair
 from hilstar.instruments.calibrate.measurements import MeasuredLevels
 from hilstar.instruments.calibrate.photometric import errors_of, held_out
@@ -111,3 +116,102 @@ def test_edges_are_paired_within_half_a_period_and_after_the_last_frame(rng):
     assert len(paired.latency_ns) == 59
     assert set(paired.latency_ns.tolist()) == {12_500_000.0}
     assert paired.unmatched == 1
+
+
+def test_residuals_are_in_the_sigmas_of_their_own_centroids(monkeypatch):
+    """Sigmas of 1, 2 and 4 in a noise of half a pixel."""
+    off = (np.array([1.0, 1.0, 1.0]), np.array([2.0, -2.0, 2.0]))
+    monkeypatch.setattr(geometric_fit, "residuals_px", lambda *given: off)
+    data = SimpleNamespace(centroids=SimpleNamespace(sigma_px=np.array([1.0, 2.0, 4.0])))
+    found = residuals_sigma(SimpleNamespace(noise_px=0.5), None, data)
+    assert found.tolist() == [2.0, 1.0, 0.5, 4.0, -2.0, 1.0]
+
+
+# A square may change every 50 ms.
+@pytest.mark.parametrize(
+    ("period_ms", "exposure_s", "is_quick"),
+    [(30, 0.019, True), (30, 0.021, False), (51, 0.0, False), (None, 0.001, False)],
+)
+def test_an_exposure_lies_within_a_refresh_with_what_comes_between(period_ms, exposure_s, is_quick):
+    count = 1 if period_ms is None else 40
+    begin_ns = np.arange(count) * (period_ms or 0) * 10**6
+    if is_quick:
+        check_rate(begin_ns, exposure_s, 20.0)
+    else:
+        assert "may change every 50 ms" in refusal(check_rate, begin_ns, exposure_s, 20.0)
+
+
+def test_a_glow_is_taken_from_the_lit_pixels_by_their_number(tmp_path):
+    """Three lit pixels of 100 DN, and a glow of 4 DN in five beside them."""
+    image = np.array([[100.0, 100, 100, 7, 7], [4, 4, 4, 4, 4]])
+    lit = image == 100
+    path = tmp_path / "white_000.png"
+    watched = []
+    context = SimpleNamespace(
+        watch=lambda pattern: watched.append(pattern.name),
+        folder=tmp_path,
+        source=SimpleNamespace(look=lambda file, pattern, stem, exposure_s: path),
+        file=None,
+        exposure_s=0.1,
+        looked=lambda path, dark: SimpleNamespace(image=image),
+        is_too_bright=lambda looked: False,
+    )
+    white = SimpleNamespace(
+        _context=context,
+        _dark=None,
+        _code=900,
+        _codes=np.zeros((2, 5), dtype=np.uint16),
+        _cold=np.ones((2, 5), dtype=bool),
+        _lit=lit,
+        _beside=image == 4,
+        _number=0,
+    )
+    for number in range(2):
+        path.touch()
+        assert _White.read(white) == 300 - 3 * 4
+        assert not path.exists()
+        assert watched[-1] == f"white_{number:03}"
+
+
+class FewDots(SimpleNamespace):
+    """So many centroids of one pose."""
+
+    def __len__(self):
+        return self.count
+
+    def at(self, which):
+        """All of them."""
+        return self
+
+
+@pytest.mark.parametrize("share", [0.99, 1.01])
+def test_the_median_of_few_dots_moves_by_chance(monkeypatch, share):
+    """Four dots a frame, whose median scatters by half as much as one."""
+    noise_px = 10.0
+    limit_px = MAX_CHANCE * noise_px / 2
+    assert limit_px > max(MIN_MOTION_PX, MOTION_NOISE * noise_px)
+    shift = np.array([0.0, 0.3, -0.7, 0.1]) * share * limit_px
+    monkeypatch.setattr(match, "frame_shifts", lambda *given: (np.arange(4), shift, noise_px))
+    centroids = SimpleNamespace(pose=np.zeros(16, dtype=int), x_px=None, y_px=None)
+    data = FewDots(count=16, centroids=centroids)
+    if share < 1:
+        match.refuse_motion(data)
+    else:
+        words = refusal(match.refuse_motion, data)
+        assert "in x between frames 1 and 2" in words
+
+
+@pytest.mark.parametrize(("fitting", "is_found"), [(20, True), (13, True), (11, False)])
+def test_a_map_that_less_than_a_third_of_many_dots_fit_is_none(monkeypatch, rng, fitting, is_found):
+    """36 decoded dots, of which the first stand where a map has them."""
+    x_px, y_px = rng.uniform(0, 1000, (2, 36))
+    u, v = x_px / 2000 - 0.2, y_px / 2000 + 0.1
+    u[fitting:], v[fitting:] = rng.uniform(-0.5, 0.5, (2, 36 - fitting))
+    decoded = SimpleNamespace(x_px=u, y_px=v, dot=np.arange(36))
+    monkeypatch.setattr(match, "decode", lambda plan, seen: decoded)
+    plan = SimpleNamespace(x_px=x_px, y_px=y_px, extent_px=100.0)
+    nominal = SimpleNamespace(tracker=SimpleNamespace(tangents=lambda x, y: (x, y)))
+    found = match._map_of(plan, nominal, None, rng)
+    assert (found is not None) == is_found
+    if is_found:
+        np.testing.assert_allclose(found @ [0.05, -0.1, 1.0], [500, -400, 1.0], atol=3.0)

@@ -12,7 +12,7 @@ import pytest
 from hilstar.basics.rotation import from_rotation_vector
 from hilstar.instruments.simulate import simulator
 from hilstar.instruments.simulate.exposures import view_at
-from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground
+from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground, full_e
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
 
@@ -89,3 +89,10 @@ def test_a_log_s_exposures_turn_as_fast_at_its_ends(t_ns):
     view = view_at(SimpleNamespace(at=at), (0, 10**9), t_ns, 0.1)
     assert abs(view.rate_cam_rad_s[1]) == pytest.approx(0.3, rel=1e-6)
     assert view.rate_cam_rad_s[[0, 2]] == pytest.approx([0.0, 0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize(("full_well_e", "full"), [(9_000.0, 8_000.0), (5_000.0, 5_000.0)])
+def test_a_pixel_is_full_by_its_well_or_by_the_adc_above_its_offset(full_well_e, full):
+    """Codes to 1023, of which 23 are the offset, of 8 electrons each."""
+    detector = SimpleNamespace(bits=10, offset_dn=23.0, gain_e_per_dn=8.0, full_well_e=full_well_e)
+    assert full_e(detector) == full

@@ -1,0 +1,121 @@
+"""The light of a virtual bench's exposures, and its levels where another monitor is the true one."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.special import ndtr
+
+from hilstar.display.panel import Panel
+from hilstar.display.quantise import LitLight
+from hilstar.display.response import Response
+from hilstar.instruments.calibrate.effective_psf import _rms
+from hilstar.instruments.compare.sky_comparison import common_motion
+from hilstar.instruments.simulate import twin
+from hilstar.instruments.simulate.star_finder import CROWDED_SHARE, crowded
+from hilstar.optics.psf import GaussianPsf
+
+
+def test_an_exposure_is_the_mean_of_its_own_frames(monkeypatch):
+    """Three frames of 1/30 s from frame 7 on; frame n lights its first pixel with n e-/s."""
+    drawn = []
+
+    def draw(sprites, number):
+        drawn.append(number)
+        return SimpleNamespace(levels=number)
+
+    asked = []
+
+    def exposure(before, count):
+        asked.append((before, count))
+        return range(count)
+
+    bench = SimpleNamespace(
+        config=SimpleNamespace(
+            tracker=SimpleNamespace(exposure_s=0.1), monitor=SimpleNamespace(refresh_hz=30.0)
+        ),
+        quantiser=SimpleNamespace(exposure=exposure),
+        view=lambda q, rate, t_ns: (q, t_ns),
+        light=lambda view, faults: (view, faults),
+        draw_sprites=draw,
+    )
+
+    class First(int):
+        """The levels of frame 7, of 1 x 2 pixels."""
+
+        shape = (1, 2)
+
+    def lit(levels, panel):
+        return [LitLight(np.array([0]), np.array([panel * float(levels)]))]
+
+    monkeypatch.setattr(twin, "_primaries_lit", lit)
+    frame = SimpleNamespace(levels=First(7), q_icrs_to_cam="q", t_ns=0)
+    panels = twin.exposure_lights(bench, frame, 7, [1.0, 10.0])
+    assert drawn == [8, 9]
+    assert asked == [(7 % twin.PHASES, 3)]
+    for (light,), panel in zip(panels, (1.0, 10.0), strict=True):
+        assert light.place.tolist() == [0]
+        assert light.e_per_s == pytest.approx([8.0 * panel])
+
+
+def test_a_true_monitor_s_light_is_in_the_assumed_one_s_order():
+    """The assumed one has red before green; what the true one lacks lies between its neighbours."""
+    black, red, green, both = (0, 0, 0), (1, 0, 0), (0, 1, 0), (1, 1, 0)
+    assumed = Response(
+        8,
+        np.array([0.0, 0.2, 0.5, 1.0]),
+        np.array([0.1, 0.35, 0.75]),
+        0.03,
+        np.array([black, red, green, both], dtype=np.uint16),
+    )
+    true = Response(
+        8, np.array([0.0, 0.4, 1.0]), np.array([0.2, 0.7]), 0.01, np.array([black, red, both])
+    )
+    found = twin.levels_of(assumed, true)
+    np.testing.assert_allclose(found.light, [0.0, 0.4, 0.7, 1.0])
+    assert found.black == 0.01
+    assert found.rgb is assumed.rgb
+    assert twin.levels_of(Response(8, true.light, true.threshold), true) is true
+
+
+@pytest.mark.parametrize(("times", "is_crowded"), [(0.95, False), (1.05, True)])
+def test_a_window_is_about_the_pixel_of_its_star(times, is_crowded):
+    """A star 0.4 px right of its pixel, whose window of seven pixels ends 3.1 px from it."""
+    psf = GaussianPsf((0.5, 0.5))
+    x_px, y_px = np.array([10.4, 15.0]), np.array([20.0, 20.0])
+    share = float(ndtr((13.5 - 15.0) / 0.5))
+    flux = np.array([1.0, times * CROWDED_SHARE / share])
+    assert crowded(x_px, y_px, flux, 3, psf)[0] == is_crowded
+
+
+@pytest.mark.parametrize(("move_px", "is_told"), [(0.09, False), (0.11, True), (-0.11, True)])
+def test_a_common_move_is_told_beyond_what_a_star_may_be_off(rng, move_px, is_told):
+    places = rng.uniform(-100, 100, (12, 2))
+    moves = np.tile([move_px, 0.0], (12, 1))
+    motion = common_motion(places, moves, np.full(12, 0.1))
+    assert (motion is not None) == is_told
+
+
+def test_an_rms_is_the_root_of_the_mean_of_squares():
+    assert _rms(np.array([3.0, -4.0, 0.0, 0.0])) == 2.5
+
+
+@pytest.mark.parametrize(("true_e_per_s", "white_e_per_s"), [(None, 100.0), (80.0, 80.0)])
+def test_a_true_white_is_that_of_all_primaries(true_e_per_s, white_e_per_s):
+    response = Response(8, np.array([0.0, 0.4, 1.0]), np.array([0.2, 0.7]))
+    primaries = tuple(Panel(response, white) for white in (30.0, 60.0, 10.0))
+    bench = SimpleNamespace(
+        config=SimpleNamespace(
+            verify=SimpleNamespace(true_flux_at_white_e_per_s=true_e_per_s, true_calibration=None)
+        ),
+        flux_at_white_e_per_s=100.0,
+        panel=Panel(response, 100.0, primaries=primaries),
+        calibration=SimpleNamespace(response=response),
+        uniformity=None,
+    )
+    panel = twin.true_panel(bench)
+    assert panel.flux_at_white_e_per_s == white_e_per_s
+    parts = [primary.flux_at_white_e_per_s for primary in panel.primaries]
+    assert parts == pytest.approx([share * white_e_per_s for share in (0.3, 0.6, 0.1)])

@@ -528,11 +528,9 @@ def geometry(context: StepContext) -> StepOutcome:
         f"{chosen.name}: held-out dots {chosen.rms_arcsec:.2f} arcsec rms, {chosen.max_arcsec:.2f}"
         f" max; a star's place is known to {error.rms_arcsec:.2f} arcsec rms"
     )
-    # the standard error of an rms over n dots of two axes each, 2 n numbers
-    rms_error_arcsec = chosen.rms_arcsec / math.sqrt(4 * len(calibrated.data))
     number = StepNumber(
         chosen.rms_arcsec,
-        rms_error_arcsec,
+        chosen.rms_error_arcsec,
         "arcsec",
         "rms distance of held-out dots from where the fit has them",
     )

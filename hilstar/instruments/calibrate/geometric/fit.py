@@ -446,6 +446,11 @@ class Candidate:
         return float(np.sqrt((self.off_arcsec**2).sum(axis=1).mean()))
 
     @property
+    def rms_error_arcsec(self) -> float:
+        """Standard error of that rms: of n dots with two axes each, which are 2 n numbers."""
+        return self.rms_arcsec / math.sqrt(4 * len(self.dot))
+
+    @property
     def max_arcsec(self) -> float:
         """Largest held-out error."""
         return float(np.hypot(*self.off_arcsec.T).max())

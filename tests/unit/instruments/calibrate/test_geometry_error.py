@@ -648,3 +648,12 @@ def test_a_tracker_s_lens_is_held_where_it_is_stated_and_narrow_dots_are_freed_o
     assert words == "they are off"
     seen = ("seen", sigma_px) if sigma_px <= 0.8 else "seen"
     assert asked == [(seen, is_known)]
+
+
+def test_an_rms_of_dots_is_as_sure_as_it_is_over_many_draws(rng):
+    """Of 40 dots whose two axes have one scatter."""
+    candidates = [candidate("", rng.normal(0.0, 3.0, (40, 2))) for _ in range(1000)]
+    scatter_arcsec = np.std([each.rms_arcsec for each in candidates])
+    stated_arcsec = np.mean([each.rms_error_arcsec for each in candidates])
+    # a scatter of a thousand is known to 2.2 %
+    assert stated_arcsec == pytest.approx(scatter_arcsec, rel=0.09)

@@ -380,3 +380,12 @@ def test_pixels_without_a_value_are_refused():
 def test_what_is_no_fits_is_told():
     with pytest.raises(ImageSizeError, match="not a FITS image"):
         read_fits_image(b"BZh91AY")
+
+
+@pytest.mark.parametrize(("off_s", "is_said"), [(5.9, False), (6.1, True), (-5.9, False)])
+def test_a_second_time_may_be_off_by_half_the_exposure_and_a_second(off_s, is_said):
+    """Programs differ in whether DATE-OBS is the start."""
+    other = str(np.datetime64(utc_ns(EIGHT_PM) + round(off_s * 1e9), "ns"))
+    found = read_image({"DATE-AVG": EIGHT_PM, "DATE-MID": other, "EXPTIME": 10.0})
+    assert found.t_ns == utc_ns(EIGHT_PM)
+    assert bool(found.notes) is is_said

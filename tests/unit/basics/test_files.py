@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import zlib
 from pathlib import Path
 
 import pytest
@@ -233,3 +234,26 @@ def test_a_file_s_name_is_no_directory_unless_one_is_there(tmp_path):
     check_directory("-o", tmp_path / "run-0.5")
     (tmp_path / "old.csv").mkdir()
     check_directory("-o", tmp_path / "old.csv")
+
+
+@pytest.mark.parametrize(
+    ("content", "harm"),
+    [
+        (b"12345", None),
+        (b"123456", "overwritten"),
+        (b"1234", "truncated"),
+        (b"12344", "overwritten"),
+    ],
+)
+def test_what_somebody_did_to_a_file_is_told(tmp_path, content, harm):
+    file = NewFile(tmp_path / "run.mcap")
+    os.write(file.fd, b"12345")
+    file.note()
+    with (tmp_path / "run.mcap").open("r+b") as other:
+        other.write(content)
+        other.truncate()
+    os.utime(tmp_path / "run.mcap", ns=(0, 0))
+    assert file.harm(5, zlib.crc32(b"12345")) == harm
+    (tmp_path / "run.mcap").unlink()
+    assert file.harm(5, zlib.crc32(b"12345")) == "deleted"
+    file.close()

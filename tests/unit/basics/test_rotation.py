@@ -9,6 +9,7 @@ from hilstar.basics.rotation import (
     angle_between_rad,
     conjugate,
     direction_of,
+    from_matrix,
     from_radec_roll_deg,
     multiply,
     normalise,
@@ -147,3 +148,12 @@ def test_the_rate_between_two_attitudes_is_that_of_the_shorter_way(rng):
     later = propagate(q, rate, 2.0)
     for sign in (1, -1):
         np.testing.assert_allclose(rate_between_rad_s(q, sign * later, 2.0), rate, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("turn_deg", [120.0, 179.0, 180.0])
+def test_a_matrix_of_a_large_turn_about_any_axis_gives_its_quaternion(axis, turn_deg):
+    half = np.radians(turn_deg / 2)
+    q = np.zeros(4)
+    q[0], q[1 + axis] = np.cos(half), np.sin(half)
+    assert from_matrix(to_matrix(q)) == pytest.approx(q, abs=1e-15)

@@ -66,3 +66,12 @@ def test_no_percentile_is_above_the_largest_value(rng):
         for one in (value, value - 1e3):
             statistics.add(one)
         assert statistics.percentile(99) <= statistics.percentile(100) <= statistics.max == value
+
+
+@pytest.mark.parametrize("size", [9e-7, -9e-7, 0.0])
+def test_what_is_within_a_millionth_of_0_counts_as_0_by_value_and_at_once(size):
+    by_value, at_once = RunningStatistics(), RunningStatistics()
+    for value in (size, size, 1.0):
+        by_value.add(value)
+    at_once.add_all(np.array([size, size, 1.0]))
+    assert by_value.percentile(50) == at_once.percentile(50) == 0.0

@@ -370,3 +370,24 @@ def test_two_attitudes_at_one_time_of_a_row_a_star_are_refused(csv_of):
     text = f"t_s,qw,qx,qy,qz,star_x,star_y\n0,{Q},1,2\n0,{OTHER},3,4\n"
     with pytest.raises(InputError, match=":3: another attitude at t_s = 0; repeat the answer"):
         read_telemetry(csv_of(text))
+
+
+@pytest.mark.parametrize("t_s", ["9.1e9", "-9.1e9", "noon"])
+def test_a_time_of_telemetry_beyond_64_bits_is_refused_on_either_side(csv_of, t_s):
+    with pytest.raises(InputError, match=f"t_s = '{t_s}' is no time"):
+        read_telemetry(csv_of(f"t_s,qw,qx,qy,qz\n{t_s},{Q}\n"))
+    late = "-9e9" if t_s.startswith("-") else "9e9"
+    assert abs(read_telemetry(csv_of(f"t_s,qw,qx,qy,qz\n{late},{Q}\n")).t_ns[0]) == 9 * 10**18
+
+
+@pytest.mark.parametrize(
+    ("columns", "is_named"), [("wx,wy,wz", True), ("gyro_x,gyro_y", False), ("p,q,r", True)]
+)
+def test_three_columns_like_rates_of_another_program_are_named(csv_of, columns, is_named):
+    cells = ",".join("0" for _ in columns.split(","))
+    text = f"t_s,qw,qx,qy,qz,{columns}\n0,{Q},{cells}\n0.1,{Q},{cells}\n"
+    found = open_log(csv_of(text))
+    assert (
+        any(f"columns {columns.replace(',', ', ')} are not used" in line for _, line in found.told)
+        is is_named
+    )

@@ -151,6 +151,16 @@ def test_rates_may_be_off_by_a_fifth_of_the_turn_and_over_a_gap_by_a_fiftieth(of
     assert [kind for kind, _ in log_joins(samples).told] == told
 
 
+@pytest.mark.parametrize(("off", "told"), [(0.002, []), (0.01, ["log-gap"])])
+def test_of_a_long_gap_s_turn_a_degree_may_be_missing(off, told):
+    """Five radians: a degree is a third of a hundredth."""
+    times = [*np.arange(0, 10, 0.5), *np.arange(600, 610, 0.5)]
+    samples = coning_samples(times, spin=0.0085, nutation=0.0)
+    rate = samples[0].rate_cam_rad_s * (1 + off)
+    samples = [replace(sample, rate_cam_rad_s=rate) for sample in samples]
+    assert [kind for kind, _ in log_joins(samples).told] == told
+
+
 def test_a_discontinuity_with_rates_of_another_turn_is_no_misfit():
     samples = coning_samples(np.arange(0, 10, 0.5))
     samples[7:] = [replace(sample, q_icrs_to_cam=START) for sample in samples[7:8]]

@@ -236,3 +236,11 @@ def test_a_message_that_is_no_attitude_is_refused_with_its_number(tmp_path, mess
 def test_a_file_without_attitudes_is_refused(tmp_path):
     (tmp_path / "run.mcap").write_bytes(ledger([]))
     assert "no attitude" in refusal(read_log, tmp_path / "run.mcap")
+
+
+def test_two_attitudes_of_one_time_are_those_of_a_sender_that_restarted(tmp_path):
+    path = tmp_path / "a.mcap"
+    turned = AttitudeSample(5, np.array([0.0, 1.0, 0.0, 0.0]), None, 0)
+    path.write_bytes(ledger([attitude_message(upright_sample(5)), attitude_message(turned)]))
+    line = refusal(read_log, path)
+    assert "the sender restarted here" in line and "more of its digits" not in line

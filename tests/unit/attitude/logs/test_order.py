@@ -64,3 +64,11 @@ def test_an_attitude_that_says_nothing_new_is_dropped(change, is_dropped):
 def test_two_without_a_rate_are_one():
     without = replace(SAMPLE, rate_cam_rad_s=None)
     assert read([without, without, SAMPLE])[0] == [":0", ":2"]
+
+
+def test_the_largest_of_several_delays_is_told():
+    newest_ns = 10 * REORDER_NS
+    _, told = read(at(newest_ns, newest_ns - 8 * 10**8, newest_ns - 10**8))
+    assert told == [
+        ("log-order", "2 attitudes came out of order, by up to 0.8 s, and are sorted"),
+    ]

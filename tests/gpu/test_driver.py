@@ -130,7 +130,35 @@ def test_a_gpu_that_does_not_finish_or_cannot_be_waited_for_is_an_error(context,
         return result
 
     driver._ask = driver._wait = wait
+    fences: list[int] = []
+    delete = driver._delete
+    driver._delete = lambda fence: (fences.append(fence), delete(fence))
     with pytest.raises(GpuError, match=words):
         driver.wait()
+    assert len(fences) == 1  # a frame's fence goes, whatever became of it
     waited_ns = 10 * NS_PER_S if result == GL_TIMEOUT_EXPIRED else 0
     assert sum(slices_ns) == waited_ns
+
+
+@pytest.mark.parametrize(
+    ("status", "words"),
+    [
+        (0x8253, "the GPU is lost: this program's work reset it"),  # glext.h
+        (0x8254, "the GPU is lost: another program's work reset it"),
+        (0x8255, "the GPU is lost: it was reset for an unknown reason"),
+        (0x1234, "the GPU is lost: reset status 0x1234"),
+    ],
+)
+def test_a_gpu_that_was_reset_is_lost_and_errors_without_end_are_told_once(context, status, words):
+    """A lost context may give the same error for ever; the reset goes before it."""
+    driver = Driver(context)
+    driver._error = lambda: 0x0507
+    assert driver.fault() == "the GL driver reports GL_CONTEXT_LOST"
+    driver._reset = lambda: status
+    assert driver.fault() == words
+    errors = iter([0x0502, 0x0505, 0x0502, 0x9999, 0])
+    driver._reset = None
+    driver._error = lambda: next(errors)
+    assert driver.fault() == (
+        "the GL driver reports GL_INVALID_OPERATION, GL_OUT_OF_MEMORY, 0x9999"
+    )

@@ -59,7 +59,11 @@ def edid(
         ("underscan", "auto", False),
         ("underscan", "on", True),
         ("left margin", 12, True),
+        ("left margin", 0, None),
         ("abm level", 3, True),
+        ("abm level", 0, None),
+        ("vibrant hue", 90, None),
+        ("vibrant hue", 0, True),
         ("color vibrance", 150, None),
         ("color vibrance", 180, True),
         ("vrr_capable", 1, None),  # what it can is no fault; whether it does is measured

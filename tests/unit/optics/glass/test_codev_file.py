@@ -259,6 +259,12 @@ def test_an_aperture_without_a_size_is_refused(words):
     assert "has no size; write its half-width" in refusal(read_codev, seq(more={1: [words]}))
 
 
+@pytest.mark.parametrize("keyword", ["CUF", "IC", "XOD", "YOD", "ZOD"])
+def test_what_changes_nothing_at_zero_is_refused_elsewhere(keyword):
+    read_codev(seq(f"{keyword} 0"))
+    assert f"{keyword} is not known" in refusal(read_codev, seq(f"{keyword} 0.1"))
+
+
 @pytest.mark.parametrize(
     ("x_deg", "y_deg", "wanted"),
     [

@@ -282,6 +282,7 @@ def test_dropped_frames_are_the_seed_s(faulty):
     [
         ({"kind": "star-gone", "hip": 999_999}, "hip = 999999: not among the"),
         ({"kind": "star-gone", "star": "Nibiru"}, 'star = "Nibiru": not among the'),
+        ({"kind": "flash", "hip": 999_999, "v_mag": 1.0, "for_s": 0.2}, "hip = 999999: not among"),
         ({"kind": "light-map", "file": "nothing.fits"}, "a message names no files"),
     ],
 )

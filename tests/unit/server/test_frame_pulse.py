@@ -166,6 +166,7 @@ def test_a_line_that_is_lost_is_told_once_and_tried_until_it_is_back(kept):
     assert notices.counts() == {"sync-lost": 1, "sync-back": 1}
     summary = pulse.summary()
     assert summary.lost == 1 and summary.skipped >= 10 and summary.pulses >= before + 1
+    assert summary.pulses + summary.skipped == number  # the frame of the lost one is skipped, too
     assert "lost 1 time" in summary.line()
 
 

@@ -158,3 +158,17 @@ def test_the_attitude_of_the_tracker_in_the_reference_has_no_negative_scalar(
             assert found.q_tracker_to_reference == pytest.approx(
                 tuple(wanted * np.sign(wanted[0])), abs=1e-12
             )
+
+
+def test_a_variance_is_about_the_axis_of_the_tracker_that_stands_there(tmp_path: Path) -> None:
+    """Turned by a third about (1, 1, 1) the tracker's z is the display's x, and its x and y are y
+    and z.
+    """
+    table = "[alignment]\nq_mon_to_reference = [1, 0, 0, 0]\n"
+    table += "covariance_arcsec2 = [[4, 0, 0], [0, 25, 0], [0, 0, 25]]\n"
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"collimator": {"q_cam_to_mon": [0.5, 0.5, 0.5, 0.5]}}) + table)
+    found = cube_to_boresight(read_bench_file(path), None)
+    assert found is not None
+    assert found.roll_arcsec == pytest.approx(HALF_OF_95 * 2, rel=1e-6)
+    assert found.cross_arcsec == pytest.approx(ROUND * 5, rel=1e-5)

@@ -6,11 +6,13 @@ from __future__ import annotations
 
 import os
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from hilstar.instruments.study.speed import benchmark, report, tracker
 from hilstar.instruments.study.speed.report import (
@@ -366,6 +368,83 @@ def test_the_loop_that_is_compiled_is_given_its_stamps_and_sigmas(monkeypatch, r
             x_px, y_px, rng.uniform(1, 9, 30), np.arange(30), (40, 24), footprint_px
         )
         drawn = benchmark._make_numba()(sprites, (0.7, 1.1), (24, 40))
+        wanted = benchmark.numpy_linear(sprites, (0.7, 1.1), (24, 40))
+        np.testing.assert_allclose(drawn, wanted, atol=1e-5)
+
+
+@dataclass
+class PlantedImage:
+    """An image of GalSim's, or a part of one: its array, and its first column and row."""
+
+    array: np.ndarray
+    xmin: int = 0
+    ymin: int = 0
+
+    @property
+    def bounds(self):
+        height, width = self.array.shape
+        return PlantedBounds(self.xmin, self.xmin + width - 1, self.ymin, self.ymin + height - 1)
+
+    def __getitem__(self, part):
+        rows = slice(part.ymin - self.ymin, part.ymax - self.ymin + 1)
+        columns = slice(part.xmin - self.xmin, part.xmax - self.xmin + 1)
+        return PlantedImage(self.array[rows, columns], part.xmin, part.ymin)
+
+
+class PlantedBounds(NamedTuple):
+    """Columns and rows, the last included."""
+
+    xmin: int
+    xmax: int
+    ymin: int
+    ymax: int
+
+    def __and__(self, other):
+        low, high = np.maximum(self, other), np.minimum(self, other)
+        return PlantedBounds(*map(int, (low[0], high[1], low[2], high[3])))
+
+
+@dataclass(frozen=True)
+class PlantedGaussian:
+    """A profile of GalSim's, exact in the pixel."""
+
+    sigma: float
+    wide: tuple[float, float] = (1.0, 1.0)
+    flux: float = 1.0
+
+    def transform(self, dudx, dudy, dvdx, dvdy):
+        assert dudy == dvdx == 0
+        return replace(self, wide=(dudx * self.sigma, dvdy * self.sigma))
+
+    def withFlux(self, flux):
+        return replace(self, flux=flux)
+
+    def drawImage(self, image, scale, center, add_to_image):
+        assert scale == 1.0 and add_to_image
+        x, y = center
+        shares = []
+        for first, count, at, sigma in zip(
+            (image.xmin, image.ymin), image.array.shape[::-1], (x, y), self.wide, strict=True
+        ):
+            edges = first + np.arange(count + 1) - 0.5
+            shares.append(np.diff(ndtr((edges - at) / sigma)))
+        image.array += self.flux * np.outer(shares[1], shares[0])
+
+
+def test_galsim_is_asked_for_the_same_stars_in_the_same_stamps(monkeypatch, rng):
+    planted = SimpleNamespace(
+        ImageF=PlantedImage,
+        Gaussian=PlantedGaussian,
+        BoundsI=PlantedBounds,
+        PositionD=lambda x, y: (x, y),
+    )
+    monkeypatch.setitem(sys.modules, "galsim", planted)
+    x_px, y_px = rng.uniform(-3, 43, 30), rng.uniform(-3, 27, 30)
+    for footprint_px in (8, 9):
+        sprites = benchmark.pack_sprites(
+            x_px, y_px, rng.uniform(1, 9, 30), np.arange(30), (40, 24), footprint_px
+        )
+        drawn = benchmark._make_galsim()(sprites, (0.7, 1.1), (24, 40))
         wanted = benchmark.numpy_linear(sprites, (0.7, 1.1), (24, 40))
         np.testing.assert_allclose(drawn, wanted, atol=1e-5)
 

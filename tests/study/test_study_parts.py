@@ -396,9 +396,10 @@ def test_a_distance_is_of_both_coordinates():
 
 
 def test_a_psf_s_fit_is_about_its_own_background():
-    image = star_image(100.3, 49.8, rigs.PSF_SIGMA_PX) + rigs.DARK_DN
-    x_px, y_px = rigs.psf_fit(image, np.array([100]), np.array([50]))
-    assert (x_px[0], y_px[0]) == pytest.approx((100.3, 49.8), abs=1e-3)
+    for share in (1.0, 0.01):
+        image = share * star_image(100.3, 49.8, rigs.PSF_SIGMA_PX) + rigs.DARK_DN
+        x_px, y_px = rigs.psf_fit(image, np.array([100]), np.array([50]))
+        assert (x_px[0], y_px[0]) == pytest.approx((100.3, 49.8), abs=1e-3)
 
 
 @pytest.fixture(scope="module")

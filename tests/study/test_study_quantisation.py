@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import fields, replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -294,6 +296,32 @@ def test_errors_fall_with_the_frames_of_an_exposure():
     assert srgb.steps == pytest.approx(star / first_step, rel=1e-6)
     assert steps_words(srgb) == f"sRGB, 8 bits: {srgb.steps:.1f} steps"
     assert steps_words(replace(srgb, steps=100.4)) == "sRGB, 8 bits: 100 steps"
+
+
+def test_errors_over_frames_are_rms_over_where_an_exposure_begins(monkeypatch):
+    """Four begins for each number of frames, by each method; light is a frame's mean."""
+    panel = frames_panels()[0]
+    sprites, tile, bright, _ = codes.judged_phases(2)
+    light = []
+    sizes = itertools.cycle((1.0, 2.0, 3.0, 4.0))
+
+    def errors(image, share, kinds):
+        light.append(image.sum() / (share * bright.sum()))
+        size = next(sizes)
+        places = {kind: size * (number + 2) for number, kind in enumerate(kinds)}
+        return SimpleNamespace(flux_rms_mag=size, axis_rms_px=places.get)
+
+    planted = sprites, tile, bright, SimpleNamespace(errors=errors)
+    monkeypatch.setattr(codes, "judged_phases", lambda phases: planted)
+    rows = list(over_frames(panel, 2, (2, 16)))
+    assert [(row.method, row.frames) for row in rows] == list(
+        product(("temporal", "dither"), (2, 16))
+    )
+    rms = math.sqrt((1 + 4 + 9 + 16) / 4)
+    for row in rows:
+        figures = row.flux_rms_mag, row.axis_rms_px_moment, row.axis_rms_px_window
+        assert (*figures, row.axis_rms_px_fit) == pytest.approx((rms, 2 * rms, 3 * rms, 4 * rms))
+    np.testing.assert_allclose(light, 1.0, atol=0.1)
 
 
 def test_errors_over_frames_are_drawn_solid_by_temporal_and_dotted_by_dither(small_run):

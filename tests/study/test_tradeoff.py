@@ -199,6 +199,9 @@ def test_extended_precision_knows_places_between_those_of_float64():
     assert len(places.random_turns(5, camera)) == 5
     stars = places.stars_to(4.0)
     near = stars.vectors[stars.grid.near(turn[2], 0.1)]
+    # a cell that is taken for its centre has no radius
+    grid = places.in_cells(stars, 10.0, by_centres=True).grid
+    assert (set(grid.cos_radius.tolist()), set(grid.sin_radius.tolist())) == ({1.0}, {0.0})
     exact = places.EXACT.places_px(near, turn, camera)
     assert np.isfinite(exact).all() and len(exact) > 5
     assert (exact != exact.astype(np.float64)).mean() > 0.9

@@ -20,7 +20,7 @@ from hilstar.cli import demo as demo_command
 from hilstar.cli import serve as serve_command
 from hilstar.cli import tracker as tracker_command
 from hilstar.cli.accept import _print_costs
-from hilstar.cli.campaign import telling
+from hilstar.cli.campaign import _scheduler, telling
 from hilstar.cli.demo import FOV_ARCSEC, PIXEL_ARCSEC, WRONG, TrackerBeside
 from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
 from hilstar.cli.send import heard
@@ -31,6 +31,9 @@ from hilstar.cli.tracker import TrackerOptions, checked_rate, parse_silent, plan
 from hilstar.instruments.assess import assessment
 from hilstar.instruments.calibrate import camera_edges, effective_psf
 from hilstar.instruments.calibrate import latency as by_diode
+from hilstar.instruments.campaign import acceptance as acceptance_engine
+from hilstar.instruments.campaign import acceptance_page, acceptance_plan
+from hilstar.instruments.campaign.requirements import NOT_MET
 from hilstar.instruments.simulate import heads as twin_heads
 from hilstar.instruments.simulate.tracker_process import SILENT_AFTER_S, Planted
 from hilstar.server.answers.answer import Answer
@@ -543,3 +546,58 @@ def test_a_latency_has_one_source_of_edges_and_overwrites_none(
         (tmp_path / name).write_bytes(b"")
     refused = run_hilstar_here("latency", "run.mcap", *words, cwd=tmp_path)
     assert refused.returncode == 2 and line in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "workers", "memory", "key", "words"),
+    [
+        ("tcp://127.0.0.1:1", 4, None, None, "leave out --workers and --memory"),
+        ("tcp://127.0.0.1:1", None, "4GB", None, "leave out --workers and --memory"),
+        (None, 4, "4GB", Path("k.pem"), "is for a cluster"),
+        (None, 4, "4GB", None, None),
+    ],
+)
+def test_a_cluster_has_its_own_workers(
+    scheduler: str | None,
+    workers: int | None,
+    memory: str | None,
+    key: Path | None,
+    words: str | None,
+) -> None:
+    options = SimpleNamespace(
+        scheduler=scheduler, memory=memory, tls_ca_file=None, tls_cert=None, tls_key=key
+    )
+    cases = SimpleNamespace(workers=workers)
+    if words is None:
+        assert _scheduler(options, cases) is None  # type: ignore[arg-type]
+    else:
+        assert words in refusal(_scheduler, options, cases)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words", "code"),
+    [
+        (NOT_MET, [], 0),
+        (NOT_MET, ["--strict"], 1),
+        ("met", ["--strict"], 0),
+        ("not shown", ["--strict"], 0),
+    ],
+)
+def test_an_acceptance_that_is_not_met_is_an_error_where_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdict: str, words: list[str], code: int
+) -> None:
+    accepted = SimpleNamespace(
+        on_bench=False,
+        check=lambda: None,
+        run=lambda missing: [],
+        verdicts=lambda results: [verdict],
+    )
+    monkeypatch.setattr(acceptance_plan, "read_acceptance_plan", lambda *_: None)
+    monkeypatch.setattr(acceptance_engine, "Acceptance", lambda *_: accepted)
+    monkeypatch.setattr(acceptance_engine, "write_ledger", lambda path, results: 0)
+    monkeypatch.setattr(acceptance_page, "write_acceptance", lambda *_: {})
+    monkeypatch.setattr(acceptance_page, "lines_of", lambda *_: ["a line"])
+    monkeypatch.setattr(acceptance_page, "verdict_of", lambda verdicts: verdicts[0])
+    done = run_hilstar_here("accept", "bench.toml", "-o", "out", *words, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (code, "")
+    assert done.stdout.splitlines()[0] == "a line"

@@ -54,10 +54,10 @@ def test_errors_are_root_mean_squares_and_maxima_of_light_and_of_place():
     shown[5, 15] = 4.0
     shown[19, 8] = 8.0
     shown[15, 15] = 8.0
-    found = measure(wanted, shown, 10)
+    errors = measure(wanted, shown, 10)
     half_mag = 2.5 * np.log10(2)
-    assert (found.flux_rms_mag, found.flux_max_mag) == pytest.approx((half_mag / 2, half_mag))
-    assert (found.centroid_rms_px, found.centroid_max_px) == pytest.approx((2.5, 5.0))
+    assert (errors.flux_rms_mag, errors.flux_max_mag) == pytest.approx((half_mag / 2, half_mag))
+    assert (errors.centroid_rms_px, errors.centroid_max_px) == pytest.approx((2.5, 5.0))
     shown[15, 15] = 0.0
     lost = measure(wanted, shown, 10)
     assert lost.centroid_max_px == lost.flux_max_mag == np.inf

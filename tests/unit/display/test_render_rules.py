@@ -21,7 +21,13 @@ from hilstar.display.render.backend import ScreenView, as_maps, level_cost
 from hilstar.display.render.context import check_limits, draws_by_cpu
 from hilstar.display.render.cpu_stars import CpuStars, least_side_px
 from hilstar.display.render.disc_tiles import TILE_PX, Sure
-from hilstar.display.render.encoder import MEETING_WINGS, lit_sides
+from hilstar.display.render.encoder import (
+    MEETING_WINGS,
+    lit_sides,
+    most_covered_px,
+    set_sides,
+    viewport_of_sprites,
+)
 from hilstar.display.render.light_units import DENSER_WINGS, MAX_SUM, LightUnits
 from hilstar.display.render.numpy_backend import NumpyBackend
 from hilstar.display.render.presenter import checked_triples, drawn_codes
@@ -345,6 +351,32 @@ def test_a_lone_star_lights_its_pixel_from_the_first_threshold_on(share, lit):
     assert np.count_nonzero(backend.levels()) == lit
 
 
+@pytest.mark.parametrize("per_star", [1, 4])
+def test_sprites_cover_the_squares_of_their_whole_stars_at_most(per_star):
+    """Two of 10 px, three of 6 and one of 4, by rates that are a path's in all."""
+    rates = np.array([200.0, 100.0, 99.0, 50.0, 10.0, 9.0]) / per_star
+    stars = replace(sprites_at(np.zeros((6, 2)), rates, 10), per_star=per_star)
+    sides = (SpriteSide(100.0, 6), SpriteSide(10.0, 4))
+    assert most_covered_px(stars, 10, sides, 0) == 2 * 100 + 3 * 36 + 16
+    # fewer than are worth counting, or of one side
+    assert most_covered_px(stars, 10, sides, 601) == most_covered_px(stars, 10, (), 0) == 600
+
+
+def test_a_program_of_points_knows_up_to_eight_sides_and_a_footprint_about_its_image():
+    sides = tuple(SpriteSide(100.0 - k, 20 - 2 * k) for k in range(9))
+    program: dict[str, object] = {}
+    set_sides(program, sides[:8])
+    assert program["sides"] == 8
+    set_sides(program, sides[:2])
+    assert program == {
+        "sides": 2,
+        "below_e_per_s": [100.0, 99.0, *[0.0] * 6],
+        "side_px": [20, 18, *[0] * 6],
+    }
+    assert refusal(set_sides, program, sides) == "9 sizes of sprites; give at most 8"
+    assert viewport_of_sprites((64, 48), 5) == (-5, -5, 74, 58)
+
+
 def test_nothing_stays_of_a_frame_in_finer_units_or_of_a_floor(rng):
     """Sixty stars over white need units that an int has no room for."""
     target = Target(SIZE_PX, PSF, gamma_response(8, 2.2), WHITE_E_PER_S)
@@ -389,13 +421,13 @@ def test_a_tile_has_a_sprite_s_light_where_its_square_touches_it(rng):
     corner_px, shape = (-32 + 7, 13), (5, 7)
     for reach_px in (3, 40):
         sprites_px = rng.integers((-60, -40), (300, 260), (6, 2))
-        found = Sure(1.0, 2.0, sprites_px, reach_px).apart(corner_px, shape)
+        is_apart = Sure(1.0, 2.0, sprites_px, reach_px).apart(corner_px, shape)
         rows, columns = np.indices((5 * TILE_PX, 7 * TILE_PX))
         is_lit = np.zeros(rows.shape, bool)
         for x, y in sprites_px - corner_px:
             is_lit |= (np.abs(columns - x) <= reach_px) & (np.abs(rows - y) <= reach_px)
         by_tile = is_lit.reshape(5, TILE_PX, 7, TILE_PX).any(axis=(1, 3))
-        assert np.array_equal(found, ~by_tile)
+        assert np.array_equal(is_apart, ~by_tile)
 
 
 def test_a_thousand_stars_in_a_pixel_have_their_light_though_each_is_rounded(rng):

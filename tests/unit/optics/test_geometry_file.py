@@ -119,19 +119,3 @@ def test_a_file_of_another_kind_is_refused(tmp_path, kind):
     path = geometry_file(tmp_path)
     path.write_text(path.read_text().replace(KIND, kind))
     assert f"kind = '{kind}' and '{KIND}' is wanted" in refusal(load_geometry, path, SIZE)
-
-
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ("map_arcsec = [[1.0, 2.0], [3.0]]", "map_arcsec has rows of different lengths"),
-        ("map_arcsec = [[1.0, 2.0]]\nmodes_arcsec = [[1.0, 2.0]]", "not x and y of each place"),
-        ("modes_arcsec = [[1.0, 2.0]]", "not x and y of each place"),
-        ("alignment_covariance_arcsec2 = [[1.0, 0.0], [0.0, 1.0]]", "is not 3 by 3"),
-    ],
-)
-def test_a_map_of_errors_has_two_figures_of_each_place(tmp_path, table, words):
-    assert words in refusal(load_notes, geometry_file(tmp_path, f"[error]\n{table}"))
-    right = "map_arcsec = [[1.0, 2.0]]\nmodes_arcsec = [[1.0, 2.0, 3.0, 4.0]]"
-    notes = load_notes(geometry_file(tmp_path, f"[error]\n{right}"))
-    assert notes.error.modes_arcsec == [[1.0, 2.0, 3.0, 4.0]]

@@ -135,8 +135,11 @@ def test_a_disc_s_radius_is_of_a_power_of_its_light(rng, share, radius_px):
 
 
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)])
-def test_of_two_discs_the_brighter_shows(order):
-    rows, columns, greys = np.array([10, 10]), np.array([10, 13]), np.array([0.9, 0.4])
+@pytest.mark.parametrize(
+    ("greys", "row"), [((0.9, 0.4), [0.9] * 7 + [0.4]), ((0.4, 0.9), [0.4] + [0.9] * 7)]
+)
+def test_of_two_discs_the_brighter_shows(order, greys, row):
     kept = list(order)
-    drawn = _discs((21, 30), (rows[kept], columns[kept]), np.full(2, 4.0), greys[kept])
-    assert drawn[10, 8:16].tolist() == [0.9] * 7 + [0.4]
+    places = (np.array([10, 10])[kept], np.array([10, 13])[kept])
+    drawn = _discs((21, 30), places, np.full(2, 4.0), np.array(greys)[kept])
+    assert drawn[10, 8:16].tolist() == row

@@ -24,6 +24,7 @@ from hilstar.instruments.assess.clock import (
 )
 from hilstar.instruments.assess.components import global_phases
 from hilstar.server.record.commanded import Commanded
+from tests.support.assessments import a_clock
 from tests.support.planted_tracker import SCALE, attitude, scalar_first
 
 ARCSEC_PER_RAD = 180 * 3600 / np.pi
@@ -243,3 +244,9 @@ def test_telemetry_that_began_before_a_steady_slew_is_found_by_its_attitudes():
     assert coarse is not None
     assert coarse.offset_s == pytest.approx(START_S - 10.0, abs=0.5)
     assert coarse.turn_rad < np.radians(0.5)
+
+
+def test_a_telemetry_s_time_is_put_on_the_run_s_clock() -> None:
+    """An hour after a start at 100 s, of a clock 1.25 ms ahead and 12.5 ppm fast."""
+    told_s = 100 + 0.00125 + 3600 * (1 + 12.5e-6)
+    assert a_clock().run_s(np.array([told_s]), 100.0) == pytest.approx([3700.0], rel=1e-12)

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from hilstar.instruments.assess.budget import _of_fit, intervals_of
+from hilstar.instruments.assess.budget import _field_interval, _of_fit, intervals_of
 from hilstar.instruments.assess.components import NOTHING, Component, Components
+from hilstar.instruments.assess.look_alikes import LookAlikes
 from tools.interval_coverage import KINDS
 
 TRIALS = 200
@@ -47,6 +48,19 @@ def test_the_mean_square_of_a_fit_scatters_as_a_noncentral_chi_square(size: floa
     variance = _of_fit(np.array([size]), FUNCTIONS, np.array([of_answer]))
     standard = stats.ncx2(FUNCTIONS, size / of_answer).var() if size else 2 * FUNCTIONS
     assert variance == pytest.approx(standard * of_answer**2)
+
+
+def test_a_field_s_axes_across_are_two_that_err_by_themselves() -> None:
+    """A known clock and nothing slow: across, the mean of two mean squares scatters by the root of
+    two less than the one about the boresight.
+    """
+    fov = Component(np.full(3, 4.0), np.ones((ANSWERS, 3)), float(FUNCTIONS))
+    known = LookAlikes(np.zeros((ANSWERS, 3, 2)), np.eye(2), np.zeros(3))
+    low, high = _field_interval(fov, np.ones(3), known)
+    sigma = math.sqrt(4 * 4.0 / ANSWERS + 2 * FUNCTIONS / ANSWERS**2)
+    within = 1.96 * sigma * np.array([math.sqrt(0.5), 1.0])
+    assert high**2 == pytest.approx(4.0 + within, rel=1e-4)
+    assert low**2 == pytest.approx(4.0 - within, rel=1e-4)
 
 
 @pytest.mark.parametrize(

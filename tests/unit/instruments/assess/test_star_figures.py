@@ -146,6 +146,16 @@ def test_a_sharp_limit_is_where_the_last_star_was_reported(limit_mag, rng):
     assert all_seen == pytest.approx(6.975, abs=1e-9)
 
 
+def test_a_limit_of_drawn_cases_is_by_the_stars_that_were_lit_in_them() -> None:
+    """Ten bins of ten stars: all are seen but in the second case, which sees half of all bins'."""
+    lit = np.full((2, 10), 10)
+    reported = np.stack([lit[0], np.repeat([10, 0], 5)])
+    middle_mag = 4.025 + 0.05 * np.arange(10)
+    bins = DetectionBins(middle_mag, lit, reported)
+    assert bins.half_seen(np.array([1])) == pytest.approx(4.25, abs=0.01)
+    assert bins.half_seen(np.array([0])) == pytest.approx(middle_mag[-1], abs=1e-9)
+
+
 @pytest.mark.parametrize("colour", [0.0, 0.1])
 def test_a_colour_is_told_beside_a_signal_that_bends_with_the_light(colour, rng):
     """Stars that are the redder the further they are from V 5, by signals that are too: 0.1 mag at

@@ -101,6 +101,14 @@ def test_a_tracker_is_silent_beyond_each_of_its_limits():
         assert (rate == "planted: max_rate_deg_s") is beyond
 
 
+def test_a_planted_bias_is_about_the_tracker_s_own_axes():
+    bias_arcsec = np.array([20.0, -10.0, 300.0])
+    told = tracker(bias_arcsec=tuple(bias_arcsec)).reported(solved_at(0.0), exposure(), 0.0)
+    error = Rotation.from_matrix(to_matrix(told.q_icrs_to_cam) @ to_matrix(START_Q).T)
+    turn_arcsec = np.degrees(error.as_rotvec()) * 3600
+    assert turn_arcsec == pytest.approx(bias_arcsec, abs=1e-6)
+
+
 def test_planted_rates_are_scaled_biased_and_late():
     """A rate that lags by 0.5 s under 0.2 deg/s2 is 0.1 deg/s short of it."""
     acceleration = np.radians([0.2, 0.0, -0.4])

@@ -928,6 +928,7 @@ def test_a_bench_that_predicts_or_moves_nothing_draws_points(tmp_path, keys, pre
     assert ways == {(prediction, "point")}
     assert (turning.default.prediction, turning.default.smear) == ("rate", default)
     assert {still.auto.prediction, still.as_filed.prediction} == {"rate"}
+    assert (turning.auto.sprite, turning.default.sprite) == ("cut", "full")
 
 
 def test_a_star_on_a_path_is_found_with_a_tenth_of_its_light(parts):

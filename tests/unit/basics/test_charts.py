@@ -159,3 +159,14 @@ def test_a_path_without_an_ending_keeps_what_looks_like_one(tmp_path, monkeypatc
         "run.0001.png",
         "run.0001.svg",
     ]
+
+
+def test_a_name_that_was_moved_from_its_line_s_end_is_joined_to_it():
+    with charts.panels_of("Three lines") as (axes,):
+        for name, end in (("high", 0.9), ("upper", 0.5), ("lower", 0.499)):
+            axes.plot([0, 1], [0.5, end], label=name)
+        axes.plot([0, 0.5], [0.1, 0.1], label="short")
+        axes.set(xlim=(0, 1), ylim=(0, 1))
+        charts.label_ends(axes)
+    joined = {text.get_text(): text.arrow_patch is not None for text in axes.texts}
+    assert joined == {"high": False, "upper": False, "lower": True, "short": True}

@@ -185,7 +185,7 @@ def test_a_page_is_light_on_paper_whatever_the_reader_prefers() -> None:
         (12345.678, "12\u202f350"),
         (12345, "12\u202f345"),
         (1e15, "1\u202f000\u202f000\u202f000\u202f000\u202f000"),
-        (0.0002, "0.0002"),
+        (0.00023456, "0.0002346"),
         (-0.00002, "-2\N{MIDDLE DOT}10\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT FIVE}"),
         (False, "False"),
         ([1, 2, 3], "1, 2, 3"),

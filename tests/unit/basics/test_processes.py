@@ -288,6 +288,17 @@ def test_a_user_s_module_is_the_one_beside_the_file_and_hides_no_installed_one(
             user_function(f"python:{function}", tmp_path)
 
 
+def test_modules_of_one_name_are_each_those_of_their_own_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for folder, level in (("a", 5), ("b", 6)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "of_two_benches.py").write_text(f"def level(): return {level}\n")
+    found = [user_function("python:of_two_benches:level", tmp_path / name)() for name in "abab"]
+    assert found == [5, 6, 5, 6]
+    assert sys.path[-1] == str(tmp_path / "b")  # last: it hides nothing that is installed
+    assert sys.path.count(str(tmp_path / "b")) == 1
+
+
 @pytest.fixture
 def ending(monkeypatch):
     """The state of a command's end, as if its handlers were installed."""

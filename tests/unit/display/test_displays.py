@@ -146,3 +146,11 @@ def test_a_monitor_s_identity_has_what_x_says_and_the_kernel_s_edid_where_x_hide
         assert now.window_system == (added if output is shown else added[:1])
     assert names == {None: "DELL U2412M", hidden: "DELL U2412M", shown: "DELL P2423D"}
     assert identity_of(display("VGA-1"), None, b"", {}, tmp_path).model == ""
+
+
+def test_a_display_s_line_has_its_number_its_name_its_mode_and_its_size():
+    """A server that does not say its refresh, as Xvfb, has none of 0 Hz."""
+    plain = display(resolution_px=(1920, 1200), refresh_hz=60, size_mm=(518, 324))
+    assert plain.line() == f"{plain.index}: DP-1, 1920 x 1200, 60 Hz, 518 x 324 mm"
+    unknown = display(resolution_px=(640, 480), refresh_hz=0, size_mm=(163, 122))
+    assert unknown.line() == f"{plain.index}: DP-1, 640 x 480, refresh not known, 163 x 122 mm"

@@ -202,6 +202,17 @@ def test_a_late_clock_is_named_with_its_offset(rng):
     assert float(cause.split()[3]) == pytest.approx(0.05, abs=0.002)
 
 
+def test_a_late_clock_is_named_whichever_way_the_tracker_is_turned(rng):
+    """Rates are about the axes of what was commanded, a third of a turn from the tracker's."""
+    commanded = commanded_of(rng, 60)
+    rate = rng.normal(size=(60, 3)) * np.radians(1.0)
+    late = multiply(from_rotation_vectors(-rate * 0.05), commanded)
+    turn = from_rotation_vector(np.array([0.0, 0.0, 2 * np.pi / 3]))
+    found = align(pairs_of(commanded, multiply(turn, late), rate), CAMERA)
+    (cause,) = found.residual.causes
+    assert float(cause.split()[3]) == pytest.approx(0.05, rel=1e-6)
+
+
 def wild_half(rng: np.random.Generator, reported: np.ndarray) -> np.ndarray:
     return np.concatenate([commanded_of(rng, 20), reported[20:]])
 

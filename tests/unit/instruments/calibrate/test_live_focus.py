@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate import live_focus
 from hilstar.instruments.calibrate.first_light.focus import Sharpness
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
 from hilstar.instruments.calibrate.live_focus import focus_readings, follow_answers, streak
@@ -122,6 +123,44 @@ def test_dots_that_saturate_have_no_figure_and_are_dimmed(benches, tmp_path):
         reading = next(images)
         assert reading.figure is None and "saturate" in reading.why
         assert next(images).code < reading.code == 2**10 - 1
+
+
+def test_a_pattern_is_shown_to_its_watcher_once_and_images_are_read_as_they_come(
+    tmp_path, monkeypatch
+):
+    """Dots of more than 600 DN saturate a tracker that sees codes as they are."""
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
+    file = read_bench_file(tmp_path / "bench.toml")
+    looked = {}
+
+    def look(file, pattern, stem, exposure_s):
+        looked[stem] = float(pattern.codes.max())
+        return stem
+
+    def sharpness(light, screen, detector):
+        raise InputError(f"{light:.0f} DN are no dots")
+
+    source = SimpleNamespace(look=look, pixels=lambda path, size_px: looked[path])
+    dots = {
+        "seen_screen_of": lambda file: None,
+        "first_dots": lambda screen: None,
+        "dot_image": lambda plan, frame, size_px, code: np.full((2, 2), code, dtype=np.uint16),
+        "is_too_bright": lambda image, dark, detector: image > 600,
+        "seen_sharpness": sharpness,
+    }
+    for name, value in dots.items():
+        monkeypatch.setattr(live_focus, name, value)
+    watched = []
+    images = focus_readings(file, source, tmp_path, 1.0, watched.append)
+    readings = [next(images) for _ in range(6)]
+    first, second, *others = (reading.code for reading in readings)
+    assert first == 1023
+    assert others == [others[0]] * 4
+    assert 0 < others[0] < 600
+    shown = [int(pattern.codes.max()) for pattern in watched]
+    assert shown == list(dict.fromkeys([first, second, others[0]]))
+    assert readings[-1].why == f"{others[0]} DN are no dots"
+    assert [reading.number for reading in readings] == [1, 2, 3, 4, 5, 6]
 
 
 def test_the_command_ends_with_the_best_image(benches, tmp_path):

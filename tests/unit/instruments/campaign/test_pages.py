@@ -186,6 +186,8 @@ def test_the_verdict_of_all_requirements_is_the_worst(required, words, whole, st
     assert requirements_page.verdict_of(verdicts) == whole
     assert requirements_page._verdict(verdicts).state == state
     assert acceptance_page.verdict_of([clause_of(word) for word in words]) == whole
+    untested = ClauseVerdict(clause_of(MET).clause, None, "", "no clock")
+    assert acceptance_page.verdict_of([untested]) == NOT_SHOWN
     told = requirements_page._verdict(verdicts).words
     assert told.startswith(f"Of {len(words)}: ")
     for word in set(words):
@@ -464,3 +466,17 @@ def test_what_is_open_is_more_cases_or_why_there_is_no_figure() -> None:
     tested = [clause_of(MET)]
     assert [tile.state for tile in acceptance_page._counts(tested)] == [OK]
     assert [tile.state for tile in acceptance_page._counts([clause_of(NOT_MET)])] == [WARN, BAD]
+
+
+def test_a_case_s_rate_is_that_of_all_axes_together_and_its_error_one_of_two(tmp_path) -> None:
+    """3 and 4 deg/s are 5; 6 and 8 arcsec about the median are 10 of two axes."""
+    numbers = {
+        "error_x_arcsec": np.array([10.0, 16.0, 4.0, np.nan]),
+        "error_y_arcsec": np.array([20.0, 28.0, 12.0, np.nan]),
+        "vary.rate_deg_s.x": np.array([0.0, 3.0, -3.0, 1.0]),
+        "vary.rate_deg_s.y": np.array([1.0, -4.0, 4.0, 0.0]),
+        "vary.tracker.exposure_s": np.full(4, 9.0),
+    }
+    error, rate = requirements_page._error_and_rate(Columns(4, numbers, {}))
+    assert error[:3] == pytest.approx(np.array([0.0, 10.0, 10.0]) / np.sqrt(2))
+    assert rate == pytest.approx([1.0, 5.0, 5.0, 1.0])

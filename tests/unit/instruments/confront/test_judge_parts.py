@@ -207,3 +207,40 @@ def test_dim_parts_are_named_by_the_quarter_of_an_image_that_is_no_square(x_px, 
     # a faint star beside the part is in it, one with all of its light is not
     assert is_dim(row_at(x_px, y_px, 0.5))
     assert not is_dim(row_at(x_px, y_px, 0.1))
+
+
+@pytest.mark.parametrize(("floor_px", "used_px"), [(0.3, 0.3), (0.001, 0.02)])
+def test_a_date_is_told_by_the_stars_that_move_and_by_their_places_errors(
+    floor_px, used_px, monkeypatch
+):
+    """Four stars move by 0.4 px a year along x, and are 0.8 px on: two years late, by places that
+    are known to 0.4 px each and to the camera's floor. The fifth is not clean.
+    """
+    now = np.array(
+        [[0.1, 0.2, 1.0], [0.3, 0.1, 1.0], [0.2, 0.4, 1.0], [0.0, 0.0, 1.0], [9.0, 9, 1]]
+    )
+    monkeypatch.setattr(
+        judge,
+        "unit_vectors_icrs",
+        lambda catalog, epoch: np.array([4e-4 * (epoch - 2020.0), 0.0, 0.0]) + catalog,
+    )
+    order = np.array([4, 3, 2, 1, 0])
+    by_row = SimpleNamespace(taken=lambda rows: now[::-1][rows])
+    sky = SimpleNamespace(catalog=by_row, order=order, epoch_jyear=2020.0, vectors=now)
+    star = np.array([3, 0, 4, 1, 2])
+    places_px = 1000 * now[star, :2] + [0.8, 0.0]
+    shot = SimpleNamespace(
+        clean=np.array([True, True, False, True, True]),
+        star=star,
+        sky=sky,
+        found=SimpleNamespace(places_px=places_px, sigma_px=np.full(5, 0.4)),
+    )
+    looking = SimpleNamespace(places_px=lambda camera, vectors: (1000 * vectors[:, :2]).T)
+    camera = SimpleNamespace(pointings=[looking], camera=None, floor_px=floor_px)
+    judging: Any = SimpleNamespace(session=SimpleNamespace(shots=[shot], camera=camera))
+    found = Judge._dated(judging, 0)
+    assert found is not None
+    assert found.years == pytest.approx(2.0)
+    assert found.sigma == pytest.approx(math.hypot(0.4, used_px) / (0.4 * 2))
+    shot.clean[:] = False
+    assert Judge._dated(judging, 0) is None

@@ -307,6 +307,9 @@ def test_nea_is_the_scatter_of_attitudes_from_stars_off_by_their_bounds():
         math.hypot(x, y) / math.sqrt(2), rel=4 / math.sqrt(4 * trials)
     )
     assert about[-1] == pytest.approx(z, rel=4 / math.sqrt(2 * trials))
+    # of stars that every second exposure has: half the information
+    rare = nea_arcsec(turns, np.stack([sigma_px] * 2), np.full(count, 0.5))
+    np.testing.assert_allclose(rare[:, 1:], math.sqrt(2) * np.stack([across, about])[:, 1:])
     lost = np.stack([np.where(np.arange(count) < 2, (np.nan, 1e6) * (count // 2), sigma_px)] * 2)
     # stars without a place are none
     assert np.isinf(nea_arcsec(turns, lost, np.ones(count))[:, :3]).all()

@@ -14,6 +14,7 @@ import pytest
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.display.balance import Seen
 from hilstar.display.quantise import LevelCost
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.backend import level_cost
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
@@ -33,9 +34,11 @@ from hilstar.server.bench.effort import (
     FieldCost,
     Light,
     _combinations,
+    _cut_to_mag,
     cut_px,
     exact_in_time,
     plan_effort,
+    side_candidates,
 )
 from hilstar.server.bench.effort_report import effort_keys, effort_lines
 from hilstar.server.bench.least_psf import Choice
@@ -316,6 +319,26 @@ def test_small_sprites_save_the_pixels_that_the_catalogue_s_stars_do_not_need():
     sprites = effort.taken.sprites.choice
     share = np.mean(area_px) / GaussianPsf(SIGMA).footprint_px ** 2
     assert sprites.ms / (sprites.ms + sprites.saved_ms) == pytest.approx(share)
+
+
+@pytest.mark.parametrize("method", ["round", "exact"])
+def test_the_sprites_of_codes_are_as_those_codes_light_pixels(method):
+    """A star under full scale by so many magnitudes has its peak there, and beyond its sprite a
+    quarter of what lights a pixel at most.
+    """
+    sky = replace(light_range(10, 6.0), turning=0.5, sky_share=0.1)
+    asked = render_settings(tolerance_mag=0.05, tolerance_px=0.05)
+    own = [sides.sides for sides in side_candidates(asked, sky, method)]
+    of_method = [
+        one.sprites.sides
+        for one in _combinations(asked, sky, ("round", "exact"))
+        if one.method == method
+    ]
+    assert set(of_method) == set(own)
+    lit_e_per_s = QUANTISERS[method].lit_from_e_per_s(sky.panel)
+    for size in (4, 6, 8):
+        rate = 1e6 * 10 ** (-0.4 * _cut_to_mag(sky, method, size)) / sky.psf.peak_share
+        assert rate * sky.psf.outside_share(size) == pytest.approx(lit_e_per_s / 4)
 
 
 @pytest.mark.parametrize("size", [4, 6, 8, 5, 7])

@@ -963,11 +963,15 @@ def test_no_star_is_judged_that_clips_or_shows_less_than_half_a_step(parts):
 def test_points_that_are_drawn_for_paths_are_charged_to_smear_alone(parts, monkeypatch):
     monkeypatch.setattr(predictors, "JITTER", ())
     scene = scene_of(parts, 4)
-    drawn_as_points = replace(scene.marks.auto, smear="point")
+    drawn_as_points = replace(scene.marks.auto, smear="point", sprite="coarse")
     budget = error_budget(scene, drawn_as_points)
     by_step = {part.step: part.error_arcsec for part in budget}
     # against the sky itself, the panel's refresh included
     assert by_step["whole"] == pytest.approx(scene.error(drawn_as_points).error_arcsec, rel=ROUNDED)
     assert by_step["refresh"] > 0.01 * by_step["whole"]
+    # what coarse sprites cut is charged last, and not to the codes
+    assert by_step["sprites"] > 0
+    whole, rss = by_step.pop("whole"), by_step.pop("rss")
+    assert rss == pytest.approx(math.hypot(*by_step.values()), rel=ROUNDED) and whole > 0
     assert by_step["smear"] > 100 and by_step["depth"] < 0.01 * by_step["smear"]
     assert by_step["codes"] < 0.1 * by_step["smear"]

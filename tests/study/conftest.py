@@ -8,6 +8,7 @@ an SVG takes as long as its PNG.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial, wraps
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from hilstar.basics import charts
+from hilstar.instruments.study import sweep
 from hilstar.instruments.study.sweep import Load, OtherWork
 from tests.support.studies import SmallRun, Studied, studied
 
@@ -64,6 +66,33 @@ def whole_study(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Studi
     return partial(studied, tmp_path_factory)
 
 
+@contextmanager
+def times_are_watched() -> Iterator[None]:
+    """Whoever times works counts what others do from before the first of them to after the last."""
+    is_counted = False
+    begin, spent = OtherWork.__init__, sweep.spent
+
+    def begun(others: OtherWork) -> None:
+        nonlocal is_counted
+        is_counted = True
+        begin(others)
+
+    def ended(others: OtherWork) -> Load:
+        nonlocal is_counted
+        is_counted = False
+        return Load()
+
+    def timed(work: Callable[[], object]) -> sweep.Spent:
+        assert is_counted
+        return spent(work)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(OtherWork, "__init__", begun)
+        patch.setattr(OtherWork, "load", ended)
+        patch.setattr(sweep, "spent", timed)
+        yield
+
+
 @pytest.fixture(scope="session")
 def small_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SmallRun]:
     """Runs a study's own function, which takes a folder first, in this process; its charts are
@@ -73,7 +102,7 @@ def small_run(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., SmallRu
     def run(work: Callable[..., object], *arguments: object) -> SmallRun:
         folder = tmp_path_factory.mktemp("small")
         saved: dict[str, Figure] = {}
-        with pytest.MonkeyPatch.context() as patch:
+        with pytest.MonkeyPatch.context() as patch, times_are_watched():
             patch.setattr(charts, "finish", lambda drawn: None)
             patch.setattr(charts, "save", lambda drawn, path: saved.update({path.name: drawn}))
             told = work(folder, *arguments)

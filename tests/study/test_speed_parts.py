@@ -483,6 +483,8 @@ def test_a_plan_is_measured_on_its_own_file_cell_by_cell(small_bench_file, monke
     methods = {"numpy": benchmark.numpy_linear}, {"galsim": "not installed"}
     monkeypatch.setattr(benchmark, "other_methods", lambda: methods)
     monkeypatch.setattr(benchmark, "fresh_start", fresh_start)
+    # of the last minute, five and fifteen
+    monkeypatch.setattr(os, "getloadavg", lambda: (1.234, 5.0, 15.0))
     file = benchmark.read_bench_file(small_bench_file)
     size = file.config.monitor.resolution_px
     plan = benchmark.BenchmarkPlan((size,), (3, 2000), 1, 60.0, 3, 0, file)
@@ -496,6 +498,7 @@ def test_a_plan_is_measured_on_its_own_file_cell_by_cell(small_bench_file, monke
     assert {(row.size, row.stars) for row in result.rows} == {(size, 3), (size, 2000)}
     assert list(result.does) == ["numpy"] and result.tracker == []
     assert [(row.method, row.why) for row in result.skipped] == [("galsim", "not installed")]
+    assert result.machine.load == 1.23
     assert result.gl_renderer and result.machine.cores == len(os.sched_getaffinity(0))
     whats = [aim.what for aim in result.aims]
     assert whats == [

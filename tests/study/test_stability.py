@@ -471,6 +471,11 @@ def test_a_star_s_largest_errors_are_those_of_either_sign():
     # the middle has 95 % of the light of its neighbour, 1.1 px from the star
     beside, own = image.pixel_shares(np.array([1.1, 0.1]), image.SIGMA_PX)
     assert errors.peak == pytest.approx(0.95 * beside / own - 1, rel=1e-4)
+    # beyond half a pixel the middle is the next one's
+    right = image.star_errors(
+        lambda s: image.linear_image(s, on.resolution_px, on.psf), on, np.array([0.7, -0.7])
+    )
+    assert abs(right.peak) < 1e-6 and right.flux < 2e-6
     brighter = image.star_errors(lambda s: 1.03 * draw(s), on, np.array([-0.3]))
     assert (brighter.flux, brighter.peak) == pytest.approx((1.03**2 - 1,) * 2, rel=1e-3)
 

@@ -928,6 +928,7 @@ def test_a_bench_that_predicts_or_moves_nothing_draws_points(tmp_path, keys, pre
     assert ways == {(prediction, "point")}
     assert (turning.default.prediction, turning.default.smear) == ("rate", default)
     assert {still.auto.prediction, still.as_filed.prediction} == {"rate"}
+    assert (turning.auto.sprite, turning.default.sprite) == ("cut", "full")
 
 
 def test_a_star_on_a_path_is_found_with_a_tenth_of_its_light(parts):
@@ -962,11 +963,15 @@ def test_no_star_is_judged_that_clips_or_shows_less_than_half_a_step(parts):
 def test_points_that_are_drawn_for_paths_are_charged_to_smear_alone(parts, monkeypatch):
     monkeypatch.setattr(predictors, "JITTER", ())
     scene = scene_of(parts, 4)
-    drawn_as_points = replace(scene.marks.auto, smear="point")
+    drawn_as_points = replace(scene.marks.auto, smear="point", sprite="coarse")
     budget = error_budget(scene, drawn_as_points)
     by_step = {part.step: part.error_arcsec for part in budget}
     # against the sky itself, the panel's refresh included
     assert by_step["whole"] == pytest.approx(scene.error(drawn_as_points).error_arcsec, rel=ROUNDED)
     assert by_step["refresh"] > 0.01 * by_step["whole"]
+    # what coarse sprites cut is charged last, and not to the codes
+    assert by_step["sprites"] > 0
+    whole, rss = by_step.pop("whole"), by_step.pop("rss")
+    assert rss == pytest.approx(math.hypot(*by_step.values()), rel=ROUNDED) and whole > 0
     assert by_step["smear"] > 100 and by_step["depth"] < 0.01 * by_step["smear"]
     assert by_step["codes"] < 0.1 * by_step["smear"]

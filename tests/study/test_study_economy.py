@@ -139,6 +139,7 @@ def test_a_scene_that_turns_is_drawn_along_its_paths_at_each_effort(monkeypatch)
 
     class Planted:
         def __init__(self, path, tables):
+            self.name = path.stem
             tables_of[path.stem] = tables
 
         def __enter__(self):
@@ -147,8 +148,20 @@ def test_a_scene_that_turns_is_drawn_along_its_paths_at_each_effort(monkeypatch)
         def __exit__(self, *raised):
             pass
 
+    drawn = []
+
+    def in_turn(works, rounds):
+        for name, work in works.items():
+            work(3)
+            assert drawn[-1] == (name, 3)
+        return dict.fromkeys(works, rounds)
+
+    def frame_of(bench, turn, number):
+        drawn.append((bench.name, number))
+
     monkeypatch.setattr(economy, "study_bench", Planted)
-    monkeypatch.setattr(economy, "in_turn", dict.fromkeys)
+    monkeypatch.setattr(economy, "in_turn", in_turn)
+    monkeypatch.setattr(economy, "frame_of", frame_of)
     monkeypatch.setattr(economy, "outcome", lambda scene, name, bench, times: (name, times))
     for scene, motion in ((SCENES[0], "auto"), (SCENES[4], "on")):
         assert economy.compare(scene, 12, 7) == [("full", 7), ("default", 7), ("0.1", 7)]

@@ -14,7 +14,7 @@ import pytest
 from hilstar.basics import charts
 from hilstar.display.phases import USUAL_PSF, fainter, measure, phase_grid
 from hilstar.display.render.reference import linear_image
-from hilstar.instruments.study import codes, quantisation
+from hilstar.instruments.study import codes, quantisation, sweep
 from hilstar.instruments.study.codes import (
     AIMS,
     BITS,
@@ -296,6 +296,35 @@ def test_errors_fall_with_the_frames_of_an_exposure():
     assert srgb.steps == pytest.approx(star / first_step, rel=1e-6)
     assert steps_words(srgb) == f"sRGB, 8 bits: {srgb.steps:.1f} steps"
     assert steps_words(replace(srgb, steps=100.4)) == "sRGB, 8 bits: 100 steps"
+
+
+def test_a_study_s_lines_and_tables_are_of_each_of_its_parts(rows, small_run, monkeypatch):
+    """Its times are planted, and what frames add up to."""
+    timed = []
+    for bits, way in product(BITS, WAYS):
+        of_way = faintest(rows, bits, way.name).figures
+        timed.append(TimedWay(bits, way.name, bits * 1.5, AIMS[bits][1], of_way))
+
+    def timed_ways(given, rounds):
+        assert (given, rounds) == (rows, quantisation.QUICK_ROUNDS)
+        sweep.spent(list)
+        return timed
+
+    monkeypatch.setattr(quantisation, "way_errors", lambda quick: rows)
+    monkeypatch.setattr(quantisation, "timed_ways", timed_ways)
+    monkeypatch.setattr(codes, "study_frames", lambda folder, quick: f"frames in {folder.name}")
+    run = small_run(quantisation.run, True)
+    lines, right = run.told
+    wanted = [summary(bits, rows) for bits in BITS]
+    wanted += [centroiders_line(centroider_errors(rows)), times_line(timed)]
+    assert (lines, right) == ([*wanted, f"frames in {run.folder.name}"], True)
+    assert len(run.rows("quantisation")) == len(rows)
+    written = run.rows("quantisation_time")
+    assert [(int(row["bits"]), row["method"], float(row["frame_ms"])) for row in written] == [
+        (row.bits, row.method, row.frame_ms) for row in timed
+    ]
+    charts_of = {"quantisation", "quantisation_centroiders", "quantisation_time"}
+    assert set(run.charts) == charts_of
 
 
 def test_errors_over_frames_are_rms_over_where_an_exposure_begins(monkeypatch):

@@ -193,6 +193,29 @@ def test_predictions_are_told_by_their_worst_and_rms_and_timed_after_the_last_sa
         assert (times_ns[0], times_ns[-1]) == (samples[-2].t_ns, samples[-1].t_ns)
 
 
+def test_each_field_s_stars_are_those_near_its_own_boresight(monkeypatch):
+    fields = []
+
+    def in_fields(road, near, turns, camera):
+        fields.append((near, turns))
+        return np.zeros((sum(map(len, near)), 2))
+
+    monkeypatch.setattr(places, "places_in_fields", in_fields)
+    with ExitStack() as stack:
+        step = places.projection(stack, True)
+    camera = places.ideal_monitor(places.demo_config())
+    cos_field = math.cos(camera.field_radius_rad(0.0))
+    assert len(fields) == 1 + len(places.ROADS)
+    for near, turns in fields:
+        assert len(near) == len(turns) == 6
+        for vectors, turn in zip(near, turns, strict=True):
+            cosines = vectors @ turn[2]
+            # cells that reach into the field may end some degrees beyond it
+            assert (cosines > cos_field).sum() > 100
+            assert cosines.min() > math.cos(math.acos(cos_field) + math.radians(10))
+    assert step.work.startswith(f"{len(fields[0][0][0])} stars near the field to sprites")
+
+
 def test_extended_precision_knows_places_between_those_of_float64():
     camera = places.ideal_monitor(places.demo_config())
     (turn,) = places.random_turns(1, camera)
@@ -297,6 +320,18 @@ def test_the_smear_s_stars_are_even_over_the_detector_in_the_middle_of_the_expos
     assert abs(down_px.mean()) == pytest.approx(turn_px, rel=0.1)
     lengths_px = np.hypot(across_px, down_px)
     assert places.path_words(bench, stars) == f"{lengths_px.min():.0f} to {lengths_px.max():.0f} px"
+    # each sprite is of the star whose place it has
+    at = np.array([-0.5, 0.5])
+    sprites = bench.chain(at, np.array([0.25, 0.75]), stars)
+    for instant in range(2):
+        own = np.isclose(sprites.data["electrons_per_s"], (0.25, 0.75)[instant])
+        assert sorted(sprites.star[own].tolist()) == list(range(16))
+        np.testing.assert_allclose(
+            sprites.x_px[own], x_px[2 * instant][sprites.star[own]], atol=1e-4
+        )
+        np.testing.assert_allclose(
+            sprites.y_px[own], y_px[2 * instant][sprites.star[own]], atol=1e-4
+        )
     # shares of light along the path, whole in all
     for sprites_of in places.smear_methods(bench).values():
         data = sprites_of(stars).data

@@ -35,6 +35,7 @@ from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
 from tests.support.spectra import write_curve
 
+SURE = 5.0  # standard deviations
 BENCH = """[tracker]
 aperture_mm = 18.4
 focal_length_mm = 35.0
@@ -290,6 +291,30 @@ def test_stars_twinkle_and_bodies_do_not(rng):
     share = twinkled.electrons_per_s / seen.electrons_per_s
     assert (share[-2:] == 1.0).all()
     assert (share[:-2] != 1.0).all()
+
+
+def test_a_star_that_twinkles_has_its_light_in_the_mean_and_young_s_scatter(rng):
+    """Over n draws a mean of 1 is known to sigma / sqrt(n), and a normal scatter of 1 to
+    1 / sqrt(2 n); a light of mean 1 has a normal logarithm of mean -s^2 / 2.
+    """
+    _, stars, moving = stars_and_sky()
+    among = moving.among(stars)
+    exposure_s = 2e-3  # Young's 0.81 for a star at the zenith
+    share = []
+    for _ in range(20):
+        twinkled = moving.air.twinkling(among, moving.utc_ns(0), exposure_s, rng)
+        share.append(twinkled.electrons_per_s / among.electrons_per_s)
+    high = moving.air.above(moving.utc_ns(0)).altitude_rad(among.vectors) > math.radians(60)
+    drawn = np.array(share)[:, high]
+    count = drawn.size
+    assert count > 1000
+    masses = air_mass(moving.air.above(moving.utc_ns(0)).altitude_rad(among.vectors)[high])
+    sigma = scintillation(18.4, masses, 1200.0, exposure_s)
+    assert drawn.mean() == pytest.approx(1.0, abs=SURE * sigma.max() / math.sqrt(count))
+    # s^2 = ln(1 + sigma^2)
+    wanted = np.sqrt(np.log1p(sigma**2))
+    scatter = (np.log(drawn) + wanted**2 / 2) / wanted
+    assert scatter.std() == pytest.approx(1.0, abs=SURE / math.sqrt(2 * count))
 
 
 def facing(up: np.ndarray, altitude_deg: float) -> np.ndarray:

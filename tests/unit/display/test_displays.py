@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from hilstar.display.identity import MonitorIdentity
 from hilstar.display.window.displays import Display, display_of
 from hilstar.display.window.library import glfw
 from hilstar.display.window.output_settings import OutputState
@@ -146,3 +147,18 @@ def test_a_monitor_s_identity_has_what_x_says_and_the_kernel_s_edid_where_x_hide
         assert now.window_system == (added if output is shown else added[:1])
     assert names == {None: "DELL U2412M", hidden: "DELL U2412M", shown: "DELL P2423D"}
     assert identity_of(display("VGA-1"), None, b"", {}, tmp_path).model == ""
+
+
+def test_a_monitor_is_asked_by_its_edids_first_block(tmp_path, monkeypatch):
+    """ddcutil takes 128 bytes of it, in hexadecimal; half a block names no monitor."""
+    program = tmp_path / "ddcutil"
+    program.write_text('#!/bin/sh\necho "VCP 10 C ${#8} 999"\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    block = edid()
+    brightness = []
+    for given in (block, block + bytes(128), block[:64]):
+        output = OutputState("DP-1", HD, edid=given)
+        brightness.append(identity_of(display(), output, b"", {}, tmp_path).brightness)
+    unasked = MonitorIdentity().brightness
+    assert brightness == [256, 256, unasked]

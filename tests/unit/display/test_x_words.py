@@ -390,39 +390,3 @@ def test_an_output_is_found_by_its_whole_name_and_none_without_a_server(monkeypa
     monkeypatch.setattr(randr, "Randr", of_none)
     assert randr.output_named("HDMI-1") is None
     assert randr.lit_outputs() == []
-
-
-def test_every_gpu_of_a_screen_is_named_and_given_back(monkeypatch):
-    """As libXrandr lays them out: XRRProviderResources is a time, a count and a pointer, and
-    XRRProviderInfo has the name behind two lists of numbers.
-    """
-    names = {70: b"AMD", 71: b"Intel", 72: b"NVIDIA-0"}
-    ids = (ctypes.c_ulong * len(names))(*names)
-    listed = struct.pack("@LiP", 0, len(names), ctypes.addressof(ids))
-    memory = [ctypes.create_string_buffer(listed, len(listed))]
-    screen = ctypes.create_string_buffer(256)
-    given_back = []
-
-    def address(buffer: ctypes.Array) -> int:
-        memory.append(buffer)
-        return ctypes.addressof(buffer)
-
-    def info(display: int, resources: object, number: int) -> int:
-        name = ctypes.create_string_buffer(names[number])
-        packed = struct.pack("@IiPiPP", 0, 0, 0, 0, 0, address(name))
-        return address(ctypes.create_string_buffer(packed, len(packed)))
-
-    library = SimpleNamespace(
-        XRRGetScreenResourcesCurrent=lambda display, root: ctypes.addressof(screen),
-        XRRGetProviderResources=lambda display, root: ctypes.addressof(memory[0]),
-        XRRGetProviderInfo=info,
-        XRRFreeScreenResources=lambda at: given_back.append("screen"),
-        XRRFreeProviderResources=lambda at: given_back.append("list"),
-        XRRFreeProviderInfo=lambda at: given_back.append("provider"),
-    )
-    connection = object.__new__(randr.Randr)
-    monkeypatch.setattr(connection, "_xrandr", library, raising=False)
-    monkeypatch.setattr(connection, "_display", 1, raising=False)
-    monkeypatch.setattr(connection, "_root", 2, raising=False)
-    assert connection._providers() == ("AMD", "Intel", "NVIDIA-0")
-    assert sorted(given_back) == ["list", "provider", "provider", "provider", "screen"]

@@ -21,18 +21,19 @@ from hilstar.server.serve import Outlet, serve
 from tests.support.benches import SMALL_BENCH
 from tests.support.waiting import wait_for
 
-JUMPED_NS = 1000 * NS_PER_S  # far more than a frame of a loaded machine takes
+# each far more than a frame of a loaded machine takes
+BEHIND_NS, JUMPED_NS = 500 * NS_PER_S, 1000 * NS_PER_S
 NEAR_NS = 100 * NS_PER_S
 FRAMES = 3
 
 
 class Stream:
-    """A sender in this process, whose clock stands JUMPED_NS behind the host's; what comes back to
-    it.
+    """A sender in this process, whose clock stood BEHIND_NS behind the host's and jumped back by
+    JUMPED_NS; what comes back to it.
     """
 
     steps, two_way, stamped = False, True, False
-    endpoint, reconnects = "none", 0
+    endpoint, reconnects = "none", 2
     conventions = PACKETS
     link_counts = SimpleNamespace(summary=dict)
 
@@ -48,7 +49,7 @@ class Stream:
         host_ns = HOST_CLOCK.now_ns()
         self.sequence += 1
         q = np.array([0.5, 0.5, -0.5, 0.5])
-        sample = AttitudeSample(host_ns - JUMPED_NS, q, None, self.sequence)
+        sample = AttitudeSample(host_ns - BEHIND_NS - JUMPED_NS, q, None, self.sequence)
         return [Arrival(host_ns, sample, encode(sample))]
 
     def send(self, packet: object) -> None:
@@ -88,11 +89,15 @@ def test_frames_are_recorded_and_told_at_the_sender_s_time_after_a_jump(tmp_path
     with hilstar.load(path) as bench:
         outlet = Outlet(ledger=ledger)
         limit = Limit(frames=FRAMES, from_first_attitude=True)
-        serve(bench, link, limit, wait_for_status, outlet)
+        summary = serve(bench, link, limit, wait_for_status, outlet)
+    assert summary.reconnects == link.reconnects
     assert len(records) == FRAMES
     for record in records:
         assert record.t_ns - record.light_ns == JUMPED_NS
-        assert abs(record.light_ns - (record.draw_ns - JUMPED_NS)) < NEAR_NS
+        assert abs(record.light_ns - (record.draw_ns - BEHIND_NS - JUMPED_NS)) < NEAR_NS
+        # the attitude of that time, not of the host's
+        assert record.age_ns is not None
+        assert abs(record.age_ns) < NEAR_NS
     light_ns = {record.frame: record.light_ns for record in records}
     for status in link.statuses:
         assert status.light_t_ns == light_ns[status.frame]

@@ -327,6 +327,25 @@ def facing(up: np.ndarray, altitude_deg: float) -> np.ndarray:
     return from_radec_roll_deg(math.degrees(math.atan2(y, x)), math.degrees(math.asin(z)), 0.0)
 
 
+@pytest.mark.parametrize(("altitude_deg", "is_told"), [(-12.1, False), (-11.9, True), (5.0, True)])
+def test_a_sun_above_astronomical_night_is_told_once_with_its_altitude(
+    altitude_deg, is_told, caplog
+):
+    _, _, moving = stars_and_sky()
+    air = replace(moving.air, told=set())
+    utc_ns = moving.utc_ns(0)
+    up = air.above(utc_ns).up
+    level = np.cross(up, [0.0, 0.0, 1.0])
+    level /= np.linalg.norm(level)
+    altitude_rad = math.radians(altitude_deg)
+    sun_km = 1.5e8 * (math.sin(altitude_rad) * up + math.cos(altitude_rad) * level)
+    for _ in range(2):
+        air.check_sun(sun_km, utc_ns)
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == is_told
+    assert all(f"the Sun stands at {altitude_deg:.1f} degrees" in line for line in told)
+
+
 def test_below_the_horizon_there_is_neither_star_nor_sky(tmp_path, caplog):
     file = site_bench(tmp_path, "sky_v_mag_arcsec2 = 20.5")
     with Simulator(file) as simulator:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from hilstar.display.identity import MonitorIdentity
+from hilstar.display.window import this_monitor
 from hilstar.display.window.displays import Display, display_of
 from hilstar.display.window.library import glfw
 from hilstar.display.window.output_settings import OutputState
@@ -162,3 +163,14 @@ def test_a_monitor_is_asked_by_its_edids_first_block(tmp_path, monkeypatch):
         brightness.append(identity_of(display(), output, b"", {}, tmp_path).brightness)
     unasked = MonitorIdentity().brightness
     assert brightness == [256, 256, unasked]
+
+
+def test_a_monitor_that_does_not_answer_is_not_waited_for(tmp_path, monkeypatch):
+    program = tmp_path / "ddcutil"
+    program.write_text("#!/bin/sh\nexec sleep 600\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    monkeypatch.setattr(this_monitor, "DDC_S", 0.05)
+    output = OutputState("DP-1", HD, edid=edid())
+    now = identity_of(display(), output, b"", {}, tmp_path)
+    assert (now.model, now.brightness) == ("DELL U2412M", None)

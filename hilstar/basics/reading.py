@@ -68,6 +68,7 @@ MAGIC = {
     b"\x80\x03": "a pickle",
     b"\x80\x04": "a pickle",
     b"\x80\x05": "a pickle",
+    b"\xff\xfe\0\0": "text in UTF-32, not UTF-8",
     b"\xff\xfe": "text in UTF-16, not UTF-8",
     b"\xfe\xff": "text in UTF-16, not UTF-8",
 }

@@ -33,7 +33,15 @@ PLACES_PX = np.array(
 RATES = np.array([2e5, 5e4, 1e5, 3e5, 8e5, 9e3])
 # of a star's light: what a footprint cuts; llvmpipe's pow is good to 2e-5 of the glow
 CUT, GLOW_LIMIT = 1e-4, 1e-4
-BACKENDS: list[Callable[[Target], Backend]] = [NumpyBackend, Renderer]
+
+
+class PointsRenderer(Renderer):
+    """OpenGL draws stars as points, whatever machine it is on."""
+
+    MAY_USE_CPU = False
+
+
+BACKENDS: list[Callable[[Target], Backend]] = [NumpyBackend, Renderer, PointsRenderer]
 
 
 def stars_image() -> np.ndarray:
@@ -75,6 +83,14 @@ def scene(rng: np.random.Generator) -> tuple[FrameLight, np.ndarray]:
     return light, image + stars_image()
 
 
+def path_of_sprites() -> tuple[FrameLight, np.ndarray]:
+    """Each star as two sprites in one place, with a third of its light and the rest."""
+    order = np.repeat(np.arange(len(RATES)), 2)
+    parts = np.tile([1 / 3, 2 / 3], len(RATES))
+    sprites = sprites_at(PLACES_PX[order], RATES[order] * parts, PSF.footprint_px)
+    return replace(sprites, star=order, per_star=2), stars_image()
+
+
 def limit(wanted: np.ndarray) -> float:
     return float(CUT * RATES.max() + GLOW_LIMIT * wanted.max())
 
@@ -84,7 +100,9 @@ def test_light_and_levels_are_those_of_closed_forms_frame_by_frame(make, rng):
     """Each frame has its own light: other maps, the same again, none, and blank."""
     frames = [scene(rng), scene(rng)]
     plain = replace(frames[0][0], extended=())
-    follow = [*frames, frames[0], (plain, stars_image()), (None, np.zeros(SIZE[::-1])), frames[1]]
+    path = path_of_sprites()
+    follow = [*frames, frames[0], (plain, stars_image()), path, (None, np.zeros(SIZE[::-1]))]
+    follow += [frames[1], path, (plain, stars_image())]
     backend = make(Target(SIZE, PSF, srgb_response(8), WHITE))
     panel = backend.target.panel()
     for number, (light, wanted) in enumerate(follow):

@@ -5,15 +5,16 @@ rows.
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics import charts
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import angle_between_rad
+from hilstar.basics.rotation import angle_between_rad, from_rotation_vector, propagate, to_matrix
 from hilstar.instruments.study.chain import answers, choices, measuring, run
 from hilstar.instruments.study.chain.measuring import CombinationRow, ErrorPart, StageTime
 from hilstar.instruments.study.chain.tracker import (
@@ -21,12 +22,14 @@ from hilstar.instruments.study.chain.tracker import (
     MeasuredStars,
     Off,
     StarJudge,
+    attitude_off_arcsec,
     off,
     within,
 )
-from hilstar.instruments.study.predictors import Movement
+from hilstar.instruments.study.predictors import Movement, attitude_at
 from hilstar.instruments.study.sweep import Load, Spent
 from hilstar.optics.scan import Scan
+from hilstar.server.bench.config import AttitudeSettings
 from tests.support.tables import csv_rows
 
 PERIOD_S = 1 / 50
@@ -39,6 +42,28 @@ def bench_of(scan: Scan, exposure_s: float) -> SimpleNamespace:
     monitor = SimpleNamespace(refresh_hz=1 / PERIOD_S)
     config = SimpleNamespace(monitor=monitor, tracker=SimpleNamespace(exposure_s=exposure_s))
     return SimpleNamespace(config=config, scan=scan, camera=SimpleNamespace(resolution_px=SIZE_PX))
+
+
+def turn_ahead_deg(prediction: choices.Prediction, ahead_ms: float) -> float:
+    """The turn since the newest of two samples, 10 ms and 20 ms later, whose rates are thrice that
+    of their attitudes: 1 deg/s about z.
+    """
+    samples = []
+    for t_ns in (0, 10_000_000):
+        q = propagate(np.array([1.0, 0, 0, 0]), np.array([0, 0, math.radians(1.0)]), t_ns * 1e-9)
+        samples.append(AttitudeSample(t_ns, q, np.array([0, 0, math.radians(3.0)])))
+    settings = AttitudeSettings(max_extrapolation_ms=ahead_ms)
+    timeline = choices.filled_timeline(samples, prediction, settings)
+    shown = attitude_at(timeline, 30_000_000).q_icrs_to_cam
+    return math.degrees(angle_between_rad(shown, samples[-1].q_icrs_to_cam))
+
+
+@pytest.mark.parametrize("ahead_ms", [0.0, 500.0])
+def test_an_attitude_is_held_carried_on_by_its_rate_or_by_the_last_two(ahead_ms):
+    """Also for a bench that predicts nothing itself: the study tries each way."""
+    turns_deg = {way: turn_ahead_deg(way, ahead_ms) for way in choices.PREDICTIONS}
+    wanted = {"rate": 0.06, "two samples": 0.02, "held": 0.0}
+    assert turns_deg == pytest.approx(wanted, rel=1e-3, abs=1e-6)
 
 
 def test_an_exposure_before_a_fast_panel_begins_within_a_refresh():
@@ -170,6 +195,24 @@ def test_stars_are_off_by_their_angle_and_light_and_lost_ones_by_all():
     unseen = off(judge, wanted, shown)
     assert unseen.lost.tolist() == [False, False, True]
     assert (unseen.arcsec[2], unseen.mag[2]) == (77.0, LOST_MAG)
+
+
+def test_an_attitude_is_off_by_the_turn_of_its_stars_and_two_are_enough():
+    turn_arcsec = np.array([3.0, -4.0, 60.0])
+    turn = to_matrix(from_rotation_vector(turn_arcsec / 206264.806))
+    stars = np.array([[0.03, 0.01, 1.0], [-0.02, 0.03, 1.0], [0.01, -0.04, 1.0]])
+    stars /= np.linalg.norm(stars, axis=1, keepdims=True)
+    light = np.ones(3)
+    wanted = MeasuredStars(stars, light)
+    for lost in ((), (1,)):
+        shown = stars @ turn.T
+        shown[list(lost)] = np.nan
+        found = attitude_off_arcsec(MeasuredStars(shown, light), wanted)
+        assert found == pytest.approx((5.0, 60.0), rel=1e-3)
+    shown[0] = np.nan
+    assert all(
+        math.isnan(turn) for turn in attitude_off_arcsec(MeasuredStars(shown, light), wanted)
+    )
 
 
 @pytest.fixture
@@ -518,6 +561,11 @@ def test_tables_and_charts_of_scenes_are_of_their_rows(tmp_path, figures):
     assert axes.get_title(loc="left") == "Average field, 30 stars"
     points = {tuple(line.get_xydata()[0]) for line in axes.get_lines() if line.get_marker() == "o"}
     assert points == {(2.0, 3.0), (4.0, 9.0), (5.0, 1.0)}
+    rings = {}
+    for line in axes.get_lines():
+        if line.get_marker() == "o" and line.get_markerfacecolor() == "none":
+            rings[line.get_markeredgecolor()] = tuple(line.get_xydata()[0])
+    assert rings == {charts.RED: (5.0, 1.0), charts.INK: (2.0, 3.0)}
     place, light, times = budget.axes
     bars = [[bar.get_width() for bar in of.patches] for of in (place, light, times)]
     assert bars == [[0.2, 0.7, 0.75], [0.03, 0.01, 0.033], [1.0, 3.0]]
@@ -542,7 +590,7 @@ def test_a_shallower_catalogue_is_judged_by_its_best_row():
 def test_bit_stealing_is_worth_what_it_takes_off_the_error():
     plain = row(quantisation="round", error_arcsec=1.0, time_ms=4.0)
     stealing = row(bit_stealing="true", error_arcsec=0.5, time_ms=6.0)
-    worse = row(bit_stealing="true", error_arcsec=0.95, time_ms=6.0)
+    worse = row(bit_stealing="true", error_arcsec=0.95, error_mag=0.001, time_ms=6.0)
     assert answers.stealing_line([plain, stealing, worse], plain, Load()) == (
         "bit stealing, if the primaries are known in the tracker's colours: takes"
         f" {charts.two_digits(1.0)} arcsec to {charts.two_digits(0.5)} in 1.50 of the time, with"
@@ -614,8 +662,8 @@ def test_points_are_named_on_the_front_where_they_are_a_tenth_better_and_once_a_
         row(quantisation="round", error_arcsec=9.0, on_front="true"),
         row(quantisation="round", error_arcsec=8.2, on_front="true", faintest_v_mag=6.5),
         row(quantisation="exact", error_arcsec=8.0, on_front="true", bit_stealing="true"),
-        row(quantisation="dither", error_arcsec=30.0, rate_deg_s=1.0, prediction="held"),
-        row(quantisation="dither", error_arcsec=20.0, rate_deg_s=1.0, smear="point"),
+        row(quantisation="dither", error_arcsec=30.0, rate_deg_s=1.0, smear="point"),
+        row(quantisation="dither", error_arcsec=20.0, rate_deg_s=1.0, prediction="held"),
         replace(AUTO, error_arcsec=1.0, time_ms=12.0, on_front="true"),
         row(quantisation="temporal", error_arcsec=40.0, chosen="default"),
     ]
@@ -625,9 +673,11 @@ def test_points_are_named_on_the_front_where_they_are_a_tenth_better_and_once_a_
         ("exact + bit stealing", 8.0, charts.BLUE),
         ("auto: 1 arcsec, 12 ms", 1.0, charts.RED),
         ("default: 40 arcsec, 5 ms", 40.0, charts.INK),
-        ("dither, points by rate", 20.0, charts.ORANGE),
+        ("dither, paths held", 20.0, charts.ORANGE),
         ("temporal", 40.0, charts.GREEN),
     ]
+    assert run.short_words(rows[3], AUTO) == "dither, points by rate"
+    assert run.short_words(rows[1], AUTO) == "round, fewer stars"
 
 
 def test_an_error_of_nothing_stands_far_below_the_smallest(tmp_path, figures):
@@ -638,6 +688,14 @@ def test_an_error_of_nothing_stands_far_below_the_smallest(tmp_path, figures):
     for line in figures[0].axes[0].get_lines():
         drawn.update(line.get_ydata())
     assert min(drawn) == pytest.approx(1e-3) and max(drawn) == 1.0
+
+
+@dataclass(frozen=True)
+class SimpleGlass:
+    """A row of a glass."""
+
+    psf: str
+    error_arcsec: float
 
 
 def test_a_busy_machine_s_tables_have_no_front_and_no_verdict(tmp_path, monkeypatch):
@@ -653,7 +711,10 @@ def test_a_busy_machine_s_tables_have_no_front_and_no_verdict(tmp_path, monkeypa
         for row in csv_rows(tmp_path / "chain.csv")
     }
     assert fronts == {("", "", "")}
-    run.write_chain(tmp_path, [result], [], ["of nothing"], Load())
+    glass = [SimpleGlass("a Gaussian", 2.0), SimpleGlass("a basis of 6", 0.5)]
+    run.write_chain(tmp_path, [result], glass, ["of nothing"], Load())
+    psfs = [(row["psf"], row["error_arcsec"]) for row in csv_rows(tmp_path / "chain_psf.csv")]
+    assert psfs == [("a Gaussian", "2.0"), ("a basis of 6", "0.5")]
     assert {row["on_front"] for row in csv_rows(tmp_path / "chain.csv")} == {"true", "false"}
 
 
@@ -667,8 +728,15 @@ def test_steps_that_change_nothing_are_named_and_not_drawn(tmp_path, figures):
         ErrorPart(scene, "auto", "prediction", 0.0, 0.0),
         ErrorPart(scene, "auto", "whole", 0.75, 0.033),
     ]
-    run.draw_budget(tmp_path / "b", [AUTO], budget, STAGES, Load())
-    place, light, _ = figures[0].axes
+    turning = replace(AUTO, scene="1 deg/s", rate_deg_s=1.0)
+    more = [replace(part, scene="1 deg/s", error_arcsec=2 * part.error_arcsec) for part in budget]
+    stages = [*STAGES, StageTime("1 deg/s", "auto", "sprites", 7.0)]
+    run.draw_budget(tmp_path / "b", [AUTO, turning], [*budget, *more], stages, Load())
+    place, light, times, turning_place, _, turning_times = figures[0].axes
+    # each scene's own parts and stages
+    assert [bar.get_width() for bar in turning_place.patches] == [0.0, 1.4, 1.5]
+    assert [bar.get_width() for bar in times.patches] == [1.0, 3.0]
+    assert [bar.get_width() for bar in turning_times.patches] == [7.0]
     assert [bar.get_width() for bar in place.patches] == [0.0, 0.7, 0.75]
     assert [bar.get_width() for bar in light.patches] == [0.03, 0.01, 0.033]
     note = " ".join(figures[0].get_supxlabel().split())

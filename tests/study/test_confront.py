@@ -67,6 +67,9 @@ def test_an_image_is_named_by_the_words_that_set_it_apart() -> None:
     rows = [row("night_a_1.png"), row("night_b_1.png"), row("night_c.png", "other")]
     names = [confront.short_name(each, rows) for each in rows]
     assert names == ["a", "b", "night c"]
+    # of three, words that two alone share set them apart from the third
+    rows = [row("n_a_1.png"), row("n_a_2.png"), row("n_b_2.png")]
+    assert [confront.short_name(each, rows) for each in rows] == ["a 1", "a 2", "b 2"]
 
 
 def test_a_refusal_is_of_the_image_that_it_names_or_of_all() -> None:

@@ -138,6 +138,27 @@ def test_curves_have_the_styles_that_are_given(figures, tmp_path):
     assert [line.get_linestyle() for line in figures[0].axes[0].get_lines()] == ["-", ":"]
 
 
+def test_a_panel_s_limits_margins_and_scales_are_its_own_axes(figures, tmp_path):
+    line = (LineSpec("at", "error", named=False),)
+    panels = (
+        PanelSpec(line, xlim=(0.5, 7.0), ylim=(-3.0, 4.0)),
+        PanelSpec(line, from_zero=True, margins=(0.5, 0.25)),
+        PanelSpec(line, scales=("symlog", "log")),
+    )
+    looks = looks_of({"a": "first", "b": "second"})
+    layout = {"share_x": False}
+    spec = ChartSpec(panels, lambda row: row.way, looks, layout=layout)
+    rows = [WayError("a", 1.0, 2.0), WayError("a", 3.0, 6.0)]
+    draw_rows(tmp_path / "x", "A finding", spec, rows)
+    limited, margined, scaled = figures[0].axes
+    assert (limited.get_xlim(), limited.get_ylim()) == ((0.5, 7.0), (-3.0, 4.0))
+    # half of 2 beyond either end, and a quarter of 4 above
+    assert margined.get_xlim() == pytest.approx((0.0, 4.0))
+    assert margined.get_ylim() == pytest.approx((0.0, 7.0))
+    assert (scaled.get_xscale(), scaled.get_yscale()) == ("symlog", "log")
+    assert scaled.xaxis.get_transform().linthresh == 1.0
+
+
 def test_curves_share_an_axis_where_they_have_one_x(figures, tmp_path):
     x = np.array([1.0, 2.0])
     for second_x, is_shared in ((x, True), (10 * x, False)):

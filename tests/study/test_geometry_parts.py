@@ -126,8 +126,56 @@ def test_a_star_s_error_is_how_far_it_is_shown_from_its_traced_place(monkeypatch
     """A camera whose principal point is 3 px to the right and 4 px down of the traced one's."""
     true = Camera(SIZE_PX, 1000.0, (199.5, 149.5), np.eye(3))
     off = replace(true, principal_point_px=(202.5, 153.5))
-    traced = SimpleNamespace(resolution_px=SIZE_PX, directions=true.rays)
+    places = []
+
+    def directions(x_px, y_px):
+        places.extend((x_px, y_px))
+        return true.rays(x_px, y_px)
+
+    traced = SimpleNamespace(resolution_px=SIZE_PX, directions=directions)
     monkeypatch.setattr(geometry, "BENCH", traced)
     errors_arcsec = geometry._star_errors(SimpleNamespace(monitor=off))
     assert len(errors_arcsec) == geometry.STARS
     np.testing.assert_allclose(errors_arcsec, 5 * ARCSEC_PER_RAD / 1000, rtol=1e-9)
+    # all over the screen, from edge to edge of its outermost pixels
+    for place_px, side_px in zip(places, SIZE_PX, strict=True):
+        ends = place_px.min(), place_px.max()
+        assert ends == pytest.approx((-0.5, side_px - 0.5), abs=side_px / 400)
+
+
+@pytest.mark.parametrize("tilt_deg", [(4.0, 2.5), (-1.0, 3.0)])
+def test_a_ray_along_a_lens_s_own_axis_goes_straight_through_it(tilt_deg):
+    """Of a lens that is tilted and shifted so that its axis runs through the pupil."""
+    axis = turned(*tilt_deg)[:, 2]
+    vertex = axis / axis[2] * 60.0
+    lens = {"lens_tilt_deg": tilt_deg, "lens_shift_mm": tuple(vertex[:2])}
+    bench = TracedBench(**UPRIGHT | lens)
+    at, ray = bench.behind_lens(np.array([3.0 * axis, axis]))
+    for number in range(2):
+        np.testing.assert_allclose(ray[number], axis, atol=1e-12)
+        np.testing.assert_allclose(np.cross(at[number], axis), 0, atol=1e-9)
+    thick_mm = sum(geometry.THICKNESS_MM) * 350.0 / geometry.DESIGN_FOCAL_MM
+    assert at[0] @ axis == pytest.approx(np.linalg.norm(vertex) + thick_mm)
+    x, y = bench.places_px(axis[None])
+    to_screen_mm = 60.0 + (geometry.BACK_FOCUS_MM * 3.5 + thick_mm)
+    screen_px = axis[:2] / axis[2] * to_screen_mm / bench.pitch_mm
+    assert (x[0] - 959.5, y[0] - 539.5) == pytest.approx(tuple(screen_px))
+
+
+def outcome_of(model: str, held_out: float, rms: float, largest: float):
+    return geometry.CalibrationOutcome(20, 60, 0.02, model, 1000, held_out, rms, largest)
+
+
+def test_a_model_fails_by_its_worst_star_and_is_chosen_by_held_out_dots():
+    """Whatever the stars say, which a lab does not know."""
+    near = outcome_of("near", 2.0, 0.25, 0.99)
+    worse = outcome_of("worse", 1.5, 0.5, 1.5)
+    pinhole = outcome_of("a pinhole", 9.0, 120.4, 300.0)
+    assert geometry.line_of(near) == (
+        "near: stars 0.25 arcsec rms, 0.99 maximum; held-out dots 2 rms"
+    )
+    assert geometry.line_of(worse).endswith("held-out dots 1.5 rms; FAILS: over 1 arcsec")
+    assert geometry.models_finding([pinhole, near, worse], 5432.1) == (
+        "Uncalibrated stars are off by 5432 arcsec rms, by a pinhole 120, by the model that"
+        " held-out dots choose (worse) 0.5"
+    )

@@ -6,6 +6,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from hilstar.instruments.study import sweep
 from hilstar.instruments.study.chain.run import headline
 from hilstar.instruments.study.speed.report import Aim, Machine, Result, lines
@@ -48,6 +50,26 @@ def test_children_that_have_ended_are_not_others(tmp_path, monkeypatch):
     all_s, others_s = OtherWork._times_s()
     assert all_s == all_before_s
     assert others_before_s - others_s >= 0.2
+
+
+def test_other_work_is_all_but_idling_and_waiting_less_this_process_s_own(tmp_path, monkeypatch):
+    """proc(5): user, nice, system, idle, iowait, irq, softirq and steal, in ticks, then guests,
+    whose time is in user's.
+    """
+    stat = tmp_path / "stat"
+    monkeypatch.setattr(sweep, "STAT", stat)
+    stat.write_text("cpu  10000 2000 3000 40000 5000 600 70 8 900 90\ncpu0 1 1 1 1\n")
+    tick_s = 1 / os.sysconf("SC_CLK_TCK")
+    times = os.times()
+    own_s = times.user + times.system + times.children_user + times.children_system
+    all_s, others_s = OtherWork._times_s()
+    assert all_s == pytest.approx(60678 * tick_s)
+    assert others_s + own_s == pytest.approx(15678 * tick_s, abs=0.5)
+    stat.write_text("intr 1 2 3\n")
+    assert OtherWork._times_s() == (0.0, 0.0)
+    # a core of four is more than 15 %, half of one is not
+    monkeypatch.setattr(os, "cpu_count", lambda: 4)
+    assert [Load(cores).busy for cores in (0.5, 0.6, 0.7, 1.0)] == [False, False, True, True]
 
 
 def test_a_busy_machine_is_said_and_no_aim_is_judged():

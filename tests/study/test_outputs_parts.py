@@ -109,10 +109,36 @@ def test_rapp_of_a_bench_s_stars_is_of_those_on_its_image(bench, small_run):
         assert {int(each["hip"]) for each in own} == set(stars.hip[inside].tolist())
         ratios = [float(each["rapp3"]) for each in own]
         assert all(0.5 < ratio < 5 for ratio in ratios)
+    named = zip(fields_of(OWN), findings[1:], strict=True)
+    for field, finding in named:
+        own = [float(each["rapp3"]) for each in rows if each["field"] == field.stem]
+        low, middle, high = np.percentile(own, (5, 50, 95))
+        assert finding.text == (
+            f"RAPP3 of the stars of {field.name}: {len(own)} stars, median {middle:.2f}, 90 % from"
+            f" {low:.2f} to {high:.2f}"
+        )
     # red stars have more light in a sensor that sees to 1050 nm
     bv = np.array([float(each["bv_mag"]) for each in rows])
     ratio = np.array([float(each["rapp3"]) for each in rows])
     assert np.median(ratio[bv > 1.0]) > np.median(ratio[bv < 0.2])
+
+
+def test_a_bench_s_ratios_are_by_its_own_weighting(tmp_path, small_run):
+    path = tmp_path / "photons.toml"
+    tables = {**BENCH, "sky": {"faintest_v_mag": 3.0, "passband_weighting": "photon"}}
+    path.write_text(bench_text(tables))
+    run = small_run(rapp.bench_rapp, read_bench_file(path))
+    table = np.genfromtxt(run.folder / "rapp_bench.csv", delimiter=",", names=True)
+    at = dict(zip(table["temperature_k"].tolist(), table["rapp3_photon"].tolist(), strict=True))
+    assert run.told[0].text == (
+        f"By photons.toml a black body of 3000 K gives {at[3000]:.2f} times the electrons of the"
+        f" average model, one of 5000 K {at[5000]:.2f}, 9000 K {at[9000]:.2f}, 50000 K"
+        f" {at[50_000]:.2f}"
+    )
+    by_energy = table["rapp3_energy"][table["temperature_k"] == 3000][0]
+    assert abs(by_energy / at[3000] - 1) > 0.01
+    (electrons,) = (y for label, _, y in run.lines("rapp_bench", 0) if label == "electrons")
+    np.testing.assert_array_equal(electrons, table["rapp3_photon"])
 
 
 def truth_of(*stars: tuple[int, str, float, float, float, bool]) -> np.ndarray:
@@ -209,6 +235,8 @@ def test_effort_is_within_where_light_and_each_centroider_are():
     assert (within.worst_px, within.share, within.within) == (0.06, pytest.approx(0.6), True)
     assert outcome(flux_max_mag=0.04).share == pytest.approx(0.8)
     assert not outcome(max_px_wide=0.11).within
+    # at the tolerance it is within
+    assert outcome(max_px_wide=0.1).share == 1.0 and outcome(max_px_wide=0.1).within
     assert not outcome(flux_max_mag=0.051).within
 
 

@@ -5,11 +5,14 @@ how the virtual tracker's works are ordered.
 from __future__ import annotations
 
 import os
-from dataclasses import replace
+import sys
+from dataclasses import dataclass, replace
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
 from hilstar.instruments.study.speed import benchmark, report, tracker
 from hilstar.instruments.study.speed.report import (
@@ -283,3 +286,219 @@ def test_noise_by_numpy_is_of_the_detector_s_own_figures():
     assert dn[0].mean() == pytest.approx(100.0, rel=0.01)
     # and a twelfth by rounding
     assert dn[0].std() == pytest.approx(((400 + 400) / 16 + 1 / 12) ** 0.5, rel=0.03)
+
+
+def test_a_scene_keeps_the_brightest_in_view_and_fills_up_with_faint_ones(bench_with, rng):
+    """All over a cap half as wide again as the field; columns stay with their stars."""
+    bench = bench_with()
+    q = benchmark.from_radec_roll_deg(*benchmark.RADEC_ROLL_DEG)
+    every = bench.shown_stars
+    visible = bench.sprites(q, every).star
+    by_light = every.v_mag[visible].argsort()
+    few = benchmark.scene(bench, every, q, 5, rng).stars
+    shown = few.hip[bench.sprites(q, few).star]
+    assert set(shown.tolist()) == set(every.hip[visible[by_light[:5]]].tolist())
+    vectors = dict(zip(every.hip.tolist(), every.vectors.tolist(), strict=True))
+    for hip, vector, v_mag in zip(few.hip.tolist(), few.vectors.tolist(), few.v_mag, strict=True):
+        assert vectors[hip] == vector
+        assert every.v_mag[every.hip == hip][0] == v_mag
+    many = benchmark.scene(bench, every, q, 2000, rng).stars
+    known = {tuple(vector) for vector in every.vectors.tolist()}
+    is_random = np.array([tuple(vector) not in known for vector in many.vectors.tolist()])
+    assert (~is_random).sum() == len(every)
+    # as bright as the fainter half of the sky
+    assert many.v_mag[is_random].min() >= np.median(every.v_mag)
+    assert len(np.unique(many.hip[is_random])) > 10
+    boresight = benchmark.to_matrix(q)[2]
+    angles_rad = np.arccos(many.vectors[is_random] @ boresight)
+    field_rad = bench.camera.field_radius_rad(bench.psf.footprint_px)
+    assert angles_rad.max() == pytest.approx(1.5 * field_rad, rel=0.02)
+
+
+def test_a_stage_is_culling_then_projecting_then_drawing(monkeypatch):
+    """In 1, 2 and 4 ms, of which the drawing's are its own stages'."""
+    now_ms = [0.0]
+    monkeypatch.setattr(benchmark.time, "perf_counter", lambda: now_ms[0] * 1e-3)
+
+    def takes(ms, result=None):
+        now_ms[0] += ms
+        return result
+
+    measurement = bare_cell(Result(MACHINE))
+    measurement.stage_ms = {}
+    measurement.icrs_to_image = np.eye(3)
+    near = (np.arange(2), np.zeros((3, 2)), np.ones(2))
+    measurement.candidates = SimpleNamespace(near=lambda *asked: takes(1, near))
+    camera = SimpleNamespace(project=lambda rays: takes(2, (np.zeros(2), np.zeros(2))))
+    camera.resolution_px = (40, 30)
+    measurement.bench = SimpleNamespace(shown_stars=None, camera=camera)
+    measurement.staged = SimpleNamespace(
+        footprint_px=8,
+        draw=lambda sprites: takes(4),
+        levels=lambda: takes(9),
+        stage_ms={"splat": 4.0, "read_back": 9.0},
+    )
+    for _ in range(2):
+        measurement._draw_stages()
+    assert measurement.stage_ms == {
+        "cull": pytest.approx([1.0, 1.0]),
+        "project": pytest.approx([2.0, 2.0]),
+        "splat": [4.0, 4.0],
+        "read_back": [9.0, 9.0],
+    }
+
+
+def test_a_fresh_process_s_figures_are_medians_of_the_reference_size():
+    result = Result(MACHINE)
+    for size, import_ms in ((SMALL, 9e9), (FULL_HD, 300.0), (FULL_HD, 100.0), (FULL_HD, 150.0)):
+        result.startup.append(ProcessStart(*size, import_ms, import_ms / 10, import_ms / 100))
+    benchmark.tell_starts(result, (SMALL, FULL_HD))
+    assert (result.import_ms, result.first_frame_ms, result.memory_mb) == (150.0, 15.0, 1.5)
+    benchmark.tell_starts(result, (SMALL,))
+    assert result.import_ms == 9e9
+
+
+def test_the_loop_that_is_compiled_is_given_its_stamps_and_sigmas(monkeypatch, rng):
+    """Beside NumPy's image, of sigmas that differ and over the edges."""
+    compiled = SimpleNamespace(njit=lambda function: function)
+    monkeypatch.setitem(sys.modules, "numba", compiled)
+    x_px, y_px = rng.uniform(-3, 43, 30), rng.uniform(-3, 27, 30)
+    for footprint_px in (8, 9):
+        sprites = benchmark.pack_sprites(
+            x_px, y_px, rng.uniform(1, 9, 30), np.arange(30), (40, 24), footprint_px
+        )
+        drawn = benchmark._make_numba()(sprites, (0.7, 1.1), (24, 40))
+        wanted = benchmark.numpy_linear(sprites, (0.7, 1.1), (24, 40))
+        np.testing.assert_allclose(drawn, wanted, atol=1e-5)
+
+
+@dataclass
+class PlantedImage:
+    """An image of GalSim's, or a part of one: its array, and its first column and row."""
+
+    array: np.ndarray
+    xmin: int = 0
+    ymin: int = 0
+
+    @property
+    def bounds(self):
+        height, width = self.array.shape
+        return PlantedBounds(self.xmin, self.xmin + width - 1, self.ymin, self.ymin + height - 1)
+
+    def __getitem__(self, part):
+        rows = slice(part.ymin - self.ymin, part.ymax - self.ymin + 1)
+        columns = slice(part.xmin - self.xmin, part.xmax - self.xmin + 1)
+        return PlantedImage(self.array[rows, columns], part.xmin, part.ymin)
+
+
+class PlantedBounds(NamedTuple):
+    """Columns and rows, the last included."""
+
+    xmin: int
+    xmax: int
+    ymin: int
+    ymax: int
+
+    def __and__(self, other):
+        low, high = np.maximum(self, other), np.minimum(self, other)
+        return PlantedBounds(*map(int, (low[0], high[1], low[2], high[3])))
+
+
+@dataclass(frozen=True)
+class PlantedGaussian:
+    """A profile of GalSim's, exact in the pixel."""
+
+    sigma: float
+    wide: tuple[float, float] = (1.0, 1.0)
+    flux: float = 1.0
+
+    def transform(self, dudx, dudy, dvdx, dvdy):
+        assert dudy == dvdx == 0
+        return replace(self, wide=(dudx * self.sigma, dvdy * self.sigma))
+
+    def withFlux(self, flux):
+        return replace(self, flux=flux)
+
+    def drawImage(self, image, scale, center, add_to_image):
+        assert scale == 1.0 and add_to_image
+        x, y = center
+        shares = []
+        for first, count, at, sigma in zip(
+            (image.xmin, image.ymin), image.array.shape[::-1], (x, y), self.wide, strict=True
+        ):
+            edges = first + np.arange(count + 1) - 0.5
+            shares.append(np.diff(ndtr((edges - at) / sigma)))
+        image.array += self.flux * np.outer(shares[1], shares[0])
+
+
+def test_galsim_is_asked_for_the_same_stars_in_the_same_stamps(monkeypatch, rng):
+    planted = SimpleNamespace(
+        ImageF=PlantedImage,
+        Gaussian=PlantedGaussian,
+        BoundsI=PlantedBounds,
+        PositionD=lambda x, y: (x, y),
+    )
+    monkeypatch.setitem(sys.modules, "galsim", planted)
+    x_px, y_px = rng.uniform(-3, 43, 30), rng.uniform(-3, 27, 30)
+    for footprint_px in (8, 9):
+        sprites = benchmark.pack_sprites(
+            x_px, y_px, rng.uniform(1, 9, 30), np.arange(30), (40, 24), footprint_px
+        )
+        drawn = benchmark._make_galsim()(sprites, (0.7, 1.1), (24, 40))
+        wanted = benchmark.numpy_linear(sprites, (0.7, 1.1), (24, 40))
+        np.testing.assert_allclose(drawn, wanted, atol=1e-5)
+
+
+def test_a_method_agrees_by_its_largest_difference_as_a_share_of_our_brightest_pixel(bench_with):
+    """Of images that are half as bright and a quarter brighter; every kind of hilstar's is timed."""
+    bench = bench_with()
+    q = benchmark.from_radec_roll_deg(*benchmark.RADEC_ROLL_DEG)
+    cell = report.Cell(*bench.camera.resolution_px, len(bench.sprites(q)))
+    assert cell.stars > 3
+    result = Result(MACHINE)
+
+    def times(factor):
+        return lambda *asked: factor * benchmark.numpy_linear(*asked)
+
+    with benchmark.CellMeasurement(bench, q, cell, result) as measurement:
+        measurement.measure({"dim": times(0.5), "bright": times(1.25)}, 1, 60.0)
+    worst = {row.method: row.worst_of_peak for row in result.agreement}
+    # the GPU's erf and float32 sums: 1e-5
+    assert worst == pytest.approx({"dim": 0.5, "bright": 0.25}, abs=2e-5)
+    kinds = [(row.method, row.kind) for row in result.rows]
+    assert kinds[:3] == [("hilstar", kind) for kind in report.OF_AN_IMAGE]
+    assert kinds[-2:] == [("dim", "linear_only"), ("bright", "linear_only")]
+    assert {"cull", "project"} < {kind for _, kind in kinds}
+    assert all(row.ms.min > 0 for row in result.rows) and len(result.python_ms) == 1
+
+
+def test_a_plan_is_measured_on_its_own_file_cell_by_cell(small_bench_file, monkeypatch, rng):
+    """Fresh processes are planted, and peers are not asked for."""
+    started = []
+
+    def fresh_start(path, q, size):
+        started.append((path, size))
+        return ProcessStart(*size, 10.0 * len(started), 20.0, 30.0)
+
+    methods = {"numpy": benchmark.numpy_linear}, {"galsim": "not installed"}
+    monkeypatch.setattr(benchmark, "other_methods", lambda: methods)
+    monkeypatch.setattr(benchmark, "fresh_start", fresh_start)
+    file = benchmark.read_bench_file(small_bench_file)
+    size = file.config.monitor.resolution_px
+    plan = benchmark.BenchmarkPlan((size,), (3, 2000), 1, 60.0, 3, 0, file)
+    cells = []
+    result = benchmark.run(plan, rng, cells.append)
+    assert cells == [1, 2] and started == [(file.path, size)] * 3
+    assert (result.import_ms, result.first_frame_ms, result.memory_mb) == (20.0, 20.0, 30.0)
+    few, many = result.scenes
+    assert (few.stars, few.catalogue, few.random) == (3, 3, 0)
+    assert many.catalogue + many.random == 2000 and many.random > 1000
+    assert {(row.size, row.stars) for row in result.rows} == {(size, 3), (size, 2000)}
+    assert list(result.does) == ["numpy"] and result.tracker == []
+    assert [(row.method, row.why) for row in result.skipped] == [("galsim", "not installed")]
+    assert result.gl_renderer and result.machine.cores == len(os.sched_getaffinity(0))
+    whats = [aim.what for aim in result.aims]
+    assert whats == [
+        f"turning by 10 deg/s, {count} stars, {size[0]} x {size[1]}, 2 still frames"
+        for count in (3, 2000)
+    ]

@@ -567,3 +567,51 @@ def test_a_case_is_judged_by_its_largest_figure():
     assert image.coded_neighbours().figures.tolerance == pytest.approx(1.0)
     assert image.coded_coarse().figures.tolerance == pytest.approx(0.5)
     assert image.no_stars().figures.error == 0.0
+
+
+def test_codes_are_judged_on_the_panels_that_their_cases_name(monkeypatch):
+    """Bits, and magnitudes under the star whose peak is white."""
+    scenes = {}
+
+    def judged(case, scene, *given, **more):
+        scenes[case] = scene
+
+    monkeypatch.setattr(image, "judged", judged)
+    for visit in image.CODES:
+        visit()
+    said = {}
+    for case, scene in scenes.items():
+        light = scene.sprites.data["electrons_per_s"] * scene.psf.peak_share
+        said[case] = scene.panel.response.bits, round(float(-2.5 * np.log10(light.max())), 3)
+    assert said == {
+        "stars half off the screen, 6 mag under white on 8 bits": (8, 6.0),
+        "two stars 1 px apart, 6 mag under white": (8, 6.0),
+        "codes of stars of sigma 0.3 px, 3 mag under white": (8, 3.0),
+        "pixels 5 % apart, stars 6 mag under white": (8, 6.0),
+        "a panel of 2 bits, stars whose peak is white": (2, 0.0),
+        "a panel of 16 bits, stars 10 mag under white": (16, 10.0),
+    }
+
+
+@pytest.mark.parametrize("place", ["a pixel of the corner", "all beyond it"])
+def test_a_crowd_is_wrong_by_a_pixel_as_by_its_light(place, monkeypatch):
+    """Light that two pixels of the corner exchange, or a thousandth of it away from there."""
+    monkeypatch.setattr(image, "CROWD", 300)
+    monkeypatch.setattr(image, "CROWD_PX", (200, 200))
+    monkeypatch.setattr(image, "CORNER_PX", 64)
+
+    def drawn(on, sprites):
+        light = image.linear_image(sprites, on.resolution_px, on.psf)
+        if place == "all beyond it":
+            light[100:] *= 1.002
+        else:
+            light[20, 20], light[20, 21] = (
+                light[20, 20] + 0.01 * light.max(),
+                light[20, 21] - 0.01 * light.max(),
+            )
+        return light
+
+    monkeypatch.setattr(image, "drawn", drawn)
+    case = image.many_stars()
+    assert not case.right and case.figures.error > 5e-4
+    assert case.figures.tolerance < 1e-5

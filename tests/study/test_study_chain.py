@@ -746,15 +746,19 @@ def test_each_chain_is_timed_in_each_round_and_one_by_its_stages():
     """After a frame that does not count; the rounds end with the time, but not before two."""
 
     class Chain:
+        last = None
+
         def __init__(self, ms):
-            self.ms, self.frames = ms, 0
+            self.ms, self.staged = ms, 0
 
         def frame_ms(self):
-            self.frames += 1
-            return (self.ms if self.frames > 1 else 1e9), 2 * self.ms
+            # the first after another chain's fills caches
+            is_first, Chain.last = Chain.last is not self, self
+            return (1e9 if is_first else self.ms), 2 * self.ms
 
         def stages_ms(self):
-            return (self.ms, 2.0, 3.0, 4.0)
+            self.staged += 1
+            return (self.ms, 2.0, 3.0, 1e9 if self.staged == 1 else 4.0)
 
     chains = [Chain(1.0), Chain(5.0), Chain(9.0)]
     times, stages = measuring.timed(chains, 0.0, 1)
@@ -896,21 +900,33 @@ def test_sprites_are_whole_cut_within_the_bench_s_tolerance_or_within_ten_times_
         chosen = ChainCombination("round", False, parts[0].faintest_v_mag, sprite)
         render = parts[0].bench(chosen).config.render
         keys[sprite] = (render.effort, render.tolerance_mag, render.tolerance_px)
+    depth = parts[0].faintest_v_mag - 1
+    for method in ("round", "exact"):
+        shallow = parts[0].bench(ChainCombination(method, False, depth, "cut"))
+        assert shallow.config.render.quantisation == method
+        assert shallow.shown_stars.v_mag.max() <= depth
     assert keys["full"][0] == "full"
     assert keys["cut"] == ("auto", 0.01, 0.05)
     assert keys["coarse"] == ("auto", pytest.approx(0.1), pytest.approx(0.5))
 
 
-def test_a_bench_that_predicts_nothing_holds_the_newest_attitude(tmp_path):
+@pytest.mark.parametrize(
+    ("keys", "prediction", "default"),
+    [
+        ("[attitude]\nmax_extrapolation_ms = 0\n", "held", "path"),
+        ('motion = "off"\n', "rate", "point"),
+    ],
+)
+def test_a_bench_that_predicts_or_moves_nothing_draws_points(tmp_path, keys, prediction, default):
     """In a turn; hilstar's default predicts. A catalogue ends with its faintest star."""
-    text = SMALL.replace("= 9\n", "= 6.007\n") + "[attitude]\nmax_extrapolation_ms = 0\n"
+    text = SMALL.replace("= 9\n", "= 6.007\n") + keys
     with Parts(small_file(tmp_path, text)) as held:
         assert held.faintest_v_mag == held.own.stars.v_mag.max().round(2) <= 6.0
         turning = held.marks(predictors.Movement(np.array(ORION_Q), 1.0))
         still = held.marks(predictors.Movement(np.array(ORION_Q), 0.0))
     ways = {(mark.prediction, mark.smear) for mark in (turning.auto, turning.as_filed)}
-    assert ways == {("held", "point")}
-    assert (turning.default.prediction, turning.default.smear) == ("rate", "path")
+    assert ways == {(prediction, "point")}
+    assert (turning.default.prediction, turning.default.smear) == ("rate", default)
     assert {still.auto.prediction, still.as_filed.prediction} == {"rate"}
 
 
@@ -946,7 +962,11 @@ def test_no_star_is_judged_that_clips_or_shows_less_than_half_a_step(parts):
 def test_points_that_are_drawn_for_paths_are_charged_to_smear_alone(parts, monkeypatch):
     monkeypatch.setattr(predictors, "JITTER", ())
     scene = scene_of(parts, 4)
-    budget = error_budget(scene, replace(scene.marks.auto, smear="point"))
+    drawn_as_points = replace(scene.marks.auto, smear="point")
+    budget = error_budget(scene, drawn_as_points)
     by_step = {part.step: part.error_arcsec for part in budget}
+    # against the sky itself, the panel's refresh included
+    assert by_step["whole"] == pytest.approx(scene.error(drawn_as_points).error_arcsec, rel=ROUNDED)
+    assert by_step["refresh"] > 0.01 * by_step["whole"]
     assert by_step["smear"] > 100 and by_step["depth"] < 0.01 * by_step["smear"]
     assert by_step["codes"] < 0.1 * by_step["smear"]

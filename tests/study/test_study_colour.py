@@ -345,3 +345,66 @@ def test_a_class_s_figures_are_of_its_own_stars():
         mean = place + count / 2
         assert (row.stars, row.off_nm, row.mean_nm) == (2, mean, 500 + mean)
         assert (row.subtypes, row.subtypes_white) == (2 * mean, 3 * mean)
+
+
+def test_a_shown_star_s_place_and_light_are_of_its_primaries_where_they_stand(monkeypatch):
+    """Three stars, of which one is too bright to be judged and one too faint. Red stands a third of
+    a pixel to the left, blue as far to the right.
+    """
+    monkeypatch.setattr(colour, "FRAME_PX", (120, 60))
+    x_px, y_px = np.array([20.2, 60.4, 100.0]), np.array([30.1, 29.8, 30.0])
+    levels = np.zeros((60, 120, 3), dtype=np.uint16)
+    levels[30, 60] = 255, 255, 0
+    levels[30, 61] = 0, 255, 255
+    levels[30, [20, 100]] = 255
+    light = np.array([90.0, 40.0, 20.0])
+    bench = SimpleNamespace(
+        flux_at_white_e_per_s=10.0,
+        shown_stars=SimpleNamespace(v_mag=np.array([0.9, 3.0, 6.0]), electrons_per_s=light),
+        draw=lambda q: SimpleNamespace(levels=levels),
+        sprites=lambda q, stars: SimpleNamespace(
+            x_px=x_px, y_px=y_px, star=np.arange(3), data={"electrons_per_s": light}
+        ),
+        config=SimpleNamespace(monitor=SimpleNamespace(bits=8)),
+        calibration=SimpleNamespace(response=SimpleNamespace(rgb=None)),
+    )
+    places = np.array([[-1 / 3, 0.0], [0.0, 0.0], [1 / 3, 0.0]])
+    for mono in (True, False):
+        colours = SimpleNamespace(
+            of_white=np.array([0.5, 0.3, 0.2]),
+            mono=mono,
+            places_px=places,
+            wanted=lambda stars, numbers: np.array([[float(number)] for number in numbers]),
+        )
+        shown = colour.shown_stars(bench, colours, 2)
+        assert shown.wanted.tolist() == [[1.0]] * 2
+        # red once, green twice, blue once
+        by_primary = np.array([5.0, 6.0, 2.0])
+        np.testing.assert_allclose(shown.light, by_primary.sum() / 40.0)
+        whole = by_primary.sum() if mono else 40.0
+        np.testing.assert_allclose(shown.shares, [by_primary / whole] * 2)
+        middle_px = by_primary @ [60 - 1 / 3, 60.5, 61 + 1 / 3] / by_primary.sum()
+        np.testing.assert_allclose(shown.off_px, [[middle_px - 60.4, 30 - 29.8]] * 2)
+
+
+def test_the_worst_place_in_a_mosaic_is_the_furthest_to_either_side(monkeypatch):
+    monkeypatch.setattr(colour, "SIGMAS_PX", (1.0,))
+    monkeypatch.setattr(colour, "STARS_K", (5000.0,))
+    off_px = {0: np.array([-0.3, 0.1]), 1: np.array([0.2, -0.1])}
+    widths_px = []
+
+    def planted(image, width_px, steps):
+        widths_px.append(width_px)
+        return off_px[len(widths_px) - 1]
+
+    monkeypatch.setattr(colour, "mosaic_off_px", planted)
+    channels = [
+        colour.Optics(30.0, *[colour.load_curve(name, name) for name in ("ccd47-20", "n-bk7-10mm")])
+    ] * 3
+    mosaic, superpixel = colour.study_mosaic(channels)
+    assert (mosaic.image, mosaic.max_px) == ("mosaic", 0.3)
+    assert mosaic.rms_px == pytest.approx(math.sqrt(0.05))
+    assert (superpixel.image, superpixel.max_px) == ("superpixel", 0.2)
+    # a superpixel's light spreads by the variance of its pixels
+    wide_px = math.sqrt(1 + colour.SUPERPIXEL_VARIANCE_PX2)
+    assert widths_px == pytest.approx([1.0, wide_px])

@@ -131,3 +131,37 @@ def test_an_outcome_has_the_worst_star_of_either_sign_and_the_median_time(monkey
     assert asked == [(scene.turn.q_icrs_to_cam.tolist(), 0, np.radians([0.6, 0.8, 0.0]).tolist())]
     # full effort has the default's tolerance
     assert economy.outcome(scene, "full", bench, times).tolerance_mag == economy.DEFAULT.mag
+
+
+def test_a_scene_that_turns_is_drawn_along_its_paths_at_each_effort(monkeypatch):
+    """And each bench has its scene's lens, stars and depth."""
+    tables_of = {}
+
+    class Planted:
+        def __init__(self, path, tables):
+            tables_of[path.stem] = tables
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *raised):
+            pass
+
+    monkeypatch.setattr(economy, "study_bench", Planted)
+    monkeypatch.setattr(economy, "in_turn", dict.fromkeys)
+    monkeypatch.setattr(economy, "outcome", lambda scene, name, bench, times: (name, times))
+    for scene, motion in ((SCENES[0], "auto"), (SCENES[4], "on")):
+        assert economy.compare(scene, 12, 7) == [("full", 7), ("default", 7), ("0.1", 7)]
+        for name, tables in tables_of.items():
+            assert tables["render"]["motion"] == motion
+            assert tables["monitor"]["bits"] == 12
+            assert tables["sky"] == {"faintest_v_mag": scene.faintest_v_mag}
+            assert tables["collimator"] == {"focal_length_mm": scene.focal_length_mm}
+            assert tables["render"]["quantisation"] == ("exact" if name == "full" else "auto")
+            assert ("effort" in tables["render"]) == (name != "full")
+    assert tables_of["0.1"]["render"]["tolerance_mag"] == 0.1
+
+
+def test_bars_have_room_over_the_highest_and_over_a_limit_of_one():
+    assert economy.bar_limits([0.2, 0.4]) == pytest.approx((0, 1.45))
+    assert economy.bar_limits([0.2, 3.0]) == pytest.approx((0, 4.35))

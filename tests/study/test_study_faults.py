@@ -11,6 +11,7 @@ from hilstar.basics.rotation import angle_between_rad, propagate
 from hilstar.display.quantise import shown_light
 from hilstar.instruments.study import faults
 from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS, Stray
+from hilstar.instruments.study.sweep import Load
 from hilstar.optics.layers.fault_kinds import KINDS
 
 pytestmark = pytest.mark.study
@@ -191,3 +192,63 @@ def test_even_light_of_white_leaves_no_star_and_none_leaves_all_of_a_small_bench
     some = faults.stray_light(bench, 0.2)
     assert clear.median_mag <= some.median_mag < white.median_mag
     assert clear.p95_mag <= some.p95_mag
+
+
+def test_a_case_s_faults_go_by_the_frame_s_time(panel, monkeypatch):
+    """Of a star that moves by 60 px a second, and the schedule that is asked."""
+    bench, folder = panel
+    frames = faults.CaseFrames(bench, folder, "false star, moving")
+    asked_ns = []
+    monkeypatch.setattr(frames.schedule, "at", asked_ns.append)
+    layers = []
+    layer = faults.FaultLayer
+
+    def kept(view, now):
+        layers.append([each.since_ns for each in now])
+        return layer(view, now)
+
+    monkeypatch.setattr(faults, "FaultLayer", kept)
+    for frame in (0, 90):
+        frames.with_faults(frame)
+    begin_ns, later_ns = 0, round(90 / faults.REFRESH_HZ * 1e9)
+    assert asked_ns == [begin_ns, later_ns] and layers == [[begin_ns], [later_ns]]
+
+
+def test_a_study_of_faults_is_told_by_its_dearest_and_its_slowest():
+    def cost(case, frame_ms, without_ms, quantisation="round"):
+        return faults.FaultCost(quantisation, case, frame_ms, without_ms, frame_ms - without_ms)
+
+    costs = [
+        cost(NOWHERE, 5.25, 5.0),
+        cost("false star, on the sky", 5.5, 5.0),
+        cost("64 false stars", 7.0, 5.0),
+        cost("measured map", 14.0, 5.0),
+        cost("blank", 2.0, 5.0),
+        cost("blank", 99.0, 1.0, "exact"),
+    ]
+    assert faults.cost_line(costs, "round") == (
+        "round: of a frame of 5.0 ms a scenario with nothing on takes +0.25 ms, a false star"
+        " +0.50 ms; the dearest, measured map, +9.0 ms"
+    )
+    strays = [Stray("round", 0.03, 30, 0.0, 0.2, 0.0), Stray("exact", 0.03, 30, 0.0, 0.1, 0.0)]
+    assert faults.stray_line(strays, "round").endswith("from stray light of 0.03 of white on")
+    assert faults.stray_line(strays, "exact").endswith("from no stray light here on")
+
+
+def test_the_charts_of_faults_say_their_slowest_frames(small_run):
+    cases = [(NOWHERE, 5.0), ("false star, on the sky", 6.0), ("64 false stars", 7.0)]
+    costs = []
+    for quantisation in QUANTISATIONS:
+        for case, frame_ms in (*cases, ("measured map", 14.0)):
+            costs.append(faults.FaultCost(quantisation, case, frame_ms, 4.0, frame_ms - 4.0))
+    run = small_run(lambda folder: faults.draw_costs(folder / "c", costs, Load()))
+    assert run.title("c") == (
+        "With false stars a frame takes at most 7.0 ms, with the dearest fault, measured map, 14 ms"
+    )
+
+
+def test_a_star_is_lost_that_is_a_magnitude_too_faint(monkeypatch, bench_with):
+    off_mag = [0.9, 1.1, 0.2, 0.6]
+    monkeypatch.setattr(faults, "light_errors_mag", lambda *measured: off_mag)
+    stray = faults.stray_light(bench_with(), 0.0)
+    assert (stray.lost, stray.median_mag, stray.stars) == (0.25, pytest.approx(0.75), 4)

@@ -5,6 +5,8 @@ between two of its own rows.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from scipy.special import ndtr
 
 from hilstar.basics.rotation import propagate
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.study import limits
 from hilstar.instruments.study.limits import StressLimit, limits_finding
 from tests.support.benches import ROOT
@@ -91,6 +94,25 @@ def test_directions_and_attitudes_are_right_up_to_where_they_have_no_place(measu
     assert limit.words.startswith("nowhere to ")
 
 
+def test_a_wide_field_s_directions_are_as_far_from_the_axis_as_is_said(monkeypatch):
+    """Along x, from 30 degrees to 1e-7 short of 90."""
+    asked = []
+
+    def camera(*given):
+        made = monitor_camera(*given)
+        project = made.project
+        return SimpleNamespace(
+            project=lambda rays: asked.append(rays) or project(rays), rays=made.rays
+        )
+
+    monkeypatch.setattr(limits, "monitor_camera", camera)
+    limit = limits.wide_fields()
+    (rays,) = asked
+    short_deg = np.degrees(np.arctan2(rays[:, 2], rays[:, 0]))
+    np.testing.assert_allclose(short_deg, limit.at, rtol=1e-6)
+    assert (limit.at[0], limit.at[-1]) == pytest.approx((60.0, 1e-7))
+
+
 def test_a_turn_over_parted_refreshes_is_off_by_their_part():
     """By f (1 - f) / 2 of a refresh over n + f refreshes (server/sync.py), to first order."""
     limit = limits.parted_refreshes()
@@ -140,8 +162,11 @@ def test_a_crossing_is_found_between_points_and_none_is_said_as_such():
     assert limit_of([1.0, 1.0, 1.0]).words == "everywhere"
     falling = limit_of([0.0, tolerance * 10, 0.0])
     assert 1.0 < falling.meets < 2.0
-    assert limits_finding([crossing, limit_of([0.0, 0.0, 0.0])]).startswith(
-        "1 of 2 methods of hilstar leave their tolerance"
+    # a method that reaches its tolerance keeps it
+    assert not limit_of([0.0, tolerance, tolerance]).fails
+    others = [limit_of([0.0, 0.0, 0.0]), replace(crossing, stress=limits.BITS)]
+    assert limits_finding([crossing, *others]) == (
+        "2 of 3 methods of hilstar leave their tolerance: packets over 3 ms old"
     )
 
 

@@ -83,6 +83,11 @@ def test_images_without_and_with_noise_are_of_one_sky(scenes):
     sigma_dn = np.sqrt(SKY_E2 / GAIN_E_PER_DN**2 + 1 / 6)
     assert off_dn.std() == pytest.approx(sigma_dn, rel=4 / np.sqrt(2 * dark.sum()) + 0.03)
     assert abs(off_dn.mean()) < 5 * sigma_dn / np.sqrt(dark.sum()) + 0.5
+    kinds = []
+    for name in ("field", "field_without_noise"):
+        header = fits.getheader(scenes.folder / f"{name}.fits")
+        kinds.append([value for key, value in header.items() if "NOISE" in key.upper()])
+    assert kinds[0] != kinds[1] and "none" in map(str, kinds[1])
     middle = WCS(fits.getheader(scenes.folder / "field.fits")).pixel_to_world(109.5, 74.5)
     assert (middle.ra.deg, middle.dec.deg) == pytest.approx(FIELD[:2], abs=1e-6)
 

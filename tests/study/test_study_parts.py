@@ -152,6 +152,32 @@ def test_jitter_is_the_amplitudes_that_are_stated():
     assert angle_between_rad(still, predictors.ORION) > 0
 
 
+def test_jitter_is_another_wave_on_each_axis_and_in_the_rate():
+    """Sines of each frequency, 2 f rad further from axis to axis, small enough to add up."""
+    for t_s in (0.0, 0.0123, 1.7):
+        q = predictors.shaken(predictors.ORION, t_s)
+        off = to_matrix(q) @ to_matrix(predictors.ORION).T
+        turns_rad = np.array([off[1, 2] - off[2, 1], off[2, 0] - off[0, 2], off[0, 1] - off[1, 0]])
+        waves_arcsec = np.zeros(3)
+        for axis in range(3):
+            for size_arcsec, hz in predictors.JITTER:
+                wave = math.sin(math.tau * hz * t_s + 2 * axis * hz)
+                waves_arcsec[axis] += size_arcsec * wave
+        sign = np.sign(turns_rad @ waves_arcsec)
+        np.testing.assert_allclose(
+            sign * turns_rad / 2 * ARCSEC_PER_RAD,
+            waves_arcsec,
+            atol=1e-3 * np.abs(waves_arcsec).max(),
+        )
+    shaken = predictors.Movement(predictors.ORION, 0.5)
+    rates = np.array([shaken.rate_rad_s(ns) for ns in (10**9, 10**9 + 3_000_000)])
+    steady = math.radians(0.5) * predictors.AXIS
+    # of 2 pi f size and more, in arcsec a second
+    jitter_arcsec_s = np.abs(rates - steady).max() * ARCSEC_PER_RAD
+    fastest = sum(math.tau * hz * size for size, hz in predictors.JITTER)
+    assert 0.05 * fastest < jitter_arcsec_s < 1.01 * fastest
+
+
 def test_a_movement_s_samples_end_with_the_newest_at_its_rate():
     movement = predictors.Movement(predictors.ORION, 0.5, packet_hz=50, shaken=False)
     samples = movement.samples(1_234_000_000)
@@ -370,9 +396,10 @@ def test_a_distance_is_of_both_coordinates():
 
 
 def test_a_psf_s_fit_is_about_its_own_background():
-    image = star_image(100.3, 49.8, rigs.PSF_SIGMA_PX) + rigs.DARK_DN
-    x_px, y_px = rigs.psf_fit(image, np.array([100]), np.array([50]))
-    assert (x_px[0], y_px[0]) == pytest.approx((100.3, 49.8), abs=1e-3)
+    for share in (1.0, 0.01):
+        image = share * star_image(100.3, 49.8, rigs.PSF_SIGMA_PX) + rigs.DARK_DN
+        x_px, y_px = rigs.psf_fit(image, np.array([100]), np.array([50]))
+        assert (x_px[0], y_px[0]) == pytest.approx((100.3, 49.8), abs=1e-3)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import math
 from typing import get_type_hints
 
@@ -28,8 +29,10 @@ from hilstar.instruments.study.predictors import (
     NEAR,
     SLEW_DEG,
     SLEW_S,
+    predictors,
     rate_of,
     slew_attitude,
+    slew_sample,
 )
 
 SLEW_PART_S = 2.0  # a tenth of the swing, from its fastest on
@@ -228,3 +231,65 @@ def test_a_crossing_is_where_the_logarithms_of_frequencies_are_parted_by_the_err
     # from 0.3 under to 1.8 over
     assert crossing_hz(rows, "p", 100, 20) == pytest.approx(8 * 4 ** (0.3 / 2.1))
     assert crossing_hz(rows[:6], "p", 100, 20) == math.inf
+
+
+def test_every_vibration_is_under_half_of_the_packets_rate_and_comes_with_and_without_rates(
+    monkeypatch,
+):
+    asked = []
+
+    def planted(way, jitter_hz, packet_hz, age_ms, has_rates):
+        asked.append((way, jitter_hz, packet_hz, age_ms, has_rates))
+        return jitter_hz / 100, age_ms / 100
+
+    monkeypatch.setattr(prediction, "shaken_error", planted)
+    rows = shaken_rows(quick=False)
+    wanted = set()
+    for packet_hz, age_ms in prediction.SHAKEN_CELLS:
+        for jitter_hz in (1, 2, 3, 5, 7, 10, 14, 20, 27, 35, 45):
+            if 2 * jitter_hz < packet_hz:
+                for way in ("rate", "auto", "newest"):
+                    wanted |= {
+                        (way, jitter_hz, packet_hz, age_ms, rates) for rates in (True, False)
+                    }
+    assert len(asked) == len(wanted) and set(asked) == wanted
+    for row, (way, jitter_hz, packet_hz, age_ms, has_rates) in zip(rows, asked, strict=True):
+        packets = "with rates" if has_rates else "without rates"
+        assert row == Shaken(
+            way, packets, packet_hz, age_ms, jitter_hz, age_ms / 100, jitter_hz / 100
+        )
+
+
+def test_auto_is_told_by_the_vibration_at_which_it_is_worst():
+    rows = []
+    for packets, hz, residuals in (
+        ("with rates", 2, {"rate": 2.0, "newest": 8.0, "auto": 2.2}),
+        ("with rates", 20, {"rate": 9.0, "newest": 4.0, "auto": 6.0}),
+        ("without rates", 20, {"rate": 1.0, "newest": 5.0, "auto": 1.0}),
+    ):
+        rows += [Shaken(way, packets, 100, 20, hz, 1.0, left) for way, left in residuals.items()]
+    # another age is not most benches'
+    rows += [
+        Shaken(way, "with rates", 100, 5, 2, 1.0, left)
+        for way, left in zip(("rate", "newest", "auto"), (1, 1, 9), strict=True)
+    ]
+    assert prediction.auto_times(rows) == pytest.approx(1.5)
+
+
+def test_the_time_of_an_attitude_is_its_median_in_microseconds(monkeypatch):
+    """Of clocks that read 3, 5 and 40 us, in turn."""
+    now_ns = [0]
+    steps_ns = itertools.cycle((3000, 0, 5000, 0, 40_000, 0))
+
+    def clock():
+        now_ns[0] += next(steps_ns)
+        return now_ns[0]
+
+    # each call's end follows its begin by one step
+    next(steps_ns)
+    monkeypatch.setattr(prediction.time, "perf_counter_ns", clock)
+    samples = [slew_sample(k * 10_000_000) for k in range(30)]
+    hold = next(predictor for predictor in predictors() if predictor.name == "hold")
+    outcome = prediction._outcome(hold, samples, 100, 20)
+    assert outcome.attitude_us == 5.0
+    assert prediction.line_of(outcome).endswith("maximum, 5 us per attitude")

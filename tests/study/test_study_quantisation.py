@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import fields, replace
 from itertools import product
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from hilstar.basics import charts
 from hilstar.display.phases import USUAL_PSF, fainter, measure, phase_grid
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.study import codes, quantisation
@@ -53,6 +56,22 @@ def test_the_measure_finds_the_error_that_was_put_in():
     assert (errors.centroid_rms_px, errors.centroid_max_px) == pytest.approx((1, 1), abs=1e-4)
     nothing = measure(image, np.zeros_like(image), tile)
     assert np.isinf(nothing.flux_max_mag) and np.isinf(nothing.centroid_rms_px)
+
+
+def test_a_timed_field_has_three_times_as_many_stars_in_each_magnitude_as_in_the_one_before():
+    """Over eight of them under a white peak, all over the frame."""
+    field = codes.star_field((1000, 200), 10)
+    peaks = field.data["electrons_per_s"] * USUAL_PSF.peak_share
+    mags = -2.5 * np.log10(peaks)
+    assert len(mags) == codes.STARS and mags.min() >= 0 and mags.max() < 8.001
+    # of 10^(m / 2) evenly
+    for limit in (6.0, 7.0, 7.5):
+        share = (10 ** (limit / 2) - 1) / (10**4 - 1)
+        sigma = math.sqrt(share * (1 - share) / codes.STARS)
+        assert (mags < limit).mean() == pytest.approx(share, abs=4 * sigma)
+    for places, side_px in ((field.x_px, 1000), (field.y_px, 200)):
+        assert places.min() < 0.02 * side_px and places.max() > 0.98 * side_px
+        assert places.mean() == pytest.approx(side_px / 2, rel=0.08)
 
 
 def test_fainter_stars_have_less_light():
@@ -195,6 +214,11 @@ def test_errors_are_drawn_by_their_panel_and_way_with_their_aim(rows, small_run)
     rows = [replace(rows[0], figures=dark), *rows[1:]]
     run = small_run(lambda folder: draw_magnitudes(folder / "m", rows))
     figure = run.charts["m"]
+    exact, rounded = (largest_words(rows, 10, method) for method in ("exact", "round"))
+    assert run.title("m") == (
+        f"On 10 bits every star to 8 magnitudes under white is within {exact} with exact,"
+        f" {rounded} with round"
+    )
     for number, bits in enumerate(BITS):
         aim_mag, limit_mag = AIMS[bits]
         for axes, error, aim in zip(
@@ -272,3 +296,57 @@ def test_errors_fall_with_the_frames_of_an_exposure():
     assert srgb.steps == pytest.approx(star / first_step, rel=1e-6)
     assert steps_words(srgb) == f"sRGB, 8 bits: {srgb.steps:.1f} steps"
     assert steps_words(replace(srgb, steps=100.4)) == "sRGB, 8 bits: 100 steps"
+
+
+def test_errors_over_frames_are_rms_over_where_an_exposure_begins(monkeypatch):
+    """Four begins for each number of frames, by each method; light is a frame's mean."""
+    panel = frames_panels()[0]
+    sprites, tile, bright, _ = codes.judged_phases(2)
+    light = []
+    sizes = itertools.cycle((1.0, 2.0, 3.0, 4.0))
+
+    def errors(image, share, kinds):
+        light.append(image.sum() / (share * bright.sum()))
+        size = next(sizes)
+        places = {kind: size * (number + 2) for number, kind in enumerate(kinds)}
+        return SimpleNamespace(flux_rms_mag=size, axis_rms_px=places.get)
+
+    planted = sprites, tile, bright, SimpleNamespace(errors=errors)
+    monkeypatch.setattr(codes, "judged_phases", lambda phases: planted)
+    rows = list(over_frames(panel, 2, (2, 16)))
+    assert [(row.method, row.frames) for row in rows] == list(
+        product(("temporal", "dither"), (2, 16))
+    )
+    rms = math.sqrt((1 + 4 + 9 + 16) / 4)
+    for row in rows:
+        figures = row.flux_rms_mag, row.axis_rms_px_moment, row.axis_rms_px_window
+        assert (*figures, row.axis_rms_px_fit) == pytest.approx((rms, 2 * rms, 3 * rms, 4 * rms))
+    np.testing.assert_allclose(light, 1.0, atol=0.1)
+
+
+def test_errors_over_frames_are_drawn_solid_by_temporal_and_dotted_by_dither(small_run):
+    rows = []
+    for number, panel in enumerate(("coarse", "fine"), start=1):
+        for method, times in (("temporal", 1.0), ("dither", 3.0)):
+            for frames in (2, 6):
+                mag = 0.1 * number * times / frames
+                rows.append(
+                    codes.OverFrames(panel, 6.0, 50.0 * number, method, frames, mag, 0, 0, mag / 2)
+                )
+    run = small_run(lambda folder: codes.draw(folder / "o", rows))
+    assert run.title("o") == (
+        "Over any 6 frames temporal places stars within 0.0083 px rms on coarse, and within 0.017 px"
+        " on fine"
+    )
+    for axes, error in zip(run.charts["o"].axes, ("flux_rms_mag", "axis_rms_px_fit"), strict=True):
+        drawn = {}
+        for line in axes.get_lines():
+            drawn[line.get_color(), line.get_linestyle()] = list(line.get_ydata())
+        assert len(drawn) == 4
+        for number, panel in enumerate(("coarse", "fine")):
+            for method, style in (("temporal", "-"), ("dither", ":")):
+                own = [row for row in rows if (row.panel, row.method) == (panel, method)]
+                wanted = [getattr(row, error) for row in own]
+                assert drawn[charts.SERIES[number], style] == wanted
+    labels = {line.get_label() for line in run.charts["o"].axes[0].get_lines()}
+    assert {"coarse: 50.0 steps", "fine: 100 steps"} < labels

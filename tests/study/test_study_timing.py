@@ -218,3 +218,22 @@ def test_stripes_are_of_the_display_s_rows_behind_the_rows_of_the_tracker(small)
         assert row["light"] == pytest.approx(recorded[key], abs=1e-6)
         same += 1
     assert same == len(recorded)
+
+
+def test_a_case_s_line_has_its_largest_errors_beside_those_foretold():
+    """At 1 deg/s a beat of f = 0.3 moves a star by f (1 - f) / 2 of a refresh over 6.3 of them, and
+    changes its light by f or 1 - f of one refresh in 6.3.
+    """
+    case = timing.TimingCase(6.3)
+    points = []
+    for off, foretold, mag in ((-0.9, -0.8, 0.02), (0.5, 0.4, -0.06), (0.3, 0.1, 0.01)):
+        points.append(timing.BeatPoint(6.3, 1.0, 0.5, off, foretold, mag, mag))
+    line = timing.case_line(case, points)
+    worst_arcsec = 3600 / 60 * 0.3 * 0.7 / 2
+    off_rms = np.sqrt((0.01 + 0.01 + 0.04) / 3)
+    assert line.startswith("6.3 refreshes: up to 0.9 arcsec (")
+    assert line.endswith(f"; {off_rms:.2g} arcsec rms off that (3 stars)")
+    told = float(line.partition("(")[2].partition(" foretold")[0])
+    assert told == pytest.approx(worst_arcsec / 6.3, rel=0.02)
+    assert " and 0.06 mag (" in line
+    assert timing.TimingCase(2.4, 0.25).words == "2.4 refreshes, lit 0.25 of each"

@@ -171,6 +171,114 @@ def test_a_prediction_s_errors_are_those_of_its_samples():
     assert max(places.prediction_errors(blend, samples)) < 0.2 * max(errors)
 
 
+def test_predictions_are_told_by_their_worst_and_rms_and_timed_after_the_last_sample_but_one(
+    tradeoff_study, monkeypatch
+):
+    samples = [slew_sample(k * 50_000_000) for k in range(200)]
+    steps = tradeoff_study[2]["prediction"]
+    for predictor in predictors()[:2]:
+        errors = places.prediction_errors(predictor, samples)
+        row = steps[predictor.name]
+        assert float(row["error"]) == pytest.approx(max(errors))
+        assert float(row["second"]) == pytest.approx(math.sqrt(np.mean(np.square(errors))))
+    timed = []
+    monkeypatch.setattr(places, "slew_sample", lambda t_ns: samples[t_ns // 50_000_000])
+    monkeypatch.setattr(places, "prediction_errors", lambda predictor, samples: [1.0])
+    monkeypatch.setattr(places, "attitudes_at", lambda attitude_at, times: timed.append(times))
+    with ExitStack() as stack:
+        for trial in places.prediction(stack, True).trials:
+            trial.work()
+    for times_ns in timed:
+        assert len(times_ns) == 60
+        assert (times_ns[0], times_ns[-1]) == (samples[-2].t_ns, samples[-1].t_ns)
+
+
+def test_extended_precision_knows_places_between_those_of_float64():
+    camera = places.ideal_monitor(places.demo_config())
+    (turn,) = places.random_turns(1, camera)
+    assert len(places.random_turns(5, camera)) == 5
+    stars = places.stars_to(4.0)
+    near = stars.vectors[stars.grid.near(turn[2], 0.1)]
+    # a cell that is taken for its centre has no radius
+    grid = places.in_cells(stars, 10.0, by_centres=True).grid
+    assert (set(grid.cos_radius.tolist()), set(grid.sin_radius.tolist())) == ({1.0}, {0.0})
+    exact = places.EXACT.places_px(near, turn, camera)
+    assert np.isfinite(exact).all() and len(exact) > 5
+    assert (exact != exact.astype(np.float64)).mean() > 0.9
+
+
+def test_a_step_s_cells_are_its_own_and_have_no_front_on_a_busy_machine(small_run, monkeypatch):
+    """The study is as busy as its busiest step."""
+    trial = Trial("a method", 0.5, 2.0, list, True, False, {"max_px_fit": 0.25})
+    trial = replace(trial, time_ms=3.0, quartiles_ms=(2.0, 7.0), on_front=True, beaten="why")
+    step = Trials("psf", "sums", Figure("error", "mag"), Figure("rms", "px"), "", [trial])
+    cells = tradeoff.cells_of_trial(step, trial)
+    assert {name: cells.pop(name) for name in tradeoff.MORE_COLUMNS if name != "max_px_fit"} == {
+        name: "" for name in tradeoff.MORE_COLUMNS if name != "max_px_fit"
+    }
+    assert cells == {
+        "step": "psf",
+        "work": "sums",
+        "method": "a method",
+        "error": 0.5,
+        "error_unit": "mag",
+        "error_is": "error",
+        "second": 2.0,
+        "second_unit": "px",
+        "second_is": "rms",
+        "time_ms": 3.0,
+        "quartile_1_ms": 2.0,
+        "quartile_3_ms": 7.0,
+        "default": True,
+        "exact": False,
+        "front": True,
+        "beaten_by": "why",
+        "max_px_fit": 0.25,
+    }
+    loads = {"first": Load(), "busy": Load(1e3), "last": Load(1e-3)}
+    steps = {name: replace(step, name=name, load=load) for name, load in loads.items()}
+    plans = [lambda stack, quick, name=name: steps[name] for name in loads]
+    monkeypatch.setattr(tradeoff, "STEPS", tuple(plans))
+    monkeypatch.setattr(tradeoff, "measured", lambda step, budget_s: step)
+    run = small_run(tradeoff.run, True)
+    fronts = {row["step"]: row["front"] for row in run.rows("tradeoff")}
+    assert fronts == {"first": "True", "busy": "", "last": "True"}
+    lines, right = run.told
+    assert right is None and lines[-1] == Load(1e3).caution
+    assert set(run.charts) == {f"tradeoff_{name}" for name in loads}
+
+
+def test_codes_that_are_timed_are_those_of_one_frame_after_the_other(monkeypatch):
+    drawn = []
+
+    class Planted:
+        footprint_px = 10
+
+        def __init__(self, target):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *raised):
+            pass
+
+        def draw(self, field, number):
+            drawn.append(number)
+
+        def levels(self):
+            return None
+
+    errors = SimpleNamespace(flux_max_mag=0.1, max_px=lambda kind: 0.2)
+    monkeypatch.setattr(light, "Renderer", Planted)
+    monkeypatch.setattr(light, "code_errors", lambda *asked: [errors])
+    with ExitStack() as stack:
+        trial, *_ = light.quantisation(stack, True).trials
+        for _ in range(3):
+            trial.work()
+    assert drawn == [0, 1, 2]
+
+
 def test_the_smear_s_stars_are_even_over_the_detector_in_the_middle_of_the_exposure():
     bench = places.smear_bench()
     side = bench.side_px
@@ -408,6 +516,27 @@ def test_what_beats_a_default_is_the_fastest_that_does_and_on_a_busy_machine_not
     busy = measured(step, 0.02)
     assert not any(trial.on_front or trial.beaten for trial in busy.trials)
     assert f"   {sweep.NOT_JUDGED}" in table_lines(busy)
+
+
+def test_a_step_s_works_share_its_budget_and_its_floor_is_drawn_where_one_is_below(
+    clock, monkeypatch, small_run
+):
+    asked = []
+    turns = trials.in_turn
+
+    def in_turn(works, rounds, share_s):
+        asked.append((list(works), rounds, share_s))
+        return turns(works, 1, share_s)
+
+    monkeypatch.setattr(trials, "in_turn", in_turn)
+    step = measured(three_methods(clock, 4.0), 0.6)
+    assert asked == [(["fast and rough", "own", "slow and rough"], MAX_ROUNDS, pytest.approx(0.2))]
+    for floor, is_drawn in ((5e-3, True), (1e-3, False)):
+        floored = replace(step, error=Figure("error", "px", floor))
+        run = small_run(lambda folder, step=floored: draw_trials(folder / "t", step, "here"))
+        levels = [y for _, x, y in run.lines("t", 0) if x == [0.0, 1.0]]
+        assert levels == ([[floor, floor]] if is_drawn else [])
+        assert run.title("t") == charts.capital(trials.finding(floored))
 
 
 def test_a_time_s_quartiles_are_of_the_wall_and_say_where_methods_overlap():

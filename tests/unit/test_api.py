@@ -13,9 +13,12 @@ from astropy.io import fits
 from scipy.spatial.transform import Rotation
 
 import hilstar
+from hilstar.api import OpenBench, _unit_of, _unit_quaternion
 from hilstar.rotation import from_radec_roll_deg
+from hilstar.server.bench.frame import Bench
 from hilstar.testing import compare
 from tests.support.benches import bench_text
+from tests.support.refusals import refusal
 
 BELT = from_radec_roll_deg(84.057, -1.2, 30.0)
 # Float64 angles and places in both: Astropy's own transformations agree to some 1e-10 rad.
@@ -232,3 +235,38 @@ def test_a_frame_can_be_pickled_without_its_bench(bench):
     assert repr(again) == repr(frame)
     with pytest.raises(hilstar.InputError, match="was pickled"):
         again.to_table()
+
+
+@pytest.mark.parametrize(
+    ("column", "unit"),
+    [
+        ("electrons_r_per_s", "electron / s"),
+        ("shift_arcsec", "arcsec"),
+        ("v_mag", "mag"),
+        ("parallax_mas", "mas"),
+        ("ra_deg", "deg"),
+        ("x_px", "pix"),
+        ("period_d", "day"),
+        ("temperature_k", "K"),
+        ("hip", None),
+    ],
+)
+def test_a_column_s_unit_is_that_of_its_longest_end(column, unit):
+    assert _unit_of(column) == unit
+
+
+@pytest.mark.parametrize(("off", "is_kept"), [(0.0, True), (9e-7, True), (2e-6, False)])
+def test_a_quaternion_of_seven_digits_is_drawn_as_it_was_written(off, is_kept):
+    q = np.array([1.0 + off, 0.0, 0.0, 0.0])
+    drawn = _unit_quaternion(q)
+    assert (drawn is q) is is_kept
+    assert abs(np.linalg.norm(drawn) - 1) <= (1e-6 if is_kept else 1e-15)
+
+
+def test_a_closed_bench_draws_no_more(monkeypatch):
+    bench = object.__new__(OpenBench)
+    monkeypatch.setattr(Bench, "close", lambda self: None)
+    bench._refuse_closed("frame")
+    bench.close()
+    for what in ("frame", "draw", "simulate", "budget"):
+        assert "closed" in refusal(bench._refuse_closed, what)

@@ -531,14 +531,9 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
     valid = np.flatnonzero(answers.valid)
     error_budget = _budget_of(run, timed, valid)
     clock = error_budget.clock
-    start_s = float(run.commanded.t_s[0])
-    t_s = start_s + (tau_s - clock.offset_s - start_s) / (1 + clock.drift)
+    t_s = clock.run_s(tau_s, float(run.commanded.t_s[0]))
     right_rows = valid[error_budget.row]
-    right = np.zeros(len(t_s), dtype=np.bool_)
-    right[right_rows] = True
-    right[valid[error_budget.held]] = True
-    wrong = np.zeros(len(t_s), dtype=np.bool_)
-    wrong[valid[error_budget.wrong]] = True
+    right, wrong = _right_and_wrong(error_budget, valid, len(t_s))
     further = FurtherFigures()
     add_rates(further, answers, run.commanded, error_budget)
     add_jitter(further, error_budget)
@@ -580,6 +575,20 @@ def assess_files(ledger: Path, telemetry: Path | None, settings: AssessSettings)
         cube=bench.cube,
         further=further,
     )
+
+
+def _right_and_wrong(
+    found: DecomposedRun, valid: IntArray, count: int
+) -> tuple[BoolArray, BoolArray]:
+    """Which of so many rows (count,) are right answers and which wrong ones, of which `valid` (k,)
+    were assessed. An answer that looked while a frame was held came, and was not wrong.
+    """
+    right = np.zeros(count, dtype=np.bool_)
+    right[valid[found.row]] = True
+    right[valid[found.held]] = True
+    wrong = np.zeros(count, dtype=np.bool_)
+    wrong[valid[found.wrong]] = True
+    return right, wrong
 
 
 def _answers_of_ledger(run: RunLedger, settings: AssessSettings) -> TimedAnswers:
@@ -778,7 +787,7 @@ def _axes_by_name(rotation: FloatArray) -> str:
     nearest[range(3), column] = np.sign(matrix[range(3), column])
     cosine = (np.trace(matrix @ nearest.T) - 1) / 2
     off_rad = np.arccos(np.clip(cosine, -1, 1))
-    if abs(np.linalg.det(nearest) - 1) > 1e-9 or off_rad > NEAR_AXES_RAD:
+    if off_rad > NEAR_AXES_RAD:
         return ""
     axes = []
     for letter, row, k in zip("xyz", nearest, column.tolist(), strict=True):

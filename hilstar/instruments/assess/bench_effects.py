@@ -24,7 +24,7 @@ from hilstar.instruments.assess.places import spread_rows
 from hilstar.instruments.simulate.glass import MIN_STARS as MIN_SPLIT_STARS
 from hilstar.instruments.simulate.glass import split_errors, told_psf
 from hilstar.instruments.simulate.noise import attitude_limits_arcsec, field_stars
-from hilstar.instruments.simulate.star_finder import star_finder
+from hilstar.instruments.simulate.star_finder import Matched, star_finder
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.optics.camera import Camera
 from hilstar.server.answers.answer import ReportedStar
@@ -175,17 +175,23 @@ def display_errors(file: BenchFile, q_icrs_to_cam: FloatArray) -> FloatArray:
             field = twin.field(q, number)
             sky = finder.match(field.sky_e, field.x_px, field.y_px)
             shown = finder.match(field.shown_e, field.x_px, field.y_px)
-            both = (sky.index >= 0) & (shown.index >= 0)
-            if both.sum() < MIN_STARS:
-                continue
-            i = sky.index[both]
-            j = shown.index[both]
-            true_rays = twin.camera.rays(sky.found.x_px[i], sky.found.y_px[i])
-            shown_rays = twin.camera.rays(shown.found.x_px[j], shown.found.y_px[j])
-            light = sky.found.flux[i]
-            turn_rad = turn_between(normalise(true_rays), normalise(shown_rays), light)
-            errors[number] = ARCSEC_PER_RAD * turn_rad
+            errors[number] = matched_turn(twin.camera, sky, shown)
     return errors
+
+
+def matched_turn(camera: Camera, sky: Matched, shown: Matched) -> FloatArray:
+    """The turn (3,), arcsec, cam axes, from the stars of the sky to the same ones as shown, by the
+    sky's light; NaN for fewer than MIN_STARS that are found in both.
+    """
+    both = (sky.index >= 0) & (shown.index >= 0)
+    if both.sum() < MIN_STARS:
+        return np.full(3, np.nan)
+    i = sky.index[both]
+    j = shown.index[both]
+    true_rays = camera.rays(sky.found.x_px[i], sky.found.y_px[i])
+    shown_rays = camera.rays(shown.found.x_px[j], shown.found.y_px[j])
+    light = sky.found.flux[i]
+    return ARCSEC_PER_RAD * turn_between(normalise(true_rays), normalise(shown_rays), light)
 
 
 def turn_between(true: FloatArray, seen: FloatArray, weight: FloatArray) -> FloatArray:

@@ -359,6 +359,10 @@ class ClockFit:
     offset_told: bool
     drift_told: bool
 
+    def run_s(self, tau_s: FloatArray, start_s: float) -> FloatArray:
+        """Times (n,) of the telemetry's clock on that of a run that began at `start_s`, s."""
+        return start_s + (tau_s - self.offset_s - start_s) / (1 + self.drift)
+
 
 class ClockSolver:
     """Fits bias and clock of telemetry with times (n,), s, and attitudes (n, 4) to the commanded

@@ -7,7 +7,7 @@ from pathlib import Path
 from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.acceptance_plan import AcceptancePlan, CaseSet, ClauseTable
 from hilstar.instruments.campaign.case_table import Columns
-from hilstar.instruments.campaign.requirements import RequirementVerdict
+from hilstar.instruments.campaign.requirements import RequirementVerdict, bench_error
 from hilstar.instruments.campaign.solvers import CENTROIDS
 from hilstar.instruments.campaign.sweep import LevelCount
 from hilstar.server.bench.alignment import cube_to_boresight
@@ -83,10 +83,7 @@ class AcceptedBench:
         """How far the bench's own attitude may be off at 95 %, arcsec across and about, and its
         own time, s; None and 0 where no certificate says it.
         """
-        if self.certificate is None:
-            return None, 0.0
-        late_ms = self.certificate.expanded(("latency",)) or 0.0
-        return self.certificate.attitude_arcsec, late_ms / 1e3
+        return bench_error(self.file, self.certificate)
 
     @property
     def solver_text(self) -> str:

@@ -53,6 +53,8 @@ from hilstar.instruments.campaign.plan import (
     checked_conditions,
 )
 from hilstar.instruments.campaign.results import MAX_FITTED_CASES, attitudes_of
+from hilstar.server.bench.bench_file import BenchFile
+from hilstar.server.bench.certificate_file import Certificate
 
 AXIS_INDICES = {"x": [0], "y": [1], "z": [2], "cross": [0, 1], "roll": [2]}
 COMPARISONS: dict[str, Callable[[Any, Any], Any]] = {
@@ -169,6 +171,18 @@ def verdicts_of(
             verdict = judged_figure(require, figure, bench_arcsec, bench_s)
         verdicts.append(verdict)
     return verdicts
+
+
+def bench_error(
+    file: BenchFile, certificate: Certificate | None
+) -> tuple[tuple[float, float] | None, float]:
+    """How far a bench's own attitude may be off at 95 %, arcsec across and about, and its own time,
+    s; None and 0 where no certificate says it.
+    """
+    if certificate is None:
+        return None, 0.0
+    late_ms = certificate.late_ms(file.config.monitor.panel_delay_ms) or 0.0
+    return certificate.attitude_arcsec, late_ms / 1e3
 
 
 def chosen_cases(condition: str, cases: Columns) -> npt.NDArray[np.bool_]:

@@ -44,6 +44,7 @@ from hilstar.instruments.campaign.requirements import (
     NOT_MET,
     NOT_SHOWN,
     RequirementVerdict,
+    bench_error,
     verdicts_of,
 )
 from hilstar.instruments.campaign.star_motion import with_motion
@@ -103,11 +104,9 @@ def write_requirements(
     certificate = None
     if plan.through == "bench":
         certificate = bench_certificate(file)
-    bench_arcsec = None
-    if certificate is not None:
-        bench_arcsec = certificate.attitude_arcsec
+    own_arcsec, own_s = bench_error(file, certificate)
     cases = with_motion(cases, plan.require, file, scale, plan.through)
-    verdicts = verdicts_of(plan.require, cases, scale, plan.seed, bench_arcsec)
+    verdicts = verdicts_of(plan.require, cases, scale, plan.seed, own_arcsec, own_s)
     rows = []
     for verdict in verdicts:
         summary = summary_of(verdict)

@@ -238,9 +238,8 @@ class Judge:
         light_dn = self._light_dn(number)
         level = shot.level.level
         variance = session.pixels.variance_dn2(level)
-        star_variance = np.maximum(light_dn, 0) / session.pixels.gain_e_per_dn
-        noise = np.sqrt(variance + star_variance)
-        residual = (shot.above_dn - light_dn) / noise
+        gain_e_per_dn = session.pixels.gain_e_per_dn
+        residual = in_sigmas(shot.above_dn - light_dn, light_dn, variance, gain_e_per_dn)
         expected = self._expected(number)
         rows = self._rows(number, expected)
         dim, is_dim = _dim_regions(rows, shot.photo.size_px)
@@ -249,11 +248,7 @@ class Judge:
                 rows[k] = replace(row, flags=(*row.flags, "dim region"))
         light_sigma = light_dn / np.sqrt(variance)
         sources = self._sources(number, light_sigma, expected)
-        background = residual[self._background(shot, light_sigma)]
-        background = background[np.abs(background) < MAX_CHI]
-        background_chi2 = math.nan
-        if len(background):
-            background_chi2 = float((background**2).mean())
+        background_chi2 = chi2_of(residual[self._background(shot, light_sigma)])
         star_chi2 = math.nan
         if shot.clean.any():
             star_chi2 = float(np.median(shot.found.chi2[shot.clean]))
@@ -418,8 +413,9 @@ class Judge:
         camera = self.session.camera.camera
         if config.sky.bodies.satellites is None or config.site is None or shot.photo.t_ns is None:
             return {}
-        utc = f"{np.datetime64(shot.photo.t_ns, 'ns').astype('datetime64[ms]')}Z"
-        sky = msgspec.structs.replace(config.sky, epoch_utc=utc, epoch_jyear=shot.sky.epoch_jyear)
+        sky = msgspec.structs.replace(
+            config.sky, epoch_utc=utc_of(shot.photo.t_ns), epoch_jyear=shot.sky.epoch_jyear
+        )
         moving = bench_moving(msgspec.structs.replace(config, sky=sky), file.folder)
         if moving is None or moving.satellites is None:
             return {}
@@ -518,6 +514,29 @@ def defects(photographs: Iterable[FloatArray], have_moved: bool) -> tuple[BoolAr
         dark_counts = dark_counts + (sigmas < -HOT_SIGMAS)
     minimum = max(1, math.ceil(HOT_SHARE * count))
     return bright_counts >= minimum, dark_counts >= minimum
+
+
+def in_sigmas(
+    off_dn: FloatArray, light_dn: FloatArray, variance_dn2: FloatArray, gain_e_per_dn: float
+) -> FloatArray:
+    """What a photograph has beyond its prediction (height, width), DN, in sigmas of the background
+    and of the predicted light's own shot noise.
+    """
+    star_variance = np.maximum(light_dn, 0) / gain_e_per_dn
+    return np.asarray(off_dn / np.sqrt(variance_dn2 + star_variance))
+
+
+def chi2_of(sigmas: FloatArray) -> float:
+    """The mean square of background pixels (n,), without those beyond MAX_CHI; NaN of none."""
+    near = sigmas[np.abs(sigmas) < MAX_CHI]
+    if len(near):
+        return float((near**2).mean())
+    return math.nan
+
+
+def utc_of(t_ns: int) -> str:
+    """A time, ns of UTC, as a bench file has it, to the millisecond."""
+    return f"{np.datetime64(t_ns, 'ns').astype('datetime64[ms]')}Z"
 
 
 def light_at(above_dn: FloatArray, x_px: float, y_px: float) -> float:

@@ -174,10 +174,10 @@ class OtherWork:
         try:
             first_line = STAT.read_text(encoding="ascii").split("\n", 1)[0]
             ticks = [int(word) for word in first_line.split()[1:9]]
+            user, nice, system, idle, waiting, *interrupts = ticks
         except (OSError, ValueError):
             return 0.0, 0.0
         tick_s = 1 / os.sysconf("SC_CLK_TCK")
-        user, nice, system, idle, waiting, *interrupts = ticks
         busy = user + nice + system + sum(interrupts)
         own_s = 0.0
         for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN):

@@ -72,7 +72,7 @@ class BodyLayer:
         extended = list(light.extended)
         names = []
         over_white = []
-        drawn_lights = self._lights(discs, posed)
+        drawn_lights = self._lights(discs, posed, is_before_light=bool(extended))
         for disc, lights in zip(reversed(discs), drawn_lights, strict=True):
             extended.extend(lights)
             if lights:
@@ -223,14 +223,17 @@ class BodyLayer:
         shear = _shear(scan, turn.rate_cam_rad_s, camera)
         return DiscView(camera, self.canvas.psf, tuple(poses), shear)
 
-    def _lights(self, discs: list[Disc], posed: DiscView) -> list[list[ExtendedLight]]:
+    def _lights(
+        self, discs: list[Disc], posed: DiscView, is_before_light: bool = False
+    ) -> list[list[ExtendedLight]]:
         """The light of each of some discs, which are nearest first, in the order in which they
-        are drawn.
+        are drawn; they may stand before other light, such as diffuse light.
         """
         lights = []
         for number, disc in reversed([*enumerate(discs, 1)]):
-            # the last of the list is drawn first, and there is nothing to cover
-            lights.append(disc_lights(disc, posed, covers=number < len(discs)))
+            # the last of the list is drawn first: it covers no other disc
+            covers = is_before_light or number < len(discs)
+            lights.append(disc_lights(disc, posed, covers))
         return lights
 
     def _clips(self, lights: list[ExtendedLight], white_e_per_s: float) -> bool:

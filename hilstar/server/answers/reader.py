@@ -234,6 +234,12 @@ class DecodingLink:
         self._road.close()
 
 
+def newest_details(before: dict[str, str], new: dict[str, str]) -> dict[str, str]:
+    """The examples of refusals by reason, of the MAX_DETAILS reasons that came last."""
+    earlier = {reason: detail for reason, detail in before.items() if reason not in new}
+    return dict([*earlier.items(), *new.items()][-MAX_DETAILS:])
+
+
 class AnswersApart(Closing):
     """The `AnswerSource` of a bench. It starts the reading process at once, and restarts it if it
     ends.
@@ -282,7 +288,7 @@ class AnswersApart(Closing):
             self._refused.update(handed.refused)
             if handed.trouble is not None:
                 self._trouble = handed.trouble
-            self.details = dict(list({**self.details, **handed.details}.items())[-MAX_DETAILS:])
+            self.details = newest_details(self.details, handed.details)
         return answers
 
     def refusals(self) -> dict[str, int]:

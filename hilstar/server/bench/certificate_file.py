@@ -151,6 +151,16 @@ class Certificate(msgspec.Struct, frozen=True, kw_only=True):
                 half_widths.append(max(abs(figure.lower), abs(figure.upper)))
         return max(half_widths) if half_widths else None
 
+    def late_ms(self, stated_ms: float) -> float | None:
+        """How far the bench's light may be from the delay that its file states, ms, at 95 %: what
+        is stated is taken into account already. None where not assessed.
+        """
+        off_ms = []
+        for figure in self.figures:
+            if figure.quantity == "latency":
+                off_ms += [abs(figure.lower - stated_ms), abs(figure.upper - stated_ms)]
+        return max(off_ms, default=None)
+
     @property
     def attitude_arcsec(self) -> tuple[float, float] | None:
         """How far the bench's own attitude may be off at 95 %, across the boresight and about

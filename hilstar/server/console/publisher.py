@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from hilstar.server.record.ledger import Ledger, LedgerSwitch
     from hilstar.server.run_progress import Running
     from hilstar.server.screen.screen import Screen
+    from hilstar.sky.stars import Stars
 
 MIN_PICTURE_NS = NS_PER_S // 10  # shortest interval between two pictures
 MAX_CLIPPED = 300  # clipped stars in the state; a picture has hundreds of stars
@@ -335,7 +336,9 @@ class OrderHandler:
     def _switch_ledger(self, order: messages.Order, who: str) -> Done:
         with self._ledger_lock:
             if order.on:
-                path = self._free_path()
+                last = self._ledger.last
+                folder = Path.cwd() if last is None else last.path.parent
+                path = free_path(folder, datetime.now(UTC))
                 was_on = self._ledger.on
                 ledger = self._ledger.begin(lambda: self._make_ledger(path))
                 if not was_on:
@@ -349,21 +352,6 @@ class OrderHandler:
             if ledger_now.failure is not None:
                 return 500, f"{ledger_now.path}: {ledger_now.failure}"
             return 200, f"ledger off: {ledger_now.path} is whole"
-
-    def _free_path(self) -> Path:
-        """A free path for a new ledger, named by UTC: in the folder of the newest ledger, else in
-        the current working directory.
-        """
-        if self._ledger.last is None:
-            folder = Path.cwd()
-        else:
-            folder = self._ledger.last.path.parent
-        now = datetime.now(UTC)
-        for k in range(100):
-            path = folder / (f"hilstar-{now:%Y%m%dT%H%M%SZ}" + (f"-{k}" if k else "") + ".mcap")
-            if not path.exists():
-                return path
-        return folder / f"hilstar-{now:%Y%m%dT%H%M%S.%fZ}.mcap"
 
     def _mark(self, order: messages.Order, who: str) -> Done:
         text = printable(" ".join(order.text.split()))[:MAX_MARK_CHARACTERS]
@@ -449,23 +437,34 @@ def setup_for(
     )
 
 
+def free_path(folder: Path, now: datetime) -> Path:
+    """A free path in a folder for a new ledger, named by its time, UTC."""
+    for k in range(100):
+        path = folder / (f"hilstar-{now:%Y%m%dT%H%M%SZ}" + (f"-{k}" if k else "") + ".mcap")
+        if not path.exists():
+            return path
+    return folder / f"hilstar-{now:%Y%m%dT%H%M%S.%fZ}.mcap"
+
+
+def names_of(stars: "Stars") -> dict[int, str]:
+    """The names of the brightest stars without a HIP number, MAX_NAMES at most, by index."""
+    unnamed = np.flatnonzero(stars.hip == 0)
+    unnamed = unnamed[np.argsort(stars.v_mag[unnamed], kind="stable")[:MAX_NAMES]]
+    names = zip(unnamed.tolist(), stars.names(unnamed), strict=True)
+    return {star: name for star, name in names if name}
+
+
 def scene_of(bench: Bench, aids_in_levels: bool) -> OverlayScene:
     """The scene of a bench, from which the page's process draws its overlay. `aids_in_levels`: the
     levels of pictures contain the operator's aids already.
     """
     stars = bench.shown_stars
     overlay = overlay_of(bench)
-    unnamed = np.flatnonzero(stars.hip == 0)
-    unnamed = unnamed[np.argsort(stars.v_mag[unnamed], kind="stable")[:MAX_NAMES]]
     return OverlayScene(
         marks=overlay.marks,
         hip=stars.hip.copy(),
         v_mag=stars.v_mag.astype(np.float32),
-        names={
-            star: name
-            for star, name in zip(unnamed.tolist(), stars.names(unnamed), strict=True)
-            if name
-        },
+        names=names_of(stars),
         sky=overlay.sky(),
         aids=aid_levels_of(bench),
         aids_in_levels=aids_in_levels,

@@ -115,3 +115,58 @@ def test_names_at_the_side_stand_in_the_order_of_their_lines():
     assert sorted(heights, key=heights.__getitem__) == sorted(ends, key=ends.__getitem__)
     assert (np.diff(sorted(heights.values())) > 0.01).all()
     assert heights["e"] == pytest.approx(0.1)
+
+
+def test_names_that_fill_a_panel_begin_at_its_foot():
+    assert charts.spread([0.3, 0.1, 0.05], 0.2) == pytest.approx([0.4, 0.2, 0.0])
+    assert charts.spread([1.5, 0.9], 0.2) == pytest.approx([1.0, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("value", "text"), [(1e6, "10⁶"), (999_000, "10⁶"), (1.24e-5, "1.2·10⁻⁵"), (math.inf, "-")]
+)
+def test_a_measured_figure_has_two_digits(value, text):
+    assert charts.two_digits(value) == text
+
+
+def test_a_key_of_a_file_keeps_its_letters():
+    texts = ("tracker.aperture_mm", "drift_ms of a day", "a drift", "drift", "x")
+    assert [charts.capital(text) for text in texts] == [
+        "tracker.aperture_mm",
+        "drift_ms of a day",
+        "A drift",
+        "Drift",
+        "x",
+    ]
+
+
+@pytest.mark.parametrize("unit", ["%", "mag", "px", "s", "arcsec", "deg/s"])
+def test_a_title_is_of_even_lines_and_parts_no_figure_from_its_unit(unit):
+    lines = charts.title_lines(f"the error of a star is on the whole below 0.25 {unit} or so", 46)
+    first, second = lines.split("\n")
+    assert abs(len(first) - len(second)) < 12
+    assert f"0.25\N{NO-BREAK SPACE}{unit}" in lines
+    assert charts.title_lines("1.234e-05 of it") == "1.2·10⁻⁵ of it"
+
+
+def test_a_path_without_an_ending_keeps_what_looks_like_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(charts, "png", lambda figure: b"png")
+    monkeypatch.setattr(charts, "svg", lambda figure: "svg")
+    charts.save(Figure(), tmp_path / "run.0001")
+    charts.save(Figure(), tmp_path / "one.svg")
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "one.svg",
+        "run.0001.png",
+        "run.0001.svg",
+    ]
+
+
+def test_a_name_that_was_moved_from_its_line_s_end_is_joined_to_it():
+    with charts.panels_of("Three lines") as (axes,):
+        for name, end in (("high", 0.9), ("upper", 0.5), ("lower", 0.499)):
+            axes.plot([0, 1], [0.5, end], label=name)
+        axes.plot([0, 0.5], [0.1, 0.1], label="short")
+        axes.set(xlim=(0, 1), ylim=(0, 1))
+        charts.label_ends(axes)
+    joined = {text.get_text(): text.arrow_patch is not None for text in axes.texts}
+    assert joined == {"high": False, "upper": False, "lower": True, "short": True}

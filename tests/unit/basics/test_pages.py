@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 
 import pytest
@@ -23,7 +24,9 @@ from hilstar.basics.pages import (
     page_of,
     page_style,
     side_by_side,
+    split_key,
     table_of,
+    value_text,
     within,
 )
 from hilstar.basics.palette import colours_of
@@ -174,3 +177,45 @@ def test_a_page_is_light_on_paper_whatever_the_reader_prefers() -> None:
     )
     assert rest.count(dark) == 1
     assert "@media print { :root { color-scheme: light } }" in style
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (12345.678, "12\u202f350"),
+        (12345, "12\u202f345"),
+        (1e15, "1\u202f000\u202f000\u202f000\u202f000\u202f000"),
+        (0.00023456, "0.0002346"),
+        (-0.00002, "-2\N{MIDDLE DOT}10\N{SUPERSCRIPT MINUS}\N{SUPERSCRIPT FIVE}"),
+        (False, "False"),
+        ([1, 2, 3], "1, 2, 3"),
+        ({"a_b": 1.5, "p95": (2, 3)}, "a b 1.5; at 95 % 2 \N{MULTIPLICATION SIGN} 3"),
+        (math.inf, "inf"),
+    ],
+)
+def test_a_value_is_written_as_a_person_does(value, text) -> None:
+    assert value_text(value) == text
+
+
+def test_what_is_false_or_none_at_all_has_its_row_and_what_is_empty_has_none() -> None:
+    figures = {"lit": False, "dots": 0, "list": [], "words": "", "offset_error_s": 0.1}
+    assert [name for name, _ in keyed_rows(figures)] == ["lit", "dots", "list", "offset error"]
+
+
+def test_the_longest_ending_of_a_key_is_its_unit() -> None:
+    assert [split_key(key) for key in ("dark_e_per_s", "turn_deg_s", "wait_s", "x_error_deg")] == [
+        ("dark", "_e_per_s"),
+        ("turn", "_deg_s"),
+        ("wait", "_s"),
+        ("x_error", "_deg"),
+    ]
+
+
+def test_a_row_may_be_short_and_a_column_of_empty_texts_is_left_out() -> None:
+    rows = [("a", "", 1), ("b", "")]
+    assert cell_texts(table_of(rows, ("name", "none"))) == [["name"], ["a"], ["b"]]
+    assert cell_texts(table_of(rows)) == [["a", "", "1"], ["b", ""]]
+
+
+def test_a_card_s_anchor_is_text() -> None:
+    assert 'id="a&quot;b"' in Card("Title", anchor='a"b').html()

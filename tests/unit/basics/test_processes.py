@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib.util
+import multiprocessing
 import os
 import resource
 import select
@@ -14,13 +15,15 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from importlib.machinery import PathFinder
+from types import SimpleNamespace
 
 import pytest
 
 from hilstar.basics.process import interrupts, scheduling
-from hilstar.basics.process.pool import ONE_THREAD, _for_children
+from hilstar.basics.process.pool import ONE_THREAD, ProcessPool, WorkerProcess, _for_children
 from hilstar.basics.process.programs import EACH_S, Service, sign_period_s
 from hilstar.basics.process.scheduling import (
     HEAVY,
@@ -55,7 +58,10 @@ def test_signs_go_to_systemd_twice_in_what_it_waits_for_this_process(environment
     assert sign_period_s(environment, OWN) == pytest.approx(period_s)
 
 
-def test_a_service_whose_work_hangs_gives_no_sign_until_it_goes_on(tmp_path):
+@pytest.mark.parametrize("is_abstract", [False, True])
+def test_a_service_whose_work_hangs_gives_no_sign_until_it_goes_on(tmp_path, is_abstract):
+    """sd_notify(3): @ stands for the zero that an abstract socket's name begins with."""
+    address = f"@hilstar-{tmp_path}" if is_abstract else str(tmp_path / "notify")
     asked = 0
 
     def alive() -> bool:
@@ -64,9 +70,9 @@ def test_a_service_whose_work_hangs_gives_no_sign_until_it_goes_on(tmp_path):
         return asked > 3
 
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
-        systemd.bind(str(tmp_path / "notify"))
+        systemd.bind(address.replace("@", "\0"))
         systemd.settimeout(PATIENCE_S)
-        environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "20000"}
+        environment = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "20000"}
         with Service(lambda: True, alive, lambda: "two\nlines", environment):
             assert systemd.recv(999) == b"READY=1\nSTATUS=two lines"
             assert systemd.recv(999) == b"WATCHDOG=1\nSTATUS=two lines"
@@ -188,12 +194,13 @@ def test_a_loop_leaves_the_collector_and_the_threads_turns_as_they_were(monkeypa
         (gc.enable if was_collecting else gc.disable)()
 
 
-def test_tries_come_at_once_and_then_twice_as_seldom_until_all_was_well():
+@pytest.mark.parametrize("first_anew", [True, False])
+def test_tries_come_at_once_and_then_twice_as_seldom_until_all_was_well(first_anew):
     clock = FakeClock()
     again = BackOff(0.05, 0.3, clock)
     assert again.over
     waits_s = []
-    for anew in (True, False, False, False, False, True, False):
+    for anew in (first_anew, False, False, False, False, True, False):
         again.put_off(anew=anew)
         waits_s.append(again.left_s)
         clock.sleep(again.left_s)
@@ -211,6 +218,24 @@ def test_workers_have_one_thread_and_no_ctrl_c_and_their_owner_keeps_its_own(mon
         assert signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, set())
     assert {name: os.environ.get(name) for name in ONE_THREAD} == before
     assert signal.pthread_sigmask(signal.SIG_BLOCK, set()) == mask
+
+
+def test_an_answer_of_a_worker_that_has_died_since_is_still_heard():
+    here, there = multiprocessing.Pipe()
+    reading, writing = os.pipe()
+    ended = SimpleNamespace(
+        sentinel=reading, exitcode=-9, join=lambda seconds: None, is_alive=lambda: False
+    )
+    pool = ProcessPool(int, (), ())
+    worker = WorkerProcess(ended, here)
+    pool.workers.append(worker)
+    there.send(("answer", 5))
+    there.close()
+    os.close(writing)
+    news = [next(pool.heard()) for _ in range(2)]
+    assert [(one.kind, one.said) for one in news] == [("answer", 5), ("died", -9)]
+    assert worker.ready and pool.workers == []
+    os.close(reading)
 
 
 def test_what_nobody_reads_takes_so_much_memory_and_is_counted_when_it_is_read(monkeypatch):
@@ -261,6 +286,63 @@ def test_a_user_s_module_is_the_one_beside_the_file_and_hides_no_installed_one(
     for function in ("os:system", "pyclbr:system", "subprocess:run", "of_this_bench", ""):
         with pytest.raises(UserCodeError):
             user_function(f"python:{function}", tmp_path)
+
+
+def test_modules_of_one_name_are_each_those_of_their_own_folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    for folder, level in (("a", 5), ("b", 6)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "of_two_benches.py").write_text(f"def level(): return {level}\n")
+    found = [user_function("python:of_two_benches:level", tmp_path / name)() for name in "abab"]
+    assert found == [5, 6, 5, 6]
+    assert sys.path[-1] == str(tmp_path / "b")  # last: it hides nothing that is installed
+    assert sys.path.count(str(tmp_path / "b")) == 1
+
+
+@pytest.fixture
+def ending(monkeypatch):
+    """The state of a command's end, as if its handlers were installed."""
+    made = interrupts._Ending()
+    made.guard = 0
+    monkeypatch.setattr(interrupts, "_ending", made)
+    return made
+
+
+def test_a_stop_that_opens_after_a_signal_is_set_at_once(ending):
+    ending.signal = signal.SIGTERM
+    stop = threading.Event()
+    with interrupts.stop_on_signal(stop):
+        assert stop.is_set()
+    assert ending.stops == []
+    assert (interrupts.caught(), interrupts.exit_code()) == ("SIGTERM", 128 + 15)
+
+
+def test_a_program_that_uses_a_stop_has_its_own_handlers_again(ending):
+    ending.guard = None
+    before = [signal.getsignal(number) for number in interrupts.ENDING]
+    for _ in range(2):  # a signal of the first time is none of the second
+        stop = threading.Event()
+        with interrupts.stop_on_signal(stop):
+            assert not stop.is_set()
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop.wait(PATIENCE_S)
+        assert [signal.getsignal(number) for number in interrupts.ENDING] == before
+    assert interrupts.exit_code() == 128 + 15
+    ending.signal = None
+    assert (interrupts.caught(), interrupts.exit_code()) == (None, 128 + 2)
+
+
+def test_a_signal_that_comes_while_it_is_held_raises_at_the_end(ending):
+    done = []
+    with pytest.raises(KeyboardInterrupt), interrupts.held():
+        with interrupts.held():
+            interrupts._handle(signal.SIGINT, None)
+            done.append("inner")
+        done.append("outer")
+    assert done == ["inner", "outer"] and ending.holds == 0
+    with interrupts.held():  # the end is under way
+        done.append("again")
+    assert interrupts.caught() == "SIGINT"
 
 
 PARENT_OF_ONE = """

@@ -10,11 +10,14 @@ from pathlib import Path
 
 import pytest
 
+from hilstar.basics import reading
 from hilstar.basics.errors import InputError, one_line, shortened
 from hilstar.basics.reading import (
     CHUNK_BYTES,
     MAGIC,
+    KeptFiles,
     exists,
+    named_bytes,
     open_lines,
     open_regular,
     read_bytes,
@@ -136,3 +139,77 @@ def test_a_line_is_one_line_and_bounded_whatever_it_repeats():
     line = one_line("bench\udcff.toml:\n\x1b[31m " + "x" * 10**6 + " word" * 10**6)
     assert line.startswith("bench\\xff.toml: \\x1b[31m xxx")
     assert len(line) <= 1000
+
+
+@pytest.mark.parametrize("mark", [True, False], ids=["marked", "unmarked"])
+@pytest.mark.parametrize("encoding", ["utf-16-le", "utf-16-be", "utf-32-le", "utf-32-be"])
+def test_a_wide_text_is_read_line_by_line_and_named_where_it_is_not(tmp_path, encoding, mark):
+    path = tmp_path / "wide.csv"
+    text = "t_s,qw\n0,1\n"
+    path.write_bytes((("\ufeff" if mark else "") + text).encode(encoding))
+    with open_lines(path, ADVICE, 1000) as lines:
+        assert "".join(lines).removeprefix("\ufeff") == text
+    assert f"it is text in {encoding[:6].upper()}, not UTF-8" in text_refusal(path)
+
+
+def test_a_line_of_windows_is_read_and_one_of_no_text_is_not(tmp_path, caplog):
+    path = tmp_path / "lines.csv"
+    path.write_bytes(b"\x0cpage\n20 \xb0C\n")
+    with open_lines(path, ADVICE, 1000) as lines:
+        assert list(lines) == ["\x0cpage\n", "20 °C\n"]
+    assert "line 2 is not UTF-8, and is read as Windows-1252" in caplog.text
+    path.write_bytes(b"a\n\x1b \xb0\n")
+    with (
+        pytest.raises(InputError, match="it is no text: line 2 has a byte 0x1b"),
+        open_lines(path, ADVICE, 1000) as lines,
+    ):
+        list(lines)
+
+
+def test_what_was_taken_longest_ago_goes_first(monkeypatch):
+    monkeypatch.setattr(reading, "MAX_KEPT_BYTES", 10)
+    kept = KeptFiles()
+    for state in (1, 2):
+        kept.keep((state,), b"1234")
+    kept.content((1,))
+    kept.keep((3,), b"1234")
+    assert [kept.content((state,)) for state in (1, 2, 3)] == [b"1234", None, b"1234"]
+    kept.keep((4,), b"12345678901")
+    assert kept.content((4,)) is None and kept.content((3,)) is not None
+    assert kept.content(None) is None
+
+
+@pytest.mark.parametrize(("age_s", "is_kept"), [(0.5, False), (10.0, True)])
+def test_a_file_that_was_just_written_is_read_again(tmp_path, monkeypatch, age_s, is_kept):
+    """Two writes within a file system's step of time leave the same state."""
+    path = tmp_path / "bench.toml"
+    path.write_bytes(b"one")
+    written_ns = path.stat().st_ctime_ns
+    monkeypatch.setattr(reading.time, "time_ns", lambda: written_ns + round(age_s * 1e9))
+    assert (named_bytes(path, ADVICE, 3) is named_bytes(path, ADVICE, 3)) is is_kept
+    with pytest.raises(InputError, match="at most 2 bytes are read"):
+        named_bytes(path, ADVICE, 2)
+
+
+@pytest.mark.parametrize(
+    ("whole_lines", "text", "pieces"),
+    [
+        (True, "123456789\n1\n", ["123456789\n", "1\n"]),
+        (False, "123456789\n1\n", ["123456789\n", "1\n"]),
+        (False, "1234567890\n1", ["1234567890", "\n", "1"]),
+        (True, "1234567890\n", None),
+        (True, "1\n1234567890", None),
+    ],
+)
+def test_a_line_is_as_long_as_the_limit_with_its_end(
+    tmp_path, monkeypatch, whole_lines, text, pieces
+):
+    monkeypatch.setattr(reading, "MAX_LINE_CHARACTERS", 10)
+    path = tmp_path / "lines.txt"
+    path.write_text(text)
+    with open_lines(path, ADVICE, 100, whole_lines) as lines:
+        if pieces is not None:
+            assert list(lines) == pieces
+            return
+        with pytest.raises(InputError, match=r":\d: the line has 10 characters or more"):
+            list(lines)

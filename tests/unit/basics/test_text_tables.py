@@ -167,6 +167,8 @@ def test_whole_numbers_and_sharp_ones_at_the_end_are_known_to_be_whole(table_fil
     for others, last, whole in (
         (("57", "58"), "59", True),
         (("57", "58"), "5", False),
+        (("9", "58"), "7", False),
+        (("58", "9"), "70", True),
         (("0.12345678901234567", "0.1234567890123456"), "0.123456789012", True),
         (("1.5e-05", "1.5e-05"), "1.5e-0", False),
         (("1.5e-05", "1.5e-05"), "1.512345678901", False),
@@ -200,6 +202,13 @@ def test_rows_that_do_not_hold_are_told_by_any_name(table_file):
         path = table_file(f"t_s,{header}\n1,{flags[0]}\n2,{flags[1]}\n")
         cells = [cells[1].lower() for _, cells in read_table_rows(path, ("t_s",), ("valid",))]
         assert [cell in {"1", "t", "y"} for cell in cells] == [True, False]
+
+
+@pytest.mark.parametrize("header", ["valid", "lost"])
+def test_a_blank_flag_says_nothing_of_its_row_whatever_its_column_tells(table_file, header):
+    path = table_file(f"t_s,{header},n\n1,1,0\n2,,0\n3,0,0\n")
+    flags = [cells[1] for _, cells in read_table_rows(path, ("t_s",), ("valid",))]
+    assert flags == (["1", "", "0"] if header == "valid" else ["0", "", "1"])
 
 
 def test_columns_know_their_names_and_units(table_file):

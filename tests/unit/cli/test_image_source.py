@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.cli.image_source import DotOptions, dot_images
+from hilstar.basics.resources import resource_path
+from hilstar.cli.image_source import DotOptions, ImageOptions, dot_images, real_source
 from hilstar.instruments.calibrate import grabbed_dots
+from hilstar.instruments.calibrate.first_light import image_sources
 from hilstar.instruments.calibrate.grabbed_dots import DotImages
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.refusals import refusal
@@ -60,3 +62,31 @@ def test_images_are_given_or_taken_and_what_is_of_taking_is_refused_of_files(
 ):
     file = read_bench_file(small_bench_file)
     assert words in refusal(dot_images, file, given, PLAN, options)
+
+
+def test_a_camera_takes_off_the_dark_frame_that_is_named_as_a_command_does(
+    monkeypatch, small_bench_file
+):
+    made = []
+    for name in ("ByHand", "GrabCamera", "GrabCommand"):
+        monkeypatch.setattr(
+            image_sources, name, lambda *given, name=name: made.append((name, *given))
+        )
+    file = read_bench_file(small_bench_file)
+    for grab in (None, "genicam:SN7", GRAB):
+        real_source(file, grab, NAMED_DARK, "diode")
+    assert made == [
+        ("ByHand", NAMED_DARK, "diode"),
+        ("GrabCamera", file, "SN7", NAMED_DARK, "diode"),
+        ("GrabCommand", GRAB, NAMED_DARK, "diode"),
+    ]
+
+
+def test_a_truth_of_the_example_s_name_is_one_s_own_where_there_is_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    options = {"grab": None, "dark": None, "diode": None}
+    own = ImageOptions(virtual=Path("truth-example.toml"), **options)
+    assert own.truth() == resource_path("configs", "truth-example.toml")
+    (tmp_path / "truth-example.toml").write_text("")
+    assert own.truth() == Path("truth-example.toml")
+    assert ImageOptions(virtual=Path("other.toml"), **options).truth() == Path("other.toml")

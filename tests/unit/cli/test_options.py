@@ -24,6 +24,7 @@ from hilstar.cli.options import (
     parse_speed,
     parse_spin,
     parse_split,
+    with_values,
 )
 from hilstar.cli.serve import ServeOptions, _consoles, _exit_code, _limit
 from hilstar.cli.tracker import checked_rate, parse_silent
@@ -177,6 +178,8 @@ def test_a_run_s_duration_is_refresh_periods(options, slots, frames):
         ((4, 0), 0),  # one head had an attitude
         ((4, 4), 4),
         ((0, 3), 3),
+        ((2, 3), 2),
+        ((3, 0, 1), 3),
         ((2, 4), 2),
         ((0, -9), 1),  # a signal is none of a command's codes
         ((77, 0), 1),
@@ -211,3 +214,10 @@ def test_pages_of_heads_have_ports_one_after_another_or_each_the_system_s(monkey
     assert "as many ports" in refusal(_consoles, "127.0.0.1:65535", None, 2)
     # the last port there is
     assert _consoles("127.0.0.1:65535", None, 1) == ("127.0.0.1:65535",)
+
+
+def test_darks_stands_before_each_of_its_files_up_to_the_next_option():
+    words = ["photon-transfer", "--darks", "a", "b", "c", "--flats", "d", "e"]
+    wanted = "photon-transfer --darks a --darks b --darks c --flats d e"
+    assert with_values(words) == wanted.split()
+    assert with_values(["x", "--darks", "a"]) == ["x", "--darks", "a"]

@@ -170,6 +170,7 @@ def test_a_camera_for_other_machines_says_which(tmp_path: Path, parts: Parts) ->
         (["--answer", "udp://a:1", "--format", "xml"], "--format xml: write "),
         (["--answer", "udp://a:1", "--rate", "21"], "--rate 21: write 0.01 to 20 Hz"),
         (["--answer", "udp://a:1", "--bias", "1,2,1e6"], "write at most 100000 arcsec"),
+        (["--answer", "udp://a:1", "--bias=1,-1e6,2"], "write at most 100000 arcsec"),
         (["--answer", "udp://a:1", "--silent", "soon"], "--silent soon: write seconds"),
     ],
 )

@@ -20,23 +20,27 @@ from hilstar.cli import demo as demo_command
 from hilstar.cli import serve as serve_command
 from hilstar.cli import tracker as tracker_command
 from hilstar.cli.accept import _print_costs
-from hilstar.cli.campaign import telling
+from hilstar.cli.campaign import _scheduler, telling
 from hilstar.cli.demo import FOV_ARCSEC, PIXEL_ARCSEC, WRONG, TrackerBeside
 from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
 from hilstar.cli.send import heard
 from hilstar.cli.send import tell as tell_sent
 from hilstar.cli.serve import ServeOptions, heads_run
-from hilstar.cli.study import study_lines
+from hilstar.cli.study import refuse_unused, study_lines
 from hilstar.cli.tracker import TrackerOptions, checked_rate, parse_silent, planted_errors, recorded
 from hilstar.instruments.assess import assessment
 from hilstar.instruments.calibrate import camera_edges, effective_psf
 from hilstar.instruments.calibrate import latency as by_diode
+from hilstar.instruments.campaign import acceptance as acceptance_engine
+from hilstar.instruments.campaign import acceptance_page, acceptance_plan
+from hilstar.instruments.campaign.requirements import NOT_MET
 from hilstar.instruments.simulate import heads as twin_heads
 from hilstar.instruments.simulate.tracker_process import SILENT_AFTER_S, Planted
 from hilstar.server.answers.answer import Answer
 from hilstar.server.heads import HeadsRun
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
+from tests.support.refusals import refusal
 
 Q = np.array([0.5, -0.5, 0.5, -0.5])
 
@@ -493,3 +497,107 @@ def test_what_is_given_as_an_option_of_a_run_is_an_option_of_the_real_command() 
     ):
         assert names <= set(options.__dataclass_fields__), options
     assert math.isfinite(WRONG)
+
+
+@pytest.mark.parametrize(
+    ("what", "given", "words"),
+    [
+        ("chain", {}, "is of a bench"),
+        ("chain", {"bench": Path("b.toml")}, None),
+        ("models", {"bench": Path("b.toml"), "radec": "1,2,3"}, None),
+        ("timing", {"bench": Path("b.toml")}, "has benches of its own; leave out b.toml"),
+        ("timing", {"star": "Vega"}, "has fields of its own; leave out --star"),
+        ("chain", {"bench": Path("b.toml"), "radec": "1,2,3"}, "leave out --radec"),
+        ("outputs", {"radec": "1,2,3"}, "a field is seen by a bench"),
+        ("confront", {}, "is of photographs; add --images DIR"),
+        ("confront", {"images": Path("d")}, None),
+        ("timing", {"images": Path("d")}, "has no photographs; leave out --images"),
+        ("chain", {"bench": Path("b.toml"), "images": Path("d")}, "leave out --images"),
+        ("geometry", {}, None),
+    ],
+)
+def test_a_study_takes_what_it_uses_and_nothing_else(
+    what: str, given: dict[str, Any], words: str | None
+) -> None:
+    known = dict.fromkeys(("bench", "images", "radec", "star")) | given
+    options = SimpleNamespace(what=what, bench=known["bench"], images=known["images"])
+    pointing = SimpleNamespace(radec=known["radec"], star=known["star"])
+    if words is None:
+        refuse_unused(options, pointing)  # type: ignore[arg-type]
+    else:
+        assert words in refusal(refuse_unused, options, pointing)
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ([], "give the edges with one of --edges"),
+        (["--edges", "e.csv", "--diode", "serial:/dev/x@9600"], "give the edges with one of"),
+        (["--edges", "e.csv", "--grab", "genicam:S"], "give the edges with one of --edges"),
+        (["--edges", "e.csv", "--exposure", "0.01"], "--exposure: is for --grab; leave it out"),
+        (["--edges", "out/latency.png", "-o", "out"], "out/latency.png"),
+    ],
+)
+def test_a_latency_has_one_source_of_edges_and_overwrites_none(
+    tmp_path: Path, words: list[str], line: str
+) -> None:
+    (tmp_path / "out").mkdir()
+    for name in ("run.mcap", "e.csv", "out/latency.png"):
+        (tmp_path / name).write_bytes(b"")
+    refused = run_hilstar_here("latency", "run.mcap", *words, cwd=tmp_path)
+    assert refused.returncode == 2 and line in refused.stderr
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "workers", "memory", "key", "words"),
+    [
+        ("tcp://127.0.0.1:1", 4, None, None, "leave out --workers and --memory"),
+        ("tcp://127.0.0.1:1", None, "4GB", None, "leave out --workers and --memory"),
+        (None, 4, "4GB", Path("k.pem"), "is for a cluster"),
+        (None, 4, "4GB", None, None),
+    ],
+)
+def test_a_cluster_has_its_own_workers(
+    scheduler: str | None,
+    workers: int | None,
+    memory: str | None,
+    key: Path | None,
+    words: str | None,
+) -> None:
+    options = SimpleNamespace(
+        scheduler=scheduler, memory=memory, tls_ca_file=None, tls_cert=None, tls_key=key
+    )
+    cases = SimpleNamespace(workers=workers)
+    if words is None:
+        assert _scheduler(options, cases) is None  # type: ignore[arg-type]
+    else:
+        assert words in refusal(_scheduler, options, cases)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "words", "code"),
+    [
+        (NOT_MET, [], 0),
+        (NOT_MET, ["--strict"], 1),
+        ("met", ["--strict"], 0),
+        ("not shown", ["--strict"], 0),
+    ],
+)
+def test_an_acceptance_that_is_not_met_is_an_error_where_that_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, verdict: str, words: list[str], code: int
+) -> None:
+    accepted = SimpleNamespace(
+        on_bench=False,
+        check=lambda: None,
+        run=lambda missing: [],
+        verdicts=lambda results: [verdict],
+    )
+    monkeypatch.setattr(acceptance_plan, "read_acceptance_plan", lambda *_: None)
+    monkeypatch.setattr(acceptance_engine, "Acceptance", lambda *_: accepted)
+    monkeypatch.setattr(acceptance_engine, "write_ledger", lambda path, results: 0)
+    monkeypatch.setattr(acceptance_page, "write_acceptance", lambda *_: {})
+    monkeypatch.setattr(acceptance_page, "lines_of", lambda *_: ["a line"])
+    monkeypatch.setattr(acceptance_page, "verdict_of", lambda verdicts: verdicts[0])
+    done = run_hilstar_here("accept", "bench.toml", "-o", "out", *words, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (code, "")
+    assert done.stdout.splitlines()[0] == "a line"

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
-from hilstar.display.calibration import load_calibration, read_toml, with_uniformity
+from hilstar.display.calibration import (
+    load_calibration,
+    primary_lights,
+    primary_responses,
+    read_toml,
+    with_uniformity,
+)
+from hilstar.display.identity import MonitorIdentity
 from tools import make_lcd_example
 
 HEAD = """[calibration]
@@ -77,6 +84,8 @@ def test_light_is_above_black_and_relative_to_white(write):
         "cd/m2",
     )
     assert calibration.weights is None
+    assert not calibration.can_steal_bits
+    assert load_calibration(write(table=RGB), 2).can_steal_bits
     assert calibration.uniformity_map((8, 8)) is None
 
 
@@ -235,3 +244,86 @@ def test_bits_are_stolen_up_to_13_bits(bits, can):
     else:
         with pytest.raises(InputError, match="at most 13 bits"):
             load_calibration("srgb", bits, bit_stealing=True)
+
+
+WEIGHTS = "[weights]\nr = 1\ng = 1\nb = 2\n"
+OF_GREY = np.array([0, 0.1, 0.4, 1])
+OF_EACH = np.array([[0, 1, 2, 4], [0, 2, 12, 30], [0, 0.1, 0.5, 6]])
+
+
+@pytest.mark.parametrize(
+    ("head", "table", "wanted"),
+    [
+        (HEAD + WEIGHTS, TABLE, np.outer([0.25, 0.25, 0.5], OF_GREY)),
+        (HEAD, RGB, OF_EACH / 40),
+        (HEAD + WEIGHTS, RGB, OF_EACH / [[16], [120], [12]]),
+    ],
+    ids=["grey and weights", "each", "each and weights"],
+)
+def test_a_primary_s_light_is_its_share_of_white_as_the_tracker_sees_it(write, head, table, wanted):
+    """Above black, by its code: all three at full light are 1."""
+    lights = primary_lights(write(head, table), 2)
+    assert lights == pytest.approx(wanted)
+    assert lights[:, -1].sum() == pytest.approx(1)
+
+
+def test_each_primary_s_response_is_relative_to_its_own_white(write):
+    responses = primary_responses(write(table=RGB), 2)
+    lights = [response.light for response in responses]
+    assert np.array(lights) == pytest.approx(OF_EACH / OF_EACH[:, -1:])
+    of_grey = primary_responses(write(), 2)
+    assert np.array([response.light for response in of_grey]) == pytest.approx(
+        np.tile(OF_GREY, (3, 1))
+    )
+    assert "add [weights] r, g, b" in str(_refused(primary_lights, write(), 2))
+
+
+def _refused(asked, *arguments) -> InputError:
+    with pytest.raises(InputError) as caught:
+        asked(*arguments)
+    return caught.value
+
+
+def test_a_formula_s_primaries_are_those_of_rec_709_and_its_hash_is_of_its_bits():
+    """IEC 61966-2-1: 0.2126, 0.7152 and 0.0722 of white."""
+    lights = primary_lights("gamma2.2", 8)
+    for light, share in zip(lights, (0.2126, 0.7152, 0.0722), strict=True):
+        assert light == pytest.approx(share * (np.arange(256) / 255) ** 2.2)
+    assert [len(response.light) for response in primary_responses("srgb", 10)] == [1024] * 3
+    hashes = {
+        load_calibration(name, bits).sha256 for name in ("srgb", "gamma2.2") for bits in (8, 10)
+    }
+    assert len(hashes) == 4
+
+
+def test_a_grid_is_of_the_monitor_that_is_told_or_else_of_the_file_s(write, tmp_path):
+    source = write(HEAD + '[monitor_identity]\nmaker = "ABC"\nserial = "7"\n')
+    grid = np.array([[1.0, 0.8], [0.9, 0.7]])
+    for identity, serial in ((None, "7"), (MonitorIdentity(maker="ABC", serial="8"), "8")):
+        with_uniformity(source, 2, tmp_path / "other.toml", grid, identity)
+        assert read_toml(tmp_path / "other.toml").monitor_identity.serial == serial
+
+
+def test_a_table_may_stand_in_a_folder_beside_its_file(write, tmp_path):
+    path = write(HEAD.replace("table.csv", "tables/light.csv"))
+    assert "there is no such file beside it" in str(_refused(load_calibration, path, 2))
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables" / "light.csv").write_text(TABLE)
+    (tmp_path / "light.csv").write_text(TABLE.replace("1.5", "2.5"))
+    assert load_calibration(path, 2).response.light == pytest.approx(OF_GREY)
+
+
+@pytest.mark.parametrize(("black", "is_one"), [("0.44", True), ("0.45", False), ("0.35", False)])
+def test_three_blacks_agree_within_a_tenth_of_their_mean(write, black, is_one):
+    path = write(table=RGB.replace("0,0.4,0.4,0.4", f"0,0.4,0.4,{black}"))
+    if is_one:
+        assert load_calibration(path, 2).response.white == 3
+    else:
+        assert f"code 0 has 0.4, 0.4, {black}" in str(_refused(load_calibration, path, 2))
+
+
+@pytest.mark.parametrize("codes", [(0, 1, 1, 3), (0, 2, 1, 3), (0, 0.5, 2, 3)])
+def test_codes_rise_by_whole_numbers(write, codes):
+    rows = "".join(f"{code},{light}\n" for code, light in zip(codes, (1, 2, 3, 4), strict=True))
+    said = str(_refused(load_calibration, write(table="code,w\n" + rows), 2))
+    assert "its codes are not whole numbers that rise" in said

@@ -174,3 +174,11 @@ def test_a_monitor_that_does_not_answer_is_not_waited_for(tmp_path, monkeypatch)
     output = OutputState("DP-1", HD, edid=edid())
     now = identity_of(display(), output, b"", {}, tmp_path)
     assert (now.model, now.brightness) == ("DELL U2412M", None)
+
+
+def test_a_display_s_line_has_its_number_its_name_its_mode_and_its_size():
+    """A server that does not say its refresh, as Xvfb, has none of 0 Hz."""
+    plain = display(resolution_px=(1920, 1200), refresh_hz=60, size_mm=(518, 324))
+    assert plain.line() == f"{plain.index}: DP-1, 1920 x 1200, 60 Hz, 518 x 324 mm"
+    unknown = display(resolution_px=(640, 480), refresh_hz=0, size_mm=(163, 122))
+    assert unknown.line() == f"{plain.index}: DP-1, 640 x 480, refresh not known, 163 x 122 mm"

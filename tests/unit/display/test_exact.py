@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hilstar.display.exact import ExactQuantiser
-from hilstar.display.footprints import FootprintMap, star_losses_mag
+from hilstar.display.footprints import LEAST_LIGHT, FootprintMap, PixelOrder, star_losses_mag
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import round_levels, shown_light
 from hilstar.display.render.reference import linear_image
@@ -430,3 +430,22 @@ def test_a_star_within_a_brighter_one_loses_what_that_one_does():
     shown_mag = star_losses_mag(sprites, panel, footprints, exact(sprites, panel))
     assert shown_mag[0] > 0.1
     assert shown_mag[1] == pytest.approx(shown_mag[0], abs=0.02)  # a fiftieth of a pixel apart
+
+
+@pytest.mark.parametrize("sigma", [(0.85, 0.85), (0.5, 1.3)])
+def test_a_star_s_choice_is_among_nine_pixels_at_least_and_all_near_ones_at_most(sigma):
+    """A Gaussian's k-th nearest pixel has exp(-k / area) of its peak; the wider axis is not the
+    nearer.
+    """
+    order = PixelOrder(GaussianPsf(sigma))
+    variance_px2 = np.square(sigma) + 1 / 12
+    area_px2 = 2 * np.pi * np.sqrt(variance_px2.prod())
+    assert order.area_px2 == pytest.approx(area_px2)
+    steps = np.array([1e-6, 1.0, 50.0, 1e9], dtype=np.float32)
+    reach = order.reach(steps)
+    assert reach[[0, 1, 3]].tolist() == [9, 9, order.near]
+    pixels = area_px2 * np.log(50.0 / (area_px2 * LEAST_LIGHT))
+    assert abs(reach[2] - pixels) < 1
+    assert order.near_sigmas(0.6) - order.near_sigmas() == pytest.approx(
+        0.6 / np.sqrt(variance_px2.min())
+    )

@@ -189,3 +189,33 @@ def test_a_monitor_without_a_serial_number_is_doubted():
         MonitorIdentity().doubt == "no EDID: the monitor is told apart by connector and mode alone"
     )
     assert edid_identity(b"\0" * 128).doubt.startswith("EDID unreadable")
+
+
+@pytest.mark.parametrize(("byte", "week"), [(0, None), (1, 1), (54, 54), (55, None), (255, None)])
+def test_a_week_is_one_of_54_or_not_known(byte, week):
+    """VESA E-EDID 1.4, 3.4.4: 0 is none, and 255 says that the year is the model's."""
+    block = bytearray(real()[0].block)
+    block[16] = byte
+    block[127] = -sum(block[:127]) % 256
+    assert edid_identity(bytes(block)).week == week
+
+
+@pytest.mark.parametrize(
+    ("text", "serial"), [("AAA", "AAA"), ("AAAA", ""), ("123", "123"), ("1234", ""), ("CDE", "CDE")]
+)
+def test_characters_in_a_row_are_a_placeholder_from_four_on(text, serial):
+    assert edid_identity(with_serial_text(text)).serial == serial
+
+
+def test_a_monitor_is_doubted_by_its_maker_or_by_its_edid():
+    """One that says its model and no maker has an EDID that cannot be trusted."""
+    nameless = MonitorIdentity(model="0a1b", edid_sha256="a" * 64, connector="DP-1")
+    assert nameless.doubt.startswith("EDID unreadable: the monitor is told apart by connector")
+    named = MonitorIdentity(maker="DEL", edid_sha256="a" * 64, connector="DP-2")
+    assert named.doubt.endswith("another one of its kind on DP-2 passes for it")
+
+
+def test_two_monitors_of_a_kind_without_a_number_are_not_the_same():
+    numberless = msgspec.structs.replace(THIS, serial="")
+    other = msgspec.structs.replace(numberless, edid_sha256="b" * 64)
+    assert list(differences(numberless, other)) == ["another monitor"]

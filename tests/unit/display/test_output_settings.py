@@ -97,6 +97,12 @@ def test_max_bpc_is_compared_with_the_bench_s_bits():
             "(scaling mode Full aspect)",
             True,
         ),
+        # of several preferred modes the first is named
+        (
+            {"mode_px": (1280, 720), "preferred_px": ((1920, 1200), (1024, 768))},
+            "--mode 1920x1200",
+            True,
+        ),
         ({"transform": (1.25, 0, 0, 0, 1.25, 0, 0, 0, 1)}, "--transform none", True),
         # a smaller scale, and a shift to the left: both below the identity
         ({"transform": (0.8, 0, 0, 0, 0.8, 0, 0, 0, 1)}, "--transform none", True),

@@ -13,6 +13,7 @@ from hilstar.display.primaries import (
     _matching_function,
     channel_matrix,
     read_primaries,
+    reddest_nm,
 )
 from hilstar.sky.electrons import Optics
 from hilstar.sky.spectrum import Curve, constant_curve, load_curve
@@ -100,6 +101,7 @@ def test_channels_of_one_colour_have_no_condition_number(tmp_path):
     [
         ("wavelength_nm,r,g\n400,1,1\n", "column b is missing"),
         ("wavelength_nm,r,g,b\n400,1,1,1\n390,1,1,1\n", "3: wavelengths do not rise"),
+        ("wavelength_nm,r,g,b\n400,1,1,1\n400,1,1,1\n", "3: wavelengths do not rise"),
         ("wavelength_nm,r,g,b\n400,1,-1,1\n", "2: power below 0"),
         ("wavelength_nm,r,g,b\n0.4,1,1,1\n", "2: power below 0, or a wavelength that is not in nm"),
         ("wavelength_nm,r,g,b\n400,1,x,1\n", "g = 'x' is not a finite number"),
@@ -178,3 +180,13 @@ def test_the_colour_matching_functions_are_the_cie_s():
     fitted = np.array([_matching_function(lobes) for lobes in MATCHING])
     at_cie = fitted[:, np.isin(XY_NM, CIE_NM)]
     np.testing.assert_allclose(at_cie.T, CIE_XYZ, rtol=0.0, atol=FIT_OFF)
+
+
+def test_the_reddest_light_is_the_longest_wavelength_with_a_hundredth_of_a_primary_s_power():
+    """Of whichever primary; what is fainter is a spectrometer's noise."""
+    nm = np.array([400.0, 500.0, 600.0, 700.0, 800.0])
+    red = Curve(nm, np.array([0.0, 1.0, 50.0, 0.6, 0.4]))
+    blue = Curve(nm, np.array([9.0, 1.0, 0.0, 0.0, 0.1]))
+    assert reddest_nm([red]) == 700.0
+    assert reddest_nm([red, blue]) == 800.0
+    assert reddest_nm([red], least=0.1) == 600.0

@@ -9,6 +9,8 @@ from hilstar.basics.errors import InputError
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import (
     MASK_TURNS,
+    LitLight,
+    RoundQuantiser,
     ThresholdCounter,
     blue_noise,
     dither_levels,
@@ -16,7 +18,10 @@ from hilstar.display.quantise import (
     round_levels,
     shown_light,
 )
+from hilstar.display.render.reference import linear_image
 from hilstar.display.response import encode, gamma_response, srgb_response
+from hilstar.optics.psf import GaussianPsf
+from tests.support.stars import sprites_at
 from tools.make_blue_noise import SEED, void_and_cluster
 
 WHITE = 1e6
@@ -170,3 +175,22 @@ def test_the_counter_counts_as_a_search_does(response, rng):
     assert np.array_equal(
         ThresholdCounter(thresholds).count(light), np.searchsorted(thresholds, light, side="right")
     )
+
+
+def test_a_part_of_an_image_s_light_is_that_of_some_lit_pixels():
+    image = np.zeros((3, 4), dtype=np.float32)
+    image[0, 2], image[1, 1], image[2, 0], image[2, 3] = 5.0, 6.0, 7.0, 8.0
+    lit = LitLight.of(image)
+    assert (lit.place.tolist(), lit.e_per_s.tolist()) == ([2, 5, 8, 11], [5.0, 6.0, 7.0, 8.0])
+    part = lit.part(1, 3)
+    assert (part.place.tolist(), part.e_per_s.tolist()) == ([5, 8], [6.0, 7.0])
+
+
+@pytest.mark.parametrize(("share", "lit"), [(0.999, 0), (1.001, 1)])
+def test_the_faintest_star_that_rounding_shows_lights_the_pixel_in_whose_middle_it_is(share, lit):
+    psf = GaussianPsf((0.6, 0.9))
+    panel = Panel(srgb_response(8), WHITE)
+    rate = share * RoundQuantiser.faintest_e_per_s(panel, psf)
+    star = sprites_at(np.array([[20.0, 15.0]]), np.array([rate]), psf.footprint_px)
+    linear = linear_image(star, (40, 30), psf).astype(np.float32)
+    assert np.count_nonzero(round_levels(linear, panel)) == lit

@@ -116,6 +116,29 @@ def test_what_is_no_spectra_of_three_primaries_is_refused(tmp_path, text, words)
     assert_file_refused(read_ccss, tmp_path / "panel.ccss", words)
 
 
+@pytest.mark.parametrize(("light", "counts"), [(0.018, False), (0.022, True)])
+def test_a_sample_under_a_fiftieth_of_the_brightest_is_black(tmp_path, light, counts):
+    """Of light that no mixture has; the brightest sample has 4."""
+    dim = [0.0, 0.0, 0.0, 4 * light]
+    (tmp_path / "panel.ccss").write_text(ccss([*COLOURS, dim]))
+    if counts:
+        assert_file_refused(read_ccss, tmp_path / "panel.ccss", ": no three of its 4 samples are")
+    else:
+        assert len(read_ccss(tmp_path / "panel.ccss")) == 3
+
+
+@pytest.mark.parametrize(("times", "is_sum"), [(1.1, True), (1.2, False)])
+def test_white_has_no_more_light_than_its_primaries_and_a_seventh(tmp_path, times, is_sum):
+    """A screen that dims with what it shows has less; a white subpixel adds to it."""
+    white = (times * np.sum(COLOURS, axis=0)).tolist()
+    (tmp_path / "panel.ccss").write_text(ccss([*COLOURS, white]))
+    if is_sum:
+        assert len(read_ccss(tmp_path / "panel.ccss")) == 3
+    else:
+        words = ": a sample has 1.20 times the light of its primaries: a white subpixel"
+        assert_file_refused(read_ccss, tmp_path / "panel.ccss", words)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [

@@ -12,15 +12,26 @@ import pytest
 
 from hilstar.basics.units import COMPUTE_VERSION
 from hilstar.display.exact import ExactQuantiser, Turn
+from hilstar.display.footprints import PixelOrder
 from hilstar.display.panel import Panel
+from hilstar.display.quantise import round_levels
 from hilstar.display.render.aids import CROSSHAIR, GRID, PATCH, AidLevels, lay_over
 from hilstar.display.render.apart import ApartBackend
 from hilstar.display.render.backend import ScreenView, as_maps, level_cost
 from hilstar.display.render.context import check_limits, draws_by_cpu
-from hilstar.display.render.encoder import MEETING_WINGS, lit_sides
+from hilstar.display.render.cpu_stars import CpuStars, least_side_px
+from hilstar.display.render.disc_tiles import TILE_PX, Sure
+from hilstar.display.render.encoder import (
+    MEETING_WINGS,
+    lit_sides,
+    most_covered_px,
+    set_sides,
+    viewport_of_sprites,
+)
 from hilstar.display.render.light_units import DENSER_WINGS, MAX_SUM, LightUnits
 from hilstar.display.render.numpy_backend import NumpyBackend
 from hilstar.display.render.presenter import checked_triples, drawn_codes
+from hilstar.display.render.reference import linear_image
 from hilstar.display.render.target import SpriteSide, Target
 from hilstar.display.response import Levels, gamma_response
 from hilstar.optics.extended import LightMap
@@ -32,6 +43,8 @@ from tests.support.stars import sprites_at
 SIZE_PX = (64, 48)
 PSF = GaussianPsf((0.85, 0.85))
 WHITE_E_PER_S = 1000.0
+# lit pixels whose light is so near to a threshold that its rounding to units passes it; measured 4e-3
+UNITS = 1e-2
 
 
 def units(uniformity: np.ndarray | None = None) -> LightUnits:
@@ -295,6 +308,139 @@ def test_where_numpy_draws_a_bench_is_planned_as_for_a_usual_opengl():
     by_compute = ExactQuantiser.cost(PSF, COMPUTE_VERSION)
     assert level_cost(ExactQuantiser, PSF) == by_compute
     assert level_cost(ExactQuantiser, PSF, old) == ExactQuantiser.cost(PSF, 330) != by_compute
+
+
+@pytest.mark.parametrize("sigma_px", [(0.85, 0.85), (0.6, 0.75)], ids=["even", "odd"])
+@pytest.mark.parametrize("rate", [400.0, 8000.0])
+def test_stars_on_any_pixel_of_an_image_s_edges_have_the_levels_of_their_light(sigma_px, rate):
+    """One to a row or a column of tiles, moved by a third of a pixel from one to the next, across
+    the left and right edges, then the upper and lower ones.
+    """
+    psf = GaussianPsf(sigma_px)
+    assert psf.footprint_px % 2 == (sigma_px[0] != 0.85)
+    across = np.concatenate([np.arange(-7, 7, 1 / 3), 25 + np.arange(-7, 7, 1 / 3)])
+    along = 10 + 19 * np.arange(len(across)) + np.linspace(-0.5, 0.5, len(across))
+    long_px = 19 * len(across) + 3
+    for size, places in (
+        ((25, long_px), np.stack([across, along], axis=1)),
+        ((long_px, 25), np.stack([along, across], axis=1)),
+    ):
+        stars = sprites_at(places, np.full(len(places), rate), psf.footprint_px)
+        backend = NumpyBackend(Target(size, psf, gamma_response(8, 2.2), WHITE_E_PER_S))
+        backend.draw(stars)
+        linear = linear_image(stars, size, psf).astype(np.float32)
+        wanted = round_levels(linear, backend.target.panel())
+        assert np.count_nonzero(wanted) > 500
+        off = backend.levels().astype(int) - wanted
+        # light in whole units, to either side of a threshold
+        assert np.count_nonzero(off) <= UNITS * np.count_nonzero(wanted)
+        assert np.abs(off).max() <= 1
+        # nothing stays where the last frame was
+        backend.draw(None)
+        assert not backend.levels().any()
+
+
+@pytest.mark.parametrize(("share", "lit"), [(0.98, 0), (1.02, 1)])
+def test_a_lone_star_lights_its_pixel_from_the_first_threshold_on(share, lit):
+    """To a part in 64 of it, the largest unit."""
+    target = Target(SIZE_PX, PSF, gamma_response(8, 2.2), WHITE_E_PER_S)
+    threshold = float(target.response.threshold[0]) * WHITE_E_PER_S
+    rate = share * threshold / PSF.peak_share
+    backend = NumpyBackend(target)
+    backend.draw(sprites_at(np.array([[20.0, 30.0]]), np.array([rate]), PSF.footprint_px))
+    assert np.count_nonzero(backend.levels()) == lit
+
+
+@pytest.mark.parametrize("per_star", [1, 4])
+def test_sprites_cover_the_squares_of_their_whole_stars_at_most(per_star):
+    """Two of 10 px, three of 6 and one of 4, by rates that are a path's in all."""
+    rates = np.array([200.0, 100.0, 99.0, 50.0, 10.0, 9.0]) / per_star
+    stars = replace(sprites_at(np.zeros((6, 2)), rates, 10), per_star=per_star)
+    sides = (SpriteSide(100.0, 6), SpriteSide(10.0, 4))
+    assert most_covered_px(stars, 10, sides, 0) == 2 * 100 + 3 * 36 + 16
+    # fewer than are worth counting, or of one side
+    assert most_covered_px(stars, 10, sides, 601) == most_covered_px(stars, 10, (), 0) == 600
+
+
+def test_a_program_of_points_knows_up_to_eight_sides_and_a_footprint_about_its_image():
+    sides = tuple(SpriteSide(100.0 - k, 20 - 2 * k) for k in range(9))
+    program: dict[str, object] = {}
+    set_sides(program, sides[:8])
+    assert program["sides"] == 8
+    set_sides(program, sides[:2])
+    assert program == {
+        "sides": 2,
+        "below_e_per_s": [100.0, 99.0, *[0.0] * 6],
+        "side_px": [20, 18, *[0] * 6],
+    }
+    assert refusal(set_sides, program, sides) == "9 sizes of sprites; give at most 8"
+    assert viewport_of_sprites((64, 48), 5) == (-5, -5, 74, 58)
+
+
+def test_nothing_stays_of_a_frame_in_finer_units_or_of_a_floor(rng):
+    """Sixty stars over white need units that an int has no room for."""
+    target = Target(SIZE_PX, PSF, gamma_response(8, 2.2), WHITE_E_PER_S)
+    places = rng.uniform(10, 38, (2, 60, 2))
+    over_white = np.full(60, 3 * WHITE_E_PER_S)
+    first, second = (sprites_at(at, over_white, PSF.footprint_px) for at in places)
+    light = LightUnits(target.panel(), SIZE_PX, PSF)
+    assert light.unit_for(second) is None
+    after, alone = NumpyBackend(target), NumpyBackend(target)
+    after.draw(first)
+    for backend in (after, alone):
+        backend.draw(second)
+    assert np.array_equal(after.levels(), alone.levels())
+    levels = np.zeros(SIZE_PX[::-1], np.uint8)
+    cpu = CpuStars(light, levels)
+    cpu.lay(Levels(np.full(SIZE_PX[::-1], 7, np.uint8)))
+    star = sprites_at(np.array([[20.2, 30.1]]), np.array([900.0]), PSF.footprint_px)
+    cpu.add(star, light.unit_for(star))
+    cpu.encode()
+    assert levels.min() == 7 < levels[30, 20]
+    cpu.lay(None)
+    assert not levels.any()
+
+
+@pytest.mark.parametrize("sigma_px", [(0.85, 0.85), (0.6, 0.75), (1.2, 0.7)])
+def test_the_smallest_square_holds_all_pixels_that_exact_may_light(sigma_px):
+    """And none of two pixels less does."""
+    psf = GaussianPsf(sigma_px)
+    order = PixelOrder(psf)
+    x, y = order.places()[:, :, : order.near]
+    side = least_side_px(psf)
+    assert side % 2 == psf.footprint_px % 2
+    for smaller, is_held in ((0, True), (2, False)):
+        first = -((side - smaller - 1) // 2)
+        last = (side - smaller) // 2
+        inside = (x >= first) & (x <= last) & (y >= first) & (y <= last)
+        assert inside.all() == is_held
+
+
+def test_a_tile_has_a_sprite_s_light_where_its_square_touches_it(rng):
+    """Of tiles from a corner of the image that is none of its own; pixel by pixel."""
+    corner_px, shape = (-32 + 7, 13), (5, 7)
+    for reach_px in (3, 40):
+        sprites_px = rng.integers((-60, -40), (300, 260), (6, 2))
+        is_apart = Sure(1.0, 2.0, sprites_px, reach_px).apart(corner_px, shape)
+        rows, columns = np.indices((5 * TILE_PX, 7 * TILE_PX))
+        is_lit = np.zeros(rows.shape, bool)
+        for x, y in sprites_px - corner_px:
+            is_lit |= (np.abs(columns - x) <= reach_px) & (np.abs(rows - y) <= reach_px)
+        by_tile = is_lit.reshape(5, TILE_PX, 7, TILE_PX).any(axis=(1, 3))
+        assert np.array_equal(is_apart, ~by_tile)
+
+
+def test_a_thousand_stars_in_a_pixel_have_their_light_though_each_is_rounded(rng):
+    """To whole units, half of one off at most and none of it to one side: 5 sigmas of the sum."""
+    stars = sprites_at(rng.uniform(20, 21, (1000, 2)), rng.uniform(0.2, 0.4, 1000), 10)
+    target = Target(SIZE_PX, PSF, gamma_response(8, 2.2), WHITE_E_PER_S)
+    light = LightUnits(target.panel(), SIZE_PX, PSF)
+    unit_e_per_s = light.unit_for(stars)
+    cpu = CpuStars(light, np.zeros(SIZE_PX[::-1], np.uint8), sums := np.zeros(64 * 48, np.int32))
+    cpu.lay(None)
+    cpu.add(stars, unit_e_per_s)
+    off = sums.reshape(48, 64)[20, 20] - linear_image(stars, SIZE_PX, PSF)[20, 20] / unit_e_per_s
+    assert abs(off) < 5 * np.sqrt(1000 / 12) + 1
 
 
 def test_a_path_s_sprites_have_the_side_of_their_whole_star():

@@ -9,6 +9,7 @@ from hilstar.basics.errors import InputError
 from hilstar.display.render.encoder import code_table
 from hilstar.display.response import (
     bit_stealing_response,
+    code_dtype,
     encode,
     gamma_response,
     mixed_response,
@@ -168,3 +169,14 @@ def test_channels_are_mixed_as_the_tracker_weighs_them():
     signal = 100 / 255
     assert mixed.light[100] == pytest.approx((signal**2.0 + 2 * signal**2.2 + signal**2.4) / 4)
     assert (mixed.light[0], mixed.light[-1], mixed.black) == (0, pytest.approx(1), 0.001)
+
+
+@pytest.mark.parametrize("response", [srgb_response(8), gamma_response(10)])
+def test_light_at_a_threshold_is_the_level_above_it(response):
+    """And the next smaller number of float32 that below; codes are as deep as their monitor."""
+    thresholds = response.thresholds_e_per_s(1e5)
+    levels = np.arange(1, response.white + 1)
+    assert np.array_equal(encode(thresholds, response, 1e5), levels)
+    below = np.nextafter(thresholds, np.float32(0))
+    assert np.array_equal(encode(below, response, 1e5), levels - 1)
+    assert (code_dtype(8), code_dtype(9)) == (np.uint8, np.uint16)

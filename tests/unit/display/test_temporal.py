@@ -16,9 +16,11 @@ from hilstar.display.temporal import (
     MAX_CARRIED_STEPS,
     NONE_BEFORE,
     TemporalQuantiser,
+    first_phases,
     places_before,
 )
 from hilstar.optics.psf import GaussianPsf
+from hilstar.optics.sprites import join_sprites
 from tests.support.centroiders import family_errors_px, moment
 from tests.support.star_tiles import SIDE, SIGMA, SIZE, TILE, WHITE, flux_of, places, stars, tiles
 
@@ -258,3 +260,22 @@ def test_each_star_carries_over_so_many_of_its_own_largest_step():
     most = MAX_CARRIED_STEPS * np.array([2.0, 10.0, 0.5])
     kept = quantiser._bounded(error, steps)
     np.testing.assert_allclose(kept, [most, -most, np.minimum(3.0, most)], rtol=1e-6)
+
+
+def test_a_frame_without_stars_ends_a_sequence_and_new_stars_begin_between_half_steps():
+    """With sprites of no star as without any sprites; a star's part of a step is by its number."""
+    panel = Panel(srgb_response(8), WHITE)
+    size = (50, 40)
+    first = stars(np.array([12.3, 36.1]), np.array([20.2, 18.9]), flux_of(5.0), size=size)
+    for nothing in (None, join_sprites([], first.footprint_px)):
+        quantiser = TemporalQuantiser(panel, size, GaussianPsf(SIGMA))
+        begun = quantiser.levels(first).copy()
+        goes_on = quantiser.levels(first).copy()
+        assert (goes_on != begun).any()
+        quantiser.levels(nothing)
+        assert np.array_equal(quantiser.levels(first), begun)
+    phases = first_phases(np.arange(1000), np.full(1000, NONE_BEFORE))
+    assert -0.5 <= phases.min() < -0.49 < 0.49 < phases.max() < 0.5
+    assert phases[0] == -0.5
+    known = np.array([3, NONE_BEFORE])
+    assert first_phases(np.array([5, 5]), known).tolist() == [0.0, pytest.approx(phases[5])]

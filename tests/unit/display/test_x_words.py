@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilstar.display.window import randr
+from hilstar.display.window import randr, x11
 from hilstar.display.window.awake import Blanking, SetAside
 from hilstar.display.window.output_settings import OutputState
 from hilstar.display.window.randr import (
@@ -24,10 +24,11 @@ from hilstar.display.window.randr import (
 )
 from hilstar.display.window.this_monitor import ddc_settings, edid_of_drm
 from hilstar.display.window.visibility import ScreenArea, WindowView, off_place
-from hilstar.display.window.watch import is_foreign, shown_as
+from hilstar.display.window.watch import is_foreign, presented_as, shown_as
 from hilstar.display.window.x11 import (
     CLOCK,
     MAX_GAPS,
+    MAX_UST_AGE_NS,
     SERVER_GONE,
     SYNC_EXTENSION,
     WINDOW_GONE,
@@ -110,6 +111,8 @@ def test_a_window_is_on_the_screen_where_all_of_its_pixels_are(corner_px, size_p
     assert off_place(area, area, (1, 1)) == ""
     moved = ScreenArea((corner_px[0] + 1, corner_px[1]), size_px)
     assert off_place(moved, area, (1920, 1080)) == "moved off its display"
+    larger = ScreenArea(corner_px, (size_px[0], size_px[1] + 1))
+    assert off_place(area, larger, (1920, 1080)) == "moved off its display"
 
 
 def present_event(
@@ -390,3 +393,48 @@ def test_an_output_is_found_by_its_whole_name_and_none_without_a_server(monkeypa
     monkeypatch.setattr(randr, "Randr", of_none)
     assert randr.output_named("HDMI-1") is None
     assert randr.lit_outputs() == []
+
+
+@pytest.mark.parametrize(
+    ("age_ns", "is_taken"),
+    [
+        (-16_666_667, True),  # a stamp of the end of the blank that has begun
+        (-16_666_668, False),
+        (0, True),
+        (MAX_UST_AGE_NS - 1, True),
+        (MAX_UST_AGE_NS, False),
+    ],
+)
+def test_a_driver_s_time_is_of_this_swap_from_a_refresh_ahead_to_a_second_ago(age_ns, is_taken):
+    now_ns = 10**12
+    sync = SimpleNamespace(swap_ns=lambda: now_ns - age_ns)
+    waited: list[int] = []
+    stamps = SwapStamps(sync, 16_666_667, lambda: now_ns)
+    swap_ns = stamps.after_swap(lambda: waited.append(1))
+    assert swap_ns == (now_ns - age_ns if is_taken else now_ns)
+    assert (stamps.source, len(waited)) == (
+        (SYNC_EXTENSION.decode(), 0) if is_taken else (CLOCK, 1)
+    )
+
+
+def test_frames_were_shown_in_the_ways_of_which_the_server_counted_some():
+    assert presented_as({"flip": 5, "copy": 0}) == "flip"
+    assert presented_as({"flip": 0, "copy": 3, "skip": 2}) == "copy"
+    assert presented_as({"copy": 3, "flip": 5}) == "flip and copy"
+    assert presented_as({"skip": 2}) == presented_as({}) == "unknown"
+
+
+def test_a_server_s_release_is_three_numbers(monkeypatch):
+    """X.Org writes 1.21.1.4 as 12101004; the last is a snapshot's."""
+    closed: list[int] = []
+    library = SimpleNamespace(
+        XOpenDisplay=lambda name: 7,
+        XVendorRelease=lambda display: 12_101_004,
+        XServerVendor=lambda display: b"The X.Org Foundation",
+        XCloseDisplay=closed.append,
+    )
+    monkeypatch.setattr(x11, "xlib", lambda: library)
+    assert x11.server_of() == "The X.Org Foundation 1.21.1"
+    assert closed == [7]
+    library.XOpenDisplay = lambda name: None
+    assert x11.server_of() == ""

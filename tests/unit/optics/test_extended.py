@@ -18,9 +18,10 @@ from hilstar.optics.extended import (
     Shear,
     disc_lights,
     shifted,
+    times,
 )
 from hilstar.optics.psf import GaussianPsf
-from hilstar.sky.bodies.disc import Disc
+from hilstar.sky.bodies.disc import AIR_TOP, Air, Disc
 
 SIZE_PX, MIDDLE_PX = (96, 80), (47.5, 39.5)
 CAMERA = Camera(SIZE_PX, 500.0, MIDDLE_PX, np.eye(3))
@@ -138,3 +139,73 @@ def test_a_small_disc_that_moves_with_the_rows_has_the_light_of_those_it_meets_a
     off_px = np.hypot(x + light.corner_px[0] - MIDDLE_PX[0], y + light.corner_px[1] - MIDDLE_PX[1])
     assert (light.cover[off_px < 1.5] == 1).all()
     assert light.cover.sum() == pytest.approx(np.pi * 25 / (1 - down * share), rel=0.01)
+
+
+@pytest.mark.parametrize("air", [None, Air(0.05 * 6400.0, 0.3)])
+def test_a_disc_s_pixels_are_those_of_its_limb_its_air_and_its_psf_s_reach(air):
+    """Of a face of 12 px, which air of a twentieth of a radius makes larger by its top; the limb
+    of a near sphere is a circle about the middle of the image.
+    """
+    distance_km = 6400.0 * CAMERA.focal_length_px / 12.0
+    direction = np.array([0.0, 0.0, 1.0])
+    pole = np.array([0.0, 1.0, 0.0])
+    disc = Disc(
+        "x", direction, distance_km, 6400.0, 6400.0, pole, -direction, "uniform", 1e6, 1.0, air
+    )
+    left, top, width, height = DiscLight(disc, np.eye(3), CAMERA, PSF).region(SIZE_PX)
+    radius_px = 12.0 * (1 + (AIR_TOP * 0.05 if air else 0.0))
+    for first, size, middle, sigma in (
+        (left, width, MIDDLE_PX[0], 0.8),
+        (top, height, MIDDLE_PX[1], 1.0),
+    ):
+        reach_px = radius_px + 4 * np.sqrt(sigma**2 + 1 / 12)
+        assert reach_px < middle - first < reach_px + 3
+        assert reach_px < first + size - middle < reach_px + 3
+
+
+@pytest.mark.parametrize("at_px", [(20.0, 20.0), (75.0, 60.0)])
+def test_a_turning_camera_s_disc_is_within_its_pixels(at_px):
+    """Its limb's places, each while its own pixel is lit, 3 px and more from those at rest."""
+    rate_rad_s = np.array([0.2, -1.6, 0.0])
+    disc = uniform_disc(at_px, 14.0)
+    shear = Shear(rate_rad_s, (0.0, 2e-4), MIDDLE_PX)
+    limb = disc.limb(60)
+    places = np.stack(CAMERA.project(limb))
+    at_rest = places.copy()
+    for _ in range(20):
+        late_s = shear.late_s(*places)
+        turned = limb - late_s[:, None] * np.cross(rate_rad_s, limb)
+        places = np.stack(CAMERA.project(turned))
+    assert np.hypot(*(places - at_rest)).max() > 3
+    left, top, width, height = DiscLight(disc, np.eye(3), CAMERA, PSF, shear=shear).region(SIZE_PX)
+    low, high = np.array([left, top]), np.array([left + width, top + height])
+    on_image = np.clip(places, 0.0, np.array(SIZE_PX)[:, None] - 1.0)
+    assert (on_image.min(axis=1) >= low).all()
+    assert (on_image.max(axis=1) < high).all()
+
+
+def test_a_large_disc_is_moved_with_its_camera_and_hides_at_the_middle_of_its_poses():
+    disc = uniform_disc((40.0, 30.0), 20.0)
+    light = DiscLight(disc, np.eye(3), CAMERA, PSF)
+    x_px, y_px = MIDDLE_PX
+    assert shifted(light, 0.4, -0.3).camera.principal_point_px == (x_px + 0.4, y_px - 0.3)
+    turns = [to_matrix(propagate(AT_REST, np.array([0.0, 0.01, 0.0]), k)) for k in range(3)]
+    shares = (0.2, 0.5, 0.3)
+    poses = tuple(Pose(turn, share) for turn, share in zip(turns, shares, strict=True))
+    covering, *drawn = disc_lights(disc, DiscView(CAMERA, PSF, poses), True)
+    assert (covering.times, covering.covers) == (0.0, True)
+    assert covering.icrs_to_image is turns[1]
+    assert [(part.times, part.covers) for part in drawn] == [(share, False) for share in shares]
+    assert [part.icrs_to_image for part in drawn] == turns
+    assert len(disc_lights(disc, DiscView(CAMERA, PSF, poses), False)) == 3
+
+
+def test_light_times_a_factor_has_so_much_more_of_it_and_hides_as_much():
+    """Each kind in its own way."""
+    cover = np.ones((2, 2), np.float32)
+    glow = GlowLight(np.array([0.0, 0.0, 1.0]), 5.0, 0.1, 2.0, CAMERA)
+    disc = DiscLight(uniform_disc((40.0, 30.0)), np.eye(3), CAMERA, PSF, times=5.0)
+    assert times(glow, 3.0).peak_e_per_s == 15.0
+    assert times(disc, 3.0).times == 15.0
+    more = times(LightMap(cover, times=5.0, cover=cover), 3.0)
+    assert (more.times, more.cover is cover, more.image is cover) == (15.0, True, True)

@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 
 from hilstar.basics.rotation import from_rotation_vector, to_matrix
-from hilstar.display.render.reference import linear_image
+from hilstar.display.render.reference import extended_image, linear_image
 from hilstar.optics.camera import Camera
+from hilstar.optics.extended import LightMap
 from hilstar.optics.layers.bodies import BodyLayer
 from hilstar.optics.layers.layers import light_of
 from hilstar.optics.layers.star_layer import StarLayer
-from hilstar.optics.layers.truth import sprite_truth
+from hilstar.optics.layers.truth import TRUTH_DTYPE, clipped_in, sprite_truth, with_channels
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Scan
-from hilstar.optics.sprites import join_sprites
+from hilstar.optics.sprites import AddedLight, join_sprites
 from hilstar.sky.bodies.disc import Air, Disc
 from hilstar.sky.stars import Stars, with_bodies
 from tests.support.stars import sprites_at, stars_at
@@ -73,6 +74,9 @@ SAME_PLACE_PX = 0.05
 # A star and a disc that fall by a share s of the rows meanwhile are lit until theirs are written
 # again, 1 / (1 - s): s is up to 0.03 here, and known to its square.
 ROW_SHARE = 2e-3
+# of a face's variance, px^2: the quadratures of its places and of the camera's poses, and rows that
+# the face runs with for a share s of its light, up to 0.03, twice
+FACE_PX2 = 0.2
 ROWS = [(0, 1), (0, -1), (1, 0), (-1, 0)]
 
 
@@ -112,12 +116,13 @@ def test_a_disc_goes_where_a_star_in_its_middle_goes(view):
     middles = [(image * [x, y]).sum(axis=(1, 2)) / image.sum() for image in images]
     assert images[1].sum() == pytest.approx(images[0].sum(), rel=ROW_SHARE)
     assert middles[1] == pytest.approx(middles[0], abs=SAME_PLACE_PX)
-    # and as wide along its way, but for the face's own width
-    spread = [
-        (image * (x - middle[0]) ** 2).sum() / image.sum()
-        for image, middle in zip(images, middles, strict=True)
-    ]
-    assert 0 < spread[1] - spread[0] < 8.0
+    # and as wide along its way, but for the face's own width: of 4 px under the Sun, 4^2 / 5
+    for axis in (0, 1):
+        spread = [
+            (image * ([x, y][axis] - middle[axis]) ** 2).sum() / image.sum()
+            for image, middle in zip(images, middles, strict=True)
+        ]
+        assert spread[1] - spread[0] == pytest.approx(3.2, abs=FACE_PX2)
 
 
 def test_what_a_disc_hides_is_farther_than_it():
@@ -161,6 +166,44 @@ def test_a_star_of_several_sprites_is_one_row_that_clips_where_any_of_them_does(
     assert rows["clipped"].tolist() == wanted
 
 
+def test_what_clips_is_named_by_its_name_or_else_its_number():
+    rows = np.zeros(4, dtype=TRUTH_DTYPE)
+    rows["hip"] = [7, 8, 0, 9]
+    rows["name"] = ["", "Rigel", "Moon", "dim"]
+    rows["clipped"] = [True, True, True, False]
+    assert clipped_in(rows) == [7, "Rigel", "Moon"]
+
+
+def test_each_channel_of_a_tracker_has_its_share_of_a_row_s_electrons():
+    rows = np.zeros(2, dtype=TRUTH_DTYPE)
+    rows["electrons_per_s"] = [100.0, 10.0]
+    assert with_channels(rows, None) is rows
+    table = with_channels(rows, np.array([[0.5, 0.3, 0.2], [0.1, 0.2, 0.7]]))
+    for name, light in (("r", [50.0, 1.0]), ("g", [30.0, 2.0]), ("b", [20.0, 7.0])):
+        assert table[f"electrons_{name}_per_s"] == pytest.approx(np.array(light))
+    assert table["electrons_per_s"].tolist() == [100.0, 10.0]
+
+
+def test_light_that_faults_add_has_rows_of_its_own_by_its_names():
+    """A line of two sprites and a point, beside a star; what no catalogue knows is not known."""
+    stars = stars_at(np.eye(3), np.ones(3))
+    places = np.array([[10.0, 5.0], [20.0, 9.0], [30.0, 8.0], [50.0, 6.0]])
+    light = sprites_at(places, np.array([1.0, 3.0, 5.0, 7.0]), FOOTPRINT)
+    added = (AddedLight("line", 2.5, 0.25, 40.0), AddedLight("point", 6.0, 1.5, 50.0))
+    light = replace(light, star=np.array([-1, -1, 2, -2]), added=added, per_star=2)
+    rows, star = sprite_truth(stars, light, np.array([1]))
+    assert star.tolist() == [2, -2, -1]
+    named = {str(row["name"]): row for row in rows[1:]}
+    for name, *figures in (
+        ("line", 17.5, 8.0, 2.5, 0.25, 40.0, True),
+        ("point", 50.0, 6.0, 6.0, 1.5, 50.0, False),
+    ):
+        columns = ("x_px", "y_px", "v_mag", "bv", "electrons_per_s", "clipped")
+        assert [named[name][column] for column in columns] == pytest.approx(figures)
+        assert named[name]["drawn"]
+        assert np.isnan([named[name][c] for c in ("temperature_k", "ra_deg", "sigma_mag")]).all()
+
+
 def test_an_image_without_a_star_has_no_rows():
     stars = stars_at(np.eye(3), np.ones(3))
     rows, star = sprite_truth(stars, join_sprites([], FOOTPRINT), np.empty(0, dtype=np.intp))
@@ -186,3 +229,64 @@ def test_a_pixel_shows_at_most_its_white_or_its_full_well_in_an_exposure(
     canvas = replace(CANVAS, white_e_per_s=white_e_per_s, full_e=200.0)
     view = replace(AT_START, scan=Scan(hold_s=hold_s))
     assert canvas.white_in(view) == pytest.approx(largest_e_per_s)
+
+
+def body_layer(discs: list[Disc], canvas: Canvas) -> tuple[BodyLayer, list[float]]:
+    """The layer of discs, and how far from the boresight each of its views looked for them."""
+    reached_rad: list[float] = []
+
+    def near(axis, reach_rad, wide_rad, *observer) -> list[Disc]:
+        reached_rad.append(reach_rad)
+        return discs
+
+    names = tuple(disc.name for disc in discs)
+    return BodyLayer(SimpleNamespace(names=names, discs=near), canvas), reached_rad
+
+
+@pytest.mark.parametrize(
+    ("view", "away_s"),
+    [
+        (AT_START, 0.0),
+        (replace(AT_START, scan=Scan(hold_s=0.2)), 0.0),
+        (View(AT_START.q_icrs_to_cam, TURN, scan=Scan((0, 1), 0.1, 0.04)), 0.09),
+        (View(AT_START.q_icrs_to_cam, TURN, scan=Scan((0, 1), 0.1, 0.2), exposed=True), 0.15),
+    ],
+    ids=["at once", "still", "row by row", "rolling shutter"],
+)
+def test_bodies_are_looked_for_as_far_as_the_camera_turns_in_their_time(view, away_s):
+    """A frame's light ends half of the scan and the hold after the attitude; an exposure's begins
+    and ends half of its whole before and after.
+    """
+    layer, reached_rad = body_layer([], Canvas(WIDE, GaussianPsf((0.8, 1.0))))
+    for seen in (AT_START, view):
+        layer.add(join_sprites([], FOOTPRINT), stars_at(np.eye(3), np.ones(3)), seen)
+    more_rad = float(np.linalg.norm(TURN)) * away_s
+    assert reached_rad[1] - reached_rad[0] == pytest.approx(more_rad, abs=1e-12)
+
+
+@pytest.mark.parametrize("radius_px", [3.0, 15.0])
+def test_no_diffuse_light_shines_through_a_dark_body(radius_px):
+    """Small ones are maps, large ones drawn ray by ray; a new Moon has no light of its own."""
+    disc = Disc(
+        "Moon", AHEAD, 500 / radius_px, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), AHEAD, "lambert"
+    )
+    layer, _ = body_layer([disc], CANVAS)
+    even = LightMap(np.ones((80, 96), np.float32))
+    stars = with_bodies(stars_at(-np.eye(3), np.ones(3)), ("Moon",), np.zeros(1))
+    before = replace(join_sprites([], FOOTPRINT), extended=(even,))
+    light = layer.add(before, stars, AT_START)
+    image = extended_image(light.extended, CAMERA.resolution_px)
+    assert image[39:41, 47:49].max() < 0.01
+    # the disc's area, by a pixel's width of its limb
+    assert (1 - image).sum() == pytest.approx(np.pi * radius_px**2, rel=0.02)
+    assert image[:5].min() == 1
+
+
+def test_stars_without_paths_are_points_though_the_camera_turns():
+    stars = stars_at(np.array([[0.01, 0.02, 1.0]]), np.ones(1))
+    view = View(AT_START.q_icrs_to_cam, TURN, scan=Scan((0, 1), 0.1, 0.2))
+    empty = join_sprites([], FOOTPRINT)
+    point = StarLayer(CANVAS, paths=False).add(empty, stars, view)
+    assert len(point) == 1
+    assert (point.x_px[0], point.y_px[0]) == pytest.approx((52.5, 49.5))
+    assert len(StarLayer(CANVAS).add(empty, stars, view)) > 1

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.optics.camera import Lens, ResidualField, bounded, field_terms, ray_shifts
 from tests.support.refusals import refusal
@@ -140,3 +141,131 @@ def test_a_lens_that_folds_inside_and_opens_again_at_the_edge_is_refused():
     """
     lens = Lens((-260.0, 26_000.0, 0.0))
     assert "folds" in refusal(bounded, replace(PINHOLE, lens=lens), MARGIN_PX)
+
+
+def test_a_field_is_held_beyond_a_tenth_of_half_an_image_on_every_side(rng):
+    """Where its polynomials would diverge: as at the nearest place that is 1.1 half images off."""
+    field = residual_field(rng)
+    half_x, half_y = SIZE[0] / 2, SIZE[1] / 2
+    middle_x, middle_y = half_x - 0.5, half_y - 0.5
+
+    def shift_at(x: float, y: float) -> np.ndarray:
+        """At a place in half images from the middle."""
+        return np.array(
+            field.at(np.array([middle_x + x * half_x]), np.array([middle_y + y * half_y]))
+        )
+
+    for x, y in ((-1.0, 0.3), (1.0, -0.2)):
+        for beside in (shift_at, lambda x, y: shift_at(y, x)):
+            edge = beside(1.1 * x, y)
+            assert beside(3 * x, y) == pytest.approx(edge)
+            assert np.abs(beside(1.05 * x, y) - edge).max() > 1e-4
+
+
+def test_a_ray_that_runs_along_a_tilted_screen_or_away_from_it_has_no_place():
+    """A screen turned by 1 rad about y faces 1 rad to the right: from 0.57 rad to the left on no
+    ray meets it.
+    """
+    lens = Lens(tilt_rad=(0.0, 1.0))
+    limit = -np.tan(np.pi / 2 - 1.0)
+    u = np.array([limit + 1e-3, limit - 1e-3, -3.0, 3.0])
+    right, down = lens.bent(u, np.full(4, 0.2))
+    assert np.isfinite(right).tolist() == np.isfinite(down).tolist() == [True, False, False, True]
+
+
+def test_beyond_its_lens_a_direction_goes_on_straight_from_the_principal_point(rng):
+    """As many times as far as the place at the lens's bound, along each direction."""
+    lens = Lens((0.3, 0.0, 0.0), (1e-2, -2e-2), max_tangent=0.1)
+    camera = replace(PINHOLE, lens=lens, principal_point_px=(700.0, 610.0))
+    angle = rng.uniform(0, 2 * np.pi, 20)
+    bound = 0.1 * np.array([np.cos(angle), np.sin(angle)])
+    centre = np.array(camera.principal_point_px)[:, None]
+    at_bound = np.stack(camera.places_px(*(bound * (1 - 1e-9)))) - centre
+    for times in (1.5, 4.0):
+        beyond = np.stack(camera.places_outward_px(*(times * bound))) - centre
+        assert beyond == pytest.approx(times * at_bound, rel=1e-6, abs=1e-5)
+    within = np.stack(camera.places_outward_px(*(0.5 * bound)))
+    assert within == pytest.approx(np.stack(camera.places_px(*(0.5 * bound))))
+
+
+def test_the_boresight_is_cam_s_z_or_the_principal_point_where_that_is_behind():
+    turned = from_rotation_vector(np.array([0.02, -0.05, 0.4]))
+    camera = replace(PINHOLE, cam_to_image=to_matrix(turned))
+    u, v, w = camera.cam_to_image @ np.array([0.0, 0.0, 1.0])
+    focal_px, (x_px, y_px) = camera.focal_length_px, camera.principal_point_px
+    assert camera.boresight_px == pytest.approx((x_px + focal_px * u / w, y_px + focal_px * v / w))
+    behind = replace(PINHOLE, cam_to_image=np.diag([1.0, -1.0, -1.0]))
+    assert behind.boresight_px == behind.principal_point_px
+
+
+@pytest.mark.parametrize("lens", [None, Lens((0.6, -0.5, 2.0), (-2e-3, 1e-3), (0.05, -0.1))])
+def test_an_image_s_scales_and_solid_angles_are_those_of_small_turns(lens, rng):
+    """Pixels to a radian by turns of 1e-5 rad about many axes from many places: none is outside
+    the two scales, and a pinhole's are those of its axis. A pixel's solid angle is that of its
+    four corners, by the excess of their triangles.
+    """
+    camera = bounded(replace(PINHOLE, lens=lens, principal_point_px=(500.0, 800.0)), MARGIN_PX)
+    smallest, largest = camera.scales_px_rad()
+    if lens is None:
+        assert smallest == largest == camera.focal_length_px
+    x, y = rng.uniform(-0.5, np.array(SIZE)[:, None] - 0.5, (2, 300))
+    rays = camera.rays(x, y)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    aside = np.cross(rays, rng.normal(size=rays.shape))
+    aside /= np.linalg.norm(aside, axis=1, keepdims=True)
+    moved = np.stack(camera.project(rays + 1e-5 * aside))
+    per_rad = np.hypot(*(moved - [x, y])) / 1e-5
+    if lens is not None:
+        assert smallest * 0.999 < per_rad.min() < smallest * 1.02
+        assert largest / 1.02 < per_rad.max() < largest * 1.001
+    corners = [
+        camera.rays(x + right / 2, y + down / 2)
+        for right, down in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
+    corners = [ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in corners]
+    sr = sum(
+        np.abs(np.einsum("ni,ni->n", a, np.cross(b, c))) / 2
+        for a, b, c in ((corners[0], corners[1], corners[2]), (corners[0], corners[2], corners[3]))
+    )
+    assert camera.pixel_sr(x, y) == pytest.approx(sr, rel=1e-5)
+
+
+def test_by_a_turn_of_a_right_angle_any_direction_may_come_into_view(rng):
+    """Of a screen 22 deg to its corner: from a reach of 68 deg on none is culled."""
+    around = rng.normal(size=(200, 3))
+    reach_rad = np.pi / 2 - PINHOLE.field_radius_rad(MARGIN_PX)
+    assert len(PINHOLE.in_view(around, MARGIN_PX, reach_rad + 1e-6)) == 200
+    assert len(PINHOLE.in_view(around, MARGIN_PX, reach_rad - 0.1)) < 200
+
+
+def test_the_field_reaches_to_the_corner_that_is_farthest_from_the_principal_point():
+    for middle_px in ((300.0, 200.0), (1500.0, 200.0), (300.0, 900.0), (1500.0, 900.0)):
+        camera = replace(PINHOLE, principal_point_px=middle_px)
+        corners = [
+            camera.rays(np.array([x]), np.array([y]))[0]
+            for x in (-0.5 - MARGIN_PX, SIZE[0] - 0.5 + MARGIN_PX)
+            for y in (-0.5 - MARGIN_PX, SIZE[1] - 0.5 + MARGIN_PX)
+        ]
+        farthest_rad = max(np.arctan(np.hypot(u, v)) for u, v, _ in corners)
+        assert camera.field_radius_rad(MARGIN_PX) == pytest.approx(farthest_rad)
+        # the planes of the image's sides, a margin outside it, pass through two corners each
+        along = np.array(corners) @ camera.edges(MARGIN_PX).T
+        assert (np.abs(along) < 1e-12).sum(axis=0).tolist() == [2, 2, 2, 2]
+        assert along.min() > -1e-12
+
+
+def test_a_wide_field_s_fastest_star_is_as_fast_as_finite_differences_say(rng):
+    """Through a corner of 75 deg, of a camera that turns about an axis beside its own."""
+    camera = replace(
+        PINHOLE, focal_length_px=300.0, principal_point_px=(700.0, 400.0), resolution_px=(1600, 900)
+    )
+    for rate in ([0.3, -0.2, 0.5], [-0.1, 0.4, -0.6], [0.0, 0.0, 1.0]):
+        x, y = np.meshgrid(np.linspace(-0.5, 1599.5, 120), np.linspace(-0.5, 899.5, 80))
+        rays = camera.rays(x.ravel(), y.ravel())
+        step_s = 1e-6
+        before, after = (
+            np.stack(camera.project(rays - sign * step_s * np.cross(rate, rays)))
+            for sign in (-1, 1)
+        )
+        fastest = np.hypot(*(after - before)).max() / (2 * step_s)
+        assert camera.fastest_px_s(np.array(rate)) == pytest.approx(fastest, rel=0.02)

@@ -243,3 +243,82 @@ def test_light_outside_a_square_is_that_along_the_wider_axis(is_tall):
     outside = SampledPsf(image, 4).outside_share(5)
     exact = GaussianPsf((1.5, 0.5)).outside_share(5)
     assert outside == pytest.approx(exact, rel=0.01)
+
+
+@pytest.mark.parametrize("is_tall", [False, True])
+def test_an_elongated_psf_s_ellipse_lies_along_it_and_its_table_ends_in_the_dark(is_tall):
+    """All shares are within it; its axes are those of the PSF, not each other's."""
+    sigma = (0.6, 1.0) if is_tall else (1.0, 0.6)
+    psf = SampledPsf(sampled(gaussian(*sigma), 3, 6), 3)
+    (x2, y2), factor = psf.reach
+    variance_x, variance_y = psf.variance_px2
+    assert y2 / x2 == pytest.approx(variance_y / variance_x)
+    wide_px = np.array(psf.width_px)
+    assert (variance_x, variance_y) == pytest.approx(tuple(wide_px**2 + 1 / 12))
+    half_px = psf.footprint_px / 2
+    at = np.linspace(-half_px, half_px, 4 * psf.footprint_px + 1)
+    shares = psf.shares(at, at[:, None])
+    assert (shares <= factor * np.exp(-(at**2) / x2 - at[:, None] ** 2 / y2)).all()
+    for edge in (shares[0], shares[-1], shares[:, 0], shares[:, -1]):
+        assert not edge.any()
+    assert psf.width_px == pytest.approx(sigma, rel=0.015)
+    # and not much larger than what has a ten-thousandth of the peak
+    lit_px2 = np.mean(shares > 1e-4 * psf.peak_share) * psf.footprint_px**2
+    ellipse_px2 = np.pi * np.sqrt(x2 * y2) * np.log(factor / (1e-4 * psf.peak_share))
+    assert lit_px2 < ellipse_px2 < 1.4 * lit_px2
+
+
+def test_the_shader_s_cells_interpolate_the_shares_themselves(rng):
+    """Each cell's four coefficients: of 1, x, y and x y, from its upper left corner on."""
+    psf = SampledPsf(sampled(coma(), 3, 6), 3)
+    side = psf.footprint_px
+    defines, uniforms, cells = psf.shader(side)
+    steps = (len(cells)) // side
+    assert (defines, uniforms) == ((f"SHARE_STEPS {steps}.0",), {})
+    assert cells.shape == (side * steps, side * steps, 4)
+    x, y = rng.uniform(-side / 2, side / 2, (2, 300))
+    column, row = ((at + side / 2) * steps for at in (x, y))
+    corner = cells[row.astype(int), column.astype(int)].astype(float)
+    u, v = column % 1, row % 1
+    terms = np.stack([np.ones(300), u, v, u * v], axis=1)
+    assert (corner * terms).sum(axis=1) == pytest.approx(psf.shares(x, y), abs=1e-7)
+
+
+@pytest.mark.parametrize("integrated", [False, True])
+def test_a_blurred_psf_is_as_wide_as_both_and_of_the_same_kind(integrated):
+    at = np.arange(-15, 16) / 3
+    profile = gaussian(0.8, 0.6)
+    light = in_pixels(profile, at, at, 5) if integrated else sampled(profile, 3, 5)
+    psf = SampledPsf(light, 3, integrated)
+    wider = psf.blurred(0.5)
+    assert wider.pixel_integrated is integrated
+    # as far as a Gaussian and a pixel are no Gaussian
+    assert wider.width_px == pytest.approx(np.hypot(psf.width_px, 0.5), rel=5e-3)
+    assert psf.width_px == pytest.approx((0.8, 0.6), rel=0.015)
+
+
+def test_a_table_of_any_footprint_has_a_star_s_light_and_place_at_every_phase(rng):
+    """Of footprints whose share of the largest table is an odd number of steps, and others."""
+    for sigma_px in (3.1, 3.4):
+        psf = SampledPsf(sampled(gaussian(sigma_px, sigma_px), 2, 20), 2)
+        pixel = np.arange(-20, 21)
+        for x, y in rng.uniform(-0.5, 0.5, (3, 2)):
+            share = psf.shares(pixel - x, (pixel - y)[:, None])
+            assert share.sum() == pytest.approx(1, abs=1e-6)
+            assert (share.sum(axis=0) @ pixel, share.sum(axis=1) @ pixel) == pytest.approx(
+                (x, y), abs=CENTROID_LIMIT_PX
+            )
+
+
+def test_a_narrow_gaussian_is_drawn_by_error_functions_of_its_own_axes(rng):
+    """Under half a pixel no polynomial will do: float32, and the rational function's own error."""
+    psf = GaussianPsf((0.3, 0.45))
+    defines, uniforms, table = psf.shader(psf.footprint_px)
+    assert (defines, table) == ((), None)
+    wanted = tuple(1 / (sigma * np.sqrt(2)) for sigma in psf.sigma_px)
+    assert uniforms["inverse_sigma_sqrt2"] == pytest.approx(wanted)
+    fraction = rng.uniform(-0.5, 0.5, (2, 50)).astype(np.float32)
+    rates = rng.uniform(1, 2, 50).astype(np.float32)
+    drawn = psf.drawn_stamps(fraction, rates, 7, psf.footprint_px)
+    assert np.abs(drawn - psf.stamps(fraction.astype(float), rates, 7)).max() < 2e-6
+    assert psf.variance_px2 == pytest.approx((0.09 + 1 / 12, 0.2025 + 1 / 12))

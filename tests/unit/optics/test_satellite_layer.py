@@ -14,8 +14,8 @@ from hilstar.basics.rotation import from_rotation_vector, propagate, to_matrix
 from hilstar.display.render.reference import extended_image, linear_image
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.layers import Sources, light_of, seen_in, sky_layers
-from hilstar.optics.layers.satellites import SatelliteLayer
-from hilstar.optics.layers.view import Canvas, View
+from hilstar.optics.layers.satellites import FRAME_SPRITES, SatelliteLayer
+from hilstar.optics.layers.view import POINT_PX, Canvas, View
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Scan
 from hilstar.sky.bodies.passes import Cone
@@ -197,8 +197,31 @@ def test_a_camera_at_rest_has_discs_of_wide_satellites_alone():
     assert disc.name == "OTHER"
     assert disc.direction == pytest.approx(one.direction(0.0), abs=1e-12)
     assert disc.radius_rad == pytest.approx(WIDE_KM / 2 / np.linalg.norm(seen_km), rel=1e-6)
+    # a disc hides stars however faint it is
+    faint = SatelliteLayer(one.sky, Canvas(CAMERA, PSF), faintest_e_per_s=1e30)
+    assert [disc.name for disc in faint.discs(stars, view)] == ["OTHER"]
     away = replace(view, q_icrs_to_cam=looking_at(-one.direction(0.0)))
     assert SatelliteLayer(one.sky, Canvas(CAMERA, PSF)).discs(stars, away) == []
+
+
+@pytest.mark.parametrize(("share", "is_wide"), [(0.97, False), (1.03, True)])
+def test_a_satellite_is_a_disc_from_a_fifth_of_a_pixel_on(share, is_wide):
+    """By its diameter; beside it a pinhole has as many pixels to a radian everywhere."""
+    seen_km = scene().sky.passing(Cone(NORTH, np.pi, 0.0), scene().t_ns).seen_km[0, 0]
+    size_m = share * POINT_PX / CAMERA.focal_length_px * np.linalg.norm(seen_km) * 1000
+    sized = scene(f"norad,size_m\n7,{size_m}\n")
+    light, stars = sized.light(View(sized.q, None, sized.t_ns, scan=Scan(hold_s=1e-3)))
+    assert light.discs == (("OTHER",) if is_wide else ())
+    layer = SatelliteLayer(sized.sky, Canvas(CAMERA, PSF))
+    assert len(layer.discs(stars, View(sized.q, None, sized.t_ns))) == is_wide
+
+
+def test_an_exposure_s_streak_is_finer_than_a_frame_may_cost():
+    """Of a PSF of a tenth of a pixel, over some hundred pixels."""
+    long = scene()
+    canvas = Canvas(CAMERA, GaussianPsf((0.1, 0.1)))
+    exposed, _ = long.light(View.exposure(long.q, RATE, 1.5, long.t_ns), canvas=canvas)
+    assert (exposed.per_star > FRAME_SPRITES, exposed.capped) == (True, 0)
 
 
 def test_discs_are_drawn_the_farthest_first():

@@ -301,7 +301,7 @@ def test_a_lens_s_table_turns_a_path_of_tangents_into_one_of_pixels(rng):
     at = np.stack([rng.uniform(-0.3, 0.3, 30), rng.uniform(-0.25, 0.25, 30)])
     by = rng.normal(0, 0.1, (2, 30))
     bend = rng.normal(0, 0.1, (2, 30))
-    found = table.along(at, by, bend)
+    by_time = table.along(at, by, bend)
     for k in range(30):
         column = int(np.clip(np.rint((at[0, k] + 0.2) * 10), 0, 4))
         row = int(np.clip(np.rint((at[1, k] + 0.15) * 10), 0, 3))
@@ -310,7 +310,7 @@ def test_a_lens_s_table_turns_a_path_of_tangents_into_one_of_pixels(rng):
         for axis in (0, 1):
             place, by_u, by_v, uu, uv, vv = terms[:, axis, 5 * row + column]
             whole = place + by_u * u + by_v * v + uu * u * u + uv * u * v + vv * v * v
-            assert found[:, axis, k] == pytest.approx(whole.coef[:3])
+            assert by_time[:, axis, k] == pytest.approx(whole.coef[:3])
 
 
 def test_a_path_has_nodes_by_its_length_and_all_where_that_is_not_known():

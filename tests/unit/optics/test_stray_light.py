@@ -10,7 +10,8 @@ import pytest
 from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.optics.camera import Camera
 from hilstar.optics.layers.fault_kinds import Gradient, MeasuredMap
-from hilstar.optics.layers.stray_light import gradient_image, map_image, pixels_in
+from hilstar.optics.layers.stray_light import gradient_image, map_image, pixels_in, read_map
+from tests.support.refusals import refusal
 
 TRACKER = Camera((40, 30), 100.0, (19.5, 14.5), np.eye(3))
 MAP = MeasuredMap(name="m", file="map.npy")
@@ -174,3 +175,26 @@ def test_a_part_of_an_image_that_is_nowhere_in_the_other_s_has_no_light():
     image = map_image(np.ones((30, 40)), MAP, wide, TRACKER)
     assert (image > 0).tolist() == on.tolist()
     assert on.any()
+
+
+@pytest.mark.parametrize(
+    ("shape", "is_map"), [((2, 2), True), ((1, 5), False), ((5, 1), False), ((2, 2, 2), False)]
+)
+def test_a_map_has_two_axes_of_two_pixels_or_more(tmp_path, shape, is_map):
+    values = np.arange(np.prod(shape), dtype=float).reshape(shape)
+    np.save(tmp_path / "map.npy", values)
+    if is_map:
+        assert np.array_equal(read_map(tmp_path / "map.npy"), values)
+    else:
+        said = refusal(read_map, tmp_path / "map.npy")
+        assert f"an array of shape {shape}" in said
+
+
+@pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
+def test_a_map_of_light_has_no_value_that_is_none(tmp_path, value):
+    values = np.ones((3, 4))
+    values[2, 1] = value
+    np.save(tmp_path / "map.npy", values)
+    assert "a value is negative or not finite" in refusal(read_map, tmp_path / "map.npy")
+    np.save(tmp_path / "map.npy", np.zeros((3, 4)))
+    assert "is dark everywhere" in refusal(read_map, tmp_path / "map.npy")

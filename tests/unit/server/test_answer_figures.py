@@ -308,6 +308,20 @@ def test_a_fault_s_spans_are_cut_where_the_run_begins_and_ends():
     assert (fault.first_wrong_s, fault.recovered_s) == (0.5, 0.0)
 
 
+def test_what_was_ten_seconds_before_a_fault_has_nothing_to_do_with_it():
+    tally = tallied("w" * 145 + "r" * 150, faults=[(25.0, 26.0)])
+    (fault,) = tally.report(START_NS).faults
+    assert (fault.before.length_s, fault.before.right, fault.before.wrong) == (10.0, 100, 0)
+
+
+def test_an_answer_is_due_in_a_span_of_over_half_a_cycle():
+    tally = SpanTally()
+    tally.add(AnswerRecord(host_ns=1, raw="01", middle_ns=1, verdict="right"))
+    shares = [tally.span(cycles * CYCLE_S, CYCLE_S).availability for cycles in (0.4, 0.6, 1.6)]
+    assert shares == [None, 1.0, 0.5]
+    assert tally.span(9.0, None).availability is None
+
+
 def test_a_fault_that_does_not_end_has_nothing_after_it():
     tally = judged_run(fault_record(6.5, "start", 2, "haze"))
     (fault,) = tally.report(START_NS).faults

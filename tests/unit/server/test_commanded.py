@@ -96,6 +96,7 @@ def test_what_was_shown_in_a_gap_is_known_where_little_can_have_happened(gap_s, 
     moments = commanded.at(np.array([0.9 + gap_s / 2, 0.55, -0.01, t_s[-1] + 0.01]))
     assert moments.known.tolist() == [is_known, True, False, False]
     assert np.isfinite(moments.q[:, 0]).tolist() == moments.known.tolist()
+    assert commanded.at(t_s[[0, -1]]).known.all()
 
 
 def test_long_intervals_are_no_gaps_where_all_are_long():

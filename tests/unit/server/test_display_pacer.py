@@ -237,3 +237,16 @@ def test_the_budget_is_a_period_until_frames_have_been_timed_and_then_passes_ove
     assert budget.min_ns == DRAW_NS
     budget.add(3 * DRAW_NS)
     assert budget.ns == 3 * DRAW_NS + GUARD_NS
+
+
+@pytest.mark.parametrize(
+    ("well", "is_raised"), [(0, True), (116, True), (117, False), (300, False)]
+)
+def test_a_guard_is_raised_by_three_late_flips_of_one_hundred_and_twenty(well, is_raised):
+    budget = DrawBudget(PERIOD_NS)
+    late = (2e6, PERIOD_NS)
+    told = [budget.add_flip(*late) for _ in range(2)]
+    told += [budget.add_flip(2e6, 0.0) for _ in range(well)]
+    assert not any(told)
+    assert budget.add_flip(*late) is is_raised
+    assert budget.guard_ns == (1.25 * 2e6 if is_raised else GUARD_NS)

@@ -9,6 +9,7 @@ import json
 import socket
 import sys
 import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -127,6 +128,8 @@ def test_what_comes_back_is_its_outputs(model, display):
     valid = AnswerPacket(2, protocol.ANSWER_VALID, 1_250_000_000, (0.5, -0.5, -0.5, 0.5))
     damaged = bytearray(encode(valid))
     damaged[9] ^= 1
+    other_version = bytes([protocol.VERSION + 1]) + encode(valid)[1:-4]
+    display.sendto(other_version + zlib.crc32(other_version).to_bytes(4, "little"), peer)
     display.sendto(b"?", peer)
     display.sendto(damaged, peer)
     display.sendto(encode(lost), peer)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import datetime
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +17,14 @@ from hilstar.display.window.x11 import BackBuffer
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.config import parse_config
 from hilstar.server.screen import gate
-from hilstar.server.screen.gate import GATE_FRAMES, Timing, faults, pass_gate, timing_of
+from hilstar.server.screen.gate import (
+    GATE_FRAMES,
+    Timing,
+    faults,
+    follows_frames,
+    pass_gate,
+    timing_of,
+)
 from tests.support.benches import SMALL_BENCH
 from tests.support.model_display import model_screen, plain_window
 
@@ -106,6 +114,63 @@ def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
 def test_each_fault_of_a_display_is_said_with_what_to_do(monitor, changes, timing, words):
     (fault,) = faults(plain_window(**changes), monitor, timing)
     assert words in fault
+
+
+def test_frames_that_are_held_back_are_told_by_their_number_and_the_delay_of_all_of_them(monitor):
+    timing = Timing(PERIOD_MS, 0, True, queued=2)
+    (fault,) = faults(plain_window(), monitor, timing)
+    assert "holds 2 finished frames back, and light comes 33.3 ms after the swap" in fault
+
+
+def test_a_screen_s_size_is_that_of_an_image_as_it_is_turned(tmp_path):
+    keys = "rotate_deg = 90\n[collimator]"
+    turned = parse_config(tmp_path / "bench.toml", SMALL_BENCH.replace("[collimator]", keys))
+    assert list(faults(plain_window(size_px=(240, 320)), turned.monitor, GOOD)) == []
+    (fault,) = faults(plain_window(), turned.monitor, GOOD)
+    assert "320 x 240 px and the bench file says 240 x 320" in fault
+
+
+@pytest.mark.parametrize(
+    ("steps", "is_enough"), [(0, True), (512, False), (1023, False), (1024, True)]
+)
+def test_a_gamma_ramp_has_a_step_for_each_code(tmp_path, steps, is_enough):
+    bench = SMALL_BENCH.replace("[collimator]", "bits = 10\n[collimator]")
+    monitor = parse_config(tmp_path / "bench.toml", bench).monitor
+    window = plain_window(back_buffer=BackBuffer(10, 0), screen_bits=10, ramp_size=steps)
+    assert (list(faults(window, monitor, GOOD)) == []) is is_enough
+
+
+def test_a_period_s_error_is_the_scatter_of_intervals_without_dropped_frames(monitor):
+    """Of the median of n: sqrt(pi / 2) sigma / sqrt(n)."""
+    periods_ms = PERIOD_MS + 0.1 * (-1.0) ** np.arange(GATE_FRAMES)
+    wanted_ms = np.sqrt(np.pi / 2) * 0.1 / np.sqrt(GATE_FRAMES)
+    assert timing_of(periods_ms, monitor, 60.0).period_error_ms == pytest.approx(wanted_ms)
+    periods_ms[:20] *= 2
+    assert timing_of(periods_ms, monitor, 60.0).period_error_ms == pytest.approx(wanted_ms)
+    assert timing_of(np.full(GATE_FRAMES, 99.0), monitor, 60.0).period_error_ms == 0.0
+
+
+@pytest.mark.parametrize(
+    ("early", "is_variable"),
+    [("11111", True), ("10101", True), ("00111", True), ("11000", False), ("00001", False)],
+)
+def test_a_refresh_is_variable_where_most_early_frames_are_shown_at_once(early, is_variable):
+    """The second swap of a pair comes 1.5 or 2 periods after the first."""
+    times_ns = [0]
+    for is_early in early:
+        times_ns += [
+            times_ns[-1] + 10 * 100,
+            times_ns[-1] + 10 * 100 + (150 if is_early == "1" else 200),
+        ]
+    left = iter(times_ns[1:])
+    screen = SimpleNamespace(
+        present=lambda number: None,
+        swap=lambda timed: next(left),
+        clock=SimpleNamespace(period_ns=100),
+    )
+    clock = SimpleNamespace(wait_until=lambda due_ns, stop: None)
+    assert follows_frames(screen, clock) is is_variable
+    assert list(left) == []
 
 
 @pytest.mark.parametrize("buffers", [2, 3])

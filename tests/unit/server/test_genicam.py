@@ -7,6 +7,8 @@ import re
 import sys
 import time
 from contextlib import closing
+from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from hilstar.server.genicam.camera import (
     has_aravis,
     list_cameras,
 )
+from hilstar.server.genicam.child_lines import chosen
 from hilstar.server.genicam.pixels import mosaic_of, unpacked
 from hilstar.server.gige.camera import GigECamera
 from hilstar.server.gige.registers import CameraSettings
@@ -34,6 +37,49 @@ from tests.support.refusals import refusal
 needs_aravis = pytest.mark.skipif(
     not has_aravis(), reason="Aravis is not installed (gir1.2-aravis-0.8, python3-gi)"
 )
+
+
+SEEN = [
+    {"id": "A-1", "serial": "11", "address": "192.168.1.10", "vendor": "A", "model": "M"},
+    {"id": "A-2", "serial": "22", "address": "192.168.1.11", "vendor": "A", "model": "M"},
+    {"id": "B-3", "serial": "33", "address": "192.168.1.12", "vendor": "B", "model": "N"},
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [("A-2", "A-2"), ("22", "A-2"), ("192.168.1.11", "A-2"), ("B-N", "B-3"), ("33", "B-3")],
+)
+def test_a_camera_is_meant_by_its_identifier_serial_address_or_model(name, found):
+    assert chosen(name, SEEN) == found
+    assert chosen("", SEEN[:1]) == "A-1"
+
+
+def test_a_name_of_no_camera_or_of_several_is_refused_with_what_is_there():
+    for name, count in (("", 3), ("A-M", 2), ("C", 0)):
+        with pytest.raises(LookupError, match=f"fits {count} of the cameras here: A-1 .*, B-3"):
+            chosen(name, SEEN)
+    with pytest.raises(LookupError, match="no camera is there"):
+        chosen("A-1", [])
+
+
+@pytest.mark.parametrize(
+    ("asked_us", "off_us", "is_refused"),
+    [
+        (100_000.0, 999.0, False),
+        (100_000.0, 1001.0, True),
+        (100.0, 19.0, False),
+        (100.0, 21.0, True),
+    ],
+)
+def test_an_exposure_may_be_a_hundredth_or_a_step_off(asked_us, off_us, is_refused):
+    camera = SimpleNamespace(about={"exposure_us": (10.0, 1e6)}, _said=lambda text: text)
+    for exposure_us in (asked_us - off_us, asked_us + off_us):
+        check = partial(GenicamCamera._check_exposure, camera, asked_us, exposure_us)
+        if is_refused:
+            assert "it can do 1e-05 to 1 s" in refusal(check)
+        else:
+            check()
 
 
 @pytest.mark.parametrize(

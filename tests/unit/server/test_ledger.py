@@ -135,9 +135,9 @@ def test_a_ledger_that_cannot_be_begun_leaves_nothing(tmp_path, kept_bench, monk
     assert len(list(Path("/proc/self/fd").iterdir())) == open_files
 
 
-def disk_of(monkeypatch, free_bytes: int, total_bytes: int = 100_000_000_000) -> None:
+def disk_of(monkeypatch, free_bytes: int, total_bytes: int = 100_000_000_000) -> list[int]:
     """A disk with so much free for a user, in blocks of 4 kB; root has 5 GB more, and files are
-    read in pieces of 1 MB.
+    read in pieces of 1 MB. The list grows with each look.
     """
     block = 4096
     disk = SimpleNamespace(
@@ -147,7 +147,14 @@ def disk_of(monkeypatch, free_bytes: int, total_bytes: int = 100_000_000_000) ->
         f_bavail=free_bytes // block,
         f_bfree=(free_bytes + 5_000_000_000) // block,
     )
-    monkeypatch.setattr(os, "fstatvfs", lambda fd: disk)
+    looks: list[int] = []
+
+    def fstatvfs(fd: int) -> SimpleNamespace:
+        looks.append(fd)
+        return disk
+
+    monkeypatch.setattr(os, "fstatvfs", fstatvfs)
+    return looks
 
 
 def test_of_a_disk_that_fills_packets_have_the_last_64_mb_and_its_state_is_said(
@@ -163,6 +170,9 @@ def test_of_a_disk_that_fills_packets_have_the_last_64_mb_and_its_state_is_said(
         disk_of(monkeypatch, 9_900_000_000)
         wait_for(lambda: notices.active, "a disk of which less than a tenth is free")
         assert "disk-low" in notices.active and "ledger-thin" not in notices.active
+        looks = disk_of(monkeypatch, 11_000_000_000)
+        wait_for(lambda: len(looks) > 1)
+        assert "disk-low" in notices.active  # until 12 % are free
         disk_of(monkeypatch, 63_000_000)
         wait_for(lambda: "ledger-thin" in notices.active)
         keep(ledger, 10, 20)
@@ -170,12 +180,14 @@ def test_of_a_disk_that_fills_packets_have_the_last_64_mb_and_its_state_is_said(
         disk_of(monkeypatch, 12_100_000_000)
         wait_for(lambda: not notices.active, "there is room again")
         keep(ledger, 20, 30)
+        # on a small disk frames go on until 2 % are free
+        looks = disk_of(monkeypatch, 30_000_000, 1_000_000_000)
+        wait_for(lambda: len(looks) > 1)
     assert [sample.sequence for sample in read_log(path)] == list(range(30))
     assert [frame.frame for frame in drawable_frames(path)] == [*range(10), *range(20, 30)]
     assert ledger.summary()["unrecorded"] == 10
-    assert notices.counts() == dict.fromkeys(
-        ("ledger-thin", "ledger-whole", "disk-low", "disk-well"), 1
-    )
+    told = dict.fromkeys(("ledger-thin", "ledger-whole", "disk-low", "disk-well"), 1)
+    assert notices.counts() == told | {"disk-low": 2}
 
 
 def test_a_process_s_memory_is_what_the_kernel_says_it_is():
@@ -429,6 +441,62 @@ def test_a_split_ledger_that_cannot_go_on_elsewhere_stays_and_says_so(
     assert frames == list(range(8))
 
 
+class LedgerTime:
+    """The clock of a ledger, which stands until it is moved, and the turns of its writer."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.now_s = 1000.0
+        self._turns = 0
+        monkeypatch.setattr(ledger_module, "FLUSH_S", 0.002)
+        clock = SimpleNamespace(
+            monotonic=lambda: self.now_s, monotonic_ns=time.monotonic_ns, time_ns=time.time_ns
+        )
+        monkeypatch.setattr(ledger_module, "time", clock)
+        take = LedgerQueue.take
+
+        def counted(queue: LedgerQueue) -> list[QueueEntry]:
+            self._turns += 1
+            return take(queue)
+
+        monkeypatch.setattr(LedgerQueue, "take", counted)
+
+    def pass_by(self, seconds: float) -> None:
+        """Let time pass, and the writer see it."""
+        self.now_s += seconds
+        before = self._turns
+        wait_for(lambda: self._turns > before + 2)
+
+
+def test_a_ledger_that_is_split_by_its_age_begins_each_part_anew(tmp_path, kept_bench, monkeypatch):
+    passing = LedgerTime(monkeypatch)
+    path = tmp_path / "run.mcap"
+    files = []
+    with Ledger(path, kept_bench, split=SplitLimits(seconds=60.0)) as ledger:
+        for seconds in (59.0, 2.0, 57.0, 0.0, 3.0):
+            passing.pass_by(seconds)
+            files.append(ledger.summary().get("files", 1))
+    assert files == [1, 2, 2, 2, 3]
+
+
+def test_a_ledger_that_is_harmed_again_and_again_rests_twice_as_long(
+    tmp_path, kept_bench, monkeypatch
+):
+    """One second, two, and at most three."""
+    monkeypatch.setattr(ledger_module, "MAX_REST_S", 3.0)
+    passing = LedgerTime(monkeypatch)
+    notices = Notices()
+    rested_s = []
+    with Ledger(tmp_path / "run.mcap", kept_bench, notices) as ledger:
+        for harmed in range(1, 5):
+            ledger.path.unlink()
+            passing.pass_by(0.0)
+            begun_s = passing.now_s
+            while notices.counts().get("ledger-lost", 0) < harmed and passing.now_s < begun_s + 9:
+                passing.pass_by(0.5)
+            rested_s.append(passing.now_s - begun_s)
+    assert rested_s == [0.0, 1.5, 2.5, 3.5]
+
+
 def test_a_ledger_needs_no_new_file_once_it_has_begun(tmp_path, kept_bench):
     limits = resource.getrlimit(resource.RLIMIT_NOFILE)
     with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:
@@ -574,3 +642,5 @@ def test_a_flood_of_one_reason_leaves_the_first_packets_of_another():
     assert sum(kept) == 20  # of a burst
     assert flood.keeps("packet", "norm", 0)
     assert flood.counted() == {("packet", "crc"): 80}
+    assert not flood.keeps("packet", "crc", 1)
+    assert flood.counted() == {("packet", "crc"): 1}  # since the last call

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from hilstar.basics.reading import warn_once
-from hilstar.sky.electrons import Optics, Photometry, band_mean, load_library, tabulate
+from hilstar.sky.electrons import (
+    Optics,
+    Photometry,
+    band_mean,
+    library_electrons_per_s,
+    load_library,
+    reference_mean_w_m2_m,
+    tabulate,
+)
 from hilstar.sky.spectral_types import DUST_EBV_MAG, bare_and_dusty
 from hilstar.sky.spectrum import (
     Curve,
@@ -220,3 +228,22 @@ def test_photon_weighting_weighs_a_passband_by_the_wavelength():
         for weighting, weights in response.items():
             wanted = np.trapezoid(spectrum * weights, nm) / np.trapezoid(weights, nm)
             assert band_mean(library, v, weighting)[star] == pytest.approx(wanted, rel=1e-5)
+
+
+@pytest.mark.parametrize("zero_point", ["vega", "iau-bolometric"])
+def test_a_star_s_rate_is_by_its_own_mean_in_the_weighting_that_is_chosen(zero_point):
+    """Of one V and another weighting a star's flux is as much larger as the reference's mean is
+    beside its own.
+    """
+    library, v = load_library(), load_curve("johnson-v", "johnson-v")
+    optics = Optics(30.0, v, constant_curve(1.0))
+    rate, mean, reference = {}, {}, {}
+    for weighting in ("energy", "photon"):
+        photometry = Photometry(zero_point, weighting)
+        rate[weighting] = library_electrons_per_s(library, optics, photometry)
+        mean[weighting] = band_mean(library, v, weighting)
+        reference[weighting] = reference_mean_w_m2_m(photometry)
+    larger = reference["photon"] / reference["energy"]
+    wanted = larger * mean["energy"] / mean["photon"]
+    assert rate["photon"] / rate["energy"] == pytest.approx(wanted, rel=1e-12)
+    assert np.ptp(wanted) > 0.01

@@ -7,6 +7,7 @@ without sampling.
 from __future__ import annotations
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -176,14 +177,25 @@ def test_one_seed_gives_one_frame_on_any_number_of_threads(monkeypatch):
     assert (detector.expose(mean_e, 1.0, np.random.default_rng(3)) != frames[0]).mean() > 0.9
 
 
-def test_one_thread_is_this_one(monkeypatch):
-    def refuse(threads):
-        raise AssertionError(threads)
+@pytest.mark.parametrize(
+    ("stated", "threads"), [("1", []), ("3", [3]), ("0", [4]), ("2,8", [2]), ("", [4]), ("9", [5])]
+)
+def test_blocks_have_the_threads_that_are_stated_or_one_for_each_core(monkeypatch, stated, threads):
+    """Of five blocks, where there are four cores; a single thread is this one."""
+    made, drawn = [], []
 
-    monkeypatch.setattr(frame_noise, "ThreadPoolExecutor", refuse)
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-    detector = Detector(DetectorSettings(read_noise_e=5.0), (40, 700))
-    assert detector.expose(np.zeros((700, 40)), 1.0, np.random.default_rng(2)).any()
+    class Pool(ThreadPoolExecutor):
+        def __init__(self, count):
+            made.append(count)
+            super().__init__(count)
+
+    monkeypatch.setattr(frame_noise, "PART_PX", 100)
+    monkeypatch.setattr(frame_noise, "ThreadPoolExecutor", Pool)
+    monkeypatch.setattr(frame_noise.os, "sched_getaffinity", lambda process: {0, 1, 2, 3})
+    monkeypatch.setenv("OMP_NUM_THREADS", stated)
+    draw_blocks((100, 10), np.random.default_rng(1), lambda part, words: drawn.append(part.start))
+    assert made == threads
+    assert sorted(drawn) == list(range(0, 100, 20))
 
 
 def test_words_repeat_nowhere_in_a_frame():

@@ -492,8 +492,7 @@ def _fields(
     counts = []
     for q in attitudes:
         in_cam = vectors @ to_matrix(q).T
-        inside = in_cam[:, 2] > 0
-        inside &= _is_in_image(camera, in_cam, margin)
+        inside = _is_in_image(camera, in_cam, margin)
         inside &= _is_in_image(bench.camera, in_cam, MIN_EDGE_PX)
         counts.append(int(inside.sum()))
     fields: list[FloatArray] = []

@@ -263,11 +263,18 @@ def without_s_curves(
     poses = len(look.q_poses)
     rough = fits.fit(problem, fits.Model(fits.RADIAL, (), poses), 0, data).geometry
     for pose, q_cam_to_pose in enumerate(rough.q_poses):
-        turned_axes = rough.tracker.cam_to_image @ to_matrix(q_cam_to_pose)
-        tracker = replace(rough.tracker, cam_to_image=turned_axes)
-        screen = SeenScreen(rough.monitor, tracker, is_sure=True, psf_sigma_px=psf_sigma_px)
+        screen = seen_in_pose(rough, q_cam_to_pose, psf_sigma_px)
         seen = seen.without_s_curve(pose, screen.dot_shape)
     return seen
+
+
+def seen_in_pose(
+    geometry: fits.Geometry, q_cam_to_pose: FloatArray, psf_sigma_px: float
+) -> SeenScreen:
+    """The part of the screen seen in a pose, to which a quaternion (4,) turns the cam frame."""
+    turned_axes = geometry.tracker.cam_to_image @ to_matrix(q_cam_to_pose)
+    tracker = replace(geometry.tracker, cam_to_image=turned_axes)
+    return SeenScreen(geometry.monitor, tracker, is_sure=True, psf_sigma_px=psf_sigma_px)
 
 
 def _too_few(data: fits.MatchedDots) -> InputError:
@@ -322,15 +329,20 @@ def calibrate_geometry(
         tracker_known=tracker_known,
     )
     _refuse_gaps(calibrated)
-    expected = calibrated.held_out_noise_arcsec
-    error = chosen.rms_arcsec
-    if error > max(MAX_MISFIT * expected, expected + MISFIT_FLOOR_ARCSEC):
-        raise MisfitError(
-            f"dots held out of the fit are {error:.3g} arcsec rms off, where the noise of the"
-            f" centroids makes {expected:.2g}: something moved between the frames, or the tracker's"
-            " flight model is wrong"
-        )
+    refuse_misfit(chosen.rms_arcsec, calibrated.held_out_noise_arcsec)
     return calibrated
+
+
+def refuse_misfit(error_arcsec: float, expected_arcsec: float) -> None:
+    """Refuse (MisfitError) dots that are farther off, rms, than the noise of their centroids is
+    expected to put them.
+    """
+    if error_arcsec > max(MAX_MISFIT * expected_arcsec, expected_arcsec + MISFIT_FLOOR_ARCSEC):
+        raise MisfitError(
+            f"dots held out of the fit are {error_arcsec:.3g} arcsec rms off, where the noise of"
+            f" the centroids makes {expected_arcsec:.2g}: something moved between the frames, or"
+            " the tracker's flight model is wrong"
+        )
 
 
 def bounded_to_field(problem: fits.Problem, fit: fits.Fit) -> fits.Fit:

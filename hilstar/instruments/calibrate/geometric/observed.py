@@ -234,11 +234,6 @@ def read_exposed(
         image = _picture(path, data, advice, resolution_px)
     if image.ndim != 2:
         raise InputError(f"{path}: is no grey image of one plane; {advice}")
-    if resolution_px is not None and (image.shape[1], image.shape[0]) != resolution_px:
-        sizes = "is {1} x {0} px, and [tracker] resolution_px is {2} x {3}".format(
-            *image.shape, *resolution_px
-        )
-        raise InputError(f"{path}: {sizes}; give whole images, or set the key")
     return np.asarray(image, dtype=np.float64), exposure_s
 
 

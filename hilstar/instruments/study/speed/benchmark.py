@@ -586,16 +586,21 @@ def run(
     if plan.exposures:
         result.tracker, without = tracker.tracker_rows(plan.exposures, plan.budget_s)
         result.skipped += without
-    size = plan.sizes[0]
-    if report.REFERENCE_PX in plan.sizes:
+    tell_starts(result, plan.sizes)
+    result.others_cores = round(others.cores(), 2)
+    result.aims += _aims(result)
+    return result
+
+
+def tell_starts(result: report.Result, sizes: Sequence[report.Size]) -> None:
+    """The medians of fresh processes at REFERENCE_PX, or at the first of sizes without it."""
+    size = sizes[0]
+    if report.REFERENCE_PX in sizes:
         size = report.REFERENCE_PX
     starts = [start for start in result.startup if start.size == size]
     for name in ("import_ms", "first_frame_ms", "memory_mb"):
         median = np.median([getattr(start, name) for start in starts])
         setattr(result, name, float(median))
-    result.others_cores = round(others.cores(), 2)
-    result.aims += _aims(result)
-    return result
 
 
 def own_bench_file(path: Path, size_px: report.Size, **render: Value) -> BenchFile:

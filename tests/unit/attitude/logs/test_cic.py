@@ -109,3 +109,12 @@ def test_several_segments_follow_each_other(cic_log):
     found = cic_log(WHOLE + second[second.index("META_START") :])
     assert [sample.discontinuity for sample in found.samples] == [False, False, True]
     assert np.diff([sample.t_ns for sample in found.samples])[1] == 86_400 * 10**9 - 10_250_000_000
+
+
+def test_each_segment_has_its_real_part_where_its_own_comment_has_it(cic_log):
+    """Read as the first's, the second's attitude is another one: w, x, y and z differ."""
+    w, x, y, z = ALNILAM.split()
+    second = cic_text([f"60311 0 {x} {y} {z} {w}"], comment="q1, q2, q3, q0 (real part)")
+    found = cic_log(WHOLE + second[second.index("META_START") :])
+    first, _, last = (sample.q_icrs_to_cam.tolist() for sample in found.samples)
+    assert first == last

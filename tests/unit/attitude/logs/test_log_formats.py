@@ -110,6 +110,14 @@ def test_a_format_of_another_package_is_read_written_and_named(tmp_path, package
         write_log(tmp_path / "c.txt", samples)
 
 
+def test_a_format_of_hilstar_s_is_tried_before_another_that_looks_as_close(package):
+    """Both have a magic number and nothing else to look at: which comes first is hilstar's."""
+    package("planetarium_log:FORMAT")
+    found = formats.log_formats()
+    names = [each.name for each in found if each.magic and each.begins is None]
+    assert names[-1] == "a planetarium's log" and len(names) > 1
+
+
 @pytest.mark.parametrize(
     "value", ["planetarium_log:read", "planetarium_log:MISSING", "no_such_module:FORMAT"]
 )

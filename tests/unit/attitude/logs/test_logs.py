@@ -204,3 +204,53 @@ def test_a_log_has_no_more_attitudes_than_memory_can_hold(tmp_path, monkeypatch)
         InputError, match=r"log.csv:5: more than 3 attitudes; split the log into several"
     ):
         read_log(path)
+
+
+@pytest.mark.parametrize(
+    ("second", "words", "is_dropout"),
+    [
+        ("0.0,1,0,0,0", "two attitudes have one time; write more of its digits", False),
+        ("0.5,0,0,0,0", ":3: ", True),
+        ("0.5,1,1,0,0", ":3: ", False),
+    ],
+)
+def test_what_follows_an_attitude_and_is_none_is_refused_with_its_line(
+    tmp_path, second, words, is_dropout
+):
+    path = tmp_path / "log.csv"
+    path.write_text(f"t_s,qw,qx,qy,qz\n0.0,0,1,0,0\n{second}\n1.0,1,0,0,0\n")
+    line = refusal(read_log, path)
+    assert words in line
+    assert (logs.DROPOUT in line) is is_dropout
+
+
+def starting_at(first_ns):
+    turn = np.array([1.0, 0.0, 0.0, 0.0])
+    return [AttitudeSample(first_ns + k * 10**9, turn) for k in range(3)]
+
+
+@pytest.mark.parametrize(
+    ("text", "t_ns"),
+    [
+        (None, 0),
+        ("0.25", 250_000_000),
+        ("2", 2_000_000_000),
+        ("2024-01-01T00:00:01.5", 1_500_000_000),
+    ],
+)
+def test_a_time_is_in_seconds_from_the_log_s_begin_or_a_date(tmp_path, text, t_ns):
+    first_ns = 1_704_067_200 * 10**9
+    assert logs.time_in_log(tmp_path, starting_at(first_ns), text) == first_ns + t_ns
+
+
+@pytest.mark.parametrize(
+    ("first_ns", "text", "words"),
+    [
+        (10**9, "2.1", "is 2 s long, and its times are no dates; write"),
+        (1_704_067_200 * 10**9, "-0.1", "is 2 s long, from 2024-01-01T00:00:00"),
+        (1_704_067_200 * 10**9, "nan", "--time nan: "),
+        (1_704_067_200 * 10**9, "noon", "--time noon: "),
+    ],
+)
+def test_a_time_beyond_a_log_is_refused_with_its_span(tmp_path, first_ns, text, words):
+    assert words in refusal(logs.time_in_log, tmp_path, starting_at(first_ns), text)

@@ -18,13 +18,14 @@ import pytest
 
 from hilstar.attitude.wire.apart import (
     ReaderProcess,
+    ReadOrder,
     Record,
     RecordStream,
     pack,
     process_state,
     why_hung,
 )
-from hilstar.attitude.wire.apart_child import Wire, _ForwardedNotices, as_read
+from hilstar.attitude.wire.apart_child import Wire, _ForwardedNotices, _Reading, as_read
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
 from hilstar.attitude.wire.roads import ANSWERS, MAX_READ_BYTES, ByteRoad, RawMessage
@@ -232,6 +233,61 @@ def test_a_file_that_cannot_be_read_any_more_is_told_while_that_lasts(tmp_path, 
         path.unlink(missing_ok=True)
         path.write_bytes(b"two")
         assert taken(link) == b"two" and link.trouble == ""
+
+
+def test_a_file_is_read_from_its_end_on_and_from_its_beginning_once_it_was_cut(tmp_path):
+    path = tmp_path / "t.bin"
+    path.write_bytes(b"before")
+    with FileRoad(path, ANSWERS, Notices(), FakeClock()) as link, path.open("ab", 0) as growing:
+        assert taken(link) == b""
+        growing.write(b"one")
+        assert taken(link) == b"one"
+        os.truncate(path, 0)
+        growing.write(b"two")
+        assert taken(link) == b"two"
+        growing.write(b"three")
+        assert taken(link) == b"three"
+
+
+def test_a_device_s_bytes_that_wait_already_may_have_come_at_any_time():
+    """Those that come later came after the last look that found none."""
+    clock = FakeClock()
+    here, there = socket.socketpair()
+    reading, writing = os.pipe()
+    stream = RecordStream()
+
+    def handed_over() -> RawMessage:
+        under_way.hand_over(under_way.link)
+        (record,) = stream.feed(here.recv(1 << 16))
+        assert record.order == 3
+        return record.message
+
+    with here, there:
+        under_way = _Reading(Wire(there, clock), ReadOrder(3, device=True), reading, clock)
+        os.write(writing, b"one")
+        clock.sleep(1.0)
+        first = handed_over()
+        assert (first.parts, first.empty_ns, first.timely) == ([b"one"], 0, False)
+        looked_ns = clock.now_ns()
+        under_way.hand_over(under_way.link)
+        os.write(writing, b"two")
+        clock.sleep(1.0)
+        second = handed_over()
+        assert looked_ns <= second.empty_ns < clock.now_ns() - 500_000_000
+        under_way.close()
+    os.close(writing)
+
+
+def test_a_sign_of_life_is_given_each_tenth_of_a_second():
+    clock = FakeClock()
+    here, there = socket.socketpair()
+    stream = RecordStream()
+    with here, there:
+        wire = Wire(there, clock)
+        for _ in range(100):
+            wire.sign()
+            clock.sleep(0.01)
+        assert len(list(stream.feed(here.recv(1 << 16)))) == pytest.approx(10, abs=1)
 
 
 def test_a_file_that_comes_back_is_no_trouble_any_more(tmp_path):
@@ -476,6 +532,36 @@ def test_what_another_order_brought_is_passed_over():
             theirs.sendall(pack(Record(order, RawMessage(order, [b"%d" % order]))))
         assert [record.order for record in reader.take()] == [2, 2]
         reader._wire = None
+    reader.close()
+
+
+def test_the_time_in_which_this_process_was_stopped_is_no_silence_of_the_reader(monkeypatch):
+    """A minute counts as a tenth of a second; four more in which it says nothing are too many."""
+    clock, notices = FakeClock(), Notices()
+    reader = ReaderProcess(notices, module="__hello__", clock=clock)
+    monkeypatch.setattr(reader, "_state", lambda: ("S", 0.0))
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        assert reader._wire is not None
+        reader._wire.close()
+        reader._wire = ours
+        theirs.sendall(pack(Record()))
+        assert reader.wait(1000) and reader.take() == []  # a sign of life
+        clock.sleep(60.0)
+        assert not reader.wait(0) and reader.trouble == ""
+        for _ in range(3):
+            clock.sleep(0.1)
+            reader.wait(0)
+        assert notices.counts() == {}
+        theirs.sendall(pack(Record()))  # what it says ends a silence
+        assert reader.wait(1000) and reader.take() == []
+        for _ in range(4):
+            clock.sleep(0.1)
+            reader.wait(0)
+        assert notices.counts() == {}
+        clock.sleep(0.1)
+        reader.wait(0)
+        assert notices.counts() == {"receiver-failed": 1}
     reader.close()
 
 

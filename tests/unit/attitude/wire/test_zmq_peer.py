@@ -10,8 +10,10 @@ import pytest
 import zmq
 
 from hilstar.attitude.wire import zmq_peer as zmq_peer_module
+from hilstar.attitude.wire.roads import LinkCounts
 from hilstar.attitude.wire.zmq_links import ZmqApart, ZmqReceiver
 from hilstar.attitude.wire.zmq_peer import PeerLook, answer_of, peer_trouble
+from hilstar.attitude.wire.zmq_socket import CLIENT_REJECTED, WRONG_PEER, trouble_of
 from hilstar.basics.notices import Notices
 from tests.support.fake_clock import FakeClock
 from tests.support.waiting import wait_for
@@ -224,3 +226,20 @@ def test_a_socket_in_the_file_system_is_asked_as_a_port_is(tmp_path):
         assert peer_trouble(PLACE, answer, "SUB", False) == ""
         assert "a PUB socket is there, and ours is REP" in peer_trouble(PLACE, answer, "REP", False)
     assert answer_of(f"ipc://{tmp_path}/none", 1.0) is None
+
+
+@pytest.mark.parametrize(
+    ("connections", "rejected", "said", "trouble"),
+    [
+        (0, 0, WRONG_PEER, "why"),  # what we connect to is another socket, and none was made
+        (1, 1, WRONG_PEER, ""),
+        (2, 2, CLIENT_REJECTED, "why"),  # to what we bind: all that came were rejected
+        (2, 1, CLIENT_REJECTED, ""),
+        (0, 0, "flood", ""),
+    ],
+)
+def test_a_socket_without_a_partner_says_why(connections, rejected, said, trouble):
+    notices = Notices()
+    notices.tell(said, "why")
+    counts = LinkCounts(connections=connections, rejected=rejected)
+    assert trouble_of(counts, notices) == trouble

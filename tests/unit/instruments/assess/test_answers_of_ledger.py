@@ -29,8 +29,9 @@ from hilstar.instruments.assess.budget import Axes
 from hilstar.optics.glass.psf_file import glass_of, write_glass
 from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.record.commanded_run import read_commanded
 from hilstar.server.record.ledger_records import AnswerRecord
-from tests.support.assessments import a_budget, a_run, an_assessment
+from tests.support.assessments import RIGHT, VALID, a_budget, a_run, an_assessment
 from tests.support.benches import bench_text
 from tests.support.glass import SIDE_PX, stack
 from tests.support.planted_run import NS_PER_S, write_ledger, write_run, write_telemetry
@@ -101,6 +102,32 @@ def test_answers_without_stamps_are_where_the_run_placed_them(tmp_path: Path) ->
     by_arrival = read_answers(ledger_of(tmp_path, [record(at) for at in at_ns]), "arrival")
     assert by_arrival.telemetry.t_ns.tolist() == [at + LIGHT_NS for at in at_ns]
     assert by_arrival.stamp == "middle"
+
+
+def test_answers_that_came_after_a_later_one_are_counted_each(tmp_path: Path) -> None:
+    """Stamps of 1, 4, 2, 3 and 5 s: two were overtaken by the second."""
+    at_ns = [NS_PER_S * k for k in (1, 4, 2, 3, 5)]
+    records = [record(at, host_ns=9 * NS_PER_S + k) for k, at in enumerate(at_ns)]
+    assert read_answers(ledger_of(tmp_path, records), "middle").out_of_order == 2
+
+
+# Eleven answers to a block, 200 s apart: a drift of 1e-3 is 2.2 s from one block to the next, a step
+# is one beyond 1 s and twice that.
+@pytest.mark.parametrize(
+    ("drift", "step_s", "is_set"),
+    [
+        (1e-3, 0.0, False),
+        (-1e-3, 0.0, False),
+        (1.9e-3, 0.0, False),
+        (0.0, 6.0, True),
+        (0, -6, True),
+    ],
+)
+def test_blocks_that_are_long_apart_may_drift_as_far(drift, step_s, is_set) -> None:
+    host_ns = 200 * NS_PER_S * np.arange(33)
+    t_ns = host_ns + np.rint(drift * host_ns).astype(np.int64)
+    t_ns[11:] += round(step_s * NS_PER_S)
+    assert assessment._clock_was_set(t_ns, host_ns) is is_set
 
 
 @pytest.mark.parametrize(("step_s", "is_set"), [(0.0, False), (0.2, False), (5.0, True)])
@@ -291,3 +318,67 @@ def test_a_file_s_times_count_from_the_run_s_zero_where_they_meet_it(
     middle_s = run.config.tracker.exposure_s / 2 - 0.25
     expected = planted.tau_s + ahead_s - timed.base_s + middle_s
     assert timed.tau_s == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_moment_within_an_exposure_and_a_refresh_of_a_held_frame_is_held(tmp_path: Path) -> None:
+    """An exposure of 0.3 s on a display of 10 Hz: 0.25 s before the missed frames, and after them."""
+    frames_s = np.arange(0.0, 10.0, 0.1)
+    frames_s = frames_s[(frames_s < 3.95) | (frames_s > 4.45)]
+    missed = [0] * len(frames_s)
+    missed[40] = 5
+    q = scalar_first(attitude(scan, frames_s))
+    text = bench_text({"tracker": {"exposure_s": 0.3}, "monitor": {"refresh_hz": 10.0}})
+    path = write_ledger(
+        tmp_path / "run.mcap", frames_s, q, start_ns=0, bench=text, missed_before=missed
+    )
+    run = read_ledger(path)
+    ((begin_s, end_s),) = read_commanded(path).commanded.held_s.tolist()
+    reach_s = 0.3 / 2 + 0.1
+    ends_s = np.repeat([begin_s - reach_s, end_s + reach_s], 2)
+    moments_s = ends_s + np.tile([-1e-3, 1e-3], 2)
+    assert (run.commanded.at(moments_s).held_s > 0).tolist() == [False, True, True, False]
+
+
+def test_answers_at_held_frames_came_and_were_not_wrong() -> None:
+    """Of twelve rows the valid ones are numbered among themselves: the eighth of these is right,
+    the sixth was held, the fourth is wrong.
+    """
+    valid = np.flatnonzero(VALID)
+    right, wrong = assessment._right_and_wrong(a_budget(), valid, len(VALID))
+    assert np.flatnonzero(right).tolist() == sorted([*valid[RIGHT].tolist(), int(valid[5])])
+    assert np.flatnonzero(wrong).tolist() == [valid[3]]
+
+
+def test_a_cube_s_doubt_is_half_of_the_bias_s_interval(monkeypatch) -> None:
+    told = []
+    monkeypatch.setattr(assessment, "cube_to_boresight", lambda *given: told.append(given))
+    found = a_budget()
+    assessment._cube_of("file", "certificate", found)  # type: ignore[arg-type]
+    ((file, certificate, turned),) = told
+    assert (file, certificate) == ("file", "certificate")
+    assert turned.bias_arcsec.tolist() == [-3.0, 4.0, -11.0]
+    assert turned.half_arcsec.tolist() == [0.5, 0.75, 2.0]
+
+
+@pytest.mark.parametrize(
+    ("lasting_arcsec", "told_arcsec"), [(0.0, None), (0.35, None), (0.45, 0.38), (0.9, 0.85)]
+)
+def test_noise_that_lasts_counts_beyond_what_white_noise_leaves_in_a_mean(
+    lasting_arcsec, told_arcsec
+) -> None:
+    """Of one arcsec from answer to answer a mean of twenty has a twentieth of the variance."""
+    blocks = 40
+    alone = np.tile([1.0, -1.0], 10 * blocks)
+    lasting = np.repeat(np.tile([1.0, -1.0], blocks // 2), 20) * lasting_arcsec
+    left = (alone + lasting)[:, None] * np.ones(3)
+    found = a_budget()
+    variance = np.full(3, 1 + lasting_arcsec**2)
+    components = replace(found.components, left=left, noise_variance=variance)
+    timed = TimedAnswers(Path("x.csv"), an_assessment().telemetry, np.zeros(1), 0.0)
+    notes = assessment._notes(a_run(), replace(found, components=components), timed)
+    slow = [note for note in notes if "the noise is not white" in note]
+    assert len(slow) == (told_arcsec is not None)
+    if told_arcsec is not None:
+        assert (
+            f"{told_arcsec:.2g} arcsec across the boresight and {told_arcsec:.2g} about" in slow[0]
+        )

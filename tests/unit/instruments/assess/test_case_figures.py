@@ -155,6 +155,11 @@ def test_a_slew_of_one_sense_and_rest_are_no_slews_of_both_signs(rng: np.random.
     with pytest.raises(TooFewCases, match="slews of both signs") as few:
         stamp(rates, rng)
     assert few.value.cases == 20
+    # two senses, each about its own axis
+    across = np.zeros((20, 3))
+    across[::2, 0], across[1::2, 1] = 0.5, -0.5
+    with pytest.raises(TooFewCases, match="slews of both signs"):
+        stamp(across, rng)
     rates[::4, 1] = -0.5
     assert stamp(rates, rng).high < 0.01
     # about the boresight alone it shows in no place of a star

@@ -11,9 +11,11 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess.clock import (
     CUT_SIGMAS,
+    DRIFT_PRIOR,
     FLOOR_ARCSEC,
     ClockFit,
     ClockSolver,
+    CoarseClock,
     _correlation,
     coarse_offset,
     honest,
@@ -74,6 +76,11 @@ def test_a_clock_s_offset_drift_and_bias_come_out_with_their_signs(offset_s, dri
     assert bias == pytest.approx(BIAS_ARCSEC, abs=EXACT_ARCSEC)
     assert np.abs(found.residual_arcsec[found.used]).max() < EXACT_ARCSEC
     assert found.offset_told and found.drift_told
+    tau_s, _ = telemetry(offset_s, drift)
+    assert found.run_s(tau_s, START_S) == pytest.approx(found.t_s, abs=1e-9)
+    assert found.run_s(np.array([START_S + offset_s]), START_S) == pytest.approx(
+        [START_S], abs=1e-5
+    )
 
 
 def test_the_sigmas_of_a_clock_are_those_of_least_squares(rng):
@@ -193,3 +200,46 @@ def test_speeds_that_mirror_each_other_or_hardly_overlap_tell_nothing(bins, fewe
     common = bins - np.abs(lag)
     assert not alike[common < fewest].any()
     assert alike[(common >= fewest) & (common < 2 * fewest)].any()
+
+
+def test_a_drift_that_hardly_shows_is_drawn_to_none(rng):
+    """Noise of 5 arcsec in slews of 5 arcsec/s tells a drift as badly as none is known."""
+
+    def slow(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        turn = 2 * np.pi * (t_s - START_S)
+        wide_deg = 5 / 3600 * 10 / (2 * np.pi)
+        return 84 + wide_deg * np.sin(turn / 10), wide_deg * np.cos(turn / 10), 0 * t_s
+
+    run = Commanded(RUN_S, scalar_first(attitude(slow, RUN_S)))
+    t_s = START_S + np.arange(1.0, SECONDS - 1.0, ANSWER_S)
+    error = 5.0 * rng.standard_normal((len(t_s), 3)) / ARCSEC_PER_RAD
+    q = scalar_first(Rotation.from_rotvec(error) * attitude(slow, t_s))
+    coarse = CoarseClock(0.0, 1e-4, np.array([1.0, 0.0, 0.0, 0.0]), len(t_s))
+    found = ClockSolver(run, t_s, q, SCALE).fit(coarse)
+    assert not found.drift_told
+    # what is known beforehand and what shows together are better than either
+    assert 0.3 * DRIFT_PRIOR < found.sigma_drift < DRIFT_PRIOR
+    assert abs(found.drift) < 3 * DRIFT_PRIOR
+
+
+@pytest.mark.parametrize(("begun", "bins", "lag"), [(300, 50, -300), (20, 60, -20)])
+def test_a_lag_is_where_the_longer_recording_began_before_the_shorter(begun, bins, lag, rng):
+    """A piece of 400 bins, that begins so many after them; and the other way round."""
+    whole = rng.uniform(0.5, 1.5, 400)
+    part = whole[begun : begun + bins]
+    for a, b, wanted in ((part, whole, lag), (whole, part, -lag)):
+        information, lags = _correlation(a, b)
+        assert lags[np.argmax(information)] == wanted
+
+
+def test_telemetry_that_began_before_a_steady_slew_is_found_by_its_attitudes():
+    """Angular speeds are all alike, and so is the turn between attitudes at any other offset."""
+    turn_rad = np.radians(1.0) * (RUN_S - START_S)
+    run = Commanded(RUN_S, scalar_first(Rotation.from_rotvec(turn_rad[:, None] * [0, 0, 1])))
+    t_s = np.arange(0.0, SECONDS, ANSWER_S)
+    shown_rad = np.radians(1.0) * (t_s - 10.0)
+    q = scalar_first(Rotation.from_rotvec(shown_rad[:, None] * [0, 0, 1]))
+    coarse = coarse_offset(run, t_s, q)
+    assert coarse is not None
+    assert coarse.offset_s == pytest.approx(START_S - 10.0, abs=0.5)
+    assert coarse.turn_rad < np.radians(0.5)

@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilstar.instruments.assess.components import EDGES, LOCAL, _component, components_of
+from hilstar.instruments.assess.components import (
+    EDGES,
+    LOCAL,
+    SOUGHT,
+    Phases,
+    _best_of,
+    _component,
+    components_of,
+)
 from tests.support.claims import holds
 from tests.support.planted_tracker import SCALE, attitude, scalar_first, scan, star_px, waves
 
@@ -134,3 +142,25 @@ def test_fields_on_two_sides_of_the_sky_have_phases_of_their_own() -> None:
     whole = found.pixel.variance + found.fov.variance + found.noise_variance
     # 2400 answers know a variance to 3 %, and errors that noise adds to by chance to as much
     assert whole == pytest.approx((error**2).mean(axis=0) + 1, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("chances", "known", "sought"), [(3, False, False), (9, True, False), (18, True, True)]
+)
+def test_a_direction_that_was_sought_has_to_explain_more_than_one_that_is_known(
+    chances, known, sought
+):
+    """A wave whose power is so many times the scatter of noise's own, the root of six times twelve
+    harmonics: six and twelve are sure.
+    """
+    rng = np.random.default_rng(12)
+    count = 900
+    place_px = rng.uniform(0, 50, (count, 2))
+    wave = np.sin(2 * np.pi * place_px[:, 0])
+    about = rng.standard_normal((count, 3))
+    about[:, 0] += np.sqrt(2 * chances * np.sqrt(6 * 12) / count) * wave
+    for name, is_found in (("the phase of a test", known), (SOUGHT, sought)):
+        waves_found, component, best = _best_of([Phases(name, place_px)], about, 0.0)
+        assert (waves_found is not None) is is_found
+        assert (best is not None and best.name == name) is is_found
+        assert component.detail == (name if is_found else "")

@@ -20,7 +20,7 @@ from hilstar.instruments.assess.look_alikes import (
     slow_variance,
     turns_of,
 )
-from hilstar.instruments.assess.places import Projector
+from hilstar.instruments.assess.places import Projector, Scale, places_of
 from tests.support.assessments import a_clock
 from tools.interval_coverage import KINDS
 
@@ -157,14 +157,16 @@ def test_a_field_s_error_that_goes_with_the_rate_may_all_be_the_clock_s(clock_si
 def test_a_clock_is_no_better_known_than_its_fit_and_what_looks_like_it_say():
     """Offset, drift and bias, each where the one and where the other is the larger."""
     fit = a_clock()  # known to 0.1 ms, 2 ppm and an arcsec
-    turn = np.tile([[3e4, 0.0], [0.0, 0.0], [0.0, 4e5]], (5, 1, 1))
+    mean = np.array([[3e4, 1e6], [0.0, 0.0], [-1e4, 4e5]])
+    turn = mean + np.array([-2.0, -1.0, 0.0, 1.0, 2.0])[:, None, None] * [1e3, 1e4]
     for offset_s, drift in ((1e-5, 5e-6), (4e-4, 1e-6)):
-        look_alikes = LookAlikes(turn, np.diag([offset_s**2, drift**2]), np.zeros(3))
-        found = _beside_field(fit, look_alikes)
-        assert found.sigma_offset_s == max(offset_s, 1e-4)
-        assert found.sigma_drift == max(drift, 2e-6)
-        of_clock = [3e4 * offset_s, 0.0, 4e5 * drift]
-        assert found.sigma_bias_arcsec == pytest.approx(np.hypot(1.0, of_clock))
+        together = 0.5 * offset_s * drift
+        covariance = np.array([[offset_s**2, together], [together, drift**2]])
+        found = _beside_field(fit, LookAlikes(turn, covariance, np.zeros(3)))
+        assert found.sigma_offset_s == pytest.approx(max(offset_s, 1e-4))
+        assert found.sigma_drift == pytest.approx(max(drift, 2e-6))
+        of_clock = np.diag(mean @ covariance @ mean.T)
+        assert found.sigma_bias_arcsec == pytest.approx(np.sqrt(1 + of_clock))
         assert found.offset_s == fit.offset_s
 
 
@@ -195,3 +197,36 @@ def test_a_pixel_error_is_noise_beside_a_clock(rng: np.random.Generator) -> None
     # stretches of the run may widen it by chance
     assert both / 1.3 < of_middle < 2.25 * both
     assert not look_alikes.slow_variance.any()
+
+
+def test_errors_that_last_widen_a_clock_s_sigma_by_how_stretches_differ(rng: np.random.Generator):
+    """Errors that are the same over each fortieth of a run, along the turn: as of forty answers."""
+    rate_rad_s = np.zeros((ANSWERS, 3))
+    rate_rad_s[:, 0] = 1e-3 * np.tile([1.0, -1.0], ANSWERS // 2)
+    turn = turns_of(rate_rad_s, swing())
+    own = np.repeat(rng.choice([-1.0, 1.0], 40), ANSWERS // 40)
+    left = np.zeros((ANSWERS, 3))
+    left[:, 0] = own * np.tile([1.0, -1.0], ANSWERS // 2)
+    left[:, 1:] = rng.standard_normal((ANSWERS, 2))
+    known = clock_covariance(turn, None, left, WIDE_ARCSEC2, np.array([10.0, 1e-12]))
+    white_s = 1 / (ARCSEC_PER_RAD * 1e-3 * np.sqrt(ANSWERS))
+    assert np.sqrt(known[0, 0]) == pytest.approx(white_s * np.sqrt(ANSWERS / 40), rel=0.02)
+
+
+def test_a_place_moves_as_far_as_the_field_does_on_the_detector():
+    """On 1200 by 700 pixels a star is usually 0.3 of 700 from the boresight: a roll moves it by so
+    much of an arc.
+    """
+    scale = Scale(5000.0, (1200, 700))
+    assert scale.roll_px == pytest.approx(210.0)
+    assert scale.pixel_arcsec == pytest.approx(41.253, abs=1e-3)
+    angle_rad = 1e-3
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    rolled = np.array([[cosine, sine, 0.0], [-sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    panned = np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+    tipped = np.array([[1.0, 0.0, 0.0], [0.0, cosine, sine], [0.0, -sine, cosine]])
+    start, *moved = places_of(np.stack([np.eye(3), rolled, panned, tipped]), 5000.0, scale.roll_px)
+    assert start.tolist() == [0.0, 0.0, 5000.0, 210.0, 0.0, 0.0]
+    # of an x axis that goes along with a turn about y, and not with one about itself
+    distance_px = [float(np.linalg.norm(place - start)) for place in moved]
+    assert distance_px == pytest.approx([0.21, np.hypot(5.0, 0.21), 5.0], rel=1e-4)

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from hilstar.basics.arrays import FloatArray, IntArray
-from hilstar.instruments.assess.bounded_figures import TooFewCases
+from hilstar.instruments.assess.bounded_figures import TooFewCases, clopper_pearson
+from hilstar.instruments.assess.star_drawing import _detection
 from hilstar.instruments.assess.star_figures import (
     DetectionBins,
     StarTable,
@@ -161,3 +162,19 @@ def test_a_colour_is_told_beside_a_signal_that_bends_with_the_light(colour, rng)
     # 0.02 mag over a colour's own 0.1 and the root of 600
     assert figure.value == pytest.approx(colour, abs=4 * 0.2 / math.sqrt(count))
     assert (figure.low > 0) == (colour > 0)
+
+
+def test_detection_is_drawn_in_the_middles_of_twelve_bins_from_the_brightest_star(rng):
+    """Four stars in each of the bins of half a magnitude but the fourth; the faintest is the last."""
+    v_mag = np.concatenate([np.repeat(2.1 + 0.5 * np.arange(12), 4), [2.0, 8.0]])
+    v_mag = v_mag[(v_mag < 3.5) | (v_mag > 4.0)]
+    offsets_px = np.where(v_mag < 5.0, 0.0, np.nan) * np.ones((2, 1))
+    stars = table(np.arange(len(v_mag)), places_in(len(v_mag), rng), offsets_px, v_mag)
+    drawn = np.array(list(_detection(stars)))
+    middles = 2.25 + 0.5 * np.delete(np.arange(12), 3)
+    assert drawn[:, 0] == pytest.approx(middles, abs=1e-5)
+    assert drawn[:, 1].tolist() == (middles < 5.0).astype(float).tolist()
+    low, high = clopper_pearson(5, 5, 0.975)
+    assert drawn[0, 2:] == pytest.approx([1 - low, high - 1])
+    low, high = clopper_pearson(0, 4, 0.975)
+    assert drawn[-2, 2:] == pytest.approx([0 - low, high])

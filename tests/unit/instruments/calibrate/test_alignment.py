@@ -22,15 +22,18 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
-from hilstar.display.geometry import monitor_camera
+from hilstar.display.geometry import load_notes, monitor_camera
 from hilstar.instruments.calibrate.alignment import (
     AxesArcsec,
     Residual,
     align,
     corrected,
     groups_of,
+    lines_of,
     remarks_of,
     residual_of,
+    summary_of,
+    write_alignment,
 )
 from hilstar.instruments.calibrate.attitude_pairs import (
     COMMANDED,
@@ -199,6 +202,17 @@ def test_a_late_clock_is_named_with_its_offset(rng):
     assert float(cause.split()[3]) == pytest.approx(0.05, abs=0.002)
 
 
+def test_a_late_clock_is_named_whichever_way_the_tracker_is_turned(rng):
+    """Rates are about the axes of what was commanded, a third of a turn from the tracker's."""
+    commanded = commanded_of(rng, 60)
+    rate = rng.normal(size=(60, 3)) * np.radians(1.0)
+    late = multiply(from_rotation_vectors(-rate * 0.05), commanded)
+    turn = from_rotation_vector(np.array([0.0, 0.0, 2 * np.pi / 3]))
+    found = align(pairs_of(commanded, multiply(turn, late), rate), CAMERA)
+    (cause,) = found.residual.causes
+    assert float(cause.split()[3]) == pytest.approx(0.05, rel=1e-6)
+
+
 def wild_half(rng: np.random.Generator, reported: np.ndarray) -> np.ndarray:
     return np.concatenate([commanded_of(rng, 20), reported[20:]])
 
@@ -352,3 +366,39 @@ def test_what_a_rotation_does_not_explain_is_said_across_and_about_the_boresight
     assert cause == "a cause"
     explained = Residual(some, some, AxesArcsec(0.0, 0.0), 8, ())
     assert remarks_of(SimpleNamespace(residual=explained)) == ()
+
+
+@pytest.mark.parametrize("skipped", [0, 6])
+def test_an_alignment_s_figures_are_alike_in_lines_summary_and_file(tmp_path, rng, skipped):
+    commanded = np.repeat(commanded_of(rng, 12), 2, axis=0)
+    reported = turned_by(rng, commanded)
+    reported[5] = commanded_of(rng, 1)[0]
+    found = align(replace(pairs_of(commanded, reported), skipped=skipped), CAMERA)
+    summary = summary_of(found)
+    counts = [summary[name] for name in ("pairs", "used", "wild", "skipped", "attitudes")]
+    assert counts == [24, 23, 1, skipped, 12]
+    assert summary["wild_rows"] == (7,)
+    lines = {line[:24].strip(): line[24:] for line in lines_of(found)}
+    text = "\n".join(lines_of(found))
+    assert "23 of 24 used, of 12 attitudes" in text
+    assert (f", {skipped} skipped" in text) == (skipped > 0)
+    assert "1, on lines 7" in text
+    x, y, z = summary["rotation_arcsec"]
+    of_x, of_y, of_z = summary["sigma_arcsec"]
+    assert f"x {x:.2f} +- {of_x:.2f}, y {y:.2f} +- {of_y:.2f}" in text
+    assert f"about the boresight {z:.2f} +- {of_z:.2f} arcsec" in text
+    assert lines
+    file = SimpleNamespace(config=SimpleNamespace(collimator=SimpleNamespace(geometry=None)))
+    path = tmp_path / "geometry.toml"
+    write_alignment(path, found, file)
+    notes = load_notes(path)
+    for name, sigma in zip("xyz", summary["sigma_arcsec"], strict=True):
+        assert notes.sigma[f"rotation_{name}_arcsec"] == pytest.approx(sigma, rel=1e-5)
+    assert notes.made.rotation_arcsec == pytest.approx((x, y, z), rel=1e-6)
+    assert (notes.made.pairs, notes.made.pairs_used, notes.made.wild_rows) == (24, 23, [7])
+    residual = summary["residual_arcsec"]
+    assert notes.error.alignment_cross_arcsec == pytest.approx(residual["cross"])
+    assert notes.error.alignment_roll_arcsec == pytest.approx(residual["roll"])
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(notes.error.alignment_covariance_arcsec2)), summary["sigma_arcsec"]
+    )

@@ -9,6 +9,7 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -35,6 +36,7 @@ from hilstar.instruments.calibrate.geometric.dots import (
 from hilstar.instruments.calibrate.geometric.fit import MatchedDots, Nominal
 from hilstar.instruments.calibrate.geometric.geometry_fit import calibrate_files
 from hilstar.instruments.calibrate.geometric.match import (
+    _middle_places,
     _nearest,
     _refuse_orientation,
     decode,
@@ -434,3 +436,12 @@ def test_a_dot_at_two_places_is_refused_whichever_axis_it_moves_along(tmp_path, 
     plan = tmp_path / "plan.csv"
     plan.write_text(f"frame,dot,x_px,y_px\n0,3,10,20\n1,3,10,20\n2,3,{place}\n")
     assert refusal(read_plan, plan).startswith(f"{plan}: dot 3 is at two places")
+
+
+def test_poses_are_told_by_places_over_the_middle_of_the_dots():
+    """Dots over 100 to 600 px and 40 to 90 px: four columns and rows over the middle 60 %."""
+    plan = SimpleNamespace(x_px=np.array([600.0, 100, 300]), y_px=np.array([40.0, 80, 90]))
+    x_px, y_px = _middle_places(plan)
+    assert sorted({round(x, 6) for x in x_px.tolist()}) == [200, 300, 400, 500]
+    assert sorted({round(y, 6) for y in y_px.tolist()}) == [50, 60, 70, 80]
+    assert len(x_px) == 16

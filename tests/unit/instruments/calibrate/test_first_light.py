@@ -4,7 +4,10 @@ command.
 
 from __future__ import annotations
 
+import math
 import sys
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,6 +26,8 @@ from hilstar.instruments.calibrate.first_light.geometry import (
     UPRIGHT,
     WAYS,
     ScreenMounting,
+    SquaresAlike,
+    _is_oblique,
     corrected,
     figure_for,
     keys_of_ways,
@@ -104,6 +109,74 @@ def test_the_figure_tells_each_way_round_and_the_mounting_that_mends_it(way):
         # leaves the identity.
         optics = np.array(way).reshape(2, 2) @ np.linalg.inv(mounting.matrix)
         assert np.allclose(optics @ corrected(mounting, way).matrix, np.eye(2))
+
+
+# two of the monitor's pixels to one of the tracker's
+COARSE = BenchGeometry(
+    GEOMETRY.monitor,
+    monitor_camera((400, 300), 13, 13 * GEOMETRY.monitor.focal_length_px / 2000, NO_TURN),
+)
+
+
+def figure_image(figure, seen_as: np.ndarray, lights=(9.0, 4.0, 1.0)) -> np.ndarray:
+    """The figure's squares as Gaussians of a sigma of 2 px in COARSE's tracker, their places about
+    its middle multiplied by a matrix.
+    """
+    image = np.random.default_rng(4).normal(0, 1.0, (300, 400))
+    y, x = np.mgrid[:300, :400]
+    for *place, light in zip(figure.x_px, figure.y_px, lights, strict=True):
+        right, down = seen_as @ (np.array(place) - [319.5, 239.5]) / 2
+        far2 = (x - 199.5 - right) ** 2 + (y - 149.5 - down) ** 2
+        image += 1000 * light * np.exp(-far2 / 8)
+    return image
+
+
+def test_a_figure_tells_focal_length_and_turn_and_how_sure_that_is():
+    figure = figure_for(COARSE)
+    cos, sin = math.cos(math.radians(-20)), math.sin(math.radians(-20))
+    larger = 1.1 * np.array([[cos, -sin], [sin, cos]])
+    seen = see_figure(figure_image(figure, larger), figure, COARSE)
+    assert seen.scale == pytest.approx(1.1, rel=1e-3)
+    assert seen.focal_length_px == pytest.approx(COARSE.monitor.focal_length_px / 1.1, rel=1e-3)
+    assert seen.turn_deg == pytest.approx(-20.0, abs=0.05)
+    # a tenth of a pixel over the figure's side, 2 * 120 px of the monitor and 120 of the tracker's
+    assert figure.reach_px == 120
+    assert seen.turn_error_deg == pytest.approx(math.degrees(0.1 / 120), rel=0.1)
+
+
+@pytest.mark.parametrize("seen_as", [np.diag([1.4, 1.0]), np.diag([1.0, 1.4])])
+def test_a_figure_that_is_longer_one_way_is_no_square(seen_as):
+    figure = figure_for(COARSE)
+    words = refusal(see_figure, figure_image(figure, seen_as), figure, COARSE)
+    assert "1.40 times as long one way as the other" in words
+
+
+@pytest.mark.parametrize("lights", [(9.0, 4.0, 4.0), (9.0, 9.0, 1.0)])
+def test_two_squares_of_one_light_are_not_told_apart(lights):
+    figure = figure_for(COARSE)
+    with pytest.raises(SquaresAlike, match="cannot be told apart"):
+        see_figure(figure_image(figure, np.eye(2), lights), figure, COARSE)
+
+
+@pytest.mark.parametrize("off_px", [(0, 110), (0, 130), (0, -130), (150, 0), (170, 0), (-170, 0)])
+def test_a_figure_is_where_the_tracker_looks_unless_that_is_a_quarter_of_the_screen_off(off_px):
+    """Of 640 x 480 px: 160 and 120."""
+    middle = np.array([319.5, 239.5])
+    axis_px = middle + off_px
+    monitor = replace(GEOMETRY.monitor, principal_point_px=tuple(axis_px.tolist()))
+    figure = figure_for(BenchGeometry(monitor, GEOMETRY.tracker))
+    is_near = abs(off_px[0]) < 160 and abs(off_px[1]) < 120
+    # the corner is at one end of both sides, the others are at the other end of one
+    found = (
+        np.ptp(figure.x_px) / 2 + figure.x_px.min(),
+        np.ptp(figure.y_px) / 2 + figure.y_px.min(),
+    )
+    assert found == pytest.approx(axis_px if is_near else middle, abs=1.0)
+
+
+@pytest.mark.parametrize(("turn_deg", "is_oblique"), [(41, 1), (-41, 1), (39, 0), (-39, 0)])
+def test_a_figure_is_oblique_turned_either_way(turn_deg, is_oblique):
+    assert _is_oblique((SimpleNamespace(turn_deg=turn_deg), None)) == is_oblique
 
 
 @pytest.mark.parametrize("key", keys_of_ways())
@@ -266,6 +339,7 @@ def test_a_command_is_told_the_exposure_and_must_write_a_new_image(tmp_path):
             "no camera on bus 3",
         ),
         ("true {pattern} {output}", "wrote no image"),
+        ("touch {output} {pattern}", "wrote no image"),
         ("sh -c 'yes {pattern} {output} >&2'", "printed more than 4 MB"),
         ("no-such-command-here {pattern} {output}", "cannot be run"),
         ("cp {pattern} here.png", "has no {output}"),

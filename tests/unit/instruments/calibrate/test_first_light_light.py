@@ -200,14 +200,16 @@ def test_without_an_image_of_a_monitor_that_is_off_black_is_the_bench_files(tmp_
 MAG_A_PERCENT = 0.01 * 2.5 / np.log(10)
 
 
-def response_figures(p95_percent=0.5, p95_sigmas=1.0, ratios=(1.0,), sigmas=(0.5,), black=False):
+def response_figures(
+    p95_percent=0.5, p95_sigmas=1.0, ratios=(1.0,), sigmas=(0.5,), black=False, others=()
+):
     """The figures of a response of gamma 2.4 where the bench file has 2.2, by readings whose links
     have these ratios.
     """
     holdout = {"p95_percent": p95_percent, "rms_mag": 0.002, "max_mag": 0.01}
     holdout["p95_sigmas"] = p95_sigmas
     fitted = {
-        "channels": {"w": {"holdout": holdout}},
+        "channels": {"w": {"holdout": holdout}} | dict(others),
         "drift_percent": None,
         "noise_relative": 0.003,
         "codes": 12,
@@ -232,6 +234,13 @@ def test_figures_of_a_response_are_in_their_units():
     assert figures["bench_file_off_max_mag"] == pytest.approx(0.2 / 2.4 * 7.5, abs=0.02)
     assert (figures["black_level_measured"], figures["patches"]) == ("yes", 24)
     assert np.isnan(figures["drift_percent"])
+    worse = {"p95_percent": 3.0, "rms_mag": 0.004, "max_mag": 0.02, "p95_sigmas": 1.5}
+    better = {"p95_percent": 0.1, "rms_mag": 0.001, "max_mag": 0.003, "p95_sigmas": 0.2}
+    channels = {"g": {"holdout": worse}, "b": {"holdout": better}}
+    of_three = response_figures(others=channels)
+    assert of_three["held_out_p95_mag"] == pytest.approx(3 * MAG_A_PERCENT)
+    names = ("held_out_rms_mag", "held_out_max_mag", "held_out_p95_sigmas")
+    assert [of_three[name] for name in names] == [0.004, 0.02, 1.5]
 
 
 @pytest.mark.parametrize(
@@ -258,6 +267,10 @@ def test_a_response_is_refused_beyond_its_limit_and_its_noise(tmp_path, changes,
     assert outcome.verdict == verdict
     assert words in outcome.line
     assert bool(outcome.changes) == (verdict == "done")
+    if outcome.changes:
+        # an rms of 12 levels is known to one over the root of twice as many
+        assert outcome.number.value == 0.002
+        assert outcome.number.error == pytest.approx(0.002 / np.sqrt(24))
 
 
 def test_a_hot_pixel_of_the_dark_frame_makes_no_image_too_bright(tmp_path):

@@ -5,6 +5,7 @@ form: shares, scatter, errors of full scale, verdicts, and maps of light.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,14 +14,17 @@ from scipy import stats
 from scipy.special import ndtr
 
 from hilstar.display.calibration import weights_of_grid
-from hilstar.instruments.calibrate.first_light import context
-from hilstar.instruments.calibrate.first_light.context import FittedFigure
+from hilstar.instruments.calibrate.first_light import context, photometry
+from hilstar.instruments.calibrate.first_light import uniformity as uniformities
+from hilstar.instruments.calibrate.first_light.context import FittedFigure, StepContext
+from hilstar.instruments.calibrate.first_light.photometer import Photometer, Range
 from hilstar.instruments.calibrate.first_light.seen_stars import (
     StarSpot,
     _explained,
     _is_in_image,
     _is_inside,
 )
+from hilstar.instruments.calibrate.first_light.session import STEPS, FirstLightSession
 from hilstar.instruments.calibrate.first_light.stars import (
     LOST_SHARE,
     SYSTEMATIC_MAG,
@@ -42,7 +46,10 @@ from hilstar.instruments.calibrate.first_light.uniformity import (
     _not_negative,
     _shown,
     _smoothness,
+    _spacing,
 )
+from hilstar.instruments.calibrate.first_light.uniformity import uniformity as measured_uniformity
+from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.calibrate.scale import MeasuredScale
 from hilstar.optics.camera import Camera
 
@@ -344,3 +351,192 @@ def test_a_figure_is_at_an_end_within_a_thousandth_of_that(low, high):
         (high, True),
     ):
         assert FittedFigure("power", value, low, high).is_at_end == is_at_end
+
+
+@pytest.mark.parametrize(("rms_mag", "is_even"), [(0.0019, True), (0.0021, False)])
+def test_light_is_even_where_it_varies_by_less_than_a_star_s_error(rms_mag, is_even):
+    """Of a map of six fields; one of a single field always is."""
+    fields = 10 ** (-0.4 * rms_mag * np.array([-1.0, 1.0, -1.0, 1.0]))
+    used = np.ones(4, dtype=bool)
+    of_six = UniformityMap(np.ones((2, 3)), fields, 0.0, 0.0, used, 0.0, 0.0)
+    assert of_six.rms_mag == pytest.approx(rms_mag)
+    assert of_six.is_even == is_even
+    assert UniformityMap(np.ones((1, 1)), fields**9, 0.0, 0.0, used, 0.0, 0.0).is_even
+
+
+@pytest.mark.parametrize(
+    ("psf_px", "screen_px", "period"),
+    [
+        # dots of a sigma of 0.83 px: 16 of them and 26.5 px of the monitor
+        (0.7, (640, 480), 28),
+        # of 0.47 px: ten px of the tracker, 20 of the monitor
+        (0.2, (640, 480), 20),
+        # 64 dots along the longer side: 30 px
+        (0.2, (1080, 1920), 30),
+        (0.2, (1080, 1921), 32),
+    ],
+)
+def test_a_lattice_has_dots_apart_and_not_too_many(psf_px, screen_px, period):
+    """Half a pixel of the tracker's to one of the monitor's, and dots of three."""
+    cameras = [SimpleNamespace(focal_length_px=f) for f in (1600.0, 800.0)]
+    geometry = SimpleNamespace(monitor=cameras[0], tracker=cameras[1])
+    spacing = _spacing(
+        SimpleNamespace(
+            real_geometry=lambda: geometry, psf_sigma_px=psf_px, resolution_px=screen_px
+        )
+    )
+    sigma_px = math.hypot(psf_px, 1.5 / math.sqrt(12))
+    assert spacing.sigma_px == pytest.approx(sigma_px)
+    assert spacing.period == period
+    assert spacing.reach == pytest.approx(min(period / 4, 9 * sigma_px))
+
+
+@pytest.mark.parametrize(("left_mag", "known_mag"), [(0.001, None), (0.0, None), (0.001, 0.03)])
+def test_where_light_is_called_even_what_its_map_has_is_an_error(
+    monkeypatch, tmp_path, left_mag, known_mag
+):
+    """A map of 0.0015 mag, less than is worth a map, which is written nowhere: its standard
+    deviation adds to its own error.
+    """
+    at_dots = 10 ** (-0.4 * 0.0015 * np.tile([1.0, -1.0], 20))
+
+    def map_of(dots, light, size_px):
+        shape = 10 ** (-0.4 * float(np.std(light)) * np.tile([1.0, -1.0], 20))
+        used = np.ones(40, dtype=bool)
+        if np.ptp(light):
+            # what the bench file's map leaves of even light
+            return UniformityMap(np.ones((2, 2)), shape, 0.005, 0.0, used, 0.007, 0.0)
+        return UniformityMap(np.ones((2, 2)), at_dots, 0.0005, 0.0, used, left_mag, 0.0)
+
+    known = None
+    if known_mag is not None:
+        known = np.ones((40, 1), dtype=np.float32)
+        known[::2] = 0.5
+    places = np.arange(40)
+    seen = DotLight(np.zeros(40, dtype=int), places, np.ones(40), 0.002)
+    monkeypatch.setattr(uniformities, "see_dots", lambda context: (seen, ()))
+    monkeypatch.setattr(uniformities, "map_of", map_of)
+    monkeypatch.setattr(
+        uniformities,
+        "calibration_of",
+        lambda context: SimpleNamespace(uniformity_map=lambda size_px: known),
+    )
+    monkeypatch.setattr(uniformities, "draw_uniformity", lambda *given: None)
+    written = []
+
+    def write_map(context, light_map, error_mag):
+        written.append(error_mag)
+        return [], ()
+
+    monkeypatch.setattr(uniformities, "_write_map", write_map)
+    at = SimpleNamespace(resolution_px=(1, 40), truth=None, session=tmp_path)
+    outcome = measured_uniformity(at)
+    wanted_mag = math.hypot(left_mag, 0.0015)
+    assert outcome.figures["map_error_mag"] == pytest.approx(wanted_mag)
+    assert outcome.figures["change_rms_mag"] == pytest.approx(0.0015)
+    assert written == ([] if known_mag is None else [pytest.approx(wanted_mag)])
+
+
+def test_each_primary_s_share_is_of_all_channels(monkeypatch):
+    rates = np.array([[1.0, 2.0, 3.0], [10.0, 20.0, 30.0]])
+    monkeypatch.setattr(photometry, "bench_primaries", lambda monitor, folder: "primaries")
+    monkeypatch.setattr(photometry, "named_channels", lambda tracker, folder: "channels")
+    monkeypatch.setattr(photometry, "channel_matrix", lambda *given: SimpleNamespace(e_per_s=rates))
+    file = SimpleNamespace(config=SimpleNamespace(monitor=None, tracker=None), folder=None)
+    assert photometry.shares_of_white(file).tolist() == [11.0, 22.0, 33.0]
+
+
+def test_a_hot_pixel_does_not_fill_a_range():
+    """Of 400 DN; the second column has a hot pixel."""
+    at = SimpleNamespace(
+        _cold=np.array([[True, False], [True, True]]), context=SimpleNamespace(full_dn=400)
+    )
+    assert Photometer._filled(at, np.array([[10.0, 390.0], [100.0, 50.0]])) == 0.25
+
+
+@pytest.mark.parametrize(("times", "name"), [(1, "patch"), (4, "patch_4"), (16, "patch_16")])
+def test_an_image_is_named_by_its_longer_exposure(times, name):
+    taken = []
+
+    def take(pattern, exposure_s):
+        taken.append((pattern.name, exposure_s))
+        return Path(pattern.name)
+
+    photometer = SimpleNamespace(
+        field=SimpleNamespace(lattice=lambda size_px, period, patch: None),
+        context=SimpleNamespace(resolution_px=(8, 8), take=take),
+        exposure_s=0.25,
+        images=[],
+    )
+    path = Photometer._take(photometer, "patch", Range(4, times), Patch(100, "w"))
+    assert taken == [(name, 0.25 * times)]
+    assert photometer.images == [path]
+
+
+def test_light_that_rounding_hides_has_shot_noise():
+    """Light of -3 DN is none, of 50 DN is that; rounding hides 2 DN rms of each."""
+    asked = []
+
+    def sum_dn2(light_dn, times, blacks):
+        asked.append((light_dn, times, blacks))
+        return 9.0
+
+    patches = [Patch(5, "w"), Patch(9, "w"), Patch(0, "w"), Patch(0, "w")]
+    at = Range(2, 4)
+    photometer = SimpleNamespace(
+        field=SimpleNamespace(monitor_px=100.0),
+        exposure_s=0.5,
+        scatter=SimpleNamespace(dark_dn2=lambda times: 16.0, sum_dn2=sum_dn2),
+        _dots=lambda at: 10,
+        _rounded=lambda at, light_dn: np.array([2.0, -2.0]),
+    )
+    lit = {}
+    for order, light_dn in enumerate((-3.0, 50.0)):
+        lit[order] = SimpleNamespace(patch=patches[order], at=at, light_dn=light_dn, blacks=0.5)
+    factors = {("w", at): 2.0}
+    values = Photometer._values(photometer, patches, lit, np.array([5.0, 15.0]), factors)
+    assert asked == [(2.0, 4, 0.5), (52.0, 4, 0.5)]
+    np.testing.assert_allclose(values.light, [-0.3, 5.0, -0.1, 0.1])
+    # black is of 100 px of the monitor
+    np.testing.assert_allclose(values.sigma, [0.3, 0.3, 0.08, 0.08])
+
+
+def test_what_the_lowest_code_adds_is_less_by_what_it_adds_to_a_ratio():
+    """A ratio of 1000 to 100 DN, of which 40 and 10 were added: 4 % less 10 %."""
+    added_dn = {1000.0: 40.0, 100.0: 10.0, 200.0: 8.0}
+    photometer = SimpleNamespace(_cut_dn=lambda at, light_dn: added_dn[light_dn])
+    patch = Patch(100, "w")
+    at = Range(1, 1)
+    pair = SimpleNamespace(more=at, less=at, light_dn=(1000.0, 100.0))
+    link = SimpleNamespace(patch=patch, dense=1, times=(1, 1))
+    values = SimpleNamespace(light=np.array([0.0, 5.0]), per_dn=np.array([0.0, 0.5]))
+    lit = {1: SimpleNamespace(patch=patch, at=at, light_dn=200.0)}
+    effect = Photometer._of_cut(photometer, values, lit, [pair], [link])
+    np.testing.assert_allclose(effect, [0.0, 8 * 0.5 + 5 * 0.06])
+
+
+def test_a_file_is_named_from_the_bench_file_s_folder():
+    at = SimpleNamespace(
+        file=SimpleNamespace(folder=Path("/benches/first")),
+        session=Path("/benches/first/session"),
+        change=lambda *named: named,
+    )
+    named = StepContext.names(at, "collimator", "geometry", at.session / "geometry.toml")
+    assert named == ("collimator", "geometry", "session/geometry.toml")
+    at.file.folder = Path("/benches/second")
+    named = StepContext.names(at, "collimator", "geometry", at.session / "geometry.toml")
+    assert named[2] == "../first/session/geometry.toml"
+
+
+@pytest.mark.parametrize("step", STEPS, ids=[step.name for step in STEPS])
+def test_a_step_that_was_skipped_runs_again_where_what_it_lacked_may_be_there(step):
+    number = STEPS.index(step)
+    session = SimpleNamespace(
+        records={}, unfinished={}, _unmet=lambda step: None, _state=lambda number: "state"
+    )
+    for verdict, is_done in (("done", True), ("skipped", not step.needs), ("failed", False)):
+        record = SimpleNamespace(verdict=verdict, state_sha256="state", files={})
+        session.records = {step.name: record}
+        assert FirstLightSession._is_done(session, number) == is_done
+        record.state_sha256 = "other"
+        assert not FirstLightSession._is_done(session, number)

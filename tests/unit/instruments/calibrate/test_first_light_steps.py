@@ -14,6 +14,7 @@ import pytest
 from hilstar.display.calibration import load_calibration, read_toml, with_uniformity
 from hilstar.display.response import srgb_response
 from hilstar.instruments.calibrate.first_light import stars
+from hilstar.instruments.calibrate.first_light import uniformity as uniformities
 from hilstar.instruments.calibrate.first_light.context import StepOutcome, rewrite, with_changes
 from hilstar.instruments.calibrate.first_light.focus import first_dots, focus
 from hilstar.instruments.calibrate.first_light.geometry import geometry, orientation
@@ -22,7 +23,12 @@ from hilstar.instruments.calibrate.first_light.photometer import Assumed, Photom
 from hilstar.instruments.calibrate.first_light.photometry import photometry
 from hilstar.instruments.calibrate.first_light.session import display, latency
 from hilstar.instruments.calibrate.first_light.stars import scale, verify
-from hilstar.instruments.calibrate.first_light.uniformity import uniformity, warm_up
+from hilstar.instruments.calibrate.first_light.uniformity import (
+    _White,
+    see_dots,
+    uniformity,
+    warm_up,
+)
 from hilstar.instruments.calibrate.geometric.dots import write_plan
 from hilstar.instruments.calibrate.grabbed_dots import grab_dots
 from hilstar.instruments.calibrate.latency import edges_of
@@ -116,6 +122,11 @@ def test_readings_are_in_their_file_as_they_are(tmp_path):
     np.testing.assert_allclose(measured.sigma, readings.sigma, rtol=1e-4)
     np.testing.assert_allclose(measured.common, readings.common, rtol=1e-4)
     assert measured.code.tolist() == [0, 300, WHITE, 700, 0]
+    lines = (tmp_path / "measured.csv").read_text().splitlines()
+    rows = [line.split(",")[:3] for line in lines if not line.startswith("#")]
+    codes = ["0", "300", str(WHITE), "700", "0"]
+    assert rows[0] == ["order", "code", "channel"]
+    assert rows[1:] == [[str(order), code, "w"] for order, code in enumerate(codes, start=1)]
 
 
 def test_primaries_are_read_apart_and_black_is_of_all_of_them(tmp_path):
@@ -394,9 +405,15 @@ FILED_WHITE_E_PER_S = float(CLOSED["render"]["flux_at_white_e_per_s"])
 
 
 @pytest.mark.parametrize("share", [1.0, 1.07, 0.9])
-def test_stars_say_what_white_is_worth(tmp_path, share):
+def test_stars_say_what_white_is_worth(tmp_path, monkeypatch, share):
     camera = ClosedCamera(power_of(2.2), share * FILED_WHITE_E_PER_S / E_PER_S_A_DN)
     context = closed_context(tmp_path, camera, STARS)
+    noises_mag = []
+
+    def draw(path, e_per_s, off_mag, noise_mag, finding):
+        noises_mag.append(noise_mag)
+
+    monkeypatch.setattr(stars, "draw_light", draw)
     outcome = scale(context)
     assert outcome.verdict == "done", outcome.line
     figures = outcome.figures
@@ -414,8 +431,13 @@ def test_stars_say_what_white_is_worth(tmp_path, share):
         relative = set_keys.pop(("certify", "flux_at_white_relative"))
         assert relative == pytest.approx(error_mag / MAG_A_RELATIVE, rel=0.01)
         assert set_keys == {("render", "flux_at_white_e_per_s"): pytest.approx(white, rel=1e-5)}
+    word = "brighter" if figures["off_mag"] < 0 else "fainter"
+    off = f"{abs(figures['off_mag']):.3f} +- {error_mag:.3f} mag {word} than the bench file has it"
+    assert off in outcome.line
     rows = np.loadtxt(tmp_path / "readings.csv", delimiter=",", skiprows=1)
     assert len(rows) == figures["stars"]
+    (noise_mag,) = noises_mag
+    np.testing.assert_allclose(rows[:, 2], noise_mag / MAG_A_RELATIVE * rows[:, 1])
     # the same stars by their catalogue's light, each in the noise that its row states
     with open_bench(context.file) as bench:
         place = {hip: k for k, hip in enumerate(bench.stars.hip.tolist())}
@@ -514,6 +536,7 @@ class Watched(ClosedCamera):
     """A camera beside a photodiode, whose square lights so long after its swap."""
 
     delay_ms: float = 0.0
+    jitter_ms: float = 0.1
 
     def diode(self, file, seconds):
         """300 swaps at the file's rate; the square changes every third frame."""
@@ -522,7 +545,7 @@ class Watched(ClosedCamera):
         level = np.array([marker_light(frame, "code") for frame in range(300)])
         swap_ns = 10**9 + np.round(np.arange(300) * period_ns).astype(np.int64)
         shown = edges_of(swap_ns, level)
-        late_ns = np.round(1e6 * (self.delay_ms + rng.normal(0, 0.1, len(level))))
+        late_ns = np.round(1e6 * (self.delay_ms + rng.normal(0, self.jitter_ms, len(level))))
         seen = edges_of(swap_ns + late_ns.astype(np.int64), level)
         return DiodeRecording(shown, seen)
 
@@ -567,6 +590,33 @@ def test_a_panel_s_delay_is_what_the_scan_out_leaves_of_the_diode_s(tmp_path, fi
     assert latency(bare).verdict == "skipped"
     none = closed_context(tmp_path, Watched(), {"monitor": monitor | {"photodiode_px": 0}})
     assert "photodiode_px is 0" in latency(none).line
+
+
+@pytest.mark.parametrize(("filed_ms", "is_changed"), [(5.5, True), (6.2, False)])
+def test_a_delay_that_differs_by_less_than_three_errors_stays(tmp_path, filed_ms, is_changed):
+    """Edges scatter by 2 ms; the median of some 150 is known to 0.2 ms."""
+    monitor = {
+        **{"photodiode_px": 12, "refresh_hz": 60.0, "scanout_ms": 0.0},
+        "panel_delay_ms": filed_ms,
+    }
+    seen = Watched(delay_ms=6.5, jitter_ms=2.0)
+    outcome = latency(closed_context(tmp_path, seen, {"monitor": monitor}))
+    off_ms = abs(outcome.figures["panel_delay_ms"] - filed_ms)
+    error_ms = outcome.figures["error_ms"]
+    assert error_ms == pytest.approx(0.2, rel=0.3)
+    assert off_ms > 0.1
+    assert (off_ms >= 3 * error_ms) == is_changed == bool(outcome.changes)
+
+
+@pytest.mark.parametrize("delay_ms", [-0.04, -0.2])
+def test_light_that_is_early_by_its_noise_alone_is_no_delay(tmp_path, delay_ms):
+    monitor = {"photodiode_px": 12, "refresh_hz": 60.0, "scanout_ms": 0.0, "panel_delay_ms": 1.0}
+    seen = Watched(delay_ms=delay_ms, jitter_ms=0.02)
+    context = closed_context(tmp_path, seen, {"monitor": monitor})
+    if delay_ms < -0.1:
+        assert "before the scan-out could reach it" in refusal(latency, context)
+    else:
+        assert latency(context).figures["panel_delay_ms"] == 0.0
 
 
 @pytest.mark.parametrize("is_paced", [True, False])
@@ -627,3 +677,71 @@ def test_dots_are_grabbed_in_the_brightest_code_that_does_not_saturate(tmp_path)
         grab_dots, context.file, camera, tmp_path / "dots", 0.02, overwrite=True, tell=told.append
     )
     assert "--exposure" in words
+
+
+def test_dots_are_watched_without_what_black_glows_and_no_image_of_them_stays(tmp_path):
+    """A screen that began to glow after the dark frame, by a 200th of white's light: 2.5 DN
+    in each pixel.
+    """
+    light = {}
+    for glow in (0.0, 0.005):
+        folder = tmp_path / f"{glow}"
+        folder.mkdir()
+        camera = ClosedCamera(srgb_response(BITS).light, 5_000.0)
+        context = closed_context(folder, camera, known=dict(FOCUSED))
+        white = _White(context)
+        camera.black = glow
+        light[glow] = np.mean([white.read() for _ in range(4)])
+        names = sorted(path.name for path in (folder / "images").iterdir())
+        assert names == ["dark_000.png", f"white_{WHITE:05}_000.png"]
+    # each of 9 pixels at white, in a circle that holds nearly all of it
+    lit = int((white._codes > 0).sum())
+    seen = lit * 5_000.0 * EXPOSURE_S * RATIO**2
+    assert 0.5 * seen < light[0.0] < seen
+    assert light[0.005] == pytest.approx(light[0.0], rel=0.02)
+
+
+def test_dots_that_differ_from_one_to_the_next_far_beyond_their_noise_are_no_map(tmp_path):
+    """By 5 % from pixel to pixel: 1.7 % from dot to dot, of which noise is a tenth."""
+    uneven = 1 + 0.05 * np.random.default_rng(4).normal(size=SCREEN_PX[::-1])
+    outcome = uniformity_of(tmp_path, uneven, None)
+    figures = outcome.figures
+    assert figures["left_rms_mag"] > max(3 * figures["dot_noise_mag"], 0.01)
+    assert outcome.verdict == "failed"
+    assert "that is far above their noise: dust, a panel uneven from pixel to pixel" in outcome.line
+
+
+def test_a_response_from_pixel_to_pixel_is_averaged_over_a_dot(tmp_path):
+    """A detector of 6 % PRNU: a Gaussian spreads a dot over 4 pi of its sigma squared."""
+    noise_mag = {}
+    for prnu in (0.0, 0.06):
+        camera = ClosedCamera(srgb_response(BITS).light)
+        detector = {"tracker.detector": {"prnu": prnu}}
+        context = closed_context(tmp_path, camera, detector, known=dict(FOCUSED))
+        dots, _ = see_dots(context)
+        noise_mag[prnu] = dots.noise_mag
+    sigma2_px2 = SIGMA_PX**2 + (3 * RATIO) ** 2 / 12
+    response = 0.06 / math.sqrt(4 * math.pi * sigma2_px2)
+    added = math.sqrt(noise_mag[0.06] ** 2 - noise_mag[0.0] ** 2) / MAG_A_RELATIVE
+    assert added == pytest.approx(response, rel=1e-6)
+
+
+def test_a_dot_is_as_noisy_as_its_photons_and_all_pixels_in_its_reach(tmp_path, monkeypatch):
+    """Half of the noise is that of the background: of 100 DN in a pixel."""
+    noise_mag = {}
+    background = SimpleNamespace(noise=0.0)
+    monkeypatch.setattr(uniformities, "noisiest_background", lambda image: background)
+    camera = ClosedCamera(srgb_response(BITS).light)
+    context = closed_context(tmp_path, camera, known=dict(FOCUSED))
+    for noise_dn in (0.0, 100.0):
+        background.noise = noise_dn
+        dots, _ = see_dots(context)
+        noise_mag[noise_dn] = dots.noise_mag
+    dn = float(np.median(dots.light))
+    photons_mag = MAG_A_RELATIVE / math.sqrt(dn * GAIN_E_PER_DN)
+    # of other images, with photons of their own
+    assert noise_mag[0.0] == pytest.approx(photons_mag, rel=1e-3)
+    reach_px = uniformities._spacing(context).reach * RATIO
+    added_mag = math.sqrt(noise_mag[100.0] ** 2 - photons_mag**2)
+    wanted_mag = MAG_A_RELATIVE * 100 * math.sqrt(math.pi) * reach_px / dn
+    assert added_mag == pytest.approx(wanted_mag, rel=1e-3)

@@ -5,25 +5,35 @@ their derivatives, light and background, weights, and which dots stand alone.
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate.first_light import focus
 from hilstar.instruments.calibrate.first_light.focus import (
+    ROUNDS,
     SIGMAS_PX,
     DotNoise,
+    Sharpness,
     _alone,
     _amplitudes,
     _Dots,
     _each_sigma,
     _first_places,
+    _fitted,
     _points,
     _Shape,
     _slopes,
     _stepped,
     _weights,
+    seen_sharpness,
+    sharpness,
+    why_blurred,
 )
+from tests.support.refusals import refusal
 
 HALF = 6
 SIGMA_PX, SIDE_PX = 0.8, 2.4
@@ -101,10 +111,10 @@ def test_a_pixel_weighs_by_background_photons_and_response():
 
 def test_dots_are_alone_and_whole_in_their_squares():
     image = np.full((60, 80), 7.0)
-    x_px = np.array([6.0, 5.4, 30.0, 42.9, 60.0, 73.0, 74.0])
-    y_px = np.array([20.0, 50.0, 20.0, 20.0, 20.0, 40.0, 10.0])
+    x_px = np.array([6.0, 5.4, 30.0, 42.9, 60.0, 73.0, 74.0, 30.0, 45.0])
+    y_px = np.array([20.0, 50.0, 20.0, 20.0, 20.0, 40.0, 10.0, 54.0, 5.0])
     dots = _alone(image, 7.0, x_px, y_px, HALF)
-    # the second's square leaves the image, as the last's does; the middle two are 12.9 px apart
+    # the second's square leaves the image, as the last three's do; the middle two are 12.9 px apart
     assert dots.x_px.tolist() == [6.0, 30.0, 42.9, 60.0, 73.0]
     near = _alone(image, 7.0, np.array([30.0, 42.0]), np.array([20.0, 32.0]), HALF)
     assert len(near.x_px) == 0
@@ -151,3 +161,101 @@ def test_each_dot_has_its_own_sigma_and_a_wild_one_is_told():
     wanted_px = SIGMA_PX + 0.002 * (np.arange(count) - 4)
     # one step of Newton's: the square of a hundredth
     np.testing.assert_allclose(sigmas_px[is_tame], wanted_px[is_tame], atol=2e-4)
+
+
+def drawn_dots(sigmas_px: np.ndarray, noise_dn: float, rng, side_px: float = SIDE_PX) -> np.ndarray:
+    """Squares of 4000 DN by Gaussians, 24 px apart in rows of five, over noise."""
+    edges = np.arange(121) - 0.5
+    image = rng.normal(0.0, noise_dn, (120, 120))
+    for number, sigma_px in enumerate(sigmas_px):
+        axes = []
+        for place in np.divmod(number, 5):
+            middle = 12 + 24 * place + rng.uniform(-0.5, 0.5)
+            near = (edges - middle)[:, None] + np.linspace(-0.5, 0.5, 21) * side_px
+            axes.append(np.diff(ndtr(near / sigma_px), axis=0).mean(axis=1))
+        image += 4000 * np.outer(*axes)
+    return image
+
+
+def test_dots_that_differ_are_as_sure_as_their_mean(rng):
+    """25 dots whose sigmas differ by 4 %, and noise that explains a tenth of it."""
+    found = sharpness(drawn_dots(0.8 * (1 + 0.04 * rng.standard_normal(25)), 2.0, rng), SIDE_PX)
+    scatter_px = np.std(found.each_psf_sigma_px)
+    assert scatter_px == pytest.approx(0.032, rel=0.4)
+    # the model's own hundredth, and what the side's edge may be off
+    model_px = math.hypot(0.01 * found.psf_sigma_px, 3.5e-4 * found.dot_side_px)
+    least_px = math.hypot(scatter_px / math.sqrt(len(found.x_px)), model_px)
+    assert least_px * 0.999 < found.psf_sigma_error_px < 1.5 * least_px
+
+
+def test_a_misfit_makes_the_errors_of_sigma_and_side_larger(rng):
+    """Noise of 6 DN where 2 are stated: errors are as if 6 were, and the side's own knowledge
+    weighs as much less.
+    """
+    image = drawn_dots(np.full(25, 2.4), 6.0, rng)
+    places = 12.0 + 24 * np.arange(5)
+    x_px, y_px = (grid.ravel() for grid in np.meshgrid(places, places))
+    dots = _alone(image, 0.0, x_px, y_px, HALF)
+    start = _Shape(_points(1.2, SIDE_PX, 0.0), 2.4, SIDE_PX)
+    stated, larger = (_fitted(dots, start, SIDE_PX, noise, DotNoise()) for noise in (2.0, 6.0))
+    assert larger.has_settled
+    assert stated.sigma_error_px == pytest.approx(larger.sigma_error_px, rel=0.05)
+    assert stated.side_error_px == pytest.approx(larger.side_error_px, rel=0.05)
+    # the dots alone tell little of so small a side
+    assert larger.side_error_px == pytest.approx(0.01 * SIDE_PX, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("turn_deg", "side"), [(0.0, 12.0), (45.0, 12 * math.sqrt(2)), (-30.0, 16.39)]
+)
+def test_squares_about_dots_hold_a_turned_one_s_corners(monkeypatch, rng, turn_deg, side):
+    halves = []
+
+    def alone(image, level, x_px, y_px, half):
+        halves.append(half)
+        raise InputError("enough")
+
+    monkeypatch.setattr(focus, "_alone", alone)
+    image = drawn_dots(np.full(6, 0.8), 1.0, rng)
+    assert refusal(sharpness, image, 12.0, turn_deg) == "enough"
+    # and four pixels of the PSF's wings
+    assert halves == [math.ceil(side / 2 + 4)]
+
+
+def test_the_mean_of_images_has_as_many_times_the_electrons_in_a_dn(monkeypatch):
+    asked = []
+    monkeypatch.setattr(focus, "sharpness", lambda *given: asked.append(given))
+    screen = SimpleNamespace(tracker_px_a_monitor_px=0.8, turn_deg=12.0)
+    detector = SimpleNamespace(gain_e_per_dn=4.0, prnu=0.01)
+    seen_sharpness("image", screen, detector, images=3)
+    assert asked == [("image", pytest.approx(3 * 0.8), 12.0, DotNoise(12.0, 0.01))]
+
+
+# Of pixels that are seen 1.5 px wide; the bench file states 0.8 px of PSF.
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, ""),
+        ({"has_settled": False}, f"has not settled in {ROUNDS} rounds"),
+        # 3 % wider and four errors of a third of the dot's: 1.545 + 4 * 0.02
+        ({"dot_side_px": 3 * 1.624, "dot_side_error_px": 0.06}, ""),
+        ({"dot_side_px": 3 * 1.626, "dot_side_error_px": 0.06}, "as wide as monitor pixels"),
+        ({"psf_sigma_error_px": 0.159}, ""),
+        ({"psf_sigma_error_px": 0.161}, "cannot be told from a monitor pixel of 1.50 px"),
+        # 30 % wider than stated, and a tenth of a pixel: 1.14 px
+        ({"psf_sigma_px": 1.139}, ""),
+        ({"psf_sigma_px": 1.141}, "turn the focus"),
+        ({"psf_sigma_px": 0.2}, ""),
+    ],
+)
+def test_a_focus_is_blamed_beyond_what_its_errors_explain(changes, words):
+    none = np.zeros(0)
+    figures = {
+        "psf_sigma_px": 0.8,
+        "psf_sigma_error_px": 0.01,
+        "dot_side_px": 4.5,
+        "dot_side_error_px": 0.0,
+    }
+    failure = why_blurred(Sharpness(none, none, none, **figures | changes), 0.8, 1.5)
+    assert bool(failure) == bool(words)
+    assert words in failure

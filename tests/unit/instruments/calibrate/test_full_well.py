@@ -9,6 +9,7 @@ from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate.first_light.focus import MAX_PIXEL_SHARE, Sharpness, why_blurred
 from hilstar.instruments.calibrate.full_well import check_full_well, cut_off_dn
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX
+from hilstar.instruments.calibrate.grabbed_dots import is_too_bright
 from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
 
@@ -72,3 +73,16 @@ def test_dots_wider_than_their_pixels_make_no_psf(wider, is_refused):
     sharp = Sharpness(place, place, place, 0.55, 0.01, DOT_PX * wider * seen_pixel_px, 0.05)
     reason = why_blurred(sharp, 0.55, seen_pixel_px)
     assert ("full_well_e" in reason) == is_refused
+
+
+@pytest.mark.parametrize(
+    ("peak_dn", "is_bright"), [(2456.0, False), (2458.0, True), (4095.0, True), (4096.0, False)]
+)
+def test_dots_are_too_bright_from_six_tenths_of_saturation_on_hot_pixels_apart(peak_dn, is_bright):
+    """Of 12 bits; an image of more bits is another detector's, of which nothing is known."""
+    detector = DetectorSettings(bits=12, gain_e_per_dn=4.0, full_well_e=1e6, offset_dn=0.0)
+    dark = np.full((6, 8), 50.0)
+    dark[1, 1], dark[4, 5] = 2100.0, 2040.0
+    image = np.full((6, 8), 50.0)
+    image[1, 1], image[3, 3] = 4000.0, peak_dn
+    assert is_too_bright(image, dark, detector) is is_bright

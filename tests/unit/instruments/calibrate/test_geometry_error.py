@@ -6,13 +6,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from matplotlib.quiver import Quiver
+from PIL import Image
 
+from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.geometry import load_notes
+from hilstar.instruments.calibrate.first_light.geometry import _ends_of, _geometry_figures
 from hilstar.instruments.calibrate.geometric import fit as geometric_fit
+from hilstar.instruments.calibrate.geometric import geometry_fit
+from hilstar.instruments.calibrate.geometric.dot_shape import DotShape
 from hilstar.instruments.calibrate.geometric.dots import SeenScreen, lit_for, plan_seen_dots
 from hilstar.instruments.calibrate.geometric.fit import (
     BROWN_CONRADY,
@@ -32,15 +39,28 @@ from hilstar.instruments.calibrate.geometric.fit import (
 from hilstar.instruments.calibrate.geometric.geometry_fit import (
     ROUND,
     Calibrated,
+    MisfitError,
+    _in_view,
+    _refuse_gaps,
+    bounded_to_field,
+    calibrate_seen,
+    draw_geometry,
     lines_of,
     nominal_of,
+    refuse_misfit,
+    seen_in_pose,
     summary_of,
     write_calibrated,
 )
-from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids
-from hilstar.optics.camera import Lens
+from hilstar.instruments.calibrate.geometric.observed import (
+    Observed,
+    dot_centroids,
+    measure_images,
+)
+from hilstar.optics.camera import Camera, Lens
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text
+from tests.support.refusals import refusal
 
 # A tracker of 256 x 256 px, of 39 arcsec that sees the whole of a small screen.
 SMALL_FIELD = {
@@ -173,6 +193,14 @@ def test_a_larger_model_is_taken_for_more_than_chance(is_chance, chosen):
     large = candidate("large", large.off_arcsec * (0.96 * small.rms_arcsec / large.rms_arcsec))
     assert large.rms_arcsec < GAIN * small.rms_arcsec
     assert best_of([small, large]).name == chosen
+
+
+def test_a_dot_that_both_models_throw_far_off_hides_no_gain_on_the_others():
+    """Every dot is 10 % nearer by the larger model, and one of fifty is a hundred times farther."""
+    off_arcsec = np.random.default_rng(5).normal(0, 1.0, (50, 2))
+    off_arcsec[7] = [80.0, -60.0]
+    small, large = candidate("small", off_arcsec), candidate("large", 0.9 * off_arcsec)
+    assert best_of([small, large]).name == "large"
 
 
 @pytest.mark.parametrize("psf_sigma_px", [0.5, 2.8])
@@ -333,6 +361,34 @@ def calibrated(folder, *, tracker_known: bool) -> Calibrated:
     )
 
 
+def assert_reported(found: Calibrated, summary: dict) -> None:
+    """The figures of first light's step, and which of them are at an end."""
+    figures = _geometry_figures(found)
+    counts = summary["centroids"]
+    assert (figures["centroids_lost"], figures["centroids_false"]) == (counts["lost"], 4)
+    assert (figures["dots_planned"], figures["dots_recognised"]) == (
+        len(found.plan),
+        len(np.unique(found.data.dot)),
+    )
+    for place, error in (("held_out", summary["held_out"]), ("error", summary["error"])):
+        for name in ("rms_arcsec", "max_arcsec"):
+            assert figures[f"{place}_{name}"] == error[name]
+    for name, parameter in summary["parameters"].items():
+        if name.startswith("rotation"):
+            assert name not in figures
+        else:
+            assert figures[name] == parameter["value"]
+    assert figures["notes"] == ("; ".join(summary["notes"]) or "none")
+    tilts = [summary["parameters"][f"tilt_{axis}_deg"]["value"] for axis in "xy"]
+    wanted = [
+        (f"tilt_{axis}_deg", tilt, -60.0, 60.0) for axis, tilt in zip("xy", tilts, strict=True)
+    ]
+    # held-out dots are two hundred times their noise off
+    assert _ends_of(found) == (*wanted, ("the degree of the lens's field", 0, -1.0, 7))
+    fine = dataclasses.replace(found, chosen=candidate("fine", np.full((2, 2), 1e-3)))
+    assert _ends_of(fine) == tuple(wanted)
+
+
 OFF = (("pinhole", 4.0), ("pinhole + k1", 2.0))
 
 
@@ -399,7 +455,196 @@ def test_the_figures_of_a_geometry_are_the_fit_s_wherever_they_stand(tmp_path, t
     map_arcsec = np.nan_to_num(uncertainty.map_arcsec, nan=-1.0)
     np.testing.assert_allclose(of_file.map_arcsec, map_arcsec, atol=1e-4)
     np.testing.assert_allclose(of_file.modes_arcsec, uncertainty.modes_arcsec, rtol=1e-4)
+    assert_reported(found, summary)
     lines = "\n".join(lines_of(found))
     lost = summary["centroids"]["lost"]
     assert f"{matched} matched, {lost} lost, 4 false" in lines
     assert f"1.581 arcsec rms, 2.000 max; noise: {held_out['noise_arcsec']:.3f}" in lines
+
+
+@pytest.mark.parametrize("size_px", [(120, 60), (60, 120), (256, 256)])
+def test_a_lens_is_known_to_a_hundredth_beyond_the_farthest_corner_of_the_field(tmp_path, size_px):
+    """Of a pinhole before a tracker that sees a part of the screen; all of it, and it has no end."""
+    problem, data = dots_of(*tilted_screen(tmp_path), 3, 0.02)
+    found = fit(problem, Model(PINHOLE), 0, data, min_gain=1.0)
+    tracker = found.geometry.tracker
+    middle_px = tuple((side - 1) / 2 for side in size_px)
+    seen = dataclasses.replace(tracker, resolution_px=size_px, principal_point_px=middle_px)
+    geometry = dataclasses.replace(found.geometry, tracker=seen)
+    bounded = bounded_to_field(problem, dataclasses.replace(found, geometry=geometry))
+    if size_px == (256, 256):
+        assert bounded.geometry is geometry
+    else:
+        # the fit turns and shifts it by far less than a thousandth
+        reach = math.hypot(*size_px) / 2 / tracker.focal_length_px
+        assert bounded.geometry.monitor.lens.max_tangent == pytest.approx(1.01 * reach, rel=2e-3)
+
+
+def test_residuals_are_drawn_as_the_mean_of_a_dot_s_centroids(tmp_path, figures):
+    found = calibrated(tmp_path, tracker_known=True)
+    draw_geometry(tmp_path / "geometry", found)
+    places, residuals = figures[0].axes[:2]
+    (arrows,) = (drawn for drawn in residuals.collections if isinstance(drawn, Quiver))
+    right_px, down_px = geometric_fit.residuals_px(found.problem, found.fit.geometry, found.data)
+    dots = np.unique(found.data.dot)
+    means = [[part[found.data.dot == dot].mean() for dot in dots] for part in (right_px, down_px)]
+    np.testing.assert_allclose([arrows.U, arrows.V], means, atol=1e-12)
+    np.testing.assert_allclose([arrows.X, arrows.Y], [found.plan.x_px[dots], found.plan.y_px[dots]])
+    # down the screen is down the picture
+    assert places.images[0].get_extent() == [-0.5, 639.5, 359.5, -0.5]
+    assert residuals.get_ylim() == (359.5, -0.5)
+    np.testing.assert_array_equal(places.images[0].get_array(), found.uncertainty.map_arcsec)
+
+
+def test_only_centroids_of_a_pose_are_freed_of_its_dots_s_curve(rng):
+    """Of narrow dots, and not of those whose PSF or side is wide."""
+    x_px, y_px = rng.uniform(20, 40, (2, 30))
+    pose = np.arange(30) % 3
+    settings = dot_centroids(1.5)
+    seen = Observed(np.zeros(30, np.intp), pose, x_px, y_px, np.ones(30), settings)
+    freed = seen.without_s_curve(1, DotShape(0.4, 2.0, 10.0))
+    is_moved = (np.abs(freed.x_px - x_px) > 1e-6) & (np.abs(freed.y_px - y_px) > 1e-6)
+    np.testing.assert_array_equal(is_moved, pose == 1)
+    np.testing.assert_array_equal(freed.x_px[pose != 1], x_px[pose != 1])
+    np.testing.assert_array_equal(freed.y_px[pose != 1], y_px[pose != 1])
+    for wide in (DotShape(0.81, 2.0, 10.0), DotShape(0.4, 8.1, 10.0)):
+        same = seen.without_s_curve(1, wide)
+        np.testing.assert_array_equal([same.x_px, same.y_px], [x_px, y_px])
+    # nothing is known of how a table's were measured
+    table = dataclasses.replace(seen, settings=None)
+    assert table.without_s_curve(1, DotShape(0.4, 2.0, 10.0)) is table
+
+
+def test_dots_that_the_image_s_edge_cuts_are_not_measured(tmp_path):
+    """Of Gaussians of 1.5 px, the second within its window of the left edge."""
+    y, x = np.mgrid[:60, :80]
+    image = np.full((60, 80), 40.0)
+    for x_px, y_px in ((40.3, 30.6), (2.0, 20.0), (60.0, 50.2)):
+        image += 800 * np.exp(-((x - x_px) ** 2 + (y - y_px) ** 2) / (2 * 1.5**2))
+    path = tmp_path / "frame_3.png"
+    Image.fromarray(np.rint(image).astype(np.uint16)).save(path)
+    seen = measure_images([path], None, (80, 60))
+    assert seen.frame.tolist() == [3, 3]
+    np.testing.assert_allclose(np.sort(seen.x_px), [40.3, 60.0], atol=0.05)
+    np.testing.assert_allclose(np.sort(seen.y_px), [30.6, 50.2], atol=0.05)
+    assert seen.edge_px == dot_centroids(1.5).radius_px
+
+
+@pytest.mark.parametrize(
+    ("error_arcsec", "expected_arcsec", "is_refused"),
+    [(1.09, 0.1, False), (1.11, 0.1, True), (7.9, 2.0, False), (8.1, 2.0, True), (0.0, 0.0, False)],
+)
+def test_dots_are_no_lens_s_beyond_four_times_their_noise_and_an_arcsecond(
+    error_arcsec, expected_arcsec, is_refused
+):
+    if not is_refused:
+        refuse_misfit(error_arcsec, expected_arcsec)
+        return
+    words = refusal(refuse_misfit, error_arcsec, expected_arcsec)
+    assert f"are {error_arcsec:.3g} arcsec rms off" in words
+    assert f"makes {expected_arcsec:.2g}: something moved" in words
+
+
+def test_a_dot_is_turned_as_its_pose_is():
+    """Of a tracker that is turned by 50 degrees about its boresight: by where its pixels lie."""
+    camera = Camera((400, 300), 2000.0, (199.5, 149.5), np.eye(3))
+    pose = from_rotation_vector(np.array([0.0, 0.0, math.radians(50)]))
+    geometry = geometric_fit.Geometry(camera, np.array([1.0, 0.0, 0.0, 0.0]), camera, pose[None])
+    seen = seen_in_pose(geometry, pose, 0.6)
+    rays = camera.rays(np.array([199.5, 209.5]), np.array([149.5, 149.5])) @ to_matrix(pose).T
+    (u, right), (v, below) = camera.project(rays)
+    turn_deg = math.degrees(math.atan2(below - v, right - u))
+    assert abs(turn_deg) == pytest.approx(50, abs=1e-6)
+    assert seen.dot_shape.turn_deg == pytest.approx(turn_deg)
+    assert (seen.is_sure, seen.psf_sigma_px) == (True, 0.6)
+
+
+@pytest.mark.parametrize("edge_px", [0.0, 7.0])
+def test_places_are_in_view_farther_than_a_window_from_each_edge(edge_px):
+    """Of two cameras alike: a monitor's pixel is the tracker's."""
+    camera = Camera((120, 80), 900.0, (50.0, 45.0), np.eye(3))
+    q_poses = np.array([[1.0, 0.0, 0.0, 0.0]])
+    fit_of = SimpleNamespace(
+        geometry=SimpleNamespace(monitor=camera, tracker=camera, q_poses=q_poses)
+    )
+    for axis, last in ((0, 119), (1, 79)):
+        for end, inwards in ((edge_px, 1), (last - edge_px, -1)):
+            for off, is_seen in ((0.01, True), (-0.01, False)):
+                place = [60.0, 40.0]
+                place[axis] = end + inwards * off
+                x_px, y_px = np.array(place)[:, None]
+                assert _in_view(fit_of, x_px, y_px, edge_px)[0].tolist() == [is_seen]
+
+
+def test_a_part_of_an_upright_screen_without_its_dots_is_named():
+    """Of 90 x 180 px, with four dots in each ninth: two in its lower right are enough."""
+    corners = [(x, y) for y in (20, 40, 80, 100, 140, 160) for x in (10, 20, 40, 50, 70, 80)]
+    x_px, y_px = np.array(corners, dtype=float).T
+    ninth = (x_px // 30 + 3 * (y_px // 60)).astype(int)
+    monitor = SimpleNamespace(resolution_px=(90, 180))
+    dots = np.arange(36)
+
+    def refuse(is_seen):
+        found = SimpleNamespace(
+            plan=Places(x_px, y_px),
+            problem=SimpleNamespace(nominal=SimpleNamespace(monitor=monitor)),
+            measurable=[np.ones(36, dtype=bool)],
+            data=SimpleNamespace(dot=np.repeat(dots[is_seen], 3)),
+        )
+        return _refuse_gaps(found)
+
+    refuse(dots >= 0)
+    for place, words in ((8, "lower right"), (2, "upper right"), (4, "middle"), (3, "middle left")):
+        of_ninth = dots[ninth == place]
+        refuse(~np.isin(dots, of_ninth[:2]))
+        refused = refusal(refuse, ~np.isin(dots, of_ninth[:3]))
+        assert refused.startswith(f"only 1 of 4 dots were recognised in the {words} of the screen")
+
+
+class Places:
+    """Dots on a screen, of which only the places count."""
+
+    def __init__(self, x_px, y_px):
+        self.x_px, self.y_px = x_px, y_px
+
+    def __len__(self):
+        return len(self.x_px)
+
+
+@pytest.mark.parametrize("sigma_px", [0.4, 0.8, 0.9])
+@pytest.mark.parametrize(
+    ("has_model", "is_ideal", "is_known"),
+    [(False, False, False), (True, False, True), (False, True, True)],
+)
+def test_a_tracker_s_lens_is_held_where_it_is_stated_and_narrow_dots_are_freed_of_their_s_curve(
+    tmp_path, monkeypatch, sigma_px, has_model, is_ideal, is_known
+):
+    tracker = dict(SMALL_FIELD["tracker"])
+    if has_model:
+        tracker["distortion"] = "lens.toml"
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(SMALL_FIELD, {"tracker": tracker}))
+    asked = []
+
+    def fitted(plan, nominal, seen, rng, *, tracker_known):
+        asked.append((seen, tracker_known))
+        raise MisfitError("they are off")
+
+    def freed(plan, nominal, seen, psf_sigma_px):
+        return seen, psf_sigma_px
+
+    monkeypatch.setattr(geometry_fit, "calibrate_geometry", fitted)
+    monkeypatch.setattr(geometry_fit, "without_s_curves", freed)
+    monkeypatch.setattr(geometry_fit, "nominal_of", lambda file: None)
+    monkeypatch.setattr(geometry_fit, "dot_sigma_px", lambda file: 1.0)
+    words = refusal(
+        calibrate_seen,
+        read_bench_file(path),
+        "plan",
+        "seen",
+        tracker_is_ideal=is_ideal,
+        psf_sigma_px=sigma_px,
+    )
+    assert words == "they are off"
+    seen = ("seen", sigma_px) if sigma_px <= 0.8 else "seen"
+    assert asked == [(seen, is_known)]

@@ -11,9 +11,11 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate import live_focus
 from hilstar.instruments.calibrate.first_light.focus import Sharpness
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
 from hilstar.instruments.calibrate.live_focus import focus_readings, follow_answers, streak
+from hilstar.server.answers.answer import Answer
 from hilstar.server.answers.star_widths import FocusCurve, sparkline
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import TWIN, bench_text
@@ -123,6 +125,44 @@ def test_dots_that_saturate_have_no_figure_and_are_dimmed(benches, tmp_path):
         assert next(images).code < reading.code == 2**10 - 1
 
 
+def test_a_pattern_is_shown_to_its_watcher_once_and_images_are_read_as_they_come(
+    tmp_path, monkeypatch
+):
+    """Dots of more than 600 DN saturate a tracker that sees codes as they are."""
+    (tmp_path / "bench.toml").write_text(bench_text(TWIN))
+    file = read_bench_file(tmp_path / "bench.toml")
+    looked = {}
+
+    def look(file, pattern, stem, exposure_s):
+        looked[stem] = float(pattern.codes.max())
+        return stem
+
+    def sharpness(light, screen, detector):
+        raise InputError(f"{light:.0f} DN are no dots")
+
+    source = SimpleNamespace(look=look, pixels=lambda path, size_px: looked[path])
+    dots = {
+        "seen_screen_of": lambda file: None,
+        "first_dots": lambda screen: None,
+        "dot_image": lambda plan, frame, size_px, code: np.full((2, 2), code, dtype=np.uint16),
+        "is_too_bright": lambda image, dark, detector: image > 600,
+        "seen_sharpness": sharpness,
+    }
+    for name, value in dots.items():
+        monkeypatch.setattr(live_focus, name, value)
+    watched = []
+    images = focus_readings(file, source, tmp_path, 1.0, watched.append)
+    readings = [next(images) for _ in range(6)]
+    first, second, *others = (reading.code for reading in readings)
+    assert first == 1023
+    assert others == [others[0]] * 4
+    assert 0 < others[0] < 600
+    shown = [int(pattern.codes.max()) for pattern in watched]
+    assert shown == list(dict.fromkeys([first, second, others[0]]))
+    assert readings[-1].why == f"{others[0]} DN are no dots"
+    assert [reading.number for reading in readings] == [1, 2, 3, 4, 5, 6]
+
+
 def test_the_command_ends_with_the_best_image(benches, tmp_path):
     _, truth = benches
     bench = tmp_path / "truth-1.0.toml"
@@ -209,6 +249,28 @@ def test_silence_ends_after_a_while_and_says_whose():
 
     with pytest.raises(InputError, match="no answer in 30 s: the reader starts again"):
         follow_answers(source, hold, lambda reading: True, lambda: False, clock)
+
+
+def test_silence_counts_from_the_last_answer():
+    """One each 25 s for 100 s, of no star; the line is silent after that."""
+    clock = FakeClock()
+    begun_ns = clock.ns
+    times_ns = [begun_ns + 25 * k * 10**9 for k in range(5)]
+
+    def take():
+        due = [at for at in times_ns if at <= clock.ns]
+        del times_ns[: len(due)]
+        return [Answer(at, b"") for at in due]
+
+    source = SimpleNamespace(take=take, trouble=lambda: "unplugged", unread="")
+
+    def hold(done):
+        while not done():
+            clock.work(1e9)
+
+    with pytest.raises(InputError, match="no answer in 30 s: unplugged"):
+        follow_answers(source, hold, lambda reading: False, lambda: False, clock)
+    assert (clock.ns - begun_ns) / 1e9 == pytest.approx(130, abs=2)
 
 
 def test_a_curve_is_as_high_as_its_values():

@@ -116,3 +116,9 @@ def test_a_floor_beside_relative_noise_is_what_faint_levels_scatter_beyond_it(tm
     # the scatter of 2000 readings is known to 1.6 %
     assert levels.additive_noise == pytest.approx(6.0, rel=0.07)
     assert levels.relative_noise == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_cause_without_a_value_in_a_row_does_nothing_to_it(tmp_path):
+    text = "code,channel,value,common_1,common_2\n0,w,1,,0.5\n9,w,5,0.25,\n"
+    measured = read_measurements(table_of(tmp_path, text))
+    assert measured.common.tolist() == [[0.0, 0.5], [0.25, 0.0]]

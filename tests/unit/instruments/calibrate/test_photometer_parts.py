@@ -4,6 +4,7 @@ between black images, and the error of a ratio of ranges.
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -395,3 +396,35 @@ def test_a_code_brighter_than_stated_is_read_shorter_and_then_on_the_next_lattic
     assert {times: sums.tolist() for times, sums in blacks.items()} == dict.fromkeys(
         (1, 4), [100.0] * 2
     )
+
+
+def test_a_ratio_is_said_with_each_lattice_s_own_exposure():
+    link = ratio_of("g", Range(1, 4), Range(2), 0.98765)
+    said = "a pixel of every 1, exposed 4 times longer is 0.98765 +- 0.00988 times one of every 2"
+    assert link.words == f"code 50 of g: {said}"
+    sparse = ratio_of("r", Range(1, 16), Range(1, 4), 1.0).words
+    assert sparse.endswith("one of every 1, exposed 4 times longer")
+
+
+@pytest.mark.parametrize("even_relative", [0.0, 0.1])
+def test_black_is_the_mean_of_two_screens_over_one_that_is_off(even_relative):
+    """Screens of 100 DN a pixel that differ by 2 DN, and 60 DN without glow; no rounding."""
+    made = photometer(_even_relative=even_relative, images=[], _dark_screen="first")
+    parts = {"first": np.full((50, 60), 99.0), "again": np.full((50, 60), 101.0)}
+    parts["unlit"] = np.full((50, 60), 60.0)
+    made._part = parts.__getitem__
+    made._black_screen = lambda number: f"black {number}"
+    made._noise_dn = lambda variance_dn2, sum_dn: 50.0
+    made.context.unlit = lambda: "unlit"
+    made.context.take = {"black 1": "again"}.__getitem__
+    made.context.exposure_s = 0.2
+    light, error = made._with_black([], np.array([3.0, 7.0]))
+    seconds = 1000.0 * 0.2
+    more_dn = 40.0 * PIXELS
+    np.testing.assert_allclose(light, np.array([3.0, 7.0]) + more_dn / seconds)
+    screens_dn2 = 2.0**2 * PIXELS / 2
+    # of the mean of two, and of one whose glow has no shot noise: more than there is
+    variance = screens_dn2 / 2 + max(screens_dn2 - 0.25 * more_dn, 0.0)
+    variance += (even_relative * more_dn) ** 2
+    assert error == pytest.approx(math.sqrt(variance) / seconds, rel=1e-6)
+    assert made.images == ["again", "unlit"]

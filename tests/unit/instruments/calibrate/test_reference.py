@@ -26,6 +26,7 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.calibrate.reference import (
     FACES,
     Reading,
+    _moved,
     _station_zeros,
     fit_reference,
     pointing,
@@ -314,3 +315,13 @@ def test_a_covariance_is_about_the_axes_of_mon(rng: np.random.Generator) -> None
     readings, _ = planted_cube(rng, stations=False, sigma=True)
     x, y, z = fit_reference(Path("readings.csv"), readings).sigma_arcsec
     assert z > 5 * max(x, y)
+
+
+@pytest.mark.parametrize("elevation_rad", [0.0, 1.1, -0.7])
+def test_a_link_is_moved_by_angles_on_the_sky(elevation_rad: float) -> None:
+    right_rad, up_rad = 2e-4, -3e-4
+    moved = _moved(pointing(0.4, elevation_rad), right_rad, up_rad)
+    azimuth_deg, elevation_deg = angles_deg(moved)
+    turned_deg = math.degrees(0.4 + right_rad / math.cos(elevation_rad))
+    assert azimuth_deg == pytest.approx(turned_deg, abs=1e-9)
+    assert elevation_deg == pytest.approx(math.degrees(elevation_rad + up_rad), abs=1e-9)

@@ -16,18 +16,25 @@ from scipy.special import erf, ndtr
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.panel import Panel
 from hilstar.display.response import Levels, table_response
+from hilstar.instruments.calibrate.first_light import seen_stars
 from hilstar.instruments.calibrate.first_light.photometer import PixelScatter, Range, monitor_area
 from hilstar.instruments.calibrate.first_light.seen_stars import (
     Beyond,
+    ExpectedStars,
     Scatter,
     StarSpot,
     StarsSeen,
+    _alone,
     _codes_mag,
+    _compared,
     _fields,
+    _mean_dark,
+    see_stars,
 )
 from hilstar.instruments.calibrate.first_light.stars import frames_for, place_reasons
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.tracker.centroids import noisiest_background
 from tests.support.closed_camera import AXIS_PX, DETECTOR_PX, ClosedCamera, closed_context
 
 WIDE = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=0.0, electronics_dn=0.0)
@@ -298,3 +305,164 @@ def test_fields_have_the_most_stars_that_both_tracker_and_screen_have(tmp_path, 
     assert counts == sorted(counts, reverse=True)
     # the screen has 3.3 x 3.0 degrees without its margins: 2 stars on average
     assert counts[0] >= 4
+
+
+def test_a_star_is_as_wide_as_its_sprite_its_pixels_and_the_psf_of_the_focus(monkeypatch):
+    """The focus found the PSF twice as wide as the bench file has it; half a pixel of the tracker's
+    to one of the monitor's.
+    """
+    cameras = [SimpleNamespace(focal_length_px=f) for f in (1600.0, 800.0)]
+    geometry = SimpleNamespace(monitor=cameras[0], tracker=cameras[1])
+    context = SimpleNamespace(
+        geometry=lambda: geometry,
+        file=SimpleNamespace(config=None, folder=None),
+        tracker_psf=SimpleNamespace(width_px=(0.6, 1.0)),
+        psf_sigma_px=1.6,
+        detector=SimpleNamespace(gain_e_per_dn=4.0, prnu=0.01, electronics_e=10.0),
+    )
+    sprite = SimpleNamespace(width_px=(1.2, 0.9))
+    monkeypatch.setattr(seen_stars, "display_psf", lambda config, folder, monitor: sprite)
+    spot = StarSpot.of(context)
+    # the square of light and that of the drawing's pixel: a twelfth each
+    wanted = (
+        math.sqrt(1.2**2 + (1.2**2 + 1 / 6) / 4),
+        math.sqrt(2.0**2 + (0.9**2 + 1 / 6) / 4),
+    )
+    assert spot.sigma_px == pytest.approx(wanted)
+    assert (spot.gain_e_per_dn, spot.prnu, spot.electronics_dn) == (4.0, 0.01, 2.5)
+
+
+def test_each_star_s_place_counts_by_its_own_noise(rng):
+    """A star far off within its noise, and others near: no scatter beyond noise."""
+    noise_px = np.array([3.0] + [0.01] * 9)
+    off_px = noise_px[:, None] * np.tile([1.0, -1.0], (10, 1))
+    stars = replace(seen(rng, count=10), residual_px=off_px, place_noise_px=noise_px)
+    assert stars.beyond_px.sigma == pytest.approx(0.0, abs=1e-9)
+
+
+def test_fields_are_shown_over_the_noise_of_an_image_less_its_dark_one(monkeypatch, rng):
+    dark = 50 + rng.normal(0, 2.0, (90, 120))
+    asked = []
+    names = []
+
+    def shown(context, spot, noise_dn):
+        asked.append(noise_dn)
+        field = SimpleNamespace(codes=(np.zeros((2, 2), dtype=np.uint16),), expected=None)
+        return [field, field]
+
+    def compared(context, patterns, dark, expected, spot):
+        names.append([pattern.name for pattern in patterns])
+        return replace(seen(rng, count=3), lost=1, images=(patterns[0].name,))
+
+    monkeypatch.setattr(seen_stars.StarSpot, "of", lambda context: WIDE)
+    monkeypatch.setattr(seen_stars, "_mean_dark", lambda context, frames: (dark, ("dark",)))
+    monkeypatch.setattr(seen_stars, "_shown_fields", shown)
+    monkeypatch.setattr(seen_stars, "_compared", compared)
+    stars = see_stars(None, frames=3)
+    assert asked == [pytest.approx(math.sqrt(2) * noisiest_background(dark).noise)]
+    assert names == [
+        ["stars_000", "stars_000_01", "stars_000_02"],
+        ["stars_001", "stars_001_01", "stars_001_02"],
+    ]
+    assert (len(stars.dn), stars.lost, stars.frames) == (6, 2, 3)
+    assert stars.images == ("dark", "stars_000", "stars_001")
+
+
+def test_a_mean_dark_is_a_mean():
+    images = {0: np.full((2, 3), 10.0), 1: np.full((2, 3), 14.0)}
+    context = SimpleNamespace(dark=lambda number: number, read=images.get)
+    dark, paths = _mean_dark(context, 2)
+    assert dark.tolist() == [[12.0] * 3] * 2
+    assert paths == (0, 1)
+
+
+def test_stars_that_are_compared_are_alone_whole_within_both_edges_and_no_planets(monkeypatch):
+    """A tracker of 200 x 150 px; places on it and on a screen of 401 x 301 px, a star a row."""
+    rows = [
+        # hip, place, screen, light, drawn, clipped, catalogue's row
+        (1, (100, 75), (250, 100), 100.0, 1, 0, 4),
+        (2, (60, 75), (100, 200), 100.0, 1, 0, -1),  # a planet
+        (3, (30, 30), (200, 150), 100.0, 0, 0, 5),  # not drawn
+        (4, (30, 60), (200, 150), 100.0, 1, 1, 6),  # clipped
+        (5, (11, 100), (200, 150), 100.0, 1, 0, 7),  # at the tracker's edge
+        (6, (150, 40), (395, 150), 100.0, 1, 0, 8),  # at the screen's
+        (7, (150, 100), (200, 290), 100.0, 1, 0, 9),
+        (8, (150, 107), (200, 150), 1.0, 1, 0, 10),  # beside a brighter one
+        (9, (160, 20), (200, 150), 100.0, 1, 0, 11),
+        (10, (165, 20), (210, 150), 0.09, 1, 0, 12),  # too faint to disturb that
+        (11, (np.nan, np.nan), (200, 150), 100.0, 1, 0, 13),
+        (12, (20, 130), (40, 280), 100.0, 1, 0, 14),
+    ]
+    columns = [np.array(column) for column in zip(*rows, strict=True)]
+    hip, place, screen, light, drawn, clipped, row = columns
+    truth = {
+        "hip": hip,
+        "x_px": screen[:, 0],
+        "y_px": screen[:, 1],
+        "electrons_per_s": light,
+        "drawn": drawn.astype(bool),
+        "clipped": clipped.astype(bool),
+    }
+    camera = SimpleNamespace(project=lambda in_cam: place.T, resolution_px=(200, 150))
+    frame = SimpleNamespace(rows=truth, star=np.arange(12), q_icrs_to_cam=np.array([1.0, 0, 0, 0]))
+    stars = SimpleNamespace(directions=lambda star: np.zeros((len(star), 3)), row=row)
+    context = SimpleNamespace(
+        file=SimpleNamespace(config=SimpleNamespace(tracker=None), folder=None),
+        resolution_px=(401, 301),
+    )
+    monkeypatch.setattr(seen_stars, "tracker_camera", lambda settings, folder: camera)
+    monkeypatch.setattr(seen_stars, "_codes_mag", lambda *given: given[4][:, 0] / 100)
+    spot = StarSpot((1.0, 1.0), 4.0, 0.0, 0.0)
+    alone = _alone(SimpleNamespace(stars=stars), context, frame, (), spot)
+    assert alone.hip.tolist() == [1, 9, 12]
+    assert alone.place_px.tolist() == [[100, 75], [160, 20], [20, 130]]
+    wanted = [[0.25, -1 / 3], [0.0, 0.0], [-0.8, 130 / 150]]
+    np.testing.assert_allclose(alone.screen, wanted)
+    np.testing.assert_allclose(alone.codes_mag, [2.5, 2.0, 0.4])
+
+
+def test_stars_are_measured_in_the_mean_of_images_of_a_screen_that_is_half_as_bright(rng):
+    """Seven stars of which one saturates above its dark level, two that are not there, one of which
+    half the light would not show, and one that nothing is asked of.
+    """
+    spot = StarSpot((0.9, 1.1), 4.0, 0.0, 0.0)
+    place = np.array([[20.0 + 25 * k, 20.3 + 7 * k] for k in range(9)])
+    dn = np.array([3000.0, 4000, 5000, 6000, 8000, 9000, 24_000, 0, 0])
+    noise_dn = 4.0
+    # at which a star's second pixel is three thresholds of eight sigmas, in the mean of four
+    shown_dn = 24 * noise_dn / 2 / spot.second_share(place)
+    asked_dn = 2 * dn
+    asked_dn[7:] = 2 * shown_dn[7:] * [1.2, 0.7]
+    axes = []
+    for axis, (size, sigma) in enumerate(((240, 0.9), (100, 1.1))):
+        edges = np.arange(size + 1) - 0.5
+        axes.append(np.diff(ndtr((edges - place[:, axis, None]) / sigma), axis=1))
+    drawn = np.einsum("n,ny,nx->yx", dn, axes[1], axes[0])
+    exposure_s, floor_dn = 0.5, 600.0
+
+    def look(pattern, dark):
+        return SimpleNamespace(
+            path=pattern, image=drawn + rng.normal(0, noise_dn, drawn.shape), floor_dn=floor_dn
+        )
+
+    context = SimpleNamespace(look=look, exposure_s=exposure_s, full_dn=4095)
+    none = np.zeros((9, 2))
+    wanted = ExpectedStars(
+        hip=np.arange(9, dtype=np.int32),
+        place_px=place,
+        e_per_s=asked_dn * 4.0 / exposure_s,
+        screen=none,
+        codes_mag=none[:, 0],
+    )
+    stars = _compared(context, ["a", "b", "c", "d"], None, wanted, spot)
+    assert stars.hip.tolist() == [0, 1, 2, 3, 4, 5, 6]
+    assert (stars.images, stars.frames) == (("a", "b", "c", "d"), 4)
+    np.testing.assert_allclose(stars.dn, dn[:7], rtol=0.03)
+    # 0.8 of 4095 DN, of which the dark level has 600: 2676 DN; the brightest has 3500 in a pixel
+    assert 2676 < drawn.max() < 0.8 * 4095 + floor_dn
+    assert np.isinf(stars.noise_mag).tolist() == [False] * 6 + [True]
+    assert stars.lost == 1
+    pixels = (2 * spot.radius_px + 1) ** 2
+    photons = dn[0] / (4.0 * 4)
+    faint = MAG_A_RELATIVE * math.sqrt(photons + pixels * noise_dn**2 / 4) / dn[0]
+    assert stars.noise_mag[0] == pytest.approx(faint, rel=0.1)

@@ -14,7 +14,9 @@ from astropy.io import fits
 from PIL import Image
 
 from hilstar.basics.errors import InputError
+from hilstar.instruments.calibrate import sensor
 from hilstar.instruments.calibrate.sensor import (
+    Levels,
     _Figures,
     _system_gain,
     import_emva,
@@ -341,3 +343,66 @@ def test_the_error_of_a_gain_is_the_scatter_of_sensors_that_are_alike(rng):
     assert np.mean(gains) == pytest.approx(0.2, rel=SIGMAS * math.sqrt(2 / 3 / pixels / sensors))
     # a standard deviation of n values is known to 1 / sqrt(2 n)
     assert np.std(gains) == pytest.approx(np.mean(errors), rel=SIGMAS / math.sqrt(2 * sensors))
+
+
+@pytest.mark.parametrize(("largest_dn", "bits"), [(4095.0, 12), (4096.0, 13)])
+def test_a_sensor_s_figures_are_the_lines_of_its_frames(monkeypatch, largest_dn, bits):
+    """Levels without scatter, of 0.5 DN an electron; the fourth is full, and the fifth beyond it."""
+    k, prnu = 0.5, 0.02
+    dark_s = np.array([0.0, 2.0, 8.0])
+    signal_dn = np.array([200.0, 800.0, 1300.0, 2000.0, 2100.0])
+    flat_s = 0.1
+    under_dn2 = 0.25 * 36.0 + 1 / 12 + 0.25 * 40.0 * flat_s
+    temporal = under_dn2 + k * signal_dn
+    temporal[-1] = 50.0  # full
+    pattern0, pattern_s = (0.25 * 3.0**2), (0.25 * 0.7**2)
+    light = Levels(
+        100.0 + 20.0 * flat_s + signal_dn,
+        temporal,
+        pattern0 + pattern_s * flat_s**2 + (prnu * signal_dn) ** 2,
+        np.full(5, flat_s),
+        largest_dn,
+        (80, 60),
+    )
+    dark = Levels(
+        100.0 + 20.0 * dark_s,
+        0.25 * 36.0 + 1 / 12 + 0.25 * 40.0 * dark_s,
+        pattern0 + pattern_s * dark_s**2,
+        dark_s,
+        300.0,
+        (80, 60),
+    )
+    levels = {"FLATS": light, "--darks": dark}
+    monkeypatch.setattr(sensor, "read_levels", lambda paths, what: levels[what])
+    found = measure_sensor([], [])
+    keys = found.keys
+    wanted = {
+        "gain_e_per_dn": 2.0,
+        "offset_dn": 100.0,
+        "read_noise_e": 6.0,
+        "dsnu_e": 3.0,
+        "dsnu_e_per_s": 0.7,
+        "dark_e_per_s": 40.0,
+        "full_well_e": 4000.0,
+        "bits": bits,
+    }
+    assert {name: keys[name] for name in wanted} == pytest.approx(wanted)
+    # by the level nearest to half of full, without what dark frames have of it
+    assert keys["prnu"] == pytest.approx(prnu)
+    pattern_dn2 = (prnu * 800.0) ** 2
+    at_half = light.pattern_error_dn2[1] / math.sqrt(80 * 60)
+    sigma = at_half / (2 * math.sqrt(pattern_dn2)) / 800.0
+    assert found.sigmas["prnu"] == pytest.approx(sigma)
+    # the slope of signals up to 70 % of full alone, whose inverse is the gain
+    weight = 80 * 60 / 2 * (signal_dn[:3] / temporal[:3]) ** 2
+    slope_error = 1 / math.sqrt(weight.sum())
+    assert found.sigmas["gain_e_per_dn"] == pytest.approx(slope_error / k**2)
+    np.testing.assert_allclose(found.transfer[0], signal_dn)
+
+
+def test_frames_of_two_exposures_are_no_pair(tmp_path):
+    flats, _ = write_frames(tmp_path, SENSOR, LEVELS_E[:2])
+    with fits.open(flats[1], mode="update") as hdus:
+        hdus[0].header["EXPTIME"] = 0.2
+    with pytest.raises(InputError, match="its size or EXPTIME is not that of"):
+        sensor.read_levels(flats, "FLATS")

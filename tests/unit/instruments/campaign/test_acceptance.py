@@ -5,6 +5,7 @@ not accused, and plans that are wrong are refused.
 from __future__ import annotations
 
 import functools
+import tomllib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -254,6 +255,39 @@ def test_a_condition_on_no_column_is_refused_before_the_first_case(tmp_path: Pat
     text = ONE + 'condition = "rate_deg_s.x < 1"\n'
     assert "no key that the plan varies" in refusal(accepted, tmp_path, text)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_set_has_the_plan_s_seed_unless_it_has_its_own_and_the_columns_that_its_clauses_ask_for(
+    tmp_path: Path,
+) -> None:
+    """A sweep of single stars is found from their columns, and a set keeps those that it names."""
+    sets = (
+        "seed = 5\n[cases.a]\ncases = 4\n[cases.b]\ncases = 4\nseed = 9\ncolumns = ['time']\n"
+        "[cases.c]\ncases = 4\n[cases.c.sweep]\nkey = 'rate_deg_s.x'\nstart = 1\nstop = 2\n"
+        "star_v_mag = 4.0\n"
+    )
+    clauses = [
+        clause_text("availability", 0.9, "a", "minimum"),
+        clause_text("rate-bias x", 0.9, "b", "maximum"),
+        clause_text("c edge", 1.5, "c", "minimum"),
+    ]
+    plain, own, swept = read_plan_text(tmp_path, sets + "".join(clauses))
+    assert [each.tables["seed"] for each in (plain, own, swept)] == [5, 9, 5]
+    assert "columns" not in plain.tables
+    assert own.tables["columns"] == ["rate", "time"]
+    assert swept.tables["columns"] == ["stars"]
+
+
+@pytest.mark.parametrize(("whole", "value"), [(False, 2.6), (True, 3)])
+def test_a_level_is_varied_beside_what_its_set_varies(whole: bool, value: float) -> None:
+    sweep = SweepTable(key="rate_deg_s.x", start=1.0, stop=9.0, whole=whole)
+    other = {"key": "time_s", "values": [0.0]}
+    case_set = CaseSet("name", "", {"cases": 4, "vary": [other]}, sweep)
+    told = tomllib.loads(case_set.text(2.6))
+    assert told == {"cases": 4, "vary": [other, {"key": "rate_deg_s.x", "values": [value]}]}
+    assert tomllib.loads(case_set.text())["vary"] == [other]
+    alone = CaseSet("name", "", {"cases": 4}, sweep)
+    assert len(tomllib.loads(alone.text(2.6))["vary"]) == 1
 
 
 def test_what_a_display_cannot_change_is_not_tested_on_a_bench(tmp_path: Path) -> None:

@@ -377,3 +377,18 @@ def test_places_of_one_date_tell_no_motion(rng: np.random.Generator) -> None:
     verdict = figure_verdict(one_date, "proper-motion", maximum=1.0)
     assert (verdict.value, verdict.method) == (None, "cases at several dates tell it")
     assert figure_verdict(one_date, "catalogue-age", maximum=100.0).value is not None
+
+
+def test_cases_without_a_frame_that_reports_stars_tell_nothing_of_false_ones(
+    rng: np.random.Generator,
+) -> None:
+    cases = reported_stars(rng, false=2.0)
+    silent = CASES // 4
+    frames = cases.numbers["star_frames"].copy()
+    false = cases.numbers["star_false"].copy()
+    frames[:silent] = 0.0
+    false[:silent] = 99.0
+    numbers = cases.numbers | {"star_frames": frames, "star_false": false}
+    found = figure_verdict(dataclasses.replace(cases, numbers=numbers), "false-stars", maximum=9.0)
+    assert found.cases == CASES - silent
+    assert found.value == pytest.approx(false[silent:].sum() / frames[silent:].sum())

@@ -4,6 +4,7 @@ whose an answer is, and what a tracker that falls silent is waited for.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -320,3 +321,82 @@ def test_an_exposure_that_began_before_a_case_s_last_row_was_lit_is_not_its_own(
     cases.answer(cases.shown)
     cases.pass_s(0.02)
     assert cases.rows()[0]["received"] == 1
+
+
+def test_an_answer_that_fits_its_own_case_better_is_not_that_of_the_case_before(cases):
+    """The case before stood 100 arcsec beside this one: both would be right."""
+    cases.begin(0)
+    cases.pass_s(0.3)
+    turn = from_rotation_vector(np.array([100.0, 0.0, 0.0]) / ARCSEC_PER_RAD)
+    cases.run._before_q = multiply(turn, cases.shown)
+    cases.answer(cases.shown, off_arcsec=60.0)
+    cases.pass_s(0.02)
+    assert cases.run._now.late == 1
+    cases.answer(cases.shown, off_arcsec=40.0)
+    cases.pass_s(0.02)
+    (row,) = cases.rows()
+    assert (row["received"], row["late"], row["wrong"]) == (1, 1, 0)
+
+
+def test_a_first_attitude_is_that_of_the_first_right_answer_and_stays(cases):
+    cases.run._plan = msgspec.structs.replace(cases.run._plan, answers=3)
+    cases.begin(0)
+    for seconds, off_arcsec in ((0.2, 36_000.0), (0.2, 10.0), (0.2, -20.0)):
+        cases.pass_s(seconds)
+        cases.answer(cases.shown, off_arcsec=off_arcsec)
+    cases.pass_s(0.02)
+    (row,) = cases.rows()
+    assert (row["received"], row["wrong"]) == (3, 1)
+    assert row["first_attitude_s"] == pytest.approx(0.39, abs=0.011)
+
+
+def test_a_display_is_that_of_the_cases_it_shows_though_a_check_case_is_the_first(
+    tmp_path, monkeypatch
+):
+    """Two renderers by what they draw, with a check case before each case; a renderer's cases stand
+    together.
+    """
+    path = write_campaign(
+        tmp_path,
+        {"key": "sky.faintest_v_mag", "values": [3.0, 4.0]},
+        attitudes=ANY_SKY,
+        through="bench",
+        sampling="grid",
+        cases=6,
+        check_every=1,
+    )
+    plan, file = parse_plan(path, path.read_text()), read_bench_file(tmp_path / "bench.toml")
+    maker = CaseMaker(plan, file, tmp_path)
+    order = BenchOrder(plan, 6, maker, Design("grid", plan.seed, 6, maker.attitude_dimensions, [2]))
+    directory = Directory(tmp_path / "out")
+    run = BenchRun(
+        order,
+        bench_columns(maker.parameters),
+        directory,
+        source=Tracker(),
+        rules=RULES,
+        notices=Notices(),
+        on_done=lambda done: None,
+    )
+    drawn = []
+
+    @contextlib.contextmanager
+    def display(shown_file):
+        yield shown_file.config.sky.faintest_v_mag
+
+    def show(turns, faintest_v_mag):
+        drawn.append((faintest_v_mag, [number for number, _ in turns]))
+        return True
+
+    monkeypatch.setattr(run, "show", show)
+    assert run.run(display)
+    run.journal.close()
+    directory.close()
+    assert sorted(faintest for faintest, _ in drawn) == [3.0, 4.0]
+    for faintest_v_mag, numbers in drawn:
+        assert numbers[0] >= 6  # a check case
+        shown = [number for number in numbers if number < 6]
+        assert {order.case(number).values["sky.faintest_v_mag"] for number in shown} == {
+            faintest_v_mag
+        }
+    assert sorted(number for _, numbers in drawn for number in numbers) == list(range(13))

@@ -14,8 +14,9 @@ from astropy.io import fits
 from astropy.time import Time
 from scipy.spatial.transform import Rotation
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
-from hilstar.instruments.campaign.cases import CaseMaker, value_kind
+from hilstar.instruments.campaign.cases import CaseMaker, beside_q, value_kind
 from hilstar.instruments.campaign.job import Job, files_sha256
 from hilstar.instruments.campaign.plan import Design, Parameter, parse_plan
 from hilstar.instruments.campaign.session import Session
@@ -382,3 +383,73 @@ def test_frames_along_a_log_have_the_log_s_rate(tmp_path: Path) -> None:
 )
 def test_whole_values_are_whole_numbers_where_they_have_64_bits(values, kind) -> None:
     assert value_kind(Parameter("key", values)) == kind
+
+
+@pytest.mark.parametrize(
+    ("position_angle_deg", "radec"),
+    [(0.0, (84.0, 8.0)), (90.0, (94.0, -2.0)), (180.0, (84.0, -12.0))],
+)
+def test_a_position_angle_is_from_north_to_east(position_angle_deg, radec) -> None:
+    """Ten degrees from a place two degrees under the equator; to the east along a great circle."""
+    middle = to_matrix(from_radec_roll_deg(84.0, -2.0, 0.0))[2]
+    q = beside_q(middle, np.radians(10.0), np.radians(position_angle_deg), 30.0)
+    wanted = to_matrix(from_radec_roll_deg(*radec, 30.0))
+    assert np.degrees(np.arccos(to_matrix(q)[2] @ wanted[2])) < 0.04
+    back = to_matrix(beside_q(middle, 0.0, 1.0, 30.0))
+    assert back == pytest.approx(to_matrix(from_radec_roll_deg(84.0, -2.0, 30.0)), abs=1e-9)
+
+
+def maker_of(folder: Path, *vary: dict[str, Any], **keys: Any) -> CaseMaker:
+    path = write_campaign(folder, *vary, **keys)
+    file = read_bench_file(folder / "bench.toml")
+    return CaseMaker(parse_plan(path, path.read_text()), file, folder)
+
+
+def test_a_case_that_begins_at_a_log_s_end_stays_there(tmp_path: Path) -> None:
+    q = [" ".join(map(repr, from_radec_roll_deg(ra, 0.0, 0.0).tolist())) for ra in (80.0, 81.0)]
+    rows = [f"{t_s},{','.join(each.split())}" for t_s, each in zip((0.0, 2.0), q, strict=True)]
+    (tmp_path / "log.csv").write_text("t_s,qw,qx,qy,qz\n" + "\n".join(rows) + "\n")
+    maker = maker_of(tmp_path, attitudes={"kind": "log", "log": "log.csv"}, frames=4, step_s=0.5)
+    last = np.full(maker.attitude_dimensions + len(maker.parameters), 0.5)
+    last[0] = 0.75  # 1.5 s
+    case = maker.case(0, last)
+    times_ns = [maker.view(case, frame, 0.1).t_ns for frame in range(4)]
+    assert times_ns == [1_500_000_000, 2_000_000_000, 2_000_000_000, 2_000_000_000]
+    boresight = to_matrix(maker.view(case, 3, 0.1).q_icrs_to_cam)[2]
+    assert np.degrees(np.arctan2(boresight[1], boresight[0])) == pytest.approx(81.0, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("time_s", "length_s", "end_s"),
+    [(0.0, 3.0, 3.0), (0.0, 2.9, None), (1.0, 2.0, 2.0), (4.0, 9.0, None)],
+)
+def test_a_fault_ends_after_the_case_s_own_begin_and_within_it(
+    tmp_path: Path, time_s: float, length_s: float, end_s: float | None
+) -> None:
+    """The scenario's fault is over after 3 s of its own time."""
+    (tmp_path / "dark.toml").write_text(SCENARIO)
+    vary = ({"key": "scenario", "values": ["dark.toml"]}, {"key": "time_s", "values": [time_s]})
+    maker = maker_of(tmp_path, *vary)
+    case = maker.case(0, np.full(maker.attitude_dimensions + 2, 0.5))
+    assert maker.fault_end_s(case, length_s) == end_s
+
+
+@pytest.mark.parametrize("values", [[5.0, 20.0], [20.0, 5.0]])
+def test_the_fastest_jitter_has_to_be_shown(tmp_path: Path, values: list[float]) -> None:
+    """Six frames a swing: 10 Hz on a display of 60 Hz."""
+    vary = (
+        {"key": "jitter_arcsec.across", "values": [10.0]},
+        {"key": "jitter_hz", "values": values},
+    )
+    with pytest.raises(InputError, match="20 Hz on a display of 60 Hz; write at most 10"):
+        maker_of(tmp_path, *vary, through="bench")
+
+
+def test_a_case_s_seed_has_63_bits(tmp_path: Path) -> None:
+    """As many as a FITS header holds: half of them begin with a 1."""
+    maker = maker_of(tmp_path)
+    point = np.full(maker.attitude_dimensions + len(maker.parameters), 0.5)
+    seeds = [maker.case(number, point).noise_seed for number in range(40)]
+    assert len(set(seeds)) == 40
+    assert max(seeds) < 2**63
+    assert 8 < sum(seed >= 2**62 for seed in seeds) < 32

@@ -92,3 +92,26 @@ def test_a_quantity_of_further_columns_is_taken_with_them(tmp_path: Path) -> Non
     require = '[[require]]\nquantity = "rate-bias"\nmaximum = 1.0\n'
     plan = parse_plan(tmp_path / "plan.toml", plan_text(columns=["rate"]) + require)
     assert plan.columns == ("rate",)
+
+
+@pytest.mark.parametrize(
+    ("held", "varied", "values"),
+    [
+        ('epoch_utc = "2026-04-01T00:00:00Z"', "epoch_jyear", [2020.0, 2030.0]),
+        ("epoch_jyear = 2026.0", "epoch_utc", ["2020-01-01T00:00:00Z", "2030-01-01T00:00:00Z"]),
+    ],
+)
+def test_a_varied_date_stands_in_the_place_of_the_bench_s(
+    tmp_path: Path, held: str, varied: str, values: list[Any]
+) -> None:
+    plan = write_campaign(tmp_path, {"key": f"sky.{varied}", "values": values})
+    bench = tmp_path / "bench.toml"
+    text = bench.read_text()
+    assert "[sky]" not in text
+    bench.write_text(f"{text}\n[sky]\n{held}\n")
+    maker = CaseMaker(read_plan(plan), read_bench_file(bench), tmp_path)
+    dates = []
+    for share in (0.25, 0.75):
+        case = maker.case(0, np.append(np.full(maker.attitude_dimensions, 0.5), share))
+        dates.append(maker.bench(case).config.sky.epoch_jyear)
+    assert dates == pytest.approx([2020.0, 2030.0], abs=0.01)

@@ -120,6 +120,16 @@ PLANS += [
     (plan_text(JITTER, HZ, columns=["rate"]), "errors of the rate are not told"),
     (looking(*SUN, kind="body", body="venus"), "sky.bodies.planets"),
     (looking(*SUN, kind="body", body="pluto"), "pluto"),
+    (plan_text(SLEW, SLEW), 'key = "motion_s" stands there twice'),
+    (plan_text(PSF, SLEW, PSF), 'key = "tracker.psf_sigma_px" stands there twice'),
+    (noise("maximum = 3", """condition = 'why < "clouds"'"""), "such as"),
+    (noise("maximum = 3", """condition = 'why == clouds'"""), "such as"),
+    (plan_text() + '[centroids]\ncentroider = "psf"\npsf_focus_um = 5.0\n', 'psf is "tracker"'),
+    (
+        plan_text() + '[centroids]\ncentroider = "psf"\npsf = "gaussian"\npsf_focus_um = -5.0\n',
+        'psf is "gaussian"; leave it out',
+    ),
+    (plan_text() + "[centroids]\npsf_focus_um = 5.0\n", 'are for centroider = "psf"'),
 ]
 
 

@@ -300,3 +300,56 @@ def test_cases_without_a_frame_have_no_share_and_no_error() -> None:
     )
     by_name = {measure.name: measure for measure in results.measures(cases)}
     assert by_name["unanswered"].values.tolist() == [1.0] * 8 + [0.5] * 8
+
+
+@pytest.mark.parametrize("count", [16, 100])
+def test_a_median_is_as_sure_as_the_values_beside_the_middle_and_a_mean_as_its_scatter(count):
+    """Of even values from 0 to 1 the ranks half a root of their number to either side of a half."""
+    values = np.random.default_rng(3).permutation(np.linspace(0, 1, count))
+    assert results._level(values, False) == pytest.approx((0.5, 0.5 / math.sqrt(count)))
+    standard = values.std(ddof=1) / math.sqrt(count)
+    assert results._level(values, True) == pytest.approx((0.5, standard))
+
+
+def test_a_share_is_none_by_chance_and_all_where_bins_say_all():
+    """Of ranks in bins that chance made, on average, none; of bins that do not overlap, nearly all."""
+    rng = np.random.default_rng(4)
+    index = np.repeat(np.arange(8), 10)
+    # what bins of ten have by chance is 7 of 79; half of it is cut off at 0
+    shares = [results._share(rng.standard_normal(80), index, 8) for _ in range(200)]
+    assert np.mean(shares) < 0.04
+    apart = results._share(10.0 * index + rng.random(80), index, 8)
+    # within a bin the variance of ten ranks is 8.25 of 533.25
+    assert apart == pytest.approx(1 - 8.25 / 533.25, abs=0.005)
+
+
+def test_sure_costs_come_first_and_then_the_largest(rng: np.random.Generator):
+    """Errors that grow with `slow`, more with `fast`, and not with `none`, whose few wild bins cost
+    the most; a key with less than four cases in one of its bins has no cost.
+    """
+    count = 240
+    fast, slow = rng.integers(0, 3, (2, count))
+    few = np.zeros(count)
+    few[:3] = 1.0
+    z = (1 + 6 * fast + 2 * slow) * np.where(np.arange(count) % 2, 1.0, -1.0)
+    z = z * rng.uniform(0.9, 1.1, count)
+    columns = columns_of(
+        case=np.arange(count).tolist(),
+        frames=[1] * count,
+        solved=[1] * count,
+        wrong=[0] * count,
+        error_x_arcsec=[0.0] * count,
+        error_y_arcsec=[0.0] * count,
+        error_z_arcsec=z.tolist(),
+    )
+    varied = {"vary.none": rng.integers(0, 3, count), "vary.few": few}
+    varied |= {"vary.slow": slow, "vary.fast": fast}
+    for name, values in varied.items():
+        columns.numbers[name] = values.astype(float)
+    found = [cost for cost in costs(columns) if cost.measure == "roll"]
+    assert [cost.parameter for cost in found] == ["fast", "slow", "none"]
+    assert [cost.sure for cost in found] == [True, True, False]
+    assert found[0].places == (0.0, 1.0, 2.0)
+    assert (found[0].best, found[0].worst) == (0, 2)
+    levels = found[0].level
+    assert found[0].cost == pytest.approx(math.sqrt((levels**2).mean() - levels[0] ** 2))

@@ -7,6 +7,7 @@ from __future__ import annotations
 import resource
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,13 @@ from hilstar.basics.rotation import from_radec_roll_deg, from_rotation_vector, m
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.campaign import solvers
 from hilstar.instruments.campaign.plan import Centroiding
-from hilstar.instruments.campaign.solvers import SolverFault, choose_solver, printed_attitude
+from hilstar.instruments.campaign.solvers import (
+    SolverFault,
+    checked_attitude,
+    choose_solver,
+    printed_attitude,
+    tracker_facts,
+)
 from hilstar.instruments.campaign.tally import attitude_error_arcsec
 from hilstar.instruments.simulate.simulator import Exposure, Simulator
 from hilstar.server.answers.answer import ReportedStar
@@ -204,3 +211,38 @@ def test_an_answer_of_several_parts_has_each_of_them() -> None:
 def test_an_answer_that_is_none_is_the_solver_s_fault(told: dict[str, object]) -> None:
     with pytest.raises(SolverFault, match=r"^the solver"):
         solvers.whole_answer(told, "the solver")
+
+
+@pytest.mark.parametrize(
+    ("norm", "is_taken"), [(1.0009, True), (0.9991, True), (1.002, False), (0.998, False)]
+)
+def test_a_quaternion_is_a_unit_one_but_for_its_decimals(norm: float, is_taken: bool) -> None:
+    numbers = (norm * np.array([0.5, 0.5, -0.5, 0.5])).tolist()
+    if is_taken:
+        assert checked_attitude(numbers, "who") == pytest.approx([0.5, 0.5, -0.5, 0.5])
+        return
+    with pytest.raises(SolverFault, match="who: answered a quaternion of norm"):
+        checked_attitude(numbers, "who")
+
+
+def test_a_solver_is_told_the_field_along_the_image_s_width() -> None:
+    """1200 by 700 px of 13 um behind 65 mm: 5000 px, and twice the arc tangent of 600 of them."""
+    settings = SimpleNamespace(
+        resolution_px=(1200, 700),
+        focal_length_mm=65.0,
+        pixel_pitch_um=13.0,
+        principal_point_px=None,
+        exposure_s=0.2,
+    )
+    config = SimpleNamespace(tracker=settings, sky=SimpleNamespace(epoch_jyear=2026.5))
+    canvas = SimpleNamespace(psf=SimpleNamespace(width_px=(0.7, 0.8)))
+    facts = tracker_facts(SimpleNamespace(config=config, canvas=canvas))  # type: ignore[arg-type]
+    assert facts == {
+        "resolution_px": (1200, 700),
+        "focal_length_px": pytest.approx(5000.0),
+        "principal_point_px": (599.5, 349.5),
+        "fov_deg": pytest.approx(13.6855, abs=1e-4),
+        "psf_sigma_px": (0.7, 0.8),
+        "exposure_s": 0.2,
+        "epoch_jyear": 2026.5,
+    }

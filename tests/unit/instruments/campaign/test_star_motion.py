@@ -18,6 +18,7 @@ from hilstar.instruments.campaign.star_motion import (
     BRIGHTEST,
     YEARLY_TURN,
     StarMotion,
+    _observers,
     turn_of,
     with_motion,
 )
@@ -139,3 +140,55 @@ def test_a_field_s_stars_are_those_within_half_of_each_side_of_the_detector() ->
     stars = StarMotion(2026.0, vectors @ to_matrix(q), np.zeros_like(vectors), zeros)
     assert stars.in_field(q, Scale(1000.0, (800, 500))).tolist() == [0, 1]
     assert stars.in_field(q, Scale(1000.0, (500, 800))).tolist() == [3]
+
+
+def test_sirius_moves_as_hipparcos_has_it(motion: StarMotion) -> None:
+    """-546.01 mas a year along right ascension and -1223.08 along declination (HIP 32349)."""
+    dec_rad = math.radians(-16.7161)
+    ra_rad = math.radians(101.2872)
+    east = np.array([-math.sin(ra_rad), math.cos(ra_rad), 0.0])
+    north = np.array(
+        [
+            -math.sin(dec_rad) * math.cos(ra_rad),
+            -math.sin(dec_rad) * math.sin(ra_rad),
+            math.cos(dec_rad),
+        ]
+    )
+    yearly_mas = 1000 * ARCSEC_PER_RAD * motion.yearly[0]  # the brightest star
+    assert yearly_mas @ east == pytest.approx(-546.01, abs=0.5)
+    assert yearly_mas @ north == pytest.approx(-1223.08, abs=0.5)
+    assert np.linalg.norm(yearly_mas) == pytest.approx(math.hypot(546.01, 1223.08), abs=0.5)
+
+
+def test_a_field_with_a_near_star_has_no_likely_parallax(tmp_path: Path) -> None:
+    """Alpha Centauri: a parallax of 0.75 arcsec, of which 0.5 or more show at any time of the year.
+    Its proper motion of 3.7 arcsec is no part of that.
+    """
+    file = read_bench_file(write_bench(tmp_path, **OBSERVER))
+    moving = bench_moving(file.config, file.folder)
+    assert moving is not None
+    parallax = StarMotion.of(file).by_parallax(moving)
+    near = from_radec_roll_deg(219.9, -60.8, 0.0)
+    assert np.isnan(parallax.likely_turn_rad(near, SCALE)).all()
+    # 61 Cygni's 0.29 arcsec are no such
+    assert np.isfinite(parallax.likely_turn_rad(from_radec_roll_deg(316.7, 38.7, 0.0), SCALE)).all()
+
+
+def test_what_places_the_observer_is_told_as_the_bench_file_writes_it(tmp_path: Path) -> None:
+    """A table of cases has numbers for true and false, and texts as they are; a key of the tracker
+    places nobody.
+    """
+    file = read_bench_file(write_bench(tmp_path, **OBSERVER))
+    numbers = {
+        "frames": np.ones(2),
+        "vary.sky.bodies.sun": np.array([1.0, 0.0]),
+        "vary.sky.epoch_jyear": np.array([2026.0, 2027.5]),
+        "vary.tracker.exposure_s": np.array([0.1, 0.2]),
+    }
+    texts = {"vary.spacecraft.orbit": ["geocentre", "low.tle"]}
+    told = _observers(Columns(2, numbers, texts), file)
+    assert told == [
+        {"sky.bodies.sun": True, "sky.epoch_jyear": 2026.0, "spacecraft.orbit": "geocentre"},
+        {"sky.bodies.sun": False, "sky.epoch_jyear": 2027.5, "spacecraft.orbit": "low.tle"},
+    ]
+    assert [type(values["sky.bodies.sun"]) for values in told] == [bool, bool]

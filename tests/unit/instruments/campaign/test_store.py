@@ -17,6 +17,7 @@ from hilstar.instruments.campaign.store import (
     About,
     Directory,
     Journal,
+    failures,
     file_sha256,
     schema_of,
     write_table,
@@ -131,3 +132,33 @@ def test_a_campaign_file_that_is_none_is_refused(tmp_path: Path, text: bytes) ->
         pytest.raises(InputError, match=r"campaign\.json"),
     ):
         directory.claim(About({}, "", {}, "centroids", False, {}))
+
+
+def test_failures_are_counted_over_all_blocks_of_a_table(tmp_path: Path) -> None:
+    rows = []
+    for case, why in enumerate(("", "cloud", "", "dust", "cloud", "", "cloud")):
+        rows.append({"case": case, "status": "failed" if why else "done", "why": why})
+    path = tmp_path / "t.parquet"
+    columns = {"case": "int64", "status": "text", "why": "text"}
+    write_table(path, schema_of(columns, {}), iter([rows[:3], rows[3:4], rows[4:]]))
+    assert list(failures(path).items()) == [("cloud", 3), ("dust", 1)]
+
+
+@pytest.mark.parametrize(("cases", "blocks"), [(1, 1), (8, 1), (9, 2), (16, 2), (17, 3)])
+def test_blocks_hold_all_cases_and_one_that_is_full_takes_no_more(
+    tmp_path: Path, cases: int, blocks: int
+) -> None:
+    journal = Journal(tmp_path / "j", cases)
+    assert journal.blocks == blocks
+    assert [len(journal.missing(block)) for block in range(blocks)] == [
+        min(8, cases - 8 * block) for block in range(blocks)
+    ]
+    rows = [row(case) for case in range(cases)]
+    assert journal.append(rows) == cases
+    assert journal.append(rows) == 0
+    journal.close()
+    again = Journal(tmp_path / "j", cases)
+    assert again.append(rows) == 0
+    assert again.done == cases
+    assert not any(again.missing(block) for block in range(blocks))
+    again.close()

@@ -136,3 +136,46 @@ def test_a_sweep_by_factors_has_both_ends_above_0(start, stop, scale, is_taken) 
         return
     with pytest.raises(InputError, match=r"^set: "):
         sweep.check("set")
+
+
+@pytest.mark.parametrize(
+    ("successes", "cases", "told"),
+    [
+        (7, 7, (False, False)),  # 0.5^7 is more than a part of eight of 5 %
+        (8, 8, (True, False)),
+        (0, 7, (False, False)),
+        (0, 8, (False, True)),
+        (15, 16, (True, False)),
+        (9, 16, (False, False)),
+    ],
+)
+def test_a_level_shows_its_share_with_its_part_of_the_doubt(successes, cases, told) -> None:
+    sweep = SweepTable(key="k", start=1.0, stop=9.0, rounds=6)
+    assert sweep.shown(LevelCount(3.0, successes, cases), 0.95) == told
+
+
+@pytest.mark.parametrize("sense", [1.0, -1.0])
+def test_an_edge_is_between_the_farthest_level_that_passed_and_the_nearest_that_did_not(
+    sense: float,
+) -> None:
+    """In whatever order they were run."""
+    sweep = SweepTable(key="k", start=sense, stop=9 * sense, rounds=3)
+    counts = [
+        LevelCount(sense * level, successes, 16)
+        for level, successes in ((1.0, 16), (9.0, 0), (5.0, 2), (3.0, 14), (7.0, 1))
+    ]
+    found = edge_figure(sweep, counts, 0.95)
+    assert found.value == 4.0 * sense
+    assert sorted((sense * found.low, sense * found.high)) == [3.0, 5.0]
+    assert found.cases == 80
+
+
+@pytest.mark.parametrize(("scale", "level"), [("log", 10**0.5), ("linear", 65.811)])
+def test_the_widest_gap_is_halved_on_the_sweep_s_own_scale(scale: str, level: float) -> None:
+    """Passed at 10 and failed at 31.6, of which neither is sure. By factors the widest gap is that
+    from 1 to 10, by numbers that from 31.6 to 100.
+    """
+    sweep = SweepTable(key="k", start=1.0, stop=100.0, scale=scale, rounds=6)  # type: ignore[arg-type]
+    counts = [LevelCount(1.0, 16, 16), LevelCount(100.0, 0, 16)]
+    counts += [LevelCount(10.0, 9, 16), LevelCount(10**1.5, 7, 16)]
+    assert next_level(sweep, counts) == pytest.approx(level, abs=1e-3)

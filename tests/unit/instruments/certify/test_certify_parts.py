@@ -16,14 +16,17 @@ from scipy.interpolate import CubicSpline
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.geometric import fit as fits
-from hilstar.instruments.certify import estimates, lens
+from hilstar.instruments.certify import certificate, estimates, lens
 from hilstar.instruments.certify.bench_readings import LightReadings
-from hilstar.instruments.certify.budget import Input
+from hilstar.instruments.certify.budget import BudgetTrials, Combined, Input
 from hilstar.instruments.certify.certificate import (
     _contributions,
+    _figures,
     _input_row,
     _judged,
+    _monitor,
     _place_of,
     files_of,
 )
@@ -118,6 +121,46 @@ def test_a_figure_s_field_counts_from_0_and_its_star_has_its_own():
     assert _place_of(budget, "attitude_x", -1) == (None, 0, "field 0")
     assert _place_of(budget, "attitude_z", -3) == (None, 2, "field 2")
     assert _place_of(budget, "latency", 0) == (None, None, "screen")
+
+
+def test_a_certificate_s_monitor_is_the_one_that_was_read_or_else_of_its_files(monkeypatch):
+    """Of two files the second has an identity."""
+    filed = MonitorIdentity(maker="DEL", serial="filed")
+    origins = [SimpleNamespace(identity=None), SimpleNamespace(identity=filed)]
+    monkeypatch.setattr(certificate, "measured_on", lambda file: iter(origins))
+    monitor = SimpleNamespace(resolution_px=(1920, 1080), refresh_hz=60.0, calibration="srgb")
+    file = SimpleNamespace(config=SimpleNamespace(monitor=monitor))
+    read = MonitorIdentity(maker="DEL", serial="read")
+    facts = {"resolution_px": [1920, 1080], "refresh_hz": 60.0, "calibration": "srgb"}
+    for now, serial in ((read, "read"), (None, "filed")):
+        told = _monitor(file, now)  # type: ignore[arg-type]
+        assert told == facts | {"identity": {"maker": "DEL", "serial": serial}}
+    origins.clear()
+    assert _monitor(file, None)["identity"] == {}  # type: ignore[arg-type]
+
+
+def test_each_figure_has_its_own_numbers_and_a_truth_where_there_is_one():
+    """Three delays, of which the truth of two is known, and the trials of the second differ."""
+    names = [("latency", 0, "ms"), ("latency", 0, "ms"), ("latency", 0, "ms")]
+    budget = SimpleNamespace(not_assessed=[], names=names, inputs=[budget_input("a")])
+    value, standard = np.array([8.0, 9.0, 10.0]), np.array([0.5, 0.25, 0.0])
+    lower, upper = value - 3 * standard, value + 3 * standard
+    freedom = np.array([2.51, 1e6, 7.0])
+    combined = Combined(value, standard, freedom, lower, upper, standard[:, None])
+    moved = np.array([0.0, 0.5, 0.0])
+    drawn = BudgetTrials(value + moved, 1.1 * standard, lower + moved, upper + moved, 9, True)
+    file = certified("guarded", 8.0, max_latency_ms=1.6)
+    found = list(_figures(file, budget, combined, drawn, np.array([8.1, 9.2])))  # type: ignore[arg-type]
+    assert [each.truth for each in found] == [8.1, 9.2, None]
+    assert [each.value for each in found] == [8.0, 9.0, 10.0]
+    assert [each.k for each in found] == [3.0, 3.0, 0.0]
+    assert [each.dof for each in found] == [2.5, None, 7.0]
+    assert [(each.lower, each.upper) for each in found] == [(6.5, 9.5), (8.75, 10.25), (10.0, 10.0)]
+    assert [each.conforms for each in found] == [True, False, False]
+    assert [bool(each.by_trials.differs) for each in found] == [False, True, False]
+    assert found[1].by_trials.standard_uncertainty == pytest.approx(0.275)
+    unknown = SimpleNamespace(**vars(budget) | {"not_assessed": ["latency: no photodiode"]})
+    assert list(_figures(file, unknown, combined, drawn, None)) == []  # type: ignore[arg-type]
 
 
 def deviation(value: np.ndarray, sigma: float = 1e-6) -> LightDeviation:
@@ -321,6 +364,19 @@ def test_cells_correlate_as_the_means_over_them_do():
     np.testing.assert_allclose(turned, vectors.T @ values, atol=ROUNDING)
 
 
+def test_a_cell_with_half_of_its_readings_is_filled():
+    """Of four to a cell, one cell has two and another one."""
+    x_px, y_px = lattice(60, 60)
+    kept = np.ones(len(x_px), dtype=bool)
+    kept[(x_px == 100) & (y_px <= 20)] = False
+    kept[(x_px >= 200) & (x_px <= 210) & (y_px <= 20)] = False
+    kept[(x_px == 200) & (y_px == 0)] = True
+    cells = Cells(x_px[kept], y_px[kept])
+    assert cells.count[[5, 10]].tolist() == [2, 1]
+    assert np.flatnonzero(~cells.filled).tolist() == [10]
+    assert cells.typical == pytest.approx((898 * 4 + 2) / 899)
+
+
 def test_a_rectangle_leaves_the_empty_corner_out():
     x_px, y_px = lattice(12, 12)
     assert _rectangle(x_px, y_px).all()
@@ -355,6 +411,20 @@ def test_a_tilted_screen_s_terms_are_scales_lean_and_a_perspective_s_second_orde
     # a perspective moves a place along itself
     for number, factor in enumerate((u * u, u * v, v * v)):
         np.testing.assert_allclose(terms[:, :, 2 + number], [u * factor, v * factor])
+
+
+def test_a_dot_is_wild_along_either_axis_and_not_by_what_is_smooth(rng):
+    """Of errors of 0.1 arcsec about a cubic of 5."""
+    x_px, y_px = (rng.uniform(0, side, 400) for side in SIZE_PX)
+    read = SimpleNamespace(x_px=x_px, y_px=y_px)
+    u = x_px / 960 - 1
+    residual = np.stack([5 * u**3, np.zeros(400)], axis=1) + 0.1 * rng.standard_normal((400, 2))
+    residual[17, 0] += 5.0
+    residual[41, 1] -= 5.0
+    usable = np.ones(400, dtype=bool)
+    usable[3] = False
+    tame = lens._tame(read, residual, usable, SIZE_PX)  # type: ignore[arg-type]
+    assert np.flatnonzero(~tame).tolist() == [3, 17, 41]
 
 
 def test_waves_of_a_tracker_s_pixels_come_back_after_one_pixel():

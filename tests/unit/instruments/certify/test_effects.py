@@ -251,6 +251,16 @@ def test_a_map_of_errors_is_read_where_each_star_is_half_of_its_square_along_eac
         assert not place[axis, :, other].any()
 
 
+def test_a_place_whose_error_is_not_known_has_the_largest_of_the_map(tmp_path):
+    """Below 0 is unknown: the first of six, of which the largest is 7."""
+    rows = [[-1.0, 2.0, 3.0], [4.0, 7.0, 5.0]]
+    place = of_geometry(tmp_path, f"map_arcsec = {rows}\n")["geometry"].place
+    places = (np.array([-0.5, HEIGHT_PX - 0.5]), np.array([-0.5, 959.5, WIDTH_PX - 0.5]))
+    known = RegularGridInterpolator(places, [[7.0, 2.0, 3.0], [4.0, 7.0, 5.0]])
+    x_px, y_px = np.array(PLACES).T
+    assert place[0, :, 0] * math.sqrt(2) == pytest.approx(known((y_px, x_px)))
+
+
 def test_an_alignment_s_covariance_turns_the_sky_about_its_own_axes(tmp_path):
     """In the middle of the field a turn about x moves a star along y, and one about y along x."""
     error = "alignment_covariance_arcsec2 = [[4, 0, 0], [0, 9, 0], [0, 0, 100]]\n"
@@ -283,6 +293,39 @@ def test_levels_of_a_calibration_move_the_light_that_stars_have_of_them(tmp_path
     assert value.levels[0] == pytest.approx([1.0, 1.02])
     spread = np.sqrt((response.levels**2).sum(axis=0))
     assert spread == pytest.approx([0.03, 0.04])
+
+
+def test_levels_are_relative_to_white_with_what_they_have_in_common(tmp_path):
+    """Errors of black, which are 0.002 of white in all levels, and each level's own beside them."""
+    light, common = np.array([0.05, 0.1, 0.5, 1.0]), 0.002
+    relative = np.array([0.06, 0.03, 0.04, 0.01])
+    off = np.array([0.03, -0.01, 0.02, 0.005])
+    table = "".join(f"{code},{(code / 255) ** 2.2!r}\n" for code in range(256))
+    (tmp_path / "light.csv").write_text("code,w\n" + table)
+    (tmp_path / "light.toml").write_text(
+        '[calibration]\nkind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\n'
+        f'bits = 8\nresponse = "light.csv"\n[errors]\nlight = {light.tolist()}\n'
+        f"off = {off.tolist()}\nrelative = {relative.tolist()}\ndof = 20.0\ncommon = {common}\n"
+    )
+    file = bench(tmp_path, calibration="light.toml")
+    value = as_stated()
+    response = by_name(list(of_files(file, figures_of(file), value, [])))["response"]
+    black = common / light
+    own = relative**2 - black**2
+    of_stars = slice(1, 3)  # the stars' two levels are read themselves
+    assert value.levels[0] - 1 == pytest.approx(off[of_stars] - off[-1])
+    variance = own[of_stars] + own[-1] + (black[of_stars] - black[-1]) ** 2
+    assert (response.levels**2).sum(axis=0) == pytest.approx(variance)
+    (product,) = [response.levels[:, 0] @ response.levels[:, 1]]
+    apart = black[of_stars] - black[-1]
+    assert product == pytest.approx(own[-1] + apart[0] * apart[1])
+
+
+def as_stated() -> Deviations:
+    """A bench that is as its file says."""
+    return Deviations(
+        np.ones((1, 2)), np.zeros((1, COUNT)), np.zeros((1, COUNT, 2)), np.full(1, 8.0), np.zeros(1)
+    )
 
 
 def test_places_that_a_turn_moves_are_that_turn_of_the_attitude(tmp_path):

@@ -53,6 +53,11 @@ def test_what_turns_and_grows_about_the_middle_shifts_nothing_there():
     assert common.differing == []
 
 
+def test_a_motion_is_as_rich_as_its_stars_allow():
+    ranks = [rank_for(stars) for stars in (1, 5, 6, 12, 15, 16, 17)]
+    assert ranks == [1, 1, 2, 2, 2, 3, 3]
+
+
 @pytest.mark.parametrize("stars", [4, 6, 16, 40])
 def test_the_richest_motion_that_stars_determine_moves_them_as_they_moved(rng, stars):
     """A shift by 4 stars, turn and scale from 6 on, and from 16 on a camera's turn."""

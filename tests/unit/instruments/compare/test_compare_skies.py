@@ -8,12 +8,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 import hilstar
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.compare import MAX_LINES, assert_same_sky, compare
+from hilstar.instruments.compare.compare_skies import read_frame_fits
 from hilstar.instruments.compare.report import ChartPanel
 from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG
 from hilstar.instruments.compare.star_fit import star_psf
@@ -22,6 +24,7 @@ from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.sprites import pack_sprites
 from hilstar.server.bench.frame_files import write_frame_fits, write_truth_csv
 from tests.support.benches import SMALL_BENCH
+from tests.support.refusals import assert_file_refused
 
 ORION = from_radec_roll_deg(84.057, -1.2, 0.0)
 FAULT_MAG, FAULT_PX = 0.01, 0.02  # the smallest that must be seen
@@ -384,3 +387,48 @@ def test_what_is_no_sky_is_refused(scene):
         )
     with pytest.raises(AssertionError, match="missing"):
         assert_same_sky(nothing, golden)
+
+
+@pytest.mark.parametrize(
+    ("unit", "value", "words"),
+    [
+        ("electron/s", -1e29, ""),
+        ("adu", 1.0, "not a linear image in electron/s (BUNIT is 'adu')"),
+        (None, 1.0, "(BUNIT is None)"),
+        ("electron/s", 2e30, "a pixel has more than 1e+30 electron/s"),
+        ("electron/s", -2e30, "a pixel has more than 1e+30 electron/s"),
+    ],
+)
+def test_a_frame_is_electrons_per_second_of_a_size_that_can_be_squared(
+    tmp_path, unit, value, words
+):
+    image = np.zeros((3, 4), dtype=np.float32)
+    image[1, 2] = value
+    hdu = fits.PrimaryHDU(image)
+    if unit is not None:
+        hdu.header["BUNIT"] = unit
+    path = tmp_path / "frame.fits"
+    hdu.writeto(path)
+    if words:
+        assert_file_refused(read_frame_fits, path, words)
+    else:
+        np.testing.assert_array_equal(read_frame_fits(path), image)
+
+
+def test_cubes_are_compared_by_their_sum_and_each_channel_by_itself():
+    """A star that red has lost and blue has won is the same star in their sum."""
+    x, y = np.array([20.2, 60.4, 100.7, 50.1]), np.array([30.3, 80.1, 40.8, 20.6])
+    shares = np.array([[1.0, 2.0, 3.0, 1.5], [3.0, 1.0, 0.5, 2.0], [2.0, 2.5, 1.0, 1.0]])
+    golden = np.stack([grid(x, y, 1e5 * flux) for flux in shares])
+    moved = shares.copy()
+    moved[0, 1] -= 0.5
+    moved[2, 1] += 0.5
+    frame = np.stack([grid(x, y, 1e5 * flux) for flux in moved])
+    found = compare(frame, golden)
+    assert found.bad == [] and not found.same
+    light = sorted(star.flux_e_per_s for star in found.stars)
+    assert light == pytest.approx(sorted(1e5 * shares.sum(axis=0)), rel=1e-4)
+    errors_mag = {name: -2.5 * np.log10(1 + off) for name, off in (("r", -0.25), ("b", 0.2))}
+    for name, channel in found.channels.items():
+        off = [star.flux_error_mag for star in channel.bad]
+        assert off == pytest.approx([errors_mag[name]] if name in errors_mag else [], abs=1e-4)

@@ -10,7 +10,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.instruments.compare.report import MIN_ERROR, ChartPanel, draw, write_report
+from hilstar.instruments.compare import report
+from hilstar.instruments.compare.report import (
+    MAX_LISTED,
+    MIN_ERROR,
+    ChartPanel,
+    draw,
+    write_report,
+)
 from hilstar.instruments.compare.sky_comparison import (
     CommonChange,
     Limits,
@@ -222,3 +229,16 @@ def test_a_panel_with_what_is_common_has_its_stars_beyond_that():
     assert (light.common, light.limit) == (0.0456, 0.01)
     assert light.label("extra", 0) == "extra: 1\n(1 by what is common)"
     assert light.label("missing", 1) == "missing: 1"
+
+
+@pytest.mark.parametrize("more", [0, 1, 7])
+def test_the_page_lists_forty_stars_and_counts_those_beyond(monkeypatch, more):
+    monkeypatch.setattr(report, "drawing_of", lambda figure, words: "")
+    count = MAX_LISTED + more
+    stars = [replace(FAINTER, hip=(k,), flux_error_mag=1.0 + k) for k in range(count)]
+    *_, last = report._cards(comparison(stars), None)
+    page = last.html()
+    assert f"{count} stars that differ, the worst first" in page
+    assert page.count(" mag, ") == MAX_LISTED
+    assert (f"{more} more in compare.csv." in page) == (more > 0)
+    assert ("more in compare.csv" in page) == (more > 0)

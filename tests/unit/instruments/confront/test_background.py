@@ -185,3 +185,14 @@ def test_what_is_left_out_about_a_long_source_is_bounded(length_px, half_px):
     y, x = np.indices(dark.shape)
     reach_px = half_px + 2
     assert np.array_equal(mask, (abs(y - 140) <= reach_px) & (abs(x - 150) <= reach_px))
+
+
+@pytest.mark.parametrize(("length_px", "is_trail"), [(14, False), (30, True)])
+def test_a_thin_source_is_a_trail_where_it_is_long(length_px, is_trail):
+    """A bar that is over the threshold in its middle row alone."""
+    dn = np.zeros((60, 60))
+    dn[30, 10 : 10 + length_px] = 3.7
+    found = find_sources(dn)
+    assert len(found) == 1
+    assert found.length_px[0] > 5 * found.width_px[0]
+    assert found.trail.tolist() == [is_trail]

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilstar.instruments.confront import measured_bench
 from hilstar.instruments.confront.background import FixedPattern
 from hilstar.instruments.confront.light import NO_CORRECTION, LightFit
 from hilstar.instruments.confront.measured_bench import (
@@ -217,3 +218,20 @@ def test_what_was_written_is_the_camera_that_photographs_are_held_against(tmp_pa
     # 2 DN's steps have a variance of 4/12 DN^2, of which 1/12 is the detector's own
     coarse = fixed_camera(file, 2.0)
     assert coarse.pixels.read_noise_e**2 == pytest.approx(16.0 - GAIN**2 / 4)
+
+
+def test_a_site_is_written_without_its_sky_whose_light_was_measured(tmp_path):
+    site = "[site]\nlatitude_deg = 40.0\nlongitude_deg = 10.0\nheight_m = 0\nsky_v_mag_arcsec2 = 20.5\n"
+    t_ns = int(np.datetime64("2026-03-20T21:00:00", "ns").astype(np.int64))
+    session, _ = session_of(tmp_path, t_ns=t_ns, air=object())
+    given = tomllib.loads(GIVEN + site)
+    text = SimpleNamespace(
+        path=session.file.path, text=GIVEN + site, folder=session.file.folder,
+        config=session.file.config,
+    )  # fmt: skip
+    session.file = text
+    tables = measured_bench._tables(session, 0.5, True)
+    assert tables["site"] == {"latitude_deg": 40.0, "longitude_deg": 10.0, "height_m": 0}
+    assert given["site"]["sky_v_mag_arcsec2"] == 20.5
+    session.air = None
+    assert "site" not in measured_bench._tables(session, 0.5, True)

@@ -355,3 +355,32 @@ def test_a_catalogue_is_complete_by_the_latitude_s_size(latitude_deg, complete_v
     judging = SimpleNamespace(session=SimpleNamespace(shots=[shot], camera=camera))
     fainter = judge.Judge._fainter(judging, 0, None)
     assert fainter.complete_v_mag == pytest.approx(complete_v_mag, abs=1e-5)  # of the pole's digits
+
+
+def test_a_core_is_widened_by_colour_and_stays_an_ellipse():
+    """Covariances of 1 and 0.5 px^2 that are 1.4 times as large at a magnitude more of B-V; what
+    leans is at most 0.9 of the root of both, to either side.
+    """
+    middle = np.array([MIDDLE_PX[0]]), np.array([MIDDLE_PX[1]])
+    for lean, kept in ((0.2, 0.2), (5.0, 0.9 * math.sqrt(0.5)), (-5.0, -0.9 * math.sqrt(0.5))):
+        psf = StarPsf(np.array([[1.0], [0.5], [lean]]), 0.4, 0.0, 2.0, SIZE_PX)
+        assert psf.core(*middle, np.array([np.nan])) == pytest.approx(np.array([[1, 0.5, kept]]))
+        red = psf.core(*middle, np.array([MEAN_BV_MAG + 1.0]))
+        assert red == pytest.approx(1.4 * np.array([[1, 0.5, kept]]))
+
+
+def test_a_pixel_weighs_by_background_photons_and_one_hundredth_of_its_own_light():
+    """1000 DN at 0.5 e- a DN beside 100 DN^2: 2000 and 10^2 more."""
+    stamps = cut_stamps(np.zeros((20, 30)), np.full((20, 30), 100.0), *np.full((3, 1), 12.0))
+    weight = stamps.weight(np.full((1, 2 * HALF + 1, 2 * HALF + 1), 1000.0), 0.5)
+    assert weight == pytest.approx(1 / (100 + 2000 + 100))
+
+
+@pytest.mark.parametrize(("x_px", "y_px"), [(1.0, 8.0), (28.0, 8.0), (15.0, 1.0), (15.0, 18.0)])
+def test_pixels_beyond_each_edge_of_an_image_do_not_count(x_px, y_px):
+    """A star one pixel from an edge of 30 by 20 px: four rows or columns of its eleven are beyond."""
+    at = np.array([x_px]), np.array([y_px]), np.zeros(1)
+    stamps = cut_stamps(np.ones((20, 30)), np.ones((20, 30)), *at)
+    side = 2 * HALF + 1
+    assert int(np.isfinite(stamps.variance).sum()) == side * (side - HALF + 1)
+    assert stamps.values.sum() == side * (side - HALF + 1)

@@ -4,11 +4,14 @@ rest of the noise the pixels'.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from hilstar.instruments.confront.background import FixedPattern, fixed_pattern, sky_level
 from hilstar.instruments.confront.photon_transfer import (
+    PixelFit,
     _median_error,
     fit_pedestal,
     fit_pixels,
@@ -245,3 +248,42 @@ def test_a_background_without_a_free_part_has_the_bench_file_s_detector():
         assert found.pedestal_dn == offset_dn
         assert "no part of the background is free of sources" in found.notes[0]
         assert not found.gain_told
+
+
+def test_a_pixel_s_variance_is_of_its_light_above_the_pedestal_reading_and_rounding():
+    """100 DN above 60 at 0.4 e- a DN are 250 DN^2, 4 e- are 10 DN, and steps of 6 DN are 3 DN^2;
+    what lies under the pedestal has no light.
+    """
+    pixels = PixelFit(0.4, 60.0, 4.0, 6.0, {}, np.empty((0, 2)))
+    found = pixels.variance_dn2(np.array([160.0, 60.0, 20.0]))
+    assert found == pytest.approx([250 + 103, 103, 103])
+
+
+@pytest.mark.parametrize(
+    ("told_dn", "pedestal_dn"), [(40.0, 60.0), (80.0, 60.0), (20.0, 20.0), (100.0, 100.0)]
+)
+def test_a_pedestal_is_the_bench_s_unless_skies_are_three_sigmas_off_to_either_side(
+    told_dn, pedestal_dn
+):
+    """Of levels of 300 DN a shade of 3 % is 9 DN, beside 5 DN of the skies' own: 10.3."""
+    points = np.tile([300.0, 100.0], (400, 1))
+    bench = DetectorSettings(gain_e_per_dn=5.0, read_noise_e=10.0, offset_dn=60.0)
+    nothing = FixedPattern((0.0,) * 4, (math.inf,) * 4)
+    pixels = fit_pixels(points, 1.0, (told_dn, 5.0), bench, nothing)
+    assert pixels.pedestal_dn == pedestal_dn
+    assert pixels.sigma["pedestal_dn"] == pytest.approx(math.hypot(5.0, 9.0))
+
+
+def test_a_pattern_of_lines_is_in_half_of_the_differences():
+    """Columns of 8 DN and rows of 6 DN: differences along a row have the one, down a column the
+    other, of which points are the mean.
+    """
+    gain, read_e, light_dn = 4.0, 8.0, 200.0
+    squares = (0.0, 0.0, 64.0, 36.0)
+    pattern = FixedPattern(squares, (1e-9,) * 4)
+    variance_dn2 = light_dn / gain + (read_e / gain) ** 2 + 1 / 12 + (64.0 + 36.0) / 2
+    bench = DetectorSettings(gain_e_per_dn=9.0, read_noise_e=read_e)
+    points = np.tile([light_dn, variance_dn2], (400, 1))
+    pixels = fit_pixels(points, 1.0, None, bench, pattern)
+    assert pixels.gain_told
+    assert pixels.gain_e_per_dn == pytest.approx(gain)

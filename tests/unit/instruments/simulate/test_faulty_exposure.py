@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,10 +13,13 @@ import hilstar
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import angle_between_rad
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
-from hilstar.instruments.simulate.exposures import faulty_exposure
+from hilstar.instruments.simulate import exposures
+from hilstar.instruments.simulate.exposures import LogFaults, faulty_exposure
 from hilstar.instruments.simulate.pictures import TrackerPictures
-from hilstar.instruments.simulate.simulator import Simulator
-from hilstar.optics.layers.fault_kinds import Now
+from hilstar.instruments.simulate.simulator import FrameNoise, Simulator, _merge
+from hilstar.optics.layers.fault_kinds import KINDS, Now
+from hilstar.optics.layers.truth import TRUTH_DTYPE
+from hilstar.optics.layers.view import STILL, View
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.fault_views import faults_at
@@ -197,3 +201,81 @@ def test_a_simulation_s_pictures_have_the_faults_of_the_display(tmp_path):
 
 def dn_of(png):
     return np.asarray(Image.open(io.BytesIO(png)), dtype=np.uint16) >> 4
+
+
+def test_light_of_one_point_in_two_pieces_is_in_the_middle_of_it():
+    rows = np.zeros(2, dtype=TRUTH_DTYPE)
+    rows["x_px"], rows["y_px"] = [10.0, 14.0], [8.0, 4.0]
+    rows["electrons_per_s"] = [30.0, 10.0]
+    _merge(rows[0], rows[1])
+    assert (rows["x_px"][0], rows["y_px"][0]) == pytest.approx((11.0, 7.0))
+    assert rows["electrons_per_s"][0] == 40.0
+
+
+def test_faults_of_a_log_count_from_its_first_sample(monkeypatch):
+    """Of a clock that is far from 0; a display that stands still has the log's own attitude."""
+    start_ns, second_ns = 10**15, NS_PER_S
+    turned = np.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0])
+    samples = [
+        AttitudeSample(start_ns, np.array([1.0, 0.0, 0.0, 0.0])),
+        AttitudeSample(start_ns + 2 * second_ns, turned),
+    ]
+    asked = []
+    monkeypatch.setattr(exposures, "simulator_view", lambda *_: SimpleNamespace(prepare=None))
+    monkeypatch.setattr(exposures, "Timetable", lambda *parts: parts)
+    monkeypatch.setattr(exposures, "pieces_of", lambda *parts: asked.append(parts) or ())
+    tracker = SimpleNamespace(exposure_s=0.1)
+    simulator = SimpleNamespace(config=SimpleNamespace(tracker=tracker))
+    views = [View.exposure(turned, STILL, 0.1, start_ns + at) for at in (0, second_ns)]
+    assert LogFaults("scenario", samples).pieces(simulator, views) == [(), ()]
+    assert [run_ns for _, run_ns, _, _ in asked] == [0, second_ns]
+    assert asked[0][2][0] == "scenario" and asked[0][2][2] == 0.1
+    attitude_at = asked[0][3]
+    assert attitude_at(2 * second_ns) == pytest.approx(turned)
+    half = np.array([np.cos(0.05), 0.0, np.sin(0.05), 0.0])
+    assert angle_between_rad(attitude_at(second_ns), half) < 1e-9
+
+
+class Exposing:
+    """A simulator that says what it was asked to expose: 12 bits of one level."""
+
+    def __init__(self):
+        self.asked = []
+        self.config = SimpleNamespace(tracker=SimpleNamespace(detector=SimpleNamespace(bits=12)))
+
+    def view(self, q, rate, t_ns, velocity_km_s, place_km):
+        return View.exposure(q, rate, 0.1, t_ns, velocity_km_s, place_km)
+
+    def expose(self, view, rng, faults):
+        shown = view if faults is None else faults.pieces[0].view
+        self.asked.append((shown, float(rng.normal())))
+        return SimpleNamespace(dn=np.full((2, 3), 0x123, dtype=np.uint16))
+
+
+def test_pictures_of_a_run_have_a_noise_each_and_stand_where_the_display_does():
+    made = object.__new__(TrackerPictures)
+    made._simulator = Exposing()
+    made._noise = FrameNoise("full")
+    made._count = 0
+    made._stood = None
+    made._view = None
+    frozen = Now(1, KINDS["freeze"](name="stuck"), 0)
+    on = []
+    made._now = lambda: tuple(on)
+    rate = np.array([0.0, 0.02, 0.0])
+    first = AttitudeSample(5, np.array(ORION_Q), rate)
+    away = AttitudeSample(9, np.array([0.6, 0.8, 0.0, 0.0]), rate)
+    for sample, faults in ((first, []), (away, [frozen]), (away, [frozen]), (away, [])):
+        on[:] = faults
+        picture = np.asarray(Image.open(io.BytesIO(made(sample))), dtype=np.uint16)
+        assert (picture == 0x1230).all()
+    views = [view for view, _ in made._simulator.asked]
+    for view, sample, is_still in zip(
+        views, (first, first, first, away), (False, True, True, False), strict=True
+    ):
+        np.testing.assert_array_equal(view.q_icrs_to_cam, sample.q_icrs_to_cam)
+        assert view.t_ns == sample.t_ns
+        np.testing.assert_array_equal(view.turn.rate_cam_rad_s, STILL if is_still else rate)
+    noise = [drawn for _, drawn in made._simulator.asked]
+    wanted = [np.random.default_rng((0, number)).normal() for number in range(4)]
+    assert noise == wanted

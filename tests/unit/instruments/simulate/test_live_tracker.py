@@ -4,6 +4,8 @@ errors that are planted.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -18,8 +20,14 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.instruments.simulate import live_exposure
 from hilstar.instruments.simulate.answer_link import answer_packet, json_answer
 from hilstar.instruments.simulate.live_exposure import (
+    BLINDED,
+    BLINDED_SHARE,
+    LOST,
+    TOO_FEW,
+    TRACKING,
     Exposed,
     LiveTracker,
     Solved,
@@ -29,7 +37,8 @@ from hilstar.instruments.simulate.live_exposure import (
 from hilstar.instruments.simulate.tracker_process import OwnClock, Planted, PlantedErrors
 from hilstar.server.answers.answer import Answer, ReportedStar
 from hilstar.server.bench.bench_file import read_bench_file
-from hilstar.tracker.identify import FoundStars, Identified
+from hilstar.tracker.centroids import Centroids
+from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified
 from tests.support.benches import bench_text
 
 PERIOD_NS = 100
@@ -160,6 +169,132 @@ def test_a_tracker_expects_where_its_last_two_attitudes_lead_and_nothing_after_f
         assert live._expected(solved_at(6 * NS_PER_S, start).exposed) is None
     finally:
         live.lost_in_space = None
+
+
+@pytest.mark.parametrize(("apart_s", "is_known"), [(0.1, True), (1.0, True), (1.1, False)])
+def test_two_attitudes_tell_a_rate_up_to_a_second_apart(live, apart_s, is_known):
+    rate = np.array([0.01, -0.02, 0.3])
+    start = np.array([0.5, 0.5, -0.5, 0.5])
+    for at_s in (0.0, apart_s):
+        live._answered(solved_at(round(at_s * NS_PER_S), propagate(start, rate, at_s)))
+    wanted = rate if is_known else np.zeros(3)
+    assert live.rate_cam_rad_s() == pytest.approx(wanted, abs=1e-9)
+
+
+def stars_of(count: int) -> FoundStars:
+    """Stars of 100, 110, ... e-, 1.5 px wide but for the first, whose width is not known."""
+    along = np.arange(count, dtype=float)
+    width_px = np.where(along, 1.5, np.nan)
+    return FoundStars(along, 2 * along, 100.0 + 10 * along, np.zeros((count, 3)), width_px)
+
+
+@pytest.mark.parametrize(
+    ("count", "full_share", "fits", "guesses", "mode"),
+    [
+        (9, 0.0, True, True, TRACKING),
+        (9, BLINDED_SHARE - 1e-3, True, True, TRACKING),
+        (9, BLINDED_SHARE + 1e-3, True, True, BLINDED),
+        (MIN_STARS - 1, 0.0, False, None, TOO_FEW),
+        (MIN_STARS, 0.0, False, None, LOST),
+        (MIN_STARS, 0.0, False, False, LOST),
+        (0, 0.0, False, True, TOO_FEW),
+    ],
+)
+def test_a_tracker_says_why_it_has_no_attitude(
+    live, monkeypatch, count, full_share, fits, guesses, mode
+):
+    """`guesses`: whether a solver finds a lost one's attitude, None without a solver."""
+    dn = np.zeros((100, 100), dtype=np.uint16)
+    dn.ravel()[: round(full_share * dn.size)] = 2**16 - 1
+    found = Identified(IDENTITY, np.arange(2), np.arange(2), 0.0)
+    asked = []
+
+    def identify(stars, q, near, place):
+        asked.append(q)
+        return found if fits else None
+
+    monkeypatch.setattr(live_exposure, "identify", identify)
+    monkeypatch.setattr(live, "_found", lambda dn, exposed, expected: stars_of(count))
+
+    def solver(stars, dn):
+        return IDENTITY if guesses else None
+
+    monkeypatch.setattr(live, "lost_in_space", None if guesses is None else solver)
+    monkeypatch.setattr(live, "_expected", lambda exposed: IDENTITY)
+    solved = live.solve(solved_at(0, IDENTITY).exposed, dn)
+    assert solved.mode == mode
+    assert (solved.identified is found) == (mode == TRACKING)
+    assert len(asked) == (0 if mode == BLINDED else 1 + bool(guesses and not fits and count))
+
+
+@pytest.mark.parametrize(
+    ("rate_rad_s", "window_px", "is_still"),
+    [
+        ((0.0, 0.0, 9.0), 1.0, True),
+        ((0.3, 0.4, 0.0), 1.0, True),
+        # a streak of 8 px, and one that is wider than any window
+        ((4.8, 6.4, 0.0), 8 / 12**0.5, False),
+        ((0.0, 90.0, 0.0), 6.0, False),
+    ],
+)
+def test_the_window_is_as_wide_as_an_even_streak(
+    live, monkeypatch, rate_rad_s, window_px, is_still
+):
+    """Of a tracker whose pixel is a 1000th of a radian, in exposures of a millisecond."""
+    asked = []
+
+    def find(image, settings, background):
+        asked.append(settings)
+        none = np.zeros(0)
+        return Centroids(none, none, none, none, np.zeros(0, np.intp), np.zeros(0, bool))
+
+    monkeypatch.setattr(live_exposure, "find_stars", find)
+    camera = SimpleNamespace(focal_length_px=1000.0, rays=lambda x, y: np.ones((0, 3)))
+    monkeypatch.setattr(live, "camera", camera)
+    monkeypatch.setattr(live, "exposure_s", 1e-3)
+    monkeypatch.setattr(live, "rate_cam_rad_s", lambda: np.array(rate_rad_s))
+    live._found(np.full((48, 64), 100, dtype=np.uint16), solved_at(0, IDENTITY).exposed, None)
+    (settings,) = asked
+    assert settings.window_sigma_px == pytest.approx(window_px)
+    assert (settings.psf_sigma_px is not None) == is_still
+
+
+def test_the_brightest_stars_are_reported_in_dn_with_what_is_known(live):
+    """At 2 e- a DN: the second and the fourth are of the catalogue, one by no number."""
+    live.adjust(0.05, 0.0)
+    stars = stars_of(40)
+    named = np.flatnonzero(live.stars.hip > 0)[:1]
+    identified = Identified(IDENTITY, np.array([1, 3]), np.append(named, named), 0.0)
+    hip = int(live.stars.hip[named[0]])
+    solved = Solved(solved_at(0, IDENTITY).exposed, TRACKING, stars, identified)
+    reported = live.reported_stars(solved)
+    assert len(reported) == 30
+    for k, star in enumerate(reported):
+        assert (star.x_px, star.y_px) == (k, 2 * k)
+        assert star.dn == pytest.approx((100 + 10 * k) / 2)
+        assert star.hip == (hip if k in (1, 3) else None)
+        assert star.width_px == (1.5 if k else None)
+    live.adjust(0.05, 20.0)
+    assert live.reported_stars(solved)[0].dn == pytest.approx(500.0)
+    live.adjust(0.05, 0.0)
+
+
+def test_an_uneven_dark_grows_with_the_client_s_exposure_and_gain(live, monkeypatch):
+    """1000 to 3000 e- at 2 e- a DN, above an offset of 100 DN."""
+    ramp_e = np.linspace(1000.0, 3000.0, 48 * 64).reshape(48, 64)
+    live.adjust(0.05, 0.0)
+    monkeypatch.setattr(live, "_bench_under_e", ramp_e)
+    try:
+        for exposure_s, gain_db, dn_per_e in (
+            (0.1, 0.0, 1.0),
+            (0.05, 20.0, 5.0),
+            (0.025, 0.0, 0.25),
+        ):
+            live.adjust(exposure_s, gain_db)
+            np.testing.assert_allclose(live._dark_dn, 100 + dn_per_e * ramp_e)
+    finally:
+        monkeypatch.undo()
+        live.adjust(0.05, 0.0)
 
 
 def test_its_own_clock_is_off_and_drifts_and_is_turned_back():

@@ -307,6 +307,9 @@ def test_nea_is_the_scatter_of_attitudes_from_stars_off_by_their_bounds():
         math.hypot(x, y) / math.sqrt(2), rel=4 / math.sqrt(4 * trials)
     )
     assert about[-1] == pytest.approx(z, rel=4 / math.sqrt(2 * trials))
+    # of stars that every second exposure has: half the information
+    rare = nea_arcsec(turns, np.stack([sigma_px] * 2), np.full(count, 0.5))
+    np.testing.assert_allclose(rare[:, 1:], math.sqrt(2) * np.stack([across, about])[:, 1:])
     lost = np.stack([np.where(np.arange(count) < 2, (np.nan, 1e6) * (count // 2), sigma_px)] * 2)
     # stars without a place are none
     assert np.isinf(nea_arcsec(turns, lost, np.ones(count))[:, :3]).all()
@@ -570,3 +573,29 @@ def test_a_field_s_budget_is_of_its_own_stars_in_the_light_behind_each(tmp_path,
     above = [row for row in found.rows if row["detection"] < 0.5]
     assert below[-1]["v_mag"] <= found.found_v_mag <= above[0]["v_mag"]
     assert found.rows[0]["v_mag"] <= stars.v_mag[inside].min() < found.rows[0]["v_mag"] + 1
+
+
+def test_the_light_behind_a_star_is_that_of_the_pixel_whose_half_sides_hold_it():
+    image = np.arange(20.0).reshape(4, 5)
+    field = np.zeros(4, dtype=[("x_px", "f8"), ("y_px", "f8")])
+    field["x_px"], field["y_px"] = [2.3, 2.7, -0.4, 4.4], [1.2, 0.8, 2.6, -0.3]
+    assert noise._at_stars(image, field).tolist() == [7.0, 8.0, 15.0, 4.0]
+
+
+def test_limits_by_magnitude_are_medians_of_fields_with_the_stars_up_to_each():
+    """Of three fields, the last without a star; NEA falls with the stars."""
+    fields = []
+    for v_mag in ([3.1, 4.0, 4.6], [3.5, 3.75], []):
+        rows = np.zeros(len(v_mag), dtype=[("v_mag", "f8")])
+        rows["v_mag"] = v_mag
+        fields.append(rows)
+    who, ways = len(noise.WHO), 2
+    scale = np.arange(1.0, who * ways + 1).reshape(who, ways, 1)
+    curves = [scale * np.array(by_star) for by_star in ([np.inf, 9.0, 5.0], [np.inf, 4.0], [])]
+    rows = noise._nea_rows(fields, curves, 4.6)
+    assert [row["v_mag"] for row in rows] == [4.0, 4.25, 4.5, 4.6]
+    # a star of just the limit is used; without two stars a field has no attitude
+    assert [row["stars"] for row in rows] == [2.0, 2.0, 2.0, 2.0]
+    for row, median in zip(rows, (9.0, 9.0, 9.0, 5.0), strict=True):
+        for number, name in enumerate(noise.NEA_COLUMNS, start=1):
+            assert row[name] == number * median

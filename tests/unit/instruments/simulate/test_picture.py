@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import label
 
-from hilstar.instruments.simulate.eye_picture import MAX_RADIUS_PX, exposure_picture
+from hilstar.instruments.simulate.eye_picture import MAX_RADIUS_PX, _discs, exposure_picture
 
 FULL = 2900  # DN at which every one of these stars is full
 SKY_DN, NOISE_DN = 80, 5
@@ -121,3 +121,25 @@ def test_a_star_at_the_edge_is_drawn_as_far_as_the_frame_goes(rng):
     assert picture[0, 199] == 255
     assert (picture[:MAX_RADIUS_PX, -MAX_RADIUS_PX:] == 255).mean() > 0.6
     assert (picture == 255).sum() < (MAX_RADIUS_PX + 1) ** 2
+
+
+@pytest.mark.parametrize(("share", "radius_px"), [(1.0, 8), (0.5, 5), (0.25, 3)])
+def test_a_disc_s_radius_is_of_a_power_of_its_light(rng, share, radius_px):
+    """8 px for the brightest, and of a share of its light that to 0.77."""
+    assert radius_px == round(MAX_RADIUS_PX * share**0.77)
+    picture = picture_of(noisy_frame(rng, [(60, 50, 2500), (120, 130, 2500 * share)]))
+    disc = picture[112:129, 122:139]
+    wanted = disc_pixels(8, 8, radius_px, size=17)
+    assert (disc[wanted] == disc[8, 8]).all()
+    assert not (disc[~wanted] == disc[8, 8]).any()
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+@pytest.mark.parametrize(
+    ("greys", "row"), [((0.9, 0.4), [0.9] * 7 + [0.4]), ((0.4, 0.9), [0.4] + [0.9] * 7)]
+)
+def test_of_two_discs_the_brighter_shows(order, greys, row):
+    kept = list(order)
+    places = (np.array([10, 10])[kept], np.array([10, 13])[kept])
+    drawn = _discs((21, 30), places, np.full(2, 4.0), np.array(greys)[kept])
+    assert drawn[10, 8:16].tolist() == row

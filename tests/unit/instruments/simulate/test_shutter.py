@@ -4,6 +4,8 @@ display in closed form.
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.special import ndtr
@@ -316,3 +318,20 @@ def test_rows_are_exposed_in_the_order_that_the_bench_file_says_in_microseconds(
     late_s = view.scan.late_s(np.array([3.0, 3.0, 70.0]), np.array([0.0, 99.0, 49.5]), (80, 100))
     first_s = -99 / 2 * 40e-6 if direction == "down" else 99 / 2 * 40e-6
     assert late_s == pytest.approx([first_s, -first_s, 0.0], abs=1e-9)
+
+
+def test_a_triggered_exposure_begins_with_its_frame_and_a_free_one_anywhere_in_it():
+    """From the middle of an exposure of 30 ms, at 50 Hz."""
+
+    def phases_s(trigger: str) -> list[float]:
+        twin = object.__new__(Twin)
+        tracker = SimpleNamespace(trigger=trigger, exposure_s=0.03)
+        monitor = SimpleNamespace(refresh_hz=50.0)
+        twin.config = SimpleNamespace(tracker=tracker, monitor=monitor)
+        return [twin._phase_s(frame) for frame in range(200)]
+
+    assert set(phases_s("frame")) == {-0.015}
+    free_s = np.sort(phases_s("free"))
+    assert free_s[0] == 0.0 and free_s[-1] < 0.02
+    # 200 moments fill a refresh evenly: none is farther from the next than three 200ths of it
+    assert np.diff(free_s).max() < 3 * 0.02 / 200

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.instruments.simulate.star_finder import StarFinder, crowded, nearest, shared
+from hilstar.instruments.simulate.star_finder import (
+    StarFinder,
+    crowded,
+    nearest,
+    shared,
+    star_finder,
+)
 from hilstar.instruments.verify.verdict import median
 from hilstar.optics.psf import GaussianPsf
 from hilstar.tracker.centroiders import FAMILY
 from hilstar.tracker.centroids import Centroids, CentroidSettings, LocalBackground
+from hilstar.tracker.settings import DetectorSettings
 
 # Of a star of sigma 1 px in pixels: a window's S-curve, a box's cut wings.
 BIAS_PX = {"moment": 1e-3, "window": 0.03, "wide": 0.03, "fit": 1e-3, "box3": 0.3, "box5": 0.1}
@@ -72,3 +80,34 @@ def test_each_centroider_places_stars_where_they_are_also_aside_and_at_the_edge(
     assert np.isfinite(found).all()
     assert np.abs(found[:, :2] - np.array(places[:2]).T).max() < BIAS_PX[kind]
     assert 0 <= found[0, 2] < 1.5 and abs(found[1, 2] - 30.2) < BIAS_PX[kind]
+
+
+@pytest.mark.parametrize(("bayer", "least"), [(None, 1.0), ("rggb", 0.25)])
+def test_blobs_begin_at_a_fifth_of_the_faintest_star_s_peak_of_red_in_a_mosaic(bayer, least):
+    """Stars of 50 e-/s that are drawn, and fainter ones that are not; three monitor pixels to one
+    of the tracker.
+    """
+    detector = DetectorSettings(bayer=bayer)
+    config = SimpleNamespace(
+        tracker=SimpleNamespace(exposure_s=0.2, detector=detector),
+        verify=SimpleNamespace(centroider=None),
+    )
+    bench = SimpleNamespace(
+        config=config,
+        psf=SimpleNamespace(width_px=(0.9, 1.2)),
+        tracker_psf=GaussianPsf((0.6, 0.8)),
+        shown_stars=SimpleNamespace(electrons_per_s=np.array([900.0, 3.0, 50.0, 49.0])),
+        faintest_shown_e_per_s=50.0,
+    )
+    finder = star_finder(bench, 3.0)
+    # sampled and shown by squares of a monitor pixel each
+    sigma_px = [
+        math.sqrt(own**2 + (shown**2 + 2 / 12) / 9) for own, shown in ((0.6, 0.9), (0.8, 1.2))
+    ]
+    if bayer is None:
+        assert finder.psf.width_px == pytest.approx(sigma_px)
+    peak_e = 50.0 * 0.2 * finder.psf.peak_share
+    threshold_e = finder.background.noise * finder.settings.threshold_sigma
+    assert threshold_e == pytest.approx(0.2 * least * peak_e)
+    assert finder.background.level == 0.0
+    assert finder.centroider == "window" and finder.told is None

@@ -4,6 +4,7 @@ it is sent, and what it counts.
 
 from __future__ import annotations
 
+import itertools
 import threading
 from types import SimpleNamespace
 from typing import Any
@@ -191,7 +192,10 @@ def test_exposures_follow_the_tracker_s_own_clock_from_the_first_frame_to_the_ru
 ) -> None:
     """A clock that is fast by 1 % has a period of 198 ms of the host's; in 2 s eleven begin."""
     display = Display(FakeClock())
+    cpu_s = itertools.count(0.0, 0.25)
+    monkeypatch.setattr(tracker_process.time, "process_time", lambda: next(cpu_s))
     process, sent = ran(monkeypatch, display, 2.0)
+    assert process.tally.cpu_ms.percentiles().max == 250.0
     begin_ns = np.array([begin for begin, _ in display.spans_ns])
     first_ns = begin_ns[0]
     assert first_ns == process._begun_ns == first_ns // FRAME_NS * FRAME_NS

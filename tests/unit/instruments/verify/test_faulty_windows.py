@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilstar.instruments.verify import faulty_fields
 from hilstar.instruments.verify.faulty_fields import (
     FaultSeen,
     FaultyFields,
@@ -110,3 +111,43 @@ def test_each_fault_has_a_line_of_its_figures():
         "fault step (attitude-step): 0.0123 px off",
         "fault none (attitude-step): nothing was found",
     ]
+
+
+FLASH = KINDS["flash"](name="flare", radec_deg=(1.0, 2.0), electrons=5.0, for_s=3.0)
+
+
+@pytest.mark.parametrize(("fault", "since_s"), [(FLASH, 1.5), (GLOW, 0.0)])
+def test_a_fault_is_looked_at_half_way_through_or_at_its_beginning_where_it_never_ends(
+    monkeypatch, fault, since_s
+):
+    fields = fields_of(None)
+    fields._rng = np.random.default_rng(1)
+    fields._view = None
+    fields._attitude = lambda fault: "attitude"
+    shown = []
+    fields._shot = lambda q, first_frame, effects: shown.append((q, first_frame, effects))
+    fields._compared = lambda fault, plain, faulty: "seen"
+    monkeypatch.setattr(faulty_fields, "FaultLayer", lambda view, now: now)
+    assert fields._one(fault) == "seen"
+    (plain, faulty) = shown
+    assert plain[2] is None and plain[:2] == faulty[:2]
+    ((now),) = faulty[2]
+    assert (now.fault, now.since_ns) == (fault, round(since_s * 1e9))
+
+
+def test_stars_of_a_wrong_attitude_are_off_by_their_median_distance():
+    """Three that are found, by 0.5, 1 and 1.3 px in several directions, and one that is not."""
+    fields = fields_of(None)
+    truth = np.zeros(4, dtype=[("x_px", "f8"), ("y_px", "f8")])
+    truth["x_px"] = [10.0, 20.0, 30.0, 40.0]
+    geometry = SimpleNamespace(to_tracker=lambda x, y: (2 * x, y + 5))
+    fields._twin = SimpleNamespace(assumed_geometry=geometry)
+    found = SimpleNamespace(x_px=np.array([60.5, 20.3, 39.0]), y_px=np.array([6.2, 5.4, 5.0]))
+    index = np.array([1, 2, 0, -1])
+    fields._finder = SimpleNamespace(
+        match=lambda image, x, y: SimpleNamespace(found=found, index=index)
+    )
+    shot = SimpleNamespace(frame=SimpleNamespace(rows=truth), shown_e=None)
+    assert fields._stars_off_px(shot) == pytest.approx(1.0)
+    index[:] = -1
+    assert fields._stars_off_px(shot) is None

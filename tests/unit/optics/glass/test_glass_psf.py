@@ -8,17 +8,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.special import erf
 
 from hilstar.basics.errors import InputError
 from hilstar.optics.glass.glass_psf import (
+    MAX_CUT,
     MIN_WIDTH_PX,
+    Field,
     GlassPsf,
+    NodeSpline,
     _adaptive_spread,
     glass_psf,
     regridded,
+    with_components,
 )
 from hilstar.optics.glass.psf_file import Stack, facts_of, glass_of
-from hilstar.optics.psf import PIXEL_VARIANCE
+from hilstar.optics.psf import ONE_PSF, PIXEL_VARIANCE
 from tests.support.claims import holds
 from tests.support.glass import HALF_PX, SIDE_PX, illumination, moments, profile, stack, truth
 
@@ -290,3 +295,74 @@ def test_a_psf_in_other_pixels_has_its_light_and_its_moments_by_the_matrix(matri
     spread = np.einsum("yx,yxj,yxk->jk", found, places - at, places - at)
     assert spread == pytest.approx(matrix @ np.diag(sigma_px**2) @ matrix.T, abs=REGRIDDED)
     assert new_per_px >= per_px / np.sqrt(abs(np.linalg.det(matrix)))
+
+
+@pytest.mark.parametrize("count", [1, 3, 6])
+def test_a_spline_over_nodes_is_one_at_each_and_keeps_its_value_beyond_the_ends(count):
+    """A polynomial of few nodes, a spline of many."""
+    nodes = np.array([-3.0, -1.0, 0.5, 2.0, 2.5, 7.0])[:count]
+    spline = NodeSpline(nodes)
+    assert spline(nodes) == pytest.approx(np.eye(count), abs=1e-9)
+    ends = np.array([nodes[0] - 5, nodes[-1] + 5])
+    assert spline(ends) == pytest.approx(np.eye(count)[[0, -1]], abs=1e-9)
+    assert spline(np.linspace(-3, 7, 9)).sum(axis=1) == pytest.approx(1)
+
+
+def test_places_beyond_a_field_go_to_the_nearest_of_its_edge():
+    """A corner, a side, and within; of a line of points its two ends, and what is beside it."""
+    square = Field(np.array([[0.0, 0.0], [0.0, 80.0], [100.0, 0.0], [100.0, 80.0], [40.0, 30.0]]))
+    x = np.array([130.0, -3.0, 50.0, 20.0, 50.0])
+    y = np.array([120.0, -4.0, 95.0, 70.0, -9.0])
+    places, beyond_px = square.within(x, y)
+    assert places.tolist() == [[100, 80], [0, 0], [50, 80], [20, 70], [50, 0]]
+    assert beyond_px == pytest.approx([50.0, 5.0, 15.0, 0.0, 9.0])
+    line = Field(np.array([[0.0, 0.0], [30.0, 40.0], [60.0, 80.0]]))
+    places, beyond_px = line.within(np.array([63.0, -6.0, 34.0]), np.array([84.0, -8.0, 37.0]))
+    assert places == pytest.approx(np.array([[60.0, 80.0], [0.0, 0.0], [30.0, 40.0]]))
+    assert beyond_px == pytest.approx([5.0, 10.0, 5.0])
+
+
+@pytest.fixture(scope="module")
+def two_psfs():
+    """A sharp PSF in blue light, of half of the illumination, and a wide one in red, of all of it."""
+    at = np.arange(-21, 22) / 3
+    images = []
+    for sigma_px in (0.5, 1.1):
+        images.append(np.exp(-(at**2 + at[:, None] ** 2) / (2 * sigma_px**2)))
+    places = np.array([[100.0, 80.0, 450.0, 0.0], [100.0, 80.0, 650.0, 0.0]])
+    facts = facts_of(2)
+    facts[:, 0] = 0.5, 1.0
+    glass = glass_of(Stack(np.array(images), places, facts, 3))
+    return glass_psf(glass, 0.0, np.array([0.1, 0.9]))
+
+
+def test_a_glass_is_sampled_for_its_sharpest_psf_and_cut_for_its_widest(two_psfs):
+    assert two_psfs.width_px == pytest.approx((0.5, 0.5), rel=0.02)
+    half_px = two_psfs.footprint_px / 2
+    inside = erf(half_px / (1.1 * np.sqrt(2))) ** 2
+    assert 1 - inside < MAX_CUT
+    assert 1 - erf((half_px - 2) / (1.1 * np.sqrt(2))) ** 2 > MAX_CUT
+
+
+def test_a_star_s_illumination_is_that_of_its_own_light(two_psfs):
+    spectra = np.array([[1.0, 0.0], [0.0, 1.0], [0.25, 0.75]])
+    at = np.full(3, 100.0)
+    _, _, illumination_found = two_psfs.centroids_px(at, at - 20, spectra)
+    assert illumination_found == pytest.approx([0.5, 1.0, 0.875])
+
+
+def test_one_field_point_of_two_colours_has_simpler_glasses_and_one_psf_has_none(two_psfs):
+    names = [name for name, _ in two_psfs.simpler()]
+    assert names == [ONE_PSF, "Gaussians by field"]
+    image = np.exp(-((np.arange(-18, 19) / 3) ** 2) / 2)
+    place = np.array([[100.0, 80.0, np.nan, 0.0]])
+    alone = glass_of(Stack((image * image[:, None])[None], place, facts_of(1), 3))
+    assert [name for name, _ in glass_psf(alone, 0.0, np.ones(1)).simpler()] == [ONE_PSF]
+
+
+def test_a_glass_of_so_many_components_has_no_more(glass):
+    """The mean is one of them; each PSF still has all of its light."""
+    few = with_components(glass_psf(glass, 0.0, MEAN), 3)
+    assert few.components == 3
+    light = few.optics.weights @ few.optics.basis.sum(axis=(1, 2))
+    assert light == pytest.approx(1, abs=1e-9)

@@ -17,6 +17,7 @@ from hilstar.optics.glass.optiland_lens import (
     GlassFile,
     _euler_rad,
     _terms_beside_base,
+    find_glass,
     glass_files,
 )
 from tests.support.lenses import seq
@@ -135,3 +136,13 @@ def test_a_surface_s_angles_turn_about_fixed_x_then_y_then_z(rng):
         about_z = np.array([[np.cos(z), -np.sin(z), 0], [np.sin(z), np.cos(z), 0], [0, 0, 1]])
         assert about_z @ about_y @ about_x == pytest.approx(turn, abs=1e-12)
     assert _euler_rad(np.eye(3)) == [0.0, 0.0, 0.0]
+
+
+def test_of_a_glass_of_several_makers_the_first_in_the_order_is_taken(monkeypatch):
+    """A maker that the order does not know comes last; the note says whose it is."""
+    makers = tuple(file_of("k7", maker) for maker in ("lzos", "sumita", "hikari"))
+    monkeypatch.setattr(optiland_lens, "_database", lambda: makers)
+    file, notes = find_glass(Glass("K7"), "surface 1")
+    assert (file.catalogue, notes) == ("hikari", ["surface 1: K7 is taken as hikari's"])
+    monkeypatch.setattr(optiland_lens, "_database", lambda: makers[:1])
+    assert find_glass(Glass("K7"), "surface 1")[0].catalogue == "lzos"

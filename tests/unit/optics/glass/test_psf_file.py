@@ -12,7 +12,15 @@ from astropy.io import fits
 from scipy.ndimage import uniform_filter
 
 from hilstar.optics.camera import Lens
-from hilstar.optics.glass.psf_file import Glass, Stack, facts_of, glass_of, read_glass, write_glass
+from hilstar.optics.glass.psf_file import (
+    Glass,
+    Stack,
+    facts_of,
+    glass_of,
+    pupil_places,
+    read_glass,
+    write_glass,
+)
 from hilstar.optics.psf import SampledPsf
 from hilstar.sky.spectrum import Curve
 from tests.support.glass import stack
@@ -176,3 +184,28 @@ def test_detail_finer_than_a_pixel_asks_for_no_component(rng):
     grained = replace(given, images=given.images * (1 + grain))
     # by samples there would be 37
     assert len(glass_of(grained).basis) < len(glass_of(given).basis) + 5
+
+
+def test_a_pupil_s_places_are_the_middles_of_its_equal_parts():
+    assert pupil_places(4).tolist() == [-0.75, -0.25, 0.25, 0.75]
+
+
+@pytest.mark.parametrize("is_tall", [False, True])
+def test_a_pixel_s_negative_light_counts_over_the_whole_of_an_image_that_is_not_square(is_tall):
+    """Of 9 x 21 samples, 3 to a pixel: a pixel at the far end of the longer side has a share of
+    -0.2 of the light.
+    """
+    image = np.zeros((9, 21))
+    image[4, 10] = 1.2
+    image[3:6, 18:] = -0.2 / 9
+    if is_tall:
+        image = image.T
+    spoilt_stack = Stack(image[None], np.array([[5.0, 6.0, np.nan, 0.0]]), facts_of(1), 3)
+    assert "20.0% of its light is negative" in refusal(glass_of, spoilt_stack)
+
+
+def test_a_file_s_transmission_rises_from_wavelength_to_wavelength(tmp_path, glass):
+    curve = Curve(np.array([400.0, 700.0, 700.0]), np.array([0.8, 0.9, 0.9]))
+    write_glass(tmp_path / "psf.fits", replace(glass, transmission=curve))
+    said = refusal(read_glass, tmp_path / "psf.fits")
+    assert "TRANSMISSION has wavelengths that do not rise" in said

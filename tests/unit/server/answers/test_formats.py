@@ -15,13 +15,26 @@ import numpy as np
 import pytest
 from cobs import cobs
 
+from hilstar.attitude.wire import protocol
 from hilstar.attitude.wire.packet import AnswerPacket, encode, framed
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import angle_between_rad, conjugate, from_radec_roll_deg, multiply
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    conjugate,
+    from_radec_roll_deg,
+    from_rotation_vector,
+    multiply,
+)
 from hilstar.server.answers.answer import Answer
 from hilstar.server.answers.explain import lines_of, under_conventions
-from hilstar.server.answers.formats import MAX_KEPT_BYTES, AnswerDecoder, RefusedAnswer
-from hilstar.server.bench.config.answers import AnswersSettings, check_answers
+from hilstar.server.answers.formats import (
+    MAX_KEPT_BYTES,
+    AnswerDecoder,
+    FrameDecoder,
+    RefusedAnswer,
+    reported_stars,
+)
+from hilstar.server.bench.config.answers import AnswersSettings, FrameField, check_answers
 from tests.support.refusals import refusal
 
 Q = from_radec_roll_deg(283.021, 35.349, 30.0)
@@ -42,6 +55,7 @@ FIELDS: list[dict[str, Any]] = [
     {"name": "wz", "at": 34, "type": "i24be", "scale": 1e-6},
 ]
 BODY_BYTES = 37
+Q_NAMES = ("qw", "qx", "qy", "qz")
 # The check values of 123456789 in the catalogue of parametrised CRC algorithms, and by hand.
 CHECKS = {
     "crc16-ccitt-false": 0x29B1,
@@ -269,6 +283,147 @@ def test_a_wrong_json_answer_is_refused_with_its_reason(line):
     (found,) = decoder_of(format="json", fields=[]).feed(0, line + b"\n")
     assert isinstance(found, RefusedAnswer)
     assert found.reason == REFUSED_JSON[line]
+
+
+@pytest.mark.parametrize(
+    ("count", "kept"), [(0, 0), (12, 12), (1_000_000, 1_000_000), (1_000_001, None), (-1, None)]
+)
+def test_an_absurd_count_of_stars_is_left_out_of_its_answer(count, kept):
+    said = msgspec.json.encode({"q": [1, 0, 0, 0], "stars": count})
+    (found,) = answers(decoder_of(messages=True, format="json", fields=[]).feed(0, said))
+    assert found.star_count == kept
+
+
+@pytest.mark.parametrize(
+    ("row", "hip", "width_px"),
+    [
+        ([1, 2, 3, 1, 1e-3], 1, 1e-3),
+        ([1, 2, 3, 2**31 - 1, 1000.0], 2**31 - 1, 1000.0),
+        ([1, 2, 3, 0, 0.0], None, None),
+        ([1, 2, 3, 2**31, 1000.1], None, None),
+        ([1, 2, 3, -5, -1.0], None, None),
+    ],
+)
+def test_a_number_or_width_beyond_its_limits_is_left_out_of_its_star(row, hip, width_px):
+    (star,) = reported_stars([row])
+    assert (star.hip, star.width_px, star.dn) == (hip, width_px, 3)
+
+
+@pytest.mark.parametrize(
+    ("raw", "field", "wanted"),
+    [
+        # (raw shifted down to its mask's lowest bit) x scale + add, by hand
+        ("a8", {"type": "u8", "mask": 0x38, "scale": 2.0, "add": 3.0}, 13),
+        ("a8", {"type": "u8", "mask": 0x80}, 1),
+        ("012c", {"type": "u16be", "scale": 0.5, "add": 10.0}, 160.0),
+        ("2c01", {"type": "u16le", "scale": -2.0, "add": 0.25}, -599.75),
+        ("feffff", {"type": "i24le"}, -2),
+        ("fffffe", {"type": "u24be", "add": -1.0}, 0xFFFFFD),
+        ("000000c0", {"type": "f32le", "scale": 3.0, "add": 1.0}, -5.0),
+        ("c004000000000000", {"type": "f64be"}, -2.5),
+        ("ffffffffffffff7f", {"type": "i64le", "add": -5.0}, 2**63 - 6),  # no float holds that
+    ],
+)
+def test_a_field_s_number_is_scaled_and_then_added_to(raw, field, wanted):
+    decoder = FrameDecoder(settings_of(framing="slip"))
+    declared = msgspec.convert({"name": "t_ns", "at": 1, **field}, FrameField)
+    value = decoder.value(b"\x55" + bytes.fromhex(raw), declared)
+    assert value == wanted and type(value) is type(wanted)
+
+
+@pytest.mark.parametrize(
+    ("flags", "mode"),
+    [
+        (protocol.ANSWER_TRACKING, "tracking"),
+        (protocol.ANSWER_LOST_IN_SPACE, "lost in space"),
+        (protocol.ANSWER_TRACKING | protocol.ANSWER_TOO_FEW_STARS, "too few stars"),
+        (protocol.ANSWER_LOST_IN_SPACE | protocol.ANSWER_TRACKING, "lost in space"),
+        # whoever is blinded sees few stars, too
+        (protocol.ANSWER_BLINDED | protocol.ANSWER_TOO_FEW_STARS, "blinded"),
+        (0, ""),
+    ],
+)
+def test_of_several_flags_the_cause_is_the_mode(flags, mode):
+    packet = encode(AnswerPacket(8, flags, 43, tuple(Q.tolist())))
+    (found,) = answers(decoder_of(messages=True, format="packet", fields=[]).feed(0, packet))
+    assert found.mode == mode
+
+
+def test_a_checksum_may_leave_out_a_frame_s_first_bytes():
+    keys = {"framing": "fixed", "length": 60, "checksum": "sum8", "checksum_at": 11}
+    decoder = decoder_of(**keys, checksum_from=2)
+    assert decoder.frames.fault(b"\xff\x07123456789\xdd") == ""
+    assert "is 0xde, and 0xdd by the bytes" in decoder.frames.fault(b"\xff\x07123456789\xde")
+    assert decoder.frames.fault(b"\xff\x07123456789") == "too short for its checksum: 11 bytes"
+
+
+def test_space_packets_of_another_version_are_none():
+    """133.0-B: the upper three bits of the primary header are 0."""
+    keys, framed_as = FRAMINGS["ccsds"]
+    for version in range(8):
+        packet = bytearray(framed_as(body_of())[:-2])
+        packet[0] |= version << 5
+        found = decoder_of(**keys).feed(5, sealed(bytes(packet)))
+        assert len(answers(found)) == (version == 0)
+
+
+def test_what_follows_an_endless_line_or_frame_is_read():
+    said = msgspec.json.encode({"t_ns": 7, "q": [1, 0, 0, 0]}) + b"\n"
+    lines = decoder_of(format="json", fields=[]).feed(0, b" " * 70_000 + b"\n" + said + said)
+    assert [getattr(each, "reason", "") for each in lines] == ["framing", "", ""]
+    # a length of 5000 bytes is none, and is not waited for
+    keys = {**SYNC, "length": {"at": 2, "type": "u16be"}}
+    framed = b"\x1a\xcf" + struct.pack(">H", BODY_BYTES + 2) + body_of()[4:]
+    found = decoder_of(**keys).feed(0, b"\x1a\xcf" + struct.pack(">H", 5000) + sealed(framed))
+    assert len(answers(found)) == 1
+    assert found[0].detail == "a length that no frame has"
+
+
+@pytest.mark.parametrize(("source", "taken"), [("file", 1), ("udp", 0)])
+def test_a_pause_within_a_frame_ends_it_but_in_a_file(source, taken):
+    keys, framed_as = FRAMINGS["sync"]
+    road = {"path": "a.bin"} if source == "file" else {}
+    decoder = decoder_of(**keys, source=source, **road)
+    frame = framed_as(body_of())
+    found = decoder.feed(10**9, frame[:20]) + decoder.feed(3 * 10**9, frame[20:])
+    assert len(answers(found)) == taken
+
+
+def test_an_answer_s_bytes_are_explained_field_by_field():
+    fields = [
+        {"name": "t_ns", "at": 0, "type": "u16be", "add": 1.0},
+        *(
+            {"name": name, "at": 2 + k, "type": "i8", "scale": 1 / 64}
+            for k, name in enumerate(Q_NAMES)
+        ),
+        {"name": "stars", "at": 6, "type": "u8", "scale": 2.0, "add": -1.0},
+    ]
+    keys = {"framing": "fixed", "length": 13, "checksum": "crc16-xmodem"}
+    decoder = decoder_of(**keys, fields=fields, messages=True)
+    body = bytes([1, 2, 32, 0xE0, 32, 32, 5, 0, 0, 0, 0])
+    raw = body + struct.pack(">H", crc16(body, 0))
+    (found,) = answers(decoder.feed(0, raw))
+    lines = lines_of(found, decoder, None)
+    seal = raw[11:].hex(" ")
+    assert lines[:3] == [
+        f"  01 02 20 e0 20 20 05 00 00 00 00 {seal}",
+        f"  bytes  11 to  12  {seal:<24} checksum: crc16-xmodem, right",
+        f"  bytes   0 to   1  {'01 02':<24} t_ns  = 259  (u16be, + 1)",
+    ]
+    assert lines[3] == f"  bytes   2 to   2  {'20':<24} qw    = 0.5  (i8, x 0.015625)"
+    assert lines[7] == f"  bytes   6 to   6  {'05':<24} stars = 9  (u8, x 2, + -1)"
+    assert len(lines) == 8 + 4  # and a line for each convention
+
+
+@pytest.mark.parametrize(("off_deg", "matching"), [(0.05, 1), (0.2, 0)])
+def test_a_convention_is_told_only_where_no_other_is_nearly_as_near(off_deg, matching):
+    """A degree from the axes the camera's and the sky's quaternion are two degrees apart."""
+    decoder = decoder_of(messages=True, format="json", fields=[])
+    shown = from_rotation_vector(np.radians([1.0, 0.0, 0.0]))
+    sent = from_rotation_vector(np.radians([1.0 + off_deg, 0.0, 0.0]))
+    (found,) = decoder.feed(0, msgspec.json.encode({"q": sent.tolist()}))
+    readings = under_conventions(found, decoder, shown)
+    assert sum(reading.matches for reading in readings) == matching
 
 
 def test_centroids_that_are_none_are_left_out():

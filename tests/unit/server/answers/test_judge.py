@@ -19,6 +19,7 @@ from hilstar.server.answers.judge import (
     AnswerJudge,
     AnswerRules,
     AnswerTimes,
+    DelayFit,
     fitted_delay,
 )
 from hilstar.server.answers.pairing import LitFrame, LitFrames, residual_arcsec
@@ -99,7 +100,8 @@ def test_an_exposure_of_a_dark_or_a_jumping_sky_has_no_attitude():
     dark, jumping = LitFrames(PERIOD_NS), LitFrames(PERIOD_NS)
     away = from_rotation_vector(np.radians([0.0, 30.0, 0.0]))
     for k in range(60):
-        dark.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, None if k > 30 else START))
+        sender_ns = 10**12 + k * PERIOD_NS // 2  # whose clock runs at half of the host's speed
+        dark.add(LitFrame(k, k * PERIOD_NS, sender_ns, None if k > 30 else START))
         jumping.add(lit_frame(k, START if k < 30 else multiply(away, START)))
     assert dark.over(0, NS_PER_S // 4) is not None
     assert dark.over(round(0.6 * NS_PER_S), round(0.9 * NS_PER_S)) is None
@@ -107,6 +109,72 @@ def test_an_exposure_of_a_dark_or_a_jumping_sky_has_no_attitude():
     assert jumping.over(round(0.4 * NS_PER_S), round(0.6 * NS_PER_S)) is None
     assert jumping.over(round(0.6 * NS_PER_S), round(0.9 * NS_PER_S)) is not None
     assert jumping.over(-NS_PER_S, 0) is None
+
+
+def test_an_exposure_needs_a_sky_for_half_of_its_time():
+    """Sixteen refreshes, of which the first six or nine and a half have one."""
+    frames = LitFrames(PERIOD_NS)
+    for k in range(60):
+        frames.add(LitFrame(k, k * PERIOD_NS, k * PERIOD_NS, None if k > 30 else START))
+    assert frames.over(21 * PERIOD_NS, 37 * PERIOD_NS) is not None
+    assert frames.over(25 * PERIOD_NS, 41 * PERIOD_NS) is None
+
+
+def test_the_newest_frame_counts_as_lit_for_half_a_second():
+    frames = lit_at_rest(61)  # the last one at 1 s
+    assert frames.over(round(1.1 * NS_PER_S), round(1.5 * NS_PER_S)) is not None
+    assert frames.over(round(1.6 * NS_PER_S), round(1.7 * NS_PER_S)) is None
+
+
+@pytest.mark.parametrize(
+    ("known_s", "excused_arcsec"),
+    # three sigmas of a turn of 1 deg/s, and no more than 0.3 s of it
+    [(0.0, 0.0), (0.05, 540.0), (1.0, 1080.0)],
+)
+def test_a_turn_s_unknown_time_does_not_count_against_a_tracker(known_s, excused_arcsec):
+    rate = np.radians([0.0, 1.0, 0.0])
+    middle_ns = 1_100_000_000
+    truth = propagate(START, rate, 1.1)
+    for off_arcsec, verdict in ((-20.0, "right"), (20.0, "wrong")):
+        judge = AnswerJudge(
+            AnswerRules(EXPOSURE_S, clock="unix"), lit_in_turn(LitFrames(PERIOD_NS), rate)
+        )
+        offset = UnixOffset(0, round(known_s * NS_PER_S))
+        judge.times = AnswerTimes(AnswerRules(EXPOSURE_S, clock="unix"), lambda at=offset: at)
+        turn = [0.0, 0.0, (3600.0 + excused_arcsec + off_arcsec) / ARCSEC_PER_RAD]
+        q = multiply(from_rotation_vector(np.array(turn)), truth)
+        assert judge.judge(Answer(middle_ns, b"", middle_ns, q)).verdict == verdict
+
+
+def test_a_fitted_clock_s_uncertainty_is_in_seconds():
+    times = AnswerTimes(AnswerRules(EXPOSURE_S, latency_s=0.1))
+    rng = np.random.default_rng(6)
+    for k in range(100):
+        host_ns = round((k / ANSWER_HZ + rng.exponential(JITTER_S)) * NS_PER_S)
+        _, sigma_s = times.middle(Answer(host_ns, b"", EPOCH_NS + k * NS_PER_S // 10))
+    assert 0 < sigma_s < 2 * JITTER_S
+
+
+def test_errors_that_were_kept_follow_the_delay_that_the_motion_shows():
+    """A tracker without errors: what it seemed off by before its delay was known is undone."""
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S), lit_until(12.0))
+    for k in range(10, 110):
+        middle_s = k / ANSWER_HZ
+        host_ns = round((middle_s + 0.25) * NS_PER_S)
+        judge.judge(Answer(host_ns, b"", round(middle_s * NS_PER_S), attitude_at(middle_s)))
+    assert judge.times.delay_s == pytest.approx(0.25, abs=2e-3)
+    # 0.1 s too early, some 0.3 deg/s were 100 arcsec
+    assert max(judge.figures(host_ns, {}).rms_arcsec) < 5.0
+
+
+def test_a_delay_that_no_motion_shows_goes_back_to_the_one_that_is_assumed():
+    judge = AnswerJudge(AnswerRules(EXPOSURE_S), lit_at_rest(600))
+    judge.times.shift(DelayFit(0.2, 0.01))
+    for k in range(10, 60):
+        middle_ns = k * NS_PER_S // 10
+        judge.judge(Answer(middle_ns + NS_PER_S // 4, b"", middle_ns, START))
+    assert judge.times.delay_s == pytest.approx(judge.times.guess_s)
+    assert judge.times.sigma_s == pytest.approx(0.1)
 
 
 BIAS_ARCSEC, NOISE_ARCSEC = np.array([12.0, -7.0, 30.0]), np.array([3.0, 3.0, 20.0])

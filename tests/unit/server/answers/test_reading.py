@@ -23,6 +23,7 @@ from hilstar.server.answers.reader import (
     MAX_ANSWERS_PER_S,
     MAX_BURST_BYTES,
     MAX_BYTES_PER_S,
+    MAX_DETAILS,
     MAX_WORK_S,
     PIECE_BYTES,
     WORK_SHARE,
@@ -31,6 +32,7 @@ from hilstar.server.answers.reader import (
     ReadPlan,
     handed_over,
     live_answers,
+    newest_details,
     recorded_answers,
 )
 from tests.support.fake_clock import FakeClock
@@ -126,6 +128,13 @@ def test_refusals_are_counted_by_reason_with_the_newest_example():
     assert link.clock.slept_s == [0.0]
 
 
+def test_of_many_reasons_the_examples_of_the_newest_are_kept():
+    many = {str(k): f"of {k}" for k in range(MAX_DETAILS)}
+    kept = newest_details(many, {"new": "a new one", "3": "another of 3"})
+    assert list(kept) == [str(k) for k in range(1, MAX_DETAILS) if k != 3] + ["new", "3"]
+    assert (kept["3"], kept["4"]) == ("another of 3", "of 4")
+
+
 def test_a_fault_of_the_line_is_told_when_it_changes():
     link = Link([[], [], [], []])
     assert [told.trouble for told in link.take()] == [""]
@@ -162,6 +171,11 @@ def test_of_a_flood_of_bytes_a_burst_is_read_and_then_so_many_a_second():
     (refused,) = [each for each in link.take() if FLOOD in each.refused]
     left_bytes = MAX_BURST_BYTES - burst * PIECE_BYTES + MAX_BYTES_PER_S / 10
     assert refused.refused[FLOOD] == 40 - int(left_bytes // PIECE_BYTES)
+    # a line that was idle for a minute has saved up no more than a burst
+    link.road._chunks = [[noise * (burst + 9)]]
+    link.clock.work(60 * NS_PER_S)
+    (refused,) = [each for each in link.take() if FLOOD in each.refused]
+    assert refused.refused[FLOOD] == 9
 
 
 def test_a_message_is_decoded_whole_and_a_stream_in_pieces():

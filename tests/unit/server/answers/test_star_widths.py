@@ -14,6 +14,7 @@ from hilstar.server.answers.star_widths import (
     FocusCurve,
     FocusFigure,
     FocusReading,
+    sparkline,
     width_figure,
 )
 
@@ -121,3 +122,18 @@ def test_a_curve_remembers_a_bounded_number_of_readings_and_its_best():
         curve.add(FocusReading(number, number, 9, FocusFigure(sigma_px, 0.01, 9, 0.0, 0.0)))
     assert curve.count == 3000 and len(curve.readings) == 2000
     assert curve.best.number == 5 and curve.state().best_ago_s == 2995
+
+
+def test_a_figure_is_worse_beyond_both_errors():
+    """Three sigmas of a difference of 0.3 and 0.4 px are 1.5 px."""
+    curve = FocusCurve("answers")
+    curve.add(FocusReading(1, 0.0, 0, FocusFigure(2.0, 0.4, 9, 0.0, 0.0)))
+    worse = [curve.is_worse(FocusFigure(width, 0.3, 9, 0.0, 0.0)) for width in (3.4, 3.6)]
+    assert worse == [False, True]
+
+
+def test_a_curve_shows_the_newest_figures():
+    rising = [1.0] * 10 + [float(k) for k in range(40)]
+    assert sparkline(rising, 0.0) == sparkline(rising[10:], 0.0)
+    assert sparkline(rising, 0.0)[0] == "▁" and sparkline(rising, 0.0)[-1] == "█"
+    assert sparkline([1.0, 2.0, 1.5], 4.0) == "▁▃▂"  # a span of 4 would be the highest bar

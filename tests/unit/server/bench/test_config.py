@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 from astropy.time import Time
+from msgspec.structs import replace
 
-from hilstar.server.bench.config import parse_config, read_config
+from hilstar.server.bench.config import AttitudeSettings, parse_config, read_config
 from hilstar.server.bench.config.bench_config import sky_jd
 from hilstar.server.bench.star_rates import bench_optics
 from tests.support.benches import ROOT, SMALL_BENCH, bench_text
@@ -147,3 +148,22 @@ def test_a_moment_s_julian_date_counts_from_the_bench_s_own(tmp_path, sky, t_s, 
     t_ns = None if t_s is None else round(t_s * 1e9)
     # a Julian date in a float is right to 40 us
     assert sky_jd(config, t_ns) == pytest.approx(Time(utc, scale="utc").jd, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("source", "lockstep", "port"),
+    [
+        ("zmq", False, 5560),
+        ("zmq", True, 5560),
+        ("vizard", False, 5570),  # Basilisk's vizInterface: its broadcast, and its live stream
+        ("vizard", True, 5556),
+        ("42", False, 10001),  # 42's Inp_IPC.txt
+        ("42", True, 10001),
+        ("udp", False, None),
+        ("serial", False, None),
+    ],
+)
+def test_a_source_without_an_endpoint_is_where_its_simulator_usually_is(source, lockstep, port):
+    settings = AttitudeSettings(source=source, lockstep=lockstep)
+    assert settings.address == ("" if port is None else f"tcp://127.0.0.1:{port}")
+    assert replace(settings, endpoint="ipc:///a").address == "ipc:///a"

@@ -14,6 +14,7 @@ import pytest
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.display.balance import Seen
 from hilstar.display.quantise import LevelCost
+from hilstar.display.quantisers import QUANTISERS
 from hilstar.display.render.backend import level_cost
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
@@ -26,6 +27,7 @@ from hilstar.server.bench.build import (
     open_bench,
     timed_frame_ms,
 )
+from hilstar.server.bench.cameras import bench_camera
 from hilstar.server.bench.config import RenderSettings
 from hilstar.server.bench.effort import (
     PATH_MS,
@@ -33,14 +35,16 @@ from hilstar.server.bench.effort import (
     FieldCost,
     Light,
     _combinations,
+    _cut_to_mag,
     cut_px,
     exact_in_time,
     motion_candidates,
     plan_effort,
+    side_candidates,
 )
 from hilstar.server.bench.effort_report import effort_keys, effort_lines
 from hilstar.server.bench.least_psf import Choice
-from hilstar.server.bench.scene import turning_of
+from hilstar.server.bench.scene import Display, scenes_of, turning_of
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import run_hilstar_here, typed
@@ -168,6 +172,27 @@ def test_paths_are_charged_where_frames_may_turn(motion, on_screen, turns, small
     scan_s, hold_s = (config.monitor.panel_scanout_ms, config.monitor.panel_hold_ms)
     wanted = scan_s / (scan_s + 2 * hold_s) if turns else None
     assert turning_of(config, on_screen) == pytest.approx(wanted)
+
+
+def test_a_screen_s_share_of_the_sky_is_its_solid_angle_over_the_sphere_s(tmp_path):
+    """Of 320 x 240 pixels of 57.65 um behind 60 mm, about a pixel's own in the middle."""
+    file = bench_file_of(
+        tmp_path / "bench.toml", f"{SMALL_BENCH}[render]\nflux_at_white_e_per_s = 1e6\n"
+    )
+    camera = bench_camera(file.config, file.folder)
+    display = Display(
+        calibration=SimpleNamespace(response=None),
+        camera=camera,
+        context=None,
+        drive=1.0,
+        turning=None,
+        path_px=0.0,
+        darkest=0.5,
+    )
+    scene = next(scenes_of(file, SimpleNamespace(electrons_per_s=None), display))
+    wanted = 320 * 240 * (0.05765 / 60) ** 2 / (4 * np.pi)
+    assert scene.light.sky_share == pytest.approx(wanted, rel=1e-3)
+    assert (scene.white_e_per_s, scene.light.white_e_per_s) == (1e6, 0.5e6)
 
 
 def test_a_psf_in_place_of_a_glass_shares_the_tolerance():
@@ -307,6 +332,26 @@ def test_small_sprites_save_the_pixels_that_the_catalogue_s_stars_do_not_need():
     sprites = effort.taken.sprites.choice
     share = np.mean(area_px) / GaussianPsf(SIGMA).footprint_px ** 2
     assert sprites.ms / (sprites.ms + sprites.saved_ms) == pytest.approx(share)
+
+
+@pytest.mark.parametrize("method", ["round", "exact"])
+def test_the_sprites_of_codes_are_as_those_codes_light_pixels(method):
+    """A star under full scale by so many magnitudes has its peak there, and beyond its sprite a
+    quarter of what lights a pixel at most.
+    """
+    sky = replace(light_range(10, 6.0), turning=0.5, sky_share=0.1)
+    asked = render_settings(tolerance_mag=0.05, tolerance_px=0.05)
+    own = [sides.sides for sides in side_candidates(asked, sky, method)]
+    of_method = [
+        one.sprites.sides
+        for one in _combinations(asked, sky, ("round", "exact"))
+        if one.method == method
+    ]
+    assert set(of_method) == set(own)
+    lit_e_per_s = QUANTISERS[method].lit_from_e_per_s(sky.panel)
+    for size in (4, 6, 8):
+        rate = 1e6 * 10 ** (-0.4 * _cut_to_mag(sky, method, size)) / sky.psf.peak_share
+        assert rate * sky.psf.outside_share(size) == pytest.approx(lit_e_per_s / 4)
 
 
 @pytest.mark.parametrize("size", [4, 6, 8, 5, 7])

@@ -6,11 +6,12 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from hilstar.server.bench import would_do as keys_that_would_do
 from hilstar.server.bench.config import RenderSettings
-from hilstar.server.bench.would_do import MAX_PAIRS, _smallest_pair, _Trial, would_do
+from hilstar.server.bench.would_do import MAX_PAIRS, _smallest_pair, _Trial, _Trials, would_do
 
 VALUES = (1, 2, 3, 4)
 
@@ -115,3 +116,40 @@ def test_where_no_pair_does_each_key_s_largest_change_is_told(monkeypatch):
 
 def test_a_bench_that_is_within_needs_nothing():
     assert would_do(SimpleNamespace(effort=SimpleNamespace(within=True))) == []
+
+
+def values_of(way, trials, trial=None):
+    start = trial or _Trial(RenderSettings(), 12, 7.0)
+    return [trial.changes[-1].value for trial in way(trials, start)]
+
+
+def test_a_full_scale_comes_down_by_magnitudes_and_to_the_faintest_star_at_most():
+    trials = SimpleNamespace(_stars=SimpleNamespace(v_mag=np.array([0.0, 2.2])))
+    measured = _Trial(RenderSettings(flux_at_white_e_per_s=1e6), 12, 7.0)
+    wanted = [6.31e5, 3.98e5, 2.51e5, 1.58e5, 1.0e5, 6.31e4, 2.51e4]  # 10^(-0.4 mag), three digits
+    assert values_of(_Trials._brighter, trials, measured) == wanted
+    stated = _Trial(RenderSettings(brightest_v_mag=1.0), 12, 7.0)
+    assert values_of(_Trials._brighter, trials, stated) == [1.5, 2.0]
+    assert values_of(_Trials._brighter, trials) == [0.5, 1.0, 1.5, 2.0]
+
+
+def test_a_catalogue_ends_no_brighter_than_its_brightest_star():
+    trials = SimpleNamespace(_stars=SimpleNamespace(v_mag=np.array([5.4, 7.0])))
+    assert values_of(_Trials._shallower, trials) == [6.5, 6.0, 5.5]
+
+
+@pytest.mark.parametrize(
+    ("frames", "codes", "values"),
+    [(1, "round", []), (2, "round", ["temporal"]), (9, "temporal", [])],
+)
+def test_codes_over_frames_are_of_exposures_of_several(frames, codes, values):
+    light = SimpleNamespace(exposure_frames=frames)
+    bench = SimpleNamespace(effort=SimpleNamespace(light=light, quantisation=codes))
+    assert values_of(_Trials._codes_over_frames, SimpleNamespace(_bench=bench)) == values
+
+
+@pytest.mark.parametrize(("is_formula", "values"), [(True, [14]), (False, [])])
+def test_bits_are_more_than_there_are_and_of_a_response_that_has_them(is_formula, values):
+    bench = SimpleNamespace(calibration=SimpleNamespace(is_formula=is_formula))
+    trials = SimpleNamespace(_bench=bench, _exists=lambda trial: trial.bits != 16)
+    assert values_of(_Trials._more_bits, trials) == values

@@ -258,6 +258,17 @@ REFUSED = [
     ),
     (more(answers(source='"serial"', port="7000")), 'source = "serial" needs port'),
     (
+        more(answers(source='"tcp"', listen='"0.0.0.0:7000"')),
+        "is open to other machines, and allow does not say which may send",
+    ),
+    (more(answers(connect='"h:0"')), "is no place of a tracker"),
+    (more(answers(connect='"h:65536"')), "is no place of a tracker"),
+    (
+        more(answers(connect='"h:1"', poll_hex=f'"{"00" * 1025}"')),
+        "poll_hex has over 1024 bytes",
+    ),
+    (more(aligned([[-0.5, 0, 0], [0, 2, 0], [0, 0, 9]])), "a variance is below 0"),
+    (
         more(answers(connect='"h:1"', poll_hex=f'"{"00" * 5000}"')),
         "write what one question is",
     ),
@@ -299,6 +310,8 @@ READ = [
     more('[attitude]\nsource = "udp"\nbind = "0.0.0.0:5560"\nallow = ["10.0.0.7"]'),
     more(answers()),
     more(answers(connect='"host:65535"')),
+    more(answers(connect='"host:1"', poll_hex=f'"{"00" * 1024}"')),
+    more(answers(source='"tcp"', listen='"0.0.0.0:7000"', allow='["10.0.0.7"]')),
     more(answers(connect='"[::1]:7000"', poll_hex='"00ff"')),
     more(answers(format='"python:m:f"', trust='["mine"]')),
     frames(),

@@ -83,6 +83,9 @@ def test_each_panel_is_at_the_limit_with_the_shorter_collimator_and_shows_the_fi
 ):
     wide = size(tmp_path, WIDE).would_do
     assert len(wide.panels) == len(PANELS)
+    pitches_um = {one.panel: one.pixel_pitch_um for one in wide.panels}
+    assert pitches_um["27-inch 2560 x 1440"] == pytest.approx(233.5, abs=0.1)
+    assert pitches_um["15.6-inch 4K"] == pytest.approx(89.9, abs=0.1)  # as makers state them
     lengths = {one.panel: one for one in wide.panels if one.collimator_mm is not None}
     assert "27-inch 5K" in lengths and "27-inch 2560 x 1440" not in lengths
     for one in lengths.values():

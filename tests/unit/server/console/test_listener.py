@@ -30,6 +30,13 @@ def test_an_address_is_read_as_it_is_meant(text, wanted):
     assert parse_address(text) == ListenAddress(*wanted)
 
 
+@pytest.mark.parametrize(("option", "port"), [("--console", 8765), ("--scpi", 5025)])
+def test_an_address_without_a_port_has_its_option_s(option, port):
+    for text in ("", "127.0.0.1", "127.0.0.1:"):
+        assert parse_address(text, option) == ListenAddress("127.0.0.1", port)
+    assert parse_address("9000", option).port == 9000
+
+
 @pytest.mark.parametrize(
     "text",
     [

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
-from hilstar.server.console.overlay import overlay_of
+from hilstar.display.geometry import monitor_camera
+from hilstar.server.console.overlay import CameraMarks, overlay_of
 from tests.support.benches import ORION_Q
 
 ROUNDED_PX = 0.006  # places are sent with two decimals
@@ -77,6 +78,18 @@ def test_each_line_of_the_grid_is_where_its_label_says(overlay_bench, ra_deg, de
                 np.where(np.abs(off_deg) < 90, np.sin(np.radians(off_deg)), 1.0) * from_pole_deg
             )
         assert np.abs(off_deg).max() < LINE_DEG
+
+
+@pytest.mark.parametrize(("f_mm", "digits"), [(100.0, 0), (1600.0, 1), (8000.0, 2)])
+def test_a_grid_s_labels_have_as_many_digits_as_its_step(f_mm, digits):
+    """A screen of 400 x 300 pixels of 50 um has steps of 2, 0.1 and 0.02 deg there."""
+    q = np.array([1.0, 0.0, 0.0, 0.0])
+    camera = monitor_camera((400, 300), 50.0, f_mm, q, None)
+    q = from_radec_roll_deg(40.0, 20.0, 0.0)
+    lines = CameraMarks(camera, camera).truth(0, [], q, grid=True).grid
+    labels = [line.label.rstrip("\N{DEGREE SIGN}") for line in lines]
+    assert {len(label.partition(".")[2]) for label in labels} == {digits}
+    assert len(set(labels)) == len(labels)
 
 
 @pytest.mark.parametrize("dec_deg", [-87.0, 87.0])

@@ -9,6 +9,7 @@ import msgspec
 import pytest
 
 from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import BackOff
 from hilstar.server.console import page_process
 from hilstar.server.console.messages import RunEvent, RunState, SharedMemory
 from hilstar.server.console.page_process import Listeners, PageProcess
@@ -59,6 +60,22 @@ def test_a_page_that_ends_is_told_with_its_time_of_day_and_started_again(page_of
     assert lost.kind == "console-lost"
     assert "page ended (exit code 7)" in lost.line
     assert abs(lost.unix_s - time.time()) < 30
+
+
+@pytest.mark.parametrize(("steady_s", "anew"), [(-1.0, True), (3600.0, False)])
+def test_a_page_that_ran_steadily_is_started_again_sooner(page_of, monkeypatch, steady_s, anew):
+    put_off = []
+
+    class Recorder(BackOff):
+        def put_off(self, *, anew: bool = False) -> None:
+            put_off.append(anew)
+            super().put_off(anew=anew)
+
+    monkeypatch.setattr(page_process, "BackOff", Recorder)
+    monkeypatch.setattr(page_process, "STEADY_S", steady_s)
+    page_of("exit 7")
+    wait_for(lambda: put_off)
+    assert put_off[0] is anew
 
 
 def test_a_page_inherits_neither_the_run_s_token_nor_its_place_to_report(

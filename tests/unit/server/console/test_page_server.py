@@ -276,6 +276,31 @@ def test_a_body_of_the_largest_size_is_taken():
         assert len(page.orders[0].text) == app.MAX_BODY_BYTES - 12
 
 
+def test_of_more_orders_than_may_wait_the_last_is_refused_and_none_is_sent():
+    async def ordered() -> tuple[OrderAnswer, list[int]]:
+        channel, run_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        with channel, run_end:
+            orders = OrderChannel(channel)
+            waiting = [asyncio.create_task(orders.give(order_of("blank"))) for _ in range(8)]
+            await asyncio.sleep(0)
+            refused = await orders.give(order_of("blank"))
+            run_end.setblocking(False)
+            numbers = [msgspec.json.decode(run_end.recv(10_000), type=Order).id for _ in range(8)]
+            with pytest.raises(BlockingIOError):
+                run_end.recv(10_000)
+            for task in waiting:
+                task.cancel()
+            await asyncio.gather(*waiting, return_exceptions=True)
+        return refused, numbers
+
+    refused, numbers = asyncio.run(ordered())
+    assert (refused.status, numbers) == (503, list(range(1, 9)))
+
+
+def order_of(name: str) -> Order:
+    return Order(id=0, name=name, who="ann")
+
+
 def test_a_page_without_control_only_shows():
     with served(control=False) as page:
         status, told = page.address.control("blank")

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 import threading
+from datetime import UTC, datetime
 from types import SimpleNamespace
 
 import msgspec
@@ -54,6 +55,8 @@ from hilstar.server.console.publisher import (
     SessionPublisher,
     WatchedRun,
     _attitude,
+    free_path,
+    names_of,
     setup_for,
 )
 from hilstar.server.operator import GAMMA, Aids, OnScreen, SwitchRequests
@@ -343,6 +346,37 @@ def test_a_session_shows_what_fits_and_takes_marks_alone(memory):
     assert told[-1] == ("mark", "mark, by ann: lamp on")
     for name, text in (("mark", " "), ("blank", "")):
         assert session.do(Order(id=3, name=name, who="ann", text=text)).status == 409
+
+
+def test_a_session_shows_a_picture_that_just_fits_and_none_of_a_byte_more(memory):
+    session, told = SessionPublisher(memory), []
+    session.notices.listen(lambda notice: told.append(notice.detail))
+    room = memory.pictures.slot_bytes - PICTURE_HEAD_BYTES
+    session.show(SimpleNamespace(name="over", codes=np.zeros((1, room + 1), np.uint8)))
+    assert (told, memory.pictures.newest) == ([], 0)
+    session.show(SimpleNamespace(name="just", codes=np.zeros((1, room), np.uint8)))
+    assert (told, memory.pictures.newest) == (["shows just"], 1)
+
+
+def test_a_ledger_s_path_is_its_time_and_a_number_where_that_is_taken(tmp_path):
+    now = datetime(2027, 1, 15, 8, 0, 3, 250_000, tzinfo=UTC)
+    names = []
+    for _ in range(3):
+        path = free_path(tmp_path, now)
+        path.touch()
+        names.append(path.relative_to(tmp_path).name)
+    stem = "hilstar-20270115T080003Z"
+    assert names == [f"{stem}.mcap", f"{stem}-1.mcap", f"{stem}-2.mcap"]
+
+
+def test_names_are_those_of_the_brightest_stars_without_a_hip_number(monkeypatch):
+    monkeypatch.setattr(publisher, "MAX_NAMES", 3)
+    stars = SimpleNamespace(
+        hip=np.array([0, 7, 0, 0, 0, 0]),
+        v_mag=np.array([5.0, -1.0, 1.0, 4.0, 2.0, 3.0]),
+        names=lambda which: ["" if k == 4 else f"star {k}" for k in which],
+    )
+    assert names_of(stars) == {2: "star 2", 5: "star 5"}
 
 
 def watched_run(feed, tmp_path, **parts) -> WatchedRun:

@@ -7,11 +7,20 @@ from __future__ import annotations
 import base64
 import hashlib
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from hilstar.server.console.report import PAGE_DIR, one_script, report_page, run_data, verdict
+from hilstar.basics.rotation import from_radec_roll_deg, from_rotation_vector
+from hilstar.server.console.report import (
+    PAGE_DIR,
+    _answers,
+    one_script,
+    report_page,
+    run_data,
+    verdict,
+)
 from hilstar.server.record.ledger_records import CountRecord, EventRecord, FrameRecord, PacketForm
 from hilstar.server.record.run_figures import (
     BLOCK,
@@ -55,7 +64,7 @@ def reported_run() -> RunFigures:
     figures = RunFigures(
         {
             "unix_ns": str(1_800_000_000 * 10**9),
-            "monotonic_ns": str(10**12),
+            "monotonic_ns": str(10**12 - 3 * 10**9),  # the first swap came 3 s later
             "bench_text": "</script>",
         }
     )
@@ -122,11 +131,53 @@ def test_a_long_run_keeps_its_worst_frame_and_stays_small(reported_run):
     assert told["events"] == [
         {
             "t_s": 90.0,
-            "utc": "2027-01-15T08:01:30.000+00:00",
+            "utc": "2027-01-15T08:01:33.000+00:00",
             "kind": "mark",
             "line": "<b>cover off</b>",
         }
     ]
+
+
+def moved_run(step_ns: int, attitudes: list[np.ndarray]) -> tuple[dict, dict]:
+    """The path and motion of a run whose attitudes are `step_ns` apart, shown 60 a second."""
+    figures = RunFigures({})
+    for k, q in enumerate(attitudes):
+        figures.add(frame_record(k, q=tuple(q), t_ns=10**12 + k * step_ns))
+    told = run_data("run.mcap", figures, summarise(figures))
+    return told["path"], told["motion"]
+
+
+def test_a_path_s_rate_is_by_the_attitudes_time_not_the_screen_s():
+    turns = [from_rotation_vector(np.array([0.0, 0.0, -1e-3 * k])) for k in range(20)]
+    for step_ns in (PERIOD_NS, 2 * PERIOD_NS):
+        path, _ = moved_run(step_ns, turns)
+        *rates, last = path["rate_deg_s"][2]
+        assert last is None
+        assert rates == pytest.approx([np.degrees(1e-3) / (step_ns / 1e9)] * 19, abs=2e-4)
+
+
+@pytest.mark.parametrize(("dec_deg", "amplitude_deg"), [(0.0, 2.0), (60.0, 1.0)])
+def test_a_motion_in_right_ascension_is_as_wide_as_on_the_sky(dec_deg, amplitude_deg):
+    swing_deg = 2.0 * np.sin(2 * np.pi * np.arange(40) / 40)
+    attitudes = [from_radec_roll_deg(100.0 + ra_deg, dec_deg, 0.0) for ra_deg in swing_deg]
+    _, motion = moved_run(PERIOD_NS, attitudes)
+    curve, *others = motion["about_mean"]["curves"].values()
+    assert max(curve) == pytest.approx(amplitude_deg, abs=2e-3)
+    assert np.abs(others).max() < 2e-3
+
+
+def test_a_fault_that_never_ended_is_on_until_the_run_s_end():
+    faults = [SimpleNamespace(start_s=2.0, end_s=None), SimpleNamespace(start_s=1.0, end_s=5.0)]
+    summary = SimpleNamespace(answers=SimpleNamespace(faults=faults), duration_s=9.0)
+    run = SimpleNamespace(
+        first_swap_ns=10**9,
+        residuals=SimpleNamespace(rows=np.array([[3.0, 1.0, 2.0, 4.0]])),
+        answers=SimpleNamespace(wrong_ns=[4 * 10**9]),
+    )
+    told = _answers(run, summary)
+    assert (told["on_s"], told["on"]) == ([1.0, 2.0, 5.0, 9.0], [1, 2, 1, 0])
+    assert (told["t_s"], told["wrong_s"]) == ([2.0], [3.0])
+    assert told["xyz_arcsec"] == [[1.0], [2.0], [4.0]]
 
 
 def test_packets_are_counted_at_their_time(reported_run):

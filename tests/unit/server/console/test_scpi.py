@@ -113,6 +113,8 @@ def test_a_header_goes_on_from_the_one_before(line, wanted):
         ("SKY:ATT 1,0,0,0 RAD/S", -131),
         ("SKY:ATT 1,0,0,1e999", -222),
         ("SKY:ATT 1,0,0,1e99999", -123),
+        ("SKY:ATT 1,0,0,1e32001", -123),
+        ("SKY:ATT 1,0,0,1e-32001", -123),
         (f"SKY:ATT {'1' * 300},0,0,0", -124),
         (f"*ESE #H{'F' * 4000}", -124),
         ("*ESE 256", -222),
@@ -138,8 +140,8 @@ def test_numbers_are_read_as_ieee_488_writes_them():
     assert [scpi.number(each, "DEG/S") for each in unit.parameters] == [0.15, 255.0, -0.5]
     (unit,) = units('SKY:FAUL "say ""so""", \'ON\'')
     assert [each.text for each in unit.parameters] == ['say "so"', "ON"]
-    assert [scpi.boolean(units(f"SKY:BLAN {word}")[0].parameters[0]) for word in ("on", "OFF", "0", "0.6", "7")] == [
-        True, False, False, True, True,
+    assert [scpi.boolean(units(f"SKY:BLAN {word}")[0].parameters[0]) for word in ("on", "OFF", "0", "0.4", "0.6", "7")] == [
+        True, False, False, False, True, True,
     ]  # fmt: skip
 
 
@@ -169,6 +171,13 @@ def test_the_status_byte_sums_up_what_is_enabled():
     assert (status.questionable.read(), status.questionable.read()) == (1 << 9, 0)
     status.clear()
     assert status.byte(False) == 0 and status.standard.enable == 16
+
+
+def test_a_condition_is_an_event_when_it_begins_alone():
+    register = scpi.Register()
+    for condition, events in ((1, 1), (1, 0), (3, 2), (2, 0), (3, 1)):
+        register.see(condition)
+        assert register.read() == events
 
 
 @pytest.mark.parametrize("chunk", [1, 3, 10_000])

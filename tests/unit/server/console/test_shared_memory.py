@@ -62,6 +62,31 @@ def test_a_record_that_was_changed_is_not_taken_for_whole():
     assert records.read(1) is None
 
 
+def test_where_the_newest_records_are_damaged_the_newest_whole_one_is_read():
+    memory = bytearray(Ring.size(SLOTS, SLOT_BYTES))
+    records = Ring(memoryview(memory), SLOTS, SLOT_BYTES)
+    for k in range(1, 7):
+        records.put(b"%d" % k * 50)
+    for damaged, whole in ((b"6", 5), (b"5", 4)):
+        memory[memory.index(damaged * 50) + 7] ^= 1
+        assert records.last() == (whole, b"%d" % whole * 50)
+    memory[memory.index(b"4" * 50) + 7] ^= 1
+    assert records.last() is None  # the slot that is written next is never read
+
+
+def test_no_ring_lies_in_another_s_memory():
+    memory = SharedMemory.make(320 * 240)
+    rings = [memory.frames, memory.states, memory.events, memory.answers, memory.pictures]
+    for number, each in enumerate(rings, 1):
+        for _ in range(each._slots):
+            each.put(bytes([number]) * each.slot_bytes)
+    for number, each in enumerate(rings, 1):
+        for k in range(1, each._slots + 1):
+            assert each.read(k) == bytes([number]) * each.slot_bytes
+    memory.want = PictureRequest(5, 7)
+    assert memory.frames.read(1) == b"\1" * memory.frames.slot_bytes
+
+
 def test_a_reader_beside_a_writer_sees_whole_records_alone():
     records = ring()
     stop, torn, seen = threading.Event(), [], []

@@ -129,6 +129,8 @@ def test_the_terminal_has_a_line_of_the_tracker():
     )
     assert line(FIGURES) == (text, True)
     assert line(msgspec.structs.replace(FIGURES, silent="gone")) == ("gone", False)
+    assert not line(msgspec.structs.replace(FIGURES, trouble="unplugged"))[1]
+    assert not line(msgspec.structs.replace(FIGURES, verdict="wrong"))[1]
     assert line(TrackerFigures())[0] == "- arcsec off, rms -, - available, - late; 0 answers"
 
 

@@ -71,11 +71,12 @@ def stream():
 
 def test_faults_come_in_over_a_socket_and_bad_messages_are_counted(stream):
     schedule, opened, sender = stream
-    for message in (b"nonsense", json.dumps(STAR).encode(), b'{"start": "cover"}'):
+    bad = (b"nonsense", b"[]", b'{"start": 5}')
+    for message in (*bad, json.dumps(STAR).encode(), b'{"start": "cover"}'):
         sender.send(message)
     wait_for(lambda: len(schedule.on()) == 2)
     assert schedule.on() == ["ghost", "cover"]
-    assert opened.summary()["messages"] == 3 and opened.summary()["refused"] == 1
+    assert opened.summary()["messages"] == 5 and opened.summary()["refused"] == 3
 
 
 def test_a_flood_and_a_huge_message_leave_the_schedule_bounded_and_listening(stream):

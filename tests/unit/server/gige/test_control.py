@@ -276,6 +276,30 @@ def test_a_side_has_the_detector_s_limits():
         assert [node.findtext(f"{space}{end}") for end in ("Min", "Max")] == [str(value)] * 2
 
 
+def test_a_packet_s_size_is_the_lower_half_of_its_register_and_a_command_its_bit():
+    """GenApi counts the bits of a big-endian register from its highest."""
+    root = ElementTree.fromstring(_description(Asker(channel())))
+    space = "{http://www.genicam.org/GenApi/Version_1_1}"
+    size = root.find(f"{space}MaskedIntReg[@Name='GevSCPSPacketSizeRegister']")
+    assert size is not None
+    assert [size.findtext(f"{space}{name}") for name in ("MSB", "LSB")] == ["16", "31"]
+    values = {
+        node.get("Name"): node.findtext(f"{space}CommandValue")
+        for node in root.iter(f"{space}Command")
+    }
+    assert values.pop("GevTimestampControlLatch") == "2"  # GigE Vision's bit 30; bit 31 resets it
+    assert values and set(values.values()) == {"1"}
+
+
+def test_memory_beyond_the_description_is_no_memory():
+    client = Asker(channel())
+    size = len(_description(client).encode())
+    for count, is_there in ((4, True), (8, False)):
+        at = DESCRIPTION_AT + -(-size // 4) * 4 - 4
+        status, _ = client.ask(READ_MEMORY, struct.pack(">IHH", at, 0, count))
+        assert (status == GvcpStatus.SUCCESS) is is_there
+
+
 def _description(client: Asker) -> str:
     size = int(
         client.ask(READ_MEMORY, struct.pack(">IHH", 0x200, 0, 512))[1][4:]

@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.server.gige.features import PIXEL_FORMATS
 from hilstar.server.gige.registers import CameraSettings
-from hilstar.server.gige.stream import LAST_BLOCK, image_block, next_block, packed
+from hilstar.server.gige.stream import HEADERS_BYTES, LAST_BLOCK, image_block, next_block, packed
 
 RNG = np.random.default_rng(5)
 
@@ -85,6 +85,17 @@ def test_a_block_has_leader_data_and_trailer_numbered_from_0(packet_bytes):
     assert form == 0x0110_0005
     data = b"".join(packet[8:] for packet in packets[1:-1])
     np.testing.assert_array_equal(np.frombuffer(data, "<u2").reshape(48, 64), dn)
+
+
+def test_an_image_that_fills_its_packets_has_no_empty_one_after():
+    camera = CameraSettings(64, 48, 8, 0.1, 1.0, pixel_format="Mono8")
+    dn = np.zeros((48, 64), np.uint16)
+    whole = 64 * 48 // 3
+    for data_bytes, packets in ((whole, 3), (whole - 1, 4), (whole + 1, 3)):
+        block = image_block(7, dn, 0, camera, data_bytes + HEADERS_BYTES)
+        assert block.last == packets + 1
+        sizes = [len(b"".join(packet)) - 8 for packet in block.packets()][1:-1]
+        assert (len(sizes), sum(sizes), min(sizes) > 0) == (packets, 64 * 48, True)
 
 
 def test_blocks_are_numbered_from_1_again_after_the_last():

@@ -11,6 +11,7 @@ import pytest
 
 from hilstar.sky.bodies.oem import OemOrbit
 from tests.support.refusals import refusal
+from tests.support.skies import utc_ns
 from tests.support.sources.oem_messages import START_NS, STATION, oem, segment
 
 MINUTES = range(0, 1260, 60)
@@ -163,3 +164,20 @@ def test_what_is_no_orbit_about_the_earth_is_refused_in_one_line(text, words):
     line = refusal(station, text)
     assert words in line
     assert line.startswith("a.oem")
+
+
+def test_where_two_segments_meet_the_later_one_holds():
+    """The second begins with the states of ten seconds later, as after a manoeuvre."""
+    later = segment([1210, 1310, 1410], -10.0)
+    orbit = station(oem(segment(MINUTES[:21]), later))
+    before_ns, at_ns = START_NS + 1199 * NS, START_NS + 1200 * NS
+    assert orbit.state(before_ns)[0] == pytest.approx(STATION.state(before_ns)[0], abs=PLACE_KM)
+    assert orbit.state(at_ns)[0] == pytest.approx(STATION.state(at_ns + 10 * NS)[0], abs=PLACE_KM)
+
+
+def test_the_age_of_elements_is_from_their_epoch_s_fraction_of_a_day_on():
+    """The epoch, 08264.51782528, is that part of the 264th day of 2008."""
+    first_day_ns = utc_ns("2008-01-01T00:00:00")
+    epoch_ns = first_day_ns + round(263.51782528 * 86400e9)
+    assert STATION.age_days(epoch_ns) == pytest.approx(0.0, abs=1e-8)
+    assert STATION.age_days(epoch_ns - 86400 * NS) == pytest.approx(-1.0, abs=1e-8)

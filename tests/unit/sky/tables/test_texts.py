@@ -12,6 +12,8 @@ from astropy.table import Table
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import warn_once
+from hilstar.sky import table_reader
+from hilstar.sky.catalog import load_catalog
 from hilstar.sky.star_table import TableChoice, choose_catalog
 from tests.support.refusals import refusal
 
@@ -270,6 +272,70 @@ def test_float_identifiers_in_fits_are_not_used_where_they_cannot_hold_them(read
         catalog, _ = read(None, name=f"{k}.fits")
         assert (catalog.designation == "Gaia DR3") == (kind is np.int64)
     assert "no identifier of their own" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("kind", "first", "name"),
+    [
+        (np.float32, 2**24 - 12, "Gaia DR3"),
+        (np.float32, 2**24 + 2, "stars row"),
+        (np.float64, 2**24 + 2, "Gaia DR3"),
+        (np.float64, 2**53 + 2, "stars row"),
+    ],
+)
+def test_a_float_holds_identifiers_up_to_its_digits(read, tmp_path, kind, first, name):
+    """Even ones beyond would be held, too, but which they were nobody knows."""
+    cells = [np.arange(first, first + 12, 2)[:6].astype(kind), [2016.0] * 6, RA, DEC, V, BV]
+    columns = dict(zip(f"source_id,{GAIA}".split(","), cells, strict=True))
+    Table(columns).write(tmp_path / "stars.fits")
+    catalog, _ = read(None, name="stars.fits")
+    assert catalog.designation.startswith(name)
+
+
+@pytest.mark.parametrize(("other_jyear", "release"), [(2015.5, "Gaia DR2"), (2016.0, "Gaia DR3")])
+def test_a_release_is_the_second_where_every_epoch_is(read, other_jyear, release):
+    epochs = [2015.5] * 5 + [other_jyear]
+    catalog, _ = read(lines([f"source_id,{GAIA}"], range(11, 17), epochs, RA, DEC, V, BV))
+    assert catalog.designation == release
+
+
+def test_right_ascensions_west_of_0_are_turned(read):
+    catalog, order = read(lines(["ra_deg,dec_deg,vmag,b-v"], [-80.0, -169.5, *RA[2:]], DEC, V, BV))
+    assert catalog.ra_deg[order].tolist() == [280.0, 190.5, *RA[2:]]
+
+
+def test_a_table_is_as_long_as_its_pieces_together(read, monkeypatch):
+    monkeypatch.setattr(table_reader, "CHUNK_BYTES", 40)
+    monkeypatch.setattr(table_reader, "MAX_ROWS", 6)
+    assert_stars(*read(lines(["ra,dec,vmag,b-v"], RA, DEC, V, BV)))
+    longer = lines(["ra,dec,vmag,b-v"], [*RA, 1.0], [*DEC, 1.0], [*V, 3.0], [*BV, 0.0])
+    with pytest.raises(InputError, match="rows"):
+        read(longer, name="longer.txt")
+
+
+@pytest.mark.parametrize(
+    ("role", "unit", "by"),
+    [("ra_deg", "h", 15.0), ("dec_deg", "arcmin", 1 / 60), ("pm_dec_mas_yr", "arcsec/yr", 1000.0)],
+)
+def test_a_column_s_unit_is_the_one_that_it_states(tmp_path, role, unit, by):
+    assert table_reader.factor_to(role, "column", unit, tmp_path) == pytest.approx(by)
+    assert table_reader.factor_to(role, "column", "", tmp_path) == 1.0
+
+
+def test_a_colour_that_few_stars_have_gives_that_of_the_reddest_that_twenty_have():
+    stars = load_catalog()
+    bins = np.round(stars.vi_mag / 0.05)
+    full = max(middle for middle in np.unique(bins[bins > 0]) if (bins == middle).sum() >= 20)
+    reddest = np.median(stars.bv_mag[bins == full])
+    most = np.nanmax(stars.vi_mag)
+    assert most > full * 0.05 + 1.0
+    found = table_reader.bv_from_vi(np.array([most, full * 0.05 + 0.3]))
+    assert found == pytest.approx(reddest, abs=1e-6)
+
+
+def test_a_declination_in_hours_is_refused(tmp_path):
+    line = refusal(table_reader.factor_to, "dec_deg", "de", "h", tmp_path)
+    assert line.endswith("column de is in 'h'; give it in deg")
 
 
 def test_whole_floats_that_hold_their_identifiers_are_used(read):

@@ -6,10 +6,11 @@ import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.optics.layers.fault_kinds import fault_of
-from hilstar.server.bench.scenario import MAX_ON, FaultSchedule, Scenario
+from hilstar.server.bench.scenario import MAX_ON, FaultSchedule, Scenario, Timetable
 from tests.support.refusals import refusal
 
 FRAME_NS = 10_000_000  # 100 Hz
+EXPOSURE_S = 0.1
 
 
 def blank(name, **keys):
@@ -169,3 +170,38 @@ def test_a_fault_between_two_frames_of_a_slow_run_is_reported_as_missed():
     schedule.at(0)
     assert schedule.at(2_000_000_000) == ()
     assert [change.what for change in heard] == ["missed"]
+
+
+def timetable(*faults):
+    return Timetable(Scenario("faults.toml", "", 0, faults), lambda fault: fault, EXPOSURE_S)
+
+
+def test_an_exposure_is_cut_where_a_fault_begins_ends_or_is_renewed():
+    """A burst of cosmic rays is another one in each exposure's time from its own beginning on."""
+    cut = timetable(blank("cover", at_s=0.03, for_s=0.04), blank("on", at_s=0.25))
+    assert cut.edges_ns(0, 10**8) == [0, 30_000_000, 70_000_000, 10**8]
+    assert cut.edges_ns(30_000_000, 70_000_000) == [30_000_000, 70_000_000]
+    assert cut.edges_ns(2 * 10**8, 3 * 10**8) == [2 * 10**8, 250_000_000, 3 * 10**8]
+    rays = fault_of({"kind": "cosmic-rays", "name": "r", "number": 2, "electrons": 9, "at_s": 0.01})
+    for first in (0, 7):
+        begin_ns = first * 10**8 + 5_000_000
+        wanted_ns = [begin_ns, begin_ns + 5_000_000, begin_ns + 105_000_000, begin_ns + 15 * 10**7]
+        assert timetable(rays).edges_ns(begin_ns, begin_ns + 15 * 10**7) == wanted_ns
+
+
+def freeze(name, **keys):
+    return fault_of({"kind": "freeze", "name": name, **keys})
+
+
+def test_a_display_stands_from_the_first_of_faults_that_overlap():
+    stuck = timetable(
+        freeze("a", at_s=0.02, for_s=0.05),
+        freeze("b", at_s=0.05, for_s=0.06),
+        blank("cover", at_s=0.0),
+        freeze("c", at_s=0.3, for_s=0.1),
+    )
+    for t_s, since_s in ((0.01, None), (0.03, 0.02), (0.06, 0.02), (0.1, 0.02), (0.2, None)):
+        since_ns = stuck.stands_since_ns(round(t_s * 1e9))
+        assert since_ns == (None if since_s is None else round(since_s * 1e9))
+    assert stuck.stands_since_ns(3 * 10**8) == 3 * 10**8
+    assert stuck.stands_since_ns(4 * 10**8) is None

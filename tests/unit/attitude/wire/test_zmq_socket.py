@@ -1,0 +1,68 @@
+"""A ZeroMQ socket's bounds on the parts of a message, and what memory it watches."""
+
+from __future__ import annotations
+
+import pytest
+import zmq
+
+from hilstar.attitude.wire import zmq_socket
+from hilstar.attitude.wire.zmq_socket import MAX_GROWTH_BYTES, MAX_PARTS, ZmqReply, ZmqSocket
+from hilstar.basics.notices import Notices
+
+WAIT_MS = 20_000
+
+
+@pytest.fixture
+def pair(tmp_path):
+    """A link, its notices, and a peer that binds and sends to it."""
+    notices = Notices()
+    endpoint = f"ipc://{tmp_path}/s"
+    context = zmq.Context()
+    with context.socket(zmq.PUSH) as peer:
+        peer.linger, peer.sndtimeo = 0, WAIT_MS
+        peer.bind(endpoint)
+        with ZmqSocket(zmq.PULL, endpoint, notices=notices) as link:
+            link.wait_for_message(0)  # it connects
+            yield link, notices, peer
+    context.term()
+
+
+def taken_parts(link) -> list[int]:
+    return [len(message.parts) for message in link.taken(WAIT_MS)]
+
+
+def test_a_message_has_so_many_parts_and_a_longer_one_is_passed_over(pair):
+    link, notices, peer = pair
+    peer.send_multipart([b"x"] * MAX_PARTS)
+    assert taken_parts(link) == [MAX_PARTS]
+    peer.send_multipart([b"x"] * (MAX_PARTS + 2))
+    peer.send_multipart([b"x"])
+    assert taken_parts(link) + taken_parts(link) == [1]
+    assert notices.counts()["long-message"] == 1
+    assert link.link_counts.resets == 0
+
+
+def test_a_message_that_is_too_long_to_be_passed_over_drops_every_connection(pair, monkeypatch):
+    monkeypatch.setattr(zmq_socket, "MAX_PASSED_OVER", 5)
+    link, notices, peer = pair
+    peer.send_multipart([b"x"] * (MAX_PARTS + 10))
+    assert taken_parts(link) == []
+    assert link.link_counts.resets == 1 and notices.counts()["flood"] == 1
+
+
+def test_what_this_process_took_before_the_link_was_used_is_not_the_link_s(tmp_path, monkeypatch):
+    used_bytes = 10**9
+    monkeypatch.setattr(zmq_socket._MemoryWatch, "_used_bytes", lambda watch: used_bytes)
+    monkeypatch.setattr(zmq_socket, "LOOK_S", 0.0)
+    monkeypatch.setattr(zmq_socket, "FREED_WITHIN_S", 0.0)
+    with ZmqReply(f"ipc://{tmp_path}/open") as open_from_its_begin_on:
+        used_bytes += 2 * MAX_GROWTH_BYTES
+        assert not open_from_its_begin_on.wait_for_message(0)
+        assert open_from_its_begin_on.link_counts.resets == 0
+    with ZmqSocket(zmq.PULL, f"ipc://{tmp_path}/s") as link:
+        used_bytes += 2 * MAX_GROWTH_BYTES
+        link.wait_for_message(0)
+        assert link.link_counts.resets == 0
+        used_bytes += 2 * MAX_GROWTH_BYTES
+        link.wait_for_message(0)
+        assert link.link_counts.resets == 1

@@ -1,0 +1,53 @@
+"""What the sky and the codes add to each star, of errors that a test chooses."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilstar.instruments.certify import sky_effects
+
+MAG, ARCSEC, SPECTRUM = 0.01, 0.1, 0.02
+
+
+@pytest.mark.parametrize(
+    ("lost_mag", "scatter"), [([0.3, 0.1], 0.0), ([0.3, 0.1, 0.2], 0.1), ([0.4] * 4, 0.0)]
+)
+def test_each_star_has_its_own_errors_and_all_have_one_spectrum(lost_mag, scatter, monkeypatch):
+    """What codes lose scatters by three stars or more."""
+    count = len(lost_mag)
+    own = 1 + np.arange(count)
+    monkeypatch.setattr(
+        sky_effects, "catalogue_errors", lambda file, rows: (MAG * own, ARCSEC * rows)
+    )
+    monkeypatch.setattr(sky_effects, "spectrum_mag", lambda file, b_v: (SPECTRUM * b_v, "planted"))
+    stars = [
+        SimpleNamespace(row=10 + k, b_v_mag=0.5 * k, quantised_mag=mag)
+        for k, mag in enumerate(lost_mag)
+    ]
+    figures = SimpleNamespace(stars=stars)
+    effects = {
+        effect.input.name: effect
+        for effect in sky_effects.of_sky(None, figures)  # type: ignore[arg-type]
+    }
+    covariances = {}
+    for name, effect in effects.items():
+        assert effect.sky is not None and len(effect.sky) == effect.input.size
+        slopes = effect.sky.reshape(len(effect.sky), -1)
+        covariances[name] = (slopes.T @ slopes).reshape(3, count, 3, count)
+    nothing = np.zeros((count, count))
+    light = covariances["catalogue light"]
+    assert light[0, :, 0] == pytest.approx(np.diag((MAG * own) ** 2))
+    place = covariances["catalogue place"]
+    of_rows = np.diag((ARCSEC * (10 + np.arange(count))) ** 2)
+    for along in (1, 2):
+        assert place[along, :, along] == pytest.approx(of_rows)
+        assert light[along, :, along] == pytest.approx(nothing)
+    assert place[1, :, 2] == pytest.approx(nothing)
+    assert place[0, :, 0] == pytest.approx(nothing)
+    colour = SPECTRUM * 0.5 * np.arange(count)
+    assert covariances["spectrum"][0, :, 0] == pytest.approx(np.outer(colour, colour))
+    codes = covariances["quantisation"][0, :, 0]
+    assert codes == pytest.approx(scatter**2 * np.eye(count))

@@ -1,0 +1,147 @@
+"""Parts of a comparison of skies and of a judgement of a field, each against a closed form."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import from_rotation_vector, to_matrix
+from hilstar.instruments.compare.compare_skies import MAX_MOVE_SIGMAS, _differences
+from hilstar.instruments.compare.sky_comparison import Limits
+from hilstar.instruments.compare.star_fit import Seeds, _blended, _has, _sigma_px
+from hilstar.instruments.simulate.eye_picture import _blocks
+from hilstar.instruments.simulate.noise import found_share
+from hilstar.instruments.simulate.simulator import FaultyExposure
+from hilstar.instruments.verify.measure import DECENTRED, HIGHER, LENS, TILT, _parts
+from hilstar.instruments.verify.summary import _by_magnitude
+
+
+@pytest.mark.parametrize("sigma_px", [0.3, 0.9, 2.0])
+def test_a_star_s_sigma_is_that_of_its_correlation_without_the_pixel_s(sigma_px):
+    """Of a Gaussian with itself one pixel on: exp(-1 / (4 sigma^2)), and a pixel's variance."""
+    correlation = math.exp(-0.25 / (sigma_px**2 + 1 / 12))
+    assert _sigma_px(correlation) == pytest.approx(sigma_px)
+
+
+def test_a_blend_is_at_its_first_star_and_has_all_names():
+    places = np.array([[10.0, 10], [50, 50], [11, 10], [12, 10], [80, 20]])
+    seeds = _blended(Seeds(places, [(1,), (2,), (3,), ("Moon",), (5,)]), 1.5)
+    order = np.argsort(seeds.places_px[:, 0])
+    assert seeds.places_px[order].tolist() == [[10, 10], [50, 50], [80, 20]]
+    assert [seeds.hip[k] for k in order] == [(1, 3, "Moon"), (2,), (5,)]
+
+
+@pytest.mark.parametrize(("near", "has"), [(0, False), (1, False), (2, True), (3, True)])
+def test_a_table_is_of_a_sky_by_half_of_its_brightest_stars(near, has):
+    truth = {"x_px": np.array([10.0, 30.0, 50.0]), "y_px": np.array([10.0, 10.0, 10.0])}
+
+    class Table(dict):
+        """Three rows."""
+
+        def __len__(self):
+            return 3
+
+    found = np.array([[10.0, 10.5], [30.0, 10.5], [50.0, 10.5]])
+    found[near:, 1] += 20
+    assert _has(Table(truth), found, 1.0) == has
+
+
+def test_a_star_is_gone_that_is_too_faint_or_too_far_whichever_way():
+    far_px = MAX_MOVE_SIGMAS * 1.5
+    places = np.array([[10.0, 10.0]] * 5)
+    shifts = np.array(
+        [[0.1, 0.2], [0, 1.01 * far_px], [1.01 * far_px, 0], [0, 0.9 * far_px], [0, 0]]
+    )
+    fit = SimpleNamespace(
+        templates=SimpleNamespace(errors=lambda flux, error: (0.1 * flux, np.full(5, 0.05))),
+        flux=np.full(5, 100.0),
+        places_px=places,
+        psf=SimpleNamespace(width_px=(1.0, 1.5)),
+    )
+    moved = SimpleNamespace(flux=np.array([80.0, 100, 100, 100, 1e-6]), places_px=places + shifts)
+    limits = Limits(0.01, 0.1)
+    rows = _differences(Seeds(places, [(k,) for k in range(5)]), fit, moved, limits)
+    assert [math.isinf(row.flux_error_mag) for row in rows] == [False, True, True, False, True]
+    assert rows[0].flux_error_mag == pytest.approx(-2.5 * math.log10(0.8))
+    assert (rows[0].dx_px, rows[0].dy_px) == pytest.approx((0.1, 0.2))
+    assert (rows[1].dx_px, rows[1].dy_px) == (0.0, 0.0)
+    # a tenth of the light in magnitudes; a place's own error is under the limit
+    assert rows[0].limits.flux_mag == pytest.approx(0.1 * 2.5 / math.log(10))
+    assert rows[0].limits.centroid_px == 0.1
+
+
+def test_tilts_are_small_turns_about_both_axes_and_lenses_are_those_of_brown(rng):
+    x, y = rng.uniform(-0.3, 0.3, (2, 7))
+    parts = _parts(x, y)
+    turn = 1e-6
+    for axis, shift in ((0, (0, 1)), (1, (-1, 0))):
+        vector = np.zeros(3)
+        vector[axis] = -turn
+        rays = to_matrix(from_rotation_vector(vector)) @ np.stack([x, y, np.ones(7)])
+        moved = (rays[:2] / rays[2] - [x, y]) / turn
+        # without the shift of the whole
+        wanted = moved - np.array(shift)[:, None]
+        sign = np.sign(wanted[0] @ parts[TILT][:7, axis])
+        np.testing.assert_allclose(parts[TILT][:, axis], sign * wanted.ravel(), atol=1e-5)
+    r2 = x**2 + y**2
+    np.testing.assert_allclose(parts[LENS][:, 0], np.concatenate([x * r2, y * r2]))
+    np.testing.assert_allclose(parts[HIGHER][:, 0], np.concatenate([x * r2**2, y * r2**2]))
+    first = np.concatenate([2 * x * y, r2 + 2 * y**2])
+    second = np.concatenate([r2 + 2 * x**2, 2 * x * y])
+    np.testing.assert_allclose(parts[DECENTRED], np.column_stack([first, second]))
+
+
+def test_magnitudes_have_rows_from_the_brightest_star_on():
+    v_mag = np.array([-1.4, 0.5, 0.6, 3.0])
+    errors = SimpleNamespace(
+        of=lambda name: v_mag if name == "v_mag" else np.full(4, 0.01),
+        centroid_px=lambda: np.full(4, 0.1),
+    )
+    rows = _by_magnitude(errors)
+    assert [(row["v_from"], row["v_to"], row["stars"]) for row in rows] == [
+        (-2, -1, 1),
+        (0, 1, 2),
+        (3, 4, 1),
+    ]
+
+
+def test_blocks_of_a_picture_are_even_about_its_middle(rng):
+    blocks = _blocks(rng.integers(90, 110, (256, 384)).astype(np.uint16))
+    assert blocks.across.min() == pytest.approx(-blocks.across.max())
+    assert blocks.down.min() == pytest.approx(-blocks.down.max())
+    assert -1 < blocks.across.min() < 0
+
+
+@pytest.mark.parametrize(("minimum", "share"), [(1, 7 / 8), (2, 1 / 2), (3, 1 / 8)])
+def test_a_star_is_found_by_as_many_pixels_as_are_needed(minimum, share):
+    """Three pixels, each above the threshold in every second exposure."""
+    assert found_share(np.full((1, 1, 3), 0.5), minimum) == pytest.approx([share])
+
+
+def test_a_field_is_seen_in_the_pieces_in_which_nothing_covers_it(monkeypatch):
+    """Pieces of 0.1, 0.2 and 0.4 s, of which the second is blank."""
+    pieces = []
+    for number, seconds in enumerate((0.1, 0.2, 0.4)):
+        view = SimpleNamespace(exposure_s=seconds)
+        pieces.append(SimpleNamespace(view=view, now=number == 1))
+
+    class Layer(SimpleNamespace):
+        """Blank where its piece is."""
+
+        def turned(self, view):
+            return view
+
+    monkeypatch.setattr(
+        "hilstar.instruments.simulate.simulator.FaultLayer",
+        lambda view, now: Layer(blank=now),
+    )
+    exposure = FaultyExposure(None, pieces)
+    exposure._note = lambda sprites, share: None
+    total, open_s = exposure.light_e(
+        lambda view, layer: view, lambda view, seconds: np.full((1, 1), 10 * seconds)
+    )
+    assert total[0, 0] == pytest.approx(7.0)
+    assert open_s == pytest.approx(0.5)

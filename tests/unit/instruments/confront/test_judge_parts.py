@@ -1,0 +1,246 @@
+"""How a photograph is judged, part by part: noise of light, what explains a source, what is missing
+and where it is dim, and what moves between photographs.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from hilstar.instruments.confront import judge
+from hilstar.instruments.confront.judge import (
+    Expected,
+    Judge,
+    StarRow,
+    _dim_regions,
+    _Explanation,
+    _judged_cell,
+    chi2_of,
+    in_sigmas,
+    utc_of,
+)
+from hilstar.instruments.confront.session import MATCH_PX
+
+SIZE_PX = (800, 400)
+
+
+def test_a_residual_is_in_sigmas_of_background_and_shot_noise():
+    """4 DN of background and 100 DN of light at 4 e- a DN, which has a variance of 25 DN^2; light
+    below 0 has none.
+    """
+    off_dn = np.array([10.0, 10.0, -6.0])
+    light_dn = np.array([0.0, 100.0, -100.0])
+    found = in_sigmas(off_dn, light_dn, np.full(3, 16.0), 4.0)
+    assert found == pytest.approx([2.5, 10 / math.sqrt(41), -1.5])
+
+
+def test_a_background_s_chi_square_is_without_what_is_no_background():
+    assert chi2_of(np.array([1.0, -2.0, 4.99, -5.01, 80.0])) == pytest.approx((1 + 4 + 4.99**2) / 3)
+    assert math.isnan(chi2_of(np.array([9.0])))
+
+
+def test_a_photograph_s_time_is_kept_to_the_millisecond():
+    t_ns = int(np.datetime64("2026-03-20T21:34:56.789", "ns").astype(np.int64))
+    assert utc_of(t_ns + 999_999) == "2026-03-20T21:34:56.789Z"
+
+
+def pointing(x_rad: float, y_rad: float) -> Any:
+    """A camera turned so far about ICRS's y and x axes."""
+    half_x, half_y = x_rad / 2, y_rad / 2
+    return SimpleNamespace(q_icrs_to_cam=np.array([1.0, half_y, half_x, 0.0]))
+
+
+@pytest.mark.parametrize("along", [(0.01, 0.0), (0.0, 0.01)])
+def test_photographs_have_moved_by_the_largest_part_of_their_boresights(along):
+    """0.01 rad along one axis of the sky, of 3000 px a radian."""
+    pointings = [pointing(0.0, 0.0), pointing(*along), pointing(along[0] / 2, along[1] / 2)]
+    camera = SimpleNamespace(pointings=pointings, camera=SimpleNamespace(focal_length_px=3000.0))
+    judging: Any = SimpleNamespace(session=SimpleNamespace(camera=camera))
+    assert Judge._moved_px(judging) == pytest.approx(30.0, rel=1e-3)
+
+
+def test_planets_beside_the_image_have_their_places_and_those_behind_none(monkeypatch):
+    seen = {"Mars": [1.0, 0.0, 0.0], "Venus": [0.0, 1.0, 0.0], "Saturn": [0.0, 0.0, 1.0]}
+    monkeypatch.setattr(judge, "planets_seen", lambda t_ns: seen)
+    places = np.array([-50.0, 900.0, np.nan]), np.array([-3.0, 20.0, np.nan])
+    looking = SimpleNamespace(places_px=lambda camera, vectors: places)
+    camera = SimpleNamespace(pointings=[looking], camera=None)
+    photo = SimpleNamespace(t_ns=1)
+    session = SimpleNamespace(shots=[SimpleNamespace(photo=photo)], camera=camera)
+    judging: Any = SimpleNamespace(session=session)
+    assert Judge._planets(judging, 0) == {"Mars": (-50.0, -3.0), "Venus": (900.0, 20.0)}
+    photo.t_ns = None
+    assert Judge._planets(judging, 0) == {}
+
+
+def expected(places_px: list[tuple[float, float]], dn: list[float]) -> Expected:
+    x_px, y_px = np.array(places_px, dtype=float).T
+    return Expected(10 + np.arange(len(dn)), x_px, y_px, np.array(dn))
+
+
+def explanation(stars: Expected, snr: float, length_px: float) -> _Explanation:
+    """One source at (100, 50), of pixels with a noise of 2 DN."""
+    sources = SimpleNamespace(snr=np.array([snr]), length_px=np.array([length_px]))
+    return _Explanation(
+        shot=SimpleNamespace(sources=sources),  # type: ignore[arg-type]
+        expected=stars,
+        tree=cKDTree(np.column_stack([stars.x_px, stars.y_px])),
+        planets={},
+        satellites={},
+        near_saturated=lambda x_px, y_px: False,
+        hot=np.zeros((9, 9), dtype=bool),
+        light_sigma=np.zeros((9, 9)),
+        pixel_dn=2.0,
+        focal_length_px=3000.0,
+    )
+
+
+def test_a_source_is_the_brightest_of_the_stars_beside_it_if_these_have_light_enough():
+    """A signal of 50 is 50 x 2 x sqrt(4 pi) = 354 DN, of which 15 % are 53: of all stars together."""
+    stars = expected([(101.0, 50.0), (100.0, 51.5), (100.0, 49.0), (140.0, 50.0)], [9, 30, 20, 999])
+    assert explanation(stars, 50.0, 3.0)._brightest_star(0, (100.0, 50.0)) == 11
+    assert explanation(stars, 60.0, 3.0)._brightest_star(0, (100.0, 50.0)) is None
+    # half of a long source is beside it
+    assert explanation(stars, 50.0, 90.0)._brightest_star(0, (100.0, 50.0)) == 13
+    alone = expected([(103.6, 50.0)], [999.0])
+    is_near = MATCH_PX + 0.5 >= 3.6
+    found = explanation(alone, 50.0, 3.0)._brightest_star(0, (100.0, 50.0))
+    assert (found == 10) is is_near
+
+
+def test_missing_stars_are_bright_alone_and_within_the_image():
+    """Of ten pixels' noise of 1 DN a star of 60 DN stands out: those beside a source, an identified
+    or a saturated star, at the edge, or with half of their light, are not missing.
+    """
+    edge_px = 2 * MATCH_PX
+    places = [(100.0, 100.0), (200.0, 100.0), (300.0, 100.0), (edge_px - 0.5, 200.0)]
+    places += [(500.0, 100.0), (600.0, 100.0), (700.0, 100.0), (edge_px + 0.5, 300.0)]
+    stars = expected(places, [60, 60, 60, 60, 60, 60, 50, 60])
+    above_dn = np.zeros((400, 800))
+    above_dn[100, 500] = 30.5
+    above_dn[99, 600] = 29.5
+    sources = SimpleNamespace(places_px=np.array([[200.0, 100.0 + edge_px - 0.1]]))
+    found = SimpleNamespace(x_px=np.array([330.0, 305.0]), y_px=np.array([100.0, 100.0]))
+    shot = SimpleNamespace(
+        star=np.array([99, 98]),
+        saturated=np.array([False, True]),
+        found=found,
+        sources=sources,
+        photo=SimpleNamespace(size_px=SIZE_PX),
+        above_dn=above_dn,
+    )
+    judging: Any = SimpleNamespace(_pixel_variance=lambda shot: 1.0)
+    assert list(Judge._missing(judging, shot, stars)) == [10, 15, 17]
+    shot.star = np.array([10, 98])
+    assert list(Judge._missing(judging, shot, stars)) == [15, 17]
+
+
+def row_at(x_px: float, y_px: float, off_mag: float, **changes: Any) -> StarRow:
+    """A star of 1000 DN that is too faint by so much."""
+    row = StarRow(
+        star=1,
+        hip=1,
+        name="",
+        x_px=x_px,
+        y_px=y_px,
+        x_predicted_px=x_px,
+        y_predicted_px=y_px,
+        dn=1000 * 10 ** (-0.4 * off_mag),
+        sigma_dn=1.0,
+        dn_predicted=1000.0,
+        v_mag=4.0,
+        b_v_mag=0.6,
+        flags=(),
+    )
+    return replace(row, **changes)
+
+
+def missing_at(x_px: float, y_px: float) -> StarRow:
+    return row_at(x_px, y_px, 0.0, dn=math.nan, flags=("missing",))
+
+
+@pytest.mark.parametrize(
+    ("rows", "is_dim"),
+    [
+        ([missing_at(1.0, 1.0)], False),  # one star says nothing
+        ([missing_at(1.0, 1.0)] * 2, True),
+        ([missing_at(1.0, 1.0), row_at(2.0, 2.0, 0.0)], True),
+        ([missing_at(1.0, 1.0), *[row_at(2.0, 2.0, 0.0)] * 2], False),
+        ([row_at(2.0, 2.0, 0.26)] * 2, True),
+        ([row_at(2.0, 2.0, 0.24)] * 2, False),
+        ([row_at(2.0, 2.0, 0.9)], False),
+    ],
+)
+def test_a_part_of_an_image_is_dim_by_two_stars_or_more(rows, is_dim):
+    cell, found = _judged_cell(rows, 0.01)
+    assert found is is_dim
+    assert (cell.count, cell.missing) == (len(rows), sum("missing" in row.flags for row in rows))
+    # stars that scatter by 0.2 mag are dim only beyond four sigmas of their mean
+    assert not _judged_cell([row_at(2.0, 2.0, 0.5)] * 2, 0.2)[1]
+
+
+@pytest.mark.parametrize(
+    ("x_px", "y_px", "name"),
+    [
+        (399.0, 199.0, "upper left"),
+        (401.0, 199.0, "upper right"),
+        (399.0, 201.0, "lower left"),
+        (401.0, 201.0, "lower right"),
+        (799.4, 399.4, "lower right"),
+        (-2.0, -2.0, "upper left"),
+    ],
+)
+def test_dim_parts_are_named_by_the_quarter_of_an_image_that_is_no_square(x_px, y_px, name):
+    elsewhere = [row_at(x, y, 0.0) for x in (150.0, 650.0) for y in (150.0, 250.0)] * 4
+    dim = [missing_at(x_px, y_px), missing_at(x_px, y_px), row_at(x_px, y_px, 0.8)]
+    texts, is_dim = _dim_regions([*elsewhere, *dim], SIZE_PX)
+    assert texts == [
+        f"{name}: 2 of 3 stars are missing, those seen 0.80 mag too faint: cloud, an obstacle, or"
+        " vignetting"
+    ]
+    # a faint star beside the part is in it, one with all of its light is not
+    assert is_dim(row_at(x_px, y_px, 0.5))
+    assert not is_dim(row_at(x_px, y_px, 0.1))
+
+
+@pytest.mark.parametrize(("floor_px", "used_px"), [(0.3, 0.3), (0.001, 0.02)])
+def test_a_date_is_told_by_the_stars_that_move_and_by_their_places_errors(
+    floor_px, used_px, monkeypatch
+):
+    """Four stars move by 0.4 px a year along x, and are 0.8 px on: two years late, by places that
+    are known to 0.4 px each and to the camera's floor. The fifth is not clean.
+    """
+    now = np.array(
+        [[0.1, 0.2, 1.0], [0.3, 0.1, 1.0], [0.2, 0.4, 1.0], [0.0, 0.0, 1.0], [9.0, 9, 1]]
+    )
+    monkeypatch.setattr(
+        judge,
+        "unit_vectors_icrs",
+        lambda catalog, epoch: np.array([4e-4 * (epoch - 2020.0), 0.0, 0.0]) + catalog,
+    )
+    order = np.array([4, 3, 2, 1, 0])
+    by_row = SimpleNamespace(taken=lambda rows: now[::-1][rows])
+    sky = SimpleNamespace(catalog=by_row, order=order, epoch_jyear=2020.0, vectors=now)
+    star = np.array([3, 0, 4, 1, 2])
+    places_px = 1000 * now[star, :2] + [0.8, 0.0]
+    shot = SimpleNamespace(
+        clean=np.array([True, True, False, True, True]),
+        star=star,
+        sky=sky,
+        found=SimpleNamespace(places_px=places_px, sigma_px=np.full(5, 0.4)),
+    )
+    looking = SimpleNamespace(places_px=lambda camera, vectors: (1000 * vectors[:, :2]).T)
+    camera = SimpleNamespace(pointings=[looking], camera=None, floor_px=floor_px)
+    judging: Any = SimpleNamespace(session=SimpleNamespace(shots=[shot], camera=camera))
+    found = Judge._dated(judging, 0)
+    assert found is not None
+    assert found.years == pytest.approx(2.0)
+    assert found.sigma == pytest.approx(math.hypot(0.4, used_px) / (0.4 * 2))
+    shot.clean[:] = False
+    assert Judge._dated(judging, 0) is None

@@ -1,0 +1,295 @@
+"""How the light of photographs is fitted, and what its scatter is made of, part by part: stars that
+are trusted, corrections that stay in bounds, fits that leave stars out, pixels and neighbours.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hilstar.instruments.confront import excess
+from hilstar.instruments.confront.background import fixed_pattern
+from hilstar.instruments.confront.excess import (
+    HALF,
+    LAW,
+    Part,
+    _blends,
+    _response,
+    _rest,
+    _scintillation,
+    _variables,
+    shot_sigma,
+)
+from hilstar.instruments.confront.light import (
+    CORRECTION_PRIOR,
+    MAX_CORRECTION,
+    NO_CORRECTION,
+    StarLight,
+    _correction,
+    _CorrectionFit,
+    _held_out,
+    _robust,
+    _trusted,
+    _vignetting,
+    fit_light,
+    with_extinction,
+)
+
+MAG_A_RELATIVE = 2.5 / math.log(10)
+
+
+def stars_of(mag: np.ndarray, sigma_mag: float, **changes: Any) -> StarLight:
+    """Stars of these magnitudes (n,) in one photograph."""
+    count = len(mag)
+    dn = 10 ** (-0.4 * mag)
+    none = np.zeros(count)
+    every = np.ones(count, dtype=bool)
+    image = np.zeros(count, dtype=np.intp)
+    sigma_dn = sigma_mag / MAG_A_RELATIVE * dn
+    stars = StarLight(image, dn, sigma_dn, mag, none, none, every, image)
+    return replace(stars, **changes)
+
+
+def test_extinction_is_as_sure_as_skies_are_alike(rng):
+    """0.01 mag from sky to sky, whatever number of stars: by air masses of 1, 1.4 and 2."""
+    image = np.repeat(np.arange(3), 400)
+    v_mag = rng.uniform(2, 6, 1200)
+    masses = np.array([1.0, 1.4, 2.0])
+    mag = v_mag + 0.2 * masses[image] - 12
+    stars = stars_of(mag + 1e-3 * rng.standard_normal(1200), 1e-3, image=image, v_mag=v_mag)
+    fit = fit_light(stars, 3, lambda correction: v_mag)
+    told = with_extinction(fit, stars, masses.tolist(), known=False)
+    about = math.sqrt(float(((masses - masses.mean()) ** 2).sum()))
+    sigma = told.sigma["extinction_mag_per_air_mass"]
+    assert sigma == pytest.approx(0.01 / about, rel=0.01)
+    assert fit.zero_point_mag == pytest.approx(12 - 0.2 * masses.mean(), abs=1e-3)
+
+
+def test_a_zero_point_is_the_mean_of_the_photographs_and_no_vignetting(rng):
+    image = np.repeat(np.arange(3), 60)
+    v_mag = rng.uniform(2, 6, 180)
+    radius2 = rng.uniform(0, 1, 180)
+    mag = v_mag + np.array([-12.0, -11.4, -11.9])[image] + 0.3 * radius2 + 0.2 * radius2**2
+    stars = stars_of(mag + 1e-3 * rng.standard_normal(180), 1e-3)
+    stars = replace(stars, image=image, v_mag=v_mag, radius2=radius2)
+    fit = fit_light(stars, 3, lambda correction: v_mag)
+    assert fit.zero_point_mag == pytest.approx((12.0 + 11.4 + 11.9) / 3, abs=2e-3)
+    assert fit.colour_term == pytest.approx(0.0, abs=2e-3)
+
+
+def test_stars_are_trusted_by_the_light_that_their_own_photograph_should_have():
+    """Noise of 1 DN, zero points of 10 and 7 mag: V 6.7 makes 21 DN in the first, V 3.7 in the
+    second. Fainter stars that came out as bright are not trusted, and stars that are not clean.
+    """
+    v_mag = np.array([*np.linspace(2, 6.7, 10), 6.8, 5.0, *np.linspace(0, 3.7, 10), 3.8])
+    image = np.repeat([0, 1], [12, 11])
+    zero_mag = np.array([10.0, 7.0])[image]
+    dn = 10 ** (-0.4 * (v_mag - zero_mag))
+    dn[[10, 22]] = 30.0
+    clean = np.ones(23, dtype=bool)
+    clean[11] = False
+    stars = stars_of(v_mag, 0.01)
+    stars = replace(stars, dn=dn, sigma_dn=np.ones(23), v_mag=v_mag, image=image, clean=clean)
+    trusted = _trusted(stars, np.eye(2)[image])
+    assert np.flatnonzero(~trusted).tolist() == [10, 11, 22]
+    dark = replace(stars, sigma_dn=np.full(23, 1e9))
+    assert _trusted(dark, np.eye(2)[image]).tolist() == clean.tolist()
+
+
+@pytest.mark.parametrize("values", [(2.0, -3.0), (-1.0, 0.5)])
+def test_a_correction_that_nothing_asks_for_goes_back_to_none(values):
+    """Of magnitudes that do not change with it: the prior alone tells."""
+    fit = _CorrectionFit(np.zeros(20), np.ones(20), np.ones((20, 1)), lambda pair: np.zeros(20), 2)
+    at = np.array(values)
+    loss = fit.loss(at)
+    assert loss.value == pytest.approx(float(((at / CORRECTION_PRIOR) ** 2).sum()) / 2)
+    assert fit.step(at, loss) == pytest.approx(-at, rel=1e-6)
+
+
+@pytest.mark.parametrize(("tilt", "found"), [(4.0, 4.0), (-30.0, -10.0), (30.0, 10.0)])
+def test_a_correction_is_that_of_the_colours_within_bounds(tilt, found, rng):
+    """A tilt of 1 makes a mag of B-V 0.1 mag brighter; no star tells a bow."""
+    bv = rng.uniform(-0.2, 1.6, 60)
+    v_mag = rng.uniform(2, 6, 60)
+    every = np.ones(60, dtype=bool)
+    stars = stars_of(v_mag - 12 - 0.1 * tilt * bv, 1e-4, bv_mag=bv, v_mag=v_mag)
+
+    def magnitudes(pair: tuple[float, float]) -> np.ndarray:
+        return v_mag - 0.1 * pair[0] * bv
+
+    tilted, bow = _correction(stars, magnitudes, np.ones((60, 1)), every)
+    # the prior of 3 takes a share of it: 0.05 mag a star over 0.05 of its colour's 0.1
+    assert tilted == pytest.approx(found, rel=0.05)
+    assert abs(tilted) <= MAX_CORRECTION[0]
+    assert bow == pytest.approx(0.0, abs=0.1)
+    # those that are used have to differ in colour
+    alike = np.where(np.arange(60) < 40, 0.6, bv)
+    same = replace(stars, bv_mag=alike)
+    assert _correction(same, magnitudes, np.ones((60, 1)), np.arange(60) < 40) == NO_CORRECTION
+
+
+@pytest.mark.parametrize(("fall_mag", "columns"), [(0.02, 0), (0.1, 1)])
+def test_vignetting_is_taken_where_it_foretells_better_by_more_than_a_hundredth(fall_mag, columns):
+    """Of a scatter of 0.05 mag in 2000 stars a fall of 0.02 mag is 0.7 %, one of 0.1 is 15 %."""
+    rng = np.random.default_rng(5)
+    radius2 = rng.uniform(0, 1, 2000)
+    noise = 0.05 * rng.standard_normal(2000)
+    off_mag = noise + fall_mag * radius2
+    stars = stars_of(np.zeros(2000), 0.05, radius2=radius2)
+    every = np.ones(2000, dtype=bool)
+    assert len(_vignetting(stars, np.ones((2000, 1)), off_mag, every)) == columns
+
+
+def test_a_robust_fit_s_errors_are_by_the_scatter_that_its_freedom_leaves():
+    """Six numbers 0.3 to either side of their mean, hardly with noise: 1.4826 x 0.3 x sqrt(6/5)."""
+    target = 5 + 0.3 * np.tile([1.0, -1.0], 3)
+    every = np.ones(6, dtype=bool)
+    fit = _robust(np.ones((6, 1)), target, np.full(6, 1e-4), every)
+    assert fit.values == pytest.approx([5.0])
+    assert fit.sigma == pytest.approx([1.4826 * 0.3 * math.sqrt(6 / 5) / math.sqrt(6)], rel=1e-3)
+    assert fit.off == pytest.approx(target - 5)
+
+
+def test_stars_that_are_held_out_are_not_in_their_own_fit():
+    """Twelve columns of chance over sixty stars: what a fit takes of its own stars it adds to
+    others, 1 - 12/60 and 1 + 12/48 and more.
+    """
+    rng = np.random.default_rng(6)
+    every = np.ones(60, dtype=bool)
+    squares = []
+    for _ in range(12):
+        design = rng.standard_normal((60, 12))
+        target = 0.1 * rng.standard_normal(60)
+        squares.append(_held_out(design, target, np.full(60, 0.1), every) ** 2)
+    assert np.mean(squares) / 0.01 > 1.1
+    assert math.isnan(_held_out(np.ones((4, 1)), np.zeros(4), np.ones(4), np.zeros(4, dtype=bool)))
+
+
+def row(star: int, off_mag: float = 0.0, flags: tuple[str, ...] = (), **changes: Any) -> Any:
+    facts = {"star": star, "off_mag": off_mag, "flags": flags}
+    return SimpleNamespace(**(facts | changes))
+
+
+def sightings(rows: list[Any], **changes: Any) -> Any:
+    """Stars that count, as the parts of an excess ask for them."""
+    off_mag = np.array([each.off_mag for each in rows])
+    facts = {"rows": rows, "off_mag": off_mag, "verdicts": [None] * len(rows)}
+    return SimpleNamespace(**(facts | changes))
+
+
+def test_a_star_s_place_has_its_own_error_in_its_own_photograph():
+    found = SimpleNamespace(sigma_px=np.array([0.1, 0.2, 0.3]))
+    verdict: Any = SimpleNamespace(shot=SimpleNamespace(star=np.array([5, 7, 9]), found=found))
+    assert [shot_sigma(verdict, row(star)).tolist() for star in (7, 5)] == [[0.2], [0.1]]
+    assert shot_sigma(verdict, row(8)).tolist() == []
+
+
+def test_what_changes_between_photographs_is_beyond_noise_and_by_the_stars_seen_again(monkeypatch):
+    """Twenty stars twice, 0.03 mag to either side of their own mean, with noise of 0.02: 0.06^2 / 2
+    less 0.02^2; stars seen once tell nothing.
+    """
+    off_mag = [0.1 * star + sign * 0.03 for star in range(20) for sign in (1, -1)]
+    rows = [row(k // 2, off) for k, off in enumerate(off_mag)] + [row(90, 5.0), row(91, -5.0)]
+    noise_mag = np.append(np.full(40, 0.02), [9.0, 9.0])
+    part = _scintillation(None, sightings(rows), noise_mag)  # type: ignore[arg-type]
+    assert part.rms == pytest.approx(math.sqrt(2 * 0.03**2 - 0.02**2))
+    assert part.how.endswith("by 20 stars seen again")
+    quiet = _scintillation(None, sightings(rows), 9 * noise_mag)  # type: ignore[arg-type]
+    assert quiet.rms == 0.0
+    monkeypatch.setattr(excess, "_by_law", lambda session: Part(LAW, 0.5, "by law"))
+    few = _scintillation(None, sightings(rows[18:]), noise_mag[18:])  # type: ignore[arg-type]
+    assert few.name == LAW
+
+
+def test_what_a_law_says_stays_in_the_rest():
+    parts = [Part("a", 0.3, ""), Part(LAW, 0.2, ""), Part("b", math.nan, "")]
+    assert _rest(0.25, parts).rms == pytest.approx(0.4)
+
+
+def test_a_pixel_response_takes_of_a_star_as_its_light_lies_on_pixels():
+    """Half of the light each on two pixels, one to either side of the middle."""
+    share = np.zeros((2 * HALF + 1, 2 * HALF + 1))
+    share[HALF, [HALF - 1, HALF + 1]] = 0.5
+    psf = SimpleNamespace(
+        size_px=(80, 60),
+        core=lambda x_px, y_px, bv: (x_px.tolist(), y_px.tolist()),
+        on_pixels=lambda across, down, core: (np.array([share]), core),
+    )
+    pattern = SimpleNamespace(rms=(0.02, 0.0, 0.0, 0.0))
+    session: Any = SimpleNamespace(psf=psf, pixels=SimpleNamespace(pattern=pattern))
+    assert _response(session) == pytest.approx((0.02 * math.sqrt(0.5), 0.02 * math.sqrt(0.5)))
+
+
+def test_known_variables_and_doubles_are_told_by_what_the_others_scatter():
+    """Sixteen steady stars of 0.1 mag, one double and one variable one of 0.7."""
+    rows = [row(k, 0.1 * (-1) ** k) for k in range(16)]
+    rows += [row(20, 0.7, ("double",)), row(21, -0.7, ("variable", "blended"))]
+    part = _variables(sightings(rows))
+    whole = (16 * 0.01 + 2 * 0.49) / 18
+    assert part.rms == pytest.approx(math.sqrt(whole - 0.01))
+    assert "with 2 known variables and doubles" in part.how
+    # too few steady ones tell nothing
+    assert _variables(sightings(rows[6:])).rms == 0.0
+
+
+def test_blends_are_other_stars_by_how_far_they_lie_within_a_profile():
+    """Two stars, of which one has another of half of its light a pixel aside, with a PSF of one
+    pixel: e^(-1/4) of it. The mean is in the zero point.
+    """
+    first = SimpleNamespace(
+        star=np.array([1, 7]), x_px=np.array([10.0, 11.0]), y_px=np.zeros(2), dn=np.array([100, 50])
+    )
+    second = SimpleNamespace(
+        star=np.array([2]), x_px=np.array([40.0]), y_px=np.zeros(1), dn=np.array([80.0])
+    )
+    verdicts = [SimpleNamespace(expected=first), SimpleNamespace(expected=second)]
+    rows = [
+        row(1, x_predicted_px=10.0, y_predicted_px=0.0, dn_predicted=100.0),
+        row(2, x_predicted_px=40.0, y_predicted_px=0.0, dn_predicted=80.0),
+    ]
+    seen = sightings(rows, verdicts=verdicts, places_px=np.zeros((2, 2)))
+    psf = SimpleNamespace(fwhm_px=lambda x_px, y_px: np.full(len(x_px), 2.3548))
+    session: Any = SimpleNamespace(psf=psf)
+    added_mag = MAG_A_RELATIVE * 0.5 * math.exp(-0.25)
+    assert _blends(session, seen).rms == pytest.approx(added_mag / 2, rel=1e-4)
+
+
+def test_a_pattern_of_pixels_is_none_of_lines_of_a_detector_that_is_no_square():
+    """Offsets of 10 DN a pixel in 16 rows of 800: a column's mean has a sixteenth of their square,
+    a row's an eight hundredth.
+    """
+    rng = np.random.default_rng(9)
+    offsets = 10 * rng.standard_normal((16, 800))
+    level = np.full((16, 800), 100.0)
+    every = np.ones((16, 800), dtype=bool)
+    photographs = [(offsets + rng.standard_normal((16, 800)), level, every) for _ in range(3)]
+    found = fixed_pattern(photographs)
+    assert found is not None
+    # of 800 columns the mean square is known to sqrt(2 / n), of 16 rows to a third
+    assert found.squares[2] == pytest.approx(0.0, abs=5 * 100 / 16 * math.sqrt(2 / 800))
+    assert found.squares[3] == pytest.approx(0.0, abs=5 * 100 / 800 * math.sqrt(2 / 16))
+    # all is response where light is of one level
+    assert found.rms[0] == pytest.approx(0.1, rel=0.05)
+
+
+def test_lines_with_few_pixels_in_use_tell_no_pattern_of_lines():
+    """Columns of 5 DN in photographs whose columns have a quarter of their pixels in use at most,
+    or a little more.
+    """
+    rng = np.random.default_rng(10)
+    columns = 5 * rng.standard_normal(300)
+    level = np.full((40, 300), 100.0)
+    for used, is_known in ((10, False), (12, True)):
+        photographs = []
+        for _ in range(3):
+            use = np.zeros((40, 300), dtype=bool)
+            use[:used] = True
+            photographs.append((columns + rng.standard_normal((40, 300)), level, use))
+        found = fixed_pattern(photographs)
+        is_found = found is not None and found.rms[2] > 0
+        assert is_found is is_known

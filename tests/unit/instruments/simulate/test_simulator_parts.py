@@ -1,0 +1,91 @@
+"""What a simulator of the tracker makes anew where its bench changes, the glow between its stars,
+and how fast it turns at the ends of a log.
+"""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from hilstar.basics.rotation import from_rotation_vector
+from hilstar.instruments.simulate import simulator
+from hilstar.instruments.simulate.exposures import view_at
+from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground
+from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.benches import bench_text
+
+
+@pytest.mark.parametrize(
+    ("tables", "made"),
+    [
+        ({"verify": {"flux_mag": 0.2}}, []),
+        ({"sky": {"faintest_v_mag": 5.0}}, ["sky", "tracker"]),
+        ({"tracker": {"transmission": 0.5}}, ["sky", "tracker"]),
+        ({"tracker": {"exposure_s": 0.3}}, ["tracker"]),
+        ({"background": {"electrons_per_px": 3.0}}, ["tracker"]),
+    ],
+)
+def test_what_a_change_of_the_bench_touches_is_made_anew(tmp_path, monkeypatch, tables, made):
+    files = []
+    for name, changes in (("before.toml", {}), ("after.toml", tables)):
+        (tmp_path / name).write_text(bench_text({}, changes))
+        files.append(read_bench_file(tmp_path / name))
+    before, after = files
+    loaded = []
+    target = SimpleNamespace(resolution_px=before.config.tracker.resolution_px, psf="psf")
+    monkeypatch.setattr(simulator, "sky_layers", lambda canvas, sources: ())
+    monkeypatch.setattr(
+        simulator,
+        "Target",
+        lambda resolution_px, psf: SimpleNamespace(resolution_px=resolution_px, psf=psf),
+    )
+    running = SimpleNamespace(
+        config=before.config,
+        file=before,
+        moving=None,
+        canvas=SimpleNamespace(psf="psf"),
+        sources=(),
+        renderer=SimpleNamespace(target=target),
+        _load_sky=lambda: loaded.append("sky"),
+        _load_tracker=lambda: loaded.append("tracker"),
+    )
+    Simulator.change(running, after)
+    assert loaded == made
+    assert running.config is after.config
+    running.moving = "bodies"
+    Simulator.change(running, before)
+    assert loaded[len(made)] == "sky"
+
+
+def test_a_detector_without_a_mosaic_gathers_the_glow_of_all_channels():
+    """Three channels of 1, 2 and 4 e-/s over each place, in half a second."""
+    glow = np.array([[1.0, 1.0], [2.0, 2.0], [4.0, 4.0]])
+    air = SimpleNamespace(glow_at=lambda directions, utc_ns: glow)
+    background = SimpleNamespace(
+        _lights=[],
+        _moving=SimpleNamespace(air=air, utc_ns=lambda t_ns: t_ns),
+        _rays=np.eye(3)[:2],
+        _bayer=None,
+        _sr=np.array([1.0, 3.0]),
+        _config=SimpleNamespace(tracker=SimpleNamespace(exposure_s=0.5)),
+        _over_pixels=lambda values: values[None],
+        steady_e=10.0,
+    )
+    view = SimpleNamespace(q_icrs_to_cam=np.array([1.0, 0, 0, 0]), t_ns=0)
+    np.testing.assert_allclose(TrackerBackground.of_view_e(background, view), [[13.5, 20.5]])
+
+
+@pytest.mark.parametrize("t_ns", [0, 10**7, 5 * 10**8, 99 * 10**7, 10**9])
+def test_a_log_s_exposures_turn_as_fast_at_its_ends(t_ns):
+    """A second of 0.3 rad/s about the second axis, beyond which nothing turns."""
+
+    def at(time_ns):
+        seconds = min(max(time_ns, 0), 10**9) / 1e9
+        q = from_rotation_vector(np.array([0.0, 0.3 * seconds, 0.0]))
+        return SimpleNamespace(q_icrs_to_cam=q)
+
+    view = view_at(SimpleNamespace(at=at), (0, 10**9), t_ns, 0.1)
+    assert abs(view.rate_cam_rad_s[1]) == pytest.approx(0.3, rel=1e-6)
+    assert view.rate_cam_rad_s[[0, 2]] == pytest.approx([0.0, 0.0], abs=1e-9)

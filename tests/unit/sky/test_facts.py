@@ -1,0 +1,35 @@
+"""The errors of Hipparcos' magnitudes by where they are from."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from hilstar.sky.facts import facts_of, sigma_v_mag
+
+
+# The scatter of V about what was measured: from the catalogue's introduction by source and colour.
+@pytest.mark.parametrize(
+    ("source", "bv_mag", "scatter_mag"),
+    [
+        (b"G", 0.99, 0.010),
+        (b"G", 1.0, 0.025),
+        (b"T", 0.5, 0.010),
+        (b"T", 1.5, 0.025),
+        (b"H", 0.5, 0.004),
+        (b"H", 1.5, 0.004),
+        (b"U", 1.5, 0.0),
+        (b"", 0.5, np.nan),
+    ],
+)
+def test_the_error_of_v_is_that_of_what_was_measured_and_its_scatter(source, bv_mag, scatter_mag):
+    facts = {"v_source": np.array([source]), "sigma_measured_mag": np.array([0.003])}
+    found = sigma_v_mag(facts, np.array([bv_mag]))
+    assert found[0] == pytest.approx(np.hypot(0.003, scatter_mag), nan_ok=True)
+
+
+def test_a_number_that_hipparcos_lacks_has_no_facts():
+    """HIP 1 is there, 0 is none and 999 999 is beyond the last."""
+    facts = facts_of(np.array([1, 0, 999_999], dtype=np.int32))
+    known = np.isfinite(facts["sigma_measured_mag"])
+    assert known.tolist() == [True, False, False]

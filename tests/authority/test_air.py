@@ -35,6 +35,7 @@ from tests.support.claims import holds
 from tests.support.commands import run_hilstar_here
 from tests.support.spectra import write_curve
 
+SURE = 5.0  # standard deviations
 BENCH = """[tracker]
 aperture_mm = 18.4
 focal_length_mm = 35.0
@@ -292,6 +293,30 @@ def test_stars_twinkle_and_bodies_do_not(rng):
     assert (share[:-2] != 1.0).all()
 
 
+def test_a_star_that_twinkles_has_its_light_in_the_mean_and_young_s_scatter(rng):
+    """Over n draws a mean of 1 is known to sigma / sqrt(n), and a normal scatter of 1 to
+    1 / sqrt(2 n); a light of mean 1 has a normal logarithm of mean -s^2 / 2.
+    """
+    _, stars, moving = stars_and_sky()
+    among = moving.among(stars)
+    exposure_s = 2e-3  # Young's 0.81 for a star at the zenith
+    share = []
+    for _ in range(20):
+        twinkled = moving.air.twinkling(among, moving.utc_ns(0), exposure_s, rng)
+        share.append(twinkled.electrons_per_s / among.electrons_per_s)
+    high = moving.air.above(moving.utc_ns(0)).altitude_rad(among.vectors) > math.radians(60)
+    drawn = np.array(share)[:, high]
+    count = drawn.size
+    assert count > 1000
+    masses = air_mass(moving.air.above(moving.utc_ns(0)).altitude_rad(among.vectors)[high])
+    sigma = scintillation(18.4, masses, 1200.0, exposure_s)
+    assert drawn.mean() == pytest.approx(1.0, abs=SURE * sigma.max() / math.sqrt(count))
+    # s^2 = ln(1 + sigma^2)
+    wanted = np.sqrt(np.log1p(sigma**2))
+    scatter = (np.log(drawn) + wanted**2 / 2) / wanted
+    assert scatter.std() == pytest.approx(1.0, abs=SURE / math.sqrt(2 * count))
+
+
 def facing(up: np.ndarray, altitude_deg: float) -> np.ndarray:
     """An attitude towards the north at an altitude."""
     east = np.cross([0.0, 0.0, 1.0], up)
@@ -300,6 +325,25 @@ def facing(up: np.ndarray, altitude_deg: float) -> np.ndarray:
         math.sin(math.radians(altitude_deg)) * up + math.cos(math.radians(altitude_deg)) * north
     )
     return from_radec_roll_deg(math.degrees(math.atan2(y, x)), math.degrees(math.asin(z)), 0.0)
+
+
+@pytest.mark.parametrize(("altitude_deg", "is_told"), [(-12.1, False), (-11.9, True), (5.0, True)])
+def test_a_sun_above_astronomical_night_is_told_once_with_its_altitude(
+    altitude_deg, is_told, caplog
+):
+    _, _, moving = stars_and_sky()
+    air = replace(moving.air, told=set())
+    utc_ns = moving.utc_ns(0)
+    up = air.above(utc_ns).up
+    level = np.cross(up, [0.0, 0.0, 1.0])
+    level /= np.linalg.norm(level)
+    altitude_rad = math.radians(altitude_deg)
+    sun_km = 1.5e8 * (math.sin(altitude_rad) * up + math.cos(altitude_rad) * level)
+    for _ in range(2):
+        air.check_sun(sun_km, utc_ns)
+    told = [record.getMessage() for record in caplog.records]
+    assert len(told) == is_told
+    assert all(f"the Sun stands at {altitude_deg:.1f} degrees" in line for line in told)
 
 
 def test_below_the_horizon_there_is_neither_star_nor_sky(tmp_path, caplog):

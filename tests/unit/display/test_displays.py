@@ -9,6 +9,8 @@ from typing import Any
 
 import pytest
 
+from hilstar.display.identity import MonitorIdentity
+from hilstar.display.window import this_monitor
 from hilstar.display.window.displays import Display, display_of
 from hilstar.display.window.library import glfw
 from hilstar.display.window.output_settings import OutputState
@@ -146,6 +148,32 @@ def test_a_monitor_s_identity_has_what_x_says_and_the_kernel_s_edid_where_x_hide
         assert now.window_system == (added if output is shown else added[:1])
     assert names == {None: "DELL U2412M", hidden: "DELL U2412M", shown: "DELL P2423D"}
     assert identity_of(display("VGA-1"), None, b"", {}, tmp_path).model == ""
+
+
+def test_a_monitor_is_asked_by_its_edids_first_block(tmp_path, monkeypatch):
+    """ddcutil takes 128 bytes of it, in hexadecimal; half a block names no monitor."""
+    program = tmp_path / "ddcutil"
+    program.write_text('#!/bin/sh\necho "VCP 10 C ${#8} 999"\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    block = edid()
+    brightness = []
+    for given in (block, block + bytes(128), block[:64]):
+        output = OutputState("DP-1", HD, edid=given)
+        brightness.append(identity_of(display(), output, b"", {}, tmp_path).brightness)
+    unasked = MonitorIdentity().brightness
+    assert brightness == [256, 256, unasked]
+
+
+def test_a_monitor_that_does_not_answer_is_not_waited_for(tmp_path, monkeypatch):
+    program = tmp_path / "ddcutil"
+    program.write_text("#!/bin/sh\nexec sleep 600\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path}:/usr/bin:/bin")
+    monkeypatch.setattr(this_monitor, "DDC_S", 0.05)
+    output = OutputState("DP-1", HD, edid=edid())
+    now = identity_of(display(), output, b"", {}, tmp_path)
+    assert (now.model, now.brightness) == ("DELL U2412M", None)
 
 
 def test_a_display_s_line_has_its_number_its_name_its_mode_and_its_size():

@@ -476,6 +476,17 @@ def test_stars_beside_their_places_ask_for_the_geometry(tmp_path):
     assert outcome.figures["star_rms_px"] == pytest.approx(0.3 * RATIO, abs=0.02)
 
 
+def test_what_the_twin_finds_fails_stars_that_stand_where_the_sky_has_them(tmp_path, monkeypatch):
+    """The twin's own comparison says nothing of these stars, and both are said."""
+    camera = ClosedCamera(power_of(2.2), FILED_WHITE_E_PER_S / E_PER_S_A_DN)
+    twin = {"twin_passed": "false"}, ["the twin: the codes alone cost 0.2 mag"]
+    monkeypatch.setattr(stars, "_twin_figures", lambda context: twin)
+    outcome = verify(closed_context(tmp_path, camera, STARS))
+    assert outcome.verdict == "failed"
+    assert outcome.line.endswith(": the twin: the codes alone cost 0.2 mag")
+    assert outcome.figures["twin_passed"] == "false"
+
+
 def test_the_detector_of_the_closed_camera_is_as_its_bench_file_says(tmp_path):
     """What the tests above rest on: offset, noise and gain of its images."""
     camera = ClosedCamera(white_dn_per_s=10_000.0)

@@ -31,6 +31,27 @@ def test_variables_of_every_distribution_have_a_standard_deviation_of_one(distri
     assert drawn.mean() == pytest.approx(0.0, abs=5 / math.sqrt(DRAWS))
 
 
+def test_trials_of_few_readings_have_student_s_tails(rng):
+    """2.5 % of the draws lie beyond 2.776, of 4 degrees of freedom (JCGM 100, table G.2)."""
+    drawn = Input("x", "Student t", "", 1, 1.0, "px", 4.0).draw(DRAWS, rng)
+    share = 0.05
+    sure = 5 * math.sqrt(share * (1 - share) / DRAWS)
+    assert (np.abs(drawn) > 2.776).mean() == pytest.approx(share, abs=sure)
+
+
+def test_variables_of_one_input_share_the_estimate_of_their_spread(rng):
+    """With n degrees of freedom the mean of x^2 y^2 is n^2 / ((n - 2) (n - 4)), and of estimates of
+    their own (n / (n - 2))^2.
+    """
+    dof = 20.0
+    drawn = Input("x", "Student t", "", 2, 1.0, "px", dof).draw(DRAWS, rng)
+    both = (drawn**2).prod(axis=1)
+    wanted = dof**2 / ((dof - 2) * (dof - 4))
+    sure = 5 * both.std() / math.sqrt(DRAWS)
+    assert both.mean() == pytest.approx(wanted, abs=sure)
+    assert wanted - (dof / (dof - 2)) ** 2 > sure  # which tells them apart
+
+
 def test_few_readings_widen_the_interval_by_student_s_t():
     """2 u of an input with 4 degrees of freedom: 2.776 u, not 1.960 u (JCGM 100, table G.2)."""
     found = first_order(lambda z: 2 * z[0], [Input("x", "Student t", "", 1, 1.0, "px", 4.0)])

@@ -30,6 +30,7 @@ from hilstar.server.bench.build import (
 from hilstar.server.bench.cameras import bench_camera
 from hilstar.server.bench.config import RenderSettings
 from hilstar.server.bench.effort import (
+    PATH_MS,
     Effort,
     FieldCost,
     Light,
@@ -37,6 +38,7 @@ from hilstar.server.bench.effort import (
     _cut_to_mag,
     cut_px,
     exact_in_time,
+    motion_candidates,
     plan_effort,
     side_candidates,
 )
@@ -144,6 +146,17 @@ def test_a_scene_at_rest_asks_nothing_of_paths():
     assert part(still, "paths").error_px == 0.0 and "none" in part(still, "paths").choice
     assert part(turning, "paths").error_px == pytest.approx(0.5 * turning.motion_above_px)
     assert turning.motion_above_px >= asked.motion_above_px
+
+
+def test_paths_cost_their_time_from_the_files_motion_on_and_save_it_beyond():
+    """All stars in view have paths from there on; a larger motion has none in most frames."""
+    asked = render_settings(tolerance_px=0.1)
+    moving = replace(light_range(12, 6.0), turning=0.5, sky_share=0.1)
+    asks, *larger = (motion.choice for motion in motion_candidates(asked, moving))
+    assert (asks.ms, asks.saved_ms) == (pytest.approx(PATH_MS * 0.1 * 50), 0.0)
+    assert larger
+    for choice in larger:
+        assert (choice.ms, choice.saved_ms) == (0.0, asks.ms)
 
 
 @pytest.mark.parametrize(

@@ -271,7 +271,7 @@ def node_counts(
 ) -> IntArray:
     """ceil(per_sigma length + at_rest) nodes for each length in sigmas, 1 under `shortest_sigma`.
 
-    A length that is not finite gets MAX_NODES.
+    A length that is not finite gets MAX_NODES + at_rest.
     """
     finite = np.minimum(length_sigma, 1e9)
     length = np.where(np.isfinite(length_sigma), finite, MAX_NODES / per_sigma)

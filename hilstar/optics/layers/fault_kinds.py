@@ -164,11 +164,11 @@ class CosmicRays(Fault, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """Refuse (InputError) more tracks than a frame has time for."""
-        if self.number * self.length_px > MAX_TRACK_PX:
+        together_px = math.ceil(self.number * self.length_px)
+        if together_px > MAX_TRACK_PX:
             given = f"number = {self.number} and length_px = {self.length_px:g}"
             raise InputError(
-                f"{given} are {self.number * self.length_px:.3g} px of tracks; write at most"
-                f" {MAX_TRACK_PX} px together"
+                f"{given} are {together_px} px of tracks; write at most {MAX_TRACK_PX} px together"
             )
 
 

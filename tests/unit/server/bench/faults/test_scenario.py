@@ -111,6 +111,13 @@ def test_a_wrong_fault_is_refused_with_its_key_and_what_to_write(change, said):
             ),
             "write at most 20000 px together",
         ),
+        (
+            (
+                '[[fault]]\nkind = "cosmic-rays"\nname = "b"\nnumber = 3\nelectrons ='
+                " 1\nlength_px = 6666.7"
+            ),
+            "are 20001 px of tracks; write at most 20000 px together",
+        ),
         ('[[fault]]\nkind = "flash"\nname = "f"\nhip = 1\nelectrons = 1', "write for_s = 0.1"),
         (
             '[[fault]]\nkind = "attitude-step"\nname = "s"\nturn_deg = [0, 200, 0]',

@@ -147,7 +147,9 @@ def test_a_blank_or_a_patch_is_what_the_picture_shows(page_run):
                 if (levels == value).all():
                     break
             assert (levels == value).all()
-            assert f"changed by the operator: {name}" in page.json("/health")["reasons"][0]
+            # beside it the attitude may be stale: a busy machine's sender is late
+            reasons = page.json("/health")["reasons"]
+            assert any(f"changed by the operator: {name}" in reason for reason in reasons)
             assert page.control(name, on=False)[0] == 200
 
 

@@ -336,9 +336,7 @@ class OrderHandler:
     def _switch_ledger(self, order: messages.Order, who: str) -> Done:
         with self._ledger_lock:
             if order.on:
-                last = self._ledger.last
-                folder = Path.cwd() if last is None else last.path.parent
-                path = free_path(folder, datetime.now(UTC))
+                path = free_path(self._ledger_folder(), datetime.now(UTC))
                 was_on = self._ledger.on
                 ledger = self._ledger.begin(lambda: self._make_ledger(path))
                 if not was_on:
@@ -352,6 +350,12 @@ class OrderHandler:
             if ledger_now.failure is not None:
                 return 500, f"{ledger_now.path}: {ledger_now.failure}"
             return 200, f"ledger off: {ledger_now.path} is whole"
+
+    def _ledger_folder(self) -> Path:
+        """The folder of the newest ledger, else the current working directory."""
+        if self._ledger.last is None:
+            return Path.cwd()
+        return self._ledger.last.path.parent
 
     def _mark(self, order: messages.Order, who: str) -> Done:
         text = printable(" ".join(order.text.split()))[:MAX_MARK_CHARACTERS]

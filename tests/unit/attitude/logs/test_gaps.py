@@ -138,27 +138,30 @@ def test_a_gap_that_the_rates_on_both_sides_explain_is_blended():
     assert [kind for kind, _ in log_joins(other).told] == ["log-gap", "log-rates"]
 
 
+def told_of_rates_that_are_off(off: float, end_s: float, spin: float) -> list[str]:
+    """What is told of ten seconds on either side of a gap to `end_s`, whose rates are off by a
+    share.
+    """
+    times = [*np.arange(0, 10, 0.5), *np.arange(end_s, end_s + 10, 0.5)]
+    samples = coning_samples(times, spin=spin, nutation=0.0)
+    rate = samples[0].rate_cam_rad_s * (1 + off)
+    samples = [replace(sample, rate_cam_rad_s=rate) for sample in samples]
+    return [kind for kind, _ in log_joins(samples).told]
+
+
 # Of 0.2 rad in a gap of 100 s, and of 1 mrad between two samples: over a gap a rate is asked more.
 @pytest.mark.parametrize(
     ("off", "told"),
     [(0.015, []), (0.03, ["log-gap"]), (0.24, ["log-gap"]), (0.27, ["log-gap", "log-rates"])],
 )
 def test_rates_may_be_off_by_a_fifth_of_the_turn_and_over_a_gap_by_a_fiftieth(off, told):
-    times = [*np.arange(0, 10, 0.5), *np.arange(110, 120, 0.5)]
-    samples = coning_samples(times, spin=0.002, nutation=0.0)
-    rate = samples[0].rate_cam_rad_s * (1 + off)
-    samples = [replace(sample, rate_cam_rad_s=rate) for sample in samples]
-    assert [kind for kind, _ in log_joins(samples).told] == told
+    assert told_of_rates_that_are_off(off, end_s=110, spin=0.002) == told
 
 
 @pytest.mark.parametrize(("off", "told"), [(0.002, []), (0.01, ["log-gap"])])
 def test_of_a_long_gap_s_turn_a_degree_may_be_missing(off, told):
     """Five radians: a degree is a third of a hundredth."""
-    times = [*np.arange(0, 10, 0.5), *np.arange(600, 610, 0.5)]
-    samples = coning_samples(times, spin=0.0085, nutation=0.0)
-    rate = samples[0].rate_cam_rad_s * (1 + off)
-    samples = [replace(sample, rate_cam_rad_s=rate) for sample in samples]
-    assert [kind for kind, _ in log_joins(samples).told] == told
+    assert told_of_rates_that_are_off(off, end_s=600, spin=0.0085) == told
 
 
 def test_a_discontinuity_with_rates_of_another_turn_is_no_misfit():

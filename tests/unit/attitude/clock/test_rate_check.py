@@ -7,6 +7,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -259,10 +260,33 @@ def test_rates_that_become_right_are_believed_again():
 def test_packets_that_leave_rates_out_end_it_too():
     t_ns, q, rates = steady()
     stream = samples(t_ns, q, -rates)
-    stream += [
-        AttitudeSample(int(t_ns[-1] + (k + 1) * NS_PER_S // 100), q[-1], None, k) for k in range(30)
+    without = [
+        AttitudeSample(int(t_ns[-1] + (k + 1) * NS_PER_S // 100), q[-1], None, k) for k in range(20)
     ]
-    assert [kind for kind, _ in watched(stream)[1]] == [WRONG, RIGHT]
+    assert [kind for kind, _ in watched([*stream, *without[:19]])[1]] == [WRONG]
+    _, told, _ = watched([*stream, *without])
+    assert [kind for kind, _ in told] == [WRONG, RIGHT]
+    assert told[1][1] == "the packets carry no rates any more"
+
+
+def test_of_wrong_rates_the_acceleration_is_not_used_either():
+    t_ns, q, rates = steady()
+    stream = samples(t_ns, q, -rates)
+    last = replace(stream[-1], acceleration_cam_rad_s2=np.array([0.1, 0.0, 0.0]))
+    check, _, _ = watched([*stream[:-1], last])
+    believed = check.believed(last)
+    assert (believed.rate_cam_rad_s, believed.acceleration_cam_rad_s2) == (None, None)
+    assert (believed.t_ns, believed.sequence) == (last.t_ns, last.sequence)
+
+
+@pytest.mark.parametrize("back_s", [1.0, 50.0])
+def test_a_sender_that_starts_anew_is_checked_anew(back_s):
+    """Its rates were right, and are not after its clock has gone back."""
+    t_ns, q, rates = steady(hz=50.0, seconds=1.5)
+    begun = samples(t_ns + 100 * NS_PER_S, q, rates)
+    anew_ns = begun[-1].t_ns - round(back_s * NS_PER_S)
+    anew = samples(t_ns + anew_ns, q, -rates)
+    assert [kind for kind, _ in watched([*begun, *anew])[1]] == [WRONG]
 
 
 def test_warn_believes_the_rate_and_off_does_not_look():
@@ -379,7 +403,8 @@ def test_rates_that_are_renewed_once_in_a_second_are_wrong_though_no_lag_explain
 
 
 def test_rates_that_are_late_no_more_are_believed_again():
-    late, right = swing(0.2), swing(0.0, seconds=15.0)
+    # the last four seconds count: the ten before them do not outweigh eight right ones
+    late, right = swing(0.2, 50), swing(0.0, 50, seconds=8.0)
     later = [
         AttitudeSample(s.t_ns + 10 * NS_PER_S, s.q_icrs_to_cam, s.rate_cam_rad_s, s.sequence + 1000)
         for s in right

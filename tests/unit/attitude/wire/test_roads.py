@@ -28,7 +28,7 @@ from hilstar.attitude.wire.apart import (
 from hilstar.attitude.wire.apart_child import Wire, _ForwardedNotices, _Reading, as_read
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
-from hilstar.attitude.wire.roads import ANSWERS, MAX_READ_BYTES, ByteRoad, RawMessage
+from hilstar.attitude.wire.roads import ANSWERS, MAX_READ_BYTES, ByteRoad, RawMessage, read_device
 from hilstar.attitude.wire.serial_link import SerialRoad
 from hilstar.attitude.wire.tcp import ACCEPT_EACH_S, TOLD_S, TcpRoad
 from hilstar.attitude.wire.udp import UdpRoad
@@ -312,7 +312,7 @@ def test_a_path_that_names_nothing_yet_and_then_a_device_is_not_opened(tmp_path)
 def test_a_road_that_is_lost_is_tried_at_growing_intervals_and_told_as_its_user_s(tmp_path, kind):
     """A read that opens it brings nothing, and none waits for longer than it may."""
     clock, notices = FakeClock(), Notices()
-    with lost_road(kind, tmp_path, clock, notices) as (road, bring_back):
+    with lost_road(kind, tmp_path, clock, notices) as (road, bring_back, lose):
         assert road.link_counts.lost == 1 and notices.counts() == {"answers-lost": 1}
         tries_ns: list[int] = []
         opens = road._open if isinstance(road, SerialRoad) else road._connect
@@ -337,13 +337,34 @@ def test_a_road_that_is_lost_is_tried_at_growing_intervals_and_told_as_its_user_
         assert (road.reconnects, road.link_counts.lost) == (1, 1)
         assert notices.counts() == {"answers-lost": 1, "answers-back": 1}
         assert road.put(b"?")
+        lose()
+        wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost == 2, "another loss")
+        tries_ns.clear()
+        lost_ns = clock.now_ns()
+        while not tries_ns:
+            road.taken(SOON_MS)
+        assert tries_ns[0] - lost_ns == pytest.approx(0.05e9, abs=1e6)  # as soon as the first time
+
+
+def test_a_device_that_is_readable_and_brings_nothing_has_gone():
+    reading, writing = os.pipe()
+    try:
+        assert read_device(reading, 0) == []
+        os.write(writing, b"some")
+        assert [chunk.parts for chunk in read_device(reading, 0)] == [[b"some"]]
+        os.close(writing)
+        with pytest.raises(OSError, match="it was readable, and nothing came") as gone:
+            read_device(reading, 0)
+        assert gone.value.errno == errno.EIO
+    finally:
+        os.close(reading)
 
 
 @contextlib.contextmanager
 def lost_road(
     kind: str, folder: Path, clock: FakeClock, notices: Notices
-) -> Iterator[tuple[SerialRoad | TcpRoad, Callable[[], None]]]:
-    """A road to a tracker that has gone, and what brings the tracker back."""
+) -> Iterator[tuple[SerialRoad | TcpRoad, Callable[[], None], Callable[[], object]]]:
+    """A road to a tracker that has gone, what brings the tracker back, and what takes it away."""
     with contextlib.ExitStack() as stack:
         if kind == "serial":
             far = SerialFar(folder)
@@ -351,8 +372,7 @@ def lost_road(
             stack.enter_context(road)
             far.vanish()
             wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost, "the loss")
-            yield road, far.come
-            far.vanish()
+            yield road, far.come, far.vanish
             return
         with socket.create_server(("127.0.0.1", 0)) as server:
             place = ("127.0.0.1", server.getsockname()[1])
@@ -362,10 +382,16 @@ def lost_road(
             server.accept()[0].close()
             wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost, "the loss")
 
-        def come_back() -> None:
-            stack.enter_context(socket.create_server(place))
+        servers: list[socket.socket] = []
 
-        yield road, come_back
+        def come_back() -> None:
+            servers.append(stack.enter_context(socket.create_server(place)))
+
+        def go_away() -> None:
+            connection, _ = servers[0].accept()
+            connection.close()
+
+        yield road, come_back, go_away
 
 
 def test_a_port_that_is_lost_at_a_write_is_let_go_by_the_process_that_reads_it(

@@ -28,7 +28,14 @@ from hilstar.attitude.wire.apart import (
 from hilstar.attitude.wire.apart_child import Wire, _ForwardedNotices, _Reading, as_read
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
-from hilstar.attitude.wire.roads import ANSWERS, MAX_READ_BYTES, ByteRoad, RawMessage, read_device
+from hilstar.attitude.wire.roads import (
+    ANSWERS,
+    MAX_READ_BYTES,
+    ByteRoad,
+    LinkCounts,
+    RawMessage,
+    read_device,
+)
 from hilstar.attitude.wire.serial_link import SerialRoad
 from hilstar.attitude.wire.tcp import ACCEPT_EACH_S, TOLD_S, TcpRoad
 from hilstar.attitude.wire.udp import UdpRoad
@@ -605,6 +612,78 @@ def test_what_the_reader_counts_comes_once():
             with contextlib.suppress(BlockingIOError):
                 grown += RecordStream().feed(ours.recv(9999))
     assert [(one.counts.lost, one.counts.flooded) for one in grown] == [(1, 0), (0, 5), (1, 4)]
+
+
+def records_at(ours: socket.socket) -> list[Record]:
+    """What has been handed over by now."""
+    return list(RecordStream().feed(ours.recv(1 << 16)))
+
+
+def test_what_the_reader_is_told_is_handed_over_after_its_counts_and_lasts_or_not():
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        notices = _ForwardedNotices(Wire(theirs), 3)
+        notices.link_counts.lost = 2
+        notices.tell("lost", "it is away", "a sender")
+        notices.mention("connected", "it is here")
+        handed = records_at(ours)
+    assert [(one.order, one.notice, one.lasting) for one in handed] == [
+        (3, None, True),
+        (3, ("lost", "it is away", "a sender"), True),
+        (3, ("connected", "it is here", ""), False),
+    ]
+    assert handed[0].counts == LinkCounts(lost=2)
+    told = Notices()
+    assert [one.told_to(told) for one in handed] == [False, True, True]
+    assert (told.latest("lost"), told.latest("connected")) == ("it is away", "")
+
+
+def test_of_several_orders_the_newest_is_carried_out_with_its_device():
+    reader = ReaderProcess(Notices(), module="__hello__")
+    ours, theirs = socket.socketpair()
+    reading, writing = os.pipe()
+    with ours, theirs:
+        assert reader._wire is not None
+        reader._wire.close()
+        reader._wire = ours
+        wire = Wire(theirs)
+        assert wire.order(0) is None
+        reader.read()
+        reader.read(runs_user_code=True)
+        assert wire.order(1000) == (ReadOrder(2, runs_user_code=True), None)
+        reader.read(device=reading)
+        order, file = wire.order(1000)
+        assert order == ReadOrder(3, device=True)
+        assert file not in (None, reading)
+        os.write(writing, b"the device")
+        assert os.read(file, 100) == b"the device"
+        os.close(file)
+        reader._wire = None
+        ours.close()
+        with pytest.raises(EOFError):
+            wire.order(1000)
+    os.close(reading)
+    os.close(writing)
+    reader.close()
+
+
+def test_a_device_that_has_gone_is_said_and_let_go():
+    ours, theirs = socket.socketpair()
+    reading, writing = os.pipe()
+    with ours, theirs:
+        under_way = _Reading(Wire(theirs), ReadOrder(4, device=True), reading)
+        os.write(writing, b"a")
+        under_way.hand_over(under_way.link)
+        os.close(writing)
+        under_way.hand_over(under_way.link)
+        came, gone = records_at(ours)
+    assert (came.order, came.message.parts, came.gone) == (4, [b"a"], None)
+    # the bytes may have come at any time before they were looked for
+    assert not came.message.timely and came.message.empty_ns == 0
+    assert (gone.order, gone.message, gone.gone) == (4, None, "it was readable, and nothing came")
+    assert under_way.link is None
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(reading)
 
 
 def test_a_file_that_is_never_read_to_its_end_does_not_hide_the_one_in_its_place(tmp_path):

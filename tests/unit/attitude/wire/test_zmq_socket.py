@@ -6,8 +6,11 @@ import pytest
 import zmq
 
 from hilstar.attitude.wire import zmq_socket
+from hilstar.attitude.wire.keys import CurveKeys, make_keys
+from hilstar.attitude.wire.zmq_links import ZmqRoad
 from hilstar.attitude.wire.zmq_socket import MAX_GROWTH_BYTES, MAX_PARTS, ZmqReply, ZmqSocket
 from hilstar.basics.notices import Notices
+from tests.support.refusals import refusal
 
 WAIT_MS = 20_000
 
@@ -66,3 +69,20 @@ def test_what_this_process_took_before_the_link_was_used_is_not_the_link_s(tmp_p
         used_bytes += 2 * MAX_GROWTH_BYTES
         link.wait_for_message(0)
         assert link.link_counts.resets == 1
+
+
+def test_a_place_that_cannot_be_bound_is_refused_with_what_to_do(tmp_path):
+    make_keys(tmp_path)
+    keys = CurveKeys(tmp_path / "server.key_secret", allowed_clients=tmp_path / "allowed_clients")
+    elsewhere = "tcp://192.0.2.1:5560"  # RFC 5737: no machine has it
+    assert refusal(ZmqRoad, elsewhere, bind=True, keys=keys) == (
+        f"{elsewhere}: not an address of this machine, so it cannot be bound; connect (--connect,"
+        " bind = false) instead"
+    )
+    with ZmqRoad("tcp://127.0.0.1:*", bind=True) as road:
+        # a road that binds lets go until its first read
+        road.taken(0)
+        assert refusal(ZmqRoad, road.endpoint, bind=True) == (
+            f"{road.endpoint}: the port is in use; stop the program that has it, or choose another"
+            " port"
+        )

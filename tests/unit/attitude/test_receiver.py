@@ -606,6 +606,27 @@ def test_a_receiver_that_breaks_is_started_again_and_said():
     assert run.events == {"receiver-failed": 2}
 
 
+def test_a_receiver_that_breaks_again_and_again_is_started_ever_more_seldom():
+    """As seldom as once a second, until it has run for over ten."""
+    clock = Clock()
+    link = Script([], clock, fails=[OSError("no such socket")] * 20)
+    receiver = Receiver(link, Timeline(Policy(0, NS_PER_S)), now_ns=clock)
+    receiver.start()
+    waits_ms = []
+    for after_ns in (0, 0, 0, 0, 0, 0, 0, 10 * NS_PER_S + 1, 0):
+        broken = receiver._thread
+        broken.join(PATIENCE_S)
+        clock.now_ns += after_ns
+        begun_ns = clock.now_ns
+        receiver.tend()
+        while receiver._thread is broken:
+            clock.now_ns += NS_PER_MS
+            receiver.tend()
+        waits_ms.append((clock.now_ns - begun_ns) // NS_PER_MS)
+    receiver.close()
+    assert waits_ms == [50, 100, 200, 400, 800, 1000, 1000, 50, 100]
+
+
 def test_a_receiver_that_is_stopped_while_it_is_broken_ends():
     link = Script([], Clock(), fails=[MemoryError()] * 5)
     receiver = Receiver(link, Timeline(Policy(0, NS_PER_S)))

@@ -139,6 +139,13 @@ def test_segments_that_overlap_are_read_by_their_useable_times_then_the_later_on
     assert sum(sample.discontinuity for sample in log.samples) == changes
 
 
+def test_the_elements_of_a_state_that_was_read_count_no_more(tmp_path, monkeypatch):
+    """Eight elements a state, of which only those of one are held at one time."""
+    monkeypatch.setattr(aem_blocks, "MAX_ELEMENTS", 100)
+    (tmp_path / "log").write_text(in_xml(overlapping((range(30), {}), (range(30, 60), {}))))
+    assert len(open_log(tmp_path / "log").samples) == 60
+
+
 @pytest.mark.parametrize("allowed", [2, 3])
 def test_segments_overlap_up_to_a_number(tmp_path, monkeypatch, allowed):
     monkeypatch.setattr(aem, "MAX_OVERLAPPING", allowed)

@@ -377,6 +377,8 @@ def test_what_follows_an_endless_line_or_frame_is_read():
     found = decoder_of(**keys).feed(0, b"\x1a\xcf" + struct.pack(">H", 5000) + sealed(framed))
     assert len(answers(found)) == 1
     assert found[0].detail == "a length that no frame has"
+    # no frame, whose bytes would be fields
+    assert lines_of(found[0], decoder_of(**keys), Q) == [f"  {found[0].raw.hex(' ')}"]
 
 
 @pytest.mark.parametrize(("source", "taken"), [("file", 1), ("udp", 0)])

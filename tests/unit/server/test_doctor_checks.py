@@ -65,6 +65,9 @@ def test_a_card_is_named_by_its_vendor_and_device(monkeypatch, tmp_path):
         for name, text in parts.items():
             (device / name).write_text(f"{text}\n")
     monkeypatch.setattr(doctor, "SYS", tmp_path)
+    # whose text would end its cell in the table of a page
+    monkeypatch.setattr(doctor, "adapters", lambda: ["a | b"])
+    assert doctor.row()["links"] == "ZeroMQ and UDP over loopback; serial a / b"
     drivers = doctor.row()["OpenGL"].partition("kernel driver ")[2]
     assert drivers == "of-card0 (8086:3e92), of-card1"
 

@@ -537,15 +537,28 @@ def test_a_small_file_that_unpacks_to_a_large_one_is_refused(tmp_path, claimed, 
         read_log(path)
 
 
-def test_an_mcap_without_attitudes_lists_its_topics(tmp_path):
+TOPICS = [f"/{letter}" for letter in "abcdefghijklm"]
+
+
+@pytest.mark.parametrize(
+    ("topics", "listed"),
+    [
+        (["/imu"], "/imu"),
+        (["/imu", "/gps"], "/gps, /imu"),
+        (TOPICS[:12], ", ".join(TOPICS[:12])),
+        (TOPICS, f"{', '.join(TOPICS[:12])}, ..."),
+    ],
+)
+def test_an_mcap_without_attitudes_lists_its_topics(tmp_path, topics, listed):
     file = io.BytesIO()
     writer = Writer(file)
     writer.start(library="test")
-    for topic in ("/imu", "/gps"):
+    for topic in topics:
         writer.add_message(writer.register_channel(topic, "json", 0), 1, b"{}", 1)
     writer.finish()
     (tmp_path / "other.mcap").write_bytes(file.getvalue())
-    assert "its topics are /gps, /imu" in refusal(read_log, tmp_path / "other.mcap")
+    line = refusal(read_log, tmp_path / "other.mcap")
+    assert f"contains no attitude; its topics are {listed}, and only " in line
 
 
 @pytest.mark.parametrize(

@@ -418,7 +418,7 @@ KEYS = (Change("[monitor] bits", 10), Change("[render] quantisation", "exact"))
 TRIED = (
     Remedy(KEYS[:1], 0.0123, 0.0456, True),
     Remedy(KEYS, 0.0078, 0.0199, True),
-    Remedy(KEYS[1:], math.inf, 0.02, False),
+    Remedy(KEYS[1:], 0.02, math.inf, False),
 )
 
 
@@ -446,7 +446,8 @@ def test_a_table_says_what_was_chosen_and_what_would_do(bench_with, monkeypatch)
     told = effort_keys(bench)["would_do"]
     assert [remedy["value"] for remedy in told] == [10, [10, "exact"], "exact"]
     assert [remedy["key"] for remedy in told][1] == "[monitor] bits and [render] quantisation"
-    assert [remedy["error_mag"] for remedy in told] == [0.0123, 0.0078, None]
+    assert [remedy["error_mag"] for remedy in told] == [0.0123, 0.0078, 0.02]
+    assert [remedy["error_px"] for remedy in told] == [0.0456, 0.0199, None]
     assert [remedy["within"] for remedy in told] == [True, True, False]
 
 

@@ -39,6 +39,7 @@ from hilstar.instruments.simulate import heads as twin_heads
 from hilstar.instruments.simulate import simulator
 from hilstar.instruments.simulate.tracker_process import SILENT_AFTER_S, Planted
 from hilstar.server.answers.answer import Answer
+from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.heads import HeadsRun
 from tests.support.benches import bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
@@ -339,6 +340,16 @@ def test_a_head_gets_the_options_of_its_run_and_none_of_another_kind() -> None:
 def test_a_head_s_end_is_said_in_a_line(summary: Any, restarts: int, line: str) -> None:
     head = {"summary": summary, "exit_code": 0, "restarts": restarts}
     assert " ".join(serve_command._head_line("left", head).split()) == line
+
+
+def test_the_demo_s_tracker_answers_on_this_machine_s_clock(tmp_path: Path) -> None:
+    """Its process reads the same one as the display's."""
+    (tmp_path / "demo.toml").write_text(bench_text())
+    with demo_command.tracker_beside(tmp_path / "loop", tmp_path / "demo.toml", 1.0, 5):
+        config = read_bench_file(tmp_path / "loop" / "loop.toml").config
+    assert config.answers is not None
+    assert (config.answers.source, config.answers.clock) == ("zmq", "host")
+    assert str(config.answers.endpoint).startswith("ipc://")
 
 
 def planted_demo(folder: Path) -> TrackerBeside:

@@ -196,6 +196,8 @@ def test_decayed_satellites_are_left_out_with_one_line_and_the_others_stay(rng, 
         "3 of 8 satellites have no place by their elements at this ti"
     ]
     assert "LOST 0" in caplog.text
+    assert [sky.satellites_placed(seconds * S_NS) for seconds in (0, 1, 500)] == [5, 5, 5]
+    assert satellite_sky(some_orbits(rng, 5)).satellites_placed(0) == 5
 
 
 @pytest.mark.parametrize("way", [1, -1], ids=["after the elements", "before them"])
@@ -241,6 +243,55 @@ def test_an_observer_whose_state_comes_with_the_frame_sees_the_same(rng):
     )
     # none behind the Earth
     assert len(satellite_sky(text, Geocentre()).passing(EVERYWHERE, 777 * S_NS)) > len(ours)
+
+
+def test_an_observer_that_jumps_misses_none_that_is_near_its_new_place():
+    """By 95 km across the line of sight to one at 300 km: 17 degrees, beyond what was looked for."""
+    text = element_set(7, (97.0, 252.0, 130.0, 322.0), 0.001, 15.0)
+    sky = satellite_sky(text, Geocentre())
+    seen = sky.passing(EVERYWHERE, 0)
+    assert seen is not None
+    place_km = seen.place_km[0, 0]
+    up = place_km / np.linalg.norm(place_km)
+    across = np.cross(up, NORTH)
+    across /= np.linalg.norm(across)
+    here_km = place_km + 300.0 * up
+    there_km = here_km + 95.0 * across
+    axis = place_km - there_km
+    cone = Cone(axis / np.linalg.norm(axis), 0.01, 0.0)
+    rest = np.zeros(3)
+    assert sky.passing(cone, 0, rest, here_km) is None
+    found = sky.passing(cone, 0, rest, there_km)
+    assert found is not None
+    assert found.index.tolist() == [0]
+    # and here again, where it is not
+    assert sky.passing(cone, 0, rest, here_km) is None
+
+
+# of two steps of the difference below, 0.05 s: 1e-9 of rounding over 0.1 s, and their squares
+RATE_KM_S = 5e-6
+
+
+def test_a_pass_moves_as_the_passes_of_the_moments_about_it(rng):
+    """Where satellites sent what arrives, light time and the Earth's own way included: those that
+    come nearer send later. An eccentric one recedes by up to 5 km/s, 1e-4 km/s of its own speed.
+    """
+    text = some_orbits(rng, 40)
+    sky = satellite_sky(text, Geocentre())
+    middle_ns, step_ns = 1234 * S_NS, S_NS // 20
+    before, seen, after = (sky.passing(EVERYWHERE, middle_ns + k * step_ns) for k in (-1, 0, 1))
+    assert before.index.tolist() == seen.index.tolist() == after.index.tolist()
+    for cubic in ("seen_km", "place_km"):
+        first, middle, last = (getattr(one, cubic) for one in (before, seen, after))
+        rate_km_s = (last[0] - first[0]) / (2 * step_ns / S_NS)
+        assert np.abs(rate_km_s - middle[1]).max() < RATE_KM_S
+    light_s = np.linalg.norm(seen.seen_km[0], axis=1) / 299_792.458
+    swarm = Swarm([one.satrec for one in read_satellites(text, "f", START)])
+    swarm.move_to(START + middle_ns)
+    later_km = swarm.places_km(seen.index, START + middle_ns) - seen.place_km[0]
+    assert np.linalg.norm(later_km, axis=1) == pytest.approx(
+        np.linalg.norm(seen.place_km[1], axis=1) * light_s, rel=2e-3
+    )
 
 
 def test_a_satellite_that_meets_the_observer_is_in_the_cone_that_it_flies_into():

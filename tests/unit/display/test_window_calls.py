@@ -4,13 +4,17 @@ of two monitors that notes each call. tests/screen has the real one on a real X 
 
 from __future__ import annotations
 
+import importlib
+import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from hilstar.basics.errors import MachineError, NoDisplayError, NotThereError
 from hilstar.basics.units import NS_PER_S
+from hilstar.display.window import library as library_module
 from hilstar.display.window import window as window_module
 from hilstar.display.window.awake import Awake
 from hilstar.display.window.library import glfw as real_glfw
@@ -22,7 +26,8 @@ Call = tuple[Any, ...]
 WINDOW = "the window"
 FIRST, SECOND = "monitor of the first", "monitor of the second"
 SETTINGS = WindowSettings((640, 480), bits=10, display="DP-2", refresh_hz=75)
-RAMP = real_glfw._GLFWgammaramp.GLFWgammaramp([0.0, 0.3, 1.0], [0.0, 0.4, 1.0], [0.0, 0.6, 1.0])
+COLUMNS = ([0.0, 0.2, 0.6, 1.0], [0.0, 0.3, 0.7, 1.0], [0.0, 0.5, 0.8, 1.0])
+RAMP = real_glfw._GLFWgammaramp.GLFWgammaramp(*COLUMNS)
 
 
 class Glfw:
@@ -168,7 +173,7 @@ def lacking(kind: type[MachineError], asked: Callable[..., object], *arguments: 
     return line_of(caught.value)
 
 
-STRAIGHT = [[0.0, 0.5, 1.0]] * 3
+STRAIGHT = [pytest.approx([0.0, 1 / 3, 2 / 3, 1.0])] * 3
 
 
 def test_a_window_fills_its_display_and_leaves_it_as_it_was(library):
@@ -193,7 +198,7 @@ def test_a_window_fills_its_display_and_leaves_it_as_it_was(library):
         assert window.display is not None
         assert (window.display.name, window.display.position_px) == ("DP-2", (1920, -120))
         assert (window.display.scale, window.display.bits) == (1.5, 6)
-        assert (window.ramp_size, window.screen_bits, window.modes_hz) == (3, 6, (60, 75))
+        assert (window.ramp_size, window.screen_bits, window.modes_hz) == (4, 6, (60, 75))
         assert (window.others, window.mirrored) == (("DP-1",), None)
         assert (window.hidden, window.closing, window.scaled) == ("", False, False)
         library.calls.clear()
@@ -255,7 +260,7 @@ def test_a_window_returns_to_its_display_once_it_is_back(library, caplog):
         assert window.hidden == "minimised"
         library.callbacks["iconify"](WINDOW, 0)
         assert window.hidden == ""
-        assert window.ramp_size == 3
+        assert window.ramp_size == 4
     told = [record.getMessage() for record in caplog.records]
     assert told == [
         "the display DP-2 is gone; frames go on, and the window returns to it when it is back",
@@ -340,3 +345,16 @@ def test_without_a_window_or_a_display_one_line_says_what_is_missing(library, mo
     assert lacking(NoDisplayError, displays) == ("no display to open a window on; set DISPLAY")
     monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
     assert lacking(NoDisplayError, displays).startswith("no X11 display: this session is")
+
+
+def test_glfw_s_own_library_for_x11_is_taken_unless_another_is_named(monkeypatch):
+    """Whatever the session: GLFW's own choice would take Wayland's there."""
+    monkeypatch.setenv("WAYLAND_DISPLAY", "wayland-0")
+    monkeypatch.setenv("PYGLFW_LIBRARY", "/opt/glfw/libglfw.so")
+    importlib.reload(library_module)
+    assert os.environ["PYGLFW_LIBRARY"] == "/opt/glfw/libglfw.so"
+    monkeypatch.setenv("PYGLFW_LIBRARY", "")
+    importlib.reload(library_module)
+    chosen = Path(os.environ["PYGLFW_LIBRARY"])
+    assert chosen.is_file()
+    assert chosen.parts[-3:] == ("glfw", "x11", "libglfw.so")

@@ -148,6 +148,27 @@ def test_two_constants_are_taken_over_the_range_of_silicon():
     assert Optics(30, constant_curve(0.6), constant_curve(0.9)).range_nm == (300.0, 1100.0)
 
 
+@pytest.mark.parametrize(
+    ("name", "nm", "share"),
+    [
+        ("ccd47-20", 600.0, 0.966),  # ULTRACAM's red arm
+        ("kai-4021", 500.0, 0.55),
+        ("icx285", None, None),
+        ("imx249", None, None),
+        ("imx250", None, None),
+        ("imx252", None, None),
+        ("n-bk7-10mm", 500.0, 0.916),  # Schott
+        ("johnson-v", 530.0, 1.0),  # Bessell 1990
+    ],
+)
+def test_each_curve_that_a_bench_file_may_name_is_there(name, nm, share):
+    curve = load_curve(name, "[tracker] quantum_efficiency")
+    assert 0.3 < curve.value.max() <= 1.0
+    assert curve.wavelength_nm[0] <= 500 and curve.wavelength_nm[-1] >= 600
+    if nm is not None:
+        assert curve(np.array([nm]))[0] == pytest.approx(share, abs=5e-4)
+
+
 NM, VALUES = np.array([380.0, 450.0, 520.0]), np.array([0.05, 0.61, 0.48])
 CURVES = {
     "wavelength_nm,value\n380,0.05\n450,0.61\n520,0.48\n": "",

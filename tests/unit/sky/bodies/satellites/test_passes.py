@@ -11,7 +11,7 @@ import pytest
 
 from hilstar.sky.bodies.orbit import Geocentre, TleOrbit
 from hilstar.sky.bodies.passes import OWN_KM, Cone
-from hilstar.sky.bodies.satellites import Swarm, read_satellites
+from hilstar.sky.bodies.satellites import Swarm, read_satellites, sunlit_share
 from tests.support.satellites import element_set, satellite_sky, some_orbits, with_checksum
 from tests.support.skies import STATION_TLE, STATION_UTC, utc_ns
 
@@ -292,6 +292,49 @@ def test_a_pass_moves_as_the_passes_of_the_moments_about_it(rng):
     assert np.linalg.norm(later_km, axis=1) == pytest.approx(
         np.linalg.norm(seen.place_km[1], axis=1) * light_s, rel=2e-3
     )
+
+
+def test_what_the_earth_hides_at_a_moment_has_no_light_then(rng):
+    """Each a minute before and after a moment: by the height of the line of sight over a round
+    Earth, beside the 22 km of its flattening.
+    """
+    sky = satellite_sky(some_orbits(rng, 60), table="norad\n", utc=STATION_UTC)
+    hidden_count = seen_count = 0
+    for second in range(0, 6000, 300):
+        seen = sky.passing(Cone(NORTH, np.pi, 60.0), second * S_NS)
+        every = np.arange(len(seen))
+        for after_s in (-60.0, 60.0):
+            at = np.full(len(seen), after_s)
+            powers = after_s ** np.arange(4)
+            observer = np.einsum("k,kx->x", powers, seen.observer_km)
+            place = np.einsum("k,knx->nx", powers, seen.place_km)
+            way = place - observer
+            share = np.clip(-(way @ observer) / np.einsum("ij,ij->i", way, way), 0.0, 1.0)
+            height_km = np.linalg.norm(observer + share[:, None] * way, axis=1) - 6378.0
+            rates = seen.rates_e_per_s(every, at, at)
+            is_hidden = height_km < -25
+            assert (rates[is_hidden] == 0).all()
+            is_lit = (height_km > 5) & (sunlit_share(place, seen.now.sun_km) == 1)
+            assert (rates[is_lit] > 0).all()
+            hidden_count += int((is_hidden & (sunlit_share(place, seen.now.sun_km) == 1)).sum())
+            seen_count += int(is_lit.sum())
+    assert min(hidden_count, seen_count) > 5
+
+
+def test_light_varies_by_the_time_since_the_sky_s_date_not_since_a_frame():
+    """Between 1 + d and 1 - d of the mean, 2 mag apart, largest at 1 s and each 7 s after it."""
+    text = element_set(10_000, (97.0, 252.0, 130.0, 322.0), 0.001, 15.0)
+    table = "norad,period_s,amplitude_mag,flash_at_s\n10000,7,2,1\n"
+    ratio = 10**0.8
+    depth = (ratio - 1) / (ratio + 1)
+    for seconds in (1.0, 3.2, 715.0, 718.5):
+        rates = []
+        for rows in (table, "norad\n"):
+            seen = satellite_sky(text, Geocentre(), rows).passing(EVERYWHERE, round(seconds * S_NS))
+            now = np.zeros(1)
+            rates.append(seen.rates_e_per_s(np.array([0]), now, now)[0])
+        wanted = 1 + depth * np.cos(2 * np.pi * (seconds - 1.0) / 7.0)
+        assert rates[0] / rates[1] == pytest.approx(wanted, rel=1e-5)
 
 
 def test_a_satellite_that_meets_the_observer_is_in_the_cone_that_it_flies_into():

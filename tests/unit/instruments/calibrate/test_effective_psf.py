@@ -508,3 +508,18 @@ def test_psfs_are_drawn_where_they_are_in_the_field(tmp_path, monkeypatch):
     high = np.tile([[0.65], [1.0], [1.35]], (1, 3)) + 1 / 12
     np.testing.assert_allclose(widths, wide, atol=0.02)
     np.testing.assert_allclose(heights, high, atol=0.02)
+
+
+def test_a_spline_stays_at_its_prior_where_dots_tell_less():
+    """Dots whose pixels are known to no more than their light: a coefficient is known to 2 by
+    them, and within 0.03 without.
+    """
+    image, x_px, y_px = field_of_dots()
+    ghost = gaussian_image(x_px + 2, y_px, 0.7, 400.0)
+    dots = dots_of_image(image + ghost, x_px, y_px, 0.0).at(np.arange(12))
+    dots = replace(dots, variance=np.full_like(dots.images, 1e4**2))
+    gaussian = effective([[1.0, 1.0, 0.0]], _knots(dots))
+    amplitudes = np.column_stack([np.full(12, 1e4), np.zeros(12)])
+    spline = _spline(gaussian, dots, amplitudes, 1)
+    # a ghost of 4 % of the light would be that in all functions together
+    assert 0 < spline.sum() * KNOT_PX**2 < 0.05 * 0.04

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -71,6 +72,16 @@ def test_stars_that_a_head_sees_turned_are_the_body_turned_about_the_head_s_axes
     assert apart_arcsec == pytest.approx(np.linalg.norm(TURN_ARCSEC))
 
 
+def apart_arcsec(by_field, first: int, second: int, kind: int) -> list[float]:
+    """The angles between two heads' solutions of a kind of light, in the fields that both have."""
+    angles = []
+    for solved in by_field:
+        if solved[first] is not None and solved[second] is not None:
+            turn = rotation_of(solved[first][kind]) * rotation_of(solved[second][kind]).inv()
+            angles.append(3600 * np.degrees(turn.magnitude()))
+    return angles
+
+
 def test_each_head_is_shown_the_body_s_attitude_through_its_own_mounting(
     tmp_path, monkeypatch
 ) -> None:
@@ -82,6 +93,14 @@ def test_each_head_is_shown_the_body_s_attitude_through_its_own_mounting(
         return field(twin, q, first_frame)
 
     monkeypatch.setattr(Twin, "field", seen)
+    solutions = []
+    solved = _Head.solved
+
+    def told(head: _Head, q: FloatArray, first_frame: int) -> object:
+        solutions.append(solved(head, q, first_frame))
+        return solutions[-1]
+
+    monkeypatch.setattr(_Head, "solved", told)
     done: list[int] = []
     heads = read_heads(heads_file(tmp_path, 5599, SMALL))
     pairs = verify_heads(heads, 2, np.random.default_rng(3), done.append)
@@ -99,6 +118,11 @@ def test_each_head_is_shown_the_body_s_attitude_through_its_own_mounting(
         assert all(error < 3.0 for error in pair.linear_arcsec)
         assert len(pair.linear_arcsec) == len(pair.codes_arcsec)
     assert any(pair.codes_arcsec for pair in pairs)
+    # by the pairs' own solutions of one kind of light, field by field
+    by_field = (solutions[:3], solutions[3:])
+    for pair, (first, second) in zip(pairs, combinations(range(3), 2), strict=True):
+        for kind, found in enumerate((pair.linear_arcsec, pair.codes_arcsec)):
+            assert found == pytest.approx(apart_arcsec(by_field, first, second, kind), abs=1e-6)
 
 
 def test_a_pair_s_summary_has_the_rms_and_the_largest_of_each() -> None:

@@ -784,3 +784,16 @@ def test_fields_all_over_the_sky_are_identified_by_four_stars_and_more(tmp_path,
     # some fields have just four, and some have three
     assert {3, 4} <= set(counts)
     assert budget.identified_share == pytest.approx(np.mean(np.array(counts) >= 4))
+
+
+def test_each_of_many_stars_has_the_noise_of_its_own_light_and_background():
+    """More than are computed at once."""
+    star = gaussian(1.0, NOISY, phases=2)
+    count = 2 * noise.CHUNK + 3
+    star_e = np.geomspace(10.0, 1e5, count)
+    sky_e = np.linspace(900.0, 1.0, count)
+    rows = star.noise(star_e, sky_e, CentroidSettings())
+    for number in (0, noise.CHUNK - 1, noise.CHUNK, count - 1):
+        (alone,) = one(star, star_e[number], sky_e[number])
+        for name in noise.NOISE_COLUMNS:
+            assert rows[name][number] == pytest.approx(alone[name], rel=1e-9)

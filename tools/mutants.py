@@ -1,91 +1,48 @@
 """What README's test command holds: faults drawn by chance, one at a time, and which of them it
 finds.
 
-    python tools/mutants.py --mutants 60 --seed 1 -o DIR
-    python tools/mutants.py --mutants 40 --near -o DIR
     HILSTAR_LINE_MAP=MAP pytest -n0 -p tests.support.line_map
     python tools/mutants.py --mutants 140 --seed 2 --by-lines MAP --near -o DIR
     python tools/mutants.py --mutants 40 --rooms attitude/logs server/loop.py -o DIR
-    python tools/mutants.py --planted tools/planted_faults.toml --by-lines MAP --near -o DIR
+    python tools/mutants.py --planted tools/planted_faults.toml --by-lines MAP -o DIR
 
-Each mutant is one change in a core room, or in those of --rooms, in a copy of the checkout: one
-expression, one call, check or limit that is left out, or two arguments that are swapped. DIR gets
-mutants.csv: the change, and the test that fails ("" where none does). A test counts that fails
-twice with the change and passes without it: what fails by the machine's load, or for what the copy
-lacks, is said and passed over. A run that is stopped goes on where it was. With --near only those
-of README's tests run whose files name the changed module or its room: a few seconds a mutant. With
---by-lines those run that run the changed line, fastest first, and near ones (with --near) where
-none of them fails: tests in processes of their own are not in the map. --planted takes its changes
-from a file of faults that were thought of, and --rest the tests that README's command leaves out.
-Some mutants are no fault (a limit of memory that is one byte larger): the share that is found is a
-lower bound.
+Each mutant is one change in a core room, or in those of --rooms: one expression, one call, check or
+limit that is left out, or two arguments that are swapped. DIR gets mutants.csv: the change, and the
+test that fails with it and passes without it ("" where none does). A run that is stopped goes on
+where it was. With --by-lines those of README's tests run that run the changed line, fastest first,
+and with --near besides, where none of them fails, those whose files name the changed module or its
+room; without a map these alone. Tests in processes of their own do not see the change: the share
+that is found is a lower bound, also because some mutants are no fault (a limit of memory that is
+one byte larger). --planted takes its changes from a file of faults that were thought of, and --rest
+the tests that README's command leaves out.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
-import contextlib
 import copy
 import csv
-import gc
-import importlib
-import itertools
 import json
-import multiprocessing
 import os
 import random
-import re
-import subprocess
 import sys
-import tempfile
 import time
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
-from functools import partial
 from pathlib import Path
 
 # One process a core is enough, and threads would not survive a fork. Before NumPy is loaded.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import pytest
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-sys.dont_write_bytecode = False  # else each run compiles what it imports
+from tests.support.faults.fault_runs import ROOT, ChangedFile, Session, dotted_name, with_tests
 
-ROOT = Path(__file__).parent.parent
 ROOMS = ("sky", "optics", "display", "attitude", "tracker", "server/loop.py")
-# A mutant that never ends is found, too: an unchanged checkout takes a tenth of it when idle.
-MAX_RUN_S = 1800
 # The tests of a line that are run: few faults that the fastest pass are found by slower ones.
 MAX_TESTS_OF_LINE_S = 30.0
-HANGS = "it does not end"
-# a test that takes longer waits for what never comes, and ends the run (pytest 9.0 or newer)
-STUCK_S = 60
-# tests of one mutant that fail for other reasons, before its outcome is "none found"
-MAX_PASSED_OVER = 5
-STUCK_ENDS = (
-    *("-o", f"faulthandler_timeout={STUCK_S}"),
-    *("-o", "faulthandler_exit_on_timeout=true"),
-)
-FAILED = re.compile(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", re.MULTILINE)
-NOTHING_TO_RUN = 5  # pytest's exit code
-# the environment variables of tests/support/near_first.py
-NEAR, NEAR_ALONE = "HILSTAR_NEAR", "HILSTAR_NEAR_ALONE"
-
-# imported once for all runs
-LIBRARIES = (
-    *("astropy.coordinates", "astropy.table", "astropy.time", "astropy.wcs", "hypothesis"),
-    *("matplotlib.figure", "mcap.reader", "moderngl", "msgspec", "numpy.ma", "PIL.Image"),
-    *("rich.console", "scipy.integrate", "scipy.interpolate", "scipy.ndimage", "scipy.optimize"),
-    *("scipy.signal", "scipy.sparse.linalg", "scipy.spatial", "scipy.special", "scipy.stats"),
-    *("hypothesis.internal.observability", "skyfield.api", "typer", "xdist.plugin", "zmq"),
-)
-ALREADY_IMPORTED = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
-FORK = multiprocessing.get_context("fork")
-CHANGES = itertools.count(1)
-# the first test that fails, but for those that are named
-First = Callable[[Sequence[str]], str]
 
 COMPARED: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.LtE,
@@ -253,14 +210,6 @@ def drawn(count: int, seed: int, rooms: Sequence[str]) -> list[Mutant]:
     return random.Random(seed).sample(mutants, min(count, len(mutants)))
 
 
-def copy_checkout(folder: Path) -> None:
-    """The tracked files, in `folder`."""
-    archive = subprocess.run(
-        ["git", "archive", "--format=tar", "HEAD"], cwd=ROOT, check=True, capture_output=True
-    )
-    subprocess.run(["tar", "-x", "-C", folder], input=archive.stdout, check=True)
-
-
 @dataclass(frozen=True, slots=True)
 class LineMap:
     """What tests/support/line_map.py wrote: tests by path and line, and seconds by test and file."""
@@ -322,141 +271,33 @@ def own_lines(node: ast.stmt) -> range:
     return range(node.lineno, body[0].lineno if body else (node.end_lineno or node.lineno) + 1)
 
 
-@dataclass(frozen=True, slots=True)
-class Suite:
-    """README's tests in a copy of the checkout, nearest to a module first; `is_near`: the near
-    ones alone; `is_rest`: those that README's command leaves out.
-    """
-
-    checkout: Path
-    is_near: bool
-    is_rest: bool
-
-    def first_of(self, tests: Sequence[str], passed_over: Sequence[str] = ()) -> str:
-        """As `first_failure`, of the tests that are named, in their order."""
-        chosen = [test for test in tests if test not in passed_over]
-        if not chosen:
-            return ""
-        names = self.checkout / "chosen_tests.txt"
-        names.write_text("\n".join(chosen), encoding="utf-8")
-        return self._pytest(["-x", *deselected(passed_over), f"@{names}"], {})
-
-    def first_failure(self, module: str, passed_over: Sequence[str] = ()) -> str:
-        """The first test that fails but for those `passed_over`, "" where none does.
-
-        One that does not end is one that fails. HANGS where the tests together take too long;
-        pytest's last line where no test is named.
-        """
-        arguments = ["-x", "-p", "tests.support.near_first", *deselected(passed_over)]
-        if self.is_rest:
-            arguments.append("--rest")
-        variables = {NEAR: module}
-        if self.is_near:
-            variables[NEAR_ALONE] = "1"
-        return self._pytest(arguments, variables)
-
-    def fails(self, test: str) -> bool:
-        """Whether a test fails by itself."""
-        return bool(self._pytest([test], {}))
-
-    def _pytest(self, arguments: list[str], variables: dict[str, str]) -> str:
-        with tempfile.TemporaryFile() as output:
-            options = ["-v", "-n0", *ALREADY_IMPORTED, *STUCK_ENDS, *arguments]
-            run = FORK.Process(target=self._run, args=(options, variables, output.fileno()))
-            run.start()
-            run.join(MAX_RUN_S)
-            if run.exitcode is None:
-                run.kill()
-                run.join()
-                return HANGS
-            output.seek(0)
-            text = output.read().decode(errors="replace")
-        if run.exitcode in (0, NOTHING_TO_RUN):
-            return ""
-        failed = FAILED.search(text)
-        if failed is not None:
-            return failed[1]
-        # of a run that a stuck test ended, the name of that test
-        return (text or "no output").strip().splitlines()[-1].strip()
-
-    def _run(self, options: list[str], variables: dict[str, str], output: int) -> None:
-        """pytest in a process of its own, which begins with the libraries that are imported here:
-        that takes a third of a new one's time.
-        """
-        os.dup2(output, 1)
-        os.dup2(output, 2)
-        os.chdir(self.checkout)
-        os.environ |= {"PYTHONPATH": str(self.checkout)} | variables
-        sys.path[0] = str(self.checkout)
-        sys.exit(pytest.main(options))
-
-
-def deselected(tests: Sequence[str]) -> list[str]:
-    """pytest's options that leave tests out."""
-    options: list[str] = []
-    for test in tests:
-        options += ["--deselect", test]
-    return options
-
-
-@contextlib.contextmanager
-def planted(mutant: Mutant, checkout: Path) -> Iterator[None]:
-    """The mutant in the copy, and afterwards the file as it was."""
-    path = checkout / mutant.path
-    source = path.read_bytes()
-    source_ns = path.stat().st_mtime_ns
-    path.write_bytes(
-        source[: mutant.start_byte] + mutant.after.encode() + source[mutant.end_byte :]
-    )
-    # compiled modules are known by their source's size and time to the second
-    changed_ns = source_ns + next(CHANGES) * 1_000_000_000
-    os.utime(path, ns=(changed_ns, changed_ns))
-    try:
-        yield
-    finally:
-        path.write_bytes(source)
-        os.utime(path, ns=(source_ns, source_ns))
-
-
-def test_that_finds(
-    mutant: Mutant, checkout: Path, fails: Callable[[str], bool], first: First
-) -> str:
-    """The first test that fails by a mutant, "" where none does; `first` names a test that fails
-    but for those passed over, `fails` runs one by itself.
-    """
-    passed_over: list[str] = []
-    while len(passed_over) < MAX_PASSED_OVER:
-        with planted(mutant, checkout):
-            test = first(passed_over)
-            if not test:
-                return ""
-            is_named = test.startswith("tests/")
-            fails_again = not is_named or fails(test)
-        if is_named:
-            fails_unchanged = fails(test)
+def functions_to_run(mutant: Mutant, session: Session, line_map: LineMap | None) -> list[str]:
+    """The test functions of a mutant: those of its line, or without a map the near ones."""
+    if line_map is None:
+        return session.near(dotted_name(mutant.path))
+    functions: list[str] = []
+    for name in line_map.tests_of(mutant):
+        if "::" in name:
+            functions.append(name)
         else:
-            fails_unchanged = first(passed_over) == test
-        if fails_again and not fails_unchanged:
-            return test
-        why = "fails without it, too" if fails_unchanged else "passes when it is run again"
-        print(f"{mutant.path}:{mutant.line}: {test} does not count: it {why}", flush=True)
-        if not is_named:
-            return ""
-        passed_over.append(test)
-    return ""
+            functions += [each for each in session.items if each.startswith(f"{name}::")]
+    # a map may be older than a test's name
+    return [each for each in dict.fromkeys(functions) if each in session.items]
 
 
-def outcome_of(mutant: Mutant, suite: Suite, line_map: LineMap | None) -> Outcome:
+def outcome_of(
+    mutant: Mutant, session: Session, line_map: LineMap | None, *, with_near: bool
+) -> Outcome:
     """What the tests say of a mutant, and the time that it took."""
     begun_s = time.monotonic()
-    module = mutant.path.removesuffix(".py").replace("/", ".")
-    test = ""
-    if line_map is not None:
-        tests = line_map.tests_of(mutant)
-        test = test_that_finds(mutant, suite.checkout, suite.fails, partial(suite.first_of, tests))
-    if not test and (line_map is None or suite.is_near):
-        first = partial(suite.first_failure, module)
-        test = test_that_finds(mutant, suite.checkout, suite.fails, first)
+    source = (ROOT / mutant.path).read_bytes()
+    changed_source = source[: mutant.start_byte] + mutant.after.encode() + source[mutant.end_byte :]
+    fault = ChangedFile(mutant.path, source.decode(), changed_source.decode())
+    functions = functions_to_run(mutant, session, line_map)
+    test = session.test_that_finds(fault, functions)
+    if not test and with_near and line_map is not None:
+        near = [each for each in session.near(dotted_name(mutant.path)) if each not in functions]
+        test = session.test_that_finds(fault, near)
     wall_s = time.monotonic() - begun_s
     return Outcome(mutant.path, mutant.line, mutant.before, mutant.after, test, round(wall_s, 1))
 
@@ -496,7 +337,7 @@ def main() -> None:
     parser.add_argument("-o", dest="output", type=Path, required=True)
     options = parser.parse_args()
     options.output.mkdir(parents=True, exist_ok=True)
-    table = options.output / "mutants.csv"
+    table = (options.output / "mutants.csv").resolve()
     line_map = None
     if options.by_lines:
         line_map = LineMap(**json.loads(options.by_lines.read_text(encoding="utf-8")))
@@ -510,19 +351,15 @@ def main() -> None:
             done = len(list(csv.DictReader(rows)))
     else:
         table.write_text(",".join(field.name for field in fields(Outcome)) + "\n", encoding="utf-8")
-    for name in LIBRARIES:
-        with contextlib.suppress(ImportError):
-            importlib.import_module(name)
-    gc.freeze()
-    with tempfile.TemporaryDirectory() as temporary:
-        checkout = Path(temporary)
-        copy_checkout(checkout)
-        suite = Suite(checkout, options.near, options.rest)
+
+    def run_each(session: Session) -> None:
         for mutant in mutants[done:]:
-            outcome = outcome_of(mutant, suite, line_map)
+            outcome = outcome_of(mutant, session, line_map, with_near=options.near)
             with table.open("a", encoding="utf-8", newline="") as rows:
                 csv.writer(rows).writerow(asdict(outcome).values())
             print(outcome, flush=True)
+
+    with_tests(run_each, is_rest=options.rest)
     with table.open(encoding="utf-8") as rows:
         tests = [row["test"] for row in csv.DictReader(rows)]
     held = sum(bool(test) for test in tests)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import pytest
 import zmq
 
@@ -92,7 +94,8 @@ def test_a_place_that_cannot_be_bound_is_refused_with_what_to_do(tmp_path):
 @pytest.mark.parametrize(
     ("has_keys", "why"),
     [
-        (False, "it left before its handshake"),
+        # libzmq says which of the two by chance
+        (False, "it left before its handshake|it has no keys"),
         (True, "its key is not among those allowed"),
     ],
 )
@@ -133,4 +136,4 @@ def test_a_client_that_is_rejected_says_nothing_of_the_next_one(tmp_path, has_ke
             assert road._keeper is not None
             wait_for(lambda: counts_are(2, 1) and not road._keeper._open, "its end", poll_s=1e-3)
     assert notices.counts()["client-rejected"] == 1
-    assert f" was rejected: {why}" in notices.latest("client-rejected")
+    assert re.search(why, notices.latest("client-rejected"))

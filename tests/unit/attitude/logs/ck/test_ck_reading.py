@@ -5,6 +5,7 @@ SPICE, in frames of all kinds.
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +14,7 @@ import spiceypy
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.clock.timeline import Policy
+from hilstar.attitude.logs.ck import broken_off, reading_of
 from hilstar.attitude.logs.ck_spice import Segment, _attitudes, _Piece, _Structure, answer
 from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import log_timeline, open_log
@@ -125,6 +127,7 @@ def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(
     assert found.step_s is not None
     assert found.error_rad < BETWEEN_RAD
     rng = np.random.default_rng(kind)
+    off_most_rad = 0.0
     with spiceypy.KernelPool(
         [str(kernels_folder / name) for name in ("leap.tls", "clock.tsc", "a.bc")]
     ):
@@ -133,10 +136,13 @@ def test_functions_of_time_are_read_in_steps_whose_error_is_the_one_stated(
             shown = timeline.at(J2000_NS + round((ck.START_S + second) * NS_PER_S))
             off_rad = angle_between_rad(shown.q_icrs_to_cam, from_matrix(matrix))
             holds("ck-between", off_rad / MAS)
+            off_most_rad = max(off_most_rad, off_rad)
             if kind != 2:  # whose intervals do not join
                 assert shown.rate_cam_rad_s == pytest.approx(
                     motion.rate(second), abs=DIFFERENCE_RAD_S
                 )
+    if kind != 2:  # the largest at 200 places is about the largest at 60 others
+        assert 0.7 * off_most_rad < found.error_rad
 
 
 # Frames
@@ -232,6 +238,18 @@ def test_the_later_segment_has_priority_where_two_overlap(kernels_folder, motion
         assert angle_between_rad(q, mover.quaternion(second)) < 60 * MAS
         assert np.isfinite(rate).all() == inside
     assert found.breaks.sum() == 2
+
+
+def test_a_ck_counts_before_another_one_that_is_given_as_a_kernel(kernels_folder, motion):
+    """SPICE takes the attitude of what it has loaded last."""
+    other = ck.Motion(np.random.default_rng(5))
+    for name, mover in (("a.bc", motion), ("other.bc", other)):
+        with ck.new_ck(kernels_folder / name) as handle:
+            ck.write_segment(handle, 3, mover, TIMES[:5])
+    kernels = ("leap.tls", "clock.tsc", "other.bc")
+    found, _ = read_ck(kernels_folder / "a.bc", kernels=kernels)
+    for second, q in zip(TIMES[:5], found.q, strict=True):
+        assert angle_between_rad(q, motion.quaternion(second)) < READ_BACK_RAD
 
 
 def test_a_long_pause_that_an_interval_covers_is_no_gap(kernels_folder, motion):
@@ -388,3 +406,59 @@ def test_a_function_of_time_without_rates_has_those_of_its_turn(kind, has_rate, 
         "none": np.full((3, 3), np.nan),
     }
     assert rates == pytest.approx(wanted[whose], abs=RATE_RAD_S, nan_ok=True)
+
+
+def test_what_the_process_answers_becomes_a_log_with_its_breaks_and_notices():
+    q = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.6, 0.8]])
+    rate = np.array([[0.1, -0.2, 0.3], [np.nan] * 3, [0.0, 0.0, 0.5]])
+    arrays = {
+        "t_ns": np.array([1, 2, 4]) * NS_PER_S,
+        "q": q,
+        "rate": rate,
+        "breaks": np.array([False, False, True]),
+        "tick": np.array([65_536.0, 131_072.5, 262_144.0]),
+    }
+    # 2e-8 rad are 4.1253 mas
+    reply = {"step_s": 0.03125, "error_rad": 2e-8, "gaps_s": [0.5, 12.25, 2.0]}
+    said = {"structure": "-82000 (CASSINI)", "references": ["B1950", "J2000"]}
+    reading = reading_of(arrays, reply | said, [("kernels", "some")])
+    entries = list(reading.entries)
+    assert [entry.where for entry in entries] == [
+        ", tick 65536",
+        ", tick 131072.5",
+        ", tick 262144",
+    ]
+    samples = [entry.event for entry in entries]
+    assert [sample.t_ns for sample in samples] == [NS_PER_S, 2 * NS_PER_S, 4 * NS_PER_S]
+    assert np.array([sample.q_icrs_to_cam for sample in samples]).tolist() == q.tolist()
+    assert samples[0].rate_cam_rad_s.tolist() == [0.1, -0.2, 0.3]
+    assert samples[1].rate_cam_rad_s is None
+    assert [sample.discontinuity for sample in samples] == [False, False, True]
+    assert reading.told == [
+        ("kernels", "some"),
+        (
+            "ck-step",
+            "read every 0.03125 s where the CK is a function of time; off by 4.1 mas between",
+        ),
+        ("log-gap", "the CK has 3 gaps, the longest 12.25 s; the attitude is held there"),
+    ]
+    assert reading.conventions.source == "SPICE CK, structure -82000 (CASSINI)"
+    assert "components of B1950, J2000 (by SPICE: J2000" in reading.conventions.turns
+    assert reading.conventions.of_body and reading.conventions.scale == "TDB"
+    whole = reading_of(arrays, said | {"step_s": None, "error_rad": 0.0, "gaps_s": [3.0]})
+    assert whole.told == [
+        ("log-gap", "the CK has 1 gap, the longest 3 s; the attitude is held there")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("error_output", "last"),
+    [
+        (b"Toolkit version: N0067\n\nSPICE(DAFBEGGTEND)\n", "SPICE(DAFBEGGTEND)"),
+        (b"  \n", "no word"),
+    ],
+)
+def test_a_process_that_broke_off_is_refused_with_its_last_line(error_output, last):
+    assert broken_off(Path("a.bc"), error_output) == (
+        f"a.bc: SPICE broke off with it ({last}); is it, or a kernel, damaged?"
+    )

@@ -433,6 +433,7 @@ def test_a_head_says_the_columns_and_their_units_and_where_the_rows_begin(
 ):
     table = opened(text)
     assert (len(table.columns), table.columns[1].unit) == (columns, unit)
+    assert not any("title" in notice for notice in table.notices)
     read = list(table.rows())
     last = len(text.splitlines())
     assert [line for line, _ in read] == list(range(last - rows + 1, last + 1))

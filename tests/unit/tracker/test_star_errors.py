@@ -196,10 +196,10 @@ def test_the_largest_flux_error_is_the_largest_either_way(sign):
 def test_the_largest_distance_is_over_both_axes_and_the_rms_along_one():
     """3 and 4 px off are 5, which no axis alone is."""
     off_px = {
-        "gaussian": np.array([[3.0, 0.0, -4.5], [-4.0, 1.0, 0.0]]),
+        "window": np.array([[3.0, 0.0, -4.5], [-4.0, 1.0, 0.0]]),
         "moment": np.zeros((2, 3)),
     }
     errors = StarErrors(np.zeros(3), off_px)
-    assert errors.max_px("gaussian") == pytest.approx(5.0)
-    assert errors.axis_rms_px("gaussian") == pytest.approx(np.sqrt((9 + 16 + 1 + 4.5**2) / 6))
-    assert errors.worst() == "gaussian"
+    assert errors.max_px("window") == pytest.approx(5.0)
+    assert errors.axis_rms_px("window") == pytest.approx(np.sqrt((9 + 16 + 1 + 4.5**2) / 6))
+    assert errors.worst() == "window"

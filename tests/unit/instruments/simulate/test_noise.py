@@ -797,3 +797,9 @@ def test_each_of_many_stars_has_the_noise_of_its_own_light_and_background():
         (alone,) = one(star, star_e[number], sky_e[number])
         for name in noise.NOISE_COLUMNS:
             assert rows[name][number] == pytest.approx(alone[name], rel=1e-9)
+
+
+def test_a_bound_is_the_rms_over_the_places_within_a_pixel():
+    """Of two places with variances of 1 and 9 of the first unknown, 4 and 16 of the second."""
+    information = np.array([[np.diag([1.0, 1 / 4]), np.diag([1 / 9, 1 / 16])]])
+    np.testing.assert_allclose(noise._bounds(information), [[math.sqrt(5.0), math.sqrt(10.0)]])

@@ -26,7 +26,6 @@ from hilstar.instruments.calibrate.effective_psf import (
     _glass,
     _half_px,
     _held_out,
-    _is_alone,
     _knots,
     _of_frames,
     _placed,
@@ -34,6 +33,7 @@ from hilstar.instruments.calibrate.effective_psf import (
     _spline,
     _Sums,
     _variance,
+    are_alone,
     cut_out,
     dots_of_image,
     draw_effective,
@@ -165,8 +165,11 @@ def test_dots_are_alone_where_no_square_reaches_another():
     wide_px = 2.0 * MAX_HALF_PX
     x_px = np.array([0.0, wide_px + 0.1, 0.0, 200.0, 200.0 + wide_px - 0.1, 500.0])
     y_px = np.array([0.0, 0.0, wide_px + 0.1, 0.0, wide_px - 0.1, 0.0])
-    assert _is_alone(x_px, y_px).tolist() == [True, True, True, False, False, True]
-    assert _is_alone(np.array([3.0]), np.array([4.0])).tolist() == [True]
+    assert are_alone(x_px, y_px, MAX_HALF_PX).tolist() == [True, True, True, False, False, True]
+    assert are_alone(np.array([3.0]), np.array([4.0]), MAX_HALF_PX).tolist() == [True]
+    assert not len(are_alone(np.zeros(0), np.zeros(0), MAX_HALF_PX))
+    # two at one place have no room beside each other
+    assert not are_alone(np.zeros(2), np.zeros(2), MAX_HALF_PX).any()
 
 
 def test_pixels_scatter_by_their_light_as_the_frames_of_a_dot_do():

@@ -93,7 +93,7 @@ def parse_radec(text: str) -> tuple[float, float, float]:
         raise InputError(f"--radec {shortened(text)}: is a star; write --star {meant}")
     if len(parts) == 3 and not all(map(_is_number, parts[:2])):
         # declinations are not in hours: the two are swapped
-        if "h" in parts[1].casefold():
+        if "h" in parts[1]:
             raise InputError(f"--radec {shortened(text)}: write {RADEC_FORM}")
         # without a unit, a right ascension of several parts is hours
         ra_deg = _sexagesimal_deg(parts[0], "hourangle", text)

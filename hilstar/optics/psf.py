@@ -552,7 +552,8 @@ class SampledPsf(Psf):
         shares[:, 0] = 0.0
         of_phases = shares.reshape(side_px, steps, side_px, steps)
         of_phases /= of_phases.sum(axis=(0, 2), keepdims=True)
-        return np.pad(shares, (0, 1)).astype(np.float32)
+        # by rows: `shares` looks into the flat table, which must not be copied at each look
+        return np.ascontiguousarray(np.pad(shares, (0, 1)), dtype=np.float32)
 
     @property
     def _offsets_px(self) -> FloatArray:

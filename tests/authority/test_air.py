@@ -36,6 +36,8 @@ from tests.support.commands import run_hilstar_here
 from tests.support.spectra import write_curve
 
 SURE = 5.0  # standard deviations
+# Of refraction from 400 to 850 nm, which changes by 3 %: ERFA's own dispersion is Owens's.
+DISPERSION = 1e-3
 BENCH = """[tracker]
 aperture_mm = 18.4
 focal_length_mm = 35.0
@@ -425,6 +427,29 @@ def test_without_a_stated_pressure_it_is_the_standard_one_of_the_height():
         site_refraction(structs.replace(site, pressure_hpa=hpa), optics)[0] for hpa in (880.0, None)
     )
     assert standard / stated == pytest.approx(877.16 / 880, rel=1e-3)
+
+
+def dry_air_refractivity(wavelength_um: float) -> float:
+    """n - 1 of standard air (Edlen 1966, Metrologia 2, 71)."""
+    wave_number2 = wavelength_um**-2
+    return 1e-8 * (8342.13 + 2_406_030 / (130 - wave_number2) + 15_997 / (38.9 - wave_number2))
+
+
+@pytest.mark.parametrize("nm", [400.0, 850.0])
+def test_refraction_is_that_of_the_colour_which_the_tracker_sees(nm):
+    """The constant of tan z is the air's n - 1, and less by its scale height over the Earth's
+    radius, 0.13 %, in all colours alike: so the ratio to 550 nm is that of n - 1.
+    """
+    file = site_bench(Path())
+    optics = bench_channels(file.config.tracker, file.folder)[0]
+    site = structs.replace(file.config.site, humidity=0.0)
+
+    def constant_rad(nm: float) -> float:
+        line = Curve(np.array([nm - 1, nm, nm + 1]), np.array([0.0, 1.0, 0.0]))
+        return site_refraction(site, replace(optics, quantum_efficiency=line))[0]
+
+    ratio = dry_air_refractivity(nm * 1e-3) / dry_air_refractivity(0.55)
+    assert constant_rad(nm) / constant_rad(550.0) == pytest.approx(ratio, abs=DISPERSION)
 
 
 def test_the_skys_glow_is_that_of_the_zenith_and_van_rhijns_with_the_airs_extinction():

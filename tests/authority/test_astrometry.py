@@ -11,10 +11,13 @@ from astropy.time import Time
 from astropy.wcs import WCS
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
-from hilstar.basics.units import LIGHT_KM_S
+from hilstar.basics.units import ARCSEC_PER_RAD, LIGHT_KM_S
+from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.frame_files import world_coordinates
+from hilstar.server.bench.star_light import bench_moving, bench_stars
 from hilstar.sky.catalog import Catalog, load_catalog, plain_catalog
 from hilstar.sky.stars import aberrate, unit_vectors_icrs
+from tests.support.benches import bench_text
 from tests.support.claims import holds
 
 MAS = np.pi / (180 * 3600 * 1000)
@@ -25,6 +28,8 @@ LIMIT_MAS = 1.0
 # for the Earth and an orbit about it. Of 1041 px to a radian that is 1.4e-6 px.
 ORBIT_LIMIT_PX = 2e-6
 J2000_JD, ALPHA_CENTAURI_HIP = 2_451_545.0, 71_683
+# Of a parallax: bent light at another angle to the Sun, and DE421 against ERFA's series.
+PARALLAX_SHARE = 1e-3
 FAR_FROM_THE_SUN_AU = 1e6  # ERFA bends light by the Sun's potential too
 
 
@@ -149,6 +154,30 @@ def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the
     plain = bench.light(bench.view(q))
     assert plain is not None
     assert np.abs(plain.x_px[:30] - sprites.x_px[:30]).max() > 0.01
+
+
+def test_near_stars_are_seen_from_where_the_earth_is(tmp_path):
+    """Alpha Centauri (742 mas) and 61 Cygni, against where they are seen without parallax: by
+    ERFA's place of the Earth.
+    """
+    tables = {
+        "sky": {"epoch_utc": "2026-11-21T00:00:00Z", "faintest_v_mag": 6.0},
+        "spacecraft": {"orbit": "geocentre"},
+    }
+    file = bench_file_of(tmp_path / "bench.toml", bench_text(tables))
+    moving = bench_moving(file.config, file.folder)
+    stars = bench_stars(file.config, file.folder, moving)
+    vectors = unit_vectors_icrs(stars.catalog, file.config.sky.epoch_jyear)
+    far = moving.stars_seen(vectors, np.zeros(len(vectors)))
+    _, from_barycentre = erfa.epv00(2_461_365.5, 0.0)  # of that day, midnight
+    earth_au = from_barycentre["p"]
+    for hip in (71683, 104214):
+        star = int(np.flatnonzero(stars.hip == hip)[0])
+        direction = far[stars.row[star]]
+        parallax_rad = stars.catalog.parallax_mas[stars.row[star]] * 1e-3 / ARCSEC_PER_RAD
+        across_au = earth_au - (earth_au @ direction) * direction
+        off_rad = stars.vectors[star] - direction + parallax_rad * across_au
+        assert np.linalg.norm(off_rad) < PARALLAX_SHARE * parallax_rad
 
 
 def test_a_spacecraft_s_velocity_joins_that_of_the_earth_by_the_ephemeris(bench_with):

@@ -13,17 +13,23 @@ from astropy.coordinates import GCRS, ITRS, AltAz, CartesianRepresentation, Eart
 from astropy.time import Time
 from scipy.spatial.transform import Rotation
 
+from hilstar.attitude.logs import earth
 from hilstar.attitude.logs.earth import (
     EARTH_RATE_RAD_S,
+    Reference,
     beyond_table,
     earth_rate_ned_rad_s,
     q_icrs_to_enu,
     q_icrs_to_itrs,
     q_icrs_to_ned,
+    to_icrs,
     utc_ns_of,
 )
+from hilstar.attitude.logs.entries import LogEntry
+from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import conjugate, multiply, to_matrix, to_rotation_vector
+from hilstar.basics.units import NS_PER_S
 from tests.support.claims import holds
 
 pytestmark = pytest.mark.usefixtures("iers_of_package")
@@ -180,6 +186,53 @@ def test_beyond_the_table_the_user_is_told_by_how_much():
         # UT1 parts from UTC by 1.1 s a year, and 1 s is 15.041 arcsec
         assert off_arcsec == pytest.approx(15.041 * 1.1 * years, abs=0.5 + 15.041 * 1.1 / 365.25)
     assert np.isfinite(q_icrs_to_itrs(utc_array("2060-01-01T00:00:00"))).all()
+
+
+def test_before_the_table_the_user_is_told_by_how_much():
+    """It begins on 1973-01-02; ten years earlier UT1 may be off by 11 s."""
+    begin_ns, end_ns = (
+        int(utc_array(text)[0]) for text in ("1963-01-03T00:00:00", "1990-01-01T00:00:00")
+    )
+    line = beyond_table(begin_ns, end_ns)
+    assert line is not None and " goes from 1973-01-02 to " in line
+    off_arcsec = float(line.split("turned by ")[1].split()[0])
+    assert off_arcsec == pytest.approx(15.041 * 1.1 * 10, abs=0.5 + 15.041 * 1.1 / 365.25)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "is_told"),
+    [
+        ([-1000, -1, 0, 1, 2], True),  # the first attitudes alone are before the table
+        ([0, 1, 2, 3, 4, 10**8], False),
+        ([0, 1, 2, 3, 4, 3 * 10**9], True),  # the last one alone is beyond it
+    ],
+)
+def test_a_log_is_told_to_leave_the_table_at_either_end(monkeypatch, seconds, is_told):
+    monkeypatch.setattr(earth, "BATCH", 2)
+    begin_ns = int(utc_array("1973-01-02T00:00:00")[0])
+    entries = [
+        LogEntry("", AttitudeSample(int(second * NS_PER_S), np.array([1.0, 0.0, 0.0, 0.0])))
+        for second in seconds
+    ]
+    told: list[tuple[str, str]] = []
+    reference = Reference("ned", (48.1, 11.6), begin_ns)
+    turned = list(to_icrs(entries, reference, False, told))
+    assert [entry.event.t_ns for entry in turned] == [entry.event.t_ns for entry in entries]
+    assert [kind for kind, _ in told] == ["log-earth"] * is_told
+
+
+def test_a_level_frame_is_described_with_its_latitude_before_its_longitude():
+    turned = (
+        "turned to the ICRS with the Earth (IAU 2006/2000A; 15 arcsec for each second that its"
+        " UTC is off)"
+    )
+    assert Reference("ned", (48.1, -11.6)).words == (
+        f"north, east, down at latitude 48.1, longitude -11.6, {turned}"
+    )
+    assert Reference("enu", (-33.9, 151.2)).words == (
+        f"east, north, up at latitude -33.9, longitude 151.2, {turned}"
+    )
+    assert Reference("icrs").words == "the ICRS"
 
 
 @pytest.mark.parametrize(

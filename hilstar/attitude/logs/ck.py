@@ -22,7 +22,7 @@ import math
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -102,9 +102,19 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
         kernels = _kernels_beside(path)
         notices.append(("kernels", _beside_line(kernels)))
     arrays, reply = _asked(path, kernels, stated.body)
+    return reading_of(arrays, reply, notices)
+
+
+def reading_of(
+    arrays: Arrays, reply: dict[str, Any], notices: Iterable[tuple[str, str]] = ()
+) -> LogReading:
+    """The reading of what the process with SPICE answers: its arrays and the rest (see
+    `ck_spice`), after the `notices` so far.
+    """
+    told = list(notices)
     if reply["step_s"] is not None:
         error = f"{reply['error_rad'] * MAS_PER_RAD:.2g} mas"
-        notices.append(
+        told.append(
             (
                 "ck-step",
                 (
@@ -119,15 +129,13 @@ def read_ck(path: Path, stated: Stated) -> LogReading:
             count = "1 gap"
         else:
             count = f"{len(gaps_s)} gaps"
-        notices.append(
+        told.append(
             (
                 "log-gap",
                 f"the CK has {count}, the longest {max(gaps_s):.6g} s; the attitude is held there",
             )
         )
-    return LogReading(
-        _entries(arrays), _conventions(reply), "give a CK whose times differ", notices
-    )
+    return LogReading(_entries(arrays), _conventions(reply), "give a CK whose times differ", told)
 
 
 def _entries(arrays: Mapping[str, Any]) -> Iterator[LogEntry]:
@@ -165,16 +173,19 @@ def _asked(path: Path, kernels: list[Path], body: str | None) -> tuple[Arrays, d
             f"{path}: SPICE did not read it within {LONGEST_S:g} s; cut it into several (ckslicer)"
         ) from error
     if done.returncode:
-        last = done.stderr.decode("utf-8", "replace").strip().splitlines()[-1:] or ["no word"]
-        raise InputError(
-            f"{path}: SPICE broke off with it ({last[0]}); is it, or a kernel, damaged?"
-        )
+        raise InputError(broken_off(path, done.stderr))
     with np.load(io.BytesIO(done.stdout)) as archive:
         arrays = dict(archive)
     answer = json.loads(str(arrays.pop("said")))
     if "error" in answer:
         raise InputError(answer["error"])
     return arrays, answer
+
+
+def broken_off(path: Path, error_output: bytes) -> str:
+    """The refusal of a CK with which the process broke off, by the last line that it wrote."""
+    last = error_output.decode("utf-8", "replace").strip().splitlines()[-1:] or ["no word"]
+    return f"{path}: SPICE broke off with it ({last[0]}); is it, or a kernel, damaged?"
 
 
 def _conventions(said: dict[str, Any]) -> Conventions:

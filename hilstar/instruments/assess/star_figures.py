@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy import optimize, stats
+from scipy import optimize, special, stats
 
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.units import MAD_TO_SIGMA
@@ -336,7 +336,7 @@ def half_seen(v_mag: FloatArray, seen: IntArray, lit: IntArray) -> float:
     def loss(parameters: FloatArray) -> float:
         limit_mag, log_width = parameters
         width = MIN_SLOPE_MAG + math.exp(log_width)
-        share = stats.logistic.cdf((limit_mag - v_mag) / width)
+        share = special.expit((limit_mag - v_mag) / width)
         share = np.clip(share, 1e-9, 1 - 1e-9)
         log_likelihood = seen * np.log(share) + unseen * np.log1p(-share)
         return -float(log_likelihood.sum())

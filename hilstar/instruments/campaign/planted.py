@@ -26,7 +26,7 @@ from hilstar.instruments.campaign.plan import PlantedFaults
 from hilstar.instruments.campaign.solver_answer import SolverAnswer
 from hilstar.instruments.simulate.simulator import Exposure
 from hilstar.server.answers.answer import ReportedStar
-from hilstar.server.answers.stars import LitStars, judge_stars
+from hilstar.server.answers.stars import LitStars, lit_by_report
 
 PLANTED_STREAM = 5  # stream of a case's noise seed for what is planted
 HEALTHY = PlantedFaults()
@@ -148,23 +148,25 @@ class CaseTracker:
             return answer
         planted = self._planted
         height, width = exposure.dn.shape
-        lit = lit_stars(exposure)
+        limit = planted.star_limit_v_mag
+        v_mag = bv_mag = np.full(len(answer.stars), np.nan)
+        if limit is not None or planted.star_colour:
+            lit = lit_stars(exposure)
+            matched = lit_by_report(answer.stars, lit, (width, height))
+            # -1, no star, is the last: one more than there are
+            v_mag = np.append(lit.v_mag, np.nan)[matched]
+            bv_mag = np.append(lit.bv, np.nan)[matched]
         stars = []
-        for star in answer.stars:
-            match = judge_stars((star,), lit, (width, height))
-            matched = np.flatnonzero(np.isfinite(match.dx_px))
-            v_mag = match.lit.v_mag[matched]
-            limit = planted.star_limit_v_mag
-            if limit is not None and (not len(matched) or v_mag[0] > limit):
+        for star, its_v_mag, its_bv_mag in zip(answer.stars, v_mag, bv_mag, strict=True):
+            if limit is not None and not its_v_mag <= limit:
                 continue
             wave = math.sqrt(2) * planted.star_fov_px
             wave_x_px = wave * math.sin(2 * math.pi * star.x_px / width)
             wave_y_px = wave * math.sin(2 * math.pi * star.y_px / height)
             noise_px = planted.star_noise_px * self._rng.standard_normal(2)
             dn = star.dn
-            if dn is not None and len(matched):
-                bv = float(match.lit.bv[matched[0]])
-                dn *= flux_ratio(planted.star_colour * bv)
+            if dn is not None and np.isfinite(its_bv_mag):
+                dn *= flux_ratio(planted.star_colour * float(its_bv_mag))
             x_px = star.x_px + float(noise_px[0]) + wave_x_px
             y_px = star.y_px + float(noise_px[1]) + wave_y_px
             stars.append(ReportedStar(x_px, y_px, dn, star.hip))

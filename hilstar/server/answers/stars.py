@@ -82,6 +82,28 @@ def judge_stars(
     return StarResiduals(lit.some(alone), dx_px[alone], dy_px[alone], signal_mag[alone], false)
 
 
+def lit_by_report(
+    reported: tuple[ReportedStar, ...], lit: LitStars, size_px: tuple[int, int]
+) -> IntArray:
+    """The index in `lit` of the star that each report (n,) is of, where reports are matched one at
+    a time: the brightest within MATCH_PX, if it stands alone; -1 for any other report. `size_px` is
+    the detector's (width, height).
+    """
+    indices = np.full(len(reported), -1)
+    if not reported or not len(lit.x_px):
+        return indices
+    order = np.argsort(-lit.electrons_per_s, kind="stable")
+    lit = lit.some(order)
+    alone = _stands_alone(lit, size_px)
+    places_px = np.array([(star.x_px, star.y_px) for star in reported])
+    tree = KDTree(np.stack([lit.x_px, lit.y_px], axis=1))
+    near: Any = tree.query_ball_point(places_px, MATCH_PX)
+    for report, candidates in enumerate(near):
+        if candidates and alone[min(candidates)]:
+            indices[report] = order[min(candidates)]
+    return indices
+
+
 def lit_at(
     q_icrs_to_cam: FloatArray, stars: Stars, camera: Camera, faintest_e_per_s: float
 ) -> LitStars:

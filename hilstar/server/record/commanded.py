@@ -141,8 +141,7 @@ class Commanded:
         start_s = self.held_s[:, 0] - reach_s
         end_s = self.held_s[:, 1] + reach_s
         # Spans that now overlap become one, so that a moment lies in one span at most.
-        latest_end_s = np.maximum.accumulate(end_s)
-        is_apart = start_s[1:] > latest_end_s[:-1]
+        is_apart = start_s[1:] > end_s[:-1]
         first = np.flatnonzero(np.append(True, is_apart))
         joint_end_s = np.maximum.reduceat(end_s, first)
         spans_s = np.stack([start_s[first], joint_end_s], axis=1)

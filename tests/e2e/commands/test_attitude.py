@@ -136,9 +136,21 @@ def test_a_mounting_may_be_given_without_a_bench_file(tmp_path):
     turn = Rotation.from_quat([-0.5, -0.5, -0.5, 0.5])
     ra_deg = np.degrees(np.arctan2(*turn.inv().apply([0.0, 0.0, 1.0])[1::-1]))
     assert (found["ra_deg"], found["dec_deg"]) == pytest.approx((ra_deg, 0), abs=ROUNDING_DEG)
+
+
+def test_what_is_stated_of_a_log_is_refused_for_a_live_stream(tmp_path):
+    """A log's mounting and convention have keys in the bench file; the rest a stream has not."""
     (tmp_path / "bench.toml").write_text(SMALL_BENCH)
-    result = run_hilstar_here("attitude", tmp_path / "bench.toml", "--mounting", "1,0,0,0")
-    assert_refused(result, 2, "--mounting 1,0,0,0", "[tracker] q_body_to_cam")
+    for flag, value, words in (
+        ("--mounting", "1,0,0,0", "bench.toml as [tracker] q_body_to_cam"),
+        ("--convention", "scalar=last", "bench.toml as [attitude] convention"),
+        ("--reference", "enu", "names a live stream; leave it out"),
+        ("--place", "1,2,3", "names a live stream; leave it out"),
+        ("--epoch-utc", "2026-11-21T00:00:00Z", "names a live stream; leave it out"),
+        ("--topic", "/attitude", "names a live stream; leave it out"),
+    ):
+        result = run_hilstar_here("attitude", tmp_path / "bench.toml", flag, value)
+        assert_refused(result, 2, f"{flag} {value}: ", words)
 
 
 def test_silence_and_wrong_uses_are_refused_in_one_line(tmp_path):

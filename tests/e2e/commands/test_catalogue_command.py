@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pyarrow.parquet
 import pytest
 
 from tests.support.benches import bench_text
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.tables import csv_rows
 
 pytestmark = pytest.mark.e2e
@@ -91,6 +92,28 @@ def test_bad_input_is_one_line(faint_bench, tmp_path, monkeypatch, arguments, sa
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_an_ending_may_be_in_capitals_and_the_bench_file_is_no_output(
+    faint_bench, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    done = run_hilstar_here("catalogue", faint_bench, "-o", "S.CSV", "--faintest", "0")
+    assert done.returncode == 0, done.stderr
+    count, worth, wrote = done.stdout.strip().split("; ")
+    rows = csv_rows(tmp_path / "S.CSV")
+    assert (count, wrote) == (f"{len(rows)} stars at J2026", "wrote S.CSV")
+    zeros_mag = re.fullmatch(
+        r"an electron per second is ([\d.]+) mag \(Vega\), ([\d.]+) mag \(AB\)", worth
+    ).groups()
+    for zero_mag, system in zip(zeros_mag, ("vega", "ab"), strict=True):
+        told_mag = float(rows[0][f"instrument_mag_{system}"])
+        light_mag = -2.5 * np.log10(float(rows[0]["electrons_per_s"]))
+        assert float(zero_mag) == pytest.approx(told_mag - light_mag, abs=2e-4)
+    bench = faint_bench.rename(tmp_path / "bench.csv")
+    refused = run_hilstar_here("catalogue", bench, "-o", bench)
+    assert_refused(refused, 2, "bench.csv")
+    assert "[tracker]" in bench.read_text()
 
 
 def test_b_and_i_are_given_as_measured_beside_the_spectrum_s(faint_bench, tmp_path):

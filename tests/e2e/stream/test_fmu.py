@@ -139,10 +139,14 @@ def test_an_fmu_drives_a_bench_and_hears_what_the_tracker_answers(tmp_path):
 
 
 def test_its_packets_are_those_of_the_wire(tmp_path, monkeypatch):
-    """The FMU holds the generated table itself, and no layout of its own."""
+    """The FMU holds the generated table itself, and no layout of its own. What was imported to make
+    it is not kept.
+    """
+    path = list(sys.path)
     with zipfile.ZipFile(fmu.build(tmp_path, "127.0.0.1:5560")) as made:
         table = made.read(f"resources/{fmu.PROTOCOL}.py")
         model = made.read(f"resources/{fmu.MODEL}.py").decode()
+    assert sys.path == path and not {fmu.MODEL, fmu.PROTOCOL} & set(sys.modules)
     assert table == Path(protocol.__file__).read_bytes()
     assert re.findall(r'"<[BHIqdf0-9]{2,}"', model) == []
     monkeypatch.setitem(sys.modules, fmu.PROTOCOL, protocol)
@@ -156,6 +160,7 @@ def test_its_packets_are_those_of_the_wire(tmp_path, monkeypatch):
     ("attitude", "words"),
     [
         ("", ['source = "zmq"', 'write source = "udp"']),
+        ('source = "serial"\nport = "/dev/ttyS0"', ['source = "serial"', 'write source = "udp"']),
         ('source = "udp"\nbind = "127.0.0.1:0"', ["port 0", "write the port"]),
         ('source = "udp"\nbind = "127.0.0.1:5560"\nstatus_hz = 0', ["status_hz = 0", "write 10"]),
     ],
@@ -167,6 +172,35 @@ def test_a_bench_that_no_fmu_can_drive_is_refused(tmp_path, attitude, words):
     assert done.returncode == 2 and len(done.stderr.splitlines()) == 1
     assert all(word in done.stderr for word in words), done.stderr
     assert not (tmp_path / "display.fmu").exists()
+
+
+@pytest.mark.parametrize(
+    ("bind", "address"),
+    [
+        ("10.0.0.7:5560", "10.0.0.7:5560"),
+        ("0.0.0.0:5561", "127.0.0.1:5561"),
+        ("[::]:5562", "[::1]:5562"),
+        ("[fd00::7]:5563", "[fd00::7]:5563"),
+    ],
+)
+def test_a_bench_that_listens_everywhere_is_sent_to_on_this_machine(
+    tmp_path, monkeypatch, bind, address
+):
+    asked = []
+
+    def build(folder, address):
+        asked.append(address)
+        (folder / "made.fmu").write_bytes(b"made")
+        return folder / "made.fmu"
+
+    monkeypatch.setattr(fmu, "build", build)
+    bench = tmp_path / "bench.toml"
+    allow = 'allow = ["10.0.0.0/8", "fd00::/8"]'
+    bench.write_text(f'{LIVE_BENCH}[attitude]\nsource = "udp"\nbind = "{bind}"\n{allow}\n')
+    done = run_hilstar_here("fmu", bench, "-o", tmp_path / "display.fmu")
+    assert (done.returncode, asked) == (0, [address]), done.stderr
+    assert done.stderr.endswith(f": sends to {address}; start hilstar serve {bench} there\n")
+    assert (tmp_path / "display.fmu").read_bytes() == b"made"
 
 
 def test_it_sends_where_the_bench_listens_and_says_what_it_needs(tmp_path):

@@ -95,6 +95,9 @@ def test_every_option_of_every_command_is_a_field(file, name):
     structs.pop("return")
     assert list(structs) == list(inspect.signature(function).parameters)
     assert all(map(is_dataclass, structs.values()))
+    # each help has --json at its end
+    parameters = list(inspect.signature(for_typer(function)).parameters)
+    assert "as_json" not in parameters[:-1]
 
 
 def test_a_second_value_of_an_option_is_refused(tmp_path):

@@ -80,6 +80,7 @@ def test_other_commands_and_what_follows_two_dashes_stay():
         ["simulate", "bench.toml", "--log", "log.csv", "--frames", "3"],
         ["calibrate", "dots", "bench.toml", "--frames", "12"],
         ["service", "install", "bench.toml", "--", "--frames", ENDPOINT],
+        ["replay", "bench.toml", "log.csv", "--", "--frames", ENDPOINT],
         [],
     ):
         assert with_present_names(typed) == typed

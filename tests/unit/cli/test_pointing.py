@@ -51,8 +51,9 @@ def test_sexagesimal_is_read_as_astropy_reads_it(text, place):
     )
 
 
-def test_numbers_are_degrees():
-    assert parse_radec("84.057,-1.2,0") == (84.057, -1.2, 0.0)
+@pytest.mark.parametrize("place", [(84.057, -1.2, 0.0), (10.0, 90.0, -5.0), (370.0, -90.0, 400.0)])
+def test_numbers_are_degrees_from_pole_to_pole(place):
+    assert parse_radec(",".join(map(str, place))) == place
 
 
 @pytest.mark.parametrize(
@@ -61,6 +62,7 @@ def test_numbers_are_degrees():
         ("5h61m0s,1d0m,0", "sexagesimal: 5h36m14s"),
         ("5h60m0s,1d0m,0", "sexagesimal: 5h36m14s"),
         ("5h36m,-91d0m,0", "a declination from -90 to 90"),
+        ("10,90.0001,0", "a declination from -90 to 90"),
         ("5h36m,-1d12m,north", "sexagesimal: 5h36m14s"),
         ("5h36m,-1d12m", "write RA,DEC,ROLL in degrees"),
         ("Orion,-1d12m,0", "write RA,DEC,ROLL in degrees"),

@@ -8,9 +8,12 @@ import shlex
 import shutil
 import stat
 import subprocess
+from pathlib import Path
 
 import pytest
 
+from hilstar.basics.errors import InputError
+from hilstar.cli.service import unit_name, unit_text, units_folder
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.waiting import PATIENCE_S
@@ -63,6 +66,10 @@ def test_the_unit_serves_the_bench_and_is_watched_and_started_again(service_benc
         "a b$c%d-{utc}.mcap",
     ]
     assert (keys["Type"], keys["Restart"], keys["WatchdogSec"]) == ("notify", "always", "3")
+    # what is wrong in the command or in a file is wrong the next time, too
+    assert keys["RestartPreventExitStatus"] == str(InputError.exit_code)
+    assert (keys["StartLimitIntervalSec"], keys["RestartSec"]) == ("0", "200ms")
+    assert (keys["WorkingDirectory"], keys["UMask"]) == (str(service_bench.parent), "0027")
     assert not path.with_suffix(".env").exists()
     assert_refused(install(service_bench), 2, "hilstar-room7.service", "--overwrite")
     assert install(service_bench, "--overwrite").returncode == 0
@@ -75,6 +82,31 @@ def test_beyond_loopback_its_token_is_in_a_file_of_its_own(service_bench):
     token = tokens.read_text().removeprefix("HILSTAR_TOKEN=").strip()
     assert len(token) >= 40
     assert token not in result.stderr + result.stdout + tokens.with_suffix(".service").read_text()
+    again = install(service_bench, "--overwrite", "--", "--console", "0.0.0.0:8765")
+    assert again.returncode == 0, again.stderr
+    # a page that is open stays so
+    assert tokens.read_text().removeprefix("HILSTAR_TOKEN=").strip() == token
+
+
+def test_a_name_has_64_characters_at_most():
+    assert unit_name("a" * 64) == f"hilstar-{'a' * 64}.service"
+    with pytest.raises(InputError, match="write letters, digits"):
+        unit_name("a" * 65)
+
+
+@pytest.mark.parametrize("stated", [{}, {"XDG_CONFIG_HOME": ""}, {"XDG_CONFIG_HOME": "config"}])
+def test_a_folder_of_settings_that_is_relative_is_none(stated):
+    """As the XDG base directory specification has it."""
+    assert units_folder(stated) == Path.home() / ".config" / "systemd" / "user"
+    absolute = units_folder({"XDG_CONFIG_HOME": "/etc/of mine"})
+    assert absolute == Path("/etc/of mine/systemd/user")
+
+
+def test_a_unit_has_the_displays_that_are_named_and_no_others(tmp_path):
+    environment = {"DISPLAY": ":1", "XAUTHORITY": "", "WAYLAND_DISPLAY": "wayland $1", "HOME": "/"}
+    text = unit_text(tmp_path / "u", tmp_path / "b.toml", [], environment=environment)
+    named = [line for line in text.splitlines() if line.startswith("Environment=")]
+    assert named == ["Environment=DISPLAY=:1", 'Environment="WAYLAND_DISPLAY=wayland $$1"']
 
 
 @pytest.mark.parametrize(

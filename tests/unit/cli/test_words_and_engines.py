@@ -200,6 +200,10 @@ def test_the_angles_of_heads_are_said_pair_by_pair(
             "linear_arcsec": {"rms": 0.1, "max": 0.2}, "codes_arcsec": {"rms": 0.3, "max": 0.4},
         },
         {"heads": ["left", "up"], "fields": 0, "linear_arcsec": None, "codes_arcsec": None},
+        {
+            "heads": ["up", "left"], "fields": 1,
+            "linear_arcsec": {"rms": 0.1, "max": 0.2}, "codes_arcsec": None,
+        },
     ]  # fmt: skip
     twins = [SimpleNamespace(summary=lambda pair=pair: pair) for pair in pairs]
     asked = engine(twin_heads, "verify_heads", twins)
@@ -216,6 +220,7 @@ def test_the_angles_of_heads_are_said_pair_by_pair(
             "left to right 0.1000 / 0.2000 arcsec from linear light, 0.3000 / 0.4000 from codes"
             " (rms / max, 4 fields)",
             "left to up too few stars in both",
+            "up to left too few stars in both",
         ]
 
 

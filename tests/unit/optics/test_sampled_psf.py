@@ -4,6 +4,7 @@ fails.
 
 from __future__ import annotations
 
+import tracemalloc
 from itertools import product
 
 import numpy as np
@@ -322,3 +323,18 @@ def test_a_narrow_gaussian_is_drawn_by_error_functions_of_its_own_axes(rng):
     drawn = psf.drawn_stamps(fraction, rates, 7, psf.footprint_px)
     assert np.abs(drawn - psf.stamps(fraction.astype(float), rates, 7)).max() < 2e-6
     assert psf.variance_px2 == pytest.approx((0.09 + 1 / 12, 0.2025 + 1 / 12))
+
+
+def test_a_look_at_a_share_copies_no_table():
+    """A star of a thousand points is a thousand looks: by a copy each, seven seconds of a frame."""
+    psf = SampledPsf(sampled(airy(1.5), 4, 24), 4)
+    middle_px = np.zeros(1)
+    psf.shares(middle_px, middle_px)  # makes the table
+    tracemalloc.start()
+    try:
+        psf.shares(middle_px, middle_px)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    # a table of this footprint has 20 rows a px, of four bytes a share
+    assert peak_bytes < (20 * psf.footprint_px) ** 2 * 4 / 10

@@ -113,6 +113,8 @@ def test_a_moment_in_which_a_frame_stood_says_for_how_long():
     commanded = Commanded(t_s, scalar_first(turned(1e-4 * t_s)), held_s)
     at_s = np.array([0.45, 0.5, 0.6, 0.75, 1.2, 1.45, 1.6, 1.75])
     wanted_s = [0.0, 0.2, 0.2, 0.0, 0.4, 0.0, 0.1, 0.0]
+    # until the next frame is there
+    assert commanded.at(held_s[:, 1]).held_s == pytest.approx([0.2, 0.4, 0.1])
     assert commanded.at(at_s).held_s == pytest.approx(wanted_s)
     # seen from 0.12 s away the first two are one
     wide = commanded.over_exposures(0.12)

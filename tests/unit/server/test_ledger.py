@@ -43,6 +43,7 @@ from hilstar.server.record.ledger_records import (
     FaultRecord,
     FrameRecord,
     drawable_frames,
+    run_blocks,
 )
 from hilstar.server.record.run_figures import RunFigures, figures_of, summarise
 from tests.support.full_disk import files_of_at_most
@@ -536,15 +537,28 @@ def test_a_small_file_that_unpacks_to_a_large_one_is_refused(tmp_path, claimed, 
         read_log(path)
 
 
-def test_an_mcap_without_attitudes_lists_its_topics(tmp_path):
+TOPICS = [f"/{letter}" for letter in "abcdefghijklm"]
+
+
+@pytest.mark.parametrize(
+    ("topics", "listed"),
+    [
+        (["/imu"], "/imu"),
+        (["/imu", "/gps"], "/gps, /imu"),
+        (TOPICS[:12], ", ".join(TOPICS[:12])),
+        (TOPICS, f"{', '.join(TOPICS[:12])}, ..."),
+    ],
+)
+def test_an_mcap_without_attitudes_lists_its_topics(tmp_path, topics, listed):
     file = io.BytesIO()
     writer = Writer(file)
     writer.start(library="test")
-    for topic in ("/imu", "/gps"):
+    for topic in topics:
         writer.add_message(writer.register_channel(topic, "json", 0), 1, b"{}", 1)
     writer.finish()
     (tmp_path / "other.mcap").write_bytes(file.getvalue())
-    assert "its topics are /gps, /imu" in refusal(read_log, tmp_path / "other.mcap")
+    line = refusal(read_log, tmp_path / "other.mcap")
+    assert f"contains no attitude; its topics are {listed}, and only " in line
 
 
 @pytest.mark.parametrize(
@@ -554,6 +568,9 @@ def test_an_mcap_without_attitudes_lists_its_topics(tmp_path):
         ({"rate": [1e9, 0, 0]}, "rate"),
         ({"swap_ns": -5}, "Expected"),
         ({"t_ns": 2**70}, "Expected|range"),
+        ({"velocity_km_s": [2e5, 0, 2.5e5]}, "a velocity over"),
+        ({"place_km": [300, 0, 400]}, "a place beyond"),
+        ({"place_km": [0, 3e9, 4e9]}, "a place beyond"),
     ],
 )
 def test_a_frame_that_the_wire_would_refuse_is_refused_with_its_number(tmp_path, wrong, word):
@@ -561,6 +578,13 @@ def test_a_frame_that_the_wire_would_refuse_is_refused_with_its_number(tmp_path,
     path = frames_file(tmp_path, [form, form | wrong])
     with pytest.raises(InputError, match=f"run.mcap: message 2.*{word}"):
         list(drawable_frames(path))
+
+
+def test_records_come_in_blocks_of_the_size_that_is_asked_for(tmp_path):
+    form = {"t_ns": 1, "light_ns": 1, "draw_ns": 1, "swap_ns": 2}
+    path = frames_file(tmp_path, [form | {"frame": number} for number in range(5)])
+    blocks = [[record.frame for record in block] for block in run_blocks(path, 2)]
+    assert blocks == [[0, 1], [2, 3], [4]]
 
 
 def frames_file(tmp_path, forms):

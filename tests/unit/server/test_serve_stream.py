@@ -10,7 +10,7 @@ import hilstar
 from hilstar.attitude import receiver
 from hilstar.attitude.clock.jumps import JumpFilter
 from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import AttitudeSample, Status, encode
+from hilstar.attitude.wire.packet import AttitudeSample, Status, TimeRequest, encode
 from hilstar.attitude.wire.source import PACKETS
 from hilstar.basics.process.scheduling import HOST_CLOCK
 from hilstar.basics.units import NS_PER_S
@@ -40,12 +40,16 @@ class Stream:
     def __init__(self) -> None:
         self.sequence = 0
         self.statuses: list[Status] = []
+        self.requests: list[TimeRequest] = []
+        self.is_silent = False
 
     def wait_for_message(self, timeout_ms: int) -> bool:
         return False
 
     def receive(self, timeout_ms: int) -> list[Arrival]:
         HOST_CLOCK.sleep(1e-3)
+        if self.is_silent:
+            return []
         host_ns = HOST_CLOCK.now_ns()
         self.sequence += 1
         q = np.array([0.5, 0.5, -0.5, 0.5])
@@ -55,6 +59,8 @@ class Stream:
     def send(self, packet: object) -> None:
         if isinstance(packet, Status):
             self.statuses.append(packet)
+        elif isinstance(packet, TimeRequest):
+            self.requests.append(packet)
 
     def wire_ns(self, packet: object) -> int:
         return 0
@@ -101,3 +107,34 @@ def test_frames_are_recorded_and_told_at_the_sender_s_time_after_a_jump(tmp_path
     light_ns = {record.frame: record.light_ns for record in records}
     for status in link.statuses:
         assert status.light_t_ns == light_ns[status.frame]
+
+
+STALE_AFTER_MS = 40
+
+
+def test_once_frames_begin_the_clock_is_asked_and_a_sender_that_falls_silent_is_counted(tmp_path):
+    """One silence of the sender is one stale event, however many frames it lasts."""
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH + f"[attitude]\nstale_after_ms = {STALE_AFTER_MS}\n")
+    link = Stream()
+    seen: list[Shown] = []
+
+    def see(shown: Shown) -> None:
+        seen.append(shown)
+        if len(seen) == 1:
+            # nobody is asked before the frames begin
+            wait_for(lambda: link.requests, "a time request", poll_s=1e-3)
+            link.is_silent = True
+            silent_ns = HOST_CLOCK.now_ns()
+            wait_for(
+                lambda: HOST_CLOCK.now_ns() - silent_ns > 2e6 * STALE_AFTER_MS,
+                "an attitude that is too old",
+                poll_s=1e-3,
+            )
+
+    with hilstar.load(path) as bench:
+        summary = serve(bench, link, Limit(frames=FRAMES, from_first_attitude=True), see)
+    assert [shown.stale for shown in seen[1:]] == [True] * (FRAMES - 1)
+    assert summary.stale_events == 1
+    assert summary.clock.mode == "one-way"
+    assert summary.receive_latency_ms is not None

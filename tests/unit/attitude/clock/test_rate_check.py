@@ -7,6 +7,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hilstar.attitude.clock.rate_causes import (
     LAG_STEPS_S,
     OFTEN_OFF,
     OTHER_AXES,
+    LagFit,
     ReadAs,
     Stretch,
     cause_of,
@@ -45,6 +47,7 @@ Q_NOISE_RAD, RATE_NOISE_RAD_S = 30 * ARCSEC, math.radians(0.1)
 TOLD_WITHIN_S = 1.0  # at 20 Hz and more, as the bench file's page says; some tens of packets below
 HONEST_STREAMS = 60
 TURN = np.radians([0.2, -0.35, 0.5])
+AT_REST = np.zeros(3)
 OTHER_FRAME = np.array([[0.6, 0.0, -0.8], [0.0, 1.0, 0.0], [0.8, 0.0, 0.6]])
 
 
@@ -257,10 +260,33 @@ def test_rates_that_become_right_are_believed_again():
 def test_packets_that_leave_rates_out_end_it_too():
     t_ns, q, rates = steady()
     stream = samples(t_ns, q, -rates)
-    stream += [
-        AttitudeSample(int(t_ns[-1] + (k + 1) * NS_PER_S // 100), q[-1], None, k) for k in range(30)
+    without = [
+        AttitudeSample(int(t_ns[-1] + (k + 1) * NS_PER_S // 100), q[-1], None, k) for k in range(20)
     ]
-    assert [kind for kind, _ in watched(stream)[1]] == [WRONG, RIGHT]
+    assert [kind for kind, _ in watched([*stream, *without[:19]])[1]] == [WRONG]
+    _, told, _ = watched([*stream, *without])
+    assert [kind for kind, _ in told] == [WRONG, RIGHT]
+    assert told[1][1] == "the packets carry no rates any more"
+
+
+def test_of_wrong_rates_the_acceleration_is_not_used_either():
+    t_ns, q, rates = steady()
+    stream = samples(t_ns, q, -rates)
+    last = replace(stream[-1], acceleration_cam_rad_s2=np.array([0.1, 0.0, 0.0]))
+    check, _, _ = watched([*stream[:-1], last])
+    believed = check.believed(last)
+    assert (believed.rate_cam_rad_s, believed.acceleration_cam_rad_s2) == (None, None)
+    assert (believed.t_ns, believed.sequence) == (last.t_ns, last.sequence)
+
+
+@pytest.mark.parametrize("back_s", [1.0, 50.0])
+def test_a_sender_that_starts_anew_is_checked_anew(back_s):
+    """Its rates were right, and are not after its clock has gone back."""
+    t_ns, q, rates = steady(hz=50.0, seconds=1.5)
+    begun = samples(t_ns + 100 * NS_PER_S, q, rates)
+    anew_ns = begun[-1].t_ns - round(back_s * NS_PER_S)
+    anew = samples(t_ns + anew_ns, q, -rates)
+    assert [kind for kind, _ in watched([*begun, *anew])[1]] == [WRONG]
 
 
 def test_warn_believes_the_rate_and_off_does_not_look():
@@ -377,7 +403,8 @@ def test_rates_that_are_renewed_once_in_a_second_are_wrong_though_no_lag_explain
 
 
 def test_rates_that_are_late_no_more_are_believed_again():
-    late, right = swing(0.2), swing(0.0, seconds=15.0)
+    # the last four seconds count: the ten before them do not outweigh eight right ones
+    late, right = swing(0.2, 50), swing(0.0, 50, seconds=8.0)
     later = [
         AttitudeSample(s.t_ns + 10 * NS_PER_S, s.q_icrs_to_cam, s.rate_cam_rad_s, s.sequence + 1000)
         for s in right
@@ -465,24 +492,40 @@ SIGNED_AXES = [
 ]
 
 
+def stretches_of(
+    turns: FloatArray, sent: np.ndarray, constant: FloatArray = AT_REST, hz: int = 40
+) -> list[Stretch]:
+    """A second of each of the turns (n, 3), rad/s; the rates that are sent are `sent` (3, 3) by the
+    camera's own, and a constant.
+    """
+    stretches = []
+    q = from_radec_roll_deg(84.0, -1.2, 10.0)
+    for second, rate in enumerate(turns):
+        samples = []
+        for k in range(hz):
+            t_ns = second * NS_PER_S + k * NS_PER_S // hz
+            sample = AttitudeSample(t_ns, propagate(q, rate, k / hz), sent @ rate + constant, k)
+            samples.append(sample)
+        q = samples[-1].q_icrs_to_cam
+        stretch = stretch_of(samples)
+        assert stretch is not None
+        stretches.append(stretch)
+    return stretches
+
+
+def about_any_axis(count: int, turn_deg_s: float, rng: np.random.Generator) -> FloatArray:
+    """Turns (count, 3), rad/s, each about another axis."""
+    axes = rng.normal(size=(count, 3))
+    return np.radians(turn_deg_s) * axes / np.linalg.norm(axes, axis=1, keepdims=True)
+
+
 def turning(sent: np.ndarray, rng: np.random.Generator) -> list[Stretch]:
     """Five seconds of 40 Hz, each about another axis at 4 deg/s; `sent` (3, 3) makes the rates that
     are sent of the camera's own.
     """
-    stretches = []
-    q = from_radec_roll_deg(84.0, -1.2, 10.0)
-    for second in range(5):
-        rate = rng.normal(size=3)
-        rate *= np.radians(4.0) / np.linalg.norm(rate)
-        samples = []
-        for k in range(40):
-            t_ns = second * NS_PER_S + k * NS_PER_S // 40
-            samples.append(AttitudeSample(t_ns, propagate(q, rate, k / 40), sent @ rate, k))
-        q = samples[-1].q_icrs_to_cam
-        stretch = stretch_of(samples)
-        assert stretch is not None
+    stretches = stretches_of(about_any_axis(5, 4.0, rng), sent)
+    for stretch in stretches:
         stretch.is_off = True
-        stretches.append(stretch)
     return stretches
 
 
@@ -533,3 +576,131 @@ def test_rates_in_icrs_are_named_with_their_unit(size, rng):
     assert cause_of(stretches, 1.0).text == (
         f"they have ICRS components{words}; send the camera's, rad/s"
     )
+
+
+# What 1 rad/s is in each unit, by hand: 360 deg are 2 pi rad, and a revolution; a minute has 60 s.
+RAD_S_IN = {
+    "deg/s": 57.29577951,
+    "arcsec/s": 206_264.8062,
+    "mrad/s": 1000.0,
+    "rad/ms": 0.001,
+    "rpm": 9.549296586,
+    "revolutions/s": 0.1591549431,
+    "rad/s times pi/180": 0.01745329252,
+}
+
+
+@pytest.mark.parametrize("unit", RAD_S_IN)
+def test_every_unit_is_named_with_how_its_rates_and_their_noise_are_mended(unit, rng):
+    size = RAD_S_IN[unit]
+    # a step of 40 Hz at 0.015 deg/s in arcsec/s is 1.35 rad, less than half a turn
+    turn_deg_s = 0.015 if size > 1e4 else 2.0
+    stretches = stretches_of(about_any_axis(4, turn_deg_s, rng), size * np.eye(3))
+    cause = cause_of(stretches, 1.0)
+    assert cause is not None and cause.text == f"they are in {unit}; send rad/s"
+    assert cause.mends * size == pytest.approx(np.eye(3), abs=1e-9)
+    assert cause.scale * size == pytest.approx(1.0, abs=1e-9)
+    assert (cause.kind, cause.lag_s, cause.constant, cause.in_icrs) == (WRONG, 0.0, None, False)
+
+
+def test_a_factor_and_a_frame_without_a_name_are_told_with_what_mends_them(rng):
+    turns = about_any_axis(6, 4.0, rng)
+    cause = cause_of(stretches_of(turns, 1.6 * np.eye(3)), 1.0, others=())
+    assert cause.text == "they are 1.6 times the quaternions' own turn"
+    assert cause.mends * 1.6 == pytest.approx(np.eye(3), abs=1e-9)
+    for unit, size in (("", 1.0), (", and in deg/s", 180 / math.pi)):
+        cause = cause_of(stretches_of(turns, size * OTHER_FRAME), 1.0, others=())
+        assert cause.text == (
+            f"they are of another frame than the camera's, such as the body's{unit}"
+        )
+        # the rotation back
+        assert cause.mends * size == pytest.approx(OTHER_FRAME.T, abs=1e-9)
+        assert cause.scale * size == pytest.approx(1.0, abs=1e-9)
+    # fewer stretches than six do not tell a free number from chance
+    assert cause_of(stretches_of(turns[:5], 1.6 * np.eye(3)), 1.0, others=()) is None
+
+
+def test_rates_of_a_left_handed_frame_are_of_no_other_frame(rng):
+    mirrored = OTHER_FRAME @ np.diag([1.0, 1.0, -1.0])
+    cause = cause_of(stretches_of(about_any_axis(6, 4.0, rng), mirrored), 1.0, others=())
+    assert cause is None or "another frame" not in cause.text
+
+
+def test_a_constant_is_named_in_degrees_about_each_axis(rng):
+    constant = np.radians([0.4, -0.3, 0.6])
+    turns = about_any_axis(12, 1.0, rng)
+    stretches = stretches_of(turns, np.eye(3), constant)
+    cause = cause_of(stretches, 1.0, others=())
+    assert cause.text == "a constant (0.4, -0.3, 0.6) deg/s is added to them"
+    assert cause.constant == pytest.approx(constant, abs=1e-9)
+    assert max(cause.error(stretch) for stretch in stretches) < 1e-9
+
+
+@pytest.mark.parametrize("signs", [(1, 1, 1, 1), (1, -1, 1, -1)])
+def test_zeros_are_left_out_where_the_camera_turns_and_not_where_it_shakes(signs):
+    turns = np.array(signs)[:, None] * TURN
+    cause = cause_of(stretches_of(turns, np.zeros((3, 3))), 1.0, others=())
+    if sum(signs):
+        assert cause is not None and cause.text == "they are zero; leave them out"
+    else:
+        assert cause is None
+
+
+@pytest.mark.parametrize(("turn_deg_s", "turns"), [(0.0099, False), (0.0101, True)])
+def test_a_hundredth_of_a_degree_a_second_counts_as_rest(turn_deg_s, turns):
+    (slow,) = stretches_of(np.radians([[0.0, turn_deg_s, 0.0]]), 100 * np.eye(3))
+    assert slow.turns == turns
+    assert slow.is_off == turns
+
+
+@pytest.mark.parametrize(
+    ("lag_s", "text"),
+    [
+        (0.2, "200 ms late"),
+        (-0.034, "34 ms early"),
+        (0.49, "490 ms late"),
+        (0.492, "492 ms late or more"),
+        (-0.5, "500 ms early or more"),
+    ],
+)
+def test_a_lag_in_words_says_where_it_may_be_longer_than_those_tried(lag_s, text):
+    assert LagFit(0.1, 0.1, is_off=True, lag_s=lag_s).lag_text == text
+
+
+def swung_stretches(
+    pulsation_rad_s: float,
+    late_s: float,
+    rng: np.random.Generator | None = None,
+    q_noise_rad: float = 0.0,
+    rate_noise_rad_s: float = 0.0,
+) -> list[Stretch]:
+    """A swing about x, in stretches of 0.1 s over 4.2 s, with rates of `late_s` before."""
+    at_s = np.arange(0, 4.2, 0.02)
+    axis = np.array([1.0, 0.0, 0.0])
+    angle_rad = 0.37 / pulsation_rad_s * np.sin(pulsation_rad_s * at_s)
+    q = multiply(from_rotation_vectors(-angle_rad[:, None] * axis), START)
+    rates = 0.37 * np.cos(pulsation_rad_s * (at_s - late_s))[:, None] * axis
+    if rng is not None:
+        q = multiply(from_rotation_vectors(rng.normal(0, q_noise_rad, (len(q), 3))), q)
+        rates = rates + rng.normal(0, rate_noise_rad_s, rates.shape)
+    sent = samples(np.rint(at_s * 1e9).astype(int), q, rates)
+    stretches = [stretch_of(sent[k : k + 6]) for k in range(0, len(sent) - 6, 5)]
+    return [stretch for stretch in stretches if stretch is not None]
+
+
+@pytest.mark.parametrize("late_s", [-0.12, 0.12])
+def test_of_lags_a_period_apart_the_shortest_is_named(late_s):
+    """A swing of 0.6 s: 0.12 s late is 0.48 s early, too."""
+    lag = lag_of(swung_stretches(math.tau / 0.6, late_s))
+    assert lag is not None and lag.is_off
+    assert lag.lag_s == pytest.approx(late_s, abs=LAG_STEPS_S[1])
+
+
+@pytest.mark.parametrize(
+    "noise", [{"rate_noise_rad_s": 0.3}, {"q_noise_rad": 0.012}], ids=["rates", "quaternions"]
+)
+def test_an_error_within_the_noise_of_rates_or_of_quaternions_is_no_lag(noise, rng):
+    lag = lag_of(swung_stretches(3.7, 0.0, rng, **noise))
+    # over a fifth of the turn, which is 0.3 rad/s
+    assert lag is not None and lag.off_rad_s > 0.06
+    assert not lag.is_off and lag.lag_s == 0.0

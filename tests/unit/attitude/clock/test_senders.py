@@ -11,7 +11,7 @@ import pytest
 from hilstar.attitude.clock.senders import ESTABLISHED_AFTER, MIN_RUN, OTHER_LIFE_NS, Senders
 from hilstar.attitude.clock.stages import StreamState
 from hilstar.attitude.wire.links import Arrival, SampleArrival
-from hilstar.attitude.wire.packet import U32, AttitudeSample
+from hilstar.attitude.wire.packet import U32, AttitudeSample, encode
 from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
@@ -200,15 +200,104 @@ def test_a_second_counter_is_told_after_a_run_and_once_the_first_has_gone_on():
     assert shown.sequences == list(range(300 + MIN_RUN))
 
 
-def test_a_restart_is_held_for_three_usual_silences_and_20_ms_and_released_in_order():
-    shown = Shown().run(300)
-    restarted_ns = HOST0_NS + 300 * PERIOD_NS
+@pytest.mark.parametrize("paused_ns", [0, 100 * NS_PER_MS])
+def test_a_restart_is_held_for_three_usual_silences_and_20_ms_and_released_in_order(paused_ns):
+    """A pause of 100 ms is no usual silence any more after 400 messages (0.98^400 is 3e-4)."""
+    shown = Shown().run(20)
+    begun_ns = HOST0_NS + 20 * PERIOD_NS + paused_ns
+    for k in range(400):
+        shown.take(sample_message(20 + k, begun_ns + k * PERIOD_NS))
+    restarted_ns = begun_ns + 400 * PERIOD_NS
     for k in range(6):
         shown.take(sample_message(k, restarted_ns + k * PERIOD_NS))
-    assert shown.sequences == list(range(300))
+    assert shown.sequences == list(range(420))
     shown.take(sample_message(6, restarted_ns + 6 * PERIOD_NS + 1))
-    assert shown.sequences == [*range(300), *range(7)]
+    assert shown.sequences == [*range(420), *range(7)]
     assert shown.refused == []
+
+
+def test_of_a_sender_that_was_heard_for_less_than_a_second_no_silence_is_usual_yet():
+    shown = Shown().run(100)
+    last_ns = HOST0_NS + 99 * PERIOD_NS
+    restart = [last_ns + (k + 1) * PERIOD_NS for k in range(12)]
+    for k, host_ns in enumerate(restart):
+        shown.take(sample_message(k, host_ns))
+    assert shown.expire(last_ns + STALE_AFTER_NS).sequences == list(range(100))
+    assert shown.expire(last_ns + STALE_AFTER_NS + 1).sequences == [*range(100), *range(12)]
+
+
+def test_the_count_goes_on_from_its_largest_to_0_without_waiting():
+    shown = Shown()
+    counts = [(U32 - 30 + k) % U32 for k in range(60)]
+    for k, count in enumerate(counts):
+        shown.take(sample_message(count, HOST0_NS + k * PERIOD_NS))
+        assert len(shown.arrivals) == k + 1
+    assert shown.sequences == counts and not shown.refused
+
+
+@pytest.mark.parametrize("count", [ESTABLISHED_AFTER - 2, ESTABLISHED_AFTER - 1])
+def test_a_counter_decides_alone_from_its_eighth_message_on(count):
+    """A stray message waits for one of the counter; at its eighth message it is refused."""
+    shown = Shown().run(count)
+    stray_ns = HOST0_NS + count * PERIOD_NS - PERIOD_NS // 2
+    shown.take(sample_message(90_000, stray_ns, q=LYRA)).run(1, first=count)
+    is_eighth = count + 1 == ESTABLISHED_AFTER
+    assert shown.refused == [(90_000, "source")] * is_eighth
+    assert shown.sequences == list(range(count + is_eighth))
+
+
+def test_messages_that_waited_in_a_queue_are_one_sender_s_though_most_of_it_was_lost():
+    """Twenty come at once after 300 ms, of which the queue has dropped all but every fifth."""
+    shown = Shown().run(40)
+    late_ns = HOST0_NS + 40 * PERIOD_NS + 300 * NS_PER_MS
+    counts = [40, 60, 61, 85]
+    for count in counts:
+        shown.take(sample_message(count, HOST0_NS + count * PERIOD_NS, late_ns))
+    assert shown.sequences == [*range(40), *counts] and not shown.refused
+
+
+def test_one_long_step_is_not_the_period():
+    """After a pause of 40 ms ten packets are lost at the usual 5 ms each."""
+    shown = Shown().run(40)
+    paused_ns = HOST0_NS + 39 * PERIOD_NS + 40 * NS_PER_MS
+    shown.take(sample_message(40, paused_ns))
+    shown.take(sample_message(51, paused_ns + 11 * PERIOD_NS))
+    assert shown.sequences == [*range(41), 51]
+
+
+def repeated(shown: Shown, count: int, host_ns: int, times: int, sequence_step: int = 0) -> None:
+    """A packet with the same t_ns again and again, each 40 ms, after the counter's newest."""
+    for k in range(1, times + 1):
+        sample = AttitudeSample(
+            HOST0_NS + count * PERIOD_NS, ORION, None, count + k * sequence_step
+        )
+        now_ns = host_ns + k * 40 * NS_PER_MS
+        shown.take(Arrival(now_ns, sample, encode(sample)))
+
+
+@pytest.mark.parametrize(
+    ("sequence_step", "what"),
+    [(0, "the sender repeats one packet"), (1, "the sender's clock has stopped at t_ns {t_ns}")],
+)
+def test_a_sender_that_hangs_is_told_after_ten_repeats_in_a_row(sequence_step, what):
+    shown, last_ns = Shown(), HOST0_NS + 20 * PERIOD_NS
+    for k in range(21):
+        sample = AttitudeSample(HOST0_NS + k * PERIOD_NS, ORION, None, k)
+        shown.take(Arrival(sample.t_ns, sample, encode(sample)))
+    # nine, and it runs again: what follows begins to count anew
+    repeated(shown, 20, last_ns, 9, sequence_step)
+    again = AttitudeSample(HOST0_NS + 21 * PERIOD_NS, ORION, None, 21)
+    again_ns = last_ns + 9 * 40 * NS_PER_MS + PERIOD_NS
+    shown.take(Arrival(again_ns, again, encode(again)))
+    repeated(shown, 21, again_ns, 9, sequence_step)
+    assert shown.notices.counts() == {}
+    repeated(shown, 21, again_ns + 9 * 40 * NS_PER_MS, 1, sequence_step)
+    assert shown.notices.counts() == {"source-frozen": 1}
+    said = what.format(t_ns=again.t_ns)
+    assert shown.notices.lasting["source-frozen"] == (
+        f"{said}: refused (time), and the attitude shown is getting old"
+    )
+    assert len(shown.refused) == 19 and {reason for _, reason in shown.refused} == {"time"}
 
 
 def test_two_messages_that_nothing_follows_are_shown_when_the_first_sender_is_stale():

@@ -107,6 +107,32 @@ def test_a_mounting_where_the_file_says_the_cameras_is_refused(tmp_path):
     assert not dict(open_log(path, Stated(Mounting(MOUNTING))).told)
 
 
+@pytest.mark.parametrize(
+    ("reference", "is_told"),
+    [("ECI", True), ("Inertial", True), ("eci_j2000", True), ("J2000", False), ("icrs", False)],
+)
+def test_a_reference_that_only_simulators_call_inertial_is_told(tmp_path, reference, is_told):
+    log = open_log(FILES["CSV"].make(tmp_path), Stated(reference=reference))
+    line = f"the frame '{reference}' is taken as the ICRS; a frame of date is 0.4 deg off by now"
+    assert [text for kind, text in log.told if kind == "reference"] == [line] * is_told
+    assert np.array_equal([sample.q_icrs_to_cam for sample in log.samples], QUATERNIONS)
+
+
+@pytest.mark.parametrize("reference", [None, "ned"])
+def test_attitudes_that_were_not_set_at_the_beginning_are_counted_in_any_frame(tmp_path, reference):
+    path = tmp_path / "a.csv"
+    rows = ["t_s,qw,qx,qy,qz", "1,nan,nan,nan,nan", "2,0,0,0,0", "3,1,0,0,0", "4,1,0,0,0"]
+    path.write_text("\n".join([*rows, ""]))
+    stated = Stated()
+    if reference is not None:
+        stated = Stated(
+            reference=reference, place=(47.0, 8.0, 0.0), epoch_utc=STATEMENTS["epoch_utc"]
+        )
+    log = open_log(path, stated)
+    assert [sample.t_ns for sample in log.samples] == [3 * 10**9, 4 * 10**9]
+    assert dict(log.told)["log-start"].startswith("2 attitudes are left out at the beginning: ")
+
+
 def test_what_a_bench_file_says_of_packets_is_not_done_to_a_ledger_again(tmp_path):
     path = ledger(tmp_path)
     other = Convention(scalar="last", direction="cam_to_icrs", frame="body")

@@ -121,11 +121,21 @@ def test_times_are_of_the_epoch_and_the_format(stk_log, keywords, times, since_s
     assert [sample.t_ns - EPOCH_NS for sample in found.samples] == [int(s * 1e9) for s in since_s]
 
 
-def test_without_an_epoch_times_are_no_dates(stk_log):
-    undated = stk_log(["1 0 0 0 1", "2 0 0 0 1"], ScenarioEpoch=None)
-    assert [sample.t_ns for sample in undated.samples] == [10**9, 2 * 10**9]
+@pytest.mark.parametrize(("unit", "seconds"), [(None, 1), ("EpMin", 60), ("EpDay", 86_400)])
+def test_without_an_epoch_times_are_no_dates(stk_log, unit, seconds):
+    rows = ["1 0 0 0 1", "2 0 0 0 1"]
+    undated = stk_log(rows, ScenarioEpoch=None, TimeFormat=unit)
+    assert [sample.t_ns for sample in undated.samples] == [seconds * 10**9, 2 * seconds * 10**9]
     assert undated.conventions.scale is None
-    assert "states no ScenarioEpoch" in dict(undated.told)["log-times"]
+    no_date = "seconds of the file, no dates: it states no ScenarioEpoch"
+    assert dict(undated.told)["log-times"] == f"its times are {no_date}"
+    assert undated.conventions.time == no_date
+
+
+def test_what_follows_a_hash_is_a_comment_wherever_it_stands(stk_log):
+    rows = ["# all of it", "1 0 0 0 1 # a row's end", "  # 2 0 0 0 1", "3 0 0 0 1#4"]
+    commented = stk_log(rows, CoordinateAxes="ICRF # the axes")
+    assert [sample.t_ns - EPOCH_NS for sample in commented.samples] == [10**9, 3 * 10**9]
 
 
 ROWS = [f"{k} 0 0 0 1" for k in range(3)]

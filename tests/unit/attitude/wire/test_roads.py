@@ -28,7 +28,14 @@ from hilstar.attitude.wire.apart import (
 from hilstar.attitude.wire.apart_child import Wire, _ForwardedNotices, _Reading, as_read
 from hilstar.attitude.wire.endpoint import AllowedSenders, UdpPlace
 from hilstar.attitude.wire.file_road import FileRoad, refuse_no_file
-from hilstar.attitude.wire.roads import ANSWERS, MAX_READ_BYTES, ByteRoad, RawMessage
+from hilstar.attitude.wire.roads import (
+    ANSWERS,
+    MAX_READ_BYTES,
+    ByteRoad,
+    LinkCounts,
+    RawMessage,
+    read_device,
+)
 from hilstar.attitude.wire.serial_link import SerialRoad
 from hilstar.attitude.wire.tcp import ACCEPT_EACH_S, TOLD_S, TcpRoad
 from hilstar.attitude.wire.udp import UdpRoad
@@ -312,7 +319,7 @@ def test_a_path_that_names_nothing_yet_and_then_a_device_is_not_opened(tmp_path)
 def test_a_road_that_is_lost_is_tried_at_growing_intervals_and_told_as_its_user_s(tmp_path, kind):
     """A read that opens it brings nothing, and none waits for longer than it may."""
     clock, notices = FakeClock(), Notices()
-    with lost_road(kind, tmp_path, clock, notices) as (road, bring_back):
+    with lost_road(kind, tmp_path, clock, notices) as (road, bring_back, lose):
         assert road.link_counts.lost == 1 and notices.counts() == {"answers-lost": 1}
         tries_ns: list[int] = []
         opens = road._open if isinstance(road, SerialRoad) else road._connect
@@ -337,13 +344,34 @@ def test_a_road_that_is_lost_is_tried_at_growing_intervals_and_told_as_its_user_
         assert (road.reconnects, road.link_counts.lost) == (1, 1)
         assert notices.counts() == {"answers-lost": 1, "answers-back": 1}
         assert road.put(b"?")
+        lose()
+        wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost == 2, "another loss")
+        tries_ns.clear()
+        lost_ns = clock.now_ns()
+        while not tries_ns:
+            road.taken(SOON_MS)
+        assert tries_ns[0] - lost_ns == pytest.approx(0.05e9, abs=1e6)  # as soon as the first time
+
+
+def test_a_device_that_is_readable_and_brings_nothing_has_gone():
+    reading, writing = os.pipe()
+    try:
+        assert read_device(reading, 0) == []
+        os.write(writing, b"some")
+        assert [chunk.parts for chunk in read_device(reading, 0)] == [[b"some"]]
+        os.close(writing)
+        with pytest.raises(OSError, match="it was readable, and nothing came") as gone:
+            read_device(reading, 0)
+        assert gone.value.errno == errno.EIO
+    finally:
+        os.close(reading)
 
 
 @contextlib.contextmanager
 def lost_road(
     kind: str, folder: Path, clock: FakeClock, notices: Notices
-) -> Iterator[tuple[SerialRoad | TcpRoad, Callable[[], None]]]:
-    """A road to a tracker that has gone, and what brings the tracker back."""
+) -> Iterator[tuple[SerialRoad | TcpRoad, Callable[[], None], Callable[[], object]]]:
+    """A road to a tracker that has gone, what brings the tracker back, and what takes it away."""
     with contextlib.ExitStack() as stack:
         if kind == "serial":
             far = SerialFar(folder)
@@ -351,8 +379,7 @@ def lost_road(
             stack.enter_context(road)
             far.vanish()
             wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost, "the loss")
-            yield road, far.come
-            far.vanish()
+            yield road, far.come, far.vanish
             return
         with socket.create_server(("127.0.0.1", 0)) as server:
             place = ("127.0.0.1", server.getsockname()[1])
@@ -362,10 +389,16 @@ def lost_road(
             server.accept()[0].close()
             wait_for(lambda: not road.taken(SOON_MS) and road.link_counts.lost, "the loss")
 
-        def come_back() -> None:
-            stack.enter_context(socket.create_server(place))
+        servers: list[socket.socket] = []
 
-        yield road, come_back
+        def come_back() -> None:
+            servers.append(stack.enter_context(socket.create_server(place)))
+
+        def go_away() -> None:
+            connection, _ = servers[0].accept()
+            connection.close()
+
+        yield road, come_back, go_away
 
 
 def test_a_port_that_is_lost_at_a_write_is_let_go_by_the_process_that_reads_it(
@@ -579,6 +612,78 @@ def test_what_the_reader_counts_comes_once():
             with contextlib.suppress(BlockingIOError):
                 grown += RecordStream().feed(ours.recv(9999))
     assert [(one.counts.lost, one.counts.flooded) for one in grown] == [(1, 0), (0, 5), (1, 4)]
+
+
+def records_at(ours: socket.socket) -> list[Record]:
+    """What has been handed over by now."""
+    return list(RecordStream().feed(ours.recv(1 << 16)))
+
+
+def test_what_the_reader_is_told_is_handed_over_after_its_counts_and_lasts_or_not():
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        notices = _ForwardedNotices(Wire(theirs), 3)
+        notices.link_counts.lost = 2
+        notices.tell("lost", "it is away", "a sender")
+        notices.mention("connected", "it is here")
+        handed = records_at(ours)
+    assert [(one.order, one.notice, one.lasting) for one in handed] == [
+        (3, None, True),
+        (3, ("lost", "it is away", "a sender"), True),
+        (3, ("connected", "it is here", ""), False),
+    ]
+    assert handed[0].counts == LinkCounts(lost=2)
+    told = Notices()
+    assert [one.told_to(told) for one in handed] == [False, True, True]
+    assert (told.latest("lost"), told.latest("connected")) == ("it is away", "")
+
+
+def test_of_several_orders_the_newest_is_carried_out_with_its_device():
+    reader = ReaderProcess(Notices(), module="__hello__")
+    ours, theirs = socket.socketpair()
+    reading, writing = os.pipe()
+    with ours, theirs:
+        assert reader._wire is not None
+        reader._wire.close()
+        reader._wire = ours
+        wire = Wire(theirs)
+        assert wire.order(0) is None
+        reader.read()
+        reader.read(runs_user_code=True)
+        assert wire.order(1000) == (ReadOrder(2, runs_user_code=True), None)
+        reader.read(device=reading)
+        order, file = wire.order(1000)
+        assert order == ReadOrder(3, device=True)
+        assert file not in (None, reading)
+        os.write(writing, b"the device")
+        assert os.read(file, 100) == b"the device"
+        os.close(file)
+        reader._wire = None
+        ours.close()
+        with pytest.raises(EOFError):
+            wire.order(1000)
+    os.close(reading)
+    os.close(writing)
+    reader.close()
+
+
+def test_a_device_that_has_gone_is_said_and_let_go():
+    ours, theirs = socket.socketpair()
+    reading, writing = os.pipe()
+    with ours, theirs:
+        under_way = _Reading(Wire(theirs), ReadOrder(4, device=True), reading)
+        os.write(writing, b"a")
+        under_way.hand_over(under_way.link)
+        os.close(writing)
+        under_way.hand_over(under_way.link)
+        came, gone = records_at(ours)
+    assert (came.order, came.message.parts, came.gone) == (4, [b"a"], None)
+    # the bytes may have come at any time before they were looked for
+    assert not came.message.timely and came.message.empty_ns == 0
+    assert (gone.order, gone.message, gone.gone) == (4, None, "it was readable, and nothing came")
+    assert under_way.link is None
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(reading)
 
 
 def test_a_file_that_is_never_read_to_its_end_does_not_hide_the_one_in_its_place(tmp_path):

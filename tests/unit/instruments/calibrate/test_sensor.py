@@ -251,6 +251,49 @@ def test_the_command_takes_its_darks_up_to_the_next_option(tmp_path, monkeypatch
         assert not Path("other.toml").exists()
 
 
+def test_an_import_tells_what_it_wrote_and_what_it_passed_over(tmp_path, monkeypatch):
+    """The charts that `write_sensor` draws beside its tables are held by other tests."""
+    monkeypatch.chdir(tmp_path)
+    Path("sheet.csv").write_text("quantity,value,unit\nK,0.25,DN/e-\nsigma_d,2.5,e-\nspeed,3,m/s\n")
+    sources = []
+
+    def write(output, _, source):
+        sources.append(source)
+        return [output, Path("curves.png")]
+
+    monkeypatch.setattr(sensor, "write_sensor", write)
+    words = ("sensor", "import", "sheet.csv", "-o", "sensor.toml")
+    told = run_hilstar_here(*words)
+    assert told.returncode == 0, told.stderr
+    assert told.stdout.splitlines() == [
+        "gain_e_per_dn = 4",
+        "read_noise_e = 2.5",
+        "not used: speed",
+        "wrote sensor.toml, curves.png",
+    ]
+    assert sources == ["By hilstar sensor import from sheet.csv"]
+    assert json.loads(run_hilstar_here(*words, "--json").stdout) == {
+        "keys": {"gain_e_per_dn": 4.0, "read_noise_e": 2.5},
+        "sigmas": {},
+        "notes": ["not used: speed"],
+        "written": ["sensor.toml", "curves.png"],
+    }
+
+
+def test_a_measurement_tells_its_errors_apart_from_its_figures(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    paths = write_frames(tmp_path, SENSOR, LEVELS_E[:3], darks_s=(0.1,))
+    flats, darks = ([path.name for path in some] for some in paths)
+    monkeypatch.setattr(sensor, "write_sensor", lambda output, *_: [output])
+    words = ["sensor", "measure", *flats, "--darks", *darks, "-o", "sensor.toml"]
+    told = json.loads(run_hilstar_here(*words, "--json").stdout)
+    gain, error = told["keys"]["gain_e_per_dn"], told["sigmas"]["gain_e_per_dn"]
+    assert abs(gain - SENSOR.gain_e_per_dn) < SIGMAS * error < 0.1
+    refused = run_hilstar_here(*words[:-1], flats[0])
+    assert refused.returncode == 2
+    assert flats[0] in refused.stderr
+
+
 SPELLED = {
     "K,0.25,DN/e⁻\nσ_d,2.5,e⁻\nμ_e.sat,10.5,ke-\nη@530nm,62,%": {
         "gain_e_per_dn": 4,

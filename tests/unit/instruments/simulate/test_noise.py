@@ -599,3 +599,162 @@ def test_limits_by_magnitude_are_medians_of_fields_with_the_stars_up_to_each():
     for row, median in zip(rows, (9.0, 9.0, 9.0, 5.0), strict=True):
         for number, name in enumerate(noise.NEA_COLUMNS, start=1):
             assert row[name] == number * median
+
+
+def row_of(v_mag: float, factor: float, **changes: float) -> dict[str, float]:
+    """A row of noise.csv in which no two figures are alike."""
+    columns = [*noise.NOISE_COLUMNS, *(f"{kind}_px" for kind in noise.FAMILY)]
+    row = {"v_mag": v_mag}
+    for number, name in enumerate(columns, start=1):
+        row[name] = factor * number
+    return row | changes
+
+
+def nea_of(v_mag: float, stars: float, factor: float) -> dict[str, float]:
+    """A row of nea.csv in which no two figures are alike."""
+    row = {"v_mag": v_mag, "stars": stars}
+    for number, name in enumerate(noise.NEA_COLUMNS, start=1):
+        row[name] = factor * number
+    return row
+
+
+def spoken_budget(**changes: object) -> NoiseBudget:
+    """A budget of two magnitudes and channels, whose figures are all different."""
+    nea = [nea_of(5.0, 3.0, math.inf), nea_of(5.5, 4.0, 2.0), nea_of(6.0, 7.0, 1.5)]
+    plain: dict[str, object] = {
+        "threshold_sigma": 4.5,
+        "minimum_pixels": 3,
+        "background_e_per_px": 31.25,
+        "centroider": "fit",
+        "fields": 9,
+        "rows": [
+            row_of(5.0, 1.0, snr_r=2.5, snr_g=3.5, snr_b=1.5),
+            row_of(5.5, 0.5, snr_r=1.25, snr_g=1.75, snr_b=0.75, fit_px=math.nan),
+        ],
+        "stars": None,
+        "nea": nea,
+        "nea_arcsec": noise._by_way(nea[-1]),
+        "channels": {
+            "r": {"star_share": 0.25, "background_e_per_px": 40.0},
+            "g": {"star_share": 0.5, "background_e_per_px": 30.0},
+        },
+        "found_v_mag": 6.25,
+        "found_stars": 12.5,
+        "identified_share": 0.95,
+    }
+    return NoiseBudget(**plain | changes)
+
+
+def test_a_budget_of_noise_is_told_with_all_its_figures():
+    budget = spoken_budget()
+    lines = list(noise_lines(budget))
+    assert lines[:3] == [
+        "found                 3 px above 4.5 sigma of a background of 31.25 e- in a pixel",
+        ("pixels of r           25.0% of a star of the Sun's colour, background 40 e-"),
+        ("pixels of g           50.0% of a star of the Sun's colour, background 30 e-"),
+    ]
+    columns = noise.NEA_COLUMNS
+    for kind, line in zip(noise.WHO, lines[3 : 3 + len(noise.WHO)], strict=True):
+        across = 1.5 * (1 + columns.index(f"{kind}_across_arcsec"))
+        about = 1.5 * (1 + columns.index(f"{kind}_about_arcsec"))
+        name = f"NEA, {kind}"
+        assert line == f"{name:22}{across:.3g} arcsec across, {about:.3g} about the boresight"
+    empty, titles, first, second = lines[3 + len(noise.WHO) :]
+    assert empty == ""
+    assert titles.split() == (
+        [
+            "V",
+            "star",
+            "e-",
+            "noise",
+            "e-",
+            "SNR",
+            "SNR",
+            "r",
+            "SNR",
+            "g",
+            "detection",
+            "bound",
+            "px",
+            "fit",
+            "px",
+        ]
+    )
+    names = ["star_e", "total_e", "snr", "snr_r", "snr_g", "detection", "bound_px", "fit_px"]
+    wanted = [budget.rows[0][name] for name in names]
+    assert [float(word) for word in first.split()] == [5.0, *wanted]
+    assert second.split()[-1] == "-"
+    assert [float(word) for word in second.split()[:3]] == [5.5, wanted[0] / 2, wanted[1] / 2]
+    assert len({len(titles), len(first), len(second)}) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, "sensitive enough: "),
+        ({"identified_share": 0.9499}, "not enough: "),
+        ({}, "12.5 stars in a field (median of 9), 4 or more in 95% of fields"),
+        ({"fields": 1}, "12.5 stars in the field, 4 or more in 95% of fields"),
+        ({}, "half of the stars of V = 6.2 are found"),
+    ],
+)
+def test_a_tracker_is_sensitive_enough_where_it_identifies_95_percent_of_fields(changes, words):
+    assert words in noise.sensitivity_line(spoken_budget(**changes))
+
+
+def test_what_is_not_finite_is_an_empty_cell_and_a_table_without_rows_no_file(
+    tmp_path, monkeypatch
+):
+    drawn = []
+    monkeypatch.setattr("hilstar.basics.charts.save", lambda figure, path: drawn.append(figure))
+    budget = spoken_budget(fields=1)
+    noise.write_noise(tmp_path, budget)
+    for name, rows in (("noise", budget.rows), ("nea", budget.nea)):
+        cells = csv_rows(tmp_path / f"{name}.csv")
+        assert [list(row) for row in cells] == [list(row) for row in rows]
+        for written, row in zip(cells, rows, strict=True):
+            for key, value in row.items():
+                assert written[key] == (str(value) if math.isfinite(value) else "")
+    assert not (tmp_path / "stars.csv").exists()
+    (figure,) = drawn
+    by_magnitude, by_stars = figure.axes
+    kinds = [(way, kind) for way in ("about", "across") for kind in ("fit", "limit")]
+    for axes, key in ((by_magnitude, "v_mag"), (by_stars, "stars")):
+        for (way, kind), line in zip(kinds, axes.lines, strict=False):
+            assert list(line.get_xdata()) == [row[key] for row in budget.nea]
+            wanted = [row[f"{kind}_{way}_arcsec"] for row in budget.nea]
+            assert list(line.get_ydata()) == wanted
+            assert line.get_linestyle() == ("--" if kind == "fit" else "-")
+    texts = " ".join(text.get_text().replace("\n", " ") for text in figure.texts)
+    finding = texts.replace("\N{NO-BREAK SPACE}", " ")
+    assert "Stars to V = 6 allow 1.5 and 3 arcsec across and about the boresight" in finding
+    assert "with all noise; the field." in texts
+    infinite = {kind: {"across": math.inf, "about": math.inf} for kind in noise.WHO}
+    noise.write_noise(tmp_path, spoken_budget(nea_arcsec=infinite))
+    assert len(drawn) == 1
+    name = "NEA, limit"
+    wanted_line = f"{name:22}none: fewer than 2 stars with a place"
+    assert wanted_line in list(noise_lines(spoken_budget(nea_arcsec=infinite)))
+
+
+def test_a_mosaic_s_star_has_the_light_of_its_own_channels_before_each_colour_s_sky(tmp_path):
+    nm = np.arange(400.0, 721.0, 20.0)
+    curves = {"r": bump(620.0, 60, nm), "g": bump(540.0, 60, nm), "b": 0.5 * bump(460.0, 60, nm)}
+    keys = write_channels(tmp_path, nm, curves)
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"tracker": keys, "tracker.detector": {"bayer": "grbg"}}))
+    file = read_bench_file(path)
+    sky_e = np.tile([[20.0, 50.0], [5.0, 24.0]], (4, 6))
+    whole = noisy_star(file, sky_e)
+    star, sky = whole.mosaic
+    assert star.sum() == pytest.approx(1.0)
+    assert 0 < star[2] < star[0] < 1 and star[2] < star[1]
+    # red 50, green the mean of 20 and 24, blue 5, over the mean of all four
+    assert sky == pytest.approx(np.array([50.0, 22.0, 5.0]) / 24.75)
+    for number in range(3):
+        alone = noisy_star(file, sky_e, number).mosaic
+        wanted = np.zeros(3)
+        wanted[number] = star[number]
+        np.testing.assert_allclose(alone, [wanted, sky])
+    dark = noisy_star(file, np.zeros((4, 4))).mosaic
+    assert dark[1].tolist() == [0.0, 0.0, 0.0]

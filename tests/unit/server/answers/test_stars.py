@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from hilstar.server.answers.answer import ReportedStar
-from hilstar.server.answers.stars import LitStars, judge_stars, lit_at
+from hilstar.server.answers.stars import LitStars, judge_stars, lit_at, lit_by_report
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.config import parse_config
 from tests.support.benches import bench_text
@@ -21,7 +21,7 @@ SIZE_PX = (100, 60)
 
 def lit_stars(*places_and_light: tuple[float, float, float]) -> LitStars:
     """Lit stars at x, y, px, with electrons per second; V and B-V tell one from another."""
-    x_px, y_px, light = np.array(places_and_light, dtype=np.float64).T
+    x_px, y_px, light = np.array(places_and_light, dtype=np.float64).reshape(-1, 3).T
     number = np.arange(len(x_px), dtype=np.float64)
     return LitStars(x_px, y_px, number, -number, light)
 
@@ -88,3 +88,23 @@ def test_a_detector_sees_stars_to_the_edges_of_its_pixels():
     found = lit_at(np.array([1.0, 0.0, 0.0, 0.0]), stars, camera, 4.0)
     seen = sorted(zip(found.x_px.round(6), found.y_px.round(6), strict=True))
     assert seen == [(-0.4, 20), (30, -0.4), (30, 59.4), (50, 30), (99.4, 20)]
+
+
+def test_reports_matched_one_at_a_time_are_each_judged_as_if_it_were_alone(rng):
+    """A crowd in which stars hide one another, reports beside stars and of none."""
+    count = 60
+    places = rng.uniform((0, 0), SIZE_PX, size=(count, 2))
+    lit = lit_stars(*np.column_stack([places, rng.permutation(count) + 1.0]))
+    reported = np.concatenate(
+        [places + rng.normal(0, 1, places.shape), rng.uniform(0, 60, (20, 2))]
+    )
+    reports = tuple(ReportedStar(x_px, y_px, 1.0) for x_px, y_px in reported)
+    expected = []
+    for report in reports:
+        alone = judge_stars((report,), lit, SIZE_PX)
+        its_v_mag = alone.lit.v_mag[np.isfinite(alone.dx_px)]
+        expected.append(int(its_v_mag[0]) if len(its_v_mag) else -1)
+    assert lit_by_report(reports, lit, SIZE_PX).tolist() == expected
+    assert {star >= 0 for star in expected} == {True, False}
+    assert lit_by_report((), lit, SIZE_PX).tolist() == []
+    assert lit_by_report(reports[:1], lit_stars(*np.zeros((0, 3))), SIZE_PX).tolist() == [-1]

@@ -11,7 +11,7 @@ import pytest
 
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.cameras import fields_of_view
-from tests.support.benches import ROOT
+from tests.support.benches import ROOT, bench_text
 from tests.support.commands import run_hilstar_here
 
 BENCH = (ROOT / "examples" / "bench.toml").read_text()
@@ -200,3 +200,20 @@ def test_doctor_refuses_a_bench_file_that_names_what_is_not_there(tmp_path):
     refused = run_hilstar_here("doctor", "bench.toml", cwd=tmp_path)
     assert (refused.returncode, refused.stdout) == (2, "")
     assert "my-ccd.csv" in refused.stderr
+
+
+def test_what_is_simulated_and_verified_is_warned_of_too(tmp_path):
+    aperture_in_cm = {"tracker": {"aperture_mm": 3, "resolution_px": [256, 192]}}
+    quick = {"sky": {"faintest_v_mag": 4.0}, "render": {"quantisation": "round"}}
+    (tmp_path / "wrong.toml").write_text(bench_text(aperture_in_cm, quick))
+    for words in (
+        "simulate wrong.toml --radec 84.057,-1.2,0 -o o.fits",
+        "verify wrong.toml --fields 1",
+    ):
+        told = run_hilstar_here(words, cwd=tmp_path)
+        assert told.returncode == 0, told.stderr
+        assert (
+            told.stderr.count("check the units: ")
+            == told.stderr.count("= 3 in cm, which is 30")
+            == 1
+        )

@@ -5,6 +5,7 @@ SPICE, in frames of all kinds.
 from __future__ import annotations
 
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,6 +14,7 @@ import spiceypy
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.clock.timeline import Policy
+from hilstar.attitude.logs.ck import broken_off, reading_of
 from hilstar.attitude.logs.ck_spice import Segment, _attitudes, _Piece, _Structure, answer
 from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import log_timeline, open_log
@@ -388,3 +390,59 @@ def test_a_function_of_time_without_rates_has_those_of_its_turn(kind, has_rate, 
         "none": np.full((3, 3), np.nan),
     }
     assert rates == pytest.approx(wanted[whose], abs=RATE_RAD_S, nan_ok=True)
+
+
+def test_what_the_process_answers_becomes_a_log_with_its_breaks_and_notices():
+    q = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.6, 0.8]])
+    rate = np.array([[0.1, -0.2, 0.3], [np.nan] * 3, [0.0, 0.0, 0.5]])
+    arrays = {
+        "t_ns": np.array([1, 2, 4]) * NS_PER_S,
+        "q": q,
+        "rate": rate,
+        "breaks": np.array([False, False, True]),
+        "tick": np.array([65_536.0, 131_072.5, 262_144.0]),
+    }
+    # 2e-8 rad are 4.1253 mas
+    reply = {"step_s": 0.03125, "error_rad": 2e-8, "gaps_s": [0.5, 12.25, 2.0]}
+    said = {"structure": "-82000 (CASSINI)", "references": ["B1950", "J2000"]}
+    reading = reading_of(arrays, reply | said, [("kernels", "some")])
+    entries = list(reading.entries)
+    assert [entry.where for entry in entries] == [
+        ", tick 65536",
+        ", tick 131072.5",
+        ", tick 262144",
+    ]
+    samples = [entry.event for entry in entries]
+    assert [sample.t_ns for sample in samples] == [NS_PER_S, 2 * NS_PER_S, 4 * NS_PER_S]
+    assert np.array([sample.q_icrs_to_cam for sample in samples]).tolist() == q.tolist()
+    assert samples[0].rate_cam_rad_s.tolist() == [0.1, -0.2, 0.3]
+    assert samples[1].rate_cam_rad_s is None
+    assert [sample.discontinuity for sample in samples] == [False, False, True]
+    assert reading.told == [
+        ("kernels", "some"),
+        (
+            "ck-step",
+            "read every 0.03125 s where the CK is a function of time; off by 4.1 mas between",
+        ),
+        ("log-gap", "the CK has 3 gaps, the longest 12.25 s; the attitude is held there"),
+    ]
+    assert reading.conventions.source == "SPICE CK, structure -82000 (CASSINI)"
+    assert "components of B1950, J2000 (by SPICE: J2000" in reading.conventions.turns
+    assert reading.conventions.of_body and reading.conventions.scale == "TDB"
+    whole = reading_of(arrays, said | {"step_s": None, "error_rad": 0.0, "gaps_s": [3.0]})
+    assert whole.told == [
+        ("log-gap", "the CK has 1 gap, the longest 3 s; the attitude is held there")
+    ]
+
+
+@pytest.mark.parametrize(
+    ("error_output", "last"),
+    [
+        (b"Toolkit version: N0067\n\nSPICE(DAFBEGGTEND)\n", "SPICE(DAFBEGGTEND)"),
+        (b"  \n", "no word"),
+    ],
+)
+def test_a_process_that_broke_off_is_refused_with_its_last_line(error_output, last):
+    assert broken_off(Path("a.bc"), error_output) == (
+        f"a.bc: SPICE broke off with it ({last}); is it, or a kernel, damaged?"
+    )

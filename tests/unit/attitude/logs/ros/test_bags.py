@@ -210,6 +210,18 @@ def test_a_db3_whose_recorder_was_killed_names_the_file_that_has_the_rest(tmp_pa
     database.close()
     with pytest.raises(InputError, match=r"a\.db3-wal has the rest; merge it with: sqlite3 a\.db3"):
         open_log(tmp_path / "a.db3")
+    # one that is empty has no rest: SQLite leaves it so
+    (tmp_path / "a.db3-wal").write_bytes(b"")
+    assert_is_truth(open_log(tmp_path / "a.db3"), truth)
+
+
+def test_a_bags_metadata_of_over_two_megabytes_is_refused(tmp_path, truth):
+    bag = write_bag2(tmp_path / "a", messages(truth, ros_bags.POSE_STAMPED)("jazzy"))
+    metadata = bag / "metadata.yaml"
+    with metadata.open("ab") as file:
+        file.truncate(2_000_001)
+    line = refusal(open_log, bag)
+    assert line == f"{metadata}: has 2 MB; make it anew: ros2 bag reindex a"
 
 
 @pytest.mark.parametrize(("release", "profile"), [("humble", ""), ("noetic", "ros1")])

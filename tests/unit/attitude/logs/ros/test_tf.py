@@ -10,7 +10,14 @@ from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from tests.support.sources import ros_bags
 from tests.support.sources.ros_bags import START_NS, Make, write_bag1, write_bag2
-from tests.support.sources.ros_poses import MAKE, attitudes_of, rotations, tree, wxyz
+from tests.support.sources.ros_poses import (
+    MAKE,
+    attitudes_of,
+    fixed_transform,
+    rotations,
+    tree,
+    wxyz,
+)
 
 # A chain of four products of unit quaternions in float64.
 ROUNDING = 1e-14
@@ -51,7 +58,9 @@ def test_a_frame_and_a_body_choose_one_of_several_transforms(bag):
 
 
 def test_where_several_transforms_move_they_are_interpolated_as_tf2_does(bag):
-    slow, fast = Rotation.from_rotvec([[0.1 * k, 0.02 * k**2, 0] for k in range(4)]), rotations(12)
+    # its last rotation is its first again, and it moves all the same
+    slow = Rotation.from_rotvec([[0.1 * k, 0.02 * k**2, 0] for k in (0, 1, 3, 0)])
+    fast = rotations(12)
     sent = [
         *(
             ("/tf", ros_bags.TF, t, MAKE.tf(MAKE.transform_stamped(t, "map", "odom", wxyz(turn))))
@@ -73,8 +82,35 @@ def test_where_several_transforms_move_they_are_interpolated_as_tf2_does(bag):
     ]
 
 
-def turns_in_time(turns, step_ms):
-    return [(START_NS + k * step_ms * 10**6, turn) for k, turn in enumerate(turns)]
+def turns_in_time(turns, step_ms, start_ns=START_NS):
+    return [(start_ns + k * step_ms * 10**6, turn) for k, turn in enumerate(turns)]
+
+
+def test_a_simulated_clock_that_begins_at_zero_joins_transforms_by_its_stamps(bag):
+    """The recorder was late by 40 ms with every message of the slow transform."""
+    slow, fast = Rotation.from_rotvec([[0.1 * k, 0, 0] for k in range(3)]), rotations(5)
+    sent = []
+    for parent, child, turns, step_ms, late_ms in (
+        ("map", "odom", slow, 200, 40),
+        ("odom", "base", fast, 100, 0),
+    ):
+        for t_ns, turn in turns_in_time(turns, step_ms, start_ns=0):
+            message = MAKE.tf(MAKE.transform_stamped(t_ns, parent, child, wxyz(turn)))
+            sent.append(("/tf", ros_bags.TF, START_NS + t_ns + late_ms * 10**6, message))
+    log = open_log(bag(sent), Stated(reference="icrs", body="base"))
+    assert [sample.t_ns for sample in log.samples] == [k * 10**8 for k in range(5)]
+    truth = Slerp([0, 0.2, 0.4], slow)(np.arange(5) / 10) * fast
+    assert (attitudes_of(log) * truth).magnitude() == pytest.approx(0, abs=ROUNDING)
+
+
+def test_a_robots_tf_takes_the_static_transforms_of_its_own_namespace(bag):
+    moving, own, anothers = rotations(3), *rotations(2, seed=3)
+    sent = []
+    for topic, _, t_ns, message in tree([("icrs", "base", moving)], [("base", "cam", own)]):
+        sent.append((f"/robot{topic}", ros_bags.TF, t_ns, message))
+    sent.insert(0, fixed_transform("base", "cam", wxyz(anothers)))
+    log = open_log(bag(sent), Stated(topic="/robot/tf", body="cam"))
+    assert (attitudes_of(log) * moving * own).magnitude() == pytest.approx(0, abs=ROUNDING)
 
 
 def test_the_first_tfs_type_is_read(tmp_path):

@@ -100,6 +100,14 @@ def test_unpacking_stops_at_the_limit(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("low_limits")
+def test_as_much_as_the_limit_is_unpacked_and_a_byte_more_is_refused() -> None:
+    unpacked = bag_unpacking._unpacker(bz2.BZ2File)
+    assert unpacked(bz2.compress(bytes(LIMIT_BYTES))) == bytes(LIMIT_BYTES)
+    with pytest.raises(bag_unpacking.UnpackingError, match="unpack to over 1 MB"):
+        unpacked(bz2.compress(bytes(LIMIT_BYTES + 1)))
+
+
+@pytest.mark.usefixtures("low_limits")
 def test_every_frame_of_a_packed_message_is_unpacked() -> None:
     """Two frames one after another are what two writes of a recorder make."""
     packed = zstd.compress(b"first ") + zstd.compress(b"second")

@@ -12,8 +12,8 @@ from astropy.io import fits
 
 import hilstar
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg
-from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD, LIGHT_KM_S
 from hilstar.optics.camera import Camera, Lens
 from hilstar.optics.layers.fault_kinds import Now, fault_of
 from hilstar.optics.layers.fault_light import KEPT_BURSTS, FaultView
@@ -72,6 +72,22 @@ def test_a_false_star_lies_where_a_real_star_of_its_place_would(faulty, calm):
     assert rows["electrons_per_s"][0] == 5e4 / EXPOSURE_S
     # of 47e6 in float32
     assert total_light(frame) - total_light(calm) == pytest.approx(5e4 / EXPOSURE_S, rel=2e-4)
+
+
+def test_a_false_star_is_aberrated_as_the_stars_are(tmp_path):
+    """A direction moves towards the velocity by v / c; what is second order is 1e-5 px here."""
+    velocity_km_s = np.array([12.0, -20.0, 17.0])
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"sky": {"observer_velocity_km_s": velocity_km_s.tolist()}}))
+    direction = np.array([0.12, 0.985, -0.03])
+    direction /= np.linalg.norm(direction)
+    with hilstar.load(path) as bench:
+        table = {"kind": "false-star", "icrs": direction.tolist(), "electrons": 5e4}
+        _, rows = frame_with_faults(bench, table)
+        moved = direction + velocity_km_s / LIGHT_KM_S
+        axes = bench.camera.cam_to_image @ to_matrix(np.array(ORION_Q))
+        x_px, y_px = bench.camera.project((axes @ moved)[None])
+    assert abs(rows["x_px"][0] - x_px) < PX and abs(rows["y_px"][0] - y_px) < PX
 
 
 @pytest.mark.parametrize("key", ["tracker_px", "screen_px"])

@@ -822,3 +822,13 @@ def test_a_star_s_electrons_are_planck_s_through_30_mm_of_glass_and_the_ccd(made
     per_m2 = 3.631e-2 * seen / in_v * 1e-18 / (constants.h * constants.c)
     table = made("zero_points").table("zero_points")
     assert table["electrons_per_s"][0] == pytest.approx(np.pi / 4 * 0.03**2 * per_m2, rel=1e-6)
+
+
+def test_v_and_b_v_are_from_as_many_stars_as_table_2_2_has_but_for_those_without_a_place():
+    """The thesis counts all 118 218 rows; the catalogue has those with a place and a V."""
+    counts = {row.what: row.here for row in models.source_counts(load_catalog())}
+    assert (counts["V from T"], counts["B-V from T"]) == (409, 75_732)
+    assert counts["B-V from H"] == 0
+    for what, printed in (("V from G", 23_139), ("V from H", 94_669), ("B-V from G", 41_205)):
+        assert 0.98 * printed < counts[what] < printed
+    assert sum(counts[f"V from {source}"] for source in "GHT") <= len(load_catalog())

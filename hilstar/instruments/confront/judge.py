@@ -206,9 +206,9 @@ class Judge:
         )
         self._simulator = Simulator(replace(file, config=stars_alone), refuse=False)
         self._stars = self._simulator.stars
-        exposure_s = max(config.tracker.exposure_s, 1e-12)
-        gain_e_per_dn = config.tracker.detector.gain_e_per_dn
-        self._own_mag = -2.5 * math.log10(exposure_s / gain_e_per_dn)
+        self._own_mag = dn_offset_mag(
+            config.tracker.exposure_s, config.tracker.detector.gain_e_per_dn
+        )
         above_sigmas = (self._above_sigmas(shot) for shot in session.shots)
         self.hot, self.dead = defects(above_sigmas, self._moved_px() >= MOVED_PX)
 
@@ -243,9 +243,7 @@ class Judge:
         expected = self._expected(number)
         rows = self._rows(number, expected)
         dim, is_dim = _dim_regions(rows, shot.photo.size_px)
-        for k, row in enumerate(rows):
-            if is_dim(row) and "missing" not in row.flags:
-                rows[k] = replace(row, flags=(*row.flags, "dim region"))
+        rows = flagged_dim(rows, is_dim)
         light_sigma = light_dn / np.sqrt(variance)
         sources = self._sources(number, light_sigma, expected)
         background_chi2 = chi2_of(residual[self._background(shot, light_sigma)])
@@ -458,10 +456,8 @@ class Judge:
             return Fainter(complete_mag, reached_mag, 0.0)
         v_mag = shot.sky.v_mag[expected.star]
         slope = COUNTS_SLOPE[0] + COUNTS_SLOPE[1] * galactic_sine
-        growth = 10 ** (slope * (reached_mag - complete_mag))
-        all_stars = float((v_mag <= complete_mag).sum()) * growth
-        catalogued = float((v_mag <= reached_mag).sum())
-        return Fainter(complete_mag, reached_mag, max(all_stars - catalogued, 0.0))
+        expected_stars = stars_beyond(v_mag, complete_mag, reached_mag, slope)
+        return Fainter(complete_mag, reached_mag, expected_stars)
 
     def _dated(self, number: int) -> DatedBy | None:
         """How far off the date is by the stars that move fastest over the image; None without
@@ -490,6 +486,32 @@ class Judge:
         information = max(float((motion**2).sum()), 1e-12)
         years = float((motion * off_px / sigma_px).sum()) / information
         return DatedBy(years, information**-0.5)
+
+
+def dn_offset_mag(exposure_s: float, gain_e_per_dn: float) -> float:
+    """Magnitude of the DN of an exposure less that of electrons per second."""
+    return -2.5 * math.log10(max(exposure_s, 1e-12) / gain_e_per_dn)
+
+
+def flagged_dim(rows: Sequence[StarRow], is_dim: Callable[[StarRow], bool]) -> list[StarRow]:
+    """Rows of stars, with a flag on those that were seen in a dim region."""
+    flagged = []
+    for row in rows:
+        if is_dim(row) and "missing" not in row.flags:
+            flagged.append(replace(row, flags=(*row.flags, "dim region")))
+        else:
+            flagged.append(row)
+    return flagged
+
+
+def stars_beyond(v_mag: FloatArray, complete_mag: float, reached_mag: float, slope: float) -> float:
+    """How many stars to V = `reached_mag` a catalogue of stars (n,) lacks that is complete to
+    `complete_mag`, by star counts that grow by `slope` dex a magnitude.
+    """
+    growth = 10 ** (slope * (reached_mag - complete_mag))
+    all_stars = float((v_mag <= complete_mag).sum()) * growth
+    catalogued = float((v_mag <= reached_mag).sum())
+    return max(all_stars - catalogued, 0.0)
 
 
 def defects(photographs: Iterable[FloatArray], have_moved: bool) -> tuple[BoolArray, BoolArray]:

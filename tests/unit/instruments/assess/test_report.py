@@ -13,6 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from hilstar.basics.pages import BAD, DASH, OK, WARN, figures_of
+from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.instruments.assess import page, report
 from hilstar.instruments.assess.assessment import Acquisition, Assessment, WrongAnswer
 from hilstar.instruments.assess.budget import Axes
@@ -390,6 +391,67 @@ def test_a_verdict_is_bad_by_wrong_answers_and_lost_locks_and_a_warning_by_the_r
     states = [OK if right == 16 else WARN, BAD if wrong else OK, BAD if lost else OK]
     states.append(WARN if missed else OK)
     assert [part.split('"')[0] for part in tiles.split('data-state="')[1:]] == states
+
+
+@pytest.mark.parametrize(("wrong", "lost", "missed"), [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)])
+def test_each_fault_of_the_answers_has_its_own_cure(
+    made: Assessment, wrong: int, lost: int, missed: int
+) -> None:
+    shown = replace(
+        made,
+        wrong=made.wrong * wrong,
+        lock=replace(made.lock, outages=made.lock.outages[1:] * lost),
+        run=replace(made.run, run=CommandedRun(made.run.run.commanded, 0, 0, missed=missed)),
+    )
+    with drawn_figures():
+        cure = page._answers(shown).cure
+    assert cure == page.WRONG_CURE * wrong + page.LOST_CURE * lost + page.MISSED_CURE * missed
+
+
+@pytest.mark.parametrize(
+    ("sizes", "largest"),
+    [((2.5, 0.75, 0.625), "bias"), ((9.0, 0.75, 0.5), "fov"), ((1.0, 7.5, 7.0), "pixel")],
+)
+def test_the_cure_of_a_budget_is_that_of_its_largest_part(
+    made: Assessment, sizes: tuple[float, float, float], largest: str
+) -> None:
+    """Beside a bias of 5 arcsec across."""
+    fov, pixel, noise = (Axes(size, 1.0) for size in sizes)
+    parts = replace(made.found, fov_arcsec=fov, pixel_arcsec=pixel)
+    with drawn_figures():
+        card = page._budget(replace(made, found=parts, noise_arcsec=noise))
+    assert card.cure == page.LARGEST_CURES[page.PARTS.get(largest, page.BIAS)]
+
+
+def test_more_outages_and_wrong_answers_than_a_table_has_are_counted(made: Assessment) -> None:
+    many = page.MAX_ROWS + 3
+    shown = replace(
+        made,
+        wrong=made.wrong * many,
+        lock=replace(made.lock, outages=made.lock.outages[:1] * (many + 1)),
+    )
+    (card,) = page._events(shown)
+    lines = card_lines(card.html())["Wrong answers and outages"]
+    counts = [f"{many} wrong answers", f"{many + 1} outages"]
+    assert [line for line in lines if "|" not in line] == counts
+    assert len(lines) == 2 * (2 + page.MAX_ROWS)
+
+
+def test_a_run_over_much_of_the_sky_has_no_map(made: Assessment) -> None:
+    """Places 150 degrees from each other: some are over 72 degrees from their middle."""
+    apart = np.array([from_radec_roll_deg(ra_deg, 0.0, 0.0) for ra_deg in np.linspace(0, 150, 8)])
+    wide = replace(made, found=replace(made.found, commanded_q=apart))
+    picture, reason = page._field_map(wide)
+    assert picture == ""
+    assert reason.startswith("no map: the run goes over too much of the sky")
+
+
+def test_what_is_beside_a_tracker_is_told_without_a_certificate_too(made: Assessment) -> None:
+    card = page._beside(replace(made, certificate=None))
+    names = [
+        line.partition(" | ")[0] for line in card_lines(card.html())["What is not the tracker's"]
+    ]
+    assert names == ["display", "glass"]
 
 
 def test_nearly_all_answers_are_not_all_of_them(made: Assessment) -> None:

@@ -166,4 +166,6 @@ def test_a_verdict_s_state_is_what_the_certificate_says(conforms, state, headlin
     verdict = page._verdict(a_certificate(conforms=conforms, figures=figures))
     assert verdict.state == state
     assert verdict.headline.partition(":")[0] == headline
+    card = page._figures(a_certificate(conforms=conforms, figures=figures))
+    assert card.cure == (page.MISSED_CURE if conforms is False else "")
     assert page.statement(a_certificate(figures=[])).endswith("nothing could be stated.")

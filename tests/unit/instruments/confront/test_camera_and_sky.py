@@ -70,6 +70,8 @@ def test_a_planted_camera_and_its_attitudes_come_back(rng):
     base = Camera(SIZE_PX, 1.03 * FOCAL_PX, (319.5, 239.5), np.eye(3))
     fit, turns, photographs = fitted(rng, base, fixed=False)
     assert fit.model.startswith("k1")
+    # of 240 residuals, those of 20 % held out by fits of the others: more by their freedom
+    assert fit.held_out_px[fit.model] == pytest.approx(NOISE_PX, rel=0.2)
     camera = fit.camera
     assert camera.focal_length_px == pytest.approx(
         FOCAL_PX, abs=5 * FOCAL_PX * fit.sigma["log_focal"]
@@ -101,11 +103,14 @@ def test_a_camera_that_is_fixed_keeps_its_lens_and_finds_its_attitudes(rng):
 
 
 def test_values_count_from_the_camera_s_own_focal_length_and_point():
-    base = Camera(SIZE_PX, 1000.0, (300.0, 200.0), np.eye(3), lens=Lens((0.1, 0.2, 0.0), (0.01, 0)))
+    lens = Lens((0.1, 0.2, 0.3), (0.01, 0.02))
+    base = Camera(SIZE_PX, 1000.0, (300.0, 200.0), np.eye(3), lens=lens)
     changed = with_values(base, {"log_focal": np.log(1.1), "centre_y": -3.0, "k2": 0.5})
     assert changed.focal_length_px == pytest.approx(1100.0)
     assert changed.principal_point_px == (300.0, 197.0)
-    assert (changed.lens.radial, changed.lens.tangential) == ((0.1, 0.5, 0.0), (0.01, 0))
+    assert (changed.lens.radial, changed.lens.tangential) == ((0.1, 0.5, 0.3), (0.01, 0.02))
+    tangential = with_values(base, {"p1": 0.03, "p2": -0.04, "k1": 0.5}).lens
+    assert (tangential.radial, tangential.tangential) == ((0.5, 0.2, 0.3), (0.03, -0.04))
     assert with_values(base, {}).lens == base.lens
 
 
@@ -236,6 +241,31 @@ def test_what_explains_a_source_is_looked_for_at_its_own_row_and_column():
     # 3 px, or 3 arcmin of 1000 px, which are 0.9
     assert explained(planets={"Mars": (37.0, 13.0)}) == "Mars"
     assert explained(planets={"Mars": (38.0, 13.0)}) == ""
+
+
+@pytest.mark.parametrize(
+    ("x_px", "y_px", "row", "column"),
+    [(35.0, 29.6, 29, 35), (49.7, 12.0, 12, 49), (35.0, -0.7, 0, 35), (-0.8, 12.0, 12, 0)],
+)
+def test_a_source_beyond_an_edge_is_explained_by_the_edge_s_pixel(x_px, y_px, row, column):
+    hot = np.zeros((30, 50), dtype=bool)
+    hot[row, column] = True
+    source = {"x_px": np.array([x_px]), "y_px": np.array([y_px])}
+    assert explained(source=source, hot=hot) == "a hot pixel"
+
+
+@pytest.mark.parametrize(("off_px", "words"), [(24.5, "beside a trail"), (25.5, "")])
+def test_what_is_beside_a_trail_is_within_half_its_length_and_five_pixels(off_px, words):
+    """A trail of 40 px to the right."""
+    source = {
+        "x_px": np.array([10.0, 10.0 + off_px]),
+        "y_px": np.array([12.0, 12.0]),
+        "snr": np.array([20.0, 90.0]),
+        "length_px": np.array([3.0, 40.0]),
+        "trail": np.array([False, True]),
+        "single": np.array([False, False]),
+    }
+    assert explained(source=source) == words
 
 
 def test_a_trail_has_the_name_of_a_satellite_within_its_length_and_two_tenths_of_a_degree():

@@ -296,6 +296,7 @@ def test_pixels_that_are_bright_or_dark_in_all_photographs_are_defects_and_stars
         sigmas = np.zeros((20, 24))
         sigmas[3, 5] = 50.0  # hot
         sigmas[15, 2] = -8.0  # dead
+        sigmas[12, 9] = -8.0  # dead, beside a star
         sigmas[9:12, 8:11] = 20.0
         sigmas[10, 9] = 60.0
         sigmas[6, 12 + 2 * number] = 40.0
@@ -304,7 +305,7 @@ def test_pixels_that_are_bright_or_dark_in_all_photographs_are_defects_and_stars
         photographs.append(sigmas)
     hot, dead = defects(photographs, have_moved=True)
     assert np.argwhere(hot).tolist() == [[3, 5], [17, 20]]
-    assert np.argwhere(dead).tolist() == [[15, 2]]
+    assert np.argwhere(dead).tolist() == [[12, 9], [15, 2]]
 
 
 def test_where_stars_stand_still_a_hot_pixel_shares_nothing_in_any_photograph():
@@ -355,6 +356,27 @@ def test_a_catalogue_is_complete_by_the_latitude_s_size(latitude_deg, complete_v
     judging = SimpleNamespace(session=SimpleNamespace(shots=[shot], camera=camera))
     fainter = judge.Judge._fainter(judging, 0, None)
     assert fainter.complete_v_mag == pytest.approx(complete_v_mag, abs=1e-5)  # of the pole's digits
+
+
+def test_stars_beyond_a_catalogue_are_those_of_the_counts_less_its_own():
+    """Ten stars to V = 8 are 10 x 10^0.9 to V = 10, of which the catalogue has 15, and two fainter."""
+    v_mag = np.array([8.0] * 10 + [9.0] * 4 + [10.0] + [11.0] * 2)
+    expected_stars = judge.stars_beyond(v_mag, 8.0, 10.0, 0.45)
+    assert expected_stars == pytest.approx(10 * 10**0.9 - 15)
+    assert judge.stars_beyond(v_mag, 8.0, 9.0, 0.1) == 0.0
+
+
+def test_a_dim_region_flags_stars_that_were_seen_in_it():
+    rows = [row_of(50.0), row_of(50.0, hip=2, flags=("double",)), row_of(0.0, flags=("missing",))]
+    flagged = judge.flagged_dim(rows, lambda row: row.hip == 2 or row.dn == 0.0)
+    assert [row.flags for row in flagged] == [(), ("double", "dim region"), ("missing",)]
+
+
+def test_an_exposure_s_dn_are_its_electrons_by_the_gain():
+    """100 e- a second are 12.5 DN in half a second at 4 e- a DN."""
+    offset_mag = judge.dn_offset_mag(0.5, 4.0)
+    assert -2.5 * math.log10(100) + offset_mag == pytest.approx(-2.5 * math.log10(12.5))
+    assert math.isfinite(judge.dn_offset_mag(0.0, 4.0))
 
 
 def test_a_core_is_widened_by_colour_and_stays_an_ellipse():

@@ -49,10 +49,11 @@ from hilstar.instruments.confront.session import (
     corrected,
     radius2_of,
 )
-from hilstar.instruments.confront.star_psf import HALF, Stamps
+from hilstar.instruments.confront.star_psf import HALF, MEAN_BV_MAG, Stamps
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.sky.spectrum import Curve
+from tests.support.confrontations import a_session
 
 TRACKER = """
 [tracker]
@@ -130,14 +131,16 @@ def test_radii_are_from_the_principal_point_in_half_diagonals():
 
 
 def test_places_reach_as_far_as_95_percent_of_them_from_the_principal_point():
-    angle = np.linspace(0, 2 * math.pi, 100, endpoint=False)
-    radius_px = np.where(np.arange(100) < 96, 200.0, 390.0)
+    angle = np.linspace(0, 2 * math.pi, 101, endpoint=False)
+    radius_px = 2.0 * (np.arange(101) * 37 % 101)  # 0 to 200, in another order
     x_px = 410 + radius_px * np.cos(angle)
     y_px = 290 + radius_px * np.sin(angle)
-    places = sessions.Places(x_px, y_px, np.ones(100), np.zeros((100, 3)))
-    assert _reach_px(CAMERA, places) == pytest.approx(200.0)
+    places = sessions.Places(x_px, y_px, np.ones(101), np.zeros((101, 3)))
+    assert _reach_px(CAMERA, places) == pytest.approx(190.0)
     none = sessions.Places(np.empty(0), np.empty(0), np.empty(0), np.empty((0, 3)))
     assert _reach_px(CAMERA, none) == 0.0
+    for photographs in ([places, none], [none, places, none]):
+        assert sessions._largest_reach_px(CAMERA, photographs) == pytest.approx(190.0)
 
 
 def test_levels_of_a_power_are_light_again_and_full_scale_stays(monkeypatch):
@@ -418,3 +421,14 @@ def test_a_step_of_the_power_is_a_secant_s_within_its_limit(sign):
     assert turned == pytest.approx(0.2 * sign)
     far_turned = _tone_step((0.0, 0.1 * sign), (0.1 * sign, 9.0 * sign))
     assert far_turned == MAX_TONE_STEP * sign
+
+
+def test_a_plane_s_stars_are_fainter_by_its_own_colour_about_the_mean_colour():
+    """Of a bench of one channel, whose planes differ by the fit of their colours alone; a colour
+    that is not known counts as the mean.
+    """
+    light = replace(a_session().light, colours=np.array([0.25, -0.5]))
+    session = a_session(light=light)
+    columns = np.array([[5.0, 6.0, 7.0], [MEAN_BV_MAG + 1, np.nan, MEAN_BV_MAG - 2], [0.7] * 3])
+    np.testing.assert_allclose(session.plane_mag(0, columns), [0.25, 0.0, -0.5])
+    np.testing.assert_allclose(session.plane_mag(1, columns), [-0.5, 0.0, 1.0])

@@ -54,12 +54,15 @@ ABERRATION_RAD = np.radians(25 / 3600)  # which the renderer leaves out
 
 @dataclass(frozen=True)
 class Night:
-    """The photographs' zeniths, what was found, and each verdict with its predicted image."""
+    """The photographs' zeniths, what was found, each verdict's predicted image, and what was told
+    to be done, percent.
+    """
 
     zeniths: list[FloatArray]
     found: Confronted
     predicted: list[FloatArray]
     folder: Path
+    percents: list[int]
 
     @property
     def session(self) -> Session:
@@ -88,8 +91,9 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Night:
         )
         image = photograph(CAMERA, pointing, rng, extras)
         paths.append(folder / f"night_{time.replace(':', '-')}.png")
-        Image.fromarray(image).save(paths[-1])
+        Image.fromarray(image).save(paths[-1], compress_level=1)
     predicted: list[FloatArray] = []
+    percents: list[int] = []
     pictures = confront_run.page_pictures
 
     def kept(session: Session, verdict: Verdict) -> Pictures:
@@ -100,8 +104,8 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Night:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(confront_run, "page_pictures", kept)
         patch.setattr(page, "_charts", lambda *given: [])
-        found = confront_run.confront(bench, paths, folder / "out")
-    return Night(zeniths, found, predicted, folder / "out")
+        found = confront_run.confront(bench, paths, folder / "out", advance=percents.append)
+    return Night(zeniths, found, predicted, folder / "out", percents)
 
 
 def planted_dn(night: Night, number: int) -> FloatArray:
@@ -115,6 +119,11 @@ def planted_dn(night: Night, number: int) -> FloatArray:
     radius2 = radius2 + (shot.found.y_px - CAMERA.centre_px[1]) ** 2
     mag = mag + CAMERA.vignetting_mag * radius2 / ((WIDTH**2 + HEIGHT**2) / 4)
     return np.asarray(CAMERA.zero_e * 10 ** (-0.4 * mag) / CAMERA.gain_e_per_dn)
+
+
+def test_what_is_done_is_told_by_photograph_and_by_fit(night: Night) -> None:
+    """Two photographs opened, three parts of the fit, two verdicts and the page."""
+    assert night.percents == [4, 8, 27, 46, 65, 88, 91, 100]
 
 
 def test_the_camera_and_its_attitudes_are_those_planted(night: Night) -> None:

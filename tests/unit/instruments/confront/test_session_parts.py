@@ -15,8 +15,10 @@ from scipy.special import ndtr
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import parse_toml
+from hilstar.basics.rotation import from_matrix
 from hilstar.instruments.confront import session as sessions
-from hilstar.instruments.confront.background import FixedPattern
+from hilstar.instruments.confront.background import FixedPattern, FoundSources, SkyLevel
+from hilstar.instruments.confront.camera_fit import Pointing
 from hilstar.instruments.confront.images import Photograph, _planes
 from hilstar.instruments.confront.light import LightFit
 from hilstar.instruments.confront.measured_bench import (
@@ -30,6 +32,7 @@ from hilstar.instruments.confront.measured_bench import (
     read_tracker_file,
     vignetting_of,
 )
+from hilstar.instruments.confront.photographed_sky import DatedSky
 from hilstar.instruments.confront.photon_transfer import PixelFit
 from hilstar.instruments.confront.run import _base
 from hilstar.instruments.confront.session import (
@@ -52,8 +55,10 @@ from hilstar.instruments.confront.session import (
 from hilstar.instruments.confront.star_psf import HALF, MEAN_BV_MAG, Stamps
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
+from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.spectrum import Curve
-from tests.support.confrontations import a_session
+from tests.support.confrontations import a_session, a_shot
+from tests.support.planted_sky import rotation_of
 
 TRACKER = """
 [tracker]
@@ -432,3 +437,79 @@ def test_a_plane_s_stars_are_fainter_by_its_own_colour_about_the_mean_colour():
     columns = np.array([[5.0, 6.0, 7.0], [MEAN_BV_MAG + 1, np.nan, MEAN_BV_MAG - 2], [0.7] * 3])
     np.testing.assert_allclose(session.plane_mag(0, columns), [0.25, 0.0, -0.5])
     np.testing.assert_allclose(session.plane_mag(1, columns), [-0.5, 0.0, 1.0])
+
+
+# V, and places of stars: two that are 5 px apart and differ by 2.9 mag, two by 3.1 mag, two that
+# are 6.5 px apart, one that nothing was seen of, and one that is saturated
+SKY_STARS = (
+    (3.0, 100.2, 50.0),
+    (5.9, 105.2, 50.0),
+    (3.0, 200.0, 80.3),
+    (6.1, 200.0, 85.3),
+    (3.0, 300.4, 20.7),
+    (3.0, 300.4, 27.2),
+    (3.0, 60.0, 90.0),
+    (3.0, 30.0, 30.0),
+)
+SEEN_STARS = (0, 1, 2, 4, 5, 7)
+FIELD_PX = (400, 120)
+
+
+def identified_shot() -> sessions.Shot:
+    """A shot whose sources are the seen stars, all of one light but the last, which nearly fills
+    the range with the background.
+    """
+    camera = Camera(FIELD_PX, 4000.0, (199.5, 59.5), np.eye(3))
+    v_mag, x_px, y_px = np.array(SKY_STARS).T
+    turn = rotation_of(40.0, 20.0, 10.0)
+    vectors = camera.rays(x_px, y_px) @ turn
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    count = len(v_mag)
+    columns = {"hip": np.arange(count, dtype=np.int32), "v_mag": v_mag}
+    catalog = plain_catalog("HIP", count, columns | {"ra_deg": v_mag, "dec_deg": v_mag})
+    seen = np.array(SEEN_STARS)
+    seen_x_px, seen_y_px = x_px[seen] + 0.5, y_px[seen] - 0.5
+    level = np.full(FIELD_PX[::-1], 500.0)
+    dn = level.copy()
+    dn[30, 30] = 0.975 * 4095
+    three = np.full(len(seen), 3.0)
+    single = np.zeros(len(seen), dtype=bool)
+    sources = FoundSources(seen_x_px, seen_y_px, 10 * three, three, three, three, single)
+    q_icrs_to_cam = from_matrix(turn)
+    rows = np.arange(count)
+    shot = replace(
+        a_shot(0),
+        photo=photograph(dn),
+        level=SkyLevel(level, np.ones_like(level), 16),
+        sources=sources,
+        sky=DatedSky(catalog, 2020.0, None, vectors, rows),
+        pointing=Pointing(q_icrs_to_cam),
+    )
+    sessions._identify(shot, camera, shot.pointing)
+    return shot
+
+
+def test_stars_are_identified_at_their_sources_with_what_spoils_them():
+    """Blended by a star of the catalogue within 6 px that is less than 3 mag fainter, or by another
+    source as bright; saturated by all of a pixel's light.
+    """
+    shot = identified_shot()
+    assert sorted(shot.star.tolist()) == list(SEEN_STARS)
+    blended = dict(zip(shot.star.tolist(), shot.blended.tolist(), strict=True))
+    assert blended == {0: True, 1: True, 2: False, 4: False, 5: False, 7: False}
+    saturated = dict(zip(shot.star.tolist(), shot.saturated.tolist(), strict=True))
+    assert saturated == {star: star == 7 for star in SEEN_STARS}
+    assert shot.clean.sum() == 3
+    (middle,) = np.flatnonzero(shot.star == 7)
+    # above the background
+    assert shot.stamps.values[middle].max() == pytest.approx(0.975 * 4095 - 500)
+
+
+def test_magnitudes_are_those_of_each_correction(tmp_path):
+    """A tilt of ln(wavelength / 550 nm) makes red stars brighter than blue ones."""
+    columns = np.array([[3.0, 3.0], [0.0, 1.5], [0.0, 1.6]])
+    magnitudes = sessions._Magnitudes(bench(tmp_path), columns)
+    plain_mag = magnitudes((0.0, 0.0))
+    red_mag = magnitudes((1.0, 0.0))
+    assert (red_mag - plain_mag)[1] < (red_mag - plain_mag)[0] - 0.02
+    assert magnitudes((0.0, 0.0)).tolist() == plain_mag.tolist()

@@ -11,16 +11,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.special import ndtr
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import parse_toml
 from hilstar.basics.rotation import from_matrix
+from hilstar.instruments.confront import run as confront_run
 from hilstar.instruments.confront import session as sessions
 from hilstar.instruments.confront.background import FixedPattern, FoundSources, SkyLevel
 from hilstar.instruments.confront.camera_fit import Pointing
 from hilstar.instruments.confront.images import Photograph, _planes
 from hilstar.instruments.confront.light import LightFit
+from hilstar.instruments.confront.lost_in_space import MIN_MATCHED
 from hilstar.instruments.confront.measured_bench import (
     PER_PX,
     _absolute,
@@ -52,7 +55,7 @@ from hilstar.instruments.confront.session import (
     corrected,
     radius2_of,
 )
-from hilstar.instruments.confront.star_psf import HALF, MEAN_BV_MAG, Stamps
+from hilstar.instruments.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, join
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.sky.catalog import plain_catalog
@@ -513,3 +516,82 @@ def test_magnitudes_are_those_of_each_correction(tmp_path):
     red_mag = magnitudes((1.0, 0.0))
     assert (red_mag - plain_mag)[1] < (red_mag - plain_mag)[0] - 0.02
     assert magnitudes((0.0, 0.0)).tolist() == plain_mag.tolist()
+
+
+def test_photographs_share_the_largest_full_scale_and_those_beyond_memory_lie_in_files(
+    tmp_path, monkeypatch
+):
+    """Of 12, 14 and 12 bits; the second one is over what memory holds."""
+    monkeypatch.setattr(confront_run, "MEMORY_PX", 1.5 * 80 * 64)
+    rows, columns = np.mgrid[:64, :80]
+    paths = []
+    for number, step in enumerate((4, 15, 4)):
+        levels = (step * ((3 * rows + 7 * columns) % 700)).astype(np.uint16)
+        paths.append(tmp_path / f"{number}.tiff")
+        Image.fromarray(levels).save(paths[-1])
+    text = TRACKER.replace("[800, 600]", "[80, 64]")
+    photos = confront_run._read(bench(tmp_path, text), paths, None)
+    assert [photo.full_dn for photo in photos] == [16383.0] * 3
+    assert [photo.step_dn for photo in photos] == [4.0, 15.0, 4.0]
+    assert [isinstance(photo.dn, np.memmap) for photo in photos] == [False, True, True]
+    with pytest.raises(InputError, match=r"0\.tiff: two images have this name"):
+        confront_run._read(bench(tmp_path, text), [paths[0], paths[1], paths[0]], None)
+
+
+def test_air_masses_of_a_photograph_without_a_site_are_by_its_fitted_zenith():
+    shot = a_shot(0)
+    at_60_deg = Pointing(shot.pointing.q_icrs_to_cam, (0.0, math.sqrt(3)))
+    assert sessions._masses(shot.sky, at_60_deg) == pytest.approx(2.0, rel=0.01)
+    assert sessions._masses(shot.sky, shot.pointing) is None
+
+
+def measured_shot(dn: list[float]) -> sessions.Shot:
+    """A shot of stars of these fluxes with 1 DN of noise, the last of which is blended."""
+    count = len(dn)
+    at = np.arange(count, dtype=float)
+    measured = Measured(at, 2 * at, np.array(dn), 0.1 + at, np.ones(count), np.ones(count))
+    blended = at == count - 1
+    shot = a_shot(0)
+    vectors = np.column_stack([at, at, at])
+    return replace(
+        shot,
+        sky=replace(shot.sky, vectors=vectors[::-1]),
+        star=np.arange(count)[::-1],
+        measured=measured,
+        blended=blended,
+        saturated=np.zeros(count, dtype=bool),
+    )
+
+
+@pytest.mark.parametrize(
+    ("dn", "chosen"),
+    [
+        # ten sigmas and alone, of which there are enough; else all that are alone; else all
+        ([50.0] * MIN_MATCHED + [9.0, 50.0], range(MIN_MATCHED)),
+        ([50.0] * (MIN_MATCHED - 1) + [9.0, 50.0], range(MIN_MATCHED)),
+        ([50.0, 9.0, 50.0], range(3)),
+    ],
+)
+def test_places_that_count_are_those_of_bright_stars_that_are_alone(dn, chosen):
+    places = sessions._places(measured_shot(dn))
+    rows = np.array(chosen)
+    assert places.x_px.tolist() == rows.tolist()
+    assert places.y_px.tolist() == (2 * rows).tolist()
+    assert places.sigma_px.tolist() == (0.1 + rows).tolist()
+    assert places.vectors[:, 0].tolist() == rows.tolist()
+
+
+def test_a_psf_is_that_of_the_brightest_stars(monkeypatch):
+    """Twelve of 0.8 px, and twelve of a tenth of their light that are twice as wide."""
+    monkeypatch.setattr(sessions, "PSF_STARS", 12)
+    rng = np.random.default_rng(2)
+    places_px = rng.uniform([20, 20], [780, 580], (24, 2))
+    narrow = stamps_of(places_px[:12], 0.8, 0.8)
+    wide = stamps_of(places_px[12:], 1.6, 1.6)
+    stamps = join([replace(wide, values=wide.values / 10), narrow])
+    nothing = np.zeros(24, dtype=bool)
+    shot = replace(a_shot(0), stamps=stamps, saturated=nothing, blended=nothing)
+    photo = replace(shot.photo, dn=np.zeros((600, 800)))
+    psf = sessions._psf([replace(shot, photo=photo)], 2.0)
+    middle = np.array([399.5]), np.array([299.5])
+    assert psf.fwhm_px(*middle)[0] == pytest.approx(2.3548 * math.hypot(0.8, 1 / 12**0.5), rel=0.05)

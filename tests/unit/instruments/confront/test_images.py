@@ -125,6 +125,7 @@ def test_levels_end_with_their_bits_or_where_three_pixels_are_clipped(
 ) -> None:
     image = ramp(np.uint16, step)
     image[10, 10 : 10 + pixels_at_top] = top
+    image[20, 20] = step * ((top - 1) // step)
     (photo,) = read_photographs(saved(tmp_path, image), None)
     assert (photo.step_dn, photo.full_dn) == (step, full_dn)
 

@@ -8,12 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.coordinates import get_body, solar_system_ephemeris
 from astropy.io import fits
+from astropy.time import Time
 from PIL import Image
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.confront.images import paged, parse_utc, read_photographs
-from hilstar.instruments.confront.photographed_sky import dated_sky, earth_velocity_km_s
+from hilstar.instruments.confront.photographed_sky import (
+    dated_sky,
+    earth_velocity_km_s,
+    planets_seen,
+)
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.sky.stars import unit_vectors_icrs
 from tests.support.benches import SMALL_BENCH
@@ -246,3 +252,22 @@ def test_a_sky_is_of_its_day_as_a_moving_observer_sees_it(tmp_path: Path) -> Non
     assert undated.velocity_km_s is undated.air is None
     at_epoch = unit_vectors_icrs(undated.catalog, undated.epoch_jyear)[undated.order]
     assert undated.vectors.tolist() == at_epoch.tolist()
+
+
+# of the planets' mean elements, and what moves in the light's time to the Earth; of the Moon's
+PLANET_ERROR_RAD, MOON_ERROR_RAD = np.radians(2 / 60), np.radians(1.0)
+
+
+def test_planets_are_where_astropy_has_them_from_the_earth() -> None:
+    """On a day when the barycentre is 0.008 au from the Sun, half a degree of Mars's place."""
+    when = Time("2020-09-20T20:00:00", scale="utc")
+    seen = planets_seen(ns("2020-09-20T20:00:00"))
+    assert len(seen) == 8
+    with solar_system_ephemeris.set("builtin"):
+        for name, direction in seen.items():
+            body = name.removeprefix("the ").lower()
+            wanted = get_body(body, when).cartesian.xyz.value
+            wanted = wanted / np.linalg.norm(wanted)
+            limit_rad = MOON_ERROR_RAD if body == "moon" else PLANET_ERROR_RAD
+            assert np.linalg.norm(np.cross(direction, wanted)) < limit_rad
+            assert direction @ wanted > 0

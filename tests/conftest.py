@@ -68,9 +68,8 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark what lies in a folder, and leave out what the command does not ask for."""
-    here = Path(__file__).parent
     for item in items:
-        folder = item.path.relative_to(here).parts[0]
+        folder = selection.folders_of(item.path)[0]
         if folder in MARKERS:
             item.add_marker(MARKERS[folder])
         if folder == "timing":

@@ -107,7 +107,7 @@ def test_lost_s_roll_is_minus_hilstar_s(slopes_in_field, tmp_path):
 
     lost = lost_side.lost_folder()
     subprocess.run(["./lost", *lost_side.DATABASE], cwd=lost, capture_output=True, check=True)
-    Image.fromarray(picture(slopes_in_field)).save(tmp_path / "sky.png")
+    Image.fromarray(picture(slopes_in_field)).save(tmp_path / "sky.png", compress_level=1)
     words = ["./lost", "pipeline", "--png", str(tmp_path / "sky.png"), "--fov", f"{FIELD_DEG:g}"]
     words += ["--database", "stars.dat", "--centroid-algo", "cog", "--star-id-algo", "py"]
     words += ["--centroid-filter-brightest", "20", "--angular-tolerance", "0.05"]
@@ -173,7 +173,7 @@ def test_esa_s_tetra3_answers_hilstar_s_roll(slopes_in_field, tmp_path):
     rows["mag"] = np.round(stars.v_mag * 100)
     catalogue = bytes(28) + rows.tobytes() + bytes((9110 - len(rows)) * rows.itemsize)
     (tmp_path / "tetra3" / "BSC5").write_bytes(catalogue)
-    Image.fromarray(picture(slopes_in_field)).save(tmp_path / "sky.png")
+    Image.fromarray(picture(slopes_in_field)).save(tmp_path / "sky.png", compress_level=1)
     command = [sys.executable, "-c", ESA_SOLVER, str(tmp_path / "sky.png")]
     environment = os.environ | {"PYTHONPATH": str(tmp_path)}
     done = subprocess.run(

@@ -95,6 +95,30 @@ def test_fifty_directions_by_astropy_have_the_tables_brightness(rng):
     assert found.radiance == pytest.approx(radiance[tuple(chosen.T)], rel=SUN_PLACE)
 
 
+def test_near_the_sun_it_is_that_of_the_nearest_direction_of_the_table_and_not_called_tabled():
+    """Also where a blank corner of the table has only a share in a direction, but not on the way
+    between two that the table has.
+    """
+    radiance, tabled = (values.reshape(len(LON_DEG), len(LAT_DEG)) for values in table_17())
+    lon, lat = np.radians(np.meshgrid(LON_DEG, LAT_DEG, indexing="ij"))
+    assert tabled.any() and not tabled.all()
+    for blank in np.argwhere(~tabled):
+        here = lon[tuple(blank)], lat[tuple(blank)]
+        haversine = (
+            np.sin((lat - here[1]) / 2) ** 2
+            + np.cos(lat) * np.cos(here[1]) * np.sin((lon - here[0]) / 2) ** 2
+        )
+        nearest = np.min(haversine[tabled])
+        near = radiance[tabled & (haversine < nearest + 1e-12)]
+        assert np.isclose(near, radiance[tuple(blank)], rtol=1e-9).any()
+    first, at = np.argwhere(~tabled[:-1] & tabled[1:])[0]
+    edges = LON_DEG[first : first + 2]
+    for share, is_tabled in ((0.0, False), (0.4, False), (0.9, False), (1.0, True)):
+        here = (1 - share) * edges[0] + share * edges[1]
+        seen = Sunward(np.array([here]), np.array([LAT_DEG[at]]))
+        assert tabled_light(seen).tabled.tolist() == [is_tabled]
+
+
 def test_between_directions_it_is_within_the_error_that_is_stated():
     """Every second longitude, or latitude, is found from its neighbours; at half the step the
     error is about a quarter.

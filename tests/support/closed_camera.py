@@ -131,7 +131,7 @@ class ClosedCamera(ImageSource):
         path = stem.with_name(stem.name + ".png")
         image = np.clip(np.rint(photons + read_dn), 0, FULL_DN)
         if self.saves:
-            Image.fromarray(image.astype(np.uint16)).save(path)
+            Image.fromarray(image.astype(np.uint16)).save(path, compress_level=1)
         else:
             path.touch()
         self.images[path] = image

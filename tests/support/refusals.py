@@ -13,7 +13,7 @@ from hilstar.basics.errors import InputError
 MAX_LINE_CHARACTERS = 1000
 
 
-def line_of(error: InputError) -> str:
+def line_of(error: Exception) -> str:
     """What an error says: one printable line, and no page."""
     line = str(error)
     assert line.isprintable() and len(line) <= MAX_LINE_CHARACTERS, line

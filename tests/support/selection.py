@@ -11,6 +11,7 @@ one at a time.
 from __future__ import annotations
 
 from collections import Counter
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -65,11 +66,17 @@ def is_slow(nodeid: str) -> bool:
     return function in SLOW and bracket + case not in SLOW[function]
 
 
+@cache
+def folders_of(path: Path) -> tuple[str, ...]:
+    """The folders of a file below `tests`, which has them once for hundreds of tests."""
+    return path.relative_to(TESTS).parts[:-1]
+
+
 def reason_to_leave_out(item: pytest.Item) -> str | None:
     """Why the bare command does not run a test; None if it does."""
     if item.get_closest_marker("timing") is not None:
         return TIMING_REASON
-    for folder in item.path.relative_to(TESTS).parts[:-1]:
+    for folder in folders_of(item.path):
         if folder in REASONS_BY_FOLDER:
             return REASONS_BY_FOLDER[folder]
     if WHOLE_STUDY in getattr(item, "fixturenames", ()):
@@ -100,7 +107,7 @@ def holds_nothing_for(config: pytest.Config, path: Path) -> bool:
         return False
     if option.timing:
         return "timing" not in path.relative_to(TESTS).parts and TIMING_MARK not in path.read_text()
-    folders = path.relative_to(TESTS).parts[:-1]
+    folders = folders_of(path)
     is_slow = path.relative_to(TESTS.parent).as_posix() in SLOW_FILES
     return not is_slow and "study" not in folders and not REASONS_BY_FOLDER.keys() & set(folders)
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.charts import chart
@@ -267,14 +268,12 @@ class _Places:
         return np.asarray(padded[rows[:, :, None], columns[:, None, :]])
 
 
-def _is_alone(x_px: FloatArray, y_px: FloatArray) -> BoolArray:
-    """Which places (n,) of one frame have no other within their square."""
-    across = np.abs(x_px[:, None] - x_px)
-    down = np.abs(y_px[:, None] - y_px)
-    itself = np.where(np.eye(len(x_px)), np.inf, 0)
-    apart = np.maximum(across, down) + itself
-    nearest = apart.min(axis=1, initial=np.inf)
-    return np.asarray(nearest > 2 * MAX_HALF_PX)
+def are_alone(x_px: FloatArray, y_px: FloatArray, half_px: int) -> BoolArray:
+    """Which places (n,) have no other within 2 `half_px` along both axes."""
+    places_px = np.stack([x_px, y_px], axis=1)
+    # the nearest of all is the place itself; a table of all pairs of a lattice takes a gigabyte
+    distances: Any = cKDTree(places_px).query(places_px, k=[2], p=np.inf)[0]
+    return np.asarray(distances[:, 0] > 2 * half_px)
 
 
 def cut_out(
@@ -302,7 +301,9 @@ def cut_out(
         image = read_image(path, resolution_px)
         if dark is not None:
             image = image - dark
-        is_alone = _is_alone(data.centroids.x_px[in_frame], data.centroids.y_px[in_frame])
+        is_alone = are_alone(
+            data.centroids.x_px[in_frame], data.centroids.y_px[in_frame], MAX_HALF_PX
+        )
         alone = dot[in_frame[is_alone]]
         sums.add(alone, places.cutouts(image, alone))
     return _of_frames(sums, places)
@@ -313,7 +314,7 @@ def dots_of_image(image: FloatArray, x_px: FloatArray, y_px: FloatArray, side_px
     where they are too few.
     """
     places = _Places.of(x_px, y_px, np.full(len(x_px), side_px))
-    alone = np.flatnonzero(_is_alone(x_px, y_px))
+    alone = np.flatnonzero(are_alone(x_px, y_px, MAX_HALF_PX))
     sums = _Sums.none(len(x_px))
     sums.add(alone, places.cutouts(image, alone))
     return _of_frames(sums, places)

@@ -34,6 +34,7 @@ from hilstar.basics.errors import MachineError
 from hilstar.basics.files import write_whole
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.interrupts import stop_on_signal
+from hilstar.basics.process.scheduling import HOST_CLOCK, HostClock
 from hilstar.basics.units import NS_PER_S
 from hilstar.instruments.campaign.case_motion import AXES, CaseMotion
 from hilstar.instruments.campaign.cases import Case, CaseMaker, Q, first_row
@@ -72,14 +73,15 @@ CHECK_COLUMNS = (
 
 
 class OpenDisplay(NamedTuple):
-    """An open bench with its screen (None: headless), a sink for its frames, and who follows the
-    run.
+    """An open bench with its screen (None: headless), a sink for its frames, who follows the run,
+    and the clock that paces frames without a screen.
     """
 
     bench: Bench
     screen: Screen | None = None
     sink: FrameSink = ignore
     follower: Follower = lambda running: None
+    clock: HostClock = HOST_CLOCK
 
 
 Display = Callable[[BenchFile], AbstractContextManager[OpenDisplay]]
@@ -288,7 +290,7 @@ class BenchRun:
         self._file_sha256 = bench.file.sha256
         self._last_row_ns = 0 if screen is None else round(bench.scan.scanout_s / 2 * NS_PER_S)
         if screen is None:
-            pacer = Pacer(period_ns)
+            pacer = Pacer(period_ns, opened.clock)
         else:
             pacer = DisplayPacer(screen, self._notices)
         faults = self._faults(bench, turns)

@@ -13,6 +13,19 @@ TASK_S = 0.5  # seconds of work in a task: a kill loses about as much per worker
 MAX_STARTS_LOST = 5  # processes in succession that died before they were ready
 
 
+def processes_within(memory_bytes: int, own_bytes: int, worker_bytes: int, most: int) -> int:
+    """How many workers of `worker_bytes` fit beside this process of `own_bytes`, at most `most`.
+    Raises InputError where none does.
+    """
+    room = memory_bytes - own_bytes
+    if room < worker_bytes:
+        raise InputError(
+            f"--memory {size_text(memory_bytes)}: this process and one worker take"
+            f" {size_text(own_bytes + worker_bytes)}; write so much or more"
+        )
+    return min(most, room // worker_bytes)
+
+
 class Pool:
     """`count` processes for a job, at most as many as fit into `memory_bytes` with this one. Use it
     as a context manager.
@@ -82,13 +95,7 @@ class Pool:
             return self._count
         if not self._peak_bytes:
             return 1
-        room = self._memory_bytes - peak_bytes()
-        if room < self._peak_bytes:
-            raise InputError(
-                f"--memory {size_text(self._memory_bytes)}: this process and one worker take"
-                f" {size_text(peak_bytes() + self._peak_bytes)}; write so much or more"
-            )
-        return max(1, min(self._count, room // self._peak_bytes))
+        return processes_within(self._memory_bytes, peak_bytes(), self._peak_bytes, self._count)
 
     def _take(
         self, worker: WorkerProcess, answered: Answered, backlog: Backlog, done: Done

@@ -16,7 +16,13 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import conjugate, multiply, to_rotation_vector
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.quantise import MASK_TURNS
-from hilstar.instruments.simulate.star_finder import Matched, crowded, shared, star_finder
+from hilstar.instruments.simulate.star_finder import (
+    Matched,
+    crowded,
+    inside_by,
+    shared,
+    star_finder,
+)
 from hilstar.instruments.simulate.twin import Twin, TwinField
 from hilstar.server.bench.bench_file import HeadsFile
 from hilstar.tracker.identify import wahba
@@ -99,10 +105,11 @@ class _Head:
         x_px, y_px = head_field.x_px, head_field.y_px
         radius_px = self.finder.settings.radius_px
         margin_px = radius_px + EDGE_PX
-        inside = _inside(x_px, y_px, self.twin.camera.resolution_px, margin_px)
+        inside = inside_by(margin_px, x_px, y_px, self.twin.camera.resolution_px)
         bench = self.twin.bench
         reach_px = bench.psf.footprint_px / 2 + margin_px * self.twin.monitor_px_per_px
-        inside &= _inside(truth["x_px"], truth["y_px"], bench.camera.resolution_px, reach_px)
+        monitor_px = bench.camera.resolution_px
+        inside &= inside_by(reach_px, truth["x_px"], truth["y_px"], monitor_px)
         rates = truth["electrons_per_s"]
         is_crowded = crowded(x_px, y_px, rates, radius_px, self.finder.psf)
         has_both = (sky.index >= 0) & (shown.index >= 0)
@@ -136,16 +143,6 @@ def body_attitude(
     q_icrs_to_cam = multiply(q_body_to_cam, q_icrs_to_body)
     q_icrs_to_solved = multiply(q_cam_to_solved, q_icrs_to_cam)
     return multiply(conjugate(q_body_to_cam), q_icrs_to_solved)
-
-
-def _inside(
-    x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int], margin_px: float
-) -> npt.NDArray[np.bool_]:
-    """True for places (n,) farther than a margin from an image's edges."""
-    width, height = resolution_px
-    across = (x_px > margin_px) & (x_px < width - 1 - margin_px)
-    down = (y_px > margin_px) & (y_px < height - 1 - margin_px)
-    return np.asarray(across & down)
 
 
 def verify_heads(

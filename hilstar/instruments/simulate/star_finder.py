@@ -226,6 +226,18 @@ def shared(match: IntArray) -> npt.NDArray[np.bool_]:
     return np.asarray((match >= 0) & (counts_of_match > 1))
 
 
+def inside_by(
+    margin_px: float, x_px: FloatArray, y_px: FloatArray, resolution_px: tuple[int, int]
+) -> npt.NDArray[np.bool_]:
+    """True for places (n,) farther than a margin from the middles of an image's outermost
+    pixels.
+    """
+    width, height = resolution_px
+    across = (x_px > margin_px) & (x_px < width - 1 - margin_px)
+    down = (y_px > margin_px) & (y_px < height - 1 - margin_px)
+    return np.asarray(across & down)
+
+
 def crowded(
     x_px: FloatArray, y_px: FloatArray, flux: FloatArray, radius_px: int, psf: Psf
 ) -> npt.NDArray[np.bool_]:

@@ -28,6 +28,7 @@ from hilstar.instruments.simulate.star_finder import (
     StarFinder,
     crowded,
     faintest_e_per_s,
+    inside_by,
     nearest,
     neighbours,
     shared,
@@ -596,10 +597,8 @@ class Comparison:
         margin = self.finder.settings.radius_px + 1.5
         bench = self.twin.bench
         reach = bench.psf.footprint_px / 2 + margin * self.twin.monitor_px_per_px
-        width, height = bench.camera.resolution_px
-        x = seen.truth["x_px"]
-        y = seen.truth["y_px"]
-        inside = (x >= reach) & (x < width - 1 - reach) & (y >= reach) & (y < height - 1 - reach)
+        sprites_px = seen.truth["x_px"], seen.truth["y_px"]
+        inside = inside_by(reach, *sprites_px, bench.camera.resolution_px)
         return np.asarray(inside & self._on_detector(seen, margin))
 
     def _on_detector(self, seen: TwinField, margin_px: float) -> npt.NDArray[np.bool_]:

@@ -202,7 +202,7 @@ def solver_steps(lost: Path, folder: Path) -> Iterator[Step]:
         for number, at in enumerate(ATTITUDES):
             q = from_radec_roll_deg(*at)
             picture = folder / f"lost_{number}.png"
-            Image.fromarray(bench.simulate(q, seed=58).dn).save(picture)
+            Image.fromarray(bench.simulate(q, seed=58).dn).save(picture, compress_level=1)
             words = [sys.executable, str(solver), str(lost), str(picture.resolve()), f"{fov_deg}"]
             told = subprocess.run(words, capture_output=True, text=True, check=True).stdout
             if not told:

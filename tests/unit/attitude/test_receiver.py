@@ -18,7 +18,15 @@ import pytest
 from hilstar.attitude.clock.timeline import Policy, Timeline
 from hilstar.attitude.receiver import QUEUED_NS, Receiver, Traffic
 from hilstar.attitude.wire.links import Arrival
-from hilstar.attitude.wire.packet import AttitudeSample, Packet, Status, encode
+from hilstar.attitude.wire.packet import (
+    AttitudeSample,
+    Packet,
+    Refusal,
+    Status,
+    TimeReply,
+    TimeRequest,
+    encode,
+)
 from hilstar.basics.notices import Notice, Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK, UNDISCIPLINED_NS, UnixOffset
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
@@ -598,6 +606,27 @@ def test_a_receiver_that_breaks_is_started_again_and_said():
     assert run.events == {"receiver-failed": 2}
 
 
+def test_a_receiver_that_breaks_again_and_again_is_started_ever_more_seldom():
+    """As seldom as once a second, until it has run for over ten."""
+    clock = Clock()
+    link = Script([], clock, fails=[OSError("no such socket")] * 20)
+    receiver = Receiver(link, Timeline(Policy(0, NS_PER_S)), now_ns=clock)
+    receiver.start()
+    waits_ms = []
+    for after_ns in (0, 0, 0, 0, 0, 0, 0, 10 * NS_PER_S + 1, 0):
+        broken = receiver._thread
+        broken.join(PATIENCE_S)
+        clock.now_ns += after_ns
+        begun_ns = clock.now_ns
+        receiver.tend()
+        while receiver._thread is broken:
+            clock.now_ns += NS_PER_MS
+            receiver.tend()
+        waits_ms.append((clock.now_ns - begun_ns) // NS_PER_MS)
+    receiver.close()
+    assert waits_ms == [50, 100, 200, 400, 800, 1000, 1000, 50, 100]
+
+
 def test_a_receiver_that_is_stopped_while_it_is_broken_ends():
     link = Script([], Clock(), fails=[MemoryError()] * 5)
     receiver = Receiver(link, Timeline(Policy(0, NS_PER_S)))
@@ -910,3 +939,55 @@ def test_a_receiver_that_is_closed_has_left_its_link():
     (thread,) = set(threading.enumerate()) - before
     receiver.close()
     assert not thread.is_alive()
+
+
+def test_what_is_no_attitude_is_counted_by_reason_told_once_and_watched():
+    """Over a link that carries nothing back; a sample that is refused is watched with what it says."""
+    good = AttitudeSample(10**15, ORION, None, 7)
+    events = [
+        TimeReply(1, 2, 3, 4),
+        Refusal("crc", "JSON came", telling=True),
+        Refusal("crc", "HTTP came", telling=True),
+        TimeRequest(5, 6),
+        good,
+        replace(good, sequence=8),
+    ]
+    clock = Clock()
+    arrivals = []
+    for k, event in enumerate(events):
+        arrivals.append(Arrival(clock.now_ns + k * NS_PER_S, event, b"raw %d" % k))
+    sent = [*arrivals]
+    link, notices, told, watched = Script(arrivals, clock), Notices(), [], []
+    notices.listen(lambda notice: told.append((notice.kind, notice.detail)))
+    receiver = Receiver(
+        link,
+        Timeline(Policy(STALE_AFTER_NS, STALE_AFTER_NS)),
+        watch=lambda *message: watched.append(message),
+        notices=notices,
+        now_ns=clock,
+    )
+    while link.arrivals:
+        receiver.listen()
+    receiver.release()
+    counts = receiver.counts
+    assert (counts.received, counts.refused, counts.lost) == (6, 5, 0)
+    assert {reason: count for reason, count in counts.refused_by.items() if count} == {
+        "format": 2,
+        "crc": 2,
+        "time": 1,
+    }
+    assert counts.shown == {"crc": "JSON came"}
+    details = [
+        "(format): a TimeReply packet is not an attitude",
+        "(crc): JSON came",
+        f"(time): t_ns {good.t_ns} repeats that of the previous packet",
+    ]
+    assert told == [
+        ("refused", f"packet refused {detail}; further ones are only counted") for detail in details
+    ]
+    assert [raw for _, raw, _, _ in watched] == [arrival.raw for arrival in sent]
+    assert [host_ns for host_ns, *_ in watched] == [arrival.host_ns for arrival in sent]
+    assert [sample for _, _, sample, _ in watched[:4]] == [None] * 4
+    assert [sample.sequence for _, _, sample, _ in watched[4:]] == [7, 8]
+    reasons = [refusal and refusal.reason for *_, refusal in watched]
+    assert reasons == ["format", "crc", "crc", "format", None, "time"]

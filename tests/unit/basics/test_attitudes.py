@@ -49,6 +49,7 @@ def test_a_quantity_is_turned_into_the_unit_that_is_wanted():
     assert share_of(50 * u.percent, "share") == 0.5
     assert rate_of([0, 0, 180] * u.deg / u.s) == pytest.approx([0, 0, np.pi])
     assert t_ns_of(2.5 * u.us) == 2500
+    assert [t_ns_of(ns * u.ns) for ns in (2.4, 2.6, -2.6)] == [2, 3, -3]
     assert t_ns_of(np.int64(-3)) == -3
     assert numbers_of([1, 2] * u.deg, "places", ("n",), "arcsec", "of places").tolist() == [
         3600.0,
@@ -102,3 +103,9 @@ def test_columns_more_are_of_the_rows_that_have_them():
     assert wider["star"].tolist() == [1, 2, 3]
     np.testing.assert_array_equal(wider["dn"], [7.0, np.nan, 5.0])
     assert wider["lit"].tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("rate", [(0.0, np.inf, 0.0), (np.nan, 0.0, 0.0)])
+def test_a_rate_that_is_not_finite_is_refused(rate):
+    line = refusal(rate_of, rate)
+    assert line.startswith("rate_cam_rad_s [") and "]: is not finite; write three numbers" in line

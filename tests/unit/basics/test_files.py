@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from hilstar.basics import files
 from hilstar.basics.errors import InputError
 from hilstar.basics.files import (
     CSV,
@@ -18,12 +19,14 @@ from hilstar.basics.files import (
     check_directory,
     check_ending,
     check_outputs,
+    clear_parts,
     files_named_in,
     lock_alone,
     refuse_existing,
     whole_file,
     write_whole,
 )
+from hilstar.basics.reading import CHUNK_BYTES
 from tests.support.full_disk import files_of_at_most
 from tests.support.refusals import refusal
 
@@ -61,12 +64,17 @@ def test_what_a_bench_file_names_is_an_input_too(tmp_path):
     (tmp_path / "m.toml").write_text('[calibration]\nresponse = "m.csv"\n')
     (tmp_path / "b.toml").write_text(
         '[tracker]\nquantum_efficiency = "qe.csv"\n[monitor]\ncalibration = "m.toml"\n'
+        '[[maps]]\nfiles = [["first.fits"], ["second.fits", 5]]\n'
     )
+    for name in ("first.fits", "second.fits"):
+        (tmp_path / name).write_text("")
     assert {path.name for path in files_named_in(tmp_path / "b.toml")} == {
         "b.toml",
         "qe.csv",
         "m.toml",
         "m.csv",
+        "first.fits",
+        "second.fits",
     }
 
 
@@ -257,3 +265,61 @@ def test_what_somebody_did_to_a_file_is_told(tmp_path, content, harm):
     (tmp_path / "run.mcap").unlink()
     assert file.harm(5, zlib.crc32(b"12345")) == "deleted"
     file.close()
+
+
+def test_a_file_that_is_only_touched_is_read_through_at_longer_and_longer_intervals(
+    tmp_path, monkeypatch
+):
+    """After 1, 2 and 4 s: what is done to it in between is told at the next. It is of several
+    pieces, which all count.
+    """
+    clock = [100.0]
+    monkeypatch.setattr(files.time, "monotonic", lambda: clock[0])
+    path = tmp_path / "run.mcap"
+    file = NewFile(path)
+    content = bytes(range(256)) * (2 * CHUNK_BYTES // 256) + b"end"
+    os.write(file.fd, content)
+    file.note()
+    crc = zlib.crc32(content)
+    os.utime(path, ns=(0, 0))
+    for now_s in (100.0, 101.0, 103.0):
+        clock[0] = now_s
+        assert file.harm(len(content), crc) is None
+    with path.open("r+b") as other:
+        other.seek(CHUNK_BYTES + 5)
+        other.write(b"!")
+    os.utime(path, ns=(0, 0))
+    for now_s, harm in ((104.0, None), (106.9, None), (107.0, "overwritten")):
+        clock[0] = now_s
+        assert file.harm(len(content), crc) == harm
+    file.close()
+
+
+def test_what_killed_writers_of_any_version_left_is_deleted_and_nothing_else(tmp_path):
+    (tmp_path / "sub").mkdir()
+    left = [".run.0123456789abcdef.part.mcap", ".a.b.4711.part.csv", "sub/.x.00ff00ff00ff00ff.part"]
+    kept = [
+        ".run.0123456789abcde.part.mcap",
+        "run.4711.part.csv",
+        ".run.part",
+        ".hidden",
+        "run.csv",
+    ]
+    for name in (*left, *kept):
+        (tmp_path / name).write_text("")
+    (tmp_path / ".link.4711.part").symlink_to(tmp_path / "run.csv")
+    clear_parts(tmp_path)
+    there = {path.name for path in tmp_path.iterdir()}
+    assert there == {*kept, "sub", ".link.4711.part"}
+    assert list((tmp_path / "sub").iterdir()) == []
+
+
+def test_a_lock_that_another_has_is_refused_and_leaves_no_descriptor_open(tmp_path):
+    held = lock_alone(tmp_path / "lock", "another run is there")
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    for _ in range(3):
+        line = refusal(lock_alone, tmp_path / "lock", "another run is there")
+        assert line == f"{tmp_path}: another run is there"
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    os.close(held)
+    os.close(lock_alone(tmp_path / "lock", "another run is there"))

@@ -121,6 +121,17 @@ def test_fits_that_is_packed_is_bounded_by_what_it_unpacks_to(tmp_path: Path):
         opened_fits(whole.getvalue(), (64, 65)),
     ):
         pass
+    several = io.BytesIO()
+    fits.HDUList(
+        [fits.PrimaryHDU(np.zeros((64, 32), dtype=np.float32)), fits.ImageHDU(np.zeros((9, 7)))]
+    ).writeto(several)
+    with opened_fits(several.getvalue(), (32, 64)) as hdus:  # the first alone has to have it
+        assert [hdu.data.shape for hdu in hdus] == [(64, 32), (9, 7)]
+    # floats, whose BITPIX is below 0
+    card = b"NAXIS2  = " + b"64".rjust(20)
+    promised = several.getvalue().replace(card, card[:10] + b"99999999".rjust(20), 1)
+    with pytest.raises(ImageSizeError, match=r"unpacks to 12\.8 GB, and"), opened_fits(promised):
+        pass
     packed = gzip.compress(whole.getvalue())
     with opened_fits(packed, (64, 64)) as hdus:
         assert hdus[0].data.shape == (64, 64)

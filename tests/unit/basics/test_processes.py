@@ -4,6 +4,7 @@ counts, when a reader is prompt, what nobody reads, and where users' modules com
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import gc
 import importlib.util
@@ -18,6 +19,7 @@ import sys
 import threading
 import time
 from importlib.machinery import PathFinder
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -343,6 +345,138 @@ def test_a_signal_that_comes_while_it_is_held_raises_at_the_end(ending):
     with interrupts.held():  # the end is under way
         done.append("again")
     assert interrupts.caught() == "SIGINT"
+
+
+def ended(work) -> tuple[int, str, str]:
+    """The exit code of a fork of this process that does `work`, and what its stdout and stderr say;
+    99 where the work comes to its end.
+    """
+    (out, to_out), (err, to_err) = os.pipe(), os.pipe()
+    child = os.fork()
+    if child == 0:
+        with contextlib.suppress(BaseException):
+            os.setsid()
+            os.dup2(to_out, 1)
+            os.dup2(to_err, 2)
+            sys.stdout, sys.stderr = (os.fdopen(fd, "w", closefd=False) for fd in (1, 2))
+            for fd in (out, to_out, err, to_err):
+                os.close(fd)
+            work()
+        os._exit(99)
+    os.close(to_out)
+    os.close(to_err)
+    with os.fdopen(out) as stdout, os.fdopen(err) as stderr:
+        said = stdout.read(), stderr.read()
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status), *said
+
+
+def watched_end(monkeypatch, wait_s: float, echo_s: float, second_s: float | None) -> tuple:
+    """How the watching thread ends a process that a SIGTERM does not end, where a SIGINT comes so
+    long after it.
+    """
+    monkeypatch.setattr(interrupts, "THREAD_WAITS_S", wait_s)
+    monkeypatch.setattr(interrupts, "ECHO_S", echo_s)
+
+    def hang() -> None:
+        watched, teller = socket.socketpair()
+        threading.Thread(target=interrupts._watch, args=(watched,), daemon=True).start()
+        teller.send(bytes([signal.SIGTERM]))
+        if second_s is not None:
+            time.sleep(second_s)
+            teller.send(bytes([signal.SIGINT]))
+        time.sleep(PATIENCE_S)
+
+    return ended(hang)
+
+
+def test_a_process_that_a_signal_does_not_end_is_ended_with_a_line_and_the_first_signal_s_code(
+    ending, monkeypatch
+):
+    code, _, line = watched_end(monkeypatch, 0.05, 0.0, None)
+    assert code == 128 + 15
+    assert line.startswith("hilstar: ended 0.05 s after SIGTERM, in the middle of ")
+    assert line.count("\n") == 1
+
+
+def test_a_second_signal_ends_it_at_once_and_the_echo_of_the_first_does_not(ending, monkeypatch):
+    """A terminal and a wrapper both pass one Ctrl-C on."""
+    code, _, line = watched_end(monkeypatch, PATIENCE_S, 0.0, 0.1)
+    assert (code, line) == (128 + 15, "hilstar: ended at the second signal\n")
+    code, _, line = watched_end(monkeypatch, 0.2, PATIENCE_S, 0.05)
+    assert code == 128 + 15
+    assert line.startswith("hilstar: ended 0.2 s after SIGTERM")
+
+
+def test_what_ends_a_process_ends_its_children_but_its_guard(ending):
+    """The guard ends by itself. What a child of these holds is the pipe of stdout, to its end."""
+
+    def work() -> None:
+        children = []
+        for _ in range(3):
+            children.append(os.fork())
+            if children[-1] == 0:
+                time.sleep(PATIENCE_S)
+                os._exit(0)
+        interrupts.end_children(os.getpid(), children[1], None)
+        for child in (children[0], children[2]):
+            _, status = os.waitpid(child, 0)
+            assert os.waitstatus_to_exitcode(status) == -signal.SIGKILL
+        assert os.waitpid(children[1], os.WNOHANG) == (0, 0)
+        interrupts._ending.guard = children[1]
+        interrupts._let_guard_go()
+        with contextlib.suppress(ChildProcessError):
+            os.waitpid(children[1], 0)
+            return
+        os._exit(7)
+
+    assert ended(work)[0] == 7
+
+
+@pytest.mark.parametrize(("has_thread", "said"), [(False, "printed\nat exit\n"), (True, "")])
+def test_a_process_that_is_left_says_what_it_had_to_unless_a_thread_still_waits(
+    ending, has_thread, said
+):
+    def work() -> None:
+        interrupts._ending.guard = None
+        atexit._clear()
+        for thread in threading.enumerate():  # of this process's tests: a fork has none of them
+            assert thread is threading.main_thread()
+        if has_thread:
+            threading.Thread(target=time.sleep, args=(PATIENCE_S,), daemon=True).start()
+        atexit.register(lambda: os.write(1, b"at exit\n"))
+        sys.stdout.write("printed\n")
+        interrupts.leave(5)
+
+    assert ended(work) == (5, said, "")
+
+
+def test_a_command_ends_by_its_first_signal_and_keeps_a_hang_up_that_was_ignored(ending):
+    """Its guard is there, twice makes no second one, and stdin, closed before, is nobody else's."""
+
+    def work() -> None:
+        interrupts._ending.guard = None
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell has it for what runs with &
+        os.close(0)
+        sys.stdin = None
+        assert not interrupts.is_command()
+        interrupts.install()
+        guard = interrupts._ending.guard
+        interrupts.install()
+        assert interrupts.is_command() and interrupts._ending.guard == guard
+        assert Path("/proc/self/fd/0").readlink() == Path(os.devnull)
+        assert sys.stdin.fileno() == 0 and not sys.stdin.writable()
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        try:
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(PATIENCE_S)
+        except KeyboardInterrupt:
+            assert interrupts.caught() == "SIGINT"
+            os.kill(guard, 0)
+            interrupts.leave(interrupts.exit_code())
+
+    assert ended(work) == (128 + 2, "", "")
 
 
 PARENT_OF_ONE = """

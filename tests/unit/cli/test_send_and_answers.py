@@ -8,6 +8,7 @@ import pytest
 
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import run_hilstar_here
+from tests.support.senders import free_port
 
 ANSWERS = '[answers]\nsource = "file"\npath = "line.bin"\nformat = "json"\n'
 LINES = [
@@ -30,6 +31,19 @@ def test_a_cable_s_faults_add_up_to_every_packet_at_most(lost, corrupted, reorde
     shares = ["--lose", lost, "--corrupt", corrupted, "--reorder", reordered]
     refused = run_hilstar_here("send", "gone.jsonl", *shares)
     assert refused.returncode == 2 and words in refused.stderr
+
+
+@pytest.mark.parametrize(("duration", "packets"), [("0.1", 3), ("0.04", 2)])
+def test_a_duration_counts_from_the_log_s_first_sample_and_ends_before_its_end(
+    tmp_path, duration, packets
+):
+    times_s = (1000.0, 1000.02, 1000.04, 1000.5)
+    rows = [f"{t_s},1,0,0,0" for t_s in times_s]
+    (tmp_path / "log.csv").write_text("\n".join(["t_s,qw,qx,qy,qz", *rows]) + "\n")
+    words = ["send", "log.csv", "--to", f"udp://127.0.0.1:{free_port()}", "--wait", "0", "--json"]
+    sent = run_hilstar_here(*words, "--duration", duration, cwd=tmp_path)
+    assert sent.returncode == 0, sent.stderr
+    assert json.loads(sent.stdout)["packets"] == packets
 
 
 def test_recorded_answers_are_counted_valid_ones_apart_and_refused_ones_by_reason(tmp_path):

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.running_statistics import Percentiles
 from hilstar.cli import demo as demo_command
 from hilstar.cli import serve as serve_command
@@ -35,11 +36,13 @@ from hilstar.instruments.campaign import acceptance as acceptance_engine
 from hilstar.instruments.campaign import acceptance_page, acceptance_plan
 from hilstar.instruments.campaign.requirements import NOT_MET
 from hilstar.instruments.simulate import heads as twin_heads
+from hilstar.instruments.simulate import simulator
 from hilstar.instruments.simulate.tracker_process import SILENT_AFTER_S, Planted
 from hilstar.server.answers.answer import Answer
+from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.heads import HeadsRun
 from tests.support.benches import bench_text
-from tests.support.commands import run_hilstar_here
+from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.refusals import refusal
 
 Q = np.array([0.5, -0.5, 0.5, -0.5])
@@ -339,6 +342,16 @@ def test_a_head_s_end_is_said_in_a_line(summary: Any, restarts: int, line: str) 
     assert " ".join(serve_command._head_line("left", head).split()) == line
 
 
+def test_the_demo_s_tracker_answers_on_this_machine_s_clock(tmp_path: Path) -> None:
+    """Its process reads the same one as the display's."""
+    (tmp_path / "demo.toml").write_text(bench_text())
+    with demo_command.tracker_beside(tmp_path / "loop", tmp_path / "demo.toml", 1.0, 5):
+        config = read_bench_file(tmp_path / "loop" / "loop.toml").config
+    assert config.answers is not None
+    assert (config.answers.source, config.answers.clock) == ("zmq", "host")
+    assert str(config.answers.endpoint).startswith("ipc://")
+
+
 def planted_demo(folder: Path) -> TrackerBeside:
     """The demo's tracker, which does not run."""
     return TrackerBeside(folder, folder / "loop.toml", "ipc://answers", 30.0, 5)
@@ -606,3 +619,22 @@ def test_an_acceptance_that_is_not_met_is_an_error_where_that_is_asked_for(
     done = run_hilstar_here("accept", "bench.toml", "-o", "out", *words, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (code, "")
     assert done.stdout.splitlines()[0] == "a line"
+
+
+def test_a_scenario_gives_an_exposure_its_moments(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without one nothing changes in a sky of stars alone."""
+
+    def opened(file: Any) -> Any:
+        raise InputError("enough")
+
+    monkeypatch.setattr(simulator, "Simulator", opened)
+    (tmp_path / "bench.toml").write_text(bench_text())
+    fault = 'kind = "false-star"\nname = "ghost"\nscreen_px = [40, 50]\nelectrons_per_s = 1e5\n'
+    (tmp_path / "ghost.toml").write_text(f"[[fault]]\n{fault}at_s = 1.0\n")
+    words = ["simulate", "bench.toml", "--radec", "84,-1,0", "-o", "o.fits", "--at", "1.5"]
+    still = run_hilstar_here(*words, cwd=tmp_path)
+    assert_refused(still, 2, "simulate --at 1.5: nothing moves in this sky")
+    timed = run_hilstar_here(*words, "--scenario", "ghost.toml", cwd=tmp_path)
+    assert_refused(timed, 2, "enough")

@@ -10,11 +10,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilstar.basics.errors import MachineError, NotThereError
 from hilstar.basics.units import COMPUTE_VERSION
 from hilstar.display.exact import ExactQuantiser, Turn
 from hilstar.display.footprints import PixelOrder
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import round_levels
+from hilstar.display.render import context, numpy_backend
 from hilstar.display.render.aids import CROSSHAIR, GRID, PATCH, AidLevels, lay_over
 from hilstar.display.render.apart import ApartBackend
 from hilstar.display.render.backend import ScreenView, as_maps, level_cost
@@ -29,7 +31,7 @@ from hilstar.display.render.encoder import (
     viewport_of_sprites,
 )
 from hilstar.display.render.light_units import DENSER_WINGS, MAX_SUM, LightUnits
-from hilstar.display.render.numpy_backend import NumpyBackend
+from hilstar.display.render.numpy_backend import NumpyBackend, headless_context
 from hilstar.display.render.presenter import checked_triples, drawn_codes
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.target import SpriteSide, Target
@@ -50,6 +52,53 @@ UNITS = 1e-2
 def units(uniformity: np.ndarray | None = None) -> LightUnits:
     response = gamma_response(8, 2.2)
     return LightUnits(Panel(response, WHITE_E_PER_S, uniformity), SIZE_PX, PSF)
+
+
+NO_EGL = "libEGL-that-is-nowhere.so.1 is missing"
+
+
+@pytest.mark.parametrize("cause", ["no library", "no context"])
+def test_without_opengl_numpy_draws_with_one_warning_and_a_wish_for_it_is_refused(
+    cause, monkeypatch, caplog
+):
+    why = "OpenGL 3.3 is missing"
+
+    def refused(gpu: int | str | None) -> None:
+        raise MachineError(why)
+
+    if cause == "no library":
+        why = NO_EGL
+        monkeypatch.setattr(numpy_backend, "EGL_LIBRARY", NO_EGL.split(maxsplit=1)[0])
+    else:
+        monkeypatch.setattr(numpy_backend, "EGL_LIBRARY", None)  # this process's own names
+    monkeypatch.setattr(context, "create_context", refused)
+    numpy_backend._say_once.cache_clear()
+    monkeypatch.delenv("HILSTAR_DRAW", raising=False)
+    assert [headless_context() for _ in range(3)] == [None] * 3
+    monkeypatch.setenv("HILSTAR_DRAW", "cpu")
+    assert headless_context() is None
+    assert [record.getMessage() for record in caplog.records] == [
+        f"no OpenGL here ({why}): the processor draws, discs and `exact` slower than OpenGL would;"
+        " 'hilstar doctor' says what to install"
+    ]
+    monkeypatch.setenv("HILSTAR_DRAW", "gl")
+    with pytest.raises(MachineError) as said:
+        headless_context()
+    assert str(said.value) == (
+        f"HILSTAR_DRAW=gl, and there is no OpenGL ({why}); unset it, or see 'hilstar doctor'"
+    )
+
+
+@pytest.mark.parametrize("wanted", ["gl", "cpu"])
+def test_no_other_gpu_draws_in_the_place_of_one_that_is_named(wanted, monkeypatch):
+    def refused(gpu: int | str | None) -> None:
+        raise NotThereError(f"GPU {gpu}: not there")
+
+    monkeypatch.setattr(context, "create_context", refused)
+    monkeypatch.setattr(numpy_backend, "EGL_LIBRARY", NO_EGL)  # which only the default GPU needs
+    monkeypatch.setenv("HILSTAR_DRAW", wanted)
+    with pytest.raises(NotThereError, match="GPU 3: not there"):
+        headless_context(3)
 
 
 def test_the_dimmest_pixel_sets_what_lights_one_and_the_brightest_what_white_is():

@@ -7,8 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from hilstar.optics.layers.diffuse_layer import CELL_PX, _Face, _Part
+from hilstar.display.render.reference import extended_image
+from hilstar.optics.camera import Camera
+from hilstar.optics.layers.diffuse_layer import CELL_PX, DiffuseLayer, _Face, _Part
+from hilstar.optics.layers.star_layer import no_light
+from hilstar.optics.layers.view import Canvas, View
+from hilstar.optics.psf import GaussianPsf
 from hilstar.sky.diffuse import TangentImage
+from tests.support.stars import stars_at
 
 PX_RAD = 1e-4
 ROUNDING_PX = 1e-6
@@ -25,6 +31,30 @@ def test_one_lit_pixel_is_the_middle_of_its_light(size):
     column, row = face.image.places_px(face.middle)
     assert (column, row) == pytest.approx((5.0, 1.0), abs=ROUNDING_PX)
     assert math.acos(face.cos_radius) == pytest.approx(3 * CELL_PX * PX_RAD, rel=1e-6)
+
+
+def test_a_map_is_as_round_and_as_wide_as_the_psf_in_the_mean_of_its_axes():
+    """One lit pixel, as large as the camera's and in its middle: a Gaussian of the mean of both
+    variances and that of a pixel, 1/12, over which a PSF is summed; in electrons of a pixel's own
+    solid angle.
+    """
+    focal_px, size_px, place_px = 2000.0, (64, 48), (40.0, 20.0)
+    camera = Camera(size_px, focal_px, place_px, np.eye(3))
+    image = np.zeros((21, 21), dtype=np.float32)
+    image[10, 10] = 1e9
+    canvas = Canvas(camera, GaussianPsf((0.7, 1.9)))
+    layer = DiffuseLayer((TangentImage(image, np.eye(3), focal_px),), canvas)
+    stars = stars_at(-np.eye(3), np.ones(3))
+    nothing = no_light(canvas.psf.footprint_px)
+    seen = layer.add(nothing, stars, View(np.array([1.0, 0.0, 0.0, 0.0])))
+    light = extended_image(seen.extended, size_px)
+    assert light.sum() == pytest.approx(1e9 / focal_px**2, rel=1e-3)
+    y, x = np.indices(light.shape)
+    for at, middle in ((x, place_px[0]), (y, place_px[1])):
+        assert np.average(at, weights=light) == pytest.approx(middle, abs=1e-3)
+        variance = np.average((at - middle) ** 2, weights=light)
+        # a filter cut at 4 sigmas has 0.1 % less, and pixels off the axis their own solid angle
+        assert variance == pytest.approx((0.7**2 + 1.9**2) / 2 + 1 / 12, rel=5e-3)
 
 
 def test_no_pixel_has_a_direction_beside_or_behind_the_plane():

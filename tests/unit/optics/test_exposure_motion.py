@@ -201,3 +201,25 @@ def test_the_same_turn_is_drawn_alike_however_long_it_takes():
     np.testing.assert_allclose(
         drawn[1].data["electrons_per_s"], drawn[0].data["electrons_per_s"], rtol=1e-6
     )
+
+
+@pytest.mark.parametrize(("px_a_row", "is_drawn"), [(0.45, True), (0.55, False)])
+def test_a_turn_may_cross_half_a_row_while_one_is_read_and_its_line_says_how_much(
+    px_a_row, is_drawn
+):
+    """About the boresight of an image that is wider than high: the corner is the fastest."""
+    scan = Scan((0, 1), scanout_s=0.24)
+    corner_px = np.hypot(*(np.array(SIZE) / 2))
+    row_s = scan.scanout_s / SIZE[1]
+    rate_deg_s = np.degrees(px_a_row / row_s / corner_px)
+    at = motion((0.0, 0.0, rate_deg_s), 0.01)
+    stars, psf = star_on((100.0, 60.0), at), GaussianPsf(SIGMA)
+    if is_drawn:
+        assert len(smeared_sprites(stars, at, CAMERA, psf, scan)) > 1
+        return
+    with pytest.raises(InputError) as refused:
+        smeared_sprites(stars, at, CAMERA, psf, scan)
+    line = str(refused.value)
+    said_px = float(line.removeprefix("the camera turns by ").partition(" px")[0])
+    assert said_px == pytest.approx(px_a_row, rel=0.02)
+    assert line.endswith(" px while a row is read; shorten row_time_us or turn more slowly")

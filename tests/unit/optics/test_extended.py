@@ -16,6 +16,7 @@ from hilstar.optics.extended import (
     LightMap,
     Pose,
     Shear,
+    clipped,
     disc_lights,
     shifted,
     times,
@@ -209,3 +210,68 @@ def test_light_times_a_factor_has_so_much_more_of_it_and_hides_as_much():
     assert times(disc, 3.0).times == 15.0
     more = times(LightMap(cover, times=5.0, cover=cover), 3.0)
     assert (more.times, more.cover is cover, more.image is cover) == (15.0, True, True)
+
+
+@pytest.mark.parametrize(
+    ("edges_px", "wanted"),
+    [
+        ((1.2, 2.7, 5.1, 6.9), (1, 2, 5, 5)),
+        ((1.0, 2.0, 5.0, 6.0), (1, 2, 4, 4)),
+        ((-3.5, -1.0, 2.5, 4.0), (0, 0, 3, 4)),
+        ((90.0, 70.5, 120.0, 99.0), (90, 70, 6, 10)),
+        ((96.0, 10.0, 99.0, 20.0), None),
+        ((10.0, 80.0, 20.0, 90.0), None),
+        ((-9.0, 10.0, 0.0, 20.0), None),
+        ((-9.0, -9.0, 999.0, 999.0), (0, 0, 96, 80)),
+    ],
+)
+def test_a_rectangle_has_each_pixel_that_it_touches(edges_px, wanted):
+    assert clipped(edges_px, SIZE_PX) == wanted
+
+
+def test_a_disc_that_reaches_behind_the_camera_may_be_anywhere_on_the_image():
+    """20 degrees wide, 75 degrees off the axis: its limb from 55 to 95."""
+    direction = np.array([np.sin(np.radians(75)), 0.0, np.cos(np.radians(75))])
+    pole = np.array([0.0, 1.0, 0.0])
+    distance_km = 1 / np.sin(np.radians(20))
+    disc = Disc("x", direction, distance_km, 1.0, 1.0, pole, -direction, "uniform", 1e6)
+    assert DiscLight(disc, np.eye(3), CAMERA, PSF).region(SIZE_PX) == (0, 0, *SIZE_PX)
+    narrow = Disc("x", direction, 100 * distance_km, 1.0, 1.0, pole, -direction, "uniform", 1e6)
+    assert DiscLight(narrow, np.eye(3), CAMERA, PSF).region(SIZE_PX) is None
+    glow = GlowLight(np.array([0.0, 0.0, -1.0]), 1.0, 0.1, 2.0, CAMERA)
+    assert glow.region(SIZE_PX) == (0, 0, *SIZE_PX)
+
+
+@pytest.mark.parametrize("s_per_px", [(0.0, 2e-4), (0.0, -2e-4), (-1e-4, 0.0), (1e-4, -1e-4)])
+def test_a_sheared_disc_s_pixels_reach_as_far_as_the_turn_may_move_it(s_per_px):
+    """From the middle to an edge: half of the rows, by the farthest pixel's lever, to either side
+    and twice, whichever way the rows go.
+    """
+    sigma_px = (0.7, 2.1)
+    disc = uniform_disc((30.0, 50.0), 12.0)
+    rate = np.array([0.3, -0.4, 1.2])
+    view = DiscLight(
+        disc, np.eye(3), CAMERA, GaussianPsf(sigma_px), shear=Shear(rate, s_per_px, MIDDLE_PX)
+    )
+    late_s = (abs(s_per_px[0]) * SIZE_PX[0] + abs(s_per_px[1]) * SIZE_PX[1]) / 2
+    moved_px = 2 * 1.3 * late_s * np.hypot(CAMERA.focal_length_px, max(SIZE_PX))
+    left, top, width, height = view.region((1000, 1000))
+    for first, size, middle, sigma in (
+        (left, width, 30.0, sigma_px[0]),
+        (top, height, 50.0, sigma_px[1]),
+    ):
+        reach_px = 12.0 + 4 * np.sqrt(sigma**2 + 1 / 12) + moved_px
+        assert reach_px < first + size - middle < reach_px + 3
+        assert first == max(0, first)
+        assert first == 0 or reach_px < middle - first < reach_px + 3
+
+
+def test_a_map_moved_by_part_of_a_pixel_is_nowhere_negative_and_hides_nowhere_more_than_all():
+    """Beside hard edges, where cubic splines overshoot."""
+    image = np.zeros((12, 9), dtype=np.float32)
+    image[3:9, 2:7] = 100.0
+    moved = shifted(LightMap(image, (4, 5), cover=image / 100), 0.4, -0.3)
+    assert isinstance(moved, LightMap)
+    assert moved.image.min() == 0.0
+    assert moved.image.max() > 101
+    assert (moved.cover.min(), moved.cover.max()) == (0.0, 1.0)

@@ -52,6 +52,18 @@ def test_every_direction_on_the_screen_is_within_the_cull_and_none_behind_it_com
     assert np.isnan(camera.places_px(far, np.zeros(50))[0]).all()
 
 
+def test_the_terms_of_a_residual_field_rise_first_along_rows_as_files_have_them():
+    """T_i of the column times T_j of the row, from -1 at an edge of the outer pixel to 1 at the
+    other: T0T0, T0T1, T0T2, T1T0, T1T1, T2T0. A field of each term alone has that term.
+    """
+    x_px, y_px = np.array([-0.5, 100.0, 1400.25]), np.array([1079.5, 700.0, 13.0])
+    u = 2 * (x_px + 0.5) / SIZE[0] - 1
+    v = 2 * (y_px + 0.5) / SIZE[1] - 1
+    one = np.ones(3)
+    wanted = np.column_stack([one, v, 2 * v**2 - 1, u, u * v, 2 * u**2 - 1])
+    assert field_terms(x_px, y_px, SIZE, 2) == pytest.approx(wanted, abs=1e-12)
+
+
 def test_an_ideal_lens_is_the_pinhole():
     camera = bounded(replace(PINHOLE, lens=Lens()), MARGIN_PX)
     rays = PINHOLE.rays(np.array([0.0, 700.0, 1919.0]), np.array([1079.0, 300.0, 0.0]))

@@ -132,6 +132,28 @@ def test_an_exposure_is_half_before_and_half_after_its_attitude_and_a_still_one_
         assert np.abs(linear_image(light, SIZE_PX, PSF) - wanted).max() < PIXEL_LIMIT * wanted.sum()
 
 
+@pytest.mark.parametrize("is_exposed", [False, True])
+def test_a_turn_beyond_what_a_frame_draws_takes_a_satellite_where_it_takes_the_stars(is_exposed):
+    """45 degrees in a frame: its paths are those of a slower turn, and an exposure's are not. The
+    star stood where the satellite does, which moves by a pixel meanwhile.
+    """
+    one = scene()
+    fast = np.radians((900.0, 0.0, 0.0))
+    view = View(one.q, fast, one.t_ns, scan=Scan(scanout_s=0.005, hold_s=0.05))
+    if is_exposed:
+        view = View.exposure(one.q, fast / 100, 0.05, one.t_ns)
+    canvas = Canvas(CAMERA, PSF)
+    stars = seen_in(view, one.stars, one.sky)
+    light = light_of(canvas, sky_layers(canvas, Sources(one.sky)), stars, view)
+    places = []
+    for star in (0, 3):
+        of_star = light.star == star
+        rate = light.data["electrons_per_s"][of_star]
+        places.append([np.average(at[of_star], weights=rate) for at in (light.x_px, light.y_px)])
+    assert len(places) == 2
+    assert np.hypot(*np.subtract(*places)) < 3
+
+
 def test_satellites_fainter_than_the_faintest_are_neither_drawn_nor_written():
     one = scene()
     view = View.exposure(one.q, RATE, 0.05, one.t_ns)

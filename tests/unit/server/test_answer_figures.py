@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
+from hilstar.basics.running_statistics import Percentiles
 from hilstar.server.record.answer_figures import AnswerSpan, AnswerTally, SpanTally, answer_rows
 from hilstar.server.record.ledger_records import AnswerRecord, FaultRecord, FrameRecord
 from hilstar.server.record.run_figures import figures_of, summarise
@@ -369,12 +371,15 @@ def test_the_rows_of_a_report_say_the_answers_figures():
         fault_record(5.7, "end", 1, "flash"),
         fault_record(9.5, "start", 2, "haze"),
     )
-    rows = dict(answer_rows(tally.report(START_NS)))
+    report = tally.report(START_NS)
+    rows = dict(answer_rows(report))
     assert rows["tracker's answers"] == (
         "11: 6 right, 2 wrong, 1 without an attitude, 1 of no sky, 1 not judged; 1 came out of"
         " order"
     )
-    assert rows["tracker's availability"].startswith("66.7 %, ")
+    late = replace(report, latency_ms=Percentiles(12.0, 34.5, 40.0))
+    late_rows = dict(answer_rows(late))
+    assert late_rows["tracker's availability"] == "66.7 %, 12.0 / 34.5 ms late (p50 / p99)"
     assert rows["residual x, y, z, rms"] == "2.6 2.2 22.7 arcsec; mean 2.0 1.2 15.0"
     assert rows["fault flash"] == (
         "before 100.0 %, 2.2 2.8 19.1 arcsec; during 33.3 %, 0.0 1.0 20.0 arcsec; after 50.0 %,"

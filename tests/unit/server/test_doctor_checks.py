@@ -46,6 +46,32 @@ def test_a_machine_is_well_where_all_that_is_required_is_there(monkeypatch, ther
     }
 
 
+@pytest.mark.parametrize(
+    ("ok", "required", "state"),
+    [(True, True, "ok"), (False, True, "MISSING"), (False, False, "none"), (True, False, "ok")],
+)
+def test_only_what_is_required_is_missing(ok, required, state):
+    line = Check("serial", ok, "no serial port", required).line()
+    assert line == f"{state:8}serial      no serial port"
+
+
+def test_a_card_is_named_by_its_vendor_and_device(monkeypatch, tmp_path):
+    """As `lspci -n` does. A card without them has its driver's name alone."""
+    for card, parts in (("card1", {}), ("card0", {"vendor": "0x8086", "device": "0x3e92"})):
+        device = tmp_path / "class" / "drm" / card / "device"
+        device.mkdir(parents=True)
+        (tmp_path / "drivers" / f"of-{card}").mkdir(parents=True)
+        (device / "driver").symlink_to(tmp_path / "drivers" / f"of-{card}")
+        for name, text in parts.items():
+            (device / name).write_text(f"{text}\n")
+    monkeypatch.setattr(doctor, "SYS", tmp_path)
+    # whose text would end its cell in the table of a page
+    monkeypatch.setattr(doctor, "adapters", lambda: ["a | b"])
+    assert doctor.row()["links"] == "ZeroMQ and UDP over loopback; serial a / b"
+    drivers = doctor.row()["OpenGL"].partition("kernel driver ")[2]
+    assert drivers == "of-card0 (8086:3e92), of-card1"
+
+
 # A 27-inch office monitor behind 500 mm before a tracker of 50 mm.
 WIDE = {
     "tracker": {"focal_length_mm": 50, "pixel_pitch_um": 5.5, "resolution_px": [2048, 2048]},

@@ -9,9 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.sky.air import AIR_MASSES, SiteAir
+from hilstar.sky.air import AIR_MASSES, SiteAir, air_mass, through_air
 from hilstar.sky.bodies.orbit import Geocentre
 from hilstar.sky.bodies.passes import Cone
+from hilstar.sky.electrons import Optics
+from hilstar.sky.spectrum import Curve, constant_curve
 from hilstar.sky.stars import AirAbove
 from tests.support.satellites import satellite_sky, some_orbits
 from tests.support.skies import moving_sky
@@ -50,6 +52,56 @@ def test_air_dims_each_channel_of_a_star_by_its_own_extinction():
     found = seen.electrons_per_s[:, None] * seen.colours
     np.testing.assert_allclose(found, wanted, rtol=1e-5)  # the air masses' five digits
     np.testing.assert_allclose(seen.colours.sum(axis=1), 1.0)
+
+
+def test_below_the_horizon_air_is_that_of_the_horizon():
+    """Kasten and Young 1989: 1 / (0.50572 * 6.07995^-1.6364), 37.92."""
+    low = np.radians([0.0, -0.5, -30.0])
+    assert air_mass(low) == pytest.approx(1 / (0.50572 * 6.07995**-1.6364), rel=1e-12)
+
+
+def test_between_tabled_air_masses_extinction_is_straight_to_the_last_of_them():
+    """One of sunlight that is not in proportion to the air: at 26.3 masses, a degree up, it lies
+    between those of 15 and of 40.
+    """
+    up = np.array([0.0, 0.0, 1.0])
+    air = plain_air(up, (1.0,))
+    bent = np.array([0.0, 0.5, 0.7, 0.9, 1.2, 1.5, 2.0, 2.3, 4.8])
+    air = replace(air, dimming_mag=bent[None, :, None])
+    altitudes = np.radians([90.0, 30.0, 5.0, 1.0])
+    masses = air_mass(altitudes)
+    (shares,) = air.shares(np.full(4, -1), altitudes)
+    mag = -2.5 * np.log10(shares)
+    assert mag == pytest.approx(np.interp(masses, [0, 1, 1.5, 2, 3, 5, 8, 15, 40], bent), abs=1e-9)
+    assert 15 < masses[3] < 40
+
+
+def test_beyond_a_table_of_extinction_its_ends_hold():
+    optics = Optics(
+        30.0, Curve(np.array([300.0, 1100.0]), np.array([0.6, 0.6])), constant_curve(0.8)
+    )
+    extinction = Curve(np.array([400.0, 700.0]), np.array([0.5, 0.2]))
+    through = through_air(optics, extinction, 2.0).transmission
+    nm = np.array([310.0, 400.0, 550.0, 700.0, 1090.0])
+    mag = np.array([0.5, 0.5, 0.35, 0.2, 0.2])
+    # straight between knots 5 nm apart
+    assert through(nm) == pytest.approx(0.8 * 10 ** (-0.4 * 2.0 * mag), rel=1e-4)
+    grey = through_air(optics, constant_curve(0.3), 2.0).transmission
+    assert grey(nm) == pytest.approx(0.8 * 10 ** (-0.4 * 2.0 * 0.3), rel=1e-12)
+
+
+def test_a_zenith_is_that_of_each_second():
+    """Which the Earth turns by 15 arcsec."""
+    asked = []
+
+    def up_at(utc_ns: int) -> np.ndarray:
+        asked.append(utc_ns)
+        return np.array([0.0, 0.0, 1.0])
+
+    air = replace(plain_air(np.array([0.0, 0.0, 1.0]), (0.2,)), up_at=up_at)
+    for utc_ns in (7_000_000_000, 7_999_999_999, 8_000_000_000, 8_400_000_000):
+        air.above(utc_ns)
+    assert asked == [7_000_000_000, 8_000_000_000]
 
 
 # of one step of Newton's, in this air, down to 20 degrees of altitude: 3.9e-9 rad measured

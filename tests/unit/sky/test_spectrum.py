@@ -24,6 +24,7 @@ from hilstar.sky.spectrum import (
     constant_curve,
     integration_nodes,
     load_curve,
+    read_curve_csv,
     temperature_ballesteros2012_k,
     temperature_wang2021_k,
     torres2010_k,
@@ -71,6 +72,46 @@ def test_torres_agrees_with_pecaut_and_mamajek_and_with_supergiants_spectra():
     assert torres2010_k(bv_mag, supergiant=True) == pytest.approx(kelvin, rel=SUPERGIANTS_AGREE)
 
 
+def test_torres_s_polynomials_are_those_of_his_table():
+    """Worked out with 40 digits from the coefficients that AJ 140, 1158 prints in table 2."""
+    bv_mag = np.array([-0.3, 0.5, 1.0, 1.6])
+    dwarfs_k, supergiants_k = (
+        [33616.674, 6281.455, 4843.867, 3773.068],
+        [39729.425, 6114.788, 4973.049, 3775.676],
+    )
+    assert torres2010_k(bv_mag) == pytest.approx(dwarfs_k, rel=1e-6)
+    assert torres2010_k(bv_mag, supergiant=True) == pytest.approx(supergiants_k, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("first", "last", "nm_per_unit"),
+    [
+        (0.1, 30.0, 1000.0),
+        (0.1, 30.1, None),
+        (0.05, 2.0, None),
+        (100.0, 5000.0, 1.0),
+        (999.0, 5001.0, None),
+        (1000.0, 2600.0, 1.0),
+        (1000.0, 2601.0, None),  # nm of the infrared, or angstrom of the ultraviolet
+        (1999.0, 2500.0, 1.0),
+        (2000.0, 2500.0, 0.1),
+        (2000.0, 100_000.0, 0.1),
+        (2000.0, 100_001.0, None),
+        (30.0, 90.0, None),
+    ],
+)
+def test_wavelengths_without_a_unit_are_those_of_sensors_or_refused(
+    tmp_path, first, last, nm_per_unit
+):
+    path = tmp_path / "qe.csv"
+    path.write_text(f"wavelength,value\n{first},0.5\n{last},0.25\n")
+    if nm_per_unit is None:
+        assert "without a unit; write it in the header" in refusal(read_curve_csv, path)
+        return
+    wanted_nm = np.array([first, last]) * nm_per_unit
+    assert read_curve_csv(path).wavelength_nm == pytest.approx(wanted_nm, rel=1e-12)
+
+
 def test_temperature_scales_are_finite_over_every_colour_of_the_catalogue():
     bv = np.linspace(-0.4, 5.46, 2000)
     for scale in (temperature_ballesteros2012_k, temperature_wang2021_k):
@@ -105,6 +146,27 @@ def test_a_share_of_light_is_from_nearly_0_to_1(tmp_path, value):
 
 def test_two_constants_are_taken_over_the_range_of_silicon():
     assert Optics(30, constant_curve(0.6), constant_curve(0.9)).range_nm == (300.0, 1100.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "nm", "share"),
+    [
+        ("ccd47-20", 600.0, 0.966),  # ULTRACAM's red arm
+        ("kai-4021", 500.0, 0.55),
+        ("icx285", None, None),
+        ("imx249", None, None),
+        ("imx250", None, None),
+        ("imx252", None, None),
+        ("n-bk7-10mm", 500.0, 0.916),  # Schott
+        ("johnson-v", 530.0, 1.0),  # Bessell 1990
+    ],
+)
+def test_each_curve_that_a_bench_file_may_name_is_there(name, nm, share):
+    curve = load_curve(name, "[tracker] quantum_efficiency")
+    assert 0.3 < curve.value.max() <= 1.0
+    assert curve.wavelength_nm[0] <= 500 and curve.wavelength_nm[-1] >= 600
+    if nm is not None:
+        assert curve(np.array([nm]))[0] == pytest.approx(share, abs=5e-4)
 
 
 NM, VALUES = np.array([380.0, 450.0, 520.0]), np.array([0.05, 0.61, 0.48])

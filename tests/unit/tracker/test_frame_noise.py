@@ -264,3 +264,24 @@ def test_a_pixel_s_count_is_by_its_own_mean_and_number_whatever_stands_beside_it
     for k in range(0, 4000, 97):
         alone = poisson(mean_e[k : k + 1], number[k : k + 1], 0.0)
         assert alone[0] == counts[k]
+
+
+def test_chosen_places_of_several_parts_have_the_numbers_that_all_have(rng):
+    words = rng.integers(-(2**63), 2**63, size=(3, 4, 10), dtype=np.int64)
+    which = np.array([0, 39, 40, 57, 119, 80, 3])
+    for chosen, every in zip(normal_pairs(words, which), normal_pairs(words), strict=True):
+        assert chosen.tolist() == every.ravel()[which].tolist()
+
+
+def test_the_faintest_word_s_radius_is_the_largest_and_its_angle_goes_all_round():
+    """Box and Muller 1958, by the first half of the words a radius, sqrt(-2 ln((k + 1/2) / 2^32)),
+    and by the second an angle of -pi to pi; float32 rounds the largest half to 2^32.
+    """
+    radii = np.array([0, 1, 2**31, 2**32 - 1], dtype=np.uint32)
+    angles = np.array([0, 2**30, -(2**31), -(2**29)], dtype=np.int32)
+    words = np.concatenate([radii, angles.view(np.uint32)]).view(np.int64)
+    first, second = normal_pairs(words)
+    radius = np.sqrt(-2 * np.log((radii + 0.5) / 2**32))
+    angle = angles / 2**31 * np.pi
+    assert first == pytest.approx(radius * np.cos(angle), abs=2e-5)
+    assert second == pytest.approx(radius * np.sin(angle), abs=2e-5)

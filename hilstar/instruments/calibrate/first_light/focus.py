@@ -22,6 +22,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.units import MAD_TO_SIGMA
 from hilstar.instruments.calibrate.effective_psf import (
     Found,
+    are_alone,
     dots_of_image,
     draw_effective,
     fit_effective,
@@ -221,16 +222,11 @@ def _alone(image: FloatArray, level: float, x_px: FloatArray, y_px: FloatArray, 
     image.
     """
     height, width = image.shape
-    across = np.abs(x_px[:, None] - x_px)
-    down = np.abs(y_px[:, None] - y_px)
-    itself = np.where(np.eye(len(x_px), dtype=bool), np.inf, 0.0)
-    apart = np.maximum(across, down) + itself
-    is_alone = apart.min(axis=1, initial=np.inf) > 2 * half
     column = np.rint(x_px).astype(np.intp)
     row = np.rint(y_px).astype(np.intp)
     is_whole = (column >= half) & (column < width - half)
     is_whole &= (row >= half) & (row < height - half)
-    chosen = np.flatnonzero(is_whole & is_alone)[:MAX_DOTS]
+    chosen = np.flatnonzero(is_whole & are_alone(x_px, y_px, half))[:MAX_DOTS]
     steps = np.arange(-half, half + 1)
     rows = row[chosen, None] + steps
     columns = column[chosen, None] + steps

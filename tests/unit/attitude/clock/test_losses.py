@@ -101,3 +101,31 @@ def test_a_unit_that_was_named_stands_while_arrivals_are_uneven_and_goes_with_th
     for k in range(400):
         unit.see(10**12 + k * NS_PER_S // 100, 21 * NS_PER_S + k * NS_PER_S // 100)
     assert not unit.named and notices.counts() == {UNIT: 1, "time-unit-right": 1}
+
+
+@pytest.mark.parametrize("windows", [2, 3])
+def test_a_unit_goes_after_three_windows_of_another_pace_and_its_line_says_what_to_send(windows):
+    """Half a second each; two of them may be uneven."""
+    notices = Notices()
+    unit = TimeUnit(notices)
+    for k in range(200):
+        unit.see(k * 10_000, k * NS_PER_S // 100)
+    assert notices.lasting[UNIT] == (
+        "t_ns runs at 0.001 times real time: it is in microseconds, not in nanoseconds; send"
+        " nanoseconds: multiply by 1000"
+    )
+    for k in range(52 * windows):
+        unit.see(k * NS_PER_S // 100, (200 + k) * NS_PER_S // 100)
+    assert bool(unit.named) == (windows < 3)
+    assert notices.counts().get("time-unit-right", 0) == (windows >= 3)
+
+
+def test_picoseconds_have_no_whole_factor():
+    notices = Notices()
+    unit = TimeUnit(notices)
+    for k in range(200):
+        unit.see(k * 10 * NS_PER_S, k * NS_PER_S // 100)
+    assert notices.lasting[UNIT] == (
+        "t_ns runs at 1e+03 times real time: it is in picoseconds, not in nanoseconds; send"
+        " nanoseconds"
+    )

@@ -164,6 +164,18 @@ def test_another_named_sender_is_shown_once_the_first_is_silent(by, silent_ns, w
     assert (shown.sequences[-1] == 20) == (not is_shown)
 
 
+def test_a_sender_that_states_no_number_is_named_so_beside_one_that_does():
+    shown = Shown()
+    for k in range(20):
+        host_ns = HOST0_NS + k * PERIOD_NS
+        shown.take(sample_message(k, host_ns))
+        shown.take(message_of(OTHER, "number", 700 + k, host_ns + PERIOD_NS // 2))
+    assert shown.sequences == list(range(20))
+    assert list(shown.notices.lasting.values()) == [
+        "two senders on one link: showing the one without a number, refusing number 9 (source)"
+    ]
+
+
 def test_a_stray_message_is_refused_when_the_sender_goes_on_and_is_no_second_sender():
     shown = Shown().run(300)
     stray_ns = HOST0_NS + 300 * PERIOD_NS - PERIOD_NS // 2

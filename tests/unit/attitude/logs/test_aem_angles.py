@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log, write_log
 from hilstar.attitude.wire.source import Mounting
+from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import to_matrix
 from tests.support.sources.aem_messages import (
     EPOCHS,
@@ -304,6 +305,51 @@ def test_xml_and_kvn_of_angles_hold_the_same(
         for s in (from_kvn, from_xml)
     ]
     assert rates[0] == rates[1]
+
+
+# CCSDS 504.0-B-2: angles in degrees, rates in degrees a second, a period in seconds
+UNITS = {
+    "SPIN_ALPHA": "deg",
+    "SPIN_DELTA": "deg",
+    "SPIN_ANGLE": "deg",
+    "SPIN_ANGLE_VEL": "deg/s",
+    "NUTATION": "deg",
+    "NUTATION_PER": "s",
+    "NUTATION_PHASE": "deg",
+    "MOMENTUM_ALPHA": "deg",
+    "MOMENTUM_DELTA": "deg",
+    "NUTATION_VEL": "deg/s",
+    "ANGLE_1": "deg",
+    "ANGLE_2": "deg",
+    "ANGLE_3": "deg",
+    "ANGLE_1_DOT": "deg/s",
+    "ANGLE_2_DOT": "deg/s",
+    "ANGLE_3_DOT": "deg/s",
+}
+OF_UNITS = [case for case in XML_CASES if case[1].startswith("SPIN") or case[0] == "2.0"]
+
+
+@pytest.mark.parametrize(("version", "kind", "names", "element", "values", "inside"), OF_UNITS)
+def test_each_number_in_xml_may_state_its_unit_and_no_other(
+    tmp_path, version, kind, names, element, values, inside
+):
+    given = keywords(version, "ICRF", "A2B", names, ATTITUDE_TYPE=kind)
+    text = kvn(rows_of(values), version, **given)
+
+    def message(inside: str) -> str:
+        epoch = f"<EPOCH>{EPOCHS[0]}</EPOCH>"
+        return xml_of(text, [f"<{element}>{epoch}{inside}</{element}>"])
+
+    stated = inside
+    for name, unit in UNITS.items():
+        stated = stated.replace(f"<{name}>", f'<{name} units="{unit}">')
+    (plain,), (with_units,) = read(tmp_path, message(inside)), read(tmp_path, message(stated))
+    assert with_units.q_icrs_to_cam.tolist() == plain.q_icrs_to_cam.tolist()
+    for name, unit in UNITS.items():
+        wrong = inside.replace(f"<{name}>", f'<{name} units="rad">')
+        if wrong != inside:
+            with pytest.raises(InputError, match=f"<{name}> in 'rad'; write {unit}\\)$"):
+                read(tmp_path, message(wrong))
 
 
 # Whose attitude it is, and whose time

@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.clock.timeline import Policy
-from hilstar.attitude.logs import aem_blocks
+from hilstar.attitude.logs import aem, aem_blocks
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.basics.units import NS_PER_S
+from tests.support.refusals import refusal
 from tests.support.sources.aem_messages import (
     OFFSET_DEG,
     TURN_DEG_S,
@@ -128,12 +129,32 @@ def test_segments_that_overlap_are_read_by_their_useable_times_then_the_later_on
     log = open_log(tmp_path / "log")
     times = [sample.t_ns for sample in log.samples]
     assert all(before < after for before, after in pairwise(times))
+    # no segment has rates, and an end that is interpolated gets none
+    assert all(sample.rate_cam_rad_s is None for sample in log.samples)
     for second, number in wanted.items():
         assert which_at(log.samples, second) == pytest.approx(number, abs=1e-9), (second, number)
     [notice] = [line for kind, line in log.told if kind == "aem-overlap"]
     assert f"{len(segments)} segments overlap" in notice and "USEABLE" in notice
     changes = sum(before != after for before, after in pairwise(wanted.values()))
     assert sum(sample.discontinuity for sample in log.samples) == changes
+
+
+def test_the_elements_of_a_state_that_was_read_count_no_more(tmp_path, monkeypatch):
+    """Eight elements a state, of which only those of one are held at one time."""
+    monkeypatch.setattr(aem_blocks, "MAX_ELEMENTS", 100)
+    (tmp_path / "log").write_text(in_xml(overlapping((range(30), {}), (range(30, 60), {}))))
+    assert len(open_log(tmp_path / "log").samples) == 60
+
+
+@pytest.mark.parametrize("allowed", [2, 3])
+def test_segments_overlap_up_to_a_number(tmp_path, monkeypatch, allowed):
+    monkeypatch.setattr(aem, "MAX_OVERLAPPING", allowed)
+    (tmp_path / "log").write_text(overlapping(([0, 20], {}), ([5, 25], {}), ([10, 30], {})))
+    if allowed == 3:
+        assert len(open_log(tmp_path / "log").samples) == 6
+        return
+    line = refusal(open_log, tmp_path / "log")
+    assert line.endswith(": 3 segments overlap, and 2 may; write a file for each")
 
 
 def test_useable_times_of_segments_that_do_not_overlap_change_nothing(tmp_path):

@@ -6,9 +6,13 @@ from __future__ import annotations
 
 import errno
 import os
+import struct
 
 import pytest
 from mcap.reader import make_reader
+from mcap.records import Chunk, MessageIndex
+from mcap.stream_reader import StreamReader
+from zstandard import ZstdDecompressor
 
 from hilstar.attitude.logs import mcap_log
 from hilstar.attitude.logs.mcap_log import JsonTopic, McapWriter, parts_of, read_messages
@@ -60,6 +64,39 @@ def test_what_is_written_is_what_the_library_reads(tmp_path, writer_of):
     assert (totals.message_start_time, totals.message_end_time, totals.message_count) == (1, 9, 4)
     assert (totals.chunk_count, totals.channel_message_counts) == (2, {1: 2, 2: 2})
     assert (tmp_path / "a.mcap").stat().st_size == writer.size_bytes
+
+
+def test_each_message_lies_where_its_chunk_s_index_has_it(tmp_path, writer_of):
+    """Both index and place are read by the library, and each message's head (MCAP: opcode 5, length,
+    channel, sequence, log time) is looked up at its place.
+    """
+    writer = writer_of()
+    for number in range(2):
+        for key, time_ns in (("one", 5), ("two", 3), ("one", 9), ("two", 7)):
+            writer.add(key, 10 * number + time_ns, b"x" * time_ns, number)
+        writer.flush()
+    writer.finish()
+    with (tmp_path / "a.mcap").open("rb") as file:
+        records = list(StreamReader(file, emit_chunks=True).records)
+        file.seek(0)
+        summary = make_reader(file).get_summary()
+    by_index: list[tuple[int, int]] = []
+    data = b""
+    for record in records:
+        if isinstance(record, Chunk):
+            data = ZstdDecompressor().decompress(record.data, record.uncompressed_size)
+        elif isinstance(record, MessageIndex):
+            for time_ns, place in record.records:
+                opcode, _, channel, _, logged_ns = struct.unpack_from("<BQHIQ", data, place)
+                assert (opcode, channel, logged_ns) == (5, record.channel_id, time_ns)
+                by_index.append((channel, time_ns))
+    times = [(1, 5), (1, 9), (2, 3), (2, 7)]
+    assert by_index == [*times, *((channel, 10 + time_ns) for channel, time_ns in times)]
+    raw = (tmp_path / "a.mcap").read_bytes()
+    for chunk in summary.chunk_indexes:
+        assert raw[chunk.chunk_start_offset] == 6
+        for channel, place in chunk.message_index_offsets.items():
+            assert struct.unpack_from("<BQH", raw, place)[::2] == (7, channel)
 
 
 def test_a_topic_s_messages_are_dropped_and_the_others_stay(writer_of):

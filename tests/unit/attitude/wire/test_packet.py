@@ -79,8 +79,9 @@ def test_flags_say_what_is_valid():
 def test_the_upper_byte_of_flags_is_the_sender_s_number(number, expected):
     read = decode(packet(flags=number << 8 | 3))
     assert (read.sender, read.discontinuity) == (expected, True)
-    in_json = f'{{"t_ns": 1, "q": [1, 0, 0, 0], "sender": {number}}}'
-    assert decode(in_json.encode()).sender == expected
+    for more in ("", '"sequence": 7, '):
+        in_json = f'{{"t_ns": 1, {more}"q": [1, 0, 0, 0], "sender": {number}}}'
+        assert decode(in_json.encode()).sender == expected
     assert decode(encode(read)).sender == expected
 
 

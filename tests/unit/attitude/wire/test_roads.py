@@ -148,6 +148,52 @@ def test_a_tracker_behind_a_half_open_line_is_back_after_three_seconds_and_not_b
     assert notices.counts() == {"second-connection": 1, "answers-lost": 1, "answers-back": 1}
 
 
+def test_a_tracker_whose_hold_has_no_end_keeps_the_line_however_long_it_is_silent():
+    clock, notices = FakeClock(), Notices()
+    with TcpRoad(
+        ("127.0.0.1", 0), AllowedSenders(), ANSWERS, notices, clock, listening=True
+    ) as link:
+        port = int(link.endpoint.rpartition(":")[2])
+        with hold(link, port, clock) as first:
+            clock.work(3600e9)
+            with connect(port) as second:
+                wait_for(lambda: closed(link, second), "the refusal")
+            first.sendall(b"b")
+            wait_for(lambda: taken(link) == b"b", "the first one's bytes")
+    assert (link.link_counts.refused, link.link_counts.connections) == (1, 1)
+    assert notices.counts() == {"second-connection": 1}
+
+
+def test_bytes_of_tcp_came_after_the_last_look_that_found_none():
+    clock = FakeClock()
+    with listening(clock, Notices()) as (link, port), hold(link, port, clock) as tracker:
+        before_ns = clock.now_ns()
+        assert link.taken(0) == []
+        after_ns = clock.now_ns()
+        clock.work(1e9)
+        tracker.sendall(b"b")
+        wait_for(lambda: link.wait_for_message(SOON_MS), "the bytes")
+        (chunk,) = link.taken(SOON_MS)
+    assert chunk.parts == [b"b"]
+    assert before_ns <= chunk.empty_ns <= after_ns
+
+
+def test_what_a_full_line_takes_in_part_is_not_sent():
+    clock = FakeClock()
+    with listening(clock, Notices()) as (link, port), hold(link, port, clock) as tracker:
+        assert link.put(b"all")
+        assert tracker.recv(3) == b"all"
+        assert not link.put(bytes(1 << 26))
+
+
+@pytest.mark.parametrize(
+    ("host", "endpoint"), [("::1", "tcp://[::1]:5560"), ("192.0.2.1", "tcp://192.0.2.1:5560")]
+)
+def test_a_tcp_endpoint_has_an_ipv6_address_in_brackets(host, endpoint):
+    with TcpRoad((host, 5560), AllowedSenders(), ANSWERS, listening=False) as road:
+        assert (road.endpoint, road.verb) == (endpoint, "connecting to")
+
+
 def test_a_tracker_that_closed_its_line_is_back_at_once():
     clock, notices = FakeClock(), Notices()
     with listening(clock, notices) as (link, port):
@@ -533,11 +579,12 @@ def test_what_a_process_does_and_its_own_cpu_time_are_those_of_proc():
 
 
 def test_a_reader_that_fails_again_and_again_is_begun_anew_ever_more_seldom():
-    """One that says hello and ends; after a steady time it would be begun at once again."""
+    """One that says hello and ends; after ten steady seconds it is begun at once again."""
     clock, notices = FakeClock(), Notices()
     reader = ReaderProcess(notices, module="__hello__", clock=clock)
     waits_s = []
-    while len(waits_s) < 4:
+    for steady_s in (0.0, 0.0, 0.0, 9.9, 10.0, 0.0):
+        clock.sleep(steady_s)
         generation = reader.generation
         wait_for(lambda: reader.wait(20) and not reader.take() and reader.trouble)
         waits_s.append(reader._again.left_s)
@@ -546,8 +593,8 @@ def test_a_reader_that_fails_again_and_again_is_begun_anew_ever_more_seldom():
         reader.wait(0)
         assert reader.generation == generation + 1
     reader.close()
-    assert waits_s == pytest.approx([0.05, 0.1, 0.2, 0.4])
-    assert notices.counts() == {"receiver-failed": 4}
+    assert waits_s == pytest.approx([0.05, 0.1, 0.2, 0.4, 0.05, 0.1])
+    assert notices.counts() == {"receiver-failed": 6}
 
 
 def test_what_another_order_brought_is_passed_over():

@@ -6,8 +6,12 @@ import pytest
 import zmq
 
 from hilstar.attitude.wire import zmq_socket
+from hilstar.attitude.wire.keys import CurveKeys, load_public, load_secret, make_keys
+from hilstar.attitude.wire.zmq_links import ZmqRoad
 from hilstar.attitude.wire.zmq_socket import MAX_GROWTH_BYTES, MAX_PARTS, ZmqReply, ZmqSocket
 from hilstar.basics.notices import Notices
+from tests.support.refusals import refusal
+from tests.support.waiting import wait_for
 
 WAIT_MS = 20_000
 
@@ -66,3 +70,56 @@ def test_what_this_process_took_before_the_link_was_used_is_not_the_link_s(tmp_p
         used_bytes += 2 * MAX_GROWTH_BYTES
         link.wait_for_message(0)
         assert link.link_counts.resets == 1
+
+
+def test_a_place_that_cannot_be_bound_is_refused_with_what_to_do(tmp_path):
+    make_keys(tmp_path)
+    keys = CurveKeys(tmp_path / "server.key_secret", allowed_clients=tmp_path / "allowed_clients")
+    elsewhere = "tcp://192.0.2.1:5560"  # RFC 5737: no machine has it
+    assert refusal(ZmqRoad, elsewhere, bind=True, keys=keys) == (
+        f"{elsewhere}: not an address of this machine, so it cannot be bound; connect (--connect,"
+        " bind = false) instead"
+    )
+    with ZmqRoad("tcp://127.0.0.1:*", bind=True) as road:
+        # a road that binds lets go until its first read
+        road.taken(0)
+        assert refusal(ZmqRoad, road.endpoint, bind=True) == (
+            f"{road.endpoint}: the port is in use; stop the program that has it, or choose another"
+            " port"
+        )
+
+
+def test_a_client_that_is_rejected_says_nothing_of_the_next_one(tmp_path):
+    """One without keys, and then one with keys that leaves."""
+    make_keys(tmp_path)
+    notices = Notices()
+    keys = CurveKeys(tmp_path / "server.key_secret", allowed_clients=tmp_path / "allowed_clients")
+    with ZmqRoad("tcp://127.0.0.1:*", bind=True, keys=keys, notices=notices) as road:
+        road.taken(0)
+
+        def counts_are(connections: int, rejected: int) -> bool:
+            road.taken(20)
+            counts = road.link_counts
+            return (counts.connections, counts.rejected) == (connections, rejected)
+
+        with zmq.Context() as context:
+            with context.socket(zmq.PUB) as without:
+                without.reconnect_ivl = -1
+                without.connect(road.endpoint)
+                wait_for(lambda: counts_are(1, 1), "the rejection", poll_s=1e-3)
+            with context.socket(zmq.PUB) as client:
+                client.linger = 0
+                client.curve_publickey, client.curve_secretkey = load_secret(
+                    tmp_path / "client.key_secret"
+                )
+                client.curve_serverkey = load_public(tmp_path / "server.key")
+                client.connect(road.endpoint)
+
+                def is_heard() -> bool:
+                    client.send(b"x")
+                    return bool(road.taken(20))
+
+                wait_for(is_heard, "the client", poll_s=1e-3)
+            assert road._keeper is not None
+            wait_for(lambda: counts_are(2, 1) and not road._keeper._open, "its end", poll_s=1e-3)
+    assert notices.counts()["client-rejected"] == 1

@@ -27,6 +27,7 @@ from hilstar.instruments.calibrate.geometric.dots import (
     _distances,
     _seen_places,
     dot_image,
+    dots_of_frames,
     joined,
     lit_for,
     plan_dots,
@@ -445,3 +446,30 @@ def test_poses_are_told_by_places_over_the_middle_of_the_dots():
     assert sorted({round(x, 6) for x in x_px.tolist()}) == [200, 300, 400, 500]
     assert sorted({round(y, 6) for y in y_px.tolist()}) == [50, 60, 70, 80]
     assert len(x_px) == 16
+
+
+@pytest.mark.parametrize(
+    ("frames", "dots"), [(8, 120 / 3), (16, 240 / 6), (20, 300 / 8), (24, 360 / 10), (60, 900 / 10)]
+)
+def test_a_dot_is_lit_in_two_frames_of_five_and_in_three_to_ten(frames, dots):
+    """15 dots in each frame, of which every one is lit in so many."""
+    assert dots_of_frames(frames, 15) == round(dots)
+    with pytest.raises(InputError, match="--frames 7: the dots' codes need 8 frames or more"):
+        dots_of_frames(7, 15)
+
+
+def test_dots_of_a_wide_psf_stand_farther_apart():
+    """18 sigmas of 4 px, and 2.5 sides of 4.5 px: 83 px from dot to dot in place of 40."""
+    wide = lit_for(replace(screen(), psf_sigma_px=4.0))
+    # the field in which a wide dot is whole is smaller by 4 windows of its own
+    assert wide == pytest.approx(400 * 300 / 83.25**2, rel=0.5)
+
+
+def test_a_dot_is_on_the_screen_to_6_px_from_the_middles_of_its_outermost_pixels():
+    """Of 640 x 480 px, before a tracker that sees beyond all its edges."""
+    tracker = Camera((2000, 1500), 1000.0, (999.5, 749.5), np.eye(3))
+    monitor = Camera((640, 480), 1000.0, (319.5, 239.5), np.eye(3))
+    seen = SeenScreen(monitor, tracker, is_sure=True, psf_sigma_px=0.8)
+    x_px = np.array([6.0, 5.9, 633.0, 633.1, 300.0, 300.0, 300.0, 300.0])
+    y_px = np.array([200.0, 200.0, 200.0, 200.0, 6.0, 5.9, 473.0, 473.1])
+    assert seen.shows(x_px, y_px).tolist() == [True, False] * 4

@@ -19,13 +19,13 @@ from hilstar.instruments.calibrate.effective_psf import (
     QUANTISED_DN2,
     Dots,
     Effective,
+    Found,
     HeldOut,
     _dot_sides,
     _functions,
     _glass,
     _half_px,
     _held_out,
-    _is_alone,
     _knots,
     _of_frames,
     _placed,
@@ -33,12 +33,18 @@ from hilstar.instruments.calibrate.effective_psf import (
     _spline,
     _Sums,
     _variance,
+    are_alone,
+    cut_out,
     dots_of_image,
+    draw_effective,
     fit_effective,
+    lines_of,
+    summary_of,
 )
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX
 from hilstar.instruments.calibrate.geometric.fit import MatchedDots
 from hilstar.instruments.calibrate.geometric.observed import Observed
+from hilstar.server.bench.frame_files import png_of
 
 ROUNDING = 1e-9  # of sums of a few thousand doubles
 SIDE_PX = 0.8
@@ -159,8 +165,11 @@ def test_dots_are_alone_where_no_square_reaches_another():
     wide_px = 2.0 * MAX_HALF_PX
     x_px = np.array([0.0, wide_px + 0.1, 0.0, 200.0, 200.0 + wide_px - 0.1, 500.0])
     y_px = np.array([0.0, 0.0, wide_px + 0.1, 0.0, wide_px - 0.1, 0.0])
-    assert _is_alone(x_px, y_px).tolist() == [True, True, True, False, False, True]
-    assert _is_alone(np.array([3.0]), np.array([4.0])).tolist() == [True]
+    assert are_alone(x_px, y_px, MAX_HALF_PX).tolist() == [True, True, True, False, False, True]
+    assert are_alone(np.array([3.0]), np.array([4.0]), MAX_HALF_PX).tolist() == [True]
+    assert not len(are_alone(np.zeros(0), np.zeros(0), MAX_HALF_PX))
+    # two at one place have no room beside each other
+    assert not are_alone(np.zeros(2), np.zeros(2), MAX_HALF_PX).any()
 
 
 def test_pixels_scatter_by_their_light_as_the_frames_of_a_dot_do():
@@ -395,3 +404,125 @@ def test_more_than_a_gaussian_is_asked_for_beyond_three_standard_errors(monkeypa
     # a Gaussian is fitted to light that is one: 1 px wide and 1.3 px high
     assert found.sigma_px == pytest.approx((1.0, 1.3), abs=0.02)
     assert (found.dots, found.half_px) == (len(x_px), dots.images.shape[1] // 2)
+
+
+def test_a_dot_s_image_is_the_mean_over_its_pose_s_frames_in_which_none_is_near(tmp_path):
+    """Two poses of two frames; in each frame the dots have another level, in one a third dot is
+    beside the first. The dark image is taken off all.
+    """
+    width, height = 260, 120
+    places_px = np.stack(np.meshgrid([30.2, 80.0, 130.0, 180.0, 230.4], [30.0, 85.3]))
+    x_px, y_px = places_px.reshape(2, -1)
+    count = len(x_px)
+    column, row = np.meshgrid(np.arange(width), np.arange(height))
+    dark = (column + 3 * row).astype(np.uint16)
+    paths = {}
+    centroids = []
+    for number, (frame, pose) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
+        path = tmp_path / f"pose{pose}_frame_{frame}.png"
+        path.write_bytes(png_of((dark + 1000 * (number + 1) + row).astype(np.uint16)))
+        paths[frame, pose] = path
+        # the second pose stands 2 px lower
+        for dot in range(count):
+            centroids.append((frame, pose, x_px[dot], y_px[dot] + 2 * pose, dot))
+    near = (1, 0, x_px[0] + 9.0, y_px[0] + 9.0, count)
+    # a frame of which no dot was recognised
+    paths[2, 0] = tmp_path / "frame_2.png"
+    frame, pose, seen_x_px, seen_y_px, dot = np.array([*centroids, near]).T
+    observed = Observed(
+        frame.astype(int), pose.astype(int), seen_x_px, seen_y_px, np.ones(len(dot))
+    )
+    data = MatchedDots(observed, dot.astype(int))
+    dots = cut_out(paths, (width, height), dark.astype(float), data, 0.5 + 0.01 * dot)
+    # the third dot is never alone
+    assert len(dots.x_px) == 2 * count
+    np.testing.assert_allclose(dots.x_px, np.tile(x_px, 2))
+    np.testing.assert_allclose(dots.y_px, np.concatenate([y_px, y_px + 2]))
+    np.testing.assert_allclose(dots.side_px, np.tile(0.5 + 0.01 * np.arange(count), 2))
+    # beside the near one the first dot has the first frame alone; the second pose has frames of
+    # 3000 and 4000 DN
+    middles = dots.images[:, dots.images.shape[1] // 2, dots.images.shape[1] // 2]
+    wanted_dn = np.repeat([1500.0, 3500.0], count) + np.rint(dots.y_px)
+    wanted_dn[0] -= 500.0
+    np.testing.assert_allclose(middles, wanted_dn)
+    with pytest.raises(InputError, match="0 dots stand alone by 24 px in some frame"):
+        cut_out({}, (width, height), None, data, dot)
+
+
+def test_an_effective_psf_is_told_with_all_its_figures():
+    glass = _glass(effective([[1.0, 1.2, 0.0]]), np.array([[10.0, 5.0], [90.0, 75.0]]), 4, 1)
+    gaussian = HeldOut("Gaussian", 0.0123, 0.0045, np.array([1.0, 3.0]))
+    spline = HeldOut("spline, linear over the field", 0.0061, 0.0046, np.array([0.5, 1.5]))
+    found = Found(glass, [gaussian, spline], spline, True, (0.611, 0.722), 35, 5)
+    assert lines_of(found) == [
+        "dots                           35, each within 11 x 11 px",
+        (
+            "Gaussian                       sigma 0.611 and 0.722 px in the middle of the field,"
+            " without dot and pixel"
+        ),
+        (
+            "Gaussian                       1.23% of the peak off held-out dots (noise: 0.45%),"
+            " reduced chi square 2.00"
+        ),
+        (
+            "spline, linear over the field  0.61% of the peak off held-out dots (noise: 0.46%),"
+            " reduced chi square 1.00"
+        ),
+        "chosen                         spline, linear over the field",
+    ]
+    figures = {"rms": 0.0061, "noise": 0.0046, "reduced_chi2": 1.0}
+    first = {"name": "Gaussian", "rms": 0.0123, "noise": 0.0045, "reduced_chi2": 2.0}
+    assert summary_of(found) == {
+        "dots": 35,
+        "half_px": 5,
+        "sigma_px": [0.611, 0.722],
+        "model": "spline, linear over the field",
+        "more_than_gaussian": True,
+        "held_out": figures,
+        "models": [first, {"name": "spline, linear over the field", **figures}],
+        "components": len(glass.basis),
+    }
+    plain = replace(found, chosen=gaussian, asks_for_more=False)
+    assert lines_of(plain)[-1].endswith("Gaussian: the data ask for no more")
+
+
+def test_psfs_are_drawn_where_they_are_in_the_field(tmp_path, monkeypatch):
+    """Wider to the right, higher to the bottom."""
+    drawn = []
+    monkeypatch.setattr("hilstar.basics.charts.save", lambda figure, path: drawn.append(figure))
+    model = effective([[1.0, 1.0, 0.0], [0.6, 0.0, 0.0], [0.0, 0.5, 0.0]])
+    glass = _glass(model, np.array([[10.0, 5.0], [90.0, 75.0]]), 6, 1)
+    gaussian = HeldOut("Gaussian", 0.0123, 0.0045, np.ones(2))
+    draw_effective(tmp_path / "psf", Found(glass, [gaussian], gaussian, False, (1, 1), 9, 6))
+    (figure,) = drawn
+    (axes,) = figure.axes
+    picture = axes.images[0].get_array() ** 2
+    side = 13
+    offset_px = np.arange(side) - side // 2
+    widths = np.zeros((3, 3))
+    heights = np.zeros((3, 3))
+    for row in range(3):
+        for column in range(3):
+            light = picture[row * side : (row + 1) * side, column * side : (column + 1) * side]
+            widths[row, column] = light.sum(axis=0) @ offset_px**2 / light.sum()
+            heights[row, column] = light.sum(axis=1) @ offset_px**2 / light.sum()
+    # the Gaussian's and its pixel's
+    wide = np.tile([0.52, 1.0, 1.48], (3, 1)) + 1 / 12
+    high = np.tile([[0.65], [1.0], [1.35]], (1, 3)) + 1 / 12
+    np.testing.assert_allclose(widths, wide, atol=0.02)
+    np.testing.assert_allclose(heights, high, atol=0.02)
+
+
+def test_a_spline_stays_at_its_prior_where_dots_tell_less():
+    """Dots whose pixels are known to no more than their light: a coefficient is known to 2 by
+    them, and within 0.03 without.
+    """
+    image, x_px, y_px = field_of_dots()
+    ghost = gaussian_image(x_px + 2, y_px, 0.7, 400.0)
+    dots = dots_of_image(image + ghost, x_px, y_px, 0.0).at(np.arange(12))
+    dots = replace(dots, variance=np.full_like(dots.images, 1e4**2))
+    gaussian = effective([[1.0, 1.0, 0.0]], _knots(dots))
+    amplitudes = np.column_stack([np.full(12, 1e4), np.zeros(12)])
+    spline = _spline(gaussian, dots, amplitudes, 1)
+    # a ghost of 4 % of the light would be that in all functions together
+    assert 0 < spline.sum() * KNOT_PX**2 < 0.05 * 0.04

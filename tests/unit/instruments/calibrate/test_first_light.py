@@ -310,7 +310,7 @@ def grabbed(tmp_path, command):
     (tmp_path / "bench.toml").write_text(bench_text())
     pattern = Pattern("figure_000", black((320, 240)))
     return GrabCommand(command).look(
-        read_bench_file(tmp_path / "bench.toml"), pattern, tmp_path / "figure_000", 0.025
+        read_bench_file(tmp_path / "bench.toml"), pattern, tmp_path / "figure_000", 0.0123456789
     )
 
 
@@ -325,7 +325,7 @@ def test_a_command_is_told_the_exposure_and_must_write_a_new_image(tmp_path):
     with pytest.raises(NoImage, match="wrote no image"):
         grabbed(tmp_path, "true {pattern} {output}")
     path = grabbed(tmp_path, "sh -c 'echo {exposure_s} > {output}' {pattern}")
-    assert path.read_text() == "0.025\n"
+    assert path.read_text() == "0.0123456789\n"
 
 
 @pytest.mark.parametrize(

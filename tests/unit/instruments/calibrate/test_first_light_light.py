@@ -102,7 +102,9 @@ class Camera(ImageSource):
 
     def save(self, stem, image):
         path = stem.with_name(stem.name + ".png")
-        Image.fromarray(np.clip(np.rint(image), 0, 4095).astype(np.uint16)).save(path)
+        Image.fromarray(np.clip(np.rint(image), 0, 4095).astype(np.uint16)).save(
+            path, compress_level=1
+        )
         return path
 
     def look(self, file, pattern, stem, exposure_s):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
@@ -368,3 +369,25 @@ def test_additivity_is_as_sure_as_its_primaries_by_their_light_and_white(tmp_pat
     squares = (0.2 * 0.05) ** 2 + (0.5 * 0.02) ** 2 + (0.3 * 0.05) ** 2 + 0.01**2
     error_percent = 100 * squares**0.5
     assert found["crosstalk_error_percent"] == pytest.approx(dict.fromkeys(names, error_percent))
+
+
+def test_what_all_readings_and_black_have_in_common_is_no_error_of_the_response(tmp_path, rng):
+    """An offset of each reading moves black, and nothing above it; one of light alone does."""
+    codes = np.linspace(0, 255, 16).astype(int)
+    light = (codes / 255) ** 2.2 * (1 + 1e-3 * rng.normal(size=16)) + 0.01
+    errors = []
+    black_errors = []
+    for of_black, of_light in ((0.0, 0.0), (0.005, 0.005), (0.0, 0.005)):
+        rows = ["code,channel,value,sigma,common_1"]
+        for code, value in zip(codes.tolist(), light.tolist(), strict=True):
+            rows.append(f"{code},w,{value!r},1e-4,{of_light if code else of_black}")
+        path = tmp_path / "measured.csv"
+        path.write_text("\n".join(rows) + "\n")
+        fit = fit_channel(read_measurements(path), "w")
+        errors.append(fit.error)
+        black_errors.append(fit.black_error)
+    np.testing.assert_allclose(errors[1], errors[0], rtol=1e-6)
+    assert (errors[2][1:200] > 1.2 * errors[0][1:200]).all()
+    # of white's unit: what black itself has of the cause
+    assert black_errors[1] == pytest.approx(math.hypot(black_errors[0], 0.005), rel=1e-6)
+    assert black_errors[2] < 0.005

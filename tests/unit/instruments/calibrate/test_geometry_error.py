@@ -522,7 +522,7 @@ def test_dots_that_the_image_s_edge_cuts_are_not_measured(tmp_path):
     for x_px, y_px in ((40.3, 30.6), (2.0, 20.0), (60.0, 50.2)):
         image += 800 * np.exp(-((x - x_px) ** 2 + (y - y_px) ** 2) / (2 * 1.5**2))
     path = tmp_path / "frame_3.png"
-    Image.fromarray(np.rint(image).astype(np.uint16)).save(path)
+    Image.fromarray(np.rint(image).astype(np.uint16)).save(path, compress_level=1)
     seen = measure_images([path], None, (80, 60))
     assert seen.frame.tolist() == [3, 3]
     np.testing.assert_allclose(np.sort(seen.x_px), [40.3, 60.0], atol=0.05)

@@ -223,3 +223,16 @@ def test_edges_of_which_some_have_no_time_of_the_device_s_are_those_of_their_arr
     monkeypatch.setattr(latency, "read_lines", lambda *_: lines[1:])
     words = refusal(latency.capture_edges, "/dev/none", 115200, 2.0)
     assert words.startswith("serial:/dev/none@115200: 19 edges came, and at least 20 are needed")
+
+
+@pytest.mark.parametrize("late_ms", [12.5, 0.5, -2.5, 340.5])
+def test_the_most_frequent_delay_is_the_middle_of_its_millisecond(late_ms):
+    """Of delays that scatter by a millisecond about it: others are looked for half a period to
+    either side.
+    """
+    level = np.array([marker_light(k, "code") for k in range(200)])
+    swap_ns = 5_000_000_000 + np.round(np.arange(200) * PERIOD_NS).astype(np.int64)
+    shown = edges_of(swap_ns, level)
+    scatter_ns = 1_000_000 * (np.arange(len(shown.host_ns)) % 3 - 1)
+    seen = Edges(shown.host_ns + round(late_ms * 1e6) + scatter_ns, shown.level)
+    assert latency._likely_latency_ns(seen, shown) == (late_ms * 1e6, False)

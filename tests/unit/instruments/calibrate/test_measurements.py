@@ -7,12 +7,15 @@ import math
 import numpy as np
 import pytest
 
+from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate.measurements import (
     check_drift,
+    check_levels,
     drift_over_run,
     group_levels,
     read_measurements,
 )
+from tests.support.refusals import refusal
 
 TABLE = """code,channel,value,exposure_s,sigma,common_1,common_2,t_s
 0,w,2,0.5,0.1,0.02,0.2,10
@@ -122,3 +125,93 @@ def test_a_cause_without_a_value_in_a_row_does_nothing_to_it(tmp_path):
     text = "code,channel,value,common_1,common_2\n0,w,1,,0.5\n9,w,5,0.25,\n"
     measured = read_measurements(table_of(tmp_path, text))
     assert measured.common.tolist() == [[0.0, 0.5], [0.25, 0.0]]
+
+
+def test_a_code_of_more_bits_than_are_said_is_refused(tmp_path):
+    table = table_of(tmp_path, "code,channel,value\n0,w,1\n256,w,9\n")
+    told = refusal(read_measurements, table, 8)
+    assert "code 256 is outside 8 bits (0 to 255); say --bits" in told
+    assert read_measurements(table, 9).bits == 9
+    largest = table_of(tmp_path, "code,channel,value\n0,w,1\n255,w,9\n")
+    assert read_measurements(largest, 8).bits == read_measurements(largest).bits == 8
+
+
+@pytest.mark.parametrize(
+    ("readings", "clipped"),
+    [
+        (((200, 9.0), (255, 9.0)), []),
+        (((200, 9.0), (255, 9.0), (255, 9.0)), [200, 255]),
+        (((255, 9.0), (255, 9.0), (255, 9.0), (200, 8.0)), []),
+        (((100, 9.0), (200, 9.0), (255, 9.0), (240, 8.0)), [100, 200, 255]),
+    ],
+)
+def test_an_instrument_is_at_its_limit_where_three_largest_readings_of_several_codes_are_alike(
+    tmp_path, readings, clipped
+):
+    rows = [f"{code},r,{value}" for code, value in readings]
+    # another channel's readings have a limit of their own
+    text = "\n".join(["code,channel,value", "0,r,1", "255,g,9", *rows, ""])
+    measured = read_measurements(table_of(tmp_path, text))
+    assert measured.clipped["r"] == clipped
+    assert measured.clipped["g"] == []
+
+
+def test_black_is_the_mean_of_its_readings_in_all_channels(tmp_path):
+    text = "code,channel,value\n0,r,1\n0,g,2\n0,w,6\n255,r,20\n255,g,40\n255,w,60\n"
+    measured = read_measurements(table_of(tmp_path, text))
+    for channel, white in (("r", 20.0), ("g", 40.0), ("w", 60.0)):
+        levels = group_levels(measured, channel)
+        assert (levels.code.tolist(), levels.count.tolist()) == ([0, 255], [3, 1])
+        np.testing.assert_allclose(levels.mean, [3.0, white])
+
+
+def checked(folder, changes, sigma=1.0):
+    """Refuse levels of 20 codes that rise by 100 from each to the next, but for `changes` by code,
+    each known to `sigma`; the reason, "" for none.
+    """
+    rows = []
+    for number, code in enumerate([*range(0, 247, 13), 255]):
+        rows.append(f"{code},w,{changes.get(code, 100.0 * number)},{sigma}")
+    text = "\n".join(["code,channel,value,sigma", *rows, ""])
+    measured = read_measurements(table_of(folder, text))
+    levels = group_levels(measured, "w")
+    try:
+        check_levels(measured, "w", levels)
+    except InputError as error:
+        return str(error)
+    return ""
+
+
+def test_light_falls_where_it_does_by_four_errors_of_both_levels(tmp_path):
+    """The difference of two levels of 1 is known to 1.41: four of these are 5.66."""
+    assert checked(tmp_path, {}) == ""
+    assert checked(tmp_path, {130: 895.0}) == ""
+    told = checked(tmp_path, {130: 894.0})
+    assert "light falls by 0.67 % from code 117 to code 130, beyond the noise" in told
+
+
+def test_a_top_is_flat_below_where_an_s_curve_differs_from_white_by_its_noise(tmp_path):
+    """White of 1900 known to 1 %: by sin^2 it falls by 3 (1 - code / white)^2, four times 1 % at
+    11.5 % below white. Code 221 is 13 % below it, and code 234 is 8 %.
+    """
+    sigma = 19.0 / math.sqrt(2)
+    near_white = {221: 1895.0, 234: 1896.0}
+    told = checked(tmp_path, near_white, sigma)
+    assert "codes 221 to 255 read the same" in told
+    assert checked(tmp_path, {234: 1896.0}, sigma) == ""
+
+
+def test_a_drift_s_error_is_of_what_patches_and_slope_leave_free(tmp_path, rng):
+    """Against a line of its own for each of three patches, all of one slope."""
+    t_s = np.sort(rng.uniform(0, 50, 14))
+    patch = rng.permutation(np.arange(14) % 3)
+    light = np.array([10.0, 40.0, 90.0])[patch] * np.exp(0.01 * rng.normal(size=14))
+    rows = ["code,channel,value,t_s"]
+    for number, value, at_s in zip(patch.tolist(), light.tolist(), t_s.tolist(), strict=True):
+        rows.append(f"{(60, 120, 255)[number]},w,{value!r},{at_s!r}")
+    measured = read_measurements(table_of(tmp_path, "\n".join([*rows, ""])))
+    design = np.column_stack([patch == 0, patch == 1, patch == 2, t_s]).astype(float)
+    fitted, squares, *_ = np.linalg.lstsq(design, np.log(light), rcond=None)
+    error = math.sqrt(squares[0] / (14 - 4) * np.linalg.inv(design.T @ design)[3, 3])
+    span_s = float(np.ptp(t_s))
+    assert drift_over_run(measured) == pytest.approx((fitted[3] * span_s, error * span_s))

@@ -28,6 +28,7 @@ from hilstar.instruments.calibrate.reference import (
     Reading,
     _moved,
     _station_zeros,
+    _Unknowns,
     fit_reference,
     pointing,
     read_readings,
@@ -41,9 +42,9 @@ from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.refusals import refusal
 
 NOISE_ARCSEC = 1.0
-BENCHES = 300
-# binomial: of 300 intervals at 95 % each, 272 and fewer hold once in 1000, and 296 and more
-MIN_HELD, MAX_HELD = 273, 295
+BENCHES = 1000
+# binomial: of 1000 intervals at 95 % each, 928 and fewer hold once in 1000, and 970 and more
+MIN_HELD, MAX_HELD = 929, 970
 EXACT_ARCSEC = 1e-3
 DOTS = ((0.05, 0.02, 1.0), (-0.06, 0.03, 1.0), (0.01, -0.07, 1.0))
 
@@ -137,7 +138,7 @@ def test_a_rotation_is_found_exactly_without_noise(
 
 
 @pytest.mark.parametrize("sigma", [False, True])
-def test_the_intervals_of_300_benches_hold(sigma: bool, rng: np.random.Generator) -> None:
+def test_the_intervals_of_1000_benches_hold(sigma: bool, rng: np.random.Generator) -> None:
     from scipy import stats
 
     held = np.zeros(3)
@@ -325,3 +326,56 @@ def test_a_link_is_moved_by_angles_on_the_sky(elevation_rad: float) -> None:
     turned_deg = math.degrees(0.4 + right_rad / math.cos(elevation_rad))
     assert azimuth_deg == pytest.approx(turned_deg, abs=1e-9)
     assert elevation_deg == pytest.approx(math.degrees(elevation_rad + up_rad), abs=1e-9)
+
+
+def test_each_station_s_zero_and_each_link_moves_its_own_readings(rng: np.random.Generator) -> None:
+    """Of three stations: 0.1 mrad of the third one's zero moves its azimuths and no others."""
+    readings, _ = planted_cube(rng, noise_arcsec=0.0, repeats=1)
+    for reading in list(readings):
+        if reading.target.startswith("link") and reading.station == "B":
+            readings.append(replace(reading, station="C"))
+    zeros = _station_zeros(Path("readings.csv"), readings)
+    unknowns = _Unknowns.of(readings, zeros)
+    none = np.zeros(unknowns.count)
+    start = unknowns.residuals(none)
+    # two rotations, and the zeros of B and C; then the links
+    for number, station in ((6, "B"), (7, "C")):
+        moved = none.copy()
+        moved[number] = 1e-4
+        change = (unknowns.residuals(moved) - start).reshape(-1, 2)
+        for reading, (across, up) in zip(readings, change, strict=True):
+            is_its = reading.station == station
+            level = math.cos(reading.elevation_rad)
+            assert across == pytest.approx(1e-4 * level if is_its else 0.0, abs=1e-12)
+            assert up == 0.0
+    for number, link in enumerate(unknowns.links):
+        moved = none.copy()
+        moved[8 + 2 * number + 1] = 1e-4
+        change = (unknowns.residuals(moved) - start).reshape(-1, 2)
+        for reading, (_, up) in zip(readings, change, strict=True):
+            assert up == pytest.approx(-1e-4 if reading.target == link else 0.0, abs=1e-12)
+
+
+def test_the_covariance_of_a_rotation_is_that_of_the_turns_of_mon_and_of_the_cube(
+    rng: np.random.Generator,
+) -> None:
+    """By how the rotation itself turns, about mon's axes, with each unknown."""
+    readings, _ = planted_cube(rng, noise_arcsec=0.0, repeats=1)
+    # a cube that is far from level
+    turned = random_rotation(rng)
+    unknowns = replace(
+        _Unknowns.of(readings, _station_zeros(Path("readings.csv"), readings)), from_cube=turned
+    )
+    none = np.zeros(unknowns.count)
+    root = rng.normal(size=(unknowns.count, unknowns.count))
+    covariance = root @ root.T
+    q, found = unknowns.rotation(none, covariance)
+    step = 1e-6
+    turns = []
+    for number in range(unknowns.count):
+        moved = none.copy()
+        moved[number] = step
+        other, _ = unknowns.rotation(moved, covariance)
+        turns.append(to_rotation_vector(multiply(conjugate(q), other)) / step)
+    slopes = np.array(turns).T
+    np.testing.assert_allclose(found, slopes @ covariance @ slopes.T, rtol=1e-4, atol=1e-3)

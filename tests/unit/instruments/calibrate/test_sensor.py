@@ -144,7 +144,9 @@ def test_frames_by_plain_numpy_give_back_what_made_them(tmp_path):
     ):
         charge_e = rng.poisson(level_e * response) + read_e * rng.standard_normal(SHAPE)
         paths.append(tmp_path / f"{number:02}.png")
-        Image.fromarray(np.rint(charge_e / gain + 100).astype(np.uint16)).save(paths[-1])
+        Image.fromarray(np.rint(charge_e / gain + 100).astype(np.uint16)).save(
+            paths[-1], compress_level=1
+        )
     found = measure_sensor(paths[2:], paths[:2])
     for key, value in {
         "gain_e_per_dn": gain,

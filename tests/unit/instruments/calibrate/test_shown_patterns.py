@@ -22,6 +22,7 @@ from hilstar.instruments.calibrate import plan as plans
 from hilstar.instruments.calibrate import until_key
 from hilstar.instruments.calibrate.first_light import image_sources
 from hilstar.instruments.calibrate.first_light.image_sources import (
+    GrabCamera,
     GrabCommand,
     Pattern,
     PatternDisplay,
@@ -33,6 +34,7 @@ from hilstar.instruments.calibrate.plan import Patch, show_patches
 from hilstar.instruments.calibrate.until_key import stays_until_key
 from hilstar.optics.scan import Orientation
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.server.genicam.camera import CameraImage
 from tests.support.benches import bench_text
 
 SCREEN_PX = (320, 240)
@@ -348,3 +350,65 @@ def test_a_session_holds_a_pattern_where_it_shows_it_itself(panel, tmp_path):
     with pytest.raises(InputError, match="this session shows nothing here; leave --feed out"):
         elsewhere.hand_on(PatternFrames(watcher))
     assert math.isclose(before_s, panel.shown_s[-1], abs_tol=0.03)
+
+
+class RecordedCamera:
+    """A camera whose third answer is its image; what is asked of it is recorded."""
+
+    def __init__(self, image: CameraImage) -> None:
+        self.about = {"vendor": "Acme", "model": "Eye", "formats": ["Mono8", "Mono12", "Mono16"]}
+        self.features: dict[str, object] = {}
+        self.exposures_s: list[float] = []
+        self.asked = 0
+        self.is_open = True
+        self._image = image
+
+    def set(self, features: dict[str, object]) -> None:
+        self.features |= features
+
+    def begin(self, exposure_s: float) -> None:
+        self.exposures_s.append(exposure_s)
+
+    def image(self) -> CameraImage | None:
+        self.asked += 1
+        return self._image if self.asked == 3 else None
+
+    def close(self) -> None:
+        self.is_open = False
+
+
+def test_a_camera_exposes_once_when_the_panel_shows_the_pattern(
+    panel, tmp_path, caplog, monkeypatch, rng
+):
+    dn = rng.integers(0, 4095, (60, 80)).astype(np.uint16)
+    dn[:4] = 4095
+    camera = RecordedCamera(CameraImage(dn, 0.02, 0, "", 2))
+    named = []
+
+    def opened(name: str) -> RecordedCamera:
+        named.append(name)
+        return camera
+
+    monkeypatch.setattr(image_sources, "GenicamCamera", opened)
+    changes = {"tracker.detector": {"bits": 12}, "tracker.camera": {"gain": 3.0}}
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text(changes, {"monitor": {"resolution_px": list(SCREEN_PX)}}))
+    file = read_bench_file(path)
+    with caplog.at_level(logging.WARNING):
+        source = GrabCamera(file, "S42")
+        taken = source.look(file, pattern_of(200), tmp_path / "frame_003", 0.02)
+    assert named == ["S42"]
+    assert source.identity.endswith("S42") and source.sets_exposure
+    assert camera.features["PixelFormat"] == "Mono12"
+    assert camera.features["Gain"] == 3.0
+    assert (camera.exposures_s, camera.asked) == ([0.02], 3)
+    assert panel.now_s - panel.shown_s[0] == pytest.approx(0.25 + 3 * 0.02, abs=0.021)
+    assert taken == tmp_path / "frame_003.png"
+    np.testing.assert_array_equal(source.pixels(taken, (80, 60)), dn)
+    assert caplog.messages == [
+        "the tracker's images are Acme Eye's, Mono12",
+        f"frame_003: {(dn == 4095).sum()} pixels are saturated at 4095",
+        "frame_003: taken again after 2 incomplete images",
+    ]
+    source.close()
+    assert not camera.is_open

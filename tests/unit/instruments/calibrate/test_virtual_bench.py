@@ -145,6 +145,51 @@ def test_the_screen_s_own_black_and_light_against_place_are_in_its_images(source
     )
 
 
+def test_light_of_the_sky_and_of_black_grows_with_the_exposure_and_black_with_the_warmth(
+    sources, tmp_path
+):
+    """Before the first image's end a screen has 0.6 of its light; the sky is not its."""
+    virtual = {"warm_up_min": 1e3, "cold_percent": 40.0, "drift_percent_per_h": 0.0}
+    filed = {"monitor": {"calibration": "gamma2.2"}}
+    black = np.zeros(SCREEN_PX[::-1], dtype=np.uint16)
+    head = 'kind = "photometric"\nwho = ""\nwhen = ""\ninstrument = ""\nunit = ""\n'
+    rows = [f"{code},{float(value)!r}" for code, value in enumerate(0.99 * LIGHT + 0.01)]
+    (tmp_path / "light.csv").write_text("\n".join(["code,w", *rows]))
+    table = f'[calibration]\n{head}bits = {BITS}\nresponse = "light.csv"\n'
+    (tmp_path / "black.toml").write_text(table)
+    source = sources(
+        {"monitor": {"calibration": "black.toml"}},
+        {"certify.virtual": virtual},
+        {"background": {"electrons_per_px": 400.0}},
+        filed=[filed],
+    )
+    unlit_dn = source.pixels(source.unlit(tmp_path / "unlit"), DETECTOR_PX).mean() - OFFSET_DN
+    # 400 e- in the bench's exposure; 11 408 pixels of 4 e- of noise and photons: 0.1 DN
+    assert unlit_dn == pytest.approx(400.0 / GAIN_E_PER_DN, abs=0.5)
+    glow_e_per_s = (DOWN @ np.ones(SCREEN_PX[::-1]) @ ACROSS.T).mean() * 0.01 * WHITE_E_PER_S
+    for name, exposure_s in (("short", 0.05), ("long", 0.3)):
+        image = image_of(source, tmp_path, Pattern(name, black), exposure_s)
+        electrons = (400.0 / EXPOSURE_S + 0.6 * glow_e_per_s) * exposure_s
+        dn = electrons / GAIN_E_PER_DN
+        assert image.mean() - OFFSET_DN == pytest.approx(dn, rel=3e-3)
+
+
+def test_an_image_that_is_taken_again_has_its_noise_and_one_of_another_folder_has_not(
+    sources, tmp_path
+):
+    source = sources()
+    codes = np.zeros(SCREEN_PX[::-1], dtype=np.uint16)
+    images = []
+    for folder in ("a", "b", "a"):
+        (tmp_path / folder).mkdir(exist_ok=True)
+        file = bench(tmp_path, "filed")
+        stem = tmp_path / folder / "frame_000"
+        path = source.look(file, Pattern("frame_000", codes), stem, EXPOSURE_S)
+        images.append(source.pixels(path, DETECTOR_PX))
+    np.testing.assert_array_equal(images[0], images[2])
+    assert (images[0] != images[1]).mean() > 0.5
+
+
 def test_frames_are_shown_in_turn_for_as_long_as_the_exposure_lasts(sources, tmp_path, rng):
     """Three refreshes of 60 Hz of two frames: the first twice."""
     rate = {"monitor": {"refresh_hz": 60.0}}
@@ -243,7 +288,14 @@ def test_a_virtual_diode_sees_the_true_delay_and_the_way_of_the_scan(tmp_path, r
             "96 x 120 px and the bench file's is 120 x 96",
         ),
         ({}, {"monitor": {"bits": 8}}, "bits = 8 and the bench file says 10"),
-        ({}, {"tracker": {"resolution_px": [92, 124]}}, "[tracker] resolution_px is not"),
+        (
+            {"monitor": {"bits": 8}},
+            {"monitor": {"bits": 10}},
+            "bits = 10 and the bench file says 8",
+        ),
+        ({}, {"tracker": {"resolution_px": [124, 90]}}, "[tracker] resolution_px is not"),
+        ({}, {"tracker": {"resolution_px": [120, 92]}}, "[tracker] resolution_px is not"),
+        ({}, {"render": {"bit_stealing": True}}, "bit_stealing is for the bench that shows"),
     ],
 )
 def test_a_truth_of_another_screen_or_tracker_is_refused(tmp_path, filed, true, words):

@@ -222,3 +222,21 @@ def test_a_planted_warm_up_is_stable_by_its_size_and_never_before_the_watch(
 )
 def test_only_an_exponential_says_until_when_to_wait(law, stable_after_s, words):
     assert WarmUp(law, False, STABLE, stable_after_s=stable_after_s).cure.startswith(words)
+
+
+@pytest.mark.parametrize("drift_per_s", [0.0, -4e-7])
+def test_where_an_exponential_has_died_away_a_line_tells_the_drift(drift_per_s: float) -> None:
+    """Ten time constants before the middle: it says that nothing drifts, for sure; the line's
+    error is that of the last half of the readings.
+    """
+    t_s = np.arange(120) * 10.0
+    light = 1 + 0.04 * np.exp(-t_s / 60) + drift_per_s * t_s
+    light *= 1 + 2e-4 * np.random.default_rng(4).standard_normal(120)
+    judged = judge_warm_up(t_s, light)
+    assert judged.law == "exponential"
+    fitted, covariance = np.polyfit(t_s[60:], light[60:], 1, cov=True)
+    percent_per_h = 100 * 3600 / np.polyval(fitted, t_s[60:].mean())
+    assert judged.drift_percent_per_h == pytest.approx(fitted[0] * percent_per_h, rel=1e-3)
+    error = math.sqrt(covariance[0, 0]) * percent_per_h
+    assert judged.drift_error_percent_per_h == pytest.approx(error, rel=1e-3)
+    assert judged.dof == 58

@@ -51,3 +51,39 @@ def test_the_case_that_kills_its_workers_is_named_and_the_others_are_run(tmp_pat
         and MAX_DEATHS <= len(died) <= MAX_DEATHS + 1
     )
     assert ran == set(range(1, 12)) - {7} and this.to_run == 0
+
+
+def test_a_task_is_as_long_as_cases_took_so_far_the_last_of_them_by_three_tenths(
+    tmp_path: Path,
+) -> None:
+    """Cases of 1 s and of 0.5 s: 0.85 s, of which 17 s are 20; and 0.02 s for each of 1000 workers
+    are longer than the second that is wanted.
+    """
+    this = Backlog(Design("sobol", 1, 4000, 3, []), Journal(tmp_path / "journal", 4000), 17.0)
+    for case_s in (1.0, 0.5):
+        task = this.take(1)
+        assert task is not None
+        this.done(task, case_s * len(task))
+    task = this.take(1)
+    assert task is not None and len(task) == 20
+    this.give_back(task)
+    assert this.take(1) is task  # nobody has begun it
+    many = backlog(tmp_path / "many", 400_000, [])
+    many.done(many.take(1000), 0.5)  # type: ignore[arg-type]
+    task = many.take(1000)
+    assert task is not None and len(task) == 40
+
+
+def test_the_cases_of_a_dead_worker_come_again_at_their_own_points(tmp_path: Path) -> None:
+    this = backlog(tmp_path, 40, [0, 1, 2, 9])
+    this.done(this.take(1), 0.1)  # type: ignore[arg-type]
+    task = this.take(1)
+    assert task is not None and (task.begin, len(task)) == (4, 5)
+    assert this.died(task) is None
+    points = Design("sobol", 1, 40, 3, []).points(0, 40)
+    for case in range(4, 9):
+        again = this.take(1)
+        assert again is not None and (again.begin, len(again)) == (case, 1)
+        assert again.points[0].tolist() == points[case].tolist()
+    after = this.take(1)
+    assert after is not None and after.begin == 10

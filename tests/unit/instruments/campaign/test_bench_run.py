@@ -400,3 +400,45 @@ def test_a_display_is_that_of_the_cases_it_shows_though_a_check_case_is_the_firs
             faintest_v_mag
         }
     assert sorted(number for _, numbers in drawn for number in numbers) == list(range(13))
+
+
+def test_an_answer_without_an_attitude_counts_once_its_case_has_one(cases):
+    cases.run._plan = msgspec.structs.replace(cases.run._plan, answers=2)
+    cases.begin(0)
+    cases.pass_s(0.3)
+    cases.answer(None)
+    cases.pass_s(0.1)
+    cases.answer(cases.shown, off_arcsec=5.0)
+    cases.pass_s(0.1)
+    cases.answer(None)
+    cases.pass_s(0.02)
+    (row,) = cases.rows()
+    assert (row["received"], row["solved"], row["wrong"]) == (2, 1, 0)
+
+
+def test_a_tracker_whose_messages_are_all_refused_is_not_silent(cases):
+    cases.begin(0)
+    for _ in range(11):
+        cases.tracker.refused += 1
+        cases.pass_s(0.1)
+    (row,) = cases.rows()
+    assert (row["status"], row["why"]) == (NO_ANSWER, "the tracker had no attitude")
+
+
+def test_a_recovery_is_by_an_exposure_after_the_fault_s_end_and_until_its_answer_comes(cases):
+    """Answers come 50 ms after the middle of their exposures: that of 0.28 s comes after the
+    fault's end.
+    """
+    cases.run._plan = msgspec.structs.replace(cases.run._plan, answers=3)
+    cases.begin(0)
+    cases.run._now.fault_end_s = 0.3
+    cases.pass_s(0.2)
+    begun_ns = cases.run._now.begun_ns
+    for answered_s in (0.33, 0.4, 0.5):
+        cases.pass_s(answered_s - (cases.now_ns - begun_ns) / NS_PER_S)
+        cases.answer(cases.shown)
+        late = dataclasses.replace(cases.tracker.answers[0], t_ns=cases.now_ns - 50_000_000)
+        cases.tracker.answers[0] = late
+    now = cases.run._now
+    cases.pass_s(0.02)
+    assert now.recovery_s == pytest.approx(0.1, abs=0.011)

@@ -16,12 +16,16 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
+from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.assess.places import Scale
 from hilstar.instruments.campaign.cases import CaseMaker, beside_q, value_kind
 from hilstar.instruments.campaign.job import Job, files_sha256
 from hilstar.instruments.campaign.plan import Design, Parameter, parse_plan
 from hilstar.instruments.campaign.session import Session
+from hilstar.instruments.campaign.star_motion import StarMotion
 from hilstar.instruments.simulate.simulator import Simulator
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.star_light import bench_moving
 from hilstar.sky.bodies.orbit import TleOrbit
 from hilstar.sky.bodies.shapes import EQUATOR_KM
 from tests.support.benches import ROOT
@@ -453,3 +457,62 @@ def test_a_case_s_seed_has_63_bits(tmp_path: Path) -> None:
     assert len(set(seeds)) == 40
     assert max(seeds) < 2**63
     assert 8 < sum(seed >= 2**62 for seed in seeds) < 32
+
+
+PLANTED_OLD = "[planted]\nproper_motion = 0.5\ncatalogue_age_yr = 30.0\nparallax = -4.0\n"
+DATES = "2026-04-01T00:00:00Z", "2050-07-01T00:00:00Z"
+
+
+def test_planted_old_places_turn_a_case_by_its_years_and_its_parallax(tmp_path: Path) -> None:
+    """Half of the 24.25 years from the bench's date to the case's, 30 years more, and four times
+    the parallax the other way: each by the stars of a field that is wider than high.
+    """
+    vary = {"key": "sky.epoch_utc", "values": [DATES[1]]}
+    look = {"kind": "field", "radec_deg": [84.0, -1.0], "radius_deg": 0.0, "roll_deg": [40, 40]}
+    plan = write_campaign(tmp_path, vary, cases=1, attitudes=look, noise="none")
+    bench = tmp_path / "bench.toml"
+    text = bench.read_text().replace("[128, 128]", "[160, 90]")
+    observer = f'[sky]\nfaintest_v_mag = 6.0\nepoch_utc = "{DATES[0]}"\n[spacecraft]\norbit = "geocentre"\n'
+    bench.write_text(f"{text}\n{observer}")
+    errors = []
+    for planted in ("", PLANTED_OLD):
+        plan.write_text(plan.read_text() + planted)
+        this = cases_session(tmp_path)
+        case = this.maker.case(0, points(this, 1)[0])
+        file = this.maker.bench(case)
+        row = this.row(0, points(this, 1)[0])
+        this.close()
+        errors.append(np.array([row[f"error_{axis}_arcsec"] for axis in "xyz"]))
+    q = case.first.q_icrs_to_cam
+    scale = Scale(20e3 / file.config.tracker.pixel_pitch_um, (160, 90))
+    stars = StarMotion.of(read_bench_file(bench))
+    moving = bench_moving(file.config, tmp_path)
+    assert moving is not None
+    first, last = np.array([date[:-1] for date in DATES], dtype="datetime64[s]")
+    years = float((last - first) / np.timedelta64(1, "D")) / 365.25
+    turn_rad = (0.5 * years + 30.0) * stars.whole_turn_rad(q, scale)
+    turn_rad += -4.0 * stars.by_parallax(moving).whole_turn_rad(q, scale)
+    turn_arcsec = ARCSEC_PER_RAD * turn_rad
+    assert np.abs(turn_arcsec).min() > 0.01
+    assert errors[1] - errors[0] == pytest.approx(turn_arcsec, rel=1e-3, abs=1e-3)
+
+
+def test_a_case_that_overflows_fails_alone_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next case is as in a session of its own."""
+
+    def overflows(*_: object, **__: object) -> None:
+        raise OverflowError("a light that\nhas no number")
+
+    write_campaign(tmp_path)
+    this, alone = cases_session(tmp_path), cases_session(tmp_path)
+    where = points(this, 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulator, "expose", overflows)
+        failed = this.row(0, where[0])
+    assert (failed["case"], failed["status"]) == (0, "failed")
+    assert failed["why"] == "OverflowError: a light that has no number"
+    assert this.row(1, where[1]) == alone.row(1, where[1])
+    this.close()
+    alone.close()

@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from scipy.stats import beta, binom
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.pages import BAD, DASH, OK, WARN
+from hilstar.basics.pages import BAD, DASH, OK, WARN, Verdict
+from hilstar.instruments.assess.figure_rows import FigureRow
 from hilstar.instruments.campaign import acceptance_page, requirements_page
 from hilstar.instruments.campaign.acceptance_plan import (
     AcceptancePlan,
@@ -34,6 +35,7 @@ from hilstar.instruments.campaign.acceptance_verdicts import (
     SetResult,
 )
 from hilstar.instruments.campaign.case_table import Columns
+from hilstar.instruments.campaign.page import MeasureCosts, verdict_of, write_campaign_page
 from hilstar.instruments.campaign.plan import parse_plan
 from hilstar.instruments.campaign.requirements import (
     MET,
@@ -46,7 +48,7 @@ from hilstar.instruments.campaign.sweep import NOT_EVEN, STILL, LevelCount, Swee
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.acceptance import write_bench
 from tests.support.campaigns import write_campaign
-from tests.support.card_texts import BAND, card_lines, drawn_figures
+from tests.support.card_texts import BAND, CELL, card_lines, drawn_figures
 from tests.support.certificates import a_certificate
 from tests.support.tables import csv_rows
 
@@ -480,3 +482,78 @@ def test_a_case_s_rate_is_that_of_all_axes_together_and_its_error_one_of_two(tmp
     error, rate = requirements_page._error_and_rate(Columns(4, numbers, {}))
     assert error[:3] == pytest.approx(np.array([0.0, 10.0, 10.0]) / np.sqrt(2))
     assert rate == pytest.approx([1.0, 5.0, 5.0, 1.0])
+
+
+def campaign_summary(**changes: Any) -> dict[str, Any]:
+    """What a campaign's page is of."""
+    usual = {
+        "cases": 25_000,
+        "failed": 0,
+        "failed_because": {},
+        "wrong": 0,
+        "availability": 1.0,
+        "limit_arcsec": None,
+        "table": "out/cases.parquet",
+        "sha256": "ab" * 32,
+        "notes": [],
+    }
+    return usual | changes
+
+
+@pytest.mark.parametrize(
+    ("changes", "state", "headline"),
+    [
+        ({}, OK, "100 %"),
+        ({"availability": 0.99996}, WARN, "99.99 %"),
+        ({"availability": 0.97}, WARN, "97 %"),
+        ({"failed": 3}, WARN, "100 %"),
+        ({"failed": 3, "wrong": 1}, BAD, "100 %"),
+    ],
+)
+def test_a_campaign_is_judged_by_wrong_answers_then_by_what_is_missing(
+    changes: dict[str, Any], state: str, headline: str
+) -> None:
+    summary = campaign_summary(**changes)
+    verdict = verdict_of(summary)
+    counts = f"25000 cases, {summary['failed']} failed, {summary['wrong']} wrong answers."
+    assert verdict == Verdict(state, f"The tracker was right in {headline} of the frames", counts)
+
+
+def test_the_page_of_a_campaign_says_what_failed_and_the_known_rows_of_its_budget(
+    tmp_path: Path,
+) -> None:
+    """Of 22 reasons the page has 20; a figure's half width is that of its interval; a cure stands
+    once.
+    """
+    because = {f"reason {k}": 100 - k for k in range(22)}
+    summary = campaign_summary(failed=1969, failed_because=because, wrong=7, notes=["a note"])
+    budget = [
+        FigureRow("noise", "cross", 2.0, "arcsec", 1.7, 2.3),
+        FigureRow("noise", "roll", 30.0, "arcsec", 25.0, 35.0),
+        FigureRow("pixel error", "cross", None, "arcsec"),
+        FigureRow("pixel error", "roll", 9.0, "arcsec", 8.0, 10.0),
+    ]
+    costs = {}
+    for measure, cost in (("noise", 3), ("bias", 4)):
+        costs[measure] = MeasureCosts(f"{cost} arcsec", f"cost of {measure}", [], Figure())
+    with drawn_figures():
+        write_campaign_page(tmp_path / "campaign.html", summary, budget, costs)
+    text = (tmp_path / "campaign.html").read_text()
+    cards = card_lines(text)
+    failed = cards["Failed cases"]
+    assert f"100{CELL}reason 0" in failed and f"81{CELL}reason 19" in failed
+    assert not any("reason 20" in line for line in failed)
+    band = " ".join(cards[BAND])
+    for words in (
+        "2.00 \N{PLUS-MINUS SIGN} 0.30 arcsec noise across, one sigma",
+        "pixel error across: cannot be told",
+        "7 wrong answers",
+        "1969 failed cases",
+    ):
+        assert words in band, band
+    assert 'data-state="bad">7<small>wrong answers' in text
+    assert text.count("column `wrong` is over 0") == 1
+    assert "a note" in " ".join(cards["Table and notes"])
+    known = [line.split(CELL)[:2] for line in cards["Budget"]]
+    assert ["pixel error", "about the boresight"] in known
+    assert ["pixel error", "across"] not in known

@@ -192,7 +192,7 @@ def photographs(folder: Path, camera: Planted) -> list[Path]:
     for number, pointing in enumerate(SKY.pointings):
         image = photograph(camera, pointing, rng, WRONG if number == 0 else NOTHING_WRONG)
         paths.append(folder / f"planted_{number}.png")
-        Image.fromarray(image).save(paths[-1])
+        Image.fromarray(image).save(paths[-1], compress_level=1)
     return paths
 
 
@@ -259,7 +259,9 @@ def test_a_site_tells_air_mass_and_extinction(
         extras = Extras(zenith=tuple(up), k_mag=0.25)
         wanted.append(1 / float(rotation_of(*SKY.pointings[2])[2] @ up))
         paths.append(tmp_path / f"night_2020-09-{time.replace(':', '-')}.png")
-        Image.fromarray(photograph(camera, SKY.pointings[2], rng, extras)).save(paths[-1])
+        Image.fromarray(photograph(camera, SKY.pointings[2], rng, extras)).save(
+            paths[-1], compress_level=1
+        )
     found = confronted(write_bench(tmp_path / "guess.toml", more=SITE), paths, tmp_path / "out")
     figures = found["camera"]
     sigma = figures["sigma"]["extinction_beyond_table_mag_per_air_mass"]
@@ -306,7 +308,7 @@ def test_a_photograph_that_cannot_be_used_is_refused_with_what_to_do(
 
 
 def assert_image_refused(folder: Path, image: np.ndarray[Any, Any], name: str, says: str) -> None:
-    Image.fromarray(image).save(folder / name)
+    Image.fromarray(image).save(folder / name, compress_level=1)
     done = run_hilstar_here(
         "confront", write_bench(folder / "guess.toml"), folder / name, "-o", folder / "out"
     )
@@ -359,7 +361,7 @@ def test_a_date_that_is_ten_years_off_is_told_by_a_fast_star(tmp_path: Path) -> 
     """61 Cygni moves 5.3 arcsec a year: 0.077 px of the planted camera."""
     pointing = (316.7, 38.7, 40.0)
     image = photograph(Planted(epoch_jyear=2020.0), pointing, np.random.default_rng(2))
-    Image.fromarray(image).save(tmp_path / "cygnus.png")
+    Image.fromarray(image).save(tmp_path / "cygnus.png", compress_level=1)
     bench = write_bench(tmp_path / "guess.toml")
     for year, off in (("2010", 10.0), ("2020", 0.0)):
         found = confronted(
@@ -403,7 +405,7 @@ def test_a_trail_has_the_name_of_the_satellite_that_passed_there(tmp_path: Path)
     )[0]
     extras = Extras(trail_px=(trail[0], trail[2]), zenith=tuple(up))
     Image.fromarray(photograph(camera, pointing, np.random.default_rng(4), extras)).save(
-        tmp_path / "pass.png"
+        tmp_path / "pass.png", compress_level=1
     )
     (tmp_path / "tles.txt").write_text(STATION_TLE)
     keys = f"[site]\nlatitude_deg = {latitude}\nlongitude_deg = {longitude}\n"
@@ -432,7 +434,7 @@ def test_one_photograph_of_a_bench_with_bodies_gives_a_file_that_simulate_takes(
     """
     more = '[sky]\nepoch_utc = "2020-09-20T20:00:00Z"\n[sky.bodies]\nmoon = true\n'
     image = photograph(Planted(), SKY.pointings[2], np.random.default_rng(9), NOTHING_WRONG)
-    Image.fromarray(image).save(tmp_path / "one.png")
+    Image.fromarray(image).save(tmp_path / "one.png", compress_level=1)
     bench = write_bench(tmp_path / "guess.toml", more=more)
     found = confronted(bench, [tmp_path / "one.png"], tmp_path / "out")
     assert found["camera"]["sigma"].get("gain_e_per_dn") is None

@@ -35,7 +35,7 @@ def planted(tmp_path_factory):
     """A folder with a guess of a camera and one of its photographs, and the camera by it."""
     folder = tmp_path_factory.mktemp("planted")
     image = photograph(Planted(), SKY.pointings[1], np.random.default_rng(5))
-    Image.fromarray(image).save(folder / "sky.png")
+    Image.fromarray(image).save(folder / "sky.png", compress_level=1)
     write_bench(folder / "guess.toml")
     return folder, image, confronted(folder, folder / "sky.png", "-o", folder / "by_file", *AT)
 

@@ -47,7 +47,7 @@ def written(folder: Path, offset: str | None = None, exposure_s: float | None = 
     exif = Image.Exif()
     exif[EXIF_IFD] = table
     path = folder / "shot.png"
-    Image.fromarray(ramp()).save(path, exif=exif)
+    Image.fromarray(ramp()).save(path, exif=exif, compress_level=1)
     return path
 
 
@@ -86,7 +86,7 @@ def test_a_time_without_an_offset_is_none_and_one_that_is_given_is_it(tmp_path: 
 
 def saved(folder: Path, pixels: np.ndarray, name: str = "a.tiff") -> Path:
     path = folder / name
-    Image.fromarray(pixels).save(path)
+    Image.fromarray(pixels).save(path, compress_level=1)
     return path
 
 

@@ -91,7 +91,7 @@ def night(tmp_path_factory: pytest.TempPathFactory) -> Night:
         )
         image = photograph(CAMERA, pointing, rng, extras)
         paths.append(folder / f"night_{time.replace(':', '-')}.png")
-        Image.fromarray(image).save(paths[-1])
+        Image.fromarray(image).save(paths[-1], compress_level=1)
     predicted: list[FloatArray] = []
     percents: list[int] = []
     pictures = confront_run.page_pictures

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 import pytest
 
+from hilstar.display.calibration import with_uniformity
 from hilstar.display.primaries import ChannelMatrix
+from hilstar.instruments.simulate import budget as budgets
 from hilstar.instruments.simulate.budget import (
     LightBudget,
     MagnitudeRow,
     NotDrawn,
+    budget,
     budget_lines,
     out_of_gamut,
     red_shares,
 )
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.star_rates import bench_optics
 from hilstar.server.bench.star_size import StarSize
 from hilstar.tracker.centroiders import FAMILY
-from tests.support.benches import SMALL_BENCH
+from tests.support.benches import SMALL_BENCH, bench_text
 
 STAR = StarSize(1.0, 0.5, 1.5, 2.0, 1.25, 13.5, 4.5, None)
 
@@ -159,3 +164,43 @@ def test_shares_of_red_light_fall_with_the_wavelength_and_rise_with_redder_stars
     two = red_shares({"a": optics, "b": optics}, [650.0])
     assert [row["channel"] for row in two] == ["all", "a", "b"]
     assert two[1]["by_class"] == pytest.approx(near)
+
+
+def test_a_budget_s_ends_are_where_white_and_the_first_code_are_on_the_darkest_and_best_places(
+    tmp_path, monkeypatch
+) -> None:
+    """A screen of gamma 2.2 and 8 bits whose light falls to 0.8, through the small bench's Gaussian."""
+    monkeypatch.setattr(budgets, "_errors", lambda bench: [])
+    even = np.ones((6, 8))
+    uneven = even.copy()
+    uneven[4:, 5:] = 0.8
+    ends = []
+    for name, grid in (("even", even), ("uneven", uneven)):
+        with_uniformity("gamma2.2", 8, tmp_path / f"{name}.toml", grid)
+        path = tmp_path / f"{name}_bench.toml"
+        monitor = {"calibration": f"{name}.toml", "bits": 8}
+        render = {"quantisation": "round", "flux_at_white_e_per_s": 5e4}
+        sky = {"faintest_v_mag": 4.0}
+        path.write_text(bench_text({"monitor": monitor, "render": render, "sky": sky}))
+        with open_bench(read_bench_file(path)) as bench:
+            sigma_x_px, sigma_y_px = bench.psf.width_px
+            ends.append(budget(bench))
+    whole, falling = ends
+    peak = 1.0
+    corner = 1.0
+    for sigma_px in (sigma_x_px, sigma_y_px):
+        peak *= math.erf(0.5 / sigma_px / math.sqrt(2))
+        corner *= math.erf(1 / sigma_px / math.sqrt(2)) / 2
+    # a sprite ends at four sigmas
+    cut = 1e-3
+    at_best = whole.clips_v_mag_at_best - whole.clips_v_mag
+    assert at_best == pytest.approx(2.5 * math.log10(corner / peak), abs=cut)
+    white_v_mag = whole.clips_v_mag + 2.5 * math.log10(1 / peak)
+    # a star lights a pixel where half of the first code's light falls into its own
+    dimmest = 255**-2.2 / 2 / peak
+    assert whole.nothing_v_mag - white_v_mag == pytest.approx(-2.5 * math.log10(dimmest), abs=cut)
+    assert whole.range_mag == pytest.approx(whole.nothing_v_mag - whole.clips_v_mag)
+    brighter = falling.clips_v_mag - whole.clips_v_mag
+    assert brighter == pytest.approx(-2.5 * math.log10(0.8), abs=cut)
+    assert falling.clips_v_mag_at_best == pytest.approx(whole.clips_v_mag_at_best, abs=cut)
+    assert whole.black_e_per_s_px == 0.0

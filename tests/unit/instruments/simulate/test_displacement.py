@@ -97,3 +97,21 @@ def test_the_detector_ends_with_its_last_pixels_outer_edges():
     assert on_detector([9.0] * 4, [-0.6, -0.5, 47.4, 47.5]) == [False, True, True, False]
     assert on_detector([1.4, 1.5, 61.4, 61.6], [9.0] * 4, 2.0) == [False, True, True, False]
     assert on_detector([np.nan, 9.0], [9.0, np.nan]) == [False, False]
+
+
+def test_what_is_left_is_corrected_for_the_unknowns_and_its_95th_percentile_is_of_places(rng):
+    """Against a least-squares fit of scale, rotation and shift to 20 stars that move by chance."""
+    x, y = rng.uniform(0, 400, (2, 20))
+    dx, dy = rng.normal(size=(2, 20))
+    fit = fit_geometry(np.column_stack([x, y, dx, dy]), TRACKER, LIMIT_PX)
+    u, v = x + dx - 199.5, y + dy - 199.5
+    ones, none = np.ones(20), np.zeros(20)
+    across = np.column_stack([u, -v, ones, none])
+    down = np.column_stack([v, u, none, ones])
+    design = np.concatenate([across, down])
+    back = -np.concatenate([dx, dy])
+    rest = back - design @ np.linalg.lstsq(design, back, rcond=None)[0]
+    share = (rest @ rest / (40 - 4)) / (back @ back / 40)
+    assert fit.left == pytest.approx(share)
+    off_px = np.hypot(rest[:20], rest[20:])
+    assert fit.left_px == pytest.approx(np.percentile(off_px, 95))

@@ -106,3 +106,12 @@ def test_a_stream_after_triggers_exposes_the_last_one_s_moment_no_second_time():
     assert begins_ms(times, 1) == [400.0]
     camera.settings.triggered = False
     assert begins_ms(times, 2) == [500.0, 600.0]
+
+
+def test_a_triggered_tracker_that_answers_passes_over_free_exposures_while_no_client_is_there():
+    camera = Camera()
+    camera.settings.triggered = True
+    times = CameraExposures(STEADY, BEGUN_NS, camera, always=True)
+    assert begins_ms(times, 1) == [0.0]
+    assert times.pass_over(BEGUN_NS, BEGUN_NS + 350 * NS_PER_MS) == 2
+    assert begins_ms(times, 1) == [300.0]

@@ -7,13 +7,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 from PIL import Image
 
 import hilstar
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import angle_between_rad
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
-from hilstar.instruments.simulate import exposures
+from hilstar.instruments.simulate import batch, exposures
 from hilstar.instruments.simulate.exposures import LogFaults, faulty_exposure
 from hilstar.instruments.simulate.pictures import TrackerPictures
 from hilstar.instruments.simulate.simulator import FrameNoise, Simulator, _merge
@@ -24,7 +25,7 @@ from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.fault_views import faults_at
 from hilstar.server.bench.scenario import parse_scenario
-from tests.support.benches import ORION_Q, SMALL_BENCH
+from tests.support.benches import ORION_Q, SMALL_BENCH, bench_text
 
 EXPOSURE_S = 0.1  # the bench's default
 LIGHT_SHARE = 2e-6  # float32, and a footprint's cut
@@ -279,3 +280,39 @@ def test_pictures_of_a_run_have_a_noise_each_and_stand_where_the_display_does():
     noise = [drawn for _, drawn in made._simulator.asked]
     wanted = [np.random.default_rng((0, number)).normal() for number in range(4)]
     assert noise == wanted
+
+
+def test_a_worker_writes_exposures_each_with_its_number_s_noise_and_how_it_was_made(tmp_path):
+    """The same light as of a simulator that is asked here, with the noise of (seed, number)."""
+    rate_deg_s = np.array([0.1, -0.2, 0.4])
+    tracker = {"resolution_px": [120, 90], "exposure_s": EXPOSURE_S}
+    text = bench_text({"tracker": tracker, "sky": {"faintest_v_mag": 4.0}})
+    file = bench_file_of(tmp_path / "bench.toml", text)
+    detector = file.config.tracker.detector
+    ghost = HEAD + GHOST.replace("480, 530", "70, 20")
+    scenario = parse_scenario(tmp_path / "faults.toml", ghost)
+    noise = FrameNoise("full", 8)
+    with Simulator(file) as simulator:
+        view = simulator.view(np.array(ORION_Q), np.radians(rate_deg_s))
+        ghostly = faulty_exposure(simulator, [view], scenario, round(1.5 * NS_PER_S))
+        plain = simulator.expose(view, np.random.default_rng((8, 27)))
+        faulty = simulator.expose(view, np.random.default_rng((8, 27)), faults=ghostly)
+    for planned, pieces, wanted, names in (
+        (None, (), plain, None),
+        (scenario, ghostly.pieces, faulty, "ghost"),
+    ):
+        nothing, expose = batch._start_exposing(file, noise, tmp_path, planned)
+        assert nothing is None
+        expose(27, view, pieces)
+        with fits.open(tmp_path / "exposure_000027.fits") as (image, table):
+            np.testing.assert_array_equal(image.data, wanted.dn)
+            assert table.data["x_px"].tolist() == wanted.truth["x_px"].tolist()
+            header = image.header
+        rates = [header[name] for name in ("RATEX", "RATEY", "RATEZ")]
+        assert rates == pytest.approx(rate_deg_s)
+        assert (header["NOISE"], header["SEED"], header["EXPTIME"]) == ("full", 8, EXPOSURE_S)
+        device = (detector.gain_e_per_dn, detector.offset_dn, detector.full_well_e, detector.bits)
+        assert tuple(header[name] for name in ("GAIN", "OFFSET", "FULLWELL", "BITS")) == device
+        assert header["DEVSEED"] == detector.device_seed
+        assert header.get("FAULTS") == names
+        assert header["NSTARS"] == len(wanted.truth)

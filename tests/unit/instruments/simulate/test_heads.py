@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from itertools import combinations
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.arrays import FloatArray
+from hilstar.basics.rotation import conjugate, multiply
+from hilstar.instruments.simulate import heads as heads_module
 from hilstar.instruments.simulate.heads import (
     HeadsErrors,
     _apart_arcsec,
-    _inside,
+    _Head,
     body_attitude,
     verify_heads,
 )
+from hilstar.instruments.simulate.star_finder import star_finder
 from hilstar.instruments.simulate.twin import Twin
 from hilstar.server.bench.bench_file import read_heads
+from tests.support.benches import ORION_Q
 from tests.support.claims import holds
 from tests.support.heads import MOUNTINGS, heads_file
 
@@ -65,6 +72,16 @@ def test_stars_that_a_head_sees_turned_are_the_body_turned_about_the_head_s_axes
     assert apart_arcsec == pytest.approx(np.linalg.norm(TURN_ARCSEC))
 
 
+def apart_arcsec(by_field, first: int, second: int, kind: int) -> list[float]:
+    """The angles between two heads' solutions of a kind of light, in the fields that both have."""
+    angles = []
+    for solved in by_field:
+        if solved[first] is not None and solved[second] is not None:
+            turn = rotation_of(solved[first][kind]) * rotation_of(solved[second][kind]).inv()
+            angles.append(3600 * np.degrees(turn.magnitude()))
+    return angles
+
+
 def test_each_head_is_shown_the_body_s_attitude_through_its_own_mounting(
     tmp_path, monkeypatch
 ) -> None:
@@ -76,6 +93,14 @@ def test_each_head_is_shown_the_body_s_attitude_through_its_own_mounting(
         return field(twin, q, first_frame)
 
     monkeypatch.setattr(Twin, "field", seen)
+    solutions = []
+    solved = _Head.solved
+
+    def told(head: _Head, q: FloatArray, first_frame: int) -> object:
+        solutions.append(solved(head, q, first_frame))
+        return solutions[-1]
+
+    monkeypatch.setattr(_Head, "solved", told)
     done: list[int] = []
     heads = read_heads(heads_file(tmp_path, 5599, SMALL))
     pairs = verify_heads(heads, 2, np.random.default_rng(3), done.append)
@@ -93,6 +118,11 @@ def test_each_head_is_shown_the_body_s_attitude_through_its_own_mounting(
         assert all(error < 3.0 for error in pair.linear_arcsec)
         assert len(pair.linear_arcsec) == len(pair.codes_arcsec)
     assert any(pair.codes_arcsec for pair in pairs)
+    # by the pairs' own solutions of one kind of light, field by field
+    by_field = (solutions[:3], solutions[3:])
+    for pair, (first, second) in zip(pairs, combinations(range(3), 2), strict=True):
+        for kind, found in enumerate((pair.linear_arcsec, pair.codes_arcsec)):
+            assert found == pytest.approx(apart_arcsec(by_field, first, second, kind), abs=1e-6)
 
 
 def test_a_pair_s_summary_has_the_rms_and_the_largest_of_each() -> None:
@@ -108,11 +138,56 @@ def test_a_pair_s_summary_has_the_rms_and_the_largest_of_each() -> None:
     assert (none["fields"], none["linear_arcsec"], none["codes_arcsec"]) == (0, None, None)
 
 
-def test_places_are_inside_by_the_margin_of_each_axis() -> None:
-    x_px = np.array([2.0, 2.1, 96.9, 97.0, 50.0, 50.0, 50.0, 50.0])
-    y_px = np.array([20.0, 20.0, 20.0, 20.0, 2.0, 2.1, 46.9, 47.0])
-    expected = [False, True, True, False, False, True, True, False]
-    assert _inside(x_px, y_px, (100, 50), 2.0).tolist() == expected
+def test_a_head_is_solved_by_three_stars_and_more_that_are_drawn_whole_and_are_alone(
+    tmp_path, monkeypatch
+) -> None:
+    file = read_heads(heads_file(tmp_path, 5599, SMALL)).files[0]
+    solved_by = []
+
+    def recorded(q_body_to_cam, q_icrs_to_body, measured, wanted, weights):
+        solved_by.append((len(measured), len(wanted), weights.tolist()))
+        return body_attitude(q_body_to_cam, q_icrs_to_body, measured, wanted, weights)
+
+    monkeypatch.setattr(heads_module, "body_attitude", recorded)
+    with Twin(file) as twin:
+        head = _Head(twin)
+        usual = star_finder(twin.bench, twin.monitor_px_per_px).settings
+        assert head.finder.settings.window_sigma_px == pytest.approx(1.5 * usual.window_sigma_px)
+        q_icrs_to_body = multiply(conjugate(head.mounting.q_body_to_cam), np.array(ORION_Q))
+        seen = twin.field(np.array(ORION_Q), 0)
+        fields = []
+        monkeypatch.setattr(twin, "field", lambda q, first_frame: fields[-1])
+
+        def solved(truth: np.ndarray, **places: np.ndarray) -> list[float]:
+            """The light of the stars by which codes are solved; none where there are too few."""
+            fields.append(replace(seen, truth=truth, **places))
+            solved_by.clear()
+            if head.solved(q_icrs_to_body, 0) is None:
+                assert not solved_by
+                return []
+            (count, same, alike), (codes_count, codes_same, light) = solved_by
+            assert count == same == codes_count == codes_same == len(light)
+            # linear light places all stars alike
+            assert alike == [1.0] * count
+            return light
+
+        every = solved(seen.truth)
+        light = seen.truth["electrons_per_s"]
+        usable = np.flatnonzero(np.isin(light, every))
+        assert len(usable) == len(every) > 4
+        for name, value in (("drawn", False), ("clipped", True)):
+            for kept, wanted in ((3, 3), (2, 0)):
+                truth = seen.truth.copy()
+                truth[name][np.setdiff1d(np.arange(len(truth)), usable[:kept])] = value
+                assert len(solved(truth)) == wanted
+        # a star next to nothing in the place of another: one of them was found
+        truth = seen.truth.copy()
+        first, other = usable[:2]
+        truth["electrons_per_s"][other] = 1e-6
+        places = {"x_px": seen.x_px.copy(), "y_px": seen.y_px.copy()}
+        for place in places.values():
+            place[other] = place[first]
+        assert solved(truth, **places) == [rate for rate in every if rate not in light[usable[:2]]]
 
 
 @pytest.mark.gpu

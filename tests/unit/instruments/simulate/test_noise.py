@@ -758,3 +758,42 @@ def test_a_mosaic_s_star_has_the_light_of_its_own_channels_before_each_colour_s_
         np.testing.assert_allclose(alone, [wanted, sky])
     dark = noisy_star(file, np.zeros((4, 4))).mosaic
     assert dark[1].tolist() == [0.0, 0.0, 0.0]
+
+
+def test_fields_all_over_the_sky_are_identified_by_four_stars_and_more(tmp_path, monkeypatch):
+    """Of a pinhole's stars to V = 5, which are all found for sure."""
+    fields = 16
+    monkeypatch.setattr(noise, "TRIALS", 4)
+    monkeypatch.setattr(noise, "SKY_FIELDS", fields)
+    tracker = {"resolution_px": [300, 200], "focal_length_mm": 15, "transmission": None}
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"tracker": tracker, "sky": {"faintest_v_mag": 5.0}}))
+    file = read_bench_file(path)
+    budget = noise.noise_budget(file, None, CentroidSettings(), np.random.default_rng(2))
+    q = np.random.default_rng(2).standard_normal((fields, 4))
+    stars = bench_stars(file.config, tmp_path)
+    focal_px = 15e3 / 13
+    counts = []
+    for one_q in q:
+        x, y, z = to_matrix(one_q / np.linalg.norm(one_q)) @ stars.vectors.T
+        ahead = np.where(z > 0, z, np.nan)
+        inside = np.abs(focal_px * x / ahead) < 150
+        counts.append(int((inside & (np.abs(focal_px * y / ahead) < 100)).sum()))
+    assert budget.fields == fields
+    assert budget.found_stars == pytest.approx(np.median(counts), abs=1e-6)
+    # some fields have just four, and some have three
+    assert {3, 4} <= set(counts)
+    assert budget.identified_share == pytest.approx(np.mean(np.array(counts) >= 4))
+
+
+def test_each_of_many_stars_has_the_noise_of_its_own_light_and_background():
+    """More than are computed at once."""
+    star = gaussian(1.0, NOISY, phases=2)
+    count = 2 * noise.CHUNK + 3
+    star_e = np.geomspace(10.0, 1e5, count)
+    sky_e = np.linspace(900.0, 1.0, count)
+    rows = star.noise(star_e, sky_e, CentroidSettings())
+    for number in (0, noise.CHUNK - 1, noise.CHUNK, count - 1):
+        (alone,) = one(star, star_e[number], sky_e[number])
+        for name in noise.NOISE_COLUMNS:
+            assert rows[name][number] == pytest.approx(alone[name], rel=1e-9)

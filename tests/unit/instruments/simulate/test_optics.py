@@ -209,3 +209,18 @@ def test_what_a_wide_pixel_beside_the_detector_lights_of_it_is_there(geometry):
     expected = shares[1][:, None] * shares[0]
     assert expected.sum() > 0.02  # some of it is on the detector
     assert np.abs(image - expected).max() < NINE_FOR_A_SQUARE * expected.max() * 10
+
+
+@pytest.mark.parametrize("mirror", ["none", "x", "y", "swap"])
+def test_a_subpixel_is_beside_the_middle_of_its_pixel_where_that_is_shown(geometry, mirror):
+    """A mirrored screen shows a pixel elsewhere, with its subpixels the same way round."""
+    shown = replace(geometry, mirror=mirror)
+    x_px, y_px = np.array([3.0, 40.0]), np.array([7.0, 11.0])
+    right, down = {
+        "none": (x_px, y_px),
+        "x": (63 - x_px, y_px),
+        "y": (x_px, 47 - y_px),
+        "swap": (31.5 + (y_px - 23.5), 23.5 + (x_px - 31.5)),
+    }[mirror]
+    wanted = geometry.to_tracker(right + 0.3, down - 0.2)
+    np.testing.assert_allclose(shown.to_tracker(x_px, y_px, (0.3, -0.2)), wanted)

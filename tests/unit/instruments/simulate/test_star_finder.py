@@ -12,6 +12,7 @@ from scipy.special import ndtr
 from hilstar.instruments.simulate.star_finder import (
     StarFinder,
     crowded,
+    inside_by,
     nearest,
     shared,
     star_finder,
@@ -111,3 +112,23 @@ def test_blobs_begin_at_a_fifth_of_the_faintest_star_s_peak_of_red_in_a_mosaic(b
     assert threshold_e == pytest.approx(0.2 * least * peak_e)
     assert finder.background.level == 0.0
     assert finder.centroider == "window" and finder.told is None
+
+
+def test_places_are_inside_by_the_margin_of_each_axis():
+    x_px = np.array([2.0, 2.1, 96.9, 97.0, 50.0, 50.0, 50.0, 50.0])
+    y_px = np.array([20.0, 20.0, 20.0, 20.0, 2.0, 2.1, 46.9, 47.0])
+    expected = [False, True, True, False, False, True, True, False]
+    assert inside_by(2.0, x_px, y_px, (100, 50)).tolist() == expected
+
+
+def test_of_several_stars_that_are_found_about_a_place_the_nearest_is_its():
+    x_px = np.array([10.6, 10.1, 9.5, 40.0])
+    none = np.zeros(4)
+    whole = np.zeros(4, dtype=np.intp)
+    found = Centroids(x_px, none, none, none, whole, whole.astype(np.bool_))
+    for order in ([0, 1, 2, 3], [3, 2, 1, 0], [1, 0, 3, 2]):
+        turned = Centroids(x_px[order], none, none, none, whole, whole.astype(np.bool_))
+        match = nearest(turned, np.array([10.0, 40.2, 70.0]), np.zeros(3))
+        assert x_px[order][match[:2]].tolist() == [10.1, 40.0]
+        assert match[2] == -1
+    assert nearest(found, np.array([10.4]), np.zeros(1)).tolist() == [0]

@@ -253,6 +253,10 @@ def test_a_wrong_convention_is_named_with_what_to_write():
     assert "no convention matches" in "\n".join(
         lines_of(found, decoder, from_radec_roll_deg(10.0, 80.0, 5.0))
     )
+    # an angle over a degree in degrees, a smaller one in arcsec
+    for off_deg, angle in ((1.5, "1.50 deg"), (0.5, "1800.0 arcsec"), (1.01, "1.01 deg")):
+        turned = multiply(from_rotation_vector(np.radians([0.0, 0.0, off_deg])), Q)
+        assert f"  {angle} from what is shown" in "\n".join(lines_of(found, decoder, turned))
 
 
 def test_a_packet_is_taken_over_every_road_and_another_kind_is_not():
@@ -377,6 +381,8 @@ def test_what_follows_an_endless_line_or_frame_is_read():
     found = decoder_of(**keys).feed(0, b"\x1a\xcf" + struct.pack(">H", 5000) + sealed(framed))
     assert len(answers(found)) == 1
     assert found[0].detail == "a length that no frame has"
+    # no frame, whose bytes would be fields
+    assert lines_of(found[0], decoder_of(**keys), Q) == [f"  {found[0].raw.hex(' ')}"]
 
 
 @pytest.mark.parametrize(("source", "taken"), [("file", 1), ("udp", 0)])
@@ -399,7 +405,8 @@ def test_an_answer_s_bytes_are_explained_field_by_field():
         {"name": "stars", "at": 6, "type": "u8", "scale": 2.0, "add": -1.0},
     ]
     keys = {"framing": "fixed", "length": 13, "checksum": "crc16-xmodem"}
-    decoder = decoder_of(**keys, fields=fields, messages=True)
+    # told in the order of the bytes, whatever that of the file
+    decoder = decoder_of(**keys, fields=fields[::-1], messages=True)
     body = bytes([1, 2, 32, 0xE0, 32, 32, 5, 0, 0, 0, 0])
     raw = body + struct.pack(">H", crc16(body, 0))
     (found,) = answers(decoder.feed(0, raw))

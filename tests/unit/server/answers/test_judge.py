@@ -80,6 +80,11 @@ def test_the_lit_attitude_of_an_exposure_is_that_of_its_middle_for_a_steady_turn
     assert lit.rate_rad_s == pytest.approx(STEADY_RAD_S, rel=1e-3, abs=1e-7)
     assert lit.light_ns == round(1.1 * NS_PER_S) + 7
     assert (lit.first, lit.last) == (60, 72)
+    # an exposure of no length has the frame of its moment
+    at_once = frames.over(NS_PER_S, NS_PER_S)
+    assert (at_once.first, at_once.last, at_once.light_ns) == (60, 60, NS_PER_S + 7)
+    truth = propagate(START, STEADY_RAD_S, 1.0)
+    assert np.abs(residual_arcsec(truth, at_once.q)).max() < TURN_ARCSEC
 
 
 @pytest.mark.parametrize(

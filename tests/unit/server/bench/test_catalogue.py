@@ -352,6 +352,14 @@ def test_each_column_of_the_catalogue_s_own_figures_has_its_own(catalogue_bench)
     ):
         wanted = v + sign * own.columns[colour].values
         np.testing.assert_allclose(own.columns[column].values, wanted, atol=ROUNDED)
+    # a double's two components have its light together, and differ as they were measured
+    first, second = (own.columns[f"component_{k}_mag"].values for k in "ab")
+    double = np.isfinite(second)
+    assert double.sum() > 5
+    difference = facts["difference_hp_mag"]
+    np.testing.assert_allclose((second - first)[double], difference[double], atol=ROUNDED)
+    together = -2.5 * np.log10(10 ** (-0.4 * first) + 10 ** (-0.4 * second))
+    np.testing.assert_allclose(together[double], v[double], atol=ROUNDED)
     # absolute magnitudes are those of 10 pc, of parallaxes of five sigmas and more
     parallax = own.columns["parallax_mas"].values
     modulus = 5 * np.log10(1000 / parallax / 10)

@@ -15,6 +15,7 @@ from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.frame import Bench
+from hilstar.server.bench.primary_panels import primary_panels
 from tests.support.benches import Tables, bench_text
 from tests.support.spectra import NM, PANELS, bump, channel_keys, write_channels, write_panel
 
@@ -61,6 +62,25 @@ def light_of(bench: Bench, codes: FloatArray) -> FloatArray:
     return shown * bench.colours.of_white * bench.flux_at_white_e_per_s
 
 
+def assert_panels_are_of_their_calibration(bench: Bench) -> None:
+    """The panels of primaries have white together, by the formula that is named."""
+    own, named = (
+        primary_panels(bench.file, bench.colours, 5.0, None, name) for name in (None, "gamma2.2")
+    )
+    for panels in (own, named):
+        whites = [panel.flux_at_white_e_per_s for panel in panels]
+        assert sum(whites) == pytest.approx(5.0)
+        assert len(set(whites)) == 3
+    half = 2**11
+    # of 4095: by each formula
+    for panels, share in (
+        (own, ((half / 4095 + 0.055) / 1.055) ** 2.4),
+        (named, (half / 4095) ** 2.2),
+    ):
+        for panel in panels:
+            assert panel.response.light[half] == pytest.approx(share, rel=1e-3)
+
+
 def test_each_star_has_its_light_and_its_place_in_the_sum_of_its_stripes(coloured) -> None:
     with coloured() as bench:
         frame = bench.frame(Q)
@@ -78,6 +98,7 @@ def test_each_star_has_its_light_and_its_place_in_the_sum_of_its_stripes(coloure
             red.append((part[..., 0].sum() / total, row["v_mag"]))
         # of the B-V of 1.7, 0.6 and -0.2
         assert [round(float(v_mag), 2) for _, v_mag in sorted(red)] == [2.2, 3.5, 2.0]
+        assert_panels_are_of_their_calibration(bench)
         assert not frame.truth["clipped"].any()
 
 

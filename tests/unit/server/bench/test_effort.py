@@ -19,6 +19,7 @@ from hilstar.display.render.backend import level_cost
 from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
 from hilstar.optics.psf import GaussianPsf
+from hilstar.server.bench import effort_report
 from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
 from hilstar.server.bench.build import (
     TIMED_EXACT_S,
@@ -45,6 +46,7 @@ from hilstar.server.bench.effort import (
 from hilstar.server.bench.effort_report import effort_keys, effort_lines
 from hilstar.server.bench.least_psf import Choice
 from hilstar.server.bench.scene import Display, scenes_of, turning_of
+from hilstar.server.bench.would_do import Change, Remedy
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.commands import run_hilstar_here, typed
@@ -412,7 +414,15 @@ def test_the_parts_add_up():
     assert effort.within
 
 
-def test_a_table_says_what_was_chosen(bench_with):
+KEYS = (Change("[monitor] bits", 10), Change("[render] quantisation", "exact"))
+TRIED = (
+    Remedy(KEYS[:1], 0.0123, 0.0456, True),
+    Remedy(KEYS, 0.0078, 0.0199, True),
+    Remedy(KEYS[1:], 0.02, math.inf, False),
+)
+
+
+def test_a_table_says_what_was_chosen_and_what_would_do(bench_with, monkeypatch):
     bench = bench_with('[render]\neffort = "auto"\n[verify]\ncentroider = "box5"\n')
     lines = effort_lines(bench)
     assert lines[0].split() == ["part", "choice", "error", "of", "the", "tolerance", "saves"]
@@ -426,6 +436,19 @@ def test_a_table_says_what_was_chosen(bench_with):
     assert "within 0.05 mag, 0.1 px" in lines[5]
     assert any(line.startswith("codes: as `box5` finds stars") for line in lines)
     assert not any("would do" in line for line in lines)
+    monkeypatch.setattr(effort_report, "would_do", lambda bench: TRIED)
+    bits, exact = "[monitor] bits = 10", '[render] quantisation = "exact"'
+    assert effort_lines(bench)[len(lines) :] == [
+        f"would do: {bits} (0.0123 mag, 0.0456 px)",
+        f"would do together: {bits} and {exact} (0.0078 mag, 0.0199 px)",
+        f"would not do alone: {exact} (a star shows nothing)",
+    ]
+    told = effort_keys(bench)["would_do"]
+    assert [remedy["value"] for remedy in told] == [10, [10, "exact"], "exact"]
+    assert [remedy["key"] for remedy in told][1] == "[monitor] bits and [render] quantisation"
+    assert [remedy["error_mag"] for remedy in told] == [0.0123, 0.0078, 0.02]
+    assert [remedy["error_px"] for remedy in told] == [0.0456, 0.0199, None]
+    assert [remedy["within"] for remedy in told] == [True, True, False]
 
 
 def test_a_bench_over_its_tolerance_says_what_would_do(bench_with):

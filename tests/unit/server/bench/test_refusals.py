@@ -207,6 +207,24 @@ REFUSED = [
     ),
     (more('[attitude]\nsource = "scpi"\nclock = "shared"'), "are stamped by this machine"),
     (more('[attitude]\nsource = "udp"\nbind = "0.0.0.0:5560"'), "allow does not say which"),
+    (more('[attitude]\nsource = "serial"'), 'source = "serial" needs port; write port = "/dev'),
+    (more('[attitude]\nsource = "serial"\nport = 5560'), 'source = "serial" needs port; write'),
+    (
+        more('[attitude]\nsource = "udp"\nlockstep = true'),
+        'lockstep = true is for source = "zmq", "vizard" or "42"',
+    ),
+    (
+        more('[attitude]\nsource = "zmq"\nbind = "127.0.0.1:5560"'),
+        'bind = "127.0.0.1:5560" is for source = "udp"; write true or false',
+    ),
+    (
+        more('[attitude]\nsource = "42"\nallow = ["192.0.2.1"]'),
+        'allow is for source = "udp", and for "42" with bind = true; remove it (source = "42")',
+    ),
+    (
+        more('[attitude]\nsource = "serial"\nport = "/dev/a"\nspacecraft = "A"'),
+        'spacecraft is for source = "vizard" or "42"; remove it (source = "serial")',
+    ),
     # the tracker's answers
     (more(answers(trust='["mine"]')), 'trust is for format = "python:MODULE:FUNCTION"'),
     (

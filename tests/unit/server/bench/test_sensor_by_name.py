@@ -5,6 +5,7 @@ import tomllib
 import numpy as np
 import pytest
 
+from hilstar.cli.budget import with_its_figures
 from hilstar.instruments.simulate.noise import noise_budget, sensitivity_line
 from hilstar.server.bench.bench_file import changed_file, read_bench_file
 from hilstar.server.bench.config.sensor import other_sensor, with_sensor
@@ -173,3 +174,11 @@ def test_budget_says_whose_figures_stand(tmp_path):
     assert "its sheet has no [tracker.detector] dark_e_per_s: the bench's stand, with" in run.stderr
     assert "left out, as they are the old sensor's: [tracker.detector] " in run.stderr
     assert "dark_reference_temperature_k" in run.stderr and "prnu" in run.stderr
+
+
+def test_a_figure_that_stays_is_said_where_nothing_belongs_to_it(tmp_path, capsys):
+    file = tracker_of(tmp_path, {}, DARK)
+    assert with_its_figures(file, "imx252").config.tracker.sensor == "imx252"
+    source, *said = capsys.readouterr().err.splitlines()
+    assert source.startswith("imx252: ")
+    assert said[0] == "its sheet has no [tracker.detector] dark_e_per_s: the bench's stand"

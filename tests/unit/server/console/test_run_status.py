@@ -79,11 +79,14 @@ def test_before_the_first_frame_only_the_source_and_the_display_are_known(bench)
 def test_rates_are_those_since_the_lines_were_last_made(bench):
     bench.follow()
     bench.now_ns += 2 * NS_PER_S
-    bench.packets.received = 10
+    bench.packets.received, bench.tally.stale_frames = 10, 3
     bench.show(120)
     lines = bench.lines()
-    assert lines["frames"] == StatusLine("frames", "120 (60.0/s), 0 missed, 0 stale")
+    assert lines["frames"] == StatusLine("frames", "120 (60.0/s), 0 missed, 3 stale")
     assert lines["packets"] == StatusLine("packets", "10 received (5.0/s), 0 refused")
+    bench.packets.lost = 2
+    text = "10 received (0.0/s), 0 refused (2 lost)"
+    assert bench.lines()["packets"] == StatusLine("packets", text, False)
     bench.now_ns += NS_PER_S // 2
     bench.packets.received = 15
     bench.packets.refused_by["crc"] = 3

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 from dataclasses import replace as other
 from pathlib import Path
 from types import SimpleNamespace
@@ -146,6 +147,11 @@ def test_numbers_of_numpy_and_names_that_are_no_text_are_json(
     assert json.loads(capsys.readouterr().out) == {"a": 0.5, "b": [0, 1, 2], "c": True}
     with pytest.raises(TypeError, match="Path has no JSON"):
         print_json({"a": Path("x")})
+    of_another_encoding = os.fsdecode(b"run-\xff.mcap")
+    print_json({"path": of_another_encoding})
+    told = capsys.readouterr().out
+    assert json.loads(told)["path"] == of_another_encoding
+    told.encode("ascii")
 
 
 @pytest.mark.parametrize(
@@ -164,6 +170,11 @@ def test_numbers_of_numpy_and_names_that_are_no_text_are_json(
         (
             ClockSummary("exchange", 1.0, -3.26, 0.0125, 40, 0),
             "from time exchanges: drift -3.3 ppm, uncertainty 0.013 ms",
+        ),
+        (
+            ClockSummary("one-way", 1.0, 2.0, 0.5, 0, 1),
+            "from arrivals: drift 2.0 ppm, uncertainty 0.500 ms, excluding the minimum transport"
+            " delay, jumps: 1",
         ),
     ],
 )

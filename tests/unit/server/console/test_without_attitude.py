@@ -32,3 +32,11 @@ def test_what_the_link_knows_comes_before_start_the_sender() -> None:
     line = without_attitude(PLACE, summary_of(), f"{PLACE}: a PUSH socket is there")
     assert line == f"no attitude came from {PLACE}; a PUSH socket is there"
     assert "start the sender" in without_attitude(PLACE, summary_of())
+
+
+def test_the_reason_of_most_packets_comes_first() -> None:
+    crc = Refusal("crc", "the CRC-32 does not match the packet")
+    norm = Refusal("norm", "norm 2")
+    line = without_attitude(PLACE, summary_of(crc, norm, norm, crc, norm))
+    assert line.startswith(f"all 5 packets from {PLACE} were refused, 3 for norm: ")
+    assert "; 2 for crc: " in line

@@ -24,6 +24,7 @@ from hilstar.attitude.wire.nasa42 import (
     MessageSplitter,
     Nasa42Lockstep,
     spacecraft_number,
+    tcp_road,
 )
 from hilstar.attitude.wire.packet import AttitudeSample, Refusal, Status
 from hilstar.attitude.wire.source import CHECK_RADEC_DEG, Mounting
@@ -243,3 +244,18 @@ def test_a_message_that_comes_byte_by_byte_is_looked_through_once(monkeypatch):
     splitter = MessageSplitter()
     assert [message for byte in stream for message in splitter.feed(bytes([byte]))] == [stream]
     assert looked_at <= 2 * len(stream)
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "bind", "place"),
+    [
+        ("tcp://*:*", True, r"tcp://0\.0\.0\.0:\d+"),
+        ("tcp://127.0.0.1:*", True, r"tcp://127\.0\.0\.1:\d+"),
+        ("tcp://[::1]:10001", False, r"tcp://\[::1\]:10001"),
+        ("tcp://localhost:10001", False, "tcp://localhost:10001"),
+    ],
+)
+def test_the_road_to_42_is_where_the_endpoint_says(endpoint, bind, place):
+    with tcp_road(endpoint, bind=bind) as road:
+        assert re.fullmatch(place, road.endpoint)
+        assert road.verb == ("bound to" if bind else "connecting to")

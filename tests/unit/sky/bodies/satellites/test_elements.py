@@ -14,7 +14,15 @@ from tests.support.skies import STATION_TLE, STATION_UTC, utc_ns
 
 UTC_NS = utc_ns(STATION_UTC)
 NAME, FIRST, SECOND = STATION_TLE.splitlines()
-ONE, OTHER = (element_set(number, (51.6, 0.0, 0.0, 0.0), 0.001, 15.5) for number in (10, 11))
+ONE, OTHER, THIRD = (
+    element_set(number, (51.6, 0.0, 0.0, 0.0), 0.001, 15.5) for number in (10, 11, 12)
+)
+DEBRIS = ["DEB 10", "DEB 11", "DEB 12"]
+# The columns of numbers, counted from 1, by CelesTrak's definition of the two-line format.
+NUMBER_COLUMNS = {
+    "1": ((19, 20), (21, 32), (34, 43)),
+    "2": ((9, 16), (18, 25), (27, 33), (35, 42), (44, 51), (53, 63)),
+}
 
 
 def satellite_names(text: str) -> list[str]:
@@ -31,6 +39,8 @@ def satellite_names(text: str) -> list[str]:
         (f"# taken today\n\n{NAME}\n\n{FIRST}\n# its second\n{SECOND}", ["ISS (ZARYA)"]),
         (f"{ONE}{STATION_TLE}", ["NORAD 10", "ISS (ZARYA)"]),
         (f"DEB\n{ONE}DEB\n{OTHER}", ["DEB 10", "DEB 11"]),
+        (f"DEB\n{ONE}DEB\n{OTHER}DEB\n{THIRD}{STATION_TLE}", [*DEBRIS, "ISS (ZARYA)"]),
+        (f"{'LONG ' * 6}\n{ONE}", ["LONG LONG LONG LONG LONG"[:24]]),
         (f"MÜLL\t1\n{ONE}", ["M?LL\\x091"]),
     ],
 )
@@ -44,6 +54,21 @@ def test_of_several_sets_of_one_the_nearest_in_time_counts():
     text = f"A\n{latest}\n{SECOND}\nB\n{FIRST}\n{SECOND}\nC\n{later}\n{SECOND}\n"
     assert satellite_names(text) == ["B"]
     assert [one.name for one in read_satellites(text, "f", UTC_NS + 9 * 86_400 * 10**9)] == ["A"]
+    # of two of one epoch the first
+    assert satellite_names(f"A\n{FIRST}\n{SECOND}\nB\n{FIRST}\n{SECOND}\n") == ["A"]
+
+
+@pytest.mark.parametrize(
+    ("line", "first", "last"),
+    [(line, *columns) for line, places in NUMBER_COLUMNS.items() for columns in places],
+)
+def test_each_number_of_an_element_line_is_looked_at(line, first, last):
+    """A letter instead of its last digit, in a line whose digits add up all the same."""
+    lines = [FIRST, SECOND]
+    damaged = lines[int(line) - 1][:68]
+    lines[int(line) - 1] = with_checksum(f"{damaged[: last - 1]}x{damaged[last:]}")
+    with pytest.raises(InputError, match=rf":{line}: columns {first} to {last}, its .*x'; write a"):
+        read_satellites("\n".join(lines), "tles.txt", UTC_NS)
 
 
 def test_a_number_beyond_99999_is_one_with_a_letter():
@@ -74,6 +99,10 @@ def test_a_number_beyond_99999_is_one_with_a_letter():
         (
             f"{FIRST}\n{ONE.splitlines()[1]}\n",
             r"tles\.txt:2: it is of satellite 00010, line 1 of 25544",
+        ),
+        (
+            f"{ONE.splitlines()[0]}\n{OTHER.splitlines()[1]}\n",
+            r"tles\.txt:2: it is of satellite 00011, line 1 of 00010",
         ),
         (
             f"{FIRST}\n{with_checksum(SECOND[:8] + ' nearly ' + SECOND[16:68])}\n",

@@ -116,13 +116,29 @@ def test_the_earth_hides_what_is_behind_it():
     assert in_front(np.zeros((6, 3)), places).tolist() == [1] * 6
 
 
-def varied(begin_s: float, end_s: float, **known: float) -> float:
+def brightness(**known: float) -> Brightness:
     values = {"standard_e_per_s": 1.0, "flash_s": np.nan, "flash_at_s": 0.0, "size_m": 0.0} | known
-    return float(
-        Brightness(**{k: np.array([v]) for k, v in values.items()}).variation(
-            np.array([0]), np.array([begin_s]), np.array([end_s])
-        )[0]
-    )
+    return Brightness(**{k: np.array([v]) for k, v in values.items()})
+
+
+def varied(begin_s: float, end_s: float, **known: float) -> float:
+    times = np.array([begin_s]), np.array([end_s])
+    return float(brightness(**known).variation(np.array([0]), *times)[0])
+
+
+@pytest.mark.parametrize("known", [
+    {"period_s": 2.0, "amplitude_mag": 3.0, "flash_s": 0.05, "flash_at_s": 0.7},
+    {"period_s": 0.3, "amplitude_mag": 1.5, "flash_at_s": -4.1},
+    {"period_s": np.nan, "amplitude_mag": 0.0},
+])  # fmt: skip
+def test_the_bound_of_light_that_varies_is_its_brightest_moment(known):
+    """Over a period, in 4001 moments: 1e-5 of a wave, 1e-4 of the flash of 0.05 s."""
+    period_s = known["period_s"]
+    moments = np.linspace(0.0, period_s if period_s > 0 else 1.0, 4001)
+    light = brightness(**known)
+    same = np.zeros(len(moments), dtype=np.intp)
+    seen = light.variation(same, moments, moments)
+    assert light.most(np.array([0]))[0] == pytest.approx(seen.max(), rel=2e-4)
 
 
 @pytest.mark.parametrize("known", [

@@ -11,7 +11,7 @@ import pytest
 
 from hilstar.sky.bodies.orbit import Geocentre, TleOrbit
 from hilstar.sky.bodies.passes import OWN_KM, Cone
-from hilstar.sky.bodies.satellites import Swarm, read_satellites
+from hilstar.sky.bodies.satellites import Swarm, read_satellites, sunlit_share
 from tests.support.satellites import element_set, satellite_sky, some_orbits, with_checksum
 from tests.support.skies import STATION_TLE, STATION_UTC, utc_ns
 
@@ -196,6 +196,8 @@ def test_decayed_satellites_are_left_out_with_one_line_and_the_others_stay(rng, 
         "3 of 8 satellites have no place by their elements at this ti"
     ]
     assert "LOST 0" in caplog.text
+    assert [sky.satellites_placed(seconds * S_NS) for seconds in (0, 1, 500)] == [5, 5, 5]
+    assert satellite_sky(some_orbits(rng, 5)).satellites_placed(0) == 5
 
 
 @pytest.mark.parametrize("way", [1, -1], ids=["after the elements", "before them"])
@@ -241,6 +243,98 @@ def test_an_observer_whose_state_comes_with_the_frame_sees_the_same(rng):
     )
     # none behind the Earth
     assert len(satellite_sky(text, Geocentre()).passing(EVERYWHERE, 777 * S_NS)) > len(ours)
+
+
+def test_an_observer_that_jumps_misses_none_that_is_near_its_new_place():
+    """By 95 km across the line of sight to one at 300 km: 17 degrees, beyond what was looked for."""
+    text = element_set(7, (97.0, 252.0, 130.0, 322.0), 0.001, 15.0)
+    sky = satellite_sky(text, Geocentre())
+    seen = sky.passing(EVERYWHERE, 0)
+    assert seen is not None
+    place_km = seen.place_km[0, 0]
+    up = place_km / np.linalg.norm(place_km)
+    across = np.cross(up, NORTH)
+    across /= np.linalg.norm(across)
+    here_km = place_km + 300.0 * up
+    there_km = here_km + 95.0 * across
+    axis = place_km - there_km
+    cone = Cone(axis / np.linalg.norm(axis), 0.01, 0.0)
+    rest = np.zeros(3)
+    assert sky.passing(cone, 0, rest, here_km) is None
+    found = sky.passing(cone, 0, rest, there_km)
+    assert found is not None
+    assert found.index.tolist() == [0]
+    # and here again, where it is not
+    assert sky.passing(cone, 0, rest, here_km) is None
+
+
+# of two steps of the difference below, 0.05 s: 1e-9 of rounding over 0.1 s, and their squares
+RATE_KM_S = 5e-6
+
+
+def test_a_pass_moves_as_the_passes_of_the_moments_about_it(rng):
+    """Where satellites sent what arrives, light time and the Earth's own way included: those that
+    come nearer send later. An eccentric one recedes by up to 5 km/s, 1e-4 km/s of its own speed.
+    """
+    text = some_orbits(rng, 40)
+    sky = satellite_sky(text, Geocentre())
+    middle_ns, step_ns = 1234 * S_NS, S_NS // 20
+    before, seen, after = (sky.passing(EVERYWHERE, middle_ns + k * step_ns) for k in (-1, 0, 1))
+    assert before.index.tolist() == seen.index.tolist() == after.index.tolist()
+    for cubic in ("seen_km", "place_km"):
+        first, middle, last = (getattr(one, cubic) for one in (before, seen, after))
+        rate_km_s = (last[0] - first[0]) / (2 * step_ns / S_NS)
+        assert np.abs(rate_km_s - middle[1]).max() < RATE_KM_S
+    light_s = np.linalg.norm(seen.seen_km[0], axis=1) / 299_792.458
+    swarm = Swarm([one.satrec for one in read_satellites(text, "f", START)])
+    swarm.move_to(START + middle_ns)
+    later_km = swarm.places_km(seen.index, START + middle_ns) - seen.place_km[0]
+    assert np.linalg.norm(later_km, axis=1) == pytest.approx(
+        np.linalg.norm(seen.place_km[1], axis=1) * light_s, rel=2e-3
+    )
+
+
+def test_what_the_earth_hides_at_a_moment_has_no_light_then(rng):
+    """Each a minute before and after a moment: by the height of the line of sight over a round
+    Earth, beside the 22 km of its flattening.
+    """
+    sky = satellite_sky(some_orbits(rng, 60), table="norad\n", utc=STATION_UTC)
+    hidden_count = seen_count = 0
+    for second in range(0, 6000, 300):
+        seen = sky.passing(Cone(NORTH, np.pi, 60.0), second * S_NS)
+        every = np.arange(len(seen))
+        for after_s in (-60.0, 60.0):
+            at = np.full(len(seen), after_s)
+            powers = after_s ** np.arange(4)
+            observer = np.einsum("k,kx->x", powers, seen.observer_km)
+            place = np.einsum("k,knx->nx", powers, seen.place_km)
+            way = place - observer
+            share = np.clip(-(way @ observer) / np.einsum("ij,ij->i", way, way), 0.0, 1.0)
+            height_km = np.linalg.norm(observer + share[:, None] * way, axis=1) - 6378.0
+            rates = seen.rates_e_per_s(every, at, at)
+            is_hidden = height_km < -25
+            assert (rates[is_hidden] == 0).all()
+            is_lit = (height_km > 5) & (sunlit_share(place, seen.now.sun_km) == 1)
+            assert (rates[is_lit] > 0).all()
+            hidden_count += int((is_hidden & (sunlit_share(place, seen.now.sun_km) == 1)).sum())
+            seen_count += int(is_lit.sum())
+    assert min(hidden_count, seen_count) > 5
+
+
+def test_light_varies_by_the_time_since_the_sky_s_date_not_since_a_frame():
+    """Between 1 + d and 1 - d of the mean, 2 mag apart, largest at 1 s and each 7 s after it."""
+    text = element_set(10_000, (97.0, 252.0, 130.0, 322.0), 0.001, 15.0)
+    table = "norad,period_s,amplitude_mag,flash_at_s\n10000,7,2,1\n"
+    ratio = 10**0.8
+    depth = (ratio - 1) / (ratio + 1)
+    for seconds in (1.0, 3.2, 715.0, 718.5):
+        rates = []
+        for rows in (table, "norad\n"):
+            seen = satellite_sky(text, Geocentre(), rows).passing(EVERYWHERE, round(seconds * S_NS))
+            now = np.zeros(1)
+            rates.append(seen.rates_e_per_s(np.array([0]), now, now)[0])
+        wanted = 1 + depth * np.cos(2 * np.pi * (seconds - 1.0) / 7.0)
+        assert rates[0] / rates[1] == pytest.approx(wanted, rel=1e-5)
 
 
 def test_a_satellite_that_meets_the_observer_is_in_the_cone_that_it_flies_into():

@@ -545,6 +545,7 @@ def test_the_page_of_a_campaign_says_what_failed_and_the_known_rows_of_its_budge
     assert not any("reason 20" in line for line in failed)
     band = " ".join(cards[BAND])
     for words in (
+        "Campaign of 25000 cases",
         "2.00 \N{PLUS-MINUS SIGN} 0.30 arcsec noise across, one sigma",
         "pixel error across: cannot be told",
         "7 wrong answers",

@@ -263,3 +263,14 @@ def test_a_campaign_without_a_worker_or_a_scheduler_ends_in_a_line(
     gone.dask.status = "closed"
     with pytest.raises(MachineError, match="answers no more; start it again"):
         gone.run()
+
+
+@pytest.mark.parametrize(
+    ("address", "number"),
+    [("tcp://localhost:8786", ADDRESS), ("ucx://127.0.0.1:9000", "ucx://127.0.0.1:9000")],
+)
+def test_a_scheduler_is_reached_by_its_number(address: str, number: str) -> None:
+    assert Scheduler(address).check() == number
+    assert Scheduler(address.replace("tcp", "tls").replace("ucx", "tls")).check() == (
+        number.replace("tcp", "tls").replace("ucx", "tls")
+    )

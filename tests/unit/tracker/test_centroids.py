@@ -162,3 +162,21 @@ def test_a_pixel_of_whole_numbers_on_the_threshold_is_no_star(value, stars):
 def test_a_star_as_wide_as_the_window_has_no_width():
     flat = np.ones((SIZE_PX, SIZE_PX))
     assert np.isnan(star_widths(flat, 0.0, np.array([20.0]), np.array([20.0])))
+
+
+@pytest.mark.parametrize("is_down", [False, True])
+def test_a_gaussian_window_that_leaves_along_one_axis_leaves_the_blob_s_own_place(is_down):
+    """Beside a star 30 times as bright, 3 px off, the window (2 px) has its moment at 3 s / (1 + s)
+    = 2.72 px, s = 30 exp(-9 / 8), and no slope: a step is ten times that, onto the third star.
+    """
+    image = np.zeros((60, 60))
+    places = np.array([[20, 18], [23, 18], [47, 18]])
+    image[18, places[:, 0]] = 30.0, 900.0, 27000.0
+    if is_down:
+        image = image.T
+        places = places[:, ::-1]
+    found = find_stars(image, CentroidSettings(window_sigma_px=2.0), BACKGROUND)
+    order = np.argsort(found.peak)
+    at_px = np.column_stack([found.x_px, found.y_px])[order]
+    assert at_px[0] == pytest.approx(places[0], abs=SAME_PX)
+    assert at_px[2] == pytest.approx(places[2], abs=SAME_PX)

@@ -7,8 +7,10 @@ from __future__ import annotations
 import ctypes
 import os
 import select
+import threading
 from collections import deque
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 
@@ -36,6 +38,9 @@ class Server:
     def __init__(self) -> None:
         self.corner_px = PLACE.corner_px
         self.closed = 0
+        self.answers = threading.Event()
+        self.answers.set()
+        self.is_asked = False  # and does not answer
         self._waiting: deque[tuple[int, int]] = deque()
         self._here, self._far = os.pipe()
 
@@ -44,10 +49,16 @@ class Server:
         self._waiting.append((kind, state))
         os.write(self._far, b"!")
 
+    def ends(self) -> None:
+        """Close its end of the connection."""
+        os.close(self._far)
+        self._far = -1
+
     def free(self) -> None:
         """Close its own descriptors."""
         os.close(self._here)
-        os.close(self._far)
+        if self._far >= 0:
+            os.close(self._far)
 
     def XSelectInput(self, *_: int) -> None:
         """Every event comes."""
@@ -71,6 +82,8 @@ class Server:
         seen.type, seen.state = self._waiting.popleft()
 
     def XGetGeometry(self, _: int, drawable: int, *parts) -> int:
+        self.is_asked = not self.answers.is_set()
+        self.answers.wait()
         # after the root and the corner
         parts[3]._obj.value, parts[4]._obj.value = SCREEN_PX if drawable == ROOT else WINDOW_PX
         return 1
@@ -162,6 +175,51 @@ def test_the_connection_of_a_window_that_is_gone_is_left_to_its_end(watch, serve
     wait_for(lambda: not watch._thread.is_alive(), "the thread's end", poll_s=0.002)
     watch.close()
     assert server.closed == 0
+
+
+def test_a_watch_ends_with_its_connection(watch, server):
+    server.ends()
+    wait_for(lambda: not watch._thread.is_alive(), "the thread's end", poll_s=0.002)
+
+
+def test_a_connection_that_the_thread_still_uses_is_not_closed(watch, server, monkeypatch):
+    server.answers.clear()
+    server.tells(MAP_NOTIFY)
+    wait_for(lambda: server.is_asked, "the thread's question", poll_s=0.002)
+    with monkeypatch.context() as patch:
+        patch.setattr(visibility, "LOOK_AGAIN_S", SOON_S)
+        watch.close()
+    assert server.closed == 0
+    server.answers.set()
+    watch.close()
+    assert server.closed == 1
+
+
+@pytest.mark.parametrize(
+    ("has_dpms", "is_capable", "is_known", "level", "is_asleep"),
+    [
+        (1, 1, 1, 3, True),
+        (1, 1, 1, 0, False),
+        (1, 1, 0, 3, False),
+        (1, 0, 1, 3, False),
+        (0, 1, 1, 3, False),
+    ],
+    ids=["off", "on", "not told", "not capable", "no extension"],
+)
+def test_a_display_sleeps_where_its_server_knows_of_it(
+    has_dpms, is_capable, is_known, level, is_asleep, monkeypatch
+):
+    """Levels of dpmsconst.h: 0 is on, 3 is off."""
+
+    def info(_: int, level_at, enabled_at) -> int:
+        level_at._obj.value, enabled_at._obj.value = level, 1
+        return is_known
+
+    server = SimpleNamespace(XQueryExtension=lambda *_: has_dpms)
+    library = SimpleNamespace(DPMSCapable=lambda *_: is_capable, DPMSInfo=info)
+    monkeypatch.setattr(visibility, "xlib", lambda: server)
+    monkeypatch.setattr(visibility, "load_library", lambda *_, **types: library)
+    assert visibility._sleep_of(3)() is is_asleep
 
 
 def test_an_event_is_read_as_xlib_lays_it_out():

@@ -180,3 +180,16 @@ def test_a_gaussian_window_that_leaves_along_one_axis_leaves_the_blob_s_own_plac
     at_px = np.column_stack([found.x_px, found.y_px])[order]
     assert at_px[0] == pytest.approx(places[0], abs=SAME_PX)
     assert at_px[2] == pytest.approx(places[2], abs=SAME_PX)
+
+
+@pytest.mark.parametrize("dark_px", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_a_window_without_light_leaves_the_blob_s_own_place(dark_px):
+    """A pixel beside the star takes more than the star gives: the window (2 px) sums to 30 - 100
+    exp(-1 / 8) = -58, and a step by that would be 2.4 px towards the dark, within the window.
+    """
+    image = np.zeros((SIZE_PX, SIZE_PX))
+    right, down = dark_px
+    image[18, 20] = 30.0
+    image[18 + down, 20 + right] = -100.0
+    found = find_stars(image, CentroidSettings(window_sigma_px=2.0, iterations=1), BACKGROUND)
+    assert (found.x_px[0], found.y_px[0]) == pytest.approx((20, 18), abs=SAME_PX)

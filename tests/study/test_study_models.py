@@ -822,3 +822,47 @@ def test_a_star_s_electrons_are_planck_s_through_30_mm_of_glass_and_the_ccd(made
     per_m2 = 3.631e-2 * seen / in_v * 1e-18 / (constants.h * constants.c)
     table = made("zero_points").table("zero_points")
     assert table["electrons_per_s"][0] == pytest.approx(np.pi / 4 * 0.03**2 * per_m2, rel=1e-6)
+
+
+def test_v_and_b_v_are_from_as_many_stars_as_table_2_2_has_but_for_those_without_a_place():
+    """The thesis counts all 118 218 rows; the catalogue has those with a place and a V."""
+    counts = {row.what: row.here for row in models.source_counts(load_catalog())}
+    assert (counts["V from T"], counts["B-V from T"]) == (409, 75_732)
+    assert counts["B-V from H"] == 0
+    for what, printed in (("V from G", 23_139), ("V from H", 94_669), ("B-V from G", 41_205)):
+        assert 0.98 * printed < counts[what] < printed
+    assert sum(counts[f"V from {source}"] for source in "GHT") <= len(load_catalog())
+
+
+def test_the_percentiles_at_a_colour_are_of_the_stars_within_a_twentieth_of_a_magnitude():
+    """Twenty stars are enough, and nineteen are none."""
+    bv_mag = np.arange(60) * 0.005
+    percentiles = running_percentiles(bv_mag, 2 * bv_mag, np.array([0.1, 0.0473, 0.0423, 9.0]))
+    # 0.05 to 0.15; 0 to 0.0973; 0 to 0.0923
+    assert percentiles[3].tolist() == [21, 20, 19, 0]
+    assert percentiles[:3, 0] == pytest.approx([0.11, 0.2, 0.29])
+    assert np.isfinite(percentiles[:3]).all(axis=0).tolist() == [True, True, False, False]
+
+
+def test_a_star_s_choice_costs_what_it_costs_alone():
+    optics = study_optics("ccd47-20")
+    stars = load_catalog().taken(np.array([5, 100, 7, 40_000]))
+    assert len(set(stars.bv_mag.tolist())) == 4
+    together = models.star_costs_mag(stars, optics)
+    last = models.star_costs_mag(stars.taken(np.array([3])), optics)
+    for name, mag in together.items():
+        assert mag[3:] == pytest.approx(last[name], abs=1e-9), name
+    assert len(set(together["spectrum pickles"].round(6).tolist())) == 4
+
+
+def test_torres_has_supergiants_of_their_own_and_wang_steps_down_at_zero():
+    errors = models.scale_errors()
+    zero = int(np.flatnonzero(errors.bv == 0.0)[0])
+    wang_k = errors.kelvin["wang2021"]
+    assert errors.bv[zero - 1] == -1e-9
+    assert wang_k[zero - 1] - wang_k[zero] > 100 > abs(wang_k[zero + 1] - wang_k[zero])
+    # Torres 2010, table 2, has a polynomial of their own
+    one = int(np.flatnonzero(errors.bv == 1.0)[0])
+    assert abs(errors.percent[models.SUPERGIANTS][one]) > 1.0
+    within = errors.within["wang2021"]
+    assert 0 < within[0] < within[1]

@@ -379,3 +379,28 @@ def test_errors_over_frames_are_drawn_solid_by_temporal_and_dotted_by_dither(sma
                 assert drawn[charts.SERIES[number], style] == wanted
     labels = {line.get_label() for line in run.charts["o"].axes[0].get_lines()}
     assert {"coarse: 50.0 steps", "fine: 100 steps"} < labels
+
+
+@pytest.mark.parametrize(("quick", "phases", "count"), [(True, 6, 4), (False, 16, 8)])
+def test_the_finding_over_frames_is_of_temporal_at_the_frames_of_the_aim(
+    quick, phases, count, small_run, monkeypatch
+):
+    asked = []
+
+    def planted(panel, of_phases, counts):
+        asked.append((of_phases, len(counts)))
+        for method, times in (("temporal", 1.0), ("dither", 3.0)):
+            for frames in (4, 6):
+                mag = times * frames / 100 + len(asked) / 10
+                yield codes.OverFrames(panel.name, 6.0, 9.0, method, frames, mag, 7, 7, mag / 2)
+
+    monkeypatch.setattr(codes, "over_frames", planted)
+    told = []
+    small_run(lambda folder: told.append(codes.study_frames(folder, quick)))
+    (finding,) = told
+    assert asked == [(phases, count)] * 5
+    assert finding == (
+        "temporal over any 6 frames, rms, places by a PSF fit: sRGB, 8 bits 0.16 mag, 0.08 px;"
+        " gamma 2.2, 8 bits 0.26 mag, 0.13 px; linear, 8 bits 0.36 mag, 0.18 px; linear, 2 bits"
+        " 0.46 mag, 0.23 px; 1 bit 0.56 mag, 0.28 px"
+    )

@@ -30,7 +30,9 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
     """A row of a test, its fixtures included."""
     before_s = cpu_s()
     outcome = yield
-    path = Path(os.environ[FOLDER]) / f"{os.getpid()}.tsv"
+    folder = Path(os.environ[FOLDER])
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"{os.getpid()}.tsv"
     with path.open("a", encoding="utf-8") as rows:
         rows.write(f"{cpu_s() - before_s:.4f}\t{item.nodeid}\n")
     return outcome

@@ -192,7 +192,7 @@ def _events(found: Assessment) -> Iterator[Card]:
     if found.wrong:
         wrong = [astuple(answer) for answer in found.wrong[:MAX_ROWS]]
         table = table_of(wrong, WRONG_COLUMNS)
-        parts.append(details_of(f"{len(found.wrong)} wrong answers", table, printed=True))
+        parts.append(details_of(_counted(len(found.wrong), "wrong answer"), table, printed=True))
     outages = found.lock.outages
     if outages:
         rows = []
@@ -201,7 +201,7 @@ def _events(found: Assessment) -> Iterator[Card]:
                 (outage.start_s, outage.length_s, YES[outage.lost], outage.rows, outage.wrong)
             )
         table = table_of(rows, OUTAGE_COLUMNS)
-        parts.append(details_of(f"{len(outages)} outages", table, printed=True))
+        parts.append(details_of(_counted(len(outages), "outage"), table, printed=True))
     if parts:
         yield Card("Wrong answers and outages", words=parts)
 

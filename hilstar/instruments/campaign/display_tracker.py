@@ -184,7 +184,7 @@ class DisplayTracker:
 
 def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
     """The keys that decide the bench's frames; of the tracker those of its light gathering and
-    exposure.
+    exposure, and of how it sees a pixel, by which codes are chosen together (`seen_by`).
     """
     tracker = config.tracker
     gathers = (
@@ -192,6 +192,12 @@ def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
         tracker.quantum_efficiencies,
         tracker.transmission,
         tracker.exposure_s,
+    )
+    sees = (
+        tracker.focal_length_mm,
+        tracker.pixel_pitch_um,
+        tracker.psf_sigma_px,
+        tracker.optics,
     )
     open_part = tracker.detector.fill_factor
     drawn = None if config.render.psf == GAUSSIAN else _optics_keys(config)
@@ -202,6 +208,7 @@ def _shown_keys(config: BenchConfig) -> tuple[object, ...]:
         config.collimator,
         config.render,
         gathers,
+        sees,
         open_part,
         drawn,
     )

@@ -11,7 +11,7 @@ import re
 import shlex
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -384,16 +384,7 @@ class CommandSolver:
                 fits.PrimaryHDU(given_image(exposure, tracker)).writeto(image)
             if any(PICTURE in word for word in self._words):
                 write_dn_picture(picture, given_image(exposure, tracker))
-            command = self._words
-            for place, text in (
-                ("{fov_deg}", f"{facts['fov_deg']:.9g}"),
-                ("{focal_length_px}", f"{facts['focal_length_px']:.9g}"),
-                ("{width_px}", str(facts["resolution_px"][0])),
-                ("{height_px}", str(facts["resolution_px"][1])),
-                (IMAGE, str(image)),
-                (PICTURE, str(picture)),
-            ):
-                command = [word.replace(place, text) for word in command]
+            command = filled_words(self._words, facts, image, picture)
             try:
                 child = Child(command, self._folder)
             except OSError as error:
@@ -411,18 +402,41 @@ class CommandSolver:
                 if code is None:
                     raise SolverFault(f"the solver took longer than {self._timeout_s:g} s")
         if code:
-            error_lines = child.err.strip().splitlines()[-1:] or ["it said nothing on stderr"]
-            line = (
-                error_lines[0]
-                .replace(str(image), IMAGE)
-                .replace(str(picture), PICTURE)
-                .replace(str(folder), "")
-            )
+            line = last_words(child.err)
+            for place, name in ((image, IMAGE), (picture, PICTURE), (folder, "")):
+                line = line.replace(str(place), name)
             raise SolverFault(one_line(f"the solver ended with code {code}: {line}"))
         q = printed_attitude(child.out)
         if q is None:
             return SolverAnswer(None, "the solver found no attitude")
         return SolverAnswer(checked_attitude(q, "the solver"))
+
+
+def filled_words(
+    words: Sequence[str], facts: dict[str, Any], image: Path, picture: Path
+) -> list[str]:
+    """A command's words with what stands in braces filled in."""
+    width_px, height_px = facts["resolution_px"]
+    texts = {
+        "{fov_deg}": f"{facts['fov_deg']:.9g}",
+        "{focal_length_px}": f"{facts['focal_length_px']:.9g}",
+        "{width_px}": str(width_px),
+        "{height_px}": str(height_px),
+        IMAGE: str(image),
+        PICTURE: str(picture),
+    }
+    filled = list(words)
+    for place, text in texts.items():
+        filled = [word.replace(place, text) for word in filled]
+    return filled
+
+
+def last_words(said: str) -> str:
+    """The last line of what a program said on stderr."""
+    lines = said.strip().splitlines()
+    if lines:
+        return lines[-1]
+    return "it said nothing on stderr"
 
 
 def printed_attitude(text: str) -> object | None:

@@ -12,7 +12,7 @@ from astropy.coordinates import SkyCoord
 from scipy.spatial.transform import Rotation
 
 from hilstar.sky.catalog import load_catalog
-from tests.support.benches import SMALL_BENCH, attitude_table
+from tests.support.benches import SMALL_BENCH, attitude_table, bench_text
 from tests.support.commands import assert_refused, run_hilstar_here
 from tests.support.senders import free_port, publisher, talking
 from tests.support.sources.aem_messages import kvn, rows_of
@@ -43,6 +43,12 @@ def test_an_attitude_of_a_log_s_gap_is_said_to_be_held(tmp_path, small_bench_fil
         told_attitude(log, "--time", t_s, "--bench", small_bench_file) for t_s in (1.5, 30)
     )
     assert (between["held"], in_gap["held"]) == (False, True)
+    (tmp_path / "wide.toml").write_text(bench_text({"tracker": {"resolution_px": [1200, 800]}}))
+    told = run_hilstar_here("attitude", log, "--time", "30", "--bench", tmp_path / "wide.toml")
+    assert "the log has 1 gap, the longest 57 s" in told.stderr
+    first, place, *stars = told.stdout.splitlines()
+    assert first.endswith("(held: in a gap of the log)") and place.startswith("RA ")
+    assert len(stars) == 3 and all(" of 1200 x 800 px, " in star for star in stars)
 
 
 def test_the_rate_between_a_log_s_samples_is_in_degrees_about_the_camera_s_axes(
@@ -140,16 +146,16 @@ def test_a_mounting_may_be_given_without_a_bench_file(tmp_path):
 
 def test_what_is_stated_of_a_log_is_refused_for_a_live_stream(tmp_path):
     """A log's mounting and convention have keys in the bench file; the rest a stream has not."""
-    (tmp_path / "bench.toml").write_text(SMALL_BENCH)
+    (tmp_path / "bench.TOML").write_text(SMALL_BENCH)
     for flag, value, words in (
-        ("--mounting", "1,0,0,0", "bench.toml as [tracker] q_body_to_cam"),
-        ("--convention", "scalar=last", "bench.toml as [attitude] convention"),
+        ("--mounting", "1,0,0,0", "bench.TOML as [tracker] q_body_to_cam"),
+        ("--convention", "scalar=last", "bench.TOML as [attitude] convention"),
         ("--reference", "enu", "names a live stream; leave it out"),
         ("--place", "1,2,3", "names a live stream; leave it out"),
         ("--epoch-utc", "2026-11-21T00:00:00Z", "names a live stream; leave it out"),
         ("--topic", "/attitude", "names a live stream; leave it out"),
     ):
-        result = run_hilstar_here("attitude", tmp_path / "bench.toml", flag, value)
+        result = run_hilstar_here("attitude", tmp_path / "bench.TOML", flag, value)
         assert_refused(result, 2, f"{flag} {value}: ", words)
 
 

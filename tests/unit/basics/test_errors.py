@@ -38,6 +38,7 @@ def test_a_long_text_is_cut_to_its_limit_with_more_of_its_beginning(limit):
 
 
 def test_what_cannot_be_printed_is_escaped():
+    assert printable("\udc80\udc7f\udd00") == r"\x80\udc7f\udd00"
     assert printable("a b\t\x7f\udcff\ud800é\u2028") == r"a b\x09\x7f\xff\ud800é\u2028"
 
 

@@ -18,6 +18,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from importlib.machinery import PathFinder
 from pathlib import Path
 from types import SimpleNamespace
@@ -352,7 +353,10 @@ def ended(work) -> tuple[int, str, str]:
     99 where the work comes to its end.
     """
     (out, to_out), (err, to_err) = os.pipe(), os.pipe()
-    child = os.fork()
+    with warnings.catch_warnings():
+        # Python 3.12 warns of threads that a fork has none of; what is done here needs none.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        child = os.fork()
     if child == 0:
         with contextlib.suppress(BaseException):
             os.setsid()

@@ -16,10 +16,12 @@ from hilstar.basics.reading import (
     CHUNK_BYTES,
     MAGIC,
     KeptFiles,
+    by_number,
     exists,
     named_bytes,
     open_lines,
     open_regular,
+    parse_toml,
     read_bytes,
     read_text,
 )
@@ -213,3 +215,24 @@ def test_a_line_is_as_long_as_the_limit_with_its_end(
             return
         with pytest.raises(InputError, match=r":\d: the line has 10 characters or more"):
             list(lines)
+
+
+def test_files_are_sorted_as_people_number_them():
+    names = ["b_2.png", "a_10.png", "a_9.png", "a_9_10.png", "a_9_2.png", "a.png"]
+    assert [path.name for path in sorted(map(Path, names), key=by_number)] == [
+        *("a.png", "a_9.png", "a_9_2.png", "a_9_10.png", "a_10.png", "b_2.png"),
+    ]
+
+
+@pytest.mark.parametrize(("parts", "is_taken"), [(31, True), (32, False)])
+def test_a_key_has_31_parts_at_most(parts, is_taken):
+    """tomllib's time grows as their square."""
+    text = ".".join("a" * parts) + " = 1\n"
+    if not is_taken:
+        line = refusal(parse_toml, Path("b.toml"), text)
+        assert line == "b.toml: not TOML that anybody wrote: a key has 32 parts or more"
+        return
+    value = parse_toml(Path("b.toml"), text)
+    for _ in range(parts):
+        value = value["a"]
+    assert value == 1

@@ -9,15 +9,19 @@ from hilstar.basics.rotation import (
     angle_between_rad,
     conjugate,
     direction_of,
+    frame_turns,
     from_matrix,
     from_radec_roll_deg,
+    from_rotation_vectors,
     multiply,
     normalise,
     propagate,
     rate_between_rad_s,
+    rotate,
     slerp,
     to_matrix,
     to_radec_roll_deg,
+    to_rotation_vector,
     turn_text,
 )
 
@@ -157,3 +161,23 @@ def test_a_matrix_of_a_large_turn_about_any_axis_gives_its_quaternion(axis, turn
     q = np.zeros(4)
     q[0], q[1 + axis] = np.cos(half), np.sin(half)
     assert from_matrix(to_matrix(q)) == pytest.approx(q, abs=1e-15)
+
+
+@pytest.mark.parametrize("angle_rad", [1e-9, 5e-5, 1.9e-4, 0.3, 3.0])
+def test_rotation_vectors_come_back_of_either_sign_of_their_quaternions(angle_rad):
+    vectors = angle_rad * np.array([[0.6, -0.48, 0.64], [0.0, 1.0, 0.0]])
+    q = from_rotation_vectors(vectors)
+    for same in (q, -q, np.array([1, -1])[:, None] * q):
+        # a float64's sine and norm: 1e-15 each
+        assert to_rotation_vector(same) == pytest.approx(vectors, rel=1e-14, abs=1e-15 * angle_rad)
+
+
+@pytest.mark.parametrize(
+    ("axis", "seen"),
+    [(0, [[1, 3, -2], [1, -3, 2]]), (1, [[-3, 2, 1], [3, 2, -1]]), (2, [[2, -1, 3], [-2, 1, 3]])],
+)
+def test_a_frame_turned_about_an_axis_has_a_vector_turned_the_other_way(axis, seen):
+    """By a quarter turn and back: y is x of a frame that is turned from x to y about z."""
+    turns = frame_turns(axis, np.array([np.pi / 2, -np.pi / 2]))
+    vectors = np.array([[1.0, 2.0, 3.0]] * 2)
+    assert rotate(turns, vectors) == pytest.approx(np.array(seen, dtype=float), abs=1e-14)

@@ -6,13 +6,22 @@ from __future__ import annotations
 
 import itertools
 from decimal import Decimal
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import warn_once
-from hilstar.basics.text_tables import open_table, read_rows, seconds_of_date
+from hilstar.basics.text_tables import (
+    Chosen,
+    finite_numbers,
+    is_no_number,
+    open_table,
+    read_rows,
+    seconds_of_date,
+    table_of,
+)
 from hilstar.basics.units import DIMENSIONS, factor, plain_unit
 from tests.support.refusals import refusal
 
@@ -355,3 +364,103 @@ def test_a_date_is_seconds_since_1970_with_its_digits(text, moment):
 )
 def test_what_is_no_date_stays_as_it_is(text):
     assert seconds_of_date(text) == text
+
+
+NO_NUMBER = (
+    *("", " ", "-", "--", "---", "?", "*", ".", "NaN", "-NAN", "+nan", "nan(ind)", "-nan(ind)"),
+    *("1.#QNAN", "-1.#QNAN", "1.#IND", "-1.#IND", "NA", "N/A", "#N/A", "<NA>", "NULL", "<null>"),
+    *("(null)", "nil", "None", "NaT", "\\N", "missing", "undefined"),
+)
+
+
+@pytest.mark.parametrize("text", NO_NUMBER)
+def test_what_programs_write_for_no_number_is_none(text):
+    """pandas, R, MATLAB, Visual C++, Excel, MySQL, VizieR and others."""
+    assert is_no_number(text)
+
+
+@pytest.mark.parametrize("text", ["0", "-0", "----", "n", "nan1", "ok", "- -"])
+def test_what_is_a_number_or_a_word_is_not_called_none(text):
+    assert not is_no_number(text)
+
+
+def opened(text):
+    return table_of(Path("table.csv"), "write a table", iter(text.splitlines(keepends=True)))
+
+
+@pytest.mark.parametrize(("count", "shown"), [(12, 12), (13, 12), (30, 12)])
+def test_a_message_names_twelve_columns_at_most(count, shown):
+    names = [f"c{k}" for k in range(count)]
+    table = opened(",".join(names) + "\n" + ",".join("1" * count) + "\n")
+    assert table.names == ", ".join(names[:shown]) + (", ..." if count > shown else "")
+    table.not_used([Chosen(0)])
+    assert table.notices == [f"not used: {', '.join(names[1 : 1 + 12])}"]
+
+
+@pytest.mark.parametrize(("count", "is_taken"), [(1000, True), (1001, False)])
+def test_a_table_has_a_thousand_columns_at_most(count, is_taken):
+    text = ",".join(f"c{k}" for k in range(count)) + "\n"
+    if is_taken:
+        assert len(opened(text).columns) == count
+    else:
+        assert refusal(opened, text).endswith("names more than 1000 columns; write a table")
+
+
+def test_a_piece_of_a_table_ends_with_no_quoted_cell_open():
+    """Pieces of 8 characters or more; each begins with the number of its first line."""
+    lines = ["1,plain\n", '2,"of two\n', 'lines"\n', "3,b\n", "4,c\n", '5,"d"\n']
+    table = opened("".join(["t_s,note\n", *lines]))
+    pieces = list(table.blocks(8))
+    assert [line for _, part in pieces for line in part] == lines
+    assert [sum(line.count('"') for line in part) % 2 for _, part in pieces] == [0] * len(pieces)
+    assert [number for number, _ in pieces] == [2, 3, 5, 7]
+
+
+@pytest.mark.parametrize(
+    ("text", "columns", "unit", "rows"),
+    [
+        ("t [s], roll angle [deg]\n1.5, 2.5\n2.5, 3.5\n", 2, "deg", 2),
+        ('"# by a program, it"\nt_s,a [deg]\n1,2\n', 2, "deg", 1),
+        ("t;a\ns;deg\n---;---\n1;2\n3;4\n", 2, "deg", 2),
+        ("t_s;a [deg]\n---;---\n1;2\n3;4\n", 2, "deg", 2),
+        ("t_s;a [deg]\n0,85;1,234\n1,5;2,5\n", 2, "deg", 2),
+        ('t_s,a [deg]\n"1","2","3","x"\n'.replace(',"3","x"', ""), 2, "deg", 1),
+        ("sep=;\nt_s;a [deg]\n1;2\n", 2, "deg", 1),
+    ],
+)
+def test_a_head_says_the_columns_and_their_units_and_where_the_rows_begin(
+    text, columns, unit, rows
+):
+    table = opened(text)
+    assert (len(table.columns), table.columns[1].unit) == (columns, unit)
+    assert not any("title" in notice for notice in table.notices)
+    read = list(table.rows())
+    last = len(text.splitlines())
+    assert [line for line, _ in read] == list(range(last - rows + 1, last + 1))
+
+
+@pytest.mark.parametrize(("first", "is_numbered"), [(0, True), (1, True), (2, False)])
+def test_rows_that_begin_with_their_numbers_from_0_or_1_have_a_column_more(first, is_numbered):
+    rows = "".join(f"{first + k},{5 * k},{k}.5\n" for k in range(4))
+    table = opened("t_s,a\n" + rows)
+    if is_numbered:
+        assert [column.name for column in table.columns] == ["", "t_s", "a"]
+        assert "each row begins with its number" in table.notices[0]
+    else:
+        assert "3 cells and 2 columns" in refusal(lambda: list(table.rows()))
+
+
+@pytest.mark.parametrize(
+    ("cell", "why"),
+    [
+        ("1_000", ""),
+        ("0,85", " (a decimal comma: write a point)"),
+        ("1,234", " (thousands apart: write 1234.5)"),
+        ("1.5D3", " (an exponent of D: write E)"),
+        ("12,345,678.9", " (thousands apart: write 1234.5)"),
+        ("inf", ""),
+    ],
+)
+def test_a_cell_that_is_no_number_is_refused_with_what_to_write(cell, why):
+    line = refusal(finite_numbers, Path("t.csv"), 7, ("t_s", "a"), ("1.5", cell), "write a table")
+    assert line == f"t.csv:7: a = {cell!r} is not a finite number{why}; write a table"

@@ -236,6 +236,9 @@ def test_a_disc_that_reaches_behind_the_camera_may_be_anywhere_on_the_image():
     distance_km = 1 / np.sin(np.radians(20))
     disc = Disc("x", direction, distance_km, 1.0, 1.0, pole, -direction, "uniform", 1e6)
     assert DiscLight(disc, np.eye(3), CAMERA, PSF).region(SIZE_PX) == (0, 0, *SIZE_PX)
+    beside = np.array([1.0, 0.0, 0.0])  # from 88 to 92 degrees
+    narrow = Disc("x", beside, 28.7, 1.0, 1.0, pole, -beside, "uniform", 1e6)
+    assert DiscLight(narrow, np.eye(3), CAMERA, PSF).region(SIZE_PX) == (0, 0, *SIZE_PX)
     narrow = Disc("x", direction, 100 * distance_km, 1.0, 1.0, pole, -direction, "uniform", 1e6)
     assert DiscLight(narrow, np.eye(3), CAMERA, PSF).region(SIZE_PX) is None
     glow = GlowLight(np.array([0.0, 0.0, -1.0]), 1.0, 0.1, 2.0, CAMERA)

@@ -9,18 +9,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.sky.air import AIR_MASSES, SiteAir, air_mass, through_air
+from hilstar.sky.air import AIR_MASSES, SiteAir, air_mass, glow_e_per_s_arcsec2, through_air
 from hilstar.sky.bodies.orbit import Geocentre
 from hilstar.sky.bodies.passes import Cone
-from hilstar.sky.electrons import Optics
-from hilstar.sky.spectrum import Curve, constant_curve
+from hilstar.sky.electrons import Optics, Photometry, Weighting
+from hilstar.sky.spectrum import Curve, constant_curve, load_curve
 from hilstar.sky.stars import AirAbove
+from hilstar.sky.synthetic import vega, vega_electrons_per_s
 from tests.support.satellites import satellite_sky, some_orbits
 from tests.support.skies import moving_sky
 from tests.support.stars import stars_at
 
 # Kasten and Young 1989, at 90 and at 30 degrees of altitude
 ZENITH_MASSES, LOW_MASSES = 0.99971, 1.99429
+WEIGHTINGS: tuple[Weighting, Weighting] = ("energy", "photon")
 UTC = "2026-11-21T00:00:00Z"
 
 
@@ -88,6 +90,31 @@ def test_beyond_a_table_of_extinction_its_ends_hold():
     assert through(nm) == pytest.approx(0.8 * 10 ** (-0.4 * 2.0 * mag), rel=1e-4)
     grey = through_air(optics, constant_curve(0.3), 2.0).transmission
     assert grey(nm) == pytest.approx(0.8 * 10 ** (-0.4 * 2.0 * 0.3), rel=1e-12)
+
+
+@pytest.mark.parametrize("is_vega", [False, True], ids=["glow", "vega"])
+def test_light_of_a_v_magnitude_has_its_mean_through_v_by_energy_or_by_photons(is_vega):
+    """The electrons are as the inverse of the mean: of light that rises by a half from 470 to 700
+    nm, and of Vega's own, which falls.
+    """
+    optics = Optics(30.0, constant_curve(0.5), constant_curve(0.8))
+    spectrum = Curve(np.array([300.0, 470.0, 700.0, 1100.0]), np.array([1.0, 1.0, 1.5, 1.5]))
+    if is_vega:
+        spectrum = vega()
+        rates = [vega_electrons_per_s(optics, Photometry("vega", way)) for way in WEIGHTINGS]
+    else:
+        rates = [
+            glow_e_per_s_arcsec2(spectrum, 21.0, optics, Photometry("vega", way))
+            for way in WEIGHTINGS
+        ]
+    passband = load_curve("johnson-v", "johnson-v")
+    nm = np.linspace(470.0, 700.0, 200_001)
+    means = []
+    for photons in (np.ones(len(nm)), nm):
+        response = passband(nm) * photons
+        means.append((spectrum(nm) * response).sum() / response.sum())
+    assert rates[1] / rates[0] == pytest.approx(means[0] / means[1], rel=1e-5)
+    assert abs(means[0] / means[1] - 1) > 1e-3
 
 
 def test_a_zenith_is_that_of_each_second():

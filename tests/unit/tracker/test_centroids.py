@@ -14,6 +14,7 @@ from hilstar.tracker.centroids import (
     noisiest_background,
     star_widths,
 )
+from tests.support.refusals import refusal
 
 SIZE_PX = 40
 BACKGROUND = LocalBackground(0.0, 1.0)
@@ -193,3 +194,37 @@ def test_a_window_without_light_leaves_the_blob_s_own_place(dark_px):
     image[18 + down, 20 + right] = -100.0
     found = find_stars(image, CentroidSettings(window_sigma_px=2.0, iterations=1), BACKGROUND)
     assert (found.x_px[0], found.y_px[0]) == pytest.approx((20, 18), abs=SAME_PX)
+
+
+def test_the_noisier_parts_of_a_wide_image_are_those_of_the_same_image_on_its_side(rng):
+    """Glow over a tenth of its columns: as noisy as it is, whichever way its blocks lie."""
+    image = np.full((96, 960), 100, dtype=np.uint16)
+    image[:, 700:796] = np.rint(rng.normal(130, 9.0, (96, 96)))
+    upright, on_its_side = noisiest_background(image), noisiest_background(image.T)
+    assert upright.level == on_its_side.level == 100
+    assert upright.noise == pytest.approx(on_its_side.noise, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("threshold_sigma", "dn", "is_found"),
+    [(3.4, 104, True), (3.4, 103, False), (3.0, 103, False), (3.0, 104, True)],
+)
+@pytest.mark.parametrize("kind", [np.uint16, np.int32, np.float64])
+def test_a_pixel_is_a_star_s_from_the_first_code_over_the_threshold(
+    threshold_sigma, dn, is_found, kind
+):
+    image = np.full((31, 33), 100, dtype=kind)
+    image[15, 16] = dn
+    settings = CentroidSettings(threshold_sigma=threshold_sigma, minimum_pixels=1)
+    stars = find_stars(image, settings, LocalBackground(100.0, 1.0))
+    assert len(stars) == is_found
+    if is_found:
+        assert (stars.peak[0], stars.pixels[0]) == (dn - 100, 1)
+
+
+def test_settings_and_images_that_are_no_numbers_are_refused():
+    line = refusal(CentroidSettings, threshold_sigma=np.inf)
+    assert line == "centroids: threshold_sigma = inf; write a number from 0 up"
+    assert "type bool, shape (9, 9)" in refusal(find_stars, np.zeros((9, 9), dtype=bool))
+    assert "shape (9,)" in refusal(find_stars, np.zeros(9))
+    assert "NaN or infinite" in refusal(find_stars, np.full((9, 9), np.inf))

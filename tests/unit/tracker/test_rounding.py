@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from scipy.special import ndtr
 
-from hilstar.tracker.rounding import before_adc_dn, cut_light, cut_mean_dn, uncut_level_dn
+from hilstar.tracker.rounding import (
+    STEP_PHASES,
+    before_adc_dn,
+    cut_light,
+    cut_mean_dn,
+    rounded_light,
+    rounding_rms,
+    uncut_level_dn,
+)
 
 
 def mean_code(level_dn: float, noise_dn: float) -> float:
@@ -55,3 +63,39 @@ def test_the_noise_before_the_adc_is_what_is_stated_where_readings_do_not_tell(
     variance_dn2, stated_dn, noise_dn
 ):
     assert before_adc_dn(variance_dn2, stated_dn) == pytest.approx(noise_dn)
+
+
+def rounded_mean_dn(level_dn: float, noise_dn: float) -> float:
+    """The mean of a level in normal noise, rounded to whole codes, by the share of each code."""
+    codes = np.arange(-60, 61)
+    edges = np.append(codes - 0.5, codes[-1] + 0.5)
+    shares = np.diff(ndtr((edges - level_dn) / noise_dn))
+    return float((codes * shares).sum())
+
+
+# beyond the eighth harmonic: exp(-2 (9 pi 0.15)^2) / 9 pi of a DN
+HARMONICS_DN = 1e-6
+
+
+@pytest.mark.parametrize(("dark_noise_dn", "dn_per_e"), [(0.15, 0.002), (0.3, 0.05), (0.5, 1e-4)])
+def test_what_rounding_adds_to_light_is_by_the_codes_of_both(dark_noise_dn, dn_per_e):
+    """At each place of the dark level between two steps, beside what it adds to the dark."""
+    light_dn = np.array([0.1, 0.35, 2.8, 7.45])
+    noise_dn = np.sqrt(dark_noise_dn**2 + dn_per_e * light_dn)
+    added = rounded_light(light_dn, dark_noise_dn, dn_per_e)
+    assert len(added) == STEP_PHASES
+    for place, found in enumerate(added.tolist()):
+        dark_dn = place / STEP_PHASES
+        lit = [
+            rounded_mean_dn(dark_dn + light, noise) - dark_dn - light
+            for light, noise in zip(light_dn.tolist(), noise_dn.tolist(), strict=True)
+        ]
+        wanted = np.mean(lit) - (rounded_mean_dn(dark_dn, dark_noise_dn) - dark_dn)
+        assert found == pytest.approx(wanted, abs=HARMONICS_DN)
+
+
+@pytest.mark.parametrize("noise_dn", [0.15, 0.3, 0.6])
+def test_the_rms_of_rounding_is_that_over_all_levels(noise_dn):
+    levels = (np.arange(400) + 0.5) / 400
+    errors = [rounded_mean_dn(level, noise_dn) - level for level in levels.tolist()]
+    assert rounding_rms(noise_dn) == pytest.approx(np.std(errors), rel=1e-5)

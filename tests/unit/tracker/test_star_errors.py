@@ -191,3 +191,15 @@ def test_errors_are_the_same_wherever_stars_lie_in_their_squares_and_turn_with_t
 def test_the_largest_flux_error_is_the_largest_either_way(sign):
     errors = StarErrors(np.array([0.02, -0.01, 0.3 * sign]), {})
     assert errors.flux_max_mag == pytest.approx(0.3)
+
+
+def test_the_largest_distance_is_over_both_axes_and_the_rms_along_one():
+    """3 and 4 px off are 5, which no axis alone is."""
+    off_px = {
+        "window": np.array([[3.0, 0.0, -4.5], [-4.0, 1.0, 0.0]]),
+        "moment": np.zeros((2, 3)),
+    }
+    errors = StarErrors(np.zeros(3), off_px)
+    assert errors.max_px("window") == pytest.approx(5.0)
+    assert errors.axis_rms_px("window") == pytest.approx(np.sqrt((9 + 16 + 1 + 4.5**2) / 6))
+    assert errors.worst() == "window"

@@ -36,6 +36,13 @@ def test_decimals_are_told_in_arcsec_as_they_are_off(decimals):
     assert said_arcsec == pytest.approx(np.sqrt(np.mean(np.square(off))) * ARCSEC_PER_RAD, rel=0.15)
 
 
+@pytest.mark.parametrize("is_coarse_first", [True, False])
+def test_a_log_s_first_samples_say_in_which_steps_it_is(is_coarse_first):
+    coarse, fine = rounded_turn(lambda q: np.round(q, 3), 60), rounded_turn(lambda q: q, 60)
+    samples = [*coarse, *fine] if is_coarse_first else [*fine, *coarse]
+    assert [kind for kind, _ in coarse_lines(samples)] == [COARSE] * is_coarse_first
+
+
 @pytest.mark.parametrize("step", [2.0**-15, 1 / 32767])
 def test_fixed_point_numbers_are_told(step):
     assert (

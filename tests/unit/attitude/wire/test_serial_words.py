@@ -129,3 +129,11 @@ def test_what_is_sent_leaves_before_the_end_unless_the_line_stalls(bytes_each, l
     assert (device.waiting, device.dropped) == (0, dropped)
     assert clock.slept_s[:looks] == [DRAIN_LOOK_S] * looks
     assert sum(clock.slept_s) == pytest.approx(looks * DRAIN_LOOK_S, abs=2 * DRAIN_LOOK_S)
+
+
+def test_of_bytes_that_a_full_line_takes_in_part_it_is_said_that_they_were_not_sent() -> None:
+    with serial_line() as (master, name), SerialLink(name, BAUD) as link:
+        assert link.send_bytes(b"all of it")
+        assert os.read(master, 100) == b"all of it"
+        assert not link.send_bytes(bytes(1 << 20))
+        assert len(os.read(master, 1 << 20)) < 1 << 20

@@ -307,6 +307,18 @@ def test_so_it_does_over_ipv6():
         bound.close()
 
 
+@pytest.mark.parametrize("place", ["127.0.0.1:0", "[::1]:0"])
+def test_a_socket_is_connected_to_a_peer_of_either_ip_version(place):
+    bound = Datagrams.bound(bound_place(place, "", None))
+    host = place.rpartition(":")[0].strip("[]")
+    connected = Datagrams.connected(host, bound.port)
+    assert connected.put(b"there")
+    (came,) = bound.take(1)
+    assert came.parts == [b"there"] and came.sender[:2] == (host, connected.port)
+    bound.close()
+    connected.close()
+
+
 def test_a_flood_from_elsewhere_leaves_room_for_those_who_are_listed():
     """Once the kernel drops it, a burst of more than the socket's buffer holds displaces nobody."""
     notices = Notices()

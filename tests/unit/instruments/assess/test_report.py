@@ -177,7 +177,7 @@ def test_the_other_cards_of_a_page_have_the_assessment_s_own_figures(cards) -> N
     cures = (page.WRONG_CURE, page.LOST_CURE, page.MISSED_CURE)
     assert answers[4] == f"What to do: {' '.join(cures)}"
     assert cards["Wrong answers and outages"] == [
-        "1 wrong answers",
+        "1 wrong answer",
         "row | telemetry's time, s | run time, s | off by, deg",
         "6 | 8.016 | 11.02 | 33.25",
         "2 outages",

@@ -291,9 +291,6 @@ def test_a_measurement_tells_its_errors_apart_from_its_figures(tmp_path, monkeyp
     told = json.loads(run_hilstar_here(*words, "--json").stdout)
     gain, error = told["keys"]["gain_e_per_dn"], told["sigmas"]["gain_e_per_dn"]
     assert abs(gain - SENSOR.gain_e_per_dn) < SIGMAS * error < 0.1
-    refused = run_hilstar_here(*words[:-1], flats[0])
-    assert refused.returncode == 2
-    assert flats[0] in refused.stderr
 
 
 SPELLED = {

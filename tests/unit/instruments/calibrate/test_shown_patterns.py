@@ -8,8 +8,10 @@ import logging
 import math
 from collections import deque
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -412,3 +414,35 @@ def test_a_camera_exposes_once_when_the_panel_shows_the_pattern(
     ]
     source.close()
     assert not camera.is_open
+
+
+def test_a_display_that_is_not_as_its_bench_says_may_be_forced_or_left_to_the_person(
+    panel, tmp_path, monkeypatch
+):
+    """A session has no --force of its own: its refusal names the other way."""
+    forced_as = []
+
+    def gate(screen: object, force: bool) -> str:
+        forced_as.append(force)
+        if not force:
+            raise MachineError("the display is scaled; set it to 100 %; or add --force")
+        return "timed"
+
+    monkeypatch.setattr(image_sources, "open_bench", lambda file, context: nullcontext())
+    monkeypatch.setattr(
+        image_sources, "Screen", lambda window, opened: SimpleNamespace(forced=["it is scaled"])
+    )
+    monkeypatch.setattr(image_sources, "pass_gate", gate)
+    file = bench(tmp_path)
+    with PatternDisplay() as shown:
+        with pytest.raises(MachineError) as refused:
+            shown.gate(file)
+        assert str(refused.value) == (
+            "the display is scaled; set it to 100 %; or show the patterns yourself: name {pattern}"
+            " in --grab"
+        )
+        assert shown.forced == []
+        shown.force = True
+        assert shown.gate(file) == "timed"
+        assert shown.forced == ["it is scaled"]
+    assert forced_as == [False, True]

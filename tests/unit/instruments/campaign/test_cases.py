@@ -81,7 +81,12 @@ def test_a_case_does_not_depend_on_the_cases_before_it(tmp_path: Path) -> None:
 def test_a_case_is_made_again_by_simulate_and_its_image_has_its_truth(tmp_path: Path) -> None:
     write_campaign(tmp_path, {"key": "noise_seed", "values": [11]})
     this = cases_session(tmp_path, images=True)
-    row = this.row(0, points(this, 1)[0])
+    where = points(this, 1)[0]
+    row = this.row(0, where)
+    # a thousand images a folder
+    for number, image in ((999, "000000/case_000000999"), (1000, "000001/case_000001000")):
+        assert this.row(number, where)["image"] == f"images/{image}.fits"
+        assert (tmp_path / f"images/{image}.fits").is_file()
     this.close()
     q = ",".join(repr(row[name]) for name in ("qw", "qx", "qy", "qz"))
     again = run_hilstar_here(

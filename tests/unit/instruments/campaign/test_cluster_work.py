@@ -23,6 +23,7 @@ ADDRESS = "tcp://127.0.0.1:8786"
 KIND = Identity("1.0", "a" * 64, "2.1", "1.14", "llvmpipe")
 JOB = Job("p", "", "b", "", "", "", "centroids", ".", 1.0, "d", False)
 CASES = 40
+MOST_LOOKS = 20 * CASES  # at each a task of every worker ends
 
 
 class KilledWorker(Exception):
@@ -71,6 +72,7 @@ class Dask:
 
     def __init__(self, looks: list[dict[str, int]], answers: dict[str, Callable[..., Any]]) -> None:
         self.looks, self._answers = looks, answers
+        self.looked = 0
         self.status = "running"
         self.scheduler = self
         self.ncores = "ncores"
@@ -87,6 +89,8 @@ class Dask:
         return {"address": ADDRESS}
 
     def sync(self, what: str, workers: None, callback_timeout: float) -> dict[str, int]:
+        self.looked += 1
+        assert self.looked < MOST_LOOKS, "the campaign does not end"
         present = self.looks.pop(0) if len(self.looks) > 1 else self.looks[0]
         for worker in present:
             if self.waiting.get(worker):
@@ -259,3 +263,14 @@ def test_a_campaign_without_a_worker_or_a_scheduler_ends_in_a_line(
     gone.dask.status = "closed"
     with pytest.raises(MachineError, match="answers no more; start it again"):
         gone.run()
+
+
+@pytest.mark.parametrize(
+    ("address", "number"),
+    [("tcp://localhost:8786", ADDRESS), ("ucx://127.0.0.1:9000", "ucx://127.0.0.1:9000")],
+)
+def test_a_scheduler_is_reached_by_its_number(address: str, number: str) -> None:
+    assert Scheduler(address).check() == number
+    assert Scheduler(address.replace("tcp", "tls").replace("ucx", "tls")).check() == (
+        number.replace("tcp", "tls").replace("ucx", "tls")
+    )

@@ -131,6 +131,9 @@ def test_a_large_table_is_read_in_part(tmp_path: Path) -> None:
     )
     part = read_cases(tmp_path / "t.parquet", 10)
     assert part.cases == 100 and len(part.numbers["case"]) == 10
+    # every third: of every second there were more than are asked for
+    part = read_cases(tmp_path / "t.parquet", 49)
+    assert part.numbers["case"].tolist() == [*range(0, 60, 3), *range(60, 100, 3)]
 
 
 def columns_of(**numbers: list[float]) -> Columns:

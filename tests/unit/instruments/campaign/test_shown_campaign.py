@@ -17,9 +17,11 @@ import pyarrow.parquet as pq
 import pytest
 
 from hilstar.basics.arrays import FloatArray
+from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.basics.units import ARCSEC_PER_RAD
+from hilstar.instruments.campaign import run
 from hilstar.instruments.campaign.bench_run import OpenDisplay
 from hilstar.instruments.campaign.run import Campaign
 from hilstar.instruments.campaign.store import Directory
@@ -90,10 +92,8 @@ class ShownRun:
     is_whole: bool
 
 
-def shown_campaign(
-    folder: Path, monkeypatch: pytest.MonkeyPatch, until: int = 0, **keys: Any
-) -> ShownRun:
-    """Run the plan of `keys` in a folder."""
+def campaign_of(folder: Path, **keys: Any) -> Campaign:
+    """The campaign of a plan of `keys` in a folder."""
     answers = {
         "source": "udp",
         "bind": "127.0.0.1:5000",
@@ -111,7 +111,14 @@ def shown_campaign(
     plan = {"through": "bench", "timeout_s": 1.0, "blank_s": 0.02, "attitudes": FIELD} | keys
     vary = plan.pop("vary", ())
     (folder / "plan.toml").write_text(plan_text(*vary, **plan))
-    campaign = Campaign(folder / "plan.toml", folder / "out", "centroids", 1.0, False)
+    return Campaign(folder / "plan.toml", folder / "out", "centroids", 1.0, False)
+
+
+def shown_campaign(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, until: int = 0, **keys: Any
+) -> ShownRun:
+    """Run the plan of `keys` in a folder."""
+    campaign = campaign_of(folder, **keys)
     clock = FakeClock()
     tracker = SeeingTracker(clock, folder / "out" / "now.json", until)
     files: list[BenchFile] = []
@@ -139,7 +146,7 @@ def test_a_campaign_is_shown_from_its_plan_to_its_tables(
         f'[[fault]]\nkind = "blank"\nname = "dark"\nat_s = 0.0\nfor_s = {FAULT_S}\n'
     )
     scenario = {"key": "scenario", "values": ["faults.toml", ""]}
-    run = shown_campaign(
+    shown = shown_campaign(
         tmp_path,
         monkeypatch,
         vary=(scenario,),
@@ -148,7 +155,7 @@ def test_a_campaign_is_shown_from_its_plan_to_its_tables(
         answers=2,
         check_every=EVERY,
     )
-    assert run.is_whole
+    assert shown.is_whole
     checks = -(-CASES // EVERY) + 1
     rows = read_columns(tmp_path / "out" / "cases.parquet")
     assert rows["case"] == list(range(CASES))
@@ -179,11 +186,11 @@ def test_a_campaign_is_shown_from_its_plan_to_its_tables(
     faulty = {
         case for case, named in zip(rows["case"], rows["vary.scenario"], strict=True) if named
     }
-    frames = run.tracker.frames
+    frames = shown.tracker.frames
     assert {case for case, is_faulty in frames if is_faulty} <= faulty
     assert {case for case, _ in frames} == set(range(CASES + checks))
-    assert len(run.files) == 2
-    assert run.counts == list(range(CASES + checks + 1))
+    assert len(shown.files) == 2
+    assert shown.counts == list(range(CASES + checks + 1))
     assert not (tmp_path / "out" / "journal").exists()
     assert not (tmp_path / "out" / "now.json").exists()
     about = pq.read_schema(tmp_path / "out" / "cases.parquet").metadata
@@ -203,8 +210,17 @@ def test_a_campaign_that_a_signal_ended_goes_on_and_says_in_which_run_each_case_
     went_on = shown_campaign(tmp_path, monkeypatch, **keys)
     assert went_on.is_whole and went_on.counts == list(range(kept, 4))
     rows = read_columns(tmp_path / "out" / "cases.parquet")
-    by_order = [run for _, run in sorted(zip(rows["order"], rows["run"], strict=True))]
+    by_order = [number for _, number in sorted(zip(rows["order"], rows["run"], strict=True))]
     assert by_order == [1] * kept + [2] * (3 - kept)
     runs = csv_rows(tmp_path / "out" / "runs.csv")
     assert [row["run"] for row in runs] == ["1", "2"]
     assert not (tmp_path / "out" / "checks.csv").exists()
+
+
+def test_a_bench_is_shown_as_many_cases_as_the_limit_and_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "MAX_BENCH_CASES", 3)
+    assert campaign_of(tmp_path, cases=3).cases == 3
+    with pytest.raises(InputError, match=r'cases = 4: through = "bench" takes at most 3$'):
+        campaign_of(tmp_path, cases=4)

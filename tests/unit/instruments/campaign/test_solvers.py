@@ -5,7 +5,9 @@ case's row.
 from __future__ import annotations
 
 import resource
+import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,7 +22,10 @@ from hilstar.instruments.campaign.solvers import (
     SolverFault,
     checked_attitude,
     choose_solver,
+    filled_words,
+    last_words,
     printed_attitude,
+    time_limit,
     tracker_facts,
 )
 from hilstar.instruments.campaign.tally import attitude_error_arcsec
@@ -246,3 +251,73 @@ def test_a_solver_is_told_the_field_along_the_image_s_width() -> None:
         "exposure_s": 0.2,
         "epoch_jyear": 2026.5,
     }
+
+
+def test_stars_are_counted_in_view_found_matched_and_false(
+    seen: tuple[Simulator, Exposure],
+) -> None:
+    """Two blobs that are no stars; a fainter star beside one that has the same find; and stars on
+    either side of the outer edge of the last column, of which one is in view.
+    """
+    simulator, exposure = seen
+    usual = solver("centroids").solve(exposure, simulator).star_errors
+    assert usual is not None
+    drawn = np.flatnonzero(exposure.truth["drawn"])
+    inside = drawn[(np.abs(exposure.truth["x_px"][drawn] - 63.5) < 50)]
+    beside = np.repeat(exposure.truth[inside[:1]], 3)
+    beside["electrons_per_s"] *= 0.5
+    beside["x_px"] += [0.5, 0.0, 0.0]
+    beside["x_px"][1:] = [127.6, 127.4]
+    beside["y_px"][1:] = [5.0, 5.0]
+    truth = np.concatenate([exposure.truth, beside])
+    dn = exposure.dn.copy()
+    for x, y in ((10, 20), (100, 90)):
+        dn[y - 1 : y + 2, x - 1 : x + 2] += 2000
+    counted = (
+        solver("centroids").solve(replace(exposure, truth=truth, dn=dn), simulator).star_errors
+    )
+    assert counted is not None
+    assert counted.stars == usual.stars + 2
+    assert counted.found == usual.found + 2
+    assert counted.matched == usual.matched
+    assert counted.false == usual.false + 2
+
+
+def test_a_solver_that_takes_too_long_is_ended_and_its_alarm_with_it(
+    seen: tuple[Simulator, Exposure], tmp_path: Path
+) -> None:
+    """Afterwards the process has the handler that it had, and no alarm."""
+    (tmp_path / "slow_solver.py").write_text(
+        "import time\n\ndef solve(image, tracker):\n    time.sleep(600)\n"
+    )
+    simulator, exposure = seen
+    before = signal.getsignal(signal.SIGALRM)
+    with pytest.raises(SolverFault, match=r"longer than 0\.01 s"):
+        solver("python:slow_solver:solve", tmp_path, 0.01).solve(exposure, simulator)
+    assert signal.getsignal(signal.SIGALRM) is before
+    with time_limit(600.0):
+        assert signal.getitimer(signal.ITIMER_REAL)[0] > 0
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def test_a_command_gets_what_its_braces_name() -> None:
+    facts = {"fov_deg": 9.53125, "focal_length_px": 1538.4615384, "resolution_px": (640, 480)}
+    words = ["solve", "{image}", "--png={png}", "{fov_deg}", "{focal_length_px}"]
+    words += ["{width_px}x{height_px}", "{other}"]
+    assert filled_words(words, facts, Path("/a/i.fits"), Path("/a/i.png")) == [
+        "solve",
+        "/a/i.fits",
+        "--png=/a/i.png",
+        "9.53125",
+        "1538.46154",
+        "640x480",
+        "{other}",
+    ]
+
+
+def test_of_what_a_program_says_the_last_line_counts() -> None:
+    assert last_words("first\nsecond\nlast \n\n") == "last"
+    assert last_words(" \n") == "it said nothing on stderr"
+    two = "1 0 0 0\n0 1 0 0\ndone in 3 s\n"
+    assert printed_attitude(two) == [0.0, 1.0, 0.0, 0.0]
+    assert printed_attitude('{"q": [1, 0, 0, 0]}\n{"q": [0, 0, 1, 0]}\n{"t": 1}') == [0, 0, 1, 0]

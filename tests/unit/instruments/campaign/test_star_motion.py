@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.coordinates import get_body_barycentric_posvel
+from astropy.time import Time
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
@@ -16,7 +18,10 @@ from hilstar.instruments.campaign.case_table import Columns
 from hilstar.instruments.campaign.plan import Require
 from hilstar.instruments.campaign.star_motion import (
     BRIGHTEST,
+    OBSERVER_KM_S,
+    PARALLAX_TURN,
     YEARLY_TURN,
+    YEARS,
     StarMotion,
     _observers,
     turn_of,
@@ -35,7 +40,7 @@ OBSERVER = {
 FIELDS = 300
 NEAR_EDGE = 0.1  # share that uneven parallaxes lose to a turn about the boresight
 SCALE = Scale(1538.0, (256, 256))
-YEARS = 100.0
+AGE_YR = 100.0
 
 
 @pytest.fixture(scope="module")
@@ -50,10 +55,10 @@ def test_the_turn_is_that_which_lays_old_places_onto_the_new(
     q = from_radec_roll_deg(*radec, 30.0)
     rows = motion.in_field(q, SCALE)[:BRIGHTEST]
     old = motion.vectors[rows] @ to_matrix(q).T
-    new = (motion.vectors[rows] + YEARS * motion.yearly[rows]) @ to_matrix(q).T
+    new = (motion.vectors[rows] + AGE_YR * motion.yearly[rows]) @ to_matrix(q).T
     new /= np.linalg.norm(new, axis=1, keepdims=True)
     wanted, _ = Rotation.align_vectors(new, old)
-    turn_arcsec = ARCSEC_PER_RAD * YEARS * motion.turn_rad(q, rows)
+    turn_arcsec = ARCSEC_PER_RAD * AGE_YR * motion.turn_rad(q, rows)
     assert np.linalg.norm(turn_arcsec) > 0.5
     # of the second order in the motion, which about the boresight counts more than across
     wanted_arcsec = wanted.as_rotvec() * ARCSEC_PER_RAD
@@ -192,3 +197,48 @@ def test_what_places_the_observer_is_told_as_the_bench_file_writes_it(tmp_path: 
         {"sky.bodies.sun": False, "sky.epoch_jyear": 2027.5, "spacecraft.orbit": "low.tle"},
     ]
     assert [type(values["sky.bodies.sun"]) for values in told] == [bool, bool]
+
+
+def test_each_case_has_its_own_date_and_the_observer_of_that_date(tmp_path: Path) -> None:
+    """Dates half a year apart, beside the bench's, in no order: the Earth's velocity about the
+    barycentre is astropy's, and turns by parallax are the other way round.
+    """
+    file = read_bench_file(write_bench(tmp_path, **OBSERVER))
+    dates = ["2027-01-01T00:00:00Z", "2026-04-01T00:00:00", "2027-07-03T12:00:00Z"]
+    q = np.tile(from_radec_roll_deg(84.0, 0.0, 30.0), (3, 1))
+    numbers = {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
+    cases = Columns(3, numbers | {"frames": np.ones(3)}, {"vary.sky.epoch_utc": dates})
+    requires = [
+        Require(quantity="catalogue-age", maximum=1.0),
+        Require(quantity="parallax", maximum=1.0),
+    ]
+    told = with_motion(cases, requires, file, SCALE, "tracker")
+    times = Time([date.removesuffix("Z") for date in dates])
+    assert told.numbers[YEARS] == pytest.approx(times.jyear - times.jyear[1], abs=1e-4)
+    _, velocity = get_body_barycentric_posvel("earth", times)
+    wanted_km_s = velocity.xyz.to_value("km/s").T
+    assert told.vectors(OBSERVER_KM_S, "xyz") == pytest.approx(wanted_km_s, abs=0.01)
+    turns = told.vectors(PARALLAX_TURN, "xy")
+    assert np.linalg.norm(turns[0]) > 1e-3
+    # the Earth goes to within a fiftieth of the other side of its orbit
+    assert turns[2] == pytest.approx(-turns[0], rel=0.1, abs=0.02 * np.abs(turns).max())
+
+
+def test_dates_in_years_are_taken_as_they_are(tmp_path: Path) -> None:
+    file = read_bench_file(write_bench(tmp_path, sky={"epoch_jyear": 2026.5}))
+    q = np.tile(from_radec_roll_deg(84.0, 0.0, 30.0), (2, 1))
+    numbers = {f"q{name}": q[:, k] for k, name in enumerate("wxyz")}
+    numbers |= {"frames": np.ones(2), "vary.sky.epoch_jyear": np.array([2030.0, 2020.0])}
+    require = Require(quantity="proper-motion", maximum=1.0)
+    told = with_motion(Columns(2, numbers, {}), [require], file, SCALE, "tracker")
+    assert told.numbers[YEARS].tolist() == [3.5, -6.5]
+
+
+def test_two_stars_tell_no_turn_and_three_do(rng: np.random.Generator) -> None:
+    vectors = rng.normal(size=(3, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    turn = np.array([1e-6, -2e-6, 3e-6])
+    stars = StarMotion(2026.0, vectors, np.cross(turn, vectors), np.zeros(3))
+    q = from_radec_roll_deg(10.0, 20.0, 30.0)
+    assert stars.turn_rad(q, np.arange(2)).tolist() == [0.0, 0.0, 0.0]
+    assert stars.turn_rad(q, np.arange(3)) == pytest.approx(to_matrix(q) @ turn, rel=1e-9)

@@ -35,7 +35,7 @@ from tests.support.campaigns import read_columns, write_campaign
 CAMPAIGN = Identity("1.0", "a" * 64, "2.1", "1.14", "llvmpipe")
 OTHER = Identity("1.1", "b" * 64, "2.2", "1.15", "GeForce")
 # the largest part of memory that a process gains between two looks at its peak
-GAINED = 0.05
+GAINED = 0.01
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,10 @@ from hilstar.instruments.confront.camera_fit import (
 )
 from hilstar.instruments.confront.judge import _dim_regions, _Explanation
 from hilstar.instruments.confront.lost_in_space import SourceField, nearest_once, solve_lost
+from hilstar.instruments.confront.photographed_sky import DatedSky
+from hilstar.instruments.confront.session import _solve
 from hilstar.optics.camera import Camera, Lens
+from hilstar.sky.catalog import load_catalog
 from tests.support.planted_sky import rotation_of
 from tests.unit.instruments.confront.test_parts import row_of
 
@@ -151,6 +154,21 @@ def test_an_attitude_is_found_of_a_field_whose_scale_is_known_to_a_fifth(rng, sc
     # mirrored, it is no part of this sky
     mirrored = replace(field, places_px=field.places_px * np.array([-1, 1]))
     assert solve_lost(mirrored, scale * FOCAL_PX, vectors, np.array(turn[2])) is None
+
+
+def test_an_attitude_is_looked_for_everywhere_where_it_is_not_near_the_one_given(rng):
+    vectors = sky_of(rng)
+    turn = rotation_of(40.0, 20.0, 77.0)
+    cam = vectors @ turn.T
+    places_px = FOCAL_PX * cam[:, :2] / cam[:, 2:]
+    inside = (np.abs(places_px) < [WIDE_PX / 2, HIGH_PX / 2]).all(axis=1)
+    field = SourceField(places_px[inside], WIDE_PX, HIGH_PX)
+    base = Camera(SIZE_PX, FOCAL_PX, CENTRE_PX, np.eye(3))
+    sky = DatedSky(load_catalog(), 2020.0, None, vectors, np.arange(len(vectors)))
+    for start_deg in ((220.0, -20.0, 0.0), (41.0, 21.0, 0.0)):
+        found = _solve(field, base, sky, from_matrix(rotation_of(*start_deg)))
+        assert found is not None
+        assert np.abs(to_matrix(found.q_icrs_to_cam) @ turn.T - np.eye(3)).max() < 1e-3
 
 
 def test_a_source_is_the_brightest_of_its_stars_alone():

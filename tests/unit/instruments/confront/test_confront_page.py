@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.pages import BAD, DASH, OK
+from hilstar.basics.pages import BAD, DASH, OK, WARN
 from hilstar.instruments.confront import page
 from hilstar.instruments.confront.judge import SourceRow
 from tests.support.card_texts import BAND, card_lines, drawn_figures
@@ -216,6 +216,8 @@ def test_figures_that_no_photograph_has_are_dashes_and_the_worst_may_be_the_last
     figures = list(page._figures([none]))
     assert [figure.text for figure in figures[1:3]] == [f"{DASH} px", f"{DASH} mag"]
     assert [figure.state for figure in figures[3:]] == [OK, OK]
+    odd = some_verdicts(a_session())[0]
+    assert [figure.state for figure in list(page._figures([none, odd]))[3:]] == [WARN, WARN]
     worse = a_verdict(shot, 1, rms_px=0.75, rms_mag=0.0125)
     figures = list(page._figures([none, worse, a_verdict(shot, 2)]))
     assert [figure.text for figure in figures[1:3]] == ["0.75 px", "0.031 mag"]

@@ -8,12 +8,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.coordinates import get_body, solar_system_ephemeris
 from astropy.io import fits
+from astropy.time import Time
 from PIL import Image
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.confront.images import paged, parse_utc, read_photographs
-from hilstar.instruments.confront.photographed_sky import dated_sky, earth_velocity_km_s
+from hilstar.instruments.confront.photographed_sky import (
+    dated_sky,
+    earth_velocity_km_s,
+    planets_seen,
+)
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.sky.stars import unit_vectors_icrs
 from tests.support.benches import SMALL_BENCH
@@ -107,6 +113,57 @@ def test_a_top_that_many_pixels_have_is_where_levels_end(tmp_path: Path) -> None
     assert read_photographs(saved(tmp_path, image), None)[0].full_dn == 4092.0
 
 
+@pytest.mark.parametrize(
+    ("step", "top", "pixels_at_top", "full_dn"),
+    [
+        # a saturated level is one less than a multiple of the step
+        (16, 65535, 3, 65535.0),
+        (16, 65535, 1, 65535.0),
+        # one level over 12 bits is of 13, and the last of them is where they end
+        (4, 4096, 1, 8191.0),
+        (4, 4095, 1, 4095.0),
+        (4, 3600, 2, 4095.0),
+        (4, 3600, 3, 3600.0),
+    ],
+)
+def test_levels_end_with_their_bits_or_where_three_pixels_are_clipped(
+    tmp_path: Path, step: int, top: int, pixels_at_top: int, full_dn: float
+) -> None:
+    image = ramp(np.uint16, step)
+    image[10, 10 : 10 + pixels_at_top] = top
+    image[20, 20] = step * ((top - 1) // step)
+    (photo,) = read_photographs(saved(tmp_path, image), None)
+    assert (photo.step_dn, photo.full_dn) == (step, full_dn)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "notes"),
+    [("a.jpg", "JPEG", 1), ("a.mpo", "MPO", 1), ("a.webp", "WEBP", 1), ("a.png", "PNG", 0)],
+)
+def test_a_picture_whose_tone_curve_is_not_known_says_so(
+    tmp_path: Path, name: str, kind: str, notes: int
+) -> None:
+    path = tmp_path / name
+    picture = Image.fromarray(ramp(np.uint8, 1, 200))
+    preview = {"save_all": True, "append_images": [picture.resize((40, 32))]}
+    others = preview if kind == "MPO" else {}
+    picture.save(path, kind, **others)
+    (photo,) = read_photographs(path, None)
+    assert [note.partition(":")[0] for note in photo.notes] == ["a JPEG"] * notes
+
+
+def test_a_map_of_directions_is_no_photograph_and_one_of_its_keys_is_no_map(
+    tmp_path: Path,
+) -> None:
+    header = fits.Header({"CENTAZ": 0.0})
+    path = tmp_path / "a.fits"
+    fits.PrimaryHDU(ramp(), header).writeto(path)
+    assert read_photographs(path, None)[0].step_dn == 4.0
+    header["CENTEL"] = 90.0
+    fits.PrimaryHDU(ramp(), header).writeto(path, overwrite=True)
+    assert "(CENTAZ, CENTEL)" in refusal(read_photographs, path, None)
+
+
 def test_three_channels_that_are_alike_are_grey_and_opacity_is_none(tmp_path: Path) -> None:
     grey = ramp(np.uint8, 1, 200)
     alike = np.stack([grey] * 3, axis=2)
@@ -127,6 +184,7 @@ def test_three_channels_that_are_alike_are_grey_and_opacity_is_none(tmp_path: Pa
         (np.full((HEIGHT, WIDTH), 7, dtype=np.uint16), "are saturated at 7"),
         (np.zeros((HEIGHT, WIDTH), dtype=np.uint16), "every pixel is 0"),
         (ramp()[:20, :20], "20 x 20 px is too small"),
+        (ramp()[:63], "80 x 63 px is too small"),
         (np.eye(HEIGHT, dtype=bool), "of a palette or of print (1)"),
     ],
 )
@@ -194,3 +252,22 @@ def test_a_sky_is_of_its_day_as_a_moving_observer_sees_it(tmp_path: Path) -> Non
     assert undated.velocity_km_s is undated.air is None
     at_epoch = unit_vectors_icrs(undated.catalog, undated.epoch_jyear)[undated.order]
     assert undated.vectors.tolist() == at_epoch.tolist()
+
+
+# of the planets' mean elements, and what moves in the light's time to the Earth; of the Moon's
+PLANET_ERROR_RAD, MOON_ERROR_RAD = np.radians(2 / 60), np.radians(1.0)
+
+
+def test_planets_are_where_astropy_has_them_from_the_earth() -> None:
+    """On a day when the barycentre is 0.008 au from the Sun, half a degree of Mars's place."""
+    when = Time("2020-09-20T20:00:00", scale="utc")
+    seen = planets_seen(ns("2020-09-20T20:00:00"))
+    assert len(seen) == 8
+    with solar_system_ephemeris.set("builtin"):
+        for name, direction in seen.items():
+            body = name.removeprefix("the ").lower()
+            wanted = get_body(body, when).cartesian.xyz.value
+            wanted = wanted / np.linalg.norm(wanted)
+            limit_rad = MOON_ERROR_RAD if body == "moon" else PLANET_ERROR_RAD
+            assert np.linalg.norm(np.cross(direction, wanted)) < limit_rad
+            assert direction @ wanted > 0

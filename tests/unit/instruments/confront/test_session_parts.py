@@ -11,14 +11,19 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.special import ndtr
 
 from hilstar.basics.errors import InputError
 from hilstar.basics.reading import parse_toml
+from hilstar.basics.rotation import from_matrix
+from hilstar.instruments.confront import run as confront_run
 from hilstar.instruments.confront import session as sessions
-from hilstar.instruments.confront.background import FixedPattern
+from hilstar.instruments.confront.background import FixedPattern, FoundSources, SkyLevel
+from hilstar.instruments.confront.camera_fit import Pointing
 from hilstar.instruments.confront.images import Photograph, _planes
 from hilstar.instruments.confront.light import LightFit
+from hilstar.instruments.confront.lost_in_space import MIN_MATCHED
 from hilstar.instruments.confront.measured_bench import (
     PER_PX,
     _absolute,
@@ -30,6 +35,7 @@ from hilstar.instruments.confront.measured_bench import (
     read_tracker_file,
     vignetting_of,
 )
+from hilstar.instruments.confront.photographed_sky import DatedSky
 from hilstar.instruments.confront.photon_transfer import PixelFit
 from hilstar.instruments.confront.run import _base
 from hilstar.instruments.confront.session import (
@@ -49,11 +55,13 @@ from hilstar.instruments.confront.session import (
     corrected,
     radius2_of,
 )
-from hilstar.instruments.confront.star_psf import HALF, MEAN_BV_MAG, Stamps
+from hilstar.instruments.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, join
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
+from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.spectrum import Curve
-from tests.support.confrontations import a_session
+from tests.support.confrontations import a_session, a_shot
+from tests.support.planted_sky import rotation_of
 
 TRACKER = """
 [tracker]
@@ -432,3 +440,158 @@ def test_a_plane_s_stars_are_fainter_by_its_own_colour_about_the_mean_colour():
     columns = np.array([[5.0, 6.0, 7.0], [MEAN_BV_MAG + 1, np.nan, MEAN_BV_MAG - 2], [0.7] * 3])
     np.testing.assert_allclose(session.plane_mag(0, columns), [0.25, 0.0, -0.5])
     np.testing.assert_allclose(session.plane_mag(1, columns), [-0.5, 0.0, 1.0])
+
+
+# V, and places of stars: two that are 5 px apart and differ by 2.9 mag, two by 3.1 mag, two that
+# are 6.5 px apart, one that nothing was seen of, and one that is saturated
+SKY_STARS = (
+    (3.0, 100.2, 50.0),
+    (5.9, 105.2, 50.0),
+    (3.0, 200.0, 80.3),
+    (6.1, 200.0, 85.3),
+    (3.0, 300.4, 20.7),
+    (3.0, 300.4, 27.2),
+    (3.0, 60.0, 90.0),
+    (3.0, 30.0, 30.0),
+)
+SEEN_STARS = (0, 1, 2, 4, 5, 7)
+FIELD_PX = (400, 120)
+
+
+def identified_shot() -> sessions.Shot:
+    """A shot whose sources are the seen stars, all of one light but the last, which nearly fills
+    the range with the background.
+    """
+    camera = Camera(FIELD_PX, 4000.0, (199.5, 59.5), np.eye(3))
+    v_mag, x_px, y_px = np.array(SKY_STARS).T
+    turn = rotation_of(40.0, 20.0, 10.0)
+    vectors = camera.rays(x_px, y_px) @ turn
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    count = len(v_mag)
+    columns = {"hip": np.arange(count, dtype=np.int32), "v_mag": v_mag}
+    catalog = plain_catalog("HIP", count, columns | {"ra_deg": v_mag, "dec_deg": v_mag})
+    seen = np.array(SEEN_STARS)
+    seen_x_px, seen_y_px = x_px[seen] + 0.5, y_px[seen] - 0.5
+    level = np.full(FIELD_PX[::-1], 500.0)
+    dn = level.copy()
+    dn[30, 30] = 0.975 * 4095
+    three = np.full(len(seen), 3.0)
+    single = np.zeros(len(seen), dtype=bool)
+    sources = FoundSources(seen_x_px, seen_y_px, 10 * three, three, three, three, single)
+    q_icrs_to_cam = from_matrix(turn)
+    rows = np.arange(count)
+    shot = replace(
+        a_shot(0),
+        photo=photograph(dn),
+        level=SkyLevel(level, np.ones_like(level), 16),
+        sources=sources,
+        sky=DatedSky(catalog, 2020.0, None, vectors, rows),
+        pointing=Pointing(q_icrs_to_cam),
+    )
+    sessions._identify(shot, camera, shot.pointing)
+    return shot
+
+
+def test_stars_are_identified_at_their_sources_with_what_spoils_them():
+    """Blended by a star of the catalogue within 6 px that is less than 3 mag fainter, or by another
+    source as bright; saturated by all of a pixel's light.
+    """
+    shot = identified_shot()
+    assert sorted(shot.star.tolist()) == list(SEEN_STARS)
+    blended = dict(zip(shot.star.tolist(), shot.blended.tolist(), strict=True))
+    assert blended == {0: True, 1: True, 2: False, 4: False, 5: False, 7: False}
+    saturated = dict(zip(shot.star.tolist(), shot.saturated.tolist(), strict=True))
+    assert saturated == {star: star == 7 for star in SEEN_STARS}
+    assert shot.clean.sum() == 3
+    (middle,) = np.flatnonzero(shot.star == 7)
+    # above the background
+    assert shot.stamps.values[middle].max() == pytest.approx(0.975 * 4095 - 500)
+
+
+def test_magnitudes_are_those_of_each_correction(tmp_path):
+    """A tilt of ln(wavelength / 550 nm) makes red stars brighter than blue ones."""
+    columns = np.array([[3.0, 3.0], [0.0, 1.5], [0.0, 1.6]])
+    magnitudes = sessions._Magnitudes(bench(tmp_path), columns)
+    plain_mag = magnitudes((0.0, 0.0))
+    red_mag = magnitudes((1.0, 0.0))
+    assert (red_mag - plain_mag)[1] < (red_mag - plain_mag)[0] - 0.02
+    assert magnitudes((0.0, 0.0)).tolist() == plain_mag.tolist()
+
+
+def test_photographs_share_the_largest_full_scale_and_those_beyond_memory_lie_in_files(
+    tmp_path, monkeypatch
+):
+    """Of 12, 14 and 12 bits; the second one is over what memory holds."""
+    monkeypatch.setattr(confront_run, "MEMORY_PX", 1.5 * 80 * 64)
+    rows, columns = np.mgrid[:64, :80]
+    paths = []
+    for number, step in enumerate((4, 15, 4)):
+        levels = (step * ((3 * rows + 7 * columns) % 700)).astype(np.uint16)
+        paths.append(tmp_path / f"{number}.tiff")
+        Image.fromarray(levels).save(paths[-1])
+    text = TRACKER.replace("[800, 600]", "[80, 64]")
+    photos = confront_run._read(bench(tmp_path, text), paths, None)
+    assert [photo.full_dn for photo in photos] == [16383.0] * 3
+    assert [photo.step_dn for photo in photos] == [4.0, 15.0, 4.0]
+    assert [isinstance(photo.dn, np.memmap) for photo in photos] == [False, True, True]
+    with pytest.raises(InputError, match=r"0\.tiff: two images have this name"):
+        confront_run._read(bench(tmp_path, text), [paths[0], paths[1], paths[0]], None)
+
+
+def test_air_masses_of_a_photograph_without_a_site_are_by_its_fitted_zenith():
+    shot = a_shot(0)
+    at_60_deg = Pointing(shot.pointing.q_icrs_to_cam, (0.0, math.sqrt(3)))
+    assert sessions._masses(shot.sky, at_60_deg) == pytest.approx(2.0, rel=0.01)
+    assert sessions._masses(shot.sky, shot.pointing) is None
+
+
+def measured_shot(dn: list[float]) -> sessions.Shot:
+    """A shot of stars of these fluxes with 1 DN of noise, the last of which is blended."""
+    count = len(dn)
+    at = np.arange(count, dtype=float)
+    measured = Measured(at, 2 * at, np.array(dn), 0.1 + at, np.ones(count), np.ones(count))
+    blended = at == count - 1
+    shot = a_shot(0)
+    vectors = np.column_stack([at, at, at])
+    return replace(
+        shot,
+        sky=replace(shot.sky, vectors=vectors[::-1]),
+        star=np.arange(count)[::-1],
+        measured=measured,
+        blended=blended,
+        saturated=np.zeros(count, dtype=bool),
+    )
+
+
+@pytest.mark.parametrize(
+    ("dn", "chosen"),
+    [
+        # ten sigmas and alone, of which there are enough; else all that are alone; else all
+        ([50.0] * MIN_MATCHED + [9.0, 50.0], range(MIN_MATCHED)),
+        ([50.0] * (MIN_MATCHED - 1) + [9.0, 50.0], range(MIN_MATCHED)),
+        ([50.0, 9.0, 50.0], range(3)),
+    ],
+)
+def test_places_that_count_are_those_of_bright_stars_that_are_alone(dn, chosen):
+    places = sessions._places(measured_shot(dn))
+    rows = np.array(chosen)
+    assert places.x_px.tolist() == rows.tolist()
+    assert places.y_px.tolist() == (2 * rows).tolist()
+    assert places.sigma_px.tolist() == (0.1 + rows).tolist()
+    assert places.vectors[:, 0].tolist() == rows.tolist()
+
+
+def test_a_psf_is_that_of_the_brightest_stars(monkeypatch):
+    """Twelve of 0.8 px, and twelve of a tenth of their light that are twice as wide."""
+    monkeypatch.setattr(sessions, "PSF_STARS", 12)
+    rng = np.random.default_rng(2)
+    places_px = rng.uniform([20, 20], [780, 580], (24, 2))
+    narrow = stamps_of(places_px[:12], 0.8, 0.8)
+    wide = stamps_of(places_px[12:], 1.6, 1.6)
+    stamps = join([replace(wide, values=wide.values / 10), narrow])
+    nothing = np.zeros(24, dtype=bool)
+    shot = replace(a_shot(0), stamps=stamps, saturated=nothing, blended=nothing)
+    photo = replace(shot.photo, dn=np.zeros((600, 800)))
+    psf = sessions._psf([replace(shot, photo=photo)], 2.0)
+    middle = np.array([399.5]), np.array([299.5])
+    assert psf.fwhm_px(*middle)[0] == pytest.approx(2.3548 * math.hypot(0.8, 1 / 12**0.5), rel=0.05)

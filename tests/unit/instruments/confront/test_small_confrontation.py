@@ -248,6 +248,18 @@ def test_tables_have_each_star_at_its_place_and_what_explains_each_source(night:
     assert hot == {(str(row), str(column)) for row, column in CAMERA.hot}
 
 
+def test_sources_are_written_at_their_places_with_their_light(night: Night) -> None:
+    rows = csv_rows(night.folder / "sources.csv")
+    for shot in night.session.shots:
+        written = []
+        for row in rows:
+            if row["image"] == shot.photo.name:
+                written.append([float(row[key]) for key in ("x_px", "y_px", "snr")])
+        seen_sources = np.column_stack([shot.sources.places_px, shot.sources.snr])
+        # three and two decimals
+        assert np.array(written) == pytest.approx(seen_sources, abs=0.0051)
+
+
 def test_the_page_and_the_tracker_file_are_written_beside_the_tables(night: Night) -> None:
     for name in ("index.html", "sources.csv", "stars.csv", "tracker.toml"):
         assert str(night.folder / name) in night.found.written
@@ -256,6 +268,10 @@ def test_the_page_and_the_tracker_file_are_written_beside_the_tables(night: Nigh
     for shot in night.session.shots:
         assert shot.photo.path.name in text
     assert json.loads(json.dumps(night.found.figures)) == night.found.figures
+    noted = [note for note in night.found.notes if "its time is read from its name" in note]
+    assert [note.partition(":")[0] for note in noted] == [
+        shot.photo.path.name for shot in night.session.shots
+    ]
     assert any(line.startswith("lens: ") for line in night.found.lines)
 
 

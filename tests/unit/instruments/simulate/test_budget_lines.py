@@ -26,6 +26,7 @@ from hilstar.server.bench.star_rates import bench_optics
 from hilstar.server.bench.star_size import StarSize
 from hilstar.tracker.centroiders import FAMILY
 from tests.support.benches import SMALL_BENCH, bench_text
+from tests.support.tables import csv_rows
 
 STAR = StarSize(1.0, 0.5, 1.5, 2.0, 1.25, 13.5, 4.5, None)
 
@@ -204,3 +205,48 @@ def test_a_budget_s_ends_are_where_white_and_the_first_code_are_on_the_darkest_a
     assert brighter == pytest.approx(-2.5 * math.log10(0.8), abs=cut)
     assert falling.clips_v_mag_at_best == pytest.approx(whole.clips_v_mag_at_best, abs=cut)
     assert whole.black_e_per_s_px == 0.0
+
+
+def test_a_budget_s_table_has_a_column_for_each_kind_and_its_chart_the_errors_of_what_shows(
+    tmp_path, monkeypatch
+) -> None:
+    drawn: list[Any] = []
+    monkeypatch.setattr("hilstar.basics.charts.save", lambda figure, path: drawn.append(figure))
+    within = {"0.02_mag": 2.0, "0.05_mag": 4.5, "0.01_px": None}
+    kinds = {kind: 0.01 * (k + 1) for k, kind in enumerate(FAMILY)}
+    told = a_budget(within=within)
+    first, last = told.rows
+    middle = MagnitudeRow(5.25, 4.0, 0.025, 0.03, 0.125, 0.1, 3.5, kinds)
+    told = a_budget(within=within, rows=[first, middle, last])
+    budgets.write_report(tmp_path, told)
+    cells = csv_rows(tmp_path / "budget.csv")
+    columns = [name for name in MagnitudeRow.__slots__ if name != "axis_rms_px"]
+    assert list(cells[0]) == [*columns, *(f"axis_rms_px_{kind}" for kind in FAMILY)]
+    for written, row in zip(cells, told.rows, strict=True):
+        for name in columns:
+            value = getattr(row, name)
+            assert written[name] == ("" if value is None else str(value))
+        for kind in FAMILY:
+            value = row.axis_rms_px[kind]
+            assert written[f"axis_rms_px_{kind}"] == ("" if value is None else str(value))
+    (figure,) = drawn
+    flux, place, by_kind = figure.axes
+    # the largest so far, and the rms of each; then the limits
+    wanted = (
+        (flux, [0.0375, 0.0375], [0.0125, 0.025], [0.02, 0.05]),
+        (place, [0.125, 0.125], [0.0625, 0.125], [0.01]),
+    )
+    for axis, largest, rms, limits in wanted:
+        for line, values in zip(axis.lines, (largest, rms), strict=False):
+            assert line.get_xdata().tolist() == [3.25, 5.25]
+            assert line.get_ydata().tolist() == values
+        levels = [line.get_ydata()[0] for line in axis.lines[2 : 2 + len(limits)]]
+        assert levels == limits
+    for line, kind in zip(by_kind.lines, FAMILY, strict=False):
+        assert line.get_ydata().tolist() == [kinds[kind]] * 2
+    for axis in figure.axes:
+        assert [line.get_xdata()[0] for line in axis.lines[-2:]] == [1.25, 8.75]
+    texts = " ".join(text.get_text().replace("\n", " ") for text in figure.texts)
+    finding = texts.replace("\N{NO-BREAK SPACE}", " ")
+    assert "10 bits, exact: from V = 1.2, where stars clip" in finding
+    assert "within 0.05 mag over 4.5 magnitudes" in finding

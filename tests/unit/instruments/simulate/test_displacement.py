@@ -115,3 +115,15 @@ def test_what_is_left_is_corrected_for_the_unknowns_and_its_95th_percentile_is_o
     assert fit.left == pytest.approx(share)
     off_px = np.hypot(rest[:20], rest[20:])
     assert fit.left_px == pytest.approx(np.percentile(off_px, 95))
+
+
+@pytest.mark.parametrize(("off_px", "is_kept"), [(0.8 * LIMIT_PX, True), (2 * LIMIT_PX, False)])
+def test_a_star_that_is_off_by_less_than_the_limit_is_not_wild_beside_exact_ones(
+    rng, off_px, is_kept
+):
+    """Of 30 stars one alone is off: it is in what the model leaves, or left out."""
+    x, y = rng.uniform(-0.2, 0.2, (2, 30))
+    stars = displaced(x, y, lambda u, v: (1.01 * u + 1e-3, 1.01 * v))
+    stars[4, 2] += off_px
+    fit = fit_geometry(stars, TRACKER, LIMIT_PX)
+    assert (fit.left > 1e-7) == is_kept

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections import deque
 from types import SimpleNamespace
 
 import numpy as np
@@ -316,3 +317,69 @@ def test_a_worker_writes_exposures_each_with_its_number_s_noise_and_how_it_was_m
         assert header["DEVSEED"] == detector.device_seed
         assert header.get("FAULTS") == names
         assert header["NSTARS"] == len(wanted.truth)
+
+
+class PoolHere:
+    """A pool of workers in this process: each works at once, and answers when it is asked."""
+
+    opened: list[PoolHere]
+
+    def __init__(self, start, arguments, errors) -> None:
+        self.start_work, self.arguments = start, arguments
+        self.workers: list[PoolHere] = []
+        self.news: deque[tuple[PoolHere, str, object]] = deque()
+        self.opened.append(self)
+
+    def __enter__(self) -> PoolHere:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Nothing is left behind."""
+
+    def start(self) -> None:
+        greeting, self.work = self.start_work(*self.arguments)
+        self.workers.append(self)
+        self.news.append((self, "ready", greeting))
+
+    def heard(self):
+        yield self.news.popleft()
+
+    def give(self, task, *arguments) -> None:
+        self.news.append((self, "answer", self.work(*arguments)))
+
+
+def test_every_view_of_a_log_is_exposed_once_with_its_own_number_and_faults(tmp_path, monkeypatch):
+    """Three views, of which the second has the ghost: two cores take them in turn."""
+    PoolHere.opened = []
+    monkeypatch.setattr(batch, "ProcessPool", PoolHere)
+    monkeypatch.setattr(batch.os, "sched_getaffinity", lambda process: {0, 1})
+    tracker = {"resolution_px": [120, 90], "exposure_s": EXPOSURE_S}
+    text = bench_text({"tracker": tracker, "sky": {"faintest_v_mag": 3.0}})
+    file = bench_file_of(tmp_path / "bench.toml", text)
+    scenario = parse_scenario(tmp_path / "faults.toml", HEAD + GHOST.replace("480, 530", "70, 20"))
+    zero_ns = 10**18
+    samples = []
+    for at_s in (0.0, 1.5, 4.0):
+        samples.append(AttitudeSample(zero_ns + round(at_s * NS_PER_S), np.array(ORION_Q)))
+    noise = FrameNoise("full", 8)
+    with Simulator(file) as simulator:
+        views = []
+        for turn_deg, sample in zip((0, 20, 40), samples, strict=True):
+            rate = np.radians([0.0, 0.0, turn_deg])
+            views.append(simulator.view(np.array(ORION_Q), rate, sample.t_ns))
+        done: list[int] = []
+        batch.simulate_views(
+            file, views, noise, tmp_path / "out", done.append, LogFaults(scenario, samples)
+        )
+        assert done == [1, 2, 3]
+        (pool,) = PoolHere.opened
+        assert len(pool.workers) == 2
+        assert len(list((tmp_path / "out").iterdir())) == 3
+        for number, view in enumerate(views):
+            with fits.open(tmp_path / "out" / f"exposure_{number:06d}.fits") as (image, _):
+                header, dn = image.header, image.data.copy()
+            assert header.get("FAULTS") == ("ghost" if number == 1 else None)
+            assert header["RATEZ"] == pytest.approx((0, 20, 40)[number])
+            if number != 1:
+                plain = simulator.expose(view, np.random.default_rng((8, number)))
+                np.testing.assert_array_equal(dn, plain.dn)

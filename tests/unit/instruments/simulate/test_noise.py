@@ -797,3 +797,23 @@ def test_each_of_many_stars_has_the_noise_of_its_own_light_and_background():
         (alone,) = one(star, star_e[number], sky_e[number])
         for name in noise.NOISE_COLUMNS:
             assert rows[name][number] == pytest.approx(alone[name], rel=1e-9)
+
+
+def test_a_bound_is_the_rms_over_the_places_within_a_pixel():
+    """Of two places with variances of 1 and 9 of the first unknown, 4 and 16 of the second."""
+    information = np.array([[np.diag([1.0, 1 / 4]), np.diag([1 / 9, 1 / 16])]])
+    np.testing.assert_allclose(noise._bounds(information), [[math.sqrt(5.0), math.sqrt(10.0)]])
+
+
+def test_what_centroiders_reach_is_before_the_sky_and_no_better_than_its_bound(rng):
+    """Of a star as bright as each pixel of its sky, which makes most of its noise."""
+    star = gaussian(1.0, NOISY, phases=2)
+    stars_e = np.array([2e4, 5e4])
+    finder = CentroidSettings()
+    reached_px = noise._measured_by_rate(star, stars_e, 2e4, finder, rng)
+    assert reached_px.shape == (len(noise.FAMILY), 2)
+    bound_px = star.noise(stars_e, np.full(2, 2e4), finder)["bound_px"]
+    # an rms of 400 places along two axes is known to 2.5 %
+    assert (reached_px > 0.9 * bound_px).all()
+    fit_px = reached_px[noise.FAMILY.index("fit")]
+    assert (fit_px < 1.2 * bound_px).all()

@@ -224,3 +224,16 @@ def test_a_subpixel_is_beside_the_middle_of_its_pixel_where_that_is_shown(geomet
     }[mirror]
     wanted = geometry.to_tracker(right + 0.3, down - 0.2)
     np.testing.assert_allclose(shown.to_tracker(x_px, y_px, (0.3, -0.2)), wanted)
+
+
+def test_light_that_is_spread_part_by_part_is_all_there(geometry, rng, monkeypatch):
+    """Of 41 pixels seven at once: the last part has six."""
+    light = np.zeros((48, 64))
+    places = rng.choice(20 * 24, 41, replace=False)
+    light[14 + places // 24, 20 + places % 24] = rng.uniform(1e3, 1e6, 41)
+    with TwinOptics(geometry, GaussianPsf(PSF_PX)) as optics:
+        whole = optics.image_e_per_s(light)
+        monkeypatch.setattr(twin_optics, "POINTS_AT_ONCE", 7 * len(optics._steps) ** 2)
+        in_parts = optics.image_e_per_s(light)
+    # each part is drawn in float32
+    np.testing.assert_allclose(in_parts, whole, atol=1e-6 * whole.max())

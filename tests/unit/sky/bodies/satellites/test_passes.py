@@ -12,8 +12,16 @@ import pytest
 from hilstar.sky.bodies.orbit import Geocentre, TleOrbit
 from hilstar.sky.bodies.passes import OWN_KM, Cone
 from hilstar.sky.bodies.satellites import Swarm, read_satellites, sunlit_share
-from tests.support.satellites import element_set, satellite_sky, some_orbits, with_checksum
+from hilstar.sky.stars import with_bodies
+from tests.support.satellites import (
+    V0_E_PER_S,
+    element_set,
+    satellite_sky,
+    some_orbits,
+    with_checksum,
+)
 from tests.support.skies import STATION_TLE, STATION_UTC, utc_ns
+from tests.support.stars import stars_at
 
 START = utc_ns(STATION_UTC)
 NORTH = np.array([0.0, 0.0, 1.0])
@@ -335,6 +343,21 @@ def test_light_varies_by_the_time_since_the_sky_s_date_not_since_a_frame():
             rates.append(seen.rates_e_per_s(np.array([0]), now, now)[0])
         wanted = 1 + depth * np.cos(2 * np.pi * (seconds - 1.0) / 7.0)
         assert rates[0] / rates[1] == pytest.approx(wanted, rel=1e-5)
+
+
+def test_satellites_are_written_before_the_bodies_that_come_after_them(rng):
+    sky = satellite_sky(some_orbits(rng, 3), Geocentre())
+    stars = stars_at(rng.normal(size=(5, 3)), np.ones(5))
+    names = sky.satellites.names
+    among = with_bodies(with_bodies(stars, names, np.zeros(3), False), ("Moon",), np.zeros(1))
+    places = np.array([[0.0, 0.6, 0.8], [1.0, 0.0, 0.0]])
+    sky.satellites.write(among, np.array([2, 0]), places, np.array([V0_E_PER_S, V0_E_PER_S / 100]))
+    assert among.vectors[[7, 5]].tolist() == places.tolist()
+    assert among.electrons_per_s[[7, 5]].tolist() == [V0_E_PER_S, V0_E_PER_S / 100]
+    assert among.v_mag[[7, 5]] == pytest.approx([0.0, 5.0], abs=1e-12)
+    for untouched in (*range(5), 6, 8):
+        was = 1.0 if untouched < 5 else np.nan
+        assert among.electrons_per_s[untouched] == pytest.approx(was, nan_ok=True)
 
 
 def test_a_satellite_that_meets_the_observer_is_in_the_cone_that_it_flies_into():

@@ -24,6 +24,7 @@ CENTRE_PX = 5
 AIRY_LIMIT = 1e-3
 # sigma, px, and samples a pixel of the rows of the table in docs/where-it-fails.md
 SAMPLES_A_SIGMA = {"1.2": (0.3, 4), "0.9": (0.3, 3), "0.7": (0.7, 1), "0.6": (0.3, 2)}
+WIDE_LIMIT = 3e-4  # of the peak: the table is linear between its places (1e-4 measured)
 CENTROID_LIMIT_PX = 2e-4  # the cut wings' share, of 1e-4, times how unevenly they lie
 
 
@@ -128,6 +129,18 @@ def test_a_sampled_gaussian_is_the_gaussian():
     assert (
         np.abs(wider.stamps(fraction, light, 11) - exactly.stamps(fraction, light, 11)).max() < 2e-4
     )
+
+
+@pytest.mark.parametrize("sigma_px", [1.0, 2.0, 3.0])
+def test_a_wide_blur_spreads_beyond_the_samples_as_a_gaussian_s_does(sigma_px):
+    """The samples reach 3 px to each side, a wide blur six times its sigma: variances add."""
+    narrow = (0.5, 0.8)
+    wider = SampledPsf(sampled(gaussian(*narrow), 5, 3), 5).blurred(sigma_px)
+    exact = GaussianPsf((np.hypot(0.5, sigma_px), np.hypot(0.8, sigma_px)))
+    pixel = np.arange(-12.0, 13.0)
+    x_px, y_px = pixel - 0.3, (pixel - 0.1)[:, None]
+    apart = np.abs(wider.shares(x_px, y_px) - exact.shares(x_px, y_px))
+    assert apart.max() < WIDE_LIMIT * exact.peak_share
 
 
 @pytest.mark.parametrize(

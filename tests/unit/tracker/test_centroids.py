@@ -165,6 +165,37 @@ def test_a_star_as_wide_as_the_window_has_no_width():
     assert np.isnan(star_widths(flat, 0.0, np.array([20.0]), np.array([20.0])))
 
 
+@pytest.mark.parametrize("is_down", [False, True])
+def test_a_gaussian_window_that_leaves_along_one_axis_leaves_the_blob_s_own_place(is_down):
+    """Beside a star 30 times as bright, 3 px off, the window (2 px) has its moment at 3 s / (1 + s)
+    = 2.72 px, s = 30 exp(-9 / 8), and no slope: a step is ten times that, onto the third star.
+    """
+    image = np.zeros((60, 60))
+    places = np.array([[20, 18], [23, 18], [47, 18]])
+    image[18, places[:, 0]] = 30.0, 900.0, 27000.0
+    if is_down:
+        image = image.T
+        places = places[:, ::-1]
+    found = find_stars(image, CentroidSettings(window_sigma_px=2.0), BACKGROUND)
+    order = np.argsort(found.peak)
+    at_px = np.column_stack([found.x_px, found.y_px])[order]
+    assert at_px[0] == pytest.approx(places[0], abs=SAME_PX)
+    assert at_px[2] == pytest.approx(places[2], abs=SAME_PX)
+
+
+@pytest.mark.parametrize("dark_px", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_a_window_without_light_leaves_the_blob_s_own_place(dark_px):
+    """A pixel beside the star takes more than the star gives: the window (2 px) sums to 30 - 100
+    exp(-1 / 8) = -58, and a step by that would be 2.4 px towards the dark, within the window.
+    """
+    image = np.zeros((SIZE_PX, SIZE_PX))
+    right, down = dark_px
+    image[18, 20] = 30.0
+    image[18 + down, 20 + right] = -100.0
+    found = find_stars(image, CentroidSettings(window_sigma_px=2.0, iterations=1), BACKGROUND)
+    assert (found.x_px[0], found.y_px[0]) == pytest.approx((20, 18), abs=SAME_PX)
+
+
 def test_the_noisier_parts_of_a_wide_image_are_those_of_the_same_image_on_its_side(rng):
     """Glow over a tenth of its columns: as noisy as it is, whichever way its blocks lie."""
     image = np.full((96, 960), 100, dtype=np.uint16)

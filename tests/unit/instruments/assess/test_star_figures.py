@@ -188,3 +188,15 @@ def test_detection_is_drawn_in_the_middles_of_twelve_bins_from_the_brightest_sta
     assert drawn[0, 2:] == pytest.approx([1 - low, high - 1])
     low, high = clopper_pearson(0, 4, 0.975)
     assert drawn[-2, 2:] == pytest.approx([0 - low, high])
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_map_over_the_whole_of_a_detector_is_no_noise_of_its_stars(axis, rng):
+    """A cube of the place along an axis, up to a pixel at its ends, beside planted noise."""
+    places_px = places_in(1600, rng)
+    ends = (2 * places_px[axis] + 1) / SIZE_PX[axis] - 1
+    offsets_px = NOISE_PX * rng.standard_normal(places_px.shape) + ends**3
+    stars = table(np.arange(1600) // 40, places_px, offsets_px)
+    figure = star_figure("star-noise", stars, SIZE_PX, CONFIDENCE, rng)
+    assert figure.value == pytest.approx(NOISE_PX, rel=SIGMA_WITHIN)
+    assert figure.low < figure.value < figure.high

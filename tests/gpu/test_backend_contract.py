@@ -170,6 +170,23 @@ def test_a_sequence_that_begins_anew_is_that_of_a_new_backend(make):
     backend.close()
 
 
+@pytest.mark.parametrize("make", [NumpyBackend, Renderer])
+def test_each_frame_of_exact_stands_by_itself(make):
+    """Whatever errors the frames before it left, it is that of a new backend."""
+    target = Target(SIZE, PSF, srgb_response(5), WHITE, "exact")
+    light = sprites_at(PLACES_PX, RATES, PSF.footprint_px)
+    brighter = sprites_at(PLACES_PX, 1.013 * RATES, PSF.footprint_px)
+    new = make(target)
+    new.draw(light)
+    wanted = new.levels().copy()
+    new.close()
+    backend = make(target)
+    for number, before in enumerate((brighter, light, light)):
+        backend.draw(before, number)
+    assert (backend.levels() == wanted).all()
+    backend.close()
+
+
 def test_extended_light_of_another_frame_is_dithered_by_that_frame_s_turn(rng):
     """A glow that stands still under stars: a frame that begins anew is that of a new backend,
     whatever was drawn before it.

@@ -374,4 +374,4 @@ def test_a_glass_of_so_many_components_has_no_more_and_the_nearest_light_of_thos
     images = whole.reshape(-1, whole[0, 0].size)
     kept = np.tensordot(few.optics.weights, few.optics.basis, axes=1).reshape(images.shape)
     sizes = np.linalg.svd(images - images.mean(axis=0), compute_uv=False)
-    assert np.sum((images - kept) ** 2) == pytest.approx(np.sum(sizes[2:] ** 2), rel=0.01)
+    assert np.sum((images - kept) ** 2) == pytest.approx(np.sum(sizes[2:] ** 2), rel=1e-6)

@@ -375,3 +375,18 @@ def test_a_glass_of_so_many_components_has_no_more_and_the_nearest_light_of_thos
     kept = np.tensordot(few.optics.weights, few.optics.basis, axes=1).reshape(images.shape)
     sizes = np.linalg.svd(images - images.mean(axis=0), compute_uv=False)
     assert np.sum((images - kept) ** 2) == pytest.approx(np.sum(sizes[2:] ** 2), rel=1e-6)
+
+
+@pytest.mark.parametrize(("points", "is_quadratic"), [(8, False), (9, True)])
+def test_a_quadratic_over_the_field_wants_four_tenths_more_points_than_it_has_terms(
+    rng, points, is_quadratic
+):
+    """Of six terms: 8.4 points that are no grid. A straight slope wants its three terms alone."""
+    places_px = rng.uniform(0.0, 100.0, (points, 2))
+    field = Field(places_px)
+    at_px = places_px.mean(axis=0) + rng.uniform(-5.0, 5.0, (4, 2))
+    weights = field(*at_px.T)
+    slope = places_px @ [0.3, -0.7]
+    assert weights @ slope == pytest.approx(at_px @ [0.3, -0.7], rel=1e-6)
+    off_px = np.abs(weights @ places_px[:, 0] ** 2 - at_px[:, 0] ** 2).max()
+    assert (off_px < 1e-6) == is_quadratic

@@ -160,14 +160,47 @@ def test_a_sequence_that_begins_anew_is_that_of_a_new_backend(make):
     carried_on = levels(backend, [4, 5, 6])
     assert any((mine != other).any() for mine, other in zip(carried_on, new, strict=True))
     assert (levels(backend, [6])[0] == new[0]).all()  # the last number does not rise, either
-    for begin_anew in (lambda: None, backend.begin_anew, backend.forget_images):
+    again = levels(backend, [4, 5, 6])  # 4 is below the last number
+    assert all((mine == other).all() for mine, other in zip(again, new, strict=True))
+    for begin_anew in (backend.begin_anew, backend.forget_images):
+        levels(backend, [2, 3])
         begin_anew()
-        again = levels(backend, [4, 5, 6])  # 4 is below the last number
+        again = levels(backend, [4, 5, 6])
         assert all((mine == other).all() for mine, other in zip(again, new, strict=True))
-        if begin_anew == backend.begin_anew:
-            levels(backend, [7])
-            backend.begin_anew()
     backend.close()
+
+
+@pytest.mark.parametrize("make", [NumpyBackend, Renderer])
+def test_each_frame_of_exact_stands_by_itself(make):
+    """Whatever errors the frames before it left, it is that of a new backend."""
+    target = Target(SIZE, PSF, srgb_response(5), WHITE, "exact")
+    light = sprites_at(PLACES_PX, RATES, PSF.footprint_px)
+    brighter = sprites_at(PLACES_PX, 1.013 * RATES, PSF.footprint_px)
+    new = make(target)
+    new.draw(light)
+    wanted = new.levels().copy()
+    new.close()
+    backend = make(target)
+    for number, before in enumerate((brighter, light, light)):
+        backend.draw(before, number)
+    assert (backend.levels() == wanted).all()
+    backend.close()
+
+
+def test_extended_light_of_another_frame_is_dithered_by_that_frame_s_turn(rng):
+    """A glow that stands still under stars: a frame that begins anew is that of a new backend,
+    whatever was drawn before it.
+    """
+    light, _ = scene(rng)
+    target = Target(SIZE, PSF, srgb_response(5), WHITE, "temporal")
+    with Renderer(target) as backend:
+        backend.draw(light, 0)
+        backend.begin_anew()
+        backend.draw(light, 5)
+        drawn = backend.levels().copy()
+    with Renderer(target) as new:
+        new.draw(light, 5)
+        assert (drawn == new.levels()).all()
 
 
 @pytest.mark.parametrize("make", BACKENDS)

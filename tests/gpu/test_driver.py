@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from hilstar.display.render.driver import (
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
 from hilstar.display.response import gamma_response
+from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf
 from tests.support.stars import random_sprites
 
@@ -77,6 +79,23 @@ def test_a_frame_after_the_images_were_lost_is_as_if_nothing_had_been_drawn(quan
         assert (renderer.levels() == 7).any()  # images are kept from frame to frame
         renderer.forget_images()
         renderer.draw(few)
+        assert (renderer.levels() == wanted).all()
+
+
+def test_levels_of_extended_light_that_were_lost_are_drawn_again(rng):
+    """`exact` keeps them under the stars for as long as the light is the same."""
+    psf = GaussianPsf(SIGMA)
+    glow = LightMap(rng.uniform(1e4, 5e4, (20, 30)).astype(np.float32), (25, 8), 1.0)
+    light = replace(random_sprites(3, rng, SIZE, psf.footprint_px, (4, 6)), extended=(glow,))
+    with Renderer(Target(SIZE, psf, gamma_response(8), WHITE, "exact")) as renderer:
+        renderer.draw(light)
+        wanted = renderer.levels().copy()
+        with renderer.context:
+            renderer._floor_levels.write(np.full(SIZE[::-1], 7, np.uint8))
+        renderer.draw(light, 1)
+        assert (renderer.levels() != wanted).any()
+        renderer.forget_images()
+        renderer.draw(light)
         assert (renderer.levels() == wanted).all()
 
 

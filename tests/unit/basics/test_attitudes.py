@@ -109,3 +109,10 @@ def test_columns_more_are_of_the_rows_that_have_them():
 def test_a_rate_that_is_not_finite_is_refused(rate):
     line = refusal(rate_of, rate)
     assert line.startswith("rate_cam_rad_s [") and "]: is not finite; write three numbers" in line
+
+
+@pytest.mark.parametrize("number", [np.inf, -np.inf, np.nan])
+@pytest.mark.parametrize("scalar_of", [angle_deg_of, seconds_of, share_of])
+def test_a_number_that_is_not_finite_is_refused(scalar_of, number):
+    line = refusal(scalar_of, number, "roll")
+    assert line.startswith(f"roll {number!r}") and "write a number" in line

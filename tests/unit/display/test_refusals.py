@@ -127,6 +127,19 @@ def test_a_sample_under_a_fiftieth_of_the_brightest_is_black(tmp_path, light, co
         assert len(read_ccss(tmp_path / "panel.ccss")) == 3
 
 
+@pytest.mark.parametrize(("red", "is_third"), [(0.003, False), (0.005, True)])
+def test_a_mixture_of_two_is_no_third_primary(tmp_path, red, is_third):
+    """Blue and green stand at 82 degrees; a mixture of theirs leaves their plane by red / 4.1, and a
+    volume of 0.03 squared, 0.0009, is that of no three colours.
+    """
+    blue, green, _ = COLOURS
+    (tmp_path / "panel.ccss").write_text(ccss([blue, green, [red, 2.0, 2.0, 3.0]]))
+    if is_third:
+        assert len(read_ccss(tmp_path / "panel.ccss")) == 3
+    else:
+        assert_file_refused(read_ccss, tmp_path / "panel.ccss", ": no three of its 3 samples are")
+
+
 @pytest.mark.parametrize(("times", "is_sum"), [(1.1, True), (1.2, False)])
 def test_white_has_no_more_light_than_its_primaries_and_a_seventh(tmp_path, times, is_sum):
     """A screen that dims with what it shows has less; a white subpixel adds to it."""

@@ -438,3 +438,18 @@ def test_a_server_s_release_is_three_numbers(monkeypatch):
     assert closed == [7]
     library.XOpenDisplay = lambda name: None
     assert x11.server_of() == ""
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_an_extension_is_there_as_the_server_says_and_nowhere_without_one(monkeypatch, is_there):
+    asked: list[tuple[int, bytes]] = []
+
+    def query(display, name, opcode, event, error):
+        asked.append((display, name))
+        return int(is_there)
+
+    monkeypatch.setattr(x11, "xlib", lambda: SimpleNamespace(XQueryExtension=query))
+    assert not x11.has_extension(None, b"Present")
+    assert not asked
+    assert x11.has_extension(7, b"Present") is is_there
+    assert asked == [(7, b"Present")]

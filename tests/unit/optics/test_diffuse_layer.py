@@ -80,3 +80,12 @@ def test_a_pixel_that_two_faces_hold_is_one_s_alone():
     assert second.own.tolist() == (~first_holds).tolist()
     assert taken[3:5, 2:5].all()
     assert taken.sum() == 1 + 6
+
+
+@pytest.mark.parametrize("way", [(1, 0), (0, 1), (-1, 0), (0, -1)])
+def test_a_face_holds_what_is_within_45_degrees_on_all_four_sides(way):
+    """A face of 10 px a tangent about pixel 12, with two more around its edge."""
+    face = _Face(TangentImage(np.ones((25, 25), np.float32), np.eye(3), 10.0, 1.0), PX_RAD, 0.5)
+    off_px = np.array([0.0, 9.0, 10.0, 11.0, 12.0])
+    x_px, y_px = 12.0 + np.outer(way, off_px).astype(np.float32)
+    assert face.holds(x_px, y_px).tolist() == [True, True, True, False, False]

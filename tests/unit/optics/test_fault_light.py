@@ -219,6 +219,28 @@ def test_a_point_that_is_given_by_a_star_is_where_that_star_is_or_refused():
     assert said.startswith("electrons: [tracker] exposure_s is 0")
 
 
+@pytest.mark.parametrize(
+    "table",
+    [{"kind": "star-gone"}, {"kind": "flash", "electrons": 1, "for_s": 0.1}],
+    ids=["gone", "flash"],
+)
+@pytest.mark.parametrize(
+    ("known", "unknown", "words"),
+    [
+        ({"hip": 2}, {"hip": 9}, "hip = 9: not among the 4 stars and bodies"),
+        ({"star": "Moon"}, {"star": "Mars"}, 'star = "Mars": not among the 4 stars and bodies'),
+    ],
+    ids=["hip", "star"],
+)
+def test_a_fault_of_a_star_that_is_not_there_is_refused_before_it_begins(
+    table, known, unknown, words
+):
+    view = view_of()
+    named = table | {"name": "x"}
+    assert view.prepare(fault_of(named | known))
+    assert words in refusal(view.prepare, fault_of(named | unknown))
+
+
 def test_each_sprite_of_faults_is_of_the_light_whose_name_it_has():
     """Two tracks, and two false stars that stand on the sky."""
     view = view_of()

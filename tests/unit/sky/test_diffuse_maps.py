@@ -180,9 +180,26 @@ def test_a_picture_s_image_has_room_for_its_corners_and_is_as_fine_as_what_is_ke
     reach_rad = np.arctan(np.hypot(*shape) / 2 * np.radians(step_deg))
     side = len(image.image)
     assert image.px_per_tangent == pytest.approx(1 / kept_rad, rel=0.05)
-    assert side / 2 / image.px_per_tangent >= np.tan(reach_rad)
+    # Between the outermost pixels of the image and the corner's there is always a neighbour.
+    assert side / 2 / image.px_per_tangent >= np.tan(reach_rad) + 0.99 * kept_rad
     flux = image.image.sum() * V0_W_M2_UM / image.px_per_tangent**2
     assert flux == pytest.approx(2.0 * np.prod(shape) * np.radians(step_deg) ** 2, rel=0.01)
     edges = np.concatenate([image.image[[0, -1]].ravel(), image.image[:, [0, -1]].ravel()])
     assert edges.max() < 1.1 / V0_W_M2_UM  # a half at most, where the picture's own edge lies
     assert image.max_tangent == np.inf
+
+
+def test_a_picture_with_a_part_off_the_sky_is_of_a_cube(tmp_path):
+    """A tile at the rim of a whole sky in Aitoff's projection, whose ellipse is 162 by 81 degrees
+    about its middle: of its corners some show no direction. Only the face opposite has its light.
+    """
+    header = fits.Header()
+    header.update({"CTYPE1": "RA---AIT", "CTYPE2": "DEC--AIT", "CRVAL1": 0.0, "CRVAL2": 0.0})
+    header.update({"CRPIX1": -75.0, "CRPIX2": 5.5, "CDELT1": -2.0, "CDELT2": 2.0})
+    header.update({"CUNIT1": "deg", "CUNIT2": "deg", "BUNIT": "W/(m2 um sr)"})
+    path = tmp_path / "rim.fits"
+    fits.PrimaryHDU(np.ones((10, 8)), header).writeto(path)
+    (face,) = read_diffuse_map(path)
+    assert face.max_tangent == 1.0
+    np.testing.assert_allclose(face.axes[2], [-1.0, 0.0, 0.0], atol=1e-12)
+    assert (face.image > 0).any()

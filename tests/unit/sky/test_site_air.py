@@ -9,7 +9,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.sky.air import AIR_MASSES, SiteAir, air_mass, glow_e_per_s_arcsec2, through_air
+from hilstar.sky.air import (
+    AIR_MASSES,
+    SiteAir,
+    air_mass,
+    glow_e_per_s_arcsec2,
+    standard_pressure_hpa,
+    through_air,
+)
 from hilstar.sky.bodies.orbit import Geocentre
 from hilstar.sky.bodies.passes import Cone
 from hilstar.sky.electrons import Optics, Photometry, Weighting
@@ -202,3 +209,19 @@ def test_a_satellite_is_seen_through_the_air_and_not_through_the_ground(altitude
         masses = 1 / np.sin(np.radians(altitude_deg + 244 / (165 + 47 * altitude_deg**1.1)))
         wanted_mag = 0.2 * masses
         assert -2.5 * np.log10(through / bare[brightest]) == pytest.approx(wanted_mag, rel=0.02)
+
+
+# U.S. Standard Atmosphere 1976, table IV: geopotential height, m, and pressure, hPa.
+STANDARD = ((0.0, 1013.25), (1000.0, 898.745), (3000.0, 701.085), (5000.0, 540.199))
+
+
+@pytest.mark.parametrize(("height_m", "pressure_hpa"), STANDARD)
+def test_the_pressure_of_a_height_is_the_standard_atmosphere_s(height_m, pressure_hpa):
+    assert standard_pressure_hpa(height_m) == pytest.approx(pressure_hpa, rel=1e-4)
+
+
+def test_the_pressure_falls_with_height_and_never_to_nothing():
+    """The law of the lowest 11 km, which balloons leave, ends at 44 km."""
+    pressures_hpa = [standard_pressure_hpa(height_m) for height_m in range(-400, 43_000, 600)]
+    assert (np.diff(pressures_hpa) < 0).all()
+    assert 0 < standard_pressure_hpa(1e5) < pressures_hpa[-1]

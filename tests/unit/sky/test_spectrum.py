@@ -6,11 +6,13 @@ import re
 
 import numpy as np
 import pytest
+from numpy.polynomial import Chebyshev
 
 from hilstar.basics.reading import warn_once
 from hilstar.sky.electrons import (
     Optics,
     Photometry,
+    RateTable,
     band_mean,
     library_electrons_per_s,
     load_library,
@@ -339,3 +341,12 @@ def test_dust_dims_each_wavelength_as_fitzpatrick_s_table_has_it():
     relative = dimmed_mag[:, 1:] - dimmed_mag[:, :1]
     wanted = np.array([mag for _, mag in table])
     assert np.abs(relative - (wanted[1:] - wanted[0])).max() < 0.01
+
+
+def test_a_table_s_rate_is_that_of_v_0_and_a_hundredth_of_it_five_magnitudes_on():
+    """Pogson's law; the table is of ln rate by 1 / K, here 1e6 e-/s at 5000 K and 1e4 at 10 000 K."""
+    inverse_k = np.array([1 / 10_000, 1 / 5000])
+    table = RateTable(Chebyshev.fit(inverse_k, np.log([1e4, 1e6]), 1, domain=inverse_k))
+    temperature_k = np.array([5000.0, 10_000.0, 5000.0])
+    rates = table.electrons_per_s(np.array([0.0, 5.0, -2.5]), temperature_k)
+    assert rates == pytest.approx([1e6, 1e2, 1e7], rel=1e-12)

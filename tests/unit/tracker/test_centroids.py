@@ -146,6 +146,24 @@ def test_a_plain_window_that_walks_off_leaves_the_blob_s_own_place(aside_px):
     assert at_px[1:] == pytest.approx(places[[2, 2]], abs=0.2)
 
 
+@pytest.mark.parametrize("way", [(1, 0), (0, 1), (-1, 0), (0, -1)])
+@pytest.mark.parametrize(("gap_px", "times"), [(3, 3.0), (4, 10.0)])
+def test_a_gaussian_window_that_walks_off_leaves_the_blob_s_own_place(way, gap_px, times):
+    """Along one axis: of four stars, each brighter than the one before, each is where it is, though
+    steps of the first two would end on the last. That one's own window has a neighbour's light,
+    which draws its middle by 0.16 px at most.
+    """
+    image = np.zeros((SIZE_PX, SIZE_PX))
+    places = np.array([20, 18]) + np.outer(np.arange(4) * gap_px, way)
+    for k, (x, y) in enumerate(places):
+        image[y, x] = 30.0 * times**k
+    settings = CentroidSettings(window_sigma_px=1.5, window_radius_px=5)
+    found = find_stars(image, settings, BACKGROUND)
+    order = np.argsort(found.peak)
+    at_px = np.column_stack([found.x_px, found.y_px])[order]
+    assert at_px == pytest.approx(places, abs=0.2)
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.float64])
 def test_the_level_of_an_even_count_of_pixels_is_the_mean_of_the_middle_two(dtype):
     image = np.repeat(np.array([[10], [20]], dtype), 4, axis=1)

@@ -279,3 +279,37 @@ def test_a_spot_without_light_counts_for_nothing_and_turns_nothing(sky, rng, flu
     known = identify(found, q, seen.near, seen.place)
     assert known is not None
     assert angle_between_rad(known.q_icrs_to_cam, q) < LIMIT_RAD
+
+
+def test_a_third_that_is_false_does_not_tell_how_they_all_moved():
+    """44 of 64 are 5 px off where they are expected; 20 are other stars, 6 px off the other way.
+    Their mean, of -1.6 px, is over the second radius from both.
+    """
+    x, y, known = grid()
+    is_other = np.arange(64) % 3 == 1
+    is_other[61] = False
+    assert is_other.sum() == 20
+    x = x + np.where(is_other, 6.0, -5.0)
+    found = FoundStars(x, y, np.full(64, 1e4), rays_of(x, y))
+    identified = identify(found, LEVEL, lambda q: (np.arange(64), known), place_px)
+    assert identified is not None
+    assert list(identified.star) == np.flatnonzero(~is_other).tolist()
+
+
+@pytest.mark.parametrize(("number", "off_px", "is_left_out"), [(28, 0.75, False), (27, 0.45, True)])
+def test_a_star_is_left_out_by_what_its_own_noise_allows(number, off_px, is_left_out):
+    """Half are bright and 0.1 px off; half are faint, with twice that noise, and 0.2 px off. A
+    faint one may be 0.8 px off, four times that, and a bright one 0.4 px.
+    """
+    x, y, known = grid()
+    way = np.arange(64) // 2 + np.arange(64) // 8  # of both kinds in four directions
+    is_faint = np.arange(64) % 2 == 0
+    step_px = np.where(is_faint, 0.2, 0.1)
+    step_px[number] = off_px
+    step = np.array([[1, 0], [0, 1], [-1, 0], [0, -1]])[way % 4] * step_px[:, None]
+    x, y = x + step[:, 0], y + step[:, 1]
+    flux_e = np.where(is_faint, 0.4 / (3 * 0.02**2), 1e15)
+    found = FoundStars(x, y, flux_e, rays_of(x, y))
+    identified = identify(found, LEVEL, lambda q: (np.arange(64), known), place_px)
+    assert (number not in identified.star) == is_left_out
+    assert len(identified.star) == 64 - is_left_out

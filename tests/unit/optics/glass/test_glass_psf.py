@@ -360,9 +360,33 @@ def test_one_field_point_of_two_colours_has_simpler_glasses_and_one_psf_has_none
     assert [name for name, _ in glass_psf(alone, 0.0, np.ones(1)).simpler()] == [ONE_PSF]
 
 
-def test_a_glass_of_so_many_components_has_no_more(glass):
-    """The mean is one of them; each PSF still has all of its light."""
-    few = with_components(glass_psf(glass, 0.0, MEAN), 3)
+def test_a_glass_of_so_many_components_has_no_more_and_the_nearest_light_of_those(glass):
+    """The mean is one of them; each PSF still has all of its light. Of the PSFs' departures from
+    their mean, two images more leave the squares of all singular values but two (Eckart and Young
+    1936).
+    """
+    psf = glass_psf(glass, 0.0, MEAN)
+    few = with_components(psf, 3)
     assert few.components == 3
     light = few.optics.weights @ few.optics.basis.sum(axis=(1, 2))
     assert light == pytest.approx(1, abs=1e-9)
+    whole = np.tensordot(psf.optics.weights, psf.optics.basis, axes=1)
+    images = whole.reshape(-1, whole[0, 0].size)
+    kept = np.tensordot(few.optics.weights, few.optics.basis, axes=1).reshape(images.shape)
+    sizes = np.linalg.svd(images - images.mean(axis=0), compute_uv=False)
+    assert np.sum((images - kept) ** 2) == pytest.approx(np.sum(sizes[2:] ** 2), rel=1e-6)
+
+
+@pytest.mark.parametrize(("points", "is_quadratic"), [(8, False), (9, True)])
+def test_a_quadratic_over_the_field_wants_four_tenths_more_points_than_it_has_terms(
+    rng, points, is_quadratic
+):
+    """Of six terms: 8.4 points that are no grid. A straight slope wants its three terms alone."""
+    places_px = rng.uniform(0.0, 100.0, (points, 2))
+    field = Field(places_px)
+    at_px = places_px.mean(axis=0) + rng.uniform(-5.0, 5.0, (4, 2))
+    weights = field(*at_px.T)
+    slope = places_px @ [0.3, -0.7]
+    assert weights @ slope == pytest.approx(at_px @ [0.3, -0.7], rel=1e-6)
+    off_px = np.abs(weights @ places_px[:, 0] ** 2 - at_px[:, 0] ** 2).max()
+    assert (off_px < 1e-6) == is_quadratic

@@ -199,6 +199,9 @@ def test_a_display_s_own_modes_are_what_is_proposed(tmp_path):
     config = beating_config(tmp_path, {"exposure_s": 0.04})  # 2.4 refreshes
     assert beat_of(config, modes_hz=(60, 24, 50, 75, 100)).proposal.refresh_hz == 50
     assert beat_of(config, modes_hz=(60, 59)).proposal.refresh_hz is None
+    # the nearest, neither the slowest nor the fastest
+    config = beating_config(tmp_path, {"exposure_s": 0.125})  # 7.5 refreshes
+    assert beat_of(config, modes_hz=(96, 48, 64)).proposal.refresh_hz == 64
 
 
 def test_a_panel_that_flashes_wants_a_trigger(tmp_path):

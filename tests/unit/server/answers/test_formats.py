@@ -422,6 +422,23 @@ def test_an_answer_s_bytes_are_explained_field_by_field():
     assert len(lines) == 8 + 4  # and a line for each convention
 
 
+def test_a_frame_whose_scalar_is_last_has_other_names_of_its_fields_and_no_scalar_last():
+    """`[answers]` refuses scalar = "last" of a frame, so it is not what to write there."""
+    fields = [
+        {"name": name, "at": 4 * k, "type": "i32be", "scale": SCALE}
+        for k, name in enumerate(Q_NAMES)
+    ]
+    decoder = decoder_of(messages=True, framing="fixed", length=16, fields=fields)
+    last = np.roll(Q, -1)
+    (found,) = decoder.feed(0, struct.pack(">4i", *(round(part / SCALE) for part in last)))
+    *_, convention, fields_line = lines_of(found, decoder, Q)
+    assert convention == (
+        '  write [answers] convention = { scalar = "first", direction = "icrs_to_cam", frame ='
+        ' "cam" }'
+    )
+    assert fields_line.endswith("in the order in which they now are qw, qx, qy, qz")
+
+
 @pytest.mark.parametrize(("off_deg", "matching"), [(0.05, 1), (0.2, 0)])
 def test_a_convention_is_told_only_where_no_other_is_nearly_as_near(off_deg, matching):
     """A degree from the axes the camera's and the sky's quaternion are two degrees apart."""

@@ -375,6 +375,20 @@ def test_each_column_of_the_catalogue_s_own_figures_has_its_own(catalogue_bench)
         np.testing.assert_allclose(found[known], wanted[known], atol=ROUNDED)
 
 
+def test_a_right_ascension_that_rounds_up_to_the_full_circle_is_0(tmp_path):
+    rows = [
+        "ra,dec,pmra,pmdec,Vmag,B-V",
+        "359.9999999999,10.0,0,0,1.0,0.5",
+        "0.25,-5.5,0,0,2.0,0.5",
+    ]
+    (tmp_path / "own.csv").write_text("\n".join(rows))
+    sky = {"catalogue": "own.csv", "catalogue_epoch_jyear": 1991.25}
+    (tmp_path / "bench.toml").write_text(bench_text({"sky": sky}))
+    own = bench_catalogue(read_bench_file(tmp_path / "bench.toml"), None, 1991.25)
+    assert own.columns["ra_deg"].values.tolist() == [0.0, 0.25]
+    assert own.columns["dec_deg"].values.tolist() == [10.0, -5.5]
+
+
 def test_a_brighter_limit_is_the_command_s_and_the_file_s_where_it_gives_none(tmp_path):
     path = tmp_path / "bench.toml"
     path.write_text(bench_text({"sky": {"faintest_v_mag": 1.25, "epoch_jyear": 2010.0}}))

@@ -69,6 +69,15 @@ def test_a_record_that_is_too_long_is_cut_at_its_slot_s_end():
     assert list(records.after(0)) == [(1, bytes(range(SLOT_BYTES))), (2, b"next")]
 
 
+def test_a_writer_of_a_memory_with_records_goes_on_with_their_numbers():
+    memory = memoryview(bytearray(Ring.size(SLOTS, SLOT_BYTES)))
+    first = Ring(memory, SLOTS, SLOT_BYTES)
+    for k in range(1, 7):
+        first.put(b"%d" % k)
+    Ring(memory, SLOTS, SLOT_BYTES).put(b"new")
+    assert list(first.after(0)) == [(5, b"5"), (6, b"6"), (7, b"new")]
+
+
 class OvertakenMemory(bytearray):
     """A memory whose writer takes the slot anew while a reader copies its bytes."""
 

@@ -26,7 +26,7 @@ from hilstar.basics.rotation import (
     multiply,
 )
 from hilstar.server.answers.answer import Answer
-from hilstar.server.answers.explain import byte_lines, lines_of, under_conventions
+from hilstar.server.answers.explain import byte_lines, hex_line, lines_of, under_conventions
 from hilstar.server.answers.formats import (
     MAX_KEPT_BYTES,
     AnswerDecoder,
@@ -448,6 +448,11 @@ def test_a_frame_whose_scalar_is_last_has_other_names_of_its_fields_and_no_scala
         ' "cam" }'
     )
     assert fields_line.endswith("in the order in which they now are qw, qx, qy, qz")
+
+
+def test_a_long_answer_s_first_96_bytes_are_shown_with_how_many_there_are():
+    assert hex_line(b"\xa5" * 96) == " ".join(["a5"] * 96)
+    assert hex_line(b"\xa5" * 97) == " ".join(["a5"] * 96) + " ... (97 bytes)"
 
 
 @pytest.mark.parametrize(("at", "span"), [(0, "  0 to   1"), (6, "  6 to   7"), (-2, " 10 to  11")])

@@ -11,7 +11,14 @@ from hilstar.display.render.backend import as_maps
 from hilstar.display.render.target import Target
 from hilstar.optics.psf import GaussianPsf, SampledPsf
 from hilstar.optics.sprites import pack_sprites
-from hilstar.server.bench.least_psf import ONE_PSF, WHOLE, candidates, psf_errors
+from hilstar.server.bench.least_psf import (
+    ONE_PSF,
+    WHOLE,
+    Choice,
+    candidates,
+    first_within,
+    psf_errors,
+)
 from tests.support.psfs import gaussian, sampled
 
 SIDE_PX = 64
@@ -131,3 +138,32 @@ def test_a_psf_of_another_width_is_off_by_the_light_in_a_window_as_wide_as_the_s
     found = psf_errors(gaussian_samples(0.9, 1.5), gaussian_samples(*other), PLACES_PX)
     assert found.mag == pytest.approx(2.5 / np.log(10) * (1 - share), abs=CLOSE_MAG)
     assert found.px < CLOSE_PX
+
+
+@pytest.mark.parametrize(
+    ("errors", "chosen"),
+    [
+        ([(0.02, 0.05), (0.005, 0.2), (0.01, 0.1), (0.0, 0.0)], 2),
+        ([(0.011, 0.0), (0.0, 0.11)], 1),  # the last where none is within it
+        ([(0.02, 0.2), None, (0.0, 0.0)], 1),  # the bench's own has no errors
+    ],
+)
+def test_the_first_psf_within_both_tolerances_is_chosen(errors, chosen):
+    every = []
+    for k, error in enumerate(errors):
+        choice = None if error is None else Choice("PSF", str(k), *error)
+        every.append((GaussianPsf((1.0 + k, 1.0)), choice))
+    assert first_within(iter(every), (0.01, 0.1)) == every[chosen]
+
+
+@pytest.mark.parametrize(
+    ("errors", "note", "told"),
+    [
+        ((0.0, 0.0), "", "exact"),
+        ((0.0, 0.021), "", "0 mag and 0.021 px off at most"),
+        ((0.0123, 0.0), "", "0.012 mag and 0 px off at most"),
+        ((0.004, 0.25), "as asked", "0.004 mag and 0.25 px off at most; as asked"),
+    ],
+)
+def test_a_choice_s_line_has_each_of_its_errors(errors, note, told):
+    assert Choice("PSF", "a Gaussian", *errors, note=note).line() == f"PSF: a Gaussian; {told}"

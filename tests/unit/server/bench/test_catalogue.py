@@ -370,6 +370,7 @@ def test_each_column_of_the_catalogue_s_own_figures_has_its_own(catalogue_bench)
     ):
         found = own.columns[column].values
         assert np.isfinite(found[is_sure]).all()
+        assert not np.isfinite(found[parallax < 5 * own.columns["sigma_parallax_mas"].values]).any()
         known = np.isfinite(found)
         wanted = own.columns[apparent].values - modulus
         np.testing.assert_allclose(found[known], wanted[known], atol=ROUNDED)

@@ -123,6 +123,15 @@ def test_the_error_of_an_instrument_magnitude_is_that_of_small_steps(catalogue_b
     assert sigma_instrument_mag(stars, facts, rates, kind)[known] == pytest.approx(
         np.sqrt(variance[known]), rel=DIFFERENCE_LIMIT, abs=1e-4
     )
+    # an unknown error is unknown wherever its colour acts
+    for name, changed in (
+        ("sigma_bv_mag", (bv + STEP_MAG, vi)),
+        ("sigma_vi_mag", (bv, vi + STEP_MAG)),
+    ):
+        unknown = facts | {name: np.full(len(stars), np.nan)}
+        acts = rates(v, *changed, kind) != base
+        found = sigma_instrument_mag(stars, unknown, rates, kind)
+        assert np.isnan(found[acts & known]).all()
 
 
 @pytest.mark.parametrize("ending", ["csv", "fits", "vot", "parquet"])

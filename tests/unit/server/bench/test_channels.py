@@ -15,6 +15,7 @@ from scipy.integrate import trapezoid
 
 from hilstar import load
 from hilstar.basics.errors import InputError
+from hilstar.basics.reading import warn_once
 from hilstar.basics.rotation import direction_of, from_radec_roll_deg
 from hilstar.display.render.backend import linear_light
 from hilstar.instruments.compare import compare
@@ -67,6 +68,26 @@ def bench_with(curves, channels, *changes):
 def light_of(curves, channels, *changes):
     with bench_with(curves, channels, *changes) as bench:
         return bench.frame(ORION_Q)
+
+
+@pytest.mark.parametrize(
+    ("middles_nm", "blind"),
+    # passbands of 50 nm to either side; V is from 470 to 700 nm
+    [((850, 900, 400), True), ((850, 900, 515), False), ((760, 500, 400), False)],
+)
+def test_a_tracker_is_told_to_see_no_v_where_none_of_its_channels_does(
+    tmp_path, caplog, middles_nm, blind
+):
+    warn_once.cache_clear()
+    passbands = {}
+    for name, middle_nm in zip("rgb", middles_nm, strict=True):
+        passbands[name] = 0.5 * (np.abs(NM - middle_nm) <= 25)
+    write_channels(tmp_path, NM, passbands)
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"tracker": channel_keys("rgb")}))
+    bench_channels(read_bench_file(path).config.tracker, tmp_path)
+    told = [record.getMessage() for record in caplog.records]
+    assert [("no light of V (470 to 700 nm)" in line) for line in told] == [True] * blind
 
 
 @pytest.mark.gpu

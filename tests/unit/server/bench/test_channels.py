@@ -24,7 +24,8 @@ from hilstar.optics.sprites import AddedLight
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.frame_files import write_frame_fits
 from hilstar.server.bench.star_light import bench_stars
-from hilstar.server.bench.star_rates import bench_channels, bench_optics, star_flux
+from hilstar.server.bench.star_rates import bench_channels, bench_optics, star_flux, star_rates
+from hilstar.sky.electrons import Photometry, reference_mean_w_m2_m
 from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
 from tests.support.claims import holds
@@ -68,6 +69,20 @@ def bench_with(curves, channels, *changes):
 def light_of(curves, channels, *changes):
     with bench_with(curves, channels, *changes) as bench:
         return bench.frame(ORION_Q)
+
+
+@pytest.mark.parametrize("spectrum", ["pickles", "blackbody"])
+def test_a_zero_point_s_share_of_light_is_that_of_all_stars(tmp_path, spectrum):
+    v_mag, bv_mag, vi_mag = np.array([0.0, 4.0]), np.array([0.1, 1.2]), np.array([0.1, 1.1])
+    rates = []
+    for zero in ("iau-bolometric", "vega"):
+        path = tmp_path / "bench.toml"
+        path.write_text(bench_text({"sky": {"spectrum": spectrum, "zero_point": zero}}))
+        of_zero = star_rates(read_bench_file(path).config, tmp_path)
+        rates.append(of_zero(v_mag, bv_mag, vi_mag))
+    thesis, vega = (reference_mean_w_m2_m(Photometry(z)) for z in ("iau-bolometric", "vega"))
+    assert abs(thesis / vega - 1) > 1e-3
+    assert rates[0] / rates[1] == pytest.approx([thesis / vega] * 2, rel=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.frame_files import write_frame_fits
 from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.bench.star_rates import bench_channels, bench_optics, star_flux, star_rates
-from hilstar.sky.electrons import Photometry, reference_mean_w_m2_m
+from hilstar.sky.electrons import Photometry, reference_mean_w_m2_m, star_temperatures_k
 from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
 from tests.support.claims import holds
@@ -83,6 +83,23 @@ def test_a_zero_point_s_share_of_light_is_that_of_all_stars(tmp_path, spectrum):
     thesis, vega = (reference_mean_w_m2_m(Photometry(z)) for z in ("iau-bolometric", "vega"))
     assert abs(thesis / vega - 1) > 1e-3
     assert rates[0] / rates[1] == pytest.approx([thesis / vega] * 2, rel=1e-6)
+
+
+def test_stars_of_one_temperature_have_one_light_by_whichever_scale_their_colour_has_it(tmp_path):
+    """A black body's light is by its temperature alone."""
+    bv_mag = np.linspace(-0.2, 1.5, 18)
+    wanted_k = star_temperatures_k(bv_mag, "wang2021")
+    fine_mag = np.linspace(-0.35, 2.5, 100_001)
+    fine_k = star_temperatures_k(fine_mag, "ballesteros2012")
+    alike_mag = np.interp(-wanted_k, -fine_k, fine_mag)
+    assert np.abs(alike_mag - bv_mag).max() > 0.05
+    rates = []
+    for scale, colours_mag in (("wang2021", bv_mag), ("ballesteros2012", alike_mag)):
+        path = tmp_path / "bench.toml"
+        path.write_text(bench_text({"sky": {"spectrum": "blackbody", "temperature": scale}}))
+        of_scale = star_rates(read_bench_file(path).config, tmp_path)
+        rates.append(of_scale(np.full(18, 3.0), colours_mag, np.full(18, np.nan)))
+    np.testing.assert_allclose(rates[0], rates[1], rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from PIL import Image
 
 from hilstar.basics.rotation import from_radec_roll_deg, propagate
 from tests.support.commands import assert_refused, run_hilstar, run_hilstar_here
+from tests.support.sources.aem_messages import EPOCHS, kvn, rows_of
 from tests.support.tables import csv_rows
 
 RATE = np.radians([0.3, -0.2, 2.0])
@@ -106,6 +107,16 @@ def test_a_speed_or_span_that_gives_no_frame_gets_one_line(small_bench_file, rat
     assert_refused(
         run_hilstar_here("replay", small_bench_file, rated, "--headless", *options), 2, said
     )
+
+
+@pytest.mark.parametrize("system", ["TAI", "UTC"])
+def test_convert_writes_times_on_the_scale_of_its_log(tmp_path, system):
+    (tmp_path / "log.aem").write_text(kvn(rows_of([0, 0, 0, 1], [0, 0, 1, 0]), TIME_SYSTEM=system))
+    done = run_hilstar_here("convert", tmp_path / "log.aem", tmp_path / "out.xml")
+    assert done.returncode == 0, done.stderr
+    written = (tmp_path / "out.xml").read_text()
+    assert f"<TIME_SYSTEM>{system}</TIME_SYSTEM>" in written
+    assert all(epoch in written for epoch in EPOCHS)
 
 
 def test_convert_says_what_it_cannot(tmp_path, rated):

@@ -69,6 +69,27 @@ def test_planets_in_the_truth_table_are_where_skyfield_has_them(bodies_file, at_
             assert np.hypot(*off_deg) * 3600 < PLACE_ARCSEC
 
 
+@pytest.mark.parametrize("at_s", [0, 86_400])
+def test_an_attitude_s_brightest_star_is_a_planet_where_it_is_at_the_log_s_time(
+    bodies_file, tmp_path, at_s
+):
+    q = from_radec_roll_deg(*map(float, JUPITER.split(",")))
+    rows = [f"{t_s},{','.join(map(repr, q.tolist()))}" for t_s in (0, 86_400)]
+    (tmp_path / "log.csv").write_text("\n".join(["t_s,qw,qx,qy,qz", *rows]))
+    options = ("--time", at_s, "--bench", bodies_file, "--json")
+    done = run_hilstar_here("attitude", tmp_path / "log.csv", *options)
+    brightest = json.loads(done.stdout)["stars"][0]
+    assert brightest["name"] == "Jupiter"
+    with skyfield() as (scale, kernel):
+        now = kernel["earth"].at(scale.utc(2026, 11, 21, 0, 0, at_s))
+        ra, dec, _ = now.observe(kernel["jupiter barycenter"]).apparent().radec()
+    off_deg = (
+        (brightest["ra_deg"] - ra._degrees) * np.cos(dec.radians),
+        (brightest["dec_deg"] - dec.degrees),
+    )
+    assert np.hypot(*off_deg) * 3600 < PLACE_ARCSEC
+
+
 def test_wide_bodies_are_said_to_be_discs(bodies_file):
     done = run_hilstar_here(
         "frame", bodies_file, "--radec", MOON, "--codes", bodies_file.parent / "c.png", "--explain"

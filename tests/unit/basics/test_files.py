@@ -199,6 +199,16 @@ def test_a_file_has_one_writer(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
 
 
+def test_a_file_that_is_discarded_leaves_an_older_one_as_it_was(tmp_path):
+    path = tmp_path / "run.mcap"
+    path.write_bytes(b"a run")
+    file = NewFile(path, overwrite=True)
+    os.write(file.fd, b"new")
+    file.discard()
+    assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+    assert path.read_bytes() == b"a run"
+
+
 def test_no_ledger_of_a_run_is_written_over_by_anything_else(tmp_path):
     path = tmp_path / "run.mcap"
     path.write_bytes(b"\x89MCAP0\r\n" + b"..bench_sha256..")

@@ -11,7 +11,14 @@ from hilstar.display.render.backend import as_maps
 from hilstar.display.render.target import Target
 from hilstar.optics.psf import GaussianPsf, SampledPsf
 from hilstar.optics.sprites import pack_sprites
-from hilstar.server.bench.least_psf import ONE_PSF, WHOLE, candidates
+from hilstar.server.bench.least_psf import (
+    ONE_PSF,
+    WHOLE,
+    Choice,
+    candidates,
+    first_within,
+    psf_errors,
+)
 from tests.support.psfs import gaussian, sampled
 
 SIDE_PX = 64
@@ -104,3 +111,59 @@ def test_what_may_stand_for_a_varying_psf_ends_with_itself_by_that_name():
     name, make = list(candidates(psf))[-1]
     assert name == WHOLE
     assert make() is psf
+
+
+# A Gaussian's light in a pixel is nearly that of one a twelfth of a px^2 wider in its middle.
+PIXEL_VARIANCE_PX2 = 1 / 12
+CLOSE_MAG, CLOSE_PX = 2e-3, 2e-3
+PLACES_PX = np.array([[12.3, 40.8], [20.6, 31.2], [7.0, 9.5]])
+
+
+def gaussian_samples(sigma_x, sigma_y, x_px=0.0, y_px=0.0) -> SampledPsf:
+    return SampledPsf(sampled(gaussian(sigma_x, sigma_y, x_px, y_px), 5, 9), 5)
+
+
+@pytest.mark.parametrize("off_px", [(0.03, 0.0), (0.0, -0.04), (-0.03, 0.04)])
+def test_a_psf_beside_its_place_is_off_by_its_distance(off_px):
+    found = psf_errors(gaussian_samples(0.9, 1.5), gaussian_samples(0.9, 1.5, *off_px), PLACES_PX)
+    assert found.px == pytest.approx(np.hypot(*off_px), abs=CLOSE_PX)
+
+
+@pytest.mark.parametrize("other", [(0.9, 1.7), (1.1, 1.5)])
+def test_a_psf_of_another_width_is_off_by_the_light_in_a_window_as_wide_as_the_star(other):
+    """Through it, of a Gaussian of variance v, passes sqrt(w / (w + v)) along each axis."""
+    own = np.square([0.9, 1.5]) + PIXEL_VARIANCE_PX2
+    wider = np.square(other) + PIXEL_VARIANCE_PX2
+    share = np.sqrt((own + own) / (own + wider)).prod()
+    found = psf_errors(gaussian_samples(0.9, 1.5), gaussian_samples(*other), PLACES_PX)
+    assert found.mag == pytest.approx(2.5 / np.log(10) * (1 - share), abs=CLOSE_MAG)
+    assert found.px < CLOSE_PX
+
+
+@pytest.mark.parametrize(
+    ("errors", "chosen"),
+    [
+        ([(0.02, 0.05), (0.005, 0.2), (0.01, 0.1), (0.0, 0.0)], 2),
+        ([(0.011, 0.0), (0.0, 0.11)], 1),  # the last where none is within it
+        ([(0.02, 0.2), None, (0.0, 0.0)], 1),  # the bench's own has no errors
+    ],
+)
+def test_the_first_psf_within_both_tolerances_is_chosen(errors, chosen):
+    every = []
+    for k, error in enumerate(errors):
+        choice = None if error is None else Choice("PSF", str(k), *error)
+        every.append((GaussianPsf((1.0 + k, 1.0)), choice))
+    assert first_within(iter(every), (0.01, 0.1)) == every[chosen]
+
+
+@pytest.mark.parametrize(
+    ("errors", "note", "told"),
+    [
+        ((0.0, 0.0), "", "exact"),
+        ((0.0, 0.021), "", "0 mag and 0.021 px off at most"),
+        ((0.0123, 0.0), "", "0.012 mag and 0 px off at most"),
+        ((0.004, 0.25), "as asked", "0.004 mag and 0.25 px off at most; as asked"),
+    ],
+)
+def test_a_choice_s_line_has_each_of_its_errors(errors, note, told):
+    assert Choice("PSF", "a Gaussian", *errors, note=note).line() == f"PSF: a Gaussian; {told}"

@@ -196,6 +196,23 @@ def test_answers_of_no_sky_are_not_due():
     assert found.availability == pytest.approx(7 / 8)
 
 
+def test_answers_that_are_not_judged_say_nothing_of_the_interval():
+    """Of a fast tracker most are not: those that are judged come every CYCLE_S."""
+    judged = tallied("r" * 19 + "w").report(START_NS)
+    flooded = AnswerTally()
+    for k in range(20):
+        at_ns = START_NS + round(k * CYCLE_S * NS_PER_S)
+        verdict = "wrong" if k == 19 else "right"
+        flooded.answer(AnswerRecord(host_ns=at_ns, raw="", middle_ns=at_ns, verdict=verdict))
+        for late_ns in (1_000_000, 2_000_000, 3_000_000):
+            late = AnswerRecord(host_ns=at_ns + late_ns, raw="", verdict="unjudged")
+            late.middle_ns = at_ns
+            flooded.answer(late)
+    found = flooded.report(START_NS)
+    assert (found.unjudged, found.rate_hz) == (60, judged.rate_hz)
+    assert (found.availability, found.latency_ms) == (judged.availability, judged.latency_ms)
+
+
 def fault_record(at_s: float, event: str, number: int, name: str) -> FaultRecord:
     """An event of a fault."""
     return FaultRecord(
@@ -343,8 +360,8 @@ def test_the_faults_of_a_replayed_run_are_on_as_its_frames_say():
     """They stand before the ledger's begin; two overlap."""
     tally = AnswerTally(begun_ns=START_NS)
     for number, name in ((1, "haze"), (2, "flash")):
-        tally.fault(fault_record(-100.0, "start", number, name))
-        tally.fault(fault_record(-50.0, "end", number, name))
+        tally.fault(fault_record(-4.0, "start", number, name))
+        tally.fault(fault_record(-2.0, "end", number, name))
     on_by_second = {2: (1,), 3: (1, 2), 4: (1, 2), 5: (2,), 6: (), 7: ()}
     for second in range(10):
         at_ns = START_NS + second * NS_PER_S

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -104,6 +105,19 @@ def test_where_nothing_beats_nothing_is_said_to():
     assert beat(Exposures(59.94, 0.1, 10.0)).period_s == pytest.approx(1 / 0.06)
 
 
+@pytest.mark.parametrize(
+    ("beyond", "period_s"), [(1e-4, 0.1 / 1e-4), (-1e-5, 0.1 / 1e-5), (1e-7, None)]
+)
+def test_an_exposure_beats_unless_it_is_whole_refreshes_within_a_millionth(beyond, period_s):
+    """Exposures of 6 + f refreshes, one after the other, repeat after 1 / f of them."""
+    found = beat(Exposures(60.0, (6 + beyond) / 60))
+    if period_s is None:
+        assert (found.period_s, found.worst_arcsec_per_deg_s) == (None, 0.0)
+    else:
+        assert found.period_s == pytest.approx(period_s, rel=1e-4)
+        assert found.worst_arcsec_per_deg_s == pytest.approx(abs(beyond) / 2 / 6 * 60, rel=1e-3)
+
+
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, 0.0, -60.0])
 def test_rates_that_are_none_are_refused(wrong):
     assert "refresh_hz" in refusal(Exposures, wrong, 0.1)
@@ -181,6 +195,15 @@ def test_the_line_has_the_amount_and_the_proposal(tmp_path):
     )
 
 
+@pytest.mark.parametrize(
+    ("arcsec", "told"), [(0.123, "0.12"), (99.4, "99"), (99.6, "100"), (250.4, "250")]
+)
+def test_arcseconds_are_told_to_two_digits_without_an_exponent(tmp_path, arcsec, told):
+    found = beat_of(beating_config(tmp_path, {"exposure_s": 0.105}))
+    line = beat_line(msgspec.structs.replace(found, worst_arcsec=arcsec))
+    assert f"off by up to {told} arcsec at 1 deg/s" in line
+
+
 def test_what_does_not_matter_is_not_said(tmp_path):
     for tracker in (
         {"exposure_s": 0.1},
@@ -199,6 +222,11 @@ def test_a_display_s_own_modes_are_what_is_proposed(tmp_path):
     config = beating_config(tmp_path, {"exposure_s": 0.04})  # 2.4 refreshes
     assert beat_of(config, modes_hz=(60, 24, 50, 75, 100)).proposal.refresh_hz == 50
     assert beat_of(config, modes_hz=(60, 59)).proposal.refresh_hz is None
+    # none that is farther off than a factor of 2, though it beats with nothing
+    assert beat_of(config, modes_hz=(25, 125)).proposal.refresh_hz is None
+    # the nearest, neither the slowest nor the fastest
+    config = beating_config(tmp_path, {"exposure_s": 0.125})  # 7.5 refreshes
+    assert beat_of(config, modes_hz=(96, 48, 64)).proposal.refresh_hz == 64
 
 
 def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
@@ -207,6 +235,10 @@ def test_a_panel_that_flashes_wants_a_trigger(tmp_path):
     )
     assert found.matters and found.proposal.exposure_s is found.proposal.refresh_hz is None
     assert found.proposal.frame_hz == pytest.approx(7.5)
+    # an exposure of 2.3 refreshes has no room in two
+    tracker = {"exposure_s": 2.3 / 60, "frame_hz": 25.0}
+    long = beat_of(beating_config(tmp_path, tracker, monitor={"hold_ms": 1}))
+    assert long.proposal.frame_hz == pytest.approx(20.0)
     assert (
         "trigger the tracker ([sync] port, [tracker] trigger); at [tracker] frame_hz = 7.5 its"
         " phase stands still" in beat_line(found)

@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from hilstar.display.identity import MonitorIdentity
+from hilstar.display.render.context import Gpu
 from hilstar.server import doctor
 from hilstar.server.bench.measured_on import MonitorCheck
 from hilstar.server.bench.star_size import PANELS
@@ -53,6 +54,32 @@ def test_a_machine_is_well_where_all_that_is_required_is_there(monkeypatch, ther
 def test_only_what_is_required_is_missing(ok, required, state):
     line = Check("serial", ok, "no serial port", required).line()
     assert line == f"{state:8}serial      no serial port"
+
+
+@pytest.mark.parametrize(
+    ("listed", "window", "is_ok", "told"),
+    [
+        (["A", "B"], "A", True, "headless 0: A; 1: B; window A"),
+        (
+            ["A", "B"],
+            "B",
+            True,
+            "headless 0: A; 1: B; window B (another than headless: [render] gpu",
+        ),
+        (["", "B"], "", True, "headless 0: opens no OpenGL 3.3; 1: B; window none"),
+        ([""], "", False, "headless 0: opens no OpenGL 3.3; window none"),
+        ([], "A", False, "headless EGL lists none; window A"),
+    ],
+)
+def test_a_window_s_card_is_told_where_it_is_another_than_the_first(
+    monkeypatch, listed, window, is_ok, told
+):
+    monkeypatch.setattr(doctor, "gpus", lambda: [Gpu(k, name) for k, name in enumerate(listed)])
+    monkeypatch.setattr(doctor, "leave_contexts", lambda: None)
+    monkeypatch.setattr(doctor, "window_renderer", lambda: window)
+    check = doctor._gpus()
+    assert (check.name, check.ok, check.required) == ("gpu", is_ok, False)
+    assert check.detail.removesuffix(" chooses)") == told
 
 
 def test_a_card_is_named_by_its_vendor_and_device(monkeypatch, tmp_path):

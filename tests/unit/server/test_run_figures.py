@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server.record.ledger_records import (
     LOST,
+    AnswerRecord,
     CountRecord,
     EventRecord,
     FrameRecord,
@@ -23,6 +24,7 @@ from hilstar.server.record.ledger_records import (
 from hilstar.server.record.run_figures import (
     COUNTS,
     METRICS,
+    Keyframes,
     RunFigures,
     _turns_rad,
     summarise,
@@ -289,3 +291,26 @@ def test_a_run_of_nothing_has_no_figures():
     report = summarise(RunFigures({}))
     assert (report.frames, report.duration_s, report.missed_frames) == (0, 0.0, 0)
     assert report.interval_ms.p50 is None
+
+
+def test_of_the_frames_that_are_the_worst_the_first_is_drawn():
+    every = [
+        FrameRecord(frame=k, t_ns=k, light_ns=k, draw_ns=k, swap_ns=host_ns(10.0 * k))
+        for k in range(6)
+    ]
+    keyframes = Keyframes()
+    for part, worths in ((slice(0, 3), [1, 3, 3]), (slice(3, 6), [3, 0, 2])):
+        keyframes.add(every[part], {"oldest": np.array(worths), "none": np.zeros(3, dtype=int)})
+    drawn = {frame.frame: why for frame, why in keyframes.chosen(every[-1]) if why}
+    assert drawn == {1: "oldest"}
+
+
+def test_the_residuals_of_a_chart_are_those_of_right_answers():
+    """A wrong one of degrees would leave no room for the others; one of no sky has none."""
+    figures = RunFigures({})
+    for k, verdict in enumerate(("right", "wrong", "invalid", "unpaired", "unjudged", "right")):
+        answer = AnswerRecord(host_ns=host_ns(k), raw="", verdict=verdict)
+        answer.middle_ns = k * NS_PER_S
+        answer.residual_arcsec = None if verdict == "unpaired" else (k + 0.1, k + 0.2, k + 0.3)
+        figures.add(answer)
+    assert figures.residuals.rows.tolist() == [[0.0, 0.1, 0.2, 0.3], [5.0, 5.1, 5.2, 5.3]]

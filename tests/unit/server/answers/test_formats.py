@@ -26,7 +26,7 @@ from hilstar.basics.rotation import (
     multiply,
 )
 from hilstar.server.answers.answer import Answer
-from hilstar.server.answers.explain import lines_of, under_conventions
+from hilstar.server.answers.explain import byte_lines, hex_line, lines_of, under_conventions
 from hilstar.server.answers.formats import (
     MAX_KEPT_BYTES,
     AnswerDecoder,
@@ -259,6 +259,17 @@ def test_a_wrong_convention_is_named_with_what_to_write():
         assert f"  {angle} from what is shown" in "\n".join(lines_of(found, decoder, turned))
 
 
+@pytest.mark.parametrize(("off_deg", "matches"), [(4.9, True), (5.1, False)])
+def test_a_tracker_may_be_five_degrees_off_and_its_convention_is_told(off_deg, matches):
+    """At this attitude every other convention is over 100 degrees away."""
+    decoder = decoder_of(messages=True, format="json", fields=[])
+    shown = from_radec_roll_deg(10.0, 0.0, 80.0)
+    sent = multiply(from_rotation_vector(np.radians([off_deg, 0.0, 0.0])), shown)
+    (found,) = decoder.feed(0, msgspec.json.encode({"q": sent.tolist()}))
+    readings = under_conventions(found, decoder, shown)
+    assert [reading.matches for reading in readings] == [matches, False, False, False]
+
+
 def test_a_packet_is_taken_over_every_road_and_another_kind_is_not():
     packet = AnswerPacket(7, 1 | 2 | 8, 42, tuple(Q.tolist()), (0.0, 0.25, 0.0), 9)
     for messages, sent in ((True, encode(packet)), (False, b"\0" + framed(encode(packet)))):
@@ -420,6 +431,42 @@ def test_an_answer_s_bytes_are_explained_field_by_field():
     assert lines[3] == f"  bytes   2 to   2  {'20':<24} qw    = 0.5  (i8, x 0.015625)"
     assert lines[7] == f"  bytes   6 to   6  {'05':<24} stars = 9  (u8, x 2, + -1)"
     assert len(lines) == 8 + 4  # and a line for each convention
+
+
+def test_a_frame_whose_scalar_is_last_has_other_names_of_its_fields_and_no_scalar_last():
+    """`[answers]` refuses scalar = "last" of a frame, so it is not what to write there."""
+    fields = [
+        {"name": name, "at": 4 * k, "type": "i32be", "scale": SCALE}
+        for k, name in enumerate(Q_NAMES)
+    ]
+    decoder = decoder_of(messages=True, framing="fixed", length=16, fields=fields)
+    last = np.roll(Q, -1)
+    (found,) = decoder.feed(0, struct.pack(">4i", *(round(part / SCALE) for part in last)))
+    *_, convention, fields_line = lines_of(found, decoder, Q)
+    assert convention == (
+        '  write [answers] convention = { scalar = "first", direction = "icrs_to_cam", frame ='
+        ' "cam" }'
+    )
+    assert fields_line.endswith("in the order in which they now are qw, qx, qy, qz")
+
+
+def test_a_long_answer_s_first_96_bytes_are_shown_with_how_many_there_are():
+    assert hex_line(b"\xa5" * 96) == " ".join(["a5"] * 96)
+    assert hex_line(b"\xa5" * 97) == " ".join(["a5"] * 96) + " ... (97 bytes)"
+
+
+@pytest.mark.parametrize(("at", "span"), [(0, "  0 to   1"), (6, "  6 to   7"), (-2, " 10 to  11")])
+def test_a_checksum_is_told_where_it_stands(at, span):
+    fields = [{"name": "t_ns", "at": 2, "type": "u16be"}]
+    fields += [
+        {"name": name, "at": 4 + k, "type": "i8", "scale": 1 / 64} for k, name in enumerate(Q_NAMES)
+    ]
+    keys = {"framing": "fixed", "length": 12, "checksum": "crc16-xmodem", "checksum_at": at}
+    decoder = decoder_of(**keys, fields=fields, messages=True)
+    raw = bytes(range(0x20, 0x2C))
+    seal = raw[at % 12 : at % 12 + 2].hex(" ")
+    (line,) = (line for line in byte_lines(raw, decoder) if "checksum: " in line)
+    assert line.startswith(f"  bytes {span}  {seal} ")
 
 
 @pytest.mark.parametrize(("off_deg", "matching"), [(0.05, 1), (0.2, 0)])

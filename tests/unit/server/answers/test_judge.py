@@ -116,6 +116,39 @@ def test_an_exposure_of_a_dark_or_a_jumping_sky_has_no_attitude():
     assert jumping.over(-NS_PER_S, 0) is None
 
 
+@pytest.mark.parametrize(("period_s", "kept"), [(0.1, 200), (1.0, 20), (5.0, 16)])
+def test_frames_of_twenty_seconds_are_kept_and_at_least_sixteen(period_s, kept):
+    period_ns = round(period_s * NS_PER_S)
+    frames = LitFrames(period_ns)
+    for k in range(300):
+        frames.add(LitFrame(k, k * period_ns, k * period_ns, START))
+    oldest = 300 - kept
+    moment_ns = oldest * period_ns
+    assert frames.over(moment_ns, moment_ns + period_ns // 10).first == oldest
+    assert frames.over(moment_ns - period_ns, moment_ns - period_ns * 9 // 10) is None
+
+
+def test_the_moment_of_light_is_by_the_clock_of_the_frame_at_the_exposure_s_middle():
+    """The sender's clock runs at half of the host's speed."""
+    frames = LitFrames(PERIOD_NS)
+    for k in range(80):
+        frames.add(LitFrame(k, k * PERIOD_NS, 10**12 + k * PERIOD_NS // 2, START))
+    lit = frames.over(60 * PERIOD_NS, 72 * PERIOD_NS)
+    assert lit.light_ns == 10**12 + 33 * PERIOD_NS
+
+
+def test_a_frame_beside_a_jump_has_no_rate():
+    """The rate of an exposure within one frame is by its neighbours."""
+    jumping = LitFrames(PERIOD_NS)
+    away = from_rotation_vector(np.radians([0.0, 3.0, 0.0]))
+    for k in range(40):
+        jumping.add(lit_frame(k, START if k < 30 else multiply(away, START)))
+    for k in (29, 30):
+        lit = jumping.over(k * PERIOD_NS, k * PERIOD_NS)
+        assert (lit.first, lit.rate_rad_s.tolist()) == (k, [0.0, 0.0, 0.0])
+        assert np.abs(residual_arcsec(START if k < 30 else multiply(away, START), lit.q)).max() < 1
+
+
 def test_an_exposure_needs_a_sky_for_half_of_its_time():
     """Sixteen refreshes, of which the first six or nine and a half have one."""
     frames = LitFrames(PERIOD_NS)

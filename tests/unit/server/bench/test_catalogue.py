@@ -123,6 +123,15 @@ def test_the_error_of_an_instrument_magnitude_is_that_of_small_steps(catalogue_b
     assert sigma_instrument_mag(stars, facts, rates, kind)[known] == pytest.approx(
         np.sqrt(variance[known]), rel=DIFFERENCE_LIMIT, abs=1e-4
     )
+    # an unknown error is unknown wherever its colour acts
+    for name, changed in (
+        ("sigma_bv_mag", (bv + STEP_MAG, vi)),
+        ("sigma_vi_mag", (bv, vi + STEP_MAG)),
+    ):
+        unknown = facts | {name: np.full(len(stars), np.nan)}
+        acts = rates(v, *changed, kind) != base
+        found = sigma_instrument_mag(stars, unknown, rates, kind)
+        assert np.isnan(found[acts & known]).all()
 
 
 @pytest.mark.parametrize("ending", ["csv", "fits", "vot", "parquet"])
@@ -370,9 +379,24 @@ def test_each_column_of_the_catalogue_s_own_figures_has_its_own(catalogue_bench)
     ):
         found = own.columns[column].values
         assert np.isfinite(found[is_sure]).all()
+        assert not np.isfinite(found[parallax < 5 * own.columns["sigma_parallax_mas"].values]).any()
         known = np.isfinite(found)
         wanted = own.columns[apparent].values - modulus
         np.testing.assert_allclose(found[known], wanted[known], atol=ROUNDED)
+
+
+def test_a_right_ascension_that_rounds_up_to_the_full_circle_is_0(tmp_path):
+    rows = [
+        "ra,dec,pmra,pmdec,Vmag,B-V",
+        "359.9999999999,10.0,0,0,1.0,0.5",
+        "0.25,-5.5,0,0,2.0,0.5",
+    ]
+    (tmp_path / "own.csv").write_text("\n".join(rows))
+    sky = {"catalogue": "own.csv", "catalogue_epoch_jyear": 1991.25}
+    (tmp_path / "bench.toml").write_text(bench_text({"sky": sky}))
+    own = bench_catalogue(read_bench_file(tmp_path / "bench.toml"), None, 1991.25)
+    assert own.columns["ra_deg"].values.tolist() == [0.0, 0.25]
+    assert own.columns["dec_deg"].values.tolist() == [10.0, -5.5]
 
 
 def test_a_brighter_limit_is_the_command_s_and_the_file_s_where_it_gives_none(tmp_path):

@@ -18,6 +18,7 @@ from hilstar.server.bench.certificate_file import (
     KIND,
     Certificate,
     CertifiedFigure,
+    CubeToBoresight,
     bench_certificate,
     certificate_number,
     off_by,
@@ -158,3 +159,25 @@ def test_what_is_no_certificate_is_refused(tmp_path: Path, data: bytes | None, w
     path.write_bytes(older if data is None else data)
     with pytest.raises(InputError, match=words):
         read_certificate(path)
+
+
+@pytest.mark.parametrize(
+    ("cross_arcsec", "roll_arcsec", "without", "told"),
+    [
+        (1.234, 56.78, (), "within 1.23 arcsec across and 56.8 about it (95 %)"),
+        (None, 56.78, ("cube",), "its uncertainty is not known; without cube"),
+        (1.234, None, ("a", "b"), "its uncertainty is not known; without a, b"),
+    ],
+)
+def test_a_boresight_is_told_with_how_sure_it_is_across_and_about_it(
+    cross_arcsec, roll_arcsec, without, told
+):
+    boresight = CubeToBoresight(
+        reference="the cube",
+        boresight=(0.001, -0.002, 0.9999975),
+        q_tracker_to_reference=(1.0, 0.0, 0.0, 0.0),
+        cross_arcsec=cross_arcsec,
+        roll_arcsec=roll_arcsec,
+        without=without,
+    )
+    assert boresight.line == f"x +0.0010000, y -0.0020000, z +0.9999975 of the cube, {told}"

@@ -15,6 +15,7 @@ from scipy.integrate import trapezoid
 
 from hilstar import load
 from hilstar.basics.errors import InputError
+from hilstar.basics.reading import warn_once
 from hilstar.basics.rotation import direction_of, from_radec_roll_deg
 from hilstar.display.render.backend import linear_light
 from hilstar.instruments.compare import compare
@@ -23,7 +24,8 @@ from hilstar.optics.sprites import AddedLight
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.frame_files import write_frame_fits
 from hilstar.server.bench.star_light import bench_stars
-from hilstar.server.bench.star_rates import bench_channels, bench_optics, star_flux
+from hilstar.server.bench.star_rates import bench_channels, bench_optics, star_flux, star_rates
+from hilstar.sky.electrons import Photometry, reference_mean_w_m2_m, star_temperatures_k
 from hilstar.sky.spectrum import load_curve
 from tests.support.benches import ORION_Q, bench_text
 from tests.support.claims import holds
@@ -67,6 +69,57 @@ def bench_with(curves, channels, *changes):
 def light_of(curves, channels, *changes):
     with bench_with(curves, channels, *changes) as bench:
         return bench.frame(ORION_Q)
+
+
+@pytest.mark.parametrize("spectrum", ["pickles", "blackbody"])
+def test_a_zero_point_s_share_of_light_is_that_of_all_stars(tmp_path, spectrum):
+    v_mag, bv_mag, vi_mag = np.array([0.0, 4.0]), np.array([0.1, 1.2]), np.array([0.1, 1.1])
+    rates = []
+    for zero in ("iau-bolometric", "vega"):
+        path = tmp_path / "bench.toml"
+        path.write_text(bench_text({"sky": {"spectrum": spectrum, "zero_point": zero}}))
+        of_zero = star_rates(read_bench_file(path).config, tmp_path)
+        rates.append(of_zero(v_mag, bv_mag, vi_mag))
+    thesis, vega = (reference_mean_w_m2_m(Photometry(z)) for z in ("iau-bolometric", "vega"))
+    assert abs(thesis / vega - 1) > 1e-3
+    assert rates[0] / rates[1] == pytest.approx([thesis / vega] * 2, rel=1e-6)
+
+
+def test_stars_of_one_temperature_have_one_light_by_whichever_scale_their_colour_has_it(tmp_path):
+    """A black body's light is by its temperature alone."""
+    bv_mag = np.linspace(-0.2, 1.5, 18)
+    wanted_k = star_temperatures_k(bv_mag, "wang2021")
+    fine_mag = np.linspace(-0.35, 2.5, 100_001)
+    fine_k = star_temperatures_k(fine_mag, "ballesteros2012")
+    alike_mag = np.interp(-wanted_k, -fine_k, fine_mag)
+    assert np.abs(alike_mag - bv_mag).max() > 0.05
+    rates = []
+    for scale, colours_mag in (("wang2021", bv_mag), ("ballesteros2012", alike_mag)):
+        path = tmp_path / "bench.toml"
+        path.write_text(bench_text({"sky": {"spectrum": "blackbody", "temperature": scale}}))
+        of_scale = star_rates(read_bench_file(path).config, tmp_path)
+        rates.append(of_scale(np.full(18, 3.0), colours_mag, np.full(18, np.nan)))
+    np.testing.assert_allclose(rates[0], rates[1], rtol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("middles_nm", "blind"),
+    # passbands of 50 nm to either side; V is from 470 to 700 nm
+    [((850, 900, 400), True), ((850, 900, 515), False), ((760, 500, 400), False)],
+)
+def test_a_tracker_is_told_to_see_no_v_where_none_of_its_channels_does(
+    tmp_path, caplog, middles_nm, blind
+):
+    warn_once.cache_clear()
+    passbands = {}
+    for name, middle_nm in zip("rgb", middles_nm, strict=True):
+        passbands[name] = 0.5 * (np.abs(NM - middle_nm) <= 25)
+    write_channels(tmp_path, NM, passbands)
+    path = tmp_path / "bench.toml"
+    path.write_text(bench_text({"tracker": channel_keys("rgb")}))
+    bench_channels(read_bench_file(path).config.tracker, tmp_path)
+    told = [record.getMessage() for record in caplog.records]
+    assert [("no light of V (470 to 700 nm)" in line) for line in told] == [True] * blind
 
 
 @pytest.mark.gpu

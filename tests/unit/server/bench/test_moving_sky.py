@@ -7,7 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilstar.server.bench.moving_sky import orbit_file, wide_bodies
+from hilstar.server.bench.bench_file import at_moment, read_bench_file
+from hilstar.server.bench.moving_sky import orbit_file, satellite_lines, wide_bodies
+from hilstar.server.bench.star_light import bench_moving
+from tests.support.benches import bench_text
+from tests.support.satellites import some_orbits
 from tests.support.skies import STATION_TLE, STATION_UTC, utc_ns
 
 DAY_NS = 86_400 * 10**9
@@ -23,6 +27,36 @@ def test_elements_of_another_week_are_told_with_their_age(tmp_path, caplog, days
     orbit_file(path, utc_ns(STATION_UTC) + round(days * DAY_NS), False)
     assert bool(caplog.records) is bool(told)
     assert told in caplog.text
+
+
+@pytest.mark.parametrize(("day", "old"), [("2008-09-20", False), ("2008-12-31", True)])
+def test_elements_of_a_sky_in_unix_time_are_as_old_as_at_the_day_of_its_stars(
+    tmp_path, caplog, rng, day, old
+):
+    """The station's and the satellites' are of 2008-09-20. Of three satellites the table has two,
+    and two more that are none of them.
+    """
+    (tmp_path / "station.tle").write_text(STATION_TLE)
+    (tmp_path / "tles.txt").write_text(some_orbits(rng, 3))
+    (tmp_path / "seen.csv").write_text("norad,standard_mag\n10000,3\n10002,4\n5,6\n7,8\n")
+    path = tmp_path / "bench.toml"
+    more = {
+        "sky": {"epoch_utc": "unix"},
+        "sky.bodies": {"satellites": "tles.txt", "satellite_magnitudes": "seen.csv"},
+        "spacecraft": {"orbit": "station.tle"},
+    }
+    path.write_text(bench_text(more))
+    file = at_moment(read_bench_file(path), utc_ns(day))
+    sky = bench_moving(file.config, file.folder)
+    told = [record.getMessage() for record in caplog.records]
+    assert sum("station.tle: its elements are 10" in line for line in told) == old
+    assert sum("tles.txt: the elements of 3 of 3 satellites" in line for line in told) == old
+    assert len(told) == 2 * old
+    (line,) = satellite_lines(sky, utc_ns(day))
+    assert line == (
+        "satellites: 3 of 3 have a place by their elements; 2 are in [sky.bodies]"
+        " satellite_magnitudes"
+    )
 
 
 def test_bodies_are_told_from_the_widest_on_with_their_pixels():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
+from hilstar.optics.scan import Orientation
 from hilstar.server.bench import scene as scenes
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.server.bench.cameras import bench_camera
@@ -67,7 +68,10 @@ def test_a_monitor_s_rows_light_as_its_keys_say_or_for_a_refresh(tmp_path):
     turned = bench_file(tmp_path, {"monitor": {"flip_x": True, "rotate_deg": 270}})
     orientation = orientation_of(turned.config.monitor)
     assert orientation.screen_px((320, 240)) == (240, 320)
-    assert orientation != orientation_of(bench_file(tmp_path).config.monitor)
+    assert orientation == Orientation(flip_x=True, flip_y=False, quarter_turns=3)
+    upset = bench_file(tmp_path, {"monitor": {"flip_y": True, "rotate_deg": 90}})
+    assert orientation_of(upset.config.monitor) == Orientation(False, True, 1)
+    assert orientation_of(bench_file(tmp_path).config.monitor) == Orientation()
 
 
 PSF: Any = SimpleNamespace(peak_share=0.25)

@@ -209,8 +209,8 @@ def orders(feed, parts, monkeypatch):
     requests = SwitchRequests()
     handler = OrderHandler(requests, feed, parts)
 
-    def do(name: str, **order):
-        answer = handler.do(Order(id=4, name=name, who="ann\nfrom here", **order))
+    def do(name: str, who: str = "ann\nfrom here", **order):
+        answer = handler.do(Order(id=4, name=name, who=who, **order))
         assert answer.id == 4
         return answer.status, answer.line
 
@@ -255,6 +255,8 @@ def test_a_mark_is_told_in_one_line_with_who_wrote_it(orders):
     assert (kind, detail) == ("mark", f"mark, by {who}: lamp on")
     assert "\n" not in who
     assert orders.do("mark", text=" \n")[0] == 400
+    orders.do("mark", who="w" * 61, text="lamp off")
+    assert told[-1] == ("mark", f"mark, by {'w' * 60}: lamp off", "w" * 60)
 
 
 def test_a_ledger_is_begun_once_and_ended_with_what_became_of_it(orders, tmp_path, monkeypatch):

@@ -62,6 +62,49 @@ def test_a_record_that_was_changed_is_not_taken_for_whole():
     assert records.read(1) is None
 
 
+def test_a_record_that_is_too_long_is_cut_at_its_slot_s_end():
+    records = ring()
+    records.put(bytes(range(SLOT_BYTES + 3)))
+    records.put(b"next")
+    assert list(records.after(0)) == [(1, bytes(range(SLOT_BYTES))), (2, b"next")]
+
+
+def test_a_writer_of_a_memory_with_records_goes_on_with_their_numbers():
+    memory = memoryview(bytearray(Ring.size(SLOTS, SLOT_BYTES)))
+    first = Ring(memory, SLOTS, SLOT_BYTES)
+    for k in range(1, 7):
+        first.put(b"%d" % k)
+    Ring(memory, SLOTS, SLOT_BYTES).put(b"new")
+    assert list(first.after(0)) == [(5, b"5"), (6, b"6"), (7, b"new")]
+
+
+class OvertakenMemory(bytearray):
+    """A memory whose writer takes the slot anew while a reader copies its bytes."""
+
+    writer: Ring | None = None
+
+    def __getitem__(self, key):
+        copied = super().__getitem__(key)
+        if self.writer is not None:
+            for _ in range(SLOTS):
+                self.writer.begin()
+                self.writer.room(3)[:] = b"new"
+                self.writer.end(3, 0)
+        return copied
+
+
+def test_a_slot_that_is_begun_anew_while_it_is_copied_is_not_read():
+    memory = OvertakenMemory(Ring.size(SLOTS, SLOT_BYTES))
+    writer = Ring(memoryview(memory), SLOTS, SLOT_BYTES)
+    writer.begin()
+    writer.room(3)[:] = b"old"
+    writer.end(3, 0)
+    reader = Ring(memory, SLOTS, SLOT_BYTES)
+    assert reader.read(1) == b"old"
+    memory.writer = writer
+    assert reader.read(1) is None
+
+
 def test_where_the_newest_records_are_damaged_the_newest_whole_one_is_read():
     memory = bytearray(Ring.size(SLOTS, SLOT_BYTES))
     records = Ring(memoryview(memory), SLOTS, SLOT_BYTES)

@@ -197,12 +197,6 @@ def test_strangers_are_counted_anew_each_second():
     assert notices.counts() == {"sender-not-allowed": 1}
 
 
-def test_a_bound_road_has_no_peer_of_its_own_and_says_that_it_sent_nothing():
-    road = UdpRoad(ANYWHERE, AllowedSenders())
-    assert not road.put(b"to nobody")
-    road.close()
-
-
 def test_a_datagram_goes_out_though_the_last_one_found_nobody():
     """The kernel tells of the last refusal where the next one is sent, and sends nothing."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as closed:

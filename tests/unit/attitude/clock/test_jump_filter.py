@@ -14,7 +14,7 @@ from hilstar.attitude.clock.jumps import (
     KnownClockFilter,
 )
 from hilstar.attitude.clock.sender_clock import Exchange, SenderClock
-from hilstar.attitude.clock.stages import StreamState
+from hilstar.attitude.clock.stages import Each, Stages, StreamState
 from hilstar.attitude.wire.links import Arrival, SampleArrival
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.notices import Notices
@@ -98,6 +98,20 @@ def test_a_message_that_was_too_early_is_refused_with_by_how_much(settled):
         f"t_ns {ahead.event.t_ns} is 3.6e+03 s ahead of the sender's clock so far"
     )
     assert accepted.refusal is None
+
+
+def test_what_a_stage_held_passes_those_that_follow_it_in_the_end(settled):
+    seen, shown = [], []
+
+    def look(arrival: SampleArrival) -> SampleArrival:
+        seen.append(arrival.event.sequence)
+        return arrival
+
+    stages = Stages([settled, Each(look)], shown.append)
+    stages.take(arrival(SETTLED, jump_ns=2 * NS_PER_S))
+    assert (seen, shown) == ([], [])
+    stages.release()
+    assert seen == [each.event.sequence for each in shown] == [SETTLED]
 
 
 @pytest.mark.parametrize(("waited_ms", "is_doubted"), [(1500, False), (1400, True)])

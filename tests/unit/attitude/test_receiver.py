@@ -777,6 +777,7 @@ def test_how_far_a_clock_is_ahead_is_not_what_a_late_packet_says(caplog):
     assert run.events == {"clock-not-shared": 1}
     (line,) = [line for line in caplog.messages if 'clock = "unix"' in line]
     assert "0.100 s ahead of CLOCK_REALTIME" in line
+    assert "; the sky drawn is 0.100 s old: " in line
 
 
 @pytest.mark.parametrize("ahead_s", [0.1, 0.999])
@@ -880,6 +881,10 @@ def test_a_clock_of_another_pace_is_named_with_its_pace(pace, kind):
     )
     assert float(words[1]) == pytest.approx(pace, rel=0.05)
     assert ("slow clock" in words[2]) == (pace < 1)
+    # a slow one may be a step of 5 ms and the way to the next one behind
+    more_ms = 10.0 if pace < 1 else 0.0
+    told, line = run.receiver.clock_summary(), run.receiver.clock.summary()
+    assert told.uncertainty_ms == pytest.approx(line.uncertainty_ms + more_ms, abs=1e-9)
 
 
 def test_a_jump_of_the_sender_s_clock_is_told_with_all_that_it_jumped_so_far():

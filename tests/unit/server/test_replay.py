@@ -139,6 +139,18 @@ def test_a_stop_ends_a_replay_as_fast_as_possible(roll_log, bench_with):
     assert frames == [0, 1, 2, 3]
 
 
+def test_each_gap_of_a_log_that_is_too_long_is_one_event_of_a_stale_attitude(roll_log, bench_with):
+    """Of half a second, twice: 0.25 s is what an attitude may be old."""
+    head, *rows = roll_log.read_text().splitlines()
+    roll_log.write_text("\n".join([head, *rows[:4], *rows[9:12], *rows[17:]]) + "\n")
+    bench = bench_with()
+    stale = []
+    play = plan_play(roll_log, Wanted(MAX, step_s=0.1), bench.config)
+    summary = replay(bench, play, lambda shown: stale.append(shown.stale))
+    assert summary.stale_events == 2
+    assert 0 < sum(stale) < len(stale)
+
+
 def test_a_wrong_sky_of_the_run_is_wrong_again_in_the_frames_that_had_it():
     """Rates from 20 ms to 60 ms, a clock from 40 ms to 80 ms; an event is seen after it began."""
     past = WrongSky()

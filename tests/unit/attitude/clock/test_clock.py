@@ -13,7 +13,6 @@ from hilstar.attitude.clock.sender_clock import (
     LOCAL_DELAY_NS,
     MAX_DRIFT,
     MIN_EXCHANGES,
-    SLEW,
     SLOT_NS,
     Exchange,
     SenderClock,
@@ -28,6 +27,7 @@ from tests.support.claims import holds
 PERIOD_NS = 5_000_000
 MIN_DELAY_MS = 0.05
 HOST0_NS = 10**12
+SLEW = 0.01  # a turn seems at most a hundredth faster or slower while a clock is put right
 Q = np.array([1.0, 0.0, 0.0, 0.0])
 Delay = Callable[[np.random.Generator, int], float]
 
@@ -376,6 +376,17 @@ def test_what_a_frame_was_off_adds_to_the_uncertainty(by_ms):
     assert clock.summary().uncertainty_ms == pytest.approx(0.5 + 3)
     clock.to_sender_ns(HOST0_NS + PERIOD_NS)
     assert clock.summary().uncertainty_ms == pytest.approx(0.5)
+
+
+def test_a_stream_that_came_sooner_is_forgotten_after_half_a_minute():
+    """For a second without a delay, then 1 ms late: with that second it would be a drift."""
+    clock = SenderClock()
+    for k in range(4 * 33):
+        host_ns = HOST0_NS + k * SLOT_NS
+        late_ns = NS_PER_MS if k >= 4 else 0
+        clock.observe(host_ns - late_ns, host_ns)
+    assert clock.late_ns(host_ns - late_ns, host_ns) == pytest.approx(0, abs=1)
+    assert clock.summary().drift_ppm == pytest.approx(0, abs=1e-6)
 
 
 def test_before_any_message_sender_time_is_host_time():

@@ -6,15 +6,19 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.clock.jumps import (
+    BEHIND,
     MAX_DOUBT_NS,
     MAX_FOUND_LATE_NS,
     TRUSTED_WAIT_NS,
     JumpFilter,
+    KnownClockFilter,
 )
 from hilstar.attitude.clock.sender_clock import Exchange, SenderClock
-from hilstar.attitude.clock.stages import StreamState
+from hilstar.attitude.clock.stages import Each, Stages, StreamState
 from hilstar.attitude.wire.links import Arrival, SampleArrival
 from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.basics.notices import Notices
+from hilstar.basics.process.scheduling import UnixOffset
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 
 HOST0_NS = 10**12
@@ -74,6 +78,42 @@ def test_samples_in_doubt_are_let_go_when_nothing_has_followed_the_last(settled)
     assert settled.jumps == 0
 
 
+def test_a_jump_adds_to_the_uncertainty_by_as_much_as_its_messages_differ(clock, settled):
+    before_ms = clock.summary().uncertainty_ms
+    uneven_ns = [NS_PER_MS, 0, NS_PER_MS // 2]
+    for k, late_ns in enumerate(uneven_ns, SETTLED):
+        settled.take(arrival(k, late_ns, 2 * NS_PER_S))
+    clock._choose(HOST0_NS)
+    assert settled.jumps == 1
+    assert clock.summary().uncertainty_ms == pytest.approx(before_ms + 1.0, abs=1e-6)
+
+
+def test_a_message_that_was_too_early_is_refused_with_by_how_much(settled):
+    """The next one shows that the clock did not jump."""
+    ahead = arrival(SETTLED, jump_ns=-3600 * NS_PER_S)
+    assert settled.take(ahead) == []
+    refused, accepted = settled.take(arrival(SETTLED + 1))
+    assert refused.refusal.reason == "time"
+    assert refused.refusal.detail == (
+        f"t_ns {ahead.event.t_ns} is 3.6e+03 s ahead of the sender's clock so far"
+    )
+    assert accepted.refusal is None
+
+
+def test_what_a_stage_held_passes_those_that_follow_it_in_the_end(settled):
+    seen, shown = [], []
+
+    def look(arrival: SampleArrival) -> SampleArrival:
+        seen.append(arrival.event.sequence)
+        return arrival
+
+    stages = Stages([settled, Each(look)], shown.append)
+    stages.take(arrival(SETTLED, jump_ns=2 * NS_PER_S))
+    assert (seen, shown) == ([], [])
+    stages.release()
+    assert seen == [each.event.sequence for each in shown] == [SETTLED]
+
+
 @pytest.mark.parametrize(("waited_ms", "is_doubted"), [(1500, False), (1400, True)])
 def test_a_message_may_be_late_by_as_long_as_it_waited(settled, waited_ms, is_doubted):
     late = arrival(SETTLED, 1500 * NS_PER_MS, waited_ns=waited_ms * NS_PER_MS)
@@ -110,3 +150,32 @@ def test_lateness_is_against_the_arrivals_whatever_exchanges_say():
     assert clock.synchronised
     assert clock.latency_ns(host_ns - late_ns, host_ns) == late_ns
     assert clock.late_ns(host_ns - late_ns, host_ns) == 0
+
+
+def known_clock_notices(late_ms: list[int]) -> Notices:
+    """What is told of a sender that has this machine's clock, and sends each 50 ms from 1 s on."""
+    notices = Notices()
+    known = KnownClockFilter(notices, SenderClock(UnixOffset(0, 0), "shared"))
+    for k, late in enumerate(late_ms):
+        host_ns = NS_PER_S + 50 * k * NS_PER_MS
+        known.take(Arrival(host_ns, AttitudeSample(host_ns - late * NS_PER_MS, Q, None, k)))
+    return notices
+
+
+def test_a_clock_ahead_is_a_wrong_sky_from_its_first_packet_on():
+    """It is told 0.3 s later."""
+    (condition,) = known_clock_notices([0] * 10 + [-100] * 10).wrong_sky.now()
+    assert condition.since_ns == 3 * NS_PER_S // 2
+
+
+def test_of_packets_by_a_known_clock_the_quickest_of_some_seconds_is_told():
+    """One in three comes 120 ms late, and the last ones before it is told do not."""
+    notices = known_clock_notices([200, 120, 200] * 12 + [200] * 20)
+    assert "comes 120 ms or more after its t_ns" in notices.lasting[BEHIND]
+
+
+@pytest.mark.parametrize(("late_ms", "is_told"), [(49, False), (50, True)])
+def test_packets_of_a_known_clock_may_come_50_ms_late(late_ms, is_told):
+    notices = known_clock_notices([late_ms] * 50)
+    assert (BEHIND in notices.lasting) == is_told
+    assert "clock-behind-no-more" not in notices.counts()

@@ -56,6 +56,7 @@ def test_many_lost_of_a_shuffled_stream_are_counted_exactly():
     [
         (10**9, "seconds"),
         (10**6, "milliseconds"),
+        (10**4, "ticks of 10 us"),
         (10**3, "microseconds"),
         (100, "ticks of 100 ns"),
     ],
@@ -68,7 +69,8 @@ def test_the_unit_of_t_ns_is_named(divisor, words, hz):
     for k in range(8 * hz):
         t_ns = 10**15 + k * NS_PER_S // hz
         unit.see(t_ns // divisor, t_ns + round(rng.exponential(2e6)))
-    assert unit.named == words and f"it is in {words}" in notices.lasting[UNIT]
+    assert unit.named == words and f"it is in {words}, not" in notices.lasting[UNIT]
+    assert notices.lasting[UNIT].endswith(f"; send nanoseconds: multiply by {divisor}")
 
 
 @pytest.mark.parametrize("pace", [1.0, 0.9, 0.5, 2.0, 0.1, 10.0, 0.002])

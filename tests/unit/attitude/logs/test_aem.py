@@ -398,6 +398,17 @@ def test_quaternions_without_rates_are_written_as_such(tmp_path):
     )
 
 
+@pytest.mark.parametrize("without", [0, 1, 2])
+def test_quaternions_of_which_one_has_no_rate_are_written_without(tmp_path, without):
+    rates: list[np.ndarray | None] = [np.zeros(3)] * 3
+    rates[without] = None
+    q = from_radec_roll_deg(10.0, 5.0, 0.0)
+    samples = [AttitudeSample(k, q, rate) for k, rate in enumerate(rates)]
+    write_log(tmp_path / "a.xml", samples)
+    root = ElementTree.parse(tmp_path / "a.xml").getroot()
+    assert root.findtext("body/segment/metadata/ATTITUDE_TYPE") == "QUATERNION"
+
+
 @pytest.mark.parametrize(
     ("begin_s", "scale", "system"),
     [

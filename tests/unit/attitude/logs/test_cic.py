@@ -28,6 +28,14 @@ def cic_log(tmp_path):
     return opened
 
 
+def test_a_day_with_a_leap_second_has_86401_seconds(cic_log):
+    """31 December 2016, MJD 57753; in days of 86400 s its last second is the next day's first."""
+    rows = [f"57753 86399.0 {ALNILAM}", f"57753 86400.5 {ALNILAM}", f"57754 1.0 {ALNILAM}"]
+    begin_ns = 1_483_228_800 * 10**9  # 2017-01-01T00:00:00
+    times_ns = [sample.t_ns - begin_ns for sample in cic_log(cic_text(rows)).samples]
+    assert times_ns == [-(10**9), 10**9 // 2, 10**9]
+
+
 def test_the_real_part_comes_first_and_times_are_days_and_seconds(cic_log):
     found = cic_log(WHOLE)
     assert [sample.t_ns for sample in found.samples] == [DAY_NS, DAY_NS + 10_250_000_000]

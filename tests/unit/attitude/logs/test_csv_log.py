@@ -183,6 +183,14 @@ def test_a_column_of_marks_that_is_not_used_is_named(csv_of, header, good, bad):
     assert f"column {header} is not used" in dict(found.told)["log-table"]
 
 
+@pytest.mark.parametrize("header", ["q_ok", "qualityFlag"])
+def test_beside_a_column_of_validity_no_other_marks_are_named(csv_of, header):
+    rows = [f"{k}.0,{Q},{k % 2},1" for k in range(10)]
+    found = open_log(csv_of("\n".join([f"t_s,qw,qx,qy,qz,{header},valid", *rows]) + "\n"))
+    assert len(found.samples) == 10
+    assert "log-table" not in dict(found.told)
+
+
 def test_a_column_of_figures_is_no_mark(csv_of):
     """An error in arcseconds marks no row."""
     found = open_log(csv_of(telemetry_text("pointing_error_arcsec", "2.5", "3.5")))

@@ -138,6 +138,14 @@ def test_a_gap_that_the_rates_on_both_sides_explain_is_blended():
     assert [kind for kind, _ in log_joins(other).told] == ["log-gap", "log-rates"]
 
 
+def test_the_longest_gap_is_of_those_that_are_held():
+    """Rates explain the turn in 100.5 s, and not the one in 20.5 s."""
+    times = [*np.arange(0, 10, 0.5), *np.arange(110, 120, 0.5), *np.arange(140, 150, 0.5)]
+    samples = coning_samples(times, spin=0.002, nutation=0.0)
+    samples[40:] = [replace(sample, q_icrs_to_cam=START) for sample in samples[40:]]
+    assert log_joins(samples).told[0][1].startswith("the log has 1 gap, the longest 20.5 s (")
+
+
 def told_of_rates_that_are_off(off: float, end_s: float, spin: float) -> list[str]:
     """What is told of ten seconds on either side of a gap to `end_s`, whose rates are off by a
     share.

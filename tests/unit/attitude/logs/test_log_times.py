@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.logs.log_file import open_log, read_log
-from hilstar.attitude.logs.log_times import span_line, time_notices
+from hilstar.attitude.logs.log_times import _ratio, span_line, time_notices
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import from_rotation_vector
 from tests.support.benches import SMALL_BENCH
@@ -205,3 +205,11 @@ def test_rates_about_another_axis_say_nothing_of_the_times(inclined_deg, is_name
         for k in range(10)
     ]
     assert bool(time_notices(samples, "s")) is is_named
+
+
+def test_the_ratio_of_rates_and_turns_is_that_of_most_intervals():
+    """One rate of twenty is a hundred times as long as the others."""
+    turned = np.tile([0.01, 0.0, 0.0], (20, 1))
+    by_rate = 1000.0 * turned
+    by_rate[7] *= 100.0
+    assert _ratio(turned, by_rate) == pytest.approx(1000.0)

@@ -16,6 +16,7 @@ from hilstar.attitude.logs.mcap_log import (
     ATTITUDE_SCHEMA,
     ATTITUDE_TOPIC,
     FREE_BYTES,
+    _is_finished,
     attitude_message,
     log_time_ns,
     read_attitudes,
@@ -171,6 +172,15 @@ def test_what_is_no_mcap_file_is_called_so(tmp_path):
         match=r"run\.mcap: is no MCAP file; give an MCAP file, such as the ledger of a run",
     ):
         list(read_attitudes(tmp_path / "run.mcap"))
+
+
+@pytest.mark.parametrize(
+    ("end", "is_finished"),
+    [(b"\x89MCAP0\r\n", True), (b"\x89MCAP0\r", False), (b"\x89MCAP0\r\0", False)],
+)
+def test_a_file_is_finished_that_ends_as_the_specification_says(end, is_finished):
+    """The magic of the MCAP specification, "File Structure", at the file's both ends."""
+    assert _is_finished(io.BytesIO(b"\x89MCAP0\r\n" + bytes(100) + end)) == is_finished
 
 
 def test_a_finished_file_that_is_damaged_is_refused(tmp_path):

@@ -182,6 +182,7 @@ CIC = [
     (cic_direction(""), "ATTITUDE_DIR is missing in the metadata"),
     (cic_direction("ATTITUDE_DIR = A2C"), "ATTITUDE_DIR is A2C; write A2B or B2A"),
     (cic_direction("ATTITUDE_DIR = A2B\nATTITUDE_DIR = B2A"), ":12: ATTITUDE_DIR appears twice"),
+    (cic_direction("ATTITUDE_DIR = A2B\nATTITUDE_DIR = A2B"), ":12: ATTITUDE_DIR appears twice"),
     (
         cic_direction("ATTITUDE_DIRECTION = A2B"),
         ":11: ATTITUDE_DIRECTION is no keyword that is read here",

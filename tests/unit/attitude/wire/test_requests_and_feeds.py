@@ -28,6 +28,7 @@ from hilstar.attitude.wire.zmq_links import (
     Feed,
     ZmqLockstep,
     ZmqReceiver,
+    ZmqRoad,
     ZmqSender,
 )
 from tests.support.fake_clock import FakeClock
@@ -121,6 +122,51 @@ def test_a_feed_hands_on_hilstar_s_own_bytes_and_packets_of_any_other_attitude(
         wait_for(is_here, "what the feed hands on")
     assert {arrival.host_ns for arrival in came} == {-77}
     assert {arrival.raw for arrival in came} == {encode(SAMPLE)}
+
+
+def test_a_subscriber_that_reads_late_loses_nothing_of_ten_seconds_at_400_hz(
+    tmp_path: Path,
+) -> None:
+    """4000 messages of 1 kB: more than libzmq's own queue of 1000 and the kernel's buffer take."""
+    endpoint = f"ipc://{tmp_path}/late"
+    count, message = 4000, bytes(1000)
+    with (
+        zmq.Context() as context,
+        context.socket(zmq.SUB) as subscriber,
+        ZmqSender(endpoint) as sender,
+    ):
+        subscriber.setsockopt(zmq.RCVTIMEO, LATE_MS)
+        subscriber.setsockopt(zmq.RCVHWM, 100)
+        subscriber.subscribe(b"")
+        subscriber.connect(endpoint)
+        assert sender.wait_for_listener(LATE_MS / 1000)
+        sent = sum(sender.put(message) for _ in range(count))
+        came = sum(len(subscriber.recv()) == len(message) for _ in range(count))
+    assert sent == came == count
+
+
+def test_a_road_keeps_as_many_messages_as_it_was_given(tmp_path: Path) -> None:
+    with ZmqRoad(f"ipc://{tmp_path}/queue", queue_messages=37) as road:
+        road.wait_for_message(0)  # it opens
+        assert road._socket is not None
+        assert road._socket.getsockopt(zmq.RCVHWM) == 37
+
+
+def test_another_process_opens_a_road_with_its_topic(tmp_path: Path) -> None:
+    endpoint = f"ipc://{tmp_path}/topic"
+    with ZmqRoad(endpoint, topic=b"star ") as road:
+        open_again = road.opener()
+    came: list[bytes] = []
+    with Feed(endpoint) as feed, open_again(notices=None) as link:
+
+        def is_here() -> bool:
+            for text in (b"sun 1", b"star 2"):
+                feed._socket.send(text)
+            came.extend(arrival.raw for arrival in link.receive(SOON_MS))
+            return bool(came)
+
+        wait_for(is_here, "a message of the topic")
+    assert set(came) == {b"star 2"}
 
 
 def test_a_feed_hands_on_what_is_no_attitude_as_it_came(tmp_path: Path) -> None:

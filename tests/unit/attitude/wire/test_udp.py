@@ -138,14 +138,15 @@ class ChangedClock(HostClock):
         return super().monotonic_minus_realtime_ns() - 3600 * NS_PER_S
 
 
-def test_a_datagram_came_after_the_last_look_that_found_none():
+@pytest.mark.parametrize("look", [lambda link: link.wait(0), lambda link: link.take(1)])
+def test_a_datagram_came_after_the_last_look_that_found_none(look):
     """However wrong the calendar, by which the kernel stamps it."""
     clock = ChangedClock()
     receiving = Datagrams.bound(ANYWHERE, clock)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         clock.later_ns = 1000 * NS_PER_S
         before_ns = clock.now_ns()
-        assert not receiving.wait(0)
+        assert not look(receiving)
         after_ns = clock.now_ns()
         sender.sendto(b"1", ("127.0.0.1", receiving.port))
         assert receiving.wait(10_000)
@@ -173,6 +174,27 @@ def test_what_the_kernel_drops_is_counted_once():
             assert [message.parts for message in road.taken(10_000)] == [[b"2"]]
             assert road.link_counts.flooded == in_all
     road.close()
+
+
+def test_strangers_are_counted_anew_each_second():
+    """Two thirds of the limit in each of three seconds, which do not make the kernel drop any."""
+    clock, notices = ChangedClock(), Notices()
+    road = UdpRoad(ANYWHERE, AllowedSenders(["127.0.0.3"]), notices=notices, clock=clock)
+    per_second = 2 * MAX_STRANGERS // 3
+    batch = 50  # the socket's buffer holds that many
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.connect(("127.0.0.1", int(road.endpoint.rpartition(":")[2])))
+        for _ in range(3):
+            for _ in range(per_second // batch):
+                for _ in range(batch):
+                    stranger.send(b"1")
+                assert road.taken(10_000) == []
+            clock.later_ns += 2 * NS_PER_S
+            stranger.send(b"1")
+            assert road.taken(10_000) == []
+    road.close()
+    assert road.link_counts.rejected == 3 * (per_second // batch * batch + 1)
+    assert notices.counts() == {"sender-not-allowed": 1}
 
 
 def test_a_datagram_goes_out_though_the_last_one_found_nobody():

@@ -190,6 +190,23 @@ def test_a_map_that_has_changed_is_not_replayed_as_if_it_were_the_run_s(
     assert "is not the map that the run had" in refusal(read_recording, tmp_path / "run.mcap")
 
 
+def test_a_scenario_counts_from_the_log_s_first_sample_whichever_part_of_it_is_shown(
+    replays, slow_log, tmp_path
+):
+    """At 50 Hz from 0.5 s on, frames 5 to 9 are those from 0.6 s to 0.7 s."""
+    text = '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 0.6\nfor_s = 0.1'
+    faults = RunFaults(replays, parse_scenario(tmp_path / "f.toml", text), Notices())
+    dark = []
+
+    def sink(shown):
+        if not shown.drawn.levels.any():
+            dark.append(shown.number)
+
+    play = plan_play(slow_log, Wanted(speed=float("inf"), start_s=0.5), replays.config)
+    replay(replays, play, sink, Outlet(faults=faults))
+    assert dark == [5, 6, 7, 8, 9]
+
+
 def test_the_console_starts_a_fault_of_the_scenario_while_it_runs(replays, slow_log, tmp_path):
     scenario = parse_scenario(tmp_path / "f.toml", '[[fault]]\nkind = "blank"\nname = "cover"')
     notices, heard = Notices(), []

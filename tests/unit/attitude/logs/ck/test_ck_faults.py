@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import struct
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import spiceypy
 
 from hilstar.attitude.logs import ck_spice
-from hilstar.attitude.logs.ck_spice import answer
+from hilstar.attitude.logs.ck_spice import _named, answer
 from hilstar.attitude.logs.entries import Stated
 from hilstar.attitude.logs.log_file import open_log
 from hilstar.basics.errors import InputError, MachineError
@@ -101,6 +102,10 @@ def cut_to(count):
             bytes_at(RECORD_BYTES + 5 * WORD_BYTES + 8, struct.pack("<i", 9)),
             "segment 1 is of type 9; types 1 to 6 are read",
         ),
+        (
+            bytes_at(RECORD_BYTES + 5 * WORD_BYTES + 8, struct.pack("<i", 7)),
+            "segment 1 is of type 7; types 1 to 6 are read",
+        ),
         (words(-1, 1e9), "its counts do not fit"),
         (words(-1, float("nan")), "its counts do not fit"),
         (words(-2, 0.0), "SPICE refuses it (The requested segment"),
@@ -188,6 +193,18 @@ def test_a_meta_kernel_gives_its_kernels(tmp_path, raw, relative):
     with spiceypy.KernelPool([]):
         found, _ = answer(tmp_path / "whole.bc", [tmp_path / "all.tm"], None)
     assert len(found.t_ns) == len(TIMES)
+
+
+def test_of_path_symbols_that_begin_alike_the_one_that_is_written_counts(tmp_path):
+    meta = (
+        "KPL/MK\n\\begindata\nPATH_SYMBOLS = ( 'K' 'KERNELS' 'KE' )\n"
+        "PATH_VALUES = ( '/nowhere' '/kernels' '/nowhere' )\n"
+        "KERNELS_TO_LOAD = ( '$KERNELS/leap.tls' '$KERNELS/clock.tsc' )\n\\begintext\n"
+    )
+    (tmp_path / "all.tm").write_text(meta)
+    with spiceypy.no_found_check():
+        paths = _named(spiceypy, tmp_path / "all.tm")
+    assert paths == [Path("/kernels/leap.tls"), Path("/kernels/clock.tsc")]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.attitude.clock.timeline import Policy
 from hilstar.attitude.logs.ck import broken_off, reading_of
-from hilstar.attitude.logs.ck_spice import Segment, _attitudes, _Piece, _Structure, answer
+from hilstar.attitude.logs.ck_spice import (
+    Segment,
+    _attitudes,
+    _packets,
+    _Piece,
+    _Structure,
+    answer,
+)
 from hilstar.attitude.logs.entries import Stated, log_joins
 from hilstar.attitude.logs.log_file import log_timeline, open_log
 from hilstar.attitude.wire.packet import AttitudeSample
@@ -295,6 +302,16 @@ def test_functions_of_time_with_a_directory_are_read(kernels_folder, motion):
         ck.write_type_2(handle, steps)
     found, _ = read_ck(kernels_folder / "a.bc")
     assert len(found.gaps_s) == 100
+
+
+@pytest.mark.parametrize("count", [1, 100, 101, 200, 1000, 1001, 1100, 100_001])
+def test_functions_of_time_are_counted_by_the_words_of_their_segment(count):
+    """The CK Required Reading, "Data Type 2": a packet has eight words and two times, and every
+    hundredth packet before the last one has its start in the directory, too.
+    """
+    segment = Segment(1, 0.0, 1.0, ck.BODY, 1, 2, has_rate=True, first_word=1, last_word=1)
+    words = np.zeros(count * (8 + 2) + (count - 1) // 100)
+    assert _packets(words, segment) == (count, 8)
 
 
 @pytest.mark.parametrize(("kind", "count"), [(1, 1), (3, 3), (5, 8)])

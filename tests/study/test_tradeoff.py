@@ -803,3 +803,28 @@ def test_a_road_s_sprites_are_those_that_reach_into_the_image(name):
     found_px = places.ROADS[name].places_px(vectors, np.eye(3), camera).astype(np.float64)
     wanted_px[[2, 4]] = np.nan
     np.testing.assert_allclose(found_px, wanted_px, atol=1e-3)
+
+
+def test_stars_that_are_tested_are_all_of_a_scan_and_those_of_near_cells():
+    camera = places.ideal_monitor(places.demo_config())
+    (turn,) = places.random_turns(1, camera)
+    stars = places.stars_to(6.0)
+    every, near = places.scan(stars, turn, camera), places.by_cells(stars, turn, camera)
+    assert every.tested == len(stars) == places.by_angle(stars, turn, camera).tested
+    assert sorted(near.star.tolist()) == sorted(every.star.tolist())
+    # cells reach beyond the field, and are a small part of the sky
+    assert 1.2 * len(near.star) < near.tested < 0.1 * len(stars)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_path_s_length_is_along_the_axis_that_it_takes(axis):
+    """Through the lens of the demo's tracker, a turn about one axis moves the other's pixels."""
+    bench = places.smear_bench()
+    rate_rad_s = np.zeros(3)
+    rate_rad_s[axis] = math.radians(1.0)
+    motion = replace(bench.motion, rate_cam_rad_s=rate_rad_s)
+    bench = replace(bench, motion=motion)
+    stars = bench.grid_stars(1)
+    path_px = math.radians(1.0) * motion.exposure_s * bench.camera.focal_length_px
+    assert path_px > 1
+    assert places.path_words(bench, stars) == f"{path_px:.0f} to {path_px:.0f} px"

@@ -114,7 +114,9 @@ def test_a_traced_moon_has_its_light_at_its_place_and_towards_the_sun(radius_px,
     assert low < share < high
 
 
-@pytest.mark.parametrize(("radius_px", "phase_deg"), [(0.05, 60.0), (6.0, 120.0), (6.0, 60.0)])
+@pytest.mark.parametrize(
+    ("radius_px", "phase_deg"), [(0.05, 60.0), (6.0, 120.0), (6.0, 60.0), (4.0, 90.0)]
+)
 def test_a_disc_is_drawn_as_its_rays_and_a_point_is_not_a_disc(radius_px, phase_deg):
     size = bodies.exactness(radius_px, phase_deg)
     assert (size.body, size.radius_px, size.phase_deg) == ("Moon", radius_px, phase_deg)

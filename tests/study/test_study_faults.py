@@ -16,6 +16,10 @@ from hilstar.optics.layers.fault_kinds import KINDS
 
 pytestmark = pytest.mark.study
 
+UPPER, LOWER, LEFT, RIGHT = slice(540), slice(540, None), slice(960), slice(960, None)
+# of 1920 x 1080 px: the upper left one, its neighbours, and the lower right one
+QUARTERS = ((UPPER, LEFT), (LOWER, LEFT), (UPPER, RIGHT), (LOWER, RIGHT))
+
 
 @pytest.fixture(scope="module")
 def faults_study(whole_study):
@@ -103,6 +107,11 @@ def test_each_fault_changes_the_frame_as_its_kind_says(panel):
     for case in ("40 tracks of 12 px", "400 tracks of 25 px", "flash at a star", "gradient"):
         faulty, without = shown(panel, case)
         assert (faulty - without).sum() > 0.01 * without.sum(), case
+    # a map of nothing at the upper left corner, and of the most at the lower right one
+    faulty, without = shown(panel, "measured map")
+    added = faulty - without
+    first, *sides, last = (added[rows, columns].mean() for rows, columns in QUARTERS)
+    assert 0 < 1.5 * first < min(sides) <= max(sides) < last
     faulty, without = shown(panel, NOWHERE)
     np.testing.assert_array_equal(faulty, without)
 

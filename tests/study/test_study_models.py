@@ -253,6 +253,9 @@ def test_the_source_s_step_is_in_the_table(made):
     step_k = table["wang2021_k"][zero] - table["wang2021_k"][zero - 1]
     # thesis eq. 3.13
     assert step_k == pytest.approx(8906.09411 + 3.633 - (1079.20644 + 8180.59419), abs=0.01)
+    percent = 100 * -step_k / table["wang2021_k"][zero - 1]
+    step = f"wang2021 steps down by {-step_k:.0f} K ({percent:.1f} %) at B-V = 0"
+    assert made("temperature_scales").text.startswith(step)
     assert abs(np.diff(table["ballesteros2012_k"])[zero - 1]) < 0.01
     ratio = table["ballesteros2012_k"] / table["torres2010_k"]
     assert table["ballesteros2012_percent"] == pytest.approx(100 * (ratio - 1), abs=1e-9)
@@ -866,3 +869,13 @@ def test_torres_has_supergiants_of_their_own_and_wang_steps_down_at_zero():
     assert abs(errors.percent[models.SUPERGIANTS][one]) > 1.0
     within = errors.within["wang2021"]
     assert 0 < within[0] < within[1]
+
+
+def test_stars_beyond_a_scale_s_colours_are_not_within_anything():
+    """Of an error that rises from 0 to 1 mag over B-V of 0.5 to 0.6."""
+    bright = load_catalog()
+    bv_mag = bright.bv_mag[bright.v_mag <= 7.5]
+    inside = bv_mag[(bv_mag >= 0.5) & (bv_mag <= 0.6)]
+    assert 1000 < len(inside) < 0.1 * len(bv_mag)
+    wanted = np.percentile((inside - 0.5) / 0.1, (50, 95))
+    assert models.within_mag(np.array([0.5, 0.6]), np.array([0.0, 1.0])) == pytest.approx(wanted)

@@ -257,8 +257,12 @@ def test_errors_of_each_centroider_and_against_time_are_drawn_by_their_panel(row
     shares = [row.share for row in table]
     left = f"exact leaves {min(shares):.2f} to {max(shares):.2f} of the error"
     assert left in run.title("e")
+    # the first panel's names are those of all
+    names = [text.get_text() for text in each.axes[0].get_yticklabels()]
+    assert names == [row.centroider for row in table if row.bits == BITS[0]]
     for axes, bits in zip(each.axes, BITS, strict=True):
         own = [row for row in table if row.bits == bits]
+        assert [row.centroider for row in own] == names
         round_line, exact_line = axes.get_lines()[-2:]
         assert round_line.get_xdata().tolist() == [row.round_px for row in own]
         assert exact_line.get_xdata().tolist() == [row.exact_px for row in own]

@@ -214,3 +214,29 @@ def test_a_star_s_corner_is_its_area_s_middle_rounded_down():
     image[101:103, width - rigs.EDGE_PX : width - rigs.EDGE_PX + 2] = lit
     columns, rows = rigs.found_stars(image)
     assert (columns.tolist(), rows.tolist()) == ([51, 71], [100, 201])
+
+
+def test_lines_of_a_grid_count_by_the_third_power_of_their_light():
+    """A line's determinant, of three sums of its pixels, is that of its mirror image: of tops at
+    v and -v the common one is v (1 - k^3) / (1 + k^3) for k times the light.
+    """
+    at = np.arange(-2, 3)
+    line = np.exp(-((at - 0.37) ** 2) / (2 * 0.8**2))
+    for times in (1.0, 2.0, 5.0):
+        lines = 100 * np.stack([line, times * line[::-1]])
+        wanted_px = 0.37 * (1 - times**3) / (1 + times**3)
+        assert rigs._vertex(lines[None])[0] == pytest.approx(wanted_px, abs=GRID_PX)
+
+
+def test_the_rig_sees_stars_up_to_its_edge_on_every_side(monkeypatch):
+    """Of stars all over the panel: 640 by 480 px without 5 px on each side, but for the rows at the
+    end, which the panel does not reach.
+    """
+    x, y = np.meshgrid(np.linspace(-0.14, 0.14, 281), np.linspace(-0.1, 0.1, 201))
+    everywhere = np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
+    monkeypatch.setattr(rigs, "polar_stars", lambda: everywhere)
+    x_px, y_px = rigs.rig_field().pixel_px
+    # stars stand 2.7 px apart
+    assert 5 < x_px.min() < 5 + 3 and 635 - 3 < x_px.max() < 635
+    panel_end_px = 225.697237 + 2686.74091 * 540 / LASSI_PX_A_RADIAN
+    assert 5 < y_px.min() < 5 + 3 and panel_end_px - 3 < y_px.max() < panel_end_px

@@ -70,7 +70,7 @@ def outcomes(timing_study):
 
 
 def test_the_page_s_table_is_of_what_is_measured_now(timing_study):
-    figures = ("rms_arcsec", "worst_arcsec")
+    figures = ("rms_arcsec", "worst_arcsec", "flux_rms_mag")
     assert_recorded(timing_study[0] / "timing.csv", ("way", "rate_deg_s"), figures)
 
 
@@ -182,6 +182,10 @@ def test_the_charts_of_timing_draw_the_rows(small):
             wanted = laws.off_s * 3600 if panel == 0 else -2.5 * np.log10(laws.light)
             np.testing.assert_allclose(foretold[0], np.linspace(0, 1, 801))
             np.testing.assert_allclose(foretold[1], wanted, atol=1e-9)
+    # ticks are of what is drawn
+    ticks = run.charts["beat"].axes[0].get_yticks()
+    largest = max(abs(row["off_arcsec"]) for row in beat)
+    assert 0.0 in ticks and len(ticks) > 2 and np.abs(ticks).max() < 3 * largest
     lines = run.lines("stripes", 0)
     for case in timing.STRIPE_CASES:
         mine = [

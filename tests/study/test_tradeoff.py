@@ -16,14 +16,18 @@ import pytest
 
 from hilstar.basics import charts
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import angle_between_rad
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    from_rotation_vector,
+    to_matrix,
+)
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.target import Target
 from hilstar.display.render.variants import SplatVariant, VariantRenderer
 from hilstar.instruments.study import sweep, trials
 from hilstar.instruments.study.codes import star_field
-from hilstar.instruments.study.predictors import predictors, slew_attitude, slew_sample
+from hilstar.instruments.study.predictors import ORION, predictors, slew_attitude, slew_sample
 from hilstar.instruments.study.sweep import MAX_ROUNDS, MIN_ROUNDS, Load, in_turn, pareto_front
 from hilstar.instruments.study.tradeoff import light, places
 from hilstar.instruments.study.tradeoff import run as tradeoff
@@ -51,6 +55,7 @@ from hilstar.instruments.study.trials import (
     ms_words,
     table_lines,
 )
+from hilstar.optics.camera import Camera
 from hilstar.optics.psf import MAX_CUT
 from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
@@ -763,3 +768,63 @@ def test_sprites_of_a_path_stand_about_its_middle_and_share_its_light():
         spread = share @ at**2
         even = (1 - 1 / len(at) ** 2) / 12
         assert spread == pytest.approx(even if np.ptp(share) == 0 else 1 / 12, rel=1e-9)
+
+
+def seen_camera(turn_rad: float = 0.0) -> Camera:
+    """A display of 100 x 60 px, turned about the boresight."""
+    to_image = to_matrix(from_rotation_vector(np.array([0.0, 0.0, turn_rad])))
+    return Camera((100, 60), 1000.0, (49.5, 29.5), to_image)
+
+
+def test_a_turn_is_into_the_camera_first_and_then_into_its_image():
+    """A star beside the boresight is in the image where the camera that is turned has it."""
+    camera = seen_camera(0.4)
+    first, second, _ = places.random_turns(3, camera)
+    ra, dec = math.radians(84.057), math.radians(-1.2)
+    boresight = np.array(
+        [math.cos(dec) * math.cos(ra), math.cos(dec) * math.sin(ra), math.sin(dec)]
+    )
+    np.testing.assert_allclose(first @ boresight, [0, 0, 1], atol=1e-12)
+    assert abs(second @ boresight - [0, 0, 1]).max() > 0.01
+    beside_cam = np.array([1e-2, 0.0, 1.0])
+    beside = to_matrix(ORION).T @ beside_cam
+    x_px, y_px = camera.project((first @ beside)[None])
+    assert abs(x_px[0] - 49.5) == pytest.approx(10 * math.cos(0.4))
+    assert abs(y_px[0] - 29.5) == pytest.approx(10 * math.sin(0.4))
+
+
+@pytest.mark.parametrize("name", places.ROADS)
+def test_a_road_s_sprites_are_those_that_reach_into_the_image(name):
+    """Half of 10 px beyond the outermost pixels, in columns and rows of its own."""
+    camera = seen_camera()
+    wanted_px = np.array([[10.0, 40.0], [103.0, 20.0], [107.0, 20.0], [30.0, 63.0], [30.0, 67.0]])
+    slopes = (wanted_px - [49.5, 29.5]) / 1000.0
+    vectors = np.column_stack([slopes, np.ones(len(slopes))])
+    found_px = places.ROADS[name].places_px(vectors, np.eye(3), camera).astype(np.float64)
+    wanted_px[[2, 4]] = np.nan
+    np.testing.assert_allclose(found_px, wanted_px, atol=1e-3)
+
+
+def test_stars_that_are_tested_are_all_of_a_scan_and_those_of_near_cells():
+    camera = places.ideal_monitor(places.demo_config())
+    (turn,) = places.random_turns(1, camera)
+    stars = places.stars_to(6.0)
+    every, near = places.scan(stars, turn, camera), places.by_cells(stars, turn, camera)
+    assert every.tested == len(stars) == places.by_angle(stars, turn, camera).tested
+    assert sorted(near.star.tolist()) == sorted(every.star.tolist())
+    # cells reach beyond the field, and are a small part of the sky
+    assert 1.2 * len(near.star) < near.tested < 0.1 * len(stars)
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_path_s_length_is_along_the_axis_that_it_takes(axis):
+    """Through the lens of the demo's tracker, a turn about one axis moves the other's pixels."""
+    bench = places.smear_bench()
+    rate_rad_s = np.zeros(3)
+    rate_rad_s[axis] = math.radians(1.0)
+    motion = replace(bench.motion, rate_cam_rad_s=rate_rad_s)
+    bench = replace(bench, motion=motion)
+    stars = bench.grid_stars(1)
+    path_px = math.radians(1.0) * motion.exposure_s * bench.camera.focal_length_px
+    assert path_px > 1
+    assert places.path_words(bench, stars) == f"{path_px:.0f} to {path_px:.0f} px"

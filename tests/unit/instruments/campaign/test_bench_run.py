@@ -19,6 +19,7 @@ from hilstar.attitude.clock.timeline import Attitude
 from hilstar.basics.notices import Notices
 from hilstar.basics.rotation import from_rotation_vector, multiply
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.instruments.campaign import bench_run
 from hilstar.instruments.campaign.bench_run import NO_ANSWER, BenchOrder, BenchRun
 from hilstar.instruments.campaign.cases import CaseMaker, bench_columns
 from hilstar.instruments.campaign.plan import Design, parse_plan
@@ -442,3 +443,15 @@ def test_a_recovery_is_by_an_exposure_after_the_fault_s_end_and_until_its_answer
     now = cases.run._now
     cases.pass_s(0.02)
     assert now.recovery_s == pytest.approx(0.1, abs=0.011)
+
+
+def test_a_change_over_a_run_is_that_from_its_first_check_to_its_last():
+    """Of 0.1 a second over 30 s, though the first check has no value; three on a line are sure."""
+    at_s = np.array([0.0, 10.0, 20.0, 30.0])
+    change, sigma = bench_run._line(at_s, [None, 1.0, 2.0, 3.0])
+    assert (change, sigma) == (pytest.approx(3.0), pytest.approx(0.0, abs=1e-9))
+    assert bench_run._line(at_s, [None, 1.0, 2.0, None]) == (pytest.approx(3.0), None)
+    assert bench_run._line(at_s, [None, 1.0, None, None]) is None
+    # residuals of 1, -2 and 1: 6 over one degree of freedom, and 200 s^2 about the middle
+    change, sigma = bench_run._line(at_s, [None, 1.0, -1.0, 3.0])
+    assert (change, sigma) == (pytest.approx(3.0), pytest.approx(math.sqrt(6 / 200) * 30))

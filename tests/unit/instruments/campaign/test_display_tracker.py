@@ -27,7 +27,9 @@ AROUND_PX = 12  # of Rigel, where no star to V 4 stands
 CODES_PX, CODES_PX2 = 0.03, 0.06
 
 
-def shown_file(path: Path, **tracker: Any) -> BenchFile:
+def shown_file(
+    path: Path, quantisation: str = "exact", background: Any = None, **tracker: Any
+) -> BenchFile:
     """A bench file whose display covers the tracker's field."""
     tables = {
         "tracker": {
@@ -40,8 +42,10 @@ def shown_file(path: Path, **tracker: Any) -> BenchFile:
         "sky": {"faintest_v_mag": 4.0},
         "monitor": {"resolution_px": [640, 480], "bits": 10, "refresh_hz": REFRESH_HZ},
         "collimator": {"focal_length_mm": 250},
-        "render": {"quantisation": "exact"},
+        "render": {"quantisation": quantisation},
     }
+    if background is not None:
+        tables["background"] = background
     path.write_text(bench_text(tables))
     return read_bench_file(path)
 
@@ -93,3 +97,28 @@ def test_a_tracker_that_changes_is_one_of_the_new_file(
     before, after, wanted = images
     np.testing.assert_array_equal(after, wanted)
     assert not np.array_equal(before, after) or "exposure_s" in change
+
+
+def test_a_black_screen_is_as_bright_as_the_image_between_its_stars(tmp_path: Path) -> None:
+    background = {"electrons_per_px": 2000.0, "gradient_electrons_across": [3000.0, 0.0]}
+    file = shown_file(tmp_path / "bench.toml", background=background)
+    with contextlib.closing(DisplayTracker(file)) as tracker:
+        dark_dn = tracker.dark_dn(EXPOSURE_S)
+        image = tracker.expose(View.exposure(RIGEL, STILL, EXPOSURE_S), None)
+    assert dark_dn is not None
+    gain_e_per_dn = file.config.tracker.detector.gain_e_per_dn
+    assert np.ptp(dark_dn) == pytest.approx(3000.0 / gain_e_per_dn, rel=0.05)
+    # stars to V 4 are in a hundredth of the pixels; a code is a DN
+    off_dn = np.abs(image.dn - dark_dn)
+    assert np.percentile(off_dn, 90) <= 1.0
+
+
+def test_a_quantisation_that_was_chosen_stays_where_the_display_does(tmp_path: Path) -> None:
+    file = shown_file(tmp_path / "bench.toml", quantisation="auto")
+    moved = shown_file(tmp_path / "new.toml", "auto", principal_point_px=[50.5, 29.0])
+    with contextlib.closing(DisplayTracker(file)) as tracker:
+        chosen = tracker._bench.config.render
+        tracker.change(moved)
+        assert tracker._bench.config.tracker.principal_point_px == (50.5, 29.0)
+        assert tracker._bench.config.render == chosen
+    assert chosen.quantisation != "auto"

@@ -356,3 +356,15 @@ def test_sure_costs_come_first_and_then_the_largest(rng: np.random.Generator):
     assert (found[0].best, found[0].worst) == (0, 2)
     levels = found[0].level
     assert found[0].cost == pytest.approx(math.sqrt((levels**2).mean() - levels[0] ** 2))
+
+
+def test_some_cases_are_their_rows_of_every_column() -> None:
+    lists = [np.arange(float(k)) for k in range(4)]
+    columns = Columns(9, {"x": np.arange(4.0)}, {"why": list("abcd")}, {"times": lists})
+    some = columns.some(np.array([False, True, False, True]))
+    assert (some.cases, some.numbers["x"].tolist(), some.texts) == (
+        9,
+        [1.0, 3.0],
+        {"why": ["b", "d"]},
+    )
+    assert [values.tolist() for values in some.lists["times"]] == [[0.0], [0.0, 1.0, 2.0]]

@@ -13,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from hilstar.basics.rotation import from_radec_roll_deg, from_rotation_vector, multiply
 from hilstar.basics.units import ARCSEC_PER_RAD
@@ -42,6 +43,7 @@ EXAMPLES = ROOT / "examples"
 # the field's lever for roll.
 CROSS_LIMIT_ARCSEC = 5 * 4 / np.sqrt(12)
 ROLL_LIMIT_ARCSEC = 30 * CROSS_LIMIT_ARCSEC
+SAME_TURN_ARCSEC = 1e-6  # float64 on 1e6 arcsec, over a dozen stars
 
 
 @pytest.fixture(scope="module")
@@ -321,3 +323,48 @@ def test_of_what_a_program_says_the_last_line_counts() -> None:
     two = "1 0 0 0\n0 1 0 0\ndone in 3 s\n"
     assert printed_attitude(two) == [0.0, 1.0, 0.0, 0.0]
     assert printed_attitude('{"q": [1, 0, 0, 0]}\n{"q": [0, 0, 1, 0]}\n{"t": 1}') == [0, 0, 1, 0]
+
+
+def test_centroids_turn_by_the_least_squares_of_their_light(
+    seen: tuple[Simulator, Exposure],
+) -> None:
+    """As scipy weighs the same centroids by their electrons; even weights are another attitude."""
+    simulator, exposure = seen
+    answer = solver("centroids").solve(exposure, simulator)
+    errors = answer.star_errors
+    assert errors is not None and answer.q_icrs_to_cam is not None
+    x_px, y_px = errors.star["x_px"], errors.star["y_px"]
+    true = simulator.camera.rays(x_px, y_px)
+    measured = simulator.camera.rays(x_px + errors.dx_px, y_px + errors.dy_px)
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    measured /= np.linalg.norm(measured, axis=1, keepdims=True)
+    off_arcsec = []
+    for weights in (errors.star["electrons_per_s"], np.ones(len(true))):
+        turn, _ = Rotation.align_vectors(measured, true, weights=weights)
+        commanded = Rotation.from_quat(exposure.view.q_icrs_to_cam, scalar_first=True)
+        wanted = (turn * commanded).as_quat(scalar_first=True)
+        off_arcsec.append(np.abs(attitude_error_arcsec(wanted, answer.q_icrs_to_cam)).max())
+    assert off_arcsec[0] < SAME_TURN_ARCSEC < 100 * SAME_TURN_ARCSEC < off_arcsec[1]
+
+
+def test_false_stars_are_those_that_match_none_and_no_star_at_the_edge_is_reported(
+    seen: tuple[Simulator, Exposure],
+) -> None:
+    simulator, exposure = seen
+    dn = exposure.dn.copy()
+    dn[:3, :3] += 3000
+    answer = solver("centroids").solve(replace(exposure, dn=dn), simulator)
+    errors = answer.star_errors
+    assert errors is not None and answer.stars is not None
+    # a crowded star is matched, and has no error of its own
+    truth = np.concatenate([exposure.truth, exposure.truth])
+    crowded = solver("centroids").solve(replace(exposure, truth=truth, dn=dn), simulator)
+    assert crowded.star_errors is not None
+    for counted in (errors, crowded.star_errors):
+        assert counted.false == counted.found - counted.matched >= 1
+    assert len(crowded.star_errors.dx_px) < crowded.star_errors.matched
+    usual = solver("centroids").solve(exposure, simulator)
+    assert usual.star_errors is not None and usual.stars is not None
+    assert errors.found == usual.star_errors.found + 1
+    assert len(answer.stars) == len(usual.stars)
+    assert min(np.hypot(star.x_px, star.y_px) for star in answer.stars) > 3

@@ -212,6 +212,11 @@ def test_figures_have_the_detector_and_the_light_that_were_planted(night: Night)
         assert image["background_chi2"] == pytest.approx(1.0, abs=0.05)
         assert image["star_chi2"] < 2.0
         assert image["missing"] == 0
+    for verdict in night.found.verdicts:
+        clean = verdict.shot.clean
+        # stars with a neighbour are fitted worse
+        assert not clean.all()
+        assert verdict.star_chi2 == np.median(verdict.shot.found.chi2[clean])
     assert night.found.figures["passed"] is (not night.found.failures)
 
 

@@ -629,7 +629,9 @@ def test_an_attitude_is_tried_from_the_least_count_of_sources_on(tmp_path, monke
     monkeypatch.setattr(sessions, "_solve", lambda field, *where: tried.append(field.places_px))
     with pytest.raises(InputError, match="no part of the sky fits them"):
         sessions.open_shot(bench(tmp_path), star_field(MIN_MATCHED), CAMERA, None)
-    assert len(tried[0]) == MIN_MATCHED
+    # as they are, and then with left and right exchanged
+    assert [len(places_px) for places_px in tried] == [MIN_MATCHED, MIN_MATCHED]
+    np.testing.assert_array_equal(tried[1], tried[0] * [-1, 1])
     del tried[:]
     with pytest.raises(InputError, match=f"{MIN_MATCHED - 1} sources stand out"):
         sessions.open_shot(bench(tmp_path), star_field(MIN_MATCHED - 1), CAMERA, None)

@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from hilstar.instruments.confront import judge
@@ -45,6 +46,7 @@ PSF = StarPsf(
 # By central differences of 1e-5: their own error is 1e-10 of the function and 1e-11 by rounding.
 STEP, SLOPE_ERROR = 1e-5, 1e-8
 GAIN = 0.8
+FWHM_STEP_PX = 0.01  # of the radii at which a PSF's light is looked at
 MAG_A_RELATIVE = 2.5 / math.log(10)
 
 
@@ -389,6 +391,24 @@ def test_a_core_is_widened_by_colour_and_stays_an_ellipse():
         assert psf.core(*middle, np.array([np.nan])) == pytest.approx(np.array([[1, 0.5, kept]]))
         red = psf.core(*middle, np.array([MEAN_BV_MAG + 1.0]))
         assert red == pytest.approx(1.4 * np.array([[1, 0.5, kept]]))
+
+
+@pytest.mark.parametrize("wing_share", [0.0, 0.3, 0.6])
+def test_a_psf_is_as_wide_as_core_and_wings_together_at_half_of_their_peak(wing_share):
+    """Round Gaussians of 0.8 px^2, by the mean of 1 and 0.6, and of 2 px, each with a pixel's twelfth
+    of a px^2: SciPy's root of their sum.
+    """
+    psf = StarPsf(np.array([[1.0], [0.6], [0.1]]), 0.0, wing_share, 2.0, SIZE_PX)
+    variances = np.array([0.8, 4.0]) + 1 / 12
+    peaks = np.array([1 - wing_share, wing_share]) / variances
+
+    def over_half(radius_px: float) -> float:
+        light = peaks * np.exp(-(radius_px**2) / (2 * variances))
+        return float(light.sum() - peaks.sum() / 2)
+
+    wanted_px = 2 * brentq(over_half, 0.0, 12.0)
+    middle = np.array([MIDDLE_PX[0]]), np.array([MIDDLE_PX[1]])
+    assert psf.fwhm_px(*middle)[0] == pytest.approx(wanted_px, abs=2 * FWHM_STEP_PX)
 
 
 def test_a_pixel_weighs_by_background_photons_and_one_hundredth_of_its_own_light():

@@ -26,7 +26,10 @@ from hilstar.instruments.confront.light import (
 from hilstar.instruments.confront.session import _apart, _middles, within_image
 from hilstar.instruments.confront.star_psf import (
     HALF,
+    Measured,
+    Stamps,
     StarPsf,
+    _ShapeLoss,
     cut_stamps,
     field_terms,
     measure,
@@ -426,3 +429,33 @@ def test_pixels_beyond_each_edge_of_an_image_do_not_count(x_px, y_px):
     side = 2 * HALF + 1
     assert int(np.isfinite(stamps.variance).sum()) == side * (side - HALF + 1)
     assert stamps.values.sum() == side * (side - HALF + 1)
+
+
+def test_stars_of_a_psf_have_no_residuals_by_it_but_its_priors_and_slopes_by_each_number(rng):
+    """Colour and wings, too. Of the priors, of one sigma a number, those of the field's coefficients
+    alone are off; wings are held where they were.
+    """
+    covariance = np.array([[0.9, 0.2], [0.7, -0.1], [0.1, 0.05]])
+    psf = replace(PSF, covariance=covariance)
+    places_px = rng.uniform([30, 30], [600, 440], (5, 2))
+    nothing = np.zeros((5, 2 * HALF + 1, 2 * HALF + 1))
+    middle_px = np.rint(places_px)
+    stamps = Stamps(nothing, nothing + 4.0, *middle_px.T, rng.uniform(-0.2, 1.8, 5))
+    dx, dy = stamps.offsets(*places_px.T)
+    core = psf.core(*places_px.T, stamps.bv_mag)
+    flux_dn = np.array([500.0, 800.0, 2000.0, 3000.0, 900.0])
+    shown = flux_dn[:, None, None] * psf.on_pixels(dx, dy, core)[0] + 7.0
+    one = np.ones(5)
+    at = Measured(*places_px.T, flux_dn, one, one, one)
+    loss = _ShapeLoss(replace(stamps, values=shown), at, psf, GAIN, wide=True)
+    start = loss.start
+    off = loss.residuals(start)
+    pixels = nothing.size
+    assert off[:pixels] == pytest.approx(0.0, abs=1e-6)
+    assert off[pixels:] == pytest.approx([0.2, -0.1, 0.05, 0.0, 0.0])
+    slopes = loss.slopes(start, off)
+    for number in range(len(start)):
+        step = STEP * np.eye(len(start))[number]
+        wanted = (loss.residuals(start + step) - loss.residuals(start - step)) / (2 * STEP)
+        within = 1e-5 * np.abs(wanted).max()
+        assert slopes[:, number] == pytest.approx(wanted, abs=within)

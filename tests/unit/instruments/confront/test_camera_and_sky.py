@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from hilstar.basics.rotation import from_matrix, from_rotation_vector, multiply, to_matrix
+from hilstar.instruments.confront import lost_in_space
 from hilstar.instruments.confront.camera_fit import (
     CameraFit,
     Places,
@@ -26,6 +27,8 @@ from hilstar.instruments.confront.lost_in_space import (
     CIRCLE,
     STARS_A_CIRCLE,
     SourceField,
+    _by_hypothesis,
+    _Proof,
     _triangles_of_sky,
     nearest_once,
     solve_lost,
@@ -333,3 +336,19 @@ def test_triangles_of_the_sky_are_of_two_and_a_half_times_the_stars_that_a_circl
     stars = 2.5 * STARS_A_CIRCLE * circles
     assert stars < len(vectors)
     assert 0.75 * stars < sky.triples.max() < stars + 1
+
+
+def test_a_hypothesis_is_given_up_after_so_many_candidates(rng, monkeypatch):
+    """Of triangles by chance, none of which is proved."""
+    tried = []
+    monkeypatch.setattr(_Proof, "of", lambda proof, *candidate: tried.append(candidate))
+    vectors = rng.standard_normal((2000, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    sky = _triangles_of_sky(vectors, 0.5)
+    places_px = rng.uniform([-320, -240], [320, 240], (30, 2))
+    field = SourceField(places_px, WIDE_PX, HIGH_PX)
+    for most in (5, 9):
+        monkeypatch.setattr(lost_in_space, "MAX_CANDIDATES", most)
+        assert _by_hypothesis(field, 900.0, vectors, sky) is None
+        assert len(tried) == most
+        del tried[:]

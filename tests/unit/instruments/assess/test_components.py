@@ -103,6 +103,18 @@ def test_the_noise_that_a_fit_takes_up_is_no_part_of_its_variance(rng) -> None:
         assert np.mean(found) == pytest.approx(variance, abs=0.06)
 
 
+def test_functions_that_take_all_freedom_leave_noise_and_variance_finite(rng) -> None:
+    """Six of seven answers, about their mean: what is left counts as of one."""
+    basis, _ = np.linalg.qr(rng.normal(size=(7, 6)))
+    functions = SimpleNamespace(fit=lambda wanted: basis @ (basis.T @ wanted), freedom=6.0)
+    error = rng.normal(size=(7, 3))
+    fitted = functions.fit(error)
+    left = ((error - fitted) ** 2).sum(axis=0)
+    wanted = np.maximum(((fitted**2).sum(axis=0) - 6 * left) / 7, 0.0)
+    assert wanted.any()
+    assert _component(functions, error, 0.0).variance == pytest.approx(wanted)
+
+
 def test_the_noise_of_few_answers_has_the_freedom_that_is_left_by_the_fits() -> None:
     """Of 24 runs' axes with some 130 numbers each the mean is known to 0.025; 150 for the freedom
     would be 0.1 too little.

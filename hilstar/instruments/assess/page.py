@@ -125,9 +125,14 @@ def verdict_of(found: Assessment) -> Verdict:
 
 
 def _counted(count: int, noun: str) -> str:
+    return f"{count or 'no'} {_number_of(count, noun)}"
+
+
+def _number_of(count: int, noun: str) -> str:
+    """The noun in the singular or the plural of a count."""
     if count == 1:
-        return f"1 {noun}"
-    return f"{count or 'no'} {noun}s"
+        return noun
+    return f"{noun}s"
 
 
 def _percent(found: Assessment) -> str:
@@ -147,10 +152,10 @@ def _counts(found: Assessment) -> Iterator[KeyFigure]:
         state = WARN
     cycle = f"availability: {lock.right} of {lock.due} answers due"
     yield KeyFigure(_percent(found), f"{cycle}, one each {1e3 * lock.cycle_s:.4g} ms", state)
-    yield _count(len(found.wrong), "wrong answers", BAD)
-    yield _count(len(lock.lost), "lost locks", BAD)
+    yield _count(len(found.wrong), _number_of(len(found.wrong), "wrong answer"), BAD)
+    yield _count(len(lock.lost), _number_of(len(lock.lost), "lost lock"), BAD)
     run = found.run.run
-    of = "missed frames"
+    of = _number_of(run.missed, "missed frame")
     if run.missed:
         share = f"{100 * run.missed_share:.2g} % of the refresh periods"
         of = f"{of}, {share}; {run.held} frames were held for them"

@@ -121,6 +121,9 @@ def test_slices_have_back_what_the_fits_took_and_leave_out_what_is_not_known():
     assert slices_of(value[282:], sense[282:] * np.ones(3), sense[282:] * np.ones(3), 0.0) == ()
     (alike,) = slices_of(np.full(30, 7.0), np.ones((30, 3)), np.ones((30, 3)), 0.0)
     assert (alike.low, alike.high, alike.answers) == (7.0, 7.0, 30)
+    # twenty are enough for a slice
+    (fewest,) = slices_of(np.full(20, 7.0), np.ones((20, 3)), np.ones((20, 3)), 0.0)
+    assert fewest.answers == 20
 
 
 def test_a_limit_is_the_median_of_fields_all_along_a_run(monkeypatch):

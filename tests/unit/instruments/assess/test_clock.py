@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from hilstar.basics.arrays import FloatArray
@@ -17,12 +18,15 @@ from hilstar.instruments.assess.clock import (
     ClockSolver,
     CoarseClock,
     _correlation,
+    _variances,
     coarse_offset,
     honest,
+    most_likely,
     speed_offsets,
     weights_of,
 )
 from hilstar.instruments.assess.components import global_phases
+from hilstar.instruments.assess.places import bumps_at, centres_of
 from hilstar.server.record.commanded import Commanded
 from tests.support.assessments import a_clock
 from tests.support.planted_tracker import SCALE, attitude, scalar_first
@@ -250,3 +254,28 @@ def test_a_telemetry_s_time_is_put_on_the_run_s_clock() -> None:
     """An hour after a start at 100 s, of a clock 1.25 ms ahead and 12.5 ppm fast."""
     told_s = 100 + 0.00125 + 3600 * (1 + 12.5e-6)
     assert a_clock().run_s(np.array([told_s]), 100.0) == pytest.approx([3700.0], rel=1e-12)
+
+
+def test_the_likelihood_of_bumps_is_that_of_all_axes_together(rng) -> None:
+    """By SciPy's multivariate normal law, of which the variances found are the most likely: an
+    error over the place along x, along y, and noise alone.
+    """
+    at_px = np.linspace(0.0, 600.0, 80)
+    place = at_px[:, None] * np.eye(6)[0]
+    bumps = bumps_at(place, centres_of(place, 100.0), 100.0)
+    error = np.stack([np.sin(at_px / 90), 0.5 * np.cos(at_px / 70), 0 * at_px], axis=1)
+    residual = error + 0.3 * rng.standard_normal((80, 3))
+    residual -= residual.mean(axis=0)
+    smooth, likelihood = _variances(bumps, residual)
+    dense = np.asarray(bumps.todense())
+    constant = 40 * (1 + np.log(2 * np.pi))
+    by_axis = []
+    for axis in range(3):
+        shape = np.eye(80) + smooth.kappa[axis] * dense @ dense.T
+        law = stats.multivariate_normal(np.zeros(80), smooth.variance[axis] * shape)
+        by_axis.append(law.logpdf(residual[:, axis]) + constant)
+    assert likelihood == pytest.approx(sum(by_axis))
+    # and of white noise where there are no bumps, by which these are taken
+    taken = most_likely(place, residual)
+    assert taken.bumps is not None
+    assert (taken.kappa[:2] > 0.01).all()

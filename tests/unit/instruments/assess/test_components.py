@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess.components import (
     EDGES,
     LOCAL,
@@ -15,6 +16,8 @@ from hilstar.instruments.assess.components import (
     Phases,
     _best_of,
     _component,
+    _stretches,
+    best_direction,
     components_of,
 )
 from tests.support.claims import holds
@@ -100,6 +103,18 @@ def test_the_noise_that_a_fit_takes_up_is_no_part_of_its_variance(rng) -> None:
         assert np.mean(found) == pytest.approx(variance, abs=0.06)
 
 
+def test_functions_that_take_all_freedom_leave_noise_and_variance_finite(rng) -> None:
+    """Six of seven answers, about their mean: what is left counts as of one."""
+    basis, _ = np.linalg.qr(rng.normal(size=(7, 6)))
+    functions = SimpleNamespace(fit=lambda wanted: basis @ (basis.T @ wanted), freedom=6.0)
+    error = rng.normal(size=(7, 3))
+    fitted = functions.fit(error)
+    left = ((error - fitted) ** 2).sum(axis=0)
+    wanted = np.maximum(((fitted**2).sum(axis=0) - 6 * left) / 7, 0.0)
+    assert wanted.any()
+    assert _component(functions, error, 0.0).variance == pytest.approx(wanted)
+
+
 def test_the_noise_of_few_answers_has_the_freedom_that_is_left_by_the_fits() -> None:
     """Of 24 runs' axes with some 130 numbers each the mean is known to 0.025; 150 for the freedom
     would be 0.1 too little.
@@ -164,3 +179,53 @@ def test_a_direction_that_was_sought_has_to_explain_more_than_one_that_is_known(
         assert (waves_found is not None) is is_found
         assert (best is not None and best.name == name) is is_found
         assert component.detail == (name if is_found else "")
+
+
+@pytest.mark.parametrize(
+    ("rolled_cells", "cell_px", "starts"),
+    [
+        # 256 answers at most while the mount does not roll, where a cell is a pixel and more
+        (0.0, 4.0, [0, 256, 512, 768]),
+        (0.0, 0.5, [0]),
+        # and 16 at least: of a roll over a quarter of a cell in ten
+        (0.025, 4.0, list(range(0, 1000, 20))),
+    ],
+)
+def test_stretches_end_with_a_roll_over_a_quarter_of_a_cell(rolled_cells, cell_px, starts):
+    total = 1000 if not rolled_cells else 200
+    # in the middle of a step, so that no rounding decides
+    roll_rad = (np.arange(total) + 0.5) * rolled_cells / cell_px
+    first, rows = _stretches(roll_rad, cell_px, total)
+    assert first.tolist() == [start for start in starts if start < total]
+    assert rows.tolist() == list(range(total))
+
+
+def test_whole_stretches_over_all_of_a_run_stand_for_it():
+    """Half of eight stretches of 256 answers: each one's first row among those that are taken."""
+    first, rows = _stretches(np.zeros(2048), 4.0, 1024)
+    assert first.tolist() == [0, 256, 512, 768]
+    taken = rows.reshape(4, 256)
+    assert (taken - taken[:, :1] == np.arange(256)).all()
+    assert (taken[:, 0] % 256 == 0).all()
+    assert taken[0, 0] == 0 and taken[-1, 0] >= 1536
+
+
+def test_a_star_beside_the_mean_boresight_is_sought_where_no_axis_of_the_sky_is_near() -> None:
+    """Five degrees from (1, 1, 1), of a field of 5.4 about boresights up to 0.6 degrees off."""
+
+    def motion(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        turn = 2 * np.pi * t_s
+        return 45 + 0.6 * np.sin(turn / 391), 35.26 + 0.5 * np.cos(turn / 271), 0 * t_s
+
+    true = attitude(motion, np.arange(0.0, 600.0, 1.5))
+    axes = true.as_matrix()
+    to_icrs = attitude(lambda t_s: (45 + 0 * t_s, 35.26 + 0 * t_s, 0 * t_s), np.zeros(1)).inv()
+    off = np.tan(np.radians([3.5, -3.6]))
+    star = to_icrs.apply([*off, 1.0])[0] / np.hypot(1.0, np.hypot(*off))
+    in_cam = axes @ star
+    x, y = SCALE.focal_px * in_cam[:, :2].T / in_cam[:, 2]
+    error = np.cos(2 * np.pi * np.stack([x, y, x], axis=1))
+    found = best_direction(error, axes, SCALE)
+    assert found is not None
+    # a place some whole pixels beside it has nearly the same phases
+    assert np.linalg.norm(found - star) * SCALE.focal_px < 5.0

@@ -4,6 +4,7 @@ tables, lines and JSON.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -125,9 +126,9 @@ def test_the_band_of_a_page_has_the_verdict_and_the_four_counts(cards) -> None:
         "56.2 %",
         "availability: 9 of 16 answers due, one each 250 ms",
         "1",
-        "wrong answers",
+        "wrong answer",
         "1",
-        "lost locks",
+        "lost lock",
         "6",
         "missed frames, 5.7 % of the refresh periods; 2 frames were held for them",
     ]
@@ -367,6 +368,7 @@ def test_a_clock_that_the_motion_does_not_tell_has_no_figures(made: Assessment) 
         (16, 0, 0, 0, OK, "no wrong answers, no lost locks, no missed frames."),
         (16, 0, 0, 1, WARN, "no wrong answers, no lost locks, 1 missed frame."),
         (15, 0, 0, 0, WARN, "no wrong answers, no lost locks, no missed frames."),
+        (16, 1, 0, 0, BAD, "1 wrong answer, no lost locks, no missed frames."),
         (16, 2, 0, 0, BAD, "2 wrong answers, no lost locks, no missed frames."),
         (16, 0, 1, 0, BAD, "no wrong answers, 1 lost lock, no missed frames."),
     ],
@@ -391,6 +393,9 @@ def test_a_verdict_is_bad_by_wrong_answers_and_lost_locks_and_a_warning_by_the_r
     states = [OK if right == 16 else WARN, BAD if wrong else OK, BAD if lost else OK]
     states.append(WARN if missed else OK)
     assert [part.split('"')[0] for part in tiles.split('data-state="')[1:]] == states
+    # a tile names one thing in the singular, as the sentence does
+    for noun in counts.removesuffix(".").split(", "):
+        assert noun.partition(" ")[2] in re.split(r"[<>,]", tiles)
 
 
 @pytest.mark.parametrize(("wrong", "lost", "missed"), [(1, 0, 0), (0, 1, 0), (0, 0, 1), (0, 0, 0)])

@@ -484,6 +484,24 @@ def test_a_lens_s_slopes_are_how_far_a_number_moves_the_directions_it_shows(numb
     np.testing.assert_allclose(slopes, wanted, atol=0.01 * largest)
 
 
+@pytest.mark.parametrize(("degree", "polynomials"), [(0, 10), (7, 36), (9, 55)])
+def test_a_lens_is_its_numbers_and_cubics_or_polynomials_of_a_degree_alone(degree, polynomials):
+    """A polynomial of two variables has (d + 1) (d + 2) / 2 terms, along either axis apart."""
+    flat = Camera((800, 600), 4000.0, (399.5, 299.5), np.eye(3))
+    nominal = fits.Nominal(flat, lens.STILL[0], flat)
+    model = fits.Model(fits.BROWN_CONRADY)
+    numbers = np.zeros(model.size)
+    fitted = fits.Fit(model, 0, numbers, fits.geometry_of(model, nominal, lens.STILL, numbers))
+    terms = lens._terms(fitted, flat, TANGENTS, flat.places_px(*TANGENTS.T), degree)
+    of_lens = lens._lens_terms(fitted, flat, TANGENTS)
+    own = 0 if degree else of_lens.shape[2]
+    assert terms.shape == (2, len(TANGENTS), own + 2 * polynomials)
+    np.testing.assert_array_equal(terms[:, :, :own], of_lens[:, :, :own])
+    along, across = terms[:, :, own : own + polynomials], terms[:, :, own + polynomials :]
+    np.testing.assert_array_equal(along[0], across[1])
+    assert not along[1].any() and not across[0].any()
+
+
 def test_a_square_s_evenness_is_the_mean_of_its_rows_and_columns(monkeypatch):
     even = np.arange(40.0).reshape(5, 8)
     calibration = SimpleNamespace(uniformity_map=lambda size: even)

@@ -156,6 +156,14 @@ def test_a_tracker_s_errors_of_direction_and_evenness_are_alike_over_half_of_its
     assert np.diag(from_middle) == pytest.approx(2 * 0.01**2 * (1 - alike[0]), abs=1e-12)
 
 
+def test_each_effect_has_slopes_by_as_many_variables_as_its_input_has(settings):
+    for name, effect in settings.items():
+        slopes = (effect.levels, effect.even, effect.place, effect.delay, effect.late, effect.sky)
+        counts = [len(by_variable) for by_variable in slopes if by_variable is not None]
+        assert counts, name
+        assert set(counts) == {effect.input.size}, name
+
+
 def test_a_warm_up_is_as_seen_or_else_as_stated_in_per_cent(tmp_path):
     file = bench(tmp_path, "[certify]\nwarm_up_percent = 0.6\n")
     stated_u = 0.006 / math.sqrt(3)

@@ -10,15 +10,19 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
+from hilstar.instruments.certify.bench_readings import DotReadings
 from hilstar.instruments.certify.estimates import (
     Evenness,
     LightDeviation,
     Surface,
     _fit_without_wild,
+    evenness,
     surface,
 )
 from hilstar.instruments.certify.structure import Cells, Structure
 from hilstar.optics.camera import field_terms
+from hilstar.server.bench.bench_file import bench_file_of
+from tests.support.benches import bench_text
 
 SIZE_PX = (1920, 1080)
 CODES, BENCHES = 40, 10
@@ -69,6 +73,19 @@ def test_a_dot_that_is_wild_along_one_axis_does_not_count(rng):
     values[41, 1] -= 5.0
     _, _, usable = _fit_without_wild(terms, values, np.ones(60, dtype=bool))
     assert np.flatnonzero(~usable).tolist() == [17, 41]
+
+
+def test_dots_that_are_too_bright_or_too_dim_tell_nothing_of_a_screen_s_evenness(tmp_path, rng):
+    """Of 400 dots of 1 % of noise, half and twice the light, and one without any."""
+    file = bench_file_of(tmp_path / "bench.toml", bench_text({}))
+    width_px, height_px = file.config.monitor.resolution_px
+    grid = np.meshgrid(np.linspace(20, width_px - 21, 20), np.linspace(20, height_px - 21, 20))
+    x_px, y_px = (places_px.ravel() for places_px in grid)
+    light = np.exp(0.01 * rng.standard_normal(400))
+    light[[37, 251, 318]] = [0.5, 2.0, 0.0]
+    found = evenness(file, DotReadings(x_px, y_px, x_px, y_px, light))
+    assert found.cells.count.sum() == 397
+    assert math.sqrt(found.structure.noise_variance) == pytest.approx(0.01, rel=0.2)
 
 
 def quartic(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -14,6 +14,7 @@ from hilstar.display.calibration import weights_of_grid
 from hilstar.instruments.calibrate.geometric.dots import DOT_PX
 from hilstar.instruments.calibrate.geometric.geometry_fit import dot_sigma_px
 from hilstar.instruments.certify import readings
+from hilstar.instruments.certify.assembly import planned_codes
 from hilstar.instruments.certify.bench_readings import (
     BesideRatio,
     geometry_of,
@@ -162,3 +163,27 @@ def test_dots_are_measured_in_a_window_no_narrower_than_they_are(tmp_path, sigma
 )
 def test_a_ratio_of_neighbours_is_off_by_what_is_beyond_its_noise(ratio, error, excess):
     assert BesideRatio(ratio, error).excess == pytest.approx(excess)
+
+
+@pytest.mark.parametrize(
+    ("white", "levels", "distinct"),
+    [
+        # a screen of three bits has no more than seven
+        (7, 40, [1, 2, 3, 4, 5, 6, 7]),
+        # steps of the fourth root of 255
+        (255, 5, [1, 4, 16, 64, 255]),
+    ],
+)
+def test_codes_are_read_in_any_order_with_black_and_white_before_every_eight(
+    white, levels, distinct, rng
+):
+    codes = planned_codes(white, levels, 4, rng)
+    count = 4 * len(distinct)
+    rounds = -(-count // 8)
+    assert len(codes) == count + 2 * (rounds + 1)
+    is_between = np.arange(len(codes)) % 10 < 2
+    is_between[-2:] = True
+    assert codes[is_between].tolist() == [0, white] * (rounds + 1)
+    planned = codes[~is_between]
+    assert sorted(planned.tolist()) == sorted(4 * distinct)
+    assert planned.tolist() != sorted(planned.tolist())

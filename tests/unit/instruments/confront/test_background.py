@@ -10,7 +10,9 @@ import pytest
 from hilstar.instruments.confront.background import (
     CLIP,
     KERNEL_PX,
+    PATTERN_CLIP,
     THRESHOLD,
+    _quiet,
     find_sources,
     is_round,
     sky_level,
@@ -196,3 +198,19 @@ def test_a_thin_source_is_a_trail_where_it_is_long(length_px, is_trail):
     assert len(found) == 1
     assert found.length_px[0] > 5 * found.width_px[0]
     assert found.trail.tolist() == [is_trail]
+
+
+def test_a_pattern_s_pixels_are_within_their_clip_to_either_side_at_their_own_light():
+    """Pixels of 1 DN to either side where it is dim, and of 10 where it is bright: 9 DN is much in
+    the dim part alone, with a sigma of 1.15 by 0.5 % that are so far off.
+    """
+    level = np.repeat([100.0, 1000.0], 1600).reshape(2, 1600) + np.arange(1600) / 1e4
+    off = np.array([[1.0], [10.0]]) * np.tile([1.0, -1.0], 800)
+    far = np.arange(0, 1600, 200)
+    off[:, far] = np.array([[9.0, -9.0] * 4, [9.0, -9.0] * 4])
+    mask = np.ones((2, 1600), dtype=bool)
+    mask[1, 7] = False
+    use = _quiet(off, level, mask)
+    assert PATTERN_CLIP * 1.2 < 9.0
+    assert np.flatnonzero(~use[0]).tolist() == far.tolist()
+    assert np.flatnonzero(~use[1]).tolist() == [7]

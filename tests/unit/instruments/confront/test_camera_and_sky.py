@@ -12,6 +12,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from hilstar.basics.rotation import from_matrix, from_rotation_vector, multiply, to_matrix
+from hilstar.instruments.confront import lost_in_space
 from hilstar.instruments.confront.camera_fit import (
     CameraFit,
     Places,
@@ -22,7 +23,16 @@ from hilstar.instruments.confront.camera_fit import (
     with_values,
 )
 from hilstar.instruments.confront.judge import _dim_regions, _Explanation
-from hilstar.instruments.confront.lost_in_space import SourceField, nearest_once, solve_lost
+from hilstar.instruments.confront.lost_in_space import (
+    CIRCLE,
+    STARS_A_CIRCLE,
+    SourceField,
+    _by_hypothesis,
+    _Proof,
+    _triangles_of_sky,
+    nearest_once,
+    solve_lost,
+)
 from hilstar.instruments.confront.photographed_sky import DatedSky
 from hilstar.instruments.confront.session import _solve
 from hilstar.optics.camera import Camera, Lens
@@ -312,3 +322,33 @@ def test_a_zenith_is_told_by_how_the_air_squeezes_a_field(rng, tangents):
     # the attitude is that without air
     error = to_matrix(found.q_icrs_to_cam) @ turn.T
     assert np.abs(error - np.eye(3)).max() < 3 * ARCSEC
+
+
+def test_triangles_of_the_sky_are_of_two_and_a_half_times_the_stars_that_a_circle_takes(rng):
+    """Of a sky of even stars, brightest first. A circle takes the brightest of its own: in the
+    poorest one that is nearly the last, and in no circle one beyond.
+    """
+    vectors = rng.standard_normal((3000, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    smaller_rad = 0.5
+    circles = 4 * np.pi / (2 * np.pi * (1 - np.cos(CIRCLE * smaller_rad)))
+    sky = _triangles_of_sky(vectors, smaller_rad)
+    stars = 2.5 * STARS_A_CIRCLE * circles
+    assert stars < len(vectors)
+    assert 0.75 * stars < sky.triples.max() < stars + 1
+
+
+def test_a_hypothesis_is_given_up_after_so_many_candidates(rng, monkeypatch):
+    """Of triangles by chance, none of which is proved."""
+    tried = []
+    monkeypatch.setattr(_Proof, "of", lambda proof, *candidate: tried.append(candidate))
+    vectors = rng.standard_normal((2000, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    sky = _triangles_of_sky(vectors, 0.5)
+    places_px = rng.uniform([-320, -240], [320, 240], (30, 2))
+    field = SourceField(places_px, WIDE_PX, HIGH_PX)
+    for most in (5, 9):
+        monkeypatch.setattr(lost_in_space, "MAX_CANDIDATES", most)
+        assert _by_hypothesis(field, 900.0, vectors, sky) is None
+        assert len(tried) == most
+        del tried[:]

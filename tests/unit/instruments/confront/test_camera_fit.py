@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_matrix
+from hilstar.instruments.confront import camera_fit
 from hilstar.instruments.confront.camera_fit import (
     GAIN,
     HUBER,
@@ -23,6 +25,8 @@ from hilstar.instruments.confront.camera_fit import (
     _affordable,
     _asked_for,
     _CameraLoss,
+    _largest,
+    _settled,
     _with_zeniths,
     fit_model,
     minimised,
@@ -239,3 +243,36 @@ def test_a_zenith_is_fitted_where_no_air_is_known(rng: np.random.Generator) -> N
     assert fitted[0] is pointings[1]
     assert fitted[1].zenith is not None
     assert fitted[1].air is None
+
+
+@pytest.mark.parametrize(("share", "is_refused"), [(0.29, True), (0.31, False)])
+def test_a_lens_that_folds_is_refused_where_places_ask_for_it(share, is_refused, monkeypatch):
+    """Its error is below three tenths of that by the largest model that does not fold."""
+    fold = replace(BASE, lens=Lens((-30.0, 0.0, 0.0)))
+    pinhole = replace(BASE, lens=None)
+    fits = {"k1": (fold, (), share), "pinhole": (pinhole, (), 1.0)}
+    by_names = {MODELS[name]: fit for name, fit in fits.items()}
+    monkeypatch.setattr(
+        camera_fit, "_settled", lambda base, pointings, seen, names: by_names[names]
+    )
+    models = {name: MODELS[name] for name in ("pinhole", "k1")}
+    if is_refused:
+        with pytest.raises(InputError, match="folds within the image"):
+            _largest(BASE, (), [], models)
+    else:
+        assert _largest(BASE, (), [], models) == ("pinhole", pinhole, (), 1.0)
+
+
+def test_a_floor_has_the_freedom_of_each_number_that_was_fitted(rng: np.random.Generator) -> None:
+    """Of 52 residuals 1 number of the camera, 3 of each of four turns and 2 of each of two zeniths
+    leave 35.
+    """
+    pointings, photographs = photographed(rng)
+    blurred = []
+    for places in photographs:
+        x_px, y_px = (axis + rng.normal(0, 0.5, len(axis)) for axis in (places.x_px, places.y_px))
+        blurred.append(replace(places, x_px=x_px, y_px=y_px, sigma_px=np.full(len(x_px), 0.1)))
+    camera, fitted, floor_px = _settled(BASE, tuple(pointings), blurred, ("log_focal",))
+    off_px = np.concatenate(CameraFit(camera, fitted, "").residuals_px(blurred))
+    spread_px = 1.4826 * float(np.median(np.abs(off_px)))
+    assert math.hypot(0.1, floor_px) == pytest.approx(spread_px * math.sqrt(52 / 35), rel=1e-3)

@@ -26,6 +26,7 @@ from hilstar.instruments.confront.judge import (
     utc_of,
 )
 from hilstar.instruments.confront.session import MATCH_PX
+from tests.support.confrontations import a_shot
 
 SIZE_PX = (800, 400)
 
@@ -244,3 +245,30 @@ def test_a_date_is_told_by_the_stars_that_move_and_by_their_places_errors(
     assert found.sigma == pytest.approx(math.hypot(0.4, used_px) / (0.4 * 2))
     shot.clean[:] = False
     assert Judge._dated(judging, 0) is None
+
+
+def test_a_background_has_neither_light_nor_sources_nor_defects():
+    """A hot pixel and a dead one, stars' light of over a tenth of a sigma, and a source with its
+    neighbours.
+    """
+    shot = a_shot(0)
+    height, width = shot.photo.dn.shape
+    hot = np.zeros((height, width), dtype=bool)
+    dead = hot.copy()
+    hot[3, 4] = dead[50, 60] = True
+    light_sigma = np.zeros((height, width))
+    light_sigma[10, 20] = 0.11
+    light_sigma[10, 40] = 0.09
+    judging: Any = SimpleNamespace(hot=hot, dead=dead)
+    background = Judge._background(judging, shot, light_sigma)
+    left_out = np.argwhere(~background).tolist()
+    assert left_out == [[3, 4], [10, 20], [50, 60]]
+    at_px = np.array([30.0])
+    one = np.ones(1)
+    no = np.zeros(1, dtype=bool)
+    source = replace(shot.sources, x_px=at_px, y_px=at_px, snr=9 * one, fwhm_px=2 * one)
+    source = replace(source, length_px=2 * one, width_px=2 * one, single=no)
+    shot.sources = source
+    with_source = Judge._background(judging, shot, light_sigma)
+    assert not with_source[30, 30]
+    assert with_source.sum() < background.sum()

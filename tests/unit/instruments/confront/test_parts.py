@@ -10,6 +10,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 from scipy.special import ndtr
 
 from hilstar.instruments.confront import judge
@@ -25,7 +26,10 @@ from hilstar.instruments.confront.light import (
 from hilstar.instruments.confront.session import _apart, _middles, within_image
 from hilstar.instruments.confront.star_psf import (
     HALF,
+    Measured,
+    Stamps,
     StarPsf,
+    _ShapeLoss,
     cut_stamps,
     field_terms,
     measure,
@@ -45,6 +49,7 @@ PSF = StarPsf(
 # By central differences of 1e-5: their own error is 1e-10 of the function and 1e-11 by rounding.
 STEP, SLOPE_ERROR = 1e-5, 1e-8
 GAIN = 0.8
+FWHM_STEP_PX = 0.01  # of the radii at which a PSF's light is looked at
 MAG_A_RELATIVE = 2.5 / math.log(10)
 
 
@@ -391,6 +396,24 @@ def test_a_core_is_widened_by_colour_and_stays_an_ellipse():
         assert red == pytest.approx(1.4 * np.array([[1, 0.5, kept]]))
 
 
+@pytest.mark.parametrize("wing_share", [0.0, 0.3, 0.6])
+def test_a_psf_is_as_wide_as_core_and_wings_together_at_half_of_their_peak(wing_share):
+    """Round Gaussians of 0.8 px^2, by the mean of 1 and 0.6, and of 2 px, each with a pixel's twelfth
+    of a px^2: SciPy's root of their sum.
+    """
+    psf = StarPsf(np.array([[1.0], [0.6], [0.1]]), 0.0, wing_share, 2.0, SIZE_PX)
+    variances = np.array([0.8, 4.0]) + 1 / 12
+    peaks = np.array([1 - wing_share, wing_share]) / variances
+
+    def over_half(radius_px: float) -> float:
+        light = peaks * np.exp(-(radius_px**2) / (2 * variances))
+        return float(light.sum() - peaks.sum() / 2)
+
+    wanted_px = 2 * brentq(over_half, 0.0, 12.0)
+    middle = np.array([MIDDLE_PX[0]]), np.array([MIDDLE_PX[1]])
+    assert psf.fwhm_px(*middle)[0] == pytest.approx(wanted_px, abs=2 * FWHM_STEP_PX)
+
+
 def test_a_pixel_weighs_by_background_photons_and_one_hundredth_of_its_own_light():
     """1000 DN at 0.5 e- a DN beside 100 DN^2: 2000 and 10^2 more."""
     stamps = cut_stamps(np.zeros((20, 30)), np.full((20, 30), 100.0), *np.full((3, 1), 12.0))
@@ -406,3 +429,33 @@ def test_pixels_beyond_each_edge_of_an_image_do_not_count(x_px, y_px):
     side = 2 * HALF + 1
     assert int(np.isfinite(stamps.variance).sum()) == side * (side - HALF + 1)
     assert stamps.values.sum() == side * (side - HALF + 1)
+
+
+def test_stars_of_a_psf_have_no_residuals_by_it_but_its_priors_and_slopes_by_each_number(rng):
+    """Colour and wings, too. Of the priors, of one sigma a number, those of the field's coefficients
+    alone are off; wings are held where they were.
+    """
+    covariance = np.array([[0.9, 0.2], [0.7, -0.1], [0.1, 0.05]])
+    psf = replace(PSF, covariance=covariance)
+    places_px = rng.uniform([30, 30], [600, 440], (5, 2))
+    nothing = np.zeros((5, 2 * HALF + 1, 2 * HALF + 1))
+    middle_px = np.rint(places_px)
+    stamps = Stamps(nothing, nothing + 4.0, *middle_px.T, rng.uniform(-0.2, 1.8, 5))
+    dx, dy = stamps.offsets(*places_px.T)
+    core = psf.core(*places_px.T, stamps.bv_mag)
+    flux_dn = np.array([500.0, 800.0, 2000.0, 3000.0, 900.0])
+    shown = flux_dn[:, None, None] * psf.on_pixels(dx, dy, core)[0] + 7.0
+    one = np.ones(5)
+    at = Measured(*places_px.T, flux_dn, one, one, one)
+    loss = _ShapeLoss(replace(stamps, values=shown), at, psf, GAIN, wide=True)
+    start = loss.start
+    off = loss.residuals(start)
+    pixels = nothing.size
+    assert off[:pixels] == pytest.approx(0.0, abs=1e-6)
+    assert off[pixels:] == pytest.approx([0.2, -0.1, 0.05, 0.0, 0.0])
+    slopes = loss.slopes(start, off)
+    for number in range(len(start)):
+        step = STEP * np.eye(len(start))[number]
+        wanted = (loss.residuals(start + step) - loss.residuals(start - step)) / (2 * STEP)
+        within = 1e-5 * np.abs(wanted).max()
+        assert slopes[:, number] == pytest.approx(wanted, abs=within)

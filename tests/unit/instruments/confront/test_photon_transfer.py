@@ -234,6 +234,23 @@ def test_skies_of_one_shade_tell_the_level_without_light():
     assert two == pytest.approx((PEDESTAL_DN, PEDESTAL_DN / 2), abs=0.5)
 
 
+def test_a_pedestal_s_sigma_is_the_jackknife_s_of_leaving_out_one_sky(rng):
+    """Of four skies, (n - 1) / n times the sum of squares about the mean of four pedestals."""
+    factors = (1.0, 2.5, 4.0, 6.0)
+    levels, places = skies(factors, ((0.1, -0.2), (-0.15, 0.05), (0.0, 0.1), (0.05, 0.0)))
+    levels = [level + rng.normal(0, 4.0, level.shape) for level in levels]
+    without = []
+    for k in range(4):
+        fitted = fit_pedestal(levels[:k] + levels[k + 1 :], places)
+        assert fitted is not None
+        without.append(fitted[0])
+    found = fit_pedestal(levels, places)
+    assert found is not None
+    off_dn = np.array(without) - np.mean(without)
+    assert found[1] > 0.02 * 400
+    assert found[1] == pytest.approx(math.sqrt(0.75 * float((off_dn**2).sum())))
+
+
 def test_skies_that_are_alike_or_single_tell_none():
     assert fit_pedestal(*skies((1.0, 1.1), ((0.1, 0.0), (0.0, 0.1)))) is None
     assert fit_pedestal(*skies((1.0,), ((0.1, 0.0),))) is None

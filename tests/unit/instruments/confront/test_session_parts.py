@@ -19,6 +19,7 @@ from hilstar.basics.reading import parse_toml
 from hilstar.basics.rotation import from_matrix
 from hilstar.instruments.confront import run as confront_run
 from hilstar.instruments.confront import session as sessions
+from hilstar.instruments.confront import star_psf
 from hilstar.instruments.confront.background import FixedPattern, FoundSources, SkyLevel
 from hilstar.instruments.confront.camera_fit import Pointing
 from hilstar.instruments.confront.images import Photograph, _planes
@@ -55,7 +56,7 @@ from hilstar.instruments.confront.session import (
     corrected,
     radius2_of,
 )
-from hilstar.instruments.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, join
+from hilstar.instruments.confront.star_psf import HALF, MEAN_BV_MAG, Measured, Stamps, fit_psf, join
 from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile, bench_file_of
 from hilstar.sky.catalog import plain_catalog
@@ -364,6 +365,7 @@ def test_stars_are_first_seen_at_their_sources():
     places = _seen_at(shot, np.array([2, 0]), np.array([1, 2]))
     assert places.x_px.tolist() == [2.0, 3.0]
     assert places.y_px.tolist() == [20.0, 30.0]
+    assert places.sigma_px.tolist() == [0.15, 0.15]
     np.testing.assert_array_equal(places.vectors, np.eye(3)[[2, 0]])
 
 
@@ -595,3 +597,56 @@ def test_a_psf_is_that_of_the_brightest_stars(monkeypatch):
     psf = sessions._psf([replace(shot, photo=photo)], 2.0)
     middle = np.array([399.5]), np.array([299.5])
     assert psf.fwhm_px(*middle)[0] == pytest.approx(2.3548 * math.hypot(0.8, 1 / 12**0.5), rel=0.05)
+
+
+@pytest.mark.parametrize(("stars", "terms"), [(40, 6), (39, 2), (12, 2), (11, 1)])
+def test_a_psf_changes_over_the_field_by_as_much_as_its_stars_tell(stars, terms, monkeypatch):
+    """In the first round the wings have a twentieth of the light, of which these stars have none."""
+    monkeypatch.setattr(star_psf, "SHAPE_ROUNDS", 1)
+    rng = np.random.default_rng(2)
+    places_px = rng.uniform([20, 20], [780, 580], (stars, 2))
+    psf = fit_psf(stamps_of(places_px, 0.8, 0.9), *places_px.T, (800, 600), 2.0)
+    assert psf.covariance.shape == (3, terms)
+    assert psf.covariance[:, 0] == pytest.approx([0.64, 0.81, 0.0], abs=0.05 * 0.81)
+
+
+def star_field(count: int, wide: int = 0) -> Photograph:
+    """Stars on 100 DN with 2 DN of noise, of which the brightest ones are so many of 5 px."""
+    rng = np.random.default_rng(5)
+    dn = 100 + 2 * rng.standard_normal((300, 400))
+    y_px, x_px = np.mgrid[:300, :400]
+    for k in range(count):
+        sigma_px = 5.0 if k < wide else 1.0
+        peak_dn = 2000.0 if k < wide else 300.0
+        radius2_px2 = (x_px - 40 - 60 * (k % 6)) ** 2 + (y_px - 40 - 60 * (k // 6)) ** 2
+        dn += peak_dn * np.exp(-radius2_px2 / (2 * sigma_px**2))
+    return photograph(dn)
+
+
+def test_an_attitude_is_tried_from_the_least_count_of_sources_on(tmp_path, monkeypatch):
+    """With one less the refusal says what to do about too few."""
+    tried = []
+    monkeypatch.setattr(sessions, "_solve", lambda field, *where: tried.append(field.places_px))
+    with pytest.raises(InputError, match="no part of the sky fits them"):
+        sessions.open_shot(bench(tmp_path), star_field(MIN_MATCHED), CAMERA, None)
+    # as they are, and then with left and right exchanged
+    assert [len(places_px) for places_px in tried] == [MIN_MATCHED, MIN_MATCHED]
+    np.testing.assert_array_equal(tried[1], tried[0] * [-1, 1])
+    del tried[:]
+    with pytest.raises(InputError, match=f"{MIN_MATCHED - 1} sources stand out"):
+        sessions.open_shot(bench(tmp_path), star_field(MIN_MATCHED - 1), CAMERA, None)
+    assert not tried
+
+
+@pytest.mark.parametrize(("wide", "is_taken"), [(4, True), (6, False)])
+def test_the_ten_brightest_stars_tell_the_focus(wide, is_taken, tmp_path, monkeypatch):
+    """Of eighteen that are identified, in any order."""
+    solution = replace(a_shot(0).matched, source=np.arange(18)[::-1], star=np.arange(18))
+    monkeypatch.setattr(sessions, "_solve", lambda *given: solution)
+    photo = star_field(18, wide)
+    if is_taken:
+        shot = sessions.open_shot(bench(tmp_path), photo, CAMERA, None)
+        assert shot.matched.source.tolist() == solution.source.tolist()
+    else:
+        with pytest.raises(InputError, match="px wide; focus the lens"):
+            sessions.open_shot(bench(tmp_path), photo, CAMERA, None)

@@ -19,7 +19,8 @@ from hilstar.basics.rotation import conjugate, rotate, to_matrix
 from hilstar.instruments.confront import page
 from hilstar.instruments.confront import run as confront_run
 from hilstar.instruments.confront import session as sessions
-from hilstar.instruments.confront.judge import Verdict
+from hilstar.instruments.confront.background import source_mask
+from hilstar.instruments.confront.judge import MASK_PX, Verdict
 from hilstar.instruments.confront.page import Pictures
 from hilstar.instruments.confront.report import Confronted
 from hilstar.instruments.confront.session import Session
@@ -212,7 +213,30 @@ def test_figures_have_the_detector_and_the_light_that_were_planted(night: Night)
         assert image["background_chi2"] == pytest.approx(1.0, abs=0.05)
         assert image["star_chi2"] < 2.0
         assert image["missing"] == 0
+    for verdict in night.found.verdicts:
+        clean = verdict.shot.clean
+        # stars with a neighbour are fitted worse
+        assert not clean.all()
+        assert verdict.star_chi2 == np.median(verdict.shot.found.chi2[clean])
     assert night.found.figures["passed"] is (not night.found.failures)
+
+
+def test_a_background_is_what_no_star_lights_by_a_tenth_of_a_sigma(night: Night) -> None:
+    """Beside sources and hot pixels; of the pixels that are left the mean square is the chi^2."""
+    for number, verdict in enumerate(night.found.verdicts):
+        shot = verdict.shot
+        level_dn = shot.level.level
+        sigma_dn = np.sqrt(night.session.pixels.variance_dn2(level_dn))
+        above_dn = shot.photo.dn - level_dn
+        light_dn = night.predicted[number] - level_dn
+        is_dark = np.abs(light_dn) <= 0.1 * sigma_dn
+        is_dark &= ~source_mask(shot.sources, shot.level.above(shot.photo.dn), MASK_PX)
+        for place in CAMERA.hot:
+            is_dark[place] = False
+        shot_dn = np.sqrt(np.maximum(light_dn, 0) / night.session.pixels.gain_e_per_dn)
+        sigmas = ((above_dn - light_dn) / np.hypot(sigma_dn, shot_dn))[is_dark]
+        near = sigmas[np.abs(sigmas) < 5]
+        assert verdict.background_chi2 == pytest.approx(np.mean(near**2), rel=1e-9)
 
 
 def test_tables_have_each_star_at_its_place_and_what_explains_each_source(night: Night) -> None:

@@ -121,6 +121,12 @@ def test_a_field_of_lattices_is_of_whole_cells_about_the_middle_of_what_is_seen(
         field_for(geometry(40.0), sigma_px)
 
 
+def test_a_field_has_all_pixels_of_the_rows_and_columns_that_its_light_falls_on():
+    field = DotField(0, 0, 64, slice(10, 60), slice(20, 90), 1.0)
+    image = np.ones((300, 400))
+    assert field.tracker_px == image[field.rows, field.columns].sum() == 50 * 70
+
+
 # Half of the smallest side, in whole cells: of the monitor, upright or not, or of the tracker; and
 # at most 200 px of the tracker.
 @pytest.mark.parametrize(

@@ -140,6 +140,8 @@ def test_a_flat_dark_end_is_made_strictly_rising():
     assert np.all(np.diff(light) > 0)
     assert light[-1] == 1
     assert light[4] == pytest.approx(0.5)
+    # over a black level a thousand times as bright as white, too
+    assert np.all(np.diff(1000 + light) > 0)
 
 
 def test_a_link_in_limited_range_has_a_dark_end_that_loads(tmp_path, rng):

@@ -264,6 +264,16 @@ def test_a_ratio_is_as_sure_as_its_sums_and_their_number(pairs):
     assert link.sigmas == pytest.approx(0.1 / link.error)
 
 
+def test_a_black_sum_is_the_last_of_its_own_exposure_and_else_the_largest():
+    scatter = PixelScatter(default_dn_per_e=0.25)
+    assert scatter.dark_sum_dn(1) == 0.0
+    for times, black_dn in ((1, 9.0), (1, 2.0), (4, 5.0)):
+        scatter.add(BLACK, Range(1, times), np.full((50, 60), black_dn))
+    scatter.add(Patch(9, "w"), Range(1, 2), np.full((50, 60), 100.0))
+    sums_dn = [scatter.dark_sum_dn(times) for times in (1, 4, 2)]
+    assert sums_dn == [2.0 * PIXELS, 5.0 * PIXELS, 5.0 * PIXELS]
+
+
 def test_black_noise_is_of_its_own_exposure_and_else_of_any():
     scatter = scatter_of({1: 200.0, 4: 800.0})
     assert scatter.dark_dn2(1) == pytest.approx(200.0)

@@ -123,6 +123,13 @@ def test_blank_freeze_and_step(simulator):
     assert abs(x - star["x_px"]) == pytest.approx(shift_px, abs=1.0) and abs(y - star["y_px"]) < 1.0
 
 
+def test_the_background_is_there_for_as_long_as_the_field_is_not_blank(simulator, monkeypatch):
+    """A cover over the second half of the exposure, before a sky far brighter than its stars."""
+    monkeypatch.setattr(simulator._background, "steady_e", 5e3)
+    dark, _ = exposed(simulator, '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 1.0', 1.0)
+    assert np.median(dark.mean_e) == pytest.approx(2.5e3, rel=1e-6)
+
+
 ALIKE = (
     HEAD
     + GHOST

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections import deque
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,10 +19,17 @@ from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.simulate import batch, exposures
 from hilstar.instruments.simulate.exposures import LogFaults, faulty_exposure
 from hilstar.instruments.simulate.pictures import TrackerPictures
-from hilstar.instruments.simulate.simulator import FrameNoise, Simulator, _merge, pieces_of
+from hilstar.instruments.simulate.simulator import (
+    FaultyExposure,
+    FrameNoise,
+    Simulator,
+    _merge,
+    pieces_of,
+)
 from hilstar.optics.layers.fault_kinds import KINDS, Now
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.layers.view import STILL, View
+from hilstar.optics.sprites import join_sprites
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.fault_views import faults_at
@@ -210,6 +218,15 @@ def test_a_simulation_s_pictures_have_the_faults_of_the_display(tmp_path):
 
 def dn_of(png):
     return np.asarray(Image.open(io.BytesIO(png)), dtype=np.uint16) >> 4
+
+
+def test_an_exposure_has_the_discs_and_the_capped_stars_of_all_its_pieces():
+    made = object.__new__(FaultyExposure)
+    nothing = join_sprites([], 5)
+    seen = ((2, ("Moon",)), (0, ()), (3, ("Sun", "Moon")))
+    made._seen = [replace(nothing, capped=capped, discs=discs) for capped, discs in seen]
+    whole = made.sprites()
+    assert (whole.capped, whole.discs, whole.footprint_px) == (5, ("Moon", "Sun"), 5)
 
 
 def test_light_of_one_point_in_two_pieces_is_in_the_middle_of_it():

@@ -22,6 +22,17 @@ def normalise(q: FloatArray) -> FloatArray:
     return np.asarray(q / np.linalg.norm(q, axis=-1, keepdims=True))
 
 
+def random_attitudes(count: int, rng: np.random.Generator) -> FloatArray:
+    """Unit quaternions (count, 4), uniform over all rotations."""
+    # A normal distribution has no direction of its own, so its directions are uniform.
+    return normalise(rng.normal(size=(count, 4)))
+
+
+def random_attitude(rng: np.random.Generator) -> FloatArray:
+    """One of `random_attitudes`, (4,)."""
+    return np.asarray(random_attitudes(1, rng)[0])
+
+
 def conjugate(q: FloatArray) -> FloatArray:
     """The inverse rotations of unit quaternions (..., 4)."""
     return np.asarray(q * np.array([1.0, -1.0, -1.0, -1.0]))

@@ -15,7 +15,7 @@ from hilstar.basics.rotation import (
     from_radec_roll_deg,
     from_rotation_vector,
     multiply,
-    normalise,
+    random_attitude,
     rate_between_rad_s,
     to_matrix,
     to_radec_roll_deg,
@@ -122,7 +122,7 @@ class CaseTracker:
     def _turned(self, q: FloatArray) -> FloatArray:
         planted = self._planted
         if self._rng.random() < planted.wrong:
-            return normalise(self._rng.normal(size=4))
+            return random_attitude(self._rng)
         if planted.lost_roll:
             ra_deg, dec_deg, _ = to_radec_roll_deg(q)
             q = from_radec_roll_deg(ra_deg, dec_deg, float(self._rng.uniform(0, 360)))

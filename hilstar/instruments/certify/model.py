@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from hilstar.basics.arrays import BoolArray, FloatArray, IntArray
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import to_matrix
+from hilstar.basics.rotation import random_attitudes, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, MAG_PER_RELATIVE, magnitude
 from hilstar.display.quantise import shown_light
 from hilstar.instruments.certify.bench_readings import (
@@ -76,8 +76,7 @@ def reference_stars(file: BenchFile) -> list[ReferenceStar]:
     """
     rng = np.random.default_rng(SEED)
     stars: list[ReferenceStar] = []
-    attitudes = rng.normal(size=(ATTITUDES, 4))
-    attitudes /= np.linalg.norm(attitudes, axis=1, keepdims=True)
+    attitudes = random_attitudes(ATTITUDES, rng)
     geometry = geometry_of(file)
     number = 0
     with open_bench(file) as bench:

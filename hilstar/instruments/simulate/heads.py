@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from hilstar.attitude.wire.source import Mounting
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.rotation import conjugate, multiply, to_rotation_vector
+from hilstar.basics.rotation import conjugate, multiply, random_attitude, to_rotation_vector
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.quantise import MASK_TURNS
 from hilstar.instruments.simulate.star_finder import (
@@ -160,8 +160,7 @@ def verify_heads(
     with ExitStack() as stack:
         twins = [_Head(stack.enter_context(Twin(file))) for file in heads.files]
         for number in range(fields):
-            components = rng.normal(size=4)
-            q_icrs_to_body = components / np.linalg.norm(components)
+            q_icrs_to_body = random_attitude(rng)
             first_frame = int(rng.integers(0, MASK_TURNS))
             solved = [head.solved(q_icrs_to_body, first_frame) for head in twins]
             for pair, (first, second) in zip(pairs, combinations(solved, 2), strict=True):

@@ -25,7 +25,7 @@ from scipy.special import ndtr
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, ORANGE, chart, label_ends, two_digits, write_csv
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import normalise, to_matrix
+from hilstar.basics.rotation import normalise, random_attitudes, to_matrix
 from hilstar.basics.units import ARCSEC_PER_RAD, flux_ratio
 from hilstar.instruments.simulate.budget import SOLAR_BV, STEP_MAG, USUAL
 from hilstar.instruments.simulate.simulator import TrackerBackground, full_e
@@ -503,8 +503,7 @@ def _all_over_the_sky(
     exposure_s = file.config.tracker.exposure_s
     sky_e = np.zeros((1, 1))
     fields = _Fields([], [], sky_e)
-    for components in rng.standard_normal((SKY_FIELDS, 4)):
-        q = normalise(components)
+    for q in random_attitudes(SKY_FIELDS, rng):
         try:
             sky_e = background.of_view_e(View.exposure(q, STILL, exposure_s))
         except InputError:

@@ -24,7 +24,7 @@ from hilstar.basics.rotation import (
     conjugate,
     from_rotation_vector,
     multiply,
-    normalise,
+    random_attitude,
     to_matrix,
     to_rotation_vector,
 )
@@ -83,7 +83,7 @@ class PlantedErrors:
     def reported(self, q_icrs_to_cam: FloatArray) -> tuple[FloatArray, bool]:
         """The attitude that is reported, and whether it is a wrong one."""
         if self._rng.random() < self._planted.wrong:
-            return normalise(self._rng.normal(size=4)), True
+            return random_attitude(self._rng), True
         axes = to_matrix(q_icrs_to_cam)
         if self._star is None:
             self._star = axes[2].copy()

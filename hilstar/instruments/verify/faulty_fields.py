@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilstar.basics.arrays import FloatArray
-from hilstar.basics.rotation import from_radec_roll_deg, propagate
+from hilstar.basics.rotation import from_radec_roll_deg, propagate, random_attitude
 from hilstar.basics.units import magnitude
 from hilstar.display.quantise import MASK_TURNS
 from hilstar.instruments.simulate.star_finder import StarFinder, star_finder
@@ -147,8 +147,7 @@ class FaultyFields:
         rng = self._rng
         toward = self._direction(fault)
         if toward is None:
-            q = rng.normal(size=4)
-            return np.asarray(q / np.linalg.norm(q))
+            return random_attitude(rng)
         ra_deg = np.degrees(np.arctan2(toward[1], toward[0]))
         dec_deg = np.degrees(np.arcsin(np.clip(toward[2], -1, 1)))
         q = from_radec_roll_deg(float(ra_deg), float(dec_deg), float(rng.uniform(0, 360)))

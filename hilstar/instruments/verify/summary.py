@@ -13,6 +13,7 @@ import numpy as np
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, MUTED, RED, SMALL_PT, chart, label_ends, write_csv
 from hilstar.basics.error_spread import ErrorSpread, error_spread
+from hilstar.basics.rotation import random_attitude
 from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.display.quantise import MASK_TURNS
 from hilstar.instruments.simulate.star_finder import USUAL
@@ -53,8 +54,7 @@ def verify(
         if scenario is not None:
             faulty = FaultyFields(twin, scenario, of_faults)
         for number in range(fields):
-            components = attitudes.normal(size=4)
-            q_icrs_to_cam = components / np.linalg.norm(components)
+            q_icrs_to_cam = random_attitude(attitudes)
             first_frame = int(attitudes.integers(0, MASK_TURNS))
             comparison.add(twin.field(q_icrs_to_cam, first_frame), noise)
             on_field(number + 1)

@@ -16,6 +16,8 @@ from hilstar.basics.rotation import (
     multiply,
     normalise,
     propagate,
+    random_attitude,
+    random_attitudes,
     rate_between_rad_s,
     rotate,
     slerp,
@@ -31,6 +33,10 @@ PRINTED = 6e-8
 ROUNDING = 1e-14
 # Angles in degrees, up to 360: the same operations, in a larger unit.
 ROUNDING_DEG = 1e-11
+# Kolmogorov's bound on the largest distance of a share from its law, times the root of the count:
+# it is passed by chance once in 10 000.
+KOLMOGOROV = 2.23
+ATTITUDES = 4000
 
 
 @pytest.mark.parametrize(
@@ -181,3 +187,24 @@ def test_a_frame_turned_about_an_axis_has_a_vector_turned_the_other_way(axis, se
     turns = frame_turns(axis, np.array([np.pi / 2, -np.pi / 2]))
     vectors = np.array([[1.0, 2.0, 3.0]] * 2)
     assert rotate(turns, vectors) == pytest.approx(np.array(seen, dtype=float), abs=1e-14)
+
+
+def test_random_attitudes_are_uniform_over_all_rotations(rng):
+    """(t - sin t) / pi of them turn by less than t; a boresight is as often at each right ascension
+    and at each sine of its declination.
+    """
+    q = random_attitudes(ATTITUDES, rng)
+    assert q.shape == (ATTITUDES, 4)
+    np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0, rtol=ROUNDING)
+    turn_rad = 2 * np.arccos(np.abs(q[:, 0]))
+    x, y, z = to_matrix(q)[:, 2].T
+    ra_turns = np.arctan2(y, x) / (2 * np.pi) + 0.5
+    for shares in ((turn_rad - np.sin(turn_rad)) / np.pi, ra_turns, (z + 1) / 2):
+        steps = np.arange(1, ATTITUDES + 1) / ATTITUDES
+        assert np.abs(np.sort(shares) - steps).max() < KOLMOGOROV / np.sqrt(ATTITUDES)
+
+
+def test_one_random_attitude_is_the_next_of_many():
+    q = random_attitudes(2, np.random.default_rng(7))
+    rng = np.random.default_rng(7)
+    np.testing.assert_array_equal([random_attitude(rng), random_attitude(rng)], q)

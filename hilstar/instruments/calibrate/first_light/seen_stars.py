@@ -20,7 +20,7 @@ from scipy.special import ndtr
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import from_matrix, to_matrix
+from hilstar.basics.rotation import from_matrix, random_attitudes, to_matrix
 from hilstar.basics.units import MAG_PER_RELATIVE, magnitude
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import shown_light
@@ -475,9 +475,7 @@ def _fields(
     readable &= stars.electrons_per_s * bench.psf.peak_share <= bench.flux_at_white_e_per_s
     readable &= spot.tabled_noise_mag(dn, noise_dn, largest_dn) < READ_MAG
     readable_stars = np.flatnonzero(readable)
-    attitudes = []
-    for q in rng.normal(size=(RANDOM_ATTITUDES, 4)):
-        attitudes.append(np.asarray(q / np.linalg.norm(q)))
+    attitudes = list(random_attitudes(RANDOM_ATTITUDES, rng))
     by_brightness = np.argsort(-dn[readable_stars], kind="stable")
     brightest = readable_stars[by_brightness][:POINTED_ATTITUDES]
     others = rng.normal(size=(len(brightest), 3))

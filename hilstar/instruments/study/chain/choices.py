@@ -21,7 +21,7 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.errors import InputError
 from hilstar.basics.process.closing import Closing
-from hilstar.basics.rotation import normalise
+from hilstar.basics.rotation import random_attitudes
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.quantise import Quantisation
 from hilstar.instruments.study.predictors import Movement
@@ -142,7 +142,7 @@ def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
     """The scenes of a bench, chosen among FIELDS random fields of its sky. Raises InputError
     where it has no stars.
     """
-    fields = normalise(np.random.default_rng(SEED).normal(size=(FIELDS, 4)))
+    fields = random_attitudes(FIELDS, np.random.default_rng(SEED))
     star_rates = []
     for q in fields:
         star_rates.append(bench.sprites(q).data["electrons_per_s"])

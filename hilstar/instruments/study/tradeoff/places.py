@@ -17,7 +17,7 @@ import numpy.typing as npt
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.resources import resource_path
-from hilstar.basics.rotation import angle_between_rad, normalise, to_matrix
+from hilstar.basics.rotation import angle_between_rad, random_attitudes, to_matrix
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.phases import measure
@@ -177,10 +177,8 @@ def turn_to_image(q: FloatArray, camera: Camera) -> FloatArray:
 def random_turns(count: int, camera: Camera) -> list[FloatArray]:
     """Rotations from ICRS to image axes, (3, 3) each: ORION's, then uniformly random ones."""
     rng = np.random.default_rng(SEED)
-    directions = rng.normal(size=(count - 1, 4))
-    random_q = normalise(directions)
     turns = []
-    for q in (ORION, *random_q):
+    for q in (ORION, *random_attitudes(count - 1, rng)):
         turns.append(turn_to_image(q, camera))
     return turns
 

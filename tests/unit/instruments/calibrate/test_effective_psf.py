@@ -406,6 +406,34 @@ def test_more_than_a_gaussian_is_asked_for_beyond_three_standard_errors(monkeypa
     assert (found.dots, found.half_px) == (len(x_px), dots.images.shape[1] // 2)
 
 
+def test_a_chosen_spline_has_its_own_terms_over_the_field(monkeypatch):
+    """Light 2 px beside each dot that grows with its column: to the right of a Gaussian's."""
+    image, x_px, y_px = field_of_dots()
+    for x, y in zip(x_px, y_px, strict=True):
+        image += gaussian_image([x + 2], [y], 0.7, 2.0 * x)
+    dots = dots_of_image(image, x_px, y_px, 0.0).at(np.arange(0, len(x_px), 2))
+    dots = replace(dots, variance=np.full_like(dots.images, 4.0))
+
+    def held(start, dots, covariance, fold, count):
+        """The linear spline, of three terms, is the best of those held out."""
+        chi2 = np.linspace(1.0, 1.1, len(fold)) + abs(count - 3)
+        return HeldOut(effective_psf.MODEL_NAMES[count], 0.1, 0.1, chi2)
+
+    monkeypatch.setattr(effective_psf, "_held_out", held)
+    glass = fit_effective(dots, 1).glass
+    # points are sorted by x, then y
+    left, middle, right = glass.images[[2, 12, 22], 0, 0].sum(axis=1)
+    steps_px = np.arange(len(left)) - len(left) // 2
+    thirds_px3 = [light @ steps_px**3 / light.sum() for light in (left, middle, right)]
+    # in the middle, of two parts: see the test of a glass's centroids
+    w = 0.028 / 1.028
+    third_px3 = w * (1 - w) * ((1 - 2 * w) * 2.0**3 + 3 * 2.0 * (0.7**2 - 1))
+    # The prior of a spline's coefficients takes up to a tenth, by which a constant would differ.
+    assert thirds_px3[1] == pytest.approx(third_px3, rel=0.1)
+    assert thirds_px3[0] < 0.5 * thirds_px3[1]
+    assert thirds_px3[2] > 1.3 * thirds_px3[1]
+
+
 def test_a_dot_s_image_is_the_mean_over_its_pose_s_frames_in_which_none_is_near(tmp_path):
     """Two poses of two frames; in each frame the dots have another level, in one a third dot is
     beside the first. The dark image is taken off all.

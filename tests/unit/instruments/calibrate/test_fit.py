@@ -140,6 +140,8 @@ def test_a_flat_dark_end_is_made_strictly_rising():
     assert np.all(np.diff(light) > 0)
     assert light[-1] == 1
     assert light[4] == pytest.approx(0.5)
+    # over a black level a thousand times as bright as white, too
+    assert np.all(np.diff(1000 + light) > 0)
 
 
 def test_a_link_in_limited_range_has_a_dark_end_that_loads(tmp_path, rng):
@@ -224,6 +226,9 @@ def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rn
     )
     assert summary["error_percent"]["1e-3"] > summary["error_percent"]["1e-2"]
     assert summary["additivity_percent"] is None
+    drift, _ = drift_over_run(read_measurements(path))
+    note = read_toml(tmp_path / "monitor.toml").notes.drift
+    assert note == f"{100 * drift:+.2f} % over the run" != "+0.00 % over the run"
     light = load_calibration(tmp_path / "monitor.toml", 8).response.light
     assert np.abs(light[4:] / srgb_light(np.arange(4, 256) / 255) - 1).max() < WORST
 

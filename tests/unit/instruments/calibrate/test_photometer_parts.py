@@ -121,6 +121,12 @@ def test_a_field_of_lattices_is_of_whole_cells_about_the_middle_of_what_is_seen(
         field_for(geometry(40.0), sigma_px)
 
 
+def test_a_field_has_all_pixels_of_the_rows_and_columns_that_its_light_falls_on():
+    field = DotField(0, 0, 64, slice(10, 60), slice(20, 90), 1.0)
+    image = np.ones((300, 400))
+    assert field.tracker_px == image[field.rows, field.columns].sum() == 50 * 70
+
+
 # Half of the smallest side, in whole cells: of the monitor, upright or not, or of the tracker; and
 # at most 200 px of the tracker.
 @pytest.mark.parametrize(
@@ -256,6 +262,16 @@ def test_a_ratio_is_as_sure_as_its_sums_and_their_number(pairs):
     assert link.error == pytest.approx(0.9 * np.sqrt(variance / pairs))
     assert (link.dense, link.sparse, link.times) == (1, 2, (1, 1))
     assert link.sigmas == pytest.approx(0.1 / link.error)
+
+
+def test_a_black_sum_is_the_last_of_its_own_exposure_and_else_the_largest():
+    scatter = PixelScatter(default_dn_per_e=0.25)
+    assert scatter.dark_sum_dn(1) == 0.0
+    for times, black_dn in ((1, 9.0), (1, 2.0), (4, 5.0)):
+        scatter.add(BLACK, Range(1, times), np.full((50, 60), black_dn))
+    scatter.add(Patch(9, "w"), Range(1, 2), np.full((50, 60), 100.0))
+    sums_dn = [scatter.dark_sum_dn(times) for times in (1, 4, 2)]
+    assert sums_dn == [2.0 * PIXELS, 5.0 * PIXELS, 5.0 * PIXELS]
 
 
 def test_black_noise_is_of_its_own_exposure_and_else_of_any():

@@ -35,6 +35,7 @@ from hilstar.instruments.calibrate.first_light.stars import frames_for, place_re
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.tracker.centroids import noisiest_background
+from hilstar.tracker.rounding import rounded_light
 from tests.support.closed_camera import AXIS_PX, DETECTOR_PX, ClosedCamera, closed_context
 
 WIDE = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=0.0, electronics_dn=0.0)
@@ -73,6 +74,21 @@ def test_light_is_as_noisy_as_its_photons_and_its_window_s_background():
     # the mean of nine frames has a third of the photons' noise
     nine = StarSpot((0.9, 1.4), 4.0, 0.0, 0.0, frames=9)
     assert nine.light_noise_mag(dn, 1e-3)[1] == pytest.approx(photons[1] / 3, rel=0.05)
+
+
+@pytest.mark.parametrize("frames", [1, 4])
+def test_rounding_is_that_of_the_noise_of_one_image_before_the_adc(frames):
+    """Less a dark frame's, in the mean of frames: of 0.25 DN, two images have twice the variance
+    and the ADC adds 1/12 to each.
+    """
+    spot = StarSpot((0.9, 1.4), 4.0, 0.0, electronics_dn=1.0, frames=frames)
+    noise_dn = np.sqrt(2 * (0.25**2 + 1 / 12) / frames)
+    share, _ = spot._shares
+    light_dn = np.array([3.0, 40.0])
+    for rounded_dn, star_dn in zip(spot.rounded_dn(light_dn, noise_dn), light_dn, strict=True):
+        pixel_dn = rounded_light(star_dn * share.ravel(), 0.25, 1 / 4.0)
+        assert np.abs(pixel_dn).max() > 1e-4
+        np.testing.assert_allclose(rounded_dn, share.size * pixel_dn, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize("scatter", [0.0, 0.05])

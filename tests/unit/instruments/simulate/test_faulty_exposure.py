@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections import deque
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,14 +19,21 @@ from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
 from hilstar.instruments.simulate import batch, exposures
 from hilstar.instruments.simulate.exposures import LogFaults, faulty_exposure
 from hilstar.instruments.simulate.pictures import TrackerPictures
-from hilstar.instruments.simulate.simulator import FrameNoise, Simulator, _merge
+from hilstar.instruments.simulate.simulator import (
+    FaultyExposure,
+    FrameNoise,
+    Simulator,
+    _merge,
+    pieces_of,
+)
 from hilstar.optics.layers.fault_kinds import KINDS, Now
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.layers.view import STILL, View
+from hilstar.optics.sprites import join_sprites
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.fault_views import faults_at
-from hilstar.server.bench.scenario import parse_scenario
+from hilstar.server.bench.scenario import Timetable, parse_scenario
 from tests.support.benches import ORION_Q, SMALL_BENCH, bench_text
 
 EXPOSURE_S = 0.1  # the bench's default
@@ -123,6 +131,13 @@ def test_blank_freeze_and_step(simulator):
     assert abs(x - star["x_px"]) == pytest.approx(shift_px, abs=1.0) and abs(y - star["y_px"]) < 1.0
 
 
+def test_the_background_is_there_for_as_long_as_the_field_is_not_blank(simulator, monkeypatch):
+    """A cover over the second half of the exposure, before a sky far brighter than its stars."""
+    monkeypatch.setattr(simulator._background, "steady_e", 5e3)
+    dark, _ = exposed(simulator, '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 1.0', 1.0)
+    assert np.median(dark.mean_e) == pytest.approx(2.5e3, rel=1e-6)
+
+
 ALIKE = (
     HEAD
     + GHOST
@@ -205,6 +220,15 @@ def dn_of(png):
     return np.asarray(Image.open(io.BytesIO(png)), dtype=np.uint16) >> 4
 
 
+def test_an_exposure_has_the_discs_and_the_capped_stars_of_all_its_pieces():
+    made = object.__new__(FaultyExposure)
+    nothing = join_sprites([], 5)
+    seen = ((2, ("Moon",)), (0, ()), (3, ("Sun", "Moon")))
+    made._seen = [replace(nothing, capped=capped, discs=discs) for capped, discs in seen]
+    whole = made.sprites()
+    assert (whole.capped, whole.discs, whole.footprint_px) == (5, ("Moon", "Sun"), 5)
+
+
 def test_light_of_one_point_in_two_pieces_is_in_the_middle_of_it():
     rows = np.zeros(2, dtype=TRUTH_DTYPE)
     rows["x_px"], rows["y_px"] = [10.0, 14.0], [8.0, 4.0]
@@ -212,6 +236,20 @@ def test_light_of_one_point_in_two_pieces_is_in_the_middle_of_it():
     _merge(rows[0], rows[1])
     assert (rows["x_px"][0], rows["y_px"][0]) == pytest.approx((11.0, 7.0))
     assert rows["electrons_per_s"][0] == 40.0
+
+
+def test_each_piece_of_an_exposure_has_its_own_middle_on_the_clock_of_its_view(tmp_path):
+    """0.1 s about the 2nd second of a scenario, in which a fault is on from 1.97 to 1.99 s."""
+    text = '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 1.97\nfor_s = 0.02\n'
+    scenario = parse_scenario(tmp_path / "faults.toml", text)
+    timetable = Timetable(scenario, lambda fault: fault, 0.1)
+    start_ns = 10**15
+    view = View.exposure(np.array([1.0, 0.0, 0.0, 0.0]), STILL, 0.1, start_ns)
+    pieces = pieces_of(view, 2 * NS_PER_S, timetable)
+    assert [len(piece.now) for piece in pieces] == [0, 1, 0]
+    middles_ms = [(piece.view.t_ns - start_ns) / 1e6 for piece in pieces]
+    assert middles_ms == [-40.0, -20.0, 20.0]
+    assert [piece.view.exposure_s for piece in pieces] == pytest.approx([0.02, 0.02, 0.06])
 
 
 def test_faults_of_a_log_count_from_its_first_sample(monkeypatch):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import to_matrix
@@ -29,6 +30,7 @@ from hilstar.instruments.simulate.noise import (
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import GaussianPsf, SampledPsf
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.cameras import tracker_camera
 from hilstar.server.bench.star_light import bench_stars
 from hilstar.tracker.centroids import CentroidSettings, find_stars
 from hilstar.tracker.detector import Detector
@@ -568,6 +570,11 @@ def test_a_field_s_budget_is_of_its_own_stars_in_the_light_behind_each(tmp_path,
     assert found.nea_arcsec["limit"]["across"] == found.nea[-1]["limit_across_arcsec"]
     assert found.nea_arcsec["limit"]["about"] == found.nea[-1]["limit_about_arcsec"]
     assert len(found.nea) > 2
+    field = noise.field_stars(
+        stars, tracker_camera(file.config.tracker, tmp_path), np.array(ORION_Q)
+    )
+    assert len(field) == len(listed)
+    assert (np.diff(field["v_mag"]) >= 0).all()
     # the magnitude of which half are found
     below = [row for row in found.rows if row["detection"] > 0.5]
     above = [row for row in found.rows if row["detection"] < 0.5]
@@ -817,3 +824,56 @@ def test_what_centroiders_reach_is_before_the_sky_and_no_better_than_its_bound(r
     assert (reached_px > 0.9 * bound_px).all()
     fit_px = reached_px[noise.FAMILY.index("fit")]
     assert (fit_px < 1.2 * bound_px).all()
+
+
+@pytest.mark.parametrize("sky_e", [14.0, 20.0])
+def test_a_pixel_of_the_sky_is_above_the_threshold_as_often_as_its_codes_are(sky_e):
+    """Steps of the ADC are twice the noise before it, and the threshold is one sigma."""
+    star = gaussian(0.85, replace(NOISY, gain_e_per_dn=24.0), phases=1)
+    finder = CentroidSettings(1.0, 1)
+    sky = star.detector.noise(np.full((1, 1, 1), sky_e), 1.0)
+    above = star._above(np.zeros((1, 1, 1)), np.full((1, 1, 1), sky_e), (sky, sky), finder)
+    assert np.ptp(above) == 0.0
+    pixels = (400, 400)
+    codes = Detector(star.detector, pixels).expose(
+        np.full(pixels, sky_e), 1.0, np.random.default_rng(4)
+    )
+    level_dn = (sky_e + 60.0) / 24.0 + 200.0
+    share = np.mean(codes > level_dn + np.sqrt(sky.total_e2.item()) / 24.0)
+    # four sigmas of the share of so many pixels, and the skewness of electrons' number
+    assert above.max() == pytest.approx(share, abs=4 * 0.5 / 400 + 2e-3)
+
+
+@pytest.mark.parametrize("noises", [5.0, 6.0])
+def test_a_superpixel_has_a_quarter_of_the_light_of_its_middle_and_three_eighths_of_the_noise(
+    noises,
+):
+    """A star within one pixel, before even noise: on that pixel it is found most probably."""
+    star = NoisyStar(GaussianPsf((0.05, 0.05)), RGGB, 1.0, 1, ALIKE)
+    even = star.detector.noise(np.full(star.shares.shape, 30.0)[None], 1.0)
+    noise_e = math.sqrt(even.total_e2.flat[0])
+    star_e = np.full((1, 1, 1), 4 * noises * 0.375 * noise_e)
+    above = star._superpixels_above(star_e, (even, even), 5.0)
+    for window in above[0]:
+        assert window.max() == pytest.approx(ndtr(noises - 5.0), rel=1e-6)
+
+
+def measured(star: NoisyStar, star_e: float, threshold_sigma: float = 5.0) -> np.ndarray:
+    return noise.measured_px(
+        star, star_e, 30.0, CentroidSettings(threshold_sigma, 1), np.random.default_rng(4)
+    )
+
+
+def test_stars_of_trials_are_those_over_the_threshold_of_a_detector_without_defects(monkeypatch):
+    """Whatever its dark current, no star is none; a superpixel finds what a pixel does not."""
+    monkeypatch.setattr(noise, "TRIALS", 8)
+    dark = gaussian(0.9, replace(NOISY, dark_e_per_s=3000.0), phases=1)
+    assert np.isnan(measured(dark, 1e-6, 6.0)).all()
+    plain = gaussian(0.9, NOISY, phases=1)
+    hot = gaussian(0.9, replace(NOISY, hot_pixel_fraction=0.2), phases=1)
+    np.testing.assert_array_equal(measured(hot, 2000.0), measured(plain, 2000.0))
+    star = NoisyStar(GaussianPsf((0.9, 0.9)), RGGB, 1.0, 1, ALIKE)
+    noise_e = math.sqrt(star.detector.noise(30.0, 1.0).total_e2)
+    # a superpixel in the middle has 0.13 of the light: 9 sigmas of its own noise, and 3.4 of a
+    # pixel's
+    assert np.isfinite(measured(star, 26 * noise_e)).all()

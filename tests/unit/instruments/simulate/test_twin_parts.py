@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.special import ndtr
 
+from hilstar.display.geometry import monitor_camera
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import LitLight
 from hilstar.display.response import Response
@@ -17,8 +19,11 @@ from hilstar.instruments.simulate import twin
 from hilstar.instruments.simulate.star_finder import CROWDED_SHARE, crowded
 from hilstar.optics.psf import GaussianPsf
 
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
-def test_an_exposure_is_the_mean_of_its_own_frames(monkeypatch):
+
+@pytest.mark.parametrize("exposure_s", [0.1, 0.0999, 0.1001])
+def test_an_exposure_is_the_mean_of_its_own_frames(monkeypatch, exposure_s):
     """Three frames of 1/30 s from frame 7 on; frame n lights its first pixel with n e-/s."""
     drawn = []
 
@@ -34,7 +39,7 @@ def test_an_exposure_is_the_mean_of_its_own_frames(monkeypatch):
 
     bench = SimpleNamespace(
         config=SimpleNamespace(
-            tracker=SimpleNamespace(exposure_s=0.1), monitor=SimpleNamespace(refresh_hz=30.0)
+            tracker=SimpleNamespace(exposure_s=exposure_s), monitor=SimpleNamespace(refresh_hz=30.0)
         ),
         quantiser=SimpleNamespace(exposure=exposure),
         view=lambda q, rate, t_ns: (q, t_ns),
@@ -96,6 +101,31 @@ def test_a_common_move_is_told_beyond_what_a_star_may_be_off(rng, move_px, is_to
     moves = np.tile([move_px, 0.0], (12, 1))
     motion = common_motion(places, moves, np.full(12, 0.1))
     assert (motion is not None) == is_told
+
+
+def test_a_tracker_pixel_has_as_many_monitor_pixels_along_a_side_as_their_angles_say():
+    """Of 100 mm and 50 um, a monitor pixel is 0.5 mrad; of 50 mm and 100 um, a tracker's 2 mrad."""
+    monitor = monitor_camera((640, 480), 50.0, 100.0, UPRIGHT)
+    tracker = monitor_camera((400, 300), 100.0, 50.0, UPRIGHT)
+    cameras = SimpleNamespace(bench=SimpleNamespace(camera=monitor), camera=tracker)
+    assert twin.Twin.monitor_px_per_px.fget(cameras) == pytest.approx(4.0)
+
+
+@pytest.mark.parametrize("times", [0.99, 1.01])
+def test_stars_are_near_a_disc_up_to_a_margin_beyond_its_limb(times):
+    """Of a disc of 20 mrad, 30 mrad right of the axis, and one behind the camera, which is near
+    nothing: stars in its middle, and to either side of it by its radius and 4 px of 2 mrad.
+    """
+    camera = monitor_camera((400, 300), 100.0, 50.0, UPRIGHT)
+    off_rad = 0.03 + np.array([0.0, 1.0, -1.0]) * times * (0.02 + 4 * 0.002)
+    x_px, y_px = camera.project(np.stack([np.sin(off_rad), 0 * off_rad, np.cos(off_rad)], axis=1))
+    image = np.zeros((1, 1))
+    ahead = np.array([math.sin(0.03), 0.0, math.cos(0.03)])
+    discs = ((ahead, 0.02), (np.array([0.0, 0.0, -1.0]), 0.5))
+    field = twin.TwinField(
+        image, image, image, np.zeros(3, dtype=[("hip", "i4")]), x_px, y_px, image, discs
+    )
+    assert field.near_disc(camera, 4.0).tolist() == [True, times < 1, times < 1]
 
 
 def test_an_rms_is_the_root_of_the_mean_of_squares():

@@ -139,6 +139,21 @@ def test_a_bench_whose_geometry_is_as_assumed_has_its_own_camera(tmp_path):
         assert true.mirror == "x"
 
 
+@pytest.mark.parametrize(
+    ("lens", "mirror"),
+    [('true_geometry = "true.toml"', "y"), ("true_focal_length_mm = 121", "swap")],
+)
+def test_a_true_mirror_holds_however_the_true_lens_is_stated(tmp_path, lens, mirror):
+    (tmp_path / "true.toml").write_text(
+        'kind = "hilstar geometry 1"\nresolution_px = [480, 400]\nfocal_length_px = 2100\n'
+        "principal_point_px = [239.5, 199.5]\nq_cam_to_mon = [1, 0, 0, 0]\n"
+    )
+    with Twin(read_bench_file(twin_file(tmp_path, f'{lens}\ntrue_mirror = "{mirror}"\n'))) as twin:
+        true = true_geometry(twin.bench, twin.camera)
+        assert true.mirror == mirror
+        assert true.monitor is not twin.bench.camera
+
+
 def test_a_bench_that_draws_through_its_measured_lens_passes(tmp_path):
     """Distortion, a tilted screen and a misalignment, each of them known."""
     (tmp_path / "geometry.toml").write_text(

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.verify import faulty_fields
 from hilstar.instruments.verify.faulty_fields import (
     FaultSeen,
@@ -17,8 +18,10 @@ from hilstar.instruments.verify.faulty_fields import (
     fault_lines,
 )
 from hilstar.optics.layers.fault_kinds import KINDS
+from hilstar.optics.layers.fault_light import icrs_direction
 
 SIZE_PX = (120, 80)
+DRAWS = 200
 
 
 def fields_of(place: tuple[float, float] | None) -> FaultyFields:
@@ -88,6 +91,23 @@ def test_a_glow_is_what_it_adds_to_the_whole_image():
     assert (nothing.asked_e, nothing.note) == (0.0, "not on the tracker's image")
     dark = fields_of(None)._compared(GLOW, *shots(asked, 0 * asked))
     assert dark.flux_mag is None
+
+
+def test_a_fault_is_shown_within_the_image_and_a_glow_beside_it(rng):
+    """A point anywhere within two fifths of the field's radius, as often by area; a glow's middle
+    a fifth beyond the field's edge.
+    """
+    made = object.__new__(FaultyFields)
+    made._rng, made._view_rad = rng, 0.1
+    angles_rad = {}
+    for fault, toward in ((POINT, icrs_direction(POINT)), (GLOW, np.array(GLOW.icrs))):
+        boresights = np.array([to_matrix(made._attitude(fault))[2] for _ in range(DRAWS)])
+        angles_rad[fault.name] = np.arccos(boresights @ toward)
+    np.testing.assert_allclose(angles_rad["sun"], 1.2 * 0.1, rtol=1e-6)
+    areas = (angles_rad["ghost"] / (0.4 * 0.1)) ** 2
+    assert areas.max() < 1 + 1e-6
+    # the mean of so many uniform numbers, to four of its sigmas
+    assert areas.mean() == pytest.approx(0.5, abs=4 / math.sqrt(12 * DRAWS))
 
 
 def test_a_middle_is_x_then_y():

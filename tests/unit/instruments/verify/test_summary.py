@@ -189,6 +189,19 @@ def test_a_field_without_a_star_has_no_figures_and_lines_all_the_same():
     assert "3 stars to V = 6 are in the tracker's field" in few["reasons"][0]
 
 
+@pytest.mark.parametrize(("lost", "is_judged"), [(5, True), (6, False)])
+def test_light_is_judged_where_half_of_the_stars_are_measured(lost, is_judged):
+    """Five stars are, and all of them are 0.12 mag too faint in the median."""
+    base = measured()
+    limits = SimpleNamespace(**vars(base.config.verify) | {"flux_mag": 0.001})
+    limits.true_flux_at_white_e_per_s = None
+    tally = replace(base.tally, lost=[star(9, LOST)] * lost)
+    config = SimpleNamespace(**vars(base.config) | {"verify": limits})
+    reasons = judge(measured(tally=tally, config=config)).reasons
+    assert any("mag off at 95 %" in reason for reason in reasons) == is_judged
+    assert any(f"{lost} of {5 + lost}" in reason for reason in reasons)
+
+
 def test_the_table_has_each_star_and_the_charts_where_they_are(tmp_path, figures):
     write_report(tmp_path, judge(measured()))
     rows = csv_rows(tmp_path / "stars.csv")
@@ -288,10 +301,14 @@ def test_a_glass_is_off_its_chief_rays_and_vignettes_at_95_percent():
     glass = SimpleNamespace(
         by_colour=True,
         mean_shares=None,
-        centroids_px=lambda x, y, shares: (x + 0.3, y - 0.4, np.array([0.5, 0.25])),
+        centroids_px=lambda x, y, shares: (
+            x + np.array([0.3, 3.0]),
+            y - np.array([0.4, 4.0]),
+            np.array([0.5, 0.25]),
+        ),
     )
     effect = glass_effect(glass, stars)
-    assert effect.px == pytest.approx(0.5)
+    assert effect.px == pytest.approx(np.percentile([0.5, 5.0], 95))
     fainter = -2.5 * np.log10([0.5, 0.25])
     assert effect.mag == pytest.approx(np.percentile(fainter, 95))
     assert glass_effect(SimpleNamespace(by_colour=False), stars) is None

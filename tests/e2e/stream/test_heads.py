@@ -56,7 +56,7 @@ def test_a_head_that_is_killed_or_hangs_stops_no_other_and_is_begun_again(tmp_pa
         ]
         with Started(command, stdout=subprocess.PIPE, stderr=said, text=True) as process:
             try:
-                wait_for(lambda: lines.read_text().count("the first attitude has come") == 3)
+                wait_for(lambda: lines.read_text().count("the first attitude has come") >= 3)
                 ledgers = [tmp_path / f"run.{name}.mcap" for name in MOUNTINGS]
                 wait_for(lambda: all(len(recorded(ledger)) > BEGUN_FRAMES for ledger in ledgers))
                 heads = children(process.pid)
@@ -104,7 +104,7 @@ def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):
         command = [*HILSTAR, "serve", str(heads_file(tmp_path, port)), "--headless"]
         with Started(command, stdout=subprocess.DEVNULL, stderr=said, env=environment) as process:
             try:
-                wait_for(lambda: lines.read_text().count("the first attitude has come") == 3)
+                wait_for(lambda: lines.read_text().count("the first attitude has come") >= 3)
                 heads = children(process.pid).values()
             finally:
                 process.kill()

@@ -25,6 +25,7 @@ from hilstar.attitude.receiver import BackChannel, Traffic
 from hilstar.attitude.wire.links import StreamLink
 from hilstar.attitude.wire.packet import TimeRequest
 from hilstar.attitude.wire.zmq_links import Feed
+from hilstar.basics.errors import InputError
 from hilstar.basics.files import temporary_folder
 from hilstar.basics.process.interrupts import stop_on_signal
 from hilstar.basics.process.scheduling import HOST_CLOCK, BackOff
@@ -47,6 +48,7 @@ POLL_MS = 10
 TEND_NS = NS_PER_S // 20
 MIN_DURATION_S = 0.05  # for a head that is restarted at the end
 ENDS_S = 5.0  # what a head may take to end in order
+MAX_FOLDER_BYTES = 95  # a socket's path has 107 bytes, of which its name takes 12
 SOCKET = "body"
 BODY = (1.0, 0.0, 0.0, 0.0)
 
@@ -243,10 +245,15 @@ def head_ledger(ledger: Path, name: str, number: int = 0) -> Path:
 
 def run_heads(asked: HeadsRun, link: StreamLink, say: Say) -> dict[str, Any]:
     """Show each head until its end, or until a signal; what each one said of itself (--json), by
-    its name.
+    its name. Raises InputError where the temporary folder is too deep for a socket.
     """
     stop = threading.Event()
     with temporary_folder("heads") as folder, stop_on_signal(stop):
+        if len(os.fsencode(folder)) > MAX_FOLDER_BYTES:
+            raise InputError(
+                f"TMPDIR {folder.parent}: too deep for the heads' sockets; set TMPDIR to a folder"
+                " whose path is shorter"
+            )
         endpoint = f"ipc://{folder}/{SOCKET}"
         with Feed(endpoint) as feed:
             processes = []

@@ -7,6 +7,7 @@ import os
 import signal
 import socket
 import subprocess
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -96,9 +97,22 @@ def test_a_page_s_port_that_is_taken_is_found_before_a_head_begins(tmp_path):
         )
 
 
-def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):
-    place = tmp_path / "tmp"
+def test_a_folder_too_deep_for_a_socket_is_one_line(tmp_path):
+    place = tmp_path / ("deep" * 25)
     place.mkdir()
+    environment = {**os.environ, "TMPDIR": str(place)}
+    with publisher() as (_, port):
+        path = heads_file(tmp_path, port)
+        ended = run_hilstar("serve", path, "--headless", "--duration", "1", env=environment)
+    assert ended.returncode == 2, ended.stderr
+    assert "set TMPDIR to a folder whose path is shorter" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):
+    # pytest's own folder may be too deep for the sockets of heads
+    folder = tempfile.TemporaryDirectory()
+    place = Path(folder.name)
     environment, lines = {**os.environ, "TMPDIR": str(place)}, tmp_path / "said.txt"
     with publisher() as (sender, port), talking(sender, 50.0, BODY), lines.open("w") as said:
         command = [*HILSTAR, "serve", str(heads_file(tmp_path, port)), "--headless"]
@@ -113,3 +127,4 @@ def test_a_killed_run_leaves_no_folder_after_the_next_one(tmp_path):
         ended = run_hilstar(*command[3:], "--duration", "0.5", env=environment)
         assert ended.returncode in {0, 4}, ended.stderr
     assert not list(place.glob("hilstar-*"))
+    folder.cleanup()

@@ -145,6 +145,21 @@ def test_fields_are_as_many_as_counted_and_listed_on_either_axis(count, x_deg, y
 
 
 @pytest.mark.parametrize(
+    ("count", "wanted_um"),
+    [(2, (0.6, 0.5)), (3, (0.6, 0.5, 0.7)), (9, (0.6, 0.5, 0.7)), (0, (0.6, 0.5, 0.7))],
+)
+def test_wavelengths_are_as_many_as_counted_each_once(count, wanted_um):
+    """By the fourth number of FTYP, in both ways to list them; the third counts fields."""
+    waves = ("WAVM 1 0.6 1", "WAVM 2 0.5 1", "WAVM 3 0.7 1")
+    for lines in (waves, ("WAVL 0.6 0.5 0.7",)):
+        text = zmx("ENPD 20", f"FTYP 0 0 1 {count}", "PWAV 2", *lines)
+        if "WAVL" in lines[0]:
+            text = text.replace(b"WAVM 1 0.5875618 1\r\n", b"")
+        lens = read_zemax(text)
+        assert (lens.wavelengths_um, lens.primary) == (wanted_um, 1)
+
+
+@pytest.mark.parametrize(
     ("line", "share"),
     [
         ("  OBSC 0 5 0", 0.75),

@@ -104,6 +104,11 @@ def test_a_far_object_is_at_infinity(far):
     assert focal_length_mm(read_zemax(zmx(far=far))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
 
 
+def test_the_air_of_which_catalogues_give_indices_may_be_stated():
+    for words in ("20 1 1", "20 1 0", "25 0.5 0"):  # 0: no index is adjusted
+        assert read_zemax(zmx("ENPD 20", f"ENVD {words}")).pupil == 20.0
+
+
 @pytest.mark.parametrize(
     ("lines", "kind", "pupil"),
     [

@@ -98,6 +98,12 @@ def test_the_fields_terms_are_its_values(rng):
     )
 
 
+def test_an_image_s_edges_are_on_it_and_nowhere_is_not():
+    x_px = np.array([-0.5, SIZE[0] - 0.5, -0.51, SIZE[0] - 0.49, 7.0, np.nan, 7.0, 7.0])
+    y_px = np.array([SIZE[1] - 0.5, -0.5, 7.0, 7.0, SIZE[1] - 0.49, 7.0, np.nan, -0.51])
+    assert PINHOLE.contains_px(x_px, y_px).tolist() == [True] * 2 + [False] * 6
+
+
 def test_a_lens_that_folds_on_the_screen_is_refused():
     assert "folds" in refusal(bounded, replace(PINHOLE, lens=Lens((-20.0, 0.0, 0.0))), MARGIN_PX)
 

@@ -117,8 +117,9 @@ def test_a_sampled_gaussian_is_the_gaussian():
     x, y = rng.uniform(-9, 9, (2, 100))
     region = (-5, -4, 13, 10)
     assert np.abs(psf.spread(x, y, light, region) - exact.spread(x, y, light, region)).max() < 5e-4
-    whole = psf.spread(fraction[0], fraction[1], light, (-7, -8, 15, 17))
-    assert whole.sum(dtype=float) == pytest.approx(light.sum(), rel=FLUX_LIMIT)
+    for whole in (psf, SampledPsf(psf.samples.T, 5)):  # wide along rows, and along columns
+        image = whole.spread(*fraction, light, (-7, -8, 15, 17))
+        assert image.sum(dtype=float) == pytest.approx(light.sum(), rel=FLUX_LIMIT)
     assert psf.shares(pixel, pixel[:, None]).shape == (13, 13)
     assert psf.peak_share == pytest.approx(exact.peak_share, abs=1e-4)
     # A Gaussian and a pixel together are not quite a Gaussian, which adaptive moments weigh by: 1.4

@@ -141,6 +141,18 @@ def test_what_a_disc_hides_is_farther_than_it():
         assert left.star.tolist() == shown
 
 
+def test_a_satellite_is_left_to_its_own_layer_which_knows_what_hides_it():
+    """It has its place among the bodies' before theirs, and no distance there."""
+    face = Disc("Moon", AHEAD, 1000.0, 20.0, 20.0, np.array([0.0, 1.0, 0.0]), -AHEAD, "lambert")
+    stars = with_bodies(stars_at(AHEAD[None], np.ones(1)), ("SAT",), np.zeros(1), found=False)
+    stars = with_bodies(stars, ("Moon",), np.zeros(1))
+    stars.vectors[1:] = AHEAD
+    light = replace(sprites_at(np.full((3, 2), 40.0), np.ones(3), FOOTPRINT), star=np.arange(3))
+    moving = SimpleNamespace(names=("Moon",), distances_km=lambda *_: np.array([1000.0]))
+    left = BodyLayer(moving, CANVAS).unhidden(light, stars, [face], AT_START)
+    assert left.star.tolist() == [1]
+
+
 def test_a_streak_is_listed_in_the_middle_of_its_light():
     """Three sprites of 1, 2 and 5 parts of the light, along a line that is not an axis."""
     stars = stars_at(np.eye(3), np.ones(3))

@@ -56,6 +56,16 @@ def test_no_star_of_hipparcos_stands_twice_at_any_epoch():
     assert len(join(hipparcos, stale).catalog) == len(hipparcos) + 1
 
 
+def test_places_are_compared_at_the_median_epoch_of_the_table():
+    """Two of three are of 2016, Barnard's star among them."""
+    hipparcos = load_catalog()
+    early = moved_catalogue(hipparcos.taken(hipparcos.hip == MIZAR), 1991.25)
+    late = [
+        moved_catalogue(hipparcos.taken(hipparcos.hip == hip), 2016.0) for hip in (BARNARD, SIRIUS)
+    ]
+    assert len(join(hipparcos, stacked(early, *late)).catalog) == len(hipparcos)
+
+
 def test_further_stars_are_added_with_their_own_name_and_epoch():
     hipparcos = load_catalog()
     table = moved_catalogue(hipparcos.taken(hipparcos.hip == SIRIUS), 2016.0)
@@ -72,6 +82,9 @@ def test_a_pair_that_hipparcos_sums_takes_in_both_components_of_the_table():
     mizar = moved_catalogue(hipparcos.taken(hipparcos.hip == MIZAR), 2016.0)
     components = stacked(shifted(mizar, 0, 0.0, 0.04), shifted(mizar, 0, -14.4, 1.72))
     assert len(join(hipparcos, components).catalog) == len(hipparcos)
+    # no component is brighter than the sum by over a magnitude
+    brighter = stacked(mizar, shifted(mizar, 0, -14.4, -1.2))
+    assert len(join(hipparcos, brighter).catalog) == len(hipparcos) + 1
     # A star as near to a single one, and farther than any photometer's blur, is one of its own.
     vega = moved_catalogue(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
     assert (
@@ -84,6 +97,9 @@ def test_a_star_off_its_place_is_the_same_where_its_magnitude_is():
     hipparcos = load_catalog()
     vega = moved_catalogue(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
     assert len(join(hipparcos, shifted(vega, 0, 6.0, 0.3)).catalog) == len(hipparcos)
+    # unless another is at that place
+    beside = stacked(vega, shifted(vega, 0, 6.0, 0.3))
+    assert len(join(hipparcos, beside).catalog) == len(hipparcos) + 1
     assert len(join(hipparcos, shifted(vega, 0, 6.0, 3.0)).catalog) == len(hipparcos) + 1
 
 

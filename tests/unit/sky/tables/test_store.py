@@ -129,9 +129,13 @@ def test_nothing_depends_on_a_place_for_the_cache(stored_table, monkeypatch, tmp
 
 
 def test_only_the_newest_files_are_kept(stored_table):
+    before = set()
     for k in range(KEPT_FILES + 2):
         choose_catalog(TableChoice(stored_table, epoch_jyear=2000.0 + k))
-    assert len(stored(stored_table)) == KEPT_FILES
+        after = set(stored(stored_table))
+        assert len(after - before) == 1
+        before = after
+    assert len(before) == KEPT_FILES
 
 
 @pytest.mark.e2e

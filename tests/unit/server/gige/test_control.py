@@ -11,7 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilstar.basics.units import NS_PER_MS
-from hilstar.server.gige.control import ControlChannel, FeatureCommand, Released, Resend
+from hilstar.server.gige.control import (
+    ControlChannel,
+    ControlCounts,
+    FeatureCommand,
+    Released,
+    Resend,
+)
 from hilstar.server.gige.description import describe
 from hilstar.server.gige.features import ADDRESSES, FEATURES, PIXEL_FORMATS
 from hilstar.server.gige.registers import (
@@ -110,8 +116,12 @@ def test_a_controller_that_was_silent_for_too_long_does_not_get_its_privilege_ba
     camera = channel()
     asker = Asker(camera)
     assert asker.write(PRIVILEGE, CONTROL) == GvcpStatus.SUCCESS
-    assert asker.write(STREAM_PORT, 5000) == GvcpStatus.SUCCESS
-    asker.now_ns = (asker.read(HEARTBEAT_MS) + 1) * NS_PER_MS
+    silent_ns = (asker.read(HEARTBEAT_MS) + 1) * NS_PER_MS
+    last = command(WRITE, write_of(STREAM_PORT, 5000), number=400)
+    assert camera.receive(last, CLIENT, 0)[:2] == b"\0\0"
+    # not even by its last command once more, whose answer might have been lost
+    assert camera.receive(last, CLIENT, silent_ns)[:2] == b"\x80\x06"
+    asker.now_ns = silent_ns
     assert asker.write(STREAM_PORT, 5000) == GvcpStatus.ACCESS_DENIED
     assert camera.destination is None
     assert camera.take_events() == [Released(silent=True)]
@@ -149,6 +159,55 @@ def test_images_go_to_the_controllers_own_address_alone():
     assert camera.destination is None  # no port yet
     client.write(STREAM_PORT, 5123)
     assert camera.destination == ("127.0.0.1", 5123)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        command(DISCOVER)[:7],
+        b"\x43" + command(DISCOVER)[1:],
+        command(DISCOVER, number=0),
+        command(DISCOVER) + bytes(4),
+        command(READ, bytes(8))[:-4],
+        command(READ, bytes(540)),  # the standard's 536 bytes, and a word
+    ],
+)
+def test_what_is_no_command_is_dropped_and_counted_and_has_no_answer(data):
+    camera = channel()
+    assert camera.receive(data, CLIENT, 0) is None
+    assert camera.counts == ControlCounts(dropped=1)
+
+
+def test_each_command_is_counted_and_says_what_it_did_or_why_not():
+    camera = channel()
+    client = Asker(camera)
+    names = (0x0048, PRIVILEGE, STREAM_PORT, STREAM_ADDRESS)
+    assert client.ask(WRITE, write_of(PRIVILEGE, 0xFF)) == (0, b"\0\0\0\1")
+    three = write_of(STREAM_PORT, 7) + write_of(STREAM_ADDRESS, HERE) + write_of(STREAM_PORT, 8)
+    assert client.ask(WRITE, three) == (0, b"\0\0\0\3")
+    # of the privilege's bits the camera keeps control and exclusive access
+    status, body = client.ask(READ, struct.pack(">4I", *names))
+    assert (status, body) == (0, b"hils" + struct.pack(">3I", 3, 8, HERE))
+    assert len(client.ask(READ, bytes(536))[1]) == 536
+    assert client.ask(0x0086, struct.pack(">I8s", NAME, b"bench 7")) == (0, b"\0\0\0\x08")
+    refused = [
+        (0x0086, struct.pack(">II", PRIVILEGE, 0), GvcpStatus.INVALID_ADDRESS),
+        (0x0086, struct.pack(">I", NAME), WRONG),
+        (READ_MEMORY, struct.pack(">IHH", DESCRIPTION_AT, 0, 540), WRONG),
+        (READ_MEMORY, struct.pack(">IH", DESCRIPTION_AT, 0), WRONG),
+        (READ, bytes(6), WRONG),
+        (READ, b"", WRONG),
+        (WRITE, bytes(4), WRONG),
+        (0x0077, b"", GvcpStatus.NOT_IMPLEMENTED),
+    ]
+    for kind, body, status in refused:
+        assert client.ask(kind, body) == (status, b"")
+    assert camera.counts == ControlCounts(5 + len(refused), len(refused))
+    assert camera.controller == CLIENT
+    # a command that wants no answer is obeyed all the same
+    quiet = command(WRITE, write_of(STREAM_PORT, 9), number=500, flags=0)
+    assert camera.receive(quiet, CLIENT, 0) is None and camera.destination == (CLIENT[0], 9)
 
 
 def test_a_trigger_whose_answer_was_lost_begins_one_exposure():

@@ -26,6 +26,7 @@ from hilstar.server.gige.registers import (
     CameraIdentity,
     CameraSettings,
     GvcpStatus,
+    RegisterError,
     Registers,
 )
 from tests.support.gige_client import (
@@ -270,20 +271,33 @@ def test_a_value_that_the_camera_would_not_keep_is_refused(feature, value, statu
     assert client.write(ADDRESSES[feature], value) == status
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0, 61e6])
-def test_an_exposure_that_no_camera_makes_is_refused(value):
-    camera = channel()
-    client = Asker(camera)
+@pytest.mark.parametrize(
+    ("feature", "kept", "refused"),
+    [
+        ("ExposureTime", [10.0, 60e6], [float("nan"), float("inf"), -1.0, 0.0, 9.99, 60.1e6]),
+        # of an exposure of 50 ms
+        ("AcquisitionFrameRate", [0.01, 20.0], [0.0, 0.0099, 20.001, float("nan")]),
+        ("Gain", [0.0, 24.0], [-0.1, 24.1, float("nan")]),
+    ],
+)
+def test_a_number_is_kept_within_its_limits_and_refused_beyond(feature, kept, refused):
+    client = Asker(channel())
     client.write(PRIVILEGE, CONTROL)
-    (word,) = struct.unpack(">I", struct.pack(">f", value))
-    assert client.write(ADDRESSES["ExposureTime"], word) == GvcpStatus.INVALID_PARAMETER
-    assert camera.registers.settings.exposure_s == 0.05
+    before = client.read(ADDRESSES[feature])
+    for value in refused:
+        assert client.write(ADDRESSES[feature], _word(value)) == GvcpStatus.INVALID_PARAMETER
+        assert client.read(ADDRESSES[feature]) == before
+    for value in kept:
+        assert client.write(ADDRESSES[feature], _word(value)) == 0
+        assert client.read(ADDRESSES[feature]) == _word(value)
 
 
 def test_a_longer_exposure_lowers_the_rate_and_a_rate_beyond_it_is_refused():
     camera = channel()
     client = Asker(camera)
     client.write(PRIVILEGE, CONTROL)
+    assert client.write(ADDRESSES["ExposureTime"], _word(1000.0)) == 0
+    assert camera.registers.settings.rate_hz == 10.0  # a shorter one does not raise it
     assert client.write(ADDRESSES["ExposureTime"], _word(500_000.0)) == 0
     assert camera.registers.settings.rate_hz == pytest.approx(2.0)
     assert client.write(ADDRESSES["AcquisitionFrameRate"], _word(3.0)) != 0
@@ -357,6 +371,12 @@ def test_memory_beyond_the_description_is_no_memory():
         at = DESCRIPTION_AT + -(-size // 4) * 4 - 4
         status, _ = client.ask(READ_MEMORY, struct.pack(">IHH", at, 0, count))
         assert (status == GvcpStatus.SUCCESS) is is_there
+    # its last word is filled up with zeros
+    camera = CameraSettings(64, 48, 12, exposure_s=0.05, rate_hz=10.0)
+    registers = Registers(IDENTITY, camera, b"<xml>")
+    assert registers.read(DESCRIPTION_AT, 8) == b"<xml>\0\0\0"
+    with pytest.raises(RegisterError):
+        registers.read(DESCRIPTION_AT + 8, 4)
 
 
 def _description(client: Asker) -> str:

@@ -4,6 +4,7 @@ no X server, no waiting.
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -195,6 +196,18 @@ def test_an_idle_screen_is_kept_alive_and_ends_the_run_when_its_window_goes(tmp_
     run.screen.window.gone = "its display was unplugged"
     run.loop.idle()
     assert run.notices.counts()["window-gone"] == 1
+
+
+def test_slots_count_the_refreshes_between_two_frames_of_a_period_with_a_fraction():
+    host = FakeClock(FIRST_SWAP_NS + 1)
+    screen = FakeScreen(host)
+    screen.clock = SwapClock(FIRST_SWAP_NS, 1e9 / 60, True)
+    pacer = DisplayPacer(screen, Notices(), host)
+    moments = []
+    for moment in itertools.islice(pacer.moments(), 60):
+        moments.append(moment)
+        host.ns = moment.swap_ns + round(2.2e9 / 60)  # so long a frame takes
+    assert [moment.slot for moment in moments] == list(range(0, 180, 3))
 
 
 def test_the_grid_follows_a_screen_that_runs_a_little_slower():

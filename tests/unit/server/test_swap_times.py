@@ -105,8 +105,7 @@ def test_frames_that_a_driver_holds_back_are_found_and_refused_or_reckoned_with(
         ):
             ModelRun(tmp_path, hz, buffers=buffers)
     run = ModelRun(tmp_path, hz, force=True, buffers=buffers)
-    # how long before a swap a frame has to be ready says nothing where a queue takes it
-    assert (run.timing.queued, run.timing.guard_ms) == (held, GUARDS_MS[0])
+    assert run.timing.queued == held
     assert np.abs(run.frames(100)[4:]).max() < (QUEUED_NS if held else ON_TIME_NS)
     assert run.loop.screen_summary()["queued_frames"] == held
 

@@ -220,6 +220,7 @@ def test_an_answer_without_an_attitude_is_a_row_that_says_so(tmp_path):
 SCENARIO = (
     '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 0.5\nfor_s = 0.1\n'
     '[[fault]]\nkind = "freeze"\nname = "stuck"\n'
+    '[[fault]]\nkind = "drop"\nname = "first"\nat_s = 0\n'
 )
 
 
@@ -257,7 +258,7 @@ def test_a_run_has_the_faults_of_its_scenario_its_stream_or_its_recording(
     with run_with_faults(of[0], scenario, *of[1:]) as faults:
         assert isinstance(faults, Faults)
         assert made == [(of[0], scenario, *of[1:])]
-    assert capsys.readouterr().err == f"{path}: 2 faults, 1 of them at their time\n"
+    assert capsys.readouterr().err == f"{path}: 3 faults, 2 of them at their time\n"
     listening.endpoint = "tcp://127.0.0.1:7002"
     of = of_run('[faults]\nendpoint = "tcp://127.0.0.1:7002"\n')
     with run_with_faults(of[0], None, *of[1:]):
@@ -321,7 +322,7 @@ def test_the_files_of_a_run_are_read_or_written_and_never_both(tmp_path):
     ledger = tmp_path / "run.mcap"
     options = SimpleNamespace(ledger=ledger, scenario=scenario, overwrite=False, ledger_split=None)
     found = run_files(options, file, [log], [tmp_path / "out.csv"])
-    assert found.ledger == ledger and len(found.scenario.faults) == 2
+    assert found.ledger == ledger and len(found.scenario.faults) == 3
     for inputs, output in (([log], log), ([], scenario), ([], file.path), ([], ledger)):
         with pytest.raises(InputError):
             run_files(options, file, inputs, [output])

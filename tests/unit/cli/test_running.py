@@ -24,6 +24,8 @@ from hilstar.cli.running import (
     dated_ledger,
     end_of_run,
     followed,
+    optional_answers,
+    optional_frames,
     optional_scenario,
     page_listener,
     run_with_faults,
@@ -35,8 +37,10 @@ from hilstar.cli.tracker import open_camera, recorded
 from hilstar.instruments.calibrate import grabbed_dots
 from hilstar.instruments.calibrate.grabbed_dots import DotImages
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import load
 from hilstar.server.bench.config import parse_config
 from hilstar.server.bench.scenario import NO_SCENARIO
+from hilstar.server.record.ledger import LedgerSwitch
 from hilstar.server.summary import RunTally, RunVerdict
 from hilstar.server.watchdog import GPU_LOST
 from tests.support.benches import SMALL_BENCH, bench_text
@@ -303,6 +307,71 @@ def test_what_follows_a_run_has_each_frame_in_its_order(monkeypatch):
     ]
     with followed(None, False, description, None, status) as what:
         assert what[0] is status.see
+
+
+@pytest.mark.parametrize("acts", [False, True])
+def test_a_page_follows_a_run_after_its_status_and_hands_on_what_is_asked_there(monkeypatch, acts):
+    monkeypatch.setattr(running, "Service", lambda *_: nullcontext())
+    seen: list[object] = []
+    requests, listener, scpi, parts = object(), object(), object(), object()
+    description = SimpleNamespace(command="demo")
+
+    def opened_page(listeners, control, described, of):
+        assert (listeners.page, listeners.scpi) == (listener, scpi)
+        assert (control, described, of) == (acts, description, parts)
+        page = SimpleNamespace(
+            see=lambda shown: seen.append(("page", shown)),
+            follow=lambda run: seen.append(("page follows", run)),
+        )
+        return nullcontext((page, requests))
+
+    monkeypatch.setattr("hilstar.server.console.publisher.opened_page", opened_page)
+    status = SimpleNamespace(
+        see=lambda shown: seen.append(("status", shown)),
+        follow=lambda run: seen.append(("status follows", run)),
+        begun=0, alive=0, line=0,
+    )  # fmt: skip
+    with followed(listener, acts, description, parts, status, scpi=scpi) as (sink, follow, asked):
+        follow("a run")
+        sink("a frame")
+        assert asked is requests
+    assert seen == [
+        ("status follows", "a run"),
+        ("page follows", "a run"),
+        ("status", "a frame"),
+        ("page", "a frame"),
+    ]
+
+
+def test_answers_are_taken_and_frames_are_fed_while_a_run_lasts(tmp_path, monkeypatch, capsys):
+    taken: list[str] = []
+    source = SimpleNamespace(
+        endpoint="udp://here", take=lambda: taken.append("look") or [], unread="",
+        refusals=dict, trouble=lambda: "",
+    )  # fmt: skip
+    monkeypatch.setattr(
+        "hilstar.server.answers.reader.open_answers", lambda *given: nullcontext(source)
+    )
+    answers = {"source": "udp", "bind": "127.0.0.1:5000", "format": "json"}
+    for name, tables in (("plain", {}), ("answered", {"answers": answers})):
+        (tmp_path / f"{name}.toml").write_text(
+            bench_text({"render": {"quantisation": "round"}}, tables)
+        )
+    with load(tmp_path / "plain.toml") as bench:
+        with optional_answers(bench, Notices(), LedgerSwitch(), None) as none:
+            assert none is None
+        with optional_frames(None, bench, None) as none:
+            assert none is None
+        with optional_frames(f"ipc://{tmp_path}/feed", bench, None) as feed:
+            assert feed.endpoint == f"ipc://{tmp_path}/feed"
+    assert capsys.readouterr().err == f"frames: ipc://{tmp_path}/feed\n"
+    with (
+        load(tmp_path / "answered.toml") as bench,
+        optional_answers(bench, Notices(), LedgerSwitch(), None) as live,
+    ):
+        assert live is not None and live.figures.answers == 0
+    assert taken  # once more at its end
+    assert capsys.readouterr().err == "answers: udp://here\n"
 
 
 def test_a_ledger_s_name_has_the_time_of_its_start_where_it_asks_for_it():

@@ -57,12 +57,13 @@ def ended(
     gone: str | None = None,
     gpu: str = "",
     strict: bool = False,
+    blank: int | None = None,
 ) -> int:
     """The exit code of a run, 3 where it raises MachineError."""
     tally = RunTally()
     for _ in range(frames):
         tally.add(1_000_000, None if not accepted else 0, 3, ())
-    tally.blank_frames = 0 if accepted else frames
+    tally.blank_frames = (0 if accepted else frames) if blank is None else blank
     summary = tally.summary(1.0, PacketCounts(received=accepted), RENDERER)
     summary = replaced(summary, verdict=RunVerdict(is_strict, is_strict, 0.0, 0.0, ""))
     notices = Notices()
@@ -88,6 +89,9 @@ def ended(
         ({"strict": True, "is_strict": False}, 1),
         # a run without an attitude is code 4, the caller's
         ({"strict": True, "is_strict": False, "accepted": 0}, 0),
+        # a replay has no packets, and all frames of a run may be blank before its attitude
+        ({"strict": True, "is_strict": False, "accepted": 0, "blank": 0}, 1),
+        ({"strict": True, "is_strict": False, "blank": 10}, 1),
         ({"failure": "No space left on device"}, 1),
         ({"gone": "its display was unplugged"}, 3),
         ({"gpu": "the GPU was reset: the run ends"}, 3),

@@ -17,6 +17,7 @@ from hilstar.instruments.campaign.run import Campaign
 from hilstar.server.bench.build import open_bench
 from tests.support.benches import bench_text
 from tests.support.campaigns import plan_text
+from tests.support.commands import run_hilstar_here
 
 CASES = 8
 FIELD = {"kind": "field", "radec_deg": [80.0, 20.0], "radius_deg": 1.5, "roll_deg": [0.0, 0.0]}
@@ -86,3 +87,32 @@ def test_cases_are_shown_on_one_display_and_the_page_hears_of_the_time_left(
     ]
     ended = f"hilstar: 8 of {CASES} cases are done; the same command goes on from there\n"
     assert capsys.readouterr().err.endswith(ended) is not is_whole
+
+
+@pytest.mark.parametrize(
+    ("through", "words", "of"),
+    [
+        *(
+            ("bench", words, "tracker or display")
+            for words in ("--workers 2", "--memory 1GB", "--images fits", "--solver truth")
+        ),
+        ("bench", "--scheduler tcp://127.0.0.1:1", "tracker or display"),
+        *(
+            ("tracker", words, "bench")
+            for words in ("--headless", "--windowed", "--force", "--feed tcp://127.0.0.1:1")
+        ),
+        ("tracker", "--console", "bench"),
+    ],
+)
+def test_what_means_nothing_for_a_plan_s_way_to_its_tracker_is_refused(
+    tmp_path, through, words, of
+):
+    answers = {"source": "udp", "bind": "127.0.0.1:5000", "format": "json"}
+    (tmp_path / "bench.toml").write_text(bench_text({"answers": answers}))
+    plan = plan_text(through=through, cases=CASES, attitudes=FIELD)
+    (tmp_path / "plan.toml").write_text(plan)
+    done = run_hilstar_here("campaign", "plan.toml", "-o", "out", *words.split(), cwd=tmp_path)
+    assert done.returncode == 2
+    line = f"hilstar: campaign {words.split()[0]}: is for through = {of}; leave it out\n"
+    assert done.stderr == line
+    assert not (tmp_path / "out").exists()

@@ -140,6 +140,9 @@ def test_a_flat_dark_end_is_made_strictly_rising():
     assert np.all(np.diff(light) > 0)
     assert light[-1] == 1
     assert light[4] == pytest.approx(0.5)
+    # by what a calibration may state, and at its dark end by more than nothing
+    assert light[5] / light[4] - 1 == pytest.approx(1e-6, rel=1e-3)
+    assert light[1] == 1e-9
     # over a black level a thousand times as bright as white, too
     assert np.all(np.diff(1000 + light) > 0)
 
@@ -196,14 +199,16 @@ def test_a_floor_of_the_instrument_does_not_bend_the_faint_end(tmp_path):
 
 
 def test_without_repeats_the_residuals_tell_the_noise(tmp_path, rng):
+    """Where it is a third of what is taken for it at first."""
+    noise = 0.003
     codes = planned_codes(8, 64)
-    light = ((np.array(codes) / 255) ** 2.2 + 1e-3) * (1 + NOISE * rng.standard_normal(len(codes)))
+    light = ((np.array(codes) / 255) ** 2.2 + 1e-3) * (1 + noise * rng.standard_normal(len(codes)))
     path = write_readings(
         tmp_path / "m.csv", [(c, "w", v) for c, v in zip(codes, light, strict=True)]
     )
     fit = fit_channel(read_measurements(path), "w")
     # four sigma of a scatter of 60
-    assert fit.noise_relative == pytest.approx(NOISE, rel=4 / np.sqrt(2 * 60))
+    assert fit.noise_relative == pytest.approx(noise, rel=4 / np.sqrt(2 * 60))
 
 
 def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rng):
@@ -253,6 +258,9 @@ def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
     assert summary["additivity_percent"] == pytest.approx(100 * (1 / 1.02 - 1), abs=0.8)
     assert summary["crosstalk_percent"]["1e-0"] == summary["additivity_percent"]
     assert list(summary["crosstalk_percent"]) == [f"1e-{decade}" for decade in range(4)]
+    # a calibration is as noisy as its noisiest primary
+    noises = [summary["channels"][name]["noise_relative"] for name in shares]
+    assert summary["noise_relative"] == max(noises) > min(noises)
     for code, decade in ((255, "1e-0"), (90, "1e-1"), (31, "1e-2")):
         planted = 100 * (1 / (1.02 * (1 + 0.1 * (1 - code / 255))) - 1)
         assert summary["crosstalk_percent"][decade] == pytest.approx(

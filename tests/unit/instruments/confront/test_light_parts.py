@@ -29,6 +29,7 @@ from hilstar.instruments.confront.light import (
     CORRECTION_PRIOR,
     MAX_CORRECTION,
     NO_CORRECTION,
+    LightFit,
     StarLight,
     _correction,
     _CorrectionFit,
@@ -68,6 +69,33 @@ def test_extinction_is_as_sure_as_skies_are_alike(rng):
     sigma = told.sigma["extinction_mag_per_air_mass"]
     assert sigma == pytest.approx(0.01 / about, rel=0.01)
     assert fit.zero_point_mag == pytest.approx(12 - 0.2 * masses.mean(), abs=1e-3)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_extinction_weighs_a_photograph_by_its_clean_stars_and_what_skies_differ_by(known):
+    """Four, ten and a hundred stars 0.03 mag to either side, and about as many that are not clean."""
+    image = np.repeat([0, 1, 2], [8, 18, 200])
+    each = np.arange(len(image))
+    clean = each % 4 < 2
+    offsets_mag = np.array([-11.7, -11.66, -11.65])
+    masses = [1.0, 1.2, 1.31]
+    mag = 5.0 + each * 0.01
+    off_mag = np.where(clean, 0.03, 2.0) * (-1) ** each
+    stars = stars_of(offsets_mag[image] + mag - off_mag, 1e-3, image=image, clean=clean)
+    light = LightFit(offsets_mag, (0.0, 0.0), NO_CORRECTION, 12.0, 0.0, 1.0, mag=mag)
+    told = with_extinction(light, stars, masses, known=known)
+    spread_mag = 1.482602 * 0.03
+    sigma_mag = np.hypot(spread_mag / np.sqrt([4, 10, 100]), 0.01)
+    values, covariance = np.polyfit(masses, offsets_mag, 1, w=1 / sigma_mag, cov="unscaled")
+    assert told.extinction_mag == pytest.approx(values[0])
+    name = "extinction_beyond_table_mag_per_air_mass" if known else "extinction_mag_per_air_mass"
+    assert told.sigma == {name: pytest.approx(math.sqrt(covariance[0, 0]))}
+    assert told.masses == (1.0, 1.2, 1.31)
+    # a span of less than 0.3 tells none, nor do two photographs
+    near = with_extinction(light, stars, [1.0, 1.2, 1.29], known=known)
+    two = replace(light, offsets_mag=offsets_mag[:2])
+    few = with_extinction(two, replace(stars, image=image % 2), [1.0, 1.5], known=known)
+    assert (near.extinction_mag, few.extinction_mag, few.masses) == (None, None, (1.0, 1.5))
 
 
 def test_a_zero_point_is_the_mean_of_the_photographs_and_no_vignetting(rng):

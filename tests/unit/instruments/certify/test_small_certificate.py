@@ -18,6 +18,8 @@ from hilstar.instruments.certify.budget import BATCH
 from hilstar.instruments.certify.model import ReferenceStar
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
 from hilstar.server.bench.certificate_file import Certificate, CertifiedFigure
+from hilstar.server.bench.star_light import catalogue_choice
+from hilstar.sky.star_table import choose_catalog
 from tests.support.planted_certify import BENCH, EXACT_LENS
 from tests.support.planted_readings import (
     ARCSEC,
@@ -85,6 +87,12 @@ def stars(bench: BenchFile) -> list[ReferenceStar]:
 def by_readings(bench: BenchFile, stars: list[ReferenceStar]) -> tuple[Certificate, Truth]:
     truth = the_truth()
     return certified(bench, PlantedReader(truth, np.random.default_rng(8)), stars), truth
+
+
+def test_a_reference_star_s_row_is_its_own_in_the_catalogue(bench, stars) -> None:
+    catalogue = choose_catalog(catalogue_choice(bench.config, bench.folder))
+    rows = [star.row for star in stars]
+    assert catalogue.hip[rows].tolist() == [star.hip for star in stars]
 
 
 def certified(

@@ -12,7 +12,7 @@ import pytest
 
 from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.instruments.assess.bounded_figures import TooFewCases, clopper_pearson
-from hilstar.instruments.assess.star_drawing import _detection
+from hilstar.instruments.assess.star_drawing import _detection, star_drawing
 from hilstar.instruments.assess.star_figures import (
     DetectionBins,
     StarTable,
@@ -21,6 +21,7 @@ from hilstar.instruments.assess.star_figures import (
     star_figure,
     without_turns,
 )
+from tests.support.card_texts import drawn_figures
 
 SIZE_PX = (1200, 700)
 CONFIDENCE = 0.975
@@ -188,6 +189,28 @@ def test_detection_is_drawn_in_the_middles_of_twelve_bins_from_the_brightest_sta
     assert drawn[0, 2:] == pytest.approx([1 - low, high - 1])
     low, high = clopper_pearson(0, 4, 0.975)
     assert drawn[-2, 2:] == pytest.approx([0 - low, high])
+
+
+def test_a_map_is_drawn_as_arrows_of_the_detector_whose_rows_go_down(rng):
+    """Stars that are all off by a third of a pixel along x at the right edge, and by none left."""
+    places_px = places_in(1600, rng)
+    right = (places_px[0] + 0.5) / SIZE_PX[0]
+    stars = table(np.arange(1600) // 40, places_px, np.stack([right / 3, np.zeros(1600)]))
+    with drawn_figures() as drawn:
+        text = star_drawing(stars, SIZE_PX)
+    assert text.startswith("<")
+    (figure,) = drawn
+    _, axes = figure.axes
+    (arrows,) = axes.collections
+    wanted = place_map(stars, SIZE_PX, 8)
+    assert arrows.get_offsets() == pytest.approx(np.stack([wanted.x_px, wanted.y_px], axis=1))
+    # less the mean: from -7/16 to 7/16 of it, in the middles of eight columns
+    dx_px, dy_px = arrows.U, arrows.V
+    assert dx_px.reshape(8, 8)[0] == pytest.approx((np.arange(8) - 3.5) / 24)
+    assert dy_px == pytest.approx(np.zeros(64), abs=1e-9)
+    assert axes.yaxis_inverted()
+    title = " ".join(figure.get_suptitle().split())
+    assert title == f"Stars reported by magnitude; their places are off by at most {7 / 48:.2g} px"
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -120,9 +120,9 @@ def test_epochs_too_far_apart_for_the_polynomial_are_told(caplog, step_s, told):
     t_ns = START_NS + round(3.5 * step_s) * NS
     off_km = np.linalg.norm(orbit.state(t_ns)[0] - STATION.state(t_ns)[0])
     assert (off_km > 1.0) == told
-    if told:
-        said_km = float(re.search(r"off by some (\S+) km", caplog.text)[1])
-        assert 0.1 * off_km < said_km < off_km
+    if told:  # the figure is that of the worst epoch, by the first term that is left out
+        told_km = float(re.search(r"off by some ([\d.e+]+) km", caplog.text)[1])
+        assert off_km / 20 < told_km < 20 * off_km
 
 
 GOOD = oem(segment([0, 60, 120]))

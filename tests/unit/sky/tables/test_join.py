@@ -56,6 +56,16 @@ def test_no_star_of_hipparcos_stands_twice_at_any_epoch():
     assert len(join(hipparcos, stale).catalog) == len(hipparcos) + 1
 
 
+def test_places_are_compared_at_the_median_epoch_of_the_table():
+    """Two of three are of 2016, Barnard's star among them."""
+    hipparcos = load_catalog()
+    early = moved_catalogue(hipparcos.taken(hipparcos.hip == MIZAR), 1991.25)
+    late = [
+        moved_catalogue(hipparcos.taken(hipparcos.hip == hip), 2016.0) for hip in (BARNARD, SIRIUS)
+    ]
+    assert len(join(hipparcos, stacked(early, *late)).catalog) == len(hipparcos)
+
+
 def test_further_stars_are_added_with_their_own_name_and_epoch():
     hipparcos = load_catalog()
     table = moved_catalogue(hipparcos.taken(hipparcos.hip == SIRIUS), 2016.0)
@@ -93,6 +103,13 @@ def test_a_pair_that_hipparcos_sums_takes_in_both_components_of_the_table():
         len(join(hipparcos, stacked(vega, shifted(vega, 0, -14.4, 6.0))).catalog)
         == len(hipparcos) + 1
     )
+
+
+def test_a_star_off_its_place_is_another_where_one_is_at_that_place():
+    hipparcos = load_catalog().brighter_than(5.0)
+    vega = moved_catalogue(hipparcos.taken(hipparcos.hip == 91262), 2016.0)
+    beside = stacked(vega, shifted(vega, 0, 6.0, 0.3))
+    assert len(join(hipparcos, beside).catalog) == len(hipparcos) + 1
 
 
 @pytest.mark.parametrize("fainter_mag", [0.3, 3.0, -0.3, -3.0])

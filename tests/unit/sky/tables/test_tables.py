@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.table import MaskedColumn, Table
 
-from hilstar.sky.catalog import load_catalog
+from hilstar.sky.catalog import load_catalog, plain_catalog
 from hilstar.sky.facts import errors_of
 from hilstar.sky.star_table import TableChoice, choose_catalog, table_facts
 from hilstar.sky.table_reader import from_gaia
@@ -202,6 +202,8 @@ def test_repeated_and_impossible_rows_are_counted(tmp_path, caplog):
     (tmp_path / "t.csv").write_text("ra,dec,vmag,b-v\n" + "\n".join(rows) + "\n")
     catalog = read_stars(tmp_path / "t.csv")
     assert sorted(catalog.ra_deg.tolist()) == [1.0, 340.0]
+    # of two alike the first
+    assert {catalog.name(0), catalog.name(1)} == {"t row 4", "t row 8"}
     counts = (
         "1 without a place, 3 without a magnitude and a colour, 1 beyond what a star has, 1"
         " repeated"
@@ -360,6 +362,35 @@ def test_a_table_s_own_errors_stand_in_the_place_of_hipparcos(tmp_path):
     gaia_table().write(plain)
     assert table_facts(TableChoice(plain), stars, before) is before
     assert table_facts(TableChoice(), stars, before) is before
+
+
+def test_beside_hipparcos_a_star_of_hipparcos_keeps_its_errors_whatever_the_numbers(tmp_path):
+    """HIP 5 and Gaia DR3 5 are two stars."""
+    path = tmp_path / "stars.ecsv"
+    table = gaia_table()
+    table["ra_error"] = np.array([0.1, 0.2, 0.3, 0.4, 0.5]) * u.mas
+    table.write(path)
+    row = table["source_id"].tolist().index(5)
+    zero = np.zeros(2)
+    columns = {"v_mag": zero, "ra_deg": zero, "dec_deg": zero}
+    columns |= {"hip": np.array([5, 0], dtype=np.int32), "identifier": np.array([5, 5])}
+    stars = plain_catalog("Gaia DR3", 2, columns)
+    before = errors_of(stars)
+    facts = table_facts(TableChoice(path, with_hipparcos=True), stars, before)
+    assert facts["sigma_ra_mas"].tolist() == [before["sigma_ra_mas"][0], 0.1 * (row + 1)]
+    assert 0.1 < before["sigma_ra_mas"][0] < 2.0
+    alone = table_facts(TableChoice(path), stars, before)
+    assert alone["sigma_ra_mas"].tolist() == [0.1 * (row + 1)] * 2
+
+
+@pytest.mark.parametrize("name", ["t.vot", "t.fits"])
+def test_without_a_unit_a_column_s_own_name_says_it_in_every_format(tmp_path, name):
+    table = Table({"ra_hours": [1.0, 12.5], "dec_rad": [0.5, -1.0]})
+    table["vmag"], table["b-v"] = [4.0, 5.0], [0.5, 0.6]
+    table.write(tmp_path / name, **FORMATS[name])
+    catalog = read_stars(tmp_path / name)
+    assert sorted(catalog.ra_deg.tolist()) == pytest.approx([15.0, 187.5])
+    assert sorted(catalog.dec_deg.tolist()) == pytest.approx(np.degrees([-1.0, 0.5]))
 
 
 def test_a_table_beside_hipparcos_says_of_its_own_rows_alone(tmp_path):

@@ -215,7 +215,10 @@ def test_only_the_newest_images_are_sent_again():
             )
             answer = client.stream.recv(65536)
             assert struct.unpack(">HH", answer[:4]) == (status, number)
-        wait_for(lambda: made.counts.resent == resent_before + 1, "the one that was sent again is counted")
+        wait_for(
+            lambda: made.counts.resent == resent_before + 1,
+            "the one that was sent again is counted",
+        )
 
 
 def test_another_clients_address_is_refused_over_the_wire():

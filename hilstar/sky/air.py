@@ -7,6 +7,7 @@ them. The glow of the sky goes with the zenith distance by van Rhijn's layer and
 72, 747).
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -26,6 +27,7 @@ VAN_RHIJN = 0.96  # an emitting layer at 130 km
 STEP_NS = NS_PER_S  # the zenith of a second: 15 arcsec, 0.4 mmag at an air mass of 5
 # of the Sun's altitude: above it the sky is brighter than a night's table says
 TWILIGHT_DEG = -12.0
+TROPOPAUSE_M = 11_000.0  # of the standard atmosphere: from here to 20 km it is as warm everywhere
 MAX_TWINKLE = 1.0  # beyond it, near the horizon, the law of weak scintillation ends
 
 
@@ -55,9 +57,13 @@ def scintillation(
 
 
 def standard_pressure_hpa(height_m: float) -> float:
-    """The pressure of the International Standard Atmosphere, hPa."""
-    temperature_ratio = max(1 - 2.25577e-5 * height_m, 0.01)
-    return float(1013.25 * temperature_ratio**5.25588)
+    """The pressure of the International Standard Atmosphere (ISO 2533) at heights up to 20 km, hPa.
+
+    The ellipsoid's height is taken as the standard's geopotential one: 0.3 % of it at 20 km.
+    """
+    above_tropopause_m = max(height_m - TROPOPAUSE_M, 0.0)
+    temperature_ratio = 1 - 2.25577e-5 * (height_m - above_tropopause_m)
+    return float(1013.25 * temperature_ratio**5.25588 * math.exp(-above_tropopause_m / 6341.62))
 
 
 def extinction_curve(name: str) -> Curve | None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import warnings
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,10 +23,11 @@ from hilstar.attitude.logs.earth import (
     q_icrs_to_enu,
     q_icrs_to_itrs,
     q_icrs_to_ned,
+    stated_reference,
     to_icrs,
     utc_ns_of,
 )
-from hilstar.attitude.logs.entries import LogEntry
+from hilstar.attitude.logs.entries import LogEntry, Stated
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import conjugate, multiply, to_matrix, to_rotation_vector
@@ -219,6 +221,33 @@ def test_a_log_is_told_to_leave_the_table_at_either_end(monkeypatch, seconds, is
     turned = list(to_icrs(entries, reference, False, told))
     assert [entry.event.t_ns for entry in turned] == [entry.event.t_ns for entry in entries]
     assert [kind for kind, _ in told] == ["log-earth"] * is_told
+
+
+@pytest.mark.parametrize(
+    ("epoch_utc", "last_ns", "refused"),
+    [
+        ("1677-09-21T00:12:43", 1, "--epoch-utc 1677-09-21T00:12:43: UTC goes from 1677-09-22 to"),
+        ("1677-09-21T00:12:44", 1, ""),
+        ("2262-04-11T23:47:16", 854_775_807, ""),
+        ("2262-04-11T23:47:16", 854_775_808, "t_s 0.854775808 with --epoch-utc: UTC goes from"),
+        ("2262-04-11T23:47:17", 1, "--epoch-utc 2262-04-11T23:47:17: UTC goes from 1677-09-22 to"),
+    ],
+)
+def test_a_utc_that_64_bits_do_not_hold_is_refused(epoch_utc, last_ns, refused):
+    """-2^63 ns is 1677-09-21T00:12:43.145224192, and 2^63 - 1 is 2262-04-11T23:47:16.854775807."""
+    stated = Stated(reference="ned", place=(48.1, 11.6, 0.0), epoch_utc=epoch_utc)
+    unit = np.array([1.0, 0.0, 0.0, 0.0])
+    entries = [LogEntry("", AttitudeSample(t_ns, unit)) for t_ns in (0, last_ns, 1)]
+
+    def turned() -> list[LogEntry]:
+        reference = stated_reference(Path("log.csv"), "ned", stated, 0)
+        return list(to_icrs(entries, reference, False, []))
+
+    if refused:
+        with pytest.raises(InputError, match=f"^{refused}"):
+            turned()
+    else:
+        assert len(turned()) == len(entries)
 
 
 def test_a_level_frame_is_described_with_its_latitude_before_its_longitude():

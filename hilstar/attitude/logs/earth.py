@@ -34,7 +34,7 @@ import numpy.typing as npt
 from hilstar.attitude.logs.aem_blocks import AemFaultError, epoch_ns
 from hilstar.attitude.logs.entries import LogEntry, Stated
 from hilstar.attitude.logs.log_times import FIRST_DATE_NS
-from hilstar.attitude.wire.packet import AttitudeSample
+from hilstar.attitude.wire.packet import INT64, AttitudeSample
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, shortened
 from hilstar.basics.rotation import frame_turns, from_matrix, multiply, normalise, rotate
@@ -57,6 +57,7 @@ UT1_S_A_YEAR = 1.1
 HALF = float(np.sqrt(0.5))
 Q_NED_TO_ENU = (0.0, HALF, HALF, 0.0)
 UTC_FORM = "write a UTC such as 2026-11-22T10:00:00"
+BEYOND_NS = "UTC goes from 1677-09-22 to 2262-04-11, 64 bits of nanoseconds; write one between them"
 # Seconds from a scale to TAI; TDB is within 2 ms of TT, in which the Earth turns by 0.03 arcsec.
 TO_TAI_S = {"TAI": 0.0, "GPS": 19.0, "TT": -32.184, "TDB": -32.184}
 Kind = Literal["icrs", "enu", "ned"]
@@ -342,6 +343,8 @@ def stated_reference(path: Path, kind: Kind, stated: Stated, first_ns: int) -> R
                 " TIME, UTC at 0 s"
             )
         utc_ns = utc_ns_of(stated.epoch_utc, "--epoch-utc")
+        if first_ns + utc_ns not in INT64:
+            raise InputError(f"--epoch-utc {stated.epoch_utc}: {BEYOND_NS}")
     return Reference(kind, stated.place[:2], utc_ns)
 
 
@@ -376,6 +379,7 @@ def to_icrs(
     gyroscope measured them.
 
     At their end `told` gets a notice where the dates leave the table of the Earth's orientation.
+    Raises InputError at a time whose UTC does not fit 64 bits.
     """
     if reference.kind == "icrs":
         yield from entries
@@ -385,6 +389,9 @@ def to_icrs(
     remaining = iter(entries)
     while batch := list(islice(remaining, BATCH)):
         samples = [entry.event for entry in batch if isinstance(entry.event, AttitudeSample)]
+        beyond_ns = [each.t_ns for each in samples if each.t_ns + reference.utc_ns not in INT64]
+        if beyond_ns:
+            raise InputError(f"t_s {beyond_ns[0] / NS_PER_S:.9g} with --epoch-utc: {BEYOND_NS}")
         turned = iter(_from_icrs(samples, reference, gyro))
         if samples:
             if first_ns is None:

@@ -336,7 +336,7 @@ def _draw_stars(axes: Any, x: FloatArray, y: FloatArray, counted: BoolArray) -> 
 
 def _places(rows: Sequence[StarRow]) -> str:
     """Arrows from predicted places to those seen."""
-    bright = [row for row in rows if row.dn > 20 * row.sigma_dn]
+    bright = [row for row in rows if row.dn >= 20 * row.sigma_dn]
     x = np.array([row.x_predicted_px for row in bright])
     y = np.array([row.y_predicted_px for row in bright])
     off_px = np.array([row.off_px for row in bright]).reshape(-1, 2)

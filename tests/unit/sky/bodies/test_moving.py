@@ -192,3 +192,19 @@ def test_the_discs_are_those_of_bodies_wider_than_asked(share, is_wider):
     width_rad = moving.diameters_arcsec(0)["Moon"] * ARCSEC
     discs = moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, share * width_rad, 0)
     assert [disc.name for disc in discs] == ["Moon"] * is_wider
+
+
+def test_discs_have_the_bodies_own_shapes_and_come_nearest_first():
+    """Radii at the equator and the poles by the IAU's report (Archinal et al. 2018), km."""
+    moving, _ = sky_of(("Saturn", "Moon", "Sun", "Jupiter"))
+    discs = moving.discs(np.array([0.0, 0.0, 1.0]), np.pi)
+    shapes = [(disc.name, disc.equator_km, disc.polar_km) for disc in discs]
+    assert shapes == [
+        ("Moon", 1737.4, 1737.4),
+        ("Sun", 695_700.0, 695_700.0),
+        ("Jupiter", 71_492.0, 66_854.0),
+        ("Saturn", 60_268.0, 54_364.0),
+    ]
+    distances_km = moving.distances_km(0)[[1, 2, 3, 0]]
+    assert [disc.distance_km for disc in discs] == pytest.approx(distances_km.tolist(), rel=1e-12)
+    assert [disc.lunar_share < 1 for disc in discs] == [True, False, False, False]

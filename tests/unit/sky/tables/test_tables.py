@@ -254,6 +254,9 @@ REFUSED = {
     HEAD + "1,2,3,0.1\n1,2,3,4,5\n": "cannot be read",
     "ra,dec,vmag,b-v,pmra,pmdec\n1,2,3,0.1,5,5\n": "write [sky] catalogue_epoch_jyear",
     "ra,dec,vmag,b-v,pmra,pmdec,ref_epoch\n1,2,3,0.1,5,5,1\n": "column ref_epoch is no Julian year",
+    "ra,dec,vmag,b-v,ref_epoch\n1,2,3,0.1,2000\n3,4,5,0.1,2448349.0625\n": (
+        "column ref_epoch is no Julian year; write [sky] catalogue_epoch_jyear, such as 2000.0"
+    ),
     "source_id,ra,dec,vmag,b-v\n" + "9" * 30 + ",1,2,3,0.1\n": (
         "column source_id is no column of numbers"
     ),
@@ -391,6 +394,39 @@ def test_without_a_unit_a_column_s_own_name_says_it_in_every_format(tmp_path, na
     assert sorted(catalog.dec_deg.tolist()) == pytest.approx(np.degrees([-1.0, 0.5]))
 
 
+def test_a_table_beside_hipparcos_says_of_its_own_rows_alone(tmp_path):
+    """Row 2 is not HIP 2, and a star of the table keeps its own figures where it has a HIP number,
+    too. A blank MK type is unknown, whatever stands below the mask.
+    """
+    table = Table(
+        {
+            "hip": [0, 0, 500_000],
+            "ra_deg": [10.0, 20.0, 30.0],
+            "dec_deg": [-50.0, -60.0, -70.0],
+            "v_mag": [11.5, 12.0, 12.5],
+            "bv_mag": [0.1, 0.2, 0.3],
+            "sigma_v_mag": [0.01, 0.02, 0.03],
+            "sptype": MaskedColumn(["B5V", "G2V", "M0"], mask=[0, 1, 0]),
+        }
+    )
+    path = tmp_path / "a_name_of_more_than_sixteen.ecsv"
+    table.write(path)
+    choice = TableChoice(path, with_hipparcos=True, epoch_jyear=2000.0)
+    stars = choose_catalog(choice)
+    stars = stars.taken(np.flatnonzero((stars.v_mag > 11.4) | (stars.hip == 2)))
+    own = {stars.name(row): row for row in range(len(stars))}
+    of_table = [own["a_name_of_more_t row 1"], own["a_name_of_more_t row 2"], own["HIP 500000"]]
+    of_hipparcos = np.setdiff1d(np.arange(len(stars)), of_table)
+    before = errors_of(stars)
+    facts = table_facts(choice, stars, before)
+    for name in before:
+        np.testing.assert_array_equal(facts[name][of_hipparcos], before[name][of_hipparcos], name)
+    assert facts["sigma_measured_mag"][of_table].tolist() == [0.01, 0.02, 0.03]
+    assert facts["spectral_type"][of_table].tolist() == [b"B5V", b"", b"M0"]
+    assert facts["spectral_type_source"][of_table].tolist() == [b"U"] * 3
+    assert facts["v_source"][of_table].tolist() == [b"U"] * 3
+
+
 def test_a_star_without_a_colour_has_both_its_magnitudes_from_the_next_columns(tmp_path):
     """V alone gives no spectrum: Gaia's magnitudes then give V and colour together, as for a star
     that has no V at all. A star with V and B-V keeps them, whatever Gaia says.
@@ -400,7 +436,10 @@ def test_a_star_without_a_colour_has_both_its_magnitudes_from_the_next_columns(t
     (tmp_path / "both.csv").write_text(head + "\n".join(rows) + "\n")
     stars = read_stars(tmp_path / "both.csv")
     order = np.argsort(stars.ra_deg)
-    v_mag, bv_mag = stars.v_mag[order], stars.bv_mag[order]
+    v_mag, bv_mag, vi_mag = stars.v_mag[order], stars.bv_mag[order], stars.vi_mag[order]
+    assert np.isnan(vi_mag[0])
+    _, wanted_vi_mag = from_gaia(np.array([7.0]), np.array([1.1]))
+    assert vi_mag[1:] == pytest.approx(np.full(3, wanted_vi_mag))
     assert (v_mag[0], bv_mag[0]) == pytest.approx((4.0, 0.3))
     assert v_mag[1] != pytest.approx(4.0, abs=0.5)
     assert v_mag[1:] == pytest.approx(np.full(3, v_mag[2]))

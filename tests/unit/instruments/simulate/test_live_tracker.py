@@ -159,6 +159,7 @@ def test_a_tracker_expects_where_its_last_two_attitudes_lead_and_nothing_after_f
     live.lost_in_space = lambda stars, dn: None
     try:
         start = np.array([0.5, 0.5, -0.5, 0.5])
+        assert live._expected(solved_at(0, start).exposed) is None
         for tenth in (0, 1):
             at_ns = tenth * NS_PER_S // 10
             live._answered(solved_at(at_ns, propagate(start, rate, tenth / 10)))

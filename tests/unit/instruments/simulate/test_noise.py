@@ -850,7 +850,7 @@ def test_a_bound_is_the_rms_over_the_places_within_a_pixel():
 
 def test_what_centroiders_reach_is_before_the_sky_and_no_better_than_its_bound(rng):
     """Of a star as bright as each pixel of its sky, which makes most of its noise."""
-    star = gaussian(1.0, NOISY, phases=2)
+    star = gaussian(1.0, replace(NOISY, gain_e_per_dn=3.0), phases=2)
     stars_e = np.array([2e4, 5e4])
     finder = CentroidSettings()
     reached_px = noise._measured_by_rate(star, stars_e, 2e4, finder, rng)

@@ -23,6 +23,7 @@ from tests.support.benches import bench_text
         ({"verify": {"flux_mag": 0.2}}, []),
         ({"sky": {"faintest_v_mag": 5.0}}, ["sky", "tracker"]),
         ({"tracker": {"transmission": 0.5}}, ["sky", "tracker"]),
+        ({"tracker.detector": {"fill_factor": 0.5}}, ["sky", "tracker"]),
         ({"tracker": {"exposure_s": 0.3}}, ["tracker"]),
         ({"background": {"electrons_per_px": 3.0}}, ["tracker"]),
     ],
@@ -57,6 +58,15 @@ def test_what_a_change_of_the_bench_touches_is_made_anew(tmp_path, monkeypatch, 
     running.moving = "bodies"
     Simulator.change(running, before)
     assert loaded[len(made)] == "sky"
+    # what is drawn into is opened anew for another PSF alone
+    closed = []
+    running.renderer = SimpleNamespace(target=target, close=lambda: closed.append(True))
+    monkeypatch.setattr(simulator, "headless_context", lambda gpu: "context")
+    monkeypatch.setattr(simulator, "open_backend", lambda target, context: target.psf)
+    for psf, renderer, times in (("psf", running.renderer, 0), ("wider", "wider", 1)):
+        running.canvas = SimpleNamespace(psf=psf)
+        Simulator.change(running, after if times == 0 else before)
+        assert (running.renderer, len(closed)) == (renderer, times)
 
 
 def test_a_detector_without_a_mosaic_gathers_the_glow_of_all_channels():

@@ -463,6 +463,25 @@ def test_the_figures_of_a_geometry_are_the_fit_s_wherever_they_stand(tmp_path, t
     assert f"1.581 arcsec rms, 2.000 max; noise: {held_out['noise_arcsec']:.3f}" in lines
 
 
+def test_what_the_tracker_does_not_see_of_the_screen_is_in_the_file_and_in_a_note(tmp_path):
+    found = calibrated(tmp_path, tracker_known=True)
+    uncertainty = found.uncertainty
+    map_arcsec = uncertainty.map_arcsec.copy()
+    map_arcsec[0, 1] = np.nan
+    path = tmp_path / "geometry.toml"
+    blank = dataclasses.replace(uncertainty, map_arcsec=map_arcsec)
+    write_calibrated(path, dataclasses.replace(found, uncertainty=blank), None)
+    assert load_notes(path).error.map_arcsec[0][1] == -1
+    geometry = found.fit.geometry
+    lens = dataclasses.replace(geometry.monitor.lens, max_tangent=0.5)
+    monitor = dataclasses.replace(geometry.monitor, lens=lens)
+    geometry = dataclasses.replace(geometry, monitor=monitor)
+    in_field = dataclasses.replace(found, fit=dataclasses.replace(found.fit, geometry=geometry))
+    (note,) = summary_of(in_field, [])["notes"]
+    # the arc tangent of a half
+    assert note == "the tracker sees 26.57 deg from the axis: no star is shown farther out"
+
+
 @pytest.mark.parametrize("size_px", [(120, 60), (60, 120), (256, 256)])
 def test_a_lens_is_known_to_a_hundredth_beyond_the_farthest_corner_of_the_field(tmp_path, size_px):
     """Of a pinhole before a tracker that sees a part of the screen; all of it, and it has no end."""

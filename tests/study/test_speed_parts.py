@@ -298,6 +298,11 @@ def test_a_scene_keeps_the_brightest_in_view_and_fills_up_with_faint_ones(bench_
     few = benchmark.scene(bench, every, q, 5, rng).stars
     shown = few.hip[bench.sprites(q, few).star]
     assert set(shown.tolist()) == set(every.hip[visible[by_light[:5]]].tolist())
+    # of two that are as bright as each other one alone
+    ranked_mag = every.v_mag[visible[by_light]]
+    first_tie = int(np.flatnonzero(np.diff(ranked_mag) == 0)[0]) + 1
+    tied = benchmark.scene(bench, every, q, first_tie, rng).stars
+    assert len(bench.sprites(q, tied)) == first_tie
     vectors = dict(zip(every.hip.tolist(), every.vectors.tolist(), strict=True))
     for hip, vector, v_mag in zip(few.hip.tolist(), few.vectors.tolist(), few.v_mag, strict=True):
         assert vectors[hip] == vector
@@ -313,6 +318,9 @@ def test_a_scene_keeps_the_brightest_in_view_and_fills_up_with_faint_ones(bench_
     angles_rad = np.arccos(many.vectors[is_random] @ boresight)
     field_rad = bench.camera.field_radius_rad(bench.psf.footprint_px)
     assert angles_rad.max() == pytest.approx(1.5 * field_rad, rel=0.02)
+    # evenly by solid angle, which a mean of so many shares tells to 1 / sqrt(12 n)
+    shares = (1 - np.cos(angles_rad)) / (1 - np.cos(1.5 * field_rad))
+    assert shares.mean() == pytest.approx(0.5, abs=4 / np.sqrt(12 * len(shares)))
 
 
 def test_a_stage_is_culling_then_projecting_then_drawing(monkeypatch):

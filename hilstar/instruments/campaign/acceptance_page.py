@@ -291,7 +291,7 @@ def _margin(each: ClauseVerdict) -> str | None:
         return None
     limit = abs(each.clause.limit)
     share = ""
-    if abs(verdict.margin) <= limit:
+    if limit > 0 and abs(verdict.margin) <= limit:
         share = f" ({100 * verdict.margin / limit:.0f} %)"
     return f"{_digits(verdict.margin)} {each.unit}".rstrip() + share
 

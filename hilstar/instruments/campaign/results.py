@@ -254,8 +254,7 @@ def measures(cases: Columns) -> list[Measure]:
     right = solved - np.nan_to_num(numbers["wrong"])
     frames = np.nan_to_num(numbers["frames"], nan=1.0)
     answered = right / np.maximum(frames, 1.0)
-    unanswered = 1 - np.minimum(answered, 1.0)
-    candidates.append(Measure("unanswered", "1", unanswered, mean=True))
+    candidates.append(Measure("unanswered", "1", 1 - answered, mean=True))
     known_measures = []
     for measure in candidates:
         known = np.isfinite(measure.values).sum()

@@ -86,9 +86,9 @@ class StarMotion:
         width, height = scale.resolution_px
         half_x = width / 2 / scale.focal_px
         half_y = height / 2 / scale.focal_px
+        # below 0 behind the camera, where no size is smaller
         depth = seen_cam[:, 2]
-        inside = depth > 0
-        inside &= np.abs(seen_cam[:, 0]) < half_x * depth
+        inside = np.abs(seen_cam[:, 0]) < half_x * depth
         inside &= np.abs(seen_cam[:, 1]) < half_y * depth
         if self.display is not None:
             x_px, y_px = self.display.project(seen_cam @ self.display.cam_to_image.T)

@@ -14,10 +14,10 @@ from hilstar.instruments.certify.effects import Effect, root_mean_square
 from hilstar.instruments.certify.model import Figures
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.catalogue import sigma_instrument_mag
-from hilstar.server.bench.star_light import catalogue_choice
+from hilstar.server.bench.star_light import catalogue_choice, star_catalog
 from hilstar.server.bench.star_rates import star_flux, star_kinds, star_rates
 from hilstar.sky.facts import errors_of, motion_at
-from hilstar.sky.star_table import choose_catalog, table_facts
+from hilstar.sky.star_table import table_facts
 
 SKY = (("star_flux", "mag"), ("star_place_along", "arcsec"), ("star_place_across", "arcsec"))
 FLUX, ALONG, ACROSS = range(len(SKY))
@@ -60,12 +60,12 @@ def _of_own_star(values: FloatArray, kind: int) -> FloatArray:
 
 
 def catalogue_errors(file: BenchFile, row: IntArray) -> tuple[FloatArray, FloatArray]:
-    """The catalogue's errors of stars (n,) by their rows: of light in the tracker, mag, and of
-    place along an axis, arcsec.
+    """The catalogue's errors of stars (n,) by their rows in `star_catalog`: of light in the
+    tracker, mag, and of place along an axis, arcsec.
     """
     sky = file.config.sky
     choice = catalogue_choice(file.config, file.folder)
-    stars = choose_catalog(choice).taken(row)
+    stars = star_catalog(file.config, file.folder).taken(row)
     facts = table_facts(choice, stars, errors_of(stars))
     covariance = motion_at(stars, facts, sky.epoch_jyear).covariance
     place_mas = np.sqrt((covariance[:, 0, 0] + covariance[:, 1, 1]) / 2)

@@ -105,13 +105,11 @@ def catalogue_choice(config: BenchConfig, folder: Path) -> TableChoice:
     return TableChoice(source, sky.with_hipparcos, sky.catalogue_epoch_jyear)
 
 
-def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = None) -> Stars:
-    """The stars of a bench, with directions as the observer of `moving` sees them, and with their
-    electron rates, which are computed only here. Raises InputError.
+def star_catalog(config: BenchConfig, folder: Path) -> Catalog:
+    """The catalogue of a bench's stars, down to its faintest: `Stars.row` counts in its rows.
+    Raises InputError.
     """
     sky = config.sky
-    # called for its check: it refuses an epoch that a source should have given
-    epoch_utc_ns(config)
     choice = catalogue_choice(config, folder)
     if sky.variables == "phase":
         # All stars are read first, as a variable that is too faint on average may be bright enough
@@ -120,7 +118,17 @@ def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = No
         chosen = choose_catalog(everything).at_phase(sky_jd(config, None))
     else:
         chosen = choose_catalog(dataclasses.replace(choice, faintest_v_mag=sky.faintest_v_mag))
-    catalog = chosen.brighter_than(sky.faintest_v_mag)
+    return chosen.brighter_than(sky.faintest_v_mag)
+
+
+def bench_stars(config: BenchConfig, folder: Path, moving: MovingSky | None = None) -> Stars:
+    """The stars of a bench, with directions as the observer of `moving` sees them, and with their
+    electron rates, which are computed only here. Raises InputError.
+    """
+    sky = config.sky
+    # called for its check: it refuses an epoch that a source should have given
+    epoch_utc_ns(config)
+    catalog = star_catalog(config, folder)
     vectors = unit_vectors_icrs(catalog, sky.epoch_jyear)
     # A moving sky has its observer's position and velocity; without one the bench file may state a
     # velocity.

@@ -375,16 +375,22 @@ def test_gaps_invalid_and_wrong_answers_are_outages_and_longer_ones_lose_the_loc
 
 
 def test_a_sky_that_went_before_the_telemetry_or_came_after_it_was_not_to_be_acquired() -> None:
-    """Shown from 0, 20, 40 and 60 s for ten seconds each; answers from 25 to 55 s."""
+    """Shown from 0, 20, 40 and 60 s for ten seconds each; answers from 25 to 55 s. What is lost from
+    27 s on comes between the second sky and the third.
+    """
     frames_s = np.arange(0.0, 80.0, 0.1)
     q = np.tile([1.0, 0.0, 0.0, 0.0], (len(frames_s), 1))
     q[frames_s % 20 > 10] = np.nan
     t_s = np.arange(25.0, 55.0, 0.5)
     shown = t_s % 20 < 9.9
-    late = (t_s > 39) & (t_s < 43)
+    late = ((t_s > 39) & (t_s < 43)) | ((t_s > 26.9) & (t_s < 29.1))
     lock = lock_of(Commanded(frames_s, q), t_s, shown & ~late, np.zeros(len(t_s), dtype=bool))
     waits = [(each.start_s, each.wait_s) for each in lock.acquisitions]
-    assert waits == [(25.0, 0.0), (pytest.approx(40.0), pytest.approx(3.0, abs=0.11))]
+    assert waits == [
+        (25.0, 0.0),
+        (27.0, 2.5),
+        (pytest.approx(40.0), pytest.approx(3.0, abs=0.11)),
+    ]
 
 
 def test_the_displays_error_is_subtracted_only_where_the_answers_show_it() -> None:

@@ -131,6 +131,16 @@ def test_a_coarse_offset_is_what_has_to_be_added_to_the_telemetry_s_times():
     assert np.abs(speed_offsets(RUN, tau_s, q) + 7.3).min() < 0.6
 
 
+def test_a_speed_is_the_usual_one_of_a_bin_though_some_answers_are_wild(rng):
+    """One answer of eight, ten to a step of the grid, turns from and to a place of its own."""
+    t_s = START_S + np.arange(1.0, SECONDS - 1.0, 0.05)
+    q = scalar_first(attitude(swings, t_s))
+    wild = np.arange(4, len(q), 8)
+    q[wild] = scalar_first(Rotation.random(len(wild), random_state=5))
+    best_s, *_ = speed_offsets(RUN, t_s + 7.3, q)
+    assert best_s == pytest.approx(-7.3, abs=0.6)
+
+
 def test_few_answers_that_agree_better_do_not_outvote_many():
     """A tracker on its side about the axis of a steady turn: at any offset its answers agree among
     themselves, and at 45 s, where a quarter of them are compared, with the run besides.
@@ -207,7 +217,10 @@ def test_speeds_that_mirror_each_other_or_hardly_overlap_tell_nothing(bins, fewe
     assert alike[(common >= fewest) & (common < 2 * fewest)].any()
 
 
-def test_a_drift_that_hardly_shows_is_drawn_to_none(rng):
+@pytest.mark.parametrize(
+    ("noise_arcsec", "told", "sigmas"), [(5.0, False, (0.3, 1.0)), (0.5, True, (0.03, 0.3))]
+)
+def test_a_drift_that_hardly_shows_is_drawn_to_none(rng, noise_arcsec, told, sigmas):
     """Noise of 5 arcsec in slews of 5 arcsec/s tells a drift as badly as none is known."""
 
     def slow(t_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -217,14 +230,15 @@ def test_a_drift_that_hardly_shows_is_drawn_to_none(rng):
 
     run = Commanded(RUN_S, scalar_first(attitude(slow, RUN_S)))
     t_s = START_S + np.arange(1.0, SECONDS - 1.0, ANSWER_S)
-    error = 5.0 * rng.standard_normal((len(t_s), 3)) / ARCSEC_PER_RAD
+    error = noise_arcsec * rng.standard_normal((len(t_s), 3)) / ARCSEC_PER_RAD
     q = scalar_first(Rotation.from_rotvec(error) * attitude(slow, t_s))
     coarse = CoarseClock(0.0, 1e-4, np.array([1.0, 0.0, 0.0, 0.0]), len(t_s))
     found = ClockSolver(run, t_s, q, SCALE).fit(coarse)
-    assert not found.drift_told
+    assert found.drift_told == told
     # what is known beforehand and what shows together are better than either
-    assert 0.3 * DRIFT_PRIOR < found.sigma_drift < DRIFT_PRIOR
-    assert abs(found.drift) < 3 * DRIFT_PRIOR
+    smallest, largest = sigmas
+    assert smallest * DRIFT_PRIOR < found.sigma_drift < largest * DRIFT_PRIOR
+    assert abs(found.drift) < 3 * largest * DRIFT_PRIOR
 
 
 @pytest.mark.parametrize(("begun", "bins", "lag"), [(300, 50, -300), (20, 60, -20)])

@@ -9,18 +9,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from hilstar.basics.arrays import FloatArray, IntArray
+from hilstar.instruments.assess import star_figures
 from hilstar.instruments.assess.bounded_figures import TooFewCases, clopper_pearson
-from hilstar.instruments.assess.star_drawing import _detection
+from hilstar.instruments.assess.star_drawing import _detection, star_drawing
 from hilstar.instruments.assess.star_figures import (
     DetectionBins,
     StarTable,
+    false_stars,
     half_seen,
     place_map,
     star_figure,
     without_turns,
 )
+from tests.support.card_texts import drawn_figures
 
 SIZE_PX = (1200, 700)
 CONFIDENCE = 0.975
@@ -188,6 +192,56 @@ def test_detection_is_drawn_in_the_middles_of_twelve_bins_from_the_brightest_sta
     assert drawn[0, 2:] == pytest.approx([1 - low, high - 1])
     low, high = clopper_pearson(0, 4, 0.975)
     assert drawn[-2, 2:] == pytest.approx([0 - low, high])
+
+
+def test_a_limit_of_detection_is_known_to_a_bin_where_all_cases_have_the_same(rng, monkeypatch):
+    """Each case has a star every tenth of a magnitude from 3 to 6.9; those to 4.9 are reported."""
+    monkeypatch.setattr(star_figures, "LIMIT_DRAWS", 5)
+    v_mag = np.tile(3.0 + 0.1 * np.arange(40), 30)
+    case = np.repeat(np.arange(30), 40)
+    offsets_px = np.where(v_mag < 4.99, 0.0, np.nan) * np.ones((2, 1))
+    stars = table(case, places_in(len(case), rng), offsets_px, v_mag)
+    figure = star_figure("star-limit", stars, SIZE_PX, CONFIDENCE, rng)
+    half_bin_mag = star_figures.LIMIT_BIN_MAG / 2
+    assert 4.9 < figure.value < 5.0
+    assert figure.low == pytest.approx(figure.value - half_bin_mag)
+    assert figure.high == pytest.approx(figure.value + half_bin_mag)
+    assert figure.cases == 30
+
+
+@pytest.mark.parametrize("count", [0, 1, 4])
+def test_false_stars_that_are_as_many_in_each_case_have_poisson_s_limits(count, rng):
+    """By chi-square with 2 n and 2 n + 2 degrees of freedom; there is no scatter to draw from."""
+    cases, frames = 6, 10.0
+    figure = false_stars(np.full(cases, count), np.full(cases, frames), CONFIDENCE, rng)
+    total, exposed = cases * count, cases * frames
+    assert figure.value == pytest.approx(total / exposed)
+    assert figure.high == pytest.approx(chi2.ppf(CONFIDENCE, 2 * total + 2) / 2 / exposed)
+    low = chi2.ppf(1 - CONFIDENCE, 2 * total) / 2 / exposed if total else 0.0
+    assert figure.low == pytest.approx(low)
+    assert figure.cases == cases
+
+
+def test_a_map_is_drawn_as_arrows_of_the_detector_whose_rows_go_down(rng):
+    """Stars that are all off by a third of a pixel along x at the right edge, and by none left."""
+    places_px = places_in(1600, rng)
+    right = (places_px[0] + 0.5) / SIZE_PX[0]
+    stars = table(np.arange(1600) // 40, places_px, np.stack([right / 3, np.zeros(1600)]))
+    with drawn_figures() as drawn:
+        text = star_drawing(stars, SIZE_PX)
+    assert text.startswith("<")
+    (figure,) = drawn
+    _, axes = figure.axes
+    (arrows,) = axes.collections
+    wanted = place_map(stars, SIZE_PX, 8)
+    assert arrows.get_offsets() == pytest.approx(np.stack([wanted.x_px, wanted.y_px], axis=1))
+    # less the mean: from -7/16 to 7/16 of it, in the middles of eight columns
+    dx_px, dy_px = arrows.U, arrows.V
+    assert dx_px.reshape(8, 8)[0] == pytest.approx((np.arange(8) - 3.5) / 24)
+    assert dy_px == pytest.approx(np.zeros(64), abs=1e-9)
+    assert axes.yaxis_inverted()
+    title = " ".join(figure.get_suptitle().split())
+    assert title == f"Stars reported by magnitude; their places are off by at most {7 / 48:.2g} px"
 
 
 @pytest.mark.parametrize("axis", [0, 1])

@@ -340,14 +340,16 @@ def test_an_answer_that_fits_its_own_case_better_is_not_that_of_the_case_before(
 
 
 def test_a_first_attitude_is_that_of_the_first_right_answer_and_stays(cases):
-    cases.run._plan = msgspec.structs.replace(cases.run._plan, answers=3)
+    """The farthest of the wrong answers is the first."""
+    cases.run._plan = msgspec.structs.replace(cases.run._plan, answers=4)
     cases.begin(0)
-    for seconds, off_arcsec in ((0.2, 36_000.0), (0.2, 10.0), (0.2, -20.0)):
+    for seconds, off_arcsec in ((0.2, 36_000.0), (0.2, 10.0), (0.2, 7200.0), (0.2, -20.0)):
         cases.pass_s(seconds)
         cases.answer(cases.shown, off_arcsec=off_arcsec)
     cases.pass_s(0.02)
     (row,) = cases.rows()
-    assert (row["received"], row["wrong"]) == (3, 1)
+    assert (row["received"], row["wrong"]) == (4, 2)
+    assert row["wrong_deg"] == pytest.approx(10.0, abs=1e-6)
     assert row["first_attitude_s"] == pytest.approx(0.39, abs=0.011)
 
 

@@ -88,6 +88,30 @@ def test_pieces_fill_an_exposure_and_keep_to_the_swing() -> None:
     assert np.array_equal(whole.q_icrs_to_cam, still.at(seconds).q_icrs_to_cam)
 
 
+@pytest.mark.parametrize("seconds", [MOTION_S - 0.1, MOTION_S + 0.1])
+def test_a_motion_that_ends_within_an_exposure_parts_it_there(seconds: float) -> None:
+    """Before its middle or after it; then the sky stands."""
+    motion = CaseMotion(Q, RATE_RAD_S, ACCELERATION_RAD_S2, MOTION_S)
+    exposure_s = 0.5
+    moving, still = motion.pieces(seconds, exposure_s, 0)
+    begin_s, end_s = seconds - exposure_s / 2, seconds + exposure_s / 2
+    assert moving.exposure_s == pytest.approx(MOTION_S - begin_s)
+    assert still.exposure_s == pytest.approx(end_s - MOTION_S)
+    for piece, middle_s in ((moving, (begin_s + MOTION_S) / 2), (still, (MOTION_S + end_s) / 2)):
+        assert piece.t_ns == pytest.approx((middle_s - seconds) * NS_PER_S, abs=1)
+        assert piece.q_icrs_to_cam == pytest.approx(motion.at(middle_s).q_icrs_to_cam)
+    assert np.linalg.norm(moving.turn.rate_cam_rad_s) > 0.01
+    assert still.turn.rate_cam_rad_s == pytest.approx(np.zeros(3), abs=1e-12)
+
+
+def test_what_was_before_a_case_s_begin_leads_to_it() -> None:
+    before = CaseMotion(Q, RATE_RAD_S, ACCELERATION_RAD_S2).at(-2.0)
+    motion = CaseMotion(before.q_icrs_to_cam, before.rate_cam_rad_s, ACCELERATION_RAD_S2)
+    begun = motion.at(2.0)
+    assert angle_between_rad(begun.q_icrs_to_cam, Q) < 1e-12
+    assert begun.rate_cam_rad_s == pytest.approx(RATE_RAD_S)
+
+
 def test_a_vibration_of_whole_swings_widens_a_star_by_half_its_square(tmp_path: Path) -> None:
     """A sine's mean square is half of its amplitude's; the exposure has two swings."""
     with Simulator(bench_file_of(tmp_path / "bench.toml", SMALL_BENCH)) as simulator:

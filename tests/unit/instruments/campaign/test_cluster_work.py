@@ -80,6 +80,7 @@ class Dask:
         self.most: dict[str, int] = {}
         self.cancelled: list[Future] = []
         self.named: dict[str, Any] = {}
+        self.busy = 0  # looks that the scheduler still does not answer
 
     def __call__(self, address: str, **named: Any) -> Dask:
         self.named = named | {"address": address}
@@ -91,6 +92,9 @@ class Dask:
     def sync(self, what: str, workers: None, callback_timeout: float) -> dict[str, int]:
         self.looked += 1
         assert self.looked < MOST_LOOKS, "the campaign does not end"
+        if self.busy:
+            self.busy -= 1
+            raise TimeoutError
         present = self.looks.pop(0) if len(self.looks) > 1 else self.looks[0]
         for worker in present:
             if self.waiting.get(worker):
@@ -210,14 +214,16 @@ def test_of_a_worker_that_goes_the_task_at_work_is_lost_and_the_one_that_waits_g
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gone, here = {"a": 1}, {"b": 1}
-    run = ClusterRun(tmp_path, monkeypatch, [gone] * 3 + [{}, here], {"a": works, "b": works})
+    looks = [{}, *[gone] * 3, {}, {}, here]
+    run = ClusterRun(tmp_path, monkeypatch, looks, {"a": works, "b": works})
     run.run()
     ((begin, at_fault),) = run.lost
     assert at_fault is None
     assert sorted(run.cases) == list(range(CASES)) and begin in run.cases
     assert [future.worker for future in run.dask.cancelled] == ["a", "a"]
-    # said once, between the two workers
-    (line,) = run.said
+    # said once before each of the two workers
+    line, again = run.said
+    assert again == line
     assert line.startswith(f"hilstar: --scheduler {ADDRESS} has no worker for this campaign; start")
     assert f"dask worker {ADDRESS} --nthreads 1 --nworkers 8 --host 127.0.0.1" in line
 
@@ -263,6 +269,20 @@ def test_a_campaign_without_a_worker_or_a_scheduler_ends_in_a_line(
     gone.dask.status = "closed"
     with pytest.raises(MachineError, match="answers no more; start it again"):
         gone.run()
+
+
+def test_a_scheduler_that_is_busy_for_a_while_is_asked_again_and_one_that_stays_silent_is_gone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    busy = ClusterRun(tmp_path / "a", monkeypatch, [{"a": 1}], {"a": works})
+    busy.dask.busy = 3
+    busy.run()
+    assert sorted(busy.cases) == list(range(CASES))
+    monkeypatch.setattr(cluster, "MAX_SILENCE_S", 0.0)
+    silent = ClusterRun(tmp_path / "b", monkeypatch, [{"a": 1}], {"a": works})
+    silent.dask.busy = 1
+    with pytest.raises(MachineError, match="answers no more; start it again"):
+        silent.run()
 
 
 @pytest.mark.parametrize(

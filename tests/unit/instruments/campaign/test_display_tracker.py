@@ -28,7 +28,11 @@ CODES_PX, CODES_PX2 = 0.03, 0.06
 
 
 def shown_file(
-    path: Path, quantisation: str = "exact", background: Any = None, **tracker: Any
+    path: Path,
+    quantisation: str = "exact",
+    background: Any = None,
+    monitor: dict[str, Any] | None = None,
+    **tracker: Any,
 ) -> BenchFile:
     """A bench file whose display covers the tracker's field."""
     tables = {
@@ -40,7 +44,12 @@ def shown_file(
             **tracker,
         },
         "sky": {"faintest_v_mag": 4.0},
-        "monitor": {"resolution_px": [640, 480], "bits": 10, "refresh_hz": REFRESH_HZ},
+        "monitor": {
+            "resolution_px": [640, 480],
+            "bits": 10,
+            "refresh_hz": REFRESH_HZ,
+            **(monitor or {}),
+        },
         "collimator": {"focal_length_mm": 250},
         "render": {"quantisation": quantisation},
     }
@@ -78,15 +87,22 @@ def test_frames_of_an_exposure_stand_evenly_about_its_middle(tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     "change",
-    [{"principal_point_px": [50.5, 29.0]}, {"exposure_s": 0.09}, {"psf_sigma_px": [1.3, 0.9]}],
+    [
+        {"principal_point_px": [50.5, 29.0]},
+        {"exposure_s": 0.09},
+        {"psf_sigma_px": [1.3, 0.9]},
+        {"aperture_mm": 21.0},
+    ],
 )
 def test_a_tracker_that_changes_is_one_of_the_new_file(
     tmp_path: Path, change: dict[str, Any]
 ) -> None:
-    """Its image is that of a tracker which was never another."""
-    new = shown_file(tmp_path / "new.toml", **change)
+    """Its image is that of a tracker which was never another, with the glow of the screen's black."""
+    glows = {"calibration": "lcd-example", "bits": 8}
+    new = shown_file(tmp_path / "new.toml", monitor=glows, **change)
     images = []
-    with contextlib.closing(DisplayTracker(shown_file(tmp_path / "bench.toml"))) as tracker:
+    old = shown_file(tmp_path / "bench.toml", monitor=glows)
+    with contextlib.closing(DisplayTracker(old)) as tracker:
         exposure_s = new.config.tracker.exposure_s
         view = View.exposure(RIGEL, STILL, exposure_s)
         images.append(tracker.expose(view, None).mean_e)

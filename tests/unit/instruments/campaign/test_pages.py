@@ -430,10 +430,36 @@ def test_lines_name_each_clause_what_is_not_tested_and_what_failed(accepted) -> 
         ({"high": None}, "2.5 (2.25 or more) arcsec"),
         ({"low": None, "high": None}, "2.5 (interval unknown) arcsec"),
         ({"value": 12345.0, "low": 999.0, "high": -23456.0}, "12300 (999 to -23500) arcsec"),
+        (
+            {"quantity": "edge", "high": None, "method": f"m; {STILL} the stop"},
+            f"{STILL} 2.5 arcsec",
+        ),
+        (
+            {"quantity": "edge", "low": None, "method": f"m; {NOT_EVEN} it"},
+            f"{NOT_EVEN} 2.5 arcsec",
+        ),
     ],
 )
 def test_a_figure_without_an_end_says_so(keys, text) -> None:
     assert acceptance_page._measured(clause_of(MET, **keys)) == text
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ({"maximum": 0.0, "high": 0.0}, "0 deg"),
+        ({"maximum": 0.0, "high": 0.5}, "-0.5 deg"),
+        ({"maximum": -4.0, "high": -5.0}, "1 deg (25 %)"),
+        ({"maximum": 4.0, "high": 8.0}, "-4 deg (-100 %)"),
+        ({"maximum": 4.0, "high": 8.5}, "-4.5 deg"),
+        ({"maximum": 4.0, "high": None}, None),
+        ({"maximum": None, "minimum": 0.0, "low": 0.0}, "0 deg"),
+        ({"maximum": None, "minimum": 1.0, "low": None}, None),
+    ],
+)
+def test_a_margin_is_a_share_of_its_limit_where_that_is_not_zero(keys, text) -> None:
+    judged = clause_of(MET, "deg", quantity="edge", guard=0.0, **keys)
+    assert acceptance_page._margin(judged) == text
 
 
 @pytest.mark.parametrize(

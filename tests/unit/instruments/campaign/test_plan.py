@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 
 from hilstar.basics.rotation import to_matrix
 from hilstar.instruments.campaign.cases import CaseMaker
-from hilstar.instruments.campaign.plan import Design, parse_plan, read_plan
+from hilstar.instruments.campaign.plan import Design, Parameter, Plan, parse_plan, read_plan
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.campaigns import plan_text, write_campaign
 
@@ -34,6 +37,37 @@ def test_a_latin_hypercube_has_one_case_in_each_stratum_and_a_grid_each_node_onc
     assert all(sorted(np.floor(50 * column)) == list(range(50)) for column in cube.T)
     grid = Design("grid", 1, 12, 0, [3, 4]).points(0, 12)
     assert len({tuple(np.floor(point * [3, 4])) for point in grid}) == 12
+
+
+def test_a_plan_that_writes_no_more_than_it_must_is_as_its_page_says(tmp_path: Path) -> None:
+    """The defaults of the tables of keys of docs/campaign.md."""
+    page = Path(__file__).parents[4] / "docs/campaign.md"
+    stated: dict[str, Any] = {}
+    for line in page.read_text().splitlines():
+        row = re.match(r"\| `(\w+)` \| `([^`]+)`", line)
+        if row:
+            stated[row[1]] = json.loads(row[2])
+    keys = {"bench": "b", "cases": 1, "require": [{"quantity": "bias", "maximum": 1}]}
+    plan = msgspec.convert(keys, Plan)
+    (require,) = plan.require
+    assert stated.pop("answers") == plan.asked
+    assert stated.pop("timeout_s") == plan.limit_s
+    assert stated.pop("axis") == require.words.split()[1]
+    of_require = {key: stated.pop(key) for key in ("confidence", "condition")}
+    assert of_require == {key: getattr(require, key) for key in of_require}
+    assert set(stated) == {
+        *("seed", "sampling", "through", "frames", "step_s", "noise", "wrong_above_arcsec"),
+        *("blank_s", "silent_s", "check_every"),
+    }
+    assert stated == {key: getattr(plan, key) for key in stated}
+
+
+def test_a_key_by_its_logarithm_stays_within_its_ends(rng: np.random.Generator) -> None:
+    """Though a logarithm's exponential may be a rounding off."""
+    for low, ratio in rng.uniform([1e-3, 1.1], [10.0, 1e3], (200, 2)).tolist():
+        parameter = Parameter("key", (), low, low * ratio, log=True)
+        assert low <= parameter.value(0.0) <= low * (1 + 1e-12)
+        assert low * ratio * (1 - 1e-12) <= parameter.value(1.0) <= low * ratio
 
 
 def test_values_are_those_of_the_plan_and_reach_the_bench(tmp_path: Path) -> None:

@@ -11,7 +11,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
+from hilstar.basics.rotation import (
+    from_radec_roll_deg,
+    propagate,
+    to_matrix,
+    to_radec_roll_deg,
+)
 from hilstar.basics.units import LIGHT_KM_S
 from hilstar.instruments.campaign import acceptance
 from hilstar.instruments.campaign.case_motion import CaseMotion
@@ -109,17 +114,49 @@ def test_a_planted_bias_is_about_the_tracker_s_own_axes():
     assert turn_arcsec == pytest.approx(bias_arcsec, abs=1e-6)
 
 
-def test_planted_rates_are_scaled_biased_and_late():
-    """A rate that lags by 0.5 s under 0.2 deg/s2 is 0.1 deg/s short of it."""
+def test_a_lost_roll_is_any_and_leaves_the_boresight_where_it_is():
+    """Of 60 answers the largest gap between two rolls is far below a quarter of a turn."""
+    this = tracker(lost_roll=True)
+    told = [this.reported(solved_at(0.0), exposure(), 0.0).q_icrs_to_cam for _ in range(60)]
+    pointings = np.array([to_radec_roll_deg(q) for q in told])
+    assert pointings[:, :2] == pytest.approx(np.tile([84.0, -1.2], (60, 1)))
+    rolls_deg = np.sort(pointings[:, 2] % 360.0)
+    assert np.diff([*rolls_deg, rolls_deg[0] + 360.0]).max() < 60.0
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_wrong_and_missing_answers_are_shares_of_frames(share):
+    """Of 200 frames within four sigmas; a wrong attitude is anywhere, a missing one has no rate."""
+    told = {}
+    for name in ("wrong", "missing"):
+        this = tracker(with_rate=True, **{name: share})
+        told[name] = [this.reported(solved_at(at_s), exposure(), at_s) for at_s in range(200)]
+    turned = [propagate(START_Q, RATE_RAD_S, at_s) for at_s in range(200)]
+    wrong = [
+        abs(answer.q_icrs_to_cam @ q) < 0.999
+        for answer, q in zip(told["wrong"], turned, strict=True)
+    ]
+    missing = [answer for answer in told["missing"] if answer.q_icrs_to_cam is None]
+    within = 4 * np.sqrt(200 * share * (1 - share))
+    assert sum(wrong) == pytest.approx(200 * share, abs=within)
+    assert len(missing) == pytest.approx(200 * share, abs=within)
+    assert {(answer.why, answer.rate_cam_rad_s) for answer in missing} <= {
+        ("planted: missing", None)
+    }
+
+
+@pytest.mark.parametrize(("motion_s", "lags"), [(2.0, True), (0.5, False)])
+def test_planted_rates_are_scaled_biased_and_late(motion_s, lags):
+    """A rate that lags by 0.5 s under 0.2 deg/s2 is 0.1 deg/s short of it, as long as it lasts."""
     acceleration = np.radians([0.2, 0.0, -0.4])
-    motion = CaseMotion(START_Q, RATE_RAD_S, acceleration)
+    motion = CaseMotion(START_Q, RATE_RAD_S, acceleration, motion_s)
     conditions = CaseConditions(np.zeros(3), motion)
     this = tracker(
         conditions=conditions, rate_lag_s=0.5, rate_scale=0.02, rate_bias_deg_s=(0.1, -0.2, 0.3)
     )
     answer = SolverAnswer(START_Q, rate_cam_rad_s=RATE_RAD_S)
     told = this.reported(answer, exposure(), 1.0).rate_cam_rad_s
-    wanted = 1.02 * RATE_RAD_S + np.radians([0.1, -0.2, 0.3]) - 0.5 * acceleration
+    wanted = 1.02 * RATE_RAD_S + np.radians([0.1, -0.2, 0.3]) - 0.5 * lags * acceleration
     assert told == pytest.approx(wanted)
 
 

@@ -9,6 +9,7 @@ import random
 import zlib
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from hilstar.basics.errors import InputError
@@ -24,6 +25,7 @@ from hilstar.instruments.campaign.store import (
 )
 from tests.support.campaigns import read_columns
 from tests.support.damage import NO_JSON
+from tests.support.refusals import refusal
 
 
 def row(case: int) -> dict[str, object]:
@@ -132,6 +134,47 @@ def test_a_campaign_file_that_is_none_is_refused(tmp_path: Path, text: bytes) ->
         pytest.raises(InputError, match=r"campaign\.json"),
     ):
         directory.claim(About({}, "", {}, "centroids", False, {}))
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"plan": {"cases": 9, "seed": 1}}, "the plan's cases was 8 and is 9"),
+        ({"plan": {"cases": 8}}, "the plan's seed was 1 and is null"),
+        ({"identity": {"numpy": "2.2"}}, 'this machine\'s numpy was "2.1" and is "2.2"'),
+        ({"bench_sha256": "cc"}, "its bench file was aa and is cc"),
+        ({"files_sha256": "cc"}, "its log or scenario was bb and is cc"),
+        ({"solver": "solve"}, "--solver was centroids and is solve"),
+        ({"images": True}, "--images was another"),
+    ],
+)
+def test_a_directory_of_another_campaign_is_refused_with_what_differs(
+    tmp_path: Path, changed: dict[str, object], words: str
+) -> None:
+    """One whose table is whole may be looked at on any machine."""
+    about = About({"cases": 8, "seed": 1}, "aa", "bb", "centroids", False, {"numpy": "2.1"})
+    now = msgspec.structs.replace(about, **changed)
+    with contextlib.closing(Directory(tmp_path)) as directory:
+        directory.claim(about)
+        directory.claim(about)
+        line = refusal(directory.claim, now)
+        assert line == (
+            f"{tmp_path}: holds another campaign: {words}; write another directory after -o, or"
+            " delete this one"
+        )
+        directory.table.touch()
+        if "identity" in changed:
+            directory.claim(now)
+        else:
+            assert refusal(directory.claim, now) == line
+
+
+@pytest.mark.parametrize("name", ["cases.parquet", "journal"])
+def test_files_of_a_campaign_that_nothing_says_whose_are_refused(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).touch()
+    with contextlib.closing(Directory(tmp_path)) as directory:
+        line = refusal(directory.claim, About({}, "", "", "centroids", False, {}))
+    assert line.startswith(f"{tmp_path / name}: is there already, and no campaign.json says whose")
 
 
 def test_failures_are_counted_over_all_blocks_of_a_table(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -76,8 +77,11 @@ def test_where_it_still_answers_at_the_stop_levels_before_it_show_how_far() -> N
     assert edge_figure(sweep, counts, 0.95).low == 5.0
 
 
-def test_a_whole_key_takes_whole_numbers_and_ends_between_two(rng: np.random.Generator) -> None:
-    sweep = SweepTable(key="k", start=1, stop=9, whole=True, rounds=12)
+@pytest.mark.parametrize("scale", ["linear", "log"])
+def test_a_whole_key_takes_whole_numbers_and_ends_between_two(
+    scale: Any, rng: np.random.Generator
+) -> None:
+    sweep = SweepTable(key="k", start=1, stop=9, scale=scale, whole=True, rounds=12)
     counts = swept(sweep, 6.5, 1e-6, rng)
     assert all(count.level == int(count.level) for count in counts)
     assert len(counts) < sweep.levels

@@ -47,7 +47,9 @@ from hilstar.instruments.certify.structure import (
     Structure,
     _finer,
     _rectangle,
+    in_time,
     lasting_root,
+    weighed,
 )
 from hilstar.optics.camera import Camera
 
@@ -604,3 +606,29 @@ def test_a_certificate_has_the_hashes_of_the_bench_s_files_and_of_those_that_the
     expected = {name: sha256(text.encode()).hexdigest() for name, text in files.items()}
     expected["bench.toml"] = sha256(b"a bench").hexdigest()
     assert files_of(bench) == expected  # type: ignore[arg-type]
+
+
+def test_values_that_alternate_have_hardly_a_structure_in_time_and_the_noise_of_their_fit():
+    """Of 60 readings every second, with a pause of ten minutes after the half of them."""
+    t_s = np.arange(60.0)
+    t_s[30:] += 600.0
+    value = 3.0 * (-1.0) ** np.arange(60)
+    structure = in_time(t_s, value, np.ones((60, 1)))
+    assert structure.total < 0.01 * structure.noise_variance
+    assert structure.noise_variance == pytest.approx(9.0 * 60 / 59, rel=0.01)
+    # from half of a usual step to all of them
+    assert structure.length[[0, -1]] == pytest.approx([0.5, 60.0])
+
+
+def test_structure_that_would_have_shown_is_none_and_the_noise_is_that_of_the_residuals():
+    """Thirty combinations that a structure would make large are 0; of thirty others, whose squares
+    are 4, a mean is fitted.
+    """
+    eigen = np.repeat([100.0, 0.0], 30)
+    value = np.concatenate([np.zeros(30), np.tile([2.0, -2.0], 15)])
+    spread = Spread(eigen, value, np.full((60, 1), 1 / math.sqrt(60)))
+    lengths = np.array([1.0, 2.0])
+    structure = weighed(lengths, [spread, spread])
+    assert structure.total == 0.0 and not list(structure.parts())
+    assert math.isinf(structure.dof)
+    assert structure.noise_variance == pytest.approx(30 * 4 / 59)

@@ -269,6 +269,32 @@ def test_a_place_whose_error_is_not_known_has_the_largest_of_the_map(tmp_path):
     assert place[0, :, 0] * math.sqrt(2) == pytest.approx(known((y_px, x_px)))
 
 
+def test_the_modes_of_a_map_move_each_star_by_their_own_x_and_y_there(tmp_path):
+    """Two modes of two rows by three columns, each x at all places and then y; linear between."""
+    modes = np.array([[[1, 2, 4], [3, 5, 6]], [[-2, 0, 1], [7, -3, 2]]], dtype=float)
+    modes = np.stack([modes, 10 - 2 * modes], axis=1)
+    error = f"map_arcsec = {np.ones((2, 3)).tolist()}\nmodes_arcsec = "
+    effect = of_geometry(tmp_path, error + f"{modes.reshape(2, -1).tolist()}\n")["geometry"]
+    places = (np.array([-0.5, HEIGHT_PX - 0.5]), np.array([-0.5, 959.5, WIDTH_PX - 0.5]))
+    x_px, y_px = np.array(PLACES).T
+    assert effect.place.shape == (2, COUNT, 2) and effect.input.size == 2
+    for number, axis in np.ndindex(2, 2):
+        known = RegularGridInterpolator(places, modes[number, axis])
+        assert effect.place[number, :, axis] == pytest.approx(known((y_px, x_px)))
+
+
+@pytest.mark.parametrize(
+    ("freedom", "distribution", "dof"),
+    [("", "normal", math.inf), ("flux_at_white_dof = 12\n", "Student t", 12.0)],
+)
+def test_a_full_scale_that_is_stated_moves_all_stars_alike(tmp_path, freedom, distribution, dof):
+    file = bench(tmp_path, "[certify]\nflux_at_white_relative = 0.02\n" + freedom)
+    effect = by_name(list(of_files(file, figures_of(file), as_stated(), [])))["full scale"]
+    assert effect.even == pytest.approx(np.full((1, COUNT), 0.02))
+    about = effect.input
+    assert (about.distribution, about.dof, about.standard) == (distribution, dof, 0.02)
+
+
 def test_an_alignment_s_covariance_turns_the_sky_about_its_own_axes(tmp_path):
     """In the middle of the field a turn about x moves a star along y, and one about y along x."""
     error = "alignment_covariance_arcsec2 = [[4, 0, 0], [0, 9, 0], [0, 0, 100]]\n"

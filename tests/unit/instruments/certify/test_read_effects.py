@@ -5,12 +5,14 @@ edges that go together, light that a map leaves.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from hilstar.instruments.certify.bench_readings import BesideRatio
 from hilstar.instruments.certify.estimates import Evenness, LightDeviation, Surface
 from hilstar.instruments.certify.lens import Places
 from hilstar.instruments.certify.read_effects import (
@@ -87,6 +89,30 @@ def test_light_between_codes_is_a_triangle_half_way_to_straight_lines():
     dark = effects["dark readings"]
     assert dark.levels[0, [0, 2]] == pytest.approx([0.02, 0.002])
     assert (dark.input.dof, effects["response"].input.dof) == (5.0, 30.0)
+
+
+def test_what_readings_share_and_what_lasts_move_the_codes_between_as_the_spline_does():
+    """Of 4 % of one code's light in common, and of noise that is one for all codes; a lattice of lit
+    pixels that is 5 sigma of its noise brighter than single ones.
+    """
+    light = replace(
+        light_read(np.ones(4)),
+        lasting_factors=np.full((4, 1), 0.03),
+        lasting=Structure(np.array([5.0]), np.array([9.0]), 1.0, 7.0),
+        common_factors=np.array([[0.0], [0.04], [0.0], [0.0]]),
+        beside=BesideRatio(1 + 0.005 * math.sqrt(26), 0.005),
+    )
+    missing: list[str] = []
+    read = replace(read_of([]), light=light)
+    _, found = of_readings(stating(0.3), figures(), read, missing)
+    effects = by_name(found)
+    assert effects["noise that lasts"].levels == pytest.approx(np.full((1, 3), 0.03))
+    assert effects["noise that lasts"].input.dof == 7.0
+    shared = effects["what readings share"].levels[0]
+    assert shared[[0, 2]] == pytest.approx([0.04, 0.0])
+    assert 0 < shared[1] < 0.04
+    assert effects["pixels beside lit ones"].even == pytest.approx(np.full((1, STARS), 0.025))
+    assert missing == []
 
 
 def test_a_map_s_form_is_a_rectangle_from_the_smooth_one_to_the_linear():

@@ -92,6 +92,19 @@ def test_light_is_that_of_the_code_at_the_middle_as_the_screen_warms_and_drifts(
     assert ratio == BesideRatio(1.0, 0.0)
 
 
+def test_each_turn_of_a_virtual_bench_has_noise_of_its_own_that_its_seed_makes_again(tmp_path):
+    truth = bench(tmp_path, QUIET.replace("reading_noise = 0.0", "reading_noise = 0.01"))
+    codes = np.array([255, 100])
+    light, beside = [], []
+    for seed, turn in ((3, 0), (3, 0), (3, 1), (4, 0)):
+        read = VirtualReader(truth, truth, seed, turn).light(codes)
+        light.append(read.light.tolist())
+        beside.append(read.beside)
+    for figures in (light, beside):
+        assert figures[0] == figures[1]
+        assert figures[0] != figures[2] != figures[3] != figures[0]
+
+
 def test_a_dot_is_seen_and_lit_where_the_true_screen_has_it(tmp_path, monkeypatch):
     """A pixel of a screen that is mounted otherwise is another pixel of its true image."""
     file = bench(tmp_path, QUIET, even=True)

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from hilstar.instruments.certify import sky_effects
+from hilstar.server.bench.bench_file import read_bench_file
+from tests.support.benches import bench_text
 
 MAG, ARCSEC, SPECTRUM = 0.01, 0.1, 0.02
 
@@ -51,3 +53,20 @@ def test_each_star_has_its_own_errors_and_all_have_one_spectrum(lost_mag, scatte
     assert covariances["spectrum"][0, :, 0] == pytest.approx(np.outer(colour, colour))
     codes = covariances["quantisation"][0, :, 0]
     assert codes == pytest.approx(scatter**2 * np.eye(count))
+
+
+def test_a_spectrum_s_error_is_that_of_its_way_from_colour(tmp_path):
+    """Of black bodies how far they are from the library's star of the colour: the Sun's where none
+    is known. Of a library star: what real stars of one colour scatter, 0.026 mag at 95 %.
+    """
+    errors_mag = {}
+    b_v_mag = np.array([0.65, np.nan, 1.4])
+    for spectrum in ("blackbody", "pickles"):
+        path = tmp_path / f"{spectrum}.toml"
+        path.write_text(bench_text({"sky": {"spectrum": spectrum, "brightness": "dgs"}}))
+        error_mag, _ = sky_effects.spectrum_mag(read_bench_file(path), b_v_mag)
+        errors_mag[spectrum] = error_mag
+    sun, unknown, red = errors_mag["blackbody"]
+    assert unknown == sun
+    assert 0 < red < sun < 0.1
+    assert errors_mag["pickles"] == pytest.approx([0.026 / 2] * 3)

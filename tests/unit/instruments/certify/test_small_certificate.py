@@ -16,7 +16,9 @@ import pytest
 from hilstar.instruments.certify import assembly, certificate
 from hilstar.instruments.certify.budget import BATCH
 from hilstar.instruments.certify.model import ReferenceStar
+from hilstar.instruments.certify.sky_effects import catalogue_errors
 from hilstar.server.bench.bench_file import BenchFile, read_bench_file
+from hilstar.server.bench.catalogue import bench_catalogue
 from hilstar.server.bench.certificate_file import Certificate, CertifiedFigure
 from tests.support.planted_certify import BENCH, EXACT_LENS
 from tests.support.planted_readings import (
@@ -85,6 +87,17 @@ def stars(bench: BenchFile) -> list[ReferenceStar]:
 def by_readings(bench: BenchFile, stars: list[ReferenceStar]) -> tuple[Certificate, Truth]:
     truth = the_truth()
     return certified(bench, PlantedReader(truth, np.random.default_rng(8)), stars), truth
+
+
+def test_a_reference_star_has_the_errors_of_its_own_star_of_the_catalogue(bench, stars) -> None:
+    """Those that `hilstar catalogue` writes for its HIP number."""
+    columns = bench_catalogue(bench, None, None).columns
+    place = {hip: k for k, hip in enumerate(columns["hip"].values.tolist())}
+    own = [place[star.hip] for star in stars]
+    mag, arcsec = catalogue_errors(bench, np.array([star.row for star in stars]))
+    sigmas_mas = [columns[f"sigma_{axis}_mas"].values[own] for axis in ("ra", "dec")]
+    assert 1e3 * arcsec == pytest.approx(np.hypot(*sigmas_mas) / np.sqrt(2))
+    assert mag == pytest.approx(columns["sigma_instrument_mag"].values[own])
 
 
 def certified(

@@ -40,16 +40,17 @@ def moved_by(change: np.ndarray, shift: tuple[float, float]) -> list[StarDiffere
     return stars
 
 
-def test_what_turns_and_grows_about_the_middle_shifts_nothing_there():
-    turn = math.radians(0.3)
-    cos, sin = 1.01 * math.cos(turn), 1.01 * math.sin(turn)
+@pytest.mark.parametrize(("turn_deg", "scale"), [(0.3, 1.01), (-0.3, 0.99)])
+def test_what_turns_and_grows_about_the_middle_shifts_nothing_there(turn_deg, scale):
+    turn = math.radians(turn_deg)
+    cos, sin = scale * math.cos(turn), scale * math.sin(turn)
     common = common_change(
         moved_by(np.array([[cos, -sin], [sin, cos]]) - np.eye(2), (0.0, 0.0)), SIZE_PX
     )
     assert common is not None
     assert common.shift_px == (0.0, 0.0)
-    assert common.rotation_deg == pytest.approx(0.3, abs=ROUNDING)
-    assert common.scale_error == pytest.approx(0.01, abs=ROUNDING)
+    assert common.rotation_deg == pytest.approx(turn_deg, abs=ROUNDING)
+    assert common.scale_error == pytest.approx(scale - 1, abs=ROUNDING)
     assert common.differing == []
 
 

@@ -554,6 +554,14 @@ def test_dots_that_the_image_s_edge_cuts_are_not_measured(tmp_path):
     np.testing.assert_allclose(np.sort(seen.x_px), [40.3, 60.0], atol=0.05)
     np.testing.assert_allclose(np.sort(seen.y_px), [30.6, 50.2], atol=0.05)
     assert seen.edge_px == dot_centroids(1.5).radius_px
+    # what the dark frame has, too, is none
+    glow = np.rint(600 * np.exp(-((x - 20) ** 2 + (y - 45) ** 2) / (2 * 1.5**2)))
+    for name, light in (("dark_0", glow + 40), ("frame_3", image + glow)):
+        light = np.rint(light).astype(np.uint16)
+        Image.fromarray(light).save(tmp_path / f"{name}.png", compress_level=1)
+    assert len(measure_images([path], None, (80, 60))) == 3
+    above = measure_images([path], tmp_path / "dark_0.png", (80, 60))
+    np.testing.assert_allclose(np.sort(above.x_px), [40.3, 60.0], atol=0.05)
 
 
 @pytest.mark.parametrize(

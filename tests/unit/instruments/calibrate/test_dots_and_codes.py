@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.geometric.dots import (
     DOT_PX,
@@ -379,6 +380,19 @@ def test_frames_in_disorder_are_named_with_their_pose_but_the_first(disordered, 
     words = refusal(first_look, plan, Nominal(lens, UPRIGHT, lens), poses[0].joined(poses[1]), rng)
     beginning = "pose 1: " if disordered else ""
     assert words.startswith(f"{beginning}the frames are in reverse order")
+
+
+def test_a_pose_is_turned_as_its_image_is(rng):
+    """By a quarter turn what was at the right is below, about the middle of the tracker's image."""
+    plan = plan_dots((300, 200), 16, 20, rng)
+    first = codes_seen(plan, rng)
+    right, down = first.x_px - 319.5, first.y_px - 239.5
+    second = replace(first, x_px=319.5 - down, y_px=239.5 + right, pose=first.pose + 1)
+    lens = Camera((640, 480), 2000.0, (319.5, 239.5), np.eye(3))
+    look = first_look(plan, Nominal(lens, UPRIGHT, lens), first.joined(second), rng)
+    turns = to_matrix(look.q_poses)
+    np.testing.assert_allclose(turns[0], np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(turns[1], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-3)
 
 
 def test_an_image_of_another_size_is_refused_by_both_sizes(tmp_path):

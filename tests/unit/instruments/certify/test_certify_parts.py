@@ -624,7 +624,7 @@ def test_structure_that_would_have_shown_is_none_and_the_noise_is_that_of_the_re
     """The squares of thirty combinations that a structure would make large are a quarter, and those
     of thirty others 4; a mean is fitted.
     """
-    eigen = np.repeat([100.0, 0.0], 30)
+    eigen = np.repeat([1e4, 0.0], 30)
     value = np.concatenate([np.tile([0.5, -0.5], 15), np.tile([2.0, -2.0], 15)])
     spread = Spread(eigen, value, np.full((60, 1), 1 / math.sqrt(60)))
     lengths = np.array([1.0, 2.0])

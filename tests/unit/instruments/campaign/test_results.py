@@ -343,6 +343,9 @@ def test_a_share_is_none_by_chance_and_all_where_bins_say_all():
     # what bins of ten have by chance is 7 of 79; half of it is cut off at 0
     shares = [results._share(rng.standard_normal(80), index, 8) for _ in range(200)]
     assert np.mean(shares) < 0.04
+    # ranks 1 to 3 and 4 to 6: 13.5 between the means, of which a variance of 1 each is chance
+    whole = results._share(np.arange(6.0), np.array([0, 0, 0, 1, 1, 1]), 2)
+    assert whole == pytest.approx((13.5 - 2) / 6 / (35 / 12))
     apart = results._share(10.0 * index + rng.random(80), index, 8)
     # within a bin the variance of ten ranks is 8.25 of 533.25
     assert apart == pytest.approx(1 - 8.25 / 533.25, abs=0.005)

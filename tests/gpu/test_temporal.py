@@ -156,6 +156,24 @@ def test_paths_keep_their_light_over_the_frames():
     assert max(errors) < AIM_MAG
 
 
+def test_a_path_of_two_stretches_makes_up_once_for_what_it_left():
+    """40 sprites of 2.3 steps, of which the last eight are begun anew: after the first frame, which
+    begins anywhere, the light of each frame is the path's own 92 steps.
+    """
+    target = Target(SIZE, GaussianPsf(SIGMA), table_response(2, np.linspace(0, 1, 4)), WHITE)
+    target = replace(target, quantisation="temporal")
+    y_px = np.arange(20, 240, 24)
+    x_px = np.linspace(20, 244, 40)
+    star = np.repeat(np.arange(len(y_px)), 40)
+    rates = np.full(len(star), 2.3 * WHITE / 3)
+    paths = stars(np.tile(x_px, len(y_px)), np.repeat(y_px, 40), rates, star)
+    with Renderer(target) as gl:
+        for frame in range(4):
+            gl.draw(replace(paths, per_star=40), frame)
+            shown = [int(gl.levels()[y - 12 : y + 12].sum()) for y in y_px]
+            assert frame == 0 or shown == [92] * len(y_px)
+
+
 @pytest.mark.parametrize("way", ["cpu", "gl"])
 def test_frames_with_extended_light_go_on_where_others_stopped(way, monkeypatch):
     """A map lights the image in two frames of four, which points leave to NumPy: the light of all

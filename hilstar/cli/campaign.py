@@ -165,10 +165,14 @@ def _results(this: "Campaign", directory: "Directory") -> _Results:
     not_met = False
     if this.plan.require:
         from hilstar.instruments.campaign.requirements import NOT_MET
-        from hilstar.instruments.campaign.requirements_page import summary_of, write_requirements
+        from hilstar.instruments.campaign.requirements_page import (
+            summary_of,
+            verdict_of,
+            write_requirements,
+        )
 
         verdicts = write_requirements(this.plan, this.path, directory.table, this.maker.file)
-        not_met = any(requirement.verdict == NOT_MET for requirement in verdicts)
+        not_met = verdict_of(verdicts) == NOT_MET
         summary["requirements"] = [summary_of(requirement) for requirement in verdicts]
         lines += [requirement.words for requirement in verdicts]
     lines.append(f"{'page':20}{directory.table.with_name(PAGE_FILE)}")

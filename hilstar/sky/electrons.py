@@ -414,9 +414,9 @@ def natural_basis(colour_mag: FloatArray, knots_mag: FloatArray) -> FloatArray:
     colours held to the knots' range.
     """
     x = np.clip(colour_mag, knots_mag[0], knots_mag[-1])[:, None]
-    last = np.maximum(x - knots_mag[-1], 0) ** 3
+    # The last knot's own cubic is 0 up to it.
     cubic = np.maximum(x - knots_mag[:-1], 0) ** 3
-    d = (cubic - last) / (knots_mag[-1] - knots_mag[:-1])
+    d = cubic / (knots_mag[-1] - knots_mag[:-1])
     return np.hstack([np.ones_like(x), x, d[:, :-1] - d[:, -1:]])
 
 

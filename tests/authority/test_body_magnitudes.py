@@ -112,6 +112,29 @@ def test_the_moon_dims_by_the_squares_of_both_distances():
     assert wide - close == pytest.approx(5 * np.log10(0.0027 / 0.0024), abs=1e-9)
 
 
+def test_uranus_is_as_bright_as_its_latitudes_under_the_sun_and_the_observer_say():
+    """Mallama and Hilton 2018, equation 14: by the mean of both, neither with a sign."""
+    pole = magnitudelib._URANUS_POLE
+    across = np.cross(pole, [1.0, 0.0, 0.0])
+    across /= np.linalg.norm(across)
+    for sun_deg, observer_deg in ((60.0, 20.0), (-60.0, 20.0), (10.0, -30.0)):
+        sun, observer = (
+            au * KM_PER_AU * (np.cos(a) * across - np.sin(a) * pole)
+            for au, a in zip((19.0, 18.0), np.radians([sun_deg, observer_deg]), strict=True)
+        )
+        mean_deg = (abs(sun_deg) + abs(observer_deg)) / 2
+        wanted = -7.110 - 8.4e-4 * mean_deg + 5 * np.log10(19.0 * 18.0)
+        assert body_v_mag("Uranus", sun, observer, 2020.0) == pytest.approx(wanted, abs=1e-6)
+
+
+@pytest.mark.parametrize("phase_deg", [163.6, 163.8, 169.0])
+def test_venus_s_crescent_has_a_law_of_its_own_from_163_7_degrees_on(phase_deg):
+    """Mallama and Hilton 2018, equations 3 and 4, as Skyfield has them."""
+    vectors = seen_at_phase(0.72, 0.3, phase_deg)
+    wanted = float(magnitudelib._venus_magnitude(0.72, 0.3, phase_deg))
+    assert body_v_mag("Venus", *vectors, 2020.0) == pytest.approx(wanted, abs=SKYFIELD_MAG)
+
+
 def test_saturn_s_rings_do_not_count_from_their_dark_side():
     """Sun and observer 2 degrees from the plane: on one side of it the rings add 0.06 mag."""
     pole = light._POLES["Saturn"]

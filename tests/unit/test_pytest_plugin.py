@@ -6,10 +6,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import hilstar
+from hilstar import pytest_plugin
+from hilstar.rotation import from_radec_roll_deg
 from tests.support.benches import bench_text
 from tests.support.commands import run_started
 
@@ -105,6 +110,39 @@ def test_a_wrong_golden_frame_is_one_line(project, arguments, said):
     assert said in failed.stdout
     assert "Error" not in failed.stdout
     assert not (project / "golden").exists()
+
+
+def test_a_golden_frame_is_written_where_it_differs_by_more_than_its_limits(
+    request, tmp_path, monkeypatch
+):
+    """By default a thousandth of a magnitude, and of a pixel of 198 arcsec."""
+    monkeypatch.setattr(pytest_plugin, "GOLDEN_FOLDER", str(tmp_path))
+    few = {"render": {"quantisation": "round"}, "monitor": {"resolution_px": [160, 120]}}
+    (tmp_path / "bench.toml").write_text(bench_text(few))
+    with hilstar.load(tmp_path / "bench.toml") as bench:
+        frame, moved = (bench.frame(from_radec_roll_deg(84.057, dec, 0.0)) for dec in (0.0, 1e-4))
+    brighter = replace(frame, light=frame.light * np.float32(1.002))
+    check, update = (pytest_plugin.GoldenFrames(request.node, update=on) for on in (False, True))
+    written = request.node.user_properties
+    known = len(written)
+    golden = tmp_path / "Orion_1.fits"
+
+    update(frame, "_Orion [1]")
+    assert written[known:] == [(pytest_plugin.WRITTEN, str(golden))]
+    assert golden.is_file() and golden.with_suffix(".csv").is_file()
+    for other, wider in ((moved, {"centroid_px": 0.01}), (brighter, {"flux_mag": 0.01})):
+        with pytest.raises(AssertionError):
+            check(other, "Orion_1")
+        check(other, "Orion_1", **wider)
+        update(other, "Orion_1", **wider)
+        assert len(written) == known + 1
+    golden.with_suffix(".csv").unlink()
+    update(frame, "Orion_1.fits")
+    assert golden.with_suffix(".csv").is_file() and len(written) == known + 2
+    update(brighter, "Orion_1")
+    check(brighter, "Orion_1")
+    assert len(written) == known + 3
+    del written[known:]
 
 
 def test_the_plugin_imports_nothing_of_hilstar_but_its_version():

@@ -329,7 +329,7 @@ def _explained(residual_rad: FloatArray, columns: FloatArray) -> FloatArray | No
     design = varying.reshape(3 * pairs, amounts)
     solution, _, rank, _ = np.linalg.lstsq(design, wanted, rcond=1e-6)
     free = 3 * pairs - 3 - rank
-    if rank < amounts or free < 3:
+    if rank < amounts:
         return None
     whole = float((wanted**2).sum())
     unexplained = float(((wanted - design @ solution) ** 2).sum())

@@ -683,7 +683,13 @@ def draw_calibration(measured: Path, path: Path, bits: int | None = None) -> str
 
     Raises InputError for the same data as the fit does, and where the PNG cannot be written.
     """
-    fits = fit_all(measurements.read_measurements(measured, bits))
+    return draw_fits(fit_all(measurements.read_measurements(measured, bits)), path)
+
+
+def draw_fits(fits: dict[str, ChannelFit], path: Path) -> str:
+    """Draw the response and the held-out residuals of channels; returns the finding on the one
+    whose levels are farthest off. Raises InputError where the PNG cannot be written.
+    """
     worst = max(fits.values(), key=lambda fit: held_out(fit)["rms_percent"])
     errors = held_out(worst)
     repeats_percent = 100 * worst.levels.reading_noise(worst.noise_relative)

@@ -245,8 +245,8 @@ def _by_one_level(
     response_error_dn2 = signal_dn**2 * bench.pattern.errors[0]
     noise_error_dn2 = math.hypot(_median_error(variance), response_error_dn2)
     read_dn2 = (read_e / gain) ** 2
-    shot_dn2 = max(noise_dn2 - read_dn2, MIN_VARIANCE_DN2)
-    error = math.hypot(noise_error_dn2, 2 * READ_NOISE_SHARE * read_dn2) / shot_dn2
+    error_dn2 = math.hypot(noise_error_dn2, 2 * READ_NOISE_SHARE * read_dn2)
+    error = error_dn2 / (signal_dn / gain)
     if error > MAX_GAIN_ERROR:
         return None
     note = (

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hilstar.basics.arrays import IntArray
+from hilstar.basics.arrays import FloatArray, IntArray
 from hilstar.basics.charts import BLUE, MUTED, ORANGE, RED, SERIES, chart, label_ends, write_csv
 from hilstar.basics.units import ARCSEC_PER_RAD, flux_ratio, magnitude
 from hilstar.display.balance import Balance
@@ -19,12 +19,14 @@ from hilstar.display.panel import Panel
 from hilstar.display.phases import WHITE, fainter, line_places, phase_grid, phase_image, shown_by
 from hilstar.display.primaries import PRIMARIES, ChannelMatrix, channel_matrix, reddest_nm
 from hilstar.display.quantisers import QUANTISERS
+from hilstar.optics.camera import Camera
 from hilstar.server.bench.frame import Bench, clipping_hip, named
 from hilstar.server.bench.monitor import bench_primaries
 from hilstar.server.bench.star_rates import named_channels
 from hilstar.server.bench.star_size import StarSize, star_size
 from hilstar.sky.electrons import Optics, all_channels
 from hilstar.sky.spectral_types import class_shares
+from hilstar.sky.stars import Stars
 from hilstar.tracker.centroiders import FAMILY, Centroider
 from hilstar.tracker.star_errors import Judge, StarErrors
 
@@ -118,7 +120,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     white = bench.flux_at_white_e_per_s
     response = bench.calibration.response
     # A star of rate r has V = zero_mag + magnitude(r).
-    zero_mag = zero_point_mag(bench)
+    zero_mag = zero_point_mag(bench.stars)
     white /= solar_drive(bench)
     clips = zero_mag + magnitude(white * bench.darkest / bench.psf.peak_share)
     # Below this a star lights no pixel, wherever it is; for dithers, it lights one in half of the
@@ -135,7 +137,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
     if spectra is not None:
         primaries = channel_matrix(spectra, channels, bench.flux_at_white_e_per_s)
         ends_nm.append(reddest_nm(spectra))
-    rows = [_row(bench, mag, errors, by, clips) for mag, errors in errors_by_mag]
+    rows = [magnitude_row(mag, errors, by, clips, bench.camera) for mag, errors in errors_by_mag]
     axis_rms_px: dict[str, float | None] = dict.fromkeys(FAMILY)
     for row in rows:
         if row.below_white_mag == COMPARED_MAG:
@@ -149,7 +151,7 @@ def budget(bench: Bench, centroider: By | None = None) -> LightBudget:
         range_mag=nothing - clips,
         within=_within(rows),
         clipped_hip=clipping_hip(bench),
-        left_out=not_drawn(bench),
+        left_out=not_drawn(bench.stars, bench.drive, bench.faintest_shown_e_per_s),
         black_e_per_s_px=response.black * bench.flux_at_white_e_per_s,
         rows=rows,
         centroider=by,
@@ -199,21 +201,18 @@ def red_shares(channels: dict[str, Optics], ends_nm: list[float]) -> list[dict[s
     return rows
 
 
-def zero_point_mag(bench: Bench) -> float:
-    """V of a star of the Sun's colour that gives one electron a second, by the bench's own stars of
-    about that colour.
-
-    Raises InputError where it has none.
+def zero_point_mag(stars: Stars) -> float:
+    """V of a star of the Sun's colour that gives one electron a second, by stars of about that
+    colour.
     """
-    rates_e_per_s = bench.stars.rates_e_per_s
-    alike = _like_the_sun(bench)
-    zero_mags = bench.stars.v_mag[alike] - magnitude(rates_e_per_s[alike])
+    alike = _like_the_sun(stars)
+    zero_mags = stars.v_mag[alike] - magnitude(stars.rates_e_per_s[alike])
     return float(np.median(zero_mags))
 
 
-def _like_the_sun(bench: Bench) -> IntArray:
+def _like_the_sun(stars: Stars) -> IntArray:
     """The stars within LIKE_SOLAR_BV of the Sun's B-V, or else those nearest to it."""
-    bv_mag = bench.stars.bv_mag[: len(bench.stars.rates_e_per_s)]
+    bv_mag = stars.bv_mag[: len(stars.rates_e_per_s)]
     distance = np.abs(bv_mag - SOLAR_BV)
     return np.flatnonzero(distance <= max(LIKE_SOLAR_BV, float(distance.min())))
 
@@ -221,16 +220,16 @@ def _like_the_sun(bench: Bench) -> IntArray:
 def solar_drive(bench: Bench) -> float:
     """How much of white a star of the Sun's colour asks for, relative to a white star as bright."""
     drive = np.broadcast_to(bench.drive, len(bench.stars))
-    return float(np.median(drive[_like_the_sun(bench)]))
+    return float(np.median(drive[_like_the_sun(bench.stars)]))
 
 
-def not_drawn(bench: Bench) -> NotDrawn:
-    """The bench's stars that are not drawn; bodies, whose light is that of all stars many times
-    over, do not count.
+def not_drawn(stars: Stars, drive: FloatArray | float, faintest_shown_e_per_s: float) -> NotDrawn:
+    """The stars that are not drawn, of those that ask for `drive` (n,) of white; bodies, whose
+    light is that of all stars many times over, do not count.
     """
-    rates = bench.stars.rates_e_per_s
-    driven_e_per_s = (bench.stars.electrons_per_s * bench.drive)[: len(rates)]
-    missing = rates[driven_e_per_s < bench.faintest_shown_e_per_s]
+    rates = stars.rates_e_per_s
+    driven_e_per_s = (stars.electrons_per_s * drive)[: len(rates)]
+    missing = rates[driven_e_per_s < faintest_shown_e_per_s]
     flux_share = missing.sum() / rates.sum()
     return NotDrawn(len(missing), float(flux_share))
 
@@ -266,8 +265,11 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _row(bench: Bench, mag: float, errors: StarErrors, by: By, clips_v_mag: float) -> MagnitudeRow:
-    arcsec_per_px = ARCSEC_PER_RAD / bench.camera.scales_px_rad()[0]  # where a pixel is widest
+def magnitude_row(
+    mag: float, errors: StarErrors, by: By, clips_v_mag: float, monitor: Camera
+) -> MagnitudeRow:
+    """The row of stars `mag` magnitudes below full scale, where they clip at `clips_v_mag`."""
+    arcsec_per_px = ARCSEC_PER_RAD / monitor.scales_px_rad()[0]  # where a pixel is widest
     kind = errors.worst() if by == "all" else by
     max_px = errors.max_px(kind)
     axis_rms_px: dict[str, float | None] = {}
@@ -291,14 +293,12 @@ def _within(rows: list[MagnitudeRow]) -> dict[str, float | None]:
     centroid = [row.centroid_max_px for row in rows]
     limits = {}
     for limit_mag in FLUX_LIMITS_MAG:
-        limits[f"{limit_mag:g}_mag"] = _last_within(rows, flux, limit_mag)
-    limits[f"{CENTROID_LIMIT_PX:g}_px"] = _last_within(rows, centroid, CENTROID_LIMIT_PX)
+        limits[f"{limit_mag:g}_mag"] = last_within(rows, flux, limit_mag)
+    limits[f"{CENTROID_LIMIT_PX:g}_px"] = last_within(rows, centroid, CENTROID_LIMIT_PX)
     return limits
 
 
-def _last_within(
-    rows: list[MagnitudeRow], errors: list[float | None], limit: float
-) -> float | None:
+def last_within(rows: list[MagnitudeRow], errors: list[float | None], limit: float) -> float | None:
     """The magnitude below full scale up to which the errors of rows are within a limit; None where
     the first is not.
     """

@@ -44,6 +44,13 @@ GOLDEN = (math.sqrt(5) - 1) / 2  # its multiples fill a period most evenly
 PHASES = 4  # frames of a sequence with which an exposure may begin
 
 
+def free_phase(number: int) -> float:
+    """The share of a refresh period at which exposure `number` of a free tracker begins: however
+    many follow one another, they fill the period evenly.
+    """
+    return number * GOLDEN % 1.0
+
+
 def exposure_lights(
     bench: Bench,
     frame: Frame,
@@ -308,7 +315,7 @@ class Twin(Closing):
         """
         if self.config.tracker.trigger != "free":
             return -self.config.tracker.exposure_s / 2
-        return (first_frame * GOLDEN % 1.0) / self.config.monitor.refresh_hz
+        return free_phase(first_frame) / self.config.monitor.refresh_hz
 
     def detected_dn(self, seen: TwinField, rng: np.random.Generator) -> npt.NDArray[Any]:
         """One noisy exposure (h, w), DN, the mean of glow and background subtracted unless all

@@ -12,6 +12,7 @@ separate (blends) count as one, at the centroid of their light.
 import itertools
 import math
 from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -439,24 +440,20 @@ class Comparison:
             tally.off_px.setdefault(kind, []).extend(off_px.tolist())
         if seen.by_channel:
             tally.out_of_gamut += int((is_matched & ~seen.truth["in_gamut"]).sum())
-            self._compare_channels(seen, np.flatnonzero(is_matched & seen.truth["in_gamut"]))
+            inside_gamut = np.flatnonzero(is_matched & seen.truth["in_gamut"])
+            self._compare_channels(seen, inside_gamut)
         tally.vanished += len(sky.found) - len(shown.found)
         self._follow(seen, shown.found, wanted)
         self._count_mirrored(seen, shown.found, wanted)
         self._measure_noisy(seen, self.twin.detected_dn(seen, rng), wanted)
 
     def _compare_channels(self, seen: TwinField, stars: IntArray) -> None:
-        """The light of each channel in squares about stars, shown against sky."""
         tally = self.tally
         tally.channels_mag = tally.channels_mag or [[] for _ in seen.by_channel]
-        reach = math.ceil(self.finder.settings.radius_px)
-        for x, y in np.rint([seen.x_px[stars], seen.y_px[stars]]).T.astype(int).tolist():
-            square = np.s_[max(y - reach, 0) : y + reach + 1, max(x - reach, 0) : x + reach + 1]
-            for errors_mag, (shown_e, sky_e) in zip(
-                tally.channels_mag, seen.by_channel, strict=True
-            ):
-                ratio = float(shown_e[square].sum() / sky_e[square].sum())
-                errors_mag.append(abs(magnitude(ratio)))
+        reach_px = math.ceil(self.finder.settings.radius_px)
+        off_mag = channel_errors_mag(seen.by_channel, seen.x_px[stars], seen.y_px[stars], reach_px)
+        for errors_mag, field_mag in zip(tally.channels_mag, off_mag, strict=True):
+            errors_mag += field_mag
 
     def measured(self) -> Measured:
         """All that was measured so far, with what a verdict has to know of the bench. Raises
@@ -608,6 +605,27 @@ class Comparison:
         across = (seen.x_px >= first_px) & (seen.x_px < width - 0.5 - margin_px)
         down = (seen.y_px >= first_px) & (seen.y_px < height - 0.5 - margin_px)
         return np.asarray(across & down)
+
+
+def channel_errors_mag(
+    by_channel: Sequence[tuple[FloatArray, FloatArray]],
+    x_px: FloatArray,
+    y_px: FloatArray,
+    reach_px: int,
+) -> list[list[float]]:
+    """How far the light shown in each channel is off the sky's, mag without a sign, in squares of
+    `reach_px` to each side about stars (n,). Images are pairs of shown and sky, electrons.
+    """
+    squares = []
+    for x, y in np.rint([x_px, y_px]).T.astype(int).tolist():
+        rows = slice(max(y - reach_px, 0), y + reach_px + 1)
+        columns = slice(max(x - reach_px, 0), x + reach_px + 1)
+        squares.append((rows, columns))
+    errors_mag = []
+    for shown_e, sky_e in by_channel:
+        ratios = [float(shown_e[square].sum() / sky_e[square].sum()) for square in squares]
+        errors_mag.append([abs(magnitude(ratio)) for ratio in ratios])
+    return errors_mag
 
 
 def on_screen_median(glow_e_per_s: FloatArray) -> float:

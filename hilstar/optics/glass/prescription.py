@@ -30,7 +30,7 @@ from hilstar.optics.camera import Lens
 from hilstar.optics.glass.codev_file import read_codev
 from hilstar.optics.glass.lens_data import FieldPoint, LensPrescription, LensSurface
 from hilstar.optics.glass.optiland_lens import optic_of
-from hilstar.optics.glass.psf_file import Glass, Stack, glass_of, pupil_places
+from hilstar.optics.glass.psf_file import Glass, Stack, glass_of, pupil_places, samples_a_px
 from hilstar.optics.glass.zemax_file import read_zemax
 
 CAN_INSTALL = "pip install 'hilstar[lens]'"
@@ -46,7 +46,7 @@ ENDINGS = frozenset({".zmx", ".seq", ".json"})
 MAX_BYTES = 50_000_000
 POINTS = 5  # field points along each side
 MIN_RAYS, MAX_RAYS, GEOMETRIC_RAYS = 96, 384, 400  # across the pupil
-MIN_SAMPLES, MAX_SAMPLES = 4, 16  # a tracker pixel, where --oversampling does not say
+MAX_SAMPLES = 16  # a tracker pixel, where --oversampling does not say
 # the sum of plane waves repeats after so many stamps; at 1.5 second moments were 1.3 % off
 PERIOD_MARGIN = 2.0
 FINER = 8  # parts of a ray's share of the pupil along each axis, at its edge
@@ -420,7 +420,8 @@ def _glass(
     camera = _Chiefs.of(lens)
     places = _field_points(lens, plate)
     fields = lens.fields_at(places * pitch_mm, camera)
-    samples = per_px or _samples_a_px(lens, plate)
+    shortest_um = lens.wavelengths_um[0]
+    samples = per_px or samples_a_px(plate.pitch_um, shortest_um, lens.f_number, MAX_SAMPLES)
     side = 2 * plate.half_px * samples + 1
     grid = (side, pitch_mm / samples)
     images = []
@@ -455,13 +456,6 @@ def _glass(
     history = (made_by, f"focal length {focal_mm:.6g} mm, F-number {lens.f_number:.4g}")
     glass = glass_of(stack, tolerance, camera.lens, history=history)
     return Traced(glass, focal_mm, lens.f_number)
-
-
-def _samples_a_px(lens: _LensRays, plate: Plate) -> int:
-    """Samples to a pixel, two to the finest detail of the shortest wave."""
-    finest_um = lens.wavelengths_um[0] * lens.f_number / 2
-    wanted = math.ceil(plate.pitch_um / finest_um)
-    return min(MAX_SAMPLES, max(MIN_SAMPLES, wanted))
 
 
 def _field_points(lens: _LensRays, plate: Plate) -> FloatArray:

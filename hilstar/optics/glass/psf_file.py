@@ -15,6 +15,7 @@ keep it:
   they are known.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -44,6 +45,7 @@ FACTS = ("relative_illumination", "outside_share", "lateral_x_px", "lateral_y_px
 TOLERANCE = 1e-3  # share of a PSF's light that its basis may put elsewhere
 MAX_FILE_BYTES, MAX_IMAGES = 500_000_000, 20_000
 PHASES = 4  # places along a pixel's side at which what pixels get is compared
+MIN_SAMPLES = 4  # a tracker pixel, where --oversampling does not say
 FEW_IMAGES = 7  # no basis has fewer components
 # share of a stamp's side; a PSF whose centroid lies farther from the middle is not centred on its
 # chief ray
@@ -171,6 +173,13 @@ def glass_of(
 def pupil_places(count: int) -> FloatArray:
     """The middles (count,) of equal parts of a pupil's axis, -1 to 1."""
     return np.asarray((np.arange(count) + 0.5) / count * 2 - 1)
+
+
+def samples_a_px(pitch_um: float, shortest_um: float, f_number: float, most: int) -> int:
+    """Samples to a pixel, two to the finest detail of the shortest wave: MIN_SAMPLES to `most`."""
+    finest_um = shortest_um * f_number / 2
+    wanted = math.ceil(pitch_um / finest_um)
+    return min(most, max(MIN_SAMPLES, wanted))
 
 
 def offsets(count: int) -> IntArray:

@@ -20,12 +20,12 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.errors import InputError, MachineError, shortened
 from hilstar.basics.reading import parse_toml, read_text
 from hilstar.basics.toml_tables import Table
-from hilstar.optics.glass.psf_file import Glass, Stack, glass_of, pupil_places
+from hilstar.optics.glass.psf_file import Glass, Stack, glass_of, pupil_places, samples_a_px
 
 MAX_BYTES = 1_000_000
 ADVICE = "give a TOML file as docs/optics.md has it"
 PUPIL, FINER = 256, 4  # samples across the pupil, and of each of them along an axis at its edges
-MIN_SAMPLES, MAX_SAMPLES = 4, 32  # a tracker pixel, where --oversampling does not say
+MAX_SAMPLES = 32  # a tracker pixel, where --oversampling does not say
 MAX_STEP_WAVES = 0.5  # wavefront step between pupil samples; beyond it the PSF is an alias
 CAN_INSTALL = "pip install 'hilstar[optics]'"
 Positive = Annotated[float, Meta(gt=0, le=1e6)]
@@ -80,20 +80,15 @@ def glass_of_pupil(path: Path, per_px: int | None, tolerance: float) -> Glass:
         pupil = msgspec.convert(parse_toml(path, read_text(path, ADVICE, MAX_BYTES)), Pupil)
     except msgspec.ValidationError as error:
         raise InputError(f"{path}: {shortened(str(error))}; {ADVICE}") from error
-    samples = per_px or _samples_a_px(pupil)
+    f_number = pupil.focal_length_mm / pupil.aperture_mm
+    shortest_um = min(pupil.wavelengths_nm) * 1e-3
+    fine = samples_a_px(pupil.pixel_pitch_um, shortest_um, f_number, MAX_SAMPLES)
+    samples = per_px or fine
     try:
         stack = diffracted(pupil, samples)
         return glass_of(stack, tolerance, history=(f"hilstar optics zernike of {path.name}",))
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-
-
-def _samples_a_px(pupil: Pupil) -> int:
-    """Samples to a pixel, two to the finest detail of the shortest wave."""
-    f_number = pupil.focal_length_mm / pupil.aperture_mm
-    finest_um = min(pupil.wavelengths_nm) * 1e-3 * f_number / 2
-    wanted = math.ceil(pupil.pixel_pitch_um / finest_um)
-    return min(MAX_SAMPLES, max(MIN_SAMPLES, wanted))
 
 
 def diffracted(pupil: Pupil, per_px: int) -> Stack:

@@ -126,11 +126,9 @@ class FocusCurve:
         return apart_px > SIGMAS_APART * math.hypot(figure.error_px, self._best_figure.error_px)
 
     def why_none(self) -> str:
-        """Why there is no best image."""
+        """Why there is no best image: the first that has a figure is one."""
         if not self.readings:
             return f"no {self.source.removesuffix('s')} came"
-        if self.figures:
-            return "the tracker moved in each image; hold it still"
         return self.readings[-1].why
 
     def advice(self) -> str:

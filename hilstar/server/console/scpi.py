@@ -374,7 +374,7 @@ class InstrumentStatus:
         status_byte |= STANDARD_EVENT * bool(self.standard.event & self.standard.enable)
         status_byte |= QUESTIONABLE * bool(self.questionable.event & self.questionable.enable)
         status_byte |= OPERATION * bool(self.operation.event & self.operation.enable)
-        return status_byte | MASTER * bool(status_byte & self.service_enable & ~MASTER)
+        return status_byte | MASTER * bool(status_byte & self.service_enable)
 
 
 class NotScpi(Exception):

@@ -222,7 +222,7 @@ class ControlChannel:
         self._check_controller(peer)
         (address,) = WORD.unpack_from(body)
         data = body[WORD.size :]
-        if address <= PRIVILEGE < address + len(data):
+        if address == PRIVILEGE:
             raise RegisterError(GvcpStatus.INVALID_ADDRESS)
         self._write(address, data, peer)
         return WORD.pack(len(data))

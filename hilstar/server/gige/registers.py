@@ -63,6 +63,7 @@ USER_NAME_BYTES = 16
 
 MIN_EXPOSURE_US, MAX_EXPOSURE_US = 10.0, 60e6
 MIN_RATE_HZ, MAX_GAIN_DB = 0.01, 24.0
+ROUNDED = 1e-6  # a register's float has 24 bits: a limit may be written a little beyond
 # A client that grabs holds these: images of two formats would look alike on the wire.
 LOCKED_WHILE_STREAMING = {"PixelFormat", "AcquisitionMode", "AcquisitionFrameCount"}
 
@@ -338,7 +339,8 @@ class Registers:
             # Exposures do not overlap: a long one lowers the rate, as in a camera.
             settings.rate_hz = min(settings.rate_hz, 1 / settings.exposure_s)
         elif name == "AcquisitionFrameRate":
-            if not MIN_RATE_HZ <= value <= 1 / settings.exposure_s * (1 + 1e-6):
+            low_hz, high_hz = MIN_RATE_HZ, 1 / settings.exposure_s
+            if not low_hz * (1 - ROUNDED) <= value <= high_hz * (1 + ROUNDED):
                 raise RegisterError(GvcpStatus.INVALID_PARAMETER)
             settings.rate_hz = value
         elif 0 <= value <= MAX_GAIN_DB:

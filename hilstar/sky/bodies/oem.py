@@ -20,7 +20,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.units import NS_PER_S
 
 EPOCH = re.compile(r"(\d{4})-(?:(\d\d)-(\d\d)|(\d{3}))T(\d\d):(\d\d):(\d\d(?:\.\d+)?)Z?", re.ASCII)
-YEARS, DAYS_OF_YEAR = range(1900, 2200), range(1, 367)
+YEARS = range(1900, 2200)
 NODES = 4  # 1e-6 km of a low orbit at four minutes
 # to beyond the Lagrange points; a state in metres is outside one of them
 MIN_KM, MAX_KM, MAX_KM_S = 6000.0, 1e7, 1e3
@@ -244,7 +244,8 @@ def _epoch_ns(text: str, where: str) -> int:
         day_of_year = int(of_year or 1)
         start = f"{year}-{month}-{day}" if month else year
         date = np.datetime64(start, "D") + (day_of_year - 1)
-        is_date = int(year) in YEARS and day_of_year in DAYS_OF_YEAR
+        # a day of the year before its first or after its last is in another year
+        is_date = int(year) in YEARS and str(date).startswith(year)
         is_time = int(hour) < 24 and int(minute) < 60 and float(second) < 60
         if not is_date or not is_time:
             raise ValueError

@@ -33,15 +33,21 @@ def zernike_psf(folder, text=PUPIL, *options):
 
 
 def test_aberrations_become_the_tracker_s_glass(tmp_path):
+    """At F/10 the finest detail of 500 nm is 2.5 um: a seventh of a pixel of 17 um."""
     pytest.importorskip("poppy")
-    result = zernike_psf(tmp_path, PUPIL, "--json")
+    text = PUPIL.replace("pixel_pitch_um = 5", "pixel_pitch_um = 17")
+    result = zernike_psf(tmp_path, text, "--json")
     assert result.returncode == 0, result.stderr
     told = json.loads(result.stdout)
     assert (told["points"], told["wavelengths_nm"]) == (4, [500, 650])
     assert 0 < told["outside_share"] < 0.1
     glass = read_glass(tmp_path / "psf.fits")
     assert glass.history == ("hilstar optics zernike of lens.toml",)
+    assert glass.per_px == 7
     assert glass.lateral_px[0, 1, 0, 0] == pytest.approx(100 * 1e-5 * -49.5)
+    simple = text.replace("points = 2", "points = 1").replace("[650, 500]", "[650]")
+    zernike_psf(tmp_path, simple, "--oversampling", "5")
+    assert read_glass(tmp_path / "psf.fits").per_px == 5
 
 
 @pytest.mark.parametrize(

@@ -236,3 +236,21 @@ def test_a_key_has_31_parts_at_most(parts, is_taken):
     for _ in range(parts):
         value = value["a"]
     assert value == 1
+
+
+def test_a_room_names_the_kinds_of_files_that_it_reads_once(monkeypatch):
+    """They go before the kinds that are known here."""
+    monkeypatch.setattr(reading, "_kinds_of_rooms", [])
+    asked = []
+
+    def kinds() -> dict[bytes, str]:
+        asked.append(1)
+        return {b"\x89PNG\r\n": "a picture of ours", b"OWN": "a log of ours"}
+
+    assert reading.kind_of(b"OWN log") is None
+    for _ in range(2):
+        reading.add_kinds(kinds)
+    assert reading.kind_of(b"OWN log") == "a log of ours"
+    assert reading.kind_of(b"\x89PNG\r\n") == "a picture of ours"
+    assert reading.kind_of(b"PK\x03\x04") == "a zip archive"
+    assert len(asked) == 3

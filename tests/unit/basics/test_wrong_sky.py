@@ -19,6 +19,9 @@ def test_a_condition_holds_from_when_it_began_until_it_ends():
     sky.see(ENDS[RATES], "", 15 * S)
     assert sky.now() == [] and sky.at(14 * S) == [(RATES, "by a factor")] and sky.at(15 * S) == []
     assert sky.spans_ns() == [(10 * S, 15 * S)]
+    # none begins after it was found
+    sky.see(CLOCK, "", 20 * S, since_ns=21 * S)
+    assert sky.now()[0].since_ns == 20 * S
 
 
 def test_conditions_that_overlap_count_once_and_each_for_itself():

@@ -20,12 +20,14 @@ from hilstar.cli.calibrate import (
     _response_lines,
 )
 from hilstar.instruments.calibrate import alignment as alignment_engine
+from hilstar.instruments.calibrate import photometric as photometric_engine
 from hilstar.instruments.calibrate import scale as scale_engine
 from hilstar.server.answers.star_widths import FocusFigure, FocusReading
 from hilstar.server.bench import build, frame_files
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
 from tests.support.refusals import refusal
+from tests.support.tables import csv_rows
 
 
 def response_summary(**changed: Any) -> dict[str, Any]:
@@ -197,8 +199,68 @@ def test_dots_are_as_white_as_the_monitor_and_counted_in_each_frame(tmp_path, mo
     assert (told["frames"], len(images)) == (8, 8)
     assert {bits for _, bits in images} == {10}
     assert {int(image.max()) for image, _ in images} == {1023}
-    rows = (tmp_path / "dots" / "plan.csv").read_text().splitlines()
-    assert told["lit"] == sum(not row.startswith("#") for row in rows) - 1
+    plan = (tmp_path / "dots" / "plan.csv").read_text()
+    assert told["lit"] == sum(not row.startswith("#") for row in plan.splitlines()) - 1
+    words = ("dots", "bench.toml", "-o", "more", "--frames", "8", "--dots", "9")
+    line = f"{told['dots']} dots in 8 frames, {told['lit'] / 8:.0f} lit in each, in more\n"
+    assert run_calibrate(tmp_path, *words).stdout == line
+    assert (tmp_path / "more" / "plan.csv").read_text() == plan
+    run_calibrate(tmp_path, *words, "--seed", "1")
+    assert (tmp_path / "more" / "plan.csv").read_text() != plan
+
+
+@pytest.mark.parametrize(
+    ("line", "refused"),
+    [
+        ("geometric bench.toml seen.csv --plan d -o g.csv", "-o g.csv"),
+        ("geometric bench.toml seen.csv --plan d -o g.toml --plot p.pdf", "--plot p.pdf"),
+        ("psf bench.toml i.fits --plan d -o p.toml", "-o p.toml"),
+        ("psf bench.toml i.fits --plan d -o p.fits --plot p.pdf", "--plot p.pdf"),
+        ("alignment bench.toml pairs.csv -o g.csv", "-o g.csv"),
+        ("plan -o plan.toml", "-o plan.toml"),
+        ("photometric m.csv -o m.csv", "-o m.csv"),
+        ("photometric m.csv -o m.toml --plot p.pdf", "--plot p.pdf"),
+        ("scale bench.toml --reading 1,5 -o b.csv", "-o b.csv"),
+        ("reference r.csv -o a.csv", "-o a.csv"),
+    ],
+)
+def test_an_output_of_another_kind_is_refused_before_anything_is_read(tmp_path, line, refused):
+    done = run_calibrate(tmp_path, *line.split())
+    assert done.returncode == 2 and f"hilstar: {refused}: " in done.stderr, done.stderr
+
+
+def test_a_response_has_the_name_date_instrument_and_unit_of_its_readings(tmp_path, monkeypatch):
+    given = []
+
+    def calibrate_photometric(measured, output, provenance, bits, identity):
+        given.append((measured, output, provenance, bits, identity))
+        return response_summary() | {"written": ["m.toml"]}
+
+    monkeypatch.setattr(photometric_engine, "calibrate_photometric", calibrate_photometric)
+    monkeypatch.setattr("hilstar.display.window.this_monitor.identity_here", lambda display: None)
+    (tmp_path / "read.csv").write_text("")
+    words = "--who me --when 2026-01-02 --instrument LS-160 --unit cd/m2 --bits 10"
+    done = run_calibrate(tmp_path, "photometric", "read.csv", "-o", "m.toml", *words.split())
+    assert done.returncode == 0, done.stderr
+    made = photometric_engine.Provenance(
+        who="me", when="2026-01-02", instrument="LS-160", unit="cd/m2"
+    )
+    assert given == [(Path("read.csv"), Path("m.toml"), made, 10, None)]
+    assert done.stdout.splitlines()[4:] == [
+        "written             m.toml",
+        'in the bench file   [monitor] calibration = "m.toml"',
+    ]
+
+
+def test_a_plan_counts_its_codes_once_for_all_channels(tmp_path):
+    words = ("plan", "-o", "plan.csv", "--levels", "3", "--repeats", "2", "--json")
+    told = [
+        json.loads(run_calibrate(tmp_path, *words, "--channels", channels).stdout)
+        for channels in ("w", "wrgb")
+    ]
+    rows = csv_rows(tmp_path / "plan.csv")
+    assert (told[1]["patches"], told[1]["codes"]) == (len(rows), len({row["code"] for row in rows}))
+    assert told[0]["codes"] == told[1]["codes"] and told[0]["patches"] < told[1]["patches"]
 
 
 def test_a_plan_that_was_filled_in_is_kept(tmp_path):
@@ -217,8 +279,9 @@ def test_a_plan_that_was_filled_in_is_kept(tmp_path):
 
 
 def reading_of(number):
-    """A reading of an image each second, each less sharp than the next."""
-    return FocusReading(number, number - 1.0, 9, FocusFigure(3.0 / number, 0.01, 9, 0.0, 0.0))
+    """A reading of an image each 3 s, of which the second is the sharpest."""
+    sigma_px = 1.0 + abs(number - 2)
+    return FocusReading(number, 3.0 * number, 9, FocusFigure(sigma_px, 0.01, 9, 0.0, 0.0))
 
 
 @pytest.mark.parametrize(("images", "is_last"), [(None, [False, False]), (2, [False, True])])
@@ -236,7 +299,7 @@ def test_a_focus_ends_after_so_many_figures_or_at_a_signal(tmp_path, monkeypatch
     done = run_calibrate(tmp_path, "focus", "bench.toml", "--grab", "take {output}", *words)
     assert done.returncode == 0, done.stderr
     assert told == [*is_last, True]
-    assert "image 3 of 3" in done.stdout.splitlines()[-1]
+    assert done.stdout.splitlines()[-1].endswith(": image 2 of 3, after 6 s")
 
 
 @pytest.mark.parametrize("form", ["packet", "frame"])

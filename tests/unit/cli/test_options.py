@@ -63,6 +63,7 @@ def test_a_spin_turns_by_its_degrees_a_second_about_its_axis(text, rate_deg_s):
             {"frame": "body", "direction": "cam_to_icrs"},
         ),
         (parse_resolution, "640,480", (640, 480)),
+        (parse_resolution, "32768,1", (32768, 1)),
         (parse_memory, "4GB", 4_000_000_000),
         (parse_memory, "1.5 MB", 1_500_000),
         (parse_split, None, SplitLimits()),
@@ -75,6 +76,7 @@ def test_a_spin_turns_by_its_degrees_a_second_about_its_axis(text, rate_deg_s):
         (parse_speed, "realtime", 1.0),
         (parse_speed, "max", math.inf),
         (parse_speed, "0.001", 0.001),
+        (parse_speed, "1000", 1000.0),
         (parse_reading, "27989,1200", StarReading(27989, 1200.0)),
         (parse_reading, "27989,1200.5,3", StarReading(27989, 1200.5, 3.0)),
         (parse_sizes, "640x480,32768x1,640x480", ((640, 480), (32768, 1))),
@@ -95,7 +97,7 @@ def test_a_share_is_a_fraction_or_per_cent(text, share):
 
 
 def test_counts_are_each_once_in_their_order():
-    assert parse_counts("100,7,100", 1000) == (100, 7)
+    assert parse_counts("100,7,100,1000", 1000) == (100, 7, 1000)
 
 
 def test_a_mounting_is_a_unit_quaternion_by_option():
@@ -110,17 +112,22 @@ def test_a_mounting_is_a_unit_quaternion_by_option():
         (parse_spin, "x,y,1", "--spin AXIS,DEG_PER_S"),
         (parse_spin, "0,0,0,1", "--spin AXIS,DEG_PER_S"),
         (parse_spin, "1,1,5", "--spin AXIS,DEG_PER_S"),
+        (parse_spin, "x,-6e7", "--spin AXIS,DEG_PER_S"),  # over 1e6 rad/s, either way
+        (parse_spin, "x,6e7", "--spin AXIS,DEG_PER_S"),
         (parse_place, "90.001,0,0", "a latitude from -90 to 90"),
         (parse_place, "-90.001,0,0", "a latitude from -90 to 90"),
         (parse_place, "0,360.001,0", "a longitude from -180 to 360"),
         (parse_place, "0,-180.001,0", "a longitude from -180 to 360"),
         (parse_mounting, "1,0,0,0.1", "its norm is 1.00499"),
+        (parse_mounting, "0.998,0,0,0", "its norm is 0.998"),
         (parse_convention, "scalar=last,scalar=first", "each key once"),
         (parse_convention, "scalar", "each key once"),
         (parse_convention, "order=last", "each key once"),
         (parse_convention, "scalar=middle", "scalar is first or last"),
         (parse_resolution, "32769,480", "--resolution W,H in pixels"),
         (parse_resolution, "0.5,480", "--resolution W,H in pixels"),
+        (parse_resolution, "640,32769", "--resolution W,H in pixels"),
+        (parse_resolution, "640,0", "--resolution W,H in pixels"),
         (parse_memory, "4TB", "a size such as 4GB or 500MB"),
         (parse_memory, "0GB", "a size such as 4GB or 500MB"),
         (parse_split, "999kB", "1 MB or 10 s at minimum"),
@@ -131,6 +138,7 @@ def test_a_mounting_is_a_unit_quaternion_by_option():
         (parse_reading, "27989,5,-1", "write --reading HIP,DN"),
         (parse_reading, "27989,5,1,2", "write --reading HIP,DN"),
         (parse_sizes, "640x32769", "up to 32768 px"),
+        (parse_sizes, "640x480,32769x480", "up to 32768 px"),
         (parse_silent, "soon", "such as 5s or 5s@20s"),
     ],
 )
@@ -153,7 +161,8 @@ def test_a_moment_is_nanoseconds_and_only_where_something_moves(tmp_path):
     assert parse_at("frame", None, still) is None
     assert parse_at("frame", 1.5, still, timed=True) == 1_500_000_000
     assert parse_at("frame", -1e10, still, timed=True) == -(10**10) * NS_PER_S
-    assert "1e10 at most" in refusal(parse_at, "frame", 1.1e10, still, timed=True)
+    for at_s in (1.1e10, -1.1e10, math.nan):
+        assert "1e10 at most" in refusal(parse_at, "frame", at_s, still, timed=True)
     assert "nothing moves in this sky" in refusal(parse_at, "frame", 1.5, still)
 
 
@@ -182,6 +191,7 @@ def test_a_run_s_duration_is_refresh_periods(options, slots, frames):
         ((3, 0, 1), 3),
         ((2, 4), 2),
         ((0, -9), 1),  # a signal is none of a command's codes
+        ((-2, 3), 1),
         ((77, 0), 1),
     ],
 )
@@ -193,6 +203,9 @@ def test_a_tracker_s_exposures_neither_overlap_nor_collect_nothing():
     assert checked_rate(None, 0.05) == 10.0
     assert checked_rate(None, 0.4) == 2.5
     assert checked_rate(2.5, 0.4) == 2.5
+    assert checked_rate(0.01, 0.4) == 0.01
+    assert checked_rate(1000.0, 1e-4) == 1000.0
+    assert "0.01 to 1000 Hz" in refusal(checked_rate, 1001.0, 1e-4)
     assert "0.01 to 2.5 Hz" in refusal(checked_rate, 2.51, 0.4)
     assert "0.01 to" in refusal(checked_rate, 0.009, 0.4)
     assert "exposure_s = 0" in refusal(checked_rate, None, 0.0)

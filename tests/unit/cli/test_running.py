@@ -24,6 +24,8 @@ from hilstar.cli.running import (
     dated_ledger,
     end_of_run,
     followed,
+    optional_answers,
+    optional_frames,
     optional_scenario,
     page_listener,
     run_with_faults,
@@ -35,8 +37,10 @@ from hilstar.cli.tracker import open_camera, recorded
 from hilstar.instruments.calibrate import grabbed_dots
 from hilstar.instruments.calibrate.grabbed_dots import DotImages
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import load
 from hilstar.server.bench.config import parse_config
 from hilstar.server.bench.scenario import NO_SCENARIO
+from hilstar.server.record.ledger import LedgerSwitch
 from hilstar.server.summary import RunTally, RunVerdict
 from hilstar.server.watchdog import GPU_LOST
 from tests.support.benches import SMALL_BENCH, bench_text
@@ -53,12 +57,13 @@ def ended(
     gone: str | None = None,
     gpu: str = "",
     strict: bool = False,
+    blank: int | None = None,
 ) -> int:
     """The exit code of a run, 3 where it raises MachineError."""
     tally = RunTally()
     for _ in range(frames):
         tally.add(1_000_000, None if not accepted else 0, 3, ())
-    tally.blank_frames = 0 if accepted else frames
+    tally.blank_frames = (0 if accepted else frames) if blank is None else blank
     summary = tally.summary(1.0, PacketCounts(received=accepted), RENDERER)
     summary = replaced(summary, verdict=RunVerdict(is_strict, is_strict, 0.0, 0.0, ""))
     notices = Notices()
@@ -84,6 +89,9 @@ def ended(
         ({"strict": True, "is_strict": False}, 1),
         # a run without an attitude is code 4, the caller's
         ({"strict": True, "is_strict": False, "accepted": 0}, 0),
+        # a replay has no packets, and all frames of a run may be blank before its attitude
+        ({"strict": True, "is_strict": False, "accepted": 0, "blank": 0}, 1),
+        ({"strict": True, "is_strict": False, "blank": 10}, 1),
         ({"failure": "No space left on device"}, 1),
         ({"gone": "its display was unplugged"}, 3),
         ({"gpu": "the GPU was reset: the run ends"}, 3),
@@ -220,6 +228,7 @@ def test_an_answer_without_an_attitude_is_a_row_that_says_so(tmp_path):
 SCENARIO = (
     '[[fault]]\nkind = "blank"\nname = "cover"\nat_s = 0.5\nfor_s = 0.1\n'
     '[[fault]]\nkind = "freeze"\nname = "stuck"\n'
+    '[[fault]]\nkind = "drop"\nname = "first"\nat_s = 0\n'
 )
 
 
@@ -257,7 +266,7 @@ def test_a_run_has_the_faults_of_its_scenario_its_stream_or_its_recording(
     with run_with_faults(of[0], scenario, *of[1:]) as faults:
         assert isinstance(faults, Faults)
         assert made == [(of[0], scenario, *of[1:])]
-    assert capsys.readouterr().err == f"{path}: 2 faults, 1 of them at their time\n"
+    assert capsys.readouterr().err == f"{path}: 3 faults, 2 of them at their time\n"
     listening.endpoint = "tcp://127.0.0.1:7002"
     of = of_run('[faults]\nendpoint = "tcp://127.0.0.1:7002"\n')
     with run_with_faults(of[0], None, *of[1:]):
@@ -304,6 +313,71 @@ def test_what_follows_a_run_has_each_frame_in_its_order(monkeypatch):
         assert what[0] is status.see
 
 
+@pytest.mark.parametrize("acts", [False, True])
+def test_a_page_follows_a_run_after_its_status_and_hands_on_what_is_asked_there(monkeypatch, acts):
+    monkeypatch.setattr(running, "Service", lambda *_: nullcontext())
+    seen: list[object] = []
+    requests, listener, scpi, parts = object(), object(), object(), object()
+    description = SimpleNamespace(command="demo")
+
+    def opened_page(listeners, control, described, of):
+        assert (listeners.page, listeners.scpi) == (listener, scpi)
+        assert (control, described, of) == (acts, description, parts)
+        page = SimpleNamespace(
+            see=lambda shown: seen.append(("page", shown)),
+            follow=lambda run: seen.append(("page follows", run)),
+        )
+        return nullcontext((page, requests))
+
+    monkeypatch.setattr("hilstar.server.console.publisher.opened_page", opened_page)
+    status = SimpleNamespace(
+        see=lambda shown: seen.append(("status", shown)),
+        follow=lambda run: seen.append(("status follows", run)),
+        begun=0, alive=0, line=0,
+    )  # fmt: skip
+    with followed(listener, acts, description, parts, status, scpi=scpi) as (sink, follow, asked):
+        follow("a run")
+        sink("a frame")
+        assert asked is requests
+    assert seen == [
+        ("status follows", "a run"),
+        ("page follows", "a run"),
+        ("status", "a frame"),
+        ("page", "a frame"),
+    ]
+
+
+def test_answers_are_taken_and_frames_are_fed_while_a_run_lasts(tmp_path, monkeypatch, capsys):
+    taken: list[str] = []
+    source = SimpleNamespace(
+        endpoint="udp://here", take=lambda: taken.append("look") or [], unread="",
+        refusals=dict, trouble=lambda: "",
+    )  # fmt: skip
+    monkeypatch.setattr(
+        "hilstar.server.answers.reader.open_answers", lambda *given: nullcontext(source)
+    )
+    answers = {"source": "udp", "bind": "127.0.0.1:5000", "format": "json"}
+    for name, tables in (("plain", {}), ("answered", {"answers": answers})):
+        (tmp_path / f"{name}.toml").write_text(
+            bench_text({"render": {"quantisation": "round"}}, tables)
+        )
+    with load(tmp_path / "plain.toml") as bench:
+        with optional_answers(bench, Notices(), LedgerSwitch(), None) as none:
+            assert none is None
+        with optional_frames(None, bench, None) as none:
+            assert none is None
+        with optional_frames(f"ipc://{tmp_path}/feed", bench, None) as feed:
+            assert feed.endpoint == f"ipc://{tmp_path}/feed"
+    assert capsys.readouterr().err == f"frames: ipc://{tmp_path}/feed\n"
+    with (
+        load(tmp_path / "answered.toml") as bench,
+        optional_answers(bench, Notices(), LedgerSwitch(), None) as live,
+    ):
+        assert live is not None and live.figures.answers == 0
+    assert taken  # once more at its end
+    assert capsys.readouterr().err == "answers: udp://here\n"
+
+
 def test_a_ledger_s_name_has_the_time_of_its_start_where_it_asks_for_it():
     assert dated_ledger(None) is None
     assert dated_ledger(Path("a/run.mcap")) == Path("a/run.mcap")
@@ -321,7 +395,7 @@ def test_the_files_of_a_run_are_read_or_written_and_never_both(tmp_path):
     ledger = tmp_path / "run.mcap"
     options = SimpleNamespace(ledger=ledger, scenario=scenario, overwrite=False, ledger_split=None)
     found = run_files(options, file, [log], [tmp_path / "out.csv"])
-    assert found.ledger == ledger and len(found.scenario.faults) == 2
+    assert found.ledger == ledger and len(found.scenario.faults) == 3
     for inputs, output in (([log], log), ([], scenario), ([], file.path), ([], ledger)):
         with pytest.raises(InputError):
             run_files(options, file, inputs, [output])

@@ -20,7 +20,7 @@ from hilstar.basics.running_statistics import Percentiles
 from hilstar.cli import demo as demo_command
 from hilstar.cli import serve as serve_command
 from hilstar.cli import tracker as tracker_command
-from hilstar.cli.accept import _print_costs
+from hilstar.cli.accept import _print_costs, _time_text
 from hilstar.cli.campaign import _scheduler, telling
 from hilstar.cli.demo import FOV_ARCSEC, PIXEL_ARCSEC, WRONG, TrackerBeside
 from hilstar.cli.running import ActingPageOptions, DisplayOptions, RunOptions
@@ -33,11 +33,12 @@ from hilstar.instruments.assess import assessment
 from hilstar.instruments.calibrate import camera_edges, effective_psf
 from hilstar.instruments.calibrate import latency as by_diode
 from hilstar.instruments.campaign import acceptance as acceptance_engine
-from hilstar.instruments.campaign import acceptance_page, acceptance_plan
+from hilstar.instruments.campaign import acceptance_page, acceptance_plan, pool
 from hilstar.instruments.campaign.requirements import NOT_MET
 from hilstar.instruments.simulate import heads as twin_heads
 from hilstar.instruments.simulate import simulator
 from hilstar.instruments.simulate.tracker_process import SILENT_AFTER_S, Planted
+from hilstar.instruments.study.chain import run as chain
 from hilstar.server.answers.answer import Answer
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.heads import HeadsRun
@@ -257,6 +258,27 @@ def test_a_study_s_findings_are_right_where_all_of_its_cases_are(
     assert study_lines("limits", output, quick=True) == (["quick True"], True)
 
 
+@pytest.mark.parametrize("right", [True, False, None])
+def test_a_study_of_a_chain_tells_its_scenes_what_to_do_and_whether_all_was_right(
+    tmp_path: Path, engine: Callable[[Any, str, Any], Engine], right: bool | None
+) -> None:
+    (tmp_path / "bench.toml").write_text(bench_text())
+    asked = engine(chain, "run", chain.ChainStudy(["a scene"], right, ["write auto"]))
+    words = ("study", "chain", "bench.toml", "-o", "out", "--quick")
+    done = run_hilstar_here(*words, "--json", cwd=tmp_path)
+    assert json.loads(done.stdout) == {
+        "study": "chain",
+        "right": right,
+        "findings": ["a scene"],
+        "answers": ["write auto"],
+        "directory": "out",
+    }
+    ((file, output, quick, _), _) = asked.given[0]
+    assert (file.path, output, quick) == (Path("bench.toml"), Path("out"), True)
+    lines = run_hilstar_here(*words, cwd=tmp_path).stdout.splitlines()
+    assert lines == ["a scene", "figures and tables in out", "write auto"]
+
+
 @pytest.mark.parametrize(("on_bench", "of_time"), [(False, "on 6 cores"), (True, "at most")])
 def test_the_costs_of_a_plan_are_those_of_its_sets_and_of_all(
     capsys: pytest.CaptureFixture[str], on_bench: bool, of_time: str
@@ -333,7 +355,7 @@ def test_a_head_gets_the_options_of_its_run_and_none_of_another_kind() -> None:
     ("summary", "restarts", "line"),
     [
         ({"frames": 90}, 0, "left 90 frames, exit code 0"),
-        ({"frames": 90}, 2, "left 90 frames, exit code 0, started again 2 times"),
+        ({"frames": 90}, 1, "left 90 frames, exit code 0, started again 1 times"),
         ("no JSON", 0, "left no summary, exit code 0"),
     ],
 )
@@ -619,6 +641,68 @@ def test_an_acceptance_that_is_not_met_is_an_error_where_that_is_asked_for(
     done = run_hilstar_here("accept", "bench.toml", "-o", "out", *words, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (code, "")
     assert done.stdout.splitlines()[0] == "a line"
+
+
+def test_an_acceptance_s_sets_are_run_by_one_pool_that_turns_to_each(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, engine: Callable[[Any, str, Any], Engine]
+) -> None:
+    made: list[Any] = []
+    turned: list[Any] = []
+    ran: list[Any] = []
+
+    class Workers:
+        def __init__(self, *given: Any) -> None:
+            made.append(given)
+
+        def __enter__(self) -> Any:
+            return self
+
+        def __exit__(self, *_: object) -> None:
+            made.append("closed")
+
+        def turn_to(self, *given: Any) -> None:
+            turned.append(given)
+
+    class Cases:
+        cases = 7
+
+        def __init__(self, name: str) -> None:
+            self.job, self.identity = f"job {name}", f"identity {name}"
+
+        def run(self, directory: Any, workers: Any, on_done: Any) -> None:
+            ran.append((self.job, directory, isinstance(workers, Workers)))
+
+    def run(missing: Callable[..., None]) -> list[Any]:
+        for name in ("rates", "sky"):
+            missing(Cases(name), f"folder {name}", name)
+        return []
+
+    accepted = SimpleNamespace(
+        on_bench=False, check=lambda: None, run=run, verdicts=lambda results: ["met"]
+    )
+    read = engine(acceptance_plan, "read_acceptance_plan", "the plan")
+    opened = engine(acceptance_engine, "Acceptance", accepted)
+    monkeypatch.setattr(pool, "Pool", Workers)
+    monkeypatch.setattr(acceptance_engine, "write_ledger", lambda path, results: 0)
+    monkeypatch.setattr(acceptance_page, "write_acceptance", lambda *_: {})
+    monkeypatch.setattr(acceptance_page, "lines_of", lambda *_: [])
+    words = "--quick --through display --workers 3 --solver-timeout 2.5 --plan own.toml"
+    done = run_hilstar_here("accept", "bench.toml", "-o", "out", *words.split(), cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert read.given[0][0] == (Path("own.toml"), Path("bench.toml"), True, "display")
+    assert opened.given[0][0] == ("the plan", Path("bench.toml"), Path("out"), "centroids", 2.5)
+    jobs = [("job rates", "identity rates"), ("job sky", "identity sky")]
+    assert made == [(*jobs[0], 3), "closed"] and turned == jobs
+    assert ran == [(job, f"folder {job[4:]}", True) for job, _ in jobs]
+    assert [line for line in done.stderr.splitlines() if line.endswith("7 cases")] == [
+        "hilstar: rates: 7 cases",
+        "hilstar: sky: 7 cases",
+    ]
+
+
+def test_a_duration_has_the_unit_that_gives_it_two_or_three_digits() -> None:
+    times = [_time_text(seconds) for seconds in (9.0, 119.0, 120.0, 7199.0, 7200.0, 36e3)]
+    assert times == ["9 s", "119 s", "2 min", "120 min", "2.0 h", "10.0 h"]
 
 
 def test_a_scenario_gives_an_exposure_its_moments(

@@ -142,6 +142,21 @@ def test_a_small_disc_that_moves_with_the_rows_has_the_light_of_those_it_meets_a
     assert light.cover.sum() == pytest.approx(np.pi * 25 / (1 - down * share), rel=0.01)
 
 
+def test_a_small_disc_hides_what_is_within_its_outline_far_off_the_axis():
+    """At 39 degrees an outline is 1.3 times as long away from the axis, and its pixels are fewer
+    to a steradian by the cube of the cosine.
+    """
+    camera = Camera((960, 800), 500.0, (47.5, 39.5), np.eye(3))
+    direction = camera.rays(np.array([360.0]), np.array([300.0]))[0]
+    direction /= np.linalg.norm(direction)
+    pole = np.array([0.0, 1.0, 0.0])
+    disc = Disc("x", direction, 125.0, 1.0, 1.0, pole, -direction, "uniform", 1e6)
+    x_px, y_px = camera.project(disc.limb(360))
+    outline_px2 = abs(x_px @ np.roll(y_px, -1) - y_px @ np.roll(x_px, -1)) / 2
+    (light,) = disc_lights(disc, DiscView(camera, PSF, (Pose(np.eye(3)),)), covers=True)
+    assert light.cover.sum(dtype=float) == pytest.approx(outline_px2, rel=0.01)
+
+
 @pytest.mark.parametrize("air", [None, Air(0.05 * 6400.0, 0.3)])
 def test_a_disc_s_pixels_are_those_of_its_limb_its_air_and_its_psf_s_reach(air):
     """Of a face of 12 px, which air of a twentieth of a radius makes larger by its top; the limb

@@ -9,7 +9,7 @@ from hilstar.basics.rotation import from_radec_roll_deg, propagate, to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.display.render.reference import linear_image
 from hilstar.optics import sprites as sprites_module
-from hilstar.optics.frame_motion import EXTRA_SPRITES, CameraTurn, swept_sprites
+from hilstar.optics.frame_motion import EXTRA_PX, EXTRA_SPRITES, CameraTurn, swept_sprites
 from hilstar.optics.paths import MAX_NODES
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Orientation, Scan
@@ -216,6 +216,10 @@ def test_a_path_that_is_too_coarse_still_has_all_its_light_in_its_middle(rng):
     stars = stars_on(inside)
     sprites = swept(stars, at, scan)
     assert sprites.capped == 1000
+    wide = GaussianPsf((3.0, 3.0))
+    few = EXTRA_PX // wide.footprint_px**2  # of sprites that cover many pixels
+    large = swept_sprites(stars_on(inside[:100]), at, scan, CAMERA, wide)
+    assert 0.5 * few < len(large) - 100 <= few < 0.6 * EXTRA_SPRITES
     light = np.bincount(sprites.star, sprites.data["electrons_per_s"])
     assert light == pytest.approx(1.0, rel=1e-6)
     x_px, y_px = (

@@ -10,7 +10,7 @@ import pytest
 
 from hilstar.basics.rotation import from_rotation_vector, to_matrix
 from hilstar.display.render.reference import extended_image, linear_image
-from hilstar.optics.camera import Camera
+from hilstar.optics.camera import Camera, Lens, bounded
 from hilstar.optics.extended import LightMap
 from hilstar.optics.layers.bodies import BodyLayer
 from hilstar.optics.layers.layers import light_of
@@ -139,6 +139,18 @@ def test_what_a_disc_hides_is_farther_than_it():
         )
         left = BodyLayer(moving, canvas).unhidden(light, stars, [face], AT_START)
         assert left.star.tolist() == shown
+
+
+def test_a_satellite_is_left_to_its_own_layer_which_knows_what_hides_it():
+    """It has its place among the bodies' before theirs, and no distance there."""
+    face = Disc("Moon", AHEAD, 1000.0, 20.0, 20.0, np.array([0.0, 1.0, 0.0]), -AHEAD, "lambert")
+    stars = with_bodies(stars_at(AHEAD[None], np.ones(1)), ("SAT",), np.zeros(1), found=False)
+    stars = with_bodies(stars, ("Moon",), np.zeros(1))
+    stars.vectors[1:] = AHEAD
+    light = replace(sprites_at(np.full((3, 2), 40.0), np.ones(3), FOOTPRINT), star=np.arange(3))
+    moving = SimpleNamespace(names=("Moon",), distances_km=lambda *_: np.array([1000.0]))
+    left = BodyLayer(moving, CANVAS).unhidden(light, stars, [face], AT_START)
+    assert left.star.tolist() == [1]
 
 
 def test_a_streak_is_listed_in_the_middle_of_its_light():
@@ -280,6 +292,68 @@ def test_no_diffuse_light_shines_through_a_dark_body(radius_px):
     # the disc's area, by a pixel's width of its limb
     assert (1 - image).sum() == pytest.approx(np.pi * radius_px**2, rel=0.02)
     assert image[:5].min() == 1
+
+
+@pytest.mark.parametrize("sigma_px", [(0.4, 0.8), (1.0, 0.7), (2.5, 3.0)])
+def test_a_disc_in_an_exposure_is_a_chain_of_edges_as_near_as_its_psf_is_narrow(sigma_px):
+    """Poses at most 1.6 sigmas apart, and no more than one a sigma, to the next odd number."""
+    disc = Disc("Moon", AHEAD, 12.0, 1.0, 1.0, np.array([0.0, 1.0, 0.0]), -AHEAD, "lambert")
+    layer, _ = body_layer([disc], Canvas(CAMERA, GaussianPsf(sigma_px)))
+    length_px = 20.0
+    rate = np.array([0.0, length_px / CAMERA.focal_length_px, 0.0])
+    stars = with_bodies(stars_at(-np.eye(3), np.ones(3)), ("Moon",), np.zeros(1))
+    view = View.exposure(AT_START.q_icrs_to_cam, rate, 1.0)
+    lights = layer.add(join_sprites([], FOOTPRINT), stars, view).extended
+    ahead = np.array([light.icrs_to_image[:, 2] for light in lights])
+    places_px = np.sort(ahead[:, 0] / ahead[:, 2]) * CAMERA.focal_length_px
+    length_sigma = length_px / min(sigma_px)
+    assert np.diff(places_px).max() < 1.6 * min(sigma_px)
+    assert len(lights) % 2 == 1 and len(lights) < length_sigma + 2
+    assert sum(light.times for light in lights) == pytest.approx(1.0)
+
+
+def is_over(disc: Disc, white_e_per_s: float, canvas: Canvas, view: View = AT_START) -> bool:
+    layer, _ = body_layer([disc], replace(canvas, white_e_per_s=white_e_per_s))
+    stars = with_bodies(stars_at(-np.eye(3), np.ones(3)), ("Moon",), np.zeros(1))
+    return layer.add(join_sprites([], FOOTPRINT), stars, view).over_white == ("Moon",)
+
+
+def test_a_thin_crescent_is_over_white_by_its_lit_limb():
+    """10 degrees from new it is half a pixel wide. A Lambert sphere's brightest is at the limb,
+    which from 20 radii is seen 2.9 degrees short of a quarter turn: the Sun is 7.1 degrees high.
+    """
+    towards = np.array([np.sin(np.radians(10)), 0.0, np.cos(np.radians(10))])
+    turned = np.array([[0.8, -0.6, 0.0], [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]]) @ towards
+    pole = np.array([0.0, 1.0, 0.0])
+    crescent = Disc("Moon", AHEAD, 20.0, 1.0, 1.0, pole, turned, "lambert", 1e6)
+    height_rad = np.radians(10) - np.arcsin(1 / 20)
+    brightest = 1e6 * np.sin(height_rad) / CAMERA.focal_length_px**2
+    assert is_over(crescent, 0.95 * brightest, CANVAS)
+    assert not is_over(crescent, 1.01 * brightest, CANVAS)
+
+
+def test_behind_a_lens_a_disc_is_over_white_by_the_largest_solid_angle_of_a_pixel():
+    bowed = bounded(replace(CAMERA, lens=Lens((8.0, 0.0, 0.0))), 20.0)
+    even = Disc("Moon", AHEAD, 20.0, 1.0, 1.0, AHEAD, -AHEAD, "uniform", 1e6)
+    smallest, largest = bowed.scales_px_rad()
+    canvas = replace(CANVAS, camera=bowed)
+    assert largest > 1.1 * smallest
+    assert is_over(even, 0.99e6 / smallest**2, canvas)
+    assert not is_over(even, 1.01e6 / smallest**2, canvas)
+
+
+def test_a_small_disc_that_an_exposure_moves_is_over_white_by_the_light_of_all_its_poses():
+    """2 px wide, and moved by 2 sigmas: a chain of three."""
+    small = Disc("Moon", AHEAD, 500.0, 1.0, 1.0, AHEAD, -AHEAD, "uniform", 1e6)
+    rate = np.array([0.0, 1.6 / CAMERA.focal_length_px, 0.0])
+    view = View.exposure(AT_START.q_icrs_to_cam, rate, 1.0)
+    layer, _ = body_layer([small], CANVAS)
+    stars = with_bodies(stars_at(-np.eye(3), np.ones(3)), ("Moon",), np.zeros(1))
+    lights = layer.add(join_sprites([], FOOTPRINT), stars, view).extended
+    peaks = [float(light.image.max()) for light in lights]
+    assert len(peaks) == 3
+    assert is_over(small, 1.2 * max(peaks), CANVAS, view)
+    assert not is_over(small, 1.01 * sum(peaks), CANVAS, view)
 
 
 def test_stars_without_paths_are_points_though_the_camera_turns():

@@ -82,6 +82,9 @@ def test_weights_of_a_square_sum_to_one_and_a_point_has_the_pixel_s():
         assert np.abs(nodes).max() < (1 + side_px) / 2
         # a box's variance is its width's square over 12, and those of pixel and square add up
         assert weights @ nodes**2 == pytest.approx((1 + side_px**2) / 12, rel=1e-4)
+        assert weights @ nodes == pytest.approx(0.0, abs=1e-12)
+        fourth = (1 + side_px**4) / 80 + 6 * side_px**2 / 144
+        assert weights @ nodes**4 == pytest.approx(fourth, rel=1e-4)
 
 
 def test_the_slopes_are_those_of_differences():
@@ -125,7 +128,9 @@ def test_a_planted_gaussian_is_found_to_the_ridge(rng, side_px):
 
 
 def test_one_covariance_of_all_is_that_of_all(rng):
+    """A tenth of them are wider, and move no median."""
     covariance = np.tile([9.0, 1.0, 0.0], (STARS, 1))
+    covariance[: STARS // 10, :2] += 2.0
     points, start, *_ = gaussian_points(rng, covariance, level=0.0)
     fitted = fit_each(points, start, rounds=15, alike=True)
     assert np.ptp(fitted.covariance, axis=0) == pytest.approx(0.0, abs=1e-12)

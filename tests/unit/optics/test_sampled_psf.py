@@ -117,6 +117,9 @@ def test_a_sampled_gaussian_is_the_gaussian():
     x, y = rng.uniform(-9, 9, (2, 100))
     region = (-5, -4, 13, 10)
     assert np.abs(psf.spread(x, y, light, region) - exact.spread(x, y, light, region)).max() < 5e-4
+    for whole in (psf, SampledPsf(psf.samples.T, 5)):  # wide along rows, and along columns
+        image = whole.spread(*fraction, light, (-7, -8, 15, 17))
+        assert image.sum(dtype=float) == pytest.approx(light.sum(), rel=FLUX_LIMIT)
     assert psf.shares(pixel, pixel[:, None]).shape == (13, 13)
     assert psf.peak_share == pytest.approx(exact.peak_share, abs=1e-4)
     # A Gaussian and a pixel together are not quite a Gaussian, which adaptive moments weigh by: 1.4
@@ -199,6 +202,9 @@ def test_the_same_file_is_the_same_psf_and_another_is_not(tmp_path):
     assert read_psf(path) is first
     fits.writeto(path, sampled(airy(1.5), 3, 7), fits.Header({"OVERSAMP": 3}), overwrite=True)
     assert read_psf(path) != first
+    fits.writeto(tmp_path / "plain.fits", sampled(gaussian(2.0, 2.0), 1, 9))
+    plain = read_psf(tmp_path / "plain.fits")
+    assert (plain.per_px, plain.pixel_integrated) == (1, False)
 
 
 def test_fewer_samples_than_two_a_sigma_are_off_by_percents():

@@ -253,6 +253,8 @@ CHORDS_ON_IMAGE = {
     "beside": ([-60.0, 140.0], [200.0, 200.0], None),
     "at rest on it": ([30.0, 30.0], [20.0, 20.0], (0.0, 1.0)),
     "at rest beside it": ([130.0, 130.0], [20.0, 20.0], None),
+    "at rest left of it": ([-11.0, -11.0], [20.0, 20.0], None),
+    "along its upper side": ([-60.0, 140.0], [-11.0, -11.0], None),
     # which way it comes from behind is not known: it counts whole
     "from behind the camera": ([NOWHERE, 40.0], [NOWHERE, 30.0], (0.0, 1.0)),
     "to behind the camera": ([40.0, NOWHERE], [30.0, NOWHERE], (0.0, 1.0)),

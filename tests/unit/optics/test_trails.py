@@ -221,6 +221,8 @@ def test_beyond_what_an_image_may_cost_streaks_are_coarser_and_counted():
     fine, coarse = (trails(seen, view, lit, Brush(BRUSH.psf, most)) for most in (2000, 5))
     assert (len(coarse.sprites), coarse.sprites.capped, fine.sprites.capped) == (5, 1, 0)
     assert image_of(coarse.sprites).sum() == pytest.approx(image_of(fine.sprites).sum(), rel=0.02)
+    undrawn = trails(seen, view, lit, Brush(BRUSH.psf, 5), faintest_e_per_s=np.inf)
+    assert (len(undrawn.sprites), undrawn.sprites.capped) == (0, 0)
     # beside three stars that are drawn coarser than they should be
     stars = replace(
         sprites_at(np.array([[5.0, 6.0]]), np.ones(1), BRUSH.psf.footprint_px), capped=3
@@ -282,6 +284,9 @@ def test_a_path_across_the_image_is_drawn_from_edge_to_edge():
     half_px = 80 + BRUSH.psf.footprint_px / 2 + 1
     assert [begin[0], end[0]] == pytest.approx([0.5 - half_px / 1200, 0.5 + half_px / 1200])
     assert count == 1 + np.floor(2 * half_px / SIGMA_PX[0] / SPACING_SIGMA)
+    # one at rest has a sprite for each quarter of a second, in which its light may change
+    counts, _ = sprite_counts(StillPass(np.zeros(1)), view, Lit(np.zeros(1), 1.1), BRUSH)
+    assert counts.tolist() == [5]
 
 
 class BentPass(StraightPass):
@@ -314,7 +319,8 @@ class StillPass:
         return len(self._rays)
 
     def directions(self, which, seconds, velocity_km_s=None):
-        return self._rays / np.linalg.norm(self._rays, axis=1, keepdims=True)
+        rays = self._rays[which]
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
 
     def speeds_rad_s(self):
         return np.linspace(0.0, 0.01, len(self))

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import constants
 
 from hilstar.basics.errors import InputError
 from hilstar.display.footprints import FootprintMap
@@ -116,6 +117,8 @@ def test_what_may_stand_for_a_varying_psf_ends_with_itself_by_that_name():
 # A Gaussian's light in a pixel is nearly that of one a twelfth of a px^2 wider in its middle.
 PIXEL_VARIANCE_PX2 = 1 / 12
 CLOSE_MAG, CLOSE_PX = 2e-3, 2e-3
+# 0.4 % of a star's light is beyond a square two pixels smaller than its footprint, 3 px away
+CUT_MAG, CUT_PX = 0.01, 0.02
 PLACES_PX = np.array([[12.3, 40.8], [20.6, 31.2], [7.0, 9.5]])
 
 
@@ -138,6 +141,34 @@ def test_a_psf_of_another_width_is_off_by_the_light_in_a_window_as_wide_as_the_s
     found = psf_errors(gaussian_samples(0.9, 1.5), gaussian_samples(*other), PLACES_PX)
     assert found.mag == pytest.approx(2.5 / np.log(10) * (1 - share), abs=CLOSE_MAG)
     assert found.px < CLOSE_PX
+
+
+class Coloured(GaussianPsf):
+    """A Gaussian with half of its light at 1000 nm, where it has half the throughput of 500 nm."""
+
+    by_colour = True
+    wavelengths_nm = np.array([500.0, 1000.0])
+    mean_shares = np.array([0.5, 0.5])
+    side_px = 1
+
+    def stamps_at(self, x_px, y_px, spectra, electrons_per_s=None):
+        """By the spectrum of each star, in squares of its own side."""
+        fraction_px = np.stack([x_px - np.rint(x_px), y_px - np.rint(y_px)])
+        return np.moveaxis(self.stamps(fraction_px, spectra @ [1.0, 0.5], self.side_px), 2, 0)
+
+
+@pytest.mark.parametrize("wider_px", [-2, 2])
+def test_a_coloured_psf_s_light_is_counted_in_photons_of_a_cool_and_a_hot_star(wider_px):
+    """Planck's law in photons at 3000 K; a hot star has less of its light at 1000 nm."""
+    wavelengths_m = Coloured.wavelengths_nm * 1e-9
+    energies = constants.h * constants.c / (wavelengths_m * constants.k * 3000.0)
+    photons = 1 / (wavelengths_m**4 * np.expm1(energies))
+    wanted_mag = 2.5 / np.log(10) * 0.5 * photons[1] / photons.sum()
+    own, other = gaussian_samples(0.7, 0.8), Coloured((0.7, 0.8))
+    other.side_px = own.footprint_px + wider_px
+    found = psf_errors(own, other, PLACES_PX)
+    assert found.mag == pytest.approx(wanted_mag, abs=CUT_MAG)
+    assert found.px < CUT_PX
 
 
 @pytest.mark.parametrize(

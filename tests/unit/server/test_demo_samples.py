@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from PIL import Image
 
 from hilstar.basics.rotation import (
     angle_between_rad,
@@ -12,7 +15,14 @@ from hilstar.basics.rotation import (
     to_radec_roll_deg,
 )
 from hilstar.server import demo
-from hilstar.server.demo import REST_S, _jittered, scan_samples, slew_samples
+from hilstar.server.demo import (
+    REST_S,
+    Demo,
+    _jittered,
+    scan_samples,
+    slew_samples,
+    write_pictures,
+)
 
 DURATION_S = 10.0
 
@@ -68,3 +78,21 @@ def test_jitter_is_as_large_as_stated_about_each_axis_and_forgets_in_its_time(rn
     steps = np.diff(off_arcsec, axis=0).std(axis=0)
     # a step of 10 ms in 0.4 s: sqrt(2 (1 - e^-0.025)) of a sigma
     assert steps == pytest.approx(np.array([1.5, 1.5, 6.0]) * 0.2222, rel=0.1)
+
+
+def test_a_kept_frame_is_two_pictures_of_its_codes_and_each_is_told(tmp_path):
+    codes = np.arange(12, dtype=np.uint16).reshape(3, 4) * 90
+    told = []
+    kept = {7: codes, 1200: codes[::-1]}
+    summary: Any = None
+    write_pictures(tmp_path, Demo(summary, kept, bits=10), told.append)
+    assert told == [1, 2, 3, 4]
+    names = {
+        f"frame_{number}_{kind}.png" for number in ("0007", "1200") for kind in ("codes", "preview")
+    }
+    assert {path.name for path in tmp_path.iterdir()} == names
+    first, last = (
+        np.asarray(Image.open(tmp_path / f"frame_{n}_codes.png")) for n in ("0007", "1200")
+    )
+    assert np.array_equal(first, last[::-1]) and first.shape == (3, 4)
+    assert np.array_equal(np.argsort(first, axis=None), np.arange(12))

@@ -4,6 +4,7 @@ no X server, no waiting.
 
 from __future__ import annotations
 
+import itertools
 from types import SimpleNamespace
 
 import numpy as np
@@ -189,9 +190,24 @@ def test_an_idle_screen_is_kept_alive_and_ends_the_run_when_its_window_goes(tmp_
     run = PacedRun(tmp_path, Limit(slots=0))
     run.loop.idle()
     assert run.screen.presented == [0] and not run.loop.stop.is_set()
+    run.screen.aids.toggle("blank")  # a key that was pressed meanwhile
+    run.loop.idle()
+    assert run.notices.counts()["operator"] == 1
     run.screen.window.gone = "its display was unplugged"
     run.loop.idle()
     assert run.notices.counts()["window-gone"] == 1
+
+
+def test_slots_count_the_refreshes_between_two_frames_of_a_period_with_a_fraction():
+    host = FakeClock(FIRST_SWAP_NS + 1)
+    screen = FakeScreen(host)
+    screen.clock = SwapClock(FIRST_SWAP_NS, 1e9 / 60, True)
+    pacer = DisplayPacer(screen, Notices(), host)
+    moments = []
+    for moment in itertools.islice(pacer.moments(), 60):
+        moments.append(moment)
+        host.ns = moment.swap_ns + round(2.2e9 / 60)  # so long a frame takes
+    assert [moment.slot for moment in moments] == list(range(0, 180, 3))
 
 
 def test_the_grid_follows_a_screen_that_runs_a_little_slower():
@@ -250,3 +266,25 @@ def test_a_guard_is_raised_by_three_late_flips_of_one_hundred_and_twenty(well, i
     assert not any(told)
     assert budget.add_flip(*late) is is_raised
     assert budget.guard_ns == (1.25 * 2e6 if is_raised else GUARD_NS)
+
+
+@pytest.mark.parametrize(
+    ("leads_ns", "guard_ns"),
+    [
+        ((3e6, 1e6, 2e6), 1.25 * 2e6),  # the middle one, whenever it came
+        ((0.48 * PERIOD_NS,) * 3, 0.5 * PERIOD_NS),  # half a period at most
+        ((0.52 * PERIOD_NS,) * 3, GUARD_NS),  # so early that a driver was not the cause
+        ((0.5e6,) * 3, GUARD_NS),  # never lowered
+    ],
+)
+def test_a_guard_is_a_quarter_more_than_the_middle_lead_of_late_flips(leads_ns, guard_ns):
+    budget = DrawBudget(PERIOD_NS)
+    raised = [budget.add_flip(lead_ns, PERIOD_NS) for lead_ns in leads_ns]
+    assert raised == [False, False, guard_ns > GUARD_NS] and budget.guard_ns == guard_ns
+
+
+def test_a_frame_is_never_begun_more_than_a_period_before_its_swap():
+    budget = DrawBudget(PERIOD_NS)
+    for _ in range(DrawBudget.FRAMES):
+        budget.add(round(1.5 * PERIOD_NS))
+    assert budget.ns == PERIOD_NS and budget.min_ns == round(1.5 * PERIOD_NS)

@@ -5,6 +5,7 @@ the system says of them.
 from __future__ import annotations
 
 import datetime
+import itertools
 from contextlib import contextmanager
 from types import SimpleNamespace
 
@@ -12,8 +13,11 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import MachineError
+from hilstar.display.identity import TABLE, MonitorIdentity
 from hilstar.display.window.output_settings import OutputState
+from hilstar.display.window.window import WindowSettings
 from hilstar.display.window.x11 import BackBuffer
+from hilstar.server.bench import build
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.config import parse_config
 from hilstar.server.screen import gate
@@ -85,8 +89,21 @@ def test_intervals_of_more_than_a_period_and_a_half_are_dropped_frames(monitor):
     ]
 
 
-def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
-    assert list(faults(plain_window(), monitor, GOOD)) == []
+@pytest.mark.parametrize(
+    ("changes", "timing"),
+    [
+        ({}, GOOD),
+        # at the limits: two dropped frames, 1 % of the period, one sample, a ramp of as many steps
+        ({}, Timing(PERIOD_MS, 2, True)),
+        ({}, Timing(PERIOD_MS * 1.0099, 0, True)),
+        ({}, Timing(PERIOD_MS * 0.9901, 0, True)),
+        ({"back_buffer": BackBuffer(8, 1), "ramp_size": 0}, GOOD),
+        # a display without a refresh of its own drops none
+        ({}, Timing(1.7 * PERIOD_MS, 60, False)),
+    ],
+)
+def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor, changes, timing):
+    assert list(faults(plain_window(**changes), monitor, timing)) == []
 
 
 @pytest.mark.parametrize(
@@ -105,7 +122,9 @@ def test_a_display_as_the_bench_file_has_it_has_no_fault(monitor):
             GOOD,
             "the X screen has 10 bits per colour and the window 8, so that X converts codes",
         ),
-        ({"back_buffer": BackBuffer(8, 4)}, GOOD, "4 samples a pixel"),
+        ({"back_buffer": BackBuffer(8, 2)}, GOOD, "2 samples a pixel"),
+        ({}, Timing(PERIOD_MS, 3, True), "dropped 3 of 120 frames"),
+        ({}, Timing(PERIOD_MS, 0, True, queued=1), "holds 1 finished frame back, and light comes"),
         ({}, Timing(PERIOD_MS * 1.02, 0, True), "58.82 Hz and the bench file says 60"),
         ({}, Timing(PERIOD_MS * 0.98, 0, True), "61.22 Hz and the bench file says 60"),
         ({}, Timing(0.4, 0, False, waits=False), "switch vertical sync on"),
@@ -183,11 +202,42 @@ def test_a_fixed_refresh_is_not_taken_for_a_variable_one(tmp_path, buffers, hz):
 
 
 @pytest.mark.parametrize("stamp_ns", [None, 200_000])
-def test_a_variable_refresh_is_recognised_and_refused(tmp_path, stamp_ns):
-    screen, display = model_screen(tmp_path, variable=True, stamp_ns=stamp_ns)
+@pytest.mark.parametrize("queued", [0, 1])
+def test_a_variable_refresh_is_recognised_and_refused(tmp_path, stamp_ns, queued):
+    screen, display = model_screen(tmp_path, variable=True, stamp_ns=stamp_ns, buffers=2 + queued)
     with pytest.raises(MachineError, match=r"variable refresh.*VariableRefresh.*or add --force"):
         pass_gate(screen, force=False, clock=display.clock)
-    assert pass_gate(screen, force=True, clock=display.clock).variable
+    timing = pass_gate(screen, force=True, clock=display.clock)
+    # a driver that stamps its flips waits for the last one, and holds none back
+    assert timing.variable and timing.queued == (queued if stamp_ns is None else 0)
+
+
+def test_one_burst_that_the_machine_delays_hides_no_queue(tmp_path):
+    screen, display = model_screen(tmp_path, buffers=3)
+    pass_gate(screen, force=True, clock=display.clock)
+    presents = []
+
+    def delayed(*values):
+        presents.append(values)
+        if len(presents) == gate.BURST + 2:  # in the second burst
+            display.clock.work(1.1 * display.period_ns)
+
+    screen.bench.renderer.present = delayed
+    assert gate.queue_of(screen, display.clock) == (1, False)
+    assert len(presents) == gate.BURSTS * gate.BURST
+
+
+def test_a_guard_is_one_with_which_no_frame_of_its_trials_is_late(tmp_path):
+    """A driver that needs 1.9 ms for each fourth frame, else 0.2 ms."""
+    screen, display = model_screen(tmp_path)
+    pass_gate(screen, force=False, clock=display.clock)
+    needs_ms = itertools.cycle([0.2] * (gate.GUARD_TRIALS - 1) + [1.9])
+
+    def present(*values):
+        display.deadline_ns = round(next(needs_ms) * 1e6)
+
+    screen.bench.renderer.present = present
+    assert gate.needed_guard_ms(screen, display.clock) == 2.0
 
 
 def test_a_wrong_setting_of_the_output_is_refused_and_a_doubtful_one_is_told(tmp_path, caplog):
@@ -244,3 +294,37 @@ def test_a_wrong_size_is_said_before_the_bench_is_opened_or_a_frame_drawn(tmp_pa
     ):
         raise AssertionError("a display of another size is refused")
     assert opened == []
+
+
+@pytest.mark.parametrize(("gpu", "is_told"), [("nUMp", False), ("GeForce", True)])
+def test_a_run_s_output_is_what_the_gate_saw_with_the_monitor_and_what_was_forced(
+    tmp_path, monkeypatch, caplog, gpu, is_told
+):
+    """The bench is real and drawn by NumPy; the window and the gate are not there."""
+    output = OutputState("DP-1", (320, 240), properties={"TearFree": "off"})
+    monitor = MonitorIdentity(maker="DEL", model="U2720Q", mode="320x240@60.00")
+
+    def past_gate(screen, force):
+        screen.output = output
+        screen.forced.append("it is scaled")
+
+    @contextmanager
+    def window_of(settings):
+        assert settings == WindowSettings((320, 240), 8, None, 60.0)
+        yield plain_window()
+
+    monkeypatch.setattr(build, "headless_context", lambda gpu: None)
+    monkeypatch.setattr(gate, "window_context", lambda: None)
+    monkeypatch.setattr(gate, "Window", window_of)
+    monkeypatch.setattr(gate, "pass_gate", past_gate)
+    monkeypatch.setattr(gate, "identity_here", lambda display: monitor)
+    path = tmp_path / "bench.toml"
+    path.write_text(f'{SMALL_BENCH}[render]\nquantisation = "round"\ngpu = "{gpu}"\n')
+    today = datetime.date(2024, 1, 1)
+    with gate.open_screen(
+        read_bench_file(path), today, windowed=True, force=True, timed=False
+    ) as screen:
+        forced = screen.bench.output.pop("forced")
+        assert forced == screen.forced and forced[-1] == "it is scaled"
+        assert screen.bench.output == output.fields() | {TABLE: monitor.known()}
+    assert (f"[render] gpu = '{gpu}' is for headless frames" in caplog.text) is is_told

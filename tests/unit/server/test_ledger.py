@@ -316,6 +316,7 @@ def test_a_ledger_that_is_moved_touched_or_linked_is_whole(tmp_path, kept_bench)
         wait_for(lambda: notices.counts().get("ledger-moved"))
         keep(ledger, 10, 20)
     assert ledger.failure is None
+    assert notices.counts() == {"ledger-moved": 1}
     assert [frame.frame for frame in drawable_frames(tmp_path / "moved.mcap")] == list(range(20))
 
 
@@ -644,6 +645,7 @@ def test_refused_packets_are_counted_by_reason(tmp_path, kept_bench):
         each["reason"]: each["count"] for topic, each in figures_messages if topic == "/not_kept"
     }
     assert len(whole) == 40
+    assert {each["reason"] for each in whole} == {f"{why}: {'d' * 200}" for why in ("crc", "norm")}
     assert counted == {"crc": 380, "norm": 80}
     assert max(len(each["raw"]) for each in whole) == 2048
 

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from hilstar.attitude.clock.timeline import Attitude
+from hilstar.attitude.wire import protocol
+from hilstar.attitude.wire.packet import AnswerPacket
 from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.server import serve
@@ -215,7 +217,12 @@ def test_a_valid_answer_is_passed_on_with_the_stamp_of_the_sender_s_own_clock():
     )
     answer = Answer(20 * NS_PER_S, b"", None, np.array([1.0, 0.0, 0.0, 0.0]))
     serve._pass_on(receiver, iter([5]), answer, 12 * NS_PER_S)
-    assert [(each.sequence, each.t_ns) for each in sent] == [(5, 5 * NS_PER_S)]
+    q, still = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+    assert sent == [AnswerPacket(5, protocol.ANSWER_VALID, 5 * NS_PER_S, q, still, 0)]
+    turning = replace(answer, rate_cam_rad_s=np.array([0.1, -0.2, 0.3]), star_count=9)
+    serve._pass_on(receiver, iter([6]), turning, 13 * NS_PER_S)
+    flags = protocol.ANSWER_VALID | protocol.ANSWER_RATE_VALID
+    assert sent.pop() == AnswerPacket(6, flags, 6 * NS_PER_S, q, (0.1, -0.2, 0.3), 9)
     invalid = replace(answer, valid=False)
     without_attitude = replace(answer, q_icrs_to_cam=None)
     for other in (invalid, without_attitude):

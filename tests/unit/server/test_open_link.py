@@ -40,6 +40,15 @@ def test_basilisk_s_rates_end_at_the_bench_s_largest_turn_and_at_its_silence(tmp
         rates.moving(AttitudeSample(0, q))  # back to the beginning
 
 
+@pytest.mark.parametrize(("source", "of_packets"), [("udp", True), ("scpi", False)])
+def test_what_scpi_s_own_process_sends_has_no_sender_s_convention(tmp_path, source, of_packets):
+    keys = {"source": source} | ({"endpoint": "udp://127.0.0.1:0"} if of_packets else {})
+    config = parse_config(tmp_path / "bench.toml", bench_text({"attitude": keys}))
+    with open_link(config, tmp_path) as link:
+        assert link.conventions.of_packets is of_packets
+        assert (link.conventions.source == "SCPI") is not of_packets
+
+
 class Waiting:
     """A link on which something waits, and what was sent back."""
 

@@ -40,38 +40,38 @@ def test_any_seven_bits_of_the_square_s_code_tell_its_frames():
 
 
 @pytest.mark.parametrize(
-    ("keys", "marker", "square"),
+    ("keys", "marker", "square", "patch"),
     [
-        ("photodiode_px = 40\n", 1, (40, 255)),
-        ('photodiode_px = 40\nphotodiode = "code"\n', CODE[3], (40, 255 * CODE[3])),
-        ("", None, (0, 0)),
-        ("bits = 10\nphotodiode_px = 20\n", 1, (20, 1023)),
+        ("photodiode_px = 40\n", 1, (40, 255), 64),
+        ('photodiode_px = 40\nphotodiode = "code"\n', CODE[3], (40, 255 * CODE[3]), 64),
+        ("", None, (0, 0), 64),
+        ("bits = 10\nphotodiode_px = 20\n", 1, (20, 1023), 256),
     ],
 )
-def test_the_square_is_white_or_black_at_the_monitor_s_own_bits(tmp_path, keys, marker, square):
+def test_square_and_patch_have_codes_of_the_monitor_s_own_bits(
+    tmp_path, keys, marker, square, patch
+):
     screen, _ = model_screen(tmp_path, monitor=keys)
     shown = []
     screen.bench.renderer.present = lambda *values: shown.append(values)
-    screen.aids.toggle("patch")
+    screen.aids.set("patch", True, 0.25)
     screen.aids.toggle("crosshair")
     assert screen.present(3) == marker
-    ((overlay, patch, drawn),) = shown
-    assert (overlay, drawn) == (PATCH | CROSSHAIR, square)
-    white = 1023 if "10" in keys else 255
-    assert patch == round(screen.aids.patch_share * white)
+    assert shown == [(PATCH | CROSSHAIR, patch, square)]
     screen.window.gone = "unplugged"
     screen.present(4)
     assert len(shown) == 1  # nothing is drawn on a window that is gone
 
 
-def test_keys_turn_the_aids_and_quit(tmp_path):
+@pytest.mark.parametrize("quits", ["q", "escape"])
+def test_keys_turn_the_aids_and_quit(tmp_path, quits):
     screen, model = model_screen(tmp_path)
     model.window.keys = deque(["b", "c", "x", "b", "g"])
     screen.swap()
     states = screen.aids.states()
     assert [name for name, on in states.items() if on] == ["crosshair", "grid"]
     assert not screen.closing
-    model.window.keys.append("q")
+    model.window.keys.append(quits)
     screen.swap(timed=False)
     assert screen.closing
 

@@ -189,6 +189,22 @@ def test_a_picture_s_image_has_room_for_its_corners_and_is_as_fine_as_what_is_ke
     assert image.max_tangent == np.inf
 
 
+def test_each_picture_of_a_file_is_a_map_at_its_own_place(tmp_path):
+    hdus = fits.HDUList([fits.PrimaryHDU()])
+    places_deg = ((40.0, 20.0), (75.0, -30.0))
+    for ra_deg, dec_deg in places_deg:
+        header = fits.Header()
+        header.update({"CTYPE1": "RA---TAN", "CTYPE2": "DEC--TAN", "BUNIT": "W/(m2 um sr)"})
+        header.update({"CRVAL1": ra_deg, "CRVAL2": dec_deg, "CRPIX1": 3.5, "CRPIX2": 2.5})
+        header.update({"CDELT1": -0.1, "CDELT2": 0.1})
+        hdus.append(fits.ImageHDU(np.ones((4, 6)), header))
+    hdus.writeto(tmp_path / "maps.fits")
+    middles = [image.axes[2] for image in read_diffuse_map(tmp_path / "maps.fits")]
+    ra, dec = np.radians(places_deg).T
+    wanted = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    assert np.array(middles) == pytest.approx(wanted, abs=1e-4)
+
+
 def test_a_picture_with_a_part_off_the_sky_is_of_a_cube(tmp_path):
     """A tile at the rim of a whole sky in Aitoff's projection, whose ellipse is 162 by 81 degrees
     about its middle: of its corners some show no direction. Only the face opposite has its light.

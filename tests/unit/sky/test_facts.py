@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hilstar.sky.facts import facts_of, sigma_v_mag
+from hilstar.sky.catalog import plain_catalog
+from hilstar.sky.facts import errors_of, facts_of, sigma_v_mag
 
 
 # The scatter of V about what was measured: from the catalogue's introduction by source and colour.
@@ -33,3 +34,20 @@ def test_a_number_that_hipparcos_lacks_has_no_facts():
     facts = facts_of(np.array([1, 0, 999_999], dtype=np.int32))
     known = np.isfinite(facts["sigma_measured_mag"])
     assert known.tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("identifier", "epoch_jyear", "is_known"),
+    [(1, 1991.25, True), (1, 2016.0, False), (7, 1991.25, False)],
+)
+def test_only_figures_of_hipparcos_itself_have_its_errors(identifier, epoch_jyear, is_known):
+    """A table's first row may be HIP 1, whose place it has of another epoch."""
+    columns = {
+        "hip": np.array([1], dtype=np.int32),
+        "identifier": np.array([identifier]),
+        "epoch_jyear": np.array([epoch_jyear]),
+        **{name: np.zeros(1) for name in ("v_mag", "ra_deg", "dec_deg")},
+    }
+    errors = errors_of(plain_catalog("HIP", 1, columns))
+    sigmas = [errors[name][0] for name in errors if name.startswith("sigma_")]
+    assert len(sigmas) == 8 and np.isfinite(sigmas).tolist() == [is_known] * 8

@@ -16,6 +16,7 @@ from hilstar.sky.air import (
     glow_e_per_s_arcsec2,
     standard_pressure_hpa,
     through_air,
+    with_knots,
 )
 from hilstar.sky.bodies.orbit import Geocentre
 from hilstar.sky.bodies.passes import Cone
@@ -122,6 +123,15 @@ def test_light_of_a_v_magnitude_has_its_mean_through_v_by_energy_or_by_photons(i
         means.append((spectrum(nm) * response).sum() / response.sum())
     assert rates[1] / rates[0] == pytest.approx(means[0] / means[1], rel=1e-5)
     assert abs(means[0] / means[1] - 1) > 1e-3
+
+
+def test_a_curve_with_another_s_knots_is_the_same_curve_to_both_ends_of_a_range():
+    """The ends are knots, too: outside of its knots a curve is nothing."""
+    curve = Curve(np.array([300.0, 500.0, 900.0]), np.array([0.1, 0.9, 0.5]))
+    other = Curve(np.array([350.0, 450.0, 650.0, 800.0]), np.ones(4))
+    both = with_knots(curve, other, (400.0, 700.0))
+    assert both.wavelength_nm.tolist() == [400.0, 450.0, 500.0, 650.0, 700.0]
+    assert both.value == pytest.approx([0.5, 0.7, 0.9, 0.75, 0.7])
 
 
 def test_a_zenith_is_that_of_each_second():

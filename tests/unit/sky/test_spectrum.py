@@ -18,6 +18,7 @@ from hilstar.sky.electrons import (
     load_library,
     reference_mean_w_m2_m,
     tabulate,
+    tabulate_pickles,
 )
 from hilstar.sky.spectral_types import DUST_EBV_MAG, LETTERS, bare_and_dusty, class_shares
 from hilstar.sky.spectrum import (
@@ -139,6 +140,14 @@ def test_a_tracker_that_sees_nothing_is_refused():
         30, Curve(np.array([300.0, 400]), np.ones(2)), Curve(np.array([500.0, 600]), np.ones(2))
     )
     assert "share no wavelength" in refusal(tabulate, "dgs", apart, Photometry())
+
+
+@pytest.mark.parametrize(("low_nm", "high_nm"), [(200.0, 1000.0), (300.0, 1700.0)])
+def test_a_tracker_that_sees_more_than_the_library_s_spectra_have_is_refused(low_nm, high_nm):
+    wide = Optics(30, Curve(np.array([low_nm, high_nm]), np.ones(2)), constant_curve(1.0))
+    line = refusal(tabulate_pickles, wide, Photometry())
+    assert f"detects {low_nm:.0f} to {high_nm:.0f} nm, and the Pickles spectra" in line
+    assert "run from 250 to 1600 nm" in line
 
 
 @pytest.mark.parametrize("value", [1.5, 5e-324, 1e-200, 0.0, -1.0, float("nan"), 10**400])

@@ -541,19 +541,20 @@ def test_a_pixel_is_the_ccd47_20_s_where_no_pitch_is_stated():
 
 def test_cosmic_rays_come_at_their_rate_and_leave_their_charge():
     settings = DetectorSettings(cosmic_rays_per_cm2_s=1000.0)
-    shape, expected = (512, 512), 1000.0 * 0.512**2
+    shape, expected = (410, 640), 1000.0 * 0.410 * 0.640
     image_e = cosmic_rays_e(settings, shape, 1.0, generator(), pixel_pitch_um=10.0)
     labels, found = ndimage.label(image_e, structure=np.ones((3, 3)))
-    # Tracks of a few pixels on 262 144: two of 262 touch about as often as 262^2 / 2 * 25 / 262
-    # 144 = 3 times.
+    # Tracks of a few pixels on 262 400: two of 262 touch about as often as 262^2 / 2 * 25 / 262
+    # 400 = 3 times.
     assert found == pytest.approx(expected - 3, abs=SIGMAS * math.sqrt(expected))
     charge_e = ndimage.sum_labels(image_e, labels, range(1, found + 1))
     # cos^2 even from 0 to 1: half of the paths are longer than sqrt 2 of the depth. The median's
     # error is
     # 1 / (2 f sqrt n) = 3 %, f = 0.7 the density there.
-    assert np.median(charge_e) == pytest.approx(
-        math.sqrt(2) * RAY_DEPTH_UM * RAY_E_PER_UM, rel=SIGMAS * 0.03
-    )
+    # 106 e- a micrometre, in 20 of them
+    assert np.median(charge_e) == pytest.approx(math.sqrt(2) * 20 * 388 / 3.66, rel=SIGMAS * 0.03)
+    along_axis_e = RAY_DEPTH_UM * RAY_E_PER_UM
+    assert along_axis_e == pytest.approx(2120, rel=1e-3)
 
 
 def test_a_ray_longer_than_the_sensor_leaves_what_its_way_across_is_worth():
@@ -652,8 +653,9 @@ def test_wrong_exposures_are_refused(exposure_s):
         Detector(DetectorSettings(), SIZE_PX).expose(flat_e(1.0), exposure_s, generator())
 
 
-def test_dark_beyond_what_can_be_drawn_is_refused():
-    detector = Detector(DetectorSettings(dark_e_per_s=1e6), SIZE_PX)
+@pytest.mark.parametrize("version", [1, 2])
+def test_dark_beyond_what_can_be_drawn_is_refused(version):
+    detector = Detector(DetectorSettings(dark_e_per_s=1e6, noise_version=version), SIZE_PX)
     for expose in (
         lambda: detector.expose(flat_e(0.0), 1e7, generator()),
         lambda: detector.expose_noiseless(flat_e(0.0), 1e7),

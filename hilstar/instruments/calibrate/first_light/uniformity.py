@@ -109,6 +109,10 @@ class UniformityMap:
         form_mag = math.sqrt(_not_negative(beyond_mag2, self.left_error_mag2))
         return math.hypot(self.fit_mag, max(form_mag, self.missed_mag))
 
+    def is_far(self, noise_mag: float) -> bool:
+        """Whether held-out dots are farther from the map than their noise explains."""
+        return self.left_mag > max(FAR_SIGMAS * noise_mag, FAR_MAG)
+
     @property
     def is_even(self) -> bool:
         """Whether the light is even to within a star's error."""
@@ -164,7 +168,7 @@ def uniformity(context: StepContext) -> StepOutcome:
     else:
         line += "; nothing was written"
     verdict: Verdict = "done"
-    if light_map.left_mag > max(FAR_SIGMAS * dots.noise_mag, FAR_MAG):
+    if light_map.is_far(dots.noise_mag):
         verdict = "failed"
         line += (
             ": that is far above their noise: dust, a panel uneven from pixel to pixel, or light"

@@ -244,8 +244,7 @@ def rough_geometry(file: BenchFile, plan: DotPlan, seen: Observed) -> SeenScreen
     nominal = nominal_of(file)
     look = first_look(plan, nominal, seen, np.random.default_rng(SEED))
     problem, data = matched(plan, nominal, seen, look)
-    if len(np.unique(data.dot)) < MIN_DOTS:
-        raise _too_few(data)
+    refuse_few(data)
     rough = fits.fit(problem, fits.Model(fits.RADIAL), 0, data).geometry
     return SeenScreen(rough.monitor, rough.tracker, is_sure=True, psf_sigma_px=psf_sigma_of(file))
 
@@ -258,8 +257,7 @@ def without_s_curves(
     """
     look = first_look(plan, nominal, seen, np.random.default_rng(SEED))
     problem, data = matched(plan, nominal, seen, look)
-    if len(np.unique(data.dot)) < MIN_DOTS:
-        raise _too_few(data)
+    refuse_few(data)
     poses = len(look.q_poses)
     rough = fits.fit(problem, fits.Model(fits.RADIAL, (), poses), 0, data).geometry
     for pose, q_cam_to_pose in enumerate(rough.q_poses):
@@ -277,12 +275,15 @@ def seen_in_pose(
     return SeenScreen(geometry.monitor, tracker, is_sure=True, psf_sigma_px=psf_sigma_px)
 
 
-def _too_few(data: fits.MatchedDots) -> InputError:
-    return InputError(
-        f"{len(np.unique(data.dot))} dots were recognised and {MIN_DOTS} are needed: look at focus,"
-        " exposure and stray light, and at whether the tracker sees the part of the screen where"
-        " the dots are (plan.csv)"
-    )
+def refuse_few(data: fits.MatchedDots) -> None:
+    """Refuse (InputError) fewer dots than a fit needs, however many centroids they have."""
+    dots = len(np.unique(data.dot))
+    if dots < MIN_DOTS:
+        raise InputError(
+            f"{dots} dots were recognised and {MIN_DOTS} are needed: look at focus, exposure and"
+            " stray light, and at whether the tracker sees the part of the screen where the dots"
+            " are (plan.csv)"
+        )
 
 
 def calibrate_geometry(
@@ -312,8 +313,7 @@ def calibrate_geometry(
         tracker_names = tuple(fits.TRACKER_STEPS)
     look = first_look(plan, nominal, seen, rng)
     problem, data = matched(plan, nominal, seen, look, tracker_names)
-    if len(np.unique(data.dot)) < MIN_DOTS:
-        raise _too_few(data)
+    refuse_few(data)
     models = fits.candidates(problem, data, tracker_names)
     chosen = fits.best_of(models)
     fit = fits.fit(problem, chosen.model, chosen.field_degree, data)

@@ -225,6 +225,8 @@ def test_a_socket_in_the_file_system_is_asked_as_a_port_is(tmp_path):
         assert answer is not None
         assert peer_trouble(PLACE, answer, "SUB", False) == ""
         assert "a PUB socket is there, and ours is REP" in peer_trouble(PLACE, answer, "REP", False)
+        made.bind(f"ipc://@{tmp_path}")  # Linux's names without a file
+        assert answer_of(f"ipc://@{tmp_path}") == answer
     assert answer_of(f"ipc://{tmp_path}/none", 1.0) is None
 
 

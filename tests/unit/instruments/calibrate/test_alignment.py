@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from scipy.stats import f_oneway
 
 from hilstar.basics.rotation import (
     angle_between_rad,
@@ -294,6 +295,31 @@ def test_the_residual_s_rms_has_the_freedom_that_the_rotation_took():
     assert (found.cross, found.roll) == pytest.approx((np.sqrt(2), 2 * np.sqrt(2)))
 
 
+def test_what_repeats_do_not_explain_is_the_variance_between_attitudes_of_several_counts():
+    """By the analysis of variance of three attitudes that were taken two, two and five times."""
+    counts = [2, 2, 5]
+    roll_arcsec = [[40.0, 43.0], [-21.0, -19.0], [3.0, 5.0, 1.0, 4.0, 2.0]]
+    off_rad = np.zeros((9, 3))
+    off_rad[:, 2] = np.concatenate(roll_arcsec) / ARCSEC_PER_RAD
+    commanded = np.repeat(np.eye(4)[:3], counts, axis=0)
+    found = residual_of(commanded, None, off_rad, np.eye(4)[0], np.linspace(-0.5, 0.5, 9))
+    squares_within = sum(len(part) * np.var(part) for part in roll_arcsec)
+    repeat = np.sqrt(squares_within / (9 - 3))
+    assert found.repeat.roll == pytest.approx(repeat)
+    usual_count = (9 - (2**2 + 2**2 + 5**2) / 9) / (3 - 1)
+    ratio = f_oneway(*roll_arcsec).statistic
+    assert found.unexplained.roll == pytest.approx(repeat * np.sqrt((ratio - 1) / usual_count))
+    assert (found.repeat.cross, found.unexplained.cross) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("pairs", "is_told"), [(5, False), (6, True)])
+def test_three_pairs_more_than_attitudes_tell_how_well_one_repeats(rng, pairs, is_told):
+    commanded = np.resize(np.eye(4)[:3], (pairs, 4))
+    off_rad = 1e-5 * rng.normal(size=(pairs, 3))
+    found = residual_of(commanded, None, off_rad, np.eye(4)[0], np.linspace(-0.5, 0.5, pairs))
+    assert (found.repeat is not None, found.unexplained is not None) == (is_told, is_told)
+
+
 def test_the_angle_between_rotations_is_scipy_s_from_none_to_half_a_turn(rng):
     """Of either sign of a quaternion; tiny ones are not lost in a cosine's rounding."""
     axes = rng.normal(size=(60, 3))
@@ -383,6 +409,10 @@ def test_an_alignment_s_figures_are_alike_in_lines_summary_and_file(tmp_path, rn
     assert "23 of 24 used, of 12 attitudes" in text
     assert (f", {skipped} skipped" in text) == (skipped > 0)
     assert "1, on lines 7" in text
+    rows = tuple(range(2, 13))
+    ten = ", ".join(map(str, rows[:10]))
+    for count, named in ((10, f"10, on lines {ten}"), (11, f"11, on lines {ten}, ...")):
+        assert f"wild{named:>{len(named) + 20}}" in lines_of(replace(found, wild=rows[:count]))
     x, y, z = summary["rotation_arcsec"]
     of_x, of_y, of_z = summary["sigma_arcsec"]
     assert f"x {x:.2f} +- {of_x:.2f}, y {y:.2f} +- {of_y:.2f}" in text

@@ -5,6 +5,7 @@ form: shares, scatter, errors of full scale, verdicts, and maps of light.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -47,6 +48,7 @@ from hilstar.instruments.calibrate.first_light.uniformity import (
     _shown,
     _smoothness,
     _spacing,
+    draw_uniformity,
 )
 from hilstar.instruments.calibrate.first_light.uniformity import uniformity as measured_uniformity
 from hilstar.instruments.calibrate.plan import Patch
@@ -295,6 +297,34 @@ def test_a_map_s_figures_are_of_the_dots_that_are_used():
     assert made.error_mag(0.03) == pytest.approx(math.hypot(0.01, form_mag), rel=1e-4)
     # a finer map that shows more counts where that is larger
     assert made.error_mag(0.049) == pytest.approx(math.hypot(0.01, 0.02), rel=1e-3)
+    # three times their noise is far, and 0.01 mag where that is more
+    assert (made.is_far(0.0166), made.is_far(0.0167)) == (True, False)
+    for left_mag, is_far in ((0.0101, True), (0.0099, False)):
+        assert replace(made, left_mag=left_mag).is_far(0.001) == is_far
+
+
+def test_dots_are_drawn_as_much_fainter_as_they_are_than_the_brightest_place_and_the_map(
+    tmp_path, figures
+):
+    """Seven dots, of which the faintest is on a dead pixel and not drawn."""
+    faint_mag = np.array([0.3, 0.0, 0.1, 0.2, 0.4, 0.5, 5.0])
+    off_mag = np.array([0.01, -0.02, 0.0, 0.03, -0.04, 0.05, 0.0])
+    used = faint_mag < 1
+    x, y = np.arange(7) * 10, np.arange(7) * 3 + 1
+    # relative to the median dot, of 0.3 mag
+    at_dots = 10 ** (-0.4 * (faint_mag - 0.3 - off_mag))
+    made = UniformityMap(np.ones((2, 2)), at_dots, 0.05, 1e-9, used, 0.01, 0.02)
+    seen = DotLight(x, y, 700 * 10 ** (-0.4 * faint_mag), 0.002)
+    draw_uniformity(tmp_path / "light", seen, made, "a finding")
+    brightest_mag = (faint_mag - 0.3 - off_mag)[used].min()
+    wanted = [(faint_mag - 0.3 - brightest_mag)[used], off_mag[used]]
+    for axes, drawn_mag in zip(figures[0].axes, wanted, strict=False):
+        (points,) = axes.collections
+        np.testing.assert_array_equal(points.get_offsets(), np.stack([x, y], axis=1)[used])
+        np.testing.assert_allclose(points.get_array(), drawn_mag, atol=1e-12)
+        # a few outliers do not set the scale
+        assert points.get_clim() == pytest.approx(np.percentile(drawn_mag, (0.5, 99.5)))
+        assert axes.yaxis_inverted()
 
 
 def test_dots_shown_are_squares_about_their_lattice():

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from hilstar.display.calibration import load_calibration, primary_responses, read_toml
 from hilstar.display.response import srgb_light
@@ -16,8 +16,9 @@ from hilstar.instruments.calibrate.photometric import (
     Provenance,
     _additivity,
     calibrate_photometric,
-    draw_calibration,
+    draw_fits,
     fit_channel,
+    held_out,
     strictly_rising,
 )
 from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches, planned_codes
@@ -140,6 +141,9 @@ def test_a_flat_dark_end_is_made_strictly_rising():
     assert np.all(np.diff(light) > 0)
     assert light[-1] == 1
     assert light[4] == pytest.approx(0.5)
+    # by what a calibration may state, and at its dark end by more than nothing
+    assert light[5] / light[4] - 1 == pytest.approx(1e-6, rel=1e-3)
+    assert light[1] == 1e-9
     # over a black level a thousand times as bright as white, too
     assert np.all(np.diff(1000 + light) > 0)
 
@@ -196,14 +200,16 @@ def test_a_floor_of_the_instrument_does_not_bend_the_faint_end(tmp_path):
 
 
 def test_without_repeats_the_residuals_tell_the_noise(tmp_path, rng):
+    """Where it is a third of what is taken for it at first."""
+    noise = 0.003
     codes = planned_codes(8, 64)
-    light = ((np.array(codes) / 255) ** 2.2 + 1e-3) * (1 + NOISE * rng.standard_normal(len(codes)))
+    light = ((np.array(codes) / 255) ** 2.2 + 1e-3) * (1 + noise * rng.standard_normal(len(codes)))
     path = write_readings(
         tmp_path / "m.csv", [(c, "w", v) for c, v in zip(codes, light, strict=True)]
     )
     fit = fit_channel(read_measurements(path), "w")
     # four sigma of a scatter of 60
-    assert fit.noise_relative == pytest.approx(NOISE, rel=4 / np.sqrt(2 * 60))
+    assert fit.noise_relative == pytest.approx(noise, rel=4 / np.sqrt(2 * 60))
 
 
 def test_calibrate_writes_a_file_that_loads_and_says_how_good_it_is(tmp_path, rng):
@@ -253,6 +259,9 @@ def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
     assert summary["additivity_percent"] == pytest.approx(100 * (1 / 1.02 - 1), abs=0.8)
     assert summary["crosstalk_percent"]["1e-0"] == summary["additivity_percent"]
     assert list(summary["crosstalk_percent"]) == [f"1e-{decade}" for decade in range(4)]
+    # a calibration is as noisy as its noisiest primary
+    noises = [summary["channels"][name]["noise_relative"] for name in shares]
+    assert summary["noise_relative"] == max(noises) > min(noises)
     for code, decade in ((255, "1e-0"), (90, "1e-1"), (31, "1e-2")):
         planted = 100 * (1 / (1.02 * (1 + 0.1 * (1 - code / 255))) - 1)
         assert summary["crosstalk_percent"][decade] == pytest.approx(
@@ -265,6 +274,13 @@ def test_primaries_are_fitted_and_their_sum_compared_with_white(tmp_path, rng):
         for code, decade in ((90, "1e-1"), (31, "1e-2")):
             error = summary["channels"][name]["error_percent"][decade]
             assert found.light[code] == pytest.approx((code / 255) ** power, rel=3 * error / 100)
+    # the screen has one black level, which each primary tells
+    blacks = [summary["channels"][name]["black_level"]["unit"] for name in shares]
+    table = (tmp_path / "monitor.csv").read_text().splitlines()
+    (dark,) = [row for row in table if row.startswith("0,")]
+    light = [float(cell) for cell in dark.split(",")[1:]]
+    assert light == pytest.approx([np.mean(blacks)] * 3, rel=1e-5)
+    assert max(blacks) > 1.0001 * min(blacks)
     said = run_hilstar_here(
         "calibrate", "photometric", tmp_path / "m.csv", "-o", tmp_path / "again.toml"
     ).stdout
@@ -292,15 +308,42 @@ def test_the_scatter_of_a_black_without_light_is_no_relative_noise(tmp_path, rng
     path = write_readings(
         tmp_path / "m.csv", [(code, channel, abs(value)) for code, channel, value in rows]
     )
-    assert calibrate_photometric(path, tmp_path / "monitor.toml")["noise_relative"] < 0.1
+    found = calibrate_photometric(path, tmp_path / "monitor.toml")
+    assert found["noise_relative"] < 0.1
+    assert (found["codes"], found["repeats"]) == (len(times), {"min": 1, "max": 5})
 
 
-def test_a_drawing_says_what_it_shows(tmp_path, rng):
-    path = measure_plan(tmp_path / "m.csv", CURVES["gamma"], rng, black=1e-3)
-    finding = draw_calibration(path, tmp_path / "m.png")
-    assert "rms off" in finding
-    with Image.open(tmp_path / "m.png") as image:
-        assert image.size[0] > 500
+def test_a_drawing_shows_each_channel_and_tells_of_the_one_that_is_farthest_off(
+    tmp_path, rng, figures
+):
+    path = measure_plan(tmp_path / "m.csv", CURVES["gamma"], rng, black=0.01)
+    fit = fit_channel(read_measurements(path), "w")
+    scales = {"r": 1, "g": 3, "b": 2}
+    fits = {name: replace(fit, residual=k * fit.residual) for name, k in scales.items()}
+    finding = draw_fits(fits, tmp_path / "m")
+    errors = held_out(fits["g"])
+    rms, mag, largest = (errors[name] for name in ("rms_percent", "rms_mag", "max_percent"))
+    assert finding == (
+        f"Levels held out of the fit are {rms:.2g} % ({mag:.2g} mag) rms off, {largest:.2g} % at"
+        f" the maximum; a patch repeats to {100 * fit.levels.reading_noise(fit.noise_relative):.2g} %"
+    )
+    response, residual = figures[0].axes
+    curve, dots, black = response.lines[:3]
+    np.testing.assert_array_equal(curve.get_xdata(), np.arange(1, 256))
+    np.testing.assert_array_equal(curve.get_ydata(), np.maximum(fit.light[1:], 1e-5))
+    assert black.get_ydata() == pytest.approx([fit.black / fit.white] * 2)
+    code, light = dots.get_data()
+    # levels are drawn as the fit is, above black
+    bright = code > 50
+    np.testing.assert_allclose(light[bright], fit.light[code[bright]], rtol=5 * NOISE)
+    np.testing.assert_allclose(light * fit.white + fit.black, fit.levels.mean[-len(code) :])
+    bands = [band.get_paths()[0].vertices[:, 1] for band in residual.collections]
+    shown = fit.light >= 1e-3
+    for band, drawn, k in zip(bands, residual.lines, scales.values(), strict=False):
+        assert band.max() == pytest.approx(100 * fit.error[shown].max())
+        code, off_percent = drawn.get_data()
+        assert shown[code].all()
+        np.testing.assert_allclose(off_percent, 100 * k * fit.residual[-len(code) :])
 
 
 def ramp(codes, bits=8, curve=CURVES["gamma"], repeats=3, black=1e-3):

@@ -43,7 +43,7 @@ def test_a_loss_is_a_square_that_goes_on_as_a_line():
 
 def test_held_out_levels_count_down_to_three_decades():
     fit = SimpleNamespace(
-        light=np.array([0.0, 5e-4, 2e-3, 0.1, 1.0]),
+        light=np.array([0.0, 9e-4, 1e-3, 0.1, 1.0]),
         levels=SimpleNamespace(code=np.arange(5)),
         residual=np.array([0.5, 0.03, -0.04, 0.0]),
         residual_error=np.full(4, 0.01),

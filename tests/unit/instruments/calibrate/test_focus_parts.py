@@ -151,6 +151,9 @@ def test_each_dot_has_its_own_sigma_and_a_wild_one_is_told():
     values = []
     for number, place in enumerate(places):
         sigma_px = SIGMA_PX + 0.002 * (number - 4)
+        if number == 0:
+            # of sigmas that scatter by 0.009 px this is four of theirs off, and six medians
+            sigma_px = SIGMA_PX + 0.039
         if number == 7:
             sigma_px = 1.4 * SIGMA_PX
         share, *_ = _slopes(shape(sigma_px), place[None], HALF)
@@ -160,6 +163,7 @@ def test_each_dot_has_its_own_sigma_and_a_wild_one_is_told():
     assert np.flatnonzero(~is_tame).tolist() == [7]
     wanted_px = SIGMA_PX + 0.002 * (np.arange(count) - 4)
     # one step of Newton's: the square of a hundredth
+    is_tame[0] = False
     np.testing.assert_allclose(sigmas_px[is_tame], wanted_px[is_tame], atol=2e-4)
 
 

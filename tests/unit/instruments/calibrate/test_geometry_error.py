@@ -47,6 +47,7 @@ from hilstar.instruments.calibrate.geometric.geometry_fit import (
     draw_geometry,
     lines_of,
     nominal_of,
+    refuse_few,
     refuse_misfit,
     seen_in_pose,
     summary_of,
@@ -543,6 +544,15 @@ def test_dots_are_no_lens_s_beyond_four_times_their_noise_and_an_arcsecond(
     words = refusal(refuse_misfit, error_arcsec, expected_arcsec)
     assert f"are {error_arcsec:.3g} arcsec rms off" in words
     assert f"makes {expected_arcsec:.2g}: something moved" in words
+
+
+def test_a_fit_needs_twelve_dots_however_many_centroids_they_have():
+    numbers = np.repeat(np.arange(12), 2)
+    zeros = np.zeros(24)
+    seen = Observed(zeros.astype(int), zeros.astype(int), zeros, zeros, zeros, None)
+    refuse_few(MatchedDots(seen, numbers))
+    line = refusal(refuse_few, MatchedDots(seen, np.minimum(numbers, 10)))
+    assert line.startswith("11 dots were recognised and 12 are needed")
 
 
 def test_a_dot_is_turned_as_its_pose_is():

@@ -226,21 +226,28 @@ def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):
     assert 0.6 < np.sqrt(np.mean(np.square(ratios))) < 1.4
 
 
-def test_a_cause_that_scales_all_light_alike_leaves_each_level_as_well_known(tmp_path):
-    """Light is relative to white, of which such a cause takes the same share."""
+def test_a_cause_that_readings_share_is_in_a_level_s_error_by_what_white_has_not_of_it(tmp_path):
+    """Light is relative to white. Of a cause that scales all light no level has a share; of one
+    that white does not have, a level has its own.
+    """
     codes = np.arange(0, 256, 15)
     light = gamma_response(BITS, POWER).light[codes]
     level_errors = []
-    for name, share in (("alone", 0.0), ("scaled", 0.01)):
-        rows = [
-            (code, "w", one, 1e-3 * one + 1e-9, share * one)
-            for code, one in zip(codes.tolist(), light.tolist(), strict=True)
-        ]
+    dark = 1 - codes / 255
+    for name, share in (("alone", 0 * dark), ("scaled", 0.01 + 0 * dark), ("dark", 0.01 * dark)):
+        rows = list(
+            zip(codes, ["w"] * len(codes), light, 1e-3 * light + 1e-9, share * light, strict=True)
+        )
         path = write_readings(tmp_path / f"{name}.csv", rows, "code,channel,value,sigma,common_1")
         level_errors.append(fit_channel(read_measurements(path), "w").level_error)
-    alone, scaled = level_errors
+    alone, scaled, darker = level_errors
     # a share of 0.01 beside the levels' 0.001 would make them ten times as large
     np.testing.assert_allclose(scaled, alone, rtol=0.05)
+    # the levels' own smoothness tells a part of it
+    left = np.sqrt(darker[:-1] ** 2 - alone[:-1] ** 2) / dark[1:-1]
+    np.testing.assert_allclose(left, left[0], rtol=0.02)
+    assert 0.001 < left[0] < 0.01
+    assert darker[-1] == pytest.approx(alone[-1], rel=1e-3)
 
 
 @pytest.mark.parametrize("black_sigma", [1e-9, 1e-4])

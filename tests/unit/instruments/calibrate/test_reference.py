@@ -49,6 +49,12 @@ EXACT_ARCSEC = 1e-3
 DOTS = ((0.05, 0.02, 1.0), (-0.06, 0.03, 1.0), (0.01, -0.07, 1.0))
 
 
+def test_a_face_of_the_cube_is_named_by_its_normal():
+    for axis, normal in zip("xyz", np.eye(3), strict=True):
+        np.testing.assert_array_equal(FACES[f"+{axis}"], normal)
+        np.testing.assert_array_equal(FACES[f"-{axis}"], -normal)
+
+
 def random_rotation(rng: np.random.Generator, size: float = 1.0) -> FloatArray:
     """A rotation matrix by chance; with a small `size` near the identity."""
     q = normalise(np.array([1.0, *(size * rng.normal(size=3))]))

@@ -17,8 +17,10 @@ from hilstar.basics.errors import InputError
 from hilstar.instruments.calibrate import sensor
 from hilstar.instruments.calibrate.sensor import (
     Levels,
+    SensorFile,
     _Figures,
     _system_gain,
+    draw_curves,
     import_emva,
     measure_sensor,
     write_sensor,
@@ -29,6 +31,7 @@ from hilstar.tracker.detector import Detector
 from hilstar.tracker.settings import DetectorSettings
 from tests.support.benches import SMALL_BENCH
 from tests.support.commands import run_hilstar_here
+from tests.support.refusals import refusal
 
 SIZE_PX = (256, 200)
 SHAPE = (200, 256)
@@ -191,6 +194,11 @@ def test_json_says_what_csv_says(tmp_path):
     ]
     (tmp_path / "emva.json").write_text(json.dumps(objects))
     assert import_emva(tmp_path / "emva.json") == import_emva(tmp_path / "emva.csv")
+    # its objects are counted as a person counts them
+    objects[1]["unit"] = "kg"
+    (tmp_path / "emva.json").write_text(json.dumps(objects))
+    line = refusal(import_emva, tmp_path / "emva.json")
+    assert "emva.json:2: sigma_d = 6.2 kg; write it above 0 in e- or ke-" in line
 
 
 def test_photon_transfer_of_an_imported_sensor_gives_its_sheet_back(tmp_path):
@@ -294,7 +302,7 @@ def test_a_measurement_tells_its_errors_apart_from_its_figures(tmp_path, monkeyp
 
 
 SPELLED = {
-    "K,0.25,DN/e⁻\nσ_d,2.5,e⁻\nμ_e.sat,10.5,ke-\nη@530nm,62,%": {
+    "K,0.25,DN/e⁻\nσ_d,2.5,e⁻\nμ_e.sat,10.5,ke-\nη@530nm,100,%": {
         "gain_e_per_dn": 4,
         "read_noise_e": 2.5,
         "full_well_e": 10500,
@@ -314,7 +322,7 @@ SPELLED = {
         "gain_e_per_dn": 4,
         "dark_e_per_s": 2,
     },
-    "K,0.25,DN/e-\nK,0.25,DN/e-\n1/K,4.02,e-/DN": {"gain_e_per_dn": 4},
+    "K,0.25,DN/e-\nK,0.25,DN/e-\n1/K,4.02,e-/DN\nDSNU,0.5,DN": {"gain_e_per_dn": 4, "dsnu_e": 2},
 }
 
 
@@ -322,9 +330,9 @@ SPELLED = {
 def test_symbols_and_units_of_a_sheet_are_read_as_people_spell_them(tmp_path, rows):
     (tmp_path / "sheet.csv").write_text(f"quantity,value,unit\n{rows}\n")
     sensor = import_emva(tmp_path / "sheet.csv")
-    keys = {
-        key: value for key, value in sensor.keys.items() if key != "dark_reference_temperature_k"
-    }
+    keys = dict(sensor.keys)
+    # the dark signal of a sheet is that at its own temperature
+    assert keys.pop("dark_reference_temperature_k", None) == keys.get("temperature_k")
     assert keys == pytest.approx(SPELLED[rows])
     assert sensor.notes == ()
     assert [nm for nm, _ in sensor.efficiency] == ([530] if "530" in rows else [])
@@ -387,6 +395,12 @@ def test_the_error_of_a_gain_is_the_scatter_of_sensors_that_are_alike(rng):
     assert np.std(gains) == pytest.approx(np.mean(errors), rel=SIGMAS / math.sqrt(2 * sensors))
 
 
+def line_errors(place, sigma, pixels):
+    """One sigma of the slope of a line and of its value at 0, by the sigmas of a pixel's points."""
+    design = np.column_stack([place, np.ones(len(place))]) / sigma[:, None]
+    return np.sqrt(np.diag(np.linalg.inv(design.T @ design)) / pixels)
+
+
 @pytest.mark.parametrize(("largest_dn", "bits"), [(4095.0, 12), (4096.0, 13)])
 def test_a_sensor_s_figures_are_the_lines_of_its_frames(monkeypatch, largest_dn, bits):
     """Levels without scatter, of 0.5 DN an electron; the fourth is full, and the fifth beyond it."""
@@ -436,9 +450,35 @@ def test_a_sensor_s_figures_are_the_lines_of_its_frames(monkeypatch, largest_dn,
     sigma = at_half / (2 * math.sqrt(pattern_dn2)) / 800.0
     assert found.sigmas["prnu"] == pytest.approx(sigma)
     # the slope of signals up to 70 % of full alone, whose inverse is the gain
-    weight = 80 * 60 / 2 * (signal_dn[:3] / temporal[:3]) ** 2
+    pixels = 80 * 60
+    weight = pixels / 2 * (signal_dn[:3] / temporal[:3]) ** 2
     slope_error = 1 / math.sqrt(weight.sum())
-    assert found.sigmas["gain_e_per_dn"] == pytest.approx(slope_error / k**2)
+
+    def in_electrons(value_dn, error_dn):
+        return math.hypot(error_dn, value_dn * slope_error / k) / k
+
+    def root_in_electrons(root_dn, error_dn2):
+        return in_electrons(root_dn, error_dn2 / (2 * root_dn))
+
+    # of means of two frames, variances of their differences, and covariances
+    dark_s_error, offset_error = line_errors(
+        dark_s, np.sqrt(dark.temporal_dn2 / 2 + dark.spatial_dn2), pixels
+    )
+    _, read_error = line_errors(dark_s, math.sqrt(2) * dark.temporal_dn2, pixels)
+    both_dn2 = dark.temporal_dn2 + dark.spatial_dn2
+    rate_error, dsnu_error = line_errors(dark_s**2, np.hypot(both_dn2, dark.spatial_dn2), pixels)
+    assert {name: found.sigmas[name] for name in found.sigmas if name != "prnu"} == pytest.approx(
+        {
+            "gain_e_per_dn": slope_error / k**2,
+            "offset_dn": offset_error,
+            "read_noise_e": root_in_electrons(0.5 * 6.0, read_error),
+            "dsnu_e": root_in_electrons(0.5 * 3.0, dsnu_error),
+            "dsnu_e_per_s": root_in_electrons(0.5 * 0.7, rate_error),
+            "dark_e_per_s": in_electrons(0.5 * 40.0, dark_s_error),
+            # half of the way from the level below to that above
+            "full_well_e": in_electrons(2000.0, (2100.0 - 1300.0) / 2),
+        }
+    )
     np.testing.assert_allclose(found.transfer[0], signal_dn)
 
 
@@ -448,3 +488,64 @@ def test_frames_of_two_exposures_are_no_pair(tmp_path):
         hdus[0].header["EXPTIME"] = 0.2
     with pytest.raises(InputError, match="its size or EXPTIME is not that of"):
         sensor.read_levels(flats, "FLATS")
+
+
+def write_pair(path, levels_dn, noise_dn):
+    """Two frames of 64 x 48 px whose noise is two chequered patterns that are unlike."""
+    down, right = np.mgrid[0:48, 0:64]
+    names = []
+    for number, (level_dn, place) in enumerate(zip(levels_dn, (down, right), strict=True)):
+        pattern_dn = noise_dn * (1 - 2 * (place % 2))
+        names.append(path.with_name(f"{path.name}_{number}.png"))
+        # the right half is brighter by 40: the pattern that both have in common
+        frame = level_dn + pattern_dn + 40 * (right >= 32)
+        Image.fromarray(frame.astype(np.uint16)).save(names[-1])
+    return names
+
+
+def test_a_pair_of_frames_tells_noise_by_its_difference_and_the_pattern_by_what_is_common(tmp_path):
+    """Light that differs from one frame to the other is no noise."""
+    levels = sensor.read_levels(write_pair(tmp_path / "flat", (100, 107), 3), "FLATS")
+    assert levels.mean_dn.tolist() == [123.5]
+    assert levels.temporal_dn2.tolist() == [9.0]
+    assert levels.spatial_dn2.tolist() == [400.0]
+    assert levels.largest_dn == 150.0
+
+
+@pytest.mark.parametrize(("apart_dn", "is_refused"), [(1, False), (2, True)])
+def test_darks_without_exposures_differ_by_half_their_noise_at_most(tmp_path, apart_dn, is_refused):
+    """Of 3 DN of noise: 1.5 DN."""
+    darks = [
+        *write_pair(tmp_path / "dark", (100, 100), 3),
+        *write_pair(tmp_path / "later", (100 + apart_dn, 100 + apart_dn), 3),
+    ]
+    flats = [
+        *write_pair(tmp_path / "half", (200, 200), 6),
+        *write_pair(tmp_path / "full", (300, 300), 8),
+    ]
+    if not is_refused:
+        measure_sensor(flats, darks)
+        return
+    with pytest.raises(InputError, match=f"their means differ by {apart_dn} DN"):
+        measure_sensor(flats, darks)
+
+
+def test_a_sensor_s_lines_are_drawn_through_its_points(tmp_path, figures):
+    """Shot noise makes a variance of the signal over e- a DN, and dark current a line from the
+    offset on.
+    """
+    points = np.array([[0.0, 1000.0, 3000.0], [0.0, 500.0, 1500.0]])
+    dark_points = np.array([[0.5, 4.0], [101.0, 108.0]])
+    keys = {"gain_e_per_dn": 2.0, "offset_dn": 100.0, "dark_e_per_s": 4.0, "full_well_e": 8000.0}
+    for transfer, dark, signal_dn, seconds in (
+        (points, dark_points, 3000.0, 4.0),
+        (None, None, 4000.0, 1.0),
+    ):
+        found = SensorFile(keys, {}, transfer=transfer, dark=dark)
+        draw_curves(tmp_path / "curves", found.settings, found)
+        lines, darks = ([line.get_xydata() for line in axes.lines] for axes in figures[-1].axes)
+        np.testing.assert_allclose(lines[0], [[0, 0], [signal_dn, signal_dn / 2]])
+        np.testing.assert_allclose(darks[0], [[0, 100], [seconds, 100 + 2 * seconds]])
+        if transfer is not None:
+            np.testing.assert_allclose(lines[1], points.T)
+            np.testing.assert_allclose(darks[1], dark_points.T)

@@ -224,6 +224,49 @@ def test_only_an_exponential_says_until_when_to_wait(law, stable_after_s, words)
     assert WarmUp(law, False, STABLE, stable_after_s=stable_after_s).cure.startswith(words)
 
 
+@pytest.mark.parametrize(
+    ("law", "is_stable", "stable_after_s", "line"),
+    [
+        (
+            "exponential",
+            True,
+            900.0,
+            "white is stable to 0.2 % after 900 +- 40 s; it drifts by -1.50 +- 0.25 %/h at the end",
+        ),
+        (
+            "line",
+            True,
+            120.0,
+            "white is stable to 0.2 % from the first reading, at 120 s, on; it drifts by -1.50"
+            " +- 0.25 %/h at the end",
+        ),
+        (
+            "exponential",
+            False,
+            900.0,
+            "white is not yet stable to 0.2 %: by its exponential it is after 900 +- 40 s; it"
+            " drifts by -1.50 +- 0.25 %/h at the end",
+        ),
+        (
+            "line",
+            False,
+            900.0,
+            "white is not shown to be stable to 0.2 %: it drifts by -1.50 +- 0.25 %/h at the end",
+        ),
+        (
+            "none",
+            False,
+            math.inf,
+            "white is not stable to 0.2 %: the last readings follow neither a line nor an"
+            " exponential",
+        ),
+    ],
+)
+def test_what_was_found_of_white_is_one_sentence(law, is_stable, stable_after_s, line):
+    found = WarmUp(law, is_stable, 0.002, stable_after_s, 40.0, -1.5, 0.25, from_s=120.0)
+    assert found.line == line
+
+
 @pytest.mark.parametrize("drift_per_s", [0.0, -4e-7])
 def test_where_an_exponential_has_died_away_a_line_tells_the_drift(drift_per_s: float) -> None:
     """Ten time constants before the middle: it says that nothing drifts, for sure; the line's

@@ -12,6 +12,8 @@ from hilstar.instruments.compare.star_fit import (
     bright_pixels,
     describes,
     nameless_seeds,
+    names_at,
+    star_psf,
 )
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.psf import GaussianPsf
@@ -52,6 +54,32 @@ def test_a_table_of_stars_a_few_pixels_away_is_that_of_another_sky(rng):
     assert describes(table, image)
     table["x_px"] += 12.0
     assert not describes(table, image)
+
+
+def test_the_sigma_of_an_image_is_that_of_most_of_its_bright_stars(rng):
+    """The brightest one is a double star, and another runs over the image's edge."""
+    size_px = 160, 120
+    psf = GaussianPsf((0.85, 0.7))
+    grid = np.arange(20, 160, 24.0), np.arange(20, 120, 24.0)
+    x, y = (part.ravel() + rng.uniform(-0.4, 0.4, part.size) for part in np.meshgrid(*grid))
+    x[3] = -0.3
+    flux = np.full(len(x), 1e4)
+    flux[:2] = 2e4
+    x[1], y[1] = x[0] + 1.2, y[0] + 0.4
+    sprites = pack_sprites(x, y, flux, np.arange(len(x)), size_px, psf.footprint_px)
+    assert star_psf(linear_image(sprites, size_px, psf)).sigma_px == pytest.approx(
+        psf.sigma_px, rel=1e-3
+    )
+
+
+def test_a_star_of_a_table_has_its_number_or_a_body_s_name():
+    table = np.zeros(3, dtype=TRUTH_DTYPE)
+    table["x_px"], table["y_px"] = [10.0, 20.0, 30.0], [5.0, 6.0, 7.0]
+    table["hip"], table["name"] = [32349, 0, 91262], ["", "Mars", ""]
+    places_px = np.array([[30.5, 7.5], [20.0, 6.9], [10.0, 6.1], [11.2, 5.0]])
+    assert names_at(places_px, table, 1.0) == [(91262,), ("Mars",), (), ()]
+    assert names_at(places_px, None, 1.0) == names_at(places_px, table[:0], 1.0) == [()] * 4
+    assert names_at(places_px[:0], table, 1.0) == []
 
 
 def test_bright_pixels_are_places_x_and_y_brightest_first():

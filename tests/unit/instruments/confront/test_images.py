@@ -72,6 +72,9 @@ def test_a_photograph_s_time_is_the_middle_of_its_exposure_in_utc(tmp_path, offs
 
 
 def test_a_time_without_an_offset_is_none_and_one_that_is_given_is_it(tmp_path: Path) -> None:
+    dated = written(tmp_path, "+00:00")
+    assert read_photographs(dated, None)[0].t_ns is not None
+    assert read_photographs(dated, None, 77)[0].t_ns == 77
     path = written(tmp_path)
     assert read_photographs(path, None)[0].t_ns is None
     assert read_photographs(path, None)[0].exposure_s == 8.0
@@ -172,6 +175,10 @@ def test_three_channels_that_are_alike_are_grey_and_opacity_is_none(tmp_path: Pa
         (alike, np.concatenate([alike, opaque], axis=2), np.stack([grey, opaque[..., 0]], axis=2))
     ):
         assert read(saved(tmp_path, pixels, f"{number}.png")).tolist() == grey.tolist()
+    # noise is each channel's own, and light is not
+    noisy = alike.copy()
+    noisy[grey < 150] += np.array([12, 0, 0], dtype=np.uint8)
+    assert read(saved(tmp_path, noisy, "noisy.png")).tolist() == noisy.mean(axis=2).tolist()
     coloured = alike.copy()
     coloured[..., 2] //= 2
     says = refusal(read_photographs, saved(tmp_path, coloured, "b.png"), None)
@@ -238,9 +245,25 @@ def test_a_sky_is_of_its_day_as_a_moving_observer_sees_it(tmp_path: Path) -> Non
         moved /= np.linalg.norm(moved, axis=1, keepdims=True)
         # the square of v / c
         assert np.abs(sky.vectors - moved).max() < 1e-7
+    # Sirius, the brighter of alpha Centauri, and Vega, as ESA SP-1200 has them
+    three = np.array([0, 3, 4])
+    assert plain.hip[three].tolist() == [32349, 71683, 91262]
+    assert [plain.name(int(star)) for star in three] == ["HIP 32349", "HIP 71683", "HIP 91262"]
+    v_mag, bv_mag, vi_mag = plain.columns(plain.order[three])
+    assert v_mag.tolist() == plain.v_mag[three].tolist() == pytest.approx([-1.44, -0.01, 0.03])
+    assert bv_mag.tolist() == plain.bv_mag[three].tolist() == pytest.approx([0.009, 0.71, -0.001])
+    assert vi_mag == pytest.approx([-0.02, 0.69, -0.01])
+    sigma_mag, is_double, is_variable = plain.within(three)
+    assert sigma_mag.shape == (3,) and (sigma_mag > 0).all()
+    assert (is_double.tolist(), is_variable.tolist()) == ([True, True, False], [True, False, True])
     assert plain.velocity_km_s.tolist() == earth_velocity_km_s(t_ns).tolist()
     ground_km_s = over_site.velocity_km_s - plain.velocity_km_s
     assert np.linalg.norm(ground_km_s) == pytest.approx(0.465 * np.cos(np.radians(40)), rel=0.01)
+    east = np.cross([0.0, 0.0, 1.0], over_site.air.up)
+    # the pole of date is 0.002 rad from that of the ICRS
+    np.testing.assert_allclose(
+        ground_km_s / np.linalg.norm(ground_km_s), east / np.linalg.norm(east), atol=0.005
+    )
     assert plain.air is None
     assert plain.masses(np.array([0.0, 0.0, 1.0])) is None
     assert over_site.air is not None

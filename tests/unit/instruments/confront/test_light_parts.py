@@ -29,6 +29,7 @@ from hilstar.instruments.confront.light import (
     CORRECTION_PRIOR,
     MAX_CORRECTION,
     NO_CORRECTION,
+    LightFit,
     StarLight,
     _correction,
     _CorrectionFit,
@@ -37,6 +38,7 @@ from hilstar.instruments.confront.light import (
     _trusted,
     _vignetting,
     fit_light,
+    join_light,
     with_extinction,
 )
 
@@ -61,13 +63,43 @@ def test_extinction_is_as_sure_as_skies_are_alike(rng):
     v_mag = rng.uniform(2, 6, 1200)
     masses = np.array([1.0, 1.4, 2.0])
     mag = v_mag + 0.2 * masses[image] - 12
-    stars = stars_of(mag + 1e-3 * rng.standard_normal(1200), 1e-3, image=image, v_mag=v_mag)
+    stars = stars_of(mag + 0.01 * rng.standard_normal(1200), 0.01, image=image, v_mag=v_mag)
     fit = fit_light(stars, 3, lambda correction: v_mag)
     told = with_extinction(fit, stars, masses.tolist(), known=False)
     about = math.sqrt(float(((masses - masses.mean()) ** 2).sum()))
     sigma = told.sigma["extinction_mag_per_air_mass"]
     assert sigma == pytest.approx(0.01 / about, rel=0.01)
-    assert fit.zero_point_mag == pytest.approx(12 - 0.2 * masses.mean(), abs=1e-3)
+    assert fit.zero_point_mag == pytest.approx(12 - 0.2 * masses.mean(), abs=2e-3)
+    # that of a photograph by its 400 stars
+    assert fit.sigma["zero_point_mag"] == pytest.approx(0.01 / math.sqrt(400), rel=0.1)
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_extinction_weighs_a_photograph_by_its_clean_stars_and_what_skies_differ_by(known):
+    """Four, ten and a hundred stars 0.03 mag to either side, and about as many that are not clean."""
+    image = np.repeat([0, 1, 2], [8, 18, 200])
+    each = np.arange(len(image))
+    clean = each % 4 < 2
+    offsets_mag = np.array([-11.7, -11.66, -11.65])
+    masses = [1.0, 1.2, 1.31]
+    mag = 5.0 + each * 0.01
+    off_mag = np.where(clean, 0.03, 2.0) * (-1) ** each
+    stars = stars_of(offsets_mag[image] + mag - off_mag, 1e-3, image=image, clean=clean)
+    light = LightFit(offsets_mag, (0.0, 0.0), NO_CORRECTION, 12.0, 0.0, 1.0, mag=mag)
+    assert stars.sigma_mag == pytest.approx(1e-3)
+    told = with_extinction(light, stars, masses, known=known)
+    spread_mag = 1.482602 * 0.03
+    sigma_mag = np.hypot(spread_mag / np.sqrt([4, 10, 100]), 0.01)
+    values, covariance = np.polyfit(masses, offsets_mag, 1, w=1 / sigma_mag, cov="unscaled")
+    assert told.extinction_mag == pytest.approx(values[0])
+    name = "extinction_beyond_table_mag_per_air_mass" if known else "extinction_mag_per_air_mass"
+    assert told.sigma == {name: pytest.approx(math.sqrt(covariance[0, 0]))}
+    assert told.masses == (1.0, 1.2, 1.31)
+    # a span of less than 0.3 tells none, nor do two photographs
+    near = with_extinction(light, stars, [1.0, 1.2, 1.29], known=known)
+    two = replace(light, offsets_mag=offsets_mag[:2])
+    few = with_extinction(two, replace(stars, image=image % 2), [1.0, 1.5], known=known)
+    assert (near.extinction_mag, few.extinction_mag, few.masses) == (None, None, (1.0, 1.5))
 
 
 def test_a_zero_point_is_the_mean_of_the_photographs_and_no_vignetting(rng):
@@ -97,6 +129,12 @@ def test_stars_are_trusted_by_the_light_that_their_own_photograph_should_have():
     stars = replace(stars, dn=dn, sigma_dn=np.ones(23), v_mag=v_mag, image=image, clean=clean)
     trusted = _trusted(stars, np.eye(2)[image])
     assert np.flatnonzero(~trusted).tolist() == [10, 11, 22]
+    # however noisy what is not clean, as most of them
+    noisy = stars_of(np.full(40, 5.0), 0.01)
+    none = np.zeros(40, dtype=bool)
+    noisy = replace(noisy, dn=np.full(40, 100.0), sigma_dn=np.full(40, 50.0), clean=none)
+    more = join_light([stars, noisy])
+    assert _trusted(more, np.eye(2)[more.image])[:23].tolist() == trusted.tolist()
     dark = replace(stars, sigma_dn=np.full(23, 1e9))
     assert _trusted(dark, np.eye(2)[image]).tolist() == clean.tolist()
 
@@ -109,6 +147,31 @@ def test_a_correction_that_nothing_asks_for_goes_back_to_none(values):
     loss = fit.loss(at)
     assert loss.value == pytest.approx(float(((at / CORRECTION_PRIOR) ** 2).sum()) / 2)
     assert fit.step(at, loss) == pytest.approx(-at, rel=1e-6)
+
+
+def test_a_loss_is_a_square_up_to_one_and_a_half_sigmas_and_a_line_from_there():
+    off = np.array([3.0, 0.5, 1.0])
+    target = 7 + 2 * np.concatenate([off, -off])
+    fit = _CorrectionFit(target, np.full(6, 2.0), np.ones((6, 1)), lambda pair: np.zeros(6), 2)
+    loss = fit.loss(np.zeros(2))
+    np.testing.assert_allclose(loss.off, (target - 7) / 2, atol=1e-9)
+    assert loss.value == pytest.approx(2 * (1.5 * (3 - 1.5 / 2) + 0.5**2 / 2 + 1 / 2))
+    np.testing.assert_allclose(loss.weight, np.minimum(1, 1.5 / np.abs(loss.off)))
+
+
+@pytest.mark.parametrize(("count", "is_free"), [(17, False), (18, True)])
+def test_a_tilt_takes_fifteen_stars_more_than_what_is_fitted_beside_it(count, is_free, rng):
+    """Beside the zero points of three photographs."""
+    bv = rng.uniform(-0.2, 1.6, 20)
+    image = np.arange(20) % 3
+    use = np.arange(20) < count
+    stars = stars_of(-12 + image - 0.1 * bv, 1e-4, bv_mag=bv)
+
+    def magnitudes(pair: tuple[float, float]) -> np.ndarray:
+        return -0.1 * pair[0] * bv - 0.01 * pair[1] * bv**2
+
+    tilted, bow = _correction(stars, magnitudes, np.eye(3)[image], use)
+    assert (tilted > 0.3, bow) == (is_free, 0.0)
 
 
 @pytest.mark.parametrize(("tilt", "found"), [(4.0, 4.0), (-30.0, -10.0), (30.0, 10.0)])
@@ -145,11 +208,25 @@ def test_vignetting_is_taken_where_it_foretells_better_by_more_than_a_hundredth(
     assert len(_vignetting(stars, np.ones((2000, 1)), off_mag, every)) == columns
 
 
-def test_a_robust_fit_s_errors_are_by_the_scatter_that_its_freedom_leaves():
-    """Six numbers 0.3 to either side of their mean, hardly with noise: 1.4826 x 0.3 x sqrt(6/5)."""
+@pytest.mark.parametrize(("count", "columns"), [(10, 0), (12, 1)])
+def test_vignetting_is_sought_by_eight_stars_more_than_photographs(count, columns):
+    """Of three photographs, where it is plain."""
+    radius2 = np.linspace(0, 1, count)
+    image = np.arange(count) % 3
+    off_mag = image + radius2 + 1e-3 * np.cos(7 * np.arange(count))
+    stars = stars_of(np.zeros(count), 1e-3, radius2=radius2, image=image)
+    every = np.ones(count, dtype=bool)
+    assert len(_vignetting(stars, np.eye(3)[image], off_mag, every)) == columns
+
+
+@pytest.mark.parametrize("noise", [1e-4, 0.4])
+def test_a_robust_fit_s_errors_are_by_the_scatter_that_its_freedom_leaves(noise):
+    """Six numbers 0.3 to either side of their mean, whatever noise has of it: 1.4826 x 0.3 x
+    sqrt(6/5).
+    """
     target = 5 + 0.3 * np.tile([1.0, -1.0], 3)
     every = np.ones(6, dtype=bool)
-    fit = _robust(np.ones((6, 1)), target, np.full(6, 1e-4), every)
+    fit = _robust(np.ones((6, 1)), target, np.full(6, noise), every)
     assert fit.values == pytest.approx([5.0])
     assert fit.sigma == pytest.approx([1.4826 * 0.3 * math.sqrt(6 / 5) / math.sqrt(6)], rel=1e-3)
     assert fit.off == pytest.approx(target - 5)

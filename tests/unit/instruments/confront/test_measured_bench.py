@@ -9,6 +9,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from astropy.io import fits
 
 from hilstar.instruments.confront import measured_bench
 from hilstar.instruments.confront.background import FixedPattern
@@ -21,6 +22,7 @@ from hilstar.instruments.confront.measured_bench import (
 from hilstar.instruments.confront.photon_transfer import PixelFit
 from hilstar.instruments.confront.star_psf import StarPsf
 from hilstar.optics.camera import Camera, Lens
+from tests.support.psfs import gaussian, sampled
 
 GIVEN = """
 [tracker]
@@ -218,6 +220,20 @@ def test_what_was_written_is_the_camera_that_photographs_are_held_against(tmp_pa
     # 2 DN's steps have a variance of 4/12 DN^2, of which 1/12 is the detector's own
     coarse = fixed_camera(file, 2.0)
     assert coarse.pixels.read_noise_e**2 == pytest.approx(16.0 - GAIN**2 / 4)
+
+
+def test_a_psf_of_samples_is_held_by_its_covariance(tmp_path):
+    """A Gaussian that is wider across, in three samples a pixel; its file says nothing of shade."""
+    samples = sampled(gaussian(1.1, 0.8), 3, 6).astype(np.float32)
+    header = fits.Header({"OVERSAMP": 3})
+    fits.PrimaryHDU(samples, header).writeto(tmp_path / "psf.fits")
+    bench = tmp_path / "bench.toml"
+    bench.write_text(GIVEN + '[tracker.optics]\npsf = "psf.fits"\n')
+    held = fixed_camera(read_tracker_file(bench)[0], 1.0)
+    wanted = np.array([[1.1**2], [0.8**2], [0.0]])
+    np.testing.assert_allclose(held.psf.covariance, wanted, atol=0.05)
+    assert held.psf.size_px == (1280, 960)
+    assert held.light.vignetting_mag == (0.0, 0.0)
 
 
 def test_a_site_is_written_without_its_sky_whose_light_was_measured(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,15 +18,23 @@ from hilstar.instruments.simulate.budget import (
     NotDrawn,
     budget,
     budget_lines,
+    last_within,
+    magnitude_row,
+    not_drawn,
     out_of_gamut,
     red_shares,
+    zero_point_mag,
 )
+from hilstar.optics.camera import Camera, Lens
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.star_rates import bench_optics
 from hilstar.server.bench.star_size import StarSize
+from hilstar.sky.stars import Stars
 from hilstar.tracker.centroiders import FAMILY
+from hilstar.tracker.star_errors import StarErrors
 from tests.support.benches import SMALL_BENCH, bench_text
+from tests.support.stars import stars_at
 from tests.support.tables import csv_rows
 
 STAR = StarSize(1.0, 0.5, 1.5, 2.0, 1.25, 13.5, 4.5, None)
@@ -250,3 +259,68 @@ def test_a_budget_s_table_has_a_column_for_each_kind_and_its_chart_the_errors_of
     finding = texts.replace("\N{NO-BREAK SPACE}", " ")
     assert "10 bits, exact: from V = 1.2, where stars clip" in finding
     assert "within 0.05 mag over 4.5 magnitudes" in finding
+
+
+def test_a_budget_s_arcseconds_are_those_where_a_pixel_is_widest() -> None:
+    """A lens with 1000 px to a radian in the middle and more at its corners: 0.01 px are up to 2.06
+    arcsec.
+    """
+    lens = Lens(radial=(0.5, 0.0, 0.0))
+    monitor = Camera((800, 600), 1000.0, (399.5, 299.5), np.eye(3), lens)
+    off_px = np.array([[0.006, 0.0], [0.008, 0.0]])
+    by_kind = dict.fromkeys(FAMILY, 3 * off_px) | {"moment": off_px}
+    errors = StarErrors(np.array([0.3, -0.4]), by_kind)
+    row = magnitude_row(1.0, errors, "moment", 3.0, monitor)
+    assert row.centroid_max_arcsec == pytest.approx(206264.8 * 0.01 / 1000, rel=1e-5)
+    assert row.centroid_max_px == pytest.approx(0.01)
+    assert row.axis_rms_px == pytest.approx(dict.fromkeys(FAMILY, 0.015) | {"moment": 0.005})
+    assert row.centroid_rms_px == pytest.approx(0.01 / math.sqrt(2))
+    assert (row.flux_max_mag, row.flux_rms_mag) == (0.4, pytest.approx(math.sqrt(0.125)))
+    assert (row.v_mag, row.below_white_mag) == (4.0, 1.0)
+
+
+def test_a_budget_s_reach_ends_before_the_first_magnitude_beyond_the_limit() -> None:
+    none = dict.fromkeys(FAMILY)
+    rows = [
+        MagnitudeRow(1.0 + mag, mag, None, None, None, None, None, none)
+        for mag in (0.0, 0.5, 1.0, 1.5)
+    ]
+    for errors, within_mag in (
+        ([0.01, 0.02, 0.021, 0.001], 0.5),
+        ([0.01, 0.01, 0.01, 0.02], 1.5),
+        ([0.01, None, 0.01, 0.01], 0.0),
+        ([0.03, 0.01, 0.01, 0.01], None),
+        ([None, 0.01, 0.01, 0.01], None),
+    ):
+        assert last_within(rows, errors, 0.02) == within_mag
+
+
+def stars_of(electrons_per_s: list[float], v_mag: list[float], bv_mag: list[float]) -> Stars:
+    """Five stars with these figures, wherever they stand."""
+    stars = stars_at(np.eye(3)[[0, 1, 2, 0, 1]], np.ones(5))
+    return replace(
+        stars,
+        electrons_per_s=np.array(electrons_per_s),
+        v_mag=np.array(v_mag),
+        bv_mag=np.array(bv_mag),
+    )
+
+
+def test_stars_too_faint_to_be_drawn_have_their_share_of_all_light_but_a_body_s() -> None:
+    """Of 900, 70, 20 and 10 e-/s, the second driven twice and the fourth three times as bright."""
+    stars = stars_of([900.0, 70.0, 20.0, 10.0, 1e9], [0.0] * 5, [0.0] * 5)
+    drive = np.array([1.0, 2.0, 1.0, 3.0, 1.0])
+    missing = not_drawn(replace(stars, bodies=("moon",)), drive, 30.0)
+    assert (missing.stars, missing.flux_share) == (1, pytest.approx(0.02))
+    assert not_drawn(replace(stars, bodies=("moon",)), 1.0, 30.0).stars == 2
+
+
+def test_the_zero_point_is_that_of_stars_of_the_sun_s_colour() -> None:
+    """Of 1000 e-/s at V = 4 three are of B-V 0.56 to 0.74, and red ones are twice as bright."""
+    rates_e_per_s = [1000.0, 100.0, 10.0, 2000.0, 5.0]
+    v_mag = [4.0, 6.5, 9.0, 4.0, 4.0]
+    alike = stars_of(rates_e_per_s, v_mag, [0.56, 0.65, 0.74, 1.5, 0.5])
+    assert zero_point_mag(alike) == pytest.approx(11.5)
+    # none is as near as a tenth: the nearest
+    red = stars_of(rates_e_per_s, v_mag, [1.4, 1.5, 1.9, 1.5, 1.2])
+    assert zero_point_mag(red) == pytest.approx(4 + 2.5 * math.log10(5))

@@ -20,6 +20,7 @@ from hilstar.basics.rotation import (
     to_rotation_vector,
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
+from hilstar.cli.tracker import solver_of
 from hilstar.instruments.simulate import live_exposure
 from hilstar.instruments.simulate.answer_link import answer_packet, json_answer
 from hilstar.instruments.simulate.live_exposure import (
@@ -40,6 +41,7 @@ from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.tracker.centroids import Centroids
 from hilstar.tracker.identify import MIN_STARS, FoundStars, Identified
 from tests.support.benches import bench_text
+from tests.support.refusals import refusal
 
 PERIOD_NS = 100
 IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
@@ -157,6 +159,7 @@ def test_a_tracker_expects_where_its_last_two_attitudes_lead_and_nothing_after_f
     live.lost_in_space = lambda stars, dn: None
     try:
         start = np.array([0.5, 0.5, -0.5, 0.5])
+        assert live._expected(solved_at(0, start).exposed) is None
         for tenth in (0, 1):
             at_ns = tenth * NS_PER_S // 10
             live._answered(solved_at(at_ns, propagate(start, rate, tenth / 10)))
@@ -362,3 +365,39 @@ def test_a_packet_has_the_flags_of_its_mode_and_of_what_is_known():
         encode(answer_packet(Answer(0, b"", 5, valid=False, mode="too few stars", star_count=2), 4))
     )
     assert (none.flags, none.stars) == (protocol.ANSWER_TOO_FEW_STARS, 2)
+
+
+OWN_SOLVER = """
+answers = [[0.6, 0.0, -0.8, 0.0], "no star", "no star", "blind", None]
+
+def solve(image, tracker):
+    assert image.shape == (48, 64)
+    answer = answers.pop(0)
+    if isinstance(answer, str):
+        raise ValueError(answer)
+    return answer
+"""
+
+
+def test_a_solver_of_images_gives_its_attitudes_and_each_reason_of_a_failure_is_told_once(
+    live, capsys
+):
+    (live.file.folder / "own_solver.py").write_text(OWN_SOLVER)
+    solve = solver_of("python:own_solver:solve", live)
+    dn = np.zeros((48, 64), np.uint16)
+    found = [solve(None, dn) for _ in range(5)]
+    assert found[0].tolist() == [0.6, 0.0, -0.8, 0.0] and found[1:] == [None] * 4
+    assert capsys.readouterr().err.splitlines() == [
+        f"hilstar: the solver raised ValueError: {why}" for why in ("no star", "blind")
+    ]
+
+
+def test_without_a_solver_the_true_attitude_is_taken_and_where_none_is_installed_that_is_told(
+    live, capsys, monkeypatch
+):
+    assert solver_of("truth", live) is None and capsys.readouterr().err == ""
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    assert solver_of(None, live) is None
+    told = capsys.readouterr().err
+    assert "hilstar[solve] is not installed" in told and "--solver truth" in told
+    assert "--solver centroids: is a campaign's" in refusal(solver_of, "centroids", live)

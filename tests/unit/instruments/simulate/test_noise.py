@@ -4,6 +4,7 @@ simulated exposures.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 
@@ -229,6 +230,25 @@ def test_a_star_whose_pixels_all_clip_has_no_bound_and_one_that_clips_in_part_ha
     )
 
 
+def test_a_pixel_clips_by_its_dark_charge_and_its_star():
+    """Of a well of 1e4 e- 6000 e- of dark leave 4000."""
+    dark = replace(QUIET, full_well_e=1e4, dark_e_per_s=6000.0)
+    for star_e, clipped in ((0.95 * 4000, 0.0), (1.05 * 4000, 1.0)):
+        assert one(gaussian(0.02, dark, phases=1), star_e)["clipped_px"] == clipped
+
+
+@pytest.mark.parametrize("minimum_pixels", [1, 2, 3])
+def test_a_star_is_found_where_so_many_of_its_pixels_are_above_the_threshold(minimum_pixels):
+    """By all outcomes of four pixels, the mean over two places."""
+    above = np.array([[[0.9, 0.5, 0.2, 0.0], [0.3, 0.3, 0.8, 1.0]]])
+    shares = []
+    for place in above[0]:
+        outcomes = np.array(list(itertools.product((0, 1), repeat=4)))
+        chances = np.prod(np.where(outcomes, place, 1 - place), axis=1)
+        shares.append(chances[outcomes.sum(axis=1) >= minimum_pixels].sum())
+    assert noise.found_share(above, minimum_pixels) == pytest.approx([np.mean(shares)])
+
+
 TILE_PX, TILES = 40, 30
 SAMPLED = 5e-3  # the table of a sampled PSF is linear between its steps
 SHARE_ERROR = 4 * 0.5 / TILES  # of a share of TILES^2 stars, to four of its sigmas
@@ -263,6 +283,12 @@ def test_stars_between_rows_have_the_bounds_of_their_own():
     coarse, exact = (
         star.noise(one, np.full(len(one), 20.0), CentroidSettings()) for one in (grid, off)
     )
+    # half way by magnitude: a bound by its logarithm, a probability as it is
+    rows = np.zeros(2, noise.NOISE_DTYPE)
+    rows["star_e"], rows["detection"] = (1e4, 1e2), (1.0, 0.2)
+    rows["bound_x_px"], rows["bound_y_px"] = (0.01, 0.1), (0.02, 0.08)
+    middle = between(rows, np.array([1e3]))
+    np.testing.assert_allclose(middle[:, 0], [math.sqrt(0.001), 0.04, 0.6])
     x, _, seen = between(coarse, off)
     fine = exact["clipped_px"] == 0  # the bound steps by some per cent where a pixel begins to clip
     np.testing.assert_allclose(x[fine], exact["bound_x_px"][fine], rtol=2e-3)
@@ -575,6 +601,13 @@ def test_a_field_s_budget_is_of_its_own_stars_in_the_light_behind_each(tmp_path,
     )
     assert len(field) == len(listed)
     assert (np.diff(field["v_mag"]) >= 0).all()
+    # the same by all its stars, whatever attitude is asked for beside it
+    away_q = np.roll(ORION_Q, 1)
+    limits_arcsec = noise.attitude_limits_arcsec(file, np.array([away_q, ORION_Q]))
+    assert limits_arcsec[1] == pytest.approx(list(found.nea_arcsec["limit"].values()), rel=1e-6)
+    assert limits_arcsec[0] != pytest.approx(limits_arcsec[1], rel=0.01)
+    # rows end with the first whose stars are hardly found
+    assert found.rows[-1]["detection"] < noise.UNSEEN <= found.rows[-2]["detection"]
     # the magnitude of which half are found
     below = [row for row in found.rows if row["detection"] > 0.5]
     above = [row for row in found.rows if row["detection"] < 0.5]
@@ -606,6 +639,9 @@ def test_limits_by_magnitude_are_medians_of_fields_with_the_stars_up_to_each():
     for row, median in zip(rows, (9.0, 9.0, 9.0, 5.0), strict=True):
         for number, name in enumerate(noise.NEA_COLUMNS, start=1):
             assert row[name] == number * median
+    # of fields that have no attitude one row says so
+    (none,) = noise._nea_rows(fields[2:], curves[2:], 4.6)
+    assert (none["v_mag"], none["stars"], none["limit_about_arcsec"]) == (4.6, 0.0, np.inf)
 
 
 def row_of(v_mag: float, factor: float, **changes: float) -> dict[str, float]:

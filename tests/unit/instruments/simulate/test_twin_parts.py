@@ -22,6 +22,14 @@ from hilstar.optics.psf import GaussianPsf
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
+@pytest.mark.parametrize("count", [5, 21, 34, 200])
+def test_exposures_of_a_free_tracker_fill_a_refresh_period_evenly(count):
+    """As multiples of the golden section do: no gap is 1.9 times the mean one, none a third."""
+    phases = np.sort([twin.free_phase(number) for number in range(7, 7 + count)])
+    gaps = np.diff(phases, append=phases[0] + 1)
+    assert 0.4 / count < gaps.min() < gaps.max() < 1.9 / count
+
+
 @pytest.mark.parametrize("exposure_s", [0.1, 0.0999, 0.1001])
 def test_an_exposure_is_the_mean_of_its_own_frames(monkeypatch, exposure_s):
     """Three frames of 1/30 s from frame 7 on; frame n lights its first pixel with n e-/s."""

@@ -170,6 +170,12 @@ def test_codes_of_glasses_keep_their_digits(code, index_d, abbe):
     )
 
 
+@pytest.mark.parametrize("name", ["12345", "51.642", "516.64", "N517642", "5.17.642"])
+def test_a_name_of_too_few_digits_or_with_letters_is_no_code(name):
+    glass = read_codev(seq().replace(b"NBK7_SCHOTT", name.encode())).surfaces[0].glass
+    assert (glass.name, glass.index_d) == (name, None)
+
+
 def test_a_private_glass_is_refused_where_it_is_used():
     private = "PRV\nPWL 656.3 587.6 486.1\n'E48' 1.5284 1.5311 1.537\nEND"
     assert focal_length_mm(read_codev(seq(private))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)

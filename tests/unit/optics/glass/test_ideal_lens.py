@@ -14,6 +14,7 @@ import pytest
 from scipy.special import j1
 
 from hilstar.basics.arrays import FloatArray
+from hilstar.optics.glass import prescription
 from hilstar.optics.glass.prescription import Plate, traced
 
 FOCAL_MM, F_NUMBER, UM = 50.0, 4.0, 0.5
@@ -22,6 +23,8 @@ FIELD_TANGENT = 0.05
 PITCH_UM = 4.0
 # A circle that 96 cells count across: their edges' parts are known to an eighth of a cell.
 AIRY_OF_PEAK = 2e-3
+# of all light: sums of five samples a pixel against nine, 0.8 um apart; measured 3e-3
+FRINGES = 6e-3
 MOVED_PX = 1e-5  # slopes by differences of a ray's places; Newton's rounds end at rounding
 MOMENT = 0.01  # the circle's edge, as above, squared; and shares of four samples
 
@@ -100,6 +103,28 @@ def test_an_aplanat_s_psf_is_airys(crowding, cut):
     pattern = airy(wide, high, (np.arange(side) - side // 2) * step_mm)
     peak = np.pi * wide * high * (NA * step_mm / (UM * 1e-3)) ** 2
     assert image / peak == pytest.approx(pattern, abs=AIRY_OF_PEAK)
+
+
+def test_a_pixel_has_the_light_of_all_its_fringes():
+    """A sample of 4 um, where the pattern's own are 1 um apart, has the sum of finer ones."""
+    plate = Plate((9, 9), PITCH_UM, half_px=3)
+    whole, fine = (
+        traced(Aplanat(0.0), plate, per_px, 1e-6, "a closed form").glass for per_px in (1, 9)
+    )
+    light = [made.images[0, 0, 0] * (1 - made.outside[0, 0, 0]) for made in (whole, fine)]
+    by_pixel = np.pad(light[1], 4).reshape(7, 9, 7, 9).sum(axis=(1, 3))
+    assert light[0] == pytest.approx(by_pixel, abs=FRINGES)
+
+
+def test_rays_are_as_many_as_keep_the_next_image_of_the_star_off_its_stamp(monkeypatch):
+    """The sum of plane waves repeats: with six rays across the pupil after 12 um, at the edge of
+    this stamp.
+    """
+    monkeypatch.setattr(prescription, "MIN_RAYS", 6)
+    plate = Plate((9, 9), PITCH_UM, half_px=3)
+    glass = traced(Aplanat(0.0), plate, 2, 1e-6, "a closed form").glass
+    image = glass.images[0, 0, 0]
+    assert image[:, [0, -1]].max() < 0.01 * image.max()
 
 
 def test_an_aplanat_has_a_pinhole_s_camera_and_an_even_field():

@@ -4,7 +4,9 @@ it needs optiland, whose database is planted here.
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -12,13 +14,20 @@ from scipy.spatial.transform import Rotation
 
 from hilstar.optics.glass import optiland_lens
 from hilstar.optics.glass.codev_file import read_codev
-from hilstar.optics.glass.lens_data import Glass, LensPrescription
+from hilstar.optics.glass.lens_data import (
+    Aperture,
+    FieldPoint,
+    Glass,
+    LensPrescription,
+    LensSurface,
+)
 from hilstar.optics.glass.optiland_lens import (
     GlassFile,
     _euler_rad,
     _terms_beside_base,
     find_glass,
     glass_files,
+    optic_of,
 )
 from tests.support.lenses import seq
 from tests.support.refusals import refusal
@@ -146,3 +155,117 @@ def test_of_a_glass_of_several_makers_the_first_in_the_order_is_taken(monkeypatc
     assert (file.catalogue, notes) == ("hikari", ["surface 1: K7 is taken as hikari's"])
     monkeypatch.setattr(optiland_lens, "_database", lambda: makers[:1])
     assert find_glass(Glass("K7"), "surface 1")[0].catalogue == "lzos"
+
+
+# What hilstar asks of optiland: an Optic notes what is added to it, the rest are names to build on.
+OPTILAND = {
+    "__init__.py": "",
+    "optic.py": """
+class Part(list):
+    def add(self, **given): self.append(given)
+    def set_type(self, **given): self.append(given)
+
+class Optic:
+    def __init__(self): self.surfaces, self.fields, self.wavelengths = Part(), Part(), Part()
+    def set_aperture(self, **given): self.aperture = given
+""",
+    "materials/__init__.py": "",
+    "materials/base.py": "class BaseMaterial: pass",
+    "materials/material_file.py": "MaterialFile = str",
+    "physical_apertures/__init__.py": "",
+    "physical_apertures/base.py": "class BaseAperture: pass",
+    "database/__init__.py": "",
+    "database/catalog_nk.csv": """filename,min_wavelength,max_wavelength
+glass/schott/N-BK7.yml,0.3,2.5
+glass/schott/infrared/N-SF5.yml,0.4,2.4
+glass/misc/schott/B270.yml,0.35,2.0
+main/SiO2/Malitson.yml,0.21,6.7
+""",
+}
+
+
+def taken_out() -> dict[str, ModuleType]:
+    """The modules of optiland that were imported, which are no longer."""
+    names = [name for name in sys.modules if name.partition(".")[0] == "optiland"]
+    return {name: sys.modules.pop(name) for name in names}
+
+
+@pytest.fixture
+def planted_optiland(tmp_path, monkeypatch):
+    for name, text in OPTILAND.items():
+        path = tmp_path / "optiland" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(optiland_lens, "_database", lambda: tuple(optiland_lens._read_database()))
+    own = taken_out()
+    yield tmp_path / "optiland"
+    taken_out()
+    sys.modules.update(own)
+
+
+def test_the_database_s_glasses_and_materials_are_by_name_and_maker(planted_optiland):
+    """A maker's further glasses are its own; a form of a glass (in a deeper folder) is none."""
+    for glass, wanted in (
+        (Glass("B270", ("SCHOTT",)), ("b270", "schott", 0.35, 2.0, True)),
+        (Glass("SILICA"), ("sio2", "malitson", 0.21, 6.7, False)),
+    ):
+        file, notes = find_glass(glass, "surface 1")
+        limits_um = file.shortest_um, file.longest_um
+        assert (file.name, file.catalogue, *limits_um, file.is_glass) == wanted
+        assert notes == []
+    assert "N-SF5 is in no catalogue" in refusal(find_glass, Glass("N-SF5"), "surface 1")
+
+
+def test_optiland_is_given_each_surface_in_its_axes_the_pupil_fields_and_wavelengths(
+    planted_optiland,
+):
+    level = {"turn": np.eye(3), "origin_mm": np.zeros(3)}
+    angles_rad = [0.1, -0.2, 0.3]
+    tilted = {
+        "turn": Rotation.from_euler("xyz", angles_rad).as_matrix(),
+        "origin_mm": np.array([1.0, -2.0, 30.0]),
+    }
+    masks = (
+        Aperture("circle", (4.0, 4.0), True),
+        Aperture("rectangle", (1.0, 5.0), False, centre_mm=(3.0, 0.0)),
+    )
+    schott, own, air = Glass("NBK7", ("SCHOTT",)), Glass("own", index_d=1.6), Glass()
+    surfaces = (
+        LensSurface("1", 0.02, -0.5, (), schott, (), False, **level),
+        LensSurface("2", 0.0, 0.0, (0.0, 0.0, 0.0, 1e-6), own, masks, True, **level),
+        LensSurface("3", 0.0, 0.0, (1e-3, 0.0, 2e-6), Glass("MIRROR"), (), False, **tilted),
+        LensSurface("4", 0.0, 0.0, (), air, (), False, **level, paraxial_focal_mm=60.0),
+    )
+    fields = (FieldPoint(0.0, 1.0), FieldPoint(1.5, -2.0))
+    lens = LensPrescription(
+        surfaces, "f_number", 5.0, "real_image_height", fields, (0.6, 0.5, 0.7), 1
+    )
+    optic, notes = optic_of(lens)
+    space, first, second, mirror, thin = optic.surfaces
+    assert space == {"index": 0, "radius": np.inf, "thickness": np.inf}
+    here = dict.fromkeys(("x", "y", "z", "rx", "ry", "rz"), 0.0)
+    nbk7 = str(planted_optiland / "database/data-nk/glass/schott/N-BK7.yml")
+    shape = {"radius": 50.0, "conic": -0.5, "surface_type": "standard"}
+    assert first == {"index": 1, "material": nbk7, "is_stop": False, **here, **shape}
+    material, aperture = second.pop("material"), second.pop("aperture")
+    shape = {"surface_type": "even_asphere", "coefficients": [0.0, 1e-6], "conic": 0.0}
+    assert second == {"index": 2, "is_stop": True, **here, "radius": np.inf, **shape}
+    assert float(material._calculate_n(0.55)) == 1.6 and float(material._calculate_k(0.55)) == 0
+    assert aperture.contains([0, 3, 2, 4.1], [3.9, 0, 3, 0]).tolist() == [True, False, False, False]
+    assert aperture.extent == (-4.0, 4.0, -5.0, 5.0)
+    there = dict(zip(here, (1.0, -2.0, 30.0, *angles_rad), strict=True))
+    assert {name: mirror[name] for name in there} == pytest.approx(there)
+    told = [mirror[name] for name in ("index", "material", "surface_type", "coefficients")]
+    assert told == [3, "mirror", "odd_asphere", [1e-3, 0.0, 2e-6]]
+    shape = {"surface_type": "paraxial", "f": 60.0, "radius": np.inf}
+    assert thin == {"index": 4, "material": "air", "is_stop": False, **here, **shape}
+    assert optic.aperture == {"aperture_type": "imageFNO", "value": 5.0}
+    places = [{"x": 0.0, "y": 1.0}, {"x": 1.5, "y": -2.0}]
+    assert optic.fields == [{"field_type": "real_image_height"}, *places]
+    waves = zip((0.6, 0.5, 0.7), (False, True, False), strict=True)
+    assert optic.wavelengths == [{"value": um, "is_primary": main} for um, main in waves]
+    assert notes == ()
+    without = replace(lens, surfaces=tuple(replace(each, is_stop=False) for each in surfaces))
+    stops = [given["is_stop"] for given in optic_of(without)[0].surfaces[1:]]
+    assert stops == [True, False, False, False]

@@ -19,6 +19,7 @@ from hilstar.optics.glass.psf_file import (
     glass_of,
     pupil_places,
     read_glass,
+    samples_a_px,
     write_glass,
 )
 from hilstar.optics.psf import SampledPsf
@@ -209,3 +210,19 @@ def test_a_file_s_transmission_rises_from_wavelength_to_wavelength(tmp_path, gla
     write_glass(tmp_path / "psf.fits", replace(glass, transmission=curve))
     said = refusal(read_glass, tmp_path / "psf.fits")
     assert "TRANSMISSION has wavelengths that do not rise" in said
+
+
+@pytest.mark.parametrize(
+    ("pitch_um", "shortest_um", "f_number", "most", "wanted"),
+    [
+        (10.0, 0.5, 4.0, 32, 10),
+        (10.1, 0.5, 4.0, 32, 11),
+        (10.0, 0.5, 4.0, 8, 8),  # no more than there is time for
+        (10.0, 0.5, 40.0, 32, 4),  # as a spline wants them
+    ],
+)
+def test_half_a_fringe_of_the_pupil_s_edges_has_a_sample(
+    pitch_um, shortest_um, f_number, most, wanted
+):
+    """The finest fringes of a pupil are those of its ends, wavelength times F-number apart."""
+    assert samples_a_px(pitch_um, shortest_um, f_number, most) == wanted

@@ -104,6 +104,11 @@ def test_a_far_object_is_at_infinity(far):
     assert focal_length_mm(read_zemax(zmx(far=far))) == pytest.approx(FOCAL_MM, abs=TOLERANCE_MM)
 
 
+def test_the_air_of_which_catalogues_give_indices_may_be_stated():
+    for words in ("20 1 1", "20 1 0", "25 0.5 0"):  # 0: no index is adjusted
+        assert read_zemax(zmx("ENPD 20", f"ENVD {words}")).pupil == 20.0
+
+
 @pytest.mark.parametrize(
     ("lines", "kind", "pupil"),
     [
@@ -142,6 +147,21 @@ def test_one_field_on_the_axis_is_one_field():
 def test_fields_are_as_many_as_counted_and_listed_on_either_axis(count, x_deg, y_deg, wanted):
     text = zmx(f"FTYP 0 0 {count} 1", "ENPD 20", f"XFLN {x_deg}", f"YFLN {y_deg}")
     assert [(point.x, point.y) for point in read_zemax(text).fields] == wanted
+
+
+@pytest.mark.parametrize(
+    ("count", "wanted_um"),
+    [(2, (0.6, 0.5)), (3, (0.6, 0.5, 0.7)), (9, (0.6, 0.5, 0.7)), (0, (0.6, 0.5, 0.7))],
+)
+def test_wavelengths_are_as_many_as_counted_each_once(count, wanted_um):
+    """By the fourth number of FTYP, in both ways to list them; the third counts fields."""
+    waves = ("WAVM 1 0.6 1", "WAVM 2 0.5 1", "WAVM 3 0.7 1")
+    for lines in (waves, ("WAVL 0.6 0.5 0.7",)):
+        text = zmx("ENPD 20", f"FTYP 0 0 1 {count}", "PWAV 2", *lines)
+        if "WAVL" in lines[0]:
+            text = text.replace(b"WAVM 1 0.5875618 1\r\n", b"")
+        lens = read_zemax(text)
+        assert (lens.wavelengths_um, lens.primary) == (wanted_um, 1)
 
 
 @pytest.mark.parametrize(

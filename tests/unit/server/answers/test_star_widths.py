@@ -132,6 +132,14 @@ def test_a_figure_is_worse_beyond_both_errors():
     assert worse == [False, True]
 
 
+def test_a_curve_without_a_best_image_says_why():
+    curve = FocusCurve("answers")
+    assert curve.why_none() == "no answer came"
+    assert FocusCurve().why_none() == "no image came"
+    curve.add(FocusReading(1, 0.0, 0, None, "no star is wide enough"))
+    assert curve.best is None and curve.why_none() == "no star is wide enough"
+
+
 def test_a_curve_shows_the_newest_figures():
     rising = [1.0] * 10 + [float(k) for k in range(40)]
     assert sparkline(rising, 0.0) == sparkline(rising[10:], 0.0)

@@ -676,6 +676,7 @@ def test_round_is_timed_only_where_exact_may_be_late():
         method for method, _ in timed[1:]
     ] == ["exact", "round"]
     assert "[render] codes_ms = [4.57, 9.12]" in slow.where
+    assert measured_cost(frame_ms, cost(2.0, 3.0), 10.0).cheap_ms == 4.57  # in time, not surely
 
 
 def test_frames_are_timed_for_no_longer_than_asked(small_bench_file):

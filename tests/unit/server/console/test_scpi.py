@@ -117,6 +117,11 @@ def test_a_header_goes_on_from_the_one_before(line, wanted):
         ("SKY:ATT 1,0,0,1e-32001", -123),
         (f"SKY:ATT {'1' * 300},0,0,0", -124),
         (f"*ESE #H{'F' * 4000}", -124),
+        # at most 255 digits, and exponents to 32 000: what stands at these limits is only too large
+        (f"SKY:ATT 1,0,0,{'1' * 256}", -124),
+        (f"SKY:ATT {'1' * 255},0,0,1e32000", -222),
+        (f"*ESE #H{'F' * 256}", -124),
+        (f"*ESE #H{'F' * 255}", -222),
         ("*ESE 256", -222),
         ("*ESE 1 V", -138),
         ("*ESE #14abcd", -168),
@@ -143,6 +148,16 @@ def test_numbers_are_read_as_ieee_488_writes_them():
     assert [scpi.boolean(units(f"SKY:BLAN {word}")[0].parameters[0]) for word in ("on", "OFF", "0", "0.4", "0.6", "7")] == [
         True, False, False, False, True, True,
     ]  # fmt: skip
+    masks = [units(f"*ESE {text}")[0].parameters[0] for text in ("1.6", "1.4")]
+    assert [scpi.integer(mask, 255) for mask in masks] == [2, 1]
+
+
+def test_a_command_says_how_many_parameters_it_takes():
+    (unit,) = units("SKY:FAULT 'a','b','c'")
+    for limits, text in (((1, 2), "takes 2"), ((0,), "takes none"), ((4,), "takes 4")):
+        with pytest.raises(ScpiError, match=f"SKY:FAULt {text}"):
+            scpi.count(unit, *limits)
+    assert scpi.count(unit, 1, 3) == scpi.count(unit, 3) == unit.parameters
 
 
 def test_the_queue_of_errors_is_bounded_and_its_last_says_so():
@@ -169,8 +184,15 @@ def test_the_status_byte_sums_up_what_is_enabled():
         == scpi.QUESTIONABLE | scpi.MESSAGE_WAITS
     )
     assert (status.questionable.read(), status.questionable.read()) == (1 << 9, 0)
+    status.operation.see(4)
+    assert status.byte(False) & scpi.OPERATION == 0
+    status.operation.enable = 4
+    assert status.byte(False) & scpi.OPERATION
+    status.preset()
+    assert status.operation.enable == status.questionable.enable == 0
+    status.completes = True
     status.clear()
-    assert status.byte(False) == 0 and status.standard.enable == 16
+    assert status.byte(False) == 0 and status.standard.enable == 16 and not status.completes
 
 
 def test_a_condition_is_an_event_when_it_begins_alone():
@@ -183,7 +205,7 @@ def test_a_condition_is_an_event_when_it_begins_alone():
 @pytest.mark.parametrize("chunk", [1, 3, 10_000])
 def test_lines_are_the_same_however_they_are_cut(chunk):
     data = (
-        b"*IDN?\r\n\n"
+        b"\r*IDN?\r\n\n"
         + b"x" * (MAX_LINE_BYTES + 1)
         + b"\n*CLS\n"
         + b"y" * MAX_LINE_BYTES
@@ -192,7 +214,7 @@ def test_lines_are_the_same_however_they_are_cut(chunk):
     buffer, lines = LineBuffer(), []
     for at in range(0, len(data), chunk):
         lines += buffer.feed(data[at : at + chunk])
-    assert lines == ["*IDN?", "", None, "*CLS", "y" * MAX_LINE_BYTES]
+    assert lines == ["\r*IDN?", "", None, "*CLS", "y" * MAX_LINE_BYTES]
 
 
 def mutated(rng: np.random.Generator) -> bytes:
@@ -366,6 +388,11 @@ def test_a_control_character_closes_the_connection_wherever_it_stands(byte):
 )
 def test_a_mistyped_line_is_none_of_these(line):
     assert obeyed(line.encode("latin-1") + b"\r\n", []) == ([line], False)
+
+
+def test_two_lines_together_are_no_request():
+    lines = ["GET ", "/ ", "A ", "HTTP/1.1"]
+    assert obeyed("\n".join([*lines, ""]).encode(), []) == (lines, False)
 
 
 @pytest.mark.timing

@@ -51,7 +51,7 @@ def frames() -> FaultyFrames:
 
 def test_only_a_frame_after_another_is_dropped_or_frozen_and_each_is_counted(frames):
     bench: Any = SimpleNamespace(renderer=None)
-    drawn: Any = SimpleNamespace(sprites=None, clipped_hip=())
+    drawn: Any = SimpleNamespace(sprites=None, clipped_hip=(26311, "Moon"))
     assert (frames.dropped, frames.frozen, frames.has_dropped) == (0, 0, False)
     assert not frames.drops(on("drop"), 1)
     assert frames.frozen_frame(on("freeze"), bench) is None
@@ -60,7 +60,8 @@ def test_only_a_frame_after_another_is_dropped_or_frozen_and_each_is_counted(fra
     assert not frames.drops(None, 2)
     assert frames.drops(on("drop"), 2) and frames.drops(on("drop"), 3)
     assert frames.frozen_frame(on("drop"), bench) is None
-    assert frames.frozen_frame(on("freeze"), bench) is not None
+    stays = frames.frozen_frame(on("freeze"), bench)
+    assert stays is not None and stays.clipped_hip == drawn.clipped_hip
     assert (frames.dropped, frames.frozen, frames.has_dropped) == (2, 1, True)
     frames.shown(None, drawn, attitude_at(4), 4, stays=False)
     assert not frames.has_dropped

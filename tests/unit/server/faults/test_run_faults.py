@@ -14,6 +14,7 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.optics.layers.fault_kinds import Now
 from hilstar.server import faults
+from hilstar.server.bench.config.attitude import FaultSettings
 from hilstar.server.bench.scenario import parse_scenario
 from hilstar.server.faults import MAX_NAMES, ReplayedFaults, RunFaults, act, read_recording
 from hilstar.server.record.ledger_records import FaultRecord, FrameRecord
@@ -227,3 +228,13 @@ def test_a_message_starts_stops_or_asks_as_the_stream_s(message, calls):
     )
     act(schedule, msgspec.json.encode(message))
     assert asked == calls
+
+
+def test_a_run_listens_to_the_stream_of_its_bench_file_while_it_lasts(tmp_path, bench, scenario):
+    run = RunFaults(bench, scenario, Notices(), Kept())
+    with run.listening(FaultSettings(), tmp_path) as endpoint:
+        assert endpoint == ""
+    place = f"ipc://{tmp_path}/faults"
+    for _ in range(2):  # it is free again afterwards
+        with run.listening(FaultSettings(endpoint=place, bind=True), tmp_path) as endpoint:
+            assert endpoint == f"bound to {place}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import ipaddress
 import socket
 import struct
@@ -19,7 +20,7 @@ from hilstar.attitude.wire.endpoint import AllowedSenders
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.process.scheduling import HOST_CLOCK
-from hilstar.server.gige.camera import GigECamera, camera_address
+from hilstar.server.gige.camera import GigECamera, _broadcast_of, camera_address
 from hilstar.server.gige.registers import CameraIdentity, CameraSettings
 from tests.support.gige_client import (
     CONTROL,
@@ -270,6 +271,30 @@ def test_hostile_clients_leave_the_controller_its_images():
 @pytest.mark.parametrize("text", ["0.0.0.0", "224.0.0.1", "camera", "::1", "127.0.0.2:3956", ""])
 def test_an_address_that_is_none_is_refused_in_one_line(text):
     assert "--camera" in refusal(camera_address, text)
+
+
+def test_a_client_s_search_is_heard_on_the_broadcast_address_of_the_camera_s_interface(
+    monkeypatch,
+):
+    """By Linux's SIOCGIFADDR and SIOCGIFBRDADDR: a struct ifreq with a sockaddr_in (netdevice(7))."""
+    links = {b"lo": ("127.0.0.1", "0.0.0.0"), b"eth0": ("10.1.2.3", "10.1.3.255"), b"down": None}
+
+    def ioctl(file, number, request):
+        name = request[:16].rstrip(b"\0")
+        place = links[name]
+        if place is None:
+            raise OSError("no address")
+        text = {0x8915: place[0], 0x8919: place[1]}[number]
+        return request[:16] + struct.pack("=HH4s16x", 2, 0, socket.inet_aton(text))
+
+    monkeypatch.setattr(socket, "if_nameindex", lambda: [(1, "lo"), (2, "down"), (3, "eth0")])
+    monkeypatch.setattr(fcntl, "ioctl", ioctl)
+    for address, broadcast in (
+        ("127.0.0.2", "127.255.255.255"),
+        ("10.1.2.3", "10.1.3.255"),
+        ("10.9.9.9", "10.9.9.9"),
+    ):
+        assert _broadcast_of(ipaddress.IPv4Address(address)) == broadcast
 
 
 def test_a_second_camera_at_one_address_says_what_to_do():

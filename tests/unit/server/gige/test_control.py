@@ -11,7 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hilstar.basics.units import NS_PER_MS
-from hilstar.server.gige.control import ControlChannel, FeatureCommand, Released, Resend
+from hilstar.server.gige.control import (
+    ControlChannel,
+    ControlCounts,
+    FeatureCommand,
+    Released,
+    Resend,
+)
 from hilstar.server.gige.description import describe
 from hilstar.server.gige.features import ADDRESSES, FEATURES, PIXEL_FORMATS
 from hilstar.server.gige.registers import (
@@ -20,6 +26,7 @@ from hilstar.server.gige.registers import (
     CameraIdentity,
     CameraSettings,
     GvcpStatus,
+    RegisterError,
     Registers,
 )
 from tests.support.gige_client import (
@@ -110,8 +117,12 @@ def test_a_controller_that_was_silent_for_too_long_does_not_get_its_privilege_ba
     camera = channel()
     asker = Asker(camera)
     assert asker.write(PRIVILEGE, CONTROL) == GvcpStatus.SUCCESS
-    assert asker.write(STREAM_PORT, 5000) == GvcpStatus.SUCCESS
-    asker.now_ns = (asker.read(HEARTBEAT_MS) + 1) * NS_PER_MS
+    silent_ns = (asker.read(HEARTBEAT_MS) + 1) * NS_PER_MS
+    last = command(WRITE, write_of(STREAM_PORT, 5000), number=400)
+    assert camera.receive(last, CLIENT, 0)[:2] == b"\0\0"
+    # not even by its last command once more, whose answer might have been lost
+    assert camera.receive(last, CLIENT, silent_ns)[:2] == b"\x80\x06"
+    asker.now_ns = silent_ns
     assert asker.write(STREAM_PORT, 5000) == GvcpStatus.ACCESS_DENIED
     assert camera.destination is None
     assert camera.take_events() == [Released(silent=True)]
@@ -149,6 +160,55 @@ def test_images_go_to_the_controllers_own_address_alone():
     assert camera.destination is None  # no port yet
     client.write(STREAM_PORT, 5123)
     assert camera.destination == ("127.0.0.1", 5123)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"",
+        command(DISCOVER)[:7],
+        b"\x43" + command(DISCOVER)[1:],
+        command(DISCOVER, number=0),
+        command(DISCOVER) + bytes(4),
+        command(READ, bytes(8))[:-4],
+        command(READ, bytes(540)),  # the standard's 536 bytes, and a word
+    ],
+)
+def test_what_is_no_command_is_dropped_and_counted_and_has_no_answer(data):
+    camera = channel()
+    assert camera.receive(data, CLIENT, 0) is None
+    assert camera.counts == ControlCounts(dropped=1)
+
+
+def test_each_command_is_counted_and_says_what_it_did_or_why_not():
+    camera = channel()
+    client = Asker(camera)
+    names = (0x0048, PRIVILEGE, STREAM_PORT, STREAM_ADDRESS)
+    assert client.ask(WRITE, write_of(PRIVILEGE, 0xFF)) == (0, b"\0\0\0\1")
+    three = write_of(STREAM_PORT, 7) + write_of(STREAM_ADDRESS, HERE) + write_of(STREAM_PORT, 8)
+    assert client.ask(WRITE, three) == (0, b"\0\0\0\3")
+    # of the privilege's bits the camera keeps control and exclusive access
+    status, body = client.ask(READ, struct.pack(">4I", *names))
+    assert (status, body) == (0, b"hils" + struct.pack(">3I", 3, 8, HERE))
+    assert len(client.ask(READ, bytes(536))[1]) == 536
+    assert client.ask(0x0086, struct.pack(">I8s", NAME, b"bench 7")) == (0, b"\0\0\0\x08")
+    refused = [
+        (0x0086, struct.pack(">II", PRIVILEGE, 0), GvcpStatus.INVALID_ADDRESS),
+        (0x0086, struct.pack(">I", NAME), WRONG),
+        (READ_MEMORY, struct.pack(">IHH", DESCRIPTION_AT, 0, 540), WRONG),
+        (READ_MEMORY, struct.pack(">IH", DESCRIPTION_AT, 0), WRONG),
+        (READ, bytes(6), WRONG),
+        (READ, b"", WRONG),
+        (WRITE, bytes(4), WRONG),
+        (0x0077, b"", GvcpStatus.NOT_IMPLEMENTED),
+    ]
+    for kind, body, status in refused:
+        assert client.ask(kind, body) == (status, b"")
+    assert camera.counts == ControlCounts(5 + len(refused), len(refused))
+    assert camera.controller == CLIENT
+    # a command that wants no answer is obeyed all the same
+    quiet = command(WRITE, write_of(STREAM_PORT, 9), number=500, flags=0)
+    assert camera.receive(quiet, CLIENT, 0) is None and camera.destination == (CLIENT[0], 9)
 
 
 def test_a_trigger_whose_answer_was_lost_begins_one_exposure():
@@ -211,20 +271,33 @@ def test_a_value_that_the_camera_would_not_keep_is_refused(feature, value, statu
     assert client.write(ADDRESSES[feature], value) == status
 
 
-@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0.0, 61e6])
-def test_an_exposure_that_no_camera_makes_is_refused(value):
-    camera = channel()
-    client = Asker(camera)
+@pytest.mark.parametrize(
+    ("feature", "kept", "refused"),
+    [
+        ("ExposureTime", [10.0, 60e6], [float("nan"), float("inf"), -1.0, 0.0, 9.99, 60.1e6]),
+        # of an exposure of 50 ms
+        ("AcquisitionFrameRate", [0.01, 20.0], [0.0, 0.0099, 20.001, float("nan")]),
+        ("Gain", [0.0, 24.0], [-0.1, 24.1, float("nan")]),
+    ],
+)
+def test_a_number_is_kept_within_its_limits_and_refused_beyond(feature, kept, refused):
+    client = Asker(channel())
     client.write(PRIVILEGE, CONTROL)
-    (word,) = struct.unpack(">I", struct.pack(">f", value))
-    assert client.write(ADDRESSES["ExposureTime"], word) == GvcpStatus.INVALID_PARAMETER
-    assert camera.registers.settings.exposure_s == 0.05
+    before = client.read(ADDRESSES[feature])
+    for value in refused:
+        assert client.write(ADDRESSES[feature], _word(value)) == GvcpStatus.INVALID_PARAMETER
+        assert client.read(ADDRESSES[feature]) == before
+    for value in kept:
+        assert client.write(ADDRESSES[feature], _word(value)) == 0
+        assert client.read(ADDRESSES[feature]) == _word(value)
 
 
 def test_a_longer_exposure_lowers_the_rate_and_a_rate_beyond_it_is_refused():
     camera = channel()
     client = Asker(camera)
     client.write(PRIVILEGE, CONTROL)
+    assert client.write(ADDRESSES["ExposureTime"], _word(1000.0)) == 0
+    assert camera.registers.settings.rate_hz == 10.0  # a shorter one does not raise it
     assert client.write(ADDRESSES["ExposureTime"], _word(500_000.0)) == 0
     assert camera.registers.settings.rate_hz == pytest.approx(2.0)
     assert client.write(ADDRESSES["AcquisitionFrameRate"], _word(3.0)) != 0
@@ -298,6 +371,12 @@ def test_memory_beyond_the_description_is_no_memory():
         at = DESCRIPTION_AT + -(-size // 4) * 4 - 4
         status, _ = client.ask(READ_MEMORY, struct.pack(">IHH", at, 0, count))
         assert (status == GvcpStatus.SUCCESS) is is_there
+    # its last word is filled up with zeros
+    camera = CameraSettings(64, 48, 12, exposure_s=0.05, rate_hz=10.0)
+    registers = Registers(IDENTITY, camera, b"<xml>")
+    assert registers.read(DESCRIPTION_AT, 8) == b"<xml>\0\0\0"
+    with pytest.raises(RegisterError):
+        registers.read(DESCRIPTION_AT + 8, 4)
 
 
 def _description(client: Asker) -> str:
@@ -455,7 +534,7 @@ def test_a_packed_image_of_an_odd_count_ends_in_a_whole_triple():
 )
 def test_a_detector_s_own_format_is_the_first(bits, formats):
     camera = CameraSettings(64, 48, bits, exposure_s=0.05, rate_hz=10.0)
-    assert sorted(camera.pixel_formats()) == sorted(formats)
+    assert camera.pixel_formats() == formats
     assert PIXEL_FORMATS[camera.pixel_format].bits == bits
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.server.gige.features import PIXEL_FORMATS
 from hilstar.server.gige.registers import CameraSettings
-from hilstar.server.gige.stream import HEADERS_BYTES, LAST_BLOCK, image_block, next_block, packed
+from hilstar.server.gige.stream import HEADERS_BYTES, image_block, next_block, packed
 
 RNG = np.random.default_rng(5)
 
@@ -99,4 +99,4 @@ def test_an_image_that_fills_its_packets_has_no_empty_one_after():
 
 
 def test_blocks_are_numbered_from_1_again_after_the_last():
-    assert next_block(0) == 1 and next_block(LAST_BLOCK) == 1
+    assert [next_block(number) for number in (0, 1, 0xFFFE, 0xFFFF)] == [1, 2, 0xFFFF, 1]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.sky.bodies.disc import Air, Disc
+from hilstar.sky.bodies.shapes import lunar_share
 from tests.support.ray_traced.bodies import Body, lambert, lunar_lambert, traced
 from tests.support.skies import moving_sky
 
@@ -143,6 +144,8 @@ def test_the_moon_s_law_is_of_its_phase_and_a_planet_s_is_lambert_s():
     mcewen = 1 - 0.019 * g + 2.42e-4 * g**2 - 1.46e-6 * g**3
     assert 0.1 < mcewen < 0.9
     assert moon.lunar_share == pytest.approx(mcewen, abs=ABERRATION)
+    # beyond the angles to which it was fitted it is no less than nothing
+    assert [lunar_share(phase_deg) for phase_deg in (0.0, 120.0, 175.0)] == [1.0, 0.0, 0.0]
     assert {discs[name].law for name in discs if name not in ("Sun", "Moon")} == {"lambert"}
 
 

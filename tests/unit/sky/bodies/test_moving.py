@@ -10,7 +10,8 @@ import pytest
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.units import KM_PER_AU
 from hilstar.sky.bodies.kernel import Kernel, Viewpoint, apparent_stars
-from hilstar.sky.bodies.orbit import TleOrbit
+from hilstar.sky.bodies.moving import BodyLight, MovingSky
+from hilstar.sky.bodies.orbit import Geocentre, TleOrbit
 from hilstar.sky.stars import Stars
 from tests.support.refusals import refusal
 from tests.support.skies import ALL_BODIES, STATION_TLE, STATION_UTC, moving_sky, utc_ns
@@ -54,6 +55,21 @@ def test_at_any_time_of_a_day_bodies_are_where_an_ephemeris_of_that_moment_has_t
         assert seen_arcsec(seen, then.sight(0).directions).max() < limit_arcsec
         fresh = then.among(stars_at(np.eye(3), np.ones(3)))
         assert np.abs(stars.v_mag - fresh.v_mag)[-len(ALL_BODIES) :].max() < MAGNITUDE_MAG
+
+
+@pytest.mark.parametrize(("unix", "leap_s"), [(True, 0), (False, 1)])
+def test_past_a_leap_second_a_unix_time_is_that_of_the_date(unix, leap_s):
+    """Two days from the eve of 2017, whose last minute had 61 s: in days of 86400 s they end with
+    the second day, counted in seconds one before. The Moon moves by half an arcsecond in it.
+    """
+    eve = utc_ns("2016-12-31T00:00:00Z")
+    after_ns = 48 * HOUR_NS
+    ones = np.ones(1)
+    moon = BodyLight(("Moon",), ones, ones)
+    moving = MovingSky(Kernel(), Geocentre(), eve, moon, unix=unix)
+    then = moving_sky(eve + after_ns - leap_s * 10**9, ("Moon",))
+    off = moving.sight(after_ns).seen_km[1] - then.sight(0).seen_km[1]
+    assert np.linalg.norm(off) < 0.1
 
 
 def test_a_parallax_moves_a_star_away_from_where_the_observer_went_and_none_or_less_does_not():
@@ -176,3 +192,19 @@ def test_the_discs_are_those_of_bodies_wider_than_asked(share, is_wider):
     width_rad = moving.diameters_arcsec(0)["Moon"] * ARCSEC
     discs = moving.discs(np.array([0.0, 0.0, 1.0]), np.pi, share * width_rad, 0)
     assert [disc.name for disc in discs] == ["Moon"] * is_wider
+
+
+def test_discs_have_the_bodies_own_shapes_and_come_nearest_first():
+    """Radii at the equator and the poles by the IAU's report (Archinal et al. 2018), km."""
+    moving, _ = sky_of(("Saturn", "Moon", "Sun", "Jupiter"))
+    discs = moving.discs(np.array([0.0, 0.0, 1.0]), np.pi)
+    shapes = [(disc.name, disc.equator_km, disc.polar_km) for disc in discs]
+    assert shapes == [
+        ("Moon", 1737.4, 1737.4),
+        ("Sun", 695_700.0, 695_700.0),
+        ("Jupiter", 71_492.0, 66_854.0),
+        ("Saturn", 60_268.0, 54_364.0),
+    ]
+    distances_km = moving.distances_km(0)[[1, 2, 3, 0]]
+    assert [disc.distance_km for disc in discs] == pytest.approx(distances_km.tolist(), rel=1e-12)
+    assert [disc.lunar_share < 1 for disc in discs] == [True, False, False, False]

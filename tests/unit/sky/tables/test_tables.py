@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from astropy.table import MaskedColumn, Table
 
-from hilstar.sky.catalog import load_catalog
+from hilstar.sky.catalog import load_catalog, plain_catalog
 from hilstar.sky.facts import errors_of
 from hilstar.sky.star_table import TableChoice, choose_catalog, table_facts
 from hilstar.sky.table_reader import from_gaia
@@ -202,6 +202,8 @@ def test_repeated_and_impossible_rows_are_counted(tmp_path, caplog):
     (tmp_path / "t.csv").write_text("ra,dec,vmag,b-v\n" + "\n".join(rows) + "\n")
     catalog = read_stars(tmp_path / "t.csv")
     assert sorted(catalog.ra_deg.tolist()) == [1.0, 340.0]
+    # of two alike the first
+    assert {catalog.name(0), catalog.name(1)} == {"t row 4", "t row 8"}
     counts = (
         "1 without a place, 3 without a magnitude and a colour, 1 beyond what a star has, 1"
         " repeated"
@@ -252,6 +254,9 @@ REFUSED = {
     HEAD + "1,2,3,0.1\n1,2,3,4,5\n": "cannot be read",
     "ra,dec,vmag,b-v,pmra,pmdec\n1,2,3,0.1,5,5\n": "write [sky] catalogue_epoch_jyear",
     "ra,dec,vmag,b-v,pmra,pmdec,ref_epoch\n1,2,3,0.1,5,5,1\n": "column ref_epoch is no Julian year",
+    "ra,dec,vmag,b-v,ref_epoch\n1,2,3,0.1,2000\n3,4,5,0.1,2448349.0625\n": (
+        "column ref_epoch is no Julian year; write [sky] catalogue_epoch_jyear, such as 2000.0"
+    ),
     "source_id,ra,dec,vmag,b-v\n" + "9" * 30 + ",1,2,3,0.1\n": (
         "column source_id is no column of numbers"
     ),
@@ -359,6 +364,68 @@ def test_a_table_s_own_errors_stand_in_the_place_of_hipparcos(tmp_path):
     assert table_facts(TableChoice(), stars, before) is before
 
 
+def test_beside_hipparcos_a_star_of_hipparcos_keeps_its_errors_whatever_the_numbers(tmp_path):
+    """HIP 5 and Gaia DR3 5 are two stars."""
+    path = tmp_path / "stars.ecsv"
+    table = gaia_table()
+    table["ra_error"] = np.array([0.1, 0.2, 0.3, 0.4, 0.5]) * u.mas
+    table.write(path)
+    row = table["source_id"].tolist().index(5)
+    zero = np.zeros(2)
+    columns = {"v_mag": zero, "ra_deg": zero, "dec_deg": zero}
+    columns |= {"hip": np.array([5, 0], dtype=np.int32), "identifier": np.array([5, 5])}
+    stars = plain_catalog("Gaia DR3", 2, columns)
+    before = errors_of(stars)
+    facts = table_facts(TableChoice(path, with_hipparcos=True), stars, before)
+    assert facts["sigma_ra_mas"].tolist() == [before["sigma_ra_mas"][0], 0.1 * (row + 1)]
+    assert 0.1 < before["sigma_ra_mas"][0] < 2.0
+    alone = table_facts(TableChoice(path), stars, before)
+    assert alone["sigma_ra_mas"].tolist() == [0.1 * (row + 1)] * 2
+
+
+@pytest.mark.parametrize("name", ["t.vot", "t.fits"])
+def test_without_a_unit_a_column_s_own_name_says_it_in_every_format(tmp_path, name):
+    table = Table({"ra_hours": [1.0, 12.5], "dec_rad": [0.5, -1.0]})
+    table["vmag"], table["b-v"] = [4.0, 5.0], [0.5, 0.6]
+    table.write(tmp_path / name, **FORMATS[name])
+    catalog = read_stars(tmp_path / name)
+    assert sorted(catalog.ra_deg.tolist()) == pytest.approx([15.0, 187.5])
+    assert sorted(catalog.dec_deg.tolist()) == pytest.approx(np.degrees([-1.0, 0.5]))
+
+
+def test_a_table_beside_hipparcos_says_of_its_own_rows_alone(tmp_path):
+    """Row 2 is not HIP 2, and a star of the table keeps its own figures where it has a HIP number,
+    too. A blank MK type is unknown, whatever stands below the mask.
+    """
+    table = Table(
+        {
+            "hip": [0, 0, 500_000],
+            "ra_deg": [10.0, 20.0, 30.0],
+            "dec_deg": [-50.0, -60.0, -70.0],
+            "v_mag": [11.5, 12.0, 12.5],
+            "bv_mag": [0.1, 0.2, 0.3],
+            "sigma_v_mag": [0.01, 0.02, 0.03],
+            "sptype": MaskedColumn(["B5V", "G2V", "M0"], mask=[0, 1, 0]),
+        }
+    )
+    path = tmp_path / "a_name_of_more_than_sixteen.ecsv"
+    table.write(path)
+    choice = TableChoice(path, with_hipparcos=True, epoch_jyear=2000.0)
+    stars = choose_catalog(choice)
+    stars = stars.taken(np.flatnonzero((stars.v_mag > 11.4) | (stars.hip == 2)))
+    own = {stars.name(row): row for row in range(len(stars))}
+    of_table = [own["a_name_of_more_t row 1"], own["a_name_of_more_t row 2"], own["HIP 500000"]]
+    of_hipparcos = np.setdiff1d(np.arange(len(stars)), of_table)
+    before = errors_of(stars)
+    facts = table_facts(choice, stars, before)
+    for name in before:
+        np.testing.assert_array_equal(facts[name][of_hipparcos], before[name][of_hipparcos], name)
+    assert facts["sigma_measured_mag"][of_table].tolist() == [0.01, 0.02, 0.03]
+    assert facts["spectral_type"][of_table].tolist() == [b"B5V", b"", b"M0"]
+    assert facts["spectral_type_source"][of_table].tolist() == [b"U"] * 3
+    assert facts["v_source"][of_table].tolist() == [b"U"] * 3
+
+
 def test_a_star_without_a_colour_has_both_its_magnitudes_from_the_next_columns(tmp_path):
     """V alone gives no spectrum: Gaia's magnitudes then give V and colour together, as for a star
     that has no V at all. A star with V and B-V keeps them, whatever Gaia says.
@@ -368,7 +435,10 @@ def test_a_star_without_a_colour_has_both_its_magnitudes_from_the_next_columns(t
     (tmp_path / "both.csv").write_text(head + "\n".join(rows) + "\n")
     stars = read_stars(tmp_path / "both.csv")
     order = np.argsort(stars.ra_deg)
-    v_mag, bv_mag = stars.v_mag[order], stars.bv_mag[order]
+    v_mag, bv_mag, vi_mag = stars.v_mag[order], stars.bv_mag[order], stars.vi_mag[order]
+    assert np.isnan(vi_mag[0])
+    _, wanted_vi_mag = from_gaia(np.array([7.0]), np.array([1.1]))
+    assert vi_mag[1:] == pytest.approx(np.full(3, wanted_vi_mag))
     assert (v_mag[0], bv_mag[0]) == pytest.approx((4.0, 0.3))
     assert v_mag[1] != pytest.approx(4.0, abs=0.5)
     assert v_mag[1:] == pytest.approx(np.full(3, v_mag[2]))

@@ -224,6 +224,14 @@ def test_motions_too_small_for_mas_are_refused_without_a_unit(read, per_mas):
         read(text, epoch_jyear=2000.0)
 
 
+@pytest.mark.parametrize("moving", [[1.0, 2.0, 3.0], [1e-3, 2e-3]], ids=["in mas", "too few"])
+def test_stars_that_stand_still_say_nothing_of_a_motion_s_unit(read, moving):
+    motions = [*moving, *[0.0] * (len(RA) - len(moving))]
+    text = lines(["ra,dec,pmra,pmdec,vmag,b-v"], RA, DEC, motions, motions, V, BV)
+    catalog, order = read(text, epoch_jyear=2000.0)
+    assert catalog.pm_ra_cosdec_mas_yr[order].tolist() == motions
+
+
 GAIA = "ref_epoch,ra,dec,phot_g_mean_mag,bp_rp"
 IDENTIFIERS = {
     "rounded": ["4.000000000e+18"] * 6,
@@ -251,9 +259,16 @@ def test_a_hip_number_of_several_stars_stays_with_the_brightest_and_that_is_said
         catalog, _ = read(text)
         assert sorted(catalog.hip.tolist()) == [0, 0, 0, 0, 30438, 32349]
         assert "2 HIP numbers are of several stars each (HIP 32349 of 3)" in caplog.text
-    caplog.clear()
-    read(lines(["hip,ra_deg,dec_deg,v_mag,bv_mag"], range(1, 7), RA, DEC, V, BV), name="other.csv")
-    assert "of several stars" not in caplog.text
+    # a row that is no star, for it has no colour, takes part in nothing
+    for name, numbers, words in (
+        ("other.csv", [1, 2, 3, 4, 5, 5], ""),
+        ("one.csv", [7, 7, 3, 4, 5, 5], "1 HIP number is of several stars each (HIP 7 of 2)"),
+    ):
+        caplog.clear()
+        colours = [*BV[:5], ""]
+        read(lines(["hip,ra_deg,dec_deg,v_mag,bv_mag"], numbers, RA, DEC, V, colours), name=name)
+        assert ("of several stars" in caplog.text) == bool(words)
+        assert words in caplog.text
 
 
 def test_float_identifiers_in_fits_are_not_used_where_they_cannot_hold_them(read, tmp_path, caplog):
@@ -300,8 +315,8 @@ def test_a_release_is_the_second_where_every_epoch_is(read, other_jyear, release
 
 
 def test_right_ascensions_west_of_0_are_turned(read):
-    catalog, order = read(lines(["ra_deg,dec_deg,vmag,b-v"], [-80.0, -169.5, *RA[2:]], DEC, V, BV))
-    assert catalog.ra_deg[order].tolist() == [280.0, 190.5, *RA[2:]]
+    catalog, order = read(lines(["ra_deg,dec_deg,vmag,b-v"], [-80.0, -180.0, *RA[2:]], DEC, V, BV))
+    assert catalog.ra_deg[order].tolist() == [280.0, 180.0, *RA[2:]]
 
 
 def test_a_table_is_as_long_as_its_pieces_together(read, monkeypatch):
@@ -325,7 +340,11 @@ def test_a_column_s_unit_is_the_one_that_it_states(tmp_path, role, unit, by):
 def test_a_colour_that_few_stars_have_gives_that_of_the_reddest_that_twenty_have():
     stars = load_catalog()
     bins = np.round(stars.vi_mag / 0.05)
-    full = max(middle for middle in np.unique(bins[bins > 0]) if (bins == middle).sum() >= 20)
+    middles, counts = np.unique(bins[np.isfinite(bins)], return_counts=True)
+    for middle in middles[counts == 20]:
+        wanted = np.median(stars.bv_mag[bins == middle])
+        assert table_reader.bv_from_vi(middle * 0.05) == pytest.approx(wanted, abs=1e-6)
+    full = max(middles[counts >= 20])
     reddest = np.median(stars.bv_mag[bins == full])
     most = np.nanmax(stars.vi_mag)
     assert most > full * 0.05 + 1.0

@@ -22,6 +22,7 @@ from hilstar.attitude.wire.nasa42 import (
     MAX_MESSAGE_BYTES,
     MessageReader,
     MessageSplitter,
+    Nasa42Link,
     Nasa42Lockstep,
     spacecraft_number,
     tcp_road,
@@ -215,6 +216,29 @@ def test_in_lockstep_each_message_is_acknowledged_once_its_own_frame_is_shown():
             assert arrivals[-1].event.sequence == number
             link.answer(Status(0, 0, 0, 0, 0, 0, 0), 0, None)
             assert simulator.recv(64) == b"Ack\n"
+
+
+def test_a_free_stream_acknowledges_each_message_of_a_chunk_and_none_that_has_no_end():
+    with (
+        Nasa42Link("tcp://127.0.0.1:*", MessageReader(0, Mounting()), bind=True) as link,
+        closing(socket.socket()) as simulator,
+    ):
+        place = parse_endpoint(link.endpoint).address
+        simulator.connect(("127.0.0.1", int(place.rpartition(":")[2])))
+        simulator.settimeout(PATIENCE_S)
+        begun, ended = GOOD[:40].encode(), GOOD[40:].encode()
+        arrivals = []
+
+        def come(count: int) -> bool:
+            arrivals.extend(link.receive(10))
+            return len(arrivals) == count
+
+        simulator.sendall(GOOD.encode() * 3 + begun)
+        wait_for(lambda: come(3), "three messages")
+        assert simulator.recv(64) == b"Ack\n" * 3
+        simulator.sendall(ended + GOOD.encode())
+        wait_for(lambda: come(5), "two more")
+        assert simulator.recv(64) == b"Ack\n" * 2
 
 
 def test_a_message_without_an_end_costs_its_bound_and_no_more():

@@ -184,9 +184,10 @@ def as_xml(fields):
 
 
 def as_kvn(fields):
-    return "CCSDS_OMM_VERS = 2.0\n" + "".join(
-        f"{key} = {value}\n" for key, value in (META | fields).items()
-    )
+    """With the units that a KVN may state behind its figures."""
+    units = {"MEAN_MOTION": " [rev/day]", "INCLINATION": " [deg]", "BSTAR": " [1/ER]"}
+    lines = [f"{key} = {value}{units.get(key, '')}" for key, value in (META | fields).items()]
+    return "\n".join(["CCSDS_OMM_VERS = 2.0", "COMMENT a set = of elements", *lines, ""])
 
 
 FORMS = [json_omm, as_text_json, as_csv, as_xml, as_kvn]
@@ -221,6 +222,10 @@ def test_an_omm_is_the_satellite_of_its_two_lines(form):
         ({"EPOCH": "2008-09-31T00:00:00"}, "element set 1: .*day"),
         ({"EPOCH": ""}, "EPOCH is missing"),
         ({"NORAD_CAT_ID": "-7"}, "NORAD_CAT_ID is -7; write a catalogue number"),
+        (
+            {"NORAD_CAT_ID": 1_000_000_000},
+            "NORAD_CAT_ID is 1000000000; write a catalogue number, such as 25544",
+        ),
     ],
 )
 def test_an_element_that_sgp4_would_take_otherwise_is_refused_by_name(form, change, said):
@@ -261,6 +266,12 @@ def test_what_writers_leave_out_and_numbers_of_nine_digits_are_read():
 def test_what_is_no_omm_is_refused_in_one_line(text):
     with pytest.raises(InputError, match=r"^omm: (?!.*\n)"):
         read_satellites(text, "omm", UTC_NS)
+
+
+def test_a_header_in_small_letters_is_told_what_it_lacks():
+    header, rows = as_csv(FIELDS).split("\n", 1)
+    with pytest.raises(InputError, match="omm: element set 1: EPOCH is missing"):
+        read_satellites(f"{header.lower()}\n{rows}", "omm", UTC_NS)
 
 
 def test_an_orbit_is_one_element_set():

@@ -112,11 +112,20 @@ def test_whichever_way_time_goes_a_fixed_observer_misses_none_along_an_axis(step
     assert found > 5
 
 
-def test_after_a_look_for_bright_ones_a_look_for_faint_ones_finds_them(rng):
+@pytest.mark.parametrize(
+    ("fewer", "more"),
+    [
+        ({"faintest_e_per_s": 1e5}, {"faintest_e_per_s": 0.0}),
+        ({"half_s": 0.1}, {"half_s": 200.0}),
+        ({"radius_rad": 0.3}, {"radius_rad": 1.2}),
+    ],
+    ids=["bright and faint", "soon and late", "near and far"],
+)
+def test_after_a_look_for_few_a_look_for_more_finds_them(rng, fewer, more):
     """As of a frame after an exposure, or the other way round."""
     text = some_orbits(rng, 60)
     sky, cone = satellite_sky(text, Geocentre()), Cone(NORTH, 1.0, 0.1)
-    (few, many) = (replace(cone, faintest_e_per_s=limit) for limit in (1e5, 0.0))
+    few, many = replace(cone, **fewer), replace(cone, **more)
     found = []
     for one in (few, many, few, many):
         seen = sky.passing(one, 0)

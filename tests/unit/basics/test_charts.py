@@ -55,6 +55,7 @@ def test_colours_stand_out_on_both_pages(paper):
         ((0.0009, 0.7), [0.001, 0.003, 0.01, 0.03, 0.1, 0.3]),
         ((0.026, 0.14), [0.03, 0.04, 0.05, 0.07, 0.1]),
         ((1e-13, 10), [1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1]),
+        ((1e-22, 10), [1e-21, 1e-18, 1e-15, 1e-12, 1e-9, 1e-6, 1e-3, 1]),
     ],
 )
 def test_ticks_are_round_and_names_at_the_side_keep_apart(limits, ticks):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -13,6 +14,19 @@ from matplotlib.figure import Figure
 from hilstar.basics import charts
 from tests.support.figures import two_lines
 from tests.support.pictures import assert_drawn
+
+
+@dataclass(frozen=True)
+class Record:
+    """A row of a table."""
+
+    name: str
+    error_px: float
+
+
+def test_a_table_of_records_has_a_column_a_field_and_a_row_a_record(tmp_path):
+    charts.write_records(tmp_path / "t.csv", [Record("a, b", 0.5), Record("c", 1e-9)])
+    assert (tmp_path / "t.csv").read_text() == 'name,error_px\n"a, b",0.5\nc,1e-09\n'
 
 
 def test_a_chart_is_written_for_light_and_dark_pages(tmp_path):

@@ -278,6 +278,7 @@ def test_a_message_that_comes_byte_by_byte_is_looked_through_once(monkeypatch):
         ("tcp://*:*", True, r"tcp://0\.0\.0\.0:\d+"),
         ("tcp://127.0.0.1:*", True, r"tcp://127\.0\.0\.1:\d+"),
         ("tcp://[::1]:10001", False, r"tcp://\[::1\]:10001"),
+        ("tcp://[::1]:*", True, r"tcp://\[::1\]:\d+"),
         ("tcp://localhost:10001", False, "tcp://localhost:10001"),
     ],
 )

@@ -24,6 +24,7 @@ from hilstar.basics.rotation import (
 )
 from hilstar.basics.units import ARCSEC_PER_RAD, MAD_TO_SIGMA
 from hilstar.display.geometry import load_notes, monitor_camera
+from hilstar.display.identity import MonitorIdentity
 from hilstar.instruments.calibrate.alignment import (
     AxesArcsec,
     Residual,
@@ -420,8 +421,16 @@ def test_an_alignment_s_figures_are_alike_in_lines_summary_and_file(tmp_path, rn
     assert lines
     file = SimpleNamespace(config=SimpleNamespace(collimator=SimpleNamespace(geometry=None)))
     path = tmp_path / "geometry.toml"
-    write_alignment(path, found, file)
+    first, second = (MonitorIdentity(maker="ACM", serial=serial) for serial in ("1", "2"))
+    write_alignment(path, found, file, first)
     notes = load_notes(path)
+    assert notes.identity == first
+    # a later alignment stands before the monitor that it sees, or before the file's own
+    collimator = SimpleNamespace(geometry=path.name)
+    filed = SimpleNamespace(config=SimpleNamespace(collimator=collimator), folder=tmp_path)
+    for identity, wanted in ((second, second), (None, first)):
+        write_alignment(tmp_path / "again.toml", found, filed, identity)
+        assert load_notes(tmp_path / "again.toml").identity == wanted
     for name, sigma in zip("xyz", summary["sigma_arcsec"], strict=True):
         assert notes.sigma[f"rotation_{name}_arcsec"] == pytest.approx(sigma, rel=1e-5)
     assert notes.made.rotation_arcsec == pytest.approx((x, y, z), rel=1e-6)

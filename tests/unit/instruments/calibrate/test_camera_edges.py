@@ -102,7 +102,7 @@ def test_exposures_stand_on_the_hosts_clock_as_early_as_their_bytes_allow(rng):
 def test_the_square_is_the_largest_patch_that_blinks(rng):
     images = rng.integers(18, 23, (12, 48, 64)).astype(np.uint8)
     images[::2, 30:42, 8:20] += 80
-    images[1::3, 5, 60] += 200  # a pixel that flickers, by more than twice as much
+    images[1::3, 5, 58:61] += 200  # pixels that flicker, by more than twice as much
     square = find_square(film_of(images, np.arange(12), np.arange(12)))
     assert square.rows == (30, 42)
     assert square.pixels.shape == (12, 64)

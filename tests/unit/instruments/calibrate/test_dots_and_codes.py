@@ -17,6 +17,7 @@ import pytest
 from PIL import Image
 
 from hilstar.basics.errors import InputError
+from hilstar.basics.rotation import to_matrix
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.calibrate.geometric.dots import (
     DOT_PX,
@@ -49,6 +50,7 @@ from hilstar.instruments.calibrate.geometric.match import (
 )
 from hilstar.instruments.calibrate.geometric.observed import (
     Observed,
+    dot_centroids,
     numbered,
     read_image,
     read_observed,
@@ -88,10 +90,10 @@ def test_a_dot_is_drawn_about_its_place_in_its_frames():
 
 
 def test_two_plans_are_one_after_the_other():
-    first = DotPlan(np.array([1.0]), np.array([2.0]), np.array([[True, False]]))
-    second = DotPlan(np.array([3.0, 1.0]), np.array([4.0, 2.0]), np.array([[False], [True]]))
+    first = DotPlan(np.array([5.0]), np.array([2.0]), np.array([[True, False]]))
+    second = DotPlan(np.array([3.0, 5.0]), np.array([4.0, 2.0]), np.array([[False], [True]]))
     both = joined(first, second)
-    assert both.x_px.tolist() == [1.0, 3.0, 1.0]
+    assert both.x_px.tolist() == [5.0, 3.0, 5.0]
     assert both.y_px.tolist() == [2.0, 4.0, 2.0]
     assert both.lit.tolist() == [[True, False, False], [False, False, False], [False, False, True]]
     # the third stands where the first does
@@ -186,8 +188,9 @@ def test_dots_over_what_is_seen_are_apart_and_reach_its_edges(rng):
     assert u.min() < 30 and u.max() > 369 and v.min() < 30 and v.max() > 269
     beside = plan_seen_dots(seen, 16, 12, rng, beside=plan)
     others = np.stack([beside.x_px, beside.y_px], axis=1)
-    assert _distances(others, places).min() > 2
-    assert not set(map(tuple, others.tolist())) & set(map(tuple, places.tolist()))
+    # as many as were asked for, no nearer to those of another plan than 0.3 of their own distance
+    assert len(plan) == len(beside) == dots_of_frames(16, 12)
+    assert _distances(others, places).min() > 0.28 * math.sqrt(359 * 259 / 1.5**2 / len(plan))
     x, _ = _seen_places(seen, 12, np.empty((0, 2)))
     assert len(x) == 12
     # 40 px and more from dot to dot, of 2.5 sides and 20 px of wings
@@ -379,6 +382,19 @@ def test_frames_in_disorder_are_named_with_their_pose_but_the_first(disordered, 
     assert words.startswith(f"{beginning}the frames are in reverse order")
 
 
+def test_a_pose_is_turned_as_its_image_is(rng):
+    """By a quarter turn what was at the right is below, about the middle of the tracker's image."""
+    plan = plan_dots((300, 200), 16, 20, rng)
+    first = codes_seen(plan, rng)
+    right, down = first.x_px - 319.5, first.y_px - 239.5
+    second = replace(first, x_px=319.5 - down, y_px=239.5 + right, pose=first.pose + 1)
+    lens = Camera((640, 480), 2000.0, (319.5, 239.5), np.eye(3))
+    look = first_look(plan, Nominal(lens, UPRIGHT, lens), first.joined(second), rng)
+    turns = to_matrix(look.q_poses)
+    np.testing.assert_allclose(turns[0], np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(turns[1], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-3)
+
+
 def test_an_image_of_another_size_is_refused_by_both_sizes(tmp_path):
     path = tmp_path / "frame_0.png"
     codes = np.arange(24, dtype=np.uint8).reshape(4, 6)
@@ -460,9 +476,16 @@ def test_a_dot_is_lit_in_two_frames_of_five_and_in_three_to_ten(frames, dots):
 
 def test_dots_of_a_wide_psf_stand_farther_apart():
     """18 sigmas of 4 px, and 2.5 sides of 4.5 px: 83 px from dot to dot in place of 40."""
-    wide = lit_for(replace(screen(), psf_sigma_px=4.0))
-    # the field in which a wide dot is whole is smaller by 4 windows of its own
-    assert wide == pytest.approx(400 * 300 / 83.25**2, rel=0.5)
+    seen = replace(screen(), psf_sigma_px=4.0)
+    # in the field in which a dot's window is whole
+    margin_px = dot_centroids(seen.dot_sigma_px).radius_px + 1
+    area_px2 = (399 - 2 * margin_px) * (299 - 2 * margin_px)
+    assert abs(lit_for(seen) - area_px2 / 83.25**2) < 1.0
+
+
+def test_dots_are_measured_in_a_window_as_wide_as_they_are_and_of_1_5_px_at_least():
+    widths_px = [dot_centroids(sigma_px).window_sigma_px for sigma_px in (0.4, 1.5, 6.0)]
+    assert widths_px == [1.5, 1.5, 6.0]
 
 
 def test_a_dot_is_on_the_screen_to_6_px_from_the_middles_of_its_outermost_pixels():

@@ -29,6 +29,7 @@ from hilstar.instruments.calibrate.first_light.geometry import (
     SquaresAlike,
     _is_oblique,
     corrected,
+    draw_spots,
     figure_for,
     keys_of_ways,
     look_of,
@@ -142,6 +143,39 @@ def test_a_figure_tells_focal_length_and_turn_and_how_sure_that_is():
     # a tenth of a pixel over the figure's side, 2 * 120 px of the monitor and 120 of the tracker's
     assert figure.reach_px == 120
     assert seen.turn_error_deg == pytest.approx(math.degrees(0.1 / 120), rel=0.1)
+
+
+@pytest.mark.parametrize("size_px", [(400, 100), (100, 400)])
+def test_a_figure_is_half_as_large_as_the_smallest_side_of_screen_and_field(size_px):
+    """100 px of the tracker are 200 of the monitor: a figure of 100, a quarter to each side."""
+    middle_px = tuple((side - 1) / 2 for side in size_px)
+    tracker = replace(COARSE.tracker, resolution_px=size_px, principal_point_px=middle_px)
+    figure = figure_for(BenchGeometry(COARSE.monitor, tracker))
+    assert figure.reach_px == 50
+    # of squares of whole pixels
+    sides_px = np.abs(np.diag(figure.axes_px))
+    assert sides_px == pytest.approx([100, 100], abs=1)
+
+
+def test_spots_are_drawn_where_the_tracker_sees_them_each_with_its_name_inwards(tmp_path, figures):
+    """In an image of twice as many columns as are drawn, whose brightest pixels stay."""
+    image = np.zeros((20, 1462))
+    image[3, 1001] = image[7, 600] = image[16, 20] = 900.0
+    x_px, y_px = np.array([1001.0, 600.0, 20.0]), np.array([3.0, 7.0, 16.0])
+    draw_spots(tmp_path / "spots", image, x_px, y_px, "a finding")
+    (axes,) = figures[0].axes
+    (drawn,) = axes.images
+    assert drawn.get_extent() == [-0.5, 1461.5, 19.5, -0.5]
+    grey = drawn.get_array()
+    assert grey.shape == (10, 731)
+    assert [grey[1, 500], grey[3, 300], grey[8, 10]] == [30.0] * 3
+    np.testing.assert_array_equal(axes.collections[0].get_offsets(), np.stack([x_px, y_px], axis=1))
+    names = [(text.get_text(), text.xy, text.get_ha()) for text in axes.texts]
+    assert names == [
+        ("corner", (1001.0, 3.0), "right"),
+        ("right", (600.0, 7.0), "left"),
+        ("below", (20.0, 16.0), "left"),
+    ]
 
 
 @pytest.mark.parametrize("seen_as", [np.diag([1.4, 1.0]), np.diag([1.0, 1.4])])

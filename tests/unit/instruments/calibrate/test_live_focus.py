@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import time
 from contextlib import ExitStack, closing
 from types import SimpleNamespace
 
@@ -121,7 +122,10 @@ def test_dots_that_saturate_have_no_figure_and_are_dimmed(benches, tmp_path):
     file, truth = benches
     with closing(VirtualBench(file, truth(1.0), 0)) as source:
         images = focus_readings(file, source, tmp_path, 1.0)
+        begin_s = time.monotonic()
         reading = next(images)
+        # by the clock of the readings, which begins with them
+        assert 0 < reading.t_s <= time.monotonic() - begin_s
         assert reading.figure is None and "saturate" in reading.why
         assert next(images).code < reading.code == 2**10 - 1
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.errors import InputError
+from hilstar.basics.units import NS_PER_S
 from hilstar.display.geometry import monitor_camera
 from hilstar.instruments.campaign.plan import Centroiding, parse_plan
 from hilstar.instruments.campaign.run import Campaign
@@ -18,6 +19,7 @@ from hilstar.instruments.campaign.session import Session
 from hilstar.instruments.campaign.solvers import CENTROIDS, choose_solver
 from hilstar.instruments.campaign.tally import attitude_error_arcsec
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
+from hilstar.instruments.simulate.exposures import faulty_exposure
 from hilstar.instruments.simulate.glass import told_psf
 from hilstar.instruments.simulate.optics import TwinOptics
 from hilstar.instruments.simulate.simulator import Simulator
@@ -28,6 +30,7 @@ from hilstar.optics.psf import GaussianPsf
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.cameras import tracker_camera, tracker_psf
 from hilstar.server.bench.glass import say_once
+from hilstar.server.bench.scenario import parse_scenario
 from hilstar.server.bench.star_glass import BAND_NM, StarGlass
 from hilstar.server.bench.star_light import bench_stars
 from hilstar.server.bench.star_rates import bench_optics
@@ -82,6 +85,36 @@ def test_a_star_s_shares_are_its_spectrum_times_the_quantum_efficiency(glass_fil
         )
     finer = StarGlass(file, psf, band_nm=BAND_NM / 2).shares(stars, which)
     assert found == pytest.approx(finer, abs=SHARES)
+
+
+GLOW = """seed = 5
+[[fault]]
+kind = "glow"
+name = "lamp"
+at_s = 0.5
+tracker_px = [3, 40]
+electrons_per_s = 500.0
+scale_deg = 4.0
+"""
+
+
+def test_stray_light_is_added_to_stars_behind_a_glass_once(glass_file, tmp_path):
+    """As the law of its light has it about a place, and nowhere more."""
+    with Simulator(glass_file()) as simulator:
+        view = simulator.view(np.array(ORION_Q), np.zeros(3))
+        plain_e = simulator.expose(view, None).mean_e
+        scenario = parse_scenario(tmp_path / "faults.toml", GLOW)
+        faults = faulty_exposure(simulator, [view], scenario, NS_PER_S)
+        added_e = simulator.expose(view, None, faults=faults).mean_e - plain_e
+        rays = simulator.camera.rays(*simulator.camera.grid_px(SIDE_PX))
+    lamp = simulator.camera.rays(np.array([3.0]), np.array([40.0]))[0]
+    lengths = np.linalg.norm(rays, axis=1) * np.linalg.norm(lamp)
+    angle_deg = np.degrees(np.arccos(np.minimum(rays @ lamp / lengths, 1)))
+    wanted_e = 0.2 * 500 / (1 + (angle_deg / 4) ** 2)
+    share = added_e.ravel() / wanted_e
+    assert np.quantile(share, [0.03, 1.0]) == pytest.approx([1.0, 1.0], abs=0.01)
+    # what a measured PSF has below 0 is cut, and so is less of the lamp there
+    assert plain_e.min() == 0.0 and share.min() < 0.9
 
 
 @pytest.mark.parametrize("spectrum", ["pickles", "mk"])

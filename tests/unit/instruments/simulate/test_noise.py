@@ -639,9 +639,9 @@ def test_limits_by_magnitude_are_medians_of_fields_with_the_stars_up_to_each():
     for row, median in zip(rows, (9.0, 9.0, 9.0, 5.0), strict=True):
         for number, name in enumerate(noise.NEA_COLUMNS, start=1):
             assert row[name] == number * median
-    # of fields that have no attitude one row says so
-    (none,) = noise._nea_rows(fields[2:], curves[2:], 4.6)
-    assert (none["v_mag"], none["stars"], none["limit_about_arcsec"]) == (4.6, 0.0, np.inf)
+    # where no limit has an attitude one row says so
+    (none,) = noise._nea_rows([fields[0][:1]], [curves[0][..., :1]], 4.6)
+    assert (none["v_mag"], none["stars"], none["limit_about_arcsec"]) == (4.6, 1.0, np.inf)
 
 
 def row_of(v_mag: float, factor: float, **changes: float) -> dict[str, float]:
@@ -903,7 +903,7 @@ def measured(star: NoisyStar, star_e: float, threshold_sigma: float = 5.0) -> np
 def test_stars_of_trials_are_those_over_the_threshold_of_a_detector_without_defects(monkeypatch):
     """Whatever its dark current, no star is none; a superpixel finds what a pixel does not."""
     monkeypatch.setattr(noise, "TRIALS", 8)
-    dark = gaussian(0.9, replace(NOISY, dark_e_per_s=3000.0), phases=1)
+    dark = gaussian(0.9, replace(NOISY, dark_e_per_s=3000.0, gain_e_per_dn=3.0), phases=1)
     assert np.isnan(measured(dark, 1e-6, 6.0)).all()
     plain = gaussian(0.9, NOISY, phases=1)
     hot = gaussian(0.9, replace(NOISY, hot_pixel_fraction=0.2), phases=1)

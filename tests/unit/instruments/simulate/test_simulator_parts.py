@@ -14,6 +14,7 @@ from hilstar.instruments.simulate import simulator
 from hilstar.instruments.simulate.exposures import view_at
 from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground, full_e
 from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.cameras import tracker_camera
 from tests.support.benches import bench_text
 
 
@@ -23,6 +24,7 @@ from tests.support.benches import bench_text
         ({"verify": {"flux_mag": 0.2}}, []),
         ({"sky": {"faintest_v_mag": 5.0}}, ["sky", "tracker"]),
         ({"tracker": {"transmission": 0.5}}, ["sky", "tracker"]),
+        ({"tracker.detector": {"fill_factor": 0.5}}, ["sky", "tracker"]),
         ({"tracker": {"exposure_s": 0.3}}, ["tracker"]),
         ({"background": {"electrons_per_px": 3.0}}, ["tracker"]),
     ],
@@ -57,6 +59,15 @@ def test_what_a_change_of_the_bench_touches_is_made_anew(tmp_path, monkeypatch, 
     running.moving = "bodies"
     Simulator.change(running, before)
     assert loaded[len(made)] == "sky"
+    # what is drawn into is opened anew for another PSF alone
+    closed = []
+    running.renderer = SimpleNamespace(target=target, close=lambda: closed.append(True))
+    monkeypatch.setattr(simulator, "headless_context", lambda gpu: "context")
+    monkeypatch.setattr(simulator, "open_backend", lambda target, context: target.psf)
+    for psf, renderer, times in (("psf", running.renderer, 0), ("wider", "wider", 1)):
+        running.canvas = SimpleNamespace(psf=psf)
+        Simulator.change(running, after if times == 0 else before)
+        assert (running.renderer, len(closed)) == (renderer, times)
 
 
 def test_a_detector_without_a_mosaic_gathers_the_glow_of_all_channels():
@@ -75,6 +86,24 @@ def test_a_detector_without_a_mosaic_gathers_the_glow_of_all_channels():
     )
     view = SimpleNamespace(q_icrs_to_cam=np.array([1.0, 0, 0, 0]), t_ns=0)
     np.testing.assert_allclose(TrackerBackground.of_view_e(background, view), [[13.5, 20.5]])
+
+
+def test_a_pixel_of_a_wide_field_has_its_own_solid_angle_across_and_down(tmp_path):
+    """The cube of the cosine of a pixel's angle from the axis, on 300 x 200 px."""
+    tracker = {"resolution_px": [300, 200], "focal_length_mm": 5.0, "pixel_pitch_um": 13.0}
+    path = tmp_path / "bench.toml"
+    path.write_text(
+        bench_text({"tracker": tracker}, {"background": {"zodiacal_v_mag_arcsec2": 20.0}})
+    )
+    file = read_bench_file(path)
+    light_e = TrackerBackground(
+        file.config, tmp_path, tracker_camera(file.config.tracker, tmp_path)
+    ).steady_e
+    for row, column in ((0, 150), (100, 0), (100, 299), (199, 299)):
+        tangent = np.hypot(column - 149.5, row - 99.5) * 13e-3 / 5.0
+        share = light_e[row, column] / light_e[100, 150]
+        # light is linear between places 0.05 rad apart
+        assert share == pytest.approx((1 + tangent**2) ** -1.5, rel=2e-3)
 
 
 @pytest.mark.parametrize("t_ns", [0, 10**7, 5 * 10**8, 99 * 10**7, 10**9])

@@ -98,6 +98,12 @@ class LightFit:
     colours: FloatArray = field(default_factory=lambda: np.zeros(1))
     colour_terms: dict[str, float] = field(default_factory=dict)
 
+    @property
+    def is_linear(self) -> bool:
+        """Whether DN go as light, to within what a tone curve is stated from on."""
+        limit = max(LINEAR_OFF, LINEAR_SIGMAS * self.sigma["linearity"])
+        return abs(self.linearity - 1) <= limit
+
     def illumination(self, radius2: FloatArray) -> FloatArray:
         """Light relative to the axis at squares of radii."""
         a, b = self.vignetting_mag

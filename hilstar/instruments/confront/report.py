@@ -14,7 +14,6 @@ from hilstar.basics.units import ARCSEC_PER_RAD
 from hilstar.instruments.confront.background import KINDS
 from hilstar.instruments.confront.excess import Excess
 from hilstar.instruments.confront.judge import Verdict
-from hilstar.instruments.confront.light import LINEAR_OFF, LINEAR_SIGMAS
 from hilstar.instruments.confront.session import Session
 
 MAX_RMS_PX, MAX_RMS_MAG, CHI2 = 0.15, 0.2, (0.8, 1.25)  # with --strict, of each photograph
@@ -299,10 +298,9 @@ def _tone(session: Session) -> str:
         )
     sigma = light.sigma["linearity"]
     tone_text = f"DN go as light to the power {light.linearity:.3f} +- {sigma:.3f}"
-    bent = abs(light.linearity - 1) > max(LINEAR_OFF, LINEAR_SIGMAS * sigma)
-    if bent:
-        return f"{tone_text}: a tone curve that is no power, which stays in all figures"
-    return f"{tone_text}: no tone curve"
+    if light.is_linear:
+        return f"{tone_text}: no tone curve"
+    return f"{tone_text}: a tone curve that is no power, which stays in all figures"
 
 
 def _beyond(verdict: Verdict) -> Iterator[str]:

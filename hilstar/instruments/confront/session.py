@@ -35,8 +35,6 @@ from hilstar.instruments.confront.camera_fit import (
 )
 from hilstar.instruments.confront.images import Photograph, paged
 from hilstar.instruments.confront.light import (
-    LINEAR_OFF,
-    LINEAR_SIGMAS,
     NO_CORRECTION,
     Correction,
     LightFit,
@@ -364,8 +362,7 @@ def run_session(
     linearity = session.light.linearity
     if fixed is not None or linearity < MIN_POWER:
         return session
-    least_off = max(LINEAR_OFF, LINEAR_SIGMAS * session.light.sigma["linearity"])
-    if abs(linearity - 1) < least_off:
+    if session.light.is_linear:
         return session
     # Levels made linear by a power have a power of their own. The power to undo is where the
     # logarithm of that is 0: its root, by secants.

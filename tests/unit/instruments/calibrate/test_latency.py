@@ -9,6 +9,7 @@ from hilstar.instruments.calibrate import latency
 from hilstar.instruments.calibrate.latency import (
     Edges,
     Paired,
+    draw_latency,
     edges_of,
     latency_lines,
     nearest_of,
@@ -178,6 +179,28 @@ def test_the_lines_have_the_figures(tmp_path):
     text = {line[:24].strip(): line[24:] for line in latency_lines(summarise(rises, config))}
     assert text["rise, fall"] == "20.00, - ms (medians)"
     assert "note" not in text
+
+
+def test_latencies_are_drawn_by_the_level_after_their_edge(tmp_path, figures):
+    """Three rises of 20 ms, and falls of 23 and 24."""
+    config = parse_config(tmp_path / "bench.toml", SMALL_BENCH)
+    latency_ns = np.array([20e6, 23e6, 20e6, 24e6, 20e6])
+    paired = Paired(latency_ns, np.array([1, 0, 1, 0, 1]), unmatched=0, ambiguous=False)
+    draw_latency(tmp_path / "latency", paired, summarise(paired, config))
+    (axes,) = figures[0].axes
+    names = [text.get_text() for text in axes.get_legend().get_texts()]
+    drawn = {}
+    for name, bars in zip(names, axes.containers, strict=True):
+        lit = [bar for bar in bars if bar.get_height()]
+        drawn[name] = [
+            (bar.get_height(), bar.get_x(), bar.get_x() + bar.get_width()) for bar in lit
+        ]
+    (rises,) = drawn["dark to light"]
+    assert (rises[0], rises[1]) == (3, 20.0)
+    (first, last) = drawn["light to dark"]
+    assert (first[0], last[0]) == (1, 1)
+    assert first[1] <= 23.0 < first[2] < last[1] < 24.0
+    assert last[2] == pytest.approx(24.0)
 
 
 def test_the_code_says_which_frame_by_any_seven():

@@ -159,6 +159,7 @@ def test_an_instrument_is_at_its_limit_where_three_largest_readings_of_several_c
 def test_black_is_the_mean_of_its_readings_in_all_channels(tmp_path):
     text = "code,channel,value\n0,r,1\n0,g,2\n0,w,6\n255,r,20\n255,g,40\n255,w,60\n"
     measured = read_measurements(table_of(tmp_path, text))
+    assert measured.channels == ("w", "r", "g")
     for channel, white in (("r", 20.0), ("g", 40.0), ("w", 60.0)):
         levels = group_levels(measured, channel)
         assert (levels.code.tolist(), levels.count.tolist()) == ([0, 255], [3, 1])

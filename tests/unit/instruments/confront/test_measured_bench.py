@@ -228,9 +228,12 @@ def test_a_psf_of_samples_is_held_by_its_covariance(tmp_path):
     header = fits.Header({"OVERSAMP": 3})
     fits.PrimaryHDU(samples, header).writeto(tmp_path / "psf.fits")
     bench = tmp_path / "bench.toml"
+    wanted = np.array([[1.1**2], [0.8**2], [0.0]])
+    bench.write_text(GIVEN.replace("exposure_s", "psf_sigma_px = [1.1, 0.8]\nexposure_s"))
+    stated = fixed_camera(read_tracker_file(bench)[0], 1.0)
+    np.testing.assert_allclose(stated.psf.covariance, wanted)
     bench.write_text(GIVEN + '[tracker.optics]\npsf = "psf.fits"\n')
     held = fixed_camera(read_tracker_file(bench)[0], 1.0)
-    wanted = np.array([[1.1**2], [0.8**2], [0.0]])
     np.testing.assert_allclose(held.psf.covariance, wanted, atol=0.05)
     assert held.psf.size_px == (1280, 960)
     assert held.light.vignetting_mag == (0.0, 0.0)

@@ -22,12 +22,14 @@ from hilstar.optics.psf import GaussianPsf
 UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-@pytest.mark.parametrize("count", [5, 21, 34, 200])
+@pytest.mark.parametrize("count", [5, 21, 34, 233])
 def test_exposures_of_a_free_tracker_fill_a_refresh_period_evenly(count):
-    """As multiples of the golden section do: no gap is 1.9 times the mean one, none a third."""
+    """As multiples of the golden section do, of a number of Fibonacci's: in gaps of two lengths,
+    1.17 and 0.72 of the mean one.
+    """
     phases = np.sort([twin.free_phase(number) for number in range(7, 7 + count)])
     gaps = np.diff(phases, append=phases[0] + 1)
-    assert 0.4 / count < gaps.min() < gaps.max() < 1.9 / count
+    assert 0.7 / count < gaps.min() < gaps.max() < 1.2 / count
 
 
 @pytest.mark.parametrize("exposure_s", [0.1, 0.0999, 0.1001])

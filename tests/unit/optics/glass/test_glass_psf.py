@@ -347,6 +347,15 @@ def test_a_glass_is_sampled_for_its_sharpest_psf_and_cut_for_its_widest(two_psfs
     assert 1 - erf((half_px - 2) / (1.1 * np.sqrt(2))) ** 2 > MAX_CUT
 
 
+def test_a_blur_wider_than_the_images_has_room_beyond_them(two_psfs):
+    """Images to 7 px from the middle, and a Gaussian of 6 px: variances add, a pixel's too."""
+    wide = two_psfs.blurred(6.0)
+    at = np.array([100.0]), np.array([80.0])
+    for spectrum, sigma_px in (([1.0, 0.0], 0.5), ([0.0, 1.0], 1.1)):
+        light = moments(wide.stamps_at(*at, np.array(spectrum), np.ones(1))[0])
+        assert light[3:] == pytest.approx([sigma_px**2 + 36.0 + PIXEL_VARIANCE] * 2, rel=2e-3)
+
+
 def test_a_star_s_illumination_is_that_of_its_own_light(two_psfs):
     spectra = np.array([[1.0, 0.0], [0.0, 1.0], [0.25, 0.75]])
     at = np.full(3, 100.0)

@@ -133,12 +133,8 @@ def put_value(place, value):
         (spoilt(images=put_value(1, 0.0)), "image 2 has samples that are not finite, or no light"),
         (lambda s: replace(s, at=s.at[:-1]), "write one point for each image"),
         (spoilt(at=put_value((0, 2), 999.0)), "give each point one image of each wavelength"),
-        (spoilt(images=lambda i: np.roll(i, 26, axis=2)), "put the chief ray there"),
-        (spoilt(images=lambda i: np.roll(i, 26, axis=1)), "put the chief ray there"),
         (spoilt(images=lambda i: i - 0.3 * i.mean()), "subtract its background"),
         (spoilt(facts=put_value((0, 0), 3.0)), "relative_illumination is not within 0 to 2"),
-        (spoilt(facts=put_value((0, 0), -0.1)), "relative_illumination is not within 0 to 2"),
-        (spoilt(facts=put_value((0, 1), 1.0)), "outside_share is not within 0 to 1"),
         (spoilt(facts=put_value((0, 1), -0.1)), "outside_share is not within 0 to 1"),
         (spoilt(at=lambda at: at * [1, 1, -1, 1]), "write wavelengths over 0 nm"),
         (lambda s: replace(s, per_px=0), "0 samples a pixel; write 1 or more"),
@@ -222,10 +218,11 @@ def test_a_pixel_s_negative_light_counts_over_the_whole_of_an_image_that_is_not_
 
 
 def test_a_file_s_transmission_rises_from_wavelength_to_wavelength(tmp_path, glass):
-    curve = Curve(np.array([400.0, 700.0, 700.0]), np.array([0.8, 0.9, 0.9]))
-    write_glass(tmp_path / "psf.fits", replace(glass, transmission=curve))
-    said = refusal(read_glass, tmp_path / "psf.fits")
-    assert "TRANSMISSION has wavelengths that do not rise" in said
+    for nm in ([400.0, 700.0, 700.0], [400.0]):
+        curve = Curve(np.array(nm), np.full(len(nm), 0.8))
+        write_glass(tmp_path / "psf.fits", replace(glass, transmission=curve))
+        said = refusal(read_glass, tmp_path / "psf.fits")
+        assert "TRANSMISSION has wavelengths that do not rise" in said
 
 
 @pytest.mark.parametrize(

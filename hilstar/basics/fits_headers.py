@@ -170,11 +170,13 @@ def _with_inherited(own: Any, primary: Any) -> Any:
 
 
 def _refuse_blank(pixels: npt.NDArray[Any], header: Any) -> None:
-    """Pixels without a value: Astropy makes them NaN but for unsigned numbers, which it leaves."""
+    """Pixels without a value: Astropy makes them NaN but for unsigned numbers, which it leaves, and
+    whose BSCALE is 1.
+    """
     blank = header.get("BLANK")
     if blank is None or pixels.dtype.kind not in "iu":
         return
-    level = blank * header.get("BSCALE", 1) + header.get("BZERO", 0)
+    level = blank + header.get("BZERO", 0)
     count = int((pixels == level).sum())
     if count:
         raise InputError(f"{count} pixels have no value (BLANK = {blank}); give a whole raw frame")

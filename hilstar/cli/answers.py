@@ -131,8 +131,7 @@ def _shown_now(file: "BenchFile") -> "FloatArray | None":
         return None
     try:
         with open_link(file.config, file.folder) as link:
-            if link.steps:
-                return None
+            assert not link.steps  # nobody waits for a frame of it
             return first_attitude(link, SHOWN_WITHIN_S).q_icrs_to_cam
     except InputError:
         say(f"{settings.address}: no attitude comes; give what is shown by --radec RA,DEC,ROLL")

@@ -207,7 +207,6 @@ class ExactQuantiser(quantise.Quantiser):
         else:
             self._flat[:-1] = floor.ravel()
         self._on_floor = floor is not None
-        self._lit = np.empty(0, dtype=np.int32)
         if sprites is not None and len(sprites):
             footprint = self._map.find(sprites)
             levels = np.empty(footprint.place.shape, dtype=self._flat.dtype)

@@ -704,11 +704,13 @@ def _psf_in(path: Path, content: bytes) -> SampledPsf:
         raise InputError(f"{path}: not a FITS image; {FILE_ADVICE}") from error
     if not image.ndim:
         raise InputError(f"{path}: not a FITS image; {FILE_ADVICE}")
-    if image.ndim == 3 and len(image) > 1:
-        raise InputError(
-            f"{path}: holds {len(image)} images, and one PSF is drawn all over the field; write one"
-            " of them"
-        )
+    if image.ndim == 3:
+        if len(image) > 1:
+            raise InputError(
+                f"{path}: holds {len(image)} images, and one PSF is drawn all over the field; write"
+                " one of them"
+            )
+        image = image.reshape(image.shape[1:])
     if type(per_px) is not int or type(integrated) is not bool:
         raise InputError(
             f"{path}: OVERSAMP is {per_px!r} and PIXINT {integrated!r}; write a whole number, and T"

@@ -116,6 +116,23 @@ def test_exact_on_light_that_is_no_star_s_is_as_without_opengl(way, lit, rng, mo
     assert np.mean(levels[oracle > 0] != oracle[oracle > 0]) < CHOICES
 
 
+@pytest.mark.parametrize("lit", [((0, 1, 2), (1, 2)), ((), (0,))], ids=["by NumPy", "by points"])
+def test_a_frame_of_exact_hangs_on_no_frame_before(lit, rng, monkeypatch):
+    """Red leaves its stars' errors to the others by NumPy, on a glow, or by a compute shader; in
+    the second frame it is drawn the other way.
+    """
+    glow = LightMap(np.full((60, 80), 3e3, dtype=np.float32), (90, 60))
+    sprites = stars(rng)
+    frames = []
+    for lit_now in lit:
+        lights = tuple((glow,) if k in lit_now else () for k in range(3))
+        frames.append(replace(sprites, extended=(glow,) if lit_now else (), lights=lights))
+    target = target_of("exact")
+    both = levels_of(target, frames, "gl", monkeypatch)
+    alone = levels_of(target, frames[1:], "gl", monkeypatch)
+    np.testing.assert_array_equal(both[1], alone[0])
+
+
 def test_a_backend_of_one_panel_refuses_primaries():
     for kind in (Renderer, NumpyBackend):
         with pytest.raises(ValueError, match="open those of primaries by open_backend"):

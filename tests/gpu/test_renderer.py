@@ -12,7 +12,7 @@ from hilstar.basics.errors import InputError, MachineError
 from hilstar.display.render import context as context_module
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
-from hilstar.display.render.target import Target
+from hilstar.display.render.target import SpriteSide, Target
 from hilstar.display.response import encode, srgb_response
 from hilstar.optics.psf import MAX_CUT, GaussianPsf
 from hilstar.optics.sprites import FrameLight
@@ -50,6 +50,20 @@ def plain_target(resolution=(256, 192), sigma=(0.85, 0.85), bits=8, white=1e6) -
     return Target(
         resolution, GaussianPsf(sigma), None if bits is None else srgb_response(bits), white
     )
+
+
+@pytest.mark.parametrize(("per_star", "is_small"), [(1, True), (4, False)])
+def test_a_fainter_star_s_square_is_by_the_light_of_its_whole_path(by_points, per_star, is_small):
+    """Four sprites in one place: of stars below the side's rate, or of one star above it."""
+    target = replace(plain_target((60, 40), bits=None), sides=(SpriteSide(1e4, 5),))
+    places_px = np.tile([30.2, 20.4], (4, 1))
+    sprites = sprites_at(places_px, np.full(4, 4e3), target.psf.footprint_px)
+    sprites = replace(sprites, per_star=per_star, star=np.arange(4) // per_star)
+    with Renderer(target) as gl:
+        gl.draw(sprites)
+        linear = gl.linear()
+        assert linear[18:23, 28:33].all()
+        assert (linear[:, 33].any(), linear[23].any()) == (not is_small, not is_small)
 
 
 @BOTH_WAYS

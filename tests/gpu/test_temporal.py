@@ -16,6 +16,7 @@ from hilstar.display.quantise import shown_light
 from hilstar.display.render.reference import linear_image
 from hilstar.display.render.renderer import Renderer
 from hilstar.display.render.target import Target
+from hilstar.display.render.way import WAY_VARIABLE
 from hilstar.display.response import gamma_response, srgb_response, table_response
 from hilstar.display.temporal import TemporalQuantiser
 from hilstar.optics.extended import LightMap
@@ -155,10 +156,12 @@ def test_paths_keep_their_light_over_the_frames():
     assert max(errors) < AIM_MAG
 
 
-def test_frames_with_extended_light_go_on_where_others_stopped():
-    """A map lights the image in every second frame, by points drawn by NumPy: the light of all
+@pytest.mark.parametrize("way", ["cpu", "gl"])
+def test_frames_with_extended_light_go_on_where_others_stopped(way, monkeypatch):
+    """A map lights the image in two frames of four, which points leave to NumPy: the light of all
     is right within a step.
     """
+    monkeypatch.setenv(WAY_VARIABLE, way)
     panel = Panel(table_response(2, np.linspace(0, 1, 4)), WHITE)
     sprites = stars(*places(), 1.3 * WHITE / 3)
     none = replace(
@@ -175,7 +178,7 @@ def test_frames_with_extended_light_go_on_where_others_stopped():
     ):
         total = np.zeros(len(sprites))
         for frame in range(9):
-            lights = (light,) if frame % 2 else ()
+            lights = (light,) if frame % 4 in (1, 2) else ()
             gl.draw(replace(sprites, extended=lights), frame)
             floor.draw(replace(none, extended=lights), frame)
             added = shown_light(gl.levels(), panel) - shown_light(floor.levels(), panel)

@@ -4,18 +4,16 @@ ends.
 
 from __future__ import annotations
 
-import ctypes
 import os
 import re
 import signal
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from hilstar.display.window.awake import _Server
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -135,57 +133,6 @@ def test_what_somebody_sets_meanwhile_is_prevented_and_comes_after(server, tmp_p
         process.send_signal(signal.SIGINT)
         process.wait(PATIENCE_S)
     assert blanking_of(server)[0] == "120"
-
-
-class StandIn:
-    """Stands for libX11 and libXext before a server with DPMS: no server that runs without a
-    monitor has it.
-    """
-
-    def __init__(self) -> None:
-        self.saver, self.level, self.on, self.calls = [600, 300, 1, 1], 3, 1, []
-        self.XOpenDisplay = lambda _: 1  # takes an attribute, as a function of ctypes does
-
-    def DPMSQueryExtension(self, *_: object) -> int:
-        return 1
-
-    def DPMSCapable(self, _: object) -> int:
-        return 1
-
-    def DPMSInfo(self, _: object, level: ctypes.c_ushort, on: ctypes.c_ubyte) -> None:
-        level._obj.value, on._obj.value = self.level, self.on
-
-    def XGetScreenSaver(self, _: object, *parts: ctypes.c_int) -> None:
-        for part, value in zip(parts, self.saver, strict=True):
-            part._obj.value = value
-
-    def XSetScreenSaver(self, _: object, *parts: int) -> None:
-        self.saver = list(parts)
-
-    def __getattr__(self, name: str) -> Callable[..., None]:
-        return lambda _, *words: self.calls.append((name, *words))
-
-
-def test_standby_is_ended_prevented_and_restored(monkeypatch):
-    library = StandIn()
-    monkeypatch.setattr(ctypes, "CDLL", lambda _: library)
-    server = _Server()
-    before = server.blanking()
-    assert before == (600, 300, 1, 1, True) and before.happens
-    server.prevent(before)
-    assert [name for name, *_ in library.calls] == [
-        "DPMSForceLevel",
-        "DPMSDisable",
-        "XForceScreenSaver",
-        "XSync",
-    ]
-    library.on = 0  # as the server has it after that
-    assert not server.blanking().happens
-    server.restore(before)
-    assert library.calls[-2][0] == "DPMSEnable" and library.saver == [600, 300, 1, 1]
-    library.calls.clear()
-    server.restore(before._replace(dpms=False))
-    assert [name for name, *_ in library.calls] == ["XSync"]
 
 
 def test_a_virtual_server_is_kept_awake_too(tmp_path):

@@ -14,7 +14,6 @@ from pathlib import Path
 
 import pytest
 
-from hilstar.display.window.x11 import sync_control
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.commands import assert_refused, run_hilstar
 from tests.support.forks import HILSTAR, Started
@@ -231,8 +230,3 @@ def test_a_compositing_manager_is_refused(server, tmp_path):
         x11.XCloseDisplay(client)
     assert result.returncode == 3
     assert "compositing manager" in result.stderr
-
-
-def test_without_a_driver_that_tells_of_swaps_there_is_no_sync_control():
-    assert sync_control(None, None) is None
-    assert sync_control(0, 5) is None

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,13 @@ import pytest
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics import charts
 from hilstar.basics.errors import InputError
-from hilstar.basics.rotation import angle_between_rad, from_rotation_vector, propagate, to_matrix
+from hilstar.basics.rotation import (
+    angle_between_rad,
+    from_rotation_vector,
+    propagate,
+    random_attitudes,
+    to_matrix,
+)
 from hilstar.instruments.study.chain import answers, choices, measuring, run
 from hilstar.instruments.study.chain.measuring import CombinationRow, ErrorPart, StageTime
 from hilstar.instruments.study.chain.tracker import (
@@ -29,7 +36,10 @@ from hilstar.instruments.study.chain.tracker import (
 from hilstar.instruments.study.predictors import Movement, attitude_at
 from hilstar.instruments.study.sweep import Load, Spent
 from hilstar.optics.scan import Scan
-from hilstar.server.bench.config import AttitudeSettings
+from hilstar.server.bench.bench_file import read_bench_file
+from hilstar.server.bench.build import open_bench
+from hilstar.server.bench.config import AttitudeSettings, parse_config
+from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.tables import csv_rows
 
 PERIOD_S = 1 / 50
@@ -68,24 +78,8 @@ def test_an_attitude_is_held_carried_on_by_its_rate_or_by_the_last_two(ahead_ms)
 
 def test_an_exposure_before_a_fast_panel_begins_within_a_refresh():
     """Of 2 ms: 3.7 ms are 1.7 ms of the second one."""
-    bench = bench_of(Scan((0, 1), 0.0, 0.0), 0.1)
-    bench.config.monitor.refresh_hz = 500.0
-    assert choices.exposure(bench, 10).begin_s == pytest.approx(10 / 500 + 0.0017)
-
-
-class Sky:
-    """A bench's sky by the number of a field: the rates of its stars, none where none are stated."""
-
-    def __init__(self, rates_by_field: dict[int, list[float]], others: list[float]) -> None:
-        self.rates_by_field = rates_by_field
-        self.others = others
-        self.seen: list[np.ndarray] = []
-        self.file = SimpleNamespace(path="bench.toml")
-
-    def sprites(self, q: np.ndarray) -> SimpleNamespace:
-        rates = self.rates_by_field.get(len(self.seen), self.others)
-        self.seen.append(q)
-        return SimpleNamespace(data={"electrons_per_s": np.array(rates)})
+    seen = choices.panel_exposure(10, 1 / 500, 0.1, Scan((0, 1), 0.0, 0.0), SIZE_PX)
+    assert seen.begin_s == pytest.approx(10 / 500 + 0.0017)
 
 
 def test_the_scenes_are_the_median_the_densest_and_the_faintest_of_the_fields():
@@ -93,15 +87,31 @@ def test_the_scenes_are_the_median_the_densest_and_the_faintest_of_the_fields():
     or more.
     """
     five = [90.0, 2.0, 2.0, 2.0, 2.0]
-    rates_by_field = {3: five, 40: [70.0] * 20, 60: [9.0, 2.0], 90: [20.0, 1.0, 1.0], 91: five}
-    sky = Sky(rates_by_field, [])
-    average, dense, faint, slow, fast = choices.five_scenes(sky)
-    assert len(sky.seen) == choices.FIELDS
-    for scene, field in ((average, 3), (dense, 40), (faint, 90), (slow, 3), (fast, 3)):
-        np.testing.assert_array_equal(scene.q_icrs_to_cam, sky.seen[field])
-    assert [scene.rate_deg_s for scene in (average, dense, faint, slow, fast)] == [0, 0, 0, 1, 10]
-    with pytest.raises(InputError, match=r"bench\.toml: \[sky\] leaves no star"):
-        choices.five_scenes(Sky({}, []))
+    by_field = {3: five, 40: [70.0] * 20, 60: [9.0, 2.0], 90: [20.0, 1.0, 1.0], 91: five}
+    rates = [np.array(by_field.get(number, [])) for number in range(choices.FIELDS)]
+    assert choices.chosen_fields(rates) == (3, 40, 90)
+    assert choices.chosen_fields([np.array([])] * 3) is None
+
+
+def test_the_scenes_of_a_bench_stand_still_but_for_two_slews(tmp_path):
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH)
+    with open_bench(read_bench_file(path)) as bench:
+        scenes = choices.five_scenes(bench)
+        fields = random_attitudes(choices.FIELDS, np.random.default_rng(choices.SEED))
+        chosen = choices.chosen_fields([bench.sprites(q).data["electrons_per_s"] for q in fields])
+    assert [scene.rate_deg_s for scene in scenes] == [0, 0, 0, 1, 10]
+    average, dense, faint = fields[list(chosen)]
+    for scene, q in zip(scenes, (average, dense, faint, average, average), strict=True):
+        np.testing.assert_array_equal(scene.q_icrs_to_cam, q)
+    # Sirius alone, in none of the fields of two degrees
+    narrow = {"sky": {"faintest_v_mag": -1.0}, "monitor": {"resolution_px": [32, 24]}}
+    path.write_text(bench_text(narrow))
+    with (
+        open_bench(read_bench_file(path)) as bench,
+        pytest.raises(InputError, match=r"bench\.toml: \[sky\] leaves no star"),
+    ):
+        choices.five_scenes(bench)
 
 
 @pytest.mark.parametrize("hold_s", [0.0, 0.004, PERIOD_S], ids=["flash", "short", "whole"])
@@ -111,7 +121,7 @@ def test_each_row_gives_one_light_over_whole_refreshes(hold_s, down, axis):
     after that of frame 10, and is three refreshes long.
     """
     scan = Scan(down, 0.012, hold_s)
-    seen = choices.exposure(bench_of(scan, 3 * PERIOD_S), 10)
+    seen = choices.panel_exposure(10, PERIOD_S, 3 * PERIOD_S, scan, SIZE_PX)
     assert (seen.begin_s, seen.length_s) == pytest.approx((10 * PERIOD_S + 0.0037, 3 * PERIOD_S))
     assert seen.middle_ns() == pytest.approx(1e9 * (11.5 * PERIOD_S + 0.0037), abs=1)
     rows = SIZE_PX[0] if axis else SIZE_PX[1]
@@ -156,8 +166,9 @@ def test_the_light_of_an_exposure_is_each_row_s_share_of_each_frame():
 
 
 def test_a_frame_s_light_is_a_refresh_its_delay_and_half_its_scan_late():
-    monitor = SimpleNamespace(period_ms=16.0, panel_delay_ms=5.0, panel_scanout_ms=8.0)
-    assert choices.lead_ns(SimpleNamespace(monitor=monitor)) == 25_000_000
+    monitor = {"refresh_hz": 62.5, "panel_delay_ms": 5.0, "scanout_ms": 8.0}
+    config = parse_config(Path("bench.toml"), bench_text({"monitor": monitor}))
+    assert choices.lead_ns(config) == 25_000_000
 
 
 @pytest.mark.parametrize(
@@ -186,13 +197,12 @@ def test_stars_are_off_by_their_angle_and_light_and_lost_ones_by_all():
     shown = MeasuredStars(
         np.array([moved, [0.0, 1.0, 0.0], [np.nan] * 3]), np.array([9.0, 20.0, 0.0])
     )
-    judge = SimpleNamespace(lost_arcsec=77.0)
-    found = off(judge, shown, wanted)
+    found = off(shown, wanted, 77.0)
     assert found.arcsec == pytest.approx([30.0, 0.0, 77.0], abs=1e-6)
     assert found.mag == pytest.approx([-2.5 * math.log10(0.9), 0.0, LOST_MAG])
     assert found.lost.tolist() == [False, False, True]
     # a star that is lost in the sky itself, and shown
-    unseen = off(judge, wanted, shown)
+    unseen = off(wanted, shown, 77.0)
     assert unseen.lost.tolist() == [False, False, True]
     assert (unseen.arcsec[2], unseen.mag[2]) == (77.0, LOST_MAG)
 
@@ -225,6 +235,7 @@ def planted_scene(monkeypatch):
     class Judge:
         def __init__(self, tracker, movement, seen):
             self.movement, self.seen, self.sky = movement, seen, "sky"
+            self.lost_arcsec = 77.0
             made.append(self)
 
         def __len__(self):
@@ -241,7 +252,7 @@ def planted_scene(monkeypatch):
     ]
     turns = [(3.0, 1.0), (4.0, nan), (nan, 7.0)]
     monkeypatch.setattr(measuring, "StarJudge", Judge)
-    monkeypatch.setattr(measuring, "off", lambda judge, shown, sky: offs[shown])
+    monkeypatch.setattr(measuring, "off", lambda shown, sky, lost_arcsec: offs[shown])
     monkeypatch.setattr(measuring, "attitude_off_arcsec", lambda shown, sky: turns[shown])
     monkeypatch.setattr(measuring.DrawingChain, "exposed", lambda chain, seen: seen)
     monkeypatch.setattr(measuring.DrawingChain, "sprite_px", lambda chain: "9")

@@ -69,8 +69,8 @@ def test_unseen_bodies_cost_what_they_do_between_steps_of_the_orbit():
         return BodyCost(scene, 9.0, 8.0, 1.0, cpu_ms, discs, 5)
 
     costs = [
-        cost("planets, none in view", 0.4),
         cost("Moon, not in view", 0.7),
+        cost("planets, none in view", 0.4),
         cost("Moon in view, 55 px", 3.0, "Moon"),
         cost("the same, at a step of the orbit", 20.0),
     ]

@@ -301,8 +301,8 @@ def test_a_star_that_is_lost_is_no_nearer_than_one_that_is_found_late(parts):
     (judge,) = scene.judges
     held = ChainCombination("exact", False, bench.faintest_v_mag, "full", "point", "held")
     image_e = scene.tracker.image_e(scene.chain(held).exposed(judge.seen), judge.seen)
-    late = off(judge, judge.measure(image_e), judge.sky)
-    dark = off(judge, judge.measure(np.zeros_like(image_e)), judge.sky)
+    late = off(judge.measure(image_e), judge.sky, judge.lost_arcsec)
+    dark = off(judge.measure(np.zeros_like(image_e)), judge.sky, judge.lost_arcsec)
     assert dark.lost.all() and not late.lost.all()
     assert (
         dark.arcsec.min() > late.arcsec[~late.lost].max() > MATCH_PX * scene.tracker.arcsec_per_px

@@ -366,6 +366,13 @@ def test_the_title_of_spectra_says_what_its_table_holds(models_study):
         assert "{:.1f} % ({:.1f} %)".format(*np.percentile(errors, (50, 95))) in texts["spectra"]
 
 
+def test_the_note_of_spectra_counts_those_beyond_its_dashed_line(made):
+    """The reddest spectra, whose V-I tells little."""
+    vi_mag = made("spectra").table("spectra")["vi_mag"]
+    notes = " ".join(text.get_text().replace("\n", " ") for text in made("spectra").chart.texts)
+    assert f"each held out in turn; {(vi_mag >= 2.5).sum()} are redder than the" in notes
+
+
 def test_a_title_follows_its_data(tmp_path, monkeypatch):
     """A zero point a magnitude brighter is in the title without a change to it."""
     before = zero_points(tmp_path).text

@@ -116,7 +116,7 @@ def further_figures() -> FurtherFigures:
         FigureRow("stamp jitter", "", 0.0004, "s", 0.0003, None),
         FigureRow("rate scale", "cross", 0.02, "1", 0.01, 0.03),
     ]
-    return FurtherFigures(rows, {"rate bias": "too few turns"})
+    return FurtherFigures(rows, {"rate lag": "no acceleration", "rate bias": "too few turns"})
 
 
 def an_assessment() -> Assessment:

@@ -167,6 +167,10 @@ def test_a_frame_is_its_linear_image(bench):
     frame = bench.frame(BELT)
     assert np.shares_memory(np.asarray(frame), frame.linear)
     assert np.asarray(frame, dtype=np.float64).dtype == np.float64
+    assert np.shares_memory(frame.__array__(copy=False), frame.linear)
+    assert not np.shares_memory(np.array(frame), frame.linear)
+    with pytest.raises(ValueError, match="a float32 image as float64 is a copy"):
+        frame.__array__(np.float64, copy=False)
     copied = np.array(frame)
     copied[:] = 0
     assert frame.linear.any()
@@ -181,6 +185,13 @@ def test_a_table_has_units_and_places_that_the_image_has(bench):
     x_px, y_px = frame.wcs.world_to_pixel(SkyCoord(table["ra_deg"], table["dec_deg"]))
     assert x_px == pytest.approx(frame.truth["x_px"], abs=SAME_PX)
     assert y_px == pytest.approx(frame.truth["y_px"], abs=SAME_PX)
+    height, width = frame.linear.shape
+    assert frame.wcs.pixel_shape == (width, height) and width != height
+
+
+def test_an_angle_that_rounds_to_a_whole_turn_is_said_as_none(bench):
+    frame = bench.frame(from_radec_roll_deg(359.9998, 12.0, 359.9997))
+    assert "at RA 0.000, Dec 12.000, roll 0.000 deg" in repr(frame)
 
 
 def test_an_exposures_stars_have_their_places_too(bench):

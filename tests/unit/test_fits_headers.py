@@ -62,6 +62,7 @@ def read_image(cards: dict, pattern: str = "RGGB"):
         ({"EXPTIME": 10}, 10.0),
         ({"EXPTIME": "10.0"}, 10.0),
         ({"EXPTIME": "10 s"}, 10.0),
+        ({"EXPTIME": "1.5 min"}, 90.0),
         ({"EXPTIME": "250 ms"}, 0.25),
         ({"EXPTIME": (250.0, "[ms] exposure time")}, 0.25),
         ({"EXPTIME": (250.0, "Exposure time (ms)")}, 0.25),
@@ -110,6 +111,9 @@ def test_two_exposures_that_differ_are_said():
     found = read_image({"EXPTIME": 10.0, "EXPOSURE": 20.0})
     assert found.exposure_s == 10.0
     assert found.notes == ("EXPTIME says 10 s and EXPOSURE 20 s: EXPTIME is taken",)
+    shorter = read_image({"EXPTIME": 10.0, "EXPOSURE": 5.0})
+    assert shorter.notes == ("EXPTIME says 10 s and EXPOSURE 5 s: EXPTIME is taken",)
+    assert not read_image({"EXPTIME": 10.0, "EXPOSURE": 9.995}).notes  # one of them is rounded
 
 
 def astropy_ns(text: str, scale: str) -> int:
@@ -141,6 +145,7 @@ def astropy_ns(text: str, scale: str) -> int:
         ({"DATE-OBS": "2024-03-01", "MJD-OBS": 60370.5}, "2024-03-01T12:00:05"),
         ({"MJD-OBS": 60370.5}, "2024-03-01T12:00:05"),
         ({"MJD-AVG": 60370.5}, "2024-03-01T12:00:00"),
+        ({"MJD-AVG": 60370.5 + 0.25 / 86400}, "2024-03-01T12:00:00.250"),
         ({"MJD-END": 60370.5}, "2024-03-01T11:59:55"),
         ({"DATE-OBS": "01/03/99", "TIME-OBS": "20:00:00"}, "1999-03-01T20:00:05"),
         ({"DATE-OBS": EIGHT_PM, "TIMESYS": "UTC"}, "2024-03-01T20:00:05"),
@@ -332,10 +337,11 @@ def test_an_extension_s_own_keywords_count_first(own):
     mine = own(mosaic("RGGB"))
     mine.header["EXPTIME"] = 4.0
     assert read_fits_image(file_of(primary, mine)).exposure_s == 4.0
-    apart = fits.ImageHDU(mosaic("RGGB"))
-    apart.header["INHERIT"] = False
-    found = read_fits_image(file_of(primary, apart))
-    assert (found.bayer, found.exposure_s, found.t_ns) == ("", None, None)
+    for no in (False, "F"):
+        apart = fits.ImageHDU(mosaic("RGGB"))
+        apart.header["INHERIT"] = no
+        found = read_fits_image(file_of(primary, apart))
+        assert (found.bayer, found.exposure_s, found.t_ns) == ("", None, None)
 
 
 def test_the_first_of_several_images_is_taken_and_said():

@@ -202,8 +202,11 @@ def test_a_rotation_of_something_else(mistake, said):
 
 
 def test_a_declination_beyond_the_pole_is_refused():
-    with pytest.raises(hilstar.InputError, match="dec_deg = 95: a declination is from -90 to 90"):
-        rotation.from_radec_roll_deg(84, 95, 0)
+    for dec_deg in (95, -95):
+        said = f"dec_deg = {dec_deg}: a declination is from -90 to 90"
+        with pytest.raises(hilstar.InputError, match=said):
+            rotation.from_radec_roll_deg(84, dec_deg, 0)
+    assert rotation.from_radec_roll_deg(84, -90, 0).shape == (4,)
 
 
 def test_an_exposure_is_an_array_of_its_dn(bench):

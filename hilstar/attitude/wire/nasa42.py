@@ -15,6 +15,7 @@ hilstar connects, and retries until 42 is there, or listens where 42 is the clie
 """
 
 import re
+from calendar import isleap
 from collections.abc import Sequence
 from datetime import date
 
@@ -177,7 +178,9 @@ def _time_ns(text: str) -> int | None:
     if match is None:
         return None
     year, day_of_year, hour, minute, second = (int(part) for part in match.groups()[:5])
-    if not (year >= 1 and 1 <= day_of_year <= 366 and hour < 24 and minute < 60 and second <= 60):
+    if not (year >= 1 and hour < 24 and minute < 60 and second <= 60):
+        return None
+    if not 1 <= day_of_year <= 365 + isleap(year):
         return None
     days = date(year, 1, 1).toordinal() - 1 + day_of_year - EPOCH_DAY
     seconds = days * SECONDS_PER_DAY + hour * 3600 + minute * 60 + second

@@ -616,8 +616,7 @@ class Renderer(Backend):
 
     def forget_images(self) -> None:
         """See `Backend.forget_images`."""
-        self._last_count = None
-        self._levels_black = False
+        self._last_count = None  # so that all is cleared
         self._floor_encoder = None
         self._floor_levels = None
         with self._ctx:

@@ -26,8 +26,7 @@ from hilstar.optics.camera import Camera
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.cameras import bench_camera
 from hilstar.server.bench.config.bench_config import jyear
-from hilstar.server.bench.star_light import bench_moving, catalogue_choice
-from hilstar.sky.star_table import choose_catalog
+from hilstar.server.bench.star_light import bench_moving, star_catalog
 from hilstar.sky.stars import unit_vectors_icrs
 
 if TYPE_CHECKING:
@@ -63,11 +62,9 @@ class StarMotion:
         """The stars of a bench file, seen on its display or in the sky. Raises InputError as its
         catalogue does.
         """
-        sky = file.config.sky
-        catalog = choose_catalog(catalogue_choice(file.config, file.folder))
-        catalog = catalog.brighter_than(sky.faintest_v_mag)
+        catalog = star_catalog(file.config, file.folder)
         catalog = catalog.taken(np.argsort(catalog.v_mag, kind="stable"))
-        date = sky.epoch_jyear
+        date = file.config.sky.epoch_jyear
         before = unit_vectors_icrs(catalog, date - 0.5)
         after = unit_vectors_icrs(catalog, date + 0.5)
         vectors = unit_vectors_icrs(catalog, date)

@@ -7,6 +7,7 @@ asked for, so none of these figures is a reason against a bench.
 
 import math
 from dataclasses import dataclass
+from typing import Self, TypeGuard
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import from_radec_roll_deg, propagate, random_attitude
 from hilstar.basics.units import magnitude
 from hilstar.display.quantise import MASK_TURNS
-from hilstar.instruments.simulate.star_finder import StarFinder, star_finder
+from hilstar.instruments.simulate.star_finder import Matched, StarFinder, star_finder
 from hilstar.instruments.simulate.twin import Twin, exposure_lights
 from hilstar.optics.layers.fault_kinds import (
     AttitudeStep,
@@ -38,6 +39,7 @@ from hilstar.server.bench.scenario import Scenario, lasts_ns
 OFF_AXIS = 0.4  # a fault is placed within this share of the field's radius
 OFF_FIELD = 1.2  # where a glow's is
 WINDOW_SIGMAS = 6.0
+NOT_ON_IMAGE = "not on the tracker's image"
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +71,34 @@ class _Shot:
     frame: Frame
 
 
+@dataclass(frozen=True, slots=True)
+class FaultWindow:
+    """The square of a detector in which a point's light is summed: `reach_px` to each side of its
+    middle pixel.
+    """
+
+    resolution_px: tuple[int, int]
+    reach_px: int
+
+    @classmethod
+    def of(cls, resolution_px: tuple[int, int], width_px: tuple[float, float]) -> Self:
+        """WINDOW_SIGMAS of the wider axis of a PSF, and a pixel more."""
+        return cls(resolution_px, math.ceil(WINDOW_SIGMAS * max(width_px)) + 1)
+
+    def is_whole(self, place_px: FloatArray) -> bool:
+        """Whether the window about a place (x, y) is whole on the detector."""
+        x, y = place_px
+        width, height = self.resolution_px
+        reach = self.reach_px
+        return bool(reach <= x < width - reach and reach <= y < height - reach)
+
+    def about(self, place_px: FloatArray) -> tuple[slice, slice]:
+        """The rows and the columns of the window about a place (x, y)."""
+        reach = self.reach_px
+        x, y = np.rint(place_px).astype(int).tolist()
+        return slice(y - reach, y + reach + 1), slice(x - reach, x + reach + 1)
+
+
 class FaultyFields:
     """Shows faults one by one on a twin's bench."""
 
@@ -79,6 +109,7 @@ class FaultyFields:
         self._faults = scenario.prepared(self._view.prepare)
         self._finder: StarFinder = star_finder(twin.bench, twin.monitor_px_per_px)
         self._view_rad = twin.camera.field_radius_rad(0.0)
+        self._window = FaultWindow.of(twin.camera.resolution_px, self._finder.psf.width_px)
 
     def seen(self) -> list[FaultSeen]:
         """Every fault of the scenario, in its order."""
@@ -91,10 +122,9 @@ class FaultyFields:
                 fault.KIND,
                 note="of the run's frames: a field that stands still has none",
             )
-        q = self._attitude(fault)
+        q = attitude_at(fault, self._direction(fault), self._view_rad, self._rng)
         first_frame = int(self._rng.integers(0, MASK_TURNS))
-        since_ns = (lasts_ns(fault) or 0) // 2
-        effects = FaultLayer(self._view, (Now(1, fault, since_ns),))
+        effects = FaultLayer(self._view, (Now(1, fault, looked_at_ns(fault)),))
         plain = self._shot(q, first_frame, None)
         faulty = self._shot(q, first_frame, effects)
         if isinstance(fault, AttitudeStep):
@@ -103,35 +133,11 @@ class FaultyFields:
             return FaultSeen(
                 fault.name, fault.KIND, asked_e=0.0, seen_e=float(faulty.shown_e.sum())
             )
-        return self._compared(fault, plain, faulty)
-
-    def _compared(self, fault: Fault, plain: _Shot, faulty: _Shot) -> FaultSeen:
-        asked = faulty.asked_e - plain.asked_e
-        shown = faulty.shown_e - plain.shown_e
-        if isinstance(fault, PointLight | StarGone):
-            source = plain if isinstance(fault, StarGone) else faulty
-            place = self._place_px(fault, source.frame)
-            if place is None or not self._whole(place):
-                return FaultSeen(fault.name, fault.KIND, note="not on the tracker's image")
-            window = self._window(place)
-            asked = asked[window]
-            shown = shown[window]
-        asked_e = float(asked.sum())
-        seen_e = float(shown.sum())
-        if not abs(asked_e) > 0:
-            return FaultSeen(
-                fault.name,
-                fault.KIND,
-                asked_e=0.0,
-                seen_e=seen_e,
-                note="not on the tracker's image",
-            )
-        share = seen_e / asked_e
-        flux_mag = magnitude(share) if share > 0 else None
-        off_px = None
-        if isinstance(fault, PointLight | StarGone) and share > 0:
-            off_px = float(np.hypot(*(_middle(shown) - _middle(asked))))
-        return FaultSeen(fault.name, fault.KIND, asked_e, seen_e, flux_mag, off_px)
+        source = plain if isinstance(fault, StarGone) else faulty
+        place_px = self._place_px(fault, source.frame) if _has_place(fault) else None
+        asked_e = faulty.asked_e - plain.asked_e
+        shown_e = faulty.shown_e - plain.shown_e
+        return fault_seen(fault, asked_e, shown_e, place_px, self._window)
 
     def _shot(self, q: FloatArray, first_frame: int, effects: FaultLayer | None) -> _Shot:
         twin = self._twin
@@ -141,20 +147,6 @@ class FaultyFields:
         asked = twin.sky_optics.image_e_per_s(frame.linear) * exposure_s
         shown = twin.true_optics.images_e_per_s(lights[0], twin.primaries).sum(axis=0) * exposure_s
         return _Shot(asked, shown, frame)
-
-    def _attitude(self, fault: Fault) -> FloatArray:
-        """An attitude at which a fault falls on the image; any one where that does not matter."""
-        rng = self._rng
-        toward = self._direction(fault)
-        if toward is None:
-            return random_attitude(rng)
-        ra_deg = np.degrees(np.arctan2(toward[1], toward[0]))
-        dec_deg = np.degrees(np.arcsin(np.clip(toward[2], -1, 1)))
-        q = from_radec_roll_deg(float(ra_deg), float(dec_deg), float(rng.uniform(0, 360)))
-        angle = rng.uniform(0, 2 * np.pi)
-        off = OFF_FIELD if isinstance(fault, Glow) else OFF_AXIS * math.sqrt(rng.random())
-        axis_cam = np.array([math.cos(angle), math.sin(angle), 0.0])
-        return propagate(q, off * self._view_rad * axis_cam, 1.0)
 
     def _direction(self, fault: Fault) -> FloatArray | None:
         """A fault's place on the sky; None where it has none of its own."""
@@ -182,37 +174,81 @@ class FaultyFields:
         x_px, y_px = self._twin.assumed_geometry.to_tracker(row["x_px"], row["y_px"])
         return np.array([x_px[0], y_px[0]])
 
-    def _whole(self, place_px: FloatArray) -> bool:
-        """Whether the window about a place is whole on the detector."""
-        x, y = place_px
-        width, height = self._twin.camera.resolution_px
-        reach = self._reach_px()
-        return bool(reach <= x < width - reach and reach <= y < height - reach)
-
-    def _reach_px(self) -> int:
-        """How far a window reaches from its middle pixel."""
-        return math.ceil(WINDOW_SIGMAS * max(self._finder.psf.width_px)) + 1
-
-    def _window(self, place_px: FloatArray) -> tuple[slice, slice]:
-        """The rows and columns of the window about a place."""
-        reach = self._reach_px()
-        x, y = np.rint(place_px).astype(int).tolist()
-        return slice(y - reach, y + reach + 1), slice(x - reach, x + reach + 1)
-
     def _stars_off_px(self, shot: _Shot) -> float | None:
         """Median distance, px, of the stars shown with a wrong attitude from their places by that
         attitude; None without a match.
         """
         truth = shot.frame.rows
         x_px, y_px = self._twin.assumed_geometry.to_tracker(truth["x_px"], truth["y_px"])
-        match = self._finder.match(shot.shown_e, x_px, y_px)
-        is_matched = match.index >= 0
-        if not is_matched.any():
-            return None
-        source = match.index[is_matched]
-        right_px = match.found.x_px[source] - x_px[is_matched]
-        down_px = match.found.y_px[source] - y_px[is_matched]
-        return float(np.median(np.hypot(right_px, down_px)))
+        return median_off_px(self._finder.match(shot.shown_e, x_px, y_px), x_px, y_px)
+
+
+def _has_place(fault: Fault) -> TypeGuard[PointLight | StarGone]:
+    """Whether a fault is one point of an image, as a glow is not."""
+    return isinstance(fault, PointLight | StarGone)
+
+
+def looked_at_ns(fault: Fault) -> int:
+    """How long after its beginning a fault is looked at: half way through, or at its beginning
+    where it never ends.
+    """
+    return (lasts_ns(fault) or 0) // 2
+
+
+def attitude_at(
+    fault: Fault, toward: FloatArray | None, view_rad: float, rng: np.random.Generator
+) -> FloatArray:
+    """An attitude at which a fault in the direction `toward` (3,), ICRS, falls on the image of a
+    field of this radius; any one where it has no direction.
+    """
+    if toward is None:
+        return random_attitude(rng)
+    ra_deg = np.degrees(np.arctan2(toward[1], toward[0]))
+    dec_deg = np.degrees(np.arcsin(np.clip(toward[2], -1, 1)))
+    q = from_radec_roll_deg(float(ra_deg), float(dec_deg), float(rng.uniform(0, 360)))
+    angle = rng.uniform(0, 2 * np.pi)
+    off = OFF_FIELD if isinstance(fault, Glow) else OFF_AXIS * math.sqrt(rng.random())
+    axis_cam = np.array([math.cos(angle), math.sin(angle), 0.0])
+    return propagate(q, off * view_rad * axis_cam, 1.0)
+
+
+def fault_seen(
+    fault: Fault,
+    asked_e: FloatArray,
+    shown_e: FloatArray,
+    place_px: FloatArray | None,
+    window: FaultWindow,
+) -> FaultSeen:
+    """What a fault adds to an image (h, w), electrons, as asked for and as shown; of a point what
+    it adds within the window about its place, None where it has none on the image.
+    """
+    if _has_place(fault):
+        if place_px is None or not window.is_whole(place_px):
+            return FaultSeen(fault.name, fault.KIND, note=NOT_ON_IMAGE)
+        rows_and_columns = window.about(place_px)
+        asked_e = asked_e[rows_and_columns]
+        shown_e = shown_e[rows_and_columns]
+    asked_sum_e = float(asked_e.sum())
+    shown_sum_e = float(shown_e.sum())
+    if not abs(asked_sum_e) > 0:
+        return FaultSeen(fault.name, fault.KIND, asked_e=0.0, seen_e=shown_sum_e, note=NOT_ON_IMAGE)
+    share = shown_sum_e / asked_sum_e
+    flux_mag = magnitude(share) if share > 0 else None
+    off_px = None
+    if _has_place(fault) and share > 0:
+        off_px = float(np.hypot(*(_middle(shown_e) - _middle(asked_e))))
+    return FaultSeen(fault.name, fault.KIND, asked_sum_e, shown_sum_e, flux_mag, off_px)
+
+
+def median_off_px(match: Matched, x_px: FloatArray, y_px: FloatArray) -> float | None:
+    """The median distance of the matched stars from their places (n,), px; None without a match."""
+    is_matched = match.index >= 0
+    if not is_matched.any():
+        return None
+    source = match.index[is_matched]
+    right_px = match.found.x_px[source] - x_px[is_matched]
+    down_px = match.found.y_px[source] - y_px[is_matched]
+    return float(np.median(np.hypot(right_px, down_px)))
 
 
 def _middle(light: FloatArray) -> FloatArray:

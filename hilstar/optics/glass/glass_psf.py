@@ -57,6 +57,7 @@ SMALLEST, DARK = 1e-15, 1e-12  # numbers, and illuminations, that count as none
 SPRITES_AT_ONCE_PX = 2_000_000  # bounds the memory: their stamps take 8 MB
 # samples to a pixel; rounds in which a weight becomes as wide as a PSF
 MIN_REGRIDDED, WIDTH_ROUNDS = 4, 20
+FINE_STEPS_A_PX = 4  # of the light whose Gaussian is sought
 # basis images of the simpler glasses that may stand for one
 COMPONENTS = (3, 6, 12)
 
@@ -720,15 +721,19 @@ def as_gaussians(psf: GlassPsf) -> GlassPsf:
     widths by adaptive moments.
     """
     optics = psf.optics
-    side = psf.footprint_px
     _, height, width = optics.basis.shape
-    pixel = _grid_offsets(side, side)
     place = _grid_offsets(height, width) / psf.per_px
-    stamps = psf._centred().astype(np.float64)
+    # Whole pixels are too far apart for the weight, which is narrower than a PSF.
+    at_px = offsets(psf.footprint_px * FINE_STEPS_A_PX | 1) / FINE_STEPS_A_PX
+    down = _pixels_of(height, psf.per_px, at_px, psf.pixel_integrated)
+    across = _pixels_of(width, psf.per_px, at_px, psf.pixel_integrated)
+    fine_px = _grid_offsets(len(at_px), len(at_px)) / FINE_STEPS_A_PX
     centroids = psf.moved_px.reshape(-1, 2)
     images = []
-    for stamp, centroid in zip(stamps, centroids, strict=True):
-        spread = _adaptive_spread(stamp, pixel - centroid)
+    for weights, centroid in zip(psf._psf_weights, centroids, strict=True):
+        image = np.tensordot(weights, optics.basis, axes=1)
+        light = (down @ image @ across.T).ravel()
+        spread = _adaptive_spread(light, fine_px - centroid)
         if not psf.pixel_integrated:
             spread = spread - np.eye(2) * PIXEL_VARIANCE
         images.append(_gaussian(place - centroid, spread))

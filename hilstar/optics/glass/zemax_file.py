@@ -491,9 +491,11 @@ class _Reader(LensFileReader):
                 arms = int(line.value(1))
                 yield Aperture("spider", (first / 2, 0.0), False, centre_mm=centre, arms=arms)
                 continue
-            if second <= 0 or first < 0:
+            # A circle's first number is its inner radius, which may be 0.
+            is_circle = line.keyword in {"CLAP", "FLAP", "OBSC"}
+            if second <= 0 or first < 0 or (first == 0 and not is_circle):
                 line.refuse(f"at surface {surface.number} has no size", "write its half-width")
-            if line.keyword in {"CLAP", "FLAP", "OBSC"}:
+            if is_circle:
                 # A floating aperture is the surface's own edge, so it is not moved.
                 place = (0.0, 0.0) if line.keyword == "FLAP" else centre
                 yield Aperture("circle", (second, second), is_clear, first, place)

@@ -319,13 +319,8 @@ def test_what_a_bench_cannot_do_is_refused_before_the_first_case(
     assert not (tmp_path / "out").exists() or not list((tmp_path / "out").glob("journal/*"))
 
 
-def test_options_of_the_other_kind_and_a_bench_without_answers_are_refused(tmp_path: Path) -> None:
+def test_a_bench_without_answers_is_refused(tmp_path: Path) -> None:
     write_bench(tmp_path, cases=4)
-    assert_refused(
-        run_hilstar_here(*COMMAND, "--workers", "2", cwd=tmp_path),
-        2,
-        "--workers: is for through = tracker",
-    )
     text = (tmp_path / "bench.toml").read_text()
     (tmp_path / "bench.toml").write_text(text[: text.index("[answers]")])
     assert_refused(

@@ -43,7 +43,7 @@ def test_where_a_star_clips_and_where_it_shows_nothing_is_where_frames_say_so(be
     """
     bench = bench_with('[render]\nquantisation = "round"\nflux_at_white_e_per_s = 1e8\n')
     found = budget(bench)
-    zero_mag = zero_point_mag(bench)
+    zero_mag = zero_point_mag(bench.stars)
     white_rate, dark_rate = (
         10 ** (0.4 * (zero_mag - v)) for v in (found.clips_v_mag, found.nothing_v_mag)
     )

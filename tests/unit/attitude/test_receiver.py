@@ -671,6 +671,13 @@ def test_a_clock_that_is_not_shared_is_said_once(offset_s, refused):
     assert run.counts.refused_by["time"] == (800 if refused else 0)
 
 
+@pytest.mark.parametrize(("packets", "told"), [(2, {}), (3, {"clock-not-shared": 1})])
+def test_three_packets_ahead_of_a_shared_clock_are_told_and_two_are_not(packets, told):
+    sender = Sender(offset_ns=NS_PER_S // 10)
+    times = range(0, packets * NS_PER_S, NS_PER_S)
+    assert ReceiverRun(lambda t0: sender.packets(t0, times), SHARED).events == told
+
+
 class SteppingUnixTime:
     """This machine's clock of Unix time: `error_ns` as its kernel states it, and a step after so
     many readings.

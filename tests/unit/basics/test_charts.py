@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 import re
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -13,6 +14,19 @@ from matplotlib.figure import Figure
 from hilstar.basics import charts
 from tests.support.figures import two_lines
 from tests.support.pictures import assert_drawn
+
+
+@dataclass(frozen=True)
+class Record:
+    """A row of a table."""
+
+    name: str
+    error_px: float
+
+
+def test_a_table_of_records_has_a_column_a_field_and_a_row_a_record(tmp_path):
+    charts.write_records(tmp_path / "t.csv", [Record("a, b", 0.5), Record("c", 1e-9)])
+    assert (tmp_path / "t.csv").read_text() == 'name,error_px\n"a, b",0.5\nc,1e-09\n'
 
 
 def test_a_chart_is_written_for_light_and_dark_pages(tmp_path):
@@ -55,6 +69,7 @@ def test_colours_stand_out_on_both_pages(paper):
         ((0.0009, 0.7), [0.001, 0.003, 0.01, 0.03, 0.1, 0.3]),
         ((0.026, 0.14), [0.03, 0.04, 0.05, 0.07, 0.1]),
         ((1e-13, 10), [1e-12, 1e-10, 1e-8, 1e-6, 1e-4, 1e-2, 1]),
+        ((1e-22, 10), [1e-21, 1e-18, 1e-15, 1e-12, 1e-9, 1e-6, 1e-3, 1]),
     ],
 )
 def test_ticks_are_round_and_names_at_the_side_keep_apart(limits, ticks):

@@ -4,6 +4,7 @@ line, and never awaited.
 
 from __future__ import annotations
 
+import io
 import os
 import socket
 from pathlib import Path
@@ -254,3 +255,12 @@ def test_a_room_names_the_kinds_of_files_that_it_reads_once(monkeypatch):
     assert reading.kind_of(b"\x89PNG\r\n") == "a picture of ours"
     assert reading.kind_of(b"PK\x03\x04") == "a zip archive"
     assert len(asked) == 3
+
+
+def test_a_file_that_has_just_come_is_not_kept_whatever_age_it_states(tmp_path):
+    """A copy keeps its original's time; the next one may come within the same tick."""
+    path = tmp_path / "a.txt"
+    path.write_text("a")
+    os.utime(path, (1e9, 1e9))
+    with reading.open_named(path, "give a file", 100) as file:
+        assert not isinstance(file, io.BytesIO)

@@ -448,6 +448,16 @@ def test_rows_that_begin_with_their_numbers_from_0_or_1_have_a_column_more(first
         assert "each row begins with its number" in table.notices[0]
     else:
         assert "3 cells and 2 columns" in refusal(lambda: list(table.rows()))
+    # numbers that do not follow each other are no rows' own
+    apart = opened("t_s,a\n" + rows.replace(f"{first + 2},", "9,"))
+    assert "3 cells and 2 columns" in refusal(lambda: list(apart.rows()))
+
+
+def test_what_parts_the_cells_leaves_more_numbers_where_two_would_give_alike_rows():
+    """Words with blanks between them are more cells, none of which is a number."""
+    table = opened("kind of star,value\nred and big,5\nblue and small,7\n")
+    assert [column.name for column in table.columns] == ["kind of star", "value"]
+    assert [cells for _, cells in table.rows()] == [["red and big", "5"], ["blue and small", "7"]]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ and the budget are the test's.
 
 from __future__ import annotations
 
+import datetime
 import hashlib
 import json
 import math
@@ -17,7 +18,7 @@ from hilstar.instruments.calibrate.warm_up import WarmUp
 from hilstar.instruments.certify import certificate as certificates
 from hilstar.instruments.certify import check as checks
 from hilstar.instruments.certify.check import CheckFigure
-from hilstar.instruments.certify.readings import VirtualReader
+from hilstar.instruments.certify.readings import ImageReader, VirtualReader
 from tests.support.benches import bench_text
 from tests.support.commands import run_hilstar_here
 from tests.unit.server.bench.test_certificate_file import certificate
@@ -51,6 +52,43 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 
     monkeypatch.setattr(certificates, "certify", certified)
     return made
+
+
+class Source:
+    """A source of images, which tells what it was asked before it has taken one."""
+
+    identity, monitor = "a camera, serial 7", None
+
+    def __init__(self) -> None:
+        self.asked: list[Any] = []
+
+    def find_monitor(self, file: Any, today: datetime.date, *, force: bool) -> None:
+        self.asked.append(
+            (file.path.name, (datetime.datetime.now(datetime.UTC).date() - today).days, force)
+        )
+
+    def gate(self, file: Any) -> None:
+        self.asked.append("gate")
+
+    def close(self) -> None:
+        self.asked.append("closed")
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_images_of_a_camera_are_read_past_the_gate_of_the_monitor_that_is_there(
+    folder: Path, asked: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch, again: bool
+) -> None:
+    source = Source()
+    monkeypatch.setattr("hilstar.cli.certify.image_source", lambda file, images: source)
+    done = certify(folder, "--grab", "take {output}", *["--again"] * again)
+    assert done.returncode == 0, done.stderr
+    reader = asked[0]["reader"]
+    assert isinstance(reader, ImageReader) and reader.source is source
+    assert reader.truth is None and not reader.folder.exists()
+    (monitor, *rest) = source.asked
+    assert monitor in {("bench.toml", days, again) for days in (0, 1)}  # around midnight
+    assert rest == ["gate", "closed"]
+    assert "images by a camera, serial 7" in done.stderr
 
 
 def test_a_certificate_is_kept_with_its_page_and_said_with_the_digest_of_its_file(

@@ -88,3 +88,17 @@ def test_limits_that_are_not_stated_are_the_usual_ones_and_0_is_stated(asked):
     assert (frame, golden, usual["truth"].name) == ("a.fits", "b.fits", "t.csv")
     assert (usual["flux_mag"], usual["centroid_px"]) == (0.001, 0.001)
     assert stated["flux_mag"] == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "limits"),
+    [
+        ("", (1e-3, 1e-3)),
+        ("--flux-mag 0.5", (0.5, 1e-3)),
+        ("--centroid-px 0.5", (1e-3, 0.5)),
+    ],
+)
+def test_a_limit_that_is_not_given_is_a_thousandth(asked, words, limits):
+    run_hilstar_here("compare", "frame.fits", "golden.fits", *words.split())
+    ((_, _, given),) = asked
+    assert (given["flux_mag"], given["centroid_px"]) == limits

@@ -16,7 +16,7 @@ from msgspec.structs import replace as replaced
 from hilstar.attitude.receiver import PacketCounts
 from hilstar.basics.errors import InputError, MachineError
 from hilstar.basics.notices import Notices
-from hilstar.cli import image_source, running
+from hilstar.cli import first_light, image_source, running
 from hilstar.cli.image_source import DotOptions, dot_images
 from hilstar.cli.running import (
     ActingPageOptions,
@@ -345,6 +345,22 @@ def test_a_page_follows_a_run_after_its_status_and_hands_on_what_is_asked_there(
         ("status", "a frame"),
         ("page", "a frame"),
     ]
+
+
+def test_a_session_s_lines_go_to_the_terminal_and_to_its_page(monkeypatch, capsys):
+    told: list[object] = []
+    file, listener = object(), object()
+
+    def session_page(*given):
+        assert given == (listener, True, file)
+        return nullcontext(SimpleNamespace(say=told.append, show=told.append))
+
+    monkeypatch.setattr("hilstar.server.console.publisher.session_page", session_page)
+    for page, heard in ((None, []), (listener, ["step 2", "a pattern"])):
+        with first_light._shown(page, True, file) as (tell, show):
+            tell("step 2")
+            show("a pattern")
+        assert told == heard and capsys.readouterr().err == "step 2\n"
 
 
 def test_answers_are_taken_and_frames_are_fed_while_a_run_lasts(tmp_path, monkeypatch, capsys):

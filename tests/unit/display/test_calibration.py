@@ -108,6 +108,12 @@ def test_codes_between_the_rows_follow_the_light_s_power(write):
     # A power law is a straight line in log light over log code, which PCHIP keeps; so is what lies
     # below the first row.
     assert calibration.response.light == pytest.approx((np.arange(256) / 255) ** 2.2, rel=1e-9)
+    # below the first row the power is that of the first two
+    steep = rows.replace("4,", "4,", 1).splitlines()
+    steep[1] = f"4,{0.25 + 250 * (16 / 255) ** 2.2 / 4**3!r}"
+    path = write(HEAD.replace("bits = 2", "bits = 8"), "\n".join(["code,w", *steep, ""]))
+    light = load_calibration(path, 8).response.light
+    assert light[[1, 2, 3]] / light[4] == pytest.approx((np.arange(1, 4) / 4) ** 3, rel=1e-9)
 
 
 def test_uniformity_is_bilinear_between_the_middles_of_its_fields(write):
@@ -120,6 +126,16 @@ def test_uniformity_is_bilinear_between_the_middles_of_its_fields(write):
 
 
 NOISE = "[weights]\nr = 2\ng = 5\nb = 1\n[noise]\nrelative = 0.013\n"
+ERRORS = """[errors]
+light = [0.5, 1.0]
+off = [0.01, -0.02]
+relative = [0.003, 0.004]
+dof = 7
+[notes]
+text = "by night"
+[monitor_identity]
+serial = "ABC12"
+"""
 
 
 def test_uniformity_that_falls_steeply_ends_at_half_its_darkest_field(write):
@@ -137,12 +153,14 @@ def test_uniformity_that_falls_steeply_ends_at_half_its_darkest_field(write):
 def test_a_calibration_with_another_grid_of_light_is_else_as_it_was(write, tmp_path, source):
     """A grid of two columns and three rows, rows from the top; without one the light is even."""
     if source != "gamma2.2":
-        source = write(HEAD + NOISE, TABLE if source == "grey" else RGB)
+        source = write(HEAD + NOISE + ERRORS, TABLE if source == "grey" else RGB)
+        file = read_toml(source)
+        assert (file.errors.black, file.errors.common) == (0.0, None)
     before = load_calibration(source, 2)
     grid = np.array([[1.0, 0.8], [0.9, 0.7], [0.6, 0.5]])
     path = tmp_path / "even" / "other.toml"
     path.parent.mkdir()
-    for relative in (0.02, None):
+    for relative in (0.02345, None):
         files = with_uniformity(source, 2, path, grid, when="2026-11-29", relative=relative)
         names = ["other.toml", "other.csv", "other-uniformity.csv"]
         assert [file.name for file in files] == names
@@ -152,6 +170,11 @@ def test_a_calibration_with_another_grid_of_light_is_else_as_it_was(write, tmp_p
         assert after.response.light == pytest.approx(before.response.light, rel=1e-6)
         assert after.weights == pytest.approx(before.weights, rel=1e-6)
         assert after.noise == pytest.approx(before.noise, rel=1e-6)
+        assert after.notes == before.notes
+        if source != "gamma2.2":
+            again = read_toml(path)
+            kept = again.errors, again.notes, again.monitor_identity
+            assert kept == (file.errors, file.notes, file.monitor_identity)
     assert with_uniformity(source, 2, path, None, when="2026-11-29") == files[:2]
     assert load_calibration(path, 2).uniformity_map((2, 3)) is None
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilstar.display.exact import ExactQuantiser
+from hilstar.display.exact import ExactQuantiser, Turn
 from hilstar.display.footprints import LEAST_LIGHT, FootprintMap, PixelOrder, star_losses_mag
 from hilstar.display.panel import Panel
 from hilstar.display.quantise import round_levels, shown_light
@@ -231,6 +231,26 @@ def test_a_long_path_is_begun_anew_after_32_sprites():
     assert np.array_equal(levels, exact(parted, panel, size))
     sooner = replace(whole, star=np.arange(35) // 31, per_star=31)
     assert not np.array_equal(levels, exact(sooner, panel, size))
+
+
+def test_a_path_is_drawn_as_by_itself_whatever_is_drawn_beside_it_and_in_panels_before():
+    """Of 24 sprites and of 3, whose reach is that of the light of their own path. What a panel
+    before left of a path is no star's.
+    """
+    panel = Panel(srgb_response(8), WHITE)
+    counts, steps = np.array([24, 3]), np.array([5.0, 2.3])
+    star = np.repeat([0, 1], counts)
+    along_px = 10 + 3.3 * np.concatenate([np.arange(count) for count in counts])
+    rates = steps[star] * panel.response.light[1] * WHITE
+    both = replace(sprites_at(along_px, 12.3 + 40 * star, rates), star=star, per_star=24)
+    short = replace(both, data=both.data[24:], star=star[24:], per_star=3)
+    levels = exact(both, panel)
+    np.testing.assert_array_equal(levels[40:], exact(short, panel)[40:])
+    assert levels[40:].any()
+    before, after = (ExactQuantiser(panel, FIELD, GaussianPsf(SIGMA)) for _ in range(2))
+    before.levels(both)
+    after.turn, after.before = Turn((1.0,)), [before]
+    np.testing.assert_array_equal(after.levels(both), levels)
 
 
 def test_no_floor_remains_of_the_frame_before():

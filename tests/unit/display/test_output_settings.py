@@ -124,6 +124,7 @@ def test_a_mode_transform_or_path_that_changes_frames_is_told_with_what_mends_it
 
 def test_a_plain_output_has_no_findings_nor_one_without_a_preferred_mode():
     assert not list(findings(PLAIN, 8, 277.0))
+    assert not list(findings(replace(PLAIN, transform=(1, 0, 0, 0, 1, 0, 0, 0, 1)), 8))
     assert not list(findings(replace(PLAIN, preferred_px=(), providers=("one",)), 8))
 
 

@@ -58,6 +58,10 @@ GEOMETRIES = [
         GEOMETRY + "[error]\nalignment_covariance_arcsec2 = [[1.0, 0.0], [0.0, 1.0]]\n",
         ": ...alignment_covariance_arcsec2 is not 3 by 3",
     ),
+    (
+        GEOMETRY + "[error]\nalignment_covariance_arcsec2 = [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]]\n",
+        ": ...alignment_covariance_arcsec2 is not 3 by 3",
+    ),
 ]
 
 

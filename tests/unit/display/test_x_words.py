@@ -7,13 +7,14 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import struct
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hilstar.display.window import randr, x11
-from hilstar.display.window.awake import Blanking, SetAside
+from hilstar.display.window.awake import Blanking, SetAside, _Server
 from hilstar.display.window.output_settings import OutputState
 from hilstar.display.window.randr import (
     GammaInfo,
@@ -37,6 +38,7 @@ from hilstar.display.window.x11 import (
     SyncControl,
     back_buffer,
     is_end_of_window,
+    sync_control,
 )
 
 # X.h
@@ -306,6 +308,57 @@ def test_what_somebody_sets_meanwhile_comes_back_and_what_stands_at_the_end_stay
     assert aside.to_restore(saver) is None
 
 
+class StandIn:
+    """Stands for libX11 and libXext before a server with DPMS: no server that runs without a
+    monitor has it.
+    """
+
+    def __init__(self) -> None:
+        self.saver, self.level, self.on, self.calls = [600, 300, 1, 1], 3, 1, []
+        self.XOpenDisplay = lambda _: 1  # takes an attribute, as a function of ctypes does
+
+    def DPMSQueryExtension(self, *_: object) -> int:
+        return 1
+
+    def DPMSCapable(self, _: object) -> int:
+        return 1
+
+    def DPMSInfo(self, _: object, level: ctypes.c_ushort, on: ctypes.c_ubyte) -> None:
+        level._obj.value, on._obj.value = self.level, self.on
+
+    def XGetScreenSaver(self, _: object, *parts: ctypes.c_int) -> None:
+        for part, value in zip(parts, self.saver, strict=True):
+            part._obj.value = value
+
+    def XSetScreenSaver(self, _: object, *parts: int) -> None:
+        self.saver = list(parts)
+
+    def __getattr__(self, name: str) -> Callable[..., None]:
+        return lambda _, *words: self.calls.append((name, *words))
+
+
+def test_standby_is_ended_prevented_and_restored(monkeypatch):
+    library = StandIn()
+    monkeypatch.setattr(ctypes, "CDLL", lambda _: library)
+    server = _Server()
+    before = server.blanking()
+    assert before == (600, 300, 1, 1, True) and before.happens
+    server.prevent(before)
+    assert [name for name, *_ in library.calls] == [
+        "DPMSForceLevel",
+        "DPMSDisable",
+        "XForceScreenSaver",
+        "XSync",
+    ]
+    library.on = 0  # as the server has it after that
+    assert not server.blanking().happens
+    server.restore(before)
+    assert library.calls[-2][0] == "DPMSEnable" and library.saver == [600, 300, 1, 1]
+    library.calls.clear()
+    server.restore(before._replace(dpms=False))
+    assert [name for name, *_ in library.calls] == ["XSync"]
+
+
 class Driver:
     """A driver with GLX_OML_sync_control and framebuffers, called as its definitions say."""
 
@@ -349,6 +402,12 @@ def test_the_time_of_a_swap_is_the_drivers_microseconds_in_nanoseconds():
     """GLX_OML_sync_control: "UST is ... in microseconds"."""
     assert SyncControl(Driver(1_234_567_891), 1, 2).swap_ns() == 1_234_567_891_000
     assert SyncControl(Driver(None), 1, 2).swap_ns() is None
+
+
+def test_without_a_driver_that_tells_of_swaps_there_is_no_sync_control():
+    assert sync_control(None, None) is None
+    assert sync_control(0, 5) is None
+    assert sync_control(5, 0) is None
 
 
 @pytest.mark.parametrize("sizes", [(8, 8, 8), (2, 10, 10), (5, 6, 5), (11, 11, 10)])

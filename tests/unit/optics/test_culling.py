@@ -11,6 +11,7 @@ import pytest
 
 from hilstar.basics.rotation import normalise, to_matrix
 from hilstar.display.geometry import monitor_camera
+from hilstar.optics import sprites as sprites_module
 from hilstar.optics.camera import Camera
 from hilstar.optics.psf import GaussianPsf, pixel_shares
 from hilstar.optics.sprites import CLIP_TOLERANCE, clipped_sprites, make_sprites, pack_sprites
@@ -86,6 +87,15 @@ def test_the_field_s_radius_is_the_angle_to_the_farthest_corner(middle_px, margi
 def test_bodies_that_have_no_place_yet_are_not_found(flat_sky):
     nowhere = replace(flat_sky.grid, centre=np.full_like(flat_sky.grid.centre, np.nan))
     assert len(nowhere.near(np.array([0.0, 0.0, 1.0]), 1.0, np.eye(3))) == 0
+
+
+def test_of_more_doubtful_stars_than_are_asked_the_brightest_are(monkeypatch):
+    """Three pairs, each of which is over white together alone."""
+    monkeypatch.setattr(sprites_module, "MAX_DOUBTFUL", 2)
+    x = np.array([20.0, 20.0, 60.0, 60.0, 100.0, 100.0])
+    light = np.array([0.6, 0.6, 0.9, 0.9, 0.7, 0.7]) / GaussianPsf(SIGMA).peak_share
+    sprites = pack_sprites(x, np.full(6, 40.0), light, np.arange(6), (200, 120), FOOTPRINT)
+    assert clipped_sprites(sprites, GaussianPsf(SIGMA), 1.0, (200, 120)).tolist() == [2, 3]
 
 
 @pytest.mark.parametrize("count", [3, 450])

@@ -57,6 +57,26 @@ def test_a_map_is_as_round_and_as_wide_as_the_psf_in_the_mean_of_its_axes():
         assert variance == pytest.approx((0.7**2 + 1.9**2) / 2 + 1 / 12, rel=5e-3)
 
 
+@pytest.mark.parametrize(("first_step_share", "words"), [(0.5, "is drawn where"), (2.0, "is not")])
+def test_a_monitor_s_map_is_kept_for_an_attitude_of_either_sign_and_said(first_step_share, words):
+    """Its brightest pixel beside the screen's first step; q and -q are one attitude."""
+    focal_px = 2000.0
+    image = np.zeros((20, 20), dtype=np.float32)
+    image[5:15, 5:15] = 1e9
+    largest = 1e9 / focal_px**2
+    camera = Camera((64, 48), focal_px, (31.5, 23.5), np.eye(3))
+    step = largest * first_step_share
+    canvas = Canvas(camera, GaussianPsf((0.1, 0.1)), first_step_e_per_s=step)
+    layer = DiffuseLayer((TangentImage(image, np.eye(3), focal_px),), canvas)
+    assert f"has {1 / first_step_share:.3g} of the light" in layer.line()
+    assert f"it {words}" in layer.line()
+    stars = stars_at(-np.eye(3), np.ones(3))
+    q = np.array([0.9999, 0.008, -0.006, 0.01])
+    seen = [layer.add(no_light(5), stars, View(sign * q)).extended for sign in (1, -1)]
+    assert len(seen[0]) == (1 if first_step_share < 1 else 0)
+    assert all(one is other for one, other in zip(*seen, strict=True))
+
+
 def test_no_pixel_has_a_direction_beside_or_behind_the_plane():
     ahead = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.3, 0.2, -1.0]])
     image = TangentImage(np.zeros((5, 5), dtype=np.float32), np.eye(3), 100.0)

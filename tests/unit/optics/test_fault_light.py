@@ -19,7 +19,7 @@ from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Scan
 from hilstar.sky.stars import with_bodies
 from tests.support.refusals import refusal
-from tests.support.stars import stars_at
+from tests.support.stars import sprites_at, stars_at
 
 MONITOR = Camera((320, 240), 1000.0, (159.5, 119.5), np.eye(3))
 TRACKER = Camera((100, 60), 400.0, (49.5, 29.5), np.eye(3))
@@ -247,7 +247,9 @@ def test_each_sprite_of_faults_is_of_the_light_whose_name_it_has():
     tables = (
         {"kind": "false-star", "name": "right", "icrs": [0.05, 0.0, 0.99874922], "electrons": 10},
         {"kind": "false-star", "name": "below", "icrs": [0.0, 0.05, 0.99874922], "electrons": 20},
+        {"kind": "false-star", "name": "fixed", "tracker_px": [20.0, 30.0], "electrons": 30},
         RAYS | {"number": 2, "length_px": 0.0},
+        {"kind": "false-star", "name": "last", "tracker_px": [60.0, 30.0], "electrons": 40},
     )
     now = [Now(k, view.prepare(fault_of(table)), 0) for k, table in enumerate(tables, 1)]
     attitude = View(np.array([1.0, 0.0, 0.0, 0.0]))
@@ -263,11 +265,27 @@ def test_each_sprite_of_faults_is_of_the_light_whose_name_it_has():
     offset_px = 1000 * 0.05 / 0.99874922
     assert placed["right"] == pytest.approx((159.5 + offset_px, 119.5, 40.0))
     assert placed["below"] == pytest.approx((159.5, 119.5 + offset_px, 80.0))
+    assert len(placed) == 5 and placed["fixed"][2] < placed["last"][2]
     # a blank frame's camera turns as before
     blank = Now(9, fault_of({"kind": "blank", "name": "dark"}), 0)
     dark = FaultLayer(view, (*now, blank)).add(before, view.by.stars, attitude)
     assert (len(dark), dark.added) == (0, ())
     assert dark.rate_cam_rad_s is before.rate_cam_rad_s
+
+
+def test_a_star_that_is_gone_for_a_part_of_a_frame_is_dimmed_there_alone():
+    """The light of the layers before stays as it is: it may be another image's, too."""
+    view = view_of()
+    row = int(np.flatnonzero(view.by.stars.hip > 0)[0])
+    stars = view.by.stars
+    places = np.full((2, 2), 20.0)
+    before = sprites_at(places, np.full(2, 8.0), PSF.footprint_px)
+    before = replace(before, star=np.array([row, row + 1]))
+    table = {"kind": "star-gone", "name": "gone", "hip": int(stars.hip[row])}
+    now = (Now(1, fault_of(table), 0, 0.75),)
+    light = FaultLayer(view, now).add(before, stars, View(np.array([1.0, 0.0, 0.0, 0.0])))
+    assert light.data["electrons_per_s"].tolist() == [2.0, 8.0]
+    assert before.data["electrons_per_s"].tolist() == [8.0, 8.0]
 
 
 @pytest.mark.parametrize(("share", "left"), [(1.0, ("Mars",)), (0.25, ("Moon", "Mars"))])

@@ -15,7 +15,15 @@ from hilstar.optics.extended import LightMap
 from hilstar.optics.layers.bodies import BodyLayer
 from hilstar.optics.layers.layers import light_of
 from hilstar.optics.layers.star_layer import StarLayer
-from hilstar.optics.layers.truth import TRUTH_DTYPE, clipped_in, sprite_truth, with_channels
+from hilstar.optics.layers.truth import (
+    TRUTH_DTYPE,
+    brightest_in_view,
+    clipped_in,
+    designations,
+    sprite_names,
+    sprite_truth,
+    with_channels,
+)
 from hilstar.optics.layers.view import Canvas, View
 from hilstar.optics.psf import GaussianPsf
 from hilstar.optics.scan import Scan
@@ -214,6 +222,39 @@ def test_light_that_faults_add_has_rows_of_its_own_by_its_names():
         assert [named[name][column] for column in columns] == pytest.approx(figures)
         assert named[name]["drawn"]
         assert np.isnan([named[name][c] for c in ("temperature_k", "ra_deg", "sigma_mag")]).all()
+
+
+def test_what_is_seen_is_named_once_by_its_number_or_its_own_name():
+    stars = stars_at(np.eye(3), np.ones(3))
+    light = sprites_at(np.full((5, 2), 20.0), np.ones(5), FOOTPRINT)
+    added = (AddedLight("line", 2.5, 0.25, 40.0), AddedLight("point", 6.0, 1.5, 50.0))
+    light = replace(light, star=np.array([-1, -1, 2, -2, 2]), added=added, per_star=2)
+    names = designations(stars, light, np.arange(5))
+    number = int(stars.hip[2])
+    assert (names[0], set(names[1:]), len(names)) == (number, {"line", "point"}, 3)
+    assert sprite_names(stars, light) == ["line", "line", number, "point", number]
+    assert designations(stars, light, np.array([0])) == ("line",)
+
+
+def test_the_brightest_in_view_are_stars_and_discs_on_the_pixels_with_their_angles():
+    """A disc has no sprite; a star whose footprint alone reaches the image is not on it."""
+    rays = np.array([[0.03, -0.04, 1.0], [-0.06, 0.02, 1.0], [0.098, 0.0, 1.0], [0.0, 0.05, 1.0]])
+    stars = with_bodies(stars_at(rays, np.ones(4)), ("Moon",), np.zeros(1))
+    order = stars.row[:4]
+    stars.vectors[4] = AHEAD
+    stars.v_mag[:] = [*np.array([3.0, 1.0, 0.0, 2.0])[order], -12.0]
+    rows = np.flatnonzero(order != 3)
+    places = np.column_stack(CAMERA.project(stars.vectors[rows]))
+    light = replace(sprites_at(places, np.ones(3), FOOTPRINT), star=rows, discs=("Moon",))
+    views = brightest_in_view(light, stars, CAMERA, AT_START.q_icrs_to_cam, 5)
+    named = [(view.name, view.hip, view.v_mag) for view in views]
+    assert named == [("Moon", 0, -12.0), ("", 1, 1.0), ("HIP 1", 0, 3.0)]  # by its own number
+    angles_deg = np.degrees(np.arctan([0.0, np.hypot(0.06, 0.02), 0.05]))
+    assert [view.from_boresight_deg for view in views] == pytest.approx(angles_deg, abs=1e-9)
+    assert (views[2].x_px, views[2].y_px) == pytest.approx((47.5 + 15.0, 39.5 - 20.0))
+    sky_deg = np.degrees(np.arctan2(-0.04, 0.03)) % 360, np.degrees(np.arctan2(1.0, 0.05))
+    assert (views[2].ra_deg, views[2].dec_deg) == pytest.approx(sky_deg)
+    assert len(brightest_in_view(light, stars, CAMERA, AT_START.q_icrs_to_cam, 2)) == 2
 
 
 def test_an_image_without_a_star_has_no_rows():

@@ -111,6 +111,9 @@ def test_a_psf_s_file_read_again_is_the_same_psf(tmp_path):
     assert found.per_px == 3
     assert np.asarray(found.samples).shape == ROUND.shape
     assert read_psf(tmp_path / "psf.fits") is found
+    # a cube of one image, as some programs write every image
+    (tmp_path / "cube.fits").write_bytes(fits_bytes(ROUND[None], OVERSAMP=3))
+    np.testing.assert_array_equal(read_psf(tmp_path / "cube.fits").samples, found.samples)
 
 
 def test_light_that_reaches_too_far_is_no_psf():

@@ -144,10 +144,11 @@ def test_a_map_of_the_camera_s_own_pixels_is_itself():
 
 
 def test_a_part_of_an_image_that_is_nowhere_in_the_other_s_has_no_light():
-    """A field of 130 degrees that looks 40 degrees aside: a part lies behind the tracker's plane.
-    Areas are those of small steps about each pixel.
+    """A field of 130 degrees that looks 40 degrees aside, turned by 35 about its axis: a part lies
+    behind the tracker's plane. Areas are those of small steps about each pixel.
     """
-    aside = to_matrix(from_rotation_vector(np.radians([0.0, -40.0, 0.0])))
+    turned = to_matrix(from_rotation_vector(np.radians([0.0, 0.0, 35.0])))
+    aside = turned @ to_matrix(from_rotation_vector(np.radians([0.0, -40.0, 0.0])))
     wide = Camera((60, 40), 14.0, (29.5, 19.5), aside)
 
     def place_px(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

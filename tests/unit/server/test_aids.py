@@ -9,7 +9,7 @@ import pytest
 
 from hilstar.display.render.aids import lay_over, level_of_code
 from hilstar.display.response import Response
-from hilstar.server.operator import SWITCHES, Aids
+from hilstar.server.operator import PATCHES, SWITCHES, Aids
 from tests.support.x11.screens import lines_over
 
 LINE = 96
@@ -63,3 +63,11 @@ def test_switches_are_known_by_name_and_in_words():
     for name in SWITCHES:
         aids.set(name, False)
     assert aids.text == "" and aids.shows_sky and not aids.overlay
+
+
+def test_a_patch_steps_through_its_shares_of_white_and_turns_off():
+    aids, shown = Aids(), []
+    for _ in range(2 * len(PATCHES) + 2):
+        aids.toggle("patch")
+        shown.append(aids.patch_share if aids.is_on("patch") else None)
+    assert shown == [*PATCHES, None] * 2

@@ -206,8 +206,8 @@ def test_slots_count_the_refreshes_between_two_frames_of_a_period_with_a_fractio
     moments = []
     for moment in itertools.islice(pacer.moments(), 60):
         moments.append(moment)
-        host.ns = moment.swap_ns + round(2.2e9 / 60)  # so long a frame takes
-    assert [moment.slot for moment in moments] == list(range(0, 180, 3))
+        host.ns = moment.swap_ns + round(1.2e9 / 60)  # so long a frame takes
+    assert [moment.slot for moment in moments] == list(range(0, 120, 2))
 
 
 def test_the_grid_follows_a_screen_that_runs_a_little_slower():

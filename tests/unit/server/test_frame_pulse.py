@@ -4,6 +4,7 @@ costs the frames: nothing.
 
 from __future__ import annotations
 
+import threading
 import time
 
 import pytest
@@ -73,7 +74,7 @@ def test_each_frame_has_a_pulse_of_the_width_and_level_asked_for_and_the_line_en
     kept, active
 ):
     high = active == "high"
-    with FramePulse(Line(high), pulse_settings(active=active, pulse_ms=3.0), Notices()) as pulse:
+    with FramePulse.of(pulse_settings(active=active, pulse_ms=3.0), Notices()) as pulse:
         for number in range(12):
             pulsed_frames(pulse, 1, number)
             wait_for(
@@ -113,6 +114,41 @@ def test_the_delay_is_the_one_from_the_frame_s_stamp_to_the_line(kept):
         off_ms = sum(seen_ms) / 12 - pulse.summary().delay_ms
         assert 0 <= off_ms <= pulse.summary().line_ms + 0.01
     assert pulse.summary().delay_ms >= 20.0 > pulse.summary().line_ms
+
+
+class HeldLine(Line):
+    """One that returns from its rise only when it is let go."""
+
+    def __init__(self):
+        self.rises, self.let_go = threading.Event(), threading.Event()
+        super().__init__()
+
+    def set(self, active):
+        super().set(active)
+        if active:
+            self.rises.set()
+            self.let_go.wait(PATIENCE_S)
+
+
+def test_frames_that_come_while_the_line_is_busy_are_heard_and_counted_as_skipped(kept):
+    """A pulse's width counts from when the line is known to be raised."""
+    line, heard = HeldLine(), []
+    with FramePulse(line, pulse_settings(pulse_ms=10.0), Notices()) as pulse:
+        pulse.counted = heard.append
+        none = pulse.summary()
+        for number in range(3):
+            pulse.frame(number, time.monotonic_ns())
+        assert line.rises.wait(PATIENCE_S)
+        time.sleep(0.01)  # longer than the pulse that is asked for
+        known_ns = time.monotonic_ns()
+        line.let_go.set()
+    assert heard == ["skipped", "skipped", "sent"]
+    fallen_ns = [at_ns for at_ns, level in kept[0].edges if not level][-1]
+    assert fallen_ns - known_ns >= 10_000_000
+    summary = pulse.summary()
+    assert (summary.pulses, summary.skipped, summary.lost) == (1, 2, 0)
+    told = (none.delay_ms, none.jitter_ms, none.max_delay_ms, none.line_ms)
+    assert (none.pulses, *told) == (0, None, None, None, None)
 
 
 def test_of_every_third_frame(kept):

@@ -220,7 +220,7 @@ def test_one_burst_that_the_machine_delays_hides_no_queue(tmp_path):
     def delayed(*values):
         presents.append(values)
         if len(presents) == gate.BURST + 2:  # in the second burst
-            display.clock.work(1.1 * display.period_ns)
+            display.clock.work(2.1 * display.period_ns)
 
     screen.bench.renderer.present = delayed
     assert gate.queue_of(screen, display.clock) == (1, False)

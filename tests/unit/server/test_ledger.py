@@ -278,13 +278,19 @@ def test_a_ledger_that_is_harmed_is_said_and_goes_on_in_another_file(
     assert notices.counts()["ledger-lost"] == 1
 
 
-def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, kept_bench):
-    with Ledger(tmp_path / "run.mcap", kept_bench) as ledger:
+@pytest.mark.parametrize("with_folder", [False, True])
+def test_a_ledger_that_is_harmed_at_the_very_end_is_said_too(tmp_path, kept_bench, with_folder):
+    """Also where no other can be begun any more."""
+    folder = tmp_path / "runs"
+    folder.mkdir()
+    with Ledger(folder / "run.mcap", kept_bench) as ledger:
         keep(ledger, 0, 10)
         wait_for(
             lambda: len(list(drawable_frames(ledger.path))) == 10, "the first frames on the disk"
         )
-        (tmp_path / "run.mcap").unlink()
+        (folder / "run.mcap").unlink()
+        if with_folder:
+            folder.rmdir()
     assert ledger.failure.endswith("run.mcap was deleted while it was written")
     assert ledger.summary()["unrecorded"] >= 20
 

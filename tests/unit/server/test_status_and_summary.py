@@ -160,7 +160,8 @@ def test_a_run_without_a_frame_has_nulls_where_there_is_no_figure():
 def test_a_summary_has_the_figures_of_its_frames():
     tally = RunTally()
     for k in range(100):
-        tally.add((2 + k % 2) * MS, None if k == 0 else 7 * MS, 50 + k, (5, 3) if k == 8 else ())
+        clipped = {8: (5, 3), 9: ("Venus",)}.get(k, ())
+        tally.add((2 + k % 2) * MS, None if k == 0 else 7 * MS, 50 + k, clipped)
     counts = PacketCounts(received=30)
     counts.refused_by["crc"] = 10
     summary = msgspec.to_builtins(tally.summary(2.0, counts, RENDERER))
@@ -169,7 +170,7 @@ def test_a_summary_has_the_figures_of_its_frames():
     assert summary["frame_ms"]["p50"] == pytest.approx(2.0, rel=2e-3)
     assert summary["attitude_age_ms"]["p99"] == pytest.approx(7.0, rel=2e-3)
     assert summary["stars_drawn"] == {"mean": pytest.approx(99.5), "max": 149}
-    assert summary["clipped"] == {"max": 2, "hip": [3, 5], "bodies": []}
+    assert summary["clipped"] == {"max": 2, "hip": [3, 5], "bodies": ["Venus"]}
     assert summary["packets"]["accepted"] == 20 and summary["packets"]["refused_by"]["crc"] == 10
 
 

@@ -29,6 +29,8 @@ def test_a_run_on_time_is_right(summary):
     [
         ({"missed_frames": 6}, True, "6 of 606 frames missed"),
         ({"missed_frames": 7}, False, "7 of 607 frames missed"),
+        # one percent itself, of those that were due
+        ({"frames": 594, "missed_frames": 6}, True, "6 of 600 frames missed"),
         ({"frames": 13, "missed_frames": 167}, False, "167 of 180 frames missed"),
         ({"stale_frames": 6}, True, "6 of 600 frames with a stale attitude"),
         ({"stale_frames": 7}, False, "7 of 600 frames with a stale attitude"),
@@ -47,12 +49,15 @@ def test_frames_missed_and_stale_fail_beyond_one_percent(summary, changes, stric
 
 def test_missed_frames_alone_are_late_and_no_wrong_sky(summary):
     late = verdict_of(replace(summary, missed_frames=6))
+    assert late.late_share == 0.0099
     assert not late.ok and late.line == "the sky was right, but late; 6 of 606 frames missed"
     stale = verdict_of(replace(summary, missed_frames=6, stale_frames=1))
     assert stale.line.startswith("the sky was not right throughout; 6 of 606")
 
 
 def test_any_time_of_a_wrong_sky_fails(summary):
-    wrong = WrongSkyTotal(0.4, [ConditionTotal("rates-wrong", 1, 0.4, "by a factor")])
+    ended = ConditionTotal("source-frozen", 1, 0.0, "at once")
+    lasted = ConditionTotal("rates-wrong", 1, 0.4, "by a factor")
+    wrong = WrongSkyTotal(0.4, [ended, lasted])
     found = verdict_of(replace(summary, wrong_sky=wrong))
     assert not found.ok and not found.strict and "0.4 s of a wrong sky (rates-wrong)" in found.line

@@ -24,7 +24,13 @@ from hilstar.display.render.reference import linear_image
 from hilstar.display.response import srgb_response
 from hilstar.optics.psf import GaussianPsf
 from hilstar.tracker.centroiders import FAMILY
-from hilstar.tracker.star_errors import GOLDEN, Judge, StarErrors, stamp_errors
+from hilstar.tracker.star_errors import (
+    GOLDEN,
+    Judge,
+    StarErrors,
+    spread_phases,
+    stamp_errors,
+)
 from tests.support import centroiders as outside
 
 SIGMA = (0.85, 0.85)
@@ -119,6 +125,20 @@ def test_errors_are_those_of_fine_samples_and_other_centroiders(method, seen):
     assert found.off_px["moment"] == pytest.approx(plain, abs=1e-12)
     flux = -2.5 * np.log10(tiles_of(shown, tile).sum((1, 2)) / tiles_of(wanted, tile).sum((1, 2)))
     assert found.flux_mag == pytest.approx(flux, abs=1e-12)
+
+
+def test_an_image_turned_over_its_diagonal_has_its_errors_the_other_way_round():
+    """Stars of another width, and at other places in the tracker's pixels, along x than along y."""
+    sigma, seen, evenly = (0.85, 0.6), Seen(0.62, 1.3), spread_phases(COUNT)
+    phases = (evenly, 0.4 * evenly + 0.1)
+    wanted, shown, _ = codes("round", 5.0, seen, sigma)
+    places = line_places(phase_grid(COUNT, GaussianPsf(sigma))[0])
+    tracker = (seen.blur_px, seen.pixel_px)
+    upright = Judge(wanted, places, sigma, *tracker, phases=phases).errors(shown)
+    turned = Judge(wanted.T, places[::-1], sigma[::-1], *tracker, phases=phases[::-1])
+    for kind, off_px in turned.errors(shown.T).off_px.items():
+        back_px = off_px[::-1].reshape(2, COUNT, COUNT).transpose(0, 2, 1).reshape(2, -1)
+        assert np.abs(back_px - upright.off_px[kind]).max() < SHIFT_PX, kind
 
 
 @pytest.mark.parametrize("seen", [Seen(0.62, 1.0), Seen(0.3, 0.2), Seen(1.1, 2.3)])

@@ -9,7 +9,7 @@ stars.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -25,6 +25,7 @@ from hilstar.basics.rotation import random_attitudes
 from hilstar.basics.units import NS_PER_MS, NS_PER_S
 from hilstar.display.quantise import Quantisation
 from hilstar.instruments.study.predictors import Movement
+from hilstar.optics.scan import Scan
 from hilstar.server.bench.bench_file import BenchFile
 from hilstar.server.bench.build import assembled
 from hilstar.server.bench.config import AttitudeSettings, BenchConfig, RenderSettings, SkySettings
@@ -138,28 +139,36 @@ class ChainScene:
     rate_deg_s: float = 0.0
 
 
+def chosen_fields(star_rates: Sequence[FloatArray]) -> tuple[int, int, int] | None:
+    """The numbers of three fields, by the rates (n,) of the stars of each: the one with as many
+    stars as most have, the one with the most, and the one whose brightest star is the faintest, of
+    those with enough of them; None where no field has a star.
+    """
+    counts = np.array([len(rates) for rates in star_rates])
+    if not counts.any():
+        return None
+    typical = float(np.median(counts[counts > 0]))
+    average = np.argmin(np.abs(counts - typical))
+    brightest = np.full(len(star_rates), np.inf)
+    for number, rates in enumerate(star_rates):
+        if len(rates) >= ENOUGH * typical:
+            brightest[number] = rates.max()
+    return int(average), int(np.argmax(counts)), int(np.argmin(brightest))
+
+
 def five_scenes(bench: Bench) -> tuple[ChainScene, ...]:
     """The scenes of a bench, chosen among FIELDS random fields of its sky. Raises InputError
     where it has no stars.
     """
     fields = random_attitudes(FIELDS, np.random.default_rng(SEED))
-    star_rates = []
-    for q in fields:
-        star_rates.append(bench.sprites(q).data["electrons_per_s"])
-    counts = np.array([len(rates) for rates in star_rates])
-    if not counts.any():
+    star_rates = [bench.sprites(q).data["electrons_per_s"] for q in fields]
+    chosen = chosen_fields(star_rates)
+    if chosen is None:
         raise InputError(
             f"{bench.file.path}: [sky] leaves no star that the monitor shows; write a larger"
             " faintest_v_mag"
         )
-    typical = float(np.median(counts[counts > 0]))
-    average = fields[np.argmin(np.abs(counts - typical))]
-    brightest = np.full(len(star_rates), np.inf)
-    for number, rates in enumerate(star_rates):
-        if len(rates) >= ENOUGH * typical:
-            brightest[number] = rates.max()
-    faint = fields[np.argmin(brightest)]
-    dense = fields[np.argmax(counts)]
+    average, dense, faint = (fields[number] for number in chosen)
     return (
         ChainScene("average field", "what most frames are", average),
         ChainScene("dense field", "the most stars: time", dense),
@@ -227,11 +236,19 @@ def shortened_line(bench: Bench) -> str | None:
 
 
 def exposure(bench: Bench, first_frame: int) -> PanelExposure:
-    """An exposure that starts START_S after a frame's middle row lights."""
+    """An exposure of the bench that starts START_S after a frame's middle row lights."""
     period_s = 1 / bench.config.monitor.refresh_hz
-    length_s = exposure_s(bench)
-    scan = bench.scan
-    size = bench.camera.resolution_px
+    return panel_exposure(
+        first_frame, period_s, exposure_s(bench), bench.scan, bench.camera.resolution_px
+    )
+
+
+def panel_exposure(
+    first_frame: int, period_s: float, length_s: float, scan: Scan, size: tuple[int, int]
+) -> PanelExposure:
+    """An exposure before a panel of `size` pixels (width, height), START_S after the middle row of
+    a frame lights, less whole refreshes of `period_s`.
+    """
     begin_s = first_frame * period_s + START_S % period_s
     before = math.ceil((scan.scanout_s / 2 + scan.hold_s) / period_s) + 1
     numbers = np.arange(

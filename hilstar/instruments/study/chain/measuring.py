@@ -343,7 +343,7 @@ class SceneMeasurement:
         for number, judge in enumerate(self.judges):
             light = self.chain(combination, number).exposed(judge.seen)
             shown = judge.measure(self.tracker.image_e(light, judge.seen))
-            star_errors.append(off(judge, shown, judge.sky))
+            star_errors.append(off(shown, judge.sky, judge.lost_arcsec))
             turns.append(attitude_off_arcsec(shown, judge.sky))
         arcsec, mag = pooled(star_errors)
         cross, roll = (rms_of_known(column) for column in zip(*turns, strict=True))
@@ -432,7 +432,7 @@ def error_budget(scene: SceneMeasurement, combination: choices.ChainCombination)
     def between(before: int, after: int) -> tuple[float, float]:
         offs = []
         for judge, measured in zip(scene.judges, measured_by_step, strict=True):
-            offs.append(off(judge, measured[after], measured[before]))
+            offs.append(off(measured[after], measured[before], judge.lost_arcsec))
         return pooled(offs)
 
     errors = {step: between(k, k + 1) for k, step in enumerate(STEPS)}

@@ -283,16 +283,16 @@ def within(
     return np.asarray(inside)
 
 
-def off(judge: StarJudge, shown: MeasuredStars, wanted: MeasuredStars) -> Off:
+def off(shown: MeasuredStars, wanted: MeasuredStars, lost_arcsec: float) -> Off:
     """The errors of stars in place and light, between two measurements.
 
-    A lost star is off by all its light, and by 3 px or its path, whichever is longer: to lose a
-    star is no better than to find it late.
+    A lost star is off by all its light, and by `lost_arcsec`, that of 3 px or of its path,
+    whichever is longer: to lose a star is no better than to find it late.
     """
     lost = shown.lost | wanted.lost
     chord = np.linalg.norm(shown.directions - wanted.directions, axis=1)
     angle_arcsec = 2 * np.arcsin(np.minimum(chord, 2.0) / 2) * ARCSEC_PER_RAD
-    arcsec = np.where(lost, judge.lost_arcsec, angle_arcsec)
+    arcsec = np.where(lost, lost_arcsec, angle_arcsec)
     shown_e = np.where(lost, 1.0, shown.light_e)
     wanted_e = np.where(lost, 1.0, wanted.light_e)
     return Off(arcsec, np.where(lost, LOST_MAG, magnitude(shown_e / wanted_e)), lost)

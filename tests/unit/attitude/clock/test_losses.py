@@ -25,6 +25,8 @@ def lost_of(*sequences: int) -> int:
         ([1, 2, 5, 6], 2),
         ([1, 2, 5, 3, 6], 1),  # 3 came late
         ([1, 2, 5, 5, 5, 6], 2),  # 5 came twice
+        ([1, 2, 5, 6, 5, 3, 3, 7], 1),  # late ones, too
+        ([5, 6, 8, 5, 9], 1),  # and the first
         ([U32 - 2, U32 - 1, 0, 1], 0),
         ([U32 - 2, 1, 2], 2),
         ([0, 0, 0, 0], 0),  # it does not count

@@ -1,6 +1,7 @@
 """What is said of a serial line whose bytes are no packets."""
 
 import os
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 
@@ -21,6 +22,7 @@ from hilstar.basics.units import NS_PER_S
 from hilstar.server.open_link import first_attitude
 from tests.support.fake_clock import FakeClock
 from tests.support.senders import packet
+from tests.support.waiting import PATIENCE_S
 from tests.support.wire.ptys import serial_line
 
 BAUD = 115_200
@@ -137,3 +139,19 @@ def test_of_bytes_that_a_full_line_takes_in_part_it_is_said_that_they_were_not_s
         assert os.read(master, 100) == b"all of it"
         assert not link.send_bytes(bytes(1 << 20))
         assert len(os.read(master, 1 << 20)) < 1 << 20
+
+
+def test_with_patience_all_bytes_go_to_a_reader_that_takes_them_in_parts() -> None:
+    """More than a pty holds, 4 to 20 kB."""
+    taken = bytearray()
+
+    def reads(master: int) -> None:
+        while len(taken) < 1 << 16:
+            taken.extend(os.read(master, 1 << 12))
+
+    with serial_line() as (master, name), SerialLink(name, BAUD) as link:
+        reader = threading.Thread(target=reads, args=(master,), daemon=True)
+        reader.start()
+        assert link.send_bytes(bytes(1 << 16), PATIENCE_S)
+        reader.join(PATIENCE_S)
+    assert len(taken) == 1 << 16

@@ -252,12 +252,16 @@ def test_a_lag_is_where_the_longer_recording_began_before_the_shorter(begun, bin
 
 
 def test_telemetry_that_began_before_a_steady_slew_is_found_by_its_attitudes():
-    """Angular speeds are all alike, and so is the turn between attitudes at any other offset."""
+    """Angular speeds are all alike, and so is the turn between attitudes at any other offset. Two
+    of five answers are wild.
+    """
     turn_rad = np.radians(1.0) * (RUN_S - START_S)
     run = Commanded(RUN_S, scalar_first(Rotation.from_rotvec(turn_rad[:, None] * [0, 0, 1])))
     t_s = np.arange(0.0, SECONDS, ANSWER_S)
     shown_rad = np.radians(1.0) * (t_s - 10.0)
     q = scalar_first(Rotation.from_rotvec(shown_rad[:, None] * [0, 0, 1]))
+    wild = np.arange(len(q)) % 5 < 2
+    q[wild] = scalar_first(Rotation.random(int(wild.sum()), random_state=6))
     coarse = coarse_offset(run, t_s, q)
     assert coarse is not None
     assert coarse.offset_s == pytest.approx(START_S - 10.0, abs=0.5)

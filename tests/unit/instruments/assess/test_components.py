@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from types import SimpleNamespace
 
 import numpy as np
@@ -115,6 +116,15 @@ def test_functions_that_take_all_freedom_leave_noise_and_variance_finite(rng) ->
     assert _component(functions, error, 0.0).variance == pytest.approx(wanted)
 
 
+def test_where_the_sky_stands_all_about_the_mean_is_noise(rng) -> None:
+    error = rng.normal(size=(40, 3)) + np.array([5.0, -3.0, 20.0])
+    still = np.tile([0.6, 0.0, 0.8, 0.0], (40, 1))
+    found = components_of(error, still, SCALE)
+    assert found.mean == pytest.approx(error.mean(axis=0))
+    assert found.noise_variance == pytest.approx(error.var(axis=0, ddof=1))
+    assert "moved by 0 px only" in found.fov.reason and "moved by 0 px only" in found.pixel.reason
+
+
 def test_the_noise_of_few_answers_has_the_freedom_that_is_left_by_the_fits() -> None:
     """Of 24 runs' axes with some 130 numbers each the mean is known to 0.025; 150 for the freedom
     would be 0.1 too little.
@@ -123,7 +133,12 @@ def test_the_noise_of_few_answers_has_the_freedom_that_is_left_by_the_fits() -> 
     found = []
     for seed in range(8):
         error = np.random.default_rng(seed).normal(size=(len(true), 3))
-        found.append(components_of(error, scalar_first(true), SCALE).noise_variance)
+        parts = components_of(error, scalar_first(true), SCALE)
+        found.append(parts.noise_variance)
+        # a wave that bumps fit spans four spacings, each of which is a quarter more than the last
+        over_px = float(re.findall(r"repeats over (\d+) px", parts.fov.detail)[0])
+        steps_up = np.log(over_px / (4 * 20.0)) / np.log(1.25)
+        assert steps_up == pytest.approx(round(steps_up), abs=0.05)
     assert np.mean(found) == pytest.approx(1.0, abs=0.06)
 
 

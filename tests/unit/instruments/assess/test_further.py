@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from hilstar.attitude.logs.telemetry import Telemetry
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
 from hilstar.instruments.assess.assessment import (
@@ -30,6 +31,7 @@ from hilstar.instruments.assess.further import (
     END,
     FurtherFigures,
     add_jitter,
+    add_rates,
     add_stars,
     rate_notes,
 )
@@ -39,8 +41,9 @@ from hilstar.server.answers.answer import ReportedStar
 from hilstar.server.answers.stars import LitStars, StarResiduals
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.star_light import bench_stars
+from hilstar.server.record.commanded import Commanded
 from hilstar.server.record.ledger_records import AnswerRecord
-from tests.support.assessments import a_budget
+from tests.support.assessments import a_budget, a_clock
 from tests.support.benches import bench_text
 from tests.support.planted_run import write_ledger
 from tests.support.planted_tracker import attitude, rate_rad_s, scalar_first
@@ -280,6 +283,35 @@ def slewing(count: int, taken: float) -> Any:
         pixel=Component(np.zeros(3), none, 0.0),
     )
     return replace(found, components=components, rate_rad_s=rate_rad_s, row=np.arange(count))
+
+
+def test_rates_that_are_left_out_are_said_with_how_many(rng: np.random.Generator) -> None:
+    """Three of 400 that are 50 sigmas off, as of a field of a few stars close together."""
+    count = 400
+    run_s = np.arange(0.0, 90.0, 0.05)
+    commanded = Commanded(run_s, scalar_first(attitude(motion, run_s)))
+    t_s = 2.0 + 0.2 * np.arange(count)
+    moments = commanded.at(t_s)
+    reported_rad_s = moments.rate_rad_s + np.radians(0.01) * rng.standard_normal((count, 3))
+    reported_rad_s[[40, 190, 333]] += np.radians(0.5)
+    found = replace(
+        slewing(count, 0.0),
+        clock=replace(a_clock(), t_s=t_s),
+        rate_rad_s=moments.rate_rad_s,
+        commanded_q=moments.q,
+    )
+    valid = np.ones(count, dtype=bool)
+    t_ns = np.round(1e9 * t_s).astype(np.int64)
+    lines = np.arange(count) + 2
+    telemetry = Telemetry(
+        Path("t.csv"), t_ns, moments.q, valid, lines, rate_cam_rad_s=reported_rad_s
+    )
+    further = FurtherFigures()
+    add_rates(further, telemetry, commanded, found)
+    noise = {row.axis: row.value for row in further.rows if row.quantity == "rate noise"}
+    assert noise == pytest.approx({"cross": 0.01, "roll": 0.01}, rel=0.15)
+    said = [note for note in further.notes if "3 of 400 rates left out, beyond 8 sigmas" in note]
+    assert [note.partition(":")[0] for note in said] == ["rate noise, cross", "rate noise, roll"]
 
 
 def test_a_stamp_s_jitter_has_back_what_the_budget_s_fits_took() -> None:

@@ -246,8 +246,12 @@ def test_the_map_of_a_field_has_the_field_s_own_places_with_east_at_the_left(wri
 
 
 def test_noise_is_drawn_beside_the_normal_distribution_of_its_sigma(written, made) -> None:
-    for axes, sigma in zip(written[1][3].axes, (0.5, 1.0, 3.0), strict=True):
+    for k, (axes, sigma) in enumerate(zip(written[1][3].axes, (0.5, 1.0, 3.0), strict=True)):
         (normal,) = axes.get_lines()
+        bars = axes.patches
+        edges = [bar.get_x() for bar in bars] + [bars[-1].get_x() + bars[-1].get_width()]
+        shares, _ = np.histogram(made.found.components.left[:, k], edges, density=True)
+        assert [bar.get_height() for bar in bars] == pytest.approx(shares.tolist())
         height = 1 / (sigma * np.sqrt(2 * np.pi))
         assert max(normal.get_ydata()) == pytest.approx(height)
         at_sigma = np.interp(sigma, normal.get_xdata(), normal.get_ydata())

@@ -251,6 +251,11 @@ def test_a_wrong_plan_is_refused_in_one_line(tmp_path: Path, text: str, told: st
     assert "\n" not in line and "plan.toml" in line and told in line
 
 
+def test_a_set_for_which_no_clause_asks_is_not_run(tmp_path: Path) -> None:
+    text = ONE + SETS["rate-limit"]
+    assert [case_set.name for case_set in read_plan_text(tmp_path, text)] == ["lost"]
+
+
 def test_a_condition_on_no_column_is_refused_before_the_first_case(tmp_path: Path) -> None:
     text = ONE + 'condition = "rate_deg_s.x < 1"\n'
     assert "no key that the plan varies" in refusal(accepted, tmp_path, text)

@@ -92,12 +92,14 @@ def test_frames_of_an_exposure_stand_evenly_about_its_middle(tmp_path: Path) -> 
         {"exposure_s": 0.09},
         {"psf_sigma_px": [1.3, 0.9]},
         {"aperture_mm": 21.0},
+        {"distortion": "lens.toml"},
     ],
 )
 def test_a_tracker_that_changes_is_one_of_the_new_file(
     tmp_path: Path, change: dict[str, Any]
 ) -> None:
     """Its image is that of a tracker which was never another, with the glow of the screen's black."""
+    (tmp_path / "lens.toml").write_text("k1 = 0.5\n")
     glows = {"calibration": "lcd-example", "bits": 8}
     new = shown_file(tmp_path / "new.toml", monitor=glows, **change)
     images = []

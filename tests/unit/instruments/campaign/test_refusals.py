@@ -32,6 +32,7 @@ BY_THE_COMMAND = {
     "no such bench": ({}, {"bench": "other.toml"}, ["other.toml"]),
     "unknown bench key": ({"key": "tracker.psf_sigma"}, {}, ["tracker.psf_sigma", "psf_sigma_px"]),
     "beyond the bench's limits": ({"minimum": 0.01}, {}, ["tracker.psf_sigma_px", "0.01"]),
+    "beyond them at the other end": ({"maximum": 1e4}, {}, ["tracker.psf_sigma_px", "10000"]),
     "no table": ({"key": "psf"}, {}, ["psf"]),
     "turned round": ({"minimum": 2.0}, {}, ["smaller one first"]),
     "half a range": ({"maximum": None}, {}, ["minimum"]),

@@ -267,6 +267,24 @@ def test_the_benchs_own_time_guards_a_time_s_limit_on_both_sides(low_s, high_s, 
     assert judged_figure(require, figure, bench_s=0.4).verdict == wanted
 
 
+@pytest.mark.parametrize(
+    ("side", "low", "high", "wanted"),
+    [
+        ("maximum", 4.0, 5.0, MET),
+        ("maximum", 5.0, 6.0, NOT_SHOWN),
+        ("minimum", 5.0, 6.0, MET),
+        ("minimum", 4.0, 5.0, NOT_SHOWN),
+    ],
+)
+def test_an_end_on_the_limit_keeps_it(side, low, high, wanted):
+    """The levels of a sweep may be the limit itself."""
+    require = Require(quantity="edge", **{side: 5.0})
+    figure = BoundedFigure((low + high) / 2, low, high, 50, "planted")
+    found = judged_figure(require, figure)
+    assert found.verdict == wanted
+    assert (found.margin == 0.0) is (wanted == MET)
+
+
 def test_the_benchs_guard_takes_off_the_margin_of_a_maximum_and_of_a_minimum():
     most = Require(quantity="bias", maximum=10.0)
     least = Require(quantity="availability", minimum=0.9)

@@ -207,6 +207,28 @@ def test_an_answer_is_its_error_on_what_was_lit_where_that_is_known() -> None:
     assert reported[2] == pytest.approx(solved[2])
 
 
+def test_a_budget_of_many_cases_is_that_of_an_even_share_of_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    """A bias that grows from 0 to 20 arcsec over the cases, of which every fifth counts."""
+    monkeypatch.setattr(results, "MAX_FITTED_CASES", 40)
+    monkeypatch.setattr(results, "noise_limit", lambda file, commanded: Axes(None, None))
+    write_campaign(tmp_path)
+    count = 200
+    at = Rotation.random(count, random_state=4).as_quat(scalar_first=True)
+    errors = 0.01 * rng.standard_normal((count, 3))
+    errors[:, 0] += np.linspace(0.0, 20.0, count)
+    columns = vectors_of("q{}", "wxyz", at) | vectors_of("solved_q{}", "wxyz", at)
+    columns |= vectors_of("error_{}_arcsec", "xyz", errors)
+    columns |= vectors_of("scatter_{}_arcsec", "xyz", np.full((count, 3), np.nan))
+    columns |= {"frames": [1.0] * count, "solved": [1.0] * count, "wrong": [0.0] * count}
+    file = read_bench_file(tmp_path / "bench.toml")
+    budget, parts = results.case_budget(columns_of(**columns), file, rng)
+    assert parts is not None and len(parts.row) == 40
+    assert budget["bias_arcsec"][0] == pytest.approx(errors[::5, 0].mean(), abs=1e-3)
+    assert budget["availability"] == 1.0
+
+
 def test_the_scatter_within_cases_is_that_of_those_with_several_frames() -> None:
     scatter = np.array([[3.0, 4.0, 20.0], [np.nan] * 3, [1.0, 2.0, 10.0]])
     found = results._scatter_arcsec(columns_of(**vectors_of("scatter_{}_arcsec", "xyz", scatter)))
@@ -321,6 +343,9 @@ def test_a_share_is_none_by_chance_and_all_where_bins_say_all():
     # what bins of ten have by chance is 7 of 79; half of it is cut off at 0
     shares = [results._share(rng.standard_normal(80), index, 8) for _ in range(200)]
     assert np.mean(shares) < 0.04
+    # ranks 1 to 3 and 4 to 6: 13.5 between the means, of which a variance of 1 each is chance
+    whole = results._share(np.arange(6.0), np.array([0, 0, 0, 1, 1, 1]), 2)
+    assert whole == pytest.approx((13.5 - 2) / 6 / (35 / 12))
     apart = results._share(10.0 * index + rng.random(80), index, 8)
     # within a bin the variance of ten ranks is 8.25 of 533.25
     assert apart == pytest.approx(1 - 8.25 / 533.25, abs=0.005)

@@ -621,14 +621,14 @@ def test_values_that_alternate_have_hardly_a_structure_in_time_and_the_noise_of_
 
 
 def test_structure_that_would_have_shown_is_none_and_the_noise_is_that_of_the_residuals():
-    """Thirty combinations that a structure would make large are 0; of thirty others, whose squares
-    are 4, a mean is fitted.
+    """The squares of thirty combinations that a structure would make large are a quarter, and those
+    of thirty others 4; a mean is fitted.
     """
-    eigen = np.repeat([100.0, 0.0], 30)
-    value = np.concatenate([np.zeros(30), np.tile([2.0, -2.0], 15)])
+    eigen = np.repeat([1e4, 0.0], 30)
+    value = np.concatenate([np.tile([0.5, -0.5], 15), np.tile([2.0, -2.0], 15)])
     spread = Spread(eigen, value, np.full((60, 1), 1 / math.sqrt(60)))
     lengths = np.array([1.0, 2.0])
     structure = weighed(lengths, [spread, spread])
     assert structure.total == 0.0 and not list(structure.parts())
     assert math.isinf(structure.dof)
-    assert structure.noise_variance == pytest.approx(30 * 4 / 59)
+    assert structure.noise_variance == pytest.approx(30 * (0.25 + 4) / 59)

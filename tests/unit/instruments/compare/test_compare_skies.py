@@ -15,9 +15,9 @@ from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
 from hilstar.display.render.reference import linear_image
 from hilstar.instruments.compare import MAX_LINES, assert_same_sky, compare
-from hilstar.instruments.compare.compare_skies import read_frame_fits
+from hilstar.instruments.compare.compare_skies import compare_skies, read_frame_fits
 from hilstar.instruments.compare.report import ChartPanel
-from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG
+from hilstar.instruments.compare.sky_comparison import CENTROID_PX, FLUX_MAG, Limits
 from hilstar.instruments.compare.star_fit import star_psf
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.psf import GaussianPsf
@@ -300,6 +300,26 @@ def test_of_a_pair_only_the_star_that_changed_is_named(apart_px, ratio):
             assert bad and all(
                 abs(star.x_px - x[k]) < 2 and abs(star.y_px - y[k]) < 2 for star in bad
             )
+
+
+def test_names_are_of_the_image_s_own_table_and_those_of_a_blend_brightest_first():
+    """A star of 3e5 e-/s goes and one of 4e5 comes; the brighter of two that are one stands below
+    the other in the table.
+    """
+    kind = ("hip", "x_px", "y_px", "electrons_per_s")
+    fainter, brighter = (7, 20.3, 30.2, 1e5), (8, 20.6, 30.4, 1e6)
+    lost, brought = (9, 60.1, 50.0, 3e5), (11, 90.2, 20.1, 4e5)
+    tables, images = [], []
+    for stars in ((fainter, brighter, lost), (fainter, brighter, brought)):
+        table = np.zeros(len(stars), dtype=TRUTH_DTYPE)
+        for name, values in zip(kind, zip(*stars, strict=True), strict=True):
+            table[name] = values
+        tables.append(table)
+        images.append(grid(table["x_px"], table["y_px"], table["electrons_per_s"]))
+    (truth, frame_truth), (golden, frame) = tables, images
+    found = compare_skies(frame, golden, Limits(), truth, frame_truth)
+    names = {star.kind: star.hip for star in found.stars}
+    assert names == {"same": (8, 7), "missing": (9,), "extra": (11,)}
 
 
 def test_a_blend_is_one_star_with_both_names(scene):

@@ -205,7 +205,7 @@ def test_more_components_are_nearer_to_the_whole(relay_file):
 
 
 def test_the_virtual_tracker_takes_the_least_too(relay_file, caplog):
-    tables = {"tracker": {"effort": "auto", "tolerance_mag": 0.05, "tolerance_px": 0.05}}
+    tables = {"tracker": {"effort": "auto", "tolerance_mag": 0.02, "tolerance_px": 0.05}}
     file = relay_file(tables)
     found = tracker_psf(file.config.tracker, file.folder)
     assert 3 <= len(found.optics.basis) <= 12 and "[tracker] effort: PSF: a basis of" in caplog.text

@@ -11,6 +11,7 @@ import pytest
 from scipy.special import erf
 
 from hilstar.basics.errors import InputError
+from hilstar.optics.glass import glass_psf as glass_psf_module
 from hilstar.optics.glass.glass_psf import (
     MAX_CUT,
     MIN_WIDTH_PX,
@@ -26,10 +27,12 @@ from hilstar.optics.glass.psf_file import Stack, facts_of, glass_of
 from hilstar.optics.psf import ONE_PSF, PIXEL_VARIANCE
 from tests.support.claims import holds
 from tests.support.glass import HALF_PX, SIDE_PX, illumination, moments, profile, stack, truth
+from tests.support.psfs import gaussian, in_pixels
 
 # What is asked of the whole chain; measured here: 3e-7, 2e-4 px and 4e-3 at the points, 1.4e-3 px
 # between them.
 FLUX, CENTROID_PX, SECOND = 1e-3, 3e-3, 1e-2
+GAUSSIAN = 2e-3  # of a star's light in a pixel: adaptive moments of a Gaussian and a pixel together
 MEAN = np.array([0.2, 0.3, 0.3, 0.2])
 PIXELS_PX = 2.3e-3  # exp(-2 (pi s)^2) / pi of s = 0.5 px: what pixels move a Gaussian's centroid
 # Each round halves the distance of 1 / w from 1 / s: after 20, w is within s^2 / 2^20 of s.
@@ -344,6 +347,15 @@ def test_a_glass_is_sampled_for_its_sharpest_psf_and_cut_for_its_widest(two_psfs
     assert 1 - erf((half_px - 2) / (1.1 * np.sqrt(2))) ** 2 > MAX_CUT
 
 
+def test_a_blur_wider_than_the_images_has_room_beyond_them(two_psfs):
+    """Images to 7 px from the middle, and a Gaussian of 6 px: variances add, a pixel's too."""
+    wide = two_psfs.blurred(6.0)
+    at = np.array([100.0]), np.array([80.0])
+    for spectrum, sigma_px in (([1.0, 0.0], 0.5), ([0.0, 1.0], 1.1)):
+        light = moments(wide.stamps_at(*at, np.array(spectrum), np.ones(1))[0])
+        assert light[3:] == pytest.approx([sigma_px**2 + 36.0 + PIXEL_VARIANCE] * 2, rel=2e-3)
+
+
 def test_a_star_s_illumination_is_that_of_its_own_light(two_psfs):
     spectra = np.array([[1.0, 0.0], [0.0, 1.0], [0.25, 0.75]])
     at = np.full(3, 100.0)
@@ -360,6 +372,46 @@ def test_one_field_point_of_two_colours_has_simpler_glasses_and_one_psf_has_none
     assert [name for name, _ in glass_psf(alone, 0.0, np.ones(1)).simpler()] == [ONE_PSF]
 
 
+@pytest.mark.parametrize(("integrated", "side_px"), [(False, 5), (True, 7)])
+def test_a_footprint_holds_all_samples_and_the_pixels_that_are_integrated_in_them(
+    integrated, side_px
+):
+    """Samples to 1.875 px from the middle, of which a pixel's reach half a pixel farther."""
+    light = np.exp(-((np.arange(-7, 8) / 2.4) ** 2) / 2)
+    place = np.array([[100.0, 80.0, np.nan, 0.0]])
+    one = Stack((light * light[:, None])[None], place, facts_of(1), 4, integrated)
+    assert glass_psf(glass_of(one), 0.0, np.ones(1)).footprint_px == side_px
+
+
+@pytest.mark.parametrize("integrated", [False, True])
+def test_of_gaussians_the_nearest_gaussians_are_themselves(integrated):
+    at = np.arange(-24, 25) / 4
+    images = []
+    for profile_of_two in (gaussian(0.6, 0.9), gaussian(1.1, 0.7)):
+        if integrated:
+            images.append(in_pixels(profile_of_two, at, at, 8))
+        else:
+            images.append(profile_of_two(at, at[:, None]))
+    places = np.array([[100.0, 80.0, 450.0, 0.0], [100.0, 80.0, 650.0, 0.0]])
+    own = Stack(np.array(images), places, facts_of(2), 4, integrated)
+    psf = glass_psf(glass_of(own), 0.0, np.array([0.5, 0.5]))
+    nearest = dict(psf.simpler())["Gaussians by field"]()
+    stars = np.full(2, 100.2), np.full(2, 79.7), np.eye(2)
+    apart = nearest.stamps_at(*stars) - psf.stamps_at(*stars)
+    assert np.abs(apart).max() < GAUSSIAN
+
+
+def test_stars_of_several_blocks_are_all_on_one_image(glass, rng, monkeypatch):
+    psf = glass_psf(glass, 0.0, MEAN)
+    x_px, y_px = rng.uniform(10, 60, (2, 10))
+    light = rng.uniform(1.0, 2.0, 10)
+    whole = psf.image(x_px, y_px, MEAN, light, (70, 65))
+    monkeypatch.setattr(glass_psf_module, "SPRITES_AT_ONCE_PX", 3 * psf.footprint_px**2)
+    assert psf.image(x_px, y_px, MEAN, light, (70, 65)) == pytest.approx(whole, abs=1e-6)
+    stamps = psf.stamps_at(x_px, y_px, MEAN, light)
+    assert whole.sum() == pytest.approx(stamps.sum(), rel=1e-5)
+
+
 def test_a_glass_of_so_many_components_has_no_more_and_the_nearest_light_of_those(glass):
     """The mean is one of them; each PSF still has all of its light. Of the PSFs' departures from
     their mean, two images more leave the squares of all singular values but two (Eckart and Young
@@ -368,6 +420,8 @@ def test_a_glass_of_so_many_components_has_no_more_and_the_nearest_light_of_thos
     psf = glass_psf(glass, 0.0, MEAN)
     few = with_components(psf, 3)
     assert few.components == 3
+    names = [[name for name, _ in with_components(psf, count).simpler()] for count in (3, 4, 6)]
+    assert [of_count[2:] for of_count in names] == [[], ["a basis of 3"], ["a basis of 3"]]
     light = few.optics.weights @ few.optics.basis.sum(axis=(1, 2))
     assert light == pytest.approx(1, abs=1e-9)
     whole = np.tensordot(psf.optics.weights, psf.optics.basis, axes=1)

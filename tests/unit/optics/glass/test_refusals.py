@@ -71,6 +71,9 @@ ZEMAX = [
     # not indented, as an operand of the merit function
     (zmx(more={1: ["FRNL 3 4 5 6 7 8 9"]}), r"line \d+: FRNL at surface 1 is not known"),
     (zmx_surface("CLAP 0 0 0"), r"line \d+: CLAP at surface 1 has no size"),
+    (zmx_surface("OBSC -1 5 0"), r"line \d+: OBSC at surface 1 has no size"),
+    (zmx_surface("SQAP 0 5 0"), r"line \d+: SQAP at surface 1 has no size"),
+    (zmx_surface("ELOB 0 5 0"), r"line \d+: ELOB at surface 1 has no size"),
     (
         zmx_surface("TYPE DGRATING"),
         r"line \d+: TYPE at surface 1 is DGRATING; write one of STANDARD",

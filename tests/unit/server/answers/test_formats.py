@@ -270,6 +270,15 @@ def test_a_tracker_may_be_five_degrees_off_and_its_convention_is_told(off_deg, m
     assert [reading.matches for reading in readings] == [matches, False, False, False]
 
 
+def test_where_two_conventions_read_one_attitude_alike_neither_is_told():
+    """No turn at all is its own inverse, to the last bit."""
+    decoder = decoder_of(messages=True, format="json", fields=[])
+    (found,) = decoder.feed(0, b'{"q": [1, 0, 0, 0]}')
+    readings = under_conventions(found, decoder, np.array([1.0, 0.0, 0.0, 0.0]))
+    assert [reading.off_rad for reading in readings][:2] == [0.0, 0.0]
+    assert not any(reading.matches for reading in readings)
+
+
 def test_a_packet_is_taken_over_every_road_and_another_kind_is_not():
     packet = AnswerPacket(7, 1 | 2 | 8, 42, tuple(Q.tolist()), (0.0, 0.25, 0.0), 9)
     for messages, sent in ((True, encode(packet)), (False, b"\0" + framed(encode(packet)))):

@@ -235,16 +235,25 @@ def test_a_recorded_line_gives_its_answers_and_the_last_one_without_an_end(tmp_p
     assert (first.t_ns, last.t_ns, first.host_ns) == (77, 77, 0)
 
 
-@pytest.mark.parametrize("polled", [{}, POLLED | {"poll_hz": 10.0}], ids=["silent", "polled"])
-def test_an_open_line_is_read_for_so_long(polled):
+@pytest.mark.parametrize(
+    ("polled", "waited_ms", "asked"),
+    [
+        ({}, {100}, 0),
+        (POLLED | {"poll_hz": 10.0}, {100}, 10),
+        # no longer than until the next question, and no longer than a look
+        (POLLED | {"poll_hz": 25.0}, {40}, 24),
+        (POLLED | {"poll_hz": 4.0}, {100, 50}, 4),
+    ],
+)
+def test_an_open_line_is_read_for_so_long(polled, waited_ms, asked):
     clock = FakeClock(100 * NS_PER_S)
     road = Road(clock, [[LINE], [], [LINE]], messages=True)
     plan = ReadPlan(settings_of(**(JSON | polled)), Path(), None)
     found = list(live_answers(plan, road, plan.decoder(True), 0.95, lambda: False, clock))
     assert [answer.host_ns for answer in found] == [100 * NS_PER_S - 5] * 2
     assert clock.ns == pytest.approx(101 * NS_PER_S, abs=0.06 * NS_PER_S)
-    assert set(road.waited_ms) == {100}
-    assert road.asked == [b"\x0a\xff"] * (10 if polled else 0)
+    assert set(road.waited_ms) == waited_ms
+    assert road.asked == [b"\x0a\xff"] * asked
 
 
 def test_an_open_line_is_read_until_it_is_stopped():

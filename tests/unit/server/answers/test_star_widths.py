@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -68,10 +70,11 @@ def test_the_best_is_where_the_ring_was_sharpest(rng):
 def test_a_tracker_without_widths_is_known_after_some_answers_with_stars():
     widths = AnswerWidths()
     without = Answer(0, b"", centroids=(ReportedStar(1.0, 2.0, 3.0, 7),))
-    for _ in range(NONE_AFTER):
+    for k in range(NONE_AFTER):
         assert not widths.reports_none
-        assert widths.take(without) is None
-    assert widths.reports_none and widths.state is None
+        # however much later the next answer comes: there is nothing to read
+        assert widths.take(replace(without, host_ns=k * NS_PER_S)) is None
+    assert widths.reports_none and widths.state is None and widths.curve.count == 0
     # an attitude without stars, as in a packet, is one of stars whose widths are not reported
     packets = AnswerWidths()
     for _ in range(NONE_AFTER):

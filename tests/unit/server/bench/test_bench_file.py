@@ -9,7 +9,9 @@ from dataclasses import FrozenInstanceError
 
 import pytest
 
+from hilstar.basics.errors import InputError
 from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.server.bench import build
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.build import open_bench
 from hilstar.server.record.ledger import Ledger
@@ -33,6 +35,26 @@ sys.addaudithook(
         else None
     )
 )
+
+
+def test_a_bench_that_cannot_be_opened_lets_its_own_context_go(tmp_path, monkeypatch):
+    """A window frees its own; where NumPy draws there is none."""
+    path = tmp_path / "bench.toml"
+    path.write_text(SMALL_BENCH.replace("[collimator]", 'calibration = "none.toml"\n[collimator]'))
+    file = read_bench_file(path)
+    released = []
+
+    class OwnContext:
+        def release(self) -> None:
+            released.append(self)
+
+    own, windows = OwnContext(), OwnContext()
+    for made, given, freed in ((own, None, [own]), (None, None, []), (own, windows, [])):
+        released.clear()
+        monkeypatch.setattr(build, "headless_context", lambda gpu, made=made: made)
+        with pytest.raises(InputError, match=r"none\.toml"):
+            open_bench(file, given)
+        assert released == freed
 
 
 def test_a_file_that_is_replaced_after_it_was_read_changes_nothing_of_the_run(

@@ -365,22 +365,23 @@ def test_a_table_s_own_errors_stand_in_the_place_of_hipparcos(tmp_path):
 
 
 def test_beside_hipparcos_a_star_of_hipparcos_keeps_its_errors_whatever_the_numbers(tmp_path):
-    """HIP 5 and Gaia DR3 5 are two stars."""
+    """HIP 5 and Gaia DR3 5 are two stars; a star of the table may have a HIP number, too."""
     path = tmp_path / "stars.ecsv"
     table = gaia_table()
     table["ra_error"] = np.array([0.1, 0.2, 0.3, 0.4, 0.5]) * u.mas
     table.write(path)
-    row = table["source_id"].tolist().index(5)
-    zero = np.zeros(2)
-    columns = {"v_mag": zero, "ra_deg": zero, "dec_deg": zero}
-    columns |= {"hip": np.array([5, 0], dtype=np.int32), "identifier": np.array([5, 5])}
-    stars = plain_catalog("Gaia DR3", 2, columns)
+    numbers = [5, 5, 4295806720]
+    rows = [table["source_id"].tolist().index(number) for number in numbers]
+    own = [0.1 * (row + 1) for row in rows]
+    columns = {name: np.zeros(3) for name in ("v_mag", "ra_deg", "dec_deg")}
+    columns |= {"hip": np.array([5, 0, 7], dtype=np.int32), "identifier": np.array(numbers)}
+    stars = plain_catalog("Gaia DR3", 3, columns)
     before = errors_of(stars)
     facts = table_facts(TableChoice(path, with_hipparcos=True), stars, before)
-    assert facts["sigma_ra_mas"].tolist() == [before["sigma_ra_mas"][0], 0.1 * (row + 1)]
-    assert 0.1 < before["sigma_ra_mas"][0] < 2.0
+    assert facts["sigma_ra_mas"].tolist() == [before["sigma_ra_mas"][0], *own[1:]]
+    assert before["sigma_ra_mas"][0] > 0.6
     alone = table_facts(TableChoice(path), stars, before)
-    assert alone["sigma_ra_mas"].tolist() == [0.1 * (row + 1)] * 2
+    assert alone["sigma_ra_mas"].tolist() == own
 
 
 @pytest.mark.parametrize("name", ["t.vot", "t.fits"])

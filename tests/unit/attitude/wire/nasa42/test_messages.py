@@ -150,6 +150,8 @@ GOOD = "TIME 2024-099-00:00:01.5\nSC[0].B[0].wn = [0 0 1e-3]\nSC[0].B[0].qn = [0
         ("2024-099", "2024-367", "format"),
         ("2024-099", "0000-099", "format"),
         ("2024-099", "9999-366", "format"),
+        ("2024-099", "2023-366", "format"),
+        ("2024-099", "2024-000", "format"),
         ("00:00:01.5", "25:00:01.5", "format"),
         ("00:00:01.5", "23:59:60.000000000", None),
         ("SC[0].B[0].qn", "SC[1].B[0].qn", "format"),
@@ -276,6 +278,7 @@ def test_a_message_that_comes_byte_by_byte_is_looked_through_once(monkeypatch):
         ("tcp://*:*", True, r"tcp://0\.0\.0\.0:\d+"),
         ("tcp://127.0.0.1:*", True, r"tcp://127\.0\.0\.1:\d+"),
         ("tcp://[::1]:10001", False, r"tcp://\[::1\]:10001"),
+        ("tcp://[::1]:*", True, r"tcp://\[::1\]:\d+"),
         ("tcp://localhost:10001", False, "tcp://localhost:10001"),
     ],
 )

@@ -436,7 +436,7 @@ def measure_sensor(flats: Sequence[Path], darks: Sequence[Path]) -> SensorFile:
 
 @dataclass(frozen=True, slots=True)
 class _Unit:
-    """What a figure in DN is divided by, with its one-sigma error."""
+    """What a figure in DN is divided by, with its relative one-sigma error."""
 
     value: float
     error: float

@@ -157,6 +157,20 @@ def test_a_figure_is_half_as_large_as_the_smallest_side_of_screen_and_field(size
     assert sides_px == pytest.approx([100, 100], abs=1)
 
 
+@pytest.mark.parametrize(("side_px", "has_space"), [(30, True), (29, False)])
+def test_a_figure_needs_space_for_its_largest_square(side_px, has_space):
+    """Of 3 x 5 px of the monitor, as far from the middle as a quarter of what the tracker sees."""
+    middle_px = ((side_px - 1) / 2,) * 2
+    tracker = replace(
+        COARSE.tracker, resolution_px=(side_px, side_px), principal_point_px=middle_px
+    )
+    geometry = BenchGeometry(COARSE.monitor, tracker)
+    if has_space:
+        assert figure_for(geometry).side_px == 5
+        return
+    assert refusal(figure_for, geometry).startswith("the tracker sees too little of the monitor")
+
+
 def test_spots_are_drawn_where_the_tracker_sees_them_each_with_its_name_inwards(tmp_path, figures):
     """In an image of twice as many columns as are drawn, whose brightest pixels stay."""
     image = np.zeros((20, 1462))

@@ -25,6 +25,7 @@ import math
 import re
 from functools import partial
 from pathlib import Path
+from statistics import fmean
 from typing import Any, get_type_hints
 
 from hilstar.basics.charts import two_digits
@@ -520,7 +521,8 @@ def certify_table() -> str:
                 cells.append("")
                 continue
             held, low, high, ratio = (
-                sum(float(row[key]) for row in members) / len(members)
+                # its rounding is the same in every Python; that of sum is not
+                fmean(float(row[key]) for row in members)
                 for key in ("held_percent", "low_percent", "high_percent", "ratio")
             )
             cells.append(f"{held:.1f} % ({low:.0f} to {high:.0f}), {ratio:.2f}")

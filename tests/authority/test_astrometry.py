@@ -31,6 +31,8 @@ J2000_JD, ALPHA_CENTAURI_HIP = 2_451_545.0, 71_683
 # Of a parallax: bent light at another angle to the Sun, and DE421 against ERFA's series.
 PARALLAX_SHARE = 1e-3
 FAR_FROM_THE_SUN_AU = 1e6  # ERFA bends light by the Sun's potential too
+# 2 GM/c^2 of the Sun, 2e-8 AU, over that distance, times beta, is 2e-18 rad: rounding is more
+SUN_FAR_AWAY_RAD = 1e-14
 
 
 def separation_rad(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -154,6 +156,19 @@ def test_stars_of_a_frame_stand_where_erfa_sees_them_from_a_spacecraft_about_the
     plain = bench.light(bench.view(q))
     assert plain is not None
     assert np.abs(plain.x_px[:30] - sprites.x_px[:30]).max() > 0.01
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_velocity_along_one_axis_moves_all_stars_as_erfa_does(bench_with, axis):
+    velocity_km_s = np.zeros(3)
+    velocity_km_s[axis] = -29.8
+    moving = bench_with(f"[sky]\nobserver_velocity_km_s = {velocity_km_s.tolist()}\n").stars
+    still = bench_with("").stars
+    rows = {hip: row for row, hip in enumerate(still.hip.tolist())}
+    natural = still.vectors[[rows[hip] for hip in moving.hip.tolist()]]
+    beta = velocity_km_s / LIGHT_KM_S
+    seen = erfa.ab(natural, beta, FAR_FROM_THE_SUN_AU, np.sqrt(1 - beta @ beta))
+    assert np.abs(moving.vectors - seen).max() < SUN_FAR_AWAY_RAD
 
 
 def test_near_stars_are_seen_from_where_the_earth_is(tmp_path):

@@ -33,7 +33,14 @@ from hilstar.attitude.wire.packet import (
 )
 from hilstar.attitude.wire.roads import PAUSE_S, LinkCounts, RawMessage
 from hilstar.attitude.wire.serial_link import SerialLink
-from hilstar.attitude.wire.zmq_socket import LOOK_S, _Doorkeeper, _MemoryWatch
+from hilstar.attitude.wire.zmq_socket import (
+    EVENT,
+    FREED_WITHIN_S,
+    LOOK_S,
+    MAX_GROWTH_BYTES,
+    _Doorkeeper,
+    _MemoryWatch,
+)
 from hilstar.basics.errors import InputError
 from hilstar.basics.notices import Notices
 from hilstar.basics.units import NS_PER_S
@@ -193,6 +200,86 @@ def test_memory_that_is_used_is_seen_at_most_every_look():
     clock.sleep(LOOK_S)
     assert watch.grown_bytes() == pytest.approx(kept.nbytes, rel=0.1)
     watch.close()
+
+
+@pytest.mark.parametrize("is_freed", [True, False])
+def test_memory_that_is_not_returned_counts_no_more_and_what_is_returned_does(
+    monkeypatch, is_freed
+):
+    """A reset frees what a link held; what stays for FREED_WITHIN_S was something else's."""
+    clock = FakeClock()
+    used_bytes = 10**9
+    monkeypatch.setattr(_MemoryWatch, "_used_bytes", lambda watch: used_bytes)
+    watch = _MemoryWatch(clock)
+    watch.begin()
+    used_bytes += 2 * MAX_GROWTH_BYTES
+    assert watch.grown_bytes() == 2 * MAX_GROWTH_BYTES
+    if is_freed:
+        used_bytes = 10**9
+    watch.await_release()
+    waited_s = sum(clock.slept_s)
+    clock.sleep(LOOK_S)
+    assert watch.grown_bytes() == 0
+    if is_freed:
+        assert waited_s == 0
+    else:
+        assert FREED_WITHIN_S <= waited_s <= FREED_WITHIN_S + LOOK_S
+    watch.close()
+
+
+class Monitor:
+    """A socket's monitor that has these events, one at each call of `tend`."""
+
+    def __init__(self, *events: tuple[int, int]) -> None:
+        self._events = list(events)
+
+    def recv_multipart(self, flags: int) -> list[bytes]:
+        if not self._events:
+            raise zmq.Again
+        return [EVENT.pack(*self._events.pop(0)), b"tcp://127.0.0.1:9"]
+
+
+class Look:
+    """A look at what is there in the place of a partner, which finds nothing."""
+
+    begun = 0
+
+    def begin(self) -> None:
+        self.begun += 1
+
+    def take(self) -> str:
+        return ""
+
+
+def test_each_connection_that_we_made_ends_by_its_own_handshake_and_failure():
+    """One that was greeted is lost; the next, which was not, is no partner's, and neither is one
+    whose handshake failed; the last is lost again.
+    """
+    greeted = (zmq.EVENT_HANDSHAKE_SUCCEEDED, 7)
+    failed = (zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL, 7)
+    ended = (zmq.EVENT_DISCONNECTED, 7)
+    ends = (
+        ((greeted, ended), (1, 1, 0)),
+        ((ended,), (1, 1, 1)),
+        ((failed, ended), (1, 1, 2)),
+        ((greeted, ended), (2, 2, 2)),
+        ((ended,), (2, 2, 3)),
+    )
+    counts, look, opened, lost = LinkCounts(), Look(), [], []
+    told = zmq_socket.ConnectionsTold(lambda: opened.append(1), lost.append)
+    with contextlib.ExitStack() as opened_here:
+        context = opened_here.enter_context(zmq.Context())
+        watched = opened_here.enter_context(context.socket(zmq.SUB))
+        keeper = _Doorkeeper(watched, look=look, counts=counts, told=told, notices=Notices())
+        opened_here.callback(keeper.close)
+        opened_here.callback(setattr, keeper, "monitor", keeper.monitor)
+        for events, expected in ends:
+            keeper.monitor = Monitor(*events)
+            keeper.tend()
+            assert (len(opened), len(lost), look.begun) == expected
+            assert keeper.lost
+            keeper.lost = False
+        assert (counts.connections, counts.rejected) == (2, 3)
 
 
 def test_connections_over_the_limit_are_ended_unless_their_descriptor_is_another_s(monkeypatch):

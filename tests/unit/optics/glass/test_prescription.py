@@ -524,3 +524,66 @@ def test_vignetting_is_that_of_the_field_s_own_direction():
 def test_vignetting_beside_a_field_s_direction_is_refused(point):
     line = refusal(prescription._vignetting, (point,))
     assert f"{point.x:g}, {point.y:g} is vignetted along neither x nor y" in line
+
+
+class PinholeRays:
+    """In place of an optic of optiland's: a hole 2 mm across 40 mm before a plane image, whose rays
+    start within the pupil that a field's factors leave, as optiland's do.
+    """
+
+    def __init__(self, *fields: tuple[float, float]) -> None:
+        tables = [SimpleNamespace(vx=vx, vy=vy) for vx, vy in fields]
+        self.fields = SimpleNamespace(max_field=10.0, fields=tables)
+        self.object_surface = SimpleNamespace(is_infinite=True)
+        colours = [SimpleNamespace(value=um) for um in (0.65, 0.45, 0.55, 0.55)]
+        self.wavelengths = SimpleNamespace(wavelengths=colours)
+        self.primary_wavelength = 0.55
+        # as arrays, and the sign that optiland gives a lens turned round
+        self.paraxial = SimpleNamespace(f2=lambda: np.array([-40.0]), FNO=lambda: np.array([20.0]))
+        image = SimpleNamespace(get_effective_transform=lambda: ((0.0, 0.0, 40.0), np.eye(3)))
+        self.image_surface = SimpleNamespace(geometry=SimpleNamespace(cs=image))
+        generator = SimpleNamespace(generate_rays=self.starts)
+        self.ray_tracer = SimpleNamespace(ray_generator=generator)
+
+    def starts(self, hx, hy, px, py, um):
+        (field,) = self.fields.fields
+        slope_x, slope_y = (np.tan(np.radians(10.0 * np.asarray(h))) for h in (hx, hy))
+        n = 1 / np.sqrt(1 + slope_x**2 + slope_y**2)
+        return SimpleNamespace(
+            x=np.asarray(px) * (1 - field.vx),
+            y=np.asarray(py) * (1 - field.vy),
+            z=np.zeros(np.shape(px)),
+            L=slope_x * n,
+            M=slope_y * n,
+            N=n,
+        )
+
+    def trace_generic(self, hx, hy, px, py, um):
+        rays = self.starts(hx, hy, px, py, um)
+        rays.x = rays.x + 40.0 * rays.L / rays.N
+        rays.y = rays.y + 40.0 * rays.M / rays.N
+        rays.z = np.full(rays.x.shape, 40.0)
+        rays.opd = 40.0 / rays.N
+        rays.i = np.ones(rays.x.shape)
+        return rays
+
+
+def test_an_optic_s_factors_cut_a_pupil_once_along_both_axes():
+    """The own factors, of points between the file's, stand for those of optiland's fields; beside
+    them its figures are sizes, and its colours each once.
+    """
+    points = (FieldPoint(0.0, 0.0), FieldPoint(0.0, 10.0, compression=(0.1, 0.4)))
+    rays = prescription._LensRays(PinholeRays((0.1, 0.4)), points)
+    assert (rays.focal_length_mm, rays.f_number) == (40.0, 20.0)
+    assert rays.wavelengths_um == [0.45, 0.55, 0.65] and rays.primary_um == 0.55
+    for share in (0.0, 0.5, 1.0):
+        bundle = rays.bundle(np.array([0.0, share]), 0.55, 200)
+        lit = bundle.light > 0
+        # its rows and columns are the middles of 200 parts of the pupil
+        half_mm = 1 - 1 / 200
+        across = np.ptp(bundle.x[lit]) / 2 / half_mm
+        down = np.ptp(bundle.y[lit]) / 2 / half_mm
+        assert (across, down) == pytest.approx((1 - 0.1 * share, 1 - 0.4 * share), abs=0.01)
+        at_mm = 40 * np.tan(np.radians(10 * share))
+        middle = (bundle.x[lit].mean(), bundle.y[lit].mean())
+        assert middle == pytest.approx((0.0, at_mm), abs=1e-9)

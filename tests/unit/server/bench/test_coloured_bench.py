@@ -5,6 +5,7 @@ sub-pixels, and which clip.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.basics.rotation import from_radec_roll_deg
+from hilstar.optics.extended import LightMap
 from hilstar.server.bench.bench_file import bench_file_of
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.frame import Bench
@@ -27,6 +29,7 @@ STARS = (
     (1.0, 0.6, 95.0, 10.0),
 )
 THIRD = 1 / 3
+SPLINE_PX = 1e-3  # a third of a pixel by cubic splines, of a spot of 2 px sigma
 PLACES_PX = ((-THIRD, 0.0), (0.0, 0.0), (THIRD, 0.0))
 Q = from_radec_roll_deg(84.0, 10.0, 17.0)
 
@@ -139,3 +142,26 @@ def test_a_red_star_is_drawn_where_its_red_alone_lights_a_pixel(coloured) -> Non
         with coloured({"render": keys}) as bench:
             assert (2.0 in bench.shown_stars.v_mag.round(1)) is shown
             assert (2.0 in bench.faint_stars.v_mag.round(1)) is not shown
+
+
+def test_each_frame_s_wide_light_is_its_own_and_the_same_objects_are_moved_once(coloured) -> None:
+    """A spot of light in one frame, elsewhere in the next: each primary's stands where its stripe
+    is not.
+    """
+    y, x = np.mgrid[:21, :21]
+    spot = np.exp(-((x - 10) ** 2 + (y - 10) ** 2) / 8).astype(np.float32)
+    with coloured() as bench:
+        stars = bench.light(bench.view(Q))
+        assert stars is not None
+        for corner_px in ((5, 6), (50, 30), (5, 6)):
+            frame = replace(stars, extended=(LightMap(spot, corner_px),))
+            driven = bench.colours.driven(frame, bench.shown_stars)
+            for (part,), (stripe_x, stripe_y) in zip(driven.lights, PLACES_PX, strict=True):
+                rows, columns = np.indices(part.image.shape)
+                light = part.image.sum()
+                at_x = (part.image * (columns + part.corner_px[0])).sum() / light
+                at_y = (part.image * (rows + part.corner_px[1])).sum() / light
+                wanted = (corner_px[0] + 10 - stripe_x, corner_px[1] + 10 - stripe_y)
+                assert (at_x, at_y) == pytest.approx(wanted, abs=SPLINE_PX)
+            again = bench.colours.driven(frame, bench.shown_stars)
+            assert again.lights is driven.lights

@@ -32,20 +32,31 @@ MOMENT = 0.01  # the circle's edge, as above, squared; and shares of four sample
 class Aplanat:
     """What the glass asks of an optic of optiland's. `crowding` puts the pupil's places nearer to
     the middle; `cut` is the share of the pupil that is cut off along x and y.
+
+    As optiland's does, it cuts by its fields' factors itself. Its detector's middle is at
+    `detector_mm`; the image of a `relay` is turned round, and its focal length counts below 0.
     """
 
     def __init__(
-        self, max_field: float = 1.0, crowding: float = 0.0, cut: tuple[float, float] = (0.0, 0.0)
+        self,
+        max_field: float = 1.0,
+        crowding: float = 0.0,
+        cut: tuple[float, float] = (0.0, 0.0),
+        relay: bool = False,
+        detector_mm: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         self.crowding = crowding
+        self.detector_mm = detector_mm
+        self.upright = -1 if relay else 1
         self.object_surface = SimpleNamespace(is_infinite=True)
         edge = SimpleNamespace(x=0.0, y=max_field, vx=cut[0], vy=cut[1])
         self.fields = SimpleNamespace(max_field=max_field, fields=[edge])
         wave = SimpleNamespace(value=UM)
         self.wavelengths = SimpleNamespace(wavelengths=[wave])
         self.primary_wavelength = UM
-        self.paraxial = SimpleNamespace(f2=lambda: FOCAL_MM, FNO=lambda: [F_NUMBER])
-        frame = SimpleNamespace(get_effective_transform=lambda: (np.zeros(3), np.eye(3)))
+        focal_mm = self.upright * FOCAL_MM
+        self.paraxial = SimpleNamespace(f2=lambda: focal_mm, FNO=lambda: [F_NUMBER])
+        frame = SimpleNamespace(get_effective_transform=lambda: (detector_mm, np.eye(3)))
         self.image_surface = SimpleNamespace(geometry=SimpleNamespace(cs=frame))
         generator = SimpleNamespace(generate_rays=self.generate_rays)
         self.ray_tracer = SimpleNamespace(ray_generator=generator)
@@ -54,6 +65,9 @@ class Aplanat:
         """Rays that enter: parallel, from places in the plane of the pupil, mm."""
         scale = FIELD_TANGENT if self.fields.max_field else 0.0
         length = np.sqrt(1 + scale**2 * (hx**2 + hy**2))
+        (edge,) = self.fields.fields
+        px = px * (1 - edge.vx)
+        py = py * (1 - edge.vy)
         radius = np.hypot(px, py)
         at = FOCAL_MM * NA * ((1 - self.crowding) + self.crowding * radius**2)
         return SimpleNamespace(
@@ -68,11 +82,13 @@ class Aplanat:
         hx, hy, px, py = np.broadcast_arrays(hx, hy, px, py)
         start = self.generate_rays(hx, hy, px, py, um)
         is_lost = np.hypot(px, py) > 1.2
-        x = np.where(is_lost, np.nan, FOCAL_MM * start.L / start.N)
-        cos_x = start.L - start.x / FOCAL_MM
-        cos_y = start.M - start.y / FOCAL_MM
+        right_mm, down_mm, along_mm = self.detector_mm
+        x = np.where(is_lost, np.nan, self.upright * FOCAL_MM * start.L / start.N) + right_mm
+        y = self.upright * FOCAL_MM * start.M / start.N + down_mm
+        cos_x = self.upright * (start.L - start.x / FOCAL_MM)
+        cos_y = self.upright * (start.M - start.y / FOCAL_MM)
         return SimpleNamespace(
-            x=x, y=FOCAL_MM * start.M / start.N, z=np.zeros_like(x),
+            x=x, y=y, z=np.full_like(x, along_mm),
             L=cos_x, M=cos_y, N=np.sqrt(1 - cos_x**2 - cos_y**2),
             opd=100.0 - start.L * start.x - start.M * start.y,
             i=np.where(is_lost, 0.0, 1.0),
@@ -127,10 +143,14 @@ def test_rays_are_as_many_as_keep_the_next_image_of_the_star_off_its_stamp(monke
     assert image[:, [0, -1]].max() < 0.01 * image.max()
 
 
-def test_an_aplanat_has_a_pinhole_s_camera_and_an_even_field():
+@pytest.mark.parametrize(
+    ("relay", "detector_mm"), [(False, (0.0, 0.0, 0.0)), (True, (0.3, -0.2, 60.0))]
+)
+def test_an_aplanat_has_a_pinhole_s_camera_and_an_even_field(relay, detector_mm):
     focus_um = 8.0
     plate = Plate((401, 301), PITCH_UM, (focus_um,), half_px=2)
-    made = traced(Aplanat(), plate, 2, 1e-3, "a closed form")
+    lens = Aplanat(relay=relay, detector_mm=detector_mm)
+    made = traced(lens, plate, 2, 1e-3, "a closed form")
     assert made.focal_length_mm == pytest.approx(FOCAL_MM, rel=1e-9)
     assert (*made.glass.lens.radial, *made.glass.lens.tangential) == pytest.approx(
         [0] * 5, abs=1e-6

@@ -228,7 +228,7 @@ def test_memory_that_is_not_returned_counts_no_more_and_what_is_returned_does(
 
 
 class Monitor:
-    """A socket's monitor that has these events, one at each call of `tend`."""
+    """A socket's monitor that has these events, and then no more."""
 
     def __init__(self, *events: tuple[int, int]) -> None:
         self._events = list(events)
@@ -280,6 +280,38 @@ def test_each_connection_that_we_made_ends_by_its_own_handshake_and_failure():
             assert keeper.lost
             keeper.lost = False
         assert (counts.connections, counts.rejected) == (2, 3)
+
+
+def test_a_descriptor_that_is_used_again_is_another_connection(monkeypatch):
+    """The second of two is over the limit, and ends unrejected; the number's next one stands, and
+    its failed handshake counts.
+    """
+    monkeypatch.setattr(zmq_socket, "MAX_CONNECTIONS", 1)
+    # beyond all limits of open files
+    first, second = 2**30, 2**30 + 1
+    failed = (zmq.EVENT_HANDSHAKE_FAILED_AUTH, second)
+    steps = (
+        ([(zmq.EVENT_ACCEPTED, first), (zmq.EVENT_ACCEPTED, second)], set(), (1, 0)),
+        ([(zmq.EVENT_DISCONNECTED, second)], {second}, (1, 0)),
+        # it left before its handshake
+        ([(zmq.EVENT_DISCONNECTED, first)], {first, second}, (1, 1)),
+        ([(zmq.EVENT_ACCEPTED, second)], {first}, (1, 1)),
+        ([failed, (zmq.EVENT_DISCONNECTED, second)], {first, second}, (1, 2)),
+    )
+    counts = LinkCounts()
+    told = zmq_socket.ConnectionsTold(lambda: None, lambda why: None)
+    with contextlib.ExitStack() as opened:
+        context = opened.enter_context(zmq.Context())
+        watched = opened.enter_context(context.socket(zmq.SUB))
+        keeper = _Doorkeeper(watched, look=None, counts=counts, told=told, notices=Notices())
+        opened.callback(keeper.close)
+        opened.callback(setattr, keeper, "monitor", keeper.monitor)
+        for events, left, expected in steps:
+            keeper.monitor = Monitor(*events)
+            keeper.tend()
+            assert keeper.left == left
+            assert (counts.refused, counts.rejected) == expected
+        assert counts.connections == 3
 
 
 def test_connections_over_the_limit_are_ended_unless_their_descriptor_is_another_s(monkeypatch):

@@ -11,11 +11,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import j1
 
 from hilstar.basics.arrays import FloatArray
 from hilstar.optics.glass import prescription
+from hilstar.optics.glass.lens_data import FieldPoint
 from hilstar.optics.glass.prescription import Plate, traced
+from tests.support.refusals import refusal
 
 FOCAL_MM, F_NUMBER, UM = 50.0, 4.0, 0.5
 NA = 1 / (2 * F_NUMBER)
@@ -184,3 +187,69 @@ def test_a_wide_image_is_the_cone_of_its_rays(defocus_um):
         line = image.sum(axis=axis)
         assert line @ off_px == pytest.approx(0, abs=MOMENT)
         assert line @ off_px**2 == pytest.approx(variance_px2, rel=MOMENT)
+
+
+def rays_of(lens: Aplanat) -> prescription._LensRays:
+    return prescription._LensRays(lens, (FieldPoint(0.0, 0.0),))
+
+
+def test_rays_are_placed_by_a_tilted_detector_s_own_axes(rng):
+    turn = Rotation.from_euler("xyz", [3.0, -2.0, 5.0], degrees=True)
+    detector_mm = (0.3, -0.2, 60.0)
+    lens = Aplanat(detector_mm=detector_mm)
+    frame = SimpleNamespace(get_effective_transform=lambda: (detector_mm, turn.as_matrix()))
+    lens.image_surface = SimpleNamespace(geometry=SimpleNamespace(cs=frame))
+    places_mm = np.column_stack([rng.uniform(-5, 5, (20, 2)), np.zeros(20)])
+    directions = rng.normal(size=(20, 3))
+    x, y, z = (turn.apply(places_mm) + detector_mm).T
+    right, down, along = turn.apply(directions).T
+    ends = SimpleNamespace(x=x, y=y, z=z, L=right, M=down, N=along)
+    at_mm, cosines = rays_of(lens).at_image(ends)
+    assert pytest.approx(places_mm[:, :2], abs=1e-12) == at_mm.T
+    assert pytest.approx(directions, abs=1e-12) == cosines.T
+
+
+def test_wavelengths_rise_each_once_and_figures_are_sizes():
+    lens = Aplanat(relay=True)
+    lens.wavelengths.wavelengths = [SimpleNamespace(value=um) for um in (0.65, 0.45, 0.5, 0.45)]
+    rays = rays_of(lens)
+    assert rays.wavelengths_um == [0.45, 0.5, 0.65]
+    assert (rays.focal_length_mm, rays.f_number) == (FOCAL_MM, F_NUMBER)
+
+
+def without_power(lens: Aplanat) -> None:
+    lens.paraxial.f2 = lambda: np.array([np.inf])
+
+
+def without_wavelengths(lens: Aplanat) -> None:
+    lens.wavelengths.wavelengths = []
+
+
+def of_a_near_object(lens: Aplanat) -> None:
+    lens.object_surface.is_infinite = False
+
+
+def without_its_middle(lens: Aplanat) -> None:
+    trace = lens.trace_generic
+
+    def traced_beside_it(hx, hy, px, py, um):
+        rays = trace(hx, hy, px, py, um)
+        rays.x = np.where(np.hypot(hx, hy) == 0, np.nan, rays.x)
+        return rays
+
+    lens.trace_generic = traced_beside_it
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (without_power, "no focal length or no wavelength"),
+        (without_wavelengths, "no focal length or no wavelength"),
+        (of_a_near_object, "its object is near"),
+        (without_its_middle, "the chief ray of its field's middle is lost"),
+    ],
+)
+def test_a_lens_that_is_none_for_stars_is_refused(change, words):
+    lens = Aplanat()
+    change(lens)
+    assert words in refusal(rays_of, lens)

@@ -570,12 +570,16 @@ class ZmqSocket(ByteRoad):
     def _reset(self, why: str) -> None:
         """Drop every connection, and what libzmq keeps of it."""
         self.link_counts.resets += 1
-        self._notices.tell(
-            "flood", f"{self.endpoint}: {why}; dropping every connection and reconnecting"
-        )
         self._shut()
         self._memory.await_release()
-        self._open()
+        try:
+            self._open()
+        finally:
+            # Told once the old socket takes nobody: a request of who connects by this line would be
+            # lost with it, and never answered.
+            self._notices.tell(
+                "flood", f"{self.endpoint}: {why}; dropping every connection and reconnecting"
+            )
 
     def _shut(self, linger_ms: int = 0) -> None:
         if self._keeper is not None:

@@ -11,9 +11,9 @@ from hilstar.attitude.wire import zmq_socket
 from hilstar.attitude.wire.keys import CurveKeys, load_public, load_secret, make_keys
 from hilstar.attitude.wire.zmq_links import ZmqRoad
 from hilstar.attitude.wire.zmq_socket import MAX_GROWTH_BYTES, MAX_PARTS, ZmqReply, ZmqSocket
-from hilstar.basics.notices import Notices
+from hilstar.basics.notices import Notice, Notices
 from tests.support.refusals import refusal
-from tests.support.waiting import wait_for
+from tests.support.waiting import PATIENCE_S, wait_for
 
 WAIT_MS = 20_000
 
@@ -54,6 +54,31 @@ def test_a_message_that_is_too_long_to_be_passed_over_drops_every_connection(pai
     peer.send_multipart([b"x"] * (MAX_PARTS + 10))
     assert taken_parts(link) == []
     assert link.link_counts.resets == 1 and notices.counts()["flood"] == 1
+
+
+def test_who_connects_when_the_dropping_is_told_is_heard():
+    """By the line the new socket is bound: the old one would take the request and lose it."""
+    notices = Notices()
+    with ZmqReply("tcp://127.0.0.1:0", notices=notices) as link, zmq.Context() as context:
+        assert not link.wait_for_message(0)
+        attacker = context.socket(zmq.DEALER)
+        asker = context.socket(zmq.REQ)
+        monitor = asker.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED)
+
+        def connect(notice: Notice) -> None:
+            if notice.kind == "flood":
+                asker.connect(link.endpoint)
+                asker.send(b"request")
+                assert monitor.poll(1000 * PATIENCE_S)  # a socket has taken it
+
+        notices.listen(connect)
+        with attacker, asker, monitor:
+            attacker.connect(link.endpoint)
+            attacker.send_multipart([b"", *[b"x"] * (MAX_PARTS + 1)])
+            assert link.request(1000 * PATIENCE_S) is None
+            request = link.request(20_000)
+            assert request is not None and request.parts == [b"request"]
+            asker.disable_monitor()
 
 
 def test_what_this_process_took_before_the_link_was_used_is_not_the_link_s(tmp_path, monkeypatch):

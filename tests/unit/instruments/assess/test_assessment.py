@@ -14,7 +14,7 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial.transform import Rotation
 
-from hilstar.basics import charts, pages
+from hilstar.basics import charts
 from hilstar.basics.arrays import FloatArray
 from hilstar.instruments.assess import report
 from hilstar.instruments.assess.assessment import AssessSettings, assess_files, lock_of
@@ -52,7 +52,8 @@ def by_file(
     """
     folder, drawn = tmp_path_factory.mktemp("assess"), []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pages, "svg", lambda figure: drawn.append(figure) or charts.svg(figure))
+        svg = charts.svg
+        patch.setattr(charts, "svg", lambda figure: drawn.append(figure) or svg(figure))
         ledger, telemetry = write_run(folder, planted)
         run = run_hilstar_here(
             "assess", ledger, telemetry, "-o", folder / "out", "--json", "--display-attitudes", "0"

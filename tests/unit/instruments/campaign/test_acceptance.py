@@ -62,11 +62,11 @@ SETS = {
         'key = "scenario"\nvalues = ["dark.toml"]\n'
     ),
     "rate-limit": (
-        "[cases.rate-limit]\ncases = 16\n[cases.rate-limit.sweep]\n"
+        "[cases.rate-limit]\ncases = 8\n[cases.rate-limit.sweep]\n"
         'key = "rate_deg_s.across"\nstart = 0.1\nstop = 10.0\nscale = "log"\nrounds = 7\n'
     ),
     "sun": (
-        '[cases.sun]\ncases = 16\n[cases.sun.attitudes]\nkind = "body"\nbody = "sun"\n'
+        '[cases.sun]\ncases = 8\n[cases.sun.attitudes]\nkind = "body"\nbody = "sun"\n'
         '[cases.sun.sweep]\nkey = "body_deg"\nstart = 90.0\nstop = 0.0\n'
         '[[cases.sun.vary]]\nkey = "sky.epoch_utc"\nvalues = ["2026-03-20T12:00:00"]\n'
         '[[cases.sun.vary]]\nkey = "sky.bodies.sun"\nvalues = [true]\n'
@@ -83,7 +83,7 @@ SETS = {
         'values = ["geocentre"]\n'
     ),
     "earth": (
-        '[cases.earth]\ncases = 16\n[cases.earth.attitudes]\nkind = "body"\nbody = "earth"\n'
+        '[cases.earth]\ncases = 8\n[cases.earth.attitudes]\nkind = "body"\nbody = "earth"\n'
         '[cases.earth.sweep]\nkey = "limb_deg"\nstart = 45.0\nstop = -30.0\n'
         '[[cases.earth.vary]]\nkey = "sky.epoch_utc"\nvalues = ["2026-03-20T12:00:00"]\n'
         '[[cases.earth.vary]]\nkey = "spacecraft.orbit"\nvalues = ["low-orbit.tle"]\n'
@@ -91,7 +91,7 @@ SETS = {
         '[[cases.earth.vary]]\nkey = "time_s"\nminimum = -1400.0\nmaximum = 1400.0\n'
     ),
     "false-stars": (
-        "[cases.false-stars]\ncases = 16\n[cases.false-stars.sweep]\n"
+        "[cases.false-stars]\ncases = 8\n[cases.false-stars.sweep]\n"
         'key = "tracker.detector.false_stars"\nstart = 1\nstop = 200\nscale = "log"\nwhole = true\n'
     ),
 }
@@ -399,7 +399,7 @@ def test_a_plan_s_time_is_that_of_its_cases_on_their_workers_and_of_what_opens_t
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A case takes 3 s at a sweep's start, 6 s in its middle and 9 s at its end, and a session 1 s;
-    eight levels of 16 cases on 4 workers take 8 (16 x 6 / 4 + 1) s.
+    nine levels of 8 cases on 4 workers take 9 (8 x 6 / 4 + 1) s.
     """
     plan = tmp_path / "plan.toml"
     clauses = "".join(
@@ -419,8 +419,8 @@ def test_a_plan_s_time_is_that_of_its_cases_on_their_workers_and_of_what_opens_t
     assert (field.case_set.name, field.cases) == ("field", 60)
     assert field.seconds == pytest.approx(60 * 2 / 4 + 5, abs=5)
     levels = 2 + 7
-    assert (sweep.case_set.name, sweep.cases) == ("rate-limit", levels * 16)
-    assert sweep.seconds == pytest.approx(levels * (16 * 6 / 4 + 1), abs=10)
+    assert (sweep.case_set.name, sweep.cases) == ("rate-limit", levels * 8)
+    assert sweep.seconds == pytest.approx(levels * (8 * 6 / 4 + 1), abs=10)
     # of more workers than cases some have nothing to do
     at_s = iter([(2000.0, 500.0), (3e3, 0.0), (3e3, 0.0), (3e3, 0.0)])
     field, sweep = made.costs(100)

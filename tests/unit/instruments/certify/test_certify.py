@@ -102,10 +102,6 @@ HARD: dict[str, tuple[Callable[[np.random.Generator], Truth], tuple[str, ...]]] 
         lambda rng: dots_in_place(rng, 60, 0.5),
         ("place_along", "place_across", "attitude_x", "attitude_y"),
     ),
-    "dots over 200 px": (
-        lambda rng: dots_in_place(rng, 200, 0.5),
-        ("place_along", "place_across", "attitude_x", "attitude_y"),
-    ),
     # The polynomials beside the lens follow it: by what they leave intervals held 60 %.
     "few of dots' errors over 280 px": (
         lambda rng: dots_in_place(rng, 280, 0.03),

@@ -24,6 +24,7 @@ from hilstar.display.calibration import (
     CalibrationHead,
     NotesTable,
     load_calibration,
+    read_toml,
     write_calibration,
 )
 from hilstar.display.geometry import ErrorTable, MadeTable, Notes, write_geometry
@@ -261,6 +262,10 @@ def test_the_commands_of_calibrate_give_the_figures_of_the_steps(whole, tmp_path
     assert light["black_level"]["relative"] == pytest.approx(
         steps["photometry"]["black_level"], rel=SAME
     )
+    own, again = (folder / "s" / "response.toml", tmp_path / "response.toml")
+    assert read_toml(own).errors == read_toml(again).errors
+    responses = [load_calibration(path, 10).response.light for path in (own, again)]
+    assert np.array_equal(*responses)
     # As the bench file was before the step: white as it had it.
     text = (folder / "bench.toml").read_text()
     before = folder / "before-scale.toml"

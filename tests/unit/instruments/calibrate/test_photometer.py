@@ -26,7 +26,7 @@ from hilstar.instruments.calibrate.first_light.image_sources import VirtualBench
 from hilstar.instruments.calibrate.first_light.photometer import monitor_area
 from hilstar.instruments.calibrate.first_light.photometry import photometry
 from hilstar.instruments.calibrate.measurements import read_measurements
-from hilstar.instruments.calibrate.photometric import calibrate_photometric, fit_channel
+from hilstar.instruments.calibrate.photometric import fit_channel
 from hilstar.instruments.calibrate.plan import PlanSettings, plan_patches
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.server.bench.bench_file import read_bench_file
@@ -179,21 +179,6 @@ def test_what_rounding_takes_of_codes_that_cannot_be_exposed_longer_is_in_their_
     assert abs(black) < SURE
     # Half a step of the ADC, of codes whose peak is a few steps.
     assert float(outcome.figures["error_at_1e-3_percent"]) > 1.0
-
-
-def test_the_command_and_the_step_give_the_same_figures(tmp_path):
-    power_law_bench(tmp_path, NOISY)
-    outcome, _, _ = measured_light(tmp_path, 0)
-    found = calibrate_photometric(tmp_path / "measured.csv", tmp_path / "again.toml", bits=BITS)
-    mine, its = (read_toml(tmp_path / name).errors for name in ("response.toml", "again.toml"))
-    assert mine == its
-    assert found["holdout"]["rms_mag"] == outcome.figures["held_out_rms_mag"]
-    assert found["black_level"]["relative"] == pytest.approx(outcome.figures["black_level"])
-    responses = [
-        load_calibration(tmp_path / name, BITS).response.light
-        for name in ("response.toml", "again.toml")
-    ]
-    assert np.array_equal(*responses)
 
 
 def test_a_cause_that_readings_share_is_in_the_error_of_the_response(tmp_path):

@@ -35,7 +35,7 @@ from hilstar.instruments.confront.session import MATCH_PX
 from hilstar.optics.camera import Camera
 from hilstar.sky.catalog import plain_catalog
 from hilstar.sky.stars import unit_vectors_icrs
-from tests.support.confrontations import a_shot, seen_shot, sources_at
+from tests.support.confrontations import a_shot, a_star, seen_shot, sources_at
 
 SIZE_PX = (800, 400)
 FOCAL_PX = 3000.0
@@ -152,22 +152,8 @@ def test_missing_stars_are_bright_alone_and_within_the_image():
 
 def row_at(x_px: float, y_px: float, off_mag: float, **changes: Any) -> StarRow:
     """A star of 1000 DN that is too faint by so much."""
-    row = StarRow(
-        star=1,
-        hip=1,
-        name="",
-        x_px=x_px,
-        y_px=y_px,
-        x_predicted_px=x_px,
-        y_predicted_px=y_px,
-        dn=1000 * 10 ** (-0.4 * off_mag),
-        sigma_dn=1.0,
-        dn_predicted=1000.0,
-        v_mag=4.0,
-        b_v_mag=0.6,
-        flags=(),
-    )
-    return replace(row, **changes)
+    light = {"dn": 1000 * 10 ** (-0.4 * off_mag), "dn_predicted": 1000.0, "sigma_dn": 1.0}
+    return a_star("", 1, 4.0, (x_px, y_px), **(light | changes))
 
 
 def missing_at(x_px: float, y_px: float) -> StarRow:

@@ -37,7 +37,7 @@ from hilstar.instruments.confront.star_psf import (
     measure,
 )
 from hilstar.server.bench.bench_file import bench_file_of
-from tests.support.confrontations import TRACKER, a_light, a_session, a_shot
+from tests.support.confrontations import TRACKER, a_light, a_session, a_shot, a_star
 
 WIDE_PX, HIGH_PX = SIZE_PX = (640, 480)
 MIDDLE_PX = (319.5, 239.5)  # pixel (0, 0) is the centre of the top-left one
@@ -216,28 +216,14 @@ def test_the_light_at_a_place_is_of_its_row_and_column():
 
 
 def row_of(dn: float, **changes) -> StarRow:
-    row = StarRow(
-        star=1,
-        hip=1,
-        name="",
-        x_px=10.5,
-        y_px=20.0,
-        x_predicted_px=10.0,
-        y_predicted_px=20.25,
-        dn=dn,
-        sigma_dn=1.0,
-        dn_predicted=100.0,
-        v_mag=4.0,
-        b_v_mag=0.6,
-        flags=(),
-    )
-    return replace(row, **changes)
+    star = a_star("", 1, 4.0, (10.0, 20.0), dn=dn, dn_predicted=100.0)
+    return replace(star, **changes)
 
 
 def test_a_star_with_less_light_than_predicted_is_fainter():
     row = row_of(50.0)
     assert row.off_mag == pytest.approx(2.5 * math.log10(2))
-    assert row.off_px == (0.5, -0.25)
+    assert row.off_px == (0.25, -0.125)
     assert row.counted
     assert math.isnan(row_of(-3.0).off_mag)
     for change in (

@@ -257,5 +257,5 @@ def test_a_case_s_time_is_that_of_the_first_two_after_one_that_warms_up(monkeypa
     monkeypatch.setattr(acceptance, "time", SimpleNamespace(perf_counter=lambda: now_s))
     design = SimpleNamespace(points=lambda begin, end: [f"point {k}" for k in range(begin, end)])
     campaign: Any = SimpleNamespace(cases=60, design=design, job="job")
-    assert acceptance._case_s(campaign) == (2.0, 5.0)
+    assert acceptance.first_cases_s(campaign) == (2.0, 5.0)
     assert Slow.closed

@@ -9,7 +9,7 @@ import os
 import platform
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -244,6 +244,42 @@ class Progress:
             thread.join()
 
 
+def origin_of(source: ImageSource) -> str:
+    """What takes the images, and the monitor that shows the patterns where its EDID tells it."""
+    monitor = source.monitor
+    if monitor is None or not monitor.edid_sha256:
+        return source.identity
+    return f"{source.identity} on {monitor.name()}"
+
+
+def state_sha256(
+    number: int,
+    config: Mapping[str, Mapping[str, Any]],
+    folder: Path,
+    source: str,
+    tables: tuple[str, ...] = (),
+) -> str:
+    """The SHA-256 of what a step depends on: its tables (or these) of a bench file in `folder`,
+    without later steps' keys, the files that they name, and the source of its images.
+    """
+    step = STEPS[number]
+    later = {key for other in STEPS[number + 1 :] for key in other.writes}
+    keys_by_table = {}
+    for table in tables or step.tables:
+        keys_by_table[table] = {
+            key: value for key, value in config[table].items() if f"{table}.{key}" not in later
+        }
+    named = {}
+    for text in _texts(keys_by_table):
+        if _is_file(folder / text):
+            named[text] = sha256_of(folder / text)
+    # a step without tables shows nothing
+    origin = source if step.tables else platform.python_version()
+    return hashlib.sha256(
+        msgspec.json.encode([__version__, origin, keys_by_table, named], order="sorted")
+    ).hexdigest()
+
+
 class FirstLightSession:
     """A session in a directory, with at most `patches` readings of the response; `watch` is called
     with each pattern.
@@ -438,33 +474,9 @@ class FirstLightSession:
         self._watch(pattern)
 
     def _state(self, number: int, tables: tuple[str, ...] = ()) -> str:
-        """The SHA-256 of what a step depends on: its tables without later steps' keys, files
-        they name, the source.
-        """
-        step = STEPS[number]
-        later = {key for other in STEPS[number + 1 :] for key in other.writes}
+        """The state of a step of this session."""
         config = msgspec.to_builtins(self.file.config)
-        keys_by_table = {}
-        for table in tables or step.tables:
-            keys_by_table[table] = {
-                key: value for key, value in config[table].items() if f"{table}.{key}" not in later
-            }
-        named = {}
-        for text in _texts(keys_by_table):
-            if _is_file(self.file.folder / text):
-                named[text] = sha256_of(self.file.folder / text)
-        monitor = self.source.monitor
-        if monitor is not None and monitor.edid_sha256:
-            shown_on = f" on {monitor.name()}"
-        else:
-            shown_on = ""
-        if step.tables:
-            seen_by = self.source.identity + shown_on
-        else:
-            seen_by = platform.python_version()
-        return hashlib.sha256(
-            msgspec.json.encode([__version__, seen_by, keys_by_table, named], order="sorted")
-        ).hexdigest()
+        return state_sha256(number, config, self.file.folder, origin_of(self.source), tables)
 
     def as_file(self, running: str | None = None) -> SessionFile:
         """The contents of session.json."""

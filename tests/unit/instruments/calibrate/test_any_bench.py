@@ -511,32 +511,21 @@ def test_what_is_beyond_noise_is_told_from_noise():
     assert more.low > 0.2
 
 
-class Distances:
-    """Stars `off_px` from the sky along x and y, with noise along each axis, for `noise_words`."""
-
-    def __init__(self, off_px, noise_px):
-        self.residual_px, self.place_noise_px = np.full((4, 2), off_px), np.full(4, noise_px)
-
-
 def test_noise_is_never_said_to_be_more_than_the_whole():
     """A line said that stars were 0.081 px off, of which noise was 0.086."""
-    assert noise_words(Distances(0.1, 0.05)) == "of which noise is 0.071 px"
-    assert noise_words(Distances(0.05, 0.06)) == "no more than their noise makes (0.085 px)"
-
-
-class Places:
-    """The places of stars, for `frames_for`."""
-
-    def __init__(self, beyond, frames=1):
-        self.beyond_px, self.frames = beyond, frames
+    for off_px, noise_px, words in (
+        (0.1, 0.05, "of which noise is 0.071 px"),
+        (0.05, 0.06, "no more than their noise makes (0.085 px)"),
+    ):
+        assert noise_words(np.full((4, 2), off_px), np.full(4, noise_px)) == words
 
 
 def test_frames_are_asked_for_where_noise_hides_the_places():
     limit_px = 0.1
     sigma = limit_px / P95_OF_TWO
-    assert frames_for(Places(Beyond(0.0, 0.0, 0.9 * sigma)), limit_px) == 1
-    assert frames_for(Places(Beyond(3 * sigma, 2 * sigma, 4 * sigma)), limit_px) == 1
-    assert frames_for(Places(Beyond(0.0, 0.0, 3 * sigma)), limit_px) == 9
+    assert frames_for(Beyond(0.0, 0.0, 0.9 * sigma), 1, limit_px) == 1
+    assert frames_for(Beyond(3 * sigma, 2 * sigma, 4 * sigma), 1, limit_px) == 1
+    assert frames_for(Beyond(0.0, 0.0, 3 * sigma), 1, limit_px) == 9
 
 
 @pytest.mark.parametrize(
@@ -544,7 +533,7 @@ def test_frames_are_asked_for_where_noise_hides_the_places():
 )
 def test_no_more_frames_are_advised_than_the_option_takes(high, advised):
     limit_px = 0.1
-    (reason,) = place_reasons(Places(Beyond(0.0, 0.0, high * limit_px / P95_OF_TWO)), limit_px)
+    (reason,) = place_reasons(Beyond(0.0, 0.0, high * limit_px / P95_OF_TWO), 1, limit_px)
     assert advised in reason
     assert ("--average" in reason) == bool(advised)
     assert "a longer [tracker] exposure_s" in reason

@@ -304,9 +304,7 @@ class _White:
             self._lit = self._lit_pixels(looked)
             near = binary_dilation(self._lit, iterations=RING_PX)
             self._beside = near & self._cold & ~self._lit
-        # What black pixels glow more than in the dark frame is no light of the dots.
-        glow = looked.image[self._beside].mean() * self._lit.sum()
-        return float(looked.image[self._lit].sum() - glow)
+        return light_of_dots(looked.image, self._lit, self._beside)
 
     def _lit_pixels(self, looked: DarkSubtracted) -> BoolArray:
         """The pixels that the dots light. Raises InputError where there are none."""
@@ -318,6 +316,15 @@ class _White:
                 " is on"
             )
         return np.asarray(lit)
+
+
+def light_of_dots(image: FloatArray, lit: BoolArray, beside: BoolArray) -> float:
+    """The light of dots, DN, in lit pixels of an image (h, w), of which those beside them tell the
+    glow.
+    """
+    # what black pixels glow more than in the dark frame is no light of the dots
+    glow = image[beside].mean() * lit.sum()
+    return float(image[lit].sum() - glow)
 
 
 def _draw_warm_up(picture: Path, judged: WarmUp, t_s: FloatArray, light: FloatArray) -> None:

@@ -542,6 +542,6 @@ def test_what_the_lowest_code_adds_is_less_by_what_it_adds_to_a_ratio(tmp_path):
 )
 def test_a_file_is_named_from_the_bench_file_s_folder(tmp_path, folder, name):
     (tmp_path / folder).mkdir(exist_ok=True)
-    context = closed_context(tmp_path / folder, ClosedCamera())
+    context = replace(closed_context(tmp_path / folder, ClosedCamera()), session=tmp_path / "s")
     (change,) = context.names("collimator", "geometry", tmp_path / "s" / "geometry.toml")
     assert (change.table, change.key, change.after) == ("collimator", "geometry", name)

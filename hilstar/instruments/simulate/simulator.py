@@ -590,6 +590,13 @@ def _tracker_keys(config: BenchConfig) -> tuple[object, ...]:
     return config.tracker, config.background, config.sky, config.site
 
 
+def gathered(glow: FloatArray, bayer: str | None) -> FloatArray:
+    """The glow (channels, n) that pixels gather: by channel under a mosaic, else all (1, n)."""
+    if bayer is None:
+        return np.asarray(glow.sum(axis=0, keepdims=True))
+    return glow
+
+
 class TrackerBackground:
     """Light between the stars on a bench's detector: what is the same in every view, zodiacal light
     by direction, sky glow.
@@ -651,9 +658,8 @@ class TrackerBackground:
             self._say(float(sun_angles.elongation_deg.min()), beyond=not zodiacal.tabled.all())
             rates = [light.electrons_per_s_sr(sun_angles, zodiacal) for light in self._lights]
         if self._moving is not None and self._moving.air is not None:
-            glow = self._moving.air.glow_at(directions, self._moving.utc_ns(view.t_ns))
-            if self._bayer is None:
-                glow = glow.sum(axis=0, keepdims=True)
+            of_channels = self._moving.air.glow_at(directions, self._moving.utc_ns(view.t_ns))
+            glow = gathered(of_channels, self._bayer)
             if rates:
                 rates = [rate + more for rate, more in zip(rates, glow, strict=True)]
             else:

@@ -44,6 +44,7 @@ from hilstar.instruments.simulate.bench_geometry import PIXELS_AT_ONCE, BenchGeo
 from hilstar.server.bench.config.certify import VirtualSettings
 from hilstar.server.bench.monitor import bench_calibration, calibration_source
 from hilstar.tracker.centroids import noisiest_background
+from hilstar.tracker.settings import DetectorSettings
 
 APART_TRACKER_PX, APART_SIGMAS = 10.0, 16.0  # from dot to dot
 # Radius of the circle about a dot whose light is summed. At most a quarter of a period, so that no
@@ -470,7 +471,8 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     """
     geometry = context.real_geometry()
     ratio = geometry.tracker.focal_length_px / geometry.monitor.focal_length_px
-    sigma_px, period, reach = _spacing(context)
+    spacing = _spacing(context)
+    _, period, reach = spacing
     dark_path = context.dark()
     dark = context.read(dark_path)
     bad = unusable_pixels(dark, context.full_dn)
@@ -493,16 +495,25 @@ def see_dots(context: StepContext) -> tuple[DotLight, tuple[Path, ...]]:
     if lit.sum() < MIN_DOTS:
         few = f"{int(lit.sum())} dots are seen whole and {MIN_DOTS} are needed"
         raise InputError(f"{few}; look at the geometry and the focus")
-    detector = context.detector
     dn = float(np.median(light[lit]))
-    pixels = math.pi * (reach * ratio) ** 2
+    reach_px = reach * ratio
+    noise_mag = dot_noise_mag(dn, noise_dn, reach_px, spacing.sigma_px, context.detector)
+    seen_dots = DotLight(column[lit], row[lit], light[lit], noise_mag)
+    return seen_dots, (dark_path, *(looked.path for looked in looks))
+
+
+def dot_noise_mag(
+    dn: float, noise_dn: float, reach_px: float, sigma_px: float, detector: DetectorSettings
+) -> float:
+    """The noise of a dot's light, which is summed within its reach over a background of `noise_dn`
+    in a pixel, tracker px.
+    """
+    pixels = math.pi * reach_px**2
     # The noise of the dark frame is in that of the image above it; PRNU averages over a dot's
     # pixels.
     sum_dn2 = dn / detector.gain_e_per_dn + pixels * noise_dn**2
     response2 = detector.prnu**2 / (4 * math.pi * sigma_px**2)
-    noise = math.sqrt(sum_dn2 / dn**2 + response2)
-    seen_dots = DotLight(column[lit], row[lit], light[lit], MAG_PER_RELATIVE * noise)
-    return seen_dots, (dark_path, *(looked.path for looked in looks))
+    return MAG_PER_RELATIVE * math.sqrt(sum_dn2 / dn**2 + response2)
 
 
 def unusable_pixels(dark: FloatArray, full_dn: float) -> BoolArray:

@@ -31,7 +31,12 @@ from hilstar.instruments.calibrate.first_light.geometry import UPRIGHT, figure_f
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource
 from hilstar.instruments.calibrate.first_light.photometry import rounds_alike
 from hilstar.instruments.calibrate.first_light.seen_stars import Beyond, StarSpot
-from hilstar.instruments.calibrate.first_light.session import FirstLightSession, Progress
+from hilstar.instruments.calibrate.first_light.session import (
+    NAMES,
+    FirstLightSession,
+    Progress,
+    SessionPlan,
+)
 from hilstar.instruments.calibrate.first_light.stars import (
     P95_OF_TWO,
     frames_for,
@@ -307,28 +312,30 @@ class Dark(ImageSource):
     identity, sets_exposure = "dark", True
 
 
-def test_a_session_holds_every_step_to_the_ends_of_its_model(tmp_path, monkeypatch):
+def ran(folder, runs):
+    """A session whose steps come to these outcomes, and its exit code."""
+    (folder / "bench.toml").write_text(bench_text())
+    (folder / "s").mkdir()
+    file = read_bench_file(folder / "bench.toml")
+    session = FirstLightSession(folder / "s", file, Dark(), 0, plan=SessionPlan(runs=runs))
+    return session, session.run(frozenset(), lambda line: None)
+
+
+def test_a_session_holds_every_step_to_the_ends_of_its_model(tmp_path):
     at_end = StepOutcome("done", "found", fitted=(FittedFigure("tilt", -60.0, -60.0, 60.0),))
-    monkeypatch.setattr(sessions, "RUNS", {name: lambda context: at_end for name in sessions.NAMES})
-    (tmp_path / "bench.toml").write_text(bench_text())
-    session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Dark(), 0)
-    (tmp_path / "s").mkdir()
-    assert session.run(frozenset(), lambda line: None) == 1
+    session, code = ran(tmp_path, {name: lambda context: at_end for name in NAMES})
+    assert code == 1
     assert {record.verdict for record in session.records.values()} <= {"failed", "skipped"}
 
 
 @pytest.mark.parametrize(
     ("photometry", "scale"), [("done", "done"), ("skipped", "done"), ("failed", "skipped")]
 )
-def test_no_scale_is_done_by_a_response_that_failed(tmp_path, monkeypatch, photometry, scale):
+def test_no_scale_is_done_by_a_response_that_failed(tmp_path, photometry, scale):
     """White was 0.167 mag off with 0.016 stated, by stars in a response that was not measured."""
-    runs = {name: lambda context: StepOutcome("done", "found") for name in sessions.NAMES}
+    runs = {name: lambda context: StepOutcome("done", "found") for name in NAMES}
     runs["photometry"] = lambda context: StepOutcome(photometry, "so it ended")
-    monkeypatch.setattr(sessions, "RUNS", runs)
-    (tmp_path / "bench.toml").write_text(bench_text())
-    (tmp_path / "s").mkdir()
-    session = FirstLightSession(tmp_path / "s", read_bench_file(tmp_path / "bench.toml"), Dark(), 0)
-    session.run(frozenset(), lambda line: None)
+    session, _ = ran(tmp_path, runs)
     assert session.records["scale"].verdict == scale
 
 

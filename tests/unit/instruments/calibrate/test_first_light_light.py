@@ -4,8 +4,6 @@ them and of stars.
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from PIL import Image
@@ -26,7 +24,9 @@ from hilstar.instruments.calibrate.first_light.context import StepContext, darke
 from hilstar.instruments.calibrate.first_light.image_sources import ImageSource, VirtualBench
 from hilstar.instruments.calibrate.first_light.photometer import (
     Assumed,
+    LatticeRatio,
     Photometer,
+    Readings,
     field_for,
     peak_shares,
 )
@@ -217,10 +217,26 @@ def response_figures(
         "codes": 12,
         "error_percent": {"1e-0": 0.1, "1e-3": 0.9},
     }
-    links = [SimpleNamespace(ratio=r, sigmas=s) for r, s in zip(ratios, sigmas, strict=True)]
-    readings = SimpleNamespace(links=links, black_known=black, patches=[0] * 24, exposure_s=0.2)
+    links = []
+    for ratio, of_one in zip(ratios, sigmas, strict=True):
+        error = abs(ratio - 1) / of_one
+        links.append(LatticeRatio(Patch(50, "w"), 1, 2, ratio, error=error))
+    count = 24
+    none = np.zeros(count)
+    readings = Readings(
+        patches=[Patch(50, "w")] * count,
+        light=none,
+        exposure_s=0.2,
+        links=links,
+        black_known=black,
+        images=(),
+        above_black=none,
+        period=none.astype(int),
+        sigma=none,
+        common=none[:, None],
+    )
     responses = (gamma_response(10, 2.2), gamma_response(10, 2.4))
-    return _response_figures(SimpleNamespace(truth=None), readings, fitted, responses, 1e-5)
+    return _response_figures(None, readings, fitted, responses, 1e-5)
 
 
 def test_figures_of_a_response_are_in_their_units():
@@ -229,7 +245,10 @@ def test_figures_of_a_response_are_in_their_units():
     assert figures["noise_percent"] == pytest.approx(0.3)
     assert figures["error_at_1e-3_percent"] == 0.9
     assert figures["links_max_mag"] == pytest.approx(-2.5 * np.log10(0.98))
-    assert (figures["links"], figures["links_max_sigmas"]) == ("1.0100, 0.9800", 2.0)
+    assert (figures["links"], figures["links_max_sigmas"]) == (
+        "1.0100, 0.9800",
+        pytest.approx(2.0),
+    )
     assert figures["gamma"] == pytest.approx(2.4, abs=1e-6)
     assert figures["gamma_in_bench_file"] == pytest.approx(2.2, abs=1e-6)
     # at a thousandth of white by gamma 2.4 the signal is 0.056, which 2.2 has 0.2 powers brighter

@@ -19,8 +19,11 @@ from hilstar.instruments.calibrate.first_light.context import (
 from hilstar.instruments.calibrate.first_light.image_sources import complete_images
 from hilstar.instruments.calibrate.first_light.photometer import _seen
 from hilstar.instruments.calibrate.first_light.session import (
+    FIRST_LIGHT,
     STEPS,
     FirstLightSession,
+    SessionPlan,
+    SessionStep,
     origin_of,
     state_sha256,
 )
@@ -55,6 +58,17 @@ def record(name: str, verdict: str, state: str = "", **figures: float) -> StepRe
     )
 
 
+def test_later_keys_are_those_of_the_steps_after_one():
+    steps = (
+        SessionStep("", "", "", name="first", writes=("monitor.flip_x",)),
+        SessionStep("", "", "", name="second", writes=("monitor.bits", "render.bits")),
+    )
+    plan = SessionPlan(steps, {})
+    assert plan.names == ("first", "second")
+    assert plan.later_keys(0) == {"monitor.bits", "render.bits"}
+    assert plan.later_keys(1) == frozenset()
+
+
 def test_a_camera_is_told_with_the_monitor_that_it_sees():
     camera = ClosedCamera()
     assert origin_of(camera) == "closed camera"
@@ -71,15 +85,15 @@ def test_a_step_depends_on_its_tables_but_for_what_later_steps_set(tmp_path, num
         for key in step.writes:
             table, name = key.split(".")
             tables[table][name] = 1
-    before = state_sha256(number, tables, tmp_path, "a camera")
-    later = [key for step in STEPS[number + 1 :] for key in step.writes]
+    later = FIRST_LIGHT.later_keys(number)
+    before = state_sha256(STEPS[number], later, tables, tmp_path, "a camera")
     for table, keys in tables.items():
         for name in keys:
             changed = tables | {table: keys | {name: 2}}
             is_read = table in STEPS[number].tables and f"{table}.{name}" not in later
-            after = state_sha256(number, changed, tmp_path, "a camera")
+            after = state_sha256(STEPS[number], later, changed, tmp_path, "a camera")
             assert (after != before) == is_read
-    by_another = state_sha256(number, tables, tmp_path, "another")
+    by_another = state_sha256(STEPS[number], later, tables, tmp_path, "another")
     assert (by_another != before) == bool(STEPS[number].tables)
 
 

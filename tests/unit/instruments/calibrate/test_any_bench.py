@@ -39,7 +39,6 @@ from hilstar.instruments.calibrate.first_light.session import (
 )
 from hilstar.instruments.calibrate.first_light.stars import (
     P95_OF_TWO,
-    frames_for,
     noise_words,
     place_reasons,
 )
@@ -51,12 +50,7 @@ from hilstar.instruments.calibrate.geometric.dots import (
     lit_for,
     plan_seen_dots,
 )
-from hilstar.instruments.calibrate.geometric.fit import (
-    BROWN_CONRADY,
-    MatchedDots,
-    Model,
-    held_out,
-)
+from hilstar.instruments.calibrate.geometric.fit import BROWN_CONRADY, MatchedDots, Model, held_out
 from hilstar.instruments.calibrate.geometric.geometry_fit import (
     calibrate_seen,
     matched,
@@ -66,7 +60,6 @@ from hilstar.instruments.calibrate.geometric.geometry_fit import (
 )
 from hilstar.instruments.calibrate.geometric.match import first_look
 from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids
-from hilstar.instruments.calibrate.scale import StarReading, scale_of
 from hilstar.instruments.certify.readings import dot_settings
 from hilstar.instruments.simulate.bench_geometry import BenchGeometry
 from hilstar.instruments.simulate.optics import TwinOptics
@@ -295,17 +288,6 @@ def test_the_virtual_tracker_s_wide_pixel_is_as_sharp_as_its_psf():
     assert abs(found.psf_sigma_px - 0.55) < 4 * found.psf_sigma_error_px < 0.03
 
 
-def test_no_step_is_done_with_a_figure_at_an_end_of_its_model():
-    outcome = StepOutcome(
-        "done", "PSF sigma 0.1 px", fitted=(FittedFigure("PSF sigma", 0.1, 0.1, 12.0),)
-    )
-    checked = outcome.checked()
-    assert checked.verdict == "failed"
-    assert "PSF sigma 0.1 is at an end of its model (0.1 to 12)" in checked.line
-    inside = StepOutcome("done", "", fitted=(FittedFigure("PSF sigma", 0.11, 0.1, 12.0),))
-    assert inside.checked() is inside
-
-
 class Dark(ImageSource):
     """A source that shows nothing."""
 
@@ -496,9 +478,7 @@ def test_the_noise_of_a_whole_catalogue_s_stars_is_that_of_each_and_takes_no_min
     each_mag = spot.light_noise_mag(few_dn, noise_dn)
     rounded = []
     monkeypatch.setattr(
-        seen_stars,
-        "rounded_light",
-        lambda *given: rounded.append(given) or rounded_light(*given),
+        seen_stars, "rounded_light", lambda *given: rounded.append(given) or rounded_light(*given)
     )
     catalogue_dn = np.concatenate([few_dn, [0.4], np.geomspace(0.5, largest_dn, 100_000)])
     noise_mag = spot.tabled_noise_mag(catalogue_dn, noise_dn, largest_dn)
@@ -506,16 +486,6 @@ def test_the_noise_of_a_whole_catalogue_s_stars_is_that_of_each_and_takes_no_min
     # 200 points over five decades, and noise as the square root of light: 1e-3
     assert noise_mag[:4] == pytest.approx(each_mag, rel=2e-3)
     assert noise_mag[4] == math.inf
-
-
-def test_what_is_beyond_noise_is_told_from_noise():
-    rng = np.random.default_rng(5)
-    noise = rng.uniform(0.05, 0.4, 200)
-    alone, more = (Beyond.of(rng.normal(0, np.hypot(noise, extra)), noise) for extra in (0.0, 0.3))
-    assert alone.low == 0.0
-    assert alone.high < 0.1
-    assert more.low < 0.3 < more.high
-    assert more.low > 0.2
 
 
 def test_noise_is_never_said_to_be_more_than_the_whole():
@@ -527,14 +497,6 @@ def test_noise_is_never_said_to_be_more_than_the_whole():
         assert noise_words(np.full((4, 2), off_px), np.full(4, noise_px)) == words
 
 
-def test_frames_are_asked_for_where_noise_hides_the_places():
-    limit_px = 0.1
-    sigma = limit_px / P95_OF_TWO
-    assert frames_for(Beyond(0.0, 0.0, 0.9 * sigma), 1, limit_px) == 1
-    assert frames_for(Beyond(3 * sigma, 2 * sigma, 4 * sigma), 1, limit_px) == 1
-    assert frames_for(Beyond(0.0, 0.0, 3 * sigma), 1, limit_px) == 9
-
-
 @pytest.mark.parametrize(
     ("high", "advised"), [(2.9, "(--average 9)"), (28.99, "(--average 841)"), (60.0, "")]
 )
@@ -544,15 +506,6 @@ def test_no_more_frames_are_advised_than_the_option_takes(high, advised):
     assert advised in reason
     assert ("--average" in reason) == bool(advised)
     assert "a longer [tracker] exposure_s" in reason
-
-
-def test_a_noisy_reading_counts_less_and_equal_ones_are_their_median():
-    ratios = np.array([1.0, 1.02, 0.98, 2.0])
-    assert scale_of(10.0, ratios, np.zeros(4)).flux_at_white_e_per_s == pytest.approx(10.1)
-    weighed = scale_of(10.0, ratios, np.array([0.01, 0.01, 0.01, 0.5]))
-    assert weighed.flux_at_white_e_per_s == pytest.approx(10.0, abs=0.06)
-    assert weighed.relative_error is not None
-    assert StarReading(1, 5.0).sigma_dn == 0.0
 
 
 def test_dots_of_a_certificate_stand_close_and_are_measured_all_the_same():

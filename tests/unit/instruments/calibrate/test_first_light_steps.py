@@ -323,9 +323,7 @@ def test_a_warm_up_is_watched_until_white_is_stable(tmp_path, share):
     np.testing.assert_allclose(rows[:, 0], 10.0 * np.arange(figures["readings"]))
     # the dots' light without the glow of what is not lit
     np.testing.assert_allclose(
-        rows[:, 1] / rows[-1, 1],
-        (1 + share * np.exp(-rows[:, 0] / 200)) / (1 + rest),
-        rtol=0.006,
+        rows[:, 1] / rows[-1, 1], (1 + share * np.exp(-rows[:, 0] / 200)) / (1 + rest), rtol=0.006
     )
 
 

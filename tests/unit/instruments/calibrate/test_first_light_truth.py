@@ -9,11 +9,7 @@ import math
 import numpy as np
 import pytest
 
-from hilstar.instruments.calibrate.first_light.stars import (
-    _against_truth,
-    _known_glow,
-    _twin_file,
-)
+from hilstar.instruments.calibrate.first_light.stars import _against_truth, _known_glow, _twin_file
 from hilstar.instruments.calibrate.first_light.uniformity import _warm_up_truth
 from hilstar.instruments.verify.measure import GlowFit
 from hilstar.server.bench.bench_file import read_bench_file

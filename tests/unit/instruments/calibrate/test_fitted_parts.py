@@ -106,11 +106,13 @@ def test_readings_weigh_alike_unless_the_noise_of_each_is_known():
     known = scale_of(100.0, ratios, np.array([0.01, 0.5, 0.02]))
     assert known.weights[0] > known.weights[2] > 100 * known.weights[1]
     assert known.noise_mag == pytest.approx(known.weights.sum() ** -0.5)
+    # the one far off counts for nothing where it is that noisy
+    far = scale_of(10.0, np.array([1.0, 1.02, 0.98, 2.0]), np.array([0.01, 0.01, 0.01, 0.5]))
+    assert far.flux_at_white_e_per_s == pytest.approx(10.0, abs=0.06)
 
 
 @pytest.mark.parametrize(
-    ("vector", "off_rad"),
-    [((0.3, 0.0, 0.0), 0.3), ((0.0, 2.8, 0.0), 2.8), ((0.0, 0.0, 1.0), 0.0)],
+    ("vector", "off_rad"), [((0.3, 0.0, 0.0), 0.3), ((0.0, 2.8, 0.0), 2.8), ((0.0, 0.0, 1.0), 0.0)]
 )
 def test_a_boresight_may_be_turned_backwards(vector, off_rad):
     q = from_rotation_vector(np.array(vector))

@@ -58,11 +58,7 @@ from hilstar.instruments.calibrate.geometric.geometry_fit import (
     without_s_curves,
     write_calibrated,
 )
-from hilstar.instruments.calibrate.geometric.observed import (
-    Observed,
-    dot_centroids,
-    measure_images,
-)
+from hilstar.instruments.calibrate.geometric.observed import Observed, dot_centroids, measure_images
 from hilstar.optics.camera import Camera, Lens
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.benches import bench_text

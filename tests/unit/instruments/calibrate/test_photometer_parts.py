@@ -223,26 +223,6 @@ def test_a_range_is_the_densest_that_holds_and_longer_where_that_is_faint(
     assert made._range(np.array(peaks_dn)) == wanted
 
 
-def test_a_pixel_s_light_is_the_sum_over_dots_exposures_and_ratios():
-    made = photometer()
-    made.scatter = scatter_of({1: 0.0, 4: 0.0})
-    patch = Patch(7, "r")
-    reading = _Reading(patch, Range(2, 4), 4096.0, 1.0)
-    factor = 1.02
-    made._rounded = lambda at, light_dn: np.zeros(16)
-    blacks = np.array([100.0, 130.0])
-    planned = [Patch(0, "r"), patch, Patch(0, "r")]
-    values = made._values(planned, {1: reading}, blacks, {("r", Range(2, 4)): factor})
-    # 32 x 32 dots, four exposures of half a second
-    per_dn = 1 / (1024 * 4 * EXPOSURE_S * factor)
-    assert values.light[1] == pytest.approx(4096 * per_dn)
-    assert values.per_dn[1] == pytest.approx(per_dn)
-    # of 4096 DN with 0.25 DN an electron
-    assert values.sigma[1] == pytest.approx(32.0 * per_dn)
-    # black is over 1000 monitor pixels, and about its own mean
-    assert values.light[[0, 2]] == pytest.approx(np.array([-15, 15]) / 1000 / EXPOSURE_S)
-
-
 @pytest.mark.parametrize("pairs", [1, 4])
 def test_a_ratio_is_as_sure_as_its_sums_and_their_number(pairs):
     made = photometer()
@@ -326,15 +306,6 @@ def test_light_passes_the_ratios_of_its_own_channel_from_its_range_on():
     assert _passes(Patch(9, "r"), Range(4, 4), link)  # exposed longer: fainter light
     assert not _passes(Patch(9, "r"), Range(4), link)
     assert not _passes(Patch(9, "g"), Range(1), link)
-
-
-def test_black_is_as_noisy_as_its_images_over_the_field_s_pixels():
-    made = photometer(scatter=scatter_of({1: 400.0}))
-    planned = [Patch(0, "w"), Patch(0, "w")]
-    values = made._values(planned, {}, np.array([5.0, 5.0]), {})
-    # 20 DN over 1000 monitor pixels and half a second
-    assert values.sigma == pytest.approx(20 / 1000 / EXPOSURE_S)
-    assert values.light.tolist() == [0.0, 0.0]
 
 
 def test_a_patch_s_peaks_are_white_s_on_the_sparsest_lattice_by_light_and_share():

@@ -41,13 +41,7 @@ from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.server.bench.build import open_bench
 from hilstar.tracker.centroids import noisiest_background
 from hilstar.tracker.rounding import rounded_light
-from tests.support.closed_camera import (
-    AXIS_PX,
-    DETECTOR_PX,
-    RATIO,
-    ClosedCamera,
-    closed_context,
-)
+from tests.support.closed_camera import AXIS_PX, DETECTOR_PX, RATIO, ClosedCamera, closed_context
 from tests.support.seen_stars import stars_seen
 
 WIDE = StarSpot((0.9, 1.4), gain_e_per_dn=4.0, prnu=0.0, electronics_dn=0.0)

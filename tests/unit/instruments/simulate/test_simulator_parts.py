@@ -13,12 +13,7 @@ from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import from_rotation_vector
 from hilstar.basics.units import NS_PER_S
 from hilstar.instruments.simulate.exposures import view_at
-from hilstar.instruments.simulate.simulator import (
-    Simulator,
-    TrackerBackground,
-    full_e,
-    gathered,
-)
+from hilstar.instruments.simulate.simulator import Simulator, TrackerBackground, full_e, gathered
 from hilstar.server.bench.bench_file import read_bench_file
 from hilstar.server.bench.cameras import tracker_camera
 from hilstar.tracker.settings import DetectorSettings

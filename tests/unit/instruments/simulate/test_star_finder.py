@@ -35,15 +35,7 @@ def test_a_star_is_crowded_by_the_light_that_others_bring_into_its_window():
     flux = [1.0, 1.0, 1.0, 1.0, 1.0, 1000.0, 1.0]
     assert crowded(
         np.array(place), np.full(7, 50.0), np.array(flux), 4, GaussianPsf((1.0, 1.0))
-    ).tolist() == [
-        True,
-        True,
-        False,
-        False,
-        True,
-        False,
-        False,
-    ]
+    ).tolist() == [True, True, False, False, True, False, False]
 
 
 def test_two_stars_that_are_found_as_one_are_no_two():

@@ -380,6 +380,16 @@ def pieces_of(
     return tuple(pieces)
 
 
+def joined(parts: Sequence[FrameLight]) -> FrameLight:
+    """The light of an exposure's pieces, end to end: each disc once, and capped stars of all."""
+    whole = join_sprites(parts, parts[0].footprint_px)
+    discs: dict[str, None] = {}
+    for part in parts:
+        discs |= dict.fromkeys(part.discs)
+    capped = sum(part.capped for part in parts)
+    return replace(whole, capped=capped, discs=tuple(discs))
+
+
 class FaultyExposure:
     """One exposure with its faults, as `Simulator.expose` draws it, piece by piece."""
 
@@ -434,13 +444,7 @@ class FaultyExposure:
 
     def sprites(self) -> FrameLight:
         """The sprites of the bench's own stars and discs in any of its pieces, end to end."""
-        parts = [_own(sprites) for sprites in self._seen]
-        whole = join_sprites(parts, parts[0].footprint_px)
-        discs: dict[str, None] = {}
-        for part in parts:
-            discs |= dict.fromkeys(part.discs)
-        capped = sum(part.capped for part in parts)
-        return replace(whole, capped=capped, discs=tuple(discs))
+        return joined([_own(sprites) for sprites in self._seen])
 
     def added_truth(self) -> npt.NDArray[np.void]:
         """Rows of TRUTH_DTYPE for what faults added: in electrons per second of the whole

@@ -16,15 +16,15 @@ import hilstar
 from hilstar.attitude.wire.packet import AttitudeSample
 from hilstar.basics.rotation import angle_between_rad, from_radec_roll_deg
 from hilstar.basics.units import ARCSEC_PER_RAD, NS_PER_S
-from hilstar.instruments.simulate import batch, exposures
+from hilstar.instruments.simulate import batch
 from hilstar.instruments.simulate.exposures import LogFaults, faulty_exposure
 from hilstar.instruments.simulate.pictures import TrackerPictures
 from hilstar.instruments.simulate.simulator import (
-    FaultyExposure,
     FrameNoise,
     Simulator,
     _merge,
     exposure_truth,
+    joined,
     pieces_of,
 )
 from hilstar.optics.layers.fault_kinds import KINDS, Now
@@ -254,11 +254,9 @@ def dn_of(png):
 
 
 def test_an_exposure_has_the_discs_and_the_capped_stars_of_all_its_pieces():
-    made = object.__new__(FaultyExposure)
     nothing = join_sprites([], 5)
     seen = ((2, ("Moon",)), (0, ()), (3, ("Sun", "Moon")))
-    made._seen = [replace(nothing, capped=capped, discs=discs) for capped, discs in seen]
-    whole = made.sprites()
+    whole = joined([replace(nothing, capped=capped, discs=discs) for capped, discs in seen])
     assert (whole.capped, whole.discs, whole.footprint_px) == (5, ("Moon", "Sun"), 5)
 
 
@@ -285,28 +283,27 @@ def test_each_piece_of_an_exposure_has_its_own_middle_on_the_clock_of_its_view(t
     assert [piece.view.exposure_s for piece in pieces] == pytest.approx([0.02, 0.02, 0.06])
 
 
-def test_faults_of_a_log_count_from_its_first_sample(monkeypatch):
-    """Of a clock that is far from 0; a display that stands still has the log's own attitude."""
-    start_ns, second_ns = 10**15, NS_PER_S
+def test_faults_of_a_log_count_from_its_first_sample(tmp_path):
+    """Of a clock that is far from 0: the display stands still from the first second on, in which it
+    has the log's own attitude.
+    """
+    start_ns = 10**15
     turned = np.array([np.cos(0.1), 0.0, np.sin(0.1), 0.0])
     samples = [
         AttitudeSample(start_ns, np.array([1.0, 0.0, 0.0, 0.0])),
-        AttitudeSample(start_ns + 2 * second_ns, turned),
+        AttitudeSample(start_ns + 2 * NS_PER_S, turned),
     ]
-    asked = []
-    monkeypatch.setattr(exposures, "simulator_view", lambda *_: SimpleNamespace(prepare=None))
-    monkeypatch.setattr(exposures, "Timetable", lambda *parts: parts)
-    monkeypatch.setattr(exposures, "pieces_of", lambda *parts: asked.append(parts) or ())
-    tracker = SimpleNamespace(exposure_s=0.1)
-    simulator = SimpleNamespace(config=SimpleNamespace(tracker=tracker))
-    views = [View.exposure(turned, STILL, 0.1, start_ns + at) for at in (0, second_ns)]
-    assert LogFaults("scenario", samples).pieces(simulator, views) == [(), ()]
-    assert [run_ns for _, run_ns, _, _ in asked] == [0, second_ns]
-    assert asked[0][2][0] == "scenario" and asked[0][2][2] == 0.1
-    attitude_at = asked[0][3]
-    assert attitude_at(2 * second_ns) == pytest.approx(turned)
+    text = '[[fault]]\nkind = "freeze"\nname = "stuck"\nat_s = 1.0\n'
+    scenario = parse_scenario(tmp_path / "faults.toml", text)
+    tracker = {"resolution_px": [64, 48], "exposure_s": 0.1}
+    file = bench_file_of(tmp_path / "bench.toml", bench_text({"tracker": tracker}))
+    views = [View.exposure(turned, STILL, 0.1, start_ns + at) for at in (0, 2 * NS_PER_S)]
+    with Simulator(file) as simulator:
+        moving, standing = LogFaults(scenario, samples).pieces(simulator, views)
+    assert [len(piece.now) for piece in (*moving, *standing)] == [0, 1]
     half = np.array([np.cos(0.05), 0.0, np.sin(0.05), 0.0])
-    assert angle_between_rad(attitude_at(second_ns), half) < 1e-9
+    assert moving[0].view.q_icrs_to_cam == pytest.approx(turned)
+    assert angle_between_rad(standing[0].view.q_icrs_to_cam, half) < 1e-9
 
 
 class Exposing:

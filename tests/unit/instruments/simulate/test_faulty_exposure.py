@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 from collections import deque
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -32,7 +31,7 @@ from hilstar.optics.layers.layers import light_of, sky_layers
 from hilstar.optics.layers.truth import TRUTH_DTYPE
 from hilstar.optics.layers.view import STILL, View
 from hilstar.optics.sprites import join_sprites
-from hilstar.server.bench.bench_file import bench_file_of
+from hilstar.server.bench.bench_file import bench_file_of, read_bench_file
 from hilstar.server.bench.cameras import bench_camera, tracker_camera
 from hilstar.server.bench.fault_views import faults_at
 from hilstar.server.bench.scenario import Timetable, parse_scenario
@@ -306,49 +305,33 @@ def test_faults_of_a_log_count_from_its_first_sample(tmp_path):
     assert angle_between_rad(standing[0].view.q_icrs_to_cam, half) < 1e-9
 
 
-class Exposing:
-    """A simulator that says what it was asked to expose: 12 bits of one level."""
-
-    def __init__(self):
-        self.asked = []
-        self.config = SimpleNamespace(tracker=SimpleNamespace(detector=SimpleNamespace(bits=12)))
-
-    def view(self, q, rate, t_ns, velocity_km_s, place_km):
-        return View.exposure(q, rate, 0.1, t_ns, velocity_km_s, place_km)
-
-    def expose(self, view, rng, faults):
-        shown = view if faults is None else faults.pieces[0].view
-        self.asked.append((shown, float(rng.normal())))
-        return SimpleNamespace(dn=np.full((2, 3), 0x123, dtype=np.uint16))
-
-
-def test_pictures_of_a_run_have_a_noise_each_and_stand_where_the_display_does():
-    made = object.__new__(TrackerPictures)
-    made._simulator = Exposing()
-    made._noise = FrameNoise("full")
-    made._count = 0
-    made._stood = None
-    made._view = None
+def test_pictures_of_a_run_have_a_noise_each_and_stand_where_the_display_does(tmp_path):
+    """As a simulator has them that is given the noise and the view of each."""
+    tracker = {"resolution_px": [120, 90], "exposure_s": EXPOSURE_S}
+    path = tmp_path / "bench.toml"
+    sky = {"faintest_v_mag": 4.0}
+    path.write_text(
+        bench_text({"tracker": tracker, "sky": sky, "render": {"quantisation": "round"}})
+    )
     frozen = Now(1, KINDS["freeze"](name="stuck"), 0)
     on = []
-    made._now = lambda: tuple(on)
     rate = np.array([0.0, 0.02, 0.0])
     first = AttitudeSample(5, np.array(ORION_Q), rate)
     away = AttitudeSample(9, np.array([0.6, 0.8, 0.0, 0.0]), rate)
-    for sample, faults in ((first, []), (away, [frozen]), (away, [frozen]), (away, [])):
-        on[:] = faults
-        picture = np.asarray(Image.open(io.BytesIO(made(sample))), dtype=np.uint16)
-        assert (picture == 0x1230).all()
-    views = [view for view, _ in made._simulator.asked]
-    for view, sample, is_still in zip(
-        views, (first, first, first, away), (False, True, True, False), strict=True
-    ):
-        np.testing.assert_array_equal(view.q_icrs_to_cam, sample.q_icrs_to_cam)
-        assert view.t_ns == sample.t_ns
-        np.testing.assert_array_equal(view.turn.rate_cam_rad_s, STILL if is_still else rate)
-    noise = [drawn for _, drawn in made._simulator.asked]
-    wanted = [np.random.default_rng((0, number)).normal() for number in range(4)]
-    assert noise == wanted
+    taken = []
+    with hilstar.load(path) as bench:
+        pictures = TrackerPictures(bench, now=lambda: tuple(on))
+        for sample, faults in ((first, []), (away, [frozen]), (away, [frozen]), (away, [])):
+            on[:] = faults
+            taken.append(dn_of(pictures(sample)))
+    with Simulator(read_bench_file(path)) as simulator:
+        moving, still, elsewhere = (
+            simulator.view(q, turn)
+            for q, turn in ((ORION_Q, rate), (ORION_Q, STILL), (away.q_icrs_to_cam, rate))
+        )
+        for number, view in enumerate((moving, still, still, elsewhere)):
+            rng = np.random.default_rng((0, number))
+            np.testing.assert_array_equal(taken[number], simulator.expose(view, rng).dn)
 
 
 def test_a_worker_writes_exposures_each_with_its_number_s_noise_and_how_it_was_made(tmp_path):

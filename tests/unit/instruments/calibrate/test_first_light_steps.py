@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,6 +37,7 @@ from hilstar.instruments.calibrate.measurements import read_measurements
 from hilstar.instruments.calibrate.plan import Patch
 from hilstar.server.bench.build import open_bench
 from hilstar.server.bench.cameras import bench_camera
+from hilstar.server.screen.gate import Timing
 from hilstar.server.screen.screen import marker_light
 from hilstar.tracker.centroids import noisiest_background
 from hilstar.tracker.rounding import rounding_rms
@@ -628,13 +628,7 @@ def test_light_that_is_early_by_its_noise_alone_is_no_delay(tmp_path, delay_ms):
 @pytest.mark.parametrize("is_paced", [True, False])
 def test_a_display_is_timed_by_its_own_frames(tmp_path, is_paced):
     camera = ClosedCamera()
-    timing = SimpleNamespace(
-        period_ms=12.5,
-        period_error_ms=0.003,
-        dropped=2,
-        paced_by_screen=is_paced,
-        modes_hz=[60, 80],
-    )
+    timing = Timing(12.5, 2, is_paced, modes_hz=(60, 80), period_error_ms=0.003)
     camera.gate = lambda file: timing
     camera.forced = ["another rate"]
     outcome = display(closed_context(tmp_path, camera))

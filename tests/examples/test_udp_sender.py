@@ -22,7 +22,7 @@ from tests.support.waiting import PATIENCE_S
 
 # The port is bound before the bench is opened, which may take a second: what is sent meanwhile is
 # read, and answered late.
-STREAM_S = 5
+STREAM_S = 3
 READ_S = 0.5  # until a busy machine has read what was sent
 
 

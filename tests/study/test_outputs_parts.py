@@ -11,8 +11,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from astropy.io import fits
+from astropy.wcs import WCS
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
+from hilstar.cli.study import thesis_lines
 from hilstar.instruments.study import economy, outputs, rapp
 from hilstar.instruments.study.economy import EffortComparison, EffortOutcome
 from hilstar.instruments.study.engine import row_panels
@@ -57,8 +59,11 @@ def bench(tmp_path_factory):
 
 
 def test_a_bench_s_outputs_are_its_exposures_and_their_stars(bench, small_run):
-    run = small_run(outputs.run, bench, OWN)
+    """As its command writes them; the field of one's own is where it is asked for."""
+    run = small_run(lambda folder: thesis_lines("outputs", bench.path, folder, OWN))
     lines, folder = run.told, run.folder
+    middle = WCS(fits.getheader(folder / "field.fits")).pixel_to_world(59.5, 44.5)
+    assert (middle.ra.deg, middle.dec.deg) == pytest.approx(OWN[:2], abs=1e-6)
     assert [line.split(":")[0] for line in lines] == ["orion", "lyra", "zeta_cas", "field"]
     names = output_files(fields_of(OWN))
     assert {name for name in names if name.endswith((".csv", ".fits"))} == {

@@ -29,15 +29,17 @@ from hilstar.instruments.study.colour import (
 from hilstar.sky.spectral_types import LETTERS
 from tests.support.claims import holds
 from tests.support.recorded import assert_recorded, assert_row
+from tests.support.studies import times_are_watched
 
 AIM_SUBTYPES, AIM_PERCENT, AIM_LATERAL = 3.0, 2.0, 0.1
 
 
 @pytest.fixture(scope="module")
 def study(whole_study):
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, times_are_watched():
         patch.setattr(colour, "QUICK_ROUNDS", 1)  # no claim here is of a time
-        found = whole_study("colour", {"colour"})
+        measured = colour.measure(True)
+    found = whole_study.reported("colour", {"colour"}, measured)
     return found.folder, found.rows
 
 
@@ -244,8 +246,10 @@ def test_the_chart_of_choices_has_a_point_of_each(figures, tmp_path):
             assert (fill == "none") == (row.method == "round")
 
 
-def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, monkeypatch):
-    """The share of red light by class and the mosaic are measured here; the other parts planted."""
+def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, tmp_path):
+    """The share of red light by class is measured here; the other parts are planted."""
+    colour.write_spectra(tmp_path)
+    red = colour.red_shares(tmp_path)
     gamut = [colour.GamutRow("OLED", "a", 1.0, 0.5, 0.25, 0.75, 3.0, 2.0, 9.0)]
     by_class = [colour.GamutClass("OLED", "a", "G", 7, 550.0, 2.0, 1.0, 8.0)]
     lateral = [colour.LateralColour("planar-1897", "OLED", "star", 0.02, 0.001, 0.05)]
@@ -256,23 +260,17 @@ def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, mo
         choices.append(
             colour.ColourChoice(tracker, ink, method, 9, 3.0, 2.0 + number, number, 1, 1, 1, 1)
         )
-    asked = []
-
-    def study_choices(folder, trackers, fields, rounds):
-        asked.append((dict(trackers), fields, rounds))
-        return choices
-
-    monkeypatch.setattr(colour, "study_gamut", lambda folder: (gamut, by_class))
-    monkeypatch.setattr(colour, "study_lateral", lambda folder: lateral)
-    monkeypatch.setattr(colour, "study_choices", study_choices)
-    run = small_run(colour.run, True)
-    quick = {"mono": "ccd47-20", "Bayer": "Bayer, wide dyes"}
-    assert asked == [(quick, colour.QUICK_FIELDS, colour.QUICK_ROUNDS)]
+    mosaic = []
+    for sigma_px, image in itertools.product((0.55, 1.0, 1.5), ("mosaic", "superpixel")):
+        mosaic.append(colour.MosaicPlaces(sigma_px, 5000.0, image, sigma_px / 8, sigma_px / 4))
+    measured = colour.ColourMeasured(choices, gamut, by_class, lateral, red, mosaic, colour.Load())
+    run = small_run(colour.report, measured)
     for name, rows in (
         ("colour", choices),
         ("colour_gamut", gamut),
         ("colour_class", by_class),
         ("colour_lateral", lateral),
+        ("colour_mosaic", mosaic),
     ):
         written = run.rows(name)
         assert len(written) == len(rows)
@@ -280,16 +278,13 @@ def test_a_study_s_tables_and_lines_are_of_what_each_part_measures(small_run, mo
             assert list(row.values()) == [str(value) for value in asdict(planted).values()]
     assert "class" in run.rows("colour_class")[0]
     assert_recorded(run.folder / "colour_red.csv", ("sensor",), tuple("OBAFGKM"))
-    keys = ("sigma_px", "temperature_k", "image")
-    assert_recorded(run.folder / "colour_mosaic.csv", keys, ("rms_px", "max_px"))
     findings = run.told[0]
     assert findings[0] == run.title("colour")
     assert findings[1] == "lateral colour of planar-1897 by star on OLED: off by 5% of the sky's"
-    quoted = [row for row in run.rows("colour_mosaic") if row["sigma_px"] == "1.0"]
-    assert len(findings) == 2 + len(quoted) == 8
-    for line, row in zip(findings[2:], quoted, strict=True):
-        star = f"a star of 1 px, {float(row['temperature_k']):g} K"
-        assert line == f"{star}, is {float(row['rms_px']):.3f} px off rms in a {row['image']}"
+    assert findings[2:] == [
+        "a star of 1 px, 5000 K, is 0.125 px off rms in a mosaic",
+        "a star of 1 px, 5000 K, is 0.125 px off rms in a superpixel",
+    ]
 
 
 def test_a_dye_falls_to_one_over_e_at_its_half_width():

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hilstar.basics.rotation import angle_between_rad, propagate
+from hilstar.cli.study import study_lines
 from hilstar.display.quantise import shown_light
 from hilstar.instruments.study import faults
 from hilstar.instruments.study.faults import CASES, NOWHERE, QUANTISATIONS, Stray
@@ -23,7 +24,7 @@ QUARTERS = ((UPPER, LEFT), (LOWER, LEFT), (UPPER, RIGHT), (LOWER, RIGHT))
 
 @pytest.fixture(scope="module")
 def faults_study(whole_study):
-    return whole_study("faults", {"faults", "faults_cost"})
+    return whole_study.reported("faults", {"faults", "faults_cost"}, faults.measure(quick=True))
 
 
 def test_every_kind_but_a_dropped_frame_has_its_cost(faults_study):
@@ -159,7 +160,8 @@ def test_a_small_study_of_faults_draws_its_rows(small_run):
             ("QUICK_SHARES", (0.0, 0.02, 1.0)),
         ):
             patch.setattr(faults, name, value)
-        run = small_run(faults.run, True)
+        # as its command runs it
+        run = small_run(lambda folder: study_lines("faults", folder, quick=True))
     costs, strays = run.rows("faults-cost"), run.rows("faults-stray")
     assert [(row["quantisation"], row["case"]) for row in costs] == [
         (name, case) for name in QUANTISATIONS for case in cases

@@ -38,12 +38,6 @@ from hilstar.instruments.study.predictors import (
 SLEW_PART_S = 2.0  # a tenth of the swing, from its fastest on
 
 
-@pytest.fixture(scope="module")
-def whole_prediction(whole_study):
-    found = whole_study("prediction", {"prediction", "prediction_jitter"})
-    return found.folder, found.findings
-
-
 def typed_rows(path, record):
     """A table as records of texts and numbers."""
     kinds = get_type_hints(record)
@@ -117,8 +111,10 @@ def test_auto_is_the_rate_where_vibrations_are_slow_and_damps_where_they_are_fas
     assert shaken_finding(list(shaken.values())).startswith("Of a vibration above 1")
 
 
-def test_the_study_writes_what_it_found(whole_prediction):
-    folder, lines = whole_prediction
+def test_the_study_writes_what_it_found(whole_study):
+    measured = prediction.measure(quick=True)
+    found = whole_study.reported("prediction", {"prediction", "prediction_jitter"}, measured)
+    folder, lines = found.folder, found.findings
     outcomes = by_cell(typed_rows(folder / "prediction.csv", PredictionOutcome))
     assert len(typed_rows(folder / "prediction_jitter.csv", Shaken)) > 20
     assert len(lines) == 1 + 5 + 1

@@ -18,13 +18,13 @@ from hilstar.instruments.study.timing import (
     TimingSky,
     compare,
     frame_weights,
-    measure,
     slew,
 )
 from hilstar.optics.scan import Scan
 from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
 from tests.support.benches import ROOT
 from tests.support.recorded import assert_recorded
+from tests.support.studies import times_are_watched
 from tests.support.tables import csv_rows
 
 GAIN = 20  # compensated against not: the issue's own figure
@@ -40,28 +40,21 @@ FRAME_ARCSEC = RATE_DEG_S * PERIOD_S * 3600
 @pytest.fixture(scope="module")
 def small(small_run):
     """The quick study, whose times are of one frame; and what it measured."""
-    measured = []
-
-    def keep(quick):
-        measured.extend(measure(quick))
-        return measured
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(timing, "measure", keep)
+    with pytest.MonkeyPatch.context() as patch, times_are_watched():
         patch.setattr(timing, "COST_ROUNDS", 1)
-        run = small_run(timing.run, True)
-    return run, measured
+        measured = timing.measure(True)
+    return small_run(timing.report, measured), measured
 
 
 @pytest.fixture(scope="module")
 def timing_study(small):
-    """The study's folder and findings, and what it measured."""
+    """The study's folder and findings, and its slews."""
     run, measured = small
-    return run.folder, run.told[0], measured
+    return run.folder, run.told[0], measured.outcomes
 
 
-def test_the_command_draws_its_three_charts(whole_study):
-    assert whole_study("timing", {"timing", "stripes", "beat"}).rows("timing")
+def test_a_whole_study_draws_its_three_charts(whole_study, small):
+    assert whole_study.reported("timing", {"timing", "stripes", "beat"}, small[1]).rows("timing")
 
 
 @pytest.fixture(scope="module")
@@ -199,10 +192,10 @@ def test_the_charts_of_timing_draw_the_rows(small):
         assert set(np.diff(x)) == {16.0} and 50 < len(x) <= 64
     parted = max(abs(row["light"] - 1) for row in stripes if row["refreshes"] % 1)
     assert f"up to {100 * parted:.0f} % of its light, 0 % where" in run.title("stripes")
-    arcsec = {outcome.way: outcome.rms_arcsec for outcome in measured}
+    arcsec = {outcome.way: outcome.rms_arcsec for outcome in measured.outcomes}
     assert f"off by {arcsec['prediction']:.2g} arcsec rms with prediction" in run.title("timing")
     assert run.told[0][0] == run.title("timing")
-    for outcome, line in zip(measured, run.told[0][1:], strict=False):
+    for outcome, line in zip(measured.outcomes, run.told[0][1:], strict=False):
         assert line.startswith(f"{outcome.way}: {outcome.rms_arcsec:.3g} arcsec rms, ")
     off = [row["off_arcsec"] - row["foretold_arcsec"] for row in beat]
     assert f"within {np.sqrt(np.mean(np.square(off))):.2g} arcsec rms" in run.title("beat")

@@ -51,6 +51,7 @@ from hilstar.instruments.study.trials import (
     Trial,
     Trials,
     draw_trials,
+    judged,
     measured,
     ms_words,
     table_lines,
@@ -61,6 +62,7 @@ from hilstar.sky.electrons import TABLE_DEGREE
 from hilstar.sky.spectrum import Curve
 from hilstar.sky.stars import CELL_DEG
 from tests.support.benches import ROOT
+from tests.support.studies import times_are_watched
 from tests.support.tables import csv_rows
 
 NAMES = [
@@ -85,27 +87,26 @@ PROFILE_SHARE = 2e-7
 
 
 @pytest.fixture(scope="module")
-def small(small_run):
+def steps_measured():
     """Every step with one round; of those that draw at chance, fewer places than the page's."""
-    with pytest.MonkeyPatch.context() as patch:
+    with pytest.MonkeyPatch.context() as patch, times_are_watched():
         patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)  # no claim here is of a time
         patch.setattr(sweep, "MIN_ROUNDS", 1)
-        return small_run(tradeoff.run, True)
+        return tradeoff.measure(quick=True)
 
 
 @pytest.fixture(scope="module")
-def tradeoff_study(small):
+def tradeoff_study(small_run, steps_measured):
+    small = small_run(tradeoff.report, steps_measured)
     rows = small.rows("tradeoff")
     lines, _ = small.told
     steps = {name: {r["method"]: r for r in rows if r["step"] == name} for name in NAMES}
     return small.folder, lines, steps
 
 
-def test_the_command_writes_every_step(whole_study):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tradeoff, "QUICK_BUDGET_S", 0.0)
-        patch.setattr(sweep, "MIN_ROUNDS", 1)
-        found = whole_study("tradeoff", {f"tradeoff_{name}" for name in NAMES})
+def test_a_whole_study_draws_every_step(whole_study, steps_measured):
+    charts_of = {f"tradeoff_{name}" for name in NAMES}
+    found = whole_study.reported("tradeoff", charts_of, steps_measured)
     assert {row["step"] for row in found.rows("tradeoff")} == set(NAMES)
 
 
@@ -235,7 +236,7 @@ def test_extended_precision_knows_places_between_those_of_float64():
     assert (exact != exact.astype(np.float64)).mean() > 0.9
 
 
-def test_a_step_s_cells_are_its_own_and_have_no_front_on_a_busy_machine(small_run, monkeypatch):
+def test_a_step_s_cells_are_its_own_and_have_no_front_on_a_busy_machine(small_run):
     """The study is as busy as its busiest step."""
     trial = Trial("a method", 0.5, 2.0, list, True, False, {"max_px_fit": 0.25})
     trial = replace(trial, time_ms=3.0, quartiles_ms=(2.0, 7.0), on_front=True, beaten="why")
@@ -264,11 +265,8 @@ def test_a_step_s_cells_are_its_own_and_have_no_front_on_a_busy_machine(small_ru
         "max_px_fit": 0.25,
     }
     loads = {"first": Load(), "busy": Load(1e3), "last": Load(1e-3)}
-    steps = {name: replace(step, name=name, load=load) for name, load in loads.items()}
-    plans = [lambda stack, quick, name=name: steps[name] for name in loads]
-    monkeypatch.setattr(tradeoff, "STEPS", tuple(plans))
-    monkeypatch.setattr(tradeoff, "measured", lambda step, budget_s: step)
-    run = small_run(tradeoff.run, True)
+    steps = [replace(step, name=name, load=load) for name, load in loads.items()]
+    run = small_run(tradeoff.report, steps)
     fronts = {row["step"]: row["front"] for row in run.rows("tradeoff")}
     assert fronts == {"first": "True", "busy": "", "last": "True"}
     lines, right = run.told
@@ -539,9 +537,7 @@ def test_a_planted_worse_method_is_off_the_front_and_a_beaten_default_says_why(c
     assert any(beaten.default.beaten in line for line in table_lines(beaten))
 
 
-def test_what_beats_a_default_is_the_fastest_that_does_and_on_a_busy_machine_nothing(
-    clock, monkeypatch
-):
+def test_what_beats_a_default_is_the_fastest_that_does_and_on_a_busy_machine_nothing(clock):
     step = three_methods(clock, 4.0, floor=1.0)
     step = replace(step, trials=[*step.trials, Trial("rough", 0.2, 0.0, clock(2.0))])
     beaten = measured(step, 0.02)
@@ -552,8 +548,7 @@ def test_what_beats_a_default_is_the_fastest_that_does_and_on_a_busy_machine_not
         "slow and rough",
     ]
     assert beaten.default.beaten.startswith("'fast and rough' is no worse")
-    monkeypatch.setattr(sweep.OtherWork, "load", lambda self: Load(1e3))
-    busy = measured(step, 0.02)
+    busy = judged(replace(beaten, load=Load(1e3)))
     assert not any(trial.on_front or trial.beaten for trial in busy.trials)
     assert f"   {sweep.NOT_JUDGED}" in table_lines(busy)
 

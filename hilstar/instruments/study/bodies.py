@@ -541,10 +541,27 @@ def approach(benches: Mapping[str, Bench], body: str, off_deg: float, rounds: in
     )
 
 
+@dataclass(frozen=True, slots=True)
+class BodiesMeasured:
+    """The costs of scenes, the frames near bodies and the errors of discs, and the work of others
+    while frames were timed.
+    """
+
+    costs: Sequence[BodyCost]
+    nears: Sequence[Near]
+    sizes: Sequence[Exactness]
+    load: Load
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write `bodies_cost`, `bodies_size` and `bodies_limits` (PNG and CSV); a line for each
     finding. Raises InputError.
     """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> BodiesMeasured:
+    """Every scene's cost, every approach to a body, and every disc."""
     names: tuple[str, ...] = tuple(BODIES)
     rounds = ROUNDS
     near_deg = NEAR_DEG
@@ -569,6 +586,12 @@ def run(directory: Path, quick: bool = False) -> Judged:
     sizes = []
     for phase, radius in product(PHASES_DEG, radii_px):
         sizes.append(exactness(radius, phase))
+    return BodiesMeasured(costs, nears, sizes, load)
+
+
+def report(directory: Path, measured: BodiesMeasured) -> Judged:
+    """Write what was measured; a line for each finding. Raises InputError."""
+    costs, nears, sizes, load = measured.costs, measured.nears, measured.sizes, measured.load
     write_rows(directory / "bodies_cost.csv", costs)
     write_rows(directory / "bodies_size.csv", sizes)
     write_rows(directory / "bodies_limits.csv", nears)

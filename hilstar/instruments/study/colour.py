@@ -646,10 +646,30 @@ def choice_panel(error: str, ylabel: str) -> PanelSpec:
     return PanelSpec((points,), ylabel, scales=("log", "log"), names=False)
 
 
+@dataclass(frozen=True, slots=True)
+class ColourMeasured:
+    """The rows of each table by its name, and the work of others while choices were timed; `red`
+    has a sensor and the share of each class.
+    """
+
+    choices: Sequence[ColourChoice]
+    gamut: Sequence[GamutRow]
+    by_class: Sequence[GamutClass]
+    lateral: Sequence[LateralColour]
+    red: Sequence[tuple[str | float, ...]]
+    mosaic: Sequence[MosaicPlaces]
+    load: Load
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write colour.csv and its chart, and the tables colour_gamut, _class, _lateral, _red and
     _mosaic; findings.
     """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> ColourMeasured:
+    """Every panel's gamut, the lateral colours, the choices of codes, and the mosaic's places."""
     fields = FIELDS
     rounds = ROUNDS
     before = dict(TRACKERS)
@@ -664,26 +684,37 @@ def run(directory: Path, quick: bool = False) -> Judged:
         gamut, by_class = study_gamut(folder)
         lateral = list(study_lateral(folder))
         choices = list(study_choices(folder, before, fields, rounds))
-        red = []
-        for sensor in (*MONO, *SENSORS):
-            tracker = file_of(folder, "OLED", sensor).config.tracker
-            shares = class_shares(bench_optics(tracker, folder), RED_NM)
-            red.append((sensor, *shares.values()))
+        load = others.load()
+        red = red_shares(folder)
         wide = file_of(folder, "OLED", TRACKERS["Bayer"]).config.tracker
         mosaic = list(study_mosaic(bench_channels(wide, folder)))
-    write_rows(directory / "colour.csv", choices)
-    write_rows(directory / "colour_gamut.csv", gamut)
-    write_rows(directory / "colour_class.csv", by_class)
-    write_rows(directory / "colour_lateral.csv", lateral)
-    write_csv(directory / "colour_red.csv", ("sensor", *LETTERS), red)
-    write_rows(directory / "colour_mosaic.csv", mosaic)
-    load = others.load()
-    lines = [draw(directory / "colour", choices, load)]
-    lines += map(lateral_line, lateral)
-    for places in mosaic:
+    return ColourMeasured(choices, gamut, by_class, lateral, red, mosaic, load)
+
+
+def red_shares(folder: Path) -> list[tuple[str | float, ...]]:
+    """Each sensor, and the share of light that the stars of each class have beyond RED_NM."""
+    rows: list[tuple[str | float, ...]] = []
+    for sensor in (*MONO, *SENSORS):
+        tracker = file_of(folder, "OLED", sensor).config.tracker
+        shares = class_shares(bench_optics(tracker, folder), RED_NM)
+        rows.append((sensor, *shares.values()))
+    return rows
+
+
+def report(directory: Path, measured: ColourMeasured) -> Judged:
+    """Write what was measured; findings. Raises InputError."""
+    write_rows(directory / "colour.csv", measured.choices)
+    write_rows(directory / "colour_gamut.csv", measured.gamut)
+    write_rows(directory / "colour_class.csv", measured.by_class)
+    write_rows(directory / "colour_lateral.csv", measured.lateral)
+    write_csv(directory / "colour_red.csv", ("sensor", *LETTERS), measured.red)
+    write_rows(directory / "colour_mosaic.csv", measured.mosaic)
+    lines = [draw(directory / "colour", measured.choices, measured.load)]
+    lines += map(lateral_line, measured.lateral)
+    for places in measured.mosaic:
         if places.sigma_px == QUOTED_SIGMA_PX:
             lines.append(mosaic_line(places))
-    return load.judged(lines)
+    return measured.load.judged(lines)
 
 
 def lateral_line(row: LateralColour) -> str:

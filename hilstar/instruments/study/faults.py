@@ -264,10 +264,24 @@ def light_of(bench: Bench, sprites: FrameLight) -> FloatArray:
     return shown_light(levels, bench.panel).copy()
 
 
+@dataclass(frozen=True, slots=True)
+class FaultsMeasured:
+    """The costs of faults, the errors under stray light, and the work of others meanwhile."""
+
+    costs: Sequence[FaultCost]
+    strays: Sequence[Stray]
+    load: Load
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Measure; write `faults-cost.csv`, `faults-stray.csv` and their charts; the findings, a
     line each. Raises InputError.
     """
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> FaultsMeasured:
+    """Every case and every share of stray light, with each quantisation."""
     costs: list[FaultCost] = []
     strays: list[Stray] = []
     rounds = QUICK_ROUNDS if quick else ROUNDS
@@ -281,7 +295,12 @@ def run(directory: Path, quick: bool = False) -> Judged:
                     costs.append(cost_of(bench, Path(name), case, rounds))
                 for share in shares:
                     strays.append(stray_light(bench, share))
-    load = others.load()
+    return FaultsMeasured(costs, strays, others.load())
+
+
+def report(directory: Path, measured: FaultsMeasured) -> Judged:
+    """Write what was measured; the findings, a line each. Raises InputError."""
+    costs, strays, load = measured.costs, measured.strays, measured.load
     write_rows(directory / "faults-cost.csv", costs)
     write_rows(directory / "faults-stray.csv", strays)
     draw_stray(directory / "faults", strays)

@@ -93,13 +93,36 @@ class CentroiderErrors:
         return self.exact_px / self.round_px
 
 
+@dataclass(frozen=True, slots=True)
+class QuantisationMeasured:
+    """The errors of every way, the times with the work of others meanwhile, and the errors over
+    several frames.
+    """
+
+    rows: Sequence[WayErrors]
+    timed: Sequence[TimedWay]
+    load: Load
+    over_frames: Sequence[codes.OverFrames]
+
+
 def run(directory: Path, quick: bool = False) -> Judged:
     """Write the charts and their tables (CSV) into `directory`; a line for each finding."""
+    return report(directory, measure(quick))
+
+
+def measure(quick: bool) -> QuantisationMeasured:
+    """Every way's errors over magnitudes, its times, and its errors over frames."""
     rows = way_errors(quick)
-    write_rows(directory / "quantisation.csv", rows)
     others = OtherWork()
     timed = timed_ways(rows, QUICK_ROUNDS if quick else ROUNDS)
     load = others.load()
+    return QuantisationMeasured(rows, timed, load, codes.measure_frames(quick))
+
+
+def report(directory: Path, measured: QuantisationMeasured) -> Judged:
+    """Write what was measured; a line for each finding. Raises InputError."""
+    rows, timed, load = measured.rows, measured.timed, measured.load
+    write_rows(directory / "quantisation.csv", rows)
     by_centroider = centroider_errors(rows)
     draw_magnitudes(directory / "quantisation", rows)
     draw_each(directory / "quantisation_centroiders", by_centroider)
@@ -109,7 +132,7 @@ def run(directory: Path, quick: bool = False) -> Judged:
     for bits in codes.BITS:
         lines.append(summary(bits, rows))
     lines += [centroiders_line(by_centroider), times_line(timed)]
-    lines.append(codes.study_frames(directory, quick))
+    lines.append(codes.report_frames(directory, measured.over_frames))
     return load.judged(lines)
 
 

@@ -157,6 +157,16 @@ def test_a_scene_that_turns_is_drawn_along_its_paths_at_each_effort(bench_with):
     assert (drawn[0] != bench.draw(turn.q_icrs_to_cam).levels).any()
 
 
+def test_each_effort_is_timed_by_its_own_bench(bench_with):
+    benches = {name: bench_with(f"[sky]\nfaintest_v_mag = {name}\n") for name in ("6", "4")}
+    works = economy.frame_works(benches, SCENES[0].turn)
+    for name, bench in benches.items():
+        drawn = works[name](0)
+        again = bench.draw(SCENES[0].turn.q_icrs_to_cam)
+        np.testing.assert_array_equal(drawn.levels, again.levels)
+    assert works["6"](0).star_count > works["4"](0).star_count
+
+
 def test_bars_have_room_over_the_highest_and_over_a_limit_of_one():
     assert economy.bar_limits([0.2, 0.4]) == pytest.approx((0, 1.45))
     assert economy.bar_limits([0.2, 3.0]) == pytest.approx((0, 4.35))

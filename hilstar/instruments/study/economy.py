@@ -2,7 +2,7 @@
 the effort that two tolerances need, with the times of whole frames and the errors of stars.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -218,12 +218,10 @@ def compare(scene: EffortScene, bits: int, rounds: int) -> list[EffortOutcome]:
     """A scene at full effort and at the effort that each of TOLERANCES needs, timed in turn."""
     with TemporaryDirectory() as folder, ExitStack() as stack:
         benches = {}
-        works: dict[str, Callable[[int], object]] = {}
         for name, tables in bench_tables(scene, bits).items():
             bench = study_bench(Path(folder) / f"{name}.toml", tables)
             benches[name] = stack.enter_context(bench)
-            works[name] = partial(frame_of, bench, scene.turn)
-        times = in_turn(works, rounds)
+        times = in_turn(frame_works(benches, scene.turn), rounds)
         outcomes = []
         for name, bench in benches.items():
             drawn = frame_of(bench, scene.turn, 0)
@@ -231,6 +229,16 @@ def compare(scene: EffortScene, bits: int, rounds: int) -> list[EffortOutcome]:
             found = FrameErrors(drawn.star_count, errors)
             outcomes.append(outcome(scene, name, bench, found, times[name]))
         return outcomes
+
+
+def frame_works(
+    benches: Mapping[str, Bench], turn: CameraTurn
+) -> dict[str, Callable[[int], Drawn]]:
+    """What is timed of each bench: a frame of the turn, by its number."""
+    works: dict[str, Callable[[int], Drawn]] = {}
+    for name, bench in benches.items():
+        works[name] = partial(frame_of, bench, turn)
+    return works
 
 
 def frame_of(bench: Bench, turn: CameraTurn, number: int) -> Drawn:

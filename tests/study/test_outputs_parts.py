@@ -5,8 +5,6 @@ tables, words and places by closed forms, without a study.
 from __future__ import annotations
 
 import math
-from contextlib import contextmanager
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,9 +13,9 @@ from astropy.wcs import WCS
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
 from hilstar.cli.study import thesis_lines
+from hilstar.instruments.simulate.simulator import Exposure
 from hilstar.instruments.study import economy, outputs, rapp
 from hilstar.instruments.study.economy import EffortComparison, EffortOutcome
-from hilstar.instruments.study.engine import row_panels
 from hilstar.instruments.study.fields import FIELDS, fields_of
 from hilstar.instruments.study.outputs import (
     OutputScene,
@@ -164,7 +162,7 @@ TRUTH = truth_of(
 
 
 def scene_outputs(truth=TRUTH, inside=(True, True, False)) -> outputs.Outputs:
-    noisy = SimpleNamespace(dn=np.full((90, 120), 33.4), truth=truth)
+    noisy = Exposure(None, np.full((90, 120), 33), np.full((90, 120), 33.4), truth)
     return outputs.Outputs(noisy, noisy, np.array(inside), 40.0, 12.3, 5.0, "a camera")
 
 
@@ -245,25 +243,15 @@ def test_effort_is_within_where_light_and_each_centroider_are():
     assert not outcome(flux_max_mag=0.051).within
 
 
-def test_each_panel_of_effort_s_chart_ends_over_its_own_highest_bar(tmp_path, monkeypatch):
+def test_each_panel_of_effort_s_chart_ends_over_its_own_highest_bar(tmp_path, figures):
     """A speed-up of 9 beside errors of 2.4 limits, and errors within them: the line at 1 is seen."""
-    drawn = []
-
-    @contextmanager
-    def kept(*parts):
-        with row_panels(*parts) as panels:
-            yield panels
-            drawn.append([axes.get_ylim() for axes in panels])
-
-    monkeypatch.setattr(economy, "row_panels", kept)
     full = outcome(tolerance="full", frame_ms=36.0)
     for worst_px in (0.24, 0.03):
         errors = {"flux_max_mag": 0.001, "max_px_fit": worst_px, "max_px_box5": 0.03}
         economy.draw(tmp_path / "a.png", [EffortComparison(full, outcome(**errors))], Load())
     room = 1.45  # for the legend
-    assert [limits for chart in drawn for limits in chart] == [
-        pytest.approx((0, room * height)) for height in (9.0, 2.4, 9.0, 1.0)
-    ]
+    limits = [axes.get_ylim() for figure in figures for axes in figure.axes]
+    assert limits == [pytest.approx((0, room * height)) for height in (9.0, 2.4, 9.0, 1.0)]
 
 
 def test_effort_s_gain_is_told_by_depth_over_the_default_tolerance_alone():

@@ -180,6 +180,7 @@ def test_a_zoom_is_about_its_star_the_brightest_on_the_image_or_the_middle():
     scene = OutputScene("s", "s", FIELDS[0], zoom_hip=12)
     name, place = _zoom(scene, scene_outputs())
     assert ("12" in name, tuple(place)) == (True, (10.0, 5.0))
+    assert _zoom(scene, scene_outputs(inside=(True, False, True)))[0] == "the middle"
     brightest = OutputScene("s", "s", FIELDS[0])
     assert tuple(_zoom(brightest, scene_outputs())[1]) == (0.0, 0.0)
     beyond = _zoom(brightest, scene_outputs(inside=(False, False, True)))

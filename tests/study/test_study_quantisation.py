@@ -37,7 +37,6 @@ from hilstar.instruments.study.quantisation import (
     summary,
     timed_ways,
     times_line,
-    way_errors,
 )
 from hilstar.instruments.study.sweep import Load
 from hilstar.tracker.centroiders import FAMILY
@@ -155,22 +154,13 @@ def test_the_faint_end_is_the_first_magnitude_at_it():
     assert faintest([WayErrors(8, "exact", 20.0, None), *made], 10, "exact") is made[1]
 
 
-def test_a_whole_study_has_quarters_of_a_magnitude_beyond_every_aim(monkeypatch):
-    asked = []
-
-    def planted(bits, way, phases, mags):
-        asked.append((bits, way.name, phases, list(mags)))
-        return mags
-
-    monkeypatch.setattr(codes, "code_errors", planted)
-    monkeypatch.setattr(codes, "error_figures", lambda errors: errors)
-    rows = way_errors(quick=False)
-    assert [(bits, name) for bits, name, *_ in asked] == list(
-        product(BITS, (way.name for way in WAYS))
-    )
-    quarters = [k / 4 for k in range(41)]
-    assert all(phases == 32 and mags == quarters for *_, phases, mags in asked)
-    assert all(row.mag_under_white == row.figures for row in rows)
+def test_a_whole_study_has_quarters_of_a_magnitude_beyond_every_aim(rows):
+    phases, mags = quantisation.phases_and_mags(quick=False)
+    assert phases == 32 and mags.tolist() == [k / 4 for k in range(41)]
+    wanted = []
+    for bits, way in product(BITS, WAYS):
+        wanted += [(bits, way.name, mag) for mag in (0.0, 2.0, 4.0, 6.0, 8.0)]
+    assert [(row.bits, row.method, row.mag_under_white) for row in rows] == wanted
 
 
 def timed_way(bits, method, frame_ms, **figures):

@@ -43,7 +43,6 @@ from hilstar.instruments.study.tradeoff.places import (
     EXACT_NODES,
     GAUSS,
     SPRITE_PSF,
-    smear_methods,
 )
 from hilstar.instruments.study.tradeoff.run import STEPS
 from hilstar.instruments.study.trials import (
@@ -178,7 +177,7 @@ def test_a_prediction_s_errors_are_those_of_its_samples():
 
 
 def test_predictions_are_told_by_their_worst_and_rms_and_timed_after_the_last_sample_but_one(
-    tradeoff_study, monkeypatch
+    tradeoff_study,
 ):
     samples = [slew_sample(k * 50_000_000) for k in range(200)]
     steps = tradeoff_study[2]["prediction"]
@@ -187,39 +186,23 @@ def test_predictions_are_told_by_their_worst_and_rms_and_timed_after_the_last_sa
         row = steps[predictor.name]
         assert float(row["error"]) == pytest.approx(max(errors))
         assert float(row["second"]) == pytest.approx(math.sqrt(np.mean(np.square(errors))))
-    timed = []
-    monkeypatch.setattr(places, "slew_sample", lambda t_ns: samples[t_ns // 50_000_000])
-    monkeypatch.setattr(places, "prediction_errors", lambda predictor, samples: [1.0])
-    monkeypatch.setattr(places, "attitudes_at", lambda attitude_at, times: timed.append(times))
-    with ExitStack() as stack:
-        for trial in places.prediction(stack, True).trials:
-            trial.work()
-    for times_ns in timed:
-        assert len(times_ns) == 60
-        assert (times_ns[0], times_ns[-1]) == (samples[-2].t_ns, samples[-1].t_ns)
+    times_ns = places.moments_ns(samples)
+    assert len(times_ns) == 60
+    assert (times_ns[0], times_ns[-1]) == (samples[-2].t_ns, samples[-1].t_ns)
 
 
-def test_each_field_s_stars_are_those_near_its_own_boresight(monkeypatch):
-    fields = []
-
-    def in_fields(road, near, turns, camera):
-        fields.append((near, turns))
-        return np.zeros((sum(map(len, near)), 2))
-
-    monkeypatch.setattr(places, "places_in_fields", in_fields)
-    with ExitStack() as stack:
-        step = places.projection(stack, True)
+def test_each_field_s_stars_are_those_near_its_own_boresight(tradeoff_study):
     camera = places.ideal_monitor(places.demo_config())
-    cos_field = math.cos(camera.field_radius_rad(0.0))
-    assert len(fields) == 1 + len(places.ROADS)
-    for near, turns in fields:
-        assert len(near) == len(turns) == 6
-        for vectors, turn in zip(near, turns, strict=True):
-            cosines = vectors @ turn[2]
-            # cells that reach into the field may end some degrees beyond it
-            assert (cosines > cos_field).sum() > 100
-            assert cosines.min() > math.cos(math.acos(cos_field) + math.radians(10))
-    assert step.work.startswith(f"{len(fields[0][0][0])} stars near the field to sprites")
+    turns = places.random_turns(6, camera)
+    radius_rad = camera.field_radius_rad(0.0)
+    near = places.stars_near(places.stars_to(places.NO_LIMIT_V_MAG), turns, radius_rad)
+    for vectors, turn in zip(near, turns, strict=True):
+        cosines = vectors @ turn[2]
+        # cells that reach into the field may end some degrees beyond it
+        assert (cosines > math.cos(radius_rad)).sum() > 100
+        assert cosines.min() > math.cos(radius_rad + math.radians(10))
+    row = next(iter(tradeoff_study[2]["projection"].values()))
+    assert row["work"].startswith(f"{len(near[0])} stars near the field to sprites")
 
 
 def test_extended_precision_knows_places_between_those_of_float64():
@@ -749,14 +732,11 @@ def test_a_rule_reaches_over_all_that_curves_share():
 
 
 def test_sprites_of_a_path_stand_about_its_middle_and_share_its_light():
-    drawn = []
-    bench = SimpleNamespace(chain=lambda at, share, stars: drawn.append((at, share)))
-    methods = smear_methods(bench)
-    for method in methods.values():
-        method(None)
-    counts = [len(at) for at, _ in drawn]
+    placed = places.path_nodes()
+    assert list(placed) == list(places.smear_methods(places.smear_bench()))
+    counts = [len(at) for at, _ in placed.values()]
     assert sorted(counts) == sorted((*GAUSS, EXACT_NODES, *EVENLY))
-    for at, share in drawn:
+    for at, share in placed.values():
         assert share.sum() == pytest.approx(1.0)
         assert share @ at == pytest.approx(0.0, abs=1e-12)
         # of a path from -1/2 to 1/2, all but what so many sprites leave out

@@ -11,11 +11,11 @@ Then the prediction of a vibration beside a steady turn, against its frequency: 
 import math
 import time
 from bisect import bisect_right
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -194,23 +194,41 @@ def line_of(row: PredictionOutcome) -> str:
     return f"{row.method}: {errors}, {row.attitude_us:.0f} us per attitude"
 
 
+class ShakenCase(NamedTuple):
+    """A vibration with one way of prediction; see `Shaken`."""
+
+    way: Way
+    packets: str
+    packet_hz: int
+    age_ms: int
+    jitter_hz: int
+
+
 def shaken_rows(quick: bool) -> list[Shaken]:
     """A vibration by every way of prediction, with and without rates."""
+    rows = []
+    for case in shaken_cases(quick):
+        way, packets, packet_hz, age_ms, jitter_hz = case
+        has_rates = packets == SENDERS[0]
+        residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, has_rates)
+        rows.append(Shaken(*case, gain, residual))
+    return rows
+
+
+def shaken_cases(quick: bool) -> Iterator[ShakenCase]:
+    """Each vibration under half of the packets' rate, by every way of prediction, with and without
+    rates.
+    """
     cells: tuple[tuple[int, int], ...] = SHAKEN_CELLS
     frequencies: tuple[int, ...] = SHAKEN_HZ
     if quick:
         cells = QUICK_SHAKEN_CELLS
         frequencies = QUICK_SHAKEN_HZ
-    rows = []
     for packets, cell, way, jitter_hz in product(SENDERS, cells, WAYS, frequencies):
         packet_hz, age_ms = cell
         if jitter_hz >= packet_hz / 2:
             continue  # it looks like a slow one
-        has_rates = packets == SENDERS[0]
-        residual, gain = shaken_error(way, jitter_hz, packet_hz, age_ms, has_rates)
-        row = Shaken(way, packets, packet_hz, age_ms, jitter_hz, gain, residual)
-        rows.append(row)
-    return rows
+        yield ShakenCase(way, packets, packet_hz, age_ms, jitter_hz)
 
 
 def shaken_finding(rows: Sequence[Shaken]) -> str:

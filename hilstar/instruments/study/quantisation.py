@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hilstar.basics.arrays import FloatArray
 from hilstar.basics.charts import BLUE, INK, ORANGE, SMALL_PT
 from hilstar.basics.units import flux_ratio
 from hilstar.display.phases import USUAL_PSF, WHITE
@@ -136,13 +137,16 @@ def report(directory: Path, measured: QuantisationMeasured) -> Judged:
     return load.judged(lines)
 
 
+def phases_and_mags(quick: bool) -> tuple[int, FloatArray]:
+    """Sub-pixel phases along an axis, and magnitudes under white."""
+    if quick:
+        return 8, np.linspace(0, 8, 5)
+    return 32, np.linspace(0, 10, 41)
+
+
 def way_errors(quick: bool) -> list[WayErrors]:
     """The errors of every way over magnitudes."""
-    phases = 32
-    mags = np.linspace(0, 10, 41)
-    if quick:
-        phases = 8
-        mags = np.linspace(0, 8, 5)
+    phases, mags = phases_and_mags(quick)
     rows = []
     for bits, way in product(codes.BITS, codes.WAYS):
         errors = codes.code_errors(bits, way, phases, mags)

@@ -274,6 +274,7 @@ def test_effort_s_gain_is_told_by_depth_over_the_default_tolerance_alone():
         " as fast; largest errors of 40 stars 0.0200 mag and 0.0600 px by the worst of six"
         " centroiders (0.0400 by a PSF fit), within the tolerance"
     )
+    assert economy.economy_finding(pairs[:2]).endswith("within tolerance")
     slow = economy.line_of(pairs[3], Load())
     assert "2.0 times as SLOW" in slow and slow.endswith("OVER the tolerance")
     assert NOT_JUDGED in economy.line_of(pairs[0], Load(1e3))

@@ -8,11 +8,8 @@ import math
 
 import numpy as np
 import pytest
-from astropy.io import fits
-from astropy.wcs import WCS
 
 from hilstar.basics.rotation import from_radec_roll_deg, to_matrix
-from hilstar.cli.study import thesis_lines
 from hilstar.instruments.simulate.simulator import Exposure
 from hilstar.instruments.study import economy, outputs, rapp
 from hilstar.instruments.study.economy import EffortComparison, EffortOutcome
@@ -23,7 +20,6 @@ from hilstar.instruments.study.outputs import (
     _scene_words,
     _zoom,
     heat_words,
-    output_files,
     thesis_total_e,
 )
 from hilstar.instruments.study.sweep import NOT_JUDGED, Load
@@ -54,43 +50,6 @@ def bench(tmp_path_factory):
     path = tmp_path_factory.mktemp("bench") / "bench.toml"
     path.write_text(bench_text(BENCH))
     return read_bench_file(path)
-
-
-def test_a_bench_s_outputs_are_its_exposures_and_their_stars(bench, small_run):
-    """As its command writes them; the field of one's own is where it is asked for."""
-    run = small_run(lambda folder: thesis_lines("outputs", bench.path, folder, OWN))
-    lines, folder = run.told, run.folder
-    middle = WCS(fits.getheader(folder / "field.fits")).pixel_to_world(59.5, 44.5)
-    assert (middle.ra.deg, middle.dec.deg) == pytest.approx(OWN[:2], abs=1e-6)
-    assert [line.split(":")[0] for line in lines] == ["orion", "lyra", "zeta_cas", "field"]
-    names = output_files(fields_of(OWN))
-    assert {name for name in names if name.endswith((".csv", ".fits"))} == {
-        path.name for path in folder.iterdir()
-    }
-    for field, line in zip(fields_of(OWN), lines, strict=True):
-        rows = csv_rows(folder / f"{field.stem}.csv")
-        with fits.open(folder / f"{field.stem}.fits") as opened:
-            noisy = opened[0].data.astype(float)
-        with fits.open(folder / f"{field.stem}_without_noise.fits") as opened:
-            clean = opened[0].data.astype(float)
-        assert noisy.shape == clean.shape == SIZE_PX[::-1]
-        difference = noisy - clean
-        assert difference.std() > 1.0
-        assert np.median(noisy) == pytest.approx(np.median(clean), abs=1.0)
-        x = np.array([float(row["x_px"]) for row in rows])
-        y = np.array([float(row["y_px"]) for row in rows])
-        inside = (x >= -0.5) & (x < 119.5) & (y >= -0.5) & (y < 89.5)
-        v_mag = np.array([float(row["v_mag"]) for row in rows])
-        light = [float(row["electrons_per_s"]) for row in rows]
-        assert light == sorted(light, reverse=True)
-        words = f"{inside.sum()} stars"
-        assert words in line
-        assert f"V {v_mag.min():.2f} to {v_mag.max():.2f}, mean {v_mag.mean():.2f}" in line
-        assert f"sky {np.median(noisy):.0f} DN" in line
-        brightest = int(np.argmax(np.where(inside, light, 0)))
-        column, row = round(x[brightest]), round(y[brightest])
-        near = clean[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3]
-        assert near.max() == clean.max()
 
 
 def test_rapp_of_a_bench_s_stars_is_of_those_on_its_image(bench, small_run):

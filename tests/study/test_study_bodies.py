@@ -18,7 +18,6 @@ from hilstar.instruments.study.bodies import (
     SCENES,
     BodyCost,
 )
-from hilstar.instruments.study.sweep import Spent
 from hilstar.optics.camera import Camera
 
 TABLES = ("bodies_cost", "bodies_size", "bodies_limits")  # and the charts of each
@@ -239,38 +238,17 @@ def test_a_small_study_of_bodies_draws_its_rows(small_run):
     assert "the dearest:" in cost
 
 
-def test_a_full_moon_s_traced_light_is_its_rate_in_its_circle():
-    """A million electrons a second; a disc of one brightness near its middle."""
+def test_a_full_moon_s_traced_light_is_within_its_circle_and_a_half_moon_s_is_half_of_it():
     disc = bodies.moon(6.0, 0.0)
     camera = Camera((31, 31), bodies.FOCAL_PX, (15.0, 15.0), np.eye(3))
     image = bodies.traced(disc, camera)
-    assert image.sum() == pytest.approx(1e6, rel=5e-3)
     y, x = np.indices(image.shape)
-    middle = [15 + at for at in bodies.MIDDLE_PX]
-    assert (image * x).sum() / image.sum() == pytest.approx(middle[0], abs=0.02)
-    assert (image * y).sum() / image.sum() == pytest.approx(middle[1], abs=0.02)
-    reach = np.hypot(x - middle[0], y - middle[1])
+    reach = np.hypot(x - 15 - bodies.MIDDLE_PX[0], y - 15 - bodies.MIDDLE_PX[1])
     assert image[reach > 6 + 5 * max(bodies.SIGMA_PX)].max() < 1e-3 * image.max()
     # half of its light is lost at quarter phase and more, as less of it is lit
     half = bodies.moon(6.0, 90.0)
     lit = bodies.traced(replace(half, normal_e_per_s_sr=disc.normal_e_per_s_sr), camera)
     assert lit.sum() < 0.5 * image.sum()
-
-
-def test_a_level_is_crossed_between_its_steps():
-    steps = np.linspace(-3.0, 3.0, 7)
-    profile = np.array(
-        [
-            [8.0, 8.0, 8.0, 6.0, 2.0, 0.0, 0.0],  # half of 8 lies midway from 0 to 1
-            [4.0, 4.0, 1.0, 0.0, 0.0, 0.0, 0.0],  # two thirds of the way from -2 to -1
-            [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0],
-        ]
-    )
-    found = bodies.half_level_px(profile, steps)
-    assert found[:2] == pytest.approx([0.5, -2 + 2 / 3])
-    assert np.isnan(found[2])
-    shortest = bodies.shortest([Spent(3.0, 9.0), Spent(4.0, 7.0)])
-    assert shortest == (3.0, 7.0)
 
 
 def test_each_bench_has_the_bodies_of_its_name_and_aims_at_those_that_it_knows():

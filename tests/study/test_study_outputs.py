@@ -9,9 +9,9 @@ import pytest
 from astropy.io import fits
 from astropy.wcs import WCS
 
+from hilstar.cli.study import thesis_lines
 from hilstar.instruments.study import outputs
 from hilstar.instruments.study.fields import fields_of
-from hilstar.server.bench.bench_file import read_bench_file
 from tests.support.tables import csv_rows
 
 SIZE_PX = (220, 150)
@@ -50,7 +50,8 @@ def scenes(small_run, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         # the thesis's fields are as any other
         patch.setattr(outputs, "fields_of", lambda radec: fields_of(radec)[-2:])
-        return small_run(outputs.run, read_bench_file(path), FIELD)
+        # as its command writes them
+        return small_run(lambda folder: thesis_lines("outputs", path, folder, FIELD))
 
 
 def table_of(run):

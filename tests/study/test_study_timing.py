@@ -25,7 +25,7 @@ from hilstar.server.sync import ARCSEC_PER_DEG, Exposures, seen_at
 from tests.support.benches import ROOT
 from tests.support.recorded import assert_recorded
 from tests.support.studies import times_are_watched
-from tests.support.tables import csv_rows
+from tests.support.tables import csv_numbers
 
 GAIN = 20  # compensated against not: the issue's own figure
 RATE_DEG_S = QUICK_RATES_DEG_S[0]
@@ -117,10 +117,7 @@ def test_each_way_has_a_finding_and_a_row(timing_study):
 
 
 def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(timing_study):
-    rows = [
-        {name: float(value) for name, value in row.items()}
-        for row in csv_rows(timing_study[0] / "stripes.csv")
-    ]
+    rows = csv_numbers(timing_study[0] / "stripes.csv")
     assert max(abs(row["light"] - row["foretold"]) for row in rows) < 1e-6
     deep = [row["light"] for row in rows if row["refreshes"] == 2.4 and row["lit_ms"] == 4]
     assert max(deep) > 1.2 and min(deep) < 0.9
@@ -131,10 +128,7 @@ def test_rows_of_a_rolling_shutter_have_the_stripes_that_are_foretold(timing_stu
 
 def test_a_tracker_sees_the_beat_that_is_foretold(timing_study):
     """Star by star, each on a row of its own phase; and of another phase it would not be."""
-    rows = [
-        {name: float(value) for name, value in row.items()}
-        for row in csv_rows(timing_study[0] / "beat.csv")
-    ]
+    rows = csv_numbers(timing_study[0] / "beat.csv")
     for case in QUICK_CASES:
         mine = [row for row in rows if (row["refreshes"], row["lit"]) == (case.refreshes, case.lit)]
         assert len(mine) > 30
@@ -160,8 +154,7 @@ def test_an_angle_on_the_tracker_is_that_of_its_own_lens(outcomes):
 
 def test_the_charts_of_timing_draw_the_rows(small):
     run, measured = small
-    beat = [{name: float(x) for name, x in row.items()} for row in run.rows("beat")]
-    stripes = [{name: float(x) for name, x in row.items()} for row in run.rows("stripes")]
+    beat, stripes = (csv_numbers(run.folder / f"{name}.csv") for name in ("beat", "stripes"))
     for panel, name in enumerate(("off_arcsec", "light_mag")):
         lines = run.lines("beat", panel)
         for case in QUICK_CASES:
@@ -205,16 +198,11 @@ def test_stripes_are_of_the_display_s_rows_behind_the_rows_of_the_tracker(small)
     """Rows of 16 us and a scan-out of a refresh over the screen: a row begins late by its own time
     less that of its place on the screen; between the middle rows nothing is late.
     """
-    stripes = [{name: float(x) for name, x in row.items()} for row in small[0].rows("stripes")]
-    recorded = {}
-    for row in csv_rows(ROOT / "results" / "stripes.csv"):
-        recorded[row["refreshes"], row["lit_ms"], row["row"]] = float(row["light"])
-    same = 0
-    for row, text in zip(stripes, small[0].rows("stripes"), strict=True):
-        key = text["refreshes"], text["lit_ms"], text["row"]
-        assert row["light"] == pytest.approx(recorded[key], abs=1e-6)
-        same += 1
-    assert same == len(recorded)
+    now, then = (
+        {(row["refreshes"], row["lit_ms"], row["row"]): row["light"] for row in csv_numbers(path)}
+        for path in (small[0].folder / "stripes.csv", ROOT / "results" / "stripes.csv")
+    )
+    assert now == pytest.approx(then, abs=1e-6)
 
 
 def test_a_case_s_line_has_its_largest_errors_beside_those_foretold():

@@ -366,12 +366,15 @@ def test_the_stars_of_several_frames_are_those_between_two_magnitudes(tmp_path):
     with open_bench(file) as bench:
         colours = colour.colours_of(file, bench.stars)
         shown = colour.shown_stars(bench, colours, 2)
-        v_mag = bench.shown_stars.v_mag
-        judged = (v_mag > colour.BRIGHTEST_V_MAG) & (v_mag < colour.FAINTEST_V_MAG)
+        judged = colour.is_judged(bench.shown_stars.v_mag)
         wanted = colours.wanted(bench.shown_stars, np.flatnonzero(judged))
     assert len(shown.light) == len(shown.wanted) == len(shown.shares) == len(shown.off_px) > 10
     np.testing.assert_allclose(shown.light, 1.0, atol=0.05)
     assert {tuple(row) for row in shown.wanted} <= {tuple(row) for row in wanted}
+    ends_mag = np.array([colour.BRIGHTEST_V_MAG, colour.FAINTEST_V_MAG])
+    assert colour.is_judged(np.concatenate([ends_mag, ends_mag + 0.01])).tolist() == [
+        *(False, False, True, False)
+    ]
 
 
 def test_the_worst_place_in_a_mosaic_is_the_furthest_to_either_side():

@@ -421,7 +421,7 @@ def shown_stars(bench: Bench, colours: Colours, fields: int) -> ShownStars:
     stars = bench.shown_stars
     rng = np.random.default_rng(1)
     bits, rgb = bench.config.monitor.bits, bench.calibration.response.rgb
-    judged = (stars.v_mag > BRIGHTEST_V_MAG) & (stars.v_mag < FAINTEST_V_MAG)
+    judged = is_judged(stars.v_mag)
     wanted = []
     shares = []
     light = []
@@ -438,6 +438,11 @@ def shown_stars(bench: Bench, colours: Colours, fields: int) -> ShownStars:
         light.append(found.by_primary.sum(axis=1) / rates)
         off_px.append(found.off_px)
     return ShownStars(*map(np.concatenate, (wanted, shares, light, off_px)))
+
+
+def is_judged(v_mag: FloatArray) -> BoolArray:
+    """Whether stars (n,) are fainter than white and bright enough for their colour to be read."""
+    return np.asarray((v_mag > BRIGHTEST_V_MAG) & (v_mag < FAINTEST_V_MAG))
 
 
 def primary_shares(by_primary: FloatArray, rates: FloatArray, mono: bool) -> FloatArray:

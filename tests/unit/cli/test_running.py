@@ -42,13 +42,14 @@ from hilstar.server.bench.build import load
 from hilstar.server.bench.scenario import NO_SCENARIO
 from hilstar.server.faults import NO_RECORDING, Recording, ReplayedFaults, RunFaults
 from hilstar.server.record.ledger import LedgerSwitch
+from hilstar.server.replay import DrawnBy
 from hilstar.server.summary import RunTally, RunVerdict
 from hilstar.server.watchdog import GPU_LOST
 from tests.support.benches import SMALL_BENCH, bench_text
 from tests.support.model_display import model_screen
 from tests.support.senders import free_port
 
-RENDERER = SimpleNamespace(gl_renderer="none", gl_version="none", path="NumPy")
+RENDERER = DrawnBy("none", "none", "NumPy")
 TOKEN = "0123456789abcdef-0123"
 
 

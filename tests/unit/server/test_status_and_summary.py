@@ -15,6 +15,7 @@ from hilstar.basics.notices import Notices
 from hilstar.server.bench.config import AttitudeSettings
 from hilstar.server.operator import OnScreen
 from hilstar.server.pacer import Shown
+from hilstar.server.replay import DrawnBy
 from hilstar.server.serve import StatusMaker, traffic_of
 from hilstar.server.summary import RunTally, SwapTally
 
@@ -42,7 +43,7 @@ def loop():
     )
 
 
-RENDERER = SimpleNamespace(gl_renderer="llvmpipe", gl_version="4.5", path="points")
+RENDERER = DrawnBy("llvmpipe", "4.5", "points")
 
 
 def shown_frame(

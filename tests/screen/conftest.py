@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from hilstar.instruments.calibrate.first_light import image_sources
 from tests.support.benches import SCREEN_BENCH, still_log
 from tests.support.x11.screens import Screen, xvfb
 from tests.support.x11.xorg import Xorg, xorg
@@ -17,6 +18,15 @@ def screen(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Screen]:
     """A screen of 640 x 480."""
     with xvfb(tmp_path_factory.mktemp("screen")) as running:
         yield running
+
+
+@pytest.fixture
+def screen_here(screen: Screen, monkeypatch: pytest.MonkeyPatch) -> Screen:
+    """The screen as this process's own: one that has a pattern within moments, as no panel has."""
+    monkeypatch.setenv("DISPLAY", screen.display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    monkeypatch.setattr(image_sources, "SETTLE_S", 0.05)
+    return screen
 
 
 @pytest.fixture

@@ -117,7 +117,8 @@ def test_two_runs_on_one_server_keep_it_awake_until_the_last_ends(server, tmp_pa
     with shown_frames_of(server, tmp_path / "one", "one", "--windowed") as one:
         wait_for(lambda: awake(server))
         with shown_frames_of(server, tmp_path / "two", "two", "--windowed") as two:
-            wait_for(lambda: "Hz" in (tmp_path / "two" / "two.txt").read_text())
+            said = tmp_path / "two" / "two.txt"
+            wait_for(lambda: "the first attitude has come" in said.read_text())
             one.send_signal(signal.SIGINT)
             one.wait(PATIENCE_S)
             wait_for(lambda: awake(server))

@@ -13,7 +13,7 @@ import pytest
 from hilstar.server.bench.config.hardware import DEFAULT_PSF_SIGMA_PX
 from hilstar.server.genicam.camera import has_aravis
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar_here
 from tests.support.forks import HILSTAR, Started
 from tests.support.gige_client import own_address
 from tests.support.senders import free_port
@@ -60,27 +60,12 @@ needs_aravis = pytest.mark.skipif(
 
 
 @needs_aravis
-def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(screen, tmp_path):
+def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(screen_here, tmp_path):
     bench, truth = benches(tmp_path)
     endpoint = f"tcp://127.0.0.1:{free_port()}"
     with virtual_camera(truth, endpoint) as (address, ended):
-        result = run_hilstar(
-            "first-light",
-            bench,
-            "-o",
-            tmp_path / "s",
-            "--grab",
-            f"genicam:{address}",
-            "--frames",
-            endpoint,
-            "--frames",
-            "2",
-            "--patches",
-            "0",
-            "--json",
-            env=screen.env,
-            timeout=4 * PATIENCE_S,
-        )
+        words = f"--grab genicam:{address} --feed {endpoint} --frames 2 --patches 0 --json"
+        result = run_hilstar_here(f"first-light {words}", bench, "-o", tmp_path / "s")
         told, err = ended()
     assert result.returncode == 0, (result.stderr, err)
     camera = json.loads(told)["camera"]
@@ -94,29 +79,21 @@ def test_first_light_calibrates_a_bench_through_the_virtual_trackers_camera(scre
         judged = tmp_path / f"judged-{code}.toml"
         text = file.read_text()
         judged.write_text(f"{text}\n[verify]\ntrue_focal_length_mm = {TRUE_FOCAL_MM}\n")
-        verified = run_hilstar("verify", judged, "--fields", "3", "--strict")
+        verified = run_hilstar_here("verify", judged, "--fields", "3", "--strict")
         assert verified.returncode == code, (verified.stdout, verified.stderr)
 
 
 @needs_aravis
-def test_geometry_and_psf_are_calibrated_by_dots_that_a_camera_takes(screen, tmp_path):
+def test_geometry_and_psf_are_calibrated_by_dots_that_a_camera_takes(screen_here, tmp_path):
     bench, truth = benches(tmp_path)
     endpoint = f"tcp://127.0.0.1:{free_port()}"
     plan = tmp_path / "plan"
-    planned = run_hilstar("calibrate", "dots", bench, "-o", plan, "--frames", "10", "--dots", "25")
+    planned = run_hilstar_here("calibrate dots --frames 10 --dots 25", bench, "-o", plan)
     assert planned.returncode == 0, planned.stderr
     with virtual_camera(truth, endpoint) as (address, ended):
-        words = ("--plan", plan, "--grab", f"genicam:{address}", "--feed", endpoint, "--json")
-        geometry = run_hilstar(
-            "calibrate",
-            "geometric",
-            bench,
-            "-o",
-            tmp_path / "geometry.toml",
-            "--tracker-is-ideal",
-            *words,
-            env=screen.env,
-        )
+        words = f"--grab genicam:{address} --feed {endpoint} --tracker-is-ideal --json"
+        files = (bench, "-o", tmp_path / "geometry.toml", "--plan", plan)
+        geometry = run_hilstar_here(f"calibrate geometric {words}", *files)
         told, err = ended()
     assert geometry.returncode == 0, (geometry.stderr, err)
     assert json.loads(told)["camera"]["dropped"] == 0
@@ -127,26 +104,7 @@ def test_geometry_and_psf_are_calibrated_by_dots_that_a_camera_takes(screen, tmp
     off_px = abs(fitted["value"] - TRUE_FOCAL_MM * 1e3 / 57.65)
     assert off_px < SIGMAS * fitted["sigma"] < 0.5
     images = sorted((plan / "images").glob("frame_*.png"))
-    words = ("--plan", plan, "-o", tmp_path / "psf.fits", "--json")
-    psf = run_hilstar("calibrate", "psf", bench, *images, *words)
+    files = (bench, *images, "--plan", plan, "-o", tmp_path / "psf.fits")
+    psf = run_hilstar_here("calibrate psf --json", *files)
     assert psf.returncode == 0, psf.stderr
     assert json.loads(psf.stdout)["sigma_px"] == pytest.approx(DEFAULT_PSF_SIGMA_PX, rel=0.01)
-
-
-@needs_aravis
-def test_a_bench_is_checked_against_its_file_through_a_camera(screen, tmp_path):
-    """The truth's collimator is 1 mm longer than the bench file's: the check tells it."""
-    bench, truth = benches(tmp_path)
-    endpoint = f"tcp://127.0.0.1:{free_port()}"
-    with virtual_camera(truth, endpoint) as (address, ended):
-        words = ("--check", "--grab", f"genicam:{address}", "--feed", endpoint, "--json")
-        checked = run_hilstar(
-            "certify", bench, "-o", tmp_path / "c", *words, env=screen.env, timeout=8 * PATIENCE_S
-        )
-        told, err = ended()
-    assert checked.returncode == 1, (checked.stderr, err)
-    assert json.loads(told)["camera"]["dropped"] == 0
-    figures = {figure["quantity"]: figure for figure in json.loads(checked.stdout)["figures"]}
-    assert {name for name in figures if not figures[name]["in_tolerance"]} == {"scale"}
-    scale = figures["scale"]
-    assert scale["value"] == pytest.approx(1e6 * (120 / TRUE_FOCAL_MM - 1), abs=scale["threshold"])

@@ -17,7 +17,7 @@ from hilstar.instruments.calibrate.first_light.image_sources import Pattern, Pat
 from hilstar.server.bench.bench_file import read_bench_file
 from tests.support import plain_camera
 from tests.support.benches import TWIN, bench_text
-from tests.support.commands import run_hilstar
+from tests.support.commands import run_hilstar, run_hilstar_here
 from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S, best_of_three, in_time, wait_for
 from tests.support.wire.ptys import Cable
@@ -29,22 +29,13 @@ ADDED_MS = 25.0
 MEDIAN_MS = 4.0
 
 
-def test_the_display_shows_each_pattern_while_the_command_runs(screen, tmp_path):
-    (tmp_path / "bench.toml").write_text(bench_text(TWIN, {"monitor": {"bits": 8}}))
+def test_the_display_shows_each_pattern_while_the_command_runs(screen_here, tmp_path):
+    bench = tmp_path / "bench.toml"
+    bench.write_text(bench_text(TWIN, {"monitor": {"bits": 8}}))
     with plain_camera.on_duty() as camera:
-        grab = f"{camera} {screen.file} {{output}} --reversed"
-        words = [
-            "first-light",
-            tmp_path / "bench.toml",
-            "-o",
-            tmp_path / "s",
-            "--grab",
-            grab,
-            "--patches",
-            "0",
-            "--json",
-        ]
-        result = run_hilstar(*words, env=screen.env, timeout=PATIENCE_S)
+        grab = ("--grab", f"{camera} {screen_here.file} {{output}} --reversed")
+        words = "first-light --frames 2 --patches 0 --json"
+        result = run_hilstar_here(words, bench, "-o", tmp_path / "s", *grab)
     assert result.returncode == 0, result.stderr
     steps = {step["name"]: step for step in json.loads(result.stdout)["steps"]}
     assert steps["display"]["verdict"] == "done"

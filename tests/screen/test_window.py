@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
-import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -14,8 +15,8 @@ from PIL import Image
 from hilstar.basics.rotation import propagate
 from hilstar.server.record.ledger_records import frame_records
 from tests.support.benches import ATTITUDE, SCREEN_BENCH, still_log
-from tests.support.commands import run_hilstar
-from tests.support.forks import Started
+from tests.support.commands import run_hilstar, run_hilstar_here, typed
+from tests.support.forks import HILSTAR, Started
 from tests.support.waiting import PATIENCE_S
 from tests.support.x11.events import client
 from tests.support.x11.screens import Screen, Shown, codes_of, lines_over, xvfb
@@ -132,7 +133,8 @@ def refused_run(
     screen: Screen, screen_file: Path, *options: str, display: str | None = None
 ) -> tuple[int, str]:
     env = screen.env if display is None else screen.env | {"DISPLAY": display}
-    result = run_hilstar("replay", screen_file, screen_file.parent / "still.csv", *options, env=env)
+    with mock.patch.dict(os.environ, env, clear=True):
+        result = run_hilstar_here("replay", screen_file, screen_file.parent / "still.csv", *options)
     assert "Traceback" not in result.stderr
     return result.returncode, result.stderr
 
@@ -174,24 +176,10 @@ def test_a_display_that_is_not_there_gets_one_line(screen, screen_file):
 
 
 def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
-    """Two levels: black and white; the square of the first white one stays 5 s."""
-    command = [
-        "calibrate",
-        "plan",
-        "-o",
-        str(tmp_path / "plan.csv"),
-        "--levels",
-        "2",
-        "--repeats",
-        "1",
-        "--show",
-    ]
-    with Started(
-        [sys.executable, "-m", "hilstar", *command, "--seconds", "1"],
-        stderr=subprocess.PIPE,
-        text=True,
-        env=screen.env,
-    ) as process:
+    """Two levels between rounds of black, half and white: each comes up three times."""
+    words = "calibrate plan --levels 2 --repeats 1 --show --seconds 0.2 -o"
+    command = [*HILSTAR, *typed(words, tmp_path / "plan.csv")]
+    with Started(command, stderr=subprocess.PIPE, text=True, env=screen.env) as process:
         seen = set()
         end = time.monotonic() + PATIENCE_S
         while process.poll() is None and time.monotonic() < end:
@@ -205,24 +193,9 @@ def test_the_patches_of_a_plan_come_up_on_the_screen(screen, tmp_path):
 
 def test_the_dots_of_a_plan_come_up_turned_as_the_stars_are(screen, screen_file, tmp_path):
     screen_file.write_text(SCREEN_BENCH.replace("[collimator]", "flip_x = true\n[collimator]"))
-    command = [
-        "calibrate",
-        "dots",
-        str(screen_file),
-        "-o",
-        str(tmp_path / "plan"),
-        "--frames",
-        "8",
-        "--dots",
-        "10",
-        "--show",
-    ]
-    with Started(
-        [sys.executable, "-m", "hilstar", *command, "--seconds", "0.4"],
-        stderr=subprocess.PIPE,
-        text=True,
-        env=screen.env,
-    ) as process:
+    words = "calibrate dots --frames 8 --dots 10 --show --seconds 0.2"
+    command = [*HILSTAR, *typed(words, screen_file, "-o", tmp_path / "plan")]
+    with Started(command, stderr=subprocess.PIPE, text=True, env=screen.env) as process:
         wanted = None
         seen = False
         end = time.monotonic() + PATIENCE_S

@@ -100,8 +100,8 @@ class ModelDisplay:
         self.flips_ns: list[int] = []
         self._variable = variable
         self._held, self._stamp_ns, self._stampless = buffers - 2, stamp_ns, stampless
-        sync = None if stamp_ns is None else SimpleNamespace(swap_ns=self._stamp)
-        self._stamps = SwapStamps(sync, period_ns, clock.now_ns)
+        stamp = None if stamp_ns is None else self._stamp
+        self._stamps = SwapStamps(stamp, period_ns, clock.now_ns)
         own = {
             "swap": self.swap,
             "look_at_events": lambda: None,

@@ -4,7 +4,6 @@ thousands; here each public call is watched instead.
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +11,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from hilstar.attitude.receiver import BackChannel, Traffic
@@ -20,14 +18,13 @@ from hilstar.attitude.wire.packet import Status
 from hilstar.basics.notices import Notices
 from hilstar.basics.reading import KeptFiles
 from hilstar.basics.wrong_sky import ENDS, WrongSky
-from hilstar.display.window.watch import DisplayWatch
-from hilstar.optics.camera import Camera
+from hilstar.display.window.watch import PresentedModes
 from hilstar.optics.layers.fault_kinds import Gradient
-from hilstar.optics.layers.fault_light import FaultView
 from hilstar.server.bench.scenario import FaultSchedule, parse_scenario
 from hilstar.server.console.messages import Order
 from hilstar.server.console.publisher import OrderHandler
 from hilstar.server.record.ledger import FloodFilter, LedgerQueue, LedgerSwitch, QueueEntry
+from tests.unit.optics.test_fault_light import view_of
 
 NOW_NS = 10**12
 FLOOD = 1000  # of one kind: more than are said
@@ -162,19 +159,15 @@ def test_the_frames_thread_takes_faults_and_their_ends_under_the_lock():
 
 
 def test_a_fault_s_map_is_kept_under_the_lock():
-    camera = Camera((8, 6), 100.0, (3.5, 2.5), np.eye(3))
-    by = SimpleNamespace(canvas=SimpleNamespace(camera=camera), tracker=camera, exposure_s=0.1)
-    view = FaultView(by)
+    view = view_of()
     with only_under_its_lock(view, "_maps"):
         view.prepare(Gradient(name="stray", electrons_per_s=5.0))
 
 
 def test_how_a_screen_showed_frames_is_taken_under_a_lock():
-    watch = object.__new__(DisplayWatch)  # without the thread and the X server of a real one
-    events = SimpleNamespace(modes=lambda: ["flip", "copy", "flip"])
-    watch._lock, watch._events, watch._shown = threading.Lock(), events, Counter()
-    with only_under_its_lock(watch, "_events"):
-        assert watch.presented == {"flip": 2, "copy": 1}
+    modes = PresentedModes(lambda: ["flip", "copy", "flip"])
+    with only_under_its_lock(modes, "_counts", "_taken"):
+        assert modes.counts() == {"flip": 2, "copy": 1}
 
 
 def test_a_status_is_posted_and_taken_under_a_lock():

@@ -205,10 +205,10 @@ def linear_light(
     return images
 
 
-def level_cost(quantiser: type[Quantiser], psf: Psf, context: "Context | None" = None) -> LevelCost:
-    """The tabulated cost of a quantiser by the OpenGL of a context.
+def level_cost(quantiser: type[Quantiser], psf: Psf, gl_version: int | None = None) -> LevelCost:
+    """The tabulated cost of a quantiser by an OpenGL of a version, 430 for 4.3.
 
     Where NumPy draws everything (None) no frame waits for a screen, so the bench is planned as for
     a usual GL.
     """
-    return quantiser.cost(psf, COMPUTE_VERSION if context is None else context.version_code)
+    return quantiser.cost(psf, COMPUTE_VERSION if gl_version is None else gl_version)

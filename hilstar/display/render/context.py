@@ -4,6 +4,7 @@ import contextlib
 import ctypes
 import math
 import mmap
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -126,40 +127,39 @@ def described() -> str:
             exact = "compute shaders"
         else:
             exact = "NumPy (slow: their shaders need OpenGL 4.3)"
-        stars = "CPU" if draws_by_cpu(ctx) else "points"
+        stars = "CPU" if draws_by_cpu(str(info["GL_RENDERER"])) else "points"
         return f"{what}; round by {stars}, exact and temporal by {exact}"
     finally:
         ctx.release()
 
 
 def check_limits(
-    ctx: moderngl.Context, resolution_px: tuple[int, int], footprint_px: int, sigma: str
+    info: Mapping[str, Any], resolution_px: tuple[int, int], footprint_px: int, sigma: str
 ) -> None:
-    """Raise InputError where this GL cannot draw such an image, or points as large as its
-    sprites; those are by `sigma`.
+    """Raise InputError where a GL with such a context's `info` cannot draw such an image, or points
+    as large as its sprites; those are by `sigma`.
     """
     largest = (
-        int(min(ctx.info["GL_MAX_TEXTURE_SIZE"], *ctx.info["GL_MAX_VIEWPORT_DIMS"]))
-        - 2 * footprint_px
+        int(min(info["GL_MAX_TEXTURE_SIZE"], *info["GL_MAX_VIEWPORT_DIMS"])) - 2 * footprint_px
     )
     if max(resolution_px) > largest:
         raise InputError(
             f"resolution_px = {list(resolution_px)}: this GL draws at most {largest} px"
         )
-    points = ctx.info["GL_POINT_SIZE_RANGE"][1]
+    points = info["GL_POINT_SIZE_RANGE"][1]
     if footprint_px > points:
         raise InputError(
             f"{sigma}: needs sprites of {footprint_px} px; this GL draws at most {points:g} px"
         )
 
 
-def draws_by_cpu(ctx: moderngl.Context) -> bool:
-    """Whether stars are drawn by `cpu_stars` beside this GL: HILSTAR_DRAW, else where it is a
-    processor's, too.
+def draws_by_cpu(renderer: str) -> bool:
+    """Whether stars are drawn by `cpu_stars` beside the GL of a renderer: HILSTAR_DRAW, else where
+    that is a processor, too.
     """
     wanted = wanted_way()
     if wanted is None:
-        return is_software(ctx)
+        return is_processor(renderer)
     return wanted == "cpu"
 
 
@@ -174,7 +174,11 @@ def shares_memory(ctx: moderngl.Context) -> bool:
 
 def is_software(ctx: moderngl.Context) -> bool:
     """Whether a processor draws, and no graphics card."""
-    renderer = str(ctx.info["GL_RENDERER"])
+    return is_processor(str(ctx.info["GL_RENDERER"]))
+
+
+def is_processor(renderer: str) -> bool:
+    """Whether GL_RENDERER names a processor, and no graphics card."""
     return any(name in renderer for name in SOFTWARE)
 
 

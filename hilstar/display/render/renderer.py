@@ -91,13 +91,13 @@ class Renderer(Backend):
         try:
             with self._ctx:
                 self._driver = Driver(self._ctx)
-                self._uses_cpu = self.MAY_USE_CPU and draws_by_cpu(self._ctx)
+                self._uses_cpu = self.MAY_USE_CPU and draws_by_cpu(self.gl_renderer)
                 if target.response:
                     key = "sprite_sigma_px"
                 else:
                     key = "psf_sigma_px"
                 check_limits(
-                    self._ctx,
+                    self._ctx.info,
                     target.resolution_px,
                     self.footprint_px,
                     f"{key} = {list(target.psf.width_px)}",

@@ -7,7 +7,7 @@ Only what the server already knows is asked for, so that no request makes it pro
 import ctypes
 import shutil
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -416,9 +416,14 @@ def output_named(name: str, survival: Survival | None = None) -> OutputState | N
     """The output of that name; None where RandR does not have it."""
     try:
         with Randr(survival) as randr:
-            return next((state for state in randr.outputs() if state.name == name), None)
+            return named(randr.outputs(), name)
     except OSError:
         return None
+
+
+def named(outputs: Iterable[OutputState], name: str) -> OutputState | None:
+    """The one of some outputs that has this whole name; None where none has it."""
+    return next((state for state in outputs if state.name == name), None)
 
 
 def lit_outputs() -> list[OutputState]:

@@ -8,6 +8,7 @@ import contextlib
 import ctypes
 import threading
 from collections import Counter
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -136,6 +137,24 @@ class PresentEvents:
         self._xcb.xcb_disconnect(self._connection)
 
 
+class PresentedModes:
+    """Counts of frames by how the X server showed them; any thread may take the newest.
+
+    `taken` gives the modes of the frames since its last call.
+    """
+
+    def __init__(self, taken: Callable[[], Iterable[str]]) -> None:
+        self._taken = taken
+        self._counts: Counter[str] = Counter()
+        self._lock = threading.Lock()
+
+    def counts(self) -> dict[str, int]:
+        """Frames up to now: flip, copy, skip."""
+        with self._lock:
+            self._counts.update(self._taken())
+            return dict(self._counts)
+
+
 class DisplayWatch:
     """Looks once a second whether the gamma ramp of `output` (None: of none) is another, and how a
     window's frames are shown.
@@ -147,16 +166,16 @@ class DisplayWatch:
         self, output: str | None, window: int, survival: Survival, look_s: float = LOOK_S
     ) -> None:
         self.ramp_changed = False
-        self._shown: Counter[str] = Counter()
         self._output = output
         self._look_s = look_s
         self._randr: Randr | None = None
         self._events: PresentEvents | None = None
-        self._lock = threading.Lock()
+        self._modes: PresentedModes | None = None
         with contextlib.suppress(OSError):
             self._randr = Randr(survival) if output else None
         with contextlib.suppress(OSError, AttributeError, ValueError):
             self._events = PresentEvents(window)
+            self._modes = PresentedModes(self._events.modes)
         self._first = self._ramp()
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="hilstar-display-watch", daemon=True)
@@ -171,20 +190,15 @@ class DisplayWatch:
         while not self._stop.wait(self._look_s):
             ramp = self._ramp()
             self.ramp_changed = is_foreign(ramp, self._first)
-            self._take_events()
-
-    def _take_events(self) -> None:
-        with self._lock:
-            if self._events is not None:
-                self._shown.update(self._events.modes())
+            # the server's events would fill its queue until somebody asks
+            _ = self.presented
 
     @property
     def presented(self) -> dict[str, int]:
         """Frames by how the X server showed them up to now: flip, copy, skip; empty where it
         does not say.
         """
-        self._take_events()
-        return dict(self._shown)
+        return {} if self._modes is None else self._modes.counts()
 
     def stop(self) -> None:
         """Stop looking; the connections stay."""

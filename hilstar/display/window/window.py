@@ -204,7 +204,7 @@ class Window(Closing):
         sync = sync_control(self._x_display, glx_window)
         display_hz = 0 if self.display is None else self.display.refresh_hz
         period_ns = NS_PER_S / (display_hz or settings.refresh_hz or USUAL_REFRESH_HZ)
-        self._stamps = SwapStamps(sync, period_ns)
+        self._stamps = SwapStamps(None if sync is None else sync.swap_ns, period_ns)
         if monitor is not None:
             self._set_identity_ramp(monitor)
         if self._survival is not None:

@@ -198,27 +198,28 @@ class SwapStamps:
 
     Linux stamps the *end* of a vertical blank, when the first row is lit, and tells of it at its
     beginning: up to a millisecond ahead of now. So a stamp may be a refresh period ahead; a single
-    one that cannot be right is passed over.
+    one that cannot be right is passed over. `stamp_ns` asks the driver, which may have none of the
+    last swap; it is None where the driver has none at all.
     """
 
     def __init__(
         self,
-        sync: SyncControl | None,
+        stamp_ns: Callable[[], int | None] | None,
         period_ns: float,
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._sync = sync
+        self._stamp_ns = stamp_ns
         self._period_ns = period_ns
         self._now_ns = now_ns
         self._gaps = 0
-        self.source = CLOCK if sync is None else SYNC_EXTENSION.decode()
+        self.source = CLOCK if stamp_ns is None else SYNC_EXTENSION.decode()
 
     def after_swap(self, wait: Callable[[], None]) -> int:
         """Time of the swap just asked for, host ns; `wait` returns once it is done, where the
         driver does not say.
         """
-        if self._sync is not None:
-            swap_ns = self._sync.swap_ns()
+        if self._stamp_ns is not None:
+            swap_ns = self._stamp_ns()
             if (
                 swap_ns is not None
                 and -self._period_ns <= self._now_ns() - swap_ns < MAX_UST_AGE_NS
@@ -232,7 +233,7 @@ class SwapStamps:
                     "%s gives no time of swaps; the host's clock after them is used instead",
                     SYNC_EXTENSION.decode(),
                 )
-                self._sync = None
+                self._stamp_ns = None
         wait()
         self.source = CLOCK
         return self._now_ns()

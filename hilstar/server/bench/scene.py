@@ -67,6 +67,11 @@ class Display(NamedTuple):
     path_px: float
     darkest: float
 
+    @property
+    def gl_version(self) -> int | None:
+        """The version of its OpenGL, 430 for 4.3; None where NumPy draws."""
+        return None if self.context is None else int(self.context.version_code)
+
 
 def scenes_of(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene]:
     """The scene of each way to draw a bench's stars, from the cheapest on."""
@@ -91,7 +96,7 @@ def scenes_of(file: BenchFile, stars: Stars, display: Display) -> Iterator[Scene
             psf=psf,
             psf_choice=choice,
             exposure_frames=file.config.exposure_frames,
-            cost=partial(level_cost, context=display.context),
+            cost=partial(level_cost, gl_version=display.gl_version),
             turning=display.turning,
             path_px=display.path_px,
         )

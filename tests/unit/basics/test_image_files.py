@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import ast
 import bz2
+import functools
 import gzip
 import io
 import struct
@@ -61,6 +62,7 @@ def chunk(kind: bytes, body: bytes) -> bytes:
     return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
 
 
+@functools.cache
 def png_bomb(side_px: int = SIDE_PX) -> bytes:
     """A dark PNG of side_px x side_px, in some 170 kB."""
     packer, rows = zlib.compressobj(9), []

@@ -10,6 +10,7 @@ from hilstar.basics.errors import InputError
 from hilstar.display.footprints import FootprintMap
 from hilstar.display.render.backend import as_maps
 from hilstar.display.render.target import Target
+from hilstar.optics.extended import LightMap
 from hilstar.optics.psf import GaussianPsf, SampledPsf
 from hilstar.optics.sprites import pack_sprites
 from hilstar.server.bench.least_psf import (
@@ -64,10 +65,18 @@ def sprites_of(psf):
 
 
 def test_a_psf_of_any_class_that_varies_is_drawn_as_a_map_of_its_own_light():
+    """After all other light; stars of one PSF, and those without spectra, stay sprites."""
     psf = Vignetted((0.8, 0.8))
-    light = as_maps(sprites_of(psf), Target(SIZE_PX, psf))
-    (image,) = (part.image for part in light.extended)
-    assert len(light) == 0
+    before = LightMap(np.ones(SIZE_PX, np.float32))
+    sprites = replace(sprites_of(psf), extended=(before,))
+    light = as_maps(sprites, Target(SIZE_PX, psf))
+    kept, made = light.extended
+    assert kept is before
+    assert (len(light), made.lasting) == (0, False)
+    plain = replace(sprites, spectra=None)
+    assert as_maps(plain, Target(SIZE_PX, psf)) is plain
+    assert as_maps(sprites, Target(SIZE_PX, GaussianPsf((0.8, 0.8)))) is sprites
+    image = made.image
     assert image[:, : SIDE_PX // 2].sum() == pytest.approx(1e3, rel=1e-5)
     assert image[:, SIDE_PX // 2 :].sum() == pytest.approx(1e4, rel=1e-5)
 

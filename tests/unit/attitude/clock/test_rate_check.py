@@ -55,11 +55,13 @@ def moved_attitudes(rates: FloatArray, step_s: float) -> FloatArray:
     """The attitudes (n, 4) from START at rates (n, 3), cam, that change linearly from one to the
     next.
     """
-    steps = from_rotation_vectors(-(rates[1:] + rates[:-1]) / 2 * step_s)
-    q = [START]
-    for step in steps:
-        q.append(multiply(step, q[-1]))
-    return np.array(q)
+    q = np.vstack([START, from_rotation_vectors(-(rates[1:] + rates[:-1]) / 2 * step_s)])
+    # The products of all steps up to each: of 1, 2, 4, 8, ... steps in turn.
+    steps = 1
+    while steps < len(q):
+        q[steps:] = multiply(q[steps:], q[:-steps])
+        steps *= 2
+    return q
 
 
 def samples(t_ns, q, rates, broken=()) -> list[AttitudeSample]:

@@ -170,10 +170,10 @@ def test_what_a_file_holds_and_not_its_name_says_what_it_is(tmp_path, form):
 
 def test_all_that_holds_of_a_file_that_a_process_of_its_own_reads(tmp_path):
     form = FORMS["a SPICE CK"]
-    for claim, trials in ((assert_cuts_are_read, 4), (spoil, 6)):
+    for claim, trials in ((assert_cuts_are_read, 2), (spoil, 3)):
         claim(form.make(tmp_path), form, trials)
         (tmp_path / "a.bc").unlink()
-    noise_behind(form.make(tmp_path), 6)
+    noise_behind(form.make(tmp_path), 2)
     (tmp_path / "a.bc").unlink()
     renamed(form.make(tmp_path), form, [".dat"])
 

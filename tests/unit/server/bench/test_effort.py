@@ -232,9 +232,7 @@ def test_auto_leaves_exact_where_numpy_would_be_late():
     by_shader, by_numpy = (
         planned(
             asked,
-            replace(
-                bright, cost=partial(level_cost, context=SimpleNamespace(version_code=version))
-            ),
+            replace(bright, cost=partial(level_cost, gl_version=version)),
         )
         for version in (430, 330)
     )
